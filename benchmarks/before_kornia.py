@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.filters import gaussian_taps, separable
+from dhtorch.geometry.filters import correlate_separable, gaussian_taps
 from dhtorch.records import Camera, Pose
 
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -34,7 +34,7 @@ def to_matrix(T: Pose) -> Tensor:
 def gaussian(x: Tensor, sigma_px: float) -> Tensor:
     """``geometry.filters.gaussian``."""
     taps = gaussian_taps(sigma_px)
-    return separable(x, taps, taps)
+    return correlate_separable(x, taps, taps)
 
 
 def to_c2w(quaternion: np.ndarray, t: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from typing import Any
 
 import cv2
 
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
 #: Options that are not as they come.
@@ -70,11 +70,13 @@ def main() -> int:
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for path in sorted(p for p in data.iterdir() if p.is_dir()):
-            rows.append(row(path, Path(folder)) | {"processor": archive.processor(), "cores": os.cpu_count()})
+            rows.append(
+                row(path, Path(folder)) | {"processor": result_files.describe_processor(), "cores": os.cpu_count()}
+            )
             if options.pictures is not None and path.name in SHOWN:
                 picture(Path(folder) / path.name, options.pictures / f"{path.name}.jpg")
             print(rows[-1], flush=True)
-            options.json.write_text(storage.dumps(storage.strict(rows), indent=1) + "\n")
+            options.json.write_text(storage.dump_strict_json(storage.to_strict_json(rows), indent=1) + "\n")
     return 0
 
 

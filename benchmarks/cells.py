@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dhtorch.experiments.report import Table, text
+from dhtorch.experiments.report import ReportTable, text
 
 
 def percent(value: float | None) -> str:
@@ -17,4 +17,4 @@ def number(value: float | None) -> str:
 
 def table(head: list[str], rows: list[list[str]]) -> str:
     """A Markdown table, words left and numbers right."""
-    return text.grid(Table("", head, rows))
+    return text.table_to_markdown(ReportTable("", head, rows))

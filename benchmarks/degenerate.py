@@ -22,9 +22,9 @@ import torch
 from degenerate_pairs import KINDS, Pair, make
 from torch import Tensor
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.codes import Gate, PoseCode, names
-from dhtorch.geometry.patches import nearest
+from dhtorch.geometry.patches import sample_nearest
 from dhtorch.pipeline.pair import merge
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.pipeline.spec import Trace
@@ -79,7 +79,7 @@ def join(made: list[tuple[int, str, Pair]]) -> Batch:
     numbers, kinds, pairs = zip(*made, strict=True)
     anchors, others = zip(*(pair.frames() for pair in pairs), strict=True)
     uv, truth = torch.stack([pair.uv for pair in pairs]), torch.stack([pair.truth for pair in pairs])
-    return Batch([*numbers], [*kinds], tree.collate(anchors), tree.collate(others), uv, truth)
+    return Batch([*numbers], [*kinds], pytree.collate(anchors), pytree.collate(others), uv, truth)
 
 
 def broken(estimate: Estimate, trace: Trace) -> dict[str, Tensor]:
@@ -175,7 +175,7 @@ def answer(batch: Batch, method: str, tallies: dict[str, Tally]) -> None:
             tally.exceptions[f"{type(error).__name__}: {error}"[:120]] += 1
             tally.examples.append(batch.numbers[0])
         return
-    true = nearest(batch.truth, batch.uv.nan_to_num().clamp(-1e3, 1e3))[0]
+    true = sample_nearest(batch.truth, batch.uv.nan_to_num().clamp(-1e3, 1e3))[0]
     faults = broken(estimate, trace)
     for b, kind in enumerate(batch.kinds):
         tally, keep = tallies[kind], estimate.keep[b] & true[b].isfinite()

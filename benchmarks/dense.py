@@ -36,21 +36,21 @@ def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, A
     trace: dict[str, Any] = {}
     with torch.no_grad():
         joined = MAP(anchor, other, trace=trace)
-    asked = dense.views_asked(joined, other, trace)
+    asked = dense.selected_views(joined, other, trace)
     bytes_0, bytes_1 = (_bytes(frame) for frame in (anchor, other))
     size = dense.map_hw(hw, 640)
-    cameras = [dense.resized(frame, 640)[1] for frame in (anchor, other)]
+    cameras = [dense.downscale_grey(frame, 640)[1] for frame in (anchor, other)]
 
     def ours() -> None:
         with torch.no_grad():
-            dense.swept(anchor, asked, method=MAP, partners=1)
+            dense.sweep_depth(anchor, asked, method=MAP, partners=1)
 
     def peer() -> None:
         small = [
             cv2.resize(x, size[::-1], interpolation=cv2.INTER_AREA) if size != hw else x for x in (bytes_0, bytes_1)
         ]
         views = (small[0], cameras[0]), (small[1], cameras[1])
-        stereo.matched(stereo.rectify(*views, trace["fit"].T_1_from_0, nearest_m=0.7 * NEAR).pictures)
+        stereo.match_disparity(stereo.rectify_pair(*views, trace["fit"].T_1_from_0, nearest_m=0.7 * NEAR).pictures)
 
     a, b, c = harness.in_turn([ours, peer, harness.natively()(ours)], repeats=options.repeats, clock=options.clock)
     more: dict[str, Any] = {"n": size[0] * size[1], "bar": True}

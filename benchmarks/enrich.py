@@ -30,11 +30,11 @@ import numpy as np
 from dhtorch import data, testing
 from dhtorch.data.codecs.tiff import decode_tiff
 from dhtorch.data.recording import Recording
-from dhtorch.extract.enriched import camera_key, pixels
+from dhtorch.extract.enriched import camera_key, to_rgb_uint8
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.records import Frame
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.synthetic.recording import SyntheticRoom
 
@@ -121,7 +121,7 @@ def cameras(source: Sequence[Recording]) -> int:
 
 def digest(path: Path) -> str:
     """Of all that lies there."""
-    return archive.data_digest(archive.files_below([path]))
+    return result_files.compute_data_digest(result_files.list_files_below([path]))
 
 
 # ------------------------------------------------------------------------------------------------------ comparing
@@ -147,7 +147,7 @@ def robot(path: Path, source: Sequence[Recording], out: Path) -> int:
             f for each in data.open_all(out, camera=key, depth=column) for f in (each[i] for i in range(len(each)))
         ]
         for frame, again, cells in zip(frames, opened, rows[: len(frames)], strict=False):
-            count += same(pixels(frame), pixels(again), f"{key} picture")
+            count += same(to_rgb_uint8(frame), to_rgb_uint8(again), f"{key} picture")
             stored = decode_tiff(cells[column]["bytes"], out, tuple(features[column]["shape"][:2]))
             count += same(again.depth[0].numpy(), stored, f"{key} depth")
             count += close(frame, again, f"{key}")
@@ -204,7 +204,7 @@ def nerfstudio(path: Path, source: Sequence[Recording], out: Path) -> int:
         for i, shot in enumerate(about["frames"]):
             frame = recording[i]
             picture = np.array(Image.open(io.BytesIO((file.parent / shot["file_path"]).read_bytes())))
-            count += same(pixels(frame), picture, "picture")
+            count += same(to_rgb_uint8(frame), picture, "picture")
             K = cam.to_matrix(frame.camera)[0].double().numpy()
             stored = [shot["fl_x"], shot["fl_y"], shot["cx"] - 0.5, shot["cy"] - 0.5]
             count += same(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]], np.float32), np.array(stored, np.float32), "K")
@@ -244,10 +244,10 @@ def main() -> int:
                 if options.only is not None and options.only not in name:
                     continue
                 found = row(name, path, told, target, folder)
-                found |= {"processor": archive.processor(), "cores": os.cpu_count()}
+                found |= {"processor": result_files.describe_processor(), "cores": os.cpu_count()}
                 rows.append(found)
                 print(found, flush=True)
-                options.json.write_text(storage.dumps(storage.strict(rows), indent=1) + "\n")
+                options.json.write_text(storage.dump_strict_json(storage.to_strict_json(rows), indent=1) + "\n")
     return 0
 
 

@@ -23,14 +23,13 @@ import hydra
 import torch
 from hydra.utils import instantiate
 
-from dhtorch import calibration
-from dhtorch import pytree as tree
+from dhtorch import calibration, pytree
 from dhtorch.calibration import score_calibration
 from dhtorch.cli.run import config_dir
-from dhtorch.data.pairs import around, by_gap
+from dhtorch.data.pairs import by_gap, candidate_frames
 from dhtorch.experiments import protocol
 from dhtorch.experiments.compare import dense_comparison
-from dhtorch.experiments.compare_methods import MIN_ABOVE as FEW
+from dhtorch.experiments.compare_methods import MIN_ANSWERS_ABOVE_THRESHOLD as FEW
 from dhtorch.metrics import control
 from dhtorch.metrics.errors import Points
 
@@ -49,7 +48,7 @@ def settings(method: str) -> tuple[protocol.Method, list[Any]]:
 
 def _sparse(method: protocol.Method, chosen: list[Any], seeds: int) -> dict[str, list[Points]]:
     """Scene → candidates of every seed."""
-    offers = None if method.choose is None else around
+    offers = None if method.choose is None else candidate_frames
     variants = {f"{k}": protocol.Variant(method, seed=k, offers=offers) for k in range(seeds)}
     return _by_scene(protocol.run(chosen, protocol.Protocol(variants), by_gap, protocol.Settings()).points)
 
@@ -59,7 +58,7 @@ def _dense(method: protocol.Method, chosen: list[Any]) -> dict[str, list[Points]
     study = dense_comparison.run(
         chosen, {"auto": method}, by_gap, protocol.Settings(), anchors=ANCHORS, peers=False, rooms=()
     )
-    wanted = (dense_comparison.DENSE, dense_comparison.FULL)
+    wanted = (dense_comparison.DENSE_VARIANT, dense_comparison.FULL_COHORT)
     return _by_scene({k: p for k, p in study.points.items() if k[1:] == wanted and p.keep.numel()})
 
 
@@ -84,16 +83,20 @@ def main() -> int:
     method, chosen = settings(options.method)
     found = _dense(method, chosen) if options.dense else _sparse(method, chosen, options.seeds)
     scenes = [scene.name for scene in chosen if scene.role is None]
-    pooled = {s: tree.collate(found[s]) for s in scenes if found.get(s)}
+    pooled = {s: pytree.collate(found[s]) for s in scenes if found.get(s)}
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=HERE, capture_output=True, text=True, check=False
     ).stdout.strip()
     name = "dense" if options.dense else options.method
     origin = {"method": name, "scenes": [*pooled], "truth": "full", "seeds": options.seeds, "git": commit}
-    choose = control.plug_in if method.views == 1 else partial(control.most_scenes, few=FEW * options.seeds)
-    fitted = score_calibration.fit(list(pooled.values()), choose=choose, provenance=origin)
+    choose = (
+        control.plug_in_threshold
+        if method.views == 1
+        else partial(control.scene_quantile_threshold, few=FEW * options.seeds)
+    )
+    fitted = score_calibration.fit_calibration(list(pooled.values()), choose=choose, provenance=origin)
     target = options.output or HERE.parent / "dhtorch" / "calibration" / f"{name}.json"
-    print(calibration.save(fitted, target))
+    print(calibration.save_calibration(fitted, target))
     return 0
 
 

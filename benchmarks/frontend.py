@@ -172,11 +172,11 @@ def against_dinov2(options: Any) -> list[dict[str, Any]]:
     """Rows of the front end at 224x224 beside a forward pass of DINOv2-L."""
     frame = view(SIZES["224"])
     try:
-        network = dinov2.load()
+        network = dinov2.load_dinov2()
     except ImportError as error:
         print(f"dinov2_l: skipped, {error}")
         return []
-    pixels = dinov2.pixel_values(frame.image)
+    pixels = dinov2.preprocess_image(frame.image)
     fast, seconds = compiled(front_end, frame, 1024)
     calls = [partial(front_end, frame, 1024), fast, partial(network, pixel_values=pixels)]
     times = harness.in_turn(calls, repeats=max(options.repeats // 3, 4), warm_up=1, clock=options.clock, least_ms=20)

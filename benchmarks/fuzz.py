@@ -29,7 +29,7 @@ import mutations  # noqa: E402
 import recoders  # noqa: E402
 from test_hostile import SAMPLES  # noqa: E402
 
-from dhtorch.data.io.safe_open import MAX_MEMORY  # noqa: E402
+from dhtorch.data.io.safe_open import MAX_MEMORY_BYTES  # noqa: E402
 from dhtorch.runtime import storage  # noqa: E402
 
 SOME, MANY = 150, 1000  # cases of every format
@@ -46,7 +46,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--case", type=int, help="one case of it")
     parser.add_argument("--json", type=Path, help="write a summary")
     options = parser.parse_args(argv)
-    hostile.SECONDS, hostile.BYTES = SECONDS, MAX_MEMORY
+    hostile.SECONDS, hostile.BYTES = SECONDS, MAX_MEMORY_BYTES
     names = [options.only] if options.only else list(SAMPLES)
     numbers = [options.case] if options.case is not None else range(MANY if options.full else SOME)
     end = time.monotonic() + (MINUTES * 60 if not options.full else float("inf"))
@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     total = sum(each["cases"] for each in found.values())
     print(f"{total} cases, {len(failures)} failures")
     if options.json:
-        law = {"name": "all", "cases": total, "failures": len(failures), "cpu_s": SECONDS, "bytes": MAX_MEMORY}
+        law = {"name": "all", "cases": total, "failures": len(failures), "cpu_s": SECONDS, "bytes": MAX_MEMORY_BYTES}
         storage.write_json(options.json, [law | {"seed": options.seed}, *({"name": k} | v for k, v in found.items())])
     return int(bool(failures))
 

@@ -25,14 +25,14 @@ from dhtorch.codes import PoseCode
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.geometry import se3
-from dhtorch.geometry.pose_conventions import CONVENTIONS, STATED, camera_axes
+from dhtorch.geometry.pose_conventions import CONVENTIONS, STATED_AXES, pose_from_axes
 from dhtorch.metrics import errors, holdout
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.pytree import collate
-from dhtorch.records import Frame, GivenPose, Pose, PoseFit
+from dhtorch.records import Frame, Pose, PoseFit, PosePrior
 from dhtorch.runtime import storage
-from dhtorch.stages import pose_prior as given
+from dhtorch.stages import pose_prior
 from dhtorch.synthetic import SyntheticRoom
 
 #: Captures whose poses come from a device or a tracker, with cutoff (m), frames between two views, and what they need.
@@ -85,7 +85,7 @@ class Asked:
     method: Method  # its tracks and near returns' pose are known
     found: PoseFit
 
-    def points(self, fit: GivenPose | None, at: Tensor) -> tuple[errors.Points, PoseFit]:
+    def points(self, fit: PosePrior | None, at: Tensor) -> tuple[errors.Points, PoseFit]:
         """What is answered in the pairs ``at``, under a pose or the near returns' own."""
         trace: dict[str, Any] = {}
         method = self.method.replace(
@@ -93,7 +93,7 @@ class Asked:
             pose=lambda *_: self.found[at],
         )
         estimate = method(self.anchor[at], self.others[at], fit=fit, trace=trace)
-        return errors.select(estimate, self.truth[at]), trace["fit"]
+        return errors.points_from_estimate(estimate, self.truth[at]), trace["fit"]
 
 
 def pairs_of(recording: Recording, gap: int) -> list[tuple[int, int]]:
@@ -112,7 +112,7 @@ def tracked(scene: Scene, method: Method) -> Asked:
     anchor, others = (holdout.range_split(frame, scene.near) for frame in (whole, others))
     trace: dict[str, Any] = {}
     method(anchor, others, hint=scene.hint, trace=trace)
-    truth = holdout.candidates(trace["samples"], holdout.truth_at(whole, trace["samples"].uv), scene.near)
+    truth = holdout.select_candidates(trace["samples"], holdout.sample_truth(whole, trace["samples"].uv), scene.near)
     known = method.replace(track=lambda *_, hint: trace["tracks"])
     return Asked(scene, pairs, anchor, others, truth, known, trace["fit"])
 
@@ -123,14 +123,14 @@ def stated(world: Pose) -> Iterator[tuple[str, Pose, list[int] | None]]:
     yield "right", world, None
     for d in LATE:
         yield f"late by {d}", world, [k - d for k in range(n)]
-    yield "OpenGL axes", camera_axes(world, STATED["gl"]), None
+    yield "OpenGL axes", pose_from_axes(world, STATED_AXES["gl"]), None
     yield "inverse", se3.invert(world), None
     yield "millimetres", world.replace(t=1000 * world.t), None
     yield "order of letters", world, sorted(range(n), key=str)
     yield "backwards", world, [n - 1 - k for k in range(n)]
 
 
-def motions(asked: Asked, world: Pose, source: list[int] | None, **use: Any) -> tuple[GivenPose | None, Tensor]:
+def motions(asked: Asked, world: Pose, source: list[int] | None, **use: Any) -> tuple[PosePrior | None, Tensor]:
     """The motions of those pairs whose poses are there and not right by chance, and which pairs these are."""
     place = list(range(len(world.t))) if source is None else source
     there = [b for b, (i, j) in enumerate(asked.pairs) if min(place[i], place[j]) >= 0]
@@ -140,10 +140,10 @@ def motions(asked: Asked, world: Pose, source: list[int] | None, **use: Any) -> 
         return None, torch.tensor(there)
     ends = ([place[asked.pairs[b][side]] for b in there] for side in (0, 1))
     T_0, T_1 = (world.map(lambda x, k=k: x[k]) for k in ends)
-    return given.between(T_0, T_1, **use).to(asked.anchor.camera.f.dtype), torch.tensor(there)
+    return pose_prior.relative_prior(T_0, T_1, **use).to(asked.anchor.camera.f.dtype), torch.tensor(there)
 
 
-def off(asked: Asked, motion: GivenPose, world: Pose, at: Tensor) -> dict[str, float]:
+def off(asked: Asked, motion: PosePrior, world: Pose, at: Tensor) -> dict[str, float]:
     """By how much a motion differs from that of the capture's own poses, medians over pairs."""
     i, j = (torch.tensor(side)[at] for side in zip(*asked.pairs, strict=True))
     right = se3.relative(world.map(lambda x: x[i]), world.map(lambda x: x[j]))
@@ -172,7 +172,7 @@ def numbers(points: errors.Points, fit: PoseFit) -> dict[str, Any]:
 
 def said(points: errors.Points) -> dict[str, Any]:
     """How far answers are from what was held back."""
-    found = errors.measure(points)
+    found = errors.measure_errors(points)
     return {k: found[k] for k in ("n_candidates", "coverage", "median_rel", "p90_rel", "within_sigma", "within_2sigma")}
 
 
@@ -216,7 +216,7 @@ def main() -> int:
             for method in ASKED:
                 found += rows(scene, method)
             print(scene.name, flush=True)
-    storage.write_json(options.json, storage.strict([*found]))
+    storage.write_json(options.json, storage.to_strict_json([*found]))
     return 0
 
 

@@ -24,7 +24,7 @@ import torch
 import triangulate
 from frontend import front_end
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.geometry import epipolar
 from dhtorch.pipeline.pair import uniform_draws
 from dhtorch.pipeline.presets import METHODS
@@ -38,17 +38,17 @@ Call = Callable[[], Any]
 
 def calls(batch: int, device: str, one: tuple[str, Frame, Frame, Frame, float]) -> dict[str, Call]:
     """What is timed, by name, its inputs already on the device."""
-    near, other = (tree.collate([f[:1]] * batch).to(device) for f in one[1:3])
+    near, other = (pytree.collate([f[:1]] * batch).to(device) for f in one[1:3])
     samples, tracks, camera, _ = pnp.scene(batch, 500, 0.3, seed=1)
     draws = uniform_draws(0, batch, pnp.HYPOTHESES).to(device)
     samples, tracks, camera = samples.to(device), tracks.to(device), camera.to(device)
     uv_0, uv_1, view, T, _ = triangulate.scene(N)
     seen = [x.repeat(batch, 1, 1).to(device) for x in (uv_0, uv_1)]
-    view, T = tree.collate([view] * batch).to(device), tree.collate([T] * batch).to(device)
+    view, T = pytree.collate([view] * batch).to(device), pytree.collate([T] * batch).to(device)
     found: dict[str, Call] = {
         "frontend": partial(front_end, near, N),
         "pnp_n500": partial(pnp_ransac, samples, tracks, camera, camera, draws),
-        "triangulate": partial(epipolar.depths, seen[0], seen[1], view, view, T),
+        "triangulate": partial(epipolar.triangulate_depth, seen[0], seen[1], view, view, T),
     }
     return found | {f"pair_{name}": partial(method, near, other, n=N) for name, method in METHODS.items()}
 

@@ -29,7 +29,7 @@ from dhtorch import data
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.integrate.level import GRAVITY, directions, mean_upwards
+from dhtorch.integrate.level import _UP_BY_FORMAT, _spiral_directions, mean_camera_up
 from dhtorch.records import Frame
 from dhtorch.runtime import storage
 
@@ -75,7 +75,7 @@ def normals(frame: Frame) -> tuple[Tensor, Tensor]:
 
 def mode(n: Tensor, area: Tensor, guess: Tensor, within_deg: float) -> tuple[Tensor, float]:
     """The direction that most of the area shares, within an angle of ``guess``; and that share."""
-    axes = directions(4000)
+    axes = _spiral_directions(4000)
     axes = axes[axes @ guess > math.cos(math.radians(within_deg))]
     kernel = math.cos(math.radians(BIN_DEG))
     mass = torch.zeros(len(axes), dtype=torch.float64)
@@ -109,8 +109,8 @@ def shown(recording: Recording) -> dict[str, Any]:
     seen = [normals(recording[k]) for k in chosen]
     n, area = (torch.cat(parts) for parts in zip(*seen, strict=True))
     every = [recording.poses[k : k + 1] for k in range(count)]
-    guess = mean_upwards([T for T in every if bool(T.R.isfinite().all())])
-    stated = GRAVITY.get(recording.format)
+    guess = mean_camera_up([T for T in every if bool(T.R.isfinite().all())])
+    stated = _UP_BY_FORMAT.get(recording.format)
     row: dict[str, Any] = {"stated": None if stated is None else list(stated), "camera_up": guess.tolist()}
     if len(n) < 500:
         return row | {"why": "too little depth for normals"}
@@ -187,7 +187,7 @@ def main() -> int:
             if options.only in (None, path.name):
                 found += rows(path, Path(folder))
                 print(found[-1], flush=True)
-    storage.write_json(options.json, storage.strict(found))
+    storage.write_json(options.json, storage.to_strict_json(found))
     return 0
 
 

@@ -21,10 +21,10 @@ from typing import Any
 import cv2
 import torch
 
-from dhtorch.ops import loader as native
-from dhtorch.runtime import results as archive
+from dhtorch.ops import loader
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
-from dhtorch.runtime.allocator import keep_freed
+from dhtorch.runtime.allocator import disable_malloc_trim
 
 #: Clocks by name: what a wall shows, or (on a busy machine) the time this process was really given.
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
@@ -88,17 +88,17 @@ def _time(call: Callable[[], Any], count: int, clock: str, device: str) -> float
 @contextmanager
 def natively() -> Iterator[None]:
     """Compiled code is used in this block, and in processes forked from it; as a decorator, in each call."""
-    before, native._loaded = native._loaded, [_library()]  # no mock, which takes longer than a small call
+    before, loader._loaded = loader._loaded, [_library()]  # no mock, which takes longer than a small call
     try:
         yield
     finally:
-        native._loaded = before
+        loader._loaded = before
 
 
 @cache
 def _library() -> Path:
     """The compiled file, built unless it was, and loaded for whoever asks."""
-    path = native.build()
+    path = loader.build()
     torch.ops.load_library(str(path))
     return path
 
@@ -106,7 +106,7 @@ def _library() -> Path:
 @cache
 def _code() -> str | None:
     """The commit whose code is measured."""
-    return archive.revision(Path(archive.__file__).parent)
+    return result_files.read_git_revision(Path(result_files.__file__).parent)
 
 
 def iqr(values: Sequence[float]) -> float:
@@ -133,7 +133,7 @@ def row(name: str, ours: Sequence[float], peer: str, theirs: Sequence[float], **
 
 def place() -> dict[str, str | None]:
     """Where a row is measured: the processor, and the commit whose code it is."""
-    return {"processor": archive.processor(), "git": _code()}
+    return {"processor": result_files.describe_processor(), "git": _code()}
 
 
 def set_threads(threads: int) -> None:
@@ -154,7 +154,7 @@ class _Kept(argparse.Action):
     """What is freed, by whichever side, stays with this process (:mod:`dhtorch.runtime.allocator`)."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        if not keep_freed():
+        if not disable_malloc_trim():
             parser.error("found an allocator that keeps what it likes, expected glibc's without settings of its own")
 
 

@@ -2,12 +2,13 @@
 
     python benchmarks/judge.py --json benchmarks/results/judge_speed.json --clock cpu --repeats 9
 
-``judge_sparse``: :func:`dhtorch.judge` of a map of 640×480 with one other view, by sparse evidence (``views=False``) of
-:data:`dhtorch.validation.validate.QUICK`, from the frames to the verdict; ``judge_sparse_512`` the same by 512 samples
-of ``map``, and ``judge_views`` asks the pictures of the view as well. Rows of mode ``native`` use the compiled code of
-``python -m dhtorch.ops.loader``. All take turns in one process, a second or more of frames in a row each, as a data set
-is judged. The peer needs a motion like ours and gets one by the same method. Frames of TUM fr1/desk where DHTORCH_DATA
-is set, else of the built-in room; frames a second are 1000 / ms.
+``judge_sparse``: :func:`dhtorch.validate_depth` of a map of 640×480 with one other view, by sparse evidence
+    (``views=False``) of
+:data:`dhtorch.validation.validate.QUICK_METHOD`, from the frames to the verdict; ``judge_sparse_512`` the same by 512
+samples of ``map``, and ``judge_views`` asks the pictures of the view as well. Rows of mode ``native`` use the compiled
+code of ``python -m dhtorch.ops.loader``. All take turns in one process, a second or more of frames in a row each, as a
+data set is judged. The peer needs a motion like ours and gets one by the same method. Frames of TUM fr1/desk where
+DHTORCH_DATA is set, else of the built-in room; frames a second are 1000 / ms.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ import harness
 import pair as pairs
 import torch
 
-from dhtorch import MAP, judge
+from dhtorch import MAP, validate_depth
 from dhtorch.experiments.baselines import photometric
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.method import Method
-from dhtorch.validation.validate import QUICK
+from dhtorch.validation.validate import QUICK_METHOD
 
 METHOD = MAP.replace(n=512)
 
@@ -36,13 +37,13 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
     def check() -> None:
         trace: dict[str, Any] = {}
         with torch.no_grad():
-            asked = dense.views_asked(METHOD(near, other, trace=trace), other, trace)
-            photometric.differs(anchor.depth, near, asked)
+            asked = dense.selected_views(METHOD(near, other, trace=trace), other, trace)
+            photometric.photometric_difference(anchor.depth, near, asked)
 
     def ours(method: Method, views: bool) -> None:
-        judge(anchor.depth, near, other, method=method, views=views)
+        validate_depth(anchor.depth, near, other, method=method, views=views)
 
-    asked = {"judge_sparse": (QUICK, False), "judge_sparse_512": (METHOD, False), "judge_views": (METHOD, True)}
+    asked = {"judge_sparse": (QUICK_METHOD, False), "judge_sparse_512": (METHOD, False), "judge_views": (METHOD, True)}
     modes = {"eager": ours, "native": harness.natively()(ours)}
     sides = [(name, mode) for mode in modes for name in asked]
     calls = [*(partial(modes[mode], *asked[name]) for name, mode in sides), check]

@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
 #: Capture → options beside those as they come. The RealSense's K is nobody's: the field of view is the maker's. The
@@ -42,7 +42,7 @@ def rows(path: Path, options: tuple[str, ...], folder: Path) -> list[dict[str, A
         row = {
             "recording": said["scene"],
             "options": list(options),
-            "processor": archive.processor(),
+            "processor": result_files.describe_processor(),
         }
         row |= {"intrinsics_guessed": said["intrinsics_guessed"], "whole": said["whole"]}
         row |= {"windows": [{k: w[k] for k in ("frames", "cause", "pairs")} for w in said["windows"]]}
@@ -63,7 +63,7 @@ def main() -> int:
             folder = Path(options.pages or scratch).resolve() / name
             folder.mkdir(parents=True, exist_ok=True)
             found += [{"name": name} | row for row in rows(data / name, asked, folder)]
-    storage.write_json(options.json, storage.strict(found))
+    storage.write_json(options.json, storage.to_strict_json(found))
     return 0
 
 

@@ -29,7 +29,7 @@ from typing import cast
 from dhtorch import extract  # noqa: F401 (imported once, before commands are forked)
 from dhtorch.cli import enrich, run  # noqa: F401
 from dhtorch.runtime import (
-    results as archive,
+    results as result_files,
 )
 from dhtorch.runtime import (
     storage,
@@ -94,7 +94,7 @@ def suffered(command: str, place: Path, options: argparse.Namespace) -> list[Row
 
 def _checkout() -> str:
     """The state of the code, which every file names."""
-    return str(archive.meta(device="cpu", dtype="float32", threads=1, seed=0)["git"])
+    return str(result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=0)["git"])
 
 
 def start(command: str, folder: Path, limit: int | None = None) -> ForkProcess:

@@ -8,7 +8,7 @@ from typing import Any
 
 from speed_tables import ratio
 
-from dhtorch.experiments.report import Table, text
+from dhtorch.experiments.report import ReportTable, text
 
 RESULTS = Path(__file__).resolve().parent / "results"
 
@@ -33,7 +33,7 @@ def functions() -> str:
         cells += [size, f"{1e3 * r['ours_ms']:.0f}", ratio(r["ratio"]), f"{r['largest']:.1g}", f"{r['median_rel']:.1g}"]
         shown.append([*cells, lacks(r), r["why"]])
     head = ["ours", "kornia's", "used", "asked", "ours, µs", "ratio", "largest", "median", "kornia's lacks", "why"]
-    return f"{text.grid(Table('', head, shown, n_label=3))}\n\n{measured(asked)}"
+    return f"{text.table_to_markdown(ReportTable('', head, shown, n_label=3))}\n\n{measured(asked)}"
 
 
 def lacks(r: dict[str, Any]) -> str:
@@ -60,7 +60,7 @@ def answers() -> str:
         cells = [f"{r['scene']}, `{r['method']}`", str(r["pairs"]), str(r["answered"])]
         shown.append([*cells, f"{r['median_rel']:.1g}", f"{r['largest_rel']:.1g}", f"{100 * r['flipped']:.2g} %"])
     head = ["scene, method", "pairs", "answers", "median difference of depth", "largest", "gates flipped"]
-    return text.grid(Table("", head, shown))
+    return text.table_to_markdown(ReportTable("", head, shown))
 
 
 #: Tables of docs/kornia.md.

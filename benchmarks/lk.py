@@ -33,9 +33,9 @@ from dhtorch import data
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.baselines import opencv
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.determinism import LANES
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES
 from dhtorch.geometry.patches import luma
-from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
+from dhtorch.geometry.pyramid import Pyramid, PyramidCache, build_pyramid
 from dhtorch.records import TrackHint
 from dhtorch.stages import track
 from dhtorch.stages.sample import spiral
@@ -64,16 +64,16 @@ def pairs(count: int) -> tuple[Tensor, Tensor]:
 def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0: Pyramid | None = None):
     """Positions (B, N, 2) and whether they were found (B, N)."""
     B, N, _ = uv.shape
-    assert B * N % LANES == 0
-    o = lk.SearchOptions(window, 30, 0.01, track.MIN_EIGENVALUE, "none")
+    assert B * N % ELEMENTWISE_LANES == 0
+    o = lk.SearchOptions(window, 30, 0.01, track.MIN_TRACK_EIGENVALUE, "none")
     with torch.no_grad():
         source = build_pyramid(image_0, LEVELS, window) if pyramid_0 is None else pyramid_0
         target = build_pyramid(image_1, LEVELS, window, gradients=False)
         x = uv.permute(2, 0, 1).reshape(2, B * N).contiguous()
         batch = torch.arange(B).repeat_interleave(N)
-        known = lk.within(x, *source.bounds())
+        known = lk.is_between(x, *source.bounds())
         every = {"known": known, "begun": known, "near_levels": len(source.levels), "alike": True}
-        d, found, _ = lk.search(source, target, o, x, torch.zeros_like(x), batch, **every)
+        d, found, _ = lk.search_displacements(source, target, o, x, torch.zeros_like(x), batch, **every)
     return (x + d).reshape(2, B, N).permute(1, 2, 0), found.reshape(B, N)
 
 
@@ -135,7 +135,7 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
     image_0, image_1 = pairs(batch)
     uv = spiral(tuple(image_0.shape[-2:]), n).float().expand(batch, n, 2).contiguous()
     views, suffix = (image_0, image_1, uv), f"_w{window}_n{n}" + (f"_b{batch}" if batch > 1 else "")
-    kept = Pyramids(image_0)
+    kept = PyramidCache(image_0)
     anchor = kept(LEVELS, window)
     options: Any = {"window": window, "levels": LEVELS}
     calls = [
@@ -144,7 +144,7 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
         partial(forward_opencv, *views, window),
         partial(track.lucas_kanade, *views, **options),
         partial(track.lucas_kanade, *views, hint=TrackHint(pyramid=kept), **options),
-        partial(opencv.lucas_kanade, *views, **options),
+        partial(opencv.opencv_lucas_kanade, *views, **options),
         partial(harness.natively()(forward), *views, window),
         partial(harness.natively()(track.lucas_kanade), *views, **options),
         partial(forward_compiled, *views, window),

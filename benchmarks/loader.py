@@ -50,9 +50,9 @@ BARS = "640x480"
 NATIVE = {"transform_native": "transform", "by_batch_native": "by_batch"}
 NETWORKS = {"dinov2_l": {}, "dinov2_s": {"hidden": 384, "layers": 12, "heads": 6}}
 OPENCV = PAPER.replace(
-    track=opencv.lucas_kanade,
-    pose=opencv.pnp_ransac,
-    triangulate=partial(triangulate.two_view, solver=opencv.triangulate),
+    track=opencv.opencv_lucas_kanade,
+    pose=opencv.opencv_pnp_ransac,
+    triangulate=partial(triangulate.two_view, solver=opencv.opencv_triangulate),
 )
 
 
@@ -217,7 +217,7 @@ def steps(benches: Sequence[Bench], repeats: int, clock: str) -> Iterator[dict[s
     picture = torch.zeros(1, 3, SIDE, SIDE)
     for peer, sizes in NETWORKS.items():
         try:
-            network = dinov2.load(**sizes)
+            network = dinov2.load_dinov2(**sizes)
         except ImportError as error:
             print(f"step rows skipped: {error}")
             return

@@ -18,7 +18,7 @@ from typing import Any
 import harness
 
 from dhtorch import MAP
-from dhtorch.cli.stream import streamed
+from dhtorch.cli.stream import stream_scene
 from dhtorch.data.scene import Scene
 from dhtorch.runtime import storage
 from dhtorch.synthetic import SyntheticRoom
@@ -45,7 +45,7 @@ def measure(frames: int) -> dict[str, Any]:
 
     room = SyntheticRoom(n_frames=frames, hw=HW, depth_hw=HW)
     settings = {"steps": (1, 2, 3, 5, 8), "seed": 0, "most": None, "dtype": "float32", "device": "cpu", "cutoff": 2.0}
-    told = streamed(Scene(room, near=2.0), MAP.replace(n=SAMPLES), settings, progress=watched)
+    told = stream_scene(Scene(room, near=2.0), MAP.replace(n=SAMPLES), settings, progress=watched)
     return {
         "name": "stream_recording",
         "frames": told["n_frames"],

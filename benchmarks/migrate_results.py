@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dhtorch.runtime import results
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime.storage import replace_file
 
 WINGS = {
@@ -101,7 +101,7 @@ def migrate(path: Path) -> None:
     if isinstance(content, dict) and "schema" in content:
         new = content | {"config": present_settings(content["config"])}
         if new != content:
-            results.write(path, new)
+            result_files.write_result(path, new)
     elif isinstance(content, list):
         new_rows = [row | {"mode": MODES.get(row["mode"], row["mode"])} if "mode" in row else row for row in content]
         if new_rows != content:

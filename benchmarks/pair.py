@@ -25,8 +25,7 @@ from typing import Any
 import harness
 import torch
 
-from dhtorch import data
-from dhtorch import pytree as tree
+from dhtorch import data, pytree
 from dhtorch.codes import Source
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.baselines import opencv
@@ -34,7 +33,7 @@ from dhtorch.experiments.baselines.frozen import WINDOW_1
 from dhtorch.metrics import errors, holdout
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.presets import AUTO, MAP, PAPER
-from dhtorch.pipeline.view_report import choosing
+from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.records import DepthMap, Frame
 from dhtorch.stages import triangulate
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -52,9 +51,9 @@ GOOD = 0.05
 EVERY = 4
 
 PEER = PAPER.replace(
-    track=opencv.lucas_kanade,
-    pose=opencv.pnp_ransac,
-    triangulate=partial(triangulate.two_view, solver=opencv.triangulate),
+    track=opencv.opencv_lucas_kanade,
+    pose=opencv.opencv_pnp_ransac,
+    triangulate=partial(triangulate.two_view, solver=opencv.opencv_triangulate),
 )
 
 
@@ -69,13 +68,13 @@ def load(batch: int) -> tuple[str, Frame, Frame, Frame, float]:
     recording, near, gap = _recording()
     chosen = by_gap(recording, gap)
     chosen = [chosen[k % len(chosen)] for k in range(batch)]
-    anchor, other = (tree.collate([recording[p[k]] for p in chosen]) for k in (0, 1))
+    anchor, other = (pytree.collate([recording[p[k]] for p in chosen]) for k in (0, 1))
     return recording.name, holdout.range_split(anchor, near), holdout.range_split(other, near), anchor, near
 
 
 def median_error(method: Any, pair: tuple[str, Frame, Frame, Frame, float]) -> float | None:
     """Median relative depth error over the answered candidates."""
-    return errors.measure(answers(method, pair))["median_rel"]
+    return errors.measure_errors(answers(method, pair))["median_rel"]
 
 
 def answers(method: Any, pair: tuple[str, Frame, Frame, Frame, float]) -> errors.Points:
@@ -83,8 +82,8 @@ def answers(method: Any, pair: tuple[str, Frame, Frame, Frame, float]) -> errors
     _, near, other, anchor, cutoff = pair
     trace: dict[str, Any] = {}
     estimate = method(near, other, trace=trace)
-    truth = holdout.candidates(trace["samples"], holdout.truth_at(anchor, estimate.uv), cutoff)
-    return errors.select(estimate, truth)
+    truth = holdout.select_candidates(trace["samples"], holdout.sample_truth(anchor, estimate.uv), cutoff)
+    return errors.points_from_estimate(estimate, truth)
 
 
 def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[str, Any]]:
@@ -109,7 +108,7 @@ def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[
     sides = harness.in_turn([partial(call, side) for side in methods], repeats=options.repeats, clock=options.clock)
     times = {side: [t / batch for t in found] for side, found in zip(methods, sides, strict=True)}
     points = {side: said(side) for side in methods}
-    found = {side: errors.measure(points[side])["median_rel"] for side in methods}
+    found = {side: errors.measure_errors(points[side])["median_rel"] for side in methods}
     good = {side: int((points[side].answered().error <= GOOD).sum()) / batch for side in methods}
     rows = []
     for side in methods:
@@ -134,7 +133,7 @@ def measure_every_pixel(threads: int, options: Any, n: int = 2048) -> list[dict[
 
     def ours(mode: str = "eager") -> DepthMap:
         with torch.no_grad(), MODES[mode]():
-            return dense.complete(near, other, method=MAP, partners=1)
+            return dense.complete_depth(near, other, method=MAP, partners=1)
 
     def peer() -> None:
         with torch.no_grad():
@@ -160,7 +159,7 @@ def pixel_errors(found: DepthMap, pair: tuple[str, Frame, Frame, Frame, float]) 
     chosen[:, ::EVERY, ::EVERY] = True
     chosen &= found.source == Source.SWEPT
     _, h, w = found.depth.shape
-    truth = holdout.truth_at(anchor, dense.pixels(near, (h, w))[chosen.flatten()][None])
+    truth = holdout.sample_truth(anchor, dense.map_pixel_centres(near, (h, w))[chosen.flatten()][None])
     counts = truth.ok & (truth.depth > cutoff)
     return (found.depth[chosen][None] / truth.depth - 1).abs()[counts]
 
@@ -180,11 +179,11 @@ def measure_anchor(threads: int, options: Any, n: int = 2048) -> list[dict[str, 
         trace: dict[str, Any] = {}
         with torch.no_grad(), MODES[mode]():
             estimate = method(anchor, others, n=n, trace=trace)
-        truth = holdout.candidates(trace["samples"], holdout.truth_at(truth_of, estimate.uv), near)
-        found[name] = errors.measure(errors.select(estimate, truth))["median_rel"]
+        truth = holdout.select_candidates(trace["samples"], holdout.sample_truth(truth_of, estimate.uv), near)
+        found[name] = errors.measure_errors(errors.points_from_estimate(estimate, truth))["median_rel"]
 
-    sides = [partial(call, mode, choosing(AUTO), mode) for mode in MODES]
-    sides.append(partial(call, "window_1", choosing(WINDOW_1)))
+    sides = [partial(call, mode, with_view_selection(AUTO), mode) for mode in MODES]
+    sides.append(partial(call, "window_1", with_view_selection(WINDOW_1)))
     *ours, peer = harness.in_turn(sides, repeats=options.repeats, clock=options.clock)
     rows = []
     for mode, times in zip(MODES, ours, strict=True):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from captures import row
 
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.testing.stray import write_stray
@@ -37,7 +37,12 @@ def main() -> int:
         )
         write_stray(capture, room, codec="libx265")
         found = row(capture, Path(folder), ())
-    found |= {"frames": options.frames, "hw": list(HW), "processor": archive.processor(), "cores": os.cpu_count()}
+    found |= {
+        "frames": options.frames,
+        "hw": list(HW),
+        "processor": result_files.describe_processor(),
+        "cores": os.cpu_count(),
+    }
     print(found)
     storage.write_json(options.json, [found])
     return found["rc"]

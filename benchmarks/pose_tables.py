@@ -10,7 +10,7 @@ from typing import Any
 
 from cells import percent, table
 
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
 RESULTS = Path(__file__).resolve().parent / "results"
 
@@ -59,7 +59,7 @@ def answered_numbers(rows: list[dict[str, Any]]) -> str:
     keys = ("median_rel", "within_sigma", "within_2sigma")
     error, one, two = (percent(statistics.median(row[key] for row in of)) for key in keys)
     near = [row["near"]["median_rel"] for row in of if row["near"]["median_rel"] is not None]
-    return f"{error} ({percent(statistics.median(near)) if near else '–'}), {one}, {two}; {many(len(of), 'capture')}"
+    return f"{error} ({percent(statistics.median(near)) if near else '–'}), {one}, {two}; {format_count(len(of), 'capture')}"
 
 
 def by_capture(method: str) -> dict[str, list[dict[str, Any]]]:

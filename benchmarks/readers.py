@@ -32,7 +32,7 @@ from dhtorch.experiments.focal.stacks import FocalStack
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
 PERIOD = 20
@@ -213,7 +213,7 @@ def _work(name: str, n: int) -> dict[str, Any]:
         root.mkdir()
         path = pool.apply(_write, (name, root, n))
         size = sum(f.stat().st_size for f in root.rglob("*") if f.is_file())
-        return pool.apply(measure, (name, path)) | {"mib": size / 2**20, "processor": archive.processor()}
+        return pool.apply(measure, (name, path)) | {"mib": size / 2**20, "processor": result_files.describe_processor()}
 
 
 def _write(name: str, root: Path, n: int) -> Path:

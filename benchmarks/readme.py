@@ -26,8 +26,8 @@ import speed_tables
 from cells import number, percent, table
 
 from dhtorch.experiments.compare import method_comparison
-from dhtorch.experiments.report import Table, layouts, text
-from dhtorch.runtime import results as archive
+from dhtorch.experiments.report import ReportTable, layouts, text
+from dhtorch.runtime import results as result_files
 
 HERE = Path(__file__).resolve().parent
 README = HERE.parent / "README.md"
@@ -114,7 +114,7 @@ def comparison() -> str:
     """The numbers that decide the method comparison, each beside its bar."""
     summary = json.loads((RESULTS / "method_comparison.json").read_text())["summary"]
     rows = []
-    for name, (one, many, _) in method_comparison.BARS.items():
+    for name, (one, many, _) in method_comparison.METHOD_BARS.items():
         bars = f"{BOUND[name]} {one:g}" if one == many else f"{BOUND[name]} {one:g} / {many:g}"
         cells = [f"{summary[f'{m}.{name}']['value']:.3f}" for m in COMPARED]
         rows.append([NUMBER[name], *cells, bars])
@@ -209,7 +209,7 @@ def verdicts(names: Sequence[str]) -> str:
     for name in names:
         result = json.loads((RESULTS / f"{name}.json").read_text())
         rows.append([f"`{result['experiment']}` on {result['data']['name']}", result["verdict"], result["why"]])
-    return text.grid(Table("", ["experiment", "verdict", "why"], rows, n_label=3))
+    return text.table_to_markdown(ReportTable("", ["experiment", "verdict", "why"], rows, n_label=3))
 
 
 def row_of(name: str, scene: str, method: str) -> dict[str, Any]:
@@ -294,7 +294,7 @@ def swept() -> str:
     names = [[f"`{value}`" for value in job["overrides"].values()] for job in jobs]
     head = [*(f"`{key}`" for key in jobs[0]["overrides"]), *(HEAD[key] for key in SWEPT)]
     rows = [a + b for a, b in zip(names, shown, strict=True)]
-    return text.grid(Table("", head, rows, n_label=len(names[0])))
+    return text.table_to_markdown(ReportTable("", head, rows, n_label=len(names[0])))
 
 
 def number_as(value: float, key: str) -> str:
@@ -315,7 +315,7 @@ def captures() -> str:
         first = "" if found["first_s"] is None else f"{found['first_s']:.0f}"
         said = (found.get("said") or found.get("why") or "").removeprefix(f"{found['name']}: ")
         rows.append([said, f"`{found['name']}`", first, f"{found['seconds']:.0f}"])
-    grid = text.grid(Table("", ["what came out", "capture", "first picture, s", "all, s"], rows))
+    grid = text.table_to_markdown(ReportTable("", ["what came out", "capture", "first picture, s", "all, s"], rows))
     shown = "".join(
         f"\n\n![{file.stem}: picture, sensor, completed](../assets/captures/{file.name})\n\n`{file.stem}`"
         for file in sorted((HERE.parent / "docs/assets/captures").glob("*.jpg"))
@@ -352,7 +352,7 @@ def enriched() -> str:
         "MB a minute",
         "loaders",
     ]
-    grid = text.grid(Table("", head, rows))
+    grid = text.table_to_markdown(ReportTable("", head, rows))
     first = json.loads(file.read_text())[0]
     options = "`frames=3 'dense={size: 160}'`"
     return f"{grid}\n\n{options}; processor time of {first['processor']}, {first['cores']} cores, beside other work."
@@ -580,10 +580,10 @@ TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, (
 
 def in_layout(name: str) -> str:
     """The tables of ``results/<name>.json`` in the paper's layout, the paper's figures beside ours."""
-    found = layouts.in_layout(archive.read(RESULTS / f"{name}.json"))
+    found = layouts.layout_tables(result_files.read_result(RESULTS / f"{name}.json"))
     if not found:
         raise ValueError(f"{RESULTS / name}.json: found an experiment without tables of its own, expected a known one")
-    return text.markdown(found).rstrip()
+    return text.tables_to_markdown(found).rstrip()
 
 
 def maker(name: str) -> Callable[[], str]:

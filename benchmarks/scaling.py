@@ -21,7 +21,7 @@ import pnp
 import torch
 from torch.nn.functional import interpolate
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.experiments.memory import peak_mib
 from dhtorch.geometry import camera as cam
 from dhtorch.metrics import holdout
@@ -53,7 +53,7 @@ def resized(frame: Frame, hw: tuple[int, int]) -> Frame:
 
 def repeated(frame: Frame, batch: int) -> Frame:
     """``batch`` copies of a frame."""
-    return tree.collate([frame] * batch)
+    return pytree.collate([frame] * batch)
 
 
 def series(full: bool) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
@@ -73,7 +73,7 @@ def series(full: bool) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
     shown = [(hw, partial(METHODS["paper"], resized(anchor, hw), resized(other, hw), n=512)) for hw in sizes]
     found["paper.pixels"] = [(hw[0] * hw[1], call) for hw, call in shown]
     counts = [1 << k for k in doublings]
-    windows = [partial(PAPER.replace(views=v), anchor, tree.stack(views(v)[1:]), n=512) for v in counts]
+    windows = [partial(PAPER.replace(views=v), anchor, pytree.stack(views(v)[1:]), n=512) for v in counts]
     found["window.views"] = [*zip(counts, windows, strict=True)]
     return found
 
@@ -84,7 +84,7 @@ def small_calls() -> None:
     anchor, other = frame, frame.replace(image=frame.image.roll(2, -1))
     for method in METHODS.values():
         method(anchor, other, n=64)
-    PAPER(anchor, tree.stack([other]), n=64)
+    PAPER(anchor, pytree.stack([other]), n=64)
 
 
 def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 
 from reproduce import AGAIN
 
-from dhtorch.experiments.report import Table, text
+from dhtorch.experiments.report import ReportTable, text
 
 RESULTS = Path(__file__).resolve().parent / "results"
 
@@ -121,7 +121,7 @@ def bars() -> str:
         rows.append([*cells, ratio(r["ratio"]), f"≤ {bar:g}", verdict, errors(r), maker, *others])
     head = ["", "ours, ms", "peer, ms", "ratio", "bar", "", "errors, ours / peer", "on, code of"]
     head += [{"avx2": "ratio held to AVX2", "kept": "memory kept"}[how] for how in AGAIN]
-    return text.grid(Table("", head, rows))
+    return text.table_to_markdown(ReportTable("", head, rows))
 
 
 def stages() -> str:
@@ -136,7 +136,7 @@ def stages() -> str:
                 cells += [f"{r['ours_ms']:.1f}", f"{r['ratio']:.2f}"]
             shown.append([*cells, f"{r['peer_ms']:.1f}"])
     head = ["one thread", "`paper`, ms", "ratio", "`map`, ms", "ratio", "`opencv`, ms"]
-    return on("pair", text.grid(Table("", head, shown)))
+    return on("pair", text.table_to_markdown(ReportTable("", head, shown)))
 
 
 def every_row(file: str) -> str:
@@ -147,7 +147,7 @@ def every_row(file: str) -> str:
         cells = [f"`{r['name']}`", mode, str(r["threads"]), f"{r['ours_ms']:.2f}", f"{r['ours_iqr']:.2f}"]
         rows.append([*cells, r["peer"], f"{r['peer_ms']:.2f}", ratio(r["ratio"]), errors(r)])
     head = ["row", "mode", "threads", "ours, ms", "iqr", "peer", "peer, ms", "ratio", "errors, ours / peer"]
-    return on(file, text.grid(Table("", head, rows, n_label=2)))
+    return on(file, text.table_to_markdown(ReportTable("", head, rows, n_label=2)))
 
 
 def scaling() -> str:
@@ -160,7 +160,7 @@ def scaling() -> str:
             cells = [str(r["n"]), f"{r['ours_ms']:.1f}", "–" if r["peak_mib"] is None else f"{r['peak_mib']:.0f}"]
             rows.append([f"`{name}`", *grows, *cells])
     head = ["what doubles", "time ^", "memory ^", "largest size", "ms there", "MiB above the inputs there"]
-    return on("scaling", text.grid(Table("", head, rows)))
+    return on("scaling", text.table_to_markdown(ReportTable("", head, rows)))
 
 
 def memory() -> str:
@@ -170,7 +170,7 @@ def memory() -> str:
         for r in timings("memory")
     ]
     head = ["frames", "peak, MiB", "after", "then, MiB more", "bar"]
-    return on("memory", text.grid(Table("", head, rows)))
+    return on("memory", text.table_to_markdown(ReportTable("", head, rows)))
 
 
 #: Tables by marker.

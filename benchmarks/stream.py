@@ -20,7 +20,7 @@ import harness
 import torch
 
 from dhtorch import data, extend
-from dhtorch.data.pairs import around, between
+from dhtorch.data.pairs import candidate_frames, spaced_frames
 from dhtorch.data.recording import Recording
 from dhtorch.experiments.baselines import opencv
 from dhtorch.metrics.holdout import range_split
@@ -33,9 +33,9 @@ from dhtorch.synthetic.recording import SyntheticRoom
 
 PEER = partial(
     extend,
-    track=opencv.lucas_kanade,
-    pose=opencv.pnp_ransac,
-    triangulate=partial(triangulate.two_view, solver=opencv.triangulate),
+    track=opencv.opencv_lucas_kanade,
+    pose=opencv.opencv_pnp_ransac,
+    triangulate=partial(triangulate.two_view, solver=opencv.opencv_triangulate),
 )
 
 
@@ -58,8 +58,8 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
             seen[k] = range_split(recording[k], near)
         return seen[k]
 
-    offered = stack([view(k) for k in around(recording, i)])
-    five = stack([view(k) for k in between(i, i + gap, WINDOW.views)])
+    offered = stack([view(k) for k in candidate_frames(recording, i)])
+    five = stack([view(k) for k in spaced_frames(i, i + gap, WINDOW.views)])
 
     def auto() -> None:
         with torch.no_grad():

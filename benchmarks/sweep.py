@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
 #: The command, as README has it.
@@ -25,7 +25,7 @@ COLUMNS = ("coverage", "median_rel", "p90_rel", "coverage_at_5")
 
 def row(folder: Path) -> dict[str, Any]:
     """The numbers of one job."""
-    result = archive.read(folder)
+    result = result_files.read_result(folder)
     (found,) = (r for r in result["rows"] if r["pair"] is None and r["truth"] == "full")
     told = {"method": found["method"], "method.n": result["config"]["method"]["n"]}
     made = {"overrides": told, **{key: found[key] for key in COLUMNS}, "ms": sum(found["ms"].values())}
@@ -43,7 +43,7 @@ def main() -> int:
         if done.returncode == 0:
             rows = [row(path.parent) for path in sorted(Path(folder).rglob("result.json"))]
             rows.sort(key=lambda r: [COMMAND.index(str(v)) for v in r["overrides"].values()])
-            options.json.write_text(storage.dumps(rows, indent=1) + "\n")
+            options.json.write_text(storage.dump_strict_json(rows, indent=1) + "\n")
     return done.returncode
 
 

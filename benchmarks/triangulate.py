@@ -44,11 +44,13 @@ def scene(n: int) -> tuple[Tensor, Tensor, Camera, Pose, Tensor]:
 def measure(n: int, options: Any, compile_too: bool) -> list[dict[str, Any]]:
     """Rows of one number of points."""
     uv_0, uv_1, camera, T, truth = scene(n)
-    calls: dict[str, Callable[[], Tensor]] = {"eager": partial(epipolar.depths, uv_0, uv_1, camera, camera, T)}
+    calls: dict[str, Callable[[], Tensor]] = {
+        "eager": partial(epipolar.triangulate_depth, uv_0, uv_1, camera, camera, T)
+    }
     seconds = 0.0
     if compile_too:
         torch.compiler.reset()
-        calls["compiled"] = partial(torch.compile(epipolar.depths), uv_0, uv_1, camera, camera, T)
+        calls["compiled"] = partial(torch.compile(epipolar.triangulate_depth), uv_0, uv_1, camera, camera, T)
         start = time.perf_counter()
         calls["compiled"]()
         seconds = time.perf_counter() - start

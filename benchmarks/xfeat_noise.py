@@ -1,4 +1,5 @@
-"""How wrong XFeat's matches are: the constants of ``dhtorch.experiments.baselines.xfeat.noise``, fitted and tested.
+"""How wrong XFeat's matches are: the constants of ``dhtorch.experiments.baselines.xfeat.match_covariance``, fitted and
+tested.
 
 python benchmarks/xfeat_noise.py [--json FILE]      a few minutes; needs the extra ``matchers``
 
@@ -23,7 +24,7 @@ from torch import Tensor
 from dhtorch.experiments.baselines import xfeat
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.geometry.patches import nearest
+from dhtorch.geometry.patches import sample_nearest
 from dhtorch.synthetic import SyntheticRoom
 
 #: Rooms that the constants are fitted in, and rooms that they are tested in.
@@ -48,13 +49,13 @@ EXPECTED = {"within_sigma": 1 - math.exp(-0.5), "within_2sigma": 1 - math.exp(-2
 def truth(room: SyntheticRoom, i: int, j: int, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Where whole pixels (1, N, 2) of frame i lie in frame j, px, and which are seen there and no mirror or pane."""
     there = room.truth(i)
-    depth, _ = nearest(there["depth"], uv)
-    surface, _ = nearest(there["surface"].float(), uv)
+    depth, _ = sample_nearest(there["depth"], uv)
+    surface, _ = sample_nearest(there["surface"].float(), uv)
     T = se3.compose(se3.invert(room.true_poses[j : j + 1]), room.true_poses[i : i + 1])
     camera = room.camera.to(torch.float64)
     xyz = se3.apply(T, cam.unproject(camera, uv.double(), depth.double()))
     uv_1 = cam.project(camera, xyz).float()
-    seen, inside = nearest(room.truth(j)["depth"], uv_1)
+    seen, inside = sample_nearest(room.truth(j)["depth"], uv_1)
     ordinary = surface == 0
     return uv_1, inside & ordinary & ((seen / xyz[..., 2] - 1).abs() < HIDDEN)
 
@@ -62,7 +63,7 @@ def truth(room: SyntheticRoom, i: int, j: int, uv: Tensor) -> tuple[Tensor, Tens
 def matches(seeds: tuple[int, ...]) -> dict[str, Tensor]:
     """Errors in cells, similarities and spreads of the valid matches in the rooms of these seeds."""
     draw = torch.Generator().manual_seed(0)
-    net = xfeat.packaged()
+    net = xfeat.load_xfeat()
     found: dict[str, list[Tensor]] = {"error": [], "similarity": [], "spread": []}
     for seed in seeds:
         for path in PATHS:
@@ -71,8 +72,8 @@ def matches(seeds: tuple[int, ...]) -> dict[str, Tensor]:
                 high = torch.tensor([room.hw[1], room.hw[0]]) - 2 * MARGIN
                 uv = (torch.rand(1, SAMPLES, 2, generator=draw) * high).floor() + MARGIN
                 tracks = xfeat.match(room[0].image, room[gap].image, uv, sharpness=SHARPNESS, **LOOK)
-                a, b = (xfeat.features(net, room[k].image, **LOOK)[0] for k in (0, gap))
-                match = xfeat.search(a, b, uv[0], SHARPNESS)
+                a, b = (xfeat.extract_xfeat(net, room[k].image, **LOOK)[0] for k in (0, gap))
+                match = xfeat.search_matches(a, b, uv[0], SHARPNESS)
                 there, known = truth(room, 0, gap, uv)
                 use = (known & tracks.valid)[0]
                 found["error"].append(((tracks.uv_1 - there)[0] * torch.tensor(b.gain))[use])
@@ -83,7 +84,7 @@ def matches(seeds: tuple[int, ...]) -> dict[str, Tensor]:
 
 def squares(found: dict[str, Tensor], gain: float, unlike: float) -> Tensor:
     """Squared errors (M,) in units of what :func:`xfeat.noise` states."""
-    cov = xfeat.noise(found["similarity"], found["spread"], gain=gain, unlike=unlike)
+    cov = xfeat.match_covariance(found["similarity"], found["spread"], gain=gain, unlike=unlike)
     return (found["error"] * torch.linalg.solve(cov, found["error"])).sum(-1)
 
 

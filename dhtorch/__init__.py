@@ -12,7 +12,7 @@ import importlib.util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from dhtorch.alignment.align import anchor
+    from dhtorch.alignment.align import align_depth
     from dhtorch.pipeline.method import Method
     from dhtorch.pipeline.pair import merge
     from dhtorch.pipeline.presets import AUTO, MAP, PAPER, WINDOW, extend
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from dhtorch.pytree import collate
     from dhtorch.records import (
         Camera,
+        DepthValidation,
         Estimate,
         Frame,
-        Map,
+        MergedDepth,
         Pose,
         PoseFit,
         Samples,
         TrackHint,
         Tracks,
-        Verdict,
     )
-    from dhtorch.transforms import ExtendDepth, JudgeDepth
-    from dhtorch.validation.validate import judge
+    from dhtorch.transforms import ExtendDepth, ValidateDepth
+    from dhtorch.validation.validate import validate_depth
 
 __version__ = "0.1.0"
 
@@ -41,11 +41,11 @@ __all__ = [
     "PAPER",
     "WINDOW",
     "Camera",
+    "DepthValidation",
     "Estimate",
     "ExtendDepth",
     "Frame",
-    "JudgeDepth",
-    "Map",
+    "MergedDepth",
     "Method",
     "Pose",
     "PoseFit",
@@ -53,12 +53,12 @@ __all__ = [
     "Stream",
     "TrackHint",
     "Tracks",
-    "Verdict",
-    "anchor",
+    "ValidateDepth",
+    "align_depth",
     "collate",
     "extend",
-    "judge",
     "merge",
+    "validate_depth",
 ]
 
 #: Where a public name lives, if not among the records.

@@ -85,7 +85,7 @@ def collate(records: Iterable[R]) -> R:
     return _join(list(records), torch.cat)
 
 
-def in_pieces(fn: Callable[..., R], size: int, *batch: Any) -> R:
+def chunked_apply(fn: Callable[..., R], size: int, *batch: Any) -> R:
     """``fn(*batch)`` for tensors and records of any batch, at most ``size`` of its items at a time; no ``None``.
 
     ``fn`` must treat every item alike. Gradient: that of ``fn``.

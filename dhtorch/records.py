@@ -15,26 +15,26 @@ from torch import Tensor
 from dhtorch.codes import Gate, PoseCode, State
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.checks import all_finite
-from dhtorch.geometry.coarse_flow import Flow
-from dhtorch.geometry.pyramid import Pyramids
+from dhtorch.geometry.coarse_flow import CoarseFlow
+from dhtorch.geometry.pyramid import PyramidCache
 from dhtorch.geometry.se3 import Pose
 from dhtorch.pytree import KEEP_DTYPE, Record, record
 
 __all__ = [
     "Camera",
-    "Choice",
+    "DepthValidation",
     "Estimate",
     "Frame",
-    "GivenPose",
-    "Map",
+    "InitialPose",
+    "MergedDepth",
     "Pose",
     "PoseFit",
+    "PosePrior",
     "Samples",
     "Shutter",
-    "StartPose",
     "TrackHint",
     "Tracks",
-    "Verdict",
+    "ViewSelection",
 ]
 
 
@@ -93,9 +93,9 @@ class TrackHint:
     """What the caller of a tracker knows beforehand. Every tracker takes one and may ignore it."""
 
     start: Tensor | None = None  # (B, N, 2) px, where to look first in image 1; None or not finite = at ``uv_0``
-    pyramid: Pyramids | None = None  # of image 0, shared by all who search in it
+    pyramid: PyramidCache | None = None  # of image 0, shared by all who search in it
     levels: int | None = None  # pyramid levels that the motion in this scene asks for; None = the tracker's own
-    flows: tuple[Flow, Flow] | None = None  # coarse motion of the whole picture, to image 1 and back
+    flows: tuple[CoarseFlow, CoarseFlow] | None = None  # coarse motion of the whole picture, to image 1 and back
 
     def replace(self, **changes: Any) -> TrackHint:
         """A copy with some fields replaced."""
@@ -143,10 +143,11 @@ class PoseFit(Record):
 
 
 @record
-class GivenPose(Record):
+class PosePrior(Record):
     """A relative pose from elsewhere (kinematics, SLAM, a device's own tracker, a calibration), for ``fit=``.
 
-    Near returns are held against it (:func:`dhtorch.stages.pose_prior.hold`): a pose that they contradict is not used.
+    Near returns are held against it (:func:`dhtorch.stages.pose_prior.check_pose_prior`): a pose that they contradict
+    is not used.
     """
 
     T_1_from_0: Pose  # not finite = not known
@@ -155,12 +156,12 @@ class GivenPose(Record):
 
 
 @record
-class StartPose(GivenPose):
+class InitialPose(PosePrior):
     """A relative pose from elsewhere that only starts the search for the most probable one."""
 
 
 @record
-class Choice(Record):
+class ViewSelection(Record):
     """Which of V offered views are asked, and why these."""
 
     index: Tensor  # (views, B) int64, rising
@@ -222,7 +223,7 @@ class DepthMap(Record):
 
 
 @record
-class Map(Record):
+class MergedDepth(Record):
     """Sensor and recovered depth side by side: what a user of the pipeline wants."""
 
     uv: Tensor  # (B, N, 2) px
@@ -233,7 +234,7 @@ class Map(Record):
 
 
 @record
-class Verdict(Record):
+class DepthValidation(Record):
     """Whether a depth map is right: of every pixel, and of the frame as (value, low, high) with 95 % between.
 
     Evidence is in sigmas, positive where the map is too far, NaN where a kind of evidence says nothing.

@@ -320,18 +320,18 @@ def exit_codes() -> str:
 def colours() -> str:
     """The project's colours, each with a patch of itself."""
     tables = {
-        "Where a depth comes from": {words(names(Source)[k]): c for k, c in palette.SOURCES.items()},
-        "Methods": palette.METHODS,
-        "Series that are no method, in turn": {str(k + 1): c for k, c in enumerate(palette.OTHERS)},
-        "Gates: why an answer is withheld": {words(names(Gate)[k]): c for k, c in palette.GATES.items()},
-        "Holes: why there is no return": {words(names(Hole)[k]): c for k, c in palette.HOLES.items()},
+        "Where a depth comes from": {words(names(Source)[k]): c for k, c in palette.SOURCE_COLOURS.items()},
+        "Methods": palette.METHOD_COLOURS,
+        "Series that are no method, in turn": {str(k + 1): c for k, c in enumerate(palette.SERIES_COLOURS)},
+        "Gates: why an answer is withheld": {words(names(Gate)[k]): c for k, c in palette.GATE_COLOURS.items()},
+        "Holes: why there is no return": {words(names(Hole)[k]): c for k, c in palette.HOLE_COLOURS.items()},
     }
     parts = [_patches(title, table) for title, table in tables.items()]
-    maps = {"depth": palette.DEPTH, "1/depth": palette.INVERSE_DEPTH, "score": palette.SCORE}
-    maps |= {"error": palette.ERROR, "signed difference": palette.SIGNED, "picture": palette.GREY}
-    rows = [f"| {name} | `{kind}` | {_ramp(palette.ramp(kind, 33))} |" for name, kind in maps.items()]
+    maps = {"depth": palette.DEPTH_CMAP, "1/depth": palette.INVERSE_DEPTH_CMAP, "score": palette.SCORE_CMAP}
+    maps |= {"error": palette.ERROR_CMAP, "signed difference": palette.SIGNED_CMAP, "picture": palette.GREY_CMAP}
+    rows = [f"| {name} | `{kind}` | {_ramp(palette.sample_cmap(kind, 33))} |" for name, kind in maps.items()]
     parts.append("\n".join(["## Colour maps, from small to large", "", "| | | |", "| :-- | :-- | :-- |", *rows]))
-    pages = [f"| `{name}` | {_patch(day)} | {_patch(dark)} |" for name, (day, dark) in palette.PAGE.items()]
+    pages = [f"| `{name}` | {_patch(day)} | {_patch(dark)} |" for name, (day, dark) in palette.PAGE_COLOURS.items()]
     head = ["## Variables of a page", "", "| | by day | in the dark |", "| :-- | :-- | :-- |"]
     return "\n\n".join([*parts, "\n".join([*head, *pages])])
 

@@ -32,14 +32,14 @@ from dhtorch import calibration, data
 from dhtorch.codes import Source
 from dhtorch.data.pairs import by_choice
 from dhtorch.data.scene import Scene
-from dhtorch.experiments.exhibits import look
+from dhtorch.experiments.exhibits import make_exhibit
 from dhtorch.experiments.protocol import Settings
-from dhtorch.integrate.sweeps import Sweep
+from dhtorch.integrate.sweeps import DenseSweep
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.pytree import stack
-from dhtorch.viz.plots import Axis, Key, Panel, Stroke, colours, save
+from dhtorch.viz.plots import Axis, LegendKey, Panel, Stroke, colours, save_figure
 from dhtorch.viz.viewer import html
 
 REPO = Path(__file__).resolve().parents[1]
@@ -74,7 +74,7 @@ def triptych(path: Path) -> None:
     whole = recording[FRAME]
     near = range_split(whole, CUTOFF)
     others = stack([range_split(recording[k], CUTOFF) for k in pair.offered])
-    found = dense.complete(near, others, calibration=calibration.load("dense"))
+    found = dense.complete_depth(near, others, calibration=calibration.load_calibration("dense"))
     image = whole.image[0].permute(1, 2, 0)
     depth, source = found.depth[0].numpy(), found.source[0].numpy()
     sensed, known = source == Source.SENSOR, source != Source.NONE
@@ -82,7 +82,7 @@ def triptych(path: Path) -> None:
     axes = figure.subplots(1, 3)
     axes[0].imshow(image)
     for axis, mask in zip(axes[1:], (sensed, known), strict=True):
-        shown = axis.imshow(np.where(mask, depth, np.nan), cmap=colours.DEPTH, vmin=DEPTHS[0], vmax=DEPTHS[1])
+        shown = axis.imshow(np.where(mask, depth, np.nan), cmap=colours.DEPTH_CMAP, vmin=DEPTHS[0], vmax=DEPTHS[1])
     titles = (
         f"holo_a, frame {int(recording.number[FRAME])}",
         f"a sensor that reaches {CUTOFF:g} m: {100 * sensed.mean():.0f} %",
@@ -116,11 +116,11 @@ def risk(path: Path) -> None:
         curves = [c for c in curves if c["coverage"]]
         parts = [_at(c, share) for c in curves]
         coverage, error = (np.mean([p[k] for p in parts], 0).tolist() for k in (0, 1))
-        stroke = Stroke(colours.METHODS[name], 2.2)
+        stroke = Stroke(colours.METHOD_COLOURS[name], 2.2)
         panel.line(coverage, error, stroke)
         panel.dot(coverage[-1], error[-1], stroke, width=7)
-        keys.append(Key(name, stroke.colour, stroke=stroke))
-    save(panel.figure(keys=keys), path)
+        keys.append(LegendKey(name, stroke.colour, stroke=stroke))
+    save_figure(panel.figure(keys=keys), path)
 
 
 def _at(curve: dict[str, Any], share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -140,7 +140,7 @@ def viewer(path: Path, frames: int = 40, height: int = 450) -> None:
     if browser is None:
         raise SystemExit(f"found none of {', '.join(CHROMIUM)}: the page is drawn by a browser")
     common = Settings(cutoff=CUTOFF)
-    shown = look(kitchen(), AUTO, by_choice, common, most=1, sweep=Sweep.asked(True))
+    shown = make_exhibit(kitchen(), AUTO, by_choice, common, most=1, sweep=DenseSweep.asked(True))
     script = f"""
       const made = [];
       setTimeout(() => {{
@@ -158,7 +158,9 @@ def viewer(path: Path, frames: int = 40, height: int = 450) -> None:
     """
     with tempfile.TemporaryDirectory() as folder:
         page = Path(folder) / "page.html"
-        page.write_text(html.page(shown).replace("</script>\n</body>", f"{script}</script>\n</body>"), encoding="utf-8")
+        page.write_text(
+            html.build_viewer_page(shown).replace("</script>\n</body>", f"{script}</script>\n</body>"), encoding="utf-8"
+        )
         options = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         options += [f"--window-size=1180,{height + 330}", "--virtual-time-budget=60000", "--dump-dom"]
         done = subprocess.run([browser, *options, page.as_uri()], capture_output=True, text=True, check=True)

@@ -10,33 +10,30 @@ import torch
 from support.contract_rows import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
 from dhtorch.alignment import (
-    align as metric,
+    align,
+    error_model,
+    references,
+    residual_noise,
 )
-from dhtorch.alignment import (
-    error_model as distortion,
-)
-from dhtorch.alignment import (
-    references as anchors,
-)
-from dhtorch.alignment import (
-    residual_noise as scatter,
-)
-from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.experiments.focal import blur, filling, sharpness
 from dhtorch.experiments.negative import arms, clusters, registration
 from dhtorch.experiments.probes import ridge as probe
 from dhtorch.geometry import (
-    affine_alignment as affine,
-)
-from dhtorch.geometry import (
+    affine_alignment,
     camera,
     covariance,
+    determinism,
     epipolar,
     filters,
     least_squares,
+    map_estimate,
     p3p,
+    patches,
+    plane_sweep,
     pyramid,
     ransac,
+    reprojection_problem,
     se3,
     sparse_grid,
     thin_lens,
@@ -45,19 +42,7 @@ from dhtorch.geometry import (
     coarse_flow as start,
 )
 from dhtorch.geometry import (
-    determinism as exact,
-)
-from dhtorch.geometry import (
     linalg as small,
-)
-from dhtorch.geometry import (
-    map_estimate as most_probable,
-)
-from dhtorch.geometry import (
-    patches as lookup,
-)
-from dhtorch.geometry import (
-    plane_sweep as sweep,
 )
 from dhtorch.geometry import (
     pose_averaging as rigid,
@@ -66,34 +51,22 @@ from dhtorch.geometry import (
     pose_conventions as conventions,
 )
 from dhtorch.geometry import (
-    reprojection_problem as near_far,
-)
-from dhtorch.geometry import (
     windows as neighbours,
 )
 from dhtorch.metrics import holdout
 from dhtorch.pipeline import (
     dense,
     method,
+    multiview,
     pair,
-)
-from dhtorch.pipeline import (
-    multiview as window,
-)
-from dhtorch.pipeline import (
-    surface as stereo,
-)
-from dhtorch.pipeline import (
-    view_selection as views,
+    surface,
+    view_selection,
 )
 from dhtorch.pipeline.presets import MAP, PAPER, WINDOW
 from dhtorch.records import Camera, Frame, Samples, Tracks
-from dhtorch.stages import backproject, holes, pose, score, track, triangulate
-from dhtorch.stages import pose_prior as given
+from dhtorch.stages import backproject, holes, pose, pose_prior, score, track, triangulate
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.validation import evidence
-from dhtorch.validation import faults as causes
-from dhtorch.validation import validate as verdict
+from dhtorch.validation import evidence, faults, validate
 
 HW = (48, 64)
 FEW = 11  # points; no other axis of any answer is as long
@@ -156,13 +129,13 @@ def tracked(batch, n, dtype, noise=0.2):
     eye = torch.eye(2, dtype=dtype).expand(batch, n, 2, 2) * 0.04
     tracks = Tracks(uv_0, uv_1, zero, zero, eye.clone(), zero == 0)
     cov = (1e-6 * torch.eye(6, dtype=dtype)).expand(batch, 6, 6).clone()
-    return samples, tracks, given_pose(T, n).replace(cov=cov), camera_0, camera_1
+    return samples, tracks, known_pose_fit(T, n).replace(cov=cov), camera_0, camera_1
 
 
 def held(batch, n, dtype):
     """A given pose and what it is held against."""
     samples, tracks, fit, camera_0, camera_1 = tracked(batch, n, dtype)
-    return given.stated(poses(batch, dtype), sigma=(0.01, 0.01)), samples, tracks, camera_0, camera_1, fit
+    return pose_prior.make_prior(poses(batch, dtype), sigma=(0.01, 0.01)), samples, tracks, camera_0, camera_1, fit
 
 
 def estimated(batch, n, dtype):
@@ -174,9 +147,9 @@ def swept(batch, n, dtype):
     """View 0, view 1 and an inverse depth for every pixel of the former."""
     v, u = (uniform(batch, 1, 48, 64, dtype=dtype, seed=k) for k in (6, 7))
     T = se3.Pose(poses(batch, dtype, seed=2).R, uniform(batch, 3, dtype=dtype, low=-0.1, high=0.1, seed=3))
-    view = sweep.View(filters.gaussian(v, 2.0), cameras(batch, dtype, True, seed=5), T)
+    view = plane_sweep.SweptView(filters.gaussian_blur(v, 2.0), cameras(batch, dtype, True, seed=5), T)
     q = uniform(batch, 48, 64, dtype=dtype, low=0.2, high=0.5)
-    return sweep.base(filters.gaussian(u, 2.0), cameras(batch, dtype, True)), view, q
+    return plane_sweep.make_reference_view(filters.gaussian_blur(u, 2.0), cameras(batch, dtype, True)), view, q
 
 
 def volumes(batch, n, dtype):
@@ -191,7 +164,7 @@ def probed(batch, n, dtype):
 
 def solved(batch, n, dtype):
     x, y = probed(batch, n, dtype)
-    return probe.ridge(probe.moments(x, y), torch.tensor([0.1, 1.0])), x
+    return probe.solve_ridge(probe.compute_moments(x, y), torch.tensor([0.1, 1.0])), x
 
 
 def two_views(batch, n, dtype):
@@ -234,7 +207,7 @@ def nearby(batch, n, dtype):
 
 def judged(batch, n, dtype):
     frame, samples = sampled(batch, n, dtype)
-    return samples, holdout.truth_at(frame, samples.uv), 1.0
+    return samples, holdout.sample_truth(frame, samples.uv), 1.0
 
 
 def planes(batch, n, dtype):
@@ -251,12 +224,12 @@ def positive(batch, n, dtype):
 
 def problems(batch, n, dtype):
     """Near and far tracks of a few pairs as planes, the unknowns near their optimum, and a noise."""
-    n = n + -n % exact.PRODUCT_LANES
+    n = n + -n % determinism.PRODUCT_LANES
     samples, tracks, fit, camera_0, camera_1 = tracked(batch, n, dtype)
     near = torch.arange(n) % 3 > 0
     planes = lambda v: v.transpose(1, 2) if v.ndim == 3 else v  # noqa: E731
     flat = tracks.cov[..., 0, 0]
-    problem = near_far.Problem(
+    problem = reprojection_problem.PoseDepthProblem(
         f=camera_1.f,
         c=camera_1.c,
         ray=planes(camera.rays(camera_0, tracks.uv_0)),
@@ -268,12 +241,16 @@ def problems(batch, n, dtype):
         far=~near.expand(batch, n),
     )
     turn = uniform(batch, 3, dtype=dtype, low=-0.01, high=0.01, seed=9)
-    return problem, near_far.Unknowns(fit.T_1_from_0, turn), uniform(*problem.near.shape, dtype=dtype, low=0.1)
+    return (
+        problem,
+        reprojection_problem.Unknowns(fit.T_1_from_0, turn),
+        uniform(*problem.near.shape, dtype=dtype, low=0.1),
+    )
 
 
 def linear(batch, n, dtype):
     problem, at, noise = problems(batch, n, dtype)
-    return problem, near_far.linearise_tracks(problem, at), noise
+    return problem, reprojection_problem.linearise_tracks(problem, at), noise
 
 
 def weighed(batch, n, dtype):
@@ -284,7 +261,7 @@ def weighed(batch, n, dtype):
 
 def nine(batch, n, dtype):
     A = uniform(batch, 9, 12, dtype=dtype)
-    at = near_far.Unknowns(poses(batch, dtype), uniform(batch, 3, dtype=dtype))
+    at = reprojection_problem.Unknowns(poses(batch, dtype), uniform(batch, 3, dtype=dtype))
     return at, A @ A.mT + 0.1 * torch.eye(9, dtype=dtype), uniform(batch, 9, dtype=dtype)
 
 
@@ -334,12 +311,12 @@ def lenses(batch, dtype):
 def stacks(batch, n, dtype):
     """A picture and ever softer copies of it."""
     image = shifted(batch, n, dtype)[0]
-    return torch.stack([filters.gaussian(image, s) for s in (1.0, 0.0, 1.5, 2.5)], 1)
+    return torch.stack([filters.gaussian_blur(image, s) for s in (1.0, 0.0, 1.5, 2.5)], 1)
 
 
 def blurs(batch, n, dtype):
     image = uniform(batch, 1, *HW, dtype=torch.float64, seed=7).round().to(dtype)
-    return blur.local_blur(filters.gaussian(torch.nn.functional.avg_pool2d(image, 5, 1, 2), 1.0))
+    return blur.estimate_blur(filters.gaussian_blur(torch.nn.functional.avg_pool2d(image, 5, 1, 2), 1.0))
 
 
 def sensed(batch, n, dtype):
@@ -350,7 +327,7 @@ def sensed(batch, n, dtype):
 
 def filled(batch, n, dtype):
     coarse, _ = sensed(batch, n, dtype)
-    return filling.bilinear(coarse, HW), coarse, blurs(batch, n, dtype)
+    return filling.fill_bilinear(coarse, HW), coarse, blurs(batch, n, dtype)
 
 
 def entries(batch, n, dtype):
@@ -392,157 +369,157 @@ ROWS = [
     Row(se3.relative, lambda b, n, d: (poses(b, d), poses(b, d, seed=1)), POINTLESS, grad=(0, 1)),
     Row(se3.hat, lambda b, n, d: (uniform(b, n, 3, dtype=d),), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
     Row(se3.exp, lambda b, n, d: (uniform(b, 6, dtype=d, low=-1),), POINTLESS + " raises", grad=(0,), bad=wrong_last_axis(0)),
-    Row(rigid.rigid_mean, lambda b, n, d: (se3.Pose(*(x.unflatten(0, (b, 5)) for x in (poses(5 * b, d).R, poses(5 * b, d).t))), positive(5 * b, n, d).unflatten(0, (b, 5)), torch.ones(b, 5, dtype=torch.bool)), "dtype batch vmap capture raises", bad=wrong_last_axis(1), atol=1e-4),
+    Row(rigid.average_poses, lambda b, n, d: (se3.Pose(*(x.unflatten(0, (b, 5)) for x in (poses(5 * b, d).R, poses(5 * b, d).t))), positive(5 * b, n, d).unflatten(0, (b, 5)), torch.ones(b, 5, dtype=torch.bool)), "dtype batch vmap capture raises", bad=wrong_last_axis(1), atol=1e-4),
     Row(se3.log, lambda b, n, d: (poses(b, d),), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0].replace(t=a[0].t[:, :2]),)),
     Row(se3.adjoint, lambda b, n, d: (poses(b, d),), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0].replace(t=a[0].t[:, :2]),)),
     Row(se3.orthonormal, lambda b, n, d: (poses(b, d).R,), POINTLESS, grad=(0,)),
-    Row(conventions.readings, lambda b, n, d: (poses(b, d), poses(b, d, seed=1)), POINTLESS + " raises", grad=(0, 1), bad=lambda a: (a[0], a[1].replace(t=a[1].t[:, :2]))),
-    Row(conventions.in_axes, lambda b, n, d: (poses(b, d), conventions.STATED["gl"]), POINTLESS, grad=(0,)),
-    Row(conventions.camera_axes, lambda b, n, d: (poses(b, d), conventions.STATED["gl"]), POINTLESS, grad=(0,)),
+    Row(conventions.pose_hypotheses, lambda b, n, d: (poses(b, d), poses(b, d, seed=1)), POINTLESS + " raises", grad=(0, 1), bad=lambda a: (a[0], a[1].replace(t=a[1].t[:, :2]))),
+    Row(conventions.motion_from_axes, lambda b, n, d: (poses(b, d), conventions.STATED_AXES["gl"]), POINTLESS, grad=(0,)),
+    Row(conventions.pose_from_axes, lambda b, n, d: (poses(b, d), conventions.STATED_AXES["gl"]), POINTLESS, grad=(0,)),
     Row(conventions.relative_covariance, lambda b, n, d: (poses(b, d), positive(b, n, d), positive(b, n, d)), POINTLESS + " raises", grad=(0, 1, 2), bad=wrong_last_axis(1)),
     Row(se3.retract, lambda b, n, d: (poses(b, d), uniform(b, 6, dtype=d, low=-1)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
     Row(se3.rotation_angle, lambda b, n, d: (poses(b, d).R,), POINTLESS, grad=(0,)),
-    Row(lookup.in_a_row, lambda b, n, d: (frames(b, n, d)[0].image,), "dtype capture gradcheck", grad=(0,)),
-    Row(lookup.patches, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d).long(), 5), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1,), (0,), bad=wrong_last_axis(1)),
-    Row(lookup.windows, lambda b, n, d: (frames(b, n, d)[0].depth, torch.arange(b)[:, None] * HW[0] * HW[1] + torch.arange(n) % 900, 5), "dtype capture gradcheck empty", grad=(0,)),
-    Row(lookup.summarise, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d).int(), 5, mean_and_corner), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1,), (0,), bad=wrong_last_axis(1)),
-    Row(lookup.nearest_index, lambda b, n, d: (HW, pixels(b, n, d).int()), "batch vmap capture empty shuffle padding", (1,)),
-    Row(lookup.luma, lambda b, n, d: (frames(b, n, d)[0].image, 1), POINTLESS, grad=(0,)),
-    Row(lookup.nearest, lambda b, n, d: (frames(b, n, d)[0].depth, pixels(b, n, d)), "dtype batch vmap capture gradcheck empty shuffle padding nan raises", (1,), (0,), bad=wrong_last_axis(1)),
-    Row(lookup.magnified, lambda b, n, d: (frames(b, n, d)[0].depth, 1.3, 0.1), "dtype batch vmap capture gradcheck", (0,), (0,)),
-    Row(lookup.pixels, lambda b, n, d: (pixels(b, n, d),), "batch vmap capture empty shuffle padding nan", (0,)),
-    Row(lookup.fits, lambda b, n, d: (pixels(b, n, d).int(), HW, 5), "batch vmap capture empty shuffle padding", (0,)),
-    Row(lookup.read_whole, lambda b, n, d: (frames(b, n, d)[0].depth, pixels(b, n, d).int(), 5), "dtype batch vmap capture gradcheck empty shuffle padding", (1,), (0,)),
-    Row(lookup.round_half_up, lambda b, n, d: (pixels(b, n, d),), "dtype batch vmap capture empty shuffle padding nan", (0,)),
-    Row(sparse_grid.pack, lambda b, n, d: (places(b, n),), "batch vmap capture empty shuffle padding raises", (0,), bad=wrong_last_axis(0)),
-    Row(sparse_grid.unpack, lambda b, n, d: (sparse_grid.pack(places(b, n)),), "batch vmap capture empty shuffle padding", (0,)),
-    Row(sparse_grid.find, lambda b, n, d: (sparse_grid.pack(places(b, 40)).unique(), sparse_grid.pack(places(b, n))), "batch capture empty shuffle padding raises", (1,), shared=(0,), bad=lambda a: (a[0][None], a[1])),
-    Row(sparse_grid.near, lambda b, n, d: (sparse_grid.pack(places(1, n)[0]), sparse_grid.pack(places(b, 9)).unique()), "capture empty raises", bad=lambda a: (a[0][None], a[1])),
+    Row(patches.flatten_images, lambda b, n, d: (frames(b, n, d)[0].image,), "dtype capture gradcheck", grad=(0,)),
+    Row(patches.extract_patches, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d).long(), 5), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1,), (0,), bad=wrong_last_axis(1)),
+    Row(patches.extract_windows, lambda b, n, d: (frames(b, n, d)[0].depth, torch.arange(b)[:, None] * HW[0] * HW[1] + torch.arange(n) % 900, 5), "dtype capture gradcheck empty", grad=(0,)),
+    Row(patches.reduce_patches, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d).int(), 5, mean_and_corner), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1,), (0,), bad=wrong_last_axis(1)),
+    Row(patches.nearest_pixel_index, lambda b, n, d: (HW, pixels(b, n, d).int()), "batch vmap capture empty shuffle padding", (1,)),
+    Row(patches.luma, lambda b, n, d: (frames(b, n, d)[0].image, 1), POINTLESS, grad=(0,)),
+    Row(patches.sample_nearest, lambda b, n, d: (frames(b, n, d)[0].depth, pixels(b, n, d)), "dtype batch vmap capture gradcheck empty shuffle padding nan raises", (1,), (0,), bad=wrong_last_axis(1)),
+    Row(patches.rescale_field_of_view, lambda b, n, d: (frames(b, n, d)[0].depth, 1.3, 0.1), "dtype batch vmap capture gradcheck", (0,), (0,)),
+    Row(patches.containing_pixels, lambda b, n, d: (pixels(b, n, d),), "batch vmap capture empty shuffle padding nan", (0,)),
+    Row(patches.is_patch_inside, lambda b, n, d: (pixels(b, n, d).int(), HW, 5), "batch vmap capture empty shuffle padding", (0,)),
+    Row(patches.gather_reduced, lambda b, n, d: (frames(b, n, d)[0].depth, pixels(b, n, d).int(), 5), "dtype batch vmap capture gradcheck empty shuffle padding", (1,), (0,)),
+    Row(patches.round_half_up, lambda b, n, d: (pixels(b, n, d),), "dtype batch vmap capture empty shuffle padding nan", (0,)),
+    Row(sparse_grid.pack_cells, lambda b, n, d: (places(b, n),), "batch vmap capture empty shuffle padding raises", (0,), bad=wrong_last_axis(0)),
+    Row(sparse_grid.unpack_cells, lambda b, n, d: (sparse_grid.pack_cells(places(b, n)),), "batch vmap capture empty shuffle padding", (0,)),
+    Row(sparse_grid.find_cells, lambda b, n, d: (sparse_grid.pack_cells(places(b, 40)).unique(), sparse_grid.pack_cells(places(b, n))), "batch capture empty shuffle padding raises", (1,), shared=(0,), bad=lambda a: (a[0][None], a[1])),
+    Row(sparse_grid.touches_cells, lambda b, n, d: (sparse_grid.pack_cells(places(1, n)[0]), sparse_grid.pack_cells(places(b, 9)).unique()), "capture empty raises", bad=lambda a: (a[0][None], a[1])),
     Row(epipolar.triangulate, two_views, ALL, (0, 1), (0, 1, 2, 3, 4), bad=wrong_last_axis(0), leaks=True),
-    Row(epipolar.depths, two_views, ALL, (0, 1), (0, 1, 2, 3, 4), bad=wrong_last_axis(0), leaks=True),
-    Row(epipolar.describe, lambda b, n, d: (camera.unproject(two_views(b, n, d)[2], two_views(b, n, d)[0], uniform(b, n, dtype=d, low=1, high=2)), *two_views(b, n, d)), ALL, (0, 1, 2), (0, 1, 2, 3, 4, 5), bad=wrong_last_axis(0), leaks=True),
+    Row(epipolar.triangulate_depth, two_views, ALL, (0, 1), (0, 1, 2, 3, 4), bad=wrong_last_axis(0), leaks=True),
+    Row(epipolar.describe_triangulation, lambda b, n, d: (camera.unproject(two_views(b, n, d)[2], two_views(b, n, d)[0], uniform(b, n, dtype=d, low=1, high=2)), *two_views(b, n, d)), ALL, (0, 1, 2), (0, 1, 2, 3, 4, 5), bad=wrong_last_axis(0), leaks=True),
     Row(epipolar.point_jacobians, lambda b, n, d: (cameras(b, d), uniform(b, n, 3, dtype=d, low=1, high=2)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
     Row(epipolar.depth_variance, lambda b, n, d: (epipolar.triangulate(*two_views(b, n, d)), tracked(b, n, d)[1].cov, tracked(b, n, d)[2].cov), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0, 1), (0, 1, 2), leaks=True),
-    Row(exact.steady, lambda b, n, d: (torch.sin, uniform(b, n, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding nan", (1,), (1,)),
-    Row(small.determinant, entries, POINTWISE, (0, 1, 2, 3), (0, 1, 2, 3)),
-    Row(small.adjugate, entries, POINTWISE, (0, 1, 2, 3), (0, 1, 2, 3)),
-    Row(with_options(small.inverse, least=1e-9), entries, "dtype capture gradcheck", grad=(0, 1, 2, 3)),
-    Row(small.eigenvalues, lambda b, n, d: entries(b, n, d)[:3], POINTWISE, (0, 1, 2), (0, 1, 2)),
-    Row(small.quadratic, lambda b, n, d: (*entries(b, n, d), uniform(b, n, dtype=d)), POINTWISE, (0, 1, 2, 3, 4), (0, 1, 2, 3, 4)),
-    Row(small.upper, lambda b, n, d: (tracked(b, n, d)[1].cov,), POINTWISE, (0,), (0,)),
-    Row(small.product, lambda b, n, d: (tracked(b, n, d)[1].cov, uniform(b, n, 2, 3, dtype=d)), POINTWISE, (0, 1), (0, 1)),
-    Row(small.product_of_planes, lambda b, n, d: (uniform(3, 2, b, n, dtype=d), uniform(2, 3, b, n, dtype=d)), "dtype capture gradcheck empty", grad=(0, 1)),
-    Row(small.turned, lambda b, n, d: (poses(b, d).R, uniform(b, 3, n, dtype=d)), "dtype batch vmap capture gradcheck empty", grad=(0, 1)),
-    Row(small.cofactors, lambda b, n, d: (uniform(3, 3, b, n, dtype=d),), "dtype capture gradcheck empty", grad=(0,)),
+    Row(determinism.pad_elementwise, lambda b, n, d: (torch.sin, uniform(b, n, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding nan", (1,), (1,)),
+    Row(small.determinant_2x2, entries, POINTWISE, (0, 1, 2, 3), (0, 1, 2, 3)),
+    Row(small.adjugate_2x2, entries, POINTWISE, (0, 1, 2, 3), (0, 1, 2, 3)),
+    Row(with_options(small.inverse_2x2, least=1e-9), entries, "dtype capture gradcheck", grad=(0, 1, 2, 3)),
+    Row(small.eigenvalues_2x2, lambda b, n, d: entries(b, n, d)[:3], POINTWISE, (0, 1, 2), (0, 1, 2)),
+    Row(small.quadratic_form, lambda b, n, d: (*entries(b, n, d), uniform(b, n, dtype=d)), POINTWISE, (0, 1, 2, 3, 4), (0, 1, 2, 3, 4)),
+    Row(small.upper_triangle, lambda b, n, d: (tracked(b, n, d)[1].cov,), POINTWISE, (0,), (0,)),
+    Row(small.small_matmul, lambda b, n, d: (tracked(b, n, d)[1].cov, uniform(b, n, 2, 3, dtype=d)), POINTWISE, (0, 1), (0, 1)),
+    Row(small.matmul_planes, lambda b, n, d: (uniform(3, 2, b, n, dtype=d), uniform(2, 3, b, n, dtype=d)), "dtype capture gradcheck empty", grad=(0, 1)),
+    Row(small.rotate_planes, lambda b, n, d: (poses(b, d).R, uniform(b, 3, n, dtype=d)), "dtype batch vmap capture gradcheck empty", grad=(0, 1)),
+    Row(small.cofactor_planes, lambda b, n, d: (uniform(3, 3, b, n, dtype=d),), "dtype capture gradcheck empty", grad=(0,)),
     Row(backproject.backproject, frames, ALL, (1,), (0, 1), bad=wrong_last_axis(1)),
     Row(holes.classify, sampled, "dtype batch vmap capture empty shuffle padding nan raises", (1,), (), bad=wrong_last_axis(1)),
     Row(holes.min_eigenvalue, lambda b, n, d: (frames(b, n, d)[0].image, pixels(b, n, d)), ALL, (1,), (0,), bad=wrong_last_axis(1)),
-    Row(holes.route, lambda b, n, d: (sampled(b, n, d)[1].hole,), "batch vmap capture empty shuffle padding", (0,)),
+    Row(holes.suggest_route, lambda b, n, d: (sampled(b, n, d)[1].hole,), "batch vmap capture empty shuffle padding", (0,)),
     Row(triangulate.two_view, tracked, ALL, (0, 1), (1, 3, 4), bad=lambda a: (a[0], a[1].replace(uv_0=a[1].uv_0[:, 1:]), *a[2:])),
-    Row(score.rank, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
-    Row(score.rank_by_error, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
-    Row(score.rank_by_sigma, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
-    Row(score.evidence, estimated, "dtype batch vmap capture gradcheck empty shuffle nan raises", (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
+    Row(score.confidence, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
+    Row(score.confidence_from_error, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
+    Row(score.confidence_from_sigma, estimated, ALL, (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
+    Row(score.score_features, estimated, "dtype batch vmap capture gradcheck empty shuffle nan raises", (0, 1, 2), (0,), bad=lambda a: (a[0], a[1].replace(uv=a[1].uv[:, 1:]), *a[2:])),
     Row(score.expected_error_loss, lambda b, n, d: (uniform(n, dtype=d, low=-5), uniform(n, dtype=d), uniform(n, dtype=d)), "dtype capture gradcheck raises", grad=(0,), bad=wrong_last_axis(1)),
     Row(pose.pnp_ransac, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
-    Row(given.hold, held, "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(uv_1=a[2].uv_1[:, 1:]), *a[3:]), atol=1e-4),
-    Row(given.between, lambda b, n, d: (poses(b, d), poses(b, d, seed=1)), "dtype batch vmap capture gradcheck", grad=(0, 1)),
-    Row(given.stated, lambda b, n, d: (poses(b, d),), "dtype batch vmap capture gradcheck", grad=(0,)),
+    Row(pose_prior.check_pose_prior, held, "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(uv_1=a[2].uv_1[:, 1:]), *a[3:]), atol=1e-4),
+    Row(pose_prior.relative_prior, lambda b, n, d: (poses(b, d), poses(b, d, seed=1)), "dtype batch vmap capture gradcheck", grad=(0, 1)),
+    Row(pose_prior.make_prior, lambda b, n, d: (poses(b, d),), "dtype batch vmap capture gradcheck", grad=(0,)),
     Row(pose.map_pose, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4, slow="capture"),
     Row(track.lucas_kanade, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
-    Row(track.refine, lambda b, n, d: (*shifted(b, n, d), shifted(b, n, d)[2] + 0.3), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
+    Row(track.refine_tracks, lambda b, n, d: (*shifted(b, n, d), shifted(b, n, d)[2] + 0.3), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
     Row(pyramid.build_pyramid, lambda b, n, d: (shifted(b, n, d)[0], 2, 9), "dtype batch capture"),
     Row(start.coarse_flow, lambda b, n, d: shifted(b, n, d)[:2], "batch capture", slow="capture"),
-    Row(start.upright, lambda b, n, d: (shifted(b, n, d)[0], turns(b, d), uniform(b, dtype=d, low=0.5, high=2.0)), "dtype batch vmap capture gradcheck", grad=(0,)),
-    Row(start.turned, lambda b, n, d: (turns(b, d), pixels(b, n, d), HW), "dtype batch vmap capture gradcheck empty shuffle padding", (1,), (1,)),
-    Row(sweep.pixel_rays, lambda b, n, d: (cameras(b, d), (5, 7), 2), "dtype batch capture gradcheck", grad=(0,), slow="capture"),
-    Row(sweep.base, lambda b, n, d: (uniform(b, 1, *HW, dtype=d), cameras(b, d)), "dtype batch capture raises", bad=lambda a: (a[0][0], a[1])),
-    Row(sweep.seen_at, lambda b, n, d: (swept(b, n, d)[1], camera.rays(cameras(b, d), pixels(b, n, d)), uniform(b, n, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1, 2), (0, 1, 2), bad=wrong_last_axis(2)),
-    Row(sweep.turned, lambda b, n, d: (swept(b, n, d)[1].T_1_from_0.R, uniform(b, n, 3, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding", (1,), (0, 1)),
-    Row(sweep.bilinear, lambda b, n, d: (uniform(b, 3, *HW, dtype=d), pixels(b, n, d)), "dtype batch capture gradcheck empty", grad=(0, 1)),
-    Row(sweep.travel, lambda b, n, d: swept(b, n, d)[:2], "dtype batch capture"),
-    Row(sweep.census, lambda b, n, d: (uniform(b, 1, *HW, dtype=d),), "batch capture raises", bad=lambda a: (a[0][0],)),
-    Row(sweep.count_bits, lambda b, n, d: (torch.randint(0, 2**31 - 1, (b, n), generator=generator(), dtype=torch.int32),), "batch vmap capture empty shuffle padding", (0,)),
-    Row(sweep.aggregate, lambda b, n, d: (volumes(b, n, d), torch.arange(1, b + 1)), "batch capture raises", bad=lambda a: (a[0][0], a[1])),
-    Row(sweep.winner, lambda b, n, d: (sweep.aggregate(volumes(b, n, d)),), "batch capture raises", bad=lambda a: (a[0][0],)),
-    Row(sweep.surface, lambda b, n, d: (volumes(b, n, d), torch.arange(1, b + 1)), "batch capture"),
-    Row(sweep.with_gradients, lambda b, n, d: (uniform(b, 1, *HW, dtype=d),), POINTLESS, grad=(0,)),
-    Row(sweep.fit_windows, lambda b, n, d: (*swept(b, n, d)[:2], sweep.with_gradients(swept(b, n, d)[1].image), swept(b, n, d)[2]), "dtype batch capture"),
-    Row(neighbours.smooth, lambda b, n, d: (uniform(b, 12, 15, dtype=d), uniform(b, dtype=d)), "dtype batch vmap capture gradcheck", grad=(0,)),
+    Row(start.undo_similarity, lambda b, n, d: (shifted(b, n, d)[0], turns(b, d), uniform(b, dtype=d, low=0.5, high=2.0)), "dtype batch vmap capture gradcheck", grad=(0,)),
+    Row(start.apply_similarity, lambda b, n, d: (turns(b, d), pixels(b, n, d), HW), "dtype batch vmap capture gradcheck empty shuffle padding", (1,), (1,)),
+    Row(plane_sweep.pixel_rays, lambda b, n, d: (cameras(b, d), (5, 7), 2), "dtype batch capture gradcheck", grad=(0,), slow="capture"),
+    Row(plane_sweep.make_reference_view, lambda b, n, d: (uniform(b, 1, *HW, dtype=d), cameras(b, d)), "dtype batch capture raises", bad=lambda a: (a[0][0], a[1])),
+    Row(plane_sweep.project_inverse_depth, lambda b, n, d: (swept(b, n, d)[1], camera.rays(cameras(b, d), pixels(b, n, d)), uniform(b, n, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding raises", (1, 2), (0, 1, 2), bad=wrong_last_axis(2)),
+    Row(plane_sweep.rotate_rays, lambda b, n, d: (swept(b, n, d)[1].T_1_from_0.R, uniform(b, n, 3, dtype=d)), "dtype batch vmap capture gradcheck empty shuffle padding", (1,), (0, 1)),
+    Row(plane_sweep.sample_bilinear, lambda b, n, d: (uniform(b, 3, *HW, dtype=d), pixels(b, n, d)), "dtype batch capture gradcheck empty", grad=(0, 1)),
+    Row(plane_sweep.epipolar_warp, lambda b, n, d: swept(b, n, d)[:2], "dtype batch capture"),
+    Row(plane_sweep.census_transform, lambda b, n, d: (uniform(b, 1, *HW, dtype=d),), "batch capture raises", bad=lambda a: (a[0][0],)),
+    Row(plane_sweep.count_set_bits, lambda b, n, d: (torch.randint(0, 2**31 - 1, (b, n), generator=generator(), dtype=torch.int32),), "batch vmap capture empty shuffle padding", (0,)),
+    Row(plane_sweep.aggregate_costs, lambda b, n, d: (volumes(b, n, d), torch.arange(1, b + 1)), "batch capture raises", bad=lambda a: (a[0][0], a[1])),
+    Row(plane_sweep.best_plane, lambda b, n, d: (plane_sweep.aggregate_costs(volumes(b, n, d)),), "batch capture raises", bad=lambda a: (a[0][0],)),
+    Row(plane_sweep.aggregate_best_plane, lambda b, n, d: (volumes(b, n, d), torch.arange(1, b + 1)), "batch capture"),
+    Row(plane_sweep.stack_gradients, lambda b, n, d: (uniform(b, 1, *HW, dtype=d),), POINTLESS, grad=(0,)),
+    Row(plane_sweep.fit_windows, lambda b, n, d: (*swept(b, n, d)[:2], plane_sweep.stack_gradients(swept(b, n, d)[1].image), swept(b, n, d)[2]), "dtype batch capture"),
+    Row(neighbours.smooth_within_tolerance, lambda b, n, d: (uniform(b, 12, 15, dtype=d), uniform(b, dtype=d)), "dtype batch vmap capture gradcheck", grad=(0,)),
     Row(neighbours.window_sum, lambda b, n, d: (uniform(b, 12, 15, dtype=d), 2), "dtype batch vmap capture gradcheck", grad=(0,)),
-    Row(neighbours.extreme, lambda b, n, d: (uniform(b, 12, 15, dtype=d), 2, torch.maximum), "dtype batch vmap capture gradcheck", grad=(0,)),
-    Row(neighbours.spread, lambda b, n, d: (uniform(b, 12, 15, dtype=d), 2), "dtype batch vmap capture"),
-    Row(sweep.hidden, lambda b, n, d: (sweep.travel(*swept(b, n, d)[:2]), swept(b, n, d)[2], uniform(b, dtype=d, high=0.1)), "batch capture"),
+    Row(neighbours.window_extreme, lambda b, n, d: (uniform(b, 12, 15, dtype=d), 2, torch.maximum), "dtype batch vmap capture gradcheck", grad=(0,)),
+    Row(neighbours.window_range, lambda b, n, d: (uniform(b, 12, 15, dtype=d), 2), "dtype batch vmap capture"),
+    Row(plane_sweep.occlusion_mask, lambda b, n, d: (plane_sweep.epipolar_warp(*swept(b, n, d)[:2]), swept(b, n, d)[2], uniform(b, dtype=d, high=0.1)), "batch capture"),
     Row(track.lucas_kanade_affine, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
-    Row(affine.register, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d)), "dtype batch capture empty shuffle padding nan raises", (2, 3), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
-    Row(affine.step, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d), torch.eye(2, dtype=d).expand(b, n, 2, 2)), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3, 4), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
+    Row(affine_alignment.register_affine, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d)), "dtype batch capture empty shuffle padding nan raises", (2, 3), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
+    Row(affine_alignment.registration_step, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d), torch.eye(2, dtype=d).expand(b, n, 2, 2)), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3, 4), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
     Row(p3p.p3p, triples, "dtype batch vmap capture shuffle padding", (0, 1), atol=1e-4),
     Row(least_squares.linearise, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
-    Row(least_squares.reprojection, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
-    Row(least_squares.robust, lambda b, n, d: (uniform(b, n, dtype=d), "cauchy", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
+    Row(least_squares.reprojection_residuals, planes, "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=lambda a: (*a[:4], a[4][..., 1:])),
+    Row(least_squares.robust_loss, lambda b, n, d: (uniform(b, n, dtype=d), "cauchy", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
     Row(least_squares.gauss_newton_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch vmap capture"),
-    Row(least_squares.trial_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch capture raises", bad=wrong_last_axis(2)),
+    Row(least_squares.trial_pose_step, lambda b, n, d: (poses(b, d), positive(b, n, d), uniform(b, 6, dtype=d)), "dtype batch capture raises", bad=wrong_last_axis(2)),
     Row(least_squares.solve_spd, lambda b, n, d: (positive(b, n, d), uniform(b, 6, 1, dtype=d)), "dtype batch vmap capture"),
     Row(least_squares.normal_equations, lambda b, n, d: (uniform(b, 7, 2, n - n % 16 + 16, dtype=d), uniform(b, n - n % 16 + 16, dtype=d)), "dtype batch vmap capture gradcheck", grad=(0, 1)),
-    Row(least_squares.move, lambda b, n, d: (poses(b, d), uniform(b, 6, dtype=d, low=-0.2, high=0.2)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
-    Row(least_squares.choose, lambda b, n, d: (uniform(b, dtype=d) > 0.5, poses(b, d), poses(b, d, seed=1)), POINTLESS, grad=(1, 2)),
-    Row(least_squares.weight_slope, lambda b, n, d: (uniform(b, n, dtype=d), "geman_mcclure", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
-    Row(least_squares.implicit, lambda b, n, d: (torch.sin, uniform(b, 6, dtype=d, low=-0.2, high=0.2)), "dtype batch capture"),
-    Row(near_far.moved, lambda b, n, d: (nine(b, n, d)[0], uniform(b, 9, dtype=d, low=-0.2, high=0.2)), "dtype batch vmap capture raises", bad=wrong_last_axis(1)),
-    Row(near_far.step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
-    Row(near_far.trial_step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
-    Row(near_far.straighten, lambda b, n, d: (pixels(b, n, d).mT, cameras(b, d).f, cameras(b, d).c, uniform(b, n, dtype=d, low=-0.5, high=0.5), uniform(b, 3, dtype=d, high=0.02)), "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=wrong_last_axis(3)),
-    Row(near_far.fixed, lambda b, n, d: problems(b, n, d)[:1], "dtype batch vmap capture"),
-    Row(near_far.linearise_tracks, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture raises", bad=lambda a: (a[0].replace(uv=a[0].uv[..., 1:]), a[1])),
-    Row(near_far.residuals, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
-    Row(near_far.squares, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
-    Row(with_options(near_far.normal, kernel="geman_mcclure", bend=2.0), weighed, "dtype batch vmap capture"),
-    Row(near_far.prior, lambda b, n, d: (uniform(b, dtype=d),), POINTLESS, grad=(0,)),
-    Row(most_probable.noise_scale, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture"),
-    Row(most_probable.most_probable, lambda b, n, d: (problems(b, n, d)[0], problems(b, n, d)[1].T, most_probable.FitOptions()), "batch vmap capture", slow="capture"),
-    Row(most_probable.pose_covariance, lambda b, n, d: (problems(b, n, d)[0], most_probable.Solution(*weighed(b, n, d)[1:], torch.ones(b, dtype=torch.bool)), most_probable.FitOptions()), "batch vmap capture"),
+    Row(least_squares.move_pose, lambda b, n, d: (poses(b, d), uniform(b, 6, dtype=d, low=-0.2, high=0.2)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
+    Row(least_squares.select_batch, lambda b, n, d: (uniform(b, dtype=d) > 0.5, poses(b, d), poses(b, d, seed=1)), POINTLESS, grad=(1, 2)),
+    Row(least_squares.robust_weight_slope, lambda b, n, d: (uniform(b, n, dtype=d), "geman_mcclure", 0.5), "dtype batch vmap capture gradcheck empty shuffle padding nan", (0,), (0,)),
+    Row(least_squares.implicit_step, lambda b, n, d: (torch.sin, uniform(b, 6, dtype=d, low=-0.2, high=0.2)), "dtype batch capture"),
+    Row(reprojection_problem.retract_unknowns, lambda b, n, d: (nine(b, n, d)[0], uniform(b, 9, dtype=d, low=-0.2, high=0.2)), "dtype batch vmap capture raises", bad=wrong_last_axis(1)),
+    Row(reprojection_problem.unknowns_step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
+    Row(reprojection_problem.trial_unknowns_step, nine, "dtype batch vmap capture raises", bad=wrong_last_axis(2)),
+    Row(reprojection_problem.undo_rolling_shutter, lambda b, n, d: (pixels(b, n, d).mT, cameras(b, d).f, cameras(b, d).c, uniform(b, n, dtype=d, low=-0.5, high=0.5), uniform(b, 3, dtype=d, high=0.02)), "dtype batch vmap capture gradcheck empty raises", grad=(0, 1, 2, 3, 4), bad=wrong_last_axis(3)),
+    Row(reprojection_problem.track_constants, lambda b, n, d: problems(b, n, d)[:1], "dtype batch vmap capture"),
+    Row(reprojection_problem.linearise_tracks, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture raises", bad=lambda a: (a[0].replace(uv=a[0].uv[..., 1:]), a[1])),
+    Row(reprojection_problem.whitened_residuals, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
+    Row(reprojection_problem.squared_residuals, linear, "dtype batch vmap capture gradcheck raises", grad=(2,), bad=wrong_last_axis(2)),
+    Row(with_options(reprojection_problem.pose_normal_equations, kernel="geman_mcclure", bend=2.0), weighed, "dtype batch vmap capture"),
+    Row(reprojection_problem.shutter_prior, lambda b, n, d: (uniform(b, dtype=d),), POINTLESS, grad=(0,)),
+    Row(map_estimate.estimate_noise_variance, lambda b, n, d: problems(b, n, d)[:2], "dtype batch vmap capture"),
+    Row(map_estimate.estimate_map_pose, lambda b, n, d: (problems(b, n, d)[0], problems(b, n, d)[1].T, map_estimate.FitOptions()), "batch vmap capture", slow="capture"),
+    Row(map_estimate.pose_covariance, lambda b, n, d: (problems(b, n, d)[0], map_estimate.MapSolution(*weighed(b, n, d)[1:], torch.ones(b, dtype=torch.bool)), map_estimate.FitOptions()), "batch vmap capture"),
     Row(covariance.noise_shape, lambda b, n, d: (tracked(b, n, d)[1].cov * uniform(b, n, 1, 1, dtype=d, low=0.5), torch.ones(b, n, dtype=torch.bool), 0.1), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(0)),
-    Row(covariance.median, lambda b, n, d: (uniform(b, n, dtype=d), uniform(b, n, dtype=d, seed=1) > 0.3), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(1)),
-    Row(covariance.from_normal, lambda b, n, d: (positive(b, n, d), uniform(b, dtype=d, low=0.1)), "dtype batch vmap capture"),
+    Row(covariance.masked_median, lambda b, n, d: (uniform(b, n, dtype=d), uniform(b, n, dtype=d, seed=1) > 0.3), "dtype batch vmap capture gradcheck empty shuffle raises", (0, 1), (0,), bad=wrong_last_axis(1)),
+    Row(covariance.covariance_from_normal, lambda b, n, d: (positive(b, n, d), uniform(b, dtype=d, low=0.1)), "dtype batch vmap capture"),
     Row(covariance.mahalanobis, lambda b, n, d: (uniform(b, 6, dtype=d), positive(b, n, d)), "dtype batch vmap capture"),
-    Row(ransac.collinear, lambda b, n, d: (uniform(b, 3, n, dtype=d), torch.ones(b, n, dtype=torch.bool)), "batch capture"),
+    Row(ransac.is_collinear, lambda b, n, d: (uniform(b, 3, n, dtype=d), torch.ones(b, n, dtype=torch.bool)), "batch capture"),
     Row(ransac.distinct_triples, lambda b, n, d: (uniform(b, 20, 3, dtype=d), torch.full((b,), n)), "batch vmap capture"),
-    Row(ransac.even_slots, lambda b, n, d: (torch.full((b,), n), 16), "batch vmap capture"),
+    Row(ransac.evenly_spaced_slots, lambda b, n, d: (torch.full((b,), n), 16), "batch vmap capture"),
     Row(ransac.usable_first, lambda b, n, d: (uniform(b, n, dtype=d) > 0.5, 16), "batch vmap capture"),
     Row(holdout.range_split, lambda b, n, d: (frames(b, n, d)[0], 1.02), "dtype batch vmap capture gradcheck", grad=(0,)),
-    Row(holdout.truth_at, frames, ALL, (1,), (0,), bad=wrong_last_axis(1)),
-    Row(holdout.half, lambda b, n, d: (sampled(b, n, d)[1], 3), "dtype batch empty raises", (0,), bad=lambda a: (a[0].replace(trackability=a[0].trackability[:, 1:]), a[1])),
-    Row(holdout.without_returns, lambda b, n, d: (sampled(b, n, d)[1], torch.rand(b, n, generator=generator(3)) < 0.5), ALL, (0, 1), (0,), bad=lambda a: (a[0], a[1][:, 1:])),
-    Row(holdout.drop_outs, lambda b, n, d: (*sampled(b, n, d), holdout.truth_at(*frames(b, n, d))), "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(depth=a[2].depth[:, 1:]))),
-    Row(arms.read_arm, lambda b, n, d: (frames(b, n, d)[0].image, pixels(1, n, d)[0]), "dtype batch capture gradcheck raises", grad=(0, 1), shared=(1,), bad=wrong_last_axis(1)),
-    Row(arms.correlate, waves, "dtype batch vmap capture gradcheck empty shuffle padding raises", (2, 3), (0, 1), bad=wrong_last_axis(3)),
-    Row(with_options(registration.register, iterations=5), registered, "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
-    Row(with_options(registration.normals, neighbours=4), lambda b, n, d: registered(b, n, d)[:1], "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
+    Row(holdout.sample_truth, frames, ALL, (1,), (0,), bad=wrong_last_axis(1)),
+    Row(holdout.split_half, lambda b, n, d: (sampled(b, n, d)[1], 3), "dtype batch empty raises", (0,), bad=lambda a: (a[0].replace(trackability=a[0].trackability[:, 1:]), a[1])),
+    Row(holdout.hide_returns, lambda b, n, d: (sampled(b, n, d)[1], torch.rand(b, n, generator=generator(3)) < 0.5), ALL, (0, 1), (0,), bad=lambda a: (a[0], a[1][:, 1:])),
+    Row(holdout.select_real_holes, lambda b, n, d: (*sampled(b, n, d), holdout.sample_truth(*frames(b, n, d))), "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(depth=a[2].depth[:, 1:]))),
+    Row(arms.sample_arm, lambda b, n, d: (frames(b, n, d)[0].image, pixels(1, n, d)[0]), "dtype batch capture gradcheck raises", grad=(0, 1), shared=(1,), bad=wrong_last_axis(1)),
+    Row(arms.correlate_windows, waves, "dtype batch vmap capture gradcheck empty shuffle padding raises", (2, 3), (0, 1), bad=wrong_last_axis(3)),
+    Row(with_options(registration.register_icp, iterations=5), registered, "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
+    Row(with_options(registration.estimate_normals, neighbours=4), lambda b, n, d: registered(b, n, d)[:1], "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
     Row(clusters.largest_cluster, clustered, "dtype batch vmap capture shuffle raises", (0, 1), bad=wrong_last_axis(0)),
-    Row(holdout.candidates, judged, "dtype batch vmap capture empty shuffle raises", (0, 1), bad=lambda a: (a[0], a[1].replace(depth=a[1].depth[:, 1:]), a[2])),
-    Row(filters.grey, lambda b, n, d: (frames(b, n, d)[0].image,), POINTLESS, grad=(0,)),
-    Row(filters.separable, lambda b, n, d: (frames(b, n, d)[0].image, [0.25, 0.5, 0.25], [-0.5, 0.0, 0.5]), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], *a[1:])),
-    Row(filters.gaussian, lambda b, n, d: (frames(b, n, d)[0].image, 1.2), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], a[1])),
-    Row(filters.box, lambda b, n, d: (frames(b, n, d)[0].image, 2), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], a[1])),
+    Row(holdout.select_candidates, judged, "dtype batch vmap capture empty shuffle raises", (0, 1), bad=lambda a: (a[0], a[1].replace(depth=a[1].depth[:, 1:]), a[2])),
+    Row(filters.grayscale, lambda b, n, d: (frames(b, n, d)[0].image,), POINTLESS, grad=(0,)),
+    Row(filters.correlate_separable, lambda b, n, d: (frames(b, n, d)[0].image, [0.25, 0.5, 0.25], [-0.5, 0.0, 0.5]), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], *a[1:])),
+    Row(filters.gaussian_blur, lambda b, n, d: (frames(b, n, d)[0].image, 1.2), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], a[1])),
+    Row(filters.box_mean, lambda b, n, d: (frames(b, n, d)[0].image, 2), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], a[1])),
     Row(thin_lens.spot_gain, lambda b, n, d: (lenses(b, d), uniform(b, 3, dtype=d, low=1, high=4)), POINTLESS + " raises", grad=(0, 1), bad=lambda a: (a[0], a[1][:, 0])),
     Row(thin_lens.spot_diameter, lambda b, n, d: (lenses(b, d), uniform(b, n, dtype=d, low=1, high=4), uniform(b, dtype=d, low=1, high=4, seed=1)), ALL, (1,), (0, 1, 2), bad=lambda a: (a[0], a[1], a[2][None])),
     Row(thin_lens.depth_of_spot, lambda b, n, d: (lenses(b, d), uniform(b, n, dtype=d, low=-2, high=0.5), uniform(b, dtype=d, low=1, high=2, seed=1)), ALL, (1,), (0, 1, 2), bad=lambda a: (a[0], a[1], a[2][None]), leaks=True),
-    Row(blur.local_blur, lambda b, n, d: (shifted(b, n, d)[0],), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],), slow="capture"),
-    Row(blur.inverse_depth, lambda b, n, d: (blurs(b, n, d), torch.ones(b, *HW, dtype=d), lenses(b, d), uniform(b, dtype=d, low=1, high=2)), "dtype batch vmap capture raises", bad=wrong_last_axis(1)),
-    Row(blur.side_by_height, lambda b, n, d: (blurs(b, n, d),), "dtype vmap capture"),
-    Row(blur.side_by_colour, lambda b, n, d: (frames(b, n, d)[0].image,), "dtype batch vmap capture raises", bad=lambda a: (a[0][:, :2],), slow="capture"),
-    Row(sharpness.sharpness, lambda b, n, d: (stacks(b, n, d),), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0],)),
-    Row(sharpness.sharpest, lambda b, n, d: (sharpness.sharpness(stacks(b, n, d)),), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],)),
-    Row(sharpness.depth_at, lambda b, n, d: (uniform(b, *HW, dtype=d, high=3), torch.tensor([0.5, 1.0, 2.0, 4.0], dtype=d).expand(b, 4)), "dtype batch gradcheck raises", grad=(0, 1), bad=lambda a: (a[0][0], a[1])),
-    Row(sharpness.align, lambda b, n, d: (stacks(b, n, d),), "dtype raises", bad=lambda a: (a[0][0],)),
-    Row(probe.moments, probed, "vmap capture gradcheck empty raises", grad=(0, 1), bad=lambda a: (a[0][:, 1:], a[1])),
-    Row(probe.join, lambda b, n, d: (probe.moments(*probed(b, n, d)), probe.moments(*probed(b, n + 2, d))), "vmap capture gradcheck empty raises", grad=(0, 1), bad=lambda a: (a[0], probe.columns(a[1], torch.tensor([0])))),
-    Row(probe.ridge, lambda b, n, d: (probe.moments(*probed(b, n, d)), torch.tensor([0.1, 1.0], dtype=d)), "capture gradcheck empty raises", grad=(1,), bad=lambda a: (a[0], torch.ones(2, 3))),
-    Row(probe.predict, solved, "vmap capture gradcheck empty raises", grad=(0, 1), bad=wrong_last_axis(1)),
-    Row(filling.bilinear, lambda b, n, d: (sensed(b, n, d)[0], HW), "dtype batch vmap capture raises", bad=lambda a: (a[0][0], a[1])),
-    Row(filling.joint_bilateral, sensed, "dtype vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1]), slow="capture"),
-    Row(filling.guided_filter, sensed, "dtype batch vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
-    Row(filling.defocus_guided, filled, "dtype vmap capture raises", bad=wrong_last_axis(0), slow="capture"),
+    Row(blur.estimate_blur, lambda b, n, d: (shifted(b, n, d)[0],), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],), slow="capture"),
+    Row(blur.inverse_depth_from_blur, lambda b, n, d: (blurs(b, n, d), torch.ones(b, *HW, dtype=d), lenses(b, d), uniform(b, dtype=d, low=1, high=2)), "dtype batch vmap capture raises", bad=wrong_last_axis(1)),
+    Row(blur.guess_side_by_height, lambda b, n, d: (blurs(b, n, d),), "dtype vmap capture"),
+    Row(blur.guess_side_by_colour, lambda b, n, d: (frames(b, n, d)[0].image,), "dtype batch vmap capture raises", bad=lambda a: (a[0][:, :2],), slow="capture"),
+    Row(sharpness.measure_sharpness, lambda b, n, d: (stacks(b, n, d),), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0],)),
+    Row(sharpness.find_sharpest, lambda b, n, d: (sharpness.measure_sharpness(stacks(b, n, d)),), "dtype batch vmap capture raises", bad=lambda a: (a[0][0],)),
+    Row(sharpness.depth_at_focus, lambda b, n, d: (uniform(b, *HW, dtype=d, high=3), torch.tensor([0.5, 1.0, 2.0, 4.0], dtype=d).expand(b, 4)), "dtype batch gradcheck raises", grad=(0, 1), bad=lambda a: (a[0][0], a[1])),
+    Row(sharpness.align_stack, lambda b, n, d: (stacks(b, n, d),), "dtype raises", bad=lambda a: (a[0][0],)),
+    Row(probe.compute_moments, probed, "vmap capture gradcheck empty raises", grad=(0, 1), bad=lambda a: (a[0][:, 1:], a[1])),
+    Row(probe.join_moments, lambda b, n, d: (probe.compute_moments(*probed(b, n, d)), probe.compute_moments(*probed(b, n + 2, d))), "vmap capture gradcheck empty raises", grad=(0, 1), bad=lambda a: (a[0], probe.select_features(a[1], torch.tensor([0])))),
+    Row(probe.solve_ridge, lambda b, n, d: (probe.compute_moments(*probed(b, n, d)), torch.tensor([0.1, 1.0], dtype=d)), "capture gradcheck empty raises", grad=(1,), bad=lambda a: (a[0], torch.ones(2, 3))),
+    Row(probe.predict_targets, solved, "vmap capture gradcheck empty raises", grad=(0, 1), bad=wrong_last_axis(1)),
+    Row(filling.fill_bilinear, lambda b, n, d: (sensed(b, n, d)[0], HW), "dtype batch vmap capture raises", bad=lambda a: (a[0][0], a[1])),
+    Row(filling.fill_joint_bilateral, sensed, "dtype vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1]), slow="capture"),
+    Row(filling.fill_guided, sensed, "dtype batch vmap capture gradcheck raises", grad=(1,), bad=lambda a: (a[0][0], a[1])),
+    Row(filling.fill_defocus_guided, filled, "dtype vmap capture raises", bad=wrong_last_axis(0), slow="capture"),
 ]  # fmt: skip
 
 #: Functions without a batch of points: samplers, loops over a callable, flat lists of pooled points. Their promises are
@@ -550,11 +527,11 @@ ROWS = [
 ELSEWHERE = {
     *(f"dhtorch.stages.pose_prior.{name}" for name in ("from_frames", "without")),
     *(f"dhtorch.stages.backproject.{name}" for name in ("around", "places")),
-    "dhtorch.geometry.inference_mode.spared",
+    "dhtorch.geometry.inference_mode.run_without_grad",
     "dhtorch.geometry.least_squares.has_graph",
     "dhtorch.geometry.patches.product_is_exact",
-    "dhtorch.geometry.reprojection_problem.squares_at",
-    "dhtorch.geometry.windows.bands",
+    "dhtorch.geometry.reprojection_problem.squared_residuals_at",
+    "dhtorch.geometry.windows.row_bands",
     "dhtorch.geometry.p3p.p3p_of_planes",
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
     *(
@@ -569,10 +546,10 @@ ELSEWHERE = {
     *(f"support.reference.{name}" for name in ("register", "register_step", "composed", "believed", "nearest_inside")),
     *(f"dhtorch.geometry.sparse_grid.{name}" for name in ("occupied", "components")),
     *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "reserve", "confirmed", "splat")),
-    "dhtorch.integrate.sweeps.edges",
+    "dhtorch.integrate.sweeps.depth_step_rel",
     *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
     "dhtorch.integrate.picture.draw_map",
-    "dhtorch.integrate.from_maps.join",
+    "dhtorch.integrate.from_maps.fuse_frame_maps",
     *(f"dhtorch.integrate.scales.{name}" for name in ("coarse", "union")),
     *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "voxel_of", "meshed", "write", "write_surface")),
     *(f"dhtorch.integrate.level.{name}" for name in ("upwards", "mean_upwards", "floor", "standing", "directions")),
@@ -593,18 +570,18 @@ ELSEWHERE = {
         )
     ),
     "dhtorch.geometry.filters.gaussian_taps",
-    "dhtorch.pipeline.multiview.ask_window",
+    "dhtorch.pipeline.multiview.estimate_multiview",
     *(
         f"dhtorch.pipeline.pair.{name}"
         for name in ("ask_pair", "tracked", "under_pose", "merge", "lifted", "undistort_tracks", "uniform_draws")
     ),
     *(f"dhtorch.pipeline.method.{name}" for name in ("parts", "networks", "options")),
     "dhtorch.stages.fuse.inverse_variance",
-    "dhtorch.stages.fuse.agree",
-    "dhtorch.geometry.free_space.within_reach",
+    "dhtorch.stages.fuse.fuse_consistent",
+    "dhtorch.geometry.free_space.free_space_violations",
     *(f"dhtorch.pipeline.view_selection.{name}" for name in ("by_probes", "shrunk", "weighed")),
     *(f"dhtorch.geometry.coarse_flow.{name}" for name in ("small", "is_turned", "inverse")),
-    "dhtorch.stages.track.coarse",
+    "dhtorch.stages.track.resolve_coarse_flow",
     "dhtorch.geometry.patches.whole_is_faster",
     *(f"dhtorch.geometry.plane_sweep.{name}" for name in ("add_costs", "level", "misfit", "rivals")),
     *(
@@ -612,7 +589,7 @@ ELSEWHERE = {
         for name in ("complete", "map_hw", "options", "pixels", "resized", "sensed", "shipped")
     ),
     *(f"dhtorch.pipeline.dense.{name}" for name in ("swept", "views_asked", "worthiest")),
-    "dhtorch.pipeline.dense.partner_of",
+    "dhtorch.pipeline.dense.source_view_of",
     *(f"dhtorch.pipeline.surface.{name}" for name in ("best_planes", "fitted", "pose_variance")),
     *(f"dhtorch.validation.validate.{name}" for name in ("judge", "judged", "decided", "cut", "share")),
     *(
@@ -622,17 +599,17 @@ ELSEWHERE = {
     *(f"dhtorch.validation.evidence.{name}" for name in ("by_answers", "by_views", "by_maps", "nearest_surface")),
     *(f"dhtorch.validation.faults.{name}" for name in ("turned", "name_cause", "decided", "watch", "ray_lengths")),
     "dhtorch.metrics.detection.auroc",
-    "dhtorch.alignment.align.anchor",
+    "dhtorch.alignment.align.align_depth",
     *(f"dhtorch.alignment.references.{name}" for name in ("gathered", "at_anchors", "spread_within")),
     *(
         f"dhtorch.alignment.error_model.{name}"
         for name in ("basis_of", "fields", "curves", "log_depth", "predicted", "fit")
     ),
     *(f"dhtorch.alignment.error_model.{name}" for name in ("reading", "freedom_of", "leans", "between_nodes")),
-    "dhtorch.alignment.residual_noise.variance",
-    "dhtorch.geometry.determinism.filled",
+    "dhtorch.alignment.residual_noise.residual_variance",
+    "dhtorch.geometry.determinism.round_up",
     "dhtorch.geometry.least_squares.minimise",
-    "dhtorch.geometry.reprojection_problem.equations",
+    "dhtorch.geometry.reprojection_problem.pose_normal_equations_at",
     *(
         f"dhtorch.geometry.lucas_kanade.{n}"
         for n in ("search", "step", "squares", "window_covariance", "for_some", "within")
@@ -657,7 +634,7 @@ ELSEWHERE = {
         f"dhtorch.experiments.compare_methods.{name}"
         for name in ("against", "completed", "equal_coverage", "method_ratios", "promises", "ratio_over_seeds")
     ),
-    "dhtorch.metrics.curves.sampled",
+    "dhtorch.metrics.curves.sample_curves",
     *(f"dhtorch.metrics.correlation.{name}" for name in ("pearson", "spearman", "ranks")),
     *(f"dhtorch.metrics.bootstrap.{name}" for name in ("interval", "interval_of", "resample", "single")),
     *(f"dhtorch.experiments.probes.ridge.{name}" for name in ("columns", "folds", "mean_error", "ratio", "equivalent")),
@@ -845,17 +822,17 @@ def public_functions():
     parts = [
         method,
         pair,
-        views,
-        window,
+        view_selection,
+        multiview,
         dense,
-        anchors,
-        distortion,
-        scatter,
-        stereo,
-        metric,
+        references,
+        error_model,
+        residual_noise,
+        surface,
+        align,
         evidence,
-        causes,
-        verdict,
+        faults,
+        validate,
         *ESTIMATORS,
     ]
     for package in ("geometry", "stages", "evaluate", "integrate"):

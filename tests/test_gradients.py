@@ -11,9 +11,8 @@ from test_contract import shifted, tracked
 from torch.func import jacfwd, jacrev, vmap
 from torch.utils import _pytree as torch_pytree
 
-from dhtorch import MAP, PAPER, extend
-from dhtorch import pytree as tree
-from dhtorch.geometry.patches import nearest
+from dhtorch import MAP, PAPER, extend, pytree
+from dhtorch.geometry.patches import sample_nearest
 from dhtorch.metrics import holdout
 from dhtorch.pipeline.pair import merge, undistort_tracks, uniform_draws
 from dhtorch.pipeline.presets import METHODS
@@ -74,8 +73,8 @@ def stages(pair, trace):
         "map_pose": (pose.map_pose, posing),
         "two_view": (triangulate.two_view, geometry),
         "two_view of map": (METHODS["map"].triangulate, geometry),
-        "rank": (score.rank, (estimate, samples, tracks, fit)),
-        "rank_by_error": (score.rank_by_error, (estimate, samples, tracks, fit)),
+        "rank": (score.confidence, (estimate, samples, tracks, fit)),
+        "rank_by_error": (score.confidence_from_error, (estimate, samples, tracks, fit)),
         "learned_score": (scorer, (estimate, samples, tracks, fit)),
         "merge": (merge, (samples, estimate)),
         "extend": (partial(extend, n=N), tuple(pair)),
@@ -364,7 +363,7 @@ def test_half_precision_is_lifted_where_it_is_read(single, name, what, dtype):
 
 def test_a_window_of_half_precision():
     anchor, *others = (f.to(torch.bfloat16) for f in views(room(), 0, 8, 16))
-    estimate = extend_window(anchor, tree.stack(others), n=N)
+    estimate = extend_window(anchor, pytree.stack(others), n=N)
     assert estimate.depth.dtype == torch.float32 and int(estimate.keep.sum()) > 20
     assert estimate.depth[estimate.keep].isfinite().all()
 
@@ -383,15 +382,15 @@ class Task:
     def __init__(self, n=512):
         rooms = [room(seed, hw=(180, 240)) for seed in self.rooms]
         pairs = [views(each, 0, 16, dtype=torch.float32) for each in rooms]
-        whole = tree.collate([each[0] for each in rooms])
-        self.near, self.other = (tree.collate(frames) for frames in zip(*pairs, strict=True))
+        whole = pytree.collate([each[0] for each in rooms])
+        self.near, self.other = (pytree.collate(frames) for frames in zip(*pairs, strict=True))
         self.method = METHODS["map"].replace(n=n, pose={"turn_sigma": 0.0})  # a global shutter
         trace = {}
         self.method(self.near, self.other, trace=trace)
         self.tracks, self.samples = trace["tracks"], trace["samples"]
-        truth = holdout.truth_at(whole, self.samples.uv)
-        self.far = holdout.candidates(self.samples, truth, 2.0).ok
-        self.here = holdout.candidates(self.samples, truth, 0.0).ok & ~self.far
+        truth = holdout.sample_truth(whole, self.samples.uv)
+        self.far = holdout.select_candidates(self.samples, truth, 2.0).ok
+        self.here = holdout.select_candidates(self.samples, truth, 0.0).ok & ~self.far
         self.truth = torch.where(self.far, truth.depth, 1.0)
         assert int(self.far.sum()) > 100
 
@@ -477,13 +476,13 @@ def test_a_wrong_scale_of_near_depth_is_recovered_pixel_by_pixel(task):
     def residual(theta):
         depth = lying * (-field(theta)).exp()
         estimate = task.ask(task.near.camera, depth)
-        told, _ = nearest(depth, task.samples.uv)
+        told, _ = sample_nearest(depth, task.samples.uv)
         return relative(
             estimate, torch.where(task.far, task.truth, torch.where(task.here, told, 1.0)), task.far | task.here
         )
 
     def left(theta):
-        wrong, _ = nearest((field(true) - field(theta)).expand(len(lying), -1, -1), task.samples.uv)
+        wrong, _ = sample_nearest((field(true) - field(theta)).expand(len(lying), -1, -1), task.samples.uv)
         return float(wrong[task.here].abs().median())
 
     start = torch.zeros(12)

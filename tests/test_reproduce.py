@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
@@ -30,7 +30,7 @@ def test_a_result_was_made_with_the_settings_that_its_command_has_today(name):
 
 
 def test_another_setting_is_seen(tmp_path, monkeypatch):
-    result = archive.read(REPO / "benchmarks/results/hole_census.json")
+    result = result_files.read_result(REPO / "benchmarks/results/hole_census.json")
     result["config"]["experiment"]["stride"] = 1
     (tmp_path / "hole_census.json").write_text(json.dumps(result))
     monkeypatch.setattr(reproduce, "RESULTS", tmp_path)
@@ -58,7 +58,7 @@ def test_a_speed_is_told_with_its_processor():
         named = {row.get("processor") for row in rows}
         assert len(named) == 1 and None not in named, name
         assert named.pop() in speed_tables.on(name, "")
-    meta = archive.read(REPO / "benchmarks/results/latency.json")["meta"]
+    meta = result_files.read_result(REPO / "benchmarks/results/latency.json")["meta"]
     assert meta["processor"]
 
 
@@ -68,9 +68,9 @@ def test_a_processor_is_named_by_maker_model_and_vectors(tmp_path, monkeypatch):
     info = tmp_path / "cpuinfo"
     for more, vectors in (("", "AVX2"), (" avx512f", "AVX-512"), (" avx512f amx_tile", "AVX-512 and AMX")):
         info.write_text(told.format(more))
-        assert archive.processor(info) == f"A. Maker 9000 @ 2 GHz, family 6 model 85, {vectors}"
-    assert archive.processor(tmp_path / "none")
+        assert result_files.describe_processor(info) == f"A. Maker 9000 @ 2 GHz, family 6 model 85, {vectors}"
+    assert result_files.describe_processor(tmp_path / "none")
     monkeypatch.setenv("ATEN_CPU_CAPABILITY", "avx2")
-    assert archive.processor(info).endswith("AVX-512 and AMX held to AVX2")
+    assert result_files.describe_processor(info).endswith("AVX-512 and AMX held to AVX2")
     info.write_text(told.format(""))
-    assert archive.processor(info).endswith("model 85, AVX2")
+    assert result_files.describe_processor(info).endswith("model 85, AVX2")

@@ -26,11 +26,13 @@ IMAGE, GAP = "observation.image_primary", 2
 def steps(root: str, **options: Any) -> Iterator[dict[str, Any]]:
     """Every step with the picture some steps before it; the first ones of an episode are padded with their own."""
     files = sorted(Path(root).glob("*-train.tfrecord-*"))
-    records = [(file, span) for file in files for span in tfrecord.record_spans(file)]
+    records = [(file, span) for file in files for span in tfrecord.index_records(file)]
     episodes = open_all(root, "rlds", split="train", camera="observation/image_0", **options)
     for (file, span), recording in zip(records, episodes, strict=True):
-        found = tfrecord.example(tfrecord.read_record(file, span), file, span.offset)
-        actions = tfrecord.numbers(file, "action", found["steps/action"], 7 * len(recording)).reshape(-1, 7)
+        found = tfrecord.parse_example(tfrecord.read_record(file, span), file, span.offset)
+        actions = tfrecord.read_feature_numbers(file, "action", found["steps/action"], 7 * len(recording)).reshape(
+            -1, 7
+        )
         for i in range(len(recording)):
             frame, pair = recording[i], [recording[max(i - GAP, 0)].image[0], recording[i].image[0]]
             pictures = torch.stack(pair).movedim(1, -1).numpy()

@@ -9,7 +9,7 @@ import numpy as np
 from pyarrow import array, parquet
 
 from dhtorch.records import Frame
-from dhtorch.synthetic.robot import joints
+from dhtorch.synthetic.robot import _solve_joints
 from dhtorch.synthetic.two_cameras import open_two_cameras
 from dhtorch.testing import write_lerobot, write_rlds
 
@@ -30,7 +30,7 @@ def hand(frame: Frame) -> np.ndarray:
     """Seven joint angles and the gripper's width (8,) of an arm that carries the camera, rad and m."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = frame.T_world_from_cam.R[0].numpy(), frame.T_world_from_cam.t[0].numpy()
-    return np.append(joints(np.linalg.inv(BASE) @ T), 0.02 + 0.01 * np.sin(40 * T[2, 3]))
+    return np.append(_solve_joints(np.linalg.inv(BASE) @ T), 0.02 + 0.01 * np.sin(40 * T[2, 3]))
 
 
 def write_robot(root: Path) -> None:

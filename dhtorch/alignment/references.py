@@ -14,28 +14,28 @@ from torch import Tensor
 
 from dhtorch.codes import Source
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.patches import nearest
+from dhtorch.geometry.patches import sample_nearest
 from dhtorch.records import DepthMap, Estimate, Samples
 
 #: Anchors of one source that are used at most, evenly spread over its samples or pixels.
-MOST: Final = 512
+MAX_REFERENCES_PER_SOURCE: Final = 512
 
 #: Relative error that every return may have beside what it states.
-FLOOR: Final = 0.01
+MIN_RETURN_ERROR: Final = 0.01
 
 #: Relative error that far answers have beside what they state, each alone and all together: matches that slip, and
 #: motions that their covariance takes for better than they are.
-FAR_ALONE, FAR_SHARED = 0.02, 0.05
+FAR_OWN_ERROR, FAR_SHARED_ERROR = 0.02, 0.05
 
 #: Share of a far map's variance that all its pixels share (its motion's).
-SHARED: Final = 0.5
+MAP_SHARED_RATIO: Final = 0.5
 
 #: Blocks (rows, columns) of the picture whose anchors have errors in common, and share of the variance that they have.
-BLOCKS: Final = (6, 8)
-CORRELATED: Final = 0.3
+ERROR_BLOCKS: Final = (6, 8)
+BLOCK_CORRELATION: Final = 0.3
 
 
-class Anchors(NamedTuple):
+class MetricReferences(NamedTuple):
     """What is known in metres, on pixels of the map; (B, N) each."""
 
     share: Tensor  # (B, N, 2) place, share of width and height
@@ -50,7 +50,7 @@ class Anchors(NamedTuple):
     @property
     def block(self) -> Tensor:
         """Part (B, N) int64 of the picture; near and far ones of one part are two."""
-        rows, columns = BLOCKS
+        rows, columns = ERROR_BLOCKS
         cell = (self.share * self.share.new_tensor([columns, rows])).floor().long()
         column, row = cell[..., 0].clamp(0, columns - 1), cell[..., 1].clamp(0, rows - 1)
         return 2 * (row * columns + column) + self.near.long()
@@ -58,20 +58,20 @@ class Anchors(NamedTuple):
     @property
     def of_block(self) -> Tensor:
         """Which anchors are in which block (B, N, blocks): 1, else 0."""
-        return F.one_hot(self.block, 2 * BLOCKS[0] * BLOCKS[1]).to(self.x)
+        return F.one_hot(self.block, 2 * ERROR_BLOCKS[0] * ERROR_BLOCKS[1]).to(self.x)
 
     def weight(self, used: Tensor) -> Tensor:
         """How many anchors each of those ``used`` (B, N) counts as among its block's, 0 of the others."""
-        count = self.x.new_zeros(len(used), 2 * BLOCKS[0] * BLOCKS[1])
+        count = self.x.new_zeros(len(used), 2 * ERROR_BLOCKS[0] * ERROR_BLOCKS[1])
         count = count.scatter_add(1, self.block, used.to(count)).gather(1, self.block)
-        return used / (1 + CORRELATED * (count - 1).clamp_min(0))
+        return used / (1 + BLOCK_CORRELATION * (count - 1).clamp_min(0))
 
 
-def gathered(
+def collect_references(
     x: Tensor,  # (B, h, w)
     given: Sequence[Samples | Estimate | DepthMap],
     hw: tuple[int, int],
-) -> Anchors:
+) -> MetricReferences:
     """All anchors on the pixels of a map, NaN where it has no value; those without one are not used.
 
     Args:
@@ -86,9 +86,9 @@ def gathered(
     for share, depth, sigma, together, near, keep in parts:
         check("anchor", depth_map=(x, "B h w"), anchors=(share, "B N 2"))
         n = depth.shape[1]
-        pick = torch.linspace(0, n - 1, min(n, MOST), device=x.device).round().long()
+        pick = torch.linspace(0, n - 1, min(n, MAX_REFERENCES_PER_SOURCE), device=x.device).round().long()
         found.append(_read(x, share[:, pick], tuple(part[:, pick] for part in (depth, sigma, together, near, keep))))
-    return Anchors(*(torch.cat(parts, 1) for parts in zip(*found, strict=True)))
+    return MetricReferences(*(torch.cat(parts, 1) for parts in zip(*found, strict=True)))
 
 
 def _of_map(one: DepthMap) -> tuple[Tensor, ...]:
@@ -97,7 +97,7 @@ def _of_map(one: DepthMap) -> tuple[Tensor, ...]:
     v, u = torch.meshgrid((rows + 0.5) / len(rows), (columns + 0.5) / len(columns), indexing="ij")
     share = torch.stack([u, v], -1).flatten(0, 1).expand(len(depth), -1, -1)
     depth, sigma, keep, near = (p.flatten(1) for p in (depth, sigma, one.keep, one.source == Source.SENSOR))
-    return share, depth, sigma, SHARED**0.5 * sigma, near, keep
+    return share, depth, sigma, MAP_SHARED_RATIO**0.5 * sigma, near, keep
 
 
 def _of_points(one: Samples | Estimate, hw: tuple[int, int]) -> tuple[Tensor, ...]:
@@ -108,23 +108,23 @@ def _of_points(one: Samples | Estimate, hw: tuple[int, int]) -> tuple[Tensor, ..
     return share, depth, sigma, one.sigma_shared.double(), torch.zeros_like(one.keep), one.keep
 
 
-def _read(x: Tensor, share: Tensor, told: tuple[Tensor, ...]) -> Anchors:
+def _read(x: Tensor, share: Tensor, told: tuple[Tensor, ...]) -> MetricReferences:
     """The map at anchors, and their variances."""
     depth, sigma, together, near, keep = told
-    value, inside = at_anchors(x, share)
+    value, inside = sample_at_references(x, share)
     use = keep & inside & value.isfinite() & depth.isfinite() & (depth > 0) & sigma.isfinite() & (sigma >= 0)
     z = torch.where(use, depth, 1.0)
     rel, common = (torch.where(use & (s >= 0), s / z, 0.0) for s in (sigma, together))
     common = torch.where(near, 0.0, common)
-    var = (rel.square() - common.square()).clamp_min(0) + FLOOR**2 + torch.where(near, 0.0, FAR_ALONE**2)
-    common = torch.where(near, 0.0, (common.square() + FAR_SHARED**2).sqrt())
+    var = (rel.square() - common.square()).clamp_min(0) + MIN_RETURN_ERROR**2 + torch.where(near, 0.0, FAR_OWN_ERROR**2)
+    common = torch.where(near, 0.0, (common.square() + FAR_SHARED_ERROR**2).sqrt())
     share = torch.where(use[..., None], share, 0.5)
     told_x = torch.where(use, value, 1.0)
-    within = torch.where(use, at_anchors(spread_within(x), share)[0], 0.0)
-    return Anchors(share=share, x=told_x, within=within, depth=z, var=var, shared=common, near=near, used=use)
+    within = torch.where(use, sample_at_references(local_spread(x), share)[0], 0.0)
+    return MetricReferences(share=share, x=told_x, within=within, depth=z, var=var, shared=common, near=near, used=use)
 
 
-def spread_within(x: Tensor) -> Tensor:
+def local_spread(x: Tensor) -> Tensor:
     """Standard deviation (B, h, w) by which a map differs about each of its pixels: a return and the value of the map
     stand somewhere in theirs, evenly up to the next pixel on either side. A step to no value (NaN) is none.
 
@@ -138,7 +138,7 @@ def spread_within(x: Tensor) -> Tensor:
     return (total / 3).sqrt()
 
 
-def at_anchors(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
+def sample_at_references(x: Tensor, share: Tensor) -> tuple[Tensor, Tensor]:
     """Values (B, N) of a map (B, h, w) at the pixels nearest to places (B, N, 2), and whether these are inside."""
     h, w = x.shape[-2:]
-    return nearest(x, share * share.new_tensor([w, h]) - 0.5)
+    return sample_nearest(x, share * share.new_tensor([w, h]) - 0.5)

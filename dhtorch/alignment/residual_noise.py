@@ -19,60 +19,60 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.alignment.references import FLOOR, Anchors, at_anchors
-from dhtorch.geometry.covariance import median
+from dhtorch.alignment.references import MIN_RETURN_ERROR, MetricReferences, sample_at_references
+from dhtorch.geometry.covariance import masked_median
 
 #: Relative scatter of a map without near returns.
-SCATTER: Final = 0.01
+DEFAULT_RESIDUAL: Final = 0.01
 
 #: How that goes with roughness.
-OF_ROUGH: Final = 0.5
+DEFAULT_ROUGHNESS_GAIN: Final = 0.5
 
 #: Side of the window in which a map is rough, as a share of its longer side.
-WINDOW: Final = 0.03
+ROUGHNESS_WINDOW: Final = 0.03
 
 #: Share of errors that lie within one sigma.
-SHARE: Final = 0.683
+ONE_SIGMA_QUANTILE: Final = 0.683
 
 #: Share of a Cauchy distribution's scale that so many lie within.
-WITHIN: Final = 1.84
+CAUCHY_68_QUANTILE: Final = 1.84
 
 #: Candidates, as powers of ten from, to and how many: levels of relative error, and of error by roughness.
-LEVELS, SLOPES = (-5, 0, 51), (-3, 1, 41)
+ERROR_LEVELS, ROUGHNESS_LEVELS = (-5, 0, 51), (-3, 1, 41)
 
 #: Widths of the kernels of what is off in places: share of the longer side, and log depth.
-PLACE, DEPTH = 0.04, 0.05
+PLACE_KERNEL_WIDTH, DEPTH_KERNEL_WIDTH = 0.04, 0.05
 
 #: Weight of what no return says against those around a pixel.
-NOTHING: Final = 0.3
+EMPTY_KERNEL_WEIGHT: Final = 0.3
 
 #: Depths between which what is off in places is found.
-BINS: Final = 48
+N_DEPTH_BINS: Final = 48
 
 #: From how many sigmas on a return is off by more than the map's scatter. Beyond two, chance leaves .08 of the variance
 #: of returns with normal noise, all over the map; beyond three, .005.
-BEYOND: Final = 3.0
+OUTLIER_SIGMAS: Final = 3.0
 
 #: Returns off by more of these levels are no witnesses of what returns have by themselves.
-OUTSIDE: Final = 3.0
+OUTLIER_LEVELS: Final = 3.0
 
 #: Unevenness of a map, as a share of the scatter of returns, below which it is as good as even.
-EVEN: Final = 0.1
+MIN_UNEVENNESS: Final = 0.1
 
 #: How far apart returns are at least that a map is wrong at alike and a sensor is not, whose noise is smooth over a few
 #: of its pixels; and the correlation length of what the map is wrong by there, that of the shortest field of a model
-#: (:data:`dhtorch.alignment.error_model.LENGTHS`). Shares of the longer side.
-ASIDE, SMOOTH = 0.035, 0.13
+#: (:data:`dhtorch.alignment.error_model.FIELD_LENGTHS`). Shares of the longer side.
+NOISE_INDEPENDENCE_DISTANCE, MAP_CORRELATION_LENGTH = 0.035, 0.13
 
 #: Least share of what returns have by themselves that differs from each to the next.
-OWN: Final = 0.5
+MIN_UNCORRELATED_RATIO: Final = 0.5
 
 #: Pairs of returns for which the belief counts that all of the scatter is the map's.
-BELIEVED: Final = 10
+PRIOR_PAIRS: Final = 10
 
 
-def variance(
-    points: Anchors,
+def residual_variance(
+    points: MetricReferences,
     r: Tensor,  # (B, N)
     told: tuple[Tensor, Tensor],  # (B, N) variance by reading; standard deviation of the fit
     log: Tensor,  # (B, h, w) log depth of the map
@@ -88,31 +88,31 @@ def variance(
     read, of_fit = told
     with torch.no_grad():
         near = points.used & points.near
-        r = r - median(r, near).maximum(-of_fit).minimum(of_fit)
+        r = r - masked_median(r, near).maximum(-of_fit).minimum(of_fit)
         out = _standing_out(log, known)
         rough = _roughness(out, known)
-        h = at_anchors(rough, points.share)[0].clamp_min(1e-9)
-        steep = near & (h >= median(h, near))
+        h = sample_at_references(rough, points.share)[0].clamp_min(1e-9)
+        steep = near & (h >= masked_median(h, near))
         flat, slope = _levels(r, read, h, (near, steep))
         some = near.any(-1, keepdim=True)
-        flat, slope = torch.where(some, flat, SCATTER), torch.where(some, slope, OF_ROUGH)
-        excess = (r.square() - BEYOND**2 * (flat.square() + (slope * h).square() + read)).clamp_min(0)
-        level = at_anchors(log, points.share)[0]
-        off = _in_places(points.share, level, (excess, near), log, known)
-        calm = near & (r.abs() <= OUTSIDE * flat)
-        stands = at_anchors(out, points.share)[0]
-        stated = (median(points.var, calm) - FLOOR**2).clamp_min(0)
+        flat, slope = torch.where(some, flat, DEFAULT_RESIDUAL), torch.where(some, slope, DEFAULT_ROUGHNESS_GAIN)
+        excess = (r.square() - OUTLIER_SIGMAS**2 * (flat.square() + (slope * h).square() + read)).clamp_min(0)
+        level = sample_at_references(log, points.share)[0]
+        off = _local_variance(points.share, level, (excess, near), log, known)
+        calm = near & (r.abs() <= OUTLIER_LEVELS * flat)
+        stands = sample_at_references(out, points.share)[0]
+        stated = (masked_median(points.var, calm) - MIN_RETURN_ERROR**2).clamp_min(0)
         place = points.share * points.share.new_tensor(_sides(log))
         apart = torch.cdist(place, place, compute_mode="donot_use_mm_for_euclid_dist")
-        fast = _fast(r, stands, calm / (h.square() + (EVEN * flat).square()).clamp_min(1e-18))
-        slow = _slow(r, apart, points.of_block, calm, flat.square())
-        alone = stated.minimum(_alone(r, apart, calm, flat.square()))
+        fast = _uneven_variance(r, stands, calm / (h.square() + (MIN_UNEVENNESS * flat).square()).clamp_min(1e-18))
+        slow = _smooth_variance(r, apart, points.of_block, calm, flat.square())
+        alone = stated.minimum(_max_sensor_variance(r, apart, calm, flat.square()))
         of_map = (fast + slow).maximum(flat.square() - alone).minimum(flat.square())
-        slope = _at_edges(r, (stands, h, points.of_block), (flat, slope), steep, stated)
+        slope = _edge_noise(r, (stands, h, points.of_block), (flat, slope), steep, stated)
         return of_map[..., None] + (slope[..., None] * rough).square() + off
 
 
-def _fast(r: Tensor, stands: Tensor, weight: Tensor) -> Tensor:
+def _uneven_variance(r: Tensor, stands: Tensor, weight: Tensor) -> Tensor:
     """Variance (B, 1) of what a map is off by from pixel to pixel: that makes it uneven, and residuals go with how it
     ``stands`` out of its surroundings, against it. Where they go along with it the map is too smooth, and what of them
     is told by it is the map's. Where it is even this is known best, whatever returns have by themselves."""
@@ -121,31 +121,32 @@ def _fast(r: Tensor, stands: Tensor, weight: Tensor) -> Tensor:
     return torch.where(mean < 0, -mean, mean * both / alone.clamp_min(1e-18))
 
 
-def _slow(r: Tensor, apart: Tensor, of_block: Tensor, among: Tensor, whole: Tensor) -> Tensor:
+def _smooth_variance(r: Tensor, apart: Tensor, of_block: Tensor, among: Tensor, whole: Tensor) -> Tensor:
     """Variance (B, 1) of what a map is off by over more than a few pixels of a sensor: returns that stand ``apart``
     (B, N, N) are off alike by it, and not by what they have by themselves. It is that of a field of correlation
-    ``SMOOTH``: products of residuals are regressed on it, pairs of blocks (``of_block`` (B, N, blocks), one of them 1)
+    ``MAP_CORRELATION_LENGTH``: products of residuals are regressed on it, pairs of blocks (``of_block`` (B, N, blocks),
+        one of them 1)
     being the unit of chance. Without many pairs it is as likely the ``whole`` (B, 1) of
     the scatter."""
-    pair = among[:, None] & among[..., None] & (apart > ASIDE)
-    alike = torch.where(pair, (-0.5 * (apart / SMOOTH).square()).exp(), 0.0)
+    pair = among[:, None] & among[..., None] & (apart > NOISE_INDEPENDENCE_DISTANCE)
+    alike = torch.where(pair, (-0.5 * (apart / MAP_CORRELATION_LENGTH).square()).exp(), 0.0)
     both = of_block.mT @ (alike * r[:, None] * r[..., None]) @ of_block  # every pair of blocks is there twice
     error = 2 * both.square().sum((1, 2)) - both.diagonal(dim1=1, dim2=2).square().sum(-1)
     more = _beyond_chance(both.sum((1, 2))[:, None], error[:, None])
-    return (more + BELIEVED * whole) / (alike.square().sum((1, 2))[:, None] + BELIEVED)
+    return (more + PRIOR_PAIRS * whole) / (alike.square().sum((1, 2))[:, None] + PRIOR_PAIRS)
 
 
-def _alone(r: Tensor, apart: Tensor, among: Tensor, whole: Tensor) -> Tensor:
-    """Most variance (B, 1) that returns have by themselves: ``OWN`` of it differs from each to the next, so that what
-    neighbours are off by alike is more than that. Without many pairs it is as likely the ``whole`` (B, 1) of the
-    scatter."""
+def _max_sensor_variance(r: Tensor, apart: Tensor, among: Tensor, whole: Tensor) -> Tensor:
+    """Most variance (B, 1) that returns have by themselves: ``MIN_UNCORRELATED_RATIO`` of it differs from each to the
+    next, so that what neighbours are off by alike is more than that. Without many pairs it is as likely the ``whole``
+    (B, 1) of the scatter."""
     itself = torch.eye(r.shape[1], dtype=torch.bool, device=r.device)
-    pair = among[:, None] & among[..., None] & (apart <= ASIDE) & ~itself
+    pair = among[:, None] & among[..., None] & (apart <= NOISE_INDEPENDENCE_DISTANCE) & ~itself
     differ = torch.where(pair, 0.5 * (r[:, None] - r[..., None]).square(), 0.0).sum((1, 2))[:, None]
-    return (differ / OWN + BELIEVED * whole) / (pair.sum((1, 2))[:, None] + BELIEVED)
+    return (differ / MIN_UNCORRELATED_RATIO + PRIOR_PAIRS * whole) / (pair.sum((1, 2))[:, None] + PRIOR_PAIRS)
 
 
-def _at_edges(
+def _edge_noise(
     r: Tensor, of_map: tuple[Tensor, Tensor, Tensor], levels: tuple[Tensor, Tensor], steep: Tensor, stated: Tensor
 ) -> Tensor:
     """Level (B, 1) of error by roughness, less what returns have by themselves where a map is rough, at most what is
@@ -154,11 +155,11 @@ def _at_edges(
     stands, h, of_block = of_map
     flat, slope = levels
     level = flat.square() + (slope * h).square()
-    weight = (steep & (r.square() <= OUTSIDE**2 * level)) / level.clamp_min(1e-18)
+    weight = (steep & (r.square() <= OUTLIER_LEVELS**2 * level)) / level.clamp_min(1e-18)
     both = (weight * stands * r)[:, None] @ of_block
     along = both.sum(-1).abs()
     sure = _beyond_chance(along, both.square().sum(-1)) / along.clamp_min(1e-18)
-    alone = (1 - sure) * stated / median(h.square(), steep).clamp_min(1e-18)
+    alone = (1 - sure) * stated / masked_median(h.square(), steep).clamp_min(1e-18)
     return (slope.square() - alone).maximum(sure * slope.square()).sqrt()
 
 
@@ -185,7 +186,7 @@ def _sides(x: Tensor) -> tuple[float, float]:
 
 def _side(x: Tensor) -> int:
     """Pixels along the window in which a map is rough."""
-    return max(3, 2 * round(0.5 * WINDOW * max(x.shape[-2:])) + 1)
+    return max(3, 2 * round(0.5 * ROUGHNESS_WINDOW * max(x.shape[-2:])) + 1)
 
 
 def _around(x: Tensor, known: Tensor, side: int) -> Tensor:
@@ -203,36 +204,40 @@ def _levels(r: Tensor, read: Tensor, h: Tensor, among: tuple[Tensor, Tensor]) ->
     likeliest level says how much each return counts as one that is read where it stands.
     """
     near, steep = among
-    levels, slopes = (torch.logspace(*of).to(r) for of in (LEVELS, SLOPES))
+    levels, slopes = (torch.logspace(*of).to(r) for of in (ERROR_LEVELS, ROUGHNESS_LEVELS))
     levels = levels.square()[None, :, None].expand(len(r), -1, r.shape[1])
-    flat = _held(r.abs(), _read_there(r, levels, read, near & ~steep))
+    flat = _quantile_68(r.abs(), _inlier_probability(r, levels, read, near & ~steep))
     slopes = torch.cat((torch.zeros_like(slopes[:1]), slopes))
-    levels = (flat.square() / WITHIN**2).clamp_min(1e-10)[..., None] + (slopes[:, None] * h[:, None]).square()
+    levels = (flat.square() / CAUCHY_68_QUANTILE**2).clamp_min(1e-10)[..., None] + (
+        slopes[:, None] * h[:, None]
+    ).square()
     known_to = (8 / near.sum(-1, keepdim=True).clamp_min(8)).sqrt()  # the difference of two variances, of half each
     beyond = (r.square() - flat.square() * (1 + known_to)).clamp_min(0).sqrt() / h
-    return flat, _held(beyond, _read_there(r, levels, read, steep)).clamp_max(10.0 ** SLOPES[1])
+    return flat, _quantile_68(beyond, _inlier_probability(r, levels, read, steep)).clamp_max(
+        10.0 ** ROUGHNESS_LEVELS[1]
+    )
 
 
-def _read_there(r: Tensor, levels: Tensor, read: Tensor, among: Tensor) -> Tensor:
+def _inlier_probability(r: Tensor, levels: Tensor, read: Tensor, among: Tensor) -> Tensor:
     """How probable (B, N) it is that anchors are read where they stand, under the likeliest of ``levels`` (B, G, N),
     squared scales of their errors; 0 of those that are not ``among`` them."""
     there, beside = (
-        1 / (v.sqrt() * (1 + r[:, None].square() / v)) for v in (levels, levels + read[:, None] / WITHIN**2)
+        1 / (v.sqrt() * (1 + r[:, None].square() / v)) for v in (levels, levels + read[:, None] / CAUCHY_68_QUANTILE**2)
     )
     like = torch.where(among[:, None], (there + beside).log(), 0.0).sum(-1)
     best = like.argmax(-1)[:, None, None].expand(-1, -1, r.shape[1])
     return torch.where(among, (there / (there + beside)).gather(1, best)[:, 0], 0.0)
 
 
-def _held(value: Tensor, weight: Tensor) -> Tensor:
-    """Weighted quantile (B, 1) of values (B, N) at ``SHARE``."""
+def _quantile_68(value: Tensor, weight: Tensor) -> Tensor:
+    """Weighted quantile (B, 1) of values (B, N) at ``ONE_SIGMA_QUANTILE``."""
     value, order = value.sort(-1)
     sums = weight.gather(1, order).cumsum(-1)
-    at = (sums < SHARE * sums[:, -1:]).sum(-1, keepdim=True).clamp_max(value.shape[1] - 1)
+    at = (sums < ONE_SIGMA_QUANTILE * sums[:, -1:]).sum(-1, keepdim=True).clamp_max(value.shape[1] - 1)
     return value.gather(1, at)
 
 
-def _in_places(
+def _local_variance(
     share: Tensor,  # (B, N, 2)
     level: Tensor,  # (B, N) log depth of the map at anchors
     found: tuple[Tensor, Tensor],  # (B, N) what they are off by, squared; which count
@@ -247,10 +252,14 @@ def _in_places(
     high = torch.where(known, log, -torch.inf).flatten(1).amax(-1, keepdim=True)
     width = torch.where(low < high, high - low, 1.0)
     low = torch.where(low < high, low, 0.0)
-    step = (width / (BINS - 1)).clamp_min(DEPTH)
-    bins = low + width * torch.linspace(0, 1, BINS).to(log)
+    step = (width / (N_DEPTH_BINS - 1)).clamp_min(DEPTH_KERNEL_WIDTH)
+    bins = low + width * torch.linspace(0, 1, N_DEPTH_BINS).to(log)
     of_place = [
-        _kernel(share[..., k] * side, side * torch.linspace(0, 1, max(3, round(2 * side / PLACE))).to(log)[None], PLACE)
+        _kernel(
+            share[..., k] * side,
+            side * torch.linspace(0, 1, max(3, round(2 * side / PLACE_KERNEL_WIDTH))).to(log)[None],
+            PLACE_KERNEL_WIDTH,
+        )
         for k, side in enumerate(sides)
     ]
     of_depth = _kernel(level, bins, step[..., None]) * used[:, None]
@@ -261,7 +270,7 @@ def _in_places(
     at = 2 * (log - low[..., None]) / width[..., None] - 1
     where = torch.stack((u.expand_as(at), v.expand_as(at), at), -1)[:, None]
     mass, total = F.grid_sample(grid, where, padding_mode="border", align_corners=True)[:, :, 0].unbind(1)
-    return total / (mass + NOTHING)
+    return total / (mass + EMPTY_KERNEL_WEIGHT)
 
 
 def _kernel(at: Tensor, node: Tensor, length: float | Tensor) -> Tensor:

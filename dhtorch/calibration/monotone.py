@@ -10,22 +10,22 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.determinism import steady
+from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.pytree import Record, record
 
 #: Rise given to the two end blocks of a table, where isotonic regression is flat, so that no order is lost there.
-TILT = 1e-3
+_MAX_END_RISE = 1e-3
 
 #: Pull of the sigmoid towards the identity beside a log loss of total weight 1: keeps separable data finite and is
 #: otherwise too small to see.
-RIDGE = 1e-6
+_RIDGE_WEIGHT = 1e-6
 
 #: A probability is kept this far from 0 and 1 before its logit is taken.
-EDGE = 1e-6
+_LOGIT_MARGIN = 1e-6
 
 
 @record
-class Table(Record):
+class MonotoneTable(Record):
     """A monotone function by its corners: straight between them, constant beyond."""
 
     x: Tensor  # (k,) strictly rising
@@ -52,10 +52,10 @@ class Sigmoid(Record):
 
     def __call__(self, p: Tensor) -> Tensor:
         """The function at ``p`` (any shape), elementwise; arguments outside (0, 1) count as its ends."""
-        return steady(torch.sigmoid, self.slope.to(p) * _logit(p) + self.offset.to(p))
+        return pad_elementwise(torch.sigmoid, self.slope.to(p) * _logit(p) + self.offset.to(p))
 
 
-def isotonic(
+def fit_isotonic(
     x: Tensor,  # (n,)
     y: Tensor,  # (n,)
     weight: Tensor | None = None,  # (n,) ≥ 0
@@ -63,7 +63,7 @@ def isotonic(
     rising: bool = True,
     min_share: float = 0.0,
     ends: tuple[float, float] | None = None,
-) -> Table:
+) -> MonotoneTable:
     """The monotone function with the least weighted square error, made continuous.
 
     Pool-adjacent-violators gives blocks of equal value. The table runs straight from the middle of one block to the
@@ -94,14 +94,16 @@ def isotonic(
     mass = torch.zeros_like(at).index_add(0, group, weight)
     mean = torch.zeros_like(at).index_add(0, group, weight * y) / mass
     sign = 1.0 if rising else -1.0
-    blocks = _joined(_blocks((sign * mean).tolist(), mass.tolist(), at.tolist()), min_share * float(mass.sum()))
+    blocks = _join_light_blocks(
+        _pool_blocks((sign * mean).tolist(), mass.tolist(), at.tolist()), min_share * float(mass.sum())
+    )
     middle = [block[2] for block in blocks]
     value = [sign * block[0] for block in blocks]
     low, high = (float(at[0]), float(at[-1])) if ends is None else ends
-    return _table(middle, value, min(low, middle[0]), max(high, middle[-1]))
+    return _make_table(middle, value, min(low, middle[0]), max(high, middle[-1]))
 
 
-def pool_adjacent_violators(
+def _pool_adjacent_violators(
     y: Tensor,  # (n,) in the order of the argument
     weight: Tensor,  # (n,) > 0
 ) -> Tensor:
@@ -111,19 +113,19 @@ def pool_adjacent_violators(
         ValueError: unequal lengths.
     """
     check("pool_adjacent_violators", y=(y, "n"), weight=(weight, "n"))
-    blocks = _blocks(y.tolist(), weight.tolist(), [0.0] * y.numel())
+    blocks = _pool_blocks(y.tolist(), weight.tolist(), [0.0] * y.numel())
     value = torch.tensor([block[0] for block in blocks], dtype=torch.float64)
     return value.repeat_interleave(torch.tensor([block[3] for block in blocks], dtype=torch.long))
 
 
-def platt(
+def fit_platt(
     p: Tensor,  # (n,) in [0, 1]
     good: Tensor,  # (n,) bool
     weight: Tensor | None = None,  # (n,) ≥ 0
     *,
     steps: int = 100,
 ) -> Sigmoid:
-    """The sigmoid of logit(p) with the least weighted log loss: the simple control beside :func:`isotonic`.
+    """The sigmoid of logit(p) with the least weighted log loss: the simple control beside :func:`fit_isotonic`.
 
     Args:
         p: claimed probability, or a score in [0, 1].
@@ -148,15 +150,15 @@ def platt(
     identity = torch.tensor([1.0, 0.0], dtype=torch.float64, device=p.device)
 
     def loss(theta: Tensor) -> Tensor:
-        pull = RIDGE / 2 * (theta - identity).square().sum()
+        pull = _RIDGE_WEIGHT / 2 * (theta - identity).square().sum()
         return (share * torch.nn.functional.softplus(-sign * (feature @ theta))).sum() + pull
 
     theta = identity
     for _ in range(steps):
         claimed = torch.sigmoid(feature @ theta)
-        gradient = feature.mT @ (share * (claimed - good.double())) + RIDGE * (theta - identity)
+        gradient = feature.mT @ (share * (claimed - good.double())) + _RIDGE_WEIGHT * (theta - identity)
         curvature = (feature * (share * claimed * (1 - claimed))[:, None]).mT @ feature
-        step = torch.linalg.solve(curvature + RIDGE * torch.eye(2).to(curvature), gradient)
+        step = torch.linalg.solve(curvature + _RIDGE_WEIGHT * torch.eye(2).to(curvature), gradient)
         before, length = loss(theta), 1.0
         while length > 1e-6 and loss(theta - length * step) > before:
             length /= 2
@@ -170,51 +172,51 @@ def platt(
 _Block = tuple[float, float, float, int]
 
 
-def _merged(a: _Block, b: _Block) -> _Block:
+def _merge_blocks(a: _Block, b: _Block) -> _Block:
     mass = a[1] + b[1]
     return (a[0] * a[1] + b[0] * b[1]) / mass, mass, (a[2] * a[1] + b[2] * b[1]) / mass, a[3] + b[3]
 
 
-def _blocks(y: list[float], weight: list[float], at: list[float]) -> list[_Block]:
+def _pool_blocks(y: list[float], weight: list[float], at: list[float]) -> list[_Block]:
     """Pool-adjacent-violators in one pass: a stack of blocks whose values rise strictly."""
     stack: list[_Block] = []
     for value, mass, place in zip(y, weight, at, strict=True):
         block = (value, mass, place, 1)
         while stack and stack[-1][0] >= block[0]:
-            block = _merged(stack.pop(), block)
+            block = _merge_blocks(stack.pop(), block)
         stack.append(block)
     return stack
 
 
-def _joined(blocks: list[_Block], least: float) -> list[_Block]:
+def _join_light_blocks(blocks: list[_Block], least: float) -> list[_Block]:
     """Neighbours joined until every block weighs ``least``; values still rise, being means of rising values."""
     joined: list[_Block] = []
     for block in blocks:
         light = bool(joined) and joined[-1][1] < least
-        joined.append(_merged(joined.pop(), block) if light else block)
+        joined.append(_merge_blocks(joined.pop(), block) if light else block)
     while len(joined) > 1 and joined[-1][1] < least:
         last = joined.pop()
-        joined.append(_merged(joined.pop(), last))
+        joined.append(_merge_blocks(joined.pop(), last))
     return joined
 
 
-def _table(x: list[float], y: list[float], low: float, high: float) -> Table:
+def _make_table(x: list[float], y: list[float], low: float, high: float) -> MonotoneTable:
     """Corners at the middles of blocks and at both ends, the end blocks tilted inwards."""
     corners = list(zip(x, y, strict=True))
     if len(x) > 1:
         left, right = low < x[0], high > x[-1]
-        corners[0] = (x[0], y[0] + left * _tilt(y[1] - y[0]))
-        corners[-1] = (x[-1], y[-1] - right * _tilt(y[-1] - y[-2]))
+        corners[0] = (x[0], y[0] + left * _end_rise(y[1] - y[0]))
+        corners[-1] = (x[-1], y[-1] - right * _end_rise(y[-1] - y[-2]))
         corners = [(low, y[0])] * left + corners + [(high, y[-1])] * right
     at, value = zip(*corners, strict=True)
-    return Table(torch.tensor(at, dtype=torch.float64), torch.tensor(value, dtype=torch.float64))
+    return MonotoneTable(torch.tensor(at, dtype=torch.float64), torch.tensor(value, dtype=torch.float64))
 
 
-def _tilt(step: float) -> float:
+def _end_rise(step: float) -> float:
     """A small part of the step to the next block, in its direction."""
-    return max(-TILT, min(TILT, step / 4))
+    return max(-_MAX_END_RISE, min(_MAX_END_RISE, step / 4))
 
 
 def _logit(p: Tensor) -> Tensor:
-    p = p.clamp(EDGE, 1 - EDGE)
-    return steady(torch.log, p) - steady(torch.log, 1 - p)
+    p = p.clamp(_LOGIT_MARGIN, 1 - _LOGIT_MARGIN)
+    return pad_elementwise(torch.log, p) - pad_elementwise(torch.log, 1 - p)

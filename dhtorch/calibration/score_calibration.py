@@ -17,34 +17,34 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from dhtorch.calibration.monotone import Sigmoid, Table, isotonic, platt
+from dhtorch.calibration.monotone import MonotoneTable, Sigmoid, fit_isotonic, fit_platt
 from dhtorch.metrics import control
 from dhtorch.metrics.errors import Points
-from dhtorch.metrics.reliability import GOOD, pool
-from dhtorch.metrics.risk import capped
+from dhtorch.metrics.reliability import GOOD_ERROR_REL, pool_answers
+from dhtorch.metrics.risk import cap_error
 from dhtorch.records import DepthMap
 from dhtorch.runtime import storage
 
-SCHEMA = 1
+_SCHEMA_VERSION = 1
 
 Answers = TypeVar("Answers", Points, DepthMap)
 
 #: Share of the fitting scenes' weight on which a step of a table must rest.
-MIN_SHARE = 0.02
+_MIN_STEP_SHARE = 0.02
 
 #: Probability that a normal variable lies within one standard deviation.
-ONE_SIGMA = 0.6826894921370859
+_ONE_SIGMA_SHARE = 0.6826894921370859
 
 #: Share asked within two: less than a normal variable's 95 %, because errors have heavier tails and a few gross ones
 #: would widen every sigma. A little more than nine in ten, so that nine in ten may be promised in other rooms.
-TWO_SIGMA = 0.91
+_TWO_SIGMA_SHARE = 0.91
 
 #: Targets, in per cent, for which thresholds are kept.
-TARGETS = (5, 10, 20)
+_TARGET_ERRORS_PERCENT = (5, 10, 20)
 
 
 #: Floors of sigma tried, as shares of the depth.
-FLOORS = (0.0, *(1e-4 * 10 ** (k / 10) for k in range(31)))
+_SIGMA_FLOORS_REL = (0.0, *(1e-4 * 10 ** (k / 10) for k in range(31)))
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,8 @@ class SigmaModel:
 class Calibration:
     """What a score and a sigma mean, as measured on the scenes named in ``provenance``."""
 
-    probability: Table  # score → P(relative error < 10 %)
-    expected_error: Table  # score → mean capped relative error
+    probability: MonotoneTable  # score → P(relative error < 10 %)
+    expected_error: MonotoneTable  # score → mean capped relative error
     sigmoid: Sigmoid  # score in [0, 1] → P(relative error < 10 %), the simple control
     sigma: SigmaModel | None  # None = no sigma was stated
     thresholds: Mapping[int, float | None]  # per cent of mean error → threshold on the score; None = none fits
@@ -87,8 +87,8 @@ class Calibration:
     def to_json(self) -> str:
         """The calibration as strict JSON."""
         content = {
-            "schema": SCHEMA,
-            "good_error": GOOD,
+            "schema": _SCHEMA_VERSION,
+            "good_error": GOOD_ERROR_REL,
             "probability": _corners(self.probability),
             "expected_error": _corners(self.expected_error),
             "sigmoid": {"slope": float(self.sigmoid.slope), "offset": float(self.sigmoid.offset)},
@@ -96,15 +96,15 @@ class Calibration:
             "thresholds": {str(k): v for k, v in self.thresholds.items()},
             "provenance": dict(self.provenance),
         }
-        return storage.dumps(content, indent=1) + "\n"
+        return storage.dump_strict_json(content, indent=1) + "\n"
 
 
-def fit(
+def fit_calibration(
     scenes: Sequence[Points],
     *,
-    min_share: float = MIN_SHARE,
-    targets: Sequence[int] = TARGETS,
-    choose: Callable[[Sequence[Points], float], control.Control] = control.plug_in,
+    min_share: float = _MIN_STEP_SHARE,
+    targets: Sequence[int] = _TARGET_ERRORS_PERCENT,
+    choose: Callable[[Sequence[Points], float], control.ScoreThreshold] = control.plug_in_threshold,
     provenance: Mapping[str, Any] | None = None,
 ) -> Calibration:
     """Learn from scenes with truth what their scores and sigmas are worth; every scene has the same weight.
@@ -113,30 +113,30 @@ def fit(
         scenes: candidates with answers, scores and, where stated, sigmas; any depth source.
         min_share: share of the weight on which a step of a table must rest.
         targets: mean errors, in per cent, for which thresholds are chosen.
-        choose: the control that chooses them, such as :func:`dhtorch.metrics.control.most_scenes`.
+        choose: the control that chooses them, such as :func:`dhtorch.metrics.control.scene_quantile_threshold`.
         provenance: where the scenes come from, as JSON can hold it; ``n_scenes`` and ``n_answers`` are added. A file
             that is shipped names ``method`` and ``scenes``.
 
     Raises:
         ValueError: no answer in any scene.
     """
-    score, good, weight = pool(scenes)
+    score, good, weight = pool_answers(scenes)
     if not score.numel():
         raise ValueError("fit: found no answer in any scene, expected some")
-    loss = capped(torch.cat([s.answered().error for s in scenes]))
+    loss = cap_error(torch.cat([s.answered().error for s in scenes]))
     ends = (0.0, 1.0) if bool(((score >= 0) & (score <= 1)).all()) else None
     note = {**(provenance or {}), "n_scenes": sum(bool(s.keep.any()) for s in scenes), "n_answers": score.numel()}
     return Calibration(
-        probability=isotonic(score, good.double(), weight, min_share=min_share, ends=ends),
-        expected_error=isotonic(score, loss, weight, rising=False, min_share=min_share, ends=ends),
-        sigmoid=platt(score, good, weight),
-        sigma=fit_sigma(scenes),
+        probability=fit_isotonic(score, good.double(), weight, min_share=min_share, ends=ends),
+        expected_error=fit_isotonic(score, loss, weight, rising=False, min_share=min_share, ends=ends),
+        sigmoid=fit_platt(score, good, weight),
+        sigma=fit_sigma_model(scenes),
         thresholds={percent: choose(scenes, percent / 100).threshold for percent in targets},
         provenance=note,
     )
 
 
-def fit_sigma(scenes: Sequence[Points]) -> SigmaModel | None:
+def fit_sigma_model(scenes: Sequence[Points]) -> SigmaModel | None:
     """The correction after which 68 % of the answers lie within one sigma and no fewer than nine in ten within two.
 
     Scenes have the same weight. For every floor the scale follows from the first share; of all these pairs the one is
@@ -158,14 +158,16 @@ def fit_sigma(scenes: Sequence[Points]) -> SigmaModel | None:
         return None
     error, sigma, weight = torch.cat(errors), torch.cat(sigmas), torch.cat(weights)
     best, least = SigmaModel(1.0, 0.0), math.inf
-    for floor in FLOORS:
-        scale = _quantile((error.square() - floor * floor) / sigma.square(), weight, ONE_SIGMA).clamp_min(0).sqrt()
+    for floor in _SIGMA_FLOORS_REL:
+        scale = (
+            _quantile((error.square() - floor * floor) / sigma.square(), weight, _ONE_SIGMA_SHARE).clamp_min(0).sqrt()
+        )
         model = SigmaModel(float(scale), floor)
         spread = model(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
         cost = float((weight * (2 * torch.log1p((error / spread).square() / 3) + spread.log())).sum())
         best, least = (model, cost) if cost < least else (best, least)
     spread = best(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
-    wider = max(1.0, float(_quantile(error / spread, weight, TWO_SIGMA)) / 2)
+    wider = max(1.0, float(_quantile(error / spread, weight, _TWO_SIGMA_SHARE)) / 2)
     return SigmaModel(best.scale * wider, best.floor * wider)
 
 
@@ -177,7 +179,7 @@ def _quantile(x: Tensor, weight: Tensor, share: float) -> Tensor:
     return x[order][k.clamp(max=x.numel() - 1)]
 
 
-def from_json(text: str, where: str = "calibration") -> Calibration:
+def parse_calibration(text: str, where: str = "calibration") -> Calibration:
     """Read what :meth:`Calibration.to_json` wrote.
 
     Args:
@@ -188,12 +190,12 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
         ValueError: not strict JSON, or a field is missing, unknown or out of range; the message names file and field.
     """
     try:
-        content = storage.loads(text)
+        content = storage.parse_strict_json(text)
     except ValueError as error:
         raise ValueError(f"{where}: found no strict JSON ({error}), expected a calibration") from error
     known = ("schema", "good_error", "probability", "expected_error", "sigmoid", "sigma", "thresholds")
     _fields(content, (*known, "provenance"), where)
-    for name, value in (("schema", SCHEMA), ("good_error", GOOD)):
+    for name, value in (("schema", _SCHEMA_VERSION), ("good_error", GOOD_ERROR_REL)):
         _expect(content[name] == value, f"{where}.{name}", content[name], str(value))
     _fields(content["sigmoid"], ("slope", "offset"), f"{where}.sigmoid")
     slope, offset = (_number(content["sigmoid"][k], f"{where}.sigmoid.{k}") for k in ("slope", "offset"))
@@ -208,11 +210,11 @@ def from_json(text: str, where: str = "calibration") -> Calibration:
     )
 
 
-def _corners(table: Table) -> dict[str, list[float]]:
+def _corners(table: MonotoneTable) -> dict[str, list[float]]:
     return {"score": table.x.tolist(), "value": table.y.tolist()}
 
 
-def _read_table(content: Any, where: str, *, rising: bool) -> Table:
+def _read_table(content: Any, where: str, *, rising: bool) -> MonotoneTable:
     _fields(content, ("score", "value"), where)
     columns: dict[str, Tensor] = {}
     for name in ("score", "value"):
@@ -224,7 +226,7 @@ def _read_table(content: Any, where: str, *, rising: bool) -> Table:
     _expect(all(a < b for a, b in pairwise(x)), f"{where}.score", x, "rising numbers")
     ordered = all((a <= b) if rising else (a >= b) for a, b in pairwise(y))
     _expect(ordered and all(0 <= v <= 1 for v in y), f"{where}.value", y, f"{_direction(rising)} numbers from 0 to 1")
-    return Table(columns["score"], columns["value"])
+    return MonotoneTable(columns["score"], columns["value"])
 
 
 def _read_sigma(content: Any, where: str) -> SigmaModel:
@@ -266,5 +268,5 @@ def _number(value: Any, where: str) -> float:
 
 def _expect(condition: bool, where: str, found: Any, expected: str) -> None:
     if not condition:
-        shown = found if isinstance(found, str) else storage.dumps(found)
+        shown = found if isinstance(found, str) else storage.dump_strict_json(found)
         raise ValueError(f"{where}: found {shown if len(shown) <= 60 else shown[:57] + '...'}, expected {expected}")

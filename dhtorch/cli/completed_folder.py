@@ -19,21 +19,21 @@ from dhtorch.data.io import decode as data_files
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.pipeline.method import Method
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
-from dhtorch.viz.plots import at_cutoff, frame_of
+from dhtorch.viz.plots import append_cutoff, format_frame
 
 Row = dict[str, Any]
 
 #: Of the files: raised when a reader of older ones would be wrong.
-FORMAT = 1
+_FORMAT_VERSION = 1
 
 #: Folders of pictures and points, which are made of the files of a frame.
-EXTRAS = {"figures": (".png",), "points": (".ply", ".glb")}
+EXTRA_FILES = {"figures": (".png",), "points": (".ply", ".glb")}
 
 
 @dataclass(frozen=True)
-class Task:
+class CompletionTask:
     """One scene, and what is wanted of it."""
 
     scene: Scene
@@ -58,15 +58,15 @@ class Task:
     def extras(self, i: int) -> list[Path]:
         """Figure and points that are wanted of frame ``i``: of all frames, or of the first that has another view."""
         first = next((k for k in self.frames if k in self.offers), self.frames[0])
-        kinds = [kind for kind in EXTRAS if self.settings[kind] == "all" or (self.settings[kind] and i == first)]
-        return [self.folder / kind / f"{self.name(i)}{end}" for kind in kinds for end in EXTRAS[kind]]
+        kinds = [kind for kind in EXTRA_FILES if self.settings[kind] == "all" or (self.settings[kind] and i == first)]
+        return [self.folder / kind / f"{self.name(i)}{end}" for kind in kinds for end in EXTRA_FILES[kind]]
 
     def missing(self, i: int) -> bool:
         """Whether a file of frame ``i`` is to be made."""
         return self.name(i) not in self.done or not all(path.is_file() for path in self.extras(i))
 
 
-def shared(
+def build_shared_metadata(
     scene: Scene,
     layout: Layout,
     settings: Mapping[str, Any],
@@ -80,11 +80,11 @@ def shared(
     """What all frames of a scene have in common, and their key: of the options ``keyed``, the modules ``roots``, the
     data's digest and what ``more`` tells one word's files from another's."""
     config = {k: settings[k] for k in keyed} | {"scene": scene.name, "format": layout.name, "unit": layout.unit}
-    made = archive.meta(device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"])
+    made = result_files.collect_run_metadata(device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"])
     name = settings["choices"]["data"]
-    found: Row = storage.strict(
+    found: Row = storage.to_strict_json(
         {
-            "format": FORMAT,
+            "format": _FORMAT_VERSION,
             "scene": scene.name,
             "layout": layout.name,
             "unit_m": layout.unit,
@@ -94,8 +94,8 @@ def shared(
             "git": made["git"],
             "method": settings["choices"]["method"],
             "calibration": calibration,
-            "key": archive.result_key({**config, "files": FORMAT, **more}, digest, roots=roots),
-            "config": archive.portable(config),
+            "key": result_files.compute_result_key({**config, "files": _FORMAT_VERSION, **more}, digest, roots=roots),
+            "config": result_files.make_portable(config),
             "data": {"name": name, "digest": digest},
             "codes": {"source": names(Source), "gate": names(Gate)},
         }
@@ -103,14 +103,17 @@ def shared(
     return found
 
 
-def digest_of(scene: Scene, settings: Mapping[str, Any], out: Path) -> str:
+def digest_scene_files(scene: Scene, settings: Mapping[str, Any], out: Path) -> str:
     """Of all data files; what is written here may lie beside them."""
-    files = {**archive.files_below([scene.root]), **archive.files_named({k: settings[k] for k in ("data", "method")})}
+    files = {
+        **result_files.list_files_below([scene.root]),
+        **result_files.list_files_named({k: settings[k] for k in ("data", "method")}),
+    }
     place = out.resolve()
-    return archive.data_digest({k: p for k, p in files.items() if not p.resolve().is_relative_to(place)})
+    return result_files.compute_data_digest({k: p for k, p in files.items() if not p.resolve().is_relative_to(place)})
 
 
-def take_up(task: Task) -> None:
+def resume_folder(task: CompletionTask) -> None:
     """Note the frames of a folder that are whole; what a killed run left of others is removed.
 
     Raises:
@@ -120,50 +123,50 @@ def take_up(task: Task) -> None:
     folder, about = task.folder, task.folder / "complete.json"
     if folder.exists() and not folder.is_dir():
         raise NotADirectoryError(f"out: {folder} is a file, expected a folder, or a place for one")
-    storage.clear(about)
-    if not storage.filled(folder):
+    storage.remove_unfinished_files(about)
+    if not storage.has_files(folder):
         return
     if not about.is_file():
         raise FileExistsError(f"out: {folder} holds other files, expected an empty folder, or one that this word made")
     try:
-        there = storage.loads(about.read_text(encoding="utf-8"))
+        there = storage.parse_strict_json(about.read_text(encoding="utf-8"))
         same = there["key"] == task.shared["key"]
-        found = "" if same else archive.difference(there, task.shared)
+        found = "" if same else result_files.describe_difference(there, task.shared)
     except (ValueError, KeyError, TypeError) as error:
         raise FileExistsError(f"{about}: found {error}, expected what dhtorch complete writes") from None
     if not same:
         raise FileExistsError(f"{about}: found other frames ({found}), expected these, or another folder for out")
-    task.done.update(whole(task))
-    for kind in (*task.layout.folders, *EXTRAS):
+    task.done.update(read_complete_frames(task))
+    for kind in (*task.layout.folders, *EXTRA_FILES):
         for file in (folder / kind).glob("*"):
             if file.stem not in task.done:
                 file.unlink()
 
 
-def whole(task: Task) -> dict[str, Row]:
+def read_complete_frames(task: CompletionTask) -> dict[str, Row]:
     """The frames that are whole, by name."""
     metas = sorted((task.folder / "meta").glob("*.json"))
-    return {path.stem: row for path in metas if (row := _row(task, path))}
+    return {path.stem: row for path in metas if (row := _read_meta(task, path))}
 
 
-def _row(task: Task, path: Path) -> Row | None:
+def _read_meta(task: CompletionTask, path: Path) -> Row | None:
     """The meta file of a frame that is whole."""
     if any(not task.layout.file(task.folder, kind, path.stem).is_file() for kind in task.layout.folders):
         return None
     try:
-        row: Row = storage.loads(path.read_text(encoding="utf-8"))
+        row: Row = storage.parse_strict_json(path.read_text(encoding="utf-8"))
         return row if row["key"] == task.shared["key"] else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def title_of(task: Task, i: int) -> str:
+def format_frame_title(task: CompletionTask, i: int) -> str:
     """Scene, frame, those that it was completed from, and the cutoff."""
     row = task.done[task.name(i)]
-    return at_cutoff(frame_of(task.scene.name, row["frame"], row.get("views", ())), task.settings["cutoff"])
+    return append_cutoff(format_frame(task.scene.name, row["frame"], row.get("views", ())), task.settings["cutoff"])
 
 
-def maps_of(task: Task, i: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def read_completed_maps(task: CompletionTask, i: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """``depth`` and ``sigma`` (h, w) in m and the source (h, w) of a whole frame, as its files have them."""
     layout, name = task.layout, task.name(i)
     maps = {

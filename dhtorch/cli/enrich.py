@@ -17,69 +17,67 @@ from typing import Any
 
 from dhtorch.cli import enrich_page
 from dhtorch.codes import Gate, Source, names, words
-from dhtorch.data.io.decode import need
+from dhtorch.data.io.decode import import_optional
 from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, cut, engines, plan, shards
-from dhtorch.extract.enriched import SILENCE, MapRows, View, camera_key
-from dhtorch.extract.enriched import columns as map_columns
-from dhtorch.extract.nerf_target import NerfTarget
-from dhtorch.extract.origin import NO_RATE, Origin, RobotSet, knows_rate, rate
-from dhtorch.extract.robot_target import RobotTarget
-from dhtorch.extract.step_set import StepSet
-from dhtorch.extract.targets import Target
+from dhtorch.extract.enriched import NO_ANSWER_REASONS, DatasetCamera, MapRowDataset, camera_key, map_columns
+from dhtorch.extract.nerf_target import NerfstudioTarget
+from dhtorch.extract.origin import DEFAULT_FPS, DatasetSource, LeRobotSource, frame_rate, has_frame_rate
+from dhtorch.extract.robot_target import LeRobotTarget
+from dhtorch.extract.step_set import RldsSource
+from dhtorch.extract.targets import DatasetTarget
 from dhtorch.pipeline import dense
-from dhtorch.runtime import file_lock as lock
-from dhtorch.runtime import results as archive
-from dhtorch.runtime import storage
-from dhtorch.runtime.console import many
-from dhtorch.transforms import poses as given
+from dhtorch.runtime import file_lock, storage
+from dhtorch.runtime import results as result_files
+from dhtorch.runtime.console import format_count
+from dhtorch.transforms import poses
 
 Progress = Callable[..., Iterable[Any]]
 Row = dict[str, Any]
 
 #: Of the files: raised when a reader of older ones would be wrong.
-FORMAT = 1
+_FORMAT_VERSION = 1
 
 #: Formats of the new set → version of LeRobot, None = another.
-FORMATS: dict[str, int | None] = {"lerobot": 3, "v3.0": 3, "lerobot_v2.1": 2, "v2.1": 2, "nerfstudio": None}
+_OUTPUT_FORMATS: dict[str, int | None] = {"lerobot": 3, "v3.0": 3, "lerobot_v2.1": 2, "v2.1": 2, "nerfstudio": None}
 
 #: Options that decide what is written.
-KEYED = ("data", "method", "seed", "format", "dense", "causal", "gap", "cameras", "pose", "pose_sigma", "frames",
+_KEY_OPTIONS = ("data", "method", "seed", "format", "dense", "causal", "gap", "cameras", "pose", "pose_sigma", "frames",
          "step", "fps", "task", "on_error")  # fmt: skip
 
 #: Where the maps of episodes wait that are not whole; and what all share.
-_WAITING, _SHARED = ".dhtorch", "dhtorch.json"
+_SHARDS_FOLDER, _METADATA_FILE = ".dhtorch", "dhtorch.json"
 
 #: Size of a map where samples alone are wanted, px.
-_SIZE = 640
+_SAMPLED_MAP_SIDE_PX = 640
 
-_SHOWN = 3
+_MAX_COMPLAINTS = 3
 
 #: What the system says where nothing more can be written.
-_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 #: Where the motion to another view comes from.
-POSES = ("near", "device", "start")
+_POSE_SOURCES = ("near", "device", "start")
 
 
 @dataclass(frozen=True)
-class Work:
+class EnrichJob:
     """What is to be done."""
 
     out: Path
     scenes: Sequence[Scene]
-    whole: plan.Plan
-    views: dict[str, View]
-    target: Target
+    whole: plan.ExtractionPlan
+    views: dict[str, DatasetCamera]
+    target: DatasetTarget
     shared: Row
-    rows: MapRows
+    rows: MapRowDataset
     notes: Sequence[str] = ()
 
     @property
     def waiting(self) -> Path:
         """The folder of the shards."""
-        return self.out / _WAITING
+        return self.out / _SHARDS_FOLDER
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
@@ -98,48 +96,52 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
             a full disk.
         KeyboardInterrupt: Ctrl-C; what is whole stays.
     """
-    need("pyarrow.parquet", extra="scale")
-    _check(settings)
-    work = _work(settings, parts)
+    import_optional("pyarrow.parquet", extra="scale")
+    _check_options(settings)
+    work = _plan_job(settings, parts)
     home = work.out.absolute()
     rest = "what is whole stays; the same command does the rest"
     try:
-        with lock.held(home.parent / f".{home.name}.lock", f"out: {work.out}"):
-            before, owns, complaints = _make(work, settings, progress)
+        with file_lock.acquire_file_lock(home.parent / f".{home.name}.lock", f"out: {work.out}"):
+            before, owns, complaints = _write_missing_episodes(work, settings, progress)
             if settings["report"]:
-                enrich_page.write(work.out / "meta", work.shared, owns)
+                enrich_page.write_enrich_page(work.out / "meta", work.shared, owns)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"what is whole in {work.out} stays; the same command does the rest") from None
     except OSError as error:
-        if error.errno not in _FULL:
+        if error.errno not in _DISK_FULL_ERRNOS:
             raise
         raise OSError(error.errno, f"{error.strerror}: {error.filename or work.out}; {rest}") from None
-    print("\n".join(_said(work, owns, before, complaints)))
+    print("\n".join(_format_summary(work, owns, before, complaints)))
     return 0
 
 
-def _make(work: Work, settings: Mapping[str, Any], progress: Progress) -> tuple[int, list[Row], list[str]]:
+def _write_missing_episodes(
+    work: EnrichJob, settings: Mapping[str, Any], progress: Progress
+) -> tuple[int, list[Row], list[str]]:
     """Make what is missing; how many episodes were whole before, what all amount to, and what could not be read."""
-    of_episode = _episodes(work.whole)
+    of_episode = _group_by_episode(work.whole)
     owns = [work.target.own(k) for k in range(len(of_episode))]
     before = sum(own is not None for own in owns)
     every = work.whole.shards(settings["shard_rows"], apart=True)
-    _take_up(work)
-    done = shards.finished(work.waiting, work.shared)
-    todo = {k: _pieces(every, work.whole, of_episode[k]) for k, own in enumerate(owns) if own is None}
+    _prepare_folder(work)
+    done = shards.find_finished_shards(work.waiting, work.shared)
+    todo = {k: _group_shards(every, work.whole, of_episode[k]) for k, own in enumerate(owns) if own is None}
     pieces = [piece for each in todo.values() for files in each.values() for piece in files if piece.name not in done]
     positions = [position for piece in pieces for position in piece.rows]
     complaints: list[str] = []
-    engine = engines.run(
+    engine = engines.run_engine(
         settings["engine"], work.rows, positions, workers=settings["workers"], address=settings["address"]
     )
-    with closing(progress(engine, many(len(work.whole), "frame"), len(positions))) as answers:  # type: ignore[type-var]
+    with closing(progress(engine, format_count(len(work.whole), "frame"), len(positions))) as answers:  # type: ignore[type-var]
         for k, each in todo.items():
             for piece in (piece for files in each.values() for piece in files if piece.name not in done):
                 made = islice(answers, len(piece.rows))
-                kept = engines.kept(made, settings["on_error"], work.rows, complaints, "on_error=flag")
-                shards.write(work.waiting, piece, kept, work.rows.wanted, work.shared)
-            files = {_key(work, n): [work.waiting / p.name for p in own_pieces] for n, own_pieces in each.items()}
+                kept = engines.filter_rows(made, settings["on_error"], work.rows, complaints, "on_error=flag")
+                shards.write_shard(work.waiting, piece, kept, work.rows.wanted, work.shared)
+            files = {
+                _camera_key(work, n): [work.waiting / p.name for p in own_pieces] for n, own_pieces in each.items()
+            }
             owns[k] = work.target.assemble(k, [own for own in owns[:k] if own is not None], files)
             for path in (path for paths in files.values() for path in paths):
                 path.unlink(missing_ok=True)
@@ -149,24 +151,24 @@ def _make(work: Work, settings: Mapping[str, Any], progress: Progress) -> tuple[
     return before, every_own, complaints
 
 
-def _work(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> Work:
-    scenes, method = cut.cut(scenes_of(parts["data"]), settings["frames"]), parts["method"]
-    whole = plan.make(scenes, settings["gap"], method.views, rigs=True)
+def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJob:
+    scenes, method = cut.truncate_scenes(scenes_of(parts["data"]), settings["frames"]), parts["method"]
+    whole = plan.make_plan(scenes, settings["gap"], method.views, rigs=True)
     out = Path(str(settings["out"])).expanduser()
     for root in whole.roots:
         if out.resolve().is_relative_to(root.resolve()) or (root.is_file() and out.resolve() == root.resolve()):
             raise ValueError(f"out: found {out} inside the source {root}, which is only read; expected another folder")
-    asked = dense.options(settings["dense"], "dense")
-    first = [scenes[whole.order[n]] for n in _episodes(whole)[0]]
-    size = _SIZE if asked is None else asked["size"]
-    views = {v.key: v for v in (View.of(scene, size) for scene in first)}
+    asked = dense.dense_options(settings["dense"], "dense")
+    first = [scenes[whole.order[n]] for n in _group_by_episode(whole)[0]]
+    size = _SAMPLED_MAP_SIDE_PX if asked is None else asked["size"]
+    views = {v.key: v for v in (DatasetCamera.of(scene, size) for scene in first)}
     _check_views(settings, first, views)
-    format = _format(settings["format"], first)
+    format = _resolve_format(settings["format"], first)
     found = scenes, whole, views
-    origin = None if FORMATS[format] is None else _origin(settings, found)
+    origin = None if _OUTPUT_FORMATS[format] is None else _open_origin(settings, found)
     wanted = map_columns(pictures=origin is None)
-    shared = _described(settings, whole, wanted)
-    rows = MapRows(
+    shared = _build_metadata(settings, whole, wanted)
+    rows = MapRowDataset(
         scenes,
         whole,
         wanted,
@@ -180,14 +182,16 @@ def _work(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> Work:
         dense=settings["dense"],
         **_pose_options(settings),
     )
-    target = _target(settings, found, out, format, shared["key"], origin)
+    target = _open_target(settings, found, out, format, shared["key"], origin)
     notes = []
-    if FORMATS[format] is not None and settings["fps"] is None and not knows_rate(first[0].recording):
-        notes.append(f"no frame rate is known: time stamps are for {NO_RATE:g} frames a second (fps=N tells)")
-    return Work(out=out, scenes=scenes, whole=whole, views=views, target=target, shared=shared, rows=rows, notes=notes)
+    if _OUTPUT_FORMATS[format] is not None and settings["fps"] is None and not has_frame_rate(first[0].recording):
+        notes.append(f"no frame rate is known: time stamps are for {DEFAULT_FPS:g} frames a second (fps=N tells)")
+    return EnrichJob(
+        out=out, scenes=scenes, whole=whole, views=views, target=target, shared=shared, rows=rows, notes=notes
+    )
 
 
-def _check_views(settings: Mapping[str, Any], first: Sequence[Scene], views: Mapping[str, View]) -> None:
+def _check_views(settings: Mapping[str, Any], first: Sequence[Scene], views: Mapping[str, DatasetCamera]) -> None:
     """Raises ValueError for what the cameras of an episode cannot be asked."""
     names = ", ".join(scene.name for scene in first)
     if len(views) < len(first):
@@ -195,7 +199,7 @@ def _check_views(settings: Mapping[str, Any], first: Sequence[Scene], views: Map
     if any(isinstance(scene.recording, Rig) for scene in first):
         raise ValueError(f"data: found a rig ({names}), expected its cameras apart (cameras=true joins them)")
     sizes = {view.hw for view in views.values()}
-    if settings["cameras"] and (len(views) < 2 or len(sizes) > 1 or settings["gap"] != plan.CHOICE):
+    if settings["cameras"] and (len(views) < 2 or len(sizes) > 1 or settings["gap"] != plan.AUTO_GAP):
         seen = " and ".join(f"{w}x{h}" for h, w in sorted(sizes))
         found = f"{len(views)} of {seen} pixels, gap={settings['gap']}"
         raise ValueError(f"cameras: found {found}, expected two or more of one size in an episode, and gap=auto")
@@ -211,37 +215,39 @@ def _pose_options(settings: Mapping[str, Any]) -> Row:
     return {"pose": "pose", "pose_cov": settings["pose_sigma"], "refine": settings["pose"] == "start"}
 
 
-def _origin(settings: Mapping[str, Any], found: tuple[Sequence[Scene], plan.Plan, dict[str, View]]) -> Origin | None:
+def _open_origin(
+    settings: Mapping[str, Any], found: tuple[Sequence[Scene], plan.ExtractionPlan, dict[str, DatasetCamera]]
+) -> DatasetSource | None:
     """The data set with columns of its own that the recordings are of."""
     scenes, whole, _ = found
-    groups = _episodes(whole)
+    groups = _group_by_episode(whole)
     recording, numbers = scenes[whole.order[0]].recording, [whole.episodes[group[0]] for group in groups]
     if recording.format == "lerobot" and recording.root is not None:
-        return RobotSet.open(recording.root, numbers, limit=settings["frames"], bounds=recording.bounds)
+        return LeRobotSource.open(recording.root, numbers, limit=settings["frames"], bounds=recording.bounds)
     if recording.format == "rlds":
-        each = cut.Chosen(scenes, tuple(whole.order[group[0]] for group in groups))
-        return StepSet(each, numbers, settings["fps"] or rate(recording), settings["frames"])
+        each = cut.SelectedRecordings(scenes, tuple(whole.order[group[0]] for group in groups))
+        return RldsSource(each, numbers, settings["fps"] or frame_rate(recording), settings["frames"])
     return None
 
 
-def _target(
+def _open_target(
     settings: Mapping[str, Any],
-    found: tuple[Sequence[Scene], plan.Plan, dict[str, View]],
+    found: tuple[Sequence[Scene], plan.ExtractionPlan, dict[str, DatasetCamera]],
     out: Path,
     format: str,
     key: str,
-    origin: Origin | None,
-) -> Target:
+    origin: DatasetSource | None,
+) -> DatasetTarget:
     scenes, whole, views = found
-    version, of_episode = FORMATS[format], _episodes(whole)
+    version, of_episode = _OUTPUT_FORMATS[format], _group_by_episode(whole)
     if version is None:
         unposed = [v.name for v in views.values() if not v.posed]
         if unposed:
             raise ValueError(f"format=nerfstudio: found no poses of {', '.join(unposed)}, expected a posed recording")
-        return NerfTarget(out, views, _folders(scenes, whole, of_episode), key)
+        return NerfstudioTarget(out, views, _name_folders(scenes, whole, of_episode), key)
     recording = scenes[whole.order[0]].recording
-    fps = rate(recording) if origin is None else origin.fps
-    return RobotTarget(
+    fps = frame_rate(recording) if origin is None else origin.fps
+    return LeRobotTarget(
         out,
         version,
         views,
@@ -255,7 +261,9 @@ def _target(
     )
 
 
-def _folders(scenes: Sequence[Scene], whole: plan.Plan, groups: Sequence[Sequence[int]]) -> list[dict[str, str]]:
+def _name_folders(
+    scenes: Sequence[Scene], whole: plan.ExtractionPlan, groups: Sequence[Sequence[int]]
+) -> list[dict[str, str]]:
     """Name of the folder of each recording, by episode and then by camera; of the only one empty."""
     found: list[dict[str, str]] = []
     seen: set[str] = set()
@@ -272,7 +280,7 @@ def _folders(scenes: Sequence[Scene], whole: plan.Plan, groups: Sequence[Sequenc
     return found
 
 
-def _format(asked: str, first: Sequence[Scene]) -> str:
+def _resolve_format(asked: str, first: Sequence[Scene]) -> str:
     """The format to write.
 
     Raises:
@@ -282,36 +290,48 @@ def _format(asked: str, first: Sequence[Scene]) -> str:
         return asked
     kind, root = first[0].recording.format, first[0].root
     if kind != "lerobot" or root is None:
-        raise ValueError(f"format=same: found {kind}, which has no writer here; expected {', '.join(FORMATS)}")
-    return "v2.1" if RobotSet.open(root, [first[0].recording.episode or 0]).meta.version == 2 else "lerobot"
+        raise ValueError(f"format=same: found {kind}, which has no writer here; expected {', '.join(_OUTPUT_FORMATS)}")
+    return "v2.1" if LeRobotSource.open(root, [first[0].recording.episode or 0]).meta.version == 2 else "lerobot"
 
 
-def _described(settings: Mapping[str, Any], whole: plan.Plan, wanted: Mapping[str, columns.Column]) -> Row:
+def _build_metadata(
+    settings: Mapping[str, Any], whole: plan.ExtractionPlan, wanted: Mapping[str, columns.Column]
+) -> Row:
     """What all files of the set have in common, and their key."""
-    config = {k: settings[k] for k in KEYED}
-    files = {**archive.files_below(whole.roots), **archive.files_named({k: settings[k] for k in ("data", "method")})}
-    digest = archive.data_digest(files)
-    made = archive.meta(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
+    config = {k: settings[k] for k in _KEY_OPTIONS}
+    files = {
+        **result_files.list_files_below(whole.roots),
+        **result_files.list_files_named({k: settings[k] for k in ("data", "method")}),
+    }
+    digest = result_files.compute_data_digest(files)
+    made = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
     name = settings["choices"]["data"]
     source = whole.roots[0].resolve().name if whole.roots else name
-    found: Row = storage.strict(
+    found: Row = storage.to_strict_json(
         {
-            "format": FORMAT,
+            "format": _FORMAT_VERSION,
             "version": made["versions"]["dhtorch"],
             "git": made["git"],
-            "key": archive.result_key({**config, "name": name, "files": FORMAT}, digest, roots=[MapRows.__module__]),
-            "config": archive.portable(config),
+            "key": result_files.compute_result_key(
+                {**config, "name": name, "files": _FORMAT_VERSION}, digest, roots=[MapRowDataset.__module__]
+            ),
+            "config": result_files.make_portable(config),
             "method": settings["choices"]["method"],
             "data": {"name": name, "source": source, "digest": digest, "frames": len(whole)},
             "step_m": settings["step"],
             "columns": {k: c._asdict() for k, c in wanted.items()},
-            "codes": {**columns.code_tables(), "source": names(Source), "gate": names(Gate), "silent": SILENCE},
+            "codes": {
+                **columns.code_tables(),
+                "source": names(Source),
+                "gate": names(Gate),
+                "silent": NO_ANSWER_REASONS,
+            },
         }
     )
     return found
 
 
-def _take_up(work: Work) -> None:
+def _prepare_folder(work: EnrichJob) -> None:
     """The folder, ready for what is missing.
 
     Raises:
@@ -319,14 +339,14 @@ def _take_up(work: Work) -> None:
     """
     if work.out.exists() and not work.out.is_dir():
         raise NotADirectoryError(f"out: {work.out} is a file, expected a folder, or a place for one")
-    about = work.out / "meta" / _SHARED
-    storage.clear(about)  # who was killed while it was written left nothing else
+    about = work.out / "meta" / _METADATA_FILE
+    storage.remove_unfinished_files(about)  # who was killed while it was written left nothing else
     if about.is_file():
-        other = storage.loads(about.read_text(encoding="utf-8"))
+        other = storage.parse_strict_json(about.read_text(encoding="utf-8"))
         if other["key"] != work.shared["key"]:
-            what = archive.difference(other, work.shared)
+            what = result_files.describe_difference(other, work.shared)
             raise FileExistsError(f"{work.out}: found another enriched set ({what}), expected another folder for out")
-    elif storage.filled(work.out):
+    elif storage.has_files(work.out):
         raise FileExistsError(f"{work.out}: found a folder that holds something else, expected an empty or a new one")
     else:
         storage.write_json(about, work.shared)
@@ -335,7 +355,7 @@ def _take_up(work: Work) -> None:
     work.waiting.mkdir(exist_ok=True)
 
 
-def _episodes(whole: plan.Plan) -> list[list[int]]:
+def _group_by_episode(whole: plan.ExtractionPlan) -> list[list[int]]:
     """Recordings, as places in the plan, by episode."""
     found: dict[int, list[int]] = {}
     for n, number in enumerate(whole.episodes):
@@ -343,38 +363,47 @@ def _episodes(whole: plan.Plan) -> list[list[int]]:
     return list(found.values())
 
 
-def _pieces(every: Sequence[plan.Shard], whole: plan.Plan, group: Sequence[int]) -> dict[int, list[plan.Shard]]:
+def _group_shards(
+    every: Sequence[plan.ShardSpec], whole: plan.ExtractionPlan, group: Sequence[int]
+) -> dict[int, list[plan.ShardSpec]]:
     """Place of a recording in the plan → its shards."""
     spans = whole.spans
     return {n: [p for p in every if spans[n].start <= p.rows.start < spans[n].stop] for n in group}
 
 
-def _key(work: Work, n: int) -> str:
+def _camera_key(work: EnrichJob, n: int) -> str:
     return camera_key(work.scenes[work.whole.order[n]].recording)
 
 
 # ------------------------------------------------------------------------------------------------------ what is said
 
 
-def _said(work: Work, owns: Sequence[Row], before: int, complaints: Sequence[str]) -> list[str]:
+def _format_summary(work: EnrichJob, owns: Sequence[Row], before: int, complaints: Sequence[str]) -> list[str]:
     """The whole in words."""
     size = sum(path.stat().st_size for path in work.out.rglob("*") if path.is_file())
     frames = sum(own["length"] for own in owns)
     left = f" ({before} left untouched)" if before else ""
-    lines = [f"{work.out}: {many(len(owns), 'episode')}{left}, {many(frames, 'frame')}, {size / 1e6:.1f} MB"]
-    for name, shares, reasons in enrich_page.by_camera(owns):
+    lines = [
+        f"{work.out}: {format_count(len(owns), 'episode')}{left}, {format_count(frames, 'frame')}, {size / 1e6:.1f} MB"
+    ]
+    for name, shares, reasons in enrich_page.summarise_cameras(owns):
         kinds = ", ".join(f"{kind} {share:.1%}" for kind, share in shares.items())
         why = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())
         lines.append(f"  {name}: {kinds}" + (f" ({why})" if why else ""))
-    lines += [f"  {line}" for line in (*enrich_page.refuted(owns), *work.notes)]
-    lines += [f"  {complaint}" for complaint in complaints[:_SHOWN]]
-    lines += [f"  and {len(complaints) - _SHOWN} more frames"] if len(complaints) > _SHOWN else []
+    lines += [f"  {line}" for line in (*enrich_page.describe_refuted_poses(owns), *work.notes)]
+    lines += [f"  {complaint}" for complaint in complaints[:_MAX_COMPLAINTS]]
+    lines += [f"  and {len(complaints) - _MAX_COMPLAINTS} more frames"] if len(complaints) > _MAX_COMPLAINTS else []
     return lines
 
 
-def _check(settings: Mapping[str, Any]) -> None:
+def _check_options(settings: Mapping[str, Any]) -> None:
     """Options that would only fail after minutes."""
-    known = {"format": (*FORMATS, "same"), "engine": engines.ENGINES, "on_error": ("raise", "flag"), "pose": POSES}
+    known = {
+        "format": (*_OUTPUT_FORMATS, "same"),
+        "engine": engines.ENGINES,
+        "on_error": ("raise", "flag"),
+        "pose": _POSE_SOURCES,
+    }
     for name, among in known.items():
         if settings[name] not in among:
             raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(among)}")
@@ -384,13 +413,13 @@ def _check(settings: Mapping[str, Any]) -> None:
     for name, low in (("workers", 0), ("shard_rows", 1), ("gap", 0)):
         value = settings[name]
         whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
-        if not whole and not (name == "gap" and value == plan.CHOICE):
+        if not whole and not (name == "gap" and value == plan.AUTO_GAP):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
     if settings["frames"] is not None and not (isinstance(settings["frames"], int) and settings["frames"] >= 1):
         raise ValueError(f"frames: found {settings['frames']!r}, expected a whole number of at least 1, or null")
     if settings["pose_sigma"] is not None and settings["pose"] == "near":
         raise ValueError(f"pose_sigma: found {settings['pose_sigma']} with pose=near, expected pose=device or start")
-    given.sigmas(settings["pose_sigma"], "pose_sigma")
+    poses.parse_pose_sigmas(settings["pose_sigma"], "pose_sigma")
     for name, high in (("step", 1.0), ("fps", 1e4)):
         value = settings[name]
         least = 0.0 if name == "step" else 1e-4

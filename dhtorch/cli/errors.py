@@ -6,13 +6,13 @@ from __future__ import annotations
 USER_ERRORS = (ValueError, OSError, KeyError, ImportError)
 
 
-def cause(error: BaseException) -> BaseException:
+def unwrap_cause(error: BaseException) -> BaseException:
     """What a part of the settings raised while Hydra built it."""
     named = type(error).__name__ == "InstantiationException"
     return error.__cause__ if named and error.__cause__ else error
 
 
-def line(error: BaseException) -> str:
+def format_error(error: BaseException) -> str:
     """An error in one line."""
     lines = [line for line in str(error).splitlines() if line.strip()]
     if any("Original Traceback" in line for line in lines):  # a data-loader worker sends its whole traceback along
@@ -26,9 +26,11 @@ def line(error: BaseException) -> str:
         return f"{error.filename}: {error.strerror}"
     if isinstance(error, KeyError) and len(error.args) == 1:
         return str(error.args[0])
-    return message if isinstance(error, USER_ERRORS) or _from_settings(error) else f"{type(error).__name__}: {message}"
+    return (
+        message if isinstance(error, USER_ERRORS) or _is_settings_error(error) else f"{type(error).__name__}: {message}"
+    )
 
 
-def _from_settings(error: BaseException) -> bool:
+def _is_settings_error(error: BaseException) -> bool:
     """What Hydra says of settings names the option itself."""
     return type(error).__module__.startswith(("hydra.", "omegaconf."))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dhtorch.codes import Gate, names, words
 
 #: Reason of silence → what it means and what would help; of others nothing would.
-HELP = {
+_MEANING_AND_REMEDY = {
     Gate.NO_BASELINE: (
         "the camera only turned or stood still",
         "moving it sideways by a tenth of the distance would help",
@@ -21,7 +21,7 @@ HELP = {
 }
 
 #: Reason of silence that no help belongs to → what it means.
-MEANING = {
+_MEANINGS = {
     Gate.NO_TEXTURE: "blank surfaces, on which nothing can be followed",
     Gate.BEHIND: "what would lie behind a camera",
     Gate.PARALLAX: "seen from nearly the same direction in all views",
@@ -31,20 +31,20 @@ MEANING = {
 }
 
 #: What no gate says → what it means.
-_FURTHER = {"unfit": "farther than the files can say", "no_other_view": "there was no other view"}
+_OTHER_MEANINGS = {"unfit": "farther than the files can say", "no_other_view": "there was no other view"}
 
-_BY_NAME = {name.lower(): code for code, name in names(Gate).items()}
+_GATE_CODES = {name.lower(): code for code, name in names(Gate).items()}
 
 
-def meaning(name: str) -> str:
+def describe_gate(name: str) -> str:
     """What a reason means; ``name`` is a gate's, as code tables or files write it, or of what no gate says."""
-    code = _BY_NAME.get(name.lower())
+    code = _GATE_CODES.get(name.lower())
     if code is None:
-        return _FURTHER.get(name.lower(), words(name.upper()))
-    return HELP[code][0] if code in HELP else MEANING.get(code, words(name.upper()))
+        return _OTHER_MEANINGS.get(name.lower(), words(name.upper()))
+    return _MEANING_AND_REMEDY[code][0] if code in _MEANING_AND_REMEDY else _MEANINGS.get(code, words(name.upper()))
 
 
-def advice(name: str) -> str | None:
+def suggest_remedy(name: str) -> str | None:
     """What a reason means and what would help; None where nothing would."""
-    code = _BY_NAME.get(name.lower())
-    return "; ".join(HELP[code]) if code in HELP else None
+    code = _GATE_CODES.get(name.lower())
+    return "; ".join(_MEANING_AND_REMEDY[code]) if code in _MEANING_AND_REMEDY else None

@@ -17,24 +17,24 @@ from dhtorch.data import scenes_of
 from dhtorch.data.io import decode as data_files
 from dhtorch.data.scene import Scene
 from dhtorch.experiments import report
-from dhtorch.experiments.focal.stacks import Stacks
+from dhtorch.experiments.focal.stacks import FocalStacks
 from dhtorch.experiments.pictures import draw_example
 from dhtorch.experiments.protocol import MIN_CANDIDATES, Outcome, Settings
 from dhtorch.runtime import console, storage
-from dhtorch.runtime import results as archive
-from dhtorch.runtime.console import many
+from dhtorch.runtime import results as result_files
+from dhtorch.runtime.console import format_count
 
 _LOG = logging.getLogger(__name__)
 
 #: File beside a result that says where its data lie.
-PLACE = "data_root.txt"
+DATA_ROOT_FILE = "data_root.txt"
 
 #: The settings groups; their names enter the key of a result.
-GROUPS = ("method", "data", "pairs", "holdout", "experiment")
+SETTINGS_GROUPS = ("method", "data", "pairs", "holdout", "experiment")
 
 
 @dataclass(frozen=True)
-class Ended:
+class JobStatus:
     """How a job ended."""
 
     folder: str
@@ -50,7 +50,7 @@ def run(
     *,
     progress: Callable[[Iterable[Any], str, int], Iterable[Any]],
     swept: bool = False,
-) -> Ended:
+) -> JobStatus:
     """Run the experiment and write ``folder/result.json``, unless resuming finds the same one there already.
 
     Args:
@@ -67,41 +67,43 @@ def run(
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
         data_files.set_opencv_threads(settings["threads"])
-    names = {group: choices[group] for group in GROUPS}
-    asked = _asked(parts["data"])
-    digest = archive.data_digest({**_files(asked), **_named_files(settings)})
-    key = archive.result_key({**settings, "choices": names}, digest)
+    names = {group: choices[group] for group in SETTINGS_GROUPS}
+    asked = _resolve_data(parts["data"])
+    digest = result_files.compute_data_digest({**_list_data_files(asked), **_list_settings_files(settings)})
+    key = result_files.compute_result_key({**settings, "choices": names}, digest)
     target = folder / "result.json"
     for each in asked if _LOG.isEnabledFor(logging.DEBUG) else ():
         what = each.recording if isinstance(each, Scene) else each
         _LOG.debug("data: %s, %d of %s", each.name, len(what), what.format)
     _LOG.debug("digest %s, key %s", digest, key)
-    storage.clear(target)
-    if settings["resume"] and archive.finished(target, key):
+    storage.remove_unfinished_files(target)
+    if settings["resume"] and result_files.is_finished(target, key):
         print(f"{target}: finished and valid, left untouched")
-        return Ended(str(folder), "untouched")
+        return JobStatus(str(folder), "untouched")
     methods = {names["method"]: parts["method"]}
-    outcome = parts["experiment"](asked, methods, parts["pairs"], _common(settings), progress=progress)
+    outcome = parts["experiment"](asked, methods, parts["pairs"], _make_pair_settings(settings), progress=progress)
     _LOG.debug("%d pairs answered", outcome.n_pairs)
     examples = outcome.examples if settings["figures"] else []
     drawn = [path for example in examples for path in draw_example(folder / example.scene, example)]
     scenes = [each.name for each in asked]
     data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
-    result = _result(settings, names["experiment"], key, data, outcome)
-    _remember(folder, settings)
-    archive.write(target, result)
-    _show(result, [target, *drawn], swept=swept)
-    return Ended(str(folder), "finished")
+    result = _build_result(settings, names["experiment"], key, data, outcome)
+    _write_data_root(folder, settings)
+    result_files.write_result(target, result)
+    _print_result(result, [target, *drawn], swept=swept)
+    return JobStatus(str(folder), "finished")
 
 
-def _result(
+def _build_result(
     settings: Mapping[str, Any], experiment: str, key: str, data: Mapping[str, Any], outcome: Outcome
 ) -> dict[str, Any]:
     threads = torch.get_num_threads()
-    return archive.build(
+    return result_files.build_result(
         experiment=experiment,
         key=key,
-        meta=archive.meta(device=settings["device"], dtype=settings["dtype"], threads=threads, seed=settings["seed"]),
+        meta=result_files.collect_run_metadata(
+            device=settings["device"], dtype=settings["dtype"], threads=threads, seed=settings["seed"]
+        ),
         config=settings,
         data=data,
         summary=outcome.summary,
@@ -113,23 +115,23 @@ def _result(
     )
 
 
-def _remember(folder: Path, settings: Mapping[str, Any]) -> None:
+def _write_data_root(folder: Path, settings: Mapping[str, Any]) -> None:
     """Where the data lie on this machine: beside the result, which names none."""
     root = settings["data"].get("root") if isinstance(settings["data"], Mapping) else None
     if root is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / PLACE).write_text(f"{Path(root).resolve()}\n", encoding="utf-8")
+        (folder / DATA_ROOT_FILE).write_text(f"{Path(root).resolve()}\n", encoding="utf-8")
 
 
-def _show(result: Mapping[str, Any], written: Sequence[Path], *, swept: bool) -> None:
+def _print_result(result: Mapping[str, Any], written: Sequence[Path], *, swept: bool) -> None:
     """The first look; all tables where much is to be said, none of a job of a sweep, which has a table at its end."""
-    if console.verbosity() == "verbose":
+    if console.get_verbosity() == "verbose":
         report.print_tables(result)
     elif not swept:
         report.print_brief(result)
     few = {r["scene"]: r["n_few"] for r in result["rows"] if r["pair"] is None and r.get("n_few")}
     for scene, n in few.items() if not swept else ():
-        print(f"{scene}: {many(n, 'pair')} dropped, fewer than {MIN_CANDIDATES} candidates each")
+        print(f"{scene}: {format_count(n, 'pair')} dropped, fewer than {MIN_CANDIDATES} candidates each")
     if result["verdict"]:
         print(f"{result['verdict']}: {result['why']}")
     advice = report.advice(result)
@@ -138,11 +140,11 @@ def _show(result: Mapping[str, Any], written: Sequence[Path], *, swept: bool) ->
         end="\n" * bool(advice),
     )
     beside = len(written) - 1
-    more = f" and {many(beside, 'picture')} and points beside it" if beside else ""
+    more = f" and {format_count(beside, 'picture')} and points beside it" if beside else ""
     print(f"wrote {written[0]}{more}")
 
 
-def _common(settings: Mapping[str, Any]) -> Settings:
+def _make_pair_settings(settings: Mapping[str, Any]) -> Settings:
     """The options that every pair of the job shares."""
     dtype = getattr(torch, str(settings["dtype"]), None)
     if dtype not in (torch.float32, torch.float64):
@@ -165,19 +167,19 @@ def _common(settings: Mapping[str, Any]) -> Settings:
     )
 
 
-def _asked(data: Any) -> Sequence[Scene] | Sequence[Stacks]:
+def _resolve_data(data: Any) -> Sequence[Scene] | Sequence[FocalStacks]:
     """What the data of a job are: scenes, or focal stacks for the experiments that read them."""
     given = data if isinstance(data, list) else [data]
-    if given and all(isinstance(each, Stacks) for each in given):
+    if given and all(isinstance(each, FocalStacks) for each in given):
         return given
     return scenes_of(data)
 
 
-def _files(asked: Iterable[Scene | Stacks]) -> dict[str, Path]:
+def _list_data_files(asked: Iterable[Scene | FocalStacks]) -> dict[str, Path]:
     """Name → file of all data below their folders."""
-    return archive.files_below(each.root for each in asked)
+    return result_files.list_files_below(each.root for each in asked)
 
 
-def _named_files(settings: Mapping[str, Any]) -> dict[str, Path]:
+def _list_settings_files(settings: Mapping[str, Any]) -> dict[str, Path]:
     """Option → file that the settings of a group name."""
-    return archive.files_named({k: settings[k] for k in GROUPS})
+    return result_files.list_files_named({k: settings[k] for k in SETTINGS_GROUPS})

@@ -21,7 +21,7 @@ import torch
 from dhtorch import export
 from dhtorch.codes import Source
 from dhtorch.data.recording import Recording
-from dhtorch.export.frames import LAST, SIGMA_STEPS
+from dhtorch.export.frames import MAX_DEPTH_CODE, SIGMA_STEPS_PER_DEPTH_STEP
 from dhtorch.geometry.camera import from_matrix
 from dhtorch.records import Camera
 from dhtorch.runtime import storage
@@ -30,16 +30,16 @@ from dhtorch.runtime import storage
 Row = Mapping[str, Any]
 
 #: Step of depth where a sensor sees farther than steps of a millimetre reach.
-SPARSE_UNIT = 0.005
+_SPARSE_DEPTH_STEP_M = 0.005
 
 #: What a Stray capture says of a depth, by codes.Source.
-CONFIDENCE = {Source.NONE: 0, Source.SENSOR: 2, Source.RECOVERED: 1, Source.SWEPT: 1, Source.ANCHORED: 1}
+_STRAY_CONFIDENCE = {Source.NONE: 0, Source.SENSOR: 2, Source.RECOVERED: 1, Source.SWEPT: 1, Source.ANCHORED: 1}
 
 #: Files of a Stray capture that hold for whatever depth it has.
-STRAY_FILES = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")
+_STRAY_FILES = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")
 
 #: Kind of file → how its name ends; pictures otherwise.
-ENDINGS = {"meta": ".json", "arrays": ".npz"}
+_FILE_SUFFIXES = {"meta": ".json", "arrays": ".npz"}
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ class Layout:
     @property
     def sigma_unit(self) -> float:
         """m, a step of sigma."""
-        return self.unit / SIGMA_STEPS
+        return self.unit / SIGMA_STEPS_PER_DEPTH_STEP
 
     @property
     def reach(self) -> float:
         """m, the largest depth that it holds."""
-        return self.unit * LAST
+        return self.unit * MAX_DEPTH_CODE
 
     def stem(self, recording: Recording, i: int) -> str:
         """Name of the files of a frame."""
@@ -78,22 +78,24 @@ class Layout:
 
     def file(self, folder: Path, kind: str, stem: str) -> Path:
         """A file of a frame."""
-        return folder / kind / f"{stem}{ENDINGS.get(kind, '.png')}"
+        return folder / kind / f"{stem}{_FILE_SUFFIXES.get(kind, '.png')}"
 
     def close(self, folder: Path, recording: Recording, frames: Sequence[int], rows: Sequence[Row]) -> None:
         """Write what makes the frames (positions, with their meta files) a recording."""
         poses = None if recording.poses is None else recording.poses[torch.tensor(frames)]
         if self.name == "frames" and poses is not None:
-            export.write_numbered(folder, _camera(rows[0]), poses, unit=self.unit, fps=_rate(recording))
+            export.write_frames_dir_metadata(
+                folder, _read_camera(rows[0]), poses, unit=self.unit, fps=_frame_rate(recording)
+            )
         elif self.name == "tum":
             stamps = [self.stem(recording, i) for i in frames]
-            export.write_stamped(folder, _camera(rows[0]), stamps, poses)
+            export.write_tum_metadata(folder, _read_camera(rows[0]), stamps, poses)
         elif self.name == "stray" and recording.root is not None:
-            for name in STRAY_FILES:
+            for name in _STRAY_FILES:
                 storage.copy_file(recording.root / name, folder / name)
 
 
-LAYOUTS = {
+FRAME_LAYOUTS = {
     "frames": Layout("frames", 0.001, pictures="images"),
     "tum": Layout("tum", 0.0002, pictures="rgb", stamped=True),
     "stray": Layout("stray", 0.001, confidence=True),
@@ -101,15 +103,15 @@ LAYOUTS = {
 }
 
 #: Format of a recording → its own layout; ``frames`` for all others.
-OWN = {"tum": "tum", "stray": "stray"}
+_LAYOUT_OF_FORMAT = {"tum": "tum", "stray": "stray"}
 
 
-def layout_of(recording: Recording, wanted: str, unit: float | None, *, same: bool, arrays: bool = False) -> Layout:
+def select_layout(recording: Recording, wanted: str, unit: float | None, *, same: bool, arrays: bool = False) -> Layout:
     """The layout for the maps of a recording.
 
     Args:
         recording: whose frames are completed.
-        wanted: a name of ``LAYOUTS``, or ``auto``: the recording's own, else ``frames``, else ``png``.
+        wanted: a name of ``FRAME_LAYOUTS``, or ``auto``: the recording's own, else ``frames``, else ``png``.
         unit: m, a step of depth. None = the layout's own.
         same: whether the maps are of the pictures' size.
         arrays: whether there are arrays, too.
@@ -117,31 +119,31 @@ def layout_of(recording: Recording, wanted: str, unit: float | None, *, same: bo
     Raises:
         ValueError: a layout that cannot hold this recording, or another unit than its reader takes.
     """
-    names = [OWN.get(recording.format, "frames"), "frames", "png"] if wanted == "auto" else [wanted]
-    missing = {name: _missing(name, recording, same) for name in names}
+    names = [_LAYOUT_OF_FORMAT.get(recording.format, "frames"), "frames", "png"] if wanted == "auto" else [wanted]
+    missing = {name: _find_lack(name, recording, same) for name in names}
     if missing[names[-1]]:
         raise ValueError(f"format={wanted}: {recording.name} {missing[names[-1]]}; format=auto takes what fits")
-    layout = LAYOUTS[next(name for name in names if not missing[name])]
+    layout = FRAME_LAYOUTS[next(name for name in names if not missing[name])]
     if layout.name == "stray" and unit not in (None, layout.unit):
         raise ValueError(f"unit: found {unit}, expected {layout.unit} m, the only one of format=stray")
     if recording.sparse and layout.name in ("frames", "png"):
-        layout = replace(layout, unit=SPARSE_UNIT)
+        layout = replace(layout, unit=_SPARSE_DEPTH_STEP_M)
     return replace(layout, unit=layout.unit if unit is None else unit, arrays=arrays)
 
 
-def confident(source: np.ndarray) -> np.ndarray:
+def stray_confidence(source: np.ndarray) -> np.ndarray:
     """Confidence uint8 of a Stray capture of codes.Source, any shape."""
-    table = np.zeros(max(CONFIDENCE) + 1, np.uint8)
-    table[list(CONFIDENCE)] = list(CONFIDENCE.values())
+    table = np.zeros(max(_STRAY_CONFIDENCE) + 1, np.uint8)
+    table[list(_STRAY_CONFIDENCE)] = list(_STRAY_CONFIDENCE.values())
     return table[source]
 
 
-def own_cameras(rows: Sequence[Row]) -> bool:
+def has_varying_camera(rows: Sequence[Row]) -> bool:
     """Whether the camera differs from frame to frame, so that one K cannot speak for all."""
     return any((row["K"], row["distortion"]) != (rows[0]["K"], rows[0]["distortion"]) for row in rows)
 
 
-def _missing(name: str, recording: Recording, same: bool) -> str | None:
+def _find_lack(name: str, recording: Recording, same: bool) -> str | None:
     """What a recording lacks for a layout, in words."""
     if name == "frames":
         poses = recording.poses
@@ -156,13 +158,13 @@ def _missing(name: str, recording: Recording, same: bool) -> str | None:
     return None
 
 
-def _camera(row: Row) -> Camera:
+def _read_camera(row: Row) -> Camera:
     """Of the map of a frame."""
     lens = None if row["distortion"] is None else torch.tensor([row["distortion"]])
     return from_matrix(torch.tensor([row["K"]]), lens)
 
 
-def _rate(recording: Recording) -> float | None:
+def _frame_rate(recording: Recording) -> float | None:
     """Frames per second where the numbers and this rate give the very time stamps."""
     rate, times = recording.rate_hz, recording.times
     steady = rate is not None and times is not None and torch.allclose(recording.number.double() / rate, times)

@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from types import FrameType
 
 #: Signals that end the command in order.
-_ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+_TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
-class Told:
+class ReceivedSignal:
     """The signal that ended a call, if any."""
 
     number: int | None = None
@@ -27,12 +27,12 @@ class Told:
 
 
 @contextlib.contextmanager
-def ending() -> Iterator[Told]:
+def catch_termination() -> Iterator[ReceivedSignal]:
     """Meanwhile the first SIGTERM or SIGHUP raises KeyboardInterrupt; further ones do not disturb the tidying up.
 
     A signal that the caller ignores stays ignored (``nohup``); outside the main thread nothing is changed.
     """
-    told = Told()
+    told = ReceivedSignal()
 
     def tell(number: int, _frame: FrameType | None) -> None:
         if told.number is None:
@@ -41,17 +41,17 @@ def ending() -> Iterator[Told]:
 
     before = {}
     if threading.current_thread() is threading.main_thread():
-        before = {n: signal.signal(n, tell) for n in _ENDING if signal.getsignal(n) is not signal.SIG_IGN}
+        before = {n: signal.signal(n, tell) for n in _TERMINATION_SIGNALS if signal.getsignal(n) is not signal.SIG_IGN}
     try:
         yield told
     finally:
         if told.number is not None:
-            end_pool()
+            _shutdown_worker_pool()
         for number, handler in before.items():
             signal.signal(number, handler)
 
 
-def end_pool() -> None:
+def _shutdown_worker_pool() -> None:
     """End the processes of joblib's launcher, where there are any: they outlive a call."""
     pool = sys.modules.get("joblib.externals.loky.reusable_executor")
     executor = getattr(pool, "_executor", None)

@@ -17,7 +17,7 @@ from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
 from dhtorch.pipeline.stream import Stream
 from dhtorch.runtime import storage
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
@@ -36,14 +36,14 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
         files.set_opencv_threads(settings["threads"])
-    found = [streamed(scene, parts["method"], settings, progress=progress) for scene in scenes_of(parts["data"])]
+    found = [stream_scene(scene, parts["method"], settings, progress=progress) for scene in scenes_of(parts["data"])]
     path = storage.write_json(Path(settings["output"]) / "stream.json", {"scenes": found})
-    print("\n".join(_said(scene) for scene in found))
+    print("\n".join(_format_summary(scene) for scene in found))
     print(f"wrote\n  {path}")
     return 0
 
 
-def streamed(scene: Scene, method: Method, settings: Mapping[str, Any], *, progress: Progress) -> Row:
+def stream_scene(scene: Scene, method: Method, settings: Mapping[str, Any], *, progress: Progress) -> Row:
     """One scene: a row for every frame, and what they come to.
 
     Raises:
@@ -80,8 +80,8 @@ def streamed(scene: Scene, method: Method, settings: Mapping[str, Any], *, progr
     }
 
 
-def _said(scene: Row) -> str:
+def _format_summary(scene: Row) -> str:
     share = "no sample lacks a return" if scene["recovered"] is None else f"{scene['recovered']:.1%} of holes answered"
     cuts = f"; cuts at {', '.join(map(str, scene['cuts']))}" if scene["cuts"] else ""
     speed = f"{scene['frames_per_second']:.2f} frames/s"
-    return f"{scene['scene']}: {many(scene['n_frames'], 'frame')}, {speed}, {share}, {scene['mib']:.0f} MiB held{cuts}"
+    return f"{scene['scene']}: {format_count(scene['n_frames'], 'frame')}, {speed}, {share}, {scene['mib']:.0f} MiB held{cuts}"

@@ -17,16 +17,16 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch.runtime import console
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
 #: Below the sweep's folder.
-NOTES = ".progress"
+_NOTES_FOLDER = ".progress"
 
 #: Seconds between two looks, and between two notes of a job.
-PAUSE = 0.25
+_PAUSE_S = 0.25
 
 
-def noting(folder: Path, job: str, scenes: int) -> Callable[[Iterable[Any], str, int], Iterator[Any]]:
+def record_progress(folder: Path, job: str, scenes: int) -> Callable[[Iterable[Any], str, int], Iterator[Any]]:
     """What wraps the loops of one job: (items, text, number of items) → items; it notes the job's share done.
 
     Args:
@@ -34,7 +34,7 @@ def noting(folder: Path, job: str, scenes: int) -> Callable[[Iterable[Any], str,
         job: a name that no other job has.
         scenes: loops that are expected; of more the share creeps on.
     """
-    note, begun = folder / NOTES / job, 0
+    note, begun = folder / _NOTES_FOLDER / job, 0
 
     def wrap(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
         nonlocal begun
@@ -42,28 +42,28 @@ def noting(folder: Path, job: str, scenes: int) -> Callable[[Iterable[Any], str,
         before, last = begun - 1, -math.inf
         for k, item in enumerate(items):
             yield item
-            if time.monotonic() - last > PAUSE or k + 1 == total:
+            if time.monotonic() - last > _PAUSE_S or k + 1 == total:
                 last = time.monotonic()
-                _write(note, min(1.0, (before + (k + 1) / max(total, 1)) / max(scenes, begun)), text)
+                _write_note(note, min(1.0, (before + (k + 1) / max(total, 1)) / max(scenes, begun)), text)
 
     return wrap
 
 
-def finished(folder: Path, job: str) -> None:
+def mark_finished(folder: Path, job: str) -> None:
     """Note that a job has ended, well or not."""
-    _write(folder / NOTES / job, 1.0, "")
+    _write_note(folder / _NOTES_FOLDER / job, 1.0, "")
 
 
 @contextlib.contextmanager
-def watched(folder: Path, n_jobs: int) -> Iterator[None]:
+def show_sweep_progress(folder: Path, n_jobs: int) -> Iterator[None]:
     """A bar over all jobs with the time left, on a terminal, for as long as they run."""
-    if not sys.stderr.isatty() or console.verbosity() == "quiet":
+    if not sys.stderr.isatty() or console.get_verbosity() == "quiet":
         yield
         return
-    notes, stop = folder / NOTES, threading.Event()
+    notes, stop = folder / _NOTES_FOLDER, threading.Event()
     shutil.rmtree(notes, ignore_errors=True)
     notes.mkdir(parents=True)
-    drawer = threading.Thread(target=_draw, args=(notes, n_jobs, stop), daemon=True)
+    drawer = threading.Thread(target=_draw_bar, args=(notes, n_jobs, stop), daemon=True)
     drawer.start()
     try:
         yield
@@ -73,7 +73,7 @@ def watched(folder: Path, n_jobs: int) -> Iterator[None]:
         shutil.rmtree(notes, ignore_errors=True)
 
 
-def read(notes: Path) -> tuple[float, int, list[str]]:
+def _read_progress(notes: Path) -> tuple[float, int, list[str]]:
     """Jobs done with the shares of those that run, the number of whole ones, and what the running ones are at."""
     shares, at = [], []
     for path in sorted(p for p in notes.glob("*") if not p.name.endswith("~")):
@@ -84,20 +84,20 @@ def read(notes: Path) -> tuple[float, int, list[str]]:
     return sum(shares), sum(s >= 1 for s in shares), at
 
 
-def _draw(notes: Path, n_jobs: int, stop: threading.Event) -> None:
+def _draw_bar(notes: Path, n_jobs: int, stop: threading.Event) -> None:
     from rich.console import Console  # noqa: PLC0415
     from rich.progress import BarColumn, Progress, TimeRemainingColumn  # noqa: PLC0415
 
     columns: Sequence[Any] = ("{task.description}", BarColumn(), "{task.percentage:.0f} %", TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(f"0 of {many(n_jobs, 'job')}", total=n_jobs)
-        while not stop.wait(PAUSE):
-            done, whole, at = read(notes)
-            said = f"{whole} of {many(n_jobs, 'job')}" + (f", {', '.join(at[:2])}" if at else "")
+        task = bar.add_task(f"0 of {format_count(n_jobs, 'job')}", total=n_jobs)
+        while not stop.wait(_PAUSE_S):
+            done, whole, at = _read_progress(notes)
+            said = f"{whole} of {format_count(n_jobs, 'job')}" + (f", {', '.join(at[:2])}" if at else "")
             bar.update(task, completed=done, description=said)
 
 
-def _write(note: Path, share: float, text: str) -> None:
+def _write_note(note: Path, share: float, text: str) -> None:
     """Whole or not at all; a job never fails because nobody looks."""
     if note.parent.is_dir():
         with contextlib.suppress(OSError):

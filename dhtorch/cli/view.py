@@ -13,14 +13,14 @@ from typing import Any
 
 import torch
 
-from dhtorch.cli.job import PLACE
+from dhtorch.cli.job import DATA_ROOT_FILE
 from dhtorch.data import FormatError
 from dhtorch.data.scene import scenes_of
-from dhtorch.experiments.exhibits import look
+from dhtorch.experiments.exhibits import make_exhibit
 from dhtorch.experiments.protocol import Progress, Settings
-from dhtorch.integrate.sweeps import Sweep
-from dhtorch.runtime import results as archive
-from dhtorch.runtime.console import many
+from dhtorch.integrate.sweeps import DenseSweep
+from dhtorch.runtime import results as result_files
+from dhtorch.runtime.console import format_count
 from dhtorch.viz.viewer import again, html, points, rrd
 from dhtorch.viz.viewer.exhibit import Exhibit
 
@@ -37,64 +37,68 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         ValueError, OSError, ImportError: bad options or data, as the readers and writers raise them.
     """
     page, recording = settings["html"], settings["save"]
-    for name, endings in ((page, html.ENDINGS), (recording, rrd.ENDINGS)):
+    for name, endings in ((page, html.HTML_SUFFIXES), (recording, rrd.RRD_SUFFIXES)):
         if name is not None and (Path(name).is_dir() or Path(name).suffix.lower() not in endings):
             raise ValueError(f"{name}: expected the name of a file that ends in {endings[0]}")
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
     target = None if settings["result"] is None else Path(settings["result"])
     if target is not None and target.suffix == ".ply":
-        scene = points.read(target)
+        scene = points.read_ply_exhibit(target)
     elif target is not None:
-        scene = _archived(target, settings, progress)
+        scene = _load_result_exhibit(target, settings, progress)
     else:
-        scene = _looked(parts, settings, lambda _name: settings["holdout"]["cutoff"], progress)
+        scene = _compute_exhibit(parts, settings, lambda _name: settings["holdout"]["cutoff"], progress)
     folder = Path(settings["output"]) if target is None else target if target.is_dir() else target.parent
-    for line in _show(scene, page, recording, folder):
+    for line in _show_exhibit(scene, page, recording, folder):
         print(line)
     return 0
 
 
-def _archived(target: Path, settings: Mapping[str, Any], progress: Progress) -> Exhibit:
+def _load_result_exhibit(target: Path, settings: Mapping[str, Any], progress: Progress) -> Exhibit:
     """The scene of a result: computed again, or its points alone."""
-    result = archive.read(target)
+    result = result_files.read_result(target)
     folder = target if target.is_dir() else target.parent
     config, name = result["config"], settings["scene"]
     own = {**settings, **{k: config[k] for k in ("seed", "dtype") if k in config}}
     try:
-        parts = again.parts(result, settings["root"] or _remembered(folder))
-        scene = _looked(parts, own, partial(again.cutoff, result), progress)
+        parts = again.rebuild_parts(result, settings["root"] or _read_data_root(folder))
+        scene = _compute_exhibit(parts, own, partial(again.read_cutoff, result), progress)
     except (OSError, FormatError) as error:
         scenes = result["data"]["scenes"]
-        ply = folder / str(_chosen(scenes, name, str)) / "points.ply"
+        ply = folder / str(_select_item(scenes, name, str)) / "points.ply"
         if not ply.is_file():
             raise ValueError(f"{error}; root=PATH says where the data are") from error
         print(f"{error}; showing the points of {ply} alone (root=PATH says where the data are)", file=sys.stderr)
-        return replace(points.read(ply), name=str(_chosen(scenes, name, str)))
+        return replace(points.read_ply_exhibit(ply), name=str(_select_item(scenes, name, str)))
     facts = {"experiment": result["experiment"], "data": result["data"]["name"], "made": result["meta"]["utc"]}
     return replace(scene, facts={**facts, **scene.facts})
 
 
-def _remembered(folder: Path) -> str | None:
+def _read_data_root(folder: Path) -> str | None:
     """Where the data of a result lay when it was made, if they are there still."""
-    note = folder / PLACE
+    note = folder / DATA_ROOT_FILE
     root = note.read_text(encoding="utf-8", errors="replace").strip() if note.is_file() else ""
     return root if root and Path(root).exists() else None
 
 
-def _looked(
+def _compute_exhibit(
     parts: Mapping[str, Any], settings: Mapping[str, Any], cutoff: Callable[[str], float | None], progress: Progress
 ) -> Exhibit:
     """The chosen scene of a recording or several, computed; ``cutoff`` says by its name what is held back."""
-    chosen = _chosen(scenes_of(parts["data"]), settings["scene"], lambda scene: scene.name)
+    chosen = _select_item(scenes_of(parts["data"]), settings["scene"], lambda scene: scene.name)
     dtype = getattr(torch, str(settings["dtype"]), None)
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
     if not isinstance(settings["most"], int) or settings["most"] < 1:
         raise ValueError(f"most: found {settings['most']!r}, expected a whole number of at least 1")
     common = Settings(cutoff=cutoff(chosen.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
-    options: dict[str, Any] = {"most": settings["most"], "sweep": Sweep.asked(settings["dense"]), "progress": progress}
-    shown = look(chosen, parts["method"], parts["pairs"], common, **options)
+    options: dict[str, Any] = {
+        "most": settings["most"],
+        "sweep": DenseSweep.asked(settings["dense"]),
+        "progress": progress,
+    }
+    shown = make_exhibit(chosen, parts["method"], parts["pairs"], common, **options)
     limit = common.cutoff_of(chosen)
     hidden = limit is not None and limit != float("inf")
     facts = {"samples": f"{parts['method'].n} in each pair"}
@@ -102,7 +106,7 @@ def _looked(
     return replace(shown, facts={**facts, **shown.facts})
 
 
-def _chosen(items: Sequence[Any], wanted: str | int | None, name: Any) -> Any:
+def _select_item(items: Sequence[Any], wanted: str | int | None, name: Any) -> Any:
     """The first item, or the one of that name or number."""
     if wanted is None:
         return items[0]
@@ -114,7 +118,7 @@ def _chosen(items: Sequence[Any], wanted: str | int | None, name: Any) -> Any:
     raise ValueError(f"scene: found {wanted!r}, expected a number below {len(known)} or one of {', '.join(known[:12])}")
 
 
-def _show(scene: Exhibit, page: str | None, save: str | None, folder: Path) -> list[str]:
+def _show_exhibit(scene: Exhibit, page: str | None, save: str | None, folder: Path) -> list[str]:
     """Write or open what is asked for; lines that say where."""
     said = []
     if page is None and save is None:
@@ -124,13 +128,13 @@ def _show(scene: Exhibit, page: str | None, save: str | None, folder: Path) -> l
         elif not _has_screen():
             save = str(folder / "view.rrd")
         else:
-            rrd.spawn(scene)
-            said.append(f"{scene.name}: {many(len(scene.shots), 'pair')} in Rerun's viewer")
+            rrd.spawn_viewer(scene)
+            said.append(f"{scene.name}: {format_count(len(scene.shots), 'pair')} in Rerun's viewer")
     if page is not None:
-        path = html.write(Path(page), scene)
+        path = html.write_viewer_page(Path(page), scene)
         said.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): open it in any browser")
     if save is not None:
-        path = rrd.save(Path(save), scene)
+        path = rrd.write_rrd(Path(save), scene)
         said.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): rerun {path}")
     return said
 

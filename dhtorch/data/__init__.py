@@ -15,9 +15,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from dhtorch.data import intrinsics as told
+from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import inside
+from dhtorch.data.io.safe_open import restrict_links
 from dhtorch.data.readers import (
     arkitscenes,
     ca1m,
@@ -32,17 +32,17 @@ from dhtorch.data.readers import (
     tum,
 )
 from dhtorch.data.recording import Recording, Recordings
-from dhtorch.data.scene import Given, Scene, Scenes, scenes_of
+from dhtorch.data.scene import Scene, SceneLike, Scenes, scenes_of
 from dhtorch.runtime import console
 
 __all__ = [
     "FORMATS",
     "FormatError",
-    "Given",
     "Reader",
     "Recording",
     "Recordings",
     "Scene",
+    "SceneLike",
     "Scenes",
     "open",
     "open_all",
@@ -82,11 +82,13 @@ FORMATS: Final[dict[str, Reader]] = {
 }
 
 #: The variable that says where a collection of scenes lies.
-ROOT_VARIABLE: Final = "DHTORCH_DATA"
+_SCENES_ROOT_VARIABLE: Final = "DHTORCH_DATA"
 
-_UNSAID = [(name, None) for name in told.OPTIONS]  # as settings that serve all formats have them
+_UNSET_INTRINSICS = [
+    (name, None) for name in intrinsics_options.INTRINSICS_OPTIONS
+]  # as settings that serve all formats have them
 
-_SHOWN = 4  # names of many recordings in a message
+_MAX_NAMES_SHOWN = 4  # names of many recordings in a message
 
 
 def open(root: str | Path, format: str = "auto", *, follow_links: bool = False, **options: object) -> Recording:
@@ -98,7 +100,7 @@ def open(root: str | Path, format: str = "auto", *, follow_links: bool = False, 
     found = open_all(root, format, follow_links=follow_links, **options)
     if len(found) > 1:
         names = found.names if isinstance(found, Recordings) else [each.name for each in found]
-        shown = ", ".join(names[:_SHOWN]) + (" …" if len(names) > _SHOWN else "")
+        shown = ", ".join(names[:_MAX_NAMES_SHOWN]) + (" …" if len(names) > _MAX_NAMES_SHOWN else "")
         raise FormatError(root, "recordings", f"{len(found)} recordings: {shown}", "one (open_all returns them all)")
     return found[0]
 
@@ -137,27 +139,27 @@ def open_all(
         raise FormatError(root, "path", "no such file or folder", f"a {format} capture")
     read = FORMATS[format].read
     known = list(inspect.signature(read).parameters)[1:]
-    options = {name: value for name, value in options.items() if (name, value) not in _UNSAID}
+    options = {name: value for name, value in options.items() if (name, value) not in _UNSET_INTRINSICS}
     for option in options:
         if option not in known:
-            shown = f"{option!r}{console.suggestion(option, known)}"
+            shown = f"{option!r}{console.suggest_name(option, known)}"
             raise ValueError(f"data: format {format} has no option {shown}, expected one of {', '.join(known)}")
-    with inside(bounds):
+    with restrict_links(bounds):
         found = read(root, **options)
     if isinstance(found, Recordings):
-        return replace(found, make=_Bounded(found.make, bounds))
+        return replace(found, make=_RestrictedOpener(found.make, bounds))
     return [replace(recording, bounds=bounds) for recording in found]
 
 
 @dataclass(frozen=True)
-class _Bounded:
+class _RestrictedOpener:
     """Opens one of many recordings, no link of which may lead out of the capture."""
 
     make: Callable[[int], Recording]
     bounds: Path | None
 
     def __call__(self, i: int) -> Recording:
-        with inside(self.bounds):
+        with restrict_links(self.bounds):
             return replace(self.make(i), bounds=self.bounds)
 
 
@@ -195,7 +197,7 @@ def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str
     root = Path(root)
     if not root.exists():
         raise FormatError(root, "path", "no such file or folder", "a capture")
-    with inside(None if follow_links else root):
+    with restrict_links(None if follow_links else root):
         for name, reader in FORMATS.items():
             if evidence := reader.recognise(root):
                 return name, evidence
@@ -236,9 +238,9 @@ def scenes_root(root: str | Path | None) -> Path:
     Raises:
         FormatError: none given and the variable unset, or no such folder.
     """
-    root = root if root is not None else os.environ.get(ROOT_VARIABLE)
+    root = root if root is not None else os.environ.get(_SCENES_ROOT_VARIABLE)
     if not root:
-        raise FormatError(ROOT_VARIABLE, "environment variable", "nothing", "the folder that holds the scenes")
+        raise FormatError(_SCENES_ROOT_VARIABLE, "environment variable", "nothing", "the folder that holds the scenes")
     if not Path(root).is_dir():
-        raise FormatError(root, "path", "no such folder", f"the folder that holds the scenes ({ROOT_VARIABLE})")
+        raise FormatError(root, "path", "no such folder", f"the folder that holds the scenes ({_SCENES_ROOT_VARIABLE})")
     return Path(root)

@@ -21,13 +21,13 @@ from dhtorch.geometry.patches import round_half_up
 from dhtorch.records import Camera, Pose
 
 #: How far the determinant of a stored rotation may be from 1 before it is taken for damage instead of rounding.
-MAX_DET_ERROR = 0.01
+_MAX_DET_ERROR = 0.01
 
 #: No camera of ours has more pixels in a focal length, and no place on this planet is further from another one; numbers
 #: beyond would be infinite in float32.
-MAX_FOCAL = 1e6  # px
-MAX_COORDINATE = 4e7  # m
-_MAX_DISTORTION = 1e4
+_MAX_FOCAL_PX = 1e6  # px
+MAX_COORDINATE_M = 4e7  # m
+_MAX_DISTORTION_COEFFICIENT = 1e4
 
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -49,17 +49,17 @@ def to_camera(
     f, c, wh = np.array([matrix[0, 0], matrix[1, 1]]), matrix[:2, 2], np.array([hw[1], hw[0]])
     if not np.array_equal(matrix[2], [0, 0, 1]) or matrix[1, 0] != 0 or abs(matrix[0, 1]) > 1e-6 * abs(f[0]):
         raise FormatError(file, field, matrix.tolist(), "fx 0 cx, 0 fy cy, 0 0 1 (no skew)")
-    if not ((f >= 1 / MAX_FOCAL) & (f <= MAX_FOCAL)).all():
+    if not ((f >= 1 / _MAX_FOCAL_PX) & (f <= _MAX_FOCAL_PX)).all():
         raise FormatError(file, f"{field} focal length", f.tolist(), "two positive numbers of pixels")
     if not ((c > -wh) & (c < 2 * wh)).all():
         raise FormatError(file, f"{field} principal point", c.tolist(), f"a place near the {hw[1]}x{hw[0]} image")
-    lens = None if distortion is None else _distortion(distortion, file)
-    return Camera(_float32(f)[None], _float32(c)[None], None if lens is None else _float32(lens)[None])
+    lens = None if distortion is None else _parse_distortion(distortion, file)
+    return Camera(_to_float32(f)[None], _to_float32(c)[None], None if lens is None else _to_float32(lens)[None])
 
 
-def K_of(values: Sequence[float], root: Path, field: str) -> np.ndarray:
+def parse_K_option(values: Sequence[float], root: Path, field: str) -> np.ndarray:
     """K of an option's fx, fy, cx, cy."""
-    return matrix_of(*to_array(values, (4,), root, field))
+    return make_K(*to_array(values, (4,), root, field))
 
 
 def to_cameras(values: np.ndarray, hw: tuple[int, int], file: Path, field: str, lens: object) -> Camera:
@@ -73,12 +73,12 @@ def to_cameras(values: np.ndarray, hw: tuple[int, int], file: Path, field: str, 
         raise FormatError(file, field, f"{flat.shape[1]} numbers", "4 (fx fy cx cy) or 9")
     if (flat == flat[:1]).all():
         flat = flat[:1]
-    made = [to_camera(matrix_of(*k) if len(k) == 4 else k.reshape(3, 3), hw, file, field, lens) for k in flat]
+    made = [to_camera(make_K(*k) if len(k) == 4 else k.reshape(3, 3), hw, file, field, lens) for k in flat]
     distortion = None if made[0].distortion is None else made[0].distortion.expand(len(made), -1)
     return Camera(torch.cat([m.f for m in made]), torch.cat([m.c for m in made]), distortion)
 
 
-def to_poses_of(values: np.ndarray, file: Path, field: str) -> Pose:
+def parse_poses(values: np.ndarray, file: Path, field: str) -> Pose:
     """Poses of rows of 16 (4×4 by rows) or 7 numbers (x y z qx qy qz qw).
 
     Raises:
@@ -92,12 +92,12 @@ def to_poses_of(values: np.ndarray, file: Path, field: str) -> Pose:
     return to_poses(flat.reshape(-1, 4, 4), file, field)
 
 
-def matrix_of(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
+def make_K(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     """K of four numbers."""
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
 
 
-def resize_matrix(K: np.ndarray, hw: tuple[int, int], new_hw: tuple[int, int]) -> np.ndarray:
+def resize_K(K: np.ndarray, hw: tuple[int, int], new_hw: tuple[int, int]) -> np.ndarray:
     """K of an image of size ``hw`` for the same image at another size; an integer is the centre of a pixel."""
     s = np.array([new_hw[1] / hw[1], new_hw[0] / hw[0]])
     out = np.array(K, dtype=np.float64)
@@ -116,26 +116,30 @@ def to_poses(
     A matrix that is already a rotation to rounding of float64 is returned as it stands.
 
     Raises:
-        FormatError: not finite, last row not 0 0 0 1, or determinant further than ``MAX_DET_ERROR`` from 1 (a
+        FormatError: not finite, last row not 0 0 0 1, or determinant further than ``_MAX_DET_ERROR`` from 1 (a
             reflection, a scale, or damage).
     """
     if not np.isfinite(c2w).all():
-        raise FormatError(file, field, f"a non-finite number in matrix {_first(~np.isfinite(c2w))}", "finite numbers")
-    bad = np.abs(c2w).max((-1, -2), initial=0) > MAX_COORDINATE
+        raise FormatError(
+            file, field, f"a non-finite number in matrix {_first_index(~np.isfinite(c2w))}", "finite numbers"
+        )
+    bad = np.abs(c2w).max((-1, -2), initial=0) > MAX_COORDINATE_M
     if bad.any():
-        raise FormatError(file, f"{field} {_first(bad)}", c2w[bad][0, :3].tolist(), f"at most {MAX_COORDINATE:g} m")
+        raise FormatError(
+            file, f"{field} {_first_index(bad)}", c2w[bad][0, :3].tolist(), f"at most {MAX_COORDINATE_M:g} m"
+        )
     bad = np.abs(c2w[:, 3] - [0, 0, 0, 1]).max(-1, initial=0) > 1e-6
     if bad.any():
-        raise FormatError(file, f"{field} {_first(bad)} last row", c2w[bad][0, 3].tolist(), "0 0 0 1")
+        raise FormatError(file, f"{field} {_first_index(bad)} last row", c2w[bad][0, 3].tolist(), "0 0 0 1")
     R = c2w[:, :3, :3]
     det = np.linalg.det(R)
-    bad = np.abs(det - 1) > MAX_DET_ERROR
+    bad = np.abs(det - 1) > _MAX_DET_ERROR
     if bad.any():
-        raise FormatError(file, f"{field} {_first(bad)} determinant", f"{det[bad][0]:.6g}", "1 (a rotation)")
+        raise FormatError(file, f"{field} {_first_index(bad)} determinant", f"{det[bad][0]:.6g}", "1 (a rotation)")
     off = np.abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max((-1, -2), initial=0)
     bad = off > 0.1
     if bad.any():
-        raise FormatError(file, f"{field} {_first(bad)}", "axes that are not at right angles", "a rotation")
+        raise FormatError(file, f"{field} {_first_index(bad)}", "axes that are not at right angles", "a rotation")
     u, _, vt = np.linalg.svd(R)
     R = np.where((off > 1e-14)[:, None, None], u @ vt, R)
     return Pose(torch.from_numpy(R), torch.from_numpy(c2w[:, :3, 3].copy()))
@@ -157,7 +161,9 @@ def to_c2w(
     norm = np.linalg.norm(quaternion, axis=-1)
     bad = ~((norm > 1e-6) & np.isfinite(norm))
     if bad.any():
-        raise FormatError(file, f"{field} {_first(bad)}", quaternion[bad][0].tolist(), "four numbers, not all zero")
+        raise FormatError(
+            file, f"{field} {_first_index(bad)}", quaternion[bad][0].tolist(), "four numbers, not all zero"
+        )
     c2w = np.zeros((len(t), 4, 4))
     c2w[:, :3, :3] = quaternion_to_rotation_matrix(torch.from_numpy(quaternion[:, [3, 0, 1, 2]])).numpy()
     c2w[:, :3, 3], c2w[:, 3, 3] = t, 1
@@ -191,8 +197,8 @@ def slerp(
     return weight_a[:, None] * a + weight_b[:, None] * b
 
 
-def turn_camera(camera: Camera, hw: tuple[int, int], turns: int) -> Camera:
-    """Camera of the picture of size ``hw`` after ``turns`` quarter turns clockwise; see :func:`turn_pose`."""
+def rot90_camera(camera: Camera, hw: tuple[int, int], turns: int) -> Camera:
+    """Camera of the picture of size ``hw`` after ``turns`` quarter turns clockwise; see :func:`rot90_pose`."""
     for _ in range(turns % 4):
         c = torch.stack((hw[0] - 1 - camera.c[:, 1], camera.c[:, 0]), -1)
         lens = camera.distortion
@@ -202,7 +208,7 @@ def turn_camera(camera: Camera, hw: tuple[int, int], turns: int) -> Camera:
     return camera
 
 
-def turn_pose(
+def rot90_pose(
     c2w: np.ndarray,  # (n, 4, 4)
     turns: int,
 ) -> np.ndarray:
@@ -211,7 +217,7 @@ def turn_pose(
     return c2w @ np.linalg.matrix_power(quarter, turns % 4)
 
 
-def turn_picture(x: Tensor, turns: int) -> Tensor:
+def rot90_image(x: Tensor, turns: int) -> Tensor:
     """The picture (…, H, W) after ``turns`` quarter turns clockwise."""
     return torch.rot90(x, -turns % 4, (-2, -1)).contiguous()
 
@@ -243,7 +249,7 @@ def cv_from_gl(
     return c2w @ _GL_FROM_CV
 
 
-def splat(
+def splat_depth(
     xyz_cam: Tensor,  # (M, 3) m, any point may be non-finite or behind the camera
     camera: Camera,  # B = 1
     hw: tuple[int, int],
@@ -280,7 +286,7 @@ def register_depth(
     xyz = cameras.unproject(depth_camera, uv[None], depth[v, u][None])
     if T_cam_from_depth is not None:
         xyz = se3.apply(T_cam_from_depth, xyz)
-    return splat(xyz[0], camera, hw)
+    return splat_depth(xyz[0], camera, hw)
 
 
 def _window_min(depth: Tensor, reach: int) -> Tensor:
@@ -299,19 +305,19 @@ def _window_min(depth: Tensor, reach: int) -> Tensor:
     return least
 
 
-def _distortion(value: object, file: Path) -> np.ndarray | None:
+def _parse_distortion(value: object, file: Path) -> np.ndarray | None:
     count = len(value) if isinstance(value, (Sequence, np.ndarray)) else -1
     if count not in (4, 5, 8):
         raise FormatError(file, "distortion", value, "4, 5 or 8 numbers k1 k2 p1 p2 [k3 [k4 k5 k6]]")
     lens = to_array(value, (count,), file, "distortion")
-    if np.abs(lens).max() > _MAX_DISTORTION:
-        raise FormatError(file, "distortion", lens.tolist(), f"numbers of at most {_MAX_DISTORTION:g}")
+    if np.abs(lens).max() > _MAX_DISTORTION_COEFFICIENT:
+        raise FormatError(file, "distortion", lens.tolist(), f"numbers of at most {_MAX_DISTORTION_COEFFICIENT:g}")
     return lens if lens.any() else None
 
 
-def _float32(x: np.ndarray) -> Tensor:
+def _to_float32(x: np.ndarray) -> Tensor:
     return torch.from_numpy(x.astype(np.float32))
 
 
-def _first(bad: np.ndarray) -> int:
+def _first_index(bad: np.ndarray) -> int:
     return int(np.argwhere(bad)[0, 0])

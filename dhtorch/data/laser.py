@@ -16,7 +16,7 @@ from dhtorch.data.convert import resample_depth
 from dhtorch.geometry.camera import Camera
 
 
-def judged(
+def resample_laser_depth(
     laser: Tensor,  # (h, w) m, 0 = unknown
     laser_camera: Camera,
     sensor: Tensor,  # (h', w') m, 0 = no return
@@ -31,13 +31,13 @@ def judged(
         The depth is 0 everywhere where the disagreement exceeds the limit, or where no pixel is shared (then NaN).
     """
     seen = resample_depth(laser, laser_camera, sensor_camera, (sensor.shape[0], sensor.shape[1]))
-    off = disagreement(seen, sensor)
+    off = _median_relative_difference(seen, sensor)
     if not off <= max_disagreement:
         return torch.zeros(hw, dtype=laser.dtype), off
     return resample_depth(laser, laser_camera, camera, hw), off
 
 
-def disagreement(truth: Tensor, sensor: Tensor) -> float:
+def _median_relative_difference(truth: Tensor, sensor: Tensor) -> float:
     """Median of |sensor − truth| / truth over the pixels where both answer; NaN where there is none."""
     both = (truth > 0) & (sensor > 0)
     if not bool(both.any()):

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from dhtorch.data.codecs.zips import check_directory
-from dhtorch.data.io.decode import MAX_BYTES, FormatError, read_bytes
-from dhtorch.data.io.safe_open import opened
+from dhtorch.data.codecs.zips import check_zip_directory
+from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, read_bytes
+from dhtorch.data.io.safe_open import open_regular
 
-MAX_MEMBERS = 2_000_000
-_LOCAL_HEADER = 30  # bytes before the name
+_MAX_MEMBERS = 2_000_000
+_LOCAL_HEADER_BYTES = 30  # bytes before the name
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +29,7 @@ class Member:
     path: Path  # for an archive: the archive's path, then the name inside
 
     def read(self) -> bytes:
-        """All bytes; at least one, at most ``MAX_BYTES``.
+        """All bytes; at least one, at most ``MAX_FILE_BYTES``.
 
         Raises:
             FormatError: missing, unreadable, empty, too large, or damaged.
@@ -39,7 +39,7 @@ class Member:
     def ends(self, count: int) -> tuple[bytes, bytes] | None:
         """First and last ``count`` bytes without reading the rest; None where that is not possible."""
         try:
-            with opened(self.path) as stream:
+            with open_regular(self.path) as stream:
                 first = stream.read(count)
                 stream.seek(-min(count, stream.seek(0, 2)), 2)
                 return first, stream.read(count)
@@ -60,8 +60,8 @@ class ZipMember(Member):
 
     def read(self) -> bytes:
         """As :meth:`Member.read`; a bomb stops at the size that the archive's directory names."""
-        if not 0 < self.size <= MAX_BYTES or self.packed > MAX_BYTES:
-            raise FormatError(self.path, "file size", f"{self.size} bytes", f"1 to {MAX_BYTES} bytes")
+        if not 0 < self.size <= MAX_FILE_BYTES or self.packed > MAX_FILE_BYTES:
+            raise FormatError(self.path, "file size", f"{self.size} bytes", f"1 to {MAX_FILE_BYTES} bytes")
         if self.method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise FormatError(self.path, "compression", "encryption or a rare method", "none or deflate")
         (data,) = self._stored((0, self.packed))
@@ -89,11 +89,11 @@ class ZipMember(Member):
     def _stored(self, *spans: tuple[int, int]) -> list[bytes]:
         """(start, count) bytes as they lie in the archive; the entry's header says how far behind it they begin."""
         try:
-            with opened(self.archive) as stream:
+            with open_regular(self.archive) as stream:
                 stream.seek(self.offset)
-                mark, name, extra = struct.unpack("<4s22xHH", stream.read(_LOCAL_HEADER))
-                begin = self.offset + _LOCAL_HEADER + name + extra
-                found = [_read(stream, begin + start, count) for start, count in spans]
+                mark, name, extra = struct.unpack("<4s22xHH", stream.read(_LOCAL_HEADER_BYTES))
+                begin = self.offset + _LOCAL_HEADER_BYTES + name + extra
+                found = [_read_at(stream, begin + start, count) for start, count in spans]
         except (OSError, ValueError, struct.error) as error:
             raise FormatError(self.path, "entry", error, "a zip entry") from None
         short = [(len(data), count) for data, (_, count) in zip(found, spans, strict=True) if len(data) != count]
@@ -103,40 +103,40 @@ class ZipMember(Member):
         return found
 
 
-def _read(stream: BinaryIO, start: int, count: int) -> bytes:
+def _read_at(stream: BinaryIO, start: int, count: int) -> bytes:
     """Up to ``count`` bytes."""
     stream.seek(start)
     return stream.read(count)
 
 
-def folder_members(root: Path) -> dict[str, Member]:
+def list_folder_members(root: Path) -> dict[str, Member]:
     """Name → member of the files of a folder and of its folders, one level down."""
     inside = [entry for entry in root.iterdir() if entry.is_dir()]
     files = [entry for folder in (root, *inside) for entry in folder.iterdir() if not entry.is_dir()]
     return {file.relative_to(root).as_posix(): Member(file) for file in files}
 
 
-def zip_members(archive: Path) -> dict[str, Member]:
+def list_zip_members(archive: Path) -> dict[str, Member]:
     """Name → member of the files of a zip archive. A name that occurs twice means the last one.
 
     Raises:
-        FormatError: no zip archive, or more than ``MAX_MEMBERS`` entries.
+        FormatError: no zip archive, or more than ``_MAX_MEMBERS`` entries.
     """
     try:
-        with opened(archive) as stream:
-            check_directory(stream, archive)
+        with open_regular(archive) as stream:
+            check_zip_directory(stream, archive)
             with zipfile.ZipFile(stream) as directory:
                 entries = directory.infolist()
     except FormatError:
         raise
     except (zipfile.BadZipFile, struct.error, ValueError, RuntimeError, EOFError, OSError) as error:
         raise FormatError(archive, "archive", error, "a whole zip archive") from None
-    if len(entries) > MAX_MEMBERS:
-        raise FormatError(archive, "archive", f"{len(entries)} entries", f"at most {MAX_MEMBERS}")
-    return {entry.filename: _zip_member(archive, entry) for entry in entries if not entry.is_dir()}
+    if len(entries) > _MAX_MEMBERS:
+        raise FormatError(archive, "archive", f"{len(entries)} entries", f"at most {_MAX_MEMBERS}")
+    return {entry.filename: _make_zip_member(archive, entry) for entry in entries if not entry.is_dir()}
 
 
-def member(members: Mapping[str, Member], name: str, root: Path) -> Member:
+def get_member(members: Mapping[str, Member], name: str, root: Path) -> Member:
     """The member of that name.
 
     Raises:
@@ -147,7 +147,7 @@ def member(members: Mapping[str, Member], name: str, root: Path) -> Member:
     return members[name]
 
 
-def _zip_member(archive: Path, entry: zipfile.ZipInfo) -> ZipMember:
+def _make_zip_member(archive: Path, entry: zipfile.ZipInfo) -> ZipMember:
     method = -1 if entry.flag_bits & 0x1 else entry.compress_type  # bit 0: encrypted
     packed = entry.file_size if method == zipfile.ZIP_STORED else entry.compress_size
     path = Path(f"{archive}/{entry.filename}")  # an absolute name must not hide the archive's

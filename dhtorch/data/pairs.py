@@ -13,14 +13,14 @@ import torch
 
 from dhtorch.data.recording import Recording
 from dhtorch.data.rig import Rig
-from dhtorch.data.scene import Given, Scene
-from dhtorch.runtime.console import many
+from dhtorch.data.scene import Scene, SceneLike
+from dhtorch.runtime.console import format_count
 
 #: From this many frames on, neighbouring anchors are nearly the same picture: take every other one.
-_MANY = 25
+_MANY_FRAMES = 25
 
 #: Steps from an anchor, in frames, to those around it that are offered to a method which chooses for itself.
-LADDER = (1, 2, 3, 5, 8, 12, 20, 30)
+CANDIDATE_STEPS = (1, 2, 3, 5, 8, 12, 20, 30)
 
 
 class Pair(NamedTuple):
@@ -38,7 +38,7 @@ class Pair(NamedTuple):
         return () if isinstance(self.other, int) else tuple(self.other)
 
 
-def fixed(pairs: Iterable[Sequence[int]] | Iterable[Pair]) -> list[tuple[int, int]]:
+def to_fixed_pairs(pairs: Iterable[Sequence[int]] | Iterable[Pair]) -> list[tuple[int, int]]:
     """The pairs as (i, j), for what cannot let a method choose.
 
     Raises:
@@ -54,12 +54,14 @@ def fixed(pairs: Iterable[Sequence[int]] | Iterable[Pair]) -> list[tuple[int, in
     return found
 
 
-def by_choice(scene: Given, steps: Sequence[int] = LADDER, stride: int | None = None, past: bool = False) -> list[Pair]:
+def by_choice(
+    scene: SceneLike, steps: Sequence[int] = CANDIDATE_STEPS, stride: int | None = None, past: bool = False
+) -> list[Pair]:
     """Every anchor with the frames around it, among which a method chooses: nobody has to know a gap.
 
     Args:
         scene: its recording's frames.
-        steps: how far before and after the anchor frames are offered, see :func:`around`.
+        steps: how far before and after the anchor frames are offered, see :func:`candidate_frames`.
         stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
         past: only frames before the anchor; the first frame is none then.
 
@@ -70,13 +72,13 @@ def by_choice(scene: Given, steps: Sequence[int] = LADDER, stride: int | None = 
     number = recording.number.tolist()
     if len(number) < 2:
         raise ValueError(f"pairs: {recording.name} has one frame, expected two at least")
-    steps, place = _steps(steps), {k: p for p, k in enumerate(number)}
-    anchors = [i for i in range(0, len(number), _stride(recording, stride)) if i > 0 or not past]
-    pairs = [Pair(i, tuple(_around(number, place, i, steps, past))) for i in anchors]
-    return _some(pairs, recording, f"stride {stride}, past frames alone")
+    steps, place = _check_steps(steps), {k: p for p, k in enumerate(number)}
+    anchors = [i for i in range(0, len(number), _choose_stride(recording, stride)) if i > 0 or not past]
+    pairs = [Pair(i, tuple(_candidates_of_numbers(number, place, i, steps, past))) for i in anchors]
+    return _require_pairs(pairs, recording, f"stride {stride}, past frames alone")
 
 
-def by_gap(scene: Given, gap: int | None = None, stride: int | None = None) -> list[Pair]:
+def by_gap(scene: SceneLike, gap: int | None = None, stride: int | None = None) -> list[Pair]:
     """Pairs whose frame numbers differ by ``gap``.
 
     Args:
@@ -91,18 +93,18 @@ def by_gap(scene: Given, gap: int | None = None, stride: int | None = None) -> l
     recording, gap = scene.recording, scene.gap if gap is None else gap
     if gap is None:
         raise ValueError(f"pairs.gap: {recording.name} knows no gap of its own, expected a number of frames")
-    gap = _positive_int("pairs.gap", gap)
+    gap = _check_positive_int("pairs.gap", gap)
     number = recording.number.tolist()
     if gap > number[-1] - number[0]:
-        span = f"{many(len(number), 'frame')} ({recording.name}, frame numbers {number[0]} to {number[-1]})"
+        span = f"{format_count(len(number), 'frame')} ({recording.name}, frame numbers {number[0]} to {number[-1]})"
         raise ValueError(f"pairs.gap: found {gap} for {span}, expected at most {number[-1] - number[0]}")
     place = {k: i for i, k in enumerate(number)}
-    anchors = range(0, len(number), _stride(recording, stride))
+    anchors = range(0, len(number), _choose_stride(recording, stride))
     pairs = [Pair(i, place[number[i] + gap]) for i in anchors if number[i] + gap in place]
-    return _some(pairs, recording, f"gap {gap}")
+    return _require_pairs(pairs, recording, f"gap {gap}")
 
 
-def by_time(scene: Given, seconds: float, tolerance: float | None = None, stride: int | None = None) -> list[Pair]:
+def by_time(scene: SceneLike, seconds: float, tolerance: float | None = None, stride: int | None = None) -> list[Pair]:
     """Pairs whose stamps differ by ``seconds``, give or take ``tolerance``; the closest frame counts.
 
     Args:
@@ -117,18 +119,20 @@ def by_time(scene: Given, seconds: float, tolerance: float | None = None, stride
     recording = Scene.of(scene).recording
     if recording.times is None:
         raise ValueError(f"pairs.seconds: {recording.name} has no time stamps, expected a recording with them")
-    _positive("pairs.seconds", seconds)
+    _check_positive("pairs.seconds", seconds)
     step = float(recording.times.diff().median()) if len(recording) > 1 else 0.0
-    tolerance = _not_negative("pairs.tolerance", step / 2 if tolerance is None else tolerance)
+    tolerance = _check_not_negative("pairs.tolerance", step / 2 if tolerance is None else tolerance)
     pairs = []
-    for i in range(0, len(recording), _stride(recording, stride)):
+    for i in range(0, len(recording), _choose_stride(recording, stride)):
         miss = (recording.times[i + 1 :] - recording.times[i] - seconds).abs()
         if miss.numel() and float(miss.min()) <= tolerance:
             pairs.append(Pair(i, i + 1 + int(miss.argmin())))
-    return _some(pairs, recording, f"{seconds} s ± {tolerance:g} s")
+    return _require_pairs(pairs, recording, f"{seconds} s ± {tolerance:g} s")
 
 
-def by_baseline(scene: Given, metres: float, tolerance: float | None = None, stride: int | None = None) -> list[Pair]:
+def by_baseline(
+    scene: SceneLike, metres: float, tolerance: float | None = None, stride: int | None = None
+) -> list[Pair]:
     """Pairs whose camera centres lie ``metres`` apart, give or take ``tolerance``; the earliest such frame counts.
 
     The earliest, because a camera that comes back later has seldom the same view.
@@ -145,19 +149,19 @@ def by_baseline(scene: Given, metres: float, tolerance: float | None = None, str
     recording = Scene.of(scene).recording
     if recording.poses is None:
         raise ValueError(f"pairs.metres: {recording.name} has no poses, expected a recording with them")
-    _positive("pairs.metres", metres)
-    tolerance = _not_negative("pairs.tolerance", metres / 4 if tolerance is None else tolerance)
+    _check_positive("pairs.metres", metres)
+    tolerance = _check_not_negative("pairs.tolerance", metres / 4 if tolerance is None else tolerance)
     centre = recording.poses.t
     pairs = []
-    for i in range(0, len(recording), _stride(recording, stride)):
+    for i in range(0, len(recording), _choose_stride(recording, stride)):
         good = ((centre[i + 1 :] - centre[i]).norm(dim=-1) - metres).abs() <= tolerance
         if bool(good.any()):
             pairs.append(Pair(i, i + 1 + int(torch.nonzero(good)[0])))
-    return _some(pairs, recording, f"{metres} m ± {tolerance:g} m")
+    return _require_pairs(pairs, recording, f"{metres} m ± {tolerance:g} m")
 
 
 def by_cameras(
-    scene: Given,
+    scene: SceneLike,
     instants: Sequence[int] = (0,),
     anchor: str | None = None,
     stride: int | None = None,
@@ -180,7 +184,7 @@ def by_cameras(
     """
     recording = Scene.of(scene).recording
     if not isinstance(recording, Rig):
-        expected = "several cameras as one recording (data=rig, dhtorch.data.rig.joined)"
+        expected = "several cameras as one recording (data=rig, dhtorch.data.rig.join_cameras)"
         raise ValueError(f"pairs=cameras: {recording.name} is one camera, expected {expected}")
     if anchor is not None and anchor not in recording.cameras:
         raise ValueError(f"pairs.anchor: found {anchor}, expected one of {', '.join(recording.cameras)}")
@@ -188,7 +192,7 @@ def by_cameras(
         raise ValueError(f"pairs.instants: found {list(instants)}, expected whole numbers of at least 0")
     C, n = len(recording.cameras), len(recording) // len(recording.cameras)
     chosen = range(C) if anchor is None else [recording.cameras.index(anchor)]
-    every = (2 if n >= _MANY else 1) if stride is None else _positive_int("pairs.stride", stride)
+    every = (2 if n >= _MANY_FRAMES else 1) if stride is None else _check_positive_int("pairs.stride", stride)
     pairs = []
     for k in range(0, n, every):
         near = {k + way * s for s in instants for way in ((-1,) if past else (-1, 1)) if 0 <= k + way * s < n}
@@ -196,10 +200,10 @@ def by_cameras(
             offered = sorted(q * C + d for q in near for d in range(C) if (q, d) != (k, c))
             if offered:
                 pairs.append(Pair(k * C + c, offered[0] if len(offered) == 1 else tuple(offered)))
-    return _some(pairs, recording, f"instants {list(instants)}")
+    return _require_pairs(pairs, recording, f"instants {list(instants)}")
 
 
-def by_scaled_gap(scene: Given, factor: float, stride: int | None = None) -> list[Pair]:
+def by_scaled_gap(scene: SceneLike, factor: float, stride: int | None = None) -> list[Pair]:
     """Pairs at ``factor`` times the scene's own gap, rounded, at least one frame; none where it is too short.
 
     Raises:
@@ -209,7 +213,7 @@ def by_scaled_gap(scene: Given, factor: float, stride: int | None = None) -> lis
     recording = scene.recording
     if scene.gap is None:
         raise ValueError(f"pairs.factor: {recording.name} knows no gap of its own, expected one with a gap")
-    gap = max(1, int(_positive("pairs.factor", factor) * scene.gap + 0.5))
+    gap = max(1, int(_check_positive("pairs.factor", factor) * scene.gap + 0.5))
     span = int(recording.number[-1] - recording.number[0])
     try:
         return by_gap(scene, gap, stride) if gap <= span else []
@@ -217,7 +221,9 @@ def by_scaled_gap(scene: Given, factor: float, stride: int | None = None) -> lis
         return []
 
 
-def around(recording: Recording, i: int, steps: Sequence[int] = LADDER, past: bool = False) -> list[int]:
+def candidate_frames(
+    recording: Recording, i: int, steps: Sequence[int] = CANDIDATE_STEPS, past: bool = False
+) -> list[int]:
     """Positions of frames before and after ``i`` among which a method may choose its other views, in rising order.
 
     Steps count in the capture's own frame numbers; a frame that was lost is left out. A recording that is shorter than
@@ -230,14 +236,14 @@ def around(recording: Recording, i: int, steps: Sequence[int] = LADDER, past: bo
     number = recording.number.tolist()
     if not 0 <= i < len(number):
         raise ValueError(f"pairs: found frame {i} of {recording.name}, expected 0 to {len(number) - 1}")
-    offered = _around(number, {k: p for p, k in enumerate(number)}, i, _steps(steps), past)
+    offered = _candidates_of_numbers(number, {k: p for p, k in enumerate(number)}, i, _check_steps(steps), past)
     if not offered:
         found, expected = ("nothing before frame 0", "a later one") if past else ("one frame", "two at least")
         raise ValueError(f"pairs: {recording.name} has {found}, expected {expected}")
     return offered
 
 
-def between(i: int, j: int, views: int) -> list[int]:
+def spaced_frames(i: int, j: int, views: int) -> list[int]:
     """``views`` different positions spread evenly over the way from ``i`` to ``j``: ``j`` is the last, ``i`` no part.
 
     Raises:
@@ -250,8 +256,10 @@ def between(i: int, j: int, views: int) -> list[int]:
     return [i + round((j - i) * (k + 1) / views) for k in range(views)]
 
 
-def _around(number: Sequence[int], place: Mapping[int, int], i: int, steps: Sequence[int], past: bool) -> list[int]:
-    """:func:`around`, of frame numbers whose places are known; empty where there is no other frame."""
+def _candidates_of_numbers(
+    number: Sequence[int], place: Mapping[int, int], i: int, steps: Sequence[int], past: bool
+) -> list[int]:
+    """:func:`candidate_frames`, of frame numbers whose places are known; empty where there is no other frame."""
     ways = (-1,) if past else (-1, 1)
     offered = sorted(place[k] for s in steps for k in (number[i] + way * s for way in ways) if k in place)
     if offered:
@@ -260,38 +268,38 @@ def _around(number: Sequence[int], place: Mapping[int, int], i: int, steps: Sequ
     return [min(others, key=lambda p: abs(number[p] - number[i]))] if others else []
 
 
-def _steps(steps: Sequence[int]) -> list[int]:
+def _check_steps(steps: Sequence[int]) -> list[int]:
     if not steps:
         raise ValueError("pairs.steps: found none, expected whole numbers of at least 1")
-    return sorted({_positive_int("pairs.steps", step) for step in steps})
+    return sorted({_check_positive_int("pairs.steps", step) for step in steps})
 
 
-def _stride(recording: Recording, stride: int | None) -> int:
+def _choose_stride(recording: Recording, stride: int | None) -> int:
     if stride is None:
-        return 2 if len(recording) >= _MANY else 1
-    return _positive_int("pairs.stride", stride)
+        return 2 if len(recording) >= _MANY_FRAMES else 1
+    return _check_positive_int("pairs.stride", stride)
 
 
-def _some(pairs: list[Pair], recording: Recording, wanted: str) -> list[Pair]:
+def _require_pairs(pairs: list[Pair], recording: Recording, wanted: str) -> list[Pair]:
     if not pairs:
-        found = f"no two of {many(len(recording), 'frame')} of {recording.name}"
+        found = f"no two of {format_count(len(recording), 'frame')} of {recording.name}"
         raise ValueError(f"pairs: found {found} at {wanted}, expected at least one pair")
     return pairs
 
 
-def _positive_int(name: str, value: int) -> int:
+def _check_positive_int(name: str, value: int) -> int:
     if isinstance(value, bool) or int(value) != value or value < 1:
         raise ValueError(f"{name}: found {value}, expected a whole number of at least 1")
     return int(value)
 
 
-def _positive(name: str, value: float) -> float:
+def _check_positive(name: str, value: float) -> float:
     if not 0 < value < float("inf"):
         raise ValueError(f"{name}: found {value}, expected a positive number")
     return value
 
 
-def _not_negative(name: str, value: float) -> float:
+def _check_not_negative(name: str, value: float) -> float:
     if not 0 <= value < float("inf"):
         raise ValueError(f"{name}: found {value}, expected 0 or more")
     return value

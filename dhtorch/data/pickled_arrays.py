@@ -14,51 +14,51 @@ from typing import Any, Final
 
 import numpy as np
 
-SCALARS: Final = (str, int, float, bool, bytes, type(None))
+SCALAR_TYPES: Final = (str, int, float, bool, bytes, type(None))
 
-_DTYPE = re.compile(r"[<>|=]?(?:b1|[iu][1248]|f[248]|[SU]\d{1,4}|O8?)")
-_ARRAY: Final = "numpy.ndarray"
-Spend = Callable[[int], None]
+_DTYPE_PATTERN = re.compile(r"[<>|=]?(?:b1|[iu][1248]|f[248]|[SU]\d{1,4}|O8?)")
+_ARRAY_NAME: Final = "numpy.ndarray"
+_SpendBytes = Callable[[int], None]
 
 
-class Name(str):
+class PermittedName(str):
     """A permitted name. Nothing stands behind it."""
 
 
-class _Dtype:
+class _PendingDtype:
     """Element type under construction: code such as ``f8`` and byte order."""
 
     def __init__(self, code: str) -> None:
         self.code, self.order = code, "="
 
 
-class Shell:
+class PendingArray:
     """An array under construction: an empty shell until its state arrives."""
 
     value: np.ndarray | list[Any] | None = None
     shape: tuple[int, ...] = ()
 
 
-def built(spend: Spend, target: Any, state: Any) -> Any:
+def apply_state(spend: _SpendBytes, target: Any, state: Any) -> Any:
     """``target``, an array or an element type under construction, with its state.
 
     Raises:
         ValueError, TypeError: anything else, or a state that does not fit.
     """
-    if type(target) is _Dtype:
+    if type(target) is _PendingDtype:
         _, order, subarray, names = state[:4]
         if order not in ("<", ">", "|", "=") or subarray is not None or names is not None:
             raise ValueError("a structured element type")
         target.order = order
-    elif type(target) is Shell:
+    elif type(target) is PendingArray:
         _, shape, dtype, fortran, raw = state
-        _fill(spend, target, shape, dtype, fortran, raw)
+        _fill_array(spend, target, shape, dtype, fortran, raw)
     else:
         raise TypeError("state for something else than an array or its element type")
     return target
 
 
-def filled(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw: bytes) -> np.ndarray:
+def array_from_bytes(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw: bytes) -> np.ndarray:
     """An array of raw bytes; its size is what the bytes say, not what the header says.
 
     Raises:
@@ -75,19 +75,21 @@ def filled(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw: bytes) -
     return array if dtype.isnative else array.astype(dtype.newbyteorder("="))
 
 
-def scalar(value: Any) -> Any:
+def check_scalar(value: Any) -> Any:
     """A key or a member of a set: nothing whose hash could run long or deep.
 
     Raises:
         TypeError: anything else.
     """
-    if type(value) not in SCALARS or (type(value) is int and abs(value) >= 1 << 63):
+    if type(value) not in SCALAR_TYPES or (type(value) is int and abs(value) >= 1 << 63):
         raise TypeError(f"a key of type {type(value).__name__}")
     return value
 
 
-def _fill(spend: Spend, target: Shell, shape: Any, dtype: Any, fortran: Any, raw: Any) -> Shell:
-    if target.value is not None or type(dtype) is not _Dtype or type(shape) is not tuple:
+def _fill_array(
+    spend: _SpendBytes, target: PendingArray, shape: Any, dtype: Any, fortran: Any, raw: Any
+) -> PendingArray:
+    if target.value is not None or type(dtype) is not _PendingDtype or type(shape) is not tuple:
         raise TypeError("an array with a state that is none")
     if dtype.code.lstrip("<>|=").startswith("O"):
         if type(raw) is not list or len(shape) > 1 or len(raw) != math.prod(shape):
@@ -97,48 +99,48 @@ def _fill(spend: Spend, target: Shell, shape: Any, dtype: Any, fortran: Any, raw
         if not isinstance(raw, bytes | bytearray) or type(fortran) is not bool:
             raise TypeError("an array without bytes")
         spend(len(raw))
-        target.value = filled(np.dtype(dtype.order + dtype.code.lstrip("<>|=")), shape, fortran, bytes(raw))
+        target.value = array_from_bytes(np.dtype(dtype.order + dtype.code.lstrip("<>|=")), shape, fortran, bytes(raw))
     return target
 
 
-def _new_dtype(_spend: Spend, code: Any, *_flags: Any) -> _Dtype:
-    if type(code) is not str or not _DTYPE.fullmatch(code):
+def _new_dtype(_spend: _SpendBytes, code: Any, *_flags: Any) -> _PendingDtype:
+    if type(code) is not str or not _DTYPE_PATTERN.fullmatch(code):
         raise ValueError("an element type that is no plain number, text or object")
-    return _Dtype(code)
+    return _PendingDtype(code)
 
 
-def _new_array(_spend: Spend, kind: Any, _shape: Any, _code: Any) -> Shell:
-    if kind != _ARRAY or type(kind) is not Name:
+def _new_array(_spend: _SpendBytes, kind: Any, _shape: Any, _code: Any) -> PendingArray:
+    if kind != _ARRAY_NAME or type(kind) is not PermittedName:
         raise TypeError("an array of another class")
-    return Shell()
+    return PendingArray()
 
 
-def _new_scalar(spend: Spend, dtype: Any, raw: Any) -> Any:
-    array = _fill(spend, Shell(), (), dtype, False, raw).value
+def _new_scalar(spend: _SpendBytes, dtype: Any, raw: Any) -> Any:
+    array = _fill_array(spend, PendingArray(), (), dtype, False, raw).value
     if not isinstance(array, np.ndarray):
         raise TypeError("a scalar of objects")
     return array.item()
 
 
-def _from_buffer(spend: Spend, raw: Any, dtype: Any, shape: Any, order: Any) -> Shell:
-    return _fill(spend, Shell(), shape, dtype, order == "F", raw)
+def _from_buffer(spend: _SpendBytes, raw: Any, dtype: Any, shape: Any, order: Any) -> PendingArray:
+    return _fill_array(spend, PendingArray(), shape, dtype, order == "F", raw)
 
 
-def _encode(spend: Spend, text: Any, encoding: Any) -> bytes:
+def _encode(spend: _SpendBytes, text: Any, encoding: Any) -> bytes:
     if type(text) is not str or encoding != "latin1":
         raise TypeError("an encoding other than latin1")
     spend(len(text))
     return text.encode("latin-1")
 
 
-def _new_set(_spend: Spend, items: Any = ()) -> set[Any]:
+def _new_set(_spend: _SpendBytes, items: Any = ()) -> set[Any]:
     if type(items) not in (list, tuple):
         raise TypeError("a set of something else than a list")
-    return set(map(scalar, items))
+    return set(map(check_scalar, items))
 
 
 #: What stands behind the names of functions.
-CALLS: Final[dict[str, Callable[..., Any]]] = {
+PERMITTED_CALLS: Final[dict[str, Callable[..., Any]]] = {
     "numpy.dtype": _new_dtype,
     "numpy.core.multiarray._reconstruct": _new_array,
     "numpy.core.multiarray.scalar": _new_scalar,
@@ -151,4 +153,4 @@ CALLS: Final[dict[str, Callable[..., Any]]] = {
 
 #: The only names a pickle may mention; ``numpy._core`` of numpy 2 counts as ``numpy.core``, ``__builtin__`` of Python 2
 #: as ``builtins``.
-NAMES: Final = {*CALLS, _ARRAY}
+PERMITTED_NAMES: Final = {*PERMITTED_CALLS, _ARRAY_NAME}

@@ -15,11 +15,11 @@ from typing import ClassVar, TypeVar, overload
 import torch
 from torch import Tensor
 
-from dhtorch.data.io.safe_open import inside
+from dhtorch.data.io.safe_open import restrict_links
 from dhtorch.records import Frame, Pose
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
-T = TypeVar("T")
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class Recording(Sequence[Frame]):
         for what, length in lengths.items():
             if length != n:
                 raise ValueError(
-                    f"recording {self.name}: found {length} {what}, expected one for each of {many(n, 'frame')}"
+                    f"recording {self.name}: found {length} {what}, expected one for each of {format_count(n, 'frame')}"
                 )
         if not bool((self.number.diff() > 0).all()):
             raise ValueError(f"recording {self.name}: number must increase strictly from frame to frame")
@@ -72,7 +72,7 @@ class Recording(Sequence[Frame]):
 
     def __getitem__(self, index: int) -> Frame:  # type: ignore[override]  # one frame at a time: slices would decode
         i = self._position(index)
-        with inside(self.bounds):
+        with restrict_links(self.bounds):
             frame = self.load(i)
         return frame.replace(
             time=None if self.times is None else self.times[i : i + 1],
@@ -81,7 +81,7 @@ class Recording(Sequence[Frame]):
         )
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({self.name!r}, {self.format}, {many(len(self), 'frame')})"
+        return f"{type(self).__name__}({self.name!r}, {self.format}, {format_count(len(self), 'frame')})"
 
     def _position(self, index: int) -> int:
         i, n = operator.index(index), len(self)
@@ -121,24 +121,24 @@ class MeasuredRecording(TruthRecording):
             ``surface`` is all 0: kinds of surface are not told apart. ``disagreement`` counts where both instruments
             answer, NaN where they share no pixel. A truth that was rejected for it is 0 everywhere.
         """
-        with inside(self.bounds):
+        with restrict_links(self.bounds):
             depth, disagreement = self.load_truth(self._position(index))
         surface = torch.zeros(1, *depth.shape, dtype=torch.uint8)
         return {"depth": depth[None], "surface": surface, "disagreement": torch.tensor([disagreement])}
 
 
-class Lazy(Sequence[T]):
+class LazySequence(Sequence[_Item]):
     """A sequence whose items are made when they are asked for; a subclass says how many, and makes each."""
 
-    def made(self, place: int) -> T:
+    def made(self, place: int) -> _Item:
         """The item at ``place``, from 0 on."""
         raise NotImplementedError
 
     @overload
-    def __getitem__(self, index: int) -> T: ...
+    def __getitem__(self, index: int) -> _Item: ...
     @overload
-    def __getitem__(self, index: slice) -> list[T]: ...
-    def __getitem__(self, index: int | slice) -> T | list[T]:
+    def __getitem__(self, index: slice) -> list[_Item]: ...
+    def __getitem__(self, index: int | slice) -> _Item | list[_Item]:
         places = range(len(self))
         if isinstance(index, slice):
             return [self.made(place) for place in places[index]]
@@ -146,7 +146,7 @@ class Lazy(Sequence[T]):
 
 
 @dataclass(frozen=True, eq=False)
-class Recordings(Lazy[Recording]):
+class Recordings(LazySequence[Recording]):
     """Many recordings of one data set, each opened when it is asked for.
 
     A set of robot episodes holds tens of thousands, with tables of their own, and a folder of archives hundreds of
@@ -168,6 +168,6 @@ class Recordings(Lazy[Recording]):
         return f"Recordings({len(self)}, {self.names[0]!r} …)"
 
 
-def numbers(n: int) -> Tensor:
+def consecutive_frame_numbers(n: int) -> Tensor:
     """(n,) int64 0, 1, 2, …: the frame numbers of a capture without gaps."""
     return torch.arange(n, dtype=torch.int64)

@@ -19,7 +19,7 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings, TruthRecording
 from dhtorch.data.scene import Scene, Scenes
 from dhtorch.records import Frame, Pose
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,7 +56,7 @@ class _Load:
         return self.recordings[int(self.camera[i])][int(self.places[i])]
 
 
-def joined(recordings: Sequence[Recording], *, tolerance: float | None = None, name: str | None = None) -> Rig:
+def join_cameras(recordings: Sequence[Recording], *, tolerance: float | None = None, name: str | None = None) -> Rig:
     """The cameras of a rig as one recording of the instants that all of them saw.
 
     Args:
@@ -72,7 +72,7 @@ def joined(recordings: Sequence[Recording], *, tolerance: float | None = None, n
     names = [r.name.rpartition("/")[2] for r in recordings]
     if len(recordings) < 2 or len(set(names)) < len(names):
         raise FormatError(where, "cameras", ", ".join(names) or "none", "two or more cameras of different names")
-    places = _instants(recordings, tolerance)
+    places = _common_instants(recordings, tolerance)
     if not len(places):
         found = "no instant that all cameras saw"
         raise FormatError(where, ", ".join(names), found, "frames of the same times or numbers")
@@ -80,7 +80,11 @@ def joined(recordings: Sequence[Recording], *, tolerance: float | None = None, n
     camera, flat = torch.arange(C).repeat(n), places.flatten()
     first = recordings[0].number[places[:, 0]]
     truth = all(isinstance(r, TruthRecording) for r in recordings)
-    left = [f"{r.name}: {many(len(r) - n, 'frame')} without their instant: left out" for r in recordings if len(r) > n]
+    left = [
+        f"{r.name}: {format_count(len(r) - n, 'frame')} without their instant: left out"
+        for r in recordings
+        if len(r) > n
+    ]
     make = TruthRig if truth else Rig
     return make(
         name=name or recordings[0].name.rpartition("/")[0] or recordings[0].name,
@@ -88,8 +92,8 @@ def joined(recordings: Sequence[Recording], *, tolerance: float | None = None, n
         load=_Load(tuple(recordings), camera, flat),
         number=(first[:, None] * C + torch.arange(C)).flatten(),
         root=recordings[0].root,
-        times=_along([r.times for r in recordings], camera, flat),
-        poses=_poses(recordings, camera, flat),
+        times=_gather_by_camera([r.times for r in recordings], camera, flat),
+        poses=_gather_poses(recordings, camera, flat),
         rate_hz=recordings[0].rate_hz,
         sparse=all(r.sparse for r in recordings),
         episode=recordings[0].episode,
@@ -117,7 +121,7 @@ def open_rig(
 
     Args:
         root, format, follow_links, options: as :func:`dhtorch.data.open_all`; an option of the reader chooses cameras.
-        tolerance: as :func:`joined`.
+        tolerance: as :func:`join_cameras`.
         near, gap, levels, room, role: notes of the :class:`Scene`.
 
     Raises:
@@ -132,12 +136,12 @@ def open_rig(
     if not rigs:
         shown = ", ".join(names[:4])
         raise FormatError(root, "cameras", f"{len(names)} recordings: {shown}", "two cameras or more of one scene")
-    made = Recordings(list(rigs), _Make(found, tuple(map(tuple, rigs.values())), tolerance))
+    made = Recordings(list(rigs), _MakeRig(found, tuple(map(tuple, rigs.values())), tolerance))
     return Scenes(made, partial(Scene, near=near, gap=gap, levels=levels, room=room, role=role))
 
 
 @dataclass(frozen=True, eq=False)
-class _Make:
+class _MakeRig:
     """Position → rig."""
 
     recordings: Sequence[Recording]
@@ -145,10 +149,10 @@ class _Make:
     tolerance: float | None
 
     def __call__(self, i: int) -> Rig:
-        return joined([self.recordings[place] for place in self.groups[i]], tolerance=self.tolerance)
+        return join_cameras([self.recordings[place] for place in self.groups[i]], tolerance=self.tolerance)
 
 
-def _instants(recordings: Sequence[Recording], tolerance: float | None) -> Tensor:
+def _common_instants(recordings: Sequence[Recording], tolerance: float | None) -> Tensor:
     """(instants, cameras) positions of the frames of each instant."""
     times = [r.times for r in recordings]
     first = recordings[0]
@@ -159,10 +163,10 @@ def _instants(recordings: Sequence[Recording], tolerance: float | None) -> Tenso
         steps = [float(t.diff().median()) for t in stamps if len(t) > 1]
         limit = tolerance if tolerance is not None else 0.5 * min(steps, default=1.0)
         for other in stamps[1:]:
-            at = _nearest(stamps[0], other)
+            at = _nearest_stamp(stamps[0], other)
             columns.append(at)
             good &= (other[at] - stamps[0]).abs() <= limit
-            good &= _nearest(other, stamps[0])[at] == columns[0]  # nearest to each other: one instant a frame
+            good &= _nearest_stamp(other, stamps[0])[at] == columns[0]  # nearest to each other: one instant a frame
     else:
         for r in recordings[1:]:
             at = torch.searchsorted(r.number, first.number).clamp(max=len(r) - 1)
@@ -171,7 +175,7 @@ def _instants(recordings: Sequence[Recording], tolerance: float | None) -> Tenso
     return torch.stack(columns, 1)[good]
 
 
-def _nearest(stamps: Tensor, among: Tensor) -> Tensor:
+def _nearest_stamp(stamps: Tensor, among: Tensor) -> Tensor:
     """Position (n,) of the stamp nearest to each of ``stamps``, the earlier of two; (m,) ``among`` in any order."""
     order = among.argsort(stable=True)
     known = among[order]
@@ -180,15 +184,15 @@ def _nearest(stamps: Tensor, among: Tensor) -> Tensor:
     return order[torch.where((stamps - known[left]).abs() <= (known[right] - stamps).abs(), left, right)]
 
 
-def at_instants(recording: Recording, other: Recording) -> list[int]:
+def match_instants(recording: Recording, other: Recording) -> list[int]:
     """Position in ``other`` of the frame of the instant of each frame of a recording; -1 = there is none."""
     found = [-1] * len(recording)
-    for i, k in _instants([recording, other], None).tolist():
+    for i, k in _common_instants([recording, other], None).tolist():
         found[i] = k
     return found
 
 
-def _along(values: Sequence[Tensor | None], camera: Tensor, places: Tensor) -> Tensor | None:
+def _gather_by_camera(values: Sequence[Tensor | None], camera: Tensor, places: Tensor) -> Tensor | None:
     """What every frame has, from each camera's own."""
     known = [v for v in values if v is not None]
     if len(known) < len(values):
@@ -196,8 +200,9 @@ def _along(values: Sequence[Tensor | None], camera: Tensor, places: Tensor) -> T
     return torch.stack([known[c][p] for c, p in zip(camera.tolist(), places.tolist(), strict=True)])
 
 
-def _poses(recordings: Sequence[Recording], camera: Tensor, places: Tensor) -> Pose | None:
+def _gather_poses(recordings: Sequence[Recording], camera: Tensor, places: Tensor) -> Pose | None:
     R, t = (
-        _along([None if r.poses is None else getattr(r.poses, k) for r in recordings], camera, places) for k in "Rt"
+        _gather_by_camera([None if r.poses is None else getattr(r.poses, k) for r in recordings], camera, places)
+        for k in "Rt"
     )
     return None if R is None or t is None else Pose(R, t)

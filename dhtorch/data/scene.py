@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dhtorch.data.recording import Lazy, Recording, Recordings
+from dhtorch.data.recording import LazySequence, Recording, Recordings
 from dhtorch.records import TrackHint
 
 
@@ -36,7 +36,7 @@ class Scene:
             object.__setattr__(self, "gap", int(self.recording.number[1] - self.recording.number[0]))
 
     @classmethod
-    def of(cls, given: Given) -> Scene:
+    def of(cls, given: SceneLike) -> Scene:
         """The scene itself, or a recording without notes.
 
         Raises:
@@ -66,11 +66,11 @@ class Scene:
 
 
 #: What is asked for a scene; a recording is one without notes.
-Given = Scene | Recording
+SceneLike = Scene | Recording
 
 
 @dataclass(frozen=True, eq=False)
-class Scenes(Lazy[Scene]):
+class Scenes(LazySequence[Scene]):
     """Scenes of one data set with the same notes, each recording opened when its scene is asked for."""
 
     recordings: Sequence[Recording]
@@ -87,7 +87,7 @@ class Scenes(Lazy[Scene]):
         return f"Scenes({self.recordings!r})"
 
 
-def scenes_of(given: Given | Sequence[Given]) -> Sequence[Scene]:
+def scenes_of(given: SceneLike | Sequence[SceneLike]) -> Sequence[Scene]:
     """One scene or several, given as such or as recordings; lazy where the recordings are.
 
     Raises:

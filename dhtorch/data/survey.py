@@ -16,20 +16,21 @@ from torch import Tensor
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import patches as lookup
-from dhtorch.geometry import se3
+from dhtorch.geometry import patches, se3
 from dhtorch.records import Camera, Frame, Pose
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
-PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
+_DEPTH_PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
 
-_CONSTANT_M, _CONSTANT_RAD = 1e-3, 1e-3  # poses that move less do not move
-_FAST = 5.0  # m/s; nobody carries a phone so fast
-_MANY_HOLES = 0.5
-_FAR = 200.0  # m; more is millimetres taken for metres
-_DISAGREE = 0.02  # median relative difference of depth carried from frame to frame; sound captures have 0.3 to 1.3 %
-_STEP = 5  # frames from one to the other that is held against it
-_SAMPLED = 200_000  # depth values a frame that enter the percentiles
+_MIN_MOTION_M, _MIN_MOTION_RAD = 1e-3, 1e-3  # poses that move less do not move
+_MAX_SPEED_M_S = 5.0  # m/s; nobody carries a phone so fast
+_MAX_HOLE_RATIO = 0.5
+_MAX_MEDIAN_DEPTH_M = 200.0  # m; more is millimetres taken for metres
+_MAX_DISAGREEMENT = (
+    0.02  # median relative difference of depth carried from frame to frame; sound captures have 0.3 to 1.3 %
+)
+_AGREEMENT_STEP_FRAMES = 5  # frames from one to the other that is held against it
+_MAX_SAMPLED_VALUES = 200_000  # depth values a frame that enter the percentiles
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +77,8 @@ def survey_recording(
     out = Survey(recording.name, recording.format)
     n = len(recording)
     skipped = int(recording.number[-1] - recording.number[0]) + 1 - n
-    out.say("frames", f"{n}" + (f", {many(skipped, 'number')} missing in between" if skipped else ""))
-    _times(recording.times, recording.rate_hz, out)
+    out.say("frames", f"{n}" + (f", {format_count(skipped, 'number')} missing in between" if skipped else ""))
+    _report_times(recording.times, recording.rate_hz, out)
     places = sorted({round(k * (n - 1) / max(frames - 1, 1)) for k in range(frames)})
     shots: dict[int, Frame] = {}
     for i in progress(places, recording.name, len(places)):
@@ -86,12 +87,12 @@ def survey_recording(
         except FormatError as error:
             out.warn(f"frame {int(recording.number[i])} cannot be read: {error}")
     if shots:
-        _pictures(list(shots.values()), out)
-        _depths(list(shots.values()), recording.sparse, out)
-        _confidence([s.conf for s in shots.values() if s.conf is not None], out)
-        _cameras(list(shots.values()), out)
-    _poses(recording, out)
-    _agreement(recording, shots, out)
+        _report_pictures(list(shots.values()), out)
+        _report_depth_maps(list(shots.values()), recording.sparse, out)
+        _report_confidence([s.conf for s in shots.values() if s.conf is not None], out)
+        _report_cameras(list(shots.values()), out)
+    _report_poses(recording, out)
+    _report_agreement(recording, shots, out)
     out.warnings.extend(recording.report)
     for i, shot in shots.items():
         conf = None if shot.conf is None else shot.conf[0]
@@ -108,7 +109,7 @@ def survey_pictures(name: str, images: dict[str, Tensor], depths: dict[str, Tens
             sizes = sorted({f"{x.shape[-1]}x{x.shape[-2]}" for x in found.values()})
             out.say(what, f"{len(found)}, {', '.join(sizes)}")
     if depths:
-        say_depths(list(depths.values()), out)
+        report_depths(list(depths.values()), out)
     out.warn("no intrinsics and no poses: nothing can be measured in it")
     out.tiles.extend(Tile(title, image=image) for title, image in images.items())
     out.tiles.extend(Tile(title, depth=depth) for title, depth in depths.items())
@@ -118,7 +119,7 @@ def survey_pictures(name: str, images: dict[str, Tensor], depths: dict[str, Tens
 # -------------------------------------------------------------------------------------------------------------- facts
 
 
-def _times(times: Tensor | None, rate_hz: float | None, out: Survey) -> None:
+def _report_times(times: Tensor | None, rate_hz: float | None, out: Survey) -> None:
     nominal = f"nominal {rate_hz:.3g} Hz" if rate_hz else ""
     if times is None or len(times) < 2:
         out.say("rate", nominal or "not known")
@@ -131,27 +132,27 @@ def _times(times: Tensor | None, rate_hz: float | None, out: Survey) -> None:
     out.say("rate", f"{measured} measured" + (f", {nominal}" if nominal else ""))
     out.say("duration", f"{float(times[-1] - times[0]):.3f} s")
     if bool((step <= 0).any()):
-        out.warn(f"time stamps do not increase at {many(int((step <= 0).sum()), 'place')}")
+        out.warn(f"time stamps do not increase at {format_count(int((step <= 0).sum()), 'place')}")
     gaps = step > 2.5 * middle
     if bool(gaps.any()):
-        out.warn(f"{many(int(gaps.sum()), 'gap')} in time, the longest {float(step.max()):.3f} s")
+        out.warn(f"{format_count(int(gaps.sum()), 'gap')} in time, the longest {float(step.max()):.3f} s")
 
 
-def _pictures(shots: Sequence[Frame], out: Survey) -> None:
+def _report_pictures(shots: Sequence[Frame], out: Survey) -> None:
     image = shots[0].image
     if image.numel() == 0:
         out.say("pictures", "none")
         out.warn("depth only: there are no pictures")
         return
     h, w = shots[0].hw
-    out.say("pictures", f"{w}x{h}, {pixel_kind(image.shape[1], image)}")
+    out.say("pictures", f"{w}x{h}, {describe_pixels(image.shape[1], image)}")
     warn_of_duplicates([s.image[0] for s in shots], out, "frames")
-    grey = torch.stack([lookup.luma(s.image[:, :, ::4, ::4], 1).mean() for s in shots])
+    grey = torch.stack([patches.luma(s.image[:, :, ::4, ::4], 1).mean() for s in shots])
     if float(grey.max()) < 0.02:
         out.warn("all pictures are black")
 
 
-def pixel_kind(channels: int, images: Tensor) -> str:
+def describe_pixels(channels: int, images: Tensor) -> str:
     """Colour and depth of pixels, in words."""
     return f"{'colour' if channels == 3 else 'grey'}, {'8 bits' if images.dtype == torch.uint8 else 'float'}"
 
@@ -162,42 +163,42 @@ def warn_of_duplicates(images: Sequence[Tensor], out: Survey, what: str) -> None
         out.warn(f"all {what} that were read are the same picture")
 
 
-def _depths(shots: Sequence[Frame], sparse: bool, out: Survey) -> None:
+def _report_depth_maps(shots: Sequence[Frame], sparse: bool, out: Survey) -> None:
     remark = ", not registered to the picture" if shots[0].depth_camera is not None else ""
-    say_depths([s.depth[0] for s in shots], out, remark + ", sparse returns" * sparse, sparse)
+    report_depths([s.depth[0] for s in shots], out, remark + ", sparse returns" * sparse, sparse)
 
 
-def say_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", sparse: bool = False) -> None:
+def report_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", sparse: bool = False) -> None:
     """Sizes, holes and percentiles of depth maps (h, w), m."""
     sizes = sorted({f"{d.shape[1]}x{d.shape[0]}" for d in depths})
     out.say("depth", ", ".join(sizes) + remark)
     holes = torch.stack([(d == 0).double().mean() for d in depths])
-    out.say("holes", _span([100 * h for h in holes.tolist()], "{:.1f}") + " % of the depth map")
-    values = torch.cat([_thinned(d[d > 0]) for d in depths])
+    out.say("holes", _format_range([100 * h for h in holes.tolist()], "{:.1f}") + " % of the depth map")
+    values = torch.cat([_subsample(d[d > 0]) for d in depths])
     out.depths = values
     if values.numel() == 0:
         out.warn("no depth at all in the frames that were read")
         return
-    ranks = torch.quantile(values.double(), torch.tensor(PERCENTILES).double() / 100)
-    table = ", ".join(f"{p} %: {x:.3f}" for p, x in zip(PERCENTILES, ranks.tolist(), strict=True))
+    ranks = torch.quantile(values.double(), torch.tensor(_DEPTH_PERCENTILES).double() / 100)
+    table = ", ".join(f"{p} %: {x:.3f}" for p, x in zip(_DEPTH_PERCENTILES, ranks.tolist(), strict=True))
     out.say("depth percentiles", f"{table} m")
     out.say("depth range", f"{float(values.min()):.3f} to {float(values.max()):.3f} m")
     empty = int((holes == 1).sum())
     if empty:
         out.warn(f"{empty} of {len(depths)} depth maps that were read are empty")
-    elif float(holes.mean()) > _MANY_HOLES and not sparse:
+    elif float(holes.mean()) > _MAX_HOLE_RATIO and not sparse:
         out.warn(f"most of the depth map is holes ({100 * float(holes.mean()):.0f} %)")
-    if float(ranks[3]) > _FAR:
+    if float(ranks[3]) > _MAX_MEDIAN_DEPTH_M:
         out.warn(f"median depth is {float(ranks[3]):.0f} m: are these millimetres?")
     if float(values.max() - values.min()) < 1e-3:
         out.warn("depth is the same everywhere")
 
 
-def _thinned(values: Tensor) -> Tensor:
-    return values[:: max(1, -(-values.numel() // _SAMPLED))]
+def _subsample(values: Tensor) -> Tensor:
+    return values[:: max(1, -(-values.numel() // _MAX_SAMPLED_VALUES))]
 
 
-def _confidence(maps: Sequence[Tensor], out: Survey) -> None:
+def _report_confidence(maps: Sequence[Tensor], out: Survey) -> None:
     if not maps:
         return
     counts = torch.stack([torch.bincount(m.flatten().long(), minlength=3)[:3] for m in maps]).sum(0)
@@ -208,16 +209,16 @@ def _confidence(maps: Sequence[Tensor], out: Survey) -> None:
         out.warn("confidence is the same everywhere")
 
 
-def _cameras(shots: Sequence[Frame], out: Survey) -> None:
+def _report_cameras(shots: Sequence[Frame], out: Survey) -> None:
     hw, first = shots[0].hw, shots[0].camera
     if min(hw) == 0 and shots[0].depth_camera is not None:
         first, hw = shots[0].depth_camera, (shots[0].depth.shape[-2], shots[0].depth.shape[-1])
-    out.say("intrinsics", camera_words(first, hw))
+    out.say("intrinsics", describe_camera(first, hw))
     f = torch.cat([s.camera.f for s in shots])
     if float((f.amax(0) / f.amin(0)).max()) > 1 + 1e-6:
-        out.say("focal length", _span(f[:, 0].tolist(), "{:.2f}") + " px: it changes from frame to frame")
+        out.say("focal length", _format_range(f[:, 0].tolist(), "{:.2f}") + " px: it changes from frame to frame")
     if shots[0].depth_camera is not None and min(shots[0].hw) > 0:
-        out.say("of the depth", camera_words(shots[0].depth_camera, tuple(shots[0].depth.shape[-2:])))  # type: ignore[arg-type]
+        out.say("of the depth", describe_camera(shots[0].depth_camera, tuple(shots[0].depth.shape[-2:])))  # type: ignore[arg-type]
     fx, fy = first.f[0].tolist()
     if not 0.95 < fx / fy < 1.05:
         out.warn(f"focal lengths {fx:.1f} and {fy:.1f} px: pixels are not square")
@@ -226,7 +227,7 @@ def _cameras(shots: Sequence[Frame], out: Survey) -> None:
         out.warn("the principal point is far from the middle of the picture")
 
 
-def camera_words(camera: Camera, hw: tuple[int, int]) -> str:
+def describe_camera(camera: Camera, hw: tuple[int, int]) -> str:
     """A camera in words."""
     (fx, fy), (cx, cy) = camera.f[0].tolist(), camera.c[0].tolist()
     view = [2 * math.degrees(math.atan(n / 2 / f)) for n, f in ((hw[1], fx), (hw[0], fy))]
@@ -234,7 +235,7 @@ def camera_words(camera: Camera, hw: tuple[int, int]) -> str:
     return f"f {fx:.2f} {fy:.2f}, c {cx:.2f} {cy:.2f} px, field of view {view[0]:.0f}° x {view[1]:.0f}°, {lens}"
 
 
-def _span(values: Sequence[float], form: str) -> str:
+def _format_range(values: Sequence[float], form: str) -> str:
     low, high = form.format(min(values)), form.format(max(values))
     return low if low == high else f"{low} to {high}"
 
@@ -242,7 +243,7 @@ def _span(values: Sequence[float], form: str) -> str:
 # -------------------------------------------------------------------------------------------------------------- poses
 
 
-def _poses(recording: Recording, out: Survey) -> None:
+def _report_poses(recording: Recording, out: Survey) -> None:
     poses: Pose | None = recording.poses
     if poses is None:
         out.say("poses", "none")
@@ -255,31 +256,31 @@ def _poses(recording: Recording, out: Survey) -> None:
     step = poses.t.diff(dim=0).norm(dim=-1)
     turn = se3.rotation_angle(se3.relative(poses[1:], poses[:-1]).R)
     size = float((poses.t.amax(0) - poses.t.amin(0)).norm())
-    length, turned = float(step.sum()), _degrees(turn.sum())
+    length, turned = float(step.sum()), _to_degrees(turn.sum())
     out.say("path", f"{length:.3f} m long inside a box of {size:.3f} m, {turned:.1f}° of turning")
-    usual = f"{float(step.median()):.4f} m and {_degrees(turn.median()):.2f}° from frame to frame"
+    usual = f"{float(step.median()):.4f} m and {_to_degrees(turn.median()):.2f}° from frame to frame"
     out.say("step", f"{usual}, at most {float(step.max()):.3f} m")
-    if float(step.sum()) < _CONSTANT_M and float(turn.sum()) < _CONSTANT_RAD:
+    if float(step.sum()) < _MIN_MOTION_M and float(turn.sum()) < _MIN_MOTION_RAD:
         out.warn("poses are constant")
-    elif size < _CONSTANT_M:
+    elif size < _MIN_MOTION_M:
         out.warn("the camera turns but does not move: there is no baseline")
     if recording.times is not None:
         speed = step / recording.times.diff().clamp(min=1e-9)
         out.say("speed", f"{float(speed.median()):.3f} m/s, at most {float(speed.max()):.3f} m/s")
-        if float(speed.max()) > _FAST and not recording.sparse:
+        if float(speed.max()) > _MAX_SPEED_M_S and not recording.sparse:
             number = int(recording.number[int(speed.argmax()) + 1])
             out.warn(f"the camera jumps: {float(speed.max()):.1f} m/s at frame {number}")
 
 
-def _degrees(angle: Tensor) -> float:
+def _to_degrees(angle: Tensor) -> float:
     return math.degrees(float(angle))
 
 
-def _agreement(recording: Recording, shots: dict[int, Frame], out: Survey) -> None:
+def _report_agreement(recording: Recording, shots: dict[int, Frame], out: Survey) -> None:
     """Depth carried by the poses into a later frame against the depth there, and against poses that do not move."""
     if recording.poses is None or recording.sparse or len(recording) < 2:
         return
-    step = min(_STEP, len(recording) - 1)  # at least 1
+    step = min(_AGREEMENT_STEP_FRAMES, len(recording) - 1)  # at least 1
     found: list[tuple[float, float]] = []
     for i in list(shots)[:: max(1, len(shots) // 3)]:
         j = i + step if i + step < len(recording) else max(i - step, 0)
@@ -287,31 +288,33 @@ def _agreement(recording: Recording, shots: dict[int, Frame], out: Survey) -> No
             later = shots.get(j) or recording[j]
         except FormatError:
             continue
-        moved = _disagreement(shots[i], later, se3.relative(recording.poses[i : i + 1], recording.poses[j : j + 1]))
-        still = _disagreement(shots[i], later, se3.identity(1, recording.poses.t))
+        moved = _relative_disagreement(
+            shots[i], later, se3.relative(recording.poses[i : i + 1], recording.poses[j : j + 1])
+        )
+        still = _relative_disagreement(shots[i], later, se3.identity(1, recording.poses.t))
         found += [(moved, still)] if moved is not None and still is not None else []
     if found:
         moved, still = (sorted(errors)[len(found) // 2] for errors in zip(*found, strict=True))
         out.say(
             "depth and poses", f"agree to {100 * moved:.2f} % from frame to frame ({100 * still:.2f} % without poses)"
         )
-        if moved > max(_DISAGREE, still):
+        if moved > max(_MAX_DISAGREEMENT, still):
             out.warn("depth and poses contradict each other: axes, units or scale may be wrong")
 
 
-def _disagreement(a: Frame, b: Frame, T_b_from_a: Pose) -> float | None:
+def _relative_disagreement(a: Frame, b: Frame, T_b_from_a: Pose) -> float | None:
     """Median of |z − z'| / z' of the returns of ``a`` carried into ``b``; None where too few meet."""
     v, u = (x[::7] for x in torch.nonzero(a.depth[0] > 0, as_tuple=True))
     uv = torch.stack((u, v), -1)[None].to(a.camera.f.dtype)
-    xyz = se3.apply(T_b_from_a, cameras.unproject(_depth_camera(a), uv, a.depth[0, v, u][None]).double())
-    value, inside = lookup.nearest(b.depth, cameras.project(_depth_camera(b), xyz.to(uv.dtype)))
+    xyz = se3.apply(T_b_from_a, cameras.unproject(_get_depth_camera(a), uv, a.depth[0, v, u][None]).double())
+    value, inside = patches.sample_nearest(b.depth, cameras.project(_get_depth_camera(b), xyz.to(uv.dtype)))
     meet = inside & (value > 0) & (xyz[..., 2] > 0)
     if int(meet.sum()) < 50:
         return None
     return float(((xyz[..., 2] - value).abs() / value)[meet].median())
 
 
-def _depth_camera(frame: Frame) -> Camera:
+def _get_depth_camera(frame: Frame) -> Camera:
     hw = (frame.depth.shape[-2], frame.depth.shape[-1])
     if frame.depth_camera is not None:
         return frame.depth_camera

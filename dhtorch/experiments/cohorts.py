@@ -9,7 +9,7 @@ from torch import Tensor
 
 from dhtorch.data.recording import TruthRecording
 from dhtorch.data.scene import Scene
-from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.experiments.protocol import Batch, Method, Variant
 from dhtorch.geometry import se3
 from dhtorch.metrics import holdout
@@ -17,12 +17,12 @@ from dhtorch.pipeline.spec import Trace
 from dhtorch.records import Frame, Pose, PoseFit, Samples
 
 
-def everything(frame: Frame, _cutoff: float | None) -> Frame:
+def hide_nothing(frame: Frame, _cutoff: float | None) -> Frame:
     """Hides nothing: the sensor may say all it knows."""
     return frame
 
 
-class PoseHalf:
+class PoseHalfClassifier:
     """Seat 3 of the hold-out: classifies, then takes the returns of set B away, so that only set A fixes the pose."""
 
     def __init__(self, classify: Any, seed: int, min_trackability: float) -> None:
@@ -31,8 +31,8 @@ class PoseHalf:
     def __call__(self, frame: Frame, samples: Samples) -> Samples:
         """Samples with the returns of set A alone."""
         whole: Samples = self.classify(frame, samples)
-        _, second = holdout.half(whole, self.seed, min_trackability=self.min_trackability)
-        return holdout.without_returns(whole, second)
+        _, second = holdout.split_half(whole, self.seed, min_trackability=self.min_trackability)
+        return holdout.hide_returns(whole, second)
 
 
 class HeldOut:
@@ -43,7 +43,7 @@ class HeldOut:
 
     def variant(self, **more: Any) -> Variant:
         """The method with set B hidden from it; views chosen by the returns of both sets would know B."""
-        half = PoseHalf(self.method.classify, self.seed, self.method.min_trackability)
+        half = PoseHalfClassifier(self.method.classify, self.seed, self.method.min_trackability)
         return Variant(self.method.replace(classify=half), two_frames=True, **more)
 
     def whole(self, batch: Batch, uv: Tensor) -> Samples:
@@ -53,34 +53,34 @@ class HeldOut:
     def heldout(self, batch: Batch, trace: Trace) -> holdout.Truth:
         """Set B: trackable samples whose return never took part in the pose."""
         whole, truth = self._truth(batch, trace)
-        _, second = holdout.half(whole, self.seed, min_trackability=self.method.min_trackability)
-        return _only(truth, second)
+        _, second = holdout.split_half(whole, self.seed, min_trackability=self.method.min_trackability)
+        return _restrict_candidates(truth, second)
 
     def cyclic(self, batch: Batch, trace: Trace) -> holdout.Truth:
         """The inliers of the pose: what RANSAC optimised."""
         _, truth = self._truth(batch, trace)
-        return _only(truth, trace["fit"].inlier)
+        return _restrict_candidates(truth, trace["fit"].inlier)
 
     def _truth(self, batch: Batch, trace: Trace) -> tuple[Samples, holdout.Truth]:
         whole = self.whole(batch, trace["samples"].uv)
-        found = holdout.truth_at(batch.anchor, whole.uv)
-        return whole, holdout.candidates(whole, found, 0.0)
+        found = holdout.sample_truth(batch.anchor, whole.uv)
+        return whole, holdout.select_candidates(whole, found, 0.0)
 
 
 def real_holes(batch: Batch, trace: Trace) -> holdout.Truth:
     """The sensor's own drop-outs, held against independent truth; nothing where there is none."""
     samples: Samples = trace["samples"]
-    found = holdout.truth_at(batch.exact, samples.uv)
-    if has_truth(batch.scene) is not None:
-        return found.replace(code=torch.full_like(found.code, holdout.Rule.NO_RETURN))
+    found = holdout.sample_truth(batch.exact, samples.uv)
+    if missing_truth_reason(batch.scene) is not None:
+        return found.replace(code=torch.full_like(found.code, holdout.TruthCode.NO_RETURN))
     kinds = batch.kinds(samples.uv)
     if kinds is not None:
         odd = torch.isin(kinds, torch.tensor([*batch.odd], dtype=kinds.dtype).to(kinds.device))
-        found = found.replace(code=torch.where(odd, holdout.Rule.EXCLUDED, found.code))
-    return holdout.drop_outs(batch.anchor, samples, found)
+        found = found.replace(code=torch.where(odd, holdout.TruthCode.EXCLUDED, found.code))
+    return holdout.select_real_holes(batch.anchor, samples, found)
 
 
-def trajectory(batch: Batch, *, raw: bool = False) -> Pose | None:
+def trajectory_pose(batch: Batch, *, raw: bool = False) -> Pose | None:
     """Relative pose of each pair from the device's trajectory; None where the capture has none.
 
     Args:
@@ -98,26 +98,26 @@ def trajectory(batch: Batch, *, raw: bool = False) -> Pose | None:
     return Pose(flip[:, None] * T.R * flip, flip * T.t)
 
 
-def device_fit(batch: Batch, n: int, *, raw: bool = False) -> PoseFit:
+def trajectory_pose_fit(batch: Batch, n: int, *, raw: bool = False) -> PoseFit:
     """The device's trajectory in the shape of seat 5's answer; not ok where there is none."""
-    T, like = trajectory(batch, raw=raw), batch.anchor.camera.f
+    T, like = trajectory_pose(batch, raw=raw), batch.anchor.camera.f
     if T is None:
         eye = se3.identity(like.shape[0], like)
         T = Pose(eye.R * torch.nan, eye.t)
-    return given_pose(T.to(like.dtype), n)
+    return known_pose_fit(T.to(like.dtype), n)
 
 
-def has_trajectory(scene: Scene) -> str | None:
+def missing_trajectory_reason(scene: Scene) -> str | None:
     """Why the device's trajectory cannot be used; None where it can."""
     return "no device trajectory" if scene.recording.poses is None else None
 
 
-def has_truth(scene: Scene) -> str | None:
+def missing_truth_reason(scene: Scene) -> str | None:
     """Why nothing but the sensor can be asked; None where an independent instrument was there."""
     return None if isinstance(scene.recording, TruthRecording) else "no independent truth"
 
 
-def _only(truth: holdout.Truth, mask: Tensor) -> holdout.Truth:
+def _restrict_candidates(truth: holdout.Truth, mask: Tensor) -> holdout.Truth:
     """The candidates among the masked samples; the others were not held back."""
-    near = torch.full_like(truth.code, holdout.Rule.NEAR)
+    near = torch.full_like(truth.code, holdout.TruthCode.NEAR)
     return truth.replace(code=torch.where(mask, truth.code, near))

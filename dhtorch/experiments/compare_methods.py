@@ -15,30 +15,30 @@ from typing import Any
 
 import torch
 
-from dhtorch import pytree as tree
-from dhtorch.calibration.score_calibration import fit
+from dhtorch import pytree
+from dhtorch.calibration.score_calibration import fit_calibration
 from dhtorch.metrics import bootstrap, control, errors, reliability, risk
 from dhtorch.metrics.bootstrap import Interval
 from dhtorch.metrics.errors import Points
 
 #: A scene on which either method answers fewer points says nothing about their ratio.
-MIN_ANSWERS = 20
+MIN_COMPARED_ANSWERS = 20
 
 #: A scene with fewer answers above a threshold (mean over seeds) says nothing about keeping its target.
-MIN_ABOVE = 100
+MIN_ANSWERS_ABOVE_THRESHOLD = 100
 
 #: Targets of the plug-in control, per cent of mean error.
-TARGETS = (10, 5)
+_TARGET_PERCENT = (10, 5)
 
 #: Errors below this count as this much: a ratio of two roundings is no ratio.
-SMALLEST = 1e-6
+MIN_COMPARED_ERROR = 1e-6
 
 #: Scene → the candidates of every seed.
-Seeds = Mapping[str, Sequence[Points]]
+SeedPoints = Mapping[str, Sequence[Points]]
 
 
 @dataclass
-class Comparison:
+class MethodComparison:
     """Summary keys ``<method>.<number>``, one row per method and scene, and the scenes that need naming."""
 
     summary: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -48,14 +48,14 @@ class Comparison:
 
 
 def method_ratios(
-    methods: Mapping[str, Seeds],
+    methods: Mapping[str, SeedPoints],
     *,
     reference: str = "paper",
     rooms: Mapping[str, str] | None = None,
     fallback: Mapping[str, str] | None = None,
     draws: int = 2000,
     seed: int = 0,
-) -> Comparison:
+) -> MethodComparison:
     """What every other method gains on the reference, and whether it keeps its promises.
 
     Args:
@@ -83,25 +83,25 @@ def method_ratios(
     Raises:
         ValueError: no reference, or methods that differ in scenes or number of seeds.
     """
-    complete = completed(methods, reference, fallback or {})
-    found = Comparison()
+    complete = complete_scenes(methods, reference, fallback or {})
+    found = MethodComparison()
     for method, ours in complete.items():
         if method == reference:
             continue
         rows: dict[str, dict[str, Any]] = {scene: {"method": method, "scene": scene} for scene in ours}
         numbers = _ratios(ours, complete[reference], rows, found.left_out.setdefault(method, []), draws, seed)
-        numbers |= promises(ours, rooms, rows, draws, seed)
-        for percent in TARGETS:
+        numbers |= evaluate_promises(ours, rooms, rows, draws, seed)
+        for percent in _TARGET_PERCENT:
             key = f"realised_risk_{percent}"
             found.silent[f"{method}.{percent}"] = [s for s, row in rows.items() if key in row and row[key] is None]
         for name, value in numbers.items():
-            found.summary[f"{method}.{name}"] = value.entry(errors.unit(name))
+            found.summary[f"{method}.{name}"] = value.entry(errors.metric_unit(name))
         found.rows += rows.values()
     return found
 
 
-def against(
-    ours: Seeds, theirs: Seeds, name: str, *, draws: int = 2000, seed: int = 0
+def multiview_ratios(
+    ours: SeedPoints, theirs: SeedPoints, name: str, *, draws: int = 2000, seed: int = 0
 ) -> tuple[dict[str, Interval], dict[str, dict[str, float]]]:
     """What one method of several views gains on another, with what it leaves silent counted as well.
 
@@ -116,12 +116,12 @@ def against(
         ``aurc_full_ratio_to_<name>``, geometric mean of the ratio of the areas over all candidates, where silence
         counts as an error of one. And the same scene by scene, where it is defined.
     """
-    equal, _ = ratio_over_seeds(*equal_coverage(ours, theirs), _median_rel)
-    full, _ = ratio_over_seeds(ours, theirs, lambda p: risk.measure(p)["aurc_full"], min_answers=0)
+    equal, _ = ratio_over_seeds(*cut_to_equal_coverage(ours, theirs), _median_rel)
+    full, _ = ratio_over_seeds(ours, theirs, lambda p: risk.measure_risk(p)["aurc_full"], min_answers=0)
     numbers = {
-        f"error_ratio_to_{name}": _geometric(equal, draws, seed),
-        f"worst_scene_ratio_to_{name}": _worst(equal),
-        f"aurc_full_ratio_to_{name}": _geometric(full, draws, seed),
+        f"error_ratio_to_{name}": _geometric_mean(equal, draws, seed),
+        f"worst_scene_ratio_to_{name}": _worst_ratio(equal),
+        f"aurc_full_ratio_to_{name}": _geometric_mean(full, draws, seed),
     }
     rows = {s: {f"error_ratio_to_{name}": equal[s]} if s in equal else {} for s in ours}
     for scene, ratio in full.items():
@@ -130,7 +130,11 @@ def against(
 
 
 def ratio_over_seeds(
-    ours: Seeds, theirs: Seeds, measure: Callable[[Points], float | None], *, min_answers: int = MIN_ANSWERS
+    ours: SeedPoints,
+    theirs: SeedPoints,
+    measure: Callable[[Points], float | None],
+    *,
+    min_answers: int = MIN_COMPARED_ANSWERS,
 ) -> tuple[dict[str, float], list[str]]:
     """Ratio of the medians over seeds of one number, scene by scene, and the scenes that have none.
 
@@ -146,48 +150,50 @@ def ratio_over_seeds(
         if min(kept) < min_answers or a is None or b is None:
             left_out.append(scene)
         else:
-            found[scene] = max(a, SMALLEST) / max(b, SMALLEST)
+            found[scene] = max(a, MIN_COMPARED_ERROR) / max(b, MIN_COMPARED_ERROR)
     return found, left_out
 
 
-def equal_coverage(ours: Seeds, theirs: Seeds) -> tuple[dict[str, list[Points]], dict[str, list[Points]]]:
+def cut_to_equal_coverage(
+    ours: SeedPoints, theirs: SeedPoints
+) -> tuple[dict[str, list[Points]], dict[str, list[Points]]]:
     """Both methods, cut by their own score to the smaller number of answers, seed by seed."""
     cut_ours: dict[str, list[Points]] = {}
     cut_theirs: dict[str, list[Points]] = {}
     for scene in ours:
         pairs = list(zip(ours[scene], theirs[scene], strict=True))
         sizes = [min(int(a.keep.sum()), int(b.keep.sum())) for a, b in pairs]
-        cut_ours[scene] = [risk.surest(a, n) for (a, _), n in zip(pairs, sizes, strict=True)]
-        cut_theirs[scene] = [risk.surest(b, n) for (_, b), n in zip(pairs, sizes, strict=True)]
+        cut_ours[scene] = [risk.keep_surest(a, n) for (a, _), n in zip(pairs, sizes, strict=True)]
+        cut_theirs[scene] = [risk.keep_surest(b, n) for (_, b), n in zip(pairs, sizes, strict=True)]
     return cut_ours, cut_theirs
 
 
 def _ratios(
-    ours: Seeds, theirs: Seeds, rows: dict[str, dict[str, Any]], left_out: list[str], draws: int, seed: int
+    ours: SeedPoints, theirs: SeedPoints, rows: dict[str, dict[str, Any]], left_out: list[str], draws: int, seed: int
 ) -> dict[str, Interval]:
     def geometric(ratios: Mapping[str, float], name: str) -> Interval:
         for scene, row in rows.items():
             row[name] = ratios.get(scene)
-        return _geometric(ratios, draws, seed)
+        return _geometric_mean(ratios, draws, seed)
 
     own, unanswered = ratio_over_seeds(ours, theirs, _median_rel)
     left_out += unanswered
-    equal, _ = ratio_over_seeds(*equal_coverage(ours, theirs), _median_rel)
-    ranked, _ = ratio_over_seeds(ours, theirs, lambda p: risk.measure(p)["aurc"])
+    equal, _ = ratio_over_seeds(*cut_to_equal_coverage(ours, theirs), _median_rel)
+    ranked, _ = ratio_over_seeds(ours, theirs, lambda p: risk.measure_risk(p)["aurc"])
     for scene, row in rows.items():
-        row["coverage_at_5"] = _median_over_seeds(ours[scene], lambda p: risk.measure(p)["coverage_at_5"])
+        row["coverage_at_5"] = _median_over_seeds(ours[scene], lambda p: risk.measure_risk(p)["coverage_at_5"])
     reached = [row["coverage_at_5"] for row in rows.values()]
     return {
         "median_rel_ratio": geometric(own, "median_rel_ratio"),
         "median_rel_ratio_at_equal_coverage": geometric(equal, "median_rel_ratio_at_equal_coverage"),
-        "worst_scene_ratio": _worst(equal),
+        "worst_scene_ratio": _worst_ratio(equal),
         "aurc_ratio": geometric(ranked, "aurc_ratio"),
-        "coverage_at_5": bootstrap.interval(reached, statistic="mean", draws=draws, seed=seed),
+        "coverage_at_5": bootstrap.interval_over_scenes(reached, statistic="mean", draws=draws, seed=seed),
     }
 
 
-def promises(
-    ours: Seeds, rooms: Mapping[str, str] | None, rows: dict[str, dict[str, Any]], draws: int, seed: int
+def evaluate_promises(
+    ours: SeedPoints, rooms: Mapping[str, str] | None, rows: dict[str, dict[str, Any]], draws: int, seed: int
 ) -> dict[str, Interval]:
     """What was promised in every room by what the other rooms taught: the second half of :func:`method_ratios`.
 
@@ -197,34 +203,40 @@ def promises(
         rows: scene → its numbers, filled.
         draws, seed: of the bootstrap over scenes.
     """
-    pooled = {scene: tree.collate(points) for scene, points in ours.items()}
+    pooled = {scene: pytree.collate(points) for scene, points in ours.items()}
     table, sigmoid = {}, {}
     for others, held in reliability.leave_one_room_out(pooled, rooms):
         if not any(bool(s.keep.any()) for s in others.values()):
             continue  # nothing to learn from: these scenes have no such number
-        few = MIN_ABOVE * max(map(len, ours.values()))
-        learnt = fit(list(others.values()), targets=TARGETS, choose=partial(control.most_scenes, few=few))
+        few = MIN_ANSWERS_ABOVE_THRESHOLD * max(map(len, ours.values()))
+        learnt = fit_calibration(
+            list(others.values()), targets=_TARGET_PERCENT, choose=partial(control.scene_quantile_threshold, few=few)
+        )
         for scene, points in held.items():
             table[scene] = learnt.apply(points)
             sigmoid[scene] = points.replace(score=torch.where(points.keep, learnt.sigmoid(points.score), 0.0))
-            stated = errors.measure(table[scene])
+            stated = errors.measure_errors(table[scene])
             rows[scene] |= {k: stated[k] for k in ("within_sigma", "within_2sigma")}
             rows[scene]["ece"] = reliability.excess_ece(table[scene], seed=seed)
             for percent, threshold in learnt.thresholds.items():
-                rows[scene][f"realised_risk_{percent}"] = risk.realised(points, threshold)
+                rows[scene][f"realised_risk_{percent}"] = risk.realised_risk(points, threshold)
                 above = 0 if threshold is None else int((points.keep & (points.score >= threshold)).sum())
                 rows[scene][f"n_above_{percent}"] = above / len(ours[scene])
                 rows[scene][f"coverage_within_{percent}"] = above / max(points.keep.numel(), 1)
 
     def mean(values: list[float | None]) -> Interval:
-        return bootstrap.interval(values, statistic="mean", draws=draws, seed=seed)
+        return bootstrap.interval_over_scenes(values, statistic="mean", draws=draws, seed=seed)
 
     judged = [rows[scene] for scene in table]
     numbers = {name: mean([row[name] for row in judged]) for name in ("within_sigma", "within_2sigma")}
-    for percent in TARGETS:
+    for percent in _TARGET_PERCENT:
         realised = [row[f"realised_risk_{percent}"] or 0.0 for row in judged]
         numbers[f"realised_risk_{percent}"] = mean(realised)
-        enough = [r for r, row in zip(realised, judged, strict=True) if row[f"n_above_{percent}"] >= MIN_ABOVE]
+        enough = [
+            r
+            for r, row in zip(realised, judged, strict=True)
+            if row[f"n_above_{percent}"] >= MIN_ANSWERS_ABOVE_THRESHOLD
+        ]
         spoke = [row[f"realised_risk_{percent}"] for row in judged if row[f"realised_risk_{percent}"] is not None]
         numbers[f"risk_of_speaking_{percent}"] = mean(spoke)
         numbers[f"coverage_within_{percent}"] = mean([row[f"coverage_within_{percent}"] for row in judged])
@@ -235,8 +247,8 @@ def promises(
     return numbers
 
 
-def completed(
-    methods: Mapping[str, Seeds], reference: str, fallback: Mapping[str, str]
+def complete_scenes(
+    methods: Mapping[str, SeedPoints], reference: str, fallback: Mapping[str, str]
 ) -> dict[str, dict[str, Sequence[Points]]]:
     """Every method on the reference's scenes, in its order; arguments and errors as :func:`method_ratios`."""
     if reference not in methods:
@@ -257,12 +269,12 @@ def completed(
     return complete
 
 
-def _geometric(ratios: Mapping[str, float], draws: int, seed: int) -> Interval:
+def _geometric_mean(ratios: Mapping[str, float], draws: int, seed: int) -> Interval:
     """Geometric mean over scenes."""
-    return bootstrap.interval(list(ratios.values()), statistic="geometric_mean", draws=draws, seed=seed)
+    return bootstrap.interval_over_scenes(list(ratios.values()), statistic="geometric_mean", draws=draws, seed=seed)
 
 
-def _worst(ratios: Mapping[str, float]) -> Interval:
+def _worst_ratio(ratios: Mapping[str, float]) -> Interval:
     """The largest over scenes."""
     return Interval(max(ratios.values(), default=None), None, None, len(ratios))
 
@@ -273,4 +285,4 @@ def _median_over_seeds(seeds: Sequence[Points], measure: Callable[[Points], floa
 
 
 def _median_rel(points: Points) -> float | None:
-    return errors.measure(points)["median_rel"]
+    return errors.measure_errors(points)["median_rel"]

@@ -9,21 +9,21 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.data.io.decode import set_opencv_threads
-from dhtorch.data.pairs import Pair, between
+from dhtorch.data.pairs import Pair, spaced_frames
 from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.records import Frame
-from dhtorch.runtime.parent_watch import follow_parent
+from dhtorch.runtime.parent_watch import exit_with_parent
 
-Offers = Callable[[Recording, int], Sequence[int]]  # (recording, anchor) → positions of other views
+CandidateViews = Callable[[Recording, int], Sequence[int]]  # (recording, anchor) → positions of other views
 
 #: anchor, further views, anchor with its truth as depth, kinds of surface, disagreement of truth and sensor, views
 #: around it
-Loaded = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor, tuple[Frame, ...]]
+LoadedPair = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor, tuple[Frame, ...]]
 
 
-class PairData(Dataset[Loaded]):
+class PairDataset(Dataset[LoadedPair]):
     """Pairs of one recording for a data loader."""
 
     def __init__(
@@ -32,17 +32,17 @@ class PairData(Dataset[Loaded]):
         pairs: Sequence[Pair],
         dtype: torch.dtype,
         views: int = 1,
-        offers: Offers | None = None,
+        offers: CandidateViews | None = None,
     ) -> None:
         self.recording, self.pairs, self.dtype, self.views, self.offers = recording, pairs, dtype, views, offers
 
     def __len__(self) -> int:
         return len(self.pairs)
 
-    def __getitem__(self, index: int) -> Loaded:
+    def __getitem__(self, index: int) -> LoadedPair:
         i, other = pair = Pair(*self.pairs[index])
-        own = between(i, other, self.views) if isinstance(other, int) else []
-        around = offered_views(pair, self.recording, self.offers)
+        own = spaced_frames(i, other, self.views) if isinstance(other, int) else []
+        around = candidate_views(pair, self.recording, self.offers)
         frames = {k: self.recording[k].to(self.dtype) for k in sorted({i, *own, *around})}
         anchor = frames[i]
         others, choice = (tuple(frames[k] for k in some) for some in (own, around))
@@ -54,7 +54,7 @@ class PairData(Dataset[Loaded]):
         return anchor, others, known, exact["surface"].float(), disagreement, choice
 
 
-def load(data: PairData, *, batch: int, workers: int) -> DataLoader[Loaded]:
+def load_pairs(data: PairDataset, *, batch: int, workers: int) -> DataLoader[LoadedPair]:
     """The pairs in batches of so many, read by so many processes besides."""
     workers = workers if len(data) else 0
     return DataLoader(
@@ -62,30 +62,30 @@ def load(data: PairData, *, batch: int, workers: int) -> DataLoader[Loaded]:
         batch_size=batch,
         num_workers=workers,
         collate_fn=_collate,
-        worker_init_fn=_worker,
+        worker_init_fn=_init_worker,
         # A fork would copy the locks of whatever threads torch and OpenCV run here, and may never return.
         multiprocessing_context="spawn" if workers else None,
     )
 
 
-def offered_views(pair: Pair, recording: Recording, offers: Offers | None) -> Sequence[int]:
+def candidate_views(pair: Pair, recording: Recording, offers: CandidateViews | None) -> Sequence[int]:
     """The frames among which a variant chooses; none where it takes the pair's own."""
     return pair.offered or (() if offers is None else offers(recording, pair.anchor))
 
 
-def _collate(items: list[Loaded]) -> Loaded:
+def _collate(items: list[LoadedPair]) -> LoadedPair:
     anchor, others, exact, surface, disagreement, around = zip(*items, strict=True)
-    views, choice = (tuple(tree.collate(v) for v in zip(*many, strict=True)) for many in (others, around))
-    return tree.collate(anchor), views, tree.collate(exact), torch.cat(surface), torch.cat(disagreement), choice
+    views, choice = (tuple(pytree.collate(v) for v in zip(*many, strict=True)) for many in (others, around))
+    return pytree.collate(anchor), views, pytree.collate(exact), torch.cat(surface), torch.cat(disagreement), choice
 
 
-def moved(item: Any, device: str) -> Any:
+def move_to_device(item: Any, device: str) -> Any:
     """Tensors and records of nested tuples on a device."""
-    return tuple(moved(i, device) for i in item) if isinstance(item, tuple) else item.to(device)
+    return tuple(move_to_device(i, device) for i in item) if isinstance(item, tuple) else item.to(device)
 
 
-def _worker(_number: int) -> None:
+def _init_worker(_number: int) -> None:
     """One thread in a worker of a loader, which ends with this process."""
-    follow_parent()
+    exit_with_parent()
     torch.set_num_threads(1)
     set_opencv_threads(1)

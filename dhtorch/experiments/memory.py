@@ -16,15 +16,15 @@ from typing import Any
 import torch
 
 from dhtorch.data.io.decode import set_opencv_threads
-from dhtorch.pipeline.spec import networks
+from dhtorch.pipeline.spec import iter_networks
 from dhtorch.pytree import Record
 
 _MIB = 2**20
 
 
-def weights(*parts: Any) -> dict[str, int]:
+def count_weights(*parts: Any) -> dict[str, int]:
     """``parameters`` and ``weight_bytes`` of all networks among ``parts`` and in the options of partials."""
-    tensors = {id(p): p for network in networks(*parts) for p in network.parameters()}.values()
+    tensors = {id(p): p for network in iter_networks(*parts) for p in network.parameters()}.values()
     return {
         "parameters": sum(p.numel() for p in tensors),
         "weight_bytes": sum(p.numel() * p.element_size() for p in tensors),
@@ -44,58 +44,58 @@ def peak_mib(call: Callable[[], Any], before: Callable[[], Any] | None = None) -
         MiB; None where the system does not tell.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
-        return process.submit(_peak, call, before, torch.get_num_threads()).result()
+        return process.submit(_child_peak, call, before, torch.get_num_threads()).result()
 
 
-def _peak(call: Callable[[], Any], before: Callable[[], Any] | None, threads: int) -> float | None:
+def _child_peak(call: Callable[[], Any], before: Callable[[], Any] | None, threads: int) -> float | None:
     """The child's part."""
     torch.set_num_threads(threads)
     set_opencv_threads(threads)
     if before is not None:
         before()
-    call = _own(call)
+    call = _call_on_copies(call)
     gc.collect()
-    _give_back()
-    _forget_peak()
-    start = _resident()
+    _trim_heap()
+    _reset_peak()
+    start = _resident_bytes()
     with torch.no_grad():
         call()
-    highest = _highest()
+    highest = _peak_bytes()
     return None if start is None or highest is None else max(highest - start, 0) / _MIB
 
 
-def _own(call: Any) -> Any:
+def _call_on_copies(call: Any) -> Any:
     """The same call on private copies: what came through shared memory would count on first touch."""
     if isinstance(call, partial):
-        copies = [a.map(torch.clone) if isinstance(a, Record) else _own(a) for a in call.args]
+        copies = [a.map(torch.clone) if isinstance(a, Record) else _call_on_copies(a) for a in call.args]
         return partial(call.func, *copies, **call.keywords)
     return call.clone() if isinstance(call, torch.Tensor) else call
 
 
-def _resident() -> int | None:
+def _resident_bytes() -> int | None:
     """Bytes resident now."""
-    return _status("VmRSS") or _rusage()
+    return _read_proc_status("VmRSS") or _rusage()
 
 
-def _highest() -> int | None:
+def _peak_bytes() -> int | None:
     """Bytes resident at most so far. The kernel's own high-water mark of this address space comes first:
     ``ru_maxrss`` of a new process starts at the size of the one that made it."""
-    return _status("VmHWM") or _rusage()
+    return _read_proc_status("VmHWM") or _rusage()
 
 
-def _give_back() -> None:
+def _trim_heap() -> None:
     """Hand free memory back to the system, where the C library can: what is kept would be used again, uncounted."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _forget_peak() -> None:
+def _reset_peak() -> None:
     """Set the high-water mark back to what is resident now, where the kernel allows it."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
 
-def _status(name: str) -> int | None:
+def _read_proc_status(name: str) -> int | None:
     try:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:

@@ -24,7 +24,7 @@ class Example:
     pair: str = ""  # the anchor and the views that were used, as numbers of the recording
     cutoff: float | None = None  # m
     asked: dict[str, Any] | None = (
-        None  # as dhtorch.pipeline.dense.complete takes it; None where the method was not simply asked
+        None  # as dhtorch.pipeline.dense.complete_depth takes it; None where the method was not simply asked
     )
 
     def cpu(self) -> Example:
@@ -58,7 +58,7 @@ class Outcome:
         return {r["scene"]: r for r in self.rows if (r["method"], r["truth"], r["pair"], r.get("role")) == wanted}
 
 
-def join(outcomes: Iterable[Outcome]) -> Outcome:
+def join_outcomes(outcomes: Iterable[Outcome]) -> Outcome:
     """Several runs as one: their variants must bear different names."""
     whole = Outcome()
     for part in outcomes:

@@ -8,23 +8,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from dhtorch.data.scene import Given
+from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """Run every method on every pair of every recording, for every truth test of ``settings``.
 
     Args and errors: as :func:`dhtorch.experiments.protocol.run`; ``methods`` is name → method.
     """
     variants = {name: Variant(method) for name, method in methods.items()}
-    cohorts = {test: partial(protocol.held_back, test=test) for test in settings.truth}
+    cohorts = {test: partial(protocol.held_back_truth, test=test) for test in settings.truth}
     return protocol.run(scenes, Protocol(variants, cohorts), pairs, settings, progress=progress)

@@ -15,14 +15,14 @@ from dhtorch.metrics.risk import risk_coverage
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.pair import merge
 from dhtorch.viz.plots import (
-    at_cutoff,
+    append_cutoff,
     draw_completed,
     draw_depth,
     draw_holes,
     draw_risk_coverage,
     draw_samples,
 )
-from dhtorch.viz.plots.colours import of_source
+from dhtorch.viz.plots.colours import colour_by_source
 
 
 def draw_example(folder: str | Path, example: Any) -> list[Path]:
@@ -35,17 +35,19 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
     e = example.cpu()
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    place = at_cutoff(f"{e.scene} {e.pair}", e.cutoff)
+    place = append_cutoff(f"{e.scene} {e.pair}", e.cutoff)
     whole, image, uv = merge(e.samples, e.estimate), e.frame.image[0], e.samples.uv[0]
     draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0], title=place)
     draw_holes(folder / "holes.png", image, uv, e.samples.hole[0], title=place)
     written = ["samples.png", "holes.png", "points.ply"]
     if example.asked is not None:  # where the method was asked
         with torch.no_grad():
-            maps = dense.complete(example.frame, calibration=dense.shipped(), **example.asked).to("cpu")[0]
+            maps = dense.complete_depth(example.frame, calibration=dense.default_calibration(), **example.asked).to(
+                "cpu"
+            )[0]
         draw_completed(folder / "completed.png", image, maps.depth, maps.sigma, maps.source, title=place)
         written.append("completed.png")
-    pooled = errors.select(e.estimate, e.truth)
+    pooled = errors.points_from_estimate(e.estimate, e.truth)
     if pooled.keep.any():
         draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score, title=place)
         curves = {e.method: risk_coverage(pooled)}
@@ -55,5 +57,5 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
     xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]
     columns = {name: getattr(whole, name)[0][filled] for name in ("sigma", "score")}
     columns |= {"hole": e.samples.hole[0][filled], "source": whole.source[0][filled]}
-    write_ply(folder / "points.ply", xyz, of_source(columns["source"]), **columns)
+    write_ply(folder / "points.ply", xyz, colour_by_source(columns["source"]), **columns)
     return [folder / name for name in written]

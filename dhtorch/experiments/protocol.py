@@ -16,33 +16,33 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.codes import Gate, Hole, names
-from dhtorch.data.pairs import Pair, fixed
+from dhtorch.data.pairs import Pair, to_fixed_pairs
 from dhtorch.data.recording import Recording, TruthRecording
-from dhtorch.data.scene import Given, Scene, scenes_of
-from dhtorch.experiments.loading import Offers, PairData, load, moved, offered_views
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.experiments.loading import CandidateViews, PairDataset, candidate_views, load_pairs, move_to_device
 from dhtorch.experiments.outcome import Example, Outcome
-from dhtorch.experiments.rows import Row, overlay, scene_row, summarise
+from dhtorch.experiments.rows import Row, overlay_points, scene_row, summarise_rows
 from dhtorch.experiments.shared_tracks import SharedTracks
-from dhtorch.geometry.patches import nearest, patches, round_half_up
+from dhtorch.geometry.patches import extract_patches, round_half_up, sample_nearest
 from dhtorch.metrics import errors, holdout
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
-from dhtorch.pipeline.view_report import Picked, choosing, picked
+from dhtorch.pipeline.view_report import ViewReport, report_selection, with_view_selection
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
 
-Pairs = Callable[[Scene], Sequence[Pair] | Sequence[tuple[int, int]]]
+ScenePairs = Callable[[Scene], Sequence[Pair] | Sequence[tuple[int, int]]]
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 #: A pair with fewer candidates says nothing: it is dropped and counted.
 MIN_CANDIDATES = 20
 
 #: A track looks at this many pixels across (LK window and a margin): what lies within may pull at it.
-REACH_PX = 25
+_TRACK_REACH_PX = 25
 
 
-def quiet(items: Iterable[Any], _text: str, _total: int) -> Iterable[Any]:
+def no_progress(items: Iterable[Any], _text: str, _total: int) -> Iterable[Any]:
     """No progress bar."""
     return items
 
@@ -92,9 +92,11 @@ class Batch:
         """Kind of surface (B, N) at samples; one whose track window touches an odd surface counts with that."""
         if self.surface.shape[-1] == 1:
             return None
-        kind = nearest(self.surface, uv)[0]
-        corner = (round_half_up(uv) - REACH_PX // 2).long()
-        around = patches(self.surface[:, None], corner, min(REACH_PX, *self.surface.shape[-2:]))[:, :, 0].flatten(-2)
+        kind = sample_nearest(self.surface, uv)[0]
+        corner = (round_half_up(uv) - _TRACK_REACH_PX // 2).long()
+        around = extract_patches(self.surface[:, None], corner, min(_TRACK_REACH_PX, *self.surface.shape[-2:]))[
+            :, :, 0
+        ].flatten(-2)
         for code in self.odd:
             kind = torch.where((around == code).any(-1), torch.full_like(kind, code), kind)
         return kind
@@ -112,7 +114,7 @@ class Variant:
     fit: Callable[[Batch, int], PoseFit] | None = None  # a pose from elsewhere: (batch, number of samples) → fit
     seed: int | None = None  # None = the job's
     given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
-    offers: Offers | None = None  # other views in the place of the pair's own; silent where it is offered none
+    offers: CandidateViews | None = None  # other views in the place of the pair's own; silent where it is offered none
     needs: Callable[[Scene], str | None] = lambda _scene: None  # scene → why it cannot run there, None = it can
     chooses: bool = False  # ``ask`` chooses among several views, as the method does
     two_frames: bool = False  # cannot choose: what it is judged by would take part in the choice
@@ -146,7 +148,7 @@ class Answer:
     def one(self, b: int) -> Answer:
         """Pair ``b`` alone; milliseconds are the batch's share."""
         size, cut = len(self.batch.pairs), slice(b, b + 1)
-        records = {k: v[cut] for k, v in self.trace.items() if isinstance(v, tree.Record)}
+        records = {k: v[cut] for k, v in self.trace.items() if isinstance(v, pytree.Record)}
         records |= {k: self.trace[k][:, cut] for k in ("choice",) if k in self.trace}
         return replace(
             self,
@@ -166,18 +168,18 @@ class Answer:
         )
 
 
-def held_back(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Truth:
+def held_back_truth(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Truth:
     """The cohort of the range split: samples whose return was held back and passes the truth test."""
     samples: Samples = trace["samples"]
     kinds = batch.kinds(samples.uv)
     odd = None if kinds is None else torch.isin(kinds, torch.tensor([*batch.odd], dtype=kinds.dtype).to(kinds.device))
-    found = holdout.truth_at(batch.exact, samples.uv, truth=test)
-    return holdout.candidates(samples, found, batch.cutoff if _is_cut(batch.cutoff) else None, excluded=odd)
+    found = holdout.sample_truth(batch.exact, samples.uv, truth=test)
+    return holdout.select_candidates(samples, found, batch.cutoff if _has_cutoff(batch.cutoff) else None, excluded=odd)
 
 
-def spread(pairs: Pairs, anchors: int | None, scene: Scene) -> list[tuple[int, int]]:
+def spread_pairs(pairs: ScenePairs, anchors: int | None, scene: Scene) -> list[tuple[int, int]]:
     """Some of the scene's pairs of two frames, evenly spread; None = all."""
-    found = fixed(pairs(scene))
+    found = to_fixed_pairs(pairs(scene))
     if anchors is None or len(found) <= anchors:
         return found
     return [found[(2 * k + 1) * len(found) // (2 * anchors)] for k in range(anchors)]
@@ -193,16 +195,16 @@ class Protocol:
     """Which variants run, what they may see, what they are held against, and what else is noted of each pair."""
 
     variants: Mapping[str, Variant]
-    cohorts: Mapping[str, Cohort] = field(default_factory=lambda: {"full": held_back})  # the last one decides
+    cohorts: Mapping[str, Cohort] = field(default_factory=lambda: {"full": held_back_truth})  # the last one decides
     hide: Callable[[Frame, float | None], Frame] = holdout.range_split  # (view, cutoff) → what a method may see
     columns: Callable[[Answer], Row] = no_columns  # of one pair; numbers are joined over the pairs of a scene by median
     min_candidates: int = MIN_CANDIDATES
 
     @property
-    def offers(self) -> Offers | None:
+    def offers(self) -> CandidateViews | None:
         """All frames that are offered to any variant, in the order of the recording; None where none asks for them."""
         asked = list(dict.fromkeys(v.offers for v in self.variants.values() if v.offers is not None))
-        return partial(_all_offered, asked) if asked else None
+        return partial(_all_candidates, asked) if asked else None
 
     def views(self, pairs: Sequence[Pair]) -> int:
         """Views that are loaded of every pair: as many as some variant asks for, and as a short gap holds."""
@@ -221,11 +223,16 @@ class Protocol:
         """
         for v in self.variants.values():
             if v.two_frames or v.fit is not None or (v.ask is not None and not v.chooses):
-                fixed(pairs)
+                to_fixed_pairs(pairs)
 
 
 def run(
-    scenes: Sequence[Given], protocol: Protocol, pairs: Pairs, settings: Settings, *, progress: Progress = quiet
+    scenes: Sequence[SceneLike],
+    protocol: Protocol,
+    pairs: ScenePairs,
+    settings: Settings,
+    *,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Run every variant on every pair of every scene.
 
@@ -247,22 +254,22 @@ def run(
     for scene in scenes_of(scenes):
         chosen = [Pair(*pair) for pair in pairs(scene)]  # first: a data set without pairs of views says so
         protocol.allows(chosen)
-        collected = _Collected(scene, protocol, settings)
-        data = PairData(scene.recording, chosen, settings.dtype, protocol.views(chosen), protocol.offers)
+        collected = _SceneCollector(scene, protocol, settings)
+        data = PairDataset(scene.recording, chosen, settings.dtype, protocol.views(chosen), protocol.offers)
         size = protocol.batch(settings, chosen)
-        loader = load(data, batch=size, workers=settings.workers)
+        loader = load_pairs(data, batch=size, workers=settings.workers)
         for at, items in zip(range(0, len(chosen), size), progress(loader, scene.name, len(loader)), strict=True):
-            shown = moved(tuple(items), settings.device)
+            shown = move_to_device(tuple(items), settings.device)
             collected.add(Batch(scene, chosen[at : at + size], collected.cutoff, *shown))
         outcome.rows += collected.rows()
         outcome.examples += collected.examples
         outcome.n_pairs += len(chosen)
-        outcome.points |= {(scene.name, *k): tree.collate(p) for k, p in collected.pooled.items()}
-    outcome.summary = summarise(outcome.rows, list(protocol.variants), list(protocol.cohorts))
+        outcome.points |= {(scene.name, *k): pytree.collate(p) for k, p in collected.pooled.items()}
+    outcome.summary = summarise_rows(outcome.rows, list(protocol.variants), list(protocol.cohorts))
     return outcome
 
 
-class _Collected:
+class _SceneCollector:
     """Collects the answers on one scene and turns them into rows."""
 
     def __init__(self, scene: Scene, protocol: Protocol, settings: Settings) -> None:
@@ -271,7 +278,7 @@ class _Collected:
         self.missing = {k: reason for k, v in protocol.variants.items() if (reason := v.needs(scene))}
         self.variants = {k: v for k, v in protocol.variants.items() if k not in self.missing}
         self.last = list(protocol.cohorts)[-1]
-        blind = protocol.hide is holdout.range_split and not _is_cut(self.cutoff)
+        blind = protocol.hide is holdout.range_split and not _has_cutoff(self.cutoff)
         self.least = 0 if blind else protocol.min_candidates
         self.examples: list[Example] = []
         self.pair_rows: list[Row] = []
@@ -292,7 +299,7 @@ class _Collected:
         for k, (name, variant) in enumerate(self.variants.items()):
             which, some = self._view_of(variant, batch, views, offered)
             if which not in seen:  # one record for all who see the same, so that they share tracks
-                seen[which] = tree.stack(some) if len(some) > 1 else next(iter(some), None)
+                seen[which] = pytree.stack(some) if len(some) > 1 else next(iter(some), None)
             estimate, trace = self._ask(variant, batch, near, seen[which], shared)
             truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
             answer = Answer(batch, name, estimate, trace, truths)
@@ -309,7 +316,7 @@ class _Collected:
             if not self.examples:
                 self.examples.append(self._example(answer.one(0), choices[0], near[:1], seen[which]))
 
-    def _example(self, first: Answer, choice: Picked | None, near: Frame, seen: Frame | None) -> Example:
+    def _example(self, first: Answer, choice: ViewReport | None, near: Frame, seen: Frame | None) -> Example:
         variant, (anchor, other) = self.protocol.variants[first.variant], first.batch.pairs[0]
         views = choice.views if choice is not None else (other,)
         asked: dict[str, Any] | None = None
@@ -352,7 +359,7 @@ class _Collected:
 
     def _offered(self, batch: Batch) -> dict[int, Frame]:
         """Position → frame, as variants see it, of all that are offered."""
-        positions = offered_views(batch.pairs[0], self.scene.recording, self.protocol.offers)
+        positions = candidate_views(batch.pairs[0], self.scene.recording, self.protocol.offers)
         return {k: self.protocol.hide(view, self.cutoff) for k, view in zip(positions, batch.around, strict=True)}
 
     def _view_of(
@@ -361,13 +368,13 @@ class _Collected:
         """Other views of one variant, and what they are told apart by from those of others."""
         if variant.offers is None and views:
             return variant.method.views, list(views[-variant.method.views :])
-        positions = tuple(offered_views(batch.pairs[0], self.scene.recording, variant.offers))
+        positions = tuple(candidate_views(batch.pairs[0], self.scene.recording, variant.offers))
         return positions, [offered[k] for k in positions]
 
     def _ask(
         self, variant: Variant, batch: Batch, near: Frame, seen: Frame | None, shared: SharedTracks
     ) -> tuple[Estimate, Trace]:
-        method = variant.method if batch.others and variant.offers is None else choosing(variant.method)
+        method = variant.method if batch.others and variant.offers is None else with_view_selection(variant.method)
         trace: Trace = {}
         spoil = getattr(
             self.scene.recording, "spoil_track", lambda track: track
@@ -378,20 +385,20 @@ class _Collected:
             told["fit"] = variant.fit(batch, method.n)
         told |= variant.given(batch)
         if seen is None:  # every sample is counted, none is found again
-            told["track"] = _nowhere
+            told["track"] = _track_nothing
         with torch.no_grad():
             ask = method if variant.ask is None else partial(variant.ask, method)
             estimate = ask(near, near if seen is None else seen, trace=trace, **told)
         shared.charge(trace["ms"])
         return estimate, trace
 
-    def _picked(self, answer: Answer) -> Picked | None:
+    def _picked(self, answer: Answer) -> ViewReport | None:
         """Which frames a variant chose that was offered some."""
         pair, offers = answer.batch.pairs[0], self.variants[answer.variant].offers
-        offered = offered_views(pair, self.scene.recording, offers)
+        offered = candidate_views(pair, self.scene.recording, offers)
         if not offered:  # silent, where frames were asked for and there are none
-            return None if offers is None else Picked(pair.anchor, (), 0)
-        return picked(pair.anchor, offered, answer.trace)
+            return None if offers is None else ViewReport(pair.anchor, (), 0)
+        return report_selection(pair.anchor, offered, answer.trace)
 
     def _count_holes(self, method: Method, anchor: Frame, uv: Tensor) -> None:
         """The sensor's own holes, before anything is held back."""
@@ -399,7 +406,7 @@ class _Collected:
             total = max(int((hole != Hole.NONE).sum()), 1)
             self.census.append({k: float((hole == k).sum()) / total for k in names(Hole)})
 
-    def _note(self, answer: Answer, choice: Picked | None) -> None:
+    def _note(self, answer: Answer, choice: ViewReport | None) -> None:
         """Rows and points of one pair."""
         estimate, fit, kinds = answer.estimate, answer.trace["fit"], answer.batch.kinds(answer.samples.uv)
         hole = ~answer.samples.usable
@@ -409,22 +416,24 @@ class _Collected:
         found: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
         found |= {"n_recovered": int((estimate.keep & hole).sum()), "gate_share": share, "ms": answer.trace["ms"]}
         more = self.protocol.columns(answer) | ({} if choice is None else choice.row())
-        self.overlays.setdefault(answer.variant, overlay(answer.samples, estimate, answer.batch.anchor.hw))
+        self.overlays.setdefault(answer.variant, overlay_points(answer.samples, estimate, answer.batch.anchor.hw))
         for cohort, truth in answer.truths.items():
-            points = errors.select(estimate, truth)
+            points = errors.points_from_estimate(estimate, truth)
             self.pooled.setdefault((answer.variant, cohort), []).append(points)
             self.dropped.setdefault((answer.variant, cohort), []).append(truth.dropped())
-            self.pair_rows.append({**common, "truth": cohort, **found, **errors.measure(points), **more})
+            self.pair_rows.append({**common, "truth": cohort, **found, **errors.measure_errors(points), **more})
             for code, kind in answer.batch.odd.items() if kinds is not None else ():
-                there = truth.replace(code=_reopened(truth, kinds, code))
-                self.apart.setdefault((answer.variant, cohort, kind), []).append(errors.select(estimate, there))
+                there = truth.replace(code=_reopen_kind(truth, kinds, code))
+                self.apart.setdefault((answer.variant, cohort, kind), []).append(
+                    errors.points_from_estimate(estimate, there)
+                )
 
 
-def _all_offered(asked: Sequence[Offers], recording: Recording, anchor: int) -> list[int]:
+def _all_candidates(asked: Sequence[CandidateViews], recording: Recording, anchor: int) -> list[int]:
     return sorted({k for offers in asked for k in offers(recording, anchor)})
 
 
-def _nowhere(image_0: Tensor, image_1: Tensor, uv_0: Tensor, *, hint: TrackHint = NO_HINT) -> Tracks:
+def _track_nothing(image_0: Tensor, image_1: Tensor, uv_0: Tensor, *, hint: TrackHint = NO_HINT) -> Tracks:
     """No sample is found again: there is no other view."""
     zero = torch.zeros_like(uv_0[..., 0])
     lost = torch.zeros_like(zero, dtype=torch.bool)
@@ -432,13 +441,13 @@ def _nowhere(image_0: Tensor, image_1: Tensor, uv_0: Tensor, *, hint: TrackHint 
     return Tracks(uv_0=uv_0, uv_1=uv_0, error=zero, photometric=zero, cov=cov, valid=lost)
 
 
-def _is_cut(cutoff: float | None) -> bool:
+def _has_cutoff(cutoff: float | None) -> bool:
     return cutoff is not None and cutoff != math.inf
 
 
-def _reopened(truth: holdout.Truth, kinds: Tensor | None, kind: int) -> Tensor:
+def _reopen_kind(truth: holdout.Truth, kinds: Tensor | None, kind: int) -> Tensor:
     """Codes in which the samples on one kind of surface, turned away as EXCLUDED, count, and no others."""
     if kinds is None:
         return truth.code
-    code = torch.where(truth.code == holdout.Rule.EXCLUDED, holdout.Rule.CANDIDATE, truth.code)
-    return torch.where(kinds == kind, code, torch.full_like(code, holdout.Rule.EXCLUDED))
+    code = torch.where(truth.code == holdout.TruthCode.EXCLUDED, holdout.TruthCode.CANDIDATE, truth.code)
+    return torch.where(kinds == kind, code, torch.full_like(code, holdout.TruthCode.EXCLUDED))

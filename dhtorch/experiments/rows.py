@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.metrics import curves, errors, reliability, risk
 from dhtorch.pipeline.pair import merge
 from dhtorch.records import Estimate, Samples
@@ -17,10 +17,21 @@ from dhtorch.records import Estimate, Samples
 Row = dict[str, Any]
 
 #: Points of an overlay.
-SHOWN = 200
+MAX_OVERLAY_POINTS = 200
 
 #: Columns of a pair that a scene row measures anew on its pooled points, or that name the pair.
-_OWN = {"scene", "pair", "method", "truth", "gate_share", "ms", "pnp_ok", "n_inlier", "n_holes", "n_recovered"}
+_RECOMPUTED_COLUMNS = {
+    "scene",
+    "pair",
+    "method",
+    "truth",
+    "gate_share",
+    "ms",
+    "pnp_ok",
+    "n_inlier",
+    "n_holes",
+    "n_recovered",
+}
 
 
 def scene_row(
@@ -37,20 +48,25 @@ def scene_row(
         dropped: their counts of what the truth test removed.
         apart: candidates on surfaces that are counted apart.
     """
-    pool = tree.collate(points)
-    row: Row = errors.measure(pool) | risk.measure(pool) | reliability.measure([pool])
-    row["pnp_success"] = mean([float(r["pnp_ok"]) for r in pairs])
-    row |= {key: mean([r[key] for r in pairs]) for key in ("n_holes", "n_recovered")}
+    pool = pytree.collate(points)
+    row: Row = errors.measure_errors(pool) | risk.measure_risk(pool) | reliability.measure_reliability([pool])
+    row["pnp_success"] = mean_or_none([float(r["pnp_ok"]) for r in pairs])
+    row |= {key: mean_or_none([r[key] for r in pairs]) for key in ("n_holes", "n_recovered")}
     row["n_dropped"] = {k: sum(d[k] for d in dropped) for k in dropped[0]}
-    row["gate_share"] = {k: mean([r["gate_share"][k] for r in pairs]) for k in pairs[0]["gate_share"]}
-    row["ms"] = {k: median([r["ms"].get(k, 0.0) for r in pairs]) for k in pairs[0]["ms"]}
-    row["apart"] = {kind: errors.measure(tree.collate(p)) for kind, p in apart.items()}
-    row["curves"] = curves.sampled(pool)
-    more = {k for r in pairs for k, v in r.items() if k not in _OWN | row.keys() and isinstance(v, int | float)}
-    return row | {k: median([r[k] for r in pairs if r.get(k) is not None]) for k in sorted(more)}
+    row["gate_share"] = {k: mean_or_none([r["gate_share"][k] for r in pairs]) for k in pairs[0]["gate_share"]}
+    row["ms"] = {k: median_or_none([r["ms"].get(k, 0.0) for r in pairs]) for k in pairs[0]["ms"]}
+    row["apart"] = {kind: errors.measure_errors(pytree.collate(p)) for kind, p in apart.items()}
+    row["curves"] = curves.sample_curves(pool)
+    more = {
+        k
+        for r in pairs
+        for k, v in r.items()
+        if k not in _RECOMPUTED_COLUMNS | row.keys() and isinstance(v, int | float)
+    }
+    return row | {k: median_or_none([r[k] for r in pairs if r.get(k) is not None]) for k in sorted(more)}
 
 
-def summarise(rows: Sequence[Row], variants: Sequence[str], cohorts: Sequence[str]) -> dict[str, Any]:
+def summarise_rows(rows: Sequence[Row], variants: Sequence[str], cohorts: Sequence[str]) -> dict[str, Any]:
     """Scene rows → ``<variant>.<metric>`` and, for further cohorts, ``<variant>.<cohort>.<metric>``.
 
     With one variant and one cohort the prefix is left out. Scenes with a role stay out of every number.
@@ -66,28 +82,29 @@ def summarise(rows: Sequence[Row], variants: Sequence[str], cohorts: Sequence[st
             prefix = f"{variant}." if len(variants) > 1 or len(cohorts) > 1 else ""
             if cohort != cohorts[-1]:
                 prefix += f"{cohort}."
-            summary |= {prefix + name: value for name, value in errors.summarise(scenes).items()}
+            summary |= {prefix + name: value for name, value in errors.summarise_scenes(scenes).items()}
     return summary
 
 
-def overlay(samples: Samples, estimate: Estimate, hw: tuple[int, int]) -> Row:
-    """The first pair as points to draw: pixels, gates, sources and depths of at most :data:`SHOWN` samples.
+def overlay_points(samples: Samples, estimate: Estimate, hw: tuple[int, int]) -> Row:
+    """The first pair as points to draw: pixels, gates, sources and depths of at most :data:`MAX_OVERLAY_POINTS`
+    samples.
 
     No picture goes along: result files are published, and licences of many data sets do not allow that.
     """
     whole = merge(samples, estimate)
-    step = max(1, math.ceil(samples.uv.shape[1] / SHOWN))
+    step = max(1, math.ceil(samples.uv.shape[1] / MAX_OVERLAY_POINTS))
     found: Row = {"hw": list(hw), "u": whole.uv[0, ::step, 0].round(), "v": whole.uv[0, ::step, 1].round()}
     found |= {"gate": estimate.gate[0, ::step], "source": whole.source[0, ::step]}
     found |= {"depth": [float(f"{v:.4g}") for v in whole.depth[0, ::step].tolist()]}
     return {k: v.int().tolist() if isinstance(v, Tensor) else v for k, v in found.items()}
 
 
-def mean(values: Sequence[float]) -> float | None:
+def mean_or_none(values: Sequence[float]) -> float | None:
     """Mean, None of nothing."""
     return sum(values) / len(values) if values else None
 
 
-def median(values: Sequence[float]) -> float | None:
+def median_or_none(values: Sequence[float]) -> float | None:
     """Lower median, None of nothing."""
     return float(torch.tensor(values, dtype=torch.float64).median()) if values else None

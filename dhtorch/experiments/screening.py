@@ -8,13 +8,13 @@ from typing import Protocol, TypeVar
 import torch
 
 from dhtorch.experiments.protocol import Outcome, Progress
-from dhtorch.experiments.rows import Row, mean, median, summarise
+from dhtorch.experiments.rows import Row, mean_or_none, median_or_none, summarise_rows
 
 #: A pair of frames, or a frame alone as (i, i).
-Item = tuple[int, int]
+ScreenedItem = tuple[int, int]
 
 
-class HasRow(Protocol):
+class HasSceneRow(Protocol):
     """What has a row of its own in a result."""
 
     @property
@@ -26,17 +26,17 @@ class HasRow(Protocol):
         """Not None: enters no mean."""
 
 
-Asked = TypeVar("Asked", bound=HasRow)
+ScreenedScene = TypeVar("ScreenedScene", bound=HasSceneRow)
 
 
-def screen(
-    scenes: Sequence[Asked],
-    items: Callable[[Asked], Sequence[Item]],
-    ask: Callable[[Asked, Item], Mapping[str, Row]],
+def screen_scenes(
+    scenes: Sequence[ScreenedScene],
+    items: Callable[[ScreenedScene], Sequence[ScreenedItem]],
+    ask: Callable[[ScreenedScene, ScreenedItem], Mapping[str, Row]],
     variants: Sequence[str],
     *,
     truth: str,
-    whole: Callable[[Asked, Sequence[Mapping[str, Row]]], Mapping[str, Row]] = lambda _scene, _found: {},
+    whole: Callable[[ScreenedScene, Sequence[Mapping[str, Row]]], Mapping[str, Row]] = lambda _scene, _found: {},
     progress: Progress,
 ) -> Outcome:
     """Ask every item of every scene, one after the other.
@@ -67,25 +67,25 @@ def screen(
             mine = [answer[variant] for answer in found if variant in answer]
             row = {**name, "pair": None, "method": variant, "truth": truth, "role": scene.role}
             note = {} if mine else {"note": "nothing to ask"}
-            outcome.rows.append(row | {"n_pairs": len(mine)} | note | _joined(mine) | over.get(variant, {}))
+            outcome.rows.append(row | {"n_pairs": len(mine)} | note | _join_rows(mine) | over.get(variant, {}))
         outcome.n_pairs += len(chosen)
-    outcome.summary = summarise(outcome.rows, variants, [truth])
+    outcome.summary = summarise_rows(outcome.rows, variants, [truth])
     return outcome
 
 
-def paired(outcome: Outcome, truth: str, first: str, second: str, metric: str) -> list[tuple[float, float]]:
+def paired_metric(outcome: Outcome, truth: str, first: str, second: str, metric: str) -> list[tuple[float, float]]:
     """A metric of two variants on the scenes without a role on which both have it."""
     one, other = outcome.scenes(first, truth), outcome.scenes(second, truth)
     both = [(row.get(metric), other[scene].get(metric)) for scene, row in one.items() if scene in other]
     return [(a, b) for a, b in both if a is not None and b is not None]
 
 
-def _joined(rows: Sequence[Row]) -> Row:
+def _join_rows(rows: Sequence[Row]) -> Row:
     joined: Row = {}
     for key in dict.fromkeys(k for row in rows for k in row):
         values = [row[key] for row in rows if row.get(key) is not None]
         if values and isinstance(values[0], Mapping):
-            joined[key] = {k: mean([v[k] for v in values if v[k] is not None]) for k in values[0]}
+            joined[key] = {k: mean_or_none([v[k] for v in values if v[k] is not None]) for k in values[0]}
         else:
-            joined[key] = (sum(values) if values else 0) if key.startswith("n_") else median(values)
+            joined[key] = (sum(values) if values else 0) if key.startswith("n_") else median_or_none(values)
     return joined

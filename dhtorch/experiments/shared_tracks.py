@@ -12,7 +12,7 @@ from torch import Tensor
 
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
-Track = Callable[..., Tracks]
+TrackStage = Callable[..., Tracks]
 
 
 class SharedTracks:
@@ -26,7 +26,7 @@ class SharedTracks:
         self._known: list[tuple[Any, tuple[Tensor, ...], Tracks, float]] = []
         self._owed = 0.0
 
-    def seat(self, track: Track) -> Track:
+    def seat(self, track: TrackStage) -> TrackStage:
         """The track seat of one variant."""
         self._owed = 0.0
         return partial(self._track, track)
@@ -39,7 +39,7 @@ class SharedTracks:
 
     def _track(
         self,
-        track: Track,
+        track: TrackStage,
         image_0: Tensor,
         image_1: Tensor,
         uv_0: Tensor,
@@ -47,10 +47,10 @@ class SharedTracks:
         hint: TrackHint = NO_HINT,  # its pyramid says nothing that the image does not
     ) -> Tracks:
         start = time.perf_counter()
-        key = what_it_does(track), hint.levels
+        key = stage_key(track), hint.levels
         question = (image_0, image_1, uv_0, uv_0 if hint.start is None else hint.start)
         for known, asked, tracks, ms in self._known:
-            if known == key and all(map(_same, asked, question)):
+            if known == key and all(map(_is_same_tensor, asked, question)):
                 self._owed += ms
                 return tracks
         tracks = track(image_0, image_1, uv_0, hint=hint)
@@ -58,21 +58,21 @@ class SharedTracks:
         return tracks
 
 
-def _same(a: Tensor, b: Tensor) -> bool:
+def _is_same_tensor(a: Tensor, b: Tensor) -> bool:
     """The same memory, or equal values: views that were chosen stand in new memory."""
     if a.shape != b.shape or a.dtype != b.dtype:
         return False
     return (a.data_ptr() == b.data_ptr() and a.stride() == b.stride()) or torch.equal(a, b)
 
 
-def what_it_does(fn: Any) -> Any:
+def stage_key(fn: Any) -> Any:
     """What a seat does, comparable: partials of one function with equal options are equal, however often they are
     nested."""
     if not isinstance(fn, partial):
         return fn
-    options = {k: what_it_does(v) for k, v in fn.keywords.items()}
-    args = tuple(map(what_it_does, fn.args))
+    options = {k: stage_key(v) for k, v in fn.keywords.items()}
+    args = tuple(map(stage_key, fn.args))
     if isinstance(fn.func, partial):
-        inner, before, others = what_it_does(fn.func)
+        inner, before, others = stage_key(fn.func)
         return inner, before + args, others | options
     return fn.func, args, options

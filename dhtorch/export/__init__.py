@@ -3,21 +3,28 @@
 Arrays may be torch tensors or numpy arrays, on any device. Every file is written whole or not at all.
 """
 
-from dhtorch.export.colmap import Shot, write_colmap
-from dhtorch.export.frames import Steps, faces, in_steps, png, write_numbered, write_stamped
+from dhtorch.export.colmap import ColmapImage, write_colmap
+from dhtorch.export.frames import (
+    QuantisedDepth,
+    encode_png,
+    mesh_depth_map,
+    quantise_depth,
+    write_frames_dir_metadata,
+    write_tum_metadata,
+)
 from dhtorch.export.glb import Shape, write_glb
 from dhtorch.export.ply import write_ply
 
 __all__ = [
+    "ColmapImage",
+    "QuantisedDepth",
     "Shape",
-    "Shot",
-    "Steps",
-    "faces",
-    "in_steps",
-    "png",
+    "encode_png",
+    "mesh_depth_map",
+    "quantise_depth",
     "write_colmap",
+    "write_frames_dir_metadata",
     "write_glb",
-    "write_numbered",
     "write_ply",
-    "write_stamped",
+    "write_tum_metadata",
 ]

@@ -8,18 +8,18 @@ import numpy as np
 from torch import Tensor
 
 
-def array(x: Any) -> np.ndarray:
+def to_numpy(x: Any) -> np.ndarray:
     """A numpy array of a tensor (detached, on the CPU) or of anything numpy takes."""
     return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)
 
 
-def rows(where: str, name: str, x: Any, n: int | None, width: int | None) -> np.ndarray:
+def check_rows(where: str, name: str, x: Any, n: int | None, width: int | None) -> np.ndarray:
     """``x`` as (n, width), or (n,) where ``width`` is None.
 
     Raises:
         ValueError: another shape.
     """
-    values = array(x)
+    values = to_numpy(x)
     shape = (len(values) if n is None and values.ndim else n, *([] if width is None else [width]))
     if values.shape != shape:
         expected = ", ".join("P" if s is None else str(s) for s in (n, *([] if width is None else [width])))
@@ -27,14 +27,14 @@ def rows(where: str, name: str, x: Any, n: int | None, width: int | None) -> np.
     return values
 
 
-def bytes_of_colour(rgb: np.ndarray) -> np.ndarray:
+def colour_to_uint8(rgb: np.ndarray) -> np.ndarray:
     """Colours as uint8: those are kept, others are in [0, 1], rounded and cut off there; NaN is black."""
     if rgb.dtype == np.uint8:
         return rgb
     return np.round(255 * np.clip(np.nan_to_num(rgb.astype(np.float64)), 0, 1)).astype(np.uint8)
 
 
-def finite(xyz: np.ndarray, face: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+def select_finite(xyz: np.ndarray, face: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Which points (P,) are finite, and the triangles between such points, numbered among them.
 
     Raises:
@@ -49,7 +49,7 @@ def finite(xyz: np.ndarray, face: np.ndarray | None) -> tuple[np.ndarray, np.nda
     return good, renumbered[face[good[face].all(1)]] if face.size else face.reshape(0, 3)
 
 
-def quaternion(
+def rotation_to_wxyz(
     R: Tensor,  # (3, 3)
 ) -> list[float]:
     """Quaternion w, x, y, z (kornia's) of a rotation, w >= 0."""

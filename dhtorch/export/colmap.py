@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.export.arrays import bytes_of_colour, quaternion, rows
+from dhtorch.export.arrays import check_rows, colour_to_uint8, rotation_to_wxyz
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Pose
 from dhtorch.runtime import storage
 
 
 @dataclass(frozen=True)
-class Shot:
+class ColmapImage:
     """A picture and where it was taken from (batch size 1)."""
 
     name: str  # of the picture's file
@@ -32,7 +32,7 @@ class Shot:
 
 def write_colmap(
     folder: str | Path,
-    shots: Sequence[Shot],
+    shots: Sequence[ColmapImage],
     xyz: Any,  # (P, 3) m in the world
     *,
     rgb: Any,  # (P, 3) uint8, or float in [0, 1]
@@ -49,11 +49,11 @@ def write_colmap(
     Raises:
         ValueError: wrong shapes, or an observation in a shot that does not exist.
     """
-    points = rows("write_colmap", "xyz", xyz, None, 3).astype(np.float64)
+    points = check_rows("write_colmap", "xyz", xyz, None, 3).astype(np.float64)
     P = len(points)
-    colours = bytes_of_colour(rows("write_colmap", "rgb", rgb, P, 3))
-    errors = rows("write_colmap", "error", error, P, None)
-    seen = np.asarray(rows("write_colmap", "seen_by", seen_by, P, np.shape(seen_by)[-1]), np.int64)
+    colours = colour_to_uint8(check_rows("write_colmap", "rgb", rgb, P, 3))
+    errors = check_rows("write_colmap", "error", error, P, None)
+    seen = np.asarray(check_rows("write_colmap", "seen_by", seen_by, P, np.shape(seen_by)[-1]), np.int64)
     pixels = np.asarray(uv.detach().cpu() if hasattr(uv, "detach") else uv, np.float64)
     if pixels.shape != (*seen.shape, 2):
         raise ValueError(f"write_colmap: uv has shape {pixels.shape}, expected {(*seen.shape, 2)}")
@@ -66,14 +66,16 @@ def write_colmap(
         for shot, (u, v) in zip(seen[p], pixels[p], strict=True):
             if shot >= 0 and math.isfinite(u + v):
                 track += [str(shot + 1), str(len(observed[shot]))]
-                observed[shot].append(f"{_text(u + 0.5)} {_text(v + 0.5)} {number}")
-        head = " ".join([str(number), *map(_text, points[p]), *map(str, colours[p]), _text(errors[p])])
+                observed[shot].append(f"{_format_number(u + 0.5)} {_format_number(v + 0.5)} {number}")
+        head = " ".join(
+            [str(number), *map(_format_number, points[p]), *map(str, colours[p]), _format_number(errors[p])]
+        )
         lines.append(" ".join([head, *track]))
-    cameras = [_camera(shot) for shot in shots]
+    cameras = [_camera_parameters(shot) for shot in shots]
     known = list(dict.fromkeys(cameras))
     pictures = []
     for k, shot in enumerate(shots):
-        pictures.append(f"{k + 1} {_pose(shot)} {known.index(cameras[k]) + 1} {shot.name}")
+        pictures.append(f"{k + 1} {_pose_parameters(shot)} {known.index(cameras[k]) + 1} {shot.name}")
         pictures.append(" ".join(observed[k]))
     files = {
         "cameras.txt": ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", *(f"{k + 1} {c}" for k, c in enumerate(known))],
@@ -85,20 +87,20 @@ def write_colmap(
         storage.replace_file(Path(folder) / name, ("\n".join(text) + "\n").encode("utf-8"))
 
 
-def _camera(shot: Shot) -> str:
+def _camera_parameters(shot: ColmapImage) -> str:
     """Model, size and parameters."""
     (fx, fy), (cx, cy) = shot.camera.f[0].tolist(), shot.camera.c[0].tolist()
     lens = [] if shot.camera.distortion is None else shot.camera.distortion[0].tolist()
     model, length = ("PINHOLE", 0) if not any(lens) else ("OPENCV", 4) if not any(lens[4:]) else ("FULL_OPENCV", 8)
     numbers = [fx, fy, cx + 0.5, cy + 0.5, *(lens + [0.0] * 8)[:length]]
-    return " ".join([model, str(shot.hw[1]), str(shot.hw[0]), *map(_text, numbers)])
+    return " ".join([model, str(shot.hw[1]), str(shot.hw[0]), *map(_format_number, numbers)])
 
 
-def _pose(shot: Shot) -> str:
+def _pose_parameters(shot: ColmapImage) -> str:
     """Quaternion w, x, y, z and translation, of the camera from the world."""
     T = se3.invert(shot.T_world_from_cam.map(lambda v: v.double()))
-    return " ".join(map(_text, [*quaternion(T.R[0]), *T.t[0].tolist()]))
+    return " ".join(map(_format_number, [*rotation_to_wxyz(T.R[0]), *T.t[0].tolist()]))
 
 
-def _text(value: float) -> str:
+def _format_number(value: float) -> str:
     return f"{float(value):.10g}"

@@ -15,20 +15,20 @@ import numpy as np
 import torch
 
 from dhtorch.codes import Source
-from dhtorch.export.arrays import array, quaternion
+from dhtorch.export.arrays import rotation_to_wxyz, to_numpy
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import to_matrix
 from dhtorch.records import Camera, Pose
 from dhtorch.runtime import storage
 
 #: The last step: 65535 is *no return* to readers of several sets.
-LAST = 65534
+MAX_DEPTH_CODE = 65534
 
 #: Steps of sigma in one of depth: sigma is a small share of the depth.
-SIGMA_STEPS = 5
+SIGMA_STEPS_PER_DEPTH_STEP = 5
 
 
-class Steps(NamedTuple):
+class QuantisedDepth(NamedTuple):
     """A map in whole steps, (h, w) each; 0 = no depth."""
 
     depth: np.ndarray  # uint16
@@ -37,26 +37,28 @@ class Steps(NamedTuple):
     unfit: np.ndarray  # bool: there is a depth, which the steps cannot hold, or its sigma
 
 
-def in_steps(
+def quantise_depth(
     depth: Any,  # (h, w) m, NaN = silent
     sigma: Any,  # (h, w) m
     source: Any,  # (h, w) codes.Source
     unit: float,  # m, a step of depth
-) -> Steps:
+) -> QuantisedDepth:
     """A map in steps, each value at the nearest one; a sigma below one step becomes one, as none is sure.
 
     Raises:
         ValueError: shapes that differ.
     """
-    z, s = (array(x).astype(np.float64) / step for x, step in ((depth, unit), (sigma, unit / SIGMA_STEPS)))
-    code = array(source)
+    z, s = (
+        to_numpy(x).astype(np.float64) / step for x, step in ((depth, unit), (sigma, unit / SIGMA_STEPS_PER_DEPTH_STEP))
+    )
+    code = to_numpy(source)
     if not z.shape == s.shape == code.shape:
         raise ValueError(f"in_steps: found shapes {z.shape}, {s.shape}, {code.shape}, expected three alike")
     z = z.round()
     s = s.round().clip(1)
     wanted = code != Source.NONE
-    fits = wanted & (z >= 1) & (z <= LAST) & (s <= LAST)
-    return Steps(
+    fits = wanted & (z >= 1) & (z <= MAX_DEPTH_CODE) & (s <= MAX_DEPTH_CODE)
+    return QuantisedDepth(
         depth=np.where(fits, z, 0).astype(np.uint16),
         sigma=np.where(fits, s, 0).astype(np.uint16),
         source=np.where(fits, code, Source.NONE).astype(np.uint8),
@@ -64,7 +66,7 @@ def in_steps(
     )
 
 
-def faces(
+def mesh_depth_map(
     depth: np.ndarray,  # (h, w) m, 0 or NaN where nothing is known
     step: float = 0.03,
 ) -> np.ndarray:
@@ -78,7 +80,7 @@ def faces(
     return corners[z.max(1) < (1 + step) * z.min(1)]
 
 
-def png(
+def encode_png(
     pixels: np.ndarray,  # (h, w) uint8 or uint16, or (h, w, 3) uint8
 ) -> bytes:
     """The bytes of a PNG file; nothing is lost."""
@@ -89,7 +91,7 @@ def png(
     return out.getvalue()
 
 
-def write_numbered(
+def write_frames_dir_metadata(
     folder: str | Path,
     camera: Camera,  # B = 1
     T_world_from_cam: Pose,  # (n), in the order of the pictures' names
@@ -109,7 +111,7 @@ def write_numbered(
     ]
 
 
-def write_stamped(
+def write_tum_metadata(
     folder: str | Path,
     camera: Camera,  # B = 1
     stamps: Sequence[str],  # as in the names of the pictures, s
@@ -129,7 +131,7 @@ def write_stamped(
     known = [k for k in range(len(stamps)) if bool(T.t[k].isfinite().all() and T.R[k].isfinite().all())]
     rows = []
     for k in known:
-        w, *xyz = quaternion(T.R[k])
+        w, *xyz = rotation_to_wxyz(T.R[k])
         rows.append([float(stamps[k]), *T.t[k].tolist(), *xyz, w])
     head = "# timestamp tx ty tz qx qy qz qw"
     return [*written, _write_rows(folder / "groundtruth.txt", rows, head)]

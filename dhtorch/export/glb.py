@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.export.arrays import array, bytes_of_colour, finite, rows
+from dhtorch.export.arrays import check_rows, colour_to_uint8, select_finite, to_numpy
 from dhtorch.runtime import storage
 
 _FLOAT, _UINT = 5126, 5125
@@ -46,12 +46,12 @@ def write_glb(path: str | Path, shapes: Sequence[Shape], *, up: Sequence[float] 
     Raises:
         ValueError: wrong shapes, a triangle without its corners, or an ``up`` without a direction.
     """
-    parts = _Parts()
-    turn = _turn_to_y(np.asarray(up, np.float64))
+    parts = _GltfBuilder()
+    turn = _rotation_to_y_up(np.asarray(up, np.float64))
     for shape in shapes:
         parts.add(shape, turn)
     document = parts.document()
-    text = storage.dumps(document, ensure_ascii=True, separators=(",", ":")).encode()
+    text = storage.dump_strict_json(document, ensure_ascii=True, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
     if parts.data:
@@ -59,7 +59,7 @@ def write_glb(path: str | Path, shapes: Sequence[Shape], *, up: Sequence[float] 
     storage.replace_file(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
-class _Parts:
+class _GltfBuilder:
     """Collects nodes, meshes, accessors and the one binary buffer."""
 
     def __init__(self) -> None:
@@ -70,22 +70,22 @@ class _Parts:
         self.nodes: list[dict[str, Any]] = []
 
     def add(self, shape: Shape, turn: list[float]) -> None:
-        points = rows("write_glb", "xyz", shape.xyz, None, 3)
+        points = check_rows("write_glb", "xyz", shape.xyz, None, 3)
         n = len(points)
-        corners = None if shape.face is None else rows("write_glb", "face", array(shape.face), None, 3)
-        good, corners = finite(points, corners)
+        corners = None if shape.face is None else check_rows("write_glb", "face", to_numpy(shape.face), None, 3)
+        good, corners = select_finite(points, corners)
         if not good.any():
             return
-        rgb = np.full((n, 3), 0.6) if shape.rgb is None else rows("write_glb", "rgb", shape.rgb, n, 3)
+        rgb = np.full((n, 3), 0.6) if shape.rgb is None else check_rows("write_glb", "rgb", shape.rgb, n, 3)
         attributes = {"POSITION": self._floats(points[good], bounds=True), "COLOR_0": self._colours(rgb[good])}
         if shape.normal is not None:
-            normal = rows("write_glb", "normal", shape.normal, n, 3)[good].astype(np.float64)
+            normal = check_rows("write_glb", "normal", shape.normal, n, 3)[good].astype(np.float64)
             length = np.linalg.norm(normal, axis=1, keepdims=True)
             known = np.isfinite(length) & (length > 0)
             up = np.array([0.0, 1.0, 0.0])
             attributes["NORMAL"] = self._floats(np.where(known, normal / np.where(known, length, 1), up))
         for name, value in shape.values.items():
-            column = rows("write_glb", name, value, n, None)[good].astype(np.float64)
+            column = check_rows("write_glb", name, value, n, None)[good].astype(np.float64)
             attributes[f"_{name.upper()}"] = self._floats(np.nan_to_num(column))
         primitive: dict[str, Any] = {"attributes": attributes, "material": 0, "mode": _POINTS}
         if corners is not None and len(corners):
@@ -116,7 +116,7 @@ class _Parts:
 
     def _colours(self, rgb: np.ndarray) -> int:
         """Linear light as floats: 8 bits would not keep what is dark apart, and some readers trip over 16."""
-        display = bytes_of_colour(rgb) / 255.0
+        display = colour_to_uint8(rgb) / 255.0
         return self._floats(np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4))
 
     def _accessor(
@@ -139,7 +139,7 @@ class _Parts:
         return len(self.accessors) - 1
 
 
-def _turn_to_y(up: np.ndarray) -> list[float]:
+def _rotation_to_y_up(up: np.ndarray) -> list[float]:
     """The quaternion x, y, z, w of the smallest turn that takes ``up`` to +y; half a turn goes about x."""
     length = np.linalg.norm(up)
     if up.shape != (3,) or not length > 0 or not math.isfinite(length):

@@ -17,16 +17,16 @@ import numpy as np
 
 from dhtorch.runtime import storage
 
-Feature = dict[str, Any]  # as in meta/info.json
+FeatureSpec = dict[str, Any]  # as in meta/info.json
 
 #: Version → what its info says.
-VERSIONS = {3: "v3.0", 2: "v2.1"}
+_CODEBASE_VERSIONS = {3: "v3.0", 2: "v2.1"}
 
 #: Files of a folder.
-CHUNK = 1000
+FILES_PER_CHUNK = 1000
 
-_HWC = ["height", "width", "channels"]
-_PATHS = {
+_HWC_NAMES = ["height", "width", "channels"]
+_PATH_TEMPLATES = {
     3: ("data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"),
     2: ("data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
@@ -34,7 +34,7 @@ _PATHS = {
 }  # fmt: skip
 
 
-class Clip(NamedTuple):
+class VideoSegment(NamedTuple):
     """Where the video of an episode lies."""
 
     chunk: int
@@ -44,18 +44,18 @@ class Clip(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeSpec:
     """One episode, as ``meta/`` describes it; its table is the file of its number."""
 
     number: int
     length: int
     start: int  # index of its first row
     tasks: Sequence[str] = ()
-    videos: Mapping[str, Clip] = field(default_factory=dict)
+    videos: Mapping[str, VideoSegment] = field(default_factory=dict)
     stats: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Moments(NamedTuple):
+class FeatureMoments(NamedTuple):
     """What statistics are made of: of some numbers for each of k channels, float64."""
 
     n: np.ndarray  # (k,)
@@ -65,7 +65,7 @@ class Moments(NamedTuple):
     high: np.ndarray
 
     @classmethod
-    def of(cls, values: np.ndarray, valid: np.ndarray | None = None) -> Moments:
+    def of(cls, values: np.ndarray, valid: np.ndarray | None = None) -> FeatureMoments:
         """Of numbers (n, k), those that are finite and ``valid``; none of them give no statistics."""
         x = np.asarray(values, np.float64)
         keep = np.isfinite(x) if valid is None else np.isfinite(x) & valid
@@ -76,7 +76,7 @@ class Moments(NamedTuple):
         return cls(n, mean, spread, low.min(0, initial=np.inf), high.max(0, initial=-np.inf))
 
     @classmethod
-    def parse(cls, packed: Sequence[Sequence[float | None]]) -> Moments:
+    def parse(cls, packed: Sequence[Sequence[float | None]]) -> FeatureMoments:
         """Of what :meth:`pack` gave."""
         rows = [np.array([np.nan if x is None else x for x in row]) for row in packed]
         rows[3], rows[4] = np.where(np.isnan(rows[3]), np.inf, rows[3]), np.where(np.isnan(rows[4]), -np.inf, rows[4])
@@ -86,12 +86,12 @@ class Moments(NamedTuple):
         """Lists for strict JSON; an end that is not there is null."""
         return [[float(x) if np.isfinite(x) else None for x in row] for row in self]
 
-    def __add__(self, other: Moments) -> Moments:  # type: ignore[override]
+    def __add__(self, other: FeatureMoments) -> FeatureMoments:  # type: ignore[override]
         """Of both sets of numbers (Chan, Golub and LeVeque 1979)."""
         n, apart = self.n + other.n, other.mean - self.mean
         part = other.n / np.maximum(n, 1.0)
         mean, spread = self.mean + apart * part, self.spread + other.spread + apart**2 * self.n * part
-        return Moments(n, mean, spread, np.minimum(self.low, other.low), np.maximum(self.high, other.high))
+        return FeatureMoments(n, mean, spread, np.minimum(self.low, other.low), np.maximum(self.high, other.high))
 
     def stats(self, frames: int, shape: Sequence[int]) -> dict[str, Any] | None:
         """The entry of ``meta/stats``, each in that shape; None where there is no number."""
@@ -104,22 +104,24 @@ class Moments(NamedTuple):
 # -------------------------------------------------------------------------------------------------------- features
 
 
-def numbers(kind: str, n: int = 1, names: Sequence[str] | None = None) -> Feature:
+def number_feature(kind: str, n: int = 1, names: Sequence[str] | None = None) -> FeatureSpec:
     """A feature of ``n`` numbers a frame."""
     return {"dtype": kind, "shape": [n], "names": None if names is None else list(names)}
 
 
-def picture(hw: Sequence[int], channels: int = 3, **info: Any) -> Feature:
+def image_feature(hw: Sequence[int], channels: int = 3, **info: Any) -> FeatureSpec:
     """A feature of pictures in the table."""
-    return {"dtype": "image", "shape": [*hw, channels], "names": list(_HWC), **({"info": info} if info else {})}
+    return {"dtype": "image", "shape": [*hw, channels], "names": list(_HWC_NAMES), **({"info": info} if info else {})}
 
 
-def depth_map(hw: Sequence[int], step: float) -> Feature:
+def depth_feature(hw: Sequence[int], step: float) -> FeatureSpec:
     """A feature of maps in metres (see the module), whose values are whole numbers of ``step`` m."""
-    return picture(hw, 1, is_depth_map=True, depth_unit="m", quantiser_step_m=step, no_depth=0.0)
+    return image_feature(hw, 1, is_depth_map=True, depth_unit="m", quantiser_step_m=step, no_depth=0.0)
 
 
-def schema(features: Mapping[str, Feature], types: Mapping[str, Any], metadata: Mapping[bytes, bytes]) -> Any:
+def make_arrow_schema(
+    features: Mapping[str, FeatureSpec], types: Mapping[str, Any], metadata: Mapping[bytes, bytes]
+) -> Any:
     """Arrow schema of a table: ``types`` where a column has one already, else by its feature; videos have no column."""
     import pyarrow  # noqa: PLC0415
 
@@ -135,10 +137,10 @@ def schema(features: Mapping[str, Feature], types: Mapping[str, Any], metadata: 
             kind = pyarrow.from_numpy_dtype(np.dtype(feature["dtype"]))
             kind = kind if list(feature["shape"]) == [1] else pyarrow.list_(kind, int(np.prod(feature["shape"])))
         fields.append(pyarrow.field(key, kind))
-    return pyarrow.schema(fields, metadata={**dict(metadata), b"huggingface": _huggingface(features)})
+    return pyarrow.schema(fields, metadata={**dict(metadata), b"huggingface": _huggingface_metadata(features)})
 
 
-def _huggingface(features: Mapping[str, Feature]) -> bytes:
+def _huggingface_metadata(features: Mapping[str, FeatureSpec]) -> bytes:
     """What tells the library ``datasets`` which columns are pictures."""
     found: dict[str, Any] = {}
     for key, feature in features.items():
@@ -158,40 +160,52 @@ def _huggingface(features: Mapping[str, Feature]) -> bytes:
 # ----------------------------------------------------------------------------------------------------------- places
 
 
-def data_file(version: int, number: int) -> str:
+def episode_table_path(version: int, number: int) -> str:
     """Name of the table of an episode."""
-    return _filled(_PATHS[version][0], *divmod(number, CHUNK), number)
+    return _fill_template(_PATH_TEMPLATES[version][0], *divmod(number, FILES_PER_CHUNK), number)
 
 
-def video_file(version: int, key: str, clip: Clip, number: int) -> str:
+def episode_video_path(version: int, key: str, clip: VideoSegment, number: int) -> str:
     """Name of the video of an episode."""
-    return _filled(_PATHS[version][1].replace("{video_key}", key), clip.chunk, clip.file, number)
+    return _fill_template(_PATH_TEMPLATES[version][1].replace("{video_key}", key), clip.chunk, clip.file, number)
 
 
-def _filled(template: str, chunk: int, file: int, number: int) -> str:
-    return template.format(chunk_index=chunk, file_index=file, episode_chunk=number // CHUNK, episode_index=number)
+def _fill_template(template: str, chunk: int, file: int, number: int) -> str:
+    return template.format(
+        chunk_index=chunk, file_index=file, episode_chunk=number // FILES_PER_CHUNK, episode_index=number
+    )
 
 
 # ------------------------------------------------------------------------------------------------------------- meta
 
 
-def info(
-    version: int, features: Mapping[str, Feature], episodes: Sequence[Episode], *, fps: float, n_tasks: int, robot: str
+def make_info(
+    version: int,
+    features: Mapping[str, FeatureSpec],
+    episodes: Sequence[EpisodeSpec],
+    *,
+    fps: float,
+    n_tasks: int,
+    robot: str,
 ) -> dict[str, Any]:
     """``meta/info.json``."""
-    data, video = _PATHS[version]
+    data, video = _PATH_TEMPLATES[version]
     videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
     first, last = episodes[0].number, episodes[-1].number
-    counts = {"total_videos": len(videos) * len(episodes), "total_chunks": last // CHUNK + 1} if version == 2 else {}
+    counts = (
+        {"total_videos": len(videos) * len(episodes), "total_chunks": last // FILES_PER_CHUNK + 1}
+        if version == 2
+        else {}
+    )
     sizes = {} if version == 2 else {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
     return {
-        "codebase_version": VERSIONS[version],
+        "codebase_version": _CODEBASE_VERSIONS[version],
         "robot_type": robot,
         "total_episodes": len(episodes),
         "total_frames": sum(each.length for each in episodes),
         "total_tasks": n_tasks,
         **counts,
-        "chunks_size": CHUNK,
+        "chunks_size": FILES_PER_CHUNK,
         **sizes,
         "fps": int(fps) if float(fps).is_integer() else fps,
         "splits": {"train": f"{first}:{last + 1}"},
@@ -201,11 +215,11 @@ def info(
     }
 
 
-def write_meta(
+def write_lerobot_meta(
     root: Path,
     version: int,
     about: Mapping[str, Any],  # of `info`
-    episodes: Sequence[Episode],
+    episodes: Sequence[EpisodeSpec],
     tasks: Sequence[str],  # by task_index
     stats: Mapping[str, Any] | None = None,
 ) -> list[Path]:
@@ -213,24 +227,24 @@ def write_meta(
     meta, written = root / "meta", []
     if version == 2:
         rows = [{"episode_index": e.number, "tasks": list(e.tasks), "length": e.length} for e in episodes]
-        written.append(_lines(meta / "episodes.jsonl", rows))
+        written.append(_write_json_lines(meta / "episodes.jsonl", rows))
         named = [{"task_index": k, "task": task} for k, task in enumerate(tasks)]
-        written.append(_lines(meta / "tasks.jsonl", named))
+        written.append(_write_json_lines(meta / "tasks.jsonl", named))
         if stats is not None:
             of_episodes = [{"episode_index": e.number, "stats": e.stats} for e in episodes]
-            written.append(_lines(meta / "episodes_stats.jsonl", of_episodes))
+            written.append(_write_json_lines(meta / "episodes_stats.jsonl", of_episodes))
     else:
-        columns = _episode_columns(episodes)
-        written.append(_table(meta / "episodes" / "chunk-000" / "file-000.parquet", columns))
+        columns = _make_episode_columns(episodes)
+        written.append(_write_table(meta / "episodes" / "chunk-000" / "file-000.parquet", columns))
         numbered: dict[str, list[Any]] = {"task_index": list(range(len(tasks))), "task": list(tasks)}
-        written.append(_table(meta / "tasks.parquet", numbered, index="task"))
+        written.append(_write_table(meta / "tasks.parquet", numbered, index="task"))
     if stats is not None:
         written.append(storage.write_json(meta / "stats.json", stats))
     return [*written, storage.write_json(meta / "info.json", about)]
 
 
-def _episode_columns(episodes: Sequence[Episode]) -> dict[str, list[Any]]:
-    places = [divmod(e.number, CHUNK) for e in episodes]
+def _make_episode_columns(episodes: Sequence[EpisodeSpec]) -> dict[str, list[Any]]:
+    places = [divmod(e.number, FILES_PER_CHUNK) for e in episodes]
     columns: dict[str, list[Any]] = {
         "episode_index": [e.number for e in episodes],
         "tasks": [list(e.tasks) for e in episodes],
@@ -248,11 +262,11 @@ def _episode_columns(episodes: Sequence[Episode]) -> dict[str, list[Any]]:
     return columns | {"meta/episodes/chunk_index": zeros, "meta/episodes/file_index": zeros}
 
 
-def _lines(path: Path, rows: Iterable[Any]) -> Path:
-    return storage.replace_file(path, "".join(storage.dumps(row) + "\n" for row in rows).encode())
+def _write_json_lines(path: Path, rows: Iterable[Any]) -> Path:
+    return storage.replace_file(path, "".join(storage.dump_strict_json(row) + "\n" for row in rows).encode())
 
 
-def _table(path: Path, columns: Mapping[str, list[Any]], index: str | None = None) -> Path:
+def _write_table(path: Path, columns: Mapping[str, list[Any]], index: str | None = None) -> Path:
     """A small table; ``index`` is the column that pandas takes as its index."""
     import pyarrow  # noqa: PLC0415
     from pyarrow import parquet  # noqa: PLC0415

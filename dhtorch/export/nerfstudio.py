@@ -11,19 +11,19 @@ from typing import Any
 import numpy as np
 
 #: Camera axes of OpenGL from those of OpenCV.
-_GL = np.diag([1.0, -1.0, -1.0, 1.0])
+_GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 #: m, a step of the depth pictures: nerfstudio's ``depth_unit_scale_factor``.
-STEP = 1e-3
+_DEPTH_UNIT_M = 1e-3
 
 #: Relative sigma at which confidence is one half.
-HALF = 0.1
+_HALF_CONFIDENCE_SIGMA = 0.1
 
 #: Names of a lens's first numbers, in OpenCV's order.
-_LENS = ("k1", "k2", "p1", "p2", "k3")
+_LENS_NAMES = ("k1", "k2", "p1", "p2", "k3")
 
 
-def shot(
+def make_nerfstudio_frame(
     stem: str,
     hw: Sequence[int],
     K: np.ndarray,  # (3, 3), whole numbers are pixel centres
@@ -35,8 +35,8 @@ def shot(
     Raises:
         ValueError: a lens with more numbers than nerfstudio's.
     """
-    if any(lens[len(_LENS) :]):
-        raise ValueError(f"nerfstudio: found a lens of {len(lens)} numbers, expected {' '.join(_LENS)}")
+    if any(lens[len(_LENS_NAMES) :]):
+        raise ValueError(f"nerfstudio: found a lens of {len(lens)} numbers, expected {' '.join(_LENS_NAMES)}")
     return {
         "file_path": f"images/{stem}.png",
         "depth_file_path": f"depth/{stem}.png",
@@ -47,24 +47,32 @@ def shot(
         "fl_y": float(K[1, 1]),
         "cx": float(K[0, 2]) + 0.5,
         "cy": float(K[1, 2]) + 0.5,
-        **{name: float(x) for name, x in zip(_LENS, lens, strict=False)},
-        "transform_matrix": (np.asarray(T_world_from_cam, np.float64) @ _GL).tolist(),
+        **{name: float(x) for name, x in zip(_LENS_NAMES, lens, strict=False)},
+        "transform_matrix": (np.asarray(T_world_from_cam, np.float64) @ _GL_FROM_CV).tolist(),
     }
 
 
-def transforms(shots: Sequence[Mapping[str, Any]], **more: Any) -> dict[str, Any]:
+def make_transforms(shots: Sequence[Mapping[str, Any]], **more: Any) -> dict[str, Any]:
     """``transforms.json``; ``more`` is what else it says, which nerfstudio passes over."""
-    return {"camera_model": "OPENCV", "depth_unit_scale_factor": STEP, **more, "frames": [dict(s) for s in shots]}
+    return {
+        "camera_model": "OPENCV",
+        "depth_unit_scale_factor": _DEPTH_UNIT_M,
+        **more,
+        "frames": [dict(s) for s in shots],
+    }
 
 
-def depth_steps(depth: np.ndarray) -> np.ndarray:
+def quantise_nerfstudio_depth(depth: np.ndarray) -> np.ndarray:
     """(h, w) uint16 of metres, 0 = none; what is beyond the last step becomes none."""
-    z = np.rint(np.asarray(depth, np.float64) / STEP)
+    z = np.rint(np.asarray(depth, np.float64) / _DEPTH_UNIT_M)
     return np.where((z >= 1) & (z <= 65534), z, 0).astype(np.uint16)
 
 
-def confidence(depth: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """(h, w) uint8 of depth and sigma in m: 255 is sure, one half of it a relative sigma of :data:`HALF`, 0 none."""
+def encode_confidence(depth: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """(h, w) uint8 of depth and sigma in m: 255 is sure, one half of it a relative sigma of
+    :data:`_HALF_CONFIDENCE_SIGMA`, 0 none."""
     known = depth > 0
     ratio = np.where(known, sigma, 1) / np.where(known, depth, 1)
-    return np.where(known, np.rint(255 * HALF / (HALF + ratio)).clip(1), 0).astype(np.uint8)
+    return np.where(known, np.rint(255 * _HALF_CONFIDENCE_SIGMA / (_HALF_CONFIDENCE_SIGMA + ratio)).clip(1), 0).astype(
+        np.uint8
+    )

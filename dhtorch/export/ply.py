@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.export.arrays import array, bytes_of_colour, finite, rows
+from dhtorch.export.arrays import check_rows, colour_to_uint8, select_finite, to_numpy
 from dhtorch.runtime import storage
 
-_WORDS = {"f4": "float", "u1": "uchar", "i4": "int"}
+_PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 
 
 def write_ply(
@@ -43,27 +43,27 @@ def write_ply(
     Raises:
         ValueError: arrays of unequal length or wrong shape, or a triangle without its corners.
     """
-    points = rows("write_ply", "xyz", xyz, None, 3)
+    points = check_rows("write_ply", "xyz", xyz, None, 3)
     n = len(points)
     columns: dict[str, np.ndarray] = dict(zip("xyz", points.T.astype("<f4"), strict=True))
     if normal is not None:
-        normals = np.nan_to_num(rows("write_ply", "normal", normal, n, 3)).T.astype("<f4")
+        normals = np.nan_to_num(check_rows("write_ply", "normal", normal, n, 3)).T.astype("<f4")
         columns |= dict(zip(("nx", "ny", "nz"), normals, strict=True))
     if rgb is not None:
-        colours = bytes_of_colour(rows("write_ply", "rgb", rgb, n, 3)).T
+        colours = colour_to_uint8(check_rows("write_ply", "rgb", rgb, n, 3)).T
         columns |= dict(zip(("red", "green", "blue"), colours, strict=True))
     for name, value in values.items():
         if value is not None:
-            columns["class" if name == "hole" else name] = _number(rows("write_ply", name, value, n, None))
-    corners = None if face is None else rows("write_ply", "face", array(face), None, 3)
-    good, corners = finite(points, corners)
+            columns["class" if name == "hole" else name] = _to_ply_number(check_rows("write_ply", name, value, n, None))
+    corners = None if face is None else check_rows("write_ply", "face", to_numpy(face), None, 3)
+    good, corners = select_finite(points, corners)
     vertex = np.zeros(n, [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         vertex[name] = column
     vertex = vertex[good]
     head = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     head += [f"element vertex {len(vertex)}"]
-    head += [f"property {_WORDS[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
+    head += [f"property {_PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
     body = vertex.tobytes()
     if corners is not None:
         head += [f"element face {len(corners)}", "property list uchar int vertex_indices"]
@@ -74,7 +74,7 @@ def write_ply(
     return len(vertex)
 
 
-def _number(values: np.ndarray) -> np.ndarray:
+def _to_ply_number(values: np.ndarray) -> np.ndarray:
     """As uchar, int or float, little-endian."""
     if values.dtype.kind == "b" or (values.dtype.kind in "iu" and (not values.size or values.min() >= 0)):
         small = not values.size or values.max() <= 255

@@ -8,10 +8,10 @@ import zlib
 import numpy as np
 
 #: Of deflate: more costs time and gains little.
-_LEVEL = 6
+_DEFLATE_LEVEL = 6
 
 
-def float_tiff(picture: np.ndarray, *, deflate: bool = False) -> bytes:
+def encode_float_tiff(picture: np.ndarray, *, deflate: bool = False) -> bytes:
     """TIFF of (h, w) numbers as float32: one strip, little-endian; without loss in either case.
 
     Args:
@@ -20,7 +20,7 @@ def float_tiff(picture: np.ndarray, *, deflate: bool = False) -> bytes:
     """
     h, w = picture.shape
     body = picture.astype("<f4").tobytes()
-    body = zlib.compress(body, _LEVEL) if deflate else body
+    body = zlib.compress(body, _DEFLATE_LEVEL) if deflate else body
     packing = 8 if deflate else 1
     tags = [(256, w), (257, h), (258, 32), (259, packing), (262, 1), (273, 8), (277, 1), (278, h)]
     tags += [(279, len(body)), (339, 3)]

@@ -17,30 +17,29 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dhtorch.data.io.decode import need
+from dhtorch.data.io.decode import import_optional
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, engines, plan, shards
-from dhtorch.extract.dataset import Rows, maps_hw
-from dhtorch.extract.features import Features, JoinedDataset
+from dhtorch.extract.dataset import RowDataset, common_map_hw
+from dhtorch.extract.features import FeatureTable, JoinedDataset
 from dhtorch.pipeline.method import Method
-from dhtorch.runtime import file_lock as lock
-from dhtorch.runtime import results as archive
-from dhtorch.runtime import storage
-from dhtorch.runtime.console import many
-from dhtorch.transforms import CHANNELS, Maps, grid, maps
-from dhtorch.transforms.extend_depth import ON_ERROR
-from dhtorch.transforms.tokens import FITS
+from dhtorch.runtime import file_lock, storage
+from dhtorch.runtime import results as result_files
+from dhtorch.runtime.console import format_count
+from dhtorch.transforms import TOKEN_CHANNELS, DenseMaps, maps, token_grid
+from dhtorch.transforms.extend_depth import ON_ERROR_CHOICES
+from dhtorch.transforms.tokens import FIT_MODES
 
-__all__ = ["ExtractOptions", "Features", "JoinedDataset", "run"]
+__all__ = ["ExtractOptions", "FeatureTable", "JoinedDataset", "run"]
 
 #: Of the files: raised when a reader of older ones would be wrong.
-FORMAT = 1
+_FORMAT_VERSION = 1
 
 #: ExtractOptions that change where and how fast rows are made, and no row.
-_UNKEYED = ("engine", "address")
+_OPTIONS_NOT_IN_KEY = ("engine", "address")
 
 #: Frames that cannot be read, named in the report.
-_SHOWN = 3
+_MAX_COMPLAINTS_SHOWN = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +52,7 @@ class ExtractOptions:
 
     engine: str = "local"  # local: this machine; ray: a cluster, through Ray Data
     address: str | None = None  # of the Ray cluster; None = one that is started here
-    gap: int | str | None = plan.CHOICE  # auto = chosen among earlier frames; else frames back, 0 = front end alone
+    gap: int | str | None = plan.AUTO_GAP  # auto = chosen among earlier frames; else frames back, 0 = front end alone
     patch: int = 14  # px
     tokens_hw: Sequence[int] = (224, 224)  # size of the network's picture: with it all rows have one shape
     fit: str = "stretch"  # how the picture is brought to that size
@@ -64,14 +63,14 @@ class ExtractOptions:
     shard_rows: int = 512  # of one file: what a kill loses at most
 
     def __post_init__(self) -> None:
-        for name, known in {"engine": engines.ENGINES, "on_error": ON_ERROR, "fit": FITS}.items():
+        for name, known in {"engine": engines.ENGINES, "on_error": ON_ERROR_CHOICES, "fit": FIT_MODES}.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"extract.{name}: found {getattr(self, name)!r}, expected one of {', '.join(known)}")
         for name, low in {"gap": 0, "patch": 1, "shard_rows": 1}.items():
             value = getattr(self, name)
-            if not (isinstance(value, int) and value >= low) and not (name == "gap" and value in (None, plan.CHOICE)):
+            if not (isinstance(value, int) and value >= low) and not (name == "gap" and value in (None, plan.AUTO_GAP)):
                 raise ValueError(f"extract.{name}: found {value!r}, expected a whole number of at least {low}")
-        Maps.asked(self.dense, "extract.dense")
+        DenseMaps.asked(self.dense, "extract.dense")
         if not (isinstance(self.tokens_hw, Sequence) and len(self.tokens_hw) == 2):
             raise ValueError(f"extract.tokens_hw: found {self.tokens_hw!r}, expected height and width")
 
@@ -90,55 +89,57 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
         KeyboardInterrupt: Ctrl-C; what is finished stays.
     """
     options: ExtractOptions = parts["extract"]
-    need("pyarrow.parquet", extra="scale")
+    import_optional("pyarrow.parquet", extra="scale")
     if not isinstance(settings["workers"], int) or settings["workers"] < 0:
         raise ValueError(f"workers: found {settings['workers']!r}, expected a whole number of at least 0")
     scenes = scenes_of(parts["data"])
-    whole = plan.make(scenes, options.gap, parts["method"].views)
-    rows = _rows(scenes, whole, parts["method"], settings["seed"], options)
-    folder = _folder(settings["out"])
-    with lock.held(folder / ".lock", f"out: {folder}"):
-        shards.clear(folder)  # what a killed run left there
-        return _write(settings, options, whole, rows, folder, progress)
+    whole = plan.make_plan(scenes, options.gap, parts["method"].views)
+    rows = _make_rows(scenes, whole, parts["method"], settings["seed"], options)
+    folder = _make_folder(settings["out"])
+    with file_lock.acquire_file_lock(folder / ".lock", f"out: {folder}"):
+        shards.remove_unfinished(folder)  # what a killed run left there
+        return _write_shards(settings, options, whole, rows, folder, progress)
 
 
-def _write(
+def _write_shards(
     settings: Mapping[str, Any],
     options: ExtractOptions,
-    whole: plan.Plan,
-    rows: Rows,
+    whole: plan.ExtractionPlan,
+    rows: RowDataset,
     folder: Path,
     progress: Callable[..., Iterable[Any]],
 ) -> int:
     """The shards that are not there yet; the exit code."""
-    shared = _shared(settings, options, whole, rows)
+    shared = _shared_metadata(settings, options, whole, rows)
     every = whole.shards(options.shard_rows)
-    done = shards.finished(folder, shared)
+    done = shards.find_finished_shards(folder, shared)
     counts = dict(done)
     todo = [shard for shard in every if shard.name not in done]
     positions = [position for shard in todo for position in shard.rows]
     complaints: list[str] = []
-    engine = engines.run(options.engine, rows, positions, workers=settings["workers"], address=options.address)
+    engine = engines.run_engine(options.engine, rows, positions, workers=settings["workers"], address=options.address)
     try:
-        with closing(progress(engine, many(len(whole), "frame"), len(positions))) as answers:  # type: ignore[type-var]
+        with closing(progress(engine, format_count(len(whole), "frame"), len(positions))) as answers:  # type: ignore[type-var]
             for shard in todo:
-                kept = engines.kept(islice(answers, len(shard.rows)), options.on_error, rows, complaints)
-                counts[shard.name] = shards.write(folder, shard, kept, rows.wanted, shared)
+                kept = engines.filter_rows(islice(answers, len(shard.rows)), options.on_error, rows, complaints)
+                counts[shard.name] = shards.write_shard(folder, shard, kept, rows.wanted, shared)
     except KeyboardInterrupt:
-        whole_ones = f"{len(counts)} of {many(len(every), 'shard')} in {folder} are whole and stay"
+        whole_ones = f"{len(counts)} of {format_count(len(every), 'shard')} in {folder} are whole and stay"
         raise KeyboardInterrupt(f"{whole_ones}; the same command does the rest") from None
-    _say(folder, counts, len(done), complaints)
+    _print_summary(folder, counts, len(done), complaints)
     return 0
 
 
-def _rows(scenes: Sequence[Scene], whole: plan.Plan, method: Method, seed: int, options: ExtractOptions) -> Rows:
+def _make_rows(
+    scenes: Sequence[Scene], whole: plan.ExtractionPlan, method: Method, seed: int, options: ExtractOptions
+) -> RowDataset:
     hw = (int(options.tokens_hw[0]), int(options.tokens_hw[1]))
-    rows, across = grid(hw, patch=options.patch, tokens_hw=hw)
-    every = columns.columns(method.n, rows * across, half=options.half, map_hw=_map_hw(scenes, options))
-    return Rows(
+    rows, across = token_grid(hw, patch=options.patch, tokens_hw=hw)
+    every = columns.feature_columns(method.n, rows * across, half=options.half, map_hw=_map_hw(scenes, options))
+    return RowDataset(
         scenes,
         whole,
-        columns.choose(every, options.columns),
+        columns.select_columns(every, options.columns),
         method=method,
         gap=options.gap,
         seed=seed,
@@ -151,37 +152,41 @@ def _rows(scenes: Sequence[Scene], whole: plan.Plan, method: Method, seed: int, 
 
 def _map_hw(scenes: Sequence[Scene], options: ExtractOptions) -> tuple[int, int] | None:
     """Size of the maps, where there is a column of one: all pictures must then have one shape."""
-    asked = Maps.asked(options.dense, "extract.dense")
-    named = options.columns is None or not {*maps.NUMBERS, *maps.CODES}.isdisjoint(options.columns)
-    return maps_hw(scenes, asked) if asked is not None and named else None
+    asked = DenseMaps.asked(options.dense, "extract.dense")
+    named = options.columns is None or not {*maps.MAP_NUMBER_KEYS, *maps.MAP_CODE_KEYS}.isdisjoint(options.columns)
+    return common_map_hw(scenes, asked) if asked is not None and named else None
 
 
-def _shared(settings: Mapping[str, Any], options: ExtractOptions, whole: plan.Plan, rows: Rows) -> dict[str, Any]:
+def _shared_metadata(
+    settings: Mapping[str, Any], options: ExtractOptions, whole: plan.ExtractionPlan, rows: RowDataset
+) -> dict[str, Any]:
     """Metadata of all shards: what the columns mean and where they come from."""
-    asked = {k: v for k, v in asdict(options).items() if k not in _UNKEYED}
+    asked = {k: v for k, v in asdict(options).items() if k not in _OPTIONS_NOT_IN_KEY}
     config = {**{k: settings[k] for k in ("data", "method", "seed")}, "extract": asked}
-    files = {**archive.files_below(whole.roots), **archive.files_named(config)}
-    name, digest = settings["choices"]["data"], archive.data_digest(files)
-    made = archive.meta(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
-    found: dict[str, Any] = storage.strict(
+    files = {**result_files.list_files_below(whole.roots), **result_files.list_files_named(config)}
+    name, digest = settings["choices"]["data"], result_files.compute_data_digest(files)
+    made = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
+    found: dict[str, Any] = storage.to_strict_json(
         {
-            "format": FORMAT,
+            "format": _FORMAT_VERSION,
             "version": made["versions"]["dhtorch"],
             "git": made["git"],
             "versions": made["versions"],
-            "key": archive.result_key({**config, "name": name, "format": FORMAT}, digest, roots=[Rows.__module__]),
-            "config": archive.portable(config),
+            "key": result_files.compute_result_key(
+                {**config, "name": name, "format": _FORMAT_VERSION}, digest, roots=[RowDataset.__module__]
+            ),
+            "config": result_files.make_portable(config),
             "data": {"name": name, "digest": digest, "recordings": len(whole.episodes), "frames": len(whole)},
             "columns": {k: c._asdict() for k, c in rows.wanted.items()},
             "codes": columns.code_tables(),
-            "channels": CHANNELS,
-            "grid": grid(rows.options["tokens_hw"], patch=options.patch),
+            "channels": TOKEN_CHANNELS,
+            "grid": token_grid(rows.options["tokens_hw"], patch=options.patch),
         }
     )
     return found
 
 
-def _folder(out: str) -> Path:
+def _make_folder(out: str) -> Path:
     """The folder of the shards, made where it is missing."""
     folder = Path(str(out)).expanduser()
     if folder.exists() and not folder.is_dir():
@@ -190,19 +195,21 @@ def _folder(out: str) -> Path:
     return folder
 
 
-def _say(folder: Path, counts: Mapping[str, Counter[str]], n_before: int, complaints: Sequence[str]) -> None:
+def _print_summary(folder: Path, counts: Mapping[str, Counter[str]], n_before: int, complaints: Sequence[str]) -> None:
     """What is there now, and what was wrong with frames."""
     total = sum(counts.values(), Counter())
     skipped = total.pop("skipped", 0)
     size = sum(file.stat().st_size for file in shards.shard_files(folder))
     before = f" ({n_before} left untouched)" if n_before else ""
-    print(f"{folder}: {many(len(counts), 'shard')}{before}, {many(total.total(), 'row')}, {size / 1e6:.1f} MB")
+    print(
+        f"{folder}: {format_count(len(counts), 'shard')}{before}, {format_count(total.total(), 'row')}, {size / 1e6:.1f} MB"
+    )
     said = [
         f"{n} {name.replace('_', ' ')}" for name, n in (*total.items(), ("skipped", skipped)) if n and name != "none"
     ]
     if said:
         print(f"frames with a problem: {', '.join(said)}")
-    for complaint in complaints[:_SHOWN]:
+    for complaint in complaints[:_MAX_COMPLAINTS_SHOWN]:
         print(f"  {complaint}")
-    if len(complaints) > _SHOWN:
-        print(f"  and {len(complaints) - _SHOWN} more")
+    if len(complaints) > _MAX_COMPLAINTS_SHOWN:
+        print(f"  and {len(complaints) - _MAX_COMPLAINTS_SHOWN} more")

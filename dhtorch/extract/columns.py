@@ -12,16 +12,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source, names
-from dhtorch.data.io.decode import need
-from dhtorch.transforms import CHANNELS, SampleProblem, maps
+from dhtorch.data.io.decode import import_optional
+from dhtorch.transforms import TOKEN_CHANNELS, SampleProblem, maps
 
 Row = dict[str, Any]  # column → number, text or array
 
 #: Where a row belongs: these columns come first, and every shard has them.
-PLACE = ("episode_index", "frame_index", "timestamp", "recording")
+KEY_COLUMNS = ("episode_index", "frame_index", "timestamp", "recording")
 
 #: Columns with codes → their table.
-CODES: dict[str, type] = {
+_COLUMN_CODES: dict[str, type] = {
     "source": Source,
     "flag": Flag,
     "hole": Hole,
@@ -33,11 +33,11 @@ CODES: dict[str, type] = {
 }
 
 #: Columns of floats that keep their meaning with eleven bits; pixels and poses do not.
-MAY_BE_HALF = ("xyz", "depth", "sigma", "score", "tokens", *maps.NUMBERS)
+_HALF_COLUMNS = ("xyz", "depth", "sigma", "score", "tokens", *maps.MAP_NUMBER_KEYS)
 
 
 #: Kinds that are no numbers → bytes of one, roughly.
-_GUESS = {"str": 1, "bytes": 1 << 18}
+_GUESSED_BYTES = {"str": 1, "bytes": 1 << 18}
 
 
 class Column(NamedTuple):
@@ -51,10 +51,12 @@ class Column(NamedTuple):
     @property
     def n_bytes(self) -> int:
         """In memory, of one row, files and texts by a guess."""
-        return _GUESS.get(self.kind) or np.dtype(self.kind).itemsize * math.prod(self.shape)
+        return _GUESSED_BYTES.get(self.kind) or np.dtype(self.kind).itemsize * math.prod(self.shape)
 
 
-def columns(n: int, patches: int, *, half: bool = False, map_hw: tuple[int, int] | None = None) -> dict[str, Column]:
+def feature_columns(
+    n: int, patches: int, *, half: bool = False, map_hw: tuple[int, int] | None = None
+) -> dict[str, Column]:
     """All columns of rows with ``n`` samples, ``patches`` tokens and maps of that size (None = no maps), in order."""
     f, byte, flag = "float32", "uint8", "bool"
     found = {
@@ -76,17 +78,19 @@ def columns(n: int, patches: int, *, half: bool = False, map_hw: tuple[int, int]
         "pose_cov": Column(f, (6, 6), "rad², rad m, m²", "covariance of that pose, rotation first, left perturbation"),
         "pose_ok": Column(flag, (), "1", "there is a pose"),
         "pose_code": Column(byte, (), "code", "how the search for the pose ended"),
-        "tokens": Column(f, (patches, len(CHANNELS)), "1/m, 1/m, share", "depth tokens of the patches, row by row"),
+        "tokens": Column(
+            f, (patches, len(TOKEN_CHANNELS)), "1/m, 1/m, share", "depth tokens of the patches, row by row"
+        ),
         "tokens_valid": Column(flag, (patches,), "1", "a sample of the patch has a depth"),
-        **({} if map_hw is None else _maps(map_hw)),
+        **({} if map_hw is None else _map_columns(map_hw)),
         "problem": Column(byte, (), "code", "what was wrong with the frame"),
     }
-    half_names = MAY_BE_HALF if half else ()
+    half_names = _HALF_COLUMNS if half else ()
     return {k: c._replace(kind="float16") if k in half_names else c for k, c in found.items()}
 
 
-def _maps(hw: tuple[int, int]) -> dict[str, Column]:
-    """Columns of every pixel, over the field of the picture (:func:`dhtorch.pipeline.dense.pixels`)."""
+def _map_columns(hw: tuple[int, int]) -> dict[str, Column]:
+    """Columns of every pixel, over the field of the picture (:func:`dhtorch.pipeline.dense.map_pixel_centres`)."""
     f, byte, none = "float32", "uint8", "0 = none, where a DepthMap has NaN"
     return {
         "depth_map": Column(f, hw, "m", f"z of every pixel, by sensor or sweep; {none}"),
@@ -97,7 +101,7 @@ def _maps(hw: tuple[int, int]) -> dict[str, Column]:
     }
 
 
-def choose(found: Mapping[str, Column], wanted: Sequence[str] | None) -> dict[str, Column]:
+def select_columns(found: Mapping[str, Column], wanted: Sequence[str] | None) -> dict[str, Column]:
     """The place of a row, the wanted columns (None = all) and ``problem``.
 
     Raises:
@@ -106,41 +110,41 @@ def choose(found: Mapping[str, Column], wanted: Sequence[str] | None) -> dict[st
     for name in wanted or ():
         if name not in found:
             raise ValueError(f"extract.columns: found {name!r}, expected some of {', '.join(found)}")
-    keep = set(found if wanted is None else wanted) | {*PLACE, "problem"}
+    keep = set(found if wanted is None else wanted) | {*KEY_COLUMNS, "problem"}
     return {name: column for name, column in found.items() if name in keep}
 
 
-def blank(wanted: Mapping[str, Column]) -> Row:
+def blank_features(wanted: Mapping[str, Column]) -> Row:
     """The features of a frame that cannot be read: zeros, and a ``problem`` that says so."""
     empty: dict[str, Any] = {"str": "", "bytes": b""}
     zeros = {k: empty[c.kind] if c.kind in empty else np.zeros(c.shape, c.kind) for k, c in wanted.items()}
-    zeros = {k: value for k, value in zeros.items() if k not in PLACE}
+    zeros = {k: value for k, value in zeros.items() if k not in KEY_COLUMNS}
     return {**zeros, "problem": np.asarray(SampleProblem.UNREADABLE, wanted["problem"].kind)}
 
 
 def code_tables() -> dict[str, dict[int, str]]:
     """Column → what its codes mean, for the metadata of a file."""
-    return {column: names(table) for column, table in CODES.items()}
+    return {column: names(table) for column, table in _COLUMN_CODES.items()}
 
 
-def schema(wanted: Mapping[str, Column], metadata: Mapping[str, str]) -> Any:
+def arrow_schema(wanted: Mapping[str, Column], metadata: Mapping[str, str]) -> Any:
     """Arrow schema: lists of fixed size, unit and meaning with every field."""
-    pyarrow = need("pyarrow", extra="scale")
+    pyarrow = import_optional("pyarrow", extra="scale")
     fields = [
-        pyarrow.field(name, _type(pyarrow, c), nullable=False, metadata={"unit": c.unit, "about": c.about})
+        pyarrow.field(name, _arrow_type(pyarrow, c), nullable=False, metadata={"unit": c.unit, "about": c.about})
         for name, c in wanted.items()
     ]
     return pyarrow.schema(fields, metadata=dict(metadata))
 
 
-def table(rows: Iterable[Row], wanted: Mapping[str, Column], layout: Any) -> Any:
-    """Arrow table of some rows, at least one, in the layout that :func:`schema` made."""
-    pyarrow = need("pyarrow", extra="scale")
+def arrow_table(rows: Iterable[Row], wanted: Mapping[str, Column], layout: Any) -> Any:
+    """Arrow table of some rows, at least one, in the layout that :func:`arrow_schema` made."""
+    pyarrow = import_optional("pyarrow", extra="scale")
     rows = list(rows)
     arrays = []
     for name, column in wanted.items():
-        if column.kind in _GUESS:
-            arrays.append(pyarrow.array([row[name] for row in rows], _type(pyarrow, column)))
+        if column.kind in _GUESSED_BYTES:
+            arrays.append(pyarrow.array([row[name] for row in rows], _arrow_type(pyarrow, column)))
             continue
         values = np.stack([np.asarray(row[name]).astype(column.kind) for row in rows])
         array = pyarrow.array(values.reshape(-1))
@@ -150,7 +154,7 @@ def table(rows: Iterable[Row], wanted: Mapping[str, Column], layout: Any) -> Any
     return pyarrow.Table.from_arrays(arrays, schema=layout)
 
 
-def _type(pyarrow: Any, column: Column) -> Any:
+def _arrow_type(pyarrow: Any, column: Column) -> Any:
     named = {"str": pyarrow.string(), "bytes": pyarrow.binary()}
     kind = named.get(column.kind) or pyarrow.from_numpy_dtype(np.dtype(column.kind))
     for size in reversed(column.shape):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from dhtorch.data.recording import Lazy, Recording
+from dhtorch.data.recording import LazySequence, Recording
 from dhtorch.data.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
-class Cut(Lazy[Scene]):
+class TruncatedScenes(LazySequence[Scene]):
     """Scenes with so many frames each at most."""
 
     scenes: Sequence[Scene]
@@ -22,11 +22,11 @@ class Cut(Lazy[Scene]):
     def made(self, place: int) -> Scene:
         """The scene there, cut."""
         scene = self.scenes[place]
-        return replace(scene, recording=shorter(scene.recording, self.frames))
+        return replace(scene, recording=truncate_recording(scene.recording, self.frames))
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen(Lazy[Recording]):
+class SelectedRecordings(LazySequence[Recording]):
     """The recordings of some scenes."""
 
     scenes: Sequence[Scene]
@@ -40,12 +40,12 @@ class Chosen(Lazy[Recording]):
         return self.scenes[self.places[place]].recording
 
 
-def cut(scenes: Sequence[Scene], frames: int | None) -> Sequence[Scene]:
+def truncate_scenes(scenes: Sequence[Scene], frames: int | None) -> Sequence[Scene]:
     """The scenes with their first frames alone; None = all."""
-    return scenes if frames is None else Cut(scenes, frames)
+    return scenes if frames is None else TruncatedScenes(scenes, frames)
 
 
-def shorter(recording: Recording, frames: int) -> Recording:
+def truncate_recording(recording: Recording, frames: int) -> Recording:
     """The first frames of a recording."""
     times, poses = recording.times, recording.poses
     return replace(

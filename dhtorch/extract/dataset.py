@@ -12,26 +12,26 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from dhtorch.data.recording import Recording
-from dhtorch.data.rig import at_instants
+from dhtorch.data.rig import match_instants
 from dhtorch.data.scene import Scene
-from dhtorch.extract.columns import PLACE, Column, Row
-from dhtorch.extract.plan import Plan, offers, steps_back
+from dhtorch.extract.columns import KEY_COLUMNS, Column, Row
+from dhtorch.extract.plan import ExtractionPlan, candidates_by_frame, view_offsets
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.pipeline.method import Method
-from dhtorch.pipeline.view_report import choosing
+from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.records import Camera, Frame
-from dhtorch.transforms import ExtendDepth, Maps, SampleError
+from dhtorch.transforms import DenseMaps, ExtendDepth, SampleError
 
 #: Readers give metres, and the camera of these very pixels: there is no unit that could be wrong.
-_TRUSTED = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
+_READER_OPTIONS = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
 
 
 #: Bytes of frames that are held because others will ask for them.
-HELD_BYTES = 1 << 26
+_FRAME_CACHE_BYTES = 1 << 26
 
 
-class Extracted(NamedTuple):
+class ExtractedRow(NamedTuple):
     """What came of one row of the plan."""
 
     place: Row  # the columns that say where it belongs
@@ -39,7 +39,7 @@ class Extracted(NamedTuple):
     complaint: str = ""  # why
 
 
-class Rows(Dataset[Extracted]):
+class RowDataset(Dataset[ExtractedRow]):
     """Position in the plan → answer. Depends on nothing but the position: not on the worker, its engine or the order.
 
     The sample is what a robot's data loader with ``delta_timestamps`` makes: earlier pictures, then the frame itself.
@@ -49,7 +49,7 @@ class Rows(Dataset[Extracted]):
 
     Args:
         scenes: of the data set.
-        plan: from :func:`dhtorch.extract.plan.make`.
+        plan: from :func:`dhtorch.extract.plan.make_plan`.
         wanted: columns of the rows.
         method: of one other view or several.
         gap: ``auto`` = the method chooses among earlier frames; a number of frames back to the other view, 0 = none;
@@ -62,7 +62,7 @@ class Rows(Dataset[Extracted]):
     def __init__(
         self,
         scenes: Sequence[Scene],
-        plan: Plan,
+        plan: ExtractionPlan,
         wanted: dict[str, Column],
         *,
         method: Method,
@@ -74,42 +74,42 @@ class Rows(Dataset[Extracted]):
         self.scenes, self.plan, self.wanted = scenes, plan, wanted
         self.method, self.gap, self.past, self.options = method, gap, past, options
         self.beside = beside
-        self._opened: tuple[int, Opened] | None = None
+        self._opened: tuple[int, OpenRecording] | None = None
 
     def __len__(self) -> int:
         return len(self.plan)
 
-    def __getitem__(self, position: int) -> Extracted:
+    def __getitem__(self, position: int) -> ExtractedRow:
         k, episode, i = self.plan.place(position)
         if self._opened is None or self._opened[0] != k:
             beside = [self.scenes[i].recording for i in self.plan.beside(k)] if self.beside else []
-            self._opened = (k, Opened(self.scenes[k], self.method, self.gap, self.past, self.options, beside))
+            self._opened = (k, OpenRecording(self.scenes[k], self.method, self.gap, self.past, self.options, beside))
         opened = self._opened[1]
         recording = opened.recording
         stamp = np.nan if recording.times is None else float(recording.times[i])
-        place: Row = dict(zip(PLACE, (episode, int(recording.number[i]), stamp, recording.name), strict=True))
+        place: Row = dict(zip(KEY_COLUMNS, (episode, int(recording.number[i]), stamp, recording.name), strict=True))
         try:
             with torch.no_grad():
-                return Extracted(place, self.features(opened, i))
+                return ExtractedRow(place, self.features(opened, i))
         except Exception as error:  # whatever a decoder raises; lack of memory is no property of a frame
             if isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
             text = f"{recording.name}, frame {place['frame_index']}: {error}"
-            return Extracted(place, None, " ".join(text.split()))
+            return ExtractedRow(place, None, " ".join(text.split()))
 
-    def features(self, opened: Opened, i: int) -> Row:
+    def features(self, opened: OpenRecording, i: int) -> Row:
         """The columns of frame ``i`` of an opened recording, beside those of its place."""
         anchor = opened.frame(i)
         added = opened.answer(anchor, opened.others(i))
         _check_shapes(added, self.wanted)
-        keep = {k: c for k, c in self.wanted.items() if k not in PLACE}
+        keep = {k: c for k, c in self.wanted.items() if k not in KEY_COLUMNS}
         return {k: added[k].numpy().astype(c.kind) for k, c in keep.items()}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": None}
 
 
-class Opened:
+class OpenRecording:
     """One recording, and the transforms that fit its frames."""
 
     def __init__(
@@ -122,13 +122,13 @@ class Opened:
         beside: Sequence[Recording] = (),
     ) -> None:
         self.scene, self.recording, self.options = scene, scene.recording, options
-        self.offers = offers(scene, past) if isinstance(gap, str) else None
-        self.method = method if self.offers is None else choosing(method)
-        self.steps = [] if isinstance(gap, str) else steps_back(scene, gap, method.views)
+        self.offers = candidates_by_frame(scene, past) if isinstance(gap, str) else None
+        self.method = method if self.offers is None else with_view_selection(method)
+        self.steps = [] if isinstance(gap, str) else view_offsets(scene, gap, method.views)
         self.position = {int(number): i for i, number in enumerate(self.recording.number)} if self.steps else {}
         self.transforms: dict[tuple[Any, ...], ExtendDepth] = {}
         self.held: OrderedDict[int, Frame | None] = OrderedDict()
-        self.beside = [(other, at_instants(self.recording, other)) for other in beside]
+        self.beside = [(other, match_instants(self.recording, other)) for other in beside]
 
     def frame(self, i: int) -> Frame:
         """Frame ``i``, which is likely to be asked for again as another view of those behind it."""
@@ -138,7 +138,7 @@ class Opened:
 
     def answer(self, anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Tensor]:
         """What the transform adds to the sample of a frame and its other views."""
-        sample = _sample(anchor, others)
+        sample = _make_sample(anchor, others)
         optional = tuple(key for key in ("confidence", "distortion", "depth_intrinsics") if key in sample)
         kind = (len(sample["image"]), *optional)
         if kind not in self.transforms:
@@ -155,13 +155,13 @@ class Opened:
             return [self._frame(self.position.get(number - step)) for step in self.steps]
         found: list[Frame | None] = [f for k in self.offers.get(i, ()) if (f := self._frame(k)) is not None]
         for other, places in self.beside:
-            frame = None if places[i] < 0 else readable(other, places[i])
+            frame = None if places[i] < 0 else try_read_frame(other, places[i])
             found += [] if frame is None else [frame]
         return found or [None]
 
     def _frame(self, at: int | None) -> Frame | None:
         if at is not None and at not in self.held:
-            self.held[at] = readable(self.recording, at)
+            self.held[at] = try_read_frame(self.recording, at)
             self._forget()
         return None if at is None else self.held[at]
 
@@ -169,17 +169,17 @@ class Opened:
         """Drop what was read first: decoding a video backwards starts at a key frame every time."""
         known = [frame for frame in self.held.values() if frame is not None]
         size = max((frame.image.nbytes + frame.depth.nbytes for frame in known), default=1)
-        while len(self.held) > max(2, HELD_BYTES // size):
+        while len(self.held) > max(2, _FRAME_CACHE_BYTES // size):
             self.held.popitem(last=False)
 
     def _transform(self, views: int, optional: tuple[str, ...]) -> ExtendDepth:
-        options: dict[str, Any] = {**_TRUSTED, **self.options, **{key: key for key in optional}}
+        options: dict[str, Any] = {**_READER_OPTIONS, **self.options, **{key: key for key in optional}}
         options |= {"sparse": self.recording.sparse, "hint": self.scene.hint}
         other_at = list(range(views)) if views > 1 else 0
         return ExtendDepth(method=self.method, other_at=other_at, **options)
 
 
-def maps_hw(scenes: Sequence[Scene], maps: Maps) -> tuple[int, int]:
+def common_map_hw(scenes: Sequence[Scene], maps: DenseMaps) -> tuple[int, int]:
     """Height and width of all maps of a data set, by the first frame of each recording that can be read.
 
     Raises:
@@ -187,15 +187,15 @@ def maps_hw(scenes: Sequence[Scene], maps: Maps) -> tuple[int, int]:
     """
     first: tuple[str, tuple[int, int]] | None = None
     for recording in (scene.recording for scene in scenes):
-        frames = (readable(recording, i) for i in range(len(recording)))
+        frames = (try_read_frame(recording, i) for i in range(len(recording)))
         frame = next((frame for frame in frames if frame is not None), None)
         if frame is None:
             continue  # said row by row
         hw = maps.hw(frame.hw)
         if first is not None and hw != first[1]:
-            found = f"{recording.name} has pictures of {_size(frame.hw)} and maps of {_size(hw)}"
+            found = f"{recording.name} has pictures of {_format_hw(frame.hw)} and maps of {_format_hw(hw)}"
             raise ValueError(
-                f"extract.dense: {found}, expected maps of {_size(first[1])} as of {first[0]}; extract them apart"
+                f"extract.dense: {found}, expected maps of {_format_hw(first[1])} as of {first[0]}; extract them apart"
             )
         first = first or (recording.name, hw)
     if first is None:
@@ -203,7 +203,7 @@ def maps_hw(scenes: Sequence[Scene], maps: Maps) -> tuple[int, int]:
     return first[1]
 
 
-def readable(recording: Recording, at: int) -> Frame | None:
+def try_read_frame(recording: Recording, at: int) -> Frame | None:
     """A frame, None where it cannot be read: said where that frame is the anchor."""
     try:
         return recording[at]
@@ -217,15 +217,15 @@ def _check_shapes(added: Mapping[str, Tensor], wanted: Mapping[str, Column]) -> 
     """Raises SampleError for a map of another size than its column, the only thing that a picture's size decides."""
     for name, column in wanted.items():
         if name in added and tuple(added[name].shape) != column.shape:
-            found, expected = (_size(shape) for shape in (added[name].shape, column.shape))
+            found, expected = (_format_hw(shape) for shape in (added[name].shape, column.shape))
             raise SampleError(f"{name}: found {found}, expected {expected} as of the first frame; extract it apart")
 
 
-def _size(hw: Sequence[int]) -> str:
+def _format_hw(hw: Sequence[int]) -> str:
     return f"{hw[0]}x{hw[1]}"
 
 
-def _sample(anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:
+def _make_sample(anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:
     """Frames along time, the anchor last, as the transform reads them."""
     frames = [*(anchor if other is None else other for other in others), anchor]
     cameras = [frame.camera for frame in frames]
@@ -240,7 +240,7 @@ def _sample(anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:
     lenses = [camera.distortion for camera in cameras if camera.distortion is not None]
     if lenses:
         size = max(lens.shape[-1] for lens in lenses)
-        sample["distortion"] = torch.cat([_distortion(camera, lenses[0], size) for camera in cameras])
+        sample["distortion"] = torch.cat([_pad_distortion(camera, lenses[0], size) for camera in cameras])
     if anchor.depth_camera is not None:
         sample["depth_intrinsics"] = cam.to_matrix(anchor.depth_camera)[0]
     poses = [frame.T_world_from_cam for frame in frames]
@@ -249,7 +249,7 @@ def _sample(anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:
     return sample
 
 
-def _distortion(camera: Camera, like: Tensor, size: int) -> Tensor:
+def _pad_distortion(camera: Camera, like: Tensor, size: int) -> Tensor:
     """Numbers of the lens, zeros where there is none or another has more."""
     lens = like.new_zeros(1, 0) if camera.distortion is None else camera.distortion
     return torch.nn.functional.pad(lens, (0, size - lens.shape[-1]))

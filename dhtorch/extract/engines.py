@@ -15,37 +15,37 @@ from typing import Any
 import numpy as np
 from torch.utils.data import DataLoader
 
-from dhtorch.data.io.decode import need, set_opencv_threads
+from dhtorch.data.io.decode import import_optional, set_opencv_threads
 from dhtorch.extract import columns
-from dhtorch.extract.dataset import Extracted, Rows
-from dhtorch.runtime.parent_watch import follow_parent
+from dhtorch.extract.dataset import ExtractedRow, RowDataset
+from dhtorch.runtime.parent_watch import exit_with_parent
 from dhtorch.transforms import SampleError, one_thread
 
 #: Rows of one Ray task: what is done again where a node is lost.
-TASK_ROWS = 16
+_RAY_TASK_ROWS = 16
 
 #: Bytes of shared memory of a Ray that is started on this machine.
-STORE_BYTES = 300_000_000
+_RAY_STORE_BYTES = 300_000_000
 
 #: Time that a cluster is given to answer, s.
-PATIENCE_S = 10
+_CONNECT_TIMEOUT_S = 10
 
 
 #: Names of the places.
 ENGINES = ("local", "ray")
 
 
-def run(
-    engine: str, rows: Rows, positions: Sequence[int], *, workers: int, address: str | None = None
-) -> Iterator[Extracted]:
+def run_engine(
+    engine: str, rows: RowDataset, positions: Sequence[int], *, workers: int, address: str | None = None
+) -> Iterator[ExtractedRow]:
     """The answers of the engine of that name."""
-    return on_ray(rows, positions, address) if engine == "ray" else here(rows, positions, workers)
+    return run_ray(rows, positions, address) if engine == "ray" else run_local(rows, positions, workers)
 
 
-def kept(
-    answers: Iterable[Extracted],
+def filter_rows(
+    answers: Iterable[ExtractedRow],
     on_error: str,
-    rows: Rows,
+    rows: RowDataset,
     complaints: list[str],
     otherwise: str = "extract.on_error=skip or flag",
 ) -> Iterator[columns.Row]:
@@ -60,10 +60,10 @@ def kept(
         if features is None:
             complaints.append(complaint)
         if features is not None or on_error == "flag":
-            yield {**place, **(columns.blank(rows.wanted) if features is None else features)}
+            yield {**place, **(columns.blank_features(rows.wanted) if features is None else features)}
 
 
-def here(rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Extracted]:
+def run_local(rows: RowDataset, positions: Sequence[int], workers: int) -> Iterator[ExtractedRow]:
     """In this process, or in so many data-loader workers.
 
     Raises:
@@ -76,8 +76,8 @@ def here(rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Extract
         batch_size=None,
         sampler=positions,
         num_workers=workers,
-        worker_init_fn=_worker,
-        collate_fn=_as_it_is,
+        worker_init_fn=_init_worker,
+        collate_fn=_identity,
     )
     try:
         yield from loader
@@ -87,7 +87,7 @@ def here(rows: Rows, positions: Sequence[int], workers: int) -> Iterator[Extract
         raise ChildProcessError(f"{error}; is there memory for {workers} workers?") from error
 
 
-def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterator[Extracted]:
+def run_ray(rows: RowDataset, positions: Sequence[int], address: str | None) -> Iterator[ExtractedRow]:
     """In the tasks of a Ray cluster, through Ray Data; lost nodes are made up for.
 
     Args:
@@ -98,9 +98,9 @@ def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterato
     Raises:
         ConnectionError: no cluster at the address.
     """
-    ray, data = need("ray", extra="scale"), need("ray.data", extra="scale")
-    _reach(address)
-    own = {} if address else {"include_dashboard": False, "object_store_memory": STORE_BYTES}
+    ray, data = import_optional("ray", extra="scale"), import_optional("ray.data", extra="scale")
+    _check_reachable(address)
+    own = {} if address else {"include_dashboard": False, "object_store_memory": _RAY_STORE_BYTES}
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
@@ -111,11 +111,13 @@ def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterato
         context.execution_options.preserve_order = True
         context.enable_progress_bars = False
         shared = ray.put(rows)
-        cuts = range(TASK_ROWS, len(positions), TASK_ROWS)
+        cuts = range(_RAY_TASK_ROWS, len(positions), _RAY_TASK_ROWS)
         blocks = np.split(np.asarray(positions, np.int64), cuts)
 
         def task(batch: dict[str, Any]) -> dict[str, Any]:
-            return {"answer": [pickle.dumps(answer) for answer in here(ray.get(shared), batch["data"].tolist(), 0)]}
+            return {
+                "answer": [pickle.dumps(answer) for answer in run_local(ray.get(shared), batch["data"].tolist(), 0)]
+            }
 
         tasks = data.from_numpy(blocks).map_batches(task, batch_size=None, num_cpus=1)
         for block in tasks.iter_batches(batch_size=None, prefetch_batches=1):
@@ -124,21 +126,21 @@ def on_ray(rows: Rows, positions: Sequence[int], address: str | None) -> Iterato
         ray.shutdown()
 
 
-def _reach(address: str | None) -> None:
+def _check_reachable(address: str | None) -> None:
     """Ask whether anything answers: Ray itself goes on trying for minutes."""
     host, _, port = str(address).removeprefix("ray://").rpartition(":")
     if not port.isdigit():
         return
     try:
-        socket.create_connection((host, int(port)), timeout=PATIENCE_S).close()
+        socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
     except OSError as error:
         raise ConnectionError(f"address: nothing answers at {address} ({error}), expected a cluster") from None
 
 
-def _worker(number: int) -> None:
+def _init_worker(number: int) -> None:
     one_thread(number)
-    follow_parent()
+    exit_with_parent()
 
 
-def _as_it_is(answer: Any) -> Any:
+def _identity(answer: Any) -> Any:
     return answer

@@ -13,11 +13,11 @@ from torch import Tensor
 from dhtorch.codes import Gate, PoseCode, Source, names
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
-from dhtorch.export import png
-from dhtorch.export.lerobot import Moments
-from dhtorch.export.tiff import float_tiff
-from dhtorch.extract.columns import PLACE, Column, Row
-from dhtorch.extract.dataset import Opened, Rows, readable
+from dhtorch.export import encode_png
+from dhtorch.export.lerobot import FeatureMoments
+from dhtorch.export.tiff import encode_float_tiff
+from dhtorch.extract.columns import KEY_COLUMNS, Column, Row
+from dhtorch.extract.dataset import OpenRecording, RowDataset, try_read_frame
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.pipeline import dense
@@ -25,23 +25,23 @@ from dhtorch.records import Frame
 from dhtorch.transforms import SampleError
 
 #: Steps of sigma in one of depth.
-SIGMA_STEPS: Final = 8
+MAP_SIGMA_STEPS: Final = 8
 
 #: Maps of a frame, and what each is: files.
-MAPS = {"depth": "depth as TIFF, m", "sigma": "its standard deviation as TIFF, m", "source": "codes as PNG"}
+_MAP_FILES = {"depth": "depth as TIFF, m", "sigma": "its standard deviation as TIFF, m", "source": "codes as PNG"}
 
 #: Columns of the counts: pixels by source, and silent ones by reason.
-_N_SOURCES, NO_VIEW = max(names(Source)) + 1, max(names(Gate)) + 1
+_N_SOURCES, NO_OTHER_VIEW = max(names(Source)) + 1, max(names(Gate)) + 1
 
 #: Why a pixel is silent: gates, and that there was no other view, as before the first frame of an episode.
-SILENCE = {**names(Gate), NO_VIEW: "NO_OTHER_VIEW"}
+NO_ANSWER_REASONS = {**names(Gate), NO_OTHER_VIEW: "NO_OTHER_VIEW"}
 
-#: Numbers of :class:`dhtorch.export.lerobot.Moments`, over depth, sigma, and the colours of the picture.
-_MOMENTS = (5, 5)
+#: Numbers of :class:`dhtorch.export.lerobot.FeatureMoments`, over depth, sigma, and the colours of the picture.
+_MOMENTS_SHAPE = (5, 5)
 
 
 @dataclass(frozen=True)
-class View:
+class DatasetCamera:
     """One camera of a data set."""
 
     key: str  # of its pictures, as a LeRobot feature
@@ -56,23 +56,23 @@ class View:
         return self.key.removeprefix("observation.").removeprefix("images.")
 
     @classmethod
-    def of(cls, scene: Scene, size: int) -> View:
+    def of(cls, scene: Scene, size: int) -> DatasetCamera:
         """The camera of a recording, by the first of its frames that can be read.
 
         Raises:
             ValueError: there is none, or frames have no pictures.
         """
         recording = scene.recording
-        frames = (readable(recording, i) for i in range(len(recording)))
+        frames = (try_read_frame(recording, i) for i in range(len(recording)))
         frame = next((frame for frame in frames if frame is not None), None)
         if frame is None or 0 in frame.hw:
             recording[0]  # says what is wrong with it
             raise ValueError(f"{recording.name}: found no frame with a picture, expected one")
         map_hw = dense.map_hw(frame.hw, size)
-        return cls(camera_key(recording), frame.hw, map_hw, recording.poses is not None, lens_of(frame))
+        return cls(camera_key(recording), frame.hw, map_hw, recording.poses is not None, get_distortion(frame))
 
 
-def lens_of(frame: Frame) -> tuple[float, ...]:
+def get_distortion(frame: Frame) -> tuple[float, ...]:
     """Distortion of the picture, OpenCV's order; none is empty."""
     lens = frame.camera.distortion
     return () if lens is None else tuple(lens[0].tolist())
@@ -91,7 +91,7 @@ def camera_feature(name: str) -> str:
     return "observation.images." + name.removeprefix("observation/").removeprefix("images/").replace("/", "_")
 
 
-def columns(pictures: bool) -> dict[str, Column]:
+def map_columns(pictures: bool) -> dict[str, Column]:
     """What is kept of a frame until its episode is whole."""
     f, whole = "float64", "int64"
     place = {
@@ -100,70 +100,74 @@ def columns(pictures: bool) -> dict[str, Column]:
         "timestamp": Column(f, (), "s", "NaN = none"),
         "recording": Column("str", (), "1", "name of the recording"),
     }
-    assert tuple(place) == PLACE
+    assert tuple(place) == KEY_COLUMNS
     return {
         **place,
-        **{name: Column("bytes", (), "file", about) for name, about in MAPS.items()},
+        **{name: Column("bytes", (), "file", about) for name, about in _MAP_FILES.items()},
         **({"picture": Column("bytes", (), "file", "the picture as PNG")} if pictures else {}),
         "K": Column(f, (9,), "px", "of the picture"),
         "pose": Column(f, (16,), "1, m", "T_world_from_cam by rows; NaN = none"),
         "pixels": Column(whole, (_N_SOURCES,), "1", "by source"),
-        "silent": Column(whole, (len(SILENCE),), "1", "silent ones by SILENCE"),
+        "silent": Column(whole, (len(NO_ANSWER_REASONS),), "1", "silent ones by SILENCE"),
         "refuted": Column(whole, (), "code", "0 = no pose is, else 1 + which of CONVENTIONS it looks like"),
-        "moments": Column(f, _MOMENTS, "m, 1", "of depth, sigma, red, green, blue"),
+        "moments": Column(f, _MOMENTS_SHAPE, "m, 1", "of depth, sigma, red, green, blue"),
         "problem": Column("uint8", (), "code", "what was wrong with the frame"),
     }
 
 
-class MapRows(Rows):
-    """Position in the plan → the maps of that frame; see :class:`dhtorch.extract.dataset.Rows`.
+class MapRowDataset(RowDataset):
+    """Position in the plan → the maps of that frame; see :class:`dhtorch.extract.dataset.RowDataset`.
 
     Args:
         step: m, of which depths are whole numbers, and sigma of an eighth; 0 = as found. A power of two: float32 holds
             every step of it and packs well.
         views: LeRobot feature of a camera → what it must be like.
-        more: of :class:`Rows`.
+        more: of :class:`RowDataset`.
     """
 
-    def __init__(self, *args: Any, step: float, views: Mapping[str, View], **more: Any) -> None:
+    def __init__(self, *args: Any, step: float, views: Mapping[str, DatasetCamera], **more: Any) -> None:
         super().__init__(*args, **more)
         self.step, self.views = step, dict(views)
 
-    def features(self, opened: Opened, i: int) -> Row:
+    def features(self, opened: OpenRecording, i: int) -> Row:
         """What is kept of frame ``i``."""
         recording = opened.recording
         anchor = opened.frame(i)
         view = self.views[camera_key(recording)]
         if anchor.hw != view.hw:
-            raise SampleError(f"picture of {_size(anchor.hw)}, expected {_size(view.hw)} as of the first frame")
-        if lens_of(anchor) != view.lens:
+            raise SampleError(
+                f"picture of {_format_hw(anchor.hw)}, expected {_format_hw(view.hw)} as of the first frame"
+            )
+        if get_distortion(anchor) != view.lens:
             expected = list(view.lens) or "none"
-            raise SampleError(f"lens {list(lens_of(anchor)) or 'none'}, expected {expected} as of the first frame")
+            raise SampleError(
+                f"lens {list(get_distortion(anchor)) or 'none'}, expected {expected} as of the first frame"
+            )
         others = opened.others(i)
         added = opened.answer(anchor, others)
-        depth, sigma, source, gate = _maps(added, view)
-        why = gate if any(other is not None for other in others) else np.full_like(gate, NO_VIEW)
-        depth = _stepped(depth, self.step)
-        sigma = _stepped(sigma, self.step / SIGMA_STEPS)
-        image = pixels(anchor)
+        depth, sigma, source, gate = _extract_maps(added, view)
+        why = gate if any(other is not None for other in others) else np.full_like(gate, NO_OTHER_VIEW)
+        depth = _quantise(depth, self.step)
+        sigma = _quantise(sigma, self.step / MAP_SIGMA_STEPS)
+        image = to_rgb_uint8(anchor)
         poses = recording.poses
         pose = np.full(16, np.nan) if poses is None else se3.to_matrix(poses[i : i + 1])[0].double().flatten().numpy()
         found = {
-            "depth": float_tiff(depth, deflate=True),
-            "sigma": float_tiff(sigma, deflate=True),
-            "source": png(source),
+            "depth": encode_float_tiff(depth, deflate=True),
+            "sigma": encode_float_tiff(sigma, deflate=True),
+            "source": encode_png(source),
             "K": cam.to_matrix(anchor.camera)[0].double().flatten().numpy(),
             "pose": pose,
             "pixels": np.bincount(source.ravel(), minlength=_N_SOURCES),
-            "silent": np.bincount(why[source == Source.NONE], minlength=len(SILENCE)),
-            "refuted": _refuted(added),
-            "moments": _moments(depth, sigma, image),
+            "silent": np.bincount(why[source == Source.NONE], minlength=len(NO_ANSWER_REASONS)),
+            "refuted": _refuted_code(added),
+            "moments": _compute_moments(depth, sigma, image),
             "problem": added["problem"].numpy(),
         }
-        return found if "picture" not in self.wanted else {**found, "picture": png(image)}
+        return found if "picture" not in self.wanted else {**found, "picture": encode_png(image)}
 
 
-def pixels(frame: Frame) -> np.ndarray:
+def to_rgb_uint8(frame: Frame) -> np.ndarray:
     """The picture (h, w, 3) uint8; grey in all three."""
     image = frame.image[0].cpu()
     if image.is_floating_point():
@@ -171,13 +175,13 @@ def pixels(frame: Frame) -> np.ndarray:
     return image.expand(3, -1, -1).permute(1, 2, 0).contiguous().numpy()
 
 
-def blank(view: View) -> dict[str, bytes]:
+def blank_maps(view: DatasetCamera) -> dict[str, bytes]:
     """The maps of a frame that could not be read: no depth anywhere."""
-    nothing = float_tiff(np.zeros(view.map_hw, np.float32), deflate=True)
-    return {"depth": nothing, "sigma": nothing, "source": png(np.zeros(view.map_hw, np.uint8))}
+    nothing = encode_float_tiff(np.zeros(view.map_hw, np.float32), deflate=True)
+    return {"depth": nothing, "sigma": nothing, "source": encode_png(np.zeros(view.map_hw, np.uint8))}
 
 
-def _maps(added: Mapping[str, Tensor], view: View) -> tuple[np.ndarray, ...]:
+def _extract_maps(added: Mapping[str, Tensor], view: DatasetCamera) -> tuple[np.ndarray, ...]:
     """Depth, sigma, source and gate (h, w); of samples alone where they stand, elsewhere silence without a reason."""
     if "depth_map" in added:
         depth, sigma, source, gate = (added[f"{k}_map"].numpy() for k in ("depth", "sigma", "source", "gate"))
@@ -194,7 +198,7 @@ def _maps(added: Mapping[str, Tensor], view: View) -> tuple[np.ndarray, ...]:
     return tuple(found)
 
 
-def _refuted(added: Mapping[str, Tensor]) -> np.ndarray:
+def _refuted_code(added: Mapping[str, Tensor]) -> np.ndarray:
     """Whether the near returns refute a pose that was given, and what it looks like, as the column has it."""
     looks = int(added.get("pose_looks", torch.zeros(())))
     refuted = (
@@ -203,19 +207,19 @@ def _refuted(added: Mapping[str, Tensor]) -> np.ndarray:
     return np.asarray(1 + looks if refuted else 0)
 
 
-def _stepped(x: np.ndarray, step: float) -> np.ndarray:
+def _quantise(x: np.ndarray, step: float) -> np.ndarray:
     """At the nearest step, one at least where there is anything."""
     if not step:
         return x.astype(np.float32)
     return np.where(x > 0, np.rint(x.astype(np.float64) / step).clip(1) * step, 0).astype(np.float32)
 
 
-def _moments(depth: np.ndarray, sigma: np.ndarray, image: np.ndarray) -> np.ndarray:
+def _compute_moments(depth: np.ndarray, sigma: np.ndarray, image: np.ndarray) -> np.ndarray:
     known = depth.reshape(-1, 1) > 0
-    each = [Moments.of(x.reshape(-1, 1), known) for x in (depth, sigma)]
-    each.append(Moments.of(image.reshape(-1, 3) / 255))
+    each = [FeatureMoments.of(x.reshape(-1, 1), known) for x in (depth, sigma)]
+    each.append(FeatureMoments.of(image.reshape(-1, 3) / 255))
     return np.concatenate([np.stack(moments) for moments in each], 1)
 
 
-def _size(hw: Sequence[int]) -> str:
+def _format_hw(hw: Sequence[int]) -> str:
     return f"{hw[0]}x{hw[1]}"

@@ -12,18 +12,18 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from dhtorch.data.codecs.parquet import parquet_header, read_columns
+from dhtorch.data.codecs.parquet import read_columns, read_parquet_header
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import last_change
-from dhtorch.extract.columns import PLACE
-from dhtorch.extract.shards import described, shard_files
-from dhtorch.transforms.sample_access import find
+from dhtorch.data.io.safe_open import modification_time_ns
+from dhtorch.extract.columns import KEY_COLUMNS
+from dhtorch.extract.shards import read_shard_metadata, shard_files
+from dhtorch.transforms.sample_access import get_value
 
 #: Row groups that a process keeps in memory.
-_HELD = 4
+_MAX_CACHED_GROUPS = 4
 
 
-class Features(Sequence[dict[str, Tensor]]):
+class FeatureTable(Sequence[dict[str, Tensor]]):
     """The rows of an extraction, sorted by episode and frame; read when asked for.
 
     A row is a dict with the keys and shapes that :class:`dhtorch.transforms.ExtendDepth` adds to a sample, so a model
@@ -47,17 +47,17 @@ class Features(Sequence[dict[str, Tensor]]):
         self.files = shard_files(Path(folder))
         if not self.files:
             raise FormatError(folder, "shards", "none", "a folder that dhtorch extract wrote")
-        self.about, own = described(self.files[0])
+        self.about, own = read_shard_metadata(self.files[0])
         if len(self.files) != own["of"]:
             expected = f"{own['of']}: the same dhtorch extract once more makes those that are missing"
             raise FormatError(folder, "shards", len(self.files), expected)
-        known = [name for name in self.about["columns"] if name not in PLACE]
+        known = [name for name in self.about["columns"] if name not in KEY_COLUMNS]
         for name in columns or ():
             if name not in known:
                 raise FormatError(folder, "columns", name, f"some of {', '.join(known)}")
         self.columns, self.prefix = tuple(known if columns is None else columns), prefix
-        places = [read_columns(file, PLACE[:3]) for file in self.files]
-        self.place = {name: np.concatenate([np.asarray(part[name]) for part in places]) for name in PLACE[:3]}
+        places = [read_columns(file, KEY_COLUMNS[:3]) for file in self.files]
+        self.place = {name: np.concatenate([np.asarray(part[name]) for part in places]) for name in KEY_COLUMNS[:3]}
         self._starts = np.cumsum([0, *(len(part["episode_index"]) for part in places)])
         pairs = zip(self.place["episode_index"].tolist(), self.place["frame_index"].tolist(), strict=True)
         self._row = {pair: i for i, pair in enumerate(pairs)}
@@ -95,7 +95,7 @@ class JoinedDataset(Dataset[Any]):
     def __init__(
         self,
         dataset: Any,
-        features: Features,
+        features: FeatureTable,
         *,
         episode_key: str = "episode_index",
         frame_key: str = "frame_index",
@@ -107,12 +107,12 @@ class JoinedDataset(Dataset[Any]):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         sample = self.dataset[index]
-        return {**sample, **self.features.at(*(int(find(sample, key)) for key in self.keys))}
+        return {**sample, **self.features.at(*(int(get_value(sample, key)) for key in self.keys))}
 
 
 def _row_of(file: Path, row: int, columns: tuple[str, ...]) -> tuple[int, dict[str, Any]]:
     """(place in its row group, the group) of a row."""
-    changed = last_change(file)
+    changed = modification_time_ns(file)
     starts = _starts(file, changed)
     group = int(np.searchsorted(starts, row, "right")) - 1
     return row - starts[group], _group(file, changed, (starts[group], starts[group + 1]), columns)
@@ -120,10 +120,10 @@ def _row_of(file: Path, row: int, columns: tuple[str, ...]) -> tuple[int, dict[s
 
 @lru_cache(maxsize=1024)
 def _starts(file: Path, _changed: int) -> tuple[int, ...]:
-    return parquet_header(file).groups
+    return read_parquet_header(file).groups
 
 
-@lru_cache(maxsize=_HELD)
+@lru_cache(maxsize=_MAX_CACHED_GROUPS)
 def _group(file: Path, _changed: int, rows: tuple[int, int], columns: tuple[str, ...]) -> dict[str, Any]:
     return read_columns(file, columns, rows)
 

@@ -5,21 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from dhtorch.data.io.decode import need
+from dhtorch.data.io.decode import import_optional
 from dhtorch.extract.columns import Row
-from dhtorch.extract.origin import GROUP_ROWS
+from dhtorch.extract.origin import TABLE_GROUP_ROWS
 
 
-def rows_of(parts: Sequence[Path]) -> Iterator[Row]:
+def iter_rows(parts: Sequence[Path]) -> Iterator[Row]:
     """The rows of some shards in their order, held one group at a time."""
-    parquet = need("pyarrow.parquet", extra="scale")
+    parquet = import_optional("pyarrow.parquet", extra="scale")
     for path in parts:
         with parquet.ParquetFile(path) as file:
             for batch in file.iter_batches(batch_size=8):
                 yield from batch.to_pylist()
 
 
-class Ahead:
+class PeekableRows:
     """Rows of which the first is looked at before it is taken."""
 
     def __init__(self, rows: Iterator[Row]) -> None:
@@ -39,7 +39,7 @@ class Ahead:
         self.row = next(self.rows, None)
 
 
-def together(made: Mapping[str, Ahead]) -> Iterator[dict[str, Row]]:
+def iter_instants(made: Mapping[str, PeekableRows]) -> Iterator[dict[str, Row]]:
     """The rows of one instant of all cameras; those without their instant are passed over."""
     while all(rows.row is not None for rows in made.values()):
         latest = max(rows.row["frame_index"] for rows in made.values() if rows.row is not None)
@@ -50,12 +50,12 @@ def together(made: Mapping[str, Ahead]) -> Iterator[dict[str, Row]]:
             yield {key: row for key, rows in made.items() if (row := rows.take(latest)) is not None}
 
 
-def groups(rows: Iterable[dict[str, Row]]) -> Iterator[list[dict[str, Row]]]:
+def iter_groups(rows: Iterable[dict[str, Row]]) -> Iterator[list[dict[str, Row]]]:
     """So many that are held together."""
     group: list[dict[str, Row]] = []
     for row in rows:
         group.append(row)
-        if len(group) == GROUP_ROWS:
+        if len(group) == TABLE_GROUP_ROWS:
             yield group
             group = []
     if group:

@@ -8,24 +8,26 @@ from pathlib import Path
 import numpy as np
 
 from dhtorch.data.codecs.tiff import decode_tiff
-from dhtorch.export import nerfstudio, png
-from dhtorch.extract.enriched import View
-from dhtorch.extract.instants import rows_of
-from dhtorch.extract.targets import Row, Tally
+from dhtorch.export import encode_png, nerfstudio
+from dhtorch.extract.enriched import DatasetCamera
+from dhtorch.extract.instants import iter_rows
+from dhtorch.extract.targets import MapCounts, Row
 from dhtorch.runtime import storage
 
 
-class NerfTarget:
+class NerfstudioTarget:
     """A nerfstudio folder for each recording.
 
     Args:
         root: of the folders; the folder itself where there is one recording.
-        views: cameras, see :class:`dhtorch.extract.enriched.View`.
+        views: cameras, see :class:`dhtorch.extract.enriched.DatasetCamera`.
         folders: of the recordings, by episode and then by camera.
         key: of the settings and data.
     """
 
-    def __init__(self, root: Path, views: Mapping[str, View], folders: Sequence[Mapping[str, str]], key: str) -> None:
+    def __init__(
+        self, root: Path, views: Mapping[str, DatasetCamera], folders: Sequence[Mapping[str, str]], key: str
+    ) -> None:
         self.root, self.views, self.folders, self.key = root, views, folders, key
 
     def _file(self, k: int, camera: str) -> Path:
@@ -34,7 +36,10 @@ class NerfTarget:
     def own(self, k: int) -> Row | None:
         """As :meth:`Target.own`."""
         try:
-            found = [storage.loads(self._file(k, key).read_text(encoding="utf-8"))["dhtorch"] for key in self.views]
+            found = [
+                storage.parse_strict_json(self._file(k, key).read_text(encoding="utf-8"))["dhtorch"]
+                for key in self.views
+            ]
         except (OSError, ValueError, KeyError):
             return None
         if any(each["key"] != self.key for each in found):
@@ -44,17 +49,17 @@ class NerfTarget:
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
         """As :meth:`Target.assemble`."""
         for key, view in self.views.items():
-            tally, shots = Tally(), []
+            tally, shots = MapCounts(), []
             folder = self._file(k, key).parent
-            for row in rows_of(parts[key]):
+            for row in iter_rows(parts[key]):
                 tally.add(row)
                 if row["depth"] and np.isfinite(row["pose"]).all():
                     shots.append(_write_shot(folder, row, view))
             if not shots:
                 raise ValueError(f"{folder.name}: found no frame with a pose, expected poses (format=nerfstudio)")
             cameras = {view.name: tally.summary()}
-            own = storage.strict({"key": self.key, "number": k, "length": len(shots), "cameras": cameras})
-            storage.write_json(self._file(k, key), nerfstudio.transforms(shots, dhtorch=own))
+            own = storage.to_strict_json({"key": self.key, "number": k, "length": len(shots), "cameras": cameras})
+            storage.write_json(self._file(k, key), nerfstudio.make_transforms(shots, dhtorch=own))
         found = self.own(k)
         assert found is not None  # just written
         return found
@@ -63,13 +68,13 @@ class NerfTarget:
         """As :meth:`Target.finish`: nothing is shared."""
 
 
-def _write_shot(folder: Path, row: Row, view: View) -> Row:
+def _write_shot(folder: Path, row: Row, view: DatasetCamera) -> Row:
     stem = f"frame_{row['frame_index']:06d}"
     depth, sigma = (decode_tiff(row[kind], folder / stem, view.map_hw) for kind in ("depth", "sigma"))
-    steps = nerfstudio.depth_steps(depth)
-    sure = nerfstudio.confidence(np.where(steps > 0, depth, 0), sigma)
-    pictures = {"images": row["picture"], "depth": png(steps), "confidence": png(sure)}
+    steps = nerfstudio.quantise_nerfstudio_depth(depth)
+    sure = nerfstudio.encode_confidence(np.where(steps > 0, depth, 0), sigma)
+    pictures = {"images": row["picture"], "depth": encode_png(steps), "confidence": encode_png(sure)}
     for name, content in pictures.items():
         storage.replace_file(folder / name / f"{stem}.png", content)
     K, pose = np.reshape(row["K"], (3, 3)), np.reshape(row["pose"], (4, 4))
-    return nerfstudio.shot(stem, view.hw, K, pose, view.lens)
+    return nerfstudio.make_nerfstudio_frame(stem, view.hw, K, pose, view.lens)

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
 
-from dhtorch.data.pairs import between, by_choice
+from dhtorch.data.pairs import by_choice, spaced_frames
 from dhtorch.data.scene import Scene
 
 
 @dataclass(frozen=True)
-class Shard:
+class ShardSpec:
     """Some rows in a row, and the file that holds them."""
 
     number: int
@@ -28,7 +28,7 @@ class Shard:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ExtractionPlan:
     """Every frame of a data set, by episode and then by frame."""
 
     order: tuple[int, ...]  # place of each recording in the data set
@@ -54,25 +54,25 @@ class Plan:
         """The positions of each recording, in order."""
         return [range(a, b) for a, b in pairwise((0, *self.ends))]
 
-    def shards(self, rows: int, *, apart: bool = False) -> list[Shard]:
+    def shards(self, rows: int, *, apart: bool = False) -> list[ShardSpec]:
         """The whole in pieces of so many rows; the last may be shorter. ``apart``: none has rows of two recordings."""
         spans = self.spans if apart else [range(len(self))]
         pieces = [span[i : i + rows] for span in spans for i in range(0, len(span), rows)]
-        return [Shard(k, len(pieces), piece) for k, piece in enumerate(pieces)]
+        return [ShardSpec(k, len(pieces), piece) for k, piece in enumerate(pieces)]
 
 
 #: The ``gap`` with which the method chooses among past frames.
-CHOICE = "auto"
+AUTO_GAP = "auto"
 
 
-def offers(scene: Scene, past: bool = True) -> dict[int, tuple[int, ...]]:
+def candidates_by_frame(scene: Scene, past: bool = True) -> dict[int, tuple[int, ...]]:
     """Frame → the frames (``past``: before it) among which the method chooses; the first has none before it."""
     if len(scene.recording) < 2:
         return {}
     return {pair.anchor: pair.offered for pair in by_choice(scene, stride=1, past=past)}
 
 
-def steps_back(scene: Scene, gap: int | None, views: int) -> list[int]:
+def view_offsets(scene: Scene, gap: int | None, views: int) -> list[int]:
     """How many frames before a frame its other views are, the farthest last; none with gap 0.
 
     Raises:
@@ -83,15 +83,15 @@ def steps_back(scene: Scene, gap: int | None, views: int) -> list[int]:
         raise ValueError(
             f"extract.gap: {scene.name} knows no gap of its own, expected a number of frames; 0 = front end alone"
         )
-    return between(0, gap, views) if gap else []
+    return spaced_frames(0, gap, views) if gap else []
 
 
-def make(scenes: Sequence[Scene], gap: int | str | None, views: int, *, rigs: bool = False) -> Plan:
+def make_plan(scenes: Sequence[Scene], gap: int | str | None, views: int, *, rigs: bool = False) -> ExtractionPlan:
     """The plan of a data set; opens each recording once, for its length.
 
     Args:
         scenes: of the data set.
-        gap, views: see :func:`steps_back`; a gap of :data:`CHOICE` is right for all.
+        gap, views: see :func:`view_offsets`; a gap of :data:`AUTO_GAP` is right for all.
         rigs: an episode may have several cameras, whose recordings follow one another by the order of ``scenes``.
 
     Raises:
@@ -105,7 +105,7 @@ def make(scenes: Sequence[Scene], gap: int | str | None, views: int, *, rigs: bo
     for k, scene in enumerate(scenes):
         recording = scene.recording
         if not isinstance(gap, str):
-            steps_back(scene, gap, views)
+            view_offsets(scene, gap, views)
         number = recording.episode
         if number is None and rigs and recording.camera_name is not None:  # several cameras, no episodes
             number = together.setdefault(recording.name.rpartition("/")[0], k)
@@ -119,4 +119,4 @@ def make(scenes: Sequence[Scene], gap: int | str | None, views: int, *, rigs: bo
             roots[recording.root] = None
     places = sorted(found)
     order, _, lengths = zip(*(found[place] for place in places), strict=True)
-    return Plan(order, tuple(number for number, _ in places), tuple(accumulate(lengths)), tuple(roots))
+    return ExtractionPlan(order, tuple(number for number, _ in places), tuple(accumulate(lengths)), tuple(roots))

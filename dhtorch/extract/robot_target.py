@@ -10,22 +10,22 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import Source, names
-from dhtorch.data.io.decode import need
+from dhtorch.data.io.decode import import_optional
 from dhtorch.export import lerobot
-from dhtorch.export.lerobot import Feature, Moments
-from dhtorch.extract.enriched import SIGMA_STEPS, View, blank
-from dhtorch.extract.instants import Ahead, groups, rows_of, together
-from dhtorch.extract.origin import Origin, RobotSet
-from dhtorch.extract.targets import Row, Tally
+from dhtorch.export.lerobot import FeatureMoments, FeatureSpec
+from dhtorch.extract.enriched import MAP_SIGMA_STEPS, DatasetCamera, blank_maps
+from dhtorch.extract.instants import PeekableRows, iter_groups, iter_instants, iter_rows
+from dhtorch.extract.origin import DatasetSource, LeRobotSource
+from dhtorch.extract.targets import MapCounts, Row
 from dhtorch.runtime import storage
 
 #: Metadata of an episode: what its rows amount to.
-OWN = b"dhtorch.episode"
+_EPISODE_METADATA_KEY = b"dhtorch.episode"
 
-_TASK = "look around"
+_DEFAULT_TASK = "look around"
 
 
-class RobotTarget:
+class LeRobotTarget:
     """LeRobot tables.
 
     Args:
@@ -49,9 +49,9 @@ class RobotTarget:
         self,
         root: Path,
         version: int,
-        views: Mapping[str, View],
+        views: Mapping[str, DatasetCamera],
         *,
-        origin: Origin | None,
+        origin: DatasetSource | None,
         numbers: Sequence[int],
         step: float,
         fps: float,
@@ -61,20 +61,20 @@ class RobotTarget:
     ) -> None:
         self.root, self.version, self.views = root, version, views
         self.origin, self.numbers, self.step, self.fps = origin, numbers, step, fps
-        self.tasks = origin.tasks if origin is not None else (task or _TASK,)
+        self.tasks = origin.tasks if origin is not None else (task or _DEFAULT_TASK,)
         self.key, self.cut = key, cut
-        self.given: dict[str, Feature] = {} if origin is None else origin.features
+        self.given: dict[str, FeatureSpec] = {} if origin is None else origin.features
         self.keys = {view.key: self._keys(view) for view in views.values()}
         self.renumbered = cut or list(numbers) != list(range(len(numbers)))
         for name in (*self.given, *views):
             if not name or any(mark in name for mark in ("/", "\\", "..", "\0")):
                 raise ValueError(f"data: found a feature called {name!r}, expected a name without / and ..")
-        if version == 2 and isinstance(origin, RobotSet) and origin.version == 3:
+        if version == 2 and isinstance(origin, LeRobotSource) and origin.version == 3:
             _refuse_shared_videos(origin)
 
     # -------------------------------------------------------------------------------------------------- the columns
 
-    def _keys(self, view: View) -> dict[str, str]:
+    def _keys(self, view: DatasetCamera) -> dict[str, str]:
         """What is added for a camera: kind → column."""
         depth = f"{view.key}_depth"
         depth = f"{depth}_enriched" if depth in self.given else depth
@@ -89,65 +89,65 @@ class RobotTarget:
                 raise ValueError(f"data: found a column {key} in the source, expected a set that is not enriched yet")
         return found
 
-    def added(self) -> dict[str, Feature]:
+    def added(self) -> dict[str, FeatureSpec]:
         """The features beside those of the source."""
-        found: dict[str, Feature] = {}
+        found: dict[str, FeatureSpec] = {}
         for key, view in self.views.items():
             codes = {str(code): name.lower() for code, name in names(Source).items()}
-            of: dict[str, Feature] = {
-                "depth": lerobot.depth_map(view.map_hw, self.step),
-                "sigma": lerobot.depth_map(view.map_hw, self.step / SIGMA_STEPS),
-                "source": lerobot.picture(view.map_hw, 1, codes=codes),
-                "K": lerobot.numbers("float64", 9),
-                "pose": lerobot.numbers("float64", 16),
+            of: dict[str, FeatureSpec] = {
+                "depth": lerobot.depth_feature(view.map_hw, self.step),
+                "sigma": lerobot.depth_feature(view.map_hw, self.step / MAP_SIGMA_STEPS),
+                "source": lerobot.image_feature(view.map_hw, 1, codes=codes),
+                "K": lerobot.number_feature("float64", 9),
+                "pose": lerobot.number_feature("float64", 16),
             }
             if self.origin is None:
-                found[key] = lerobot.picture(view.hw)
+                found[key] = lerobot.image_feature(view.hw)
             found |= {column: of[kind] for kind, column in self.keys[key].items()}
         return found
 
-    def features(self, columns: Iterable[str]) -> dict[str, Feature]:
+    def features(self, columns: Iterable[str]) -> dict[str, FeatureSpec]:
         """Of all columns of the tables, and the videos."""
         found = dict(self.given)
         for name in columns:
             if name not in found and name not in self.added():
                 whole = name.removeprefix("source.") != "timestamp" and name != "observation.time"
-                found[name] = lerobot.numbers("int64" if whole else "float64")
+                found[name] = lerobot.number_feature("int64" if whole else "float64")
         if "timestamp" not in self.given:
-            found["timestamp"] = lerobot.numbers("float32")
+            found["timestamp"] = lerobot.number_feature("float32")
         return found | self.added()
 
     # ------------------------------------------------------------------------------------------------- one episode
 
     def file(self, k: int) -> Path:
         """The table of the ``k``-th episode."""
-        return self.root / lerobot.data_file(self.version, k)
+        return self.root / lerobot.episode_table_path(self.version, k)
 
     def own(self, k: int) -> Row | None:
         """As :meth:`Target.own`."""
-        parquet = need("pyarrow.parquet", extra="scale")
+        parquet = import_optional("pyarrow.parquet", extra="scale")
         try:
             metadata = parquet.read_metadata(self.file(k)).metadata or {}
-            found: Row = storage.loads(metadata[OWN].decode())
+            found: Row = storage.parse_strict_json(metadata[_EPISODE_METADATA_KEY].decode())
         except (OSError, ValueError, KeyError):
             return None
         return found if found["key"] == self.key else None
 
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
         """As :meth:`Target.assemble`."""
-        parquet = need("pyarrow.parquet", extra="scale")
+        parquet = import_optional("pyarrow.parquet", extra="scale")
         start = sum(each["length"] for each in before)
-        tallies = {key: Tally() for key in self.views}
-        moments: dict[str, Moments] = {}
+        tallies = {key: MapCounts() for key in self.views}
+        moments: dict[str, FeatureMoments] = {}
         seen: dict[int, None] = {}
         tasks = self._tasks(before)
         clean = self.file(k)
         clean.parent.mkdir(parents=True, exist_ok=True)
         length, writer = 0, None
-        with storage.whole(clean, clean.with_name(f".{clean.name}.tmp")) as sink, ExitStack() as closing:
+        with storage.write_atomically(clean, clean.with_name(f".{clean.name}.tmp")) as sink, ExitStack() as closing:
             for table in self._joined(k, start, parts, tallies, tasks):
                 if writer is None:
-                    layout = lerobot.schema(self.features(table.column_names), _types(table), {})
+                    layout = lerobot.make_arrow_schema(self.features(table.column_names), _column_types(table), {})
                     writer = closing.enter_context(parquet.ParquetWriter(sink, layout, compression="zstd"))
                 writer.write_table(table.select(layout.names).cast(layout))
                 length += table.num_rows
@@ -157,7 +157,7 @@ class RobotTarget:
                 raise ValueError(f"episode {self.numbers[k]}: found no frame that can be read, expected one")
             said = [tasks[i] for i in seen if i is not None and 0 <= i < len(tasks)]
             own = self._summary(k, start, length, said, moments, tallies)
-            writer.add_key_value_metadata({OWN: storage.dumps(own)})
+            writer.add_key_value_metadata({_EPISODE_METADATA_KEY: storage.dump_strict_json(own)})
             self._copy_videos(k, length)
         return own
 
@@ -172,11 +172,11 @@ class RobotTarget:
         k: int,
         start: int,
         parts: Mapping[str, Sequence[Path]],
-        tallies: Mapping[str, Tally],
+        tallies: Mapping[str, MapCounts],
         tasks: list[str],
     ) -> Iterator[Any]:
         """The rows of an episode with what is added, as Arrow tables of few rows."""
-        made = {key: Ahead(rows_of(files)) for key, files in parts.items()}
+        made = {key: PeekableRows(iter_rows(files)) for key, files in parts.items()}
         if self.origin is None:
             yield from self._plain(k, start, made, tallies)
             return
@@ -193,11 +193,13 @@ class RobotTarget:
             yield self._renumbered(table, k, start + done)
             done += n
 
-    def _plain(self, k: int, start: int, made: Mapping[str, Ahead], tallies: Mapping[str, Tally]) -> Iterator[Any]:
+    def _plain(
+        self, k: int, start: int, made: Mapping[str, PeekableRows], tallies: Mapping[str, MapCounts]
+    ) -> Iterator[Any]:
         """The rows of recordings, without instants of which a frame could not be read."""
-        pyarrow = need("pyarrow", extra="scale")
+        pyarrow = import_optional("pyarrow", extra="scale")
         done = 0
-        for group in groups(together(made)):
+        for group in iter_groups(iter_instants(made)):
             for shots in group:
                 for key, row in shots.items():
                     tallies[key].add(row)
@@ -230,8 +232,8 @@ class RobotTarget:
 
     def _cells(self, key: str, found: Sequence[Row | None], done: int) -> dict[str, Any]:
         """Column → cells of some rows of a camera; None = a frame that could not be read."""
-        pyarrow = need("pyarrow", extra="scale")
-        nothing, cells = blank(self.views[key]), {}
+        pyarrow = import_optional("pyarrow", extra="scale")
+        nothing, cells = blank_maps(self.views[key]), {}
         values: list[Any]
         for kind, column in self.keys[key].items():
             if kind in nothing:
@@ -246,7 +248,7 @@ class RobotTarget:
 
     def _renumbered(self, table: Any, k: int, start: int) -> Any:
         """Episodes from 0 and rows one after another, as loaders count."""
-        pyarrow = need("pyarrow", extra="scale")
+        pyarrow = import_optional("pyarrow", extra="scale")
         n = table.num_rows
         news = {"episode_index": np.full(n, k), "index": start + np.arange(n)}
         for name, values in news.items():
@@ -266,15 +268,15 @@ class RobotTarget:
         start: int,
         length: int,
         tasks: Sequence[str],
-        moments: dict[str, Moments],
-        tallies: Mapping[str, Tally],
+        moments: dict[str, FeatureMoments],
+        tallies: Mapping[str, MapCounts],
     ) -> Row:
         for key, tally in tallies.items():
             maps = tally.of_maps()
             if maps is not None:
                 moments |= {self.keys[key]["depth"]: maps[0], self.keys[key]["sigma"]: maps[1], key: maps[2]}
         said = None if self.origin is None else self.origin.words(k)
-        found: Row = storage.strict(
+        found: Row = storage.to_strict_json(
             {
                 "key": self.key,
                 "number": self.numbers[k],
@@ -290,22 +292,22 @@ class RobotTarget:
     def _copy_videos(self, k: int, length: int) -> None:
         """Byte for byte."""
         for key, (file, clip) in self._clips(k, length).items():
-            storage.copy_file(file, self.root / lerobot.video_file(self.version, key, clip, k))
+            storage.copy_file(file, self.root / lerobot.episode_video_path(self.version, key, clip, k))
 
-    def _clips(self, k: int, length: int) -> dict[str, tuple[Path, lerobot.Clip]]:
+    def _clips(self, k: int, length: int) -> dict[str, tuple[Path, lerobot.VideoSegment]]:
         if self.origin is None:
             return {}
         found = self.origin.clips(k, length)
         if self.origin.version == 3:
             return found
-        chunk, file = divmod(k, lerobot.CHUNK)
+        chunk, file = divmod(k, lerobot.FILES_PER_CHUNK)
         return {key: (path, clip._replace(chunk=chunk, file=file)) for key, (path, clip) in found.items()}
 
     # ---------------------------------------------------------------------------------------------------- the whole
 
     def finish(self, owns: Sequence[Row]) -> None:
         """As :meth:`Target.finish`."""
-        parquet = need("pyarrow.parquet", extra="scale")
+        parquet = import_optional("pyarrow.parquet", extra="scale")
         features = self.features(parquet.read_schema(self.file(0)).names)
         self._write_lenses()
         self._write_about(owns)
@@ -313,7 +315,7 @@ class RobotTarget:
         for name, file in ({} if self.origin is None else self.origin.more).items():
             storage.copy_file(file, self.root / name)
         episodes = [
-            lerobot.Episode(
+            lerobot.EpisodeSpec(
                 number=k,
                 length=own["length"],
                 start=own["start"],
@@ -323,7 +325,7 @@ class RobotTarget:
             )
             for k, own in enumerate(owns)
         ]
-        about = lerobot.info(
+        about = lerobot.make_info(
             self.version,
             features,
             episodes,
@@ -332,9 +334,9 @@ class RobotTarget:
             robot="unknown" if self.origin is None else self.origin.robot,
         )
         about["splits"] = self._splits(owns) or about["splits"]  # beside the origin's, "train: all" would be wrong
-        lerobot.write_meta(self.root, self.version, about, episodes, tasks, self._stats(owns, features))
+        lerobot.write_lerobot_meta(self.root, self.version, about, episodes, tasks, self._stats(owns, features))
 
-    def _stats(self, owns: Sequence[Row], features: Mapping[str, Feature]) -> dict[str, Any]:
+    def _stats(self, owns: Sequence[Row], features: Mapping[str, FeatureSpec]) -> dict[str, Any]:
         """Of every column of numbers, and of the pictures and maps that were looked at.
 
         A LeRobot that reads v2.1 refuses a set unless whatever has "image" in its name has statistics of three
@@ -343,7 +345,7 @@ class RobotTarget:
         frames = sum(own["length"] for own in owns)
         found = {}
         for name, feature in features.items():
-            each = [Moments.parse(own["moments"][name]) for own in owns if name in own["moments"]]
+            each = [FeatureMoments.parse(own["moments"][name]) for own in owns if name in own["moments"]]
             if not each:
                 continue
             total = each[0]
@@ -376,7 +378,7 @@ class RobotTarget:
         """What an origin says of its episodes and the format has no place for."""
         if any(own["about"] for own in owns):
             rows = [{"episode_index": k, **own["about"]} for k, own in enumerate(owns)]
-            text = "".join(storage.dumps(row) + "\n" for row in rows)
+            text = "".join(storage.dump_strict_json(row) + "\n" for row in rows)
             storage.replace_file(self.root / "meta" / "source_episodes.jsonl", text.encode())
 
     def _write_lenses(self) -> None:
@@ -386,11 +388,11 @@ class RobotTarget:
             storage.write_json(self.root / "meta" / "intrinsics.json", lenses)
 
 
-def _types(table: Any) -> dict[str, Any]:
+def _column_types(table: Any) -> dict[str, Any]:
     return dict(zip(table.schema.names, table.schema.types, strict=True))
 
 
-def _add_moments(moments: dict[str, Moments], table: Any) -> None:
+def _add_moments(moments: dict[str, FeatureMoments], table: Any) -> None:
     """Of the columns of numbers."""
     for name in table.column_names:
         cells = table.column(name).to_pylist() if "struct" not in str(table.schema.field(name).type) else []
@@ -399,11 +401,11 @@ def _add_moments(moments: dict[str, Moments], table: Any) -> None:
         except (TypeError, ValueError):
             continue  # text, or rows of different length
         if values.size and values.shape[1] <= 4096:
-            here = Moments.of(values)
+            here = FeatureMoments.of(values)
             moments[name] = moments[name] + here if name in moments else here
 
 
-def _refuse_shared_videos(origin: RobotSet) -> None:
+def _refuse_shared_videos(origin: LeRobotSource) -> None:
     for key in (k for k, f in origin.features.items() if f["dtype"] == "video"):
         starts = origin.episodes.columns[f"videos/{key}/from_timestamp"]
         files = {origin.episodes[i].videos[key][0] for i in range(len(origin.episodes))}

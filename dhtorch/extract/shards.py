@@ -13,25 +13,25 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dhtorch.data.io.decode import FormatError, need
-from dhtorch.extract.columns import Column, Row, schema, table
-from dhtorch.extract.plan import Shard
-from dhtorch.runtime import results as archive
+from dhtorch.data.io.decode import FormatError, import_optional
+from dhtorch.extract.columns import Column, Row, arrow_schema, arrow_table
+from dhtorch.extract.plan import ShardSpec
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
 #: Key of the metadata that all shards share, and of those of one shard.
-SHARED, OWN = b"dhtorch", b"dhtorch.shard"
+_SHARED_METADATA_KEY, _SHARD_METADATA_KEY = b"dhtorch", b"dhtorch.shard"
 
 #: Rows that are held and decoded together: few, because a shuffled loader asks for one, and so many bytes of them at
 #: most, because maps are large.
-GROUP_ROWS, GROUP_BYTES = 16, 1 << 24
+_MAX_GROUP_ROWS, _MAX_GROUP_BYTES = 16, 1 << 24
 
 _PATTERN = "shard-*.parquet"
 _UNFINISHED = ".tmp"
 
 
-def write(
-    folder: Path, shard: Shard, rows: Iterable[Row], wanted: Mapping[str, Column], shared: Mapping[str, Any]
+def write_shard(
+    folder: Path, shard: ShardSpec, rows: Iterable[Row], wanted: Mapping[str, Column], shared: Mapping[str, Any]
 ) -> Counter[str]:
     """Write one shard, rows as they come; the file appears when it is whole.
 
@@ -45,27 +45,27 @@ def write(
     Returns:
         Number of rows by problem, and ``skipped``.
     """
-    parquet = need("pyarrow.parquet", extra="scale")
-    layout = schema(wanted, {SHARED.decode(): storage.dumps(shared)})
+    parquet = import_optional("pyarrow.parquet", extra="scale")
+    layout = arrow_schema(wanted, {_SHARED_METADATA_KEY.decode(): storage.dump_strict_json(shared)})
     problems = shared["codes"]["problem"]
     counts: Counter[str] = Counter()
     unfinished = folder / f".{shard.name}{_UNFINISHED}"
     with (
-        storage.whole(folder / shard.name, unfinished) as file,
+        storage.write_atomically(folder / shard.name, unfinished) as file,
         parquet.ParquetWriter(file, layout, compression="zstd") as writer,
     ):
-        for group in _groups(rows, group_rows(wanted)):
+        for group in _iter_groups(rows, _rows_per_group(wanted)):
             counts.update(problems[str(int(row["problem"]))].lower() for row in group)
-            writer.write_table(table(group, wanted, layout))
+            writer.write_table(arrow_table(group, wanted, layout))
         counts["skipped"] = len(shard.rows) - counts.total()
         own = {"number": shard.number, "of": shard.of, "counts": dict(sorted(counts.items()))}
-        writer.add_key_value_metadata({OWN: storage.dumps(own)})
+        writer.add_key_value_metadata({_SHARD_METADATA_KEY: storage.dump_strict_json(own)})
     return counts
 
 
-def group_rows(wanted: Mapping[str, Column]) -> int:
+def _rows_per_group(wanted: Mapping[str, Column]) -> int:
     """Rows of such columns that are held together, one at least."""
-    return max(1, min(GROUP_ROWS, GROUP_BYTES // sum(column.n_bytes for column in wanted.values())))
+    return max(1, min(_MAX_GROUP_ROWS, _MAX_GROUP_BYTES // sum(column.n_bytes for column in wanted.values())))
 
 
 def shard_files(folder: Path) -> list[Path]:
@@ -73,13 +73,13 @@ def shard_files(folder: Path) -> list[Path]:
     return sorted(folder.glob(_PATTERN))
 
 
-def clear(folder: Path) -> None:
+def remove_unfinished(folder: Path) -> None:
     """Remove what a writer left that was killed. Nobody may be writing there meanwhile."""
     for left in folder.glob(f".{_PATTERN}{_UNFINISHED}"):
         left.unlink(missing_ok=True)
 
 
-def finished(folder: Path, shared: Mapping[str, Any]) -> dict[str, Counter[str]]:
+def find_finished_shards(folder: Path, shared: Mapping[str, Any]) -> dict[str, Counter[str]]:
     """Shards in a folder that are whole: name → number of rows by problem.
 
     Raises:
@@ -88,31 +88,33 @@ def finished(folder: Path, shared: Mapping[str, Any]) -> dict[str, Counter[str]]
     found = {}
     for path in shard_files(folder):
         try:
-            other, own = described(path)
+            other, own = read_shard_metadata(path)
         except FormatError:
             continue  # torn: it is written again
         if other["key"] != shared["key"]:
-            found_there = f"a shard of another extraction ({archive.difference(other, shared)})"
+            found_there = f"a shard of another extraction ({result_files.describe_difference(other, shared)})"
             raise FileExistsError(f"{path}: found {found_there}, expected one of this, or another folder for out")
         found[path.name] = Counter(own["counts"])
     return found
 
 
-def described(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_shard_metadata(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """The metadata of a shard: what all share, and its own.
 
     Raises:
         FormatError: no shard of ours, or a torn one.
     """
-    parquet = need("pyarrow.parquet", extra="scale")
+    parquet = import_optional("pyarrow.parquet", extra="scale")
     try:
         metadata = parquet.read_metadata(path).metadata or {}
-        return storage.loads(metadata[SHARED].decode()), storage.loads(metadata[OWN].decode())
+        return storage.parse_strict_json(metadata[_SHARED_METADATA_KEY].decode()), storage.parse_strict_json(
+            metadata[_SHARD_METADATA_KEY].decode()
+        )
     except (OSError, ValueError, KeyError) as error:
         raise FormatError(path, "metadata", f"{type(error).__name__}: {error}", "a shard of dhtorch extract") from None
 
 
-def _groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:
+def _iter_groups(rows: Iterable[Row], size: int) -> Iterator[list[Row]]:
     rows = iter(rows)
     while group := list(islice(rows, size)):
         yield group

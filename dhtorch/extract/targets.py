@@ -13,19 +13,19 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dhtorch.export.lerobot import Moments
+from dhtorch.export.lerobot import FeatureMoments
 from dhtorch.geometry.pose_conventions import CONVENTIONS
 
 Row = dict[str, Any]
 
 #: Parts of an episode, along time, whose shares are noted.
-PARTS = 24
+_N_TIME_BINS = 24
 
 #: What refuted poses look like that fit in no reading of them.
-UNKNOWN = "unknown"
+UNKNOWN_CONVENTION = "unknown"
 
 
-class Target(Protocol):
+class DatasetTarget(Protocol):
     """How a format is written."""
 
     def own(self, k: int) -> Row | None:
@@ -38,13 +38,13 @@ class Target(Protocol):
         """Write what describes all episodes."""
 
 
-class Tally:
+class MapCounts:
     """Counts over the frames of one camera in one episode."""
 
     def __init__(self) -> None:
         self.pixels: list[np.ndarray] = []
         self.silent: list[np.ndarray] = []
-        self.moments: Moments | None = None
+        self.moments: FeatureMoments | None = None
         self.refuted: Counter[str] = Counter()
         self.unread = 0
 
@@ -56,8 +56,8 @@ class Tally:
         self.pixels.append(np.asarray(row["pixels"], np.int64))
         self.silent.append(np.asarray(row["silent"], np.int64))
         if row["refuted"]:
-            self.refuted[CONVENTIONS[row["refuted"] - 1] or UNKNOWN] += 1
-        moments = Moments(*np.asarray(row["moments"], np.float64).reshape(5, 5))
+            self.refuted[CONVENTIONS[row["refuted"] - 1] or UNKNOWN_CONVENTION] += 1
+        moments = FeatureMoments(*np.asarray(row["moments"], np.float64).reshape(5, 5))
         self.moments = moments if self.moments is None else self.moments + moments
 
     def summary(self) -> Row:
@@ -66,15 +66,15 @@ class Tally:
             nothing: Row = {key: [] for key in ("pixels", "silent", "over_time", "silent_over_time")}
             return {**nothing, "unread": self.unread, "frames": 0, "refuted": {}}
         pixels, silent = np.stack(self.pixels), np.stack(self.silent)
-        parts = np.array_split(np.arange(len(pixels)), min(PARTS, len(pixels)))
+        parts = np.array_split(np.arange(len(pixels)), min(_N_TIME_BINS, len(pixels)))
         along, why = ([x[at].sum(0) / max(1, pixels[at].sum()) for at in parts] for x in (pixels, silent))
         found = {"over_time": along, "silent_over_time": why, "unread": self.unread}
         found |= {"frames": len(pixels), "refuted": dict(sorted(self.refuted.items()))}
         return {"pixels": pixels.sum(0), "silent": silent.sum(0), **found}
 
-    def of_maps(self) -> tuple[Moments, Moments, Moments] | None:
+    def of_maps(self) -> tuple[FeatureMoments, FeatureMoments, FeatureMoments] | None:
         """Of depth, sigma and the picture; None where no frame could be read."""
         if self.moments is None:
             return None
-        cut = [Moments(*(x[span] for x in self.moments)) for span in (slice(0, 1), slice(1, 2), slice(2, 5))]
+        cut = [FeatureMoments(*(x[span] for x in self.moments)) for span in (slice(0, 1), slice(1, 2), slice(2, 5))]
         return cut[0], cut[1], cut[2]

@@ -27,40 +27,40 @@ from torch import Tensor
 
 from dhtorch.geometry import linalg as small
 from dhtorch.geometry.checks import check, is_static
-from dhtorch.geometry.determinism import CHUNK
-from dhtorch.geometry.inference_mode import spared
+from dhtorch.geometry.determinism import MAX_CHUNK_POINTS
+from dhtorch.geometry.inference_mode import run_without_grad
 from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
-from dhtorch.geometry.linalg import product_of_planes as product
-from dhtorch.geometry.lucas_kanade import for_some
-from dhtorch.geometry.patches import QUANTISATION, round_half_up
-from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, REACH, Pyramid
-from dhtorch.ops import loader as native
+from dhtorch.geometry.linalg import matmul_planes as product
+from dhtorch.geometry.lucas_kanade import masked_apply
+from dhtorch.geometry.patches import QUANTISATION_VARIANCE, round_half_up
+from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, SEARCH_PADDING_PX, Pyramid
+from dhtorch.ops import loader
 
 #: Of what would follow a step, at most so many times that step is taken at once; more overshoots under large warps.
-AHEAD = 0.5
+MAX_EXTRAPOLATION = 0.5
 
 #: Added to the normal equations' affine part: what 2 / 255 of noise would say of a corner that moves by 2 px. It only
 #: matters where the window determines no affine motion (a single edge).
-DAMPING = (2 / 255 / 2) ** 2
+AFFINE_DAMPING = (2 / 255 / 2) ** 2
 
 #: Ratios of contrast beyond these limits are not believed, nor windows that grow or shrink by more.
-GAIN, SCALE = (0.2, 5.0), (0.4, 2.5)
+REGISTRATION_GAIN_RANGE, REGISTRATION_SCALE_RANGE = (0.2, 5.0), (0.4, 2.5)
 
 #: From this magnification on image 1 is read from its half-size level, where a pixel of the window meets a pixel again.
-HALVE = 1.5
+HALVING_MAGNIFICATION = 1.5
 
 #: Variance of a pyramid's gradient in unit white noise.
 GRADIENT_NOISE = 2 * (3**2 + 10**2 + 3**2) / 32**2
 
 #: Share of the gradient's energy that is at most put down to noise.
-MOST_NOISE = 0.9
+MAX_NOISE_RATIO = 0.9
 
 #: A search that ends with this much more residual noise than it began with has diverged.
-WORSE = 1.2
+MAX_RESIDUAL_GROWTH = 1.2
 
 
-class Registration(NamedTuple):
-    """What :func:`register` finds for B × N points."""
+class AffineRegistration(NamedTuple):
+    """What :func:`register_affine` finds for B × N points."""
 
     uv_1: Tensor  # (B, N, 2) px, where uv_0 lies in image 1
     linear: Tensor  # (B, N, 2, 2) d uv_1 / d uv_0 of the window
@@ -71,7 +71,7 @@ class Registration(NamedTuple):
 
 
 class _Options(NamedTuple):
-    """How to search; see :func:`register`."""
+    """How to search; see :func:`register_affine`."""
 
     window: int
     steps: int
@@ -95,7 +95,7 @@ class _State(NamedTuple):
     inverse: Tensor  # (2, 8, M) rows of the inverse normal equations, for the motion of the point in the window
 
 
-def register(
+def register_affine(
     source: Pyramid,
     target: Pyramid,
     uv_0: Tensor,  # (B, N, 2) px
@@ -107,7 +107,7 @@ def register(
     iterations: int = 7,
     epsilon_px: float = 0.01,
     max_shift_px: float = 2.0,
-) -> Registration:
+) -> AffineRegistration:
     """Register the window around ``uv_0`` in the other image, up to an affine motion, a gain and a bias.
 
     A track is the place where a window fits best *unturned and unscaled*; under the perspective of a slanted surface
@@ -126,17 +126,17 @@ def register(
         max_shift_px: a search that ends further from its start is rejected.
 
     Returns:
-        :class:`Registration`. Rejected (not ok): without texture, not finite, too far, magnified or in contrast beyond
-        belief, outside the image, or a larger residual than at the start; the numbers are then those of the start.
-        ``cov`` is first-order and for white noise of equal variance in both images, which it estimates from the
+        :class:`AffineRegistration`. Rejected (not ok): without texture, not finite, too far, magnified or in contrast
+        beyond belief, outside the image, or a larger residual than at the start; the numbers are then those of the
+        start. ``cov`` is first-order and for white noise of equal variance in both images, which it estimates from the
         residual; reading between pixels smooths that noise and inflates A by the noise of T's gradient, and both are
         accounted for.
 
     Raises:
         ValueError: wrong shapes.
 
-    Gradient: none; take :func:`step` from the result.
-    Twin: ``register`` of ``tests/support/reference.py``, one point at a time.
+    Gradient: none; take :func:`registration_step` from the result.
+    Twin: ``register_affine`` of ``tests/support/reference.py``, one point at a time.
     Cost: reads a patch of image 1 once and 441 pixels of it per point and step.
     """
     B, N = (check("register", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), wanted=(wanted, "B N"))[k] for k in "BN")
@@ -149,17 +149,17 @@ def register(
         if linear is not None:
             begin = linear.to(there).permute(2, 1, 0).repeat_interleave(N, -1)
         register = partial(_register, views)
-        answer = spared(for_some, usable, register, _nothing(there), (here, there, begin, batch))
+        answer = run_without_grad(masked_apply, usable, register, _nothing(there), (here, there, begin, batch))
 
     def grid(y: Tensor) -> Tensor:  # (..., M) -> (B, N, ...)
         y = y.unflatten(-1, (B, N)).movedim((-2, -1), (0, 1))
         return y.to(uv_0.dtype) if y.is_floating_point() else y
 
     found, linear, rms, cov, shift_px, ok = (grid(y) for y in answer)
-    return Registration(torch.where(ok[..., None], found, uv_1.detach()), linear, rms, cov, shift_px, ok)
+    return AffineRegistration(torch.where(ok[..., None], found, uv_1.detach()), linear, rms, cov, shift_px, ok)
 
 
-def step(
+def registration_step(
     source: Pyramid,
     target: Pyramid,
     uv_0: Tensor,  # (B, N, 2) px
@@ -212,7 +212,7 @@ def _register(
     begin: Tensor,  # (2, 2, M)
     batch: Tensor,  # (M,)
 ) -> tuple[Tensor, ...]:
-    """The fields of a :class:`Registration`, points last."""
+    """The fields of a :class:`AffineRegistration`, points last."""
     target, o = views.target, views.o
     q = round_half_up(here)
     place = _place(here - q, o.window)
@@ -220,13 +220,13 @@ def _register(
     state = _search(views, 0, q, place, warp, batch)
     best = state._replace(warp=warp, fit=state.first)
     if len(target.levels) > 1:
-        big = _determinant(_linear(state.warp, o.window)) > HALVE**2
-        state = _State(*for_some(big, partial(_search, views, 1), state, (q, place, state.warp, batch)))
+        big = _determinant(_linear(state.warp, o.window)) > HALVING_MAGNIFICATION**2
+        state = _State(*masked_apply(big, partial(_search, views, 1), state, (q, place, state.warp, batch)))
     shift = ((state.warp * place[:, None]).sum(0) - there).square().sum(0).sqrt()
     shift = torch.where(shift.isfinite(), shift, torch.full_like(shift, o.max_shift_px))
     ok = _accept(state, best.fit, target, o.window) & (shift <= o.max_shift_px)
     best = _State(*(torch.where(ok, new, old) for new, old in zip(state, best, strict=True)))
-    rms = best.fit[1].sqrt() / best.fit[0].clamp(*GAIN)
+    rms = best.fit[1].sqrt() / best.fit[0].clamp(*REGISTRATION_GAIN_RANGE)
     A = _linear(best.warp, o.window).transpose(0, 1)
     return (best.warp * place[:, None]).sum(0), A, rms, _covariance(best, place, o.window), shift, ok
 
@@ -245,9 +245,11 @@ def _search(
     if _compilable(views, level, q, place, warp, batch):
         return _compiled(views, level, q, place, warp * zoom, batch)
     fine = o._replace(epsilon_px=o.epsilon_px * zoom)
-    memory = None if is_static(warp) else warp.new_empty(2, min(CHUNK, len(batch)), 8, o.window * o.window)
+    memory = None if is_static(warp) else warp.new_empty(2, min(MAX_CHUNK_POINTS, len(batch)), 8, o.window * o.window)
     parts = []
-    for q_, place_, warp_, batch_ in zip(*(y.split(CHUNK, -1) for y in (q, place, warp * zoom, batch)), strict=True):
+    for q_, place_, warp_, batch_ in zip(
+        *(y.split(MAX_CHUNK_POINTS, -1) for y in (q, place, warp * zoom, batch)), strict=True
+    ):
         patch, corner = _patch(target, level, warp_[0], batch_, o.window)
         Q = _pictures(source, q_, batch_, o.window, None if memory is None else memory[0, : len(batch_)])
         products = None if memory is None else memory[1, : len(batch_)]
@@ -261,9 +263,13 @@ def _compilable(views: _Views, level: int, *points: Tensor) -> bool:
     """Whether compiled code may search: it takes these tensors, and finds a window wherever it looks."""
     source, target, o = views
     levels = source.levels[0], target.levels[level]
-    room = min(source.pad, target.pad) >= o.window // 2 + REACH
-    told = room and source.levels[0].shape[1] > GRAD_Y and all(y.dtype == torch.float32 for y in (*levels, *points[:3]))
-    return told and native.serves(*levels, *points)
+    room = min(source.pad, target.pad) >= o.window // 2 + SEARCH_PADDING_PX
+    told = (
+        room
+        and source.levels[0].shape[1] > GRAD_Y_PLANE
+        and all(y.dtype == torch.float32 for y in (*levels, *points[:3]))
+    )
+    return told and loader.serves(*levels, *points)
 
 
 def _compiled(views: _Views, level: int, q: Tensor, place: Tensor, begin: Tensor, batch: Tensor) -> _State:
@@ -326,11 +332,11 @@ def _further(change: Tensor, taken: Tensor | None, before: Tensor | None) -> Ten
         return change
     bend = change - before
     share = (change * bend).sum((0, 1)) / (bend * bend).sum((0, 1)).clamp_min(1e-20)
-    return change - share.clamp(-AHEAD, AHEAD / (1 + AHEAD)) * (taken + bend)
+    return change - share.clamp(-MAX_EXTRAPOLATION, MAX_EXTRAPOLATION / (1 + MAX_EXTRAPOLATION)) * (taken + bend)
 
 
 def _nothing(there: Tensor) -> tuple[Tensor, ...]:
-    """The fields of a :class:`Registration` for points (2, M) that are not registered."""
+    """The fields of a :class:`AffineRegistration` for points (2, M) that are not registered."""
     none = torch.zeros_like(there[0], dtype=torch.bool)
     zero = torch.zeros_like(there[0])
     return there, _still(there), zero, _still(there), zero, none
@@ -339,8 +345,13 @@ def _nothing(there: Tensor) -> tuple[Tensor, ...]:
 def _accept(state: _State, first: Tensor, target: Pyramid, window: int) -> Tensor:
     """Which searches are believed (M,)."""
     size, gain = _determinant(_linear(state.warp, window)), state.fit[0]
-    sane = (size > SCALE[0] ** 2) & (size < SCALE[1] ** 2) & (gain > GAIN[0]) & (gain < GAIN[1])
-    better = _noise(state.fit) <= WORSE * _noise(first)
+    sane = (
+        (size > REGISTRATION_SCALE_RANGE[0] ** 2)
+        & (size < REGISTRATION_SCALE_RANGE[1] ** 2)
+        & (gain > REGISTRATION_GAIN_RANGE[0])
+        & (gain < REGISTRATION_GAIN_RANGE[1])
+    )
+    better = _noise(state.fit) <= MAX_RESIDUAL_GROWTH * _noise(first)
     return state.textured & sane & better & _inside(state.warp[0], target)
 
 
@@ -353,8 +364,8 @@ def _covariance(state: _State, place: Tensor, window: int) -> Tensor:
     """
     R = state.inverse.double()
     C = (R[:, :6].unflatten(1, (3, 2)) * place.double()[:, None]).sum(1)
-    square, n = state.fit[0].clamp(*GAIN).double().square(), window * window
-    variance = _noise(state.fit).double().clamp_min(QUANTISATION) * (n / (n - 8))
+    square, n = state.fit[0].clamp(*REGISTRATION_GAIN_RANGE).double().square(), window * window
+    variance = _noise(state.fit).double().clamp_min(QUANTISATION_VARIANCE) * (n / (n - 8))
     u2 = (window // 2 + 1) / (window // 2) / 3  # mean over the window
     energy = R.new_tensor([1.0, 1.0, u2, u2, u2, u2, 1 / GRADIENT_NOISE, 0.0]) * GRADIENT_NOISE * n
     noise = (R[:, None] * R[None] * energy[:, None]).sum(2) * variance
@@ -363,7 +374,7 @@ def _covariance(state: _State, place: Tensor, window: int) -> Tensor:
     ratio = product(C, false)
     trace = (ratio[0, 0] + ratio[1, 1]) / 2
     most = trace + (trace * trace - _determinant(ratio)).clamp_min(0).sqrt()
-    true = _inverse(S - false * (MOST_NOISE / most.clamp_min(MOST_NOISE)))
+    true = _inverse(S - false * (MAX_NOISE_RATIO / most.clamp_min(MAX_NOISE_RATIO)))
     spread = product(product(true, S), true) * (variance * (1 + square) / square)
     A = _linear(state.warp, window).double()
     return product(product(A.transpose(0, 1), spread), A).to(state.warp.dtype)
@@ -398,7 +409,7 @@ def _from(corner: Tensor, warp: Tensor) -> Tensor:
 def _pictures(source: Pyramid, q: Tensor, batch: Tensor, window: int, out: Tensor | None = None) -> Tensor:
     """The eight pictures (M, 8, w²) of windows around whole pixels ``q`` (2, M): ∇T, u ∇T, v ∇T, T without its mean
     and 1; u and v run from -1 to 1."""
-    first, _ = source.locate(0, q, batch, window // 2, (GRAD_X, GRAD_Y, GREY))
+    first, _ = source.locate(0, q, batch, window // 2, (GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE))
     G = source.read(0, first, window).transpose(0, 1)
     s = torch.linspace(-1, 1, window, dtype=q.dtype, device=q.device)
     one = torch.ones_like(G[:, :1])
@@ -410,10 +421,10 @@ def _pictures(source: Pyramid, q: Tensor, batch: Tensor, window: int, out: Tenso
 
 def _patch(target: Pyramid, level: int, x: Tensor, batch: Tensor, window: int) -> tuple[Tensor, Tensor]:
     """Patches (M, 1, s, s) of image 1 with room to move, and their first pixels (2, M)."""
-    reach = window // 2 + REACH
+    reach = window // 2 + SEARCH_PADDING_PX
     H, W = target.hw(level)
     middle = torch.minimum(round_half_up(x).clamp_min(0), x.new_tensor([[W - 1], [H - 1]]))
-    first, _ = target.locate(level, middle, batch, reach, (GREY,))
+    first, _ = target.locate(level, middle, batch, reach, (GREY_PLANE,))
     side = 2 * reach + 1
     return target.read(level, first, side)[0].unflatten(-1, (side, side))[:, None], middle - reach
 
@@ -453,12 +464,12 @@ def _share(places: Tensor) -> Tensor:
 def _noise(fit: Tensor) -> Tensor:
     """Variance (M,) of white noise, the same in both images, that would leave such a residual."""
     gain, variance, share = fit
-    return variance / (share + gain.clamp(*GAIN).square())
+    return variance / (share + gain.clamp(*REGISTRATION_GAIN_RANGE).square())
 
 
 def _normal(Q: Tensor) -> Tensor:
     """Normal equations (M, 8, 8) of the eight pictures."""
-    damping = torch.tensor([0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0], dtype=Q.dtype, device=Q.device) * DAMPING
+    damping = torch.tensor([0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0], dtype=Q.dtype, device=Q.device) * AFFINE_DAMPING
     return torch.bmm(Q, Q.transpose(1, 2)) + torch.diag(damping)
 
 
@@ -469,13 +480,13 @@ def _invert(H: Tensor) -> tuple[Tensor, Tensor]:
     s = s[:, :, None] * s[:, None]
     L, info = torch.linalg.cholesky_ex(H * s)
     textured = (info == 0) & (L.diagonal(dim1=1, dim2=2).amin(-1) > MIN_PIVOT)
-    L = torch.where(textured[:, None, None], L, torch.eye(8, dtype=L.dtype, device=L.device) * DAMPING**0.5)
+    L = torch.where(textured[:, None, None], L, torch.eye(8, dtype=L.dtype, device=L.device) * AFFINE_DAMPING**0.5)
     return (torch.cholesky_inverse(L) * s).to(H.dtype), textured
 
 
 def _change(solution: Tensor) -> Tensor:
     """The change (3, 2, M) that a solution (M, 8) says: δ, and what it adds at u = 1 and v = 1, px."""
-    return (solution[:, :6].T / solution[:, 6].clamp(*GAIN)).unflatten(0, (3, 2))
+    return (solution[:, :6].T / solution[:, 6].clamp(*REGISTRATION_GAIN_RANGE)).unflatten(0, (3, 2))
 
 
 def _compose(warp: Tensor, change: Tensor, window: int) -> Tensor:
@@ -491,9 +502,9 @@ def _inside(x: Tensor, pyramid: Pyramid) -> Tensor:
 
 
 def _determinant(A: Tensor) -> Tensor:
-    return small.determinant(*A.flatten(0, 1))
+    return small.determinant_2x2(*A.flatten(0, 1))
 
 
 def _inverse(A: Tensor) -> Tensor:
     """Inverse of (2, 2, M), its determinant kept from vanishing."""
-    return small.inverse(*A.flatten(0, 1), least=1e-30).unflatten(0, (2, 2))
+    return small.inverse_2x2(*A.flatten(0, 1), least=1e-30).unflatten(0, (2, 2))

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry import se3
-from dhtorch.geometry.checks import check, surely_all
-from dhtorch.geometry.linalg import inverse
+from dhtorch.geometry.checks import all_known, check
+from dhtorch.geometry.linalg import inverse_2x2
 from dhtorch.geometry.se3 import Pose
 from dhtorch.pytree import Record, record
 
@@ -197,7 +197,7 @@ def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:
         return eye.expand(*uv_ideal.shape, 2)
     a, b, c = _distort(camera.distortion, _planes(_normalised(camera, uv_ideal)))[1]
     f = camera.f[:, None]
-    turned = inverse(a, b, b, c, least=1e-12).movedim(0, -1).unflatten(-1, (2, 2))
+    turned = inverse_2x2(a, b, b, c, least=1e-12).movedim(0, -1).unflatten(-1, (2, 2))
     return f[..., :, None] * turned / f[..., None, :]
 
 
@@ -237,7 +237,7 @@ def _solved(distortion: Tensor, target: Tensor, iterations: int) -> Tensor:
         step = _newton_step(distortion, xy, target)
         xy = torch.where(moving, xy + step, xy)
         moving = moving & ((step * step).sum(0) > torch.finfo(xy.dtype).eps)
-        if surely_all(~moving):
+        if all_known(~moving):
             break
     return xy
 
@@ -246,7 +246,7 @@ def _newton_step(distortion: Tensor, xy: Tensor, target: Tensor) -> Tensor:
     """What is to be added to the planes ``xy`` (2, B, N)."""
     value, (a, b, c) = _distort(distortion, xy)
     left = target - value
-    a, b, _, c = inverse(*(x.detach() for x in (a, b, b, c)), least=1e-12)
+    a, b, _, c = inverse_2x2(*(x.detach() for x in (a, b, b, c)), least=1e-12)
     return torch.stack((a * left[0] + b * left[1], b * left[0] + c * left[1]))
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 #: Calls that are remembered before all are forgotten.
-REMEMBERED = 4096
+MAX_CACHED_CHECKS = 4096
 
 #: Patterns and shapes that were right, and their sizes: a fit asks the same at every step.
 _right: dict[tuple[tuple[str, torch.Size | None], ...], dict[str, int]] = {}
@@ -38,7 +38,7 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
         return _bound(where, args)
     if sizes is None:
         sizes = _bound(where, args)
-        if len(_right) >= REMEMBERED:
+        if len(_right) >= MAX_CACHED_CHECKS:
             _right.clear()
         _right[seen] = sizes
     return dict(sizes)
@@ -70,12 +70,12 @@ def is_static(x: Tensor) -> bool:
     return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x)
 
 
-def surely_all(mask: Tensor) -> bool:
+def all_known(mask: Tensor) -> bool:
     """Whether a mask holds everywhere, where values may be looked at: then nothing need be chosen."""
     return not is_static(mask) and bool(mask.all())
 
 
-def perhaps_any(mask: Tensor) -> bool:
+def any_possible(mask: Tensor) -> bool:
     """Whether a mask holds anywhere; it may where values are not known yet."""
     return is_static(mask) or bool(mask.any())
 

@@ -23,42 +23,42 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry import linalg as closed
-from dhtorch.geometry.checks import check, perhaps_any
-from dhtorch.geometry.filters import grey
+from dhtorch.geometry.checks import any_possible, check
+from dhtorch.geometry.filters import grayscale
 from dhtorch.pytree import Record, record
 
 #: Longest side of the small pictures, px, and of those on which turn and zoom are found.
-LONG, LONG_TURN = 64, 32
+COARSE_SIDE_PX, ROTATION_SIDE_PX = 64, 32
 
 #: Width of a cell's window, an odd number of small pixels, and about how far apart cells lie.
-WINDOW, STEP = 9, 5
-WINDOW_TURN, STEP_TURN = 7, 5
+CELL_WINDOW_PX, CELL_STEP_PX = 9, 5
+ROTATION_WINDOW_PX, ROTATION_STEP_PX = 7, 5
 
 #: Turns in degrees and zooms that are tried; their products are the candidates, the first of all is none.
-TURNS_DEG, ZOOMS = (0.0, -30.0, -15.0, 15.0, 30.0), (1.0, 1 / 1.4, 1.4)
+ROTATIONS_DEG, ZOOMS = (0.0, -30.0, -15.0, 15.0, 30.0), (1.0, 1 / 1.4, 1.4)
 
 #: How much better than none (mean correlation) a turn must fit.
-BETTER = 0.03
+MIN_CORRELATION_GAIN = 0.03
 
 #: Grey levels of a small picture, and what a correlation of one is in whole numbers: their products' sum over a window
 #: stays below 2^24.
-LEVELS, UNIT = 1023, 1024
+GREY_LEVELS, CORRELATION_UNIT = 1023, 1024
 
 #: A window whose contrast is a smaller share of the whole picture's than this, or fewer grey levels, counts as flat.
-FLAT, FLAT_LEVELS = 0.05, 2.0
+FLAT_CONTRAST_RATIO, FLAT_CONTRAST_LEVELS = 0.05, 2.0
 
 #: What it costs neighbours to differ by one small pixel, and at most, in correlation.
-SLOPE, MOST = 0.1, 0.5
+SMOOTHNESS_COST, MAX_SMOOTHNESS_COST = 0.1, 0.5
 
 #: Logarithm of a gain that counts as none, and its steps; gains that are believed.
-SAME_GAIN, STEPS_OF_GAIN, GAIN = 0.1, 32, (0.1, 10.0)
+UNIT_GAIN_LOG, GAIN_STEPS, COARSE_GAIN_RANGE = 0.1, 32, (0.1, 10.0)
 
 #: Correlation from which on a cell has a say, and the least mean say of a picture with any start at all.
-SAY, LEAST = 0.6, 0.02
+MIN_CELL_CORRELATION, MIN_MEAN_WEIGHT = 0.6, 0.02
 
 
 @record
-class Flow(Record):
+class CoarseFlow(Record):
     """The coarse motion from image 0 to image 1, on a grid of cells."""
 
     uv_0: Tensor  # (B, R, C, 2) px, middles of the cells in image 0
@@ -92,9 +92,9 @@ def coarse_flow(
     *,
     linear: Tensor | None = None,  # (B, 2, 2)
     reach: float = 0.25,
-    turns_deg: tuple[float, ...] = TURNS_DEG,
+    turns_deg: tuple[float, ...] = ROTATIONS_DEG,
     zooms: tuple[float, ...] = ZOOMS,
-) -> Flow:
+) -> CoarseFlow:
     """The coarse motion of the picture from image 0 to image 1, whatever their exposures.
 
     Args:
@@ -113,38 +113,38 @@ def coarse_flow(
     Cost: independent of the images' size but for one reading of each; a pair more where some pair is turned.
     """
     check("coarse_flow", image_0=(image_0, "B C H W"), image_1=(image_1, "B C H' W'"), linear=(linear, "B 2 2"))
-    small_0, small_1 = small(image_0, LONG), small(image_1, LONG)
-    a, b = _levels(small_0), _levels(small_1)
+    small_0, small_1 = downscale(image_0, COARSE_SIDE_PX), downscale(image_1, COARSE_SIDE_PX)
+    a, b = _quantised(small_0), _quantised(small_1)
     larger = small_1.scale / small_0.scale  # turns and zooms are those of small pictures from here on
     if linear is None:
-        found = _turn(image_0, image_1, reach, turns_deg, zooms)
+        found = _best_similarity(image_0, image_1, reach, turns_deg, zooms)
         plain = torch.eye(2, device=a.device).expand_as(found)
-        some = perhaps_any(is_turned(found))
+        some = any_possible(is_not_identity(found))
         rivals = torch.stack([plain, found], 1) if some else plain[:, None]
     else:
         rivals = linear.to(a)[:, None] / larger
-    centre, offset, fit, total = _match(a, b, rivals, reach, WINDOW, STEP)
+    centre, offset, fit, total = _match(a, b, rivals, reach, CELL_WINDOW_PX, CELL_STEP_PX)
     first = torch.arange(rivals.shape[1], device=a.device) == 0
-    pick = torch.arange(len(a), device=a.device), torch.where(first, total + BETTER, total).argmax(1)
+    pick = torch.arange(len(a), device=a.device), torch.where(first, total + MIN_CORRELATION_GAIN, total).argmax(1)
     offset, fit, linear = offset[pick], fit[pick], rivals[pick]
-    say = ((fit - SAY) / (1 - SAY)).clamp_min(0)
+    say = ((fit - MIN_CELL_CORRELATION) / (1 - MIN_CELL_CORRELATION)).clamp_min(0)
     gain = _gain(a, b, centre, offset, linear, say)
     offset = _spread(offset, say)
     uv_0 = small_0.to_image(centre)
     uv_1 = small_1.to_image(centre + offset)
-    silent = say.mean((-2, -1)) < LEAST
+    silent = say.mean((-2, -1)) < MIN_MEAN_WEIGHT
     uv_1 = torch.where(silent[:, None, None, None], torch.full_like(uv_1, torch.nan), uv_1)
     gain = torch.where(silent, torch.ones_like(gain), gain)
     linear = torch.where(silent[:, None, None], torch.eye(2, device=a.device), linear)  # nothing supports a turn
-    return Flow(uv_0=uv_0.expand_as(uv_1), uv_1=uv_1, support=say, linear=linear * larger, gain=gain)
+    return CoarseFlow(uv_0=uv_0.expand_as(uv_1), uv_1=uv_1, support=say, linear=linear * larger, gain=gain)
 
 
-def inverse(linear: Tensor) -> Tensor:
+def invert_similarity(linear: Tensor) -> Tensor:
     """The inverse (B, 2, 2) of turns and zooms. Gradient: to them."""
-    return closed.inverse(*linear.flatten(-2).unbind(-1), least=1e-30).movedim(0, -1).unflatten(-1, (2, 2))
+    return closed.inverse_2x2(*linear.flatten(-2).unbind(-1), least=1e-30).movedim(0, -1).unflatten(-1, (2, 2))
 
 
-def turned(
+def apply_similarity(
     linear: Tensor,  # (B, 2, 2)
     uv: Tensor,  # (B, N, 2) px
     hw: tuple[int, int],
@@ -155,10 +155,10 @@ def turned(
     """
     middle = uv.new_tensor([(hw[1] - 1) / 2, (hw[0] - 1) / 2])
     there = (linear.to(uv)[:, None] * (uv - middle)[..., None, :]).sum(-1) + middle
-    return torch.where(is_turned(linear)[:, None, None], there, uv)
+    return torch.where(is_not_identity(linear)[:, None, None], there, uv)
 
 
-def upright(
+def undo_similarity(
     image: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     linear: Tensor,  # (B, 2, 2) a turn and a zoom
     gain: Tensor,  # (B,)
@@ -172,23 +172,23 @@ def upright(
     check("upright", image=(image, "B C H W"), linear=(linear, "B 2 2"), gain=(gain, "B"))
     picture = _grey(image)
     H, W = picture.shape[-2:]
-    if perhaps_any(is_turned(linear)):
+    if any_possible(is_not_identity(linear)):
         rows, columns = (torch.arange(n, device=image.device, dtype=picture.dtype) for n in (H, W))
         v, u = torch.meshgrid(rows, columns, indexing="ij")
-        uv = turned(linear, torch.stack([u, v], -1).reshape(1, H * W, 2).expand(len(picture), -1, -1), (H, W))
+        uv = apply_similarity(linear, torch.stack([u, v], -1).reshape(1, H * W, 2).expand(len(picture), -1, -1), (H, W))
         place = ((2 * uv + 1) / uv.new_tensor([W, H]) - 1).reshape(-1, H, W, 2)
         seen = F.grid_sample(picture, place, mode="bilinear", padding_mode="border", align_corners=False)
-        picture = torch.where(is_turned(linear)[:, None, None, None], seen, picture)
+        picture = torch.where(is_not_identity(linear)[:, None, None, None], seen, picture)
     gain = gain.to(picture)[:, None, None, None]
     return torch.where(gain == 1, picture, picture / gain)
 
 
-def is_turned(linear: Tensor) -> Tensor:
+def is_not_identity(linear: Tensor) -> Tensor:
     """(B,) bool: not the identity."""
     return (linear != torch.eye(2, device=linear.device, dtype=linear.dtype)).flatten(1).any(1)
 
 
-class Small(NamedTuple):
+class DownscaledImage(NamedTuple):
     """A picture of a few thousand pixels, each the mean of a square of the image's."""
 
     grey: Tensor  # (B, 1, h, w) in [0, 1]
@@ -200,7 +200,7 @@ class Small(NamedTuple):
         return uv * self.scale + self.first
 
 
-def small(image: Tensor, long: int) -> Small:
+def downscale(image: Tensor, long: int) -> DownscaledImage:
     """The picture (B, C, H, W) with a longer side of at most ``long``; one that is no larger stays as it is.
 
     Of squares wider than sixteen pixels only every so many rows and columns are read: a hundred pixels tell a mean as
@@ -211,31 +211,33 @@ def small(image: Tensor, long: int) -> Small:
     thin = max(1, scale // 8)
     side = scale // thin
     picture = _grey(image[..., ::thin, ::thin])
-    return Small(F.avg_pool2d(picture, side), side * thin, (side - 1) * thin / 2)
+    return DownscaledImage(F.avg_pool2d(picture, side), side * thin, (side - 1) * thin / 2)
 
 
 def _grey(image: Tensor) -> Tensor:
     """(B, 1, H, W) in single precision at least."""
-    picture = grey(image)
+    picture = grayscale(image)
     return picture.to(torch.promote_types(picture.dtype, torch.float32))
 
 
-def _turn(image_0: Tensor, image_1: Tensor, reach: float, turns_deg: tuple[float, ...], zooms: tuple[float, ...]):
+def _best_similarity(
+    image_0: Tensor, image_1: Tensor, reach: float, turns_deg: tuple[float, ...], zooms: tuple[float, ...]
+):
     """The similarity (B, 2, 2) among the candidates under which the pictures agree best."""
-    a, b = (_levels(small(image, LONG_TURN)) for image in (image_0, image_1))
+    a, b = (_quantised(downscale(image, ROTATION_SIDE_PX)) for image in (image_0, image_1))
     angle = torch.tensor([math.radians(t) for z in zooms for t in turns_deg], device=a.device)
     zoom = torch.tensor([z for z in zooms for t in turns_deg], device=a.device)
     c, s = zoom * angle.cos(), zoom * angle.sin()
     candidates = torch.stack([c, -s, s, c], -1).reshape(1, -1, 2, 2).expand(len(a), -1, -1, -1)
-    total = _match(a, b, candidates, reach, WINDOW_TURN, STEP_TURN)[3]
+    total = _match(a, b, candidates, reach, ROTATION_WINDOW_PX, ROTATION_STEP_PX)[3]
     plain = torch.arange(total.shape[1], device=total.device) == 0
-    best = torch.where(plain, total + BETTER, total).argmax(1)
+    best = torch.where(plain, total + MIN_CORRELATION_GAIN, total).argmax(1)
     return candidates[torch.arange(len(best), device=best.device), best]
 
 
-def _levels(picture: Small) -> Tensor:
-    """(B, h, w) whole numbers from 0 to ``LEVELS``."""
-    return (picture.grey[:, 0] * LEVELS).round()
+def _quantised(picture: DownscaledImage) -> Tensor:
+    """(B, h, w) whole numbers from 0 to ``GREY_LEVELS``."""
+    return (picture.grey[:, 0] * GREY_LEVELS).round()
 
 
 def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int) -> tuple[Tensor, ...]:
@@ -249,11 +251,11 @@ def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int
     templates = _unit(_read(a, centre.reshape(1, 1, -1, 2), A, window), _floor(a))
     S = _correlation(templates, b, window)
     V = _around(S, moved.round().long(), most)
-    joined = _told(V)
+    joined = _aggregate_neighbours(V)
     D = 2 * most + 1
     i = joined.flatten(-2).argmax(-1)
     near = _highest(V)
-    fit = near.flatten(-2).gather(-1, i[..., None])[..., 0] / UNIT**2
+    fit = near.flatten(-2).gather(-1, i[..., None])[..., 0] / CORRELATION_UNIT**2
     shift = torch.stack([i % D, i // D], -1) - most
     stays = ((moved > -0.5) & (moved < moved.new_tensor([w_1 - 0.5, h_1 - 0.5]))).all(-1)
     total = torch.where(stays, fit, torch.zeros_like(fit)).sum((-2, -1)) / stays.sum((-2, -1)).clamp_min(1)
@@ -272,7 +274,7 @@ def _read(a: Tensor, centre: Tensor, A: Tensor, window: int) -> Tensor:
     r = window // 2
     o = torch.arange(-r, r + 1, device=a.device, dtype=a.dtype)
     o = torch.stack(torch.meshgrid(o, o, indexing="xy"), -1).reshape(-1, 2)
-    read = (inverse(A)[:, :, None] * o[:, None, :]).sum(-1)  # (B, G, window², 2)
+    read = (invert_similarity(A)[:, :, None] * o[:, None, :]).sum(-1)  # (B, G, window², 2)
     at = centre[..., None, :] + read[:, :, None]
     h, w = a.shape[-2:]
     grid = (2 * at + 1) / at.new_tensor([w, h]) - 1
@@ -282,15 +284,15 @@ def _read(a: Tensor, centre: Tensor, A: Tensor, window: int) -> Tensor:
 
 def _gain(a: Tensor, b: Tensor, centre: Tensor, offset: Tensor, linear: Tensor, say: Tensor) -> Tensor:
     """Ratio of the contrasts (B,) of cells that found each other, as far as it differs from one, in coarse steps."""
-    here = _read(a, centre.reshape(1, 1, -1, 2), linear[:, None], WINDOW)[:, 0]
+    here = _read(a, centre.reshape(1, 1, -1, 2), linear[:, None], CELL_WINDOW_PX)[:, 0]
     there = (centre + offset).flatten(1, 2)[:, None]
     plain = torch.eye(2, device=a.device).expand_as(linear)[:, None]
-    seen = _read(b, there, plain, WINDOW)[:, 0]
+    seen = _read(b, there, plain, CELL_WINDOW_PX)[:, 0]
     ratio = (_variance(seen) + 1).log() - (_variance(here) + 1).log()
     weight = say.flatten(1)
     mean = (ratio * weight).sum(-1) / weight.sum(-1).clamp_min(1e-6) / 2
-    mean = (mean * STEPS_OF_GAIN).round() / STEPS_OF_GAIN
-    return torch.where(mean.abs() > SAME_GAIN, mean, torch.zeros_like(mean)).exp().clamp(*GAIN)
+    mean = (mean * GAIN_STEPS).round() / GAIN_STEPS
+    return torch.where(mean.abs() > UNIT_GAIN_LOG, mean, torch.zeros_like(mean)).exp().clamp(*COARSE_GAIN_RANGE)
 
 
 def _variance(windows: Tensor) -> Tensor:
@@ -310,7 +312,7 @@ def _correlation(templates: Tensor, b: Tensor, window: int) -> Tensor:
 
 def _floor(picture: Tensor) -> Tensor:
     """Variance (B,) of grey levels under which a window of a picture (B, h, w) counts as flat."""
-    return (FLAT**2 * _variance(picture.flatten(1))).clamp_min(FLAT_LEVELS**2)
+    return (FLAT_CONTRAST_RATIO**2 * _variance(picture.flatten(1))).clamp_min(FLAT_CONTRAST_LEVELS**2)
 
 
 def _unit(windows: Tensor, floor: Tensor) -> Tensor:
@@ -321,7 +323,7 @@ def _unit(windows: Tensor, floor: Tensor) -> Tensor:
     total = x.sum(-1, keepdim=True)  # of whole numbers: exact
     squares = x.square().sum(-1, keepdim=True)
     energy = squares - total * total / n + n * floor
-    return ((x - total / n) * (UNIT / energy.sqrt())).round().float()
+    return ((x - total / n) * (CORRELATION_UNIT / energy.sqrt())).round().float()
 
 
 def _around(S: Tensor, at: Tensor, most: int) -> Tensor:
@@ -335,12 +337,12 @@ def _around(S: Tensor, at: Tensor, most: int) -> Tensor:
     return torch.where(inside, found, torch.zeros_like(found))
 
 
-def _told(V: Tensor) -> Tensor:
+def _aggregate_neighbours(V: Tensor) -> Tensor:
     """V (B, G, R, C, D, D) and what the cells to all four sides make of it, as sums of best chains of neighbours."""
-    return V + _both_ways(V) + _both_ways(V.transpose(2, 3)).transpose(2, 3)
+    return V + _messages_along(V) + _messages_along(V.transpose(2, 3)).transpose(2, 3)
 
 
-def _both_ways(V: Tensor) -> Tensor:
+def _messages_along(V: Tensor) -> Tensor:
     """What each row of cells hears from those before it and from those after it, along dim 2."""
     onwards, back = _chain(torch.cat([V, V.flip(2)])).chunk(2)
     return onwards + back.flip(2)
@@ -356,10 +358,10 @@ def _chain(V: Tensor) -> Tensor:
 
 def _message(x: Tensor) -> Tensor:
     """Best of x (…, D, D) over nearby offsets, each small pixel at the price of SLOPE, at most MOST below the best."""
-    floor = x.amax((-2, -1), keepdim=True) - round(MOST * UNIT**2)
+    floor = x.amax((-2, -1), keepdim=True) - round(MAX_SMOOTHNESS_COST * CORRELATION_UNIT**2)
     best = torch.maximum(x, floor)
     for _ in range(2):
-        best = torch.maximum(best, _highest(best) - round(SLOPE * UNIT**2))
+        best = torch.maximum(best, _highest(best) - round(SMOOTHNESS_COST * CORRELATION_UNIT**2))
     return best - floor
 
 

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.least_squares import solve_spd
-from dhtorch.geometry.linalg import upper
+from dhtorch.geometry.linalg import upper_triangle
 
 
-def from_normal(
+def covariance_from_normal(
     H: Tensor,  # (B, n, n)
     sigma: Tensor,  # (B,) standard deviation of one residual coordinate
 ) -> tuple[Tensor, Tensor]:
@@ -61,16 +61,16 @@ def noise_shape(
     Gradient: to cov, the median's choice excepted. Raises ValueError for wrong shapes.
     """
     check("noise_shape", cov=(cov, "B N 2 2"), used=(used, "B N"))
-    xx, xy, yy = upper(cov)
+    xx, xy, yy = upper_triangle(cov)
     good = used & (xx > 0) & (yy > 0) & (xx * yy > xy * xy) & (xx + yy < torch.inf)
     size = torch.where(good, 0.5 * (xx + yy), torch.ones_like(xx))
-    scale = median(size, good)[..., None, None]
+    scale = masked_median(size, good)[..., None, None]
     eye = torch.eye(2, dtype=cov.dtype, device=cov.device)
     shape = (1 - isotropic) * cov / scale + isotropic * eye
     return torch.where(good[..., None, None], shape, eye)
 
 
-def median(
+def masked_median(
     x: Tensor,  # (B, N)
     used: Tensor,  # (B, N) bool
 ) -> Tensor:

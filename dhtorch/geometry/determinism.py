@@ -5,13 +5,14 @@ may round differently; a matrix product takes another way through its sums when 
 its length. An element's answer would then depend on how many others travel with it. Three habits keep that away, and
 whoever works on rows of points follows them:
 
-- rows are filled up to whole :data:`LANES` (:func:`filled`), with points whose answers nobody reads;
+- rows are filled up to whole :data:`ELEMENTWISE_LANES` (:func:`round_up`), with points whose answers nobody reads;
 - matrix products and sums over points run over whole :data:`PRODUCT_LANES` and :data:`SUM_LANES`; products of 2×2 and
   3×3 matrices are written out as sums;
-- sin, atan2, pow, … go through :func:`steady`.
+- sin, atan2, pow, … go through :func:`pad_elementwise`.
 
 Additions, products, quotients and square roots are exact to rounding everywhere and need no such care. How many points
-are worked on at once (:data:`CHUNK`) is a matter of speed: it is a multiple of all of them, and changes no bit.
+are worked on at once (:data:`MAX_CHUNK_POINTS`) is a matter of speed: it is a multiple of all of them, and changes no
+bit.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import torch
 from torch import Tensor
 
 #: Rows of so many points leave no tail to a vector loop (two AVX-512 registers of float32 hold 32 values).
-LANES = 64
+ELEMENTWISE_LANES = 64
 
 #: Matrix products over points round alike in any company when the number of points is a multiple of this.
 PRODUCT_LANES = 16
@@ -31,15 +32,15 @@ PRODUCT_LANES = 16
 SUM_LANES = 256
 
 #: Points whose windows are read at once: few enough for these to stay in the cache.
-CHUNK = 256
+MAX_CHUNK_POINTS = 256
 
 
-def filled(count: int, lanes: int = LANES) -> int:
+def round_up(count: int, lanes: int = ELEMENTWISE_LANES) -> int:
     """``count`` rounded up to whole lanes, at least one."""
     return max(count + -count % lanes, lanes)
 
 
-def steady(fn: Callable[..., Tensor], *xs: Tensor) -> Tensor:
+def pad_elementwise(fn: Callable[..., Tensor], *xs: Tensor) -> Tensor:
     """``fn(*xs)`` elementwise on equally shaped tensors, padded so that no element falls into the scalar tail.
 
     Gradient: that of ``fn``. Raises ValueError for unequal shapes.
@@ -47,6 +48,6 @@ def steady(fn: Callable[..., Tensor], *xs: Tensor) -> Tensor:
     shape = xs[0].shape
     if any(x.shape != shape for x in xs):
         raise ValueError(f"steady: shapes are {[tuple(x.shape) for x in xs]}, expected equal shapes")
-    tail = -xs[0].numel() % LANES
+    tail = -xs[0].numel() % ELEMENTWISE_LANES
     padded = [torch.nn.functional.pad(x.reshape(-1), (0, tail), value=0.5) for x in xs]
     return fn(*padded)[: xs[0].numel()].reshape(shape)

@@ -17,12 +17,12 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.determinism import steady
-from dhtorch.geometry.linalg import quadratic, upper
+from dhtorch.geometry.determinism import pad_elementwise
+from dhtorch.geometry.linalg import quadratic_form, upper_triangle
 from dhtorch.geometry.se3 import Pose
 
-#: Points of all pairs that :func:`depths` works on at once: torch does not split so few over threads.
-POINTS = 1 << 15
+#: Points of all pairs that :func:`triangulate_depth` works on at once: torch does not split so few over threads.
+MAX_CHUNK_TRIANGULATED = 1 << 15
 
 
 class TwoView(NamedTuple):
@@ -66,7 +66,7 @@ def triangulate(
     return _describe(depth, torch.stack(direction, -1), uv_1, camera_1, T_1_from_0)
 
 
-def depths(
+def triangulate_depth(
     uv_0: Tensor,  # (B, N, 2) ideal px
     uv_1: Tensor,  # (B, N, 2) ideal px
     camera_0: Camera,
@@ -83,7 +83,7 @@ def depths(
     Gradient: as :func:`triangulate`.
     """
     check("depths", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
-    step = max(POINTS // max(uv_0.shape[0], 1), 1)
+    step = max(MAX_CHUNK_TRIANGULATED // max(uv_0.shape[0], 1), 1)
     pieces = (
         [(uv_0, uv_1)] if torch.compiler.is_compiling() else zip(uv_0.split(step, 1), uv_1.split(step, 1), strict=True)
     )
@@ -115,7 +115,7 @@ def _meet(direction: tuple[Tensor, Tensor, Tensor], uv_1: Tensor, camera_1: Came
     return near * far / (far * far).clamp_min(1e-20)
 
 
-def describe(
+def describe_triangulation(
     xyz_0: Tensor,  # (B, N, 3) m in camera 0
     uv_0: Tensor,
     uv_1: Tensor,
@@ -178,7 +178,7 @@ def depth_variance(
     defined = steep > 1e-18
     gain = slope / torch.where(defined, steep, torch.ones_like(steep))[..., None]  # d(depth) / d(uv_1), m/px
     g0, g1 = gain.unbind(-1)
-    own = quadratic(g0, g1, *upper(cov_uv_1))
+    own = quadratic_form(g0, g1, *upper_triangle(cov_uv_1))
     row = g0[..., None] * geometry.J_pose[..., 0, :] + g1[..., None] * geometry.J_pose[..., 1, :]  # (B, N, k)
     carried = sum(row[..., k, None] * cov_pose[:, None, k] for k in range(cov_pose.shape[-1]))
     shared = (carried * row).sum(-1)
@@ -197,4 +197,4 @@ def _angle(Y: Tensor, t: Tensor) -> Tensor:
     """Angle (B, N) at points Y (camera 1) between the rays to camera 1's centre (the origin) and camera 0's (t)."""
     (y0, y1, y2), (d0, d1, d2) = Y.unbind(-1), (Y - t).unbind(-1)
     cross = torch.stack((y1 * d2 - y2 * d1, y2 * d0 - y0 * d2, y0 * d1 - y1 * d0), -1)
-    return steady(torch.atan2, _length(cross), y0 * d0 + y1 * d1 + y2 * d2)
+    return pad_elementwise(torch.atan2, _length(cross), y0 * d0 + y1 * d1 + y2 * d2)

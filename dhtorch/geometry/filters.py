@@ -17,7 +17,7 @@ from torch import Tensor
 from dhtorch.geometry.checks import check
 
 
-def grey(image: Tensor) -> Tensor:
+def grayscale(image: Tensor) -> Tensor:
     """Grey values (B, 1, H, W) in [0, 1] of pictures (B, C, H, W), C 1 or 3, float in [0, 1] or uint8; BT.601.
 
     kornia's: bit for bit those of :func:`dhtorch.geometry.patches.luma` in float32 and float64, which is twice as fast
@@ -31,7 +31,7 @@ def grey(image: Tensor) -> Tensor:
     return image if image.shape[1] == 1 else rgb_to_grayscale(image)
 
 
-def separable(x: Tensor, down: Sequence[float], across: Sequence[float]) -> Tensor:
+def correlate_separable(x: Tensor, down: Sequence[float], across: Sequence[float]) -> Tensor:
     """Correlation of (B, C, H, W) with ``down`` along the rows' axis and ``across`` along the columns'.
 
     kornia's ``filter2d_separable`` takes three times as long at the least for up to 17 taps.
@@ -65,7 +65,7 @@ def gaussian_taps(sigma_px: float, derivative: bool = False) -> list[float]:
     return [v / answer for v in slope]
 
 
-def gaussian(x: Tensor, sigma_px: float, *, reach_px: int | None = None) -> Tensor:
+def gaussian_blur(x: Tensor, sigma_px: float, *, reach_px: int | None = None) -> Tensor:
     """Pictures (B, C, H, W) blurred by a Gaussian, by kornia; sigma 0 leaves them. It reaches four deviations.
 
     Picture by picture, because kornia goes another way, which rounds otherwise, when there are more pixels in all.
@@ -85,13 +85,13 @@ def gaussian(x: Tensor, sigma_px: float, *, reach_px: int | None = None) -> Tens
     return torch.cat(blurred)
 
 
-def box(x: Tensor, radius: int) -> Tensor:
+def box_mean(x: Tensor, radius: int) -> Tensor:
     """Mean over squares of ``2 radius + 1`` pixels, (B, C, H, W). Gradient: to ``x``.
 
     kornia's ``box_blur`` takes four times as long for a radius of 1.
     """
     side = 2 * radius + 1
-    return separable(x, [1 / side] * side, [1 / side] * side)
+    return correlate_separable(x, [1 / side] * side, [1 / side] * side)
 
 
 def _sum(parts: Sequence[Tensor], taps: Sequence[float]) -> Tensor:

@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.covariance import median
+from dhtorch.geometry.covariance import masked_median
 
 #: Samples in a cell of the picture, about.
-IN_CELL = 10
+SAMPLES_PER_CELL = 10
 
 #: Least share of returns among the samples around a return for a sensor whose silence says something, and least number
 #: of answers that such silence is asked of.
-DENSE, FEW = 0.6, 10
+MIN_RETURN_RATIO, MIN_FREE_SPACE_ANSWERS = 0.6, 10
 
 
-def within_reach(
+def free_space_violations(
     uv: Tensor,  # (B, N, 2) px
     sensed: Tensor,  # (B, N) m, 0 = no return
     held: Tensor,  # (B, N) bool
@@ -40,9 +40,9 @@ def within_reach(
         depth, sigma: of the answers.
 
     Returns:
-        0 where fewer than :data:`FEW` are asked, for a sensor that is sparse also where it sees, and where more returns
-        hold the pose than answers are asked: what moves on its own is then most of what is known, and a sensor that
-        sees far has its holes for other reasons.
+        0 where fewer than :data:`MIN_FREE_SPACE_ANSWERS` are asked, for a sensor that is sparse also where it sees, and
+        where more returns hold the pose than answers are asked: what moves on its own is then most of what is known,
+        and a sensor that sees far has its holes for other reasons.
 
     Raises:
         ValueError: wrong shapes.
@@ -54,21 +54,21 @@ def within_reach(
     given = sensed > 0
     held = held & given
     around = _share_around(uv, given)
-    dense = torch.where(given, around, 0).sum(-1) >= DENSE * given.sum(-1).clamp_min(1)
+    dense = torch.where(given, around, 0).sum(-1) >= MIN_RETURN_RATIO * given.sum(-1).clamp_min(1)
     few_held = held.sum(-1) <= asked.sum(-1)
     asked = asked & (around == 0)
-    close = asked & (depth.detach() + 2 * sigma.detach() < median(sensed.detach(), held))
+    close = asked & (depth.detach() + 2 * sigma.detach() < masked_median(sensed.detach(), held))
     n = asked.sum(-1)
     share = close.sum(-1) / n.clamp_min(1).to(depth.dtype)
-    told = dense & held.any(-1) & (n >= FEW) & few_held
+    told = dense & held.any(-1) & (n >= MIN_FREE_SPACE_ANSWERS) & few_held
     return torch.where(told, share, torch.zeros_like(share))
 
 
 def _share_around(uv: Tensor, given: Tensor) -> Tensor:
     """(B, N) share of the samples in each sample's cell that have a return; cells divide the samples' extent."""
     N = uv.shape[1]
-    rows = max(1, round((0.75 * N / IN_CELL) ** 0.5))
-    columns = max(1, round(N / IN_CELL / rows))
+    rows = max(1, round((0.75 * N / SAMPLES_PER_CELL) ** 0.5))
+    columns = max(1, round(N / SAMPLES_PER_CELL / rows))
     low, high = uv.detach().amin(1, keepdim=True), uv.detach().amax(1, keepdim=True)
     place = (uv.detach() - low) / (high - low).clamp_min(1e-6) * uv.new_tensor([columns, rows])
     column, row = place.long().unbind(-1)

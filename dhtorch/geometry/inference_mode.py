@@ -21,7 +21,7 @@ from dhtorch.pytree import Record
 R = TypeVar("R")
 
 
-def spared(fn: Callable[..., R], *args: Any, **options: Any) -> R:
+def run_without_grad(fn: Callable[..., R], *args: Any, **options: Any) -> R:
     """``fn(*args, **options)``, in inference mode where no tensor among the arguments asks for a graph.
 
     Tensors that ``fn`` reads elsewhere must not ask for one; it may keep none that it makes.

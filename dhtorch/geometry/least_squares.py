@@ -18,8 +18,8 @@ from torch import Tensor
 from torch.autograd.forward_ad import unpack_dual
 from torch.utils import _pytree as pytree
 
-from dhtorch.geometry.checks import check, surely_all
-from dhtorch.geometry.linalg import product
+from dhtorch.geometry.checks import all_known, check
+from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.se3 import Pose
 
 #: Points nearer to the camera plane than this (m), or behind it, are not in front.
@@ -30,13 +30,13 @@ MIN_PIVOT = 1e-6
 
 
 #: Displacement, rad or m, by which the derivative of equations in float64 is found.
-DIFFERENCE = 1e-7
+DERIVATIVE_STEP = 1e-7
 
 #: A pose, or another tree of unknowns with a leading batch dimension.
 S = TypeVar("S")
 
 
-class Normal(NamedTuple):
+class NormalEquations(NamedTuple):
     """A cost and its normal equations at one place per batch element."""
 
     cost: Tensor  # (B,)
@@ -78,7 +78,7 @@ def linearise(
     return torch.stack(columns, 1).unflatten(1, (7, 2)) * f[:, None], z
 
 
-def reprojection(
+def reprojection_residuals(
     T: Pose,
     f: Tensor,  # (B, 2) px
     c: Tensor,  # (B, 2) px
@@ -103,7 +103,7 @@ def _seen(T: Pose, xyz: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return Y[:, :2] * w, w, z[:, 0]
 
 
-def robust(square: Tensor, kernel: str | None, scale: float) -> tuple[Tensor, Tensor]:
+def robust_loss(square: Tensor, kernel: str | None, scale: float) -> tuple[Tensor, Tensor]:
     """Cost and weight of squared residuals under a robust kernel, the weights of iteratively reweighted least squares.
 
     Args:
@@ -135,15 +135,15 @@ def robust(square: Tensor, kernel: str | None, scale: float) -> tuple[Tensor, Te
     raise ValueError(f"robust: kernel is {kernel!r}, expected None, 'huber', 'cauchy' or 'geman_mcclure'")
 
 
-def weight_slope(square: Tensor, kernel: str | None, scale: float) -> Tensor:
-    """d weight / d square of :func:`robust`: how fast a kernel lets go; ≤ 0.
+def robust_weight_slope(square: Tensor, kernel: str | None, scale: float) -> Tensor:
+    """d weight / d square of :func:`robust_loss`: how fast a kernel lets go; ≤ 0.
 
     Raises:
         ValueError: an unknown kernel.
 
     Gradient: to ``square``.
     """
-    _, weight = robust(square, kernel, scale)
+    _, weight = robust_loss(square, kernel, scale)
     if kernel is None:
         return torch.zeros_like(square)
     k2 = scale * scale
@@ -221,15 +221,15 @@ def solve_spd(
         pivot = L.diagonal(dim1=-2, dim2=-1).amin(-1)  # NaN for a NaN matrix, and so not above the limit
         ok = (info == 0) & (pivot > MIN_PIVOT) & (rhs * 0 == 0).flatten(1).all(1)
         bad = ~ok[:, None, None]
-    if not surely_all(ok):
+    if not all_known(ok):
         L, A = torch.where(bad, eye, L), torch.where(bad, eye, A)
         rhs = rhs.masked_fill(bad, 0.0)
     start = torch.cholesky_solve(rhs.detach(), L)
-    x = start + torch.cholesky_solve(rhs - product(A, start), L)
+    x = start + torch.cholesky_solve(rhs - small_matmul(A, start), L)
     return (x * s)[:, :n].to(b.dtype), ok
 
 
-def implicit(equations: Callable[[Tensor], Tensor], g: Tensor) -> Tensor:
+def implicit_step(equations: Callable[[Tensor], Tensor], g: Tensor) -> Tensor:
     """The zero displacement (B, n) of an optimum, with the gradient of where the optimum lies.
 
     The implicit function theorem with the whole derivative of the equations: what Gauss–Newton leaves out (residuals
@@ -246,8 +246,8 @@ def implicit(equations: Callable[[Tensor], Tensor], g: Tensor) -> Tensor:
     if not has_graph(g):
         return torch.zeros_like(g)
     with torch.no_grad():
-        steps = DIFFERENCE * torch.eye(n, dtype=g.dtype, device=g.device)[:, None].expand(n, *g.shape)
-        slope = (torch.stack([equations(step) for step in steps], -1) - g.detach()[..., None]) / DIFFERENCE
+        steps = DERIVATIVE_STEP * torch.eye(n, dtype=g.dtype, device=g.device)[:, None].expand(n, *g.shape)
+        slope = (torch.stack([equations(step) for step in steps], -1) - g.detach()[..., None]) / DERIVATIVE_STEP
         inverse, info = torch.linalg.inv_ex(slope)
         known = (info == 0) & inverse.isfinite().flatten(1).all(1)
         inverse = torch.where(known[:, None, None], inverse, 0.0)
@@ -263,16 +263,16 @@ def gauss_newton_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
     """The pose after one Gauss–Newton step on its normal equations, and ``ok`` (B,); unchanged where H is singular.
 
     From a detached optimum this step is the implicit derivative of the optimum up to terms of the size of the
-    residuals, which :func:`implicit` has as well. The step moves the pose by Cayley's map, a rotation that agrees with
-    exp to second order and needs no transcendental function.
+    residuals, which :func:`implicit_step` has as well. The step moves the pose by Cayley's map, a rotation that agrees
+    with exp to second order and needs no transcendental function.
 
     Gradient: to T, H and g. Raises ValueError for wrong shapes.
     """
     xi, ok = solve_spd(H, -g[..., None])
-    return move(T, xi[..., 0]), ok
+    return move_pose(T, xi[..., 0]), ok
 
 
-def move(
+def move_pose(
     T: Pose,
     xi: Tensor,  # (B, 6)
 ) -> Pose:
@@ -290,7 +290,7 @@ def move(
     return Pose(M[..., :3], M[..., 3] + (t + t))
 
 
-def trial_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
+def trial_pose_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
     """:func:`gauss_newton_step` in a few operations, for proposals that are judged afterwards by their cost.
 
     The system is solved in float64 by elimination and not refined. Where it has no solution, or one that is no number,
@@ -301,11 +301,11 @@ def trial_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
     check("trial_step", H=(H, "B 6 6"), g=(g, "B 6"))
     with torch.no_grad():
         xi, info = torch.linalg.solve_ex(H.double(), -g.double())
-        return move(T, xi.to(g.dtype)), info == 0
+        return move_pose(T, xi.to(g.dtype)), info == 0
 
 
 def minimise(
-    evaluate: Callable[[S], Normal],
+    evaluate: Callable[[S], NormalEquations],
     T: S,
     steps: int,
     *,
@@ -336,22 +336,22 @@ def minimise(
         if k == steps - 1:
             found = evaluate(proposal).cost if cost is None else cost(proposal)
             better = ok & (found < best.cost)
-            if surely_all(better):
+            if all_known(better):
                 return proposal, found
-            return choose(better, proposal, T), torch.where(better, found, best.cost)
+            return select_batch(better, proposal, T), torch.where(better, found, best.cost)
         there = evaluate(proposal)
         better = ok & (there.cost < best.cost)
-        if surely_all(better):
+        if all_known(better):
             T, best = proposal, there
             factor = factor * 0.1
             continue
-        T = choose(better, proposal, T)
-        best = Normal(*(_where(better, a, b) for a, b in zip(there, best, strict=True)))
+        T = select_batch(better, proposal, T)
+        best = NormalEquations(*(_where(better, a, b) for a, b in zip(there, best, strict=True)))
         factor = torch.where(better, factor * 0.1, factor * 10)
     return T, best.cost
 
 
-def choose(mask: Tensor, new: S, old: S) -> S:
+def select_batch(mask: Tensor, new: S, old: S) -> S:
     """Batch elements of ``new`` where ``mask`` (B,) holds, of ``old`` elsewhere; trees of tensors (B, …) or None.
 
     Gradient: to the chosen ones.

@@ -14,27 +14,27 @@ import torch
 from torch import Tensor
 
 
-def determinant(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
+def determinant_2x2(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
     """a d − b c. Gradient: to all."""
     return a * d - b * c
 
 
-def adjugate(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def adjugate_2x2(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Entries ((d, −b), (−c, a)): the inverse times the determinant. Gradient: to all."""
     return d, -b, -c, a
 
 
-def inverse(a: Tensor, b: Tensor, c: Tensor, d: Tensor, *, least: float) -> Tensor:
+def inverse_2x2(a: Tensor, b: Tensor, c: Tensor, d: Tensor, *, least: float) -> Tensor:
     """Entries (4, …) of the inverse; a determinant not larger than ``least`` in size, or no number, counts as that.
 
     Gradient: to all; finite where the determinant counts as ``least``.
     """
-    det = determinant(a, b, c, d)
+    det = determinant_2x2(a, b, c, d)
     det = torch.where(det.abs() > least, det, torch.full_like(det, least))
-    return torch.stack(adjugate(a, b, c, d)) / det
+    return torch.stack(adjugate_2x2(a, b, c, d)) / det
 
 
-def eigenvalues(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
+def eigenvalues_2x2(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
     """The smaller and the larger eigenvalue of ((a, b), (b, c)).
 
     Gradient: to all; where both are equal that of their mean.
@@ -46,27 +46,27 @@ def eigenvalues(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
     return middle - split, middle + split
 
 
-def quadratic(x: Tensor, y: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+def quadratic_form(x: Tensor, y: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     """(x, y) ((a, b), (b, c)) (x, y)ᵀ. Gradient: to all."""
     return x * x * a + 2 * x * y * b + y * y * c
 
 
-def upper(S: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def upper_triangle(S: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Entries a, b, c of symmetric matrices (…, 2, 2), whose lower left is not read. Gradient: to ``S``."""
     return S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
 
 
-def product(A: Tensor, B: Tensor) -> Tensor:
+def small_matmul(A: Tensor, B: Tensor) -> Tensor:
     """Matrices (…, m, k) times (…, k, n). Gradient: to both."""
     return (A[..., :, :, None] * B[..., None, :, :]).sum(-2)
 
 
-def product_of_planes(A: Tensor, B: Tensor) -> Tensor:
+def matmul_planes(A: Tensor, B: Tensor) -> Tensor:
     """Planes (m, k, …) times (k, n, …). Gradient: to both."""
     return (A[:, :, None] * B[None]).sum(1)
 
 
-def turned(
+def rotate_planes(
     R: Tensor,  # (B, m, 3)
     x: Tensor,  # (B, 3, N)
 ) -> Tensor:
@@ -79,7 +79,7 @@ def turned(
     return R[:, :, 0] * first + R[:, :, 1] * second + R[:, :, 2] * third
 
 
-def cofactors(A: Tensor) -> Tensor:
+def cofactor_planes(A: Tensor) -> Tensor:
     """Cofactor matrices of planes (3, 3, …): row i is the cross product of the two rows that follow it in the circle.
 
     Gradient: to ``A``.

@@ -26,35 +26,35 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry.checks import all_finite, is_static
-from dhtorch.geometry.determinism import CHUNK, LANES
-from dhtorch.geometry.linalg import adjugate, determinant, eigenvalues
-from dhtorch.geometry.patches import QUANTISATION
-from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, Pyramid
-from dhtorch.ops import loader as native
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES, MAX_CHUNK_POINTS
+from dhtorch.geometry.linalg import adjugate_2x2, determinant_2x2, eigenvalues_2x2
+from dhtorch.geometry.patches import QUANTISATION_VARIANCE
+from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, Pyramid
+from dhtorch.ops import loader
 
 #: Width of a cell, px of its level, and the finest level with cells. Coarse levels only say where the next one starts:
 #: there the points of a cell share one search. Cells are nested, so that they share its start as well.
-CELL, CELL_LEVEL = 4, 2
+CELL_PX, CELL_LEVEL = 4, 2
 
 #: On the finest level the sixth step on a map leaps to where the steps seem to lead; ratios of successive steps beyond
 #: these limits are not believed.
-LEAP, RATIO = 6, (-0.9, 0.9)
+AITKEN_STEP, AITKEN_RATIO_RANGE = 6, (-0.9, 0.9)
 
 #: On coarse levels a step has converged at so many times ``epsilon_px``.
-COARSE_EPSILON = 4.0
+COARSE_EPSILON_FACTOR = 4.0
 
 #: Gauss-Newton steps on one map.
-STEPS = 8
+STEPS_PER_MAP = 8
 
 #: Radii of a point's successive maps at the top, where nothing is known yet and few cells are to be searched, between,
 #: and on the finest level. A map of radius r covers the offsets from -r to r + 1.
-TOP, BETWEEN, FINEST = (2, 2, 2, 2), (1, 2, 2), (1, 2, 2, 2)
+TOP_RADII, MIDDLE_RADII, FINEST_RADII = (2, 2, 2, 2), (1, 2, 2), (1, 2, 2, 2)
 
 #: A ratio of contrasts beyond these limits is not believed.
-GAIN = (0.2, 5.0)
+CONTRAST_RATIO_RANGE = (0.2, 5.0)
 
 #: What may be taken out of the difference of two windows.
-NORMALISE = ("none", "bias", "gain_bias")
+NORMALISATIONS = ("none", "bias", "gain_bias")
 
 
 class SearchOptions(NamedTuple):
@@ -78,7 +78,7 @@ class _Pair(NamedTuple):
     high: Tensor  # (2, 1) px of the level
 
 
-class _Windows(NamedTuple):
+class _Templates(NamedTuple):
     """What is known of the windows of image 0, whatever image 1 shows."""
 
     x: Tensor  # (2, M) px of the level
@@ -95,7 +95,7 @@ class _State(NamedTuple):
     held: Tensor  # (M,) is still on its map
 
 
-def search(
+def search_displacements(
     source: Pyramid,
     target: Pyramid,
     o: SearchOptions,
@@ -115,53 +115,57 @@ def search(
     """
     x, d = x.contiguous(), d.contiguous()
     top = min(len(source.levels), len(target.levels)) - 1
-    rough = o._replace(epsilon_px=o.epsilon_px * COARSE_EPSILON)
+    rough = o._replace(epsilon_px=o.epsilon_px * COARSE_EPSILON_FACTOR)
 
     def start(level: int, x: Tensor, d: Tensor, batch: Tensor, begun: Tensor | None = None) -> Tensor:
         """Where the search on ``level`` starts: the displacement found on the level above."""
         if level == top:
             return d * 0.5**top
         if begun is not None and level + 1 >= near_levels:
-            return for_some(~begun, lambda *cold: (start(level, *cold),), (d * 0.5**level,), (x, d, batch))[0]
+            return masked_apply(~begun, lambda *cold: (start(level, *cold),), (d * 0.5**level,), (x, d, batch))[0]
         if alike and level + 1 >= CELL_LEVEL:
             return _by_cell(source, level + 1, partial(coarse, level + 1, begun=None), x, d, batch) * 2
         return coarse(level + 1, x, d, batch, begun) * 2
 
     def coarse(level: int, x: Tensor, d: Tensor, batch: Tensor, begun: Tensor | None) -> Tensor:
         pair = _Pair(source, target, rough, level, *target.bounds(level))
-        radii = TOP if level == top or level + 1 == near_levels else BETWEEN
+        radii = TOP_RADII if level == top or level + 1 == near_levels else MIDDLE_RADII
         pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
         every = torch.ones_like(batch, dtype=torch.bool)
         return _descend(pair, radii, pixel, start(level, x, d, batch, begun), batch, every)[0]
 
     pair = _Pair(source, target, o, 0, *target.bounds(0))
-    d, held, textured, A = _descend(pair, FINEST if top else TOP, x, start(0, x, d, batch, begun), batch, known)
-    return d, known & textured & held & within(x + d, pair.low, pair.high), A
+    d, held, textured, A = _descend(
+        pair, FINEST_RADII if top else TOP_RADII, x, start(0, x, d, batch, begun), batch, known
+    )
+    return d, known & textured & held & is_between(x + d, pair.low, pair.high), A
 
 
-def step(
+def lucas_kanade_step(
     source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, x_1: Tensor, batch: Tensor
 ) -> tuple[Tensor, Tensor]:
     """One Gauss-Newton step (2, M), to be subtracted from ``x_1``, read from pixels of the finest level and carrying a
     graph; and who is textured (M,)."""
     G = _project(source.windows(0, x, batch, o.window), o.normalise)
-    J = target.windows(0, x_1, batch, o.window, (GREY,))
+    J = target.windows(0, x_1, batch, o.window, (GREY_PLANE,))
     moments = _moments(G, o.normalise)
     A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
     found = _steps((_kernels(G, o.normalise) * J).sum(-1), moments, A_inv)
-    return found if o.normalise != "gain_bias" else found[:2] / found[2].clamp(*GAIN), textured
+    return found if o.normalise != "gain_bias" else found[:2] / found[2].clamp(*CONTRAST_RATIO_RANGE), textured
 
 
-def squares(source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
+def squared_differences(
+    source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, d: Tensor, batch: Tensor
+) -> Tensor:
     """Squared grey differences between the windows at ``x`` and ``x + d`` after normalisation, summed: (M,)."""
     sums = []
-    for p, q, b in zip(*(y.split(CHUNK, -1) for y in (x, x + d, batch)), strict=True):
-        T = source.windows(0, p, b, o.window, (GREY,))[0]
-        J = target.windows(0, q, b, o.window, (GREY,))[0]
+    for p, q, b in zip(*(y.split(MAX_CHUNK_POINTS, -1) for y in (x, x + d, batch)), strict=True):
+        T = source.windows(0, p, b, o.window, (GREY_PLANE,))[0]
+        J = target.windows(0, q, b, o.window, (GREY_PLANE,))[0]
         if o.normalise != "none":
             T, J = T - T.mean(-1, keepdim=True), J - J.mean(-1, keepdim=True)
         if o.normalise == "gain_bias":
-            J = J / _gain((T * J).sum(-1), (T * T).sum(-1)).clamp(*GAIN)[:, None]
+            J = J / _gain((T * J).sum(-1), (T * T).sum(-1)).clamp(*CONTRAST_RATIO_RANGE)[:, None]
         sums.append((J - T).square().sum(-1))
     total = torch.cat(sums)
     return torch.where(total.isfinite(), total, torch.full_like(total, o.window**2))
@@ -170,14 +174,14 @@ def squares(source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, d: Te
 def window_covariance(A: Tensor, variance: Tensor) -> Tensor:
     """s² A⁻¹ (2, 2, M). The small eigenvalue of A is raised to 1e-5 of the large one, which float32 can represent."""
     a, b, c = torch.where(A.isfinite(), A, torch.zeros_like(A)).double()
-    small, _ = eigenvalues(a, b, c)
+    small, _ = eigenvalues_2x2(a, b, c)
     lift = (1e-5 * (a + c - small).clamp_min(1e-4) - small).clamp_min(0)
     a, c = a + lift, c + lift
-    scale = variance.double().clamp_min(QUANTISATION) / determinant(a, b, b, c)
-    return (torch.stack(adjugate(a, b, b, c)) * scale).to(A.dtype).unflatten(0, (2, 2))
+    scale = variance.double().clamp_min(QUANTISATION_VARIANCE) / determinant_2x2(a, b, b, c)
+    return (torch.stack(adjugate_2x2(a, b, b, c)) * scale).to(A.dtype).unflatten(0, (2, 2))
 
 
-def for_some(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: tuple[Any, ...]):
+def masked_apply(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: tuple[Any, ...]):
     """``values`` (each (..., M)), replaced where ``wanted`` (M,) by what ``fn(*columns)`` returns.
 
     ``columns`` are tensors (..., M) or trees of them. Where shapes may depend on values, ``fn`` sees only the wanted
@@ -201,8 +205,8 @@ def _picked(column: Any, some: Tensor) -> Any:
 
 
 def _whole_lanes(index: Tensor) -> Tensor:
-    """An index (M,) filled up to whole ``LANES`` by copies of its first."""
-    return torch.cat([index, index[:1].expand(-len(index) % LANES)])
+    """An index (M,) filled up to whole ``ELEMENTWISE_LANES`` by copies of its first."""
+    return torch.cat([index, index[:1].expand(-len(index) % ELEMENTWISE_LANES)])
 
 
 def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
@@ -210,7 +214,7 @@ def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, b
 
     Where shapes may depend on values it is computed once per cell.
     """
-    size = CELL * 2**level
+    size = CELL_PX * 2**level
     H, W = pyramid.hw()
     columns, rows = -(-W // size), -(-H // size)
     lowest, highest = pyramid.bounds()
@@ -236,19 +240,19 @@ def _descend(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: T
     """
     o = pair.o
     levels = pair.source.levels[pair.level], pair.target.levels[pair.level]
-    if native.serves(*levels, x, d, batch, known) and levels[0].dtype == levels[1].dtype == x.dtype == torch.float32:
+    if loader.serves(*levels, x, d, batch, known) and levels[0].dtype == levels[1].dtype == x.dtype == torch.float32:
         return _compiled(pair, radii, x, d, batch, known)
     corner = pair.target.corner(pair.level, x + d) - radii[0]
     C, moments = _map(pair, radii[0], x, corner, batch)
     A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
-    windows = _Windows(x, batch, moments, A_inv)
-    live = known & textured & within(x + d, pair.low, pair.high)
-    first, *further = (min(STEPS, o.iterations - k * STEPS) for k in range(len(radii)))
+    windows = _Templates(x, batch, moments, A_inv)
+    live = known & textured & is_between(x + d, pair.low, pair.high)
+    first, *further = (min(STEPS_PER_MAP, o.iterations - k * STEPS_PER_MAP) for k in range(len(radii)))
     state = _on_map(pair, first, _steps(C, moments, A_inv), corner, x, _State(d, live, live))
     for radius, steps in zip(radii[1:], further, strict=True):
         if steps > 0:
             again = partial(_on_new_map, pair, radius, steps)
-            state = _State(*for_some(state.live, again, state, (windows, state)))
+            state = _State(*masked_apply(state.live, again, state, (windows, state)))
     return state.d, state.held, textured, moments[2:5]
 
 
@@ -275,14 +279,14 @@ def _compiled(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: 
         iterations=o.iterations,
         level=pair.level,
         pad=pair.source.pad,
-        normalise=NORMALISE.index(o.normalise),
+        normalise=NORMALISATIONS.index(o.normalise),
         epsilon=o.epsilon_px,
         min_eigenvalue=o.min_eigenvalue,
     )
     return found, held, textured, A
 
 
-def _on_new_map(pair: _Pair, radius: int, steps: int, windows: _Windows, state: _State) -> _State:
+def _on_new_map(pair: _Pair, radius: int, steps: int, windows: _Templates, state: _State) -> _State:
     """:func:`_on_map` with a map around where the points are, of windows whose moments are known."""
     x, batch, moments, A_inv = windows
     corner = pair.target.corner(pair.level, x + state.d) - radius
@@ -311,21 +315,21 @@ def _on_map(
         hat = torch.rsub((p[:, None] - node).abs_(), 1).clamp_min_(0)  # (2, n, M) bilinear weights, 1 - |p - node|
         last, step = step, ((field * hat[0]).sum(2) * hat[1]).sum(1)
         if len(field) == 3:
-            step = step[:2] / step[2].clamp(*GAIN)
-        if k == LEAP and k < steps and pair.level == 0:
+            step = step[:2] / step[2].clamp(*CONTRAST_RATIO_RANGE)
+        if k == AITKEN_STEP and k < steps and pair.level == 0:
             step = _leap(last, step, o.epsilon_px)
         p = p - step
     p = torch.where(state.live & all_finite(p, 0), p, start)
     held = (p == p.clamp(0, field.shape[1] - 1.0)).all(0)
     restless = ~held | ((step * step).sum(0) > o.epsilon_px**2)
-    live = state.live & restless & within(p, pair.low - corner, pair.high - corner)
+    live = state.live & restless & is_between(p, pair.low - corner, pair.high - corner)
     return _State(p + corner - x, live, held)
 
 
 def _leap(last: Tensor, step: Tensor, epsilon_px: float) -> Tensor:
     """The sum of all steps to come, as shrinking by one ratio as from the ``last`` to this ``step`` (Aitken)."""
     ratio = (step * last).sum(0) / (last * last).sum(0).clamp_min(epsilon_px**2)
-    return torch.where((step * step).sum(0) > epsilon_px**2, step / (1 - ratio.clamp(*RATIO)), step)
+    return torch.where((step * step).sum(0) > epsilon_px**2, step / (1 - ratio.clamp(*AITKEN_RATIO_RANGE)), step)
 
 
 def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:
@@ -343,11 +347,15 @@ def _map(pair: _Pair, radius: int, x: Tensor, corner: Tensor, batch: Tensor, mom
     """Map (K, n, n, M) of the windows at ``x`` (2, M) that begins at the target's pixels ``corner``; the moments."""
     o, w = pair.o, pair.o.window
     side = w + 2 * radius + 1
-    planes = (GRAD_X, GRAD_Y) if moments is not None and o.normalise != "gain_bias" else (GRAD_X, GRAD_Y, GREY)
+    planes = (
+        (GRAD_X_PLANE, GRAD_Y_PLANE)
+        if moments is not None and o.normalise != "gain_bias"
+        else (GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE)
+    )
     first_0, fraction = pair.source.locate(pair.level, x, batch, w // 2, planes)
-    first_1, _ = pair.target.locate(pair.level, corner + radius, batch, w // 2 + radius, (GREY,))
+    first_1, _ = pair.target.locate(pair.level, corner + radius, batch, w // 2 + radius, (GREY_PLANE,))
     maps, sums = [], []
-    for i, j, f in zip(*(y.split(CHUNK, -1) for y in (first_0, first_1, fraction)), strict=True):
+    for i, j, f in zip(*(y.split(MAX_CHUNK_POINTS, -1) for y in (first_0, first_1, fraction)), strict=True):
         G = _project(pair.source.read(pair.level, i, w, None if pair.level else f), o.normalise)
         if moments is None:
             sums.append(_moments(G, o.normalise))
@@ -391,12 +399,12 @@ def _gain(correlation: Tensor, energy: Tensor) -> Tensor:
 def _inverse(A: Tensor, min_eigenvalue: float) -> tuple[Tensor, Tensor]:
     """Inverse (2, 2, M) of A (3, M), zero where its small eigenvalue is not above the limit; and where it is (M,)."""
     a, b, c = A.double()
-    textured = eigenvalues(a, b, c)[0] > min_eigenvalue
-    det = torch.where(textured, determinant(a, b, b, c), torch.ones_like(a))
-    found = torch.stack(adjugate(a, b, b, c)) / det
+    textured = eigenvalues_2x2(a, b, c)[0] > min_eigenvalue
+    det = torch.where(textured, determinant_2x2(a, b, b, c), torch.ones_like(a))
+    found = torch.stack(adjugate_2x2(a, b, b, c)) / det
     return torch.where(textured, found, torch.zeros_like(found)).to(A.dtype).unflatten(0, (2, 2)), textured
 
 
-def within(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
+def is_between(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Whether points (2, M) lie between bounds; NaN does not."""
     return ((x >= low) & (x <= high)).all(0)

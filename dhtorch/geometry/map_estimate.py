@@ -11,29 +11,29 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import is_static, surely_all
-from dhtorch.geometry.covariance import median
-from dhtorch.geometry.determinism import SUM_LANES, filled
+from dhtorch.geometry.checks import all_known, is_static
+from dhtorch.geometry.covariance import masked_median
+from dhtorch.geometry.determinism import SUM_LANES, round_up
 from dhtorch.geometry.least_squares import (
-    Normal,
-    choose,
+    NormalEquations,
     minimise,
     normal_equations,
-    robust,
+    robust_loss,
+    robust_weight_slope,
+    select_batch,
     solve_spd,
-    weight_slope,
 )
-from dhtorch.geometry.linalg import product
+from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.reprojection_problem import (
-    Problem,
+    PoseDepthProblem,
     Unknowns,
-    equations,
     linearise_tracks,
-    prior,
-    residuals,
-    squares,
-    squares_at,
-    trial_step,
+    pose_normal_equations_at,
+    shutter_prior,
+    squared_residuals,
+    squared_residuals_at,
+    trial_unknowns_step,
+    whitened_residuals,
 )
 from dhtorch.geometry.se3 import Pose
 
@@ -44,19 +44,19 @@ MIN_NOISE_PX, MAX_NOISE_PX = 0.1, 5.0
 MEDIAN_2D, MEDIAN_1D = 1.17741, 0.67449
 
 #: Precision (1/rad²) of a turn that is held at zero.
-RIGID = 1e18
+GLOBAL_SHUTTER_PRECISION = 1e18
 
 #: Parameters that a pose takes from its residuals.
-PARAMETERS = 6
+N_POSE_PARAMETERS = 6
 
 #: Least believed ratio of mean psi′ to mean w: residuals all beyond the bend would make it negative.
-MIN_RISE = 0.1
+MIN_PSI_SLOPE = 0.1
 
 #: Nearest parts of the near tracks that alone may show a translation, and how many tracks make such a part.
-NEAREST, MIN_PART = (0.25, 0.5), 20
+NEAREST_FRACTIONS, MIN_FRACTION_TRACKS = (0.25, 0.5), 20
 
 #: Cost (in units of its variance) that may be gained or lost without being asked why.
-SLACK = 1.0
+COST_SLACK = 1.0
 
 
 class FitOptions(NamedTuple):
@@ -73,7 +73,7 @@ class FitOptions(NamedTuple):
     steps: int = 6
 
 
-class Solution(NamedTuple):
+class MapSolution(NamedTuple):
     """The unknowns at the optimum, and the weights under which it is one."""
 
     at: Unknowns  # with a turn, zero where none was believed
@@ -84,7 +84,7 @@ class Solution(NamedTuple):
 
 
 @torch.no_grad()
-def most_probable(problem: Problem, start: Pose, o: FitOptions) -> Solution:
+def estimate_map_pose(problem: PoseDepthProblem, start: Pose, o: FitOptions) -> MapSolution:
     """Solve for the near tracks, then for all, then for all with a turn; go on only where that is borne out.
 
     *Far tracks* are believed unless the near tracks' robust cost rises by more than ``max_rise`` with them. A *turn* is
@@ -103,50 +103,50 @@ def most_probable(problem: Problem, start: Pose, o: FitOptions) -> Solution:
     whole, (problem, close) = problem, _used_first(problem)
     at = Unknowns(start, None)
     straight = torch.zeros_like(start.t)
-    none, far, rigid = (torch.full_like(start.t[:, 0], x) for x in (0.0, o.far_weight, RIGID))
+    none, far, rigid = (torch.full_like(start.t[:, 0], x) for x in (0.0, o.far_weight, GLOBAL_SHUTTER_PRECISION))
 
     def solve(
-        at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int, problem: Problem = problem
+        at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int, problem: PoseDepthProblem = problem
     ) -> tuple[Unknowns, Tensor]:
-        evaluate, judge = equations(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
-        return minimise(evaluate, at, steps, cost=judge, step=trial_step)
+        evaluate, judge = pose_normal_equations_at(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
+        return minimise(evaluate, at, steps, cost=judge, step=trial_unknowns_step)
 
     half = o.near_steps // 2
-    near, _ = solve(at, noise_scale(close, at), none, rigid, half, close)
-    near, _ = solve(near, noise_scale(close, near), none, rigid, o.near_steps - half, close)
-    both, _ = solve(near, noise_scale(problem, near), far, rigid, o.steps)
-    noise, precision = noise_scale(problem, both), rigid
+    near, _ = solve(at, estimate_noise_variance(close, at), none, rigid, half, close)
+    near, _ = solve(near, estimate_noise_variance(close, near), none, rigid, o.near_steps - half, close)
+    both, _ = solve(near, estimate_noise_variance(problem, near), far, rigid, o.steps)
+    noise, precision = estimate_noise_variance(problem, both), rigid
     if o.turn_sigma > 0:
         both, least = solve(both, noise, far, rigid, o.steps // 2)
         both = both._replace(turn=straight)
         loose = torch.full_like(rigid, o.turn_sigma**-2)
         turned, lower = solve(both, noise, far, loose, o.steps)
-        worth = least - lower > o.turn_gain * least + SLACK
-        both, precision = choose(worth, turned, both), torch.where(worth, loose, rigid)
+        worth = least - lower > o.turn_gain * least + COST_SLACK
+        both, precision = select_batch(worth, turned, both), torch.where(worth, loose, rigid)
     near = near._replace(turn=straight)
     both = both if o.turn_sigma > 0 else both._replace(turn=straight)
     scales = noise[:, : close.near.shape[1]]
     cost_near, cost_both = (_near_cost(close, x, scales, o) for x in (near, both))
-    believed = cost_both <= cost_near * (1 + o.max_rise) + SLACK
-    at, precision = choose(believed, both, near), torch.where(believed, precision, rigid)
+    believed = cost_both <= cost_near * (1 + o.max_rise) + COST_SLACK
+    at, precision = select_batch(believed, both, near), torch.where(believed, precision, rigid)
     far = torch.where(believed, far, none)
-    noise = noise_scale(problem, at)
+    noise = estimate_noise_variance(problem, at)
     translates = _translates(problem, at, noise, far, precision, o)
     of_near, of_far = (torch.where(kind, noise, 0.0).amax(-1, keepdim=True) for kind in (~problem.far, problem.far))
     noise = torch.where(whole.far, of_far, of_near.clamp_min(MIN_NOISE_PX**2))
-    return Solution(at, noise, far, precision, translates)
+    return MapSolution(at, noise, far, precision, translates)
 
 
-def _used_first(problem: Problem) -> tuple[Problem, Problem]:
+def _used_first(problem: PoseDepthProblem) -> tuple[PoseDepthProblem, PoseDepthProblem]:
     """The used tracks and the near tracks, each problem as wide as its fullest pair needs; near tracks come first."""
     if is_static(problem.near):
         return problem, problem
     used = problem.near | problem.far
     order = (used.to(torch.uint8) + problem.near.to(torch.uint8)).argsort(dim=1, descending=True, stable=True)
 
-    def some(wanted: Tensor) -> Problem:
+    def some(wanted: Tensor) -> PoseDepthProblem:
         most = int(wanted.sum(1).max())
-        index = order[:, : filled(most, SUM_LANES)]
+        index = order[:, : round_up(most, SUM_LANES)]
 
         def pick(x: Tensor) -> Tensor:
             return x.gather(-1, index.view(len(x), *[1] * (x.ndim - 2), -1).expand(*x.shape[:-1], -1))
@@ -157,33 +157,35 @@ def _used_first(problem: Problem) -> tuple[Problem, Problem]:
     return some(used), some(problem.near)
 
 
-def _translates(problem: Problem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: FitOptions) -> Tensor:
+def _translates(
+    problem: PoseDepthProblem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: FitOptions
+) -> Tensor:
     """Whether (B,) the cost is far below that of the best rotation without translation, under the same noise."""
 
     free = noise.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # a trace of t would be a baseline to a far track
 
-    normal, judge = equations(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
+    normal, judge = pose_normal_equations_at(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
 
-    def evaluate(at: Unknowns) -> Normal:
+    def evaluate(at: Unknowns) -> NormalEquations:
         there, H, g = normal(at)
-        return Normal(there, H * free * free[:, None] + torch.diag(1 - free), g * free)
+        return NormalEquations(there, H * free * free[:, None] + torch.diag(1 - free), g * free)
 
     still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
-    turned, rotation = minimise(evaluate, still, o.steps, cost=judge, step=trial_step)
-    shown = rotation - judge(at) > o.translation_gain * rotation + SLACK
-    if surely_all(shown):
+    turned, rotation = minimise(evaluate, still, o.steps, cost=judge, step=trial_unknowns_step)
+    shown = rotation - judge(at) > o.translation_gain * rotation + COST_SLACK
+    if all_known(shown):
         return shown
     costs = [_costs(problem, x, noise, o) for x in (turned, at)]
-    for part in NEAREST:
+    for part in NEAREST_FRACTIONS:
         nearest = _nearest(problem, part)
         share = torch.where(nearest, 1.0, torch.where(problem.near | problem.far, far[:, None], 0.0))
         without, found = ((each * share).sum(-1) for each in costs)
-        better = without - found > o.translation_gain * without + SLACK
-        shown = shown | (better & (nearest.sum(-1) >= MIN_PART))
+        better = without - found > o.translation_gain * without + COST_SLACK
+        shown = shown | (better & (nearest.sum(-1) >= MIN_FRACTION_TRACKS))
     return shown
 
 
-def _nearest(problem: Problem, part: float) -> Tensor:
+def _nearest(problem: PoseDepthProblem, part: float) -> Tensor:
     """The near tracks (B, N) of the shortest depth, ``part`` of all, and those just as deep."""
     inverse = torch.where(problem.near, problem.inverse, 0.0)
     last = (problem.near.sum(-1, keepdim=True) * part).ceil().long().sub(1).clamp_min(0)
@@ -191,19 +193,19 @@ def _nearest(problem: Problem, part: float) -> Tensor:
 
 
 @torch.no_grad()
-def noise_scale(problem: Problem, at: Unknowns, rounds: int = 3) -> Tensor:
+def estimate_noise_variance(problem: PoseDepthProblem, at: Unknowns, rounds: int = 3) -> Tensor:
     """Variance (B, N) px² of a residual coordinate, estimated from medians; one for the near, one for the far tracks.
 
     Medians know nothing of the scale that the sensor's noise adds to a near residual; so the estimate is repeated with
     what the last one found.
     """
     noise = torch.ones_like(problem.inverse)
-    square_of = squares_at(problem, at)
+    square_of = squared_residuals_at(problem, at)
     for _ in range(rounds):
         square, front = square_of(noise)
         size = square.sqrt()
-        near = median(size, problem.near & front) / MEDIAN_2D
-        far = median(size, problem.far & front) / MEDIAN_1D
+        near = masked_median(size, problem.near & front) / MEDIAN_2D
+        far = masked_median(size, problem.far & front) / MEDIAN_1D
         far = torch.where(problem.far.any(-1, keepdim=True), far, near)
         factor = torch.where(problem.far, far, near)
         noise = (noise * factor * factor).clamp(MIN_NOISE_PX**2, MAX_NOISE_PX**2)
@@ -211,7 +213,7 @@ def noise_scale(problem: Problem, at: Unknowns, rounds: int = 3) -> Tensor:
 
 
 @torch.no_grad()
-def pose_covariance(problem: Problem, solution: Solution, o: FitOptions) -> tuple[Tensor, Tensor]:
+def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOptions) -> tuple[Tensor, Tensor]:
     """Covariance (B, 9, 9) of (rotation, translation, turn), and ``ok`` (B,); zero where not ok.
 
     Neither the far weight nor a robust weight is an inverse variance, so this is the sandwich A⁻¹ M A⁻¹ of an
@@ -223,8 +225,8 @@ def pose_covariance(problem: Problem, solution: Solution, o: FitOptions) -> tupl
     Source: P. Huber, "Robust Statistics", 1981, section 7.6.
     """
     linear = linearise_tracks(problem, solution.at)
-    square = squares(problem, linear, solution.noise)
-    _, weight = robust(square, o.kernel, o.bend)
+    square = squared_residuals(problem, linear, solution.noise)
+    _, weight = robust_loss(square, o.kernel, o.bend)
     bread, meat = torch.zeros_like(square), torch.zeros_like(square)
     near_weight = torch.ones_like(solution.far_weight)
     for mask, omega, size in ((problem.near, near_weight, 2), (problem.far, solution.far_weight, 1)):
@@ -232,24 +234,24 @@ def pose_covariance(problem: Problem, solution: Solution, o: FitOptions) -> tupl
         rise, scatter = _rise_and_scatter(square, weight, used, size, o)
         bread = torch.where(used, weight * (omega * rise)[:, None], bread)
         meat = torch.where(used, weight * weight * (omega * omega * scatter)[:, None], meat)
-    rows = residuals(problem, linear, solution.noise).double()
+    rows = whitened_residuals(problem, linear, solution.noise).double()
     A, _ = normal_equations(rows, bread.double(), block=SUM_LANES)
     M, _ = normal_equations(rows, meat.double(), block=SUM_LANES)
-    free = o.turn_sigma**-2 if o.turn_sigma > 0 else RIGID
-    known = torch.diag_embed(prior(torch.full_like(solution.turn_precision, free).double()))
+    free = o.turn_sigma**-2 if o.turn_sigma > 0 else GLOBAL_SHUTTER_PRECISION
+    known = torch.diag_embed(shutter_prior(torch.full_like(solution.turn_precision, free).double()))
     A, M = A + known, M + known
     inverse, ok = solve_spd(A, torch.eye(9, dtype=A.dtype, device=A.device).expand_as(A))
-    whole = product(product(inverse, M), inverse)
+    whole = small_matmul(small_matmul(inverse, M), inverse)
     return 0.5 * (whole + whole.transpose(1, 2)), ok
 
 
-def _costs(problem: Problem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
+def _costs(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
     """Robust cost (B, N) of every track, of weight 1."""
-    square, _ = squares_at(problem, at)(noise)
-    return robust(square, o.kernel, o.bend)[0]
+    square, _ = squared_residuals_at(problem, at)(noise)
+    return robust_loss(square, o.kernel, o.bend)[0]
 
 
-def _near_cost(problem: Problem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
+def _near_cost(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
     """Robust cost (B,) of the near tracks alone."""
     return torch.where(problem.near, _costs(problem, at, noise, o), 0.0).sum(-1)
 
@@ -260,17 +262,17 @@ def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o
     Both are corrected for the freedom that the pose takes from few residuals, the scatter once for itself and once for
     the scale of the noise, which comes from the same residuals.
     """
-    steeper = weight_slope(square, o.kernel, o.bend) * square * (2 / size) + weight
+    steeper = robust_weight_slope(square, o.kernel, o.bend) * square * (2 / size) + weight
 
     def total(x: Tensor) -> Tensor:
         return torch.where(used, x, 0.0).sum(-1)
 
     count = total(torch.ones_like(weight)).clamp_min(1.0)
     mean = total(steeper) / count
-    uneven = (total(steeper * steeper) / count - mean * mean) / (mean * mean).clamp_min(MIN_RISE**2)
+    uneven = (total(steeper * steeper) / count - mean * mean) / (mean * mean).clamp_min(MIN_PSI_SLOPE**2)
     free = size * count
-    few = 1 + PARAMETERS / free * uneven
-    spent = free / (free - PARAMETERS).clamp_min(1.0)
+    few = 1 + N_POSE_PARAMETERS / free * uneven
+    spent = free / (free - N_POSE_PARAMETERS).clamp_min(1.0)
     rise = mean / (total(weight) / count).clamp_min(1e-9)
     scatter = total(weight * weight * square) / size / total(weight * weight).clamp_min(1e-9)
-    return rise.clamp_min(MIN_RISE) / few, scatter * spent * spent
+    return rise.clamp_min(MIN_PSI_SLOPE) / few, scatter * spent * spent

@@ -14,13 +14,13 @@ from torch import Tensor
 from torch.linalg import cross
 
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.linalg import cofactors
+from dhtorch.geometry.linalg import cofactor_planes
 
 #: Triples flatter than this (height over longest side) count as collinear.
-MIN_HEIGHT = 1e-3
+MIN_HEIGHT_RATIO = 1e-3
 
 #: Cosine of the smallest angle between two rays, a microradian.
-MAX_COSINE = 1 - 1e-12
+MAX_RAY_COSINE = 1 - 1e-12
 
 
 def p3p(
@@ -90,7 +90,7 @@ def p3p_of_planes(
         a = a / longest
         total = a.sum(0)
         flat = total * total - 2 * (a * a).sum(0)  # (4 × area)², by Heron's formula
-        sound = (flat > 4 * MIN_HEIGHT**2) & (m.amax(0) < MAX_COSINE) & (longest < torch.inf)
+        sound = (flat > 4 * MIN_HEIGHT_RATIO**2) & (m.amax(0) < MAX_RAY_COSINE) & (longest < torch.inf)
         d, step = _polish(_ranges(m, a), m, a)
         # Newton's method squares the error: a short step has arrived.
         valid = sound & (step < 1e-3) & (d.amin(0) > 1e-9)
@@ -107,7 +107,7 @@ def _ranges(m: Tensor, a: Tensor) -> Tensor:
     first, second = (cones * (gamma * gamma + 1).rsqrt()).unbind(2)
     split, other = gamma * first + second, first - gamma * second  # det(split) = 0
     # Planes g and h: split = g hᵀ + h gᵀ, and its cofactors are −p pᵀ with p = g × h, where the planes meet.
-    minors = cofactors(split)
+    minors = cofactor_planes(split)
     least, index = minors.diagonal(dim1=0, dim2=1).min(-1)
     p = _row(minors, index) * (-least).clamp_min(1e-300).rsqrt()
     eye = torch.eye(3, dtype=p.dtype, device=p.device).view(3, 3, *[1] * (p.ndim - 1))
@@ -144,7 +144,7 @@ def _outer_root(cones: Tensor) -> Tensor:
     It is made of functions that torch rounds alike wherever an element stands; sinh and pow are not among them.
     """
     k = (
-        (cofactors(cones)[:, :, :, None] * cones[:, :, None]).sum(0).sum(0).flatten(0, 1)
+        (cofactor_planes(cones)[:, :, :, None] * cones[:, :, None]).sum(0).sum(0).flatten(0, 1)
     )  # 3 det, 3 mixed terms and back: γ³, γ², γ, 1
     tiny = 1e-12 * k.abs().amax(0) + 1e-300
     _, third, c, last = (k / (k[0] + tiny.copysign(k[0]))).unbind(0)  # γ³ + 3 third γ² + 3 c γ + last = 0

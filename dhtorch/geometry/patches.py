@@ -14,32 +14,32 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import check, is_transformed
-from dhtorch.geometry.determinism import LANES
-from dhtorch.ops import loader as native
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES
+from dhtorch.ops import loader
 
 #: ITU-R BT.601 luma, the weights of ``cv2.cvtColor`` (``tests/geometry/test_patches.py``).
-LUMA = (0.299, 0.587, 0.114)
+LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 _THOUSANDTHS = (299.0, 587.0, 114.0)
 
 #: Numbers of patches that are summarised together: few enough to stay in cache, and to need no fresh memory pages.
-NUMBERS = 1 << 18
+MAX_CHUNK_NUMBERS = 1 << 18
 
 #: Operations of compiled code → the type of pixels that they read, and how many numbers they find.
-COMPILED = {"extremes": (torch.float32, 2), "brightness": (torch.uint8, 4), "texture": (torch.uint8, 1)}
+COMPILED_REDUCTIONS = {"extremes": (torch.float32, 2), "brightness": (torch.uint8, 4), "texture": (torch.uint8, 1)}
 
 #: Widest windows that compiled code reads, px.
-WIDEST = 16
+MAX_COMPILED_WINDOW_PX = 16
 
 #: Share of an image's pixels from which on windows of the whole image are faster than as many patches.
-WHOLE = 0.25
+WHOLE_IMAGE_RATIO = 0.25
 
 #: Variance of rounding grey values to 8 bits; no residual is believed to be smaller.
-QUANTISATION = 1 / (12 * 255**2)
+QUANTISATION_VARIANCE = 1 / (12 * 255**2)
 
 
-def summarise(
+def reduce_patches(
     image: Tensor,  # (B, C, H, W), planar or interleaved in memory
-    pixel: Tensor,  # (B, N, 2) int32, of :func:`pixels`
+    pixel: Tensor,  # (B, N, 2) int32, of :func:`containing_pixels`
     size: int,
     reduce: Callable[[Tensor], tuple[Tensor, ...]],
     *,
@@ -52,7 +52,7 @@ def summarise(
     with ``grey`` their grey values (size, size, P). Whatever it does pixel by pixel then runs along contiguous points.
     It must treat every point alike and may not count on P, which is a multiple of LANES: the last ones are there to
     fill up. A patch that would leave the image is moved back inside. ``compiled`` names the operation of
-    :data:`COMPILED` that does the same.
+    :data:`COMPILED_REDUCTIONS` that does the same.
 
     Raises:
         ValueError: wrong shapes, or an image smaller than a patch.
@@ -63,9 +63,9 @@ def summarise(
     sizes = check("lookup.summarise", image=(image, "B C H W"), pixel=(pixel, "B N 2"))
     B, N, C, H, W = (sizes[k] for k in "BNCHW")
     _must_fit("summarise", size, H, W)
-    flat, (b, c, v, u) = in_a_row(image)
-    if compiled is not None and size <= WIDEST and native.serves(flat, pixel):
-        kind, count = COMPILED[compiled]
+    flat, (b, c, v, u) = flatten_images(image)
+    if compiled is not None and size <= MAX_COMPILED_WINDOW_PX and loader.serves(flat, pixel):
+        kind, count = COMPILED_REDUCTIONS[compiled]
         if image.dtype == kind:
             found = image.new_empty(count, B, N, dtype=torch.float32)
             shape = (b, c, v, u, C, H, W, size)
@@ -77,10 +77,10 @@ def summarise(
     whole: Any = {"device": image.device, "dtype": middle.dtype}
     if B > 1:
         middle = middle + torch.arange(0, B * b, b, **whole)[:, None]
-    middle, fill = middle.flatten(), -(B * N) % LANES
+    middle, fill = middle.flatten(), -(B * N) % ELEMENTWISE_LANES
     if fill:
         middle = torch.nn.functional.pad(middle, (0, fill), value=(size // 2) * (u + v))
-    at_once = max(NUMBERS // (C * size * size * LANES), 1) * LANES
+    at_once = max(MAX_CHUNK_NUMBERS // (C * size * size * ELEMENTWISE_LANES), 1) * ELEMENTWISE_LANES
     read = partial(_read, flat, (C, c))
     compiling = torch.compiler.is_compiling()
     around = (_around.__wrapped__ if is_transformed() else _around)(size, (v, u), **whole)
@@ -97,11 +97,12 @@ def summarise(
 
 def whole_is_faster(hw: tuple[int, int], n: int, size: int) -> bool:
     """Whether windows of all pixels of an image are faster than the patches around n of them."""
-    return size % 2 == 1 and n >= WHOLE * hw[0] * hw[1]
+    return size % 2 == 1 and n >= WHOLE_IMAGE_RATIO * hw[0] * hw[1]
 
 
-def read_whole(found: Tensor, pixel: Tensor, size: int) -> Tensor:
-    """What was found (B, H, W) for every pixel's patch, at the pixels (B, N, 2) that :func:`summarise` would ask."""
+def gather_reduced(found: Tensor, pixel: Tensor, size: int) -> Tensor:
+    """What was found (B, H, W) for every pixel's patch, at the pixels (B, N, 2) that :func:`reduce_patches` would
+    ask."""
     x, y = _moved_inside(pixel, (found.shape[1], found.shape[2]), size)
     return found.flatten(1).gather(1, torch.add(x, y, alpha=found.shape[2]).long())
 
@@ -163,13 +164,13 @@ def _moved_inside(pixel: Tensor, hw: tuple[int, int], size: int) -> tuple[Tensor
     return u.clamp(before, hw[1] - after), v.clamp(before, hw[0] - after)
 
 
-def fits(pixel: Tensor, hw: tuple[int, int], size: int) -> Tensor:
+def is_patch_inside(pixel: Tensor, hw: tuple[int, int], size: int) -> Tensor:
     """Whether the patch around each pixel (B, N, 2) lies in an image of size ``hw``, (B, N)."""
     x, y = _moved_inside(pixel, hw, size)
     return (x == pixel[..., 0]) & (y == pixel[..., 1])
 
 
-def in_a_row(image: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:
+def flatten_images(image: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:
     """All images as one row of numbers, and the steps in it from image to image, channel, row and column."""
     C, H, W = image.shape[1:]
     if C > 1 and image.stride(1) == 1 and image.stride(3) == C:
@@ -182,7 +183,7 @@ def _must_fit(where: str, size: int, H: int, W: int) -> None:
         raise ValueError(f"lookup.{where}: image of {H}x{W} pixels is smaller than a patch of {size}x{size}")
 
 
-def patches(image: Tensor, corner: Tensor, size: int) -> Tensor:
+def extract_patches(image: Tensor, corner: Tensor, size: int) -> Tensor:
     """Square patches (B, N, C, size, size) whose top-left pixels are ``corner`` (B, N, 2).
 
     A patch that would leave the image is shifted back inside, so every pixel returned exists.
@@ -200,14 +201,14 @@ def patches(image: Tensor, corner: Tensor, size: int) -> Tensor:
     v = corner[..., 1].clamp(0, H - size)
     plane = torch.arange(B * C, device=image.device).view(B, 1, C) * (H * W)
     first = plane + (v * W + u)[..., None]  # (B, N, C) flat index of the top-left pixels
-    return windows(image, first, size)
+    return extract_windows(image, first, size)
 
 
-def windows(image: Tensor, first: Tensor, size: int) -> Tensor:
+def extract_windows(image: Tensor, first: Tensor, size: int) -> Tensor:
     """Square windows (*first.shape, size, size) of a stack of planes (*, H, W), by flat index of their top-left pixels.
 
-    The fast and unchecked part of :func:`patches`: ``first`` counts pixels through the whole stack, and the caller
-    sees to it that every window lies inside its plane.
+    The fast and unchecked part of :func:`extract_patches`: ``first`` counts pixels through the whole stack, and the
+    caller sees to it that every window lies inside its plane.
     """
     W = image.shape[-1]
     image = image.contiguous()
@@ -237,22 +238,23 @@ def luma(rgb: Tensor, dim: int) -> Tensor:
     if rgb.shape[dim] == 1:
         return rgb
     r, g, b = rgb.split(1, dim)
-    return torch.add(torch.add(LUMA[0] * r, g, alpha=LUMA[1]), b, alpha=LUMA[2])
+    return torch.add(torch.add(LUMA_WEIGHTS[0] * r, g, alpha=LUMA_WEIGHTS[1]), b, alpha=LUMA_WEIGHTS[2])
 
 
-def nearest(grid: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+def sample_nearest(grid: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Values (B, N) of ``grid`` (B, h, w) at the nearest pixel of ``uv`` (B, N, 2), and whether that pixel exists.
 
     Outside the grid, and for non-finite ``uv``, the value is that of some border pixel and ``inside`` is false.
     Twin: ``nearest`` of ``tests/support/reference.py``.
     """
     sizes = check("lookup.nearest", grid=(grid, "B h w"), uv=(uv, "B N 2"))
-    index, inside = nearest_index((sizes["h"], sizes["w"]), pixels(uv))
+    index, inside = nearest_pixel_index((sizes["h"], sizes["w"]), containing_pixels(uv))
     return grid.flatten(1).gather(1, index), inside
 
 
-def nearest_index(hw: tuple[int, int], pixel: Tensor) -> tuple[Tensor, Tensor]:
-    """Flat index (B, N) of a pixel (B, N, 2) of :func:`pixels` in a grid of size ``hw``, and whether it exists.
+def nearest_pixel_index(hw: tuple[int, int], pixel: Tensor) -> tuple[Tensor, Tensor]:
+    """Flat index (B, N) of a pixel (B, N, 2) of :func:`containing_pixels` in a grid of size ``hw``, and whether it
+    exists.
 
     Where it does not, the index is that of some border pixel.
     """
@@ -260,10 +262,10 @@ def nearest_index(hw: tuple[int, int], pixel: Tensor) -> tuple[Tensor, Tensor]:
     return torch.add(x, y, alpha=hw[1]).long(), (x == pixel[..., 0]) & (y == pixel[..., 1])
 
 
-def pixels(uv: Tensor) -> Tensor:
+def containing_pixels(uv: Tensor) -> Tensor:
     """The pixel that each ``uv`` lies in, int32; one outside of any image where it is no place at all."""
     near = uv.contiguous()  # samples that a batch shares are a view
-    if native.serves(near) and near.dtype == torch.float32:
+    if loader.serves(near) and near.dtype == torch.float32:
         pixel = torch.empty_like(near, dtype=torch.int32)
         torch.ops.dhtorch.pixels.default(near, pixel)
         return pixel
@@ -289,7 +291,7 @@ def _view_is_safe(image: Tensor) -> bool:
     return not torch._C._functorch.is_functorch_wrapped_tensor(image)
 
 
-def magnified(depth: Tensor, factor: float, right: float = 0.0) -> Tensor:
+def rescale_field_of_view(depth: Tensor, factor: float, right: float = 0.0) -> Tensor:
     """A map (..., h, w) laid over the picture with another field of view: each pixel shows what lies nearer to the
     middle by ``factor``, or farther from it, and ``right`` of the width beside that; 0 where that is outside.
 

@@ -23,38 +23,38 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.checks import all_finite, check, surely_all
+from dhtorch.geometry.checks import all_finite, all_known, check
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.windows import window_sum
-from dhtorch.ops import loader as native
+from dhtorch.ops import loader
 from dhtorch.pytree import Record, record
 
 #: Offsets (down, right) of the signs of a census: a checkerboard of 9 x 7 pixels without its middle.
-OFFSETS = tuple((i, j) for i in range(-3, 4) for j in range(-4, 5) if (i + j) % 2 and (i, j) != (-3, -4))[:31]
+CENSUS_OFFSETS = tuple((i, j) for i in range(-3, 4) for j in range(-4, 5) if (i + j) % 2 and (i, j) != (-3, -4))[:31]
 
 #: What a step of one plane and a jump of any height cost a surface, and what a pixel costs that view 1 does not show:
 #: less than a misfit (half of the signs), more than a fit. In signs.
-STEP, JUMP, UNSEEN = 3, 18, 11
+STEP_COST, JUMP_COST, UNSEEN_COST = 3, 18, 11
 
 #: Sides that a surface comes to a pixel from.
-PATHS = 4
+N_PATHS = 4
 
 #: Most views whose costs one byte can add up.
-VIEWS = 8
+MAX_SWEPT_VIEWS = 8
 
 #: Rows whose best planes are read at once.
-ROWS = 32
+ROWS_PER_BLOCK = 32
 
 #: How far beyond view 0's border its points are looked for: the longer side over this.
-MARGIN = 4
+BORDER_DIVISOR = 4
 
 #: Gains between two windows that are believed, and the variance of grey values under which nothing is seen.
-GAIN, FLAT = (0.5, 2.0), 1e-8
+WINDOW_GAIN_RANGE, FLAT_VARIANCE = (0.5, 2.0), 1e-8
 
 
 @record
-class Base(Record):
-    """View 0, whose pixels are asked for their depth; made by :func:`base`."""
+class ReferenceView(Record):
+    """View 0, whose pixels are asked for their depth; made by :func:`make_reference_view`."""
 
     image: Tensor  # (B, 1, h, w) grey
     camera: Camera
@@ -69,7 +69,7 @@ class Base(Record):
 
 
 @record
-class View(Record):
+class SweptView(Record):
     """View 1 and how it stands to view 0."""
 
     image: Tensor  # (B, 1, H, W) grey
@@ -78,7 +78,7 @@ class View(Record):
     turn: Tensor | None = None  # (B, 3) rad per unit of y, of a rolling shutter
 
 
-class Travel(NamedTuple):
+class EpipolarWarp(NamedTuple):
     """Where the level picture sees every pixel of view 0: inverse depth q at (a + q b) / (1 + q c), px of view 0."""
 
     a: Tensor  # (B, 2, N)
@@ -102,7 +102,7 @@ class Travel(NamedTuple):
         return row.mul_(hw[1]).add_(column).long()
 
 
-class Level(NamedTuple):
+class RectifiedView(NamedTuple):
     """View 1 as it would be seen without its turn, around the place of view 0's picture."""
 
     code: Tensor  # (B, H · W) int32, see census; negative where view 1 shows nothing, so along the border
@@ -126,14 +126,14 @@ def pixel_rays(camera: Camera, hw: tuple[int, int], margin: int = 0) -> Tensor:
     return torch.stack([x, y, torch.ones_like(x)], 1).flatten(2).mT
 
 
-def base(image: Tensor, camera: Camera) -> Base:
+def make_reference_view(image: Tensor, camera: Camera) -> ReferenceView:
     """View 0 of a grey picture (B, 1, h, w). Gradient: to the picture and, through the rays, to the camera."""
     check("sweep.base", image=(image, "B 1 h w"), f=(camera.f, "B 2"))
     ray = pixel_rays(camera, (image.shape[-2], image.shape[-1]))
     known = all_finite(ray, -1) if camera.distortion is not None else _sees(camera, ray)
-    if not (known.is_cpu and surely_all(known)):
+    if not (known.is_cpu and all_known(known)):
         ray = torch.where(known[..., None], ray, ray.new_tensor([0.0, 0.0, 1.0]))
-    return Base(image, camera, ray, known, census(image.detach()))
+    return ReferenceView(image, camera, ray, known, census_transform(image.detach()))
 
 
 def _sees(camera: Camera, ray: Tensor) -> Tensor:
@@ -142,19 +142,19 @@ def _sees(camera: Camera, ray: Tensor) -> Tensor:
     return fine.expand(ray.shape[:-1]).contiguous()
 
 
-def seen_at(view: View, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+def project_inverse_depth(view: SweptView, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
     """Where view 1 sees the points on rays (B, N, 3) at inverse depths q (B, N): pixels (B, N, 2) of its picture, and
     whether they lie before it (B, N). Gradient: to everything."""
     check("seen_at", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
     R, t, f, c = view.T_1_from_0.R, view.T_1_from_0.t, view.camera.f, view.camera.c
     if view.camera.distortion is None:
         given = ray.mT.contiguous(), q, R, t, torch.zeros_like(t) if view.turn is None else view.turn, f, c
-        if native.serves(*given):
+        if loader.serves(*given):
             uv = torch.empty_like(given[0][:, :2])
             front = torch.empty_like(q, dtype=torch.bool)
             torch.ops.dhtorch.seen_at(*given, uv, front)
             return uv.mT, front
-    x, y, z = (part + q * t[:, None] for part, t in zip(turned(R, ray), t.unbind(-1), strict=True))
+    x, y, z = (part + q * t[:, None] for part, t in zip(rotate_rays(R, ray), t.unbind(-1), strict=True))
     if view.turn is not None:
         p, o, s = (view.turn[:, k, None] * ray[..., 1] for k in range(3))
         x, y, z = x + (o * z - s * y), y + (s * x - p * z), z + (p * y - o * x)
@@ -166,7 +166,7 @@ def seen_at(view: View, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(places, 1).mT, front
 
 
-def turned(R: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def rotate_rays(R: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """(B, 3, 3) times each of (B, N, 3), one tensor (B, N) an axis: the numbers of :func:`dhtorch.geometry.se3.rotate`,
     which takes several times as long on so many. Gradient: to both."""
     x, y, z = ray.unbind(-1)
@@ -174,10 +174,10 @@ def turned(R: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return right, down, ahead
 
 
-def bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+def sample_bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Values (B, C, N) of pictures (B, C, H, W) at pixels (B, N, 2), and which lie inside (B, N). Gradient: to both."""
     axes = uv.mT.contiguous()
-    if native.serves(image, axes) and image.dtype == axes.dtype == torch.float32:
+    if loader.serves(image, axes) and image.dtype == axes.dtype == torch.float32:
         found = image.new_empty(*image.shape[:2], uv.shape[1])
         shown = torch.empty_like(axes[:, 0], dtype=torch.bool)
         torch.ops.dhtorch.bilinear(image, axes, found, shown)
@@ -190,33 +190,33 @@ def bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     return values[..., 0], inside
 
 
-def travel(base: Base, view: View) -> Travel:
+def epipolar_warp(base: ReferenceView, view: SweptView) -> EpipolarWarp:
     """How the pixels of view 0 travel in the level picture of view 1. Gradient: to cameras and motion."""
     s = se3.rotate(view.T_1_from_0.R.mT, view.T_1_from_0.t[:, None]).mT
     f, c = base.camera.f[..., None], base.camera.c[..., None]
     a = base.ray[..., :2].mT * f + c
-    return Travel(a.contiguous(), s[:, :2] * f + c * s[:, 2:], s[:, 2])
+    return EpipolarWarp(a.contiguous(), s[:, :2] * f + c * s[:, 2:], s[:, 2])
 
 
-def census(grey: Tensor) -> Tensor:
+def census_transform(grey: Tensor) -> Tensor:
     """Codes (B, h, w) int32 of pictures (B, 1, h, w): of each of 31 neighbours whether it is darker than the middle."""
     check("census", grey=(grey, "B 1 h w"))
     h, w = grey.shape[-2:]
-    if native.serves(grey) and grey.dtype == torch.float32:
+    if loader.serves(grey) and grey.dtype == torch.float32:
         code = torch.empty_like(grey[:, 0], dtype=torch.int32)
-        torch.ops.dhtorch.census(grey[:, 0], torch.tensor(OFFSETS), code)
+        torch.ops.dhtorch.census(grey[:, 0], torch.tensor(CENSUS_OFFSETS), code)
         return code
     padded, middle = F.pad(grey, (4, 4, 3, 3), mode="replicate")[:, 0], grey[:, 0]
     code = torch.zeros_like(middle, dtype=torch.int32)
-    for first in range(0, len(OFFSETS), 8):  # a byte at a time is a quarter of the memory
+    for first in range(0, len(CENSUS_OFFSETS), 8):  # a byte at a time is a quarter of the memory
         byte = torch.zeros_like(middle, dtype=torch.uint8)
-        for k, (i, j) in enumerate(OFFSETS[first : first + 8]):
+        for k, (i, j) in enumerate(CENSUS_OFFSETS[first : first + 8]):
             byte += (padded[:, 3 + i : 3 + i + h, 4 + j : 4 + j + w] < middle).to(torch.uint8).mul_(1 << k)
         code += byte.to(torch.int32) << first
     return code
 
 
-def count_bits(x: Tensor) -> Tensor:
+def count_set_bits(x: Tensor) -> Tensor:
     """How many of the lower 31 bits of int32 (…) are set."""
     x = x - x.bitwise_right_shift(1).bitwise_and_(0x55555555)
     high = x.bitwise_right_shift(2).bitwise_and_(0x33333333)
@@ -225,33 +225,33 @@ def count_bits(x: Tensor) -> Tensor:
     return x.mul_(0x01010101).bitwise_right_shift_(24)  # the sum of the bytes stands in the highest
 
 
-def level(base: Base, view: View, wanted: Tensor) -> Level:
+def rectify_view(base: ReferenceView, view: SweptView, wanted: Tensor) -> RectifiedView:
     """View 1 turned as view 0 is; showing nothing to pairs that are not ``wanted`` (B,). Gradient: none."""
-    margin = max(base.hw) // MARGIN
+    margin = max(base.hw) // BORDER_DIVISOR
     hw = base.hw[0] + 2 * margin, base.hw[1] + 2 * margin
     ray = pixel_rays(cam.ideal(base.camera), base.hw, margin)
-    uv, front = seen_at(view, ray, ray.new_zeros(ray.shape[:2]))
-    grey, inside = bilinear(view.image, uv)
+    uv, front = project_inverse_depth(view, ray, ray.new_zeros(ray.shape[:2]))
+    grey, inside = sample_bilinear(view.image, uv)
     seen = (inside & front).unflatten(-1, hw) & wanted[:, None, None]
     seen = F.pad(seen[:, 1:-1, 1:-1], (1, 1, 1, 1))
-    code = census(grey.detach().unflatten(-1, hw)[:, 0, None])
-    return Level(torch.where(seen, code, -1).flatten(1), hw, margin)
+    code = census_transform(grey.detach().unflatten(-1, hw)[:, 0, None])
+    return RectifiedView(torch.where(seen, code, -1).flatten(1), hw, margin)
 
 
-def misfit(base: Base, seen: Level, go: Travel, q: Tensor) -> Tensor:
+def census_cost(base: ReferenceView, seen: RectifiedView, go: EpipolarWarp, q: Tensor) -> Tensor:
     """How badly pixels fit at inverse depths q (B, N) or (B, 1): signs that differ, (B, N) int32; UNSEEN where view 1
     does not show them. Gradient: none."""
     code = seen.code.gather(1, go.cell(q, seen.hw, seen.margin))
-    count = count_bits(code ^ base.code.flatten(1))
+    count = count_set_bits(code ^ base.code.flatten(1))
     unseen = code.bitwise_right_shift(31)  # all bits or none; masks take three times as long
-    return count.add_(unseen.bitwise_and_(UNSEEN - count))
+    return count.add_(unseen.bitwise_and_(UNSEEN_COST - count))
 
 
 @torch.no_grad()
-def add_costs(
+def add_census_costs(
     C: Tensor,  # (B, D, h, w) uint8, in place
-    base: Base,
-    view: View,
+    base: ReferenceView,
+    view: SweptView,
     q: Tensor,  # (B, D)
     wanted: Tensor,  # (B,) bool, others cost UNSEEN everywhere
     *,
@@ -259,28 +259,28 @@ def add_costs(
 ) -> None:
     """Add to C how badly every pixel fits a view at every plane; ``fresh``: C holds nothing yet.
 
-    At most :data:`VIEWS` views fit into a byte. C may lie in memory with its planes last, as compiled code wants it
-    (:mod:`dhtorch.ops.loader`). Memory: pictures of view 0's size, whatever D. Gradient: none.
+    At most :data:`MAX_SWEPT_VIEWS` views fit into a byte. C may lie in memory with its planes last, as compiled code
+    wants it (:mod:`dhtorch.ops.loader`). Memory: pictures of view 0's size, whatever D. Gradient: none.
     """
-    go = travel(base, view)
-    seen = level(base, view, wanted)
+    go = epipolar_warp(base, view)
+    seen = rectify_view(base, view, wanted)
     given = base.code.flatten(1), seen.code, go.a, go.b[..., 0].contiguous(), go.c[:, 0].contiguous(), q.contiguous()
     last = C.movedim(1, -1)
-    if native.serves(last, *given):
-        torch.ops.dhtorch.add_costs(last, *given, *seen.hw, seen.margin, UNSEEN, fresh)
+    if loader.serves(last, *given):
+        torch.ops.dhtorch.add_costs(last, *given, *seen.hw, seen.margin, UNSEEN_COST, fresh)
         return
     if fresh:
         C.zero_()
     for k in range(q.shape[1]):
-        C[:, k] += misfit(base, seen, go, q[:, k, None]).to(torch.uint8).unflatten(-1, base.hw)
+        C[:, k] += census_cost(base, seen, go, q[:, k, None]).to(torch.uint8).unflatten(-1, base.hw)
 
 
-def aggregate(
+def aggregate_costs(
     C: Tensor,  # (B, h, w, D) whole numbers
     views: Tensor | int = 1,  # (B,) how many views' costs are in C
     *,
-    step: int = STEP,
-    jump: int = JUMP,
+    step: int = STEP_COST,
+    jump: int = JUMP_COST,
 ) -> Tensor:
     """Cost (B, h, w, D) int16 of the best surface through every pixel at every plane, from its four sides.
 
@@ -322,7 +322,7 @@ def _least(x: Tensor) -> Tensor:
     return x.amin(-1, keepdim=True)
 
 
-class Winner(NamedTuple):
+class BestPlane(NamedTuple):
     """The best plane of every pixel."""
 
     plane: Tensor  # (B, h, w) int64
@@ -330,10 +330,10 @@ class Winner(NamedTuple):
     cost: Tensor  # (B, h, w) of that plane
 
 
-def winner(S: Tensor) -> Winner:
+def best_plane(S: Tensor) -> BestPlane:
     """The plane of least cost S (B, h, w, D), the first of equals, and the parabola through its neighbours' costs."""
     check("winner", S=(S, "B h w D"))
-    return Winner(*(torch.cat(part, 1) for part in zip(*map(_winner, S.split(ROWS, 1)), strict=True)))
+    return BestPlane(*(torch.cat(part, 1) for part in zip(*map(_winner, S.split(ROWS_PER_BLOCK, 1)), strict=True)))
 
 
 def _winner(S: Tensor) -> tuple[Tensor, ...]:
@@ -349,41 +349,43 @@ def _winner(S: Tensor) -> tuple[Tensor, ...]:
     return index, shift, cost.to(S.dtype)
 
 
-def surface(
+def aggregate_best_plane(
     C: Tensor,  # (B, h, w, D) uint8
     views: Tensor,  # (B,) how many views' costs are in C
-) -> tuple[Winner, Tensor]:
+) -> tuple[BestPlane, Tensor]:
     """The best planes of the best surface, and its cost (B, ⌈h/2⌉, ⌈w/2⌉, D) at every other pixel, both ways.
 
-    What :func:`winner` says of :func:`aggregate`, whose answer compiled code (:mod:`dhtorch.ops.loader`) never writes
-    down.
+    What :func:`best_plane` says of :func:`aggregate_costs`, whose answer compiled code (:mod:`dhtorch.ops.loader`)
+    never writes down.
     """
-    if not native.serves(C) or C.dtype != torch.uint8:
-        S = aggregate(C, views)
-        return winner(S), S[:, ::2, ::2]
+    if not loader.serves(C) or C.dtype != torch.uint8:
+        S = aggregate_costs(C, views)
+        return best_plane(S), S[:, ::2, ::2]
     B, h, w, D = C.shape
-    prices = ((price * views).to(torch.int16).expand(B).contiguous() for price in (STEP, JUMP))
-    best = Winner(*(torch.empty(B, h, w, dtype=dtype) for dtype in (torch.int64, torch.float32, torch.int16)))
+    prices = ((price * views).to(torch.int16).expand(B).contiguous() for price in (STEP_COST, JUMP_COST))
+    best = BestPlane(*(torch.empty(B, h, w, dtype=dtype) for dtype in (torch.int64, torch.float32, torch.int16)))
     some = torch.empty(B, (h + 1) // 2, (w + 1) // 2, D, dtype=torch.int16)
     torch.ops.dhtorch.surface(C, *prices, *best, some)
     return best, some
 
 
-def rivals(some: Tensor, best: Winner, reach: Tensor) -> Tensor:
+def second_best_margin(some: Tensor, best: BestPlane, reach: Tensor) -> Tensor:
     """How much more the best plane costs (B, h, w) that lies further than ``reach`` (B,) planes from the winner.
 
-    Asked at every other pixel, both ways, of the costs ``some`` (B, ⌈h/2⌉, ⌈w/2⌉, D) there, see :func:`surface`; its
-    neighbours have its answer. Gradient: none.
+    Asked at every other pixel, both ways, of the costs ``some`` (B, ⌈h/2⌉, ⌈w/2⌉, D) there, see
+    :func:`aggregate_best_plane`; its neighbours have its answer. Gradient: none.
     """
     plane, cost = (x[:, ::2, ::2].contiguous() for x in (best.plane, best.cost))
-    if native.serves(some, plane) and some.dtype == torch.int16:
+    if loader.serves(some, plane) and some.dtype == torch.int16:
         more = torch.empty_like(cost)
         for b, far in enumerate(reach.tolist()):
             torch.ops.dhtorch.elsewhere(some[b].flatten(0, 1), plane[b], more[b], int(far))
         return _for_all(more - cost, best.cost)
     places = torch.arange(some.shape[-1], dtype=torch.int16, device=some.device)
     reach, found = reach.to(torch.int16)[:, None, None, None], []
-    for part, at, least in zip(*(x.split(ROWS // 2, 1) for x in (some, plane, cost)), strict=True):  # as it is read
+    for part, at, least in zip(
+        *(x.split(ROWS_PER_BLOCK // 2, 1) for x in (some, plane, cost)), strict=True
+    ):  # as it is read
         near = (places - at[..., None].to(torch.int16)).abs() <= reach
         found.append(part.masked_fill(near, torch.iinfo(some.dtype).max).amin(-1) - least)
     return _for_all(torch.cat(found, 1), best.cost)
@@ -395,10 +397,10 @@ def _for_all(x: Tensor, like: Tensor) -> Tensor:
 
 
 #: Radius of a window that is fitted.
-FIT_RADIUS = 4
+FIT_RADIUS_PX = 4
 
 
-class Fit(NamedTuple):
+class WindowFit(NamedTuple):
     """How the grey values around every pixel fit one view at the depths given; (B, h, w) each."""
 
     step: Tensor  # 1/m, the Gauss-Newton step of inverse depth
@@ -409,7 +411,7 @@ class Fit(NamedTuple):
     motion: Tensor  # (B, h, w, 2) px·m, d pixel / d q
 
 
-def with_gradients(grey: Tensor) -> Tensor:
+def stack_gradients(grey: Tensor) -> Tensor:
     """Pictures (B, 3, H, W): grey and its central differences along u and v, from (B, 1, H, W)."""
     padded = F.pad(grey, (1, 1, 1, 1), mode="replicate")
     du, dv = padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2], padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]
@@ -417,13 +419,13 @@ def with_gradients(grey: Tensor) -> Tensor:
 
 
 def fit_windows(
-    base: Base,
-    view: View,
+    base: ReferenceView,
+    view: SweptView,
     picture_1: Tensor,  # (B, 3, H, W), view 1's by with_gradients
     q: Tensor,  # (B, h, w) 1/m
     *,
-    radius: int = FIT_RADIUS,
-) -> Fit:
+    radius: int = FIT_RADIUS_PX,
+) -> WindowFit:
     """One step of every pixel's inverse depth towards equal grey values in its window, whatever bias and gain.
 
     Every pixel of a window is read at its own depth, so that slanted and curved surfaces are compared as they are.
@@ -433,13 +435,13 @@ def fit_windows(
     """
     flat = q.flatten(1)
     little = 1e-3 * flat.detach().amax(1, keepdim=True).clamp_min(1e-3)
-    uv, front = seen_at(view, base.ray, flat)
-    further = seen_at(view, base.ray, flat + little)[0]
+    uv, front = project_inverse_depth(view, base.ray, flat)
+    further = project_inverse_depth(view, base.ray, flat + little)[0]
     given = base.image, picture_1, uv.mT.contiguous(), further.mT.contiguous(), little[:, 0]
-    if radius == FIT_RADIUS and native.serves(*given) and all(x.dtype == torch.float32 for x in given):
+    if radius == FIT_RADIUS_PX and loader.serves(*given) and all(x.dtype == torch.float32 for x in given):
         return _compiled_fit(*given, front=front)
     motion = (further - uv) / little[..., None]
-    values, inside = bilinear(picture_1, uv)
+    values, inside = sample_bilinear(picture_1, uv)
     J, du, dv = (x.unflatten(-1, base.hw) for x in values.unbind(1))
     du_dq, dv_dq = (x.unflatten(-1, base.hw) for x in motion.unbind(-1))
     g = du * du_dq + dv * dv_dq
@@ -447,10 +449,10 @@ def fit_windows(
     share = 1 / (2 * radius + 1) ** 2
     products = (I, J, g, I * I, J * J, I * J, g * g, g * I, g * J)
     i, j, k, ii, jj, ij, kk, ki, kj = (share * window_sum(x, radius) for x in products)
-    ii, jj, ij = (ii - i * i).clamp_min(FLAT), (jj - j * j).clamp_min(FLAT), ij - i * j
+    ii, jj, ij = (ii - i * i).clamp_min(FLAT_VARIANCE), (jj - j * j).clamp_min(FLAT_VARIANCE), ij - i * j
     kk = (kk - k * k).clamp_min(1e-12)
-    gain = (ij / jj).clamp(*GAIN)
-    return Fit(
+    gain = (ij / jj).clamp(*WINDOW_GAIN_RANGE)
+    return WindowFit(
         step=((ki - k * i) - gain * (kj - k * j)) / (gain * kk),
         contrast=kk * gain * gain,
         noise=(ii + gain * gain * jj - 2 * gain * ij).clamp_min(0),
@@ -460,23 +462,23 @@ def fit_windows(
     )
 
 
-def _compiled_fit(grey: Tensor, picture_1: Tensor, *places: Tensor, front: Tensor) -> Fit:
+def _compiled_fit(grey: Tensor, picture_1: Tensor, *places: Tensor, front: Tensor) -> WindowFit:
     """What :func:`fit_windows` finds at places of every pixel, and of those a little nearer, by how much."""
     told = step, contrast, noise, correlation = [torch.empty_like(grey[:, 0]) for _ in range(4)]
     inside = torch.empty_like(step, dtype=torch.bool)
     motion = torch.empty_like(places[0])
     torch.ops.dhtorch.fit_windows(grey, picture_1, *places, *told, inside, motion)
     seen = inside & front.view_as(inside)
-    return Fit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
+    return WindowFit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
 
 
-def hidden(go: Travel, q: Tensor, tolerance: Tensor) -> Tensor:
+def occlusion_mask(go: EpipolarWarp, q: Tensor, tolerance: Tensor) -> Tensor:
     """Which pixels (B, h, w) of a map of inverse depths another one covers in view 1, nearer by more than
     ``tolerance`` (B,) 1/m. Gradient: none."""
     B, h, w = q.shape
-    edge = max(h, w) // MARGIN
+    edge = max(h, w) // BORDER_DIVISOR
     given = go.a, go.b[..., 0].contiguous(), go.c[:, 0].contiguous(), q.flatten(1), tolerance
-    if native.serves(*given) and all(x.dtype == torch.float32 for x in given):
+    if loader.serves(*given) and all(x.dtype == torch.float32 for x in given):
         covered = torch.empty_like(q, dtype=torch.bool)
         torch.ops.dhtorch.hidden(*given, covered, rows=h + 2 * edge, columns=w + 2 * edge, margin=edge)
         return covered

@@ -13,17 +13,17 @@ from torch import Tensor
 
 from dhtorch.geometry import covariance, se3
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.least_squares import choose, solve_spd
+from dhtorch.geometry.least_squares import select_batch, solve_spd
 from dhtorch.geometry.se3 import Pose
 
 #: Measurements each of which may be the start; more are thinned evenly.
-STARTS = 32
+MAX_STARTS = 32
 
 #: Steps to the mean, each reweighed.
-STEPS = 12
+REWEIGHTING_STEPS = 12
 
 
-class RigidMean(NamedTuple):
+class AveragePose(NamedTuple):
     """The motion that most of V measurements share."""
 
     T: Pose  # (B,); NaN where there is none
@@ -33,7 +33,7 @@ class RigidMean(NamedTuple):
     ok: Tensor  # (B,) bool: enough measurements, and most agree
 
 
-def rigid_mean(
+def average_poses(
     T: Pose,  # (B, V, …)
     cov: Tensor,  # (B, V, 6, 6)
     valid: Tensor,  # (B, V) bool
@@ -42,7 +42,7 @@ def rigid_mean(
     max_deviation: float = 6.0,
     min_agree: float = 0.6,
     at_least: int = 2,
-) -> RigidMean:
+) -> AveragePose:
     """The information-weighted mean of V measurements of one motion, and whether they contradict each other.
 
     The start is the measurement with the least median distance to the others. From there reweighted least squares: each
@@ -62,7 +62,7 @@ def rigid_mean(
         ValueError: wrong shapes, or no measurement (V = 0).
 
     Gradient: none; a calibration.
-    Cost: quadratic in at most :data:`STARTS` measurements, linear in the others. Float64 inside.
+    Cost: quadratic in at most :data:`MAX_STARTS` measurements, linear in the others. Float64 inside.
     Source: T. Barfoot, P. Furgale, "Associating uncertainty with three-dimensional poses for use in estimation
     problems", 2014; the scale is R. Birge's ratio.
     """
@@ -73,14 +73,14 @@ def rigid_mean(
         B, dtype = len(valid), T.t.dtype
         valid = valid & T.R.isfinite().all((-1, -2)) & T.t.isfinite().all(-1) & cov.isfinite().all((-1, -2))
         flat = Pose(T.R.double().flatten(0, 1), T.t.double().flatten(0, 1))
-        flat = choose(valid.flatten(), flat, se3.identity(B * V, flat.t))
+        flat = select_batch(valid.flatten(), flat, se3.identity(B * V, flat.t))
         eye = torch.eye(6, dtype=torch.float64, device=cov.device).expand(B * V, 6, 6)
         safe = torch.where(valid.flatten()[:, None, None], cov.double().flatten(0, 1), eye)
         information, known = solve_spd(safe, eye)
         valid = valid & known.view(B, V)
         information = information.view(B, V, 6, 6)
         mean = _start(flat, information, valid)
-        for _ in range(STEPS):
+        for _ in range(REWEIGHTING_STEPS):
             xi, square = _off(flat, mean, information)
             limit = (bend * _scale(square, valid)[:, None]) ** 2
             weight = torch.where(valid, (1 + square / limit) ** -2, 0.0)
@@ -89,7 +89,7 @@ def rigid_mean(
                 weight[..., None] * (information @ xi[..., None])[..., 0],
             )
             step, moved = solve_spd(H, g.sum(1)[..., None])
-            mean = choose(moved, se3.retract(mean, step[..., 0]), mean)
+            mean = select_batch(moved, se3.retract(mean, step[..., 0]), mean)
         xi, square = _off(flat, mean, information)
         scale = _scale(square, valid)
         agree = valid & (square < (max_deviation * scale[:, None]) ** 2)
@@ -98,13 +98,15 @@ def rigid_mean(
         ok = (n >= at_least) & (n >= min_agree * valid.sum(-1))
         total = torch.where(agree, square, 0.0).sum(-1)
         scale = torch.maximum(scale, (total / (6 * (n - 1)).clamp_min(1)).sqrt())
-        summed, known = covariance.from_normal(torch.where(agree[..., None, None], information, 0.0).sum(1), scale)
+        summed, known = covariance.covariance_from_normal(
+            torch.where(agree[..., None, None], information, 0.0).sum(1), scale
+        )
         ok = ok & known
 
     def answer(x: Tensor) -> Tensor:
         return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan).to(dtype)
 
-    return RigidMean(Pose(answer(mean.R), answer(mean.t)), answer(summed), agree, answer(scale), ok)
+    return AveragePose(Pose(answer(mean.R), answer(mean.t)), answer(summed), agree, answer(scale), ok)
 
 
 #: Median of the squared length of six independent standard normal numbers.
@@ -122,12 +124,12 @@ def _off(flat: Pose, mean: Pose, information: Tensor) -> tuple[Tensor, Tensor]:
 def _start(flat: Pose, information: Tensor, valid: Tensor) -> Pose:
     """Of each row the measurement whose distances to the others have the least median."""
     B, V = valid.shape
-    few = min(V, STARTS)
+    few = min(V, MAX_STARTS)
     offered = [k * (V - 1) // max(few - 1, 1) for k in range(few)]
     every = flat.map(lambda x: x.unflatten(0, (B, V)))
     cost = []
     for v in offered:
-        middle = covariance.median(_off(flat, every[:, v], information)[1], valid)[:, 0]
+        middle = covariance.masked_median(_off(flat, every[:, v], information)[1], valid)[:, 0]
         cost.append(torch.where(valid[:, v], middle, torch.inf))
     best = torch.tensor(offered, device=valid.device)[torch.stack(cost).argmin(0)]
     return every[torch.arange(B, device=best.device), best]
@@ -135,4 +137,4 @@ def _start(flat: Pose, information: Tensor, valid: Tensor) -> Pose:
 
 def _scale(square: Tensor, valid: Tensor) -> Tensor:
     """Factor (B,) on the stated standard deviations that explains the median of d², at least 1."""
-    return (covariance.median(square, valid)[:, 0] / _MEDIAN).sqrt().clamp_min(1.0)
+    return (covariance.masked_median(square, valid)[:, 0] / _MEDIAN).sqrt().clamp_min(1.0)

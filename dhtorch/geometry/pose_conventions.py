@@ -16,7 +16,7 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.se3 import Pose
 
 #: Camera axes in which poses are written, as rows of M.
-AXES: dict[str, tuple[tuple[int, int, int], ...]] = {
+CAMERA_AXES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "OpenGL axes (x right, y up, z backward)": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
     "left-handed axes (x right, y up, z forward)": ((1, 0, 0), (0, -1, 0), (0, 0, 1)),
@@ -27,19 +27,22 @@ AXES: dict[str, tuple[tuple[int, int, int], ...]] = {
 }
 
 #: Ways round, and metres per unit.
-WAYS = ("", "the inverse")
-UNITS = {"": 1.0, "millimetres": 1e-3, "centimetres": 1e-2}
+POSE_DIRECTIONS = ("", "the inverse")
+TRANSLATION_UNITS = {"": 1.0, "millimetres": 1e-3, "centimetres": 1e-2}
 
-_ALL = sorted(itertools.product(AXES, WAYS, UNITS), key=lambda parts: sum(bool(part) for part in parts))
+_ALL = sorted(
+    itertools.product(CAMERA_AXES, POSE_DIRECTIONS, TRANSLATION_UNITS),
+    key=lambda parts: sum(bool(part) for part in parts),
+)
 
 #: What a reading is called, the simplest first; the first is the pose as it was stated.
 CONVENTIONS = tuple(", ".join(part for part in parts if part) for parts in _ALL)
 
 #: Names of the camera axes that can be stated, and their M.
-STATED = {"cv": AXES[""], "gl": AXES["OpenGL axes (x right, y up, z backward)"]}
+STATED_AXES = {"cv": CAMERA_AXES[""], "gl": CAMERA_AXES["OpenGL axes (x right, y up, z backward)"]}
 
 
-def readings(
+def pose_hypotheses(
     T: Pose,  # (B,), as it was stated
     other_way: Pose,  # (B,), with every pose it comes from taken for its inverse
 ) -> Pose:
@@ -53,18 +56,18 @@ def readings(
     check("readings", R=(T.R, "B 3 3"), t=(T.t, "B 3"), R_back=(other_way.R, "B 3 3"), t_back=(other_way.t, "B 3"))
     found = []
     for axes, way, unit in _ALL:
-        motion = in_axes(other_way if way else T, AXES[axes])
-        found.append(Pose(motion.R, motion.t * UNITS[unit]))
+        motion = motion_from_axes(other_way if way else T, CAMERA_AXES[axes])
+        found.append(Pose(motion.R, motion.t * TRANSLATION_UNITS[unit]))
     return Pose(torch.stack([m.R for m in found], 1), torch.stack([m.t for m in found], 1))
 
 
-def in_axes(T: Pose, axes: tuple[tuple[int, int, int], ...]) -> Pose:
+def motion_from_axes(T: Pose, axes: tuple[tuple[int, int, int], ...]) -> Pose:
     """A motion (B,) between cameras with these axes as one between cameras with ours. Gradient: to the motion."""
     M = _matrix(axes, T.R)
     return Pose(M.T @ T.R @ M, (M.T @ T.t[..., None])[..., 0])
 
 
-def camera_axes(T_world_from_cam: Pose, axes: tuple[tuple[int, int, int], ...]) -> Pose:
+def pose_from_axes(T_world_from_cam: Pose, axes: tuple[tuple[int, int, int], ...]) -> Pose:
     """The pose (B,) of a camera with these axes as that of one with ours. Gradient: to the pose."""
     return T_world_from_cam.replace(R=T_world_from_cam.R @ _matrix(axes, T_world_from_cam.R))
 

@@ -16,18 +16,19 @@ from torch import Tensor
 
 from dhtorch.geometry import filters
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.patches import windows
-from dhtorch.geometry.windows import bands
-from dhtorch.ops import loader as native
+from dhtorch.geometry.patches import extract_windows
+from dhtorch.geometry.windows import row_bands
+from dhtorch.ops import loader
 
-#: Padding beyond half a window: how far from a pixel of the image (or of ``MARGIN`` around it) a search may look.
-REACH = 8
+#: Padding beyond half a window: how far from a pixel of the image (or of ``OUTSIDE_MARGIN_PX`` around it) a search may
+#: look.
+SEARCH_PADDING_PX = 8
 
 #: How far outside the image the middle of a window may lie, px of the level.
-MARGIN = 4
+OUTSIDE_MARGIN_PX = 4
 
 #: Planes of a level.
-GREY, GRAD_X, GRAD_Y = 0, 1, 2
+GREY_PLANE, GRAD_X_PLANE, GRAD_Y_PLANE = 0, 1, 2
 
 
 class Pyramid(NamedTuple):
@@ -48,7 +49,7 @@ class Pyramid(NamedTuple):
         """
         H, W = self.hw()
         high = self.levels[0].new_tensor([[W - 0.5], [H - 0.5]])
-        slack = MARGIN if level else 0
+        slack = OUTSIDE_MARGIN_PX if level else 0
         return torch.full_like(high, -0.5) * 0.5**level - slack, high * 0.5**level + slack
 
     def corner(self, level: int, x: Tensor) -> Tensor:
@@ -69,15 +70,17 @@ class Pyramid(NamedTuple):
     def read(self, level: int, first: Tensor, size: int, fraction: Tensor | None = None) -> Tensor:
         """Windows (P, M, size²) that begin at ``first`` (P, M), or (bilinear) ``fraction`` (2, M) right and below."""
         if fraction is None:
-            return windows(self.levels[level], first, size).flatten(-2)
+            return extract_windows(self.levels[level], first, size).flatten(-2)
         # Between columns by shifting the window as one long row, which runs at full speed; what the shift carries over
         # a row's end lands in the last column, which is left out.
         side = size + 1
-        w = windows(self.levels[level], first, side).flatten(-2)
+        w = extract_windows(self.levels[level], first, side).flatten(-2)
         w = torch.lerp(w[..., :-1], w[..., 1:], fraction[0][:, None]).unfold(-1, size, side)
         return torch.lerp(w[..., :-1, :], w[..., 1:, :], fraction[1][:, None, None]).flatten(-2)
 
-    def windows(self, level: int, x: Tensor, batch: Tensor, size: int, planes=(GRAD_X, GRAD_Y, GREY)) -> Tensor:
+    def windows(
+        self, level: int, x: Tensor, batch: Tensor, size: int, planes=(GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE)
+    ) -> Tensor:
         """Windows (P, M, size²) around ``x`` (2, M), between pixels."""
         first, fraction = self.locate(level, x, batch, size // 2, planes)
         return self.read(level, first, size, fraction)
@@ -87,8 +90,8 @@ class Pyramid(NamedTuple):
 def _margins(hw: tuple[int, int], *, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """First and last pixel (2, 1) of an image and the margin around it."""
     H, W = hw
-    last = torch.tensor([[W - 1 + MARGIN], [H - 1 + MARGIN]], device=device, dtype=dtype)
-    return torch.full_like(last, -MARGIN), last
+    last = torch.tensor([[W - 1 + OUTSIDE_MARGIN_PX], [H - 1 + OUTSIDE_MARGIN_PX]], device=device, dtype=dtype)
+    return torch.full_like(last, -OUTSIDE_MARGIN_PX), last
 
 
 @lru_cache(maxsize=256)
@@ -97,7 +100,7 @@ def _first(planes: tuple[int, ...], size: int, shift: int, *, device: torch.devi
     return torch.tensor(planes, device=device)[:, None] * size + shift
 
 
-class Pyramids:
+class PyramidCache:
     """The pyramids of a batch of images, each built when it is first asked for: of an anchor tracked into many views.
 
     Carries no graph. ``pyramids[i:j]`` are those of some of the images.
@@ -106,7 +109,7 @@ class Pyramids:
     def __init__(self, image: Tensor) -> None:
         self.image = image  # (B, C, H, W), as build_pyramid takes it
         self._built: dict[tuple[int, int], Pyramid] = {}
-        self._parts: dict[tuple[int, int], Pyramids] = {}
+        self._parts: dict[tuple[int, int], PyramidCache] = {}
         self._more: dict[Hashable, Any] = {}
 
     def __call__(self, levels: int, window: int) -> Pyramid:
@@ -123,10 +126,10 @@ class Pyramids:
                 self._more[key] = make(self.image)
         return self._more[key]
 
-    def __getitem__(self, part: slice) -> Pyramids:
+    def __getitem__(self, part: slice) -> PyramidCache:
         start, stop, _ = part.indices(len(self.image))
         if (start, stop) not in self._parts:
-            self._parts[start, stop] = Pyramids(self.image[start:stop])
+            self._parts[start, stop] = PyramidCache(self.image[start:stop])
         return self._parts[start, stop]
 
 
@@ -161,7 +164,7 @@ def build_pyramid(
         raise ValueError(f"build_pyramid: image has {sizes['C']} channels, expected 1 or 3")
     if levels < 1 or window < 3 or window % 2 == 0:
         raise ValueError(f"build_pyramid: expected levels >= 1 and an odd window >= 3, found {levels} and {window}")
-    pad = window // 2 + REACH
+    pad = window // 2 + SEARCH_PADDING_PX
     smallest = max(window, pad)
     if min(sizes["H"], sizes["W"]) <= smallest:
         raise ValueError(f"build_pyramid: image of {sizes['H']}x{sizes['W']} pixels is too small for window {window}")
@@ -171,7 +174,7 @@ def build_pyramid(
     while len(chain) < levels and min(h, w) > smallest:
         level = image.new_empty(len(image), 3 if gradients else 1, h + 2 * pad, w + 2 * pad, dtype=dtype)
         below = chain[-1] if chain else image
-        if native.serves(below, level) and below.dtype in (torch.uint8, torch.float32):
+        if loader.serves(below, level) and below.dtype in (torch.uint8, torch.float32):
             torch.ops.dhtorch.pyramid_level(below, level, pad, bool(chain), below.dtype == torch.uint8)
         else:
             _fill(level, pad, image, chain[-1] if chain else None)
@@ -182,10 +185,10 @@ def build_pyramid(
 
 def _fill(level: Tensor, pad: int, image: Tensor, below: Tensor | None) -> None:
     """Fill a padded level of ``image``, of whose own pixels it is made, or of those of the level ``below`` it."""
-    grey = level[:, GREY : GREY + 1]
+    grey = level[:, GREY_PLANE : GREY_PLANE + 1]
     inside = grey[..., pad:-pad, pad:-pad]
-    for part in bands(image, inside.shape[-2:]):
-        inside[..., part, :] = filters.grey(image[..., part, :]) if below is None else _half(below, pad, part)
+    for part in row_bands(image, inside.shape[-2:]):
+        inside[..., part, :] = filters.grayscale(image[..., part, :]) if below is None else _half(below, pad, part)
     _mirror(grey, pad)
     if level.shape[1] > 1:
         _add_gradients(level, pad, image)
@@ -199,7 +202,10 @@ def _half(level: Tensor, pad: int, part: slice) -> Tensor:
     """
     w = (level.shape[-1] - 2 * pad + 1) // 2
     top, bottom = (pad + 2 * row for row in (part.start, part.stop))
-    rows = [level[:, GREY : GREY + 1, top + k : bottom + k : 2, pad - 2 : pad + 2 * w + 1] for k in (-2, -1, 0, 1, 2)]
+    rows = [
+        level[:, GREY_PLANE : GREY_PLANE + 1, top + k : bottom + k : 2, pad - 2 : pad + 2 * w + 1]
+        for k in (-2, -1, 0, 1, 2)
+    ]
     smooth = _binomial(*rows)
     even = smooth[..., ::2].contiguous()
     odd = smooth[..., 1::2].contiguous()
@@ -221,11 +227,11 @@ def _mirror(grey: Tensor, pad: int) -> None:
 
 def _add_gradients(level: Tensor, pad: int, image: Tensor) -> None:
     """Fill the planes beside the grey one: Scharr's filter (3 10 3) x (-1 0 1) / 32, kornia has none; 0 outside."""
-    planes, grey = level[:, GRAD_X:], level[:, GREY : GREY + 1]
+    planes, grey = level[:, GRAD_X_PLANE:], level[:, GREY_PLANE : GREY_PLANE + 1]
     for border in (planes[..., :pad, :], planes[..., -pad:, :], planes[..., :pad], planes[..., -pad:]):
         border.zero_()
     rows, width = grey.shape[-2:]
-    for part in bands(image, (rows - 2 * pad, width)):
+    for part in row_bands(image, (rows - 2 * pad, width)):
         top, bottom = part.start + pad, part.stop + pad
         above, here, below = (grey[..., top + k : bottom + k, pad - 1 : width - pad + 1] for k in (-1, 0, 1))
         across = torch.add(here * (10 / 32), above + below, alpha=3 / 32)

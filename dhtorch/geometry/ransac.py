@@ -10,20 +10,20 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.covariance import median
+from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.least_squares import MIN_DEPTH
 from dhtorch.geometry.p3p import p3p_of_planes
 from dhtorch.geometry.se3 import Pose
 
 #: A point set counts as a line when its spread across is below this share of its spread along.
-MIN_SPREAD = 1e-3
+MIN_SPREAD_RATIO = 1e-3
 
 #: Points this many times as far as the median one are directions, not places: a renderer's sky at 1e10 m, with the
 #: points of a room, would look like a line.
-FAR_OFF = 100.0
+MAX_DISTANCE_RATIO = 100.0
 
 #: Residuals of hypotheses that are looked at together: three planes of them stay in cache.
-RESIDUALS = 1 << 15
+MAX_CHUNK_RESIDUALS = 1 << 15
 
 
 def usable_first(
@@ -42,11 +42,11 @@ def usable_first(
         raise ValueError("usable_first: usable has no points, expected N > 0")
     found = usable.cumsum(-1)
     number = found[:, -1]
-    index = torch.searchsorted(found, even_slots(number, size) + 1)
+    index = torch.searchsorted(found, evenly_spaced_slots(number, size) + 1)
     return index.clamp(max=N - 1), number.clamp(max=size)
 
 
-def even_slots(count: Tensor, size: int) -> Tensor:
+def evenly_spaced_slots(count: Tensor, size: int) -> Tensor:
     """(B, size) slots below ``count`` (B,): 0, 1, 2, … while they last; evenly thinned where there are more."""
     slot, count = torch.arange(size, device=count.device), count[:, None]
     return torch.minimum(slot * count.clamp_min(size) // size, (count - 1).clamp_min(0))
@@ -89,7 +89,7 @@ def msac_cost(
     """
     sizes = check("msac_cost", poses=(poses, "B 4 P"), points=(points, "B 6 M"), limits=(limits, "B M"))
     uv, xyz = points[:, :2], points[:, 2:]
-    pairs = max(RESIDUALS // max(sizes["P"] * sizes["M"], 1), 1)
+    pairs = max(MAX_CHUNK_RESIDUALS // max(sizes["P"] * sizes["M"], 1), 1)
     costs = []
     for b in range(0, len(points), pairs):  # few pairs at a time keep the temporaries in cache
         part = slice(b, b + pairs)
@@ -102,7 +102,7 @@ def msac_cost(
 
 
 @torch.no_grad()
-def search(
+def search_hypotheses(
     points: Tensor,  # (B, 5, M): x, y, z (m) and where they were seen, u, v (px)
     count: Tensor,  # (B,) usable slots
     f: Tensor,  # (B, 2) px
@@ -141,7 +141,7 @@ def search(
     used = torch.arange(M, device=count.device) < count[:, None]
     limits = torch.where(used, threshold_px**2, 0.0).to(points.dtype)
     some = min(preview, M)
-    seen = _take(points, even_slots(count, some)[:, None])
+    seen = _take(points, evenly_spaced_slots(count, some)[:, None])
     cost = msac_cost(lenses.flatten(2), seen, limits[:, :some])
     cost = cost.masked_fill(~valid.transpose(0, 1).flatten(1), torch.inf)
     cost, index = cost.topk(min(max(shortlist, keep), K), largest=False)
@@ -152,27 +152,27 @@ def search(
     return Pose(poses[..., :3], poses[..., 3]), cost
 
 
-def collinear(
+def is_collinear(
     xyz: Tensor,  # (B, 3, M) m
     used: Tensor,  # (B, M) bool
 ) -> Tensor:
     """(B,) bool: the used points lie on one line (or in one point), and so leave a rotation undetermined.
 
     The second largest eigenvalue of their scatter is compared with the largest through the matrix's invariants. Points
-    more than ``FAR_OFF`` times as far from the origin as the median one are not looked at.
+    more than ``MAX_DISTANCE_RATIO`` times as far from the origin as the median one are not looked at.
 
     Raises:
         ValueError: wrong shapes.
     """
     check("collinear", xyz=(xyz, "B 3 M"), used=(used, "B M"))
     reach = xyz.detach().abs().amax(1)
-    used = (used & (reach <= FAR_OFF * median(reach, used)))[:, None]
+    used = (used & (reach <= MAX_DISTANCE_RATIO * masked_median(reach, used)))[:, None]
     x = xyz.masked_fill(~used, 0.0).double()
     x = torch.where(used, x - x.sum(-1, keepdim=True) / used.sum(-1, keepdim=True).clamp_min(1), 0.0)
     scatter = torch.bmm(x, x.transpose(1, 2))
     trace = scatter.diagonal(dim1=-2, dim2=-1).sum(-1)
     minors = 0.5 * (trace * trace - (scatter * scatter).sum((-2, -1)))  # ≈ product of the two largest eigenvalues
-    return minors <= (MIN_SPREAD * trace) ** 2
+    return minors <= (MIN_SPREAD_RATIO * trace) ** 2
 
 
 def _take(x: Tensor, index: Tensor) -> Tensor:

@@ -24,26 +24,33 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import check, perhaps_any
+from dhtorch.geometry.checks import any_possible, check
 from dhtorch.geometry.determinism import SUM_LANES
-from dhtorch.geometry.least_squares import MIN_DEPTH, Normal, move, normal_equations, robust, solve_spd
-from dhtorch.geometry.linalg import turned
+from dhtorch.geometry.least_squares import (
+    MIN_DEPTH,
+    NormalEquations,
+    move_pose,
+    normal_equations,
+    robust_loss,
+    solve_spd,
+)
+from dhtorch.geometry.linalg import rotate_planes
 from dhtorch.geometry.se3 import Pose, hat
-from dhtorch.ops import loader as native
+from dhtorch.ops import loader
 from dhtorch.pytree import Record, record
 
 #: A far track is not closer to the anchor than the nearest point of the sensor by more than this factor.
-MAX_NEARER = 2.0
+NEAREST_DEPTH_DIVISOR = 2.0
 
 #: The robust kernel that compiled code knows.
-COMPILED = "geman_mcclure"
+COMPILED_KERNEL = "geman_mcclure"
 
 #: Squared residual (in units of its variance) of a point behind a camera: far beyond every kernel.
-BEHIND = 1e4
+BEHIND_CAMERA_RESIDUAL = 1e4
 
 
 @record
-class Problem(Record):
+class PoseDepthProblem(Record):
     """Tracks of B pairs as planes, N a multiple of ``SUM_LANES``; unused ones at any finite place."""
 
     f: Tensor  # (B, 2) px, camera 1
@@ -64,16 +71,16 @@ class Unknowns(NamedTuple):
     turn: Tensor | None  # (B, 3) rad per unit of y; None: none, and none is looked for
 
 
-def moved(at: Unknowns, xi: Tensor) -> Unknowns:
+def retract_unknowns(at: Unknowns, xi: Tensor) -> Unknowns:
     """The unknowns displaced by xi (B, 9): a tangent vector of the pose, then the turn; (B, 6) where there is none.
 
     Gradient: to both. Raises ValueError for wrong shapes.
     """
     check("moved", turn=(at.turn, "B 3"), xi=(xi, "B 6" if at.turn is None else "B 9"))
-    return Unknowns(move(at.T, xi[:, :6]), None if at.turn is None else at.turn + xi[:, 6:])
+    return Unknowns(move_pose(at.T, xi[:, :6]), None if at.turn is None else at.turn + xi[:, 6:])
 
 
-def step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
+def unknowns_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
     """The unknowns after one Gauss–Newton step, H (B, 9, 9) and g (B, 9), and ``ok`` (B,); unmoved where H is singular.
 
     Without a turn H is (B, 6, 6) and g (B, 6).
@@ -82,21 +89,22 @@ def step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
     """
     check("step", turn=(at.turn, "B 3"), H=(H, "B n n"), g=(g, "B n"))
     xi, ok = solve_spd(H, -g[..., None])
-    return moved(at, xi[..., 0]), ok
+    return retract_unknowns(at, xi[..., 0]), ok
 
 
-def trial_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
-    """:func:`step` in a few operations, for proposals that are judged afterwards: see ``least_squares.trial_step``.
+def trial_unknowns_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
+    """:func:`unknowns_step` in a few operations, for proposals that are judged afterwards: see
+    ``least_squares.trial_step``.
 
     Gradient: none. Raises ValueError for wrong shapes.
     """
     check("trial_step", turn=(at.turn, "B 3"), H=(H, "B n n"), g=(g, "B n"))
     with torch.no_grad():
         xi, info = torch.linalg.solve_ex(H.double(), -g.double())
-        return moved(at, xi.to(g.dtype)), info == 0
+        return retract_unknowns(at, xi.to(g.dtype)), info == 0
 
 
-def straighten(
+def undo_rolling_shutter(
     uv: Tensor,  # (B, 2, N) ideal px of camera 1, planes
     f: Tensor,  # (B, 2) px
     c: Tensor,  # (B, 2) px
@@ -113,14 +121,14 @@ def straighten(
 
 
 def _straight(seen: Tensor, y: Tensor, turn: Tensor) -> Tensor:
-    """:func:`straighten` at z = 1: where (u, v, 1) - y · turn x (u, v, 1) passes it."""
+    """:func:`undo_rolling_shutter` at z = 1: where (u, v, 1) - y · turn x (u, v, 1) passes it."""
     ray = torch.cat((seen, torch.ones_like(seen[:, :1])), 1)
-    ray = ray - y[:, None] * turned(hat(turn), ray)
+    ray = ray - y[:, None] * rotate_planes(hat(turn), ray)
     z = ray[:, 2:]
     return ray[:, :2] / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter: stays finite
 
 
-class Fixed(NamedTuple):
+class TrackConstants(NamedTuple):
     """What a problem's tracks are at z = 1, wherever the pose is."""
 
     seen: Tensor  # (B, 2, N) measured in camera 1
@@ -130,10 +138,10 @@ class Fixed(NamedTuple):
     variance: Tensor  # (B, N) 1/m², of the sensor's q; 0 for tracks that have none
 
 
-def fixed(problem: Problem) -> Fixed:
+def track_constants(problem: PoseDepthProblem) -> TrackConstants:
     """To be worked out once for several linearisations. Gradient: as :func:`linearise_tracks`."""
     f0, f1 = problem.f[:, :1], problem.f[:, 1:]
-    return Fixed(
+    return TrackConstants(
         seen=(problem.uv - problem.c[..., None]) / problem.f[..., None],
         shape=problem.shape / torch.cat((f0 * f0, f0 * f1, f1 * f1), 1)[..., None],
         height=problem.ray[:, 1] / problem.ray[:, 2],
@@ -142,7 +150,7 @@ def fixed(problem: Problem) -> Fixed:
     )
 
 
-class Linear(NamedTuple):
+class LinearisedTracks(NamedTuple):
     """The tracks of a problem, linearised at z = 1: two equations each, before their inverse depth is eliminated."""
 
     u: Tensor  # (B, 7, N), along u: six columns of the pose, then the residual; or (B, 1, N), the residual alone
@@ -150,24 +158,26 @@ class Linear(NamedTuple):
     slope: Tensor  # (B, 2, N) m, d r / d q
     free: Tensor  # (B, N) bool, neither the sensor nor infinity holds q: its variance before this track is infinite
     front: Tensor  # (B, N) bool, in front of camera 1 and not at the epipole; others are finite and have no meaning
-    fixed: Fixed
+    fixed: TrackConstants
 
 
-def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True, known: Fixed | None = None) -> Linear:
+def linearise_tracks(
+    problem: PoseDepthProblem, at: Unknowns, *, columns: bool = True, known: TrackConstants | None = None
+) -> LinearisedTracks:
     """Residuals and their Jacobian at the sensor's inverse depths, and at the most probable ones of far tracks.
 
-    Without ``columns`` the residuals alone, the same bits: enough for :func:`squares`. ``known`` is :func:`fixed` of
-    the problem, where it was worked out before.
+    Without ``columns`` the residuals alone, the same bits: enough for :func:`squared_residuals`. ``known`` is
+    :func:`track_constants` of the problem, where it was worked out before.
 
     Gradient: to measurements, cameras, rays and the sensor's q; the far tracks' q is held at its optimum, where it has
     no first-order effect. Raises ValueError for wrong shapes.
     """
     check("linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), turn=(at.turn, "B 3"))
-    known = fixed(problem) if known is None else known
+    known = track_constants(problem) if known is None else known
     seen = known.seen if at.turn is None else _straight(known.seen, known.height, at.turn)
     t = at.T.t[..., None]
     # Where the ray and the plane of the epipolar line go, in one product.
-    a, line = turned(torch.cat((at.T.R, torch.linalg.cross(t, at.T.R, dim=1)), 1), problem.ray).chunk(2, 1)
+    a, line = rotate_planes(torch.cat((at.T.R, torch.linalg.cross(t, at.T.R, dim=1)), 1), problem.ray).chunk(2, 1)
     with torch.no_grad():
         best = _inverse_depth(a, t, line, seen, known.shape)
         # A point cannot lie beyond infinity: there q is known, and nothing is eliminated.
@@ -175,13 +185,13 @@ def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True, kn
     q = torch.where(problem.near, problem.inverse, best.clamp_min(0))
     Y = a + q[:, None] * t
     # At the epipole a track fits any pose if only its point is near enough, and then holds it as if it were a vice.
-    front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < MAX_NEARER * known.nearest))
+    front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < NEAREST_DEPTH_DIVISOR * known.nearest))
     w = Y[:, 2].masked_fill(~front, 1.0).reciprocal()
     plane = Y[:, :2] * w[:, None]
     slope = (t[:, :2] - plane * t[:, 2:]) * w[:, None]
     if not columns:
         r = plane - seen
-        return Linear(r[:, :1], r[:, 1:], slope, free, front, known)
+        return LinearisedTracks(r[:, :1], r[:, 1:], slope, free, front, known)
     k = q * w
     (x, y) = plane.unbind(1)
     (x_r, y_r) = (plane - seen).unbind(1)
@@ -189,12 +199,12 @@ def linearise_tracks(problem: Problem, at: Unknowns, *, columns: bool = True, kn
     (xk, yk) = (plane * -k[:, None]).unbind(1)
     xy, zero = x * y, torch.zeros_like(x)
     u, v = torch.stack((-xy, xx, -y, k, zero, xk, x_r), 1), torch.stack((-yy, xy, x, zero, k, yk, y_r), 1)
-    return Linear(u, v, slope, free, front, known)
+    return LinearisedTracks(u, v, slope, free, front, known)
 
 
-def residuals(
-    problem: Problem,
-    linear: Linear,
+def whitened_residuals(
+    problem: PoseDepthProblem,
+    linear: LinearisedTracks,
     noise: Tensor,  # (B, N) px²
     *,
     turn: bool = True,
@@ -212,7 +222,7 @@ def residuals(
     return _rows(linear, _sphere(linear.fixed, noise), turn)
 
 
-def _rows(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor], turn: bool) -> Tensor:
+def _rows(linear: LinearisedTracks, sphere: tuple[Tensor, Tensor, Tensor], turn: bool) -> Tensor:
     m0, m1 = (m[:, None] for m in _whitener(linear, sphere))
     rows = m0 * linear.u[:, :, None] + m1 * linear.v[:, :, None]
     if not turn:
@@ -220,32 +230,34 @@ def _rows(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor], turn: bool) -> 
     return torch.cat((rows[:, :6], rows[:, :3] * linear.fixed.height[:, None, None], rows[:, 6:]), 1)
 
 
-def squares(
-    problem: Problem,
-    linear: Linear,
+def squared_residuals(
+    problem: PoseDepthProblem,
+    linear: LinearisedTracks,
     noise: Tensor,  # (B, N) px²
 ) -> Tensor:
-    """Squared length (B, N) of the whitened residuals; :data:`BEHIND` for points not in front of camera 1.
+    """Squared length (B, N) of the whitened residuals; :data:`BEHIND_CAMERA_RESIDUAL` for points not in front of camera
+    1.
 
-    Gradient: as :func:`residuals`. Raises ValueError for wrong shapes.
+    Gradient: as :func:`whitened_residuals`. Raises ValueError for wrong shapes.
     """
     check("squares", u=(linear.u, "B n N"), noise=(noise, "B N"))
     return _lengths(linear, _sphere(linear.fixed, noise))
 
 
-def squares_at(problem: Problem, at: Unknowns) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """:func:`squares` at one place as a function of the noise (B, N) px², and which tracks are in front (B, N).
+def squared_residuals_at(problem: PoseDepthProblem, at: Unknowns) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
+    """:func:`squared_residuals` at one place as a function of the noise (B, N) px², and which tracks are in front (B,
+    N).
 
-    Gradient: as :func:`residuals`.
+    Gradient: as :func:`whitened_residuals`.
     """
-    known = fixed(problem)
+    known = track_constants(problem)
 
-    linear: Linear | None = None
+    linear: LinearisedTracks | None = None
 
     def found(noise: Tensor) -> tuple[Tensor, Tensor]:
         nonlocal linear
         sphere = _sphere(known, noise)
-        given = _given(problem, known, sphere, at) if native.serves(noise) else None
+        given = _compiled_arguments(problem, known, sphere, at) if loader.serves(noise) else None
         if given is not None:  # in compiled code, up to rounding: see dhtorch.ops.loader
             square, front = torch.empty_like(noise), torch.empty_like(problem.near)
             torch.ops.dhtorch.track_squares(**given, square=square, front=front)
@@ -256,13 +268,13 @@ def squares_at(problem: Problem, at: Unknowns) -> Callable[[Tensor], tuple[Tenso
     return found
 
 
-def _lengths(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+def _lengths(linear: LinearisedTracks, sphere: tuple[Tensor, Tensor, Tensor]) -> Tensor:
     m0, m1 = _whitener(linear, sphere)
     return _square(linear, m0 * linear.u[:, -1:] + m1 * linear.v[:, -1:])
 
 
-def normal(
-    problem: Problem,
+def pose_normal_equations(
+    problem: PoseDepthProblem,
     at: Unknowns,
     noise: Tensor,  # (B, N) px²
     far_weight: Tensor,  # (B,)
@@ -270,64 +282,69 @@ def normal(
     *,
     kernel: str | None,
     bend: float,
-) -> Normal:
+) -> NormalEquations:
     """Cost and normal equations (n = 9) of near tracks with weight 1, far tracks with ``far_weight``, turns near zero.
 
     Args:
-        problem, at, noise: as in :func:`linearise_tracks` and :func:`residuals`. Without a turn n = 6.
+        problem, at, noise: as in :func:`linearise_tracks` and :func:`whitened_residuals`. Without a turn n = 6.
         far_weight: of a far track's robust cost; 0 leaves them out.
         turn_precision: of the turn around zero; a huge one holds it there.
         kernel, bend: robust kernel of a whitened residual and where it bends, see ``least_squares.robust``.
 
-    Gradient: as :func:`residuals`. Raises ValueError for wrong shapes or an unknown kernel.
+    Gradient: as :func:`whitened_residuals`. Raises ValueError for wrong shapes or an unknown kernel.
     """
-    return equations(problem, noise, far_weight, turn_precision, kernel=kernel, bend=bend)[0](at)
+    return pose_normal_equations_at(problem, noise, far_weight, turn_precision, kernel=kernel, bend=bend)[0](at)
 
 
-def equations(
-    problem: Problem,
+def pose_normal_equations_at(
+    problem: PoseDepthProblem,
     noise: Tensor,  # (B, N) px²
     far_weight: Tensor,  # (B,)
     turn_precision: Tensor,  # (B,) 1/rad²
     *,
     kernel: str | None,
     bend: float,
-) -> tuple[Callable[[Unknowns], Normal], Callable[[Unknowns], Tensor]]:
-    """:func:`normal` as a function of the unknowns, and its cost (B,) alone, the same bits; for several places.
+) -> tuple[Callable[[Unknowns], NormalEquations], Callable[[Unknowns], Tensor]]:
+    """:func:`pose_normal_equations` as a function of the unknowns, and its cost (B,) alone, the same bits; for several
+    places.
 
-    Gradient: as :func:`residuals`.
+    Gradient: as :func:`whitened_residuals`.
     """
-    known = fixed(problem)
+    known = track_constants(problem)
     sphere = _sphere(known, noise)
     share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
 
     def total(cost: Tensor, turn: Tensor | None) -> Tensor:
         return cost if turn is None else cost + turn_precision * (turn * turn).sum(-1)
 
-    def with_prior(cost: Tensor, H: Tensor, g: Tensor, turn: Tensor | None) -> Normal:
+    def with_prior(cost: Tensor, H: Tensor, g: Tensor, turn: Tensor | None) -> NormalEquations:
         if turn is None:
-            return Normal(cost, H, g)
-        precision = prior(turn_precision.to(g.dtype))
+            return NormalEquations(cost, H, g)
+        precision = shutter_prior(turn_precision.to(g.dtype))
         towards = torch.cat((torch.zeros_like(g[:, :6]), turn), -1)
-        return Normal(total(cost, turn), H + torch.diag_embed(precision), g + precision * towards)
+        return NormalEquations(total(cost, turn), H + torch.diag_embed(precision), g + precision * towards)
 
-    def compiled(at: Unknowns, columns: bool) -> Normal | None:
+    def compiled(at: Unknowns, columns: bool) -> NormalEquations | None:
         """Cost, H and g of the tracks in compiled code (:mod:`dhtorch.ops.loader`), up to the rounding of sums."""
-        given = _given(problem, known, sphere, at) if kernel == COMPILED and native.serves(share) else None
+        given = (
+            _compiled_arguments(problem, known, sphere, at)
+            if kernel == COMPILED_KERNEL and loader.serves(share)
+            else None
+        )
         if given is None:
             return None
         B, n = len(share) if columns else 0, 6 if at.turn is None else 9
-        found = Normal(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
+        found = NormalEquations(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
         torch.ops.dhtorch.track_equations(**given, share=share, **found._asdict(), bend=bend)
         return found
 
-    def normal(at: Unknowns) -> Normal:
+    def normal(at: Unknowns) -> NormalEquations:
         found = compiled(at, columns=True)
         if found is not None:
             return with_prior(*found, at.turn)
         linear = linearise_tracks(problem, at, known=known)
         rows = _rows(linear, sphere, at.turn is not None)
-        rho, weight = robust(_square(linear, rows[:, -1]), kernel, bend)
+        rho, weight = robust_loss(_square(linear, rows[:, -1]), kernel, bend)
         H, g = normal_equations(rows, torch.where(linear.front, weight * share, 0.0), block=SUM_LANES)
         return with_prior((rho * share).sum(-1), H, g, at.turn)
 
@@ -336,13 +353,13 @@ def equations(
         if found is not None:
             return total(found.cost, at.turn)
         square = _lengths(linearise_tracks(problem, at, columns=False, known=known), sphere)
-        return total((robust(square, kernel, bend)[0] * share).sum(-1), at.turn)
+        return total((robust_loss(square, kernel, bend)[0] * share).sum(-1), at.turn)
 
     return normal, cost
 
 
-def _given(
-    problem: Problem, known: Fixed, sphere: tuple[Tensor, Tensor, Tensor], at: Unknowns
+def _compiled_arguments(
+    problem: PoseDepthProblem, known: TrackConstants, sphere: tuple[Tensor, Tensor, Tensor], at: Unknowns
 ) -> dict[str, Tensor] | None:
     """What compiled code is told of tracks and unknowns; None where it cannot be told."""
     a, b, d = sphere
@@ -350,15 +367,15 @@ def _given(
     told = {k: getattr(problem, k) for k in ("ray", "inverse", "near")} | known._asdict()
     told |= {"a": a, "b": b, "d": d, "R": at.T.R.contiguous(), "t": at.T.t.contiguous(), "turn": turn}
     whole = problem.ray.shape[-1] % SUM_LANES == 0
-    return told if whole and native.serves(*told.values()) else None
+    return told if whole and loader.serves(*told.values()) else None
 
 
-def _square(linear: Linear, r: Tensor) -> Tensor:
+def _square(linear: LinearisedTracks, r: Tensor) -> Tensor:
     """Squared length (B, N) of whitened residuals (B, 2, N)."""
-    return torch.where(linear.front, (r * r).sum(1), BEHIND)
+    return torch.where(linear.front, (r * r).sum(1), BEHIND_CAMERA_RESIDUAL)
 
 
-def prior(turn_precision: Tensor) -> Tensor:
+def shutter_prior(turn_precision: Tensor) -> Tensor:
     """Information (B, 9) that is there before any track: none on the pose."""
     zero = torch.zeros_like(turn_precision)
     return torch.stack((*[zero] * 6, *[turn_precision] * 3), -1)
@@ -378,14 +395,14 @@ def _inverse_depth(a: Tensor, t: Tensor, line: Tensor, seen: Tensor, shape: Tens
     return -(p * d).sum(1) / (d * d).sum(1).clamp_min(1e-24)
 
 
-def _sphere(known: Fixed, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _sphere(known: TrackConstants, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """a, b, d (B, N) of L⁻¹ = [[a, 0], [−b d, d]], which makes the noise S = L Lᵀ of a track round."""
     xx, xy, yy = (known.shape * noise[:, None]).unbind(1)
     b = xy / xx
     return xx.rsqrt(), b, (yy - b * xy).rsqrt()
 
 
-def _whitener(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def _whitener(linear: LinearisedTracks, sphere: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """The columns (B, 2, N) of a matrix M with MᵀM = (S + variance s sᵀ)⁻¹, singular where the variance is infinite.
 
     With S = L Lᵀ the whitened slope e = L⁻¹ s is a vector of the plane. Only the residual along it depends on q: of its
@@ -396,7 +413,7 @@ def _whitener(linear: Linear, sphere: tuple[Tensor, Tensor, Tensor]) -> tuple[Te
     e0, e1 = a * s0, d * (s1 - b * s0)
     square = e0 * e0 + e1 * e1
     flat, free = square < 1e-12, linear.free
-    if perhaps_any(flat):  # there the pixel does not depend on q, and any axis will do
+    if any_possible(flat):  # there the pixel does not depend on q, and any axis will do
         unit = square.masked_fill(flat, 1.0).rsqrt()
         e0, e1 = (e0 * unit).masked_fill(flat, 1.0), (e1 * unit).masked_fill(flat, 0.0)
         free = free & ~flat

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.determinism import steady
+from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.pytree import Record, record
 
 if TYPE_CHECKING:
@@ -130,9 +130,13 @@ def exp(xi: Tensor) -> Pose:
     small = theta2 < 1e-2
     safe2 = torch.where(small, torch.ones_like(theta2), theta2)
     theta = safe2.sqrt()
-    a = torch.where(small, 1 - theta2 / 6 * (1 - theta2 / 20 * (1 - theta2 / 42)), steady(torch.sin, theta) / theta)
+    a = torch.where(
+        small, 1 - theta2 / 6 * (1 - theta2 / 20 * (1 - theta2 / 42)), pad_elementwise(torch.sin, theta) / theta
+    )
     b = torch.where(
-        small, 0.5 - theta2 / 24 * (1 - theta2 / 30 * (1 - theta2 / 56)), (1 - steady(torch.cos, theta)) / safe2
+        small,
+        0.5 - theta2 / 24 * (1 - theta2 / 30 * (1 - theta2 / 56)),
+        (1 - pad_elementwise(torch.cos, theta)) / safe2,
     )
     c = torch.where(small, (1 - theta2 / 20 * (1 - theta2 / 42 * (1 - theta2 / 72))) / 6, (1 - a) / safe2)
     W = hat(omega)
@@ -155,11 +159,11 @@ def log(T: Pose) -> Tensor:
     cos = 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1)
     small = (sin2 < 1e-4) & (cos > 0)
     sin = torch.where(small, torch.ones_like(sin2), sin2).sqrt()
-    theta = steady(torch.atan2, sin, torch.where(small, torch.zeros_like(cos), cos))
+    theta = pad_elementwise(torch.atan2, sin, torch.where(small, torch.zeros_like(cos), cos))
     omega = axis * torch.where(small, 1 + sin2 * (1 / 6 + sin2 * (3 / 40 + sin2 * (5 / 112))), theta / sin)
     theta2 = (omega * omega).sum(-1)[..., None, None]
     half = 0.5 * torch.where(small, torch.ones_like(theta), theta)
-    cotangent = steady(torch.cos, half) / steady(torch.sin, half)
+    cotangent = pad_elementwise(torch.cos, half) / pad_elementwise(torch.sin, half)
     whole = (1 - half * cotangent)[..., None] / torch.where(small[..., None], torch.ones_like(theta2), theta2)
     square = torch.where(small[..., None], (1 + theta2 / 60 * (1 + theta2 / 42)) / 12, whole)
     W = hat(omega)
@@ -190,7 +194,7 @@ def rotation_angle(R: Tensor) -> Tensor:
     """
     axis = _turn_axis(R)
     trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return steady(torch.atan2, axis.norm(dim=-1), trace - 1)
+    return pad_elementwise(torch.atan2, axis.norm(dim=-1), trace - 1)
 
 
 def turn_between(up: Sequence[float], to: Sequence[float] = (0.0, -1.0, 0.0)) -> Tensor:

@@ -12,29 +12,29 @@ from torch import Tensor
 
 from dhtorch.geometry.checks import check
 
-BITS = 21
+CELL_BITS = 21
 #: Places from -REACH to REACH - 1 have a number.
-REACH = 1 << (BITS - 1)
+CELL_RANGE = 1 << (CELL_BITS - 1)
 #: Number of a place that is out of reach.
-NOWHERE = -1
+OUT_OF_RANGE = -1
 
 
-def pack(ijk: Tensor) -> Tensor:
+def pack_cells(ijk: Tensor) -> Tensor:
     """Numbers (…,) of cells (…, 3) int64; NOWHERE for a place out of reach. Gradient: none."""
     check("sparse_grid.pack", ijk=(ijk, "* 3"))
-    shifted = ijk + REACH
-    inside = ((shifted >= 0) & (shifted < 2 * REACH)).all(-1)
+    shifted = ijk + CELL_RANGE
+    inside = ((shifted >= 0) & (shifted < 2 * CELL_RANGE)).all(-1)
     x, y, z = shifted.unbind(-1)
-    return torch.where(inside, (x << 2 * BITS) + (y << BITS) + z, NOWHERE)
+    return torch.where(inside, (x << 2 * CELL_BITS) + (y << CELL_BITS) + z, OUT_OF_RANGE)
 
 
-def unpack(key: Tensor) -> Tensor:
-    """Cells (…, 3) int64 of numbers (…,), the inverse of :func:`pack`. Gradient: none."""
-    mask = 2 * REACH - 1
-    return torch.stack((key >> 2 * BITS, (key >> BITS) & mask, key & mask), -1) - REACH
+def unpack_cells(key: Tensor) -> Tensor:
+    """Cells (…, 3) int64 of numbers (…,), the inverse of :func:`pack_cells`. Gradient: none."""
+    mask = 2 * CELL_RANGE - 1
+    return torch.stack((key >> 2 * CELL_BITS, (key >> CELL_BITS) & mask, key & mask), -1) - CELL_RANGE
 
 
-def find(
+def find_cells(
     keys: Tensor,  # (K,) int64, rising
     wanted: Tensor,  # (…,) int64
 ) -> tuple[Tensor, Tensor]:
@@ -51,7 +51,7 @@ def find(
     return torch.where(found, at, 0), found
 
 
-def occupied(
+def occupied_cells(
     xyz: Tensor,  # (…, 3) m
     side: float,
 ) -> Tensor:
@@ -64,11 +64,11 @@ def occupied(
     if not side > 0:
         raise ValueError(f"sparse_grid.occupied: side is {side}, expected a positive length")
     scaled = xyz.reshape(-1, 3).double() / side
-    there = (scaled.abs() < REACH).all(-1)  # false for NaN
-    return pack(scaled[there].floor().long()).unique()
+    there = (scaled.abs() < CELL_RANGE).all(-1)  # false for NaN
+    return pack_cells(scaled[there].floor().long()).unique()
 
 
-def near(
+def touches_cells(
     keys: Tensor,  # (K,) int64, rising
     others: Tensor,  # (V,) int64, rising
 ) -> Tensor:
@@ -78,11 +78,11 @@ def near(
         ValueError: wrong shapes.
     """
     check("sparse_grid.near", keys=(keys, "K"), others=(others, "V"))
-    around = pack(unpack(keys)[:, None] + _steps(keys))
-    return find(others, around)[1].any(-1)
+    around = pack_cells(unpack_cells(keys)[:, None] + _steps(keys))
+    return find_cells(others, around)[1].any(-1)
 
 
-def components(keys: Tensor) -> Tensor:
+def connected_components(keys: Tensor) -> Tensor:
     """Which cells (K,), numbers in rising order, hang together by faces, edges or corners: labels (K,) int64 from 0.
 
     Two cells have the same label when a chain of touching cells joins them; labels rise with their first cell.
@@ -93,7 +93,9 @@ def components(keys: Tensor) -> Tensor:
     Cost: the logarithm of the longest chain, times 13 look-ups of all cells.
     """
     check("sparse_grid.components", keys=(keys, "K"))
-    at, found = find(keys, pack(unpack(keys)[:, None] + _steps(keys)[14:]))  # each pair of neighbours once
+    at, found = find_cells(
+        keys, pack_cells(unpack_cells(keys)[:, None] + _steps(keys)[14:])
+    )  # each pair of neighbours once
     a, b = torch.arange(len(keys), device=keys.device)[:, None].expand_as(at)[found], at[found]
     label = torch.arange(len(keys), device=keys.device)
     while True:

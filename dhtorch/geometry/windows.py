@@ -10,18 +10,18 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from dhtorch.ops import loader as native
+from dhtorch.ops import loader
 
 #: Pixels that are worked on at once: few enough to stay in the cache, and to need no fresh memory.
-BAND = 1 << 17
+MAX_BAND_PIXELS = 1 << 17
 
 
-def bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
+def row_bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
     """Rows of maps of size ``hw``, made from pictures (B, ...), to be worked on at once; all of them where a graph or a
     compiler would have to carry each."""
     h, w = hw
     whole = torch.compiler.is_compiling() or (image.requires_grad and torch.is_grad_enabled())
-    rows = h if whole else max(BAND // max(len(image) * w, 1), 1)
+    rows = h if whole else max(MAX_BAND_PIXELS // max(len(image) * w, 1), 1)
     return [slice(top, min(top + rows, h)) for top in range(0, h, rows)]
 
 
@@ -42,7 +42,7 @@ def window_sum(x: Tensor, radius: int) -> Tensor:
     return x
 
 
-def extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+def window_extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """What ``pick`` chooses of two, torch.maximum or torch.minimum, in the window around each pixel (B, h, w): of two
     windows half as wide, and so on. Gradient: to x."""
     for dim in (1, 2):
@@ -55,20 +55,20 @@ def extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) ->
     return x
 
 
-def spread(q: Tensor, radius: int) -> Tensor:
+def window_range(q: Tensor, radius: int) -> Tensor:
     """Largest minus smallest value (B, h, w) of a map in the window around each pixel. Gradient: none."""
     q = q.detach()
-    return extreme(q, radius, torch.maximum) - extreme(q, radius, torch.minimum)
+    return window_extreme(q, radius, torch.maximum) - window_extreme(q, radius, torch.minimum)
 
 
-def smooth(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
+def smooth_within_tolerance(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
     """Inverse depths (B, h, w), each the mean of those along its column, then along its row, up to ``radius`` away that
     differ from it by no more than ``tolerance`` (B,) 1/m: planes stay what they are, and so do edges.
 
     A window cannot see how its pixels scatter about their mean, so what is fitted by windows must be smooth within
     them. Gradient: to q.
     """
-    if native.serves(q, tolerance) and q.dtype == tolerance.dtype == torch.float32:
+    if loader.serves(q, tolerance) and q.dtype == tolerance.dtype == torch.float32:
         out = torch.empty_like(q)
         torch.ops.dhtorch.smooth(q, tolerance, out, radius)
         return out

@@ -12,19 +12,19 @@ from torch import Tensor
 from dhtorch.codes import Source
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3
-from dhtorch.integrate.level import mean_upwards, upwards
-from dhtorch.integrate.recording import mapped
-from dhtorch.integrate.scales import REACH, TOLD_BY, coarse, union
-from dhtorch.integrate.surface import Surface, mesh, points
-from dhtorch.integrate.sweeps import edges
-from dhtorch.integrate.volume import View, Volume, confirmed, empty, fuse, reserve
+from dhtorch.integrate.level import estimate_up, mean_camera_up
+from dhtorch.integrate.recording import view_from_depth_map
+from dhtorch.integrate.scales import MAX_REACH_TRUNCATIONS, N_MAPS_FOR_VOXEL, choose_coarse_voxel, merge_surfaces
+from dhtorch.integrate.surface import Surface, extract_mesh, extract_points
+from dhtorch.integrate.sweeps import depth_step_rel
+from dhtorch.integrate.volume import DepthView, Volume, drop_unconfirmed, fuse_views, make_volume, reserve_blocks
 from dhtorch.records import Pose
 
 #: Swept maps that must agree on a surface of which nothing else speaks; of fewer maps all.
-MIN_MAPS = 2
+_MIN_AGREEING_MAPS = 2
 
 #: Depth of a neighbour over a pixel's own, minus one, from which on neither is believed: a step lies between them.
-EDGE_REL = 0.1
+_MAX_DEPTH_STEP_REL = 0.1
 
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
@@ -38,7 +38,7 @@ class FrameMap(NamedTuple):
     source: Tensor  # codes.Source
 
 
-def join(
+def fuse_frame_maps(
     recording: Recording,
     frames: Sequence[int],
     read: Callable[[int], FrameMap],
@@ -61,20 +61,20 @@ def join(
     Raises:
         ValueError: no frame that could be placed.
     """
-    poses = _places(recording, frames)
+    poses = _finite_poses(recording, frames)
     if not poses:
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
-    wide = coarse(voxel, _sigmas([read(k) for k in list(poses)[:TOLD_BY]]))
-    volumes = [empty(voxel), *([] if wide is None else [empty(wide)])]
-    volumes = _fused(recording, poses, read, volumes, progress=progress)
-    surface = reduce(union, map(points, volumes))
+    wide = choose_coarse_voxel(voxel, _swept_sigmas([read(k) for k in list(poses)[:N_MAPS_FOR_VOXEL]]))
+    volumes = [make_volume(voxel), *([] if wide is None else [make_volume(wide)])]
+    volumes = _fuse_sources(recording, poses, read, volumes, progress=progress)
+    surface = reduce(merge_surfaces, map(extract_points, volumes))
     placed = list(poses.values())
     shown = surface.xyz, 2 * voxel, surface.normal
-    up = upwards(recording, placed, *shown) if len(surface.xyz) else mean_upwards(placed).tolist()
-    return (reduce(union, map(mesh, volumes)) if meshed and len(surface.xyz) else surface), up
+    up = estimate_up(recording, placed, *shown) if len(surface.xyz) else mean_camera_up(placed).tolist()
+    return (reduce(merge_surfaces, map(extract_mesh, volumes)) if meshed and len(surface.xyz) else surface), up
 
 
-def _fused(
+def _fuse_sources(
     recording: Recording,
     poses: Mapping[int, Pose],
     read: Callable[[int], FrameMap],
@@ -84,39 +84,41 @@ def _fused(
 ) -> list[Volume]:
     """The volumes after all frames: what the sensor says in each of them, what was swept in the last."""
 
-    def views(source: int) -> Iterator[View]:
+    def views(source: int) -> Iterator[DepthView]:
         name = "sensor" if source == Source.SENSOR else "swept"
         for k in progress(list(poses), f"{recording.name}: {name}", len(poses)):
-            yield _view(recording, k, read(k), source, poses[k])
+            yield _make_view(recording, k, read(k), source, poses[k])
 
     *finer, last = volumes
     for k in poses:
-        last = reserve(last, _view(recording, k, read(k), Source.SWEPT, poses[k]), max_reach=REACH)
+        last = reserve_blocks(
+            last, _make_view(recording, k, read(k), Source.SWEPT, poses[k]), max_reach=MAX_REACH_TRUNCATIONS
+        )
     volumes = [*finer, last]
     for view in views(Source.SENSOR):
-        volumes = [fuse(volume, view, max_reach=REACH) for volume in volumes]
+        volumes = [fuse_views(volume, view, max_reach=MAX_REACH_TRUNCATIONS) for volume in volumes]
     *finer, last = volumes
     for view in views(Source.SWEPT):
-        last = fuse(last, view, source=Source.SWEPT, max_reach=REACH)
-    return [*finer, confirmed(last, min(MIN_MAPS, len(poses)))]
+        last = fuse_views(last, view, source=Source.SWEPT, max_reach=MAX_REACH_TRUNCATIONS)
+    return [*finer, drop_unconfirmed(last, min(_MIN_AGREEING_MAPS, len(poses)))]
 
 
-def _sigmas(maps: Sequence[FrameMap]) -> Tensor:
+def _swept_sigmas(maps: Sequence[FrameMap]) -> Tensor:
     """Of swept pixels."""
     return torch.cat([found.sigma[(found.source == Source.SWEPT) & (found.depth > 0)] for found in maps])
 
 
-def _places(recording: Recording, frames: Sequence[int]) -> dict[int, Pose]:
+def _finite_poses(recording: Recording, frames: Sequence[int]) -> dict[int, Pose]:
     if recording.poses is None:
         return {k: se3.identity(1, torch.zeros((), dtype=torch.float64)) for k in frames[:1]}
     poses = {k: recording.poses[k : k + 1].to(torch.float64) for k in frames}
     return {k: T for k, T in poses.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
 
 
-def _view(recording: Recording, k: int, found: FrameMap, source: int, T_world_from_cam: Pose) -> View:
+def _make_view(recording: Recording, k: int, found: FrameMap, source: int, T_world_from_cam: Pose) -> DepthView:
     """The pixels of one source, but for those beside a step."""
     depth, sigma = found.depth[None], found.sigma[None]
-    keep = (found.source[None] == source) & (depth > 0) & (sigma > 0) & (edges(depth) <= EDGE_REL)
+    keep = (found.source[None] == source) & (depth > 0) & (sigma > 0) & (depth_step_rel(depth) <= _MAX_DEPTH_STEP_REL)
     depth = torch.where(keep, depth, 0.0)
     score = torch.where(keep, 0.1 / (0.1 + sigma / torch.where(keep, depth, 1.0)), 0.0)
-    return mapped(recording[k], depth, sigma, score, T_world_from_cam=T_world_from_cam)
+    return view_from_depth_map(recording[k], depth, sigma, score, T_world_from_cam=T_world_from_cam)

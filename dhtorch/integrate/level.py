@@ -12,7 +12,7 @@ from dhtorch.data.recording import Recording
 from dhtorch.records import Pose
 
 #: Format → the direction of its world that points upwards: ARKit and the built-in room, motion capture.
-GRAVITY = {
+_UP_BY_FORMAT = {
     "stray": (0.0, 1.0, 0.0),
     "record3d": (0.0, 1.0, 0.0),
     "synthetic": (0.0, -1.0, 0.0),
@@ -22,26 +22,26 @@ GRAVITY = {
 
 #: Formats whose world is level by the way it is made, however the camera was held: a phone upright keeps its pictures
 #: lying, one above a table looks straight down.
-ALWAYS = frozenset({"stray", "arkitscenes", "synthetic"})
+_LEVEL_FORMATS = frozenset({"stray", "arkitscenes", "synthetic"})
 
 #: In the other formats a trajectory may have been moved to its first camera: a direction farther from the cameras' own
 #: upward one is not believed, cosine of the angle.
-LEAST_COSINE = 0.5
+_MIN_UP_COSINE = 0.5
 
 #: Planes that are tried, and the share of the points that the floor must hold.
-TRIALS, LEAST_SHARE = 300, 0.1
+_N_FLOOR_TRIALS, _MIN_FLOOR_SHARE = 300, 0.1
 
 #: How near a floor's normal is to the direction that is guessed, cosine of 40°.
-WITHIN = 0.77
+_MIN_GUESS_COSINE = 0.77
 
 #: Directions that are tried on the whole sphere, about 2° apart; how far a surface may lean, rad (5°).
-DIRECTIONS, LEAN = 12000, 0.087
+_N_DIRECTIONS, _LEAN_SIGMA_RAD = 12000, 0.087
 
 #: Score of an upward direction that walls and levels must reach: twice that of surfaces that stand anyhow.
-LEAST_SCORE = 0.25
+_MIN_UPRIGHT_SCORE = 0.25
 
 
-def upwards(
+def estimate_up(
     recording: Recording,
     poses: Sequence[Pose],
     xyz: Tensor,
@@ -61,19 +61,19 @@ def upwards(
         thickness: m, of the floor.
         normal: (P, 3) of the map's surfaces; NaN where unknown. None = no walls are asked.
     """
-    mean = mean_upwards(poses)
-    known = GRAVITY.get(recording.format)
-    if known is not None and _own_world(recording, poses):
+    mean = mean_camera_up(poses)
+    known = _UP_BY_FORMAT.get(recording.format)
+    if known is not None and _is_in_own_world(recording, poses):
         axis = torch.tensor(known, dtype=torch.float64)
-        if recording.format in ALWAYS or float(axis @ mean) > LEAST_COSINE:
+        if recording.format in _LEVEL_FORMATS or float(axis @ mean) > _MIN_UP_COSINE:
             return axis.tolist()
-    found = floor(xyz.double(), mean, thickness)
+    found = _fit_floor_normal(xyz.double(), mean, thickness)
     if found is None and normal is not None:
-        found = standing(normal.double(), mean)
+        found = _fit_upright_direction(normal.double(), mean)
     return (mean if found is None else found).tolist()
 
 
-def _own_world(recording: Recording, poses: Sequence[Pose]) -> bool:
+def _is_in_own_world(recording: Recording, poses: Sequence[Pose]) -> bool:
     """Whether frames stand where the recording says, not where a chain of pairs has put them."""
     if recording.poses is None or not poses:
         return False
@@ -81,37 +81,39 @@ def _own_world(recording: Recording, poses: Sequence[Pose]) -> bool:
     return bool((off < 1e-5).any())
 
 
-def mean_upwards(poses: Sequence[Pose]) -> Tensor:
+def mean_camera_up(poses: Sequence[Pose]) -> Tensor:
     """The cameras' mean upward direction (3,) in the world; that of camera axes where they cancel out."""
     mean = torch.stack([-T.R[0, :, 1].double() for T in poses]).mean(0) if poses else torch.zeros(3).double()
     length = mean.norm()
     return mean / length if float(length) > 1e-3 else torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 
 
-def floor(xyz: Tensor, guess: Tensor, thickness: float) -> Tensor | None:
+def _fit_floor_normal(xyz: Tensor, guess: Tensor, thickness: float) -> Tensor | None:
     """Unit normal (3,) of the largest plane within 40° of ``guess``; None where none holds a tenth of the points."""
     xyz = xyz[xyz.isfinite().all(-1)]
     if len(xyz) < 100:
         return None
     draw = torch.Generator().manual_seed(0)
     some = xyz[torch.randint(len(xyz), (min(len(xyz), 5000),), generator=draw)]
-    three = some[torch.randint(len(some), (TRIALS, 3), generator=draw)]
+    three = some[torch.randint(len(some), (_N_FLOOR_TRIALS, 3), generator=draw)]
     normal = torch.linalg.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=-1)
     normal = normal * torch.where(normal @ guess < 0, -1.0, 1.0)[:, None]
-    level = normal @ guess > WITHIN
+    level = normal @ guess > _MIN_GUESS_COSINE
     off = (some @ normal.T - (three[:, 0] * normal).sum(-1)).abs()
     count = torch.where(level, (off < thickness).sum(0), 0)
     best = int(count.argmax())
-    if int(count[best]) < LEAST_SHARE * len(some):
+    if int(count[best]) < _MIN_FLOOR_SHARE * len(some):
         return None
     held = some[off[:, best] < thickness]
     axis = torch.linalg.eigh((held - held.mean(0)).T @ (held - held.mean(0))).eigenvectors[:, 0]
     axis = axis if float(axis @ guess) > 0 else -axis
-    return axis if float(axis @ guess) > WITHIN else None  # the fit to all that it holds may have turned away
+    return (
+        axis if float(axis @ guess) > _MIN_GUESS_COSINE else None
+    )  # the fit to all that it holds may have turned away
 
 
-def standing(normal: Tensor, guess: Tensor) -> Tensor | None:
+def _fit_upright_direction(normal: Tensor, guess: Tensor) -> Tensor | None:
     """Unit direction (3,) within 40° of ``guess`` to which most surfaces lie level or stand upright; None = too few do.
 
     Args:
@@ -123,16 +125,18 @@ def standing(normal: Tensor, guess: Tensor) -> Tensor | None:
         return None
     draw = torch.Generator().manual_seed(0)
     some = torch.nn.functional.normalize(normal[torch.randint(len(normal), (min(len(normal), 5000),), generator=draw)])
-    axes = directions(DIRECTIONS)
-    axes = axes[axes @ guess > WITHIN]
+    axes = _spiral_directions(_N_DIRECTIONS)
+    axes = axes[axes @ guess > _MIN_GUESS_COSINE]
     upright = torch.asin((some @ axes.T).abs().clamp(max=1))  # angle from the plane at right angles to the axis
     level = torch.pi / 2 - upright
-    score = (torch.exp(-0.5 * (upright / LEAN) ** 2) + torch.exp(-0.5 * (level / LEAN) ** 2)).mean(0)
+    score = (
+        torch.exp(-0.5 * (upright / _LEAN_SIGMA_RAD) ** 2) + torch.exp(-0.5 * (level / _LEAN_SIGMA_RAD) ** 2)
+    ).mean(0)
     best = int(score.argmax())
-    return axes[best] if float(score[best]) >= LEAST_SCORE else None
+    return axes[best] if float(score[best]) >= _MIN_UPRIGHT_SCORE else None
 
 
-def directions(count: int) -> Tensor:
+def _spiral_directions(count: int) -> Tensor:
     """Unit vectors (count, 3) spread evenly over the sphere, along a spiral."""
     k = torch.arange(count, dtype=torch.float64) + 0.5
     z, turn = 1 - 2 * k / count, k * math.pi * (3 - math.sqrt(5))

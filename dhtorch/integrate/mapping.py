@@ -22,28 +22,28 @@ from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.integrate import recording as recordings
-from dhtorch.integrate.level import upwards
+from dhtorch.integrate.level import estimate_up
 from dhtorch.integrate.picture import draw_map
-from dhtorch.integrate.recording import PairEstimate, Places
-from dhtorch.integrate.scales import REACH, TOLD_BY, coarse, union
-from dhtorch.integrate.sweeps import Shelf, Sweep
+from dhtorch.integrate.recording import PairEstimate, PlacedFrames
+from dhtorch.integrate.scales import MAX_REACH_TRUNCATIONS, N_MAPS_FOR_VOXEL, choose_coarse_voxel, merge_surfaces
+from dhtorch.integrate.sweeps import DenseSweep, SweepStore
 from dhtorch.metrics import bootstrap
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.pair import merge
 from dhtorch.records import Camera, Frame
-from dhtorch.runtime import results as archive
-from dhtorch.runtime.console import many
-from dhtorch.viz.plots import at_cutoff
+from dhtorch.runtime import results as result_files
+from dhtorch.runtime.console import format_count
+from dhtorch.viz.plots import append_cutoff
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
-Pairs = Callable[[Scene], Iterable[Pair]]
+PairSelector = Callable[[Scene], Iterable[Pair]]
 
 #: Edges of voxels that are chosen from the depth, m.
-LEAST_VOXEL, MOST_VOXEL = 0.005, 0.2
+_MIN_VOXEL_M, _MAX_VOXEL_M = 0.005, 0.2
 
 #: Settings groups whose names are kept with the result.
-GROUPS = ("method", "data", "pairs")
+_CONFIG_GROUPS = ("method", "data", "pairs")
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class MappedScene:
 
     recording: Recording
     answers: Sequence[PairEstimate]
-    places: Places
+    places: PlacedFrames
     voxel: float  # m, of what the sensor sees
     surface: integrate.Surface
     row: Row
@@ -61,7 +61,7 @@ class MappedScene:
     def up(self) -> list[float]:
         """The upward direction of the map."""
         poses = list(self.places.poses.values())
-        return upwards(self.recording, poses, self.surface.xyz, 2 * self.voxel, self.surface.normal)
+        return estimate_up(self.recording, poses, self.surface.xyz, 2 * self.voxel, self.surface.normal)
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
@@ -79,7 +79,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         ValueError, OSError, ImportError: bad options or data.
         KeyboardInterrupt: Ctrl-C; scenes that are finished stay.
     """
-    _check(settings)
+    _check_settings(settings)
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
         data_files.set_opencv_threads(settings["threads"])
@@ -91,56 +91,62 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     written: list[Path] = []
     try:
         for source in sources:
-            made = make(source, parts["method"], parts["pairs"], settings, progress=progress)
-            written += write(folder / source.name, made, settings)
+            made = map_scene(source, parts["method"], parts["pairs"], settings, progress=progress)
+            written += write_mapped_scene(folder / source.name, made, settings)
             made.row["seconds"] = time.perf_counter() - began - sum(r["seconds"] for r in found)
             found.append(made.row)
             rows += [*_pair_rows(made), made.row]
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"{len(found)} of {many(len(sources), 'scene')} in {folder} are whole and stay"
+            f"{len(found)} of {format_count(len(sources), 'scene')} in {folder} are whole and stay"
         ) from None
-    result = _result(settings, sources, rows, found)
-    archive.write(folder / "result.json", result)
-    print("\n".join(_said(row, row["cell_m"]) for row in found))
+    result = _build_result(settings, sources, rows, found)
+    result_files.write_result(folder / "result.json", result)
+    print("\n".join(_describe_scene(row, row["cell_m"]) for row in found))
     print("\n".join(["wrote", *(f"  {path}" for path in [folder / "result.json", *written])]))
     return 0
 
 
-def make(scene: Scene, method: Method, pairs: Pairs, settings: Mapping[str, Any], *, progress: Progress) -> MappedScene:
+def map_scene(
+    scene: Scene, method: Method, pairs: PairSelector, settings: Mapping[str, Any], *, progress: Progress
+) -> MappedScene:
     """Ask the method, place the frames, fuse, and count.
 
     Raises:
         ValueError: as the readers, the method and the volume raise it; no frame that could be placed.
     """
     recording, chosen = scene.recording, list(pairs(scene))
-    settings = {**settings, "voxel": voxel_of(recording) if settings["voxel"] is None else settings["voxel"]}
-    sweep = Sweep.asked(settings["dense"])
+    settings = {**settings, "voxel": choose_voxel(recording) if settings["voxel"] is None else settings["voxel"]}
+    sweep = DenseSweep.asked(settings["dense"])
     options = {k: settings[k] for k in ("cutoff", "seed", "device")} | {"dtype": getattr(torch, settings["dtype"])}
-    asked = recordings.ask(scene, method, chosen, sweep=sweep, shelf=Shelf(Path(settings["output"])), **options)
+    asked = recordings.estimate_pairs(
+        scene, method, chosen, sweep=sweep, shelf=SweepStore(Path(settings["output"])), **options
+    )
     answers = list(progress(asked, f"{recording.name}: pairs", len(chosen)))
-    links = _links(answers) if settings["poses"] == "anchored" else []
-    linked = recordings.ask(scene, method, links, **options)
+    links = _linking_pairs(answers) if settings["poses"] == "anchored" else []
+    linked = recordings.estimate_pairs(scene, method, links, **options)
     found = [*answers, *progress(linked, f"{recording.name}: links", len(links))]
-    places = recordings.place(recording, found, poses=settings["poses"])
+    places = recordings.place_frames(recording, found, poses=settings["poses"])
     if not places.poses:
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
-    volumes, points = _fused(recording, answers, places, settings, progress)
+    volumes, points = _fuse_sources(recording, answers, places, settings, progress)
     *_, surface = points.values()
-    if meshed(settings["mesh"]):
-        surface = reduce(union, (integrate.mesh(volume, min_weight=settings["min_weight"]) for volume in volumes))
-    row: Row = {"scene": recording.name, "pair": None, "method": _name(settings), "truth": settings["poses"]}
+    if should_mesh(settings["mesh"]):
+        surface = reduce(
+            merge_surfaces, (integrate.extract_mesh(volume, min_weight=settings["min_weight"]) for volume in volumes)
+        )
+    row: Row = {"scene": recording.name, "pair": None, "method": _method_name(settings), "truth": settings["poses"]}
     row |= {"role": scene.role, "cutoff_m": settings["cutoff"], "n_pairs": len(chosen), "n_frames": len(places.poses)}
     row |= {"n_fragments": places.n_fragments, "n_unplaced": places.n_unplaced, "n_recovered": _n_recovered(answers)}
     row |= {} if sweep is None else {"n_swept": sum(a.swept.n for a in answers if a.swept is not None)}
-    row |= _covered(points, volumes[-1].voxel)
+    row |= _coverage_columns(points, volumes[-1].voxel)
     row |= {"n_points": len(surface.xyz), "n_triangles": None if surface.face is None else len(surface.face)}
     row |= {"volume_mib": sum(v.bytes for v in volumes) / 2**20}
     row |= {"voxel_m": settings["voxel"], "cell_m": volumes[-1].voxel}
     return MappedScene(recording, answers, places, settings["voxel"], surface, row)
 
 
-def voxel_of(recording: Recording, frames: Sequence[int] | None = None) -> float:
+def choose_voxel(recording: Recording, frames: Sequence[int] | None = None) -> float:
     """Edge of a voxel, m: twice the size of a depth pixel at the median return, from 5 mm to 20 cm, to two digits.
 
     Told by three ``frames``, None = of all.
@@ -155,13 +161,13 @@ def voxel_of(recording: Recording, frames: Sequence[int] | None = None) -> float
             f = frame.camera.f * frame.depth.shape[-1] / frame.hw[1] if own is None else own
             sizes.append(float(depth.median() / f.mean()))
     middle = 2 * sorted(sizes)[len(sizes) // 2] if sizes else 0.02
-    return float(f"{min(max(middle, LEAST_VOXEL), MOST_VOXEL):.2g}")
+    return float(f"{min(max(middle, _MIN_VOXEL_M), _MAX_VOXEL_M):.2g}")
 
 
-def _fused(
+def _fuse_sources(
     recording: Recording,
     answers: Sequence[PairEstimate],
-    places: Places,
+    places: PlacedFrames,
     settings: Mapping[str, Any],
     progress: Progress,
 ) -> tuple[list[integrate.Volume], dict[str, integrate.Surface]]:
@@ -170,35 +176,41 @@ def _fused(
     stages = {Source.SENSOR: "sensor", Source.RECOVERED: "sparse"}
     stages |= {Source.SWEPT: "dense"} if any(a.swept is not None for a in answers) else {}
     points: dict[str, integrate.Surface] = {}
-    wide = coarse(settings["voxel"], _sigmas(answers))
+    wide = choose_coarse_voxel(settings["voxel"], _swept_sigmas(answers))
 
     def seen(volume: integrate.Volume) -> integrate.Surface:
-        return integrate.points(volume, min_weight=settings["min_weight"])
+        return integrate.extract_points(volume, min_weight=settings["min_weight"])
 
     def after(source: int, volumes: list[integrate.Volume]) -> None:
         if source == Source.SENSOR or wide is None:
             points[stages[source]] = seen(volumes[0])
         else:
-            points[stages[source]] = union(points["sensor"], seen(volumes[-1]))
+            points[stages[source]] = merge_surfaces(points["sensor"], seen(volumes[-1]))
 
     options = {k: settings[k] for k in ("cutoff", "min_conf", "min_maps")} | {"progress": progress}
-    options |= {"sigma_m": settings["sensor_sigma_m"], "sigma_rel": settings["sensor_sigma_rel"], "max_reach": REACH}
-    empty = [integrate.empty(settings["voxel"], truncation=settings["truncation"])]
-    empty += [] if wide is None else [integrate.empty(wide)]
-    volumes = recordings.build_grids(recording, empty, answers, places, sources=list(stages), after=after, **options)
+    options |= {
+        "sigma_m": settings["sensor_sigma_m"],
+        "sigma_rel": settings["sensor_sigma_rel"],
+        "max_reach": MAX_REACH_TRUNCATIONS,
+    }
+    empty = [integrate.make_volume(settings["voxel"], truncation=settings["truncation"])]
+    empty += [] if wide is None else [integrate.make_volume(wide)]
+    volumes = recordings.fuse_recording_grids(
+        recording, empty, answers, places, sources=list(stages), after=after, **options
+    )
     return volumes, points
 
 
-def _sigmas(answers: Sequence[PairEstimate]) -> Tensor:
+def _swept_sigmas(answers: Sequence[PairEstimate]) -> Tensor:
     """Of what was swept, or where nothing was, of the recovered points."""
-    maps = [swept.read() for swept in [a.swept for a in answers if a.swept is not None][:TOLD_BY]]
+    maps = [swept.read() for swept in [a.swept for a in answers if a.swept is not None][:N_MAPS_FOR_VOXEL]]
     sigmas = [sigma[depth > 0] for depth, sigma, _ in maps]
     return torch.cat(sigmas or [a.estimate.sigma[a.recovered] for a in answers] or [torch.zeros(0)])
 
 
-def _covered(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
+def _coverage_columns(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
     """Columns of the last of these surfaces, of those before it with their names, and how much wider it is."""
-    found = {name: recordings.coverage(surface.xyz, voxel) for name, surface in points.items()}
+    found = {name: recordings.measure_coverage(surface.xyz, voxel) for name, surface in points.items()}
     *before, last = found
     row: Row = found[last]
     for name in before:
@@ -208,12 +220,12 @@ def _covered(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
     return row
 
 
-def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list[Path]:
+def write_mapped_scene(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list[Path]:
     """The files of one scene; returns what was written."""
     surface, voxel, up = scene.surface, scene.voxel, scene.up
     rgb = surface.features[:, :3]
     said = write_surface(folder / "map.ply", surface, f"{scene.recording.name}'s world", up)
-    cloud = _cloud(scene)
+    cloud = _collect_samples(scene)
     recovered = cloud["source"] == Source.RECOVERED
     named = {"sigma": surface.sigma, "source": surface.source}
     shapes = [export.Shape("surface", surface.xyz, rgb, surface.normal, surface.face, values=named)]
@@ -225,7 +237,7 @@ def write(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list
     columns = {k: cloud[k] for k in ("sigma", "score", "hole", "source")}
     export.write_ply(folder / "points.ply", cloud["xyz"], cloud["rgb"], comments=said, **columns)
     _write_colmap(folder / "colmap", scene)
-    title = at_cutoff(scene.recording.name, scene.row["cutoff_m"])
+    title = append_cutoff(scene.recording.name, scene.row["cutoff_m"])
     draw_map(folder / "map.png", surface, list(scene.places.poses.values()), up, voxel=voxel, title=title)
     files = ["map.ply", "map.glb", "points.ply", "map.png"]
     files += [f"colmap/{name}" for name in ("cameras.txt", "images.txt", "points3D.txt")]
@@ -242,7 +254,7 @@ def write_surface(path: Path, surface: integrate.Surface, axes: str, up: Sequenc
     return said
 
 
-def _cloud(scene: MappedScene) -> dict[str, Tensor]:
+def _collect_samples(scene: MappedScene) -> dict[str, Tensor]:
     """Every sample with depth, the sensor's or recovered, of every placed anchor, in the world."""
     parts: dict[str, list[Tensor]] = {k: [] for k in ("xyz", "rgb", "sigma", "score", "hole", "source")}
     for answer in scene.answers:
@@ -266,14 +278,14 @@ def _write_colmap(folder: Path, scene: MappedScene) -> None:
     for k in poses:
         frame: Frame = scene.recording[k]
         lenses[k] = frame.camera, frame.hw
-    shots = [export.Shot(f"{int(scene.recording.number[k]):06d}.png", *lenses[k], poses[k]) for k in poses]
-    pieces = [_triangulated(a, number, poses) for a in scene.answers if set(a.pair) <= set(poses)]
+    shots = [export.ColmapImage(f"{int(scene.recording.number[k]):06d}.png", *lenses[k], poses[k]) for k in poses]
+    pieces = [_triangulated_points(a, number, poses) for a in scene.answers if set(a.pair) <= set(poses)]
     none = [torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2).long(), torch.zeros(0, 2, 2)]
     xyz, rgb, error, seen_by, uv = map(torch.cat, zip(*(pieces or [none]), strict=True))
     export.write_colmap(folder, shots, xyz, rgb=rgb, error=error, seen_by=seen_by, uv=uv)
 
 
-def _triangulated(answer: PairEstimate, number: Mapping[int, int], poses: Mapping[int, Any]) -> list[Tensor]:
+def _triangulated_points(answer: PairEstimate, number: Mapping[int, int], poses: Mapping[int, Any]) -> list[Tensor]:
     """World points, colours, errors, views and pixels of what one pair answered."""
     keep = answer.estimate.keep[0]
     xyz = cameras.unproject(answer.camera, answer.estimate.uv, answer.estimate.depth.nan_to_num(1.0))
@@ -283,10 +295,10 @@ def _triangulated(answer: PairEstimate, number: Mapping[int, int], poses: Mappin
     return [x[keep] for x in (world, answer.rgb[0], answer.estimate.residual_px[0], views, uv)]
 
 
-def _links(answers: Sequence[PairEstimate]) -> list[tuple[int, int]]:
+def _linking_pairs(answers: Sequence[PairEstimate]) -> list[tuple[int, int]]:
     """Further pairs that hold the frames together."""
     asked = [(a.pair[0], k) for a in answers for k in a.links]
-    return recordings.chain(asked, chosen=any(a.picked is not None for a in answers))
+    return recordings.linking_pairs(asked, chosen=any(a.picked is not None for a in answers))
 
 
 def _pair_rows(scene: MappedScene) -> list[Row]:
@@ -300,19 +312,19 @@ def _pair_rows(scene: MappedScene) -> list[Row]:
     ]
 
 
-def _said(row: Row, cell: float) -> str:
+def _describe_scene(row: Row, cell: float) -> str:
     """One scene in words."""
-    placed = f"{row['n_frames']} of {many(row['n_frames'] + row['n_unplaced'], 'frame')} placed by {row['truth']} poses"
-    fragments = many(row["n_fragments"], "fragment")
+    placed = f"{row['n_frames']} of {format_count(row['n_frames'] + row['n_unplaced'], 'frame')} placed by {row['truth']} poses"
+    fragments = format_count(row["n_fragments"], "fragment")
     if not row["n_voxels"]:
         return f"{row['scene']}: {placed}, {fragments}; no surface"
     wider = f", {row['voxels_vs_sensor']:.3g} times the sensor's" if row["voxels_vs_sensor"] else ""
     wider += f" and {row['voxels_vs_sparse']:.3g} times those without a sweep" if row.get("voxels_vs_sparse") else ""
-    islands = f"{many(row['n_islands'], 'island')}, the largest {row['largest_island']:.0%}"
+    islands = f"{format_count(row['n_islands'], 'island')}, the largest {row['largest_island']:.0%}"
     size = f"{row['n_points']:,} points" + (f", {row['n_triangles']:,} triangles" if row["n_triangles"] else "")
     return (
         f"{row['scene']}: {placed}, {fragments};"
-        f" {many(row['n_voxels'], 'voxel')} of {100 * cell:g} cm{wider}, {islands};"
+        f" {format_count(row['n_voxels'], 'voxel')} of {100 * cell:g} cm{wider}, {islands};"
         f" {size}, {row['volume_mib']:.1f} MiB, {row['seconds']:.1f} s"
     )
 
@@ -321,23 +333,25 @@ def _n_recovered(answers: Iterable[PairEstimate]) -> int:
     return sum(int(answer.recovered.sum()) for answer in answers)
 
 
-def _result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: list[Row], scenes: list[Row]) -> Row:
-    choices = {group: settings["choices"][group] for group in GROUPS}
+def _build_result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: list[Row], scenes: list[Row]) -> Row:
+    choices = {group: settings["choices"][group] for group in _CONFIG_GROUPS}
     config = {k: v for k, v in settings.items() if k != "choices"}
-    named = archive.files_named({k: config[k] for k in GROUPS})
-    digest = archive.data_digest({**archive.files_below(r.root for r in sources), **named})
+    named = result_files.list_files_named({k: config[k] for k in _CONFIG_GROUPS})
+    digest = result_files.compute_data_digest({**result_files.list_files_below(r.root for r in sources), **named})
     metrics = ["n_voxels", "n_voxels_sensor", "voxels_vs_sensor", "n_fragments", "n_islands"]
-    metrics += ["n_voxels_sparse", "voxels_vs_sparse"] if Sweep.asked(settings["dense"]) is not None else []
+    metrics += ["n_voxels_sparse", "voxels_vs_sparse"] if DenseSweep.asked(settings["dense"]) is not None else []
     summary = {}
     for metric in metrics:
         values = sorted(row[metric] for row in scenes if row[metric] is not None and row["role"] is None)
         middle = float(torch.tensor(values, dtype=torch.float64).quantile(0.5)) if values else None
-        summary[f"{_name(settings)}.{metric}"] = bootstrap.single(middle, len(values), "")
+        summary[f"{_method_name(settings)}.{metric}"] = bootstrap.without_interval(middle, len(values), "")
     threads = torch.get_num_threads()
-    return archive.build(
+    return result_files.build_result(
         experiment="integrate",
-        key=archive.result_key({**config, "choices": choices}, digest, roots=[__name__]),
-        meta=archive.meta(device=settings["device"], dtype=settings["dtype"], threads=threads, seed=settings["seed"]),
+        key=result_files.compute_result_key({**config, "choices": choices}, digest, roots=[__name__]),
+        meta=result_files.collect_run_metadata(
+            device=settings["device"], dtype=settings["dtype"], threads=threads, seed=settings["seed"]
+        ),
         config=config,
         data={
             "name": choices["data"],
@@ -350,29 +364,29 @@ def _result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: list[Ro
     )
 
 
-def _name(settings: Mapping[str, Any]) -> str:
+def _method_name(settings: Mapping[str, Any]) -> str:
     return str(settings["choices"]["method"])
 
 
-def meshed(wanted: bool | None) -> bool:
+def should_mesh(wanted: bool | None) -> bool:
     """Whether triangles are made: as wanted, else where scikit-image is installed."""
     return importlib.util.find_spec("skimage") is not None if wanted is None else wanted
 
 
-def _check(settings: Mapping[str, Any]) -> None:
+def _check_settings(settings: Mapping[str, Any]) -> None:
     """Options that would only fail after minutes."""
     if settings["dtype"] not in ("float32", "float64"):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
-    if settings["poses"] not in recordings.POSES:
-        raise ValueError(f"poses: found {settings['poses']!r}, expected one of {', '.join(recordings.POSES)}")
+    if settings["poses"] not in recordings.POSE_SOURCES:
+        raise ValueError(f"poses: found {settings['poses']!r}, expected one of {', '.join(recordings.POSE_SOURCES)}")
     if settings["cutoff"] is not None and not settings["cutoff"] > 0:
         raise ValueError(f"cutoff: found {settings['cutoff']}, expected a positive number of metres, or null for none")
     if not isinstance(settings["min_maps"], int) or settings["min_maps"] < 1:
         raise ValueError(f"min_maps: found {settings['min_maps']!r}, expected a whole number of at least 1")
-    Sweep.asked(settings["dense"])
-    if settings["mesh"] and not meshed(None):
+    DenseSweep.asked(settings["dense"])
+    if settings["mesh"] and not should_mesh(None):
         raise ImportError("mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'")
-    integrate.points(
-        integrate.empty(settings["voxel"] or LEAST_VOXEL, truncation=settings["truncation"]),
+    integrate.extract_points(
+        integrate.make_volume(settings["voxel"] or _MIN_VOXEL_M, truncation=settings["truncation"]),
         min_weight=settings["min_weight"],
     )

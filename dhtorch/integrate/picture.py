@@ -13,14 +13,14 @@ from dhtorch.codes import Source, names, words
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import project
 from dhtorch.integrate.surface import Surface
-from dhtorch.integrate.volume import SOURCES, splat
+from dhtorch.integrate.volume import VOLUME_SOURCES, splat_points
 from dhtorch.records import Camera, Pose
-from dhtorch.runtime.console import many
-from dhtorch.viz.plots import Canvas, Key, Stroke, colours, headed, save
-from dhtorch.viz.plots.colours import INK, of_source
+from dhtorch.runtime.console import format_count
+from dhtorch.viz.plots import Canvas, LegendKey, Stroke, colours, prefix_title, save_figure
+from dhtorch.viz.plots.colours import INK, colour_by_source
 
 #: Lengths that a scale bar may have, m.
-LENGTHS = tuple(m * 10.0**e for e in range(-3, 4) for m in (1, 2, 5))
+_SCALE_BAR_LENGTHS_M = tuple(m * 10.0**e for e in range(-3, 4) for m in (1, 2, 5))
 
 
 def draw_map(
@@ -40,23 +40,26 @@ def draw_map(
     T = _viewpoint(surface, cameras, up)
     light = se3.rotate(T.R.mT, surface.normal[None].double())[0] @ torch.tensor([0.3, -0.5, -0.8]).double()
     shade = 0.35 + 0.65 * light.abs().nan_to_num(0.5).clamp(0, 1)[:, None]
-    by_source = torch.from_numpy(of_source(surface.source)) / 255 * shade
+    by_source = torch.from_numpy(colour_by_source(surface.source)) / 255 * shade
     xyz = se3.apply(se3.invert(T), surface.xyz[None].double())
     away = (surface.normal.double() * (T.t - surface.xyz.double())).sum(-1) < 0
     ahead = (xyz[..., 2] > voxel) & ~away
     way = se3.apply(se3.invert(T), torch.cat([pose.t for pose in cameras])[None].double())
-    lens = _fitted(torch.cat((xyz[ahead], way[way[..., 2] > voxel])), hw)
+    lens = _fit_camera(torch.cat((xyz[ahead], way[way[..., 2] > voxel])), hw)
     uv = project(lens, xyz)
     depth = torch.where(ahead, xyz[..., 2], 0.0)
     both = torch.cat((surface.features[:, :3].double(), by_source), -1)[None]
-    seen = splat(lens, hw, uv, depth, torch.ones_like(depth), both, T_world_from_cam=T, radius=0.8 * voxel)
+    seen = splat_points(lens, hw, uv, depth, torch.ones_like(depth), both, T_world_from_cam=T, radius=0.8 * voxel)
     picture = torch.where(seen.depth[0, ..., None] > 0, seen.features[0], 1.0).clamp(0, 1).numpy()
     dots = project(lens, way)[way[..., 2] > voxel].numpy()
-    counts = {code: int((surface.source == code).sum()) for code in SOURCES}
+    counts = {code: int((surface.source == code).sum()) for code in VOLUME_SOURCES}
     shown = {code: n for code, n in counts.items() if n or code != Source.SWEPT}
     *first, last = (words(names(Source)[code]) for code in shown)
     sources = f"{', '.join(first)} and {last}".capitalize()
-    pictures = {headed(f"Map of {many(len(cameras), 'view')}", title): picture[..., :3], sources: picture[..., 3:]}
+    pictures = {
+        prefix_title(f"Map of {format_count(len(cameras), 'view')}", title): picture[..., :3],
+        sources: picture[..., 3:],
+    }
     metre = float(lens.f[0, 0] / depth[depth > 0].median()) if bool((depth > 0).any()) else None
     _side_by_side(path, pictures, dots, shown, metre)
 
@@ -84,13 +87,16 @@ def _side_by_side(
         canvas.dots(inside, Stroke(INK, 1.5))
         if metre is not None:
             _scale_bar(canvas, left, width, metre * scale)
-    keys = [Key(f"{words(names(Source)[code])}  {n}", colours.SOURCES[code], "box") for code, n in counts.items()]
-    save(canvas.finished(keys), path)
+    keys = [
+        LegendKey(f"{words(names(Source)[code])}  {n}", colours.SOURCE_COLOURS[code], "box")
+        for code, n in counts.items()
+    ]
+    save_figure(canvas.finished(keys), path)
 
 
 def _scale_bar(canvas: Canvas, left: float, width: float, metre: float) -> None:
     """A round length, at most a fifth of the picture, in its lower left corner; ``metre`` in points."""
-    length = max((x for x in LENGTHS if x * metre <= width / 5), default=LENGTHS[0])
+    length = max((x for x in _SCALE_BAR_LENGTHS_M if x * metre <= width / 5), default=_SCALE_BAR_LENGTHS_M[0])
     start, end, tick = left + 6, left + 6 + length * metre, 2.5
     canvas.lines([((start, 6), (end, 6)), *(((x, 6 - tick), (x, 6 + tick)) for x in (start, end))], Stroke(INK, 1.2))
     canvas.text(f"{length:g} m", start, 11)
@@ -111,7 +117,7 @@ def _viewpoint(surface: Surface, cameras: Sequence[Pose], up: Sequence[float]) -
     return Pose(torch.stack((x, torch.linalg.cross(z, x), z), 1)[None], (middle - 2.2 * far * z)[None])
 
 
-def _fitted(xyz: Tensor, hw: tuple[int, int]) -> Camera:
+def _fit_camera(xyz: Tensor, hw: tuple[int, int]) -> Camera:
     """A camera at the origin whose picture is filled by all points but the outermost."""
     if not len(xyz):
         return Camera(torch.full((1, 2), float(hw[1])).double(), torch.tensor([[hw[1] / 2, hw[0] / 2]]).double())

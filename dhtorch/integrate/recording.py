@@ -18,25 +18,33 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import Source
-from dhtorch.data.pairs import Pair, between
+from dhtorch.data.pairs import Pair, spaced_frames
 from dhtorch.data.recording import Recording
-from dhtorch.data.scene import Given, Scene
+from dhtorch.data.scene import Scene, SceneLike
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3, sparse_grid
-from dhtorch.geometry.patches import nearest
-from dhtorch.integrate.sweeps import Shelf, Sweep, Swept, edges
-from dhtorch.integrate.volume import SOURCES, View, Volume, confirmed, fuse, reserve, splat
+from dhtorch.geometry.patches import sample_nearest
+from dhtorch.integrate.sweeps import DenseSweep, StoredSweep, SweepStore, depth_step_rel
+from dhtorch.integrate.volume import (
+    VOLUME_SOURCES,
+    DepthView,
+    Volume,
+    drop_unconfirmed,
+    fuse_views,
+    reserve_blocks,
+    splat_points,
+)
 from dhtorch.metrics.holdout import range_split
-from dhtorch.pipeline.dense import pixels
+from dhtorch.pipeline.dense import map_pixel_centres
 from dhtorch.pipeline.method import Method
-from dhtorch.pipeline.view_report import Picked, choosing, picked
+from dhtorch.pipeline.view_report import ViewReport, report_selection, with_view_selection
 from dhtorch.pytree import stack
 from dhtorch.records import Camera, Estimate, Frame, Pose, PoseFit, Samples, Tracks
 
-POSES = ("device", "anchored")
+POSE_SOURCES = ("device", "anchored")
 
 #: Radius of a recovered point's patch, in voxels.
-PATCH = 1.5
+_PATCH_RADIUS_VOXELS = 1.5
 
 
 @dataclass(frozen=True)
@@ -51,9 +59,9 @@ class PairEstimate:
     rgb: Tensor  # (1, N, 3) in [0, 1] at the samples
     camera: Camera  # of the anchor
     hw: tuple[int, int]
-    picked: Picked | None = None  # where the method chose among several
+    picked: ViewReport | None = None  # where the method chose among several
     others: Mapping[int, PoseFit] = field(default_factory=dict)  # the poses of all views that it chose
-    swept: Swept | None = None  # pixels of the anchor's map, where one was asked for
+    swept: StoredSweep | None = None  # pixels of the anchor's map, where one was asked for
 
     @property
     def links(self) -> dict[int, PoseFit]:
@@ -67,7 +75,7 @@ class PairEstimate:
 
 
 @dataclass(frozen=True)
-class Places:
+class PlacedFrames:
     """Where the frames of the map stand."""
 
     poses: dict[int, Pose]  # frame → T_world_from_cam (1), float64
@@ -75,8 +83,8 @@ class Places:
     n_unplaced: int  # frames of other fragments, or without a finite pose
 
 
-def ask(
-    scene: Given,
+def estimate_pairs(
+    scene: SceneLike,
     method: Method,
     pairs: Iterable[Pair] | Iterable[tuple[int, int]],
     *,
@@ -84,8 +92,8 @@ def ask(
     seed: int = 0,
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
-    sweep: Sweep | None = None,
-    shelf: Shelf | None = None,
+    sweep: DenseSweep | None = None,
+    shelf: SweepStore | None = None,
 ) -> Iterator[PairEstimate]:
     """The method's answer to each pair, one after the other.
 
@@ -102,22 +110,22 @@ def ask(
     """
     scene = Scene.of(scene)
     hint, recording = scene.hint, scene.recording
-    shelf = Shelf() if shelf is None else shelf
+    shelf = SweepStore() if shelf is None else shelf
     for i, j in pairs:
         offered = () if isinstance(j, int) else j
-        seen = between(i, j, max(1, min(method.views, j - i))) if isinstance(j, int) else offered
+        seen = spaced_frames(i, j, max(1, min(method.views, j - i))) if isinstance(j, int) else offered
         shown = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *seen)]
-        asked = choosing(method) if offered else method
+        asked = with_view_selection(method) if offered else method
         trace: dict[str, Any] = {}
         with torch.no_grad():
             others = stack(shown[1:]) if len(seen) > 1 else shown[-1]
             ask_one = asked if sweep is None else partial(sweep, asked)
             estimate = ask_one(shown[0], others, seed=seed, hint=hint, trace=trace)
             samples = trace["samples"].to("cpu")
-            rgb = _colour(shown[0], trace["samples"].uv)
+            rgb = _sample_colours(shown[0], trace["samples"].uv)
         tracks, fit = (trace[k].to("cpu") for k in ("tracks", "fit"))
         camera = shown[0].camera.to("cpu")
-        choice = picked(i, offered, trace) if offered else None
+        choice = report_selection(i, offered, trace) if offered else None
         fits = [t["fit"].to("cpu") for t in trace.get("views", ())]
         yield PairEstimate(
             pair=(i, seen[-1] if choice is None else choice.views[-1]),
@@ -134,7 +142,7 @@ def ask(
         )
 
 
-def place(recording: Recording, answers: Sequence[PairEstimate], *, poses: str = "device") -> Places:
+def place_frames(recording: Recording, answers: Sequence[PairEstimate], *, poses: str = "device") -> PlacedFrames:
     """Where the frames stand that the answers speak of.
 
     Args:
@@ -147,15 +155,15 @@ def place(recording: Recording, answers: Sequence[PairEstimate], *, poses: str =
     Raises:
         ValueError: another word, or ``device`` for a recording without a trajectory.
     """
-    if poses not in POSES:
-        raise ValueError(f"poses: found {poses!r}, expected one of {', '.join(POSES)}")
+    if poses not in POSE_SOURCES:
+        raise ValueError(f"poses: found {poses!r}, expected one of {', '.join(POSE_SOURCES)}")
     frames = sorted({k for answer in answers for k in (answer.pair[0], *answer.links)})
-    given = {} if recording.poses is None else {k: _own(recording, k) for k in frames}
+    given = {} if recording.poses is None else {k: _own_pose(recording, k) for k in frames}
     given = {k: T for k, T in given.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
     if poses == "device":
         if recording.poses is None:
             raise ValueError(f"poses: {recording.name} has no trajectory of its own, expected poses=anchored")
-        return Places(given, int(bool(given)), len(frames) - len(given))
+        return PlacedFrames(given, int(bool(given)), len(frames) - len(given))
     links: dict[int, list[tuple[int, Pose]]] = {k: [] for k in frames}
     for answer in answers:
         i = answer.pair[0]
@@ -168,12 +176,12 @@ def place(recording: Recording, answers: Sequence[PairEstimate], *, poses: str =
     for k in frames:
         if not any(k in fragment for fragment in fragments):
             start = given.get(k, se3.identity(1, torch.zeros(1, dtype=torch.float64)))
-            fragments.append(_reached(k, start, links))
+            fragments.append(_chain_poses(k, start, links))
     largest = max(fragments, key=len) if fragments else {}
-    return Places(largest, len(fragments), len(frames) - len(largest))
+    return PlacedFrames(largest, len(fragments), len(frames) - len(largest))
 
 
-def chain(pairs: Sequence[tuple[int, int]], *, chosen: bool = False) -> list[tuple[int, int]]:
+def linking_pairs(pairs: Sequence[tuple[int, int]], *, chosen: bool = False) -> list[tuple[int, int]]:
     """Further pairs, nearly as wide as the given ones, so that poses found for all of them can reach every frame.
 
     Steps of one width alone never join neighbours; steps of two widths without a common factor do. The wider a step
@@ -192,21 +200,21 @@ def chain(pairs: Sequence[tuple[int, int]], *, chosen: bool = False) -> list[tup
     return [link for link in links if link not in known]
 
 
-def build(
-    recording: Recording, volume: Volume, answers: Sequence[PairEstimate], places: Places, **options: Any
+def fuse_recording(
+    recording: Recording, volume: Volume, answers: Sequence[PairEstimate], places: PlacedFrames, **options: Any
 ) -> Volume:
-    """The volume after all placed frames: :func:`build_grids` of one."""
-    (built,) = build_grids(recording, [volume], answers, places, **options)
+    """The volume after all placed frames: :func:`fuse_recording_grids` of one."""
+    (built,) = fuse_recording_grids(recording, [volume], answers, places, **options)
     return built
 
 
-def build_grids(
+def fuse_recording_grids(
     recording: Recording,
     volumes: Sequence[Volume],
     answers: Sequence[PairEstimate],
-    places: Places,
+    places: PlacedFrames,
     *,
-    sources: Sequence[int] = SOURCES,
+    sources: Sequence[int] = VOLUME_SOURCES,
     cutoff: float | None = None,
     sigma_m: float = 0.0,
     sigma_rel: float = 0.01,
@@ -222,13 +230,13 @@ def build_grids(
     The sensor's depth enters every volume, each frame read once for all of them; the rest enters the last one alone.
 
     Of a swept map whole patches may be wrong together, and float where other frames see through. So room is made for
-    all maps first (:func:`dhtorch.integrate.reserve`): whatever the order, every ray that passes a place speaks of it.
-    What remains and no second map has found is left out (:func:`dhtorch.integrate.confirmed`).
+    all maps first (:func:`dhtorch.integrate.reserve_blocks`): whatever the order, every ray that passes a place speaks
+    of it. What remains and no second map has found is left out (:func:`dhtorch.integrate.drop_unconfirmed`).
 
     Args:
         recording: read once more, frame by frame.
         volumes: with four feature channels: red, green, blue and score.
-        answers, places: from :func:`ask` and :func:`place`.
+        answers, places: from :func:`estimate_pairs` and :func:`place_frames`.
         sources: which of the three to fuse.
         cutoff: m; returns beyond it are hidden.
         sigma_m, sigma_rel, min_conf: the sensor's noise and least confidence, as in stage 2.
@@ -243,48 +251,50 @@ def build_grids(
     *finer, volume = volumes
     maps = [a for a in answers if a.pair[0] in places.poses and a.swept is not None and a.swept.n]
     for answer in progress(maps, f"{recording.name}: room", len(maps)) if Source.SWEPT in sources else ():
-        volume = reserve(volume, swept(recording, answer, places), max_reach=max_reach)
+        volume = reserve_blocks(volume, view_from_sweep(recording, answer, places), max_reach=max_reach)
     if Source.SENSOR in sources:
         noise: dict[str, Any] = {"sigma_m": sigma_m, "sigma_rel": sigma_rel, "min_conf": min_conf}
         for k in progress(list(places.poses), f"{recording.name}: sensor", len(places.poses)):
             frame = range_split(recording[k].to(volume.distance.dtype), cutoff)
             *finer, volume = (
-                _with_sensor(v, frame, places.poses[k], recording.sparse, noise) for v in (*finer, volume)
+                _fuse_sensor(v, frame, places.poses[k], recording.sparse, noise) for v in (*finer, volume)
             )
         after(Source.SENSOR, [*finer, volume])
     if Source.RECOVERED in sources:
         placed = [a for a in answers if a.pair[0] in places.poses and bool(a.recovered.any())]
         for answer in progress(placed, f"{recording.name}: recovered", len(placed)):
-            one = recovered(answer, places.poses[answer.pair[0]], radius=PATCH * volume.voxel)
-            volume = fuse(volume, one, source=Source.RECOVERED, max_reach=max_reach)
+            one = view_from_recovered(answer, places.poses[answer.pair[0]], radius=_PATCH_RADIUS_VOXELS * volume.voxel)
+            volume = fuse_views(volume, one, source=Source.RECOVERED, max_reach=max_reach)
         after(Source.RECOVERED, [*finer, volume])
     if Source.SWEPT in sources:
         for answer in progress(maps, f"{recording.name}: swept", len(maps)):
-            volume = fuse(volume, swept(recording, answer, places), source=Source.SWEPT, max_reach=max_reach)
-        volume = confirmed(volume, max(1, min(min_maps, len(maps))))
+            volume = fuse_views(
+                volume, view_from_sweep(recording, answer, places), source=Source.SWEPT, max_reach=max_reach
+            )
+        volume = drop_unconfirmed(volume, max(1, min(min_maps, len(maps))))
         after(Source.SWEPT, [*finer, volume])
     return [*finer, volume]
 
 
-def _with_sensor(volume: Volume, frame: Frame, T_world_from_cam: Pose, sparse: bool, noise: dict[str, Any]) -> Volume:
+def _fuse_sensor(volume: Volume, frame: Frame, T_world_from_cam: Pose, sparse: bool, noise: dict[str, Any]) -> Volume:
     """The volume with what the sensor says in one frame."""
-    radius = PATCH * volume.voxel if sparse else None
-    return fuse(volume, sensed(frame, T_world_from_cam, radius=radius, **noise))
+    radius = _PATCH_RADIUS_VOXELS * volume.voxel if sparse else None
+    return fuse_views(volume, view_from_sensor(frame, T_world_from_cam, radius=radius, **noise))
 
 
-def coverage(xyz: Tensor, cell: float) -> dict[str, Any]:
+def measure_coverage(xyz: Tensor, cell: float) -> dict[str, Any]:
     """How much space points (P, 3) reach and whether it hangs together, in cells of ``cell`` metres.
 
     ``n_voxels`` covered; ``n_islands`` of touching ones; ``largest_island``, its share; None without any.
     """
-    key = sparse_grid.occupied(xyz, cell)
+    key = sparse_grid.occupied_cells(xyz, cell)
     if not len(key):
         return {"n_voxels": 0, "n_islands": 0, "largest_island": None}
-    sizes = sparse_grid.components(key).bincount()
+    sizes = sparse_grid.connected_components(key).bincount()
     return {"n_voxels": len(key), "n_islands": len(sizes), "largest_island": int(sizes.max()) / len(key)}
 
 
-def sensed(
+def view_from_sensor(
     frame: Frame,
     T_world_from_cam: Pose,
     *,
@@ -293,7 +303,7 @@ def sensed(
     min_conf: int = 1,
     edge_rel: float = 0.1,
     radius: float | None = None,
-) -> View:
+) -> DepthView:
     """The sensor's own depth of one frame (B = 1), with colours from the picture and its confidence as score.
 
     Returns below ``min_conf`` are left out, and those beside a depth step of more than ``edge_rel``, which belong to
@@ -306,25 +316,27 @@ def sensed(
     if frame.conf is not None:
         depth = torch.where(frame.conf >= min_conf, depth, 0.0)
     if radius is None:
-        depth = torch.where(edges(depth) > edge_rel, 0.0, depth)
+        depth = torch.where(depth_step_rel(depth) > edge_rel, 0.0, depth)
     sigma = (sigma_m**2 + (sigma_rel * depth).square()).sqrt()
     v, u = torch.meshgrid(*(torch.arange(n, device=depth.device) for n in hw), indexing="ij")
     uv = torch.stack((u, v), -1).view(1, -1, 2).to(depth)
     same = frame.depth_camera is None and hw == frame.hw
-    features = torch.cat((_colour(frame, uv if same else _in_picture(frame, camera, uv)), score.view(1, -1, 1)), -1)
+    features = torch.cat(
+        (_sample_colours(frame, uv if same else _depth_to_image_uv(frame, camera, uv)), score.view(1, -1, 1)), -1
+    )
     if radius is not None:
         some = (depth.flatten() > 0).nonzero()[:, 0]
         values = (uv[:, some], depth.flatten(1)[:, some], sigma.flatten(1)[:, some], features[:, some])
-        return splat(camera, hw, *values, T_world_from_cam=T_world_from_cam, radius=radius)
-    return View(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
+        return splat_points(camera, hw, *values, T_world_from_cam=T_world_from_cam, radius=radius)
+    return DepthView(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
 
 
-def recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius: float) -> View:
+def view_from_recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius: float) -> DepthView:
     """The recovered points of a pair as patches of ``radius`` metres."""
     estimate = answer.estimate
     depth = torch.where(answer.recovered, estimate.depth, 0.0)
     features = torch.cat((answer.rgb, estimate.score[..., None]), -1)
-    return splat(
+    return splat_points(
         answer.camera,
         answer.hw,
         estimate.uv,
@@ -336,33 +348,35 @@ def recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius: float) ->
     )
 
 
-def swept(recording: Recording, answer: PairEstimate, places: Places) -> View:
+def view_from_sweep(recording: Recording, answer: PairEstimate, places: PlacedFrames) -> DepthView:
     """The swept pixels of an anchor's map, with colours from its picture."""
     assert answer.swept is not None
-    return mapped(recording[answer.pair[0]], *answer.swept.read(), T_world_from_cam=places.poses[answer.pair[0]])
+    return view_from_depth_map(
+        recording[answer.pair[0]], *answer.swept.read(), T_world_from_cam=places.poses[answer.pair[0]]
+    )
 
 
-def mapped(
+def view_from_depth_map(
     frame: Frame,
     depth: Tensor,  # (1, h, w) m, of every pixel of a map over the frame's picture, 0 = none
     sigma: Tensor,  # (1, h, w) m
     score: Tensor,  # (1, h, w)
     *,
     T_world_from_cam: Pose,
-) -> View:
+) -> DepthView:
     """A map of one frame, with colours from its picture."""
     hw = depth.shape[-2], depth.shape[-1]
-    features = torch.cat((_colour(frame, pixels(frame, hw)[None]), score.view(1, -1, 1)), -1)
+    features = torch.cat((_sample_colours(frame, map_pixel_centres(frame, hw)[None]), score.view(1, -1, 1)), -1)
     camera = cameras.resize(frame.camera, frame.hw, hw)
-    return View(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
+    return DepthView(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
 
 
-def _own(recording: Recording, k: int) -> Pose:
+def _own_pose(recording: Recording, k: int) -> Pose:
     assert recording.poses is not None
     return recording.poses[k : k + 1].to(torch.float64)
 
 
-def _reached(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]]]) -> dict[int, Pose]:
+def _chain_poses(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]]]) -> dict[int, Pose]:
     """Poses of all frames that links join to the first one, along the fewest."""
     found, queue = {first: start}, deque([first])
     while queue:
@@ -374,13 +388,13 @@ def _reached(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]]]) 
     return found
 
 
-def _colour(frame: Frame, uv: Tensor) -> Tensor:
+def _sample_colours(frame: Frame, uv: Tensor) -> Tensor:
     """(1, N, 3) in [0, 1] at the nearest pixels."""
     image = frame.image[0].expand(3, -1, -1)
-    value = nearest(image, uv.expand(3, -1, -1))[0].T[None]
+    value = sample_nearest(image, uv.expand(3, -1, -1))[0].T[None]
     return value.to(uv) / 255 if image.dtype == torch.uint8 else value
 
 
-def _in_picture(frame: Frame, camera: Camera, uv: Tensor) -> Tensor:
+def _depth_to_image_uv(frame: Frame, camera: Camera, uv: Tensor) -> Tensor:
     """Pixels of the picture (1, N, 2) that see what pixels of the depth map see."""
     return cameras.project(frame.camera, cameras.rays(camera, uv).nan_to_num())

@@ -14,26 +14,26 @@ from dhtorch.codes import Source
 from dhtorch.integrate.surface import Surface
 
 #: Voxels of the coarse grid to a median sigma of what it holds.
-PER_SIGMA = 4
+_VOXELS_PER_SIGMA = 4
 #: Truncations of a grid from which on twofold sigma says nothing there.
-REACH = 5.0
+MAX_REACH_TRUNCATIONS = 5.0
 #: Maps whose sigmas tell the size of the coarse voxels.
-TOLD_BY = 5
+N_MAPS_FOR_VOXEL = 5
 #: Coarse over fine voxel below which one grid holds all.
-ALIKE = 1.5
+_MIN_COARSE_RATIO = 1.5
 
 
-def coarse(voxel: float, sigma: Tensor) -> float | None:
+def choose_coarse_voxel(voxel: float, sigma: Tensor) -> float | None:
     """Voxel, m, of the grid for depth of standard deviations ``sigma`` (P,) m; None = the sensor's ``voxel`` will do.
 
     Gradient: none.
     """
     usable = sigma[sigma.isfinite() & (sigma > 0)]
-    wide = float(usable.median()) / PER_SIGMA if len(usable) else 0.0
-    return float(f"{wide:.2g}") if wide > ALIKE * voxel else None
+    wide = float(usable.median()) / _VOXELS_PER_SIGMA if len(usable) else 0.0
+    return float(f"{wide:.2g}") if wide > _MIN_COARSE_RATIO * voxel else None
 
 
-def union(fine: Surface, wide: Surface) -> Surface:
+def merge_surfaces(fine: Surface, wide: Surface) -> Surface:
     """The fine surface, and of the coarse one what the sensor has not made.
 
     Points or meshes, both of one kind; of a mesh those triangles stay of which all corners stay. Gradient: none.

@@ -11,17 +11,17 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry import sparse_grid
-from dhtorch.integrate.volume import INSIDE, SIDE, SOURCES, Volume
+from dhtorch.integrate.volume import BLOCK_SIDE, BLOCK_VOXELS, VOLUME_SOURCES, Volume
 from dhtorch.pytree import Record, collate, record
 
 #: Largest step of the distance across a surface, in truncations: a view's rim is a step of up to two.
-MAX_STEP = 1.5
+_MAX_STEP_TRUNCATIONS = 1.5
 #: Blocks along the side of a brick that is meshed at a time.
-_BRICK = 8
+_BRICK_BLOCKS = 8
 #: Points that are described at a time.
-_CHUNK = 1 << 18
+_POINTS_PER_CHUNK = 1 << 18
 #: Fractions of a voxel below which a vertex of the mesh counts as lying on a voxel.
-_SNAP = 1e-4
+_SNAP_VOXELS = 1e-4
 
 
 @record
@@ -36,11 +36,11 @@ class Surface(Record):
     face: Tensor | None = None  # (F, 3) int64, counter-clockwise seen from the open side
 
 
-def points(volume: Volume, *, min_weight: float = 0.0) -> Surface:
+def extract_points(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     """The crossings of all grid edges, as points; no mesh.
 
     Args:
-        volume: from :func:`dhtorch.integrate.fuse`.
+        volume: from :func:`dhtorch.integrate.fuse_views`.
         min_weight: 1/m², least weight of the two voxels of a crossing.
 
     Raises:
@@ -48,24 +48,24 @@ def points(volume: Volume, *, min_weight: float = 0.0) -> Surface:
 
     Gradient: none.
     """
-    _check(min_weight)
-    ahead = [_edges(volume, axis, min_weight) for axis in range(3)]
+    _check_volume(min_weight)
+    ahead = [_crossing_edges(volume, axis, min_weight) for axis in range(3)]
     a, b = (torch.cat([pair[k] for pair in ahead]) for k in (0, 1))
-    order = sparse_grid.pack(a + b).argsort()  # by place: the order does not depend on how the blocks came
+    order = sparse_grid.pack_cells(a + b).argsort()  # by place: the order does not depend on how the blocks came
     a, b = a[order], b[order]
     front, back = _distance(volume, a), _distance(volume, b)
     t = front / (front - back)
     return _describe(volume, a, b, t, (a + t[:, None] * (b - a)) * volume.voxel)
 
 
-def mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
+def extract_mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     """The surface as triangles, by marching cubes over all cells whose eight corners are known.
 
     Bricks of blocks are meshed one after the other; they share their borders, and vertices on the same grid edge become
     one, so that no seam is left.
 
     Args:
-        volume: from :func:`dhtorch.integrate.fuse`.
+        volume: from :func:`dhtorch.integrate.fuse_views`.
         min_weight: 1/m², least weight of all corners of a cell.
 
     Raises:
@@ -75,14 +75,14 @@ def mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     Gradient: none.
     Source: T. Lewiner et al. 2003, as implemented by scikit-image.
     """
-    _check(min_weight)
+    _check_volume(min_weight)
     try:
         from skimage.measure import marching_cubes  # noqa: PLC0415
     except ImportError as error:
         raise ImportError("mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'") from error
     vertices, faces, count = [], [], 0
-    for origin, distance, known in _bricks(volume, min_weight):
-        cell = _meshable(distance, known, MAX_STEP * volume.truncation)
+    for origin, distance, known in _dense_bricks(volume, min_weight):
+        cell = _meshable_cells(distance, known, _MAX_STEP_TRUNCATIONS * volume.truncation)
         if not bool(cell.any()):
             continue
         mask = torch.nn.functional.pad(cell, (1, 0) * 3)  # asked at a cell's far corner
@@ -98,17 +98,17 @@ def mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     if not count:
         none = torch.zeros(0, 3, dtype=torch.int64)
         return _describe(volume, none, none, volume.distance.new_zeros(0), none.double()).replace(face=none)
-    return _welded(volume, torch.cat(vertices), torch.cat(faces))
+    return _weld_vertices(volume, torch.cat(vertices), torch.cat(faces))
 
 
-def _welded(volume: Volume, vertices: Tensor, faces: Tensor) -> Surface:
+def _weld_vertices(volume: Volume, vertices: Tensor, faces: Tensor) -> Surface:
     """One vertex for each grid edge, and no triangle that has lost its area."""
     device = volume.key.device
     rounded = vertices.round()
-    on = (vertices - rounded).abs() < _SNAP
+    on = (vertices - rounded).abs() < _SNAP_VOXELS
     a = torch.where(on, rounded, vertices.floor()).long()
     b = torch.where(on, rounded, vertices.ceil()).long()
-    number, which = sparse_grid.pack(a + b).unique(return_inverse=True)
+    number, which = sparse_grid.pack_cells(a + b).unique(return_inverse=True)
     first = torch.full_like(number, len(a)).scatter_reduce(0, which, torch.arange(len(a)), "amin")
     faces = which[faces]
     whole = (faces != faces.roll(1, 1)).all(-1)
@@ -119,19 +119,19 @@ def _welded(volume: Volume, vertices: Tensor, faces: Tensor) -> Surface:
 
 def _describe(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Tensor) -> Surface:
     """Points between voxels ``a`` and ``b`` (P, 3), with what the two know; some at a time, to bound the memory."""
-    parts = zip(*(x.split(_CHUNK) for x in (a, b, t, xyz)), strict=True)
+    parts = zip(*(x.split(_POINTS_PER_CHUNK) for x in (a, b, t, xyz)), strict=True)
     return collate(_described(volume, *part) for part in parts)
 
 
 def _described(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Tensor) -> Surface:
     t = t.to(volume.distance.dtype)[:, None]
-    index, known = _slot(volume, torch.stack((a, b)))
+    index, known = _voxel_slots(volume, torch.stack((a, b)))
     share = torch.where(known[..., None], torch.stack((1 - t, t)), 0.0)
     weight = (volume.weight.flatten(0, 1)[index] * share).sum(0) / share.sum(0).clamp_min(1e-12)
     mixed = (volume.features.flatten(0, 1)[index].to(t.dtype) * share).sum(0)
-    slope = (_slope(volume, torch.stack((a, b))) * share).sum(0)
+    slope = (_distance_gradient(volume, torch.stack((a, b))) * share).sum(0)
     length = slope.norm(dim=-1, keepdim=True)
-    codes = torch.tensor(SOURCES, dtype=torch.int32, device=weight.device)
+    codes = torch.tensor(VOLUME_SOURCES, dtype=torch.int32, device=weight.device)
     return Surface(
         xyz=xyz.to(t.dtype),
         normal=torch.where(length > 0, slope / length, torch.nan),
@@ -141,7 +141,7 @@ def _described(volume: Volume, a: Tensor, b: Tensor, t: Tensor, xyz: Tensor) -> 
     )
 
 
-def _slope(volume: Volume, ijk: Tensor) -> Tensor:
+def _distance_gradient(volume: Volume, ijk: Tensor) -> Tensor:
     """Differences (…, 3) of the distance along the axes, over two steps or, beside the unknown, over one."""
     here = _distance(volume, ijk)
     slopes = []
@@ -153,12 +153,12 @@ def _slope(volume: Volume, ijk: Tensor) -> Tensor:
     return torch.stack(slopes, -1)
 
 
-def _slot(volume: Volume, ijk: Tensor) -> tuple[Tensor, Tensor]:
+def _voxel_slots(volume: Volume, ijk: Tensor) -> tuple[Tensor, Tensor]:
     """Where voxels stand in the flattened blocks, and whether anything is known of them."""
-    block = ijk.div(SIDE, rounding_mode="floor")
-    x, y, z = (ijk - block * SIDE).unbind(-1)
-    at, found = sparse_grid.find(volume.key, sparse_grid.pack(block))
-    index = at * INSIDE + (x * SIDE + y) * SIDE + z
+    block = ijk.div(BLOCK_SIDE, rounding_mode="floor")
+    x, y, z = (ijk - block * BLOCK_SIDE).unbind(-1)
+    at, found = sparse_grid.find_cells(volume.key, sparse_grid.pack_cells(block))
+    index = at * BLOCK_VOXELS + (x * BLOCK_SIDE + y) * BLOCK_SIDE + z
     if not len(volume.key):
         return index, found
     return index, found & (volume.weight.flatten(0, 1)[index] > 0).any(-1)
@@ -166,23 +166,23 @@ def _slot(volume: Volume, ijk: Tensor) -> tuple[Tensor, Tensor]:
 
 def _distance(volume: Volume, ijk: Tensor) -> Tensor:
     """Distances (…,) at voxels; NaN where nothing is known."""
-    index, known = _slot(volume, ijk)
+    index, known = _voxel_slots(volume, ijk)
     return torch.where(known, volume.distance.flatten()[index], torch.nan) if len(volume.key) else known.float()
 
 
-def _edges(volume: Volume, axis: int, min_weight: float) -> tuple[Tensor, Tensor]:
+def _crossing_edges(volume: Volume, axis: int, min_weight: float) -> tuple[Tensor, Tensor]:
     """Voxels (P, 3) in front of the surface and their neighbours along ``axis`` behind it."""
-    shape = (-1, SIDE, SIDE, SIDE)
+    shape = (-1, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE)
     distance = torch.where(_known(volume, min_weight), volume.distance, torch.nan).view(shape)
     dim = axis + 1
     step = torch.nn.functional.one_hot(torch.tensor(axis, device=volume.key.device), 3)
-    at, found = sparse_grid.find(volume.key, sparse_grid.pack(sparse_grid.unpack(volume.key) + step))
+    at, found = sparse_grid.find_cells(volume.key, sparse_grid.pack_cells(sparse_grid.unpack_cells(volume.key) + step))
     beyond = distance.narrow(dim, 0, 1)[at] if len(at) else distance.narrow(dim, 0, 1)
     beyond = torch.where(found.view(-1, 1, 1, 1), beyond, torch.nan)
-    ahead = torch.cat((distance.narrow(dim, 1, SIDE - 1), beyond), dim)
-    crossing = ((distance > 0) != (ahead > 0)) & ((distance - ahead).abs() <= MAX_STEP * volume.truncation)
+    ahead = torch.cat((distance.narrow(dim, 1, BLOCK_SIDE - 1), beyond), dim)
+    crossing = ((distance > 0) != (ahead > 0)) & ((distance - ahead).abs() <= _MAX_STEP_TRUNCATIONS * volume.truncation)
     place = crossing.nonzero()
-    low = sparse_grid.unpack(volume.key[place[:, 0]]) * SIDE + place[:, 1:]
+    low = sparse_grid.unpack_cells(volume.key[place[:, 0]]) * BLOCK_SIDE + place[:, 1:]
     front = (distance[crossing] > 0)[:, None]
     high = low + step
     return torch.where(front, low, high), torch.where(front, high, low)
@@ -193,29 +193,31 @@ def _known(volume: Volume, min_weight: float) -> Tensor:
     return (total > 0) & (total >= min_weight)
 
 
-def _bricks(volume: Volume, min_weight: float):
+def _dense_bricks(volume: Volume, min_weight: float):
     """Dense pieces: origin (3,) in voxels, distance and what is known (n, n, n), with one voxel of the next brick."""
-    block = sparse_grid.unpack(volume.key)
-    brick = sparse_grid.pack(block.div(_BRICK, rounding_mode="floor"))
+    block = sparse_grid.unpack_cells(volume.key)
+    brick = sparse_grid.pack_cells(block.div(_BRICK_BLOCKS, rounding_mode="floor"))
     key = volume.key.cpu()
     distance = volume.distance.cpu()
     known = _known(volume, min_weight).cpu()
-    local = torch.cartesian_prod(*(torch.arange(_BRICK + 1),) * 3)
-    n = SIDE * _BRICK + 1
+    local = torch.cartesian_prod(*(torch.arange(_BRICK_BLOCKS + 1),) * 3)
+    n = BLOCK_SIDE * _BRICK_BLOCKS + 1
     for number in brick.unique():
-        first = sparse_grid.unpack(number.cpu()) * _BRICK
-        at, found = sparse_grid.find(key, sparse_grid.pack(first + local))
-        dense = torch.ones(len(local), INSIDE)
-        there = torch.zeros(len(local), INSIDE, dtype=torch.bool)
+        first = sparse_grid.unpack_cells(number.cpu()) * _BRICK_BLOCKS
+        at, found = sparse_grid.find_cells(key, sparse_grid.pack_cells(first + local))
+        dense = torch.ones(len(local), BLOCK_VOXELS)
+        there = torch.zeros(len(local), BLOCK_VOXELS, dtype=torch.bool)
         dense[found], there[found] = distance[at[found]], known[at[found]]
         dense, there = (
-            x.view(*(_BRICK + 1,) * 3, *(SIDE,) * 3).permute(0, 3, 1, 4, 2, 5).reshape(*((_BRICK + 1) * SIDE,) * 3)
+            x.view(*(_BRICK_BLOCKS + 1,) * 3, *(BLOCK_SIDE,) * 3)
+            .permute(0, 3, 1, 4, 2, 5)
+            .reshape(*((_BRICK_BLOCKS + 1) * BLOCK_SIDE,) * 3)
             for x in (dense, there)
         )
-        yield first.double() * SIDE, dense[:n, :n, :n].contiguous(), there[:n, :n, :n]
+        yield first.double() * BLOCK_SIDE, dense[:n, :n, :n].contiguous(), there[:n, :n, :n]
 
 
-def _meshable(distance: Tensor, known: Tensor, max_step: float) -> Tensor:
+def _meshable_cells(distance: Tensor, known: Tensor, max_step: float) -> Tensor:
     """Cells (n - 1)³ of which every corner is known and no edge is a rim."""
     ok = torch.ones_like(known[1:, 1:, 1:])
     n = ok.shape[0]
@@ -235,6 +237,6 @@ def _meshable(distance: Tensor, known: Tensor, max_step: float) -> Tensor:
     return ok
 
 
-def _check(min_weight: float) -> None:
+def _check_volume(min_weight: float) -> None:
     if not min_weight >= 0:
         raise ValueError(f"integrate: min_weight is {min_weight}, expected 0 or more")

@@ -25,16 +25,16 @@ from dhtorch.records import DepthMap, Estimate, Frame
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class DenseSweep:
     """How maps are made: options of ``complete`` that differ from its own, and the calibration of their sigma."""
 
     options: Mapping[str, Any] = field(default_factory=dict)
-    calibration: Calibration | None = field(default_factory=dense.shipped)
+    calibration: Calibration | None = field(default_factory=dense.default_calibration)
 
     @classmethod
-    def asked(cls, given: bool | Mapping[str, Any] | None, name: str = "dense") -> Sweep | None:
-        """What settings ask for, see :func:`dhtorch.pipeline.dense.options`."""
-        options = dense.options(given, name)
+    def asked(cls, given: bool | Mapping[str, Any] | None, name: str = "dense") -> DenseSweep | None:
+        """What settings ask for, see :func:`dhtorch.pipeline.dense.dense_options`."""
+        options = dense.dense_options(given, name)
         return None if options is None else cls(options)
 
     def __call__(
@@ -43,20 +43,20 @@ class Sweep:
         """The sparse answers, as ``method(anchor, others)`` gives them; ``trace`` also has ``dense``, the maps.
 
         Args:
-            method, anchor, others: as :func:`dhtorch.pipeline.dense.complete` takes them.
+            method, anchor, others: as :func:`dhtorch.pipeline.dense.complete_depth` takes them.
             trace: receives what the method tells.
             track: another function in the method's seat 4; None = its own.
             told: ``seed``, ``fit`` and ``hint``.
         """
         method = method if track is None else method.replace(track=track)
         own: dict[str, Any] = {**self.options, "calibration": self.calibration, **told}
-        trace["dense"] = dense.complete(anchor, others, method=method, trace=trace, **own)
+        trace["dense"] = dense.complete_depth(anchor, others, method=method, trace=trace, **own)
         sparse: Estimate = trace["sparse"]
         return sparse
 
 
 @dataclass(frozen=True, eq=False)
-class Swept:
+class StoredSweep:
     """The swept pixels of one frame's map (B = 1), which lie in a file."""
 
     file: IO[bytes]
@@ -73,7 +73,7 @@ class Swept:
         return depth, sigma, score
 
 
-class Shelf:
+class SweepStore:
     """Where the maps of a recording wait until its frames are placed: a file that goes when nobody holds it.
 
     Disk: six bytes a pixel. A kill leaves nothing behind.
@@ -84,7 +84,7 @@ class Shelf:
         self._folder = folder
         self._file: IO[bytes] | None = None
 
-    def put(self, found: DepthMap, *, edge_rel: float = 0.1) -> Swept:
+    def put(self, found: DepthMap, *, edge_rel: float = 0.1) -> StoredSweep:
         """Put the swept pixels of a map (B = 1) aside, but for those beside a step of more than ``edge_rel``.
 
         What has no return there was fitted in a window that reaches over the step, and may belong to either side.
@@ -94,15 +94,15 @@ class Shelf:
                 self._folder.mkdir(parents=True, exist_ok=True)
             self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115  (it lives as long as the shelf)
         depth = torch.where(found.keep, found.depth, 0.0)
-        keep = found.keep & (found.source == Source.SWEPT) & (edges(depth) <= edge_rel)
+        keep = found.keep & (found.source == Source.SWEPT) & (depth_step_rel(depth) <= edge_rel)
         values = torch.cat((depth, found.sigma, found.score))
         stored = torch.where(keep, values, 0.0).cpu().numpy().astype(np.float16)
         offset = self._file.seek(0, 2)
         self._file.write(stored.tobytes())
-        return Swept(self._file, offset, (depth.shape[-2], depth.shape[-1]), int(keep.sum()))
+        return StoredSweep(self._file, offset, (depth.shape[-2], depth.shape[-1]), int(keep.sum()))
 
 
-def edges(
+def depth_step_rel(
     depth: Tensor,  # (B, h, w) m, 0 = none
 ) -> Tensor:
     """Farthest over nearest depth in 3×3 pixels, minus one; what has none does not count."""

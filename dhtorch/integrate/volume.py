@@ -23,17 +23,18 @@ from dhtorch.pytree import Record, record
 from dhtorch.records import Camera, Pose
 
 #: Voxels along a block's side, and in it.
-SIDE = 8
-INSIDE = SIDE**3
+BLOCK_SIDE = 8
+BLOCK_VOXELS = BLOCK_SIDE**3
 #: Blocks that are updated at a time: bounds the memory of intermediates.
-_CHUNK = 1024
+_BLOCKS_PER_CHUNK = 1024
 #: Sources with a weight of their own, in the order in which a voxel keeps them.
-SOURCES = (Source.SENSOR, Source.RECOVERED, Source.SWEPT)
+VOLUME_SOURCES = (Source.SENSOR, Source.RECOVERED, Source.SWEPT)
 
 
 @record
 class Volume(Record):
-    """Blocks of a signed distance field; made by :func:`empty`, grown by :func:`fuse`, never changed in place."""
+    """Blocks of a signed distance field; made by :func:`make_volume`, grown by :func:`fuse_views`, never changed in
+    place."""
 
     key: Tensor  # (K,) int64, rising: numbers of the blocks, see geometry.sparse_grid
     distance: Tensor  # (K, 512) m, positive in front of the surface
@@ -51,7 +52,7 @@ class Volume(Record):
 
 
 @record
-class View(Record):
+class DepthView(Record):
     """Depth maps to be fused; pixels without an answer hold depth 0."""
 
     depth: Tensor  # (B, h, w) m, 0 = no answer
@@ -61,7 +62,7 @@ class View(Record):
     T_world_from_cam: Pose
 
 
-def empty(
+def make_volume(
     voxel: float = 0.02,
     *,
     truncation: float | None = None,
@@ -83,17 +84,17 @@ def empty(
     if not (voxel > 0 and truncation >= voxel):
         raise ValueError(f"integrate: voxel={voxel}, truncation={truncation}, expected 0 < voxel <= truncation")
     key = torch.zeros(0, dtype=torch.int64, device=device)
-    values = torch.zeros(0, INSIDE, device=device)
-    features = torch.zeros(0, INSIDE, 1 + channels, dtype=torch.float16, device=device)
-    weight = values[..., None].expand(-1, -1, len(SOURCES))
+    values = torch.zeros(0, BLOCK_VOXELS, device=device)
+    features = torch.zeros(0, BLOCK_VOXELS, 1 + channels, dtype=torch.float16, device=device)
+    weight = values[..., None].expand(-1, -1, len(VOLUME_SOURCES))
     n_swept = values.to(torch.uint8)
     sides = {"voxel": float(voxel), "truncation": float(truncation)}
     return Volume(key, values, weight, n_swept, features, **sides)
 
 
-def fuse(
+def fuse_views(
     volume: Volume,
-    view: View,
+    view: DepthView,
     *,
     source: int = Source.SENSOR,
     max_reach: float = 3.0,
@@ -125,32 +126,32 @@ def fuse(
     Cost: per view, one projection for each voxel of the blocks in sight.
     Source: B. Curless, M. Levoy 1996; sparse blocks as in M. Nießner et al. 2013, sorted instead of hashed.
     """
-    _check(volume, view)
-    if source not in SOURCES:
-        raise ValueError(f"integrate.fuse: source is {source}, expected SENSOR, RECOVERED or SWEPT {SOURCES}")
+    _check_view(volume, view)
+    if source not in VOLUME_SOURCES:
+        raise ValueError(f"integrate.fuse: source is {source}, expected SENSOR, RECOVERED or SWEPT {VOLUME_SOURCES}")
     with torch.no_grad():
-        views = [_Sight(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
-        volume = _grown(volume, [s.blocks() for s in views])
+        views = [_ViewIntegrator(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
+        volume = _grow(volume, [s.blocks() for s in views])
         for sight in views:
-            sight.add_to(volume, SOURCES.index(source), carve)
+            sight.add_to(volume, VOLUME_SOURCES.index(source), carve)
     return volume
 
 
-def reserve(volume: Volume, view: View, *, max_reach: float = 3.0) -> Volume:
+def reserve_blocks(volume: Volume, view: DepthView, *, max_reach: float = 3.0) -> Volume:
     """The volume with room for the surfaces of B views, of which nothing is said yet.
 
     A voxel learns nothing from views that were fused before its block was there: rays that passed through it are
     forgotten. Where that matters, because what comes later may be wrong, room is made for all views first.
 
-    Arguments and errors as of :func:`fuse`.
+    Arguments and errors as of :func:`fuse_views`.
     """
-    _check(volume, view)
+    _check_view(volume, view)
     with torch.no_grad():
-        sights = [_Sight(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
-        return _grown(volume, [sight.blocks() for sight in sights])
+        sights = [_ViewIntegrator(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
+        return _grow(volume, [sight.blocks() for sight in sights])
 
 
-def confirmed(volume: Volume, least: int = 2) -> Volume:
+def drop_unconfirmed(volume: Volume, least: int = 2) -> Volume:
     """The volume without what swept depth alone says and fewer than ``least`` swept views agree on; asked at the end.
 
     A view whose motion is wrong is wrong in all its pixels, and its neighbours in a patch err alike; what another view
@@ -161,11 +162,11 @@ def confirmed(volume: Volume, least: int = 2) -> Volume:
     """
     if least < 1:
         raise ValueError(f"integrate.confirmed: least is {least}, expected at least 1")
-    keep = (volume.n_swept >= least) | (volume.weight[..., : SOURCES.index(Source.SWEPT)] > 0).any(-1)
+    keep = (volume.n_swept >= least) | (volume.weight[..., : VOLUME_SOURCES.index(Source.SWEPT)] > 0).any(-1)
     return volume.replace(weight=torch.where(keep[..., None], volume.weight, 0.0))
 
 
-def splat(
+def splat_points(
     camera: Camera,  # B
     hw: tuple[int, int],
     uv: Tensor,  # (B, N, 2) px
@@ -176,7 +177,7 @@ def splat(
     T_world_from_cam: Pose,  # B
     radius: float = 0.03,
     max_radius_px: int = 12,
-) -> View:
+) -> DepthView:
     """Sparse answers as a depth map: each becomes a small disc that faces the camera.
 
     A lone ray would touch a voxel here and there; a disc of a few voxels makes a patch of surface, and claims no more
@@ -211,7 +212,7 @@ def splat(
         there &= (at >= 0).all(-1) & (at[..., 0] < w) & (at[..., 1] < h)
         b, n, o = there.nonzero(as_tuple=True)
         pixel = (b * h + at[b, n, o, 1]) * w + at[b, n, o, 0]
-        owner = _nearest_first(pixel, z[b, n], n, B * h * w)
+        owner = _nearest_owner(pixel, z[b, n], n, B * h * w)
         held = (owner >= 0).view(B, h, w)
         index = owner.clamp_min(0).view(B, h * w)
 
@@ -221,27 +222,27 @@ def splat(
             return torch.where(held[..., None], full.view(B, h, w, -1), 0.0)
 
         maps = spread(torch.cat((z[..., None], sigma.nan_to_num()[..., None], features), -1))
-    return View(maps[..., 0], maps[..., 1], maps[..., 2 : 2 + C], camera, T_world_from_cam)
+    return DepthView(maps[..., 0], maps[..., 1], maps[..., 2 : 2 + C], camera, T_world_from_cam)
 
 
-class _Sight:
+class _ViewIntegrator:
     """One view (B = 1) of a volume."""
 
-    def __init__(self, volume: Volume, view: View, max_reach: float) -> None:
+    def __init__(self, volume: Volume, view: DepthView, max_reach: float) -> None:
         self.voxel, self.truncation = volume.voxel, volume.truncation
         h, w = view.depth.shape[-2:]
         self.hw, self.camera = (h, w), view.camera
         self.R, self.t = view.T_world_from_cam.R[0].double(), view.T_world_from_cam.t[0].double()
         depth, sigma = view.depth.flatten(), view.sigma.flatten()
         self.reach = (2 * sigma).clamp_min(self.truncation)
-        usable = (depth > 0) & (depth < sparse_grid.REACH * volume.voxel) & sigma.isfinite() & (sigma > 0)
+        usable = (depth > 0) & (depth < sparse_grid.CELL_RANGE * volume.voxel) & sigma.isfinite() & (sigma > 0)
         usable &= self.reach <= max_reach * self.truncation
         usable &= self.R.isfinite().all() & self.t.isfinite().all()
         self.pixel = usable.nonzero()[:, 0]
         self.depth = torch.where(usable, depth, 0.0)
         self.precision = torch.where(usable, 1 / sigma.square(), 0.0)
         self.features = torch.nn.functional.pad(view.features.reshape(h * w, -1), (1, 0), value=1.0)
-        edge = cameras.rays(view.camera, _border(h, w).to(view.camera.f)[None])[0]
+        edge = cameras.rays(view.camera, _border_pixels(h, w).to(view.camera.f)[None])[0]
         self.extent = edge[edge.isfinite().all(-1)].abs().amax(0)[:2] if len(edge) else edge.new_zeros(2)
 
     def blocks(self) -> Tensor:
@@ -253,21 +254,21 @@ class _Sight:
         unit = ray / ray.norm(dim=-1, keepdim=True)
         surface, reach = ray * self.depth[at, None], self.reach[at]
         world, way = surface @ self.R.T + self.t, unit @ self.R.T
-        side, found = SIDE * self.voxel, []
+        side, found = BLOCK_SIDE * self.voxel, []
         longest = float(reach.max()) if len(reach) else 0.0
         steps = max(2, int((self.truncation + longest) / (side / 2)) + 2)
         for k in range(steps):
             along = -self.truncation + (self.truncation + reach) * k / (steps - 1)
-            found.append(sparse_grid.occupied(world + along[:, None] * way, side))
+            found.append(sparse_grid.occupied_cells(world + along[:, None] * way, side))
         return torch.cat(found).unique()
 
     def add_to(self, volume: Volume, source: int, carve: bool) -> None:
         """Update a fresh volume in place."""
-        corner = sparse_grid.unpack(volume.key).double() * SIDE * self.voxel
+        corner = sparse_grid.unpack_cells(volume.key).double() * BLOCK_SIDE * self.voxel
         corner = (corner - self.t) @ self.R  # in camera axes: the rotation's transpose
-        local = torch.cartesian_prod(*(torch.arange(SIDE, device=corner.device),) * 3).double() * self.voxel
+        local = torch.cartesian_prod(*(torch.arange(BLOCK_SIDE, device=corner.device),) * 3).double() * self.voxel
         local = (local @ self.R).to(self.depth.dtype)
-        for part in self._in_sight(corner, local).split(_CHUNK):
+        for part in self._in_sight(corner, local).split(_BLOCKS_PER_CHUNK):
             xyz = corner[part].to(local.dtype)[:, None] + local  # (k, 512, 3)
             self._update(volume, part, xyz, source, carve)
 
@@ -303,14 +304,14 @@ class _Sight:
         colour = volume.features[part].to(share.dtype)
         volume.features[part] = (colour + close * (self.features[pixel] - colour)).to(volume.features.dtype)
         volume.weight[part, :, source] += weight
-        if SOURCES[source] == Source.SWEPT:
+        if VOLUME_SOURCES[source] == Source.SWEPT:
             volume.n_swept[part] += (told & (along <= reach) & (fade >= 0.5) & (volume.n_swept[part] < 255)).byte()
 
 
-def _grown(volume: Volume, keys: list[Tensor]) -> Volume:
+def _grow(volume: Volume, keys: list[Tensor]) -> Volume:
     """A copy of the volume with room for further blocks."""
     key = torch.cat((volume.key, *keys)).unique()
-    at = sparse_grid.find(key, volume.key)[0]
+    at = sparse_grid.find_cells(key, volume.key)[0]
 
     def wider(x: Tensor) -> Tensor:
         return x.new_zeros(len(key), *x.shape[1:]).index_copy_(0, at, x)
@@ -319,7 +320,7 @@ def _grown(volume: Volume, keys: list[Tensor]) -> Volume:
     return volume.replace(key=key, **{name: wider(getattr(volume, name)) for name in fields})
 
 
-def _nearest_first(pixel: Tensor, depth: Tensor, owner: Tensor, n_pixels: int) -> Tensor:
+def _nearest_owner(pixel: Tensor, depth: Tensor, owner: Tensor, n_pixels: int) -> Tensor:
     """For each pixel the owner of the nearest depth, of equals the first; -1 where there is none."""
     best = torch.full((n_pixels,), torch.inf, dtype=depth.dtype, device=depth.device)
     best = best.scatter_reduce(0, pixel, depth, "amin")
@@ -329,7 +330,7 @@ def _nearest_first(pixel: Tensor, depth: Tensor, owner: Tensor, n_pixels: int) -
     return torch.where(best.isfinite(), first, -1)
 
 
-def _border(h: int, w: int) -> Tensor:
+def _border_pixels(h: int, w: int) -> Tensor:
     """Pixels (…, 2) along the edge of an image."""
     u, v = torch.arange(w), torch.arange(h)
     sides = [torch.stack((u, torch.full_like(u, k)), -1) for k in (0, h - 1)]
@@ -337,8 +338,8 @@ def _border(h: int, w: int) -> Tensor:
     return torch.cat(sides)
 
 
-def _check(volume: Volume, view: View) -> None:
-    check("integrate.fuse", key=(volume.key, "K"), distance=(volume.distance, f"K {INSIDE}"))
+def _check_view(volume: Volume, view: DepthView) -> None:
+    check("integrate.fuse", key=(volume.key, "K"), distance=(volume.distance, f"K {BLOCK_VOXELS}"))
     check("integrate.fuse", depth=(view.depth, "B h w"), sigma=(view.sigma, "B h w"), f=(view.camera.f, "B 2"))
     sizes = check("integrate.fuse", depth=(view.depth, "B h w"), features=(view.features, "B h w C"))
     check("integrate.fuse", R=(view.T_world_from_cam.R, "B 3 3"), t=(view.T_world_from_cam.t, "B 3"))

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 #: How scenes are joined to one number; the geometric mean is for ratios.
-STATISTICS = ("median", "mean", "geometric_mean")
+_STATISTICS = ("median", "mean", "geometric_mean")
 
 
 class Interval(NamedTuple):
@@ -30,12 +30,12 @@ class Interval(NamedTuple):
         return {**self._asdict(), "unit": unit}
 
 
-def single(value: float | None, n: int, unit: str = "1") -> dict[str, Any]:
+def without_interval(value: float | None, n: int, unit: str = "1") -> dict[str, Any]:
     """A summary entry of a number without an interval, over n scenes."""
     return Interval(value, None, None, n).entry(unit)
 
 
-def interval(
+def interval_over_scenes(
     values: Sequence[float | None],
     *,
     statistic: str = "median",
@@ -60,14 +60,16 @@ def interval(
 
     Source: B. Efron, "Bootstrap methods: another look at the jackknife", 1979.
     """
-    if statistic not in STATISTICS:
-        raise ValueError(f"bootstrap.statistic: found {statistic!r}, expected one of {', '.join(STATISTICS)}")
+    if statistic not in _STATISTICS:
+        raise ValueError(f"bootstrap.statistic: found {statistic!r}, expected one of {', '.join(_STATISTICS)}")
     defined = torch.tensor([v for v in values if v is not None and math.isfinite(v)], dtype=torch.float64)
     join = {"median": _median, "mean": _mean, "geometric_mean": _geometric_mean}[statistic]
-    return interval_of(lambda index: join(defined[index]), defined.numel(), level=level, draws=draws, seed=seed)
+    return interval_of_statistic(
+        lambda index: join(defined[index]), defined.numel(), level=level, draws=draws, seed=seed
+    )
 
 
-def interval_of(
+def interval_of_statistic(
     number: Callable[[Tensor], Tensor],
     n: int,
     *,
@@ -81,7 +83,7 @@ def interval_of(
         number: indices of scenes (draws, n), each row one choice of scenes → the number of every row (draws,), NaN
             where it is undefined.
         n: scenes.
-        level, draws, seed: as for :func:`interval`.
+        level, draws, seed: as for :func:`interval_over_scenes`.
 
     Returns:
         Interval; draws in which the number is undefined are left out of it.
@@ -96,13 +98,13 @@ def interval_of(
         return Interval(None, None, None, n)
     if n == 1:
         return Interval(value, None, None, 1)
-    spread = number(resample(n, draws, seed=seed)).double()
+    spread = number(resample_scenes(n, draws, seed=seed)).double()
     edges = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
     low, high = torch.nanquantile(spread, edges).tolist()
     return Interval(value, low, high, n)
 
 
-def resample(n: int, draws: int, *, seed: int = 0) -> Tensor:
+def resample_scenes(n: int, draws: int, *, seed: int = 0) -> Tensor:
     """Indices (draws, n) of scenes drawn with replacement: for numbers that are no mean or median of scene values."""
     return torch.randint(n, (draws, n), generator=torch.Generator().manual_seed(seed))
 

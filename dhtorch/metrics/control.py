@@ -23,17 +23,17 @@ import torch
 from torch import Tensor
 
 from dhtorch.metrics.errors import Points
-from dhtorch.metrics.risk import capped
+from dhtorch.metrics.risk import cap_error
 
 #: Scenes of which the spread of their risks is taken to be known.
-FEW_SCENES = 5
+_MIN_SCENES_FOR_SPREAD = 5
 
 #: Thresholds tried at most; where there are more distinct scores, evenly spaced ones among them.
-MOST_THRESHOLDS = 4096
+_MAX_THRESHOLDS = 4096
 
 
 @dataclass(frozen=True)
-class Control:
+class ScoreThreshold:
     """A threshold and what it did on the scenes it was chosen on."""
 
     threshold: float | None  # answer where score ≥ threshold; None = answer nothing
@@ -55,7 +55,7 @@ class Control:
         return f"score ≥ {self.threshold:.4g} answers {self.coverage:.1%} of the candidates"
 
 
-def plug_in(scenes: Sequence[Points], target: float) -> Control:
+def plug_in_threshold(scenes: Sequence[Points], target: float) -> ScoreThreshold:
     """The largest coverage whose scene-mean risk plus one standard error over scenes meets the target.
 
     The risk of a scene is the mean capped error of its answers, 0 where it is silent. No guarantee is claimed.
@@ -70,27 +70,29 @@ def plug_in(scenes: Sequence[Points], target: float) -> Control:
     Raises:
         ValueError: a target outside (0, 1).
     """
-    scenes = _checked(scenes, target)
-    answers = [_ordered(scene) for scene in scenes]
-    thresholds = _thresholds(answers)
-    loss, answered = _accepted(answers, thresholds)
+    scenes = _check_scenes(scenes, target)
+    answers = [_sort_losses(scene) for scene in scenes]
+    thresholds = _candidate_thresholds(answers)
+    loss, answered = _accepted_losses(answers, thresholds)
     risk = loss / answered.clamp_min(1)
-    coverage = answered / _sizes(scenes)
+    coverage = answered / _candidate_counts(scenes)
     n = len(scenes)
     mean = risk.sum(0) / max(n, 1)
     variance = (risk - mean).square().sum(0) / (n - 1) if n > 1 else torch.full_like(thresholds, torch.inf)
     bound = mean + (variance / max(n, 1)).sqrt()
-    return _lowest(thresholds, bound <= target, bound, risk, coverage, target=target)
+    return _lowest_feasible(thresholds, bound <= target, bound, risk, coverage, target=target)
 
 
-def most_scenes(scenes: Sequence[Points], target: float, *, share: float = 0.9, few: int = 0) -> Control:
+def scene_quantile_threshold(
+    scenes: Sequence[Points], target: float, *, share: float = 0.9, few: int = 0
+) -> ScoreThreshold:
     """The largest coverage at which so many scenes meet the target, each by itself, that the next one likely does.
 
     A mean over scenes may be met although half of them are above it; this asks how many are not: of n scenes
     share · (n + 1), rounded up, so that of n + 1 exchangeable ones that share would. Where that is more than all, all
     are asked; of so few the worst to come is read from their spread as well: mean + t · s · √(1 + 1/n), which the risk
     of one more scene exceeds with probability 1 − share were the risks normal, meets the target too. Of fewer than
-    :data:`FEW_SCENES` no spread is known, and no more is claimed than that all meet it.
+    :data:`_MIN_SCENES_FOR_SPREAD` no spread is known, and no more is claimed than that all meet it.
 
     Args:
         scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
@@ -106,20 +108,20 @@ def most_scenes(scenes: Sequence[Points], target: float, *, share: float = 0.9, 
     """
     if not 0 < share <= 1:
         raise ValueError(f"control.share: found {share}, expected a number above 0, at most 1")
-    scenes = _checked(scenes, target)
-    answers = [_ordered(scene) for scene in scenes]
-    thresholds = _thresholds(answers)
-    loss, answered = _accepted(answers, thresholds)
+    scenes = _check_scenes(scenes, target)
+    answers = [_sort_losses(scene) for scene in scenes]
+    thresholds = _candidate_thresholds(answers)
+    loss, answered = _accepted_losses(answers, thresholds)
     risk = loss / answered.clamp_min(1)
     kept = ((risk <= target) | (answered < few)).to(risk.dtype).mean(0)
     needed = math.ceil(share * (len(scenes) + 1) - 1e-9)
     fits = kept * len(scenes) >= min(needed, len(scenes)) - 1e-6
-    if needed > len(scenes) >= FEW_SCENES and share < 1:
-        fits = fits & (_one_more(risk, answered >= max(few, 1), share) <= target)
-    return _lowest(thresholds, fits, kept, risk, answered / _sizes(scenes), target=target)
+    if needed > len(scenes) >= _MIN_SCENES_FOR_SPREAD and share < 1:
+        fits = fits & (_next_scene_bound(risk, answered >= max(few, 1), share) <= target)
+    return _lowest_feasible(thresholds, fits, kept, risk, answered / _candidate_counts(scenes), target=target)
 
 
-def conformal(scenes: Sequence[Points], target: float, *, confidence: float | None = None) -> Control:
+def conformal_threshold(scenes: Sequence[Points], target: float, *, confidence: float | None = None) -> ScoreThreshold:
     """A threshold under which the loss of the next scene meets the target, if scenes are exchangeable.
 
     The loss of a scene is the sum of the capped errors of its answers over the number of its candidates: between 0
@@ -144,11 +146,11 @@ def conformal(scenes: Sequence[Points], target: float, *, confidence: float | No
     Source: A. Angelopoulos et al., "Conformal risk control", 2024; S. Bates et al., "Distribution-free,
     risk-controlling prediction sets", 2021 (with confidence).
     """
-    scenes = _checked(scenes, target)
-    answers = [_ordered(scene) for scene in scenes]
-    thresholds = _thresholds(answers)
-    loss, answered = _accepted(answers, thresholds)
-    sizes, n = _sizes(scenes), len(scenes)
+    scenes = _check_scenes(scenes, target)
+    answers = [_sort_losses(scene) for scene in scenes]
+    thresholds = _candidate_thresholds(answers)
+    loss, answered = _accepted_losses(answers, thresholds)
+    sizes, n = _candidate_counts(scenes), len(scenes)
     risk = loss / sizes
     needed = scenes_needed(target, confidence=confidence)
     # The loss does not rise with the threshold, so neither do its bounds: whatever lies above one that fits, fits.
@@ -159,10 +161,12 @@ def conformal(scenes: Sequence[Points], target: float, *, confidence: float | No
         bound = torch.full_like(thresholds, 1 - confidence)
         fits = risk.sum(0) / max(n, 1) <= _largest_mean(n, target, 1 - confidence)
     fits = fits & (n >= needed)
-    return _lowest(thresholds, fits, bound, risk, answered / sizes, target=target, needed=needed, confidence=confidence)
+    return _lowest_feasible(
+        thresholds, fits, bound, risk, answered / sizes, target=target, needed=needed, confidence=confidence
+    )
 
 
-def _one_more(risk: Tensor, speaks: Tensor, share: float) -> Tensor:
+def _next_scene_bound(risk: Tensor, speaks: Tensor, share: float) -> Tensor:
     """Risk (thresholds,) that one more scene stays below with that probability, by those (scenes, thresholds) that
     speak, were they normal; infinite where fewer than two do."""
     n = speaks.sum(0)
@@ -176,19 +180,19 @@ def _one_more(risk: Tensor, speaks: Tensor, share: float) -> Tensor:
 
 
 def scenes_needed(target: float, *, confidence: float | None = None) -> int:
-    """Fewest scenes on which :func:`conformal` can meet a target, were they all without any error.
+    """Fewest scenes on which :func:`conformal_threshold` can meet a target, were they all without any error.
 
     Raises:
         ValueError: a target or confidence outside (0, 1).
     """
-    _probability("target", target)
+    _check_probability("target", target)
     if confidence is None:
         return math.ceil(1 / target - 1 - 1e-9)
-    _probability("confidence", confidence)
+    _check_probability("confidence", confidence)
     return math.ceil(math.log(1 - confidence) / math.log(1 - target) - 1e-9)
 
 
-def p_value(mean: float, n: int, target: float) -> float:
+def _hoeffding_bentkus_p_value(mean: float, n: int, target: float) -> float:
     """Hoeffding–Bentkus: how probable a mean loss as small as ``mean`` over n scenes is where ``target`` is exceeded.
 
     Losses lie in [0, 1] and are independent.
@@ -201,14 +205,14 @@ def p_value(mean: float, n: int, target: float) -> float:
     return min(1.0, math.exp(-n * divergence), bentkus)
 
 
-def _ordered(scene: Points) -> tuple[Tensor, Tensor]:
+def _sort_losses(scene: Points) -> tuple[Tensor, Tensor]:
     """Scores of a scene's answers, rising, and the sum of the capped errors of the first 0, 1, … of them."""
     score, order = scene.score[scene.keep].sort()
-    loss = capped(scene.error[scene.keep])[order]
+    loss = cap_error(scene.error[scene.keep])[order]
     return score, torch.cat((loss.new_zeros(1), loss.cumsum(0)))
 
 
-def _accepted(answers: Sequence[tuple[Tensor, Tensor]], thresholds: Tensor) -> tuple[Tensor, Tensor]:
+def _accepted_losses(answers: Sequence[tuple[Tensor, Tensor]], thresholds: Tensor) -> tuple[Tensor, Tensor]:
     """Sum of the capped errors of what is accepted, and its number: (scenes, thresholds) each."""
     none = torch.zeros(0, thresholds.numel(), dtype=torch.float64)
     loss, count = [none], [none]
@@ -219,19 +223,19 @@ def _accepted(answers: Sequence[tuple[Tensor, Tensor]], thresholds: Tensor) -> t
     return torch.cat(loss).clamp_min(0), torch.cat(count)
 
 
-def _thresholds(answers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+def _candidate_thresholds(answers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
     """Scores of answers, rising: every threshold that makes a difference, or evenly spaced ones among them."""
     scores = torch.cat([torch.zeros(0, dtype=torch.float64), *(score for score, _ in answers)]).unique()
-    if scores.numel() > MOST_THRESHOLDS:
-        scores = scores[torch.linspace(0, scores.numel() - 1, MOST_THRESHOLDS, dtype=torch.float64).round().long()]
+    if scores.numel() > _MAX_THRESHOLDS:
+        scores = scores[torch.linspace(0, scores.numel() - 1, _MAX_THRESHOLDS, dtype=torch.float64).round().long()]
     return scores
 
 
-def _sizes(scenes: Sequence[Points]) -> Tensor:
+def _candidate_counts(scenes: Sequence[Points]) -> Tensor:
     return torch.tensor([s.keep.numel() for s in scenes], dtype=torch.float64)[:, None]
 
 
-def _lowest(
+def _lowest_feasible(
     thresholds: Tensor,
     fits: Tensor,
     bound: Tensor,
@@ -241,10 +245,10 @@ def _lowest(
     target: float,
     needed: int | None = None,
     confidence: float | None = None,
-) -> Control:
+) -> ScoreThreshold:
     """The lowest threshold that fits, which answers most; None of none."""
     n = risk.shape[0]
-    none = Control(None, target, None, risk=0.0, coverage=0.0, n=n, needed=needed, confidence=confidence)
+    none = ScoreThreshold(None, target, None, risk=0.0, coverage=0.0, n=n, needed=needed, confidence=confidence)
     if not bool(fits.any()):
         return none
     k = int(fits.long().argmax())
@@ -257,24 +261,24 @@ def _lowest(
     )
 
 
-def _checked(scenes: Sequence[Points], target: float) -> list[Points]:
-    _probability("target", target)
+def _check_scenes(scenes: Sequence[Points], target: float) -> list[Points]:
+    _check_probability("target", target)
     return [s for s in scenes if s.keep.numel()]
 
 
-def _probability(name: str, value: float) -> None:
+def _check_probability(name: str, value: float) -> None:
     if not 0 < value < 1:
         raise ValueError(f"control.{name}: found {value}, expected a number between 0 and 1")
 
 
 def _largest_mean(n: int, target: float, level: float) -> float:
     """Largest mean loss whose p-value is at most ``level``, to rounding and never above it; −1 where none is."""
-    if p_value(0.0, n, target) > level:
+    if _hoeffding_bentkus_p_value(0.0, n, target) > level:
         return -1.0
     low, high = 0.0, target
     for _ in range(60):
         middle = (low + high) / 2
-        low, high = (middle, high) if p_value(middle, n, target) <= level else (low, middle)
+        low, high = (middle, high) if _hoeffding_bentkus_p_value(middle, n, target) <= level else (low, middle)
     return low
 
 

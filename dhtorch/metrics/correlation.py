@@ -17,10 +17,10 @@ def pearson(x: Tensor, y: Tensor) -> float | None:
 
 def spearman(x: Tensor, y: Tensor) -> float | None:
     """Spearman's rank correlation of two (P,) lists: Pearson's of their ranks."""
-    return pearson(ranks(x), ranks(y))
+    return pearson(_ranks(x), _ranks(y))
 
 
-def ranks(x: Tensor) -> Tensor:
+def _ranks(x: Tensor) -> Tensor:
     """Ranks (P,) float64 from 0, ties by their mean."""
     values, group = torch.unique(x, return_inverse=True)
     count = torch.bincount(group, minlength=values.numel()).double()

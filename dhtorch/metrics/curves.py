@@ -11,10 +11,10 @@ from dhtorch.metrics import reliability, risk
 from dhtorch.metrics.errors import Points
 
 #: Points of a risk–coverage curve and bins of the other two.
-STEPS, BINS = 20, 10
+_N_CURVE_POINTS, _N_BINS = 20, 10
 
 
-def sampled(pooled: Points) -> dict[str, Any]:
+def sample_curves(pooled: Points) -> dict[str, Any]:
     """Risk–coverage, error against distance and reliability of one scene, as lists of equal length.
 
     Returns:
@@ -27,17 +27,20 @@ def sampled(pooled: Points) -> dict[str, Any]:
     answered = pooled.answered()
     n = answered.keep.numel()
     order = answered.score.argsort(descending=True, stable=True)
-    at = torch.tensor(sorted({max(1, round(n * (k + 1) / STEPS)) for k in range(STEPS)}) if n else [], dtype=torch.long)
+    at = torch.tensor(
+        sorted({max(1, round(n * (k + 1) / _N_CURVE_POINTS)) for k in range(_N_CURVE_POINTS)}) if n else [],
+        dtype=torch.long,
+    )
     coverage, mean = risk.risk_coverage(pooled)
     _, oracle = risk.risk_coverage(pooled, oracle=True)
     ranked = answered.error[order]
     return {
         "risk_coverage": {
-            "coverage": _rounded(coverage[at - 1].tolist()),
-            "risk": _rounded(mean[at - 1].tolist()),
-            "oracle": _rounded(oracle[at - 1].tolist()),
-            "score": _rounded(answered.score[order][at - 1].tolist()),
-            "median_rel": _rounded([float(ranked[:k].quantile(0.5)) for k in at.tolist()]),
+            "coverage": _round_digits(coverage[at - 1].tolist()),
+            "risk": _round_digits(mean[at - 1].tolist()),
+            "oracle": _round_digits(oracle[at - 1].tolist()),
+            "score": _round_digits(answered.score[order][at - 1].tolist()),
+            "median_rel": _round_digits([float(ranked[:k].quantile(0.5)) for k in at.tolist()]),
         },
         "distance": _by_distance(pooled),
         "reliability": _reliability(pooled),
@@ -45,7 +48,7 @@ def sampled(pooled: Points) -> dict[str, Any]:
 
 
 def _by_distance(pooled: Points) -> dict[str, list[float | None]]:
-    bins = torch.tensor_split(pooled.true_depth.argsort(stable=True), min(BINS, pooled.true_depth.numel()) or 1)
+    bins = torch.tensor_split(pooled.true_depth.argsort(stable=True), min(_N_BINS, pooled.true_depth.numel()) or 1)
     found: dict[str, list[float | None]] = {"depth": [], "coverage": [], "median_rel": []}
     for index in bins if pooled.true_depth.numel() else ():
         here: Points = pooled[index]
@@ -53,14 +56,14 @@ def _by_distance(pooled: Points) -> dict[str, list[float | None]]:
         found["depth"].append(float(here.true_depth.quantile(0.5)))
         found["coverage"].append(float(here.keep.double().mean()))
         found["median_rel"].append(float(error.quantile(0.5)) if error.numel() else None)
-    return {name: _rounded(values) for name, values in found.items()}
+    return {name: _round_digits(values) for name, values in found.items()}
 
 
 def _reliability(pooled: Points) -> dict[str, list[float | None]]:
-    table = reliability.diagram(*reliability.pool([pooled]), bins=BINS)
-    return {name: _rounded(getattr(table, name).tolist()) for name in ("claimed", "realised", "weight")}
+    table = reliability.reliability_diagram(*reliability.pool_answers([pooled]), bins=_N_BINS)
+    return {name: _round_digits(getattr(table, name).tolist()) for name in ("claimed", "realised", "weight")}
 
 
-def _rounded(values: list[float | None]) -> list[float | None]:
+def _round_digits(values: list[float | None]) -> list[float | None]:
     """Five significant digits: a figure shows no more, and a result file holds many curves. NaN becomes None."""
     return [None if v is None or math.isnan(v) else float(f"{v:.5g}") for v in values]

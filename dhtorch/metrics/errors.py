@@ -21,13 +21,13 @@ from dhtorch.pytree import Record, record
 from dhtorch.records import Estimate
 
 #: Metric name → None where undefined.
-Numbers = dict[str, float | None]
+MetricValues = dict[str, float | None]
 
 #: What names a row of a result rather than measuring it.
-ROW_NAMES = ("scene", "pair", "method")
+_ROW_KEYS = ("scene", "pair", "method")
 
 #: An answer whose relative error is larger counts as silently wrong.
-WRONG = 0.2
+GROSS_ERROR_REL = 0.2
 
 
 @record
@@ -51,7 +51,7 @@ class Points(Record):
         return self[self.keep]
 
 
-def points(
+def make_points(
     depth: Tensor,  # (*) m
     true_depth: Tensor,  # (*) m
     score: Tensor | None = None,  # (*)
@@ -99,7 +99,7 @@ def points(
     )
 
 
-def select(
+def points_from_estimate(
     estimate: Estimate,
     truth: Truth,
 ) -> Points:
@@ -109,7 +109,7 @@ def select(
         ValueError: wrong shapes.
     """
     check("select", gate=(estimate.gate, "B N"), depth=(truth.depth, "B N"))
-    return points(
+    return make_points(
         estimate.depth,
         truth.depth,
         estimate.score,
@@ -120,7 +120,7 @@ def select(
     )
 
 
-def measure(pooled: Points) -> Numbers:
+def measure_errors(pooled: Points) -> MetricValues:
     """Coverage and error of the answers of a pair or scene.
 
     Returns:
@@ -140,7 +140,7 @@ def measure(pooled: Points) -> Numbers:
         "coverage": answered.keep.numel() / n if n else None,
         "median_rel": _quantile(error, 0.5),
         "p90_rel": _quantile(error, 0.9),
-        "wrong_share": _share(error > WRONG),
+        "wrong_share": _share(error > GROSS_ERROR_REL),
         "corr": pearson(answered.depth, answered.true_depth),
         "residual_px": _quantile(answered.residual_px[answered.residual_px.isfinite()], 0.5),
         "within_sigma": _share((off <= sigma)[stated]),
@@ -148,7 +148,7 @@ def measure(pooled: Points) -> Numbers:
     }
 
 
-def summarise(
+def summarise_scenes(
     scenes: Iterable[Mapping[str, Any]], *, statistic: str = "median", draws: int = 2000, seed: int = 0
 ) -> dict[str, dict[str, Any]]:
     """Scenes joined to one number per metric: the ``summary`` of a result.
@@ -171,12 +171,12 @@ def summarise(
             defined = [v for v in values if v is not None]
             found = bootstrap.Interval(sum(defined) if defined else None, None, None, len(defined))
         else:
-            found = bootstrap.interval(values, statistic=statistic, draws=draws, seed=seed)
-        summary[name] = found.entry(unit(name))
+            found = bootstrap.interval_over_scenes(values, statistic=statistic, draws=draws, seed=seed)
+        summary[name] = found.entry(metric_unit(name))
     return summary
 
 
-def unit(name: str) -> str:
+def metric_unit(name: str) -> str:
     """Unit of a metric by its name: ``count``, ``px``, ``ms``, ``m``, ``deg`` or ``1``."""
     if name.startswith("n_"):
         return "count"
@@ -193,7 +193,7 @@ def _flatten(row: Mapping[str, Any], prefix: str = "") -> dict[str, float | None
     for key, value in row.items():
         if isinstance(value, Mapping):
             flat |= _flatten(value, f"{prefix}{key}.")
-        elif key in ROW_NAMES:
+        elif key in _ROW_KEYS:
             continue
         elif value is None or (isinstance(value, int | float) and not isinstance(value, bool)):
             flat[prefix + key] = value

@@ -15,21 +15,21 @@ from torch import Tensor
 from dhtorch.codes import Flag, first_reason, names
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.patches import nearest, patches, round_half_up
+from dhtorch.geometry.patches import extract_patches, round_half_up, sample_nearest
 from dhtorch.pytree import Record, record
 from dhtorch.records import Frame, Samples
 
 #: How much of the truth test is asked, from nothing to everything.
-TESTS = ("raw", "5x5", "full")
+_TRUTH_TESTS = ("raw", "5x5", "full")
 
 #: Side of the close window of a dense map, px; sparse returns: side of the close and of the wide one.
-CLOSE, CLOSE_SPARSE, WIDE_SPARSE = 5, 7, 15
+_CLOSE_WINDOW_PX, SPARSE_CLOSE_WINDOW_PX, _SPARSE_WIDE_WINDOW_PX = 5, 7, 15
 
 #: Spread (max / min − 1) of the returns from which the close and the wide window fail.
-CLOSE_SPREAD, WIDE_SPREAD = 0.05, 0.15
+_MAX_CLOSE_SPREAD, _MAX_WIDE_SPREAD = 0.05, 0.15
 
 
-class Rule:
+class TruthCode:
     """Codes of ``Truth.code``: why a sample is not held against a held-back return; the first reason wins."""
 
     CANDIDATE = 0  #: counts
@@ -51,11 +51,11 @@ class Truth(Record):
     @property
     def ok(self) -> Tensor:
         """(B, N) bool: the sample counts."""
-        return self.code == Rule.CANDIDATE
+        return self.code == TruthCode.CANDIDATE
 
     def dropped(self) -> dict[str, int]:
         """Held-back returns that do not count, by rule: the metric ``n_dropped``."""
-        rules = {code: name for code, name in names(Rule).items() if code > Rule.NEAR}
+        rules = {code: name for code, name in names(TruthCode).items() if code > TruthCode.NEAR}
         return {name.lower(): int((self.code == code).sum()) for code, name in rules.items()}
 
 
@@ -76,7 +76,7 @@ def range_split(frame: Frame, cutoff: float | None) -> Frame:
     return frame.replace(depth=torch.where(frame.depth > cutoff, torch.zeros_like(frame.depth), frame.depth))
 
 
-def half(
+def split_half(
     samples: Samples,
     seed: int,
     *,
@@ -108,7 +108,7 @@ def half(
     return usable & first, usable & ~first
 
 
-def without_returns(samples: Samples, hidden: Tensor) -> Samples:
+def hide_returns(samples: Samples, hidden: Tensor) -> Samples:
     """The samples as if the sensor had been silent at the ``hidden`` (B, N) ones: no stage can see those returns.
 
     Raises:
@@ -127,7 +127,7 @@ def without_returns(samples: Samples, hidden: Tensor) -> Samples:
     )
 
 
-def truth_at(
+def sample_truth(
     frame: Frame,
     uv: Tensor,  # (B, N, 2) px
     *,
@@ -160,35 +160,39 @@ def truth_at(
     Cost: reads window² depth pixels per sample, whatever the image size.
     """
     sizes = check("truth_at", image=(frame.image, "B C H W"), depth=(frame.depth, "B h w"), uv=(uv, "B N 2"))
-    if truth not in TESTS:
-        raise ValueError(f"holdout.truth: found {truth!r}, expected one of {', '.join(TESTS)}")
+    if truth not in _TRUTH_TESTS:
+        raise ValueError(f"holdout.truth: found {truth!r}, expected one of {', '.join(_TRUTH_TESTS)}")
     scale = sizes["w"] / sizes["W"]
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (sizes["h"], sizes["w"]), uv)
-    dense = _tested(frame.depth, place, truth, scale, window)
+    dense = _test_truth(frame.depth, place, truth, scale, window)
     if frame.sparse is None:
         return Truth(*dense)
-    sparse = _tested(frame.depth, place, truth, scale, None)
+    sparse = _test_truth(frame.depth, place, truth, scale, None)
     depth, code = (torch.where(frame.sparse[:, None], a, b) for a, b in zip(sparse, dense, strict=True))
     return Truth(depth, code)
 
 
-def _tested(depth: Tensor, place: Tensor, truth: str, scale: float, window: int | None) -> tuple[Tensor, Tensor]:
+def _test_truth(depth: Tensor, place: Tensor, truth: str, scale: float, window: int | None) -> tuple[Tensor, Tensor]:
     """The return (B, N) of each place in maps (B, h, w), and its code; ``window`` None: the maps are sparse."""
-    close, u, v = _window(depth, place, _side(CLOSE_SPARSE if window is None else CLOSE, scale))
+    close, u, v = _window_returns(
+        depth, place, _window_side(SPARSE_CLOSE_WINDOW_PX if window is None else _CLOSE_WINDOW_PX, scale)
+    )
     found = _nearest_return(close, u, v, place) if window is None else _nearest_pixel(depth, place)
     fails_close, fails_wide = torch.zeros_like(found, dtype=torch.bool), torch.zeros_like(found, dtype=torch.bool)
     if truth != "raw":
-        fails_close = _spreads(close, CLOSE_SPREAD)
+        fails_close = _is_spread(close, _MAX_CLOSE_SPREAD)
         if window is not None:
             fails_close = fails_close | (close <= 0).flatten(-2).any(-1)
     if truth == "full":
-        wide, _, _ = _window(depth, place, _side(WIDE_SPARSE if window is None else window, scale))
-        fails_wide = _spreads(wide, WIDE_SPREAD)
-    code = first_reason((found <= 0, Rule.NO_RETURN), (fails_close, Rule.CLOSE), (fails_wide, Rule.WIDE))
+        wide, _, _ = _window_returns(
+            depth, place, _window_side(_SPARSE_WIDE_WINDOW_PX if window is None else window, scale)
+        )
+        fails_wide = _is_spread(wide, _MAX_WIDE_SPREAD)
+    code = first_reason((found <= 0, TruthCode.NO_RETURN), (fails_close, TruthCode.CLOSE), (fails_wide, TruthCode.WIDE))
     return found, code
 
 
-def candidates(
+def select_candidates(
     samples: Samples,
     truth: Truth,
     cutoff: float | None,
@@ -202,7 +206,7 @@ def candidates(
 
     Args:
         samples: of the frame, with trackability.
-        truth: from :func:`truth_at`, at the same samples.
+        truth: from :func:`sample_truth`, at the same samples.
         cutoff: m; a return beyond it was held back. None: none was, and nothing is a candidate.
         excluded: samples to be counted apart, under EXCLUDED.
         min_texture: trackability asked, as a share of the median over the frame's samples.
@@ -219,17 +223,17 @@ def candidates(
     near = truth.depth <= (math.inf if cutoff is None else cutoff)
     plain = samples.trackability < min_texture * _median(samples.trackability)
     code = first_reason(
-        (truth.code == Rule.NO_RETURN, Rule.NO_RETURN),
-        (near, Rule.NEAR),
-        (truth.code == Rule.CLOSE, Rule.CLOSE),
-        (truth.code == Rule.WIDE, Rule.WIDE),
-        (torch.zeros_like(near) if excluded is None else excluded, Rule.EXCLUDED),
-        (plain, Rule.TEXTURE),
+        (truth.code == TruthCode.NO_RETURN, TruthCode.NO_RETURN),
+        (near, TruthCode.NEAR),
+        (truth.code == TruthCode.CLOSE, TruthCode.CLOSE),
+        (truth.code == TruthCode.WIDE, TruthCode.WIDE),
+        (torch.zeros_like(near) if excluded is None else excluded, TruthCode.EXCLUDED),
+        (plain, TruthCode.TEXTURE),
     )
     return truth.replace(code=code)
 
 
-def drop_outs(
+def select_real_holes(
     frame: Frame,
     samples: Samples,
     truth: Truth,
@@ -248,7 +252,7 @@ def drop_outs(
     Args:
         frame: the views with the sensor's full depth.
         samples: of these frames.
-        truth: the independent depth at the samples, from :func:`truth_at`.
+        truth: the independent depth at the samples, from :func:`sample_truth`.
         window: side of the window in the sensor map that is asked for neighbours, px of that map.
         min_returns: fewest returns in it.
         agreement: relative difference allowed between their median and the truth.
@@ -266,29 +270,29 @@ def drop_outs(
     sizes = check("drop_outs", depth=(frame.depth, "B h w"), uv=(samples.uv, "B N 2"), truth=(truth.depth, "B N"))
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (sizes["h"], sizes["w"]), samples.uv)
     answered = _nearest_pixel(frame.depth, place) > 0
-    around = _window(frame.depth, place, window)[0].flatten(-2)
+    around = _window_returns(frame.depth, place, window)[0].flatten(-2)
     count = (around > 0).sum(-1)
     ordered = torch.where(around > 0, around, torch.full_like(around, torch.inf)).sort(-1).values
     middle = ordered.gather(-1, ((count - 1).clamp_min(0) // 2)[..., None])[..., 0]
     agrees = (count >= min_returns) & ((middle - truth.depth).abs() <= agreement * truth.depth)
     plain = samples.trackability < min_texture * _median(samples.trackability)
     code = first_reason(
-        (truth.code == Rule.NO_RETURN, Rule.NO_RETURN),
-        (answered, Rule.NEAR),
-        (truth.code == Rule.CLOSE, Rule.CLOSE),
-        (truth.code == Rule.WIDE, Rule.WIDE),
-        (~agrees, Rule.EXCLUDED),
-        (plain, Rule.TEXTURE),
+        (truth.code == TruthCode.NO_RETURN, TruthCode.NO_RETURN),
+        (answered, TruthCode.NEAR),
+        (truth.code == TruthCode.CLOSE, TruthCode.CLOSE),
+        (truth.code == TruthCode.WIDE, TruthCode.WIDE),
+        (~agrees, TruthCode.EXCLUDED),
+        (plain, TruthCode.TEXTURE),
     )
     return truth.replace(code=code)
 
 
-def _side(size: int, scale: float) -> int:
+def _window_side(size: int, scale: float) -> int:
     """Odd side, at least 3, of a window of ``size`` image pixels in a map ``scale`` times as wide as the image."""
     return max(3, 2 * int(size * scale / 2) + 1)
 
 
-def _window(depth: Tensor, place: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
+def _window_returns(depth: Tensor, place: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
     """Returns (B, N, size, size) around depth pixels ``place`` (B, N, 2), 0 = none, and the u and v (B, N, size) of
     the window's columns and rows.
 
@@ -298,7 +302,7 @@ def _window(depth: Tensor, place: Tensor, size: int) -> tuple[Tensor, Tensor, Te
     size = min(size, h, w)
     centre = round_half_up(place.nan_to_num(-1e6)).clamp(-1e6, 1e6)
     corner = centre.long() - size // 2
-    value = patches(depth[:, None], corner, size)[:, :, 0]  # moved inside at the edge of the map
+    value = extract_patches(depth[:, None], corner, size)[:, :, 0]  # moved inside at the edge of the map
     steps = torch.arange(size, device=depth.device)
     u = corner[..., 0, None].clamp(0, w - size) + steps
     v = corner[..., 1, None].clamp(0, h - size) + steps
@@ -309,7 +313,7 @@ def _window(depth: Tensor, place: Tensor, size: int) -> tuple[Tensor, Tensor, Te
 
 
 def _nearest_pixel(depth: Tensor, place: Tensor) -> Tensor:
-    value, inside = nearest(depth, place)
+    value, inside = sample_nearest(depth, place)
     return torch.where(inside & value.isfinite() & (value > 0), value, torch.zeros_like(value))
 
 
@@ -322,7 +326,7 @@ def _nearest_return(window: Tensor, u: Tensor, v: Tensor, place: Tensor) -> Tens
     return returns.gather(-1, far.argmin(-1, keepdim=True))[..., 0]
 
 
-def _spreads(window: Tensor, limit: float) -> Tensor:
+def _is_spread(window: Tensor, limit: float) -> Tensor:
     """Whether the returns of a window (B, N, s, s) spread by ``limit`` or more; no return does not."""
     high = window.amax((-2, -1))
     low = torch.where(window > 0, window, torch.full_like(window, torch.inf)).amin((-2, -1))

@@ -12,15 +12,15 @@ from torch import Tensor
 
 from dhtorch.geometry.checks import check
 from dhtorch.metrics import bootstrap
-from dhtorch.metrics.errors import Numbers, Points
+from dhtorch.metrics.errors import MetricValues, Points
 from dhtorch.pytree import Record, record
 
 #: Relative error below which an answer is good.
-GOOD = 0.1
+GOOD_ERROR_REL = 0.1
 
 
 @record
-class Reliability(Record):
+class ReliabilityDiagram(Record):
     """A reliability diagram, bin by bin; an empty bin has weight 0 and NaN for the rest."""
 
     claimed: Tensor  # (bins,) mean claimed probability
@@ -35,14 +35,14 @@ class Reliability(Record):
         return float((self.weight * (self.claimed - self.realised).abs()).nansum())
 
 
-def diagram(
+def reliability_diagram(
     claimed: Tensor,  # (n,) in [0, 1]
     good: Tensor,  # (n,) bool
     weight: Tensor | None = None,  # (n,) ≥ 0
     *,
     bins: int = 10,
     equal_mass: bool = False,
-) -> Reliability:
+) -> ReliabilityDiagram:
     """Claimed probabilities against what happened, in bins.
 
     Args:
@@ -69,7 +69,7 @@ def diagram(
         return torch.zeros(bins, dtype=torch.float64, device=claimed.device).index_add(0, index, x)
 
     mass = total(weight)
-    return Reliability(
+    return ReliabilityDiagram(
         claimed=total(weight * claimed) / mass,
         realised=total(weight * good.double()) / mass,
         weight=mass / mass.sum().clamp_min(torch.finfo(torch.float64).tiny),
@@ -89,16 +89,16 @@ def excess_ece(scene: Points, *, bins: int = 10, draws: int = 200, seed: int = 0
     if not len(said.score):
         return None
     claimed = said.score.double().clamp(0, 1)
-    found = diagram(claimed, said.error < GOOD, bins=bins, equal_mass=True).ece
+    found = reliability_diagram(claimed, said.error < GOOD_ERROR_REL, bins=bins, equal_mass=True).ece
     g = torch.Generator().manual_seed(seed)
     expected = 0.0
     for _ in range(draws):
         good = torch.rand(len(claimed), generator=g, dtype=torch.float64) < claimed
-        expected += (diagram(claimed, good, bins=bins, equal_mass=True).ece or 0.0) / draws
+        expected += (reliability_diagram(claimed, good, bins=bins, equal_mass=True).ece or 0.0) / draws
     return max(0.0, (found or 0.0) - expected)
 
 
-def pool(scenes: Sequence[Points]) -> tuple[Tensor, Tensor, Tensor]:
+def pool_answers(scenes: Sequence[Points]) -> tuple[Tensor, Tensor, Tensor]:
     """Claimed probability, goodness and weight (n,) of the answers of several scenes, each scene of total weight 1."""
     answers = [scene.answered() for scene in scenes]
     if not answers:
@@ -106,23 +106,23 @@ def pool(scenes: Sequence[Points]) -> tuple[Tensor, Tensor, Tensor]:
         return none, none.bool(), none
     return (
         torch.cat([a.score for a in answers]),
-        torch.cat([a.error < GOOD for a in answers]),
+        torch.cat([a.error < GOOD_ERROR_REL for a in answers]),
         torch.cat([torch.full_like(a.score, 1 / max(a.score.numel(), 1)) for a in answers]),
     )
 
 
-def measure(scenes: Sequence[Points], *, bins: int = 10) -> Numbers:
+def measure_reliability(scenes: Sequence[Points], *, bins: int = 10) -> MetricValues:
     """``ece`` (bins of equal width) and ``ece_equal_mass`` of one or several scenes; None without answers."""
-    pooled = pool(scenes)
+    pooled = pool_answers(scenes)
     return {
-        "ece": diagram(*pooled, bins=bins).ece,
-        "ece_equal_mass": diagram(*pooled, bins=bins, equal_mass=True).ece,
+        "ece": reliability_diagram(*pooled, bins=bins).ece,
+        "ece_equal_mass": reliability_diagram(*pooled, bins=bins, equal_mass=True).ece,
     }
 
 
 def ece_interval(scenes: Sequence[Points], *, bins: int = 10, draws: int = 2000, seed: int = 0) -> bootstrap.Interval:
     """``ece`` (bins of equal width) with its interval over scenes; scenes without answers are passed over."""
-    tables = [diagram(*pool([s]), bins=bins) for s in scenes if bool(s.keep.any())]
+    tables = [reliability_diagram(*pool_answers([s]), bins=bins) for s in scenes if bool(s.keep.any())]
     if not tables:
         return bootstrap.Interval(None, None, None, 0)
     gaps = torch.stack([(t.weight * (t.claimed - t.realised)).nan_to_num() for t in tables])
@@ -130,7 +130,7 @@ def ece_interval(scenes: Sequence[Points], *, bins: int = 10, draws: int = 2000,
     def ece(index: Tensor) -> Tensor:
         return gaps[index].mean(1).abs().sum(-1)
 
-    return bootstrap.interval_of(ece, len(tables), draws=draws, seed=seed)
+    return bootstrap.interval_of_statistic(ece, len(tables), draws=draws, seed=seed)
 
 
 def leave_one_room_out(

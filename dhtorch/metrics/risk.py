@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import check
-from dhtorch.metrics.errors import Numbers, Points
+from dhtorch.metrics.errors import MetricValues, Points
 
 #: Fewest answers that a coverage at some risk may rest on.
-MIN_POINTS = 10
+_MIN_POINTS = 10
 
 #: Coverages, as tenths of the answers, between which the curve is asked whether it rises.
-STEPS = 10
+_N_MONOTONICITY_STEPS = 10
 
 
-def curve(
+def risk_curve(
     loss: Tensor,  # (n,)
     score: Tensor,  # (n,)
 ) -> Tensor:
@@ -31,7 +31,7 @@ def curve(
     Raises:
         ValueError: unequal lengths.
     """
-    return _running_sum(loss, score) / _count(loss)
+    return _running_sum(loss, score) / _running_count(loss)
 
 
 def risk_coverage(pooled: Points, *, oracle: bool = False) -> tuple[Tensor, Tensor]:
@@ -42,11 +42,11 @@ def risk_coverage(pooled: Points, *, oracle: bool = False) -> tuple[Tensor, Tens
         oracle: by rising error instead, the best possible order.
     """
     answered = pooled.answered()
-    loss = capped(answered.error)
-    return _count(loss) / max(pooled.keep.numel(), 1), curve(loss, -loss if oracle else answered.score)
+    loss = cap_error(answered.error)
+    return _running_count(loss) / max(pooled.keep.numel(), 1), risk_curve(loss, -loss if oracle else answered.score)
 
 
-def measure(pooled: Points, *, min_points: int = MIN_POINTS) -> Numbers:
+def measure_risk(pooled: Points, *, min_points: int = _MIN_POINTS) -> MetricValues:
     """How well the score of a pair or scene orders its answers by error.
 
     Returns:
@@ -67,21 +67,21 @@ def measure(pooled: Points, *, min_points: int = MIN_POINTS) -> Numbers:
     """
     n = pooled.keep.numel()
     answered = pooled.answered()
-    loss, score = capped(answered.error), answered.score
-    risk = curve(loss, score)
+    loss, score = cap_error(answered.error), answered.score
+    risk = risk_curve(loss, score)
     some = bool(risk.numel())
     last = torch.where(pooled.keep, pooled.score, -torch.inf)
-    full = curve(torch.where(pooled.keep, capped(pooled.error), 1.0), last)
-    numbers: Numbers = {
+    full = risk_curve(torch.where(pooled.keep, cap_error(pooled.error), 1.0), last)
+    numbers: MetricValues = {
         "aurc": _mean(risk),
-        "aurc_excess": _mean(risk - curve(loss, -loss)),
+        "aurc_excess": _mean(risk - risk_curve(loss, -loss)),
         "aurc_full": _mean(full),
         "augrc": _mean(_running_sum(loss, score) / max(loss.numel(), 1)),
     }
     cuts = _ends_of_ties(score)
     for percent in (5, 10, 20):
-        fits = cuts & (risk <= percent / 100) & (_count(loss) >= min_points)
-        most = int(torch.where(fits, _count(loss), 0).max()) if some else 0
+        fits = cuts & (risk <= percent / 100) & (_running_count(loss) >= min_points)
+        most = int(torch.where(fits, _running_count(loss), 0).max()) if some else 0
         numbers[f"coverage_at_{percent}"] = most / n if n else None
     numbers["monotonicity"], numbers["largest_fall"] = _monotonicity(risk)
     return numbers
@@ -96,23 +96,23 @@ def ause(pooled: Points) -> float | None:
     Source: E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", 2018.
     """
     answered = pooled.answered()
-    loss = capped(answered.error)
+    loss = cap_error(answered.error)
     n = answered.keep.numel()
     if not n:
         return None
     left = torch.tensor([max(round(n * (100 - k) / 100), 1) - 1 for k in range(96)], device=loss.device)
-    best = curve(loss, -loss)[left].mean()
+    best = risk_curve(loss, -loss)[left].mean()
     chance = loss.mean() - best
-    return float((curve(loss, answered.score)[left].mean() - best) / chance) if float(chance) > 0 else None
+    return float((risk_curve(loss, answered.score)[left].mean() - best) / chance) if float(chance) > 0 else None
 
 
-def realised(pooled: Points, threshold: float | None) -> float | None:
+def realised_risk(pooled: Points, threshold: float | None) -> float | None:
     """Mean capped error of the answers that score at least ``threshold`` (None answers nothing); None where silent."""
     accepted = pooled.keep & (pooled.score >= (torch.inf if threshold is None else threshold))
-    return _mean(capped(pooled.error[accepted]))
+    return _mean(cap_error(pooled.error[accepted]))
 
 
-def surest(pooled: Points, n: int) -> Points:
+def keep_surest(pooled: Points, n: int) -> Points:
     """The same candidates with only the ``n`` surest answers kept: two methods cut so answer equally much.
 
     Where the cut falls among answers of equal score, which cannot be told apart, those that stay are spread evenly
@@ -139,7 +139,7 @@ def surest(pooled: Points, n: int) -> Points:
     )
 
 
-def capped(error: Tensor) -> Tensor:
+def cap_error(error: Tensor) -> Tensor:
     """Loss of a relative error: the error itself, at most 1; 1 where it is not a number."""
     return error.nan_to_num(nan=1.0).clamp(max=1.0)
 
@@ -153,7 +153,7 @@ def _running_sum(loss: Tensor, score: Tensor) -> Tensor:
     return (total / size)[group].cumsum(0)
 
 
-def _count(loss: Tensor) -> Tensor:
+def _running_count(loss: Tensor) -> Tensor:
     return torch.arange(1, loss.numel() + 1, dtype=torch.float64, device=loss.device)
 
 
@@ -165,9 +165,11 @@ def _ends_of_ties(score: Tensor) -> Tensor:
 
 def _monotonicity(risk: Tensor) -> tuple[float | None, float | None]:
     n = risk.numel()
-    if n < STEPS:
+    if n < _N_MONOTONICITY_STEPS:
         return None, None
-    at = torch.tensor([n * k // STEPS - 1 for k in range(1, STEPS + 1)], device=risk.device)
+    at = torch.tensor(
+        [n * k // _N_MONOTONICITY_STEPS - 1 for k in range(1, _N_MONOTONICITY_STEPS + 1)], device=risk.device
+    )
     tenths = risk[at]
     fall = (tenths.cummax(0).values - tenths).max()
     return float((tenths.diff() >= -1e-12).double().mean()), float(fall)

@@ -37,7 +37,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from dhtorch.runtime.results import processor
+from dhtorch.runtime.results import describe_processor
 
 FOLDER = Path(__file__).with_name("csrc")
 
@@ -77,7 +77,7 @@ def library() -> Path:
     """Where the compiled file of this source, torch and processor is or would be."""
     flags = (*FLAGS, *_vectors())
     sources = (source.read_text(encoding="utf-8") for source in (HEADER, *SOURCES))
-    key = "\n".join((*sources, torch.__version__, processor(), platform.machine(), *flags))
+    key = "\n".join((*sources, torch.__version__, describe_processor(), platform.machine(), *flags))
     return cache() / f"dhtorch-{hashlib.sha256(key.encode()).hexdigest()[:16]}.so"
 
 

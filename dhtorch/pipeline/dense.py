@@ -20,46 +20,46 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch import pytree as tree
-from dhtorch.calibration import available, load
+from dhtorch import pytree
+from dhtorch.calibration import list_calibrations, load_calibration
 from dhtorch.calibration.score_calibration import Calibration
 from dhtorch.codes import Gate, PoseCode, Source, first_reason
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import plane_sweep as sweep
-from dhtorch.geometry.covariance import median
-from dhtorch.geometry.filters import grey
+from dhtorch.geometry import plane_sweep
+from dhtorch.geometry.covariance import masked_median
+from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.se3 import Pose
-from dhtorch.pipeline import surface as stereo
+from dhtorch.pipeline import surface
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.pipeline.spec import Trace
-from dhtorch.records import NO_HINT, Camera, DepthMap, Estimate, Frame, GivenPose, PoseFit, Samples, TrackHint
+from dhtorch.records import NO_HINT, Camera, DepthMap, Estimate, Frame, PoseFit, PosePrior, Samples, TrackHint
 
 #: Share of the sensor's reach (the depth that nearly all its returns are nearer than) at which the sweep ends: what the
 #: sensor sees as well is what tells whether the sweep is right.
-OVERLAP, REACH = 0.7, 0.98
+SWEEP_OVERLAP, REACH_QUANTILE = 0.7, 0.98
 
 #: What a view must be worth to be asked, as Σ log(1 + (0.1 · depth / sigma)²) over its answers without a return.
-WORTH = 5.0
+MIN_VIEW_GAIN = 5.0
 
 #: Pixels where sensor and sweep both speak by which a motion may be refuted; a difference counts beyond so many sigmas
 #: and such a share of the depth.
-WITNESSES, SIGMAS, APART = 200, 3.0, 0.1
+MIN_OVERLAP_PIXELS, REFUTING_SIGMAS, REFUTING_RATIO = 200, 3.0, 0.1
 
 
 #: What the options of a sweep may be.
-RANGES: dict[str, tuple[float, float]] = {
-    "partners": (1, sweep.VIEWS),
+DENSE_RANGES: dict[str, tuple[float, float]] = {
+    "partners": (1, plane_sweep.MAX_SWEPT_VIEWS),
     "planes": (3, 1024),
     "size": (16, math.inf),
     "refinements": (0, math.inf),
     "min_correlation": (-1, 1),
     "max_sigma_rel": (0, math.inf),
 }
-OPTIONS = tuple(RANGES)
+DENSE_OPTIONS = tuple(DENSE_RANGES)
 
 
-class Asked(NamedTuple):
+class SelectedViews(NamedTuple):
     """The other views of an anchor and what the sparse method made of them."""
 
     joined: Estimate  # (B, N) what they say together
@@ -69,7 +69,7 @@ class Asked(NamedTuple):
     samples: Samples  # (B, N) of the anchor
 
 
-def complete(
+def complete_depth(
     anchor: Frame,
     others: Frame | Sequence[Frame],
     *,
@@ -82,7 +82,7 @@ def complete(
     max_sigma_rel: float = 0.2,
     calibration: Calibration | None = None,
     seed: int | Tensor = 0,
-    fit: PoseFit | GivenPose | None = None,
+    fit: PoseFit | PosePrior | None = None,
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> DepthMap:
@@ -121,9 +121,9 @@ def complete(
     """
     trace = {} if trace is None else trace
     joined = trace["sparse"] = method(anchor, others, seed=seed, fit=fit, hint=hint, trace=trace)
-    return swept(
+    return sweep_depth(
         anchor,
-        views_asked(joined, others, trace),
+        selected_views(joined, others, trace),
         method=method,
         partners=partners,
         planes=planes,
@@ -135,9 +135,9 @@ def complete(
     )
 
 
-def swept(
+def sweep_depth(
     anchor: Frame,
-    asked: Asked,
+    asked: SelectedViews,
     *,
     method: Method = AUTO,
     partners: int = 3,
@@ -148,36 +148,36 @@ def swept(
     max_sigma_rel: float = 0.2,
     calibration: Calibration | None = None,
 ) -> DepthMap:
-    """The second half of :func:`complete`: the sweep, under motions that are known already.
+    """The second half of :func:`complete_depth`: the sweep, under motions that are known already.
 
     Arguments, result, errors, gradient, memory and cost as there; of ``method`` the reading of the sensor counts.
     """
     given = (partners, planes, size, refinements, min_correlation, max_sigma_rel)
-    _check_options("complete", dict(zip(OPTIONS, given, strict=True)))
-    index, wanted = worthiest(asked, partners)
-    base = sweep.base(*resized(anchor, size))
-    partner = [partner_of(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
+    _check_options("complete", dict(zip(DENSE_OPTIONS, given, strict=True)))
+    index, wanted = top_views(asked, partners)
+    base = plane_sweep.make_reference_view(*downscale_grey(anchor, size))
+    partner = [source_view_of(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
     q = torch.linspace(0, 1, planes).to(base.ray) / _nearest(asked.samples, anchor.sparse)[:, None].to(base.ray)
-    start = stereo.best_planes(base, partner, q)
-    found = stereo.fitted(base, partner, start, q, refinements)
+    start = surface.sweep_planes(base, partner, q)
+    found = surface.refine_surface(base, partner, start, q, refinements)
     beyond = start.q >= q[:, -1, None, None] * (1 - 1e-6)
-    silent = _silent_pairs(asked, wanted)
+    silent = _pair_gate(asked, wanted)
     told = _gated(base, found, (beyond, start.alone), silent, min_correlation, max_sigma_rel)
     returns = _returns(anchor, method, base.hw)
-    told = _judged(told, returns, asked.samples)
-    return _joined_with(told if calibration is None else calibration.apply(told), returns)
+    told = _check_against_returns(told, returns, asked.samples)
+    return _merge_returns(told if calibration is None else calibration.apply(told), returns)
 
 
-def sensed(anchor: Frame, *, method: Method = AUTO, size: int = 640) -> DepthMap:
+def sensor_depth_map(anchor: Frame, *, method: Method = AUTO, size: int = 640) -> DepthMap:
     """The map of views that have no other view: the sensor where it answers, else silence (NO_TRACK).
 
-    Arguments, result, errors and gradient as of :func:`complete`.
+    Arguments, result, errors and gradient as of :func:`complete_depth`.
     """
     _check_options("sensed", {"size": size})
     nan = torch.full((len(anchor.camera.f), *map_hw(anchor.hw, size)), torch.nan).to(anchor.camera.f)
     code = torch.zeros_like(nan, dtype=torch.int32)
     silent = DepthMap(nan, nan, torch.zeros_like(nan), code, torch.full_like(code, Gate.NO_TRACK))
-    return _joined_with(silent, _returns(anchor, method, map_hw(anchor.hw, size)))
+    return _merge_returns(silent, _returns(anchor, method, map_hw(anchor.hw, size)))
 
 
 def map_hw(hw: tuple[int, int], size: int) -> tuple[int, int]:
@@ -186,7 +186,7 @@ def map_hw(hw: tuple[int, int], size: int) -> tuple[int, int]:
     return hw if longer <= size else (max(1, round(hw[0] * size / longer)), max(1, round(hw[1] * size / longer)))
 
 
-def pixels(anchor: Frame, hw: tuple[int, int]) -> Tensor:
+def map_pixel_centres(anchor: Frame, hw: tuple[int, int]) -> Tensor:
     """Where the picture shows what the pixels of its map of size ``hw`` stand for: (h · w, 2) px, row by row."""
     rows, columns = (torch.arange(n, device=anchor.camera.f.device).to(anchor.camera.f) for n in hw)
     scale = anchor.hw[0] / hw[0], anchor.hw[1] / hw[1]
@@ -194,10 +194,10 @@ def pixels(anchor: Frame, hw: tuple[int, int]) -> Tensor:
     return torch.stack([u, v]).flatten(1).mT  # each axis by itself in memory
 
 
-def resized(frame: Frame, size: int) -> tuple[Tensor, Camera]:
+def downscale_grey(frame: Frame, size: int) -> tuple[Tensor, Camera]:
     """Grey picture (B, 1, h, w) with a longer side of at most ``size``, each pixel the mean of what it covers, and its
     camera. Gradient: to the image and the intrinsics."""
-    picture = grey(frame.image)
+    picture = grayscale(frame.image)
     picture = picture.to(torch.promote_types(picture.dtype, frame.camera.f.dtype))
     hw = map_hw(frame.hw, size)
     if hw == frame.hw:
@@ -205,8 +205,9 @@ def resized(frame: Frame, size: int) -> tuple[Tensor, Camera]:
     return F.interpolate(picture, hw, mode="area"), cam.resize(frame.camera, frame.hw, hw)
 
 
-def options(given: bool | Mapping[str, Any] | None, name: str = "dense") -> dict[str, Any] | None:
-    """What settings ask for as keywords of :func:`complete`: true = its own, a mapping = some others, false = no maps.
+def dense_options(given: bool | Mapping[str, Any] | None, name: str = "dense") -> dict[str, Any] | None:
+    """What settings ask for as keywords of :func:`complete_depth`: true = its own, a mapping = some others, false = no
+    maps.
 
     Raises:
         ValueError: something else, an unknown option, no number, or one out of range.
@@ -214,12 +215,12 @@ def options(given: bool | Mapping[str, Any] | None, name: str = "dense") -> dict
     if given is None or given is False:
         return None
     if not isinstance(given, bool | Mapping):
-        raise ValueError(f"{name}: found {given!r}, expected true, false or options among {', '.join(OPTIONS)}")
-    standard = complete.__kwdefaults__ or {}
-    found: dict[str, Any] = {option: standard[option] for option in OPTIONS}
+        raise ValueError(f"{name}: found {given!r}, expected true, false or options among {', '.join(DENSE_OPTIONS)}")
+    standard = complete_depth.__kwdefaults__ or {}
+    found: dict[str, Any] = {option: standard[option] for option in DENSE_OPTIONS}
     for option, value in (given if isinstance(given, Mapping) else {}).items():
         if option not in found:
-            raise ValueError(f"{name}: found {option!r}, expected some of {', '.join(OPTIONS)}")
+            raise ValueError(f"{name}: found {option!r}, expected some of {', '.join(DENSE_OPTIONS)}")
         whole = isinstance(found[option], int)
         if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
             raise ValueError(f"{name}.{option}: found {value!r}, expected a {'whole ' * whole}number")
@@ -230,47 +231,49 @@ def options(given: bool | Mapping[str, Any] | None, name: str = "dense") -> dict
 
 def _check_options(name: str, given: Mapping[str, float]) -> None:
     for option, value in given.items():
-        low, high = RANGES[option]
+        low, high = DENSE_RANGES[option]
         if not low <= value <= high:
             upper = f" to {high:g}" if high < math.inf else ""
             raise ValueError(f"{name}: {option} is {value}, expected at least {low:g}{upper}")
 
 
-def views_asked(joined: Estimate, others: Frame | Sequence[Frame], trace: Trace) -> Asked:
+def selected_views(joined: Estimate, others: Frame | Sequence[Frame], trace: Trace) -> SelectedViews:
     """The views that a method asked and their answers: what it was given, what it said, and its trace."""
     if not isinstance(others, Frame):
-        others = tree.stack(others)
+        others = pytree.stack(others)
     if others.image.dim() == 4:
-        others = tree.stack([others])
+        others = pytree.stack([others])
     if "views" not in trace:
-        estimates, fits = (tree.stack([trace[name]]) for name in ("estimate", "fit"))
-        return Asked(joined, others, estimates, fits, trace["samples"])
+        estimates, fits = (pytree.stack([trace[name]]) for name in ("estimate", "fit"))
+        return SelectedViews(joined, others, estimates, fits, trace["samples"])
     index = trace["choice"].index
     frames = others[index, torch.arange(index.shape[1], device=index.device)]
-    estimates, fits = (tree.stack([view[name] for view in trace["views"]]) for name in ("estimate", "fit"))
-    return Asked(joined, frames, estimates, fits, trace["samples"])
+    estimates, fits = (pytree.stack([view[name] for view in trace["views"]]) for name in ("estimate", "fit"))
+    return SelectedViews(joined, frames, estimates, fits, trace["samples"])
 
 
-def worthiest(asked: Asked, partners: int) -> tuple[Tensor, Tensor]:
+def top_views(asked: SelectedViews, partners: int) -> tuple[Tensor, Tensor]:
     """Which views are swept, (K, B) indices, those worth most first, and which of them are worth it (K, B) bool."""
     said = asked.estimates.keep & ~asked.samples.usable & (asked.estimates.sigma > 0)
     ratio = torch.where(said, 0.1 * asked.estimates.depth / asked.estimates.sigma, 0.0).detach()
     worth = torch.where(asked.fits.ok, torch.log1p(ratio.square()).sum(-1), -1.0)
     worth, index = worth.sort(dim=0, descending=True, stable=True)
-    return index[:partners], worth[:partners] > WORTH
+    return index[:partners], worth[:partners] > MIN_VIEW_GAIN
 
 
-def partner_of(asked: Asked, index: Tensor, size: int, use: Tensor, like: Tensor) -> stereo.Partner:
+def source_view_of(asked: SelectedViews, index: Tensor, size: int, use: Tensor, like: Tensor) -> surface.SourceView:
     """The views (B,) of that index and their motions, harmless ones where there are none."""
     at = index, torch.arange(len(index), device=index.device)
     frame, fit = asked.frames[at], asked.fits[at]
-    image, camera = resized(frame, size)
+    image, camera = downscale_grey(frame, size)
     eye = torch.eye(3).to(like)
     R = torch.where(fit.ok[:, None, None], fit.T_1_from_0.R.to(like), eye)
     t = torch.where(fit.ok[:, None], fit.T_1_from_0.t.to(like), eye[0])
     turn = None if fit.shutter is None else torch.where(fit.ok[:, None], fit.shutter.turn.to(like), 0.0)
     image = image.to(like)
-    return stereo.Partner(sweep.View(image, camera, Pose(R, t), turn), sweep.with_gradients(image), fit, use)
+    return surface.SourceView(
+        plane_sweep.SweptView(image, camera, Pose(R, t), turn), plane_sweep.stack_gradients(image), fit, use
+    )
 
 
 def _nearest(samples: Samples, sparse: Tensor | None = None) -> Tensor:
@@ -281,14 +284,14 @@ def _nearest(samples: Samples, sparse: Tensor | None = None) -> Tensor:
     """
     depth = torch.where(samples.usable, samples.depth, torch.inf).detach().sort(-1).values
     n = samples.usable.sum(-1)
-    last = (REACH * (n - 1).clamp_min(0)).long()
+    last = (REACH_QUANTILE * (n - 1).clamp_min(0)).long()
     if sparse is not None:
-        last = torch.where(sparse, ((1 - REACH) * n).long(), last)
+        last = torch.where(sparse, ((1 - REACH_QUANTILE) * n).long(), last)
     found = depth.gather(-1, last[:, None])[:, 0]
-    return torch.where(n > 0, OVERLAP * found, torch.ones_like(found))
+    return torch.where(n > 0, SWEEP_OVERLAP * found, torch.ones_like(found))
 
 
-def _silent_pairs(asked: Asked, wanted: Tensor) -> Tensor:
+def _pair_gate(asked: SelectedViews, wanted: Tensor) -> Tensor:
     """Gate (B,) for all pixels of anchors that no other view is of use for, else ANSWER."""
     still = (asked.fits.code == PoseCode.NO_BASELINE) | (asked.estimates.gate == Gate.NO_BASELINE).any(-1)
     moving = (asked.joined.gate == Gate.CONTRADICTED).any(-1) & ~asked.joined.keep.any(-1)
@@ -303,8 +306,8 @@ def _silent_pairs(asked: Asked, wanted: Tensor) -> Tensor:
 
 
 def _gated(
-    base: sweep.Base,
-    found: stereo.Fitted,
+    base: plane_sweep.ReferenceView,
+    found: surface.RefinedSurface,
     place: tuple[Tensor, Tensor],  # (B, h, w) bool each: nearer than the nearest plane, found in one place only
     silent: Tensor,  # (B,)
     min_correlation: float,
@@ -330,7 +333,7 @@ def _gated(
     )
 
 
-class Returns(NamedTuple):
+class SensorReturns(NamedTuple):
     """What the sensor says at every pixel of a map, (B, h, w) each."""
 
     depth: Tensor  # m
@@ -339,32 +342,32 @@ class Returns(NamedTuple):
     usable: Tensor  # bool
 
 
-def _returns(anchor: Frame, method: Method, hw: tuple[int, int]) -> Returns:
+def _returns(anchor: Frame, method: Method, hw: tuple[int, int]) -> SensorReturns:
     """What the sensor says at every pixel of a map of that size."""
-    samples = method.backproject(anchor, pixels(anchor, hw))
+    samples = method.backproject(anchor, map_pixel_centres(anchor, hw))
     told = samples.depth, samples.sigma, samples.confidence, samples.usable
-    return Returns(*(x.unflatten(1, hw) for x in told))
+    return SensorReturns(*(x.unflatten(1, hw) for x in told))
 
 
-def _judged(told: DepthMap, returns: Returns, near: Samples) -> DepthMap:
+def _check_against_returns(told: DepthMap, returns: SensorReturns, near: Samples) -> DepthMap:
     """The sweep, silent where the sensor refutes it, and as unsure as the sensor is that the motions' metre is from."""
     usable, depth, sigma = returns.usable, returns.depth.detach(), returns.sigma.detach()
     sigma_told = told.sigma.detach()
     both = usable & told.keep
     miss = (torch.where(both, told.depth.detach() - depth, 0.0)).abs()
     spread = torch.where(both, (sigma_told.square() + sigma.square()).sqrt(), 1.0)
-    wrong = both & (miss > SIGMAS * spread) & (miss > APART * depth)
+    wrong = both & (miss > REFUTING_SIGMAS * spread) & (miss > REFUTING_RATIO * depth)
     n = both.sum((1, 2))
-    refuted = (n >= WITNESSES) & (2 * wrong.sum((1, 2)) > n)
+    refuted = (n >= MIN_OVERLAP_PIXELS) & (2 * wrong.sum((1, 2)) > n)
     gate = torch.where(refuted[:, None, None] & told.keep, Gate.CONTRADICTED, told.gate)
     noise = near.usable & (near.depth > 0)
-    share = median(near.sigma / torch.where(noise, near.depth, torch.ones_like(near.depth)), noise)
+    share = masked_median(near.sigma / torch.where(noise, near.depth, torch.ones_like(near.depth)), noise)
     share = torch.where(noise.any(-1, keepdim=True), share, 0.0)[..., None].detach()  # a wrong scale passes whole
     sigma_told = (sigma_told.square() + (share * told.depth.detach()).square()).sqrt()
     return told.replace(sigma=sigma_told, gate=gate)
 
 
-def _joined_with(told: DepthMap, returns: Returns) -> DepthMap:
+def _merge_returns(told: DepthMap, returns: SensorReturns) -> DepthMap:
     """Returns of the sensor where they are usable, else the sweep where it answers."""
     usable = returns.usable
     keep = told.keep & ~usable
@@ -378,6 +381,6 @@ def _joined_with(told: DepthMap, returns: Returns) -> DepthMap:
     )
 
 
-def shipped() -> Calibration | None:
+def default_calibration() -> Calibration | None:
     """The calibration of swept depths that travels with the package."""
-    return load("dense") if "dense" in available() else None
+    return load_calibration("dense") if "dense" in list_calibrations() else None

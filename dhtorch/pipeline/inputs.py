@@ -7,15 +7,15 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.records import Camera, Frame
 
 #: What a method reads of its anchor and of the other views: times and poses of the data set are not for it.
-OF_ANCHOR = "image", "depth", "conf", "sparse", "camera", "depth_camera"
-OF_OTHERS = "image", "camera"
+REFERENCE_FIELDS = "image", "depth", "conf", "sparse", "camera", "depth_camera"
+SOURCE_FIELDS = "image", "camera"
 
 
-def agreed(anchor: Frame, others: Frame | Sequence[Frame]) -> tuple[Frame, Frame]:
+def validate_views(anchor: Frame, others: Frame | Sequence[Frame]) -> tuple[Frame, Frame]:
     """The anchor and its other views, stacked to V × B where there are several, in one precision.
 
     Frames of several data sets come in several precisions: cameras become the widest of them, and pictures that differ
@@ -36,9 +36,9 @@ def agreed(anchor: Frame, others: Frame | Sequence[Frame]) -> tuple[Frame, Frame
     for name, frame in zip(names, frames, strict=True):
         if not isinstance(frame, Frame):
             raise TypeError(f"method: {name} is a {type(frame).__name__}, expected a dhtorch.Frame")
-        _check(name, frame, OF_OTHERS if name != "anchor" else OF_ANCHOR, anchor.image.device)
+        _check(name, frame, SOURCE_FIELDS if name != "anchor" else REFERENCE_FIELDS, anchor.image.device)
     anchor, *given = _one_precision(frames)
-    return anchor, given[0] if single else tree.stack(given)
+    return anchor, given[0] if single else pytree.stack(given)
 
 
 def _check(name: str, frame: Frame, fields: tuple[str, ...], device: torch.device) -> None:

@@ -8,11 +8,11 @@ from typing import Any
 
 from torch import Tensor
 
-from dhtorch.pipeline.inputs import agreed
-from dhtorch.pipeline.multiview import ask_window
-from dhtorch.pipeline.pair import ask_pair
+from dhtorch.pipeline.inputs import validate_views
+from dhtorch.pipeline.multiview import estimate_multiview
+from dhtorch.pipeline.pair import estimate_pair
 from dhtorch.pipeline.spec import MethodSpec, Trace
-from dhtorch.records import NO_HINT, Estimate, Frame, GivenPose, PoseFit, TrackHint
+from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, PosePrior, TrackHint
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,7 +32,7 @@ class Method(MethodSpec):
         others: Frame | Sequence[Frame],
         *,
         seed: int | Tensor = 0,
-        fit: PoseFit | GivenPose | None = None,
+        fit: PoseFit | PosePrior | None = None,
         hint: TrackHint = NO_HINT,
         trace: Trace | None = None,
         **changes: Any,
@@ -45,9 +45,9 @@ class Method(MethodSpec):
                 which the camera took them. Their depth is not read. Cameras may differ.
             seed: an int gives every pair the same draws; a (B,) int64 tensor gives each pair its own. All views of an
                 anchor have the same.
-            fit: a pose that is believed, (B,) or (V, B): seat 5 is then skipped; or a :class:`GivenPose` from
-                elsewhere, which near returns may refute (:func:`dhtorch.stages.pose_prior.hold`). None = as ``given``
-                says.
+            fit: a pose that is believed, (B,) or (V, B): seat 5 is then skipped; or a :class:`PosePrior` from
+                elsewhere, which near returns may refute (:func:`dhtorch.stages.pose_prior.check_pose_prior`). None = as
+                ``given`` says.
             hint: what is known of the motion, for the tracker.
             trace: a dict that receives ``samples``, ``tracks`` (as tracked), ``tracks_ideal`` (undistorted), ``fit``,
                 ``estimate`` and ``ms`` (milliseconds by stage). Of several views those of the last, with ``ms`` summed
@@ -57,7 +57,7 @@ class Method(MethodSpec):
         Returns:
             Estimate for the B × n samples, silent ones with their reason; in the dtype of the intrinsics, float32
             where these are half precision. Images and depth may be of any floating dtype, each frame's
-            of its own (:func:`dhtorch.pipeline.inputs.agreed`).
+            of its own (:func:`dhtorch.pipeline.inputs.validate_views`).
 
         Raises:
             ValueError: wrong shapes, different batch sizes or devices, nothing to see, no other view.
@@ -70,8 +70,8 @@ class Method(MethodSpec):
         Source: paper, section "Method".
         """
         method = self.replace(**changes) if changes else self
-        anchor, others = agreed(anchor, others)
+        anchor, others = validate_views(anchor, others)
         if fit is None and method.given is not None:
             fit = method.given(anchor, others)
-        ask = ask_pair if others.image.dim() == 4 else ask_window
+        ask = estimate_pair if others.image.dim() == 4 else estimate_multiview
         return ask(method, anchor, others, seed=seed, fit=fit, hint=hint, trace=trace)

@@ -15,26 +15,26 @@ import time
 import torch
 from torch import Tensor
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.pyramid import Pyramids
-from dhtorch.pipeline.pair import Clock, lifted, tracked, under_pose
+from dhtorch.geometry.pyramid import PyramidCache
+from dhtorch.pipeline.pair import StageTimer, solve_pose_and_triangulate, track_in_chunks, upcast_intrinsics
 from dhtorch.pipeline.spec import MethodSpec, Trace
-from dhtorch.pipeline.view_selection import weighed
+from dhtorch.pipeline.view_selection import rank_views
 from dhtorch.pytree import R, stack
-from dhtorch.records import NO_HINT, Choice, Estimate, Frame, GivenPose, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, PosePrior, Samples, TrackHint, Tracks, ViewSelection
 
 #: Samples, about, by which key views are chosen.
-PROBES = 256
+N_PREVIEW_SAMPLES = 256
 
 
-def ask_window(
+def estimate_multiview(
     method: MethodSpec,
     anchor: Frame,
     others: Frame,
     *,
     seed: int | Tensor = 0,
-    fit: PoseFit | GivenPose | None = None,
+    fit: PoseFit | PosePrior | None = None,
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> Estimate:
@@ -44,7 +44,7 @@ def ask_window(
     Views are tracked into one after the other, then all poses are solved together.
     The first three seats see the anchor once; ``score`` sees the fused estimate, with tracks and pose of the last
     view. Of more than ``method.views`` the best are chosen, by ``method.choose`` or by a few of the samples
-    (:func:`dhtorch.pipeline.view_selection.weighed`); ``trace`` then has the :class:`dhtorch.records.Choice`.
+    (:func:`dhtorch.pipeline.view_selection.rank_views`); ``trace`` then has the :class:`dhtorch.records.ViewSelection`.
     ``method.chain`` only gives a start: what is searched for is always the anchor's window.
 
     Raises:
@@ -55,19 +55,19 @@ def ask_window(
     if not others.image.shape[0]:
         raise ValueError("extend: found no other view, expected at least one")
     began, ms = time.perf_counter(), {}
-    anchor, others = lifted(anchor), lifted(others)
+    anchor, others = upcast_intrinsics(anchor), upcast_intrinsics(others)
     samples = method.look(anchor)
     ms["samples"] = 1e3 * (time.perf_counter() - began)
-    hint = hint if hint.pyramid is not None else hint.replace(pyramid=Pyramids(anchor.image))
+    hint = hint if hint.pyramid is not None else hint.replace(pyramid=PyramidCache(anchor.image))
     every = torch.arange(len(others.image), device=samples.uv.device)[:, None].expand(-1, len(samples.uv))
-    choice = Choice(every)
+    choice = ViewSelection(every)
     if len(others.image) > method.views:
         began = time.perf_counter()
-        choice = _chosen(method, anchor, others, samples, seed=seed, fit=fit, hint=hint)
+        choice = _select_views(method, anchor, others, samples, seed=seed, fit=fit, hint=hint)
         ms["choose"] = 1e3 * (time.perf_counter() - began)
         pick = choice.index, torch.arange(len(samples.uv), device=choice.index.device)
         others, fit = others[pick], None if fit is None else fit[pick]
-    traces = _ask_views(method, anchor, others, samples, seed=seed, fit=fit, hint=hint, ms=ms)
+    traces = _estimate_views(method, anchor, others, samples, seed=seed, fit=fit, hint=hint, ms=ms)
     last, began = traces[-1], time.perf_counter()
     estimate = method.fuse(stack([t["estimate"] for t in traces]))
     estimate = method.score(estimate, samples, last["tracks_ideal"], last["fit"])
@@ -77,49 +77,49 @@ def ask_window(
     return estimate
 
 
-def _chosen(
+def _select_views(
     method: MethodSpec,
     anchor: Frame,
     others: Frame,
     samples: Samples,
     *,
     seed: int | Tensor,
-    fit: PoseFit | GivenPose | None,
+    fit: PoseFit | PosePrior | None,
     hint: TrackHint,
-) -> Choice:
+) -> ViewSelection:
     """Which of the views are asked, as the method chooses them or by a few of the samples."""
     if method.choose is not None:
         found = method.choose(anchor, others, method.views, fit=fit)
-        return found if isinstance(found, Choice) else Choice(found)
-    thin = samples[:, :: max(1, method.n // PROBES)]
-    probes = _ask_views(method, anchor, others, thin, seed=seed, fit=fit, hint=hint, ms={})
-    return weighed(stack([t["estimate"] for t in probes]), method.views)
+        return found if isinstance(found, ViewSelection) else ViewSelection(found)
+    thin = samples[:, :: max(1, method.n // N_PREVIEW_SAMPLES)]
+    probes = _estimate_views(method, anchor, others, thin, seed=seed, fit=fit, hint=hint, ms={})
+    return rank_views(stack([t["estimate"] for t in probes]), method.views)
 
 
-def _ask_views(
+def _estimate_views(
     method: MethodSpec,
     anchor: Frame,
     others: Frame,
     samples: Samples,
     *,
     seed: int | Tensor,
-    fit: PoseFit | GivenPose | None,
+    fit: PoseFit | PosePrior | None,
     hint: TrackHint,
     ms: dict[str, float],
 ) -> list[Trace]:
     """The anchor's samples in each of the views, as a pair."""
-    clock = Clock({"ms": ms})
+    clock = StageTimer({"ms": ms})
     seen: list[Tracks] = []
     for k, image in enumerate(others.image):
         if method.chain and seen:
-            hint = hint.replace(start=_further(seen[-1], (k + 1) / k))
-        seen.append(clock("track", tracked(method, anchor.image, image, samples.uv, hint)))
+            hint = hint.replace(start=_extrapolate_tracks(seen[-1], (k + 1) / k))
+        seen.append(clock("track", track_in_chunks(method, anchor.image, image, samples.uv, hint)))
     V, B = others.image.shape[:2]
-    answers = under_pose(
+    answers = solve_pose_and_triangulate(
         method,
-        _repeated(samples, V),
-        tree.collate(seen),
-        _repeated(anchor.camera, V),
+        _repeat_views(samples, V),
+        pytree.collate(seen),
+        _repeat_views(anchor.camera, V),
         others.camera.map(lambda x: x.flatten(0, 1)),
         seed=seed if isinstance(seed, int) else seed.repeat(V),
         fit=None if fit is None else fit.map(lambda x: x.flatten(0, 1)),
@@ -133,12 +133,12 @@ def _ask_views(
     ]
 
 
-def _repeated(record: R, V: int) -> R:
+def _repeat_views(record: R, V: int) -> R:
     """The anchor's (B, …), once for every view: (V B, …)."""
     return record.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
 
 
-def _further(tracks: Tracks, pace: float) -> Tensor:
+def _extrapolate_tracks(tracks: Tracks, pace: float) -> Tensor:
     """Where a search may start that has come ``pace`` times as far as the last one."""
     uv_0, uv_1 = tracks.uv_0.detach(), tracks.uv_1.detach()
     return torch.where(tracks.valid[..., None], uv_0 + (uv_1 - uv_0) * pace, uv_0)

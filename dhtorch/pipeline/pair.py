@@ -11,47 +11,47 @@ from torch import Tensor
 from dhtorch.codes import Gate, PoseCode, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check, is_transformed
-from dhtorch.geometry.linalg import product
-from dhtorch.ops import loader as native
+from dhtorch.geometry.linalg import small_matmul
+from dhtorch.ops import loader
 from dhtorch.pipeline.spec import MethodSpec, Trace
-from dhtorch.pytree import in_pieces
+from dhtorch.pytree import chunked_apply
 from dhtorch.records import (
     NO_HINT,
     Camera,
     Estimate,
     Frame,
-    GivenPose,
-    Map,
+    InitialPose,
+    MergedDepth,
     PoseFit,
+    PosePrior,
     Samples,
-    StartPose,
     TrackHint,
     Tracks,
 )
 from dhtorch.stages.pose import map_pose
-from dhtorch.stages.pose_prior import hold, without
+from dhtorch.stages.pose_prior import check_pose_prior, reject_poses
 
 #: Pairs tracked at once: more are no faster, and their pyramids cost memory.
-PAIRS = 8
+TRACK_CHUNK_PAIRS = 8
 
 #: The camera stood still where more than this share of at least so many tracks moved by fewer pixels. What moves in
 #: front of it is not the background, and without near returns nothing else can tell.
-STILL_SHARE, STILL_TRACKS, STILL_PX = 0.7, 16, 0.25
+STATIC_RATIO, MIN_STATIC_TRACKS, STATIC_FLOW_PX = 0.7, 16, 0.25
 
 #: Residual of near returns that a pose may leave from which a search only starts, of a ray with z = 1.
-START_MISS = 0.04
+MAX_START_RESIDUAL = 0.04
 
 #: Near returns that must lie where a search ends, if they have no pose of their own: fewer fit almost anywhere.
-MIN_NEAR = 8
+MIN_NEAR_INLIERS = 8
 
 
-def ask_pair(
+def estimate_pair(
     method: MethodSpec,
     frame_0: Frame,
     frame_1: Frame,
     *,
     seed: int | Tensor = 0,
-    fit: PoseFit | GivenPose | None = None,
+    fit: PoseFit | PosePrior | None = None,
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> Estimate:
@@ -61,31 +61,33 @@ def ask_pair(
     """
     check("extend", image_0=(frame_0.image, "B C H W"), f_0=(frame_0.camera.f, "B 2"), t=(frame_1.camera.f, "B 2"))
     check("extend", image_0=(frame_0.image, "B C H W"), image_1=(frame_1.image, "B c h w"))
-    frame_0, frame_1 = lifted(frame_0), lifted(frame_1)
-    clock = Clock(trace)
+    frame_0, frame_1 = upcast_intrinsics(frame_0), upcast_intrinsics(frame_1)
+    clock = StageTimer(trace)
     like = frame_0.camera.f
     uv = clock("sample", method.sample(frame_0.hw, method.n, device=like.device, dtype=like.dtype))
     samples = clock("backproject", method.backproject(frame_0, uv))
     samples = clock("classify", method.classify(frame_0, samples))
-    tracks = clock("track", tracked(method, frame_0.image, frame_1.image, samples.uv, hint))
+    tracks = clock("track", track_in_chunks(method, frame_0.image, frame_1.image, samples.uv, hint))
     cameras = frame_0.camera, frame_1.camera
-    estimate, usable, fit = under_pose(method, samples, tracks, *cameras, seed=seed, fit=fit, clock=clock)
+    estimate, usable, fit = solve_pose_and_triangulate(
+        method, samples, tracks, *cameras, seed=seed, fit=fit, clock=clock
+    )
     estimate = clock("score", method.score(estimate, samples, usable, fit))
     if trace is not None:
         trace.update(samples=samples, tracks=tracks, tracks_ideal=usable, fit=fit, estimate=estimate)
     return estimate
 
 
-def tracked(method: MethodSpec, image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
+def track_in_chunks(method: MethodSpec, image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
     """Seat 4, so many pairs at a time that memory stays bounded."""
 
     def some(image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
         return method.track(image_0, image_1, uv, hint=hint)
 
-    return in_pieces(some, PAIRS, image_0, image_1, uv, hint)
+    return chunked_apply(some, TRACK_CHUNK_PAIRS, image_0, image_1, uv, hint)
 
 
-def under_pose(
+def solve_pose_and_triangulate(
     method: MethodSpec,
     samples: Samples,
     tracks: Tracks,
@@ -93,8 +95,8 @@ def under_pose(
     camera_1: Camera,
     *,
     seed: int | Tensor,
-    fit: PoseFit | GivenPose | None,
-    clock: Clock,
+    fit: PoseFit | PosePrior | None,
+    clock: StageTimer,
 ) -> tuple[Estimate, Tracks, PoseFit]:
     """Seats 5 and 6: what tracks say under the pose that they give, or under a known one.
 
@@ -108,8 +110,8 @@ def under_pose(
     if not isinstance(fit, PoseFit):
         draws = uniform_draws(seed, camera_0.f.shape[0], method.hypotheses).to(camera_0.f)
         found = method.pose(samples, usable, camera_0, camera_1, draws)
-        fit = found if fit is None else _held(fit, found, samples, usable, camera_0, camera_1)
-        fit = fit.replace(code=torch.where(_still(fit, usable), PoseCode.NO_BASELINE, fit.code).to(fit.code.dtype))
+        fit = found if fit is None else _apply_prior(fit, found, samples, usable, camera_0, camera_1)
+        fit = fit.replace(code=torch.where(_is_static(fit, usable), PoseCode.NO_BASELINE, fit.code).to(fit.code.dtype))
     clock("pose", fit)
     estimate = clock("triangulate", method.triangulate(samples, usable, fit, camera_0, camera_1))
     untextured = (estimate.gate == Gate.NO_TRACK) & tracks.valid & ~textured
@@ -117,32 +119,34 @@ def under_pose(
     return estimate.replace(gate=gate), usable, fit
 
 
-def _still(fit: PoseFit, tracks: Tracks) -> Tensor:
+def _is_static(fit: PoseFit, tracks: Tracks) -> Tensor:
     """Whether (B,) a pose is missing and most of the picture stayed where it was: the camera stood still."""
     with torch.no_grad():
         way = (tracks.uv_1 - tracks.uv_0).square().sum(-1)
-        stayed = (tracks.valid & (way < STILL_PX**2)).sum(-1)
+        stayed = (tracks.valid & (way < STATIC_FLOW_PX**2)).sum(-1)
         seen = tracks.valid.sum(-1)
         lost = (fit.code == PoseCode.TOO_FEW) | (fit.code == PoseCode.DEGENERATE)
-        return lost & (seen >= STILL_TRACKS) & (stayed > STILL_SHARE * seen)
+        return lost & (seen >= MIN_STATIC_TRACKS) & (stayed > STATIC_RATIO * seen)
 
 
-def _held(
-    given: GivenPose, found: PoseFit, samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera
+def _apply_prior(
+    given: PosePrior, found: PoseFit, samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera
 ) -> PoseFit:
     """A pose from elsewhere as the near returns leave it: held against them, or the start of the most probable one."""
-    if not isinstance(given, StartPose):
-        return hold(given, samples, tracks, camera_0, camera_1, found)
-    held = hold(given.replace(cov=None), samples, tracks, camera_0, camera_1, found, max_miss=START_MISS)
+    if not isinstance(given, InitialPose):
+        return check_pose_prior(given, samples, tracks, camera_0, camera_1, found)
+    held = check_pose_prior(
+        given.replace(cov=None), samples, tracks, camera_0, camera_1, found, max_miss=MAX_START_RESIDUAL
+    )
     unused = samples.uv.new_zeros(len(samples.uv), 1, 3)
     refined = map_pose(samples, tracks, camera_0, camera_1, unused, start=lambda *_: held).replace(looks=held.looks)
     # From far off a search may end where near returns do not: they are asked again, now as of any pose.
-    end = GivenPose(refined.T_1_from_0)
-    ended = hold(end, samples, tracks, camera_0, camera_1, found, min_confirmed=MIN_NEAR)
-    return without(refined, ended)
+    end = PosePrior(refined.T_1_from_0)
+    ended = check_pose_prior(end, samples, tracks, camera_0, camera_1, found, min_confirmed=MIN_NEAR_INLIERS)
+    return reject_poses(refined, ended)
 
 
-def merge(samples: Samples, estimate: Estimate | None) -> Map:
+def merge(samples: Samples, estimate: Estimate | None) -> MergedDepth:
     """The user's map: the sensor where it has a usable return, a recovered depth where it has none, else a hole.
 
     Without an estimate the sensor's returns alone.
@@ -150,15 +154,15 @@ def merge(samples: Samples, estimate: Estimate | None) -> Map:
     Gradient: to both sources.
     """
     told = (samples.depth, samples.sigma, samples.confidence)
-    if estimate is None and native.serves(*told, samples.xyz) and {x.dtype for x in told} == {torch.float32}:
+    if estimate is None and loader.serves(*told, samples.xyz) and {x.dtype for x in told} == {torch.float32}:
         depth, sigma, score = (torch.empty_like(x) for x in told)
         source = torch.empty_like(depth, dtype=torch.int32)
         torch.ops.dhtorch.sensed.default(*told, samples.xyz, depth, sigma, score, source)
-        return Map(samples.uv, depth, sigma, score, source)
+        return MergedDepth(samples.uv, depth, sigma, score, source)
     sensed = samples.usable
     if estimate is None:
         depth, sigma, score = (torch.where(sensed, x, 0.0) for x in told)
-        return Map(samples.uv, depth, sigma, score, sensed.int() * Source.SENSOR)
+        return MergedDepth(samples.uv, depth, sigma, score, sensed.int() * Source.SENSOR)
     recovered = estimate.keep & ~sensed
     zero = torch.zeros_like(samples.depth)
 
@@ -166,7 +170,7 @@ def merge(samples: Samples, estimate: Estimate | None) -> Map:
         return torch.where(sensed, sensor, torch.where(recovered, answer.nan_to_num(), zero))
 
     source = torch.where(sensed, Source.SENSOR, torch.where(recovered, Source.RECOVERED, Source.NONE))
-    return Map(
+    return MergedDepth(
         uv=samples.uv,
         depth=choose(samples.depth, estimate.depth),
         sigma=choose(samples.sigma, estimate.sigma),
@@ -175,7 +179,7 @@ def merge(samples: Samples, estimate: Estimate | None) -> Map:
     )
 
 
-def lifted(frame: Frame) -> Frame:
+def upcast_intrinsics(frame: Frame) -> Frame:
     """The frame with intrinsics of at least single precision: half a pixel is lost on the eleven bits of a half.
 
     Gradient: to the intrinsics.
@@ -205,7 +209,7 @@ def undistort_tracks(tracks: Tracks, camera_0: Camera, camera_1: Camera) -> Trac
     uv_1 = torch.where(fine[..., None], uv_1, tracks.uv_1)
     J = cam.undistort_jacobian(camera_1, torch.where(fine[..., None], uv_1, centre_1))
     known = tracks.cov.isfinite()
-    turned = product(product(J, torch.where(known, tracks.cov, 0)), J.mT)
+    turned = small_matmul(small_matmul(J, torch.where(known, tracks.cov, 0)), J.mT)
     cov = torch.where(known, turned, tracks.cov)
     return tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov, valid=tracks.valid & fine)
 
@@ -242,7 +246,7 @@ def _(seed: Tensor, hypotheses: int) -> Tensor:
     return torch.empty(len(seed), hypotheses, 3, dtype=torch.float64)
 
 
-class Clock:
+class StageTimer:
     """Writes the milliseconds of each stage into a trace; does nothing without one."""
 
     def __init__(self, trace: Trace | None) -> None:

@@ -6,10 +6,10 @@ from functools import partial
 
 from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.pipeline.method import Method
-from dhtorch.pipeline.view_selection import by_probes
-from dhtorch.stages.fuse import agree
+from dhtorch.pipeline.view_selection import select_views_by_preview
+from dhtorch.stages.fuse import fuse_consistent
 from dhtorch.stages.pose import map_pose
-from dhtorch.stages.score import rank_by_error, rank_by_sigma
+from dhtorch.stages.score import confidence_from_error, confidence_from_sigma
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.triangulate import two_view
 
@@ -20,13 +20,13 @@ PAPER = Method()
 extend = PAPER
 
 #: Pyramid levels of ``MAP``: one more than the paper, motions are larger than 30 px.
-LEVELS = 5
+MAP_PYRAMID_LEVELS = 5
 
 #: Pose from near and far tracks together, a sigma in metres for every answer, and silence where that is too large.
 #: Tracks are registered once more with an affine window; the pose starts from the paper's. Its constants were chosen on
 #: ``data=shared_scenes`` and on the built-in rooms: figures on these are not figures on scenes that it has not seen.
 MAP = PAPER.replace(
-    track=partial(lucas_kanade_affine, levels=LEVELS),
+    track=partial(lucas_kanade_affine, levels=MAP_PYRAMID_LEVELS),
     pose=map_pose,
     triangulate=partial(
         two_view,
@@ -40,7 +40,7 @@ MAP = PAPER.replace(
         round_trip_px=0.4,
         sensor_share=1.0,
     ),
-    score=rank_by_error,
+    score=confidence_from_error,
 )
 
 #: ``MAP`` for several views of one anchor: each view a pair, their inverse depths fused where they agree.
@@ -50,11 +50,13 @@ WINDOW = MAP.replace(views=5)
 #: exposures; an answer needs views that agree or one that is sure by itself, and near returns that what lies far does
 #: not contradict. A view may be unsure: what counts is how sure they are together.
 AUTO = MAP.replace(
-    track=partial(lucas_kanade_affine, levels=LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="bias")),
+    track=partial(
+        lucas_kanade_affine, levels=MAP_PYRAMID_LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="bias")
+    ),
     triangulate={"max_sigma_rel": 1.0, "max_far_noise": 0.0025, "max_in_reach": 0.18},
-    fuse=partial(agree, max_still=0.7),
-    score=rank_by_sigma,
-    choose=by_probes,
+    fuse=partial(fuse_consistent, max_still=0.7),
+    score=confidence_from_sigma,
+    choose=select_views_by_preview,
     views=5,
     chain=False,
 )
@@ -62,7 +64,7 @@ AUTO = MAP.replace(
 METHODS = {"paper": PAPER, "map": MAP, "window": WINDOW, "auto": AUTO}
 
 
-def chosen(method: str | Method, n: int | None = None) -> Method:
+def get_method(method: str | Method, n: int | None = None) -> Method:
     """A method by its name or as it is, with ``n`` samples where that is said.
 
     Raises:

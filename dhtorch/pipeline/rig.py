@@ -10,15 +10,15 @@ from typing import Any
 
 from torch import Tensor
 
-from dhtorch.geometry.pose_averaging import RigidMean, rigid_mean
+from dhtorch.geometry.pose_averaging import AveragePose, average_poses
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import MAP
 from dhtorch.pipeline.spec import Trace
-from dhtorch.records import NO_HINT, Frame, GivenPose, Pose, TrackHint
-from dhtorch.stages.pose_prior import stated
+from dhtorch.records import NO_HINT, Frame, Pose, PosePrior, TrackHint
+from dhtorch.stages.pose_prior import make_prior
 
 
-def rig_pose(
+def estimate_rig_pose(
     anchors: Frame,  # (B,), one camera at B instants
     others: Frame,  # (B,), the other one at the same instants
     *,
@@ -28,7 +28,7 @@ def rig_pose(
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
     **options: Any,
-) -> RigidMean:
+) -> AveragePose:
     """The pose of the other camera relative to the anchors', ``T`` (1) with its covariance, from B instants.
 
     Instants that look at one place share most of their errors: those of the sensor there, of tracks on its edges. So
@@ -39,7 +39,7 @@ def rig_pose(
         method: whose seats 1 to 5 are asked. Where the cameras see the scene very differently a learned tracker helps.
         seed, hint, trace: as :class:`Method` takes them.
         places: that the instants look at, in about equal shares.
-        options: of :func:`dhtorch.geometry.pose_averaging.rigid_mean`.
+        options: of :func:`dhtorch.geometry.pose_averaging.average_poses`.
 
     Returns:
         The mean of B = 1 rig over V instants. Not ``ok`` where the instants contradict each other: the rig is not
@@ -56,20 +56,20 @@ def rig_pose(
     method(anchors, others, seed=seed, hint=hint, trace=trace)
     fit = trace["fit"]
     T = fit.T_1_from_0.map(lambda x: x[None])
-    mean = rigid_mean(T, fit.cov[None], fit.ok[None], **options)
+    mean = average_poses(T, fit.cov[None], fit.ok[None], **options)
     shared = (mean.agree.sum(-1) / places).clamp_min(1)
     return mean._replace(cov=mean.cov * shared[:, None, None].to(mean.cov))
 
 
 @dataclass(frozen=True, eq=False)
-class Rigid:
+class ConstantPose:
     """What stands in a method's ``given`` where all pairs are of the same two cameras of a rig: ``given=Rigid(…)``."""
 
     T_1_from_0: Pose  # (1)
     cov: Tensor | None = None  # (1, 6, 6); None = not stated
 
-    def __call__(self, anchor: Frame, others: Frame) -> GivenPose:
+    def __call__(self, anchor: Frame, others: Frame) -> PosePrior:
         """The pose for B anchors, and for V × B other views."""
         lead = others.camera.f.shape[:-1]
-        made = stated(self.T_1_from_0, cov=self.cov).to(anchor.camera.f.dtype)
+        made = make_prior(self.T_1_from_0, cov=self.cov).to(anchor.camera.f.dtype)
         return made.map(lambda x: x[0].to(anchor.camera.f.device).expand(*lead, *x.shape[1:]))

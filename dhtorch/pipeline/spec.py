@@ -19,13 +19,13 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from dhtorch.records import Choice, Estimate, Frame, GivenPose, PoseFit, Samples, Tracks
+from dhtorch.records import Estimate, Frame, PoseFit, PosePrior, Samples, Tracks, ViewSelection
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.holes import classify
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.sample import spiral
-from dhtorch.stages.score import rank
+from dhtorch.stages.score import confidence
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
 
@@ -51,10 +51,10 @@ class MethodSpec:
     track: Callable[..., Tracks] = lucas_kanade  # (image_0, image_1, uv_0, *, hint)
     pose: Callable[..., PoseFit] = pnp_ransac  # (samples, tracks, camera_0, camera_1, draws)
     triangulate: Callable[..., Estimate] = two_view  # (samples, tracks, fit, camera_0, camera_1)
-    score: Callable[..., Estimate] = rank  # (estimate, samples, tracks, fit)
+    score: Callable[..., Estimate] = confidence  # (estimate, samples, tracks, fit)
     fuse: Callable[..., Estimate] = inverse_variance  # (estimates (V, B, N)); asked where there are several views
-    choose: Callable[..., Tensor | Choice] | None = None  # (anchor, others, views, *, fit) -> (views, B) indices
-    given: Callable[..., GivenPose] | None = None  # (anchor, others) -> motions from elsewhere, or None
+    choose: Callable[..., Tensor | ViewSelection] | None = None  # (anchor, others, views, *, fit) -> (views, B) indices
+    given: Callable[..., PosePrior] | None = None  # (anchor, others) -> motions from elsewhere, or None
 
     n: int = 2048  # samples per anchor
     hypotheses: int = 200  # minimal samples drawn by the pose search
@@ -86,13 +86,13 @@ class MethodSpec:
         return self.classify(frame, self.backproject(frame, uv))
 
 
-def parts(*seats: Any) -> Iterator[Any]:
+def iter_components(*seats: Any) -> Iterator[Any]:
     """What sits in seats: callables, and what partials of the standard library hold, options that are none included."""
     for seat in seats:
         if isinstance(seat, MethodSpec):
-            yield from parts(*(getattr(seat, f.name) for f in fields(seat)))
+            yield from iter_components(*(getattr(seat, f.name) for f in fields(seat)))
         elif isinstance(seat, partial):
-            yield from parts(seat.func, *seat.args, *seat.keywords.values())
+            yield from iter_components(seat.func, *seat.args, *seat.keywords.values())
         else:
             yield seat
 
@@ -106,6 +106,6 @@ def options(seat: Any, function: Callable[..., Any]) -> dict[str, Any] | None:
     return {**{p.name: p.default for p in known if p.kind is p.KEYWORD_ONLY}, **own}
 
 
-def networks(*seats: Any) -> Iterator[torch.nn.Module]:
+def iter_networks(*seats: Any) -> Iterator[torch.nn.Module]:
     """The networks in seats: modules, and what partials of the standard library hold of them."""
-    return (part for part in parts(*seats) if isinstance(part, torch.nn.Module))
+    return (part for part in iter_components(*seats) if isinstance(part, torch.nn.Module))

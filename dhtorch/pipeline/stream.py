@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils import _pytree as pytree
 
 from dhtorch.codes import Gate
-from dhtorch.data.pairs import LADDER
+from dhtorch.data.pairs import CANDIDATE_STEPS
 from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import AUTO
@@ -24,10 +24,10 @@ from dhtorch.records import NO_HINT, Estimate, Frame, TrackHint
 #: Mean support of the coarse motion below which two frames in a row show different things. Real frames in a row reach
 #: 0.65 and more, pictures of different rooms 0.07 to 0.33 (``data=shared_scenes``); built-in rooms of different seeds,
 #: which share their layout, 0.37 to 0.43: no cut is seen between those.
-CUT = 0.3
+MIN_CUT_SUPPORT = 0.3
 
 #: Standard deviation of grey values below which a picture is too flat to tell a cut by.
-FLAT = 0.02
+FLAT_IMAGE_SIGMA = 0.02
 
 
 class Stream:
@@ -49,7 +49,7 @@ class Stream:
         self,
         method: Method = AUTO,
         *,
-        steps: Sequence[int] = LADDER,
+        steps: Sequence[int] = CANDIDATE_STEPS,
         seed: int = 0,
         hint: TrackHint = NO_HINT,
     ) -> None:
@@ -73,8 +73,8 @@ class Stream:
         """Depth along the samples of ``frame`` (B = 1), by the parallax to past frames.
 
         The first frame, and the first after a cut, has no other view and is silent (gate NO_BASELINE). A cut is a
-        picture in which hardly a part of the one before is found again (:func:`is_cut`); the past is then forgotten and
-        the frame's number noted in :attr:`cuts`.
+        picture in which hardly a part of the one before is found again (:func:`is_scene_cut`); the past is then
+        forgotten and the frame's number noted in :attr:`cuts`.
 
         Args:
             frame: one view, on the device of those before it.
@@ -90,7 +90,7 @@ class Stream:
             raise ValueError(f"stream: found {frame.image.shape[0]} views in one frame, expected 1")
         with torch.no_grad():
             frame = frame.detach()
-            if self.past and is_cut(self.past[-1], frame):
+            if self.past and is_scene_cut(self.past[-1], frame):
                 self.cuts.append(self.pushed)
                 self.reset()
             steps = [s for s in self.steps if s <= len(self.past)]
@@ -108,11 +108,11 @@ class Stream:
         return estimate
 
 
-def is_cut(before: Frame, after: Frame) -> bool:
+def is_scene_cut(before: Frame, after: Frame) -> bool:
     """Whether hardly a part of one picture is found again in the next; flat pictures tell nothing and are no cut."""
-    if min(float(_contrast(frame.image)) for frame in (before, after)) < FLAT:
+    if min(float(_contrast(frame.image)) for frame in (before, after)) < FLAT_IMAGE_SIGMA:
         return False
-    return float(coarse_flow(before.image, after.image).support.mean()) < CUT
+    return float(coarse_flow(before.image, after.image).support.mean()) < MIN_CUT_SUPPORT
 
 
 def _contrast(image: Tensor) -> Tensor:

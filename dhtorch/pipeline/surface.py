@@ -13,58 +13,58 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.geometry import plane_sweep as sweep
+from dhtorch.geometry import plane_sweep
 from dhtorch.geometry import windows as neighbours
-from dhtorch.geometry.checks import perhaps_any
-from dhtorch.ops import loader as native
+from dhtorch.geometry.checks import any_possible
+from dhtorch.ops import loader
 from dhtorch.records import PoseFit
 
 #: A pixel's own noise of grey values (a step of eight bits is 0.004), and how many of a window's pixels err by
 #: themselves: noise is shared through the lens, the resampling and the texture.
-GREY_NOISE, INDEPENDENT = 0.002, 5.0
+GREY_NOISE, INDEPENDENT_WINDOW_PIXELS = 0.002, 5.0
 
 #: Cost of a surface (of one view, as sweep.aggregate counts) at which grey values tell as much as they seem to: where
 #: signs fit less well, windows show something else as well, and where they fit better, less noise.
-MISFIT = 40.0
+NOMINAL_COST = 40.0
 
 #: Cost (of one view) by which the best place along the line must beat every other that is further away in the pictures
 #: than so many pixels. What surrounds a pixel weighs by the price of jumps (18 from each side): a rival within more
 #: than one may be the better one, as where a texture repeats.
-RIVAL, ELSEWHERE_PX = 5, 3.0
+MIN_SECOND_BEST_MARGIN, SECOND_BEST_RADIUS_PX = 5, 3.0
 
 #: Every such pixel tells how far one moves in the pictures from plane to plane, of all rows and columns alike.
-SOME = 17
+MOTION_STRIDE_PX = 17
 
 #: A pixel whose window of so many pixels to each side holds a step of the surface may belong to the other side of it:
 #: standard deviation as a share of the step.
-WINDOW, EDGE = 4, 0.17
+EDGE_RADIUS_PX, EDGE_SIGMA_RATIO = 4, 0.17
 
 #: Correlation of its windows from which on a view has a say in a pixel's depth.
-SAY = 0.5
+MIN_WINDOW_CORRELATION = 0.5
 
 #: Below any weight that a view can have.
-NO_WEIGHT = 1e-37
+MIN_WEIGHT = 1e-37
 
 #: Planes that a fit may move a pixel in one step and in all, and by which one surface must be nearer to hide another.
-STEP, ALL_STEPS, NEARER = 1.0, 1.5, 1.5
+MAX_STEP_PLANES, MAX_TOTAL_PLANES, OCCLUSION_PLANES = 1.0, 1.5, 1.5
 
 #: Planes by which the derivative of a step is found, and the least that it is believed to be.
-LITTLE, SLOPE = 0.1, 0.25
+DERIVATIVE_PLANES, MIN_STEP_DERIVATIVE = 0.1, 0.25
 
 #: Planes by which neighbours differ at most that lie on one surface.
-SURFACE = 1.5
+SURFACE_PLANES = 1.5
 
 
-class Partner(NamedTuple):
+class SourceView(NamedTuple):
     """A view that is swept, and how well its motion is known."""
 
-    view: sweep.View
+    view: plane_sweep.SweptView
     picture: Tensor  # (B, 3, H, W) the view's, with its gradients
     fit: PoseFit
     use: Tensor  # (B,) bool
 
 
-class Fitted(NamedTuple):
+class RefinedSurface(NamedTuple):
     """What the views together say of every pixel, (B, h, w) each."""
 
     q: Tensor  # 1/m
@@ -74,7 +74,7 @@ class Fitted(NamedTuple):
     seen: Tensor  # bool, by one view at least, and not hidden there
 
 
-class Found(NamedTuple):
+class SweptSurface(NamedTuple):
     """The best surface through the planes, (B, h, w) each."""
 
     q: Tensor  # 1/m, between the planes by a parabola
@@ -83,40 +83,43 @@ class Found(NamedTuple):
 
 
 @torch.no_grad()
-def best_planes(base: sweep.Base, partners: list[Partner], q: Tensor) -> Found:
+def sweep_planes(base: plane_sweep.ReferenceView, partners: list[SourceView], q: Tensor) -> SweptSurface:
     """The best surface through the planes q (B, D) 1/m, rising from 0. Gradient: none."""
     views = torch.stack([partner.use for partner in partners]).sum(0).clamp_min(1)
-    best, some = sweep.surface(_costs(base, partners, q), views)
+    best, some = plane_sweep.aggregate_best_plane(_costs(base, partners, q), views)
     step = q[:, 1] - q[:, 0]
     place = (best.plane + best.shift) * step[:, None, None]
     each = views[:, None, None]
-    alone = sweep.rivals(some, best, _elsewhere(base, partners, place, step)) >= RIVAL * each
-    return Found(place, (best.cost - _idle(partners, best.cost)[:, None, None]) / each.to(q), alone)
+    alone = (
+        plane_sweep.second_best_margin(some, best, _second_best_reach(base, partners, place, step))
+        >= MIN_SECOND_BEST_MARGIN * each
+    )
+    return SweptSurface(place, (best.cost - _idle_cost(partners, best.cost)[:, None, None]) / each.to(q), alone)
 
 
-def _idle(partners: list[Partner], like: Tensor) -> Tensor:
+def _idle_cost(partners: list[SourceView], like: Tensor) -> Tensor:
     """What a surface costs (B,) by views that are read for others of the batch alone: the same at all its planes."""
-    unused = [~partner.use for partner in partners if perhaps_any(partner.use)]
+    unused = [~partner.use for partner in partners if any_possible(partner.use)]
     if not unused:
         return torch.zeros_like(partners[0].use, dtype=like.dtype)
-    return sweep.PATHS * sweep.UNSEEN * torch.stack(unused).sum(0).to(like.dtype)
+    return plane_sweep.N_PATHS * plane_sweep.UNSEEN_COST * torch.stack(unused).sum(0).to(like.dtype)
 
 
-def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
+def _costs(base: plane_sweep.ReferenceView, partners: list[SourceView], q: Tensor) -> Tensor:
     """How badly every pixel fits all views at every plane, (B, h, w, D) uint8."""
     shape, planes = base.hw, q.shape[1]
-    if native.serves(q):  # compiled code goes from pixel to pixel, torch from plane to plane
+    if loader.serves(q):  # compiled code goes from pixel to pixel, torch from plane to plane
         C = torch.empty(len(q), *shape, planes, dtype=torch.uint8).movedim(-1, 1)
     else:
         C = torch.empty(len(q), planes, *shape, dtype=torch.uint8, device=q.device)
     fresh = True
     for view, _, _, use in partners:
-        if perhaps_any(use):
-            sweep.add_costs(C, base, view, q, use, fresh=fresh)
+        if any_possible(use):
+            plane_sweep.add_census_costs(C, base, view, q, use, fresh=fresh)
             fresh = False
     if fresh:
         C.zero_()
-    if native.serves(q):
+    if loader.serves(q):
         return C.movedim(1, -1)
     last = C.new_empty(len(q), *shape, planes)
     for pixels_last, planes_last in zip(C.flatten(2), last.flatten(1, 2), strict=True):
@@ -124,77 +127,85 @@ def _costs(base: sweep.Base, partners: list[Partner], q: Tensor) -> Tensor:
     return last
 
 
-def _elsewhere(base: sweep.Base, partners: list[Partner], q: Tensor, step: Tensor) -> Tensor:
+def _second_best_reach(base: plane_sweep.ReferenceView, partners: list[SourceView], q: Tensor, step: Tensor) -> Tensor:
     """Planes (B,) beyond which a pixel has moved by more than a few in the view that moves most."""
     moved = []
-    some = q.flatten(1)[:, ::SOME]  # whose median is that of all
+    some = q.flatten(1)[:, ::MOTION_STRIDE_PX]  # whose median is that of all
     for view, _, _, use in partners:
-        go = sweep.travel(base, view)
-        go = go._replace(a=go.a[..., ::SOME])
+        go = plane_sweep.epipolar_warp(base, view)
+        go = go._replace(a=go.a[..., ::MOTION_STRIDE_PX])
         (u_0, v_0), (u_1, v_1) = (go.at(some + k * step[:, None]) for k in (0, 1))
         length = torch.hypot(u_1 - u_0, v_1 - v_0).median(-1).values
         moved.append(torch.where(use, length, 0.0))
-    return (ELSEWHERE_PX / torch.stack(moved).amax(0).clamp_min(1e-3)).ceil().clamp(2, 1e4)
+    return (SECOND_BEST_RADIUS_PX / torch.stack(moved).amax(0).clamp_min(1e-3)).ceil().clamp(2, 1e4)
 
 
-def fitted(base: sweep.Base, partners: list[Partner], start: Found, q: Tensor, steps: int) -> Fitted:
+def refine_surface(
+    base: plane_sweep.ReferenceView, partners: list[SourceView], start: SweptSurface, q: Tensor, steps: int
+) -> RefinedSurface:
     """The surface through ``start``, fitted in so many ``steps`` by grey values to all views that are of use.
 
     Gradient: of ``q`` to pictures, cameras and motions, by the implicit function theorem where the last step ends.
     """
     plane = q[:, 1] - q[:, 0]
-    near = ALL_STEPS * plane[:, None, None]
+    near = MAX_TOTAL_PLANES * plane[:, None, None]
     with torch.no_grad():
-        goes = [sweep.travel(base, partner.view) for partner in partners]
-        at = neighbours.smooth(start.q, SURFACE * plane)
+        goes = [plane_sweep.epipolar_warp(base, partner.view) for partner in partners]
+        at = neighbours.smooth_within_tolerance(start.q, SURFACE_PLANES * plane)
         for _ in range(steps):
             moved = at + _joined(base, partners, goes, at, plane)[0]
             at = torch.minimum(torch.maximum(moved, start.q - near), start.q + near).clamp_min(0)
-            at = neighbours.smooth(at, SURFACE * plane)
+            at = neighbours.smooth_within_tolerance(at, SURFACE_PLANES * plane)
     step, found = _joined(base, partners, goes, at, plane, last=True)
     if step.requires_grad:
         step = step / _slope(base, partners, goes, at, plane)
-    edge = EDGE * neighbours.spread(at, WINDOW)
-    own = found.own * (start.misfit / MISFIT).square() + edge.square()
+    edge = EDGE_SIGMA_RATIO * neighbours.window_range(at, EDGE_RADIUS_PX)
+    own = found.own * (start.misfit / NOMINAL_COST).square() + edge.square()
     return found._replace(q=at + (step - step.detach()), own=own)
 
 
 @torch.no_grad()
-def _slope(base: sweep.Base, partners: list[Partner], goes: list[sweep.Travel], at: Tensor, plane: Tensor) -> Tensor:
+def _slope(
+    base: plane_sweep.ReferenceView,
+    partners: list[SourceView],
+    goes: list[plane_sweep.EpipolarWarp],
+    at: Tensor,
+    plane: Tensor,
+) -> Tensor:
     """How much smaller a step gets (B, h, w) as a surface comes nearer to where it fits best: 1 where grey values are
     straight between pixels. By it the gradient of the step becomes that of the place where it ends."""
-    little = LITTLE * plane[:, None, None]
+    little = DERIVATIVE_PLANES * plane[:, None, None]
     before, after = (_joined(base, partners, goes, at + sign * little, plane)[0] for sign in (-1, 1))
-    return ((before - after) / (2 * little)).clamp_min(SLOPE)
+    return ((before - after) / (2 * little)).clamp_min(MIN_STEP_DERIVATIVE)
 
 
 def _joined(
-    base: sweep.Base,
-    partners: list[Partner],
-    goes: list[sweep.Travel],
+    base: plane_sweep.ReferenceView,
+    partners: list[SourceView],
+    goes: list[plane_sweep.EpipolarWarp],
     at: Tensor,
     plane: Tensor,
     *,
     last: bool = False,
-) -> tuple[Tensor, Fitted]:
+) -> tuple[Tensor, RefinedSurface]:
     """The step (B, h, w) that the views together ask for at inverse depths ``at``, each by its own variance, and how
     well they fit there; what the motions add to that (``shared``) where it is the last. The gradient is the step's."""
     none = torch.zeros_like(at)
-    said = _Said(none, none.clone(), none.clone(), best=torch.full_like(at, -1), seen=torch.zeros_like(at).bool())
+    said = _ViewSums(none, none.clone(), none.clone(), best=torch.full_like(at, -1), seen=torch.zeros_like(at).bool())
     for (view, picture, fit, use), go in zip(partners, goes, strict=True):
-        one = sweep.fit_windows(base, view, picture, at)
+        one = plane_sweep.fit_windows(base, view, picture, at)
         with torch.no_grad():
-            here = one.seen & use[:, None, None] & ~sweep.hidden(go, at, NEARER * plane)
+            here = one.seen & use[:, None, None] & ~plane_sweep.occlusion_mask(go, at, OCCLUSION_PLANES * plane)
             moved = pose_variance(base, view, fit, at, one.motion) if last else None
-        said = _also(said, one, here, STEP * plane, moved)
-    step = said.step / said.weight.clamp_min(NO_WEIGHT)
+        said = _add_view(said, one, here, MAX_STEP_PLANES * plane, moved)
+    step = said.step / said.weight.clamp_min(MIN_WEIGHT)
     own, shared = 1 / said.weight, said.shared
     if last:
         shared = torch.where(said.weight > 0, shared / said.weight, torch.inf)
-    return step, Fitted(at, own, shared, said.best, said.seen)
+    return step, RefinedSurface(at, own, shared, said.best, said.seen)
 
 
-class _Said(NamedTuple):
+class _ViewSums(NamedTuple):
     """What some views said of every pixel, (B, h, w) each: sums of steps and of the motions' variances, by weight."""
 
     step: Tensor
@@ -204,25 +215,36 @@ class _Said(NamedTuple):
     seen: Tensor  # bool
 
 
-def _also(said: _Said, one: sweep.Fit, here: Tensor, most: Tensor, moved: Tensor | None) -> _Said:
+def _add_view(
+    said: _ViewSums, one: plane_sweep.WindowFit, here: Tensor, most: Tensor, moved: Tensor | None
+) -> _ViewSums:
     """What they said with one view more, where it sees pixels ``here`` (B, h, w): a step of at ``most`` (B,) 1/m, and
     the variance by its motion if that is asked for."""
     given = one.step, one.contrast, one.noise, one.correlation, here, most
-    if native.serves(*given, *said) and all(x.dtype == torch.float32 for x in (one.step, said.step, most)):
+    if loader.serves(*given, *said) and all(x.dtype == torch.float32 for x in (one.step, said.step, most)):
         variance = most.new_empty(0) if moved is None else moved
-        torch.ops.dhtorch.weigh(*given, variance, *said, grey=GREY_NOISE**2, independent=INDEPENDENT, say=SAY)
+        torch.ops.dhtorch.weigh(
+            *given,
+            variance,
+            *said,
+            grey=GREY_NOISE**2,
+            independent=INDEPENDENT_WINDOW_PIXELS,
+            say=MIN_WINDOW_CORRELATION,
+        )
         return said
     with torch.no_grad():
-        own = (one.noise + GREY_NOISE**2) / (INDEPENDENT * one.contrast)
-        say = torch.where(here & (one.correlation > SAY), 1 / own, 0.0)
+        own = (one.noise + GREY_NOISE**2) / (INDEPENDENT_WINDOW_PIXELS * one.contrast)
+        say = torch.where(here & (one.correlation > MIN_WINDOW_CORRELATION), 1 / own, 0.0)
         shared = said.shared if moved is None else said.shared + say * moved
         best = torch.where(here, torch.maximum(said.best, one.correlation), said.best)
     limit = most[:, None, None]
     step = said.step + say * torch.minimum(torch.maximum(one.step, -limit), limit)
-    return _Said(step, said.weight + say, shared, best, said.seen | here)
+    return _ViewSums(step, said.weight + say, shared, best, said.seen | here)
 
 
-def pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, motion: Tensor) -> Tensor:
+def pose_variance(
+    base: plane_sweep.ReferenceView, view: plane_sweep.SweptView, fit: PoseFit, q: Tensor, motion: Tensor
+) -> Tensor:
     """Variance (B, h, w) of q (B, h, w) 1/m, in 1/m², by the motion's covariance.
 
     ``motion`` (B, h, w, 2) px·m: d pixel / d q in the view, as :func:`dhtorch.geometry.plane_sweep.fit_windows` gives
@@ -233,12 +255,14 @@ def pose_variance(base: sweep.Base, view: sweep.View, fit: PoseFit, q: Tensor, m
     at, T = q.flatten(1), view.T_1_from_0
     moved = motion.flatten(1, 2).mT.contiguous()
     given = base.ray.mT.contiguous(), at, T.R, T.t, view.camera.f, cov.contiguous(), moved
-    if native.serves(*given) and all(x.dtype == torch.float32 for x in given):
+    if loader.serves(*given) and all(x.dtype == torch.float32 for x in given):
         variance = torch.empty_like(q)
         torch.ops.dhtorch.pose_variance(*given, variance)
         return variance
     flat = at.clamp_min(1e-6)
-    x, y, z = (part / flat + t[:, None] for part, t in zip(sweep.turned(T.R, base.ray), T.t.unbind(-1), strict=True))
+    x, y, z = (
+        part / flat + t[:, None] for part, t in zip(plane_sweep.rotate_rays(T.R, base.ray), T.t.unbind(-1), strict=True)
+    )
     du, dv = motion.flatten(1, 2).unbind(-1)
     share = 1 / (du * du + dv * dv).clamp_min(1e-12)
     # what a shift of the point does along the motion, as epipolar.point_jacobians, one number a tensor

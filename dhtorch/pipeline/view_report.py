@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from dhtorch.pipeline.method import Method
-from dhtorch.pipeline.view_selection import by_probes
+from dhtorch.pipeline.view_selection import select_views_by_preview
 
 _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Picked:
+class ViewReport:
     """The frames of one anchor that were asked, as positions in the recording, and what spoke for them."""
 
     anchor: int
@@ -42,16 +42,16 @@ class Picked:
         return f"{said} ({worth}{mute})"
 
 
-def choosing(method: Method) -> Method:
+def with_view_selection(method: Method) -> Method:
     """The method as it is asked with more frames than it looks at.
 
     One that does not choose for itself (``paper``, ``map``, ``window``) chooses by probes; and as the chosen views lie
     on both sides of the anchor, none says where the search in the next begins.
     """
-    return method if method.choose is not None else method.replace(choose=by_probes, chain=False)
+    return method if method.choose is not None else method.replace(choose=select_views_by_preview, chain=False)
 
 
-def picked(anchor: int, offered: Sequence[int], trace: Mapping[str, Any], b: int = 0) -> Picked:
+def report_selection(anchor: int, offered: Sequence[int], trace: Mapping[str, Any], b: int = 0) -> ViewReport:
     """What became of the frames offered for one anchor; said in the log at level DEBUG.
 
     Args:
@@ -62,10 +62,12 @@ def picked(anchor: int, offered: Sequence[int], trace: Mapping[str, Any], b: int
     """
     choice = trace.get("choice")
     if choice is None:
-        found = Picked(anchor, tuple(offered), len(offered))
+        found = ViewReport(anchor, tuple(offered), len(offered))
     else:
         views = tuple(offered[k] for k in choice.index[:, b].tolist())
         worth = None if choice.worth is None else tuple(choice.worth[:, b].tolist())
-        found = Picked(anchor, views, len(offered), worth, 0 if choice.mute is None else int(choice.mute[:, b].sum()))
+        found = ViewReport(
+            anchor, views, len(offered), worth, 0 if choice.mute is None else int(choice.mute[:, b].sum())
+        )
     _LOG.debug("%s", found)
     return found

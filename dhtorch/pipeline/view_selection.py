@@ -14,21 +14,21 @@ import torch.nn.functional as F
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.coarse_flow import small
-from dhtorch.geometry.determinism import steady
-from dhtorch.pipeline.pair import ask_pair, lifted
+from dhtorch.geometry.coarse_flow import downscale
+from dhtorch.geometry.determinism import pad_elementwise
+from dhtorch.pipeline.pair import estimate_pair, upcast_intrinsics
 from dhtorch.pipeline.spec import MethodSpec
-from dhtorch.records import Choice, Estimate, Frame, GivenPose, PoseFit
+from dhtorch.records import Estimate, Frame, PoseFit, PosePrior, ViewSelection
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
 
 #: Longest side of the pictures on which candidates are asked, px.
-LONG = 240
+PREVIEW_SIDE_PX = 240
 
 #: How a candidate is asked: everything that has a sigma counts, and how much is what the sigma says. Few samples, few
 #: hypotheses and no turn of rows: what is asked is which view is better, not where its points are.
-PROBE = MethodSpec(
+PREVIEW_METHOD = MethodSpec(
     n=128,
     hypotheses=100,
     track=partial(lucas_kanade, levels=4, window=15, normalise="bias"),
@@ -37,15 +37,15 @@ PROBE = MethodSpec(
 )
 
 
-def by_probes(
+def select_views_by_preview(
     anchor: Frame,
     others: Frame,  # (V, B)
     views: int,
     *,
-    fit: PoseFit | GivenPose | None = None,  # (V, B)
-    long: int = LONG,
+    fit: PoseFit | PosePrior | None = None,  # (V, B)
+    long: int = PREVIEW_SIDE_PX,
     good_sigma_rel: float = 0.1,
-) -> Choice:
+) -> ViewSelection:
     """The views to ask of many candidates, and what each is worth.
 
     Args:
@@ -54,33 +54,33 @@ def by_probes(
         views: how many to choose.
         fit: known poses of the candidates; their search is then skipped.
         long: longest side of the small pictures, px; smaller images stay as they are.
-        good_sigma_rel: see :func:`weighed`.
+        good_sigma_rel: see :func:`rank_views`.
 
     Raises:
         ValueError: wrong shapes, or not 1 <= views <= V.
 
     Gradient: none; a choice.
-    Cost: V pairs of :data:`PROBE` on small pictures.
+    Cost: V pairs of :data:`PREVIEW_METHOD` on small pictures.
     """
     check("by_probes", image_0=(anchor.image, "B C H W"), images=(others.image, "V B c h w"))
     with torch.no_grad():
-        anchor, k = shrunk(anchor, long)
+        anchor, k = downscale_frame(anchor, long)
         V, B = others.image.shape[:2]
         flat = others.map(lambda x: x.flatten(0, 1))
         several = anchor.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
         known = None if fit is None else fit.map(lambda x: x.flatten(0, 1))
-        estimate = ask_pair(PROBE, several, shrunk(flat, long)[0], fit=known)
+        estimate = estimate_pair(PREVIEW_METHOD, several, downscale_frame(flat, long)[0], fit=known)
         estimate = estimate.map(lambda x: x.unflatten(0, (V, B)))
-        return weighed(estimate.replace(sigma=estimate.sigma / k), views, good_sigma_rel=good_sigma_rel)
+        return rank_views(estimate.replace(sigma=estimate.sigma / k), views, good_sigma_rel=good_sigma_rel)
 
 
-def shrunk(frame: Frame, long: int) -> tuple[Frame, int]:
+def downscale_frame(frame: Frame, long: int) -> tuple[Frame, int]:
     """The frame with a grey picture whose longer side is at most ``long``, and how many pixels make one of its.
 
     Depth stays as it is. Gradient: to the image and the intrinsics.
     """
-    frame = lifted(frame)
-    picture = small(frame.image, long)
+    frame = upcast_intrinsics(frame)
+    picture = downscale(frame.image, long)
     depth_camera = frame.depth_camera
     if depth_camera is None:
         depth_camera = cam.resize(frame.camera, frame.hw, (frame.depth.shape[-2], frame.depth.shape[-1]))
@@ -88,12 +88,12 @@ def shrunk(frame: Frame, long: int) -> tuple[Frame, int]:
     return frame.replace(image=picture.grey, camera=camera, depth_camera=depth_camera), picture.scale
 
 
-def weighed(
+def rank_views(
     estimates: Estimate,  # (V, B, N), one per view
     views: int,
     *,
     good_sigma_rel: float = 0.1,
-) -> Choice:
+) -> ViewSelection:
     """Which views to keep, by the sigma to expect of the points together, and what each adds to those before it.
 
     A wide view is sure of what it sees, a near one sees more. What a set of views is worth is the sum over the points
@@ -115,10 +115,10 @@ def weighed(
     free = torch.ones_like(worth[:, :, 0], dtype=torch.bool)
     added = torch.zeros_like(worth[:, :, 0])
     for _ in range(views):
-        gain = steady(torch.log1p, known + worth).sum(-1).masked_fill(~free, -torch.inf)
+        gain = pad_elementwise(torch.log1p, known + worth).sum(-1).masked_fill(~free, -torch.inf)
         best = F.one_hot(gain.argmax(0), V).T.bool()
-        added = torch.where(best, gain - steady(torch.log1p, known).sum(-1), added)
+        added = torch.where(best, gain - pad_elementwise(torch.log1p, known).sum(-1), added)
         known = known + torch.where(best[..., None], worth, 0.0).sum(0)
         free = free & ~best
     index = free.flip(0).long().argsort(dim=0, stable=True)[:views]
-    return Choice(index, added.flip(0).gather(0, index), ~said.any(-1))
+    return ViewSelection(index, added.flip(0).gather(0, index), ~said.any(-1))

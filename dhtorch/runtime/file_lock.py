@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
-from dhtorch.runtime.storage import dumps, loads
+from dhtorch.runtime.storage import dump_strict_json, parse_strict_json
 
 fcntl: ModuleType | None
 try:
@@ -23,11 +23,11 @@ except ImportError:  # not on this system: nothing is locked there
     fcntl = None
 
 #: Locks of this process: the system would give it a second one.
-_mine: set[Path] = set()
+_held_locks: set[Path] = set()
 
 
 @contextlib.contextmanager
-def held(file: str | Path, what: str) -> Iterator[None]:
+def acquire_file_lock(file: str | Path, what: str) -> Iterator[None]:
     """Meanwhile this process alone writes what ``file`` stands for. The file is gone afterwards.
 
     Args:
@@ -42,20 +42,23 @@ def held(file: str | Path, what: str) -> Iterator[None]:
         yield
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path in _mine:
+    if path in _held_locks:
         raise BlockingIOError(f"{what}: found this process writing there already, expected one writer")
-    handle = _taken(path, what)
-    _mine.add(path)
+    handle = _open_locked(path, what)
+    _held_locks.add(path)
     try:
-        os.write(handle, dumps({"process": os.getpid(), "host": socket.gethostname(), "since": time.time()}).encode())
+        os.write(
+            handle,
+            dump_strict_json({"process": os.getpid(), "host": socket.gethostname(), "since": time.time()}).encode(),
+        )
         yield
     finally:
-        _mine.discard(path)
+        _held_locks.discard(path)
         path.unlink(missing_ok=True)  # before it is let go, so that nobody's newer file is removed
         os.close(handle)
 
 
-def _taken(path: Path, what: str) -> int:
+def _open_locked(path: Path, what: str) -> int:
     """An open, locked file that still stands at ``path``."""
     assert fcntl is not None
     while True:
@@ -66,7 +69,7 @@ def _taken(path: Path, what: str) -> int:
                 os.truncate(handle, 0)  # what a dead owner said of itself
                 return handle
         except BlockingIOError:
-            owner = _owner(os.pread(handle, 1000, 0))
+            owner = _describe_owner(os.pread(handle, 1000, 0))
             os.close(handle)
             raise BlockingIOError(f"{what}: found {owner} writing there, expected one writer at a time") from None
         except BaseException:
@@ -75,9 +78,9 @@ def _taken(path: Path, what: str) -> int:
         os.close(handle)  # its owner removed it meanwhile
 
 
-def _owner(text: bytes) -> str:
+def _describe_owner(text: bytes) -> str:
     try:
-        said = loads(text.decode())
+        said = parse_strict_json(text.decode())
         age = max(0, round(time.time() - float(said["since"])))
         return f"process {int(said['process'])} on {said['host']} (for {age} s)"
     except (ValueError, KeyError, TypeError):

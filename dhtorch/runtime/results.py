@@ -18,50 +18,63 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from dhtorch.runtime import code_dependencies as closure
-from dhtorch.runtime.storage import dumps, loads, replace_file, strict
+from dhtorch.runtime import code_dependencies
+from dhtorch.runtime.storage import dump_strict_json, parse_strict_json, replace_file, to_strict_json
 
-SCHEMA = 1
+_RESULT_SCHEMA = 1
 
-VERDICTS = ("supported", "refuted", "undecided")
+_VERDICTS = ("supported", "refuted", "undecided")
 
 #: Jobs that ask no question: the main job, and the map of a recording.
-UNASKED = ("pair", "integrate")
+_JOBS_WITHOUT_QUESTION = ("pair", "integrate")
 
 #: Options that do not change what is computed: where files lie, what else is written, on which machine part it runs.
-UNKEYED = frozenset(
+_NON_KEY_OPTIONS = frozenset(
     {"root", "folder", "cache", "output", "figures", "device", "resume", "traceback", "workers", "hydra"}
 )
 
 #: Bytes of a data file's head and tail that enter a digest: enough to tell recordings apart, cheap for large ones.
-EDGE_BYTES = 64 * 1024
+_DIGEST_EDGE_BYTES = 64 * 1024
 
 #: Options that say nothing about a result to its reader.
-_PLACES = ("hydra", "output")
+_LOCAL_OPTIONS = ("hydra", "output")
 
 #: Flags of x86 processors, widest vectors first, and what they are called.
-_VECTORS = {"amx_tile": "AVX-512 and AMX", "avx512f": "AVX-512", "avx2": "AVX2"}
+_VECTOR_FLAGS = {"amx_tile": "AVX-512 and AMX", "avx512f": "AVX-512", "avx2": "AVX2"}
 
 _PACKAGES = ("dhtorch", "torch", "kornia", "numpy", "opencv-python-headless", "hydra-core")
 
 #: Field → type, for the result and for its parts.
-_TEXT = (str, None)
-_NUMBER = (float, None)
-_TOP: dict[str, Any] = {
-    **{"schema": int, "experiment": str, "question": _TEXT, "expectation": _TEXT, "verdict": _TEXT, "why": _TEXT},
+_OPTIONAL_TEXT = (str, None)
+_OPTIONAL_NUMBER = (float, None)
+_RESULT_FIELDS: dict[str, Any] = {
+    **{
+        "schema": int,
+        "experiment": str,
+        "question": _OPTIONAL_TEXT,
+        "expectation": _OPTIONAL_TEXT,
+        "verdict": _OPTIONAL_TEXT,
+        "why": _OPTIONAL_TEXT,
+    },
     **{"key": str, "meta": dict, "config": dict, "data": dict, "summary": dict, "rows": list},
 }
-_META: dict[str, Any] = {"utc": str, "git": _TEXT, "versions": dict}
-_META |= {"device": str, "dtype": str, "threads": int, "seed": int}
+_META_FIELDS: dict[str, Any] = {"utc": str, "git": _OPTIONAL_TEXT, "versions": dict}
+_META_FIELDS |= {"device": str, "dtype": str, "threads": int, "seed": int}
 #: What results did not hold from the start.
-_TOP_LATER: dict[str, Any] = {"seal": str}
-_META_LATER: dict[str, Any] = {"processor": str}
-_DATA: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
-_SUMMARY: dict[str, Any] = {"value": _NUMBER, "low": _NUMBER, "high": _NUMBER, "n": int, "unit": str}
-_ROW: dict[str, Any] = {"scene": str, "pair": (list, None), "method": str}
+_ADDED_RESULT_FIELDS: dict[str, Any] = {"seal": str}
+_ADDED_META_FIELDS: dict[str, Any] = {"processor": str}
+_DATA_FIELDS: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
+_SUMMARY_FIELDS: dict[str, Any] = {
+    "value": _OPTIONAL_NUMBER,
+    "low": _OPTIONAL_NUMBER,
+    "high": _OPTIONAL_NUMBER,
+    "n": int,
+    "unit": str,
+}
+_ROW_FIELDS: dict[str, Any] = {"scene": str, "pair": (list, None), "method": str}
 
 
-def build(
+def build_result(
     *,
     experiment: str,
     key: str,
@@ -79,9 +92,9 @@ def build(
 
     Args:
         experiment: its name; ``pair`` for the main job, which asks no question.
-        key: from :func:`result_key`.
-        meta: from :func:`meta`.
-        config: resolved settings; file names are shortened as by :func:`portable`.
+        key: from :func:`compute_result_key`.
+        meta: from :func:`collect_run_metadata`.
+        config: resolved settings; file names are shortened as by :func:`make_portable`.
         data: ``{name, scenes, n_pairs, digest}``.
         summary: metric → ``{value, low, high, n, unit}``.
         rows: one per pair and, with pair null, one per scene.
@@ -91,69 +104,77 @@ def build(
         ValueError: a field is missing, unknown or of the wrong kind; the message names it.
     """
     fields = {"question": question, "expectation": expectation, "verdict": verdict, "why": why, "key": key}
-    parts = {"meta": meta, "config": portable(config), "data": data, "summary": summary, "rows": rows}
-    result = strict({"schema": SCHEMA, "experiment": experiment, **fields, **parts})
-    validate(result)
+    parts = {"meta": meta, "config": make_portable(config), "data": data, "summary": summary, "rows": rows}
+    result = to_strict_json({"schema": _RESULT_SCHEMA, "experiment": experiment, **fields, **parts})
+    validate_result(result)
     return dict(result)
 
 
-def seal(result: Mapping[str, Any]) -> str:
+def compute_seal(result: Mapping[str, Any]) -> str:
     """SHA-256 over all of a result but itself, so that a change by hand shows."""
     content = {name: value for name, value in result.items() if name != "seal"}
-    return hashlib.sha256(dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return hashlib.sha256(dump_strict_json(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def validate(result: Any, where: str = "result") -> None:
+def validate_result(result: Any, where: str = "result") -> None:
     """Check a result against schema 1.
 
     Raises:
         ValueError: names the first field that is missing, unknown, of the wrong kind or out of range.
     """
-    _fields(result, _TOP | {k: v for k, v in _TOP_LATER.items() if isinstance(result, dict) and k in result}, where)
-    _expect(result["schema"] == SCHEMA, f"{where}.schema", result["schema"], str(SCHEMA))
-    _verdict(result, where)
+    _check_fields(
+        result,
+        _RESULT_FIELDS | {k: v for k, v in _ADDED_RESULT_FIELDS.items() if isinstance(result, dict) and k in result},
+        where,
+    )
+    _expect(result["schema"] == _RESULT_SCHEMA, f"{where}.schema", result["schema"], str(_RESULT_SCHEMA))
+    _check_verdict(result, where)
     key = result["key"]
     _expect(len(key) == 64 and set(key) <= set("0123456789abcdef"), f"{where}.key", key, "64 hexadecimal digits")
-    later = {k: v for k, v in _META_LATER.items() if isinstance(result["meta"], dict) and k in result["meta"]}
-    _fields(result["meta"], _META | later, f"{where}.meta")
-    _fields(result["data"], _DATA, f"{where}.data")
+    later = {k: v for k, v in _ADDED_META_FIELDS.items() if isinstance(result["meta"], dict) and k in result["meta"]}
+    _check_fields(result["meta"], _META_FIELDS | later, f"{where}.meta")
+    _check_fields(result["data"], _DATA_FIELDS, f"{where}.data")
     for name, entry in result["summary"].items():
-        _fields(entry, _SUMMARY, f"{where}.summary.{name}")
+        _check_fields(entry, _SUMMARY_FIELDS, f"{where}.summary.{name}")
     for k, row in enumerate(result["rows"]):
-        _fields(row, _ROW, f"{where}.rows.{k}", more=True)
+        _check_fields(row, _ROW_FIELDS, f"{where}.rows.{k}", more=True)
         pair = row["pair"]
-        pairs = pair is None or (len(pair) == 2 and all(_is(v, int) for v in pair))
+        pairs = pair is None or (len(pair) == 2 and all(_is_of_kind(v, int) for v in pair))
         _expect(pairs, f"{where}.rows.{k}.pair", pair, "[i, j] or null")
-    _finite(result, where)
+    _check_finite(result, where)
 
 
-def write(path: str | Path, result: Mapping[str, Any]) -> Path:
+def write_result(path: str | Path, result: Mapping[str, Any]) -> Path:
     """Write a result so that, whatever happens, ``path`` holds either the old file or the whole new one.
 
     Raises:
         ValueError: the result is not valid; nothing is written.
     """
-    result = {**result, "seal": seal(result)}
-    validate(result, str(path))
-    return replace_file(path, _text(result).encode("utf-8"))
+    result = {**result, "seal": compute_seal(result)}
+    validate_result(result, str(path))
+    return replace_file(path, _format_result(result).encode("utf-8"))
 
 
-def _text(result: Mapping[str, Any]) -> str:
+def _format_result(result: Mapping[str, Any]) -> str:
     """JSON in which every summary entry and every row is a line: small, and two versions can be compared."""
 
     lines = []
     for name, value in result.items():
         if name == "rows":
-            body = "[\n" + ",\n".join(f"  {dumps(row)}" for row in value) + "\n ]" if value else "[]"
+            body = "[\n" + ",\n".join(f"  {dump_strict_json(row)}" for row in value) + "\n ]" if value else "[]"
         elif isinstance(value, Mapping) and name != "config":
-            body = "{\n" + ",\n".join(f"  {dumps(k)}: {dumps(v)}" for k, v in value.items()) + "\n }" if value else "{}"
+            body = (
+                "{\n" + ",\n".join(f"  {dump_strict_json(k)}: {dump_strict_json(v)}" for k, v in value.items()) + "\n }"
+                if value
+                else "{}"
+            )
         else:
-            body = dumps(value)
-        lines.append(f" {dumps(name)}: {body}")
+            body = dump_strict_json(value)
+        lines.append(f" {dump_strict_json(name)}: {body}")
     return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
-def read(path: str | Path) -> dict[str, Any]:
+def read_result(path: str | Path) -> dict[str, Any]:
     """Read and check a result; a folder stands for the ``result.json`` in it.
 
     Raises:
@@ -165,45 +186,47 @@ def read(path: str | Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: found no file, expected a result.json or a folder with one")
     try:
-        result = loads(path.read_text(encoding="utf-8"))
+        result = parse_strict_json(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: found no strict JSON ({error}), expected a result") from error
-    validate(result, str(path))
+    validate_result(result, str(path))
     return result
 
 
-def finished(path: str | Path, key: str) -> bool:
+def is_finished(path: str | Path, key: str) -> bool:
     """Whether ``path`` holds a valid result of this key as it was written, so that the job need not run again."""
     try:
-        result = read(path)
-        return bool(result["key"] == key and result.get("seal") == seal(result))
+        result = read_result(path)
+        return bool(result["key"] == key and result.get("seal") == compute_seal(result))
     except (OSError, ValueError):
         return False
 
 
-def result_key(
+def compute_result_key(
     config: Mapping[str, Any], digest: str, *, roots: Iterable[str] = (), code_dir: str | Path | None = None
 ) -> str:
     """SHA-256 over everything that decides a result: the settings, the code that they reach, and the data.
 
     Args:
-        config: resolved settings; the options in ``UNKEYED`` are left out at every depth, and of an absolute file
-            name only what :func:`portable` keeps counts.
-        digest: of the data, from :func:`data_digest`.
+        config: resolved settings; the options in ``_NON_KEY_OPTIONS`` are left out at every depth, and of an absolute
+            file name only what :func:`make_portable` keeps counts.
+        digest: of the data, from :func:`compute_data_digest`.
         roots: modules that take part beside those that the settings name.
         code_dir: the folder of this package; None = where this file lies.
     """
-    settings = json.dumps(_keyed(portable(config)), sort_keys=True, default=str)
+    settings = json.dumps(_drop_non_key_options(make_portable(config)), sort_keys=True, default=str)
     total = hashlib.sha256()
     for text in (settings, digest):
-        _add(total, text.encode())
-    for name, file in closure.reached([*closure.targets(config), *roots], code_dir).items():
-        _add(total, name.encode())
-        _add(total, file.read_bytes())
+        _update_digest(total, text.encode())
+    for name, file in code_dependencies.find_reachable_modules(
+        [*code_dependencies.iter_targets(config), *roots], code_dir
+    ).items():
+        _update_digest(total, name.encode())
+        _update_digest(total, file.read_bytes())
     return total.hexdigest()
 
 
-def files_below(roots: Iterable[Path | None]) -> dict[str, Path]:
+def list_files_below(roots: Iterable[Path | None]) -> dict[str, Path]:
     """Name → file of everything below some folders (or files); a folder's own name and place do not count."""
     files: dict[str, Path] = {}
     for k, root in enumerate(dict.fromkeys(root for root in roots if root is not None)):
@@ -212,12 +235,12 @@ def files_below(roots: Iterable[Path | None]) -> dict[str, Path]:
     return files
 
 
-def files_named(settings: Mapping[str, Any]) -> dict[str, Path]:
+def list_files_named(settings: Mapping[str, Any]) -> dict[str, Path]:
     """Option → file that it names, as weights are: the place leaves the key of a result, the content enters it."""
-    return {f"settings/{name}": path for name, path in _paths("", settings) if path.is_file()}
+    return {f"settings/{name}": path for name, path in _iter_paths("", settings) if path.is_file()}
 
 
-def data_digest(files: Mapping[str, str | Path]) -> str:
+def compute_data_digest(files: Mapping[str, str | Path]) -> str:
     """SHA-256 over data files: their relative names, sizes, first and last 64 KiB. No file: data made by the code.
 
     Args:
@@ -227,18 +250,18 @@ def data_digest(files: Mapping[str, str | Path]) -> str:
     for name in sorted(files):
         path = Path(files[name])
         size = path.stat().st_size
-        _add(total, f"{name} {size}".encode())
+        _update_digest(total, f"{name} {size}".encode())
         with path.open("rb") as file:
-            _add(total, file.read(EDGE_BYTES))
-            file.seek(max(0, size - EDGE_BYTES))
-            _add(total, file.read(EDGE_BYTES))
+            _update_digest(total, file.read(_DIGEST_EDGE_BYTES))
+            file.seek(max(0, size - _DIGEST_EDGE_BYTES))
+            _update_digest(total, file.read(_DIGEST_EDGE_BYTES))
     return total.hexdigest()
 
 
-def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+def describe_difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     """The first thing that differs between what two runs note of themselves (``config``, ``data``, ``git`` and
     ``version``), in words."""
-    ours, theirs = _flat("", here["config"]), _flat("", there["config"])
+    ours, theirs = _flatten("", here["config"]), _flatten("", there["config"])
     for name in sorted(ours.keys() | theirs.keys()):
         if ours.get(name) != theirs.get(name):
             return f"{name} {theirs.get(name)} there, {ours.get(name)} here"
@@ -248,14 +271,14 @@ def difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     return "other code" + (f": {versions[0]} there, {versions[1]} here" if versions[0] != versions[1] else "")
 
 
-def meta(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
+def collect_run_metadata(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
     """When, with which code and on what a job runs."""
-    versions = {"python": platform.python_version(), **{name: _version(name) for name in _PACKAGES}}
+    versions = {"python": platform.python_version(), **{name: _package_version(name) for name in _PACKAGES}}
     return {
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
-        "git": revision(Path(__file__).parents[1]),
+        "git": read_git_revision(Path(__file__).parents[1]),
         "versions": versions,
-        "processor": processor(),
+        "processor": describe_processor(),
         "device": str(device),
         "dtype": str(dtype).removeprefix("torch."),
         "threads": threads,
@@ -263,7 +286,7 @@ def meta(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
     }
 
 
-def processor(info: str | Path = "/proc/cpuinfo") -> str:
+def describe_processor(info: str | Path = "/proc/cpuinfo") -> str:
     """The processor by its maker's name, family and model, and the widest vectors it has: speeds depend on them.
 
     Where ATEN_CPU_CAPABILITY holds torch to narrower ones, that is said as well.
@@ -278,13 +301,13 @@ def processor(info: str | Path = "/proc/cpuinfo") -> str:
         return platform.processor() or platform.machine()
     known = {k.strip(): v.strip() for k, _, v in (line.partition(":") for line in lines)}
     flags = known.get("flags", "").split()
-    vectors = next((word for flag, word in _VECTORS.items() if flag in flags), platform.machine())
+    vectors = next((word for flag, word in _VECTOR_FLAGS.items() if flag in flags), platform.machine())
     model = f"family {known['cpu family']} model {known['model']}" if {"cpu family", "model"} <= set(known) else ""
     vectors = f"{vectors} held to {held}" if held and vectors != held else vectors
     return ", ".join(word for word in (known.get("model name", ""), model, vectors) if word)
 
 
-def portable(config: Mapping[str, Any], base: str | Path | None = None) -> dict[str, Any]:
+def make_portable(config: Mapping[str, Any], base: str | Path | None = None) -> dict[str, Any]:
     """Settings without what belongs to one machine.
 
     An absolute file name, and any ``root``, is written relative to ``base`` (None: the environment variable
@@ -294,38 +317,38 @@ def portable(config: Mapping[str, Any], base: str | Path | None = None) -> dict[
 
     def shorten(name: str, value: Any) -> Any:
         if isinstance(value, Mapping):
-            return {str(k): shorten(str(k), v) for k, v in value.items() if k not in _PLACES}
+            return {str(k): shorten(str(k), v) for k, v in value.items() if k not in _LOCAL_OPTIONS}
         if isinstance(value, list | tuple):
             return [shorten(name, v) for v in value]
         is_place = isinstance(value, str | Path) and str(value) and (name == "root" or Path(value).is_absolute())
-        return _shorter(Path(value), base) if is_place else value
+        return _shorten_path(Path(value), base) if is_place else value
 
-    return {str(k): shorten(str(k), v) for k, v in config.items() if k not in _PLACES}
+    return {str(k): shorten(str(k), v) for k, v in config.items() if k not in _LOCAL_OPTIONS}
 
 
-def _fields(value: Any, kinds: Mapping[str, Any], where: str, more: bool = False) -> None:
+def _check_fields(value: Any, kinds: Mapping[str, Any], where: str, more: bool = False) -> None:
     _expect(isinstance(value, dict), where, value, "an object")
     for name, kind in kinds.items():
         if name not in value:
-            raise ValueError(f"{where}.{name}: found nothing, expected {_say(kind)}")
+            raise ValueError(f"{where}.{name}: found nothing, expected {_describe_kind(kind)}")
         allowed = kind if isinstance(kind, tuple) else (kind,)
-        _expect(any(_is(value[name], k) for k in allowed), f"{where}.{name}", value[name], _say(kind))
+        _expect(any(_is_of_kind(value[name], k) for k in allowed), f"{where}.{name}", value[name], _describe_kind(kind))
     unknown = sorted(set(value) - set(kinds))
     if unknown and not more:
         raise ValueError(f"{where}.{unknown[0]}: found an unknown field, expected {', '.join(kinds)}")
 
 
-def _verdict(result: Mapping[str, Any], where: str) -> None:
+def _check_verdict(result: Mapping[str, Any], where: str) -> None:
     for name in ("question", "expectation", "verdict", "why"):
-        if result["experiment"] in UNASKED:
+        if result["experiment"] in _JOBS_WITHOUT_QUESTION:
             _expect(result[name] is None, f"{where}.{name}", result[name], "null, this job asks no question")
         else:
             _expect(bool(result[name]), f"{where}.{name}", result[name], "a text")
-    if result["experiment"] not in UNASKED:
-        _expect(result["verdict"] in VERDICTS, f"{where}.verdict", result["verdict"], ", ".join(VERDICTS))
+    if result["experiment"] not in _JOBS_WITHOUT_QUESTION:
+        _expect(result["verdict"] in _VERDICTS, f"{where}.verdict", result["verdict"], ", ".join(_VERDICTS))
 
 
-def _is(value: Any, kind: Any) -> bool:
+def _is_of_kind(value: Any, kind: Any) -> bool:
     if kind is None:
         return value is None
     if isinstance(value, bool):
@@ -333,7 +356,7 @@ def _is(value: Any, kind: Any) -> bool:
     return isinstance(value, int | float) if kind is float else isinstance(value, kind)
 
 
-def _say(kind: Any) -> str:
+def _describe_kind(kind: Any) -> str:
     words = {int: "a whole number", float: "a number", str: "a text", dict: "an object", list: "a list", None: "null"}
     return " or ".join(words[k] for k in (kind if isinstance(kind, tuple) else (kind,)))
 
@@ -344,47 +367,47 @@ def _expect(condition: bool, where: str, found: Any, expected: str) -> None:
         raise ValueError(f"{where}: found {shown if len(shown) <= 60 else shown[:57] + '...'}, expected {expected}")
 
 
-def _finite(value: Any, where: str) -> None:
+def _check_finite(value: Any, where: str) -> None:
     if isinstance(value, dict):
         for k, v in value.items():
-            _finite(v, f"{where}.{k}")
+            _check_finite(v, f"{where}.{k}")
     elif isinstance(value, list):
         for k, v in enumerate(value):
-            _finite(v, f"{where}.{k}")
+            _check_finite(v, f"{where}.{k}")
     elif isinstance(value, float):
         _expect(math.isfinite(value), where, value, "a finite number or null")
 
 
-def _add(total: Any, part: bytes) -> None:
+def _update_digest(total: Any, part: bytes) -> None:
     """Length first, so that no two sequences of parts make the same stream."""
     total.update(len(part).to_bytes(8, "big"))
     total.update(part)
 
 
-def _keyed(config: Any) -> Any:
+def _drop_non_key_options(config: Any) -> Any:
     if isinstance(config, Mapping):
-        return {str(k): _keyed(v) for k, v in config.items() if str(k) not in UNKEYED}
-    return [_keyed(v) for v in config] if isinstance(config, list | tuple) else config
+        return {str(k): _drop_non_key_options(v) for k, v in config.items() if str(k) not in _NON_KEY_OPTIONS}
+    return [_drop_non_key_options(v) for v in config] if isinstance(config, list | tuple) else config
 
 
-def _flat(name: str, value: Any) -> dict[str, Any]:
+def _flatten(name: str, value: Any) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         return {name: value}
-    return {k: v for key, inner in value.items() for k, v in _flat(f"{name}.{key}".lstrip("."), inner).items()}
+    return {k: v for key, inner in value.items() for k, v in _flatten(f"{name}.{key}".lstrip("."), inner).items()}
 
 
-def _paths(name: str, value: Any) -> Iterator[tuple[str, Path]]:
+def _iter_paths(name: str, value: Any) -> Iterator[tuple[str, Path]]:
     if isinstance(value, Mapping):
         for key, inner in value.items():
-            yield from _paths(f"{name}.{key}", inner)
+            yield from _iter_paths(f"{name}.{key}", inner)
     elif isinstance(value, list | tuple):
         for k, inner in enumerate(value):
-            yield from _paths(f"{name}.{k}", inner)
+            yield from _iter_paths(f"{name}.{k}", inner)
     elif isinstance(value, str) and os.sep in value:
         yield name, Path(value).expanduser()
 
 
-def _shorter(path: Path, base: str | Path | None) -> str:
+def _shorten_path(path: Path, base: str | Path | None) -> str:
     place = path.expanduser().resolve()
     if base is not None:
         home = Path(base).expanduser().resolve()
@@ -393,14 +416,14 @@ def _shorter(path: Path, base: str | Path | None) -> str:
     return place.name
 
 
-def _version(package: str) -> str | None:
+def _package_version(package: str) -> str | None:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
 
 
-def revision(folder: Path) -> str | None:
+def read_git_revision(folder: Path) -> str | None:
     """What ``git describe`` calls the code in ``folder``, None where it is not under version control."""
 
     def ask(*words: str) -> str | None:

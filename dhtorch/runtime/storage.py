@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import IO, Any
 
 #: Lists and objects inside one another that a file may hold: whoever walks through them does so by recursion.
-MAX_DEPTH = 64
+_MAX_NESTING = 64
 
 #: How the name of a file ends while it is written.
-_UNFINISHED = ".tmp"
+_UNFINISHED_SUFFIX = ".tmp"
 
 
-def strict(value: Any) -> Any:
+def to_strict_json(value: Any) -> Any:
     """The same value in what strict JSON can hold: finite numbers, strings, lists, objects with string keys, null.
 
     Non-finite numbers become null; numpy and torch values become numbers and lists, paths become strings.
@@ -35,43 +35,43 @@ def strict(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
-        return {str(k): strict(v) for k, v in value.items()}
+        return {str(k): to_strict_json(v) for k, v in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
-        return [strict(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
+        return [to_strict_json(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
     if isinstance(value, Path):
         return str(value)
     if hasattr(value, "tolist"):  # torch.Tensor, numpy.ndarray and numpy scalars
-        return strict(value.tolist())
+        return to_strict_json(value.tolist())
     raise TypeError(f"result: found a {type(value).__name__}, expected something that JSON can hold")
 
 
-def dumps(value: Any, **layout: Any) -> str:
+def dump_strict_json(value: Any, **layout: Any) -> str:
     """Strict JSON of what has a counterpart in it; ``layout`` as for :func:`json.dumps`.
 
     Raises:
-        ValueError: a number that is not finite (see :func:`strict`).
+        ValueError: a number that is not finite (see :func:`to_strict_json`).
         TypeError: a value that JSON does not know.
     """
     return json.dumps(value, **{"ensure_ascii": False, **layout}, allow_nan=False)
 
 
-def loads(text: str) -> Any:
+def parse_strict_json(text: str) -> Any:
     """The value of a text in strict JSON.
 
     Raises:
         ValueError: no JSON, a number that is not finite, a key that stands twice in one object, or values nested
-            deeper than ``MAX_DEPTH``.
+            deeper than ``_MAX_NESTING``.
     """
     try:
-        value = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_unique)
+        value = json.loads(text, parse_constant=_reject_constant, object_pairs_hook=_reject_duplicate_keys)
     except RecursionError:
-        raise ValueError(f"values nested deeper than {MAX_DEPTH}") from None
+        raise ValueError(f"values nested deeper than {_MAX_NESTING}") from None
     level = [value] if isinstance(value, dict | list) else []
-    for _ in range(MAX_DEPTH):
+    for _ in range(_MAX_NESTING):
         level = [inner for each in level for inner in (each.values() if isinstance(each, dict) else each)]
         level = [each for each in level if isinstance(each, dict | list)]
     if level:
-        raise ValueError(f"values nested deeper than {MAX_DEPTH}")
+        raise ValueError(f"values nested deeper than {_MAX_NESTING}")
     return value
 
 
@@ -81,11 +81,11 @@ def write_json(path: str | Path, value: Any) -> Path:
     Raises:
         ValueError: a number that is not finite; nothing is written.
     """
-    return replace_file(path, (dumps(value, indent=1) + "\n").encode("utf-8"))
+    return replace_file(path, (dump_strict_json(value, indent=1) + "\n").encode("utf-8"))
 
 
 @contextlib.contextmanager
-def naming(path: Path) -> Iterator[None]:
+def _add_path_to_errors(path: Path) -> Iterator[None]:
     """An error of the system that names no file (a full disk, a limit of size) names ``path``."""
     try:
         yield
@@ -99,9 +99,9 @@ def replace_file(path: str | Path, content: bytes) -> Path:
     """Write a file so that, whatever happens, ``path`` holds either what it held before or all of the new content."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED, dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED_SUFFIX, dir=path.parent)
     os.close(handle)
-    with whole(path, Path(name)) as file:
+    with write_atomically(path, Path(name)) as file:
         file.write(content)
         Path(name).chmod(0o644)
     _sync_folder(path.parent)
@@ -109,11 +109,11 @@ def replace_file(path: str | Path, content: bytes) -> Path:
 
 
 @contextlib.contextmanager
-def whole(path: Path, unfinished: Path) -> Iterator[IO[bytes]]:
+def write_atomically(path: Path, unfinished: Path) -> Iterator[IO[bytes]]:
     """The file ``unfinished``, in the folder of ``path``, to be written: it is ``path`` once the block ends, and gone
     where the block fails."""
     try:
-        with naming(path), unfinished.open("wb") as file:
+        with _add_path_to_errors(path), unfinished.open("wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -130,29 +130,32 @@ def copy_file(source: str | Path, path: str | Path) -> Path:
     if not source.is_file() or (path.is_file() and path.stat().st_size == source.stat().st_size):
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
-    with source.open("rb") as found, whole(path, path.with_name(f".{path.name}.copy{_UNFINISHED}")) as file:
+    with (
+        source.open("rb") as found,
+        write_atomically(path, path.with_name(f".{path.name}.copy{_UNFINISHED_SUFFIX}")) as file,
+    ):
         shutil.copyfileobj(found, file)
     return path
 
 
-def clear(path: str | Path) -> None:
+def remove_unfinished_files(path: str | Path) -> None:
     """Remove what a writer of ``path`` left beside it when it was killed. Nobody may be writing ``path`` meanwhile."""
     path = Path(path)
-    for left in path.parent.glob(f".{path.name}.*{_UNFINISHED}"):
+    for left in path.parent.glob(f".{path.name}.*{_UNFINISHED_SUFFIX}"):
         left.unlink(missing_ok=True)
 
 
-def filled(folder: Path) -> bool:
+def has_files(folder: Path) -> bool:
     """Whether a file lies in a folder or below; what an interrupted write left of one does not count."""
     inside = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
-    return any(not (f.name.startswith(".") and f.name.endswith(_UNFINISHED)) for f in inside)
+    return any(not (f.name.startswith(".") and f.name.endswith(_UNFINISHED_SUFFIX)) for f in inside)
 
 
-def _refuse_constant(word: str) -> None:
+def _reject_constant(word: str) -> None:
     raise ValueError(f"the constant {word}")
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]

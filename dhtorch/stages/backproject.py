@@ -16,25 +16,25 @@ from dhtorch.codes import Flag, Hole
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import all_finite, check, is_transformed
 from dhtorch.geometry.patches import (
-    fits,
-    in_a_row,
+    containing_pixels,
+    extract_patches,
+    flatten_images,
+    gather_reduced,
+    is_patch_inside,
     luma,
-    nearest_index,
-    patches,
-    pixels,
-    read_whole,
-    summarise,
+    nearest_pixel_index,
+    reduce_patches,
     whole_is_faster,
 )
-from dhtorch.geometry.windows import bands, extreme, window_sum
-from dhtorch.ops import loader as native
+from dhtorch.geometry.windows import row_bands, window_extreme, window_sum
+from dhtorch.ops import loader
 from dhtorch.records import Frame, Samples
 
 #: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
 SPARSE_SEARCH_PX = 3
 
 #: Side of the neighbourhood that appearance and depth edges are judged on, px.
-NEIGHBOURHOOD = 5
+NEIGHBOURHOOD_PX = 5
 
 
 def backproject(
@@ -89,7 +89,7 @@ def backproject(
     if uv.dim() == 2:
         uv = uv.expand(sizes["B"], *uv.shape)
     check("backproject", uv=(uv, "B N 2"), f=(frame.camera.f, "B 2"))
-    limits = Limits(
+    limits = ReturnLimits(
         near_limit=near_limit,
         min_conf=min_conf,
         sigma_m=sigma_m,
@@ -103,7 +103,7 @@ def backproject(
     return _in_torch(frame, uv, search_px, limits) if found is None else found
 
 
-class Limits(NamedTuple):
+class ReturnLimits(NamedTuple):
     """What is taken for a return, and what is said of it: options of :func:`backproject`."""
 
     near_limit: float | None
@@ -115,14 +115,14 @@ class Limits(NamedTuple):
     saturated: float
     highlight: float
 
-    def told(self) -> Limits:
+    def told(self) -> ReturnLimits:
         """As compiled code is told them, which knows no None."""
         return self if self.near_limit is not None else self._replace(near_limit=torch.inf)
 
 
-def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: Limits) -> Samples:
+def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: ReturnLimits) -> Samples:
     """The reference, on any device, with a graph."""
-    pixel = pixels(uv)
+    pixel = containing_pixels(uv)
     depth, level, edge = _read_depth(frame, uv, pixel, search_px or 0, limits.edge_rel)
     if search_px is None and frame.sparse is not None:
         found = zip(_read_depth(frame, uv, pixel, SPARSE_SEARCH_PX, limits.edge_rel), (depth, level, edge), strict=True)
@@ -159,36 +159,36 @@ def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: Limits) -
     )
 
 
-def _compiled(frame: Frame, uv: Tensor, limits: Limits) -> Samples | None:
+def _compiled(frame: Frame, uv: Tensor, limits: ReturnLimits) -> Samples | None:
     """The same bits (sigma up to the rounding of its root) of dense maps and pictures of bytes; None where compiled
     code is not loaded or does not serve."""
     conf = frame.depth.new_empty(0, dtype=torch.uint8) if frame.conf is None else frame.conf
     bytes_alone = frame.image.dtype == conf.dtype == torch.uint8 and 0 <= limits.min_conf <= 255
-    if not bytes_alone or frame.depth.dtype != uv.dtype or not native.serves(frame.depth, conf):
+    if not bytes_alone or frame.depth.dtype != uv.dtype or not loader.serves(frame.depth, conf):
         return None
-    found = places(frame, uv)
+    found = project_samples(frame, uv)
     if found is None:
         return None
     pixel, at, ray = found
-    picture, steps = in_a_row(frame.image)
+    picture, steps = flatten_images(frame.image)
     depth, sigma, confidence = (ray.new_empty(ray.shape[:2]) for _ in range(3))
     flag = torch.empty_like(depth, dtype=torch.int32)
     xyz = torch.empty_like(ray)
     said = (depth, sigma, confidence, xyz, flag)
-    size, reach = around(frame)
+    size, reach = window_sizes(frame)
     shape = (reach, *steps, *frame.image.shape[1:], size)
     torch.ops.dhtorch.samples.default(frame.depth, conf, at, picture, pixel, ray, *said, *shape, *limits.told())
     none = {"trackability": torch.zeros_like(depth), "hole": torch.zeros_like(flag)}
     return Samples(uv=uv, depth=depth, sigma=sigma, xyz=xyz, confidence=confidence, flag=flag, **none)
 
 
-def around(frame: Frame) -> tuple[int, int]:
+def window_sizes(frame: Frame) -> tuple[int, int]:
     """Sides of the neighbourhoods in the picture and in the map, px."""
     hw = frame.depth.shape[-2], frame.depth.shape[-1]
-    return min(NEIGHBOURHOOD, *frame.hw), min(NEIGHBOURHOOD, *hw)
+    return min(NEIGHBOURHOOD_PX, *frame.hw), min(NEIGHBOURHOOD_PX, *hw)
 
 
-def places(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+def project_samples(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
     """Where compiled code reads for samples (B, N, 2): pixels of picture and map (B, N, 2), and rays (B, N, 3); None
     where it does not serve."""
     camera, own = frame.camera, frame.depth_camera
@@ -197,7 +197,7 @@ def places(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
         lens = [camera.f, camera.c]
         lens += [camera.f.new_empty(0)] * 2 if own is None else [own.f, own.c]
         start, *lens = (x.contiguous() for x in (uv, *lens))
-        if {x.dtype for x in (start, *lens)} != {torch.float32} or not native.serves(start, *lens):
+        if {x.dtype for x in (start, *lens)} != {torch.float32} or not loader.serves(start, *lens):
             return None
         pixel, at = (torch.empty_like(start, dtype=torch.int32) for _ in range(2))
         ray = start.new_empty(*uv.shape[:2], 3)
@@ -205,9 +205,9 @@ def places(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
         return pixel, at, ray
     place = cam.depth_pixels(camera, frame.hw, own, (h, w), uv)
     ray = cam.rays(camera, uv.nan_to_num(0.0, 0.0, 0.0))
-    if ray.dtype != torch.float32 or not native.serves(place.contiguous(), ray):
+    if ray.dtype != torch.float32 or not loader.serves(place.contiguous(), ray):
         return None
-    return pixels(uv).contiguous(), pixels(place).contiguous(), ray
+    return containing_pixels(uv).contiguous(), containing_pixels(place).contiguous(), ray
 
 
 def _read_depth(
@@ -219,15 +219,15 @@ def _read_depth(
     """
     h, w = frame.depth.shape[-2:]
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (h, w), uv)
-    size = min(max(NEIGHBOURHOOD, 2 * search_px + 1), h, w)
-    pixel = pixel if place is uv else pixels(place)
+    size = min(max(NEIGHBOURHOOD_PX, 2 * search_px + 1), h, w)
+    pixel = pixel if place is uv else containing_pixels(place)
     if whole_is_faster((h, w), uv.shape[1], size):
-        low, high = (read_whole(x, pixel, size) for x in _whole_extremes(frame.depth, size))
+        low, high = (gather_reduced(x, pixel, size) for x in _whole_extremes(frame.depth, size))
     else:
-        low, high = summarise(frame.depth[:, None], pixel, size, _extremes, compiled="extremes")
+        low, high = reduce_patches(frame.depth[:, None], pixel, size, _extremes, compiled="extremes")
     if search_px > 0:
-        pixel = pixels(_nearest_return(frame.depth, place, size, search_px))
-    index, inside = nearest_index((h, w), pixel)
+        pixel = containing_pixels(_nearest_return(frame.depth, place, size, search_px))
+    index, inside = nearest_pixel_index((h, w), pixel)
     value = frame.depth.flatten(1).gather(1, index)
     value = value.to(torch.promote_types(value.dtype, uv.dtype))  # half precision stores, and computes nothing
     value = torch.where(inside, value.nan_to_num(0.0, 0.0, 0.0).relu(), 0.0)
@@ -249,14 +249,14 @@ def _whole_extremes(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
     for inside, around in _around(depth, size // 2):
         some = depth[:, around].detach().nan_to_num(0, 0, 0)
         none = torch.nn.functional.threshold(some, 0.0, torch.inf)
-        low.append(extreme(none, size // 2, torch.minimum)[:, inside])
-        high.append(extreme(some, size // 2, torch.maximum)[:, inside])
+        low.append(window_extreme(none, size // 2, torch.minimum)[:, inside])
+        high.append(window_extreme(some, size // 2, torch.maximum)[:, inside])
     return torch.cat(low, 1), torch.cat(high, 1)
 
 
 def _around(image: Tensor, radius: int) -> Iterator[tuple[slice, slice]]:
     """Some rows of a picture after the other: where they are among those read for them, and which these are."""
-    for part in bands(image, image.shape[-2:]):
+    for part in row_bands(image, image.shape[-2:]):
         top = max(part.start - radius, 0)
         yield slice(part.start - top, part.stop - top), slice(top, part.stop + radius)
 
@@ -264,8 +264,10 @@ def _around(image: Tensor, radius: int) -> Iterator[tuple[slice, slice]]:
 def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> Tensor:
     """The pixel (B, N, 2) with a return nearest to each ``place``, ``place`` itself where none is within reach."""
     h, w = depth.shape[-2:]
-    pixel = pixels(place).clamp(-1 - search_px, max(h, w) + search_px)  # farther outside, nothing is within reach
-    window = patches(depth.detach()[:, None], pixel - size // 2, size).flatten(2)  # moved inside at the border
+    pixel = containing_pixels(place).clamp(
+        -1 - search_px, max(h, w) + search_px
+    )  # farther outside, nothing is within reach
+    window = extract_patches(depth.detach()[:, None], pixel - size // 2, size).flatten(2)  # moved inside at the border
     last = torch.tensor([w - size, h - size], device=depth.device)
     first = torch.minimum((pixel - size // 2).clamp_min(0), last)
     steps = torch.arange(size, device=depth.device)
@@ -279,10 +281,10 @@ def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> 
     return torch.where(reachable.gather(-1, pick), found.to(place.dtype), place)
 
 
-def _appearance(image: Tensor, pixel: Tensor, limits: Limits) -> tuple[Tensor, ...]:
+def _appearance(image: Tensor, pixel: Tensor, limits: ReturnLimits) -> tuple[Tensor, ...]:
     """What the picture alone decides, (B, N) each: at the border, too dark, clipped at white, a highlight."""
     hw = (image.shape[-2], image.shape[-1])
-    size = min(NEIGHBOURHOOD, *hw)
+    size = min(NEIGHBOURHOOD_PX, *hw)
     white = 1 if image.is_floating_point() else 255
 
     def told(mean: Tensor, centre: Tensor, top: Tensor, bottom: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -291,10 +293,10 @@ def _appearance(image: Tensor, pixel: Tensor, limits: Limits) -> tuple[Tensor, .
 
     if whole_is_faster(hw, pixel.shape[1], size) and image.dtype == torch.uint8:
         found = zip(*(told(*seen) for seen in _whole_brightness(image, size)), strict=True)
-        doubts = tuple(read_whole(torch.cat(rows, 1), pixel, size) for rows in found)
+        doubts = tuple(gather_reduced(torch.cat(rows, 1), pixel, size) for rows in found)
     else:
-        doubts = told(*summarise(image.detach(), pixel, size, _brightness, compiled="brightness"))
-    return ~fits(pixel, hw, size), *doubts
+        doubts = told(*reduce_patches(image.detach(), pixel, size, _brightness, compiled="brightness"))
+    return ~is_patch_inside(pixel, hw, size), *doubts
 
 
 def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -12,7 +12,7 @@ from dhtorch.geometry.checks import check
 from dhtorch.records import Estimate
 
 #: Least share of a variance that is put down to the point's own track, whatever the pose's part.
-OWN_SHARE = 1e-3
+MIN_FUSED_OWN_RATIO = 1e-3
 
 
 def inverse_variance(
@@ -60,7 +60,7 @@ def inverse_variance(
         raise ValueError("inverse_variance: expected at least one view")
     if V == 1:
         return estimates[0]
-    said = _said(estimates)
+    said = _is_answered(estimates)
     inverse, own, shared = _inverse_depth(estimates, said)
     n = said.sum(0)
     weight, mean, chi2 = _mean(inverse, own * own + shared * shared, said)
@@ -74,7 +74,7 @@ def inverse_variance(
     gate = torch.where(n < min(max(min_views, 1), V), _last_reason(estimates.gate, said), gate)
     return _joint(
         estimates,
-        _stilled(estimates, gate, max_still),
+        _static_gate(estimates, gate, max_still),
         said,
         weight,
         depth=depth,
@@ -84,7 +84,7 @@ def inverse_variance(
     )
 
 
-def agree(
+def fuse_consistent(
     estimates: Estimate,  # (V, B, N), one per view
     *,
     max_chi2: float = 9.0,
@@ -132,7 +132,7 @@ def agree(
         raise ValueError("agree: expected at least one view")
     if V == 1:
         return estimates[0]
-    said = _said(estimates)
+    said = _is_answered(estimates)
     inverse, own, shared = _inverse_depth(estimates, said)
     variance = own.square() + shared.square()
     sureness = torch.where(said, inverse.square() / variance, torch.zeros_like(variance)).detach()  # (depth / sigma)²
@@ -148,11 +148,11 @@ def agree(
     )
     gate = first_reason((against, Gate.INCONSISTENT), (sigma > limit * depth, Gate.UNCERTAIN))
     gate = torch.where(n < 1, _last_reason(estimates.gate, said), gate)
-    gate = _contradicted(estimates, gate)
+    gate = _contradicted_gate(estimates, gate)
     parallax = torch.where(joined | (n < 1), estimates.parallax_deg, torch.zeros_like(estimates.parallax_deg))
     return _joint(
         estimates,
-        _stilled(estimates, gate, max_still),
+        _static_gate(estimates, gate, max_still),
         joined,
         weight,
         depth=depth,
@@ -171,7 +171,7 @@ def _largest_agreement(inverse: Tensor, variance: Tensor, sureness: Tensor, said
     return agreeing.gather(0, first[None, None].expand(1, *agreeing.shape[1:]))[0]
 
 
-def _said(estimates: Estimate) -> Tensor:
+def _is_answered(estimates: Estimate) -> Tensor:
     """(V, B, N) bool: an answer that can be weighed."""
     return estimates.keep & (estimates.depth > 0) & (estimates.sigma > 0) & estimates.sigma.isfinite()
 
@@ -187,13 +187,13 @@ def _mean(inverse: Tensor, variance: Tensor, among: Tensor) -> tuple[Tensor, Ten
     return weight, mean, chi2 / (n - 1).clamp_min(1)
 
 
-def _stilled(estimates: Estimate, gate: Tensor, max_still: float) -> Tensor:
+def _static_gate(estimates: Estimate, gate: Tensor, max_still: float) -> Tensor:
     """The gates (B, N); NO_BASELINE for all points of an anchor whose views mostly have none."""
     still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_still * len(estimates.gate)
     return torch.where(still[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
 
 
-def _contradicted(estimates: Estimate, gate: Tensor) -> Tensor:
+def _contradicted_gate(estimates: Estimate, gate: Tensor) -> Tensor:
     """The gates (B, N); CONTRADICTED for what an anchor answers of whose views more are contradicted than answer: what
     moves on its own is near in all of them."""
     against = (estimates.gate == Gate.CONTRADICTED).any(-1).sum(0)
@@ -242,7 +242,7 @@ def _inverse_depth(estimates: Estimate, said: Tensor) -> tuple[Tensor, Tensor, T
     inverse = 1 / torch.where(said, estimates.depth, one).double()
     whole = torch.where(said, estimates.sigma, one).double() * inverse * inverse
     shared = torch.where(said, estimates.sigma_shared, 0 * one).double() * inverse * inverse
-    own = (whole.square() - shared.square()).clamp_min(OWN_SHARE * whole.square()).sqrt()
+    own = (whole.square() - shared.square()).clamp_min(MIN_FUSED_OWN_RATIO * whole.square()).sqrt()
     return inverse, own, shared
 
 

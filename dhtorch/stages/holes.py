@@ -14,9 +14,9 @@ from torch import Tensor
 
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
 from dhtorch.geometry.checks import check, is_transformed
-from dhtorch.geometry.linalg import eigenvalues
-from dhtorch.geometry.patches import pixels, summarise
-from dhtorch.ops import loader as native
+from dhtorch.geometry.linalg import eigenvalues_2x2
+from dhtorch.geometry.patches import containing_pixels, reduce_patches
+from dhtorch.ops import loader
 from dhtorch.records import Frame, Samples
 
 
@@ -50,7 +50,7 @@ def classify(
     """
     check("classify", image=(frame.image, "B C H W"), uv=(samples.uv, "B N 2"), flag=(samples.flag, "B N"))
     trackability = min_eigenvalue(frame.image, samples.uv, block=block)
-    if native.serves(samples.xyz, samples.flag, trackability):
+    if loader.serves(samples.xyz, samples.flag, trackability):
         hole = torch.empty_like(samples.flag)
         torch.ops.dhtorch.holes.default(samples.xyz, samples.flag, trackability, hole, min_trackability)
     else:
@@ -60,13 +60,13 @@ def classify(
 
 def _first_class(samples: Samples, trackability: Tensor, min_trackability: float) -> Tensor:
     device = samples.flag.device
-    hole = (_of_flag.__wrapped__ if is_transformed() else _of_flag)(device)[samples.flag]
+    hole = (_class_of_flag.__wrapped__ if is_transformed() else _class_of_flag)(device)[samples.flag]
     flat = (trackability.detach() < min_trackability) & (hole == Hole.TRACKABLE_NO_LIDAR)
     return hole.masked_fill_(flat, Hole.LOW_TEXTURE).masked_fill_(samples.usable, Hole.NONE)
 
 
 @lru_cache(maxsize=8)
-def _of_flag(device: torch.device) -> Tensor:
+def _class_of_flag(device: torch.device) -> Tensor:
     """The class that each flag decides, whatever the texture, (256,): one look-up instead of four masks of samples."""
     flag = torch.arange(256, dtype=torch.int32, device=device)
     return first_reason(
@@ -93,7 +93,7 @@ def min_eigenvalue(
     Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
     """
     check("min_eigenvalue", image=(image, "B C H W"), uv=(uv, "B N 2"))
-    (found,) = summarise(image, pixels(uv), block + 2, _texture, grey=True, compiled="texture")
+    (found,) = reduce_patches(image, containing_pixels(uv), block + 2, _texture, grey=True, compiled="texture")
     return found
 
 
@@ -101,7 +101,7 @@ def _texture(grey: Tensor) -> tuple[Tensor]:
     """Smaller eigenvalue (P,) of the mean of ((gx², gx gy), (gx gy, gy²)), by the Sobel filters over all but the
     outermost pixels (size, size, P)."""
     gx, gy = _sobel(grey)
-    smaller, _ = eigenvalues((gx * gx).sum((0, 1)), (gx * gy).sum((0, 1)), (gy * gy).sum((0, 1)))
+    smaller, _ = eigenvalues_2x2((gx * gx).sum((0, 1)), (gx * gy).sum((0, 1)), (gy * gy).sum((0, 1)))
     return (smaller / (16 * len(gx) * len(gx)),)
 
 
@@ -112,7 +112,7 @@ def _sobel(grey: Tensor) -> tuple[Tensor, Tensor]:
     return gx, torch.add(down[:, :-2] + down[:, 2:], down[:, 1:-1], alpha=2)
 
 
-def route(hole: Tensor) -> Tensor:
+def suggest_route(hole: Tensor) -> Tensor:
     """What to try for each hole: ``codes.Hole`` (…) → ``codes.Route`` (…), for the user of the map."""
     table = torch.tensor([ROUTE_OF_HOLE[k] for k in sorted(ROUTE_OF_HOLE)], dtype=hole.dtype, device=hole.device)
     return table[hole.long()]

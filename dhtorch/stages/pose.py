@@ -12,44 +12,43 @@ from torch.utils import _pytree as pytree
 
 from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import covariance, ransac, se3
-from dhtorch.geometry import reprojection_problem as near_far
-from dhtorch.geometry.checks import all_finite, check, surely_all
-from dhtorch.geometry.determinism import PRODUCT_LANES, SUM_LANES, filled
-from dhtorch.geometry.inference_mode import spared
+from dhtorch.geometry import covariance, ransac, reprojection_problem, se3
+from dhtorch.geometry.checks import all_finite, all_known, check
+from dhtorch.geometry.determinism import PRODUCT_LANES, SUM_LANES, round_up
+from dhtorch.geometry.inference_mode import run_without_grad
 from dhtorch.geometry.least_squares import (
     MIN_DEPTH,
-    Normal,
-    choose,
+    NormalEquations,
     has_graph,
-    implicit,
+    implicit_step,
     linearise,
     minimise,
-    move,
+    move_pose,
     normal_equations,
-    reprojection,
-    robust,
+    reprojection_residuals,
+    robust_loss,
+    select_batch,
     solve_spd,
-    trial_step,
+    trial_pose_step,
 )
-from dhtorch.geometry.linalg import upper
-from dhtorch.geometry.map_estimate import FitOptions, most_probable, pose_covariance
-from dhtorch.geometry.reprojection_problem import Problem
-from dhtorch.ops import loader as native
-from dhtorch.pytree import in_pieces
+from dhtorch.geometry.linalg import upper_triangle
+from dhtorch.geometry.map_estimate import FitOptions, estimate_map_pose, pose_covariance
+from dhtorch.geometry.reprojection_problem import PoseDepthProblem
+from dhtorch.ops import loader
+from dhtorch.pytree import chunked_apply
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 
 #: Pairs solved together: few enough for their temporaries to stay in cache.
-PAIRS = 16
+PNP_CHUNK_PAIRS = 16
 
 #: Pairs whose near and far tracks are solved together: a track has ten columns there.
-MAP_PAIRS = 16
+MAP_CHUNK_PAIRS = 16
 
 #: Points the search looks at; a pair with more is thinned evenly. The last steps see all points.
-SEARCH_POINTS = 256
+MAX_SEARCH_POINTS = 256
 
 #: Noise below this is not believed (px): residuals of exact data are rounding.
-MIN_SIGMA_PX = 1e-6
+MIN_NOISE_SIGMA_PX = 1e-6
 
 
 def pnp_ransac(
@@ -146,7 +145,7 @@ def pnp_ransac(
         kernel_px=kernel_px,
     )
     inputs = (samples.xyz, tracks.uv_1, tracks.valid, cam.ideal(camera_1), draws.to(samples.xyz))
-    return in_pieces(partial(spared, _fit, options), PAIRS, *inputs)
+    return chunked_apply(partial(run_without_grad, _fit, options), PNP_CHUNK_PAIRS, *inputs)
 
 
 @dataclass(frozen=True)
@@ -171,21 +170,21 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
     rows, depth = linearise(start, f, c, xyz, uv)
     square = (rows[:, 6] * rows[:, 6]).sum(1)
     inlier = usable & found[:, None] & (depth > MIN_DEPTH) & (square < options.threshold_px**2)
-    H, g = _weighed(options, rows, inlier)
+    H, g = _inlier_normal_equations(options, rows, inlier)
     eye = torch.eye(6, dtype=H.dtype, device=H.device).expand_as(H)
     x, solved = solve_spd(H.detach(), torch.cat((-g.detach()[..., None], eye), -1))
 
     def equations(xi: Tensor) -> Tensor:
-        moved, _ = linearise(move(start, xi), f.detach(), c.detach(), xyz.detach(), uv.detach())
-        return _weighed(options, moved, inlier)[1]
+        moved, _ = linearise(move_pose(start, xi), f.detach(), c.detach(), xyz.detach(), uv.detach())
+        return _inlier_normal_equations(options, moved, inlier)[1]
 
-    T = move(start, x[..., 0])
+    T = move_pose(start, x[..., 0])
     if has_graph(g):
-        T = move(T, implicit(equations, g))
+        T = move_pose(T, implicit_step(equations, g))
     with torch.no_grad():
         n_inlier = inlier.sum(-1)
         enough = n_inlier >= options.min_inlier
-        line = ransac.collinear(xyz, torch.where(enough[:, None], inlier, usable))
+        line = ransac.is_collinear(xyz, torch.where(enough[:, None], inlier, usable))
         finite = (T.R.sum((1, 2)) + T.t.sum(1)).isfinite()
         code = first_reason(
             (usable.sum(-1) < options.min_inlier, PoseCode.TOO_FEW),
@@ -197,7 +196,7 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
         ok, nan = code == PoseCode.OK, torch.full((), torch.nan, dtype=points.dtype, device=points.device)
         total = torch.where(inlier, square, 0.0).detach().sum(-1)
         rms_px = (total / n_inlier.clamp_min(1)).sqrt()
-        sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(MIN_SIGMA_PX)
+        sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(MIN_NOISE_SIGMA_PX)
         inverse = x[..., 1:]
         cov = (inverse + inverse.transpose(1, 2)) * (0.5 * sigma_px * sigma_px)[:, None, None]
         # With H = L Lᵀ, the lower end of L is the factor of the translation's information, the rotation eliminated.
@@ -205,7 +204,7 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
         root = (lower * T.t[..., None]).sum(1)
         t_snr = (root * root).sum(-1).sqrt() / sigma_px
 
-    every = surely_all(ok)  # then nothing need be hidden
+    every = all_known(ok)  # then nothing need be hidden
 
     def answer(x: Tensor) -> Tensor:
         x = x.to(nan.dtype)
@@ -223,9 +222,9 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
     )
 
 
-def _weighed(o: _Options, rows: Tensor, inlier: Tensor) -> tuple[Tensor, Tensor]:
+def _inlier_normal_equations(o: _Options, rows: Tensor, inlier: Tensor) -> tuple[Tensor, Tensor]:
     """The normal equations of inliers, by the robust kernel."""
-    _, weight = robust((rows[:, 6] * rows[:, 6]).sum(1), o.kernel, o.kernel_px)
+    _, weight = robust_loss((rows[:, 6] * rows[:, 6]).sum(1), o.kernel, o.kernel_px)
     return normal_equations(rows, torch.where(inlier, weight, 0.0))
 
 
@@ -235,7 +234,7 @@ def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     usable = valid & all_finite(points, 1)
     points = torch.where(usable[:, None], points, torch.zeros_like(points))
     N = usable.shape[1]
-    more = (0, filled(N, PRODUCT_LANES) - N)
+    more = (0, round_up(N, PRODUCT_LANES) - N)
     return torch.nn.functional.pad(points, more), torch.nn.functional.pad(usable, more)
 
 
@@ -244,22 +243,22 @@ def _robust_pose(
 ) -> tuple[Pose, Tensor]:
     """Search, refine the best two, polish the better: a float64 pose (exactly a rotation) and whether there is one."""
     given = (points, usable, f.contiguous(), c.contiguous(), draws.contiguous())
-    if options.kernel is None and native.serves(*given):
+    if options.kernel is None and loader.serves(*given):
         return _compiled(given, options)
-    index, count = ransac.usable_first(usable, min(SEARCH_POINTS, usable.shape[1]))
+    index, count = ransac.usable_first(usable, min(MAX_SEARCH_POINTS, usable.shape[1]))
     near = points.gather(2, index[:, None].expand(-1, 5, -1))
-    poses, cost = ransac.search(near, count, f, c, draws, threshold_px=options.threshold_px)
+    poses, cost = ransac.search_hypotheses(near, count, f, c, draws, threshold_px=options.threshold_px)
     found, keep = cost[:, 0].isfinite(), cost.shape[1]
     used = torch.arange(index.shape[1], device=index.device) < count[:, None]
     near, used, fk, ck = (x.repeat_interleave(keep, 0) for x in (near, used, f, c))
     normal, cost_of = _truncated(near, used, fk, ck, threshold_px=options.threshold_px)
     flat = Pose(poses.R.flatten(0, 1), poses.t.flatten(0, 1))
-    flat, cost = minimise(normal, flat, options.local_optimisation, cost=cost_of, step=trial_step)
+    flat, cost = minimise(normal, flat, options.local_optimisation, cost=cost_of, step=trial_pose_step)
     best = cost.view(-1, keep).argmin(1) + keep * torch.arange(len(f), device=f.device)
     normal, cost_of = _truncated(
         points, usable, f, c, threshold_px=options.threshold_px, kernel=options.kernel, kernel_px=options.kernel_px
     )
-    T, _ = minimise(normal, flat[best], options.polish_steps, cost=cost_of, step=trial_step)
+    T, _ = minimise(normal, flat[best], options.polish_steps, cost=cost_of, step=trial_pose_step)
     return Pose(se3.orthonormal(T.R.double()), T.t.double()), found
 
 
@@ -295,7 +294,7 @@ def _truncated(
     threshold_px: float,
     kernel: str | None = None,
     kernel_px: float = 1.0,
-) -> tuple[Callable[[Pose], Normal], Callable[[Pose], Tensor]]:
+) -> tuple[Callable[[Pose], NormalEquations], Callable[[Pose], Tensor]]:
     """The cost that search and refinement share, Σ rho(min(r², threshold²)), points behind the camera in full: with its
     normal equations, and alone."""
     limits = torch.where(usable, threshold_px * threshold_px, 0.0).to(points.dtype)
@@ -305,14 +304,14 @@ def _truncated(
         square = (r * r).sum(1)
         return torch.where(depth > MIN_DEPTH, torch.minimum(square, limits), limits)
 
-    def normal(T: Pose) -> Normal:
+    def normal(T: Pose) -> NormalEquations:
         rows, depth = linearise(T, f, c, xyz, uv)
         square = truncated(rows[:, 6], depth)
-        rho, weight = robust(square, kernel, kernel_px)
-        return Normal(rho.sum(-1), *normal_equations(rows, torch.where(square < limits, weight, 0.0)))
+        rho, weight = robust_loss(square, kernel, kernel_px)
+        return NormalEquations(rho.sum(-1), *normal_equations(rows, torch.where(square < limits, weight, 0.0)))
 
     def cost(T: Pose) -> Tensor:
-        rho, _ = robust(truncated(*reprojection(T, f, c, xyz, uv)), kernel, kernel_px)
+        rho, _ = robust_loss(truncated(*reprojection_residuals(T, f, c, xyz, uv)), kernel, kernel_px)
         return rho.sum(-1)
 
     return normal, cost
@@ -418,20 +417,22 @@ def map_pose(
         near_steps=near_steps,
         steps=steps,
     )
-    problem = spared(_near_far, samples, tracks, camera_0, camera_1, isotropic)
-    return in_pieces(partial(spared, _fit_all, options, threshold_px), MAP_PAIRS, first, problem, tracks)
+    problem = run_without_grad(_pose_depth_problem, samples, tracks, camera_0, camera_1, isotropic)
+    return chunked_apply(
+        partial(run_without_grad, _fit_all, options, threshold_px), MAP_CHUNK_PAIRS, first, problem, tracks
+    )
 
 
-def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Problem, tracks: Tracks) -> PoseFit:
+def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: PoseDepthProblem, tracks: Tracks) -> PoseFit:
     N = tracks.uv_1.shape[1]
     eye = se3.identity(len(first.code), problem.f)
-    found = most_probable(problem.detach(), choose(first.ok, first.T_1_from_0.detach(), eye), o)
+    found = estimate_map_pose(problem.detach(), select_batch(first.ok, first.T_1_from_0.detach(), eye), o)
     # The last step, in float64 and with the graph on.
     problem = problem.to(torch.float64)
     found = pytree.tree_map(lambda x: x.double() if x.is_floating_point() else x, found)
     found = found._replace(at=found.at._replace(T=Pose(se3.orthonormal(found.at.T.R), found.at.T.t)))
     normal = partial(
-        near_far.normal,
+        reprojection_problem.pose_normal_equations,
         noise=found.noise,
         far_weight=found.far_weight,
         turn_precision=found.turn_precision,
@@ -439,10 +440,12 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Proble
         bend=o.bend,
     )
     _, H, g = normal(problem, found.at)
-    at, solved = near_far.step(found.at, H.detach(), g.detach())
+    at, solved = reprojection_problem.unknowns_step(found.at, H.detach(), g.detach())
     fixed = problem.detach()
     if has_graph(g):
-        at = near_far.moved(at, implicit(lambda xi: normal(fixed, near_far.moved(found.at, xi)).g, g))
+        at = reprojection_problem.retract_unknowns(
+            at, implicit_step(lambda xi: normal(fixed, reprojection_problem.retract_unknowns(found.at, xi)).g, g)
+        )
     with torch.no_grad():
         cov, known = pose_covariance(problem, found, o)
         finite = at.T.R.isfinite().flatten(1).all(1) & at.T.t.isfinite().all(1)
@@ -473,7 +476,9 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: Proble
     )
 
 
-def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera, isotropic: float) -> Problem:
+def _pose_depth_problem(
+    samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera, isotropic: float
+) -> PoseDepthProblem:
     """The tracks as planes, N' > 0 a multiple of ``SUM_LANES``; unused ones at a safe place."""
     usable = tracks.valid & all_finite(tracks.uv_1, -1) & all_finite(tracks.uv_0, -1)
     xyz, sigma = samples.xyz, samples.sigma.detach()
@@ -486,16 +491,16 @@ def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Came
     spread = torch.where(near, sigma, torch.ones_like(sigma)) / (z * z).detach()
     uv = torch.where(usable[..., None], tracks.uv_1, torch.zeros_like(tracks.uv_1))
     N = usable.shape[1]
-    padding = filled(N, SUM_LANES) - N
+    padding = round_up(N, SUM_LANES) - N
 
     def plane(x: Tensor, value: float = 0.0) -> Tensor:
         x = x.transpose(1, 2) if x.ndim == 3 else x
         return torch.nn.functional.pad(x, (0, padding), value=value)
 
-    shape = torch.stack(upper(shape), 1)
+    shape = torch.stack(upper_triangle(shape), 1)
     one = torch.eye(1, dtype=shape.dtype, device=shape.device).expand(1, padding)
     ends = torch.cat((one, 0 * one, one)).expand(len(shape), 3, padding)
-    return Problem(
+    return PoseDepthProblem(
         f=camera_1.f,
         c=camera_1.c,
         ray=plane(ray, 1.0),
@@ -508,12 +513,14 @@ def _near_far(samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Came
     )
 
 
-def _reprojection(problem: Problem, at: near_far.Unknowns, threshold_px: float) -> tuple[Tensor, Tensor]:
+def _reprojection(
+    problem: PoseDepthProblem, at: reprojection_problem.Unknowns, threshold_px: float
+) -> tuple[Tensor, Tensor]:
     """Near tracks (B, N) whose point, at the sensor's depth, falls close to where they were seen; rms px of these."""
     uv = problem.uv
     if at.turn is not None:
-        uv = near_far.straighten(uv, problem.f, problem.c, problem.ray[:, 1], at.turn)
-    r, depth = reprojection(at.T, problem.f, problem.c, problem.ray / problem.inverse[:, None], uv)
+        uv = reprojection_problem.undo_rolling_shutter(uv, problem.f, problem.c, problem.ray[:, 1], at.turn)
+    r, depth = reprojection_residuals(at.T, problem.f, problem.c, problem.ray / problem.inverse[:, None], uv)
     square = (r * r).sum(1)
     inlier = problem.near & (depth > MIN_DEPTH) & (square < threshold_px**2)
     return inlier, (torch.where(inlier, square, 0.0).sum(-1) / inlier.sum(-1).clamp_min(1)).sqrt()

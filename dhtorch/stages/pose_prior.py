@@ -16,25 +16,25 @@ from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import covariance, ransac, se3
 from dhtorch.geometry import pose_conventions as conventions
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.determinism import PRODUCT_LANES, filled
-from dhtorch.geometry.least_squares import MIN_DEPTH, choose, linearise
-from dhtorch.geometry.linalg import product
-from dhtorch.records import Camera, Frame, GivenPose, Pose, PoseFit, Samples, StartPose, Tracks
+from dhtorch.geometry.determinism import PRODUCT_LANES, round_up
+from dhtorch.geometry.least_squares import MIN_DEPTH, linearise, select_batch
+from dhtorch.geometry.linalg import small_matmul
+from dhtorch.records import Camera, Frame, InitialPose, Pose, PoseFit, PosePrior, Samples, Tracks
 
 #: Near returns by which it is told how a refuted pose was meant; more are thinned evenly.
-ASKED = 256
+MAX_CONVENTION_RETURNS = 256
 
 #: A near return is explained within so many standard deviations.
-BEND = 3.0
+INLIER_SIGMAS = 3.0
 
 #: Noise of a track, px, where nothing tells it.
-NOISE_PX = 1.0
+DEFAULT_TRACK_NOISE_PX = 1.0
 
 #: Factor on the standard deviations of seat 5: to first order, and blind to errors that all returns share.
-DOUBT = 3.0
+FIT_SIGMA_INFLATION = 3.0
 
 #: Translation in its own standard deviations below which there is none.
-MIN_T_SNR = 1.0
+MIN_PRIOR_T_SNR = 1.0
 
 
 class _Near(NamedTuple):
@@ -46,8 +46,8 @@ class _Near(NamedTuple):
     used: Tensor  # (B, N) bool
 
 
-def hold(
-    given: GivenPose,
+def check_pose_prior(
+    given: PosePrior,
     samples: Samples,
     tracks: Tracks,
     camera_0: Camera,
@@ -107,15 +107,15 @@ def hold(
         if given.cov is not None:
             finite = finite & given.cov.isfinite().flatten(1).all(1)
         near = _near(samples, tracks)
-        miss_px = (max_miss * camera_1.f.detach().amin(-1)).clamp_min(NOISE_PX)
-        own = choose(found.ok, found.T_1_from_0.detach().to(T.t.dtype), se3.identity(len(T.t), T.t))
-        stood = choose(finite, T.detach(), se3.identity(len(T.t), T.t))
+        miss_px = (max_miss * camera_1.f.detach().amin(-1)).clamp_min(DEFAULT_TRACK_NOISE_PX)
+        own = select_batch(found.ok, found.T_1_from_0.detach().to(T.t.dtype), se3.identity(len(T.t), T.t))
+        stood = select_batch(finite, T.detach(), se3.identity(len(T.t), T.t))
         own_cov = torch.where(found.ok[:, None, None], found.cov, 0.0).nan_to_num().to(T.t.dtype)
         xi = torch.where(found.ok[:, None], se3.log(se3.compose(own, se3.invert(stood))), 0.0)
         stated = None if given.cov is None else given.cov.detach().nan_to_num().to(T.t.dtype)
-        explained = _square(near, stood, camera_1, miss_px, stated) < BEND**2
+        explained = _square(near, stood, camera_1, miss_px, stated) < INLIER_SIGMAS**2
         still = found.code == PoseCode.NO_BASELINE
-        rigid = near.used & (_square(near, own, camera_1, miss_px, None) < BEND**2) & found.ok[:, None]
+        rigid = near.used & (_square(near, own, camera_1, miss_px, None) < INLIER_SIGMAS**2) & found.ok[:, None]
         rigid = rigid | (near.used & still[:, None])
         enough = rigid.sum(-1) >= min_near
         refuted = enough & ((explained & rigid).sum(-1) < min_explained * rigid.sum(-1))
@@ -127,14 +127,14 @@ def hold(
             cov = torch.where(found.ok[:, None, None], own_cov + xi[:, :, None] * xi[:, None], torch.diag(spread))
         else:
             cov = stated
-            far = covariance.mahalanobis(xi, stated + DOUBT**2 * own_cov) > max_deviation
+            far = covariance.mahalanobis(xi, stated + FIT_SIGMA_INFLATION**2 * own_cov) > max_deviation
             refuted, still = refuted | (enough & found.ok & far), torch.zeros_like(still)
         t_snr = _t_snr(T.t, cov[:, 3:, 3:])
         t_snr = torch.where(found.ok, torch.maximum(t_snr, found.t_snr.nan_to_num().to(t_snr)), t_snr)
         code = first_reason(
             (~finite, PoseCode.TOO_FEW),
             (refuted, PoseCode.REFUTED),
-            (still | ~(t_snr >= MIN_T_SNR), PoseCode.NO_BASELINE),
+            (still | ~(t_snr >= MIN_PRIOR_T_SNR), PoseCode.NO_BASELINE),
             (unknown, PoseCode.TOO_FEW),
             otherwise=PoseCode.OK,
         )
@@ -143,7 +143,7 @@ def hold(
         rms_px = (torch.where(inlier, square, 0.0).sum(-1) / inlier.sum(-1).clamp_min(1)).sqrt()
         looks = torch.zeros_like(code)
         if given.readings is not None:
-            looks = torch.where(refuted, _looks(near, given.readings, camera_1, rigid, miss_px), looks)
+            looks = torch.where(refuted, _matched_convention(near, given.readings, camera_1, rigid, miss_px), looks)
 
     def answer(x: Tensor) -> Tensor:
         return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan)
@@ -154,14 +154,14 @@ def hold(
         inlier=(inlier & ok[:, None])[:, :N],
         n_inlier=inlier.sum(-1),
         rms_px=answer(rms_px),
-        sigma_px=answer(torch.where(found.ok, found.sigma_px.to(rms_px), NOISE_PX)),
+        sigma_px=answer(torch.where(found.ok, found.sigma_px.to(rms_px), DEFAULT_TRACK_NOISE_PX)),
         t_snr=answer(t_snr),
         code=code,
         looks=looks,
     )
 
 
-def without(fit: PoseFit, held: PoseFit) -> PoseFit:
+def reject_poses(fit: PoseFit, held: PoseFit) -> PoseFit:
     """A fit without the poses that, ``held`` as given ones, were refuted or that nobody confirms, for that reason.
 
     Raises ValueError for wrong shapes. Gradient: to the poses that stay.
@@ -184,13 +184,13 @@ def without(fit: PoseFit, held: PoseFit) -> PoseFit:
     )
 
 
-def from_frames(
+def priors_from_frames(
     anchor: Frame,
     others: Frame,
     *,
     sigma: tuple[float, float] | None = None,
     refine: bool = False,
-) -> GivenPose:
+) -> PosePrior:
     """The motions that frames carry (``T_world_from_cam``), for the ``given`` of a method.
 
     Args:
@@ -214,32 +214,32 @@ def from_frames(
         world_0 = world_0.map(lambda x: x.expand(len(world_1.t), *x.shape))
     flat_0, flat_1 = (T.map(lambda x: x.flatten(0, 1)) if several else T for T in (world_0, world_1))
     # In float64: places far from the world's origin differ by little of their size.
-    made = between(flat_0, flat_1, sigma=sigma, refine=refine).to(anchor.camera.f.dtype)
+    made = relative_prior(flat_0, flat_1, sigma=sigma, refine=refine).to(anchor.camera.f.dtype)
     return made.map(lambda x: x.unflatten(0, world_1.t.shape[:2])) if several else made
 
 
-def between(
+def relative_prior(
     T_world_from_0: Pose,  # (B,)
     T_world_from_1: Pose,  # (B,)
     *,
     sigma: tuple[float, float] | None = None,
     cov: Tensor | None = None,  # (B, 6, 6) of T_1_from_0
     refine: bool = False,
-) -> GivenPose:
+) -> PosePrior:
     """A given motion of two poses in one world, with all its readings. Gradient: to poses and covariance."""
     T = se3.relative(T_world_from_0, T_world_from_1)
     back = se3.compose(T_world_from_1, se3.invert(T_world_from_0))
-    return stated(T, back, sigma=sigma, cov=cov, refine=refine)
+    return make_prior(T, back, sigma=sigma, cov=cov, refine=refine)
 
 
-def stated(
+def make_prior(
     T_1_from_0: Pose,  # (B,)
     other_way: Pose | None = None,  # (B,), None = its inverse
     *,
     sigma: tuple[float, float] | None = None,
     cov: Tensor | None = None,  # (B, 6, 6)
     refine: bool = False,
-) -> GivenPose:
+) -> PosePrior:
     """A given motion with all its readings; ``sigma``: standard deviations, rad and m, where ``cov`` is not given.
 
     Gradient: to poses and covariance.
@@ -248,8 +248,8 @@ def stated(
         spread = [sigma[0] ** 2] * 3 + [sigma[1] ** 2] * 3
         cov = torch.diag(torch.tensor(spread).to(T_1_from_0.t)).expand(len(T_1_from_0.t), 6, 6)
     back = se3.invert(T_1_from_0) if other_way is None else other_way
-    made = StartPose if refine else GivenPose
-    return made(T_1_from_0, cov, conventions.readings(T_1_from_0.detach(), back.detach()))
+    made = InitialPose if refine else PosePrior
+    return made(T_1_from_0, cov, conventions.pose_hypotheses(T_1_from_0.detach(), back.detach()))
 
 
 def _near(samples: Samples, tracks: Tracks) -> _Near:
@@ -257,7 +257,7 @@ def _near(samples: Samples, tracks: Tracks) -> _Near:
     points = torch.cat((samples.xyz, tracks.uv_1, samples.sigma[..., None]), -1).detach().transpose(1, 2)
     used = tracks.valid & points.isfinite().all(1) & (points[:, 2] > 0)
     points = torch.where(used[:, None], points, torch.zeros_like(points))
-    more = (0, filled(used.shape[1], PRODUCT_LANES) - used.shape[1])
+    more = (0, round_up(used.shape[1], PRODUCT_LANES) - used.shape[1])
     points, used = torch.nn.functional.pad(points, more), torch.nn.functional.pad(used, more)
     return _Near(points[:, :3], points[:, 3:5], points[:, 5], used)
 
@@ -274,18 +274,18 @@ def _square(near: _Near, T: Pose, camera: Camera, miss_px: Tensor | None, cov: T
     a, b, c = slope[:, 0] ** 2, slope[:, 0] * slope[:, 1], slope[:, 1] ** 2
     if cov is not None:
         J = rows[:, :6].permute(0, 3, 2, 1)  # (B, N, 2, 6)
-        S = (product(J, cov[:, None])[..., None, :] * J[..., None, :, :]).sum(-1)
+        S = (small_matmul(J, cov[:, None])[..., None, :] * J[..., None, :, :]).sum(-1)
         a, b, c = a + S[..., 0, 0], b + S[..., 0, 1], c + S[..., 1, 1]
-    floor = (miss_px / BEND)[:, None] ** 2
+    floor = (miss_px / INLIER_SIGMAS)[:, None] ** 2
     a, c = a + floor, c + floor
     square = (c * x * x - 2 * b * x * y + a * y * y) / (a * c - b * b)
     return torch.where((depth > MIN_DEPTH) & near.used, square, torch.inf)
 
 
-def _looks(near: _Near, readings: Pose, camera: Camera, rigid: Tensor, miss_px: Tensor) -> Tensor:
+def _matched_convention(near: _Near, readings: Pose, camera: Camera, rigid: Tensor, miss_px: Tensor) -> Tensor:
     """Which reading (B,) explains most of the near returns that move rigidly, and at least half; 0 = none."""
     B, K = readings.t.shape[:2]
-    index, count = ransac.usable_first(rigid, min(ASKED, rigid.shape[1]))
+    index, count = ransac.usable_first(rigid, min(MAX_CONVENTION_RETURNS, rigid.shape[1]))
     slot = torch.arange(index.shape[1], device=index.device) < count[:, None]
 
     def thin(x: Tensor) -> Tensor:
@@ -295,8 +295,12 @@ def _looks(near: _Near, readings: Pose, camera: Camera, rigid: Tensor, miss_px: 
     fewer = _Near(thin(near.xyz), thin(near.uv), thin(near.sigma), slot.repeat_interleave(K, 0))
     flat = readings.map(lambda x: x.flatten(0, 1).to(near.xyz.dtype))
     camera = camera.map(lambda x: x.repeat_interleave(K, 0))
-    square = _square(fewer, flat, camera, miss_px.repeat_interleave(K, 0), None).clamp(max=BEND**2).nan_to_num(BEND**2)
-    missed = torch.where(fewer.used, square, 0.0).sum(-1).view(B, K) / (BEND**2 * count.clamp_min(1))[:, None]
+    square = (
+        _square(fewer, flat, camera, miss_px.repeat_interleave(K, 0), None)
+        .clamp(max=INLIER_SIGMAS**2)
+        .nan_to_num(INLIER_SIGMAS**2)
+    )
+    missed = torch.where(fewer.used, square, 0.0).sum(-1).view(B, K) / (INLIER_SIGMAS**2 * count.clamp_min(1))[:, None]
     best = (missed <= missed.amin(-1, keepdim=True) + 0.05).int().argmax(-1)  # the simplest of those that fit alike
     fits = (missed.gather(-1, best[:, None])[:, 0] < 0.5) & (count > 0)
     return torch.where(fits, best, 0).to(torch.int32)

@@ -88,7 +88,7 @@ def _arms(
     return _polar(box, 2 * math.pi * turns * s.sqrt() + math.pi * arm, s**foveation, inner_px)
 
 
-def vogel(
+def vogel_spiral(
     hw: tuple[int, int],
     n: int = 2048,
     *,
@@ -108,7 +108,7 @@ def vogel(
     return uv.to(device=device, dtype=dtype)
 
 
-def grid(
+def regular_grid(
     hw: tuple[int, int],
     n: int = 2048,
     *,

@@ -15,18 +15,18 @@ from torch import Tensor, nn
 
 from dhtorch.codes import Gate
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.determinism import steady
+from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.records import Estimate, PoseFit, Samples, Tracks
 from dhtorch.runtime import storage
 
 #: The pose's part of a variance is subtracted from the whole; no own part is believed to be a smaller share of it.
-OWN_SHARE = 1e-6
+MIN_SCORED_OWN_RATIO = 1e-6
 
 #: Relative errors and ratios beyond these limits are not told apart: their squares stay in the range of float32.
-SMALLEST, LARGEST = 1e-6, 1e6
+MIN_RATIO, MAX_RATIO = 1e-6, 1e6
 
 #: What a learned score looks at, each as a logarithm, with the limits beyond which values are not told apart.
-EVIDENCE: dict[str, tuple[float, float]] = {
+SCORE_FEATURES: dict[str, tuple[float, float]] = {
     "expected_error": (1e-5, 1e2),  # e of rank_by_error
     "shared_error": (1e-5, 1e2),  # the pose's part of sigma / depth
     "parallax_deg": (1e-3, 1e2),
@@ -38,13 +38,13 @@ EVIDENCE: dict[str, tuple[float, float]] = {
 }
 
 #: The largest factor, as a logarithm, by which a learned score changes the error to expect.
-MOST = 4.0
+MAX_LOG_FACTOR = 4.0
 
 #: Residual and round trip, px, that count as much as a track's own noise.
-RESIDUAL_PX, ROUND_TRIP_PX = 0.5, 0.4
+SCORE_RESIDUAL_PX, SCORE_ROUND_TRIP_PX = 0.5, 0.4
 
 
-def rank(
+def confidence(
     estimate: Estimate,
     samples: Samples,
     tracks: Tracks,
@@ -84,15 +84,15 @@ def rank(
     return _silence(estimate, score, min_score)
 
 
-def rank_by_error(
+def confidence_from_error(
     estimate: Estimate,
     samples: Samples,
     tracks: Tracks,
     fit: PoseFit,
     *,
-    residual_scale_px: float = RESIDUAL_PX,
+    residual_scale_px: float = SCORE_RESIDUAL_PX,
     photometric_scale: float | None = None,
-    round_trip_scale_px: float | None = ROUND_TRIP_PX,
+    round_trip_scale_px: float | None = SCORE_ROUND_TRIP_PX,
     half_error: float = 0.1,
     recalibration: Callable[[Tensor], Tensor] | None = None,
     min_score: float = 0.0,
@@ -137,7 +137,7 @@ def rank_by_error(
     return _silence(estimate, score, min_score)
 
 
-def rank_by_sigma(
+def confidence_from_sigma(
     estimate: Estimate,
     samples: Samples,
     tracks: Tracks,
@@ -155,7 +155,7 @@ def rank_by_sigma(
     Args:
         estimate: from ``fuse``, or from seat 6 (one view).
         samples, tracks, fit: part of the seat's signature; this score does not read them.
-        half_error, recalibration, min_score: as in :func:`rank_by_error`.
+        half_error, recalibration, min_score: as in :func:`confidence_from_error`.
 
     Returns:
         Estimate with ``score`` in [0, 1], 0 where silent or where no error can be stated.
@@ -169,7 +169,7 @@ def rank_by_sigma(
     stated = estimate.keep & (estimate.depth > 0) & estimate.sigma.isfinite()
     depth = torch.where(stated, estimate.depth, torch.ones_like(estimate.depth))
     sigma = torch.where(stated, estimate.sigma, torch.ones_like(estimate.sigma))
-    expected = (sigma / depth).clamp(max=LARGEST) / (estimate.n_views - 1).clamp_min(1).to(depth).sqrt()
+    expected = (sigma / depth).clamp(max=MAX_RATIO) / (estimate.n_views - 1).clamp_min(1).to(depth).sqrt()
     zero = torch.zeros_like(expected)
     score = torch.where(stated, half_error / (half_error + expected), zero)
     if recalibration is not None:
@@ -177,8 +177,8 @@ def rank_by_sigma(
     return _silence(estimate, score, min_score)
 
 
-def evidence(estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit) -> tuple[Tensor, Tensor]:
-    """What speaks for and against every answer: logarithms (B, N, 8) in the order of :data:`EVIDENCE`.
+def score_features(estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit) -> tuple[Tensor, Tensor]:
+    """What speaks for and against every answer: logarithms (B, N, 8) in the order of :data:`SCORE_FEATURES`.
 
     Returns:
         The logarithms, 0 where there is no answer with a sigma, and a mask (B, N) of where there is.
@@ -189,7 +189,7 @@ def evidence(estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit)
     Gradient: to depth, sigma, parallax and residual; zero beyond the limits and where there is no answer.
     """
     check("evidence", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
-    terms = [(estimate.residual_px, RESIDUAL_PX), (tracks.error, ROUND_TRIP_PX)]
+    terms = [(estimate.residual_px, SCORE_RESIDUAL_PX), (tracks.error, SCORE_ROUND_TRIP_PX)]
     expected, stated = _expected_error(estimate, terms)
     others = (estimate.parallax_deg, estimate.residual_px, tracks.error, tracks.photometric, samples.trackability)
     for x in others:
@@ -201,16 +201,18 @@ def evidence(estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit)
     reach = depth / torch.where(near > 0, near, torch.ones_like(near))
     shared = torch.where(stated, estimate.sigma_shared, zero) / depth
     columns = (expected, shared, *(torch.where(stated, x, one) for x in others), reach)
-    logs = [steady(torch.log, x.clamp(*limits)) for x, limits in zip(columns, EVIDENCE.values(), strict=True)]
+    logs = [
+        pad_elementwise(torch.log, x.clamp(*limits)) for x, limits in zip(columns, SCORE_FEATURES.values(), strict=True)
+    ]
     return torch.stack([torch.where(stated, x, zero) for x in logs], -1), stated
 
 
 class LearnedScore(nn.Module):
     """A seat-7 function with weights: h / (h + e), e the relative error that the evidence lets expect.
 
-    e = exp(g(x)) times the error that :func:`rank_by_error` expects, g a network with one hidden layer. Untrained, g is
-    0 and the score that of ``rank_by_error``. Train it on answers with truth by :func:`expected_error_loss`; it travels
-    as JSON or, through ``state_dict``, as any module does.
+    e = exp(g(x)) times the error that :func:`confidence_from_error` expects, g a network with one hidden layer.
+    Untrained, g is 0 and the score that of ``confidence_from_error``. Train it on answers with truth by
+    :func:`expected_error_loss`; it travels as JSON or, through ``state_dict``, as any module does.
 
     Args:
         hidden: width of the hidden layer.
@@ -218,7 +220,7 @@ class LearnedScore(nn.Module):
         min_score: answers below it are silenced with LOW_SCORE.
         seed: of the first layer's weights.
 
-    Gradient: to the weights, and to what :func:`evidence` passes on; the threshold carries none.
+    Gradient: to the weights, and to what :func:`score_features` passes on; the threshold carries none.
     """
 
     mean: Tensor
@@ -226,7 +228,7 @@ class LearnedScore(nn.Module):
 
     def __init__(self, hidden: int = 16, *, half_error: float = 0.1, min_score: float = 0.0, seed: int = 0) -> None:
         super().__init__()
-        n = len(EVIDENCE)
+        n = len(SCORE_FEATURES)
         start = torch.rand(hidden, n + 1, generator=torch.Generator().manual_seed(seed)) * 2 - 1
         self.register_buffer("mean", torch.zeros(n))  # of the evidence it is trained on
         self.register_buffer("spread", torch.ones(n))
@@ -239,8 +241,8 @@ class LearnedScore(nn.Module):
 
     def forward(self, estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit) -> Estimate:
         """The estimate with its score; 0 where silent or where no error can be stated."""
-        x, stated = evidence(estimate, samples, tracks, fit)
-        e = steady(torch.exp, self.log_error(x))
+        x, stated = score_features(estimate, samples, tracks, fit)
+        e = pad_elementwise(torch.exp, self.log_error(x))
         zero = torch.zeros_like(e)
         score = torch.where(stated, self.half_error / (self.half_error + e), zero)
         return _silence(estimate, score, self.min_score)
@@ -259,14 +261,14 @@ class LearnedScore(nn.Module):
         more = self.last_bias.to(x).expand(x.shape[:-1])
         for k, weight in enumerate(self.last.to(x).unbind()):
             more = more + weight * hidden[..., k]
-        return x[..., 0] + MOST * more / (MOST + more.abs())
+        return x[..., 0] + MAX_LOG_FACTOR * more / (MAX_LOG_FACTOR + more.abs())
 
     def to_json(self) -> str:
         """Everything as strict JSON: weights, options and where they come from. Nothing in it can be executed."""
         weights = {k: v.tolist() for k, v in self.state_dict().items()}
         options = {"half_error": self.half_error, "min_score": self.min_score}
-        content = {"evidence": [*EVIDENCE], **options, "weights": weights, "provenance": self.provenance}
-        return storage.dumps(content, indent=1) + "\n"
+        content = {"evidence": [*SCORE_FEATURES], **options, "weights": weights, "provenance": self.provenance}
+        return storage.dump_strict_json(content, indent=1) + "\n"
 
     @classmethod
     def from_json(cls, text: str, where: str = "learned score") -> Self:
@@ -276,8 +278,8 @@ class LearnedScore(nn.Module):
             ValueError: not strict JSON, other evidence, or weights of another shape; the message names ``where``.
         """
         try:
-            content = storage.loads(text)
-            if content["evidence"] != [*EVIDENCE]:
+            content = storage.parse_strict_json(text)
+            if content["evidence"] != [*SCORE_FEATURES]:
                 raise ValueError(f"evidence is {content['evidence']}")
             weights = {k: torch.tensor(v, dtype=torch.float32) for k, v in content["weights"].items()}
             half_error, min_score = float(content["half_error"]), float(content["min_score"])
@@ -286,7 +288,9 @@ class LearnedScore(nn.Module):
             found.provenance = dict(content["provenance"])
         except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
             why = " ".join(str(error).split())
-            raise ValueError(f"{where}: found {why}, expected a learned score on {', '.join(EVIDENCE)}") from error
+            raise ValueError(
+                f"{where}: found {why}, expected a learned score on {', '.join(SCORE_FEATURES)}"
+            ) from error
         return found
 
     def save(self, path: str | Path) -> Path:
@@ -326,12 +330,14 @@ def _expected_error(estimate: Estimate, terms: list[tuple[Tensor, float]]) -> tu
         stated = stated & x.isfinite()
     one, zero = torch.ones_like(depth), torch.zeros_like(depth)
     inverse = 1 / torch.where(stated, depth, one)
-    whole = (torch.where(stated, whole, one) * inverse).clamp(max=LARGEST)
-    shared = (torch.where(stated, shared, zero) * inverse).clamp(max=LARGEST)
-    own = torch.maximum(whole * whole - shared * shared, OWN_SHARE * whole * whole).clamp_min(SMALLEST * SMALLEST)
+    whole = (torch.where(stated, whole, one) * inverse).clamp(max=MAX_RATIO)
+    shared = (torch.where(stated, shared, zero) * inverse).clamp(max=MAX_RATIO)
+    own = torch.maximum(whole * whole - shared * shared, MIN_SCORED_OWN_RATIO * whole * whole).clamp_min(
+        MIN_RATIO * MIN_RATIO
+    )
     spread = one
     for x, scale in terms:
-        ratio = (torch.where(stated, x, zero) / scale).clamp(max=LARGEST)
+        ratio = (torch.where(stated, x, zero) / scale).clamp(max=MAX_RATIO)
         spread = spread + ratio * ratio
     return (own * spread).sqrt(), stated
 

@@ -14,23 +14,29 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.geometry import affine_alignment as affine
+from dhtorch.geometry import affine_alignment
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.checks import check, perhaps_any
-from dhtorch.geometry.coarse_flow import Flow, inverse, is_turned, turned, upright
-from dhtorch.geometry.determinism import filled
-from dhtorch.geometry.inference_mode import spared
-from dhtorch.geometry.linalg import product
-from dhtorch.geometry.pyramid import Pyramid, Pyramids, build_pyramid
+from dhtorch.geometry.checks import any_possible, check
+from dhtorch.geometry.coarse_flow import (
+    CoarseFlow,
+    apply_similarity,
+    invert_similarity,
+    is_not_identity,
+    undo_similarity,
+)
+from dhtorch.geometry.determinism import round_up
+from dhtorch.geometry.inference_mode import run_without_grad
+from dhtorch.geometry.linalg import small_matmul
+from dhtorch.geometry.pyramid import Pyramid, PyramidCache, build_pyramid
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
 #: A search from a coarse flow begins on the first level (the second at least) whose windows are so many times as wide
 #: as the flow's cells are apart there: four small pixels, of which a cell is about five.
-REACH = 0.8
+START_LEVEL_MARGIN = 0.8
 
 #: Smallest eigenvalue of A per pixel of the window below which it is not tracked: 1e-4 of cv2, which sums gradients
 #: of 8-bit images scaled by 2^-5.
-MIN_EIGENVALUE = 1e-4 * 2**10 / 255**2
+MIN_TRACK_EIGENVALUE = 1e-4 * 2**10 / 255**2
 
 
 def lucas_kanade(
@@ -45,8 +51,8 @@ def lucas_kanade(
     epsilon_px: float = 0.01,
     max_round_trip_px: float = 1.0,
     normalise: str = "none",
-    min_eigenvalue: float = MIN_EIGENVALUE,
-    start: Callable[..., Flow] | None = None,
+    min_eigenvalue: float = MIN_TRACK_EIGENVALUE,
+    start: Callable[..., CoarseFlow] | None = None,
 ) -> Tracks:
     """Track points from image 0 to image 1 and back; a track that does not return to its start is not valid.
 
@@ -84,7 +90,7 @@ def lucas_kanade(
         ValueError: wrong shapes or options, an image no larger than the window, pyramids of another image.
 
     Gradient: the search has none. When an image or ``uv_0`` requires it, valid points take one more, differentiable
-    step (:func:`refine`); all other fields are detached.
+    step (:func:`refine_tracks`); all other fields are detached.
 
     Source: Lucas and Kanade 1981; Bouguet 2000 (pyramid); Baker and Matthews 2004 (inverse composition); checked
     against ``cv2.calcOpticalFlowPyrLK`` (``tests/stages/test_track.py``).
@@ -112,10 +118,10 @@ def lucas_kanade(
     levels = levels if hint.levels is None else hint.levels
     with torch.no_grad():
         source = _source(hint, image_0, levels, window)
-        flows = coarse(image_0, image_1, hint, start)
-        view = None if flows is None else _Upright(image_1, flows)
+        flows = resolve_coarse_flow(image_0, image_1, hint, start)
+        view = None if flows is None else _DerotatedImage(image_1, flows)
         target = build_pyramid(image_1 if view is None else view.image, levels, window)
-        tracks = spared(
+        tracks = run_without_grad(
             _there_and_back,
             source,
             target,
@@ -123,12 +129,12 @@ def lucas_kanade(
             o,
             init=hint.start if view is None else view.begin(uv_0.detach(), hint.start),
             homewards=None if view is None else view.back,
-            near_levels=levels if flows is None else _reaching(flows[0], source.hw(), window),
+            near_levels=levels if flows is None else _levels_for_flow(flows[0], source.hw(), window),
             limit_px=max_round_trip_px,
         )
         tracks = tracks if view is None else view.to_image(tracks)
     if torch.is_grad_enabled() and (image_0.requires_grad or image_1.requires_grad or uv_0.requires_grad):
-        uv_1 = refine(
+        uv_1 = refine_tracks(
             image_0, image_1, uv_0, tracks.uv_1, window=window, normalise=normalise, min_eigenvalue=min_eigenvalue
         )
         if view is not None:  # a step through image 1 as it is says nothing of a window that is changed there
@@ -137,7 +143,7 @@ def lucas_kanade(
     return tracks
 
 
-def refine(
+def refine_tracks(
     image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     image_1: Tensor,  # (B, C, H', W')
     uv_0: Tensor,  # (B, N, 2) px
@@ -145,7 +151,7 @@ def refine(
     *,
     window: int = 21,
     normalise: str = "none",
-    min_eigenvalue: float = MIN_EIGENVALUE,
+    min_eigenvalue: float = MIN_TRACK_EIGENVALUE,
 ) -> Tensor:
     """One differentiable Gauss-Newton step from ``uv_1``: the position (B, N, 2) as a function of the images.
 
@@ -165,53 +171,53 @@ def refine(
     target = build_pyramid(image_1, 1, window, gradients=False)
     B, N, _ = uv_0.shape
     x, x_1 = (uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, B * N) for uv in (uv_0, uv_1.detach()))
-    usable = lk.within(x, *source.bounds(0)) & lk.within(x_1, *target.bounds(0))
+    usable = lk.is_between(x, *source.bounds(0)) & lk.is_between(x_1, *target.bounds(0))
     start = _finite(x_1)
     x, x_1 = (torch.where(usable, y, torch.zeros_like(y)) for y in (x, x_1))
     batch = torch.arange(B, device=x.device).repeat_interleave(N)
     o = lk.SearchOptions(window, 1, 0.0, min_eigenvalue, normalise)
-    step, textured = lk.step(source, target, o, x, x_1, batch)
+    step, textured = lk.lucas_kanade_step(source, target, o, x, x_1, batch)
     found = start - torch.where(usable & textured, step, torch.zeros_like(step))
     return found.reshape(2, B, N).permute(1, 2, 0).to(uv_0.dtype)
 
 
-def coarse(
-    image_0: Tensor, image_1: Tensor, hint: TrackHint, start: Callable[..., Flow] | None
-) -> tuple[Flow, Flow] | None:
+def resolve_coarse_flow(
+    image_0: Tensor, image_1: Tensor, hint: TrackHint, start: Callable[..., CoarseFlow] | None
+) -> tuple[CoarseFlow, CoarseFlow] | None:
     """The coarse motion of the pictures there and back: the hint's, else what ``start`` says, else none."""
     if hint.flows is not None or start is None:
         return hint.flows
     there = start(image_0, image_1)
-    return there, start(image_1, image_0, linear=inverse(there.linear))
+    return there, start(image_1, image_0, linear=invert_similarity(there.linear))
 
 
-class _Upright:
+class _DerotatedImage:
     """Image 1 with the turn, zoom and gain of its pair undone, and the ways between the two."""
 
-    def __init__(self, image: Tensor, flows: tuple[Flow, Flow]) -> None:
+    def __init__(self, image: Tensor, flows: tuple[CoarseFlow, CoarseFlow]) -> None:
         self.hw = image.shape[-2], image.shape[-1]
         self.flows, self.linear = flows, flows[0].linear
-        self.turned = is_turned(self.linear)
+        self.turned = is_not_identity(self.linear)
         self.changed = self.turned | (flows[0].gain != 1)
         # Under a compiler, which sees no values, everything is undone, if it be nothing.
-        undo = perhaps_any(self.changed)
-        self.image = upright(image, self.linear, flows[0].gain) if undo else image
+        undo = any_possible(self.changed)
+        self.image = undo_similarity(image, self.linear, flows[0].gain) if undo else image
 
     def begin(self, uv_0: Tensor, known: Tensor | None) -> Tensor:
         """Where to look in the upright picture for pixels (B, N, 2) of image 0; ``known`` in image 1 goes before."""
         uv_1 = self.flows[0].at(uv_0) if known is None else known
-        return turned(inverse(self.linear), uv_1, self.hw)
+        return apply_similarity(invert_similarity(self.linear), uv_1, self.hw)
 
     def back(self, uv: Tensor) -> Tensor:
         """Where to look in image 0 for pixels (B, N, 2) of the upright picture."""
-        return self.flows[1].at(turned(self.linear, uv, self.hw))
+        return self.flows[1].at(apply_similarity(self.linear, uv, self.hw))
 
     def to_image(self, tracks: Tracks) -> Tracks:
         """Tracks to the upright picture as tracks to image 1."""
         A = self.linear.to(tracks.cov)[:, None]
-        uv_1 = turned(self.linear, tracks.uv_1, self.hw)
+        uv_1 = apply_similarity(self.linear, tracks.uv_1, self.hw)
         inside = ((uv_1 >= -0.5) & (uv_1 <= uv_1.new_tensor([self.hw[1] - 0.5, self.hw[0] - 0.5]))).all(-1)
-        cov = torch.where(self.turned[:, None, None, None], product(product(A, tracks.cov), A.mT), tracks.cov)
+        cov = torch.where(self.turned[:, None, None, None], small_matmul(small_matmul(A, tracks.cov), A.mT), tracks.cov)
         return tracks.replace(uv_1=uv_1, cov=cov, valid=tracks.valid & (inside | ~self.turned[:, None]))
 
 
@@ -228,7 +234,7 @@ def _there_and_back(
 ) -> Tracks:
     """Tracks of all points, laid out in one row (2, M), filled up to whole ``LANES`` by points outside the image."""
     B, N, _ = uv_0.shape
-    fill = filled(B * N) - B * N
+    fill = round_up(B * N) - B * N
 
     def row(uv: Tensor) -> Tensor:
         return F.pad(uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, B * N), (0, fill), value=-2.0)
@@ -241,12 +247,12 @@ def _there_and_back(
     d = torch.zeros_like(x) if init is None else row(init) - x
     given = d.isfinite().all(0)
     d = torch.where(given, d, torch.zeros_like(d))
-    known = lk.within(x, *source.bounds(0))
+    known = lk.is_between(x, *source.bounds(0))
     elsewhere = _finite(x) + d
     x = torch.where(known, x, torch.zeros_like(x))
     batch = F.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
 
-    search = partial(lk.search, o=o, alike=init is None, near_levels=near_levels)
+    search = partial(lk.search_displacements, o=o, alike=init is None, near_levels=near_levels)
 
     def back(x: Tensor, d: Tensor, batch: Tensor, known: Tensor, begun: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return search(target, source, x=x, d=d, batch=batch, known=known, begun=begun)
@@ -258,9 +264,9 @@ def _there_and_back(
         given = begin.isfinite().all(0)
         begin = torch.where(given, begin, torch.zeros_like(begin))
     nothing = torch.zeros_like(d), torch.zeros_like(found), torch.zeros_like(A)
-    backward, returned, _ = lk.for_some(found, back, nothing, (x + forward, begin, batch, found, given))
+    backward, returned, _ = lk.masked_apply(found, back, nothing, (x + forward, begin, batch, found, given))
     error = (forward + backward).square().sum(0).sqrt()
-    squares = lk.squares(source, target, o, x, forward, batch)
+    squares = lk.squared_differences(source, target, o, x, forward, batch)
     return Tracks(
         uv_0=uv_0,
         uv_1=grid(torch.where(known, x + forward, elsewhere)),
@@ -271,11 +277,11 @@ def _there_and_back(
     )
 
 
-def _reaching(flow: Flow, hw: tuple[int, int], window: int) -> int:
+def _levels_for_flow(flow: CoarseFlow, hw: tuple[int, int], window: int) -> int:
     """How many levels a search needs that starts where a coarse flow says: until a window reaches as far as that may
     be wrong."""
     cell_px = max(n / cells for n, cells in zip(hw, flow.support.shape[1:], strict=True))
-    return max(2, 1 + math.ceil(math.log2(REACH * cell_px / window)))
+    return max(2, 1 + math.ceil(math.log2(START_LEVEL_MARGIN * cell_px / window)))
 
 
 def _finite(x: Tensor) -> Tensor:
@@ -311,7 +317,7 @@ def lucas_kanade_affine(
     iterations: int = 7,
     epsilon_px: float = 0.01,
     max_shift_px: float = 2.0,
-    start: Callable[..., Flow] | None = None,
+    start: Callable[..., CoarseFlow] | None = None,
 ) -> Tracks:
     """Track as ``track`` does, then register every window once more, free to shear and to change its brightness.
 
@@ -321,7 +327,7 @@ def lucas_kanade_affine(
         window: of the registration; the search has its own.
         levels: of the search, where it follows hints.
         iterations, epsilon_px, max_shift_px: of the registration, see
-            :func:`dhtorch.geometry.affine_alignment.register`.
+            :func:`dhtorch.geometry.affine_alignment.register_affine`.
         start: as in :func:`lucas_kanade`; ``track`` finds its answer in the hint, and the registration begins with its
             turn and zoom.
 
@@ -340,13 +346,13 @@ def lucas_kanade_affine(
     check("lucas_kanade_affine", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), start=(hint.start, "B N 2"))
     check("lucas_kanade_affine", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     with torch.no_grad():
-        known = Pyramids(image_0) if hint.pyramid is None else hint.pyramid
+        known = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
         levels = levels if hint.levels is None else hint.levels
         source = _source(hint.replace(pyramid=known), image_0, levels, window)
-        flows = coarse(image_0, image_1, hint, start)
+        flows = resolve_coarse_flow(image_0, image_1, hint, start)
         tracks = track(image_0, image_1, uv_0, hint=TrackHint(hint.start, known, levels, flows))
         target = build_pyramid(image_1, 2, window, gradients=False)
-        found = affine.register(
+        found = affine_alignment.register_affine(
             source,
             target,
             uv_0,
@@ -370,7 +376,7 @@ def lucas_kanade_affine(
         )
     if torch.is_grad_enabled() and (image_0.requires_grad or image_1.requires_grad or uv_0.requires_grad):
         source, target = build_pyramid(image_0, 1, window), build_pyramid(image_1, 1, window)
-        again = affine.step(source, target, uv_0, tracks.uv_1, found.linear, window=window)
+        again = affine_alignment.registration_step(source, target, uv_0, tracks.uv_1, found.linear, window=window)
         # The value is the search's, bit for bit; the step lends its derivative.
         return tracks.replace(uv_1=torch.where(tracks.valid[..., None], uv_1 + (again - again.detach()), uv_1))
     return tracks

@@ -12,9 +12,9 @@ from dhtorch.codes import Gate, Hole, PoseCode, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar
 from dhtorch.geometry.checks import all_finite, check
-from dhtorch.geometry.covariance import median, noise_shape
-from dhtorch.geometry.free_space import within_reach
-from dhtorch.geometry.reprojection_problem import straighten
+from dhtorch.geometry.covariance import masked_median, noise_shape
+from dhtorch.geometry.free_space import free_space_violations
+from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
 
 #: Least trackability that a grey difference is divided by.
@@ -75,7 +75,7 @@ def two_view(
         max_far_noise: spread of the far tracks' residuals, of a ray with z = 1, above which the near returns are taken
             to move on their own and no point of the pair is answered; None asks nothing.
         max_in_reach: share of the answers that may lie where the sensor would have seen them
-            (:func:`dhtorch.geometry.free_space.within_reach`); with more, none is given. None asks nothing.
+            (:func:`dhtorch.geometry.free_space.free_space_violations`); with more, none is given. None asks nothing.
         fitted_noise: take the scale of the tracks' noise from the pose's residuals (``fit.sigma_px``), and from the
             tracks' covariances only its shape; else the covariances as they are.
         isotropic: share of that shape which does not depend on the patch, see ``covariance.noise_shape``.
@@ -115,7 +115,7 @@ def two_view(
     if fit.shutter is not None:
         y = cam.rays(cam.ideal(camera_0), uv_0)[..., 1]
         turn = torch.where(posed, fit.shutter.turn, torch.zeros_like(fit.shutter.turn))
-        uv_1 = straighten(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, turn).transpose(1, 2)
+        uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, turn).transpose(1, 2)
     geometry = solver(uv_0, uv_1, camera_0, camera_1, _stand_in(fit))
     parallax_deg = geometry.parallax * (180 / math.pi)
     mismatch = grey / texture.clamp_min(MIN_TRACKABILITY).sqrt()
@@ -146,7 +146,7 @@ def two_view(
     if max_in_reach is not None:
         seen = torch.where(samples.usable, samples.depth, torch.zeros_like(samples.depth))
         asked = (gate == Gate.ANSWER) & (samples.hole == Hole.TRACKABLE_NO_LIDAR)
-        share = within_reach(samples.uv, seen, fit.inlier, asked, geometry.depth, sigma)
+        share = free_space_violations(samples.uv, seen, fit.inlier, asked, geometry.depth, sigma)
         moving = moving | (share > max_in_reach)
     gate = torch.where((gate == Gate.ANSWER) & moving[:, None], Gate.CONTRADICTED, gate)
     keep, measured = gate == Gate.ANSWER, tracked & posed
@@ -175,7 +175,7 @@ def _relative_noise(samples: Samples, fit: PoseFit) -> Tensor:
     """Median sigma / depth (B, 1) of the near points that hold the pose; 0 where there are none."""
     used = fit.inlier & (samples.depth > 0)
     relative = samples.sigma / torch.where(used, samples.depth, torch.ones_like(samples.depth))
-    return torch.where(used.any(-1, keepdim=True), median(relative, used), 0.0)
+    return torch.where(used.any(-1, keepdim=True), masked_median(relative, used), 0.0)
 
 
 def _fitted(cov: Tensor, tracked: Tensor, fit: PoseFit, isotropic: float) -> Tensor:

@@ -15,177 +15,179 @@ import torch
 from torch import Generator, Tensor
 
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.filters import gaussian
-from dhtorch.geometry.patches import magnified
+from dhtorch.geometry.filters import gaussian_blur
+from dhtorch.geometry.patches import rescale_field_of_view
 
 #: Scales of a map that is otherwise right, and the shift of one, m.
-SCALES, SHIFT = (0.8, 1.25), 0.15
+_SCALE_FACTORS, _SHIFT_M = (0.8, 1.25), 0.15
 
 #: Tilt: share of the depth from one side of the picture to the other.
-TILT = 0.10
+_TILT_SHARE = 0.10
 
 #: Standard deviations of low-frequency warps, of log depth, and how many waves they have across the picture at most.
-WARPS, WAVES = (0.013, 0.05), 2.5
+_WARP_SIGMAS, _MAX_WARP_WAVES = (0.013, 0.05), 2.5
 
 #: Standard deviation of the blur that mixes both sides of an edge, as a share of the width.
-BLUR = 0.012
+_BLUR_SIGMA_REL = 0.012
 
 #: Local jumps: so many objects moved away by this factor (0.6 m → 1.8 m), each of pixels within a share of the width
 #: whose depth differs little from that of the middle.
-JUMPS, JUMP, OBJECT, SAME = 3, 3.0, 0.12, 0.08
+_N_JUMPS, _JUMP_FACTOR, _JUMP_RADIUS_REL, _JUMP_MAX_LOG_STEP = 3, 3.0, 0.12, 0.08
 
 #: Inventions: so many discs of this radius (share of the width) are cut out and filled smoothly, off by this at most.
-DISCS, DISC, INVENTED = 4, 0.10, 0.25
+_N_DISCS, _DISC_RADIUS_REL, _MAX_INVENTED_REL = 4, 0.10, 0.25
 
 #: Structured light: disparities of f · baseline / z px come in eighths.
-FOCAL_BASELINE, DISPARITY_STEP = 580 * 0.075, 0.125
+_FOCAL_BASELINE_PX_M, _DISPARITY_STEP_PX = 580 * 0.075, 0.125
 
 #: A unit of another data set (5000 a metre read as 1000), and a focal length that is too long by this factor.
-UNIT, FOCAL = 5.0, 1.1
+_UNIT_FACTOR, _FOCAL_FACTOR = 5.0, 1.1
 
 #: A map that was rolled sideways by this share of its width.
-ROLL = 0.1
+_ROLL_SHARE = 0.1
 
 #: A map that is cut where so many of its pixels are nearer.
-NEARER = 0.6
+_CLIP_SHARE = 0.6
 
 #: From which relative change on a pixel of a faulty map counts as wrong.
-WRONG = 0.02
+_MIN_WRONG_REL = 0.02
 
-Fault = Callable[[Tensor, Generator], Tensor]
+DepthFault = Callable[[Tensor, Generator], Tensor]
 
 
-def scaled(depth: Tensor, factor: float) -> Tensor:
+def scale_depth(depth: Tensor, factor: float) -> Tensor:
     """The map in another metre."""
     return depth * factor
 
 
-def shifted(depth: Tensor, shift: float) -> Tensor:
+def shift_depth(depth: Tensor, shift: float) -> Tensor:
     """All depths ``shift`` m more, at least a hundredth of what they were."""
     return torch.where(depth > 0, (depth + shift).clamp_min(0).maximum(0.01 * depth), 0.0)
 
 
-def tilted(depth: Tensor, share: float, angle: float) -> Tensor:
+def tilt_depth(depth: Tensor, share: float, angle: float) -> Tensor:
     """Depths that grow by ``share`` from one side of the picture to the other, in the direction ``angle`` (rad)."""
-    x, y = _places(depth)
+    x, y = _pixel_grid(depth)
     return depth * (1 + 0.5 * share * (math.cos(angle) * x + math.sin(angle) * y))
 
 
-def warped(depth: Tensor, sigma: float, generator: Generator) -> Tensor:
+def warp_depth(depth: Tensor, sigma: float, generator: Generator) -> Tensor:
     """A smooth error: log depth plus a few waves of standard deviation ``sigma``, of mean zero over the picture."""
-    x, y = _places(depth)
+    x, y = _pixel_grid(depth)
     field = torch.zeros_like(x + y)
     for _ in range(6):
         across, down, phase = torch.rand(3, generator=generator, dtype=torch.float64).tolist()
-        across, down = (WAVES * (2 * u - 1) for u in (across, down))
+        across, down = (_MAX_WARP_WAVES * (2 * u - 1) for u in (across, down))
         field = field + torch.cos(math.pi * (across * x + down * y) + 2 * math.pi * phase)
     field = (field - field.mean()) / field.std().clamp_min(1e-6)
     return depth * (sigma * field).exp()
 
 
-def blurred(depth: Tensor, share: float = BLUR) -> Tensor:
+def blur_depth(depth: Tensor, share: float = _BLUR_SIGMA_REL) -> Tensor:
     """Edges that mix foreground and background: the Gaussian mean of what is known around each pixel."""
     sigma_px = max(0.5, share * depth.shape[-1])
     known = (depth > 0).to(depth)
-    mean = gaussian(depth[:, None], sigma_px) / gaussian(known[:, None], sigma_px).clamp_min(1e-6)
+    mean = gaussian_blur(depth[:, None], sigma_px) / gaussian_blur(known[:, None], sigma_px).clamp_min(1e-6)
     return torch.where(depth > 0, mean[:, 0], 0.0)
 
 
-def jumped(depth: Tensor, generator: Generator, *, n: int = JUMPS, factor: float = JUMP) -> Tensor:
+def move_objects(depth: Tensor, generator: Generator, *, n: int = _N_JUMPS, factor: float = _JUMP_FACTOR) -> Tensor:
     """Objects that stand elsewhere: pixels around ``n`` places that lie as deep as the place does, ``factor`` times as
     deep."""
     found = depth
-    for u, v in _spots(depth, generator, n):
-        middle = _at(depth, u, v)
-        level = (depth / middle.clamp_min(1e-6)).clamp_min(1e-6).log().abs() < SAME
-        inside = _within(depth, u, v, OBJECT) & level & (depth > 0) & (middle > 0)
+    for u, v in _draw_pixels(depth, generator, n):
+        middle = _depth_at(depth, u, v)
+        level = (depth / middle.clamp_min(1e-6)).clamp_min(1e-6).log().abs() < _JUMP_MAX_LOG_STEP
+        inside = _is_within(depth, u, v, _JUMP_RADIUS_REL) & level & (depth > 0) & (middle > 0)
         found = torch.where(inside, factor * depth, found)
     return found
 
 
-def invented(depth: Tensor, generator: Generator) -> Tensor:
+def fill_discs(depth: Tensor, generator: Generator) -> Tensor:
     """Holes filled with something smooth: discs in which the map is the blurred surroundings times a smooth factor."""
-    wide = blurred(depth, DISC)
+    wide = blur_depth(depth, _DISC_RADIUS_REL)
     found = depth
-    for u, v in _spots(depth, generator, DISCS):
-        off = INVENTED * (2 * float(torch.rand((), generator=generator)) - 1)
-        x, y = _places(depth)
-        r = _distance(depth, u, v) / DISC
+    for u, v in _draw_pixels(depth, generator, _N_DISCS):
+        off = _MAX_INVENTED_REL * (2 * float(torch.rand((), generator=generator)) - 1)
+        x, y = _pixel_grid(depth)
+        r = _pixel_distance(depth, u, v) / _DISC_RADIUS_REL
         lie = wide * (1 + off * (1 - r.square()).clamp_min(0) + 0.05 * off * (x + y))
         found = torch.where((r < 1) & (depth > 0), lie, found)
     return found
 
 
-def quantised(depth: Tensor) -> Tensor:
+def quantise_disparity(depth: Tensor) -> Tensor:
     """Depth of structured light, which comes in steps that grow as its square; none beyond what one step can tell."""
-    steps = (FOCAL_BASELINE / depth.clamp_min(1e-6) / DISPARITY_STEP).round()
-    return torch.where((depth > 0) & (steps >= 1), FOCAL_BASELINE / (steps.clamp_min(1) * DISPARITY_STEP), 0.0)
+    steps = (_FOCAL_BASELINE_PX_M / depth.clamp_min(1e-6) / _DISPARITY_STEP_PX).round()
+    return torch.where(
+        (depth > 0) & (steps >= 1), _FOCAL_BASELINE_PX_M / (steps.clamp_min(1) * _DISPARITY_STEP_PX), 0.0
+    )
 
 
-def mirrored(depth: Tensor) -> Tensor:
+def mirror_depth(depth: Tensor) -> Tensor:
     """Left for right."""
     return depth.flip(-1)
 
 
-def rolled(depth: Tensor, share: float = ROLL) -> Tensor:
+def roll_depth(depth: Tensor, share: float = _ROLL_SHARE) -> Tensor:
     """Columns moved to the right by a share of the width, those beyond the edge to the left."""
     return depth.roll(round(share * depth.shape[-1]), -1)
 
 
-def cut(depth: Tensor, nearer: float = NEARER) -> Tensor:
+def clip_far_depth(depth: Tensor, nearer: float = _CLIP_SHARE) -> Tensor:
     """What is farther than a share of the pixels stands where that share ends, as where numbers of few bits run out."""
     known = torch.where(depth > 0, depth, torch.inf).flatten(1).sort(-1).values
     last = (nearer * ((depth > 0).flatten(1).sum(-1) - 1).clamp_min(0)).long()
     return depth.minimum(known.gather(1, last[:, None])[..., None])
 
 
-def _fixed(fault: Callable[[Tensor], Tensor]) -> Fault:
+def _deterministic(fault: Callable[[Tensor], Tensor]) -> DepthFault:
     """A fault without anything drawn."""
     return lambda depth, _generator: fault(depth)
 
 
 #: What a network's map does wrong: shape and metre, alone and together.
-OF_NETWORKS: dict[str, Fault] = {
-    "scale_short": _fixed(partial(scaled, factor=SCALES[0])),
-    "scale_long": _fixed(partial(scaled, factor=SCALES[1])),
-    "shift": _fixed(partial(shifted, shift=SHIFT)),
-    "tilt": _fixed(partial(tilted, share=TILT, angle=0.6)),
-    "warp_small": lambda depth, g: warped(depth, WARPS[0], g),
-    "warp_large": lambda depth, g: warped(depth, WARPS[1], g),
-    "simulated": lambda depth, g: scaled(warped(depth, WARPS[0], g), 1.05),
-    "blur": _fixed(blurred),
-    "jumps": jumped,
-    "invented": invented,
-    "quantised": _fixed(quantised),
+NETWORK_FAULTS: dict[str, DepthFault] = {
+    "scale_short": _deterministic(partial(scale_depth, factor=_SCALE_FACTORS[0])),
+    "scale_long": _deterministic(partial(scale_depth, factor=_SCALE_FACTORS[1])),
+    "shift": _deterministic(partial(shift_depth, shift=_SHIFT_M)),
+    "tilt": _deterministic(partial(tilt_depth, share=_TILT_SHARE, angle=0.6)),
+    "warp_small": lambda depth, g: warp_depth(depth, _WARP_SIGMAS[0], g),
+    "warp_large": lambda depth, g: warp_depth(depth, _WARP_SIGMAS[1], g),
+    "simulated": lambda depth, g: scale_depth(warp_depth(depth, _WARP_SIGMAS[0], g), 1.05),
+    "blur": _deterministic(blur_depth),
+    "jumps": move_objects,
+    "invented": fill_discs,
+    "quantised": _deterministic(quantise_disparity),
 }
 
 #: What sensors and data sets do wrong with maps that are right by themselves.
-OF_FILES: dict[str, Fault] = {
-    "unit": _fixed(partial(scaled, factor=UNIT)),
-    "mirrored": _fixed(mirrored),
-    "rolled": _fixed(rolled),
-    "wrong_k": _fixed(partial(magnified, factor=FOCAL)),
+FILE_FAULTS: dict[str, DepthFault] = {
+    "unit": _deterministic(partial(scale_depth, factor=_UNIT_FACTOR)),
+    "mirrored": _deterministic(mirror_depth),
+    "rolled": _deterministic(roll_depth),
+    "wrong_k": _deterministic(partial(rescale_field_of_view, factor=_FOCAL_FACTOR)),
 }
-FAULTS = OF_NETWORKS | OF_FILES
+DEPTH_FAULTS = NETWORK_FAULTS | FILE_FAULTS
 
 #: What a format does to maps that are right by themselves, of which only a bound is left.
-OF_FORMATS: dict[str, Fault] = {"cut": _fixed(cut)}
+FORMAT_FAULTS: dict[str, DepthFault] = {"cut": _deterministic(clip_far_depth)}
 
 #: A fault that is another frame's map: it is no function of this one.
 WRONG_TIME = "time"
 
 
-def spoil(
+def apply_fault(
     name: str,
     depth: Tensor,  # (B, h, w) m, 0 = none
     *,
     seed: int = 0,
     other: Tensor | None = None,  # (B, h, w) m, of another time
 ) -> tuple[Tensor, Tensor]:
-    """A map with a fault, and which of its pixels are wrong by more than ``WRONG``, (B, h, w) each.
+    """A map with a fault, and which of its pixels are wrong by more than ``_MIN_WRONG_REL``, (B, h, w) each.
 
     Args:
-        name: of :data:`FAULTS` or :data:`OF_FORMATS`, or ``time``.
+        name: of :data:`DEPTH_FAULTS` or :data:`FORMAT_FAULTS`, or ``time``.
         depth: the true map.
         seed: of what is drawn.
         other: what ``time`` gives instead.
@@ -200,39 +202,39 @@ def spoil(
         if other is None:
             raise ValueError("spoil: found no map of another time, expected other=")
         found = other
-    elif name in (known := FAULTS | OF_FORMATS):
+    elif name in (known := DEPTH_FAULTS | FORMAT_FAULTS):
         found = known[name](depth, Generator().manual_seed(seed))
     else:
         raise ValueError(f"spoil: found {name!r}, expected one of {', '.join((*known, WRONG_TIME))}")
-    wrong = (found > 0) & (depth > 0) & ((found - depth).abs() > WRONG * depth)
+    wrong = (found > 0) & (depth > 0) & ((found - depth).abs() > _MIN_WRONG_REL * depth)
     return found, wrong
 
 
-def _places(depth: Tensor) -> tuple[Tensor, Tensor]:
+def _pixel_grid(depth: Tensor) -> tuple[Tensor, Tensor]:
     """Columns (1, w) and rows (h, 1) of a map from -1 to 1."""
     h, w = depth.shape[-2:]
     x, y = (torch.linspace(-1, 1, n, dtype=depth.dtype, device=depth.device) for n in (w, h))
     return x[None], y[:, None]
 
 
-def _spots(depth: Tensor, generator: Generator, n: int) -> list[tuple[int, int]]:
+def _draw_pixels(depth: Tensor, generator: Generator, n: int) -> list[tuple[int, int]]:
     """Columns and rows of ``n`` places away from the border."""
     h, w = depth.shape[-2:]
     share = 0.1 + 0.8 * torch.rand(n, 2, generator=generator, dtype=torch.float64)
     return [(int(x * w), int(y * h)) for x, y in share.tolist()]
 
 
-def _distance(depth: Tensor, u: int, v: int) -> Tensor:
+def _pixel_distance(depth: Tensor, u: int, v: int) -> Tensor:
     """Of every pixel (h, w) from a place, in widths of the map."""
     h, w = depth.shape[-2:]
     rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) for n in (h, w))
     return ((columns[None] - u).square() + (rows[:, None] - v).square()).sqrt() / w
 
 
-def _within(depth: Tensor, u: int, v: int, radius: float) -> Tensor:
-    return _distance(depth, u, v) < radius
+def _is_within(depth: Tensor, u: int, v: int, radius: float) -> Tensor:
+    return _pixel_distance(depth, u, v) < radius
 
 
-def _at(depth: Tensor, u: int, v: int) -> Tensor:
+def _depth_at(depth: Tensor, u: int, v: int) -> Tensor:
     """Depth (B, 1, 1) at a place."""
     return depth[:, v, u][:, None, None]

@@ -17,98 +17,107 @@ from torch import Tensor
 
 from dhtorch.geometry import se3
 from dhtorch.geometry.se3 import Pose
-from dhtorch.synthetic.paths import hand_held, rotation
-from dhtorch.synthetic.raycast import MOVING, Solid, Surface, Triple
-from dhtorch.synthetic.room import box, furnished_room
+from dhtorch.synthetic.paths import hand_held_path, rotation_from_angles
+from dhtorch.synthetic.raycast import SURFACE_MOVING, Material, Solid, Triple
+from dhtorch.synthetic.room import furnished_room, make_box
 from dhtorch.synthetic.shading import ShadedRoom
 
 #: Where the viewer stands who has a body before him, and the direction that he looks in: degrees to the right.
-VIEWER, _YAW = hand_held("static", 1, step_m=0.0, rate_hz=1.0, seed=0), 12.0
+_VIEWER_POSE, _YAW = hand_held_path("static", 1, step_m=0.0, rate_hz=1.0, seed=0), 12.0
 
 #: Middle of what is held, in the viewer's axes (x right, y down, z forward).
-HELD_AT: Triple = (0.02, 0.05, 0.52)
+_HELD_CENTRE: Triple = (0.02, 0.05, 0.52)
 
 #: Middle of the turntable, in the viewer's axes, and degrees a frame.
-TURNTABLE_AT: Triple = (0.0, 0.02, 1.07)
-TURN_DEG = 2.0
+_TURNTABLE_CENTRE: Triple = (0.0, 0.02, 1.07)
+_TURN_DEG_PER_FRAME = 2.0
 
 
-def _body(
+def _body_box(
     at: Triple, size: Triple, picture: str, *, tile: float | None = None, yaw: float = 0, pitch: float = 0
 ) -> Solid:
     """A box whose middle is ``at`` in the viewer's axes, turned against him; ``size`` is (across, up, deep)."""
-    x, y, z = se3.apply(VIEWER, torch.tensor([[at]], dtype=torch.float64))[0, 0].tolist()
-    surface = Surface(picture, tile=tile, kind=MOVING)
-    return box(x, -y - size[1] / 2, z, size, surface, yaw=_YAW + yaw, pitch=pitch, shadow=False)
+    x, y, z = se3.apply(_VIEWER_POSE, torch.tensor([[at]], dtype=torch.float64))[0, 0].tolist()
+    surface = Material(picture, tile=tile, kind=SURFACE_MOVING)
+    return make_box(x, -y - size[1] / 2, z, size, surface, yaw=_YAW + yaw, pitch=pitch, shadow=False)
 
 
-def _parcels() -> list[Solid]:
+def _parcel_stack() -> list[Solid]:
     """A stack of parcels, 0.8 to 1.2 m before the viewer."""
     return [
-        _body((0.05, 0.05, 1.11), (0.42, 0.32, 0.22), "poster:0", yaw=24),
-        _body((-0.19, 0.10, 0.97), (0.21, 0.23, 0.18), "print", tile=0.5, yaw=-18),
-        _body((0.20, 0.16, 0.95), (0.20, 0.14, 0.16), "poster:2", yaw=8),
-        _body((0.02, -0.18, 1.09), (0.25, 0.15, 0.16), "poster:1", yaw=-12),
-        _body((0.0, 0.25, 1.07), (0.58, 0.05, 0.34), "carpet", yaw=4),
+        _body_box((0.05, 0.05, 1.11), (0.42, 0.32, 0.22), "poster:0", yaw=24),
+        _body_box((-0.19, 0.10, 0.97), (0.21, 0.23, 0.18), "print", tile=0.5, yaw=-18),
+        _body_box((0.20, 0.16, 0.95), (0.20, 0.14, 0.16), "poster:2", yaw=8),
+        _body_box((0.02, -0.18, 1.09), (0.25, 0.15, 0.16), "poster:1", yaw=-12),
+        _body_box((0.0, 0.25, 1.07), (0.58, 0.05, 0.34), "carpet", yaw=4),
     ]
 
 
-def _held() -> list[Solid]:
+def _held_parcel() -> list[Solid]:
     """A parcel and the fingers that hold it, 0.4 to 0.6 m before the viewer."""
-    x, y, z = HELD_AT
-    parcel = _body(HELD_AT, (0.26, 0.19, 0.10), "poster:3", yaw=22, pitch=-16)
-    label = _body((x - 0.02, y - 0.11, z + 0.01), (0.13, 0.07, 0.08), "poster:1", yaw=-14)
+    x, y, z = _HELD_CENTRE
+    parcel = _body_box(_HELD_CENTRE, (0.26, 0.19, 0.10), "poster:3", yaw=22, pitch=-16)
+    label = _body_box((x - 0.02, y - 0.11, z + 0.01), (0.13, 0.07, 0.08), "poster:1", yaw=-14)
     fingers = [
-        _body((x + 0.11, y + 0.03 * k - 0.02, z - 0.06), (0.09, 0.022, 0.022), "speckle", tile=0.15, yaw=30)
+        _body_box((x + 0.11, y + 0.03 * k - 0.02, z - 0.06), (0.09, 0.022, 0.022), "speckle", tile=0.15, yaw=30)
         for k in range(4)
     ]
     return [parcel, label, *fingers]
 
 
 #: Bodies by name.
-GUESTS = {"parcels": _parcels, "held": _held}
+MOVING_BODIES = {"parcels": _parcel_stack, "held": _held_parcel}
 
 
 @lru_cache(maxsize=2)
-def visited_room(seed: int, guest: str) -> ShadedRoom:
-    """The furnished room of a seed with one of :data:`GUESTS` at home; the same object for the same arguments."""
-    return furnished_room(seed).joined_by(GUESTS[guest]())
+def room_with_body(seed: int, guest: str) -> ShadedRoom:
+    """The furnished room of a seed with one of :data:`MOVING_BODIES` at home; the same object for the same
+    arguments."""
+    return furnished_room(seed).joined_by(MOVING_BODIES[guest]())
 
 
-def along(T_world_from_cam: Pose, *, share: float = 1.0) -> Pose:
+def move_with_viewer(T_world_from_cam: Pose, *, share: float = 1.0) -> Pose:
     """``T_world_from_home`` (n) of what goes ``share`` of the viewer's way, in his direction, and does not turn."""
-    moved = T_world_from_cam.t - VIEWER.t
+    moved = T_world_from_cam.t - _VIEWER_POSE.t
     return Pose(se3.identity(len(moved), moved).R, share * moved)
 
 
-def in_hand(T_world_from_cam: Pose) -> Pose:
+def move_in_hand(T_world_from_cam: Pose) -> Pose:
     """``T_world_from_home`` (n) of what goes and turns with the viewer, and is moved a little in his hand."""
     own = []
     for i in range(T_world_from_cam.t.shape[0]):
-        turn = rotation(3.0 * math.sin(0.41 * i), 2.0 * math.sin(0.29 * i + 1.0), 2.0 * math.sin(0.33 * i + 2.0))
+        turn = rotation_from_angles(
+            3.0 * math.sin(0.41 * i), 2.0 * math.sin(0.29 * i + 1.0), 2.0 * math.sin(0.33 * i + 2.0)
+        )
         shift = [0.012 * math.sin(0.37 * i), 0.010 * math.sin(0.31 * i + 2.0), 0.010 * math.sin(0.43 * i + 4.0)]
-        own.append(_about(HELD_AT, turn, shift))
-    home_from_viewer = se3.invert(VIEWER)
-    return se3.compose(se3.compose(T_world_from_cam, _stacked(own)), _repeated(home_from_viewer, len(own)))
+        own.append(_rotate_about(_HELD_CENTRE, turn, shift))
+    home_from_viewer = se3.invert(_VIEWER_POSE)
+    return se3.compose(se3.compose(T_world_from_cam, _stack_poses(own)), _repeat_pose(home_from_viewer, len(own)))
 
 
-def on_turntable(T_world_from_cam: Pose) -> Pose:
-    """``T_world_from_home`` (n) of what turns :data:`TURN_DEG` a frame about the upright axis of the turntable."""
-    axis = se3.apply(VIEWER, torch.tensor([[TURNTABLE_AT]], dtype=torch.float64))[0, 0].tolist()
+def turn_on_turntable(T_world_from_cam: Pose) -> Pose:
+    """``T_world_from_home`` (n) of what turns :data:`_TURN_DEG_PER_FRAME` a frame about the upright axis of the
+    turntable."""
+    axis = se3.apply(_VIEWER_POSE, torch.tensor([[_TURNTABLE_CENTRE]], dtype=torch.float64))[0, 0].tolist()
     n = T_world_from_cam.t.shape[0]
-    return _stacked([_about(tuple(axis), rotation(TURN_DEG * i, 0.0, 0.0), [0.0, 0.0, 0.0]) for i in range(n)])
+    return _stack_poses(
+        [
+            _rotate_about(tuple(axis), rotation_from_angles(_TURN_DEG_PER_FRAME * i, 0.0, 0.0), [0.0, 0.0, 0.0])
+            for i in range(n)
+        ]
+    )
 
 
-def _about(centre: tuple[float, ...], turn: list[list[float]], shift: list[float]) -> Pose:
+def _rotate_about(centre: tuple[float, ...], turn: list[list[float]], shift: list[float]) -> Pose:
     """Turned about ``centre``, then shifted (1)."""
     R, c = torch.tensor([turn], dtype=torch.float64), torch.tensor([centre], dtype=torch.float64)
     return Pose(R, c - se3.rotate(R, c[:, None])[:, 0] + torch.tensor([shift], dtype=torch.float64))
 
 
-def _stacked(motions: list[Pose]) -> Pose:
+def _stack_poses(motions: list[Pose]) -> Pose:
     parts: list[list[Tensor]] = [[m.R for m in motions], [m.t for m in motions]]
     return Pose(torch.cat(parts[0]), torch.cat(parts[1]))
 
 
-def _repeated(motion: Pose, n: int) -> Pose:
+def _repeat_pose(motion: Pose, n: int) -> Pose:
     return Pose(motion.R.expand(n, 3, 3), motion.t.expand(n, 3))

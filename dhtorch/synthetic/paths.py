@@ -15,24 +15,24 @@ import torch
 
 from dhtorch.geometry.se3 import Pose
 
-Place = tuple[float, float, float]  # x, height, z; m
-Angles = tuple[float, float, float]  # yaw (positive: right), pitch (positive: up), roll; degrees
+_Position = tuple[float, float, float]  # x, height, z; m
+_Angles = tuple[float, float, float]  # yaw (positive: right), pitch (positive: up), roll; degrees
 
-_PLACE, _YAW, _PITCH = (-0.45, 1.3, 0.2), 12.0, -9.0  # where the viewer stands and looks
-_AIM = (-0.1, 0.9, 2.0)  # what an orbit goes around
+_START_POSITION, _YAW, _PITCH = (-0.45, 1.3, 0.2), 12.0, -9.0  # where the viewer stands and looks
+_ORBIT_CENTRE = (-0.1, 0.9, 2.0)  # what an orbit goes around
 
 
-def hand_held(
+def hand_held_path(
     path: str, n_frames: int, *, step_m: float, rate_hz: float, seed: int, pan: tuple[float, float] = (0.0, 0.0)
 ) -> Pose:
-    """``T_world_from_cam`` (n_frames), float64, of one of :data:`PATHS`.
+    """``T_world_from_cam`` (n_frames), float64, of one of :data:`CAMERA_PATHS`.
 
     ``pan``: degrees by which the first frame looks farther to the right than the path says, and every next one more.
     """
-    stations = [PATHS[path](_Hand(seed), step_m * i, i / rate_hz) for i in range(n_frames)]
+    stations = [CAMERA_PATHS[path](_Hand(seed), step_m * i, i / rate_hz) for i in range(n_frames)]
     turns = [(yaw + pan[0] + pan[1] * i, *more) for i, (_, (yaw, *more)) in enumerate(stations)]
     return Pose(
-        torch.tensor([rotation(*angles) for angles in turns], dtype=torch.float64),
+        torch.tensor([rotation_from_angles(*angles) for angles in turns], dtype=torch.float64),
         torch.tensor([(x, -height, z) for (x, height, z), _ in stations], dtype=torch.float64),
     )
 
@@ -51,45 +51,45 @@ class _Hand:
         return 0.65 * math.sin(phase + a) + 0.35 * math.sin(1.83 * phase + b)
 
 
-def _walk(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
+def _walk(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
     side = 0.55 * math.sin(way / 0.55 + hand.start)
-    x, height, z = _PLACE
+    x, height, z = _START_POSITION
     place = (x + side, height + 0.03 * hand.sway(0, way / 0.25), z + 0.08 * hand.sway(1, way / 0.4))
     tremor = [hand.sway(2 + k, 2 * math.pi * 0.9 * time) for k in range(3)]
     return place, (_YAW - 11 * side + 0.6 * tremor[0], _PITCH + 0.6 * tremor[1], 0.8 * tremor[2])
 
 
-def _lateral(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
-    x, height, z = _PLACE
+def _lateral(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
+    x, height, z = _START_POSITION
     return (x + 0.55 * math.sin(way / 0.55 + hand.start), height, z), (_YAW, _PITCH, 0.0)
 
 
-def _forward(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
+def _forward(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
     a = math.radians(_YAW)
     go = 0.35 * math.sin(way / 0.35 - 0.5)
-    x, height, z = _PLACE
+    x, height, z = _START_POSITION
     return (x + math.sin(a) * go, height, z + 0.2 + math.cos(a) * go), (_YAW, _PITCH, 0.0)
 
 
-def _orbit(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
+def _orbit(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
     radius = 1.75
     a = 0.5 * math.sin(way / (0.5 * radius) + hand.start)
-    drop = math.degrees(math.atan2(_PLACE[1] - _AIM[1], radius))
-    place = (_AIM[0] - radius * math.sin(a), _PLACE[1], _AIM[2] - radius * math.cos(a))
+    drop = math.degrees(math.atan2(_START_POSITION[1] - _ORBIT_CENTRE[1], radius))
+    place = (_ORBIT_CENTRE[0] - radius * math.sin(a), _START_POSITION[1], _ORBIT_CENTRE[2] - radius * math.cos(a))
     return place, (math.degrees(a), -0.6 * drop, 0.0)
 
 
-def _turn(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
+def _turn(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
     yaw = _YAW + 20 * math.sin(way / 0.45 + hand.start)
-    return _PLACE, (yaw, _PITCH + 3 * hand.sway(0, way / 0.4), 1.5 * hand.sway(1, way / 0.4))
+    return _START_POSITION, (yaw, _PITCH + 3 * hand.sway(0, way / 0.4), 1.5 * hand.sway(1, way / 0.4))
 
 
-def _static(hand: _Hand, way: float, time: float) -> tuple[Place, Angles]:
-    return _PLACE, (_YAW, _PITCH, 0.0)
+def _static(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
+    return _START_POSITION, (_YAW, _PITCH, 0.0)
 
 
 #: Kinds of path: place and angles after a way (m) and a time (s).
-PATHS: dict[str, Callable[[_Hand, float, float], tuple[Place, Angles]]] = {
+CAMERA_PATHS: dict[str, Callable[[_Hand, float, float], tuple[_Position, _Angles]]] = {
     "walk": _walk,
     "lateral": _lateral,
     "forward": _forward,
@@ -99,7 +99,7 @@ PATHS: dict[str, Callable[[_Hand, float, float], tuple[Place, Angles]]] = {
 }
 
 
-def rotation(yaw: float, pitch: float, roll: float) -> list[list[float]]:
+def rotation_from_angles(yaw: float, pitch: float, roll: float) -> list[list[float]]:
     """World from camera: roll about z, then pitch about x (positive: up), then yaw about y (positive: right)."""
     (ca, sa), (cb, sb), (cc, sc) = ((math.cos(math.radians(v)), math.sin(math.radians(v))) for v in (yaw, pitch, roll))
     return [

@@ -21,22 +21,28 @@ from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.se3 import Pose
 
 Triple = tuple[float, float, float]
-Vector = Sequence[Tensor] | Sequence[float] | Sequence[Tensor | float]  # three components that broadcast
+_Vector = Sequence[Tensor] | Sequence[float] | Sequence[Tensor | float]  # three components that broadcast
 
-ORDINARY, MIRROR, WINDOW, DARK, MOVING = 0, 1, 2, 3, 4  #: kinds of surface; MOVING: of a body that moves
-NOWHERE = 1e9  #: distance of what is not met
+SURFACE_ORDINARY, SURFACE_MIRROR, SURFACE_WINDOW, SURFACE_DARK, SURFACE_MOVING = (
+    0,
+    1,
+    2,
+    3,
+    4,
+)  #: kinds of surface; MOVING: of a body that moves
+_NO_HIT_M = 1e9  #: distance of what is not met
 
-_STRIP = 1 << 8  # rays cast at all solids at a time: few enough to stay in the cache
+_RAYS_PER_CHUNK = 1 << 8  # rays cast at all solids at a time: few enough to stay in the cache
 
 
 @dataclass(frozen=True)
-class Surface:
+class Material:
     """How a face looks and what it does to a sensor."""
 
     picture: str  #: name of a texture
     tint: Triple = (1.0, 1.0, 1.0)
     tile: float | None = None  #: m per repetition; None stretches one copy over the face
-    kind: int = ORDINARY
+    kind: int = SURFACE_ORDINARY
     reflect: float = 0.0  #: share of the colour that comes from the mirrored ray
     glow: float = 0.0  #: light of its own, in units of the picture
 
@@ -47,11 +53,11 @@ class Solid:
 
     centre: Triple
     half: Triple
-    surface: Surface
+    surface: Material
     R: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  #: world from local
     ball: bool = False
     shadow: bool = True
-    faces: dict[int, Surface] = field(default_factory=dict)
+    faces: dict[int, Material] = field(default_factory=dict)
 
     def moved(self, motion: Pose) -> Solid:
         """The solid after a rigid motion (1) of the world."""
@@ -78,11 +84,11 @@ class Solids:
 
         Each solid is tested only in the rectangle of pixels that its corners span.
         """
-        x, y = _plane(camera, hw)
+        x, y = _image_plane(camera, hw)
         R, o = T_world_from_cam.R[0].double(), T_world_from_cam.t[0].double()
-        t = torch.full(hw, NOWHERE)
+        t = torch.full(hw, _NO_HIT_M)
         index = torch.zeros(hw, dtype=torch.int64)
-        rectangles = _rectangles(self, R, o, x, y)
+        rectangles = _solid_rectangles(self, R, o, x, y)
         rectangles[0] = (slice(None), slice(None))
         for i, (solid, (rows, columns)) in enumerate(zip(self.each, rectangles, strict=True)):
             xs, ys = x[None, columns], y[rows, None]
@@ -91,12 +97,12 @@ class Solids:
                 A = (local @ R).tolist()
                 origin = (local @ (o - torch.tensor(solid.centre, dtype=torch.float64))).tolist()
                 d = [(xs * A[k][0] + A[k][2]) + ys * A[k][1] for k in range(3)]
-                _nearer(t[rows, columns], index[rows, columns], i, *_span(solid, origin, d))
+                _update_nearest(t[rows, columns], index[rows, columns], i, *_span(solid, origin, d))
         return t.flatten(), index.flatten()
 
     def cast(self, o: Sequence[Tensor], d: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """Distance (P,) and solid index (P,) along arbitrary rays."""
-        parts = [slice(k, k + _STRIP) for k in range(0, max(o[0].numel(), 1), _STRIP)]
+        parts = [slice(k, k + _RAYS_PER_CHUNK) for k in range(0, max(o[0].numel(), 1), _RAYS_PER_CHUNK)]
         strips = [self._cast([c[s] for c in o], [c[s] for c in d]) for s in parts]
         return torch.cat([t for t, _ in strips]), torch.cat([index for _, index in strips])
 
@@ -107,10 +113,10 @@ class Solids:
         spans = zip(_ball_span(self._square[:, None], o, d), _box_span(half, o, d), strict=True)
         enter, leave, met = (torch.where(self.ball[:, None], one, other) for one, other in spans)
         at = torch.cat((leave[:1], enter[1:]))  # the room is met on leaving it
-        at = torch.where(met & (at >= 0), at, NOWHERE)
-        t = at.amin(0).clamp(max=NOWHERE)
+        at = torch.where(met & (at >= 0), at, _NO_HIT_M)
+        t = at.amin(0).clamp(max=_NO_HIT_M)
         first = torch.where(at == t, torch.arange(len(at))[:, None], len(at)).amin(0)
-        return t, torch.where(t < NOWHERE, first, 0)
+        return t, torch.where(t < _NO_HIT_M, first, 0)
 
     def locate(self, index: Tensor, p: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Face (P,) of points on solids, and their place (P,), (P,) across and down it in [-1, 1].
@@ -119,7 +125,7 @@ class Solids:
         """
         centre, half, R = self.centre[index], self.half[index], self.R[index]
         rel = [p[k] - centre[:, k] for k in range(3)]
-        x, y, z = (dot(rel, R[:, :, k].unbind(-1)) / half[:, k] for k in range(3))
+        x, y, z = (dot_product(rel, R[:, :, k].unbind(-1)) / half[:, k] for k in range(3))
         is_x = (x.abs() >= y.abs()) & (x.abs() >= z.abs())
         is_y = ~is_x & (y.abs() >= z.abs())
         main = torch.where(is_x, x, torch.where(is_y, y, z))
@@ -136,10 +142,10 @@ class Solids:
             torch.where(axis == 1, sign, down),
             torch.where(axis == 2, sign, torch.where(axis == 0, across, down)),
         ]
-        shrink = torch.where(self.ball[index], 1 / dot(local, local).sqrt(), 1.0)
+        shrink = torch.where(self.ball[index], 1 / dot_product(local, local).sqrt(), 1.0)
         half, R, centre = self.half[index], self.R[index], self.centre[index]
         local = [local[k] * half[:, k] * shrink for k in range(3)]
-        return [centre[:, k] + dot(R[:, k].unbind(-1), local) for k in range(3)]
+        return [centre[:, k] + dot_product(R[:, k].unbind(-1), local) for k in range(3)]
 
     def normal(self, face: Tensor, p: Sequence[Tensor]) -> list[Tensor]:
         """Unit normal towards the open room, three components (P,)."""
@@ -162,9 +168,9 @@ class Solids:
             if solid.shadow:
                 rel = [solid.centre[k] - p[k] for k in range(3)]
                 if way is not None:
-                    along = (dot(rel, way) / dot(way, way)).clamp(0, 1)
+                    along = (dot_product(rel, way) / dot_product(way, way)).clamp(0, 1)
                     rel = [rel[k] - along * way[k] for k in range(3)]
-                at = (dot(rel, rel) < (reach + math.hypot(*solid.half)) ** 2).nonzero()[:, 0]
+                at = (dot_product(rel, rel) < (reach + math.hypot(*solid.half)) ** 2).nonzero()[:, 0]
                 if at.numel():
                     found.append((solid, at))
         return found
@@ -177,32 +183,32 @@ class Solids:
         return torch.where(met & (leave > 0), enter, 1.0).clamp(0, 1)
 
 
-def dot(a: Vector, b: Vector) -> Tensor:
+def dot_product(a: _Vector, b: _Vector) -> Tensor:
     """Scalar product of triples of components."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]  # type: ignore[return-value]
 
 
 def world_rays(camera: Camera, T_world_from_cam: Pose, hw: tuple[int, int]) -> tuple[list[Tensor], list[Tensor]]:
     """Origins and directions (z = 1 in the camera) through all pixel centres, three (H·W,) components each."""
-    x, y = _plane(camera, hw)
+    x, y = _image_plane(camera, hw)
     R, t = T_world_from_cam.R[0].tolist(), T_world_from_cam.t[0].tolist()
     d = [((x[None] * R[k][0] + R[k][2]) + y[:, None] * R[k][1]).flatten() for k in range(3)]
     return [torch.tensor(c, dtype=torch.float32).expand(d[0].shape) for c in t], d
 
 
-def _span(solid: Solid, o: Vector, d: Vector) -> tuple[Tensor, Tensor, Tensor]:
+def _span(solid: Solid, o: _Vector, d: _Vector) -> tuple[Tensor, Tensor, Tensor]:
     """Distances at which rays in the solid's own axes enter and leave it, and whether they meet it at all."""
     return _ball_span(solid.half[0] ** 2, o, d) if solid.ball else _box_span(solid.half, o, d)
 
 
-def _ball_span(square: float | Tensor, o: Vector, d: Vector) -> tuple[Tensor, Tensor, Tensor]:
-    a, b = dot(d, d), dot(o, d)
-    under = b * b - a * (dot(o, o) - square)
+def _ball_span(square: float | Tensor, o: _Vector, d: _Vector) -> tuple[Tensor, Tensor, Tensor]:
+    a, b = dot_product(d, d), dot_product(o, d)
+    under = b * b - a * (dot_product(o, o) - square)
     root = under.clamp(min=0).sqrt()
     return (-b - root) / a, (-b + root) / a, under > 0
 
 
-def _box_span(half: Vector, o: Vector, d: Vector) -> tuple[Tensor, Tensor, Tensor]:
+def _box_span(half: _Vector, o: _Vector, d: _Vector) -> tuple[Tensor, Tensor, Tensor]:
     enters, leaves = [], []
     for k in range(3):
         inverse = 1 / torch.as_tensor(d[k])
@@ -214,7 +220,7 @@ def _box_span(half: Vector, o: Vector, d: Vector) -> tuple[Tensor, Tensor, Tenso
     return enter, leave, leave > enter
 
 
-def _nearer(t: Tensor, index: Tensor, i: int, enter: Tensor, leave: Tensor, met: Tensor) -> None:
+def _update_nearest(t: Tensor, index: Tensor, i: int, enter: Tensor, leave: Tensor, met: Tensor) -> None:
     """Write solid ``i`` into ``t`` and ``index`` where it is met first; the room is met on leaving it."""
     at = leave if i == 0 else enter
     first = met & (at < t) & (at >= 0)
@@ -222,12 +228,12 @@ def _nearer(t: Tensor, index: Tensor, i: int, enter: Tensor, leave: Tensor, met:
     index.masked_fill_(first, i)
 
 
-def _to_local(centre: Vector, columns: Sequence[Vector], o: Vector, d: Vector) -> tuple[list[Tensor], list[Tensor]]:
+def _to_local(centre: _Vector, columns: Sequence[_Vector], o: _Vector, d: _Vector) -> tuple[list[Tensor], list[Tensor]]:
     rel = [o[k] - centre[k] for k in range(3)]
-    return [dot(rel, c) for c in columns], [dot(d, c) for c in columns]
+    return [dot_product(rel, c) for c in columns], [dot_product(d, c) for c in columns]
 
 
-def _plane(camera: Camera, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def _image_plane(camera: Camera, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Ideal image-plane coordinates of the columns (W,) and rows (H,), float32."""
     f, c = camera.f[0].double(), camera.c[0].double()
     x = (torch.arange(hw[1], dtype=torch.float64) - c[0]) / f[0]
@@ -235,7 +241,7 @@ def _plane(camera: Camera, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
     return x.float(), y.float()
 
 
-def _rectangles(solids: Solids, R: Tensor, o: Tensor, x: Tensor, y: Tensor) -> list[tuple[slice, slice]]:
+def _solid_rectangles(solids: Solids, R: Tensor, o: Tensor, x: Tensor, y: Tensor) -> list[tuple[slice, slice]]:
     """Of each solid, rows and columns whose rays can meet it; all of them if it reaches behind the camera."""
     signs = torch.tensor([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=torch.float64)
     half, turn, centre = solids.half.double(), solids.R.double(), solids.centre.double()

@@ -17,19 +17,19 @@ from typing import Any, ClassVar
 import torch
 from torch import Generator, Tensor
 
-from dhtorch.data.recording import TruthRecording, numbers
+from dhtorch.data.recording import TruthRecording, consecutive_frame_numbers
 from dhtorch.data.scene import Scene
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera, resize
 from dhtorch.records import Frame, Pose
-from dhtorch.runtime.console import many
-from dhtorch.synthetic.paths import PATHS, hand_held
-from dhtorch.synthetic.raycast import DARK, MIRROR, ORDINARY, WINDOW, world_rays
+from dhtorch.runtime.console import format_count
+from dhtorch.synthetic.paths import CAMERA_PATHS, hand_held_path
+from dhtorch.synthetic.raycast import SURFACE_DARK, SURFACE_MIRROR, SURFACE_ORDINARY, SURFACE_WINDOW, world_rays
 from dhtorch.synthetic.room import furnished_room
 from dhtorch.synthetic.shading import ShadedRoom
 
 #: Values of ``truth(i)["surface"]`` where nothing moves.
-SURFACES = {ORDINARY: "ordinary", MIRROR: "mirror", WINDOW: "window", DARK: "dark"}
+SURFACE_NAMES = {SURFACE_ORDINARY: "ordinary", SURFACE_MIRROR: "mirror", SURFACE_WINDOW: "window", SURFACE_DARK: "dark"}
 
 
 class SyntheticRoom(TruthRecording):
@@ -39,11 +39,12 @@ class SyntheticRoom(TruthRecording):
         seed: of the paint and small placements, the path and the sensor noise.
         n_frames: number of frames.
         hw: (height, width) of the image in pixels.
-        path: one of :data:`PATHS`. ``walk`` is a hand-held sweep; ``rotation`` does not translate, ``static`` not move.
+        path: one of :data:`CAMERA_PATHS`. ``walk`` is a hand-held sweep; ``rotation`` does not translate, ``static``
+            not move.
         step_m: way along the path from frame to frame (for ``rotation``: the same pace, as an angle).
         rate_hz: frame rate.
-        lidar: ``phone`` = the model of :func:`phone_lidar`; ``exact`` = true depth at every image pixel; None = no
-            sensor, depth is 0 everywhere.
+        lidar: ``phone`` = the model of :func:`simulate_phone_lidar`; ``exact`` = true depth at every image pixel; None
+            = no sensor, depth is 0 everywhere.
         depth_hw: (height, width) of the phone's depth map, and of the empty one.
         range_limit: of the phone's LiDAR, m along the ray.
         depth_noise: factor on the LiDAR's noise; 0 keeps its drop-outs and limits.
@@ -61,7 +62,7 @@ class SyntheticRoom(TruthRecording):
         ValueError: an unknown path or LiDAR, or a size, count or limit that is not positive.
     """
 
-    surfaces = SURFACES
+    surfaces = SURFACE_NAMES
     odd_surfaces: ClassVar[tuple[str, ...]] = ("mirror", "window")
 
     def __init__(
@@ -85,8 +86,8 @@ class SyntheticRoom(TruthRecording):
         true_poses: Pose | None = None,
         times: Tensor | None = None,
     ):
-        if path not in PATHS:
-            raise ValueError(f"synthetic room: path is {path!r}, expected one of {', '.join(PATHS)}")
+        if path not in CAMERA_PATHS:
+            raise ValueError(f"synthetic room: path is {path!r}, expected one of {', '.join(CAMERA_PATHS)}")
         if lidar not in ("phone", "exact", None):
             raise ValueError(f"synthetic room: lidar is {lidar!r}, expected phone, exact or None")
         if trajectory_axes not in ("cv", "gl"):
@@ -96,14 +97,14 @@ class SyntheticRoom(TruthRecording):
             if not value > 0:
                 raise ValueError(f"synthetic room: {option} is {value}, expected a positive number")
         if true_poses is None:
-            true_poses = hand_held(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed)
+            true_poses = hand_held_path(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed)
         super().__init__(
             name=name,
             format="synthetic",
             load=self._render,
-            number=numbers(n_frames),
-            times=numbers(n_frames).double() / rate_hz if times is None else times,
-            poses=_turned(true_poses, trajectory_offset_deg),
+            number=consecutive_frame_numbers(n_frames),
+            times=consecutive_frame_numbers(n_frames).double() / rate_hz if times is None else times,
+            poses=_rotate_device_axes(true_poses, trajectory_offset_deg),
             pose_axes=trajectory_axes,
             rate_hz=rate_hz,
         )
@@ -125,7 +126,7 @@ class SyntheticRoom(TruthRecording):
         return {**self.__dict__, "_frames": {}}  # a worker renders what it needs
 
     def __repr__(self) -> str:
-        return f"SyntheticRoom(seed={self.seed}, path={self.path!r}, lidar={self.lidar!r}, {many(len(self), 'frame')})"
+        return f"SyntheticRoom(seed={self.seed}, path={self.path!r}, lidar={self.lidar!r}, {format_count(len(self), 'frame')})"
 
     def truth(self, index: int) -> dict[str, Tensor]:
         """What is really there at the centre of every image pixel of frame ``index``.
@@ -134,7 +135,7 @@ class SyntheticRoom(TruthRecording):
         triangulation finds it there: evaluate such pixels apart, by ``surface``.
 
         Returns:
-            ``depth`` (1, H, W) m float32 and ``surface`` (1, H, W) uint8, a key of :data:`SURFACES`.
+            ``depth`` (1, H, W) m float32 and ``surface`` (1, H, W) uint8, a key of :data:`SURFACE_NAMES`.
         """
         i = self._position(index)
         return self._true_view(i, self.camera, self.true_poses[i : i + 1], self.hw)
@@ -161,7 +162,7 @@ class SyntheticRoom(TruthRecording):
         depth_camera = resize(self.camera, self.hw, self.depth_hw)
         if self.lidar == "phone":
             options = {"range_limit": self.range_limit, "noise_factor": self.depth_noise}
-            depth, conf = phone_lidar(
+            depth, conf = simulate_phone_lidar(
                 scene, depth_camera, pose, self.depth_hw, generator=self._generator(i, "lidar"), **options
             )
         elif self.lidar == "exact":
@@ -202,10 +203,10 @@ def open_room(*, near: float = 2.0, gap: int = 6, **options: Any) -> Scene:
     for option in options:
         if option not in known:
             raise ValueError(f"synthetic room: found option {option!r}, expected one of {', '.join(known)}")
-    return as_scene(SyntheticRoom(**options), near, gap)
+    return room_to_scene(SyntheticRoom(**options), near, gap)
 
 
-def as_scene(room: SyntheticRoom, near: float, gap: int) -> Scene:
+def room_to_scene(room: SyntheticRoom, near: float, gap: int) -> Scene:
     """A room with the notes of a benchmark; a path without baseline has a role.
 
     Raises:
@@ -218,7 +219,7 @@ def as_scene(room: SyntheticRoom, near: float, gap: int) -> Scene:
 
 
 def open_rooms(
-    paths: Sequence[str] = tuple(PATHS),
+    paths: Sequence[str] = tuple(CAMERA_PATHS),
     *,
     seed: int | Sequence[int] = 2,
     n_frames: int = 12,
@@ -243,7 +244,7 @@ def open_rooms(
     return scenes
 
 
-def phone_lidar(
+def simulate_phone_lidar(
     scene: ShadedRoom,
     camera: Camera,
     T_world_from_cam: Pose,
@@ -272,7 +273,7 @@ def phone_lidar(
     per_depth = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt()
     edge, mixed = _depth_edges(depth.view(hw))
     seen = torch.where(edge, mixed, depth)
-    at = (kind == MIRROR).nonzero()[:, 0]
+    at = (kind == SURFACE_MIRROR).nonzero()[:, 0]
     _, _, more, _ = scene.mirrored([c[at] for c in o], [c[at] for c in d], depth[at], face[at])
     seen = seen.index_copy(0, at, depth[at] + more)
     distance = seen * per_depth
@@ -282,8 +283,8 @@ def phone_lidar(
     lost = 0.6 * far
     for why in (
         torch.where(edge, 0.5, 0.0),
-        torch.where(kind == MIRROR, 0.85, 0.0),
-        torch.where(kind == WINDOW, 0.9, 0.0),
+        torch.where(kind == SURFACE_MIRROR, 0.85, 0.0),
+        torch.where(kind == SURFACE_WINDOW, 0.9, 0.0),
         0.9 * ((0.25 - cosine) / 0.25).clamp(0, 1),
         0.9 * (1 - returned / 0.001).clamp(0, 1),
     ):
@@ -294,13 +295,13 @@ def phone_lidar(
     error = noise_factor * sigma * _shared_normal(hw, generator)
     reported = ((distance + error) / per_depth).clamp(min=0.05)
     level = (returned > 0.001).int() + ((returned > 0.025) & (far == 0)).int()
-    level = torch.where(edge | (kind == MIRROR) | (kind == WINDOW), 0, level)
+    level = torch.where(edge | (kind == SURFACE_MIRROR) | (kind == SURFACE_WINDOW), 0, level)
     depth = torch.where(answered, reported, torch.zeros_like(reported))
     conf = torch.where(answered, level, 0).to(torch.uint8)
     return depth.view(1, *hw), conf.view(1, *hw)
 
 
-def _turned(poses: Pose, degrees: float) -> Pose:
+def _rotate_device_axes(poses: Pose, degrees: float) -> Pose:
     """The poses a device would report whose axes are turned by a constant angle against those of its camera."""
     turn = se3.exp(poses.t.new_tensor([[math.radians(degrees) / 3**0.5] * 3 + [0.0] * 3]))
     return Pose(poses.R @ turn.R, poses.t)

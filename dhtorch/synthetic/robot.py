@@ -18,7 +18,7 @@ from random import Random
 import numpy as np
 import torch
 
-from dhtorch.data.readers.rh20t_robot import ARMS
+from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS
 from dhtorch.data.readers.rh20t_set import open_set
 from dhtorch.data.recording import Recordings
 from dhtorch.records import Pose
@@ -26,7 +26,7 @@ from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.testing.rh20t import write_rh20t
 
 #: What the hand goes to: x, height, z, m, and the direction it comes from, degrees: yaw (positive: looks right), pitch.
-THINGS = (
+_TARGETS = (
     (-0.76, 1.02, 1.95, 0, -12),
     (-0.30, 1.02, 1.98, 8, -6),
     (0.22, 0.95, 1.90, -10, -14),
@@ -42,10 +42,10 @@ THINGS = (
 )
 
 #: What the hand does there.
-MOTIONS = ("reach", "pick", "slide", "screw")
+_MOTIONS = ("reach", "pick", "slide", "screw")
 
 #: Frames a second, as RH20T's cameras.
-RATE_HZ = 10.0
+_RATE_HZ = 10.0
 
 _CONFIGURATION = 1  # a Flexiv arm
 _START_MS = 1_600_000_000_000
@@ -81,15 +81,15 @@ def open_robot(
             " at least 1 and a picture of the shape of 720x1280 with a height of a multiple of 4"
         )
     if root is None:
-        _KEPT.append(tempfile.TemporaryDirectory(prefix="dhtorch_robot_"))
-        root = _KEPT[-1].name
+        _TEMPORARY_FOLDERS.append(tempfile.TemporaryDirectory(prefix="dhtorch_robot_"))
+        root = _TEMPORARY_FOLDERS[-1].name
     folder = Path(root)
     if not folder.is_dir() or not any(folder.iterdir()):
         write_robot(folder, tasks=tasks, scenes=scenes, n_frames=n_frames, hw=hw, seed=seed)
     return open_set(folder)
 
 
-_KEPT: list[tempfile.TemporaryDirectory[str]] = []
+_TEMPORARY_FOLDERS: list[tempfile.TemporaryDirectory[str]] = []
 
 
 def write_robot(root: Path, *, tasks: int, scenes: int, n_frames: int, hw: tuple[int, int], seed: int) -> None:
@@ -97,7 +97,7 @@ def write_robot(root: Path, *, tasks: int, scenes: int, n_frames: int, hw: tuple
     for scene in range(scenes):  # the outer loop: each scene has its own room
         for task in range(tasks):
             episode = _Episode.of(task, scene, seed)
-            times = [i / RATE_HZ for i in range(n_frames)]
+            times = [i / _RATE_HZ for i in range(n_frames)]
             c2w = np.stack([episode.camera(t) for t in times])
             start = _START_MS / 1000 + 1000 * (1 + task) + 100 * scene
             room = SyntheticRoom(
@@ -105,14 +105,14 @@ def write_robot(root: Path, *, tasks: int, scenes: int, n_frames: int, hw: tuple
                 n_frames=n_frames,
                 hw=hw,
                 depth_hw=(hw[0] // 2, hw[1] // 2),
-                rate_hz=RATE_HZ,
+                rate_hz=_RATE_HZ,
                 supersample=1,
                 true_poses=Pose(torch.from_numpy(c2w[:, :3, :3]), torch.from_numpy(c2w[:, :3, 3])),
                 times=torch.tensor([start + t for t in times], dtype=torch.float64),
             )
             base = episode.base()
             home = _Episode.of(task, 0, seed).camera(0.0)
-            arm = ARMS[_CONFIGURATION]
+            arm = ROBOT_ARMS[_CONFIGURATION]
             write_rh20t(
                 root,
                 {arm.in_hand[0]: list(room)},
@@ -121,7 +121,7 @@ def write_robot(root: Path, *, tasks: int, scenes: int, n_frames: int, hw: tuple
                 hand_at_calibration=home,
                 name=f"task_{task + 1:04d}_user_0001_scene_{scene + 1:04d}",
                 stamp=_START_MS + task,
-                joint=np.stack([joints(np.linalg.inv(base) @ T @ arm.X) for T in c2w]),
+                joint=np.stack([_solve_joints(np.linalg.inv(base) @ T @ arm.X) for T in c2w]),
                 width=np.array([episode.width(t) for t in times]),
             )
 
@@ -145,11 +145,11 @@ class _Episode:
     @staticmethod
     def of(task: int, scene: int, seed: int) -> _Episode:
         """A task fixes the thing and the motion; a scene the rest."""
-        x, height, z, yaw, pitch = THINGS[task % len(THINGS)]
+        x, height, z, yaw, pitch = _TARGETS[task % len(_TARGETS)]
         own = Random(f"robot {seed} {task}")
         draw = Random(f"robot {seed} {task} {scene}")
         return _Episode(
-            motion=MOTIONS[(task + task // len(THINGS)) % len(MOTIONS)],
+            motion=_MOTIONS[(task + task // len(_TARGETS)) % len(_MOTIONS)],
             thing=(x, -height, z),
             yaw=yaw + own.uniform(-4, 4) + draw.uniform(-5, 5),
             pitch=pitch + own.uniform(-3, 3) + draw.uniform(-3, 3),
@@ -164,20 +164,20 @@ class _Episode:
 
     def camera(self, time: float) -> np.ndarray:
         """Camera to world (4, 4)."""
-        done = _smooth((time - self.start) / self.length)
+        done = _smooth_ramp((time - self.start) / self.length)
         d, side, roll = self.near, 0.0, 0.0
         if self.motion == "slide":
             d, side = self.near + 0.15, self.side * (2 * done - 1)
         elif self.motion == "pick":
             half = self.length / 2
-            back = _smooth((time - self.start - half - 0.2) / half)
-            d += (self.far - self.near) * (1 - _smooth((time - self.start) / half) + 0.8 * back)
+            back = _smooth_ramp((time - self.start - half - 0.2) / half)
+            d += (self.far - self.near) * (1 - _smooth_ramp((time - self.start) / half) + 0.8 * back)
         else:
             d += (self.far - self.near) * (1 - done)
             roll = self.roll * done if self.motion == "screw" else 0.0
         sway = 0.002 * math.sin(7.0 * time + 10 * self.length)
-        R = _turn(self.yaw, self.pitch, roll)
-        aim = _turn(self.yaw, self.pitch, 0.0)
+        R = _rotation_from_angles(self.yaw, self.pitch, roll)
+        aim = _rotation_from_angles(self.yaw, self.pitch, 0.0)
         beside = aim @ np.array([self.offset[0] + side, self.offset[1] + sway, -d])
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = R, np.array(self.thing) + beside
@@ -194,10 +194,10 @@ class _Episode:
     def width(self, time: float) -> float:
         """Opening of the gripper, mm: it closes where the hand arrives."""
         arrives = self.start + self.length * (0.5 if self.motion == "pick" else 1.0)
-        return _OPEN_MM + (_CLOSED_MM - _OPEN_MM) * _smooth((time - arrives) / 0.3)
+        return _OPEN_MM + (_CLOSED_MM - _OPEN_MM) * _smooth_ramp((time - arrives) / 0.3)
 
 
-def joints(T_base_from_tcp: np.ndarray) -> np.ndarray:
+def _solve_joints(T_base_from_tcp: np.ndarray) -> np.ndarray:
     """Seven angles (7,) for a tcp pose (4, 4), rad: two links of 0.6 m in a turning plane, and three at the wrist.
 
     No real arm's: enough for a stream that moves as smoothly as the hand and belongs to it.
@@ -216,13 +216,13 @@ def joints(T_base_from_tcp: np.ndarray) -> np.ndarray:
     return np.array([math.atan2(y, x), shoulder, 0.0, elbow, *wrist])
 
 
-def _smooth(share: float) -> float:
+def _smooth_ramp(share: float) -> float:
     """From 0 to 1 with neither speed nor acceleration at the ends."""
     s = min(max(share, 0.0), 1.0)
     return s * s * s * (10 + s * (6 * s - 15))
 
 
-def _turn(yaw: float, pitch: float, roll: float) -> np.ndarray:
+def _rotation_from_angles(yaw: float, pitch: float, roll: float) -> np.ndarray:
     """World from camera: roll about z, then pitch about x (positive: up), then yaw about y (positive: right)."""
     a, b, c = (math.radians(v) for v in (yaw, pitch, roll))
     about_y = np.array([[math.cos(a), 0, math.sin(a)], [0, 1, 0], [-math.sin(a), 0, math.cos(a)]])

@@ -16,22 +16,30 @@ import math
 from functools import lru_cache
 from random import Random
 
-from dhtorch.synthetic.raycast import DARK, MIRROR, WINDOW, Solid, Surface, Triple
+from dhtorch.synthetic.raycast import SURFACE_DARK, SURFACE_MIRROR, SURFACE_WINDOW, Material, Solid, Triple
 from dhtorch.synthetic.shading import Light, ShadedRoom
 
-LEFT, RIGHT, FRONT, BACK, HEIGHT = -2.6, 2.1, -0.5, 4.4, 2.6  #: walls and ceiling, m
-NEG_X, POS_X, TOP, BOTTOM, NEG_Z, POS_Z = range(6)  # faces by outward normal; up is -y
-LAMP = (-0.15, 1.98, 3.1)  #: middle of the lampshade: x, height, z
+ROOM_LEFT_M, ROOM_RIGHT_M, ROOM_FRONT_M, ROOM_BACK_M, _ROOM_HEIGHT_M = (
+    -2.6,
+    2.1,
+    -0.5,
+    4.4,
+    2.6,
+)  #: walls and ceiling, m
+_FACE_NEG_X, _FACE_POS_X, _FACE_TOP, _FACE_BOTTOM, _FACE_NEG_Z, _FACE_POS_Z = range(
+    6
+)  # faces by outward normal; up is -y
+_LAMP_CENTRE = (-0.15, 1.98, 3.1)  #: middle of the lampshade: x, height, z
 
-BLANK = Surface("plaster", (0.93, 0.91, 0.86), 2.0)
-PALE = Surface("wood", (1.15, 1.15, 1.12), 0.8)
-WHITE = Surface("plain", (0.88, 0.87, 0.84), 0.6)
-OAK = Surface("wood", (0.72, 0.66, 0.62), 0.7)
-BLACK = Surface("plain", (0.13, 0.13, 0.14), 0.5, kind=DARK)
-MIRROR_GLASS = Surface("plain", (0.8, 0.85, 0.85), kind=MIRROR, reflect=0.93)
-SCREEN = Surface("plain", (0.07, 0.07, 0.08), 0.5, kind=DARK, reflect=0.06)
+_BLANK_WALL = Material("plaster", (0.93, 0.91, 0.86), 2.0)
+_PALE_WOOD = Material("wood", (1.15, 1.15, 1.12), 0.8)
+_WHITE_PAINT = Material("plain", (0.88, 0.87, 0.84), 0.6)
+_OAK_WOOD = Material("wood", (0.72, 0.66, 0.62), 0.7)
+_BLACK_PLASTIC = Material("plain", (0.13, 0.13, 0.14), 0.5, kind=SURFACE_DARK)
+_MIRROR_GLASS = Material("plain", (0.8, 0.85, 0.85), kind=SURFACE_MIRROR, reflect=0.93)
+_SCREEN_GLASS = Material("plain", (0.07, 0.07, 0.08), 0.5, kind=SURFACE_DARK, reflect=0.06)
 
-_CLOTHS: tuple[Triple, ...] = (
+_BOOK_COLOURS: tuple[Triple, ...] = (
     (0.62, 0.22, 0.18),
     (0.22, 0.32, 0.50),
     (0.24, 0.42, 0.32),
@@ -50,18 +58,27 @@ def furnished_room(seed: int = 2) -> ShadedRoom:
     solids = [_shell(draw)]
     for part in (_divider, _on_the_divider, _seats, _back_wall, _side_walls):
         solids += part(draw)
-    window = Light((RIGHT - 0.03, -1.5, BACK - 1.2), (0, 0, 0.55), (0, 0.5, 0), (-1, 0, 0), (2.9, 3.1, 3.4), (3, 4))
-    lamp = Light((LAMP[0], -LAMP[1], LAMP[2]), (0.12, 0, 0), (0, 0, 0.12), (0, 0, 0), (1.25, 1.08, 0.84), (2, 2))
-    ceiling = Light((-0.6, -HEIGHT + 0.02, 1.2), (0.4, 0, 0), (0, 0, 0.4), (0, 1, 0), (1.5, 1.4, 1.25), (3, 3))
+    window = Light(
+        (ROOM_RIGHT_M - 0.03, -1.5, ROOM_BACK_M - 1.2), (0, 0, 0.55), (0, 0.5, 0), (-1, 0, 0), (2.9, 3.1, 3.4), (3, 4)
+    )
+    lamp = Light(
+        (_LAMP_CENTRE[0], -_LAMP_CENTRE[1], _LAMP_CENTRE[2]),
+        (0.12, 0, 0),
+        (0, 0, 0.12),
+        (0, 0, 0),
+        (1.25, 1.08, 0.84),
+        (2, 2),
+    )
+    ceiling = Light((-0.6, -_ROOM_HEIGHT_M + 0.02, 1.2), (0.4, 0, 0), (0, 0, 0.4), (0, 1, 0), (1.5, 1.4, 1.25), (3, 3))
     return ShadedRoom(solids, [window, lamp, ceiling], ambient=0.42, seed=seed)
 
 
-def box(
+def make_box(
     x: float,
     height: float,
     z: float,
     size: Triple,
-    surface: Surface,
+    surface: Material,
     *,
     yaw: float = 0,
     pitch: float = 0,
@@ -75,39 +92,43 @@ def box(
     return Solid((x, -height - half[1], z), half, surface, R, **more)  # type: ignore[arg-type]
 
 
-def ball(x: float, height: float, z: float, radius: float, surface: Surface, **more: object) -> Solid:
+def make_ball(x: float, height: float, z: float, radius: float, surface: Material, **more: object) -> Solid:
     """A ball resting ``height`` above the floor."""
     return Solid((x, -height - radius, z), (radius, radius, radius), surface, ball=True, **more)  # type: ignore[arg-type]
 
 
 def _tint(draw: Random) -> Triple:
     """A book cloth: a warm, cool or grey colour, never a pure one."""
-    base = draw.choice(_CLOTHS)
+    base = draw.choice(_BOOK_COLOURS)
     tone = draw.uniform(0.75, 1.2)
     return (base[0] * tone, base[1] * tone, base[2] * tone)
 
 
 def _shell(draw: Random) -> Solid:
-    size = (RIGHT - LEFT, HEIGHT, BACK - FRONT)
+    size = (ROOM_RIGHT_M - ROOM_LEFT_M, _ROOM_HEIGHT_M, ROOM_BACK_M - ROOM_FRONT_M)
     faces = {
-        TOP: Surface("plaster", (0.97, 0.96, 0.93), 2.0),
-        BOTTOM: Surface("planks", tile=1.3),
-        POS_Z: Surface("brick", tile=2.0),
-        NEG_Z: Surface("wallpaper", tile=1.6),
-        NEG_X: BLANK,
-        POS_X: BLANK,
+        _FACE_TOP: Material("plaster", (0.97, 0.96, 0.93), 2.0),
+        _FACE_BOTTOM: Material("planks", tile=1.3),
+        _FACE_POS_Z: Material("brick", tile=2.0),
+        _FACE_NEG_Z: Material("wallpaper", tile=1.6),
+        _FACE_NEG_X: _BLANK_WALL,
+        _FACE_POS_X: _BLANK_WALL,
     }
-    return box((LEFT + RIGHT) / 2, 0, (BACK + FRONT) / 2, size, BLANK, faces=faces)
+    return make_box(
+        (ROOM_LEFT_M + ROOM_RIGHT_M) / 2, 0, (ROOM_BACK_M + ROOM_FRONT_M) / 2, size, _BLANK_WALL, faces=faces
+    )
 
 
-def _legs(x: float, z: float, size: Triple, thick: float, surface: Surface, yaw: float = 0) -> list[Solid]:
+def _legs(x: float, z: float, size: Triple, thick: float, surface: Material, yaw: float = 0) -> list[Solid]:
     """Four legs under a plate of ``size`` whose top is ``size[1]`` above the floor."""
     c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
     legs = []
     for i in (-1, 1):
         for k in (-1, 1):
             dx, dz = i * (size[0] / 2 - thick), k * (size[2] / 2 - thick)
-            legs.append(box(x + c * dx + s * dz, 0, z - s * dx + c * dz, (thick, size[1], thick), surface, yaw=yaw))
+            legs.append(
+                make_box(x + c * dx + s * dz, 0, z - s * dx + c * dz, (thick, size[1], thick), surface, yaw=yaw)
+            )
     return legs
 
 
@@ -115,9 +136,9 @@ def _divider(draw: Random) -> list[Solid]:
     """A low open shelf across the view, five bays of drawers, boxes and books, and the lamp behind it."""
     x0, z, pitch, top = -1.25, 1.95, 0.42, 0.86
     wide = 5 * pitch
-    parts = [box(x0 + wide / 2, h, z, (wide + 0.03, 0.03, 0.36), WHITE) for h in (0.03, 0.43, top - 0.03)]
-    parts += [box(x0 + k * pitch, 0.03, z, (0.03, top - 0.06, 0.36), WHITE) for k in range(6)]
-    parts.append(box(x0 + wide / 2, 0.03, z + 0.175, (wide, top - 0.06, 0.01), WHITE))
+    parts = [make_box(x0 + wide / 2, h, z, (wide + 0.03, 0.03, 0.36), _WHITE_PAINT) for h in (0.03, 0.43, top - 0.03)]
+    parts += [make_box(x0 + k * pitch, 0.03, z, (0.03, top - 0.06, 0.36), _WHITE_PAINT) for k in range(6)]
+    parts.append(make_box(x0 + wide / 2, 0.03, z + 0.175, (wide, top - 0.06, 0.01), _WHITE_PAINT))
     fronts = ["print", "poster:0", "books", "wallpaper", "poster:2"]
     draw.shuffle(fronts)
     for row in (0.06, 0.46):
@@ -128,113 +149,124 @@ def _divider(draw: Random) -> list[Solid]:
             else:
                 tile = 0.6 if front in ("print", "wallpaper") else None
                 parts.append(
-                    box(left + pitch / 2 - 0.015, row, z, (pitch - 0.04, 0.36, 0.34), Surface(front, tile=tile))
+                    make_box(left + pitch / 2 - 0.015, row, z, (pitch - 0.04, 0.36, 0.34), Material(front, tile=tile))
                 )
-    shade = Surface("print", (0.8, 0.75, 0.65), 0.5, glow=0.4)
-    parts.append(box(LAMP[0], LAMP[1] + 0.17, LAMP[2], (0.012, 1.0, 0.012), BLACK, shadow=False))
-    return [*parts, ball(LAMP[0], LAMP[1] - 0.17, LAMP[2], 0.17, shade, shadow=False)]
+    shade = Material("print", (0.8, 0.75, 0.65), 0.5, glow=0.4)
+    parts.append(
+        make_box(
+            _LAMP_CENTRE[0], _LAMP_CENTRE[1] + 0.17, _LAMP_CENTRE[2], (0.012, 1.0, 0.012), _BLACK_PLASTIC, shadow=False
+        )
+    )
+    return [*parts, make_ball(_LAMP_CENTRE[0], _LAMP_CENTRE[1] - 0.17, _LAMP_CENTRE[2], 0.17, shade, shadow=False)]
 
 
 def _on_the_divider(draw: Random) -> list[Solid]:
     top, x, z = 0.86, -0.2, 1.95
     return [
         *_plant(x - 0.92, top, z + 0.05, 1.1),
-        box(x - 0.56, top, z + 0.02, (0.09, 0.03, 0.09), OAK, yaw=10),
-        ball(x - 0.56, top + 0.03, z + 0.02, 0.14, Surface("globe", tile=0.36)),
-        box(x - 0.10, top, z + 0.07, (0.30, 0.36, 0.07), Surface("poster:1"), yaw=draw.uniform(4, 14)),
+        make_box(x - 0.56, top, z + 0.02, (0.09, 0.03, 0.09), _OAK_WOOD, yaw=10),
+        make_ball(x - 0.56, top + 0.03, z + 0.02, 0.14, Material("globe", tile=0.36)),
+        make_box(x - 0.10, top, z + 0.07, (0.30, 0.36, 0.07), Material("poster:1"), yaw=draw.uniform(4, 14)),
         *_laptop(x + 0.42, top, z - 0.03),
-        ball(x - 0.40, top, z - 0.06, 0.04, Surface("speckle", (1.0, 0.55, 0.15), 0.25)),
-        ball(x - 0.46, top, z - 0.12, 0.042, Surface("speckle", (0.9, 0.2, 0.15), 0.25)),
+        make_ball(x - 0.40, top, z - 0.06, 0.04, Material("speckle", (1.0, 0.55, 0.15), 0.25)),
+        make_ball(x - 0.46, top, z - 0.12, 0.042, Material("speckle", (0.9, 0.2, 0.15), 0.25)),
     ]
 
 
 def _laptop(x: float, height: float, z: float) -> list[Solid]:
-    case = Surface("plain", (0.7, 0.7, 0.72))
-    picture = Surface("poster:0", (0.9, 0.9, 0.9), glow=0.12)
-    lid, keys, screen = (x + 0.045, height + 0.015, z + 0.125), {TOP: Surface("keyboard")}, {NEG_Z: picture}
+    case = Material("plain", (0.7, 0.7, 0.72))
+    picture = Material("poster:0", (0.9, 0.9, 0.9), glow=0.12)
+    lid, keys, screen = (
+        (x + 0.045, height + 0.015, z + 0.125),
+        {_FACE_TOP: Material("keyboard")},
+        {_FACE_NEG_Z: picture},
+    )
     return [
-        box(x, height, z, (0.35, 0.018, 0.23), case, yaw=-18, faces=keys),
-        box(*lid, (0.35, 0.24, 0.012), SCREEN, yaw=-18, pitch=-14, faces=screen),
+        make_box(x, height, z, (0.35, 0.018, 0.23), case, yaw=-18, faces=keys),
+        make_box(*lid, (0.35, 0.24, 0.012), _SCREEN_GLASS, yaw=-18, pitch=-14, faces=screen),
     ]
 
 
 def _plant(x: float, height: float, z: float, size: float) -> list[Solid]:
     """A pot with a bush of four balls."""
-    leaf = Surface("leaves", tile=0.25)
-    pot = Surface("speckle")
+    leaf = Material("leaves", tile=0.25)
+    pot = Material("speckle")
     bush = ((0, 0, 0.10), (-0.06, -0.03, 0.07), (0.05, 0.04, 0.075), (0.02, -0.06, 0.06))
     balls = [
-        ball(x + size * dx, height + size * (0.15 + 0.045 * k), z + size * dz, size * r, leaf)
+        make_ball(x + size * dx, height + size * (0.15 + 0.045 * k), z + size * dz, size * r, leaf)
         for k, (dx, dz, r) in enumerate(bush)
     ]
-    return [box(x, height, z, (0.10 * size, 0.16 * size, 0.10 * size), pot, yaw=30), *balls]
+    return [make_box(x, height, z, (0.10 * size, 0.16 * size, 0.10 * size), pot, yaw=30), *balls]
 
 
-def _chair(x: float, z: float, yaw: float, surface: Surface) -> list[Solid]:
+def _chair(x: float, z: float, yaw: float, surface: Material) -> list[Solid]:
     """A wooden chair whose back stands on its local +z side."""
     c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
 
     def at(dx: float, dz: float) -> tuple[float, float]:
         return x + c * dx + s * dz, z - s * dx + c * dz
 
-    cover = Surface("print", (1.0, 0.95, 0.9), 0.55)
-    parts = [box(x, 0.43, z, (0.44, 0.05, 0.44), cover, yaw=yaw), *_legs(x, z, (0.44, 0.43, 0.44), 0.04, surface, yaw)]
+    cover = Material("print", (1.0, 0.95, 0.9), 0.55)
+    parts = [
+        make_box(x, 0.43, z, (0.44, 0.05, 0.44), cover, yaw=yaw),
+        *_legs(x, z, (0.44, 0.43, 0.44), 0.04, surface, yaw),
+    ]
     for dx in (-0.21, 0.21):
         px, pz = at(dx, 0.2)
-        parts.append(box(px, 0.47, pz, (0.04, 0.54, 0.03), surface, yaw=yaw))
+        parts.append(make_box(px, 0.47, pz, (0.04, 0.54, 0.03), surface, yaw=yaw))
     px, pz = at(0, 0.2)
-    return [*parts, box(px, 0.56, pz, (0.385, 0.43, 0.045), cover, yaw=yaw)]
+    return [*parts, make_box(px, 0.56, pz, (0.385, 0.43, 0.045), cover, yaw=yaw)]
 
 
 def _seats(draw: Random) -> list[Solid]:
-    cushion, sofa = Surface("fabric", (0.50, 0.62, 0.72), 0.6), Surface("fabric", (0.62, 0.66, 0.58), 0.8)
-    x, z = RIGHT - 0.47, BACK - 1.2
+    cushion, sofa = Material("fabric", (0.50, 0.62, 0.72), 0.6), Material("fabric", (0.62, 0.66, 0.58), 0.8)
+    x, z = ROOM_RIGHT_M - 0.47, ROOM_BACK_M - 1.2
     parts = [
-        box(x, 0.10, z, (0.85, 0.32, 1.7), sofa),
-        box(RIGHT - 0.16, 0.30, z, (0.22, 0.50, 1.7), sofa),
-        box(x, 0.10, z - 0.9, (0.88, 0.50, 0.18), sofa),
-        box(x, 0.10, z + 0.9, (0.88, 0.50, 0.18), sofa),
-        box(x + 0.12, 0.44, z + 0.55, (0.14, 0.38, 0.40), Surface("carpet"), yaw=20, pitch=8),
-        box(x + 0.10, 0.44, z - 0.45, (0.14, 0.36, 0.38), Surface("print", (1.0, 0.75, 0.65), 0.5), yaw=-25),
-        box(0.0, 0.001, 3.0, (2.0, 0.012, 1.5), Surface("carpet"), yaw=3),
-        box(0.35, 0.36, 3.1, (0.85, 0.04, 0.5), PALE, yaw=8),
-        *_legs(0.35, 3.1, (0.85, 0.36, 0.5), 0.05, PALE, 8),
-        box(0.25, 0.40, 3.1, (0.21, 0.012, 0.28), Surface("page"), yaw=-30),
-        ball(0.58, 0.40, 3.15, 0.09, Surface("speckle", tile=0.3)),
+        make_box(x, 0.10, z, (0.85, 0.32, 1.7), sofa),
+        make_box(ROOM_RIGHT_M - 0.16, 0.30, z, (0.22, 0.50, 1.7), sofa),
+        make_box(x, 0.10, z - 0.9, (0.88, 0.50, 0.18), sofa),
+        make_box(x, 0.10, z + 0.9, (0.88, 0.50, 0.18), sofa),
+        make_box(x + 0.12, 0.44, z + 0.55, (0.14, 0.38, 0.40), Material("carpet"), yaw=20, pitch=8),
+        make_box(x + 0.10, 0.44, z - 0.45, (0.14, 0.36, 0.38), Material("print", (1.0, 0.75, 0.65), 0.5), yaw=-25),
+        make_box(0.0, 0.001, 3.0, (2.0, 0.012, 1.5), Material("carpet"), yaw=3),
+        make_box(0.35, 0.36, 3.1, (0.85, 0.04, 0.5), _PALE_WOOD, yaw=8),
+        *_legs(0.35, 3.1, (0.85, 0.36, 0.5), 0.05, _PALE_WOOD, 8),
+        make_box(0.25, 0.40, 3.1, (0.21, 0.012, 0.28), Material("page"), yaw=-30),
+        make_ball(0.58, 0.40, 3.15, 0.09, Material("speckle", tile=0.3)),
     ]
     x, z, yaw = -1.75, 3.2, draw.uniform(55, 68)
     c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
     parts += [
-        box(x, 0.08, z, (0.72, 0.34, 0.72), cushion, yaw=yaw),
-        box(x - 0.33 * s, 0.30, z - 0.33 * c, (0.72, 0.55, 0.16), cushion, yaw=yaw),
-        box(x + 0.38 * c, 0.08, z - 0.38 * s, (0.14, 0.54, 0.72), cushion, yaw=yaw),
-        box(x - 0.38 * c, 0.08, z + 0.38 * s, (0.14, 0.54, 0.72), cushion, yaw=yaw),
+        make_box(x, 0.08, z, (0.72, 0.34, 0.72), cushion, yaw=yaw),
+        make_box(x - 0.33 * s, 0.30, z - 0.33 * c, (0.72, 0.55, 0.16), cushion, yaw=yaw),
+        make_box(x + 0.38 * c, 0.08, z - 0.38 * s, (0.14, 0.54, 0.72), cushion, yaw=yaw),
+        make_box(x - 0.38 * c, 0.08, z + 0.38 * s, (0.14, 0.54, 0.72), cushion, yaw=yaw),
     ]
-    return parts + _chair(-1.0, 2.6, draw.uniform(-60, -40), OAK)
+    return parts + _chair(-1.0, 2.6, draw.uniform(-60, -40), _OAK_WOOD)
 
 
 def _back_wall(draw: Random) -> list[Solid]:
-    z = BACK
+    z = ROOM_BACK_M
     x0, x1, top = -2.15, -0.95, 2.05
-    parts = [box((x0 + x1) / 2, 0, z - 0.015, (x1 - x0, top, 0.02), OAK)]
-    parts += [box(x, 0, z - 0.16, (0.03, top, 0.30), OAK) for x in (x0, (x0 + x1) / 2, x1)]
+    parts = [make_box((x0 + x1) / 2, 0, z - 0.015, (x1 - x0, top, 0.02), _OAK_WOOD)]
+    parts += [make_box(x, 0, z - 0.16, (0.03, top, 0.30), _OAK_WOOD) for x in (x0, (x0 + x1) / 2, x1)]
     shelves = (0.06, 0.46, 0.86, 1.26, 1.66, 2.03)
-    parts += [box((x0 + x1) / 2, h, z - 0.16, (x1 - x0, 0.03, 0.30), OAK) for h in shelves]
+    parts += [make_box((x0 + x1) / 2, h, z - 0.16, (x1 - x0, 0.03, 0.30), _OAK_WOOD) for h in shelves]
     for h in shelves[:-1]:
         for left in (x0 + 0.03, (x0 + x1) / 2 + 0.03):
             parts += _books(draw, left, left + 0.53, h + 0.03, z - 0.15)
     x = 0.15
     parts += [
-        box(x, 0.08, z - 0.22, (1.5, 0.50, 0.40), WHITE),
-        box(x, 0.10, z - 0.43, (0.015, 0.46, 0.02), OAK),
-        box(x, 0.72, z - 0.06, (1.15, 0.66, 0.05), BLACK, faces={NEG_Z: SCREEN}),
-        box(x - 0.55, 0.58, z - 0.25, (0.13, 0.18, 0.12), Surface("speckle", (0.6, 0.8, 0.9), 0.3), yaw=20),
-        ball(x - 0.55, 0.74, z - 0.25, 0.13, Surface("leaves", tile=0.4)),
-        box(x + 0.58, 0.58, z - 0.22, (0.16, 0.22, 0.02), Surface("poster:3"), yaw=-12, pitch=-8),
-        box(x, 1.60, z - 0.02, (0.85, 0.60, 0.03), Surface("landscape", (0.85, 0.8, 0.75))),
-        box(1.38, 0.80, z - 0.025, (0.66, 1.16, 0.03), PALE),
-        box(1.38, 0.84, z - 0.043, (0.58, 1.08, 0.01), PALE, faces={NEG_Z: MIRROR_GLASS}),
-        box(1.89, 1.55, z - 0.02, (0.30, 0.42, 0.03), Surface("poster:2")),
+        make_box(x, 0.08, z - 0.22, (1.5, 0.50, 0.40), _WHITE_PAINT),
+        make_box(x, 0.10, z - 0.43, (0.015, 0.46, 0.02), _OAK_WOOD),
+        make_box(x, 0.72, z - 0.06, (1.15, 0.66, 0.05), _BLACK_PLASTIC, faces={_FACE_NEG_Z: _SCREEN_GLASS}),
+        make_box(x - 0.55, 0.58, z - 0.25, (0.13, 0.18, 0.12), Material("speckle", (0.6, 0.8, 0.9), 0.3), yaw=20),
+        make_ball(x - 0.55, 0.74, z - 0.25, 0.13, Material("leaves", tile=0.4)),
+        make_box(x + 0.58, 0.58, z - 0.22, (0.16, 0.22, 0.02), Material("poster:3"), yaw=-12, pitch=-8),
+        make_box(x, 1.60, z - 0.02, (0.85, 0.60, 0.03), Material("landscape", (0.85, 0.8, 0.75))),
+        make_box(1.38, 0.80, z - 0.025, (0.66, 1.16, 0.03), _PALE_WOOD),
+        make_box(1.38, 0.84, z - 0.043, (0.58, 1.08, 0.01), _PALE_WOOD, faces={_FACE_NEG_Z: _MIRROR_GLASS}),
+        make_box(1.89, 1.55, z - 0.02, (0.30, 0.42, 0.03), Material("poster:2")),
     ]
     return parts
 
@@ -250,16 +282,18 @@ def _books(draw: Random, left: float, right: float, height: float, z: float, *, 
         deep = draw.uniform(0.16, 0.24)
         if x + wide > stop:
             return books
-        surface = Surface("spine", _tint(draw))
-        books.append(box(x + wide / 2, height, z + 0.13 - deep / 2, (wide - 0.003, tall, deep), surface, shadow=False))
+        surface = Material("spine", _tint(draw))
+        books.append(
+            make_box(x + wide / 2, height, z + 0.13 - deep / 2, (wide - 0.003, tall, deep), surface, shadow=False)
+        )
         x += wide
 
 
 def _side_walls(draw: Random) -> list[Solid]:
-    x, z = RIGHT, BACK - 1.2
-    pane = Surface("landscape", (1.12, 1.12, 1.1), 1.7, kind=WINDOW, glow=0.9)
-    frame = Surface("plain", (0.95, 0.95, 0.94), 0.7)
-    parts = [box(x - 0.005, 1.0, z, (0.012, 1.05, 1.2), frame, faces={NEG_X: pane}, shadow=False)]
+    x, z = ROOM_RIGHT_M, ROOM_BACK_M - 1.2
+    pane = Material("landscape", (1.12, 1.12, 1.1), 1.7, kind=SURFACE_WINDOW, glow=0.9)
+    frame = Material("plain", (0.95, 0.95, 0.94), 0.7)
+    parts = [make_box(x - 0.005, 1.0, z, (0.012, 1.05, 1.2), frame, faces={_FACE_NEG_X: pane}, shadow=False)]
     for h, dz, size in (
         (0.94, 0, (0.10, 0.06, 1.36)),
         (2.05, 0, (0.06, 0.06, 1.32)),
@@ -267,17 +301,19 @@ def _side_walls(draw: Random) -> list[Solid]:
         (0.98, 0.63, (0.06, 1.1, 0.06)),
         (0.98, 0, (0.05, 1.1, 0.05)),
     ):
-        parts.append(box(x - 0.02, h, z + dz, size, frame))
-    curtain = Surface("fabric", (0.85, 0.72, 0.55), 0.5)
+        parts.append(make_box(x - 0.02, h, z + dz, size, frame))
+    curtain = Material("fabric", (0.85, 0.72, 0.55), 0.5)
     for dz in (-0.98, -0.90, -0.82, 0.82, 0.90, 0.98):
         parts.append(
-            box(x - 0.07, 0.55, z + dz, (0.05 + 0.03 * draw.random(), 1.70, 0.07), curtain, yaw=draw.uniform(-25, 25))
+            make_box(
+                x - 0.07, 0.55, z + dz, (0.05 + 0.03 * draw.random(), 1.70, 0.07), curtain, yaw=draw.uniform(-25, 25)
+            )
         )
     for k, (pz, h) in enumerate(((0.6, 1.2), (1.7, 1.3), (3.0, 1.25))):
-        parts.append(box(LEFT + 0.02, h, pz, (0.03, 0.6, 0.5), Surface(f"poster:{2 + k}")))
+        parts.append(make_box(ROOM_LEFT_M + 0.02, h, pz, (0.03, 0.6, 0.5), Material(f"poster:{2 + k}")))
     parts += [
-        box(1.3, 0, FRONT + 0.02, (0.9, 2.05, 0.04), PALE),
-        box(-0.6, 1.1, FRONT + 0.02, (0.9, 0.7, 0.03), Surface("poster:1")),
-        box(-1.7, 0, FRONT + 0.25, (1.0, 1.1, 0.45), OAK),
+        make_box(1.3, 0, ROOM_FRONT_M + 0.02, (0.9, 2.05, 0.04), _PALE_WOOD),
+        make_box(-0.6, 1.1, ROOM_FRONT_M + 0.02, (0.9, 0.7, 0.03), Material("poster:1")),
+        make_box(-1.7, 0, ROOM_FRONT_M + 0.25, (1.0, 1.1, 0.45), _OAK_WOOD),
     ]
     return parts

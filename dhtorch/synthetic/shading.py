@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.patches import LUMA
+from dhtorch.geometry.patches import LUMA_WEIGHTS
 from dhtorch.geometry.se3 import Pose
-from dhtorch.synthetic.raycast import MOVING, Solid, Solids, Surface, Triple, dot
-from dhtorch.synthetic.textures import SIZE, paint
+from dhtorch.synthetic.raycast import SURFACE_MOVING, Material, Solid, Solids, Triple, dot_product
+from dhtorch.synthetic.textures import TEXTURE_SIZE_PX, paint_textures
 
-_STRIP = 1 << 16  # rays shaded at a time: enough to amortise a call, few enough to stay in the cache
+_RAYS_PER_CHUNK = 1 << 16  # rays shaded at a time: enough to amortise a call, few enough to stay in the cache
 
 
 @dataclass(frozen=True)
@@ -43,13 +43,13 @@ class ShadedRoom:
 
     def __init__(self, solids: Sequence[Solid], lights: Sequence[Light], *, ambient: float, seed: int):
         self._lights, self._ambient = tuple(lights), ambient
-        self._names = sorted({s.picture for s in _surfaces(solids)})
-        self._pictures = _Pictures(paint(self._names, torch.Generator().manual_seed(seed)))
+        self._names = sorted({s.picture for s in _face_materials(solids)})
+        self._pictures = _Pictures(paint_textures(self._names, torch.Generator().manual_seed(seed)))
         self._furnish(solids, None)
 
     def _furnish(self, solids: Sequence[Solid], lit: _Lightmap | None) -> None:
         """Put up the solids; the first ones keep the light ``lit``."""
-        surfaces = _surfaces(solids)
+        surfaces = _face_materials(solids)
         self.solids = Solids(solids)
         self.kind = torch.tensor([s.kind for s in surfaces])  # (faces,), also the next ones
         self._picture = torch.tensor([self._names.index(s.picture) for s in surfaces])
@@ -58,7 +58,7 @@ class ShadedRoom:
         self._tint = torch.tensor([s.tint for s in surfaces])
         self._scale = _texture_scale(solids, surfaces)
         #: Mean grey of each face (faces,), display values: the surface's brightness to a sensor with its own light.
-        self.albedo = (self._pictures.mean[self._picture] * self._tint * torch.tensor(LUMA)).sum(-1)
+        self.albedo = (self._pictures.mean[self._picture] * self._tint * torch.tensor(LUMA_WEIGHTS)).sum(-1)
         self.light = _Lightmap(self.solids, self._lights, self._ambient, lit)
 
     def joined_by(self, guests: Sequence[Solid]) -> ShadedRoom:
@@ -70,7 +70,7 @@ class ShadedRoom:
         for guest in guests:
             if guest.shadow:
                 raise ValueError("shaded room: found a guest that casts a shadow, expected shadow=False")
-        for surface in _surfaces(guests):
+        for surface in _face_materials(guests):
             if surface.picture not in self._names:
                 raise ValueError(f"shaded room: picture is {surface.picture!r}, expected one of {self._names}")
         whole = copy.copy(self)
@@ -78,12 +78,13 @@ class ShadedRoom:
         return whole
 
     def moved(self, motion: Pose) -> ShadedRoom:
-        """The room with its solids of kind ``MOVING`` gone by a rigid motion (1) of the world, in the light they had.
+        """The room with its solids of kind ``SURFACE_MOVING`` gone by a rigid motion (1) of the world, in the light
+        they had.
 
         A surface point keeps its colour wherever it goes, so that it can be tracked like any other.
         """
         there = copy.copy(self)
-        there.solids = Solids([s.moved(motion) if s.surface.kind == MOVING else s for s in self.solids.each])
+        there.solids = Solids([s.moved(motion) if s.surface.kind == SURFACE_MOVING else s for s in self.solids.each])
         return there
 
     def shade(
@@ -93,15 +94,15 @@ class ShadedRoom:
 
         ``spread``: width of a ray per unit of ``t``; pictures are filtered to it.
         """
-        parts = [slice(k, k + _STRIP) for k in range(0, t.numel(), _STRIP)]
+        parts = [slice(k, k + _RAYS_PER_CHUNK) for k in range(0, t.numel(), _RAYS_PER_CHUNK)]
         strips = [self._paint([c[s] for c in o], [c[s] for c in d], t[s], index[s], spread) for s in parts]
         colour, face = torch.cat([s[0] for s in strips]), torch.cat([s[1] for s in strips])
         return self._mirror(colour, face, o, d, t, spread), face
 
     def cosine(self, d: Sequence[Tensor], face: Tensor, p: Sequence[Tensor]) -> Tensor:
         """Cosine (P,) of the angle between a ray and the normal of the face it meets at ``p``, in [0, 1]."""
-        along = dot(d, self.solids.normal(face, p)).abs()
-        return (along / dot(d, d).sqrt()).clamp(0, 1)
+        along = dot_product(d, self.solids.normal(face, p)).abs()
+        return (along / dot_product(d, d).sqrt()).clamp(0, 1)
 
     def mirrored(
         self, o: Sequence[Tensor], d: Sequence[Tensor], t: Tensor, face: Tensor
@@ -109,7 +110,7 @@ class ShadedRoom:
         """Origins, directions, distances and solids of the rays after reflection at ``face`` (P,)."""
         p = [o[k] + d[k] * t for k in range(3)]
         normal = self.solids.normal(face, p)
-        along = dot(d, normal)
+        along = dot_product(d, normal)
         bounced = [d[k] - 2 * along * normal[k] for k in range(3)]
         start = [p[k] + 1e-4 * bounced[k] for k in range(3)]
         return start, bounced, *self.solids.cast(start, bounced)
@@ -164,7 +165,7 @@ class _Pictures:
 
     def _bilinear(self, base: Tensor, level: Tensor, x: Tensor, y: Tensor) -> Tensor:
         start, size = self._levels[level].unbind(-1)
-        shrink = size / SIZE
+        shrink = size / TEXTURE_SIZE_PX
         x, y = x * shrink + (size / 2 - 0.5), y * shrink + (size / 2 - 0.5)
         left, above = x.floor(), y.floor()
         wx, wy = (x - left)[:, None], (y - above)[:, None]
@@ -205,9 +206,9 @@ class _Lightmap:
         p = solids.points(face, across * 0.995, down * 0.995)
         normal = solids.normal(face, p)
         p = [p[k] + 0.003 * normal[k] for k in range(3)]
-        power = ambient * _ambient(solids, p, normal)
+        power = ambient * _ambient_light(solids, p, normal)
         for light in lights:
-            power = power + _direct(solids, light, p, normal)
+            power = power + _direct_light(solids, light, p, normal)
         values = power.sqrt()
         self.values: Tensor = values if known is None else torch.cat((known.values, values))  # (L, 3)
 
@@ -226,24 +227,24 @@ class _Lightmap:
         return top + (c + (e - c) * wx - top) * wy
 
 
-def _direct(solids: Solids, light: Light, p: list[Tensor], normal: list[Tensor]) -> Tensor:
+def _direct_light(solids: Solids, light: Light, p: list[Tensor], normal: list[Tensor]) -> Tensor:
     """Power (L, 3) that reaches points from a light past everything that casts a shadow."""
     rows, columns = light.samples
     places = [((2 * i + 1) / columns - 1, (2 * k + 1) / rows - 1) for k in range(rows) for i in range(columns)]
     target = [torch.tensor([[light.centre[j] + a * light.u[j] + b * light.v[j]] for a, b in places]) for j in range(3)]
     d = [target[k] - p[k] for k in range(3)]  # (samples, L)
-    square = dot(d, d).clamp(min=0.04)
-    shine = -dot(d, light.normal) if any(light.normal) else square.sqrt()
-    gain = dot(d, normal).clamp(min=0) * shine.clamp(min=0) / (square * square)
+    square = dot_product(d, d).clamp(min=0.04)
+    shine = -dot_product(d, light.normal) if any(light.normal) else square.sqrt()
+    gain = dot_product(d, normal).clamp(min=0) * shine.clamp(min=0) / (square * square)
     lit = gain.any(0).nonzero()[:, 0]  # what faces away from all of the light is dark whatever stands between
-    gain[:, lit] *= _unshaded(solids, light, [c[lit] for c in p], [c[:, lit] for c in d])
+    gain[:, lit] *= _is_unshaded(solids, light, [c[lit] for c in p], [c[:, lit] for c in d])
     total = torch.zeros_like(gain[0])
     for k in range(len(places)):  # a sum in written order
         total = total + gain[k]
     return (total / len(places))[:, None] * torch.tensor(light.colour)
 
 
-def _unshaded(solids: Solids, light: Light, p: list[Tensor], d: list[Tensor]) -> Tensor:
+def _is_unshaded(solids: Solids, light: Light, p: list[Tensor], d: list[Tensor]) -> Tensor:
     """1 where nothing stands on the ways ``d`` (samples, P) from points ``p`` (P,) to places of a light, else 0."""
     clear = torch.ones_like(d[0])
     half = math.hypot(*(abs(light.u[k]) + abs(light.v[k]) for k in range(3)))
@@ -253,17 +254,19 @@ def _unshaded(solids: Solids, light: Light, p: list[Tensor], d: list[Tensor]) ->
     return clear
 
 
-def _ambient(solids: Solids, p: list[Tensor], normal: list[Tensor], *, reach: float = 1.1) -> Tensor:
+def _ambient_light(solids: Solids, p: list[Tensor], normal: list[Tensor], *, reach: float = 1.1) -> Tensor:
     """Share (L, 3) of light from all around that what stands within ``reach`` (m) lets through."""
     sphere = _sphere_directions()
     d = [torch.tensor([[c[k]] for c in sphere]) for k in range(3)]
-    side = torch.where(dot(d, normal) < 0, -reach, reach)  # the same directions for all, turned to the open side
+    side = torch.where(
+        dot_product(d, normal) < 0, -reach, reach
+    )  # the same directions for all, turned to the open side
     d = [c * side for c in d]  # (directions, L)
     clear = solids.open_distance(solids.each[0], p, d)
     for solid, at in solids.blockers(p, reach):
         far = solids.open_distance(solid, [c[at] for c in p], [c[:, at] for c in d])
         clear[:, at] = torch.minimum(clear[:, at], far)
-    weight = 0.35 + dot(d, normal) / reach
+    weight = 0.35 + dot_product(d, normal) / reach
     total, most = torch.zeros_like(p[0]), torch.zeros_like(p[0])
     for k in range(len(sphere)):
         total, most = total + clear[k] * weight[k], most + weight[k]
@@ -284,18 +287,18 @@ def _sphere_directions(n: int = 14) -> list[Triple]:
     return directions
 
 
-def _surfaces(solids: Sequence[Solid]) -> list[Surface]:
+def _face_materials(solids: Sequence[Solid]) -> list[Material]:
     """Of every face, six a solid."""
     return [s.faces.get(f, s.surface) for s in solids for f in range(6)]
 
 
-def _texture_scale(solids: Sequence[Solid], surfaces: Sequence[Surface]) -> Tensor:
+def _texture_scale(solids: Sequence[Solid], surfaces: Sequence[Material]) -> Tensor:
     """(faces, 3): texels per half width across and down, signed so that print reads the right way round; per m."""
     rows = []
     for f, surface in enumerate(surfaces):
         solid, axis, positive = solids[f // 6], (f % 6) // 2, f % 2
         half = [solid.half[k] for k in ((2, 1), (0, 2), (0, 1))[axis]]
-        per_m = [SIZE / (surface.tile or 2 * h) for h in half]
+        per_m = [TEXTURE_SIZE_PX / (surface.tile or 2 * h) for h in half]
         # Seen from outside, x runs left on the far (+z) face and z runs left on the near (-x) one; inside, the reverse.
         flip = (axis == 0 and not positive) or (axis == 2 and bool(positive))
         across = -1 if axis != 1 and flip == (f >= 6) else 1

@@ -21,36 +21,36 @@ from dhtorch.data.scene import Scene
 from dhtorch.geometry.camera import Camera, depth_pixels
 from dhtorch.geometry.patches import round_half_up
 from dhtorch.records import Frame, Pose, Tracks
-from dhtorch.synthetic.guests import along, in_hand, on_turntable, visited_room
-from dhtorch.synthetic.paths import hand_held, rotation
-from dhtorch.synthetic.raycast import MOVING, world_rays
-from dhtorch.synthetic.recording import SURFACES, SyntheticRoom, as_scene
+from dhtorch.synthetic.guests import move_in_hand, move_with_viewer, room_with_body, turn_on_turntable
+from dhtorch.synthetic.paths import hand_held_path, rotation_from_angles
+from dhtorch.synthetic.raycast import SURFACE_MOVING, world_rays
+from dhtorch.synthetic.recording import SURFACE_NAMES, SyntheticRoom, room_to_scene
 from dhtorch.synthetic.shading import ShadedRoom
 
 #: Near returns that are left in ``few_near``.
-FEW = 20
+_N_FEW_NEAR = 20
 
 #: Standard deviation of the additional relative depth error in ``depth_noise``; per pixel, on top of the phone's.
-DEPTH_NOISE = 0.025
+_DEPTH_NOISE_REL = 0.025
 
 #: Rolling shutter: seconds from the first row to the last, in so many bands of rows that share a pose.
-READOUT_S, BANDS = 0.02, 30
+_READOUT_S, _N_ROW_BANDS = 0.02, 30
 
 #: Share of the picture (``moved``) or of the tracks (``mistracks``) that is shown or found elsewhere, by between so
-#: many pixels at 640 columns; the picture in squares of ``TILE_PX`` px.
-MOVED_SHARE, TILE_PX, MOVED_PX = 0.3, 80, (6.0, 24.0)
+#: many pixels at 640 columns; the picture in squares of ``_TILE_PX`` px.
+_MOVED_SHARE, _TILE_PX, _MOVED_RANGE_PX = 0.3, 80, (6.0, 24.0)
 
 #: ``fast``: degrees by which the first frame looks farther to the right than the path, and each next one more.
-PAN_DEG = (-6.0, 1.2)
+_PAN_DEG = (-6.0, 1.2)
 
 #: ``exposure_jump``: grey values are two to a power between these times as bright or dark, then clipped.
-STOPS = (0.5, 1.0)
+_EXPOSURE_STOPS = (0.5, 1.0)
 
 #: ``motion_blur``: the camera turns while it exposes, in each frame another way, by so many px at 640 columns.
-SMEAR_PX = (5.0, 15.0)
+_SMEAR_RANGE_PX = (5.0, 15.0)
 
 #: Where samples will be taken: ``(hw, n) -> uv (n, 2)``.
-Places = Callable[[tuple[int, int], int], Tensor]
+_SamplePattern = Callable[[tuple[int, int], int], Tensor]
 
 
 class StressRoom(SyntheticRoom):
@@ -70,14 +70,14 @@ class StressRoom(SyntheticRoom):
         ValueError: an unknown stress; else as :class:`SyntheticRoom`.
     """
 
-    surfaces = SURFACES | {MOVING: "moving"}
+    surfaces = SURFACE_NAMES | {SURFACE_MOVING: "moving"}
     odd_surfaces = (*SyntheticRoom.odd_surfaces, "moving")
 
     def __init__(
         self,
         stress: str,
         *,
-        places: Places | None = None,
+        places: _SamplePattern | None = None,
         n_places: int = 2048,
         near: float = 2.0,
         gap: int = 6,
@@ -87,11 +87,11 @@ class StressRoom(SyntheticRoom):
             raise ValueError(f"stress room: stress is {stress!r}, expected one of {', '.join(STRESSES)}")
         options = {"name": f"stress_{stress}", **options, **STRESSES[stress].options}
         self.bands: list[Pose] = []
-        way = {k: options[k] for k in _WAY if k in options}
+        way = {k: options[k] for k in _PATH_OPTIONS if k in options}
         if stress == "rolling_shutter":
-            self.bands, options["true_poses"] = _rolled(**way)
+            self.bands, options["true_poses"] = _rolling_shutter_poses(**way)
         if stress == "fast":
-            options["true_poses"] = _panned(**way)
+            options["true_poses"] = _panning_poses(**way)
         super().__init__(**options)
         self.stress, self.places, self.n_places = stress, places, n_places
         moving = STRESSES[stress].moving
@@ -99,7 +99,7 @@ class StressRoom(SyntheticRoom):
         self.body_poses = None if moving is None else moving.motion(self.true_poses)
         self.near, self.gap = near, gap
         if self.bands:
-            self.camera = self.camera.replace(readout=torch.tensor([READOUT_S]))
+            self.camera = self.camera.replace(readout=torch.tensor([_READOUT_S]))
 
     def truth(self, index: int) -> dict[str, Tensor]:
         """As :meth:`SyntheticRoom.truth`; under a rolling shutter each row in its own camera."""
@@ -114,14 +114,17 @@ class StressRoom(SyntheticRoom):
         i, moving = self._position(index), STRESSES[self.stress].moving
         if moving is None or self.body_poses is None:
             return super().world(i)
-        return visited_room(self.seed, moving.guest).moved(self.body_poses[i : i + 1])
+        return room_with_body(self.seed, moving.guest).moved(self.body_poses[i : i + 1])
 
     def gain(self, index: int) -> float:
         """Factor on the grey values of frame ``index`` before they are clipped; 1 but for ``exposure_jump``."""
         if self.stress != "exposure_jump":
             return 1.0
         i = self._position(index)
-        stops = STOPS[0] + (STOPS[1] - STOPS[0]) * torch.rand(1, generator=self._generator(i, "gain")).item()
+        stops = (
+            _EXPOSURE_STOPS[0]
+            + (_EXPOSURE_STOPS[1] - _EXPOSURE_STOPS[0]) * torch.rand(1, generator=self._generator(i, "gain")).item()
+        )
         brighter = (i + i // self.gap) % 2 == 0  # from frame to frame and over a gap it goes up or down
         return math.pow(2.0, stops if brighter else -stops)
 
@@ -131,14 +134,14 @@ class StressRoom(SyntheticRoom):
         if self.stress != "motion_blur":
             return 0.0, 0.0
         angle, size = torch.rand(2, generator=self._generator(self._position(index), "smear")).tolist()
-        length = (SMEAR_PX[0] + (SMEAR_PX[1] - SMEAR_PX[0]) * size) * self.hw[1] / 640
+        length = (_SMEAR_RANGE_PX[0] + (_SMEAR_RANGE_PX[1] - _SMEAR_RANGE_PX[0]) * size) * self.hw[1] / 640
         return length * math.cos(2 * math.pi * angle), length * math.sin(2 * math.pi * angle)
 
     def spoil_track(self, track: Callable[..., Tracks]) -> Callable[..., Tracks]:
         """A method's tracker as it works in this room: under ``mistracks`` many of its tracks end elsewhere."""
         if self.stress != "mistracks":
             return track
-        return partial(_mistrack, track)
+        return partial(_displace_tracks, track)
 
     def _picture(self, i: int) -> Tensor:
         if self.stress == "motion_blur":
@@ -158,7 +161,7 @@ class StressRoom(SyntheticRoom):
                 k / (n - 1) - 0.5
             ) / f  # a camera that looks farther to the left and up shifts the picture right, down
             turn = torch.tensor(
-                [rotation(-math.degrees(right * at), math.degrees(down * at), 0.0)], dtype=torch.float64
+                [rotation_from_angles(-math.degrees(right * at), math.degrees(down * at), 0.0)], dtype=torch.float64
             )
             total = total + self._photograph(i, self.camera, Pose(pose.R @ turn, pose.t), self.hw)
         return total / n
@@ -168,7 +171,7 @@ class StressRoom(SyntheticRoom):
 
     def _rows(self, i: int) -> Iterator[tuple[Camera, Pose, tuple[int, int]]]:
         """Camera, pose and size of the bands of rows of frame ``i``, from the top."""
-        edges = [round(k * self.hw[0] / BANDS) for k in range(BANDS + 1)]
+        edges = [round(k * self.hw[0] / _N_ROW_BANDS) for k in range(_N_ROW_BANDS + 1)]
         for k, (top, bottom) in enumerate(pairwise(edges)):
             if bottom > top:
                 shift = torch.tensor([[0.0, float(top)]])
@@ -177,26 +180,26 @@ class StressRoom(SyntheticRoom):
 
 
 #: Options of :class:`SyntheticRoom` that decide its way.
-_WAY = ("path", "n_frames", "step_m", "rate_hz", "seed")
+_PATH_OPTIONS = ("path", "n_frames", "step_m", "rate_hz", "seed")
 
 
-def _rolled(
+def _rolling_shutter_poses(
     path: str = "walk", n_frames: int = 12, step_m: float = 0.02, rate_hz: float = 30.0, seed: int = 2
 ) -> tuple[list[Pose], Pose]:
     """Poses of the bands of every frame, and of the frames: a frame's own pose is that of its middle band."""
-    per_frame = round(BANDS / (READOUT_S * rate_hz))
-    n = n_frames * per_frame + BANDS
-    every = hand_held(path, n, step_m=step_m / per_frame, rate_hz=rate_hz * per_frame, seed=seed)
-    middle = torch.arange(n_frames) * per_frame + BANDS // 2
-    bands = [every[i * per_frame : i * per_frame + BANDS] for i in range(n_frames)]
+    per_frame = round(_N_ROW_BANDS / (_READOUT_S * rate_hz))
+    n = n_frames * per_frame + _N_ROW_BANDS
+    every = hand_held_path(path, n, step_m=step_m / per_frame, rate_hz=rate_hz * per_frame, seed=seed)
+    middle = torch.arange(n_frames) * per_frame + _N_ROW_BANDS // 2
+    bands = [every[i * per_frame : i * per_frame + _N_ROW_BANDS] for i in range(n_frames)]
     return bands, Pose(every.R[middle], every.t[middle])
 
 
-def _panned(
+def _panning_poses(
     path: str = "lateral", n_frames: int = 12, step_m: float = 0.02, rate_hz: float = 30.0, seed: int = 2
 ) -> Pose:
     """Poses of a camera that turns to the side it goes to."""
-    return hand_held(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed, pan=PAN_DEG)
+    return hand_held_path(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed, pan=_PAN_DEG)
 
 
 def open_stress(
@@ -207,7 +210,7 @@ def open_stress(
     hw: tuple[int, int] = (240, 320),
     near: float = 2.0,
     gap: int = 6,
-    places: Places | None = None,
+    places: _SamplePattern | None = None,
     n_places: int = 2048,
 ) -> list[Scene]:
     """The room under each of :data:`STRESSES` (None = all), one scene each; options as :class:`StressRoom`.
@@ -217,21 +220,21 @@ def open_stress(
     options: dict[str, Any] = {"seed": seed, "n_frames": n_frames, "hw": hw, "near": near, "gap": gap}
     names = STRESSES if stresses is None else stresses
     rooms = [StressRoom(name, places=places, n_places=n_places, **options) for name in names]
-    return [_noted(room, near, gap) for room in rooms]
+    return [_to_scene(room, near, gap) for room in rooms]
 
 
-def _noted(room: StressRoom, near: float, gap: int) -> Scene:
+def _to_scene(room: StressRoom, near: float, gap: int) -> Scene:
     moving = STRESSES[room.stress].moving
     if moving is None:
-        return as_scene(room, near, gap)
-    return replace(as_scene(room, min(near, moving.near), gap), role="moving")
+        return room_to_scene(room, near, gap)
+    return replace(room_to_scene(room, min(near, moving.near), gap), role="moving")
 
 
-def _nothing(room: StressRoom, i: int, frame: Frame) -> Frame:
+def _keep_all(room: StressRoom, i: int, frame: Frame) -> Frame:
     return frame
 
 
-def _one_plane(room: StressRoom, i: int, frame: Frame) -> Frame:
+def _keep_one_plane(room: StressRoom, i: int, frame: Frame) -> Frame:
     """Near returns off the plane that most of them lie on are gone, and so are those off their surface."""
     assert frame.depth_camera is not None
     scene, pose, hw = room.world(i), room.true_poses[i : i + 1], room.depth_hw
@@ -242,11 +245,11 @@ def _one_plane(room: StressRoom, i: int, frame: Frame) -> Frame:
     near = (said > 0) & (said <= room.near)
     sound = near & ((said / depth - 1).abs() < 0.05) & ~scene.solids.ball[solid]
     plane = torch.bincount(face[sound], minlength=1).argmax()
-    return _without(frame, near & ~(sound & (face == plane)))
+    return _remove_returns(frame, near & ~(sound & (face == plane)))
 
 
-def _few(room: StressRoom, i: int, frame: Frame) -> Frame:
-    """Of the near returns that a method would read, :data:`FEW` are left."""
+def _keep_few_returns(room: StressRoom, i: int, frame: Frame) -> Frame:
+    """Of the near returns that a method would read, :data:`_N_FEW_NEAR` are left."""
     said = frame.depth.flatten()
     near = (said > 0) & (said <= room.near)
     usable = near if frame.conf is None else near & (frame.conf.flatten() > 0)
@@ -258,16 +261,16 @@ def _few(room: StressRoom, i: int, frame: Frame) -> Frame:
         read = torch.zeros_like(near).index_fill(0, at[:, 1] * w + at[:, 0], True)
         usable = usable & read
     chosen = usable.nonzero()[:, 0]
-    chosen = chosen[torch.randperm(len(chosen), generator=room._generator(i, "few"))[:FEW]]
-    return _without(frame, near & ~torch.zeros_like(near).index_fill(0, chosen, True))
+    chosen = chosen[torch.randperm(len(chosen), generator=room._generator(i, "few"))[:_N_FEW_NEAR]]
+    return _remove_returns(frame, near & ~torch.zeros_like(near).index_fill(0, chosen, True))
 
 
-def _noisy(room: StressRoom, i: int, frame: Frame) -> Frame:
+def _add_depth_noise(room: StressRoom, i: int, frame: Frame) -> Frame:
     noise = torch.randn(frame.depth.shape, generator=room._generator(i, "noise"))
-    return frame.replace(depth=frame.depth * (1 + DEPTH_NOISE * noise).clamp_min(0.5))
+    return frame.replace(depth=frame.depth * (1 + _DEPTH_NOISE_REL * noise).clamp_min(0.5))
 
 
-def _elsewhere(room: StressRoom, i: int, frame: Frame) -> Frame:
+def _displace_tiles(room: StressRoom, i: int, frame: Frame) -> Frame:
     """Squares of the later views show what lies beside them, so that tracks end in the wrong place, and fit there.
 
     The first ``gap`` frames are left alone: anchors show what is there.
@@ -275,12 +278,12 @@ def _elsewhere(room: StressRoom, i: int, frame: Frame) -> Frame:
     if i < room.gap:
         return frame
     g, (H, W) = room._generator(i, "moved"), room.hw
-    tile = max(round(TILE_PX * W / 640), 1)
+    tile = max(round(_TILE_PX * W / 640), 1)
     v, u = torch.meshgrid(torch.arange(H), torch.arange(W), indexing="ij")
     rows, columns = -(-H // tile), -(-W // tile)
     square = (v // tile) * columns + u // tile
-    moved = torch.randperm(rows * columns, generator=g)[: round(MOVED_SHARE * rows * columns)]
-    low, high = (px * W / 640 for px in MOVED_PX)
+    moved = torch.randperm(rows * columns, generator=g)[: round(_MOVED_SHARE * rows * columns)]
+    low, high = (px * W / 640 for px in _MOVED_RANGE_PX)
     way = torch.randn(rows * columns, 2, generator=g)
     way = way / way.norm(dim=-1, keepdim=True) * (low + (high - low) * torch.rand(rows * columns, 1, generator=g))
     shift = torch.zeros_like(way).index_copy(0, moved, way[moved]).round().long()
@@ -288,30 +291,32 @@ def _elsewhere(room: StressRoom, i: int, frame: Frame) -> Frame:
     return frame.replace(image=frame.image[..., row, column])
 
 
-def _mistrack(track: Callable[..., Tracks], image_0: Tensor, image_1: Tensor, uv_0: Tensor, **options: Any) -> Tracks:
-    """Tracks of which :data:`MOVED_SHARE` end elsewhere, while all that they say of themselves stays as it was.
+def _displace_tracks(
+    track: Callable[..., Tracks], image_0: Tensor, image_1: Tensor, uv_0: Tensor, **options: Any
+) -> Tracks:
+    """Tracks of which :data:`_MOVED_SHARE` end elsewhere, while all that they say of themselves stays as it was.
 
     Which ones and where to depends on the second image alone, so every method that looks at it errs alike.
     """
     tracks = track(image_0, image_1, uv_0, **options)
-    low, high = (px * image_1.shape[-1] / 640 for px in MOVED_PX)
+    low, high = (px * image_1.shape[-1] / 640 for px in _MOVED_RANGE_PX)
     shifts = []
     for image in image_1:
         grey_levels = image if image.dtype == torch.uint8 else (255 * image).round()
         g = torch.Generator().manual_seed(int(grey_levels.long().sum()))
         wrong, length, angle = torch.rand(3, uv_0.shape[1], 1, generator=g)
         way = torch.cat((torch.cos(2 * torch.pi * angle), torch.sin(2 * torch.pi * angle)), -1)
-        shifts.append(torch.where(wrong < MOVED_SHARE, way * (low + (high - low) * length), 0.0))
+        shifts.append(torch.where(wrong < _MOVED_SHARE, way * (low + (high - low) * length), 0.0))
     return tracks.replace(uv_1=tracks.uv_1 + torch.stack(shifts).to(tracks.uv_1))
 
 
-def _without(frame: Frame, gone: Tensor) -> Frame:
+def _remove_returns(frame: Frame, gone: Tensor) -> Frame:
     """The frame without the returns under the flat mask."""
     depth = torch.where(gone.view(frame.depth.shape), torch.zeros_like(frame.depth), frame.depth)
     return frame.replace(depth=depth)
 
 
-class Moving(NamedTuple):
+class MovingBody(NamedTuple):
     """A body that moves."""
 
     guest: str  # which of the room's guests
@@ -323,8 +328,8 @@ class Stress(NamedTuple):
     """Options of the room, what is done to its frames, and what moves in it."""
 
     options: dict[str, Any]
-    spoil: Callable[[StressRoom, int, Frame], Frame] = _nothing
-    moving: Moving | None = None
+    spoil: Callable[[StressRoom, int, Frame], Frame] = _keep_all
+    moving: MovingBody | None = None
 
 
 #: What may go wrong; the hand-held walk where no path is said.
@@ -334,16 +339,16 @@ STRESSES: dict[str, Stress] = {
     "orbit": Stress({"path": "orbit"}),
     "rotation": Stress({"path": "rotation"}),
     "rotation_exact": Stress({"path": "rotation", "lidar": "exact", "image_noise": 0.0}),
-    "planar_near": Stress({"path": "walk"}, _one_plane),
-    "few_near": Stress({"path": "walk"}, _few),
-    "depth_noise": Stress({"path": "walk"}, _noisy),
+    "planar_near": Stress({"path": "walk"}, _keep_one_plane),
+    "few_near": Stress({"path": "walk"}, _keep_few_returns),
+    "depth_noise": Stress({"path": "walk"}, _add_depth_noise),
     "rolling_shutter": Stress({"path": "walk"}),
-    "moved": Stress({"path": "walk"}, _elsewhere),
+    "moved": Stress({"path": "walk"}, _displace_tiles),
     "mistracks": Stress({"path": "walk"}),
-    "convoy": Stress({"path": "walk"}, moving=Moving("parcels", along, 1.3)),
-    "convoy_slow": Stress({"path": "walk"}, moving=Moving("parcels", partial(along, share=0.5), 1.3)),
-    "held_object": Stress({"path": "walk"}, moving=Moving("held", in_hand, 2.0)),
-    "turntable": Stress({"path": "static"}, moving=Moving("parcels", on_turntable, 1.3)),
+    "convoy": Stress({"path": "walk"}, moving=MovingBody("parcels", move_with_viewer, 1.3)),
+    "convoy_slow": Stress({"path": "walk"}, moving=MovingBody("parcels", partial(move_with_viewer, share=0.5), 1.3)),
+    "held_object": Stress({"path": "walk"}, moving=MovingBody("held", move_in_hand, 2.0)),
+    "turntable": Stress({"path": "static"}, moving=MovingBody("parcels", turn_on_turntable, 1.3)),
     "fast": Stress({"path": "lateral"}),
     "exposure_jump": Stress({"path": "walk"}),
     "motion_blur": Stress({"path": "walk"}),

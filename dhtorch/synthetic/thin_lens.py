@@ -19,13 +19,13 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.thin_lens import Lens, spot_gain
 
 #: Largest number of layers; beyond it a layer's spot differs by more than ``step_px`` from the exact one.
-MAX_LAYERS = 96
+_MAX_LAYERS = 96
 
 #: Least part of a pixel that must be covered before its light is scaled up to a whole.
-LEAST_COVER = 1e-3
+_MIN_COVER = 1e-3
 
 
-def lens_of(focal_length_px: float, *, focal_length_m: float = 0.035, f_number: float = 1.4) -> Lens:
+def make_lens(focal_length_px: float, *, focal_length_m: float = 0.035, f_number: float = 1.4) -> Lens:
     """A lens (B = 1) whose picture has this focal length in pixels; the default is a fast one on a full frame."""
     values = (focal_length_m, f_number, focal_length_m / focal_length_px)
     for name, value in zip(("focal_length_m", "f_number", "pixel pitch"), values, strict=True):
@@ -34,7 +34,7 @@ def lens_of(focal_length_px: float, *, focal_length_m: float = 0.035, f_number: 
     return Lens(*(torch.tensor([v]) for v in values))
 
 
-def photograph(
+def render_defocus(
     image: Tensor,  # (B, C, H, W) all in focus, float in [0, 1] or uint8
     depth: Tensor,  # (B, H, W) m, everywhere known
     lens: Lens,
@@ -65,16 +65,16 @@ def photograph(
         raise ValueError("photograph: focus_m expected beyond the focal length of the lens")
     picture = image / 255.0 if image.dtype == torch.uint8 else image
     made = [
-        _one(picture[b] ** gamma, 1 / depth[b], spot_gain(lens, focus_m)[b], 1 / focus_m[b], step_px)
+        _render_scene(picture[b] ** gamma, 1 / depth[b], spot_gain(lens, focus_m)[b], 1 / focus_m[b], step_px)
         for b in range(sizes["B"])
     ]
     return torch.stack(made).clamp(0, 1) ** (1 / gamma)
 
 
-def _one(light: Tensor, inverse: Tensor, gain: Tensor, focus: Tensor, step_px: float) -> Tensor:
+def _render_scene(light: Tensor, inverse: Tensor, gain: Tensor, focus: Tensor, step_px: float) -> Tensor:
     """One scene (C, H, W) at S distances in focus (S,), all in dioptres: (S, C, H, W)."""
     low, high = float(inverse.min()), float(inverse.max())
-    count = min(max(math.ceil((high - low) * float(gain.max()) / step_px), 1) + 1, MAX_LAYERS)
+    count = min(max(math.ceil((high - low) * float(gain.max()) / step_px), 1) + 1, _MAX_LAYERS)
     place = torch.linspace(high, low, count, dtype=inverse.dtype)  # near first
     widest = float((gain[:, None] * (focus[:, None] - place)).abs().max())
     margin = math.ceil(widest / 2) + 2
@@ -89,13 +89,15 @@ def _one(light: Tensor, inverse: Tensor, gain: Tensor, focus: Tensor, step_px: f
         if not bool(share.any()):
             continue
         spectrum = torch.fft.rfft2(pad((solid * share)[None], (margin,) * 4, mode="replicate"))
-        spread = torch.stack([_disc(radius, abs(float(g * (f - place[k])))) for g, f in zip(gain, focus, strict=True)])
+        spread = torch.stack(
+            [_disc_transfer(radius, abs(float(g * (f - place[k])))) for g, f in zip(gain, focus, strict=True)]
+        )
         blurred = torch.fft.irfft2(spectrum * spread[:, None], s=size)
         alpha = blurred[:, -1:].clamp(0, 1)
         visible = torch.minimum(alpha, 1 - cover)
-        total = total + blurred[:, :-1] * (visible / alpha.clamp_min(LEAST_COVER))
+        total = total + blurred[:, :-1] * (visible / alpha.clamp_min(_MIN_COVER))
         cover = cover + visible
-    whole = total / cover.clamp_min(LEAST_COVER)
+    whole = total / cover.clamp_min(_MIN_COVER)
     return whole[..., margin:-margin, margin:-margin]
 
 
@@ -105,7 +107,7 @@ def _frequencies(size: tuple[int, int], like: Tensor) -> Tensor:
     return (v[:, None] ** 2 + u**2).sqrt()
 
 
-def _disc(radius: Tensor, diameter: float) -> Tensor:
+def _disc_transfer(radius: Tensor, diameter: float) -> Tensor:
     """Transfer function of a uniform disc: 2 J1(x) / x, x = π times diameter times frequency."""
     x = math.pi * diameter * radius
     some = x > 1e-3

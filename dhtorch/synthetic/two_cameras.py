@@ -6,11 +6,11 @@ import math
 
 import torch
 
-from dhtorch.data.rig import joined
+from dhtorch.data.rig import join_cameras
 from dhtorch.data.scene import Scene
 from dhtorch.geometry import se3
 from dhtorch.records import Pose
-from dhtorch.synthetic.paths import hand_held
+from dhtorch.synthetic.paths import hand_held_path
 from dhtorch.synthetic.recording import SyntheticRoom
 
 
@@ -42,8 +42,8 @@ def open_two_cameras(
     """
     if not (baseline > 0 and zoom > 0):
         raise ValueError(f"two cameras: baseline is {baseline} and zoom {zoom}, expected positive numbers")
-    left_poses = hand_held("walk", n_frames, step_m=step_m, rate_hz=30.0, seed=seed)
-    T = rig_pose(baseline, toe_in_deg)
+    left_poses = hand_held_path("walk", n_frames, step_m=step_m, rate_hz=30.0, seed=seed)
+    T = _two_camera_pose(baseline, toe_in_deg)
     right_poses = se3.compose(left_poses, T.map(lambda x: x.expand(n_frames, *x.shape[1:])))
     cameras = []
     for name, poses, scale in (("left", left_poses, 1.0), ("right", right_poses, zoom)):
@@ -60,10 +60,10 @@ def open_two_cameras(
         )
         room.camera = room.camera.replace(f=room.camera.f * scale)
         cameras.append(room)
-    return [Scene(joined(cameras), near=near)]
+    return [Scene(join_cameras(cameras), near=near)]
 
 
-def rig_pose(baseline: float, toe_in_deg: float) -> Pose:
+def _two_camera_pose(baseline: float, toe_in_deg: float) -> Pose:
     """``T_left_from_right`` (1), float64."""
     a = math.radians(toe_in_deg)
     turn = se3.exp(torch.tensor([[0.0, -a, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64))

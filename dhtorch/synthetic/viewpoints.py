@@ -10,13 +10,13 @@ import torch
 from dhtorch.geometry.camera import Camera, resize
 from dhtorch.records import Pose
 from dhtorch.synthetic.recording import SyntheticRoom, phone_camera
-from dhtorch.synthetic.room import BACK, FRONT, LEFT, RIGHT, furnished_room
+from dhtorch.synthetic.room import ROOM_BACK_M, ROOM_FRONT_M, ROOM_LEFT_M, ROOM_RIGHT_M, furnished_room
 
 #: Views of one furnished room before the next one is painted.
-VIEWS_A_ROOM = 5
+_VIEWS_PER_ROOM = 5
 
 #: A view is drawn anew while more than a hundredth of it is nearer than this, m.
-NEAREST = 0.4
+_MIN_DEPTH_M = 0.4
 
 
 def open_viewpoints(
@@ -30,7 +30,7 @@ def open_viewpoints(
     """``n`` views of the room, a recording of one frame each, with exact depth.
 
     The viewer stands anywhere, at a height of 0.9 to 1.7 m, and looks anywhere, mostly a little down; every
-    :data:`VIEWS_A_ROOM` views the room is painted anew. View ``k`` is the same however many follow.
+    :data:`_VIEWS_PER_ROOM` views the room is painted anew. View ``k`` is the same however many follow.
 
     Args:
         n: number of views.
@@ -45,7 +45,7 @@ def open_viewpoints(
         raise ValueError(f"viewpoints: n is {n}, expected at least 1")
     views = []
     for k in range(n):
-        room, camera = seed + k // VIEWS_A_ROOM, phone_camera((hw[0], hw[1]))
+        room, camera = seed + k // _VIEWS_PER_ROOM, phone_camera((hw[0], hw[1]))
         view = SyntheticRoom(
             seed=room,
             n_frames=1,
@@ -54,23 +54,23 @@ def open_viewpoints(
             image_noise=image_noise,
             supersample=supersample,
             name=f"viewpoint_{k:02d}",
-            true_poses=_place(room, camera, (hw[0], hw[1]), Random(f"viewpoint {seed} {k}")),
+            true_poses=_draw_pose(room, camera, (hw[0], hw[1]), Random(f"viewpoint {seed} {k}")),
         )
         views.append(view)
     return views
 
 
-def _place(room: int, camera: Camera, hw: tuple[int, int], draw: Random) -> Pose:
+def _draw_pose(room: int, camera: Camera, hw: tuple[int, int], draw: Random) -> Pose:
     """A place with some air around it, and a direction: ``T_world_from_cam`` (1), float64."""
     solids = furnished_room(room).solids
     small = (24, 32)
     camera = resize(camera, hw, small)
     while True:
-        x, z = draw.uniform(LEFT + 0.5, RIGHT - 0.5), draw.uniform(FRONT + 0.4, BACK - 0.8)
+        x, z = draw.uniform(ROOM_LEFT_M + 0.5, ROOM_RIGHT_M - 0.5), draw.uniform(ROOM_FRONT_M + 0.4, ROOM_BACK_M - 0.8)
         yaw, pitch = math.radians(draw.uniform(-180, 180)), math.radians(draw.uniform(-22, 4))
         ca, sa, cb, sb = math.cos(yaw), math.sin(yaw), math.cos(pitch), math.sin(pitch)
         R = torch.tensor([[[ca, sa * sb, sa * cb], [0.0, cb, -sb], [-sa, ca * sb, ca * cb]]], dtype=torch.float64)
         pose = Pose(R, torch.tensor([[x, -draw.uniform(0.9, 1.7), z]], dtype=torch.float64))
         depth, _ = solids.view(camera, pose, small)
-        if float(depth.sort().values[len(depth) // 100]) > NEAREST:
+        if float(depth.sort().values[len(depth) // 100]) > _MIN_DEPTH_M:
             return pose

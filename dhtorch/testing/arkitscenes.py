@@ -11,14 +11,14 @@ from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame
 from dhtorch.testing.parts import (
     K_matrix,
-    depth_codes,
-    pixels,
-    png,
+    encode_depth_codes,
+    encode_unfiltered_png,
+    format_row,
+    frame_time_s,
+    frame_to_hwc,
     pose_matrix,
-    quaternion,
-    seconds,
-    text_row,
-    write,
+    rotation_to_xyzw,
+    save_file,
 )
 
 
@@ -41,39 +41,39 @@ def write_arkitscenes(
     """
     for asset, frames in assets.items():
         for frame in frames:
-            name = f"{root.name}_{seconds(frame):.3f}"
+            name = f"{root.name}_{frame_time_s(frame):.3f}"
             if asset.endswith("_depth"):
-                write(root / asset / f"{name}.png", png(depth_codes(frame.depth, 1000)))
+                save_file(root / asset / f"{name}.png", encode_unfiltered_png(encode_depth_codes(frame.depth, 1000)))
                 of = "lowres_wide" if asset == "lowres_depth" else "wide"
                 hw = (frame.depth.shape[-2], frame.depth.shape[-1])
                 camera = frame.depth_camera or cameras.resize(frame.camera, frame.hw, hw)
-                _pincam(root / f"{of}_intrinsics" / f"{name}.pincam", camera, hw)
+                _write_pincam(root / f"{of}_intrinsics" / f"{name}.pincam", camera, hw)
                 if asset == "lowres_depth" and frame.conf is not None:
-                    write(root / "confidence" / f"{name}.png", png(frame.conf[0].numpy()))
+                    save_file(root / "confidence" / f"{name}.png", encode_unfiltered_png(frame.conf[0].numpy()))
                 continue
             if not asset.endswith("_intrinsics"):
-                write(root / asset / f"{name}.png", png(pixels(frame)))
+                save_file(root / asset / f"{name}.png", encode_unfiltered_png(frame_to_hwc(frame)))
             folder = asset.removesuffix("_intrinsics") + "_intrinsics"
-            _pincam(root / folder / f"{name}.pincam", frame.camera, frame.hw)
+            _write_pincam(root / folder / f"{name}.pincam", frame.camera, frame.hw)
     if trajectory is not None:
-        rows = [_row(seconds(frame), pose_matrix(frame)) for frame in trajectory]
-        write(root / "lowres_wide.traj", "".join(row + "\n" for row in rows))
+        rows = [_trajectory_row(frame_time_s(frame), pose_matrix(frame)) for frame in trajectory]
+        save_file(root / "lowres_wide.traj", "".join(row + "\n" for row in rows))
 
 
-def _pincam(file: Path, camera: Camera, hw: tuple[int, int]) -> None:
+def _write_pincam(file: Path, camera: Camera, hw: tuple[int, int]) -> None:
     K = K_matrix(camera)
-    write(file, f"{hw[1]} {hw[0]} " + text_row([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) + "\n")
+    save_file(file, f"{hw[1]} {hw[0]} " + format_row([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]) + "\n")
 
 
-def _row(time: float, c2w: np.ndarray) -> str:
+def _trajectory_row(time: float, c2w: np.ndarray) -> str:
     """Stamp, rotation vector and translation, world to camera."""
     R = c2w[:3, :3].T
-    return text_row([time, *_rotation_vector(R), *(-R @ c2w[:3, 3])])
+    return format_row([time, *_rotation_vector(R), *(-R @ c2w[:3, 3])])
 
 
 def _rotation_vector(R: np.ndarray) -> np.ndarray:
     """Axis times angle (3,) of a rotation, by way of its quaternion (exact near 0 and near half a turn)."""
-    q = quaternion(R)
+    q = rotation_to_xyzw(R)
     q = -q if q[3] < 0 else q
     length = float(np.linalg.norm(q[:3]))
     return q[:3] * (2 * np.arctan2(length, q[3]) / length if length > 0 else 2.0)

@@ -10,10 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.export.tiff import float_tiff
+from dhtorch.export.tiff import encode_float_tiff
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame
-from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, seconds, write
+from dhtorch.testing.parts import (
+    K_matrix,
+    encode_depth_codes,
+    encode_unfiltered_png,
+    frame_time_s,
+    frame_to_hwc,
+    pose_matrix,
+    save_file,
+)
 
 
 def write_ca1m(
@@ -41,29 +49,29 @@ def write_ca1m(
             archive.addfile(info, io.BytesIO(content))
 
         for i, (frame, laser) in enumerate(zip(frames, lasers, strict=True)):
-            stamp = round(seconds(frame) * 1e9)
-            for what, content in _members(frame, laser).items():
+            stamp = round(frame_time_s(frame) * 1e9)
+            for what, content in _make_members(frame, laser).items():
                 if (i, what) not in without:
                     add(f"{stamp}.{what}", content)
         add("world.gt/instances.json", b"[]")
-    write(file, out.getvalue())
+    save_file(file, out.getvalue())
 
 
-def _members(frame: Frame, laser: Frame) -> dict[str, bytes]:
+def _make_members(frame: Frame, laser: Frame) -> dict[str, bytes]:
     """The members of one frame."""
     members = {
-        "wide/image.png": png(pixels(frame)),
-        "wide/image/K.json": _json(K_matrix(frame.camera)),
-        "wide/depth.png": png(depth_codes(frame.depth, 1000)),
-        "wide/depth/K.json": _json(K_matrix(_depth_camera(frame))),
+        "wide/image.png": encode_unfiltered_png(frame_to_hwc(frame)),
+        "wide/image/K.json": _matrix_json(K_matrix(frame.camera)),
+        "wide/depth.png": encode_unfiltered_png(encode_depth_codes(frame.depth, 1000)),
+        "wide/depth/K.json": _matrix_json(K_matrix(_depth_camera(frame))),
         "wide/instances.json": b"[]",
-        "wide/T_gravity.json": _json(np.eye(3)),
-        "gt/RT.json": _json(pose_matrix(frame)),
-        "gt/depth.png": png(depth_codes(laser.depth, 1000)),
-        "gt/depth/K.json": _json(K_matrix(_depth_camera(laser))),
+        "wide/T_gravity.json": _matrix_json(np.eye(3)),
+        "gt/RT.json": _matrix_json(pose_matrix(frame)),
+        "gt/depth.png": encode_unfiltered_png(encode_depth_codes(laser.depth, 1000)),
+        "gt/depth/K.json": _matrix_json(K_matrix(_depth_camera(laser))),
     }
     if frame.conf is not None:
-        members["wide/depth/confidence.tiff"] = float_tiff(frame.conf[0].numpy() / np.float32(2))
+        members["wide/depth/confidence.tiff"] = encode_float_tiff(frame.conf[0].numpy() / np.float32(2))
     return members
 
 
@@ -72,5 +80,5 @@ def _depth_camera(frame: Frame) -> Camera:
     return frame.depth_camera or cameras.resize(frame.camera, frame.hw, hw)
 
 
-def _json(matrix: np.ndarray) -> bytes:
+def _matrix_json(matrix: np.ndarray) -> bytes:
     return json.dumps(matrix.tolist()).encode()

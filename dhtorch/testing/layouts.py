@@ -16,19 +16,19 @@ from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
 from dhtorch.testing.parts import (
     K_matrix,
-    depth_codes,
-    pixels,
-    png,
+    encode_depth_codes,
+    encode_unfiltered_png,
+    format_row,
+    format_rows,
+    frame_time_s,
+    frame_to_hwc,
     pose_matrix,
-    quaternion,
-    seconds,
-    text_row,
-    text_rows,
-    write,
+    rotation_to_xyzw,
+    save_file,
 )
 
 #: TUM's colour, depth and pose streams tick apart; the written depth stamps lag by this.
-_TUM_LAG = 0.0125  # s
+_TUM_DEPTH_LAG_S = 0.0125  # s
 
 
 def write_tum(
@@ -44,19 +44,19 @@ def write_tum(
     poses = ["# ground truth trajectory", f"# file: 'rgbd_dataset_{f'freiburg{camera}' if camera else 'own'}.bag'"]
     poses.append("# timestamp tx ty tz qx qy qz qw")
     for frame in frames:
-        time = seconds(frame)
-        for kind, stamp in (("rgb", f"{time:.6f}"), ("depth", f"{time + _TUM_LAG:.6f}")):
+        time = frame_time_s(frame)
+        for kind, stamp in (("rgb", f"{time:.6f}"), ("depth", f"{time + _TUM_DEPTH_LAG_S:.6f}")):
             lists[kind].append(f"{stamp} {kind}/{stamp}.png")
-            picture = pixels(frame) if kind == "rgb" else depth_codes(frame.depth, units_per_metre)
-            write(root / kind / f"{stamp}.png", png(picture))
+            picture = frame_to_hwc(frame) if kind == "rgb" else encode_depth_codes(frame.depth, units_per_metre)
+            save_file(root / kind / f"{stamp}.png", encode_unfiltered_png(picture))
         pose = pose_matrix(frame)
-        poses.append(f"{time:.6f} " + text_row([*pose[:3, 3], *quaternion(pose[:3, :3])]))
+        poses.append(f"{time:.6f} " + format_row([*pose[:3, 3], *rotation_to_xyzw(pose[:3, :3])]))
     for name, lines in (("rgb", lists["rgb"]), ("depth", lists["depth"]), ("groundtruth", poses)):
-        write(root / f"{name}.txt", "\n".join(lines) + "\n")
+        save_file(root / f"{name}.txt", "\n".join(lines) + "\n")
     if camera is None:
         lens = frames[0].camera.distortion
         meta = {"K": K_matrix(frames[0].camera).tolist(), "dist": [0.0] * 5 if lens is None else lens[0].tolist()}
-        write(root / "meta.json", json.dumps(meta))
+        save_file(root / "meta.json", json.dumps(meta))
 
 
 def write_named_frames(
@@ -70,45 +70,49 @@ def write_named_frames(
     if frames[0].depth_camera is not None:
         meta |= {"K": K_matrix(frames[0].camera).tolist(), "K_depth": K_matrix(frames[0].depth_camera).tolist()}
     for i, frame in enumerate(frames):
-        write(root / f"frame-{i:06d}.color.png", png(pixels(frame)))
-        write(root / f"frame-{i:06d}.depth.png", png(depth_codes(frame.depth, units_per_metre)))
-        write(root / f"frame-{i:06d}.pose.txt", text_rows(pose_matrix(frame)))
-    write(root / "camera-intrinsics.txt", text_rows(K_matrix(frames[0].depth_camera or frames[0].camera)))
+        save_file(root / f"frame-{i:06d}.color.png", encode_unfiltered_png(frame_to_hwc(frame)))
+        save_file(
+            root / f"frame-{i:06d}.depth.png", encode_unfiltered_png(encode_depth_codes(frame.depth, units_per_metre))
+        )
+        save_file(root / f"frame-{i:06d}.pose.txt", format_rows(pose_matrix(frame)))
+    save_file(root / "camera-intrinsics.txt", format_rows(K_matrix(frames[0].depth_camera or frames[0].camera)))
     if meta:
-        write(root / "meta.json", json.dumps(meta))
+        save_file(root / "meta.json", json.dumps(meta))
 
 
 def write_counted_frames(root: Path, frames: Sequence[Frame], *, units_per_metre: float = 1000.0) -> None:
     """``images/``, ``depth/``, ``poses.txt`` (a row-major matrix a line) and ``K.txt``."""
     for i, frame in enumerate(frames):
-        write(root / "images" / f"{i:05d}.png", png(pixels(frame)))
-        write(root / "depth" / f"{i:05d}.png", png(depth_codes(frame.depth, units_per_metre)))
-    write(root / "poses.txt", "".join(text_row(pose_matrix(frame).ravel()) + "\n" for frame in frames))
-    write(root / "K.txt", text_rows(K_matrix(frames[0].camera)))
+        save_file(root / "images" / f"{i:05d}.png", encode_unfiltered_png(frame_to_hwc(frame)))
+        save_file(
+            root / "depth" / f"{i:05d}.png", encode_unfiltered_png(encode_depth_codes(frame.depth, units_per_metre))
+        )
+    save_file(root / "poses.txt", "".join(format_row(pose_matrix(frame).ravel()) + "\n" for frame in frames))
+    save_file(root / "K.txt", format_rows(K_matrix(frames[0].camera)))
 
 
 def write_calib_pair(root: Path, left: Frame, right: Frame) -> None:
     """A rectified pair as Middlebury and ETH3D write it: ``calib.txt``, ``im0.png``, ``im1.png``, ``disp0.pfm``."""
     baseline, doffs = _rectification(left, right)
     h, w = left.hw
-    lines = [f"cam{i}={_matlab(K_matrix(frame.camera))}" for i, frame in enumerate((left, right))]
+    lines = [f"cam{i}={_format_matlab(K_matrix(frame.camera))}" for i, frame in enumerate((left, right))]
     lines += [f"doffs={doffs!r}", f"baseline={baseline * 1000!r}", f"width={w}", f"height={h}", f"ndisp={w}"]
-    write(root / "calib.txt", "\n".join(lines) + "\n")
+    save_file(root / "calib.txt", "\n".join(lines) + "\n")
     for i, frame in enumerate((left, right)):
-        write(root / f"im{i}.png", png(pixels(frame)))
+        save_file(root / f"im{i}.png", encode_unfiltered_png(frame_to_hwc(frame)))
     disparity = _disparity(left, baseline, doffs)
-    write(root / "disp0.pfm", f"Pf\n{w} {h}\n-1\n".encode() + disparity[::-1].astype("<f4").tobytes())
+    save_file(root / "disp0.pfm", f"Pf\n{w} {h}\n-1\n".encode() + disparity[::-1].astype("<f4").tobytes())
 
 
 def write_npz_pair(root: Path, left: Frame, right: Frame, *, name: str = "scene") -> None:
     """A rectified pair as scikit-image ships one: ``*_left.png``, ``*_right.png``, ``*_disp.npz``, ``meta.json``."""
     baseline, doffs = _rectification(left, right)
-    write(root / f"{name}_left.png", png(pixels(left)))
-    write(root / f"{name}_right.png", png(pixels(right)))
+    save_file(root / f"{name}_left.png", encode_unfiltered_png(frame_to_hwc(left)))
+    save_file(root / f"{name}_right.png", encode_unfiltered_png(frame_to_hwc(right)))
     disparity = np.ascontiguousarray(_disparity(left, baseline, doffs), np.float32)
     np.savez_compressed(root / f"{name}_disp.npz", disparity)
     meta = {"K_left": K_matrix(left.camera).tolist(), "K_right": K_matrix(right.camera).tolist()}
-    write(root / "meta.json", json.dumps(meta | {"baseline_m": baseline, "doffs": doffs}))
+    save_file(root / "meta.json", json.dumps(meta | {"baseline_m": baseline, "doffs": doffs}))
 
 
 def write_driving(
@@ -126,18 +130,18 @@ def write_driving(
     data, samples = [], []
     for i in range(T_world_from_lidar.t.shape[0]):
         shots = {name: list_[i] for name, list_ in frames.items()}
-        stamp = max(seconds(frame) for frame in shots.values()) + lidar_lag
+        stamp = max(frame_time_s(frame) for frame in shots.values()) + lidar_lag
         data.append(_datum(f"{i}L", "LIDAR", stamp, _write_sweep(root, i, shots, T_world_from_lidar[i : i + 1])))
         for name, frame in shots.items():
             file, (h, w) = f"rgb/{name}/{i:06d}.png", frame.hw
-            write(root / file, png(pixels(frame)))
+            save_file(root / file, encode_unfiltered_png(frame_to_hwc(frame)))
             image = {"filename": file, "channels": 3, "height": h, "width": w, "pose": _pose_json(pose_matrix(frame))}
-            data.append(_datum(f"{i}{name}", name, seconds(frame), {"image": image}))
+            data.append(_datum(f"{i}{name}", name, frame_time_s(frame), {"image": image}))
         samples.append({"calibration_key": key, "datum_keys": [f"{i}L", *(f"{i}{name}" for name in shots)]})
-    write(root / f"scene_{key}.json", json.dumps({"data": data, "samples": samples, "name": "written"}))
+    save_file(root / f"scene_{key}.json", json.dumps({"data": data, "samples": samples, "name": "written"}))
     zero = dict.fromkeys(("fx", "fy", "cx", "cy", "skew"), 0.0)  # the LiDAR has an entry too
     intrinsics = [zero, *(_intrinsics_json(list_[0].camera) for list_ in frames.values())]
-    write(root / "calibration" / f"{key}.json", json.dumps({"names": ["LIDAR", *frames], "intrinsics": intrinsics}))
+    save_file(root / "calibration" / f"{key}.json", json.dumps({"names": ["LIDAR", *frames], "intrinsics": intrinsics}))
 
 
 def _write_sweep(root: Path, i: int, shots: Mapping[str, Frame], T_world_from_lidar: Pose) -> dict[str, Any]:
@@ -162,7 +166,7 @@ def _datum(key: str, name: str, stamp: float, datum: dict[str, Any]) -> dict[str
 
 
 def _pose_json(pose: np.ndarray) -> dict[str, dict[str, float]]:
-    rotation = dict(zip(("qx", "qy", "qz", "qw"), map(float, quaternion(pose[:3, :3])), strict=True))
+    rotation = dict(zip(("qx", "qy", "qz", "qw"), map(float, rotation_to_xyzw(pose[:3, :3])), strict=True))
     return {"rotation": rotation, "translation": dict(zip("xyz", map(float, pose[:3, 3]), strict=True))}
 
 
@@ -184,5 +188,5 @@ def _disparity(left: Frame, baseline: float, doffs: float) -> np.ndarray:
     return np.where(depth > 0, scale / np.where(depth > 0, depth, 1) - doffs, np.inf)
 
 
-def _matlab(K: np.ndarray) -> str:
+def _format_matlab(K: np.ndarray) -> str:
     return "[" + "; ".join(" ".join(f"{x!r}" for x in row) for row in K.tolist()) + "]"

@@ -12,14 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.data.io.decode import need
-from dhtorch.export.tiff import float_tiff
+from dhtorch.data.io.decode import import_optional
+from dhtorch.export.tiff import encode_float_tiff
 from dhtorch.records import Frame
 from dhtorch.testing.lossless import write_lossless
-from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, write
+from dhtorch.testing.parts import (
+    K_matrix,
+    encode_depth_codes,
+    encode_unfiltered_png,
+    frame_to_hwc,
+    pose_matrix,
+    save_file,
+)
 
-_RANGE = {"video.depth_min": 0.01, "video.depth_max": 10.0, "video.shift": 3.5, "video.use_log": True}
-_CHUNKS = 1000
+_DEPTH_QUANTISATION = {"video.depth_min": 0.01, "video.depth_max": 10.0, "video.shift": 3.5, "video.use_log": True}
+_FILES_PER_CHUNK = 1000
 
 
 def write_lerobot(
@@ -55,69 +62,73 @@ def write_lerobot(
     first = episodes[0][0]
     key, frames = f"{camera}_depth", [frame for episode in episodes for frame in episode]
     features: dict[str, Any] = {
-        camera: _picture(image, (*first.hw, 3), {"video.fps": fps, "video.is_depth_map": False}),
-        "timestamp": _plain("float32", 1),
-        **{name: _plain("int64", 1) for name in ("frame_index", "episode_index", "index", "task_index")},
+        camera: _picture_feature(image, (*first.hw, 3), {"video.fps": fps, "video.is_depth_map": False}),
+        "timestamp": _plain_feature("float32", 1),
+        **{name: _plain_feature("int64", 1) for name in ("frame_index", "episode_index", "index", "task_index")},
     }
     if depth is not None:
         shape, kind = (*first.depth.shape[1:], 1), {"video": "video", "array": "uint16"}.get(depth, "image")
-        info = {"is_depth_map": True} | (_RANGE if depth == "video" else {"depth_unit": "m"} if depth == "tiff" else {})
-        features[key] = _picture(kind, shape, info)
+        info = {"is_depth_map": True} | (
+            _DEPTH_QUANTISATION if depth == "video" else {"depth_unit": "m"} if depth == "tiff" else {}
+        )
+        features[key] = _picture_feature(kind, shape, info)
     if intrinsics == "feature":
-        features[f"{camera}.intrinsics"] = _plain("float64", 9)
+        features[f"{camera}.intrinsics"] = _plain_feature("float64", 9)
     if poses:
-        features[f"{camera}.pose"] = _plain("float64", 16)
-    rows = _rows(episodes, fps, features, camera, depth)
-    parts = [range(len(frames))] if version == 3 else _spans(episodes)
+        features[f"{camera}.pose"] = _plain_feature("float64", 16)
+    rows = _make_columns(episodes, fps, features, camera, depth)
+    parts = [range(len(frames))] if version == 3 else _episode_row_ranges(episodes)
     for number, span in enumerate(parts):
         part = {name: [cells[i] for i in span] for name, cells in rows.items()}
-        _write_table(root / _file("data", "", number, version, "parquet"), part, group)
+        _write_table(root / _file_path("data", "", number, version, "parquet"), part, group)
         of = [frames[i] for i in span]
         if image == "video":
-            pictures = [pixels(frame) for frame in of]
+            pictures = [frame_to_hwc(frame) for frame in of]
             write_lossless(
-                root / _file("videos", camera, number, version, "mp4"), pictures, "rgb24", rate=Fraction(fps)
+                root / _file_path("videos", camera, number, version, "mp4"), pictures, "rgb24", rate=Fraction(fps)
             )
         if depth == "video":
-            codes = [quantise(frame) for frame in of]
-            write_lossless(root / _file("videos", key, number, version, "mp4"), codes, depth_pixels, rate=Fraction(fps))
+            codes = [quantise_lerobot_depth(frame) for frame in of]
+            write_lossless(
+                root / _file_path("videos", key, number, version, "mp4"), codes, depth_pixels, rate=Fraction(fps)
+            )
     videos = [name for name, feature in features.items() if feature["dtype"] == "video"]
     _write_meta(root, episodes, version, fps, features, videos)
     if intrinsics == "side-car":
         lens = first.camera.distortion
         entry = {"K": K_matrix(first.camera).tolist()} | ({} if lens is None else {"dist": lens[0].tolist()})
         entry |= {} if first.depth_camera is None else {"K_depth": K_matrix(first.depth_camera).tolist()}
-        write(root / "meta" / "intrinsics.json", json.dumps({camera: entry}))
+        save_file(root / "meta" / "intrinsics.json", json.dumps({camera: entry}))
 
 
-def quantise(frame: Frame) -> np.ndarray:
+def quantise_lerobot_depth(frame: Frame) -> np.ndarray:
     """12-bit codes of a depth map: 0 m goes to code 0 like all that is too near, what is too far to the last one."""
-    low, high, shift = (_RANGE[f"video.{name}"] for name in ("depth_min", "depth_max", "shift"))
+    low, high, shift = (_DEPTH_QUANTISATION[f"video.{name}"] for name in ("depth_min", "depth_max", "shift"))
     z = frame.depth[0].double().numpy()
     share = np.log((z + shift) / (low + shift)) / math.log((high + shift) / (low + shift))
     return np.rint(share * 4095).clip(0, 4095).astype(np.uint16)
 
 
-def _picture(dtype: str, shape: Sequence[int], info: dict[str, Any]) -> dict[str, Any]:
+def _picture_feature(dtype: str, shape: Sequence[int], info: dict[str, Any]) -> dict[str, Any]:
     return {"dtype": dtype, "shape": list(shape), "names": ["height", "width", "channels"], "info": info}
 
 
-def _plain(dtype: str, n: int) -> dict[str, Any]:
+def _plain_feature(dtype: str, n: int) -> dict[str, Any]:
     return {"dtype": dtype, "shape": [n], "names": None}
 
 
-def _spans(episodes: Sequence[Sequence[Frame]]) -> list[range]:
+def _episode_row_ranges(episodes: Sequence[Sequence[Frame]]) -> list[range]:
     ends = np.cumsum([0, *(len(episode) for episode in episodes)]).tolist()
     return [range(a, b) for a, b in itertools.pairwise(ends)]
 
 
-def _file(top: str, key: str, number: int, version: int, suffix: str) -> str:
+def _file_path(top: str, key: str, number: int, version: int, suffix: str) -> str:
     if version == 3:
         return "/".join(part for part in (top, key, "chunk-000", f"file-{number:03d}.{suffix}") if part)
     return "/".join(part for part in (top, "chunk-000", key, f"episode_{number:06d}.{suffix}") if part)
 
 
-def _rows(
+def _make_columns(
     episodes: Sequence[Sequence[Frame]], fps: int, features: dict[str, Any], camera: str, depth: str | None
 ) -> dict[str, list[Any]]:
     """Column → a value for every frame of the set."""
@@ -127,12 +138,16 @@ def _rows(
             places = {"timestamp": i / fps, "frame_index": i, "episode_index": number, "task_index": 0}
             values: dict[str, Any] = {**places, "index": len(rows["timestamp"])}
             name = f"frame-{i:06d}"
-            values[camera] = {"bytes": png(pixels(frame)), "path": f"{name}.png"}
+            values[camera] = {"bytes": encode_unfiltered_png(frame_to_hwc(frame)), "path": f"{name}.png"}
             if depth in ("tiff", "png"):
-                content = float_tiff(frame.depth[0].numpy()) if depth == "tiff" else png(depth_codes(frame.depth, 1000))
+                content = (
+                    encode_float_tiff(frame.depth[0].numpy())
+                    if depth == "tiff"
+                    else encode_unfiltered_png(encode_depth_codes(frame.depth, 1000))
+                )
                 values[f"{camera}_depth"] = {"bytes": content, "path": f"{name}.{depth}"}
             elif depth == "array":
-                values[f"{camera}_depth"] = depth_codes(frame.depth, 1000)[..., None].tolist()
+                values[f"{camera}_depth"] = encode_depth_codes(frame.depth, 1000)[..., None].tolist()
             values[f"{camera}.intrinsics"] = K_matrix(frame.camera).ravel().tolist()
             if f"{camera}.pose" in rows:
                 values[f"{camera}.pose"] = pose_matrix(frame).ravel().tolist()
@@ -142,7 +157,7 @@ def _rows(
 
 
 def _write_table(file: Path, columns: dict[str, list[Any]], group: int) -> None:
-    pyarrow, parquet = need("pyarrow"), need("pyarrow.parquet")
+    pyarrow, parquet = import_optional("pyarrow"), import_optional("pyarrow.parquet")
     types = {"timestamp": pyarrow.float32()}
     arrays = {name: pyarrow.array(cells, types.get(name)) for name, cells in columns.items()}
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -163,20 +178,20 @@ def _write_meta(
         "total_episodes": len(episodes),
         "total_frames": sum(map(len, episodes)),
         "total_tasks": 1,
-        "chunks_size": _CHUNKS,
+        "chunks_size": _FILES_PER_CHUNK,
         "fps": fps,
         "splits": {"train": f"0:{len(episodes)}"},
         "data_path": f"data/{folder}/{stem}.parquet",
         "video_path": f"videos/{video}/{stem}.mp4" if videos else None,
         "features": features,
     }
-    write(root / "meta" / "info.json", json.dumps(info))
+    save_file(root / "meta" / "info.json", json.dumps(info))
     if version == 2:
         lines = [{"episode_index": i, "tasks": ["look"], "length": len(e)} for i, e in enumerate(episodes)]
-        write(root / "meta" / "episodes.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
-        write(root / "meta" / "tasks.jsonl", json.dumps({"task_index": 0, "task": "look"}) + "\n")
+        save_file(root / "meta" / "episodes.jsonl", "".join(json.dumps(line) + "\n" for line in lines))
+        save_file(root / "meta" / "tasks.jsonl", json.dumps({"task_index": 0, "task": "look"}) + "\n")
         return
-    spans = _spans(episodes)
+    spans = _episode_row_ranges(episodes)
     zeros = [0] * len(spans)
     table: dict[str, list[Any]] = {"episode_index": list(range(len(spans))), "length": [len(s) for s in spans]}
     table |= {"data/chunk_index": zeros, "data/file_index": zeros, "tasks": [["look"]] * len(spans)}

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.data.io.decode import need
+from dhtorch.data.io.decode import import_optional
 
 _H264 = {"qp": "0", "preset": "ultrafast"}
 # No B-frames: with them the muxer refuses films of two pictures, at some sizes always and at others now and then.
 _HEVC = {"preset": "ultrafast", "x265-params": "lossless=1:bframes=0:log-level=none:pools=none:frame-threads=1"}
 
 #: Pixel format → encoder and options that lose nothing.
-_LOSSLESS: dict[str, tuple[str, dict[str, str]]] = {
+_LOSSLESS_ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
     "rgb24": ("libx264rgb", _H264),
     "yuv420p": ("libx264", _H264),
     "yuvj420p": ("libx264", _H264),
@@ -37,8 +37,8 @@ def write_lossless(
 
     ``options`` replace those of the encoder, for a file that does lose something.
     """
-    av = need("av")
-    encoder, lossless = _LOSSLESS[pixels]
+    av = import_optional("av")
+    encoder, lossless = _LOSSLESS_ENCODERS[pixels]
     chosen = dict(lossless if options is None else options)
     file.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(file), "w", format="mp4") as container:
@@ -48,13 +48,13 @@ def write_lossless(
         stream.codec_context.thread_count = 1
         for i, picture in enumerate(pictures):
             frame = av.VideoFrame(picture.shape[1], picture.shape[0], pixels)
-            _fill(frame, picture)
+            _fill_planes(frame, picture)
             frame.pts, frame.time_base = i, 1 / rate
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
 
 
-def _fill(frame: Any, picture: np.ndarray) -> None:
+def _fill_planes(frame: Any, picture: np.ndarray) -> None:
     """The first plane takes the picture, the colour planes the value that means grey."""
     for k, plane in enumerate(frame.planes):
         rows = np.full(

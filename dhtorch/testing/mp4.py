@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data.io.decode import need
+from dhtorch.data.io.decode import import_optional
 
-_TICKS = 600  # per second: 24, 25, 30 and 60 Hz are whole numbers of them
+_TICKS_PER_S = 600  # per second: 24, 25, 30 and 60 Hz are whole numbers of them
 
 
 def write_video(
@@ -32,11 +32,11 @@ def write_video(
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     h, w = pictures[0].shape[:2]
-    av = need("av")
+    av = import_optional("av")
     with av.open(str(file), "w", format="mp4") as container:
         stream = container.add_stream(codec, rate=round(1 / (times[1] - times[0])) if len(times) > 1 else 30)
         stream.width, stream.height, stream.pix_fmt = w, h, stored
-        stream.codec_context.time_base = Fraction(1, _TICKS)
+        stream.codec_context.time_base = Fraction(1, _TICKS_PER_S)
         stream.codec_context.thread_count = 1
         order = f"keyint={key_every}:bframes={b_frames}:log-level=none"
         stream.options = {"crf": str(crf), "g": str(key_every), "bf": str(b_frames)}
@@ -44,16 +44,16 @@ def write_video(
             stream.options = {"crf": str(crf), "x265-params": f"{order}:pools=none:frame-threads=1"}
         for picture, time in zip(pictures, times, strict=True):
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            frame.pts = round((time - times[0]) * _TICKS)
-            frame.time_base = Fraction(1, _TICKS)
+            frame.pts = round((time - times[0]) * _TICKS_PER_S)
+            frame.time_base = Fraction(1, _TICKS_PER_S)
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
         shift = round(Fraction(times[1] - times[0]) / stream.time_base) if hide_first else 0
     if hide_first:
-        _delay(file, shift)
+        _delay_edit(file, shift)
 
 
-def _delay(file: Path, ticks: int) -> None:
+def _delay_edit(file: Path, ticks: int) -> None:
     """Move the start of the only edit in the file's edit list: what comes before is decoded but not shown."""
     content = bytearray(file.read_bytes())
     at = content.index(b"elst") + 16  # version and flags, count, duration, then the start

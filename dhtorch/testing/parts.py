@@ -16,7 +16,7 @@ from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame
 
 
-def pixels(frame: Frame) -> np.ndarray:
+def frame_to_hwc(frame: Frame) -> np.ndarray:
     """(H, W, C) uint8."""
     image = frame.image[0]
     if image.dtype != torch.uint8:
@@ -24,13 +24,13 @@ def pixels(frame: Frame) -> np.ndarray:
     return image.permute(1, 2, 0).numpy()
 
 
-def depth_codes(depth: Tensor, units_per_metre: float) -> np.ndarray:
+def encode_depth_codes(depth: Tensor, units_per_metre: float) -> np.ndarray:
     """(h, w) uint16, row after row in memory."""
     codes = (depth[0].double() * units_per_metre).round().clamp(0, 65534)
     return np.ascontiguousarray(codes.numpy(), np.uint16)
 
 
-def png(picture: np.ndarray) -> bytes:
+def encode_unfiltered_png(picture: np.ndarray) -> bytes:
     """PNG of (H, W, 1 or 3) uint8 or (H, W) uint16, rows unfiltered."""
     h, w = picture.shape[:2]
     bits = 8 * picture.dtype.itemsize
@@ -42,7 +42,7 @@ def png(picture: np.ndarray) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + b"".join(framed)
 
 
-def quaternion(R: np.ndarray) -> np.ndarray:
+def rotation_to_xyzw(R: np.ndarray) -> np.ndarray:
     """x y z w of a rotation: the dominant eigenvector of a symmetric 4×4 matrix, exact to rounding at every angle."""
     d, s = R - R.T, R + R.T
     Q = np.empty((4, 4))
@@ -59,7 +59,7 @@ def pose_matrix(frame: Frame) -> np.ndarray:
     return se3.to_matrix(frame.T_world_from_cam)[0].double().numpy()
 
 
-def seconds(frame: Frame) -> float:
+def frame_time_s(frame: Frame) -> float:
     """Time stamp of a frame."""
     if frame.time is None:
         raise ValueError("writers: found a frame without time, expected a stamp to write")
@@ -71,17 +71,17 @@ def K_matrix(camera: Camera) -> np.ndarray:
     return cameras.to_matrix(camera)[0].double().numpy()
 
 
-def text_row(values: Any) -> str:
+def format_row(values: Any) -> str:
     """Numbers on one line, every digit kept."""
     return " ".join(f"{float(x):.17g}" for x in values)
 
 
-def text_rows(matrix: np.ndarray) -> str:
+def format_rows(matrix: np.ndarray) -> str:
     """A matrix, one row a line."""
-    return "".join(text_row(row) + "\n" for row in matrix)
+    return "".join(format_row(row) + "\n" for row in matrix)
 
 
-def write(file: Path, content: bytes | str) -> None:
+def save_file(file: Path, content: bytes | str) -> None:
     """Write a file, its folder included."""
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(content.encode() if isinstance(content, str) else content)

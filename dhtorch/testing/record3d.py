@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dhtorch.data.io.decode import need
+from dhtorch.data.io.decode import import_optional
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Frame
 from dhtorch.testing.mp4 import write_video
-from dhtorch.testing.parts import K_matrix, pixels, pose_matrix, quaternion, seconds, write
+from dhtorch.testing.parts import K_matrix, frame_time_s, frame_to_hwc, pose_matrix, rotation_to_xyzw, save_file
 
 _NO_POSE = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 
@@ -44,17 +44,17 @@ def write_r3d(
         compression: of the archive's entries.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    meta = _metadata(frames, fps, declared_hw)
+    meta = _make_metadata(frames, fps, declared_hw)
     if not depth_size:
         del meta["dw"], meta["dh"]
     if not per_frame:
         del meta["perFrameIntrinsicCoeffs"]
-    pack = need("lzfse", "liblzfse").compress
+    pack = import_optional("lzfse", "liblzfse").compress
     with zipfile.ZipFile(file, "w", compression) as archive:
         archive.writestr("metadata", json.dumps(meta))
-        archive.writestr("icon", _jpeg(pixels(frames[0])[:16, :16]))
+        archive.writestr("icon", _encode_jpeg(frame_to_hwc(frames[0])[:16, :16]))
         for i, frame in enumerate(frames):
-            archive.writestr(f"rgbd/{i}.jpg", _jpeg(pixels(frame)))
+            archive.writestr(f"rgbd/{i}.jpg", _encode_jpeg(frame_to_hwc(frame)))
             archive.writestr(f"rgbd/{i}.depth", pack(frame.depth[0].numpy().astype("<f4").tobytes()))
             if frame.conf is not None:
                 archive.writestr(f"rgbd/{i}.conf", pack(frame.conf[0].numpy().astype(np.uint8).tobytes()))
@@ -69,18 +69,18 @@ def write_record3d_exr(
     dtype: np.typing.DTypeLike = np.float16,
 ) -> None:
     """The EXR + RGB export: ``EXR_RGBD/`` with ``metadata.json``, ``rgb/<i>.jpg`` and ``depth/<i>.exr``."""
-    exr = need("OpenEXR")
+    exr = import_optional("OpenEXR")
     folder = root / "EXR_RGBD"
     for i, frame in enumerate(frames):
-        write(folder / "rgb" / f"{i}.jpg", _jpeg(pixels(frame)))
+        save_file(folder / "rgb" / f"{i}.jpg", _encode_jpeg(frame_to_hwc(frame)))
         header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
         picture = io.BytesIO()
         # The library takes memory as it lies, whatever the strides say.
         exr.File(header, {channel: np.ascontiguousarray(frame.depth[0].numpy(), dtype)}).write(picture)
-        write(folder / "depth" / f"{i}.exr", picture.getvalue())
-    meta = _metadata(frames, fps, None)
+        save_file(folder / "depth" / f"{i}.exr", picture.getvalue())
+    meta = _make_metadata(frames, fps, None)
     del meta["perFrameIntrinsicCoeffs"]
-    write(folder / "metadata.json", json.dumps(meta))
+    save_file(folder / "metadata.json", json.dumps(meta))
 
 
 def write_record3d_mp4(
@@ -97,7 +97,9 @@ def write_record3d_mp4(
     ``depth_range``: m, written into the file; None = 0 to 3 m, unsaid, as older files.
     """
     near, far = depth_range or (0.0, 3.0)
-    pictures = [np.concatenate((_hue((f.depth[0].numpy() - near) / (far - near)), pixels(f)), 1) for f in frames]
+    pictures = [
+        np.concatenate((_hue_to_rgb((f.depth[0].numpy() - near) / (far - near)), frame_to_hwc(f)), 1) for f in frames
+    ]
     write_video(file, pictures, [i / fps for i in range(len(frames))], crf=crf, stored=stored)
     meta: dict[str, Any] = {"intrinsicMatrix": K_matrix(frames[0].camera).T.ravel().tolist()}
     if depth_range is not None:
@@ -107,7 +109,7 @@ def write_record3d_mp4(
         stream.write(struct.pack(">I4s", 8 + len(text) + 1, b"free") + text + b"\0")
 
 
-def _metadata(frames: Sequence[Frame], fps: float, declared_hw: tuple[int, int] | None) -> dict[str, Any]:
+def _make_metadata(frames: Sequence[Frame], fps: float, declared_hw: tuple[int, int] | None) -> dict[str, Any]:
     hw = declared_hw or frames[0].hw
     own = [cameras.resize(f.camera, f.hw, hw) if declared_hw else f.camera for f in frames]
     return {
@@ -118,27 +120,27 @@ def _metadata(frames: Sequence[Frame], fps: float, declared_hw: tuple[int, int] 
         "fps": fps,
         "K": K_matrix(own[0]).T.ravel().tolist(),
         "perFrameIntrinsicCoeffs": [[*camera.f[0].tolist(), *camera.c[0].tolist()] for camera in own],
-        "frameTimestamps": [seconds(f) - seconds(frames[0]) for f in frames],
-        "poses": [_pose(f) for f in frames],
+        "frameTimestamps": [frame_time_s(f) - frame_time_s(frames[0]) for f in frames],
+        "poses": [_arkit_pose(f) for f in frames],
         "initPose": _NO_POSE,
     }
 
 
-def _pose(frame: Frame) -> list[float]:
+def _arkit_pose(frame: Frame) -> list[float]:
     """Quaternion and position of the camera with ARKit's axes."""
     if frame.T_world_from_cam is None:
         return _NO_POSE
     c2w = pose_matrix(frame) @ np.diag([1.0, -1.0, -1.0, 1.0])
-    return [*map(float, quaternion(c2w[:3, :3])), *map(float, c2w[:3, 3])]
+    return [*map(float, rotation_to_xyzw(c2w[:3, :3])), *map(float, c2w[:3, 3])]
 
 
-def _jpeg(picture: np.ndarray) -> bytes:
+def _encode_jpeg(picture: np.ndarray) -> bytes:
     out = io.BytesIO()
     Image.fromarray(picture).save(out, "JPEG", quality=95, subsampling=0)
     return out.getvalue()
 
 
-def _hue(share: np.ndarray) -> np.ndarray:
+def _hue_to_rgb(share: np.ndarray) -> np.ndarray:
     """(h, w, 3) uint8: the colour of full saturation and value at a share of the circle."""
     distance = np.abs((share[..., None] * 6 - [3.0, 2.0, 4.0] + 3) % 6 - 3)
     value = np.stack((distance[..., 0] - 1, 2 - distance[..., 1], 2 - distance[..., 2]), -1)

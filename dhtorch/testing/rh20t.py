@@ -10,12 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.data.readers.rh20t_robot import ARMS
+from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS
 from dhtorch.records import Frame
 from dhtorch.testing.lossless import write_lossless
-from dhtorch.testing.parts import K_matrix, depth_codes, pixels, pose_matrix, quaternion, seconds, write
+from dhtorch.testing.parts import (
+    K_matrix,
+    encode_depth_codes,
+    frame_time_s,
+    frame_to_hwc,
+    pose_matrix,
+    rotation_to_xyzw,
+    save_file,
+)
 
-_STAMP = 1_600_000_000_000  # of the calibration, ms
+_CALIBRATION_STAMP_MS = 1_600_000_000_000  # of the calibration, ms
 
 
 def write_rh20t(
@@ -30,7 +38,7 @@ def write_rh20t(
     lag: float = 0.0,
     calibrated_hw: tuple[int, int] = (720, 1280),
     name: str = "task_0001_user_0001_scene_0001",
-    stamp: int = _STAMP,
+    stamp: int = _CALIBRATION_STAMP_MS,
     joint: np.ndarray | None = None,
     width: np.ndarray | None = None,
 ) -> Path:
@@ -43,7 +51,7 @@ def write_rh20t(
     at the times of each camera; None = they follow a known law. Scenes that share a ``stamp`` share a calibration.
     """
     scene = root / f"{name}_cfg_{configuration:04d}"
-    arm, folder = ARMS[configuration], root / "calib" / str(stamp)
+    arm, folder = ROBOT_ARMS[configuration], root / "calib" / str(stamp)
     world_from_base = np.eye(4) if T_world_from_base is None else T_world_from_base
     first = cameras.get(arm.in_hand[0])
     start = pose_matrix(first[0]) if first else np.eye(4)
@@ -52,39 +60,41 @@ def write_rh20t(
     K, E, tcp = {}, {}, {}
     for serial, frames in cameras.items():
         home = scene / f"cam_{serial}"
-        stamps = [round(1000 * seconds(frame)) for frame in frames]
+        stamps = [round(1000 * frame_time_s(frame)) for frame in frames]
         later = [stamp + round(1000 * lag) for stamp in stamps]
-        write_lossless(home / "color.mp4", [pixels(f) for f in frames], "rgb24", rate=Fraction(10))
+        write_lossless(home / "color.mp4", [frame_to_hwc(f) for f in frames], "rgb24", rate=Fraction(10))
         if depth:
             place = (depth_root or scene) / home.name / "depth.mp4"
-            write_lossless(place, [_planes(f) for f in frames], "yuvj420p", rate=Fraction(10))
-        _save(home / "timestamps.npy", {"color": stamps, "depth": later if depth else []})
-        K[serial] = np.hstack((_full_K(frames[0], calibrated_hw), np.zeros((3, 1))))
+            write_lossless(place, [_encode_depth_planes(f) for f in frames], "yuvj420p", rate=Fraction(10))
+        _save_npy(home / "timestamps.npy", {"color": stamps, "depth": later if depth else []})
+        K[serial] = np.hstack((_full_size_K(frames[0], calibrated_hw), np.zeros((3, 1))))
         poses = [pose_matrix(frame) for frame in frames]
         c2w = moved @ poses[0] if serial in arm.in_hand else poses[0]
         E[serial] = [np.linalg.inv(c2w), np.eye(4)]
         if first:
             hand = [pose_matrix(frame) for frame in first]
-            published = [np.linalg.inv(arm.align_base) @ _tcp(world_from_base, h, arm.X) @ arm.align_tcp for h in hand]
+            published = [
+                np.linalg.inv(arm.align_base) @ _tcp_pose(world_from_base, h, arm.X) @ arm.align_tcp for h in hand
+            ]
             entries = zip(stamps, published, strict=False)
-            tcp[serial] = [{"timestamp": t, "tcp": _vector(T), "robot_ft": np.zeros(6)} for t, T in entries]
+            tcp[serial] = [{"timestamp": t, "tcp": _pose_vector(T), "robot_ft": np.zeros(6)} for t, T in entries]
     for kind, content in (("intrinsics", K), ("extrinsics", E)):
-        _save(folder / f"{kind}.npy", content)
-    _save(folder / "tcp.npy", robot_notation(arm.robot, _tcp(world_from_base, calibrated, arm.X)))
+        _save_npy(folder / f"{kind}.npy", content)
+    _save_npy(folder / "tcp.npy", to_robot_notation(arm.robot, _tcp_pose(world_from_base, calibrated, arm.X)))
     if first:
-        _save(scene / "transformed" / "tcp_base.npy", tcp)
-    stamps_of = {s: [round(1000 * seconds(f)) for f in fs] for s, fs in cameras.items()}
+        _save_npy(scene / "transformed" / "tcp_base.npy", tcp)
+    stamps_of = {s: [round(1000 * frame_time_s(f)) for f in fs] for s, fs in cameras.items()}
     _write_streams(scene / "transformed", stamps_of, joint, width)
-    write(scene / "metadata.json", json.dumps({"calib": stamp, "finish_time": stamp + 10**6, "rating": 9}))
+    save_file(scene / "metadata.json", json.dumps({"calib": stamp, "finish_time": stamp + 10**6, "rating": 9}))
     return scene
 
 
-def robot_notation(robot: str, T: np.ndarray) -> np.ndarray:
+def to_robot_notation(robot: str, T: np.ndarray) -> np.ndarray:
     """A tcp pose (4×4, base ← tcp) as the robot of that name writes it in a calibration folder."""
     if robot in ("flexiv", "ur5"):
-        return _vector(T)
+        return _pose_vector(T)
     if robot == "franka":  # its own tool looks the other way
-        x, y, z, w = quaternion(T[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
+        x, y, z, w = rotation_to_xyzw(T[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
         axis = np.array([x, y, z])
         angle = 2 * np.arctan2(np.linalg.norm([x, y, z]), w)
         return np.append(T[:3, 3], angle * axis / max(float(np.linalg.norm(axis)), 1e-300))
@@ -97,23 +107,23 @@ def robot_notation(robot: str, T: np.ndarray) -> np.ndarray:
     return np.append(1000 * T[:3, 3], angles)
 
 
-def _tcp(world_from_base: np.ndarray, c2w: np.ndarray, X: np.ndarray) -> np.ndarray:
+def _tcp_pose(world_from_base: np.ndarray, c2w: np.ndarray, X: np.ndarray) -> np.ndarray:
     return np.linalg.inv(world_from_base) @ c2w @ X
 
 
-def _vector(T: np.ndarray) -> np.ndarray:
+def _pose_vector(T: np.ndarray) -> np.ndarray:
     """x y z qw qx qy qz."""
-    q = quaternion(T[:3, :3])
+    q = rotation_to_xyzw(T[:3, :3])
     return np.array([*T[:3, 3], q[3], *q[:3]])
 
 
-def _planes(frame: Frame) -> np.ndarray:
+def _encode_depth_planes(frame: Frame) -> np.ndarray:
     """Low bytes above high bytes, three equal channels: a grey picture as any player shows it."""
-    code = depth_codes(frame.depth, 1000)
+    code = encode_depth_codes(frame.depth, 1000)
     return np.concatenate((code & 255, code >> 8)).astype(np.uint8)
 
 
-def _full_K(frame: Frame, calibrated_hw: tuple[int, int]) -> np.ndarray:
+def _full_size_K(frame: Frame, calibrated_hw: tuple[int, int]) -> np.ndarray:
     """K of the full-size image, so that the exact rule gives back the frame's own."""
     K = K_matrix(frame.camera)
     for axis, size, full in ((0, frame.hw[1], calibrated_hw[1]), (1, frame.hw[0], calibrated_hw[0])):
@@ -140,11 +150,11 @@ def _write_streams(
     for name, scale in (("force_torque", 2.0), ("force_torque_base", 1.0)):
         loads = {s: [(t, scale * np.full(6, (t - start) / 1000)) for t in times] for s, times in stamps.items()}
         entries = {s: [{"timestamp": t, "zeroed": x, "raw": x + 3} for t, x in load] for s, load in loads.items()}
-        _save(folder / f"{name}.npy", entries)
-    _save(folder / "joint.npy", joint)
-    _save(folder / "gripper.npy", gripper)
+        _save_npy(folder / f"{name}.npy", entries)
+    _save_npy(folder / "joint.npy", joint)
+    _save_npy(folder / "gripper.npy", gripper)
 
 
-def _save(file: Path, content: Any) -> None:
+def _save_npy(file: Path, content: Any) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     np.save(file, content, allow_pickle=True)

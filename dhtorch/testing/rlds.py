@@ -10,11 +10,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dhtorch.data.codecs.tfrecord import crc32c, masked
+from dhtorch.data.codecs.tfrecord import crc32c, mask_crc
 from dhtorch.records import Frame
-from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, write
+from dhtorch.testing.parts import (
+    K_matrix,
+    encode_depth_codes,
+    encode_unfiltered_png,
+    frame_to_hwc,
+    pose_matrix,
+    save_file,
+)
 
-_CLASS = "tensorflow_datasets.core.features"
+_FEATURES_CLASS = "tensorflow_datasets.core.features"
 
 
 def write_rlds(
@@ -44,62 +51,77 @@ def write_rlds(
     """
     first = episodes[0][0]
     of_depth = camera.replace("image", "depth")
-    observation: dict[str, Any] = {camera: _picture((*first.hw, 3) if said else (-1, -1, 3), "uint8")}
+    observation: dict[str, Any] = {camera: _describe_picture((*first.hw, 3) if said else (-1, -1, 3), "uint8")}
     if depth == "png":
-        observation[of_depth] = _picture((*first.depth.shape[1:], 1), "uint16")
+        observation[of_depth] = _describe_picture((*first.depth.shape[1:], 1), "uint16")
     elif depth == "array":
-        observation[of_depth] = _tensor(tuple(first.depth.shape[1:]), "float32")
-    observation |= {f"{camera}_intrinsics": _tensor((9,), "float32")} if intrinsics else {}
-    observation |= {f"{camera}_T_world_from_cam": _tensor((16,), "float32")} if poses else {}
-    step = {"observation": _dict(observation), "action": _tensor((7,), "float32"), "is_last": _tensor((), "bool")}
-    steps = {"pythonClassName": f"{_CLASS}.Dataset", "sequence": {"feature": _dict(step), "length": "-1"}}
-    write(root / "features.json", json.dumps(_dict({"steps": steps})))
+        observation[of_depth] = _describe_tensor(tuple(first.depth.shape[1:]), "float32")
+    observation |= {f"{camera}_intrinsics": _describe_tensor((9,), "float32")} if intrinsics else {}
+    observation |= {f"{camera}_T_world_from_cam": _describe_tensor((16,), "float32")} if poses else {}
+    step = {
+        "observation": _describe_dict(observation),
+        "action": _describe_tensor((7,), "float32"),
+        "is_last": _describe_tensor((), "bool"),
+    }
+    steps = {
+        "pythonClassName": f"{_FEATURES_CLASS}.Dataset",
+        "sequence": {"feature": _describe_dict(step), "length": "-1"},
+    }
+    save_file(root / "features.json", json.dumps(_describe_dict({"steps": steps})))
     counts = [len(part) for part in np.array_split(np.arange(len(episodes)), shards)]
     said_of = {"name": split, "shardLengths": [str(count) for count in counts]}
-    write(root / "dataset_info.json", json.dumps({"name": "tiny_robot", "version": "1.0.0", "splits": [said_of]}))
-    records = [_record(_episode(frames, camera, of_depth, depth, intrinsics, poses)) for frames in episodes]
+    save_file(root / "dataset_info.json", json.dumps({"name": "tiny_robot", "version": "1.0.0", "splits": [said_of]}))
+    records = [
+        _encode_record(_encode_episode(frames, camera, of_depth, depth, intrinsics, poses)) for frames in episodes
+    ]
     for shard, count in enumerate(counts):
         name = f"tiny_robot-{split}.tfrecord-{shard:05d}-of-{shards:05d}"
-        write(root / name, b"".join(records[sum(counts[:shard]) : sum(counts[:shard]) + count]))
+        save_file(root / name, b"".join(records[sum(counts[:shard]) : sum(counts[:shard]) + count]))
 
 
-def _episode(
+def _encode_episode(
     frames: Sequence[Frame], camera: str, of_depth: str, depth: str | None, intrinsics: bool, poses: bool
 ) -> bytes:
     """One record's message."""
     n = len(frames)
     features = {
-        f"steps/observation/{camera}": _bytes([png(pixels(frame)) for frame in frames]),
-        "steps/action": _floats(np.arange(7 * n)),
-        "steps/is_last": _wholes([int(i == n - 1) for i in range(n)]),
-        "episode_metadata/episode_id": _wholes([-1]),
+        f"steps/observation/{camera}": _bytes_feature([encode_unfiltered_png(frame_to_hwc(frame)) for frame in frames]),
+        "steps/action": _floats_feature(np.arange(7 * n)),
+        "steps/is_last": _int64s_feature([int(i == n - 1) for i in range(n)]),
+        "episode_metadata/episode_id": _int64s_feature([-1]),
     }
     if depth == "png":
-        features[f"steps/observation/{of_depth}"] = _bytes([png(depth_codes(frame.depth, 1000)) for frame in frames])
+        features[f"steps/observation/{of_depth}"] = _bytes_feature(
+            [encode_unfiltered_png(encode_depth_codes(frame.depth, 1000)) for frame in frames]
+        )
     elif depth == "array":
-        features[f"steps/observation/{of_depth}"] = _floats(np.stack([frame.depth[0].numpy() for frame in frames]))
+        features[f"steps/observation/{of_depth}"] = _floats_feature(
+            np.stack([frame.depth[0].numpy() for frame in frames])
+        )
     if intrinsics:
-        features[f"steps/observation/{camera}_intrinsics"] = _floats(
+        features[f"steps/observation/{camera}_intrinsics"] = _floats_feature(
             np.stack([K_matrix(frame.camera) for frame in frames])
         )
     if poses:
-        features[f"steps/observation/{camera}_T_world_from_cam"] = _floats(
+        features[f"steps/observation/{camera}_T_world_from_cam"] = _floats_feature(
             np.stack([pose_matrix(frame) for frame in frames])
         )
-    entries = (_field(1, _field(1, name.encode()) + _field(2, value)) for name, value in features.items())
-    return _field(1, b"".join(entries))
+    entries = (
+        _encode_field(1, _encode_field(1, name.encode()) + _encode_field(2, value)) for name, value in features.items()
+    )
+    return _encode_field(1, b"".join(entries))
 
 
-def _record(body: bytes) -> bytes:
+def _encode_record(body: bytes) -> bytes:
     length = struct.pack("<Q", len(body))
-    return length + struct.pack("<I", masked(crc32c(length))) + body + struct.pack("<I", masked(crc32c(body)))
+    return length + struct.pack("<I", mask_crc(crc32c(length))) + body + struct.pack("<I", mask_crc(crc32c(body)))
 
 
-def _field(number: int, content: bytes) -> bytes:
-    return _varint(number << 3 | 2) + _varint(len(content)) + content
+def _encode_field(number: int, content: bytes) -> bytes:
+    return _encode_varint(number << 3 | 2) + _encode_varint(len(content)) + content
 
 
-def _varint(value: int) -> bytes:
+def _encode_varint(value: int) -> bytes:
     value &= (1 << 64) - 1
     out = bytearray()
     while value > 0x7F:
@@ -108,33 +130,33 @@ def _varint(value: int) -> bytes:
     return bytes([*out, value])
 
 
-def _bytes(values: Sequence[bytes]) -> bytes:
-    return _field(1, b"".join(_field(1, value) for value in values))
+def _bytes_feature(values: Sequence[bytes]) -> bytes:
+    return _encode_field(1, b"".join(_encode_field(1, value) for value in values))
 
 
-def _floats(values: np.ndarray) -> bytes:
-    return _field(2, _field(1, np.ascontiguousarray(values, "<f4").tobytes()))
+def _floats_feature(values: np.ndarray) -> bytes:
+    return _encode_field(2, _encode_field(1, np.ascontiguousarray(values, "<f4").tobytes()))
 
 
-def _wholes(values: Sequence[int]) -> bytes:
-    return _field(3, _field(1, b"".join(_varint(value) for value in values)))
+def _int64s_feature(values: Sequence[int]) -> bytes:
+    return _encode_field(3, _encode_field(1, b"".join(_encode_varint(value) for value in values)))
 
 
-def _dict(features: dict[str, Any]) -> dict[str, Any]:
-    return {"pythonClassName": f"{_CLASS}.FeaturesDict", "featuresDict": {"features": features}}
+def _describe_dict(features: dict[str, Any]) -> dict[str, Any]:
+    return {"pythonClassName": f"{_FEATURES_CLASS}.FeaturesDict", "featuresDict": {"features": features}}
 
 
-def _shape(shape: tuple[int, ...]) -> dict[str, Any]:
+def _describe_shape(shape: tuple[int, ...]) -> dict[str, Any]:
     return {"dimensions": [str(size) for size in shape]} if shape else {}
 
 
-def _picture(shape: tuple[int, ...], dtype: str) -> dict[str, Any]:
-    image = {"shape": _shape(shape), "dtype": dtype, "encodingFormat": "png"}
-    return {"pythonClassName": f"{_CLASS}.Image", "image": image}
+def _describe_picture(shape: tuple[int, ...], dtype: str) -> dict[str, Any]:
+    image = {"shape": _describe_shape(shape), "dtype": dtype, "encodingFormat": "png"}
+    return {"pythonClassName": f"{_FEATURES_CLASS}.Image", "image": image}
 
 
-def _tensor(shape: tuple[int, ...], dtype: str) -> dict[str, Any]:
+def _describe_tensor(shape: tuple[int, ...], dtype: str) -> dict[str, Any]:
     return {
-        "pythonClassName": f"{_CLASS}.Tensor",
-        "tensor": {"shape": _shape(shape), "dtype": dtype, "encoding": "none"},
+        "pythonClassName": f"{_FEATURES_CLASS}.Tensor",
+        "tensor": {"shape": _describe_shape(shape), "dtype": dtype, "encoding": "none"},
     }

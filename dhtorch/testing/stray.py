@@ -10,9 +10,18 @@ import numpy as np
 
 from dhtorch.records import Frame
 from dhtorch.testing.mp4 import write_video
-from dhtorch.testing.parts import K_matrix, depth_codes, pixels, png, pose_matrix, quaternion, seconds, write
+from dhtorch.testing.parts import (
+    K_matrix,
+    encode_depth_codes,
+    encode_unfiltered_png,
+    frame_time_s,
+    frame_to_hwc,
+    pose_matrix,
+    rotation_to_xyzw,
+    save_file,
+)
 
-_HEADER = "timestamp, frame, x, y, z, qx, qy, qz, qw"
+_ODOMETRY_HEADER = "timestamp, frame, x, y, z, qx, qy, qz, qw"
 
 
 def write_stray(
@@ -40,27 +49,29 @@ def write_stray(
         confidence_channels: 3 as some converters leave it.
         start: number of the first frame.
     """
-    times = [seconds(frame) for frame in frames]
-    lines = [_HEADER + (", fx, fy, cx, cy, distortion_center_x, distortion_center_y" if per_frame else "")]
+    times = [frame_time_s(frame) for frame in frames]
+    lines = [_ODOMETRY_HEADER + (", fx, fy, cx, cy, distortion_center_x, distortion_center_y" if per_frame else "")]
     for i, frame in enumerate(frames, start):
-        code = depth_codes(frame.depth, 1000)
+        code = encode_depth_codes(frame.depth, 1000)
         if depth_format == "png":
-            write(root / "depth" / f"{i:06d}.png", png(code))
+            save_file(root / "depth" / f"{i:06d}.png", encode_unfiltered_png(code))
         else:
             (root / "depth").mkdir(parents=True, exist_ok=True)
             np.save(root / "depth" / f"{i:06d}.npy", code)
         if frame.conf is not None:
             conf = frame.conf[0].numpy()
-            write(root / "confidence" / f"{i:06d}.png", png(np.stack([conf] * confidence_channels, -1)))
+            save_file(
+                root / "confidence" / f"{i:06d}.png", encode_unfiltered_png(np.stack([conf] * confidence_channels, -1))
+            )
         c2w, K = pose_matrix(frame), K_matrix(frame.camera)
-        cells = [*c2w[:3, 3], *quaternion(c2w[:3, :3])]
+        cells = [*c2w[:3, 3], *rotation_to_xyzw(c2w[:3, :3])]
         cells += [K[0, 0], K[1, 1], K[0, 2], K[1, 2]] if per_frame else []
         text = ", ".join(f"{float(cell):.17g}" for cell in cells)
-        lines.append(f"{seconds(frame):.9f}, {i:06d}, {text}" + (", , " if per_frame else ""))
-    write(root / "odometry.csv", "\n".join(lines) + "\n")
+        lines.append(f"{frame_time_s(frame):.9f}, {i:06d}, {text}" + (", , " if per_frame else ""))
+    save_file(root / "odometry.csv", "\n".join(lines) + "\n")
     K = K_matrix(frames[-1].camera)
-    write(root / "camera_matrix.csv", "\n".join(", ".join(f"{x!r}" for x in row) for row in K.tolist()))
+    save_file(root / "camera_matrix.csv", "\n".join(", ".join(f"{x!r}" for x in row) for row in K.tolist()))
     if video:
         kept = slice(1 if first_picture == "lost" else 0, None)
-        pictures = [pixels(frame) for frame in frames][kept]
+        pictures = [frame_to_hwc(frame) for frame in frames][kept]
         write_video(root / "rgb.mp4", pictures, times[kept], codec=codec, hide_first=first_picture == "hidden")

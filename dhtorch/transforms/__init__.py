@@ -15,28 +15,28 @@ from dhtorch.transforms.adapters import (
     one_thread,
 )
 from dhtorch.transforms.extend_depth import ExtendDepth
-from dhtorch.transforms.maps import Maps
+from dhtorch.transforms.maps import DenseMaps
 from dhtorch.transforms.sample_access import SampleError
-from dhtorch.transforms.sample_spec import Views
+from dhtorch.transforms.sample_spec import SampleSpec
 from dhtorch.transforms.status import SampleProblem
-from dhtorch.transforms.tokens import CHANNELS, grid, patch_tokens
-from dhtorch.transforms.validate_depth import JudgeDepth
+from dhtorch.transforms.tokens import TOKEN_CHANNELS, patch_tokens, token_grid
+from dhtorch.transforms.validate_depth import ValidateDepth
 
 __all__ = [
-    "CHANNELS",
+    "TOKEN_CHANNELS",
     "AddedCollate",
+    "DenseMaps",
     "ExtendDepth",
     "ExtendedDataset",
     "ExtendedStream",
-    "JudgeDepth",
-    "Maps",
     "NumpyTransform",
     "RldsBatchTransform",
     "SampleError",
     "SampleProblem",
-    "Views",
+    "SampleSpec",
+    "ValidateDepth",
     "collate_kept",
-    "grid",
     "one_thread",
     "patch_tokens",
+    "token_grid",
 ]

@@ -17,16 +17,16 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset, IterableDataset, default_collate
 
-from dhtorch.runtime.allocator import keep_freed
-from dhtorch.transforms.collate import collated, in_one_piece
+from dhtorch.runtime.allocator import disable_malloc_trim
+from dhtorch.transforms.collate import collate_shared, pack_shared
 from dhtorch.transforms.extend_depth import ExtendDepth
-from dhtorch.transforms.sample_access import SampleError, find, has, to_tensor, without
+from dhtorch.transforms.sample_access import SampleError, drop_keys, get_value, has_key, to_tensor
 
 #: Neighbours asked for the shapes of a sample that could not be loaded.
-_NEIGHBOURS = 16
+_MAX_NEIGHBOURS_TRIED = 16
 
 
-class _Wrapped:
+class _DatasetWrapper:
     """What a wrapper does not know itself, its data set does."""
 
     dataset: Any
@@ -37,7 +37,7 @@ class _Wrapped:
         return getattr(self.dataset, name)
 
 
-class ExtendedDataset(_Wrapped, Dataset[Any]):
+class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
     """A map-style data set whose items went through the transform; everything else is the data set's own.
 
     With ``gap`` the other view is the item so many places before, of the same episode; it is put under the
@@ -114,29 +114,29 @@ class ExtendedDataset(_Wrapped, Dataset[Any]):
         as :func:`collate_kept` does. From a worker what was added comes as views of one piece of shared memory."""
         if not self.by_batch:
             skips = self.transform.on_error == "skip"
-            return (collate_kept if skips else collated)(samples, self.transform.prefix)
-        return in_one_piece(self._extended(samples), self.transform.prefix)
+            return (collate_kept if skips else collate_shared)(samples, self.transform.prefix)
+        return pack_shared(self._extended(samples), self.transform.prefix)
 
     def _extended(self, samples: Sequence[Any]) -> dict[str, Any]:
         """A whole batch of samples that the transform has not seen."""
         told = self.transform.uncollated(samples)
         if told is not None:
-            batch = default_collate([without(sample, self.consumed) for sample in samples])
+            batch = default_collate([drop_keys(sample, self.consumed) for sample in samples])
             return self._returned({**batch, **told}) or {}
         # In a worker torch collates into memory that it shares: page by page a new one, several times as slow.
-        gone = {key: _each(samples, key) for key in self.consumed if has(samples[0], key)}
+        gone = {key: _collect_key(samples, key) for key in self.consumed if has_key(samples[0], key)}
         views = self.transform.views
         own = {key: torch.stack(found) for key, found in gone.items() if key != views.depth}
         if views.depth in gone:
             own[views.in_metres] = views.metres(gone[views.depth])
-        batch = default_collate([without(sample, gone) for sample in samples] if gone else list(samples))
+        batch = default_collate([drop_keys(sample, gone) for sample in samples] if gone else list(samples))
         return self._returned(self.transform({**batch, **own} if own else batch)) or {}
 
     def _returned(self, out: dict[str, Any] | None) -> dict[str, Any] | None:
         """Without what a gap lent, and what was consumed."""
         gone = (*self.consumed, self.transform.views.in_metres) if self.consumed else ()
         gone = gone if self.gap is None else (*gone, *self._lent)
-        return without(out, gone) if out is not None and gone else out
+        return drop_keys(out, gone) if out is not None and gone else out
 
     def _loaded(self, i: int) -> dict[str, Any]:
         """The item, with the other view where it comes from another item."""
@@ -146,27 +146,27 @@ class ExtendedDataset(_Wrapped, Dataset[Any]):
         earlier = self.dataset[i - self.gap] if i >= self.gap else sample
         same = i >= self.gap and self._episode(earlier) == self._episode(sample)
         views, source = self.transform.views, earlier if same else sample
-        found = [find(source, views.image), torch.tensor([not same])]
+        found = [get_value(source, views.image), torch.tensor([not same])]
         if len(self._lent) > len(found):
-            found.append(find(source, str(views.pose)))
+            found.append(get_value(source, str(views.pose)))
         return {**sample, **dict(zip(self._lent, found, strict=True))}
 
     def _episode(self, sample: Mapping[str, Any]) -> int:
-        return 0 if self.episode_key is None else int(find(sample, self.episode_key))
+        return 0 if self.episode_key is None else int(get_value(sample, self.episode_key))
 
     def _zeros_like_neighbour(self, i: int, error: Exception) -> dict[str, Any]:
         """Zeros in the shapes of the nearest item that can be loaded."""
-        for k in (i + sign * step for step in range(1, _NEIGHBOURS) for sign in (1, -1)):
+        for k in (i + sign * step for step in range(1, _MAX_NEIGHBOURS_TRIED) for sign in (1, -1)):
             if not 0 <= k < len(self):
                 continue
             try:
-                return {key: _zero(value) for key, value in self.dataset[k].items()}
+                return {key: _zeros_like(value) for key, value in self.dataset[k].items()}
             except Exception:
                 continue  # as corrupt as the first
         raise SampleError(f"neither item {i} nor its neighbours can be loaded: {error}") from error
 
 
-class ExtendedStream(_Wrapped, IterableDataset[Any]):
+class ExtendedStream(_DatasetWrapper, IterableDataset[Any]):
     """An iterable data set whose samples went through the transform; skipped ones are left out of the stream."""
 
     def __init__(self, dataset: Iterable[Any], transform: Callable[[Any], dict[str, Any] | None]) -> None:
@@ -217,7 +217,7 @@ class AddedCollate:
     def __call__(self, instances: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         """One batch."""
         mine = [{k: v for k, v in one.items() if k.startswith(self.prefix)} for one in instances]
-        return {**self.collate(instances), **collated(mine, self.prefix)}
+        return {**self.collate(instances), **collate_shared(mine, self.prefix)}
 
 
 def collate_kept(samples: Sequence[dict[str, Any] | None], prefix: str = "dhtorch.") -> dict[str, Any]:
@@ -228,35 +228,35 @@ def collate_kept(samples: Sequence[dict[str, Any] | None], prefix: str = "dhtorc
     """
     kept = [sample for sample in samples if sample is not None]
     skipped = torch.tensor(len(samples) - len(kept))
-    return {**(collated(kept, prefix) if kept else {}), "dhtorch.skipped": skipped}
+    return {**(collate_shared(kept, prefix) if kept else {}), "dhtorch.skipped": skipped}
 
 
 def one_thread(worker: int = 0) -> None:
     """One thread for torch and OpenCV: the ``worker_init_fn`` of a data loader. Workers are the parallelism there.
 
-    A worker also keeps what it frees, where that can be asked for (:func:`dhtorch.runtime.allocator.keep_freed`): its
-    next batch asks for the same memory.
+    A worker also keeps what it frees, where that can be asked for
+    (:func:`dhtorch.runtime.allocator.disable_malloc_trim`): its next batch asks for the same memory.
     """
     torch.set_num_threads(1)
-    keep_freed()
+    disable_malloc_trim()
     opencv = sys.modules.get("cv2")
     if opencv is not None:
         opencv.setNumThreads(0)  # 1 would wait for the threads of the pool, which a forked worker does not have
 
 
-def _each(samples: Sequence[Any], key: str) -> list[torch.Tensor]:
+def _collect_key(samples: Sequence[Any], key: str) -> list[torch.Tensor]:
     """What lies under a key of each sample."""
-    return [to_tensor(find(sample, key), key, signed=False) for sample in samples]
+    return [to_tensor(get_value(sample, key), key, signed=False) for sample in samples]
 
 
-def _zero(value: Any) -> Any:
+def _zeros_like(value: Any) -> Any:
     """Nothing, in the shape and type of a value."""
     if isinstance(value, Mapping):
-        return {k: _zero(v) for k, v in value.items()}
+        return {k: _zeros_like(v) for k, v in value.items()}
     if isinstance(value, str | bytes):
         return type(value)()
     if isinstance(value, list | tuple):
-        return type(value)(_zero(v) for v in value)
+        return type(value)(_zeros_like(v) for v in value)
     if isinstance(value, bool | int | float):
         return type(value)(0)
     return torch.zeros_like(value) if isinstance(value, torch.Tensor) else np.zeros_like(value)

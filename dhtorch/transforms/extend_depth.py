@@ -14,18 +14,17 @@ from dhtorch.codes import Gate, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.pair import merge
-from dhtorch.pipeline.presets import chosen
-from dhtorch.pipeline.spec import networks
-from dhtorch.records import NO_HINT, DepthMap, Estimate, Map, PoseFit, Samples, TrackHint
-from dhtorch.transforms import maps
-from dhtorch.transforms import poses as given
+from dhtorch.pipeline.presets import get_method
+from dhtorch.pipeline.spec import iter_networks
+from dhtorch.records import NO_HINT, DepthMap, Estimate, MergedDepth, PoseFit, Samples, TrackHint
+from dhtorch.transforms import maps, poses
 from dhtorch.transforms.fast_path import Alone
-from dhtorch.transforms.sample_access import SampleError, check_sample, find, to_tensor
-from dhtorch.transforms.sample_spec import Read, Views
-from dhtorch.transforms.status import SampleProblem, Tally
-from dhtorch.transforms.tokens import CHANNELS, FITS, grid, patch_tokens
+from dhtorch.transforms.sample_access import SampleError, check_sample, get_value, to_tensor
+from dhtorch.transforms.sample_spec import SampleSpec, SampleViews
+from dhtorch.transforms.status import ProblemCounts, SampleProblem
+from dhtorch.transforms.tokens import FIT_MODES, TOKEN_CHANNELS, patch_tokens, token_grid
 
-ON_ERROR = ("raise", "skip", "flag")
+ON_ERROR_CHOICES = ("raise", "skip", "flag")
 
 
 class ExtendDepth(torch.nn.Module):
@@ -41,8 +40,8 @@ class ExtendDepth(torch.nn.Module):
         hint: what is known of the motion between the views, for the tracker.
         seed: of the pose search. With ``index_key`` each sample has the seed ``seed + sample[index_key]``.
         index_key: key of a whole number that tells samples apart; None = the same draws for all.
-        dense: True = a map of every pixel as well, with the defaults of :func:`dhtorch.pipeline.dense.complete`; a
-            mapping =
+        dense: True = a map of every pixel as well, with the defaults of :func:`dhtorch.pipeline.dense.complete_depth`;
+            a mapping =
             options for it: ``partners``, ``planes``, ``size``, ``refinements``, ``min_correlation``,
             ``max_sigma_rel``. Sigma and score of swept pixels are calibrated by what travels with the package.
         patch, tokens_hw, fit: the network's patches, see :func:`dhtorch.transforms.patch_tokens`.
@@ -54,7 +53,7 @@ class ExtendDepth(torch.nn.Module):
             as frames along time. A batch with a missing key or a wrong shape raises in any case.
         prefix: of the keys that are added.
         **views: where the images, the depth and the intrinsics are, and their units: see
-            :class:`dhtorch.transforms.Views`. ``depth_unit`` must be given.
+            :class:`dhtorch.transforms.SampleSpec`. ``depth_unit`` must be given.
 
     Returns:
         The sample and, behind the prefix (N = n, P patches, with B in front of a batch): ``uv`` (N, 2) px;
@@ -62,8 +61,8 @@ class ExtendDepth(torch.nn.Module):
         there is a depth; ``source``, ``flag``, ``hole``, ``gate`` (N,) codes of ``dhtorch.codes``; ``T_1_from_0``
         (4, 4) and its ``pose_cov`` (6, 6), ``pose_ok``, ``pose_code``; with ``pose`` also ``pose_looks``, in which of
         :data:`dhtorch.geometry.pose_conventions.CONVENTIONS` a pose would fit that the near returns refute;
-        ``tokens`` (P, 10) of :data:`dhtorch.transforms.CHANNELS` and ``tokens_valid`` (P,); ``problem``. What is not
-        valid is 0.
+        ``tokens`` (P, 10) of :data:`dhtorch.transforms.TOKEN_CHANNELS` and ``tokens_valid`` (P,); ``problem``. What is
+        not valid is 0.
 
         With ``dense`` also ``depth_map``, ``sigma_map`` (h, w) m, ``score_map`` (h, w) in [0, 1], ``source_map`` and
         ``gate_map`` (h, w) codes, over the field of the picture and of its size unless that is longer than ``size``.
@@ -76,7 +75,7 @@ class ExtendDepth(torch.nn.Module):
         SampleError: a bad sample, where ``on_error`` says so.
 
     Gradient: points, maps, tokens and pose to images, depth and intrinsics, as ``dhtorch.extend`` and
-    ``dhtorch.pipeline.dense.complete``; none in a worker, whose samples cannot carry a graph.
+    ``dhtorch.pipeline.dense.complete_depth``; none in a worker, whose samples cannot carry a graph.
     Memory: with ``dense`` that of ``complete``, about a third as much again for tokens.
     Cost: as the method; with ``dense`` most of it is the sweep's. In workers use one thread
     (``worker_init_fn=one_thread``). A process that has used several threads should not be forked: set one thread
@@ -101,22 +100,22 @@ class ExtendDepth(torch.nn.Module):
         **views: Any,
     ) -> None:
         super().__init__()
-        method = chosen(method, n)
-        if on_error not in ON_ERROR or (batched and on_error == "skip"):
-            expected = ("raise", "flag") if batched else ON_ERROR
+        method = get_method(method, n)
+        if on_error not in ON_ERROR_CHOICES or (batched and on_error == "skip"):
+            expected = ("raise", "flag") if batched else ON_ERROR_CHOICES
             raise ValueError(f"on_error is {on_error!r}, expected one of {', '.join(expected)}")
-        if fit not in FITS:
-            raise ValueError(f"fit is {fit!r}, expected one of {', '.join(FITS)}")
-        grid((max(patch, 1),) * 2, patch=patch, tokens_hw=tokens_hw)  # raises where no patch fits
-        self.views = Views(**views)
-        self.maps = maps.Maps.asked(dense)
+        if fit not in FIT_MODES:
+            raise ValueError(f"fit is {fit!r}, expected one of {', '.join(FIT_MODES)}")
+        token_grid((max(patch, 1),) * 2, patch=patch, tokens_hw=tokens_hw)  # raises where no patch fits
+        self.views = SampleSpec(**views)
+        self.maps = maps.DenseMaps.asked(dense)
         self.method, self.hint = method, hint
-        self.learned = torch.nn.ModuleList(networks(self.method))  # so that .to() and .parameters() find them
+        self.learned = torch.nn.ModuleList(iter_networks(self.method))  # so that .to() and .parameters() find them
         self.seed, self.index_key = seed, index_key
         self.patch, self.tokens_hw, self.fit = patch, tokens_hw, fit
         self.on_error, self.batched, self.prefix = on_error, bool(batched), prefix
         self._stated = batched
-        self.tally = Tally()
+        self.tally = ProblemCounts()
         self._alone = Alone(self.views, self.method)
         self._seen_hw: tuple[int, int] | None = None
 
@@ -162,7 +161,9 @@ class ExtendDepth(torch.nn.Module):
         found, B = seen.found, len(samples)
         pooled = patch_tokens(found, seen.hole, seen.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
         paired = found.depth.new_zeros(B, dtype=torch.bool)
-        added = _added(found, pooled, xyz=seen.xyz, flag=seen.flag, hole=seen.hole, gate=None, fit=None, paired=paired)
+        added = _sample_keys(
+            found, pooled, xyz=seen.xyz, flag=seen.flag, hole=seen.hole, gate=None, fit=None, paired=paired
+        )
         problem = found.source.new_full((B,), SampleProblem.NO_SECOND_VIEW)
         self._counted(problem, seen.hw)
         return {self.prefix + key: x for key, x in {**added, "problem": problem}.items()}
@@ -185,25 +186,31 @@ class ExtendDepth(torch.nn.Module):
         self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))
         return None if self.on_error == "skip" or hw is None else self._joined(sample, self._blank(hw))
 
-    def _answer(self, read: Read, seed: int | Tensor, flagged: bool) -> dict[str, Tensor]:
+    def _answer(self, read: SampleViews, seed: int | Tensor, flagged: bool) -> dict[str, Tensor]:
         frame, paired, bad = read.anchor, read.paired, read.bad
         samples, estimate, fits, dense = self._asked(read, seed)
         fit = fits[-1] if fits else None
         found = merge(samples, estimate)
-        pooled = (found, samples.hole) if dense is None else maps.as_samples(dense, frame, self.method)
+        pooled = (found, samples.hole) if dense is None else maps.map_to_samples(dense, frame, self.method)
         tokens = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
         xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, found.uv, found.depth)
         xyz = torch.where((found.source != Source.NONE)[..., None], xyz, 0.0)
         gate = None if estimate is None else estimate.gate
-        added = _added(found, tokens, xyz=xyz, flag=samples.flag, hole=samples.hole, gate=gate, fit=fit, paired=paired)
-        added |= {} if self.views.pose is None else given.keys(fits, paired, given.name_of(self.views.pose))
-        added |= {} if dense is None else maps.as_keys(dense)
+        added = _sample_keys(
+            found, tokens, xyz=xyz, flag=samples.flag, hole=samples.hole, gate=gate, fit=fit, paired=paired
+        )
+        added |= (
+            {} if self.views.pose is None else poses.refuted_pose_keys(fits, paired, poses.pose_label(self.views.pose))
+        )
+        added |= {} if dense is None else maps.map_to_keys(dense)
         if flagged:
             added = {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), 0) for key, x in added.items()}
-        problem = torch.tensor(_problems(read, flagged), dtype=torch.int32, device=xyz.device)
+        problem = torch.tensor(_problem_codes(read, flagged), dtype=torch.int32, device=xyz.device)
         return {**added, "problem": problem}
 
-    def _asked(self, read: Read, seed: int | Tensor) -> tuple[Samples, Estimate | None, list[PoseFit], DepthMap | None]:
+    def _asked(
+        self, read: SampleViews, seed: int | Tensor
+    ) -> tuple[Samples, Estimate | None, list[PoseFit], DepthMap | None]:
         """What the method says, and of which views' poses, the last of which stands for all, and the maps where they
         are wanted; the front end alone, and no estimate, where nothing is paired."""
         if read.other is None or not bool(read.paired.any()):
@@ -225,7 +232,7 @@ class ExtendDepth(torch.nn.Module):
     def _seeds(self, sample: Mapping[str, Any], batch: int) -> int | Tensor:
         if self.index_key is None:
             return self.seed
-        index = to_tensor(find(sample, self.index_key), self.index_key).flatten()
+        index = to_tensor(get_value(sample, self.index_key), self.index_key).flatten()
         if index.shape[0] != batch or index.is_floating_point():
             expected = f"{batch} whole numbers"
             raise SampleError(
@@ -235,10 +242,10 @@ class ExtendDepth(torch.nn.Module):
 
     def _blank(self, hw: tuple[int, int]) -> dict[str, Tensor]:
         """What is added to a sample that cannot be read: zeros of the usual shapes."""
-        rows, columns = grid(hw, patch=self.patch, tokens_hw=self.tokens_hw)
+        rows, columns = token_grid(hw, patch=self.patch, tokens_hw=self.tokens_hw)
         n, p = self.method.n, rows * columns
         sizes = {"uv": (n, 2), "xyz": (n, 3), "depth": (n,), "sigma": (n,), "score": (n,), "T_1_from_0": (4, 4)}
-        sizes |= {"pose_cov": (6, 6), "tokens": (p, len(CHANNELS))}
+        sizes |= {"pose_cov": (6, 6), "tokens": (p, len(TOKEN_CHANNELS))}
         out = {key: torch.zeros(1, *size) for key, size in sizes.items()}
         for key, size in {"valid": (n,), "pose_ok": (), "tokens_valid": (p,)}.items():
             out[key] = torch.zeros(1, *size, dtype=torch.bool)
@@ -248,8 +255,8 @@ class ExtendDepth(torch.nn.Module):
             out["pose_looks"] = torch.zeros(1, dtype=torch.int32)
         if self.maps is not None:
             size = self.maps.hw(hw)
-            out |= {key: torch.zeros(1, *size) for key in maps.NUMBERS}
-            out |= {key: torch.zeros(1, *size, dtype=torch.int32) for key in maps.CODES}
+            out |= {key: torch.zeros(1, *size) for key in maps.MAP_NUMBER_KEYS}
+            out |= {key: torch.zeros(1, *size, dtype=torch.int32) for key in maps.MAP_CODE_KEYS}
         return {**out, "problem": torch.full((1,), SampleProblem.UNREADABLE, dtype=torch.int32)}
 
     def _counted(self, problem: Tensor, hw: tuple[int, int]) -> None:
@@ -263,7 +270,7 @@ class ExtendDepth(torch.nn.Module):
         return {**sample, **mine}
 
 
-def _problems(read: Read, flagged: bool) -> list[int]:
+def _problem_codes(read: SampleViews, flagged: bool) -> list[int]:
     """The code of each sample; few numbers, of which torch would make several operations."""
     bad = read.bad.tolist() if flagged else [False] * len(read.bad)
 
@@ -277,8 +284,8 @@ def _problems(read: Read, flagged: bool) -> list[int]:
     return list(map(code, bad, read.sensed.tolist(), read.paired.tolist()))
 
 
-def _added(
-    found: Map,
+def _sample_keys(
+    found: MergedDepth,
     tokens: tuple[Tensor, Tensor],
     *,
     xyz: Tensor,
@@ -300,13 +307,13 @@ def _added(
         "flag": flag,
         "hole": hole,
         "gate": torch.full_like(hole, Gate.NO_TRACK) if gate is None else gate,
-        **_pose(fit, paired, found.depth),
+        **_pose_keys(fit, paired, found.depth),
         "tokens": tokens[0],
         "tokens_valid": tokens[1],
     }
 
 
-def _pose(fit: PoseFit | None, paired: Tensor, like: Tensor) -> dict[str, Tensor]:
+def _pose_keys(fit: PoseFit | None, paired: Tensor, like: Tensor) -> dict[str, Tensor]:
     B = paired.shape[0]
     if fit is None:
         code = torch.zeros(B, dtype=torch.int32, device=like.device)

@@ -17,25 +17,31 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry.checks import is_transformed
-from dhtorch.geometry.patches import WIDEST, in_a_row, product_is_exact, whole_is_faster
-from dhtorch.ops import loader as native
+from dhtorch.geometry.patches import MAX_COMPILED_WINDOW_PX, flatten_images, product_is_exact, whole_is_faster
+from dhtorch.ops import loader
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import options
-from dhtorch.records import Map
+from dhtorch.records import MergedDepth
 from dhtorch.stages import sample as samplers
-from dhtorch.stages.backproject import Limits, around, backproject, places
+from dhtorch.stages.backproject import ReturnLimits, backproject, project_samples, window_sizes
 from dhtorch.stages.holes import classify
-from dhtorch.transforms.sample_access import SampleError, find, has, plainly, to_tensor
-from dhtorch.transforms.sample_spec import CAMERAS, UNITS, Views, all_sound, step
+from dhtorch.transforms.sample_access import SampleError, get_value, has_key, numbers_fingerprint, to_tensor
+from dhtorch.transforms.sample_spec import (
+    MAX_CACHED_CAMERAS,
+    SAMPLE_UNITS_PER_METRE,
+    SampleSpec,
+    all_medians_plausible,
+    probe_stride,
+)
 
 #: Patterns that say the same whenever they are asked for a size of picture.
-_FIXED = (samplers.spiral, samplers.vogel, samplers.grid)
+_FIXED = (samplers.spiral, samplers.vogel_spiral, samplers.regular_grid)
 
 
 class Looked(NamedTuple):
     """What was seen of B samples."""
 
-    found: Map
+    found: MergedDepth
     xyz: Tensor  # (B, N, 3) m; 0 where there is no usable return
     flag: Tensor  # (B, N) int32, codes.Flag
     hole: Tensor  # (B, N) int32, codes.Hole
@@ -66,7 +72,7 @@ class _Read(NamedTuple):
 class Alone:
     """The front end of a method on samples of which ``views`` says what they hold."""
 
-    def __init__(self, views: Views, method: Method) -> None:
+    def __init__(self, views: SampleSpec, method: Method) -> None:
         self.views, self.n, self.method = views, method.n, method
         self.limits = _told(views, method)
         self.bounds = views.bounds()
@@ -78,7 +84,7 @@ class Alone:
 
         Gradient: none; where one is wanted, the stages are asked.
         """
-        if self.limits is None or not samples or not native.serves():
+        if self.limits is None or not samples or not loader.serves():
             return None
         read = []
         for sample in samples:
@@ -95,16 +101,16 @@ class Alone:
         xyz = like.new_empty(B, self.n, 3)
         counts = like.new_empty(2, B, dtype=torch.int64)
         filled = depth, sigma, score, xyz, flag, hole, source, counts
-        unit, (limits, (block, least)) = UNITS[str(self.views.depth_unit)], self.limits
+        unit, (limits, (block, least)) = SAMPLE_UNITS_PER_METRE[str(self.views.depth_unit)], self.limits
         look, exact = torch.ops.dhtorch.look.default, product_is_exact(read[0].picture)
         for b, (picture, z, signed, spots) in enumerate(read):
             where, seen = (z, spots.at, picture, spots.pixel, spots.ray), (b, unit, signed, spots.step, *self.bounds)
             grey = block, exact and spots.shape[4] == 3, least
             look(*where, *filled, *seen, *spots.shape, *limits, *grey)
-        if not all_sound(counts):
+        if not all_medians_plausible(counts):
             return None
         uv = torch.cat([one.spots.uv for one in read])
-        return Looked(Map(uv, depth, sigma, score, source), xyz, flag, hole, hw)
+        return Looked(MergedDepth(uv, depth, sigma, score, source), xyz, flag, hole, hw)
 
     def _read(self, sample: Any) -> _Read | None:
         views = self.views
@@ -112,10 +118,10 @@ class Alone:
             return None
         try:
             numbers = views.intrinsics
-            stated = plainly(find(sample, numbers)) if isinstance(numbers, str) else b""
-            picture = to_tensor(find(sample, views.image), views.image)
-            depth = to_tensor(find(sample, views.depth), views.depth, signed=False)
-            if stated is None or has(sample, self.pad):
+            stated = numbers_fingerprint(get_value(sample, numbers)) if isinstance(numbers, str) else b""
+            picture = to_tensor(get_value(sample, views.image), views.image)
+            depth = to_tensor(get_value(sample, views.depth), views.depth, signed=False)
+            if stated is None or has_key(sample, self.pad):
                 return None
             if depth.ndim == 3 and 1 in (depth.shape[0], depth.shape[2]):
                 depth = depth[0] if depth.shape[0] == 1 else depth[..., 0]
@@ -135,24 +141,24 @@ class Alone:
         Raises:
             SampleError: it cannot be read.
         """
-        if len(self.kept) >= CAMERAS or torch.is_inference_mode_enabled() or is_transformed():
+        if len(self.kept) >= MAX_CACHED_CAMERAS or torch.is_inference_mode_enabled() or is_transformed():
             return None
         read = self.views.read(sample)
         frame = read.anchor
         if read.complaints or read.other is not None or not bool(read.sensed.all()):
             return None
         uv = self.method.sample(frame.hw, self.n, device=frame.camera.f.device, dtype=frame.camera.f.dtype)[None]
-        told = places(frame, uv)
-        size, reach = around(frame)
+        told = project_samples(frame, uv)
+        size, reach = window_sizes(frame)
         h, w = frame.depth.shape[-2:]
         many = whole_is_faster(frame.hw, self.n, size) or whole_is_faster((h, w), self.n, reach)
         assert self.limits is not None
         widest = self.limits[1][0] + 2  # the block whose texture is asked, and a pixel around it
-        if told is None or many or widest > min(WIDEST, *frame.hw):
+        if told is None or many or widest > min(MAX_COMPILED_WINDOW_PX, *frame.hw):
             return None
-        _, steps = in_a_row(frame.image)
+        _, steps = flatten_images(frame.image)
         shape = (reach, *steps, *frame.image.shape[1:], size)
-        spots = self.kept[kind] = _Spots(frame.hw, uv, *told, step(frame.depth), shape)
+        spots = self.kept[kind] = _Spots(frame.hw, uv, *told, probe_stride(frame.depth), shape)
         return spots
 
 
@@ -160,10 +166,10 @@ def _is_usual(picture: Tensor, depth: Tensor) -> bool:
     """Bytes and a map of words or single precision, which compiled code reads where they lie."""
     shaped = picture.ndim == 3 and depth.ndim == 2
     typed = picture.dtype == torch.uint8 and depth.dtype in (torch.int16, torch.float32)
-    return shaped and typed and native.serves(picture, depth)
+    return shaped and typed and loader.serves(picture, depth)
 
 
-def _told(views: Views, method: Method) -> tuple[Limits, tuple[int, float]] | None:
+def _told(views: SampleSpec, method: Method) -> tuple[ReturnLimits, tuple[int, float]] | None:
     """What the stages' options tell compiled code; None where it cannot do what they ask for."""
     seen, named = options(method.backproject, backproject), options(method.classify, classify)
     fixed = any(options(method.sample, sampler) is not None for sampler in _FIXED)
@@ -171,7 +177,12 @@ def _told(views: Views, method: Method) -> tuple[Limits, tuple[int, float]] | No
     if not fixed or seen is None or named is None or seen.pop("search_px") or any(x is not None for x in more):
         return None
     own_lens = isinstance(views.depth_intrinsics, str)
-    if views.sparse or own_lens or views.depth_unit not in UNITS or views.depth_range != (0.0, float("inf")):
+    if (
+        views.sparse
+        or own_lens
+        or views.depth_unit not in SAMPLE_UNITS_PER_METRE
+        or views.depth_range != (0.0, float("inf"))
+    ):
         return None
-    limits = Limits(**seen).told()
+    limits = ReturnLimits(**seen).told()
     return (limits, (named["block"], named["min_trackability"])) if 0 <= limits.min_conf <= 2 else None

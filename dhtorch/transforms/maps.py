@@ -1,4 +1,4 @@
-"""Maps of samples: a depth for every pixel of the anchor, as :func:`dhtorch.pipeline.dense.complete` finds it."""
+"""Maps of samples: a depth for every pixel of the anchor, as :func:`dhtorch.pipeline.dense.complete_depth` finds it."""
 
 from __future__ import annotations
 
@@ -9,35 +9,35 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.calibration.score_calibration import Calibration
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.method import Method
-from dhtorch.records import DepthMap, Frame, Map
-from dhtorch.transforms.sample_spec import Read
+from dhtorch.records import DepthMap, Frame, MergedDepth
+from dhtorch.transforms.sample_spec import SampleViews
 
 #: Keys of a map: numbers, and codes.
-NUMBERS, CODES = ("depth_map", "sigma_map", "score_map"), ("source_map", "gate_map")
+MAP_NUMBER_KEYS, MAP_CODE_KEYS = ("depth_map", "sigma_map", "score_map"), ("source_map", "gate_map")
 
 
 @dataclass(frozen=True, eq=False)
-class Maps:
+class DenseMaps:
     """How maps are made: all options, and the calibration that travels with the package."""
 
     options: Mapping[str, Any]
-    calibration: Calibration | None = field(default_factory=dense.shipped)
+    calibration: Calibration | None = field(default_factory=dense.default_calibration)
 
     @classmethod
-    def asked(cls, given: bool | Mapping[str, Any], name: str = "dense") -> Maps | None:
-        """What ``dense=`` asks for, see :func:`dhtorch.pipeline.dense.options`."""
-        options = dense.options(given, name)
+    def asked(cls, given: bool | Mapping[str, Any], name: str = "dense") -> DenseMaps | None:
+        """What ``dense=`` asks for, see :func:`dhtorch.pipeline.dense.dense_options`."""
+        options = dense.dense_options(given, name)
         return None if options is None else cls(options)
 
     def hw(self, hw: tuple[int, int]) -> tuple[int, int]:
         """Height and width of the map of a picture."""
         return dense.map_hw(hw, self.options["size"])
 
-    def swept(self, read: Read, method: Method, **asked: Any) -> DepthMap:
+    def swept(self, read: SampleViews, method: Method, **asked: Any) -> DepthMap:
         """The maps of samples of which some have a second view; the others get those of :meth:`sensed`.
 
         Args:
@@ -47,18 +47,18 @@ class Maps:
         """
         assert read.other is not None
         options = {**self.options, "method": method, "calibration": self.calibration, **asked}
-        found = dense.complete(read.anchor, read.other, **options)
+        found = dense.complete_depth(read.anchor, read.other, **options)
         if bool(read.paired.all()):
             return found
         rows = torch.arange(len(read.paired), device=read.paired.device)
-        return tree.stack([self.sensed(read.anchor, method), found])[read.paired.long(), rows]
+        return pytree.stack([self.sensed(read.anchor, method), found])[read.paired.long(), rows]
 
     def sensed(self, anchor: Frame, method: Method) -> DepthMap:
         """The maps of samples without a second view: the sensor where it answers, else silence."""
-        return dense.sensed(anchor, method=method, size=self.options["size"])
+        return dense.sensor_depth_map(anchor, method=method, size=self.options["size"])
 
 
-def as_keys(found: DepthMap) -> dict[str, Tensor]:
+def map_to_keys(found: DepthMap) -> dict[str, Tensor]:
     """What is added to a sample: the fields of its map, 0 where it is silent. Gradient: to depth and sigma."""
     return {
         "depth_map": torch.where(found.keep, found.depth, 0.0),
@@ -69,13 +69,13 @@ def as_keys(found: DepthMap) -> dict[str, Tensor]:
     }
 
 
-def as_samples(found: DepthMap, frame: Frame, method: Method) -> tuple[Map, Tensor]:
+def map_to_samples(found: DepthMap, frame: Frame, method: Method) -> tuple[MergedDepth, Tensor]:
     """Every pixel of a map as a sample (B, h · w), and the class of its hole as the method's seats 2 and 3 name it.
 
     Gradient: to depth and sigma.
     """
-    uv = dense.pixels(frame, (found.depth.shape[-2], found.depth.shape[-1]))
+    uv = dense.map_pixel_centres(frame, (found.depth.shape[-2], found.depth.shape[-1]))
     with torch.no_grad():
         hole = method.look_at(frame, uv).hole
-    flat = {name.removesuffix("_map"): x.flatten(1) for name, x in as_keys(found).items() if name != "gate_map"}
-    return Map(uv=uv.expand(len(hole), -1, -1), **flat), hole
+    flat = {name.removesuffix("_map"): x.flatten(1) for name, x in map_to_keys(found).items() if name != "gate_map"}
+    return MergedDepth(uv=uv.expand(len(hole), -1, -1), **flat), hole

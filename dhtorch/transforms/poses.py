@@ -17,26 +17,26 @@ from dhtorch.codes import PoseCode
 from dhtorch.geometry import pose_conventions as conventions
 from dhtorch.geometry import se3
 from dhtorch.pytree import stack
-from dhtorch.records import GivenPose, Pose, PoseFit
-from dhtorch.stages import pose_prior as given
-from dhtorch.transforms.sample_access import Leaves, SampleError
+from dhtorch.records import Pose, PoseFit, PosePrior
+from dhtorch.stages import pose_prior
+from dhtorch.transforms.sample_access import SampleError, SampleReader
 
 #: What a pose in a sample maps.
-KINDS = ("world_from_cam", "1_from_0")
+POSE_KINDS = ("world_from_cam", "1_from_0")
 
 #: A motion itself: 3x4 or 4x4 numbers.
-Matrix = Sequence[Sequence[float]]
+PoseMatrix = Sequence[Sequence[float]]
 
 #: How far a stored rotation may be from one.
-MAX_OFF = 0.01
+_MAX_ROTATION_ERROR = 0.01
 
 
-def name_of(pose: str | Matrix) -> str:
+def pose_label(pose: str | PoseMatrix) -> str:
     """What messages call it."""
     return pose if isinstance(pose, str) else "pose"
 
 
-def check_constant(pose: Matrix, kind: str) -> None:
+def check_constant_pose(pose: PoseMatrix, kind: str) -> None:
     """A motion that is the same for all samples.
 
     Raises:
@@ -52,7 +52,7 @@ def check_constant(pose: Matrix, kind: str) -> None:
         raise ValueError(f"pose: found {found}, expected a key, or with pose_kind='1_from_0' 3x4 or 4x4 finite numbers")
 
 
-def sigmas(cov: str | Sequence[float] | None, name: str = "pose_cov") -> tuple[float, float] | None:
+def parse_pose_sigmas(cov: str | Sequence[float] | None, name: str = "pose_cov") -> tuple[float, float] | None:
     """The standard deviations (rad, m) of a relative pose that are stated as two numbers; ``name`` of the option.
 
     Raises:
@@ -65,19 +65,19 @@ def sigmas(cov: str | Sequence[float] | None, name: str = "pose_cov") -> tuple[f
     return float(cov[0]), float(cov[1])
 
 
-def motions(
-    leaves: Leaves,
+def read_pose_priors(
+    leaves: SampleReader,
     at: tuple[int, Sequence[int]],
     T: tuple[int, int],
     checks: list[Any],
     *,
-    keys: tuple[str | Matrix, str | None],
+    keys: tuple[str | PoseMatrix, str | None],
     cov: str | Sequence[float] | None,
     kind: str,
     axes: str,
     unit: float,
     refine: bool,
-) -> GivenPose:
+) -> PosePrior:
     """The motions (V, B) from the anchor to the other views, as samples state them.
 
     Args:
@@ -86,33 +86,33 @@ def motions(
         T: frames along time of the anchor's images and of the others'.
         checks: gets what contradicts that these are poses: mask, value and text.
         keys: of the pose, or the matrix of all; and of the other views' where it is another.
-        cov, kind, axes, unit, refine: see :class:`dhtorch.transforms.Views`.
+        cov, kind, axes, unit, refine: see :class:`dhtorch.transforms.SampleSpec`.
 
     Raises:
         SampleError: a missing key or a wrong shape.
 
     Gradient: to the poses.
     """
-    M, name = conventions.STATED[axes], keys[0]
-    options: dict[str, Any] = {"sigma": sigmas(cov), "refine": refine}
+    M, name = conventions.STATED_AXES[axes], keys[0]
+    options: dict[str, Any] = {"sigma": parse_pose_sigmas(cov), "refine": refine}
     found = []
     for place in at[1]:
         if kind == "1_from_0":
-            T_1_from_0 = conventions.in_axes(_pose(leaves, name, T[1], place, unit, checks), M)
-            known = None if not isinstance(cov, str) else _cov(leaves, cov, T[1], place)
-            found.append(given.stated(T_1_from_0, cov=known, **options))
+            T_1_from_0 = conventions.motion_from_axes(_read_pose(leaves, name, T[1], place, unit, checks), M)
+            known = None if not isinstance(cov, str) else _read_covariance(leaves, cov, T[1], place)
+            found.append(pose_prior.make_prior(T_1_from_0, cov=known, **options))
             continue
-        world_0 = conventions.camera_axes(_pose(leaves, name, T[0], at[0], unit, checks), M)
-        world_1 = conventions.camera_axes(_pose(leaves, keys[1] or name, T[1], place, unit, checks), M)
+        world_0 = conventions.pose_from_axes(_read_pose(leaves, name, T[0], at[0], unit, checks), M)
+        world_1 = conventions.pose_from_axes(_read_pose(leaves, keys[1] or name, T[1], place, unit, checks), M)
         known = None
         if isinstance(cov, str):
-            both = _cov(leaves, cov, T[0], at[0]), _cov(leaves, cov, T[1], place)
+            both = _read_covariance(leaves, cov, T[0], at[0]), _read_covariance(leaves, cov, T[1], place)
             known = conventions.relative_covariance(world_1, *both)
-        found.append(given.between(world_0, world_1, cov=known, **options))
+        found.append(pose_prior.relative_prior(world_0, world_1, cov=known, **options))
     return stack(found).to(leaves.dtype)
 
 
-def keys(fits: Sequence[PoseFit], paired: Tensor, name: str) -> dict[str, Tensor]:
+def refuted_pose_keys(fits: Sequence[PoseFit], paired: Tensor, name: str) -> dict[str, Tensor]:
     """What is added to a sample beside its pose: which convention a refuted one looks like; with a warning.
 
     Args:
@@ -134,7 +134,9 @@ def keys(fits: Sequence[PoseFit], paired: Tensor, name: str) -> dict[str, Tensor
     return {"pose_looks": looks}
 
 
-def _along(leaves: Leaves, key: str | Matrix, T: int, at: int, tail: tuple[tuple[int, ...], int]) -> Tensor:
+def _read_matrix(
+    leaves: SampleReader, key: str | PoseMatrix, T: int, at: int, tail: tuple[tuple[int, ...], int]
+) -> Tensor:
     """(B, rows, columns) in float64 of one matrix per sample, or one per frame; or of one for all."""
     if not isinstance(key, str):
         assert leaves.like is not None
@@ -151,13 +153,13 @@ def _along(leaves: Leaves, key: str | Matrix, T: int, at: int, tail: tuple[tuple
     return x.double()
 
 
-def _cov(leaves: Leaves, key: str, T: int, at: int) -> Tensor:
-    return _along(leaves, key, T, at, ((6,), 6))
+def _read_covariance(leaves: SampleReader, key: str, T: int, at: int) -> Tensor:
+    return _read_matrix(leaves, key, T, at, ((6,), 6))
 
 
-def _pose(leaves: Leaves, source: str | Matrix, T: int, at: int, unit: float, checks: list[Any]) -> Pose:
-    key = name_of(source)
-    x = _along(leaves, source, T, at, ((3, 4), 4))
+def _read_pose(leaves: SampleReader, source: str | PoseMatrix, T: int, at: int, unit: float, checks: list[Any]) -> Pose:
+    key = pose_label(source)
+    x = _read_matrix(leaves, source, T, at, ((3, 4), 4))
     R = x[:, :3, :3]
     with torch.no_grad():
         known = x.isfinite().flatten(1).all(1)  # a pose that is not known is no mistake: its pair is not answered
@@ -166,7 +168,9 @@ def _pose(leaves: Leaves, source: str | Matrix, T: int, at: int, unit: float, ch
         det = (torch.linalg.cross(safe[:, 0], safe[:, 1]) * safe[:, 2]).sum(-1)
         off = (safe @ safe.mT - eye).abs().flatten(1).amax(1)
         checks.append((det < 0, det, f"{key}: the determinant is {{:.4g}}, a reflection: are the axes left-handed?"))
-        checks.append((off > MAX_OFF, det, f"{key}: found no rotation (determinant {{:.4g}}), expected one in 3x3"))
+        checks.append(
+            (off > _MAX_ROTATION_ERROR, det, f"{key}: found no rotation (determinant {{:.4g}}), expected one in 3x3")
+        )
         if x.shape[1] == 4:
             last = (x[:, 3] - torch.tensor([0.0, 0, 0, 1]).to(x)).abs().amax(-1)
             text = f"{key}: the last row is off 0 0 0 1 by {{:.4g}}; is the matrix transposed?"

@@ -17,43 +17,43 @@ from dhtorch.geometry.least_squares import has_graph
 from dhtorch.records import Camera
 
 #: Where the numbers are: a key of the sample, or the numbers themselves, the same for every sample.
-Numbers = str | Sequence[float]
+KeyOrNumbers = str | Sequence[float]
 
 
 #: torch knows little of unsigned words.
-_SIGNED = {torch.uint16: torch.int32, torch.uint32: torch.int64}
+_SIGNED_DTYPES = {torch.uint16: torch.int32, torch.uint32: torch.int64}
 
 
 class SampleError(ValueError):
     """A sample cannot be read as stated; the message names the key, what was found and what was expected."""
 
 
-def find(sample: Mapping[str, Any], key: str) -> Any:
+def get_value(sample: Mapping[str, Any], key: str) -> Any:
     """The value under a key, or piece by piece in nested dicts.
 
     Raises:
         SampleError: there is none.
     """
-    value = _found(sample, key)
+    value = _look_up(sample, key)
     if value is _MISSING:
-        raise SampleError(f"{key}: found no such key, expected one of {', '.join(_keys(sample))}")
+        raise SampleError(f"{key}: found no such key, expected one of {', '.join(_list_keys(sample))}")
     return value
 
 
-def has(sample: Mapping[str, Any], key: str) -> bool:
-    """Whether there is a value under a key, as :func:`find` looks for it."""
-    return _found(sample, key) is not _MISSING
+def has_key(sample: Mapping[str, Any], key: str) -> bool:
+    """Whether there is a value under a key, as :func:`get_value` looks for it."""
+    return _look_up(sample, key) is not _MISSING
 
 
-def without(sample: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
-    """A copy of a sample without what :func:`find` finds under some keys; nested dicts that lose it are copied."""
+def drop_keys(sample: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """A copy of a sample without what :func:`get_value` finds under some keys; nested dicts that lose it are copied."""
     out = dict(sample)
     for key in keys:
         head, _, rest = key.replace("/", ".").partition(".")
         if key in out:
             del out[key]
         elif rest and isinstance(out.get(head), Mapping):
-            out[head] = without(out[head], [rest])
+            out[head] = drop_keys(out[head], [rest])
     return out
 
 
@@ -61,7 +61,7 @@ def without(sample: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
 _MISSING = object()
 
 
-def _found(sample: Mapping[str, Any], key: str) -> Any:
+def _look_up(sample: Mapping[str, Any], key: str) -> Any:
     if key in sample:
         return sample[key]
     value: Any = sample
@@ -80,7 +80,7 @@ def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
     """
     if isinstance(value, Tensor):
         x = value.as_subclass(Tensor)
-        return x.to(_SIGNED[x.dtype]) if signed and x.dtype in _SIGNED else x
+        return x.to(_SIGNED_DTYPES[x.dtype]) if signed and x.dtype in _SIGNED_DTYPES else x
     array = np.asarray(value)
     if array.dtype.kind not in "buif":
         raise SampleError(f"{key}: found {type(value).__name__} of {array.dtype}, expected an array of numbers")
@@ -90,7 +90,7 @@ def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array))
 
 
-def plainly(value: Any) -> Hashable | None:
+def numbers_fingerprint(value: Any) -> Hashable | None:
     """What tells numbers from others; None of what numpy does not know, or a graph or another device has."""
     if isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float64) and not is_transformed():
         value = value.numpy() if value.is_cpu and not has_graph(value) else value
@@ -100,10 +100,10 @@ def plainly(value: Any) -> Hashable | None:
 
 
 #: Keys of numbers that samples have one of, and collated batches one for each sample.
-_COUNTED = ("episode_index", "index", "frame_index")
+_INDEX_KEYS = ("episode_index", "index", "frame_index")
 
 
-def check_sample(sample: Any, image: str, intrinsics: Numbers, batched: bool | None) -> None:
+def check_sample(sample: Any, image: str, intrinsics: KeyOrNumbers, batched: bool | None) -> None:
     """Refuse what is no sample; where ``batched`` is None also a batch, whose samples would be read as frames in time.
 
     Raises:
@@ -118,19 +118,19 @@ def check_sample(sample: Any, image: str, intrinsics: Numbers, batched: bool | N
     if batched is not None:
         return
     try:
-        images = find(sample, image)
+        images = get_value(sample, image)
     except SampleError:
         return  # said where it is read
     n = len(images) if getattr(images, "ndim", 0) == 4 else 1
     flag = f"{image}_is_pad"
-    if has(sample, flag) and tuple(getattr(find(sample, flag), "shape", ())) == (n,):
+    if has_key(sample, flag) and tuple(getattr(get_value(sample, flag), "shape", ())) == (n,):
         return  # LeRobot's delta_timestamps: time
-    keys: tuple[Any, ...] = () if n < 2 else (intrinsics, *_COUNTED, *sample)
+    keys: tuple[Any, ...] = () if n < 2 else (intrinsics, *_INDEX_KEYS, *sample)
     for key in keys:
         value = sample.get(key) if isinstance(key, str) else None
         shape = tuple(getattr(value, "shape", ()))
         texts = isinstance(value, list | tuple) and len(value) == n and all(isinstance(text, str) for text in value)
-        several = shape == (n,) and key in _COUNTED
+        several = shape == (n,) and key in _INDEX_KEYS
         if texts or several or (key == intrinsics and shape == (n, 3, 3)):
             found = f"{n} texts" if texts else f"shape {shape}"
             raise SampleError(
@@ -139,7 +139,7 @@ def check_sample(sample: Any, image: str, intrinsics: Numbers, batched: bool | N
             )
 
 
-class Leaves:
+class SampleReader:
     """The tensors of a sample, all with B in front."""
 
     def __init__(self, sample: Mapping[str, Any], batched: bool, dtype: torch.dtype) -> None:
@@ -148,7 +148,7 @@ class Leaves:
 
     def get(self, key: str, *, signed: bool = True) -> Tensor:
         """(B, …) on the device of the first one asked for."""
-        x = to_tensor(find(self.sample, key), key, signed=signed)
+        x = to_tensor(get_value(self.sample, key), key, signed=signed)
         x = x if self.batched else x[None]
         if self.like is None:
             self.like = x
@@ -190,7 +190,7 @@ class Leaves:
             raise SampleError(f"{key}: found shape {shape}, expected {expected}")
         return x.to(self.dtype) if x.is_floating_point() else x
 
-    def numbers(self, numbers: Numbers | None, T: int, at: int) -> Tensor | None:
+    def numbers(self, numbers: KeyOrNumbers | None, T: int, at: int) -> Tensor | None:
         """(B, k) of numbers given once, per sample, or per sample and frame."""
         if numbers is None or self.like is None:
             return None
@@ -209,17 +209,17 @@ class Leaves:
             )
         return x.to(self.dtype)
 
-    def stated(self, numbers: Numbers) -> Hashable | None:
+    def stated(self, numbers: KeyOrNumbers) -> Hashable | None:
         """What tells numbers from others, so that the same ones need not be read again; None where a graph, a device or
         a type that numpy does not know has them, and in inference mode, whose tensors are of no use outside it."""
         if torch.is_inference_mode_enabled():
             return None
-        own = plainly(find(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers))
+        own = numbers_fingerprint(get_value(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers))
         if own is None or self.like is None:
             return None
         return own, self.dtype, self.like.device, self.batched, len(self.like)
 
-    def camera(self, numbers: Numbers, T: int, at: int, distortion: Tensor | None) -> Camera:
+    def camera(self, numbers: KeyOrNumbers, T: int, at: int, distortion: Tensor | None) -> Camera:
         """Camera of the frame at a place along time."""
         x = self.numbers(numbers, T, at)
         assert x is not None
@@ -234,7 +234,7 @@ class Leaves:
         """(B, T) whether a frame only pads the start or end of an episode: LeRobot's ``<key>_is_pad``."""
         assert self.like is not None
         name = f"{key}_is_pad"
-        if not has(self.sample, name):
+        if not has_key(self.sample, name):
             return torch.zeros(self.like.shape[0], T, dtype=torch.bool, device=self.like.device)
         x = self.get(name).bool().flatten(1)
         if x.shape[1] != T:
@@ -242,9 +242,9 @@ class Leaves:
         return x
 
 
-def _keys(sample: Mapping[str, Any], prefix: str = "") -> list[str]:
+def _list_keys(sample: Mapping[str, Any], prefix: str = "") -> list[str]:
     found: list[str] = []
     for key, value in sample.items():
         nested = isinstance(value, Mapping)
-        found += _keys(value, f"{prefix}{key}.") if nested else [f"{prefix}{key}"]
+        found += _list_keys(value, f"{prefix}{key}.") if nested else [f"{prefix}{key}"]
     return sorted(found)

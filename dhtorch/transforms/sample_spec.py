@@ -19,36 +19,36 @@ from torch import Tensor
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import pose_conventions as conventions
-from dhtorch.geometry.checks import is_transformed, surely_all
-from dhtorch.ops import loader as native
+from dhtorch.geometry.checks import all_known, is_transformed
+from dhtorch.ops import loader
 from dhtorch.pytree import stack
-from dhtorch.records import Camera, Frame, GivenPose
-from dhtorch.transforms import poses as given
-from dhtorch.transforms.sample_access import Leaves, Numbers, SampleError
+from dhtorch.records import Camera, Frame, PosePrior
+from dhtorch.transforms import poses
+from dhtorch.transforms.sample_access import KeyOrNumbers, SampleError, SampleReader
 
 #: Units per metre of the depths that have a name.
-UNITS = {"m": 1.0, "mm": 1000.0}
+SAMPLE_UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
 
 #: Pixels at most by which the median depth of a frame is judged.
-PROBES = 1024
+_MAX_PROBES = 1024
 
 #: Cameras that are kept; a recording has one, or one for each frame.
-CAMERAS = 64
+MAX_CACHED_CAMERAS = 64
 
 #: Relative distance from a limit beyond which single precision cannot change a verdict.
-_ROUNDING = 1e-5
+_ROUNDING_REL = 1e-5
 
 #: The shapes of the image and the depth map may differ by this share; a transposed map differs by far more.
-MAX_ASPECT = 0.1
+_MAX_ASPECT_MISMATCH = 0.1
 
 #: Options that may name a key.
-_KEYED = (
+_KEY_OPTIONS = (
     *("image", "depth", "confidence", "intrinsics", "distortion", "depth_intrinsics"),
     *("other_image", "other_intrinsics", "pose", "pose_cov", "other_pose"),
 )
 
 
-class Read(NamedTuple):
+class SampleViews(NamedTuple):
     """The views of B samples."""
 
     anchor: Frame
@@ -57,7 +57,7 @@ class Read(NamedTuple):
     bad: Tensor  # (B,) bool: values contradict what was stated
     sensed: Tensor  # (B,) bool: the anchor's map has a return
     complaints: tuple[tuple[Tensor, Tensor, str], ...]  # mask (B,), value (B,) and what to say about it
-    given: GivenPose | None = None  # the motion to the other view, where samples state it; leading dims as of other
+    given: PosePrior | None = None  # the motion to the other view, where samples state it; leading dims as of other
 
     def complaint(self) -> str:
         """What to say about the first bad sample."""
@@ -67,7 +67,7 @@ class Read(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Views:
+class SampleSpec:
     """Where in a sample the views are, and what their numbers mean.
 
     A key is looked up as it stands, else piece by piece (``observation.depth`` or ``observation/depth`` in nested
@@ -81,19 +81,21 @@ class Views:
     depth_unit: str | float = ""  # "m", "mm", or metres per unit; must be said
     image: str = "image"  # key of the anchor's image
     depth: str = "depth"  # key of the anchor's depth map
-    intrinsics: Numbers = "intrinsics"  # 3×3, or fx fy cx cy, px of the image
-    distortion: Numbers | None = None  # of the image, OpenCV's order
-    depth_intrinsics: Numbers | None = None  # px of the depth map; None = it covers the same field as the image
+    intrinsics: KeyOrNumbers = "intrinsics"  # 3×3, or fx fy cx cy, px of the image
+    distortion: KeyOrNumbers | None = None  # of the image, OpenCV's order
+    depth_intrinsics: KeyOrNumbers | None = None  # px of the depth map; None = it covers the same field as the image
     confidence: str | None = None  # key of the sensor's confidence: 0 low, 1 medium, 2 high
     other_image: str | None = None  # key of the other view's image; None = another frame along time
-    other_intrinsics: Numbers | None = None  # None = those of the anchor
+    other_intrinsics: KeyOrNumbers | None = None  # None = those of the anchor
     sparse: bool = False  # the depth map is a projected LiDAR sweep, mostly empty between returns
     at: int = -1  # the anchor's place along time
     other_at: int | Sequence[int] = 0  # the other view's; several are for a method of many views
-    pose: str | given.Matrix | None = None  # key of a pose from elsewhere, 4x4 or 3x4, NaN where it is not
+    pose: str | poses.PoseMatrix | None = None  # key of a pose from elsewhere, 4x4 or 3x4, NaN where it is not
     # known; or, with "1_from_0", the matrix itself: two cameras of a rig
     pose_kind: str = "world_from_cam"  # of each frame; or "1_from_0": maps points of the anchor into the other view
-    pose_cov: Numbers | None = None  # of each such pose: key of 6x6 (left perturbation, rad and m); or two standard
+    pose_cov: KeyOrNumbers | None = (
+        None  # of each such pose: key of 6x6 (left perturbation, rad and m); or two standard
+    )
     # deviations (rad, m) of the relative pose; None = not stated, the near returns then tell
     other_pose: str | None = None  # key of the other view's pose; None = another frame along time
     pose_axes: str = "cv"  # of the camera: x right, y down, z forward; "gl": x right, y up, z backward
@@ -109,25 +111,29 @@ class Views:
 
     def __post_init__(self) -> None:
         unit = self.depth_unit
-        if not (unit in UNITS or (isinstance(unit, float | int) and unit > 0)):
-            raise ValueError(f"depth_unit is {unit!r}, expected one of {sorted(UNITS)} or metres per unit")
+        if not (unit in SAMPLE_UNITS_PER_METRE or (isinstance(unit, float | int) and unit > 0)):
+            raise ValueError(
+                f"depth_unit is {unit!r}, expected one of {sorted(SAMPLE_UNITS_PER_METRE)} or metres per unit"
+            )
         if self.layout not in (None, "hwc", "chw"):
             raise ValueError(f"layout is {self.layout!r}, expected hwc, chw or None")
         self._check_pose()
         if self.other_image is not None and not isinstance(self.other_at, int):
             raise ValueError("other_at is a list, expected one number where other_image names the other view")
 
-    def read(self, sample: Mapping[str, Any], *, batched: bool = False, dtype: torch.dtype = torch.float32) -> Read:
+    def read(
+        self, sample: Mapping[str, Any], *, batched: bool = False, dtype: torch.dtype = torch.float32
+    ) -> SampleViews:
         """The views of a sample (B = 1) or of a collated batch.
 
         Raises:
             SampleError: a key is missing, or a shape or dtype is not what was stated. Values that contradict what was
                 stated are in ``bad``.
         """
-        leaves = Leaves(sample, batched, dtype)
+        leaves = SampleReader(sample, batched, dtype)
         images = leaves.images(self.image, self.layout)
         T, hw = images.shape[1], (images.shape[-2], images.shape[-1])
-        at = _place(self.at, T, self.image)
+        at = _frame_index(self.at, T, self.image)
         image = images[:, at]
         checks = _unit_range_checks(image, self.image)
         ready = self.in_metres in sample
@@ -139,10 +145,12 @@ class Views:
         conf = None if self.confidence is None else leaves.planes(self.confidence, T)
         if conf is not None:
             conf = conf[:, at if conf.shape[1] > 1 else 0]
-            checks.append(_is_level(conf, self.confidence))
+            checks.append(_confidence_check(conf, self.confidence))
             conf = conf.clamp(0, 2).to(torch.uint8).contiguous()
             if conf.shape != depth.shape:
-                raise SampleError(f"{self.confidence}: found {_size(conf)}, expected {_size(depth)} as {self.depth}")
+                raise SampleError(
+                    f"{self.confidence}: found {_format_hw(conf)}, expected {_format_hw(depth)} as {self.depth}"
+                )
         camera = self._camera(leaves, self.intrinsics, hw, T, at, checks)
         anchor = Frame(image, depth, camera, self._depth_camera(leaves, depth, hw, T, at), conf)
         if self.sparse:
@@ -152,7 +160,7 @@ class Views:
         if other is not None:  # tracking reads all pixels, the front end alone a few where they lie
             anchor = anchor.replace(image=anchor.image.contiguous())
         bad = torch.stack([c[0] for c in checks]).any(0) if checks else paired.new_zeros(len(depth))
-        return Read(anchor, other, paired, bad, sensed=sensed, complaints=tuple(checks), given=motion)
+        return SampleViews(anchor, other, paired, bad, sensed=sensed, complaints=tuple(checks), given=motion)
 
     @property
     def in_metres(self) -> str:
@@ -174,8 +182,8 @@ class Views:
             z = self._scaled(torch.stack(list(maps)) if len(maps) > 1 else maps[0][None])
         else:
             z = torch.empty(len(maps), *maps[0].shape, dtype=torch.float32, device=maps[0].device)
-            unit = UNITS[self.depth_unit] if isinstance(self.depth_unit, str) else 0.0
-            compiled = unit > 0 and native.serves(*words)
+            unit = SAMPLE_UNITS_PER_METRE[self.depth_unit] if isinstance(self.depth_unit, str) else 0.0
+            compiled = unit > 0 and loader.serves(*words)
             for into, read, x in zip(z, words, maps, strict=True):
                 if compiled:
                     torch.ops.dhtorch.metres.default(read, into, unit, x.dtype.is_signed)
@@ -186,27 +194,27 @@ class Views:
 
     def keys(self) -> tuple[str, ...]:
         """The keys of a sample that are read, but for those that say what only pads."""
-        said = (getattr(self, name) for name in _KEYED)
+        said = (getattr(self, name) for name in _KEY_OPTIONS)
         return tuple(dict.fromkeys(key for key in said if isinstance(key, str)))
 
     def image_hw(self, sample: Mapping[str, Any]) -> tuple[int, int] | None:
         """Size of the anchor's image, None where it cannot be read."""
         try:
-            images = Leaves(sample, batched=False, dtype=torch.float32).images(self.image, self.layout)
+            images = SampleReader(sample, batched=False, dtype=torch.float32).images(self.image, self.layout)
         except SampleError:
             return None
         return images.shape[-2], images.shape[-1]
 
     def _other(
-        self, leaves: Leaves, images: Tensor, depths: Tensor, anchor: Frame, checks: list[Any]
+        self, leaves: SampleReader, images: Tensor, depths: Tensor, anchor: Frame, checks: list[Any]
     ) -> tuple[Frame | None, Tensor]:
         T = images.shape[1]
-        at = _place(self.at, T, self.image)
+        at = _frame_index(self.at, T, self.image)
         key = self.image if self.other_image is None else self.other_image
         if self.other_image is not None:
             images = leaves.images(key, self.layout)
         wanted = [self.other_at] if isinstance(self.other_at, int) else self.other_at
-        places = [_place(p, images.shape[1], key) for p in wanted]
+        places = [_frame_index(p, images.shape[1], key) for p in wanted]
         pad = leaves.pad(key, images.shape[1])
         if self.other_image is None and set(places) == {at}:
             return None, pad.new_zeros(len(pad))
@@ -227,24 +235,24 @@ class Views:
             frames.append(Frame(image, depth, camera, anchor.depth_camera))
         return (frames[0] if isinstance(self.other_at, int) else stack(frames)), torch.stack(own).any(0)
 
-    def _motion(self, leaves: Leaves, T: int, checks: list[Any]) -> GivenPose | None:
+    def _motion(self, leaves: SampleReader, T: int, checks: list[Any]) -> PosePrior | None:
         """The motions to the other views that the samples state."""
         if self.pose is None:
             return None
         T_other = T if self.other_image is None else leaves.images(self.other_image, self.layout).shape[1]
         wanted = [self.other_at] if isinstance(self.other_at, int) else self.other_at
-        places = [_place(p, T_other, self.other_image or self.image) for p in wanted]
+        places = [_frame_index(p, T_other, self.other_image or self.image) for p in wanted]
         unit = self.pose_unit
-        found = given.motions(
+        found = poses.read_pose_priors(
             leaves,
-            (_place(self.at, T, self.image), places),
+            (_frame_index(self.at, T, self.image), places),
             (T, T_other),
             checks,
             keys=(self.pose, self.other_pose),
             cov=self.pose_cov,
             kind=self.pose_kind,
             axes=self.pose_axes,
-            unit=1 / UNITS[unit] if isinstance(unit, str) else unit,
+            unit=1 / SAMPLE_UNITS_PER_METRE[unit] if isinstance(unit, str) else unit,
             refine=self.refine,
         )
         return found[0] if isinstance(self.other_at, int) else found
@@ -255,18 +263,20 @@ class Views:
             options = {"pose_cov": self.pose_cov, "other_pose": self.other_pose, "refine": self.refine or None}
             if said := [name for name, value in options.items() if value is not None]:
                 raise ValueError(f"found {said[0]} without pose, expected the key of a pose")
-        if self.pose_kind not in given.KINDS:
-            raise ValueError(f"pose_kind is {self.pose_kind!r}, expected {' or '.join(given.KINDS)}")
-        if self.pose_axes not in conventions.STATED:
-            raise ValueError(f"pose_axes is {self.pose_axes!r}, expected {' or '.join(conventions.STATED)}")
-        if not (unit in UNITS or (isinstance(unit, float | int) and 0 < unit < float("inf"))):
-            raise ValueError(f"pose_unit is {unit!r}, expected one of {sorted(UNITS)} or metres per unit")
+        if self.pose_kind not in poses.POSE_KINDS:
+            raise ValueError(f"pose_kind is {self.pose_kind!r}, expected {' or '.join(poses.POSE_KINDS)}")
+        if self.pose_axes not in conventions.STATED_AXES:
+            raise ValueError(f"pose_axes is {self.pose_axes!r}, expected {' or '.join(conventions.STATED_AXES)}")
+        if not (unit in SAMPLE_UNITS_PER_METRE or (isinstance(unit, float | int) and 0 < unit < float("inf"))):
+            raise ValueError(
+                f"pose_unit is {unit!r}, expected one of {sorted(SAMPLE_UNITS_PER_METRE)} or metres per unit"
+            )
         if not isinstance(self.pose, str | None):
-            given.check_constant(self.pose, self.pose_kind)
+            poses.check_constant_pose(self.pose, self.pose_kind)
         between_two = self.other_image is not None and self.pose_kind == "world_from_cam"
         if self.pose is not None and between_two and self.other_pose is None:
             raise ValueError("found pose and other_image, expected other_pose: the other view's pose")
-        given.sigmas(self.pose_cov)
+        poses.parse_pose_sigmas(self.pose_cov)
 
     def _scaled(self, x: Tensor) -> Tensor:
         """Positive numbers in metres, 0 for all others."""
@@ -275,33 +285,33 @@ class Views:
         x = x.nan_to_num(0.0, 0.0, 0.0).relu()
         if not isinstance(self.depth_unit, str):
             return x * float(self.depth_unit)
-        return x if self.depth_unit == "m" else x / UNITS[self.depth_unit]
+        return x if self.depth_unit == "m" else x / SAMPLE_UNITS_PER_METRE[self.depth_unit]
 
     def _scale(self, x: Tensor, *, signed: bool) -> Tensor:
         """The same of whole numbers, in place."""
         # Every pass over a whole map costs as much as the front end: no more of them than the numbers ask for.
         x = x.relu_() if signed else x
         unit = self.depth_unit
-        return x.div_(UNITS[unit]) if isinstance(unit, str) else x.mul_(float(unit))
+        return x.div_(SAMPLE_UNITS_PER_METRE[unit]) if isinstance(unit, str) else x.mul_(float(unit))
 
     def _probed(self, depth: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor, str]]]:
         """Which maps (B,) have a return, and what speaks against the unit."""
         low, high = self.bounds()
-        if native.serves(depth):
+        if loader.serves(depth):
             counts = depth.new_empty(2, len(depth), dtype=torch.int64)
-            torch.ops.dhtorch.probe.default(depth, counts, step(depth), low, high)
-            if all_sound(counts):
+            torch.ops.dhtorch.probe.default(depth, counts, probe_stride(depth), low, high)
+            if all_medians_plausible(counts):
                 return torch.ones(len(depth), dtype=torch.bool), []
-        probes = _probes(depth.detach())
-        return any_return(depth, probes), self._depth_checks(probes, low, high)
+        probes = _probe_depth(depth.detach())
+        return _has_return(depth, probes), self._depth_checks(probes, low, high)
 
     def bounds(self) -> tuple[float, float]:
         """Between which a median return, m, surely speaks for the unit."""
-        return self.min_depth * (1 + _ROUNDING), self.max_depth * (1 - _ROUNDING)
+        return self.min_depth * (1 + _ROUNDING_REL), self.max_depth * (1 - _ROUNDING_REL)
 
     def _depth_checks(self, probes: Tensor, low: float, high: float) -> list[tuple[Tensor, Tensor, str]]:
         median = torch.where(probes > 0, probes, torch.nan).nanmedian(1).values
-        if _told_at_once(median) and all(low < m < high or math.isnan(m) for m in median.tolist()):
+        if _is_cheap_to_read(median) and all(low < m < high or math.isnan(m) for m in median.tolist()):
             return []
         said = f"{self.depth}: the median return is {{:.4g}} m with the unit {self.depth_unit!r}, expected"
         return [
@@ -310,7 +320,7 @@ class Views:
         ]
 
     def _camera(
-        self, leaves: Leaves, numbers: Numbers, hw: tuple[int, int], T: int, at: int, checks: list[Any]
+        self, leaves: SampleReader, numbers: KeyOrNumbers, hw: tuple[int, int], T: int, at: int, checks: list[Any]
     ) -> Camera:
         stated = None if self.distortion is not None else leaves.stated(numbers)
         known = (stated, hw, T, at)
@@ -320,7 +330,7 @@ class Views:
         if self.intrinsics_hw is not None and self.intrinsics_hw != hw:
             camera = cam.resize(camera, self.intrinsics_hw, hw)
         if self._fits_surely(camera, hw):
-            if stated is not None and len(self._cameras) < CAMERAS:
+            if stated is not None and len(self._cameras) < MAX_CACHED_CAMERAS:
                 self._cameras[known] = camera
             return camera
         name = numbers if isinstance(numbers, str) else "intrinsics"
@@ -336,16 +346,16 @@ class Views:
 
     def _fits_surely(self, camera: Camera, hw: tuple[int, int]) -> bool:
         """Whether no rounding can make the intrinsics suspect; for few numbers operations of torch are dear."""
-        if not (_told_at_once(camera.c) and camera.f.dtype == camera.c.dtype):
+        if not (_is_cheap_to_read(camera.c) and camera.f.dtype == camera.c.dtype):
             return False
         off = (abs((c + 0.5) / n - 0.5) for row in camera.c.tolist() for c, n in zip(row, (hw[1], hw[0]), strict=True))
-        return all(x < self.max_offset - _ROUNDING for x in off) and all(x > 0 for x in camera.f.flatten().tolist())
+        return all(x < self.max_offset - _ROUNDING_REL for x in off) and all(x > 0 for x in camera.f.flatten().tolist())
 
-    def _depth_camera(self, leaves: Leaves, depth: Tensor, hw: tuple[int, int], T: int, at: int) -> Camera | None:
+    def _depth_camera(self, leaves: SampleReader, depth: Tensor, hw: tuple[int, int], T: int, at: int) -> Camera | None:
         if self.depth_intrinsics is not None:
             return leaves.camera(self.depth_intrinsics, T, at, None)
         h, w = depth.shape[-2:]
-        if abs((h * hw[1]) / (w * hw[0]) - 1) > MAX_ASPECT:
+        if abs((h * hw[1]) / (w * hw[0]) - 1) > _MAX_ASPECT_MISMATCH:
             raise SampleError(
                 f"{self.depth}: found {h}x{w} (height x width), which is no scaled image of {hw[0]}x{hw[1]}; is it "
                 "transposed? A map with a field of its own needs depth_intrinsics"
@@ -353,29 +363,29 @@ class Views:
         return None
 
 
-def _probes(depth: Tensor) -> Tensor:
+def _probe_depth(depth: Tensor) -> Tensor:
     """Some of the numbers (B, k) of each map, evenly spread; far from each other, they are read once for all."""
-    return depth.flatten(1)[:, :: step(depth)].contiguous()
+    return depth.flatten(1)[:, :: probe_stride(depth)].contiguous()
 
 
-def step(depth: Tensor) -> int:
+def probe_stride(depth: Tensor) -> int:
     """From one of the numbers of maps (…, h, w) by which they are judged to the next."""
-    return max(1, depth.shape[-2] * depth.shape[-1] // PROBES)
+    return max(1, depth.shape[-2] * depth.shape[-1] // _MAX_PROBES)
 
 
-def all_sound(counts: Tensor) -> bool:
+def all_medians_plausible(counts: Tensor) -> bool:
     """Whether the median return of every map surely lies between both bounds; of how many of its numbers are returns,
     and how many of these do (2, B)."""
     return all(0 < some < 2 * sound for some, sound in zip(*counts.tolist(), strict=True))
 
 
-def any_return(depth: Tensor, probes: Tensor) -> Tensor:
+def _has_return(depth: Tensor, probes: Tensor) -> Tensor:
     """Whether maps (B, h, w) have a return, (B,) bool: a pass over all of them only where some numbers do not tell."""
     some = (probes > 0).any(1)
-    return some if depth.is_cpu and surely_all(some) else depth.amax((1, 2)) > 0
+    return some if depth.is_cpu and all_known(some) else depth.amax((1, 2)) > 0
 
 
-def _place(at: int, T: int, key: str) -> int:
+def _frame_index(at: int, T: int, key: str) -> int:
     """A place along time, counted from the end if negative; the only frame where there is no other."""
     if T == 1:
         return 0
@@ -384,7 +394,7 @@ def _place(at: int, T: int, key: str) -> int:
     return at % T
 
 
-def _told_at_once(x: Tensor) -> bool:
+def _is_cheap_to_read(x: Tensor) -> bool:
     """Whether numbers may be looked at without waiting for a device, and have the digits for it."""
     return x.device.type == "cpu" and x.dtype.itemsize >= 4 and not is_transformed()
 
@@ -398,11 +408,11 @@ def _unit_range_checks(image: Tensor, key: str) -> list[tuple[Tensor, Tensor, st
     return [(bad_low | bad_high, torch.where(bad_high, high, low), text)]
 
 
-def _is_level(conf: Tensor, key: str | None) -> tuple[Tensor, Tensor, str]:
+def _confidence_check(conf: Tensor, key: str | None) -> tuple[Tensor, Tensor, str]:
     high = conf.flatten(1).amax(1)
     text = f"{key}: found the value {{:.4g}}, expected 0 low, 1 medium, 2 high"
     return ~(high <= 2) | (conf != conf.floor()).flatten(1).any(1), high, text
 
 
-def _size(x: Tensor) -> str:
+def _format_hw(x: Tensor) -> str:
     return f"{x.shape[-2]}x{x.shape[-1]}"

@@ -22,19 +22,19 @@ class SampleProblem:
 
 
 #: Workers that are counted apart; more share a row, and may then lose counts.
-_ROWS = 128
+_MAX_COUNT_ROWS = 128
 
 
-class Tally:
+class ProblemCounts:
     """Counts by problem, in memory that forked and spawned workers share, each writing to a row of its own."""
 
     def __init__(self) -> None:
-        self.counts = _shared(torch.zeros(_ROWS, len(names(SampleProblem)), dtype=torch.int64))
+        self.counts = _share_memory(torch.zeros(_MAX_COUNT_ROWS, len(names(SampleProblem)), dtype=torch.int64))
 
     def add(self, problem: Tensor) -> None:
         """Count the codes of some samples."""
         worker = get_worker_info()
-        row = 0 if worker is None else 1 + worker.id % (_ROWS - 1)
+        row = 0 if worker is None else 1 + worker.id % (_MAX_COUNT_ROWS - 1)
         counts = self.counts[row].numpy()  # of which torch would make several operations for each sample
         for code in problem.tolist():
             counts[code] += 1
@@ -44,11 +44,11 @@ class Tally:
         total = self.counts.sum(0).tolist()
         return {name.lower(): total[code] for code, name in names(SampleProblem).items()}
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> Tally:
+    def __deepcopy__(self, memo: dict[int, Any]) -> ProblemCounts:
         twin = copy.copy(self)
-        twin.counts = _shared(self.counts.clone())
+        twin.counts = _share_memory(self.counts.clone())
         return twin
 
 
-def _shared(counts: Tensor) -> Tensor:
+def _share_memory(counts: Tensor) -> Tensor:
     return counts.share_memory_()

@@ -10,23 +10,23 @@ from torch import Tensor
 
 from dhtorch.codes import Hole, Source, names
 from dhtorch.geometry.checks import check
-from dhtorch.ops import loader as native
-from dhtorch.records import Map
+from dhtorch.ops import loader
+from dhtorch.records import MergedDepth
 
 #: What the numbers of a token are: 1/m, 1/m, then shares of the patch's samples in [0, 1].
-CHANNELS = ("inverse_depth", "sigma", "answered", *(f"hole_{name.lower()}" for name in names(Hole).values()))
+TOKEN_CHANNELS = ("inverse_depth", "sigma", "answered", *(f"hole_{name.lower()}" for name in names(Hole).values()))
 
 #: How many classes of holes there are; their codes count from 0.
-_CLASSES = len(names(Hole))
+_N_HOLE_CLASSES = len(names(Hole))
 
 #: Types of uv, depth, sigma, source and hole that compiled code takes.
-_COMPILED = (*[torch.float32] * 3, *[torch.int32] * 2)
+_NATIVE_DTYPES = (*[torch.float32] * 3, *[torch.int32] * 2)
 
 #: How a picture is brought to the network's size: stretched, shrunk whole with bars, or cut to fill.
-FITS = ("stretch", "pad", "crop")
+FIT_MODES = ("stretch", "pad", "crop")
 
 
-def grid(hw: tuple[int, int], *, patch: int = 14, tokens_hw: tuple[int, int] | None = None) -> tuple[int, int]:
+def token_grid(hw: tuple[int, int], *, patch: int = 14, tokens_hw: tuple[int, int] | None = None) -> tuple[int, int]:
     """Rows and columns of the patches of a picture of size ``hw``, seen by the network at ``tokens_hw``.
 
     Raises:
@@ -39,7 +39,7 @@ def grid(hw: tuple[int, int], *, patch: int = 14, tokens_hw: tuple[int, int] | N
 
 
 def patch_tokens(
-    found: Map,
+    found: MergedDepth,
     hole: Tensor,  # (B, N) codes.Hole
     hw: tuple[int, int],
     *,
@@ -62,7 +62,7 @@ def patch_tokens(
         patch: side of a patch, px of the network's picture.
         tokens_hw: size of the network's picture; None = ``hw``. What is left of a size that is no multiple of the
             patch, on the right and below, is dropped, as the network's convolution drops it.
-        fit: how the picture is brought to that size, one of :data:`FITS`.
+        fit: how the picture is brought to that size, one of :data:`FIT_MODES`.
 
     Raises:
         ValueError: wrong shapes, an unknown fit, or no patch.
@@ -71,15 +71,15 @@ def patch_tokens(
     """
     check("patch_tokens", uv=(found.uv, "B N 2"), depth=(found.depth, "B N"), hole=(hole, "B N"))
     check("patch_tokens", depth=(found.depth, "B N"), sigma=(found.sigma, "B N"), source=(found.source, "B N"))
-    rows, columns = grid(hw, patch=patch, tokens_hw=tokens_hw)
+    rows, columns = token_grid(hw, patch=patch, tokens_hw=tokens_hw)
     scale, margin = _placement(hw, tokens_hw or hw, fit)
     given = found.uv.contiguous(), found.depth, found.sigma, found.source, hole
-    if native.serves(*given) and tuple(x.dtype for x in given) == _COMPILED:
-        tokens = hole.new_empty(*hole.shape[:1], rows * columns, len(CHANNELS), dtype=torch.float32)
+    if loader.serves(*given) and tuple(x.dtype for x in given) == _NATIVE_DTYPES:
+        tokens = hole.new_empty(*hole.shape[:1], rows * columns, len(TOKEN_CHANNELS), dtype=torch.float32)
         known = torch.empty_like(tokens[..., 0], dtype=torch.bool)
         torch.ops.dhtorch.patch_tokens(*given, tokens, known, patch, rows, columns, *scale, *margin)
         return tokens, known
-    cell = _cells(found.uv, scale, margin, patch=patch, rows=rows, columns=columns)
+    cell = _patch_index(found.uv, scale, margin, patch=patch, rows=rows, columns=columns)
 
     def total(x: Tensor) -> Tensor:  # (B, N, k) → (B, P + 1, k), the last of what lies in no patch
         zero = torch.zeros(x.shape[0], rows * columns + 1, x.shape[2], dtype=torch.float64, device=x.device)
@@ -88,7 +88,7 @@ def patch_tokens(
     answered = (found.source != Source.NONE) & (found.depth > 0)
     inverse = torch.where(answered, found.depth, torch.inf).double().reciprocal()
     noise = torch.where(answered, found.sigma, 0.0).double() * inverse * inverse
-    is_class = hole[..., None] == torch.arange(_CLASSES, dtype=hole.dtype, device=hole.device)
+    is_class = hole[..., None] == torch.arange(_N_HOLE_CLASSES, dtype=hole.dtype, device=hole.device)
     sums = total(
         torch.cat((torch.ones_like(inverse)[..., None], inverse[..., None], answered[..., None], is_class), -1)
     )
@@ -104,8 +104,8 @@ def patch_tokens(
 
 def _placement(hw: tuple[int, int], tokens_hw: tuple[int, int], fit: str) -> tuple[list[float], list[float]]:
     """Scale and margin along x and y by which (uv + ½) lies in the network's picture."""
-    if fit not in FITS:
-        raise ValueError(f"tokens: fit is {fit!r}, expected one of {', '.join(FITS)}")
+    if fit not in FIT_MODES:
+        raise ValueError(f"tokens: fit is {fit!r}, expected one of {', '.join(FIT_MODES)}")
     scale = [tokens_hw[1] / hw[1], tokens_hw[0] / hw[0]]
     if fit != "stretch":
         scale = [min(scale) if fit == "pad" else max(scale)] * 2
@@ -113,7 +113,7 @@ def _placement(hw: tuple[int, int], tokens_hw: tuple[int, int], fit: str) -> tup
     return scale, margin
 
 
-def _cells(uv: Tensor, scale: list[float], margin: list[float], *, patch: int, rows: int, columns: int) -> Tensor:
+def _patch_index(uv: Tensor, scale: list[float], margin: list[float], *, patch: int, rows: int, columns: int) -> Tensor:
     """(B, N) index of the patch each sample lies in; rows · columns where it lies in none."""
     place = uv.detach().double() + 0.5
     place = place * (scale[0] if scale[0] == scale[1] else place.new_tensor(scale))

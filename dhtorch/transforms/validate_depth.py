@@ -10,18 +10,18 @@ from torch import Tensor
 
 from dhtorch.codes import State
 from dhtorch.pipeline.method import Method
-from dhtorch.pipeline.presets import chosen
+from dhtorch.pipeline.presets import get_method
 from dhtorch.pytree import stack
-from dhtorch.records import NO_HINT, Frame, TrackHint, Verdict
-from dhtorch.transforms.sample_access import Leaves, SampleError, check_sample
-from dhtorch.transforms.sample_spec import Views
-from dhtorch.validation.validate import judge
+from dhtorch.records import NO_HINT, DepthValidation, Frame, TrackHint
+from dhtorch.transforms.sample_access import SampleError, SampleReader, check_sample
+from dhtorch.transforms.sample_spec import SampleSpec
+from dhtorch.validation.validate import validate_depth
 
 #: Numbers of a frame that are added with their interval: value, low, high.
-NUMBERS = ("scale", "shift", "tilt", "wrong")
+_INTERVAL_KEYS = ("scale", "shift", "tilt", "wrong")
 
 
-class JudgeDepth(torch.nn.Module):
+class ValidateDepth(torch.nn.Module):
     """Add to each sample whether a depth map of it is right: states and evidence of every pixel, and of the whole.
 
     A new dict is returned, other keys untouched. Shapes are fixed by ``size`` and the size of the image, every number
@@ -32,13 +32,14 @@ class JudgeDepth(torch.nn.Module):
         map_unit: metres a step of the map.
         method: a name (:data:`dhtorch.pipeline.presets.METHODS`) or a :class:`dhtorch.pipeline.method.Method`.
         n: samples per image; None = the method's own number.
-        judging: options of :func:`dhtorch.validation.validate.judge`: ``views``, ``partners``, ``size``, ``tolerance``.
+        judging: options of :func:`dhtorch.validation.validate.validate_depth`: ``views``, ``partners``, ``size``,
+            ``tolerance``.
         hint: what is known of the motion between the views, for the tracker.
         seed: of the pose search.
         batched: samples are collated batches; None = single ones, and what shows a batch is refused.
         prefix: of the keys that are added.
         **views: where the images, the depth and the intrinsics are, and their units: see
-            :class:`dhtorch.transforms.Views`. ``depth_unit`` must be given.
+            :class:`dhtorch.transforms.SampleSpec`. ``depth_unit`` must be given.
 
     Returns:
         The sample and, behind the prefix (with B in front of a batch): ``state`` (h, w) of
@@ -52,7 +53,7 @@ class JudgeDepth(torch.nn.Module):
         SampleError: a bad sample.
 
     Gradient: none.
-    Cost: as :func:`dhtorch.validation.validate.judge`.
+    Cost: as :func:`dhtorch.validation.validate.validate_depth`.
     """
 
     def __init__(
@@ -70,13 +71,13 @@ class JudgeDepth(torch.nn.Module):
         **views: Any,
     ) -> None:
         super().__init__()
-        method = chosen(method, n)
+        method = get_method(method, n)
         known = ("views", "partners", "size", "tolerance")
         if unknown := [name for name in judging or {} if name not in known]:
             raise ValueError(f"judging: found {', '.join(unknown)}, expected some of {', '.join(known)}")
         if not map_unit > 0:
             raise ValueError(f"map_unit is {map_unit!r}, expected a positive number of metres")
-        self.views = Views(**views)
+        self.views = SampleSpec(**views)
         self.method, self.map, self.map_unit, self.judging = method, map, map_unit, dict(judging or {})
         self.hint, self.seed, self.batched, self.prefix = hint, seed, bool(batched), prefix
         self._stated = batched
@@ -94,22 +95,22 @@ class JudgeDepth(torch.nn.Module):
                 seen = self._judged(depth, read.anchor, read.other)
                 rows = torch.arange(len(read.paired), device=read.paired.device)
                 verdict = stack([verdict, seen])[read.paired.long(), rows]
-        added = _as_keys(verdict)
+        added = _validation_keys(verdict)
         return {**sample, **{self.prefix + key: x if self.batched else x[0].contiguous() for key, x in added.items()}}
 
-    def _judged(self, depth: Tensor | None, anchor: Frame, others: Frame | None) -> Verdict:
-        return judge(depth, anchor, others, method=self.method, seed=self.seed, hint=self.hint, **self.judging)
+    def _judged(self, depth: Tensor | None, anchor: Frame, others: Frame | None) -> DepthValidation:
+        return validate_depth(depth, anchor, others, method=self.method, seed=self.seed, hint=self.hint, **self.judging)
 
     def _map(self, sample: Mapping[str, Any], anchor: Frame) -> Tensor | None:
         if self.map is None:
             return None
-        leaves = Leaves(sample, batched=self.batched, dtype=anchor.camera.f.dtype)
+        leaves = SampleReader(sample, batched=self.batched, dtype=anchor.camera.f.dtype)
         leaves.like = anchor.image
         planes = leaves.planes(self.map, 1).to(anchor.camera.f)
         return planes[:, 0] * self.map_unit
 
 
-def _as_keys(verdict: Verdict) -> dict[str, Tensor]:
+def _validation_keys(verdict: DepthValidation) -> dict[str, Tensor]:
     there = verdict.depth > 0
     n = there.sum((1, 2)).clamp_min(1)
     states = (State.CANNOT_KNOW, State.CONSISTENT, State.WRONG)
@@ -119,7 +120,7 @@ def _as_keys(verdict: Verdict) -> dict[str, Tensor]:
         "evidence": verdict.evidence.nan_to_num(0.0, 0.0, 0.0),
         "state_share": torch.stack(shares, -1).to(verdict.depth),
     }
-    for name in NUMBERS:
+    for name in _INTERVAL_KEYS:
         value = getattr(verdict, name)
         added |= {name: value.nan_to_num(0.0, 0.0, 0.0), f"{name}_known": value.isfinite().all(-1)}
     return added | {"ceiling": verdict.ceiling.nan_to_num(0.0), "ceiling_known": verdict.ceiling.isfinite()}

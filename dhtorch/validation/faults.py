@@ -21,21 +21,21 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.codes import Flag
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.coarse_flow import coarse_flow
-from dhtorch.geometry.patches import magnified, nearest
+from dhtorch.geometry.patches import rescale_field_of_view, sample_nearest
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.method import Method
-from dhtorch.pipeline.pair import Clock, under_pose
+from dhtorch.pipeline.pair import StageTimer, solve_pose_and_triangulate
 from dhtorch.records import Frame, Pose, Samples, Tracks
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.track import lucas_kanade
 
 #: How pairs of a window are tracked and placed.
-TRACKING = Method(
+TRACKING_METHOD = Method(
     n=384,
     hypotheses=100,
     track=partial(lucas_kanade, levels=5, window=21, normalise="bias", start=coarse_flow),
@@ -43,32 +43,35 @@ TRACKING = Method(
 )
 
 #: Miss at which the loss of a sample is a half, px of a picture 640 wide.
-HALF_PX = 2.0
+HALF_LOSS_PX = 2.0
 
 #: Loss that an explanation must save over none, its standard errors over the pairs, and what it must save over the best
 #: of another kind.
-SAVES, ERRORS, BEYOND = 0.04, 3.0, 0.015
+MIN_LOSS_SAVED, MIN_STANDARD_ERRORS, MIN_MARGIN_OVER_OTHERS = 0.04, 3.0, 0.015
 
 #: Share of what a map misses beyond what the sensor's near returns miss that its cause must explain.
-EXPLAINED = 0.75
+MIN_EXPLAINED_RATIO = 0.75
 
 #: Without motions: ratio of a map to a near return at which the loss is a half, and the longer side of the grid of
 #: returns.
-HALF_RATIO, GRID = 1.1, 64
+HALF_LOSS_RATIO, RETURN_GRID_SIDE = 1.1, 64
 
 #: Way of a camera that stands still at most, as a share of the median return.
-STILL = 0.005
+STATIC_BASELINE_RATIO = 0.005
 
 #: Frames that a depth may be early or late at most, and the factors on the focal length that are tried.
-LAG = 5
-FOCALS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
+MAX_LAG_FRAMES = 5
+FOCAL_FACTORS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
 
 #: Fields of view of a depth over that of the picture it should be laid over, and by which share of the width it may lie
 #: beside its place.
-FIELDS, BESIDE = (0.55, 0.62, 0.7, 0.78, 0.87, 1.15, 1.28, 1.43, 1.6, 1.8), (-0.08, -0.04, 0.04, 0.08)
+FIELD_OF_VIEW_RATIOS, SIDEWAYS_SHIFTS = (
+    (0.55, 0.62, 0.7, 0.78, 0.87, 1.15, 1.28, 1.43, 1.6, 1.8),
+    (-0.08, -0.04, 0.04, 0.08),
+)
 
 #: Factors that take a depth in another unit to metres; 1/256 m and 1/5000 m are the steps of KITTI's and TUM's files.
-UNITS = {
+UNIT_FACTORS = {
     "mm read as m": 1e-3,
     "m read as mm": 1e3,
     "inch read as m": 0.0254,
@@ -86,15 +89,15 @@ UNITS = {
 }
 
 #: Factor by which a unit may fail to bring a map to its near returns, else it is not tried.
-NEAR_UNIT = 2.0
+MAX_UNIT_MISFIT = 2.0
 
 #: Pairs of a window, fewest that may name a cause, frames from one of a pair to the other, the widest first in which
 #: such a share of the textured samples is found again.
-PAIRS, FEWEST, GAPS, FOUND = 8, 4, (8, 4, 2, 1), 0.4
+MAX_WINDOW_PAIRS, MIN_WINDOW_PAIRS, PAIR_GAPS, MIN_TRACKED_RATIO = 8, 4, (8, 4, 2, 1), 0.4
 
 
 @dataclass(frozen=True)
-class Cause:
+class KnownFault:
     """A fault that maps of a recording may share, and how it is undone."""
 
     kind: str  # unit | mirrored | rolled | registration | along the ray | inverse | time offset | focal length
@@ -106,7 +109,7 @@ class Cause:
     scaled: bool = False  # what was undone is known up to a scale, which near returns tell
 
 
-def turned(depth: Tensor, quarters: int) -> Tensor:
+def rot90_map(depth: Tensor, quarters: int) -> Tensor:
     """A map (…, h, w) rolled counter-clockwise by quarter turns and stretched to its old size (nearest pixels)."""
     rolled = torch.rot90(depth, quarters, (-2, -1))
     if rolled.shape == depth.shape:
@@ -117,7 +120,7 @@ def turned(depth: Tensor, quarters: int) -> Tensor:
 
 def _seen_over(field: float) -> str:
     """The field in words; beyond the last one that is tried, nobody has looked."""
-    bound = {FIELDS[0]: "at most ", FIELDS[-1]: "at least "}.get(field, "")
+    bound = {FIELD_OF_VIEW_RATIOS[0]: "at most ", FIELD_OF_VIEW_RATIOS[-1]: "at least "}.get(field, "")
     return f"not registered: seen over {bound}{field:.2f} of the picture's field"
 
 
@@ -129,10 +132,10 @@ def ray_lengths(camera: cam.Camera, hw: tuple[int, int]) -> Tensor:
         return cam.rays(camera, uv).norm(dim=-1).unflatten(1, hw)
 
 
-def _may_be(cause: Cause, ratio: float) -> bool:
+def _is_possible(cause: KnownFault, ratio: float) -> bool:
     """Whether it can be a cause where near returns stand at so many times what the maps say; 0 = not known."""
-    factor = UNITS.get(cause.name)
-    return factor is None or ratio == 0 or abs(math.log(ratio / factor)) < math.log(NEAR_UNIT)
+    factor = UNIT_FACTORS.get(cause.name)
+    return factor is None or ratio == 0 or abs(math.log(ratio / factor)) < math.log(MAX_UNIT_MISFIT)
 
 
 def _mirrored(depth: Tensor, axis: int) -> Tensor:
@@ -148,33 +151,39 @@ def _times(depth: Tensor, factor: float) -> Tensor:
 
 
 #: Hypotheses: nothing first, then what is undone.
-NONE = Cause("none", "none")
-CAUSES: tuple[Cause, ...] = (
-    *(Cause("unit", name, partial(_times, factor=factor)) for name, factor in UNITS.items()),
-    Cause("mirrored", "mirrored left to right", partial(_mirrored, axis=-1)),
-    Cause("mirrored", "mirrored upside down", partial(_mirrored, axis=-2)),
-    Cause("along the ray", "distance along the ray, not depth", ray=True),
-    Cause("inverse", "inverse depth or disparity, not depth", _inverse, scaled=True),
-    *(Cause("rolled", f"rolled by {90 * k} degrees", partial(turned, quarters=4 - k)) for k in (1, 2, 3)),
-    *(Cause("registration", _seen_over(field), partial(magnified, factor=field)) for field in FIELDS),
+NO_FAULT = KnownFault("none", "none")
+KNOWN_FAULTS: tuple[KnownFault, ...] = (
+    *(KnownFault("unit", name, partial(_times, factor=factor)) for name, factor in UNIT_FACTORS.items()),
+    KnownFault("mirrored", "mirrored left to right", partial(_mirrored, axis=-1)),
+    KnownFault("mirrored", "mirrored upside down", partial(_mirrored, axis=-2)),
+    KnownFault("along the ray", "distance along the ray, not depth", ray=True),
+    KnownFault("inverse", "inverse depth or disparity, not depth", _inverse, scaled=True),
+    *(KnownFault("rolled", f"rolled by {90 * k} degrees", partial(rot90_map, quarters=4 - k)) for k in (1, 2, 3)),
     *(
-        Cause(
+        KnownFault("registration", _seen_over(field), partial(rescale_field_of_view, factor=field))
+        for field in FIELD_OF_VIEW_RATIOS
+    ),
+    *(
+        KnownFault(
             "registration",
             f"not registered: {abs(x):.0%} of the width too far {'right' if x > 0 else 'left'}",
-            partial(magnified, factor=1.0, right=x),
+            partial(rescale_field_of_view, factor=1.0, right=x),
         )
-        for x in BESIDE
+        for x in SIDEWAYS_SHIFTS
     ),
     *(
-        Cause("time offset", f"{abs(k)} frames {'late' if k > 0 else 'early'}", lag=k)
-        for k in range(-LAG, LAG + 1)
+        KnownFault("time offset", f"{abs(k)} frames {'late' if k > 0 else 'early'}", lag=k)
+        for k in range(-MAX_LAG_FRAMES, MAX_LAG_FRAMES + 1)
         if k
     ),
-    *(Cause("focal length", f"focal length {1 / factor:.2f} of the true one", focal=factor) for factor in FOCALS),
+    *(
+        KnownFault("focal length", f"focal length {1 / factor:.2f} of the true one", focal=factor)
+        for factor in FOCAL_FACTORS
+    ),
 )
 
 
-class Named(NamedTuple):
+class Diagnosis(NamedTuple):
     """What was found out about a window of frames."""
 
     cause: str | None  # name; None = nothing explains better than no fault, or it cannot be known
@@ -185,14 +194,14 @@ class Named(NamedTuple):
     by: str = "tracks"  # what told: tracks | returns (then n_pairs counts frames)
 
 
-def name_cause(
+def diagnose(
     frames: Sequence[Frame],
     maps: Sequence[Tensor] | None = None,
     *,
-    method: Method = TRACKING,
+    method: Method = TRACKING_METHOD,
     seed: int = 0,
-    watched: Watched | None = None,
-) -> Named:
+    watched: WindowTracks | None = None,
+) -> Diagnosis:
     """The known fault that the maps of a window of frames share, if one explains the pictures clearly best.
 
     Args:
@@ -201,7 +210,7 @@ def name_cause(
             returns give; None = the sensor's own depth, whose hypotheses each give motions of their own.
         method: how pairs are tracked and placed; its seats 1 to 5 count.
         seed: of the pose search.
-        watched: what :func:`watch` found in the same pictures; None = it is asked.
+        watched: what :func:`track_window` found in the same pictures; None = it is asked.
 
     Where all frames carry a pose of their own (``T_world_from_cam``) misses under that motion count half, so that a
     unit or a focal length, which motions fitted to the same depth swallow, shows. Without, a unit of the sensor's own
@@ -218,25 +227,25 @@ def name_cause(
         found = "none" if maps is None else len(maps)
         raise ValueError(f"name_cause: found {len(frames)} frames and {found} maps, expected two or more, as many maps")
     with torch.no_grad():
-        named = _by_tracks(frames, maps, method, seed, watch(frames, method) if watched is None else watched)
-        moves = named.n_pairs >= FEWEST and not _stands(frames)
+        named = _by_tracks(frames, maps, method, seed, track_window(frames, method) if watched is None else watched)
+        moves = named.n_pairs >= MIN_WINDOW_PAIRS and not _stands(frames)
         if maps is None or named.cause is not None or moves:
             return named
         told = _by_returns(frames, maps, method)
-        return told if told.n_pairs >= FEWEST else named
+        return told if told.n_pairs >= MIN_WINDOW_PAIRS else named
 
 
 def _by_tracks(
-    frames: Sequence[Frame], maps: Sequence[Tensor] | None, method: Method, seed: int, watched: Watched
-) -> Named:
+    frames: Sequence[Frame], maps: Sequence[Tensor] | None, method: Method, seed: int, watched: WindowTracks
+) -> Diagnosis:
     """What the motion of points between pictures names."""
     if not watched.pairs:
-        return Named(None, None, {}, 0)
-    window = Window(
-        anchors=tree.collate([frames[i] for i, _ in watched.pairs]),
-        others=tree.collate([frames[j] for _, j in watched.pairs]),
-        samples=tree.collate(watched.samples),
-        tracks=tree.collate(watched.tracks),
+        return Diagnosis(None, None, {}, 0)
+    window = FaultWindow(
+        anchors=pytree.collate([frames[i] for i, _ in watched.pairs]),
+        others=pytree.collate([frames[j] for _, j in watched.pairs]),
+        samples=pytree.collate(watched.samples),
+        tracks=pytree.collate(watched.tracks),
         maps=maps,
         depths=[frame.depth for frame in frames],
         pairs=watched.pairs,
@@ -244,7 +253,7 @@ def _by_tracks(
         seed=seed,
     )
     asked = {cause.name: cause for cause in window.hypotheses()}
-    named = decided({name: window.loss(cause) for name, cause in asked.items()})._replace(pairs=watched.pairs)
+    named = select_cause({name: window.loss(cause) for name, cause in asked.items()})._replace(pairs=watched.pairs)
     if named.cause is None or window.explains(asked[named.cause]):
         return named
     return named._replace(cause=None, kind=None)
@@ -258,68 +267,74 @@ def _stands(frames: Sequence[Frame]) -> bool:
         return False
     way = (torch.cat(at) - at[0]).norm(dim=-1).max()
     returns = torch.cat([frame.depth[frame.depth > 0] for frame in frames])
-    return len(returns) > 0 and bool(way < STILL * returns.median())
+    return len(returns) > 0 and bool(way < STATIC_BASELINE_RATIO * returns.median())
 
 
-def _by_returns(frames: Sequence[Frame], maps: Sequence[Tensor], method: Method) -> Named:
+def _by_returns(frames: Sequence[Frame], maps: Sequence[Tensor], method: Method) -> Diagnosis:
     """What near returns name where no motion is known; a frame is one witness here as a pair is elsewhere."""
-    places = sorted({round((len(frames) - 1) * k / (PAIRS - 1)) for k in range(PAIRS)})
+    places = sorted({round((len(frames) - 1) * k / (MAX_WINDOW_PAIRS - 1)) for k in range(MAX_WINDOW_PAIRS)})
     told = {i: _returns(frames[i], method) for i in places}
     # Those of one place in the picture know no focal length.
-    asked = [NONE, *(cause for cause in CAUSES if cause.kind != "focal length")]
+    asked = [NO_FAULT, *(cause for cause in KNOWN_FAULTS if cause.kind != "focal length")]
     losses = {}
     for cause in asked:
         held = [
-            _off(told[i], maps[i + cause.lag], cause, frames[i]) if 0 <= i + cause.lag < len(maps) else None
+            _return_loss(told[i], maps[i + cause.lag], cause, frames[i]) if 0 <= i + cause.lag < len(maps) else None
             for i in places
         ]
         losses[cause.name] = torch.stack([torch.tensor(torch.nan) if x is None else x for x in held])
-    named = decided(losses)._replace(by="returns")
+    named = select_cause(losses)._replace(by="returns")
     if named.cause is None:
         return named
-    before, after = losses[NONE.name], losses[named.cause]
+    before, after = losses[NO_FAULT.name], losses[named.cause]
     known = before.isfinite() & after.isfinite()
-    explained = (before - after)[known].mean() >= EXPLAINED * before[known].mean()
+    explained = (before - after)[known].mean() >= MIN_EXPLAINED_RATIO * before[known].mean()
     return named if bool(explained) else named._replace(cause=None, kind=None)
 
 
 def _returns(frame: Frame, method: Method) -> tuple[Tensor, Tensor]:
     """Places (1, N, 2) px of a grid over a picture, and the near return (1, N) m there, 0 without one or at an edge."""
     straight = frame if frame.depth_camera is not None else frame.replace(camera=cam.ideal(frame.camera))
-    found = method.backproject(straight, dense.pixels(frame, dense.map_hw(frame.hw, GRID)))
+    found = method.backproject(straight, dense.map_pixel_centres(frame, dense.map_hw(frame.hw, RETURN_GRID_SIDE)))
     fine = found.usable & ((found.flag & (Flag.DEPTH_EDGE | Flag.SPECULAR)) == 0)
     return found.uv, torch.where(fine, found.depth, 0.0)
 
 
-def _off(told: tuple[Tensor, Tensor], depth: Tensor, cause: Cause, frame: Frame) -> Tensor:
+def _return_loss(told: tuple[Tensor, Tensor], depth: Tensor, cause: KnownFault, frame: Frame) -> Tensor:
     """Mean loss of a map (1, h, w) with a fault undone at near returns; NaN where it meets too few."""
     uv, returned = told
     depth = _undone(depth.to(returned), cause, frame.replace(depth_camera=None))
     at = _said(depth, uv, frame.hw)
     at = at * _ratio(returned, at) if cause.scaled else at
     both = (returned > 0) & (at > 0)
-    miss = torch.where(both, at / torch.where(both, returned, 1.0), 1.0).log() / math.log(HALF_RATIO)
+    miss = torch.where(both, at / torch.where(both, returned, 1.0), 1.0).log() / math.log(HALF_LOSS_RATIO)
     return _mean_over(miss.square() / (miss.square() + 1), both)[0].cpu()
 
 
-def decided(losses: Mapping[str, Tensor]) -> Named:
+def select_cause(losses: Mapping[str, Tensor]) -> Diagnosis:
     """What is named by losses (P,) of the pairs under each hypothesis, NaN where a pair cannot tell. Gradient: none."""
-    kinds = {cause.name: cause.kind for cause in (NONE, *CAUSES)}
-    base = losses[NONE.name]
+    kinds = {cause.name: cause.kind for cause in (NO_FAULT, *KNOWN_FAULTS)}
+    base = losses[NO_FAULT.name]
     able = base.isfinite()
     mean = {name: float(loss[able & loss.isfinite()].mean()) for name, loss in losses.items()}
-    nothing = Named(None, None, {name: value for name, value in mean.items() if math.isfinite(value)}, int(able.sum()))
+    nothing = Diagnosis(
+        None, None, {name: value for name, value in mean.items() if math.isfinite(value)}, int(able.sum())
+    )
     saved = {
-        name: (base - loss)[base.isfinite() & loss.isfinite()] for name, loss in losses.items() if name != NONE.name
+        name: (base - loss)[base.isfinite() & loss.isfinite()] for name, loss in losses.items() if name != NO_FAULT.name
     }
-    saved = {name: each for name, each in saved.items() if len(each) >= FEWEST}
+    saved = {name: each for name, each in saved.items() if len(each) >= MIN_WINDOW_PAIRS}
     if not saved:
         return nothing
     best = max(saved, key=lambda name: float(saved[name].mean()))
     error = float(saved[best].std() / len(saved[best]) ** 0.5)
     beyond = [_mean_of_both(losses[name] - losses[best]) for name in saved if kinds[name] != kinds[best]]
-    clear = float(saved[best].mean()) > max(SAVES, ERRORS * error)
-    return nothing._replace(cause=best, kind=kinds[best]) if clear and all(x > BEYOND for x in beyond) else nothing
+    clear = float(saved[best].mean()) > max(MIN_LOSS_SAVED, MIN_STANDARD_ERRORS * error)
+    return (
+        nothing._replace(cause=best, kind=kinds[best])
+        if clear and all(x > MIN_MARGIN_OVER_OTHERS for x in beyond)
+        else nothing
+    )
 
 
 def _mean_of_both(more: Tensor) -> float:
@@ -328,7 +343,7 @@ def _mean_of_both(more: Tensor) -> float:
     return float(known.mean()) if len(known) else math.inf
 
 
-class Watched(NamedTuple):
+class WindowTracks(NamedTuple):
     """Pairs of a window, and the samples of each first picture with where the second shows them."""
 
     pairs: Sequence[tuple[int, int]]
@@ -337,7 +352,7 @@ class Watched(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class FaultWindow:
     """Pairs of a window, tracked: what stays the same whatever the depth."""
 
     anchors: Frame  # (P, …)
@@ -350,14 +365,14 @@ class Window:
     method: Method
     seed: int
 
-    def hypotheses(self) -> Sequence[Cause]:
+    def hypotheses(self) -> Sequence[KnownFault]:
         """What could be known: a motion fitted to near returns swallows a focal length, and the unit of its own."""
         swallowed: set[str] = {"inverse"} if self.maps is None else set()
         if self.anchors.T_world_from_cam is None or self.others.T_world_from_cam is None:
             swallowed |= {"focal length", "unit"} if self.maps is None else {"focal length"}
-        asked = [NONE, *(cause for cause in CAUSES if cause.kind not in swallowed)]
+        asked = [NO_FAULT, *(cause for cause in KNOWN_FAULTS if cause.kind not in swallowed)]
         ratio = 0.0 if self.maps is None else self._returned_over(self.maps)
-        return [each for each in asked if _may_be(each, ratio)]
+        return [each for each in asked if _is_possible(each, ratio)]
 
     def _returned_over(self, maps: Sequence[Tensor]) -> float:
         """Median ratio of near returns to what maps say there; 0 without one."""
@@ -367,19 +382,21 @@ class Window:
         found = _ratio(told, _said(depth, self.samples.uv, self.anchors.hw))
         return float(found[found > 0].median()) if bool((found > 0).any()) else 0.0
 
-    def explains(self, cause: Cause) -> bool:
+    def explains(self, cause: KnownFault) -> bool:
         """Whether maps with that fault undone come near to the sensor's returns, where there are any: an explanation
         that is only better than none is none. The sensor's own depth is held against nothing."""
         if self.maps is None:
             return True
-        before, after = (self.loss(each, near=True) for each in (NONE, cause))
-        least = self.loss(NONE, near=True, sensor=True, focal=cause.focal)
+        before, after = (self.loss(each, near=True) for each in (NO_FAULT, cause))
+        least = self.loss(NO_FAULT, near=True, sensor=True, focal=cause.focal)
         known = before.isfinite() & after.isfinite() & least.isfinite()
-        if int(known.sum()) < FEWEST:
+        if int(known.sum()) < MIN_WINDOW_PAIRS:
             return True
-        return float((before - after)[known].mean()) >= EXPLAINED * float((before - least)[known].mean())
+        return float((before - after)[known].mean()) >= MIN_EXPLAINED_RATIO * float((before - least)[known].mean())
 
-    def loss(self, cause: Cause, *, near: bool = False, sensor: bool = False, focal: float | None = None) -> Tensor:
+    def loss(
+        self, cause: KnownFault, *, near: bool = False, sensor: bool = False, focal: float | None = None
+    ) -> Tensor:
         """(P,) loss with that fault undone; NaN where a pair cannot tell.
 
         Args:
@@ -424,8 +441,8 @@ class Window:
     def _under_fit(self, samples: Samples, depth: Tensor, views: tuple[Frame, Frame]) -> Tensor:
         """Under motions fitted to near returns; a pair without one misses everything, of the sensor's own depth."""
         cameras = views[0].camera, views[1].camera
-        _, usable, fit = under_pose(
-            self.method, samples, self.tracks, *cameras, seed=self.seed, fit=None, clock=Clock(None)
+        _, usable, fit = solve_pose_and_triangulate(
+            self.method, samples, self.tracks, *cameras, seed=self.seed, fit=None, clock=StageTimer(None)
         )
         still = fit.t_snr < 3
         loss = self._missed(depth, usable, fit.T_1_from_0, cameras)
@@ -448,7 +465,7 @@ class Window:
         ahead = used & (there[..., 2] > 1e-6)
         uv = cam.project(cameras[1], torch.where(ahead[..., None], there, 1.0))
         miss = (uv - self.tracks.uv_1).norm(dim=-1) * (640 / self.anchors.hw[1])
-        loss = torch.where(ahead, miss.square() / (miss.square() + HALF_PX**2), 1.0)
+        loss = torch.where(ahead, miss.square() / (miss.square() + HALF_LOSS_PX**2), 1.0)
         return _mean_over(loss, used)
 
 
@@ -459,7 +476,7 @@ def _mean_over(loss: Tensor, used: Tensor) -> Tensor:
     return torch.where(n >= 12, mean, torch.nan)
 
 
-def _undone(depth: Tensor, cause: Cause, view: Frame) -> Tensor:
+def _undone(depth: Tensor, cause: KnownFault, view: Frame) -> Tensor:
     """Maps (P, h, w) as they should be, over the field of the pictures or of a camera of their own."""
     depth = cause.undo(depth)
     if not cause.ray:
@@ -471,7 +488,7 @@ def _undone(depth: Tensor, cause: Cause, view: Frame) -> Tensor:
 def _said(depth: Tensor, uv: Tensor, hw: tuple[int, int]) -> Tensor:
     """What maps (P, h, w) say at pixels (P, N, 2) of pictures of size ``hw``; 0 where nothing finite."""
     at = cam.resize_pixels(uv, hw, (depth.shape[-2], depth.shape[-1]))
-    return nearest(depth, at)[0].nan_to_num(0.0, 0.0, 0.0)
+    return sample_nearest(depth, at)[0].nan_to_num(0.0, 0.0, 0.0)
 
 
 def _ratio(told: Tensor, depth: Tensor) -> Tensor:
@@ -481,36 +498,36 @@ def _ratio(told: Tensor, depth: Tensor) -> Tensor:
     return ratio.nanmedian(-1, keepdim=True).values.nan_to_num(0.0)
 
 
-def watch(frames: Sequence[Frame], method: Method = TRACKING) -> Watched:
+def track_window(frames: Sequence[Frame], method: Method = TRACKING_METHOD) -> WindowTracks:
     """How points move between the pictures of a window, in pairs as wide as tracks hold: what no depth changes.
 
     Gradient: none.
     """
     found: dict[int, tuple[int, Samples, Tracks]] = {}
-    for gap in [gap for gap in GAPS if gap < len(frames)]:
-        firsts = [i for i in _firsts(len(frames)) if i not in found and i + gap < len(frames)]
+    for gap in [gap for gap in PAIR_GAPS if gap < len(frames)]:
+        firsts = [i for i in _reference_frames(len(frames)) if i not in found and i + gap < len(frames)]
         if not firsts:
             continue
         with torch.no_grad():
             samples, tracks = _tracked([frames[i] for i in firsts], [frames[i + gap] for i in firsts], method)
         textured = (samples.trackability >= method.min_trackability).sum(-1).clamp_min(1)
-        holds = tracks.valid.sum(-1) >= FOUND * textured
+        holds = tracks.valid.sum(-1) >= MIN_TRACKED_RATIO * textured
         for k, i in enumerate(firsts):
             if bool(holds[k]):
                 found[i] = gap, samples[k : k + 1], tracks[k : k + 1]
     order = sorted(found)
     pairs = [(i, i + found[i][0]) for i in order]
-    return Watched(pairs, [found[i][1] for i in order], [found[i][2] for i in order])
+    return WindowTracks(pairs, [found[i][1] for i in order], [found[i][2] for i in order])
 
 
 def _tracked(anchors: Sequence[Frame], others: Sequence[Frame], method: Method) -> tuple[Samples, Tracks]:
     """Samples of some frames found again in others."""
-    samples = method.look(tree.collate(anchors))
-    tracks = method.track(tree.collate(anchors).image, tree.collate(others).image, samples.uv)
+    samples = method.look(pytree.collate(anchors))
+    tracks = method.track(pytree.collate(anchors).image, pytree.collate(others).image, samples.uv)
     return samples, tracks.replace(valid=tracks.valid & (samples.trackability >= method.min_trackability))
 
 
-def _firsts(n: int) -> list[int]:
+def _reference_frames(n: int) -> list[int]:
     """Anchors of a window, spread evenly, not so near its ends that no earlier or later map is known."""
-    low, high = (LAG, n - 1 - LAG) if n > 3 * LAG else (0, n - 2)
-    return sorted({low + round((high - low) * k / (PAIRS - 1)) for k in range(PAIRS)})
+    low, high = (MAX_LAG_FRAMES, n - 1 - MAX_LAG_FRAMES) if n > 3 * MAX_LAG_FRAMES else (0, n - 2)
+    return sorted({low + round((high - low) * k / (MAX_WINDOW_PAIRS - 1)) for k in range(MAX_WINDOW_PAIRS)})

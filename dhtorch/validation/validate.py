@@ -17,49 +17,48 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.codes import Gate, State
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import plane_sweep as sweep
-from dhtorch.geometry import se3
+from dhtorch.geometry import plane_sweep, se3
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.covariance import median
-from dhtorch.geometry.patches import nearest
+from dhtorch.geometry.covariance import masked_median
+from dhtorch.geometry.patches import sample_nearest
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import AUTO, MAP
 from dhtorch.pipeline.spec import Trace
-from dhtorch.pipeline.view_report import choosing
-from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, TrackHint, Verdict
+from dhtorch.pipeline.view_report import with_view_selection
+from dhtorch.records import NO_HINT, DepthValidation, Estimate, Frame, PoseFit, TrackHint
 from dhtorch.validation import evidence
-from dhtorch.validation.evidence import References, Said
+from dhtorch.validation.evidence import Evidence, ValidationReferences
 
 #: The sparse method of a verdict in little time, by one other view (with ``views=False``): a metre is told by some
 #: dozens of points, and their motion by as few. ``experiment=judge_study`` holds what it says against the whole method.
-QUICK = MAP.replace(n=256, hypotheses=64, pose={"near_steps": 2, "steps": 3})
+QUICK_METHOD = MAP.replace(n=256, hypotheses=64, pose={"near_steps": 2, "steps": 3})
 
 #: Sigmas from which on evidence speaks against a pixel, and up to which it speaks for it.
-AGAINST, FOR = 3.0, 2.0
+REFUTING_EVIDENCE_SIGMAS, SUPPORTING_EVIDENCE_SIGMAS = 3.0, 2.0
 
 #: References that count as independent at most: they share tracks' neighbourhoods, lens and sensor.
-INDEPENDENT = 60
+MAX_INDEPENDENT_REFERENCES = 60
 
 #: What a sensor's metre, and a trajectory's, are good for.
-SENSOR_METRE, TRAJECTORY_METRE = 0.005, 0.02
+SENSOR_SCALE_SIGMA, TRAJECTORY_SCALE_SIGMA = 0.005, 0.02
 
 #: Fewest references of a kind that say something of a frame, and fewest for shift and tilt.
-FEWEST, FEWEST_SHAPE = 8, 24
+MIN_SCALE_REFERENCES, MIN_SHAPE_REFERENCES = 8, 24
 
 #: Pixels of a grid that count as one when a share is counted: a window.
-WINDOW = 81
+SHARE_WINDOW_PIXELS = 81
 
 #: Least share of a map's pixels that all stand exactly as far as its farthest; the least share of those of which
 #: something is known that are wrong for standing too near, and how many times the share of all others that is: from
 #: there on the map is cut, and what it gives is a bound.
-PLATEAU, CUT, MORE = 0.01, 0.1, 2.0
+MIN_PLATEAU_RATIO, MIN_CLIPPED_WRONG_RATIO, CLIPPED_RATE_FACTOR = 0.01, 0.1, 2.0
 
 
-def judge(
+def validate_depth(
     depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = says nothing; None = the sensor's own
     anchor: Frame,
     others: Frame | Sequence[Frame] | None = None,
@@ -74,7 +73,7 @@ def judge(
     fit: PoseFit | None = None,
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
-) -> Verdict:
+) -> DepthValidation:
     """Whether a depth map is right, by what the sensor and other views of the same scene say.
 
     Args:
@@ -104,28 +103,32 @@ def judge(
     Gradient: none; a verdict.
     Cost: that of the method, and with ``views`` eleven fits of every grid pixel for each partner.
     """
-    if not 0 < tolerance < evidence.TELLS / AGAINST:
-        raise ValueError(f"judge: tolerance is {tolerance}, expected above 0 and below {evidence.TELLS / AGAINST:.3f}")
+    if not 0 < tolerance < evidence.DETECTABLE_LOG_RATIO / REFUTING_EVIDENCE_SIGMAS:
+        raise ValueError(
+            f"judge: tolerance is {tolerance}, expected above 0 and below {evidence.DETECTABLE_LOG_RATIO / REFUTING_EVIDENCE_SIGMAS:.3f}"
+        )
     if size < 16 or partners < 1:
         raise ValueError(f"judge: size is {size}, partners {partners}, expected at least 16 and 1")
     check("judge", image=(anchor.image, "B C H W"), depth_map=(depth_map, "B h w"))
     check("judge", depth=(anchor.depth, "B y x"), depth_map=(depth_map, "B h w"))
     check("judge", other_maps=(other_maps, "V B h w"))
     for name, given in (("depth_map", depth_map), ("other_maps", other_maps)):
-        _must_be_metres(name, given)
+        _check_metric(name, given)
     trace = {} if trace is None else trace
     with torch.no_grad():
-        asked = None if others is None else _asked(method, anchor, others, trace, seed=seed, fit=fit, hint=hint)
+        asked = (
+            None if others is None else _estimate_views(method, anchor, others, trace, seed=seed, fit=fit, hint=hint)
+        )
         offered = trace["choice"].index if "choice" in trace else None
         options: dict[str, Any] = {"views": views, "partners": partners, "size": size, "tolerance": tolerance}
-        return judged(depth_map, anchor, asked, offered, other_maps=other_maps, method=method, **options)
+        return validate_against(depth_map, anchor, asked, offered, other_maps=other_maps, method=method, **options)
 
 
 @torch.no_grad()
-def judged(
+def validate_against(
     depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = says nothing; None = the sensor's own
     anchor: Frame,
-    asked: dense.Asked | None,
+    asked: dense.SelectedViews | None,
     offered: Tensor | None = None,  # (views, B) which of those offered were asked; None = all
     *,
     other_maps: Tensor | None = None,  # (V, B, h', w') m
@@ -134,81 +137,87 @@ def judged(
     partners: int = 2,
     size: int = 320,
     tolerance: float = 0.025,
-) -> Verdict:
-    """The second half of :func:`judge`: what was asked already says of a map; for several maps of one frame.
+) -> DepthValidation:
+    """The second half of :func:`validate_depth`: what was asked already says of a map; for several maps of one frame.
 
     Arguments, result, errors and cost as there. Gradient: none.
     """
     hw = dense.map_hw(anchor.hw, size)
     # A depth is held against a depth of the same pixel: without a depth camera of its own no lens stands between them.
     straight = anchor if anchor.depth_camera is not None else anchor.replace(camera=cam.ideal(anchor.camera))
-    returns = method.backproject(straight, dense.pixels(anchor, hw)).map(lambda x: x.unflatten(1, hw))
+    returns = method.backproject(straight, dense.map_pixel_centres(anchor, hw)).map(lambda x: x.unflatten(1, hw))
     own = depth_map is None
     grid = _usable(returns.depth if depth_map is None else _resized(depth_map.to(anchor.camera.f), hw))
     samples = method.look(anchor) if asked is None else asked.samples
     joined = Estimate.silent(samples, Gate.NO_TRACK, n_views=0) if asked is None else asked.joined
-    found = evidence.references(samples, joined, near=not own)
-    loose = torch.zeros_like(grid) if depth_map is None else evidence.extent(depth_map.to(grid), hw)
-    found = evidence.loosened(found, loose, anchor.hw)
+    found = evidence.validation_references(samples, joined, near=not own)
+    loose = torch.zeros_like(grid) if depth_map is None else evidence.resolution_sigma(depth_map.to(grid), hw)
+    found = evidence.inflate_sigma(found, loose, anchor.hw)
     allowed = (loose.square() + tolerance**2).sqrt()
-    answers = evidence.by_answers(grid, anchor.hw, found, allowed, None if own else returns)
+    answers = evidence.sparse_evidence(grid, anchor.hw, found, allowed, None if own else returns)
     kinds = [answers]
     if asked is not None and views:
         number = offered if offered is not None else torch.arange(len(asked.fits.code))[:, None].expand(-1, len(grid))
         source = None if own else other_maps
-        of = _Judged(grid, anchor, asked, number.to(grid.device), own)
-        kinds += _asked_views(of, source, partners, allowed)
+        of = _ValidatedMap(grid, anchor, asked, number.to(grid.device), own)
+        kinds += _view_evidences(of, source, partners, allowed)
     none = torch.full((len(grid), 3), torch.nan).to(grid)
-    ruler = none if asked is None else _ruler(anchor, asked)
+    ruler = none if asked is None else _scale_vs_trajectory(anchor, asked)
     return _joined(grid, kinds, _of_frame(grid, anchor, found, own), ruler, own)
 
 
-class _Judged(NamedTuple):
+class _ValidatedMap(NamedTuple):
     """A map on its grid, and the views that may speak of it."""
 
     grid: Tensor  # (B, h, w) m
     anchor: Frame
-    asked: dense.Asked
+    asked: dense.SelectedViews
     number: Tensor  # (views, B) of those asked, among those offered
     own: bool  # the sensor's own map
 
 
-def _asked(method: Method, anchor: Frame, others: Frame | Sequence[Frame], trace: Trace, **told: Any) -> dense.Asked:
+def _estimate_views(
+    method: Method, anchor: Frame, others: Frame | Sequence[Frame], trace: Trace, **told: Any
+) -> dense.SelectedViews:
     """What the method says of the anchor; it chooses where it is offered more than it looks at."""
-    others = others if isinstance(others, Frame) else tree.stack(others)
+    others = others if isinstance(others, Frame) else pytree.stack(others)
     several = others.image.dim() == 5
-    method = choosing(method) if several and len(others.image) > method.views else method
+    method = with_view_selection(method) if several and len(others.image) > method.views else method
     joined = method(anchor, others, trace=trace, **told)
-    return dense.views_asked(joined, others, trace)
+    return dense.selected_views(joined, others, trace)
 
 
-def _asked_views(of: _Judged, other_maps: Tensor | None, partners: int, tolerance: Tensor) -> tuple[Said, Said]:
+def _view_evidences(
+    of: _ValidatedMap, other_maps: Tensor | None, partners: int, tolerance: Tensor
+) -> tuple[Evidence, Evidence]:
     """What pictures and maps of the views say that are worth most; a view's number is its place among those offered."""
     grid, asked = of.grid, of.asked
-    base = sweep.base(*dense.resized(of.anchor, max(grid.shape[-2:])))
-    index, wanted = dense.worthiest(asked, partners)
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(of.anchor, max(grid.shape[-2:])))
+    index, wanted = dense.top_views(asked, partners)
     wanted = asked.fits.ok.gather(0, index) & (wanted | _moved(asked).gather(0, index))
-    chosen = [dense.partner_of(asked, k, max(base.hw), use, base.image) for k, use in zip(index, wanted, strict=True)]
-    pictures = evidence.by_views(grid, base, chosen, tolerance)
+    chosen = [
+        dense.source_view_of(asked, k, max(base.hw), use, base.image) for k, use in zip(index, wanted, strict=True)
+    ]
+    pictures = evidence.photometric_evidence(grid, base, chosen, tolerance)
     batch = torch.arange(len(grid), device=grid.device)
     number = of.number.gather(0, index)
-    maps = evidence.silent(grid)
+    maps = evidence.no_evidence(grid)
     if of.own or other_maps is not None:
         if of.own:
             depths = [_of_sensor(asked.frames[k, batch], base.hw) for k in index]
         else:
             assert other_maps is not None
             depths = [_surfaces(other_maps.to(grid)[n, batch], base.hw) for n in number]
-        maps = evidence.by_maps(grid, base, chosen, [_usable(depth) for depth in depths], tolerance)
+        maps = evidence.depth_consistency_evidence(grid, base, chosen, [_usable(depth) for depth in depths], tolerance)
     return _numbered(pictures, number), _numbered(maps, number)
 
 
-def _moved(asked: dense.Asked) -> Tensor:
+def _moved(asked: dense.SelectedViews) -> Tensor:
     """Whether a view stands significantly elsewhere, (V, B)."""
     return asked.fits.t_snr > 5
 
 
-def _numbered(said: Said, number: Tensor) -> Said:
+def _numbered(said: Evidence, number: Tensor) -> Evidence:
     """Views by their place among those offered."""
     batch = torch.arange(number.shape[1], device=number.device)[:, None, None]
     place = number[said.view.clamp_min(0).long(), batch].to(torch.int32)
@@ -223,7 +232,7 @@ def _usable(depth: Tensor) -> Tensor:
     return torch.where(depth > 0, depth, 0.0)
 
 
-def _must_be_metres(name: str, maps: Tensor | None) -> None:
+def _check_metric(name: str, maps: Tensor | None) -> None:
     """Refuse what is no map of metres."""
     if maps is None:
         return
@@ -235,7 +244,7 @@ def _must_be_metres(name: str, maps: Tensor | None) -> None:
 
 def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
     rows, columns = (
-        evidence.centres(n, m, depth_map.device).floor().long().clamp_max(n - 1)
+        evidence.pixel_centres(n, m, depth_map.device).floor().long().clamp_max(n - 1)
         for n, m in zip(depth_map.shape[-2:], hw, strict=True)
     )
     return depth_map[..., rows[:, None], columns]
@@ -244,7 +253,7 @@ def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
 def _surfaces(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
     """What a map shows on a grid: where it is coarser, the nearest of its pixels around, since an outline lies anywhere
     between two."""
-    if evidence.coarser(depth_map, hw):
+    if evidence.is_coarser(depth_map, hw):
         known = _usable(depth_map)
         depth_map = torch.where(known > 0, evidence.nearest_surface(known), 0.0)
     return _resized(depth_map, hw)
@@ -252,25 +261,29 @@ def _surfaces(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
 
 def _of_sensor(frame: Frame, hw: tuple[int, int]) -> Tensor:
     """A view's own depth at the pixels of a grid over its picture."""
-    uv = dense.pixels(frame, hw).expand(len(frame.camera.f), -1, -1)
+    uv = dense.map_pixel_centres(frame, hw).expand(len(frame.camera.f), -1, -1)
     own = frame.depth.shape[-2], frame.depth.shape[-1]
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, own, uv)
-    depth, inside = nearest(frame.depth.to(uv), place)
+    depth, inside = sample_nearest(frame.depth.to(uv), place)
     return torch.where(inside, depth, 0.0).unflatten(1, hw)
 
 
 # ------------------------------------------------------------------------------------------------------------ verdicts
 
 
-def _joined(grid: Tensor, kinds: Sequence[Said], numbers: Numbers, ruler: Tensor, own: bool) -> Verdict:
+def _joined(
+    grid: Tensor, kinds: Sequence[Evidence], numbers: FrameNumbers, ruler: Tensor, own: bool
+) -> DepthValidation:
     """What answers say and, where they were asked, pictures and maps of other views."""
-    state, said, view = decided(*kinds)
-    ceiling, at_ceiling = cut(grid, state, said)
+    state, said, view = combine_evidence(*kinds)
+    ceiling, at_ceiling = clipped_depth(grid, state, said)
     state = torch.where(at_ceiling & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
-    answers, pictures, maps = list(kinds) + [evidence.silent(grid)] * (3 - len(kinds))
+    answers, pictures, maps = list(kinds) + [evidence.no_evidence(grid)] * (3 - len(kinds))
     none = torch.full_like(ruler, torch.nan)
-    n_wrong, n_known = ((m.sum((1, 2)) / WINDOW) for m in (state == State.WRONG, state != State.CANNOT_KNOW))
-    return Verdict(
+    n_wrong, n_known = (
+        (m.sum((1, 2)) / SHARE_WINDOW_PIXELS) for m in (state == State.WRONG, state != State.CANNOT_KNOW)
+    )
+    return DepthValidation(
         depth=grid,
         state=state,
         evidence=said,
@@ -284,12 +297,12 @@ def _joined(grid: Tensor, kinds: Sequence[Said], numbers: Numbers, ruler: Tensor
         ruler=ruler,
         shift=numbers.shift,
         tilt=numbers.tilt,
-        wrong=share(n_wrong.to(grid), n_known.to(grid)),
+        wrong=share_interval(n_wrong.to(grid), n_known.to(grid)),
         ceiling=ceiling,
     )
 
 
-def cut(grid: Tensor, state: Tensor, said: Tensor) -> tuple[Tensor, Tensor]:
+def clipped_depth(grid: Tensor, state: Tensor, said: Tensor) -> tuple[Tensor, Tensor]:
     """Depth (B,) at which a map is cut, NaN where it is not, and the pixels (B, h, w) that stand there.
 
     A surface that is said to stand exactly as far as the farthest of a map may be a wall in front of the camera: it is
@@ -305,17 +318,21 @@ def cut(grid: Tensor, state: Tensor, said: Tensor) -> tuple[Tensor, Tensor]:
     here, elsewhere = (
         (near & m).sum((1, 2)) / (known & m).sum((1, 2)).clamp_min(1) for m in (there, (grid > 0) & ~there)
     )
-    ends = (there.sum((1, 2)) >= PLATEAU * n) & (here >= CUT) & (here > MORE * elsewhere)
+    ends = (
+        (there.sum((1, 2)) >= MIN_PLATEAU_RATIO * n)
+        & (here >= MIN_CLIPPED_WRONG_RATIO)
+        & (here > CLIPPED_RATE_FACTOR * elsewhere)
+    )
     return torch.where(ends, farthest, torch.nan), there & ends[:, None, None]
 
 
-def decided(*kinds: Said) -> tuple[Tensor, Tensor, Tensor]:
+def combine_evidence(*kinds: Evidence) -> tuple[Tensor, Tensor, Tensor]:
     """State, evidence and view (B, h, w) of what all kinds of evidence say: answers, pictures, maps.
 
     What speaks against a pixel counts unless another kind, that would have told, speaks for it. Gradient: none.
     """
-    against = torch.stack([k.misfit.abs() > AGAINST for k in kinds])
-    speaks_for = torch.stack([k.sure & (k.misfit.abs() < FOR) for k in kinds])
+    against = torch.stack([k.misfit.abs() > REFUTING_EVIDENCE_SIGMAS for k in kinds])
+    speaks_for = torch.stack([k.sure & (k.misfit.abs() < SUPPORTING_EVIDENCE_SIGMAS) for k in kinds])
     wrong, fine = against.any(0), speaks_for.any(0)
     state = torch.where(wrong, State.WRONG, torch.where(fine, State.CONSISTENT, State.CANNOT_KNOW))
     state = torch.where(wrong & fine, State.CANNOT_KNOW, state).to(torch.int32)
@@ -330,7 +347,7 @@ def decided(*kinds: Said) -> tuple[Tensor, Tensor, Tensor]:
     return state, said, torch.where(said.isnan(), -2, view).to(torch.int32)
 
 
-def share(part: Tensor, whole: Tensor) -> Tensor:
+def share_interval(part: Tensor, whole: Tensor) -> Tensor:
     """Share (B, 3) of counts (B,) with its interval of 95 %; NaN of none. Gradient: none.
 
     Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference", 1927.
@@ -343,7 +360,7 @@ def share(part: Tensor, whole: Tensor) -> Tensor:
     return torch.where((whole > 0)[:, None], out, torch.nan)
 
 
-class Numbers(NamedTuple):
+class FrameNumbers(NamedTuple):
     """What is said of a frame as a whole, (B, 3) each: value, low, high."""
 
     scale: Tensor
@@ -353,29 +370,29 @@ class Numbers(NamedTuple):
     tilt: Tensor
 
 
-def _of_frame(grid: Tensor, anchor: Frame, found: References, own: bool) -> Numbers:
+def _of_frame(grid: Tensor, anchor: Frame, found: ValidationReferences, own: bool) -> FrameNumbers:
     h, w = grid.shape[-2:]
-    at, inside = nearest(grid, cam.resize_pixels(found.uv, anchor.hw, (h, w)))
+    at, inside = sample_nearest(grid, cam.resize_pixels(found.uv, anchor.hw, (h, w)))
     used = found.used & inside & (at > 0)
     ratio = torch.where(used, at / found.depth, 1.0)
     log = ratio.log()
     own_sigma = (found.sigma.square() - found.shared.square()).clamp_min(1e-6).sqrt()
     kinds = []
-    for kind, metre in ((found.near, SENSOR_METRE), (~found.near, 0.0)):
-        common = median(found.shared, used & kind)[:, 0].nan_to_num()
+    for kind, metre in ((found.near, SENSOR_SCALE_SIGMA), (~found.near, 0.0)):
+        common = masked_median(found.shared, used & kind)[:, 0].nan_to_num()
         kinds.append(_location(log, own_sigma, used & kind, (common.square() + metre**2).sqrt()))
     near, far = kinds
     both = _weighed(near, far)
     if own:
         near = both = (torch.full_like(near[0], torch.nan), near[1])
     shift, tilt = _shape(ratio, found, used, own_sigma, anchor.hw)
-    return Numbers(_as_factor(*both), _as_factor(*near), _as_factor(*far), shift, tilt)
+    return FrameNumbers(_as_factor(*both), _as_factor(*near), _as_factor(*far), shift, tilt)
 
 
 def _location(x: Tensor, sigma: Tensor, used: Tensor, common: Tensor) -> tuple[Tensor, Tensor]:
     """Robust mean (B,) of x (B, N) and its standard deviation, the common part included; NaN of too few."""
-    at = median(x, used)
-    spread = 1.483 * median((x - at).abs(), used)
+    at = masked_median(x, used)
+    spread = 1.483 * masked_median((x - at).abs(), used)
     n = used.sum(-1)
     for _ in range(5):
         width = (sigma.square() + spread.square()).sqrt().clamp_min(1e-4)
@@ -384,10 +401,10 @@ def _location(x: Tensor, sigma: Tensor, used: Tensor, common: Tensor) -> tuple[T
         at = ((weight * x).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp_min(1e-12)).where(
             weight.sum(-1, keepdim=True) > 0, at
         )
-    effective = n.clamp(1, INDEPENDENT).to(x)
-    own = (spread[:, 0].square() + median(sigma, used)[:, 0].square()).sqrt() / effective.sqrt()
+    effective = n.clamp(1, MAX_INDEPENDENT_REFERENCES).to(x)
+    own = (spread[:, 0].square() + masked_median(sigma, used)[:, 0].square()).sqrt() / effective.sqrt()
     sd = (own.square() * 1.5 + common.square()).sqrt()
-    few = n < FEWEST
+    few = n < MIN_SCALE_REFERENCES
     return torch.where(few, torch.nan, at[:, 0]), torch.where(few, torch.inf, sd)
 
 
@@ -407,15 +424,17 @@ def _as_factor(log: Tensor, sd: Tensor) -> Tensor:
     return torch.stack([log, log - 1.96 * sd, log + 1.96 * sd], -1).exp().where(log.isfinite()[:, None], torch.nan)
 
 
-def _shape(ratio: Tensor, found: References, used: Tensor, sigma: Tensor, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
+def _shape(
+    ratio: Tensor, found: ValidationReferences, used: Tensor, sigma: Tensor, hw: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
     """Shift in m and tilt, (B, 3) each, of map / reference = scale + shift / reference + tilt · place."""
     size = torch.tensor([hw[1], hw[0]]).to(ratio)
     place = (found.uv + 0.5) / size - 0.5
     inverse = torch.where(used, 1 / found.depth, 0.0)
     X = torch.cat([torch.ones_like(inverse)[..., None], inverse[..., None], place], -1).double()
     y = ratio.double()
-    at = median(ratio, used).double()
-    spread = 1.483 * median((ratio - at.to(ratio)).abs(), used).double()
+    at = masked_median(ratio, used).double()
+    spread = 1.483 * masked_median((ratio - at.to(ratio)).abs(), used).double()
     width = (sigma.double().square() + spread.square()).sqrt().clamp_min(1e-4)
     residual = y - at
     eye = 1e-9 * torch.eye(4).to(X)
@@ -426,9 +445,9 @@ def _shape(ratio: Tensor, found: References, used: Tensor, sigma: Tensor, hw: tu
         beta = torch.linalg.solve(normal, ((X * weight[..., None]).mT @ y[..., None]))[..., 0]
         residual = y - (X @ beta[..., None])[..., 0]
     n = used.sum(-1).clamp_min(1)
-    inflation = (n / n.clamp_max(INDEPENDENT)).double()[:, None, None]
+    inflation = (n / n.clamp_max(MAX_INDEPENDENT_REFERENCES)).double()[:, None, None]
     cov = torch.linalg.inv(normal) * inflation * 1.5
-    few = (n < FEWEST_SHAPE)[:, None]
+    few = (n < MIN_SHAPE_REFERENCES)[:, None]
     sd = cov.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     shift = torch.stack([beta[:, 1], beta[:, 1] - 1.96 * sd[:, 1], beta[:, 1] + 1.96 * sd[:, 1]], -1)
     gradient = beta[:, 2:]
@@ -439,7 +458,7 @@ def _shape(ratio: Tensor, found: References, used: Tensor, sigma: Tensor, hw: tu
     return tuple(torch.where(few, torch.nan, x.to(ratio)) for x in (shift, tilt))  # type: ignore[return-value]
 
 
-def _ruler(anchor: Frame, asked: dense.Asked) -> Tensor:
+def _scale_vs_trajectory(anchor: Frame, asked: dense.SelectedViews) -> Tensor:
     """The sensor's metre over the trajectory's, (B, 3), by the ways between the views; NaN without a trajectory."""
     none = torch.full((len(anchor.camera.f), 3), torch.nan).to(anchor.camera.f)
     if anchor.T_world_from_cam is None or asked.frames.T_world_from_cam is None:
@@ -453,8 +472,8 @@ def _ruler(anchor: Frame, asked: dense.Asked) -> Tensor:
     used = asked.fits.ok & (asked.fits.t_snr > 10) & (way > 0.01) & length.isfinite()
     log = torch.where(used, length / way.clamp_min(1e-6), 1.0).clamp_min(1e-6).log().T
     n = used.sum(0)
-    at = median(log, used.T)
-    spread = 1.483 * median((log - at).abs(), used.T)[:, 0].where(n > 2, 0.0)
-    noise = median(1 / asked.fits.t_snr.clamp_min(1).T, used.T)[:, 0].where(n > 0, 1.0)
-    sd = (spread.square() + noise.square() + TRAJECTORY_METRE**2).sqrt()
+    at = masked_median(log, used.T)
+    spread = 1.483 * masked_median((log - at).abs(), used.T)[:, 0].where(n > 2, 0.0)
+    noise = masked_median(1 / asked.fits.t_snr.clamp_min(1).T, used.T)[:, 0].where(n > 0, 1.0)
+    sd = (spread.square() + noise.square() + TRAJECTORY_SCALE_SIGMA**2).sqrt()
     return _as_factor(torch.where(n > 0, at[:, 0], torch.nan), sd)

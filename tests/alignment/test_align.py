@@ -3,11 +3,10 @@
 import pytest
 import torch
 
-from dhtorch import anchor
-from dhtorch.alignment import align as metric
-from dhtorch.alignment import error_model as distortion
-from dhtorch.alignment.error_model import freedom_of
-from dhtorch.alignment.references import Anchors, gathered
+from dhtorch import align_depth
+from dhtorch.alignment import align, error_model
+from dhtorch.alignment.error_model import estimate_freedom
+from dhtorch.alignment.references import MetricReferences, collect_references
 from dhtorch.codes import Gate, Source
 from dhtorch.experiments.baselines import scale_shift
 from dhtorch.experiments.compare import align_study as anchor_study
@@ -42,8 +41,8 @@ def error(found, truth):
 @pytest.mark.parametrize("name", ["scale_short", "shift", "tilt", "simulated"])
 def test_faults_are_taken_out(name):
     truth, near, far = world()
-    x, _ = depth_faults.spoil(name, truth)
-    found = anchor(x, [near, far])
+    x, _ = depth_faults.apply_fault(name, truth)
+    found = align_depth(x, [near, far])
     assert found.keep.all() and (found.source == Source.ANCHORED).all()
     assert error(found, truth) < 0.015 < ((x - truth).abs() / truth).median()
     if name in ("scale_short", "shift"):  # a slope that goes with depth is not told from a scale by few returns
@@ -53,25 +52,25 @@ def test_faults_are_taken_out(name):
 @pytest.mark.parametrize(("drawn", "expected"), [("normal", 30.0), ("cauchy", 1.0), ("half wrong", 1.0)])
 def test_tails_of_returns_are_found(drawn, expected):
     truth, near, _ = world(batch=2, n=800)
-    points = gathered(truth, [near], HW)
+    points = collect_references(truth, [near], HW)
     g = torch.Generator().manual_seed(1)
     r = 0.004 * torch.randn(points.x.shape, generator=g, dtype=torch.float64)
     if drawn == "cauchy":
         r = r / torch.randn(r.shape, generator=g, dtype=torch.float64)
     if drawn == "half wrong":
         r = torch.where(torch.rand(r.shape, generator=g) < 0.4, r + 0.5, r)
-    assert freedom_of(r, points).tolist() == [expected, expected]
+    assert estimate_freedom(r, points).tolist() == [expected, expected]
 
 
 def test_returns_with_normal_noise_are_worth_what_least_squares_makes_of_them():
     off = {"ours": [], "least squares": []}
     for seed in range(12):
         truth, near, _ = world(seed=seed, noise=0.006)
-        points = gathered(1.3 * truth, [near], HW)
+        points = collect_references(1.3 * truth, [near], HW)
         use = points.used[0]
-        s, t = scale_shift.least_squares(points.x[0][use], points.depth[0][use])
+        s, t = scale_shift.fit_scale_shift(points.x[0][use], points.depth[0][use])
         off["least squares"].append(float((s * 1.3 * truth + t - truth).abs()[truth > 2].mean()))
-        found = anchor(1.3 * truth, [near], kind="affine")
+        found = align_depth(1.3 * truth, [near], kind="affine")
         off["ours"].append(float((found.depth - truth).abs()[truth > 2].mean()))
     assert sum(off["ours"]) < 1.1 * sum(off["least squares"])
 
@@ -79,7 +78,7 @@ def test_returns_with_normal_noise_are_worth_what_least_squares_makes_of_them():
 def test_a_map_that_is_right_is_left_alone():
     truth, near, far = world()
     trace = {}
-    found = anchor(truth, [near, far], trace=trace)
+    found = align_depth(truth, [near, far], trace=trace)
     assert trace["chosen"].names[int(trace["chosen"].model)] == "raw"
     assert torch.allclose(found.depth, truth)
 
@@ -93,7 +92,7 @@ def test_one_number_that_is_missing_is_told_from_two(expected, scale, shift, see
     number, where a line through them is off by several times that beyond them."""
     truth, near, far = world(noise=0.006, seed=seed)
     trace = {}
-    found = anchor(scale * truth + shift, [near, far], trace=trace)
+    found = align_depth(scale * truth + shift, [near, far], trace=trace)
     assert trace["chosen"].names[int(trace["chosen"].model)] == expected
     assert error(found, truth) < 0.001
 
@@ -102,9 +101,9 @@ def test_a_shift_makes_no_sense_of_maps_without_a_metre():
     truth, near, far = world()
     for kind in ("scale", "affine", "inverse"):
         trace = {}
-        anchor(truth, [near, far], kind=kind, trace=trace)
+        align_depth(truth, [near, far], kind=kind, trace=trace)
         assert not any(name.startswith(("raw", "shift")) for name in trace["chosen"].names)
-    assert any(name.startswith("scale") for name in metric._OF_KIND["scale"])
+    assert any(name.startswith("scale") for name in align._OF_KIND["scale"])
 
 
 @pytest.mark.parametrize("kind", ["scale", "affine", "inverse", "ordinal"])
@@ -113,78 +112,80 @@ def test_kinds_of_maps(kind):
     x = {"scale": 7 * truth, "affine": 3 * truth - 5, "inverse": 40 / truth + 3, "ordinal": truth.log().exp() ** 2}[
         kind
     ]
-    assert error(anchor(x, [near, far], kind=kind), truth) < (0.05 if kind == "ordinal" else 0.01)
+    assert error(align_depth(x, [near, far], kind=kind), truth) < (0.05 if kind == "ordinal" else 0.01)
 
 
 def test_wrong_anchors_are_outvoted():
     truth, near, far = world()
     wrong = torch.arange(far.depth.shape[1]) % 5 == 0
     far = far.replace(depth=torch.where(wrong, 1.6 * far.depth, far.depth))
-    assert error(anchor(0.8 * truth, [near, far]), truth) < 0.01
+    assert error(align_depth(0.8 * truth, [near, far]), truth) < 0.01
 
 
 def test_an_error_that_far_answers_share_does_not_move_the_map():
     truth, near, far = world()
-    assert error(anchor(truth, [near, far.replace(depth=1.03 * far.depth)]), truth) < 0.005
+    assert error(align_depth(truth, [near, far.replace(depth=1.03 * far.depth)]), truth) < 0.005
 
 
 def test_a_map_of_answers_is_an_anchor_too_and_samples_may_be_of_a_larger_picture():
     truth, near, _ = world()
     one = torch.full_like(truth, 0, dtype=torch.int32)
     swept = DepthMap(truth, 0.02 * truth, truth * 0 + 1, one + Source.SWEPT, one)
-    assert error(anchor(1.2 * truth, [near, swept]), truth) < 0.01
+    assert error(align_depth(1.2 * truth, [near, swept]), truth) < 0.01
     larger = near.replace(uv=4 * near.uv + 1.5)
-    small = anchor(1.2 * truth, near)
-    assert torch.allclose(anchor(1.2 * truth, larger, hw=(4 * HW[0], 4 * HW[1])).depth, small.depth)
+    small = align_depth(1.2 * truth, near)
+    assert torch.allclose(align_depth(1.2 * truth, larger, hw=(4 * HW[0], 4 * HW[1])).depth, small.depth)
 
 
 def test_silence():
     truth, near, far = world()
     x = truth.clone()
     x[:, :4] = torch.nan
-    found = anchor(x, [near, far])
+    found = align_depth(x, [near, far])
     assert (found.gate[:, :4] == Gate.NO_TRACK).all() and found.depth[:, :4].isnan().all()
     none = near.replace(xyz=torch.full_like(near.xyz, torch.nan))
-    lost = anchor(truth, none)
+    lost = align_depth(truth, none)
     assert (lost.gate == Gate.NO_POSE).all() and (lost.score == 0).all() and lost.depth.isnan().all()
 
 
 def test_alone_as_in_a_batch_and_in_both_floats():
     truth, near, far = world(batch=2)
-    x = depth_faults.tilted(truth, 0.1, 0.5) * torch.tensor([1.0, 1.3]).view(2, 1, 1).double()
-    both = anchor(x, [near, far])
+    x = depth_faults.tilt_depth(truth, 0.1, 0.5) * torch.tensor([1.0, 1.3]).view(2, 1, 1).double()
+    both = align_depth(x, [near, far])
     for k in range(2):
-        one = anchor(x[k : k + 1], [near[k : k + 1], far[k : k + 1]])
+        one = align_depth(x[k : k + 1], [near[k : k + 1], far[k : k + 1]])
         assert torch.allclose(one.depth, both.depth[k : k + 1], rtol=1e-9)
         assert torch.allclose(one.sigma, both.sigma[k : k + 1], rtol=1e-6)
-    short = anchor(x.float(), [near.to(torch.float32), far.to(torch.float32)])
+    short = align_depth(x.float(), [near.to(torch.float32), far.to(torch.float32)])
     assert short.depth.dtype == torch.float32
     assert torch.allclose(short.depth.double(), both.depth, rtol=1e-4)
 
 
 def test_gradients_reach_map_and_anchors():
     truth, near, far = world(n=120)
-    x = (depth_faults.tilted(truth, 0.1, 0.5)).requires_grad_()
+    x = (depth_faults.tilt_depth(truth, 0.1, 0.5)).requires_grad_()
     z = far.depth.clone().requires_grad_()
-    found = anchor(x, [near, far.replace(depth=z)])
+    found = align_depth(x, [near, far.replace(depth=z)])
     of_map, of_anchor = torch.autograd.grad(found.depth.nan_to_num().sum(), (x, z))
     assert of_map.isfinite().all() and of_anchor.isfinite().all()
     assert (of_map != 0).all() and (of_anchor[far.keep] != 0).double().mean() > 0.9
     one = torch.zeros_like(z)
     one[0, int(far.keep[0].nonzero()[3])] = 1
     for step in (torch.ones_like(z), one):
-        moved = [anchor(x.detach(), [near, far.replace(depth=z.detach() + k * 1e-5 * step)]).depth for k in (-1, 1)]
+        moved = [
+            align_depth(x.detach(), [near, far.replace(depth=z.detach() + k * 1e-5 * step)]).depth for k in (-1, 1)
+        ]
         assert float((moved[1] - moved[0]).sum() / 2e-5) == pytest.approx(float((of_anchor * step).sum()), rel=1e-4)
     pixel = torch.zeros_like(x)
     pixel[0, 30, 20] = 1e-6
-    moved = [anchor(x.detach() + k * pixel, [near, far]).depth.sum() for k in (-1, 1)]
+    moved = [align_depth(x.detach() + k * pixel, [near, far]).depth.sum() for k in (-1, 1)]
     assert float((moved[1] - moved[0]) / 2e-6) == pytest.approx(float(of_map[0, 30, 20]), rel=1e-4)
 
 
 def test_what_has_an_order_keeps_it():
     truth, near, far = world()
     x = (truth + 0.3 * truth.sin()).exp().sqrt()
-    found = anchor(x, [near, far], kind="ordinal")
+    found = align_depth(x, [near, far], kind="ordinal")
     order = x.flatten().argsort()
     assert (found.depth.flatten()[order].diff() >= 0).all()
     assert error(found, truth) < 0.05
@@ -196,34 +197,34 @@ def test_nearly_half_of_the_anchors_may_be_wrong():
     wrong = torch.rand(near.depth.shape, generator=g) < 0.4
     factor = 1 + 2 * torch.rand(near.depth.shape, generator=g)
     lost = near.replace(depth=torch.where(wrong, factor * near.depth, near.depth))
-    assert error(anchor(0.8 * truth, [lost, far]), truth) < 0.01
+    assert error(align_depth(0.8 * truth, [lost, far]), truth) < 0.01
 
 
 def test_far_answers_that_are_all_wrong_alike_do_not_move_a_map_that_near_returns_confirm():
     truth, near, far = world()
     for factor in (0.9, 1.1):
-        assert error(anchor(truth, [near, far.replace(depth=factor * far.depth)]), truth) < 0.005
+        assert error(align_depth(truth, [near, far.replace(depth=factor * far.depth)]), truth) < 0.005
 
 
 def test_bad_input_is_named():
     truth, near, _ = world()
     with pytest.raises(ValueError, match="expected one of metric"):
-        anchor(truth, near, kind="depth")
+        align_depth(truth, near, kind="depth")
     with pytest.raises(ValueError, match="no anchors"):
-        anchor(truth, [])
+        align_depth(truth, [])
     with pytest.raises(ValueError, match="B h w"):
-        anchor(truth[0], near)
+        align_depth(truth[0], near)
     with pytest.raises(ValueError, match="max_sigma_rel"):
-        anchor(truth, near, max_sigma_rel=0)
+        align_depth(truth, near, max_sigma_rel=0)
 
 
 def test_usual_fits():
     x = torch.linspace(1, 3, 40, dtype=torch.float64)
-    assert scale_shift.least_squares(x, 2 * x + 0.5) == pytest.approx((2, 0.5))
-    assert scale_shift.median_ratio(x, 2 * x) == (2, 0)
+    assert scale_shift.fit_scale_shift(x, 2 * x + 0.5) == pytest.approx((2, 0.5))
+    assert scale_shift.fit_median_scale(x, 2 * x) == (2, 0)
     z = 2 * x + 0.5
     z[::4] = 9
-    assert scale_shift.ransac(x, z) == pytest.approx((2, 0.5))
+    assert scale_shift.fit_scale_shift_ransac(x, z) == pytest.approx((2, 0.5))
 
 
 def test_summary_and_verdict_of_the_study():
@@ -231,7 +232,7 @@ def test_summary_and_verdict_of_the_study():
         {"scene": "a", "truth": "simulated", "method": by, "median_rel": e, "within_sigma": 0.7, "within_2sigma": 0.95}
         for by, e in {"anchor": 0.01, "raw": 0.05, "near least squares": 0.04}.items()
     ]
-    found = anchor_study.summary(rows, ["simulated"])
+    found = anchor_study.summarise_alignment(rows, ["simulated"])
     assert found["anchor.ratio_to_near_affine"]["value"] == pytest.approx(0.25)
     assert found["anchor.worst_ratio_to_better"]["value"] == pytest.approx(0.2)
     assert anchor_study.verdict(found) == (True, "5 of 5 bars met")
@@ -246,16 +247,16 @@ def test_exact_returns_outweigh_edges_that_an_affine_map_would_hide():
     edge = near.depth + torch.where(off, 0.25 * (1.6 - near.depth), 0.0)
     near = near.replace(depth=torch.where(near.usable, edge, near.depth))
     few = far.replace(gate=torch.where(torch.arange(600) % 20 > 0, Gate.NO_TRACK, far.gate).to(torch.int32))
-    assert error(anchor(truth, [near, few]), truth) < 0.005
+    assert error(align_depth(truth, [near, few]), truth) < 0.005
 
 
 def test_maps_of_a_batch_may_have_anchors_of_their_own_number():
     truth, near, far = world(batch=2)
     fewer = torch.tensor([[1], [0]], dtype=torch.bool) | (torch.arange(near.depth.shape[1]) % 4 == 0)
     some = near.replace(xyz=torch.where(fewer[..., None], near.xyz, torch.nan))
-    both = anchor(0.8 * truth, [some, far])
+    both = align_depth(0.8 * truth, [some, far])
     for k in range(2):
-        one = anchor(0.8 * truth[k : k + 1], [some[k : k + 1], far[k : k + 1]])
+        one = align_depth(0.8 * truth[k : k + 1], [some[k : k + 1], far[k : k + 1]])
         assert torch.allclose(one.depth, both.depth[k : k + 1], rtol=1e-9)
 
 
@@ -264,22 +265,22 @@ def test_a_handful_of_anchors_is_no_answer(left):
     truth, near, _ = world()
     first = near.usable & (near.usable.cumsum(-1) <= left)
     some = near.replace(xyz=torch.where(first[..., None], near.xyz, torch.nan))
-    assert (anchor(truth, some).gate == Gate.NO_POSE).all()
+    assert (align_depth(truth, some).gate == Gate.NO_POSE).all()
 
 
 def test_near_returns_alone_are_enough():
     truth, near, far = world()
     none = far.replace(gate=torch.full_like(far.gate, Gate.NO_BASELINE))
-    found = anchor(0.8 * truth, [near, none])
+    found = align_depth(0.8 * truth, [near, none])
     assert found.keep.all() and error(found, truth) < 0.01
-    assert torch.allclose(found.depth, anchor(0.8 * truth, near).depth, rtol=1e-6)
+    assert torch.allclose(found.depth, align_depth(0.8 * truth, near).depth, rtol=1e-6)
 
 
 def test_anchors_that_are_all_wrong_are_no_reason_to_be_sure():
     truth, near, far = world()
     g = torch.Generator().manual_seed(5)
     factor = (2 * torch.rand(near.depth.shape, generator=g) - 1).mul(0.7).exp()
-    found = anchor(truth, [near.replace(depth=near.depth * factor), far.replace(depth=far.depth * factor)])
+    found = align_depth(truth, [near.replace(depth=near.depth * factor), far.replace(depth=far.depth * factor)])
     kept = found.keep
     assert not kept.any() or float((found.sigma / found.depth)[kept].median()) > 0.1
 
@@ -288,10 +289,10 @@ def test_a_power_that_near_returns_do_not_refute_is_part_of_sigma():
     """Near returns of some noise tell a bent map no better by a power than by a line; exact ones refute the power."""
     truth, near, _ = world(noise=0.005)
     bent = 2 * (truth / 2) ** 0.85
-    found = anchor(bent, near)
+    found = align_depth(bent, near)
     assert ((found.depth - truth).abs() <= 2 * found.sigma).double().mean() > 0.95
     truth, near, _ = world(noise=0.0)
-    found = anchor(1.1 * truth + 0.2, near)
+    found = align_depth(1.1 * truth + 0.2, near)
     assert float((found.sigma / found.depth).median()) < 0.01 and error(found, truth) < 0.01
 
 
@@ -302,16 +303,16 @@ def test_numbers_with_one_scene_left_out():
         for k, scene in enumerate("abc", 1)
         for by, e in {"anchor": 0.01, "raw": 0.05, "near least squares": 0.04}.items()
     ]
-    found = anchor_study.one_left_out(rows, ["simulated"])["anchor.within_sigma_one_left_out"]
+    found = anchor_study.leave_one_scene_out(rows, ["simulated"])["anchor.within_sigma_one_left_out"]
     assert [found[k] for k in ("value", "low", "high")] == pytest.approx([0.72, 0.715, 0.725])
-    assert not anchor_study.one_left_out(rows[:3], ["simulated"])
+    assert not anchor_study.leave_one_scene_out(rows[:3], ["simulated"])
 
 
 def test_disparity_may_have_zeros_and_holes():
     truth, near, far = world()
     x = 40 / truth - 40 / truth.max()
     x[:, :, :3] = torch.nan
-    found = anchor(x, [near, far], kind="inverse")
+    found = align_depth(x, [near, far], kind="inverse")
     assert (found.gate[:, :, :3] == Gate.NO_TRACK).all() and (x == 0).any()
     assert found.keep[:, :, 3:].double().mean() > 0.99 and error(found, truth) < 0.01
 
@@ -321,7 +322,7 @@ def test_what_is_not_positive_is_no_depth(kind):
     depth, samples, _ = world()
     given = depth.clone()
     given[0, :5, :7], given[0, 5, :7] = 0.0, -1.0
-    found = anchor(given, [samples], kind=kind, hw=tuple(depth.shape[-2:]))
+    found = align_depth(given, [samples], kind=kind, hw=tuple(depth.shape[-2:]))
     assert (found.gate[0, :6, :7] == Gate.NO_TRACK).all() and (found.gate[0, 6:] != Gate.NO_TRACK).all()
 
 
@@ -330,14 +331,14 @@ def near_points(n, seed=0):
     g = torch.Generator().manual_seed(seed)
     share, x = torch.rand(1, n, 2, generator=g).double(), 1 + 3 * torch.rand(1, n, generator=g).double()
     one = torch.ones_like(x)
-    return Anchors(share, x, 0 * one, x, 1e-4 * one, 0 * one, one > 0, one > 0)
+    return MetricReferences(share, x, 0 * one, x, 1e-4 * one, 0 * one, one > 0, one > 0)
 
 
 def test_fits_start_from_what_most_anchors_say():
     points = near_points(200)
     y = 2 * points.x + 1
     wrong = torch.arange(200)[None] % 10 < 3
-    none, scale, shift, line = metric._starts(points.x, torch.where(wrong, 5 * y, y), points)[0]
+    none, scale, shift, line = align._initial_heads(points.x, torch.where(wrong, 5 * y, y), points)[0]
     assert none.tolist() == [1, 0] and scale[1] == 0 and shift[0] == 1
     torch.testing.assert_close(line, torch.tensor([2.0, 1.0]).double(), rtol=0.03, atol=0.03)
 
@@ -345,11 +346,13 @@ def test_fits_start_from_what_most_anchors_say():
 def test_anchors_that_are_left_out_are_not_fitted(monkeypatch):
     points = near_points(150)
     values = torch.linspace(1, 4, 48, dtype=torch.float64).view(1, 6, 8)
-    task = metric._task(values, values > 0, points, of_depth=True)
+    task = align._task(values, values > 0, points, of_depth=True)
     seen = []
-    fit = distortion.fit
-    monkeypatch.setattr(distortion, "fit", lambda task, model, used: seen.append(used) or fit(task, model, used))
-    left = metric._left_out(task, torch.tensor([[0, 1]]))
+    fit = error_model.fit_models
+    monkeypatch.setattr(
+        error_model, "fit_models", lambda task, model, used: seen.append(used) or fit(task, model, used)
+    )
+    left = align._cross_validate(task, torch.tensor([[0, 1]]))
     out = left.r.isfinite()
     used = seen[0].unflatten(1, out.shape[1:3])
     assert not (out & used).any() and (out | used).all() and (out.sum(2) == 2).all(), "in a block and in a quarter"
@@ -360,29 +363,29 @@ def test_few_anchors_that_were_left_out_move_sigma_little():
     for n in (8, 4000):
         points = near_points(n)
         r = 6 * 0.01 * torch.randn(1, 1, 1, n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        left = metric._Left(r, torch.full_like(r, 1e-4))
-        sixfold.append(float(metric._stretch(points, left, torch.zeros(1, 1, dtype=torch.int64))))
+        left = align._LeftOut(r, torch.full_like(r, 1e-4))
+        sixfold.append(float(align._sigma_scale(points, left, torch.zeros(1, 1, dtype=torch.int64))))
     few, many = sixfold
     assert 1 < few < 0.6 * many, sixfold
-    assert many == pytest.approx(min(6, metric.STRETCH[1]), rel=0.05)
+    assert many == pytest.approx(min(6, align.SIGMA_SCALE_RANGE[1]), rel=0.05)
 
 
 def test_a_rising_line_through_what_rises_is_what_it_goes_through():
     points = near_points(240)
     points = points._replace(depth=1 + points.x**2)
     x = torch.linspace(1.2, 3.8, 60, dtype=torch.float64).view(1, 6, 10)
-    torch.testing.assert_close(metric._ordered(x, points), 1 + x**2, rtol=0.05, atol=0)
+    torch.testing.assert_close(align._isotonic_map(x, points), 1 + x**2, rtol=0.05, atol=0)
     wavy = points._replace(depth=points.depth * (1 + 0.3 * (9 * points.x).sin()))
-    found = metric._ordered(x, wavy).flatten()
+    found = align._isotonic_map(x, wavy).flatten()
     assert (found.diff() >= -1e-12).all() and ((found / (1 + x.flatten() ** 2)).log().abs() < 0.35).all()
 
 
 def test_a_pixel_that_is_not_sure_enough_is_silent():
     truth, near, far = world()
-    x, _ = depth_faults.spoil("simulated", truth)
-    plain = anchor(x, [near, far])
+    x, _ = depth_faults.apply_fault("simulated", truth)
+    plain = align_depth(x, [near, far])
     rel = plain.sigma / plain.depth
     limit = float(rel.quantile(0.5)) * (1 + 1e-6)
-    found = anchor(x, [near, far], max_sigma_rel=limit)
+    found = align_depth(x, [near, far], max_sigma_rel=limit)
     assert torch.equal(found.gate == Gate.UNCERTAIN, rel > limit) and 0.3 < (rel > limit).double().mean() < 0.7
     assert ((found.gate == Gate.UNCERTAIN) | found.keep).all() and found.depth[~found.keep].isnan().all()

@@ -3,10 +3,9 @@
 import pytest
 import torch
 
-from dhtorch.alignment import align as metric
-from dhtorch.alignment import error_model as distortion
-from dhtorch.alignment.error_model import HEADS, MODELS, Fit, Task
-from dhtorch.alignment.references import Anchors
+from dhtorch.alignment import align, error_model
+from dhtorch.alignment.error_model import ERROR_MODELS, MODEL_HEADS, AlignmentProblem, ErrorModelFit
+from dhtorch.alignment.references import MetricReferences
 
 HW = (6, 8)
 
@@ -16,44 +15,45 @@ def points(n=40, seed=0):
     share = torch.rand(1, n, 2, generator=g, dtype=torch.float64)
     x = 1 + 3 * torch.rand(1, n, generator=g, dtype=torch.float64)
     one = torch.ones_like(x)
-    return Anchors(share, x, 0.1 * one, x, 1e-4 * one, 0 * one, one > 0, one > 0)
+    return MetricReferences(share, x, 0.1 * one, x, 1e-4 * one, 0 * one, one > 0, one > 0)
 
 
 def basis(of_depth=True):
     x = torch.linspace(1, 4, 48, dtype=torch.float64).view(1, *HW)
-    return distortion.basis_of(x, x > 0, of_depth=of_depth)
+    return error_model.make_basis(x, x > 0, of_depth=of_depth)
 
 
 @pytest.mark.parametrize("of_depth", [True, False])
 def test_a_head_gives_depth_or_its_inverse(of_depth):
     x, head = torch.tensor([0.5, 2.0, -9.0]).double(), torch.tensor([2.0, 1.0], dtype=torch.float64)
-    log, slope = distortion.log_depth(head, x, basis(of_depth))
-    y = torch.tensor([2.0, 5.0, distortion.LEAST_HEAD]).double()
+    log, slope = error_model.predict_log_depth(head, x, basis(of_depth))
+    y = torch.tensor([2.0, 5.0, error_model.MIN_HEAD]).double()
     torch.testing.assert_close(log, y.log() * (1 if of_depth else -1))
-    by_hand = torch.func.jacrev(lambda h: distortion.log_depth(h, x, basis(of_depth))[0])(head)
+    by_hand = torch.func.jacrev(lambda h: error_model.predict_log_depth(h, x, basis(of_depth))[0])(head)
     torch.testing.assert_close(slope[:2], by_hand[:2])
 
 
 def test_a_map_of_one_value_has_a_correction_too():
     flat = torch.full((1, *HW), 2.0, dtype=torch.float64)
-    found = distortion.basis_of(flat, flat > 0)
+    found = error_model.make_basis(flat, flat > 0)
     assert (
-        found.width.tolist() == [[1.0]] and distortion.curves(found, torch.full((1, 3), 2.0).double()).isfinite().all()
+        found.width.tolist() == [[1.0]]
+        and error_model.evaluate_curves(found, torch.full((1, 3), 2.0).double()).isfinite().all()
     )
 
 
 def test_short_fields_are_those_of_near_neighbours():
     where = torch.tensor([[[0.5, 0.5], [0.6, 0.5], [0.9, 0.9]]], dtype=torch.float64)
-    found = distortion.fields(basis(), where, torch.tensor([[False, True]]))
+    found = error_model.evaluate_fields(basis(), where, torch.tensor([[False, True]]))
     assert found.shape[:3] == (1, 2, 3)
     torch.testing.assert_close(found[0, :, :, :2], (2 * where - 1).expand(2, -1, -1))
-    kernel = found[0, :, :, distortion.SLOPES :] @ found[0, :, :, distortion.SLOPES :].mT
+    kernel = found[0, :, :, error_model.N_TILT_SLOPES :] @ found[0, :, :, error_model.N_TILT_SLOPES :].mT
     torch.testing.assert_close(kernel.diagonal(dim1=-2, dim2=-1), torch.ones(2, 3).double(), atol=0.1, rtol=0)
     assert kernel[0, 0, 1] > kernel[1, 0, 1] > kernel[1, 0, 2] and kernel[0, 0, 2] > kernel[1, 0, 2]
 
 
 def test_freedom_is_less_likely_than_none():
-    prior = {name: model.prior for name, model in MODELS.items()}
+    prior = {name: model.prior for name, model in ERROR_MODELS.items()}
     assert prior["shift"] == prior["scale"] and prior["shift_tilt"] == prior["scale_tilt"] == prior["affine"]
     assert prior["raw"] == 0 > prior["scale"] > prior["affine"] > prior["affine_tilt"] > prior["affine_long_4"]
     assert prior["raw"] > prior["raw_tilt"]
@@ -61,23 +61,25 @@ def test_freedom_is_less_likely_than_none():
 
 def test_what_a_fit_does_not_know_is_carried_to_the_anchors():
     anchors, of = points(), basis()
-    size = distortion.SLOPES + len(of.node) + distortion.KNOTS
+    size = error_model.N_TILT_SLOPES + len(of.node) + error_model.N_CURVE_KNOTS
     head = torch.tensor([[[1.5, 0.2]]], dtype=torch.float64)
     spread = torch.zeros(1, 1, 2 + size, 2 + size, dtype=torch.float64)
     spread[..., 0, 0], spread[..., 1, 1] = 0.03, 0.05
-    fit = Fit(
-        model=torch.tensor([[list(MODELS).index("affine")]]),
+    fit = ErrorModelFit(
+        model=torch.tensor([[list(ERROR_MODELS).index("affine")]]),
         head=head,
         beta=torch.zeros(1, 1, size, dtype=torch.float64),
         spread=spread,
         noise=torch.ones(1, 1, 2, dtype=torch.float64),
         evidence=torch.zeros(1, 1, dtype=torch.float64),
     )
-    mean, var = distortion.predicted(fit, Task(anchors, of, head.expand(1, len(HEADS), 2), anchors.x[:, :1]))
+    mean, var = error_model.predict_references(
+        fit, AlignmentProblem(anchors, of, head.expand(1, len(MODEL_HEADS), 2), anchors.x[:, :1])
+    )
     y = 1.5 * anchors.x + 0.2
     torch.testing.assert_close(mean[0], y.log())
     torch.testing.assert_close(var[0], ((0.03 * anchors.x) ** 2 + 0.05**2) / y**2)
-    torch.testing.assert_close(distortion.reading(head, anchors)[0], (0.1 * 1.5 / y) ** 2)
+    torch.testing.assert_close(error_model.placement_variance(head, anchors)[0], (0.1 * 1.5 / y) ** 2)
 
 
 def test_what_lies_between_nodes_is_part_of_what_is_believed_of_a_field():
@@ -86,43 +88,45 @@ def test_what_lies_between_nodes_is_part_of_what_is_believed_of_a_field():
     g = torch.Generator().manual_seed(0)
     where = torch.cat((of.node / of.aspect, torch.rand(60, 2, generator=g, dtype=torch.float64)))[None]
     names = ["raw", "raw_tilt", "scale_long_4", "raw_short_4"]
-    model = torch.tensor([[list(MODELS).index(name) for name in names]])
-    short = torch.tensor([[MODELS[name].short for name in names]])
-    field = distortion.fields(of, where, short)
-    found = distortion.between_nodes(model, field)[0]
+    model = torch.tensor([[list(ERROR_MODELS).index(name) for name in names]])
+    short = torch.tensor([[ERROR_MODELS[name].short for name in names]])
+    field = error_model.evaluate_fields(of, where, short)
+    found = error_model.interpolation_variance(model, field)[0]
     assert (found[:2] == 0).all() and found[2].sqrt().max() < 2e-4
     assert found[3, : len(of.node)].sqrt().max() < 2e-4 and found[3, len(of.node) :].sqrt().mean() > 2e-3
-    held = 0.04**2 * field[0, 3, :, distortion.SLOPES :].square().sum(-1)
+    held = 0.04**2 * field[0, 3, :, error_model.N_TILT_SLOPES :].square().sum(-1)
     torch.testing.assert_close(held + found[3], torch.full_like(held, 0.04**2), rtol=1e-4, atol=0)
 
 
 def test_a_fit_that_knows_all_its_nodes_is_unsure_between_them():
     """At the anchors and at every pixel, of the map whose anchors they are."""
     anchors, of = points(), basis()
-    size = distortion.SLOPES + len(of.node) + distortion.KNOTS
+    size = error_model.N_TILT_SLOPES + len(of.node) + error_model.N_CURVE_KNOTS
     head = torch.tensor([[[1.0, 0.0]]], dtype=torch.float64)
     x = torch.ones(1, 120, 160, dtype=torch.float64)
-    task = Task(anchors, of, head.expand(1, len(HEADS), 2), anchors.x[:, :1])
+    task = AlignmentProblem(anchors, of, head.expand(1, len(MODEL_HEADS), 2), anchors.x[:, :1])
     for name, low in (("raw", 0.0), ("raw_tilt", 0.0), ("raw_short_1", 6e-4), ("raw_short_4", 2.4e-3)):
-        fit = Fit(
-            model=torch.tensor([[list(MODELS).index(name)]]),
+        fit = ErrorModelFit(
+            model=torch.tensor([[list(ERROR_MODELS).index(name)]]),
             head=head,
             beta=torch.zeros(1, 1, size, dtype=torch.float64),
             spread=torch.zeros(1, 1, 2 + size, 2 + size, dtype=torch.float64),
             noise=torch.ones(1, 1, 2, dtype=torch.float64),
             evidence=torch.zeros(1, 1, dtype=torch.float64),
         )
-        for var in (distortion.predicted(fit, task)[1], metric._everywhere(task, fit, x)[1]):
+        for var in (error_model.predict_references(fit, task)[1], align._predict_map(task, fit, x)[1]):
             assert low <= float(var.mean().sqrt()) <= 1.5 * low
 
 
 def test_anchors_of_which_there_are_none_are_as_good_as_they_would_have_said():
     anchors = points()
-    task = Task(anchors, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(HEADS), 2), anchors.x[:, :1])
-    raw = torch.tensor([[list(MODELS).index("raw")]])
+    task = AlignmentProblem(
+        anchors, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(MODEL_HEADS), 2), anchors.x[:, :1]
+    )
+    raw = torch.tensor([[list(ERROR_MODELS).index("raw")]])
     for near in (True, False):
         alone = anchors._replace(near=torch.full_like(anchors.near, near))
-        noise = distortion.fit(task._replace(points=alone), raw, alone.used).noise[0, 0]
+        noise = error_model.fit_models(task._replace(points=alone), raw, alone.used).noise[0, 0]
         assert noise[int(near)] == 1, "near answers, far ones"
 
 
@@ -130,8 +134,8 @@ def test_far_answers_lean_together_and_near_returns_do_not():
     anchors = points()
     far = torch.arange(40)[None] % 2 == 0
     anchors = anchors._replace(near=~far, shared=torch.where(far, 0.05, 0.0).double())
-    lean = distortion.leans(anchors)
-    assert lean.shape == (1, 40, distortion.LEANS) and (lean[~far] == 0).all()
+    lean = error_model.motion_error_basis(anchors)
+    assert lean.shape == (1, 40, error_model.N_MOTION_ERRORS) and (lean[~far] == 0).all()
     torch.testing.assert_close(lean[far][:, 0], torch.full((20,), 0.05).double())
     assert (lean[far].abs().amax(0) > 0.02).all() and lean.abs().max() <= 3 * 0.05
 
@@ -141,10 +145,12 @@ def worth_of_a_scale(scale):
     anchors = points(n=12)
     noise = 0.05 * torch.randn(1, 12, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     anchors = anchors._replace(depth=scale * anchors.x * noise.exp(), var=torch.full_like(anchors.var, 0.05**2))
-    task = Task(anchors, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(HEADS), 2), anchors.x[:, :1])
-    model = torch.tensor([[list(MODELS).index("scale")]])
-    found = distortion.fit(task, model, anchors.used, distortion.MANY)
-    problem = distortion._problem(task, model, anchors.used)
+    task = AlignmentProblem(
+        anchors, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(MODEL_HEADS), 2), anchors.x[:, :1]
+    )
+    model = torch.tensor([[list(ERROR_MODELS).index("scale")]])
+    found = error_model.fit_models(task, model, anchors.used, error_model.FINAL_STEPS)
+    problem = error_model._problem(task, model, anchors.used)
     spread = problem.square(found.noise[0]).sqrt()
     tails = torch.distributions.StudentT(problem.freedom)
     xi = torch.zeros(1, problem.phi.shape[-1] + 2, dtype=torch.float64)

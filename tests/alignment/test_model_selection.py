@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from dhtorch.alignment.align import _Left, _simplest
-from dhtorch.alignment.error_model import HEADS
-from dhtorch.alignment.references import BLOCKS, Anchors
+from dhtorch.alignment.align import _LeftOut, _simplest
+from dhtorch.alignment.error_model import MODEL_HEADS
+from dhtorch.alignment.references import ERROR_BLOCKS, MetricReferences
 
 RAW, SCALE, SHIFT, AFFINE, DRIFT = range(5)
 PER_BLOCK = 4
@@ -14,13 +14,13 @@ PER_BLOCK = 4
 @pytest.fixture(scope="module")
 def points():
     """Near returns and far answers, four of each in every block of the picture."""
-    rows, columns = BLOCKS
+    rows, columns = ERROR_BLOCKS
     v, u = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
     cell = torch.stack(((u + 0.5) / columns, (v + 0.5) / rows), -1).flatten(0, 1).double()
     share = cell.repeat(2 * PER_BLOCK, 1)[None]
     near = (torch.arange(share.shape[1]) < share.shape[1] // 2)[None]
     one = torch.ones_like(share[..., 0])
-    return Anchors(
+    return MetricReferences(
         share, x=one, within=0 * one, depth=one, var=1e-4 * one, shared=0 * one, near=near, used=torch.ones_like(near)
     )
 
@@ -32,7 +32,7 @@ def taken(points, near, far, seed=0):
     noise = torch.randn(points.x.shape[1], generator=draw, dtype=torch.float64)  # an anchor's own, to all models
     size = [torch.where(points.near[0], a or torch.nan, b or torch.nan) for a, b in zip(near, far, strict=True)]
     r = (torch.stack(size) * noise)[None, :, None]
-    return int(_simplest(points, _Left(r, torch.full_like(r, 1e-4)), list(HEADS), torch.tensor([AFFINE])))
+    return int(_simplest(points, _LeftOut(r, torch.full_like(r, 1e-4)), list(MODEL_HEADS), torch.tensor([AFFINE])))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -78,7 +78,7 @@ def test_a_shift_that_near_returns_meet_exactly_is_not_refuted_by_one_standard_e
             far = torch.tensor([0.020, 0.020, 0.1, 0.023, 0.1])[:, None] * noise
             near = torch.tensor([0.1, 0.1, 0.1, met, 0.1])[:, None] * noise[:1]
             r = torch.where(points.near, near, far)[None, :, None]
-            place = _simplest(points, _Left(r, torch.full_like(r, 1e-4)), list(HEADS), torch.tensor([AFFINE]))
+            place = _simplest(points, _LeftOut(r, torch.full_like(r, 1e-4)), list(MODEL_HEADS), torch.tensor([AFFINE]))
             kept[met] += int(place) == AFFINE
     assert kept[0.0005] > kept[0.01] + 5
 

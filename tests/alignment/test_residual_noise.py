@@ -3,9 +3,16 @@
 import pytest
 import torch
 
-from dhtorch.alignment.error_model import LENGTHS
-from dhtorch.alignment.references import FLOOR, Anchors, at_anchors, spread_within
-from dhtorch.alignment.residual_noise import SCATTER, SMOOTH, _at_edges, _in_places, _standing_out, variance
+from dhtorch.alignment.error_model import FIELD_LENGTHS
+from dhtorch.alignment.references import MIN_RETURN_ERROR, MetricReferences, local_spread, sample_at_references
+from dhtorch.alignment.residual_noise import (
+    DEFAULT_RESIDUAL,
+    MAP_CORRELATION_LENGTH,
+    _edge_noise,
+    _local_variance,
+    _standing_out,
+    residual_variance,
+)
 
 HW = (60, 80)
 
@@ -15,13 +22,15 @@ def seen(log, truth, n=500, seed=0, noise=0.0, stated=0.0):
     pixel (1, h, w)."""
     g = torch.Generator().manual_seed(seed)
     share = torch.rand(len(log), n, 2, generator=g, dtype=torch.float64)
-    r = at_anchors(truth, share)[0] - at_anchors(log, share)[0]
+    r = sample_at_references(truth, share)[0] - sample_at_references(log, share)[0]
     if isinstance(noise, torch.Tensor):
-        noise = at_anchors(noise, share)[0]
+        noise = sample_at_references(noise, share)[0]
     r = r + noise * torch.randn(r.shape, generator=g, dtype=torch.float64)
     one = torch.ones_like(r)
-    points = Anchors(share, one, 0 * one, one, (stated**2 + FLOOR**2) * one, 0 * one, one > 0, one > 0)
-    return points, r, (at_anchors(spread_within(log), share)[0].square(), 0 * one)
+    points = MetricReferences(
+        share, one, 0 * one, one, (stated**2 + MIN_RETURN_ERROR**2) * one, 0 * one, one > 0, one > 0
+    )
+    return points, r, (sample_at_references(local_spread(log), share)[0].square(), 0 * one)
 
 
 def room():
@@ -38,7 +47,7 @@ def wall():
 
 
 def sigma(log, truth, **options):
-    return variance(*seen(log, truth, **options), log, torch.ones_like(log, dtype=torch.bool)).sqrt()
+    return residual_variance(*seen(log, truth, **options), log, torch.ones_like(log, dtype=torch.bool)).sqrt()
 
 
 def test_a_map_that_returns_follow_is_not_in_doubt():
@@ -96,7 +105,7 @@ def test_chance_is_no_error_of_a_map():
 
 
 def test_slow_errors_are_as_smooth_as_the_shortest_field():
-    assert min(LENGTHS) == SMOOTH
+    assert min(FIELD_LENGTHS) == MAP_CORRELATION_LENGTH
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -134,8 +143,8 @@ def test_less_than_returns_state_is_the_maps_where_it_goes_with_its_edges(goes_w
         points, *_ = seen(wall(), wall(), n=300, seed=seed)
         r = goes_with * stands + (1 - abs(goes_with)) * noise
         of_map, levels = (stands, 0.01 * one, points.of_block), (0.001 * one[:, :1], 0.5 * one[:, :1])
-        found.append(float(_at_edges(r, of_map, levels, one > 0, 0.01**2 * one[:, :1])))
-        assert float(_at_edges(r, of_map, levels, one > 0, 0 * one[:, :1])) == pytest.approx(0.5)
+        found.append(float(_edge_noise(r, of_map, levels, one > 0, 0.01**2 * one[:, :1])))
+        assert float(_edge_noise(r, of_map, levels, one > 0, 0 * one[:, :1])) == pytest.approx(0.5)
     assert sorted(found)[6] == pytest.approx(kept, abs=0.02)
 
 
@@ -159,8 +168,8 @@ def test_without_near_returns_a_usual_map_is_meant():
     truth, _ = room()
     points, r, told = seen(truth, truth)
     none = points._replace(near=points.near & False)
-    found = variance(none, r, told, truth, torch.ones_like(truth, dtype=torch.bool)).sqrt()
-    assert torch.allclose(found.amin(), torch.tensor(SCATTER, dtype=torch.float64), rtol=0.2)
+    found = residual_variance(none, r, told, truth, torch.ones_like(truth, dtype=torch.bool)).sqrt()
+    assert torch.allclose(found.amin(), torch.tensor(DEFAULT_RESIDUAL, dtype=torch.float64), rtol=0.2)
 
 
 def test_alone_as_in_a_batch():
@@ -169,9 +178,11 @@ def test_alone_as_in_a_batch():
     both = sigma(log, log + 0.01 * truth)
     points, r, told = seen(log, log + 0.01 * truth)
     for k in range(2):
-        one = Anchors(*(part[k : k + 1] for part in points))
+        one = MetricReferences(*(part[k : k + 1] for part in points))
         told_one = (told[0][k : k + 1], told[1][k : k + 1])
-        alone = variance(one, r[k : k + 1], told_one, log[k : k + 1], torch.ones_like(log[:1], dtype=torch.bool))
+        alone = residual_variance(
+            one, r[k : k + 1], told_one, log[k : k + 1], torch.ones_like(log[:1], dtype=torch.bool)
+        )
         assert torch.allclose(alone.sqrt(), both[k : k + 1], rtol=1e-9)
 
 
@@ -188,5 +199,5 @@ def test_what_is_off_in_one_place_is_no_doubt_in_another():
     flat = torch.zeros_like(log)
     share = 0.1 * torch.rand(1, 50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     one = torch.ones(1, 50, dtype=torch.float64)
-    found = _in_places(share, 0 * one, (one, one > 0), flat, torch.ones_like(flat, dtype=torch.bool))[0]
+    found = _local_variance(share, 0 * one, (one, one > 0), flat, torch.ones_like(flat, dtype=torch.bool))[0]
     assert found[2, 3] > 0.9 and found[:3, 22:].max() < 0.01 and found[-10:].max() < 0.01

@@ -37,26 +37,26 @@ def test_pool_adjacent_violators_equals_the_min_max_formula(n):
     for kind in range(4):
         y = [draw.choice([0.0, 1.0]) if kind % 2 else draw.gauss(0.1 * i, 1) for i in range(n)]
         w = [1.0] * n if kind < 2 else [draw.uniform(0.1, 3) for _ in range(n)]
-        found = monotone.pool_adjacent_violators(torch.tensor(y), torch.tensor(w)).tolist()
+        found = monotone._pool_adjacent_violators(torch.tensor(y), torch.tensor(w)).tolist()
         assert found == pytest.approx(brute_isotonic(torch.tensor(y).tolist(), torch.tensor(w).tolist()), abs=1e-6)
 
 
 def test_a_table_runs_through_the_middles_of_the_blocks():
     x = torch.tensor([0.1, 0.2, 0.3, 0.5, 0.7, 0.9])
     y = torch.tensor([0.0, 0.0, 1.0, 0.0, 1.0, 1.0])  # blocks: .1 .2 at 0, .3 .5 at ½, .7 .9 at 1
-    table = monotone.isotonic(x, y)
+    table = monotone.fit_isotonic(x, y)
     at = torch.tensor([0.15, 0.4, 0.8], dtype=torch.float64)
-    assert table(at).tolist() == pytest.approx([0, 0.5, 1], abs=1.1 * monotone.TILT)
-    assert float(table(torch.tensor(0.275))) == pytest.approx(0.25, abs=1.1 * monotone.TILT)
+    assert table(at).tolist() == pytest.approx([0, 0.5, 1], abs=1.1 * monotone._MAX_END_RISE)
+    assert float(table(torch.tensor(0.275))) == pytest.approx(0.25, abs=1.1 * monotone._MAX_END_RISE)
     assert table(torch.tensor([-1.0, 0.1, 0.9, 7.0])).tolist() == pytest.approx([0, 0, 1, 1])
-    falling = monotone.isotonic(x, 1 - y, rising=False)
-    assert falling(at).tolist() == pytest.approx([1, 0.5, 0], abs=1.1 * monotone.TILT)
+    falling = monotone.fit_isotonic(x, 1 - y, rising=False)
+    assert falling(at).tolist() == pytest.approx([1, 0.5, 0], abs=1.1 * monotone._MAX_END_RISE)
 
 
 def test_a_table_keeps_every_order_within_its_range():
     x = uniform(400)
     for y in ((uniform(400, seed=1) < x).double(), (uniform(400, seed=1) < 0.5).double()):
-        table = monotone.isotonic(x, y, min_share=0.05, ends=(0, 1))
+        table = monotone.fit_isotonic(x, y, min_share=0.05, ends=(0, 1))
         values = table(torch.linspace(0, 1, 5000, dtype=torch.float64))
         assert (values.diff() > 0).all() or table.y.unique().numel() == 1
         assert values[0] >= 0 and values[-1] <= 1
@@ -66,26 +66,26 @@ def test_a_table_keeps_every_order_within_its_range():
 
 def test_blocks_are_joined_until_they_weigh_enough():
     x, y = torch.arange(100.0), (torch.arange(100) >= 99).double()  # one lucky point at the top
-    bold, careful = monotone.isotonic(x, y), monotone.isotonic(x, y, min_share=0.1)
+    bold, careful = monotone.fit_isotonic(x, y), monotone.fit_isotonic(x, y, min_share=0.1)
     assert float(bold(torch.tensor(99.0))) == 1
     assert float(careful(torch.tensor(99.0))) < 0.2
     g = uniform(300, seed=3)
-    joined = monotone.isotonic(g, (uniform(300, seed=4) < g).double(), min_share=0.1)
+    joined = monotone.fit_isotonic(g, (uniform(300, seed=4) < g).double(), min_share=0.1)
     assert joined.x.numel() <= 10 + 2
 
 
 def test_equal_arguments_share_a_value_and_weights_count():
     x = torch.tensor([0.0, 0.0, 1.0, 1.0])
-    table = monotone.isotonic(x, torch.tensor([0.0, 1.0, 1.0, 1.0]), torch.tensor([3.0, 1.0, 1.0, 0.0]))
+    table = monotone.fit_isotonic(x, torch.tensor([0.0, 1.0, 1.0, 1.0]), torch.tensor([3.0, 1.0, 1.0, 0.0]))
     assert table(torch.tensor([0.0, 1.0])).tolist() == pytest.approx([0.25, 1.0])
     with pytest.raises(ValueError, match="isotonic: found no point"):
-        monotone.isotonic(x, x, torch.zeros(4))
+        monotone.fit_isotonic(x, x, torch.zeros(4))
     with pytest.raises(ValueError, match="isotonic: y has shape"):
-        monotone.isotonic(x, x[1:])
+        monotone.fit_isotonic(x, x[1:])
 
 
 def test_one_value_is_a_constant():
-    table = monotone.isotonic(torch.tensor([0.4]), torch.tensor([0.7]))
+    table = monotone.fit_isotonic(torch.tensor([0.4]), torch.tensor([0.7]))
     assert table(torch.tensor([0.0, 0.4, 9.0])).tolist() == pytest.approx([0.7] * 3)
 
 
@@ -95,7 +95,7 @@ def test_one_value_is_a_constant():
 def test_platt_minimises_the_log_loss():
     p, w = uniform(500), uniform(500, seed=1)
     good = uniform(500, seed=2) < p**2
-    found = monotone.platt(p, good, w)
+    found = monotone.fit_platt(p, good, w)
 
     def loss(slope, offset):
         claimed = torch.sigmoid(slope * torch.logit(p, eps=1e-6) + offset)
@@ -113,10 +113,10 @@ def test_platt_minimises_the_log_loss():
 def test_platt_survives_separable_one_sided_and_missing_data():
     p = torch.linspace(0, 1, 50, dtype=torch.float64)
     for good in (p > 0.5, p > 2, p >= 0):
-        found = monotone.platt(p, good)
+        found = monotone.fit_platt(p, good)
         assert torch.isfinite(found.slope) and torch.isfinite(found.offset)
         assert found(p).isfinite().all()
-    nothing = monotone.platt(torch.zeros(0), torch.zeros(0).bool())
+    nothing = monotone.fit_platt(torch.zeros(0), torch.zeros(0).bool())
     assert (float(nothing.slope), float(nothing.offset)) == (1, 0)
 
 
@@ -126,7 +126,7 @@ def test_platt_survives_separable_one_sided_and_missing_data():
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_table_is_numpys_interpolation(sign):
     x, y = uniform(9).sort().values, sign * uniform(9, seed=1).sort().values
-    table, at = monotone.Table(x, y), torch.linspace(-0.5, 1.5, 81, dtype=torch.float64)
+    table, at = monotone.MonotoneTable(x, y), torch.linspace(-0.5, 1.5, 81, dtype=torch.float64)
     at = torch.cat((at, x))
     assert table(at).tolist() == pytest.approx(np.interp(at, x, y).tolist(), abs=1e-12)
     assert table(at.view(2, 1, 45)).shape == (2, 1, 45) and torch.equal(table(at[::2]), table(at)[::2])
@@ -138,13 +138,15 @@ def test_a_table_is_numpys_interpolation(sign):
 
 
 def test_corners_that_a_short_float_cannot_tell_apart_are_a_step():
-    table = monotone.Table(torch.tensor([0.0, 1.0, 1.0 + 1e-12, 2.0]).double(), torch.tensor([0.0, 1.0, 3.0, 4.0]))
+    table = monotone.MonotoneTable(
+        torch.tensor([0.0, 1.0, 1.0 + 1e-12, 2.0]).double(), torch.tensor([0.0, 1.0, 3.0, 4.0])
+    )
     found = table(torch.tensor([0.5, 1.0, 1.5]))
     assert found[[0, 2]].tolist() == [0.5, 3.5] and 1 <= float(found[1]) <= 3
 
 
 def test_a_table_of_one_corner_passes_nan_on():
-    table = monotone.Table(torch.tensor([0.4]), torch.tensor([0.7]))
+    table = monotone.MonotoneTable(torch.tensor([0.4]), torch.tensor([0.7]))
     found = table(torch.tensor([[0.1, torch.nan, 9.0]]))
     assert found.isnan().tolist() == [[False, True, False]] and found[0, [0, 2]].tolist() == pytest.approx([0.7] * 2)
 
@@ -204,7 +206,7 @@ def test_a_table_runs_straight_from_the_middle_of_a_block_to_the_next(n, options
     y = y if rising else -y
     weight = g.integers(0, 4, n) / 2
     weight[0] = 1.0
-    found = monotone.isotonic(*map(torch.from_numpy, (x, y, weight)), rising=rising, **options)
+    found = monotone.fit_isotonic(*map(torch.from_numpy, (x, y, weight)), rising=rising, **options)
     asked = {"min_share": 0.0, "ends": None, **options}
     xs, ys = loop_isotonic(x.tolist(), y.tolist(), weight.tolist(), rising, **asked)
     assert found.x.tolist() == pytest.approx(xs, abs=1e-9) and found.y.tolist() == pytest.approx(ys, abs=1e-9)
@@ -212,15 +214,15 @@ def test_a_table_runs_straight_from_the_middle_of_a_block_to_the_next(n, options
 
 def test_steps_smaller_than_four_tilts_are_tilted_by_a_quarter():
     x = torch.tensor([0.0, 0.2, 0.6, 1.0])
-    table = monotone.isotonic(x, torch.tensor([0.5, 0.5, 0.502, 0.502]).double())
+    table = monotone.fit_isotonic(x, torch.tensor([0.5, 0.5, 0.502, 0.502]).double())
     assert table.x.tolist() == pytest.approx([0, 0.1, 0.8, 1.0])
     assert table.y.tolist() == pytest.approx([0.5, 0.5005, 0.5015, 0.502])
 
 
 def test_a_block_that_weighs_just_enough_stays():
     x, y = torch.arange(4.0), torch.tensor([0.0, 1.0, 2.0, 3.0])
-    assert monotone.isotonic(x, y, min_share=0.25).y.tolist() == [0, 1, 2, 3]
-    assert monotone.isotonic(x, y, min_share=0.26).y.tolist() == pytest.approx([0.5, 0.5 + 1e-3, 2.5 - 1e-3, 2.5])
+    assert monotone.fit_isotonic(x, y, min_share=0.25).y.tolist() == [0, 1, 2, 3]
+    assert monotone.fit_isotonic(x, y, min_share=0.26).y.tolist() == pytest.approx([0.5, 0.5 + 1e-3, 2.5 - 1e-3, 2.5])
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -236,32 +238,32 @@ def test_platt_is_the_minimum_that_scipy_finds(seed):
         claimed = -sign * (theta[0] * feature + theta[1])
         return (share * np.logaddexp(0, claimed)).sum() + 0.5e-6 * ((theta[0] - 1) ** 2 + theta[1] ** 2)
 
-    found = monotone.platt(p, good, w)
+    found = monotone.fit_platt(p, good, w)
     best = optimize.minimize(
         loss, [1.0, 0.0], method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-15, "maxiter": 4000}
     )
     tolerance = 2e-3 if seed == 2 else 1e-5
     assert [float(found.slope), float(found.offset)] == pytest.approx(best.x.tolist(), rel=tolerance, abs=1e-5)
-    scaled = monotone.platt(p, good, 1000 * w)
+    scaled = monotone.fit_platt(p, good, 1000 * w)
     assert float(scaled.slope) == pytest.approx(float(found.slope), rel=1e-9), "weights are shares"
 
 
 def test_platt_takes_as_many_steps_as_asked():
     p, good = uniform(200), uniform(200, seed=2) < uniform(200) ** 3
-    none, one, all_ = (monotone.platt(p, good, **options) for options in ({"steps": 0}, {"steps": 1}, {}))
+    none, one, all_ = (monotone.fit_platt(p, good, **options) for options in ({"steps": 0}, {"steps": 1}, {}))
     assert (float(none.slope), float(none.offset)) == (1, 0)
     assert float(one.offset) != 0 and float(one.offset) != pytest.approx(float(all_.offset), rel=1e-3)
     with pytest.raises(ValueError, match="platt: "):
-        monotone.platt(p, good[1:])
+        monotone.fit_platt(p, good[1:])
     with pytest.raises(ValueError, match="pool_adjacent_violators: "):
-        monotone.pool_adjacent_violators(p, p[1:])
+        monotone._pool_adjacent_violators(p, p[1:])
 
 
 def test_pool_adjacent_violators_equals_scikit_learn():
     sklearn = pytest.importorskip("sklearn.isotonic")
     y, w = uniform(3000) + torch.linspace(0, 1, 3000, dtype=torch.float64), uniform(3000, seed=1) + 0.01
     expected = sklearn.isotonic_regression(y.numpy(), sample_weight=w.numpy())
-    assert monotone.pool_adjacent_violators(y, w).tolist() == pytest.approx(expected.tolist(), abs=1e-12)
+    assert monotone._pool_adjacent_violators(y, w).tolist() == pytest.approx(expected.tolist(), abs=1e-12)
 
 
 def test_platt_equals_scikit_learn():
@@ -270,7 +272,7 @@ def test_platt_equals_scikit_learn():
     good = uniform(800, seed=2) < p**2
     model = linear.LogisticRegression(C=1e8, tol=1e-10, max_iter=1000)
     model.fit(torch.logit(p, eps=1e-6)[:, None].numpy(), good.numpy(), sample_weight=w.numpy())
-    found = monotone.platt(p, good, w)
+    found = monotone.fit_platt(p, good, w)
     assert [float(found.slope), float(found.offset)] == pytest.approx(
         [model.coef_[0, 0], model.intercept_[0]], abs=1e-3
     )

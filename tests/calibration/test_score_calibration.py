@@ -34,12 +34,12 @@ def scene_of(n, seed=0, spread=1.0, silent=0.2, boast=1.0, floor=0.0):
     noise = ((spread * rel) ** 2 + floor**2).sqrt() * torch.randn(n, generator=g, dtype=torch.float64)
     depth = (true * (1 + noise)).clamp_min(0.01)
     keep = torch.rand(n, generator=g, dtype=torch.float64) >= silent
-    return errors.points(depth, true, (0.1 / (0.1 + rel)) ** boast, sigma=rel * true, keep=keep)
+    return errors.make_points(depth, true, (0.1 / (0.1 + rel)) ** boast, sigma=rel * true, keep=keep)
 
 
 def fitted(**provenance):
     note = {"method": "test", "scenes": ["a", "b"]} | provenance
-    return score_calibration.fit([scene_of(800, s) for s in range(3)], provenance=note)
+    return score_calibration.fit_calibration([scene_of(800, s) for s in range(3)], provenance=note)
 
 
 # ---------------------------------------------------------------------------------------------------- plain loops
@@ -82,42 +82,44 @@ def test_the_correction_of_sigma_equals_plain_loops(spread, floor, gross):
     scenes[0].sigma[:5], scenes[1].sigma[3] = 0.0, math.inf
     for scene in scenes:
         scene.depth[5 : 5 + gross] *= 3  # gross errors, more than one in ten
-    found = score_calibration.fit_sigma(scenes)
+    found = score_calibration.fit_sigma_model(scenes)
     scale, floor, wider = loop_sigma(scenes)
     assert (found.scale, found.floor) == pytest.approx((scale, floor), rel=1e-6) and (wider > 1) is (gross > 0)
 
 
 def test_a_calibration_is_made_of_what_the_functions_say():
     scenes = [scene_of(n, s) for s, n in enumerate((90, 40, 60))]
-    silent = errors.points(torch.full((4,), math.nan), torch.ones(4))
-    score, good, weight = reliability.pool(scenes)
+    silent = errors.make_points(torch.full((4,), math.nan), torch.ones(4))
+    score, good, weight = reliability.pool_answers(scenes)
     loss = torch.cat([s.answered().error.clamp(max=1) for s in scenes])
     for options, share in (({}, 0.02), ({"min_share": 0.2}, 0.2)):
-        learnt = score_calibration.fit([*scenes, silent], **options)
+        learnt = score_calibration.fit_calibration([*scenes, silent], **options)
         steps = {"min_share": share, "ends": (0.0, 1.0)}
         for found, wanted in (
-            (learnt.probability, monotone.isotonic(score, good.double(), weight, **steps)),
-            (learnt.expected_error, monotone.isotonic(score, loss, weight, rising=False, **steps)),
+            (learnt.probability, monotone.fit_isotonic(score, good.double(), weight, **steps)),
+            (learnt.expected_error, monotone.fit_isotonic(score, loss, weight, rising=False, **steps)),
         ):
             assert torch.equal(found.x, wanted.x) and torch.equal(found.y, wanted.y)
-    assert torch.equal(learnt.sigmoid.slope, monotone.platt(score, good, weight).slope)
-    assert learnt.sigma == score_calibration.fit_sigma(scenes)
+    assert torch.equal(learnt.sigmoid.slope, monotone.fit_platt(score, good, weight).slope)
+    assert learnt.sigma == score_calibration.fit_sigma_model(scenes)
     everyone = [*scenes, silent]
-    assert learnt.thresholds == {k: control.plug_in(everyone, k / 100).threshold for k in (5, 10, 20)}
+    assert learnt.thresholds == {k: control.plug_in_threshold(everyone, k / 100).threshold for k in (5, 10, 20)}
     assert learnt.provenance == {"n_scenes": 3, "n_answers": score.numel()}
-    other = score_calibration.fit(scenes, targets=(30,), provenance={"method": "x"})
-    assert other.thresholds == {30: control.plug_in(scenes, 0.3).threshold} and other.provenance["method"] == "x"
+    other = score_calibration.fit_calibration(scenes, targets=(30,), provenance={"method": "x"})
+    assert (
+        other.thresholds == {30: control.plug_in_threshold(scenes, 0.3).threshold} and other.provenance["method"] == "x"
+    )
 
 
 def test_scores_beyond_0_and_1_end_the_tables_where_they_end():
     scene = scene_of(60, 1)
     wide = scene.replace(score=torch.where(scene.keep, 3 * scene.score - 1, 0.0))
-    learnt = score_calibration.fit([wide])
+    learnt = score_calibration.fit_calibration([wide])
     answered = wide.answered().score
     for table in (learnt.probability, learnt.expected_error):
         assert (float(table.x[0]), float(table.x[-1])) == (float(answered.min()), float(answered.max()))
     edge = scene.replace(score=torch.where(scene.keep, scene.score.clamp(0.3, 0.6), 0.0))
-    assert [float(score_calibration.fit([edge]).probability.x[k]) for k in (0, -1)] == [0, 1]
+    assert [float(score_calibration.fit_calibration([edge]).probability.x[k]) for k in (0, -1)] == [0, 1]
 
 
 def test_a_calibration_is_applied_to_score_and_sigma():
@@ -135,7 +137,8 @@ def test_a_calibration_is_applied_to_score_and_sigma():
     assert torch.equal(found.depth[scene.keep], scene.depth[scene.keep])
     bare = scene.replace(sigma=scene.sigma * math.nan)
     assert (
-        score_calibration.fit([bare]).sigma is None and score_calibration.fit([bare]).apply(scene).sigma is scene.sigma
+        score_calibration.fit_calibration([bare]).sigma is None
+        and score_calibration.fit_calibration([bare]).apply(scene).sigma is scene.sigma
     )
 
 
@@ -147,13 +150,15 @@ def test_the_least_score_is_the_threshold_after_calibration():
     assert silent.min_score(10) is None and '"10": null' in silent.to_json()
     with pytest.raises(KeyError):
         silent.min_score(5)
-    with_none = score_calibration.from_json(dataclasses.replace(silent, sigma=None).to_json())
+    with_none = score_calibration.parse_calibration(dataclasses.replace(silent, sigma=None).to_json())
     assert with_none.sigma is None and with_none.thresholds == {10: None}
 
 
 def test_floors_are_tried_from_a_ten_thousandth_to_a_tenth():
-    assert score_calibration.FLOORS[:2] == (0.0, 1e-4) and score_calibration.FLOORS[-1] == pytest.approx(0.1)
-    assert np.diff(np.log10(score_calibration.FLOORS[1:])) == pytest.approx([0.1] * 30)
+    assert score_calibration._SIGMA_FLOORS_REL[:2] == (0.0, 1e-4) and score_calibration._SIGMA_FLOORS_REL[
+        -1
+    ] == pytest.approx(0.1)
+    assert np.diff(np.log10(score_calibration._SIGMA_FLOORS_REL[1:])) == pytest.approx([0.1] * 30)
 
 
 # ---------------------------------------------------------------------------------------------------- calibration
@@ -162,18 +167,24 @@ def test_floors_are_tried_from_a_ten_thousandth_to_a_tenth():
 def test_a_boastful_score_becomes_calibrated_in_scenes_not_fitted():
     fitting = [scene_of(4000, seed, boast=0.3) for seed in range(6)]
     fresh = [scene_of(4000, seed, boast=0.3) for seed in range(10, 16)]
-    learnt = score_calibration.fit(fitting)
-    before, after = reliability.measure(fresh)["ece"], reliability.measure([learnt.apply(s) for s in fresh])["ece"]
+    learnt = score_calibration.fit_calibration(fitting)
+    before, after = (
+        reliability.measure_reliability(fresh)["ece"],
+        reliability.measure_reliability([learnt.apply(s) for s in fresh])["ece"],
+    )
     assert before > 0.1 and after < 0.02
     expected = torch.cat([learnt.expected_error(s.answered().score) for s in fresh])
-    actual = torch.cat([risk.capped(s.answered().error) for s in fresh])
+    actual = torch.cat([risk.cap_error(s.answered().error) for s in fresh])
     assert float(expected.mean()) == pytest.approx(float(actual.mean()), rel=0.05)
     assert float(expected[expected < 0.05].mean()) == pytest.approx(float(actual[expected < 0.05].mean()), rel=0.1)
 
 
 def test_every_scene_teaches_equally():
     few, many = scene_of(50, 1), scene_of(5000, 2, spread=3.0)
-    once, copied = score_calibration.fit([few, many]), score_calibration.fit([few, many[torch.arange(5000).repeat(3)]])
+    once, copied = (
+        score_calibration.fit_calibration([few, many]),
+        score_calibration.fit_calibration([few, many[torch.arange(5000).repeat(3)]]),
+    )
     at = torch.linspace(0, 1, 30, dtype=torch.float64)
     torch.testing.assert_close(once.probability(at), copied.probability(at))
     torch.testing.assert_close(once.expected_error(at), copied.expected_error(at))
@@ -182,46 +193,48 @@ def test_every_scene_teaches_equally():
 @pytest.mark.parametrize(("spread", "floor"), [(0.5, 0.0), (1.0, 0.0), (2.0, 0.0), (1.5, 0.03), (0.7, 0.1)])
 def test_the_correction_of_sigma_is_found(spread, floor):
     scenes = [scene_of(n, seed, spread=spread, floor=floor) for seed, n in enumerate((1500, 4000, 2500))]
-    found = score_calibration.fit_sigma(scenes)
+    found = score_calibration.fit_sigma_model(scenes)
     stated, one = torch.linspace(0.02, 0.32, 30, dtype=torch.float64), torch.ones(30, dtype=torch.float64)
     torch.testing.assert_close(
         found(stated, one), score_calibration.SigmaModel(spread, floor)(stated, one), rtol=0.08, atol=0
     )
-    learnt = [errors.measure(score_calibration.fit(scenes).apply(s)) for s in scenes]
+    learnt = [errors.measure_errors(score_calibration.fit_calibration(scenes).apply(s)) for s in scenes]
     assert statistics.mean(m["within_sigma"] for m in learnt) == pytest.approx(0.683, abs=0.002)
     assert statistics.mean(m["within_2sigma"] for m in learnt) == pytest.approx(0.954, abs=0.01)
     assert found(torch.tensor(3.0), torch.tensor(2.0)) == pytest.approx(math.hypot(3 * found.scale, 2 * found.floor))
-    assert score_calibration.fit_sigma([errors.points(torch.ones(3), torch.ones(3))]) is None
+    assert score_calibration.fit_sigma_model([errors.make_points(torch.ones(3), torch.ones(3))]) is None
 
 
 def test_the_correction_of_sigma_weighs_scenes_and_survives_exact_ones():
     few, many = scene_of(300, 1), scene_of(3000, 2, spread=3.0)
     once, copied = (
-        score_calibration.fit_sigma([few, many]),
-        score_calibration.fit_sigma([few, many[torch.arange(3000).repeat(3)]]),
+        score_calibration.fit_sigma_model([few, many]),
+        score_calibration.fit_sigma_model([few, many[torch.arange(3000).repeat(3)]]),
     )
     assert (once.scale, once.floor) == pytest.approx((copied.scale, copied.floor), rel=1e-9)
-    exact = score_calibration.fit_sigma([errors.points(torch.ones(30), torch.ones(30), sigma=torch.ones(30))])
+    exact = score_calibration.fit_sigma_model(
+        [errors.make_points(torch.ones(30), torch.ones(30), sigma=torch.ones(30))]
+    )
     assert math.isfinite(exact.scale) and math.isfinite(exact.floor)
 
 
 def test_calibration_changes_no_order_and_keeps_silence():
     scene = scene_of(1000, 3)
-    there = score_calibration.fit([scene_of(2000, s) for s in range(3)]).apply(scene)
+    there = score_calibration.fit_calibration([scene_of(2000, s) for s in range(3)]).apply(scene)
     assert torch.equal(there.keep, scene.keep) and (there.score[~scene.keep] == 0).all()
-    assert risk.measure(there)["aurc"] == pytest.approx(risk.measure(scene)["aurc"], abs=1e-12)
+    assert risk.measure_risk(there)["aurc"] == pytest.approx(risk.measure_risk(scene)["aurc"], abs=1e-12)
 
 
 def test_a_calibration_of_nothing_raises():
-    silent = errors.points(torch.full((4,), math.nan), torch.ones(4))
+    silent = errors.make_points(torch.full((4,), math.nan), torch.ones(4))
     for scenes in ([], [silent]):
         with pytest.raises(ValueError, match="fit: found no answer"):
-            score_calibration.fit(scenes)
+            score_calibration.fit_calibration(scenes)
 
 
 def test_json_there_and_back(tmp_path):
     learnt = fitted(truth="full")
-    back = calibration.load(calibration.save(learnt, tmp_path / "sub" / "mine.json"))
+    back = calibration.load_calibration(calibration.save_calibration(learnt, tmp_path / "sub" / "mine.json"))
     at = torch.linspace(-0.1, 1.1, 200, dtype=torch.float64)
     for name in ("probability", "expected_error", "sigmoid"):
         assert torch.equal(getattr(back, name)(at), getattr(learnt, name)(at)), name
@@ -274,7 +287,7 @@ def test_a_damaged_calibration_is_refused_by_file_and_field(path, value, message
     file = tmp_path / "mine.json"
     file.write_text(broken(path, value))
     with pytest.raises(ValueError, match=message):
-        calibration.load(file)
+        calibration.load_calibration(file)
 
 
 def test_level_tables_and_narrow_ones_are_read():
@@ -282,7 +295,7 @@ def test_level_tables_and_narrow_ones_are_read():
     for name in ("probability", "expected_error"):
         content[name] = {"score": [0.25, 0.5, 3.0], "value": [0.5, 0.5, 0.5]}
     content["thresholds"] = {"1": 0.5, "99": None}
-    found = score_calibration.from_json(json.dumps(content))
+    found = score_calibration.parse_calibration(json.dumps(content))
     assert found.probability(torch.tensor([0.0, 9.0])).tolist() == [0.5, 0.5] and found.thresholds == {1: 0.5, 99: None}
 
 
@@ -291,21 +304,21 @@ def test_text_that_is_no_calibration_is_refused(text, tmp_path):
     file = tmp_path / "mine.json"
     file.write_text(text)
     with pytest.raises(ValueError, match=r"mine\.json"):
-        calibration.load(file)
+        calibration.load_calibration(file)
 
 
 def test_origin_is_not_optional(tmp_path):
     with pytest.raises(ValueError, match=r"provenance\.scenes, expected"):
-        calibration.save(fitted(scenes=[]), tmp_path / "mine.json")
+        calibration.save_calibration(fitted(scenes=[]), tmp_path / "mine.json")
     with pytest.raises(FileNotFoundError, match="nobody: found no calibration"):
-        calibration.load("nobody")
+        calibration.load_calibration("nobody")
 
 
-@pytest.mark.parametrize("name", calibration.available() or [None])
+@pytest.mark.parametrize("name", calibration.list_calibrations() or [None])
 def test_what_travels_with_the_package_is_valid(name):
     if name is None:
         pytest.skip("no calibration travels with the package yet")
-    found = calibration.load(name)
+    found = calibration.load_calibration(name)
     assert found.provenance["method"] and found.provenance["scenes"] and found.to_json()
 
 
@@ -331,12 +344,14 @@ def answers(sigma, shared=0.0, depth=2.0, residual=0.0, gate=None, error=0.0, ph
 
 
 def scores(*args, **options):
-    return score.rank_by_error(*answers(*args), **options).score[0]
+    return score.confidence_from_error(*answers(*args), **options).score[0]
 
 
 def test_the_score_is_the_stated_function_of_the_expected_error():
     sigma, shared = torch.tensor([0.1, 0.5, 2.0]), 0.06
-    found = score.rank_by_error(*answers(sigma, shared, residual=0.8), residual_scale_px=0.5, half_error=0.2).score[0]
+    found = score.confidence_from_error(
+        *answers(sigma, shared, residual=0.8), residual_scale_px=0.5, half_error=0.2
+    ).score[0]
     expected = [math.sqrt(s * s - shared * shared) / 2 * math.sqrt(1 + (0.8 / 0.5) ** 2) for s in sigma.tolist()]
     assert found.tolist() == pytest.approx([0.2 / (0.2 + e) for e in expected], rel=1e-6)
 
@@ -351,11 +366,12 @@ def test_the_score_falls_with_every_reason_to_doubt():
         ("error", "round_trip_scale_px"),
     ):
         worse = [
-            score.rank_by_error(*answers([0.1], **{name: x}), **{option: 0.5}).score.item() for x in (0, 0.1, 1, 9)
+            score.confidence_from_error(*answers([0.1], **{name: x}), **{option: 0.5}).score.item()
+            for x in (0, 0.1, 1, 9)
         ]
         assert worse == sorted(worse, reverse=True) and len(set(worse)) == 4, name
-    ignored = score.rank_by_error(*answers([0.1], photometric=3.0, error=2.0), round_trip_scale_px=None).score
-    assert ignored == score.rank_by_error(*answers([0.1])).score
+    ignored = score.confidence_from_error(*answers([0.1], photometric=3.0, error=2.0), round_trip_scale_px=None).score
+    assert ignored == score.confidence_from_error(*answers([0.1])).score
 
 
 def test_what_a_pair_shares_moves_no_rank_and_never_flatters():
@@ -363,17 +379,19 @@ def test_what_a_pair_shares_moves_no_rank_and_never_flatters():
     whole = (0.1**2 + shared**2).sqrt()
     estimate, *rest = answers(whole.double())
     estimate = estimate.replace(sigma_shared=shared.double()[None])
-    assert score.rank_by_error(estimate, *rest).score[0].tolist() == pytest.approx([0.1 / (0.1 + 0.05)] * 3, rel=1e-4)
-    swamped = score.rank_by_error(*answers([10.0], 10.0)).score.item()
-    assert swamped <= 0.1 / (0.1 + 10.0 / 2 * math.sqrt(score.OWN_SHARE)) + 1e-9
+    assert score.confidence_from_error(estimate, *rest).score[0].tolist() == pytest.approx(
+        [0.1 / (0.1 + 0.05)] * 3, rel=1e-4
+    )
+    swamped = score.confidence_from_error(*answers([10.0], 10.0)).score.item()
+    assert swamped <= 0.1 / (0.1 + 10.0 / 2 * math.sqrt(score.MIN_SCORED_OWN_RATIO)) + 1e-9
 
 
 def test_answers_without_a_stated_error_score_zero_and_silence_stays():
     estimate, *rest = answers([0.1, math.nan, math.inf, 0.1, 0.1], gate=[0, 0, 0, Gate.PARALLAX, 0])
-    out = score.rank_by_error(estimate, *rest)
+    out = score.confidence_from_error(estimate, *rest)
     assert out.score[0].tolist() == pytest.approx([2 / 3, 0, 0, 0, 2 / 3])
     assert out.gate[0].tolist() == [0, 0, 0, Gate.PARALLAX, 0] and out.depth[0, 3].isnan()
-    cut = score.rank_by_error(estimate, *rest, min_score=0.5)
+    cut = score.confidence_from_error(estimate, *rest, min_score=0.5)
     assert cut.gate[0].tolist() == [0, Gate.LOW_SCORE, Gate.LOW_SCORE, Gate.PARALLAX, 0]
     assert cut.depth[0].isnan().tolist() == [False, True, True, True, False] == cut.sigma[0].isnan().tolist()
 
@@ -384,7 +402,7 @@ def test_a_recalibrated_score_is_the_tables_probability():
     raw, out = scores(sigma), scores(sigma, recalibration=table)
     assert torch.equal(out, table(raw)) and (out.diff() < 0).all()
     limit = fitted().min_score(10)
-    kept = score.rank_by_error(*answers(sigma), recalibration=table, min_score=limit).keep[0]
+    kept = score.confidence_from_error(*answers(sigma), recalibration=table, min_score=limit).keep[0]
     assert torch.equal(kept, raw >= fitted().thresholds[10]) and 0 < kept.sum() < 40
 
 
@@ -392,7 +410,7 @@ def test_a_recalibrated_score_is_the_tables_probability():
 def test_a_recalibrated_seat_captures_maps_differentiates_and_keeps_to_itself(kind):
     learnt = fitted()
     seat = functools.partial(
-        score.rank_by_error, recalibration=learnt.probability if kind == "table" else learnt.sigmoid
+        score.confidence_from_error, recalibration=learnt.probability if kind == "table" else learnt.sigmoid
     )
     _, *rest = answers([0.1] * 37)
     sigma = 0.01 + uniform(5, 37)

@@ -7,7 +7,7 @@ import pytest
 
 from dhtorch import data
 from dhtorch.cli import run
-from dhtorch.data.depth_maps import open_maps
+from dhtorch.data.depth_maps import open_depth_maps
 from dhtorch.synthetic import SyntheticRoom
 
 ROOM = ["data=synthetic", "data.hw=[96,128]", "data.depth_hw=[96,128]", "data.supersample=1", "data.n_frames=6"]
@@ -31,7 +31,7 @@ def maps(tmp_path_factory, room):
 def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     out = tmp_path / "out"
     asked = ["anchor", *ROOM, *LITTLE, f"depth={maps}", f"out={out}", "kind=inverse", 'fail_on="silent>0.9"']
-    assert run.main(asked) == run.DONE
+    assert run.main(asked) == run.EXIT_DONE
     assert "2 maps" in capsys.readouterr().out
     found = json.loads((out / "anchor.json").read_text())
     assert [row["frame"] for row in found["frames"]] == [0, 3]
@@ -48,19 +48,19 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     assert (out / "anchor.html").read_text().count("data:image/png;base64,") == 2
     before = {p: p.stat().st_mtime_ns for p in (out / "depth").iterdir()}
     (out / "meta" / "000003.json").unlink()
-    assert run.main(asked) == run.DONE
+    assert run.main(asked) == run.EXIT_DONE
     assert "1 left untouched" in capsys.readouterr().out
     after = {p: p.stat().st_mtime_ns for p in (out / "depth").iterdir()}
     assert before.keys() == after.keys()
     assert sum(before[p] != after[p] for p in before) == 1
-    assert run.main([*asked, "kind=affine"]) == run.FAILED, "other maps in the same folder"
+    assert run.main([*asked, "kind=affine"]) == run.EXIT_FAILED, "other maps in the same folder"
 
 
 def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
     for k in range(len(room)):
         np.save(tmp_path / f"{k:04d}.npy", 1.5 * room.truth(k)["depth"][0].numpy())
     words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "most=1", 'fail_on="scale>0.2,silent>0.99"']
-    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.SOME_FAILED
+    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.EXIT_SOME_FAILED
     assert "exceeded: scale is 0.33" in capsys.readouterr().out
     assert "Exceeded" in (tmp_path / "out" / "anchor.html").read_text()
 
@@ -70,7 +70,7 @@ def test_a_hole_in_a_file_is_no_value_of_any_kind_and_a_sensor_beside_itself_is_
         depth = room[k].depth[0].numpy()
         np.save(tmp_path / f"{k:04d}.npy", np.where(np.arange(128) < 20, 0, depth))
     words = [f"depth={tmp_path}", "most=1", "kind=affine"]
-    assert run.main(["anchor", *ROOM, *LITTLE[:1], *words, f"out={tmp_path / 'out'}"]) == run.DONE
+    assert run.main(["anchor", *ROOM, *LITTLE[:1], *words, f"out={tmp_path / 'out'}"]) == run.EXIT_DONE
     assert "of one sensor" in capsys.readouterr().out
     depth = data.open(tmp_path / "out")[0].depth
     assert (depth[..., :20] == 0).all()
@@ -89,7 +89,7 @@ def test_a_hole_in_a_file_is_no_value_of_any_kind_and_a_sensor_beside_itself_is_
 )
 def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, maps, capsys):
     words = [f"depth={maps}", f"out={tmp_path / 'out'}", word]
-    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.FAILED
+    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.EXIT_FAILED
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert said in lines[0]
@@ -97,11 +97,11 @@ def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, maps, capsys):
 
 def test_limits_of_a_metre_need_a_metre(tmp_path, maps, capsys):
     words = [f"depth={maps}", f"out={tmp_path / 'out'}", "kind=inverse", "fail_on='scale>0.1'"]
-    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.FAILED
+    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.EXIT_FAILED
     assert "expected kind=metric" in capsys.readouterr().err
 
 
 def test_an_archive_of_several_arrays_says_which_is_depth(tmp_path, room):
     truth = room.truth(0)["depth"][0].numpy()
     np.savez(tmp_path / "0.npz", depth=truth, normal=np.zeros((3, *truth.shape)))
-    assert np.allclose(open_maps(tmp_path, room)[0][0], truth)
+    assert np.allclose(open_depth_maps(tmp_path, room)[0][0], truth)

@@ -25,14 +25,14 @@ from dhtorch import testing as writers
 from dhtorch.cli import complete, layouts, run
 from dhtorch.cli import completed_folder as completed
 from dhtorch.codes import Gate, Source, names
-from dhtorch.data.pairs import around
+from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import Recording
 from dhtorch.geometry.camera import resize, unproject
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
-from dhtorch.pipeline.view_report import choosing
+from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.pytree import stack
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viz.plots import draw_completed
@@ -104,11 +104,16 @@ def test_the_files_hold_what_complete_says(room, captures, numbered):
     for kind in kinds:
         assert sorted(p.stem for p in (numbered / kind).iterdir()) == ["000000", "000001", "000002"], kind
     recording = data.open(captures / "numbered")
-    offered = around(recording, 1, [1])
+    offered = candidate_frames(recording, 1, [1])
     frames = [range_split(recording[k], NEAR) for k in (1, *offered)]
-    options = {"method": choosing(METHOD), "planes": 16, "refinements": 1, "calibration": dense.shipped()}
+    options = {
+        "method": with_view_selection(METHOD),
+        "planes": 16,
+        "refinements": 1,
+        "calibration": dense.default_calibration(),
+    }
     with torch.no_grad():
-        found = dense.complete(frames[0], stack(frames[1:]), **options)[0]
+        found = dense.complete_depth(frames[0], stack(frames[1:]), **options)[0]
     depth, sigma, source = (pixels(numbered / kind / "000001.png") for kind in ("depth", "sigma", "source"))
     assert depth.dtype == sigma.dtype == np.uint16 and source.dtype == np.uint8
     assert np.array_equal(source, found.source.numpy()) and {0, 1, 3} == set(np.unique(source))
@@ -122,8 +127,8 @@ def test_the_files_hold_what_complete_says(room, captures, numbered):
 
 
 def test_the_meta_file_tells_what_the_others_are(room, numbered):
-    row = storage.loads((numbered / "meta" / "000001.json").read_text())
-    about = storage.loads((numbered / "complete.json").read_text())
+    row = storage.parse_strict_json((numbered / "meta" / "000001.json").read_text())
+    about = storage.parse_strict_json((numbered / "complete.json").read_text())
     assert row["unit_m"] == 0.001 and row["sigma_unit_m"] == 0.0002 and row["cutoff_m"] == NEAR
     assert row["method"] == "map" and row["version"] == about["version"] and row["key"] == about["key"]
     assert row["frame"] == 1 and row["hw"] == [120, 160] and set(row["views"]) <= {0, 2} and row["views"]
@@ -149,7 +154,9 @@ def test_the_folder_is_read_again_as_numbered_frames(captures, numbered):
 
 
 def test_figure_and_points_are_of_the_first_frame(room, numbered):
-    files = [p.relative_to(numbered).as_posix() for k in completed.EXTRAS for p in sorted((numbered / k).iterdir())]
+    files = [
+        p.relative_to(numbered).as_posix() for k in completed.EXTRA_FILES for p in sorted((numbered / k).iterdir())
+    ]
     assert files == ["figures/000000.png", "points/000000.glb", "points/000000.ply"]
     assert pixels(numbered / "figures" / "000000.png").shape[1] > 1000
     head, _, body = (numbered / "points" / "000000.ply").read_bytes().partition(b"end_header\n")
@@ -192,7 +199,7 @@ def test_a_stray_capture_stays_one_with_confidence_and_video(room, tmp_path):
     assert torch.equal(back[0].image, there[0].image) and torch.equal(back.poses.t, there.poses.t[:2])
     source = pixels(tmp_path / "maps" / "source" / "000000.png")
     assert np.array_equal(back[0].conf[0], np.array([0, 2, 1, 1])[source])
-    row = storage.loads((tmp_path / "maps" / "meta" / "000000.json").read_text())
+    row = storage.parse_strict_json((tmp_path / "maps" / "meta" / "000000.json").read_text())
     assert torch.allclose(torch.tensor(row["K"])[[0, 1], [0, 1]], resize(there[0].camera, (120, 160), (60, 80)).f[0])
 
 
@@ -205,18 +212,18 @@ def test_steps_never_clip_and_never_wrap():
     sigma[0, 1], sigma[0, 8], sigma[0, 9] = 1e-9, 13.2, torch.nan
     source = torch.full(depth.shape, Source.SWEPT)
     source[0, 7] = Source.NONE
-    steps = export.in_steps(depth, sigma, source, 0.001)
+    steps = export.quantise_depth(depth, sigma, source, 0.001)
     assert steps.depth[0].tolist() == [0, 1, 1234, 65534, 0, 0, 0, 0, 0, 0]
     assert steps.sigma[0].tolist() == [0, 1, 50, 50, 0, 0, 0, 0, 0, 0], "no sigma is 0"
     assert steps.source[0].tolist() == [0, 3, 3, 3, 0, 0, 0, 0, 0, 0]
     assert steps.unfit[0].tolist() == [True, False, False, False, True, True, True, False, True, True]
     with pytest.raises(ValueError, match=r"\(1, 10\), \(1, 10\), \(10,\), expected three alike"):
-        export.in_steps(depth, sigma, source[0], 0.001)
+        export.quantise_depth(depth, sigma, source[0], 0.001)
 
 
 def test_what_does_not_fit_is_silent_counted_and_said(captures, tmp_path):
     out = said(captures / "numbered", tmp_path / "maps", most=1, unit=0.00005)
-    row = storage.loads((tmp_path / "maps" / "meta" / "000000.json").read_text())
+    row = storage.parse_strict_json((tmp_path / "maps" / "meta" / "000000.json").read_text())
     assert row["silent"]["unfit"] > 0.01 and "do not fit" in out and "reach 3.3 m" in out
     back = data.open(tmp_path / "maps")[0].depth
     assert float(back.max()) <= 3.2768 and (back > NEAR).any()
@@ -227,13 +234,13 @@ def test_png_loses_nothing():
     generator = np.random.default_rng(0)
     for shape, kind in (((7, 5), "uint16"), ((7, 5), "uint8"), ((7, 5, 3), "uint8")):
         values = generator.integers(0, np.iinfo(kind).max, shape, dtype=kind, endpoint=True)
-        assert np.array_equal(np.array(Image.open(io.BytesIO(export.png(values)))), values)
+        assert np.array_equal(np.array(Image.open(io.BytesIO(export.encode_png(values)))), values)
 
 
 def test_faces_join_neighbours_of_one_surface_alone():
     depth = np.array([[1.0, 1.01, 2.0], [1.0, 1.01, 2.0], [1.0, 0.0, 2.0]])
-    assert sorted(map(sorted, export.faces(depth).tolist())) == [[0, 1, 3], [1, 3, 4], [3, 4, 6]]
-    flat = export.faces(np.ones((3, 4)))
+    assert sorted(map(sorted, export.mesh_depth_map(depth).tolist())) == [[0, 1, 3], [1, 3, 4], [3, 4, 6]]
+    flat = export.mesh_depth_map(np.ones((3, 4)))
     assert len(flat) == 2 * 2 * 3 and {tuple(sorted(f)) for f in flat.tolist()} >= {(0, 1, 4), (1, 4, 5)}
 
 
@@ -242,8 +249,8 @@ def test_faces_join_neighbours_of_one_surface_alone():
 
 def test_said_again_it_makes_what_is_missing_and_no_more(captures, numbered, monkeypatch):
     asked = []
-    whole = complete.dense.complete
-    monkeypatch.setattr(complete.dense, "complete", lambda *a, **k: asked.append(1) or whole(*a, **k))
+    whole = complete.dense.complete_depth
+    monkeypatch.setattr(complete.dense, "complete_depth", lambda *a, **k: asked.append(1) or whole(*a, **k))
     before = stamps(numbered)
     more = {"arrays": True, "points": True, "figures": True}
     assert "3 frames (3 left untouched)" in said(captures / "numbered", numbered, most=3, **more) and not asked
@@ -380,7 +387,7 @@ def test_a_frame_alone_gets_the_sensor_and_maps_without_poses_are_maps_alone(roo
     depth = room[0].depth[0].numpy()
     assert np.array_equal(source == Source.SENSOR, (depth > 0) & (depth <= NEAR)) and set(np.unique(source)) == {0, 1}
     assert not (tmp_path / "poses.txt").exists() and not (tmp_path / "images").exists()
-    row = storage.loads((tmp_path / "meta" / "000000.json").read_text())
+    row = storage.parse_strict_json((tmp_path / "meta" / "000000.json").read_text())
     assert row["views"] == [] and row["T_world_from_cam"] is None and row["time"] is None
 
 
@@ -395,24 +402,24 @@ def test_several_scenes_have_a_folder_each_and_a_name_once(room, tmp_path):
 def test_sparse_depth_has_longer_steps_and_pictures_are_asked_for(room):
     poses = room.poses
     sparse = Recording("sweep", "driving", room.load, room.number, poses=poses, sparse=True)
-    assert layouts.layout_of(sparse, "auto", None, same=True).unit == 0.005
-    assert layouts.layout_of(sparse, "auto", 0.002, same=True).unit == 0.002
+    assert layouts.select_layout(sparse, "auto", None, same=True).unit == 0.005
+    assert layouts.select_layout(sparse, "auto", 0.002, same=True).unit == 0.002
     tum = Recording("t", "tum", room.load, room.number, poses=poses, times=room.times)
-    assert layouts.layout_of(tum, "auto", None, same=True).name == "tum"
-    assert layouts.layout_of(tum, "auto", None, same=False).name == "frames", "K there is of the pictures"
+    assert layouts.select_layout(tum, "auto", None, same=True).name == "tum"
+    assert layouts.select_layout(tum, "auto", None, same=False).name == "frames", "K there is of the pictures"
     stray = Recording("s", "stray", room.load, room.number, poses=poses)
     with pytest.raises(ValueError, match=r"unit: found 0\.002, expected 0\.001 m"):
-        layouts.layout_of(stray, "auto", 0.002, same=False)
+        layouts.select_layout(stray, "auto", 0.002, same=False)
 
 
 def test_the_sweeps_options_have_the_functions_defaults():
-    defaults = {k: p.default for k, p in inspect.signature(dense.complete).parameters.items()}
+    defaults = {k: p.default for k, p in inspect.signature(dense.complete_depth).parameters.items()}
     settings = composed()
-    assert {k: settings[k] for k in dense.OPTIONS} == {k: defaults[k] for k in dense.OPTIONS}
+    assert {k: settings[k] for k in dense.DENSE_OPTIONS} == {k: defaults[k] for k in dense.DENSE_OPTIONS}
 
 
 def test_a_figure_of_silence_is_a_figure(tmp_path):
     nothing = np.zeros((6, 8))
     draw_completed(tmp_path / "empty.png", np.zeros((1, 12, 16)), nothing, nothing, nothing, title="part $1$")
     assert pixels(tmp_path / "empty.png").size
-    assert archive.difference({"config": {"a": 1}}, {"config": {"a": 2}}) == "a 1 there, 2 here"
+    assert result_files.describe_difference({"config": {"a": 1}}, {"config": {"a": 2}}) == "a 1 there, 2 here"

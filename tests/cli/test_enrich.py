@@ -18,9 +18,9 @@ from pyarrow import parquet
 from dhtorch import data
 from dhtorch import testing as writers
 from dhtorch.cli.run import main
-from dhtorch.export.lerobot import Moments
+from dhtorch.export.lerobot import FeatureMoments
 from dhtorch.extract import shards
-from dhtorch.extract.robot_target import RobotTarget
+from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.runtime import storage
 from dhtorch.synthetic.recording import SyntheticRoom
 
@@ -76,7 +76,7 @@ def map_of(row, key):
 def test_statistics_of_large_numbers_keep_their_spread():
     """A time stamp of today squared has no digits left for how far apart two frames are."""
     x = 1.7e9 + np.arange(600).reshape(-1, 1) / 30
-    total = Moments.of(x[:7]) + Moments.of(x[7:7]) + Moments.parse(Moments.of(x[7:]).pack())
+    total = FeatureMoments.of(x[:7]) + FeatureMoments.of(x[7:7]) + FeatureMoments.parse(FeatureMoments.of(x[7:]).pack())
     entry = total.stats(len(x), (1,))
     assert np.allclose([entry["mean"][0] - 1.7e9, entry["std"][0]], [x.mean() - 1.7e9, (x - 1.7e9).std()], rtol=1e-5)
 
@@ -156,7 +156,7 @@ def test_interrupted_anywhere_the_same_command_gives_the_same_bytes(
 
     target, name, after = {
         "shard": (shards, "write", 2),
-        "table": (RobotTarget, "_copy_videos", 1),
+        "table": (LeRobotTarget, "_copy_videos", 1),
         "meta": (storage, "write_json", 2),
     }[place]
     out = tmp_path / "set"

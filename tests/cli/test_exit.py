@@ -19,22 +19,21 @@ import pytest
 from test_results import KEY, result
 
 from dhtorch.cli import run, signals
-from dhtorch.runtime import console, storage
-from dhtorch.runtime import file_lock as lock
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import console, file_lock, storage
+from dhtorch.runtime import results as result_files
 
 EVIL = "a\x1b[31mred\x07\x9b2J\u202ereversed\r"
 
 
 def test_nothing_a_terminal_obeys_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
-    with console.neutral(), console.neutral():
+    with console.escape_output(), console.escape_output():
         print(EVIL)
         print(EVIL, file=sys.stderr)
         sys.stdout.writelines(["1\t2\n"])
         assert sys.stdout.encoding and sys.stdout.fileno is not None
     out, err = capsys.readouterr()
     assert out.splitlines()[0] == err.strip() == r"a\x1b[31mred\x07\x9b2J\u202ereversed\x0d"
-    assert out.endswith("1\t2\n") and console.plain("naïve ✓ 深度") == "naïve ✓ 深度"
+    assert out.endswith("1\t2\n") and console.escape_control("naïve ✓ 深度") == "naïve ✓ 深度"
 
 
 def test_a_hostile_name_is_spelt_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -60,7 +59,7 @@ def test_a_signal_ends_a_call_in_order(
         return 0
 
     before = signal.getsignal(number)
-    monkeypatch.setattr(run, "_run", told)
+    monkeypatch.setattr(run, "_dispatch", told)
     assert run.main([]) == code and tidied
     assert "dhtorch: interrupted" in capsys.readouterr().err
     assert signal.getsignal(number) is before
@@ -69,7 +68,7 @@ def test_a_signal_ends_a_call_in_order(
 def test_an_ignored_signal_stays_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with signals.ending() as told:
+        with signals.catch_termination() as told:
             signal.raise_signal(signal.SIGHUP)
         assert told.code(7) == 7
     finally:
@@ -106,14 +105,18 @@ def test_a_worker_ends_with_a_killed_parent(tmp_path: Path) -> None:
 
 
 def _hold(file: Path, ready: Any) -> None:
-    with lock.held(file, "out: x"):
+    with file_lock.acquire_file_lock(file, "out: x"):
         ready.set()
         time.sleep(60)
 
 
 def test_one_writer_at_a_time_and_dead_ones_block_nobody(tmp_path: Path) -> None:
     file = tmp_path / "deep" / ".lock"
-    with lock.held(file, "out: x"), pytest.raises(BlockingIOError, match="this process"), lock.held(file, "out: x"):
+    with (
+        file_lock.acquire_file_lock(file, "out: x"),
+        pytest.raises(BlockingIOError, match="this process"),
+        file_lock.acquire_file_lock(file, "out: x"),
+    ):
         pass
     assert not file.exists()
     context = multiprocessing.get_context("fork")
@@ -123,19 +126,19 @@ def test_one_writer_at_a_time_and_dead_ones_block_nobody(tmp_path: Path) -> None
     try:
         assert ready.wait(30)
         match = rf"out: x: found process {other.pid} on .* \(for \d+ s\) writing there, expected one writer at a time"
-        with pytest.raises(BlockingIOError, match=match), lock.held(file, "out: x"):
+        with pytest.raises(BlockingIOError, match=match), file_lock.acquire_file_lock(file, "out: x"):
             pass
     finally:
         other.kill()
         other.join()
     assert file.exists()
-    with lock.held(file, "out: x"):
+    with file_lock.acquire_file_lock(file, "out: x"):
         assert json.loads(file.read_text())["process"] == os.getpid()
     assert not file.exists()
 
 
 def test_a_second_sweep_in_a_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with lock.held(tmp_path / ".out.lock", "x"):
+    with file_lock.acquire_file_lock(tmp_path / ".out.lock", "x"):
         assert run.main([f"output={tmp_path}/out"]) == 2
     assert "expected one writer" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -165,23 +168,23 @@ def test_a_limit_of_size_names_the_file(tmp_path: Path) -> None:
 
 
 def test_a_result_changed_by_hand_is_not_finished(tmp_path: Path) -> None:
-    path = archive.write(tmp_path / "result.json", result())
-    assert archive.finished(path, KEY)
+    path = result_files.write_result(tmp_path / "result.json", result())
+    assert result_files.is_finished(path, KEY)
     found = json.loads(path.read_text())
     path.write_text(json.dumps(found, indent=4))
-    assert archive.finished(path, KEY), "laid out otherwise, the same"
+    assert result_files.is_finished(path, KEY), "laid out otherwise, the same"
     found["rows"][0]["scene"] = "another"
     path.write_text(json.dumps(found))
-    assert archive.read(path)["rows"][0]["scene"] == "another" and not archive.finished(path, KEY)
-    archive.write(path, found)
-    assert archive.finished(path, KEY)
+    assert result_files.read_result(path)["rows"][0]["scene"] == "another" and not result_files.is_finished(path, KEY)
+    result_files.write_result(path, found)
+    assert result_files.is_finished(path, KEY)
 
 
 @pytest.mark.parametrize("text", ["[" * 200_000, '{"a":' * 900 + "1" + "}" * 900, "[" * 100 + "]" * 100])
 def test_values_nested_too_deep_are_no_result(tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "result.json"
     path.write_text(text)
-    assert not archive.finished(path, KEY)
+    assert not result_files.is_finished(path, KEY)
     with pytest.raises(ValueError, match=r"result.json: found no strict JSON"):
-        archive.read(path)
+        result_files.read_result(path)
     assert run.main(["report", str(tmp_path)]) in (1, 2) or "result.json" in capsys.readouterr().err

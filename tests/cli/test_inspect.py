@@ -53,8 +53,8 @@ def with_conf(frames: list[Frame]) -> list[Frame]:
 
 
 def only(path: Path) -> Survey:
-    (found,) = capture.find(path)
-    (survey,) = capture.surveys(found)
+    (found,) = capture.find_captures(path)
+    (survey,) = capture.survey_capture(found)
     return survey
 
 
@@ -271,14 +271,14 @@ def test_pictures_and_cameras_that_cannot_be() -> None:
 def test_one_frame_is_enough(name: str, tmp_path: Path) -> None:
     write, format, count = RECORDED[name]
     write(tmp_path, 1)
-    (found,) = capture.find(tmp_path)
-    shown = list(capture.surveys(found))
+    (found,) = capture.find_captures(tmp_path)
+    shown = list(capture.survey_capture(found))
     assert found.format == format and len(shown) == count
     assert facts(shown[0])["frames"] == "1" and len(shown[0].tiles) == 1
     tile = shown[0].tiles[0]
     assert float(tile.depth.max()) > 0 and (name == "stray_depth_only" or tile.image.shape[0] == 3)
     if name in ("tum", "stray_depth_only"):
-        check_sheet(capture.write_sheet(shown[0], tmp_path / "out"))
+        check_sheet(capture.write_contact_sheet(shown[0], tmp_path / "out"))
 
 
 #: The command on a recording of one and of several cameras; on all other formats with the slow tests.
@@ -292,7 +292,7 @@ COMMANDED = [
 def test_the_command_takes_what_inspect_finds(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Focal stacks, which have no pairs: test_focal_stacks."""
     RECORDED[name][0](tmp_path, 3)
-    (found,) = capture.find(tmp_path)
+    (found,) = capture.find_captures(tmp_path)
     monkeypatch.chdir(tmp_path)
     settings = ["data=auto", f"data.root={found.path}", "pairs.gap=1", "holdout.cutoff=1.5", "method.n=64"]
     assert run.main([*settings, "figures=false", "hydra.run.dir=out"]) == 0
@@ -315,13 +315,15 @@ def test_a_capture_that_its_reader_refuses_is_shown_as_pictures(tmp_path: Path) 
     assert survey.format == "loose pictures" and facts(survey)["pictures"] == "3, 64x48"
     assert survey.warnings[0].startswith("the tum reader refuses it: ") and "meta.json: K: found" in survey.warnings[0]
     assert facts(survey)["depth maps"] == "3, 64x48"
-    check_sheet(capture.write_sheet(survey, tmp_path / "out"))
+    check_sheet(capture.write_contact_sheet(survey, tmp_path / "out"))
 
 
 def test_loose_pictures_with_a_broken_one(tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(writers.parts.png(np.full((10, 12, 3), 90, np.uint8)))
-    (tmp_path / "b.png").write_bytes(writers.parts.png(np.arange(120, dtype=np.uint16).reshape(10, 12) + 500))
-    whole = writers.parts.png(np.zeros((10, 12, 3), np.uint8))
+    (tmp_path / "a.png").write_bytes(writers.parts.encode_unfiltered_png(np.full((10, 12, 3), 90, np.uint8)))
+    (tmp_path / "b.png").write_bytes(
+        writers.parts.encode_unfiltered_png(np.arange(120, dtype=np.uint16).reshape(10, 12) + 500)
+    )
+    whole = writers.parts.encode_unfiltered_png(np.zeros((10, 12, 3), np.uint8))
     (tmp_path / "c.png").write_bytes(whole[:-20])
     survey = only(tmp_path)
     assert facts(survey)["pictures"] == "1, 12x10" and facts(survey)["depth range"] == "0.500 to 0.619 m"
@@ -330,7 +332,7 @@ def test_loose_pictures_with_a_broken_one(tmp_path: Path) -> None:
 
 def test_many_recordings_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _driving(tmp_path, 3)
-    monkeypatch.setattr(capture, "_MOST", 1)
+    monkeypatch.setattr(capture, "_MAX_RECORDINGS", 1)
     survey = only(tmp_path)
     assert "2 recordings in this capture: the first 1 are shown" in survey.warnings
 
@@ -338,7 +340,7 @@ def test_many_recordings_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_several_captures_in_one_folder(tmp_path: Path) -> None:
     for name in ("a", "b"):
         writers.write_named_frames(tmp_path / name, walk(2))
-    assert [found.path.name for found in capture.find(tmp_path)] == ["a", "b"]
+    assert [found.path.name for found in capture.find_captures(tmp_path)] == ["a", "b"]
 
 
 @pytest.mark.parametrize(
@@ -355,9 +357,9 @@ def test_what_lies_there_instead_of_a_capture_is_said(tmp_path: Path, name: str 
         (tmp_path / name).write_bytes(b"nothing of use")
         alone = said.partition(": ")[2] or "a .txt file, which no reader knows"
         with pytest.raises(FormatError, match=f"{name}: content: found {alone}"):
-            capture.find(tmp_path / name)
+            capture.find_captures(tmp_path / name)
     with pytest.raises(FormatError, match=f"content: found {said}"):
-        capture.find(tmp_path)
+        capture.find_captures(tmp_path)
 
 
 def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -387,15 +389,17 @@ def test_command_writes_to_outputs(
 def test_warnings_are_printed(tmp_path: Path) -> None:
     out = io.StringIO()
     survey = survey_recording(replace(recording(walk(2)), report=("frame [7]: left out",)))
-    capture.print_survey(capture.Found(tmp_path, "recording", "test", "as told"), survey, Console(file=out, width=200))
+    capture.print_survey(
+        capture.FoundCapture(tmp_path, "recording", "test", "as told"), survey, Console(file=out, width=200)
+    )
     assert "warning" in out.getvalue() and "frame [7]: left out" in out.getvalue()
 
 
 @pytest.mark.parametrize("name", ["named", "stray_depth_only", "images"])
 def test_damaged_captures_are_inspected_or_refused_in_one_line(name: str, tmp_path: Path) -> None:
     def look(path: Path) -> None:
-        for found in capture.find(path):
-            for survey in capture.surveys(found, 3):
+        for found in capture.find_captures(path):
+            for survey in capture.survey_capture(found, 3):
                 assert survey.facts
 
     hostile.attack(WRITTEN[name][0], look, tmp_path, mutants=15)
@@ -424,12 +428,12 @@ REAL = {
 @real
 @pytest.mark.parametrize("name", REAL)
 def test_real_pieces_are_inspected(name: str, tmp_path: Path) -> None:
-    (found,) = capture.find(Path(ROOT) / name)
+    (found,) = capture.find_captures(Path(ROOT) / name)
     assert found.format == REAL[name]
-    surveys = list(capture.surveys(found, 3))
+    surveys = list(capture.survey_capture(found, 3))
     assert surveys and all(survey.tiles for survey in surveys)
     if name in ("arkit_single", "holo_a", "stray_room"):
-        check_sheet(capture.write_sheet(surveys[0], tmp_path))
+        check_sheet(capture.write_contact_sheet(surveys[0], tmp_path))
     for survey in surveys:
         assert not any("contradict" in w or "constant" in w or "jumps" in w for w in survey.warnings)
         if "depth and poses" in facts(survey):  # measured 0.3 to 1.3 %

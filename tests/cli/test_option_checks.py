@@ -13,7 +13,7 @@ from dhtorch.cli import job, run, view
 from dhtorch.cli import option_checks as words
 from dhtorch.cli import sweep_state as together
 from dhtorch.experiments.report import advice, jobs
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.synthetic.recording import SyntheticRoom
 
 TINY = [*ROOM, "method.n=256", "figures=false"]
@@ -76,7 +76,7 @@ def test_the_folder_of_what_is_made_is_out_or_output_to_every_command(command, t
 def test_the_first_word_of_view_may_be_a_capture(command, tmp_path, monkeypatch):  # noqa: F811
     asked = []
     monkeypatch.setattr(view, "run", lambda settings, *_, **__: asked.append(settings))
-    monkeypatch.setattr(run, "_parts", lambda *_: {})
+    monkeypatch.setattr(run, "_instantiate_parts", lambda *_: {})
     for name in ("capture", "view", "job", "sweep/1"):
         (tmp_path / name).mkdir(parents=True)
     for name in ("job", "sweep/1"):
@@ -131,9 +131,9 @@ def test_inspect_takes_the_options_of_the_reader_too(command, tmp_path):  # noqa
 
 
 def test_names_of_places_are_one_text():
-    assert words.quoted(["output=a=b,c=1/x"]) == ["output='a=b,c=1/x'"]
-    assert words.quoted(["out=/tmp/a=b (1)/c"]) == ["out='/tmp/a=b (1)/c'"]
-    assert words.quoted(["seed=0,1", "extract.columns=[a,b]"], True) == ["seed=0,1", "extract.columns=[a,b]"]
+    assert words.quote_words(["output=a=b,c=1/x"]) == ["output='a=b,c=1/x'"]
+    assert words.quote_words(["out=/tmp/a=b (1)/c"]) == ["out='/tmp/a=b (1)/c'"]
+    assert words.quote_words(["seed=0,1", "extract.columns=[a,b]"], True) == ["seed=0,1", "extract.columns=[a,b]"]
 
 
 def test_a_sweep_ends_with_one_table_and_its_file(command, tmp_path):  # noqa: F811
@@ -143,17 +143,17 @@ def test_a_sweep_ends_with_one_table_and_its_file(command, tmp_path):  # noqa: F
     with (tmp_path / "a=b/sweep.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [r["pairs.gap"] for r in rows] == ["1", "2"]
-    assert list(rows[0]) == ["pairs.gap", *jobs.METRICS]
+    assert list(rows[0]) == ["pairs.gap", *jobs.JOB_METRICS]
     (at,) = [k for k, line in enumerate(out.splitlines()) if re.match(r"\s*pairs.gap\s+coverage\s+median\s+p90", line)]
     assert len(out.splitlines()) - at < 12
-    assert not (tmp_path / "a=b" / together.NOTES).exists()
+    assert not (tmp_path / "a=b" / together._NOTES_FOLDER).exists()
     code, out, _ = command("report", "a=b")
     assert code == 0 and "pairs.gap" in out and "truth dropped" not in out
     assert command("report", "a=b", "--html", "p.html")[0] == 0 and "2 jobs" in (tmp_path / "p.html").read_text()
-    results = [archive.read(p) for p in sorted(tmp_path.rglob("result.json"))]
+    results = [result_files.read_result(p) for p in sorted(tmp_path.rglob("result.json"))]
     for k, (coverage, error) in enumerate(((0.5, 0.1), (0.4, 0.05))):
         results[k]["summary"] |= {"coverage": {"value": coverage}, "median_rel": {"value": error}}
-    assert {(0, 1), (1, 2)} <= jobs.table(results).best
+    assert {(0, 1), (1, 2)} <= jobs.jobs_table(results).best
 
 
 def test_a_job_says_little_and_all_of_it_when_asked(command):  # noqa: F811
@@ -163,13 +163,13 @@ def test_a_job_says_little_and_all_of_it_when_asked(command):  # noqa: F811
 
 
 def test_jobs_note_how_far_they_are(tmp_path):
-    (tmp_path / together.NOTES).mkdir()
-    wrap = together.noting(tmp_path, "one", 2)
+    (tmp_path / together._NOTES_FOLDER).mkdir()
+    wrap = together.record_progress(tmp_path, "one", 2)
     assert list(wrap(range(4), "first", 4)) == [0, 1, 2, 3]
-    assert together.read(tmp_path / together.NOTES) == (0.5, 0, ["first"])
-    together.finished(tmp_path, "one")
-    assert together.read(tmp_path / together.NOTES)[:2] == (1.0, 1)
-    assert list(together.noting(tmp_path / "unwatched", "one", 1)([7], "x", 1)) == [7]
+    assert together._read_progress(tmp_path / together._NOTES_FOLDER) == (0.5, 0, ["first"])
+    together.mark_finished(tmp_path, "one")
+    assert together._read_progress(tmp_path / together._NOTES_FOLDER)[:2] == (1.0, 1)
+    assert list(together.record_progress(tmp_path / "unwatched", "one", 1)([7], "x", 1)) == [7]
 
 
 @pytest.mark.parametrize(("gate", "word"), [("no_track", "smaller pairs.gap"), ("no_baseline", "larger pairs.gap")])
@@ -186,10 +186,10 @@ def test_one_bar_covers_all_jobs_and_scenes_of_every_process(command, tmp_path, 
     def draw(notes, n_jobs, stop):
         asked.append(n_jobs)
         while not stop.wait(0.02):
-            seen.append(together.read(notes))
-        seen.append(together.read(notes))
+            seen.append(together._read_progress(notes))
+        seen.append(together._read_progress(notes))
 
-    monkeypatch.setattr(together, "_draw", draw)
+    monkeypatch.setattr(together, "_draw_bar", draw)
     monkeypatch.setattr(together, "sys", SimpleNamespace(stderr=SimpleNamespace(isatty=lambda: True)))
     rooms = ["data=synthetic_seeds", "data.seed=[0,1]", "data.hw=[60,80]", "data.n_frames=3"]
     options = ["method.n=256", "pairs.gap=1,2", "figures=false", "launch=joblib", "hydra.launcher.n_jobs=2"]
@@ -199,4 +199,4 @@ def test_one_bar_covers_all_jobs_and_scenes_of_every_process(command, tmp_path, 
     done = [share for share, _, _ in seen]
     assert done == sorted(done) and seen[-1] == (2.0, 2, []), "the notes of two workers are one growing sum"
     assert any(0 < share < 2 for share in done), "it moves while they run"
-    assert not (tmp_path / "sweep" / together.NOTES).exists()
+    assert not (tmp_path / "sweep" / together._NOTES_FOLDER).exists()

@@ -36,7 +36,7 @@ def command(tmp_path, monkeypatch, capsys):
     """The command in this process, from an empty folder."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DHTORCH_DATA", raising=False)
-    monkeypatch.delenv(console.VERBOSITY, raising=False)
+    monkeypatch.delenv(console._VERBOSITY_VARIABLE, raising=False)
 
     def call(*args):
         try:
@@ -75,7 +75,7 @@ def said(frames, tmp_path_factory):
     code = (
         "import json, sys; from dhtorch.cli.run import main; print('\\x00', [main(a) for a in json.loads(sys.argv[1])])"
     )
-    env = {k: v for k, v in os.environ.items() if k not in ("DHTORCH_DATA", console.VERBOSITY)}
+    env = {k: v for k, v in os.environ.items() if k not in ("DHTORCH_DATA", console._VERBOSITY_VARIABLE)}
     run = [sys.executable, "-c", code, json.dumps(calls)]
     done = subprocess.run(run, cwd=folder, env=env, capture_output=True, text=True, timeout=550, check=False)
     return folder, done
@@ -125,7 +125,7 @@ def test_verbose_says_what_is_read_and_done(command):
     assert code == 0 and "coverage" in out
     assert all(re.match(r" *\d+ ms  dhtorch\.", line) for line in lines), err
     assert any("synthetic_room" in line for line in lines) and any("digest" in line for line in lines)
-    assert not logging.getLogger("dhtorch").handlers and console.VERBOSITY not in os.environ
+    assert not logging.getLogger("dhtorch").handlers and console._VERBOSITY_VARIABLE not in os.environ
     assert command(*TINY)[2] == "", "the next call is as before"
 
 
@@ -149,7 +149,7 @@ class Terminal(io.StringIO):
 )
 def test_progress_is_for_terminals(monkeypatch, stream, level, drawn):
     monkeypatch.setattr(sys, "stderr", shown := stream())
-    monkeypatch.setenv(console.VERBOSITY, level)
+    monkeypatch.setenv(console._VERBOSITY_VARIABLE, level)
     monkeypatch.setenv("TERM", "xterm")
     assert list(console.progress(range(3), "pairs of a room", 3)) == [0, 1, 2]
     assert ("pairs of a room" in shown.getvalue()) == drawn
@@ -245,7 +245,7 @@ def stopping(function, after):
 
 
 def test_ctrl_c_leaves_the_sheets_that_are_written(command, frames, monkeypatch):
-    monkeypatch.setattr(capture, "write_sheet", stopping(capture.write_sheet, 1))
+    monkeypatch.setattr(capture, "write_contact_sheet", stopping(capture.write_contact_sheet, 1))
     code, out, err = command("inspect", str(frames), "--out", "sheets")
     assert code == 130 and "1 contact sheet in sheets stay" in err and len(err.strip().splitlines()) == 1
     assert [p.name for p in Path("sheets").iterdir()] == [re.search(r"sheets/(\S+png)", out)[1]]

@@ -22,7 +22,7 @@ from dhtorch.cli import job
 from dhtorch.cli.run import config_dir, job_name, main
 from dhtorch.experiments.protocol import Outcome
 from dhtorch.runtime import console
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.synthetic.recording import SyntheticRoom
 
 ROOM = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact"]
@@ -47,7 +47,7 @@ def seen(paths):
 
 
 def asked(path):
-    result = archive.read(path)
+    result = result_files.read_result(path)
     return next(r["method"] for r in result["rows"]), result["config"]["seed"]
 
 
@@ -81,7 +81,7 @@ def test_kill_9_in_the_middle_of_a_sweep_loses_and_doubles_nothing(tmp_path):
     after = results(tmp_path)
     combinations = [asked(p) for p in after]
     assert sorted(combinations) == [(m, s) for m in ("opencv", "paper") for s in range(3)], "none lost, none doubled"
-    assert len({archive.read(p)["key"] for p in after}) == 6
+    assert len({result_files.read_result(p)["key"] for p in after}) == 6
     assert seen(before) == before, "what was finished is untouched"
     assert {p.name for p in tmp_path.joinpath("sweep").rglob("*") if p.is_file()} == {"result.json", "multirun.yaml"}
     n = len(before)
@@ -101,7 +101,7 @@ def test_an_interrupted_sweep_says_how_to_go_on(tmp_path, command, monkeypatch):
     code, _, err = command("-m", *SIX)
     assert code == 130 and "Traceback" not in err and "interrupted" in err
     before = seen(results(tmp_path))
-    assert len(before) == 2 and all(archive.read(p) for p in before)
+    assert len(before) == 2 and all(result_files.read_result(p) for p in before)
     program, *words = shlex.split(err.strip().splitlines()[-1])
     assert program == "dhtorch"
     code, out, err = command(*words)
@@ -110,7 +110,7 @@ def test_an_interrupted_sweep_says_how_to_go_on(tmp_path, command, monkeypatch):
 
 
 def test_an_interrupted_job_writes_nothing(tmp_path, command, monkeypatch):
-    monkeypatch.setattr(archive, "write", lambda *_: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(result_files, "write_result", lambda *_: signal.raise_signal(signal.SIGINT))
     code, _, err = command(*TINY)
     assert code == 130 and "resume=true output=outputs/" in err and not results(tmp_path)
 
@@ -164,10 +164,10 @@ def test_single_jobs_resume_in_folders_of_their_own(command, tmp_path):
 def test_another_question_in_the_same_folder_is_done_again(command, tmp_path):
     assert command("output=here", *TINY)[0] == 0
     (path,) = results(tmp_path)
-    keys = {archive.read(path)["key"]}
+    keys = {result_files.read_result(path)["key"]}
     for n, other in enumerate(("seed=1", "holdout.truth=raw", "data.depth_noise=2"), start=2):
         code, out, _ = command("output=here", "resume=true", *TINY, other)
-        keys.add(archive.read(path)["key"])
+        keys.add(result_files.read_result(path)["key"])
         assert code == 0 and "wrote" in out and len(keys) == n and results(tmp_path) == [path]
 
 
@@ -243,14 +243,14 @@ def test_changed_data_are_another_question(command, tmp_path):
     asked = ["data=auto", "pairs.gap=2", "method.n=256", "figures=false", "resume=true", "output=here"]
     assert command(*asked, f"data.root={tmp_path / 'set'}")[0] == 0
     (path,) = results(tmp_path)
-    config, digest = archive.read(path)["config"], archive.read(path)["data"]["digest"]
-    assert digest == archive.data_digest(archive.files_below([tmp_path / "set"]))
+    config, digest = result_files.read_result(path)["config"], result_files.read_result(path)["data"]["digest"]
+    assert digest == result_files.compute_data_digest(result_files.list_files_below([tmp_path / "set"]))
     assert config["data"]["root"] == "set", "no place of this machine"
     same = [*asked, f"data.root={tmp_path / 'set'}"]
     assert "left untouched" in command(*same)[1]
     image = next((tmp_path / "set").rglob("*.png"))
     image.write_bytes(image.read_bytes() + b"\0")
-    assert "wrote" in command(*same)[1] and archive.read(path)["data"]["digest"] != digest
+    assert "wrote" in command(*same)[1] and result_files.read_result(path)["data"]["digest"] != digest
 
 
 def test_files_that_settings_name_count_by_content_not_by_place(tmp_path, capsys):
@@ -267,10 +267,10 @@ def test_files_that_settings_name_count_by_content_not_by_place(tmp_path, capsys
     def key(place, words):
         place.mkdir(exist_ok=True)
         (place / "net.pt").write_text(words)
-        settings = {**{g: {} for g in job.GROUPS}, **common, "method": {"weights": str(place / "net.pt")}}
+        settings = {**{g: {} for g in job.SETTINGS_GROUPS}, **common, "method": {"weights": str(place / "net.pt")}}
         whole = parts | {"experiment": experiment}
-        job.run(settings, whole, dict.fromkeys(job.GROUPS, "some"), tmp_path / "out", progress=None)
-        return archive.read(tmp_path / "out" / "result.json")["key"]
+        job.run(settings, whole, dict.fromkeys(job.SETTINGS_GROUPS, "some"), tmp_path / "out", progress=None)
+        return result_files.read_result(tmp_path / "out" / "result.json")["key"]
 
     one, elsewhere, other = key(tmp_path / "a", "w"), key(tmp_path / "b", "w"), key(tmp_path / "a", "v")
     assert one == elsewhere != other and len(asked) == 2
@@ -283,7 +283,7 @@ def test_only_our_own_warnings_are_seen(monkeypatch, asked):
     modules = ["torch.nn", "hydra.main", "dhtorchy", "dhtorch.pipeline.pair"]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        console.hush()
+        console.ignore_foreign_warnings()
         for module in modules:
             warnings.warn_explicit("careful", UserWarning, f"{module}.py", 1, module=module)
     assert [Path(w.filename).stem for w in caught] == (modules if asked else ["dhtorch.pipeline.pair"])

@@ -11,7 +11,7 @@ import pytest
 
 from dhtorch import testing as writers
 from dhtorch.cli.run import main
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.synthetic.recording import SyntheticRoom
 
 TINY = ["data.hw=[120,160]", "data.n_frames=3", "pairs.gap=2", "method.n=1024"]
@@ -57,7 +57,7 @@ def results(folder):
 def test_one_job_writes_one_result_and_its_pictures(job):
     folder, done = job
     (path,) = results(folder)
-    result = archive.read(path)
+    result = result_files.read_result(path)
     assert result["experiment"] == "pair" and result["data"]["n_pairs"] == 1
     assert {p.name for p in path.parent.rglob("*") if p.is_file()} == {
         "result.json", "completed.png", "samples.png", "holes.png", "depth.png", "risk_coverage.png", "points.ply",
@@ -160,7 +160,7 @@ def test_a_broken_file_is_one_line_from_a_worker_too(command, tmp_path, workers)
 def test_pairs_by_time_and_by_baseline(command, tmp_path, pairs):
     code, _, err = command(*[o for o in TINY if not o.startswith("pairs")], *pairs, "figures=false")
     assert code == 0, err
-    assert archive.read(results(tmp_path)[0])["data"]["n_pairs"] >= 1
+    assert result_files.read_result(results(tmp_path)[0])["data"]["n_pairs"] >= 1
 
 
 def test_dropped_pairs_are_said(command):
@@ -201,5 +201,5 @@ def test_batches_and_workers_give_the_same_rows(tmp_path):
         done = dhtorch(folder, *TINY, "data.n_frames=5", "figures=false", *extra)
         assert done.returncode == 0, done.stderr
         (path,) = results(folder)
-        rows.append([{k: v for k, v in r.items() if k != "ms"} for r in archive.read(path)["rows"]])
+        rows.append([{k: v for k, v in r.items() if k != "ms"} for r in result_files.read_result(path)["rows"]])
     assert rows[0] == rows[1]

@@ -12,25 +12,25 @@ from torch.utils.data import DataLoader
 from dhtorch import testing as writers
 from dhtorch.cli import run
 from dhtorch.cli.validate import (
-    _cut,
-    _drift_at_least,
-    _factor,
-    _off_at_least,
-    _said,
-    _share_at_least,
-    _wrong_at_least,
-    exceeded,
+    _deviation_lower_bound,
+    _drift_lower_bound,
+    _find_shared_ceiling,
+    _format_factor,
+    _format_summary,
+    _share_lower_bound,
+    _wrong_lower_bound,
+    list_exceeded_limits,
     parse_limits,
 )
 from dhtorch.codes import State
-from dhtorch.data.depth_maps import open_maps
+from dhtorch.data.depth_maps import open_depth_maps
 from dhtorch.data.io.decode import FormatError
 from dhtorch.experiments.compare import validate_study as judge_study
 from dhtorch.experiments.protocol import Settings
-from dhtorch.export import png
+from dhtorch.export import encode_png
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.transforms import JudgeDepth, SampleError
+from dhtorch.transforms import SampleError, ValidateDepth
 
 ROOM = ["data=synthetic", "data.hw=[96,128]", "data.depth_hw=[96,128]", "data.supersample=1", "data.n_frames=6"]
 LITTLE = ["method.n=256", "size=96", "window=0", "most=2", "every=3"]
@@ -56,7 +56,7 @@ def judged(out, *words, capsys=None):
 def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
     out = tmp_path / "out"
     code, found = judged(out, f"depth={maps}", "depth_unit=mm", 'fail_on="scale>0.5,unknown>1"')
-    assert code == run.SOME_FAILED, "metres read as millimetres"
+    assert code == run.EXIT_SOME_FAILED, "metres read as millimetres"
     assert len(found["exceeded"]) == 1
     assert found["whole"]["held"]["scale"] == pytest.approx(0.999, abs=0.002)
     assert [row["frame"] for row in found["frames"]] == [0, 3]
@@ -64,7 +64,7 @@ def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
     assert page.count("data:image/png;base64,") == 2
     assert "Exceeded: scale" in page
     code, found = judged(out, f"depth={maps}", 'fail_on="scale>0.5"', "pictures=0", "views=false")
-    assert code == run.DONE
+    assert code == run.EXIT_DONE
     assert found["exceeded"] == []
     assert "data:image" not in (out / "judge.html").read_text()
 
@@ -74,7 +74,7 @@ def test_a_guessed_camera_is_told_on_the_page_and_one_frame_is_one(tmp_path, roo
     writers.write_counted_frames(capture, [room[0], room[3]])
     (capture / "K.txt").unlink()
     words = ["data=frames_dir", f"data.root={capture}", "data.fov=60", *LITTLE, "most=1", f"output={tmp_path / 'out'}"]
-    assert run.main(["judge", *words]) == run.DONE
+    assert run.main(["judge", *words]) == run.EXIT_DONE
     page = (tmp_path / "out/judge.html").read_text()
     assert "<p>Its intrinsics are a guess from a field of view of 60°" in page
     assert "capture: 1 frame: " in page and "known, of the depth" in page
@@ -93,7 +93,7 @@ def test_a_guessed_camera_is_told_on_the_page_and_one_frame_is_one(tmp_path, roo
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, capsys):
-    assert run.main(["judge", *ROOM, *LITTLE, f"output={tmp_path}", word]) == run.FAILED
+    assert run.main(["judge", *ROOM, *LITTLE, f"output={tmp_path}", word]) == run.EXIT_FAILED
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert said in lines[0]
@@ -105,11 +105,11 @@ def test_a_single_frame_exceeds_a_limit_by_its_bound_alone(tmp_path, maps):
     out = tmp_path / "out"
     code, found = judged(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.05,wrong>0.9"')
     scale = found["frames"][0]["scale"]
-    assert code == run.SOME_FAILED
+    assert code == run.EXIT_SOME_FAILED
     assert found["whole"]["held"]["scale"] == pytest.approx(scale["low"] - 1)
     assert scale["low"] - 1 < 0.099 < scale["value"] - 1 + 0.01
     code, _ = judged(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.097"')
-    assert code == run.DONE, "the value is more, its interval is not"
+    assert code == run.EXIT_DONE, "the value is more, its interval is not"
     assert found["intrinsics_guessed"] is None
 
 
@@ -117,38 +117,38 @@ def test_bounds_of_a_recording():
     def row(low, high):
         return {"scale": {"value": (low + high) / 2, "low": low, "high": high}}
 
-    assert _off_at_least([row(0.98, 1.03)], "scale", 1.0) == 0
-    assert _off_at_least([row(1.02, 1.08), row(1.03, 1.2), row(0.5, 0.6)], "scale", 1.0) == pytest.approx(0.02)
-    assert _off_at_least([row(0.8, 0.9)], "scale", 1.0) == pytest.approx(0.1)
-    assert _off_at_least([{"scale": None}], "scale", 1.0) is None
+    assert _deviation_lower_bound([row(0.98, 1.03)], "scale", 1.0) == 0
+    assert _deviation_lower_bound([row(1.02, 1.08), row(1.03, 1.2), row(0.5, 0.6)], "scale", 1.0) == pytest.approx(0.02)
+    assert _deviation_lower_bound([row(0.8, 0.9)], "scale", 1.0) == pytest.approx(0.1)
+    assert _deviation_lower_bound([{"scale": None}], "scale", 1.0) is None
     sound, far = row(0.97, 1.02), row(1.1, 1.2)
-    assert _drift_at_least([sound, far]) == pytest.approx(1.1 - 1.02)
-    assert _drift_at_least([sound, row(0.99, 1.05), {"scale": None}]) == 0
-    assert _drift_at_least(10 * [sound] + [far]) == 0, "one of eleven"
-    assert _drift_at_least(9 * [sound] + 3 * [far]) == pytest.approx(1.1 - 1.02)
-    assert _drift_at_least([far, {"scale": None}]) is None
-    assert _share_at_least(0, 0) is None
-    assert _share_at_least(1, 1) < 0.3 < _share_at_least(20, 20)
+    assert _drift_lower_bound([sound, far]) == pytest.approx(1.1 - 1.02)
+    assert _drift_lower_bound([sound, row(0.99, 1.05), {"scale": None}]) == 0
+    assert _drift_lower_bound(10 * [sound] + [far]) == 0, "one of eleven"
+    assert _drift_lower_bound(9 * [sound] + 3 * [far]) == pytest.approx(1.1 - 1.02)
+    assert _drift_lower_bound([far, {"scale": None}]) is None
+    assert _share_lower_bound(0, 0) is None
+    assert _share_lower_bound(1, 1) < 0.3 < _share_lower_bound(20, 20)
     few = {"wrong": {"value": 0.5, "low": 0.1, "high": 0.9}, "pixels": 100, "share_cannot_know": 0.9}
     many = {"wrong": {"value": 0.5, "low": 0.4, "high": 0.6}, "pixels": 100, "share_cannot_know": 0.7}
     nothing = {"wrong": None, "pixels": 100, "share_cannot_know": 1.0}
-    assert _wrong_at_least([few, many, nothing]) == pytest.approx((10 * 0.1 + 30 * 0.4) / 40)
-    assert _wrong_at_least([nothing]) is None
+    assert _wrong_lower_bound([few, many, nothing]) == pytest.approx((10 * 0.1 + 30 * 0.4) / 40)
+    assert _wrong_lower_bound([nothing]) is None
 
 
 def test_maps_that_are_cut_are_told(tmp_path, maps, room):
     for file in maps.glob("*.npy"):
         np.save(file, np.minimum(np.load(file), np.float32(2.55)))
     code, found = judged(tmp_path / "out", f"depth={maps}", "window=6", "every=2", "most=3", "method.n=512")
-    assert code == run.DONE
+    assert code == run.EXIT_DONE
     assert [row["ceiling"] for row in found["frames"]] == pytest.approx([2.55] * 3)
     assert [(row["cause"], row["kind"]) for row in found["windows"]] == [("cut at 2.55 m", "cut")]
     assert found["whole"]["ceiling"] == pytest.approx(2.55) and "2.55" in (tmp_path / "out/judge.html").read_text()
-    unnamed = _said("room", found["whole"] | {"causes": {}})
+    unnamed = _format_summary("room", found["whole"] | {"causes": {}})
     assert unnamed[-1] == "  cut at 2.55 m: what is farther is said to lie there"
-    assert not any("farther" in line for line in _said("room", found["whole"])), "said once"
-    assert _cut([{"ceiling": 2.55}, {"ceiling": None}]) is None, "not most of them"
-    assert _cut([{"ceiling": 2.55}, {"ceiling": 3.0}]) is None, "not at one depth"
+    assert not any("farther" in line for line in _format_summary("room", found["whole"])), "said once"
+    assert _find_shared_ceiling([{"ceiling": 2.55}, {"ceiling": None}]) is None, "not most of them"
+    assert _find_shared_ceiling([{"ceiling": 2.55}, {"ceiling": 3.0}]) is None, "not at one depth"
 
 
 def test_a_guessed_field_of_view_is_told(tmp_path, room):
@@ -156,16 +156,16 @@ def test_a_guessed_field_of_view_is_told(tmp_path, room):
         for name, picture in (("rgb", room[k].image[0]), ("depth", (1000 * room[k].depth[0]).to(torch.uint16))):
             (tmp_path / "capture" / name).mkdir(parents=True, exist_ok=True)
             array = picture.permute(1, 2, 0).numpy() if name == "rgb" else picture.numpy()
-            (tmp_path / "capture" / name / f"{k}.png").write_bytes(png(np.ascontiguousarray(array)))
+            (tmp_path / "capture" / name / f"{k}.png").write_bytes(encode_png(np.ascontiguousarray(array)))
     words = ["judge", str(tmp_path / "capture"), "data.fov=60", "method.n=256", "size=96", "window=0", "most=1"]
     with pytest.warns(UserWarning, match="intrinsics are a guess"):
-        assert run.main([*words, f"output={tmp_path}"]) == run.DONE
+        assert run.main([*words, f"output={tmp_path}"]) == run.EXIT_DONE
     told = json.loads((tmp_path / "judge.json").read_text())["intrinsics_guessed"]
     assert told.startswith("intrinsics are a guess") and "60" in told
 
 
 def test_a_factor_is_legible_whatever_it_is():
-    assert [_factor(x) for x in (1.0004, 999.19, 0.00099945, 9.99e29)] == [
+    assert [_format_factor(x) for x in (1.0004, 999.19, 0.00099945, 9.99e29)] == [
         "1.000",
         "999.190",
         "0.0009995",
@@ -177,38 +177,38 @@ def test_limits():
     assert parse_limits("wrong>0.05, scale > 0.1") == {"wrong": 0.05, "scale": 0.1}
     assert parse_limits(None) == {}
     held = {"wrong": 0.06, "scale": None}
-    assert exceeded({"held": held}, {"wrong": 0.06, "scale": 0.0}) == [], "not more, and not known"
-    assert len(exceeded({"held": held}, {"wrong": 0.05})) == 1
+    assert list_exceeded_limits({"held": held}, {"wrong": 0.06, "scale": 0.0}) == [], "not more, and not known"
+    assert len(list_exceeded_limits({"held": held}, {"wrong": 0.05})) == 1
 
 
 def test_maps_are_matched_by_number_unit_and_kind(tmp_path, maps, room):
-    found = open_maps(maps, room)
+    found = open_depth_maps(maps, room)
     assert torch.equal(found[3], room.truth(3)["depth"])
     (maps / "depth_0002.npy").unlink()
-    assert open_maps(maps, room)[2] is None
+    assert open_depth_maps(maps, room)[2] is None
     shorter = tmp_path / "png"
     shorter.mkdir()
     steps = (room.truth(1)["depth"][0].numpy() * 500).round().astype(np.uint16)
-    (shorter / "1.png").write_bytes(png(steps))
-    assert torch.allclose(open_maps(shorter, room, 0.002)[1], room.truth(1)["depth"], atol=0.0011)
+    (shorter / "1.png").write_bytes(encode_png(steps))
+    assert torch.allclose(open_depth_maps(shorter, room, 0.002)[1], room.truth(1)["depth"], atol=0.0011)
     (shorter / "complete.json").write_text('{"unit_m": 0.002}')
-    assert open_maps(shorter, room).unit == 0.002
+    assert open_depth_maps(shorter, room).unit == 0.002
     with pytest.raises(ValueError, match="depth_unit"):
-        open_maps(shorter, room, "furlong")
+        open_depth_maps(shorter, room, "furlong")
 
 
 def test_damaged_or_hostile_maps_are_refused(tmp_path, room):
     with pytest.raises(FormatError, match="no such file"):
-        open_maps(tmp_path, room)
+        open_depth_maps(tmp_path, room)
     np.save(tmp_path / "0.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(FormatError, match="NPY array"):
-        open_maps(tmp_path, room)[0]
+        open_depth_maps(tmp_path, room)[0]
     np.save(tmp_path / "0.npy", np.zeros((2, 3, 4)))
     with pytest.raises(FormatError, match="shape"):
-        open_maps(tmp_path, room)[0]
+        open_depth_maps(tmp_path, room)[0]
     (tmp_path / "0.png").write_bytes(b"")
     with pytest.raises(FormatError, match=r"1 \.npy and 1 \.png"):
-        open_maps(tmp_path, room)
+        open_depth_maps(tmp_path, room)
 
 
 def folder_of(root, names, hw=(6, 8)):
@@ -225,37 +225,37 @@ def depths(maps):
 
 def test_files_are_matched_by_number_else_in_order_and_never_by_halves(tmp_path, room):
     n = len(room)
-    some = open_maps(folder_of(tmp_path / "some", ["depth_3", "depth_1"]), room)
+    some = open_depth_maps(folder_of(tmp_path / "some", ["depth_3", "depth_1"]), room)
     assert depths(some)[:4] == [None, 2.0, None, 1.0] and some.frames == [1, 3]
     assert some.notes == [f"{n - 2} of {n} frames have no map."]
     assert some.report == {"missing": n - 2, "matched_by": "number"}
-    more = open_maps(folder_of(tmp_path / "more", range(n + 5)), room)
+    more = open_depth_maps(folder_of(tmp_path / "more", range(n + 5)), room)
     assert depths(more) == [1.0 + k for k in range(n)] and not more.notes
-    later = open_maps(folder_of(tmp_path / "later", [f"{95 + k}" for k in range(n)]), room)
+    later = open_depth_maps(folder_of(tmp_path / "later", [f"{95 + k}" for k in range(n)]), room)
     assert depths(later) == [1.0 + k for k in range(n)], "99 comes before 100"
     assert later.report == {"missing": 0, "matched_by": "order"} and "in their order" in later.notes[0]
-    named = open_maps(folder_of(tmp_path / "named", "abcdefghijklmnopqrstuvwxyz"[:n]), room)
+    named = open_depth_maps(folder_of(tmp_path / "named", "abcdefghijklmnopqrstuvwxyz"[:n]), room)
     assert depths(named) == [1.0 + k for k in range(n)] and named.by == "order"
     for k, names in enumerate((range(n - 1, 2 * n - 1), [*range(n - 1), "x"], ["a", "b"])):
         with pytest.raises(FormatError, match=f"one for each of {n} frames, numbered 0 to {n - 1}"):
-            open_maps(folder_of(tmp_path / f"wrong{k}", names), room)
+            open_depth_maps(folder_of(tmp_path / f"wrong{k}", names), room)
     with pytest.raises(FormatError, match=r"b_1\.npy: name: .*number 1 as a_1\.npy has"):
-        open_maps(folder_of(tmp_path / "twice", ["a_1", "b_1"]), room)
+        open_depth_maps(folder_of(tmp_path / "twice", ["a_1", "b_1"]), room)
 
 
 def test_a_map_is_laid_over_the_whole_picture(tmp_path, room):
     h, w = room[0].hw
     with pytest.raises(FormatError, match=rf"a map of {h}x{w}, expected one over the field of its picture, {w}x{h}"):
-        open_maps(folder_of(tmp_path / "upright", ["0"], (w, h)), room)[0]
+        open_depth_maps(folder_of(tmp_path / "upright", ["0"], (w, h)), room)[0]
     with pytest.warns(UserWarning, match="maps of 64x64 are taken to be stretched"):
-        assert open_maps(folder_of(tmp_path / "square", ["0"], (64, 64)), room)[0].shape == (1, 64, 64)
+        assert open_depth_maps(folder_of(tmp_path / "square", ["0"], (64, 64)), room)[0].shape == (1, 64, 64)
 
 
 OPTIONS = {"image": "image", "depth": "depth", "intrinsics": "intrinsics", "depth_unit": "mm", "n": 256}
 
 
 def test_a_loader_gets_verdicts_of_one_shape():
-    transform = JudgeDepth(map="map", judging={"size": 64}, **OPTIONS)
+    transform = ValidateDepth(map="map", judging={"size": 64}, **OPTIONS)
     samples = []
     for k, factor in ((0, 1.0), (1, 1.4)):
         sample = frames()[k]
@@ -265,7 +265,7 @@ def test_a_loader_gets_verdicts_of_one_shape():
     assert batch["dhtorch.ceiling_known"].tolist() == [False, False] and not batch["dhtorch.ceiling"].any()
     cut = transform({**sample, "map": np.minimum(metres, np.float32(1.6))})
     assert bool(cut["dhtorch.ceiling_known"]) and float(cut["dhtorch.ceiling"]) == pytest.approx(1.6)
-    in_mm = JudgeDepth(map="map", map_unit=0.001, judging={"size": 64}, **OPTIONS)({**sample, "map": 1400 * metres})
+    in_mm = ValidateDepth(map="map", map_unit=0.001, judging={"size": 64}, **OPTIONS)({**sample, "map": 1400 * metres})
     assert float(in_mm["dhtorch.scale"][0]) == pytest.approx(float(batch["dhtorch.scale"][1, 0]), abs=1e-4)
     assert batch["dhtorch.state"].shape == (2, 64, 64)
     assert batch["dhtorch.scale_known"].all()
@@ -278,30 +278,30 @@ def test_a_loader_gets_verdicts_of_one_shape():
 def test_a_loader_judges_the_sensor_by_another_view():
     first, second = frames()[0], frames()[6]
     both = {k: np.stack([first[k], second[k]]) for k in ("image", "depth")}
-    alone = JudgeDepth(judging={"size": 64, "views": False}, **OPTIONS)({**first})
+    alone = ValidateDepth(judging={"size": 64, "views": False}, **OPTIONS)({**first})
     assert not alone["dhtorch.scale_known"]
     assert (alone["dhtorch.state"] == State.CANNOT_KNOW).all()
-    seen = JudgeDepth(judging={"size": 64}, other_at=-1, at=0, **OPTIONS)({**first, **both})
+    seen = ValidateDepth(judging={"size": 64}, other_at=-1, at=0, **OPTIONS)({**first, **both})
     assert seen["dhtorch.state"].shape == (64, 64)
     assert (seen["dhtorch.state"] != State.CANNOT_KNOW).any()
     several = {k: np.stack([v, v]) for k, v in {**first, **both}.items() if isinstance(v, np.ndarray)}
     several["image_is_pad"] = np.array([[False, False], [False, True]])
-    judging = JudgeDepth(judging={"size": 64, "views": False}, other_at=-1, at=0, batched=True, **OPTIONS)
+    judging = ValidateDepth(judging={"size": 64, "views": False}, other_at=-1, at=0, batched=True, **OPTIONS)
     state = judging(several)["dhtorch.state"]
     assert (state[0] != State.CANNOT_KNOW).any() and (state[1] == State.CANNOT_KNOW).all(), "one has another view"
 
 
 def test_options_of_the_transform_that_cannot_be():
     with pytest.raises(ValueError, match="judging"):
-        JudgeDepth(judging={"colour": 1}, **OPTIONS)
+        ValidateDepth(judging={"colour": 1}, **OPTIONS)
     with pytest.raises(ValueError, match="method"):
-        JudgeDepth(method="none", **OPTIONS)
+        ValidateDepth(method="none", **OPTIONS)
     with pytest.raises(ValueError, match="map_unit"):
-        JudgeDepth(map="map", map_unit=0.0, **OPTIONS)
+        ValidateDepth(map="map", map_unit=0.0, **OPTIONS)
     with pytest.raises(ValueError, match="map_unit"):
-        JudgeDepth(map="map", map_unit=-1.0, **OPTIONS)
+        ValidateDepth(map="map", map_unit=-1.0, **OPTIONS)
     with pytest.raises(SampleError, match="no such key"):
-        JudgeDepth(map="map", **OPTIONS)(dict(frames()[0]))
+        ValidateDepth(map="map", **OPTIONS)(dict(frames()[0]))
     assert frames()[0]["image"].shape[0] == SIDE
 
 
@@ -319,9 +319,9 @@ def test_a_study_counts_what_was_planted():
     rows += [window("unit_mm", "unit", "unit", 50.0), window("unit_m", "unit", None, 50.0)]
     rows += [window("mirrored", "mirrored", "mirrored", 9.0), window("mirrored", "mirrored", None, 1.0)]
     rows += [window("none", None, None, 0.0), window("none", None, "rolled", 0.0)]
-    found = judge_study.summary([*rows, {**rows[0], "judge.called_right_wrong": 0.02}])
+    found = judge_study.summarise_validation([*rows, {**rows[0], "judge.called_right_wrong": 0.02}])
     assert found["judge.called_right_wrong_worst"]["value"] == 0.02
-    found = judge_study.summary(rows)
+    found = judge_study.summarise_validation(rows)
     assert found["judge.scale_found"]["value"] == 0.75
     assert found["judge.known"]["value"] == 0.5
     assert found["judge.named.unit"]["value"] == 0.5
@@ -335,10 +335,10 @@ def test_a_study_counts_what_was_planted():
 
 
 def test_an_alarm_needs_an_interval_without_one_and_a_distance():
-    assert judge_study.alarm(torch.tensor([1.1, 1.05, 1.15])) is True
-    assert judge_study.alarm(torch.tensor([1.1, 0.99, 1.2])) is False
-    assert judge_study.alarm(torch.tensor([1.02, 1.01, 1.03])) is False
-    assert judge_study.alarm(torch.full((3,), math.nan)) is None
+    assert judge_study.scale_alarm(torch.tensor([1.1, 1.05, 1.15])) is True
+    assert judge_study.scale_alarm(torch.tensor([1.1, 0.99, 1.2])) is False
+    assert judge_study.scale_alarm(torch.tensor([1.02, 1.01, 1.03])) is False
+    assert judge_study.scale_alarm(torch.full((3,), math.nan)) is None
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from dhtorch import testing as writers
 from dhtorch.cli.run import config_dir
 from dhtorch.data import FormatError, clocks, convert
 from dhtorch.data.readers import arkitscenes, ca1m
-from dhtorch.experiments.protocol import PairData
+from dhtorch.experiments.protocol import PairDataset
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.metrics import holdout
@@ -43,7 +43,7 @@ def shots(times: object, camera: Camera = CAMERA, hw: tuple[int, int] = HW, turn
     """What the stored pictures show; ``turns`` quarter turns clockwise would make them upright."""
     frames = []
     for time in np.round(np.asarray(times, dtype=float), 6):
-        c2w = convert.turn_pose(se3.to_matrix(path(float(time))).numpy(), -turns)
+        c2w = convert.rot90_pose(se3.to_matrix(path(float(time))).numpy(), -turns)
         frame = render(camera, se3.from_matrix(torch.from_numpy(c2w)), hw, float(time))
         frames.append(frame.replace(conf=frame.image[:, 1] // 86))  # 0, 1 and 2, in patches
     return frames
@@ -286,7 +286,7 @@ def test_nearest_against_brute_force() -> None:
         times, others = rng.uniform(0, 1, 50), np.sort(rng.uniform(0, 1, m))
         gap = np.abs(times[:, None] - others)
         want = np.where(gap.min(1) <= 0.03, gap.argmin(1), -1)
-        assert np.array_equal(clocks.nearest(times, others, 0.03), want)
+        assert np.array_equal(clocks.nearest_stamps(times, others, 0.03), want)
 
 
 def test_rotation_vectors_and_the_way_between_rotations() -> None:
@@ -359,12 +359,12 @@ def test_turning_a_lens_keeps_every_ray() -> None:
     xyz = torch.tensor([[[0.3, -0.2, 1.5], [-0.4, 0.1, 1.2], [0.0, 0.5, 2.0]]]).double()
     uv = cameras.project(lens, xyz)[0]
     for turns, turned in ((1, (HW[0] - 1 - uv[:, 1], uv[:, 0])), (2, (HW[1] - 1 - uv[:, 0], HW[0] - 1 - uv[:, 1]))):
-        pose = torch.from_numpy(convert.turn_pose(np.eye(4)[None], turns))
+        pose = torch.from_numpy(convert.rot90_pose(np.eye(4)[None], turns))
         seen = se3.apply(se3.invert(se3.from_matrix(pose)), xyz)
-        got = cameras.project(convert.turn_camera(lens, HW, turns), seen)[0]
+        got = cameras.project(convert.rot90_camera(lens, HW, turns), seen)[0]
         torch.testing.assert_close(got, torch.stack(turned, -1), atol=1e-9, rtol=0)
         picture = torch.arange(HW[0] * HW[1]).view(HW)
-        assert convert.turn_picture(picture, turns)[5, 7] == (
+        assert convert.rot90_image(picture, turns)[5, 7] == (
             picture[HW[0] - 1 - 7, 5] if turns == 1 else picture[HW[0] - 1 - 5, HW[1] - 1 - 7]
         )
 
@@ -425,11 +425,11 @@ def test_laser_truth_enters_the_main_job(tmp_path: Path) -> None:
     writers.write_arkitscenes(
         root, {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": laser}, trajectory=frames
     )
-    anchor, _, exact, surface, *_ = PairData(stored(root), [(0, 3)], torch.float32)[0]
+    anchor, _, exact, surface, *_ = PairDataset(stored(root), [(0, 3)], torch.float32)[0]
     assert exact.depth_camera is None and surface.shape == exact.depth.shape
     uv = torch.tensor([[[20.0, 20.0], [40.0, 30.0], [50.0, 10.0]]])
-    assert (holdout.truth_at(anchor, uv, truth="raw").depth > 0).tolist() == [[True, False, False]]
-    found = holdout.truth_at(exact, uv, truth="full")
+    assert (holdout.sample_truth(anchor, uv, truth="raw").depth > 0).tolist() == [[True, False, False]]
+    found = holdout.sample_truth(exact, uv, truth="full")
     assert found.ok.all() and float((found.depth - 1.8).abs().max()) < 0.1
 
 
@@ -475,7 +475,7 @@ def test_bad_files(tmp_path: Path) -> None:
     conf = next(iter(sorted((root / "confidence").iterdir())))
     image = next(iter(sorted((root / "lowres_wide").iterdir())))
     good_conf = conf.read_bytes()
-    conf.write_bytes(parts.png(np.full(HW, 3, np.uint8)[..., None]))
+    conf.write_bytes(parts.encode_unfiltered_png(np.full(HW, 3, np.uint8)[..., None]))
     fails(r"confidence: found 1 channels up to 3, expected 1 channel of 0, 1 or 2", root)
     conf.write_bytes(image.read_bytes())
     fails(r"confidence: found 3 channels", root)

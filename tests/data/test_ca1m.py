@@ -21,7 +21,7 @@ from dhtorch import testing as writers
 from dhtorch.data import FormatError
 from dhtorch.data.codecs import tarballs, tiff
 from dhtorch.data.readers import ca1m
-from dhtorch.export.tiff import float_tiff
+from dhtorch.export.tiff import encode_float_tiff
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame
 
@@ -138,7 +138,7 @@ def test_confidence_is_a_share_or_a_level(tmp_path: Path) -> None:
     steps = torch.linspace(0, 1, HW[0] * HW[1]).view(HW)
 
     def stored(picture: np.ndarray) -> None:
-        rewrite(file, lambda name, body: (name, float_tiff(picture) if "confidence" in name else body))
+        rewrite(file, lambda name, body: (name, encode_float_tiff(picture) if "confidence" in name else body))
 
     stored(steps.numpy())
     conf = data.open(file)[0].conf[0]
@@ -196,8 +196,8 @@ def test_poses_are_camera_to_world(tmp_path: Path) -> None:
 def test_opening_reads_only_poses_and_recordings_travel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file, _, _ = archive(tmp_path)
     read: list[int] = []
-    member = tarballs.read_member
-    monkeypatch.setattr(tarballs, "read_member", lambda *args: read.append(args[2]) or member(*args))
+    member = tarballs.read_tar_member
+    monkeypatch.setattr(tarballs, "read_tar_member", lambda *args: read.append(args[2]) or member(*args))
     recording = data.open(file)
     assert len(read) == 4 and max(read) < 400
     twin = pickle.loads(pickle.dumps(recording))
@@ -221,7 +221,7 @@ def test_what_is_no_archive_of_ours(tmp_path: Path) -> None:
         with pytest.raises(FormatError, match=message):
             data.open(tmp_path / name, "ca1m")
     with pytest.raises(FormatError, match="file: found no such file"):
-        list(tarballs.members(tmp_path / "gone.tar"))
+        list(tarballs.iter_tar_members(tmp_path / "gone.tar"))
 
 
 def test_a_folder_of_archives_is_listed_and_none_is_opened(tmp_path: Path) -> None:
@@ -260,16 +260,16 @@ def test_members_against_the_standard_library(tmp_path: Path, format: int) -> No
         archive.addfile(info, io.BytesIO(b"end"))
     with tarfile.open(file) as archive:
         want = [(m.name, m.offset_data, m.size) for m in archive.getmembers() if m.isreg()]
-        got = list(tarballs.members(file))
+        got = list(tarballs.iter_tar_members(file))
         assert [tuple(m) for m in got] == want and len(got) == 6
         for m in got:
-            assert tarballs.read_member(file, m.offset, m.size) == archive.extractfile(m.name).read()
+            assert tarballs.read_tar_member(file, m.offset, m.size) == archive.extractfile(m.name).read()
 
 
 def test_damaged_archives_end_the_walk(tmp_path: Path) -> None:
     file, _, _ = archive(tmp_path, n=1)
     good = file.read_bytes()
-    offset = next(iter(tarballs.members(file))).offset
+    offset = next(iter(tarballs.iter_tar_members(file))).offset
 
     def header(at: int, field: bytes) -> bytes:
         block = bytearray(good[:512])
@@ -290,15 +290,15 @@ def test_damaged_archives_end_the_walk(tmp_path: Path) -> None:
     ):
         file.write_bytes(content)
         if message is None:
-            assert len(list(tarballs.members(file))) == 10
+            assert len(list(tarballs.iter_tar_members(file))) == 10
         else:
             with pytest.raises(FormatError, match=message):
-                list(tarballs.members(file))
+                list(tarballs.iter_tar_members(file))
     file.write_bytes(good)
     with pytest.raises(FormatError, match="found 9 bytes, expected at most 8 bytes"):
-        tarballs.read_member(file, 512, 9, limit=8)
+        tarballs.read_tar_member(file, 512, 9, limit=8)
     with pytest.raises(FormatError, match="found 0 bytes, expected 9 bytes"):
-        tarballs.read_member(file, len(good), 9)
+        tarballs.read_tar_member(file, len(good), 9)
 
 
 def test_pax_sizes_and_long_names_are_bounded(tmp_path: Path) -> None:
@@ -312,7 +312,7 @@ def test_pax_sizes_and_long_names_are_bounded(tmp_path: Path) -> None:
             info.pax_headers = {key: value}
             archive.addfile(info)
         with pytest.raises(FormatError, match=message):
-            list(tarballs.members(file))
+            list(tarballs.iter_tar_members(file))
 
 
 # -------------------------------------------------------------------------------------------------------------- TIFF
@@ -333,11 +333,11 @@ def test_tiff_against_tifffile(tmp_path: Path, order: str, kind: str, compressio
 
 def test_our_tiff_is_one() -> None:
     picture = np.random.default_rng(0).random((5, 7), dtype=np.float32)
-    assert np.array_equal(tifffile.imread(io.BytesIO(float_tiff(picture))), picture)
+    assert np.array_equal(tifffile.imread(io.BytesIO(encode_float_tiff(picture))), picture)
 
 
 def test_bad_tiff(tmp_path: Path) -> None:
-    good = float_tiff(np.ones((5, 7)))
+    good = encode_float_tiff(np.ones((5, 7)))
     directory = 8 + 5 * 7 * 4
 
     def tag(number: int, value: int) -> bytes:

@@ -28,8 +28,8 @@ HERE = Path("here")
 
 def test_a_missing_decoder_names_its_extra() -> None:
     with pytest.raises(ImportError, match=r"needs no_such_a or no_such_b, .* pip install 'dhtorch\[data\]'"):
-        files.need("no_such_a", "no_such_b")
-    assert files.need("no_such_a", "json").__name__ == "json"
+        files.import_optional("no_such_a", "no_such_b")
+    assert files.import_optional("no_such_a", "json").__name__ == "json"
 
 
 # -------------------------------------------------------------------------------------------------------------- lzfse
@@ -45,33 +45,33 @@ def texts() -> list[bytes]:
 @pytest.mark.parametrize("text", texts(), ids=lambda text: f"{len(text)}")
 def test_lzfse_gives_back_the_bytes(text: bytes) -> None:
     packed = lzfse.compress(text)
-    assert codec_lzfse.unpacked_size(packed, HERE, "depth") == len(text)
-    assert codec_lzfse.unpack(packed, len(text), HERE, "depth") == text
+    assert codec_lzfse.lzfse_unpacked_size(packed, HERE, "depth") == len(text)
+    assert codec_lzfse.decompress_lzfse(packed, len(text), HERE, "depth") == text
     for other in (len(text) + 4, max(len(text) - 4, 0)):
         if other != len(text):
             with pytest.raises(FormatError, match=rf"depth: found {len(text)} bytes when unpacked, expected {other}"):
-                codec_lzfse.unpack(packed, other, HERE, "depth")
+                codec_lzfse.decompress_lzfse(packed, other, HERE, "depth")
     if len(packed) > 100:  # each place where a block may end, and a good many others
         for cut in {*range(1, 40), len(packed) // 2, len(packed) - 4, len(packed) - 20}:
             with pytest.raises(FormatError, match=r"here: depth: found b'.*' at byte \d+ of \d+"):
-                codec_lzfse.unpack(packed[:-cut], len(text), HERE, "depth")
+                codec_lzfse.decompress_lzfse(packed[:-cut], len(text), HERE, "depth")
 
 
 def test_a_member_that_is_not_compressed_is_taken_as_it_is() -> None:
     raw = np.arange(12, dtype="<f4").tobytes()
-    assert codec_lzfse.unpack(raw, 48, HERE, "depth") == raw
+    assert codec_lzfse.decompress_lzfse(raw, 48, HERE, "depth") == raw
     with pytest.raises(FormatError, match="whole LZFSE block"):
-        codec_lzfse.unpack(raw, 44, HERE, "depth")
+        codec_lzfse.decompress_lzfse(raw, 44, HERE, "depth")
 
 
 def test_a_stream_that_lies_about_its_size_never_gets_room() -> None:
     """A block that claims few bytes and holds a million: the decoder is given the room that was claimed."""
     packed = bytearray(lzfse.compress(bytes(1_000_000)))
     packed[4:8] = struct.pack("<I", 1000)
-    claimed = codec_lzfse.unpacked_size(bytes(packed), HERE, "depth")
+    claimed = codec_lzfse.lzfse_unpacked_size(bytes(packed), HERE, "depth")
     assert claimed < 1_000_000
     try:
-        assert len(codec_lzfse.unpack(bytes(packed), claimed, HERE, "depth")) == claimed
+        assert len(codec_lzfse.decompress_lzfse(bytes(packed), claimed, HERE, "depth")) == claimed
     except FormatError as error:
         assert "here: depth" in str(error)
 
@@ -102,7 +102,7 @@ def test_exr_gives_back_the_channel(tmp_path: Path, name: str, dtype: type) -> N
 def test_exr_chunks_lie_inside_the_file(tmp_path: Path) -> None:
     file = exr(tmp_path / "d.exr", {"R": np.ones((40, 6), np.float32)})
     whole = bytearray(file.read_bytes())
-    header = codec_exr.exr_header(file)
+    header = codec_exr.read_exr_header(file)
     assert header.chunks == 3
     for offset in (len(whole), 2**63, 8):
         whole[header.start + 8 : header.start + 16] = struct.pack("<Q", offset)
@@ -115,7 +115,7 @@ def test_exr_chooses_its_channel(tmp_path: Path) -> None:
     a, b = np.full((4, 6), 1, np.float32), np.full((4, 6), 2, np.float32)
     assert codec_exr.read_exr(exr(tmp_path / "1.exr", {"odd": a}))[0, 0] == 1
     two = exr(tmp_path / "2.exr", {"R": b, "odd": a})
-    assert codec_exr.exr_header(two).channels == ("R", "odd")
+    assert codec_exr.read_exr_header(two).channels == ("R", "odd")
     assert codec_exr.read_exr(two)[0, 0] == 2 and codec_exr.read_exr(two, "odd")[0, 0] == 1
     with pytest.raises(FormatError, match="channels: found R, odd, expected far"):
         codec_exr.read_exr(two, "far")
@@ -137,7 +137,7 @@ def test_exr_header_decides_before_the_decoder(tmp_path: Path) -> None:
         codec_exr.read_exr(file)
     file.write_bytes(b"\x89PNG" + whole)
     with pytest.raises(FormatError, match="expected an OpenEXR picture"):
-        codec_exr.exr_header(file)
+        codec_exr.read_exr_header(file)
 
 
 # -------------------------------------------------------------------------------------------------------------- video
@@ -163,10 +163,10 @@ def film(file: Path, codec: str = "libx264", **options: object) -> Path:
 @pytest.mark.parametrize("b_frames", [0, 3])
 def test_frames_by_number_in_any_order(tmp_path: Path, codec: str, b_frames: int) -> None:
     file = film(tmp_path / "a.mp4", codec, b_frames=b_frames)
-    header = codec_video.video_header(file)
+    header = codec_video.read_video_header(file)
     assert (header.n, header.hw, header.rate_hz) == (N, (48, 64), 60)
     assert header.codec == {"libx264": "h264", "libx265": "hevc"}[codec]
-    np.testing.assert_allclose(codec_video.video_times(file), np.arange(N) / 60, atol=1e-6)
+    np.testing.assert_allclose(codec_video.read_video_times(file), np.arange(N) / 60, atol=1e-6)
     order = [*range(N), *random.Random(0).choices(range(N), k=40), *reversed(range(N))]
     assert [number(codec_video.read_video_frame(file, i)) for i in order] == order
 
@@ -175,10 +175,10 @@ def test_frames_by_number_in_any_order(tmp_path: Path, codec: str, b_frames: int
 @pytest.mark.parametrize("b_frames", [0, 2])
 def test_a_frame_hidden_by_an_edit_list_is_there_for_who_asks(tmp_path: Path, codec: str, b_frames: int) -> None:
     file = film(tmp_path / "a.mp4", codec, b_frames=b_frames, hide_first=True)
-    shown = len(codec_video.video_times(file))
+    shown = len(codec_video.read_video_times(file))
     assert shown == N - 1 and number(codec_video.read_video_frame(file, 0)) == 1
-    assert codec_video.video_header(file, all_frames=True).n == N
-    assert codec_video.video_times(file, all_frames=True)[0] == pytest.approx(-1 / 60, abs=1e-4)
+    assert codec_video.read_video_header(file, all_frames=True).n == N
+    assert codec_video.read_video_times(file, all_frames=True)[0] == pytest.approx(-1 / 60, abs=1e-4)
     got = [number(codec_video.read_video_frame(file, i, all_frames=True)) for i in range(N)]
     assert got == list(range(N))
 
@@ -187,10 +187,10 @@ def test_a_frame_hidden_by_an_edit_list_is_there_for_who_asks(tmp_path: Path, co
 def test_a_decoder_that_shows_no_index_counts_the_same(tmp_path: Path, hidden: bool, monkeypatch) -> None:
     """PyAV before 17."""
     file = film(tmp_path / "a.mp4", hide_first=hidden)
-    said = [codec_video.video_header(file, all_frames=every) for every in (False, True)]
+    said = [codec_video.read_video_header(file, all_frames=every) for every in (False, True)]
     codec_video.close_videos()
-    monkeypatch.setattr(codec_video, "_index", lambda stream: ())
-    assert [codec_video.video_header(file, all_frames=every) for every in (False, True)] == said
+    monkeypatch.setattr(codec_video, "_index_entries", lambda stream: ())
+    assert [codec_video.read_video_header(file, all_frames=every) for every in (False, True)] == said
     assert [header.n for header in said] == [N - hidden, N]
     codec_video.close_videos()
 
@@ -203,7 +203,7 @@ def test_a_damaged_frame_never_shifts_the_others(tmp_path: Path) -> None:
     for at, size in places[10:13]:  # the second key frame and what follows
         whole[at + 4 : at + size] = bytes(size - 4)
     file.write_bytes(bytes(whole))
-    assert codec_video.video_header(file).n == N
+    assert codec_video.read_video_header(file).n == N
     with pytest.raises(FormatError, match=r"a.mp4: frame 10: found"):
         codec_video.read_video_frame(file, 10)
     for i in (*range(10), *range(20, N)):
@@ -217,14 +217,14 @@ def test_unsound_videos(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"frame 0 size: found 64x48, expected 48x64"):
         codec_video.read_video_frame(file, 0, (64, 48))
     with pytest.raises(FormatError, match=r"no.mp4: file: found no such file, expected a readable file"):
-        codec_video.video_header(tmp_path / "no.mp4")
+        codec_video.read_video_header(tmp_path / "no.mp4")
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(FormatError, match=r"a.mp4: content"):
-        codec_video.video_header(file)
+        codec_video.read_video_header(file)
     (tmp_path / "b.mp4").write_text("no video at all")
     with pytest.raises(FormatError, match=r"b.mp4: content"):
-        codec_video.video_header(tmp_path / "b.mp4")
+        codec_video.read_video_header(tmp_path / "b.mp4")
 
 
 def _in_child(file: Path, wanted: list[int], say: Callable[[list[int]], None]) -> None:

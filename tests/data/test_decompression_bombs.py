@@ -25,7 +25,7 @@ from dhtorch import testing as writers
 from dhtorch.data.codecs import hdf5, npy, parquet, pickles, tarballs, tiff, video
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.members import zip_members
+from dhtorch.data.members import list_zip_members
 from dhtorch.testing.mp4 import write_video
 
 pyarrow = pytest.importorskip("pyarrow")
@@ -51,7 +51,7 @@ def zeros(file: Path) -> Callable[[Path], Any]:
 def objects(file: Path) -> Callable[[Path], Any]:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("metadata", "[" + "{}," * 4_000_000 + "{}]")
-    return lambda path: files.decode_json(zip_members(path)["metadata"].read(), path)
+    return lambda path: files.decode_json(list_zip_members(path)["metadata"].read(), path)
 
 
 def long_directory(file: Path) -> Callable[[Path], Any]:
@@ -62,14 +62,14 @@ def long_directory(file: Path) -> Callable[[Path], Any]:
     with file.open("wb") as stream:
         stream.seek(size)
         stream.write(long + place + struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, 2**32 - 1, 2**32 - 1, 0))
-    return zip_members
+    return list_zip_members
 
 
 def many_entries(file: Path) -> Callable[[Path], Any]:
     entry = struct.pack("<4s6H3I5H2I", b"PK\1\2", 20, 20, 0, 0, 0, 33, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0) + b"a"
     body = entry * 400_000
     file.write_bytes(body + struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 0xFFFF, 0xFFFF, len(body), 0, 0))
-    return zip_members
+    return list_zip_members
 
 
 def small_numbers(file: Path) -> Callable[[Path], Any]:
@@ -90,7 +90,7 @@ def many_samples(file: Path) -> Callable[[Path], Any]:
     at = raw.index(b"stsz")
     raw[at + 8 : at + 16] = struct.pack(">II", 10, 50_000_000)
     file.write_bytes(raw)
-    return video.video_header
+    return video.read_video_header
 
 
 def empty_sets(file: Path) -> Callable[[Path], Any]:
@@ -103,7 +103,7 @@ def empty_sets(file: Path) -> Callable[[Path], Any]:
 def stacks(file: Path) -> Callable[[Path], Any]:
     with h5py.File(file, "w") as group:
         group.create_dataset("stack_train", (999_999, 10, 8, 8, 3), "u1", chunks=(1, 10, 8, 8, 3))
-    return hdf5.hdf5_arrays
+    return hdf5.list_hdf5_arrays
 
 
 def scans(file: Path) -> Callable[[Path], Any]:
@@ -170,11 +170,11 @@ def test_what_is_no_regular_file_is_never_opened(tmp_path: Path, monkeypatch: py
         end.bind("capture/plug")
         readers = {
             "bytes": files.read_bytes,
-            "table": parquet.parquet_header,
-            "arrays": hdf5.hdf5_arrays,
-            "archive": lambda path: list(tarballs.members(path)),
-            "members": zip_members,
-            "video": video.video_header,
+            "table": parquet.read_parquet_header,
+            "arrays": hdf5.list_hdf5_arrays,
+            "archive": lambda path: list(tarballs.iter_tar_members(path)),
+            "members": list_zip_members,
+            "video": video.read_video_header,
         }
         for what, read in readers.items():
             for file, word in ((pipe, "a pipe"), (device, "a device"), (plug, "a socket")):
@@ -191,7 +191,7 @@ def test_a_size_of_thousands_of_digits_is_a_damaged_header(tmp_path: Path) -> No
         info.pax_headers = {"size": "9" * 5000}
         archive.addfile(info)
     with pytest.raises(FormatError, match=r"x.tar: header at byte \d+: found size 9+…, expected a number of bytes"):
-        list(tarballs.members(file))
+        list(tarballs.iter_tar_members(file))
 
 
 def test_a_list_of_other_files_is_no_video(tmp_path: Path) -> None:
@@ -199,7 +199,7 @@ def test_a_list_of_other_files_is_no_video(tmp_path: Path) -> None:
     file = tmp_path / "x.mp4"
     file.write_text("ffconcat version 1.0\nfile other.mp4\n")
     with pytest.raises(FormatError, match=r"x.mp4: content: found b'ffconcat.*expected a video file"):
-        video.video_header(file)
+        video.read_video_header(file)
 
 
 def test_honest_files_stay_within_the_law(tmp_path: Path) -> None:

@@ -27,9 +27,9 @@ from dhtorch.data.codecs import parquet as codec_parquet
 from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import lerobot_depth, lerobot_rows
-from dhtorch.data.readers.lerobot_meta import Feature
+from dhtorch.data.readers.lerobot_meta import LeRobotFeature
 from dhtorch.records import Camera, Frame
-from dhtorch.testing.lerobot import quantise, write_lerobot
+from dhtorch.testing.lerobot import quantise_lerobot_depth, write_lerobot
 from dhtorch.testing.lossless import write_lossless
 
 KEY = "observation.images.front"
@@ -178,25 +178,27 @@ def test_the_mark_of_depth_as_it_was_called_before(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("log", [True, False])
 def test_codes_to_metres(log: bool) -> None:
-    feature = Feature("d", "video", (1, 4096, 1), {"video.depth_min": 0.2, "video.depth_max": 4, "video.use_log": log})
-    metres = lerobot_depth.decode_codes(feature, np.arange(4096, dtype=np.uint16), Path("x"))
+    feature = LeRobotFeature(
+        "d", "video", (1, 4096, 1), {"video.depth_min": 0.2, "video.depth_max": 4, "video.use_log": log}
+    )
+    metres = lerobot_depth.dequantise_depth(feature, np.arange(4096, dtype=np.uint16), Path("x"))
     assert not metres[[0, 1, 4094, 4095]].any() and (np.diff(metres[2:-2]) > 0).all()
     steps = np.diff(metres[2:-2])
     assert steps[-1] / steps[0] == pytest.approx((4 + 3.5) / (0.2 + 3.5) if log else 1, rel=0.01)
     with pytest.raises(FormatError, match="12-bit codes"):
-        lerobot_depth.decode_codes(feature, np.array([4096], dtype=np.uint16), Path("x"))
-    bad = Feature("d", "video", (1, 1), {"video.depth_min": 5.0, "video.depth_max": 4.0})
+        lerobot_depth.dequantise_depth(feature, np.array([4096], dtype=np.uint16), Path("x"))
+    bad = LeRobotFeature("d", "video", (1, 1), {"video.depth_min": 5.0, "video.depth_max": 4.0})
     with pytest.raises(FormatError, match="a range of metres"):
-        lerobot_depth.decode_codes(bad, np.zeros((1, 1), np.uint16), Path("x"))
+        lerobot_depth.dequantise_depth(bad, np.zeros((1, 1), np.uint16), Path("x"))
 
 
 def test_writer_codes_by_the_published_rule() -> None:
     """Step 1.5 mm at 1 m, 1.8 at 2 m, 2.8 at 5 m, 4.4 at 10 m."""
     z = torch.tensor([[[1.0, 2.0, 5.0, 9.98]]])
     blank = Frame(torch.zeros(1, 3, 1, 4), z, CAMERA)
-    codes = quantise(blank)
-    feature = Feature("d", "video", (1, 4, 1), {})
-    metres = lerobot_depth.decode_codes(feature, codes + np.array([[0], [1]], dtype=np.uint16), Path("x"))
+    codes = quantise_lerobot_depth(blank)
+    feature = LeRobotFeature("d", "video", (1, 4, 1), {})
+    metres = lerobot_depth.dequantise_depth(feature, codes + np.array([[0], [1]], dtype=np.uint16), Path("x"))
     np.testing.assert_allclose(np.diff(metres, axis=0)[0] * 1000, [1.5, 1.8, 2.8, 4.4], atol=0.06)
 
 
@@ -344,8 +346,8 @@ def test_a_shorter_video_is_an_error_where_it_ends(tmp_path: Path) -> None:
 def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_lerobot(tmp_path, episodes(), image="image", depth="tiff")
     asked: list[str] = []
-    read = codec_parquet._columns
-    monkeypatch.setattr(codec_parquet, "_columns", lambda f, t, c, r: asked.extend(c) or read(f, t, c, r))
+    read = codec_parquet._read_open_columns
+    monkeypatch.setattr(codec_parquet, "_read_open_columns", lambda f, t, c, r: asked.extend(c) or read(f, t, c, r))
     recording = data.open(tmp_path, episode=1)
     assert KEY not in asked
     for frame in recording:
@@ -384,7 +386,7 @@ def test_pages_that_unpack_into_too_much_are_refused(tmp_path: Path, monkeypatch
     file = tmp_path / "x.parquet"
     parquet.write_table(pyarrow.table({"x": [bytes(3 << 20)] * 2}), file, compression="zstd", use_dictionary=False)
     assert file.stat().st_size < 10_000 and len(codec_parquet.read_columns(file, ["x"])["x"][1]) == 3 << 20
-    monkeypatch.setattr(codec_parquet, "_MAX_UNPACKED", 4 << 20)
+    monkeypatch.setattr(codec_parquet, "_MAX_UNPACKED_BYTES", 4 << 20)
     with pytest.raises(FormatError, match=r"x.parquet: x: found \d+ bytes, expected at most 4194304"):
         codec_parquet.read_columns(file, ["x"])
     parquet.write_table(pyarrow.table({"x": np.arange(100)}), file, use_dictionary=False, compression="none")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dhtorch.data import pairs
-from dhtorch.data.recording import Recording, Recordings, numbers
+from dhtorch.data.recording import Recording, Recordings, consecutive_frame_numbers
 from dhtorch.data.scene import Scene, Scenes, scenes_of
 from dhtorch.records import Frame, Pose
 
@@ -23,7 +23,9 @@ def line(n: int, **fields: object) -> Recording:
     t = torch.zeros(n, 3, dtype=torch.float64)
     t[:, 0] = 0.05 * torch.arange(n)
     poses = Pose(torch.eye(3, dtype=torch.float64).expand(n, 3, 3), t)
-    whole = Recording("line", "test", _no_frame, numbers(n), times=0.1 * torch.arange(n).double(), poses=poses)
+    whole = Recording(
+        "line", "test", _no_frame, consecutive_frame_numbers(n), times=0.1 * torch.arange(n).double(), poses=poses
+    )
     return replace(whole, **fields)
 
 
@@ -112,7 +114,7 @@ def test_by_choice_offers_every_anchor_the_frames_around_it() -> None:
     assert pairs.by_choice(line(4)) == [(0, (1, 2, 3)), (1, (0, 2, 3)), (2, (0, 1, 3)), (3, (0, 1, 2))]
     long = pairs.by_choice(line(60))
     assert [p.anchor for p in long] == [*range(0, 60, 2)], "the stride is that of the other ways"
-    assert all(list(p.offered) == pairs.around(line(60), p.anchor) for p in long)
+    assert all(list(p.offered) == pairs.candidate_frames(line(60), p.anchor) for p in long)
     assert pairs.by_choice(line(9), steps=[4, 1, 4], stride=4) == [(0, (1, 4)), (4, (0, 3, 5, 8)), (8, (4, 7))]
     lost = line(5, number=torch.tensor([0, 1, 4, 5, 9]))
     assert pairs.by_choice(lost, steps=(1, 4)) == [(0, (1, 2)), (1, (0, 3)), (2, (0, 3)), (3, (1, 2, 4)), (4, (3,))]
@@ -126,24 +128,24 @@ def test_past_frames_alone_leave_the_first_without_an_anchor() -> None:
     far = line(3, number=torch.tensor([0, 50, 51]))
     assert pairs.by_choice(far, past=True) == [(1, (0,)), (2, (1,))], "where no step fits, the nearest before it"
     with pytest.raises(ValueError, match="line has nothing before frame 0, expected a later one"):
-        pairs.around(line(3), 0, past=True)
+        pairs.candidate_frames(line(3), 0, past=True)
 
 
 def test_what_cannot_choose_takes_pairs_of_two_frames() -> None:
-    assert pairs.fixed(pairs.by_gap(line(5), 3)) == [(0, 3), (1, 4)] == pairs.fixed([(0, 3), (1, 4)])
+    assert pairs.to_fixed_pairs(pairs.by_gap(line(5), 3)) == [(0, 3), (1, 4)] == pairs.to_fixed_pairs([(0, 3), (1, 4)])
     with pytest.raises(ValueError, match=r"pairs: found 2 frames to choose among \(pairs=auto\).*pairs=gap, time or"):
-        pairs.fixed(pairs.by_choice(line(3)))
+        pairs.to_fixed_pairs(pairs.by_choice(line(3)))
     assert pairs.Pair(0, 3).offered == () and pairs.Pair(*(0, (1, 2))).offered == (1, 2)
 
 
 def test_views_between_are_different_and_end_at_the_other() -> None:
-    assert pairs.between(3, 9, 1) == [9]
-    assert pairs.between(0, 20, 5) == [4, 8, 12, 16, 20]
+    assert pairs.spaced_frames(3, 9, 1) == [9]
+    assert pairs.spaced_frames(0, 20, 5) == [4, 8, 12, 16, 20]
     for n in range(1, 8):
-        found = pairs.between(2, 9, n)
+        found = pairs.spaced_frames(2, 9, n)
         assert len(set(found)) == n and found[-1] == 9 and min(found) > 2 and found == sorted(found)
     with pytest.raises(ValueError, match=r"views: found 4 for frames 0 to 3, expected 1 to 3"):
-        pairs.between(0, 3, 4)
+        pairs.spaced_frames(0, 3, 4)
 
 
 def test_what_is_no_recording_has_no_pairs() -> None:
@@ -175,17 +177,17 @@ def test_scenes_are_opened_when_they_are_asked_for() -> None:
 
 
 def test_frames_around_are_those_at_the_steps_before_and_after() -> None:
-    assert pairs.around(line(60), 30) == [0, 10, 18, 22, 25, 27, 28, 29, 31, 32, 33, 35, 38, 42, 50]
-    assert pairs.around(line(10), 0) == [1, 2, 3, 5, 8]
-    assert pairs.around(line(10), 9, steps=(1, 4)) == [5, 8]
+    assert pairs.candidate_frames(line(60), 30) == [0, 10, 18, 22, 25, 27, 28, 29, 31, 32, 33, 35, 38, 42, 50]
+    assert pairs.candidate_frames(line(10), 0) == [1, 2, 3, 5, 8]
+    assert pairs.candidate_frames(line(10), 9, steps=(1, 4)) == [5, 8]
     lost = torch.tensor([0, 1, 4, 5, 9])
-    assert pairs.around(line(5, number=lost), 2) == [1, 3, 4], "numbers 4 - 3, 4 + 1 and 4 + 5 are there"
+    assert pairs.candidate_frames(line(5, number=lost), 2) == [1, 3, 4], "numbers 4 - 3, 4 + 1 and 4 + 5 are there"
 
 
 def test_where_no_step_fits_the_nearest_frame_is_offered() -> None:
-    assert pairs.around(line(2, number=torch.tensor([0, 7])), 0) == [1]
-    assert pairs.around(line(3, number=torch.tensor([0, 50, 110])), 1) == [0]
+    assert pairs.candidate_frames(line(2, number=torch.tensor([0, 7])), 0) == [1]
+    assert pairs.candidate_frames(line(3, number=torch.tensor([0, 50, 110])), 1) == [0]
     with pytest.raises(ValueError, match="has one frame"):
-        pairs.around(line(1), 0)
+        pairs.candidate_frames(line(1), 0)
     with pytest.raises(ValueError, match="frame 9 of line"):
-        pairs.around(line(4), 9)
+        pairs.candidate_frames(line(4), 9)

@@ -22,9 +22,9 @@ def test_chunks_are_those_that_arrow_sees(tmp_path, codec):
     meta = arrow.ParquetFile(file).metadata
     for groups in ([0, 1, 2, 3], [2]):
         seen = [meta.row_group(g).column(i) for g in groups for i in range(meta.num_columns)]
-        found = parquet._chunks(file, frozenset(groups))
+        found = parquet._read_chunks(file, frozenset(groups))
         want = [(c.path_in_schema, c.physical_type, c.num_values, c.total_compressed_size) for c in seen]
-        assert [(c.path, parquet.TYPES[c.kind], c.values, c.packed) for c in found] == want
+        assert [(c.path, parquet._PHYSICAL_TYPES[c.kind], c.values, c.packed) for c in found] == want
     assert parquet.read_columns(file, ["text"], (60, 62))["text"] == ["a" * 50, "b"]
 
 
@@ -47,9 +47,9 @@ def test_a_file_that_changed_is_read_again(tmp_path):
 
 
 def test_a_cell_costs_one_footer_and_columns_that_are_not_there_none(tmp_path, monkeypatch):
-    file, opened, real = tmp_path / "x.parquet", [], parquet._open
+    file, opened, real = tmp_path / "x.parquet", [], parquet._open_table
     arrow.write_table(table(), file, row_group_size=50)
-    monkeypatch.setattr(parquet, "_open", lambda path: opened.append(path) or real(path))
+    monkeypatch.setattr(parquet, "_open_table", lambda path: opened.append(path) or real(path))
     assert [parquet.read_cell(file, "number", row) for row in (60, 61, 99)] == [60, 61, 99] and len(opened) == 1
     assert parquet.read_cell(file, "number", 100) == 100 and len(opened) == 2, "another group"
     read = parquet.read_columns(file, ["number"], (0, 2), optional=["text", "gone"])
@@ -63,9 +63,9 @@ def test_a_cell_costs_one_footer_and_columns_that_are_not_there_none(tmp_path, m
 )
 def test_damaged_structures_raise(damaged):
     with pytest.raises((ValueError, IndexError)):
-        list(thrift.items(damaged, 0, 4))
+        list(thrift.iter_list_structs(damaged, 0, 4))
 
 
 def test_a_structure_in_thrift():
     said = bytes([0x15, 0x04, 0x18, 2, 104, 105, 0x19, 0x25, 1, 4, 0x11, 0x1C, 0x15, 5, 0, 0])
-    assert thrift.fields(said, 0) == ({1: 2, 2: b"hi", 3: [-1, 2], 4: True, 5: {1: -3}}, len(said))
+    assert thrift.parse_struct(said, 0) == ({1: 2, 2: b"hi", 3: [-1, 2], 4: True, 5: {1: -3}}, len(said))

@@ -61,9 +61,9 @@ def same(a: Any, b: Any) -> bool:
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
 def test_plain_data_comes_back(protocol: int) -> None:
     content = pickle.dumps(plain(), protocol)
-    assert same(pickles.loads(content, FILE), plain())
+    assert same(pickles.load_pickle(content, FILE), plain())
     old = content.replace(b"numpy._core.", b"numpy.core.") if protocol < 4 else None  # as numpy 1 wrote it
-    assert old is None or same(pickles.loads(old, FILE), plain())
+    assert old is None or same(pickles.load_pickle(old, FILE), plain())
 
 
 def test_short_names_of_numpy_1() -> None:
@@ -72,7 +72,7 @@ def test_short_names_of_numpy_1() -> None:
     )
     assert b"numpy.core" in content
     unframed = content[:2] + content[11:] if content[2:3] == b"\x95" else content
-    assert pickles.loads(unframed, FILE).tolist() == [0, 1, 2]
+    assert pickles.load_pickle(unframed, FILE).tolist() == [0, 1, 2]
 
 
 def test_npy_files(tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ def test_npy_files(tmp_path: Path) -> None:
 
 def test_two_names_for_one_list_stay_equal() -> None:
     stamps = [1, 2, 3]
-    got = pickles.loads(pickle.dumps({"color": stamps, "depth": stamps}), FILE)
+    got = pickles.load_pickle(pickle.dumps({"color": stamps, "depth": stamps}), FILE)
     assert got == {"color": stamps, "depth": stamps}
 
 
@@ -166,7 +166,7 @@ def test_nothing_in_a_file_runs(name: str, tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.chdir(tmp_path)
     FLAG.clear()
     with pytest.raises(FormatError, match=r"some.npy: pickle: found") as error:
-        pickles.loads(ATTACKS[name], FILE)
+        pickles.load_pickle(ATTACKS[name], FILE)
     assert FLAG == [] and list(tmp_path.iterdir()) == [] and "\n" not in str(error.value)
 
 
@@ -236,7 +236,7 @@ def test_sizes_are_not_believed(name: str) -> None:
     tracemalloc.start()
     try:
         with pytest.raises(FormatError, match=r"some.npy: pickle: found"):
-            pickles.loads(HUGE[name], FILE)
+            pickles.load_pickle(HUGE[name], FILE)
         assert tracemalloc.get_traced_memory()[1] < 64 << 20
     finally:
         tracemalloc.stop()
@@ -244,7 +244,7 @@ def test_sizes_are_not_believed(name: str) -> None:
 
 def test_a_memo_of_any_number_costs_one_entry() -> None:
     """Python's own reader makes room for twice the number: 64 GB."""
-    assert pickles.loads(b"\x80\x02K\x01r\xff\xff\xff\xff0j\xff\xff\xff\xff.", FILE) == 1
+    assert pickles.load_pickle(b"\x80\x02K\x01r\xff\xff\xff\xff0j\xff\xff\xff\xff.", FILE) == 1
 
 
 def test_damaged_headers(tmp_path: Path) -> None:
@@ -321,5 +321,5 @@ def test_a_minute_of_robot() -> None:
     minute = {str(s): [{**entry, "timestamp": i, "tcp": np.arange(7.0) + i} for i in range(600)] for s in range(10)}
     content = io.BytesIO()
     np.save(content, np.array(minute, dtype=object), allow_pickle=True)
-    got = pickles.loads(content.getvalue()[128:], FILE)
+    got = pickles.load_pickle(content.getvalue()[128:], FILE)
     assert same(got["9"][599], minute["9"][599])

@@ -18,15 +18,14 @@ import torch
 from support.box_scene import BOX, CAMERA, HW, check_same, disagreement, hit, off_wall, pose, render, walk, world_points
 from torch.utils.data import DataLoader
 
-from dhtorch import data
-from dhtorch import pytree as tree
+from dhtorch import data, pytree
 from dhtorch import testing as writers
 from dhtorch.data import convert
 from dhtorch.data.codecs import npy
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import driving, frames_dir, rectified, tum
-from dhtorch.data.recording import numbers
+from dhtorch.data.recording import consecutive_frame_numbers
 from dhtorch.data.scene import Scene
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
@@ -137,16 +136,16 @@ def test_recording_is_a_sequence(tmp_path: Path) -> None:
     with pytest.raises(IndexError):
         recording[4]
     with pytest.raises(ValueError, match="found no frame"):
-        replace(recording, number=numbers(0), poses=None)
+        replace(recording, number=consecutive_frame_numbers(0), poses=None)
     with pytest.raises(ValueError, match="found 4 poses, expected one for each of 3 frames"):
-        replace(recording, number=numbers(3))
+        replace(recording, number=consecutive_frame_numbers(3))
 
 
 def test_recording_travels_to_spawned_workers(tmp_path: Path) -> None:
     writers.write_named_frames(tmp_path, walk())
     recording = pickle.loads(pickle.dumps(data.open(tmp_path)))
     loader = DataLoader(
-        recording, batch_size=2, num_workers=1, collate_fn=tree.collate, multiprocessing_context="spawn"
+        recording, batch_size=2, num_workers=1, collate_fn=pytree.collate, multiprocessing_context="spawn"
     )
     batches = list(loader)
     assert [b.image.shape[0] for b in batches] == [2, 2]
@@ -165,7 +164,7 @@ def test_quaternions_and_axes() -> None:
         q = np.append(np.sin(angle / 2) * axis / angle, np.cos(angle / 2))
         c2w = convert.to_c2w(3 * q[None], np.ones((1, 3)), Path("x"))[0]
         np.testing.assert_allclose(c2w[:3, :3], cv2.Rodrigues(axis)[0], atol=1e-12)
-        assert abs(parts.quaternion(c2w[:3, :3]) @ q) == pytest.approx(1, abs=1e-12)
+        assert abs(parts.rotation_to_xyzw(c2w[:3, :3]) @ q) == pytest.approx(1, abs=1e-12)
     looking = convert.cv_from_gl(np.eye(4)[None])[0]
     np.testing.assert_array_equal(looking @ [0, 0, 1, 0], [0, 0, -1, 0])  # forward is −z in GL axes
     np.testing.assert_array_equal(looking @ [0, 1, 0, 0], [0, -1, 0, 0])  # down is −y
@@ -194,13 +193,13 @@ def test_splat_keeps_the_nearest_and_fills_nothing() -> None:
     camera = Camera(torch.tensor([[10.0, 10.0]]), torch.tensor([[4.0, 3.0]]))
     rows = [[0, 0, 2], [0, 0, 1], [0.1, 0, 1], [0, 0, -1], [9, 9, 1], [math.nan, 0, 1], [0.8, 0, 4]]
     xyz = torch.tensor(rows, dtype=torch.float64)
-    depth = convert.splat(xyz, camera, (7, 9))
+    depth = convert.splat_depth(xyz, camera, (7, 9))
     want = torch.zeros(7, 9)
     want[3, 4], want[3, 5], want[3, 6] = 1, 1, 4
     assert torch.equal(depth, want)
     want[3, 6] = 0  # 4 m beside 1 m, one pixel apart
-    assert torch.equal(convert.splat(xyz, camera, (7, 9), hide_px=1), want)
-    assert not convert.splat(xyz[:0], camera, (7, 9)).any()
+    assert torch.equal(convert.splat_depth(xyz, camera, (7, 9), hide_px=1), want)
+    assert not convert.splat_depth(xyz[:0], camera, (7, 9)).any()
 
 
 @pytest.mark.parametrize("reach", [1, 2, 3, 8])
@@ -212,7 +211,7 @@ def test_a_point_is_hidden_by_a_much_nearer_one_in_the_square_around_it(reach: i
     least = -torch.nn.functional.max_pool2d(-depth[None, None], 2 * reach + 1, 1, reach)[0, 0]
     want = torch.where(depth > 1.1 * least, 0, depth)
     assert 0 < int((want == 0).sum()) < want.numel()
-    assert torch.equal(convert.splat(xyz, camera, (13, 17), hide_px=reach), want)
+    assert torch.equal(convert.splat_depth(xyz, camera, (13, 17), hide_px=reach), want)
 
 
 # -------------------------------------------------------------------------------------------------------- bad input
@@ -292,16 +291,16 @@ def test_damaged_pictures(named: Path) -> None:
     fails(r"color.png: file size: found 0 bytes", named)
     colour.write_bytes(b"GIF89a" + bytes(40))
     fails(r"color.png: content: found b'GIF89a.*expected a PNG or JPEG image", named)
-    colour.write_bytes(parts.png(np.zeros((10, 12, 3), np.uint8)))
+    colour.write_bytes(parts.encode_unfiltered_png(np.zeros((10, 12, 3), np.uint8)))
     fails(r"color.png: size: found 12x10, expected 64x48", named)
-    colour.write_bytes(parts.png(np.zeros(HW, np.uint16)))
+    colour.write_bytes(parts.encode_unfiltered_png(np.zeros(HW, np.uint16)))
     fails(r"color.png: bits per channel: found 16, expected 8", named)
     colour.write_bytes(good_colour)
-    depth.write_bytes(parts.png(np.zeros((*HW, 1), np.uint8)))
+    depth.write_bytes(parts.encode_unfiltered_png(np.zeros((*HW, 1), np.uint8)))
     fails(r"depth.png: depth: found png with 1 channels of 8 bits, expected png with 1 channel of 16 bits", named)
     depth.write_bytes(good_colour)
     fails(r"depth.png: depth: found png with 3 channels of 8 bits", named)
-    depth.write_bytes(parts.png(np.zeros((24, 32), np.uint16)))
+    depth.write_bytes(parts.encode_unfiltered_png(np.zeros((24, 32), np.uint16)))
     fails(r"depth.png: size: found 32x24, expected 64x48", named)
     depth.write_bytes(good_depth)
     assert len(list(data.open(named))) == 3
@@ -321,7 +320,7 @@ def test_jpeg_must_be_whole(tmp_path: Path) -> None:
     file = tmp_path / "a.jpg"
     cv2.imwrite(str(file), picture)
     good = file.read_bytes()
-    header = files.image_header(file)
+    header = files.read_image_header(file)
     assert (header.hw, header.channels, header.bits, header.kind) == ((40, 56), 3, 8, "jpeg")
     assert np.abs(files.read_image(file).transpose(1, 2, 0)[..., ::-1].astype(int) - picture).max() < 12
     file.write_bytes(good[: len(good) // 2])
@@ -334,9 +333,9 @@ def test_jpeg_must_be_whole(tmp_path: Path) -> None:
 def test_colours_are_red_green_blue_and_depth_codes_are_masked(tmp_path: Path) -> None:
     picture = np.zeros((2, 3, 3), np.uint8)
     picture[0, 1] = (250, 100, 3)
-    (tmp_path / "c.png").write_bytes(parts.png(picture))
+    (tmp_path / "c.png").write_bytes(parts.encode_unfiltered_png(picture))
     assert files.read_image(tmp_path / "c.png")[:, 0, 1].tolist() == [250, 100, 3]
-    (tmp_path / "d.png").write_bytes(parts.png(np.array([[0, 65535, 1234]], np.uint16)))
+    (tmp_path / "d.png").write_bytes(parts.encode_unfiltered_png(np.array([[0, 65535, 1234]], np.uint16)))
     depth = files.read_depth_png(tmp_path / "d.png", 1000, invalid=(65535,))
     np.testing.assert_allclose(depth, [[0, 0, 1.234]])
 
@@ -464,7 +463,7 @@ def test_bad_pairs_and_arrays(tmp_path: Path) -> None:
 def test_npz_bomb_is_not_unpacked(tmp_path: Path) -> None:
     head = io.BytesIO()
     np.lib.format.write_array_header_1_0(head, {"descr": "<f8", "fortran_order": False, "shape": (10**12,)})
-    for name, body in (("liar", bytes(64)), ("big", bytes(files.MAX_BYTES))):
+    for name, body in (("liar", bytes(64)), ("big", bytes(files.MAX_FILE_BYTES))):
         with zipfile.ZipFile(tmp_path / f"{name}.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             archive.writestr("data.npy", head.getvalue() + body)
     with pytest.raises(

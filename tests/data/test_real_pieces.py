@@ -12,8 +12,7 @@ from support.box_scene import disagreement
 from dhtorch import data
 from dhtorch.data.codecs.video import read_video_frame
 from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import patches as lookup
-from dhtorch.geometry import se3
+from dhtorch.geometry import patches, se3
 from dhtorch.records import Pose
 
 ROOT = os.environ.get("DHTORCH_DATA")
@@ -79,10 +78,10 @@ def test_real_pairs_match_along_the_disparity(name: str) -> None:
     uv = cameras.project(
         right.camera, se3.apply(se3.relative(left.T_world_from_cam, right.T_world_from_cam), xyz).float()
     )
-    grey = [lookup.luma(f.image, 1)[:, 0] for f in (left, right)]
+    grey = [patches.luma(f.image, 1)[:, 0] for f in (left, right)]
 
     def miss(du: float) -> float:
-        value, inside = lookup.nearest(grey[1], uv + torch.tensor([du, 0]))
+        value, inside = patches.sample_nearest(grey[1], uv + torch.tensor([du, 0]))
         return float((value - grey[0][0, v, u]).abs()[inside].mean())
 
     errors = {du: miss(du) for du in (-2, -1, 0, 1, 2)}

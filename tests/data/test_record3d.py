@@ -20,8 +20,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from support.box_scene import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
 
-from dhtorch import data
-from dhtorch import pytree as tree
+from dhtorch import data, pytree
 from dhtorch import testing as writers
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
@@ -114,7 +113,7 @@ def test_archive_gives_back_the_scene(tmp_path: Path, portrait: bool, method: in
     assert recording[0].conf is not None and recording[0].hw == HW[turn]
     copy = pickle.loads(pickle.dumps(recording))
     assert all(torch.equal(a.depth, b.depth) for a, b in zip(copy, recording, strict=True))
-    assert tree.collate(list(recording)).depth.shape == (3, *DEPTH_HW[turn])
+    assert pytree.collate(list(recording)).depth.shape == (3, *DEPTH_HW[turn])
 
 
 def test_unpacked_archive(tmp_path: Path) -> None:
@@ -346,7 +345,7 @@ def test_names_that_lead_out_of_the_archive_are_not_frames(tmp_path: Path) -> No
 def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     archive = r3d(tmp_path, walk(5))
     monkeypatch.setattr(files, "decode_image", lambda *_: pytest.fail("decoded a picture"))
-    monkeypatch.setattr("dhtorch.data.codecs.lzfse.unpack", lambda *_: pytest.fail("unpacked depth"))
+    monkeypatch.setattr("dhtorch.data.codecs.lzfse.decompress_lzfse", lambda *_: pytest.fail("unpacked depth"))
     assert len(data.open(archive)) == 5
 
 
@@ -383,17 +382,17 @@ def test_mp4_drops_both_red_ends_jumps_and_grey() -> None:
     hue = np.linspace(0, 3, 300, endpoint=False, dtype=np.float32)
     colours = [colorsys.hsv_to_rgb(h / 3, 1, 1) for h in hue.tolist()]
     rgb = np.tile((255 * np.array(colours)).round().astype(np.uint8), (5, 1, 1))
-    depth = record3d_video.hue_depth(rgb, 0, 3, 0.05)[2]
+    depth = record3d_video.decode_hue_depth(rgb, 0, 3, 0.05)[2]
     kept = depth > 0
     np.testing.assert_allclose(depth[kept], hue[kept], atol=0.003)
     assert hue[kept].min() == pytest.approx(0.1, abs=0.011) and hue[kept].max() == pytest.approx(2.8, abs=0.011)
     assert kept.sum() >= 268
     step = np.concatenate((rgb[:, 60:100], rgb[:, 200:240]), 1)
-    beside = record3d_video.hue_depth(step, 0, 3, 0.05)[2] == 0
+    beside = record3d_video.decode_hue_depth(step, 0, 3, 0.05)[2] == 0
     assert np.flatnonzero(beside).tolist() == [39, 40]
     grey = np.full((3, 3, 3), 128, np.uint8)
     grey[..., 0] += 20
-    assert not record3d_video.hue_depth(grey, 0, 3, 0.05).any()
+    assert not record3d_video.decode_hue_depth(grey, 0, 3, 0.05).any()
 
 
 @pytest.mark.parametrize("stored", ["yuv420p", "yuv420p10le"])

@@ -23,15 +23,15 @@ from dhtorch.data.codecs.pickles import read_npy
 from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import rh20t, rh20t_robot
-from dhtorch.data.readers.rh20t_robot import ARMS, Stream
+from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS, RobotStream
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame
 from dhtorch.testing.lossless import write_lossless
-from dhtorch.testing.rh20t import robot_notation, write_rh20t
+from dhtorch.testing.rh20t import to_robot_notation, write_rh20t
 
 HW = (36, 64)
 CAMERA = Camera(torch.tensor([[50.0, 48.0]]), torch.tensor([[33.5, 16.75]]))
-FIXED, HAND = "750612070851", ARMS[1].in_hand[0]
+FIXED, HAND = "750612070851", ROBOT_ARMS[1].in_hand[0]
 BASE = se3.to_matrix(se3.exp(torch.tensor([[0.4, -0.2, 0.9, 0.7, -0.3, 0.5]]).double()))[0].numpy()
 
 
@@ -76,7 +76,7 @@ def same_scene(recording: data.Recording, frames: list[Frame]) -> None:
 
 @pytest.mark.parametrize("configuration", range(1, 8))
 def test_fixed_and_hand_held_cameras_give_back_the_scene(tmp_path: Path, configuration: int) -> None:
-    serials = (FIXED, *ARMS[configuration].in_hand)
+    serials = (FIXED, *ROBOT_ARMS[configuration].in_hand)
     hand = se3.to_matrix(pose(5, 0.3))[0].numpy()
     shots = {FIXED: still(), serials[1]: moving()}
     root = write_rh20t(
@@ -91,7 +91,7 @@ def test_fixed_and_hand_held_cameras_give_back_the_scene(tmp_path: Path, configu
 
 
 def test_second_camera_on_the_hand_keeps_its_place_beside_the_first(tmp_path: Path) -> None:
-    first, second = ARMS[6].in_hand
+    first, second = ROBOT_ARMS[6].in_hand
     beside = se3.exp(torch.tensor([[0.1, -0.2, 0.05, 0.06, 0.01, -0.02]]).double())
     frames = [render(CAMERA, se3.compose(f.T_world_from_cam, beside), HW, float(f.time)) for f in moving()]
     hand = se3.to_matrix(pose(5, 0.3))[0].numpy()
@@ -188,7 +188,7 @@ def test_outliers_of_a_lossy_high_byte_are_dropped(tmp_path: Path) -> None:
 
 
 def test_streams_at_their_own_clocks(tmp_path: Path) -> None:
-    streams = rh20t.streams(scene(tmp_path))
+    streams = rh20t.read_robot_streams(scene(tmp_path))
     forces = {"force_torque_base", "force_torque_base_raw", "robot_ft"}
     forces |= {f"{name}/{serial}" for name in ("force_torque", "force_torque_raw") for serial in (FIXED, HAND)}
     assert streams.keys() == {"tcp_base", "joint", "gripper_command", "gripper_info"} | forces
@@ -208,14 +208,14 @@ def test_forces_that_are_none_and_forces_that_cannot_be(tmp_path: Path) -> None:
     file, stamp = tmp_path / "transformed" / "force_torque_base.npy", 1_600_000_000_500
     entries = [{"timestamp": stamp + i, "zeroed": value} for i, value in enumerate((np.full(6, np.nan), None, [0] * 6))]
     np.save(file, {FIXED: entries}, allow_pickle=True)
-    streams = rh20t.streams(tmp_path)
+    streams = rh20t.read_robot_streams(tmp_path)
     assert streams.keys() == {"force_torque_base"} and streams["force_torque_base"].values.tolist() == [[0.0] * 6]
     np.save(file, {FIXED: [{"timestamp": stamp, "zeroed": [0] * 5}]}, allow_pickle=True)
     with pytest.raises(FormatError, match=r"force_torque_base.npy: zeroed: found 5 numbers, expected 6"):
-        rh20t.streams(tmp_path)
+        rh20t.read_robot_streams(tmp_path)
     np.save(file, {FIXED: [{"zeroed": [0] * 6}]}, allow_pickle=True)
     with pytest.raises(FormatError, match=r"force_torque_base.npy: entries: found something else, expected objects"):
-        rh20t.streams(tmp_path)
+        rh20t.read_robot_streams(tmp_path)
 
 
 @pytest.mark.parametrize("lacking", [(), ("transformed",), ("transformed", "calib")])
@@ -234,7 +234,7 @@ def test_a_human_shows_the_task(tmp_path: Path, lacking: tuple[str, ...]) -> Non
     assert recordings[FIXED].report == ()
     if lacking:
         what = "tcp.npy" if "calib" in lacking else "tcp_base.npy"
-        assert recordings[HAND].poses is None and rh20t.streams(root) == {}
+        assert recordings[HAND].poses is None and rh20t.read_robot_streams(root) == {}
         assert recordings[HAND].report == (f"camera {HAND} is on the hand and there is no {what}: no poses",)
         torch.testing.assert_close(recordings[HAND][1].depth, moving()[1].depth, atol=0.5e-3 + 1e-6, rtol=0)
     else:
@@ -252,7 +252,7 @@ def test_tcp_of_each_camera_is_a_stream(tmp_path: Path) -> None:
     lost = {**entry, "timestamp": 1_600_000_000_400, "tcp": np.full(7, np.nan)}
     (tmp_path / "transformed").mkdir()
     np.save(tmp_path / "transformed" / "tcp.npy", {FIXED: [entry, lost]}, allow_pickle=True)
-    stream = rh20t.streams(tmp_path)[f"tcp/{FIXED}"]
+    stream = rh20t.read_robot_streams(tmp_path)[f"tcp/{FIXED}"]
     assert stream.times.tolist() == [1_600_000_000.5] and stream.values.tolist() == [[1, 2, 3, 1, 0, 0, 0]]
 
 
@@ -260,7 +260,7 @@ def test_rotations_turn_at_constant_speed_the_short_way() -> None:
     angle = 2.5
     end = np.array([2.0, 0, 0, math.cos(angle / 2), 0, 0, math.sin(angle / 2)])
     end[3:] *= -1  # the same rotation
-    stream = Stream(np.array([0.0, 1.0]), np.stack(([0, 0, 0, 1, 0, 0, 0], end)), pose=True)
+    stream = RobotStream(np.array([0.0, 1.0]), np.stack(([0, 0, 0, 1, 0, 0, 0], end)), pose=True)
     values, covered = stream.at(np.array([0.0, 0.2, 0.5, 1.0]), max_gap=2)
     assert covered.all()
     np.testing.assert_allclose(values[:, 0], [0, 0.4, 1, 2])
@@ -269,11 +269,11 @@ def test_rotations_turn_at_constant_speed_the_short_way() -> None:
 
 
 def test_gaps_are_not_bridged() -> None:
-    stream = Stream(np.array([0.0, 0.1, 2.0]), np.array([[0.0], [1], [20]]))
+    stream = RobotStream(np.array([0.0, 0.1, 2.0]), np.array([[0.0], [1], [20]]))
     values, covered = stream.at(np.array([-1.0, 0.05, 0.1, 1.0, 1.9999, 2.5]))
     assert covered.tolist() == [False, True, True, False, True, False]
     np.testing.assert_allclose(values[[1, 2, 4], 0], [0.5, 1, 20])
-    one = Stream(np.array([5.0]), np.array([[7.0]]))
+    one = RobotStream(np.array([5.0]), np.array([[7.0]]))
     assert one.at(np.array([4.0, 5.0, 6.0]))[1].tolist() == [False, True, False]
 
 
@@ -292,14 +292,14 @@ def test_frames_in_a_gap_of_the_tcp_are_left_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("configuration", [1, 3, 5, 6])
 def test_calibration_tcp_in_the_robots_notation(tmp_path: Path, configuration: int) -> None:
-    arm = ARMS[configuration]
+    arm = ROBOT_ARMS[configuration]
     for i in range(4):
         T = se3.to_matrix(pose(3 * i, 0.2))[0].numpy()
-        np.save(tmp_path / "tcp.npy", robot_notation(arm.robot, T))
-        np.testing.assert_allclose(rh20t_robot.calibration_tcp(tmp_path / "tcp.npy", arm), T, atol=1e-12)
+        np.save(tmp_path / "tcp.npy", to_robot_notation(arm.robot, T))
+        np.testing.assert_allclose(rh20t_robot.read_calibration_tcp(tmp_path / "tcp.npy", arm), T, atol=1e-12)
     np.save(tmp_path / "tcp.npy", np.zeros(5))
     with pytest.raises(FormatError, match=r"tcp.npy: tcp: found"):
-        rh20t_robot.calibration_tcp(tmp_path / "tcp.npy", arm)
+        rh20t_robot.read_calibration_tcp(tmp_path / "tcp.npy", arm)
 
 
 # ---------------------------------------------------------------------------------------------------------- bad input
@@ -346,11 +346,11 @@ def hostile_sample(root: Path) -> Path:
 
 def read_all(root: Path) -> None:
     hostile.read_all(root)
-    rh20t.streams(root)
+    rh20t.read_robot_streams(root)
 
 
 def test_a_large_array_where_a_pose_is_expected_is_named_by_its_shape(tmp_path):
     file = tmp_path / "tcp.npy"
     np.save(file, np.zeros((5000, 5000), np.uint8))
     with pytest.raises(FormatError, match=r"tcp: found an array of shape \(5000, 5000\), expected 7 finite numbers"):
-        rh20t_robot.calibration_tcp(file, rh20t_robot.Arm("ur5", (), *[np.eye(4)] * 3))
+        rh20t_robot.read_calibration_tcp(file, rh20t_robot.RobotArm("ur5", (), *[np.eye(4)] * 3))

@@ -17,14 +17,14 @@ from dhtorch import data
 from dhtorch.cli import inspect
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.data.codecs import tfrecord
-from dhtorch.data.intrinsics import NoIntrinsics
+from dhtorch.data.intrinsics import MissingIntrinsicsError
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import rlds
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.records import Frame
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.testing import write_rlds
-from dhtorch.testing.parts import depth_codes
+from dhtorch.testing.parts import encode_depth_codes
 
 ROOT = Path(os.environ.get("DHTORCH_DATA", "/nowhere")) / "rlds_bridge" / "bridge_dataset" / "1.0.0"
 needs_data = pytest.mark.skipif(not ROOT.is_dir(), reason="DHTORCH_DATA has no rlds_bridge")
@@ -62,7 +62,7 @@ def test_what_is_written_is_read(depth: str | None, said: bool, tmp_path: Path) 
             assert torch.equal(frame.image, shot.image)
             assert torch.allclose(frame.camera.f, shot.camera.f) and torch.allclose(frame.camera.c, shot.camera.c)
             assert torch.allclose(frame.T_world_from_cam.t, shot.T_world_from_cam.t, atol=1e-6)
-            exact = {"png": torch.from_numpy(depth_codes(shot.depth, 1000).astype(np.float32))[None] / 1000}
+            exact = {"png": torch.from_numpy(encode_depth_codes(shot.depth, 1000).astype(np.float32))[None] / 1000}
             expected = {"array": shot.depth, None: 0 * shot.depth}.get(depth, exact["png"])
             assert torch.allclose(frame.depth, expected, atol=1e-6)
         assert recording.times is not None and torch.equal(recording.times, torch.arange(len(frames)).double() / 30)
@@ -81,7 +81,7 @@ def test_options(tmp_path: Path) -> None:
     assert torch.allclose(mm[0].depth * 1000, wide[0].depth, atol=1e-4)
     again = pickle.loads(pickle.dumps(one))
     assert torch.equal(again[1].image, one[1].image)
-    with pytest.raises(NoIntrinsics, match=r"data\.fov=69"):
+    with pytest.raises(MissingIntrinsicsError, match=r"data\.fov=69"):
         data.open(tmp_path, episode=0)
     for options, said in (
         ({"episode": 3}, "found 3, expected 0 to 2 in train"),
@@ -102,7 +102,7 @@ def test_options(tmp_path: Path) -> None:
 def test_an_episode_is_read_when_it_is_asked_for(tmp_path: Path) -> None:
     write_rlds(tmp_path, episodes())
     file = tmp_path / FILE
-    spans = tfrecord.record_spans(file)
+    spans = tfrecord.index_records(file)
     raw = bytearray(file.read_bytes())
     raw[spans[1].offset + 40] ^= 1
     file.write_bytes(raw)
@@ -137,7 +137,7 @@ def test_check_sums() -> None:
 
 def record(body: bytes) -> bytes:
     length = struct.pack("<Q", len(body))
-    sums = (struct.pack("<I", tfrecord.masked(tfrecord.crc32c(x))) for x in (length, body))
+    sums = (struct.pack("<I", tfrecord.mask_crc(tfrecord.crc32c(x))) for x in (length, body))
     return length + next(sums) + body + next(sums)
 
 
@@ -163,17 +163,17 @@ def test_no_records(content: bytes, said: str, tmp_path: Path) -> None:
 
 
 def test_whole_numbers_of_all_sizes(tmp_path: Path) -> None:
-    from dhtorch.testing.rlds import _field, _wholes  # noqa: PLC0415
+    from dhtorch.testing.rlds import _encode_field, _int64s_feature  # noqa: PLC0415
 
     values = [0, 1, -1, 127, 128, 300, 2**62, -(2**63), 2**63 - 1]
-    body = _field(1, _field(1, _field(1, b"x") + _field(2, _wholes(values))))
+    body = _encode_field(1, _encode_field(1, _encode_field(1, b"x") + _encode_field(2, _int64s_feature(values))))
     file = tmp_path / "x"
     file.write_bytes(record(body))
-    (span,) = tfrecord.record_spans(file)
-    feature = tfrecord.example(tfrecord.read_record(file, span), file, span.offset)["x"]
-    assert tfrecord.numbers(file, "x", feature, 9).tolist() == values
+    (span,) = tfrecord.index_records(file)
+    feature = tfrecord.parse_example(tfrecord.read_record(file, span), file, span.offset)["x"]
+    assert tfrecord.read_feature_numbers(file, "x", feature, 9).tolist() == values
     with pytest.raises(FormatError, match="at most 3 numbers"):
-        tfrecord.numbers(file, "x", feature, 3)
+        tfrecord.read_feature_numbers(file, "x", feature, 3)
 
 
 def test_a_set_that_says_nothing(tmp_path: Path) -> None:
@@ -226,8 +226,8 @@ def test_the_bridge_set() -> None:
 @needs_data
 def test_every_record_of_the_bridge_set_is_whole() -> None:
     for file in ROOT.glob("*.tfrecord-*"):
-        for span in tfrecord.record_spans(file):
-            found = tfrecord.example(tfrecord.read_record(file, span), file, span.offset)
+        for span in tfrecord.index_records(file):
+            found = tfrecord.parse_example(tfrecord.read_record(file, span), file, span.offset)
             assert len(found) == 20 and len(found["steps/observation/image_0"].spans) == 10
 
 

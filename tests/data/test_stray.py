@@ -14,8 +14,7 @@ import pytest
 import torch
 from support.box_scene import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
 
-from dhtorch import data
-from dhtorch import pytree as tree
+from dhtorch import data, pytree
 from dhtorch import testing as writers
 from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.io.decode import FormatError
@@ -85,7 +84,7 @@ def test_capture_gives_back_the_scene(tmp_path: Path, codec: str, depth_format: 
     same_scene(recording, frames)
     copy = pickle.loads(pickle.dumps(recording))
     assert all(torch.equal(a.image, b.image) for a, b in zip(copy, recording, strict=True))
-    assert tree.collate(list(recording)).image.shape == (4, 3, *HW)
+    assert pytree.collate(list(recording)).image.shape == (4, 3, *HW)
 
 
 def test_frames_may_start_anywhere(tmp_path: Path) -> None:
@@ -166,7 +165,7 @@ def test_first_picture_before_time_zero(tmp_path: Path) -> None:
     """An edit list hides it: a decoder that obeys shows n − 1 pictures, all one row too early."""
     frames = walk(8, steady)
     writers.write_stray(tmp_path, frames, per_frame=True, first_picture="hidden")
-    assert len(codec_video.video_times(tmp_path / "rgb.mp4")) == 7
+    assert len(codec_video.read_video_times(tmp_path / "rgb.mp4")) == 7
     recording = data.open(tmp_path)
     assert recording.report == () and len(recording) == 8
     right = [picture_error(a, b) for a, b in zip(recording, frames, strict=True)]

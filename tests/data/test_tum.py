@@ -18,7 +18,7 @@ from dhtorch.testing import parts
 
 
 def test_tum_gives_back_the_scene(tmp_path: Path) -> None:
-    lens = torch.tensor([tum._CALIBRATION[1][1]])
+    lens = torch.tensor([tum._CAMERA_CALIBRATIONS[1][1]])
     frames = walk(3, CAMERA.replace(distortion=lens))
     writers.write_tum(tmp_path, frames)
     recording = data.open(tmp_path)
@@ -42,7 +42,7 @@ def test_every_code_but_zero_is_a_depth(tmp_path: Path) -> None:
     """65535, elsewhere a mark for no return, is 13.1 m here."""
     writers.write_tum(tmp_path, walk(1))
     codes = np.tile(np.array([0, 1, 5000, 65535], np.uint16), (HW[0], HW[1] // 4))
-    next((tmp_path / "depth").iterdir()).write_bytes(parts.png(codes))
+    next((tmp_path / "depth").iterdir()).write_bytes(parts.encode_unfiltered_png(codes))
     depth = data.open(tmp_path)[0].depth[0]
     assert depth[0, :4].tolist() == pytest.approx([0, 0.0002, 1, 13.107])
     assert data.open(tmp_path, units_per_metre=5208)[0].depth[0, 0, 2] == pytest.approx(5000 / 5208)
@@ -102,7 +102,7 @@ def test_tum_interpolates_between_neighbouring_poses(tmp_path: Path) -> None:
     writers.write_tum(tmp_path, walk(2))
     a, b = pose(0), pose(1)
     rows = [
-        f"{100 + s:.4f} " + parts.text_row([*T.t[0], *(q * parts.quaternion(T.R[0].numpy()))])
+        f"{100 + s:.4f} " + parts.format_row([*T.t[0], *(q * parts.rotation_to_xyzw(T.R[0].numpy()))])
         for s, T, q in ((-0.004, a, 1), (0.012, b, -1))
     ]
     (tmp_path / "groundtruth.txt").write_text("# no camera named\n" + "\n".join(rows))

@@ -156,7 +156,7 @@ def test_the_examples_run(page, capsys, monkeypatch):
     blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.M | re.S)
     names: dict = {}
     monkeypatch.setattr(data, "FORMATS", dict(data.FORMATS))  # to which an example adds
-    monkeypatch.setattr(layouts, "LAYOUTS", dict(layouts.LAYOUTS))
+    monkeypatch.setattr(layouts, "EXPERIMENT_LAYOUTS", dict(layouts.EXPERIMENT_LAYOUTS))
     exec(compile("\n".join(blocks), f"{page}.md", "exec"), names)
     if page == "methods":
         score = names["estimate"].score

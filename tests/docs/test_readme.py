@@ -12,8 +12,8 @@ import pytest
 import torch
 from torch.utils.data import Dataset
 
-from dhtorch.runtime import results as archive
-from dhtorch.transforms import CHANNELS
+from dhtorch.runtime import results as result_files
+from dhtorch.transforms import TOKEN_CHANNELS
 
 REPO = Path(__file__).resolve().parents[2]
 sys.path.append(str(REPO / "benchmarks"))
@@ -32,7 +32,7 @@ def test_tables_are_those_of_the_result_files():
 @pytest.mark.parametrize("path", sorted((REPO / "benchmarks/results").glob("*.json")), ids=lambda p: p.name)
 def test_committed_results_are_valid(path):
     if isinstance(json.loads(path.read_text()), dict):  # the others are rows of benchmarks
-        archive.read(path)
+        result_files.read_result(path)
 
 
 class Shifted(Dataset):
@@ -90,7 +90,9 @@ def test_the_loader_s_example_prints_what_stands_under_it(capsys, monkeypatch):
     assert smaller != code
     exec(compile(smaller, "README.md", "exec"), {})
     assert capsys.readouterr().out == said
-    assert len(CHANNELS) == 10 and all(f"`{name}`" in README for name in CHANNELS) and "ten channels" in README
+    assert (
+        len(TOKEN_CHANNELS) == 10 and all(f"`{name}`" in README for name in TOKEN_CHANNELS) and "ten channels" in README
+    )
 
 
 def test_it_is_short_and_shows_what_it_promises():

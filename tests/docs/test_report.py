@@ -14,7 +14,7 @@ from rich.console import Console
 from dhtorch.codes import Gate, Hole, Source, names
 from dhtorch.experiments import report
 from dhtorch.metrics import errors, risk
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.viz import plots as drawing
 from dhtorch.viz.plots import colours
 
@@ -44,15 +44,15 @@ def make_result(methods=("paper", "opencv"), **changes):
             )
         rows += scenes
         prefix = f"{method}." if len(methods) > 1 else ""
-        summary |= {prefix + name: entry for name, entry in errors.summarise(scenes).items()}
+        summary |= {prefix + name: entry for name, entry in errors.summarise_scenes(scenes).items()}
     parts = {
         "experiment": "pair",
         "key": "0" * 64,
-        "meta": archive.meta(device="cpu", dtype="float32", threads=1, seed=0),
+        "meta": result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=0),
         "config": {},
         "data": {"name": "rooms", "scenes": ["kitchen [a]", "hall|b"], "n_pairs": 5, "digest": ""},
     }
-    return archive.build(**{**parts, "summary": summary, "rows": rows, **changes})
+    return result_files.build_result(**{**parts, "summary": summary, "rows": rows, **changes})
 
 
 # ---------------------------------------------------------------------------------------------------- tables
@@ -71,7 +71,7 @@ def test_tables_show_every_scene_and_method_side_by_side():
     assert cell(0, "median") == "1.23 %" and cell(0, "p90") == "25.0 %" and cell(0, "corr") == "–"
     assert cell(1, "coverage") == "60.0 %" and cell(0, "pose found") == "100 %" and cell(0, "residual px") == "0.46"
     assert main.footer == 4 and cell(4, "scene") == "2 scenes" and cell(4, "candidates") == "300"
-    assert cell(4, "pairs") == "5" and cell(5, "scene") == report.INTERVAL and cell(5, "median") == "1.23–2.47 %"
+    assert cell(4, "pairs") == "5" and cell(5, "scene") == report.INTERVAL_LABEL and cell(5, "median") == "1.23–2.47 %"
     assert dropped.rows == [["all methods", "14", "42"]] and dropped.head == ["method", "close", "wide"]
     assert holes.head[1] == "trackable, no LiDAR" and holes.rows[0][1:] == ["60.0 %", "40.0 %"]
     assert ms.head == ["method", "track", "pose", "total"]
@@ -103,13 +103,20 @@ def test_the_console_shows_all_cells_and_takes_names_literally():
     out = io.StringIO()
     report.print_tables(make_result(), Console(file=out))
     text = out.getvalue()
-    for word in ("kitchen [a]", "hall|b", "1.23 %", "trackable, no LiDAR", "milliseconds per pair", report.INTERVAL):
+    for word in (
+        "kitchen [a]",
+        "hall|b",
+        "1.23 %",
+        "trackable, no LiDAR",
+        "milliseconds per pair",
+        report.INTERVAL_LABEL,
+    ):
         assert word in text
     assert max(map(len, text.splitlines())) <= 140 and "…" not in text
 
 
 def test_the_command_prints_both_forms_and_refuses_what_is_no_result(tmp_path, capsys):
-    archive.write(tmp_path / "result.json", make_result())
+    result_files.write_result(tmp_path / "result.json", make_result())
     assert report.main([str(tmp_path)]) == 0
     assert "pair on rooms" in capsys.readouterr().out
     assert report.main([str(tmp_path / "result.json"), "--markdown"]) == 0
@@ -150,9 +157,9 @@ def test_samples_are_drawn_in_the_colour_of_what_became_of_them(tmp_path):
     gate = torch.where(source == Source.NONE, Gate.PARALLAX, Gate.ANSWER)
     drawing.draw_samples(tmp_path / "a.png", image, uv, source, gate)
     pixels = picture(tmp_path / "a.png")
-    for colour in (colours.SENSOR, colours.RECOVERED, colours.GATES[Gate.PARALLAX]):
+    for colour in (colours.SENSOR, colours.RECOVERED, colours.GATE_COLOURS[Gate.PARALLAX]):
         assert share_of(pixels, colour) > 4e-4
-    assert share_of(pixels, colours.GATES[Gate.RESIDUAL]) < 1e-4
+    assert share_of(pixels, colours.GATE_COLOURS[Gate.RESIDUAL]) < 1e-4
     drawing.draw_samples(tmp_path / "b.png", (255 * image).to(torch.uint8), uv, 0 * source, 0 * source)
     without = picture(tmp_path / "b.png")
     assert share_of(without, colours.SENSOR) < 1e-4
@@ -164,27 +171,27 @@ def test_holes_are_drawn_by_class(tmp_path):
     hole = torch.randint(0, 3, (300,), generator=g)
     drawing.draw_holes(tmp_path / "a.png", image[:1], uv, hole, title="one channel")
     pixels = picture(tmp_path / "a.png")
-    assert share_of(pixels, colours.HOLES[Hole.TRACKABLE_NO_LIDAR]) > 1e-3
-    assert share_of(pixels, colours.HOLES[Hole.AT_BORDER]) < 1e-4
+    assert share_of(pixels, colours.HOLE_COLOURS[Hole.TRACKABLE_NO_LIDAR]) > 1e-3
+    assert share_of(pixels, colours.HOLE_COLOURS[Hole.AT_BORDER]) < 1e-4
 
 
 def test_every_code_has_a_colour_of_its_own():
-    assert set(colours.GATES) == set(names(Gate)) - {Gate.ANSWER}
-    assert set(colours.HOLES) == set(names(Hole)) - {Hole.NONE}
-    for table in (colours.GATES, colours.HOLES):
+    assert set(colours.GATE_COLOURS) == set(names(Gate)) - {Gate.ANSWER}
+    assert set(colours.HOLE_COLOURS) == set(names(Hole)) - {Hole.NONE}
+    for table in (colours.GATE_COLOURS, colours.HOLE_COLOURS):
         assert len(set(table.values())) == len(table)
 
 
 def test_depth_and_risk_figures_also_of_nothing(tmp_path):
     true = 2 + 4 * torch.rand(400, generator=torch.Generator().manual_seed(0))
     depth = torch.where(torch.arange(400) % 4 > 0, true * 1.05, math.nan)
-    points = errors.points(depth, true, true / 10)
+    points = errors.make_points(depth, true, true / 10)
     drawing.draw_depth(tmp_path / "depth.png", points.true_depth, points.depth, points.score)
     drawing.draw_depth(tmp_path / "plain.png", true, depth)
     assert share_of(picture(tmp_path / "plain.png"), colours.SENSOR) > 5e-4
     curves = {"paper": risk.risk_coverage(points), "none": risk.risk_coverage(points[:0])}
     drawing.draw_risk_coverage(tmp_path / "risk.png", curves, oracle=risk.risk_coverage(points, oracle=True))
-    assert share_of(picture(tmp_path / "risk.png"), colours.METHODS["paper"]) > 1e-3
+    assert share_of(picture(tmp_path / "risk.png"), colours.METHOD_COLOURS["paper"]) > 1e-3
     drawing.draw_depth(tmp_path / "empty.png", true[:0], depth[:0], depth[:0])
     drawing.draw_risk_coverage(tmp_path / "void.png", {})
     picture(tmp_path / "empty.png"), picture(tmp_path / "void.png")

@@ -14,12 +14,12 @@ from dhtorch.codes import Gate, Source
 from dhtorch.experiments import report
 from dhtorch.experiments.report import cells, curves, layouts, page, plots, published, text
 from dhtorch.experiments.report.figure import Figure
-from dhtorch.experiments.report.reading import flatten, scene_rows
-from dhtorch.experiments.report.tables import COLUMNS, Table, every_number
-from dhtorch.runtime import results as archive
+from dhtorch.experiments.report.reading import flatten_row, scene_rows
+from dhtorch.experiments.report.tables import MAIN_COLUMNS, ReportTable, full_tables
+from dhtorch.runtime import results as result_files
 from dhtorch.viz import plots as drawing
 from dhtorch.viz.plots import Axis, Panel, Stroke, colours
-from dhtorch.viz.plots.markup import Markup, escape, tag
+from dhtorch.viz.plots.markup import Markup, escape_html, make_tag
 
 REPO = Path(__file__).resolve().parents[2]
 RESULTS = [make() for make in archived.ALL]
@@ -42,7 +42,7 @@ def words(tree):
 
 @every
 def test_the_page_is_whole_and_needs_nothing_else(result):
-    made = page.page([result])
+    made = page.render_report([result])
     tree = parse(made)
     assert tree.get("lang") == "en" and tree.find("head/title").text
     for word in ("http", "//", "@import", "url(", "<script", "<link", "<img"):
@@ -65,11 +65,11 @@ def test_the_page_is_whole_and_needs_nothing_else(result):
 
 @every
 def test_the_page_holds_every_scene_and_every_number(result):
-    tree = parse(page.page([result]))
+    tree = parse(page.render_report([result]))
     said = words(tree)
     for row in scene_rows(result):
         assert row["scene"] in said and row["method"] in said
-        for name, number in flatten(row).items():
+        for name, number in flatten_row(row).items():
             if isinstance(number, int | float) and not isinstance(number, bool):
                 assert f"{number:.5g}" in said or str(number) in said, name
     for name, found in result["summary"].items():
@@ -85,14 +85,14 @@ def test_the_page_holds_every_scene_and_every_number(result):
 
 @pytest.mark.slow
 def test_several_results_stand_on_one_page_in_their_order():
-    tree = parse(page.page(RESULTS))
+    tree = parse(page.render_report(RESULTS))
     links = [a for a in tree.iter("a") if a.get("class") != "skip"]
     sections = list(tree.iter("section"))
     assert [a.text for a in links] == [r["experiment"] for r in RESULTS]
     assert [a.get("href")[1:] for a in links] == [s.get("id") for s in sections]
     assert "could not be downloaded" in "".join(tree.find("body/header/p").itertext())
     benchmark = {**RESULTS[0], "data": {**RESULTS[0]["data"], "name": "tum11"}}
-    said = "".join(parse(page.page([benchmark])).find("body/header/p").itertext())
+    said = "".join(parse(page.render_report([benchmark])).find("body/header/p").itertext())
     assert "does not name the sequences" in said and "could not be downloaded" not in said
 
 
@@ -109,12 +109,12 @@ def test_names_cannot_break_the_page(result):
     bad["summary"] = {"<i>" + k: v for k, v in bad["summary"].items()}
     bad |= {k: bad[k] and "<u>" + bad[k] for k in ("question", "why")}
     bad["config"]["<p>"] = "</pre><h1>"
-    made = page.page([bad])
+    made = page.render_report([bad])
     tree = parse(made)
     assert not {"script", "b", "i", "u"} & {e.tag for e in tree.iter()}
     assert '</td><script>alert("&amp;")</script>\ufffd\ufffd|' in "".join(tree.itertext())
     made.encode()
-    for line in report.markdown(bad).splitlines():
+    for line in report.to_markdown(bad).splitlines():
         assert "<" not in line
         assert not line.startswith("|") or line.endswith("|")
 
@@ -132,42 +132,42 @@ def emptied(value, name=""):
 def test_nulls_everywhere_are_shown_as_nothing(result):
     bare = {**result, "rows": [emptied(r) for r in result["rows"]]}
     bare["summary"] = {k: {**v, "value": None, "low": None, "high": None} for k, v in result["summary"].items()}
-    archive.validate(bare)
-    assert "None" not in "".join(parse(page.page([bare])).itertext())
-    assert "None" not in report.markdown(bare)
+    result_files.validate_result(bare)
+    assert "None" not in "".join(parse(page.render_report([bare])).itertext())
+    assert "None" not in report.to_markdown(bare)
     nothing = {**result, "summary": {}, "rows": [r for r in bare["rows"] if r["pair"] is not None]}
-    parse(page.page([nothing]))
-    parse(page.page([{**nothing, "rows": []}]))
+    parse(page.render_report([nothing]))
+    parse(page.render_report([{**nothing, "rows": []}]))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("some", [slice(0, None, 6), pytest.param(slice(None), marks=pytest.mark.slow)])
 def test_committed_results_make_a_page(some):
     paths = [p for p in sorted((REPO / "benchmarks/results").glob("*.json")) if p.read_text().startswith("{")][some]
-    results = [archive.read(path) for path in paths]
-    made = page.page(results)
+    results = [result_files.read_result(path) for path in paths]
+    made = page.render_report(results)
     scenes = {row["scene"] for r in results for row in r["rows"]}
-    assert parse(made) is not None and scenes and all(f">{escape(scene)}<" in made for scene in scenes)
+    assert parse(made) is not None and scenes and all(f">{escape_html(scene)}<" in made for scene in scenes)
 
 
 def test_markup_is_escaped_once():
     assert (
-        tag("a", "<", Markup("<b/>"), title='"&', class_="x", no=None)
+        make_tag("a", "<", Markup("<b/>"), title='"&', class_="x", no=None)
         == '<a title="&quot;&amp;" class="x">&lt;<b/></a>'
     )
-    assert escape(escape("&")) == "&amp;" and tag("td") == "<td></td>" and tag("br") == "<br/>"
+    assert escape_html(escape_html("&")) == "&amp;" and make_tag("td") == "<td></td>" and make_tag("br") == "<br/>"
 
 
 # ---------------------------------------------------------------------------------------------------- the command
 
 
 def test_the_command_writes_a_page_and_nowhere_else(tmp_path, capsys):
-    kept = archive.write(tmp_path / "sweep/a/result.json", RESULTS[0])
-    archive.write(tmp_path / "sweep/b/result.json", RESULTS[1])
+    kept = result_files.write_result(tmp_path / "sweep/a/result.json", RESULTS[0])
+    result_files.write_result(tmp_path / "sweep/b/result.json", RESULTS[1])
     before = kept.read_bytes()
     assert report.main([str(tmp_path / "sweep"), "--html", str(tmp_path / "page.html")]) == 0
     assert "2 results" in capsys.readouterr().out
-    assert (tmp_path / "page.html").read_text(encoding="utf-8") == page.page(RESULTS[:2])
+    assert (tmp_path / "page.html").read_text(encoding="utf-8") == page.render_report(RESULTS[:2])
     for target, reason in ((tmp_path / "sweep", "found a folder"), (kept, "ends in .html")):
         with pytest.raises(ValueError, match=reason):
             report.main([str(tmp_path / "sweep"), "--html", str(target)])
@@ -185,40 +185,40 @@ def test_the_command_writes_a_page_and_nowhere_else(tmp_path, capsys):
 
 @every
 def test_tables_are_rectangles_in_every_medium(result):
-    found = [*report.tables(result), *every_number(result)]
+    found = [*report.tables(result), *full_tables(result)]
     for table in found:
         assert all(len(row) == len(table.head) for row in table.rows), table.title
         assert not table.over or sum(span for _, span in table.over) == len(table.head)
         assert table.footer + table.quoted <= len(table.rows)
-        lines = text.grid(table).splitlines()
+        lines = text.table_to_markdown(table).splitlines()
         assert len({line.replace("\\|", "").count("|") for line in lines}) == 1
-    for block in text.markdown(found).split("\n\n"):
+    for block in text.tables_to_markdown(found).split("\n\n"):
         assert not block.startswith("|") or "\n| :--" in block
 
 
 SOURCES = {
-    "range_split": (published.RANGE_SPLIT, published.CUTOFF),
+    "range_split": (published.RANGE_SPLIT, published.CUTOFF_SWEEP),
     "real_holes": (published.REAL_HOLES,),
-    "gate_ablation": (published.GATES,),
+    "gate_ablation": (published.GATE_ABLATION,),
     "heldout": (published.HELD_OUT, published.CYCLIC, published.CROSS_DATA),
-    "calibration": (published.CALIBRATION, published.THRESHOLDS),
-    "hole_census": (published.CENSUS,),
-    "device_pose": (published.POSE,),
-    "motion": (published.MOTION,),
+    "calibration": (published.SCORE_CALIBRATION, published.THRESHOLDS),
+    "hole_census": (published.HOLE_CENSUS,),
+    "device_pose": (published.DEVICE_POSE,),
+    "motion": (published.BASELINE_MOTION,),
     "latency": (published.LATENCY,),
     "learned": (published.LEARNED,),
     "helix_correlation": (published.HELIX,),
     "icp": (published.ICP,),
-    "hole_attention": (published.ATTENTION,),
+    "hole_attention": (published.HOLE_ATTENTION,),
     "defocus": (published.DEFOCUS,),
     "focus_stack": (published.FOCUS_STACK,),
-    "defocus_fusion": (published.FUSION,),
+    "defocus_fusion": (published.DEFOCUS_FUSION,),
 }
 
 
 @pytest.mark.parametrize("result", [r for r in RESULTS if r["experiment"] in SOURCES], ids=list(SOURCES))
 def test_every_figure_of_the_paper_stands_in_the_table_of_its_experiment(result):
-    tables = layouts.in_layout(result)
+    tables = layouts.layout_tables(result)
     for quoted in SOURCES[result["experiment"]]:
         (table,) = [t for t in tables if t.note and quoted.where in t.note and quoted.data in t.note][:1]
         cells = [cell for row in table.rows for cell in row]
@@ -228,7 +228,7 @@ def test_every_figure_of_the_paper_stands_in_the_table_of_its_experiment(result)
 
 
 def test_ours_stands_beside_the_papers_line():
-    main, cutoffs = layouts.in_layout(archived.range_split())
+    main, cutoffs = layouts.layout_tables(archived.range_split())
     assert main.flat_head() == [
         "",
         "scenes",
@@ -244,7 +244,7 @@ def test_ours_stands_beside_the_papers_line():
         "gated (published: 2.0 m)",
         "gated, cutoff x1.25 (published: 2.5 m)",
     ]
-    gates = layouts.in_layout(archived.gate_ablation())[0]
+    gates = layouts.layout_tables(archived.gate_ablation())[0]
     assert [row[0].split(" (")[0] for row in gates.rows] == [
         "gap x0.5",
         "both gates",
@@ -258,12 +258,12 @@ def test_negative_results_stand_beside_the_papers_figure():
     """Ours from the committed files, not copied here: the cell beside the paper's is the summary's number."""
 
     def beside(name, label, heading, metric):
-        result = archive.read(REPO / f"benchmarks/results/{name}.json")
-        table = layouts.in_layout(result)[0]
+        result = result_files.read_result(REPO / f"benchmarks/results/{name}.json")
+        table = layouts.layout_tables(result)[0]
         (row,) = [row for row in table.rows if row[0] == label]
         at = table.flat_head().index(f"{heading}, ours")
         assert table.flat_head()[at + 1] == f"{heading}, published"
-        assert row[at] == cells.show(result["summary"][metric]["value"], metric)
+        assert row[at] == cells.format_value(result["summary"][metric]["value"], metric)
         return row[at + 1]
 
     oracle = "side from an oracle"
@@ -278,12 +278,12 @@ def test_negative_results_stand_beside_the_papers_figure():
 
 
 def test_a_stack_of_one_measure_and_a_sweep_have_the_tables_that_they_can_have():
-    first, other = layouts.in_layout(archived.focus_stack())
+    first, other = layouts.layout_tables(archived.focus_stack())
     assert [row[0] for row in first.rows] == ["clean", "noisy", "optics of a light field", "nothing blurred"]
     assert {row[0].split(", ")[1] for row in other.rows} == {"variance"} and not other.quoted
-    (swept,) = layouts.in_layout(archived.screened("focus_stack", ("given",), ("order_corr", "halves_corr")))
+    (swept,) = layouts.layout_tables(archived.screened("focus_stack", ("given",), ("order_corr", "halves_corr")))
     assert "Sweeps" in swept.title and len(swept.rows) == 1 and not swept.note
-    (given_,) = layouts.in_layout(archived.screened("focus_stack", ("given",), ("rank_corr", "gated_corr")))
+    (given_,) = layouts.layout_tables(archived.screened("focus_stack", ("given",), ("rank_corr", "gated_corr")))
     assert [row[0] for row in given_.rows] == [
         "given",
         "published: clean synthetic",
@@ -292,7 +292,7 @@ def test_a_stack_of_one_measure_and_a_sweep_have_the_tables_that_they_can_have()
 
 
 def test_what_one_picture_cannot_tell_apart_has_a_table_of_its_own():
-    rows = {row[0]: row[1:] for row in layouts.in_layout(archived.defocus())[1].rows}
+    rows = {row[0]: row[1:] for row in layouts.layout_tables(archived.defocus())[1].rows}
     assert rows["in focus, soft paint"] == ["2.40", "0.00"] and rows["nearer than the focus"] == ["1.66", "1.69"]
 
 
@@ -304,31 +304,35 @@ def test_what_was_not_measured_says_why():
         {"device_raw": (1.0, 0.1)}, scenes=("a",), notes={("a", "device_raw"): "no device trajectory"}
     )
     result = archived.result("range_split", rows)
-    main = layouts.in_layout(result)[0]
+    main = layouts.layout_tables(result)[0]
     cells = {row[0]: row[2::2] for row in main.rows}
     assert cells["gated"] == ["too short"] * 4 and cells["device pose (raw)"] == ["no device trajectory"] * 4
     assert cells["no gates"] == ["not run"] * 4
     by_scene = next(t for t in report.tables(result) if "pairs" in t.head)
-    assert by_scene.rows[0][3:] == ["too short"] * len(by_scene.head[3:]) and len(COLUMNS) <= len(by_scene.head[3:])
+    assert by_scene.rows[0][3:] == ["too short"] * len(by_scene.head[3:]) and len(MAIN_COLUMNS) <= len(
+        by_scene.head[3:]
+    )
     assert ["0 of 2 scenes", "gated"] in [row[:2] for row in by_scene.rows]
-    assert "too short" in report.markdown(result) and "not run" in report.markdown(result)
+    assert "too short" in report.to_markdown(result) and "not run" in report.to_markdown(result)
 
 
 def test_a_reason_in_all_columns_is_said_once_and_long_words_are_broken():
-    table = Table("t", ["scene", "why", "pairs", "median", "p90"], [["a", "w" * 90, "3", "too short", "too short"]], 2)
+    table = ReportTable(
+        "t", ["scene", "why", "pairs", "median", "p90"], [["a", "w" * 90, "3", "too short", "too short"]], 2
+    )
     made = page.table_markup(table)
     assert made.count("too short") == 1 and '<td class="word" colspan="2">too short</td>' in made
     assert f'<td class="why">{"w" * 90}</td>' in made and '<td class="num">3</td>' in made
-    dashes = page.table_markup(Table("t", ["scene", "median", "p90"], [["a", "–", "–"]]))
+    dashes = page.table_markup(ReportTable("t", ["scene", "median", "p90"], [["a", "–", "–"]]))
     assert dashes.count("–") == 2, "nothing is no reason"
 
 
 def test_the_cohort_that_the_summary_leaves_unnamed_decides():
     result = archived.calibration()
-    held, split = layouts.in_layout(result)[:2]
+    held, split = layouts.layout_tables(result)[:2]
     assert "heldout" in held.title and held.quoted == 2 and "full" in split.title and split.quoted == 0
     result["summary"]["paper.heldout.ece"]["value"], result["summary"]["paper.ece"]["value"] = 0.111, 0.222
-    held, split, steps = layouts.in_layout(result)[:3]
+    held, split, steps = layouts.layout_tables(result)[:3]
     assert held.rows[0][2] == "0.111" and split.rows[0][2] == "0.222"
     assert [row[0] for row in steps.rows] == ["0", "0.1", "0.3", "0.5"]
     assert [steps.rows[2][k] for k in (2, 4)] == ["34.3 %", "9.5 %"]
@@ -336,22 +340,22 @@ def test_the_cohort_that_the_summary_leaves_unnamed_decides():
 
 def test_passes_are_counted_without_scenes_of_a_role():
     result = archived.heldout()
-    table = layouts.in_layout(result)[2]
+    table = layouts.layout_tables(result)[2]
     mine = [r["passes"] for r in scene_rows(result, "heldout", "paper") if not r["role"]]
     assert table.rows[0][table.head.index("passes")] == f"{sum(mine)}/{len(mine)}" and len(mine) == 3
 
 
 def test_printed_figures_are_read_back():
-    assert published.number("64.2 %") == pytest.approx(0.642) and published.number("32,690") == 32690
-    assert published.number("−0.33") == -0.33 and published.number("571 M") == 571e6
-    assert all(published.number(word) is None for word in ("1.4–3.5 %", "yes", "8/11", "≈ 0.16", "", None))
+    assert published.parse_printed("64.2 %") == pytest.approx(0.642) and published.parse_printed("32,690") == 32690
+    assert published.parse_printed("−0.33") == -0.33 and published.parse_printed("571 M") == 571e6
+    assert all(published.parse_printed(word) is None for word in ("1.4–3.5 %", "yes", "8/11", "≈ 0.16", "", None))
 
 
 # ---------------------------------------------------------------------------------------------------- figures
 
 
 def titles(result):
-    return [figure.title.split(":")[0] for figure in plots.figures(result)]
+    return [figure.title.split(":")[0] for figure in plots.result_figures(result)]
 
 
 def test_figures_are_those_that_the_numbers_allow():
@@ -370,7 +374,7 @@ def test_figures_are_those_that_the_numbers_allow():
 
 
 def test_scenes_that_a_figure_lacks_are_named():
-    for figure in plots.figures(archived.range_split()):
+    for figure in plots.result_figures(archived.range_split()):
         if figure.title.startswith(("Risk", "Error", "What")):
             assert "terrace/CAMERA_01 (too short)" in figure.caption
 
@@ -381,14 +385,14 @@ def test_a_mean_over_few_answers_is_not_drawn():
         if row["pair"] is None:
             row["n_candidates"] = 100
             row["curves"]["risk_coverage"]["coverage"] = [0.02 * k for k in range(1, 21)]  # 2, 4, … 40 answers
-    (line,) = [m for m in curves.risk(result).panels[0].marks if m.kind == "line" and not m.stroke.dashes]
+    (line,) = [m for m in curves.risk_figure(result).panels[0].marks if m.kind == "line" and not m.stroke.dashes]
     assert len(line.places) == 16, "from ten answers on"
 
 
 def test_bins_of_several_scenes_weigh_every_scene_the_same():
     a = {"claimed": [0.1, None, 0.9], "realised": [0.2, None, 1.0], "weight": [0.5, 0.0, 0.5]}
     b = {"claimed": [0.3, 0.5, None], "realised": [0.0, 0.4, None], "weight": [2.0, 6.0, 0.0]}
-    claimed, realised, weight = curves.pooled([a, b])
+    claimed, realised, weight = curves.pool_reliability([a, b])
     assert weight == pytest.approx([0.375, 0.375, 0.25])
     assert claimed == pytest.approx([(0.25 * 0.1 + 0.125 * 0.3) / 0.375, 0.5, 0.9])
     assert realised == pytest.approx([0.25 * 0.2 / 0.375, 0.4, 1.0])
@@ -397,7 +401,7 @@ def test_bins_of_several_scenes_weigh_every_scene_the_same():
 def test_an_overlay_draws_every_point_once_in_its_class():
     result = archived.pair()
     row = next(r for r in result["rows"] if r["pair"] is None)
-    figure = plots.figures(result)[-1]
+    figure = plots.result_figures(result)[-1]
     drawn = {layer.label: layer for layer in figure.panels[0].layers}
     source, gate = row["overlay"]["source"], row["overlay"]["gate"]
     assert len(drawn["sensor"].uv) == source.count(Source.SENSOR) and drawn["sensor"].colour == colours.SENSOR
@@ -407,7 +411,7 @@ def test_an_overlay_draws_every_point_once_in_its_class():
     assert len(drawn["silent: parallax"].uv) == silent.count(Gate.PARALLAX)
     assert sum(len(layer.uv) for layer in drawn.values()) == len(source)
     assert {key.text for key in figure.legend} >= set(drawn)
-    svg = drawing.inline(figure.panels[0])
+    svg = drawing.render_inline_svg(figure.panels[0])
     round_ends = [p.get("d").count("M") for p in ET.fromstring(svg).iter("path") if "linecap" in p.get("style")]
     assert sum(round_ends) == sum(len(layer.uv) for layer in drawn.values() if layer.mark != "silent"), "a dot each"
 
@@ -427,7 +431,7 @@ ends = st.floats(1e-3, 1e3)
 
 @given(ends, st.floats(1.01, 1e4), st.booleans())
 def test_ticks_are_few_round_and_inside(low, factor, log):
-    axis = drawing.spanning([low, low * factor], "", log=log)
+    axis = drawing.fit_axis([low, low * factor], "", log=log)
     ticks = axis.ticks()
     assert 1 <= len(ticks) <= 8 and ticks == sorted(set(ticks))
     assert all(axis.low * 0.998 <= t <= axis.high * 1.002 for t in ticks)
@@ -438,7 +442,7 @@ def test_ticks_are_few_round_and_inside(low, factor, log):
 
 @given(st.lists(st.one_of(st.none(), st.floats(-1e6, 1e6)), max_size=5), st.booleans())
 def test_an_axis_takes_any_values(values, log):
-    axis = drawing.spanning(values, "", log=log)
+    axis = drawing.fit_axis(values, "", log=log)
     assert axis.low < axis.high and (not log or axis.low > 0)
     for v in values:
         assert v is None or 0 <= axis.place(v) <= 1

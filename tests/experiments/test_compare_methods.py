@@ -8,7 +8,7 @@ import statistics
 import pytest
 import torch
 
-from dhtorch import pytree as tree
+from dhtorch import pytree
 from dhtorch.calibration import score_calibration
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.metrics import bootstrap, control, errors, reliability, risk
@@ -22,7 +22,7 @@ def scene_of(n, seed=0, spread=1.0, silent=0.2, boast=1.0, floor=0.0):
     noise = ((spread * rel) ** 2 + floor**2).sqrt() * torch.randn(n, generator=g, dtype=torch.float64)
     depth = (true * (1 + noise)).clamp_min(0.01)
     keep = torch.rand(n, generator=g, dtype=torch.float64) >= silent
-    return errors.points(depth, true, (0.1 / (0.1 + rel)) ** boast, sigma=rel * true, keep=keep)
+    return errors.make_points(depth, true, (0.1 / (0.1 + rel)) ** boast, sigma=rel * true, keep=keep)
 
 
 def median(values):
@@ -43,9 +43,9 @@ def test_ratios_equal_plain_loops():
     own, equal, ranked, covered = [], [], [], []
     for scene in paper:
         pairs = list(zip(ours[scene], paper[scene], strict=True))
-        own.append([median(errors.measure(p)["median_rel"] for p in side) for side in zip(*pairs, strict=True)])
-        ranked.append([median(risk.measure(p)["aurc"] for p in side) for side in zip(*pairs, strict=True)])
-        covered.append(median(risk.measure(p)["coverage_at_5"] for p in ours[scene]))
+        own.append([median(errors.measure_errors(p)["median_rel"] for p in side) for side in zip(*pairs, strict=True)])
+        ranked.append([median(risk.measure_risk(p)["aurc"] for p in side) for side in zip(*pairs, strict=True)])
+        covered.append(median(risk.measure_risk(p)["coverage_at_5"] for p in ours[scene]))
         cut = []
         for pair in pairs:  # the surest of either, as many as the more silent one answers
             n = min(int(p.keep.sum()) for p in pair)
@@ -58,7 +58,7 @@ def test_ratios_equal_plain_loops():
         ("aurc_ratio", ranked),
     ):
         each = [a / b for a, b in ratios]
-        wanted = bootstrap.interval(each, statistic="geometric_mean", draws=300, seed=4)
+        wanted = bootstrap.interval_over_scenes(each, statistic="geometric_mean", draws=300, seed=4)
         entry = found.summary[f"map.{name}"]
         assert entry["value"] == pytest.approx(math.prod(each) ** (1 / 3)), name
         assert [entry[k] for k in ("low", "high", "n", "unit")] == pytest.approx([wanted.low, wanted.high, 3, "1"]), (
@@ -85,32 +85,32 @@ def test_intervals_are_those_of_2000_draws_unless_asked_otherwise():
 def test_seeds_are_paired_and_a_lone_one_raises():
     one, two = small(1.0, names="a", seeds=1), small(1.0, names="a", seeds=2)
     with pytest.raises(ValueError, match="shorter"):
-        compare.equal_coverage(two, one)
+        compare.cut_to_equal_coverage(two, one)
 
 
 def test_promises_equal_plain_loops():
     """Every scene with a calibration learnt from the other rooms alone, its seeds joined."""
     ours, room = small(1.0, names="abcd"), {"a": "hall", "b": "hall"}
     found = compare.method_ratios({"paper": small(0.8, names="abcd"), "map": ours}, rooms=room, draws=200, seed=2)
-    joined = {scene: tree.collate(points) for scene, points in ours.items()}
+    joined = {scene: pytree.collate(points) for scene, points in ours.items()}
     applied, sigmoid, realised = {}, {}, {5: [], 10: []}
     for scene, row in zip("abcd", found.rows, strict=True):
         others = [joined[s] for s in "abcd" if room.get(s, s) != room.get(scene, scene)]
-        nine_in_ten = functools.partial(control.most_scenes, few=100 * len(ours[scene]))
-        learnt = score_calibration.fit(others, targets=(10, 5), choose=nine_in_ten)
+        nine_in_ten = functools.partial(control.scene_quantile_threshold, few=100 * len(ours[scene]))
+        learnt = score_calibration.fit_calibration(others, targets=(10, 5), choose=nine_in_ten)
         applied[scene] = learnt.apply(joined[scene])
         claimed = learnt.sigmoid(joined[scene].score)
         sigmoid[scene] = joined[scene].replace(score=torch.where(joined[scene].keep, claimed, 0.0))
-        stated = errors.measure(applied[scene])
+        stated = errors.measure_errors(applied[scene])
         for name in ("within_sigma", "within_2sigma"):
             assert row[name] == stated[name], name
         for percent, values in realised.items():
-            values.append(risk.realised(joined[scene], learnt.thresholds[percent]))
+            values.append(risk.realised_risk(joined[scene], learnt.thresholds[percent]))
             assert row[f"realised_risk_{percent}"] == values[-1]
             above = joined[scene].keep & (joined[scene].score >= (learnt.thresholds[percent] or math.inf))
             assert row[f"coverage_within_{percent}"] == pytest.approx(float(above.double().mean()))
     for name in ("within_sigma", "within_2sigma"):
-        wanted = bootstrap.interval([row[name] for row in found.rows], statistic="mean", draws=200, seed=2)
+        wanted = bootstrap.interval_over_scenes([row[name] for row in found.rows], statistic="mean", draws=200, seed=2)
         assert list(found.summary[f"map.{name}"].values())[:3] == list(wanted[:3]), name
     for percent, values in realised.items():
         counted = [v or 0.0 for v in values]
@@ -131,13 +131,13 @@ def test_promises_equal_plain_loops():
 
 
 def exact(n, error=0.0):
-    return errors.points(torch.full((n,), 1 + error), torch.ones(n))
+    return errors.make_points(torch.full((n,), 1 + error), torch.ones(n))
 
 
 def test_a_scene_counts_from_the_twentieth_answer_of_the_median_seed():
     def ratio(ours, theirs, **options):
         return compare.ratio_over_seeds(
-            {"a": ours}, {"a": theirs}, lambda p: errors.measure(p)["median_rel"], **options
+            {"a": ours}, {"a": theirs}, lambda p: errors.measure_errors(p)["median_rel"], **options
         )
 
     enough, few = [exact(20, 0.5), exact(20, 0.5), exact(3, 0.5)], [exact(19, 0.25), exact(19, 0.25), exact(90, 0.25)]
@@ -148,7 +148,7 @@ def test_a_scene_counts_from_the_twentieth_answer_of_the_median_seed():
 
 
 def test_errors_below_a_millionth_count_as_one():
-    measure = lambda p: errors.measure(p)["median_rel"]  # noqa: E731
+    measure = lambda p: errors.measure_errors(p)["median_rel"]  # noqa: E731
     ours, theirs = {"a": [exact(30)]}, {"a": [exact(30, 0.5)]}
     assert compare.ratio_over_seeds(ours, theirs, measure)[0]["a"] == pytest.approx(2e-6)
     assert compare.ratio_over_seeds(theirs, ours, measure)[0]["a"] == pytest.approx(5e5)
@@ -166,7 +166,7 @@ def test_a_scene_without_any_error_is_not_silent():
 
 def test_seeds_without_the_number_are_passed_over_and_a_scene_without_any_is_left_out():
     ours, theirs = {"a": [exact(30, 0.5), exact(30, 0.25)]}, {"a": [exact(30, 0.5)] * 2}
-    some = lambda p: None if float(p.depth[0]) < 1.4 else errors.measure(p)["median_rel"]  # noqa: E731
+    some = lambda p: None if float(p.depth[0]) < 1.4 else errors.measure_errors(p)["median_rel"]  # noqa: E731
     assert compare.ratio_over_seeds(ours, theirs, some)[0] == {"a": 1.0}
     assert compare.ratio_over_seeds(ours, theirs, lambda _: None) == ({}, ["a"])
 
@@ -201,15 +201,15 @@ def test_ratios_are_medians_over_seeds_then_a_geometric_mean_over_scenes():
     found = compare.method_ratios({"paper": paper, "map": ours})
     expected = []
     for scene in paper:
-        a, b = ([errors.measure(p)["median_rel"] for p in side[scene]] for side in (ours, paper))
+        a, b = ([errors.measure_errors(p)["median_rel"] for p in side[scene]] for side in (ours, paper))
         expected.append(statistics.median(a) / statistics.median(b))
     entry = found.summary["map.median_rel_ratio"]
     assert entry["value"] == pytest.approx(statistics.geometric_mean(expected)) == pytest.approx(0.5, abs=0.01)
     assert entry["low"] <= entry["value"] <= entry["high"] and entry["n"] == 6 and entry["unit"] == "1"
     assert [row["median_rel_ratio"] for row in found.rows] == pytest.approx(expected)
     aurc = [
-        statistics.median(risk.measure(p)["aurc"] for p in ours[s])
-        / statistics.median(risk.measure(p)["aurc"] for p in paper[s])
+        statistics.median(risk.measure_risk(p)["aurc"] for p in ours[s])
+        / statistics.median(risk.measure_risk(p)["aurc"] for p in paper[s])
         for s in paper
     ]
     assert found.summary["map.aurc_ratio"]["value"] == pytest.approx(statistics.geometric_mean(aurc))
@@ -248,7 +248,7 @@ def test_promises_come_from_other_rooms():
 
 def test_at_equal_coverage_both_are_cut_to_the_smaller():
     paper, ours = seeds_of(1.0, silent=0.0), seeds_of(1.0, silent=0.6)
-    a, b = compare.equal_coverage(ours, paper)
+    a, b = compare.cut_to_equal_coverage(ours, paper)
     for scene, seed in itertools.product(paper, range(3)):
         assert int(a[scene][seed].keep.sum()) == int(b[scene][seed].keep.sum()) == int(ours[scene][seed].keep.sum())
     found = compare.method_ratios({"paper": paper, "map": ours})
@@ -283,15 +283,15 @@ def test_methods_that_do_not_match_raise():
 def test_one_method_against_another_with_its_silence():
     """Ratios at equal coverage as in the comparison, the worst of them, and areas in which silence counts as one."""
     ours, theirs = small(0.5, silent=0.1, n=90), small(1.0, silent=0.6, n=90)
-    numbers, rows = compare.against(ours, theirs, "window", draws=50)
+    numbers, rows = compare.multiview_ratios(ours, theirs, "window", draws=50)
     equal, _ = compare.ratio_over_seeds(
-        *compare.equal_coverage(ours, theirs), lambda p: errors.measure(p)["median_rel"]
+        *compare.cut_to_equal_coverage(ours, theirs), lambda p: errors.measure_errors(p)["median_rel"]
     )
     assert numbers["error_ratio_to_window"].value == pytest.approx(math.prod(equal.values()) ** (1 / 3))
     assert numbers["worst_scene_ratio_to_window"].value == max(equal.values())
     full = []
     for scene in ours:
-        areas = [median(risk.measure(p)["aurc_full"] for p in side[scene]) for side in (ours, theirs)]
+        areas = [median(risk.measure_risk(p)["aurc_full"] for p in side[scene]) for side in (ours, theirs)]
         full.append(areas[0] / areas[1])
         assert rows[scene] == {
             "error_ratio_to_window": equal[scene],
@@ -303,7 +303,7 @@ def test_one_method_against_another_with_its_silence():
 
 def test_a_method_that_is_silent_has_an_area_but_no_error_to_compare():
     mute = {name: [p.replace(keep=torch.zeros_like(p.keep)) for p in seeds] for name, seeds in small(1.0).items()}
-    numbers, rows = compare.against(mute, small(1.0), "window", draws=20)
+    numbers, rows = compare.multiview_ratios(mute, small(1.0), "window", draws=20)
     assert numbers["error_ratio_to_window"].value is None and numbers["worst_scene_ratio_to_window"].value is None
     assert numbers["aurc_full_ratio_to_window"].value > 1 and all(len(row) == 1 for row in rows.values())
 

@@ -6,13 +6,19 @@ import pytest
 import torch
 
 from dhtorch.experiments.focal import defocus as experiment
-from dhtorch.experiments.focal.blur import Blur, inverse_depth, local_blur, side_by_colour, side_by_height
+from dhtorch.experiments.focal.blur import (
+    BlurMap,
+    estimate_blur,
+    guess_side_by_colour,
+    guess_side_by_height,
+    inverse_depth_from_blur,
+)
 from dhtorch.experiments.protocol import Outcome, Settings
-from dhtorch.geometry.filters import gaussian
+from dhtorch.geometry.filters import gaussian_blur
 from dhtorch.geometry.thin_lens import depth_of_spot, spot_diameter, spot_gain
 from dhtorch.records import Pose
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.synthetic.thin_lens import lens_of, photograph
+from dhtorch.synthetic.thin_lens import make_lens, render_defocus
 from dhtorch.synthetic.viewpoints import open_viewpoints
 
 
@@ -28,7 +34,7 @@ def edge(angle_deg=0.0, contrast=0.8):
 @pytest.mark.parametrize("angle", [0.0, 30.0, 90.0])
 @pytest.mark.parametrize("contrast", [0.1, 0.8])
 def test_a_gaussian_blur_of_known_radius_is_recovered(sigma, angle, contrast):
-    blur = local_blur(gaussian(edge(angle, contrast), sigma), noise=0.0, window_px=12.0)
+    blur = estimate_blur(gaussian_blur(edge(angle, contrast), sigma), noise=0.0, window_px=12.0)
     assert bool(blur.valid[0, 48, 80])
     # Between the blur alone and that with a pixel's own square, as the edge falls on the pixels; the window costs 3 %.
     assert 0.93 * sigma < float(blur.sigma[0, 48, 80]) < 1.02 * math.sqrt(sigma**2 + 1 / 12)
@@ -36,19 +42,19 @@ def test_a_gaussian_blur_of_known_radius_is_recovered(sigma, angle, contrast):
 
 def test_noise_is_taken_off():
     draw = torch.Generator().manual_seed(0)
-    clean = gaussian(edge(), 2.0)
+    clean = gaussian_blur(edge(), 2.0)
     noisy = clean + 4 / 255 * torch.randn(clean.shape, generator=draw)
-    found = local_blur(noisy, noise=4 / 255).sigma[0, 40:56, 78:82].median()
-    want = local_blur(clean, noise=0.0).sigma[0, 40:56, 78:82].median()
+    found = estimate_blur(noisy, noise=4 / 255).sigma[0, 40:56, 78:82].median()
+    want = estimate_blur(clean, noise=0.0).sigma[0, 40:56, 78:82].median()
     assert float(found) == pytest.approx(float(want), rel=0.08)
-    blind = local_blur(noisy, noise=1e-6).sigma[0, 40:56, 78:82].median()
+    blind = estimate_blur(noisy, noise=1e-6).sigma[0, 40:56, 78:82].median()
     assert float(blind) < float(found), "noise that is not taken off reads as sharpness"
     flat = 0.5 + 4 / 255 * torch.randn(1, 1, 96, 160, generator=draw)
-    assert float(local_blur(flat, noise=4 / 255).valid.float().mean()) == 0
+    assert float(estimate_blur(flat, noise=4 / 255).valid.float().mean()) == 0
 
 
 def test_the_spot_follows_the_thin_lens():
-    lens = lens_of(500.0, focal_length_m=0.05, f_number=2.0)
+    lens = make_lens(500.0, focal_length_m=0.05, f_number=2.0)
     near, far = 1.0, 4.0
     spot = spot_diameter(lens, torch.tensor([[near, 2.0, far, 0.0]]), torch.tensor([2.0]))[0]
     # From the lens equation itself: images at v(z), the sensor at v(2), similar triangles behind the aperture.
@@ -64,17 +70,17 @@ def test_the_spot_follows_the_thin_lens():
 
 
 def test_a_point_becomes_a_disc_of_its_diameter():
-    lens, depth = lens_of(400.0, f_number=0.7), torch.full((1, 64, 64), 2.0)
+    lens, depth = make_lens(400.0, f_number=0.7), torch.full((1, 64, 64), 2.0)
     point = torch.zeros(1, 1, 64, 64)
     point[..., 32, 32] = 1.0
-    seen = photograph(point, depth, lens, torch.tensor([[1.0]]), gamma=1.0)[0, 0, 0]
+    seen = render_defocus(point, depth, lens, torch.tensor([[1.0]]), gamma=1.0)[0, 0, 0]
     diameter = float(spot_diameter(lens, torch.tensor([[2.0]]), torch.tensor([1.0])))
     y, x = torch.meshgrid(torch.arange(64) - 32.0, torch.arange(64) - 32.0, indexing="ij")
     assert float(seen.sum()) == pytest.approx(1.0, rel=0.1)
     r = (x * x + y * y).sqrt()
     inside, half = float(seen[r < diameter / 2 + 0.7].sum()), float(seen[r < diameter / 8**0.5].sum())
     assert inside > 0.93 and half == pytest.approx(0.5, abs=0.06)  # uniform: half the area holds half the light
-    sharp = photograph(point, depth, lens, torch.tensor([[2.0]]), gamma=1.0)[0, 0]
+    sharp = render_defocus(point, depth, lens, torch.tensor([[2.0]]), gamma=1.0)[0, 0]
     torch.testing.assert_close(sharp, point[0], atol=1e-5, rtol=0)
 
 
@@ -90,8 +96,8 @@ def test_the_lens_covers_what_is_behind_as_an_exact_light_field_does():
     (room, pinhole), focus = pictured(), 1.6
     pose, depth = room.true_poses[:1], room.truth(0)["depth"]
     aperture = 0.15
-    lens = lens_of(float(room.camera.f[0, 0]), f_number=0.035 / aperture)
-    made = photograph(pinhole, depth, lens, torch.tensor([[focus]]))[0, 0]
+    lens = make_lens(float(room.camera.f[0, 0]), f_number=0.035 / aperture)
+    made = render_defocus(pinhole, depth, lens, torch.tensor([[focus]]))[0, 0]
     total, count = torch.zeros_like(made), 0
     for i in range(4):
         for k in range(4):
@@ -109,20 +115,22 @@ def test_the_lens_covers_what_is_behind_as_an_exact_light_field_does():
 
 
 def test_inverse_depth_needs_the_side():
-    lens, focus = lens_of(400.0, f_number=0.7), torch.tensor([2.0])
+    lens, focus = make_lens(400.0, f_number=0.7), torch.tensor([2.0])
     spot = spot_diameter(lens, torch.tensor([[1.25, 5.0]]), focus)
     assert float(spot[0, 0]) == pytest.approx(-float(spot[0, 1])), "two depths, one spot"
-    blur = Blur(0.25 * spot.abs()[..., None], torch.ones(1, 2, 1), torch.ones(1, 2, 1, dtype=torch.bool))
-    found = inverse_depth(blur, torch.sign(spot)[..., None], lens, focus)
+    blur = BlurMap(0.25 * spot.abs()[..., None], torch.ones(1, 2, 1), torch.ones(1, 2, 1, dtype=torch.bool))
+    found = inverse_depth_from_blur(blur, torch.sign(spot)[..., None], lens, focus)
     torch.testing.assert_close(found[0, :, 0], torch.tensor([0.8, 0.2]), rtol=1e-5, atol=0)
     huge = blur.replace(sigma=100 * blur.sigma)
-    assert inverse_depth(huge, torch.ones(1, 2, 1), lens, focus)[0, :, 0].tolist() == [0, 0], "as far as can be"
+    assert inverse_depth_from_blur(huge, torch.ones(1, 2, 1), lens, focus)[0, :, 0].tolist() == [0, 0], (
+        "as far as can be"
+    )
     silent = blur.replace(valid=torch.zeros(1, 2, 1, dtype=torch.bool))
-    assert bool(inverse_depth(silent, torch.ones(1, 2, 1), lens, focus).isnan().all())
+    assert bool(inverse_depth_from_blur(silent, torch.ones(1, 2, 1), lens, focus).isnan().all())
 
 
 def test_the_two_ambiguities():
-    found = experiment.ambiguities(noise=1 / 255)
+    found = experiment.measure_ambiguities(noise=1 / 255)
     assert found["blank_wall.sharp_paint_px"] < 0.3 < found["blank_wall.soft_paint_px"], "soft paint looks defocused"
     assert found["blank_wall.plain_share"] == 0, "a plain wall says nothing"
     assert found["two_sides.ratio"] == pytest.approx(1, rel=0.1), "near and far of the focus look alike"
@@ -131,24 +139,25 @@ def test_the_two_ambiguities():
 def test_sides():
     sigma = torch.full((1, 40, 30), 3.0)
     sigma[:, 25:28] = 0.2
-    side = side_by_height(Blur(sigma, torch.ones_like(sigma), torch.ones_like(sigma, dtype=torch.bool)))
+    side = guess_side_by_height(BlurMap(sigma, torch.ones_like(sigma), torch.ones_like(sigma, dtype=torch.bool)))
     assert bool((side[0, :20] == 1).all()) and bool((side[0, 30:] == -1).all())
-    red_sharp = torch.cat([gaussian(edge().float(), s) for s in (1.0, 1.5, 2.0)], 1)
+    red_sharp = torch.cat([gaussian_blur(edge().float(), s) for s in (1.0, 1.5, 2.0)], 1)
     assert (
-        float(side_by_colour(red_sharp)[0, 48, 80]) == 1 and float(side_by_colour(red_sharp.flip(1))[0, 48, 80]) == -1
+        float(guess_side_by_colour(red_sharp)[0, 48, 80]) == 1
+        and float(guess_side_by_colour(red_sharp.flip(1))[0, 48, 80]) == -1
     )
 
 
 def test_bad_input():
-    lens, depth = lens_of(400.0), torch.ones(1, 8, 8)
+    lens, depth = make_lens(400.0), torch.ones(1, 8, 8)
     with pytest.raises(ValueError, match="depth has shape"):
-        photograph(torch.zeros(1, 1, 8, 9), depth, lens, torch.ones(1, 1))
+        render_defocus(torch.zeros(1, 1, 8, 9), depth, lens, torch.ones(1, 1))
     with pytest.raises(ValueError, match="without a value"):
-        photograph(torch.zeros(1, 1, 8, 8), 0 * depth, lens, torch.ones(1, 1))
+        render_defocus(torch.zeros(1, 1, 8, 8), 0 * depth, lens, torch.ones(1, 1))
     with pytest.raises(ValueError, match="beyond the focal length"):
-        photograph(torch.zeros(1, 1, 8, 8), depth, lens, torch.full((1, 1), 0.01))
+        render_defocus(torch.zeros(1, 1, 8, 8), depth, lens, torch.full((1, 1), 0.01))
     with pytest.raises(ValueError, match="expected 0 < fine_px < coarse_px"):
-        local_blur(torch.zeros(1, 1, 8, 8), fine_px=2.0, coarse_px=1.0)
+        estimate_blur(torch.zeros(1, 1, 8, 8), fine_px=2.0, coarse_px=1.0)
     with pytest.raises(ValueError, match="expected at least 1"):
         open_viewpoints(0)
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from dhtorch.experiments.focal import defocus_fusion as experiment
-from dhtorch.experiments.focal.blur import Blur
-from dhtorch.experiments.focal.filling import bilinear, defocus_guided, guided_filter, joint_bilateral
+from dhtorch.experiments.focal.blur import BlurMap
+from dhtorch.experiments.focal.filling import fill_bilinear, fill_defocus_guided, fill_guided, fill_joint_bilateral
 from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.synthetic.viewpoints import open_viewpoints
 
@@ -20,23 +20,23 @@ def step(h=70, w=84):
 
 
 def test_bilinear_gives_a_plane_back_and_leaves_holes():
-    coarse, whole = experiment.thin_out(plane(), 7)
-    found = bilinear(coarse, (70, 84))
+    coarse, whole = experiment.thin_returns(plane(), 7)
+    found = fill_bilinear(coarse, (70, 84))
     torch.testing.assert_close(found[:, 4:-4, 4:-4], whole[:, 4:-4, 4:-4], atol=1e-4, rtol=0)
     coarse[:, 3:6, 3:6] = 0
-    found = bilinear(coarse, (70, 84))
+    found = fill_bilinear(coarse, (70, 84))
     assert float(found[0, 31, 31]) == 0 and float(found[0, 60, 60]) > 0
     filled = found[found > 0]
     assert float(filled.min()) >= 1.5 - 1e-4, "a hole pulls nothing towards zero"
 
 
 # The guided filter averages its linear functions over windows: part of the ramp stays.
-@pytest.mark.parametrize(("guided", "left"), [(joint_bilateral, 0.5), (guided_filter, 0.9)])
+@pytest.mark.parametrize(("guided", "left"), [(fill_joint_bilateral, 0.5), (fill_guided, 0.9)])
 def test_guides_sharpen_an_edge_that_the_picture_shows(guided, left):
     whole = step()
-    coarse, _ = experiment.thin_out(whole, 7)
+    coarse, _ = experiment.thin_returns(whole, 7)
     picture = (whole[:, None] - 1) * 0.8 + 0.1
-    plain = bilinear(coarse, (70, 84))
+    plain = fill_bilinear(coarse, (70, 84))
     found = guided(coarse, picture)
     error, before = ((z - whole)[:, 8:-8, 30:52].abs().mean() for z in (found, plain))
     assert float(error) < left * float(before)
@@ -47,16 +47,16 @@ def test_guides_sharpen_an_edge_that_the_picture_shows(guided, left):
 
 def test_exact_defocus_corrects_an_edge_and_useless_defocus_changes_little():
     whole = step()
-    coarse, _ = experiment.thin_out(whole, 7)
-    plain = bilinear(coarse, (70, 84))
+    coarse, _ = experiment.thin_returns(whole, 7)
+    plain = fill_bilinear(coarse, (70, 84))
     everywhere = torch.ones_like(whole, dtype=torch.bool)
-    exact = Blur(0.3 + 4 * (1 / whole - 1).abs(), torch.ones_like(whole), everywhere)  # in focus at 1 m
-    error, before = ((z - whole).abs().mean() for z in (defocus_guided(plain, coarse, exact, reach_px=0.5), plain))
+    exact = BlurMap(0.3 + 4 * (1 / whole - 1).abs(), torch.ones_like(whole), everywhere)  # in focus at 1 m
+    error, before = ((z - whole).abs().mean() for z in (fill_defocus_guided(plain, coarse, exact, reach_px=0.5), plain))
     assert float(error) < 0.9 * float(before)
     noise = torch.rand(whole.shape, generator=torch.Generator().manual_seed(0))
-    useless = defocus_guided(plain, coarse, exact.replace(sigma=noise))
+    useless = fill_defocus_guided(plain, coarse, exact.replace(sigma=noise))
     assert float((useless - whole).abs().mean()) < 1.05 * float(before)
-    nothing = defocus_guided(plain, coarse, exact.replace(valid=~everywhere))
+    nothing = fill_defocus_guided(plain, coarse, exact.replace(valid=~everywhere))
     assert torch.equal(nothing, plain)
 
 
@@ -65,8 +65,8 @@ def test_bad_input():
         with pytest.raises(ValueError, match="expected an odd number from 3"):
             experiment.run([], {}, None, Settings(), factor=bad)
     with pytest.raises(ValueError, match="coarse has shape"):
-        bilinear(torch.ones(4, 4), (8, 8))
-    for guided in (guided_filter, joint_bilateral):
+        fill_bilinear(torch.ones(4, 4), (8, 8))
+    for guided in (fill_guided, fill_joint_bilateral):
         with pytest.raises(ValueError, match="guide has shape"):
             guided(torch.ones(1, 4, 4), torch.ones(1, 8, 9))
 

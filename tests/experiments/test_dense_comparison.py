@@ -29,7 +29,7 @@ def room():
 @pytest.fixture(scope="module")
 def outcome(room):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(filling, "ROUNDS", 3)
+        patch.setattr(filling, "_N_ROUNDS", 3)
         return dense_comparison.run(
             [Scene(room, near=NEAR, gap=8)],
             {"map": METHOD},
@@ -47,8 +47,8 @@ def outcome(room):
 def pair(room):
     """An anchor, another view that lies beside it, the motion that the room knows, and a grid of samples."""
     anchor, other = room[3], room[11]
-    grid = METHOD.backproject(range_split(anchor, NEAR), dense.pixels(anchor, (40, 53)))
-    return range_split(anchor, NEAR), other, exact_rooms.exact_pose(anchor, other, 1).T_1_from_0, grid, anchor
+    grid = METHOD.backproject(range_split(anchor, NEAR), dense.map_pixel_centres(anchor, (40, 53)))
+    return range_split(anchor, NEAR), other, exact_rooms.exact_pose_fit(anchor, other, 1).T_1_from_0, grid, anchor
 
 
 def test_every_variant_is_judged_where_it_belongs(outcome):
@@ -78,7 +78,7 @@ def test_a_turn_is_counted_by_its_holes():
     whole = {"scene": "carousel", "method": "dense", "truth": "full", "pair": None, "role": "rotation"}
     pairs = [whole | {"pair": [k, k + 1], "role": None, "n_holes": 100, "n_recovered": n} for k, n in ((0, 1), (1, 4))]
     others = [pairs[0] | {"method": "sgbm"}, pairs[0] | {"truth": "rectifiable"}, pairs[0] | {"scene": "hall"}]
-    found = dense_comparison.turned(Outcome(rows=[whole, *pairs, *others]))
+    found = dense_comparison.rotation_answered(Outcome(rows=[whole, *pairs, *others]))
     assert found["value"] == pytest.approx(5 / 200) and found["n"] == 1
 
 
@@ -96,13 +96,13 @@ def test_bars_are_held_one_by_one():
 @pytest.mark.parametrize("tipped", [False, True])
 def test_rectified_matching_is_right_whichever_way_the_other_camera_lies(room, mirrored, tipped):
     anchor, other = (room[k] for k in ((11, 3) if mirrored else (3, 11)))
-    T = exact_rooms.exact_pose(anchor, other, 1).T_1_from_0
+    T = exact_rooms.exact_pose_fit(anchor, other, 1).T_1_from_0
     if tipped:  # both cameras rolled by a right angle: the other view is above or below
         anchor, other = (rolled(frame) for frame in (anchor, other))
         roll = se3.exp(torch.tensor([[0.0, 0.0, torch.pi / 2, 0.0, 0.0, 0.0]]))
         T = se3.compose(roll, se3.compose(T, se3.invert(roll)))
-    grid = METHOD.backproject(anchor, dense.pixels(anchor, (40, 40)))
-    found = stereo.semi_global(anchor, other, T, grid, nearest_m=torch.tensor([1.4]))
+    grid = METHOD.backproject(anchor, dense.map_pixel_centres(anchor, (40, 40)))
+    found = stereo.match_semi_global(anchor, other, T, grid, nearest_m=torch.tensor([1.4]))
     truth = _truth(anchor, grid)
     keep = found.keep & (truth > NEAR)
     error = ((found.depth - truth).abs() / truth)[keep]
@@ -120,17 +120,17 @@ def rolled(frame):
 def test_flow_is_triangulated_and_bilateral_filling_guesses(pair):
     near, other, T, grid, exact = pair
     truth = _truth(exact, grid)
-    flow = stereo.flow(near, other, T, grid)
+    flow = stereo.match_optical_flow(near, other, T, grid)
     keep = flow.keep & (truth > NEAR)
     assert keep.sum() > 200 and float(((flow.depth - truth).abs() / truth)[keep].median()) < 0.06
-    filled = filling.bilateral(near, grid)
+    filled = filling.fill_bilateral(near, grid)
     at = grid.usable
     assert bool(filled.keep.all()) and float((filled.depth - truth).abs()[at].median()) < 0.1
     assert bool((filled.score[at].mean() > filled.score[~at].mean()).all()), "what was carried far is less sure"
     lost = se3.identity(1, torch.zeros(1)).map(lambda x: x * torch.nan)
     for silent in (
-        stereo.flow(near, other, lost, grid),
-        stereo.semi_global(near, other, lost, grid, nearest_m=truth[:, 0]),
+        stereo.match_optical_flow(near, other, lost, grid),
+        stereo.match_semi_global(near, other, lost, grid, nearest_m=truth[:, 0]),
     ):
         assert bool((silent.gate == Gate.NO_POSE).all()) and bool(silent.depth.isnan().all())
 
@@ -140,8 +140,8 @@ def test_views_before_each_other_cannot_be_rectified(pair):
     ahead = se3.exp(torch.tensor([[0.0, 0.0, 0.0, 0.01, 0.0, -0.2]]))
     beside = se3.exp(torch.tensor([[0.0, 0.0, 0.0, 0.2, 0.0, -0.01]]))
     views = (near.camera, near.hw), (other.camera, other.hw)
-    assert [bool(stereo.epipole_inside(views, T)) for T in (ahead, beside)] == [True, False]
-    silent = stereo.semi_global(near, other, ahead, grid, nearest_m=torch.tensor([1.4]))
+    assert [bool(stereo.is_epipole_inside(views, T)) for T in (ahead, beside)] == [True, False]
+    silent = stereo.match_semi_global(near, other, ahead, grid, nearest_m=torch.tensor([1.4]))
     assert bool((silent.gate == Gate.NO_BASELINE).all())
 
 
@@ -152,7 +152,7 @@ def test_a_map_is_read_at_the_nearest_pixel_and_the_sensor_is_no_answer(pair):
     source = torch.full((1, h, w), Source.SWEPT, dtype=torch.int32)
     source[:, :, :20] = Source.SENSOR
     found = DepthMap(depth, 0.1 * depth, torch.full_like(depth, 0.5), source, torch.zeros_like(source))
-    got = dense_comparison.read(found, grid, near)
+    got = dense_comparison.sample_map(found, grid, near)
     u, v = ((grid.uv[0, :, k] + 0.5) / 4 - 0.5 for k in (0, 1))
     right = u > 19.6
     expected = (v.round().clamp(0, h - 1) * w + u.round().clamp(0, w - 1) + 1)[right]
@@ -164,12 +164,12 @@ def test_a_map_is_read_at_the_nearest_pixel_and_the_sensor_is_no_answer(pair):
 def test_rooms_are_judged_where_both_views_see_texture(room):
     anchor, other = room[3], room[11]
     odd = torch.zeros(1, 120, 160, dtype=torch.bool)
-    asked = exact_rooms.judged(anchor, other, odd)
+    asked = exact_rooms.evaluated_pixels(anchor, other, odd)
     assert 500 < asked.sum() < 0.9 * asked.numel() and bool((anchor.depth[asked] > NEAR).all())
     odd[:, :, 80:] = True
-    assert not bool(exact_rooms.judged(anchor, other, odd)[:, :, 76:].any())
+    assert not bool(exact_rooms.evaluated_pixels(anchor, other, odd)[:, :, 76:].any())
     away = other.replace(depth=0.5 * other.depth)
-    assert not bool(exact_rooms.judged(anchor, away, odd).any()), "another surface stands before it"
+    assert not bool(exact_rooms.evaluated_pixels(anchor, away, odd).any()), "another surface stands before it"
 
 
 @pytest.mark.parametrize("option", [{"stride": 0}, {"anchors": 0}, {"stride": 1.5}])

@@ -22,7 +22,7 @@ from dhtorch.data.codecs import hdf5, npy, tiff
 from dhtorch.experiments.focal import ddff12, fod500, formats, image_folder
 from dhtorch.experiments.focal import writers as stack_writers
 from dhtorch.experiments.focal.light_field import refocus
-from dhtorch.experiments.focal.stacks import FocalStack, Stacks
+from dhtorch.experiments.focal.stacks import FocalStack, FocalStacks
 
 ROOT = os.environ.get("DHTORCH_DATA")
 real = pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
@@ -256,7 +256,7 @@ def test_ddff12_stacks_of_one_room_are_one_scene(tmp_path: Path) -> None:
     stack_writers.write_fod500(tmp_path / "fod", {0: stack(0), 7: stack(7)})
     assert formats.open_stacks(tmp_path / "fod").by_scene() == {"000000": [0], "000007": [1]}, "each a scene of its own"
     with pytest.raises(ValueError, match="found 1 scene of 2 stacks, expected one for each"):
-        Stacks("x", "images", raw.load, ("a", "b"), scenes=("room",))
+        FocalStacks("x", "images", raw.load, ("a", "b"), scenes=("room",))
 
 
 def test_ddff12_raw_without_its_depth_is_left_out(tmp_path: Path) -> None:
@@ -315,7 +315,7 @@ def test_stacks_are_a_sequence_and_pickle(tmp_path: Path) -> None:
     with pytest.raises(IndexError, match="stack 2 of 2"):
         stacks[2]
     with pytest.raises(ValueError, match="found none"):
-        Stacks("x", "images", stacks.load, ())
+        FocalStacks("x", "images", stacks.load, ())
 
 
 def test_bad_stacks(tmp_path: Path) -> None:
@@ -394,7 +394,7 @@ def test_bad_light_field(tmp_path: Path) -> None:
     fails(r"LF_0001.npy: light field: found float32 of", tmp_path)
     np.save(file, np.array([{"a": 1}]), allow_pickle=True)
     fails(r"LF_0001.npy: light field dtype: found object, expected real numbers", tmp_path)
-    assert npy.npy_header(file, "x", good).shape == (3, 3, 12, 16, 3)
+    assert npy.parse_npy_header(file, "x", good).shape == (3, 3, 12, 16, 3)
 
 
 def test_a_missing_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,11 +9,17 @@ import torch
 from dhtorch.experiments.focal import focus_stack as experiment
 from dhtorch.experiments.focal import formats
 from dhtorch.experiments.focal import writers as stack_writers
-from dhtorch.experiments.focal.sharpness import MEASURES, align, depth_at, sharpest, sharpness
+from dhtorch.experiments.focal.sharpness import (
+    SHARPNESS_MEASURES,
+    align_stack,
+    depth_at_focus,
+    find_sharpest,
+    measure_sharpness,
+)
 from dhtorch.experiments.focal.stacks import FocalStack
 from dhtorch.experiments.protocol import Outcome, Settings
-from dhtorch.geometry.filters import gaussian
-from dhtorch.synthetic.thin_lens import lens_of, photograph
+from dhtorch.geometry.filters import gaussian_blur
+from dhtorch.synthetic.thin_lens import make_lens, render_defocus
 from dhtorch.synthetic.viewpoints import open_viewpoints
 
 ROOT = os.environ.get("DHTORCH_DATA")
@@ -30,46 +36,46 @@ def slope(h=96, w=128, near=0.6, far=3.0):
 
 
 def swept(steps, h=96, w=128):
-    lens = lens_of(130.0, f_number=0.35)
-    return photograph(paint(h, w), slope(h, w), lens, 1 / steps[None], step_px=0.5)
+    lens = make_lens(130.0, f_number=0.35)
+    return render_defocus(paint(h, w), slope(h, w), lens, 1 / steps[None], step_px=0.5)
 
 
-@pytest.mark.parametrize("measure", MEASURES)
+@pytest.mark.parametrize("measure", SHARPNESS_MEASURES)
 def test_the_best_slice_is_found(measure):
     """Each third of the picture is sharp in one known picture."""
-    soft = [gaussian(paint(), s) for s in (0.6, 1.2, 2.4)]
+    soft = [gaussian_blur(paint(), s) for s in (0.6, 1.2, 2.4)]
     order = [(0, 1, 2), (1, 0, 1), (2, 1, 0)]  # blur of every third in every picture
     images = torch.stack(
         [torch.cat([soft[b][..., 43 * k : 43 * (k + 1)] for k, b in enumerate(row)], -1) for row in order], 1
     )
-    place = sharpest(sharpness(images, measure)).place[0]
+    place = find_sharpest(measure_sharpness(images, measure)).place[0]
     for k in range(3):
         assert float(place[:, 43 * k + 12 : 43 * k + 30].median()) == pytest.approx(k, abs=0.3)
 
 
-@pytest.mark.parametrize("measure", MEASURES)
+@pytest.mark.parametrize("measure", SHARPNESS_MEASURES)
 def test_depth_between_slices(measure):
     steps = torch.linspace(1 / 0.5, 1 / 4.0, 8)
-    focus = sharpest(sharpness(swept(steps), measure))
-    found, true = depth_at(focus.place, 1 / steps[None]), slope()
+    focus = find_sharpest(measure_sharpness(swept(steps), measure))
+    found, true = depth_at_focus(focus.place, 1 / steps[None]), slope()
     inner = (..., slice(12, -12), slice(12, -12))
     off = (1 / found - 1 / true)[inner].abs()
     assert float(off.median()) < 0.25 * float(steps[0] - steps[1]), "finer than the slices"
-    nearest = depth_at(focus.place.round(), 1 / steps[None])
+    nearest = depth_at_focus(focus.place.round(), 1 / steps[None])
     assert float(off.median()) < float((1 / nearest - 1 / true)[inner].abs().median())
 
 
 def test_a_gaussian_peak_is_placed_exactly_and_an_end_stays():
     at = torch.tensor([1.3, 2.0, 2.49, -0.4, 5.2])
     curve = torch.exp(-0.5 * ((torch.arange(5)[:, None] - at) / 1.2) ** 2)[None, :, None]
-    place = sharpest(curve).place[0, 0]
+    place = find_sharpest(curve).place[0, 0]
     torch.testing.assert_close(place, torch.tensor([1.3, 2.0, 2.49, 0.0, 4.0]), atol=1e-3, rtol=0)
-    flat = sharpest(torch.ones(1, 5, 1, 1))
-    assert float(flat.confidence) == 0 and float(sharpest(torch.zeros(1, 5, 1, 1)).confidence) == 0
+    flat = find_sharpest(torch.ones(1, 5, 1, 1))
+    assert float(flat.confidence) == 0 and float(find_sharpest(torch.zeros(1, 5, 1, 1)).confidence) == 0
 
 
 def test_known_motion_is_found_and_undone():
-    base = gaussian(paint(120, 160, seed=3), 1.5)
+    base = gaussian_blur(paint(120, 160, seed=3), 1.5)
     want = torch.tensor([[0.0, 0.0, 0.0], [0.01, 1.5, -0.7], [-0.012, -2.2, 1.1]])
     y, x = torch.meshgrid(torch.arange(120) - 59.5, torch.arange(160) - 79.5, indexing="ij")
     pictures = []
@@ -83,7 +89,7 @@ def test_known_motion_is_found_and_undone():
             torch.nn.functional.grid_sample(base, grid, mode="bicubic", padding_mode="border", align_corners=False)
         )
     moved = torch.stack(pictures, 1)
-    aligned, motion = align(moved, reference=0, blur_px=1.0)
+    aligned, motion = align_stack(moved, reference=0, blur_px=1.0)
     torch.testing.assert_close(motion[0, :, 0], want[:, 0], atol=5e-4, rtol=0)
     torch.testing.assert_close(motion[0, :, 1:], want[:, 1:], atol=0.05, rtol=0)
     before, after = ((z[0, 1:] - base)[..., 12:-12, 12:-12].abs().mean() for z in (moved, aligned))
@@ -93,18 +99,18 @@ def test_known_motion_is_found_and_undone():
 
 def test_bad_stacks():
     one = torch.zeros(1, 1, 1, 32, 32)
-    for fn in (sharpness, align):
+    for fn in (measure_sharpness, align_stack):
         with pytest.raises(ValueError, match="found 1 picture, expected a stack of at least two"):
             fn(one)
     with pytest.raises(ValueError, match="measure is 'fourier', expected one of modified_laplacian"):
-        sharpness(torch.zeros(1, 3, 1, 32, 32), "fourier")
+        measure_sharpness(torch.zeros(1, 3, 1, 32, 32), "fourier")
     place = torch.ones(1, 4, 4)
     with pytest.raises(ValueError, match="focus_m is None, expected distances"):
-        depth_at(place, None)
+        depth_at_focus(place, None)
     with pytest.raises(ValueError, match="rise or to fall throughout"):
-        depth_at(place, torch.tensor([[1.0, 3.0, 2.0]]))
+        depth_at_focus(place, torch.tensor([[1.0, 3.0, 2.0]]))
     with pytest.raises(ValueError, match="reference is 7"):
-        align(torch.zeros(1, 3, 1, 32, 32), reference=7)
+        align_stack(torch.zeros(1, 3, 1, 32, 32), reference=7)
     with pytest.raises(ValueError, match="slices: found 1"):
         experiment.run([], {}, None, Settings(), slices=1)
 
@@ -116,8 +122,8 @@ def given(outcome):
 def test_stacks_in_the_formats_of_the_data_sets(tmp_path: Path):
     steps = 1 / torch.tensor([0.1, 0.15, 0.3, 0.7, 1.5])
     near = slope(48, 64, near=0.12, far=1.4)
-    lens = lens_of(64.0, f_number=2.0)
-    shot = photograph(paint(48, 64), near, lens, 1 / steps[None])[0].expand(-1, 3, -1, -1)
+    lens = make_lens(64.0, f_number=2.0)
+    shot = render_defocus(paint(48, 64), near, lens, 1 / steps[None])[0].expand(-1, 3, -1, -1)
     images = (255 * shot).round().to(torch.uint8)[None]
     stack_writers.write_fod500(
         tmp_path / "fod", {0: FocalStack(images, depth=near), 1: FocalStack(images.flip(-1), depth=near.flip(-1))}
@@ -129,7 +135,7 @@ def test_stacks_in_the_formats_of_the_data_sets(tmp_path: Path):
 
     ten = 1 / torch.linspace(2.0, 1 / 7, 10)[None]
     far = slope(48, 64, near=0.6, far=6.0)
-    shot = photograph(paint(48, 64), far, lens_of(64.0, f_number=0.2), ten)[0].expand(-1, 3, -1, -1)
+    shot = render_defocus(paint(48, 64), far, make_lens(64.0, f_number=0.2), ten)[0].expand(-1, 3, -1, -1)
     stack = FocalStack((255 * shot).round().to(torch.uint8)[None], depth=far)
     stack_writers.write_ddff12(tmp_path / "d.h5", {"val": [stack]})
     outcome = experiment.run([formats.open_stacks(tmp_path / "d.h5")], {}, None, Settings(), stride_px=1, window_px=3.0)
@@ -141,7 +147,7 @@ def room(near, seed, invert=False):
     """A stack of ten pictures as a light-field camera would refocus them; read back to front where inverted."""
     ten = 1 / torch.linspace(2.0, 1 / 7, 10)[None]
     depth = slope(48, 64, near=near, far=6.0)
-    shot = photograph(paint(48, 64, seed), depth, lens_of(64.0, f_number=0.2), ten)[0].expand(-1, 3, -1, -1)
+    shot = render_defocus(paint(48, 64, seed), depth, make_lens(64.0, f_number=0.2), ten)[0].expand(-1, 3, -1, -1)
     images = (255 * shot).round().to(torch.uint8)[None]
     return FocalStack(images.flip(1) if invert else images, depth=depth)
 
@@ -173,16 +179,16 @@ def test_intervals_resample_rooms_and_not_stacks_of_one_room(tmp_path: Path):
 
 def test_the_order_of_a_sweep_without_truth(tmp_path: Path):
     steps = torch.linspace(1 / 0.5, 1 / 4.0, 8)
-    measured = sharpness(swept(steps))
-    assert experiment.order(measured) > 0.95 and experiment.halves(measured) > 0.8
+    measured = measure_sharpness(swept(steps))
+    assert experiment.order_correlation(measured) > 0.95 and experiment.halves_correlation(measured) > 0.8
     shuffled = measured[:, torch.randperm(8, generator=torch.Generator().manual_seed(4))]
-    assert experiment.order(shuffled) < 0.8
+    assert experiment.order_correlation(shuffled) < 0.8
 
 
 def test_rendered_stacks_have_every_condition():
     (view,) = open_viewpoints(1, hw=(60, 80))
     outcome = experiment.run([view], {}, None, Settings(), measures=("gradient_energy",), slices=5, window_px=3.0)
-    assert {r["method"] for r in outcome.rows} == set(experiment.RENDERED)
+    assert {r["method"] for r in outcome.rows} == set(experiment.RENDERED_CONDITIONS)
     assert outcome.scenes("clean")["viewpoint_00"]["rank_corr"] > 0.5
     assert outcome.verdict in ("supported", "refuted")
 
@@ -202,4 +208,4 @@ def test_verdict_goes_either_way():
 def test_the_order_of_the_real_sweep_is_recovered():
     stacks = formats.open_stacks(Path(ROOT) / "focus_stack_heatsink" / "assets" / "9")
     images = stacks[0].images[:, :, 1:2, ::2, ::2]
-    assert experiment.order(sharpness(images)) > 0.95
+    assert experiment.order_correlation(measure_sharpness(images)) > 0.95

@@ -24,7 +24,7 @@ def outcome():
 
 
 def test_four_maps_of_one_room(outcome):
-    found = {v: outcome.scenes(v, experiment.TRUTH)["synthetic_room"] for v in experiment.VARIANTS}
+    found = {v: outcome.scenes(v, experiment.MAP_TRUTH)["synthetic_room"] for v in experiment.VARIANTS}
     device, fused = found["sensor device"], found["fused device"]
     assert device["n_voxels"] > 300 and fused["n_voxels"] > device["n_voxels"] and fused["n_recovered"] > 50
     assert fused["voxels_vs_sensor"] == fused["n_voxels"] / device["n_voxels"]
@@ -40,8 +40,8 @@ def test_without_a_trajectory_there_are_anchored_maps_alone():
     blind = Changed(room(n_frames=3), poses=None)
     found = asked(blind)
     assert found.verdict == "undecided" and found.why == "no scene with a trajectory"
-    assert found.scenes("fused device", experiment.TRUTH)["synthetic_room"]["note"] == "nothing to ask"
-    assert found.scenes("fused anchored", experiment.TRUTH)["synthetic_room"]["n_voxels"] > 0
+    assert found.scenes("fused device", experiment.MAP_TRUTH)["synthetic_room"]["note"] == "nothing to ask"
+    assert found.scenes("fused anchored", experiment.MAP_TRUTH)["synthetic_room"]["n_voxels"] > 0
 
 
 @pytest.mark.parametrize(
@@ -50,9 +50,9 @@ def test_without_a_trajectory_there_are_anchored_maps_alone():
 )
 def test_verdict_goes_either_way(voxels, islands, expected):
     outcome = rows(
-        ("a", "sensor device", experiment.TRUTH, {"n_voxels": 100, "n_islands": 5}),
-        ("a", "fused device", experiment.TRUTH, {"n_voxels": voxels, "n_islands": islands}),
-        ("a", "fused anchored", experiment.TRUTH, {"n_fragments": 3}),
+        ("a", "sensor device", experiment.MAP_TRUTH, {"n_voxels": 100, "n_islands": 5}),
+        ("a", "fused device", experiment.MAP_TRUTH, {"n_voxels": voxels, "n_islands": islands}),
+        ("a", "fused anchored", experiment.MAP_TRUTH, {"n_fragments": 3}),
     )
     holds, why = experiment.verdict(outcome)
     assert holds is expected and ("1.20 times" in why) is (voxels == 120)

@@ -9,7 +9,7 @@ from test_protocols import method, room, rows
 
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.negative import helix_correlation as experiment
-from dhtorch.experiments.negative.arms import correlate, read_arm
+from dhtorch.experiments.negative.arms import correlate_windows, sample_arm
 from dhtorch.experiments.protocol import Settings
 
 HW = (160, 200)
@@ -48,33 +48,35 @@ def sites(batch, *at):
 def test_a_known_shift_is_found_between_steps():
     shifts = (0.0, 7.3, -11.6)
     at = sites(3, 80, 150, 200, 300)
-    found = correlate(signals(0, 0, 0), 0.5 * signals(*shifts) + 0.2, at, at)
+    found = correlate_windows(signals(0, 0, 0), 0.5 * signals(*shifts) + 0.2, at, at)
     assert bool(found.valid.all()) and float(found.peak.min()) > 0.97
     torch.testing.assert_close(found.lag, torch.tensor(shifts).double()[:, None].expand(-1, 4), atol=0.05, rtol=0)
 
 
 def test_the_search_may_start_elsewhere():
     at = sites(1, 150, 200)
-    found = correlate(signals(0), signals(30.0), at, at + 25, max_lag=10)
+    found = correlate_windows(signals(0), signals(30.0), at, at + 25, max_lag=10)
     torch.testing.assert_close(found.lag, torch.full((1, 2), 5.0).double(), atol=0.05, rtol=0)
 
 
 def test_what_cannot_be_found_is_not_valid():
     at = sites(1, 20, 200, 395)
-    assert correlate(signals(0), signals(0), at, at).valid.tolist() == [[False, True, False]], "windows leave the arm"
+    assert correlate_windows(signals(0), signals(0), at, at).valid.tolist() == [[False, True, False]], (
+        "windows leave the arm"
+    )
     flat = torch.full((1, 400), 0.3).double()
     for first, second in ((flat, signals(0)), (signals(0), flat)):
-        found = correlate(first, second, at, at)
+        found = correlate_windows(first, second, at, at)
         assert not bool(found.valid.any()) and not bool(found.lag.any()) and not bool(found.peak.any())
     middle = sites(1, 200)
-    assert not bool(correlate(signals(0), signals(20.0), middle, middle, max_lag=15, min_peak=0.9).valid.any())
+    assert not bool(correlate_windows(signals(0), signals(20.0), middle, middle, max_lag=15, min_peak=0.9).valid.any())
 
 
 def test_gradient_moves_the_shift():
     first, at = signals(0), sites(1, 150, 250)
     shift = torch.tensor(4.3, dtype=torch.float64, requires_grad=True)
     x = torch.arange(400).double()[:, None]
-    correlate(first, waves(x - shift)[None], at, at).lag.sum().backward()
+    correlate_windows(first, waves(x - shift)[None], at, at).lag.sum().backward()
     assert abs(float(shift.grad) - 2) < 0.2, "each of the two lags follows the shift"
 
 
@@ -82,23 +84,23 @@ def test_wrong_options_and_short_signals_say_so():
     at = sites(1, 5)
     for options in ({"window": 20}, {"window": 1}, {"max_lag": 0}):
         with pytest.raises(ValueError, match="expected odd from 3, and from 1"):
-            correlate(signals(0), signals(0), at, at, **options)
+            correlate_windows(signals(0), signals(0), at, at, **options)
     with pytest.raises(ValueError, match="signals have 30 and 400 steps, expected at least 41 and 121"):
-        correlate(signals(0, length=30), signals(0), at, at)
+        correlate_windows(signals(0, length=30), signals(0), at, at)
 
 
 def test_an_arm_reads_between_pixels():
     ramp = torch.arange(30.0).expand(20, 30)[None, None] / 30 + torch.arange(20.0)[:, None] / 50
     arm = torch.tensor([[3.25, 4.5], [12.0, 7.75], [29.0, 19.0]])
     expected = arm[:, 0] / 30 + arm[:, 1] / 50
-    torch.testing.assert_close(read_arm(ramp, arm, blur_px=0)[0], expected)
-    torch.testing.assert_close(read_arm(ramp, arm[1:2])[0], expected[1:2])  # a blur leaves a ramp alone
+    torch.testing.assert_close(sample_arm(ramp, arm, blur_px=0)[0], expected)
+    torch.testing.assert_close(sample_arm(ramp, arm[1:2])[0], expected[1:2])  # a blur leaves a ramp alone
     byte = (255 * ramp).round().clamp(0, 255).to(torch.uint8)
-    torch.testing.assert_close(read_arm(byte, arm[:2], blur_px=0)[0], expected[:2], atol=0.005, rtol=0)
+    torch.testing.assert_close(sample_arm(byte, arm[:2], blur_px=0)[0], expected[:2], atol=0.005, rtol=0)
 
 
 def test_arms_are_curves_of_even_steps_half_a_turn_apart():
-    first, second = experiment.arms_of(HW, 512, CENTRE)
+    first, second = experiment.make_arms(HW, 512, CENTRE)
     for arm in (first, second):
         steps = arm.uv.diff(dim=0).norm(dim=-1)
         assert float(steps.quantile(0.05)) > 0.97 and float(steps.max()) < 1.01
@@ -110,7 +112,7 @@ def test_arms_are_curves_of_even_steps_half_a_turn_apart():
 
 
 def test_round_arms_wind_in_circles():
-    for arm in experiment.arms_of(HW, 512, CENTRE, round_arms=True):
+    for arm in experiment.make_arms(HW, 512, CENTRE, round_arms=True):
         way = arm.uv[300:] - CENTRE
         radius = way.norm(dim=-1)
         assert float(radius.max()) == pytest.approx(79.5, abs=0.5) and bool((radius.diff() > 0).all())
@@ -119,10 +121,10 @@ def test_round_arms_wind_in_circles():
 
 def along(move):
     """Lags along a round arm where they were found, tangents and ways from the centre there."""
-    arm, _ = experiment.arms_of(HW, 512, CENTRE, round_arms=True)
+    arm, _ = experiment.make_arms(HW, 512, CENTRE, round_arms=True)
     at = torch.arange(100, len(arm.uv) - 100, 15)
-    first, second = (read_arm(p, arm.uv) for p in (picture(), picture(move)))
-    found = correlate(first, second, at[None], at[None], window=41, max_lag=15, min_peak=0.8)
+    first, second = (sample_arm(p, arm.uv) for p in (picture(), picture(move)))
+    found = correlate_windows(first, second, at[None], at[None], window=41, max_lag=15, min_peak=0.8)
     valid = found.valid[0]
     assert int(valid.sum()) > 40
     return found.lag[0, valid], arm.tangent[at[valid]], arm.uv[at[valid]] - CENTRE

@@ -8,7 +8,7 @@ from test_protocols import method, room, rows
 from dhtorch.experiments.negative import hole_attention as experiment
 from dhtorch.experiments.negative.clusters import largest_cluster
 from dhtorch.experiments.protocol import Settings
-from dhtorch.stages.sample import grid, spiral
+from dhtorch.stages.sample import regular_grid, spiral
 
 HW = (120, 160)
 
@@ -151,7 +151,7 @@ def test_a_scene_without_holes_and_a_sampler_without_a_gaze():
     full = asked(room(lidar="exact", hw=(96, 128)), stride=5)
     assert full.verdict == "undecided" and shown(full)["attention"]["note"] == "nothing to ask"
     with pytest.raises(ValueError, match="expected a sampler with an option gaze"):
-        asked(room(), base=method().replace(sample=grid))
+        asked(room(), base=method().replace(sample=regular_grid))
     with pytest.raises(ValueError, match="stride is 0"):
         asked(room(), stride=0)
 

@@ -8,7 +8,7 @@ from support.rooms import Changed
 from test_protocols import method, room, rows
 
 from dhtorch.experiments.negative import icp as experiment
-from dhtorch.experiments.negative.registration import normals, register
+from dhtorch.experiments.negative.registration import estimate_normals, register_icp
 from dhtorch.experiments.protocol import Settings
 from dhtorch.geometry import se3
 from dhtorch.records import Pose
@@ -53,8 +53,8 @@ START = motion(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 def test_the_same_points_are_brought_back_exactly():
     q = surface(900)
     x = se3.apply(se3.invert(TRUE), q)
-    for planes in (None, normals(q)):
-        found = register(x, q, START, normals_1=planes)
+    for planes in (None, estimate_normals(q)):
+        found = register_icp(x, q, START, normals_1=planes)
         angle, distance = off(found.T_1_from_0, TRUE)
         assert angle < 1e-3 and distance < 1e-5 and bool(found.ok) and float(found.inlier_share) == 1
         assert float(found.rms_m) < 1e-5 and 0 < float(found.condition) <= 1
@@ -62,7 +62,7 @@ def test_the_same_points_are_brought_back_exactly():
 
 def test_points_agree_with_the_textbook_on_dense_clouds():
     q, x = surface(1200, 1), se3.apply(se3.invert(TRUE), surface(600, 2))
-    found = register(x, q, START, reach_m=0.2, least_reach_m=0.2, keep=1.0, iterations=40)
+    found = register_icp(x, q, START, reach_m=0.2, least_reach_m=0.2, keep=1.0, iterations=40)
     expected = oracle(x[0], q[0], START, 40, 0.2)
     angle, distance = off(found.T_1_from_0, expected)
     assert angle < 0.01 and distance < 2e-4, "the same fixed point"
@@ -72,7 +72,7 @@ def test_points_agree_with_the_textbook_on_dense_clouds():
 
 def test_planes_forgive_other_samples_of_the_same_surface():
     q, x = surface(1200, 1, 0.002), se3.apply(se3.invert(TRUE), surface(700, 2, 0.002))
-    point, plane = (register(x, q, START, normals_1=m) for m in (None, normals(q)))
+    point, plane = (register_icp(x, q, START, normals_1=m) for m in (None, estimate_normals(q)))
     worse, better = off(point.T_1_from_0, TRUE), off(plane.T_1_from_0, TRUE)
     assert better[1] < 0.004 and better[0] < 0.2
     assert worse[1] > 2 * better[1] and float(point.rms_m) > 2 * float(plane.rms_m), "nearest is not the same point"
@@ -81,8 +81,8 @@ def test_planes_forgive_other_samples_of_the_same_surface():
 def test_masked_points_and_batch_mates_change_nothing():
     q, x = surface(400, 1).float(), surface(300, 2).float()
     hole = torch.full((1, 60, 3), torch.nan)
-    alone = register(x, q, START.to(torch.float32))
-    padded = register(torch.cat((x, hole), 1), torch.cat((hole, q), 1), START.to(torch.float32))
+    alone = register_icp(x, q, START.to(torch.float32))
+    padded = register_icp(torch.cat((x, hole), 1), torch.cat((hole, q), 1), START.to(torch.float32))
     for field in ("rms_m", "inlier_share", "condition"):
         torch.testing.assert_close(getattr(alone, field), getattr(padded, field))
     torch.testing.assert_close(alone.T_1_from_0.t, padded.T_1_from_0.t)
@@ -93,17 +93,17 @@ def test_trimming_survives_what_the_other_view_does_not_show():
     q = surface(900)
     x = se3.apply(se3.invert(TRUE), q)
     x[:, :150, 2] += 0.15  # something stands in front
-    kept, all_of_them = (register(x, q, START, keep=k, least_reach_m=0.25) for k in (0.8, 1.0))
+    kept, all_of_them = (register_icp(x, q, START, keep=k, least_reach_m=0.25) for k in (0.8, 1.0))
     assert off(kept.T_1_from_0, TRUE)[1] < 0.005 < off(all_of_them.T_1_from_0, TRUE)[1]
 
 
 def test_a_wall_leaves_three_directions_open():
     q = surface(600)
     q[..., 2] = 2.0
-    flat = register(q, q, START, normals_1=normals(q))
+    flat = register_icp(q, q, START, normals_1=estimate_normals(q))
     assert not bool(flat.ok) and float(flat.condition) < 1e-9
     bumpy = surface(600)
-    assert float(register(bumpy, bumpy, START, normals_1=normals(bumpy)).condition) > 1e-4
+    assert float(register_icp(bumpy, bumpy, START, normals_1=estimate_normals(bumpy)).condition) > 1e-4
 
 
 def test_normals_of_a_known_plane_face_the_camera():
@@ -112,10 +112,10 @@ def test_normals_of_a_known_plane_face_the_camera():
     q = surface(500)
     q[..., 2] = 2.5 - (true[0] * q[..., 0] + true[1] * q[..., 1]) / true[2]
     q[:, 7] = torch.nan
-    found = normals(q)
+    found = estimate_normals(q)
     assert bool(found[:, 7].isnan().all()) and bool((found[:, 8:] @ true > 0.99999).all())
     cloud = torch.rand(1, 500, 3, generator=torch.Generator().manual_seed(0)) + 1
-    assert float(normals(cloud).isnan().any(-1).float().mean()) > 0.5, "no plane in a fog"
+    assert float(estimate_normals(cloud).isnan().any(-1).float().mean()) > 0.5, "no plane in a fog"
 
 
 def test_what_cannot_be_registered_is_flagged():
@@ -123,26 +123,26 @@ def test_what_cannot_be_registered_is_flagged():
     nothing = torch.full((1, 40, 3), torch.nan).double()
     start = motion(0.1, 0, 0, 0.2, 0, 0)
     for x, y, T in ((nothing, q, start), (q, nothing, start), (q, q + 10, start), (q[:, :4], q, START)):
-        found = register(x, y, T)
+        found = register_icp(x, y, T)
         assert not bool(found.ok) and torch.equal(found.T_1_from_0.t, T.t)
         assert bool(found.inlier_share.isfinite()) and bool(found.condition.isfinite())
     lost = Pose(START.R * torch.nan, START.t)
-    assert not bool(register(q, q, lost).ok)
+    assert not bool(register_icp(q, q, lost).ok)
 
 
 def test_empty_sets_and_bad_options_raise():
     q = surface(50)
     for x, y in ((q[:, :0], q), (q, q[:, :0])):
         with pytest.raises(ValueError, match="expected at least one each"):
-            register(x, y, START)
+            register_icp(x, y, START)
     with pytest.raises(ValueError, match="expected shares"):
-        register(q, q, START, keep=0.0)
+        register_icp(q, q, START, keep=0.0)
     with pytest.raises(ValueError, match="least reach up to the reach"):
-        register(q, q, START, reach_m=0.05)
+        register_icp(q, q, START, reach_m=0.05)
     with pytest.raises(ValueError, match="normals_1 has shape"):
-        register(q, q, START, normals_1=q[:, :10])
+        register_icp(q, q, START, normals_1=q[:, :10])
     with pytest.raises(ValueError, match="neighbours"):
-        normals(q[:, :5])
+        estimate_normals(q[:, :5])
 
 
 def asked(*recordings, **options):
@@ -157,7 +157,7 @@ def test_the_exact_pose_cannot_be_improved_and_no_pose_can():
     assert found["poor"]["rotation_deg"] == pytest.approx(4.0, abs=1e-6)
     assert found["poor + icp points"]["rotation_deg"] < 2.5
     assert found["none + icp points"]["drift_rel"] < found["none"]["drift_rel"]
-    assert all(found[v]["n_voxels"] == found[v]["n_voxels_all"] for v in experiment.SOURCES)
+    assert all(found[v]["n_voxels"] == found[v]["n_voxels_all"] for v in experiment.ICP_POSE_SOURCES)
     assert len([r for r in outcome.rows if r["pair"] is not None]) == 9 * 2
 
 

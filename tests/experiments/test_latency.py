@@ -26,7 +26,7 @@ def measured(**options):
     room = rendered(hw=(60, 80), n_frames=3)
     fast = {"rounds": 2, "front_end_repeats": 10, "pair_repeats": 1, "dinov2_repeats": 1, "peak": False}
     chosen = {"paper": PAPER}
-    options = {**fast, "sizes": SIZES, "n": 64, "dinov2": partial(dinov2.load, **TINY), **options}
+    options = {**fast, "sizes": SIZES, "n": 64, "dinov2": partial(dinov2.load_dinov2, **TINY), **options}
     return latency.run([noted(room)], chosen, partial(by_gap, gap=2), Settings(), **options)
 
 
@@ -44,13 +44,13 @@ def test_every_stage_has_a_row_at_every_size():
         assert mine["front_end"]["p95_ms"] >= mine["front_end"]["p50_ms"] and mine["front_end"]["p99_ms"] is None
         assert mine["pair"]["repeats"] == 2 and mine["pair"]["p95_ms"] is None, "two calls have no tail"
     (theirs,) = (r for r in outcome.rows if r["method"] == "dinov2_l")
-    network = dinov2.load(**TINY)
+    network = dinov2.load_dinov2(**TINY)
     assert theirs["parameters"] == sum(p.numel() for p in network.parameters()) and theirs["hw"] == [56, 56]
     assert theirs["weight_bytes"] == 4 * theirs["parameters"] and theirs["n"] is None
     assert outcome.verdict == "refuted" and "DINOv2-L / front end" in outcome.why, "a tiny network is no match"
     for name, value in outcome.summary.items():
         assert set(value) == {"value", "low", "high", "n", "unit"}, name
-    storage.strict(outcome.rows)
+    storage.to_strict_json(outcome.rows)
 
 
 def test_without_transformers_the_rest_is_measured(monkeypatch):
@@ -61,7 +61,7 @@ def test_without_transformers_the_rest_is_measured(monkeypatch):
     assert outcome.verdict == "undecided" and outcome.summary["paper.front_end.48x64"]["value"] > 0
     assert not any(name.startswith("dinov2_l") for name in outcome.summary)
     with pytest.raises(ImportError, match="pip install"):
-        dinov2.load()
+        dinov2.load_dinov2()
 
 
 def ratio(low, high):
@@ -84,7 +84,7 @@ def ratio(low, high):
 def test_the_verdict_needs_both_ratios_beyond_the_spread(speedup, growth, holds):
     summary = {"paper.front_end.48x64": ratio(1, 1), "paper.pair.48x64": ratio(9, 9), "paper.growth": ratio(*growth)}
     summary |= {} if speedup is None else {"paper.speedup": ratio(*speedup)}
-    found, why = latency.judge("paper", summary, SIZES, "not measured: no library")
+    found, why = latency.verdict("paper", summary, SIZES, "not measured: no library")
     assert found is holds and "growth" in why
     assert ("no library" in why) == (speedup is None)
 
@@ -92,14 +92,14 @@ def test_the_verdict_needs_both_ratios_beyond_the_spread(speedup, growth, holds)
 def test_ratios_are_taken_round_by_round():
     """A round in which the machine is twice as slow changes no ratio."""
     small, large, theirs = (
-        latency.Branch(m, s, (1, 1), None, 1, {"parameters": 0, "weight_bytes": 0, "peak_mib": None}, rounds)
+        latency.TimedBranch(m, s, (1, 1), None, 1, {"parameters": 0, "weight_bytes": 0, "peak_mib": None}, rounds)
         for m, s, rounds in (
             ("a", "front_end", [{"front_end": [1.0, 1.0]}, {"front_end": [2.0, 2.0]}]),
             ("a", "front_end", [{"front_end": [3.0]}, {"front_end": [6.0]}]),
-            (latency.VISUAL, "forward", [{"forward": [50.0]}, {"forward": [100.0]}]),
+            (latency.VISUAL_BRANCH, "forward", [{"forward": [50.0]}, {"forward": [100.0]}]),
         )
     )
-    summary = latency.summarise([small, large, theirs])
+    summary = latency.summarise_timings([small, large, theirs])
     assert [summary["a.growth"][k] for k in ("value", "low", "high")] == [3, 3, 3]
     assert [summary["a.speedup"][k] for k in ("value", "low", "high")] == [50, 50, 50]
 
@@ -130,30 +130,32 @@ def test_peak_memory_counts_what_the_call_needs_and_not_its_inputs():
 
 def test_networks_in_a_method_are_counted_once():
     network = torch.nn.Linear(3, 4)
-    method = partial(PAPER, score=partial(score.rank, extra=network), other=network)
-    assert memory.weights(method, network) == {"parameters": 16, "weight_bytes": 64}
-    assert memory.weights(PAPER) == {"parameters": 0, "weight_bytes": 0}
+    method = partial(PAPER, score=partial(score.confidence, extra=network), other=network)
+    assert memory.count_weights(method, network) == {"parameters": 16, "weight_bytes": 64}
+    assert memory.count_weights(PAPER) == {"parameters": 0, "weight_bytes": 0}
 
 
 def test_dinov2_shapes_seed_and_local_weights(tmp_path):
     pytest.importorskip("transformers")
     state = torch.get_rng_state()
-    network, again = dinov2.load(**TINY), dinov2.load(**TINY)
+    network, again = dinov2.load_dinov2(**TINY), dinov2.load_dinov2(**TINY)
     assert torch.equal(torch.get_rng_state(), state) and not network.training
     image = torch.randint(0, 256, (2, 3, 40, 60), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
     with torch.no_grad():
-        tokens = network(pixel_values=dinov2.pixel_values(image, 56)).last_hidden_state
+        tokens = network(pixel_values=dinov2.preprocess_image(image, 56)).last_hidden_state
         assert tokens.shape == (2, 1 + 4 * 4, 32)
-        assert torch.equal(tokens, again(pixel_values=dinov2.pixel_values(image, 56)).last_hidden_state)
+        assert torch.equal(tokens, again(pixel_values=dinov2.preprocess_image(image, 56)).last_hidden_state)
         network.save_pretrained(tmp_path / "weights")
-        local = dinov2.load(tmp_path / "weights")(pixel_values=dinov2.pixel_values(image, 56)).last_hidden_state
+        local = dinov2.load_dinov2(tmp_path / "weights")(
+            pixel_values=dinov2.preprocess_image(image, 56)
+        ).last_hidden_state
     assert torch.equal(tokens, local)
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        dinov2.load(tmp_path / "nowhere")
+        dinov2.load_dinov2(tmp_path / "nowhere")
 
 
 def test_pixel_values_are_centred():
-    grey = dinov2.pixel_values(torch.full((1, 1, 30, 30), 0.5), 28)
+    grey = dinov2.preprocess_image(torch.full((1, 1, 30, 30), 0.5), 28)
     expected = (0.5 - torch.tensor(dinov2.COLOUR_MEAN)) / torch.tensor(dinov2.COLOUR_STD)
     assert grey.shape == (1, 3, 28, 28) and torch.allclose(grey[0].mean((-1, -2)), expected, atol=1e-6)
-    assert torch.allclose(dinov2.pixel_values(torch.full((1, 1, 30, 30), 51, dtype=torch.uint8), 28)[0, 0, 0, 0], (0.2 - torch.tensor(0.485)) / 0.229)  # fmt: skip
+    assert torch.allclose(dinov2.preprocess_image(torch.full((1, 1, 30, 30), 51, dtype=torch.uint8), 28)[0, 0, 0, 0], (0.2 - torch.tensor(0.485)) / 0.229)  # fmt: skip

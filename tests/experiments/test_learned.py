@@ -117,9 +117,9 @@ def test_depth_is_read_where_the_sample_is(installed, name, hw):
     """Resizing and cropping are undone: an image pixel reads the depth that was painted there."""
     frame = ramp(*hw, batch=2)
     found = ADAPTERS[name](installed[name])(frame, frame)
-    uv = sample.grid(hw, 400).expand(2, -1, -1)
-    depth, confidence = relative.read(found, uv)
-    true = holdout.truth_at(frame, uv, truth="raw").depth
+    uv = sample.regular_grid(hw, 400).expand(2, -1, -1)
+    depth, confidence = relative.sample_relative_depth(found, uv)
+    true = holdout.sample_truth(frame, uv, truth="raw").depth
     seen = depth.isfinite()
     coarse = max(hw) / 512  # image pixels to a network pixel: half of one may be missed, and half of an image pixel
     slope = 4 / hw[1] + 3 / hw[0]
@@ -156,7 +156,7 @@ def test_the_scale_rests_on_pixels_that_no_sample_reads():
     """Truth that is wrong at every sample, and only there, does not move the scale."""
     frame = ramp(120, 160)
     found = relative.RelativeDepth(frame.depth / UNIT, frame.depth, torch.ones(1, 2), torch.zeros(1, 2))
-    uv = sample.grid(frame.hw, 9000)[None]
+    uv = sample.regular_grid(frame.hw, 9000)[None]
     at = (uv[0] + 0.5).floor().long()
     lying = frame.depth.clone()
     lying[0, at[:, 1], at[:, 0]] = 99.0
@@ -179,7 +179,7 @@ def test_in_a_sparse_map_the_return_of_a_sample_does_not_count():
     scale = learned.fit_scale(found, frame.replace(depth=lone), uv, n_pixels=50000, seed=0)
     far = learned.fit_scale(found, frame.replace(depth=lone), uv - 50, n_pixels=50000, seed=0)
     assert int(far.n_pixels) > int(scale.n_pixels)
-    reads = holdout.truth_at(frame.replace(depth=lone), uv, truth="raw").depth
+    reads = holdout.sample_truth(frame.replace(depth=lone), uv, truth="raw").depth
     assert float(reads) == 5.0 and scale.factor.isnan().all()
 
 
@@ -224,7 +224,7 @@ def test_networks_are_measured_on_our_candidates(room, installed):
         assert row["pnp_success"] is None and row["seconds_per_video"] > 0
         assert f"{name}.on_ours.median_rel" in outcome.summary and f"{name}.seconds_per_video" in outcome.summary
     assert outcome.verdict == "supported" and "1 of 1" in outcome.why
-    storage.strict(outcome.rows)
+    storage.to_strict_json(outcome.rows)
 
 
 def test_a_network_is_asked_once_for_all_its_scales(room, installed):
@@ -243,7 +243,7 @@ def test_a_network_is_asked_once_for_all_its_scales(room, installed):
 
 def test_the_control_is_worth_its_scale_alone(room, installed):
     """The same depth everywhere times an oracle's scale is the median depth of what the oracle saw."""
-    outcome = asked(room, installed, models={"constant": relative.Constant}, scales=("oracle",))
+    outcome = asked(room, installed, models={"constant": relative.ConstantDepth}, scales=("oracle",))
     (row,) = (r for r in outcome.rows if r["pair"] == [0, 6] and r["method"] == "constant_oracle")
     truth = room.truth(0)["depth"]
     assert abs(row["scale_factor"] / float(truth.median()) - 1) < 0.05 and row["coverage"] == 1
@@ -266,7 +266,7 @@ def test_verdict_goes_either_way():
             rows.append({**common, "method": "vggt_oracle", "on_ours": {"median_rel": theirs}})
         return learned.Outcome(rows=rows)
 
-    decide = partial(learned.judge, ours="paper", theirs="vggt_oracle")
+    decide = partial(learned.verdict, ours="paper", theirs="vggt_oracle")
     assert decide(outcome((0.06, 0.03), (0.05, 0.02), (0.02, 0.03)))[0] is True
     assert decide(outcome((0.06, 0.03), (0.02, 0.03)))[0] is False
     assert decide(outcome((None, 0.03), (0.02, None)))[0] is None

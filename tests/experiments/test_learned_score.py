@@ -9,11 +9,11 @@ from support.rooms import noted
 from dhtorch.cli.run import config_dir
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.probes import learned_score
-from dhtorch.experiments.probes.learned_score import Lesson, train
+from dhtorch.experiments.probes.learned_score import LabelledAnswers, train_score
 from dhtorch.experiments.protocol import Settings
 from dhtorch.metrics import bootstrap, holdout, risk
-from dhtorch.metrics.errors import select
-from dhtorch.stages.score import EVIDENCE, LearnedScore
+from dhtorch.metrics.errors import points_from_estimate
+from dhtorch.stages.score import SCORE_FEATURES, LearnedScore
 from dhtorch.synthetic.recording import SyntheticRoom
 
 with initialize_config_dir(str(config_dir()), version_base="1.3"):
@@ -47,42 +47,42 @@ def held_out(scene, method):
     near, other = (holdout.range_split(recording[k], scene.near) for k in (0, 16))
     estimate = method(near, other, trace=trace)
     known = frame.replace(depth=recording.truth(0)["depth"], depth_camera=None)
-    truth = holdout.candidates(trace["samples"], holdout.truth_at(known, trace["samples"].uv), scene.near)
-    return trace, select(estimate, truth)
+    truth = holdout.select_candidates(trace["samples"], holdout.sample_truth(known, trace["samples"].uv), scene.near)
+    return trace, points_from_estimate(estimate, truth)
 
 
 def made_up(n=4000, seed=0):
     """Answers whose mean error is what a score by hand expects, times what the photometric evidence says."""
     g = torch.Generator().manual_seed(seed)
-    x = torch.randn(n, len(EVIDENCE), generator=g) * 0.5 - 3.5
+    x = torch.randn(n, len(SCORE_FEATURES), generator=g) * 0.5 - 3.5
     mean = (x[:, 0] + 1.5 * (x[:, 5] + 3.5)).exp()
-    return Lesson(x, -mean * (1 - torch.rand(n, generator=g)).log())
+    return LabelledAnswers(x, -mean * (1 - torch.rand(n, generator=g)).log())
 
 
 def aurc(error, expected):
-    return float(risk.curve(error.clamp(max=1).double(), -expected.double()).mean())
+    return float(risk.risk_curve(error.clamp(max=1).double(), -expected.double()).mean())
 
 
 def test_it_learns_what_makes_answers_err_and_foresees_the_mean_error():
-    scorer, unseen = train([made_up(seed=0), made_up(seed=1)]), made_up(seed=2)
+    scorer, unseen = train_score([made_up(seed=0), made_up(seed=1)]), made_up(seed=2)
     expected = scorer.log_error(unseen.x).exp()
     assert aurc(unseen.error, expected) < 0.9 * aurc(unseen.error, unseen.x[:, 0])
     for some in (unseen.x[:, 5] > -3.2, (unseen.x[:, 5] + 3.5).abs() < 0.3, unseen.x[:, 5] < -3.8):
         assert float(expected[some].mean() / unseen.error[some].clamp(max=1).mean()) == pytest.approx(1, abs=0.15)
-    once, again = (train([made_up(200), made_up(200, seed=1)], steps=3).state_dict() for _ in range(2))
+    once, again = (train_score([made_up(200), made_up(200, seed=1)], steps=3).state_dict() for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(once.values(), again.values(), strict=True))
     with pytest.raises(ValueError, match="no answer with truth"):
-        train([Lesson(torch.zeros(0, 8), torch.zeros(0))])
+        train_score([LabelledAnswers(torch.zeros(0, 8), torch.zeros(0))])
 
 
 def test_scenes_weigh_the_same_however_many_answers_they_have():
     """A large scene whose photometric evidence is right and a small one where it is the wrong way round."""
     right, wrong = made_up(4000, seed=0), made_up(4000, seed=1)
     turned = wrong.replace(x=torch.cat((wrong.x[:, :5], -7 - wrong.x[:, 5:6], wrong.x[:, 6:]), 1))
-    probe = torch.full((2, len(EVIDENCE)), -3.5)
+    probe = torch.full((2, len(SCORE_FEATURES)), -3.5)
     probe[0, 5], probe[1, 5] = -2.5, -4.5
-    even = train([right, turned[:400]], most=4000, steps=100).log_error(probe)
-    alone = train([right], most=4000, steps=100).log_error(probe)
+    even = train_score([right, turned[:400]], most=4000, steps=100).log_error(probe)
+    alone = train_score([right], most=4000, steps=100).log_error(probe)
     assert float(alone[0] - alone[1]) == pytest.approx(3.0, abs=0.8)
     assert abs(float(even[0] - even[1])) < 0.5 * float(alone[0] - alone[1])
 
@@ -92,9 +92,9 @@ def test_the_experiment_scores_the_same_answers_three_ways(tmp_path, monkeypatch
 
     def remembered(lessons, **options):
         taught.append(lessons)
-        return train(lessons, **options)
+        return train_score(lessons, **options)
 
-    monkeypatch.setattr(learned_score, "train", remembered)
+    monkeypatch.setattr(learned_score, "train_score", remembered)
     target = tmp_path / "score.json"
     outcome = learned_score.run(rooms, {"map": MAP}, by_gap, Settings(), steps=20, save=str(target))
     rows = {v: outcome.scenes(v) for v in ("paper", "by_error", "learned")}
@@ -106,7 +106,7 @@ def test_the_experiment_scores_the_same_answers_three_ways(tmp_path, monkeypatch
     for_first, for_second, for_all = taught
     assert len(for_first) == len(for_second) == 1 and len(for_all) == 2
     assert torch.equal(for_all[0].x, for_second[0].x) and torch.equal(for_all[1].x, for_first[0].x)
-    trace, _ = held_out(rooms[0], MAP.replace(score=train(for_first, steps=20)))
+    trace, _ = held_out(rooms[0], MAP.replace(score=train_score(for_first, steps=20)))
     scores = outcome.points["room0", "learned", "full"].answered().score
     assert torch.isin(scores, trace["estimate"].score.double()).all(), "the other room's scorer sat in the seat"
     saved = LearnedScore.read(target)

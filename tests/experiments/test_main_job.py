@@ -17,7 +17,7 @@ from dhtorch.codes import Gate, names
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments import pair, protocol
 from dhtorch.experiments.compare import opencv_twin
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.synthetic.recording import SyntheticRoom
 
@@ -55,7 +55,7 @@ BOUNDS = {0: 0.02, 1: 0.01, 2: 0.01, 3: 0.011, 4: 0.02}
 
 
 def test_the_committed_rooms_of_five_seeds_keep_their_bounds():
-    result = archive.read(Path(__file__).parents[2] / "benchmarks/results/room_exact.json")
+    result = result_files.read_result(Path(__file__).parents[2] / "benchmarks/results/room_exact.json")
     wanted = {"method": "paper", "truth": "full", "pair": None}
     found = {r["scene"]: r["median_rel"] for r in result["rows"] if all(r[k] == v for k, v in wanted.items())}
     assert set(found) == {f"synthetic_walk_{seed}" for seed in BOUNDS}
@@ -200,10 +200,10 @@ def test_verdict_goes_either_way():
         row("b", "ours", 0.056, 0.5),
         row("b", "ref", 0.05, 0.5),
     ]
-    assert opencv_twin.compare(rows[:2], "ours", "ref", "full", 0.1) == (1, [])
-    compared, worse = opencv_twin.compare(rows, "ours", "ref", "full", 0.1)
+    assert opencv_twin.compare_scenes(rows[:2], "ours", "ref", "full", 0.1) == (1, [])
+    compared, worse = opencv_twin.compare_scenes(rows, "ours", "ref", "full", 0.1)
     assert compared == 2 and len(worse) == 1 and "b median_rel" in worse[0]
-    assert opencv_twin.compare([*rows[:1], row("a", "ref", 0.05, 0.6)], "ours", "ref", "full", 0.1)[1]
+    assert opencv_twin.compare_scenes([*rows[:1], row("a", "ref", 0.05, 0.6)], "ours", "ref", "full", 0.1)[1]
     with pytest.raises(ValueError, match=r"experiment\.methods"):
         opencv_twin.run([], {"paper": method("paper")}, by_gap, pair.Settings())
 

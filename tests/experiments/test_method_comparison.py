@@ -45,7 +45,7 @@ def test_rows_are_those_of_the_first_seed(outcome):
 
 
 def test_summary_has_every_number_of_the_bars(outcome):
-    assert {f"strict.{number}" for number in method_comparison.BARS} <= set(outcome.summary)
+    assert {f"strict.{number}" for number in method_comparison.METHOD_BARS} <= set(outcome.summary)
     assert "strict.median_rel_ratio_at_equal_coverage" in outcome.summary
     assert outcome.summary["strict.median_rel_ratio"]["n"] == 2, "the rotation stays out"
     assert outcome.verdict == "refuted" and "bars met" in outcome.why
@@ -68,15 +68,15 @@ def test_wrong_answers_where_near_things_move_count_whatever_the_role(outcome):
 
 def candidates(answered, wrong, silent):
     depth = torch.tensor([1.0] * answered + [1.3] * wrong + [torch.nan] * silent)
-    return errors.points(depth, torch.ones_like(depth))
+    return errors.make_points(depth, torch.ones_like(depth))
 
 
 def test_the_worst_room_is_the_one_with_most_wrong_answers_a_candidate():
     few = [candidates(0, 1, 9), candidates(0, 3, 7)]  # all that is said is wrong, but little is said
     many = [candidates(5, 4, 1), candidates(7, 2, 1)]
-    found = method_comparison._convoy_wrong("map", [few, many, [candidates(0, 0, 0)]])
+    found = method_comparison._worst_wrong_share("map", [few, many, [candidates(0, 0, 0)]])
     assert found["map.convoy_wrong"]["value"] == pytest.approx(0.3) and found["map.convoy_wrong"]["n"] == 2
-    assert method_comparison._convoy_wrong("map", []) == {}
+    assert method_comparison._worst_wrong_share("map", []) == {}
 
 
 def test_the_rooms_of_the_settings_are_those_in_which_a_body_moves():
@@ -89,7 +89,7 @@ def judged(**changes):
     good = {"median_rel_ratio": 0.6, "worst_scene_ratio": 1.0, "aurc_ratio": 0.5, "coverage_at_5": 0.3}
     good |= {"within_sigma": 0.7, "within_2sigma": 0.95, "ece": 0.05, "realised_risk_10": 0.08}
     values = good | {"realised_risk_5": 0.04} | changes
-    return compare.Comparison(summary={f"map.{k}": {"value": v} for k, v in values.items()})
+    return compare.MethodComparison(summary={f"map.{k}": {"value": v} for k, v in values.items()})
 
 
 @pytest.mark.parametrize(

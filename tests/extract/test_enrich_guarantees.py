@@ -27,19 +27,19 @@ from dhtorch import data
 from dhtorch import testing as writers
 from dhtorch.cli.run import main
 from dhtorch.data.codecs import tfrecord
-from dhtorch.data.readers.rlds import Described
+from dhtorch.data.readers.rlds import StepFeature
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.extract import cut, plan
-from dhtorch.extract.enriched import MapRows, View, camera_feature, camera_key, columns
-from dhtorch.extract.instants import Ahead
-from dhtorch.extract.nerf_target import NerfTarget
-from dhtorch.extract.origin import NO_RATE, RobotSet, rate
-from dhtorch.extract.robot_target import RobotTarget
-from dhtorch.extract.step_set import StepSet
-from dhtorch.extract.targets import Tally
+from dhtorch.extract.enriched import DatasetCamera, MapRowDataset, camera_feature, camera_key, map_columns
+from dhtorch.extract.instants import PeekableRows
+from dhtorch.extract.nerf_target import NerfstudioTarget
+from dhtorch.extract.origin import DEFAULT_FPS, LeRobotSource, frame_rate
+from dhtorch.extract.robot_target import LeRobotTarget
+from dhtorch.extract.step_set import RldsSource
+from dhtorch.extract.targets import MapCounts
 from dhtorch.pipeline.presets import PAPER
-from dhtorch.runtime import file_lock as lock
+from dhtorch.runtime import file_lock
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.two_cameras import open_two_cameras
 
@@ -139,12 +139,12 @@ def test_a_changed_source_is_another_set(robot, whole, tmp_path, capsys):
 def test_an_episode_made_with_other_settings_is_not_whole(format, robot, tmp_path):
     out = enrich(robot, tmp_path / "set", "data=lerobot", "data.episode=0", f"format={format}")
     key = json.loads((out / "meta" / "dhtorch.json").read_text())["key"]
-    views = {FRONT: View(FRONT, HW, HW, posed=True)}
+    views = {FRONT: DatasetCamera(FRONT, HW, HW, posed=True)}
 
     def own(key, k=0):
         if format == "nerfstudio":
-            return NerfTarget(out, views, [{FRONT: ""}, {FRONT: "1"}], key).own(k)
-        return RobotTarget(out, 3, views, origin=None, numbers=[0, 1], step=0.0, fps=30.0, task=None, key=key).own(k)
+            return NerfstudioTarget(out, views, [{FRONT: ""}, {FRONT: "1"}], key).own(k)
+        return LeRobotTarget(out, 3, views, origin=None, numbers=[0, 1], step=0.0, fps=30.0, task=None, key=key).own(k)
 
     assert own(key)["length"] == LENGTHS[0]
     assert own(f"{key}x") is None
@@ -193,21 +193,21 @@ def test_a_video_that_no_episode_has_is_no_feature_of_the_new_set(tmp_path):
     about = json.loads(info.read_text())
     about["features"]["observation.images.wrist"] = about["features"][FRONT]
     info.write_text(json.dumps(about))
-    found = RobotSet.open(source, [0])
+    found = LeRobotSource.open(source, [0])
     assert set(found.features) == set(about["features"]) - {"observation.images.wrist"}
     assert set(found.clips(0, 2)) == {FRONT}
 
 
 def test_a_nerfstudio_folder_holds_frames_with_a_pose_and_is_sure_of_its_own_depth_alone(tmp_path, monkeypatch):
     """It has no pose that is not known, and no step beyond 65.534 m."""
-    made, in_metres = MapRows.features, []
+    made, in_metres = MapRowDataset.features, []
 
     def lost(self, opened, i):
         row = made(self, opened, i)
         in_metres.append(np.array(Image.open(io.BytesIO(row["depth"]))))
         return {**row, "pose": np.full(16, np.nan)} if i == 1 else row
 
-    monkeypatch.setattr(MapRows, "features", lost)
+    monkeypatch.setattr(MapRowDataset, "features", lost)
     source = tmp_path / "source"
     source.mkdir()
     writers.write_lerobot(source, [[shot.replace(depth=40 * shot.depth) for shot in shots(3)]], depth="tiff")
@@ -221,7 +221,7 @@ def test_a_nerfstudio_folder_holds_frames_with_a_pose_and_is_sure_of_its_own_dep
 
 
 def test_two_writers_do_not_share_a_folder(robot, whole, tmp_path, capsys):
-    with lock.held(tmp_path / ".set.lock", "out"):
+    with file_lock.acquire_file_lock(tmp_path / ".set.lock", "out"):
         assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED]) == 2
     assert "one writer" in capsys.readouterr().err and not (tmp_path / "set").exists()
 
@@ -270,14 +270,14 @@ def test_an_older_version_of_the_format(robot, whole, tmp_path):
 
 def test_the_whole_is_never_held(tmp_path, monkeypatch):
     content = os.urandom(300_000)
-    made = MapRows.features
+    made = MapRowDataset.features
 
     def large(self, opened, i):
         if not hasattr(large, "row"):
             large.row = made(self, opened, i)
         return {**large.row, "picture": content + bytes([i % 256])}
 
-    monkeypatch.setattr(MapRows, "features", large)
+    monkeypatch.setattr(MapRowDataset, "features", large)
     tracemalloc.start()
     words = ["data=synthetic", "data.hw=[48,64]", "data.n_frames=60", "data.supersample=1", "report=false"]
     assert main(["enrich", f"out={tmp_path / 'set'}", *words, *ASKED]) == 0
@@ -326,12 +326,12 @@ def test_the_record_of_an_episode_is_read_once(tmp_path, monkeypatch):
     writers.write_rlds(tmp_path / "1.0.0", [shots(7), shots(5)])
     recordings = data.open_all(tmp_path / "1.0.0")
     read, opened = [], []
-    record, stream = tfrecord.read_record, tfrecord.opened
+    record, stream = tfrecord.read_record, tfrecord.open_regular
     monkeypatch.setattr(tfrecord, "read_record", lambda file, span: read.append(span) or record(file, span))
-    monkeypatch.setattr(tfrecord, "opened", lambda file: opened.append(file) or stream(file))
+    monkeypatch.setattr(tfrecord, "open_regular", lambda file: opened.append(file) or stream(file))
     held = [recordings[0], recordings[1]]
     read.clear(), opened.clear()
-    steps = StepSet(held, [0, 1], 30.0)
+    steps = RldsSource(held, [0, 1], 30.0)
     tables = [list(steps.batches(k, [])) for k in (0, 1)]
     assert [sum(t.num_rows for t in found) for found in tables] == [7, 5] and steps.about(1)["split"] == "train"
     assert len(read) == 2, "one an episode"
@@ -340,9 +340,9 @@ def test_the_record_of_an_episode_is_read_once(tmp_path, monkeypatch):
 
 
 class Told(NamedTuple):
-    """Steps of an episode made by hand, as dhtorch.data.readers.rlds_steps.Steps has them."""
+    """Steps of an episode made by hand, as dhtorch.data.readers.rlds_steps.EpisodeSteps has them."""
 
-    features: dict[str, Described]
+    features: dict[str, StepFeature]
     each: dict[str, list]  # feature → value of every step
     instruction: str = "language_instruction"
     n: int = 12
@@ -356,9 +356,9 @@ def test_steps_tell_their_time_their_task_and_how_pictures_are_encoded():
     """Twelve steps, of which eight come together; a feature that is called as a column of every table stands apart."""
     jpeg, png = b"\xff\xd8\xff\xe0", b"\x89PNG"
     features = {
-        "language_instruction": Described("text", "string", ()),
-        "timestamp": Described("tensor", "float32", ()),
-        "observation/image_0": Described("image", "uint8", (48, 64, 3)),
+        "language_instruction": StepFeature("text", "string", ()),
+        "timestamp": StepFeature("tensor", "float32", ()),
+        "observation/image_0": StepFeature("image", "uint8", (48, 64, 3)),
     }
     each = {
         "language_instruction": ["reach"] * 9 + ["grasp"] * 3,
@@ -366,7 +366,7 @@ def test_steps_tell_their_time_their_task_and_how_pictures_are_encoded():
         "observation/image_0": [jpeg, png] * 6,
     }
     tasks = ["place", "reach"]  # of an episode before
-    tables = list(StepSet([], [0], 5.0, held={0: Told(features, each)}).batches(0, tasks))
+    tables = list(RldsSource([], [0], 5.0, held={0: Told(features, each)}).batches(0, tasks))
     found = [row for table in tables for row in table.to_pylist()]
     assert [table.num_rows for table in tables] == [8, 4]
     assert [row["timestamp"] for row in found] == pytest.approx([k / 5 for k in range(12)])
@@ -377,7 +377,7 @@ def test_steps_tell_their_time_their_task_and_how_pictures_are_encoded():
 
 
 def test_counts_of_an_episode_are_sums_and_shares_along_it():
-    tally = Tally()
+    tally = MapCounts()
     for k in range(48):  # two to a part; the second half is all recovered
         pixels = [6, 0, 2] if k < 24 else [0, 0, 8]
         row = {"depth": b"x", "pixels": pixels, "silent": [pixels[0], 0], "refuted": 0, "moments": np.ones(25)}
@@ -414,17 +414,17 @@ def pair_of_cameras():
 
 def test_another_camera_of_the_instant_is_another_view():
     scenes = [Scene(each) for each in pair_of_cameras()]
-    whole = plan.make(scenes, "auto", 1, rigs=True)
+    whole = plan.make_plan(scenes, "auto", 1, rigs=True)
     assert whole.episodes == (0, 0) and whole.beside(0) == [1] and whole.beside(1) == [0]
-    views = {v.key: v for v in (View.of(scene, 64) for scene in scenes)}
+    views = {v.key: v for v in (DatasetCamera.of(scene, 64) for scene in scenes)}
     assert list(views) == ["observation.images.left", "observation.images.right"]
     options = {"method": PAPER.replace(n=128), "gap": "auto", "step": 0.0, "views": views, "dense": False}
-    alone = MapRows(scenes, whole, columns(pictures=False), **options)[0]
-    beside = MapRows(scenes, whole, columns(pictures=False), beside=True, pose="pose", **options)
+    alone = MapRowDataset(scenes, whole, map_columns(pictures=False), **options)[0]
+    beside = MapRowDataset(scenes, whole, map_columns(pictures=False), beside=True, pose="pose", **options)
     left, right = beside[0], beside[3]
     assert alone.features["pixels"][2] == 0, "the first frame has nothing before it"
     assert left.features["pixels"][2] > 0 and right.features["pixels"][2] > 0
-    assert camera_key(cut.shorter(scenes[1].recording, 2)) == "observation.images.right"
+    assert camera_key(cut.truncate_recording(scenes[1].recording, 2)) == "observation.images.right"
 
 
 @pytest.mark.parametrize(
@@ -450,9 +450,9 @@ def test_a_frame_of_another_size_or_lens_than_the_first_is_said():
         plain,
     ]
     scene = Scene(Recording(name="mixed", format="x", load=frames.__getitem__, number=torch.arange(4)))
-    view = View.of(scene, 64)
+    view = DatasetCamera.of(scene, 64)
     options = {"method": PAPER.replace(n=64), "gap": 1, "step": 0.0, "views": {view.key: view}, "dense": False}
-    made = MapRows([scene], plan.make([scene], 1, 1), columns(pictures=False), **options)
+    made = MapRowDataset([scene], plan.make_plan([scene], 1, 1), map_columns(pictures=False), **options)
     said = [made[i].complaint for i in range(4)]
     assert "picture of 40x64, expected 48x64 as of the first frame" in said[1]
     assert "expected none as of the first frame" in said[2]
@@ -462,13 +462,13 @@ def test_a_frame_of_another_size_or_lens_than_the_first_is_said():
 def test_frames_that_were_skipped_do_not_slow_a_recording_down():
     number = torch.tensor([0, 2, 4, 5])
     known = {"name": "a", "format": "x", "load": shots(1).__getitem__, "number": number}
-    assert rate(Recording(**known, times=number.double() / 10)) == 10
-    assert rate(Recording(**known, times=number.double() / 10, rate_hz=15.0)) == 15
-    assert rate(Recording(**known)) == NO_RATE
+    assert frame_rate(Recording(**known, times=number.double() / 10)) == 10
+    assert frame_rate(Recording(**known, times=number.double() / 10, rate_hz=15.0)) == 15
+    assert frame_rate(Recording(**known)) == DEFAULT_FPS
 
 
 def test_a_row_is_taken_by_its_own_frame_alone():
-    rows = Ahead(iter([{"frame_index": 3}, {"frame_index": 5}]))
+    rows = PeekableRows(iter([{"frame_index": 3}, {"frame_index": 5}]))
     assert rows.take(2) is None and rows.take(4) is None, "it lies ahead, or behind"
     assert rows.take(3) == {"frame_index": 3}
     assert rows.take(5) == {"frame_index": 5} and rows.take(6) is None

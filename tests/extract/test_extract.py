@@ -23,7 +23,7 @@ import dhtorch
 from dhtorch import data, extract
 from dhtorch import testing as writers
 from dhtorch.cli.run import config_dir, main
-from dhtorch.extract import Features, JoinedDataset, columns, engines, shards
+from dhtorch.extract import FeatureTable, JoinedDataset, columns, engines, shards
 from dhtorch.geometry import camera as cam
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.transforms import ExtendDepth, ExtendedDataset, SampleProblem
@@ -118,7 +118,7 @@ def test_rows_are_those_of_the_transform_in_a_loader(robot, command):
     code, out, err = command(*asked(robot))
     assert code == 0 and err == "", err
     assert "features: 3 shards, 12 rows" in out and "6 no second view" in out
-    features, expected = Features("features"), live(robot)
+    features, expected = FeatureTable("features"), live(robot)
     joined = JoinedDataset(Items(robot), features)
     assert len(features) == len(joined) == sum(LENGTHS)
     with torch.no_grad():
@@ -152,7 +152,7 @@ def test_rows_join_the_data_set_by_episode_and_frame(robot, command):
 
 def test_episodes_keep_their_numbers(robot, command):
     assert command(*asked(robot, "data.episode=[2,0]"))[0] == 0
-    features = Features("features", ["tokens"])
+    features = FeatureTable("features", ["tokens"])
     assert sorted(set(features.place["episode_index"])) == [0, 2] and len(features) == LENGTHS[0] + LENGTHS[2]
     assert features.at(2, 1).keys() == {"dhtorch.tokens"}
     with pytest.raises(KeyError, match="frame 0 of episode 1"):
@@ -196,7 +196,9 @@ def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command)
     assert f"12 shards ({len(before)} left untouched), 12 rows" in out
     after = seen(files("features"))
     assert {k: after[k] for k in before} == before, "what was finished is untouched"
-    assert Features("features", ["depth"]).place["frame_index"].tolist() == list(range(12)), "none lost, none doubled"
+    assert FeatureTable("features", ["depth"]).place["frame_index"].tolist() == list(range(12)), (
+        "none lost, none doubled"
+    )
     assert [p.name for p in Path("features").iterdir() if p.name.startswith(".")] == []
     assert command(*[a.replace("out=features", "out=whole") for a in args])[0] == 0
     assert contents("whole") == contents("features"), "the same as without the kill"
@@ -204,7 +206,7 @@ def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command)
 
 @pytest.mark.slow
 def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(robot, command, monkeypatch):
-    real, calls = shards.write, []
+    real, calls = shards.write_shard, []
 
     def interrupted(*args):
         calls.append(1)
@@ -212,14 +214,14 @@ def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(robot, command, monkey
             signal.raise_signal(signal.SIGINT)
         return real(*args)
 
-    monkeypatch.setattr(shards, "write", interrupted)
+    monkeypatch.setattr(shards, "write_shard", interrupted)
     code, out, err = command(*asked(robot))
     assert code == 130 and "Traceback" not in err and out == ""
     assert "interrupted: 1 of 3 shards in features are whole and stay; the same command does the rest" in err
     before = seen(files("features"))
     assert len(before) == 1
     with pytest.raises(data.FormatError, match="found 1, expected 3: the same dhtorch extract once more"):
-        Features("features")
+        FeatureTable("features")
     code, out, _ = command(*asked(robot))
     assert code == 0 and "3 shards (1 left untouched)" in out
     assert {k: v for k, v in seen(files("features")).items() if k in before} == before
@@ -262,7 +264,7 @@ def test_a_corrupt_frame_is_skipped_and_counted(damaged, command):
     assert code == 0 and err == "", err
     assert "7 rows" in out and "1 skipped" in out and "00003.png" in out
     assert "3 no second view" in out, "the two first, and the one whose other view cannot be read"
-    assert Features("features").place["frame_index"].tolist() == [0, 1, 2, 4, 5, 6, 7]
+    assert FeatureTable("features").place["frame_index"].tolist() == [0, 1, 2, 4, 5, 6, 7]
     code, out, _ = command(*damaged, "extract.on_error=skip")
     assert "(3 left untouched), 7 rows" in out and "1 skipped" in out, "counts are kept with the shards"
 
@@ -270,7 +272,7 @@ def test_a_corrupt_frame_is_skipped_and_counted(damaged, command):
 def test_a_corrupt_frame_is_flagged_with_zeros(damaged, command):
     code, out, _ = command(*damaged, "extract.on_error=flag", "workers=1")
     assert code == 0 and "8 rows" in out and "1 unreadable" in out
-    features = Features("features")
+    features = FeatureTable("features")
     assert [int(row["dhtorch.problem"]) for row in features] == [1, 1, 0, 3, 0, 1, 0, 0]
     row = features.at(0, 3)
     assert int(row.pop("dhtorch.problem")) == SampleProblem.UNREADABLE and all(not x.any() for x in row.values())
@@ -313,15 +315,15 @@ def test_a_folder_that_cannot_be_written(robot, command):
 
 
 def test_a_full_disk_is_one_line(robot, command, monkeypatch):
-    real = columns.table
+    real = columns.arrow_table
 
     def full(rows, *args):
         if rows[0]["frame_index"]:
             raise OSError(28, "No space left on device")
         return real(rows, *args)
 
-    monkeypatch.setattr(shards, "GROUP_ROWS", 1)
-    monkeypatch.setattr(shards, "table", full)
+    monkeypatch.setattr(shards, "_MAX_GROUP_ROWS", 1)
+    monkeypatch.setattr(shards, "arrow_table", full)
     code, _, err = command(*asked(robot))
     assert code == 2 and "No space left" in err and not list(Path("features").iterdir()), err
 
@@ -359,14 +361,14 @@ def test_a_killed_worker_is_said(monkeypatch):
             os.kill(os.getpid(), signal.SIGKILL)
 
     with pytest.raises(ChildProcessError, match="memory for 1 workers"):
-        list(engines.here(Deadly(), range(4), 1))
+        list(engines.run_local(Deadly(), range(4), 1))
 
 
 def test_a_method_of_many_views_looks_back_several_times(command):
     window = ["data.hw=[72,96]", "data.n_frames=6", "data.supersample=1", "data.lidar=exact", "method=window"]
     code, out, err = command(*window, "method.n=64", "method.views=2", "extract.gap=3", "out=window")
     assert code == 0 and "6 rows" in out, err
-    problems = [int(row["dhtorch.problem"]) for row in Features("window")]
+    problems = [int(row["dhtorch.problem"]) for row in FeatureTable("window")]
     assert problems == [1, 1, 0, 0, 0, 0], "the nearer view, two frames back, is there before the farther one"
 
 
@@ -375,10 +377,10 @@ def test_without_a_gap_the_method_chooses_among_earlier_frames(command):
     room += ["method.n=256", "extract.columns=[T_1_from_0,pose_ok,problem]"]
     code, out, err = command(*room, "out=chosen")
     assert code == 0 and "6 rows" in out, err
-    rows = list(Features("chosen"))
+    rows = list(FeatureTable("chosen"))
     assert [int(row["dhtorch.problem"]) for row in rows] == [1, 0, 0, 0, 0, 0], "the first has none before it"
     command(*room, "extract.gap=1", "out=one")
-    gap = list(Features("one"))
+    gap = list(FeatureTable("one"))
     assert all(torch.equal(rows[1][k], gap[1][k]) for k in gap[1]), "one earlier frame is asked as a pair"
     length = {k: float(found[5]["dhtorch.T_1_from_0"][:3, 3].norm()) for k, found in (("chosen", rows), ("one", gap))}
     assert rows[5]["dhtorch.pose_ok"] and length["chosen"] > 2 * length["one"], "a wider one is worth more"

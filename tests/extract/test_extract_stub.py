@@ -11,8 +11,8 @@ from test_plan import Load, recording
 pytest.importorskip("pyarrow")
 
 from dhtorch import extract
-from dhtorch.extract import Features, shards
-from dhtorch.runtime import results as archive
+from dhtorch.extract import FeatureTable, shards
+from dhtorch.runtime import results as result_files
 from dhtorch.transforms import SampleError
 
 
@@ -44,7 +44,7 @@ def bytes_of(folder):
 
 def test_every_frame_is_a_row(made):
     done = made()
-    features = Features(done.folder)
+    features = FeatureTable(done.folder)
     assert done.code == 0 and features.place["episode_index"].tolist() == [0, 0, 0, 1, 1, 1]
     assert features.place["frame_index"].tolist() == [0, 1, 2] * 2
     assert [int(row["dhtorch.problem"]) for row in features] == [1, 0, 0] * 2, "no view goes across episodes"
@@ -69,14 +69,14 @@ def test_one_recording_need_not_be_a_list(made):
 
 
 def test_options_reach_the_rows(made):
-    whole = Features(made(options={"gap": 2, "patch": 7}).folder)
+    whole = FeatureTable(made(options={"gap": 2, "patch": 7}).folder)
     assert [int(row["dhtorch.problem"]) for row in whole] == [1, 1, 0] * 2
     assert whole[0]["dhtorch.tokens"].shape == (24, 10) and whole.about["grid"] == [4, 6]
     tall = {"tokens_hw": (98, 28)}
-    fits = [Features(made(out=fit, options={"fit": fit, **tall}).folder)[2] for fit in ("stretch", "pad", "crop")]
+    fits = [FeatureTable(made(out=fit, options={"fit": fit, **tall}).folder)[2] for fit in ("stretch", "pad", "crop")]
     one, two, three = (row["dhtorch.tokens"] for row in fits)
     assert one.shape == (14, 10) and not any(torch.equal(*pair) for pair in ((one, two), (two, three), (one, three)))
-    few = Features(made(out="few", options={"columns": ["depth"], "half": True}).folder)
+    few = FeatureTable(made(out="few", options={"columns": ["depth"], "half": True}).folder)
     assert few.columns == ("depth", "problem") and few.about["columns"]["depth"]["kind"] == "float16"
     assert torch.allclose(few[2]["dhtorch.depth"], whole[2]["dhtorch.depth"], rtol=2**-11)
     bad = [recording(2, load=Load(bad={1}))]
@@ -132,7 +132,7 @@ def test_other_data_is_another_question(made, tmp_path):
     (root / "a.bin").write_bytes(b"one")
     folder = made([recording(root=root)], options={"gap": 0}).folder
     assert "1 left untouched" in made([recording(root=root)], options={"gap": 0}).said
-    shared, _ = shards.described(folder / "shard-00000.parquet")
+    shared, _ = shards.read_shard_metadata(folder / "shard-00000.parquet")
     assert str(tmp_path) not in json.dumps(shared), "no place of this machine"
     (root / "a.bin").write_bytes(b"two")
     with pytest.raises(FileExistsError, match="other data"):
@@ -149,8 +149,8 @@ def test_other_data_is_another_question(made, tmp_path):
 
 def test_a_shard_tells_where_it_comes_from(made):
     folder = made(seed=3, options={"engine": "local"}).folder
-    shared, own = shards.described(shards.shard_files(folder)[1])
-    meta = archive.meta(device="cpu", dtype="float32", threads=1, seed=3)
+    shared, own = shards.read_shard_metadata(shards.shard_files(folder)[1])
+    meta = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=3)
     assert shared["format"] == 1 and shared["git"] == meta["git"] and shared["versions"] == meta["versions"]
     assert shared["version"] == meta["versions"]["dhtorch"]
     assert shared["data"]["name"] == "made" and (shared["data"]["recordings"], shared["data"]["frames"]) == (2, 6)
@@ -177,14 +177,14 @@ def test_a_bad_frame_ends_the_run_unless_told_otherwise(made):
 
 def test_skipped_and_flagged_frames_are_counted_and_said(made):
     skipped = made([recording(**BAD)], out="skip", options={"gap": 1, "on_error": "skip"})
-    assert Features(skipped.folder).place["frame_index"].tolist() == [10, 13, 14]
+    assert FeatureTable(skipped.folder).place["frame_index"].tolist() == [10, 13, 14]
     assert ", 3 rows," in skipped.said and "frames with a problem: 2 no second view, 2 skipped\n" in skipped.said
     assert skipped.said.endswith("  one, frame 11: position 1 is damaged\n  one, frame 12: position 2 is damaged\n")
     flagged = made([recording(**BAD)], out="flag", options={"gap": 1, "on_error": "flag"})
     assert ", 5 rows," in flagged.said and "frames with a problem: 2 no second view, 2 unreadable\n" in flagged.said
-    rows = list(Features(flagged.folder))
+    rows = list(FeatureTable(flagged.folder))
     assert [int(row["dhtorch.problem"]) for row in rows] == [1, 3, 3, 1, 0]
-    assert Features(flagged.folder).place["frame_index"].tolist() == [10, 11, 12, 13, 14]
+    assert FeatureTable(flagged.folder).place["frame_index"].tolist() == [10, 11, 12, 13, 14]
     assert all(not v.any() for k, v in rows[1].items() if k != "dhtorch.problem")
 
 
@@ -196,7 +196,7 @@ def test_only_three_bad_frames_are_named(made):
 
 
 def test_an_interrupted_run_says_what_stays(made, monkeypatch):
-    real, calls = shards.write, []
+    real, calls = shards.write_shard, []
 
     def interrupted(*args):
         calls.append(1)
@@ -204,7 +204,7 @@ def test_an_interrupted_run_says_what_stays(made, monkeypatch):
             raise KeyboardInterrupt
         return real(*args)
 
-    monkeypatch.setattr(shards, "write", interrupted)
+    monkeypatch.setattr(shards, "write_shard", interrupted)
     with pytest.raises(KeyboardInterrupt, match=r"^1 of 2 shards in .*out are whole and stay; the same command does"):
         made()
     assert "1 left untouched" in made().said

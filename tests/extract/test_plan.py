@@ -13,7 +13,7 @@ from support.stub_samples import H, K, N, Stub, Told, W, added, tiny
 from dhtorch import extract
 from dhtorch.data import Recording, Scene
 from dhtorch.extract import columns, plan
-from dhtorch.extract.dataset import Rows
+from dhtorch.extract.dataset import RowDataset
 from dhtorch.records import Camera, Frame
 
 P = 6
@@ -53,9 +53,9 @@ def recording(n=4, numbers=None, name="one", load=None, gap=None, levels=None, *
 
 def rows(recordings, gap, method=None, wanted=None, **options):
     method = Stub(answer=method or Told(), n=N)
-    found = columns.columns(N, P)
-    made = plan.make(recordings, gap, 1)
-    return Rows(recordings, made, wanted or found, method=method, gap=gap, tokens_hw=(H, W), **options)
+    found = columns.feature_columns(N, P)
+    made = plan.make_plan(recordings, gap, 1)
+    return RowDataset(recordings, made, wanted or found, method=method, gap=gap, tokens_hw=(H, W), **options)
 
 
 class Seen:
@@ -77,7 +77,7 @@ def forgotten():
 
 
 def test_positions_and_places():
-    whole = plan.Plan(order=(2, 0, 1), episodes=(0, 4, 9), ends=(3, 4, 8), roots=())
+    whole = plan.ExtractionPlan(order=(2, 0, 1), episodes=(0, 4, 9), ends=(3, 4, 8), roots=())
     assert len(whole) == 8
     assert [whole.place(i) for i in range(8)] == [
         (2, 0, 0),
@@ -89,44 +89,46 @@ def test_positions_and_places():
 
 
 def test_shards_cut_the_rows_in_equal_pieces():
-    whole = plan.Plan(order=(0,), episodes=(0,), ends=(8,), roots=())
+    whole = plan.ExtractionPlan(order=(0,), episodes=(0,), ends=(8,), roots=())
     for size, pieces in ((3, [3, 3, 2]), (4, [4, 4]), (8, [8]), (9, [8]), (1, [1] * 8)):
         shards = whole.shards(size)
         assert [len(s.rows) for s in shards] == pieces and [i for s in shards for i in s.rows] == list(range(8))
         assert [(s.number, s.of) for s in shards] == [(k, len(pieces)) for k in range(len(pieces))]
     assert [s.name for s in whole.shards(3)] == [f"shard-0000{k}.parquet" for k in range(3)]
-    assert plan.Shard(123, 200, range(1)).name == "shard-00123.parquet"
+    assert plan.ShardSpec(123, 200, range(1)).name == "shard-00123.parquet"
 
 
 def test_the_plan_is_sorted_by_episode():
-    made = plan.make(
+    made = plan.make_plan(
         [recording(2, name="c", episode=5), recording(3, name="a", episode=1), recording(4, name="b", episode=0)], 1, 1
     )
     assert (made.order, made.episodes, made.ends) == ((2, 1, 0), (0, 1, 5), (4, 7, 9))
-    unnumbered = plan.make([recording(2), recording(3, name="two")], 0, 1)
+    unnumbered = plan.make_plan([recording(2), recording(3, name="two")], 0, 1)
     assert (unnumbered.order, unnumbered.episodes, unnumbered.ends) == ((0, 1), (0, 1), (2, 5))
 
 
 def test_roots_are_named_once_in_order():
     roots = [Path("/b"), None, Path("/a"), Path("/b")]
-    made = plan.make([recording(root=r, name=str(k)) for k, r in enumerate(roots)], 0, 1)
+    made = plan.make_plan([recording(root=r, name=str(k)) for k, r in enumerate(roots)], 0, 1)
     assert made.roots == (Path("/b"), Path("/a"))
 
 
 def test_two_recordings_of_one_episode_are_refused():
     with pytest.raises(ValueError, match="data: left and right are one episode, expected one camera of it"):
-        plan.make([recording(name="left", episode=3), recording(name="x"), recording(name="right", episode=3)], 0, 1)
+        plan.make_plan(
+            [recording(name="left", episode=3), recording(name="x"), recording(name="right", episode=3)], 0, 1
+        )
 
 
 def test_steps_go_back_by_the_gap_evenly_for_many_views():
     own, none = SimpleNamespace(name="r", gap=7), SimpleNamespace(name="r", gap=None)
-    assert plan.steps_back(own, 3, 1) == [3] and plan.steps_back(own, None, 1) == [7]
-    assert plan.steps_back(own, 0, 1) == plan.steps_back(none, 0, 3) == []
-    assert plan.steps_back(own, 6, 3) == [2, 4, 6] and plan.steps_back(own, None, 2) == [4, 7]
+    assert plan.view_offsets(own, 3, 1) == [3] and plan.view_offsets(own, None, 1) == [7]
+    assert plan.view_offsets(own, 0, 1) == plan.view_offsets(none, 0, 3) == []
+    assert plan.view_offsets(own, 6, 3) == [2, 4, 6] and plan.view_offsets(own, None, 2) == [4, 7]
     with pytest.raises(ValueError, match=r"extract\.gap: r knows no gap of its own, expected a number.*0 = front end"):
-        plan.steps_back(none, None, 1)
+        plan.view_offsets(none, None, 1)
     with pytest.raises(ValueError, match="views: found 4"):
-        plan.make([recording(gap=3)], None, 4)
+        plan.make_plan([recording(gap=3)], None, 4)
 
 
 # ---------------------------------------------------------------------------------------------------- rows
@@ -153,7 +155,7 @@ def test_a_row_says_where_it_belongs():
     )
     assert len(made) == 2
     assert made[1].place == {"episode_index": 7, "frame_index": 9, "timestamp": 2.5, "recording": "x"}
-    assert list(made[0].place) == list(columns.PLACE) and made[0].complaint == ""
+    assert list(made[0].place) == list(columns.KEY_COLUMNS) and made[0].complaint == ""
     assert np.isnan(rows([recording()], 0)[2].place["timestamp"])
 
 
@@ -169,8 +171,8 @@ def test_features_are_those_of_the_transform_in_the_types_of_the_columns():
     assert answer.features.keys() == wanted.keys()
     for name, value in wanted.items():
         assert np.array_equal(answer.features[name], value.numpy()), name
-        assert answer.features[name].dtype == columns.columns(N, P)[name].kind
-    few = rows([one], 1, wanted=columns.choose(columns.columns(N, P, half=True), ["depth"]))[2]
+        assert answer.features[name].dtype == columns.feature_columns(N, P)[name].kind
+    few = rows([one], 1, wanted=columns.select_columns(columns.feature_columns(N, P, half=True), ["depth"]))[2]
     assert list(few.features) == ["depth", "problem"] and few.features["depth"].dtype == np.float16
 
 
@@ -220,7 +222,9 @@ def test_a_frame_that_cannot_be_read_says_so_and_is_no_other_view():
 def test_many_views_are_the_nearest_first_and_the_anchor_pads():
     method = Stub(answer=Seen(), n=N, views=2)
     one = recording(6)
-    made = Rows([one], plan.make([one], 4, 2), columns.columns(N, P), method=method, gap=4, tokens_hw=(H, W))
+    made = RowDataset(
+        [one], plan.make_plan([one], 4, 2), columns.feature_columns(N, P), method=method, gap=4, tokens_hw=(H, W)
+    )
     for position, views in ((5, (3, 1)), (3, (1, 3))):
         made[position]
         _, other, _ = Seen.calls[-1]
@@ -232,7 +236,7 @@ def test_many_views_are_the_nearest_first_and_the_anchor_pads():
 def test_a_row_chooses_among_the_earlier_frames_that_can_be_read():
     first, alone = recording(5, load=Load(bad={1})), recording(1, name="alone", load=Load(30))
     method = Stub(answer=Seen(), n=N)
-    made = Rows([first, alone], plan.make([first, alone], "auto", 5), columns.columns(N, P), method=method, gap="auto",
+    made = RowDataset([first, alone], plan.make_plan([first, alone], "auto", 5), columns.feature_columns(N, P), method=method, gap="auto",
                 tokens_hw=(H, W))  # fmt: skip
     asked = {}
     for position in (0, 2, 3, 4, 5):

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("ray.data")
 pytest.importorskip("pyarrow")
 
-from dhtorch.extract import Features
+from dhtorch.extract import FeatureTable
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -96,7 +96,7 @@ def test_a_killed_node_costs_no_row_and_changes_none(tmp_path, cluster):
     assert "Traceback" not in (tmp_path / "err").read_text()
     assert start(tmp_path, "out=one").wait(600) == 0
     assert contents(tmp_path / "ray") == contents(tmp_path / "one")
-    assert Features(tmp_path / "ray", ["depth"]).place["frame_index"].tolist() == list(range(ROWS))
+    assert FeatureTable(tmp_path / "ray", ["depth"]).place["frame_index"].tolist() == list(range(ROWS))
 
 
 def test_a_killed_driver_resumes_with_another_engine(tmp_path):

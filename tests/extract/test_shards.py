@@ -17,10 +17,10 @@ from pyarrow import parquet
 
 from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source, names
 from dhtorch.data import FormatError
-from dhtorch.extract import Features, JoinedDataset, columns, engines, shards
-from dhtorch.extract.dataset import Extracted
-from dhtorch.extract.plan import Shard
-from dhtorch.transforms import CHANNELS, ExtendDepth, SampleProblem
+from dhtorch.extract import FeatureTable, JoinedDataset, columns, engines, shards
+from dhtorch.extract.dataset import ExtractedRow
+from dhtorch.extract.plan import ShardSpec
+from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth, SampleProblem
 
 N, P = 5, 6
 SHARED = {
@@ -29,14 +29,14 @@ SHARED = {
     "data": {"digest": "d"},
     "git": "v1-2-gab",
     "version": "0.1",
-    "columns": dict.fromkeys(columns.columns(N, P)),
+    "columns": dict.fromkeys(columns.feature_columns(N, P)),
     "codes": {"problem": {"0": "NONE", "1": "NO_SECOND_VIEW", "2": "NO_DEPTH", "3": "UNREADABLE"}},
 }
 
 
 def row(k, wanted=None, episode=0, problem=0):
     rng = np.random.default_rng(k)
-    found = columns.columns(N, P) if wanted is None else wanted
+    found = columns.feature_columns(N, P) if wanted is None else wanted
     values = {}
     for name, column in found.items():
         values[name] = (
@@ -48,13 +48,13 @@ def row(k, wanted=None, episode=0, problem=0):
 
 def written(folder, pieces, wanted=None, shared=SHARED, of=None):
     """Shards of some rows each."""
-    wanted = columns.columns(N, P) if wanted is None else wanted
+    wanted = columns.feature_columns(N, P) if wanted is None else wanted
     shared = {**shared, "columns": dict.fromkeys(wanted)}
     folder.mkdir(exist_ok=True)
     first = 0
     for number, piece in enumerate(pieces):
-        shard = Shard(number, of or len(pieces), range(first, first + len(piece)))
-        shards.write(folder, shard, piece, wanted, shared)
+        shard = ShardSpec(number, of or len(pieces), range(first, first + len(piece)))
+        shards.write_shard(folder, shard, piece, wanted, shared)
         first += len(piece)
     return folder
 
@@ -87,9 +87,9 @@ def test_columns_have_the_shapes_types_and_units_that_they_are_known_by():
         "tokens_valid": (flag, (P,), "1"),
         "problem": (byte, (), code),
     }
-    found = columns.columns(N, P)
+    found = columns.feature_columns(N, P)
     assert {k: (c.kind, c.shape, c.unit) for k, c in found.items()} == wanted and list(found) == list(wanted)
-    half = columns.columns(N, P, half=True)
+    half = columns.feature_columns(N, P, half=True)
     assert {k for k in half if half[k] != found[k]} == {"xyz", "depth", "sigma", "score", "tokens"}
     assert all(half[k] == found[k]._replace(kind="float16") for k in half if half[k] != found[k])
 
@@ -99,8 +99,8 @@ def test_every_key_of_the_transform_has_a_column():
     extender = ExtendDepth(depth_unit="m", n=N, on_error="flag", prefix="far.")
     with pytest.warns(UserWarning, match="flagged"):
         blank = {k.removeprefix("far."): v for k, v in extender(lost).items() if k not in lost}
-    found = columns.columns(N, P)
-    assert set(found) == set(columns.PLACE) | set(blank)
+    found = columns.feature_columns(N, P)
+    assert set(found) == set(columns.KEY_COLUMNS) | set(blank)
     kinds = {torch.float32: "float32", torch.bool: "bool", torch.int32: "uint8"}
     assert {k: (found[k].shape, found[k].kind) for k in blank} == {
         k: (tuple(v.shape), kinds[v.dtype]) for k, v in blank.items()
@@ -125,19 +125,21 @@ def test_codes_fit_a_byte_and_are_named():
 
 
 def test_chosen_columns_keep_place_problem_and_order():
-    found = columns.columns(N, P)
+    found = columns.feature_columns(N, P)
     place = ["episode_index", "frame_index", "timestamp", "recording"]
-    assert list(columns.choose(found, None)) == list(found) and list(columns.PLACE) == place
-    assert list(columns.choose(found, ["tokens", "uv"])) == [*place, "uv", "tokens", "problem"]
-    assert list(columns.choose(found, [])) == [*place, "problem"]
+    assert list(columns.select_columns(found, None)) == list(found) and list(columns.KEY_COLUMNS) == place
+    assert list(columns.select_columns(found, ["tokens", "uv"])) == [*place, "uv", "tokens", "problem"]
+    assert list(columns.select_columns(found, [])) == [*place, "problem"]
     with pytest.raises(
         ValueError, match=r"extract\.columns: found 'colour', expected some of episode_index, .*problem$"
     ):
-        columns.choose(found, ["uv", "colour"])
+        columns.select_columns(found, ["uv", "colour"])
 
 
 def test_a_blank_row_is_zeros_and_a_problem():
-    blank = columns.blank(columns.choose(columns.columns(N, P, half=True), ["xyz", "pose_ok", "gate"]))
+    blank = columns.blank_features(
+        columns.select_columns(columns.feature_columns(N, P, half=True), ["xyz", "pose_ok", "gate"])
+    )
     assert {k: (v.dtype, v.shape) for k, v in blank.items()} == {
         "xyz": (np.float16, (N, 3)),
         "gate": (np.uint8, (N,)),
@@ -148,10 +150,10 @@ def test_a_blank_row_is_zeros_and_a_problem():
 
 
 def test_a_table_holds_the_numbers_row_by_row():
-    wanted = columns.columns(N, P)
-    layout = columns.schema(wanted, {"a": "b"})
+    wanted = columns.feature_columns(N, P)
+    layout = columns.arrow_schema(wanted, {"a": "b"})
     given = [row(k, problem=k % 4) for k in range(3)]
-    table = columns.table(iter(given), wanted, layout)
+    table = columns.arrow_table(iter(given), wanted, layout)
     assert table.num_rows == 3 and table.schema.metadata == {b"a": b"b"} and table.column_names == list(wanted)
     for name, column in wanted.items():
         field = table.schema.field(name)
@@ -162,7 +164,7 @@ def test_a_table_holds_the_numbers_row_by_row():
             else:
                 assert np.array_equal(np.asarray(one), np.asarray(given[k][name]).astype(column.kind)), name
     assert layout.field("uv").type == pyarrow.list_(pyarrow.list_(pyarrow.float32(), 2), N)
-    assert layout.field("tokens").type == pyarrow.list_(pyarrow.list_(pyarrow.float32(), len(CHANNELS)), P)
+    assert layout.field("tokens").type == pyarrow.list_(pyarrow.list_(pyarrow.float32(), len(TOKEN_CHANNELS)), P)
     assert layout.field("recording").type == pyarrow.string() and layout.field("pose_ok").type == pyarrow.bool_()
 
 
@@ -170,13 +172,13 @@ def test_a_table_holds_the_numbers_row_by_row():
 
 
 def test_a_shard_says_what_it_holds(tmp_path):
-    wanted = columns.columns(N, P)
+    wanted = columns.feature_columns(N, P)
     given = [row(k, problem=(0, 1, 1, 3)[k]) for k in range(4)]
-    counts = shards.write(tmp_path, Shard(2, 7, range(8, 14)), given, wanted, SHARED)
+    counts = shards.write_shard(tmp_path, ShardSpec(2, 7, range(8, 14)), given, wanted, SHARED)
     assert counts == {"none": 1, "no_second_view": 2, "unreadable": 1, "skipped": 2}
     path = tmp_path / "shard-00002.parquet"
     assert [p.name for p in tmp_path.iterdir()] == [path.name], "nothing else is left"
-    shared, own = shards.described(path)
+    shared, own = shards.read_shard_metadata(path)
     assert shared == SHARED and own == {"number": 2, "of": 7, "counts": dict(counts)}
     metadata = parquet.read_metadata(path)
     assert metadata.num_rows == 4 and metadata.row_group(0).column(0).compression == "ZSTD"
@@ -185,18 +187,20 @@ def test_a_shard_says_what_it_holds(tmp_path):
 
 
 def test_rows_are_stored_in_groups_of_sixteen(tmp_path):
-    few = columns.choose(columns.columns(N, P), ["pose_ok"])
-    shards.write(tmp_path, Shard(0, 1, range(35)), (row(k, few) for k in range(35)), few, SHARED | {"columns": few})
+    few = columns.select_columns(columns.feature_columns(N, P), ["pose_ok"])
+    shards.write_shard(
+        tmp_path, ShardSpec(0, 1, range(35)), (row(k, few) for k in range(35)), few, SHARED | {"columns": few}
+    )
     metadata = parquet.read_metadata(tmp_path / "shard-00000.parquet")
     assert [metadata.row_group(k).num_rows for k in range(metadata.num_row_groups)] == [16, 16, 3]
-    features = Features(tmp_path)
+    features = FeatureTable(tmp_path)
     for k in (0, 15, 16, 31, 32, 34):
         assert features.at(0, k)["dhtorch.pose_ok"] == bool(row(k, few)["pose_ok"])
 
 
 def test_halves_and_fewer_columns_are_smaller_files(tmp_path):
-    whole, half = columns.columns(N, P), columns.columns(N, P, half=True)
-    few = columns.choose(half, ["tokens"])
+    whole, half = columns.feature_columns(N, P), columns.feature_columns(N, P, half=True)
+    few = columns.select_columns(half, ["tokens"])
     size = [
         sum(
             p.stat().st_size
@@ -227,7 +231,7 @@ def test_a_shard_that_is_not_finished_leaves_nothing(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        shards.write(tmp_path, Shard(0, 1, range(2)), broken(), columns.columns(N, P), SHARED)
+        shards.write_shard(tmp_path, ShardSpec(0, 1, range(2)), broken(), columns.feature_columns(N, P), SHARED)
     assert not list(tmp_path.iterdir())
 
 
@@ -240,7 +244,7 @@ def test_what_a_killed_writer_left_is_cleared(tmp_path):
         ".shard-x",
     ):
         (tmp_path / name).write_bytes(b"PAR1")
-    shards.clear(tmp_path)
+    shards.remove_unfinished(tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {
         "shard-00001.parquet",
         ".other.tmp",
@@ -252,18 +256,18 @@ def test_what_a_killed_writer_left_is_cleared(tmp_path):
 
 def test_finished_shards_are_whole_and_of_this_extraction(tmp_path):
     folder = written(tmp_path / "out", [[row(0)], [row(1, problem=1), row(2)], [row(3)]])
-    assert shards.finished(folder, SHARED) == {
+    assert shards.find_finished_shards(folder, SHARED) == {
         "shard-00000.parquet": Counter(none=1),
         "shard-00001.parquet": Counter(none=1, no_second_view=1),
         "shard-00002.parquet": Counter(none=1),
     }
     torn = folder / "shard-00001.parquet"
     torn.write_bytes(torn.read_bytes()[:-50])
-    assert sorted(shards.finished(folder, SHARED)) == ["shard-00000.parquet", "shard-00002.parquet"]
+    assert sorted(shards.find_finished_shards(folder, SHARED)) == ["shard-00000.parquet", "shard-00002.parquet"]
     parquet.write_table(pyarrow.table({"a": [1]}), torn)
-    assert len(shards.finished(folder, SHARED)) == 2, "a table of somebody else's"
+    assert len(shards.find_finished_shards(folder, SHARED)) == 2, "a table of somebody else's"
     with pytest.raises(FormatError, match=r"shard-00001.parquet: metadata: found KeyError.*a shard of dhtorch extract"):
-        shards.described(torn)
+        shards.read_shard_metadata(torn)
 
 
 @pytest.mark.parametrize(
@@ -285,19 +289,19 @@ def test_the_first_difference_between_two_extractions_is_said(tmp_path, change, 
     ours = {**SHARED, **change, "key": "x" * 64}
     expected = rf"shard-00000.parquet: found a shard of another extraction \({said}\), expected one of this, or another"
     with pytest.raises(FileExistsError, match=expected):
-        shards.finished(folder, ours)
-    assert shards.finished(folder, {**SHARED, **change}), "the key alone decides"
+        shards.find_finished_shards(folder, ours)
+    assert shards.find_finished_shards(folder, {**SHARED, **change}), "the key alone decides"
 
 
 # ---------------------------------------------------------------------------------------------------- reading back
 
 
 def test_rows_come_back_in_the_types_of_the_transform(tmp_path):
-    half = columns.columns(N, P, half=True)
+    half = columns.feature_columns(N, P, half=True)
     given = [[row(0), row(1)], [row(4)], [row(0, episode=2), row(3, episode=2)]]
-    features = Features(written(tmp_path / "out", given, half))
+    features = FeatureTable(written(tmp_path / "out", given, half))
     flat = [one for piece in given for one in piece]
-    assert len(features) == 5 and features.columns == tuple(k for k in half if k not in columns.PLACE)
+    assert len(features) == 5 and features.columns == tuple(k for k in half if k not in columns.KEY_COLUMNS)
     kinds = {"float32": torch.float32, "float16": torch.float32, "bool": torch.bool, "uint8": torch.int32}
     for one, mine in zip(flat, features, strict=True):
         assert mine.keys() == {f"dhtorch.{k}" for k in features.columns}
@@ -314,7 +318,7 @@ def test_rows_come_back_in_the_types_of_the_transform(tmp_path):
 
 def test_a_row_is_found_by_place_and_by_episode_and_frame(tmp_path):
     folder = written(tmp_path / "out", [[row(0), row(1)], [row(0, episode=2), row(7, episode=2)]])
-    features = Features(folder, ["depth", "gate"], prefix="far.")
+    features = FeatureTable(folder, ["depth", "gate"], prefix="far.")
     assert features.at(2, 7).keys() == {"far.depth", "far.gate"}
     for i, key in enumerate(((0, 0), (0, 1), (2, 0), (2, 7))):
         mine = features.at(*key)
@@ -331,29 +335,29 @@ def test_a_row_is_found_by_place_and_by_episode_and_frame(tmp_path):
 
 def test_a_rewritten_file_is_read_again(tmp_path):
     folder = written(tmp_path / "out", [[row(0)]])
-    first = Features(folder)[0]
+    first = FeatureTable(folder)[0]
     written(folder, [[row(0) | {"depth": np.full(N, 8.0)}]])
     os.utime(folder / "shard-00000.parquet", ns=(10**18, 10**18))
     assert not torch.equal(first["dhtorch.depth"], torch.full((N,), 8.0))
-    assert torch.equal(Features(folder)[0]["dhtorch.depth"], torch.full((N,), 8.0))
+    assert torch.equal(FeatureTable(folder)[0]["dhtorch.depth"], torch.full((N,), 8.0))
 
 
 def test_a_folder_without_a_whole_extraction_is_refused(tmp_path):
     with pytest.raises(FormatError, match="shards: found none, expected a folder that dhtorch extract wrote"):
-        Features(tmp_path)
+        FeatureTable(tmp_path)
     folder = written(tmp_path / "out", [[row(0)], [row(1)]], of=3)
     with pytest.raises(
         FormatError, match="shards: found 2, expected 3: the same dhtorch extract once more makes those"
     ):
-        Features(folder)
+        FeatureTable(folder)
     whole = written(tmp_path / "whole", [[row(0)]])
     for wrong in ("colour", "timestamp"):
         with pytest.raises(FormatError, match=f"columns: found {wrong}, expected some of uv, xyz, .*problem$"):
-            Features(whole, ["uv", wrong])
+            FeatureTable(whole, ["uv", wrong])
 
 
 def test_items_are_joined_by_the_numbers_of_episode_and_frame(tmp_path):
-    features = Features(written(tmp_path / "out", [[row(0), row(1), row(0, episode=1)]]), ["depth"])
+    features = FeatureTable(written(tmp_path / "out", [[row(0), row(1), row(0, episode=1)]]), ["depth"])
     items = [
         {"episode_index": torch.tensor(1), "frame_index": 0, "x": 1},
         {"episode_index": 0, "frame_index": 1, "x": 2},
@@ -368,7 +372,7 @@ def test_items_are_joined_by_the_numbers_of_episode_and_frame(tmp_path):
 
 
 def test_a_joined_data_set_goes_through_a_loader(tmp_path):
-    features = Features(written(tmp_path / "out", [[row(k) for k in range(4)]]), ["tokens", "tokens_valid"])
+    features = FeatureTable(written(tmp_path / "out", [[row(k) for k in range(4)]]), ["tokens", "tokens_valid"])
     joined = JoinedDataset([{"episode_index": 0, "frame_index": k} for k in (3, 1, 0, 2)], features)
     (batch,) = torch.utils.data.DataLoader(joined, batch_size=4, num_workers=1, multiprocessing_context="fork")
     assert batch["dhtorch.tokens"].shape == (4, P, 10) and batch["frame_index"].tolist() == [3, 1, 0, 2]
@@ -387,7 +391,7 @@ class Counted(torch.utils.data.Dataset):
         return 50
 
     def __getitem__(self, i):
-        return Extracted({"at": i, "threads": torch.get_num_threads()}, None, str(i))
+        return ExtractedRow({"at": i, "threads": torch.get_num_threads()}, None, str(i))
 
 
 class Ray:
@@ -434,9 +438,9 @@ def ray(monkeypatch):
 
 def test_answers_come_in_the_order_of_their_positions():
     order = [7, 3, 3, 20]
-    answers = list(engines.here(Counted(), order, 0))
+    answers = list(engines.run_local(Counted(), order, 0))
     assert [a.place["at"] for a in answers] == order and {a.place["threads"] for a in answers} == {1}
-    assert all(type(a) is Extracted and a.features is None and a.complaint == str(a.place["at"]) for a in answers)
+    assert all(type(a) is ExtractedRow and a.features is None and a.complaint == str(a.place["at"]) for a in answers)
 
 
 def test_arrays_of_an_answer_come_as_they_are():
@@ -444,7 +448,7 @@ def test_arrays_of_an_answer_come_as_they_are():
         def __getitem__(self, i):
             return super().__getitem__(i)._replace(features={"depth": np.full(3, i)})
 
-    (answer,) = engines.here(Arrays(), [2], 0)
+    (answer,) = engines.run_local(Arrays(), [2], 0)
     assert type(answer.features["depth"]) is np.ndarray and answer.features["depth"].tolist() == [2, 2, 2]
 
 
@@ -454,13 +458,13 @@ def test_an_error_that_is_no_dead_worker_stays_what_it_is():
             raise RuntimeError("shapes do not fit")
 
     with pytest.raises(RuntimeError, match=r"^shapes do not fit"):
-        list(engines.here(Broken(), [0], 0))
+        list(engines.run_local(Broken(), [0], 0))
 
 
 def test_ray_is_given_blocks_and_gives_the_same_answers(ray):
     order = list(range(49, 9, -1))
-    answers = list(engines.on_ray(Counted(), order, None))
-    assert [a.place["at"] for a in answers] == order and all(type(a) is Extracted for a in answers)
+    answers = list(engines.run_ray(Counted(), order, None))
+    assert [a.place["at"] for a in answers] == order and all(type(a) is ExtractedRow for a in answers)
     assert [name for name, _ in ray.log] == ["init", "blocks", "shutdown"] and ray.log[1][1] == [16, 16, 8]
     options = ray.log[0][1]
     assert options["address"] is None and options["include_dashboard"] is False and options["log_to_driver"] is False
@@ -482,7 +486,7 @@ def test_a_cluster_that_is_there_is_joined_and_left(ray, monkeypatch):
     ):
         asked.clear()
         ray.log.clear()
-        assert len(list(engines.on_ray(Counted(), [1, 2], address))) == 2
+        assert len(list(engines.run_ray(Counted(), [1, 2], address))) == 2
         assert [w for w, _ in asked] == where and all(timeout == 10 for _, timeout in asked)
         assert ray.log[0][1]["address"] == address and "object_store_memory" not in ray.log[0][1]
         assert ray.log[-1][0] == "shutdown"
@@ -494,15 +498,15 @@ def test_a_cluster_that_does_not_answer_is_said(ray, monkeypatch):
 
     monkeypatch.setattr(engines.socket, "create_connection", refused)
     with pytest.raises(ConnectionError, match=r"address: nothing answers at ray://head:1 \(refused\), expected a clu"):
-        list(engines.on_ray(Counted(), [1], "ray://head:1"))
+        list(engines.run_ray(Counted(), [1], "ray://head:1"))
     assert not ray.log
     monkeypatch.setattr(ray, "init", lambda **_: (_ for _ in ()).throw(ValueError("no node")))
     with pytest.raises(ConnectionError, match=r"engine=ray: no node"):
-        list(engines.on_ray(Counted(), [1], None))
+        list(engines.run_ray(Counted(), [1], None))
 
 
 def test_ray_is_left_when_a_reader_stops_early(ray):
-    answers = engines.on_ray(Counted(), range(40), None)
+    answers = engines.run_ray(Counted(), range(40), None)
     assert next(answers).place["at"] == 0
     answers.close()
     assert ray.log[-1][0] == "shutdown"

@@ -6,9 +6,9 @@ import math
 import pytest
 import torch
 
-from dhtorch.geometry import affine_alignment as affine
+from dhtorch.geometry import affine_alignment
 from dhtorch.geometry.pyramid import build_pyramid
-from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine, refine
+from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine, refine_tracks
 
 HW = (160, 200)
 FIELDS = ("uv_1", "error", "photometric", "cov", "valid")
@@ -50,7 +50,7 @@ def points(n, seed=1, hw=HW, margin=36):
 
 def registered(image_0, image_1, uv_0, uv_1, **options):
     source, target = build_pyramid(image_0, 3), build_pyramid(image_1, 3)
-    return affine.register(source, target, uv_0, uv_1, **options)
+    return affine_alignment.register_affine(source, target, uv_0, uv_1, **options)
 
 
 SLANTED, STILL = [[1.06, 0.05], [-0.07, 0.95]], [[1.0, 0.0], [0.0, 1.0]]
@@ -170,4 +170,4 @@ def test_with_and_without_a_graph_the_value_is_the_same():
     graph = lucas_kanade_affine(image_0, image_1.clone().requires_grad_(), uv)
     assert all(torch.equal(getattr(plain, k), getattr(graph, k)) for k in FIELDS)
     assert graph.uv_1.requires_grad and not plain.uv_1.requires_grad
-    assert refine(image_0, image_1, uv, plain.uv_1).shape == plain.uv_1.shape
+    assert refine_tracks(image_0, image_1, uv, plain.uv_1).shape == plain.uv_1.shape

@@ -8,8 +8,8 @@ import torch
 from support import reference
 from support.textures import places, waves
 
-from dhtorch.geometry import affine_alignment as affine
-from dhtorch.geometry.pyramid import Pyramids, build_pyramid
+from dhtorch.geometry import affine_alignment
+from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
 from dhtorch.records import TrackHint, Tracks
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 
@@ -69,7 +69,9 @@ def near(uv, linear=TURNED, shift=(0.4, -0.7), spread=0.4, seed=3):
 def test_every_step_is_the_regression_of_one_window(steps):
     src, dst = two_views(noise=0.01)
     uv = places(2, 6, H, W, margin=14)
-    found = affine.register(*pyramids(src, dst), uv, near(uv), window=WINDOW, iterations=steps, epsilon_px=0.0)
+    found = affine_alignment.register_affine(
+        *pyramids(src, dst), uv, near(uv), window=WINDOW, iterations=steps, epsilon_px=0.0
+    )
     expected = by_hand(src, dst, uv, near(uv), steps, 0.0)
     agrees(found, expected)
     assert expected[-1].mean() > 0.8 or not steps
@@ -80,7 +82,7 @@ def test_contrast_is_taken_out_and_not_believed_beyond_five_times(gain, bias):
     src, dst = two_views(gain=gain, bias=bias)
     uv = places(2, 6, H, W, margin=14)
     expected = by_hand(src, dst, uv, near(uv))
-    agrees(affine.register(*pyramids(src, dst), uv, near(uv), window=WINDOW), expected)
+    agrees(affine_alignment.register_affine(*pyramids(src, dst), uv, near(uv), window=WINDOW), expected)
     assert expected[-1].mean() > 0.8 if 0.2 < gain < 5 else expected[-1].mean() < 0.5
 
 
@@ -89,7 +91,10 @@ def test_a_step_that_moves_no_corner_further_than_epsilon_is_the_last(epsilon):
     src, dst = two_views(noise=0.02, shortest=6.0)
     uv = places(2, 8, H, W, margin=14)
     options = {"window": WINDOW, "iterations": 12, "epsilon_px": epsilon}
-    agrees(affine.register(*pyramids(src, dst), uv, near(uv), **options), by_hand(src, dst, uv, near(uv), 12, epsilon))
+    agrees(
+        affine_alignment.register_affine(*pyramids(src, dst), uv, near(uv), **options),
+        by_hand(src, dst, uv, near(uv), 12, epsilon),
+    )
 
 
 @pytest.mark.parametrize(("scale", "n_levels"), [(1.9, 2), (1.9, 1), (2.7, 2), (0.55, 2), (0.35, 2)])
@@ -98,7 +103,7 @@ def test_magnified_windows_are_read_from_the_half_size_level_and_extreme_ones_no
     uv = torch.tensor([[[52.0, 44.0], [53.3, 45.2], [50.4, 43.6], [54.9, 46.0], [51.1, 46.8]]] * 2, dtype=torch.float64)
     start = near(uv, [[scale, 0.1], [-0.1, scale]], (0.3, 0.2), spread=0.2)
     options = {"window": WINDOW, "iterations": 12, "max_shift_px": 3.0}
-    found = affine.register(*pyramids(src, dst, n_levels), uv, start, **options)
+    found = affine_alignment.register_affine(*pyramids(src, dst, n_levels), uv, start, **options)
     expected = by_hand(src, dst, uv, start, 12, max_shift=3.0, n_levels=n_levels)
     agrees(found, expected, rtol=1e-5)
 
@@ -109,7 +114,7 @@ def test_a_search_that_ends_too_far_or_worse_or_outside_keeps_its_start():
     start = near(uv, spread=5.0)
     seen = set()
     for limit in (0.5, 2.0, 50.0):
-        found = affine.register(*pyramids(src, dst), uv, start, window=WINDOW, max_shift_px=limit)
+        found = affine_alignment.register_affine(*pyramids(src, dst), uv, start, window=WINDOW, max_shift_px=limit)
         expected = by_hand(src, dst, uv, start, max_shift=limit)
         agrees(found, expected, rtol=1e-3)  # where a search runs away, every rounding counts
         ok = found.ok
@@ -126,7 +131,9 @@ def test_the_covariance_in_windows_of_little_texture_and_much_noise(window, nois
     src, dst = two_views(noise=noise / contrast)
     src, dst = 0.5 + contrast * (src - 0.5), 0.5 + contrast * (dst - 0.5)
     uv = places(2, 8, H, W, margin=14)
-    found = affine.register(*pyramids(src, dst, 1, window), uv, near(uv), window=window, iterations=2, epsilon_px=0.0)
+    found = affine_alignment.register_affine(
+        *pyramids(src, dst, 1, window), uv, near(uv), window=window, iterations=2, epsilon_px=0.0
+    )
     agrees(found, by_hand(src, dst, uv, near(uv), 2, 0.0, n_levels=1, window=window), rtol=1e-5)
     assert torch.linalg.eigvalsh(found.cov).min() > 0
 
@@ -136,12 +143,12 @@ def test_nothing_is_found_without_texture_and_of_points_that_are_not_wanted():
     src[0, :, :, 60:] = 0.3
     uv = places(2, 12, H, W, margin=14)
     start, views = near(uv), pyramids(src, dst)
-    found = affine.register(*views, uv, start, window=WINDOW)
+    found = affine_alignment.register_affine(*views, uv, start, window=WINDOW)
     flat = torch.zeros(2, 12, dtype=torch.bool)
     flat[0] = uv[0, :, 0] > 67
     assert flat.sum() > 2 and not found.ok[flat].any() and found.ok[1].float().mean() > 0.8
     wanted = torch.arange(12) % 3 == torch.tensor([[0], [1]])
-    some = affine.register(*views, uv, start, wanted=wanted, window=WINDOW)
+    some = affine_alignment.register_affine(*views, uv, start, wanted=wanted, window=WINDOW)
     assert torch.equal(some.ok, found.ok & wanted) and torch.equal(some.uv_1[~wanted], start[~wanted])
     for name in found._fields:
         assert torch.equal(getattr(some, name)[wanted], getattr(found, name)[wanted]), name
@@ -158,7 +165,7 @@ def test_the_differentiable_step_is_one_regression_from_where_it_is_put():
         torch.from_numpy(np.random.default_rng(2).random((2, 6, 2, 2))) - 0.5
     )
     source, target = pyramids(src, dst, 1)
-    found = affine.step(source, target, uv, uv_1, linear, window=WINDOW)
+    found = affine_alignment.registration_step(source, target, uv, uv_1, linear, window=WINDOW)
     for b in range(2):
         here, there = (reference.levels(image[b], 1, WINDOW)[0] for image in (src, dst))
         for n in range(6):
@@ -174,7 +181,7 @@ def test_a_step_leaves_what_it_cannot_move():
     linear = torch.eye(2).double().repeat(2, 6, 1, 1)
     linear[:, 5, 0, 1] = math.nan
     uv, uv_1 = place.expand(2, -1, -1), place_1.expand(2, -1, -1)
-    found = affine.step(*pyramids(src, dst, 1), uv, uv_1, linear, window=WINDOW)
+    found = affine_alignment.registration_step(*pyramids(src, dst, 1), uv, uv_1, linear, window=WINDOW)
     moved = (found != uv_1).any(-1)
     assert found.isfinite().all()
     assert moved[:, [0, 1]].tolist() == [[False, True]] * 2
@@ -202,7 +209,7 @@ def test_valid_tracks_are_registered_and_rejected_ones_say_how_far_they_went(lin
     valid = torch.arange(20).view(2, 10) % 4 != 1
     options = {"window": WINDOW, "iterations": 9, "epsilon_px": 0.05, "max_shift_px": 0.9}
     images = (torch.zeros_like(src) if made else src, dst)
-    extra = {"hint": TrackHint(pyramid=Pyramids(src))} if made else {}
+    extra = {"hint": TrackHint(pyramid=PyramidCache(src))} if made else {}
     tracks = lucas_kanade_affine(*images, uv, track=given(uv, start, valid), **options, **extra)
     found, _, rms, cov, shift, ok = (torch.from_numpy(x) for x in by_hand(src, dst, uv, start, 9, 0.05, 0.9))
     old = given(uv, start, valid)()
@@ -226,7 +233,7 @@ def test_the_search_before_it_is_given_the_start_the_pyramid_and_the_levels():
         seen.append((*images, options))
         return lucas_kanade(*images, **options)
 
-    made = Pyramids(src)
+    made = PyramidCache(src)
     run = lambda **options: lucas_kanade_affine(src, dst, uv, track=track, **options)  # noqa: E731
     run(hint=TrackHint(uv + 1, made), window=WINDOW, levels=2)
     run(hint=TrackHint(levels=1), levels=3)
@@ -244,7 +251,7 @@ def test_the_usual_registration_takes_seven_steps_of_a_window_of_21_px_and_2_px_
     start = near(uv, spread=1.8)
     sure = torch.ones(2, 16, dtype=torch.bool)
     usual = lucas_kanade_affine(src, dst, uv, track=given(uv, start, sure))
-    plain = affine.register(*pyramids(src, dst, 2, 21), uv, start)
+    plain = affine_alignment.register_affine(*pyramids(src, dst, 2, 21), uv, start)
     expected = by_hand(src, dst, uv, start, 7, 0.01, 2.0, window=21)
     agrees(plain, expected, rtol=1e-5)
     np.testing.assert_allclose(usual.uv_1.numpy(), expected[0], rtol=1e-6)
@@ -266,8 +273,10 @@ def test_only_valid_tracks_have_a_derivative():
         for keep, some in ((valid, True), (~valid, False)):
             (slope,) = torch.autograd.grad(tracks.uv_1[keep].sum(), leaf, retain_graph=True, allow_unused=True)
             assert bool((slope != 0).any()) == some
-        linear = affine.register(*pyramids(src, dst), uv.detach(), options["track"]().uv_1, window=WINDOW).linear
-        again = affine.step(
+        linear = affine_alignment.register_affine(
+            *pyramids(src, dst), uv.detach(), options["track"]().uv_1, window=WINDOW
+        ).linear
+        again = affine_alignment.registration_step(
             *pyramids(src, dst, 1), leaf if leaf is uv else uv.detach(), tracks.uv_1, linear, window=WINDOW
         )
         (want,) = torch.autograd.grad(again[valid].sum(), leaf)
@@ -282,8 +291,8 @@ def test_a_picture_that_only_changes_along_rows_determines_no_motion():
     src = row.expand(2, 1, H, W).contiguous()
     uv = places(2, 6, H, W, margin=14)
     views, still = pyramids(src, src.roll(1, 3), 1), torch.eye(2, dtype=uv.dtype).expand(2, 6, 2, 2)
-    assert torch.equal(affine.step(*views, uv, uv + 0.3, still, window=WINDOW), uv + 0.3)
-    assert not affine.register(*views, uv, uv + 0.3, window=WINDOW).ok.any()
+    assert torch.equal(affine_alignment.registration_step(*views, uv, uv + 0.3, still, window=WINDOW), uv + 0.3)
+    assert not affine_alignment.register_affine(*views, uv, uv + 0.3, window=WINDOW).ok.any()
 
 
 def test_a_search_that_ends_with_more_noise_than_it_began_with_is_rejected():
@@ -293,7 +302,7 @@ def test_a_search_that_ends_with_more_noise_than_it_began_with_is_rejected():
     start = near(uv, spread=4.0)
     options = {"iterations": 1, "epsilon_px": 0.0, "max_shift_px": 50.0}
     for image in (dst, waves(2, H, W, seed=9)):
-        found = affine.register(*pyramids(src, image), uv, start, window=WINDOW, **options)
+        found = affine_alignment.register_affine(*pyramids(src, image), uv, start, window=WINDOW, **options)
         agrees(found, by_hand(src, image, uv, start, 1, 0.0, 50.0), rtol=1e-5)
 
 
@@ -309,7 +318,7 @@ def test_a_search_that_ends_outside_is_rejected_however_well_it_fits():
 
     uv = torch.tensor([[[7.0, 30.0], [7.0, 45.0], [7.0, 60.0], [9.0, 30.0], [9.0, 45.0], [9.0, 60.0]]]).double()
     truth = uv - torch.tensor([7.9, 0.0])
-    found = affine.register(
+    found = affine_alignment.register_affine(
         *pyramids(picture(u - 7.9), picture(u)), uv, truth + torch.tensor([0.6, 0.0]), window=WINDOW
     )
     assert found.ok.tolist() == [[False] * 3 + [True] * 3]

@@ -9,7 +9,7 @@ from kornia.geometry.camera import PinholeCamera
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.checks import all_finite, check, is_static, perhaps_any, surely_all
+from dhtorch.geometry.checks import all_finite, all_known, any_possible, check, is_static
 
 HW = (480, 640)
 
@@ -357,10 +357,10 @@ def test_shapes_are_static_in_graphs_and_transforms_only():
 
 def test_masks_are_looked_at_where_they_have_values_alone():
     all_, some, none = torch.tensor([True, True]), torch.tensor([True, False]), torch.tensor([False, False])
-    assert [surely_all(x) for x in (all_, some, none)] == [True, False, False]
-    assert [perhaps_any(x) for x in (all_, some, none)] == [True, True, False]
+    assert [all_known(x) for x in (all_, some, none)] == [True, False, False]
+    assert [any_possible(x) for x in (all_, some, none)] == [True, True, False]
     told = []
-    torch.vmap(lambda x: (told.append((surely_all(x), perhaps_any(x))), x)[1])(none[None])
+    torch.vmap(lambda x: (told.append((all_known(x), any_possible(x))), x)[1])(none[None])
     assert told == [(False, True)]
 
 

@@ -12,11 +12,11 @@ from torch import Tensor
 
 from dhtorch.geometry import coarse_flow as start
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.determinism import LANES
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES
 from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.records import TrackHint, Tracks
 from dhtorch.stages import track
-from dhtorch.stages.track import MIN_EIGENVALUE, lucas_kanade, lucas_kanade_affine
+from dhtorch.stages.track import MIN_TRACK_EIGENVALUE, lucas_kanade, lucas_kanade_affine
 
 H, W = 240, 320
 
@@ -52,7 +52,7 @@ def _pair(
     return seen(uv), seen(back), there
 
 
-def _share_near(flow: start.Flow, there: Tensor, limit_px: float) -> float:
+def _share_near(flow: start.CoarseFlow, there: Tensor, limit_px: float) -> float:
     """Share of the pixels still in sight whose start is closer than that to where they went."""
     v, u = torch.meshgrid(torch.arange(8, H - 8, 8), torch.arange(8, W - 8, 8), indexing="ij")
     uv = torch.stack([u, v], -1).reshape(1, -1, 2)
@@ -130,27 +130,27 @@ def test_neighbours_tell_what_a_repeated_pattern_cannot() -> None:
 
 def test_cells_hear_from_above_and_below_as_from_left_and_right() -> None:
     V = torch.randint(0, 1 << 14, (1, 2, 4, 5, 7, 7), generator=torch.Generator().manual_seed(0)).float()
-    told, turned = start._told(V), start._told(V.transpose(2, 3)).transpose(2, 3)
+    told, turned = start._aggregate_neighbours(V), start._aggregate_neighbours(V.transpose(2, 3)).transpose(2, 3)
     assert torch.equal(told, turned)
     for quiet in ((slice(1, None), slice(None)), (slice(None), slice(1, None))):  # one row, one column alone speaks
         alone = V.clone()
         alone[:, :, quiet[0], quiet[1]] = 0
-        assert bool((start._told(alone)[:, :, -1, -1] != 0).any())
+        assert bool((start._aggregate_neighbours(alone)[:, :, -1, -1] != 0).any())
 
 
 def test_what_is_upright_was_read_where_its_pixels_lie() -> None:
     v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
     a = math.radians(20.0)
     linear = 0.7 * torch.tensor([[[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]])
-    at = start.turned(linear, torch.stack([u, v], -1).reshape(1, -1, 2), (H, W)).reshape(H, W, 2)
+    at = start.apply_similarity(linear, torch.stack([u, v], -1).reshape(1, -1, 2), (H, W)).reshape(H, W, 2)
     inside = ((at >= 0) & (at <= torch.tensor([W - 1.0, H - 1.0]))).all(-1)
     for axis, ramp in enumerate((u, v)):
-        seen = start.upright((ramp / W)[None, None], linear, torch.tensor([0.5]))
+        seen = start.undo_similarity((ramp / W)[None, None], linear, torch.tensor([0.5]))
         torch.testing.assert_close(seen[0, 0][inside] * W * 0.5, at[..., axis][inside], atol=2e-3, rtol=0)
-    same = start.upright(u[None, None] / W, torch.eye(2)[None], torch.ones(1))
+    same = start.undo_similarity(u[None, None] / W, torch.eye(2)[None], torch.ones(1))
     assert torch.equal(same[0, 0], u / W)
     places = 300 * torch.rand(1, 500, 2, generator=torch.Generator().manual_seed(0))
-    assert torch.equal(start.turned(torch.eye(2)[None], places, (H, W)), places)
+    assert torch.equal(start.apply_similarity(torch.eye(2)[None], places, (H, W)), places)
 
 
 def test_one_pair_is_answered_as_in_a_batch() -> None:
@@ -167,7 +167,7 @@ def test_one_pair_is_answered_as_in_a_batch() -> None:
 def test_a_small_picture_says_where_its_pixels_lie(long: int) -> None:
     v, u = torch.meshgrid(torch.arange(float(H)), torch.arange(float(W)), indexing="ij")
     for ramp, axis in ((u, 0), (v, 1)):
-        picture = start.small((ramp / W)[None, None], long)
+        picture = start.downscale((ramp / W)[None, None], long)
         h, w = picture.grey.shape[-2:]
         assert max(h, w) <= long or picture.scale == 1
         at = torch.stack(torch.meshgrid(torch.arange(float(w)), torch.arange(float(h)), indexing="xy"), -1)
@@ -245,13 +245,13 @@ def test_a_start_spares_the_levels_it_does_not_need_and_no_others() -> None:
     """A point that was told where to look is searched for there and nowhere else; one that was not, everywhere."""
     a, b, _ = _pair(5, (40.0, 0.0))
     source, target = build_pyramid(a, 5, 21), build_pyramid(b, 5, 21)
-    o = lk.SearchOptions(21, 30, 0.01, MIN_EIGENVALUE, "bias")
-    x = (60 + 200 * torch.rand(2, LANES * 8, generator=torch.Generator().manual_seed(1))).clamp_max(H - 60)
+    o = lk.SearchOptions(21, 30, 0.01, MIN_TRACK_EIGENVALUE, "bias")
+    x = (60 + 200 * torch.rand(2, ELEMENTWISE_LANES * 8, generator=torch.Generator().manual_seed(1))).clamp_max(H - 60)
     expected = torch.tensor([[40.0], [0.0]]).expand_as(x)
     every, none = torch.ones_like(x[0], dtype=torch.bool), torch.zeros_like(x[0], dtype=torch.bool)
 
     def share(d: Tensor, begun: Tensor, near_levels: int) -> float:
-        found, ok, _ = lk.search(
+        found, ok, _ = lk.search_displacements(
             source, target, o, x, d, torch.zeros_like(x[0], dtype=torch.long), known=every, alike=False,
             begun=begun, near_levels=near_levels,
         )  # fmt: skip
@@ -270,8 +270,8 @@ def test_a_start_spares_the_levels_it_does_not_need_and_no_others() -> None:
 def test_a_larger_picture_needs_more_levels_from_a_start(width: int, levels: int) -> None:
     cells = torch.zeros(1, 10, 13)
     uv = torch.zeros(1, 10, 13, 2)
-    flow = start.Flow(uv, uv, cells, torch.eye(2)[None], torch.ones(1))
-    assert track._reaching(flow, (width * 3 // 4, width), 21) == levels
+    flow = start.CoarseFlow(uv, uv, cells, torch.eye(2)[None], torch.ones(1))
+    assert track._levels_for_flow(flow, (width * 3 // 4, width), 21) == levels
 
 
 def test_what_is_found_in_the_upright_picture_is_told_of_the_image():
@@ -279,9 +279,9 @@ def test_what_is_found_in_the_upright_picture_is_told_of_the_image():
     turn = 1.3 * torch.tensor([[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]])
     linear = torch.stack([turn, torch.eye(2)])
     middle = torch.tensor([[[W / 2, H / 2]]]).expand(2, 1, 2)
-    none = start.Flow(middle[:, None], middle[:, None], torch.ones(2, 1, 1), linear, torch.ones(2))
+    none = start.CoarseFlow(middle[:, None], middle[:, None], torch.ones(2, 1, 1), linear, torch.ones(2))
     image = torch.rand(2, 1, H, W, generator=torch.Generator().manual_seed(0))
-    undone = track._Upright(image, (none, none))
+    undone = track._DerotatedImage(image, (none, none))
     uv = torch.tensor([[150.0, 110.0], [2.0, 3.0], [-3.0, 3.0]]).expand(2, 3, 2)
     cov = torch.tensor([[4.0, 1.0], [1.0, 0.5]]).expand(2, 3, 2, 2)
     known = torch.ones(2, 3, dtype=torch.bool)

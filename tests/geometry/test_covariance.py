@@ -17,7 +17,7 @@ def positive(n, batch=2, seed=0):
 def test_the_covariance_is_the_inverse_times_the_variance():
     H, sigma = positive(6, 3), torch.tensor([0.5, 3.0, 2.0], dtype=D)
     H[1, 0], H[1, :, 0] = 0, 0
-    cov, ok = covariance.from_normal(H, sigma)
+    cov, ok = covariance.covariance_from_normal(H, sigma)
     assert ok.tolist() == [True, False, True] and (cov[1] == 0).all()
     for b in (0, 2):
         np.testing.assert_allclose(cov[b], float(sigma[b]) ** 2 * np.linalg.inv(H[b].numpy()), rtol=1e-9, atol=1e-12)
@@ -25,7 +25,7 @@ def test_the_covariance_is_the_inverse_times_the_variance():
 
 def test_a_covariance_is_symmetric_bit_for_bit():
     unit = torch.logspace(-3, 3, 5, dtype=D)
-    cov, ok = covariance.from_normal(unit[:, None] * positive(5, 20) * unit, torch.ones(20, dtype=D))
+    cov, ok = covariance.covariance_from_normal(unit[:, None] * positive(5, 20) * unit, torch.ones(20, dtype=D))
     assert ok.all() and torch.equal(cov, cov.mT)
 
 
@@ -51,7 +51,7 @@ def test_a_length_in_standard_deviations():
     ],
 )
 def test_the_median_of_the_used(values, used, wanted):
-    found = covariance.median(torch.tensor([values], dtype=D), torch.tensor([used], dtype=torch.bool))
+    found = covariance.masked_median(torch.tensor([values], dtype=D), torch.tensor([used], dtype=torch.bool))
     assert found.tolist() == [[wanted]]
 
 

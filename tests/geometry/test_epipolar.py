@@ -49,7 +49,7 @@ def triangulated(uv_0, uv_1, T=MOTIONS):
 
 
 def described(xyz, uv_0, uv_1, T=MOTIONS):
-    return epipolar.describe(xyz, uv_0, uv_1, CAMERA_0, CAMERA_1, T)
+    return epipolar.describe_triangulation(xyz, uv_0, uv_1, CAMERA_0, CAMERA_1, T)
 
 
 def close(a, b, rtol=1e-9, atol=1e-9):
@@ -125,10 +125,10 @@ def test_parallel_rays_meet_at_depth_zero():
 
 @pytest.mark.parametrize("points", [1, 7, 8, 9, 24, 1 << 15])
 def test_depths_in_pieces_are_those_of_triangulate(points, monkeypatch):
-    monkeypatch.setattr(epipolar, "POINTS", points)
+    monkeypatch.setattr(epipolar, "MAX_CHUNK_TRIANGULATED", points)
     for n in (0, 1, 12):
         uv_0, uv_1, _ = scene(n, noise_px=1.0)
-        found = epipolar.depths(uv_0, uv_1, CAMERA_0, CAMERA_1, MOTIONS)
+        found = epipolar.triangulate_depth(uv_0, uv_1, CAMERA_0, CAMERA_1, MOTIONS)
         assert torch.equal(found, triangulated(uv_0, uv_1).depth)
 
 
@@ -240,7 +240,7 @@ def test_lenses_of_the_cameras_play_no_part():
     """Pixels are ideal: a lens left in the camera is not applied again."""
     uv_0, uv_1, xyz = scene(noise_px=1.0)
     bent = [c.replace(distortion=double([0.2, 0, 0.01, 0]).expand(2, 4)) for c in (CAMERA_0, CAMERA_1)]
-    for fn, first in ((epipolar.triangulate, ()), (epipolar.describe, (xyz,))):
+    for fn, first in ((epipolar.triangulate, ()), (epipolar.describe_triangulation, (xyz,))):
         plain = fn(*first, uv_0, uv_1, CAMERA_0, CAMERA_1, MOTIONS)
         for a, b in zip(fn(*first, uv_0, uv_1, *bent, MOTIONS), plain, strict=True):
             assert torch.equal(a, b)
@@ -249,13 +249,13 @@ def test_lenses_of_the_cameras_play_no_part():
 def test_nothing_is_repeated_to_fit():
     """One view's pixels, camera or points for two pairs, or one pixel for many, are mistakes and no broadcasts."""
     uv, xyz, (a, b) = torch.zeros(2, 5, 2), torch.ones(2, 5, 3), (CAMERA_0, CAMERA_1)
-    for fn in (epipolar.triangulate, epipolar.depths):
+    for fn in (epipolar.triangulate, epipolar.triangulate_depth):
         for args in ((uv[:1], uv, a, b), (uv, uv[:, :1], a, b), (uv, uv, a[:1], b), (uv, uv, a, b[:1])):
             with pytest.raises(ValueError, match=f"{fn.__name__}.*expected"):
                 fn(*args, MOTIONS)
     for args in ((xyz[:1], uv, uv), (xyz, uv[:, :1], uv), (xyz, uv, uv[:, :1])):
         with pytest.raises(ValueError, match=r"describe.*expected"):
-            epipolar.describe(*args, a, b, MOTIONS)
+            epipolar.describe_triangulation(*args, a, b, MOTIONS)
     with pytest.raises(ValueError, match=r"point_jacobians.*expected"):
         epipolar.point_jacobians(a[:1], xyz)
 

@@ -7,7 +7,7 @@ import pytest
 import scipy.ndimage as ndi
 import torch
 
-from dhtorch.geometry.filters import box, gaussian, gaussian_taps, grey, separable
+from dhtorch.geometry.filters import box_mean, correlate_separable, gaussian_blur, gaussian_taps, grayscale
 from dhtorch.geometry.patches import luma
 
 
@@ -19,41 +19,41 @@ def pictures(seed=0):
 def test_correlation_along_both_axes(down, across):
     x = pictures()
     want = ndi.correlate1d(ndi.correlate1d(x.numpy(), down, axis=2, mode="nearest"), across, axis=3, mode="nearest")
-    np.testing.assert_allclose(separable(x, down, across).numpy(), want, atol=1e-12)
+    np.testing.assert_allclose(correlate_separable(x, down, across).numpy(), want, atol=1e-12)
 
 
 @pytest.mark.parametrize("sigma", [0.3, 1.0, 1.1, 2.6])
 def test_a_gaussian_reaches_four_deviations_and_is_scipys(sigma):
     x, reach = pictures(), math.ceil(4 * sigma)
     want = ndi.gaussian_filter(x.numpy(), sigma, mode="nearest", radius=reach, axes=(2, 3))
-    np.testing.assert_allclose(gaussian(x, sigma).numpy(), want, atol=1e-12)
+    np.testing.assert_allclose(gaussian_blur(x, sigma).numpy(), want, atol=1e-12)
     assert len(gaussian_taps(sigma)) == 2 * reach + 1
 
 
 def test_no_blur_leaves_the_picture():
-    assert gaussian_taps(0.0) == [1.0] and torch.equal(gaussian(pictures(), 0.0), pictures())
+    assert gaussian_taps(0.0) == [1.0] and torch.equal(gaussian_blur(pictures(), 0.0), pictures())
 
 
 @pytest.mark.parametrize("hw", [(240, 320), (256, 256)])
 def test_a_blurred_picture_does_not_depend_on_its_company(hw):
     """kornia filters so many pixels in another way when there are more of them."""
     x = torch.rand(3, 1, *hw, generator=torch.Generator().manual_seed(0))
-    for k, alone in enumerate(gaussian(one, 2.0) for one in x.split(1)):
-        assert torch.equal(gaussian(x, 2.0)[k : k + 1], alone)
+    for k, alone in enumerate(gaussian_blur(one, 2.0) for one in x.split(1)):
+        assert torch.equal(gaussian_blur(x, 2.0)[k : k + 1], alone)
 
 
 def test_a_blur_may_reach_less_far():
     want = ndi.gaussian_filter(pictures().numpy(), 1.2, mode="nearest", radius=2, axes=(2, 3))
-    np.testing.assert_allclose(gaussian(pictures(), 1.2, reach_px=2).numpy(), want, atol=1e-12)
-    assert gaussian(pictures()[:0], 1.2).shape == (0, 3, 9, 12)
+    np.testing.assert_allclose(gaussian_blur(pictures(), 1.2, reach_px=2).numpy(), want, atol=1e-12)
+    assert gaussian_blur(pictures()[:0], 1.2).shape == (0, 3, 9, 12)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_grey_is_that_of_patches_bit_for_bit(dtype):
     x = pictures().to(dtype)
-    assert torch.equal(grey(x), luma(x, 1)) and torch.equal(grey(x[:, :1]), x[:, :1])
+    assert torch.equal(grayscale(x), luma(x, 1)) and torch.equal(grayscale(x[:, :1]), x[:, :1])
     whole = (255 * x).to(torch.uint8)
-    assert torch.equal(grey(whole), luma(whole, 1)) and torch.equal(grey(whole[:, :1]), luma(whole[:, :1], 1))
+    assert torch.equal(grayscale(whole), luma(whole, 1)) and torch.equal(grayscale(whole[:, :1]), luma(whole[:, :1], 1))
 
 
 @pytest.mark.parametrize("sigma", [0.4, 1.0, 2.3])
@@ -73,13 +73,13 @@ def test_the_derivative_answers_1_to_a_slope_of_1(sigma):
 @pytest.mark.parametrize("radius", [0, 1, 3])
 def test_a_box_is_the_mean_of_a_square(radius):
     want = ndi.uniform_filter(pictures().numpy(), 2 * radius + 1, mode="nearest", axes=(2, 3))
-    np.testing.assert_allclose(box(pictures(), radius).numpy(), want, atol=1e-12)
+    np.testing.assert_allclose(box_mean(pictures(), radius).numpy(), want, atol=1e-12)
 
 
 def test_bad_taps_are_refused():
     for taps in (([1.0], [0.5, 0.5]), ([0.5, 0.5], [1.0])):
         with pytest.raises(ValueError, match="expected odd numbers"):
-            separable(pictures(), *taps)
+            correlate_separable(pictures(), *taps)
     for bad in ((-0.1, False), (math.nan, False), (0.0, True), (-1.0, True)):
         with pytest.raises(ValueError, match="expected a positive number"):
             gaussian_taps(*bad)

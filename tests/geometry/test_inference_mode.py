@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from dhtorch.geometry.inference_mode import spared
+from dhtorch.geometry.inference_mode import run_without_grad
 
 
 def seen(x, y):
@@ -16,7 +16,7 @@ def seen(x, y):
 def test_what_comes_out_may_enter_a_graph():
     weight = torch.ones(3, requires_grad=True)
     given = torch.arange(3.0)
-    out, inside = spared(seen, torch.arange(3.0), given)
+    out, inside = run_without_grad(seen, torch.arange(3.0), given)
     assert inside
     assert out["given"] is given
     assert not out["made"].is_inference()
@@ -28,20 +28,20 @@ def test_what_comes_out_may_enter_a_graph():
 @pytest.mark.parametrize("asks", ["x", "option"])
 def test_a_graph_that_is_asked_for_is_there(asks):
     x, y = (torch.ones(2, requires_grad=name == asks) for name in ("x", "option"))
-    (out, inside) = spared(seen, x, y=y)
+    (out, inside) = run_without_grad(seen, x, y=y)
     assert not inside
     assert out["made"].requires_grad == (asks == "x")
     with torch.no_grad():
-        assert spared(seen, x, y=y)[1]
+        assert run_without_grad(seen, x, y=y)[1]
 
 
 def test_transforms_and_compilers_see_the_function_itself():
     x = torch.arange(3.0)
-    (_, tangent) = torch.func.jvp(lambda x: spared(seen, x, x)[0]["made"], (x,), (torch.ones(3),))
+    (_, tangent) = torch.func.jvp(lambda x: run_without_grad(seen, x, x)[0]["made"], (x,), (torch.ones(3),))
     assert tangent.tolist() == [2.0, 2.0, 2.0]
     with torch.autograd.forward_ad.dual_level():
         dual = torch.autograd.forward_ad.make_dual(x, torch.ones(3))
-        out = spared(seen, dual, x)[0]["made"]
+        out = run_without_grad(seen, dual, x)[0]["made"]
         assert torch.autograd.forward_ad.unpack_dual(out).tangent.tolist() == [2.0, 2.0, 2.0]
-    compiled = torch.compile(lambda x: spared(torch.mul, x, 2), backend="eager", fullgraph=True)
+    compiled = torch.compile(lambda x: run_without_grad(torch.mul, x, 2), backend="eager", fullgraph=True)
     assert compiled(x).tolist() == [0.0, 2.0, 4.0]

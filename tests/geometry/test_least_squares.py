@@ -9,18 +9,18 @@ from dhtorch.geometry import least_squares, se3
 from dhtorch.geometry.least_squares import (
     MIN_DEPTH,
     MIN_PIVOT,
-    Normal,
-    choose,
+    NormalEquations,
     gauss_newton_step,
     linearise,
     minimise,
-    move,
+    move_pose,
     normal_equations,
-    reprojection,
-    robust,
+    reprojection_residuals,
+    robust_loss,
+    robust_weight_slope,
+    select_batch,
     solve_spd,
-    trial_step,
-    weight_slope,
+    trial_pose_step,
 )
 from dhtorch.geometry.se3 import Pose
 
@@ -72,7 +72,7 @@ def test_residuals_without_a_jacobian_are_those_with_one_bit_for_bit():
     T, f, c, xyz, uv = (x.to(torch.float32) for x in scene(3, 50))
     xyz[1, 2, :9] = -1.0  # behind
     rows, depth = linearise(T, f, c, xyz, uv)
-    r, z = reprojection(T, f, c, xyz, uv)
+    r, z = reprojection_residuals(T, f, c, xyz, uv)
     assert torch.equal(r, rows[:, 6]) and torch.equal(z, depth)
 
 
@@ -94,17 +94,17 @@ def plain_rho(square, kernel, k):
 def test_cost_weight_and_slope_are_a_formula_its_derivative_and_its_second(kernel, scale):
     r = torch.tensor([0.0, 1e-4, 0.3, 0.499, 0.501, 1.9, 1.999, 2.001, 3.0, 20.0], dtype=D)
     square = (r * r).requires_grad_()
-    rho, weight = robust(square, kernel, scale)
+    rho, weight = robust_loss(square, kernel, scale)
     np.testing.assert_allclose(rho.detach(), plain_rho(square.detach().numpy(), kernel, scale), rtol=1e-12, atol=1e-15)
     torch.testing.assert_close(torch.autograd.grad(rho.sum(), square, retain_graph=True)[0], weight)
     assert weight[0] == 1
     slope = torch.autograd.grad(weight.sum(), square)[0] if weight.requires_grad else torch.zeros_like(square)
     assert slope.isfinite().all()
-    torch.testing.assert_close(weight_slope(square, kernel, scale), slope, rtol=1e-12, atol=1e-15)
+    torch.testing.assert_close(robust_weight_slope(square, kernel, scale), slope, rtol=1e-12, atol=1e-15)
 
 
 def test_an_unknown_kernel_raises():
-    for function in (robust, weight_slope):
+    for function in (robust_loss, robust_weight_slope):
         with pytest.raises(ValueError, match="kernel is 'tukey'"):
             function(torch.ones(1), "tukey", 1.0)
 
@@ -215,15 +215,15 @@ def cayley(T, xi):
 
 def test_a_pose_moves_by_cayleys_map():
     T, xi = se3.exp(drawn(5, 6)), drawn(5, 6, seed=1)
-    moved = move(T, xi)
+    moved = move_pose(T, xi)
     for x, y in zip((moved.R, moved.t), cayley(T, xi), strict=True):
         torch.testing.assert_close(x, y)
     small = 1e-3 * xi
-    exact, near = se3.retract(T, small), move(T, small)
+    exact, near = se3.retract(T, small), move_pose(T, small)
     assert (exact.R - near.R).abs().max() < 3e-9 and (exact.t - near.t).abs().max() < 3e-6
 
 
-@pytest.mark.parametrize("step", [gauss_newton_step, trial_step])
+@pytest.mark.parametrize("step", [gauss_newton_step, trial_pose_step])
 def test_a_step_solves_the_normal_equations(step):
     T, H, g = se3.exp(drawn(3, 6)), positive(6, 3), 0.1 * drawn(3, 6, seed=1)
     H[1] = 0
@@ -235,7 +235,7 @@ def test_a_step_solves_the_normal_equations(step):
     if step is gauss_newton_step:
         assert torch.equal(moved.R[1], T.R[1]) and torch.equal(moved.t[1], T.t[1])
     else:
-        assert not trial_step(T, H.requires_grad_(), g)[0].R.requires_grad
+        assert not trial_pose_step(T, H.requires_grad_(), g)[0].R.requires_grad
 
 
 def test_one_step_passes_gradcheck_through_the_normal_equations():
@@ -261,7 +261,7 @@ def test_damping_follows_success_and_each_element_goes_its_own_way():
 
     def evaluate(x):
         places.append(x)
-        return Normal(costs[:, len(places) - 1], 2 * torch.eye(2).expand(4, 2, 2), x)
+        return NormalEquations(costs[:, len(places) - 1], 2 * torch.eye(2).expand(4, 2, 2), x)
 
     def step(x, H, g):
         assert torch.equal(x, g) and (H[:, 0, 1] == 0).all()  # equations of the place that is left
@@ -279,7 +279,7 @@ def test_the_first_step_is_damped_by_a_ten_thousandth():
     seen_H = []
 
     def evaluate(x):
-        return Normal(x[:, 0], H, x)
+        return NormalEquations(x[:, 0], H, x)
 
     minimise(evaluate, torch.zeros(1, 2, dtype=D), 1, step=lambda x, A, g: (seen_H.append(A), (x, x[:, 0] == 0))[1])
     torch.testing.assert_close(seen_H[0] - H, 1e-4 * torch.diag_embed(H.diagonal(dim1=1, dim2=2)), rtol=1e-9, atol=0)
@@ -291,7 +291,7 @@ def test_the_last_proposal_is_judged_by_its_cost_alone_and_may_be_rejected():
 
     def evaluate(x):
         asked.append(x)
-        return Normal(((x - 3) ** 2).sum(-1), torch.eye(1, dtype=D).expand(2, 1, 1), x - 3)
+        return NormalEquations(((x - 3) ** 2).sum(-1), torch.eye(1, dtype=D).expand(2, 1, 1), x - 3)
 
     def step(x, H, g):
         return x - g * torch.tensor([[0.5], [2.5]], dtype=D), torch.ones(2, dtype=torch.bool)  # the second overshoots
@@ -307,7 +307,7 @@ def test_the_last_proposal_is_judged_by_its_cost_alone_and_may_be_rejected():
 
 def test_a_last_step_that_could_not_be_solved_is_not_taken_however_little_it_costs():
     def evaluate(x):
-        return Normal(x[:, 0], torch.eye(1, dtype=D).expand(2, 1, 1), x)
+        return NormalEquations(x[:, 0], torch.eye(1, dtype=D).expand(2, 1, 1), x)
 
     def step(x, H, g):
         return x - 1, torch.tensor([True, False])
@@ -322,7 +322,7 @@ def test_minimise_descends_to_the_optimum_and_leaves_what_is_no_number():
     def evaluate(T):
         rows, _ = linearise(T, f, c, xyz, uv)
         one = torch.ones_like(rows[:, 0, 0])
-        return Normal((rows[:, 6] ** 2).sum((1, 2)), *normal_equations(rows, one))
+        return NormalEquations((rows[:, 6] ** 2).sum((1, 2)), *normal_equations(rows, one))
 
     start = se3.retract(T, torch.full((3, 6), 0.1, dtype=D))
     best, cost = minimise(evaluate, start, 8)
@@ -334,7 +334,7 @@ def test_minimise_descends_to_the_optimum_and_leaves_what_is_no_number():
 
 def test_choose_takes_whole_elements_of_trees():
     new, old = (Pose(x * torch.ones(3, 3, 3), x * torch.ones(3, 3)) for x in (1.0, 2.0))
-    mixed = choose(torch.tensor([True, False, True]), (new, torch.zeros(3)), (old, torch.ones(3)))
+    mixed = select_batch(torch.tensor([True, False, True]), (new, torch.zeros(3)), (old, torch.ones(3)))
     assert mixed[0].R[:, 1, 1].tolist() == [1, 2, 1] and mixed[0].t[:, 2].tolist() == [1, 2, 1]
     assert mixed[1].tolist() == [0, 1, 0]
 
@@ -345,10 +345,12 @@ def test_implicit_is_the_derivative_of_where_equations_end():
     root = a.detach().clone()
     for _ in range(50):
         root = root - (root + root**3 - a.detach()) / (1 + 3 * root**2)
-    found = root + least_squares.implicit(lambda xi: (root + xi) + (root + xi) ** 3 - a.detach(), root + root**3 - a)
+    found = root + least_squares.implicit_step(
+        lambda xi: (root + xi) + (root + xi) ** 3 - a.detach(), root + root**3 - a
+    )
     assert torch.equal(found, root)
     slope = torch.autograd.grad(found.sum(), a)[0]
     torch.testing.assert_close(slope, 1 / (1 + 3 * root**2), rtol=1e-5, atol=0)
-    flat = least_squares.implicit(lambda xi: 0 * xi, 2 * a)
+    flat = least_squares.implicit_step(lambda xi: 0 * xi, 2 * a)
     assert not flat.any() and not torch.autograd.grad(flat.sum(), a)[0].any()
-    assert not least_squares.implicit(lambda xi: xi, a.detach()).requires_grad
+    assert not least_squares.implicit_step(lambda xi: xi, a.detach()).requires_grad

@@ -18,22 +18,22 @@ def entries(A):
 
 def test_determinant_and_adjugate_are_those_of_numpy():
     A = matrices(50, 2, 2)
-    found = torch.stack(small.adjugate(*entries(A)), -1).unflatten(-1, (2, 2))
-    det = small.determinant(*entries(A))
+    found = torch.stack(small.adjugate_2x2(*entries(A)), -1).unflatten(-1, (2, 2))
+    det = small.determinant_2x2(*entries(A))
     np.testing.assert_allclose(det.numpy(), np.linalg.det(A.numpy()), rtol=1e-12)
     np.testing.assert_allclose((found @ A).numpy(), det[:, None, None].numpy() * np.eye(2), atol=1e-12)
 
 
 def test_the_inverse_of_a_singular_matrix_is_its_adjugate_over_the_least_determinant():
     A = matrices(50, 2, 2)
-    found = small.inverse(*entries(A), least=1e-12).movedim(0, -1).unflatten(-1, (2, 2))
+    found = small.inverse_2x2(*entries(A), least=1e-12).movedim(0, -1).unflatten(-1, (2, 2))
     np.testing.assert_allclose(found.numpy(), np.linalg.inv(A.numpy()), rtol=1e-10)
     one, two = torch.ones(2), torch.tensor([2.0, torch.nan])
-    assert small.inverse(one, two, one, two, least=0.5)[:, 0].tolist() == [4.0, -4.0, -2.0, 2.0]
-    assert small.inverse(one, two, one, two, least=0.5)[[0, 2]][1, 1] == -2.0, "no number counts as the least, too"
+    assert small.inverse_2x2(one, two, one, two, least=0.5)[:, 0].tolist() == [4.0, -4.0, -2.0, 2.0]
+    assert small.inverse_2x2(one, two, one, two, least=0.5)[[0, 2]][1, 1] == -2.0, "no number counts as the least, too"
     half = torch.tensor([0.5, 0.25, -0.25, -1.0], dtype=torch.float64)
     zero = torch.zeros_like(half)
-    found = small.inverse(half, zero, zero, torch.ones_like(half), least=0.25)[3]
+    found = small.inverse_2x2(half, zero, zero, torch.ones_like(half), least=0.25)[3]
     assert found.tolist() == [1.0, 1.0, -1.0, 1.0], "a determinant of the least size counts as it, with its sign lost"
 
 
@@ -45,13 +45,13 @@ def test_eigenvalues_are_those_of_numpy(equal):
         else matrices(9, 2, 2)
     )
     a, b, _, c = entries(A)
-    found = torch.stack(small.eigenvalues(a, b, c), -1)
+    found = torch.stack(small.eigenvalues_2x2(a, b, c), -1)
     np.testing.assert_allclose(found.numpy(), np.linalg.eigvalsh(A.mT.numpy()), rtol=1e-12, atol=1e-12)
 
 
 def test_equal_eigenvalues_pass_the_gradient_of_their_mean():
     a, b, c = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (2.0, 0.0, 2.0))
-    smaller, larger = small.eigenvalues(a, b, c)
+    smaller, larger = small.eigenvalues_2x2(a, b, c)
     for found in (smaller, larger):
         assert [float(g) for g in torch.autograd.grad(found, (a, b, c), retain_graph=True)] == [0.5, 0.0, 0.5]
 
@@ -60,20 +60,20 @@ def test_a_quadratic_form_reads_the_upper_half():
     S, v = matrices(20, 2, 2), matrices(20, 2, seed=1)
     whole = torch.triu(S) + torch.triu(S, 1).mT
     want = torch.einsum("ni,nij,nj->n", v, whole, v)
-    torch.testing.assert_close(small.quadratic(*v.unbind(-1), *small.upper(S)), want)
-    assert [x[3].item() for x in small.upper(S)] == [S[3, 0, 0].item(), S[3, 0, 1].item(), S[3, 1, 1].item()]
+    torch.testing.assert_close(small.quadratic_form(*v.unbind(-1), *small.upper_triangle(S)), want)
+    assert [x[3].item() for x in small.upper_triangle(S)] == [S[3, 0, 0].item(), S[3, 0, 1].item(), S[3, 1, 1].item()]
 
 
 def test_products_are_matrix_products():
     A, B = matrices(7, 3, 2), matrices(7, 2, 4, seed=1)
-    torch.testing.assert_close(small.product(A, B), A @ B)
-    planes = small.product_of_planes(A.movedim(0, -1), B.movedim(0, -1))
+    torch.testing.assert_close(small.small_matmul(A, B), A @ B)
+    planes = small.matmul_planes(A.movedim(0, -1), B.movedim(0, -1))
     torch.testing.assert_close(planes.movedim(-1, 0), A @ B)
     R, x = matrices(4, 3, 3), matrices(4, 3, 11, seed=1)
-    torch.testing.assert_close(small.turned(R, x), R @ x)
+    torch.testing.assert_close(small.rotate_planes(R, x), R @ x)
 
 
 def test_cofactors_are_the_inverse_transposed_times_the_determinant():
     A = matrices(9, 3, 3)
-    found = small.cofactors(A.movedim(0, -1)).movedim(-1, 0)
+    found = small.cofactor_planes(A.movedim(0, -1)).movedim(-1, 0)
     torch.testing.assert_close(found, torch.linalg.inv(A).mT * torch.linalg.det(A)[:, None, None])

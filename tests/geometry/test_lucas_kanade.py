@@ -10,10 +10,10 @@ from support import reference
 from support.textures import levels, places, waves
 
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.determinism import LANES
-from dhtorch.geometry.pyramid import Pyramids, build_pyramid
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES
+from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
 from dhtorch.records import TrackHint
-from dhtorch.stages.track import MIN_EIGENVALUE, lucas_kanade, refine
+from dhtorch.stages.track import MIN_TRACK_EIGENVALUE, lucas_kanade, refine_tracks
 
 H, W, WINDOW = 100, 122, 7
 FIELDS = ("uv_1", "error", "photometric", "cov", "valid")
@@ -38,7 +38,7 @@ def reference_options(o):
 
 def twin(src, dst, uv, init=None, limit=1.0, **options):
     """Tracks (B, N) by the slow search, and where that never left the fast one's maps."""
-    o = OPTIONS | {"min_eigenvalue": MIN_EIGENVALUE} | options
+    o = OPTIONS | {"min_eigenvalue": MIN_TRACK_EIGENVALUE} | options
     rows = []
     for b in range(len(uv)):
         views = [reference.levels(image[b], o["levels"], o["window"]) for image in (src, dst)]
@@ -246,7 +246,7 @@ def test_a_pyramid_made_before_is_used_in_the_images_place():
     src, dst = two_views()
     uv = places(2, 8, H, W, margin=12)
     other = waves(2, H, W, seed=9)
-    found = lucas_kanade(other, dst, uv, hint=TrackHint(pyramid=Pyramids(src)), **OPTIONS)
+    found = lucas_kanade(other, dst, uv, hint=TrackHint(pyramid=PyramidCache(src)), **OPTIONS)
     want = lucas_kanade(src, dst, uv, **OPTIONS)
     assert all(torch.equal(getattr(found, f), getattr(want, f)) for f in FIELDS)
     two = lucas_kanade(src, dst, uv, hint=TrackHint(levels=2), **OPTIONS)
@@ -262,7 +262,7 @@ def test_refining_is_one_step_of_regression(normalise, gain):
     src, dst = two_views((0.4, -0.3), gain, 0.1)
     uv = places(2, 8, H, W, margin=1)
     uv_1 = uv + torch.tensor([0.45, -0.2], dtype=uv.dtype)
-    found = refine(src, dst, uv, uv_1, window=WINDOW, normalise=normalise)
+    found = refine_tracks(src, dst, uv, uv_1, window=WINDOW, normalise=normalise)
     for b in range(2):
         level_0, level_1 = levels(src[b], 1, WINDOW)[0], levels(dst[b], 1, WINDOW)[0]
         for n in range(8):
@@ -285,7 +285,7 @@ def test_refining_leaves_what_it_cannot_refine():
         .expand(2, -1, -1)
     )
     uv_1 = torch.tensor([[61.0, 10.0], [61, 60], [5, 60], [W, 60], [62, 60], [62, math.inf]]).double().expand(2, -1, -1)
-    found = refine(src, dst, uv, uv_1, window=WINDOW)
+    found = refine_tracks(src, dst, uv, uv_1, window=WINDOW)
     want = uv_1.clone()
     want[:, 5, 1] = 0
     moved = torch.tensor([False, True, False, False, False, False])
@@ -293,7 +293,7 @@ def test_refining_leaves_what_it_cannot_refine():
     g, _ = reference.template(reference.levels(src[0], 1, WINDOW)[0], uv[0, 1], reference.Options(WINDOW))
     texture = float(torch.linalg.eigvalsh(g @ g.T)[0]) / WINDOW**2
     for share, stays in ((0.999, False), (1.001, True)):
-        found = refine(src, dst, uv, uv_1, window=WINDOW, min_eigenvalue=share * texture)
+        found = refine_tracks(src, dst, uv, uv_1, window=WINDOW, min_eigenvalue=share * texture)
         assert torch.equal(found[0, 1], uv_1[0, 1]) == stays
 
 
@@ -305,7 +305,7 @@ def test_the_usual_limit_of_texture_is_opencvs():
     (level,) = reference.levels(torch.from_numpy(wave / 255.0)[None], 1, 21)
     ours, _ = reference.template(level, torch.tensor([32.0, 32.0]).double(), reference.Options())
     small = float(torch.linalg.eigvalsh(ours @ ours.T)[0])
-    assert theirs / 1e-4 == pytest.approx(small / 21**2 / MIN_EIGENVALUE, rel=1e-6)
+    assert theirs / 1e-4 == pytest.approx(small / 21**2 / MIN_TRACK_EIGENVALUE, rel=1e-6)
 
 
 @pytest.mark.parametrize("normalise", NORMALISE)
@@ -315,14 +315,14 @@ def test_squares_are_those_of_the_windows(normalise):
     batch = torch.arange(9) % 2
     o = lk.SearchOptions(WINDOW, 1, 0.0, 0.0, normalise)
     pyramids = (build_pyramid(y, 1, WINDOW) for y in (src, dst))
-    found = lk.squares(*pyramids, o, x, d, batch)
+    found = lk.squared_differences(*pyramids, o, x, d, batch)
     for n in range(9):
         views = (reference.levels(y[n % 2], 1, WINDOW)[0] for y in (src, dst))
         slow = reference.Options(WINDOW, normalise=normalise)
         want = reference.difference(*views, x[:, n], (x + d)[:, n], slow)
         assert float(found[n]) == pytest.approx(want, rel=1e-9)
     dark = torch.full_like(dst, math.nan)
-    broken = lk.squares(build_pyramid(src, 1, WINDOW), build_pyramid(dark, 1, WINDOW), o, x, d, batch)
+    broken = lk.squared_differences(build_pyramid(src, 1, WINDOW), build_pyramid(dark, 1, WINDOW), o, x, d, batch)
     assert broken.tolist() == [WINDOW**2] * 9, "as black on white"
 
 
@@ -356,19 +356,19 @@ def test_some_are_replaced_and_the_others_kept():
     seen = []
 
     def double(x, y):
-        assert x.shape[-1] % LANES == 0
+        assert x.shape[-1] % ELEMENTWISE_LANES == 0
         seen.append(x)
         return 2 * x, y + 1
 
-    first, second = lk.for_some(wanted, double, values, (torch.arange(130.0) + 5, torch.ones(2, 130)))
+    first, second = lk.masked_apply(wanted, double, values, (torch.arange(130.0) + 5, torch.ones(2, 130)))
     assert torch.equal(first, torch.where(wanted, 2 * (torch.arange(130.0) + 5), torch.arange(130.0)))
     assert torch.equal(second, torch.where(wanted, 2.0, 0.0).expand(2, -1)) and set(seen[0].tolist()) == set(
         (torch.arange(130.0) + 5)[wanted].tolist()
     )
-    assert lk.for_some(wanted & False, double, values, values) is values and len(seen) == 1
+    assert lk.masked_apply(wanted & False, double, values, values) is values and len(seen) == 1
     low, high = torch.tensor([[0.0], [1.0]]), torch.tensor([[2.0], [3.0]])
     x = torch.tensor([[0.0, 2.0, 2.1, 1.0, 1.0, math.nan, -0.1], [1.0, 3.0, 2.0, 3.1, 0.9, 2.0, 2.0]])
-    assert lk.within(x, low, high).tolist() == [True, True, False, False, False, False, False]
+    assert lk.is_between(x, low, high).tolist() == [True, True, False, False, False, False, False]
 
 
 # --- options as they are and with a graph ----------------------------------------------------------------------------
@@ -401,7 +401,7 @@ def test_with_a_graph_valid_tracks_take_one_more_step(normalise, who):
     assert 0.1 < plain.valid.float().mean() < 0.95 and not plain.uv_1.requires_grad
     leaves[who] = leaves[who].requires_grad_()
     graph = lucas_kanade(*leaves, **options)
-    step = refine(*leaves, plain.uv_1, window=WINDOW, normalise=normalise, min_eigenvalue=1e-9)
+    step = refine_tracks(*leaves, plain.uv_1, window=WINDOW, normalise=normalise, min_eigenvalue=1e-9)
     assert torch.equal(graph.uv_1, torch.where(plain.valid[..., None], step, plain.uv_1))
     assert all(torch.equal(getattr(graph, f), getattr(plain, f)) for f in FIELDS[1:])
     assert not graph.error.requires_grad and not graph.cov.requires_grad

@@ -14,9 +14,9 @@ from dhtorch.geometry.map_estimate import (
     MEDIAN_2D,
     MIN_NOISE_PX,
     FitOptions,
-    Solution,
-    most_probable,
-    noise_scale,
+    MapSolution,
+    estimate_map_pose,
+    estimate_noise_variance,
     pose_covariance,
 )
 
@@ -55,7 +55,7 @@ def test_the_noise_is_that_of_medians_of_near_and_of_far_residuals(noise):
     tracks, at = problem(2, noise=noise, depth=0.004)
     tracks.near[0, 2], tracks.far[1, -3] = False, False
     tracks.ray[1, :, 3:5] *= -1
-    found = noise_scale(tracks, at)
+    found = estimate_noise_variance(tracks, at)
     for b in range(2):
         near, far = plain_noise(tracks, at, b)
         np.testing.assert_allclose(found[b, tracks.near[b]], near, rtol=1e-7)
@@ -66,7 +66,7 @@ def test_the_noise_is_that_of_medians_of_near_and_of_far_residuals(noise):
             assert near == far == pytest.approx(MAX_NOISE_PX**2)
         if noise == 0.6:
             assert 0.2 < near != far < 3
-    rounds = [noise_scale(tracks, at, rounds=k)[0, 0] for k in (1, 2, 3)]
+    rounds = [estimate_noise_variance(tracks, at, rounds=k)[0, 0] for k in (1, 2, 3)]
     if noise == 0.6:
         assert len(set(map(float, rounds))) == 3 and rounds[2] == found[0, 0]
 
@@ -74,7 +74,7 @@ def test_the_noise_is_that_of_medians_of_near_and_of_far_residuals(noise):
 def test_without_far_tracks_their_noise_is_that_of_the_near_ones():
     tracks, at = problem(1, 12, 8)
     alone = tracks.replace(far=tracks.far & False)
-    found = noise_scale(alone, at)
+    found = estimate_noise_variance(alone, at)
     near, far = plain_noise(alone, at, 0)
     assert near == far and np.allclose(found, near, rtol=1e-9)
 
@@ -127,7 +127,7 @@ def test_the_covariance_is_the_sandwich_of_an_m_estimator(o):
     tracks.ray[0, :, 4] *= -1  # behind the camera
     noise = torch.where(tracks.far, 0.5, 0.3).to(D) * torch.tensor([[1.0], [1.7]], dtype=D)
     far = torch.tensor([o.far_weight, 0.25 * o.far_weight], dtype=D)
-    solution = Solution(at, noise, far, torch.full((2,), 7.0, dtype=D), torch.ones(2) > 0)
+    solution = MapSolution(at, noise, far, torch.full((2,), 7.0, dtype=D), torch.ones(2) > 0)
     cov, ok = pose_covariance(tracks, solution, o)
     assert ok.all() and torch.equal(cov, cov.mT)
     for b in range(2):
@@ -142,7 +142,7 @@ def test_a_pose_that_is_not_determined_has_no_covariance():
     tracks.near[1, 0] = True
     noise = torch.full_like(tracks.inverse, 0.1)
     one = torch.ones(2, dtype=D)
-    cov, ok = pose_covariance(tracks, Solution(at, noise, one, one, one > 0), FitOptions())
+    cov, ok = pose_covariance(tracks, MapSolution(at, noise, one, one, one > 0), FitOptions())
     assert ok.tolist() == [True, False] and cov[0].any() and not cov[1].any()
 
 
@@ -169,14 +169,14 @@ def contradiction():
 def test_far_tracks_are_believed_up_to_the_rise_of_the_near_cost_that_is_allowed():
     tracks, at = contradiction()
     o = FitOptions(far_weight=0.5, turn_sigma=0.0, **LONG)
-    near, both = (most_probable(tracks, at.T, o._replace(max_rise=x)) for x in (-9.0, 1e9))
+    near, both = (estimate_map_pose(tracks, at.T, o._replace(max_rise=x)) for x in (-9.0, 1e9))
     assert float(near.far_weight) == 0 and float(both.far_weight) == 0.5
-    noise = noise_scale(tracks, both.at)
+    noise = estimate_noise_variance(tracks, both.at)
     before, after = (costs(tracks, x.at, noise, o, 0.5, only_near=True) for x in (near, both))
     rise = (after - 1.0) / before - 1
     assert 0.1 < rise < 3, "a case that depends on the option, and on one unit of slack"
     for share, believed in ((0.97, False), (1.03, True)):
-        found = most_probable(tracks, at.T, o._replace(max_rise=share * rise))
+        found = estimate_map_pose(tracks, at.T, o._replace(max_rise=share * rise))
         wanted = both if believed else near
         assert float(found.far_weight) == float(wanted.far_weight)
         torch.testing.assert_close(found.at.T.t, wanted.at.T.t, rtol=0, atol=1e-12)
@@ -185,16 +185,16 @@ def test_far_tracks_are_believed_up_to_the_rise_of_the_near_cost_that_is_allowed
 def test_a_turn_is_believed_from_the_share_of_the_cost_that_is_asked():
     tracks, at = problem(1, 30, 40, noise=0.3, depth=0.003, turn=0.002, seed=6)
     o = FitOptions(far_weight=0.5, max_rise=1e9, turn_sigma=0.003, translation_gain=-1e9, **LONG)
-    rigid, turned = (most_probable(tracks, at.T, o._replace(turn_gain=x)) for x in (1e9, -1e9))
+    rigid, turned = (estimate_map_pose(tracks, at.T, o._replace(turn_gain=x)) for x in (1e9, -1e9))
     assert float(rigid.turn_precision) > 1e12 and rigid.at.turn.abs().max() < 1e-9
     assert float(turned.turn_precision) == pytest.approx(0.003**-2) and turned.at.turn.abs().max() > 1e-4
-    noise = noise_scale(tracks, rigid.at)
+    noise = estimate_noise_variance(tracks, rigid.at)
     held = float((turned.at.turn**2).sum()) / 0.003**2
     before, after = costs(tracks, rigid.at, noise, o, 0.5), costs(tracks, turned.at, noise, o, 0.5) + held
     gain = (before - after - 1.0) / before
     assert 0.05 < gain < 0.9
     for share, believed in ((0.97, True), (1.03, False)):
-        found = most_probable(tracks, at.T, o._replace(turn_gain=share * gain))
+        found = estimate_map_pose(tracks, at.T, o._replace(turn_gain=share * gain))
         torch.testing.assert_close(found.at.turn, (turned if believed else rigid).at.turn, rtol=0, atol=1e-9)
 
 
@@ -203,7 +203,7 @@ def test_a_prior_holds_the_turn_to_its_standard_deviation():
     sizes = []
     for sigma in (1e-4, 1e-3, 0.1):
         o = FitOptions(turn_sigma=sigma, turn_gain=-1e9, max_rise=1e9, **LONG)
-        sizes.append(float(most_probable(tracks, at.T, o).at.turn.norm()))
+        sizes.append(float(estimate_map_pose(tracks, at.T, o).at.turn.norm()))
     assert sizes[0] < 0.2 * sizes[1] < 0.2 * sizes[2]
 
 
@@ -211,8 +211,8 @@ def test_a_translation_is_believed_from_the_share_that_no_rotation_takes_away():
     """The best pure rotation by scipy, from the written-out cost."""
     tracks, at = problem(1, 14, 30, noise=0.5, depth=0.003, baseline=0.004, seed=8)
     o = FitOptions(far_weight=0.5, max_rise=1e9, turn_sigma=0.0, **LONG)
-    solution = most_probable(tracks, at.T, o)
-    noise = noise_scale(tracks, solution.at)
+    solution = estimate_map_pose(tracks, at.T, o)
+    noise = estimate_noise_variance(tracks, solution.at)
     ray, uv, xx_xy_yy = (getattr(tracks, k)[0].numpy() for k in ("ray", "uv", "shape"))
     W = np.linalg.inv(xx_xy_yy[[0, 1, 1, 2]].T.reshape(-1, 2, 2) * noise[0].numpy()[:, None, None])
 
@@ -226,7 +226,7 @@ def test_a_translation_is_believed_from_the_share_that_no_rotation_takes_away():
     gain = (found.fun - costs(tracks, solution.at, noise, o, 0.5) - 1.0) / found.fun
     assert 0.05 < gain < 0.9
     for share, believed in ((0.98, True), (1.02, False)):
-        again = most_probable(tracks, at.T, o._replace(translation_gain=share * gain))
+        again = estimate_map_pose(tracks, at.T, o._replace(translation_gain=share * gain))
         assert bool(again.translates) is believed
 
 
@@ -236,7 +236,7 @@ def test_steps_are_counted():
     start = se3.retract(at.T, torch.full((1, 6), 0.01, dtype=D))
 
     def off(**options):
-        found = most_probable(tracks, start, FitOptions(turn_sigma=0.0, max_rise=1e9, **options)).at.T
+        found = estimate_map_pose(tracks, start, FitOptions(turn_sigma=0.0, max_rise=1e9, **options)).at.T
         return float((found.t - at.T.t).norm())
 
     still = off(near_steps=0, steps=0)
@@ -255,10 +255,10 @@ def test_where_they_stand_and_who_stands_beside_them_does_not_matter_to_tracks()
     wide = tracks.map(place)
     empty = order >= 32
     wide = wide.replace(near=wide.near & ~empty, far=wide.far & ~empty)
-    plain, mixed = most_probable(tracks, at.T, FitOptions()), most_probable(wide, at.T, FitOptions())
+    plain, mixed = estimate_map_pose(tracks, at.T, FitOptions()), estimate_map_pose(wide, at.T, FitOptions())
     torch.testing.assert_close(mixed.at.T.t, plain.at.T.t, rtol=0, atol=1e-9)
     torch.testing.assert_close(mixed.noise[:, ~empty], plain.noise[:, order[~empty]], rtol=1e-6, atol=0)
-    noise = noise_scale(tracks, plain.at)
+    noise = estimate_noise_variance(tracks, plain.at)
     near, far = (torch.where(kind, noise, 0).amax(-1, keepdim=True) for kind in (tracks.near, tracks.far))
     torch.testing.assert_close(plain.noise, torch.where(tracks.far, far, near), rtol=1e-9, atol=0)
     assert (mixed.noise[:, empty] == mixed.noise[:, wide.near[0]][:, :1]).all() and (near != far).all()
@@ -268,7 +268,7 @@ def test_a_few_near_tracks_behind_very_many_far_ones_are_the_first_to_be_solved(
     tracks, at = problem(1, 12, 300, seed=5)
     turned = tracks.map(lambda x: x.flip(-1) if x.shape[-1] == 312 else x)
     o = FitOptions(max_rise=-9.0, turn_sigma=0.0)  # the near tracks alone are answered
-    first, last = most_probable(tracks, at.T, o), most_probable(turned, at.T, o)
-    alone = most_probable(tracks.replace(far=tracks.far & False), at.T, o)
+    first, last = estimate_map_pose(tracks, at.T, o), estimate_map_pose(turned, at.T, o)
+    alone = estimate_map_pose(tracks.replace(far=tracks.far & False), at.T, o)
     for found in (first, last):
         torch.testing.assert_close(found.at.T.t, alone.at.T.t, rtol=0, atol=1e-9)

@@ -8,8 +8,8 @@ import pytest
 import torch
 from support.reference import luma, nearest, patch
 
-from dhtorch.geometry import patches as lookup
-from dhtorch.geometry.determinism import LANES
+from dhtorch.geometry import patches
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES
 
 H, W = 9, 13
 #: Pixels, some of whose patches lie beyond each border and corner.
@@ -44,31 +44,31 @@ def strided(image):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_halves_are_rounded_upwards(dtype):
     x = torch.tensor([-2.5, -1.5, -0.5, 0.5, 1.5, 2.5, 3.5, -0.75, -0.25, 0.49, 7.0, 1e6 + 0.5], dtype=dtype)
-    found = lookup.round_half_up(x.requires_grad_())
+    found = patches.round_half_up(x.requires_grad_())
     assert found.tolist() == [-2, -1, 0, 1, 2, 3, 4, -1, 0, 0, 7, 1e6 + 1]
     assert found.dtype == dtype and not found.requires_grad
 
 
 def test_a_place_lies_in_the_pixel_whose_middle_is_nearest_and_no_place_in_none():
     uv = torch.tensor([[[0.5, 1.49], [-0.5, -0.51], [2.5, 3.5], [math.nan, 2.0]]])
-    found = lookup.pixels(uv)
+    found = patches.containing_pixels(uv)
     assert found.tolist() == [[[1, 1], [0, -1], [3, 4], [-1, 2]]] and found.dtype == torch.int32
     nowhere = torch.tensor([[[x, 1.0], [1.0, x]] for x in (math.nan, math.inf, -math.inf, 1e30, -1e30)])
-    assert not lookup.nearest_index((H, W), lookup.pixels(nowhere))[1].any()
+    assert not patches.nearest_pixel_index((H, W), patches.containing_pixels(nowhere))[1].any()
 
 
 def test_the_nearest_pixel_is_read_and_border_pixels_beyond():
     grid = pictures()[:, 0]
     values = [-7.0, -0.51, -0.5, -0.1, 0.0, 0.49, 0.5, 1.5, 2.5, 7.9, 8.49, 8.5, 11.5, 12.49, 12.5, 40.0]
     uv = torch.tensor([[(u, v) for u in values for v in values]] * 2, dtype=torch.float64)
-    value, inside = lookup.nearest(grid, uv)
+    value, inside = patches.sample_nearest(grid, uv)
     for b in range(2):
         for n, (u, v) in enumerate(uv[b].tolist()):
             assert (value[b, n], bool(inside[b, n])) == nearest(grid[b], (u, v))
 
 
 def test_the_index_of_a_pixel_counts_along_rows():
-    index, inside = lookup.nearest_index((H, W), pixels())
+    index, inside = patches.nearest_pixel_index((H, W), pixels())
     want = [[min(max(v, 0), H - 1) * W + min(max(u, 0), W - 1) for u, v in row] for row in pixels().tolist()]
     assert index.tolist() == want and index.dtype == torch.int64
     assert inside.tolist() == [[0 <= u < W and 0 <= v < H for u, v in row] for row in pixels().tolist()]
@@ -79,7 +79,7 @@ def test_a_patch_fits_when_all_its_pixels_exist(size):
     every = torch.tensor([[(u, v) for u in range(-2, W + 2) for v in range(-2, H + 2)]], dtype=torch.int32)
     first, last = -(size // 2), size - size // 2 - 1
     want = [first + u >= 0 and last + u < W and first + v >= 0 and last + v < H for u, v in every[0].tolist()]
-    assert lookup.fits(every, (H, W), size).tolist() == [want]
+    assert patches.is_patch_inside(every, (H, W), size).tolist() == [want]
 
 
 # --- patches ---------------------------------------------------------------------------------------------------------
@@ -90,21 +90,21 @@ def test_a_patch_fits_when_all_its_pixels_exist(size):
 def test_patches_are_slices_moved_back_inside(layout, graph):
     image = layout(pictures()).requires_grad_(graph)
     corner = torch.tensor([[[0, 0], [-3, 2], [8, 4], [9, 5], [30, 30]], [[1, 3], [4, -9], [8, 5], [7, 0], [3, 4]]])
-    found = lookup.patches(image, corner, 5)
+    found = patches.extract_patches(image, corner, 5)
     for b in range(2):
         for n, (u, v) in enumerate(corner[b].tolist()):
             left, top = min(max(u, 0), W - 5), min(max(v, 0), H - 5)
             assert torch.equal(found[b, n], image[b, :, top : top + 5, left : left + 5])
     with pytest.raises(ValueError, match="smaller than a patch of 10x10"):
-        lookup.patches(image, corner, 10)
-    assert lookup.patches(image, corner, 9)[0, 0, 0].equal(image[0, 0, :, :9])
+        patches.extract_patches(image, corner, 10)
+    assert patches.extract_patches(image, corner, 9)[0, 0, 0].equal(image[0, 0, :, :9])
 
 
 def test_a_patches_gradient_falls_on_its_pixels():
     image = pictures(B=1).requires_grad_()
     corner = torch.tensor([[[1, 2], [2, 2]]])
     weight = torch.rand(1, 2, 3, 4, 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    (lookup.patches(image, corner, 4) * weight).sum().backward()
+    (patches.extract_patches(image, corner, 4) * weight).sum().backward()
     want = torch.zeros_like(image)
     for n, (u, v) in enumerate(corner[0].tolist()):
         want[0, :, v : v + 4, u : u + 4] += weight[0, n]
@@ -114,7 +114,7 @@ def test_a_patches_gradient_falls_on_its_pixels():
 @pytest.mark.parametrize("graph", [False, True])
 def test_windows_are_counted_through_a_stack_of_planes(graph):
     stack = pictures().requires_grad_(graph)  # six planes
-    found = lookup.windows(stack, torch.tensor([[4 * H * W + 2 * W + 3], [5 * H * W + 4 * W + 8]]), 5)
+    found = patches.extract_windows(stack, torch.tensor([[4 * H * W + 2 * W + 3], [5 * H * W + 4 * W + 8]]), 5)
     assert torch.equal(found[0, 0], stack[1, 1, 2:7, 3:8]) and torch.equal(found[1, 0], stack[1, 2, 4:9, 8:13])
 
 
@@ -134,7 +134,7 @@ def corner_and_sum(p):
 def test_summaries_are_those_of_a_loop_over_patches(layout, dtype, colour, grey):
     image = pictures(C=colour, dtype=dtype)
     for size in (4, 5):
-        found = lookup.summarise(layout(image), pixels(), size, corner_and_sum, grey=grey)
+        found = patches.reduce_patches(layout(image), pixels(), size, corner_and_sum, grey=grey)
         for b in range(2):
             for n, (u, v) in enumerate(pixels()[b].tolist()):
                 around = patch(image[b], (u, v), size).double()
@@ -154,25 +154,25 @@ def test_summaries_see_whole_lanes_of_a_few_patches_at_a_time(n, dtype, monkeypa
     seen = []
 
     def first(p):
-        assert p.shape[:2] == (3, 3) and p.shape[2] % LANES == 0
+        assert p.shape[:2] == (3, 3) and p.shape[2] % ELEMENTWISE_LANES == 0
         seen.append(p.shape[2])
         return (p[0, 0],)
 
-    (whole,) = lookup.summarise(image, pixel, 3, first, grey=True)
+    (whole,) = patches.reduce_patches(image, pixel, 3, first, grey=True)
     assert whole.shape == (2, n) and len(seen) == 1
-    monkeypatch.setattr(lookup, "NUMBERS", 3 * 3 * 3 * 128)
-    (parts,) = lookup.summarise(image, pixel, 3, first, grey=True)
+    monkeypatch.setattr(patches, "MAX_CHUNK_NUMBERS", 3 * 3 * 3 * 128)
+    (parts,) = patches.reduce_patches(image, pixel, 3, first, grey=True)
     assert torch.equal(parts, whole) and max(seen[1:]) <= 128
     assert len(seen) - 1 == max(1, -(-2 * n // 128)), "as many patches at a time as there is room for"
     want = [[patch(image[b], pixel[b, k].tolist(), 3)[:, 0, 0] for k in range(n)] for b in range(2)]
     if n:
-        grey = lookup.luma(torch.stack([torch.stack(x) for x in want]), -1)[..., 0]
+        grey = patches.luma(torch.stack([torch.stack(x) for x in want]), -1)[..., 0]
         torch.testing.assert_close(whole, grey)
 
 
 def test_a_summarys_gradient_falls_on_the_pixels_it_saw():
     image = pictures().requires_grad_()
-    (total,) = lookup.summarise(image, pixels(), 4, lambda p: (p[1].square().sum((0, 1)),))
+    (total,) = patches.reduce_patches(image, pixels(), 4, lambda p: (p[1].square().sum((0, 1)),))
     total.sum().backward()
     want = torch.zeros_like(image)
     for b in range(2):
@@ -184,7 +184,7 @@ def test_a_summarys_gradient_falls_on_the_pixels_it_saw():
 @pytest.mark.parametrize("how", ["autocast", "matmul"])
 def test_grey_values_of_bytes_keep_their_bits_where_products_lose_some(how):
     image = interleaved(pictures(dtype=torch.uint8))
-    read = lambda: lookup.summarise(image, pixels(), 5, corner_and_sum, grey=True)  # noqa: E731
+    read = lambda: patches.reduce_patches(image, pixels(), 5, corner_and_sum, grey=True)  # noqa: E731
     want = read()
     precision = torch.get_float32_matmul_precision()
     try:
@@ -201,7 +201,7 @@ def test_grey_values_of_bytes_keep_their_bits_where_products_lose_some(how):
 @pytest.mark.parametrize("grey", [False, True])
 def test_a_graph_reads_interleaved_bytes_as_python_does(grey):
     image = interleaved(pictures(dtype=torch.uint8))
-    read = lambda x, p: lookup.summarise(x, p, 5, corner_and_sum, grey=grey)  # noqa: E731
+    read = lambda x, p: patches.reduce_patches(x, p, 5, corner_and_sum, grey=grey)  # noqa: E731
     for x, y in zip(torch.compile(read, backend="eager")(image, pixels()), read(image, pixels()), strict=True):
         torch.testing.assert_close(x, y, rtol=1e-6, atol=0, check_dtype=False)
 
@@ -209,10 +209,10 @@ def test_a_graph_reads_interleaved_bytes_as_python_does(grey):
 def test_patches_larger_than_the_image_are_refused():
     for size, fine in ((9, True), (10, False)):
         if fine:
-            lookup.summarise(pictures(), pixels(), size, corner_and_sum)
+            patches.reduce_patches(pictures(), pixels(), size, corner_and_sum)
         else:
             with pytest.raises(ValueError, match=r"lookup.summarise: image of 9x13 pixels is smaller than .* 10x10"):
-                lookup.summarise(pictures(), pixels(), size, corner_and_sum)
+                patches.reduce_patches(pictures(), pixels(), size, corner_and_sum)
 
 
 # --- grey ------------------------------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def test_patches_larger_than_the_image_are_refused():
 def test_grey_is_opencvs(dim):
     rgb = pictures(dtype=torch.uint8).movedim(1, dim)
     for x in (rgb, rgb.float() / 255, rgb.double() / 255):
-        grey = lookup.luma(x, dim)
+        grey = patches.luma(x, dim)
         assert grey.dtype == (torch.float64 if x.dtype == torch.float64 else torch.float32)
         for b in range(2):
             theirs = cv2.cvtColor(rgb.float()[b].movedim(dim if dim < 0 else 0, -1).numpy() / 255, cv2.COLOR_RGB2GRAY)
@@ -232,12 +232,12 @@ def test_grey_is_opencvs(dim):
 
 def test_bytes_and_floats_of_one_picture_have_the_same_grey_bit_for_bit():
     rgb = pictures(dtype=torch.uint8)
-    assert torch.equal(lookup.luma(rgb, 1), lookup.luma(rgb.float() / 255, 1))
+    assert torch.equal(patches.luma(rgb, 1), patches.luma(rgb.float() / 255, 1))
     one = pictures(C=1, dtype=torch.uint8)
-    assert torch.equal(lookup.luma(one, 1), one.float() / 255)
-    assert lookup.luma(one.double(), 1).equal(one.double())
+    assert torch.equal(patches.luma(one, 1), one.float() / 255)
+    assert patches.luma(one.double(), 1).equal(one.double())
 
 
 def test_rounding_to_bytes_has_the_variance_that_residuals_are_not_believed_below():
     grey = torch.rand(1_000_000, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    assert float(((grey * 255).round() / 255 - grey).var()) == pytest.approx(lookup.QUANTISATION, rel=0.01)
+    assert float(((grey * 255).round() / 255 - grey).var()) == pytest.approx(patches.QUANTISATION_VARIANCE, rel=0.01)

@@ -5,11 +5,10 @@ import itertools
 import pytest
 import torch
 
-from dhtorch.geometry import plane_sweep as sweep
-from dhtorch.geometry import se3
+from dhtorch.geometry import plane_sweep, se3
 from dhtorch.geometry import windows as neighbours
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.filters import gaussian
+from dhtorch.geometry.filters import gaussian_blur
 
 
 def generator(seed=0):
@@ -18,7 +17,7 @@ def generator(seed=0):
 
 def texture(h, w, sigma=1.5, seed=0, dtype=torch.float32):
     """A picture of blobs with grey values in [0, 1]."""
-    image = gaussian(torch.rand(1, 1, h, w, generator=generator(seed), dtype=torch.float64), sigma)
+    image = gaussian_blur(torch.rand(1, 1, h, w, generator=generator(seed), dtype=torch.float64), sigma)
     return ((image - image.min()) / (image.max() - image.min())).to(dtype)
 
 
@@ -32,35 +31,35 @@ def wall(depth, t, *, angle=(0.0, 0.0, 0.0), hw=(96, 128), slope=0.0, dtype=torc
         torch.tensor([[110.0, 110.0]], dtype=dtype), torch.tensor([[w / 2 - 0.5, h / 2 - 0.5]], dtype=dtype)
     )
     picture = texture(h + 80, w + 80, dtype=dtype)
-    base = sweep.base(picture[..., 40:-40, 40:-40].contiguous(), camera)
+    base = plane_sweep.make_reference_view(picture[..., 40:-40, 40:-40].contiguous(), camera)
     T = se3.exp(torch.tensor([[*angle, *t]], dtype=dtype))
     q = (1 - slope * base.ray[..., 0]) / depth  # of the plane z = depth + slope x
     # every pixel of view 1 meets the wall where view 0 shows it
-    ray = sweep.pixel_rays(camera, hw)
+    ray = plane_sweep.pixel_rays(camera, hw)
     back = se3.invert(T)
     d, c = se3.rotate(back.R, ray), back.t[:, None]
     far = (depth + slope * c[..., 0] - c[..., 2]) / (d[..., 2] - slope * d[..., 0])
     x = c + far[..., None] * d
     plain = x[..., :2] / x[..., 2:] * camera.f[:, None] + camera.c[:, None]
-    seen = sweep.bilinear(picture, plain + 40)[0].unflatten(-1, hw)
-    return base, sweep.View(seen, camera, T), q.unflatten(-1, hw)
+    seen = plane_sweep.sample_bilinear(picture, plain + 40)[0].unflatten(-1, hw)
+    return base, plane_sweep.SweptView(seen, camera, T), q.unflatten(-1, hw)
 
 
 def test_bits_are_counted():
     x = torch.randint(0, 2**31 - 1, (500,), generator=generator(), dtype=torch.int32)
     x = torch.cat([x, torch.tensor([0, 1, 2**31 - 1], dtype=torch.int32)])
-    assert sweep.count_bits(x).tolist() == [int(v).bit_count() for v in x]
+    assert plane_sweep.count_set_bits(x).tolist() == [int(v).bit_count() for v in x]
 
 
 def test_a_census_compares_31_neighbours_with_the_middle():
     image = texture(12, 15)
-    code = sweep.census(image)[0]
-    assert len(set(sweep.OFFSETS)) == 31 and (0, 0) not in sweep.OFFSETS
+    code = plane_sweep.census_transform(image)[0]
+    assert len(set(plane_sweep.CENSUS_OFFSETS)) == 31 and (0, 0) not in plane_sweep.CENSUS_OFFSETS
     for i, j in itertools.product((0, 5, 11), (0, 7, 14)):
-        for k, (di, dj) in enumerate(sweep.OFFSETS):
+        for k, (di, dj) in enumerate(plane_sweep.CENSUS_OFFSETS):
             beside = image[0, 0, min(max(i + di, 0), 11), min(max(j + dj, 0), 14)]
             assert (int(code[i, j]) >> k) & 1 == int(beside < image[0, 0, i, j])
-    assert torch.equal(sweep.census(0.25 * image + 0.5)[0], code), "gain and bias change no sign"
+    assert torch.equal(plane_sweep.census_transform(0.25 * image + 0.5)[0], code), "gain and bias change no sign"
 
 
 @pytest.mark.parametrize(
@@ -72,18 +71,18 @@ def test_the_plane_of_least_cost_is_the_walls(t, angle):
     base, view, _ = wall(2.0, t, angle=angle)
     q = torch.linspace(0, 1, 33)[None]  # plane 16 is the wall's
     C = torch.zeros(1, 33, *base.hw, dtype=torch.uint8)
-    sweep.add_costs(C, base, view, q, torch.tensor([True]))
+    plane_sweep.add_census_costs(C, base, view, q, torch.tensor([True]))
     inner = C[:, :, 24:-24, 32:-32]
     assert (inner.argmin(1) - 16).abs().float().mean() < 2
-    best = sweep.winner(sweep.aggregate(C.movedim(1, -1)))
+    best = plane_sweep.best_plane(plane_sweep.aggregate_costs(C.movedim(1, -1)))
     apart = (best.plane + best.shift - 16)[:, 24:-24, 32:-32].abs()
     assert (apart < 1.5).float().mean() > 0.99 and float(apart.median()) < 0.5
     again = torch.zeros_like(C)
-    sweep.add_costs(again, base, view, q, torch.tensor([False]))
-    assert bool((again == sweep.UNSEEN).all()), "a view that is not wanted says nothing"
+    plane_sweep.add_census_costs(again, base, view, q, torch.tensor([False]))
+    assert bool((again == plane_sweep.UNSEEN_COST).all()), "a view that is not wanted says nothing"
     before = C.clone()
-    sweep.add_costs(C, base, view, q, torch.tensor([False]))
-    assert torch.equal(C, before + sweep.UNSEEN), "costs are added up"
+    plane_sweep.add_census_costs(C, base, view, q, torch.tensor([False]))
+    assert torch.equal(C, before + plane_sweep.UNSEEN_COST), "costs are added up"
 
 
 def best_path_cost(C, i, j, d, step, jump):
@@ -106,7 +105,7 @@ def best_path_cost(C, i, j, d, step, jump):
 @pytest.mark.parametrize(("views", "step", "jump"), [(1, 3, 18), (2, 3, 18), (1, 1, 4)])
 def test_aggregated_costs_are_those_of_four_paths(views, step, jump):
     C = torch.randint(0, 31, (2, 7, 6, 5), generator=generator(3), dtype=torch.uint8)
-    S = sweep.aggregate(C, torch.tensor([1, views]), step=step, jump=jump)
+    S = plane_sweep.aggregate_costs(C, torch.tensor([1, views]), step=step, jump=jump)
     for b, n in ((0, 1), (1, views)):
         for i, j, d in itertools.product((0, 3, 6), (0, 2, 5), (0, 2, 4)):
             down = best_path_cost(C[b, :, j].tolist(), i, j, d, n * step, n * jump)
@@ -117,7 +116,7 @@ def test_aggregated_costs_are_those_of_four_paths(views, step, jump):
 def test_the_winner_its_shift_and_its_cost():
     S = torch.randint(0, 400, (1, 40, 5, 12), generator=generator(4), dtype=torch.int16)
     S[0, 0, 0] = torch.tensor([90, 60, 20, 4, 8, 40, 50, 60, 70, 80, 90, 99], dtype=torch.int16)
-    found = sweep.winner(S)
+    found = plane_sweep.best_plane(S)
     for i, j in itertools.product(range(40), range(5)):
         cost = S[0, i, j].tolist()
         best = cost.index(min(cost))
@@ -138,8 +137,8 @@ def test_windows_are_fitted_to_walls_that_recede_and_to_other_light(slope, light
     view = view.replace(image=light[0] * view.image + light[1])
     q = truth + 0.01 + 0.01 * torch.randn(truth.shape, generator=generator())  # a quarter of a pixel, and noise
     for _ in range(4):
-        q = neighbours.smooth(q, torch.tensor([0.05]))
-        fit = sweep.fit_windows(base, view, sweep.with_gradients(view.image), q)
+        q = neighbours.smooth_within_tolerance(q, torch.tensor([0.05]))
+        fit = plane_sweep.fit_windows(base, view, plane_sweep.stack_gradients(view.image), q)
         q = q + fit.step.clamp(-0.05, 0.05)
     inner = slice(None), slice(16, -16), slice(24, -24)
     assert float((q - truth)[inner].abs().median()) < 0.0015  # a thirtieth of a pixel
@@ -150,10 +149,10 @@ def test_windows_are_fitted_to_walls_that_recede_and_to_other_light(slope, light
 def test_what_the_step_says_of_the_pictures_is_the_derivative_of_the_depth_that_fits():
     """A shift of view 1 along the epipolar line moves the depth by as much as the gradient claims."""
     base, view, truth = wall(2.0, (0.2, 0.0, 0.0), dtype=torch.float64)
-    picture = sweep.with_gradients(view.image)
+    picture = plane_sweep.stack_gradients(view.image)
     t = view.T_1_from_0.t.clone().requires_grad_()
     moved = view.replace(T_1_from_0=view.T_1_from_0.replace(t=t))
-    step = sweep.fit_windows(base, moved, picture, truth).step[0, 48, 64]
+    step = plane_sweep.fit_windows(base, moved, picture, truth).step[0, 48, 64]
     (g,) = torch.autograd.grad(step, t)
     # q · |t| is what the pictures show: d q / d t_x = - q / t_x at the depth that fits
     assert float(g[0, 0]) == pytest.approx(-0.5 / 0.2, rel=0.1)
@@ -162,20 +161,20 @@ def test_what_the_step_says_of_the_pictures_is_the_derivative_of_the_depth_that_
 def test_planes_and_edges_stay_when_a_map_is_smoothed():
     v, u = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
     slope = (0.3 + 0.01 * u - 0.005 * v)[None].double()
-    torch.testing.assert_close(neighbours.smooth(slope, torch.tensor([0.1])), slope)
+    torch.testing.assert_close(neighbours.smooth_within_tolerance(slope, torch.tensor([0.1])), slope)
     step = torch.where(u < 15, 0.3, 0.8)[None]
-    torch.testing.assert_close(neighbours.smooth(step, torch.tensor([0.1])), step)
+    torch.testing.assert_close(neighbours.smooth_within_tolerance(step, torch.tensor([0.1])), step)
     noisy = 0.5 + 0.02 * torch.randn(1, 40, 50, generator=generator())
-    assert float(neighbours.smooth(noisy, torch.tensor([0.2])).std()) < 0.3 * float(noisy.std())
+    assert float(neighbours.smooth_within_tolerance(noisy, torch.tensor([0.2])).std()) < 0.3 * float(noisy.std())
 
 
 def test_what_a_nearer_surface_covers_is_hidden():
     base, view, _ = wall(2.0, (0.2, 0.0, 0.0))
     q = torch.full((1, *base.hw), 0.25)
     q[:, :, 40:70] = 0.75  # a post before the wall, 11 px further along in view 1
-    found = sweep.hidden(sweep.travel(base, view), q, torch.tensor([0.1]))
+    found = plane_sweep.occlusion_mask(plane_sweep.epipolar_warp(base, view), q, torch.tensor([0.1]))
     assert bool(found[:, :, 72:80].all()) and not bool(found[:, :, 40:70].any()) and not bool(found[:, :, :39].any())
-    assert not bool(sweep.hidden(sweep.travel(base, view), q, torch.tensor([0.6])).any())
+    assert not bool(plane_sweep.occlusion_mask(plane_sweep.epipolar_warp(base, view), q, torch.tensor([0.6])).any())
 
 
 def test_a_lens_is_in_the_reading():
@@ -184,33 +183,37 @@ def test_a_lens_is_in_the_reading():
     base, view, _ = wall(2.0, (0.2, 0.0, 0.0))
     straight = base.camera
     camera = straight.replace(distortion=bent)
-    ray = sweep.pixel_rays(camera, base.hw)
+    ray = plane_sweep.pixel_rays(camera, base.hw)
     plain = ray[..., :2] * straight.f[:, None] + straight.c[:, None]
-    seen = sweep.bilinear(base.image, plain)[0].unflatten(-1, base.hw)
+    seen = plane_sweep.sample_bilinear(base.image, plain)[0].unflatten(-1, base.hw)
     q = torch.linspace(0, 1, 33)[None]
     C = torch.zeros(1, 33, *base.hw, dtype=torch.uint8)
-    sweep.add_costs(C, sweep.base(seen, camera), view, q, torch.tensor([True]))
-    assert (sweep.winner(sweep.aggregate(C.movedim(1, -1))).plane[:, 24:-24, 32:-32] == 16).float().mean() > 0.9
+    plane_sweep.add_census_costs(C, plane_sweep.make_reference_view(seen, camera), view, q, torch.tensor([True]))
+    assert (
+        plane_sweep.best_plane(plane_sweep.aggregate_costs(C.movedim(1, -1))).plane[:, 24:-24, 32:-32] == 16
+    ).float().mean() > 0.9
 
 
 def test_rivals_are_the_best_places_further_away():
     S = torch.randint(0, 400, (2, 7, 5, 12), generator=generator(6), dtype=torch.int16)
-    best, reach = sweep.winner(S), torch.tensor([2.0, 4.0])
+    best, reach = plane_sweep.best_plane(S), torch.tensor([2.0, 4.0])
     some = S[:, ::2, ::2]
-    found = sweep.rivals(some, best, reach)
+    found = plane_sweep.second_best_margin(some, best, reach)
     for b, i, j in itertools.product(range(2), range(7), range(5)):
         asked = S[b, i - i % 2, j - j % 2].tolist()
         at = asked.index(min(asked))
         others = [cost for k, cost in enumerate(asked) if abs(k - at) > reach[b]]
         assert int(found[b, i, j]) == min(others) - asked[at]
-    assert bool((sweep.rivals(some, best, torch.tensor([20.0, 20.0])) > 30_000).all()), "all in reach: there is none"
+    assert bool((plane_sweep.second_best_margin(some, best, torch.tensor([20.0, 20.0])) > 30_000).all()), (
+        "all in reach: there is none"
+    )
 
 
 def test_windows_are_summed_and_their_spread_is_known():
     q = torch.rand(2, 9, 11, generator=generator(), dtype=torch.float64)
     padded = torch.nn.functional.pad(q[:, None], (4, 4, 4, 4), mode="replicate")[:, 0]
     for radius in (1, 2, 4):
-        total, spread = neighbours.window_sum(q, radius), neighbours.spread(q, radius)
+        total, spread = neighbours.window_sum(q, radius), neighbours.window_range(q, radius)
         for i, j in itertools.product((0, 4, 8), (0, 5, 10)):
             window = padded[:, 4 + i - radius : 5 + i + radius, 4 + j - radius : 5 + j + radius].flatten(1)
             torch.testing.assert_close(total[:, i, j], window.sum(-1))

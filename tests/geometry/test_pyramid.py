@@ -8,7 +8,14 @@ import torch
 from support.textures import levels as levels_by_hand
 
 from dhtorch.geometry import windows as neighbours
-from dhtorch.geometry.pyramid import GRAD_X, GRAD_Y, GREY, MARGIN, REACH, build_pyramid
+from dhtorch.geometry.pyramid import (
+    GRAD_X_PLANE,
+    GRAD_Y_PLANE,
+    GREY_PLANE,
+    OUTSIDE_MARGIN_PX,
+    SEARCH_PADDING_PX,
+    build_pyramid,
+)
 
 
 def noise(B, C, H, W, seed=0, dtype=torch.float64):
@@ -18,10 +25,10 @@ def noise(B, C, H, W, seed=0, dtype=torch.float64):
 @pytest.mark.parametrize("hw", [(60, 81), (53, 64), (47, 47)])
 @pytest.mark.parametrize("band", [1 << 17, 500, 1])
 def test_levels_are_opencvs_mirrored_beyond_the_border_with_scharrs_gradients(hw, band, monkeypatch):
-    monkeypatch.setattr(neighbours, "BAND", band)
+    monkeypatch.setattr(neighbours, "MAX_BAND_PIXELS", band)
     image = noise(2, 1, *hw)
     found = build_pyramid(image, 3, 7)
-    assert found.pad == 7 // 2 + REACH and len(found.levels) == 3
+    assert found.pad == 7 // 2 + SEARCH_PADDING_PX and len(found.levels) == 3
     for b in range(2):
         for k, want in enumerate(levels_by_hand(image[b], len(found.levels), 7)):
             assert found.hw(k) == want.grey.shape
@@ -32,7 +39,7 @@ def test_the_next_level_is_kornias_blur_at_even_pixels_and_gradients_are_its_sch
     image = noise(2, 1, 40, 51)
     found = build_pyramid(image, 2, 5)
     inner = slice(found.pad, -found.pad)
-    grey = found.levels[1][:, GREY, inner, inner]
+    grey = found.levels[1][:, GREY_PLANE, inner, inner]
     binomial = torch.tensor([[1.0, 4, 6, 4, 1]], dtype=torch.float64) / 16
     blurred = kornia.filters.filter2d_separable(image, binomial, binomial, border_type="reflect")
     torch.testing.assert_close(grey, blurred[:, 0, ::2, ::2])
@@ -58,7 +65,7 @@ def test_a_pyramid_without_gradients_has_the_grey_values_alone():
     image = noise(2, 3, 47, 61)
     with_slopes, without = build_pyramid(image, 2, 9), build_pyramid(image, 2, 9, gradients=False)
     for level, grey in zip(with_slopes.levels, without.levels, strict=True):
-        assert level.shape[1] == 3 and torch.equal(level[:, GREY : GREY + 1], grey)
+        assert level.shape[1] == 3 and torch.equal(level[:, GREY_PLANE : GREY_PLANE + 1], grey)
 
 
 @pytest.mark.parametrize(("window", "least"), [(21, 22), (5, 11), (19, 20), (3, 10)])
@@ -79,7 +86,7 @@ def test_a_batch_without_images_has_levels_without_images():
 def test_as_many_levels_are_made_as_asked_for():
     assert [len(build_pyramid(noise(1, 1, 90, 90), n, 5).levels) for n in (1, 2, 3, 4, 9)] == [1, 2, 3, 4, 4]
     usual = build_pyramid(noise(1, 1, 180, 180), window=5), build_pyramid(noise(1, 1, 60, 60))
-    assert len(usual[0].levels) == 4 and usual[1].pad == 21 // 2 + REACH, "four, and windows of 21 px"
+    assert len(usual[0].levels) == 4 and usual[1].pad == 21 // 2 + SEARCH_PADDING_PX, "four, and windows of 21 px"
 
 
 @pytest.mark.parametrize(
@@ -102,7 +109,10 @@ def test_bounds_are_the_pixels_area_and_a_margin_on_coarse_levels():
     low, high = found.bounds()
     assert low.tolist() == [[-0.5], [-0.5]] and high.tolist() == [[76.5], [49.5]]
     low, high = found.bounds(1)  # where the same places lie on the level, MARGIN further out
-    assert low.tolist() == [[-0.25 - MARGIN]] * 2 and high.tolist() == [[38.25 + MARGIN], [24.75 + MARGIN]]
+    assert low.tolist() == [[-0.25 - OUTSIDE_MARGIN_PX]] * 2 and high.tolist() == [
+        [38.25 + OUTSIDE_MARGIN_PX],
+        [24.75 + OUTSIDE_MARGIN_PX],
+    ]
 
 
 def test_a_places_corner_is_the_pixel_left_of_and_above_it():
@@ -125,7 +135,7 @@ def test_windows_are_read_between_pixels(size, level):
     uv = np.random.default_rng(0).uniform([-3, -3], [W + 2, H + 2], (12, 2))
     uv[0], uv[1], uv[2] = (5, 7), (5.25, 7), (W - 1, H - 1)
     batch = torch.arange(12) % 2
-    for planes in ((GRAD_X, GRAD_Y, GREY), (GREY,), (GRAD_Y,)):
+    for planes in ((GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE), (GREY_PLANE,), (GRAD_Y_PLANE,)):
         read = found.windows(level, torch.from_numpy(uv.T), batch, size, planes)
         by_hand = [levels_by_hand(image[b], 2, 7)[level] for b in range(2)]
         for k, plane in enumerate(planes):
@@ -133,7 +143,7 @@ def test_windows_are_read_between_pixels(size, level):
             np.testing.assert_allclose(read[k].numpy(), want, atol=1e-12)
     assert torch.equal(
         found.windows(level, torch.from_numpy(uv.T), batch, size)[2],
-        found.windows(level, torch.from_numpy(uv.T), batch, size, (GREY,))[0],
+        found.windows(level, torch.from_numpy(uv.T), batch, size, (GREY_PLANE,))[0],
     )
 
 
@@ -141,12 +151,12 @@ def test_windows_begin_at_whole_pixels_with_the_rest_beside_them():
     image = noise(2, 1, 34, 45)
     found = build_pyramid(image, 1, 7)
     x = torch.tensor([[8.25, 20.0], [11.75, 3.5]], dtype=torch.float64)
-    first, fraction = found.locate(0, x, torch.tensor([1, 0]), 2, (GRAD_Y, GREY))
+    first, fraction = found.locate(0, x, torch.tensor([1, 0]), 2, (GRAD_Y_PLANE, GREY_PLANE))
     assert fraction.tolist() == [[0.25, 0.0], [0.75, 0.5]]
     read = found.read(0, first, 3)
     assert read.shape == (2, 2, 9)
     whole = read.view(2, 2, 3, 3)
-    for k, plane in enumerate((GRAD_Y, GREY)):
+    for k, plane in enumerate((GRAD_Y_PLANE, GREY_PLANE)):
         for n, (b, u, v) in enumerate(((1, 8, 11), (0, 20, 3))):
             left, top = u + found.pad - 2, v + found.pad - 2
             assert torch.equal(whole[k, n], found.levels[0][b, plane, top : top + 3, left : left + 3])

@@ -19,7 +19,7 @@ D = torch.float64
 @pytest.mark.parametrize("size", [1, 4, 7])
 def test_slots_are_counted_up_or_thinned_evenly(size):
     counts = [0, 1, 3, 4, 5, 7, 13, 700]
-    found = ransac.even_slots(torch.tensor(counts), size)
+    found = ransac.evenly_spaced_slots(torch.tensor(counts), size)
     for row, count in zip(found.tolist(), counts, strict=True):
         wanted = [min(i, max(count - 1, 0)) if count <= size else i * count // size for i in range(size)]
         assert row == wanted
@@ -132,7 +132,9 @@ def test_the_best_of_all_solutions_are_found_with_their_costs():
     points, f, c, _ = scenes(2, 24, noise=2.0)
     points[0, 3:, 15:], count = 0, torch.tensor([15, 24])
     draws = torch.rand(2, 9, 3, generator=torch.Generator().manual_seed(3), dtype=D)
-    pose, cost = ransac.search(points, count, f, c, draws, threshold_px=5.0, keep=3, preview=24, shortlist=36)
+    pose, cost = ransac.search_hypotheses(
+        points, count, f, c, draws, threshold_px=5.0, keep=3, preview=24, shortlist=36
+    )
     for b in range(2):
         best = every_cost(points[b], int(count[b]), f[b], c[b], draws[b], 5.0)[:3]
         np.testing.assert_allclose(cost[b], [x[0] for x in best], rtol=1e-9)
@@ -154,7 +156,7 @@ def test_a_preview_of_few_points_chooses_who_is_scored_on_all():
     draws = torch.tensor([[triple(1, 11, 25), triple(0, 8, 24)]], dtype=D)
     found = {}
     for preview in (5, 48):
-        pose, cost = ransac.search(
+        pose, cost = ransac.search_hypotheses(
             points, torch.tensor([40]), f, c, draws, threshold_px=2.0, keep=1, preview=preview, shortlist=1
         )
         found[preview] = pose.t[0, 0], float(cost)
@@ -167,11 +169,11 @@ def test_where_no_triple_has_a_solution_the_cost_is_infinite_and_the_pose_finite
     points, f, c, _ = scenes(2, 12)
     points[0, :3] = torch.ones(3, 1, dtype=D) * torch.arange(12)
     draws = torch.rand(2, 6, 3, generator=torch.Generator().manual_seed(0), dtype=D)
-    pose, cost = ransac.search(points, torch.tensor([12, 12]), f, c, draws, threshold_px=3.0)
+    pose, cost = ransac.search_hypotheses(points, torch.tensor([12, 12]), f, c, draws, threshold_px=3.0)
     assert cost.shape == (2, 2) and cost[0].isinf().all() and cost[1, 0].isfinite()
     assert pose.R.isfinite().all() and pose.t.isfinite().all()
     with pytest.raises(ValueError, match="at least 5 solutions"):
-        ransac.search(points, torch.tensor([12, 12]), f, c, draws[:, :1], threshold_px=3.0, keep=5)
+        ransac.search_hypotheses(points, torch.tensor([12, 12]), f, c, draws[:, :1], threshold_px=3.0, keep=5)
 
 
 # ------------------------------------------------------------------------------------------------ lines
@@ -187,15 +189,19 @@ def cross(across, along=1.0):
 
 def test_a_line_is_a_thousand_times_as_long_as_wide():
     used = torch.tensor([[1, 1, 1, 1, 0, 0]]) > 0
-    assert [bool(ransac.collinear(cross(s), used)) for s in (0.0, 0.9e-3, 1.1e-3, 0.5)] == [True, True, False, False]
-    assert [bool(ransac.collinear(cross(0.3, s), used)) for s in (0.25e-3, 0.4e-3)] == [True, False]
+    assert [bool(ransac.is_collinear(cross(s), used)) for s in (0.0, 0.9e-3, 1.1e-3, 0.5)] == [True, True, False, False]
+    assert [bool(ransac.is_collinear(cross(0.3, s), used)) for s in (0.25e-3, 0.4e-3)] == [True, False]
     three = torch.cat((cross(0.3), cross(0.0), cross(0.0)[..., [2, 3, 4, 5, 0, 1]]))
-    assert ransac.collinear(three, torch.cat((used, used, used[:, [2, 3, 4, 5, 0, 1]]))).tolist() == [False, True, True]
-    assert ransac.collinear(cross(0.5), torch.zeros(1, 6, dtype=torch.bool)).item()
-    assert ransac.collinear(cross(0.5), torch.tensor([[1, 0, 0, 0, 0, 0]]) > 0).item()
+    assert ransac.is_collinear(three, torch.cat((used, used, used[:, [2, 3, 4, 5, 0, 1]]))).tolist() == [
+        False,
+        True,
+        True,
+    ]
+    assert ransac.is_collinear(cross(0.5), torch.zeros(1, 6, dtype=torch.bool)).item()
+    assert ransac.is_collinear(cross(0.5), torch.tensor([[1, 0, 0, 0, 0, 0]]) > 0).item()
     unused = cross(0.0)
     unused[0, :, 4] = torch.tensor([0.5, 0.5, 3.0])
-    assert ransac.collinear(unused, used).item() and not ransac.collinear(unused, torch.ones_like(used)).item()
+    assert ransac.is_collinear(unused, used).item() and not ransac.is_collinear(unused, torch.ones_like(used)).item()
 
 
 def test_points_a_hundred_times_as_far_as_the_median_one_are_not_looked_at():
@@ -206,8 +212,8 @@ def test_points_a_hundred_times_as_far_as_the_median_one_are_not_looked_at():
     for reach, looked_at in ((199.0, True), (201.0, False)):
         xyz[0, 2, 5] = reach
         line[0, :2, 5] = torch.tensor([0.0, reach], dtype=D)
-        assert not ransac.collinear(xyz, used).item()
-        assert ransac.collinear(line, used).item() is not looked_at
+        assert not ransac.is_collinear(xyz, used).item()
+        assert ransac.is_collinear(line, used).item() is not looked_at
     xyz[0, 2, 5] = 1e10
-    assert not ransac.collinear(xyz, used).item()
-    assert not ransac.collinear(xyz.float(), used).item()
+    assert not ransac.is_collinear(xyz, used).item()
+    assert not ransac.is_collinear(xyz.float(), used).item()

@@ -6,11 +6,10 @@ import torch
 from support import reference
 from support.textures import levels, places, waves
 
-from dhtorch.geometry import affine_alignment as affine
-from dhtorch.geometry import patches as lookup
+from dhtorch.geometry import affine_alignment, patches
 from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.records import TrackHint
-from dhtorch.stages.track import lucas_kanade, refine
+from dhtorch.stages.track import lucas_kanade, refine_tracks
 
 H, W, WINDOW = 90, 106, 11
 
@@ -69,7 +68,7 @@ def test_tracks_agree_to_rounding(normalise, given):
     apart = (single.uv_1[0] - torch.stack([t.uv_1 for t in slow])).abs()[stayed & single.valid[0]]
     assert apart.max() < 2e-5
     # One step from where any search ended is the same step, whatever way led there.
-    again = refine(src, dst, uv, fast.uv_1, window=WINDOW, normalise=normalise)
+    again = refine_tracks(src, dst, uv, fast.uv_1, window=WINDOW, normalise=normalise)
     for n, (x, x_1) in enumerate(zip(uv[0], fast.uv_1[0], strict=True)):
         step = reference.one_step(views[1][0], x_1, *reference.template(views[0][0], x, o), o)
         torch.testing.assert_close(again[0, n], x_1 - step, rtol=0, atol=1e-12)
@@ -83,14 +82,14 @@ def test_registrations_agree_to_rounding():
     middle = torch.tensor([(W - 1) / 2, (H - 1) / 2]).double()
     start = (uv - middle) @ torch.tensor(turned).double().T + middle + torch.tensor([0.6, -0.5]).double()
     source, target = build_pyramid(src, 2, WINDOW), build_pyramid(dst, 2, WINDOW, gradients=False)
-    fast = affine.register(source, target, uv, start, window=WINDOW)
+    fast = affine_alignment.register_affine(source, target, uv, start, window=WINDOW)
     here, there = reference.levels(src[0], 1, WINDOW), reference.levels(dst[0], 2, WINDOW)
     slow = [reference.register(here, there, x, s, window=WINDOW) for x, s in zip(uv[0], start[0], strict=True)]
     assert fast.ok[0].tolist() == [t.ok for t in slow] and fast.ok.float().mean() > 0.7
     torch.testing.assert_close(fast.uv_1[0], torch.stack([t.uv_1 for t in slow]), rtol=0, atol=1e-12)
     torch.testing.assert_close(fast.linear[0], torch.stack([t.linear for t in slow]), rtol=0, atol=1e-12)
     torch.testing.assert_close(fast.cov[0], torch.stack([t.cov for t in slow]), rtol=1e-5, atol=0)
-    single = affine.register(
+    single = affine_alignment.register_affine(
         *(build_pyramid(y.float(), 2, WINDOW) for y in (src, dst)), uv.float(), start.float(), window=WINDOW
     )
     assert (single.uv_1[0] - torch.stack([t.uv_1 for t in slow])).abs().max() < 3e-5
@@ -101,15 +100,15 @@ def test_patches_agree_bit_for_bit_and_grey_values_to_the_last_bit(dtype):
     image = (picture(channels=3).clamp(0, 1) * 255).byte()
     image = image if dtype == torch.uint8 else image.float() / 255
     uv = places(1, 40, H, W, margin=-4)
-    pixel = lookup.pixels(uv)
-    seen = lookup.summarise(image[None], pixel, 5, lambda p: (p.float().amax((0, 1, 2)), p[1, 0, 3].float()))
-    corners = lookup.patches(image[None], pixel - 2, 5)
+    pixel = patches.containing_pixels(uv)
+    seen = patches.reduce_patches(image[None], pixel, 5, lambda p: (p.float().amax((0, 1, 2)), p[1, 0, 3].float()))
+    corners = patches.extract_patches(image[None], pixel - 2, 5)
     for n, (u, v) in enumerate(pixel[0].tolist()):
         want = reference.patch(image, (u, v), 5)
         assert torch.equal(corners[0, n], want)
         assert (seen[0][0, n], seen[1][0, n]) == (want.max().float(), want[1, 0, 3].float())
-    torch.testing.assert_close(lookup.luma(image, 0), reference.luma(image), atol=2e-7, rtol=0)
-    value, inside = lookup.nearest(image[:1].float(), uv)
+    torch.testing.assert_close(patches.luma(image, 0), reference.luma(image), atol=2e-7, rtol=0)
+    value, inside = patches.sample_nearest(image[:1].float(), uv)
     for n, x in enumerate(uv[0]):
         want, exists = reference.nearest(image[0].float(), x)
         assert value[0, n] == want and bool(inside[0, n]) == exists

@@ -5,9 +5,8 @@ import pytest
 import torch
 from support import dense_reprojection as dense
 
-from dhtorch.geometry import reprojection_problem as near_far
-from dhtorch.geometry import se3
-from dhtorch.geometry.reprojection_problem import Problem, Unknowns
+from dhtorch.geometry import reprojection_problem, se3
+from dhtorch.geometry.reprojection_problem import PoseDepthProblem, Unknowns
 
 D = torch.float64
 N = 16
@@ -44,7 +43,7 @@ def scene(off=0.5, turn=0.02, seed=0):
     variance = (0.02 * (1 + rand(2, N))) ** 2
     variance[:, 3] = 0
     shape = torch.stack((S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]), 1)
-    return Problem(f, c, ray, uv, q, variance, shape, near, far), Unknowns(T, turn)
+    return PoseDepthProblem(f, c, ray, uv, q, variance, shape, near, far), Unknowns(T, turn)
 
 
 def every(problem, at):
@@ -57,7 +56,7 @@ def every(problem, at):
 def test_pixels_are_turned_back_by_their_row():
     problem, at = scene()
     y = problem.ray[:, 1] / problem.ray[:, 2]
-    found = near_far.straighten(problem.uv, problem.f, problem.c, y, at.turn)
+    found = reprojection_problem.undo_rolling_shutter(problem.uv, problem.f, problem.c, y, at.turn)
     for b in range(2):
         for k in range(N):
             ray = np.append(((problem.uv[b, :, k] - problem.c[b]) / problem.f[b]).numpy(), 1.0)
@@ -66,7 +65,7 @@ def test_pixels_are_turned_back_by_their_row():
             np.testing.assert_allclose(found[b, :, k], wanted, rtol=1e-12)
     f = torch.ones(1, 2, dtype=D)
     wild = [[0.0, 0.8], [0.0, 1.0], [0.0, 1.2], [0.0, 0.95]]  # z = 1 - 0.8, 0, -0.2 and 0.05
-    edge = near_far.straighten(
+    edge = reprojection_problem.undo_rolling_shutter(
         torch.tensor([[[1.0] * 4, [0.0] * 4]], dtype=D),
         f,
         0 * f,
@@ -79,7 +78,7 @@ def test_pixels_are_turned_back_by_their_row():
 
 def test_tracks_are_linearised_at_their_inverse_depths():
     problem, at = scene()
-    linear = near_far.linearise_tracks(problem, at)
+    linear = reprojection_problem.linearise_tracks(problem, at)
     for b, tracks in enumerate(every(problem, at)):
         f = problem.f[b].numpy()
         assert linear.front[b].tolist() == [x.front for x in tracks]
@@ -98,35 +97,38 @@ def test_tracks_are_linearised_at_their_inverse_depths():
 def test_far_tracks_are_not_believed_without_a_near_one_to_bound_them():
     problem, at = scene()
     alone = problem.replace(near=problem.near & False)
-    assert not near_far.linearise_tracks(alone, at).front[:, list(FAR)].any()
+    assert not reprojection_problem.linearise_tracks(alone, at).front[:, list(FAR)].any()
 
 
 def test_whitened_rows_have_the_gram_matrix_of_the_eliminated_problem():
     """Six columns of the pose, three of the turn and the residual; far, near, known and unbounded inverse depths."""
     problem, at = scene()
-    linear = near_far.linearise_tracks(problem, at)
-    rows, squares = near_far.residuals(problem, linear, NOISE), near_far.squares(problem, linear, NOISE)
+    linear = reprojection_problem.linearise_tracks(problem, at)
+    rows, squares = (
+        reprojection_problem.whitened_residuals(problem, linear, NOISE),
+        reprojection_problem.squared_residuals(problem, linear, NOISE),
+    )
     for b, tracks in enumerate(every(problem, at)):
         for k, x in enumerate(tracks):
             if x.front:
                 gram = rows[b, :, :, k] @ rows[b, :, :, k].T
                 np.testing.assert_allclose(gram, x.gram, rtol=1e-6, atol=1e-9 * np.abs(x.gram).max())
             np.testing.assert_allclose(float(squares[b, k]), x.square, rtol=1e-6)
-    assert squares[0, BEHIND] == squares[0, EPIPOLE] == near_far.BEHIND
+    assert squares[0, BEHIND] == squares[0, EPIPOLE] == reprojection_problem.BEHIND_CAMERA_RESIDUAL
 
 
 def test_without_baseline_a_pixel_tells_nothing_of_depth_and_counts_in_full():
     problem, at = scene()
     at = at._replace(T=se3.Pose(at.T.R, 0 * at.T.t))
-    linear = near_far.linearise_tracks(problem, at)
-    squares = near_far.squares(problem, linear, NOISE)
+    linear = reprojection_problem.linearise_tracks(problem, at)
+    squares = reprojection_problem.squared_residuals(problem, linear, NOISE)
     for b in range(2):
         for k in (*range(8), *FAR):
             r = np.array([linear.u[b, 6, k], linear.v[b, 6, k]]) * problem.f[b].numpy()
             xx, xy, yy = problem.shape[b, :, k].tolist()
             S = float(NOISE[b, k]) * np.array([[xx, xy], [xy, yy]])
             np.testing.assert_allclose(float(squares[b, k]), r @ np.linalg.inv(S) @ r, rtol=1e-9)
-    assert near_far.residuals(problem, linear, NOISE).isfinite().all()
+    assert reprojection_problem.whitened_residuals(problem, linear, NOISE).isfinite().all()
 
 
 def test_a_baseline_of_a_tenth_of_a_millimetre_is_one():
@@ -136,7 +138,7 @@ def test_a_baseline_of_a_tenth_of_a_millimetre_is_one():
     Y = at.T.R @ problem.ray + problem.inverse[:, None] * at.T.t[..., None]
     uv = Y[:, :2] / Y[:, 2:] * problem.f[..., None] + problem.c[..., None]
     problem = problem.replace(uv=uv)
-    rows = near_far.residuals(problem, near_far.linearise_tracks(problem, at), NOISE)
+    rows = reprojection_problem.whitened_residuals(problem, reprojection_problem.linearise_tracks(problem, at), NOISE)
     for b, tracks in enumerate(every(problem, at)):
         for k in FAR:
             assert tracks[k].front and tracks[k].v == np.inf and tracks[k].s @ tracks[k].W @ tracks[k].s < 0.1
@@ -150,7 +152,9 @@ def test_a_baseline_of_a_tenth_of_a_millimetre_is_one():
 def test_without_a_turn_the_equations_are_those_of_the_pose_at_a_turn_of_zero():
     problem, at = scene(turn=0.0)
     weight, precision = torch.tensor([0.3, 0.7], dtype=D), torch.tensor([2e3, 5e4], dtype=D)
-    normal, cost = near_far.equations(problem, NOISE, weight, precision, kernel="cauchy", bend=1.5)
+    normal, cost = reprojection_problem.pose_normal_equations_at(
+        problem, NOISE, weight, precision, kernel="cauchy", bend=1.5
+    )
     still = at._replace(turn=torch.zeros_like(at.turn))
     whole, pose = normal(still), normal(at._replace(turn=None))
     torch.testing.assert_close(pose.H, whole.H[:, :6, :6], rtol=1e-12, atol=1e-9)
@@ -158,7 +162,7 @@ def test_without_a_turn_the_equations_are_those_of_the_pose_at_a_turn_of_zero():
     assert torch.equal(pose.cost, whole.cost)
     for x in (at, still, at._replace(turn=None)):
         assert torch.equal(cost(x), normal(x).cost)
-    moved, ok = near_far.step(at._replace(turn=None), pose.H, pose.g)
+    moved, ok = reprojection_problem.unknowns_step(at._replace(turn=None), pose.H, pose.g)
     assert moved.turn is None and ok.all() and not torch.equal(moved.T.R, at.T.R)
 
 
@@ -166,7 +170,9 @@ def test_without_a_turn_the_equations_are_those_of_the_pose_at_a_turn_of_zero():
 def test_normal_equations_are_the_schur_complement_of_one_with_all_inverse_depths(kernel):
     problem, at = scene()
     weight, precision = torch.tensor([0.3, 0.7], dtype=D), torch.tensor([2e3, 5e4], dtype=D)
-    cost, H, g = near_far.normal(problem, at, NOISE, weight, precision, kernel=kernel, bend=1.5)
+    cost, H, g = reprojection_problem.pose_normal_equations(
+        problem, at, NOISE, weight, precision, kernel=kernel, bend=1.5
+    )
     for b, tracks in enumerate(every(problem, at)):
         share = [(x.near + float(weight[b]) * x.far) * dense.weight(x.square, kernel, 1.5)[1] for x in tracks]
         wanted_H, wanted_g = dense.reduced(tracks, share)
@@ -189,12 +195,14 @@ def test_the_gradient_is_half_that_of_the_cost(kernel):
 
         def cost(x, problem=problem, at=at, precision=precision):
             moved = Unknowns(se3.retract(at.T, x[:, :6]), at.turn + x[:, 6:])
-            return near_far.normal(
+            return reprojection_problem.pose_normal_equations(
                 problem, moved, NOISE, torch.ones(2, dtype=D), precision, kernel=kernel, bend=2.0
             ).cost.sum()
 
         half = 0.5 * torch.autograd.functional.jacobian(cost, torch.zeros(2, 9, dtype=D))
-        g = near_far.normal(problem, at, NOISE, torch.ones(2, dtype=D), precision, kernel=kernel, bend=2.0).g
+        g = reprojection_problem.pose_normal_equations(
+            problem, at, NOISE, torch.ones(2, dtype=D), precision, kernel=kernel, bend=2.0
+        ).g
         parts = (slice(0, 3), slice(3, 6), slice(6, 9)) if turn else (slice(0, 3), slice(3, 6))
         for part in parts:
             torch.testing.assert_close(g[:, part], half[:, part], rtol=0, atol=rtol * float(half[:, part].abs().max()))
@@ -203,12 +211,17 @@ def test_the_gradient_is_half_that_of_the_cost(kernel):
 def test_a_prior_adds_its_own_cost_gradient_and_information_and_nothing_else():
     problem, at = scene()
     one, precision = torch.ones(2, dtype=D), torch.tensor([1e4, 3e5], dtype=D)
-    free, held = (near_far.normal(problem, at, NOISE, one, p, kernel="cauchy", bend=2.0) for p in (0 * one, precision))
+    free, held = (
+        reprojection_problem.pose_normal_equations(problem, at, NOISE, one, p, kernel="cauchy", bend=2.0)
+        for p in (0 * one, precision)
+    )
     torch.testing.assert_close(held.cost - free.cost, precision * (at.turn**2).sum(-1))
     torch.testing.assert_close((held.g - free.g)[:, 6:], precision[:, None] * at.turn)
-    torch.testing.assert_close(held.H - free.H, torch.diag_embed(near_far.prior(precision)), rtol=1e-9, atol=1e-6)
+    torch.testing.assert_close(
+        held.H - free.H, torch.diag_embed(reprojection_problem.shutter_prior(precision)), rtol=1e-9, atol=1e-6
+    )
     assert not (held.g - free.g)[:, :6].any()
-    assert near_far.prior(precision)[1].tolist() == [0.0] * 6 + [3e5] * 3
+    assert reprojection_problem.shutter_prior(precision)[1].tolist() == [0.0] * 6 + [3e5] * 3
 
 
 def test_elimination_is_the_schur_complement_of_the_whole_problem():
@@ -217,7 +230,7 @@ def test_elimination_is_the_schur_complement_of_the_whole_problem():
     used = [k for k in range(N) if k not in (3, BEYOND, EPIPOLE, BEHIND, UNUSED)]
     problem = problem.map(lambda x: x[..., used] if x.shape[-1] == N else x)
     noise, n = NOISE[:, used], len(used)
-    _, H, g = near_far.normal(
+    _, H, g = reprojection_problem.pose_normal_equations(
         problem, at, noise, torch.ones(2, dtype=D), torch.zeros(2, dtype=D), kernel=None, bend=1.0
     )
     for b in range(2):
@@ -249,7 +262,7 @@ def test_elimination_is_the_schur_complement_of_the_whole_problem():
 # ------------------------------------------------------------------------------------------------ steps
 
 
-@pytest.mark.parametrize("step", [near_far.step, near_far.trial_step])
+@pytest.mark.parametrize("step", [reprojection_problem.unknowns_step, reprojection_problem.trial_unknowns_step])
 def test_a_step_solves_for_the_pose_and_the_turn(step):
     g = torch.Generator().manual_seed(0)
     A, v = torch.randn(3, 9, 12, generator=g, dtype=D), torch.randn(3, 9, generator=g, dtype=D) * 0.1
@@ -265,5 +278,5 @@ def test_a_step_solves_for_the_pose_and_the_turn(step):
         np.testing.assert_allclose(moved.T.R[b], turn @ at.T.R[b].numpy(), rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(moved.T.t[b], turn @ at.T.t[b].numpy() + xi[3:6], rtol=1e-9)
         np.testing.assert_allclose(moved.turn[b], at.turn[b].numpy() + xi[6:], rtol=1e-9)
-    if step is near_far.step:
+    if step is reprojection_problem.unknowns_step:
         assert torch.equal(moved.turn[1], at.turn[1]) and torch.equal(moved.T.R[1], at.T.R[1])

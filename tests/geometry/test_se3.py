@@ -8,7 +8,7 @@ import torch
 from kornia.geometry.liegroup import Se3, So3
 
 from dhtorch.geometry import se3
-from dhtorch.geometry.determinism import LANES, filled, steady
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES, pad_elementwise, round_up
 from dhtorch.geometry.se3 import Pose
 
 #: Rotation angles on both sides of where the series end (0.1 rad), up to beyond half a turn.
@@ -219,7 +219,7 @@ def test_the_gradient_of_an_angle_is_one_along_its_axis():
 # ------------------------------------------------------------------------------------------------ steady rounding
 
 
-@pytest.mark.parametrize("shape", [(1,), (7, 3), (LANES,), (2, LANES + 1), (0, 3), ()])
+@pytest.mark.parametrize("shape", [(1,), (7, 3), (ELEMENTWISE_LANES,), (2, ELEMENTWISE_LANES + 1), (0, 3), ()])
 def test_functions_are_handed_whole_strides_in_one_row(shape):
     """No element is left over for the scalar loop, whose rounding differs."""
     seen = []
@@ -229,25 +229,27 @@ def test_functions_are_handed_whole_strides_in_one_row(shape):
         return torch.atan2(a, b)
 
     a = torch.rand(shape, generator=torch.Generator().manual_seed(0))
-    found = steady(fn, a, 1 + a)
-    count = -(-a.numel() // LANES) * LANES
+    found = pad_elementwise(fn, a, 1 + a)
+    count = -(-a.numel() // ELEMENTWISE_LANES) * ELEMENTWISE_LANES
     assert seen == [((count,), (count,))]
     torch.testing.assert_close(found, torch.atan2(a, 1 + a))
 
 
 def test_an_element_s_value_does_not_hang_on_its_place():
     x = torch.linspace(-6, 6, 203)
-    alone = torch.cat([steady(torch.sigmoid, v[None]) for v in x])
-    assert torch.equal(steady(torch.sigmoid, x), alone)
-    assert LANES % 32 == 0, "two registers of sixteen"
+    alone = torch.cat([pad_elementwise(torch.sigmoid, v[None]) for v in x])
+    assert torch.equal(pad_elementwise(torch.sigmoid, x), alone)
+    assert ELEMENTWISE_LANES % 32 == 0, "two registers of sixteen"
 
 
 def test_unequal_shapes_are_refused():
     with pytest.raises(ValueError, match=r"shapes are \[\(3,\), \(1,\)\], expected equal shapes"):
-        steady(torch.atan2, torch.ones(3), torch.ones(1))
+        pad_elementwise(torch.atan2, torch.ones(3), torch.ones(1))
     with pytest.raises(ValueError, match="equal shapes"):
-        steady(torch.atan2, torch.ones(2, 3), torch.ones(3, 2))
+        pad_elementwise(torch.atan2, torch.ones(2, 3), torch.ones(3, 2))
 
 
 def test_rows_are_filled_up_to_whole_lanes():
-    assert [filled(n, 16) for n in (0, 1, 15, 16, 17, 32)] == [16, 16, 16, 16, 32, 32] and filled(1) == LANES
+    assert [round_up(n, 16) for n in (0, 1, 15, 16, 17, 32)] == [16, 16, 16, 16, 32, 32] and round_up(
+        1
+    ) == ELEMENTWISE_LANES

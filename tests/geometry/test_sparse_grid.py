@@ -31,21 +31,21 @@ def some_cells(n, reach, seed):
 def test_numbers_are_written_with_21_bits_for_each_axis_and_sort_as_places_do():
     edge = (-REACH - 1, -REACH, -1, 0, 5, REACH - 1, REACH)
     ijk = list(itertools.product(edge, edge, edge))
-    key = sparse_grid.pack(torch.tensor(ijk))
-    assert key.tolist() == [number(x) for x in ijk] and sparse_grid.NOWHERE == -1
+    key = sparse_grid.pack_cells(torch.tensor(ijk))
+    assert key.tolist() == [number(x) for x in ijk] and sparse_grid.OUT_OF_RANGE == -1
     inside = [x for x, k in zip(ijk, key.tolist(), strict=True) if k >= 0]
     assert len(inside) == 5**3 and inside == sorted(inside)
-    assert sparse_grid.unpack(key[key >= 0]).tolist() == [list(x) for x in inside]
+    assert sparse_grid.unpack_cells(key[key >= 0]).tolist() == [list(x) for x in inside]
     assert (key[key >= 0].diff() > 0).all()
 
 
 def test_numbers_are_found_where_they_stand():
     keys = torch.tensor([-1, 3, 4, 9, 100])
     wanted = torch.tensor([[100, 4, 5], [-1, 101, -7]])
-    at, found = sparse_grid.find(keys, wanted)
+    at, found = sparse_grid.find_cells(keys, wanted)
     assert at.tolist() == [[4, 2, 0], [0, 0, 0]]
     assert found.tolist() == [[True, True, False], [True, False, False]]
-    at, found = sparse_grid.find(keys[:0], wanted)
+    at, found = sparse_grid.find_cells(keys[:0], wanted)
     assert at.tolist() == [[0] * 3] * 2 and not found.any() and found.shape == (2, 3)
 
 
@@ -55,7 +55,7 @@ def test_points_fall_into_the_cells_that_division_says(side):
     xyz = np.concatenate([draw.uniform(-2, 2, (40, 3)), draw.integers(-4, 5, (40, 3)) * side]).astype(np.float32)
     xyz[0], xyz[1] = (0.7, -0.7, 0.0), (1.0, -0.5, -1.0)  # 0.7f is less than 7 steps of 0.1, on the border of a cell
     want = sorted({number(math.floor(float(x) / side) for x in p) for p in xyz})
-    found = sparse_grid.occupied(torch.from_numpy(xyz).view(2, 40, 3), side)
+    found = sparse_grid.occupied_cells(torch.from_numpy(xyz).view(2, 40, 3), side)
     assert found.tolist() == want and found.dtype == torch.int64
 
 
@@ -64,20 +64,20 @@ def test_points_out_of_reach_are_nowhere():
     inside = [[far - 0.25, 0.0, 0.0], [0.0, 0.25 - far, 0.0]]
     outside = [[far, 0.0, 0.0], [0.0, 0.0, far], [0.0, 2 * far, 0.0], [0.0, -2 * far, 0.0]]
     hopeless = [[math.nan, 0.0, 0.0], [0.0, math.inf, 0.0], [0.0, 0.0, -math.inf]]
-    found = sparse_grid.occupied(torch.tensor(inside + outside + hopeless, dtype=torch.float64), 0.25)
+    found = sparse_grid.occupied_cells(torch.tensor(inside + outside + hopeless, dtype=torch.float64), 0.25)
     assert found.tolist() == sorted([number((REACH - 1, 0, 0)), number((0, 1 - REACH, 0))])
     for side in (0.0, -1.0, math.nan):
         with pytest.raises(ValueError, match="expected a positive length"):
-            sparse_grid.occupied(torch.zeros(1, 3), side)
+            sparse_grid.occupied_cells(torch.zeros(1, 3), side)
 
 
 def test_near_cells_are_those_that_touch():
     ijk, keys = some_cells(60, 5, seed=1)
     others, other_keys = some_cells(25, 5, seed=2)
     want = [any(touch(a, b) for b in others) for a in ijk]
-    assert sparse_grid.near(keys, other_keys).tolist() == want and 0.3 < np.mean(want) < 0.8
+    assert sparse_grid.touches_cells(keys, other_keys).tolist() == want and 0.3 < np.mean(want) < 0.8
     for step in itertools.product((-2, -1, 0, 1, 2), repeat=3):
-        near = sparse_grid.near(torch.tensor([number((0, 0, 0))]), torch.tensor([number(step)]))
+        near = sparse_grid.touches_cells(torch.tensor([number((0, 0, 0))]), torch.tensor([number(step)]))
         assert near.tolist() == [touch((0, 0, 0), step)]
 
 
@@ -101,13 +101,13 @@ def by_flooding(ijk):
 def test_components_are_those_of_a_walk_from_cell_to_cell(n, reach):
     ijk, keys = some_cells(n, reach, seed=n)
     want = by_flooding(ijk)
-    assert sparse_grid.components(keys).tolist() == want and 3 < max(want) < len(ijk) - 5
+    assert sparse_grid.connected_components(keys).tolist() == want and 3 < max(want) < len(ijk) - 5
 
 
 def test_sparse_grid_hang_together_by_faces_edges_and_corners():
     steps = list(itertools.product((-1, 0, 1), repeat=3))
     ijk = sorted({(10 * k + s * i, s * j, s * h) for k, (i, j, h) in enumerate(steps) for s in (0, 1)})
-    labels = sparse_grid.components(torch.tensor([number(x) for x in ijk])).tolist()
+    labels = sparse_grid.connected_components(torch.tensor([number(x) for x in ijk])).tolist()
     assert labels == by_flooding(ijk) and max(labels) == 26
 
 
@@ -116,5 +116,5 @@ def test_a_long_chain_is_one_component_and_no_cells_are_none():
     chain = sorted({tuple(x) for x in turns.tolist()})
     lone = (chain[0][0], chain[0][1], chain[0][2] + 5)  # between the first and the last of the chain
     ijk = sorted([*chain, lone])
-    assert sparse_grid.components(torch.tensor([number(x) for x in ijk])).tolist() == by_flooding(ijk)
-    assert sparse_grid.components(torch.zeros(0, dtype=torch.int64)).tolist() == []
+    assert sparse_grid.connected_components(torch.tensor([number(x) for x in ijk])).tolist() == by_flooding(ijk)
+    assert sparse_grid.connected_components(torch.zeros(0, dtype=torch.int64)).tolist() == []

@@ -12,10 +12,21 @@ from support.room_truth import room_distance
 from dhtorch import MAP, extend
 from dhtorch.codes import Gate, Source
 from dhtorch.data.recording import Recording
-from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3, sparse_grid
-from dhtorch.integrate import View, confirmed, empty, fuse, level, mesh, points, recording, splat, sweeps
+from dhtorch.integrate import (
+    DepthView,
+    drop_unconfirmed,
+    extract_mesh,
+    extract_points,
+    fuse_views,
+    level,
+    make_volume,
+    recording,
+    splat_points,
+    sweeps,
+)
 from dhtorch.pipeline import dense
 from dhtorch.pytree import collate
 from dhtorch.records import Camera, DepthMap, Estimate, Pose, Samples, Tracks
@@ -30,7 +41,7 @@ def view(frame, sigma=0.005, T=None):
     colour = frame.image.permute(0, 2, 3, 1).float() / 255
     camera = frame.depth_camera or frame.camera
     T = frame.T_world_from_cam if T is None else T
-    return View(frame.depth, torch.full_like(frame.depth, sigma), colour, camera, T)
+    return DepthView(frame.depth, torch.full_like(frame.depth, sigma), colour, camera, T)
 
 
 def wall(z=2.0, sigma=0.01, colour=0.5, hw=(60, 80)):
@@ -38,7 +49,7 @@ def wall(z=2.0, sigma=0.01, colour=0.5, hw=(60, 80)):
     camera = Camera(torch.tensor([[100.0, 100.0]]), torch.tensor([[39.5, 29.5]]))
     depth = torch.full((1, *hw), z)
     features = torch.full((1, *hw, 1), colour)
-    return View(depth, torch.full_like(depth, sigma), features, camera, se3.identity(1, depth))
+    return DepthView(depth, torch.full_like(depth, sigma), features, camera, se3.identity(1, depth))
 
 
 def height(surface):
@@ -47,9 +58,9 @@ def height(surface):
 
 @pytest.fixture(scope="module")
 def box():
-    volume = empty(VOXEL, channels=3)
+    volume = make_volume(VOXEL, channels=3)
     for frame in walk(4, hw=(96, 128), camera=Camera(torch.tensor([[123.0, 116.5]]), torch.tensor([[67.5, 44.0]]))):
-        volume = fuse(volume, view(frame))
+        volume = fuse_views(volume, view(frame))
     return volume
 
 
@@ -58,7 +69,7 @@ def box():
 
 def test_points_and_mesh_lie_on_the_walls_of_the_box(box):
     pytest.importorskip("skimage")
-    for surface in (points(box), mesh(box)):
+    for surface in (extract_points(box), extract_mesh(box)):
         off = off_wall(surface.xyz) * BOX.min()
         assert len(surface.xyz) > 3000 and float(off.median()) < 0.001 and float(off.quantile(0.99)) < VOXEL / 4
         inward = (surface.normal.double() * -surface.xyz.double().sign()).amax(-1)
@@ -67,7 +78,7 @@ def test_points_and_mesh_lie_on_the_walls_of_the_box(box):
 
 def test_a_mesh_faces_the_open_side_and_has_no_seams(box):
     pytest.importorskip("skimage")
-    surface = mesh(box)
+    surface = extract_mesh(box)
     a, b, c = surface.xyz.double()[surface.face].unbind(1)
     area = torch.linalg.cross(b - a, c - a)
     towards = (area * -a).sum(-1)
@@ -84,7 +95,7 @@ def test_a_mesh_faces_the_open_side_and_has_no_seams(box):
 
 
 def test_colours_are_those_of_the_pictures(box):
-    surface = points(box)
+    surface = extract_points(box)
     tone = [
         torch.sin(3 * surface.xyz[:, 0] + 1),
         torch.sin(4 * surface.xyz[:, 1] - surface.xyz[:, 0]),
@@ -97,10 +108,10 @@ def test_colours_are_those_of_the_pictures(box):
 def seen_from_four_places(hw, voxel):
     """Exact depth of the built-in room: recording, volume, all that was seen."""
     source = SyntheticRoom(lidar="exact", hw=hw, supersample=1)
-    volume, seen = empty(voxel, channels=3), []
+    volume, seen = make_volume(voxel, channels=3), []
     for i in (0, 3, 6, 9):
         one = view(source[i], T=source.true_poses[i : i + 1])
-        volume = fuse(volume, one)
+        volume = fuse_views(volume, one)
         v, u = torch.meshgrid(torch.arange(hw[0]), torch.arange(hw[1]), indexing="ij")
         uv = torch.stack((u, v), -1).view(1, -1, 2).float()
         xyz = cameras.unproject(one.camera, uv, one.depth.flatten(1))
@@ -116,20 +127,28 @@ def room():
 def test_the_furnished_room_is_found_exactly_and_completely(room):
     pytest.importorskip("skimage")
     _, volume, seen = room
-    surface = mesh(volume)
+    surface = extract_mesh(volume)
     error = room_distance(surface.xyz)
     assert float(error.median()) < 0.002 and float(error.mean()) < 0.006 and float(error.quantile(0.99)) < 0.05
-    there, found = sparse_grid.occupied(seen, 0.03), sparse_grid.occupied(surface.xyz, 0.03)
-    assert float(sparse_grid.near(there, found).double().mean()) > 0.97, "complete: what was seen is in the map"
+    there, found = sparse_grid.occupied_cells(seen, 0.03), sparse_grid.occupied_cells(surface.xyz, 0.03)
+    assert float(sparse_grid.touches_cells(there, found).double().mean()) > 0.97, (
+        "complete: what was seen is in the map"
+    )
 
 
 def test_no_surface_where_nothing_was_seen(room):
     pytest.importorskip("skimage")
     _, volume, seen = room
-    reach = sparse_grid.occupied(seen, volume.truncation + volume.voxel)
-    for surface in (mesh(volume), points(volume)):
-        assert bool(sparse_grid.near(sparse_grid.occupied(surface.xyz, volume.truncation + volume.voxel), reach).all())
-        near = sparse_grid.near(sparse_grid.occupied(surface.xyz, 0.03), sparse_grid.occupied(seen, 0.03))
+    reach = sparse_grid.occupied_cells(seen, volume.truncation + volume.voxel)
+    for surface in (extract_mesh(volume), extract_points(volume)):
+        assert bool(
+            sparse_grid.touches_cells(
+                sparse_grid.occupied_cells(surface.xyz, volume.truncation + volume.voxel), reach
+            ).all()
+        )
+        near = sparse_grid.touches_cells(
+            sparse_grid.occupied_cells(surface.xyz, 0.03), sparse_grid.occupied_cells(seen, 0.03)
+        )
         assert float(near.double().mean()) > 0.97, "nor far beside what was seen"
 
 
@@ -154,7 +173,7 @@ def test_open3d_finds_the_same_surface():
         lens = o3d.camera.PinholeCameraIntrinsic(320, 240, fx, fy, cx, cy)
         theirs.integrate(rgbd, lens, np.linalg.inv(se3.to_matrix(walk_through.true_poses[i : i + 1])[0].numpy()))
     other = np.asarray(theirs.extract_triangle_mesh().vertices)
-    surface = mesh(volume)
+    surface = extract_mesh(volume)
     ours = surface.xyz.numpy()
     there, back = spatial.cKDTree(other).query(ours)[0], spatial.cKDTree(ours).query(other)[0]
     assert np.median(there) < 1e-4 and np.quantile(there, 0.9) < 0.002 and np.quantile(there, 0.99) < 0.01
@@ -167,55 +186,55 @@ def test_open3d_finds_the_same_surface():
 
 def test_overlap_is_blended_by_precision_and_order_does_not_matter():
     near, far = wall(2.00, sigma=0.01), wall(2.03, sigma=0.02)
-    one = fuse(fuse(empty(0.02, channels=1), near), far)
-    other = fuse(fuse(empty(0.02, channels=1), far), near)
+    one = fuse_views(fuse_views(make_volume(0.02, channels=1), near), far)
+    other = fuse_views(fuse_views(make_volume(0.02, channels=1), far), near)
     expected = (2.00 * 4 + 2.03) / 5
-    assert height(points(one)) == pytest.approx(expected, abs=0.002)
-    assert height(points(other)) == pytest.approx(height(points(one)), abs=1e-5)
-    sigma = points(one).sigma
+    assert height(extract_points(one)) == pytest.approx(expected, abs=0.002)
+    assert height(extract_points(other)) == pytest.approx(height(extract_points(one)), abs=1e-5)
+    sigma = extract_points(one).sigma
     assert float(sigma.median()) == pytest.approx(1 / math.sqrt(1 / 0.01**2 + 1 / 0.02**2), rel=0.05)
 
 
 def test_a_batch_of_views_is_one_after_the_other_bit_for_bit():
     both = collate([wall(2.0), wall(2.02)])
-    together = fuse(empty(0.02, channels=1), both)
-    apart = fuse(fuse(empty(0.02, channels=1), wall(2.0)), wall(2.02))
-    again = fuse(empty(0.02, channels=1), both)
+    together = fuse_views(make_volume(0.02, channels=1), both)
+    apart = fuse_views(fuse_views(make_volume(0.02, channels=1), wall(2.0)), wall(2.02))
+    again = fuse_views(make_volume(0.02, channels=1), both)
     for name in ("key", "distance", "weight", "features"):
         assert torch.equal(getattr(together, name), getattr(again, name)), "the same every time"
-    at, found = sparse_grid.find(together.key, apart.key)
+    at, found = sparse_grid.find_cells(together.key, apart.key)
     assert bool(found.all())
     known = apart.weight.sum(-1) > 0
     torch.testing.assert_close(together.distance[at][known], apart.distance[known], atol=0.02, rtol=0)
 
 
 def test_the_volume_that_was_fused_into_is_unchanged():
-    before = fuse(empty(0.02, channels=1), wall(2.0))
+    before = fuse_views(make_volume(0.02, channels=1), wall(2.0))
     kept = before.map(torch.clone)
-    fuse(before, wall(2.02))
+    fuse_views(before, wall(2.02))
     for name in ("key", "distance", "weight", "features"):
         assert torch.equal(getattr(before, name), getattr(kept, name))
 
 
 def test_sources_keep_their_own_weights_and_the_largest_names_a_point():
     sigmas = {Source.SENSOR: 0.01, Source.RECOVERED: 0.03, Source.SWEPT: 0.02}
-    volume = empty(0.02, channels=1)
+    volume = make_volume(0.02, channels=1)
     for code, sigma in sigmas.items():
-        volume = fuse(volume, wall(2.0, sigma=sigma), source=code)
-    assert set(points(volume).source.tolist()) == {Source.SENSOR}
+        volume = fuse_views(volume, wall(2.0, sigma=sigma), source=code)
+    assert set(extract_points(volume).source.tolist()) == {Source.SENSOR}
     assert volume.weight.amax((0, 1)).tolist() == pytest.approx([sigma**-2 for sigma in sigmas.values()], rel=1e-4)
     for code in sigmas:
-        alone = fuse(empty(0.02, channels=1), wall(2.0, sigma=0.02), source=code)
-        assert set(points(alone).source.tolist()) == {code}
-        assert height(points(alone)) == pytest.approx(2.0, abs=1e-3)
+        alone = fuse_views(make_volume(0.02, channels=1), wall(2.0, sigma=0.02), source=code)
+        assert set(extract_points(alone).source.tolist()) == {code}
+        assert height(extract_points(alone)) == pytest.approx(2.0, abs=1e-3)
 
 
 def test_what_is_unsure_is_spread_as_far_as_it_is_unsure():
     """Answers 20 cm apart of sigma 10 cm are one wall between them, not two, nor the farther one alone."""
-    volume = empty(0.02, channels=1)
+    volume = make_volume(0.02, channels=1)
     for z in (2.9, 3.1, 2.95, 3.05):
-        volume = fuse(volume, wall(z, sigma=0.1), source=Source.RECOVERED)
-    z = points(volume).xyz[:, 2]
+        volume = fuse_views(volume, wall(z, sigma=0.1), source=Source.RECOVERED)
+    z = extract_points(volume).xyz[:, 2]
     assert float((z - 3.0).abs().quantile(0.9)) < 0.05
 
 
@@ -224,25 +243,25 @@ def test_what_is_unsure_is_spread_as_far_as_it_is_unsure():
 
 def hovering(volume):
     """Points of a surface that hangs in front of a wall at 2.5 m."""
-    return int((points(volume).xyz[:, 2] < 2.2).sum())
+    return int((extract_points(volume).xyz[:, 2] < 2.2).sum())
 
 
 def test_rays_that_end_behind_carve_away_what_was_wrong():
     ghost, truth = wall(2.0, sigma=0.05), wall(2.5, sigma=0.01)
-    before = fuse(empty(0.02, channels=1), ghost, source=Source.RECOVERED)
+    before = fuse_views(make_volume(0.02, channels=1), ghost, source=Source.RECOVERED)
     assert hovering(before) > 1000
-    assert hovering(fuse(before, truth)) == 0
-    assert hovering(fuse(before, truth, carve=False)) > 1000
+    assert hovering(fuse_views(before, truth)) == 0
+    assert hovering(fuse_views(before, truth, carve=False)) > 1000
 
 
 def test_carving_follows_answered_rays_only():
     truth = wall(2.5)
     depth = truth.depth.clone()
     depth[..., :40] = 0  # no answer on the left
-    volume = fuse(fuse(empty(0.02, channels=1), wall(2.0, sigma=0.05)), truth.replace(depth=depth))
-    left = points(volume).xyz[:, 0] < -0.03
-    z = points(volume).xyz[:, 2]
-    assert bool((z[left] < 2.2).any()) and not bool((z[~left & (points(volume).xyz[:, 0] > 0.03)] < 2.2).any())
+    volume = fuse_views(fuse_views(make_volume(0.02, channels=1), wall(2.0, sigma=0.05)), truth.replace(depth=depth))
+    left = extract_points(volume).xyz[:, 0] < -0.03
+    z = extract_points(volume).xyz[:, 2]
+    assert bool((z[left] < 2.2).any()) and not bool((z[~left & (extract_points(volume).xyz[:, 0] > 0.03)] < 2.2).any())
     assert float(z[left].min()) == pytest.approx(2.0, abs=0.01), "unchanged, where nobody looked"
 
 
@@ -255,15 +274,15 @@ def test_sparse_answers_become_patches_of_surface():
     sigma = torch.tensor([[0.02, 0.02, 0.02, 0.02, math.nan]])
     features = torch.arange(5.0).view(1, 5, 1)
     camera = wall().camera
-    one = splat(camera, (60, 80), uv, depth, sigma, features, T_world_from_cam=se3.identity(1, uv), radius=0.06)
+    one = splat_points(camera, (60, 80), uv, depth, sigma, features, T_world_from_cam=se3.identity(1, uv), radius=0.06)
     assert one.depth.shape == (1, 60, 80) and one.features.shape == (1, 60, 80, 1)
     assert (
         float(one.depth[0, 30, 20]) == 2.0 and float(one.depth[0, 30, 23]) == 2.0 and float(one.depth[0, 30, 24]) == 0
     )
     assert float(one.depth[0, 30, 60]) == 1.5 and float(one.features[0, 30, 60]) == 2.0, "the nearer one covers"
     assert set(one.depth.unique().tolist()) == {0.0, 1.5, 2.0}
-    volume = fuse(empty(0.02, channels=1), one, source=Source.RECOVERED)
-    surface = points(volume)
+    volume = fuse_views(make_volume(0.02, channels=1), one, source=Source.RECOVERED)
+    surface = extract_points(volume)
     where = cameras.unproject(camera, uv[:, [0, 2]], depth[:, [0, 2]])[0]
     nearest = torch.cdist(surface.xyz, where).amin(1)
     assert len(surface.xyz) > 10 and float(nearest.max()) < 0.06 + 2 * 0.02, "no more than the disc is claimed"
@@ -272,7 +291,7 @@ def test_sparse_answers_become_patches_of_surface():
 def no_points(camera, n=0, wrong=0):
     """Splats of ``n`` answers at depth 0, or a call whose depths are too many."""
     uv, zero = torch.zeros(1, n, 2), torch.zeros(1, n)
-    return splat(
+    return splat_points(
         camera, (60, 80), uv, torch.zeros(1, n + wrong), zero, zero[..., None], T_world_from_cam=se3.identity(1, zero)
     )
 
@@ -290,18 +309,18 @@ def test_no_answer_leaves_no_trace():
         no_points(nothing.camera),
     ]
     for one in hopeless:
-        volume = fuse(empty(0.02, channels=1), one)
-        assert len(volume.key) == 0 and len(points(volume).xyz) == 0
-    before = fuse(empty(0.02, channels=1), nothing)
+        volume = fuse_views(make_volume(0.02, channels=1), one)
+        assert len(volume.key) == 0 and len(extract_points(volume).xyz) == 0
+    before = fuse_views(make_volume(0.02, channels=1), nothing)
     for one in hopeless:
-        after = fuse(before, one)
+        after = fuse_views(before, one)
         assert all(torch.equal(getattr(before, k), getattr(after, k)) for k in ("key", "distance", "weight"))
     pytest.importorskip("skimage")
-    assert mesh(empty()).xyz.shape == mesh(empty()).face.shape == (0, 3)
+    assert extract_mesh(make_volume()).xyz.shape == extract_mesh(make_volume()).face.shape == (0, 3)
 
 
 def test_wrong_shapes_and_options_raise():
-    good, volume = wall(), empty(0.02, channels=1)
+    good, volume = wall(), make_volume(0.02, channels=1)
     for wrong in (
         good.replace(sigma=good.sigma[..., 1:]),
         good.replace(features=good.features[0]),
@@ -310,14 +329,14 @@ def test_wrong_shapes_and_options_raise():
         good.replace(T_world_from_cam=se3.identity(2, good.depth)),
     ):
         with pytest.raises(ValueError, match=r"integrate\.fuse"):
-            fuse(volume, wrong)
+            fuse_views(volume, wrong)
     with pytest.raises(ValueError, match="source is 0"):
-        fuse(volume, good, source=Source.NONE)
+        fuse_views(volume, good, source=Source.NONE)
     for options in ({"voxel": 0.0}, {"voxel": -1.0}, {"voxel": 0.02, "truncation": 0.01}):
         with pytest.raises(ValueError, match="expected 0 < voxel <= truncation"):
-            empty(**options)
+            make_volume(**options)
     with pytest.raises(ValueError, match="min_weight is -1"):
-        points(volume, min_weight=-1)
+        extract_points(volume, min_weight=-1)
     with pytest.raises(ValueError, match=r"integrate\.(fuse|splat)"):
         no_points(good.camera, 3, wrong=1)
 
@@ -325,7 +344,7 @@ def test_wrong_shapes_and_options_raise():
 def test_a_mesh_without_scikit_image_names_the_extra(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "skimage.measure", None)
     with pytest.raises(ImportError, match=r"dhtorch\[mesh\]"):
-        mesh(empty())
+        extract_mesh(make_volume())
 
 
 def test_distorted_lenses_and_far_worlds():
@@ -334,12 +353,12 @@ def test_distorted_lenses_and_far_worlds():
         torch.tensor([[61.5, 58.25]]), torch.tensor([[33.5, 21.75]]), torch.tensor([[-0.1, 0.02, 0.001, 0.0]])
     )
     for shift in (0.0, 5000.0):
-        volume = empty(VOXEL, channels=3)
+        volume = make_volume(VOXEL, channels=3)
         for frame in walk(2, camera=lens):
             T = frame.T_world_from_cam
-            volume = fuse(volume, view(frame, T=Pose(T.R, T.t + shift)))
-        off = off_wall(points(volume).xyz.double() - shift) * BOX.min()
-        assert len(points(volume).xyz) > 500 and float(off.median()) < 0.005, HW
+            volume = fuse_views(volume, view(frame, T=Pose(T.R, T.t + shift)))
+        off = off_wall(extract_points(volume).xyz.double() - shift) * BOX.min()
+        assert len(extract_points(volume).xyz) > 500 and float(off.median()) < 0.005, HW
 
 
 # ----------------------------------------------------------------------------------------------------------- recordings
@@ -353,7 +372,7 @@ def answered(i, j, T, ok=True):
     samples = Samples(torch.zeros(1, n, 2), zero, zero, xyz, zero, code, zero, code)
     estimate = Estimate(samples.uv, zero + 2, zero + 0.1, zero, zero, zero, code, zero, code)
     tracks = Tracks(samples.uv, samples.uv, zero, zero, torch.zeros(1, n, 2, 2), code == 0)
-    fit = given_pose(T if ok else T.map(lambda v: v * math.nan), n)
+    fit = known_pose_fit(T if ok else T.map(lambda v: v * math.nan), n)
     return recording.PairEstimate((i, j), samples, estimate, tracks, fit, torch.zeros(1, n, 3), wall().camera, (60, 80))
 
 
@@ -377,7 +396,7 @@ def relative(i, j):
 def test_anchored_poses_are_chained_and_the_largest_fragment_is_the_map(known):
     links = [(0, 3), (3, 6), (1, 4), (6, 8), (2, 5), (5, 8), (4, 7)]
     answers = [answered(i, j, relative(i, j), ok=(i, j) != (4, 7)) for i, j in links]
-    places = recording.place(Trajectory(TRUE if known else None), answers, poses="anchored")
+    places = recording.place_frames(Trajectory(TRUE if known else None), answers, poses="anchored")
     assert set(places.poses) == {0, 2, 3, 5, 6, 8} and places.n_fragments == 3 and places.n_unplaced == 3
     start = TRUE[:1] if known else se3.identity(1, TRUE.t)
     for k, T in places.poses.items():
@@ -389,13 +408,15 @@ def test_anchored_poses_are_chained_and_the_largest_fragment_is_the_map(known):
 def test_device_poses_are_the_recordings_own_where_finite():
     broken = Pose(TRUE.R.clone(), TRUE.t.clone())
     broken.t[3] = math.nan
-    places = recording.place(Trajectory(broken), [answered(0, 3, relative(0, 3)), answered(1, 4, relative(1, 4))])
+    places = recording.place_frames(
+        Trajectory(broken), [answered(0, 3, relative(0, 3)), answered(1, 4, relative(1, 4))]
+    )
     assert set(places.poses) == {0, 1, 4} and (places.n_fragments, places.n_unplaced) == (1, 1)
     assert torch.equal(places.poses[4].t, TRUE.t[4:5])
     with pytest.raises(ValueError, match="walk has no trajectory of its own, expected poses=anchored"):
-        recording.place(Trajectory(None), [])
+        recording.place_frames(Trajectory(None), [])
     with pytest.raises(ValueError, match="found 'gps', expected one of device, anchored"):
-        recording.place(Trajectory(None), [], poses="gps")
+        recording.place_frames(Trajectory(None), [], poses="gps")
 
 
 WIDTHS = ([(i, i + 20) for i in range(0, 20, 2)], [(i, i + 4) for i in range(5)], [(0, 1), (1, 2)], [(0, 3), (6, 9)])
@@ -403,18 +424,18 @@ WIDTHS = ([(i, i + 20) for i in range(0, 20, 2)], [(i, i + 4) for i in range(5)]
 
 @pytest.mark.parametrize("pairs", WIDTHS)
 def test_links_of_another_width_join_all_frames(pairs):
-    links = recording.chain(pairs)
+    links = recording.linking_pairs(pairs)
     assert not set(links) & set(pairs)
     answers = [answered(i, j, se3.identity(1, TRUE.t)) for i, j in [*pairs, *links]]
-    places = recording.place(Trajectory(None), answers, poses="anchored")
+    places = recording.place_frames(Trajectory(None), answers, poses="anchored")
     assert places.n_fragments == 1 and places.n_unplaced == 0
 
 
 def test_the_camera_knows_where_up_is():
     turned = se3.exp(torch.tensor([[math.pi / 2, 0, 0, 0, 0, 0]]).double())
-    assert level.mean_upwards([se3.identity(1, TRUE.t)]).tolist() == pytest.approx([0, -1, 0])
-    assert level.mean_upwards([turned]).tolist() == pytest.approx([0, 0, -1], abs=1e-6)
-    assert level.mean_upwards([]).tolist() == [0, -1, 0]
+    assert level.mean_camera_up([se3.identity(1, TRUE.t)]).tolist() == pytest.approx([0, -1, 0])
+    assert level.mean_camera_up([turned]).tolist() == pytest.approx([0, 0, -1], abs=1e-6)
+    assert level.mean_camera_up([]).tolist() == [0, -1, 0]
 
 
 @pytest.mark.parametrize("own", [None, Camera(torch.tensor([[40.0, 38.0]]), torch.tensor([[17.0, 12.0]]))])
@@ -425,10 +446,10 @@ def test_a_frames_depth_wears_the_pictures_colours(own):
     conf[:, :5] = 0
     spoilt = small.depth.clone()
     spoilt[0, 20, 30] = 0.5
-    one = recording.sensed(small.replace(conf=conf, depth=spoilt), small.T_world_from_cam)
+    one = recording.view_from_sensor(small.replace(conf=conf, depth=spoilt), small.T_world_from_cam)
     assert float(one.depth[:, :5].max()) == 0 and float(one.depth[0, 19:22, 29:32].max()) == 0, "and no depth edges"
     assert float((one.depth > 0).double().mean()) > 0.7 and float(one.features[..., 3].max()) == 1
-    surface = points(fuse(empty(VOXEL), one))
+    surface = extract_points(fuse_views(make_volume(VOXEL), one))
     tone = [torch.sin(3 * surface.xyz[:, 0] + 1), torch.sin(4 * surface.xyz[:, 1] - surface.xyz[:, 0])]
     error = (surface.features[:, :2] - (torch.stack(tone, -1) * 0.5 + 0.5)).abs()
     assert float(error.median()) < 0.04
@@ -438,7 +459,7 @@ def test_sparse_returns_become_discs():
     frame = walk(1)[0]
     few = torch.zeros_like(frame.depth)
     few[0, ::8, ::8] = frame.depth[0, ::8, ::8]
-    one = recording.sensed(frame.replace(depth=few), frame.T_world_from_cam, radius=0.15)
+    one = recording.view_from_sensor(frame.replace(depth=few), frame.T_world_from_cam, radius=0.15)
     assert 4 * int((few > 0).sum()) < int((one.depth > 0).sum()) < 0.9 * few.numel()
 
 
@@ -446,9 +467,9 @@ def test_coverage_counts_cells_and_islands():
     xyz = torch.tensor(
         [[0.05, 0.05, 0.05], [0.15, 0.15, 0.05], [0.95, 0.05, 0.05], [math.nan, 0, 0], [0.06, 0.06, 0.06]]
     )
-    found = recording.coverage(xyz, 0.1)
+    found = recording.measure_coverage(xyz, 0.1)
     assert found == {"n_voxels": 3, "n_islands": 2, "largest_island": pytest.approx(2 / 3)}
-    assert recording.coverage(xyz[3:4], 0.1) == {"n_voxels": 0, "n_islands": 0, "largest_island": None}
+    assert recording.measure_coverage(xyz[3:4], 0.1) == {"n_voxels": 0, "n_islands": 0, "largest_island": None}
 
 
 @pytest.fixture(scope="module")
@@ -456,16 +477,19 @@ def walked():
     """A small recording of the built-in room, its pairs and what the method says about them."""
     room = SyntheticRoom(hw=(240, 320), n_frames=5, supersample=1, step_m=0.03)
     method = extend.replace(n=1024)
-    return room, list(recording.ask(room, method, [(0, 4)], cutoff=2.0))
+    return room, list(recording.estimate_pairs(room, method, [(0, 4)], cutoff=2.0))
 
 
 def test_recovered_points_widen_the_map_beyond_the_sensor(walked):
     room, answers = walked
-    places = recording.place(room, answers)
-    near = recording.build(room, empty(0.04), answers, places, sources=[Source.SENSOR], cutoff=2.0)
-    both = recording.build(room, near, answers, places, sources=[Source.RECOVERED], cutoff=2.0)
-    one, two = points(near), points(both)
-    assert recording.coverage(two.xyz, 0.04)["n_voxels"] > 1.02 * recording.coverage(one.xyz, 0.04)["n_voxels"]
+    places = recording.place_frames(room, answers)
+    near = recording.fuse_recording(room, make_volume(0.04), answers, places, sources=[Source.SENSOR], cutoff=2.0)
+    both = recording.fuse_recording(room, near, answers, places, sources=[Source.RECOVERED], cutoff=2.0)
+    one, two = extract_points(near), extract_points(both)
+    assert (
+        recording.measure_coverage(two.xyz, 0.04)["n_voxels"]
+        > 1.02 * recording.measure_coverage(one.xyz, 0.04)["n_voxels"]
+    )
     new = two.xyz[two.source == Source.RECOVERED]
     (answer,), T = answers, places.poses[0]
     raw = cameras.unproject(answer.camera, answer.estimate.uv, answer.estimate.depth)[answer.recovered]
@@ -474,20 +498,20 @@ def test_recovered_points_widen_the_map_beyond_the_sensor(walked):
     assert float(room_distance(new).median()) < 1.1 * float(room_distance(raw).median()), "no worse than its points"
     assert float(torch.cdist(new.double(), raw).amin(1).quantile(0.99)) < 0.15, "and nowhere but at them"
     assert float(two.xyz[:, 2].max()) > 1 + float(one.xyz[:, 2].max()), "farther than the sensor"
-    again = recording.build(room, empty(0.04), answers, places, cutoff=2.0)
+    again = recording.fuse_recording(room, make_volume(0.04), answers, places, cutoff=2.0)
     assert torch.equal(again.distance, both.distance) and torch.equal(again.key, both.key)
 
 
 def test_of_two_grids_each_is_what_it_is_alone_and_frames_are_read_once(walked, monkeypatch):
     room, answers = walked
-    places = recording.place(room, answers)
+    places = recording.place_frames(room, answers)
     alone = [
-        recording.build(room, empty(voxel), answers, places, sources=sources, cutoff=2.0)
+        recording.fuse_recording(room, make_volume(voxel), answers, places, sources=sources, cutoff=2.0)
         for voxel, sources in ((0.05, [Source.SENSOR]), (0.1, [Source.SENSOR, Source.RECOVERED]))
     ]
     reads, read = [], type(room).__getitem__
     monkeypatch.setattr(type(room), "__getitem__", lambda self, k: reads.append(k) or read(self, k))
-    both = recording.build_grids(room, [empty(0.05), empty(0.1)], answers, places, cutoff=2.0)
+    both = recording.fuse_recording_grids(room, [make_volume(0.05), make_volume(0.1)], answers, places, cutoff=2.0)
     assert sorted(reads) == sorted(places.poses)
     for one, other in zip(alone, both, strict=True):
         for name in ("key", "distance", "weight", "features"):
@@ -514,10 +538,10 @@ def box_map(frame, sigma=0.02):
 
 def looked_around(frames, maps):
     """Frames as a recording, answers that hold their maps, and their places."""
-    shelf = sweeps.Shelf()
+    shelf = sweeps.SweepStore()
     answers = [replace(answered(k, k, relative(0, 0)), swept=shelf.put(found)) for k, found in enumerate(maps)]
     walked = Recording(name="box", format="made", load=frames.__getitem__, number=torch.arange(len(frames)))
-    return walked, answers, recording.Places({k: f.T_world_from_cam for k, f in enumerate(frames)}, 1, 0)
+    return walked, answers, recording.PlacedFrames({k: f.T_world_from_cam for k, f in enumerate(frames)}, 1, 0)
 
 
 def test_swept_pixels_enter_with_their_source_and_weight_and_without_edges():
@@ -527,16 +551,16 @@ def test_swept_pixels_enter_with_their_source_and_weight_and_without_edges():
     depth[0, 40, 60] *= 0.8
     source[0, :10], gate[..., :5] = Source.SENSOR, Gate.UNCERTAIN
     walked, (answer,), places = looked_around([frame], [found.replace(depth=depth, source=source, gate=gate)])
-    one = recording.swept(walked, answer, places)
+    one = recording.view_from_sweep(walked, answer, places)
     there = torch.ones_like(depth, dtype=torch.bool)
     there[0, 39:42, 59:62], there[0, :10], there[..., :5] = False, False, False
     assert torch.equal(one.depth > 0, there) and answer.swept.n == int(there.sum())
     torch.testing.assert_close(one.depth[there], frame.depth[there], rtol=1e-3, atol=0)
     torch.testing.assert_close(one.sigma[there], torch.full_like(one.sigma[there], 0.02), rtol=1e-3, atol=0)
     assert torch.equal(one.features[..., :3], frame.image.permute(0, 2, 3, 1) / 255)
-    volume = recording.build(walked, empty(VOXEL), [answer], places, sources=[Source.SWEPT])
+    volume = recording.fuse_recording(walked, make_volume(VOXEL), [answer], places, sources=[Source.SWEPT])
     assert float(volume.weight[..., :2].max()) == 0 and float(volume.weight[..., 2].max()) == pytest.approx(2500, 1e-2)
-    surface = points(volume)
+    surface = extract_points(volume)
     assert set(surface.source.tolist()) == {Source.SWEPT} and len(surface.xyz) > 1000
     assert float((off_wall(surface.xyz) * BOX.min()).quantile(0.99)) < VOXEL / 2, "a map alone is believed"
     assert float((surface.features[:, 3] - 0.5).abs().max()) < 0.01
@@ -546,7 +570,9 @@ def test_a_map_of_half_the_size_is_of_the_same_walls():
     (frame,) = walk(1, **WIDE)
     (small,) = walk(1, hw=(48, 64), camera=cameras.resize(frame.camera, (96, 128), (48, 64)))
     walked, answers, places = looked_around([frame], [box_map(small)])
-    surface = points(recording.build(walked, empty(VOXEL), answers, places, sources=[Source.SWEPT]))
+    surface = extract_points(
+        recording.fuse_recording(walked, make_volume(VOXEL), answers, places, sources=[Source.SWEPT])
+    )
     assert len(surface.xyz) > 1000 and float((off_wall(surface.xyz) * BOX.min()).quantile(0.95)) < VOXEL / 2
 
 
@@ -564,8 +590,10 @@ def test_a_wrong_patch_that_others_see_through_is_gone(bad):
             sigma=torch.where(patch, sigma, maps[bad].sigma),
         )
         walked, answers, places = looked_around(frames, [*maps[:bad], wrong, *maps[bad + 1 :]])
-        volume = recording.build(walked, empty(VOXEL), answers, places, sources=[Source.SWEPT], min_maps=least)
-        return int((off_wall(points(volume).xyz) * BOX.min() > 0.2).sum())
+        volume = recording.fuse_recording(
+            walked, make_volume(VOXEL), answers, places, sources=[Source.SWEPT], min_maps=least
+        )
+        return int((off_wall(extract_points(volume).xyz) * BOX.min() > 0.2).sum())
 
     assert off(0.02, 1) == 0, "outweighed by those who see through"
     assert off(0.002, 1) > 100 and off(0.002, 2) == 0, "not found by a second one"
@@ -573,25 +601,28 @@ def test_a_wrong_patch_that_others_see_through_is_gone(bad):
 
 def test_a_surface_that_one_map_alone_has_is_kept_where_others_speak():
     (frame,) = walk(1, **WIDE)
-    volume = fuse(empty(VOXEL, channels=3), view(frame), source=Source.SWEPT)
-    assert len(points(confirmed(volume)).xyz) == 0 and len(points(confirmed(volume, 1)).xyz) > 1000
-    both = fuse(volume, view(frame, sigma=0.5 * VOXEL), source=Source.RECOVERED)
-    assert len(points(confirmed(both)).xyz) == len(points(both).xyz)
-    assert int(fuse(volume, view(frame), source=Source.SWEPT).n_swept.max()) == 2
+    volume = fuse_views(make_volume(VOXEL, channels=3), view(frame), source=Source.SWEPT)
+    assert (
+        len(extract_points(drop_unconfirmed(volume)).xyz) == 0
+        and len(extract_points(drop_unconfirmed(volume, 1)).xyz) > 1000
+    )
+    both = fuse_views(volume, view(frame, sigma=0.5 * VOXEL), source=Source.RECOVERED)
+    assert len(extract_points(drop_unconfirmed(both)).xyz) == len(extract_points(both).xyz)
+    assert int(fuse_views(volume, view(frame), source=Source.SWEPT).n_swept.max()) == 2
     with pytest.raises(ValueError, match="least is 0, expected at least 1"):
-        confirmed(volume, 0)
+        drop_unconfirmed(volume, 0)
 
 
 def test_a_shelf_holds_maps_of_all_sizes_and_leaves_nothing_behind(tmp_path):
     frames = walk(2, **WIDE)
     small = walk(1)[0]
-    shelf = sweeps.Shelf(tmp_path / "out")
+    shelf = sweeps.SweepStore(tmp_path / "out")
     assert not (tmp_path / "out").exists(), "no folder for maps that nobody made"
     kept = [shelf.put(box_map(frame)) for frame in (frames[0], small, frames[1])]
     assert list((tmp_path / "out").iterdir()) == []
     for k, frame in ((2, frames[1]), (0, frames[0]), (1, small)):
         depth, sigma, score = kept[k].read()
-        there = sweeps.edges(frame.depth) <= 0.1
+        there = sweeps.depth_step_rel(frame.depth) <= 0.1
         assert kept[k].hw == frame.hw and kept[k].n == int(there.sum()) > 0.9 * there.numel()
         torch.testing.assert_close(depth, torch.where(there, frame.depth, 0.0), rtol=1e-3, atol=0)
         assert torch.equal(score, 0.5 * there) and float((sigma - 0.02 * there).abs().max()) < 1e-4
@@ -609,29 +640,33 @@ def test_a_shelf_holds_maps_of_all_sizes_and_leaves_nothing_behind(tmp_path):
 )
 def test_what_no_sweep_can_be_asked_for_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
-        sweeps.Sweep.asked(given)
+        sweeps.DenseSweep.asked(given)
 
 
 def test_a_sweep_is_asked_for_by_true_or_by_options():
-    assert sweeps.Sweep.asked(False) is None is sweeps.Sweep.asked(None)
-    standard = dense.options(True)
-    assert standard is not None and sweeps.Sweep.asked(True).options == standard
+    assert sweeps.DenseSweep.asked(False) is None is sweeps.DenseSweep.asked(None)
+    standard = dense.dense_options(True)
+    assert standard is not None and sweeps.DenseSweep.asked(True).options == standard
     asked = {"min_correlation": 1, "size": 320}
-    assert sweeps.Sweep.asked(asked).options == standard | asked
+    assert sweeps.DenseSweep.asked(asked).options == standard | asked
 
 
 def test_a_sweep_finds_more_of_the_far_walls_than_samples_and_the_method_runs_once():
     room = SyntheticRoom(hw=(150, 200), n_frames=8, supersample=1, step_m=0.03)
     calls = []
     method = MAP.replace(n=512, classify=lambda *args: calls.append(1) or classify(*args))
-    answers = list(recording.ask(room, method, [(0, 5), (2, 7)], cutoff=2.0, sweep=sweeps.Sweep({"planes": 40})))
+    answers = list(
+        recording.estimate_pairs(room, method, [(0, 5), (2, 7)], cutoff=2.0, sweep=sweeps.DenseSweep({"planes": 40}))
+    )
     assert len(calls) == 2
-    places = recording.place(room, answers)
-    sparse = recording.build(room, empty(0.04), [replace(a, swept=None) for a in answers], places, cutoff=2.0)
-    dense = recording.build(room, empty(0.04), answers, places, cutoff=2.0)
-    near = [(far_of(room, 0, points(volume).xyz) < 0.08).double().mean() for volume in (sparse, dense)]
+    places = recording.place_frames(room, answers)
+    sparse = recording.fuse_recording(
+        room, make_volume(0.04), [replace(a, swept=None) for a in answers], places, cutoff=2.0
+    )
+    dense = recording.fuse_recording(room, make_volume(0.04), answers, places, cutoff=2.0)
+    near = [(far_of(room, 0, extract_points(volume).xyz) < 0.08).double().mean() for volume in (sparse, dense)]
     assert near[1] > 1.4 * near[0] > 0.2
-    surface = points(dense)
+    surface = extract_points(dense)
     off = room_distance(surface.xyz[surface.source == Source.SWEPT])
     assert len(off) > 1000 and float(off.median()) < 0.04 and float((off > 0.2).double().mean()) < 0.1
 
@@ -651,7 +686,7 @@ def test_up_is_the_formats_axis_else_the_floors():
     ground = torch.rand(800, 3, generator=g).double() * torch.tensor([4.0, 0.01, 4.0])
     wall = torch.rand(300, 3, generator=g).double() * torch.tensor([0.01, 3.0, 4.0])
     askew = se3.exp(torch.tensor([[0.3, 0.0, 0.1, 0.0, 0.0, 0.0]], dtype=torch.float64)).R[0]
-    found = level.floor(torch.cat((ground, wall)) @ askew.T, torch.tensor([0.0, -1.0, 0.0]).double(), 0.02)
+    found = level._fit_floor_normal(torch.cat((ground, wall)) @ askew.T, torch.tensor([0.0, -1.0, 0.0]).double(), 0.02)
     assert (found - askew @ torch.tensor([0.0, -1.0, 0.0]).double()).norm() < 0.02
     up = (askew @ torch.tensor([0.0, -1.0, 0.0]).double()).tolist()
     assert (se3.turn_between(up) @ torch.tensor(up, dtype=torch.float64) - torch.tensor([0.0, -1.0, 0.0])).norm() < 1e-9

@@ -9,7 +9,13 @@ import torch
 from dhtorch import MAP, data
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3
-from dhtorch.integrate.level import WITHIN, directions, floor, standing, upwards
+from dhtorch.integrate.level import (
+    _MIN_GUESS_COSINE,
+    _fit_floor_normal,
+    _fit_upright_direction,
+    _spiral_directions,
+    estimate_up,
+)
 from dhtorch.records import Pose
 
 GUESSES = torch.nn.functional.normalize(torch.randn(12, 3, dtype=torch.float64, generator=torch.manual_seed(0)), dim=-1)
@@ -23,10 +29,10 @@ def level_floor():
 
 def test_a_floor_is_found():
     up = torch.tensor([0.1, -1.0, 0.1], dtype=torch.float64)
-    found = floor(level_floor(), up / up.norm(), 0.02)
+    found = _fit_floor_normal(level_floor(), up / up.norm(), 0.02)
     tilt = (found - torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)).abs().max()
     assert tilt < 0.02 / 4, "the wall's foot lies in the slab of 2 cm that is fitted, 4 m wide"
-    assert floor(level_floor()[:50], up / up.norm(), 0.02) is None, "of few points none is believed"
+    assert _fit_floor_normal(level_floor()[:50], up / up.norm(), 0.02) is None, "of few points none is believed"
 
 
 @pytest.mark.skipif("DHTORCH_DATA" not in os.environ, reason="DHTORCH_DATA is unset")
@@ -35,9 +41,11 @@ def test_a_door_is_no_floor_far_from_the_guess():
     h, w = frame.hw
     uv = torch.stack(torch.meshgrid(torch.arange(0, w, 24.0), torch.arange(0, h, 24.0), indexing="xy"), -1)
     xyz = MAP.backproject(frame, uv.reshape(-1, 2)).xyz[0].double()
-    found = [floor(xyz, guess, 0.05) for guess in GUESSES]
+    found = [_fit_floor_normal(xyz, guess, 0.05) for guess in GUESSES]
     assert any(axis is None for axis in found)
-    assert all(float(axis @ guess) > WITHIN for axis, guess in zip(found, GUESSES, strict=True) if axis is not None)
+    assert all(
+        float(axis @ guess) > _MIN_GUESS_COSINE for axis, guess in zip(found, GUESSES, strict=True) if axis is not None
+    )
 
 
 def test_walls_tell_where_no_floor_is_seen():
@@ -49,10 +57,10 @@ def test_walls_tell_where_no_floor_is_seen():
     clutter = torch.randn(1500, 3, dtype=torch.float64, generator=draw)
     normal = torch.cat((walls, clutter, clutter[:50] * torch.nan))
     guess = torch.tensor([0.0, -0.94, 0.34], dtype=torch.float64)
-    found = standing(normal, guess / guess.norm())
+    found = _fit_upright_direction(normal, guess / guess.norm())
     assert found is not None and float(found @ torch.tensor([0.0, -1, 0]).double()) > 0.9986, "3°"
-    assert standing(clutter, guess / guess.norm()) is None, "what stands anyhow tells nothing"
-    assert standing(normal[:50], guess / guess.norm()) is None
+    assert _fit_upright_direction(clutter, guess / guess.norm()) is None, "what stands anyhow tells nothing"
+    assert _fit_upright_direction(normal[:50], guess / guess.norm()) is None
 
 
 def held(kind: str, rotation: tuple[float, float, float], chained: bool = False) -> list[float]:
@@ -64,8 +72,8 @@ def held(kind: str, rotation: tuple[float, float, float], chained: bool = False)
     pose = Pose(torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64)) @ turn, torch.zeros(1, 3).double())
     recording = Recording(kind, kind, load=lambda _i: None, number=torch.tensor([0]), poses=pose)  # type: ignore[arg-type]
     if chained:
-        return upwards(recording, [se3.identity(1, pose.t)], level_floor(), 0.02)
-    return upwards(recording, [pose], level_floor() * torch.tensor([1.0, -1, -1]), 0.02)
+        return estimate_up(recording, [se3.identity(1, pose.t)], level_floor(), 0.02)
+    return estimate_up(recording, [pose], level_floor() * torch.tensor([1.0, -1, -1]), 0.02)
 
 
 @pytest.mark.parametrize("rotation", [(0.0, 0, 0), (0, 0, torch.pi / 2), (0, 0, -torch.pi / 2), (-torch.pi / 2, 0, 0)])
@@ -83,7 +91,7 @@ def test_a_trajectory_that_begins_in_its_first_camera_is_not_taken_for_level():
 
 
 def test_directions_are_spread_evenly():
-    found = directions(2000)
+    found = _spiral_directions(2000)
     torch.testing.assert_close(found.norm(dim=-1), torch.ones(2000, dtype=torch.float64))
     torch.testing.assert_close(found.T @ found / 2000, torch.eye(3).double() / 3, atol=2e-3, rtol=0)
     nearest = (found @ found.T).fill_diagonal_(-1).amax(1).clamp(-1, 1).acos()

@@ -17,7 +17,7 @@ from dhtorch.cli.run import config_dir, main
 from dhtorch.experiments import report
 from dhtorch.integrate import mapping
 from dhtorch.pipeline.presets import METHODS
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viz.viewer import points
 
@@ -60,7 +60,7 @@ def test_every_file_is_written_and_named(job):
 
 def test_the_result_counts_what_was_widened(job):
     folder, _ = job
-    result = archive.read(folder)
+    result = result_files.read_result(folder)
     assert result["experiment"] == "integrate" and result["question"] is None and result["verdict"] is None
     pair, scene = result["rows"]
     assert pair["pair"] == [0, 3] and pair["placed"] == 1 and scene["n_frames"] == 2 and scene["n_fragments"] == 1
@@ -73,7 +73,7 @@ def test_the_result_counts_what_was_widened(job):
 def test_plyfile_and_trimesh_read_the_map(job):
     folder, _ = job
     plyfile, trimesh = pytest.importorskip("plyfile"), pytest.importorskip("trimesh")
-    row = archive.read(folder)["rows"][-1]
+    row = result_files.read_result(folder)["rows"][-1]
     vertex = plyfile.PlyData.read(folder / "synthetic_room" / "map.ply")["vertex"]
     assert len(vertex) == row["n_points"] and set(np.unique(vertex["source"])) == {1, 2}
     assert bool((vertex["sigma"] > 0).all()) and bool(((vertex["score"] >= 0) & (vertex["score"] <= 1.001)).all())
@@ -90,7 +90,7 @@ def test_colmap_reads_views_and_tracks(job):
     pycolmap = pytest.importorskip("pycolmap")
     model = pycolmap.Reconstruction(str(folder / "synthetic_room" / "colmap"))
     assert len(model.images) == 2 and len(model.cameras) == 1
-    assert len(model.points3D) == archive.read(folder)["rows"][0]["n_kept"] > 30
+    assert len(model.points3D) == result_files.read_result(folder)["rows"][0]["n_kept"] > 30
     (camera,) = model.cameras.values()
     misses = [
         np.linalg.norm(camera.img_from_cam(image.cam_from_world() * model.points3D[p.point3D_id].xyz) - p.xy)
@@ -162,8 +162,8 @@ def test_ctrl_c_keeps_the_scenes_that_are_whole(tmp_path, monkeypatch):
         row = {"seconds": 0.0, "scene": source.name, "method": "map", "truth": "device"}
         return mapping.MappedScene(source.recording, [], None, None, None, row)
 
-    monkeypatch.setattr(mapping, "make", make)
-    monkeypatch.setattr(mapping, "write", lambda *_: [])
+    monkeypatch.setattr(mapping, "map_scene", make)
+    monkeypatch.setattr(mapping, "write_mapped_scene", lambda *_: [])
     settings = {"output": str(tmp_path), "dtype": "float32", "poses": "device", "mesh": None, "threads": None}
     settings |= {"voxel": 0.1, "truncation": None, "min_weight": 0.0, "cutoff": None, "dense": False, "min_maps": 2}
     rooms = [SyntheticRoom(n_frames=2), SyntheticRoom(n_frames=2)]
@@ -196,7 +196,7 @@ def test_a_dense_map_says_what_the_sweep_added(command, tmp_path):
     assert "times those without a sweep" in out
     here = tmp_path / "here"
     assert {p.name for p in here.rglob("*") if p.is_file()} == {*FILES, "result.json"}, "the maps' file is gone"
-    result = archive.read(here)
+    result = result_files.read_result(here)
     pair, scene = result["rows"]
     assert pair["map_hw"] == [120, 160] and pair["n_swept"] == scene["n_swept"] > 1000
     assert scene["n_voxels"] > scene["n_voxels_sparse"] > scene["n_voxels_sensor"]
@@ -205,7 +205,7 @@ def test_a_dense_map_says_what_the_sweep_added(command, tmp_path):
     assert result["config"]["dense"] == {"planes": 32, "size": 160}
     words = (here / "synthetic_room" / "map.ply").read_bytes()[:400]
     assert b"source: 0 none, 1 sensor, 2 recovered, 3 swept" in words
-    (shot,) = points.read(here / "synthetic_room" / "map.ply").shots
+    (shot,) = points.read_ply_exhibit(here / "synthetic_room" / "map.ply").shots
     assert len(shot.swept.xyz) > 200 and len(shot.swept.xyz) + len(shot.samples["xyz"]) == scene["n_points"]
     glb = (here / "synthetic_room" / "map.glb").read_bytes()
     assert b'"name":"swept"' in glb and b'"_SOURCE"' in glb
@@ -247,7 +247,7 @@ def test_what_sweeps_is_a_method_of_several_views_unless_another_is_said(word):
 )
 def test_a_voxel_is_two_pixels_of_the_sensor(name, least, most):
     recording = data.open(Path(os.environ["DHTORCH_DATA"]) / name)
-    voxel = mapping.voxel_of(recording)
+    voxel = mapping.choose_voxel(recording)
     assert least <= voxel <= most and voxel == float(f"{voxel:.2g}")
     frames = [recording[k] for k in (0, len(recording) // 2, len(recording) - 1)]
     sizes = []
@@ -274,7 +274,7 @@ def test_a_real_desk_becomes_a_map(tmp_path, monkeypatch, capsys):
         "output=here",
     ]
     assert main(["integrate", *options, "mesh=false"]) == 0
-    (scene,) = [r for r in archive.read(tmp_path / "here")["rows"] if r["pair"] is None]
+    (scene,) = [r for r in result_files.read_result(tmp_path / "here")["rows"] if r["pair"] is None]
     assert scene["n_frames"] == 3 and scene["n_voxels"] > 1000 and scene["largest_island"] > 0.2
     assert torch.get_num_threads() == 1 and "tum_fr1_desk9: 3 of 3 frames" in capsys.readouterr().out
     shutil.rmtree(tmp_path / "here")

@@ -5,17 +5,17 @@ import torch
 
 from dhtorch.codes import Source
 from dhtorch.integrate import Surface
-from dhtorch.integrate.from_maps import FrameMap, join
-from dhtorch.integrate.scales import coarse, union
+from dhtorch.integrate.from_maps import FrameMap, fuse_frame_maps
+from dhtorch.integrate.scales import choose_coarse_voxel, merge_surfaces
 from dhtorch.synthetic.recording import SyntheticRoom
 
 NEAR = 2.2
 
 
 def test_unsure_depth_gets_voxels_of_its_own_and_sure_depth_the_sensors():
-    assert coarse(0.01, torch.tensor([0.12, 0.16, 0.2, torch.nan, 0.0])) == pytest.approx(0.04)
-    assert coarse(0.01, torch.full((9,), 0.02)) is None
-    assert coarse(0.01, torch.zeros(0)) is None
+    assert choose_coarse_voxel(0.01, torch.tensor([0.12, 0.16, 0.2, torch.nan, 0.0])) == pytest.approx(0.04)
+    assert choose_coarse_voxel(0.01, torch.full((9,), 0.02)) is None
+    assert choose_coarse_voxel(0.01, torch.zeros(0)) is None
 
 
 def surface(xyz, source, face=None):
@@ -29,11 +29,11 @@ def test_of_the_coarse_surface_stays_what_the_sensor_has_not_made():
     fine = surface([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], [Source.SENSOR] * 3, torch.tensor([[0, 1, 2]]))
     S, W = Source.SENSOR, Source.SWEPT
     wide = surface([[float(k), 5, 5] for k in range(6)], [S, W, W, W, S, W], triangles)
-    both = union(fine, wide)
+    both = merge_surfaces(fine, wide)
     assert both.xyz[:, 0].tolist() == [0, 1, 0, 1, 2, 3] and both.source.tolist() == [S] * 3 + [W] * 3
     assert both.face.tolist() == [[0, 1, 2], [3, 4, 5]]
     assert both.xyz[both.face[1]][:, 0].tolist() == [1, 2, 3]
-    cloud = union(fine.replace(face=None), wide.replace(face=None))
+    cloud = merge_surfaces(fine.replace(face=None), wide.replace(face=None))
     assert cloud.xyz[:, 0].tolist() == [0, 1, 0, 1, 2, 3, 5] and cloud.face is None
 
 
@@ -62,9 +62,9 @@ def seen(room, sigma_rel):
 @pytest.mark.parametrize("sigma_rel", [0.01, 0.06])
 def test_swept_depth_is_in_the_map_however_unsure_it_is(room, sigma_rel):
     read, voxel = seen(room, sigma_rel), 0.02
-    found, _ = join(room, range(4), read, voxel=voxel, meshed=False)
+    found, _ = fuse_frame_maps(room, range(4), read, voxel=voxel, meshed=False)
     swept = found.source == Source.SWEPT
-    truth, _ = join(room, range(4), seen(room, 0.0001), voxel=voxel, meshed=False)
+    truth, _ = fuse_frame_maps(room, range(4), seen(room, 0.0001), voxel=voxel, meshed=False)
     there = truth.xyz[truth.source == Source.SWEPT]
     reach = torch.cdist(there[::7], found.xyz[swept]).amin(1)
     assert float((reach < 0.25).double().mean()) > 0.6  # most of what was swept is covered

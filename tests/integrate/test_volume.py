@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from dhtorch.geometry import se3, sparse_grid
-from dhtorch.integrate import View, empty, fuse, points, recording, splat
-from dhtorch.integrate.volume import SOURCES, Volume
+from dhtorch.integrate import DepthView, extract_points, fuse_views, make_volume, recording, splat_points
+from dhtorch.integrate.volume import VOLUME_SOURCES, Volume
 from dhtorch.records import Camera, Frame
 
 CAMERA = Camera(torch.tensor([[22.0, 18.0]]), torch.tensor([[10.5, 6.25]]))
@@ -23,13 +23,13 @@ def looked(seed, sigma=0.02, far=2.0):
     depth = far + 0.02 * torch.arange(HW[1]) + 0.03 * draw(1, *HW)
     depth[draw(1, *HW) < 0.1] = 0
     T = se3.exp(0.1 * torch.randn(1, 6, generator=g, dtype=torch.float64))
-    return View(depth, sigma * (0.5 + draw(1, *HW)), draw(1, *HW, 2), CAMERA, T)
+    return DepthView(depth, sigma * (0.5 + draw(1, *HW)), draw(1, *HW, 2), CAMERA, T)
 
 
 def voxels(volume):
     """Whole numbers (K, 512, 3) of every voxel."""
     local = torch.tensor(list(itertools.product(range(8), repeat=3)))
-    return sparse_grid.unpack(volume.key)[:, None] * 8 + local
+    return sparse_grid.unpack_cells(volume.key)[:, None] * 8 + local
 
 
 def loop_fuse(volume, looks, max_reach=3.0, carve=True):
@@ -73,18 +73,18 @@ def loop_fuse(volume, looks, max_reach=3.0, carve=True):
 
 @pytest.mark.parametrize(("carve", "max_reach", "sigma"), [(True, 3.0, 0.02), (False, 3.0, 0.15), (True, 1.2, 0.15)])
 def test_every_voxel_learns_what_its_pixel_says(carve, max_reach, sigma):
-    volume = empty(0.1, truncation=0.25, channels=2)
+    volume = make_volume(0.1, truncation=0.25, channels=2)
     looks = [(looked(0), 0), (looked(1, sigma, far=1.7), 1), (looked(2, sigma), 2), (looked(3), 2)]
     for view, source in looks:
-        which = SOURCES[source]
-        volume = fuse(volume, view, source=which, carve=carve, max_reach=max_reach)
+        which = VOLUME_SOURCES[source]
+        volume = fuse_views(volume, view, source=which, carve=carve, max_reach=max_reach)
     # what was said before a block was there is not known to it: ask again, now that all blocks are
     blank = volume.replace(
         **{k: torch.zeros_like(getattr(volume, k)) for k in ("distance", "weight", "n_swept", "features")}
     )
     for view, source in looks:
-        which = SOURCES[source]
-        blank = fuse(blank, view, source=which, carve=carve, max_reach=max_reach)
+        which = VOLUME_SOURCES[source]
+        blank = fuse_views(blank, view, source=which, carve=carve, max_reach=max_reach)
     distance, weight, swept, coloured, colour, sure = loop_fuse(blank, looks, max_reach, carve)
     assert sure.mean() > 0.8 and (weight[sure] > 0).any(0).all() and (weight[sure].sum(-1) == 0).any()
     features = blank.features.flatten(0, 1).numpy()[sure]
@@ -97,13 +97,13 @@ def test_every_voxel_learns_what_its_pixel_says(carve, max_reach, sigma):
 
 def test_blocks_are_where_the_surface_and_what_is_kept_around_it_are():
     view = looked(0)
-    volume = fuse(empty(0.1, truncation=0.25, channels=2), view)
+    volume = fuse_views(make_volume(0.1, truncation=0.25, channels=2), view)
     v, u = torch.meshgrid(*(torch.arange(float(n)) for n in HW), indexing="ij")
     ray = torch.stack(((u - 10.5) / 22, (v - 6.25) / 18, torch.ones_like(u)), -1).double()
     T, there = view.T_world_from_cam, view.depth[0] > 0
     for along in (-0.25, 0.0, 0.25):
         xyz = (ray * (view.depth[0] + along / ray.norm(dim=-1))[..., None])[there] @ T.R[0].T + T.t[0]
-        key = sparse_grid.pack((xyz / 0.8).floor().long())
+        key = sparse_grid.pack_cells((xyz / 0.8).floor().long())
         assert torch.isin(key, volume.key).all(), along
     assert len(volume.key) < 80 and torch.equal(volume.key, volume.key.sort().values)
 
@@ -111,7 +111,7 @@ def test_blocks_are_where_the_surface_and_what_is_kept_around_it_are():
 def scattered(seed=0):
     """A volume of three blocks, two of them neighbours, with random distances and unknown voxels."""
     g = torch.Generator().manual_seed(seed)
-    key = sparse_grid.pack(torch.tensor([[0, 0, 0], [1, 0, 0], [3, -2, 1]])).sort().values
+    key = sparse_grid.pack_cells(torch.tensor([[0, 0, 0], [1, 0, 0], [3, -2, 1]])).sort().values
     distance = 0.3 * (torch.rand(3, 512, generator=g) - 0.5)
     weight = torch.rand(3, 512, 3, generator=g) * 100
     weight[torch.rand(3, 512, generator=g) < 0.3] = 0
@@ -166,11 +166,11 @@ def test_points_are_the_crossings_of_all_grid_edges(min_weight):
         xyz = tuple(round(0.1 * (p + t * (k == axis)), 4) for k, p in enumerate(place))
         expected[xyz] = (
             weight.sum() ** -0.5,
-            SOURCES[int(weight.argmax())],
+            VOLUME_SOURCES[int(weight.argmax())],
             feature[1:] / feature[0],
             normal / np.linalg.norm(normal),
         )
-    surface = points(volume, min_weight=min_weight)
+    surface = extract_points(volume, min_weight=min_weight)
     found = {tuple(round(v, 4) for v in xyz): k for k, xyz in enumerate(surface.xyz.tolist())}
     assert len(surface.xyz) == len(found) == len(expected) > 100
     close = [min(expected, key=lambda q, p=p: math.dist(p, q)) for p in found]
@@ -192,7 +192,7 @@ def test_splats_are_discs_of_which_the_nearest_is_seen(radius):
     depth[0, 3], sigma[0, 4], depth[1, 5] = 0.0, math.nan, -1.0
     both = CAMERA.map(lambda x: x.expand(2, 2))
     T = se3.identity(2, uv)
-    view = splat(both, HW, uv, depth, sigma, features, T_world_from_cam=T, radius=radius, max_radius_px=4)
+    view = splat_points(both, HW, uv, depth, sigma, features, T_world_from_cam=T, radius=radius, max_radius_px=4)
     for b, v, u in itertools.product(range(2), range(HW[0]), range(HW[1])):
         best = (math.inf, -1)
         for k in range(n):
@@ -222,7 +222,7 @@ def test_what_the_sensor_says_keeps_its_noise_its_confidence_and_no_edges():
     image = torch.randint(0, 256, (1, 3, *HW), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
     frame = Frame(image, depth, CAMERA, conf=conf)
     T = se3.identity(1, depth)
-    view = recording.sensed(frame, T, sigma_m=0.03, sigma_rel=0.02)
+    view = recording.view_from_sensor(frame, T, sigma_m=0.03, sigma_rel=0.02)
     wanted = depth.nan_to_num().clamp_min(0)
     wanted[:, :, 15:17] = 0
     wanted[0, 5, 6] = 0
@@ -230,12 +230,12 @@ def test_what_the_sensor_says_keeps_its_noise_its_confidence_and_no_edges():
     torch.testing.assert_close(view.sigma, (0.03**2 + (0.02 * wanted) ** 2).sqrt())
     torch.testing.assert_close(view.features[..., :3], image.permute(0, 2, 3, 1) / 255)
     assert torch.equal(view.features[..., 3], conf / 2) and view.camera is CAMERA and view.T_world_from_cam is T
-    plain = recording.sensed(frame.replace(conf=None), T)
+    plain = recording.view_from_sensor(frame.replace(conf=None), T)
     assert plain.depth[0, 5, 6] == 2 and (plain.features[..., 3] == 1).all()
     torch.testing.assert_close(plain.sigma, 0.01 * plain.depth)
-    strict = recording.sensed(frame, T, min_conf=2, edge_rel=0.09)
+    strict = recording.view_from_sensor(frame, T, min_conf=2, edge_rel=0.09)
     assert (
         strict.depth[0, 5, 5] == 0 and not strict.depth[:, :, 11:13].any() and (strict.depth[:, :, :5] > 0).sum() == 68
     )
-    lax = recording.sensed(frame, T, min_conf=0, edge_rel=1.0)
+    lax = recording.view_from_sensor(frame, T, min_conf=0, edge_rel=1.0)
     assert torch.equal(lax.depth, depth.nan_to_num().clamp_min(0))

@@ -20,7 +20,7 @@ def world_of(n, points=40, seed=0, hard=0.2):
     score = 1 / (1 + own + 0.3 * torch.rand(shape, generator=g, dtype=torch.float64))
     silent = torch.rand(shape, generator=g, dtype=torch.float64) < 0.2
     depth = torch.where(silent, torch.nan, 2 * (1 + error))
-    flat = errors.points(depth, torch.full_like(depth, 2.0), score)
+    flat = errors.make_points(depth, torch.full_like(depth, 2.0), score)
     return flat.map(lambda x: x.reshape(shape))
 
 
@@ -36,7 +36,7 @@ def scenes_of(n, **options):
 def mean_loss(world, threshold):
     """Mean over scenes of the capped error of what is answered, over all candidates."""
     taken = world.keep & (world.score >= (math.inf if threshold is None else threshold))
-    return float(torch.where(taken, risk.capped(world.error), 0.0).mean())
+    return float(torch.where(taken, risk.cap_error(world.error), 0.0).mean())
 
 
 def table(scene, threshold):
@@ -68,8 +68,8 @@ def test_one_scene_more_stays_below_by_students_t_from_a_table():
     speaks = torch.ones_like(risks, dtype=torch.bool)
     spread = statistics.stdev(risks[:, 0].tolist()) * math.sqrt(1 + 1 / 5)
     for share, t in ((0.9, 1.533), (0.95, 2.132)):
-        assert float(control._one_more(risks, speaks, share)) == pytest.approx(0.04 + t * spread, rel=0.01)
-    assert float(control._one_more(risks, speaks & (risks < 0.025), 0.9)) == math.inf
+        assert float(control._next_scene_bound(risks, speaks, share)) == pytest.approx(0.04 + t * spread, rel=0.01)
+    assert float(control._next_scene_bound(risks, speaks & (risks < 0.025), 0.9)) == math.inf
 
 
 def brute_most(scenes, target, share, few):
@@ -104,19 +104,19 @@ def brute_conformal(scenes, target):
 @pytest.mark.parametrize("target", [0.02, 0.05, 0.1, 0.2, 0.5])
 def test_both_controls_equal_plain_loops(seed, target):
     scenes = scenes_of(12, points=25, seed=seed)
-    assert control.plug_in(scenes, target).threshold == brute_plug_in(scenes, target)
-    assert control.conformal(scenes, target).threshold == brute_conformal(scenes, target)
+    assert control.plug_in_threshold(scenes, target).threshold == brute_plug_in(scenes, target)
+    assert control.conformal_threshold(scenes, target).threshold == brute_conformal(scenes, target)
 
 
 def test_what_is_reported_is_what_happens_at_the_threshold():
     scenes = scenes_of(30)
-    found = control.plug_in(scenes, 0.15)
-    realised = [risk.realised(p, found.threshold) or 0.0 for p in scenes]
+    found = control.plug_in_threshold(scenes, 0.15)
+    realised = [risk.realised_risk(p, found.threshold) or 0.0 for p in scenes]
     assert found.risk == pytest.approx(statistics.mean(realised)) and found.n == 30
     assert found.bound == pytest.approx(found.risk + statistics.stdev(realised) / math.sqrt(30)) and found.bound <= 0.15
     answered = [len(table(p, found.threshold)) / p.keep.numel() for p in scenes]
     assert found.coverage == pytest.approx(statistics.mean(answered)) and f"{found.coverage:.1%}" in found.why
-    promised = control.conformal(scenes, 0.15)
+    promised = control.conformal_threshold(scenes, 0.15)
     losses = [sum(table(p, promised.threshold)) / p.keep.numel() for p in scenes]
     assert promised.risk == pytest.approx(statistics.mean(losses))
     assert promised.bound == pytest.approx((sum(losses) + 1) / 31) and promised.bound <= 0.15
@@ -136,18 +136,18 @@ def test_what_is_reported_is_what_happens_at_the_threshold():
 )
 def test_few_scenes_are_told_how_many_it_takes(target, confidence, needed):
     assert control.scenes_needed(target, confidence=confidence) == needed
-    perfect = [errors.points(torch.ones(20), torch.ones(20)) for _ in range(needed)]
-    assert control.conformal(perfect, target, confidence=confidence).threshold == 1.0
-    found = control.conformal(perfect[1:], target, confidence=confidence)
+    perfect = [errors.make_points(torch.ones(20), torch.ones(20)) for _ in range(needed)]
+    assert control.conformal_threshold(perfect, target, confidence=confidence).threshold == 1.0
+    found = control.conformal_threshold(perfect[1:], target, confidence=confidence)
     assert found.threshold is None and found.needed == needed and f"at least {needed}" in found.why
     assert found.n == needed - 1 and found.coverage == 0
 
 
 def test_nine_scenes_cannot_promise_five_per_cent():
     scenes = scenes_of(9, hard=0.0)
-    assert control.conformal(scenes, 0.05).threshold is None
-    assert control.conformal(scenes, 0.1, confidence=0.9).threshold is None
-    assert control.plug_in(scenes, 0.05).threshold is not None
+    assert control.conformal_threshold(scenes, 0.05).threshold is None
+    assert control.conformal_threshold(scenes, 0.1, confidence=0.9).threshold is None
+    assert control.plug_in_threshold(scenes, 0.05).threshold is not None
 
 
 def loop_confident(scenes, target, confidence):
@@ -169,7 +169,7 @@ def loop_confident(scenes, target, confidence):
 @pytest.mark.parametrize(("target", "confidence"), [(0.1, 0.5), (0.15, 0.8), (0.3, 0.95), (0.4, 0.2)])
 def test_the_control_with_confidence_equals_plain_loops(target, confidence, seed):
     scenes = scenes_of(14, points=10, seed=seed)
-    found = control.conformal(scenes, target, confidence=confidence)
+    found = control.conformal_threshold(scenes, target, confidence=confidence)
     assert found.threshold == loop_confident(scenes, target, confidence)
     assert (found.target, found.confidence, found.n) == (target, confidence, 14)
     assert found.bound == (None if found.threshold is None else pytest.approx(1 - confidence))
@@ -179,57 +179,65 @@ def test_the_control_with_confidence_equals_plain_loops(target, confidence, seed
 def equal_errors(error, n, scenes=2):
     """Scenes of n answers of the same error and of as many silent candidates."""
     depth = torch.cat((torch.full((n,), 4 * (1 + error)), torch.full((n,), math.nan))).double()
-    return [errors.points(depth, torch.full_like(depth, 4.0)) for _ in range(scenes)]
+    return [errors.make_points(depth, torch.full_like(depth, 4.0)) for _ in range(scenes)]
 
 
 def test_a_bound_of_exactly_the_target_is_accepted():
-    assert control.plug_in(equal_errors(0.25, 8), 0.25).threshold == 1
-    assert control.plug_in(equal_errors(0.25, 8), 0.2499).threshold is None
+    assert control.plug_in_threshold(equal_errors(0.25, 8), 0.25).threshold == 1
+    assert control.plug_in_threshold(equal_errors(0.25, 8), 0.2499).threshold is None
     scenes = equal_errors(0.5, 8, scenes=3)  # loss ½ of ½ the candidates: (3/4 + 1) / 4
-    assert control.conformal(scenes, 0.4375).threshold == 1 and control.conformal(scenes, 0.4374).threshold is None
-    found = control.conformal(scenes, 0.4375)
+    assert (
+        control.conformal_threshold(scenes, 0.4375).threshold == 1
+        and control.conformal_threshold(scenes, 0.4374).threshold is None
+    )
+    found = control.conformal_threshold(scenes, 0.4375)
     assert (found.bound, found.risk, found.coverage, found.needed) == (0.4375, 0.25, 0.5, 2)
-    found = control.plug_in(scenes, 0.5)
+    found = control.plug_in_threshold(scenes, 0.5)
     assert (found.bound, found.risk, found.coverage) == (0.5, 0.5, 0.5)
     assert (found.needed, found.confidence, found.target, found.n) == (None, None, 0.5, 3)
 
 
 def test_one_error_is_never_worse_than_one():
-    assert control.plug_in(equal_errors(7.0, 4), 0.99).threshold is None
-    assert control.conformal(equal_errors(7.0, 4, scenes=9), 0.55).bound == pytest.approx((9 * 0.5 + 1) / 10)
+    assert control.plug_in_threshold(equal_errors(7.0, 4), 0.99).threshold is None
+    assert control.conformal_threshold(equal_errors(7.0, 4, scenes=9), 0.55).bound == pytest.approx((9 * 0.5 + 1) / 10)
 
 
 def test_silent_scenes_count_with_risk_0_and_scenes_without_candidates_not_at_all():
-    silent, empty = errors.points(torch.full((5,), math.nan), torch.ones(5)), errors.points(*[torch.zeros(0)] * 2)
-    found = control.plug_in([*equal_errors(0.25, 8), silent, empty], 0.3)
+    silent, empty = (
+        errors.make_points(torch.full((5,), math.nan), torch.ones(5)),
+        errors.make_points(*[torch.zeros(0)] * 2),
+    )
+    found = control.plug_in_threshold([*equal_errors(0.25, 8), silent, empty], 0.3)
     risks = [0.25, 0.25, 0.0]
     assert found.n == 3 and found.risk == pytest.approx(0.5 / 3) and found.coverage == pytest.approx(1 / 3)
     assert found.bound == pytest.approx(0.5 / 3 + statistics.stdev(risks) / math.sqrt(3))
 
 
 def test_thinned_thresholds_are_spread_evenly_from_the_lowest_score_to_the_highest(monkeypatch):
-    monkeypatch.setattr(control, "MOST_THRESHOLDS", 5)
+    monkeypatch.setattr(control, "_MAX_THRESHOLDS", 5)
     n = 17
     for first_good, expected in ((0, 0), (1, 4), (4, 4), (5, 8), (13, 16), (16, 16)):
         wrong = torch.arange(n) < first_good
-        scene = errors.points(torch.where(wrong, 9.0, 1.0), torch.ones(n), torch.arange(float(n)))
-        assert control.plug_in([scene, scene], 0.01).threshold == expected
-    monkeypatch.setattr(control, "MOST_THRESHOLDS", 17)
+        scene = errors.make_points(torch.where(wrong, 9.0, 1.0), torch.ones(n), torch.arange(float(n)))
+        assert control.plug_in_threshold([scene, scene], 0.01).threshold == expected
+    monkeypatch.setattr(control, "_MAX_THRESHOLDS", 17)
     wrong = torch.arange(n) < 5
-    scene = errors.points(torch.where(wrong, 9.0, 1.0), torch.ones(n), torch.arange(float(n)))
-    assert control.plug_in([scene, scene], 0.01).threshold == 5, "as many as there are: none is left out"
+    scene = errors.make_points(torch.where(wrong, 9.0, 1.0), torch.ones(n), torch.arange(float(n)))
+    assert control.plug_in_threshold([scene, scene], 0.01).threshold == 5, "as many as there are: none is left out"
 
 
 def test_the_reason_is_said_in_words():
-    assert control.plug_in(equal_errors(0.0, 8), 0.1).why == "score ≥ 1 answers 50.0% of the candidates"
-    few = control.conformal(equal_errors(0.0, 8), 0.1).why
+    assert control.plug_in_threshold(equal_errors(0.0, 8), 0.1).why == "score ≥ 1 answers 50.0% of the candidates"
+    few = control.conformal_threshold(equal_errors(0.0, 8), 0.1).why
     assert few == "2 scenes are too few: a target of 0.1 takes at least 9"
-    bad = control.conformal(equal_errors(9.0, 8, scenes=9), 0.1)
+    bad = control.conformal_threshold(equal_errors(9.0, 8, scenes=9), 0.1)
     assert bad.why == "no threshold meets 0.1 on these 9 scenes" and bad.needed == 9 and bad.bound is None
 
 
 def test_no_scene_is_no_evidence():
-    assert control.p_value(0.0, 0, 0.1) == 1 and control.p_value(0.0, 1, 0.5) == 0.5
+    assert (
+        control._hoeffding_bentkus_p_value(0.0, 0, 0.1) == 1 and control._hoeffding_bentkus_p_value(0.0, 1, 0.5) == 0.5
+    )
 
 
 @pytest.mark.parametrize(("target", "n", "worlds"), [(0.1, 100, 30), (0.1, 25, 60), (0.05, 19, 60)])
@@ -237,7 +245,7 @@ def test_conformal_keeps_its_promise_for_the_next_scene(target, n, worlds):
     losses, none = [], 0
     for world in range(worlds):
         scenes = world_of(n + 20, points=20, seed=1000 + world)
-        found = control.conformal(split(scenes[:n]), target)
+        found = control.conformal_threshold(split(scenes[:n]), target)
         none += found.threshold is None
         losses.append(mean_loss(scenes[n:], found.threshold))
     error = statistics.stdev(losses) / math.sqrt(len(losses))
@@ -249,7 +257,8 @@ def test_conformal_keeps_its_promise_for_the_next_scene(target, n, worlds):
 def test_with_confidence_few_worlds_exceed_the_target():
     judge, worlds, target, confidence = world_of(1500, points=20, seed=5), 40, 0.15, 0.8
     found = [
-        control.conformal(scenes_of(60, points=20, seed=2000 + w), target, confidence=confidence) for w in range(worlds)
+        control.conformal_threshold(scenes_of(60, points=20, seed=2000 + w), target, confidence=confidence)
+        for w in range(worlds)
     ]
     exceeded = sum(mean_loss(judge, f.threshold) > target for f in found)
     allowed = 1 - confidence
@@ -260,9 +269,9 @@ def test_with_confidence_few_worlds_exceed_the_target():
 def test_with_confidence_the_lowest_threshold_of_small_p_value_is_taken():
     world = world_of(60, seed=7)
     scenes = split(world)
-    found = control.conformal(scenes, 0.15, confidence=0.8)
+    found = control.conformal_threshold(scenes, 0.15, confidence=0.8)
     below = max(t for t in every_threshold(scenes) if t < found.threshold)
-    p = [control.p_value(mean_loss(world, t), 60, 0.15) for t in (found.threshold, below)]
+    p = [control._hoeffding_bentkus_p_value(mean_loss(world, t), 60, 0.15) for t in (found.threshold, below)]
     assert p[0] <= 0.2 < p[1]
 
 
@@ -270,8 +279,8 @@ def test_plug_in_holds_in_the_mean_and_promises_no_scene():
     realised, over = [], 0
     for world in range(40):
         scenes = scenes_of(40, points=20, seed=3000 + world)
-        threshold = control.plug_in(scenes[:20], 0.1).threshold
-        risks = [risk.realised(p, threshold) or 0.0 for p in scenes[20:]]
+        threshold = control.plug_in_threshold(scenes[:20], 0.1).threshold
+        risks = [risk.realised_risk(p, threshold) or 0.0 for p in scenes[20:]]
         realised.append(statistics.mean(risks))
         over += sum(r > 0.1 for r in risks)
     assert statistics.mean(realised) <= 0.1
@@ -289,11 +298,15 @@ def test_the_p_value_equals_its_formula_and_is_valid(n, target):
         divergence = (1 - mean) * math.log((1 - mean) / (1 - target))
         divergence += mean * math.log(mean / target) if mean else 0
         bentkus = math.e * binomial_cdf(math.ceil(n * mean - 1e-9), n, target)
-        assert control.p_value(mean, n, target) == pytest.approx(min(1, math.exp(-n * divergence), bentkus), rel=1e-9)
-    assert control.p_value(target, n, target) == 1 == control.p_value(0.9, n, target)
+        assert control._hoeffding_bentkus_p_value(mean, n, target) == pytest.approx(
+            min(1, math.exp(-n * divergence), bentkus), rel=1e-9
+        )
+    assert (
+        control._hoeffding_bentkus_p_value(target, n, target) == 1 == control._hoeffding_bentkus_p_value(0.9, n, target)
+    )
     # losses of 0 and 1 with mean equal to the target: small p-values are as rare as they say
     for level in (0.05, 0.2):
-        seen = [k for k in range(n + 1) if control.p_value(k / n, n, target) <= level]
+        seen = [k for k in range(n + 1) if control._hoeffding_bentkus_p_value(k / n, n, target) <= level]
         rare = sum(math.comb(n, k) * target**k * (1 - target) ** (n - k) for k in seen)
         assert rare <= level + 1e-12
 
@@ -303,46 +316,46 @@ def test_any_depth_source_will_do():
     truth = 1 + 3 * torch.rand(40, 30, generator=g)
     confidence = 1 + 9 * torch.rand(40, 30, generator=g)  # as learned models state it: from 1 upwards
     prediction = truth * (1 + torch.randn(40, 30, generator=g) / confidence / 2)
-    scenes = [errors.points(*row) for row in zip(prediction, truth, confidence, strict=True)]
-    for found in (control.plug_in(scenes, 0.05), control.conformal(scenes, 0.05)):
+    scenes = [errors.make_points(*row) for row in zip(prediction, truth, confidence, strict=True)]
+    for found in (control.plug_in_threshold(scenes, 0.05), control.conformal_threshold(scenes, 0.05)):
         assert 1 < found.threshold < 10 and 0.1 < found.coverage < 1
 
 
 def test_nothing_to_choose_from():
-    silent = errors.points(torch.full((5,), math.nan), torch.ones(5))
-    empty = errors.points(torch.zeros(0), torch.zeros(0))
+    silent = errors.make_points(torch.full((5,), math.nan), torch.ones(5))
+    empty = errors.make_points(torch.zeros(0), torch.zeros(0))
     for scenes in ([], [empty], [silent] * 30, [empty, silent]):
-        for found in (control.plug_in(scenes, 0.1), control.conformal(scenes, 0.1)):
+        for found in (control.plug_in_threshold(scenes, 0.1), control.conformal_threshold(scenes, 0.1)):
             assert found.threshold is None and found.coverage == 0 and found.why
             assert found.n == sum(s is silent for s in scenes)
-    bad = [errors.points(torch.full((5,), 9.0), torch.ones(5)) for _ in range(30)]
-    assert "no threshold meets 0.1" in control.plug_in(bad, 0.1).why
-    assert control.plug_in(scenes_of(1), 0.5).threshold is None, "one scene has no standard error"
+    bad = [errors.make_points(torch.full((5,), 9.0), torch.ones(5)) for _ in range(30)]
+    assert "no threshold meets 0.1" in control.plug_in_threshold(bad, 0.1).why
+    assert control.plug_in_threshold(scenes_of(1), 0.5).threshold is None, "one scene has no standard error"
 
 
 def test_many_scores_are_thinned_without_losing_the_promise(monkeypatch):
     scenes = scenes_of(30, points=300)
-    exact = control.conformal(scenes, 0.08)
-    monkeypatch.setattr(control, "MOST_THRESHOLDS", 50)
-    coarse = control.conformal(scenes, 0.08)
+    exact = control.conformal_threshold(scenes, 0.08)
+    monkeypatch.setattr(control, "_MAX_THRESHOLDS", 50)
+    coarse = control.conformal_threshold(scenes, 0.08)
     assert coarse.bound <= 0.08 and exact.threshold < coarse.threshold < exact.threshold + 0.05
-    assert control.plug_in(scenes, 0.1).bound <= 0.1
+    assert control.plug_in_threshold(scenes, 0.1).bound <= 0.1
 
 
 @pytest.mark.parametrize("wrong", [0.0, 1.0, -0.1, math.nan])
 def test_bad_targets_raise(wrong):
-    for call in (control.plug_in, control.conformal):
+    for call in (control.plug_in_threshold, control.conformal_threshold):
         with pytest.raises(ValueError, match=r"control\.target: found"):
             call([], wrong)
     with pytest.raises(ValueError, match=r"control\.confidence: found"):
-        control.conformal([], 0.1, confidence=wrong)
+        control.conformal_threshold([], 0.1, confidence=wrong)
 
 
 @pytest.mark.parametrize(("share", "few"), [(0.9, 0), (1.0, 0), (0.6, 0), (0.9, 12), (1.0, 20), (0.95, 0), (0.95, 12)])
 @pytest.mark.parametrize("target", [0.03, 0.08, 0.2])
 def test_most_scenes_is_the_lowest_threshold_that_so_many_keep(target, share, few):
     scenes = scenes_of(12, seed=4)
-    found = control.most_scenes(scenes, target, share=share, few=few)
+    found = control.scene_quantile_threshold(scenes, target, share=share, few=few)
     expected = brute_most(scenes, target, share, few)
     assert found.threshold == expected
     if expected is not None:
@@ -360,24 +373,26 @@ def test_of_few_scenes_the_worst_to_come_is_read_from_their_spread():
     """Seven scenes just below the target: close together they are believed, far apart they are not."""
 
     def scene(error, score):
-        return errors.points(torch.tensor([1.0 + error, 1.0]), torch.ones(2), torch.tensor([score, 0.9]))
+        return errors.make_points(torch.tensor([1.0 + error, 1.0]), torch.ones(2), torch.tensor([score, 0.9]))
 
     close = [scene(e, 0.3) for e in (0.090, 0.091, 0.092, 0.093, 0.090, 0.091, 0.092)]
     apart = [scene(e, 0.3) for e in (0.001, 0.098, 0.001, 0.098, 0.001, 0.098, 0.05)]
-    assert control.most_scenes(close, 0.05).threshold == pytest.approx(0.3)
-    assert control.most_scenes(apart, 0.05).threshold == pytest.approx(0.9)
-    assert control.most_scenes(apart[:4], 0.05).threshold == pytest.approx(0.3), "of four no spread is known"
+    assert control.scene_quantile_threshold(close, 0.05).threshold == pytest.approx(0.3)
+    assert control.scene_quantile_threshold(apart, 0.05).threshold == pytest.approx(0.9)
+    assert control.scene_quantile_threshold(apart[:4], 0.05).threshold == pytest.approx(0.3), (
+        "of four no spread is known"
+    )
 
 
 def test_a_mean_may_keep_what_scenes_do_not():
     """One bad scene among many good ones: the mean is met, and nine in ten are; all are at a higher threshold alone."""
     good, bad = (
-        errors.points(torch.tensor([1.0 + e, 1.0]), torch.ones(2), torch.tensor([0.3, 0.9])) for e in (0.01, 0.4)
+        errors.make_points(torch.tensor([1.0 + e, 1.0]), torch.ones(2), torch.tensor([0.3, 0.9])) for e in (0.01, 0.4)
     )
     scenes = [good] * 19 + [bad]
-    assert control.plug_in(scenes, 0.05).threshold == pytest.approx(0.3)
-    assert control.most_scenes(scenes, 0.05).threshold == pytest.approx(0.3)
-    assert control.most_scenes(scenes, 0.05, share=1.0).threshold == pytest.approx(0.9)
-    assert control.most_scenes([good] * 3 + [bad], 0.05).threshold == pytest.approx(0.9)
+    assert control.plug_in_threshold(scenes, 0.05).threshold == pytest.approx(0.3)
+    assert control.scene_quantile_threshold(scenes, 0.05).threshold == pytest.approx(0.3)
+    assert control.scene_quantile_threshold(scenes, 0.05, share=1.0).threshold == pytest.approx(0.9)
+    assert control.scene_quantile_threshold([good] * 3 + [bad], 0.05).threshold == pytest.approx(0.9)
     with pytest.raises(ValueError, match=r"control\.share"):
-        control.most_scenes(scenes, 0.05, share=0.0)
+        control.scene_quantile_threshold(scenes, 0.05, share=0.0)

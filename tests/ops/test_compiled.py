@@ -21,48 +21,39 @@ from torch.utils._pytree import tree_leaves
 from dhtorch import PAPER, WINDOW
 from dhtorch.codes import PoseCode, Source
 from dhtorch.geometry import (
-    affine_alignment as affine,
-)
-from dhtorch.geometry import (
+    affine_alignment,
     least_squares,
     p3p,
+    patches,
+    plane_sweep,
     pyramid,
     ransac,
+    reprojection_problem,
     se3,
 )
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry import (
-    patches as lookup,
-)
-from dhtorch.geometry import (
-    plane_sweep as sweep,
-)
-from dhtorch.geometry import (
-    reprojection_problem as near_far,
-)
-from dhtorch.geometry import (
     windows as neighbours,
 )
 from dhtorch.geometry.camera import Camera, from_matrix, project, unproject
-from dhtorch.geometry.filters import gaussian
-from dhtorch.geometry.reprojection_problem import Problem
+from dhtorch.geometry.filters import gaussian_blur
+from dhtorch.geometry.reprojection_problem import PoseDepthProblem
 from dhtorch.metrics.holdout import range_split
-from dhtorch.ops import loader as native
-from dhtorch.pipeline import dense
-from dhtorch.pipeline import surface as stereo
+from dhtorch.ops import loader
+from dhtorch.pipeline import dense, surface
 from dhtorch.pipeline.pair import merge
-from dhtorch.records import NO_HINT, Frame, Map, PoseFit, Samples, Shutter, TrackHint, Tracks
+from dhtorch.records import NO_HINT, Frame, MergedDepth, PoseFit, Samples, Shutter, TrackHint, Tracks
 from dhtorch.stages import sample
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
-from dhtorch.stages.pose import SEARCH_POINTS, map_pose, pnp_ransac
+from dhtorch.stages.pose import MAX_SEARCH_POINTS, map_pose, pnp_ransac
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.transforms import ExtendDepth, ExtendedDataset, patch_tokens
 from dhtorch.transforms.sample_access import SampleError
-from dhtorch.transforms.sample_spec import CAMERAS, UNITS, Views
+from dhtorch.transforms.sample_spec import MAX_CACHED_CAMERAS, SAMPLE_UNITS_PER_METRE, SampleSpec
 from dhtorch.transforms.status import SampleProblem
-from dhtorch.transforms.tokens import FITS
+from dhtorch.transforms.tokens import FIT_MODES
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32", reason="no C++ compiler here")
@@ -72,7 +63,7 @@ needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32",
 def unused(monkeypatch):
     """Every test begins and ends without compiled code."""
     monkeypatch.delenv("DHTORCH_NATIVE", raising=False)
-    monkeypatch.setattr(native, "_loaded", [])
+    monkeypatch.setattr(loader, "_loaded", [])
 
 
 @pytest.fixture(scope="session")
@@ -81,14 +72,14 @@ def cache(tmp_path_factory):
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DHTORCH_CACHE", str(folder))
-        native.build()
+        loader.build()
     return folder
 
 
 @pytest.fixture
 def loaded(cache, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(cache))
-    native.load()
+    loader.load()
 
 
 def volume(*shape, most, seed=0):
@@ -97,10 +88,10 @@ def volume(*shape, most, seed=0):
 
 def both_ways(call, monkeypatch):
     """What compiled code answers, and torch."""
-    assert native._loaded
+    assert loader._loaded
     found = call()
     with monkeypatch.context() as patch:
-        patch.setattr(native, "_loaded", [])
+        patch.setattr(loader, "_loaded", [])
         return found, call()
 
 
@@ -173,9 +164,9 @@ def test_pixels_are_the_same(loaded, monkeypatch):
     uv = torch.rand(2, 50, 2, generator=torch.Generator().manual_seed(3)) * 40 - 5
     uv[0, :8, 0] = torch.tensor([torch.nan, torch.inf, -torch.inf, 3e9, -3e9, 0.5, -0.5, 1.5])
     calls = counted(monkeypatch, "pixels")
-    ours, torchs = both_ways(lambda: lookup.pixels(uv), monkeypatch)
+    ours, torchs = both_ways(lambda: patches.containing_pixels(uv), monkeypatch)
     assert calls == ["pixels"] and ours.dtype == torchs.dtype and torch.equal(ours, torchs)
-    assert lookup.pixels(uv.double()).dtype == torch.int32 and len(calls) == 1
+    assert patches.containing_pixels(uv.double()).dtype == torch.int32 and len(calls) == 1
 
 
 @needs_compiler
@@ -267,9 +258,9 @@ def test_pyramids_that_compiled_code_cannot_build_are_torchs(loaded, monkeypatch
 def test_whole_depths_in_metres_are_the_same_bits(loaded, monkeypatch, kind, unit, bounds):
     every = torch.arange(-(1 << 15), 1 << 15, dtype=torch.int32).to(torch.int16).view(kind).view(2, 128, 256)
     calls = counted(monkeypatch, "metres")
-    views = Views(depth_unit="mm", depth_range=bounds)
+    views = SampleSpec(depth_unit="mm", depth_range=bounds)
     if unit == "m":  # another divisor than the one that is written for
-        monkeypatch.setitem(UNITS, "mm", 5000.0)
+        monkeypatch.setitem(SAMPLE_UNITS_PER_METRE, "mm", 5000.0)
     ours, torchs = both_ways(lambda: views.metres(list(every)), monkeypatch)
     assert len(calls) == 2 and ours.dtype == torchs.dtype == torch.float32
     assert torch.equal(ours, torchs) and ours.unique().numel() > 8000 and ours.amin() == 0
@@ -280,17 +271,17 @@ def test_depths_that_compiled_code_does_not_take_are_torchs(loaded, monkeypatch)
     calls = counted(monkeypatch, "metres", "probe")
     whole = torch.arange(6000).view(1, 60, 100)
     for x in (whole.int(), whole.float(), whole.double(), whole.to(torch.uint8)):
-        assert (Views(depth_unit="mm").metres([x])[0] - x / 1000.0).abs().max() < 1e-6
-    assert Views(depth_unit=0.002).metres([whole.to(torch.int16)])[0, 0, 59, 99] == 5999 * 0.002
+        assert (SampleSpec(depth_unit="mm").metres([x])[0] - x / 1000.0).abs().max() < 1e-6
+    assert SampleSpec(depth_unit=0.002).metres([whole.to(torch.int16)])[0, 0, 59, 99] == 5999 * 0.002
     with pytest.raises(SampleError, match="is the unit mm"):
-        Views(depth_unit="m").metres([whole.to(torch.int16)])
-    Views(depth_unit="m")._probed(whole.double())
+        SampleSpec(depth_unit="m").metres([whole.to(torch.int16)])
+    SampleSpec(depth_unit="m")._probed(whole.double())
     assert not calls
 
 
 @needs_compiler
 def test_what_some_depths_say_is_what_torch_says(loaded, monkeypatch):
-    views, random = Views(depth_unit="m"), torch.Generator().manual_seed(5)
+    views, random = SampleSpec(depth_unit="m"), torch.Generator().manual_seed(5)
     depth = 3 * torch.rand(6, 60, 80, generator=random)
     depth[0, ::2], depth[1], depth[2], depth[3, :40] = 0, 0, 0, 300.0
     depth[2, 31, 17], depth[4] = 1.5, 0.004
@@ -333,7 +324,7 @@ def sparse(batch, n, seed=0):
     uv = uv * torch.tensor([90.0, 70.0]) - 5
     uv[:, ::7, 1], depth[:, ::5], sigma[:, ::11], depth[:, ::13] = torch.nan, 0, torch.nan, torch.inf
     source, hole = (torch.randint(0, k, (batch, n), generator=random, dtype=torch.int32) for k in (3, 8))
-    return Map(uv, depth, sigma, torch.ones_like(depth), source), hole - 1  # -1: of no class
+    return MergedDepth(uv, depth, sigma, torch.ones_like(depth), source), hole - 1  # -1: of no class
 
 
 @needs_compiler
@@ -376,32 +367,32 @@ def test_tokens_that_compiled_code_cannot_pool_are_torchs(loaded, monkeypatch):
 def test_surfaces_and_rivals_are_equal(loaded, monkeypatch, shape, views, most):
     """In numbers as small as costs allow: bytes where four paths fit into one, or two, or one, and larger ones."""
     C, views = volume(*shape, most=most), torch.tensor(views)
-    (found, some), (expected, few) = both_ways(lambda: sweep.surface(C, views), monkeypatch)
+    (found, some), (expected, few) = both_ways(lambda: plane_sweep.aggregate_best_plane(C, views), monkeypatch)
     for a, b in zip((*found, some), (*expected, few), strict=True):
         assert torch.equal(a, b) and a.dtype == b.dtype
     for reach in (0.0, 2.0, 1e4):
         far = torch.full((len(C),), reach)
-        a, b = both_ways(lambda far=far: sweep.rivals(some, found, far), monkeypatch)
+        a, b = both_ways(lambda far=far: plane_sweep.second_best_margin(some, found, far), monkeypatch)
         assert torch.equal(a, b)
 
 
 @needs_compiler
 def test_costs_are_equal_also_where_a_place_lies_behind_the_other_view(loaded, monkeypatch):
     """One pair sideways and turned, one straight ahead through what it sees; a view that only one of them wants."""
-    pictures = gaussian(torch.rand(2, 2, 30, 41, generator=torch.Generator().manual_seed(0)), 1.0)
+    pictures = gaussian_blur(torch.rand(2, 2, 30, 41, generator=torch.Generator().manual_seed(0)), 1.0)
     camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[19.5, 14.0], [21.0, 15.5]]))
     motion = torch.tensor([[0.02, -0.1, 0.2, -0.3, 0.1, 0.05], [0.0, 0.0, 0.0, 0.1, 0.0, -1.4]])
-    base = sweep.base(pictures[:, :1], camera)
-    view = sweep.View(pictures[:, 1:], camera, se3.exp(motion))
+    base = plane_sweep.make_reference_view(pictures[:, :1], camera)
+    view = plane_sweep.SweptView(pictures[:, 1:], camera, se3.exp(motion))
     q = torch.linspace(0, 1, 37).square() * torch.tensor([[1.0], [0.9]])
 
     def costs():
         C = torch.zeros(2, *base.hw, 37, dtype=torch.uint8).movedim(-1, 1)
         for wanted in ([True, False], [True, True]):
-            sweep.add_costs(C, base, view, q, torch.tensor(wanted))
+            plane_sweep.add_census_costs(C, base, view, q, torch.tensor(wanted))
         return C
 
-    assert bool((sweep.travel(base, view).c * q < -1).any()), "behind the other view"
+    assert bool((plane_sweep.epipolar_warp(base, view).c * q < -1).any()), "behind the other view"
     found, expected = both_ways(costs, monkeypatch)
     assert torch.equal(found, expected) and len(found.unique()) > 20
 
@@ -411,20 +402,21 @@ def test_costs_are_equal_also_where_a_place_lies_behind_the_other_view(loaded, m
 def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
     g = torch.Generator().manual_seed(1)
     picture = torch.rand(2, 1, 6, 21, generator=g).mul(9).round() / 9  # equal neighbours are not darker
-    assert torch.equal(*both_ways(lambda: sweep.census(picture), monkeypatch))
+    assert torch.equal(*both_ways(lambda: plane_sweep.census_transform(picture), monkeypatch))
     ray = torch.rand(2, 500, 3, generator=g) - 0.5
     camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[19.5, 14.0], [21.0, 15.5]]))
     motion = se3.exp(0.5 * torch.randn(2, 6, generator=g))
-    view = sweep.View(
+    view = plane_sweep.SweptView(
         torch.zeros(2, 1, 4, 4), camera, motion, 0.1 * torch.randn(2, 3, generator=g) if turning else None
     )
     found, expected = both_ways(
-        lambda: sweep.seen_at(view, ray, torch.rand(2, 500, generator=g.manual_seed(2))), monkeypatch
+        lambda: plane_sweep.project_inverse_depth(view, ray, torch.rand(2, 500, generator=g.manual_seed(2))),
+        monkeypatch,
     )
     assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1]) and not bool(found[1].all())
     for shape in ((2, 30, 17), (2, 3, 5), (2, 1, 1)):
         q = torch.rand(*shape, generator=g)
-        smooth = both_ways(lambda q=q: neighbours.smooth(q, torch.tensor([0.2, 0.5])), monkeypatch)
+        smooth = both_ways(lambda q=q: neighbours.smooth_within_tolerance(q, torch.tensor([0.2, 0.5])), monkeypatch)
         assert torch.equal(*smooth)
 
 
@@ -434,18 +426,18 @@ def test_places_codes_and_smooth_maps_are_equal(loaded, monkeypatch, turning):
 def test_fitted_windows_agree_up_to_rounding(loaded, monkeypatch, lens, hw):
     """Pairs turned and moved, pixels that leave the other picture or lie behind it, and one without texture."""
     g = torch.Generator().manual_seed(3)
-    pictures = gaussian(torch.rand(3, 2, *hw, generator=g), 1.2)
+    pictures = gaussian_blur(torch.rand(3, 2, *hw, generator=g), 1.2)
     pictures[2, 0] = 0.4
     f = torch.full((3, 2), float(max(hw)))
     lens = torch.tensor([[0.05, -0.01, 0.001, -0.002]]).expand(3, -1) if lens else None
     camera = Camera(f, torch.tensor([[hw[1] / 2, hw[0] / 2]]).expand(3, -1), lens)
     motion = se3.exp(0.05 * torch.randn(3, 6, generator=g) + torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, -0.4]))
-    base = sweep.base(pictures[:, :1], camera)
-    view = sweep.View(pictures[:, 1:], camera, motion)
-    q = 0.2 + 0.1 * gaussian(torch.rand(3, 1, *hw, generator=g), 2.0)[:, 0]
+    base = plane_sweep.make_reference_view(pictures[:, :1], camera)
+    view = plane_sweep.SweptView(pictures[:, 1:], camera, motion)
+    q = 0.2 + 0.1 * gaussian_blur(torch.rand(3, 1, *hw, generator=g), 2.0)[:, 0]
     q[:, 0] = 4.0  # behind
-    picture = sweep.with_gradients(view.image)
-    found, expected = both_ways(lambda: sweep.fit_windows(base, view, picture, q), monkeypatch)
+    picture = plane_sweep.stack_gradients(view.image)
+    found, expected = both_ways(lambda: plane_sweep.fit_windows(base, view, picture, q), monkeypatch)
     assert torch.equal(found.seen, expected.seen) and not bool(found.seen.all()) and bool(found.seen.any())
     for name in ("step", "contrast", "noise", "correlation", "motion"):
         a, b = getattr(found, name), getattr(expected, name)
@@ -461,10 +453,12 @@ def test_what_hides_and_how_sure_motions_are_agrees(loaded, monkeypatch, turning
     grey = torch.rand(2, 1, 13, 50, generator=g)
     camera = Camera(torch.tensor([[40.0, 41.0], [35.0, 35.0]]), torch.tensor([[24.5, 6.0], [21.0, 5.5]]))
     T = se3.exp(torch.tensor([[0.02, -0.1, 0.2, -0.6, 0.1, 0.05], [0.0, 0.0, 0.0, 0.1, 0.0, -1.4]]))
-    base, view = sweep.base(grey, camera), sweep.View(grey, camera, T)
+    base, view = plane_sweep.make_reference_view(grey, camera), plane_sweep.SweptView(grey, camera, T)
     q = torch.rand(2, 13, 50, generator=g)
     near = torch.tensor([0.01, 0.3])
-    found, expected = both_ways(lambda: sweep.hidden(sweep.travel(base, view), q, near), monkeypatch)
+    found, expected = both_ways(
+        lambda: plane_sweep.occlusion_mask(plane_sweep.epipolar_warp(base, view), q, near), monkeypatch
+    )
     assert torch.equal(found, expected) and 0.05 < found.float().mean() < 0.9
     half = torch.randn(2, 9 if turning else 6, 9 if turning else 6, generator=g)
     cov = 1e-4 * half @ half.mT
@@ -474,11 +468,11 @@ def test_what_hides_and_how_sure_motions_are_agrees(loaded, monkeypatch, turning
     fit = PoseFit(T, cov[:, :6, :6], none[:, None] > 1, none.long(), none, none, none, code, shutter)
     motion = torch.randn(2, 13, 50, 2, generator=g)
     motion[0, :2] = 0.0
-    found, expected = both_ways(lambda: stereo.pose_variance(base, view, fit, q, motion), monkeypatch)
+    found, expected = both_ways(lambda: surface.pose_variance(base, view, fit, q, motion), monkeypatch)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=0.0)
     for code in (PoseCode.OK, PoseCode.TOO_FEW):
         lost = fit.replace(code=torch.full_like(fit.code, code), cov=fit.cov * torch.nan, shutter=None)
-        a, b = both_ways(lambda lost=lost: stereo.pose_variance(base, view, lost, q, motion), monkeypatch)
+        a, b = both_ways(lambda lost=lost: surface.pose_variance(base, view, lost, q, motion), monkeypatch)
         assert torch.equal(a, b) and not a.any(), "what is not known is no number"
 
 
@@ -488,11 +482,11 @@ def test_maps_agree_to_far_less_than_their_sigma(loaded, monkeypatch, partners):
     room = SyntheticRoom(n_frames=9, hw=(96, 128), depth_hw=(48, 64))
     anchor, *others = (range_split(room[k], 2.0) for k in (1, 6, 8))
     with monkeypatch.context() as patch:
-        patch.setattr(native, "_loaded", [])
+        patch.setattr(loader, "_loaded", [])
         trace = {}
-        asked = dense.views_asked(WINDOW(anchor, others, trace=trace), others, trace)
+        asked = dense.selected_views(WINDOW(anchor, others, trace=trace), others, trace)
     found, expected = both_ways(
-        lambda: dense.swept(anchor, asked, partners=partners, planes=48, max_sigma_rel=0.5), monkeypatch
+        lambda: dense.sweep_depth(anchor, asked, partners=partners, planes=48, max_sigma_rel=0.5), monkeypatch
     )
     assert (found.gate != expected.gate).float().mean() <= 0.005 and torch.equal(found.gate == 0, found.depth > 0)
     both = (found.source == Source.SWEPT) & (expected.source == Source.SWEPT)
@@ -503,16 +497,16 @@ def test_maps_agree_to_far_less_than_their_sigma(loaded, monkeypatch, partners):
 
 @needs_compiler
 def test_windows_of_another_size_or_type_or_with_a_graph_are_fitted_by_torch(loaded, monkeypatch):
-    monkeypatch.setattr(sweep, "_compiled_fit", None)
+    monkeypatch.setattr(plane_sweep, "_compiled_fit", None)
     grey = torch.rand(1, 2, 12, 14, generator=torch.Generator().manual_seed(4))
     camera = Camera(torch.full((1, 2), 20.0), torch.tensor([[6.5, 5.5]]))
     motion = se3.exp(torch.tensor([[0.0, 0.0, 0.0, 0.1, 0.0, 0.0]]))
 
     def fitted(grey, **options):
-        base = sweep.base(grey[:, :1], camera.to(grey.dtype))
-        view = sweep.View(grey[:, 1:], camera.to(grey.dtype), motion.to(grey.dtype))
+        base = plane_sweep.make_reference_view(grey[:, :1], camera.to(grey.dtype))
+        view = plane_sweep.SweptView(grey[:, 1:], camera.to(grey.dtype), motion.to(grey.dtype))
         q = torch.full_like(grey[:, 0], 0.5)
-        return sweep.fit_windows(base, view, sweep.with_gradients(view.image), q, **options)
+        return plane_sweep.fit_windows(base, view, plane_sweep.stack_gradients(view.image), q, **options)
 
     fitted(grey.double())
     fitted(grey, radius=2)
@@ -527,7 +521,7 @@ def test_windows_of_another_size_or_type_or_with_a_graph_are_fitted_by_torch(loa
 def seen_twice():
     """Two pictures, each seen again moved by a few pixels and lit otherwise; points in, at the border of and beside it."""
     g = torch.Generator().manual_seed(5)
-    rough, fine = (gaussian(torch.rand(2, 1, 120, 150, generator=g), s) - 0.5 for s in (3.0, 0.8))
+    rough, fine = (gaussian_blur(torch.rand(2, 1, 120, 150, generator=g), s) - 0.5 for s in (3.0, 0.8))
     wide = 2.5 * rough + fine + 0.5
     here, there = wide[..., 10:-10, 10:-10], 0.8 * wide[..., 13:-7, 5:-15] + 0.1
     there = there + 0.004 * torch.randn(there.shape, generator=g)
@@ -572,40 +566,48 @@ def test_a_search_for_points_agrees_up_to_rounding(loaded, monkeypatch, seen_twi
 
 def test_compiled_code_has_the_constants_of_torchs():
     """It reads past the end of a row: a level has a row more than a window at its border reaches."""
-    source = native.SOURCES[1].read_text()
+    source = loader.SOURCES[1].read_text()
     for line in (
-        f"STEPS = {lk.STEPS}, LEAP = {lk.LEAP}, MARGIN = {pyramid.MARGIN};",
-        f"RATIO = {lk.RATIO[1]}f, LEAST_GAIN = {lk.GAIN[0]}f, MOST_GAIN = {lk.GAIN[1]}f;",
-        f"{{ {', '.join(lk.NORMALISE).upper()} }}",
+        f"STEPS = {lk.STEPS_PER_MAP}, LEAP = {lk.AITKEN_STEP}, MARGIN = {pyramid.OUTSIDE_MARGIN_PX};",
+        f"RATIO = {lk.AITKEN_RATIO_RANGE[1]}f, LEAST_GAIN = {lk.CONTRAST_RATIO_RANGE[0]}f, MOST_GAIN = {lk.CONTRAST_RATIO_RANGE[1]}f;",
+        f"{{ {', '.join(lk.NORMALISATIONS).upper()} }}",
     ):
         assert line in source
-    source = native.SOURCES[2].read_text()
+    source = loader.SOURCES[2].read_text()
     for line in (
-        f"REACH = {pyramid.REACH}, MARGIN = {pyramid.MARGIN};",
-        f"AHEAD = {affine.AHEAD}f, LEAST_GAIN = {affine.GAIN[0]}f, MOST_GAIN = {affine.GAIN[1]}f;",
+        f"REACH = {pyramid.SEARCH_PADDING_PX}, MARGIN = {pyramid.OUTSIDE_MARGIN_PX};",
+        f"AHEAD = {affine_alignment.MAX_EXTRAPOLATION}f, LEAST_GAIN = {affine_alignment.REGISTRATION_GAIN_RANGE[0]}f, MOST_GAIN = {affine_alignment.REGISTRATION_GAIN_RANGE[1]}f;",
         "NOISE = 2.0 / 255 / 2, DAMPING = NOISE * NOISE, MIN_PIVOT = 1e-6;",
     ):
         assert line in source
     for line in (
-        f"RADIUS = {sweep.FIT_RADIUS};",
-        f"LEAST_GAIN = {sweep.GAIN[0]}f, MOST_GAIN = {sweep.GAIN[1]}f, FLAT = 1e-8f;",
+        f"RADIUS = {plane_sweep.FIT_RADIUS_PX};",
+        f"LEAST_GAIN = {plane_sweep.WINDOW_GAIN_RANGE[0]}f, MOST_GAIN = {plane_sweep.WINDOW_GAIN_RANGE[1]}f, FLAT = 1e-8f;",
     ):
-        assert line in native.SOURCES[4].read_text()
+        assert line in loader.SOURCES[4].read_text()
     for line in (
-        f"MIN_HEIGHT = {p3p.MIN_HEIGHT}, MAX_COSINE = 1 - 1e-12;".replace("0.001", "1e-3"),
+        f"MIN_HEIGHT = {p3p.MIN_HEIGHT_RATIO}, MAX_COSINE = 1 - 1e-12;".replace("0.001", "1e-3"),
         f"MIN_DEPTH = {least_squares.MIN_DEPTH:g}f, DAMPING = 1e-4f;".replace("e-06", "e-6"),
-        f"SEARCH_POINTS = {SEARCH_POINTS}, PREVIEW = 32, SHORTLIST = 32, KEEP = 2;",
+        f"SEARCH_POINTS = {MAX_SEARCH_POINTS}, PREVIEW = 32, SHORTLIST = 32, KEEP = 2;",
     ):
-        assert line in native.SOURCES[7].read_text()
-    kept = f"MAX_NEARER = {near_far.MAX_NEARER}f, BEHIND = 1e4f, MIN_DEPTH = 1e-6f;"
-    assert kept in native.SOURCES[8].read_text() and near_far.BEHIND == 1e4 and least_squares.MIN_DEPTH == 1e-6
-    searched, minimised = (inspect.signature(f).parameters for f in (ransac.search, least_squares.minimise))
+        assert line in loader.SOURCES[7].read_text()
+    kept = f"MAX_NEARER = {reprojection_problem.NEAREST_DEPTH_DIVISOR}f, BEHIND = 1e4f, MIN_DEPTH = 1e-6f;"
+    assert (
+        kept in loader.SOURCES[8].read_text()
+        and reprojection_problem.BEHIND_CAMERA_RESIDUAL == 1e4
+        and least_squares.MIN_DEPTH == 1e-6
+    )
+    searched, minimised = (inspect.signature(f).parameters for f in (ransac.search_hypotheses, least_squares.minimise))
     assert [searched[k].default for k in ("preview", "shortlist", "keep")] == [32, 32, 2]
-    assert minimised["damping"].default == 1e-4 and p3p.MAX_COSINE == 1 - 1e-12
-    assert sweep.FLAT == 1e-8
-    assert affine.DAMPING == (2 / 255 / 2) ** 2 and least_squares.MIN_PIVOT == 1e-6
-    assert lk.RATIO[0] == -lk.RATIO[1] and {*lk.TOP, *lk.BETWEEN, *lk.FINEST} <= {1, 2}
-    assert pyramid.REACH >= pyramid.MARGIN + 2 + 2, "the largest radius, and the row"
+    assert minimised["damping"].default == 1e-4 and p3p.MAX_RAY_COSINE == 1 - 1e-12
+    assert plane_sweep.FLAT_VARIANCE == 1e-8
+    assert affine_alignment.AFFINE_DAMPING == (2 / 255 / 2) ** 2 and least_squares.MIN_PIVOT == 1e-6
+    assert lk.AITKEN_RATIO_RANGE[0] == -lk.AITKEN_RATIO_RANGE[1] and {
+        *lk.TOP_RADII,
+        *lk.MIDDLE_RADII,
+        *lk.FINEST_RADII,
+    } <= {1, 2}
+    assert pyramid.SEARCH_PADDING_PX >= pyramid.OUTSIDE_MARGIN_PX + 2 + 2, "the largest radius, and the row"
 
 
 def registered(here, there, uv, **options):
@@ -613,7 +615,7 @@ def registered(here, there, uv, **options):
     window = options.get("window", 21)
     views = pyramid.build_pyramid(here, 1, window), pyramid.build_pyramid(there, 2, window, gradients=False)
     moved = torch.tensor([5.2, -2.8]) if "linear" not in options else torch.tensor([0.2, 0.2])
-    return affine.register(*views, uv, uv + moved.to(uv), **options)
+    return affine_alignment.register_affine(*views, uv, uv + moved.to(uv), **options)
 
 
 def register_alike(found, expected, most_apart=0.1):
@@ -643,18 +645,18 @@ def test_a_registration_agrees_up_to_rounding(loaded, monkeypatch, seen_twice, o
 @needs_compiler
 def test_a_magnified_window_is_registered_on_the_half_size_level_alike(loaded, monkeypatch):
     g = torch.Generator().manual_seed(6)
-    small = gaussian(torch.rand(1, 1, 60, 80, generator=g), 1.5)
+    small = gaussian_blur(torch.rand(1, 1, 60, 80, generator=g), 1.5)
     small = (small - small.mean()) * 2 + 0.5
     large = torch.nn.functional.interpolate(small, scale_factor=2, mode="bicubic", align_corners=False)
     uv = 15 + torch.rand(1, 100, 2, generator=g) * torch.tensor([50.0, 30.0])
 
     def magnified():
         views = pyramid.build_pyramid(small, 1), pyramid.build_pyramid(large, 2)
-        return affine.register(*views, uv, 2 * uv + 0.7, linear=1.9 * torch.eye(2)[None])
+        return affine_alignment.register_affine(*views, uv, 2 * uv + 0.7, linear=1.9 * torch.eye(2)[None])
 
     found, expected = both_ways(magnified, monkeypatch)
     register_alike(found, expected)
-    assert (found.linear.det()[found.ok] > affine.HALVE**2).all()
+    assert (found.linear.det()[found.ok] > affine_alignment.HALVING_MAGNIFICATION**2).all()
 
 
 @needs_compiler
@@ -663,7 +665,7 @@ def test_a_registration_is_told_the_same_in_any_company_and_without_texture_noth
     together = registered(here, there, uv)
     some = torch.rand(uv.shape[:2], generator=torch.Generator().manual_seed(7)) < 0.3
     chosen = registered(here, there, uv, wanted=some)
-    for name in affine.Registration._fields:
+    for name in affine_alignment.AffineRegistration._fields:
         whole = getattr(together, name)
         assert torch.equal(getattr(chosen, name)[some & together.ok], whole[some & together.ok]), name
         alone = getattr(registered(here[1:], there[1:], uv[1:, ::3]), name)
@@ -676,11 +678,11 @@ def test_a_registration_is_told_the_same_in_any_company_and_without_texture_noth
 @needs_compiler
 def test_a_registration_in_another_type_or_reaching_past_the_padding_is_torchs(loaded, monkeypatch, seen_twice):
     here, there, uv = seen_twice
-    monkeypatch.setattr(affine, "_compiled", None)
+    monkeypatch.setattr(affine_alignment, "_compiled", None)
     registered(here.double(), there.double(), uv.double())
     narrow = pyramid.build_pyramid(here, 1, 9), pyramid.build_pyramid(there, 1, 9)
     usable = (uv > 20).all(-1) & (uv < 80).all(-1)
-    affine.register(*narrow, uv, uv, wanted=usable, window=11)
+    affine_alignment.register_affine(*narrow, uv, uv, wanted=usable, window=11)
     with pytest.raises(TypeError):
         registered(here, there, uv)
 
@@ -794,7 +796,9 @@ def test_poses_in_another_type_by_a_kernel_or_with_a_graph_are_torchs(loaded, mo
 def every_track(turning):
     """Tracks of every kind, as many as compiled code takes; their unknowns and noise."""
     problem, at = test_reprojection_problem.scene()
-    problem = Problem(problem.f, problem.c, *(x.repeat(*[1] * (x.ndim - 1), 16) for x in tree_leaves(problem)[2:]))
+    problem = PoseDepthProblem(
+        problem.f, problem.c, *(x.repeat(*[1] * (x.ndim - 1), 16) for x in tree_leaves(problem)[2:])
+    )
     noise = test_reprojection_problem.NOISE.repeat(1, 16)
     return (
         problem.to(torch.float32),
@@ -812,7 +816,7 @@ def test_equations_of_tracks_agree_up_to_rounding(loaded, monkeypatch, turning):
     monkeypatch.setattr(torch.ops.dhtorch, "track_equations", lambda **given: (asked.append(1), call(**given)))
 
     def ask(kernel="geman_mcclure", told=told, at=at):
-        normal, cost = near_far.equations(*told, kernel=kernel, bend=2.0)
+        normal, cost = reprojection_problem.pose_normal_equations_at(*told, kernel=kernel, bend=2.0)
         return (*normal(at), cost(at))
 
     found, expected = both_ways(ask, monkeypatch)
@@ -827,7 +831,9 @@ def test_equations_of_tracks_agree_up_to_rounding(loaded, monkeypatch, turning):
     leaf = at.T.t.clone().requires_grad_()
     assert ask(at=at._replace(T=at.T.replace(t=leaf)))[0].requires_grad
     assert len(asked) == 2, "in torch"
-    (square, front), (wanted, ahead) = both_ways(lambda: near_far.squares_at(problem, at)(noise), monkeypatch)
+    (square, front), (wanted, ahead) = both_ways(
+        lambda: reprojection_problem.squared_residuals_at(problem, at)(noise), monkeypatch
+    )
     assert torch.equal(front, ahead) and 0 < front.float().mean() < 1
     torch.testing.assert_close(square, wanted, rtol=1e-3, atol=1e-3)
 
@@ -877,21 +883,22 @@ def test_a_search_in_another_type_or_with_a_graph_is_torchs(loaded, monkeypatch,
 @needs_compiler
 def test_what_compiled_code_cannot_do_is_left_to_torch(loaded, monkeypatch):
     x = torch.zeros(2, 3, 4, 5)
-    assert native.serves(x, x.to(torch.uint8))
-    assert not native.serves(x.double()) and not native.serves(x.half()) and not native.serves(x.mT)
-    assert not native.serves(x.to("meta")) and not native.serves(torch.nn.Parameter(x))
+    assert loader.serves(x, x.to(torch.uint8))
+    assert not loader.serves(x.double()) and not loader.serves(x.half()) and not loader.serves(x.mT)
+    assert not loader.serves(x.to("meta")) and not loader.serves(torch.nn.Parameter(x))
     with torch.no_grad():
-        assert not native.serves(torch.nn.Parameter(x)), "no plain tensor"
-        assert native.serves(x.clone().requires_grad_())
+        assert not loader.serves(torch.nn.Parameter(x)), "no plain tensor"
+        assert loader.serves(x.clone().requires_grad_())
     told = []
-    torch.vmap(lambda y: (told.append(native.serves(y)), y)[1])(x)
+    torch.vmap(lambda y: (told.append(loader.serves(y)), y)[1])(x)
     assert told == [False]
     C = volume(2, 4, 5, 6, most=31)
-    assert torch.equal(sweep.surface(C.int(), torch.tensor(1))[1], sweep.surface(C, torch.tensor(1))[1]), (
-        "other numbers"
-    )
+    assert torch.equal(
+        plane_sweep.aggregate_best_plane(C.int(), torch.tensor(1))[1],
+        plane_sweep.aggregate_best_plane(C, torch.tensor(1))[1],
+    ), "other numbers"
     monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
-    assert not native.serves(x)
+    assert not loader.serves(x)
 
 
 @needs_compiler
@@ -902,46 +909,46 @@ def test_tangents_are_carried_though_compiled_code_is_loaded(loaded):
         found = forward_ad.unpack_dual(top).tangent
     expected = pyramid.build_pyramid(tangent, 2, 11).levels[1]  # linear in the image
     assert found is not None and torch.allclose(found, expected, atol=1e-6)
-    assert native.serves(image)
+    assert loader.serves(image)
 
 
 @needs_compiler
 def test_the_environment_asks_for_it(cache, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(cache))
-    assert not native.serves(torch.zeros(1))
+    assert not loader.serves(torch.zeros(1))
     monkeypatch.setenv("DHTORCH_NATIVE", "0")
-    assert not native.serves(torch.zeros(1)) and not native._loaded
+    assert not loader.serves(torch.zeros(1)) and not loader._loaded
     monkeypatch.setenv("DHTORCH_NATIVE", "1")
-    assert native.serves(torch.zeros(1)) and native._loaded == [native.library()]
-    assert list(cache.iterdir()) == [native.library()], "nothing unfinished stays"
-    monkeypatch.setattr(native, "processor", lambda: "another one")
-    assert not native.library().exists()
+    assert loader.serves(torch.zeros(1)) and loader._loaded == [loader.library()]
+    assert list(cache.iterdir()) == [loader.library()], "nothing unfinished stays"
+    monkeypatch.setattr(loader, "describe_processor", lambda: "another one")
+    assert not loader.library().exists()
 
 
 def test_nothing_is_compiled_silently(tmp_path, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "none"))
     monkeypatch.setenv("DHTORCH_NATIVE", "1")
-    with pytest.raises(FileNotFoundError, match=f"not compiled .*; {native.COMMAND} does it"):
-        sweep.surface(volume(1, 2, 2, 3, most=31), torch.tensor(1))
+    with pytest.raises(FileNotFoundError, match=f"not compiled .*; {loader.COMMAND} does it"):
+        plane_sweep.aggregate_best_plane(volume(1, 2, 2, 3, most=31), torch.tensor(1))
     assert not (tmp_path / "none").exists()
 
 
 @pytest.mark.skipif(platform.machine().lower() not in ("x86_64", "amd64"), reason="levels are those of x86-64")
 def test_a_torch_held_to_narrower_vectors_has_a_file_of_its_own(monkeypatch):
     monkeypatch.delenv("ATEN_CPU_CAPABILITY", raising=False)
-    own, flags = native.library(), native._vectors()
+    own, flags = loader.library(), loader._vectors()
     monkeypatch.setenv("ATEN_CPU_CAPABILITY", "avx2")
-    assert (flags, native._vectors()) == (("-march=native",), ("-march=x86-64-v3",))
-    assert native.library() != own
+    assert (flags, loader._vectors()) == (("-march=native",), ("-march=x86-64-v3",))
+    assert loader.library() != own
 
 
 def test_another_torch_and_another_processor_have_a_file_of_their_own(monkeypatch):
-    files = [native.library()]
+    files = [loader.library()]
     with monkeypatch.context() as other:
         other.setattr(torch, "__version__", "1.0")
-        files.append(native.library())
-    monkeypatch.setattr(native, "processor", lambda: "another, AVX2")
-    assert len({*files, native.library()}) == 3
+        files.append(loader.library())
+    monkeypatch.setattr(loader, "describe_processor", lambda: "another, AVX2")
+    assert len({*files, loader.library()}) == 3
 
 
 def test_a_compiler_that_is_missing_or_fails_is_told(tmp_path, monkeypatch):
@@ -953,7 +960,7 @@ def test_a_compiler_that_is_missing_or_fails_is_told(tmp_path, monkeypatch):
     if shutil.which("false"):
         monkeypatch.setenv("CXX", "false --kind")
         with pytest.raises(OSError, match=r"false --kind .*exit code 1"):
-            native.build()
+            loader.build()
         assert not list(tmp_path.iterdir())
 
 
@@ -995,7 +1002,7 @@ def equal(ours, theirs):
 SEATS = [
     {},
     {"backproject": {"near_limit": 1.7, "sigma_m": 0.004, "min_conf": 2}, "classify": {"block": 3}},
-    {"backproject": {"edge_rel": 0.6, "dark": 0.5, "saturated": 0.6, "highlight": 0.4}, "sample": sample.vogel},
+    {"backproject": {"edge_rel": 0.6, "dark": 0.5, "saturated": 0.6, "highlight": 0.4}, "sample": sample.vogel_spiral},
     {"backproject": {"min_conf": 0}, "classify": {"min_trackability": 1e-3, "block": 9}, "sample": {"foveation": 0.5}},
 ]
 
@@ -1032,7 +1039,7 @@ def test_a_view_alone_at_once_is_what_the_stages_say(loaded, monkeypatch, kind, 
 
 
 @needs_compiler
-@pytest.mark.parametrize("fit", FITS)
+@pytest.mark.parametrize("fit", FIT_MODES)
 def test_a_view_alone_has_tokens_of_the_size_that_the_network_sees(loaded, monkeypatch, fit):
     transform = ExtendDepth(depth_unit="mm", n=200, tokens_hw=(28, 28), fit=fit)
     one, calls = decoded("uint16", "mm"), counted(monkeypatch, "look")
@@ -1108,13 +1115,13 @@ def test_what_is_not_as_usual_is_asked_of_the_stages(loaded, monkeypatch):
     said(plain, dense=True)
     said(plain, n=5000)
     said({**plain, "before": plain["image"]}, other_image="before")
-    said(plain, method=PAPER.replace(sample=lambda hw, n, **o: sample.grid(hw, n)))
+    said(plain, method=PAPER.replace(sample=lambda hw, n, **o: sample.regular_grid(hw, n)))
     said(plain, method=PAPER.replace(backproject=lambda *looked: backproject(*looked, min_conf=1)))
     said(plain, method=PAPER.replace(backproject={"search_px": 2}))
     said(plain, method=PAPER.replace(classify={"block": 15}))
     with forward_ad.dual_level():
         said(plain)
-    monkeypatch.setattr(native, "_loaded", [])
+    monkeypatch.setattr(loader, "_loaded", [])
     said(plain)
     assert not calls
 
@@ -1170,6 +1177,6 @@ def test_what_samples_of_a_kind_share_is_kept_but_not_for_all_and_is_nobodys_to_
         K = plain["intrinsics"] + k * np.diag([1.0, 1, 0])
         (stages,) = by_stages(transform, monkeypatch, lambda K=K: transform({**plain, "intrinsics": K}))
         equal(transform({**plain, "intrinsics": K}), stages)
-    assert len(transform._alone.kept) == CAMERAS
+    assert len(transform._alone.kept) == MAX_CACHED_CAMERAS
     transform.method = transform.method.replace(n=20)
     assert transform(plain)["dhtorch.uv"].shape == (20, 2), "a method that somebody puts in is the one that is asked"

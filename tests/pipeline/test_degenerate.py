@@ -133,10 +133,10 @@ def test_one_return_of_the_sky_does_not_make_a_line(sky):
     xyz = torch.rand(1, 3, 20, generator=torch.Generator().manual_seed(0)) + torch.tensor([0.0, 0.0, 1.0])[:, None]
     xyz[..., 3] *= sky / xyz[..., 3].amax()
     used = torch.ones(1, 20, dtype=torch.bool)
-    assert not ransac.collinear(xyz, used).item()
+    assert not ransac.is_collinear(xyz, used).item()
     line = xyz[..., :1] + torch.linspace(0, 1, 20) * torch.tensor([0.3, 0.1, 0.5])[:, None]
     line[..., 3] = xyz[..., 3]
-    assert ransac.collinear(line, used).item()
+    assert ransac.is_collinear(line, used).item()
     _, pair = make(2 * len(KINDS))
     at = pair.uv.round().long()[3]
     codes = []

@@ -5,12 +5,12 @@ import torch
 from support.board_scenes import Board, look
 
 from dhtorch import MAP
-from dhtorch.calibration.monotone import Sigmoid, Table
+from dhtorch.calibration.monotone import MonotoneTable, Sigmoid
 from dhtorch.calibration.score_calibration import Calibration, SigmaModel
 from dhtorch.codes import Gate, Source
-from dhtorch.experiments.compare.exact_rooms import exact_pose
+from dhtorch.experiments.compare.exact_rooms import exact_pose_fit
 from dhtorch.metrics.holdout import range_split
-from dhtorch.pipeline.dense import complete, resized, sensed, swept, views_asked
+from dhtorch.pipeline.dense import complete_depth, downscale_grey, selected_views, sensor_depth_map, sweep_depth
 from dhtorch.pytree import collate, stack
 from dhtorch.synthetic import SyntheticRoom
 
@@ -33,12 +33,12 @@ def views(room):
 @pytest.fixture(scope="module")
 def found(views):
     with torch.no_grad():
-        return complete(views[0], views[1], **FAST)
+        return complete_depth(views[0], views[1], **FAST)
 
 
 def exact(room, i, j, n=1):
     """The pose from the room itself."""
-    return exact_pose(room[i], room[j], n)
+    return exact_pose_fit(room[i], room[j], n)
 
 
 def test_far_pixels_of_the_room_are_found_and_know_how_well(views, found):
@@ -57,8 +57,8 @@ def test_under_the_true_motion_textured_pixels_are_within_hundredths(room, views
     """Exact pose and depth: what both views show and bears texture."""
     fit = exact(room, 3, 11, n=512)
     with torch.no_grad():
-        got = complete(views[0], views[1], fit=fit, method=FAST["method"], planes=96)
-    depth, picture = views[2], resized(views[0], 640)[0][:, 0]
+        got = complete_depth(views[0], views[1], fit=fit, method=FAST["method"], planes=96)
+    depth, picture = views[2], downscale_grey(views[0], 640)[0][:, 0]
     mean = torch.nn.functional.avg_pool2d(picture, 9, 1, 4)
     contrast = (torch.nn.functional.avg_pool2d(picture.square(), 9, 1, 4) - mean.square()).clamp_min(0).sqrt()
     low = -torch.nn.functional.max_pool2d(-depth, 11, 1, 5)
@@ -78,7 +78,7 @@ def test_the_sensor_speaks_where_it_answers_and_is_no_input(views, found):
     half = anchor.depth.clone()
     half[:, :, ::2] = 0  # every other column of returns
     with torch.no_grad():
-        fewer = complete(anchor.replace(depth=half), other, fit=None, **FAST)
+        fewer = complete_depth(anchor.replace(depth=half), other, fit=None, **FAST)
     swept = sensed & (half == 0) & (fewer.source == Source.SWEPT)
     assert swept.sum() > 500
     assert float(((fewer.depth - depth).abs() / depth)[swept].median()) < 0.03, "the sweep knows near surfaces, too"
@@ -95,14 +95,14 @@ def test_silence_has_reasons_and_no_value(found):
 def test_a_camera_that_only_turns_gets_the_sensor_alone():
     room = SyntheticRoom(n_frames=6, hw=(240, 320), depth_hw=(120, 160), path="rotation")
     with torch.no_grad():
-        got = complete(range_split(room[0], NEAR), range_split(room[4], NEAR), **FAST)
+        got = complete_depth(range_split(room[0], NEAR), range_split(room[4], NEAR), **FAST)
     assert bool((got.source != Source.SWEPT).all()) and bool((got.source == Source.SENSOR).any())
     assert bool((got.gate[got.source == Source.NONE] == Gate.NO_BASELINE).all())
 
 
 def test_without_another_view_the_map_is_the_sensors(views):
     anchor = views[0]
-    got = sensed(anchor, method=FAST["method"])
+    got = sensor_depth_map(anchor, method=FAST["method"])
     seen = anchor.depth > 0
     assert torch.equal(got.depth[seen], anchor.depth[seen]) and bool((got.source[seen] == Source.SENSOR).all())
     assert bool((got.gate[~seen] == Gate.NO_TRACK).all()) and bool(got.depth[~seen].isnan().all())
@@ -110,10 +110,10 @@ def test_without_another_view_the_map_is_the_sensors(views):
 
 def test_a_calibration_changes_swept_pixels_alone(views, found):
     model = SigmaModel(2.0, 0.0)
-    table = Table(torch.tensor([0.0, 1.0]), torch.tensor([0.0, 0.5]))
+    table = MonotoneTable(torch.tensor([0.0, 1.0]), torch.tensor([0.0, 0.5]))
     sigmoid = Sigmoid(torch.tensor(1.0), torch.tensor(0.0))
     with torch.no_grad():
-        got = complete(views[0], views[1], calibration=Calibration(table, table, sigmoid, model, {}), **FAST)
+        got = complete_depth(views[0], views[1], calibration=Calibration(table, table, sigmoid, model, {}), **FAST)
     swept = found.source == Source.SWEPT
     torch.testing.assert_close(got.sigma[swept], 2 * found.sigma[swept])
     torch.testing.assert_close(got.score[swept], 0.5 * found.score[swept])
@@ -127,7 +127,7 @@ def test_a_motion_that_the_sensor_refutes_is_not_believed(room, views):
     fit = exact(room, 3, 11, n=512)
     wrong = fit.replace(T_1_from_0=fit.T_1_from_0.replace(t=1.5 * fit.T_1_from_0.t))
     with torch.no_grad():
-        got = complete(views[0], views[1], fit=wrong, **FAST)
+        got = complete_depth(views[0], views[1], fit=wrong, **FAST)
     assert not bool((got.source == Source.SWEPT).any())
     assert bool((got.gate[got.source == Source.NONE] != Gate.ANSWER).all())
 
@@ -137,8 +137,8 @@ def test_more_views_say_more(room, views):
     others = stack([range_split(room[k], NEAR) for k in (0, 11)])
     method = MAP.replace(n=512, views=2)
     with torch.no_grad():
-        one = complete(views[0], others, method=method, planes=48, partners=1)
-        two = complete(views[0], others, method=method, planes=48, partners=2)
+        one = complete_depth(views[0], others, method=method, planes=48, partners=1)
+        two = complete_depth(views[0], others, method=method, planes=48, partners=2)
     share = [float((m.source == Source.SWEPT).float().mean()) for m in (one, two)]
     assert share[1] > share[0] > 0.1
 
@@ -149,10 +149,10 @@ def test_a_batch_is_a_loop_bit_for_bit():
     anchors = [range_split(room[k], NEAR) for k in (1, 3)]
     others = [range_split(room[k], NEAR) for k in (9, 11)]
     with torch.no_grad():
-        together = complete(collate(anchors), collate(others), **FAST)
+        together = complete_depth(collate(anchors), collate(others), **FAST)
         assert bool((together.source == Source.SWEPT).flatten(1).any(1).all())
         for b in range(2):
-            alone = complete(anchors[b], others[b], **FAST)
+            alone = complete_depth(anchors[b], others[b], **FAST)
             for name in ("depth", "sigma", "score", "source", "gate"):
                 x, y = getattr(together, name)[b : b + 1], getattr(alone, name)
                 assert torch.equal(x.nan_to_num(-1), y.nan_to_num(-1)), name
@@ -165,7 +165,7 @@ def test_depth_carries_gradients_to_pictures_near_depth_and_intrinsics(views):
         inputs[:2] = [x / 255 for x in inputs[:2]]
     image_0, image_1, depth, f = (x.clone().requires_grad_() for x in inputs)
     asked = anchor.replace(image=image_0, depth=depth, camera=anchor.camera.replace(f=f))
-    got = complete(asked, other.replace(image=image_1), **FAST)
+    got = complete_depth(asked, other.replace(image=image_1), **FAST)
     swept = got.source == Source.SWEPT
     got.depth[swept].sum().backward()
     for x in (image_0, image_1, depth, f):
@@ -180,7 +180,7 @@ def test_double_precision_goes_in_beside_pictures_of_bytes():
     anchor, other = (range_split(room[i], NEAR).to(torch.float64) for i in (1, 6))
     for as_given in (lambda x: (255 * x).byte(), lambda x: x.float()):
         asked, view = (frame.replace(image=as_given(frame.image)) for frame in (anchor, other))
-        assert complete(asked, view, **FAST).depth.dtype == torch.float64
+        assert complete_depth(asked, view, **FAST).depth.dtype == torch.float64
 
 
 def test_half_precision_goes_in_and_single_comes_out(views, found):
@@ -191,7 +191,7 @@ def test_half_precision_goes_in_and_single_comes_out(views, found):
         return frame.replace(image=image.half(), depth=frame.depth.half())
 
     with torch.no_grad():
-        got = complete(half(anchor), half(other), **FAST)
+        got = complete_depth(half(anchor), half(other), **FAST)
     assert got.depth.dtype == got.sigma.dtype == torch.float32
     swept = (got.source == Source.SWEPT) & (found.source == Source.SWEPT)
     assert swept.sum() > 0.8 * (found.source == Source.SWEPT).sum()
@@ -205,7 +205,7 @@ def test_between_the_returns_of_a_sparse_sensor_places_are_swept_as_near_as_they
     fit = exact(room, 3, 11, n=512)
     with torch.no_grad():
         swept_near, dense_sensor = (
-            complete(one, room[11], fit=fit, **FAST) for one in (anchor, anchor.replace(sparse=None))
+            complete_depth(one, room[11], fit=fit, **FAST) for one in (anchor, anchor.replace(sparse=None))
         )
     near = (room[3].depth < 0.6 * room[3].depth.amax()) & ~told
     found, missed = (near & (one.source == Source.SWEPT) for one in (swept_near, dense_sensor))
@@ -216,19 +216,19 @@ def test_between_the_returns_of_a_sparse_sensor_places_are_swept_as_near_as_they
 
 
 def test_a_large_picture_is_swept_at_the_size_asked(views):
-    picture, camera = resized(views[0], 160)
+    picture, camera = downscale_grey(views[0], 160)
     assert picture.shape == (1, 1, 120, 160)
     torch.testing.assert_close(camera.f, views[0].camera.f / 2)
     torch.testing.assert_close(camera.c, (views[0].camera.c + 0.5) / 2 - 0.5)
     with torch.no_grad():
-        got = complete(views[0], views[1], size=160, **FAST)
+        got = complete_depth(views[0], views[1], size=160, **FAST)
     assert got.depth.shape == (1, 120, 160) and bool((got.source == Source.SWEPT).any())
 
 
 @pytest.mark.parametrize("wrong", [{"partners": 0}, {"partners": 9}, {"planes": 2}, {"size": 8}, {"refinements": -1}])
 def test_options_out_of_range_raise(views, wrong):
     with pytest.raises(ValueError, match=f"complete: {next(iter(wrong))} is .*, expected at least"):
-        complete(views[0], views[1], **{**FAST, **wrong})
+        complete_depth(views[0], views[1], **{**FAST, **wrong})
 
 
 def boards(*far):
@@ -236,9 +236,11 @@ def boards(*far):
     near = [Board(1.5, x=(-9, -0.35), seed=7), Board(1.5, y=(0.42, 9), seed=8)]
     anchor, which = look([*near, *far], (0.0, 0.0, 0.0))
     other, _ = look([*near, *far], (0.15, 0.02, 0.01), angle=(0.01, -0.02, 0.01))
-    fit = exact_pose(anchor, other, 512)
+    fit = exact_pose_fit(anchor, other, 512)
     with torch.no_grad():
-        got = complete(range_split(anchor, NEAR), range_split(other, NEAR), fit=fit, method=FAST["method"], planes=64)
+        got = complete_depth(
+            range_split(anchor, NEAR), range_split(other, NEAR), fit=fit, method=FAST["method"], planes=64
+        )
     return got, anchor.depth, torch.where(anchor.depth > NEAR, which - len(near), -1)
 
 
@@ -298,10 +300,10 @@ def test_a_sweep_is_captured_as_one_graph():
     method, trace = MAP.replace(n=256), {}
     with torch.no_grad():
         joined = method(anchor, other, trace=trace)
-        asked = views_asked(joined, other, trace)
+        asked = selected_views(joined, other, trace)
 
         def sweep(anchor, asked):
-            return swept(anchor, asked, method=method, planes=16, partners=1)
+            return sweep_depth(anchor, asked, method=method, planes=16, partners=1)
 
         plain = sweep(anchor, asked)
         captured = torch.compile(sweep, fullgraph=True, backend="eager")(anchor, asked)

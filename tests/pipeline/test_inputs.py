@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from dhtorch import AUTO, MAP, PAPER
-from dhtorch.pipeline.inputs import agreed
+from dhtorch.pipeline.inputs import validate_views
 from dhtorch.records import Frame
 from dhtorch.synthetic import SyntheticRoom
 
@@ -75,8 +75,8 @@ def test_frames_of_several_precisions_give_one_answer(views):
 
 
 def test_equal_precisions_stay_byte_for_byte(views):
-    anchor, others = agreed(views[0], views[1])
+    anchor, others = validate_views(views[0], views[1])
     assert anchor.image is views[0].image and others.image is views[1].image
-    anchor, others = agreed(views[0], list(views[1:]))
+    anchor, others = validate_views(views[0], list(views[1:]))
     assert others.image.dtype == torch.uint8 and others.image.shape == (2, 1, 3, 96, 128)
     assert isinstance(others, Frame)

@@ -12,10 +12,10 @@ from hydra.utils import instantiate
 from dhtorch import extend
 from dhtorch.cli.run import config_dir
 from dhtorch.codes import Gate, Source
-from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.pipeline.pair import lifted, merge, undistort_tracks, uniform_draws
+from dhtorch.pipeline.pair import merge, undistort_tracks, uniform_draws, upcast_intrinsics
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.records import Camera, Estimate, Frame, Samples, Tracks
 from dhtorch.stages import pose, score, triangulate
@@ -113,7 +113,7 @@ class Seats:
         self.uv = 2 + rand(n, 2, seed=40) * torch.tensor([25.0, 15.0])
         self.samples = samples_of(self.uv.expand(batch, n, 2))
         self.tracks = tracks_of(self.samples.uv)
-        self.fit = given_pose(se3.exp(rand(batch, 6, seed=41)), n)
+        self.fit = known_pose_fit(se3.exp(rand(batch, 6, seed=41)), n)
         self.estimate = estimate_of(self.samples, gate)
         answers = {"backproject": self.samples, "classify": self.samples.replace(flag=self.samples.flag + 4)}
         answers |= {"track": self.tracks, "pose": self.fit, "triangulate": self.estimate, "sample": self.uv}
@@ -160,7 +160,7 @@ def test_every_seat_gets_what_those_before_it_found():
 
 
 def test_a_given_pose_is_taken_and_seat_five_not_asked():
-    seats, other = Seats(), given_pose(se3.exp(rand(2, 6, seed=90)), 12)
+    seats, other = Seats(), known_pose_fit(se3.exp(rand(2, 6, seed=90)), 12)
     extend(frame(), frame(), **seats.seats, n=12, fit=other)
     assert "pose" not in seats.seen and seats.seen["triangulate"][0][2] is other
 
@@ -221,12 +221,12 @@ def test_intrinsics_of_half_precision_are_computed_with_as_single_ones():
     half = frame(1, dtype=torch.float16)
     seen = half.camera.map(lambda x: x[:1])
     both = half.replace(depth_camera=seen, image=half.image.half())
-    found = lifted(both)
+    found = upcast_intrinsics(both)
     assert found.camera.f.dtype == found.depth_camera.c.dtype == torch.float32
     assert torch.equal(found.camera.f, half.camera.f.float()) and found.image.dtype == torch.float16
     for dtype in (torch.float32, torch.float64):
         plain = frame(1, dtype=dtype)
-        assert lifted(plain).camera is plain.camera and lifted(plain).depth_camera is None
+        assert upcast_intrinsics(plain).camera is plain.camera and upcast_intrinsics(plain).depth_camera is None
     seats = Seats(batch=1)
     extend(half, half, **seats.seats)
     assert seats.seen["sample"][1]["dtype"] == torch.float32
@@ -346,7 +346,7 @@ def told(n=40, noise_px=0.4):
         uv_1=seen + noise_px * torch.tensor(rng.normal(size=(1, n, 2))),
         photometric=torch.tensor(rng.uniform(0, 3, (1, n))),
     )
-    fit = given_pose(T, n).replace(
+    fit = known_pose_fit(T, n).replace(
         cov=1e-8 * torch.eye(6).double()[None],
         inlier=torch.arange(n)[None] % 3 == 0,
         sigma_px=torch.tensor([0.7]).double(),
@@ -380,7 +380,7 @@ def test_every_option_of_the_method_reaches_its_seat():
 
     def answer(**options):
         of = lambda *args: triangulate.two_view(*args, **options)  # noqa: E731
-        return extend(*frames, **given, triangulate=of, score=score.rank_by_error)
+        return extend(*frames, **given, triangulate=of, score=score.confidence_from_error)
 
     found, expected = METHODS["map"](*frames, **given), answer(**WRITTEN_OUT)
     assert 5 < int(found.keep.sum()) < 40
@@ -401,7 +401,7 @@ def test_the_method_has_the_seats_that_its_configuration_names():
     method = METHODS["map"]
     assert METHODS["paper"] is extend and type(method) is type(configured)
     assert method.pose is pose.map_pose is configured.pose.func
-    assert method.score is score.rank_by_error is configured.score.func
+    assert method.score is score.confidence_from_error is configured.score.func
     options = configured.triangulate.keywords
     assert {k: options[k] for k in WRITTEN_OUT} == WRITTEN_OUT, "what the test above asks for"
     assert method.triangulate.keywords.items() <= WRITTEN_OUT.items()

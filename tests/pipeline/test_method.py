@@ -10,23 +10,22 @@ import torch
 from support.rooms import room as rendered
 
 import dhtorch
-from dhtorch import MAP, PAPER, WINDOW, TrackHint
-from dhtorch import pytree as tree
+from dhtorch import MAP, PAPER, WINDOW, TrackHint, pytree
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.scene import Scene
 from dhtorch.experiments import pair as pairs
 from dhtorch.experiments import protocol
 from dhtorch.extract import plan
-from dhtorch.extract.dataset import Rows
+from dhtorch.extract.dataset import RowDataset
 from dhtorch.geometry import camera as cam
 from dhtorch.pipeline.method import Method
-from dhtorch.pipeline.spec import networks
+from dhtorch.pipeline.spec import iter_networks
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.holes import classify
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.sample import spiral
-from dhtorch.stages.score import rank
+from dhtorch.stages.score import confidence
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
 from dhtorch.transforms import ExtendDepth
@@ -60,7 +59,7 @@ def triangulate(samples, tracks, fit, camera_0, camera_1):
 
 
 def score(estimate, samples, tracks, fit):
-    return rank(estimate, samples, tracks, fit)
+    return confidence(estimate, samples, tracks, fit)
 
 
 def fuse(estimates):
@@ -85,7 +84,7 @@ def alike(a, b):
 
 def test_a_plain_function_in_every_seat_answers_as_the_stage_itself(room):
     assert alike(PLAIN(room[0], room[3]), USUAL(room[0], room[3]))
-    others = tree.stack([room[k] for k in (1, 2, 3)])
+    others = pytree.stack([room[k] for k in (1, 2, 3)])
     assert alike(PLAIN(room[0], others, views=3), USUAL(room[0], others, views=3))
     assert alike(PLAIN(room[0], [room[k] for k in (1, 2, 3)], views=2), USUAL(room[0], others, views=2))
 
@@ -114,7 +113,7 @@ def test_it_runs_in_a_transform_and_in_rows_for_a_data_set(room):
     kinds = {"depth": "float32", "gate": "int32"}
     columns = {name: SimpleNamespace(kind=kind, shape=(PLAIN.n,)) for name, kind in kinds.items()}
     rows = [
-        Rows([Scene(room)], plan.make([Scene(room)], 3, 1), columns, method=m, gap=3)[4].features
+        RowDataset([Scene(room)], plan.make_plan([Scene(room)], 3, 1), columns, method=m, gap=3)[4].features
         for m in (PLAIN, USUAL)
     ]
     assert all((rows[0][k] == rows[1][k]).all() for k in columns)
@@ -123,19 +122,19 @@ def test_it_runs_in_a_transform_and_in_rows_for_a_data_set(room):
 def test_it_runs_in_the_viewer_and_its_result_in_the_report(room, tmp_path):
     from dhtorch.cli import job  # noqa: PLC0415
     from dhtorch.experiments import report  # noqa: PLC0415
-    from dhtorch.experiments.exhibits import look  # noqa: PLC0415
-    from dhtorch.runtime import results as archive  # noqa: PLC0415
+    from dhtorch.experiments.exhibits import make_exhibit  # noqa: PLC0415
+    from dhtorch.runtime import results as result_files  # noqa: PLC0415
 
-    shown = look(room, PLAIN, partial(by_gap, gap=3), protocol.Settings())
+    shown = make_exhibit(room, PLAIN, partial(by_gap, gap=3), protocol.Settings())
     assert len(shown.shots) == 4 and (shown.shots[0].samples["gate"] == 0).sum() > 20
     settings = {"threads": None, "resume": False, "figures": False, "seed": 0, "device": "cpu", "dtype": "float32"}
     settings |= {"batch": 1, "workers": 0, "holdout": {"cutoff": None, "truth": "full"}, "method": {}, "data": {}}
     settings |= {"pairs": {}, "experiment": {}}
     parts = {"data": Scene(room, near=2.0), "method": PLAIN, "pairs": partial(by_gap, gap=3), "experiment": pairs.run}
-    choices = dict.fromkeys(job.GROUPS, "mine") | {"experiment": "pair", "method": "plain"}
+    choices = dict.fromkeys(job.SETTINGS_GROUPS, "mine") | {"experiment": "pair", "method": "plain"}
     ended = job.run(settings, parts, choices, tmp_path, progress=lambda items, *_: items)
     assert ended.state == "finished"
-    result = archive.read(tmp_path)
+    result = result_files.read_result(tmp_path)
     (row,) = (r for r in result["rows"] if r["pair"] is None)
     assert row["method"] == "plain" and row["coverage"] > 0.5
     assert report.main([str(tmp_path), "--html", str(tmp_path / "page.html")]) == 0
@@ -168,7 +167,7 @@ def test_options_are_the_papers_unless_they_are_changed():
 
 def test_options_are_those_of_what_sits_there_now():
     seat = PAPER.replace(track=track).replace(track={"hint": TrackHint()}).track
-    assert seat.func is track and PAPER.replace(score={"min_score": 0.5}).score.func is rank
+    assert seat.func is track and PAPER.replace(score={"min_score": 0.5}).score.func is confidence
 
 
 def test_a_pose_from_elsewhere_takes_the_place_of_seat_5(room):
@@ -201,7 +200,7 @@ def test_a_hint_is_cut_with_its_pairs_and_may_be_ignored(room):
         seen.append(hint)
         return lucas_kanade(image_0, image_1, uv_0)
 
-    many = [tree.collate([room[k]] * 10) for k in (0, 3)]
+    many = [pytree.collate([room[k]] * 10) for k in (0, 3)]
     start = torch.arange(10.0).view(10, 1, 1).expand(10, N, 2)
     found = PAPER(*many, n=N, track=blind, hint=TrackHint(start, levels=3))
     assert [len(h.start) for h in seen] == [8, 2] and torch.equal(seen[1].start, start[8:])
@@ -211,7 +210,7 @@ def test_a_hint_is_cut_with_its_pairs_and_may_be_ignored(room):
 def test_networks_of_a_method_are_found_in_partials():
     net, other = torch.nn.Linear(2, 1), torch.nn.Linear(3, 1)
     method = PAPER.replace(score=net, pose=partial(partial(pnp_ransac, other), solver=net))
-    assert list(networks(method)) == [other, net, net] and not list(networks(PAPER, MAP))
+    assert list(iter_networks(method)) == [other, net, net] and not list(iter_networks(PAPER, MAP))
 
 
 def test_several_views_must_be_some(room):

@@ -6,11 +6,10 @@ import pytest
 import torch
 from support import textured_box as walls
 
-from dhtorch import PAPER, extend
-from dhtorch import pytree as tree
+from dhtorch import PAPER, extend, pytree
 from dhtorch.codes import Gate
 from dhtorch.experiments.baselines import opencv
-from dhtorch.pipeline.view_selection import weighed
+from dhtorch.pipeline.view_selection import rank_views
 from dhtorch.records import Estimate
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
@@ -118,7 +117,7 @@ def test_one_view_is_that_views_answer():
 def test_order_of_views_and_silence_change_nothing():
     views, _ = noisy(N=50, share=0.002)
     silent = answers(*(torch.full((1, 50), x, dtype=torch.float64) for x in (1.0, 1.0)), gate=[[Gate.NO_TRACK] * 50])
-    straight, turned = SURE(views), SURE(tree.collate([silent, views[[2, 0, 3, 1]]]))
+    straight, turned = SURE(views), SURE(pytree.collate([silent, views[[2, 0, 3, 1]]]))
     for field in FLOATS:
         assert torch.allclose(getattr(straight, field), getattr(turned, field), equal_nan=True), field
 
@@ -145,21 +144,21 @@ def test_key_views_are_those_that_leave_the_smallest_sigma():
     gate = torch.zeros(5, 10, dtype=torch.int32)
     gate[1, 5:], gate[2, :5], gate[3, :5], gate[4] = (Gate.NO_TRACK,) * 4
     views = answers(torch.full((5, 10), 4.0), sigma, gate=gate.tolist())
-    assert weighed(views, 2).index[:, 0].tolist() == [1, 2]
-    assert weighed(views, 3).index[:, 0].tolist() == [1, 2, 3]
-    assert weighed(views, 5).index[:, 0].tolist() == [0, 1, 2, 3, 4]
-    both = tree.stack([views[:, 0], views[[4, 3, 2, 1, 0], 0]], 1)  # a batch of two, each with its own choice
-    assert weighed(both, 2).index.T.tolist() == [[1, 2], [2, 3]]
+    assert rank_views(views, 2).index[:, 0].tolist() == [1, 2]
+    assert rank_views(views, 3).index[:, 0].tolist() == [1, 2, 3]
+    assert rank_views(views, 5).index[:, 0].tolist() == [0, 1, 2, 3, 4]
+    both = pytree.stack([views[:, 0], views[[4, 3, 2, 1, 0], 0]], 1)  # a batch of two, each with its own choice
+    assert rank_views(both, 2).index.T.tolist() == [[1, 2], [2, 3]]
     same = answers(torch.full((3, 10), 4.0), torch.full((3, 10), 0.1))
-    assert weighed(same, 1).index[:, 0].tolist() == [2]
+    assert rank_views(same, 1).index[:, 0].tolist() == [2]
     with pytest.raises(ValueError, match="weighed"):
-        weighed(views, 6)
+        rank_views(views, 6)
 
 
 def test_it_captures():
     views, _ = noisy(V=3, N=8)
     compiled = torch.compile(inverse_variance, fullgraph=True, backend="eager")
-    for a, b in zip(*(tree.pytree.tree_leaves(f(views)) for f in (inverse_variance, compiled)), strict=True):
+    for a, b in zip(*(pytree.pytree.tree_leaves(f(views)) for f in (inverse_variance, compiled)), strict=True):
         assert torch.equal(a.nan_to_num(), b.nan_to_num())
 
 
@@ -170,8 +169,8 @@ def test_it_captures():
 def room():
     """Two anchors with three further views each: (2,), (3, 2); near returns only."""
     at = lambda k: walls.near(walls.view(walls.at(k)))  # noqa: E731
-    anchors = tree.collate([at(0), at(1)])
-    return anchors, tree.stack([tree.collate([at(i), at(i + 1)]) for i in (2, 4, 6)])
+    anchors = pytree.collate([at(0), at(1)])
+    return anchors, pytree.stack([pytree.collate([at(i), at(i + 1)]) for i in (2, 4, 6)])
 
 
 def test_without_chain_it_is_the_pairs_fused(room):
@@ -179,7 +178,7 @@ def test_without_chain_it_is_the_pairs_fused(room):
     trace = {}
     window = extend_window(anchor, others, chain=False, trace=trace, **PAIR)
     single = [extend(anchor, others[k], score=lambda e, *_: e, **PAIR) for k in range(3)]
-    fused = inverse_variance(tree.stack(single))
+    fused = inverse_variance(pytree.stack(single))
     for field in ("depth", "sigma", "gate", "n_views"):
         assert torch.equal(getattr(window, field).nan_to_num(), getattr(fused, field).nan_to_num()), field
     assert len(trace["views"]) == 3 and torch.equal(trace["fit"].code, trace["views"][-1]["fit"].code)
@@ -213,8 +212,8 @@ def test_one_view_is_a_pair(room):
     assert torch.equal(window.gate, pair.gate)
     for field in FLOATS:
         assert torch.equal(getattr(window, field).nan_to_num(), getattr(pair, field).nan_to_num()), field
-    pairs = tree.stack([extend(anchor, others[k], **PAIR) for k in range(3)])
-    best = pairs[weighed(pairs, 1).index[0], torch.arange(2)]
+    pairs = pytree.stack([extend(anchor, others[k], **PAIR) for k in range(3)])
+    best = pairs[rank_views(pairs, 1).index[0], torch.arange(2)]
     chosen = extend_window(anchor, others, views=1, chain=False, **PAIR)
     assert torch.equal(chosen.gate, best.gate) and torch.equal(chosen.depth.nan_to_num(), best.depth.nan_to_num())
 
@@ -223,16 +222,16 @@ def test_any_tracker_and_given_poses(room):
     anchor, others = room
     trace = {}
     extend_window(anchor, others, trace=trace, **PAIR)
-    fit = tree.stack([t["fit"] for t in trace["views"]])
+    fit = pytree.stack([t["fit"] for t in trace["views"]])
     given, found = extend_window(anchor, others, fit=fit, **PAIR), trace["estimate"]
     assert torch.equal(given.gate, found.gate)
-    plain = extend_window(anchor, others, track=opencv.lucas_kanade, **PAIR)  # takes neither start nor pyramid
+    plain = extend_window(anchor, others, track=opencv.opencv_lucas_kanade, **PAIR)  # takes neither start nor pyramid
     assert (plain.gate > 0).all()  # it states no covariance: nothing to weigh its answers by
 
 
 def test_of_many_views_the_widest_is_kept_and_copies_of_the_anchor_are_not(room):
     anchor, others = room
-    more = tree.stack([anchor, others[0], anchor, others[2]])
+    more = pytree.stack([anchor, others[0], anchor, others[2]])
     few, trace = extend_window(anchor, others[[0, 2]], **PAIR), {}
     chosen = extend_window(anchor, more, views=2, trace=trace, **PAIR)
     assert torch.equal(chosen.gate, few.gate) and len(trace["views"]) == 2

@@ -9,11 +9,10 @@ import torch
 from support import box_scene as box
 from support import textured_box as walls
 
-from dhtorch import data, extend
-from dhtorch import pytree as tree
+from dhtorch import data, extend, pytree
 from dhtorch.codes import Flag, Gate, PoseCode, Source
 from dhtorch.experiments.baselines import opencv
-from dhtorch.experiments.baselines.device_pose import device_pose, given_pose
+from dhtorch.experiments.baselines.device_pose import device_pose_fit, known_pose_fit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.pipeline.pair import merge
@@ -24,9 +23,9 @@ ROOT = os.environ.get("DHTORCH_DATA")
 real = [pytest.mark.data, pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")]
 OPENCV = partial(
     extend,
-    track=opencv.lucas_kanade,
-    pose=opencv.pnp_ransac,
-    triangulate=partial(triangulate.two_view, solver=opencv.triangulate),
+    track=opencv.opencv_lucas_kanade,
+    pose=opencv.opencv_pnp_ransac,
+    triangulate=partial(triangulate.two_view, solver=opencv.opencv_triangulate),
 )
 
 
@@ -43,7 +42,7 @@ def views():
 
 
 def together(pairs):
-    return tree.collate([p[0] for p in pairs]), tree.collate([p[1] for p in pairs])
+    return pytree.collate([p[0] for p in pairs]), pytree.collate([p[1] for p in pairs])
 
 
 def truth_of(frame, uv):
@@ -182,14 +181,14 @@ def test_a_pure_rotation_is_not_answered():
 def test_a_given_pose_replaces_seat_five(views):
     (frame_0, frame_1), *_ = views[0]
     n = 512
-    fit = device_pose(frame_0, frame_1, n)
+    fit = device_pose_fit(frame_0, frame_1, n)
     estimate = extend(frame_0.replace(depth=0 * frame_0.depth), frame_1, n=n, fit=fit)
     z = truth_of(frame_0, estimate.uv)
     error = ((estimate.depth - z).abs() / z)[estimate.keep]
     assert estimate.keep.sum() > 450 and error.median() < 0.025
     with pytest.raises(ValueError, match="T_world_from_cam"):
-        device_pose(frame_0.replace(T_world_from_cam=None), frame_1, n)
-    lost = given_pose(fit.T_1_from_0.map(lambda x: x * torch.nan), n)
+        device_pose_fit(frame_0.replace(T_world_from_cam=None), frame_1, n)
+    lost = known_pose_fit(fit.T_1_from_0.map(lambda x: x * torch.nan), n)
     assert not lost.ok.any() and not extend(frame_0, frame_1, n=n, fit=lost).keep.any()
 
 

@@ -14,20 +14,20 @@ from torch import Tensor
 from dhtorch import data
 from dhtorch.codes import PoseCode
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.pairs import between, by_cameras
+from dhtorch.data.pairs import by_cameras, spaced_frames
 from dhtorch.data.recording import Recording, TruthRecording
-from dhtorch.data.rig import Rig, joined, open_rig
+from dhtorch.data.rig import Rig, join_cameras, open_rig
 from dhtorch.geometry import covariance, se3
-from dhtorch.geometry.pose_averaging import rigid_mean
+from dhtorch.geometry.pose_averaging import average_poses
 from dhtorch.pipeline.presets import MAP, PAPER
-from dhtorch.pipeline.rig import Rigid, rig_pose
+from dhtorch.pipeline.rig import ConstantPose, estimate_rig_pose
 from dhtorch.pytree import collate
 from dhtorch.records import Frame, Pose
 from dhtorch.synthetic import two_cameras
 from dhtorch.testing import write_lerobot
 from dhtorch.transforms import ExtendDepth
 
-TRUE = se3.invert(two_cameras.rig_pose(0.15, 3.0))
+TRUE = se3.invert(two_cameras._two_camera_pose(0.15, 3.0))
 
 
 @cache
@@ -52,27 +52,27 @@ def one(name: str, stamps: list[float] | None, places: list[int], value: int = 0
 
 def test_frames_of_one_instant_stand_together() -> None:
     a, b = one("car/a", [0.0, 0.1, 0.2, 0.3], [0, 1, 2, 3], 1), one("car/b", [0.11, 0.19, 0.4], [5, 6, 9], 2)
-    rig = joined([a, b])
+    rig = join_cameras([a, b])
     assert rig.name == "car" and rig.cameras == ("a", "b") and len(rig) == 4
     assert rig.times is not None and rig.times.tolist() == [0.1, 0.11, 0.2, 0.19]
     assert rig.camera.tolist() == [0, 1, 0, 1] and rig.instant.tolist() == [0, 0, 1, 1]
     assert [int(frame.image[0, 0, 0, 0]) for frame in rig] == [1, 2, 1, 2]
     assert [float(frame.time[0]) for frame in rig] == [0.1, 0.11, 0.2, 0.19]
     assert any("car/a: 2 frames without their instant" in line for line in rig.report)
-    assert len(joined([a, b], tolerance=0.02)) == 4 and not isinstance(rig, TruthRecording)
+    assert len(join_cameras([a, b], tolerance=0.02)) == 4 and not isinstance(rig, TruthRecording)
     with pytest.raises(FormatError, match="no instant that all cameras saw"):
-        joined([a, b], tolerance=0.001)
-    by_number = joined([one("car/a", None, [1, 2, 4]), one("car/b", [0.0, 1.0, 2.0], [2, 3, 4])])
+        join_cameras([a, b], tolerance=0.001)
+    by_number = join_cameras([one("car/a", None, [1, 2, 4]), one("car/b", [0.0, 1.0, 2.0], [2, 3, 4])])
     assert by_number.times is None and by_number.number.tolist() == [4, 5, 8, 9]
     for wrong in ([a], [a, a], []):
         with pytest.raises(FormatError, match="two or more cameras of different names"):
-            joined(wrong)
+            join_cameras(wrong)
 
 
 def test_a_frame_belongs_to_one_instant() -> None:
     slow, fast = one("car/a", [0.0, 1.0], [0, 1]), one("car/b", [k / 10 for k in range(11)], list(range(11)))
-    assert joined([slow, fast]).times.tolist() == [0, 0, 1, 1]  # type: ignore[union-attr]
-    assert joined([fast, slow], tolerance=0.3).times.tolist() == [0, 0, 1, 1]  # type: ignore[union-attr]
+    assert join_cameras([slow, fast]).times.tolist() == [0, 0, 1, 1]  # type: ignore[union-attr]
+    assert join_cameras([fast, slow], tolerance=0.3).times.tolist() == [0, 0, 1, 1]  # type: ignore[union-attr]
 
 
 def test_cameras_of_a_data_set(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_pairs_in_space_and_in_time() -> None:
     assert [tuple(p) for p in mixed] == [(1, (0, 2, 3)), (5, (2, 3, 4, 6, 7)), (9, (6, 7, 8, 10, 11))]
     past = by_cameras(rig, instants=[0, 2], anchor="left", past=True)
     assert tuple(past[0]) == (0, 1) and tuple(past[3]) == (6, (2, 3, 7))
-    assert between(1, 0, 1) == [0]
+    assert spaced_frames(1, 0, 1) == [0]
     for options, said in (
         ({"anchor": "head"}, "expected one of left, right"),
         ({"instants": []}, "pairs.instants"),
@@ -136,12 +136,12 @@ SIGMA = torch.tensor([0.002] * 3 + [0.005] * 3, dtype=torch.float64)
 
 def test_the_mean_is_as_good_as_its_covariance_says() -> None:
     T, each, cov = measured(200, 12, SIGMA)
-    found = rigid_mean(each, cov, torch.ones(200, 12, dtype=torch.bool))
+    found = average_poses(each, cov, torch.ones(200, 12, dtype=torch.bool))
     assert found.ok.all() and found.agree.float().mean() > 0.99
     xi = se3.log(se3.compose(found.T, se3.invert(T)))
     z = xi / found.cov.diagonal(dim1=1, dim2=2).sqrt()
     assert 0.62 < (z.abs() < 1).float().mean() < 0.80 and (z.abs() < 4).all()
-    bold = rigid_mean(each, cov / 25, torch.ones(200, 12, dtype=torch.bool))
+    bold = average_poses(each, cov / 25, torch.ones(200, 12, dtype=torch.bool))
     torch.testing.assert_close(bold.scale.mean(), torch.tensor(5.0, dtype=torch.float64), atol=0.5, rtol=0)
 
 
@@ -152,9 +152,9 @@ def test_wrong_measurements_do_not_count() -> None:
     t = each.t.clone()
     t[:, :3] += torch.randn(20, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) + 0.3
     t[:, 11] = torch.nan
-    found = rigid_mean(Pose(each.R, t), cov, valid)
+    found = average_poses(Pose(each.R, t), cov, valid)
     assert found.ok.all() and not found.agree[:, :3].any() and not found.agree[:, 11].any()
-    clean = rigid_mean(each, cov, valid & (torch.arange(12) > 2))
+    clean = average_poses(each, cov, valid & (torch.arange(12) > 2))
     torch.testing.assert_close(found.T.t, clean.T.t, atol=1e-3, rtol=0)
 
 
@@ -163,31 +163,31 @@ def test_a_rig_that_is_not_rigid_has_no_pose() -> None:
     t = each.t.clone()
     t[:, 5:] += 0.2
     valid = torch.ones(5, 10, dtype=torch.bool)
-    found = rigid_mean(Pose(each.R, t), cov, valid)
+    found = average_poses(Pose(each.R, t), cov, valid)
     assert not found.ok.any() and found.T.t.isnan().all() and found.cov.isnan().all()
     _, wild, cov = measured(5, 10, 60 * SIGMA, seed=3)
-    assert not rigid_mean(wild, cov / 3600, valid).ok.any(), "what scatters sixtyfold is no one motion"
-    assert not rigid_mean(each, cov, valid & (torch.arange(10) < 1)).ok.any()
-    assert not rigid_mean(each, cov, torch.zeros_like(valid)).ok.any()
+    assert not average_poses(wild, cov / 3600, valid).ok.any(), "what scatters sixtyfold is no one motion"
+    assert not average_poses(each, cov, valid & (torch.arange(10) < 1)).ok.any()
+    assert not average_poses(each, cov, torch.zeros_like(valid)).ok.any()
     with pytest.raises(ValueError, match="no measurement"):
-        rigid_mean(each[:, :0], cov[:, :0], valid[:, :0])
+        average_poses(each[:, :0], cov[:, :0], valid[:, :0])
 
 
 def test_a_robots_cameras_are_measured_once() -> None:
     left, right = cameras(0), cameras(1)
-    found = rig_pose(left, right, method=MAP.replace(n=400))
+    found = estimate_rig_pose(left, right, method=MAP.replace(n=400))
     xi = se3.log(se3.compose(found.T.to(torch.float64), se3.invert(TRUE)))[0]
     assert found.ok.all() and found.agree.float().mean() > 0.6
     assert xi[:3].norm() < 0.003 and xi[3:].norm() < 0.006, "0.15 m apart"
     off = covariance.mahalanobis(xi[None], found.cov.to(torch.float64))
     assert off < 4.74, "one rig in a thousand"
-    surer = rig_pose(left, right, method=MAP.replace(n=400), places=3)
+    surer = estimate_rig_pose(left, right, method=MAP.replace(n=400), places=3)
     share = found.agree.sum() / (found.agree.sum() / 3).clamp_min(1)
     torch.testing.assert_close(found.cov / share, surer.cov, rtol=1e-4, atol=0)
     with pytest.raises(ValueError, match="places is 0"):
-        rig_pose(left, right, places=0)
+        estimate_rig_pose(left, right, places=0)
     trace: dict[str, Any] = {}
-    given = PAPER.replace(n=300, given=Rigid(found.T, found.cov))
+    given = PAPER.replace(n=300, given=ConstantPose(found.T, found.cov))
     estimate = given(left, right, trace=trace)
     assert (trace["fit"].code == PoseCode.OK).all() and estimate.keep.float().mean() > 0.5
     assert torch.equal(trace["fit"].T_1_from_0.t, found.T.t.expand(6, 3))

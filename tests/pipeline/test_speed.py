@@ -34,12 +34,12 @@ def two_views(n):
 
 @pytest.mark.parametrize("points", [64, 10_000])
 def test_depths_are_those_of_triangulate_in_any_pieces(monkeypatch, points):
-    monkeypatch.setattr(epipolar, "POINTS", points)
+    monkeypatch.setattr(epipolar, "MAX_CHUNK_TRIANGULATED", points)
     args, truth = two_views(333)
-    found = epipolar.depths(*args)
+    found = epipolar.triangulate_depth(*args)
     assert torch.equal(found, epipolar.triangulate(*args).depth)
     torch.testing.assert_close(found, truth, rtol=2e-3, atol=0)
-    assert epipolar.depths(*(x[:, :0] if k < 2 else x for k, x in enumerate(args))).shape == (2, 0)
+    assert epipolar.triangulate_depth(*(x[:, :0] if k < 2 else x for k, x in enumerate(args))).shape == (2, 0)
 
 
 def test_trial_steps_are_gauss_newton_steps_and_know_no_company():
@@ -47,14 +47,14 @@ def test_trial_steps_are_gauss_newton_steps_and_know_no_company():
     A, v = torch.randn(40, 6, 9, generator=g), torch.randn(40, 6, generator=g)
     H, T = A @ A.mT + 0.1 * torch.eye(6), se3.exp(0.1 * torch.randn(40, 6, generator=g))
     H[3], v[4, 2] = 0, torch.nan
-    step, ok = least_squares.trial_step(T, H, v)
+    step, ok = least_squares.trial_pose_step(T, H, v)
     wanted, fine = least_squares.gauss_newton_step(T, H, v)
     assert fine.sum() == 38 and ok[fine].all() and not ok[3]
     torch.testing.assert_close(step.R[fine], wanted.R[fine], rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(step.t[fine], wanted.t[fine], rtol=1e-5, atol=1e-6)
     assert step.t[4].isnan().any()  # no cost of it is below another
     for b in fine.nonzero()[:, 0].tolist():
-        one, _ = least_squares.trial_step(T[b : b + 1], H[b : b + 1], v[b : b + 1])
+        one, _ = least_squares.trial_pose_step(T[b : b + 1], H[b : b + 1], v[b : b + 1])
         assert torch.equal(one.R[0], step.R[b]) and torch.equal(one.t[0], step.t[b])
 
 

@@ -11,13 +11,13 @@ import torch
 from dhtorch import MAP, PAPER
 from dhtorch.cli.run import main
 from dhtorch.codes import Gate
-from dhtorch.pipeline.stream import Stream, is_cut
-from dhtorch.pipeline.view_selection import by_probes
+from dhtorch.pipeline.stream import Stream, is_scene_cut
+from dhtorch.pipeline.view_selection import select_views_by_preview
 from dhtorch.pytree import stack
 from dhtorch.records import Frame
 from dhtorch.synthetic import open_room
 
-FAST = MAP.replace(n=256, views=2, choose=by_probes)
+FAST = MAP.replace(n=256, views=2, choose=select_views_by_preview)
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +83,9 @@ def test_a_cut_is_noticed_and_the_past_forgotten(frames: list[Frame], elsewhere:
     for frame in (frames[0], frames[1], elsewhere):
         last = stream.push(frame)
     assert stream.cuts == [2] and len(stream.past) == 1 and bool((last.gate == Gate.NO_BASELINE).all())
-    assert not is_cut(frames[0], frames[1]) and is_cut(frames[1], elsewhere)
+    assert not is_scene_cut(frames[0], frames[1]) and is_scene_cut(frames[1], elsewhere)
     dark = frames[1].replace(image=torch.zeros_like(frames[1].image))
-    assert not is_cut(frames[0], dark) and not is_cut(dark, frames[1]), "nothing is told by a black picture"
+    assert not is_scene_cut(frames[0], dark) and not is_scene_cut(dark, frames[1]), "nothing is told by a black picture"
 
 
 def test_after_a_reset_it_is_as_new(frames: list[Frame]) -> None:

@@ -6,13 +6,11 @@ from support.board_scenes import Board, look
 
 from dhtorch import MAP
 from dhtorch.codes import Gate, PoseCode, Source
-from dhtorch.experiments.compare.exact_rooms import exact_pose
-from dhtorch.geometry import plane_sweep as sweep
-from dhtorch.geometry import se3
-from dhtorch.geometry.covariance import median
+from dhtorch.experiments.compare.exact_rooms import exact_pose_fit
+from dhtorch.geometry import plane_sweep, se3
+from dhtorch.geometry.covariance import masked_median
 from dhtorch.metrics.holdout import range_split
-from dhtorch.pipeline import dense
-from dhtorch.pipeline import surface as stereo
+from dhtorch.pipeline import dense, surface
 from dhtorch.pytree import collate, stack
 
 NEAR, N = 2.0, 512
@@ -26,7 +24,7 @@ def scene():
     small = {"hw": (60, 80), "f": 70.0}
     frames = [look(boards, at, **small)[0] for at in ((0.0, 0.0, 0.0), (0.15, 0.02, 0.01), (-0.04, 0.01, 0.0))]
     anchor, *others = (range_split(frame, NEAR) for frame in frames)
-    fits = [exact_pose(frames[0], frame, N) for frame in frames[1:]]
+    fits = [exact_pose_fit(frames[0], frame, N) for frame in frames[1:]]
     cov = torch.diag(torch.tensor([1e-8] * 3 + [1e-6] * 3)).expand(1, 6, 6)
     estimates, samples = [], None
     for other, fit in zip(others, fits, strict=True):
@@ -34,13 +32,13 @@ def scene():
         estimates.append(METHOD(anchor, other, fit=fit.replace(cov=cov), trace=trace))
         samples = trace["samples"]
     given = stack([fit.replace(cov=cov) for fit in fits])
-    return anchor, dense.Asked(estimates[0], stack(others), stack(estimates), given, samples)
+    return anchor, dense.SelectedViews(estimates[0], stack(others), stack(estimates), given, samples)
 
 
 def mapped(scene, **options):
     anchor, asked = scene
     with torch.no_grad():
-        return dense.swept(anchor, asked, **{"method": METHOD, "planes": 24, "partners": 1, **options})
+        return dense.sweep_depth(anchor, asked, **{"method": METHOD, "planes": 24, "partners": 1, **options})
 
 
 def only(asked, *views):
@@ -70,16 +68,16 @@ def test_the_wall_is_found(scene):
 
 def test_pixels_of_a_map_stand_for_what_they_cover(scene):
     anchor, _ = scene
-    uv = dense.pixels(anchor, (30, 40)).unflatten(0, (30, 40))
+    uv = dense.map_pixel_centres(anchor, (30, 40)).unflatten(0, (30, 40))
     assert uv[0, 0].tolist() == [0.5, 0.5] and uv[29, 39].tolist() == [78.5, 58.5] and uv[0, 1].tolist() == [2.5, 0.5]
-    picture, camera = dense.resized(anchor, 40)
+    picture, camera = dense.downscale_grey(anchor, 40)
     torch.testing.assert_close(picture[0, 0, 3, 5], anchor.image[0, 0, 6:8, 10:12].mean())
     torch.testing.assert_close(camera.c, (anchor.camera.c + 0.5) / 2 - 0.5)
 
 
 def test_true_is_no_number():
     with pytest.raises(ValueError, match=r"dense.planes: found True, expected a whole number"):
-        dense.options({"planes": True})
+        dense.dense_options({"planes": True})
 
 
 def test_what_the_motion_does_not_know_is_in_sigma(scene):
@@ -92,7 +90,7 @@ def test_what_the_motion_does_not_know_is_in_sigma(scene):
 def test_no_depth_is_surer_than_the_sensors_metre(scene):
     anchor, asked = scene
     samples = asked.samples.replace(sigma=0.03 * asked.samples.depth)
-    share = median(samples.sigma / samples.depth, samples.usable & (samples.depth > 0))
+    share = masked_median(samples.sigma / samples.depth, samples.usable & (samples.depth > 0))
     found = mapped((anchor, asked._replace(samples=samples)))
     told = found.source == Source.SWEPT
     assert float(share) == pytest.approx(0.03, rel=1e-4)
@@ -120,13 +118,13 @@ def test_a_few_returns_refute_no_motion(scene):
     assert not bool((refuted.source == Source.SWEPT).any()) and bool((silent == Gate.CONTRADICTED).any())
     few = torch.zeros_like(anchor.depth)
     few[:, 10:14, :30] = anchor.depth[:, 10:14, :30]
-    assert 20 < int((few > 0).sum()) < dense.WITNESSES
+    assert 20 < int((few > 0).sum()) < dense.MIN_OVERLAP_PIXELS
     assert bool((mapped((anchor.replace(depth=few), wrong)).source == Source.SWEPT).any())
 
 
 def test_a_pixel_that_fits_elsewhere_as_well_is_silent(scene, monkeypatch):
-    best = stereo.best_planes
-    monkeypatch.setattr(stereo, "best_planes", lambda *a: best(*a)._replace(alone=torch.tensor(False)))
+    best = surface.sweep_planes
+    monkeypatch.setattr(surface, "sweep_planes", lambda *a: best(*a)._replace(alone=torch.tensor(False)))
     found = mapped(scene)
     assert not bool((found.source == Source.SWEPT).any())
     assert bool((found.gate[found.source == Source.NONE] == Gate.UNCERTAIN).any())
@@ -135,33 +133,35 @@ def test_a_pixel_that_fits_elsewhere_as_well_is_silent(scene, monkeypatch):
 def test_a_rival_is_a_place_that_costs_nearly_as_little(scene, monkeypatch):
     """Costs made by hand: one plane that fits, and another far away that fits as well, or not at all."""
     anchor, asked = scene
-    base = sweep.base(*dense.resized(anchor, 80))
-    index, wanted = dense.worthiest(asked, 1)
-    partner = [dense.partner_of(asked, index[0], 80, wanted[0], base.image)]
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(anchor, 80))
+    index, wanted = dense.top_views(asked, 1)
+    partner = [dense.source_view_of(asked, index[0], 80, wanted[0], base.image)]
     q = torch.linspace(0, 1, 32)[None]
     for second, alone in ((0, False), (25, True)):
         costs = torch.full((1, *base.hw, 32), 30, dtype=torch.uint8)
         costs[..., 8], costs[..., 28] = 0, second
-        monkeypatch.setattr(stereo, "_costs", lambda *_, costs=costs: costs)
-        found = stereo.best_planes(base, partner, q)
+        monkeypatch.setattr(surface, "_costs", lambda *_, costs=costs: costs)
+        found = surface.sweep_planes(base, partner, q)
         assert bool((found.alone == alone).all())
         torch.testing.assert_close(found.q, torch.full_like(found.q, 8 / 31), atol=0.5 / 31, rtol=0)
 
 
 def test_how_far_away_is_elsewhere_says_the_view_that_moves_most(scene, monkeypatch):
     anchor, asked = scene
-    base = sweep.base(*dense.resized(anchor, 80))
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(anchor, 80))
     q = torch.linspace(0, 1, 24)[None]
-    each = [dense.partner_of(asked, torch.tensor([v]), 80, torch.tensor([True]), base.image) for v in (0, 1)]
-    reach, rivals = [], sweep.rivals
-    monkeypatch.setattr(sweep, "rivals", lambda some, best, far: reach.append(float(far)) or rivals(some, best, far))
+    each = [dense.source_view_of(asked, torch.tensor([v]), 80, torch.tensor([True]), base.image) for v in (0, 1)]
+    reach, rivals = [], plane_sweep.second_best_margin
+    monkeypatch.setattr(
+        plane_sweep, "second_best_margin", lambda some, best, far: reach.append(float(far)) or rivals(some, best, far)
+    )
     for partners in ([each[0]], [each[1]], each):
-        stereo.best_planes(base, partners, q)
+        surface.sweep_planes(base, partners, q)
     assert reach[0] < reach[1] and reach[2] == reach[0]
 
 
 def test_what_a_nearer_surface_hides_is_not_found(scene, monkeypatch):
-    monkeypatch.setattr(sweep, "hidden", lambda _go, q, _tolerance: torch.ones_like(q, dtype=torch.bool))
+    monkeypatch.setattr(plane_sweep, "occlusion_mask", lambda _go, q, _tolerance: torch.ones_like(q, dtype=torch.bool))
     found = mapped(scene)
     silent = found.source == Source.NONE
     assert not bool((found.source == Source.SWEPT).any()) and bool((found.gate[silent] == Gate.NO_TRACK).all())
@@ -183,8 +183,8 @@ def test_views_that_are_of_no_use_to_one_of_a_batch_say_nothing_of_it(scene):
 
 def changed(monkeypatch, change):
     """Windows that tell something else: ``change`` of the view and of what a fit finds."""
-    fit = sweep.fit_windows
-    monkeypatch.setattr(sweep, "fit_windows", lambda base, view, *a, **k: change(view, fit(base, view, *a, **k)))
+    fit = plane_sweep.fit_windows
+    monkeypatch.setattr(plane_sweep, "fit_windows", lambda base, view, *a, **k: change(view, fit(base, view, *a, **k)))
 
 
 def test_windows_that_hardly_fit_have_no_say(scene, monkeypatch):
@@ -204,7 +204,7 @@ def test_one_view_in_which_a_pixel_fits_is_enough(scene, monkeypatch):
 
 def test_pixels_of_a_window_err_together(scene, monkeypatch):
     plain = mapped(scene)
-    monkeypatch.setattr(stereo, "INDEPENDENT", 4 * stereo.INDEPENDENT)
+    monkeypatch.setattr(surface, "INDEPENDENT_WINDOW_PIXELS", 4 * surface.INDEPENDENT_WINDOW_PIXELS)
     found = mapped(scene)
     both = (plain.source == Source.SWEPT) & (found.source == Source.SWEPT)
     assert both.sum() > 50 and float((found.sigma / plain.sigma)[both].median()) < 0.9
@@ -212,24 +212,27 @@ def test_pixels_of_a_window_err_together(scene, monkeypatch):
 
 def test_a_fit_moves_a_pixel_no_further_than_a_few_planes(scene, monkeypatch):
     anchor, asked = scene
-    base = sweep.base(*dense.resized(anchor, 80))
-    partner = [dense.partner_of(asked, torch.tensor([0]), 80, torch.tensor([True]), base.image)]
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(anchor, 80))
+    partner = [dense.source_view_of(asked, torch.tensor([0]), 80, torch.tensor([True]), base.image)]
     q = torch.linspace(0, 1, 24)[None]
-    start = stereo.best_planes(base, partner, q)
+    start = surface.sweep_planes(base, partner, q)
     changed(monkeypatch, lambda _view, f: f._replace(step=1e4 * f.step))
     with torch.no_grad():
-        found = stereo.fitted(base, partner, start, q, 2)
-    assert float((found.q - start.q).abs().max()) * 23 < stereo.ALL_STEPS + stereo.STEP + stereo.SURFACE
+        found = surface.refine_surface(base, partner, start, q, 2)
+    assert (
+        float((found.q - start.q).abs().max()) * 23
+        < surface.MAX_TOTAL_PLANES + surface.MAX_STEP_PLANES + surface.SURFACE_PLANES
+    )
 
 
 @pytest.mark.parametrize(("views", "planes"), [((1,), 1.0), ((0, 1), 0.5)])
 def test_a_view_that_goes_astray_asks_for_no_more_than_a_plane(views, planes, scene, monkeypatch):
     """The second view asks for a place far away, the first, as sure, for none: they meet in between."""
     anchor, asked = scene
-    base = sweep.base(*dense.resized(anchor, 80))
-    partners = [dense.partner_of(asked, torch.tensor([v]), 80, torch.tensor([True]), base.image) for v in views]
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(anchor, 80))
+    partners = [dense.source_view_of(asked, torch.tensor([v]), 80, torch.tensor([True]), base.image) for v in views]
     q = torch.linspace(0, 1, 24)[None]
-    start = stereo.Found(torch.full((1, *base.hw), 0.4), torch.zeros(1, *base.hw), torch.tensor(True))
+    start = surface.SweptSurface(torch.full((1, *base.hw), 0.4), torch.zeros(1, *base.hw), torch.tensor(True))
     even = dict.fromkeys(("contrast", "noise", "correlation"), torch.ones(1, *base.hw))
 
     def astray(view, f):
@@ -237,21 +240,21 @@ def test_a_view_that_goes_astray_asks_for_no_more_than_a_plane(views, planes, sc
 
     changed(monkeypatch, astray)
     with torch.no_grad():
-        found = stereo.fitted(base, partners, start, q, 1)
-    assert float((found.q - start.q).median()) * 23 == pytest.approx(planes * stereo.STEP, rel=1e-3)
+        found = surface.refine_surface(base, partners, start, q, 1)
+    assert float((found.q - start.q).median()) * 23 == pytest.approx(planes * surface.MAX_STEP_PLANES, rel=1e-3)
 
 
 def test_what_a_motion_does_not_know_of_a_depth_is_its_derivative_along_the_line(scene):
     """How far the depth must go for a pixel to stay where it is seen, for each of six displacements of the pose."""
     anchor, asked = scene
-    base = sweep.base(*(x.to(torch.float64) for x in dense.resized(anchor, 80)))
-    view = dense.partner_of(asked, torch.tensor([0]), 80, torch.tensor([True]), base.image).view.to(torch.float64)
+    base = plane_sweep.make_reference_view(*(x.to(torch.float64) for x in dense.downscale_grey(anchor, 80)))
+    view = dense.source_view_of(asked, torch.tensor([0]), 80, torch.tensor([True]), base.image).view.to(torch.float64)
     A = torch.randn(6, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     cov, q = (A @ A.T)[None], torch.full((1, *base.hw), 0.3, dtype=torch.float64)
     little = 1e-6
 
     def seen(view, q):
-        return sweep.seen_at(view, base.ray, q.flatten(1))[0][0]
+        return plane_sweep.project_inverse_depth(view, base.ray, q.flatten(1))[0][0]
 
     motion = (seen(view, q + little) - seen(view, q)) / little
     rows = []
@@ -260,5 +263,5 @@ def test_what_a_motion_does_not_know_of_a_depth_is_its_derivative_along_the_line
         rows.append(((seen(view.replace(T_1_from_0=T), q) - seen(view, q)) / little * motion).sum(-1))
     J = torch.stack(rows, -1) / motion.square().sum(-1, keepdim=True)
     fit = asked.fits[0].to(torch.float64).replace(cov=cov)
-    found = stereo.pose_variance(base, view, fit, q, motion.unflatten(0, base.hw)[None])
+    found = surface.pose_variance(base, view, fit, q, motion.unflatten(0, base.hw)[None])
     torch.testing.assert_close(found.flatten(), ((J @ cov[0]) * J).sum(-1), rtol=1e-4, atol=0.0)

@@ -11,15 +11,15 @@ from support.rooms import noted
 from dhtorch.cli import run
 from dhtorch.data.pairs import by_choice, by_gap
 from dhtorch.experiments import pair, protocol
-from dhtorch.experiments.exhibits import look
+from dhtorch.experiments.exhibits import make_exhibit
 from dhtorch.experiments.paper import global_map, heldout, range_split
 from dhtorch.integrate import recording as maps
 from dhtorch.pipeline.presets import AUTO, MAP, PAPER, WINDOW
-from dhtorch.pipeline.view_report import Picked, choosing, picked
-from dhtorch.pipeline.view_selection import by_probes
+from dhtorch.pipeline.view_report import ViewReport, report_selection, with_view_selection
+from dhtorch.pipeline.view_selection import select_views_by_preview
 from dhtorch.pytree import stack
-from dhtorch.records import Choice
-from dhtorch.runtime import results as archive
+from dhtorch.records import ViewSelection
+from dhtorch.runtime import results as result_files
 from dhtorch.synthetic import SyntheticRoom
 
 N = 256
@@ -56,7 +56,7 @@ def test_every_method_chooses_among_what_is_offered(outcome):
 def test_a_single_view_answers_as_the_pair_does(room):
     anchor, others = room[0], [room[k] for k in (1, 2, 4)]
     trace = {}
-    found = choosing(SMALL["map"])(anchor, stack(others), trace=trace)
+    found = with_view_selection(SMALL["map"])(anchor, stack(others), trace=trace)
     k = int(trace["choice"].index[0, 0])
     alone = SMALL["map"](anchor, others[k])
     for name in ("depth", "sigma", "gate", "score"):
@@ -81,10 +81,13 @@ def _told(outcome):
 
 
 def test_what_chooses_for_itself_is_asked_as_it_is():
-    assert choosing(AUTO) is AUTO
+    assert with_view_selection(AUTO) is AUTO
     for method in (PAPER, MAP, WINDOW):
-        assert choosing(method).choose is by_probes and choosing(method).views == method.views
-        assert not choosing(method).chain, "views lie on both sides: none says where the next search begins"
+        assert (
+            with_view_selection(method).choose is select_views_by_preview
+            and with_view_selection(method).views == method.views
+        )
+        assert not with_view_selection(method).chain, "views lie on both sides: none says where the next search begins"
 
 
 def test_a_seat_may_give_indices_alone(room):
@@ -94,30 +97,36 @@ def test_a_seat_may_give_indices_alone(room):
     trace = {}
     last(room[0], stack([room[k] for k in (1, 2, 4)]), trace=trace)
     assert trace["choice"].index.tolist() == [[2]] and trace["choice"].worth is None
-    assert str(picked(0, (1, 2, 4), trace)) == "frame 0: view 4, chosen of 3"
+    assert str(report_selection(0, (1, 2, 4), trace)) == "frame 0: view 4, chosen of 3"
 
 
 def test_why_is_said_in_one_line(caplog):
-    choice = Choice(torch.tensor([[0], [3]]), torch.tensor([[12.345], [310.4]]), torch.tensor([[False]] * 3 + [[True]]))
+    choice = ViewSelection(
+        torch.tensor([[0], [3]]), torch.tensor([[12.345], [310.4]]), torch.tensor([[False]] * 3 + [[True]])
+    )
     with caplog.at_level(logging.DEBUG, "dhtorch"):
-        found = picked(12, (4, 9, 20, 31), {"choice": choice})
+        found = report_selection(12, (4, 9, 20, 31), {"choice": choice})
     line = "frame 12: views 4, 31, chosen of 4 (worth 12.3, 310; 1 had no baseline or no pose)"
     assert [r.getMessage() for r in caplog.records] == [line] == [str(found)]
     assert found.row() == {"views": [4, 31], "why": {"n_offered": 4, "worth": [12.35, 310.4], "n_mute": 1}}
-    assert picked(0, (1,), {}) == Picked(0, (1,), 1) and str(picked(0, (1,), {})).endswith("1, all that were offered")
+    assert report_selection(0, (1,), {}) == ViewReport(0, (1,), 1) and str(report_selection(0, (1,), {})).endswith(
+        "1, all that were offered"
+    )
 
 
 def test_each_anchor_of_a_batch_is_told_of_its_own():
     index, worth = torch.tensor([[0, 1], [3, 2]]), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
     mute = torch.tensor([[False, True]] * 4)
-    found = picked(7, (4, 9, 20, 31), {"choice": Choice(index, worth, mute)}, b=1)
-    assert found == Picked(7, (9, 20), 4, (2.0, 4.0), 4)
+    found = report_selection(7, (4, 9, 20, 31), {"choice": ViewSelection(index, worth, mute)}, b=1)
+    assert found == ViewReport(7, (9, 20), 4, (2.0, 4.0), 4)
 
 
 def test_what_a_view_adds_and_which_say_nothing(room):
-    choice = by_probes(room[0], stack([room[k] for k in (0, 1, 2, 4)]), 3)  # the anchor itself has no baseline
+    choice = select_views_by_preview(
+        room[0], stack([room[k] for k in (0, 1, 2, 4)]), 3
+    )  # the anchor itself has no baseline
     assert choice.mute[0, 0] and not choice.mute[3, 0] and choice.index[:, 0].tolist() == [1, 2, 3]
-    one = by_probes(room[0], stack([room[k] for k in (0, 1, 2, 4)]), 1)
+    one = select_views_by_preview(room[0], stack([room[k] for k in (0, 1, 2, 4)]), 1)
     best = int(one.index[0, 0])
     assert float(choice.worth[best - 1, 0]) == float(one.worth[0, 0]) == float(choice.worth.max())
 
@@ -136,7 +145,7 @@ def test_two_frames_are_each_others_view():
 
 
 def test_what_is_shown_is_the_last_view_that_was_asked(room):
-    shown = look(noted(room), SMALL["map"], OFFERED, protocol.Settings(cutoff=math.inf), most=1)
+    shown = make_exhibit(noted(room), SMALL["map"], OFFERED, protocol.Settings(cutoff=math.inf), most=1)
     (shot,) = shown.shots
     j = int(shot.label.split(" → ")[1])
     assert shot.label.startswith("0 → ") and shown.views[shot.view_1].number == j
@@ -144,18 +153,18 @@ def test_what_is_shown_is_the_last_view_that_was_asked(room):
 
 
 def test_a_map_knows_all_views_and_links_them(room):
-    found = list(maps.ask(room, SMALL["window"], OFFERED(room), cutoff=math.inf))
+    found = list(maps.estimate_pairs(room, SMALL["window"], OFFERED(room), cutoff=math.inf))
     assert [a.pair[0] for a in found] == [0, 3] and all(a.pair[1] == a.picked.views[-1] for a in found)
     assert all([*a.links] == [a.pair[1], a.picked.views[0]] or set(a.links) == set(a.picked.views) for a in found)
-    places = maps.place(room, found, poses="anchored")
+    places = maps.place_frames(room, found, poses="anchored")
     asked = {0, 3}.union(*(a.picked.views for a in found))
     assert set(places.poses) <= asked and len(places.poses) + places.n_unplaced == len(asked)
-    (one,) = maps.ask(room, SMALL["window"], by_gap(room, 2)[:1])
+    (one,) = maps.estimate_pairs(room, SMALL["window"], by_gap(room, 2)[:1])
     assert one.picked is None and [*one.links] == [2] and one.pair == (0, 2)
 
 
 def test_steps_of_two_widths_join_what_was_chosen():
-    links = maps.chain([(0, 4), (3, 1), (2, 0), (1, 4), (4, 2)], chosen=True)
+    links = maps.linking_pairs([(0, 4), (3, 1), (2, 0), (1, 4), (4, 2)], chosen=True)
     assert set(links) == {(0, 1), (1, 2), (2, 3), (3, 4)}, "the median width 2 is there but for (0, 2), (1, 3), (2, 4)"
 
 
@@ -171,7 +180,7 @@ def test_steps_of_two_widths_join_what_was_chosen():
     ],
 )
 def test_an_option_of_one_choice_alone_chooses_it(words, choice):
-    assert run._with_pairs(words) == [*words, *choice]
+    assert run._add_implied_choice(words) == [*words, *choice]
 
 
 def test_a_job_and_a_map_without_a_gap(tmp_path, monkeypatch, capsys):
@@ -187,7 +196,7 @@ def test_a_job_and_a_map_without_a_gap(tmp_path, monkeypatch, capsys):
     assert run.main(["-v", *tiny, "pairs.stride=2", "figures=false", "output=job"]) == 0, capsys.readouterr().err
     said = capsys.readouterr().err
     assert said.count("dhtorch.pipeline.view_report: frame ") == 2 and "chosen of 2" in said
-    result = archive.read(tmp_path / "job")
+    result = result_files.read_result(tmp_path / "job")
     assert [r["pair"][0] for r in result["rows"] if r["pair"]] == [0, 2]
     assert (
         run.main(
@@ -204,7 +213,7 @@ def test_a_job_and_a_map_without_a_gap(tmp_path, monkeypatch, capsys):
         )
         == 0
     )
-    rows = archive.read(tmp_path / "map")["rows"]
+    rows = result_files.read_result(tmp_path / "map")["rows"]
     assert [r["pair"][0] for r in rows if r["pair"]] == [0, 1, 2] and all(r["views"] for r in rows if r["pair"])
     scene = next(r for r in rows if r["pair"] is None)
     assert scene["n_frames"] + scene["n_unplaced"] == 3, "all frames were asked"

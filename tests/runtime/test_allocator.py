@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from dhtorch.cli import run
-from dhtorch.runtime import allocator as memory
+from dhtorch.runtime import allocator
 
 glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library has no such setting")
 
@@ -41,7 +41,7 @@ def said(how, **env):
 
 
 def clean():
-    return {k: v for k, v in os.environ.items() if k not in memory.SETTINGS}
+    return {k: v for k, v in os.environ.items() if k not in allocator._MALLOC_VARIABLES}
 
 
 @glibc
@@ -62,29 +62,29 @@ def test_what_the_environment_says_stands(name):
 
 
 def test_another_allocator_is_left_alone(monkeypatch):
-    for name in memory.SETTINGS:
+    for name in allocator._MALLOC_VARIABLES:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(ctypes, "CDLL", lambda _: object())
-    assert memory.keep_freed() is False
+    assert allocator.disable_malloc_trim() is False
 
     def missing(_):
         raise OSError("no such library")
 
     monkeypatch.setattr(ctypes, "CDLL", missing)
-    assert memory.keep_freed() is False
+    assert allocator.disable_malloc_trim() is False
 
 
 @pytest.mark.parametrize("words", [["stream", "most=2"], ["pairs=gap", "pairs.gap=1", "figures=false"]])
 def test_commands_that_work_on_frames_keep_what_they_free(words, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(run, "keep_freed", lambda: asked.append(1))
+    monkeypatch.setattr(run, "disable_malloc_trim", lambda: asked.append(1))
     small = ["data=synthetic", "data.n_frames=3", "method=paper", "method.n=64"]
     assert run.main([*words, *small, f"output={tmp_path / 'out'}"]) == 0 and asked == [1]
 
 
 @pytest.mark.parametrize("words", [["--version"], ["--help"], ["stream", "--help"], ["stream", "moost=2"]])
 def test_commands_that_only_say_something_do_not_ask(words, monkeypatch, capsys):
-    monkeypatch.setattr(run, "keep_freed", lambda: pytest.fail("asked"))
+    monkeypatch.setattr(run, "disable_malloc_trim", lambda: pytest.fail("asked"))
     with contextlib.suppress(SystemExit):  # as help ends
         run.main(words)
     assert "".join(capsys.readouterr())

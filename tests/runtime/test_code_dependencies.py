@@ -14,8 +14,8 @@ from omegaconf import OmegaConf
 
 import dhtorch
 from dhtorch.cli.run import config_dir, job_name
-from dhtorch.runtime import code_dependencies as closure
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import code_dependencies
+from dhtorch.runtime import results as result_files
 
 ROOT = Path(dhtorch.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
@@ -74,51 +74,54 @@ MAIN = ("data=synthetic",)
 )
 def test_a_result_is_another_one_when_what_it_reaches_is_edited(package, overrides, path, counts):
     config = settings(*overrides)
-    before = archive.result_key(config, "d", code_dir=package)
+    before = result_files.compute_result_key(config, "d", code_dir=package)
     with edited(package / path):
-        assert (archive.result_key(config, "d", code_dir=package) != before) == counts
-    assert archive.result_key(config, "d", code_dir=package) == before
+        assert (result_files.compute_result_key(config, "d", code_dir=package) != before) == counts
+    assert result_files.compute_result_key(config, "d", code_dir=package) == before
 
 
 def test_tables_that_travel_with_a_module_count_with_it(package):
     config = copy.deepcopy(settings(*MAIN))
-    node = {"_target_": "dhtorch.calibration.probability", "name": "map"}
+    node = {"_target_": "dhtorch.calibration.load_probability", "name": "map"}
     config["method"]["score"]["recalibration"] = node
-    before = archive.result_key(config, "d", code_dir=package)
+    before = result_files.compute_result_key(config, "d", code_dir=package)
     with edited(package / "calibration" / "map.json"):
-        assert archive.result_key(config, "d", code_dir=package) != before
-    assert not any(name.endswith((".pyc", ".css")) for name in closure.reached(closure.targets(config), package))
+        assert result_files.compute_result_key(config, "d", code_dir=package) != before
+    assert not any(
+        name.endswith((".pyc", ".css"))
+        for name in code_dependencies.find_reachable_modules(code_dependencies.iter_targets(config), package)
+    )
 
 
 def test_further_roots_count(package):
     config = {"method": {"_target_": "dhtorch.pipeline.method.Method"}}
     roots = {"roots": ["dhtorch.extract.dataset"], "code_dir": package}
-    before = archive.result_key(config, "d", **roots)
-    assert before != archive.result_key(config, "d", code_dir=package)
+    before = result_files.compute_result_key(config, "d", **roots)
+    assert before != result_files.compute_result_key(config, "d", code_dir=package)
     with edited(package / "extract" / "dataset.py"):
-        assert before != archive.result_key(config, "d", **roots)
+        assert before != result_files.compute_result_key(config, "d", **roots)
 
 
 def test_names_are_those_of_modules_functions_and_packages():
-    reach = lambda *names: set(closure.reached(names))  # noqa: E731
+    reach = lambda *names: set(code_dependencies.find_reachable_modules(names))  # noqa: E731
     assert reach("dhtorch.codes.Gate") == reach("dhtorch.codes") == {"__init__.py", "codes.py"}
     assert {"geometry/__init__.py", "geometry/se3.py", "pytree.py"} <= reach("dhtorch.geometry.se3.exp")
     assert reach("dhtorch.nothing", "dhtorch.nowhere.at.all") == {"__init__.py"} and reach("nobody.knows") == set()
-    assert reach() == set() and list(closure.reached(["dhtorch.records"])) == sorted(
-        closure.reached(["dhtorch.records"])
+    assert reach() == set() and list(code_dependencies.find_reachable_modules(["dhtorch.records"])) == sorted(
+        code_dependencies.find_reachable_modules(["dhtorch.records"])
     )
 
 
 def test_somebody_elses_function_counts_and_what_it_takes_from_here(tmp_path, monkeypatch):
     (tmp_path / "their_tracker.py").write_text("from dhtorch.stages import track\n\ndef follow(): ...\n")
     monkeypatch.syspath_prepend(tmp_path)
-    found = closure.reached(["their_tracker.follow"])
+    found = code_dependencies.find_reachable_modules(["their_tracker.follow"])
     assert found["elsewhere:their_tracker"] == tmp_path / "their_tracker.py"
     assert {"stages/track.py", "geometry/lucas_kanade.py"} <= set(found) and "pipeline/multiview.py" not in found
     config = {"track": {"_target_": "their_tracker.follow"}}
-    before = archive.result_key(config, "d")
+    before = result_files.compute_result_key(config, "d")
     with edited(tmp_path / "their_tracker.py"):
-        assert archive.result_key(config, "d") != before
+        assert result_files.compute_result_key(config, "d") != before
     sys.modules.pop("their_tracker", None)
 
 
@@ -134,11 +137,11 @@ def written(path):
 
 def test_no_import_of_the_package_is_missed():
     for path in FILES:
-        found, expected = set(closure.imported(path.read_text(encoding="utf-8"))), set(written(path))
+        found, expected = set(code_dependencies.iter_imports(path.read_text(encoding="utf-8"))), set(written(path))
         assert expected <= found, path
         assert not found - expected or '"""' in path.read_text(encoding="utf-8"), "an example in a docstring"
     told = "from dhtorch.a import (\n    b,  # a note\n    c as d,\n)\n\ndef f():\n    import dhtorch.e\n    from dhtorch import g\n"
-    assert list(closure.imported(told)) == [
+    assert list(code_dependencies.iter_imports(told)) == [
         "dhtorch.a",
         "dhtorch.a.b",
         "dhtorch.a.c",

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
 KEY = "0123456789abcdef" * 4
@@ -24,7 +24,7 @@ KEY = "0123456789abcdef" * 4
 
 @cache
 def meta_now():
-    return archive.meta(device="cpu", dtype=torch.float32, threads=1, seed=0)
+    return result_files.collect_run_metadata(device="cpu", dtype=torch.float32, threads=1, seed=0)
 
 
 def result(**changes):
@@ -33,7 +33,7 @@ def result(**changes):
         "key": KEY,
         "meta": meta_now(),
         "config": {"method": {"n": 2048}, "holdout": {"cutoff": math.inf}},
-        "data": {"name": "room", "scenes": ["room"], "n_pairs": 1, "digest": archive.data_digest({})},
+        "data": {"name": "room", "scenes": ["room"], "n_pairs": 1, "digest": result_files.compute_data_digest({})},
         "summary": {"coverage": {"value": 0.5, "low": None, "high": None, "n": 1, "unit": "1"}},
         "rows": [
             {
@@ -46,16 +46,16 @@ def result(**changes):
             {"scene": "room", "pair": None, "method": "paper", "corr": math.nan, "ms": {"track": np.float32(1.5)}},
         ],
     }
-    return archive.build(**{**parts, **changes})
+    return result_files.build_result(**{**parts, **changes})
 
 
 def test_a_result_survives_the_disk_and_is_strict(tmp_path):
     written = result()
-    path = archive.write(tmp_path / "deep" / "result.json", written)
+    path = result_files.write_result(tmp_path / "deep" / "result.json", written)
     text = path.read_text()
     assert "NaN" not in text and "Infinity" not in text
-    sealed = {**written, "seal": archive.seal(written)}
-    assert archive.read(path) == archive.read(path.parent) == sealed == json.loads(text)
+    sealed = {**written, "seal": result_files.compute_seal(written)}
+    assert result_files.read_result(path) == result_files.read_result(path.parent) == sealed == json.loads(text)
     assert written["rows"][1]["corr"] is None and written["config"]["holdout"]["cutoff"] is None
     assert written["rows"][0]["pair"] == [0, 5] and written["rows"][0]["n_kept"] == 3
     assert [p.name for p in path.parent.iterdir()] == ["result.json"]
@@ -89,7 +89,7 @@ def test_validation_names_the_field(place, value, message):
         inner = inner[name]
     inner[place[-1]] = value
     with pytest.raises(ValueError, match=message):
-        archive.validate(bad)
+        result_files.validate_result(bad)
 
 
 @pytest.mark.parametrize("place", [("rows",), ("meta", "git"), ("summary", "coverage", "unit"), ("rows", 0, "scene")])
@@ -100,7 +100,7 @@ def test_a_missing_field_is_named(place):
         inner = inner[name]
     del inner[place[-1]]
     with pytest.raises(ValueError, match=r"\." + r"\.".join(map(str, place)) + ": found nothing, expected"):
-        archive.validate(bad)
+        result_files.validate_result(bad)
 
 
 def test_an_experiment_has_a_question_and_a_verdict():
@@ -115,46 +115,46 @@ def test_an_experiment_has_a_question_and_a_verdict():
 def test_reading_says_what_is_wrong_with_a_file(tmp_path):
     path = tmp_path / "result.json"
     with pytest.raises(FileNotFoundError, match=r"result\.json: found no file"):
-        archive.read(path)
+        result_files.read_result(path)
     for text in ("", "{", '{"a": NaN}', '{"a": 1}', "[]", "\x00"):
         path.write_text(text)
         with pytest.raises(ValueError, match=r"result\.json"):
-            archive.read(path)
-        assert not archive.finished(path, KEY)
+            result_files.read_result(path)
+        assert not result_files.is_finished(path, KEY)
 
 
 def test_finished_asks_for_the_same_key(tmp_path):
-    assert not archive.finished(tmp_path, KEY)
-    archive.write(tmp_path / "result.json", result())
-    assert archive.finished(tmp_path / "result.json", KEY) and archive.finished(tmp_path, KEY)
-    assert not archive.finished(tmp_path, KEY[::-1])
+    assert not result_files.is_finished(tmp_path, KEY)
+    result_files.write_result(tmp_path / "result.json", result())
+    assert result_files.is_finished(tmp_path / "result.json", KEY) and result_files.is_finished(tmp_path, KEY)
+    assert not result_files.is_finished(tmp_path, KEY[::-1])
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path):
-    path = archive.write(tmp_path / "result.json", result())
+    path = result_files.write_result(tmp_path / "result.json", result())
     before = path.read_bytes()
     with pytest.raises(ValueError, match=r"\.key"):
-        archive.write(path, {**result(), "key": "x"})
+        result_files.write_result(path, {**result(), "key": "x"})
     os_replace, storage.Path.replace = storage.Path.replace, lambda *_: (_ for _ in ()).throw(OSError("disk full"))
     try:
         with pytest.raises(OSError, match="disk full"):
-            archive.write(path, {**result(), "key": KEY[::-1]})
+            result_files.write_result(path, {**result(), "key": KEY[::-1]})
     finally:
         storage.Path.replace = os_replace
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["result.json"]
 
 
 def write_for_ever(path, ready):
-    one = archive.read(path)
+    one = result_files.read_result(path)
     one["rows"] = one["rows"] * 200
     while True:
-        archive.write(path, one)
+        result_files.write_result(path, one)
         ready.set()
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_a_killed_writer_leaves_a_whole_file(tmp_path):
-    path = archive.write(tmp_path / "result.json", result())
+    path = result_files.write_result(tmp_path / "result.json", result())
     context = multiprocessing.get_context("fork")
     ready = context.Event()
     writer = context.Process(target=write_for_ever, args=(path, ready))
@@ -162,21 +162,21 @@ def test_a_killed_writer_leaves_a_whole_file(tmp_path):
     try:
         assert ready.wait(60)
         for _ in range(20):
-            assert len(archive.read(path)["rows"]) == 400  # read while it is being replaced
+            assert len(result_files.read_result(path)["rows"]) == 400  # read while it is being replaced
     finally:
         writer.kill()
         writer.join()
-    assert archive.finished(path, KEY)
+    assert result_files.is_finished(path, KEY)
 
 
 def test_what_a_killed_writer_left_is_cleared(tmp_path):
-    path = archive.write(tmp_path / "result.json", result())
+    path = result_files.write_result(tmp_path / "result.json", result())
     for name in (".result.json.abc.tmp", ".result.json.1.tmp", "result.json.tmp", ".other.json.1.tmp", "x.tmp"):
         (tmp_path / name).write_text("{")
-    storage.clear(path)
-    storage.clear(tmp_path / "nowhere" / "result.json")
+    storage.remove_unfinished_files(path)
+    storage.remove_unfinished_files(tmp_path / "nowhere" / "result.json")
     assert {p.name for p in tmp_path.iterdir()} == {"result.json", "result.json.tmp", ".other.json.1.tmp", "x.tmp"}
-    assert archive.finished(path, KEY)
+    assert result_files.is_finished(path, KEY)
 
 
 def test_rows_may_hold_what_an_experiment_needs(tmp_path):
@@ -187,8 +187,8 @@ def test_rows_may_hold_what_an_experiment_needs(tmp_path):
     asked = {"experiment": "latency", "question": "Q", "expectation": "E", "why": "W", "verdict": "undecided"}
     summary = {"a.b.median_rel": {"value": None, "low": None, "high": None, "n": 0, "unit": "1"}}
     written = result(rows=rows, summary=summary, **asked)
-    archive.write(tmp_path / "result.json", written)
-    assert archive.read(tmp_path)["rows"][1] == {**rows[1], "curve": [[0.1, 0.2], [0.3, None]], "ok": True}
+    result_files.write_result(tmp_path / "result.json", written)
+    assert result_files.read_result(tmp_path)["rows"][1] == {**rows[1], "curve": [[0.1, 0.2], [0.3, None]], "ok": True}
 
 
 def test_the_key_is_of_settings_code_and_data(tmp_path):
@@ -199,7 +199,7 @@ def test_the_key_is_of_settings_code_and_data(tmp_path):
     (code / "sub" / "b.py").write_text("y = 1\n")
     config = {"seed": 0, "device": "cpu", "data": {"root": "/data/a", "gap": 2}, "resume": False, "limit": math.inf}
     config |= {"method": {"_target_": "dhtorch.a.function"}}
-    key = lambda c=config, d="digest": archive.result_key(c, d, code_dir=code)  # noqa: E731
+    key = lambda c=config, d="digest": result_files.compute_result_key(c, d, code_dir=code)  # noqa: E731
     first = key()
     assert first == key({**config, "device": "cuda", "resume": True, "data": {"gap": 2, "root": "/data/b"}})
     assert first == key({**config, "output": "elsewhere", "workers": 4, "traceback": True, "figures": False})
@@ -218,13 +218,13 @@ def test_the_key_is_of_settings_code_and_data(tmp_path):
     (code / "sub" / "table.json").write_text("{}")
     others.add(key())
     assert first not in others and len(others) == 6, "a table that scores are read from decides a result as code does"
-    archive.validate({**result(), "key": archive.result_key(config, "")})
+    result_files.validate_result({**result(), "key": result_files.compute_result_key(config, "")})
 
 
 def test_the_digest_reads_names_sizes_and_both_ends(tmp_path):
-    head, tail = b"h" * archive.EDGE_BYTES, b"t" * archive.EDGE_BYTES
+    head, tail = b"h" * result_files._DIGEST_EDGE_BYTES, b"t" * result_files._DIGEST_EDGE_BYTES
     one = tmp_path / "one"
-    digest = lambda data, name="a/depth.bin": (one.write_bytes(data), archive.data_digest({name: one}))[1]  # noqa: E731
+    digest = lambda data, name="a/depth.bin": (one.write_bytes(data), result_files.compute_data_digest({name: one}))[1]  # noqa: E731
     first = digest(head + b"middle" + tail)
     assert first == digest(head + b"MIDDLE" + tail), "only the two ends are read"
     assert first not in {
@@ -235,8 +235,10 @@ def test_the_digest_reads_names_sizes_and_both_ends(tmp_path):
     }
     elsewhere = tmp_path / "two"
     elsewhere.write_bytes(b"short")
-    assert digest(b"short") == archive.data_digest({"a/depth.bin": elsewhere})
-    assert archive.data_digest({"a": one, "b": elsewhere}) == archive.data_digest({"b": elsewhere, "a": one})
+    assert digest(b"short") == result_files.compute_data_digest({"a/depth.bin": elsewhere})
+    assert result_files.compute_data_digest({"a": one, "b": elsewhere}) == result_files.compute_data_digest(
+        {"b": elsewhere, "a": one}
+    )
 
 
 def test_settings_lose_what_belongs_to_one_machine(tmp_path, monkeypatch):
@@ -249,7 +251,7 @@ def test_settings_lose_what_belongs_to_one_machine(tmp_path, monkeypatch):
         "name": "a/b",
         "hydra": {"job": 1},
     }
-    short = archive.portable(config)
+    short = result_files.make_portable(config)
     assert short == {
         "data": {"root": "sets/holo"},
         "more": [{"root": "tum"}, {"root": "sets/kitchen"}],
@@ -257,18 +259,18 @@ def test_settings_lose_what_belongs_to_one_machine(tmp_path, monkeypatch):
         "name": "a/b",
     }
     monkeypatch.delenv("DHTORCH_DATA")
-    assert archive.portable(config)["data"]["root"] == "holo"
+    assert result_files.make_portable(config)["data"]["root"] == "holo"
 
 
 def test_meta_says_when_and_with_what():
-    meta = archive.meta(device="cpu", dtype=torch.float64, threads=2, seed=7)
+    meta = result_files.collect_run_metadata(device="cpu", dtype=torch.float64, threads=2, seed=7)
     assert meta["dtype"] == "float64" and meta["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
     assert meta["utc"].endswith("+00:00") and (meta["git"] is None or isinstance(meta["git"], str))
 
 
 def test_what_json_cannot_hold_is_refused():
     with pytest.raises(TypeError, match="found a object"):
-        storage.strict({"x": object()})
+        storage.to_strict_json({"x": object()})
 
 
 # ---------------------------------------------------------------------------------------------------- each field
@@ -329,7 +331,7 @@ def test_what_json_cannot_hold_is_refused():
 def test_every_field_is_of_its_kind(place, value, expected):
     bad = changed(result(), place, value)
     with pytest.raises(ValueError, match=r"^file" + "".join(rf"\.{p}" for p in place)) as error:
-        archive.validate(bad, "file")
+        result_files.validate_result(bad, "file")
     assert str(error.value).endswith(f", expected {expected}") and ": found " in str(error.value)
 
 
@@ -346,11 +348,11 @@ def changed(value, place, new):
 
 
 def test_whole_numbers_are_numbers_and_rows_may_hold_more():
-    archive.validate(changed(result(), ("summary", "coverage", "value"), 1))
-    archive.validate(changed(result(), ("summary", "coverage", "low"), -2.5))
-    archive.validate(changed(result(), ("rows", 0, "note"), "more"))
-    archive.validate(changed(result(), ("meta", "git"), "v1"))
-    archive.validate(changed(result(), ("rows",), []))
+    result_files.validate_result(changed(result(), ("summary", "coverage", "value"), 1))
+    result_files.validate_result(changed(result(), ("summary", "coverage", "low"), -2.5))
+    result_files.validate_result(changed(result(), ("rows", 0, "note"), "more"))
+    result_files.validate_result(changed(result(), ("meta", "git"), "v1"))
+    result_files.validate_result(changed(result(), ("rows",), []))
 
 
 @pytest.mark.parametrize("part", ["top", "meta", "data", "summary", "rows"])
@@ -373,10 +375,10 @@ def test_every_field_must_be_there_and_no_other(part):
         del inner[name]
         where = ".".join(map(str, ("result", *place, name)))
         with pytest.raises(ValueError, match=f"^{where}: found nothing, expected "):
-            archive.validate(bad)
+            result_files.validate_result(bad)
     if part != "rows":
         with pytest.raises(ValueError, match=r"zz: found an unknown field, expected " + ", ".join(fields)):
-            archive.validate(changed(result(), (*place, "zz"), 1))
+            result_files.validate_result(changed(result(), (*place, "zz"), 1))
 
 
 @pytest.mark.parametrize("experiment", ["pair", "integrate", "motion"])
@@ -412,7 +414,7 @@ def test_strict_makes_of_everything_what_json_holds():
         "as": [True, 0, "x", None, -2.5],
         "deep": {"a": {"b": ((math.nan,),)}},
     }
-    assert storage.strict(given) == {
+    assert storage.to_strict_json(given) == {
         "1": [0.5, [0, 1, 2], [[1.0, None]]],
         "sets": [[1, 2, 3], ["a", "b"]],
         "path": "/a/b",
@@ -420,9 +422,9 @@ def test_strict_makes_of_everything_what_json_holds():
         "as": [True, 0, "x", None, -2.5],
         "deep": {"a": {"b": [[None]]}},
     }
-    assert storage.strict(True) is True and type(storage.strict(np.int64(3))) is int
+    assert storage.to_strict_json(True) is True and type(storage.to_strict_json(np.int64(3))) is int
     with pytest.raises(TypeError, match="result: found a complex, expected something that JSON can hold"):
-        storage.strict([1j])
+        storage.to_strict_json([1j])
 
 
 # ---------------------------------------------------------------------------------------------------- files
@@ -431,12 +433,14 @@ def test_strict_makes_of_everything_what_json_holds():
 def test_every_row_and_every_entry_is_a_line_of_its_own(tmp_path):
     summary = {name: {"value": 1.0, "low": None, "high": None, "n": 1, "unit": "°"} for name in "ab"}
     rows = [{"scene": "é", "pair": None, "method": "m"}] * 3
-    text = archive.write(tmp_path / "r.json", result(summary=summary, rows=rows)).read_text(encoding="utf-8")
+    text = result_files.write_result(tmp_path / "r.json", result(summary=summary, rows=rows)).read_text(
+        encoding="utf-8"
+    )
     lines = text.split("\n")
     assert text.endswith("\n}\n") and sum(line.startswith('  {"scene": "é"') for line in lines) == 3
     assert sum(line.startswith(('  "a": {', '  "b": {')) and "°" in line for line in lines) == 2
     assert sum(line.startswith(' "config": {"method": ') for line in lines) == 1
-    empty = archive.write(tmp_path / "e.json", result(summary={}, rows=[], config={})).read_text()
+    empty = result_files.write_result(tmp_path / "e.json", result(summary={}, rows=[], config={})).read_text()
     assert ' "rows": []' in empty and ' "summary": {}' in empty and json.loads(empty)["rows"] == []
 
 
@@ -496,25 +500,29 @@ def test_a_system_that_cannot_sync_a_folder_is_no_error(tmp_path, monkeypatch):
 
 
 def test_constants_that_json_does_not_know_are_refused(tmp_path):
-    path = archive.write(tmp_path / "result.json", result())
+    path = result_files.write_result(tmp_path / "result.json", result())
     good = path.read_text()
     for word in ("NaN", "Infinity", "-Infinity"):
         path.write_text(good.replace('"value": 0.5', f'"value": {word}'))
         with pytest.raises(
             ValueError, match=rf"result.json: found no strict JSON \(the constant {word}\), expected a re"
         ):
-            archive.read(path)
-        assert not archive.finished(tmp_path, KEY)
+            result_files.read_result(path)
+        assert not result_files.is_finished(tmp_path, KEY)
     path.write_text(good)
-    assert archive.finished(tmp_path, KEY) and archive.finished(str(path), KEY) and not archive.finished(path, KEY[:-1])
+    assert (
+        result_files.is_finished(tmp_path, KEY)
+        and result_files.is_finished(str(path), KEY)
+        and not result_files.is_finished(path, KEY[:-1])
+    )
 
 
 def test_a_key_that_stands_twice_is_refused(tmp_path):
-    path = archive.write(tmp_path / "result.json", result())
+    path = result_files.write_result(tmp_path / "result.json", result())
     path.write_text(path.read_text().replace('"n": 1,', '"n": 1, "n": 2,'))
     with pytest.raises(ValueError, match=r"result.json: found no strict JSON \(the key 'n' twice\), expected a result"):
-        archive.read(path)
-    assert storage.loads('{"a": {"b": 1}, "b": [{"b": 2}]}') == {"a": {"b": 1}, "b": [{"b": 2}]}
+        result_files.read_result(path)
+    assert storage.parse_strict_json('{"a": {"b": 1}, "b": [{"b": 2}]}') == {"a": {"b": 1}, "b": [{"b": 2}]}
 
 
 def test_what_is_not_finite_is_not_written(tmp_path):
@@ -523,9 +531,9 @@ def test_what_is_not_finite_is_not_written(tmp_path):
             storage.write_json(tmp_path / "a.json", [value])
     assert not list(tmp_path.iterdir())
     path = storage.write_json(tmp_path / "a.json", {"é": [1, None]})
-    assert path.read_bytes() == '{\n "é": [\n  1,\n  null\n ]\n}\n'.encode() and storage.loads(path.read_text()) == {
-        "é": [1, None]
-    }
+    assert path.read_bytes() == '{\n "é": [\n  1,\n  null\n ]\n}\n'.encode() and storage.parse_strict_json(
+        path.read_text()
+    ) == {"é": [1, None]}
 
 
 # ---------------------------------------------------------------------------------------------------- keys
@@ -533,7 +541,7 @@ def test_what_is_not_finite_is_not_written(tmp_path):
 
 def test_each_option_counts_but_those_of_place_and_pace(tmp_path):
     (tmp_path / "a.py").write_text("")
-    key = lambda config, digest="d": archive.result_key(config, digest, code_dir=tmp_path)  # noqa: E731
+    key = lambda config, digest="d": result_files.compute_result_key(config, digest, code_dir=tmp_path)  # noqa: E731
     base = {"a": 1, "deep": {"b": [1, {"c": 2}]}}
     first = key(base)
     assert first == key({"deep": {"b": (1, {"c": 2})}, "a": 1}), "neither order nor the kind of a list"
@@ -562,7 +570,9 @@ def test_code_counts_by_name_and_content(tmp_path):
             path = folder / name.replace("__init__", "@").replace("__", "/").replace("_", ".").replace("@", "__init__")
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text)
-        return archive.result_key({}, "d", roots=["dhtorch.a", "dhtorch.sub.b", "dhtorch.c"], code_dir=folder)
+        return result_files.compute_result_key(
+            {}, "d", roots=["dhtorch.a", "dhtorch.sub.b", "dhtorch.c"], code_dir=folder
+        )
 
     first = key(a_py="1", sub__b_py="2", sub__m_json="3")
     assert first == key(sub__b_py="2", sub__m_json="3", a_py="1"), "the folder's own place does not count"
@@ -588,9 +598,9 @@ def test_the_digest_tells_what_is_joined_from_what_is_apart(tmp_path):
     def digest(**texts):
         for name, text in texts.items():
             (tmp_path / name).write_bytes(text)
-        return archive.data_digest({name: tmp_path / name for name in texts})
+        return result_files.compute_data_digest({name: tmp_path / name for name in texts})
 
-    edge = archive.EDGE_BYTES
+    edge = result_files._DIGEST_EDGE_BYTES
     assert edge == 64 * 1024
     whole = {digest(a=b"one", b=b"two"), digest(a=b"two", b=b"one"), digest(a=b"one"), digest(b=b"one"), digest()}
     whole |= {digest(a=b"on", b=b"etwo"), digest(a=b""), digest(a=b"\0" * (edge + 1)), digest(a=b"\0" * edge)}
@@ -610,14 +620,14 @@ def test_files_are_named_by_their_place_below_a_root(tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(name)
     one, two, file = tmp_path / "one" / "set", tmp_path / "two" / "set", tmp_path / "three.npz"
-    found = archive.files_below([one, None, two, one, file])
+    found = result_files.list_files_below([one, None, two, one, file])
     assert found == {
         "0/a.bin": one / "a.bin",
         "0/sub/b.bin": one / "sub" / "b.bin",
         "1/a.bin": two / "a.bin",
         "2/three.npz": file,
     }
-    assert archive.files_below([]) == archive.files_below([None]) == {}
+    assert result_files.list_files_below([]) == result_files.list_files_below([None]) == {}
 
 
 def test_files_that_settings_name_are_found_at_every_depth(tmp_path, monkeypatch):
@@ -632,7 +642,7 @@ def test_files_that_settings_name_are_found_at_every_depth(tmp_path, monkeypatch
         "gone": "/nowhere/net.pt",
         "folder": str(tmp_path / "sub"),
     }
-    assert archive.files_named(settings) == {
+    assert result_files.list_files_named(settings) == {
         "settings/.method.weights": tmp_path / "net.pt",
         "settings/.method.seats.0.a": Path("sub/list.txt"),
         "settings/.method.seats.1": tmp_path / "net.pt",
@@ -649,10 +659,10 @@ def test_places_are_relative_to_the_collection_or_a_last_word(tmp_path, monkeypa
         (tmp_path / "x.pt", "x.pt"),
         (base / "a" / ".." / "d", "d"),
     ):
-        assert archive.portable({"w": str(given)}, base) == {"w": short}, given
-        assert archive.portable({"deep": [{"w": given}]}, str(base)) == {"deep": [{"w": short}]}
+        assert result_files.make_portable({"w": str(given)}, base) == {"w": short}, given
+        assert result_files.make_portable({"deep": [{"w": given}]}, str(base)) == {"deep": [{"w": short}]}
     plain = {"root": "", "w": "a/b", "n": 3, 4: None, "seats": ("x", 1.5), "place": "~"}
-    assert archive.portable(plain, base) == {
+    assert result_files.make_portable(plain, base) == {
         "root": "",
         "w": "a/b",
         "n": 3,
@@ -666,16 +676,16 @@ def test_places_are_relative_to_the_collection_or_a_last_word(tmp_path, monkeypa
         "output": 2,
         "a": {"output": 3, "hydra": 4, "root": ["r/one", "r/two"]},
     }
-    assert archive.portable(nested) == {"root": "set", "a": {"root": ["one", "two"]}}
+    assert result_files.make_portable(nested) == {"root": "set", "a": {"root": ["one", "two"]}}
     monkeypatch.setenv("DHTORCH_DATA", str(base))
-    assert archive.portable({"w": str(base / "a" / "b")}) == {"w": "a/b"}
-    assert archive.portable({"w": str(base / "a" / "b")}, tmp_path) == {"w": "sets/a/b"}, (
+    assert result_files.make_portable({"w": str(base / "a" / "b")}) == {"w": "a/b"}
+    assert result_files.make_portable({"w": str(base / "a" / "b")}, tmp_path) == {"w": "sets/a/b"}, (
         "a base that is given goes first"
     )
 
 
 def test_meta_holds_what_it_was_given_and_what_is_installed(tmp_path, monkeypatch):
-    meta = archive.meta(device="cuda:1", dtype="float16", threads=3, seed=11)
+    meta = result_files.collect_run_metadata(device="cuda:1", dtype="float16", threads=3, seed=11)
     assert (meta["device"], meta["dtype"], meta["threads"], meta["seed"]) == ("cuda:1", "float16", 3, 11)
     assert {"python", "dhtorch", "torch", "kornia", "numpy", "opencv-python-headless", "hydra-core"} == set(
         meta["versions"]
@@ -686,10 +696,10 @@ def test_meta_holds_what_it_was_given_and_what_is_installed(tmp_path, monkeypatc
     assert abs((datetime.now(UTC) - when).total_seconds()) < 60 and when.microsecond == 0
 
     def absent(name):
-        raise archive.importlib.metadata.PackageNotFoundError(name)
+        raise result_files.importlib.metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(archive.importlib.metadata, "version", absent)
-    versions = archive.meta(device="cpu", dtype="x", threads=1, seed=0)["versions"]
+    monkeypatch.setattr(result_files.importlib.metadata, "version", absent)
+    versions = result_files.collect_run_metadata(device="cpu", dtype="x", threads=1, seed=0)["versions"]
     assert versions["torch"] is None and versions["python"]
 
 
@@ -698,8 +708,8 @@ def test_the_commit_is_that_of_the_code(tmp_path, monkeypatch):
     package = tmp_path / "package"
     package.mkdir()
     (package / "__init__.py").write_text("")
-    monkeypatch.setattr(archive, "__file__", str(package / "runtime/results.py"))
-    commit = lambda: archive.meta(device="cpu", dtype="x", threads=1, seed=0)["git"]  # noqa: E731
+    monkeypatch.setattr(result_files, "__file__", str(package / "runtime/results.py"))
+    commit = lambda: result_files.collect_run_metadata(device="cpu", dtype="x", threads=1, seed=0)["git"]  # noqa: E731
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     assert commit() is None
     git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]

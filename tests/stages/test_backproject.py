@@ -157,7 +157,7 @@ def test_every_sample_is_what_a_loop_says(options):
 @pytest.mark.parametrize(("interleaved", "pixels"), [(False, 1 << 17), (True, 1 << 17), (False, 700)])
 def test_all_pixels_at_once_are_told_bit_for_bit_what_a_few_are(interleaved, pixels, monkeypatch):
     """So many are read from windows of the whole picture and map, some rows after the other; a few from patches."""
-    monkeypatch.setattr("dhtorch.geometry.windows.BAND", pixels)
+    monkeypatch.setattr("dhtorch.geometry.windows.MAX_BAND_PIXELS", pixels)
     frame = frames(dtype=torch.float32)
     image = (255 * frame.image).round().to(torch.uint8)
     frame = frame.replace(image=image.to(memory_format=torch.channels_last) if interleaved else image)

@@ -5,12 +5,12 @@ import torch
 from test_inverse_variance import views_of
 
 from dhtorch.codes import Gate, Hole, PoseCode
-from dhtorch.geometry.free_space import within_reach
+from dhtorch.geometry.free_space import free_space_violations
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.presets import AUTO, MAP
 from dhtorch.pytree import collate, stack
 from dhtorch.records import Pose, PoseFit, Samples
-from dhtorch.stages.fuse import agree
+from dhtorch.stages.fuse import fuse_consistent
 from dhtorch.synthetic.stress import open_stress
 
 #: Samples on a grid of 40 × 30 pixels: 10 of a cell of the module's own grid lie side by side.
@@ -53,7 +53,7 @@ def share(samples, fit, depth, sigma=0.01):
 def reach(samples, fit, depth, sigma=0.01, asked=None):
     one = torch.ones_like(samples.depth)
     asked = (samples.hole == Hole.TRACKABLE_NO_LIDAR) if asked is None else asked
-    return within_reach(samples.uv, samples.depth, fit.inlier, asked, depth * one, sigma * one)
+    return free_space_violations(samples.uv, samples.depth, fit.inlier, asked, depth * one, sigma * one)
 
 
 def test_answers_where_the_sensor_would_have_seen_them_are_counted():
@@ -153,7 +153,9 @@ def test_more_views_contradicted_than_answering_silence_the_anchor():
         gate = views.gate.clone()
         gate[:n] = torch.where(gate[:n] == 0, code, gate[:n])
         nan = torch.where(gate == 0, views.depth, torch.nan)
-        return agree(views.replace(gate=gate, depth=nan, sigma=torch.where(gate == 0, views.sigma, torch.nan)))
+        return fuse_consistent(
+            views.replace(gate=gate, depth=nan, sigma=torch.where(gate == 0, views.sigma, torch.nan))
+        )
 
     assert len(views.gate) == 4
     assert against(1).keep.any() and against(2).keep.any()

@@ -7,15 +7,15 @@ import torch
 
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, Route, names
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import patches as lookup
-from dhtorch.geometry.patches import luma, nearest, patches
+from dhtorch.geometry import patches
+from dhtorch.geometry.patches import extract_patches, luma, sample_nearest
 from dhtorch.records import Camera, Frame
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
-from dhtorch.stages.sample import grid, spiral, vogel
+from dhtorch.stages.sample import regular_grid, spiral, vogel_spiral
 
 HW = (96, 128)
-SAMPLERS = [spiral, grid, vogel]
+SAMPLERS = [spiral, regular_grid, vogel_spiral]
 
 
 def rand(*shape, seed=0):
@@ -70,7 +70,7 @@ def test_spiral_arms_are_half_a_turn_apart_and_foveation_flattens():
 
 
 def test_vogel_and_grid_are_uniform():
-    for sampler in (grid, vogel):
+    for sampler in (regular_grid, vogel_spiral):
         uv = sampler((400, 400), 4000)
         cells = torch.histogramdd(uv, [4, 4], range=[0.0, 400.0, 0.0, 400.0]).hist
         assert cells.min() > 0.7 * 250 and cells.max() < 1.3 * 250
@@ -79,13 +79,13 @@ def test_vogel_and_grid_are_uniform():
 def test_patches_agree_with_slices_and_shift_inside():
     image = rand(2, 3, 20, 30)
     corner = torch.tensor([[[4, 5], [-3, 18], [29, 0]], [[0, 0], [25, 15], [7, 7]]])
-    out = patches(image, corner, 5)
+    out = extract_patches(image, corner, 5)
     assert torch.equal(out[0, 0], image[0, :, 5:10, 4:9])
     assert torch.equal(out[0, 1], image[0, :, 15:20, 0:5])
     assert torch.equal(out[1, 1], image[1, :, 15:20, 25:30])
-    assert torch.equal(out, patches(image.clone().requires_grad_(), corner, 5))
+    assert torch.equal(out, extract_patches(image.clone().requires_grad_(), corner, 5))
     with pytest.raises(ValueError, match="smaller than a patch"):
-        patches(image, corner, 21)
+        extract_patches(image, corner, 21)
 
 
 def test_luma_is_opencv_grey():
@@ -97,7 +97,9 @@ def test_luma_is_opencv_grey():
 
 def test_nearest_reads_the_nearest_pixel_and_knows_the_border():
     depth = torch.arange(12.0).view(1, 3, 4)
-    value, inside = nearest(depth, torch.tensor([[[0.4, 0.6], [3.4, 2.4], [3.6, 0.0], [-0.6, 0.0], [torch.nan, 0]]]))
+    value, inside = sample_nearest(
+        depth, torch.tensor([[[0.4, 0.6], [3.4, 2.4], [3.6, 0.0], [-0.6, 0.0], [torch.nan, 0]]])
+    )
     assert value[0, :2].tolist() == [4.0, 11.0] and inside.tolist() == [[True, True, False, False, False]]
 
 
@@ -186,16 +188,16 @@ def test_flags_confidence_and_limits():
 @pytest.mark.parametrize("colour", [1, 3])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
 def test_summaries_are_those_of_the_patches_for_planar_and_interleaved_pictures(monkeypatch, colour, dtype):
-    monkeypatch.setattr(lookup, "NUMBERS", 5 * 5 * colour * 64)  # several pieces
+    monkeypatch.setattr(patches, "MAX_CHUNK_NUMBERS", 5 * 5 * colour * 64)  # several pieces
     image = torch.randint(0, 255, (2, colour, *HW), generator=torch.Generator().manual_seed(0)).to(dtype)
     pixel = torch.randint(-9, 140, (2, 300, 2), dtype=torch.int32, generator=torch.Generator().manual_seed(1))
-    expected = patches(image, pixel - 2, 5).float()
+    expected = extract_patches(image, pixel - 2, 5).float()
     for picture in (image, image.contiguous(memory_format=torch.channels_last), image.repeat(1, 1, 1, 2)[..., : HW[1]]):
-        first, total = lookup.summarise(picture, pixel, 5, lambda p: (p[-1, 1, 0], p.float().sum((0, 1, 2))))
+        first, total = patches.reduce_patches(picture, pixel, 5, lambda p: (p[-1, 1, 0], p.float().sum((0, 1, 2))))
         assert torch.equal(first.float(), expected[:, :, -1, 1, 0])
         torch.testing.assert_close(total, expected.sum((2, 3, 4)))
     with pytest.raises(ValueError, match="smaller than a patch"):
-        lookup.summarise(image[..., :4], pixel, 5, lambda p: (p[0, 0, 0],))
+        patches.reduce_patches(image[..., :4], pixel, 5, lambda p: (p[0, 0, 0],))
 
 
 def test_grey_of_interleaved_bytes_is_exact_whoever_else_is_asked_for():

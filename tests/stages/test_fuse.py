@@ -9,11 +9,11 @@ from test_inverse_variance import still_views, views_of
 
 from dhtorch.codes import Gate
 from dhtorch.geometry import camera as cam
-from dhtorch.pipeline.view_selection import by_probes, shrunk, weighed
+from dhtorch.pipeline.view_selection import downscale_frame, rank_views, select_views_by_preview
 from dhtorch.pytree import collate, stack
 from dhtorch.records import Frame, Samples, Tracks
-from dhtorch.stages.fuse import agree
-from dhtorch.stages.score import rank_by_sigma
+from dhtorch.stages.fuse import fuse_consistent
+from dhtorch.stages.score import confidence_from_sigma
 from dhtorch.synthetic import open_room
 
 
@@ -44,7 +44,7 @@ def one_point(q, variance, weight_of, *, max_chi2, max_against):
 def test_views_are_joined_as_a_loop_over_points_joins_them(options):
     o = {"max_chi2": 9.0, "max_against": 0.25, "sure_rel": 0.05, "sure_rel_each": 0.08, "max_sigma_rel": 0.2} | options
     views = views_of(spread=3.0, N=60)
-    found = agree(views, **options)
+    found = fuse_consistent(views, **options)
     seen = set()
     for b, k in itertools.product(range(2), range(60)):
         said = [v for v in range(4) if views.gate[v, b, k] == 0]
@@ -93,7 +93,7 @@ def test_another_view_that_is_silent_costs_nothing():
     mute = views[:1].replace(gate=torch.full_like(views.gate[:1], int(Gate.NO_TRACK)))
     more = views.map(lambda x: torch.cat((x, x[:1])))
     more = more.replace(gate=torch.cat((views.gate, mute.gate)))
-    before, after = agree(views), agree(more)
+    before, after = fuse_consistent(views), fuse_consistent(more)
     spoken = (views.gate == 0).any(0)
     assert torch.equal(before.gate[spoken], after.gate[spoken])
     assert torch.equal(before.depth.nan_to_num(), after.depth.nan_to_num())
@@ -101,18 +101,18 @@ def test_another_view_that_is_silent_costs_nothing():
 
 
 def test_a_contradiction_silences_and_an_outvoted_view_does_not():
-    found = agree(still_views([4.0, 4.1, 4.05, 9.0], [0.1, 0.1, 0.1, 2.0]))
+    found = fuse_consistent(still_views([4.0, 4.1, 4.05, 9.0], [0.1, 0.1, 0.1, 2.0]))
     assert found.keep.all() and float(found.depth) == pytest.approx(4.05, abs=0.05) and int(found.n_views) == 4
-    assert int(agree(still_views([4.0, 6.0], [0.1, 0.1])).gate) == Gate.INCONSISTENT
-    assert int(agree(still_views([4.0, 4.1, 6.0], [0.1, 0.1, 0.1])).gate) == Gate.INCONSISTENT
+    assert int(fuse_consistent(still_views([4.0, 6.0], [0.1, 0.1])).gate) == Gate.INCONSISTENT
+    assert int(fuse_consistent(still_views([4.0, 4.1, 6.0], [0.1, 0.1, 0.1])).gate) == Gate.INCONSISTENT
 
 
 def test_one_view_alone_must_be_sure():
     for sigma, gate in ((0.19, Gate.ANSWER), (0.21, Gate.UNCERTAIN)):
-        assert int(agree(still_views([4.0, 1.0], [sigma, 1.0], gate=[0, 2])).gate) == gate
-    both = agree(still_views([4.0, 4.0], [0.5, 0.5]))
+        assert int(fuse_consistent(still_views([4.0, 1.0], [sigma, 1.0], gate=[0, 2])).gate) == gate
+    both = fuse_consistent(still_views([4.0, 4.0], [0.5, 0.5]))
     assert both.keep.all() and float(both.sigma) == pytest.approx(0.5), "what views share is not averaged out"
-    assert int(agree(still_views([4.0, 4.0], [0.9, 0.9])).gate) == Gate.UNCERTAIN
+    assert int(fuse_consistent(still_views([4.0, 4.0], [0.9, 0.9])).gate) == Gate.UNCERTAIN
 
 
 def test_where_most_views_stand_still_none_is_believed():
@@ -120,22 +120,22 @@ def test_where_most_views_stand_still_none_is_believed():
     for still, silenced in ((2, False), (3, True), (5, True)):
         gate = views.gate.clone()
         gate[:still, 1, 2] = Gate.NO_BASELINE
-        found = agree(views.replace(gate=gate), sure_rel=1.0)
+        found = fuse_consistent(views.replace(gate=gate), sure_rel=1.0)
         assert bool((found.gate[1] == Gate.NO_BASELINE).all()) == silenced and bool((found.gate[0] == 0).all())
-    assert bool((agree(views.replace(gate=gate), max_still=1.0, sure_rel=1.0).gate[0] == 0).all())
+    assert bool((fuse_consistent(views.replace(gate=gate), max_still=1.0, sure_rel=1.0).gate[0] == 0).all())
 
 
 def test_a_single_partner_is_its_own_answer_and_none_is_refused():
     views = views_of(V=1, N=9)
-    assert torch.equal(agree(views).depth.nan_to_num(), views.depth[0].nan_to_num())
+    assert torch.equal(fuse_consistent(views).depth.nan_to_num(), views.depth[0].nan_to_num())
     with pytest.raises(ValueError, match="at least one view"):
-        agree(views[:0])
+        fuse_consistent(views[:0])
 
 
 def test_order_of_views_and_of_points_changes_nothing_but_rounding():
     views = views_of(N=80, spread=2.0)
     turned, shuffled = torch.tensor([2, 0, 3, 1]), torch.randperm(80, generator=torch.Generator().manual_seed(0))
-    a, b, c = agree(views), agree(views[turned]), agree(views[:, :, shuffled])
+    a, b, c = fuse_consistent(views), fuse_consistent(views[turned]), fuse_consistent(views[:, :, shuffled])
     keep = a.keep & b.keep
     assert float((a.keep == b.keep).float().mean()) == 1
     torch.testing.assert_close(a.depth[keep], b.depth[keep], rtol=1e-12, atol=0)
@@ -144,11 +144,11 @@ def test_order_of_views_and_of_points_changes_nothing_but_rounding():
 
 def test_gradients_are_finite_and_right():
     views = views_of(N=6, spread=1.0)
-    keep = agree(views).keep
+    keep = fuse_consistent(views).keep
     assert int(keep.sum()) > 3
 
     def answer(depth, sigma):
-        found = agree(views.replace(depth=depth, sigma=sigma))
+        found = fuse_consistent(views.replace(depth=depth, sigma=sigma))
         return found.depth[keep], found.sigma[keep]
 
     depth, sigma = (x.nan_to_num(1.0).requires_grad_() for x in (views.depth, views.sigma))
@@ -157,18 +157,20 @@ def test_gradients_are_finite_and_right():
 
 def test_it_captures():
     views = views_of()
-    plain, compiled = agree(views), torch.compile(agree, backend="eager", fullgraph=True)(views)
+    plain, compiled = fuse_consistent(views), torch.compile(fuse_consistent, backend="eager", fullgraph=True)(views)
     assert torch.equal(plain.gate, compiled.gate)
     torch.testing.assert_close(plain.depth, compiled.depth, equal_nan=True)
 
 
 def test_an_answer_that_more_views_give_is_surer():
     views = still_views([4.0] * 4, [0.2] * 4)
-    some = [agree(views[:k] if k > 1 else still_views([4.0, 4.0], [0.2, 0.2], gate=[0, 2])) for k in (1, 2, 4)]
+    some = [
+        fuse_consistent(views[:k] if k > 1 else still_views([4.0, 4.0], [0.2, 0.2], gate=[0, 2])) for k in (1, 2, 4)
+    ]
     zero, uv = torch.zeros(1, 1), torch.zeros(1, 1, 2)
     samples = Samples(uv, zero, zero, torch.zeros(1, 1, 3), zero, zero.int(), zero, zero.int())
     tracks = Tracks(uv, uv, zero, zero, torch.zeros(1, 1, 2, 2), zero > 0)
-    scores = [float(rank_by_sigma(e, samples, tracks, None).score) for e in some]
+    scores = [float(confidence_from_sigma(e, samples, tracks, None).score) for e in some]
     assert scores == pytest.approx([0.1 / (0.1 + 0.05 / math.sqrt(n)) for n in (1, 2, 4)])
 
 
@@ -186,41 +188,45 @@ def test_small_pictures_choose_views_as_large_ones_do(room):
     frames = [room[k] for k in (0, 1, 2, 4, 6, 9)]
     anchor = frames[0]
     candidates = stack([*frames[1:], frames[0]])  # the anchor itself is among them and says nothing
-    chosen = by_probes(anchor, candidates, 2).index
+    chosen = select_views_by_preview(anchor, candidates, 2).index
     assert chosen.shape == (2, 1) and bool((chosen[:-1] < chosen[1:]).all())
     assert 5 not in chosen[:, 0].tolist()
-    again = by_probes(anchor, candidates, 2, long=120).index
+    again = select_views_by_preview(anchor, candidates, 2, long=120).index
     assert len(set(again[:, 0].tolist()) & set(chosen[:, 0].tolist())) >= 1
     with pytest.raises(ValueError, match="views is 9"):
-        by_probes(anchor, candidates, 9)
+        select_views_by_preview(anchor, candidates, 9)
 
 
 def test_each_anchor_of_a_batch_gets_its_own(room):
     anchors = [room[0], room[11]]
     others = [[room[k] for k in ks] for ks in ((1, 3, 6, 9), (10, 8, 5, 2))]
-    both = by_probes(collate(anchors), stack([collate(list(pair)) for pair in zip(*others, strict=True)]), 2).index
+    both = select_views_by_preview(
+        collate(anchors), stack([collate(list(pair)) for pair in zip(*others, strict=True)]), 2
+    ).index
     for b in range(2):
-        assert by_probes(anchors[b], stack(others[b]), 2).index[:, 0].tolist() == both[:, b].tolist()
+        assert select_views_by_preview(anchors[b], stack(others[b]), 2).index[:, 0].tolist() == both[:, b].tolist()
 
 
 def test_a_small_frame_sees_the_same_rays(room):
     frame: Frame = room[0]
-    little, k = shrunk(frame, 80)
+    little, k = downscale_frame(frame, 80)
     assert k == 4 and little.hw == (60, 80)
     uv = torch.tensor([[[10.0, 20.0], [63.0, 5.0]]])
     torch.testing.assert_close(cam.rays(little.camera, uv), cam.rays(frame.camera, uv * k + (k - 1) / 2))
-    assert shrunk(frame, 400)[1] == 1
+    assert downscale_frame(frame, 400)[1] == 1
     frame = frame.replace(depth_camera=None)
     own = cam.resize(frame.camera, frame.hw, (frame.depth.shape[-2], frame.depth.shape[-1]))
-    kept = shrunk(frame, 80)[0].depth_camera
+    kept = downscale_frame(frame, 80)[0].depth_camera
     assert torch.equal(kept.f, own.f) and torch.equal(kept.c, own.c), "the map is as large as it was"
     turned = own.replace(c=own.c + 3)
-    assert shrunk(frame.replace(depth_camera=turned), 80)[0].depth_camera is turned
+    assert downscale_frame(frame.replace(depth_camera=turned), 80)[0].depth_camera is turned
 
 
 def test_a_small_picture_is_no_reason_to_be_less_sure(room):
     frames = [room[k] for k in (0, 2, 4, 6)]
-    large, little = (by_probes(frames[0], stack(frames[1:]), 3, long=n, good_sigma_rel=1e-4) for n in (400, 160))
+    large, little = (
+        select_views_by_preview(frames[0], stack(frames[1:]), 3, long=n, good_sigma_rel=1e-4) for n in (400, 160)
+    )
     ratio = little.worth / large.worth
     assert bool((ratio > 1 / 3).all() and (ratio < 3).all()), ratio
 
@@ -228,4 +234,4 @@ def test_a_small_picture_is_no_reason_to_be_less_sure(room):
 def test_key_views_takes_what_adds_most():
     views = views_of(V=3, B=1, N=4, silent=0.0)
     sigma = views.depth * torch.tensor([0.5, 0.01, 0.02]).double()[:, None, None]
-    assert weighed(views.replace(sigma=sigma), 1).index.tolist() == [[1]]
+    assert rank_views(views.replace(sigma=sigma), 1).index.tolist() == [[1]]

@@ -7,7 +7,7 @@ import torch
 
 from dhtorch.codes import Flag, Hole, Route, first_reason
 from dhtorch.records import Camera, Frame, Samples
-from dhtorch.stages.holes import classify, min_eigenvalue, route
+from dhtorch.stages.holes import classify, min_eigenvalue, suggest_route
 
 HW = (24, 32)
 GREY = np.array([0.299, 0.587, 0.114])
@@ -132,8 +132,8 @@ def test_what_to_try_for_each_hole():
         Hole.AT_BORDER: Route.TURN_HEAD,
     }
     hole = torch.tensor([[*table], [*reversed(table)]], dtype=torch.int32)
-    assert route(hole).tolist() == [[*table.values()], [*reversed(table.values())]]
-    assert route(hole).dtype == torch.int32
+    assert suggest_route(hole).tolist() == [[*table.values()], [*reversed(table.values())]]
+    assert suggest_route(hole).dtype == torch.int32
 
 
 def test_the_first_reason_that_holds_is_the_code():

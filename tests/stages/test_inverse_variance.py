@@ -10,11 +10,11 @@ import torch
 
 from dhtorch import PAPER
 from dhtorch.codes import Gate
-from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import se3
 from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.pipeline.pair import uniform_draws
-from dhtorch.pipeline.view_selection import weighed
+from dhtorch.pipeline.view_selection import rank_views
 from dhtorch.pytree import collate, stack
 from dhtorch.records import Camera, Estimate, Frame, Samples, TrackHint, Tracks
 from dhtorch.stages.fuse import inverse_variance
@@ -238,17 +238,17 @@ def test_key_views_are_added_one_by_one_each_the_one_that_adds_most(good):
     views = views.replace(gate=lone, depth=views.depth.nan_to_num(4.0), sigma=views.sigma.nan_to_num(0.3))
     for count in range(1, 7):
         expected = plain_key_views(views, count, good)
-        assert weighed(views, count, good_sigma_rel=good).index.T.tolist() == expected
+        assert rank_views(views, count, good_sigma_rel=good).index.T.tolist() == expected
         if good == 0.1:
-            assert weighed(views, count).index.T.tolist() == expected
+            assert rank_views(views, count).index.T.tolist() == expected
     for bad in (0, 7):
         with pytest.raises(ValueError, match="expected 1 to 6"):
-            weighed(views, bad)
+            rank_views(views, bad)
 
 
 def test_what_a_view_adds_stands_beside_it():
     views = views_of(V=4, B=3, N=6, silent=0.0, seed=1)
-    choice = weighed(views, 3)
+    choice = rank_views(views, 3)
     worth = (0.1 * views.depth / views.sigma).square()
     for b in range(3):
         known, left, added = torch.zeros(6).double(), list(range(4)), {}
@@ -265,9 +265,9 @@ def test_answers_without_a_sigma_add_nothing():
     views = views_of(V=3, B=1, N=4, silent=0.0)
     sigma = views.sigma.clone()
     sigma[2], sigma[1, 0, :2], sigma[1, 0, 2:] = torch.nan, 0.0, torch.inf
-    assert weighed(views.replace(sigma=sigma), 1).index.tolist() == [[0]]
+    assert rank_views(views.replace(sigma=sigma), 1).index.tolist() == [[0]]
     mute = views.replace(gate=torch.full_like(views.gate, Gate.NO_TRACK))
-    assert weighed(mute, 2).index.T.tolist() == [[1, 2]], "the wider of equals"
+    assert rank_views(mute, 2).index.T.tolist() == [[1, 2]], "the wider of equals"
 
 
 # ---------------------------------------------------------------------------------------------------- the window
@@ -286,7 +286,7 @@ class Seats:
         self.n, self.calls, self.asked = n, [], {"track": [], "pose": [], "triangulate": []}
         self.uv = 10 + rand(2, n, 2, seed=30, high=40).float()
         self.answers = views_of(V=V, N=n, silent=0.2, spread=0.2).to(torch.float32)
-        self.fits = [given_pose(se3.exp(rand(2, 6, seed=50 + k).float()), n) for k in range(V)]
+        self.fits = [known_pose_fit(se3.exp(rand(2, 6, seed=50 + k).float()), n) for k in range(V)]
 
     def number(self, image):
         return next(k for k in range(len(self.others.image)) if torch.equal(self.others.image[k], image))
@@ -426,7 +426,7 @@ def test_of_more_views_the_key_views_are_asked_again_with_their_own_poses():
     n = 512
     seats = Seats(V=5, n=n)
     fits = stack(seats.fits)
-    known = weighed(seats.answers[:, :, ::2], 2).index
+    known = rank_views(seats.answers[:, :, ::2], 2).index
     assert not torch.equal(known[:, 0], known[:, 1]), "the two anchors choose otherwise"
     options = seats.seats() | {"track": lambda image_0, image_1, uv, hint: seats.tracks(0, uv)}
     asked = []

@@ -12,8 +12,7 @@ from torch.utils._pytree import tree_leaves
 
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import covariance, se3
-from dhtorch.geometry import map_estimate as most_probable
+from dhtorch.geometry import covariance, map_estimate, se3
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 from dhtorch.stages.pose import map_pose, pnp_ransac
 from dhtorch.stages.triangulate import two_view
@@ -125,7 +124,7 @@ def newton_step(args, fit, o, isotropic):
     """Of one pair: how far the written-out problem (``support/dense_reprojection.py``) would still go from the answer, in its deviations."""
     problem = dense.problem_of(args, isotropic)
     at = dense.unknowns(fit.T_1_from_0.R, fit.T_1_from_0.t, fit.shutter.turn)
-    tracks = dense.tracks(problem, at, most_probable.noise_scale(problem, at))
+    tracks = dense.tracks(problem, at, map_estimate.estimate_noise_variance(problem, at))
     weights = [dense.weight(x.square, o.kernel, o.bend)[1] * (x.near + o.far_weight * x.far) for x in tracks]
     H, g = dense.reduced(tracks, weights)
     known = np.diag([0.0] * 6 + [o.turn_sigma**-2 if fit.shutter.turn.abs().amax() > 1e-9 else 1e18] * 3)
@@ -148,7 +147,7 @@ def newton_step(args, fit, o, isotropic):
 def test_the_answer_is_the_optimum_of_the_problem_that_its_options_describe(isotropic, options):
     """And not the optimum of the default's, so every option reaches the problem."""
     args, *_ = pairs(1, 20, 40, depth=0.01 if "bend" in options else 0.03, turn=0.002, seed=2)
-    base = most_probable.FitOptions(max_rise=10.0, near_steps=8, steps=16, turn_sigma=0.0, translation_gain=-9.0)
+    base = map_estimate.FitOptions(max_rise=10.0, near_steps=8, steps=16, turn_sigma=0.0, translation_gain=-9.0)
     o = base._replace(**options)
     fit = map_pose(*args, isotropic=isotropic, **o._asdict())
     assert fit.code.tolist() == [PoseCode.OK] and (fit.shutter.turn.abs().amax() > 1e-5) == (o.turn_sigma > 0)
@@ -163,11 +162,11 @@ def test_the_near_cost_may_rise_by_the_share_that_is_allowed():
     args, *_ = pairs(1, 12, 60, noise=0.3, depth=0.003, baseline=0.3, seed=4)
     shift = torch.tensor([3.3, 2.1], dtype=D) * (torch.arange(72) >= 12)[:, None]
     args = put(args, uv_1=args[1].uv_1 + shift)
-    o = most_probable.FitOptions(far_weight=0.5, turn_sigma=0.0, translation_gain=-9.0, near_steps=12, steps=12)
+    o = map_estimate.FitOptions(far_weight=0.5, turn_sigma=0.0, translation_gain=-9.0, near_steps=12, steps=12)
     ask = lambda rise: map_pose(*args, **o._replace(max_rise=rise)._asdict())  # noqa: E731
     problem, start = dense.problem_of(args, 0.1), pnp_ransac(*args).T_1_from_0
-    places = [most_probable.most_probable(problem, start, o._replace(max_rise=x)).at for x in (-9.0, 1e9)]
-    noise = most_probable.noise_scale(problem, places[1])
+    places = [map_estimate.estimate_map_pose(problem, start, o._replace(max_rise=x)).at for x in (-9.0, 1e9)]
+    noise = map_estimate.estimate_noise_variance(problem, places[1])
     before, after = (
         dense.cost([x for x in dense.tracks(problem, at, noise) if x.near], 0.0, o.kernel, o.bend) for at in places
     )
@@ -219,13 +218,13 @@ def test_what_is_said_about_a_pose_follows_from_its_tracks():
             np.testing.assert_allclose(float(fit.rms_px[b]), np.sqrt((error[error < limit] ** 2).mean()), rtol=1e-6)
             t, cov = fit.T_1_from_0.t[b].numpy(), fit.cov[b, 3:, 3:].numpy()
             np.testing.assert_allclose(float(fit.t_snr[b]), np.sqrt(t @ np.linalg.inv(cov) @ t), rtol=1e-7)
-            noise = most_probable.noise_scale(problem, at)[b]
+            noise = map_estimate.estimate_noise_variance(problem, at)[b]
             np.testing.assert_allclose(float(fit.sigma_px[b]) ** 2, float(noise[30]), rtol=0.2)
         assert torch.equal(fit.cov, fit.shutter.cov[:, :6, :6])
     args = put(args, uv_1=tracks.uv_1, valid=tracks.valid & (torch.arange(64) < 24))
     alone = map_pose(*args, translation_gain=-9.0)  # without far tracks their noise is that of the near ones
     at = dense.unknowns(alone.T_1_from_0.R, alone.T_1_from_0.t, alone.shutter.turn)
-    noise = most_probable.noise_scale(dense.problem_of(args, 0.1), at)[:, 0]
+    noise = map_estimate.estimate_noise_variance(dense.problem_of(args, 0.1), at)[:, 0]
     assert alone.ok.all()
     torch.testing.assert_close(alone.sigma_px**2, noise, rtol=0.2, atol=0)
 
@@ -404,7 +403,7 @@ def test_gradients_stay_finite_whatever_the_input():
 
 
 def test_options_have_one_default():
-    options, conf = most_probable.FitOptions()._asdict(), Path(__file__).parents[2] / "conf" / "method"
+    options, conf = map_estimate.FitOptions()._asdict(), Path(__file__).parents[2] / "conf" / "method"
     written = yaml.safe_load((conf / "map.yaml").read_text())["pose"]
     defaults = {k: v for k, v in map_pose.__kwdefaults__.items() if k != "start"}
     assert defaults == options | {k: defaults[k] for k in ("isotropic", "threshold_px")}

@@ -8,7 +8,7 @@ import torch
 from dhtorch.codes import PoseCode
 from dhtorch.geometry import covariance, se3
 from dhtorch.records import Camera, Samples, Tracks
-from dhtorch.stages.pose import SEARCH_POINTS, pnp_ransac
+from dhtorch.stages.pose import MAX_SEARCH_POINTS, pnp_ransac
 
 
 def pairs(batch, n, *, noise=0.0, outliers=0.0, planar=False, seed=0, dtype=torch.float64):
@@ -273,9 +273,9 @@ def test_kernels_resist_small_mistakes(kernel):
 
 
 def test_many_points_are_thinned_for_the_search_only():
-    args, T = pairs(4, 4 * SEARCH_POINTS, noise=0.5, outliers=0.3, dtype=torch.float32)
+    args, T = pairs(4, 4 * MAX_SEARCH_POINTS, noise=0.5, outliers=0.3, dtype=torch.float32)
     fit = pnp_ransac(*args)
-    assert (fit.n_inlier > 2.7 * SEARCH_POINTS).all()
+    assert (fit.n_inlier > 2.7 * MAX_SEARCH_POINTS).all()
     rotation, translation = errors(fit, T)
     assert rotation.max() < 0.02 and translation.max() < 1e-3
 

@@ -7,17 +7,16 @@ import torch
 from support.sample_dicts import GAP, frames, room
 
 from dhtorch.codes import Gate, PoseCode
-from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import pose_conventions as conventions
 from dhtorch.geometry import se3
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.pytree import collate, stack
-from dhtorch.records import Camera, GivenPose, Pose, Samples, StartPose, Tracks
-from dhtorch.stages import pose_prior as given
+from dhtorch.records import Camera, InitialPose, Pose, PosePrior, Samples, Tracks
+from dhtorch.stages import pose_prior
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.transforms import ExtendDepth, ExtendedDataset, SampleError
-from dhtorch.transforms import poses as of_samples
+from dhtorch.transforms import ExtendDepth, ExtendedDataset, SampleError, poses
 
 N = 400
 SIGMA = (0.004, 0.008)
@@ -54,7 +53,7 @@ def off_by(T, sigma, seed=0):
 @pytest.mark.parametrize("method", ["paper", "map"])
 def test_a_right_pose_is_used_as_it_is(pairs, method):
     T = se3.relative(*pairs[3])
-    _, fit, error, _ = asked(pairs, given.between(*pairs[3], sigma=(1e-4, 1e-4)), method)
+    _, fit, error, _ = asked(pairs, pose_prior.relative_prior(*pairs[3], sigma=(1e-4, 1e-4)), method)
     assert fit.ok.all() and error.numel() > 150 and error.abs().median() < 0.03
     assert torch.equal(fit.T_1_from_0.R, T.R.float()) and torch.equal(fit.T_1_from_0.t, T.t.float())
     assert torch.equal(fit.cov, torch.diag(torch.tensor([1e-8] * 6)).expand(3, 6, 6))
@@ -66,28 +65,28 @@ def test_a_stated_covariance_makes_sigma_honest(pairs):
     shares, wide, narrow = [], [], []
     for seed in range(4):
         motion = off_by(T, SIGMA, seed)
-        estimate, fit, _, z = asked(pairs, given.stated(motion, sigma=SIGMA))
+        estimate, fit, _, z = asked(pairs, pose_prior.make_prior(motion, sigma=SIGMA))
         assert fit.ok.all()
         shares.append((z.abs() < 1).float().mean())
         wide.append(estimate.sigma[estimate.keep].median())
-        bold = asked(pairs, given.stated(motion, sigma=(1e-4, 1e-4)))
+        bold = asked(pairs, pose_prior.make_prior(motion, sigma=(1e-4, 1e-4)))
         narrow.append(bold[0].keep.any())
     share = torch.stack(shares).mean()
     assert 0.5 < share < 0.95, share
     assert not any(narrow), "a pose that is off by forty of its own standard deviations is refuted"
-    exact = asked(pairs, given.stated(T, sigma=(1e-4, 1e-4)))[0]
+    exact = asked(pairs, pose_prior.make_prior(T, sigma=(1e-4, 1e-4)))[0]
     assert torch.stack(wide).mean() > 1.5 * exact.sigma[exact.keep].median(), "what the pose does not know is in sigma"
 
 
 def test_a_covariance_that_is_not_stated_is_taken_from_the_near_returns(pairs):
     T = se3.relative(*pairs[3])
-    _, right, *_ = asked(pairs, given.stated(T))
-    _, off, _, z = asked(pairs, given.stated(off_by(T, (0.002, 0.004))))
+    _, right, *_ = asked(pairs, pose_prior.make_prior(T))
+    _, off, _, z = asked(pairs, pose_prior.make_prior(off_by(T, (0.002, 0.004))))
     assert right.ok.all() and off.ok.all()
     spread = lambda fit: fit.cov.diagonal(dim1=1, dim2=2).sum(-1)  # noqa: E731
     assert (spread(off) > 1.5 * spread(right)).all() and (z.abs() < 2).float().mean() > 0.6
     dark = pairs[0].replace(depth=torch.zeros_like(pairs[0].depth))
-    _, fit, *_ = asked((dark, *pairs[1:]), given.stated(T, sigma=(0.0, 0.0)))
+    _, fit, *_ = asked((dark, *pairs[1:]), pose_prior.make_prior(T, sigma=(0.0, 0.0)))
     assert fit.ok.all() and (fit.cov == 0).all() and fit.t_snr.isinf().all(), "exact because it is said"
 
 
@@ -113,7 +112,9 @@ def test_a_pose_for_which_nobody_vouches_is_not_used(pairs, few_returns):
 
     def fit(count, motion, **options):
         trace = {}
-        few_returns(count)(pairs[0], pairs[1], fit=given.stated(motion, **options).to(torch.float32), trace=trace)
+        few_returns(count)(
+            pairs[0], pairs[1], fit=pose_prior.make_prior(motion, **options).to(torch.float32), trace=trace
+        )
         return trace["fit"]
 
     want = torch.tensor([0.01**2] * 3 + [0.02**2] * 3)
@@ -132,8 +133,8 @@ def test_a_pose_for_which_nobody_vouches_is_not_used(pairs, few_returns):
 
 
 WRONG = {
-    name: (lambda T, M=M: conventions.in_axes(T, tuple(zip(*M, strict=True))))
-    for name, M in conventions.AXES.items()
+    name: (lambda T, M=M: conventions.motion_from_axes(T, tuple(zip(*M, strict=True))))
+    for name, M in conventions.CAMERA_AXES.items()
     if name
 }
 WRONG["the inverse"] = se3.invert
@@ -146,7 +147,7 @@ WRONG["OpenGL axes (x right, y up, z backward), the inverse"] = lambda T: se3.in
 
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_pose_is_refuted_and_named(pairs, name):
-    estimate, fit, *_ = asked(pairs, given.stated(WRONG[name](se3.relative(*pairs[3]))), "paper")
+    estimate, fit, *_ = asked(pairs, pose_prior.make_prior(WRONG[name](se3.relative(*pairs[3]))), "paper")
     assert (fit.code == PoseCode.REFUTED).all() and not fit.ok.any() and fit.T_1_from_0.t.isnan().all()
     assert {conventions.CONVENTIONS[i] for i in fit.looks.tolist()} == {name}
     silent = set(estimate.gate.unique().tolist())
@@ -154,22 +155,22 @@ def test_a_wrong_pose_is_refuted_and_named(pairs, name):
 
 
 def test_poses_of_the_camera_read_as_poses_of_the_world_are_named(pairs):
-    _, fit, *_ = asked(pairs, given.between(*(se3.invert(T) for T in pairs[3])), "paper")
+    _, fit, *_ = asked(pairs, pose_prior.relative_prior(*(se3.invert(T) for T in pairs[3])), "paper")
     assert {conventions.CONVENTIONS[i] for i in fit.looks.tolist()} == {"the inverse"}
 
 
 def test_a_nonsense_pose_is_refuted_without_a_name(pairs):
     T = off_by(se3.relative(*pairs[3]), (0.5, 0.5))
-    _, fit, *_ = asked(pairs, given.stated(T), "paper")
+    _, fit, *_ = asked(pairs, pose_prior.make_prior(T), "paper")
     assert (fit.code == PoseCode.REFUTED).all() and (fit.looks == 0).all()
 
 
 def test_one_wrong_pose_of_a_batch_silences_its_pair_alone(pairs):
     T = se3.relative(*pairs[3])
     mixed = T.replace(t=torch.where(torch.tensor([[False], [True], [False]]), -T.t, T.t))
-    estimate, fit, *_ = asked(pairs, given.stated(mixed))
+    estimate, fit, *_ = asked(pairs, pose_prior.make_prior(mixed))
     assert fit.ok.tolist() == [True, False, True]
-    alone = asked(tuple(x[2:] if k < 3 else x for k, x in enumerate(pairs)), given.stated(mixed[2:]))[0]
+    alone = asked(tuple(x[2:] if k < 3 else x for k, x in enumerate(pairs)), pose_prior.make_prior(mixed[2:]))[0]
     assert torch.equal(alone.gate[0], estimate.gate[2])
     assert fit.inlier.any(1).tolist() == [True, False, True]
 
@@ -185,32 +186,34 @@ def test_a_pose_that_explains_a_third_of_the_returns_in_some_reading_has_no_name
     zero = torch.zeros(1, 60)
     samples = Samples(uv, depth[None], 0.001 * depth[None], xyz[None], zero + 1, zero.int(), zero + 1, zero.int())
     tracks = Tracks(uv, uv, zero, zero, torch.eye(2).expand(1, 60, 2, 2), zero == 0)
-    motion = given.stated(T.replace(t=-2 * T.t), sigma=(1e-3, 1e-3))
-    fit = given.hold(motion, samples, tracks, camera, camera, given_pose(T, 60))
+    motion = pose_prior.make_prior(T.replace(t=-2 * T.t), sigma=(1e-3, 1e-3))
+    fit = pose_prior.check_pose_prior(motion, samples, tracks, camera, camera, known_pose_fit(T, 60))
     assert fit.code.tolist() == [PoseCode.REFUTED] and fit.looks.tolist() == [0] and not fit.inlier.any()
-    motion = given.stated(T.replace(t=0.5 * T.t), sigma=(1e-3, 1e-3))
-    fit = given.hold(motion, samples, tracks, camera, camera, given_pose(T, 60))
+    motion = pose_prior.make_prior(T.replace(t=0.5 * T.t), sigma=(1e-3, 1e-3))
+    fit = pose_prior.check_pose_prior(motion, samples, tracks, camera, camera, known_pose_fit(T, 60))
     assert fit.code.tolist() == [PoseCode.REFUTED] and int(fit.n_inlier) == 21 and not fit.inlier.any()
-    motion = given.stated(T.replace(t=-T.t), sigma=(1e-3, 1e-3))
-    fit = given.hold(motion, samples, tracks, camera, camera, given_pose(T, 60))
+    motion = pose_prior.make_prior(T.replace(t=-T.t), sigma=(1e-3, 1e-3))
+    fit = pose_prior.check_pose_prior(motion, samples, tracks, camera, camera, known_pose_fit(T, 60))
     assert conventions.CONVENTIONS[int(fit.looks)] == "the inverse"
 
 
 def test_refining_starts_from_the_given_pose(pairs):
     T = se3.relative(*pairs[3])
     rough = off_by(T, (0.003, 0.006), seed=1)
-    _, fit, *_ = asked(pairs, given.stated(rough, refine=True))
-    assert isinstance(given.stated(rough, refine=True), StartPose) and fit.ok.all() and fit.shutter is not None
+    _, fit, *_ = asked(pairs, pose_prior.make_prior(rough, refine=True))
+    assert (
+        isinstance(pose_prior.make_prior(rough, refine=True), InitialPose) and fit.ok.all() and fit.shutter is not None
+    )
     distance = lambda A: (A.t.double() - T.t).norm(dim=-1)  # noqa: E731
     assert (distance(fit.T_1_from_0) < distance(rough)).all()
-    _, refuted, *_ = asked(pairs, given.stated(se3.invert(T), refine=True))
+    _, refuted, *_ = asked(pairs, pose_prior.make_prior(se3.invert(T), refine=True))
     assert (refuted.code == PoseCode.REFUTED).all() and (refuted.looks > 0).all()
 
 
 def test_where_a_search_ends_is_held_against_the_near_returns(pairs):
-    _, fit, *_ = asked(pairs, given.stated(se3.relative(*pairs[3]), refine=True))
+    _, fit, *_ = asked(pairs, pose_prior.make_prior(se3.relative(*pairs[3]), refine=True))
     codes = torch.tensor([PoseCode.REFUTED, PoseCode.OK, PoseCode.TOO_FEW])
-    left = given.without(fit, fit.replace(code=codes))
+    left = pose_prior.reject_poses(fit, fit.replace(code=codes))
     assert left.code.tolist() == codes.tolist() and left.ok.tolist() == [False, True, False]
     assert left.T_1_from_0.t.isnan().all(1).tolist() == [True, False, True] and not left.inlier[0].any()
     assert torch.equal(left.shutter.cov[1], fit.shutter.cov[1]) and left.shutter.turn[2].isnan().all()
@@ -219,22 +222,22 @@ def test_where_a_search_ends_is_held_against_the_near_returns(pairs):
 def test_a_pose_without_translation_or_unknown_is_not_used(pairs):
     T = se3.relative(*pairs[3])
     anchor, _, truth, worlds = pairs
-    estimate, fit, *_ = asked((anchor, anchor, truth, worlds), given.stated(se3.identity(3, T.t)))
+    estimate, fit, *_ = asked((anchor, anchor, truth, worlds), pose_prior.make_prior(se3.identity(3, T.t)))
     assert (fit.code == PoseCode.NO_BASELINE).all() and not estimate.keep.any()
-    estimate, fit, *_ = asked(pairs, given.stated(T.replace(t=T.t * torch.nan)))
+    estimate, fit, *_ = asked(pairs, pose_prior.make_prior(T.replace(t=T.t * torch.nan)))
     assert (fit.code == PoseCode.TOO_FEW).all() and not estimate.keep.any() and (estimate.gate == Gate.NO_POSE).any()
 
 
 def test_gradients_reach_the_given_pose(pairs):
     T = se3.relative(*pairs[3]).to(torch.float32)
     t = T.t.clone().requires_grad_()
-    estimate = METHODS["paper"](pairs[0], pairs[1], n=N, fit=GivenPose(T.replace(t=t)))
+    estimate = METHODS["paper"](pairs[0], pairs[1], n=N, fit=PosePrior(T.replace(t=t)))
     estimate.depth[estimate.keep].sum().backward()
     assert t.grad.isfinite().all() and (t.grad.norm(dim=-1) > 0).all()
 
 
 def test_frames_may_carry_the_pose(pairs):
-    method = METHODS["paper"].replace(n=N, given=lambda a, b: given.from_frames(a, b, sigma=SIGMA))
+    method = METHODS["paper"].replace(n=N, given=lambda a, b: pose_prior.priors_from_frames(a, b, sigma=SIGMA))
     placed = [f.replace(T_world_from_cam=T) for f, T in zip(pairs[:2], pairs[3], strict=True)]
     trace = {}
     method(*placed, trace=trace)
@@ -244,20 +247,20 @@ def test_frames_may_carry_the_pose(pairs):
     codes = [view["fit"].code.tolist() for view in trace["views"]]
     assert codes[0] == [PoseCode.OK] * 3 and PoseCode.OK not in codes[1]
     two = stack([placed[1], placed[1].replace(T_world_from_cam=pairs[3][0])])
-    motions = given.from_frames(placed[0], two).T_1_from_0
+    motions = pose_prior.priors_from_frames(placed[0], two).T_1_from_0
     assert motions.t.shape == (2, 3, 3) and not motions.t[1].any()
     torch.testing.assert_close(motions.t[0], se3.relative(*pairs[3]).t.float())
     with pytest.raises(ValueError, match="T_world_from_cam is absent"):
         method(placed[0], pairs[1].replace(T_world_from_cam=None))
     with pytest.raises(ValueError, match=r"given.sigma: found \(1,\)"):
-        given.from_frames(*placed, sigma=(1,))
+        pose_prior.priors_from_frames(*placed, sigma=(1,))
 
 
 def test_axes_are_turned_into_ours():
     """Forward, a turn to the left: along x and about z of a robot's camera, along z and against y of ours."""
     turn = se3.exp(torch.tensor([[0.0, 0.0, 0.3, 0.0, 0.0, 0.0]], dtype=torch.float64)).R
     T = Pose(turn, torch.tensor([[1.0, 0.2, 0.1]], dtype=torch.float64))
-    found = conventions.in_axes(T, conventions.AXES["robot axes (x forward, y left, z up)"])
+    found = conventions.motion_from_axes(T, conventions.CAMERA_AXES["robot axes (x forward, y left, z up)"])
     torch.testing.assert_close(found.t, torch.tensor([[-0.2, -0.1, 1.0]], dtype=torch.float64))
     torch.testing.assert_close(se3.log(found)[0, :3], torch.tensor([0.0, -0.3, 0.0], dtype=torch.float64))
 
@@ -360,11 +363,11 @@ def test_what_is_no_pose_is_refused(sample, change, said):
 
 
 def test_of_several_views_the_first_that_is_refuted_gives_the_name(pairs):
-    _, fit, *_ = asked(pairs, given.stated(se3.relative(*pairs[3])))
+    _, fit, *_ = asked(pairs, pose_prior.make_prior(se3.relative(*pairs[3])))
     wrong = fit.replace(code=torch.full_like(fit.code, PoseCode.REFUTED))
     both = [wrong.replace(looks=torch.tensor(looks)) for looks in ([0, 3, 5], [4, 6, 7])]
     with pytest.warns(UserWarning, match="camera: the near returns contradict the pose; looks like"):
-        found = of_samples.keys([fit, *both], torch.tensor([True, True, False]), "camera")
+        found = poses.refuted_pose_keys([fit, *both], torch.tensor([True, True, False]), "camera")
     assert found["pose_looks"].tolist() == [4, 3, 0]
 
 
@@ -414,4 +417,7 @@ def test_maps_are_swept_under_the_given_pose(sample):
 
 def test_a_given_pose_is_a_record():
     T = se3.identity(2, torch.zeros(1))
-    assert isinstance(given.stated(T, refine=True)[0:1], StartPose) and given.stated(T).readings.t.shape[1] == 42
+    assert (
+        isinstance(pose_prior.make_prior(T, refine=True)[0:1], InitialPose)
+        and pose_prior.make_prior(T).readings.t.shape[1] == 42
+    )

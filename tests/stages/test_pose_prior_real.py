@@ -16,7 +16,7 @@ from dhtorch.geometry.pose_conventions import CONVENTIONS
 from dhtorch.pipeline.presets import MAP
 from dhtorch.pytree import collate
 from dhtorch.records import Frame, Pose
-from dhtorch.stages import pose_prior as given
+from dhtorch.stages import pose_prior
 
 ROOT = Path(os.environ.get("DHTORCH_DATA", "/nowhere"))
 GL = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
@@ -42,7 +42,7 @@ def world(frame: Frame) -> Tensor:
 
 def asked(anchor: Frame, others: Frame, poses: tuple[Tensor, Tensor], **options):
     """Estimate and fit under poses that a data set would state so."""
-    motion = given.between(*(Pose(M[:, :3, :3], M[:, :3, 3]) for M in poses), **options).to(torch.float32)
+    motion = pose_prior.relative_prior(*(Pose(M[:, :3, :3], M[:, :3, 3]) for M in poses), **options).to(torch.float32)
     trace: dict = {}
     return MAP.replace(n=1000)(anchor, others, fit=motion, trace=trace), trace["fit"]
 

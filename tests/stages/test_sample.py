@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch.stages.sample import grid, spiral, vogel
+from dhtorch.stages.sample import regular_grid, spiral, vogel_spiral
 
 
 def to_border(centre, angle, low, high):
@@ -81,7 +81,7 @@ def test_vogels_sunflower_is_its_formula(gaze, margin_px, n):
         angle = k * math.pi * (3 - math.sqrt(5))
         r = to_border(centre, angle, low, high) * math.sqrt((k + 0.5) / n)
         expected.append((centre[0] + r * math.cos(angle), centre[1] + r * math.sin(angle)))
-    found = vogel((60, 80), n, gaze=gaze, margin_px=margin_px, dtype=torch.float64)
+    found = vogel_spiral((60, 80), n, gaze=gaze, margin_px=margin_px, dtype=torch.float64)
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-9)
 
 
@@ -96,16 +96,16 @@ def test_a_grid_fills_rows_of_equal_height_evenly(hw, n, margin_px):
         for row, count in enumerate(number)
         for i in range(count)
     ]
-    found = grid(hw, n, margin_px=margin_px, dtype=torch.float64)
+    found = regular_grid(hw, n, margin_px=margin_px, dtype=torch.float64)
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
 
 
 def test_a_grid_of_a_long_image_is_one_row_and_that_of_a_tall_one_has_no_more_rows_than_points():
-    assert grid((4, 900), 3, margin_px=1).tolist() == [[150.5, 1.5], [449.5, 1.5], [748.5, 1.5]]
-    assert grid((900, 4), 3, margin_px=1).tolist() == [[1.5, 150.5], [1.5, 449.5], [1.5, 748.5]]
+    assert regular_grid((4, 900), 3, margin_px=1).tolist() == [[150.5, 1.5], [449.5, 1.5], [748.5, 1.5]]
+    assert regular_grid((900, 4), 3, margin_px=1).tolist() == [[1.5, 150.5], [1.5, 449.5], [1.5, 748.5]]
 
 
-@pytest.mark.parametrize("sampler", [spiral, grid, vogel])
+@pytest.mark.parametrize("sampler", [spiral, regular_grid, vogel_spiral])
 def test_the_margin_may_leave_one_pixel_and_no_less(sampler):
     assert sampler((5, 9), 4, margin_px=2)[:, 1].tolist() == [2.0] * 4
     assert sampler((5, 5), 3).tolist() == [[2.0, 2.0]] * 3, "two pixels by default"
@@ -119,7 +119,7 @@ def test_the_margin_may_leave_one_pixel_and_no_less(sampler):
     assert sampler((50, 90), 3, dtype=torch.float64).dtype == torch.float64
 
 
-@pytest.mark.parametrize("sampler", [spiral, vogel])
+@pytest.mark.parametrize("sampler", [spiral, vogel_spiral])
 def test_the_gaze_may_lie_on_the_margin_and_not_beyond(sampler):
     for gaze in ((2.0, 2.0), (87.0, 47.0)):
         uv = sampler((50, 90), 9, gaze=gaze)
@@ -129,10 +129,10 @@ def test_the_gaze_may_lie_on_the_margin_and_not_beyond(sampler):
             sampler((50, 90), 9, gaze=gaze)
 
 
-@pytest.mark.parametrize("sampler", [spiral, grid, vogel])
+@pytest.mark.parametrize("sampler", [spiral, regular_grid, vogel_spiral])
 def test_a_single_sample_is_one(sampler):
     (u, v), *others = sampler((50, 90), 1, dtype=torch.float64).tolist()
-    reach = 0.0 if sampler is grid else 0.5**0.5  # of the way to the border
+    reach = 0.0 if sampler is regular_grid else 0.5**0.5  # of the way to the border
     assert not others
     if sampler is spiral:
         np.testing.assert_allclose([[u, v]], plain_spiral((50, 90), 1))

@@ -11,13 +11,13 @@ from dhtorch.codes import Gate, PoseCode
 from dhtorch.pytree import collate
 from dhtorch.records import Estimate, Pose, PoseFit, Samples, Tracks
 from dhtorch.stages.score import (
-    EVIDENCE,
-    MOST,
+    MAX_LOG_FACTOR,
+    SCORE_FEATURES,
     LearnedScore,
-    evidence,
+    confidence,
+    confidence_from_error,
     expected_error_loss,
-    rank,
-    rank_by_error,
+    score_features,
 )
 
 B, N = 2, 12
@@ -89,7 +89,7 @@ def test_the_papers_score_rises_with_parallax_and_falls_with_the_residual(option
     estimate, *rest = answers()
     p, r = estimate.parallax_deg.numpy(), estimate.residual_px.numpy()
     half, scale = options.get("half_parallax_deg", 2.0), options.get("residual_scale_px", 3.0)
-    found = rank(estimate, *rest, **options)
+    found = confidence(estimate, *rest, **options)
     same(found.score, p / (p + half) * np.maximum(0, 1 - r / scale), estimate.keep.numpy())
     for name in ("uv", "depth", "sigma", "sigma_shared", "parallax_deg", "residual_px", "n_views", "gate"):
         assert torch.equal(getattr(found, name).nan_to_num(), getattr(estimate, name).nan_to_num()), name
@@ -99,7 +99,7 @@ def test_the_papers_score_is_zero_where_parallax_or_residual_is_no_number():
     estimate, *rest = answers()
     parallax, residual = estimate.parallax_deg.clone(), estimate.residual_px.clone()
     parallax[0, 0], residual[0, 1], parallax[0, 2] = torch.nan, torch.nan, torch.inf
-    found = rank(estimate.replace(parallax_deg=parallax, residual_px=residual), *rest).score
+    found = confidence(estimate.replace(parallax_deg=parallax, residual_px=residual), *rest).score
     assert found[0, :3].tolist() == [0, 0, 0] and (found[0, 3:-2] > 0).all() and found.isfinite().all()
 
 
@@ -133,9 +133,9 @@ def test_the_score_is_half_where_the_expected_error_is_the_half_error(options):
     expected = plain_error(estimate, tracks, **options)
     keep = estimate.keep.numpy()
     for half in (0.1, 0.03):
-        found = rank_by_error(estimate, samples, tracks, fit, half_error=half, **options)
+        found = confidence_from_error(estimate, samples, tracks, fit, half_error=half, **options)
         same(found.score, half / (half + expected), keep)
-    found = rank_by_error(estimate, samples, tracks, fit, **options)
+    found = confidence_from_error(estimate, samples, tracks, fit, **options)
     same(found.score, 0.1 / (0.1 + expected), keep)
     assert torch.equal(found.gate, estimate.gate)
 
@@ -143,15 +143,15 @@ def test_the_score_is_half_where_the_expected_error_is_the_half_error(options):
 def test_a_recalibration_changes_scores_of_answers_alone_and_comes_before_the_threshold():
     seat = answers()
     keep = seat[0].keep
-    plain = rank_by_error(*seat)
-    found = rank_by_error(*seat, recalibration=lambda s: 1 - s / 2)
+    plain = confidence_from_error(*seat)
+    found = confidence_from_error(*seat, recalibration=lambda s: 1 - s / 2)
     torch.testing.assert_close(found.score, torch.where(keep, 1 - plain.score / 2, 0.0))
     limit = float((1 - plain.score / 2)[keep].median())
-    strict = rank_by_error(*seat, recalibration=lambda s: 1 - s / 2, min_score=limit)
+    strict = confidence_from_error(*seat, recalibration=lambda s: 1 - s / 2, min_score=limit)
     assert torch.equal(strict.gate == Gate.LOW_SCORE, keep & (found.score < limit))
 
 
-@pytest.mark.parametrize("seat", [rank, rank_by_error, "learned"])
+@pytest.mark.parametrize("seat", [confidence, confidence_from_error, "learned"])
 def test_below_the_threshold_and_not_at_it_an_answer_becomes_silent(seat):
     parts = answers()
     ask = (lambda *p, min_score=0.0: LearnedScore(min_score=min_score)(*p)) if seat == "learned" else seat
@@ -179,7 +179,7 @@ def test_no_error_is_expected_below_a_millionth_nor_told_apart_above_a_million()
     shared[0, :5] = torch.tensor([0.0, 0.2, 0.5, 0.0, 0.0])
     residual[0, 0] = 1e12
     changed = estimate.replace(depth=depth, sigma=sigma, sigma_shared=shared, residual_px=residual)
-    found = rank_by_error(changed, parts[1], tracks.replace(error=error), parts[3]).score[0, :5]
+    found = confidence_from_error(changed, parts[1], tracks.replace(error=error), parts[3]).score[0, :5]
     e = 0.1 / found - 0.1
     expected = torch.tensor([1.0, 0.1 * 1e-3, 0.1 * 1e-3, 1e-6, 1e6]).double()
     torch.testing.assert_close(e, expected, rtol=1e-6, atol=1e-13)
@@ -196,16 +196,19 @@ def test_where_no_error_can_be_stated_the_score_is_zero():
     for name, values in broken.items():
         x = getattr(estimate, name).clone()
         x[1, 0], x[1, 1] = values
-        found = rank_by_error(estimate.replace(**{name: x}), samples, tracks, fit)
+        found = confidence_from_error(estimate.replace(**{name: x}), samples, tracks, fit)
         assert found.score[1, :2].tolist() == [0, 0] and (found.score[1, 2:-2] > 0).all(), name
-        again = rank_by_error(estimate.replace(**{name: x}), samples, tracks, fit, recalibration=lambda s: 1 - s / 2)
+        again = confidence_from_error(
+            estimate.replace(**{name: x}), samples, tracks, fit, recalibration=lambda s: 1 - s / 2
+        )
         assert again.score[1, :2].tolist() == [0, 0] and again.score.isfinite().all(), name
-        assert not evidence(estimate.replace(**{name: x}), samples, tracks, fit)[1][1, :2].any(), name
+        assert not score_features(estimate.replace(**{name: x}), samples, tracks, fit)[1][1, :2].any(), name
     for name, scale in (("photometric", "photometric_scale"), ("error", "round_trip_scale_px")):
         x = getattr(tracks, name).clone()
         x[1, 0] = torch.nan
         found = [
-            rank_by_error(estimate, samples, tracks.replace(**{name: x}), fit, **{scale: s}).score for s in (0.3, None)
+            confidence_from_error(estimate, samples, tracks.replace(**{name: x}), fit, **{scale: s}).score
+            for s in (0.3, None)
         ]
         assert found[0][1, 0] == 0 and found[1][1, 0] > 0, "only where it is asked"
 
@@ -233,10 +236,10 @@ def test_evidence_is_the_logarithm_of_what_it_is_called():
     depth = samples.depth.clone()
     depth[:, 0] = 0  # an inlier without a return does not count in the mean
     samples, fit = samples.replace(depth=depth), fit.replace(inlier=fit.inlier | (torch.arange(N) == 0))
-    x, stated = evidence(estimate, samples, tracks, fit)
+    x, stated = score_features(estimate, samples, tracks, fit)
     assert torch.equal(stated, estimate.keep) and (x[~stated] == 0).all() and x.shape == (B, N, 8)
     columns = plain_evidence(estimate, samples, tracks, fit)
-    assert [*columns] == [*EVIDENCE]
+    assert [*columns] == [*SCORE_FEATURES]
     for k, (name, expected) in enumerate(columns.items()):
         np.testing.assert_allclose(x[..., k][stated].numpy(), np.log(expected)[stated], rtol=1e-9, err_msg=name)
 
@@ -259,19 +262,19 @@ def test_evidence_is_not_told_apart_beyond_its_limits():
         extreme = extreme.replace(depth=x if end else estimate.depth, sigma=(4 * x * x if end else 4 * x))
         extreme = extreme.replace(sigma_shared=2 * x * x if end else 2 * x)
         seat = samples.replace(trackability=x), tracks.replace(error=x, photometric=x), fit
-        found, stated = evidence(extreme, *seat)
+        found, stated = score_features(extreme, *seat)
         rows = found[stated].exp()
-        for k, name in enumerate(EVIDENCE):
+        for k, name in enumerate(SCORE_FEATURES):
             if name != "reach" or end:
                 np.testing.assert_allclose(rows[:, k].numpy(), limits[name][end], rtol=1e-9, err_msg=name)
     near = samples.replace(depth=samples.depth * 1e9)
-    found, stated = evidence(estimate, near, tracks, fit)
+    found, stated = score_features(estimate, near, tracks, fit)
     np.testing.assert_allclose(found[..., 7][stated].exp().numpy(), 1e-2)
 
 
 def test_without_returns_that_hold_the_pose_the_reach_is_the_depth_itself():
     estimate, samples, tracks, fit = answers()
-    found, stated = evidence(estimate, samples, tracks, fit.replace(inlier=torch.zeros_like(fit.inlier)))
+    found, stated = score_features(estimate, samples, tracks, fit.replace(inlier=torch.zeros_like(fit.inlier)))
     torch.testing.assert_close(found[..., 7].exp()[stated], estimate.depth[stated])
 
 
@@ -283,7 +286,7 @@ def test_evidence_is_nothing_where_any_of_it_is_no_number():
         x[0, 3] = torch.nan
         changed = {id(record): record.replace(**{name: x})}
         seat = [changed.get(id(r), r) for r in (estimate, samples, tracks, fit)]
-        found, stated = evidence(*seat)
+        found, stated = score_features(*seat)
         assert not stated[0, 3] and int(stated.sum()) == int(estimate.keep.sum()) - 1, name
         assert found.isfinite().all() and (found[0, 3] == 0).all()
 
@@ -312,7 +315,7 @@ def plain_forward(scorer, x):
 
 def test_the_learned_score_is_its_network_written_out():
     seat, scorer = answers(), trained(half_error=0.07)
-    x, stated = evidence(*seat)
+    x, stated = score_features(*seat)
     expected = plain_forward(scorer, x.numpy())
     np.testing.assert_allclose(scorer.log_error(x).detach().numpy(), expected, rtol=1e-9)
     same(scorer(*seat).score.detach(), 0.07 / (0.07 + np.exp(expected)), stated.numpy())
@@ -323,7 +326,7 @@ def test_the_learned_score_is_its_network_written_out():
 
 def test_untrained_it_is_the_score_made_by_hand():
     seat = answers()
-    scored, by_hand = LearnedScore()(*seat), rank_by_error(*seat)
+    scored, by_hand = LearnedScore()(*seat), confidence_from_error(*seat)
     torch.testing.assert_close(scored.score.detach(), by_hand.score, rtol=1e-9, atol=0)
     assert torch.equal(scored.gate, by_hand.gate) and torch.equal(scored.depth.isnan(), by_hand.depth.isnan())
 
@@ -339,10 +342,10 @@ def test_the_first_weights_are_drawn_by_the_seed_as_for_a_linear_layer():
 
 
 def test_the_correction_is_bounded_and_gradients_reach_every_weight():
-    x, stated = evidence(*answers())
+    x, stated = score_features(*answers())
     wild = trained(spread=1e3)
     more = (wild.log_error(x) - x[..., 0]).detach()[stated].abs()
-    assert more.max() <= MOST == 4 and more.min() > 3.9
+    assert more.max() <= MAX_LOG_FACTOR == 4 and more.min() > 3.9
     scorer = trained()
     seat = answers()
     depth = seat[0].depth.clone().requires_grad_()

@@ -13,9 +13,9 @@ import torch.nn.functional as F
 from support.textures import levels
 
 from dhtorch.geometry.lucas_kanade import CELL_LEVEL
-from dhtorch.geometry.pyramid import Pyramids, build_pyramid
+from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
 from dhtorch.records import TrackHint
-from dhtorch.stages.track import lucas_kanade, refine
+from dhtorch.stages.track import lucas_kanade, refine_tracks
 
 ROOT = os.environ.get("DHTORCH_DATA")
 FIELDS = ("uv_1", "error", "photometric", "cov", "valid")
@@ -186,10 +186,10 @@ def test_wrong_shapes_and_options_raise():
         lambda: lucas_kanade(image, image, uv, normalise="both"),
         lambda: lucas_kanade(image, image, uv, iterations=0),
         lambda: lucas_kanade(image, image, uv, window=51),
-        lambda: lucas_kanade(image, image, uv, hint=TrackHint(pyramid=Pyramids(image[..., :-1]))),
-        lambda: lucas_kanade(image, image, uv, hint=TrackHint(pyramid=Pyramids(image[:1]))),
-        lambda: refine(image, image, uv, uv[:, :3]),
-        lambda: refine(image, image, uv, uv, normalise="both"),
+        lambda: lucas_kanade(image, image, uv, hint=TrackHint(pyramid=PyramidCache(image[..., :-1]))),
+        lambda: lucas_kanade(image, image, uv, hint=TrackHint(pyramid=PyramidCache(image[:1]))),
+        lambda: refine_tracks(image, image, uv, uv[:, :3]),
+        lambda: refine_tracks(image, image, uv, uv, normalise="both"),
     ]
     for call in calls:
         with pytest.raises(ValueError):
@@ -209,7 +209,7 @@ def test_cached_pyramid_initial_positions_sizes_and_dtypes():
     started = lucas_kanade(src, dst, uv, levels=1, hint=TrackHint(start=truth + 1.0))
     assert (started.uv_1 - truth).norm(dim=-1).median() < 0.02 and started.valid.float().mean() > 0.97
     nowhere = lucas_kanade(src, dst, uv, levels=1, hint=TrackHint(start=torch.full_like(uv, float("nan"))))
-    cached = lucas_kanade(src, dst, uv, levels=1, hint=TrackHint(pyramid=Pyramids(src)))
+    cached = lucas_kanade(src, dst, uv, levels=1, hint=TrackHint(pyramid=PyramidCache(src)))
     narrow = lucas_kanade(src[..., :-7], dst[..., :-3, :], uv, levels=1, hint=TrackHint(start=truth))
     assert all(torch.equal(getattr(nowhere, f), getattr(plain, f)) for f in FIELDS)
     assert all(torch.equal(getattr(cached, f), getattr(plain, f)) for f in FIELDS)
@@ -273,7 +273,7 @@ def test_no_points():
     src = scene(2, 60, 70, dtype=torch.float32)
     tracks = lucas_kanade(src, src, torch.zeros(2, 0, 2))
     assert tracks.uv_1.shape == (2, 0, 2) and tracks.cov.shape == (2, 0, 2, 2) and tracks.valid.shape == (2, 0)
-    assert refine(src, src, torch.zeros(2, 0, 2), torch.zeros(2, 0, 2)).shape == (2, 0, 2)
+    assert refine_tracks(src, src, torch.zeros(2, 0, 2), torch.zeros(2, 0, 2)).shape == (2, 0, 2)
 
 
 def test_mapped_and_captured_with_a_graph_it_equals_eager():
@@ -294,7 +294,7 @@ def test_refine_gradcheck(normalise):
     uv_0 = points(2, 3, 24, 26, margin=2)
     uv_1 = uv_0 + torch.tensor([0.8, 0.25], dtype=torch.float64)
     leaves = tuple(x.clone().requires_grad_() for x in (src, dst, uv_0))
-    step = lambda i, j, x: refine(i, j, x, uv_1, window=7, normalise=normalise)  # noqa: E731
+    step = lambda i, j, x: refine_tracks(i, j, x, uv_1, window=7, normalise=normalise)  # noqa: E731
     assert (step(*leaves) - uv_1).abs().min() > 1e-4
     assert torch.autograd.gradcheck(step, leaves, fast_mode=True)
 

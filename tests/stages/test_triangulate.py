@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dhtorch.codes import Gate, PoseCode
-from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar, se3
 from dhtorch.records import Camera, Pose, Samples, Tracks
@@ -39,7 +39,7 @@ def scene(n=200, batch=2, dtype=torch.float64, seed=0, noise_px=0.0, t=(0.2, -0.
     cov = torch.eye(2, dtype=torch.float64).expand(batch, n, 2, 2) * max(noise_px, 0.1) ** 2
     tracks = Tracks(uv_0, uv_1, zero, zero, cov, zero == 0)
     cast = lambda r: r.to(dtype)  # noqa: E731
-    return cast(samples), cast(tracks), cast(given_pose(T, n)), cast(camera_0), cast(camera_1), depth.to(dtype)
+    return cast(samples), cast(tracks), cast(known_pose_fit(T, n)), cast(camera_0), cast(camera_1), depth.to(dtype)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

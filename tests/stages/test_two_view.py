@@ -8,8 +8,7 @@ import torch
 
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import epipolar, se3
-from dhtorch.geometry import reprojection_problem as near_far
+from dhtorch.geometry import epipolar, reprojection_problem, se3
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 from dhtorch.stages.triangulate import two_view
 
@@ -195,7 +194,7 @@ def test_a_rolling_shutter_counts_with_all_correlations_of_rotation_translation_
         def depths(unknown, one=one):
             pose, turn = unknown[None, :6], unknown[None, 6:]
             lens = CAMERA_1[one]
-            uv_1 = near_far.straighten(tracks.uv_1[one].mT, lens.f, lens.c, y[one], turn).mT
+            uv_1 = reprojection_problem.undo_rolling_shutter(tracks.uv_1[one].mT, lens.f, lens.c, y[one], turn).mT
             T = se3.retract(fit.T_1_from_0[one], pose)
             return epipolar.triangulate(tracks.uv_0[one], uv_1, CAMERA_0[one], lens, T).depth[0]
 

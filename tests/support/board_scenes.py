@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import torch
 
-from dhtorch.geometry import plane_sweep as sweep
-from dhtorch.geometry import se3
+from dhtorch.geometry import plane_sweep, se3
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.filters import gaussian
+from dhtorch.geometry.filters import gaussian_blur
 from dhtorch.records import Frame, Pose
 
 
@@ -31,7 +30,7 @@ class Board:
         if self.stripes:
             return 0.5 + 0.4 * torch.sin(2 * torch.pi * x / self.stripes)
         uv = torch.stack([x, y], -1).flatten(1, 2) * 90 + 350
-        return sweep.bilinear(_paint(self.seed), uv % 690 + 4)[0][:, 0].view_as(x)
+        return plane_sweep.sample_bilinear(_paint(self.seed), uv % 690 + 4)[0][:, 0].view_as(x)
 
 
 _PAINTED: dict[int, torch.Tensor] = {}
@@ -40,7 +39,7 @@ _PAINTED: dict[int, torch.Tensor] = {}
 def _paint(seed):
     if seed not in _PAINTED:
         g = torch.Generator().manual_seed(seed)
-        image = gaussian(torch.rand(1, 1, 700, 700, generator=g), 1.5)
+        image = gaussian_blur(torch.rand(1, 1, 700, 700, generator=g), 1.5)
         _PAINTED[seed] = (image - image.min()) / (image.max() - image.min())
     return _PAINTED[seed]
 
@@ -50,7 +49,7 @@ def look(boards, t, *, hw=(120, 160), f=140.0, angle=(0.0, 0.0, 0.0)):
     h, w = hw
     camera = Camera(torch.tensor([[f, f]]), torch.tensor([[w / 2 - 0.5, h / 2 - 0.5]]))
     T = se3.exp(torch.tensor([[*angle, 0.0, 0.0, 0.0]]))
-    ray = se3.rotate(T.R, sweep.pixel_rays(camera, hw)).unflatten(1, hw)
+    ray = se3.rotate(T.R, plane_sweep.pixel_rays(camera, hw)).unflatten(1, hw)
     x0, y0, z0 = t
     depth = torch.full((1, h, w), torch.inf)
     image = torch.zeros(1, h, w)

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras
-from dhtorch.geometry import patches as lookup
-from dhtorch.geometry import se3
+from dhtorch.geometry import patches, se3
 from dhtorch.records import Camera, Frame, Pose
 
 BOX = torch.tensor([2.0, 1.5, 3.0], dtype=torch.float64)  # half sizes of the room, m
@@ -85,7 +84,7 @@ def disagreement(a: Frame, b: Frame, near: float = math.inf, reach: int = 0) -> 
     best = torch.full_like(z, math.inf)
     for dv in range(-reach, reach + 1):
         for du in range(-reach, reach + 1):
-            value, inside = lookup.nearest(b.depth, uv + torch.tensor([du, dv]))
+            value, inside = patches.sample_nearest(b.depth, uv + torch.tensor([du, dv]))
             error = (z - value).abs() / value.clamp(min=1e-9)
             best = torch.where(inside & (value > 0) & (z > 0), torch.minimum(best, error), best)
     found = best[torch.isfinite(best)]

@@ -34,7 +34,7 @@ from dhtorch.data import FormatError
 from dhtorch.data.io import decode as files
 from dhtorch.data.recording import Recording
 from dhtorch.experiments.focal import formats
-from dhtorch.experiments.focal.stacks import FocalStack, Stacks
+from dhtorch.experiments.focal.stacks import FocalStack, FocalStacks
 from support.byte_damage import EXECUTED, Capture, mutate
 
 SECONDS = 2  # of a processor for one mutant, whatever else the machine does
@@ -67,7 +67,7 @@ def read_all(path: Path) -> None:
                 assert bool(torch.isfinite(depth).all()) and bool((depth >= 0).all())
 
 
-def _opened(path: Path) -> Sequence[Recording] | list[Stacks]:
+def _opened(path: Path) -> Sequence[Recording] | list[FocalStacks]:
     try:
         data.recognise(path)
     except FormatError:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy.optimize import brentq
 
-from dhtorch.geometry.reprojection_problem import Problem, Unknowns
+from dhtorch.geometry.reprojection_problem import PoseDepthProblem, Unknowns
 from dhtorch.geometry.se3 import Pose
 
 D = torch.float64
@@ -50,7 +50,7 @@ def hat(w: np.ndarray) -> np.ndarray:
     return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
 
 
-def tracks(problem: Problem, at: Unknowns, noise: torch.Tensor, b: int = 0) -> list[Track]:
+def tracks(problem: PoseDepthProblem, at: Unknowns, noise: torch.Tensor, b: int = 0) -> list[Track]:
     """All tracks of pair ``b``; ``noise`` (B, N) px²."""
     P = {k: getattr(problem, k)[b].double().numpy() for k in ("f", "c", "ray", "uv", "inverse", "variance", "shape")}
     near, far = problem.near[b].tolist(), problem.far[b].tolist()
@@ -119,7 +119,7 @@ def reduced(found: list[Track], weights: list[float]) -> tuple[np.ndarray, np.nd
     return A[:9, :9] - A[:9, 9:] @ own @ A[9:, :9], b[:9] - A[:9, 9:] @ own @ b[9:]
 
 
-def problem_of(args: tuple, isotropic: float) -> Problem:
+def problem_of(args: tuple, isotropic: float) -> PoseDepthProblem:
     """The problem that ``map_pose`` is asked: arguments of the seat → planes, one track at a time."""
     samples, seen, camera_0, camera_1, _ = args
     B, N = seen.valid.shape
@@ -153,7 +153,7 @@ def problem_of(args: tuple, isotropic: float) -> Problem:
             if near[b, n]:
                 out["ray"][b, :, n] = xyz / xyz[2]
                 out["inverse"][b, n], out["variance"][b, n] = 1 / xyz[2], (sigma / xyz[2] ** 2) ** 2
-    return Problem(f=camera_1.f.double(), c=camera_1.c.double(), near=near, far=far, **out)
+    return PoseDepthProblem(f=camera_1.f.double(), c=camera_1.c.double(), near=near, far=far, **out)
 
 
 def unknowns(R: torch.Tensor, t: torch.Tensor, turn: torch.Tensor | None = None) -> Unknowns:

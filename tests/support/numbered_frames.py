@@ -4,12 +4,12 @@ import torch
 
 import dhtorch
 from dhtorch.codes import Gate
-from dhtorch.data.recording import Recording, numbers
+from dhtorch.data.recording import Recording, consecutive_frame_numbers
 from dhtorch.data.scene import Scene
-from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.pipeline.method import Method
 from dhtorch.records import Estimate, Pose, Tracks
-from dhtorch.stages.sample import grid
+from dhtorch.stages.sample import regular_grid
 
 #: Step from the anchor → share of the samples that is answered, rightly.
 SHARES = {1: 0.2, 2: 0.5, -2: 0.1, 5: 0.3, -5: 0.4}
@@ -24,7 +24,7 @@ def frame(i):
 
 
 def scene(name="hall", n=10, load=frame, **notes):
-    recording = Recording(name=name, format="made", load=load, number=numbers(n))
+    recording = Recording(name=name, format="made", load=load, number=consecutive_frame_numbers(n))
     return Scene(recording, near=2.0, gap=min(2, n - 1), **notes)
 
 
@@ -37,7 +37,7 @@ def track(image_0, image_1, uv_0, *, hint):
 
 def pose(samples, _tracks, _camera_0, _camera_1, _draws):
     still = Pose(torch.eye(3).expand(len(samples.uv), 3, 3), torch.zeros(len(samples.uv), 3))
-    return given_pose(still, samples.uv.shape[1])
+    return known_pose_fit(still, samples.uv.shape[1])
 
 
 def triangulate(samples, tracks, _fit, _camera_0, _camera_1):
@@ -55,7 +55,9 @@ def score(estimate, _samples, _tracks, _fit):
     return estimate.replace(score=estimate.keep.to(estimate.depth))
 
 
-MAP = Method(sample=grid, track=track, pose=pose, triangulate=triangulate, score=score, n=1920, min_trackability=0.0)
+MAP = Method(
+    sample=regular_grid, track=track, pose=pose, triangulate=triangulate, score=score, n=1920, min_trackability=0.0
+)
 
 
 def choosing(*steps):

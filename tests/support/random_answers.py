@@ -14,6 +14,6 @@ def random_points(n, seed=0, ties=False, silent=0.3):
     score = g.integers(0, 6, n) / 5 if ties else g.uniform(0, 1, n)
     keep = g.uniform(size=n) > silent
     t = torch.from_numpy
-    return errors.points(
+    return errors.make_points(
         t(depth), t(true), t(score), sigma=t(0.2 * true), residual_px=t(g.uniform(0, 3, n)), keep=t(keep)
     )

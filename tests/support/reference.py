@@ -321,7 +321,7 @@ def within(x: Tensor, hw: tuple[int, int]) -> bool:
 
 
 class Registered(NamedTuple):
-    """As :class:`dhtorch.geometry.affine_alignment.Registration`, of one point."""
+    """As :class:`dhtorch.geometry.affine_alignment.AffineRegistration`, of one point."""
 
     uv_1: Tensor  # (2,) px
     linear: Tensor  # (2, 2)

@@ -3,9 +3,9 @@
 import random
 
 from dhtorch.codes import Gate, Hole, names
-from dhtorch.experiments.rows import summarise
+from dhtorch.experiments.rows import summarise_rows
 from dhtorch.metrics import errors
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 
 SCENES = ("kitchen_000", "office_desk", "terrace/CAMERA_01", "lab_rotation")
 ROLES = {"lab_rotation": "rotation"}
@@ -114,14 +114,14 @@ def result(experiment, rows, summary=None, data=None, **changes):
     parts = {
         "experiment": experiment,
         "key": "0" * 64,
-        "meta": archive.meta(device="cpu", dtype="float32", threads=1, seed=0),
+        "meta": result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=0),
         "config": {"seed": 0, "method": {"n": 2048, "track": {"levels": 4}}},
         "data": data or DATA,
-        "summary": summarise(rows, variants, cohorts) if summary is None else summary,
+        "summary": summarise_rows(rows, variants, cohorts) if summary is None else summary,
         "rows": rows,
         **({} if experiment == "pair" else asked),
     }
-    return archive.build(**{**parts, **changes})
+    return result_files.build_result(**{**parts, **changes})
 
 
 def range_split():
@@ -174,7 +174,7 @@ def calibration():
 
     variants = {"paper": (0.06, 0.6), "opencv": (0.07, 0.5)}
     rows = rows_of(variants, ("full",), more=more) + rows_of(variants, ("heldout",), more=more)
-    return result("calibration", rows, summarise(rows, list(variants), ["heldout", "full"]))
+    return result("calibration", rows, summarise_rows(rows, list(variants), ["heldout", "full"]))
 
 
 def device_pose():
@@ -195,7 +195,7 @@ def hole_census():
     scenes = [
         {k: v for k, v in r.items() if k not in ("pair", "role")} for r in rows if r["pair"] is None and not r["role"]
     ]
-    return result("hole_census", rows, errors.summarise(scenes))
+    return result("hole_census", rows, errors.summarise_scenes(scenes))
 
 
 def real_holes():
@@ -259,7 +259,7 @@ def screened(experiment, variants, metrics, extra=None):
             base = {"scene": scene, "method": variant, "truth": "full", "n_candidates": 3000}
             found = {m: rng.uniform(-0.2, 0.9) for m in metrics}
             rows += [{**base, **found, "pair": [0, 0]}, {**base, **found, "pair": None, "role": ROLES.get(scene)}]
-    return result(experiment, rows, summarise(rows, variants, ["full"]) | (extra or {}))
+    return result(experiment, rows, summarise_rows(rows, variants, ["full"]) | (extra or {}))
 
 
 def icp():

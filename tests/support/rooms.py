@@ -4,7 +4,7 @@ from functools import cache
 
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
-from dhtorch.synthetic.recording import SyntheticRoom, as_scene
+from dhtorch.synthetic.recording import SyntheticRoom, room_to_scene
 
 
 @cache
@@ -16,7 +16,7 @@ def room(**options) -> SyntheticRoom:
 def noted(recording, near=2.0, gap=6) -> Scene:
     """A recording with the notes of a benchmark; a scene keeps its own."""
     if isinstance(recording, SyntheticRoom):
-        return as_scene(recording, near, gap)
+        return room_to_scene(recording, near, gap)
     return recording if isinstance(recording, Scene) else Scene(recording, near=near, gap=gap)
 
 

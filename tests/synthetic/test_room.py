@@ -8,10 +8,10 @@ import torch
 
 from dhtorch.geometry import camera, se3
 from dhtorch.pytree import collate
-from dhtorch.synthetic.paths import PATHS
-from dhtorch.synthetic.raycast import DARK, MIRROR, ORDINARY, WINDOW
-from dhtorch.synthetic.recording import SURFACES, SyntheticRoom, open_room, phone_lidar
-from dhtorch.synthetic.room import BACK, FRONT, HEIGHT, LEFT, RIGHT, furnished_room
+from dhtorch.synthetic.paths import CAMERA_PATHS
+from dhtorch.synthetic.raycast import SURFACE_DARK, SURFACE_MIRROR, SURFACE_ORDINARY, SURFACE_WINDOW
+from dhtorch.synthetic.recording import SURFACE_NAMES, SyntheticRoom, open_room, simulate_phone_lidar
+from dhtorch.synthetic.room import _ROOM_HEIGHT_M, ROOM_BACK_M, ROOM_FRONT_M, ROOM_LEFT_M, ROOM_RIGHT_M, furnished_room
 from dhtorch.synthetic.shading import Light, ShadedRoom
 
 SMALL = {"hw": (120, 160), "depth_hw": (48, 64)}
@@ -64,11 +64,13 @@ def test_frame_keeps_the_promises_of_the_record():
 
 def test_true_depth_lies_on_the_walls_of_the_room(room):
     x, y, z = world_points(room, 0)[0].unbind(-1)
-    assert x.min() > LEFT - 1e-3 and x.max() < RIGHT + 1e-3
-    assert y.min() > -HEIGHT - 1e-3 and y.max() < 1e-3
-    assert z.min() > FRONT - 1e-3 and z.max() < BACK + 1e-3
-    assert ((z - BACK).abs() < 1e-5).double().mean() > 0.15, "the brick wall is a plane and fills part of the view"
-    assert ((x - RIGHT).abs() < 1e-5).double().mean() > 0.01
+    assert x.min() > ROOM_LEFT_M - 1e-3 and x.max() < ROOM_RIGHT_M + 1e-3
+    assert y.min() > -_ROOM_HEIGHT_M - 1e-3 and y.max() < 1e-3
+    assert z.min() > ROOM_FRONT_M - 1e-3 and z.max() < ROOM_BACK_M + 1e-3
+    assert ((z - ROOM_BACK_M).abs() < 1e-5).double().mean() > 0.15, (
+        "the brick wall is a plane and fills part of the view"
+    )
+    assert ((x - ROOM_RIGHT_M).abs() < 1e-5).double().mean() > 0.01
 
 
 @pytest.mark.parametrize("j", [6, 11])
@@ -83,8 +85,8 @@ def test_a_world_point_is_the_same_point_in_another_frame(room, j):
     assert seen.double().sum() > 0.8 * inside.double().sum(), "most points stay visible"
     assert disagree[seen].median() < 2e-5
 
-    plain = (room.truth(0)["surface"].reshape(-1) == ORDINARY) & (
-        sample(truth["surface"][:, None], uv)[0][0] == ORDINARY
+    plain = (room.truth(0)["surface"].reshape(-1) == SURFACE_ORDINARY) & (
+        sample(truth["surface"][:, None], uv)[0][0] == SURFACE_ORDINARY
     )
     colour, _ = sample(room[j].image, uv)
     error = (colour - room[0].image[0].reshape(3, -1)).abs().mean(0)
@@ -166,7 +168,7 @@ def test_another_seed_is_another_room():
 def lidar(room, seed=0, **options):
     pose, cam = room.poses[:1], camera.resize(room.camera, room.hw, (96, 128))
     generator = torch.Generator().manual_seed(seed)
-    return phone_lidar(furnished_room(room.seed), cam, pose, (96, 128), generator=generator, **options)
+    return simulate_phone_lidar(furnished_room(room.seed), cam, pose, (96, 128), generator=generator, **options)
 
 
 def low_truth(room):
@@ -180,12 +182,12 @@ def low_truth(room):
 def test_lidar_fails_on_mirror_window_dark_surfaces_and_edges(room):
     depth, surface = low_truth(room)
     answered = torch.stack([lidar(room, s)[0][0] > 0 for s in range(4)]).double().mean(0)
-    share = {name: answered[surface == kind].mean() for kind, name in SURFACES.items()}
+    share = {name: answered[surface == kind].mean() for kind, name in SURFACE_NAMES.items()}
     assert share["ordinary"] > 0.7
     assert share["mirror"] < 0.3 and share["window"] < 0.3 and share["dark"] < 0.4
     patch = torch.nn.functional.unfold(depth[None, None], 3, padding=1).reshape(9, 96, 128)[:, 1:-1, 1:-1]
-    jump = (patch.amax(0) > 1.3 * patch.amin(0)) & (surface[1:-1, 1:-1] == ORDINARY) & (depth[1:-1, 1:-1] < 2)
-    calm = (patch.amax(0) < 1.1 * patch.amin(0)) & (surface[1:-1, 1:-1] == ORDINARY) & (depth[1:-1, 1:-1] < 2)
+    jump = (patch.amax(0) > 1.3 * patch.amin(0)) & (surface[1:-1, 1:-1] == SURFACE_ORDINARY) & (depth[1:-1, 1:-1] < 2)
+    calm = (patch.amax(0) < 1.1 * patch.amin(0)) & (surface[1:-1, 1:-1] == SURFACE_ORDINARY) & (depth[1:-1, 1:-1] < 2)
     inner = answered[1:-1, 1:-1]
     assert jump.sum() > 100
     assert inner[jump].mean() < 0.75 < 0.95 < inner[calm].mean()
@@ -194,7 +196,7 @@ def test_lidar_fails_on_mirror_window_dark_surfaces_and_edges(room):
 def test_lidar_sees_the_room_behind_the_mirror(room):
     depth, surface = low_truth(room)
     reported, conf = lidar(room, range_limit=50.0, noise_factor=0.0)
-    echo = (surface == MIRROR) & (reported[0] > 0)
+    echo = (surface == SURFACE_MIRROR) & (reported[0] > 0)
     assert echo.sum() > 5
     assert (reported[0][echo] > depth[echo] + 0.3).all() and (conf[0][echo] == 0).all()
 
@@ -206,7 +208,7 @@ def test_lidar_confidence_and_noise_follow_range(room):
     reported = torch.stack([d[0] for d, _ in draws])
     assert conf.unique().tolist() == [0, 1, 2]
     assert (conf[reported == 0] == 0).all()
-    plain = surface == ORDINARY
+    plain = surface == SURFACE_ORDINARY
     near, far = plain & (depth < 2), plain & (depth > 3.5)
     assert conf[:, near].double().mean() > 1.5 > conf[:, far].double().mean()
 
@@ -231,14 +233,19 @@ def test_lidar_range_limit_is_along_the_ray(room):
     assert weak.any() and (conf[0][weak] < 2).all()
 
 
-@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize("path", CAMERA_PATHS)
 def test_paths_stay_in_the_room_and_keep_their_word(path):
     scene = open_room(path=path, n_frames=300, seed=3)
     room = scene.recording
     R, t = room.poses.R, room.poses.t
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=torch.float64).expand(300, 3, 3), atol=1e-12, rtol=0)
     assert (torch.linalg.det(R) > 0).all()
-    assert t[:, 0].min() > LEFT + 0.5 and t[:, 0].max() < RIGHT - 0.5 and t[:, 2].min() > 0 and t[:, 2].max() < 1.2
+    assert (
+        t[:, 0].min() > ROOM_LEFT_M + 0.5
+        and t[:, 0].max() < ROOM_RIGHT_M - 0.5
+        and t[:, 2].min() > 0
+        and t[:, 2].max() < 1.2
+    )
     turn = se3.rotation_angle(R[:-6].mT @ R[6:]).rad2deg()
     way = (t[6:] - t[:-6]).norm(dim=-1)
     assert turn.max() < 15 and way.max() < 0.25
@@ -278,7 +285,7 @@ def test_detail_to_track_is_near_and_far_and_absent_on_the_blank_wall(room):
     depth = room.truth(0)["depth"][0][corners[:, 1], corners[:, 0]]
     assert (depth < 2).sum() > 150 and (depth > 2).sum() > 300
     x = world_points(room, 0)[0, :, 0].reshape(240, 320)
-    wall = torch.nn.functional.max_pool2d((x < RIGHT - 1e-4).float()[None], 9, 1, 4)[0] == 0  # and all around it
+    wall = torch.nn.functional.max_pool2d((x < ROOM_RIGHT_M - 1e-4).float()[None], 9, 1, 4)[0] == 0  # and all around it
     slope = torch.from_numpy(cv2.cornerMinEigenVal(grey, 5)).double()
     assert wall.sum() > 100
     assert slope[wall].median() < 0.02 * slope.median()
@@ -301,10 +308,10 @@ def test_image_noise_has_the_size_asked_for():
 
 def test_all_kinds_of_surface_are_in_view(room):
     surface = room.truth(0)["surface"]
-    for kind in (MIRROR, WINDOW, DARK):
+    for kind in (SURFACE_MIRROR, SURFACE_WINDOW, SURFACE_DARK):
         assert (surface == kind).double().mean() > 0.01
     image = room[0].image.double().mean(1)
-    assert image[surface == DARK].mean() < 40 and image[surface == WINDOW].mean() > 180
+    assert image[surface == SURFACE_DARK].mean() < 40 and image[surface == SURFACE_WINDOW].mean() > 180
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from dhtorch.stages.backproject import backproject
 from dhtorch.stages.sample import spiral
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.synthetic import guests, stress
-from dhtorch.synthetic.raycast import MOVING, ORDINARY, Solid, Surface
+from dhtorch.synthetic.raycast import SURFACE_MOVING, SURFACE_ORDINARY, Material, Solid
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.room import furnished_room
 from dhtorch.synthetic.stress import STRESSES, StressRoom, open_stress
@@ -85,12 +85,12 @@ def test_planar_points_are_planar(walk):
 def test_only_twenty_near_returns_remain(walk, places):
     few = room("few_near", places=places, n_places=512)
     frame = few[1]
-    assert near(frame).sum() == stress.FEW
+    assert near(frame).sum() == stress._N_FEW_NEAR
     assert torch.equal(frame.depth[near(frame)], walk[1].depth[near(frame)])
     assert torch.equal(frame.depth[~near(walk[1])], walk[1].depth[~near(walk[1])])
     if places is not None:  # each of them is read
         samples = backproject(frame, spiral(few.hw, 512))
-        assert len(samples.depth[(samples.depth > 0) & (samples.depth <= NEAR)].unique()) == stress.FEW
+        assert len(samples.depth[(samples.depth > 0) & (samples.depth <= NEAR)].unique()) == stress._N_FEW_NEAR
 
 
 def test_depth_noise_is_two_to_three_percent(walk):
@@ -104,7 +104,7 @@ def test_rows_of_a_rolling_shutter_are_seen_one_after_the_other():
     first, last = rolling.bands[3][:1], rolling.bands[3][-1:]
     whole = se3.relative(*(rolling.true_poses[i : i + 1] for i in (3, 4))).t.norm()
     assert 0.5 < se3.relative(first, last).t.norm() / whole < 0.7  # 20 ms of 33 ms
-    assert rolling[3].camera.readout.item() == pytest.approx(stress.READOUT_S)
+    assert rolling[3].camera.readout.item() == pytest.approx(stress._READOUT_S)
 
     def seen_from(pose):
         still = SyntheticRoom(**SMALL | {"image_noise": 0.0, "n_frames": 1})
@@ -133,7 +133,7 @@ def test_three_in_ten_tracks_end_elsewhere_and_say_nothing_of_it(walk):
     image_0, image_1 = torch.cat((wrong[0].image, wrong[1].image)), torch.cat((wrong[6].image, wrong[7].image))
     plain, spoiled = (track(image_0, image_1, uv) for track in (lucas_kanade, wrong.spoil_track(lucas_kanade)))
     shift = (spoiled.uv_1 - plain.uv_1).norm(dim=-1)
-    low, high = (px * 128 / 640 for px in stress.MOVED_PX)
+    low, high = (px * 128 / 640 for px in stress._MOVED_RANGE_PX)
     assert 0.25 < (shift > 0).float().mean() < 0.35
     assert low - 1e-3 < shift[shift > 0].min() and shift.max() < high + 1e-3
     assert not torch.equal(shift[0] > 0, shift[1] > 0)
@@ -200,26 +200,26 @@ def test_background_stands_and_the_body_goes_as_said(name):
     i, j = 1, 7
     T = se3.compose(there.body_poses[j : j + 1], se3.invert(there.body_poses[i : i + 1]))
     inside, depth, grey, surface, found = carried(there, i, j)
-    ground = inside & (surface == ORDINARY) & (found == ORDINARY) & (depth < 0.01)
+    ground = inside & (surface == SURFACE_ORDINARY) & (found == SURFACE_ORDINARY) & (depth < 0.01)
     assert ground.sum() > 3000 and depth[ground].median() < 2e-5 and grey[ground].median() < 6
-    left_behind = inside & (surface == MOVING)
+    left_behind = inside & (surface == SURFACE_MOVING)
     assert not (depth[left_behind] < 1e-4).double().mean() > 0.2, "it does not stand"
     inside, depth, grey, surface, found = carried(there, i, j, T)
-    body = inside & (surface == MOVING)
-    good = body & (found == MOVING) & (depth < 0.01)
+    body = inside & (surface == SURFACE_MOVING)
+    good = body & (found == SURFACE_MOVING) & (depth < 0.01)
     assert good.sum() > 0.85 * body.sum() > 1000
     assert depth[good].median() < 2e-5 and grey[good].median() < 6
-    assert grey[inside & (surface == ORDINARY)].median() > 1.5 * grey[good].median() or name == "turntable"
+    assert grey[inside & (surface == SURFACE_ORDINARY)].median() > 1.5 * grey[good].median() or name == "turntable"
 
 
 def test_a_body_hides_what_is_behind_it_and_changes_nothing_else(walk):
     there, plain = room("convoy_slow"), walk.truth(3)
     truth, image = there.truth(3), there[3].image
-    body = truth["surface"] == MOVING
+    body = truth["surface"] == SURFACE_MOVING
     assert 0.2 < body.double().mean() < 0.35
     assert (truth["depth"][body] < plain["depth"][body]).all()
     assert torch.equal(truth["depth"][~body], plain["depth"][~body])
-    beside = (~body & (truth["surface"] == ORDINARY))[:, None].expand_as(image)
+    beside = (~body & (truth["surface"] == SURFACE_ORDINARY))[:, None].expand_as(image)
     assert torch.equal(image[beside], walk[3].image[beside]) and image[~beside].double().std() > 20
 
 
@@ -231,14 +231,16 @@ def test_bodies_go_with_the_viewer_half_as_far_in_his_hand_or_round():
         assert torch.equal(body.R, torch.eye(3, dtype=torch.float64).expand_as(body.R))
     held = room("held_object")
     seen_by_him = se3.compose(se3.invert(held.true_poses), held.body_poses)
-    middle = se3.apply(seen_by_him, se3.apply(guests.VIEWER, torch.tensor([[guests.HELD_AT]]).double()).expand(8, 1, 3))
+    middle = se3.apply(
+        seen_by_him, se3.apply(guests._VIEWER_POSE, torch.tensor([[guests._HELD_CENTRE]]).double()).expand(8, 1, 3)
+    )
     assert 0.005 < (middle[6, 0] - middle[0, 0]).norm() < 0.05
     turned = se3.rotation_angle(seen_by_him.R[6:] @ seen_by_him.R[:2].mT).rad2deg()
     assert ((turned > 1) & (turned < 10)).all()
     table = room("turntable")
     assert torch.equal(table.true_poses.t[0], table.true_poses.t[7])
     angle = se3.rotation_angle(table.body_poses.R[1:] @ table.body_poses.R[:-1].mT).rad2deg()
-    assert torch.allclose(angle, torch.full_like(angle, guests.TURN_DEG), atol=1e-6)
+    assert torch.allclose(angle, torch.full_like(angle, guests._TURN_DEG_PER_FRAME), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -251,23 +253,25 @@ def test_near_returns_lie_on_the_body(name, least, most):
         frame = there.recording[i]
         kind = torch.nn.functional.interpolate(there.recording.truth(i)["surface"][None].float(), frame.depth.shape[1:])
         close = (frame.depth > 0) & (frame.depth <= there.near)
-        share = (kind[0][close] == MOVING).double().mean()
+        share = (kind[0][close] == SURFACE_MOVING).double().mean()
         assert close.double().mean() > 0.2 and least <= share <= most
-        candidates = (there.recording.truth(i)["depth"] > there.near) & (there.recording.truth(i)["surface"] != MOVING)
+        candidates = (there.recording.truth(i)["depth"] > there.near) & (
+            there.recording.truth(i)["surface"] != SURFACE_MOVING
+        )
         assert candidates.double().mean() > 0.4
 
 
 def test_a_moving_body_is_counted_apart():
     batch = protocol.Batch(open_stress(["convoy"], hw=(48, 64), n_frames=7)[0], [], None, *[None] * 5)
-    assert batch.odd[MOVING] == "moving" and MOVING not in SyntheticRoom.surfaces
+    assert batch.odd[SURFACE_MOVING] == "moving" and SURFACE_MOVING not in SyntheticRoom.surfaces
 
 
 def test_guests_are_painted_like_the_room_and_cast_no_shadow():
     scene, size = furnished_room(2), ((0.0, -1.0, 1.0), (0.1, 0.1, 0.1))
     with pytest.raises(ValueError, match="casts a shadow"):
-        scene.joined_by([Solid(*size, Surface("print"))])
+        scene.joined_by([Solid(*size, Material("print"))])
     with pytest.raises(ValueError, match="zebra"):
-        scene.joined_by([Solid(*size, Surface("zebra"), shadow=False)])
+        scene.joined_by([Solid(*size, Material("zebra"), shadow=False)])
 
 
 def test_fast_is_sixty_to_a_hundred_and_fifty_pixels_from_frame_to_partner():

@@ -12,7 +12,7 @@ from pyarrow import parquet
 from dhtorch import testing as writers
 from dhtorch.cli.run import main
 from dhtorch.data.rig import open_rig
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import results as result_files
 from dhtorch.synthetic.recording import SyntheticRoom
 
 LEFT, FRONT = "observation.images.left", "observation.images.front"
@@ -49,7 +49,7 @@ def test_a_job_of_two_cameras_is_that_of_each_alone(robot, tmp_path):
     source = ["data=lerobot", f"data.root={robot}", "pairs.gap=2", "holdout=none", "figures=false", *ASKED]
     for name, said in (("both", f"[{LEFT},{FRONT}]"), ("left", LEFT), ("front", FRONT)):
         assert main([*source, f"data.camera={said}", f"output={tmp_path / name}"]) == 0
-    both, *each = (archive.read(tmp_path / name) for name in ("both", "left", "front"))
+    both, *each = (result_files.read_result(tmp_path / name) for name in ("both", "left", "front"))
     assert [name.rpartition("/")[2] for name in both["data"]["scenes"]] == ["left", "front"]
 
     def of(result, camera):
@@ -89,7 +89,7 @@ def test_features_of_two_cameras_are_refused_and_name_the_option(robot, tmp_path
 def test_other_cameras_of_the_instant_are_the_views_of_pairs_cameras(robot, tmp_path):
     words = ["data=rig", f"data.root={robot}", "pairs=cameras", "holdout=none", "figures=false", *ASKED]
     assert main([*words, f"output={tmp_path / 'rig'}"]) == 0
-    pairs = [tuple(row["pair"]) for row in archive.read(tmp_path / "rig")["rows"] if row["pair"]]
+    pairs = [tuple(row["pair"]) for row in result_files.read_result(tmp_path / "rig")["rows"] if row["pair"]]
     rig = open_rig(robot)[0].recording
     assert pairs and all(i // 2 == j // 2 and i % 2 != j % 2 for i, j in pairs), "another camera, the same instant"
     assert {i % 2 for i, _ in pairs} == {0, 1} and sorted(rig.cameras) == ["front", "left"]

@@ -16,11 +16,11 @@ from dhtorch.transforms import (
     ExtendDepth,
     ExtendedDataset,
     ExtendedStream,
-    JudgeDepth,
     NumpyTransform,
     RldsBatchTransform,
     SampleError,
     SampleProblem,
+    ValidateDepth,
     collate_kept,
     one_thread,
 )
@@ -301,7 +301,7 @@ def test_a_batch_is_not_taken_for_time():
             tiny()(shown)
     whole = tiny(batched=True)(batch)
     assert whole["dhtorch.uv"].shape[0] == 2
-    judge = JudgeDepth(depth_unit="mm", other_image="before")
+    judge = ValidateDepth(depth_unit="mm", other_image="before")
     with pytest.raises(SampleError, match="batched=True"):
         judge(batch)
 

@@ -9,7 +9,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, default_collate
 
 from dhtorch.transforms import AddedCollate, collate_kept
-from dhtorch.transforms.collate import collated, in_one_piece
+from dhtorch.transforms.collate import collate_shared, pack_shared
 
 PREFIX = "ours."
 SHAPES = {"depth": (3,), "tokens": (5, 2), "flag": (7,), "one": (), "none": (0, 2)}
@@ -49,10 +49,12 @@ def pieces(batch):
 
 
 def whole(samples):
-    return in_one_piece(default_collate(samples), PREFIX)
+    return pack_shared(default_collate(samples), PREFIX)
 
 
-@pytest.mark.parametrize("collate", [partial(collated, prefix=PREFIX), whole, partial(collate_kept, prefix=PREFIX)])
+@pytest.mark.parametrize(
+    "collate", [partial(collate_shared, prefix=PREFIX), whole, partial(collate_kept, prefix=PREFIX)]
+)
 def test_from_a_worker_our_tensors_come_in_one_piece(collate):
     expected = batches(None, 0)
     for found, batch in zip(batches(collate, 1), expected, strict=True):
@@ -70,7 +72,7 @@ def test_from_a_worker_our_tensors_come_in_one_piece(collate):
         assert bounds[-1][0] + bounds[-1][1] - bounds[0][0] <= found[PREFIX + "depth"].untyped_storage().nbytes()
 
 
-@pytest.mark.parametrize("collate", [partial(collated, prefix=PREFIX), whole])
+@pytest.mark.parametrize("collate", [partial(collate_shared, prefix=PREFIX), whole])
 def test_where_nothing_leaves_the_process_nothing_is_shared(collate):
     for batch in batches(collate, 0):
         assert len(set(pieces(batch).values())) == len(pieces(batch))
@@ -78,7 +80,7 @@ def test_where_nothing_leaves_the_process_nothing_is_shared(collate):
 
 
 def test_a_batch_without_ours_is_torchs():
-    for found, expected in zip(batches(partial(collated, prefix="nobody"), 1), batches(None, 1), strict=True):
+    for found, expected in zip(batches(partial(collate_shared, prefix="nobody"), 1), batches(None, 1), strict=True):
         assert found.keys() == expected.keys() and len(set(pieces(found).values())) == len(pieces(found))
 
 
@@ -101,4 +103,4 @@ def test_another_collator_keeps_its_keys_beside_ours():
 def test_shapes_that_differ_are_told(monkeypatch):
     monkeypatch.setattr(Items, "__getitem__", lambda self, i: {PREFIX + "depth": torch.zeros(2 + i)})
     with pytest.raises(RuntimeError, match=r"equal size, but got \[2\] at entry 0 and \[3\] at entry 1"):
-        batches(partial(collated, prefix=PREFIX), 1)
+        batches(partial(collate_shared, prefix=PREFIX), 1)

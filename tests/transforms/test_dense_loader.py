@@ -15,20 +15,20 @@ from torch.utils.data import default_collate
 from dhtorch import MAP
 from dhtorch.cli.run import main
 from dhtorch.codes import Source
-from dhtorch.extract import ExtractOptions, Features, columns, shards
-from dhtorch.extract.dataset import maps_hw
+from dhtorch.extract import ExtractOptions, FeatureTable, columns, shards
+from dhtorch.extract.dataset import common_map_hw
 from dhtorch.pipeline import dense
-from dhtorch.records import Map
+from dhtorch.records import MergedDepth
 from dhtorch.transforms import (
     AddedCollate,
+    DenseMaps,
     ExtendDepth,
     ExtendedDataset,
-    Maps,
     NumpyTransform,
     RldsBatchTransform,
     SampleError,
     SampleProblem,
-    Views,
+    SampleSpec,
     patch_tokens,
 )
 
@@ -77,17 +77,19 @@ def test_the_other_keys_are_those_without_maps(pair):
 
 def test_maps_and_tokens_are_those_of_the_dense_method(sample, pair):
     out = pair[0]
-    read = Views(depth_unit="mm", other_image="before").read(sample)
+    read = SampleSpec(depth_unit="mm", other_image="before").read(sample)
     with torch.no_grad():
-        found = dense.complete(read.anchor, read.other, method=METHOD, calibration=dense.shipped(), **DENSE)
+        found = dense.complete_depth(
+            read.anchor, read.other, method=METHOD, calibration=dense.default_calibration(), **DENSE
+        )
     swept = found.source == Source.SWEPT
     assert swept.sum() > 500 and (~found.keep).sum() > 500, "or there is nothing to compare"
     for key in ("depth", "sigma", "score", "source", "gate"):
         expected = torch.where(found.keep | (key == "gate"), getattr(found, key), 0)[0]
         assert torch.equal(out[f"{key}_map"], expected), key
-    uv = dense.pixels(read.anchor, (SIZE, SIZE))
+    uv = dense.map_pixel_centres(read.anchor, (SIZE, SIZE))
     hole = METHOD.look_at(read.anchor, uv).hole
-    every = Map(uv[None], *(out[f"{key}_map"].reshape(1, -1) for key in ("depth", "sigma", "score", "source")))
+    every = MergedDepth(uv[None], *(out[f"{key}_map"].reshape(1, -1) for key in ("depth", "sigma", "score", "source")))
     tokens, known = patch_tokens(every, hole, (SIDE, SIDE))
     assert torch.equal(out["tokens"], tokens[0]) and torch.equal(out["tokens_valid"], known[0])
 
@@ -128,8 +130,8 @@ def test_a_batch_is_its_samples_and_the_unpaired_get_the_sensor_alone(items):
     alone = added(default_collate([single(s) for s in samples]))
     assert [k for k in alone if not torch.equal(alone[k], together[k])] == []
     assert (together["source_map"] == Source.SWEPT).flatten(1).any(1).tolist() == [True, False, True, True]
-    anchor = Views(depth_unit="mm").read(items[GAP + 1]).anchor
-    sensed = dense.sensed(anchor, method=METHOD, size=SIZE)
+    anchor = SampleSpec(depth_unit="mm").read(items[GAP + 1]).anchor
+    sensed = dense.sensor_depth_map(anchor, method=METHOD, size=SIZE)
     assert torch.equal(together["depth_map"][1], sensed.depth[0].nan_to_num())
     assert torch.equal(together["gate_map"][1], sensed.gate[0])
     none = added(transform(other_image=None, **options)(items[GAP + 1]))
@@ -174,10 +176,10 @@ def test_options_that_cannot_be_raise_when_it_is_made(wrong, said):
 
 
 def test_true_is_what_complete_does_by_itself():
-    standard = Maps.asked(True)
-    assert standard.options == Maps.asked({}).options and Maps.asked(False) is None
-    assert {k: dense.complete.__kwdefaults__[k] for k in standard.options} == standard.options
-    changed = Maps.asked({"size": 224, "max_sigma_rel": 1}).options
+    standard = DenseMaps.asked(True)
+    assert standard.options == DenseMaps.asked({}).options and DenseMaps.asked(False) is None
+    assert {k: dense.complete_depth.__kwdefaults__[k] for k in standard.options} == standard.options
+    changed = DenseMaps.asked({"size": 224, "max_sigma_rel": 1}).options
     assert changed == {**standard.options, "size": 224, "max_sigma_rel": 1}
 
 
@@ -239,7 +241,7 @@ def bytes_of(folder):
 def test_maps_are_written_read_back_and_resumed(command, tmp_path):
     code, said, err = command("extract.half=true")
     assert code == 0 and "2 shards, 3 rows" in said, err
-    features = Features("out")
+    features = FeatureTable("out")
     about = features.about["columns"]
     kinds = {k: (about[k]["kind"], about[k]["shape"], about[k]["unit"]) for k in SHAPES}
     f, byte = ("float16", [36, 48]), ("uint8", [36, 48], "code")
@@ -284,25 +286,25 @@ class OtherSize(Load):
 
 def test_recordings_of_another_shape_are_refused_before_the_work(tmp_path):
     small, wide = recording(2, load=Load(bad={0})), recording(2, name="two", load=OtherSize(0))
-    assert maps_hw([small, recording(3)], Maps.asked({"size": 21})) == (14, 21)
+    assert common_map_hw([small, recording(3)], DenseMaps.asked({"size": 21})) == (14, 21)
     said = "extract.dense: two has pictures of 28x84 and maps of 11x32, expected maps of 21x32 as of one; extract them"
     with pytest.raises(ValueError, match=said):
-        maps_hw([small, wide], Maps.asked({"size": 32}))
+        common_map_hw([small, wide], DenseMaps.asked({"size": 32}))
     with pytest.raises(ValueError, match="found no frame that can be read"):
-        maps_hw([recording(2, load=Load(bad={0, 1}))], Maps.asked(True))
+        common_map_hw([recording(2, load=Load(bad={0, 1}))], DenseMaps.asked(True))
 
 
 def test_a_frame_of_another_shape_is_one_that_cannot_be_read():
-    wanted = columns.columns(6, 6, map_hw=(14, 21))
+    wanted = columns.feature_columns(6, 6, map_hw=(14, 21))
     made = rows([recording(2, load=OtherSize(1))], 0, wanted=wanted, dense={"size": 21})
     assert made[0].features["depth_map"].shape == (14, 21) and made[1].features is None
     assert "one, frame 1: depth_map: found 7x21, expected 14x21 as of the first frame" in made[1].complaint
 
 
 def test_few_maps_are_held_at_once():
-    assert shards.group_rows(columns.columns(2048, 256)) == shards.GROUP_ROWS
-    large = columns.columns(2048, 256, map_hw=(480, 640))
-    assert 1 < shards.group_rows(large) < 5
-    held = shards.group_rows(large) * sum(c.n_bytes for c in large.values())
-    assert held <= shards.GROUP_BYTES < held * 2
-    assert shards.group_rows(columns.columns(64, 256, map_hw=(2160, 3840))) == 1
+    assert shards._rows_per_group(columns.feature_columns(2048, 256)) == shards._MAX_GROUP_ROWS
+    large = columns.feature_columns(2048, 256, map_hw=(480, 640))
+    assert 1 < shards._rows_per_group(large) < 5
+    held = shards._rows_per_group(large) * sum(c.n_bytes for c in large.values())
+    assert held <= shards._MAX_GROUP_BYTES < held * 2
+    assert shards._rows_per_group(columns.feature_columns(64, 256, map_hw=(2160, 3840))) == 1

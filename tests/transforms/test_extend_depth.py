@@ -17,20 +17,18 @@ import dhtorch
 from dhtorch import PAPER
 from dhtorch.codes import Flag, Gate, Source
 from dhtorch.geometry import camera as cam
-from dhtorch.records import Frame, Verdict
+from dhtorch.records import DepthValidation, Frame
 from dhtorch.stages import score
 from dhtorch.transforms import (
     ExtendDepth,
     ExtendedDataset,
-    JudgeDepth,
     SampleError,
     SampleProblem,
-    Views,
+    SampleSpec,
+    ValidateDepth,
     collate_kept,
     one_thread,
-)
-from dhtorch.transforms import (
-    sample_spec as views,
+    sample_spec,
 )
 from dhtorch.transforms import (
     validate_depth as judge_depth,
@@ -74,7 +72,7 @@ def test_it_adds_what_the_method_answers(sample, items):
     out = transform()(sample)
     assert out is not sample and all(out[k] is sample[k] for k in sample)
     assert all(np.array_equal(sample[k], before[k]) for k in sample), "the sample is not changed in place"
-    read = Views(depth_unit="mm", other_image="before").read(sample)
+    read = SampleSpec(depth_unit="mm", other_image="before").read(sample)
     trace = {}
     estimate = dhtorch.extend(read.anchor, read.other, n=N, trace=trace)
     found, mine = dhtorch.merge(trace["samples"], estimate), added(out)
@@ -232,7 +230,7 @@ def test_a_depth_map_of_its_own_size_and_camera(sample):
     K = sample["intrinsics"]
     # Pixels 1, 3, 5, … of the image: a camera whose pixel centres are exactly those.
     own = [K[0, 0] / 2, K[1, 1] / 2, (K[0, 2] - 1) / 2, (K[1, 2] - 1) / 2]
-    read = Views(depth_unit="mm", depth_intrinsics=own).read({**sample, "depth": half})
+    read = SampleSpec(depth_unit="mm", depth_intrinsics=own).read({**sample, "depth": half})
     assert read.anchor.depth_camera is not None and read.anchor.depth.shape == (1, SIDE // 2, SIDE // 2)
     out = added(transform(depth_intrinsics=own)({**sample, "depth": half}))
     whole = added(transform()(sample))
@@ -267,7 +265,7 @@ def test_a_learned_part_is_a_part_of_the_module(sample):
             self.gain = torch.nn.Parameter(torch.tensor(0.5))
 
         def forward(self, estimate, samples, tracks, fit):
-            ranked = score.rank(estimate, samples, tracks, fit)
+            ranked = score.confidence(estimate, samples, tracks, fit)
             return ranked.replace(score=ranked.score * self.gain)
 
     module = transform(method=dhtorch.extend.replace(score=Scorer()))
@@ -512,15 +510,15 @@ def test_what_a_verdict_does_not_know_is_0_and_said_to_be_unknown():
     told["depth"] = torch.tensor([[[1.0, 0.0]]]).expand(3, 1, 2)
     told |= dict.fromkeys(("evidence", "by_answers", "by_views", "by_maps"), pixel)
     numbers = ("scale", "scale_near", "scale_far", "ruler", "shift", "tilt", "wrong")
-    keys = judge_depth._as_keys(Verdict(**told, **dict.fromkeys(numbers, number)))
+    keys = judge_depth._validation_keys(DepthValidation(**told, **dict.fromkeys(numbers, number)))
     assert keys["state_share"].tolist() == [[1.0, 0.0, 0.0]] * 3, "where the map says nothing, nothing is shared out"
-    for name in judge_depth.NUMBERS:
+    for name in judge_depth._INTERVAL_KEYS:
         assert keys[f"{name}_known"].tolist() == [True, False, False] and keys[name].isfinite().all()
         assert torch.equal(keys[name][0], number[0]) and keys[name][2].tolist() == [0.0] * 3
     assert keys["ceiling_known"].tolist() == [True, True, False] and keys["ceiling"].tolist() == [0.0, 3.0, 0.0]
 
 
-@pytest.mark.parametrize("transform", [ExtendDepth, JudgeDepth])
+@pytest.mark.parametrize("transform", [ExtendDepth, ValidateDepth])
 @pytest.mark.parametrize(
     "sample", [None, torch.zeros(3, 8, 8), "frame", [1, 2]], ids=["none", "tensor", "text", "list"]
 )
@@ -537,7 +535,7 @@ def test_no_sample_is_skipped_but_cannot_be_flagged():
         ExtendDepth(depth_unit="m", on_error="flag")(None)
 
 
-@pytest.mark.parametrize("transform", [ExtendDepth, JudgeDepth])
+@pytest.mark.parametrize("transform", [ExtendDepth, ValidateDepth])
 def test_a_transform_without_a_unit_says_which_there_are(transform):
     with pytest.raises(ValueError, match=r"depth_unit is '', expected one of \['m', 'mm'\] or metres per unit"):
         transform()
@@ -546,6 +544,6 @@ def test_a_transform_without_a_unit_says_which_there_are(transform):
 def test_one_return_that_no_probe_meets_is_a_return():
     depth = torch.zeros(2, 60, 80)
     depth[1, 31, 17] = 1.5
-    assert 2 * views.PROBES < 60 * 80
-    assert views.any_return(depth, views._probes(depth)).tolist() == [False, True]
-    assert views.any_return(depth[1:] + 1, views._probes(depth[1:] + 1)).tolist() == [True]
+    assert 2 * sample_spec._MAX_PROBES < 60 * 80
+    assert sample_spec._has_return(depth, sample_spec._probe_depth(depth)).tolist() == [False, True]
+    assert sample_spec._has_return(depth[1:] + 1, sample_spec._probe_depth(depth[1:] + 1)).tolist() == [True]

@@ -15,7 +15,7 @@ from dhtorch.codes import Gate, Source
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify
 from dhtorch.transforms import ExtendDepth, SampleError, SampleProblem, patch_tokens
-from dhtorch.transforms.status import Tally
+from dhtorch.transforms.status import ProblemCounts
 
 QUIET = {"none": 0, "no_second_view": 0, "no_depth": 0, "unreadable": 0}
 
@@ -422,7 +422,7 @@ def test_gradients_pass_where_they_are_asked_for():
 
 
 def test_counts_are_by_problem():
-    tally = Tally()
+    tally = ProblemCounts()
     tally.add(torch.tensor([0, 3, 3]))
     tally.add(torch.tensor([1], dtype=torch.int32))
     assert tally.report() == {"none": 1, "no_second_view": 1, "no_depth": 0, "unreadable": 2}
@@ -434,7 +434,7 @@ def test_counts_are_by_problem():
 
 def test_workers_count_in_rows_of_their_own(monkeypatch):
     """More workers than rows share some, and none writes into that of the main process."""
-    tally = Tally()
+    tally = ProblemCounts()
     tally.add(torch.tensor([0]))
     for worker in (0, 1, 126, 127):
         info = type("Info", (), {"id": worker})()

@@ -6,9 +6,8 @@ import torch
 from torch.autograd import forward_ad
 from torch.utils.data import default_collate
 
-from dhtorch.transforms import SampleError, Views
-from dhtorch.transforms import sample_spec as views
-from dhtorch.transforms.sample_access import Leaves, to_tensor
+from dhtorch.transforms import SampleError, SampleSpec, sample_spec
+from dhtorch.transforms.sample_access import SampleReader, to_tensor
 
 H, W = 6, 8
 K = [20.0, 22.0, 3.6, 2.4]  # fx fy cx cy
@@ -36,7 +35,7 @@ def sample(**changes):
 
 def read(given, **options):
     batched, dtype = options.pop("batched", False), options.pop("dtype", torch.float32)
-    return Views(**{"depth_unit": "m", **options}).read(given, batched=batched, dtype=dtype)
+    return SampleSpec(**{"depth_unit": "m", **options}).read(given, batched=batched, dtype=dtype)
 
 
 def numbers(camera):
@@ -175,7 +174,7 @@ def test_what_is_no_return_is_zero():
 def test_whole_depths_are_single_precision_whatever_type_tensors_have_by_default(kind):
     torch.set_default_dtype(torch.float64)
     try:
-        found = Views(depth_unit="mm").metres([torch.from_numpy(np.full((H, W), 500, kind))])
+        found = SampleSpec(depth_unit="mm").metres([torch.from_numpy(np.full((H, W), 500, kind))])
     finally:
         torch.set_default_dtype(torch.float32)
     assert found.dtype == torch.float32 and (found == 0.5).all()
@@ -388,7 +387,7 @@ def test_numbers_along_time_are_those_of_the_frame():
 
 
 def test_the_same_numbers_are_read_once_and_others_never_taken_for_them():
-    views = Views(depth_unit="m")
+    views = SampleSpec(depth_unit="m")
     given = [matrix(*K), matrix(*K), matrix(21, 22, 3.5, 2.5), matrix(*K).astype(np.float64), torch.tensor(matrix(*K))]
     given += [
         [*K],
@@ -406,24 +405,24 @@ def test_the_same_numbers_are_read_once_and_others_never_taken_for_them():
     assert first is again
     for k in range(200):  # one for each frame: never more than some are kept
         views.read(sample(intrinsics=matrix(20 + k / 100, *K[1:])))
-    assert len(views._cameras) <= 64 and Views(depth_unit="m") == views
+    assert len(views._cameras) <= 64 and SampleSpec(depth_unit="m") == views
     small = views.read(sample(image=picture(shape=(2 * H, 2 * W, 3)))).anchor.camera
     assert torch.equal(small.c, first.c) and views.read(sample(image=picture(shape=(6 * H, 6 * W, 3)))).bad
     leaf = torch.tensor(matrix(*K), requires_grad=True)
     views.read(sample(intrinsics=leaf)).anchor.camera.f.sum().backward()
     assert leaf.grad.sum() == 2
-    views = Views(depth_unit="m")
+    views = SampleSpec(depth_unit="m")
     with torch.inference_mode():
         views.read(sample())
     assert not views.read(sample()).anchor.camera.f.is_inference(), "a graph could not go through it"
     with forward_ad.dual_level():
         tangent = forward_ad.make_dual(torch.tensor(matrix(*K)), torch.ones(3, 3))
         assert forward_ad.unpack_dual(views.read(sample(intrinsics=tangent)).anchor.camera.f).tangent is not None
-    flat, views = np.array(K, np.float32), Views(depth_unit="m")
+    flat, views = np.array(K, np.float32), SampleSpec(depth_unit="m")
     views.read(sample(intrinsics=flat))
     with pytest.raises(SampleError, match="expected"):
         views.read(sample(intrinsics=flat.reshape(2, 1, 2)))
-    leaves = Leaves(sample(intrinsics=np.array(K, object)), batched=False, dtype=torch.float32)
+    leaves = SampleReader(sample(intrinsics=np.array(K, object)), batched=False, dtype=torch.float32)
     leaves.images("image", None)
     assert leaves.stated("intrinsics") is None, "bytes of objects are addresses"
     assert leaves.stated((20.0, 22.0, 3.6, 2.4)) is not None
@@ -471,7 +470,7 @@ def test_the_principal_point_lies_near_the_centre_of_the_picture():
 def test_numbers_that_are_looked_at_are_judged_as_by_operations(monkeypatch):
     def judged(given):
         with monkeypatch.context() as patched:
-            patched.setattr(views, "_told_at_once", lambda _: False)
+            patched.setattr(sample_spec, "_is_cheap_to_read", lambda _: False)
             return read(given).bad
 
     near = [limit * (1 + step * 2**-23) for limit in (0.01, 100.0) for step in (-100, -2, -1, 0, 1, 2, 100)]
@@ -683,27 +682,27 @@ def test_every_part_of_a_batch_holds_the_same_samples():
 
 
 def test_the_size_of_the_picture_is_height_and_width():
-    views = Views(depth_unit="m", image="a.b")
+    views = SampleSpec(depth_unit="m", image="a.b")
     assert views.image_hw({"a": {"b": picture()}}) == (H, W)
     assert views.image_hw({"a": {"b": np.stack([picture()] * 4)}}) == (H, W)
     assert views.image_hw({"image": picture()}) is None and views.image_hw({"a.b": picture(shape=(H, W))}) is None
-    stated = Views(depth_unit="m", layout="hwc")
+    stated = SampleSpec(depth_unit="m", layout="hwc")
     assert stated.image_hw({"image": picture(shape=(3, 5, 3))}) == (3, 5)
 
 
 @pytest.mark.parametrize("unit", ["cm", "", 0, -0.001, None])
 def test_a_unit_is_a_name_or_a_positive_number(unit):
     with pytest.raises(ValueError, match=r"depth_unit is .*, expected one of"):
-        Views(depth_unit=unit)
+        SampleSpec(depth_unit=unit)
 
 
 def test_options_that_cannot_be_are_refused():
     with pytest.raises(ValueError, match=r"depth_unit is 'cm', expected one of \['m', 'mm'\] or metres per unit"):
-        Views(depth_unit="cm")
+        SampleSpec(depth_unit="cm")
     with pytest.raises(ValueError, match="layout is 'bgr', expected hwc, chw or None"):
-        Views(depth_unit="m", layout="bgr")
+        SampleSpec(depth_unit="m", layout="bgr")
     with pytest.raises(ValueError, match="other_at is a list, expected one number where other_image"):
-        Views(depth_unit="m", other_image="right", other_at=[0])
-    assert Views(depth_unit="m", other_at=[0, 1]).other_at == [0, 1]
+        SampleSpec(depth_unit="m", other_image="right", other_at=[0])
+    assert SampleSpec(depth_unit="m", other_at=[0, 1]).other_at == [0, 1]
     with pytest.raises(ValueError, match="depth_unit is '', expected one of"):
-        Views()
+        SampleSpec()

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from dhtorch import Map
+from dhtorch import MergedDepth
 from dhtorch.codes import Hole, Source, names
-from dhtorch.transforms import CHANNELS, grid, patch_tokens
+from dhtorch.transforms import TOKEN_CHANNELS, patch_tokens, token_grid
 
 
 def drawn(hw, n=300, batch=2, seed=0, dtype=torch.float64):
@@ -18,12 +18,12 @@ def drawn(hw, n=300, batch=2, seed=0, dtype=torch.float64):
     other = torch.randint(1, 7, (batch, n), dtype=torch.int32, generator=g)
     hole = torch.where(source == Source.SENSOR, Hole.NONE, other)
     sigma = depth * (0.02 + 0.2 * torch.rand(batch, n, generator=g, dtype=dtype))
-    return Map(uv, torch.where(source > 0, depth, 0.0), sigma, depth, source), hole
+    return MergedDepth(uv, torch.where(source > 0, depth, 0.0), sigma, depth, source), hole
 
 
 def pooled(found, hole, rows, columns, patch, place):
     """The tokens, one patch and one sample at a time; ``place`` takes a pixel to the network's picture."""
-    tokens = np.zeros((len(found.uv), rows * columns, len(CHANNELS)))
+    tokens = np.zeros((len(found.uv), rows * columns, len(TOKEN_CHANNELS)))
     known = np.zeros(tokens.shape[:2], bool)
     for b in range(len(found.uv)):
         for r in range(rows):
@@ -50,7 +50,7 @@ def pooled(found, hole, rows, columns, patch, place):
 
 
 def test_channels_are_depth_then_answers_then_holes():
-    assert CHANNELS == (
+    assert TOKEN_CHANNELS == (
         "inverse_depth",
         "sigma",
         "answered",
@@ -81,7 +81,7 @@ def test_tokens_are_those_of_a_plain_loop(hw, patch, seen, fit, place):
     tokens, known = patch_tokens(found, hole, hw, patch=patch, tokens_hw=seen, fit=fit)
     rows, columns = (size // patch for size in (seen or hw))
     wanted, some = pooled(found, hole, rows, columns, patch, place)
-    assert tokens.shape == (2, rows * columns, 10) and grid(hw, patch=patch, tokens_hw=seen) == (rows, columns)
+    assert tokens.shape == (2, rows * columns, 10) and token_grid(hw, patch=patch, tokens_hw=seen) == (rows, columns)
     assert np.array_equal(known.numpy(), some) and some.any()
     np.testing.assert_allclose(tokens.numpy(), wanted, rtol=1e-9, atol=1e-12)
     assert torch.allclose(tokens[..., 3:].sum(-1), (tokens[..., 3:].sum(-1) > 0).double()), "shares of holes sum to 1"
@@ -90,7 +90,7 @@ def test_tokens_are_those_of_a_plain_loop(hw, patch, seen, fit, place):
 def told(uv, depth, sigma=0.0, source=1):
     uv = torch.tensor([uv], dtype=torch.float64)
     depth = torch.tensor([depth], dtype=torch.float64)
-    return Map(uv, depth, depth * 0 + sigma, depth, torch.full(depth.shape, source, dtype=torch.int32))
+    return MergedDepth(uv, depth, depth * 0 + sigma, depth, torch.full(depth.shape, source, dtype=torch.int32))
 
 
 def test_patches_go_row_by_row_and_a_pixel_on_the_edge_is_in_the_later_one():
@@ -156,7 +156,7 @@ def test_tokens_lie_where_the_network_sees_them(fit):
     uv = torch.cartesian_prod(torch.arange(120.0), torch.arange(60.0))[None]
     value = 1 / (1 + uv[..., 0] + 200 * uv[..., 1])  # a depth that tells the pixel
     one = torch.ones_like(value)
-    found = Map(uv, value, 0 * one, one, one.int())
+    found = MergedDepth(uv, value, 0 * one, one, one.int())
     tokens, known = patch_tokens(found, one.int() * 0, hw, tokens_hw=(side, side), fit=fit)
     picture = (1 / value).view(120, 60).T[None, None]
     if fit == "crop":
@@ -172,7 +172,7 @@ def test_tokens_lie_where_the_network_sees_them(fit):
 
 
 def test_tokens_refuse_what_cannot_be():
-    found = Map(*(torch.zeros(1, 0, 2), *torch.zeros(3, 1, 0), torch.zeros(1, 0, dtype=torch.int32)))
+    found = MergedDepth(*(torch.zeros(1, 0, 2), *torch.zeros(3, 1, 0), torch.zeros(1, 0, dtype=torch.int32)))
     tokens, known = patch_tokens(found, torch.zeros(1, 0), (28, 28))
     assert tokens.shape == (1, 4, 10) and not known.any() and (tokens == 0).all()
     with pytest.raises(ValueError, match="found a picture of 10x28, expected at least one patch of 14 px"):
@@ -185,10 +185,10 @@ def test_tokens_refuse_what_cannot_be():
 
 
 def test_a_grid_counts_whole_patches():
-    assert grid((28, 43)) == (2, 3) and grid((480, 640), patch=16, tokens_hw=(31, 64)) == (1, 4)
-    assert grid((14, 14)) == (1, 1) and grid((3, 3), patch=3, tokens_hw=(5, 3)) == (1, 1)
+    assert token_grid((28, 43)) == (2, 3) and token_grid((480, 640), patch=16, tokens_hw=(31, 64)) == (1, 4)
+    assert token_grid((14, 14)) == (1, 1) and token_grid((3, 3), patch=3, tokens_hw=(5, 3)) == (1, 1)
     for hw, patch in (((13, 40), 14), ((40, 13), 14), ((40, 40), 0), ((40, 40), -1)):
         with pytest.raises(ValueError, match=f"found a picture of {hw[0]}x{hw[1]}, expected .* patch of {patch} px"):
-            grid(hw, patch=patch)
+            token_grid(hw, patch=patch)
     with pytest.raises(ValueError, match="found a picture of 9x50"):
-        grid((400, 400), tokens_hw=(9, 50))
+        token_grid((400, 400), tokens_hw=(9, 50))

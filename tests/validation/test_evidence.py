@@ -7,20 +7,19 @@ import pytest
 import torch
 
 from dhtorch.codes import Flag, Gate
-from dhtorch.geometry import plane_sweep as sweep
-from dhtorch.geometry import se3
+from dhtorch.geometry import plane_sweep, se3
 from dhtorch.geometry.camera import Camera
-from dhtorch.pipeline.surface import Partner
+from dhtorch.pipeline.surface import SourceView
 from dhtorch.records import Estimate, Samples
 from dhtorch.validation import evidence
 from dhtorch.validation.evidence import (
-    References,
-    by_answers,
-    by_maps,
-    by_views,
-    extent,
-    loosened,
-    references,
+    ValidationReferences,
+    depth_consistency_evidence,
+    inflate_sigma,
+    photometric_evidence,
+    resolution_sigma,
+    sparse_evidence,
+    validation_references,
 )
 
 HW = (24, 32)
@@ -30,7 +29,7 @@ def told(uv, depth, sigma=0.01, shared=0.0, near=False):
     """Answers at pixels (N, 2) of a picture of ``HW``."""
     uv = torch.tensor(uv, dtype=torch.float32)[None]
     full = [torch.as_tensor(x, dtype=torch.float32).expand(1, uv.shape[1]) for x in (depth, sigma, shared)]
-    return References(
+    return ValidationReferences(
         uv, *full, used=torch.ones_like(full[0], dtype=torch.bool), near=torch.full_like(full[0], near) > 0
     )
 
@@ -40,8 +39,8 @@ def a_view(t, use=True):
     camera = Camera(torch.tensor([[40.0, 40.0]]), torch.tensor([[15.5, 11.5]]))
     picture = torch.rand(1, 1, *HW, generator=torch.Generator().manual_seed(0))
     T = se3.exp(torch.tensor([[0.0, 0.0, 0.0, *t]]))
-    return sweep.base(picture, camera), Partner(
-        sweep.View(picture, camera, T), picture.expand(-1, 3, -1, -1), None, torch.tensor([use])
+    return plane_sweep.make_reference_view(picture, camera), SourceView(
+        plane_sweep.SweptView(picture, camera, T), picture.expand(-1, 3, -1, -1), None, torch.tensor([use])
     )
 
 
@@ -54,7 +53,7 @@ def test_what_a_return_says_is_not_said_again_by_an_answer():
     )
     answers = Estimate.silent(samples, Gate.ANSWER, n_views=2)
     answers = answers.replace(depth=3 * two, sigma=0.1 * two, sigma_shared=0.05 * two)
-    found = references(samples, answers, near=True)
+    found = validation_references(samples, answers, near=True)
     assert found.depth.tolist() == [[1.0, 6.0]]
     assert found.near.tolist() == [[True, False]]
     assert found.shared[0, 0] == 0, "a return shares no motion"
@@ -63,8 +62,8 @@ def test_what_a_return_says_is_not_said_again_by_an_answer():
 
 def test_answers_that_disagree_are_as_unsure_as_they_disagree():
     flat = torch.full((1, *HW), 2.0)
-    alike = by_answers(flat, HW, told([[10, 10], [14, 10]], [1.5, 1.5]), 0.02)
-    apart = by_answers(flat, HW, told([[10, 10], [14, 10]], [1.2, 1.9]), 0.02)
+    alike = sparse_evidence(flat, HW, told([[10, 10], [14, 10]], [1.5, 1.5]), 0.02)
+    apart = sparse_evidence(flat, HW, told([[10, 10], [14, 10]], [1.2, 1.9]), 0.02)
     assert alike.misfit[0, 10, 12] == pytest.approx(math.log(2 / 1.5) / math.hypot(0.01, 0.02), rel=1e-3)
     middle = 0.5 * (math.log(2 / 1.2) + math.log(2 / 1.9))
     spread = 0.5 * (math.log(2 / 1.2) - math.log(2 / 1.9))
@@ -74,30 +73,30 @@ def test_answers_that_disagree_are_as_unsure_as_they_disagree():
 def test_a_reference_is_as_unsure_as_the_map_is_loose_there():
     loose = torch.zeros(1, 12, 16)
     loose[0, 5, 5] = 0.03
-    found = loosened(told([[10.5, 10.5], [20, 20]], 2.0, sigma=0.04), loose, HW)
+    found = inflate_sigma(told([[10.5, 10.5], [20, 20]], 2.0, sigma=0.04), loose, HW)
     torch.testing.assert_close(found.sigma, torch.tensor([[0.05, 0.04]]))
 
 
 def test_a_map_as_fine_as_its_grid_has_no_extent():
     step = torch.tensor([1.0, 3.0, 3.0, 1.0]).expand(1, 2, 4)
-    assert not extent(step, (2, 4)).any()
-    assert not extent(step, (1, 2)).any()
-    assert extent(step, (2, 8)).any()
+    assert not resolution_sigma(step, (2, 4)).any()
+    assert not resolution_sigma(step, (1, 2)).any()
+    assert resolution_sigma(step, (2, 8)).any()
     finer_down = torch.tensor([1.0, 3.0, 3.0, 1.0])[:, None].expand(1, 4, 2)  # and coarser across, without a step there
-    assert not extent(finer_down, (2, 4)).any()
+    assert not resolution_sigma(finer_down, (2, 4)).any()
 
 
 def test_the_extent_of_a_pixel_is_how_far_the_next_one_may_be_true():
     near, far = 1.0, 3.0
     step = torch.tensor([[[near, near, far, far]]]).expand(1, 2, 4)
-    assert not extent(step, (2, 4)).any()
-    assert not extent(step, (1, 2)).any()  # finer than the grid
-    found = extent(step, (4, 8))
+    assert not resolution_sigma(step, (2, 4)).any()
+    assert not resolution_sigma(step, (1, 2)).any()  # finer than the grid
+    found = resolution_sigma(step, (4, 8))
     by_hand = math.log(far / near) * torch.tensor([0, 0, 0, 0.25, 0.25, 0, 0, 0]).sqrt()
     torch.testing.assert_close(found, by_hand.expand(1, 4, 8))
     hole = step.clone()
     hole[..., 2] = 0
-    assert not extent(hole, (4, 8)).any()  # a step to no value is none
+    assert not resolution_sigma(hole, (4, 8)).any()  # a step to no value is none
 
 
 def test_of_several_views_the_mildest_counts(monkeypatch):
@@ -105,9 +104,11 @@ def test_of_several_views_the_mildest_counts(monkeypatch):
     base, partner = a_view((0.1, 0, 0))
     flat = torch.full((1, *HW), 2.0)
     monkeypatch.setattr(
-        evidence, "_by_view", lambda q, base, p, tolerance: (torch.full_like(q, said[p.fit]), torch.ones_like(q) > 0)
+        evidence,
+        "_view_evidence",
+        lambda q, base, p, tolerance: (torch.full_like(q, said[p.fit]), torch.ones_like(q) > 0),
     )
-    found = by_views(flat, base, [partner._replace(fit=k) for k in said], 0.02)
+    found = photometric_evidence(flat, base, [partner._replace(fit=k) for k in said], 0.02)
     assert (found.misfit == -2).all()
     assert (found.view == 1).all()
 
@@ -117,28 +118,28 @@ def test_a_pixel_without_a_depth_has_none_from_its_window(monkeypatch):
     holed = torch.full((1, *HW), 2.0)
     holed[0, 10, 10] = 0
     monkeypatch.setattr(
-        evidence, "_by_view", lambda q, base, p, tolerance: (torch.full_like(q, 1.0), torch.ones_like(q) > 0)
+        evidence, "_view_evidence", lambda q, base, p, tolerance: (torch.full_like(q, 1.0), torch.ones_like(q) > 0)
     )
-    found = by_views(holed, base, [partner], 0.02)
+    found = photometric_evidence(holed, base, [partner], 0.02)
     assert found.misfit[0, 10, 10].isnan()
     assert found.misfit[0, 10, 11] == 1
 
 
 def test_the_best_of_other_depths_is_named_with_its_factor(monkeypatch):
     q = torch.full((1, *HW), 0.5)
-    likes = dict.fromkeys(evidence.RIVALS, 0.1) | {0.58: 0.95, 1.14: 0.6}
+    likes = dict.fromkeys(evidence.RIVAL_FACTORS, 0.1) | {0.58: 0.95, 1.14: 0.6}
 
     def fit(base, view, picture, at, *, radius):
         value = likes[min(likes, key=lambda k: abs(k - float(at[0, 0, 0]) / 0.5))]
         return SimpleNamespace(correlation=torch.full_like(at, value), seen=torch.ones_like(at) > 0)
 
-    monkeypatch.setattr(sweep, "fit_windows", fit)
+    monkeypatch.setattr(plane_sweep, "fit_windows", fit)
     base, partner = a_view((0.1, 0, 0))
     best, factor, beside = evidence._rivals(q, base, partner)
     assert best[0, 5, 5] == pytest.approx(0.95)
     assert factor[0, 5, 5] == pytest.approx(0.58)
     assert beside[0, 5, 5] == pytest.approx(
-        0.95 if 0.7 * evidence.TELLS < -math.log(0.58) < 3 * evidence.TELLS else 0.6
+        0.95 if 0.7 * evidence.DETECTABLE_LOG_RATIO < -math.log(0.58) < 3 * evidence.DETECTABLE_LOG_RATIO else 0.6
     )
 
 
@@ -148,7 +149,7 @@ def test_what_another_view_does_not_see_it_says_nothing_of():
     pose = SimpleNamespace(
         cov=1e-8 * torch.eye(6)[None], shutter=None, ok=torch.tensor([True]), T_1_from_0=partner.view.T_1_from_0
     )
-    misfit, sure = evidence._by_view(torch.full((1, *HW), 1.0), base, partner._replace(fit=pose), 0.02)
+    misfit, sure = evidence._view_evidence(torch.full((1, *HW), 1.0), base, partner._replace(fit=pose), 0.02)
     assert misfit[0, :, -10:].isnan().all()
     assert not sure[0, :, -10:].any()
 
@@ -163,11 +164,11 @@ def test_windows_that_fit_say_nothing_where_the_lens_knows_no_ray(monkeypatch):
         seen=like > 0, correlation=like * 0 + 0.99, noise=like * 1e-6, contrast=like, step=like * 0.1,
         motion=torch.full((1, *HW, 2), 4.0),
     )  # fmt: skip
-    monkeypatch.setattr(sweep, "fit_windows", lambda *args, **options: window)
+    monkeypatch.setattr(plane_sweep, "fit_windows", lambda *args, **options: window)
     monkeypatch.setattr(evidence, "_rivals", lambda *args: (like * 0 + 0.1, like * 0 + 1.14, like * 0 + 0.1))
     known = torch.ones(1, *HW, dtype=torch.bool)
     known[0, :, :5] = False
-    misfit, sure = evidence._by_view(like, base.replace(known=known.flatten(1)), partner._replace(fit=pose), 0.02)
+    misfit, sure = evidence._view_evidence(like, base.replace(known=known.flatten(1)), partner._replace(fit=pose), 0.02)
     assert misfit[known].isfinite().all()
     assert sure[known].all()
     assert misfit[~known].isnan().all()
@@ -178,11 +179,13 @@ def test_maps_speak_only_between_views_that_stand_apart():
     """A surface in front of what the other view's map shows: one of the two is wrong, if the views tell depths apart."""
     near, far = torch.full((1, *HW), 1.0), torch.full((1, *HW), 3.0)
     base, apart = a_view((0.6, 0, 0))
-    found = by_maps(near, base, [apart], [far], 0.02)
+    found = depth_consistency_evidence(near, base, [apart], [far], 0.02)
     known = found.misfit.isfinite()
     assert known.any()
     assert (found.misfit[known] < -3).all()
     assert not found.sure.any()
     base, same = a_view((1e-4, 0, 0))
-    assert not by_maps(near, base, [same], [far], 0.02).misfit.isfinite().any()
-    assert not by_maps(far, base, [apart], [near], 0.02).misfit.isfinite().any(), "what lies behind may be hidden"
+    assert not depth_consistency_evidence(near, base, [same], [far], 0.02).misfit.isfinite().any()
+    assert not depth_consistency_evidence(far, base, [apart], [near], 0.02).misfit.isfinite().any(), (
+        "what lies behind may be hidden"
+    )

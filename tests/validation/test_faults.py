@@ -6,27 +6,27 @@ import pytest
 import torch
 
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.patches import magnified
+from dhtorch.geometry.patches import rescale_field_of_view
 from dhtorch.metrics.holdout import range_split
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.synthetic.depth_faults import mirrored
-from dhtorch.synthetic.paths import hand_held
+from dhtorch.synthetic.depth_faults import mirror_depth
+from dhtorch.synthetic.paths import hand_held_path
 from dhtorch.validation.faults import (
-    CAUSES,
-    NONE,
-    TRACKING,
-    UNITS,
-    Watched,
-    decided,
-    name_cause,
+    KNOWN_FAULTS,
+    NO_FAULT,
+    TRACKING_METHOD,
+    UNIT_FACTORS,
+    WindowTracks,
+    diagnose,
     ray_lengths,
-    turned,
-    watch,
+    rot90_map,
+    select_cause,
+    track_window,
 )
 
 N, FIRST = 16, 4
-METHOD = TRACKING.replace(n=256)
-UNWATCHED = Watched((), (), ())  # no pair in which anything moves
+METHOD = TRACKING_METHOD.replace(n=256)
+UNWATCHED = WindowTracks((), (), ())  # no pair in which anything moves
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def frames():
 
 @pytest.fixture(scope="module")
 def watched(frames):
-    return watch(frames, METHOD)
+    return track_window(frames, METHOD)
 
 
 def along_the_ray(depth):
@@ -48,10 +48,10 @@ def along_the_ray(depth):
 #: Fault → its kind, and how it is planted; an inverse of the sensor's own has no returns to be held against.
 FAULTS = {
     "unit": ("unit", lambda d: 1000 * d),
-    "mirrored": ("mirrored", mirrored),
+    "mirrored": ("mirrored", mirror_depth),
     "upside down": ("mirrored", lambda d: d.flip(-2)),
-    "rolled": ("rolled", lambda d: turned(d, 1)),
-    "registration": ("registration", lambda d: magnified(d, 1 / 1.35)),
+    "rolled": ("rolled", lambda d: rot90_map(d, 1)),
+    "registration": ("registration", lambda d: rescale_field_of_view(d, 1 / 1.35)),
     "along the ray": ("along the ray", along_the_ray),
     "inverse": ("inverse", lambda d: torch.where(d > 0, 7 / d.clamp_min(0.1), 0.0)),
 }
@@ -71,7 +71,7 @@ def test_a_planted_fault_is_named(name, own, frames, watched):
     kind, plant = FAULTS[name]
     spoilt = [plant(frame.depth) for frame in frames]
     shown, maps = planted(frames, spoilt, own)
-    found = name_cause(shown, maps, method=METHOD, watched=watched)
+    found = diagnose(shown, maps, method=METHOD, watched=watched)
     assert found.kind == kind
     assert found.n_pairs >= 4
 
@@ -79,10 +79,10 @@ def test_a_planted_fault_is_named(name, own, frames, watched):
 @pytest.fixture(scope="module")
 def panned():
     """A camera that walks and looks 3 degrees farther to the left each frame, so that maps of other frames differ."""
-    poses = hand_held("walk", N, step_m=0.06, rate_hz=30.0, seed=1, pan=(24.0, -3.0))
+    poses = hand_held_path("walk", N, step_m=0.06, rate_hz=30.0, seed=1, pan=(24.0, -3.0))
     room = SyntheticRoom(n_frames=N, hw=(180, 240), depth_hw=(90, 120), supersample=1, seed=1, true_poses=poses)
     shown = [room[k] for k in range(N)]
-    return shown, watch(shown, METHOD)
+    return shown, track_window(shown, METHOD)
 
 
 @pytest.mark.parametrize("own", [True, False])
@@ -91,12 +91,12 @@ def test_maps_that_come_late_or_early_are_named_by_how_much(late, name, own, pan
     frames, watched = panned
     spoilt = [frames[min(max(k - late, 0), N - 1)].depth for k in range(N)]
     shown, maps = planted(frames, spoilt, own)
-    assert name_cause(shown, maps, method=METHOD, watched=watched).cause == name
+    assert diagnose(shown, maps, method=METHOD, watched=watched).cause == name
 
 
 def test_a_lag_as_long_as_the_window_cannot_be_told(frames):
     """No pair has a map so much earlier or later: those at the ends say nothing in its place."""
-    found = name_cause(frames[:5], method=METHOD)
+    found = diagnose(frames[:5], method=METHOD)
     assert found.n_pairs == 4
     assert {"none", "4 frames late", "1 frames early"} < set(found.loss)
     assert not {"5 frames late", "5 frames early"} & set(found.loss)
@@ -105,35 +105,42 @@ def test_a_lag_as_long_as_the_window_cannot_be_told(frames):
 def test_pairs_are_as_wide_as_tracks_hold(frames):
     """Two takes of four frames, the second upside down: a pair across the cut shows no point twice."""
     upside_down = [frame.replace(image=frame.image.flip(-2)) for frame in frames[4:8]]
-    assert list(watch(frames[:4], METHOD).pairs) == [(0, 2), (1, 3), (2, 3)]
-    assert list(watch(frames[:4] + upside_down, METHOD).pairs) == [(0, 2), (1, 3), (2, 3), (4, 6), (5, 7), (6, 7)]
+    assert list(track_window(frames[:4], METHOD).pairs) == [(0, 2), (1, 3), (2, 3)]
+    assert list(track_window(frames[:4] + upside_down, METHOD).pairs) == [
+        (0, 2),
+        (1, 3),
+        (2, 3),
+        (4, 6),
+        (5, 7),
+        (6, 7),
+    ]
 
 
 @pytest.mark.parametrize("own", [True, False])
-@pytest.mark.parametrize("name", UNITS)
+@pytest.mark.parametrize("name", UNIT_FACTORS)
 def test_a_unit_is_named(name, own, frames, watched):
-    spoilt = [frame.depth / UNITS[name] for frame in frames]
+    spoilt = [frame.depth / UNIT_FACTORS[name] for frame in frames]
     shown, maps = planted(frames, spoilt, own)
-    assert name_cause(shown, maps, method=METHOD, watched=watched).cause == name
+    assert diagnose(shown, maps, method=METHOD, watched=watched).cause == name
 
 
 def test_a_scale_that_is_no_unit_is_not_named(frames, watched):
     shown = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames]
     for factor in (1.6, 0.5, 7.0):
-        assert name_cause(shown, [factor * f.depth for f in frames], method=METHOD, watched=watched).cause is None
+        assert diagnose(shown, [factor * f.depth for f in frames], method=METHOD, watched=watched).cause is None
 
 
 def test_a_fault_that_is_no_known_one_is_not_named_after_the_nearest(frames, watched):
     """Depths that are bent are explained a little as lengths of rays or as inverse depth, and not by half."""
     shown = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames]
     for power in (1.15, 0.7):
-        assert name_cause(shown, [f.depth**power for f in frames], method=METHOD, watched=watched).cause is None
+        assert diagnose(shown, [f.depth**power for f in frames], method=METHOD, watched=watched).cause is None
 
 
 @pytest.mark.parametrize(("field", "bound"), [(1.6, ""), (0.65, ""), (1.95, "at least "), (0.5, "at most ")])
 def test_a_field_is_told_within_a_step_and_beyond_them_as_a_bound(field, bound, frames, watched):
     shown = [range_split(f, 2.0).replace(T_world_from_cam=None) for f in frames]
-    found = name_cause(shown, [magnified(f.depth, 1 / field) for f in frames], method=METHOD, watched=watched)
+    found = diagnose(shown, [rescale_field_of_view(f.depth, 1 / field) for f in frames], method=METHOD, watched=watched)
     told = re.fullmatch(r"not registered: seen over (at \w+ )?(\d\.\d\d) of the picture's field", found.cause)
     if bound:
         assert told[1] == bound
@@ -145,35 +152,35 @@ def test_pairs_that_some_explanations_cannot_tell_favour_none_of_them():
     """Two hard pairs fall out of the window's end for a late map: what is left is easier, and no explanation."""
     base = torch.tensor([0.6, 0.6, 0.2, 0.2, 0.2, 0.2])
     none_left = torch.full((6,), torch.nan)
-    losses = {cause.name: none_left for cause in CAUSES} | {NONE.name: base}
+    losses = {cause.name: none_left for cause in KNOWN_FAULTS} | {NO_FAULT.name: base}
     late = torch.cat((none_left[:2], base[2:]))
     sideways = base - torch.tensor([0.05, 0.06, 0.05, 0.06, 0.05, 0.06])
-    assert decided(losses | {"1 frames late": late}).cause is None
-    assert decided(losses | {"1 frames late": late, "mirrored left to right": sideways}).kind == "mirrored"
+    assert select_cause(losses | {"1 frames late": late}).cause is None
+    assert select_cause(losses | {"1 frames late": late, "mirrored left to right": sideways}).kind == "mirrored"
 
 
 def test_a_sound_recording_has_no_cause(frames, watched):
-    found = name_cause(frames, method=METHOD, watched=watched)
+    found = diagnose(frames, method=METHOD, watched=watched)
     assert found.cause is None
     assert found.loss["none"] < 1
 
 
 def test_a_wrong_focal_length_is_named_with_a_trajectory_alone(frames, watched):
     long = [f.replace(camera=f.camera.replace(f=1.15 * f.camera.f)) for f in frames]
-    assert name_cause(long, method=METHOD, watched=watched).kind == "focal length"
+    assert diagnose(long, method=METHOD, watched=watched).kind == "focal length"
     lost = [f.replace(T_world_from_cam=None) for f in long]
-    found = name_cause(lost, method=METHOD, watched=watched)
+    found = diagnose(lost, method=METHOD, watched=watched)
     assert not any("focal" in name for name in found.loss), "it cannot be known"
 
 
 def test_the_unit_of_a_sensor_cannot_be_known_without_a_trajectory(frames, watched):
     shown = [f.replace(depth=1000 * f.depth, T_world_from_cam=None) for f in frames]
-    assert name_cause(shown, method=METHOD, watched=watched).cause is None
+    assert diagnose(shown, method=METHOD, watched=watched).cause is None
 
 
 def test_nothing_is_named_where_nothing_can_be_tracked(frames):
     blank = [f.replace(image=torch.full_like(f.image, 128)) for f in frames]
-    found = name_cause(blank, method=METHOD)
+    found = diagnose(blank, method=METHOD)
     assert found.cause is None
     assert found.n_pairs == 0
 
@@ -190,18 +197,18 @@ def still(frames):
 def test_a_camera_that_stands_still_names_faults_of_maps_by_near_returns(name, frames, still):
     kind, plant = FAULTS[name]
     maps = [plant(frames[0].depth)] * len(still)
-    found = name_cause(still, maps, watched=UNWATCHED)
+    found = diagnose(still, maps, watched=UNWATCHED)
     assert (found.kind, found.by, found.n_pairs) == (kind, "returns", 6)
 
 
 def test_a_camera_that_is_said_to_stand_still_is_one(frames, still):
     """Tracks that do not move fit every depth alike, whatever the trajectory."""
     held = [f.replace(T_world_from_cam=frames[0].T_world_from_cam) for f in still]
-    seen = watch(held, METHOD)
+    seen = track_window(held, METHOD)
     assert len(seen.pairs) >= 4
-    maps = [mirrored(frames[0].depth)] * len(held)
-    assert name_cause(held, maps, method=METHOD, watched=seen).kind == "mirrored"
-    own = name_cause([f.replace(depth=maps[0]) for f in held], method=METHOD, watched=seen)
+    maps = [mirror_depth(frames[0].depth)] * len(held)
+    assert diagnose(held, maps, method=METHOD, watched=seen).kind == "mirrored"
+    own = diagnose([f.replace(depth=maps[0]) for f in held], method=METHOD, watched=seen)
     assert own.cause is None, "its own returns are nothing to hold it against"
 
 
@@ -218,51 +225,51 @@ def test_a_camera_that_stands_still_names_no_fault_after_the_nearest(frames, sti
         0 * true,
         0 * true + 2,
     ):
-        assert name_cause(still, [spoilt] * len(still), watched=UNWATCHED).cause is None
+        assert diagnose(still, [spoilt] * len(still), watched=UNWATCHED).cause is None
     holes = [f.replace(depth=0 * f.depth) for f in still]
-    assert name_cause(holes, [1000 * true] * len(still), watched=UNWATCHED).n_pairs == 0
+    assert diagnose(holes, [1000 * true] * len(still), watched=UNWATCHED).n_pairs == 0
 
 
 def test_one_map_a_frame(frames):
     with pytest.raises(ValueError, match="as many maps"):
-        name_cause(frames, [frames[0].depth])
+        diagnose(frames, [frames[0].depth])
 
 
 def test_an_explanation_must_be_clear_and_alone():
     def losses(**saved):
         base = torch.linspace(0.5, 0.6, 8)
-        found = {cause.name: base.clone() for cause in (NONE, *CAUSES)}
+        found = {cause.name: base.clone() for cause in (NO_FAULT, *KNOWN_FAULTS)}
         for name, by in saved.items():
             found[{"mirror": "mirrored left to right", "mm": "mm read as m"}[name]] -= by
         return found
 
-    assert decided(losses(mirror=0.2)).kind == "mirrored"
-    assert decided(losses()).cause is None
-    assert decided(losses(mirror=0.02)).cause is None, "saves little"
-    assert decided(losses(mirror=0.2, mm=0.195)).cause is None, "two kinds explain it"
-    assert decided(losses(mirror=torch.tensor([0.9, -0.3] * 4))).cause is None, "some pairs only"
+    assert select_cause(losses(mirror=0.2)).kind == "mirrored"
+    assert select_cause(losses()).cause is None
+    assert select_cause(losses(mirror=0.02)).cause is None, "saves little"
+    assert select_cause(losses(mirror=0.2, mm=0.195)).cause is None, "two kinds explain it"
+    assert select_cause(losses(mirror=torch.tensor([0.9, -0.3] * 4))).cause is None, "some pairs only"
     few = {name: torch.cat([x[:3], torch.full((5,), torch.nan)]) for name, x in losses(mirror=0.2).items()}
-    assert decided(few).cause is None, "too few pairs tell"
+    assert select_cause(few).cause is None, "too few pairs tell"
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_a_roll_is_undone(quarters):
     depth = torch.arange(48.0).reshape(1, 6, 8).repeat_interleave(8, 1).repeat_interleave(8, 2)
-    back = turned(turned(depth, quarters), 4 - quarters)
+    back = rot90_map(rot90_map(depth, quarters), 4 - quarters)
     assert (back == depth).float().mean() > 0.8
 
 
 def test_a_quarter_turn_is_counter_clockwise():
     depth = torch.zeros(1, 4, 4)
     depth[0, 0, 3] = 1  # the upper right corner
-    assert turned(depth, 1)[0, 0, 0] == 1
-    assert turned(depth, 3)[0, 3, 3] == 1
+    assert rot90_map(depth, 1)[0, 0, 0] == 1
+    assert rot90_map(depth, 3)[0, 3, 3] == 1
 
 
 def test_what_a_motion_swallows_is_not_asked(frames, watched):
     """Inverse depths of the sensor's own have no returns that tell their scale."""
-    own = name_cause(frames, method=METHOD, watched=watched)
-    beside = name_cause(frames, [f.depth for f in frames], method=METHOD, watched=watched)
-    inverse = next(cause.name for cause in CAUSES if cause.kind == "inverse")
+    own = diagnose(frames, method=METHOD, watched=watched)
+    beside = diagnose(frames, [f.depth for f in frames], method=METHOD, watched=watched)
+    inverse = next(cause.name for cause in KNOWN_FAULTS if cause.kind == "inverse")
     assert inverse not in own.loss
     assert inverse in beside.loss

@@ -7,15 +7,23 @@ from pathlib import Path
 import pytest
 import torch
 
-from dhtorch import AUTO, judge
+from dhtorch import AUTO, validate_depth
 from dhtorch.codes import State
 from dhtorch.metrics.detection import auroc
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
 from dhtorch.pytree import collate, stack
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.validation.evidence import Said
-from dhtorch.validation.validate import QUICK, SENSOR_METRE, TRAJECTORY_METRE, cut, decided, judged, share
+from dhtorch.validation.evidence import Evidence
+from dhtorch.validation.validate import (
+    QUICK_METHOD,
+    SENSOR_SCALE_SIGMA,
+    TRAJECTORY_SCALE_SIGMA,
+    clipped_depth,
+    combine_evidence,
+    share_interval,
+    validate_against,
+)
 
 RESULTS = Path(__file__).resolve().parents[2] / "benchmarks" / "results"
 NEAR, ANCHOR, OTHERS = 2.0, 5, (0, 2, 8, 11)
@@ -47,12 +55,12 @@ def true(room):
 def asked(anchor, others):
     """What the sparse method makes of the views: the same for every map of the anchor."""
     trace = {}
-    return dense.views_asked(METHOD(anchor, others, trace=trace), others, trace)
+    return dense.selected_views(METHOD(anchor, others, trace=trace), others, trace)
 
 
 @pytest.fixture(scope="module")
 def sound(true, anchor, others):
-    return judge(true, anchor, others, **SMALL)
+    return validate_depth(true, anchor, others, **SMALL)
 
 
 def at_grid(x, verdict):
@@ -71,7 +79,7 @@ def test_a_true_map_is_consistent_and_its_numbers_hold(sound):
     assert sound.shift[0, 1] < 0 < sound.shift[0, 2]
 
 
-@pytest.mark.parametrize(("name", "good_for"), [("scale_near", SENSOR_METRE), ("ruler", TRAJECTORY_METRE)])
+@pytest.mark.parametrize(("name", "good_for"), [("scale_near", SENSOR_SCALE_SIGMA), ("ruler", TRAJECTORY_SCALE_SIGMA)])
 def test_a_metre_is_told_no_closer_than_what_tells_it_is_good_for(name, good_for, sound):
     """However many points agree: they share one sensor, or one trajectory."""
     _, low, high = getattr(sound, name)[0]
@@ -79,7 +87,7 @@ def test_a_metre_is_told_no_closer_than_what_tells_it_is_good_for(name, good_for
 
 
 def test_near_and_far_that_contradict_each_other_leave_the_scale_open(true, anchor, asked):
-    found = judged(torch.where(true > NEAR, 1.3 * true, true), anchor, asked, **SMALL, views=False)
+    found = validate_against(torch.where(true > NEAR, 1.3 * true, true), anchor, asked, **SMALL, views=False)
     near, far, both = (x[0].log() for x in (found.scale_near, found.scale_far, found.scale))
     assert near[2] < far[1]
     assert near[0] < both[0] < far[0]
@@ -91,14 +99,14 @@ def test_near_and_far_that_contradict_each_other_leave_the_scale_open(true, anch
 def test_a_tilt_is_the_error_from_one_side_of_the_picture_to_the_other(side, tilt, true, anchor):
     n = true.shape[side]
     place = ((torch.arange(n) + 0.5) / n - 0.5).reshape((n, 1) if side == -2 else (n,))
-    value, low, high = judge((1 + tilt * place) * true, anchor, **SMALL).tilt[0]
+    value, low, high = validate_depth((1 + tilt * place) * true, anchor, **SMALL).tilt[0]
     assert value == pytest.approx(tilt, rel=0.05)
     assert 0 < low < tilt < high
 
 
 @pytest.mark.parametrize("factor", [1.1, 1 / 1.1])
 def test_a_wrong_metre_is_found_by_near_returns_and_by_far_answers(factor, true, anchor, others, sound):
-    found = judge(factor * true, anchor, others, **SMALL, views=False)
+    found = validate_depth(factor * true, anchor, others, **SMALL, views=False)
     for name in ("scale", "scale_near", "scale_far"):
         value, low, high = getattr(found, name)[0] / factor
         assert abs(math.log(value)) < 0.03
@@ -109,7 +117,7 @@ def test_a_wrong_metre_is_found_by_near_returns_and_by_far_answers(factor, true,
 def test_a_surface_that_stands_elsewhere_is_wrong_and_its_surroundings_are_not(true, anchor, others):
     moved = torch.zeros_like(true, dtype=torch.bool)
     moved[:, 60:120, 70:140] = True
-    found = judge(torch.where(moved, 1.6 * true, true), anchor, others, **SMALL)
+    found = validate_depth(torch.where(moved, 1.6 * true, true), anchor, others, **SMALL)
     inside = at_grid(moved, found) > 0
     assert ((found.state == State.CONSISTENT) & inside).sum() <= 0.003 * inside.sum()
     assert auroc(found.evidence.abs()[found.known], inside[found.known]) > 0.97
@@ -118,7 +126,7 @@ def test_a_surface_that_stands_elsewhere_is_wrong_and_its_surroundings_are_not(t
 
 
 def test_without_another_view_near_returns_alone_speak(true, anchor):
-    found = judge(true, anchor, **SMALL)
+    found = validate_depth(true, anchor, **SMALL)
     near = at_grid(true, found) < 0.9 * NEAR
     far = at_grid(true, found) > 1.2 * NEAR
     assert (found.known & near).sum() > 0.5 * near.sum()
@@ -129,7 +137,7 @@ def test_without_another_view_near_returns_alone_speak(true, anchor):
 
 
 def test_a_single_sensor_view_can_know_nothing_of_itself(room):
-    found = judge(None, room[ANCHOR], **SMALL)
+    found = validate_depth(None, room[ANCHOR], **SMALL)
     assert not found.known.any()
     assert found.scale.isnan().all()
     assert (found.view == -2).all()
@@ -139,7 +147,7 @@ def test_a_camera_that_only_turns_knows_nothing_of_what_is_far():
     turning = SyntheticRoom(n_frames=6, hw=(180, 240), path="rotation", supersample=1, seed=0)
     near = [range_split(turning[k], NEAR) for k in (0, 2, 5)]
     true = turning.truth(2)["depth"]
-    found = judge(1.3 * true, near[1], stack([near[0], near[2]]), **SMALL)
+    found = validate_depth(1.3 * true, near[1], stack([near[0], near[2]]), **SMALL)
     far = at_grid(true, found) > 1.2 * NEAR
     assert (found.state == State.CONSISTENT)[far].float().mean() < 0.003
 
@@ -148,14 +156,16 @@ def test_quick_leaves_a_metre_unknown_where_the_motion_comes_out_short(room, tru
     """Motions that few points hold loosely are too short: of a true map they would say that it is too far."""
 
     def by_points(method, k):
-        return judge(true, anchor, range_split(room[k], NEAR), method=method, views=False, size=160).scale_far[0]
+        return validate_depth(true, anchor, range_split(room[k], NEAR), method=method, views=False, size=160).scale_far[
+            0
+        ]
 
     beside = (ANCHOR - 1, ANCHOR + 1)
-    loose = torch.stack([by_points(QUICK.replace(triangulate={"min_t_snr": 10.0}), k) for k in beside])
+    loose = torch.stack([by_points(QUICK_METHOD.replace(triangulate={"min_t_snr": 10.0}), k) for k in beside])
     assert (loose[:, 0] > 1.05).all()
     assert (loose[:, 1] > 1).any(), "a false alarm"
-    assert all(by_points(QUICK, k).isnan().all() for k in beside)
-    assert by_points(QUICK, ANCHOR + 3).isfinite().all(), "a wider way is known well enough"
+    assert all(by_points(QUICK_METHOD, k).isnan().all() for k in beside)
+    assert by_points(QUICK_METHOD, ANCHOR + 3).isfinite().all(), "a wider way is known well enough"
 
 
 @pytest.mark.parametrize("name", ["judge_study", "judge_study_streams"])
@@ -171,18 +181,18 @@ def test_what_quick_missed_by_points_alone_it_was_silent_on(name):
 def test_the_sensors_own_metre_is_told_by_a_trajectory_alone(room, others):
     wrong = 1.25
     swollen = [room[k].replace(depth=wrong * room[k].depth) for k in (ANCHOR, *OTHERS)]
-    found = judge(None, swollen[0], stack(swollen[1:]), **SMALL, views=False)
+    found = validate_depth(None, swollen[0], stack(swollen[1:]), **SMALL, views=False)
     _, low, high = found.scale[0]
     assert low < wrong < high
     assert not low <= 1 <= high
     assert found.scale_near.isnan().all()
     lost = [frame.replace(T_world_from_cam=None) for frame in swollen]
-    assert judge(None, lost[0], stack(lost[1:]), **SMALL, views=False).scale.isnan().all()
+    assert validate_depth(None, lost[0], stack(lost[1:]), **SMALL, views=False).scale.isnan().all()
 
 
 def test_exposure_of_other_views_changes_little(true, anchor, others, sound):
     dim = others.replace(image=(others.image.float() / 255 * 0.7 + 0.05))
-    found = judge(true, anchor.replace(image=anchor.image.float() / 255), dim, **SMALL)
+    found = validate_depth(true, anchor.replace(image=anchor.image.float() / 255), dim, **SMALL)
     both = found.known & sound.known
     assert both.sum() > 0.8 * sound.known.sum()
     assert (found.state == sound.state)[both].float().mean() > 0.95
@@ -192,7 +202,7 @@ def test_maps_of_other_views_see_through_what_stands_too_near(room, true, anchor
     maps = torch.stack([room.truth(k)["depth"] for k in OTHERS])
     blob = true.clone()
     blob[:, 60:120, 70:140] *= 0.6
-    found = judge(blob, anchor, others, other_maps=maps, **SMALL)
+    found = validate_depth(blob, anchor, others, other_maps=maps, **SMALL)
     inside = at_grid(blob < 0.9 * true, found) > 0
     told = found.by_maps.isfinite()
     assert (found.by_maps[told & inside] < -3).float().mean() > 0.8
@@ -204,7 +214,7 @@ def test_maps_of_other_views_see_through_what_stands_too_near(room, true, anchor
 def test_coarse_maps_of_other_views_see_through_no_true_outline(fewer, room, true, anchor, asked):
     """An outline lies anywhere between two of their pixels, and what is before it may be either's."""
     maps = torch.stack([room.truth(k)["depth"][:, fewer // 2 :: fewer, fewer // 2 :: fewer] for k in OTHERS])
-    assert not (judged(true, anchor, asked, other_maps=maps, **SMALL).by_maps < -3).any()
+    assert not (validate_against(true, anchor, asked, other_maps=maps, **SMALL).by_maps < -3).any()
 
 
 @pytest.mark.parametrize(("n", "good"), [(2, (1,)), (7, (3, 6))])  # more than are looked at, too
@@ -212,14 +222,14 @@ def test_a_view_that_tells_is_named_by_its_place_among_those_offered(n, good, tr
     blank = torch.full_like(others.image[0], 128)
     offered = [others[k % len(OTHERS)] for k in range(n)]
     offered = [view if k in good else view.replace(image=blank) for k, view in enumerate(offered)]
-    found = judge(true, anchor, stack(offered), **SMALL)
+    found = validate_depth(true, anchor, stack(offered), **SMALL)
     assert set(found.view.unique().tolist()) == {-2, -1, *good}
 
 
 def test_a_map_that_is_cut_is_wrong_or_unknown_where_it_is(true, anchor, others):
     """A byte in centimetres: nothing is farther than 2.55 m, as windows at the outline of what is near would have it."""
     byte = (true * 100).round().clamp_max(255) / 100
-    found = judge(byte, anchor, others, **SMALL)
+    found = validate_depth(byte, anchor, others, **SMALL)
     off = at_grid(true, found) > 1.2 * found.depth
     assert off.float().mean() > 0.3
     assert not (found.state == State.CONSISTENT)[off].any()
@@ -234,7 +244,7 @@ def test_a_wall_that_ends_a_map_is_no_cut_and_neither_is_a_wrong_metre():
     said = torch.zeros_like(grid)
     state[1:, :, 10:], said[1, :, 10:] = State.WRONG, 5.0  # too far
     state[2], said[2:] = State.WRONG, -5.0  # all too near
-    depth, at = cut(grid, state, said)
+    depth, at = clipped_depth(grid, state, said)
     assert depth[:3].isnan().all() and not at[:3].any()
     assert depth[3] == 3 and torch.equal(at[3], grid[3] == 3)
 
@@ -250,9 +260,9 @@ def test_a_wall_that_ends_a_map_is_no_cut_and_neither_is_a_wrong_metre():
 )
 def test_what_is_no_map_is_refused(bad, said, true, anchor):
     with pytest.raises(ValueError, match=said):
-        judge(bad(true), anchor)
+        validate_depth(bad(true), anchor)
     with pytest.raises(ValueError, match=said.replace("depth_map", "other_maps")):
-        judge(true, anchor, other_maps=bad(true)[None])
+        validate_depth(true, anchor, other_maps=bad(true)[None])
 
 
 @pytest.mark.parametrize("fewer", [4, 8])
@@ -263,14 +273,14 @@ def test_a_sound_map_of_few_pixels_is_not_wrong_at_its_outlines(fewer, room, tru
         return x[:, fewer // 2 :: fewer, fewer // 2 :: fewer]
 
     maps = torch.stack([coarse(room.truth(k)["depth"]) for k in OTHERS])
-    found = judge(coarse(true), anchor, others, other_maps=maps, **SMALL)
+    found = validate_depth(coarse(true), anchor, others, other_maps=maps, **SMALL)
 
     def called(verdict):
         return float((verdict.state == State.WRONG).sum() / verdict.known.sum())
 
     assert called(found) < called(sound) + 0.02
     assert found.known.float().mean() > 0.6 * sound.known.float().mean()
-    off = judge(1.1 * coarse(true), anchor, others, **SMALL, views=False)
+    off = validate_depth(1.1 * coarse(true), anchor, others, **SMALL, views=False)
     assert not off.scale[0, 1] <= 1 <= off.scale[0, 2]
 
 
@@ -278,16 +288,16 @@ def test_no_depth_is_never_right_or_wrong(true, anchor, others):
     holes = true.clone()
     holes[:, :, :120] = torch.nan
     holes[:, :60] = 0
-    found = judge(holes, anchor, others, **SMALL)
+    found = validate_depth(holes, anchor, others, **SMALL)
     assert not found.known[at_grid((~(holes > 0)), found) > 0].any()
-    nothing = judge(torch.zeros_like(true), anchor, others, **SMALL)
+    nothing = validate_depth(torch.zeros_like(true), anchor, others, **SMALL)
     assert not nothing.known.any()
     assert nothing.wrong.isnan().all()
 
 
 def test_kinds_of_evidence_that_contradict_each_other_cannot_be_known():
     def said(misfit, sure):
-        return Said(torch.tensor([[[misfit]]]), torch.tensor([[[sure]]]), torch.zeros(1, 1, 1, dtype=torch.int32))
+        return Evidence(torch.tensor([[[misfit]]]), torch.tensor([[[sure]]]), torch.zeros(1, 1, 1, dtype=torch.int32))
 
     nan = math.nan
     silent = said(nan, False)
@@ -301,12 +311,12 @@ def test_kinds_of_evidence_that_contradict_each_other_cannot_be_known():
         ((silent, silent, silent), State.CANNOT_KNOW),
     ]
     for kinds, expected in cases:
-        assert int(decided(*kinds)[0]) == expected
+        assert int(combine_evidence(*kinds)[0]) == expected
 
 
 def test_what_speaks_loudest_decides_and_of_what_is_fine_the_closest():
     def said(misfit, sure, view):
-        return Said(torch.tensor([[[misfit]]]), torch.tensor([[[sure]]]), torch.tensor([[[view]]]))
+        return Evidence(torch.tensor([[[misfit]]]), torch.tensor([[[sure]]]), torch.tensor([[[view]]]))
 
     silent = said(math.nan, False, -2)
     cases = [
@@ -316,22 +326,22 @@ def test_what_speaks_loudest_decides_and_of_what_is_fine_the_closest():
         ((silent, said(2.5, True, 3), silent), (2.5, 3)),
     ]
     for kinds, expected in cases:
-        _, evidence, view = decided(*kinds)
+        _, evidence, view = combine_evidence(*kinds)
         assert (float(evidence), int(view)) == (pytest.approx(expected[0]), expected[1])
-    assert int(decided(silent, silent)[2]) == -2
+    assert int(combine_evidence(silent, silent)[2]) == -2
 
 
 def test_a_share_of_few_has_a_wide_interval():
-    few, many = (share(torch.tensor([0.1 * n]), torch.tensor([n]))[0] for n in (10.0, 1000.0))
+    few, many = (share_interval(torch.tensor([0.1 * n]), torch.tensor([n]))[0] for n in (10.0, 1000.0))
     assert few[1] < many[1] < 0.1 < many[2] < few[2]
-    assert share(torch.zeros(1), torch.zeros(1)).isnan().all()
+    assert share_interval(torch.zeros(1), torch.zeros(1)).isnan().all()
 
 
 @pytest.mark.parametrize("n", [5.0, 50.0])
 def test_none_of_some_may_still_be_a_few(n):
     """Wilson's interval of none: from 0 to z² / (n + z²), not to 0."""
     square = 1.96**2
-    none, all_of = (share(torch.tensor([part]), torch.tensor([n]))[0] for part in (0.0, n))
+    none, all_of = (share_interval(torch.tensor([part]), torch.tensor([n]))[0] for part in (0.0, n))
     torch.testing.assert_close(none, torch.tensor([0.0, 0.0, square / (n + square)]))
     torch.testing.assert_close(all_of, torch.tensor([1.0, n / (n + square), 1.0]))
 
@@ -346,12 +356,12 @@ def test_area_under_the_curve():
 @pytest.mark.parametrize("option", [{"tolerance": 0.2}, {"tolerance": 0}, {"size": 4}, {"partners": 0}])
 def test_options_out_of_range_are_refused(option, true, anchor, others):
     with pytest.raises(ValueError, match="judge: "):
-        judge(true, anchor, others, **option)
+        validate_depth(true, anchor, others, **option)
 
 
 def test_a_map_of_another_batch_is_refused(true, anchor, others):
     with pytest.raises(ValueError, match="judge"):
-        judge(true.expand(2, -1, -1), anchor, others)
+        validate_depth(true.expand(2, -1, -1), anchor, others)
 
 
 def test_a_batch_is_judged_as_its_members_are(room, true, anchor, others):
@@ -360,8 +370,8 @@ def test_a_batch_is_judged_as_its_members_are(room, true, anchor, others):
     both = collate([anchor, other])
     maps = torch.cat([true, 1.1 * room.truth(6)["depth"]])
     views = others[:2]
-    found = judge(maps, both, views.map(lambda x: x.expand(-1, 2, *x.shape[2:])), **SMALL, views=False)
-    alone = judge(maps[1:], other, views, **SMALL, views=False)
+    found = validate_depth(maps, both, views.map(lambda x: x.expand(-1, 2, *x.shape[2:])), **SMALL, views=False)
+    alone = validate_depth(maps[1:], other, views, **SMALL, views=False)
     assert torch.equal(found.state[1:], alone.state)
     assert torch.allclose(found.scale[1:], alone.scale)
 
@@ -369,4 +379,4 @@ def test_a_batch_is_judged_as_its_members_are(room, true, anchor, others):
 def test_a_map_without_pixels_is_refused():
     room = SyntheticRoom(n_frames=1, hw=(48, 64), depth_hw=(24, 32))
     with pytest.raises(ValueError, match=r"depth_map has shape \(1, 0, 0\), expected at least 2×2 pixels"):
-        judge(torch.zeros(1, 0, 0), room[0], None)
+        validate_depth(torch.zeros(1, 0, 0), room[0], None)

@@ -19,7 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from dhtorch.codes import Gate, Hole, Source, State, names
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.viz import plots as drawing
-from dhtorch.viz.plots import Axis, Key, Layer, Panel, Picture, colours, inline, notebook
+from dhtorch.viz.plots import Axis, LayeredPicture, LegendKey, Panel, PointLayer, colours, notebook, render_inline_svg
 from dhtorch.viz.viewer import html as pages
 
 REPO = Path(__file__).resolve().parents[2]
@@ -27,11 +27,11 @@ REPO = Path(__file__).resolve().parents[2]
 
 def panel(title="a scene", **options):
     made = Panel(title, Axis(0, 1, "share, %", percent=True), Axis(0.01, 1, "error, %", log=True), **options)
-    for k, stroke in enumerate(drawing.series(["paper", "map", "mine", "yours"]).values()):
+    for k, stroke in enumerate(drawing.assign_strokes(["paper", "map", "mine", "yours"]).values()):
         made.line([0, 0.5, 1], [0.1, 0.2, 0.1 * (k + 1)], stroke)
         made.dot(0.5, 0.2, stroke, 'says <this>: "x" & more')
     made.diamond(0.7, 0.5, "published: 3")
-    made.bar(0.1, 0.2, 0.01, 0.5, colours.HOLES[Hole.TOO_DARK], colours.SOFT)
+    made.bar(0.1, 0.2, 0.01, 0.5, colours.HOLE_COLOURS[Hole.TOO_DARK], colours.SOFT)
     made.fill([0, 1, 1], [0.1, 0.1, 0.2], colours.FAINT)
     return made
 
@@ -40,8 +40,8 @@ def panel(title="a scene", **options):
 
 
 def test_svg_is_small_the_same_every_time_and_has_no_names_to_meet():
-    made = inline(panel())
-    assert made == inline(panel()) and len(made) < 5000
+    made = render_inline_svg(panel())
+    assert made == render_inline_svg(panel()) and len(made) < 5000
     tree = ET.fromstring(made)
     assert tree.get("role") == "img" and tree.get("aria-label") == "a scene"
     for word in ("id=", "href", "url(", "http", "xmlns", "<style", "<metadata", "font-family", "clip", "NaN"):
@@ -53,9 +53,9 @@ def test_svg_is_small_the_same_every_time_and_has_no_names_to_meet():
 
 
 def test_svg_takes_the_colours_of_the_page_and_leaves_the_others():
-    made = inline(panel())
+    made = render_inline_svg(panel())
     assert "stroke:var(--ink)" in made and "fill:var(--theirs-ground)" in made and "stroke:var(--faint)" in made
-    assert f"stroke:{colours.METHODS['map'].lower()}" in made and colours.INK not in made
+    assert f"stroke:{colours.METHOD_COLOURS['map'].lower()}" in made and colours.INK not in made
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_svg_takes_the_colours_of_the_page_and_leaves_the_others():
 )
 def test_any_name_can_be_a_title_and_a_row(name):
     for made in (panel(name), Panel("", Axis(0, 1), None, size=(300, 0), rows=[name, "b"])):
-        tree = ET.fromstring(inline(made))
+        tree = ET.fromstring(render_inline_svg(made))
         said = "".join(tree.itertext())
         first = " ".join(name.encode("utf-8", "replace").decode().replace("\x00", "\ufffd").split())
         assert first in said, "whole, or cut with all of it in the title"
@@ -76,11 +76,13 @@ def test_what_is_drawn_is_where_its_numbers_say():
     (mark,) = made.marks
     left, bottom, width, height = made.box
     assert mark.places[0] == pytest.approx((146 * (left + width / 2), 136 * (bottom + height / 4)))
-    (dot,) = [p for p in ET.fromstring(inline(made)).iter("path") if colours.SENSOR.lower() in p.get("style")]
+    (dot,) = [
+        p for p in ET.fromstring(render_inline_svg(made)).iter("path") if colours.SENSOR.lower() in p.get("style")
+    ]
     u, v = map(float, re.match(r"M(\S+) (\S+)h0", dot.get("d")).groups())
     assert (u, v) == pytest.approx((mark.places[0][0], 136 - mark.places[0][1]), abs=0.051), "SVG counts down"
     pixels = np.asarray(_pixels(made.figure(dpi=72)))
-    y, x = np.argwhere(np.abs(pixels - colours.rgb(colours.SENSOR)).max(-1) < 12).mean(0)
+    y, x = np.argwhere(np.abs(pixels - colours.parse_rgb(colours.SENSOR)).max(-1) < 12).mean(0)
     assert (x + 0.5, y + 0.5) == pytest.approx((u, v), abs=0.75), "a picture file shows it in the same place"
 
 
@@ -91,19 +93,19 @@ def _pixels(figure):
 
 
 def test_a_picture_lies_under_its_points(tmp_path):
-    layers = [Layer("sensor", np.array([[0.0, 0.0], [3.0, 1.0]]), colours.SENSOR, "sensor")]
-    layers.append(Layer("silent", np.array([[1.0, 1.0]]), colours.SILENT, "silent"))
-    shown = Picture("two", (2, 4), layers, np.full((1, 2, 4), 0.5), width=80)
+    layers = [PointLayer("sensor", np.array([[0.0, 0.0], [3.0, 1.0]]), colours.SENSOR, "sensor")]
+    layers.append(PointLayer("silent", np.array([[1.0, 1.0]]), colours.SILENT, "silent"))
+    shown = LayeredPicture("two", (2, 4), layers, np.full((1, 2, 4), 0.5), width=80)
     pixels = _pixels(shown.figure(dpi=72))
-    blue = np.argwhere(np.abs(pixels - colours.rgb(colours.SENSOR)).max(-1) < 40)
+    blue = np.argwhere(np.abs(pixels - colours.parse_rgb(colours.SENSOR)).max(-1) < 40)
     assert {tuple(np.round((p - (20, 0) - (9.5, 9.5)) / 20).astype(int)) for p in blue} == {(0, 0), (1, 3)}
 
 
 def test_figures_leave_nothing_behind(tmp_path):
     before = dict(mpl.rcParams)
-    inline(panel())
-    figure = panel().figure(keys=[Key("a", colours.INK), Key("b", colours.SENSOR, "dot")])
-    drawing.save(figure, tmp_path / "a.png")
+    render_inline_svg(panel())
+    figure = panel().figure(keys=[LegendKey("a", colours.INK), LegendKey("b", colours.SENSOR, "dot")])
+    drawing.save_figure(figure, tmp_path / "a.png")
     gone = weakref.ref(figure)
     del figure
     gc.collect()
@@ -114,26 +116,37 @@ def test_figures_leave_nothing_behind(tmp_path):
 
 
 def test_blue_is_the_sensor_orange_what_was_recovered_purple_what_was_swept_and_nothing_else():
-    own = {colours.SENSOR, colours.RECOVERED, colours.SWEPT, colours.ANCHORED}
-    others = [*colours.METHODS.values(), *colours.OTHERS, *colours.GATES.values(), *colours.HOLES.values()]
-    others += [c for pair in colours.PAGE.values() for c in pair] + [colours.PALE, colours.HELD]
+    own = {colours.SENSOR, colours.RECOVERED, colours.SWEPT, colours.ALIGNED}
+    others = [
+        *colours.METHOD_COLOURS.values(),
+        *colours.SERIES_COLOURS,
+        *colours.GATE_COLOURS.values(),
+        *colours.HOLE_COLOURS.values(),
+    ]
+    others += [c for pair in colours.PAGE_COLOURS.values() for c in pair] + [colours.PALE, colours.HELD]
     assert not own & {c.upper() for c in others}
-    assert colours.SOURCES[Source.SENSOR] == colours.SENSOR and colours.SOURCES[Source.RECOVERED] == colours.RECOVERED
-    assert colours.SOURCES[Source.SWEPT] == colours.SWEPT and set(colours.SOURCES) == set(names(Source))
-    assert colours.of_source(np.array([1, 2, 3]))[:, 0].tolist() == [0x00, 0xE6, 0xC6]
+    assert (
+        colours.SOURCE_COLOURS[Source.SENSOR] == colours.SENSOR
+        and colours.SOURCE_COLOURS[Source.RECOVERED] == colours.RECOVERED
+    )
+    assert colours.SOURCE_COLOURS[Source.SWEPT] == colours.SWEPT and set(colours.SOURCE_COLOURS) == set(names(Source))
+    assert colours.colour_by_source(np.array([1, 2, 3]))[:, 0].tolist() == [0x00, 0xE6, 0xC6]
 
 
 def test_every_code_and_every_method_has_a_colour_of_its_own():
-    assert set(colours.GATES) == set(names(Gate)) - {Gate.ANSWER}
-    assert set(colours.HOLES) == set(names(Hole)) - {Hole.NONE}
-    assert set(colours.METHODS) >= {*METHODS, "opencv", "auto", "xfeat"}
-    for table in (colours.GATES, colours.HOLES, colours.METHODS):
+    assert set(colours.GATE_COLOURS) == set(names(Gate)) - {Gate.ANSWER}
+    assert set(colours.HOLE_COLOURS) == set(names(Hole)) - {Hole.NONE}
+    assert set(colours.METHOD_COLOURS) >= {*METHODS, "opencv", "auto", "xfeat"}
+    for table in (colours.GATE_COLOURS, colours.HOLE_COLOURS, colours.METHOD_COLOURS):
         assert len({c.upper() for c in table.values()}) == len(table)
-    assert not {c.upper() for c in colours.METHODS.values()} & {c.upper() for c in colours.OTHERS}
+    assert not {c.upper() for c in colours.METHOD_COLOURS.values()} & {c.upper() for c in colours.SERIES_COLOURS}
 
 
 def test_a_method_has_the_same_colour_in_any_company():
-    alone, among = drawing.series(["map"]), drawing.series(["mine", "map", "paper", *map(str, range(30))])
+    alone, among = (
+        drawing.assign_strokes(["map"]),
+        drawing.assign_strokes(["mine", "map", "paper", *map(str, range(30))]),
+    )
     assert alone["map"] == among["map"] and list(among)[:3] == ["mine", "map", "paper"]
     first = [among[str(k)] for k in range(23)]
     assert len(set(first)) == 23, "what has used up the colours is dashed"
@@ -144,32 +157,39 @@ def test_what_is_drawn_on_a_page_is_seen_by_day_and_in_the_dark():
     and of the twelve gates the lightest by day and the darkest in the dark."""
 
     def luminance(colour):
-        parts = [c / 255 for c in colours.rgb(colour)]
+        parts = [c / 255 for c in colours.parse_rgb(colour)]
         linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in parts]
         return float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
 
     for k in (0, 1):
-        ground = luminance(colours.PAGE["ground"][k])
-        for colour in (*colours.METHODS.values(), *colours.OTHERS, colours.SENSOR, *colours.GATES.values()):
-            shown = colours.PAGE["ink"][k] if colour == colours.INK else colour
+        ground = luminance(colours.PAGE_COLOURS["ground"][k])
+        for colour in (
+            *colours.METHOD_COLOURS.values(),
+            *colours.SERIES_COLOURS,
+            colours.SENSOR,
+            *colours.GATE_COLOURS.values(),
+        ):
+            shown = colours.PAGE_COLOURS["ink"][k] if colour == colours.INK else colour
             low, high = sorted((ground, luminance(shown)))
-            assert (high + 0.05) / (low + 0.05) > (2.2 if colour in colours.GATES.values() else 2.7), colour
+            assert (high + 0.05) / (low + 0.05) > (2.2 if colour in colours.GATE_COLOURS.values() else 2.7), colour
 
 
 def test_the_viewer_draws_in_these_colours():
     script = "".join((REPO / "dhtorch/viz/viewer" / name).read_text() for name in pages._SCRIPTS)
     for name in ("sensor", "recovered", "swept", "silent", "pale", "held", "white", "black"):
-        assert f"DATA.colours.{name}" in script and name.upper() in pages._COLOURS
+        assert f"DATA.colours.{name}" in script and name.upper() in pages._COLOUR_NAMES
     assert (
-        set(re.findall(r'new Scale\([^;]*?, "(\w+)", \{', script)) == set(pages._RAMPS) == {"depth", "score", "error"}
+        set(re.findall(r'new Scale\([^;]*?, "(\w+)", \{', script))
+        == set(pages._CMAP_OF_QUANTITY)
+        == {"depth", "score", "error"}
     )
-    assert pages._RAMPS["depth"] == colours.DEPTH
-    for name in pages._RAMPS.values():
-        stops = colours.ramp(name)
+    assert pages._CMAP_OF_QUANTITY["depth"] == colours.DEPTH_CMAP
+    for name in pages._CMAP_OF_QUANTITY.values():
+        stops = colours.sample_cmap(name)
         exact = mpl.colormaps[name](np.linspace(0, 1, len(stops)))[:, :3]
-        assert np.abs(np.array([colours.rgb(c) for c in stops]) / 255 - exact).max() < 0.003
+        assert np.abs(np.array([colours.parse_rgb(c) for c in stops]) / 255 - exact).max() < 0.003
         middle = mpl.colormaps[name](np.linspace(0, 1, 2 * len(stops) - 1))[1::2, :3]
-        between = np.array([colours.rgb(c) for c in stops]) / 255
+        between = np.array([colours.parse_rgb(c) for c in stops]) / 255
         assert np.abs((between[1:] + between[:-1]) / 2 - middle).max() < 0.06, "straight lines between them do"
 
 
@@ -208,11 +228,17 @@ def test_importing_costs_no_drawing_library():
 
 def test_the_page_of_colours_shows_them_all():
     shown = (REPO / "docs/colours.md").read_text(encoding="utf-8")
-    tables = (colours.SOURCES, colours.METHODS, colours.GATES, colours.HOLES, dict(colours.PAGE))
+    tables = (
+        colours.SOURCE_COLOURS,
+        colours.METHOD_COLOURS,
+        colours.GATE_COLOURS,
+        colours.HOLE_COLOURS,
+        dict(colours.PAGE_COLOURS),
+    )
     wanted = [c for table in tables for value in table.values() for c in ([value] if isinstance(value, str) else value)]
-    assert all(f"`{c.lower()}`" in shown for c in [*wanted, *colours.OTHERS])
-    for name in (colours.DEPTH, colours.SCORE, colours.ERROR, colours.SIGNED):
-        assert f"`{name}`" in shown and colours.ramp(name, 33)[7] in shown
+    assert all(f"`{c.lower()}`" in shown for c in [*wanted, *colours.SERIES_COLOURS])
+    for name in (colours.DEPTH_CMAP, colours.SCORE_CMAP, colours.ERROR_CMAP, colours.SIGNED_CMAP):
+        assert f"`{name}`" in shown and colours.sample_cmap(name, 33)[7] in shown
 
 
 def test_a_long_title_is_set_smaller_then_cut_in_its_middle():
@@ -230,12 +256,15 @@ def test_known_is_a_share_of_the_depth_in_the_figure_of_a_verdict(monkeypatch):
     said = []
     monkeypatch.setattr(drawing.Canvas, "title", lambda self, text, *_: said.append(text))
     depth, state = np.array([[1.0, 1.0], [1.0, 0.0]]), np.array([[State.CONSISTENT, State.WRONG], [0, 0]])
-    drawing.draw_verdict(io.BytesIO(), np.zeros((1, 2, 2)), depth, state, np.zeros((2, 2)), title="room, frame 3")
+    drawing.draw_validation(io.BytesIO(), np.zeros((1, 2, 2)), depth, state, np.zeros((2, 2)), title="room, frame 3")
     assert "room, frame 3" in said and "Known: 67 % of the depth, of which 50.0 % are wrong" in said
 
 
 def test_figures_of_all_notebooks_have_the_same_sizes():
-    assert set(notebook.SETTINGS) <= set(mpl.rcParams) and mpl.RcParams(notebook.SETTINGS)["figure.dpi"] >= 150
+    assert (
+        set(notebook.NOTEBOOK_RC_PARAMS) <= set(mpl.rcParams)
+        and mpl.RcParams(notebook.NOTEBOOK_RC_PARAMS)["figure.dpi"] >= 150
+    )
     for file in (REPO / "notebooks").glob("*.ipynb"):
         code = "".join("".join(c["source"]) for c in json.loads(file.read_text())["cells"] if c["cell_type"] == "code")
         assert "rcParams |= notebook.SETTINGS" in code, file.name

@@ -28,13 +28,13 @@ from dhtorch import testing as writers
 from dhtorch.cli import run
 from dhtorch.codes import Gate, Source, names
 from dhtorch.data.pairs import by_choice, by_gap
-from dhtorch.experiments.exhibits import DENSE, SWEPT, look
+from dhtorch.experiments.exhibits import MAX_CLOUD_POINTS, MAX_SWEPT_POINTS, make_exhibit
 from dhtorch.experiments.protocol import Settings
-from dhtorch.integrate.sweeps import Sweep
+from dhtorch.integrate.sweeps import DenseSweep
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import METHODS
-from dhtorch.runtime import code_dependencies as closure
-from dhtorch.runtime import results as archive
+from dhtorch.runtime import code_dependencies
+from dhtorch.runtime import results as result_files
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viz import viewer
 from dhtorch.viz.viewer import again, points, rrd
@@ -50,8 +50,8 @@ browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 @pytest.fixture(scope="module")
 def scene():
     room = rendered(hw=(180, 240), n_frames=6)
-    method, sweep = METHODS["map"].replace(n=N), Sweep({"planes": 32})
-    return look(room, method, lambda r: by_gap(r, 4), Settings(cutoff=CUTOFF), sweep=sweep)
+    method, sweep = METHODS["map"].replace(n=N), DenseSweep({"planes": 32})
+    return make_exhibit(room, method, lambda r: by_gap(r, 4), Settings(cutoff=CUTOFF), sweep=sweep)
 
 
 @pytest.fixture(scope="module")
@@ -123,8 +123,8 @@ def test_points_seen_from_the_other_camera_lie_where_they_were_tracked(scene):
 
 def test_what_was_held_back_is_apart(scene):
     for shot in scene.shots:
-        assert 0 < len(shot.seen.xyz) <= DENSE and 0 < shot.seen.xyz[:, 2].max() <= CUTOFF
-        assert 0 < len(shot.held.xyz) <= DENSE and shot.held.xyz[:, 2].min() > CUTOFF
+        assert 0 < len(shot.seen.xyz) <= MAX_CLOUD_POINTS and 0 < shot.seen.xyz[:, 2].max() <= CUTOFF
+        assert 0 < len(shot.held.xyz) <= MAX_CLOUD_POINTS and shot.held.xyz[:, 2].min() > CUTOFF
         assert shot.depth_image.depth.max() <= CUTOFF and shot.seen.rgb.std() > 10
 
 
@@ -132,7 +132,9 @@ def test_swept_pixels_are_a_cloud_of_their_own(scene):
     for shot in scene.shots:
         view, swept = scene.views[shot.view_0], shot.swept
         assert (
-            1000 < len(swept.xyz) <= SWEPT and swept.sigma.min() > 0 and 0 < swept.score.min() < swept.score.max() < 1
+            1000 < len(swept.xyz) <= MAX_SWEPT_POINTS
+            and swept.sigma.min() > 0
+            and 0 < swept.score.min() < swept.score.max() < 1
         )
         uv = swept.xyz[:, :2] / swept.xyz[:, 2:] * view.f + view.c
         assert np.abs(uv - np.round(uv)).max() < 0.01, "pixels of the picture"
@@ -144,29 +146,33 @@ def test_swept_pixels_are_a_cloud_of_their_own(scene):
 
 
 def test_without_a_sweep_there_are_no_swept_pixels():
-    found = look(noted(SyntheticRoom(hw=(40, 60), n_frames=2)), METHODS["paper"], lambda r: by_gap(r, 1), Settings())
-    data = data_of(pages.page(found))
+    found = make_exhibit(
+        noted(SyntheticRoom(hw=(40, 60), n_frames=2)), METHODS["paper"], lambda r: by_gap(r, 1), Settings()
+    )
+    data = data_of(pages.build_viewer_page(found))
     assert len(found.shots[0].swept.xyz) == 0 and "swept" not in data["about"]
 
 
 def test_a_method_that_chooses_sweeps_what_it_chose():
     room = noted(rendered(hw=(180, 240), n_frames=6))
     method = METHODS["window"].replace(n=256, views=2)
-    found = look(room, method, lambda r: by_choice(r, stride=9), Settings(cutoff=CUTOFF), sweep=Sweep({"planes": 16}))
+    found = make_exhibit(
+        room, method, lambda r: by_choice(r, stride=9), Settings(cutoff=CUTOFF), sweep=DenseSweep({"planes": 16})
+    )
     assert len(found.shots) == 1 and found.shots[0].facts["views"] and len(found.shots[0].swept.xyz) > 500
 
 
 def test_without_a_trajectory_every_pair_stands_alone():
     whole = SyntheticRoom(hw=(60, 80), n_frames=4)
     room = Changed(whole, lambda frame: frame.replace(T_world_from_cam=None), poses=None)
-    found = look(noted(room), METHODS["paper"], lambda r: by_gap(r, 2), Settings())
+    found = make_exhibit(noted(room), METHODS["paper"], lambda r: by_gap(r, 2), Settings())
     assert found.path is None and not found.placed and len(found.shots) == 2
     assert all((shot.T_world_from_0 == np.eye(4)).all() for shot in found.shots)
 
 
 def test_of_many_pairs_some_are_shown():
     room = SyntheticRoom(hw=(40, 60), n_frames=8)
-    found = look(noted(room), METHODS["paper"], lambda r: by_gap(r, 1), Settings(), most=3)
+    found = make_exhibit(noted(room), METHODS["paper"], lambda r: by_gap(r, 1), Settings(), most=3)
     assert [shot.label for shot in found.shots] == ["0 → 1", "3 → 4", "6 → 7"]
 
 
@@ -204,7 +210,7 @@ def unpacked(packed):
 
 
 def test_the_page_is_whole_and_small(scene):
-    page = pages.page(scene)
+    page = pages.build_viewer_page(scene)
     found = Tags(page)
     assert len(found.scripts) == 2 and not found.addresses
     code = len(page) - len(found.scripts[0])
@@ -215,7 +221,7 @@ def test_the_page_is_whole_and_small(scene):
 
 
 def test_the_page_holds_what_was_computed(scene):
-    data = data_of(pages.page(scene))
+    data = data_of(pages.build_viewer_page(scene))
     for shot, sent in zip(scene.shots, data["shots"], strict=True):
         assert sent["counts"] == shot.gates()
         for name in ("xyz", "depth", "sigma", "error"):
@@ -238,7 +244,7 @@ def test_names_are_text_and_never_markup(scene):
     named = replace(scene, name=HOSTILE, facts={HOSTILE: HOSTILE})
     named.shots[0].facts[HOSTILE] = HOSTILE
     try:
-        page = pages.page(named)
+        page = pages.build_viewer_page(named)
     finally:
         del named.shots[0].facts[HOSTILE]
     found = Tags(page)
@@ -270,7 +276,7 @@ def chromium(folder, page, *flags, script=""):
 def test_a_browser_draws_the_points(scene, tmp_path, dark):
     shot = tmp_path / "shot.png"
     flags = [f"--screenshot={shot}", *["--force-dark-mode"] * dark]
-    _, console = chromium(tmp_path, pages.page(scene), *flags, script='chooseColour("source")')
+    _, console = chromium(tmp_path, pages.build_viewer_page(scene), *flags, script='chooseColour("source")')
     assert console == []
     pixels = np.asarray(Image.open(shot).convert("RGB")).astype(int)
     stage = pixels[110:600, 30:700]
@@ -301,7 +307,7 @@ def test_a_browser_counts_and_obeys(scene, tmp_path):
       said.push(String(before !== $("space").toDataURL()), document.querySelector("h1").textContent, document.title);
       document.body.dataset.said = JSON.stringify(said);
     """
-    dom, console = chromium(tmp_path, pages.page(named), "--dump-dom", script=script)
+    dom, console = chromium(tmp_path, pages.build_viewer_page(named), "--dump-dom", script=script)
     assert console == []
     attribute = re.search(r'data-said="([^"]*)"', dom)
     first, second, sample, beside, changed, heading, title = json.loads(html.unescape(attribute[1]))
@@ -323,7 +329,7 @@ def test_a_browser_counts_and_obeys(scene, tmp_path):
 @pytest.fixture(scope="module")
 def recorded(scene, tmp_path_factory):
     chunks = pytest.importorskip("rerun.chunk")
-    return chunks.RrdReader(rrd.save(tmp_path_factory.mktemp("rrd") / "view.rrd", scene))
+    return chunks.RrdReader(rrd.write_rrd(tmp_path_factory.mktemp("rrd") / "view.rrd", scene))
 
 
 def column(reader, entity, component):
@@ -358,7 +364,7 @@ def test_a_recording_is_read_back_as_computed(recorded, scene):
         s, T = shot.samples, shot.T_world_from_0
         here = s["source"] == Source.RECOVERED
         assert np.allclose(where[k], s["xyz"][here] @ T[:3, :3].T + T[:3, 3], atol=1e-5)
-        assert np.allclose(radii[k], s["sigma"][here].clip(rrd.SMALLEST, rrd.LARGEST), atol=1e-6)
+        assert np.allclose(radii[k], s["sigma"][here].clip(rrd._MIN_RADIUS_M, rrd._MAX_RADIUS_M), atol=1e-6)
         assert counts[k] == [shot.gates()["ANSWER"]]
         assert np.allclose(swept[k], shot.swept.xyz @ T[:3, :3].T + T[:3, 3], atol=1e-5)
 
@@ -370,7 +376,7 @@ def test_a_result_is_shown_as_it_was_archived(job, command, tmp_path):
     code, out, err = command("view", job, "html=page.html")
     assert (code, err) == (0, "") and "page.html" in out
     data = data_of((tmp_path / "page.html").read_text())
-    rows = [row for row in archive.read(job)["rows"] if row["pair"] is not None]
+    rows = [row for row in result_files.read_result(job)["rows"] if row["pair"] is not None]
     assert [shot["label"] for shot in data["shots"]] == ["{} → {}".format(*row["pair"]) for row in rows]
     assert [shot["counts"]["ANSWER"] for shot in data["shots"]] == [row["n_recovered"] for row in rows]
     assert data["facts"]["data"] == "synthetic" and "2 m" in data["facts"]["sensor"]
@@ -417,9 +423,9 @@ def test_bad_input_gets_one_clear_line(command, args, words):
 
 
 def test_data_that_are_gone_leave_the_points(job, command, tmp_path):
-    result = archive.read(job)
+    result = result_files.read_result(job)
     result["config"]["data"] = {"_target_": "dhtorch.data.open_all", "root": "gone", "format": "auto"}
-    archive.write(tmp_path / "old" / "result.json", result)
+    result_files.write_result(tmp_path / "old" / "result.json", result)
     code, _, err = command("view", "old", "html=page.html")
     assert code == 2 and "gone" in err
     shutil.copytree(job / "synthetic_room", tmp_path / "old" / "synthetic_room")
@@ -443,14 +449,14 @@ def test_data_that_are_gone_leave_the_points(job, command, tmp_path):
         "dhtorch.data.os",
         "dhtorch.data.Path",
         "dhtorch.export.write_ply",
-        "dhtorch.synthetic.recording._turned",
-        "dhtorch.synthetic.recording.phone_lidar.__globals__",
+        "dhtorch.synthetic.recording._rotate_device_axes",
+        "dhtorch.synthetic.recording.simulate_phone_lidar.__globals__",
         7,
         None,
     ],
 )
 def test_a_result_calls_only_what_settings_are_meant_to_name(job, name):
-    result = archive.read(job)
+    result = result_files.read_result(job)
     for place in (["data"], ["method"], ["method", "track"]):
         changed = copy.deepcopy(result)
         node = changed["config"]
@@ -458,36 +464,38 @@ def test_a_result_calls_only_what_settings_are_meant_to_name(job, name):
             node = node[key]
         node["_target_"] = name
         with pytest.raises(ValueError, match="_target_"):
-            again.parts(changed)
+            again.rebuild_parts(changed)
 
 
 def test_options_that_a_function_has_not_are_named(job):
-    result = archive.read(job)
+    result = result_files.read_result(job)
     result["config"]["method"]["track"]["windw"] = 3
     with pytest.raises(ValueError, match=r"config\.method\.track.*windw"):
-        again.parts(result)
+        again.rebuild_parts(result)
 
 
 @pytest.mark.parametrize(("group", "folder"), [("data", "data"), ("pairs", "pairs"), ("method", "method")])
 def test_every_setting_that_ships_can_be_shown_again(job, group, folder):
     files = list((run.config_dir() / folder).glob("*.yaml"))
-    named = {name for file in files for name in closure.targets(OmegaConf.to_container(OmegaConf.load(file)))}
+    named = {
+        name for file in files for name in code_dependencies.iter_targets(OmegaConf.to_container(OmegaConf.load(file)))
+    }
     assert named
     for name in named:
-        result = archive.read(job)
+        result = result_files.read_result(job)
         result["config"][group] = {"_target_": name, "_partial_": True}
         module, _, last = name.rpartition(".")
-        found, expected = again.parts(result)[group], getattr(importlib.import_module(module), last)
+        found, expected = again.rebuild_parts(result)[group], getattr(importlib.import_module(module), last)
         assert isinstance(found, Method) if expected is Method else found.func is expected
 
 
 def test_null_stands_for_what_strict_json_cannot_hold(job):
-    result = archive.read(job)
+    result = result_files.read_result(job)
     assert result["config"]["method"]["backproject"]["near_limit"] is None
-    assert again.parts(result)["method"].backproject.keywords["near_limit"] is None
-    assert again.cutoff(result, "synthetic_room") == 2.0
+    assert again.rebuild_parts(result)["method"].backproject.keywords["near_limit"] is None
+    assert again.read_cutoff(result, "synthetic_room") == 2.0
     result["rows"][-1]["cutoff_m"] = None
-    assert again.cutoff(result, "synthetic_room") == math.inf
+    assert again.read_cutoff(result, "synthetic_room") == math.inf
 
 
 def test_points_of_a_file(tmp_path):
@@ -495,20 +503,20 @@ def test_points_of_a_file(tmp_path):
     xyz, sigma, score = rng.normal(size=(50, 3)), rng.random(50), rng.random(50)
     source = rng.integers(1, 4, 50)
     export.write_ply(tmp_path / "p.ply", xyz, sigma=sigma, score=score, source=source)
-    (shot,) = points.read(tmp_path / "p.ply").shots
+    (shot,) = points.read_ply_exhibit(tmp_path / "p.ply").shots
     dense = source == Source.SWEPT
     for name, value in {"xyz": xyz, "sigma": sigma, "score": score, "source": source}.items():
         assert np.allclose(shot.samples[name], value[~dense], atol=1e-6), name
     for name, value in {"xyz": xyz, "sigma": sigma, "score": score}.items():
         assert np.allclose(getattr(shot.swept, name), value[dense], atol=1e-6), name
-    assert "points" in data_of(pages.page(points.read(tmp_path / "p.ply")))["about"]
+    assert "points" in data_of(pages.build_viewer_page(points.read_ply_exhibit(tmp_path / "p.ply")))["about"]
 
 
 def test_what_opens_a_page_is_text_and_stands_before_the_space(tmp_path):
     evil = '</script><b onload="x">\udcff&'
     export.write_ply(tmp_path / "p.ply", np.ones((1, 3)))
-    opening = viewer.Opening({evil: evil}, [evil], b"PNG", evil)
-    made = pages.page(replace(points.read(tmp_path / "p.ply"), name=evil, opening=opening))
+    opening = viewer.PageOpening({evil: evil}, [evil], b"PNG", evil)
+    made = pages.build_viewer_page(replace(points.read_ply_exhibit(tmp_path / "p.ply"), name=evil, opening=opening))
     made.encode("utf-8")
     assert "<b onload" not in made and made.count("&lt;/script&gt;&lt;b onload=&quot;x&quot;&gt;?&amp;") >= 6
     assert (
@@ -517,7 +525,7 @@ def test_what_opens_a_page_is_text_and_stands_before_the_space(tmp_path):
         < made.index("data:image/png;base64,UE5H")
         < made.index("<main>")
     )
-    assert '<section id="opening"' not in pages.page(points.read(tmp_path / "p.ply"))
+    assert '<section id="opening"' not in pages.build_viewer_page(points.read_ply_exhibit(tmp_path / "p.ply"))
 
 
 @pytest.mark.parametrize(
@@ -535,7 +543,7 @@ def test_what_opens_a_page_is_text_and_stands_before_the_space(tmp_path):
 def test_broken_points_are_refused(tmp_path, content):
     (tmp_path / "p.ply").write_bytes(content)
     with pytest.raises(ValueError, match=r"p\.ply"):
-        points.read(tmp_path / "p.ply")
+        points.read_ply_exhibit(tmp_path / "p.ply")
 
 
 def test_the_viewer_says_what_it_offers():

@@ -13,11 +13,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.io.decode import MAX_PIXELS, FormatError, need, read_bytes
+from dhtorch.data.io.decode import MAX_PIXELS, FormatError, import_optional, read_bytes
 
 _MAGIC = b"\x76\x2f\x31\x01"
-_TILED, _DEEP, _PARTS = 0x200, 0x800, 0x1000  # bits of the version field
-_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}  # compression → scan lines in a chunk
+_TILED, _DEEP, _MULTIPART = 0x200, 0x800, 0x1000  # bits of the version field
+_LINES_PER_CHUNK = {
+    0: 1,
+    1: 1,
+    2: 1,
+    3: 16,
+    4: 32,
+    5: 16,
+    6: 32,
+    7: 32,
+    8: 32,
+    9: 256,
+}  # compression → scan lines in a chunk
 
 
 class ExrHeader(NamedTuple):
@@ -49,9 +60,9 @@ def decode_exr(data: bytes, file: Path, channel: str | None = None, hw: tuple[in
     header = decode_exr_header(data, file)
     if hw is not None and header.hw != tuple(hw):
         raise FormatError(file, "size", f"{header.hw[1]}x{header.hw[0]}", f"{hw[1]}x{hw[0]}")
-    name = _choose(header, channel, file)
+    name = _select_channel(header, channel, file)
     _check_chunks(header, data, file)
-    library = need("OpenEXR")
+    library = import_optional("OpenEXR")
     try:
         with library.File(io.BytesIO(data), separate_channels=True, num_threads=0) as picture:
             pixels = np.array(picture.channels()[name].pixels)
@@ -62,7 +73,7 @@ def decode_exr(data: bytes, file: Path, channel: str | None = None, hw: tuple[in
     return pixels.astype(np.float32)
 
 
-def exr_header(file: Path) -> ExrHeader:
+def read_exr_header(file: Path) -> ExrHeader:
     """Size and channels of an EXR file without decoding it.
 
     Raises:
@@ -72,17 +83,17 @@ def exr_header(file: Path) -> ExrHeader:
 
 
 def decode_exr_header(data: bytes, file: Path) -> ExrHeader:
-    """As :func:`exr_header`, of bytes in memory; ``file`` names them in errors."""
+    """As :func:`read_exr_header`, of bytes in memory; ``file`` names them in errors."""
     if not data.startswith(_MAGIC) or len(data) < 8:
         raise FormatError(file, "content", f"{data[:4]!r}", "an OpenEXR picture")
     version = struct.unpack_from("<I", data, 4)[0]
-    if version & 0xFF != 2 or version & (_TILED | _DEEP | _PARTS):
+    if version & 0xFF != 2 or version & (_TILED | _DEEP | _MULTIPART):
         raise FormatError(file, "version", f"{version:#x}", "2, one part of scan lines")
-    attributes, start = _attributes(data, file)
+    attributes, start = _parse_attributes(data, file)
     try:
         x0, y0, x1, y1 = struct.unpack("<4i", attributes["dataWindow"])
-        per_chunk = _LINES[attributes["compression"][0]]
-        channels = _channels(attributes["channels"])
+        per_chunk = _LINES_PER_CHUNK[attributes["compression"][0]]
+        channels = _parse_channels(attributes["channels"])
     except (KeyError, IndexError, struct.error, ValueError) as error:
         raise FormatError(file, "header", error, "channels, compression and dataWindow") from None
     h, w = y1 - y0 + 1, x1 - x0 + 1
@@ -92,7 +103,7 @@ def decode_exr_header(data: bytes, file: Path) -> ExrHeader:
     return ExrHeader((h, w), channels, start, -(-h // per_chunk))
 
 
-def _attributes(data: bytes, file: Path) -> tuple[dict[str, bytes], int]:
+def _parse_attributes(data: bytes, file: Path) -> tuple[dict[str, bytes], int]:
     """Name → value of the header's attributes, and where the header ends."""
     attributes: dict[str, bytes] = {}
     at = 8
@@ -111,7 +122,7 @@ def _attributes(data: bytes, file: Path) -> tuple[dict[str, bytes], int]:
     return attributes, at + 1
 
 
-def _channels(value: bytes) -> tuple[str, ...]:
+def _parse_channels(value: bytes) -> tuple[str, ...]:
     names, at = [], 0
     while value[at]:
         end = value.index(b"\0", at)
@@ -132,7 +143,7 @@ def _check_chunks(header: ExrHeader, data: bytes, file: Path) -> None:
             raise FormatError(file, f"chunk {i}", f"bytes beyond the {len(data)} of the file", "a whole picture")
 
 
-def _choose(header: ExrHeader, channel: str | None, file: Path) -> str:
+def _select_channel(header: ExrHeader, channel: str | None, file: Path) -> str:
     wanted = [channel] if channel else ["R", "Y", "Z", "V", "depth", *header.channels[: len(header.channels) == 1]]
     for name in wanted:
         if name in header.channels:

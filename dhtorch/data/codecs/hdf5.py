@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.io.decode import MAX_BYTES, FormatError, need
-from dhtorch.data.io.safe_open import check_file, opened, unreadable
+from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, import_optional
+from dhtorch.data.io.safe_open import check_regular_file, open_regular, unreadable_error
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FILTERS = {"gzip", "lzf", "shuffle", "fletcher32"}  # come with the library
@@ -39,39 +39,39 @@ class Hdf5Array(NamedTuple):
         """
         if not 0 <= i < self.shape[0]:
             raise IndexError(f"{self.file}: {self.key}: entry {i} of {self.shape[0]}")
-        with _opened(self.file) as group:
-            array = _checked(group, self.key, self.file)
+        with _open_hdf5(self.file) as group:
+            array = _check_array(group, self.key, self.file)
             if array.shape != self.shape or array.dtype != self.dtype:
                 found = f"{array.dtype} of {array.shape}"
                 raise FormatError(self.file, self.key, found, f"{self.dtype} of {self.shape}")
             return np.asarray(array[i])
 
 
-def hdf5_arrays(file: Path) -> dict[str, Hdf5Array]:
+def list_hdf5_arrays(file: Path) -> dict[str, Hdf5Array]:
     """Name → array of numbers, of the top level of a file. Nothing of the values is read.
 
     Raises:
-        FormatError: missing or damaged file, an array that lies elsewhere, or rows beyond ``MAX_BYTES``.
+        FormatError: missing or damaged file, an array that lies elsewhere, or rows beyond ``MAX_FILE_BYTES``.
         ImportError: no decoder is installed.
     """
-    with _opened(file) as group:
+    with _open_hdf5(file) as group:
         if len(group) > _MAX_NAMES:
             raise FormatError(file, "names", f"{len(group)}", f"at most {_MAX_NAMES}")
         found = {}
         for key in group:
-            array = _checked(group, key, file)
+            array = _check_array(group, key, file)
             found[key] = Hdf5Array(file, key, array.shape, array.dtype)
         return found
 
 
 @contextmanager
-def _opened(file: Path) -> Iterator[Any]:
-    library = need("h5py")
+def _open_hdf5(file: Path) -> Iterator[Any]:
+    library = import_optional("h5py")
     try:
-        with opened(file) as stream:
+        with open_regular(file) as stream:
             head = stream.read(len(_SIGNATURE))
     except OSError as error:
-        raise unreadable(file, error) from None
+        raise unreadable_error(file, error) from None
     if head != _SIGNATURE:
         raise FormatError(file, "content", repr(head), "an HDF5 file")
     try:
@@ -83,9 +83,9 @@ def _opened(file: Path) -> Iterator[Any]:
         raise FormatError(file, "data", error or type(error).__name__, "a whole HDF5 file") from None
 
 
-def _checked(group: Any, key: str, file: Path) -> Any:
+def _check_array(group: Any, key: str, file: Path) -> Any:
     """An array of numbers stored in this file, whose rows fit into memory."""
-    library = need("h5py")
+    library = import_optional("h5py")
     if not isinstance(group.get(key, getlink=True), library.HardLink):
         raise FormatError(file, key, "a link", "an array in this file")
     array = group.get(key)
@@ -98,10 +98,12 @@ def _checked(group: Any, key: str, file: Path) -> Any:
     filters = {names.get(pipeline.get_filter(i)[0], "unknown") for i in range(pipeline.get_nfilters())}
     if not filters <= _FILTERS:
         raise FormatError(file, f"{key} filters", ", ".join(sorted(filters)), ", ".join(sorted(_FILTERS)))
-    if array.shape[0] > (size := check_file(file)):
+    if array.shape[0] > (size := check_regular_file(file)):
         raise FormatError(file, f"{key} size", f"{array.shape[0]} rows in {size} bytes", "at most one a byte")
     row = math.prod(array.shape[1:]) * array.dtype.itemsize
     chunk = math.prod(array.chunks or (1,)) * array.dtype.itemsize
-    if max(row, chunk) > MAX_BYTES:
-        raise FormatError(file, f"{key} size", f"rows of {row} and chunks of {chunk} bytes", f"at most {MAX_BYTES}")
+    if max(row, chunk) > MAX_FILE_BYTES:
+        raise FormatError(
+            file, f"{key} size", f"rows of {row} and chunks of {chunk} bytes", f"at most {MAX_FILE_BYTES}"
+        )
     return array

@@ -10,12 +10,12 @@ import struct
 from pathlib import Path
 from types import ModuleType
 
-from dhtorch.data.io.decode import FormatError, need
+from dhtorch.data.io.decode import FormatError, import_optional
 
-_END = b"bvx$"
+_END_OF_STREAM = b"bvx$"
 
 
-def unpack(data: bytes, size: int, file: Path, field: str) -> bytes:
+def decompress_lzfse(data: bytes, size: int, file: Path, field: str) -> bytes:
     """Exactly ``size`` bytes of an LZFSE stream; a member that is not compressed and has that size is returned as is.
 
     Raises:
@@ -24,31 +24,31 @@ def unpack(data: bytes, size: int, file: Path, field: str) -> bytes:
     """
     if len(data) == size and not data.startswith(b"bvx"):
         return data
-    claimed = unpacked_size(data, file, field)
+    claimed = lzfse_unpacked_size(data, file, field)
     if claimed != size:
         raise FormatError(file, field, f"{claimed} bytes when unpacked", f"{size} bytes")
     # imagecodecs is told how much room there is; the other two grow their buffer as long as a hostile stream asks.
-    decoder = need("imagecodecs", "liblzfse", "lzfse")
+    decoder = import_optional("imagecodecs", "liblzfse", "lzfse")
     try:
         bounded = decoder.__name__ == "imagecodecs"
         raw = bytes(decoder.lzfse_decode(data, out=size) if bounded else decoder.decompress(data))
-    except _errors(decoder) as error:
+    except _decoder_errors(decoder) as error:
         raise FormatError(file, field, error or "damaged blocks", "a whole LZFSE stream") from None
     if len(raw) != size:
         raise FormatError(file, field, f"{len(raw)} bytes when unpacked", f"{size} bytes")
     return raw
 
 
-def unpacked_size(data: bytes, file: Path, field: str) -> int:
+def lzfse_unpacked_size(data: bytes, file: Path, field: str) -> int:
     """Bytes that the blocks of a stream say they hold; every block and the end mark lie inside ``data``.
 
     Raises:
         FormatError: no LZFSE, an unknown block, or the stream ends before its end mark.
     """
     at, size = 0, 0
-    while data[at : at + 4] != _END:
+    while data[at : at + 4] != _END_OF_STREAM:
         try:
-            raw, length = _block(data, at)
+            raw, length = _parse_block(data, at)
         except (struct.error, KeyError):
             found = f"{data[at : at + 4]!r} at byte {at} of {len(data)}"
             raise FormatError(file, field, found, "a whole LZFSE block") from None
@@ -56,7 +56,7 @@ def unpacked_size(data: bytes, file: Path, field: str) -> int:
     return size
 
 
-def _block(data: bytes, at: int) -> tuple[int, int]:
+def _parse_block(data: bytes, at: int) -> tuple[int, int]:
     """(unpacked bytes, length in the stream) of the block at a place."""
     kind, raw = struct.unpack_from("<4sI", data, at)
     if kind == b"bvx-":  # stored
@@ -73,6 +73,6 @@ def _block(data: bytes, at: int) -> tuple[int, int]:
     return raw, length
 
 
-def _errors(decoder: ModuleType) -> tuple[type[Exception], ...]:
+def _decoder_errors(decoder: ModuleType) -> tuple[type[Exception], ...]:
     own = (getattr(decoder, name, ValueError) for name in ("error", "LzfseError"))
     return (RuntimeError, ValueError, MemoryError, *own)

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
 from dhtorch.data.io.decode import MAX_TEXT_BYTES, FormatError
-from dhtorch.data.io.safe_open import allow
+from dhtorch.data.io.safe_open import check_memory
 
 #: The first box of a film.
-FIRST: Final = (b"ftyp", b"styp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip", b"uuid", b"pnot")
+MP4_FIRST_BOXES: Final = (b"ftyp", b"styp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip", b"uuid", b"pnot")
 
-_FOLDERS: Final = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof", b"traf", b"edts", b"mvex")
-_RUNS: Final = (b"stts", b"ctts")  # tables of (count, value)
-_SAMPLE: Final = 200  # bytes that a decoder and our own table take for one
+_CONTAINER_BOXES: Final = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof", b"traf", b"edts", b"mvex")
+_RUN_LENGTH_BOXES: Final = (b"stts", b"ctts")  # tables of (count, value)
+_BYTES_PER_SAMPLE: Final = 200  # bytes that a decoder and our own table take for one
 _MAX_DEPTH: Final = 12
 _MAX_BOXES: Final = 200_000
 
@@ -29,7 +29,7 @@ class _Box(NamedTuple):
     end: int
 
 
-def check_samples(stream: BinaryIO, file: Path) -> None:
+def check_sample_count(stream: BinaryIO, file: Path) -> None:
     """Refuse a film with more samples than bytes, or than memory is allowed for.
 
     Raises:
@@ -37,17 +37,17 @@ def check_samples(stream: BinaryIO, file: Path) -> None:
     """
     total = stream.seek(0, 2)
     found = 0
-    for number, box in enumerate(_boxes(stream, _Box(b"", 0, total), 0)):
+    for number, box in enumerate(_iter_boxes(stream, _Box(b"", 0, total), 0)):
         if number > _MAX_BOXES:
             raise FormatError(file, "boxes", f"more than {_MAX_BOXES}", "a film of fewer")
-        claimed = _claimed(stream, box, file)
+        claimed = _declared_samples(stream, box, file)
         if claimed > total:
             raise FormatError(file, box.kind.decode(), f"{claimed} samples in {total} bytes", "at most one a byte")
         found += claimed if box.kind in (b"stsz", b"stz2", b"trun") else 0
-        allow(file, "samples", _SAMPLE * max(found, claimed), f"{max(found, claimed)} samples")
+        check_memory(file, "samples", _BYTES_PER_SAMPLE * max(found, claimed), f"{max(found, claimed)} samples")
 
 
-def _boxes(stream: BinaryIO, inside: _Box, depth: int) -> Iterator[_Box]:
+def _iter_boxes(stream: BinaryIO, inside: _Box, depth: int) -> Iterator[_Box]:
     """Boxes in their order, those inside others behind them; one that is damaged ends its folder."""
     at = inside.start
     while at + 8 <= inside.end:
@@ -62,12 +62,12 @@ def _boxes(stream: BinaryIO, inside: _Box, depth: int) -> Iterator[_Box]:
             return
         box = _Box(kind, start, min(end, inside.end))
         yield box
-        if kind in _FOLDERS and depth < _MAX_DEPTH:
-            yield from _boxes(stream, box, depth + 1)
+        if kind in _CONTAINER_BOXES and depth < _MAX_DEPTH:
+            yield from _iter_boxes(stream, box, depth + 1)
         at = end
 
 
-def _claimed(stream: BinaryIO, box: _Box, file: Path) -> int:
+def _declared_samples(stream: BinaryIO, box: _Box, file: Path) -> int:
     """Samples that a table speaks of."""
     stream.seek(box.start)
     if box.kind in (b"stsz", b"stz2"):
@@ -76,7 +76,7 @@ def _claimed(stream: BinaryIO, box: _Box, file: Path) -> int:
     if box.kind == b"trun":
         _, n = struct.unpack(">II", stream.read(8).ljust(8, b"\0"))
         return int(n)
-    if box.kind in _RUNS:
+    if box.kind in _RUN_LENGTH_BOXES:
         if box.end - box.start > MAX_TEXT_BYTES:
             raise FormatError(file, box.kind.decode(), f"{box.end - box.start} bytes", f"at most {MAX_TEXT_BYTES}")
         table = stream.read(box.end - box.start)[8:]

@@ -17,12 +17,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.codecs.zips import check_directory
-from dhtorch.data.io.decode import MAX_BYTES, FormatError, read_bytes
-from dhtorch.data.io.safe_open import allow
+from dhtorch.data.codecs.zips import check_zip_directory
+from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, read_bytes
+from dhtorch.data.io.safe_open import check_memory
 
 #: Bytes in which a header ends.
-_HEAD = 12_288
+_MAX_HEADER_BYTES = 12_288
 
 
 class NpyHeader(NamedTuple):
@@ -34,7 +34,7 @@ class NpyHeader(NamedTuple):
     start: int  # byte where the values start
 
 
-def npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
+def parse_npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
     """Header of an ``.npy`` file from its first bytes (12 KB are plenty); of numbers, texts or pickled objects.
 
     Raises:
@@ -54,30 +54,30 @@ def npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
     return NpyHeader(shape, bool(fortran), dtype, stream.tell())
 
 
-def real_header(file: Path, field: str, head: bytes) -> NpyHeader:
-    """As :func:`npy_header`, of real numbers only."""
-    header = npy_header(file, field, head)
+def parse_real_npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
+    """As :func:`parse_npy_header`, of real numbers only."""
+    header = parse_npy_header(file, field, head)
     if header.dtype.kind not in "fiu" or header.dtype.hasobject:
         raise FormatError(file, f"{field} dtype", header.dtype, "real numbers")
     return header
 
 
-def real_numbers(file: Path, field: str, raw: bytes) -> np.ndarray:
+def _decode_real_npy(file: Path, field: str, raw: bytes) -> np.ndarray:
     """The bytes of an ``.npy`` file of real numbers as floating point.
 
     Raises:
-        FormatError: as :func:`real_header`, or another number of bytes than the header says.
+        FormatError: as :func:`parse_real_npy_header`, or another number of bytes than the header says.
     """
-    header = real_header(file, field, raw)
+    header = parse_real_npy_header(file, field, raw)
     count, left = math.prod(header.shape), len(raw) - header.start
     if count * header.dtype.itemsize != left:
         raise FormatError(file, field, f"{left} bytes", f"{header.shape} of {header.dtype}")
     array = np.frombuffer(raw, header.dtype, count, header.start)
     array = array.reshape(header.shape, order="F" if header.fortran else "C")
-    return array.astype(_floating(header.dtype))
+    return array.astype(_smallest_float_dtype(header.dtype))
 
 
-def _floating(dtype: np.dtype) -> type[np.floating]:
+def _smallest_float_dtype(dtype: np.dtype) -> type[np.floating]:
     """The smallest floating point that holds all values."""
     exact = dtype.itemsize <= (4 if dtype.kind == "f" else 2)
     return np.float32 if exact else np.float64
@@ -87,26 +87,29 @@ def read_npz(file: Path, key: str) -> np.ndarray:
     """Array ``key`` of an ``.npz`` archive as floating point; pickled objects are refused.
 
     Raises:
-        FormatError: missing or damaged archive, no such key, not numeric, or larger than it says or than ``MAX_BYTES``.
+        FormatError: missing or damaged archive, no such key, not numeric, or larger than it says or than
+            ``MAX_FILE_BYTES``.
     """
     try:
         data = read_bytes(file)
-        check_directory(io.BytesIO(data), file)
+        check_zip_directory(io.BytesIO(data), file)
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             if f"{key}.npy" not in archive.namelist():
                 raise FormatError(file, "key", ", ".join(sorted(archive.namelist())[:8]) or "nothing", f"{key}.npy")
             member = archive.getinfo(f"{key}.npy")
-            if member.file_size > MAX_BYTES:
-                raise FormatError(file, key, "an array that unpacks beyond the limit", f"at most {MAX_BYTES} bytes")
+            if member.file_size > MAX_FILE_BYTES:
+                raise FormatError(
+                    file, key, "an array that unpacks beyond the limit", f"at most {MAX_FILE_BYTES} bytes"
+                )
             if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                 raise FormatError(file, key, f"compression {member.compress_type}", "none or deflate, as numpy writes")
             with archive.open(member) as stream:
-                header = real_header(file, key, stream.read(_HEAD))
-            takes = member.file_size + math.prod(header.shape) * np.dtype(_floating(header.dtype)).itemsize
-            allow(file, key, takes, f"{header.shape} of {header.dtype}", len(data))
+                header = parse_real_npy_header(file, key, stream.read(_MAX_HEADER_BYTES))
+            takes = member.file_size + math.prod(header.shape) * np.dtype(_smallest_float_dtype(header.dtype)).itemsize
+            check_memory(file, key, takes, f"{header.shape} of {header.dtype}", len(data))
             raw = archive.read(member)
     except FormatError:
         raise
     except (zipfile.BadZipFile, zlib.error, struct.error, ValueError, RuntimeError, EOFError, OSError) as error:
         raise FormatError(file, "archive", error, "a whole .npz archive") from None
-    return real_numbers(file, key, raw)
+    return _decode_real_npy(file, key, raw)

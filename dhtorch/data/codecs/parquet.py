@@ -14,11 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dhtorch.data.codecs import thrift
-from dhtorch.data.io.decode import MAX_BYTES, MAX_TEXT_BYTES, FormatError, need
-from dhtorch.data.io.safe_open import GROWTH, MAX_MEMORY, last_change, opened, unreadable
+from dhtorch.data.io.decode import MAX_FILE_BYTES, MAX_TEXT_BYTES, FormatError, import_optional
+from dhtorch.data.io.safe_open import (
+    MAX_MEMORY_BYTES,
+    MAX_MEMORY_RATIO,
+    modification_time_ns,
+    open_regular,
+    unreadable_error,
+)
 
-MAX_ROWS = 50_000_000
-_MAX_UNPACKED = MAX_MEMORY // 4  # bytes of columns asked for, where the file is smaller: decoding makes some copies
+_MAX_ROWS = 50_000_000
+_MAX_UNPACKED_BYTES = (
+    MAX_MEMORY_BYTES // 4
+)  # bytes of columns asked for, where the file is smaller: decoding makes some copies
 
 
 class ParquetHeader(NamedTuple):
@@ -29,14 +37,14 @@ class ParquetHeader(NamedTuple):
     groups: tuple[int, ...]  # first row of each row group, and one beyond the last row
 
 
-def parquet_header(file: Path) -> ParquetHeader:
+def read_parquet_header(file: Path) -> ParquetHeader:
     """Rows, columns and row groups of a table, from its footer alone.
 
     Raises:
-        FormatError: missing, truncated or damaged file, or more than ``MAX_ROWS`` rows.
+        FormatError: missing, truncated or damaged file, or more than ``_MAX_ROWS`` rows.
         ImportError: no decoder is installed.
     """
-    return _open(file)[1]
+    return _open_table(file)[1]
 
 
 def read_columns(
@@ -59,15 +67,15 @@ def read_columns(
         of numbers of one length, nested as deep as they like, become the further axes of the array.
 
     Raises:
-        FormatError: as :func:`parquet_header`; no such column or rows, values missing, or lists of unequal length.
+        FormatError: as :func:`read_parquet_header`; no such column or rows, values missing, or lists of unequal length.
         ImportError: no decoder is installed.
     """
-    table, header = _open(file)
+    table, header = _open_table(file)
     columns = [*columns, *(name for name in optional if name in header.columns and name not in columns)]
-    return _columns(file, (table, header), columns, rows or (0, header.rows))
+    return _read_open_columns(file, (table, header), columns, rows or (0, header.rows))
 
 
-def _columns(
+def _read_open_columns(
     file: Path, found: tuple[Any, ParquetHeader], columns: Sequence[str], rows: tuple[int, int]
 ) -> dict[str, np.ndarray | list[Any]]:
     """As :func:`read_columns`, of a table that was opened."""
@@ -79,7 +87,7 @@ def _columns(
         raise FormatError(file, "rows", header.rows, f"rows {first} to {end - 1}")
     spans = list(zip(header.groups, header.groups[1:], strict=False))
     wanted = [i for i, (low, high) in enumerate(spans) if low < end and high > first]
-    pyarrow = need("pyarrow")
+    pyarrow = import_optional("pyarrow")
     try:
         _check_pages(file, columns, wanted)
         got = table.read_row_groups(wanted, columns=list(columns), use_threads=False)
@@ -87,7 +95,7 @@ def _columns(
         if wanted and got.num_rows != spans[wanted[-1]][1] - spans[wanted[0]][0]:
             raise FormatError(file, "rows", got.num_rows, "as many as the footer says")
         part = got.slice(start, end - first)
-        return {name: _array(part.column(name).combine_chunks(), file, name) for name in columns}
+        return {name: _column_to_array(part.column(name).combine_chunks(), file, name) for name in columns}
     except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, MemoryError) as error:
         if isinstance(error, FormatError):
             raise
@@ -100,31 +108,31 @@ def read_cell(file: Path, column: str, row: int) -> Any:
     Raises:
         FormatError: as :func:`read_columns`.
     """
-    key = (file, last_change(file), column)
-    first, values = _held.get(key, (0, ()))
+    key = (file, modification_time_ns(file), column)
+    first, values = _row_group_cache.get(key, (0, ()))
     if not first <= row < first + len(values):
-        _held.pop(key, None)
-        while len(_held) >= _MAX_HELD:
-            _held.popitem(last=False)
-        table, header = _open(file)
+        _row_group_cache.pop(key, None)
+        while len(_row_group_cache) >= _MAX_CACHED:
+            _row_group_cache.popitem(last=False)
+        table, header = _open_table(file)
         starts = header.groups
         if not 0 <= row < starts[-1]:
             raise FormatError(file, "rows", starts[-1], f"row {row}")
         group = int(np.searchsorted(starts, row, "right")) - 1
         rows = starts[group], starts[group + 1]
-        first, values = rows[0], _columns(file, (table, header), [column], rows)[column]
-        _held[key] = (first, values)
+        first, values = rows[0], _read_open_columns(file, (table, header), [column], rows)[column]
+        _row_group_cache[key] = (first, values)
     return values[row - first]
 
 
 #: Row groups in memory, by file, time of change and column: first row and values.
-_held: OrderedDict[tuple[Path, int, str], tuple[int, Any]] = OrderedDict()
-_MAX_HELD = 4
+_row_group_cache: OrderedDict[tuple[Path, int, str], tuple[int, Any]] = OrderedDict()
+_MAX_CACHED = 4
 
 
-def _open(file: Path) -> tuple[Any, ParquetHeader]:
+def _open_table(file: Path) -> tuple[Any, ParquetHeader]:
     size = _footer_size(file)
-    pyarrow, parquet = need("pyarrow"), need("pyarrow.parquet")
+    pyarrow, parquet = import_optional("pyarrow"), import_optional("pyarrow.parquet")
     limits = {"thrift_string_size_limit": size, "thrift_container_size_limit": max(size, 1)}
     try:
         table = parquet.ParquetFile(file, memory_map=False, pre_buffer=False, **limits)
@@ -133,21 +141,21 @@ def _open(file: Path) -> tuple[Any, ParquetHeader]:
         names = tuple(table.schema_arrow.names)
     except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, MemoryError) as error:
         raise FormatError(file, "footer", error, "a whole parquet file") from None
-    if min(counts, default=0) < 0 or sum(counts) != meta.num_rows or meta.num_rows > MAX_ROWS:
-        raise FormatError(file, "footer", f"{meta.num_rows} rows in groups of {counts[:4]}", f"at most {MAX_ROWS}")
+    if min(counts, default=0) < 0 or sum(counts) != meta.num_rows or meta.num_rows > _MAX_ROWS:
+        raise FormatError(file, "footer", f"{meta.num_rows} rows in groups of {counts[:4]}", f"at most {_MAX_ROWS}")
     starts = np.cumsum([0, *counts]).tolist()
     return table, ParquetHeader(meta.num_rows, names, tuple(starts))
 
 
 def _footer_size(file: Path) -> int:
     try:
-        with opened(file) as stream:
+        with open_regular(file) as stream:
             head = stream.read(4)
             size = stream.seek(0, 2)
             stream.seek(max(size - 8, 0))
             tail = stream.read(8)
     except OSError as error:
-        raise unreadable(file, error) from None
+        raise unreadable_error(file, error) from None
     length = int.from_bytes(tail[:4], "little")
     if size < 12 or head != b"PAR1" or tail[4:] != b"PAR1" or not 0 < length <= min(size - 12, MAX_TEXT_BYTES):
         raise FormatError(file, "file", f"{size} bytes from {head!r} to {tail[4:]!r}", "a whole parquet file")
@@ -157,9 +165,9 @@ def _footer_size(file: Path) -> int:
 # ----------------------------------------------------------------------------------------------------------- values
 
 
-def _array(column: Any, file: Path, name: str) -> np.ndarray | list[Any]:
+def _column_to_array(column: Any, file: Path, name: str) -> np.ndarray | list[Any]:
     """Arrow's nested lists → the axes of an array."""
-    types = need("pyarrow.types")
+    types = import_optional("pyarrow.types")
     if column.null_count:
         raise FormatError(file, name, f"{column.null_count} missing values", "a value in every row")
     kind = getattr(column.type, "storage_type", column.type)
@@ -169,7 +177,7 @@ def _array(column: Any, file: Path, name: str) -> np.ndarray | list[Any]:
     if not (types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)):
         return column.to_pylist()
     count = len(column)
-    inner = _array(column.flatten(), file, name)
+    inner = _column_to_array(column.flatten(), file, name)
     if isinstance(inner, list):
         return column.to_pylist()
     if types.is_fixed_size_list(kind):
@@ -200,70 +208,70 @@ class _Chunk(NamedTuple):
 
 
 #: Physical types and codecs by their numbers in a footer.
-TYPES = ("BOOLEAN", "INT32", "INT64", "INT96", "FLOAT", "DOUBLE", "BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
-CODECS = ("UNCOMPRESSED", "SNAPPY", "GZIP", "LZO", "BROTLI", "LZ4", "ZSTD", "LZ4_RAW")
-_WIDTH = {"INT32": 4, "FLOAT": 4, "INT96": 12, "BOOLEAN": 1}
-_TEXTS = ("BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
+_PHYSICAL_TYPES = ("BOOLEAN", "INT32", "INT64", "INT96", "FLOAT", "DOUBLE", "BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
+_CODECS = ("UNCOMPRESSED", "SNAPPY", "GZIP", "LZO", "BROTLI", "LZ4", "ZSTD", "LZ4_RAW")
+_TYPE_BYTES = {"INT32": 4, "FLOAT": 4, "INT96": 12, "BOOLEAN": 1}
+_STRING_TYPES = ("BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
 
 
 def _check_pages(file: Path, columns: Sequence[str], groups: Sequence[int]) -> None:
     """Refuse a chunk whose pages, by their own headers, unpack into more than the footer says or than the limit."""
     total = 0
-    chunks = _chunks(file, frozenset(groups))
-    with opened(file) as stream:
-        most = max(_MAX_UNPACKED, GROWTH * stream.seek(0, 2))
+    chunks = _read_chunks(file, frozenset(groups))
+    with open_regular(file) as stream:
+        most = max(_MAX_UNPACKED_BYTES, MAX_MEMORY_RATIO * stream.seek(0, 2))
         for chunk in chunks:
             if any(chunk.path == name or chunk.path.startswith(f"{name}.") for name in columns):
-                total += _chunk_bytes(file, stream, chunk)
+                total += _unpacked_chunk_bytes(file, stream, chunk)
             if total > most:
                 raise FormatError(file, chunk.path, f"{total} bytes", f"at most {most}")
 
 
-def _chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
+def _read_chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
     """The chunks of some row groups. Arrow is not asked: it ends the process where what it finds there is damaged."""
-    key = (file, last_change(file), groups)
-    if key in _told:
-        return _told[key]
+    key = (file, modification_time_ns(file), groups)
+    if key in _chunk_cache:
+        return _chunk_cache[key]
     size = _footer_size(file)
-    with opened(file) as stream:
+    with open_regular(file) as stream:
         stream.seek(-8 - size, 2)
         footer = stream.read(size)
     try:
-        every = enumerate(thrift.items(footer, 0, 4))
-        found = [_chunk(column[3]) for g, group in every if g in groups for column in group[1]]
+        every = enumerate(thrift.iter_list_structs(footer, 0, 4))
+        found = [_parse_chunk(column[3]) for g, group in every if g in groups for column in group[1]]
     except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise FormatError(file, "footer", error, "a whole parquet file") from None
-    while len(_told) >= _MAX_HELD:
-        _told.popitem(last=False)
-    _told[key] = found
+    while len(_chunk_cache) >= _MAX_CACHED:
+        _chunk_cache.popitem(last=False)
+    _chunk_cache[key] = found
     return found
 
 
 #: Chunks by file, time of change and row groups.
-_told: OrderedDict[tuple[Path, int, frozenset[int]], list[_Chunk]] = OrderedDict()
+_chunk_cache: OrderedDict[tuple[Path, int, frozenset[int]], list[_Chunk]] = OrderedDict()
 
 
-def _chunk(said: dict[int, Any]) -> _Chunk:
+def _parse_chunk(said: dict[int, Any]) -> _Chunk:
     path = b".".join(said[3]).decode("utf-8", "replace")
     start, dictionary = int(said[9]), int(said.get(11) or 0)
     start = dictionary if 0 < dictionary < start else start
     numbers = [int(said[k]) for k in (1, 4, 5, 6, 7)]
-    if not (0 <= numbers[0] < len(TYPES) and 0 <= numbers[1] < len(CODECS)):
+    if not (0 <= numbers[0] < len(_PHYSICAL_TYPES) and 0 <= numbers[1] < len(_CODECS)):
         raise ValueError(f"type {numbers[0]} and codec {numbers[1]} of {path}")
     return _Chunk(path, numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], start)
 
 
-def _chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
+def _unpacked_chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
     """Bytes that the pages of one column chunk unpack into."""
     values = unpacked = at = 0
-    width = _WIDTH.get(TYPES[chunk.kind], 8)
-    if chunk.start < 4 or not 0 <= chunk.packed <= MAX_BYTES:
+    width = _TYPE_BYTES.get(_PHYSICAL_TYPES[chunk.kind], 8)
+    if chunk.start < 4 or not 0 <= chunk.packed <= MAX_FILE_BYTES:
         raise FormatError(file, chunk.path, f"{chunk.packed} bytes at {chunk.start}", "a column inside the file")
     stream.seek(chunk.start)
     data = stream.read(chunk.packed)
     while at < len(data) and values < chunk.values:
         try:
-            page, at = thrift.fields(data, at)
+            page, at = thrift.parse_struct(data, at)
             full, packed = int(page[2]), int(page[3])
             inner = page.get(5) or page.get(8) or {}
             count, entries = int(inner.get(1, 0)), int((page.get(7) or {}).get(1, 0))
@@ -273,8 +281,8 @@ def _chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
             found = f"a page of {packed} bytes that unpack into {full}"
             raise FormatError(file, chunk.path, found, f"at most {chunk.unpacked}")
         values += count
-        if entries and TYPES[chunk.kind] in _TEXTS:
-            width = max(width, _longest(file, chunk, data[at : at + packed], full))
+        if entries and _PHYSICAL_TYPES[chunk.kind] in _STRING_TYPES:
+            width = max(width, _longest_dictionary_entry(file, chunk, data[at : at + packed], full))
         unpacked += max(full, width * max(count, entries))
         at += packed
     if values != chunk.values:
@@ -282,15 +290,15 @@ def _chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
     return unpacked
 
 
-def _longest(file: Path, chunk: _Chunk, packed: bytes, full: int) -> int:
+def _longest_dictionary_entry(file: Path, chunk: _Chunk, packed: bytes, full: int) -> int:
     """Bytes of the longest entry of a dictionary: a row costs some bits in the file and an entry in memory."""
-    pyarrow = need("pyarrow")
-    if full > _MAX_UNPACKED or TYPES[chunk.kind] != "BYTE_ARRAY":
+    pyarrow = import_optional("pyarrow")
+    if full > _MAX_UNPACKED_BYTES or _PHYSICAL_TYPES[chunk.kind] != "BYTE_ARRAY":
         return full  # a fixed length is at most all of it
     try:
         plain = packed
-        if CODECS[chunk.codec] != "UNCOMPRESSED":
-            plain = pyarrow.Codec(CODECS[chunk.codec].lower()).decompress(packed, full, asbytes=True)
+        if _CODECS[chunk.codec] != "UNCOMPRESSED":
+            plain = pyarrow.Codec(_CODECS[chunk.codec].lower()).decompress(packed, full, asbytes=True)
     except (pyarrow.ArrowException, OSError, ValueError, TypeError) as error:
         raise FormatError(file, chunk.path, error, "a dictionary that unpacks") from None
     at = longest = 0

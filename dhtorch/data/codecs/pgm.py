@@ -10,7 +10,9 @@ import numpy as np
 
 from dhtorch.data.io.decode import MAX_PIXELS, FormatError, read_bytes
 
-_HEAD = re.compile(rb"P5\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s")
+_HEADER_PATTERN = re.compile(
+    rb"P5\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s+(?:#[^\n]*\n\s*)*(\d{1,9})\s"
+)
 
 
 def read_pgm(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
@@ -20,7 +22,7 @@ def read_pgm(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
         FormatError: missing or truncated file, no codes of 16 bits, another size than ``hw``.
     """
     data = read_bytes(file)
-    head = _HEAD.match(data[:1024])
+    head = _HEADER_PATTERN.match(data[:1024])
     if head is None:
         raise FormatError(file, "header", repr(data[:16]), "P5, width, height and largest code")
     w, h, largest = map(int, head.groups())

@@ -17,19 +17,28 @@ from typing import Any, Final
 
 import numpy as np
 
-from dhtorch.data.codecs.npy import npy_header
+from dhtorch.data.codecs.npy import parse_npy_header
 from dhtorch.data.io import decode as files
 from dhtorch.data.io import safe_open as doors
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.pickled_arrays import CALLS, NAMES, SCALARS, Name, Shell, built, filled, scalar
+from dhtorch.data.pickled_arrays import (
+    PERMITTED_CALLS,
+    PERMITTED_NAMES,
+    SCALAR_TYPES,
+    PendingArray,
+    PermittedName,
+    apply_state,
+    array_from_bytes,
+    check_scalar,
+)
 
-MAX_PICKLE_BYTES: Final = 128_000_000
-MAX_STEPS: Final = 10_000_000  # instructions of one pickle
-MAX_DEPTH: Final = 32  # containers inside containers
+_MAX_PICKLE_BYTES: Final = 128_000_000
+_MAX_INSTRUCTIONS: Final = 10_000_000  # instructions of one pickle
+_MAX_NESTING: Final = 32  # containers inside containers
 
 #: Bytes that a value takes on the stack, in its container, in the memo and in the copy that is handed out, at most.
-_SIZES: Final = {set: 500, dict: 500, list: 250, tuple: 120, float: 40, int: 40, bool: 16, type(None): 16}
-_OTHER: Final = 100
+_BYTES_PER_VALUE: Final = {set: 500, dict: 500, list: 250, tuple: 120, float: 40, int: 40, bool: 16, type(None): 16}
+_BYTES_PER_OTHER_VALUE: Final = 100
 
 _MARK = object()
 
@@ -45,18 +54,18 @@ def read_npy(file: Path) -> Any:
     Raises:
         FormatError: missing or damaged file, or a pickle that contains or does anything else.
     """
-    data = files.read_bytes(file, MAX_PICKLE_BYTES)
-    shape, fortran, dtype, start = npy_header(file, "header", data)
+    data = files.read_bytes(file, _MAX_PICKLE_BYTES)
+    shape, fortran, dtype, start = parse_npy_header(file, "header", data)
     body = data[start:]
     if dtype.hasobject:
-        return loads(body, file)
+        return load_pickle(body, file)
     try:
-        return filled(dtype, shape, fortran, body)
+        return array_from_bytes(dtype, shape, fortran, body)
     except (ValueError, TypeError, OverflowError) as error:
         raise FormatError(file, "data", error, f"numbers of type {dtype}") from None
 
 
-def loads(data: bytes, file: Path) -> Any:
+def load_pickle(data: bytes, file: Path) -> Any:
     """The object of a pickle of plain data; ``file`` names it in errors.
 
     Raises:
@@ -65,7 +74,7 @@ def loads(data: bytes, file: Path) -> Any:
     collects = gc.isenabled()
     gc.disable()  # it looks at every new container again and again, and finds no cycle: most of the time went there
     try:
-        return _Machine(data, file).run()
+        return _Unpickler(data, file).run()
     except FormatError:
         raise
     except (IndexError, KeyError, TypeError, ValueError, AttributeError, OverflowError, struct.error) as error:
@@ -76,7 +85,7 @@ def loads(data: bytes, file: Path) -> Any:
             gc.enable()
 
 
-class _Machine:
+class _Unpickler:
     """Runs one pickle: a stack, a memo, and the instructions as methods of one table."""
 
     def __init__(self, data: bytes, file: Path) -> None:
@@ -84,19 +93,22 @@ class _Machine:
         self.stack: list[Any] = []
         self.memo: dict[int, Any] = {}
         self.steps = self.nodes = 0
-        self.taken, self.most = 0, max(doors.MAX_MEMORY, doors.GROWTH * len(data))  # bytes of Python's own objects
+        self.taken, self.most = (
+            0,
+            max(doors.MAX_MEMORY_BYTES, doors.MAX_MEMORY_RATIO * len(data)),
+        )  # bytes of Python's own objects
         self.budget = 4 * len(data) + 4096  # bytes that calls may make of this file; shared values could multiply
 
     def run(self) -> Any:
         while True:
             self.steps += 1
-            if self.steps > MAX_STEPS:
-                raise FormatError(self.file, "pickle", f"more than {MAX_STEPS} instructions", "fewer")
+            if self.steps > _MAX_INSTRUCTIONS:
+                raise FormatError(self.file, "pickle", f"more than {_MAX_INSTRUCTIONS} instructions", "fewer")
             code = self.data[self.at]
             self.at += 1
             if code == 0x2E:  # STOP
                 return self._plain(self.stack.pop(), 0)
-            step = _STEPS.get(code)
+            step = _INSTRUCTIONS.get(code)
             if step is None:
                 raise FormatError(self.file, "pickle", f"instruction {bytes([code])!r}", "one that builds plain data")
             step(self)
@@ -125,20 +137,20 @@ class _Machine:
 
     def push(self, value: Any) -> None:
         self.stack.append(value)
-        self.take_memory(_SIZES.get(type(value), _OTHER))
+        self.take_memory(_BYTES_PER_VALUE.get(type(value), _BYTES_PER_OTHER_VALUE))
 
     def remember(self, key: int) -> None:
         self.memo[key] = self.stack[-1]
-        self.take_memory(_OTHER)
+        self.take_memory(_BYTES_PER_OTHER_VALUE)
 
     def recall(self, key: int) -> None:
         self.stack.append(self.memo[key])
-        self.take_memory(_SIZES[bool])
+        self.take_memory(_BYTES_PER_VALUE[bool])
 
     def take_memory(self, n: int) -> None:
         self.taken += n
         if self.taken > self.most:
-            doors.allow(self.file, "pickle", self.taken, f"{self.steps} instructions", len(self.data))
+            doors.check_memory(self.file, "pickle", self.taken, f"{self.steps} instructions", len(self.data))
 
     def top(self, kind: type) -> Any:
         if type(self.stack[-1]) is not kind:
@@ -159,7 +171,7 @@ class _Machine:
         if len(items) % 2:
             raise ValueError("a key without a value")
         for key, value in zip(items[::2], items[1::2], strict=True):
-            target[scalar(key)] = value
+            target[check_scalar(key)] = value
 
     def integer(self, n: int) -> None:
         if not 0 <= n <= 16:
@@ -169,9 +181,9 @@ class _Machine:
     def name(self, module: Any, attribute: Any) -> None:
         text = re.sub(r"^numpy\._core\b", "numpy.core", f"{module}.{attribute}")
         text = re.sub(r"^__builtin__\b", "builtins", text)
-        if text not in NAMES or type(module) is not str or type(attribute) is not str:
+        if text not in PERMITTED_NAMES or type(module) is not str or type(attribute) is not str:
             raise FormatError(self.file, "pickle", f"the name {text}", "numpy arrays and plain containers only")
-        self.push(Name(text))
+        self.push(PermittedName(text))
 
     def line(self) -> str:
         end = self.data.index(b"\n", self.at, self.at + 256)
@@ -179,13 +191,13 @@ class _Machine:
 
     def call(self) -> None:
         function, args = self.pop_n(2)
-        if type(function) is not Name or type(args) is not tuple:
+        if type(function) is not PermittedName or type(args) is not tuple:
             raise TypeError("a call of something else than a permitted name")
-        self.push(CALLS[function](self.spend, *args))
+        self.push(PERMITTED_CALLS[function](self.spend, *args))
 
     def build(self) -> None:
         target, state = self.pop_n(2)
-        self.push(built(self.spend, target, state))
+        self.push(apply_state(self.spend, target, state))
 
     def spend(self, n: int) -> None:
         self.budget -= n
@@ -201,16 +213,16 @@ class _Machine:
         times the one before) has more nodes than the file has instructions: both end here.
         """
         self.nodes += 1
-        if depth > MAX_DEPTH or self.nodes > 8 * self.steps + 64:
-            raise FormatError(self.file, "pickle", "containers nested beyond measure", f"at most {MAX_DEPTH} deep")
+        if depth > _MAX_NESTING or self.nodes > 8 * self.steps + 64:
+            raise FormatError(self.file, "pickle", "containers nested beyond measure", f"at most {_MAX_NESTING} deep")
         kind = type(value)
-        if kind in SCALARS or kind is bytearray:
+        if kind in SCALAR_TYPES or kind is bytearray:
             return value
         if kind in (list, tuple, set):
             return kind(self._plain(item, depth + 1) for item in value)
         if kind is dict:
             return {key: self._plain(item, depth + 1) for key, item in value.items()}
-        if kind is Shell and value.value is not None:
+        if kind is PendingArray and value.value is not None:
             if isinstance(value.value, np.ndarray):
                 return value.value
             items = [self._plain(item, depth + 1) for item in value.value]
@@ -218,51 +230,51 @@ class _Machine:
         raise TypeError(f"a bare {kind.__name__} is no data")
 
 
-def _pushes(form: str) -> Callable[[_Machine], None]:
+def _push_number(form: str) -> Callable[[_Unpickler], None]:
     """A number, stored as ``form`` of the struct module."""
     return lambda m: m.push(m.unpack(form))
 
 
-def _texts(form: str) -> Callable[[_Machine], None]:
+def _push_text(form: str) -> Callable[[_Unpickler], None]:
     return lambda m: m.push(m.take(m.unpack(form)).decode("utf-8", "surrogatepass"))
 
 
-def _bytes(form: str) -> Callable[[_Machine], None]:
+def _push_bytes(form: str) -> Callable[[_Unpickler], None]:
     return lambda m: m.push(m.take(m.unpack(form)))
 
 
-def _stores(form: str) -> Callable[[_Machine], None]:
+def _store_memo(form: str) -> Callable[[_Unpickler], None]:
     return lambda m: m.remember(m.unpack(form))
 
 
-def _recalls(form: str) -> Callable[[_Machine], None]:
+def _push_memo(form: str) -> Callable[[_Unpickler], None]:
     return lambda m: m.recall(m.unpack(form))
 
 
-def _collects(make: Callable[[Any], Any]) -> Callable[[_Machine], None]:
+def _push_collected(make: Callable[[Any], Any]) -> Callable[[_Unpickler], None]:
     return lambda m: m.push(make(m.since_mark()))
 
 
-def _tuples(n: int) -> Callable[[_Machine], None]:
+def _push_tuple(n: int) -> Callable[[_Unpickler], None]:
     return lambda m: m.push(m.pop_n(n))
 
 
-def _append(machine: _Machine) -> None:
+def _append_to_list(machine: _Unpickler) -> None:
     (value,) = machine.pop_n(1)
     machine.top(list).append(value)
 
 
-def _extend(machine: _Machine) -> None:
+def _extend_list(machine: _Unpickler) -> None:
     items = machine.since_mark()
     machine.top(list).extend(items)
 
 
-def _add(machine: _Machine) -> None:
+def _add_to_set(machine: _Unpickler) -> None:
     items = machine.since_mark()
-    machine.top(set).update(map(scalar, items))
+    machine.top(set).update(map(check_scalar, items))
 
 
-_STEPS: Final[dict[int, Callable[[_Machine], Any]]] = {
+_INSTRUCTIONS: Final[dict[int, Callable[[_Unpickler], Any]]] = {
     ord(code): step
     for code, step in {
         "\x80": lambda m: m.take(1),  # PROTO: an instruction we do not know stops us, a number would not
@@ -274,41 +286,41 @@ _STEPS: Final[dict[int, Callable[[_Machine], Any]]] = {
         "N": lambda m: m.push(None),
         "\x88": lambda m: m.push(True),
         "\x89": lambda m: m.push(False),
-        "J": _pushes("<i"),
-        "K": _pushes("<B"),
-        "M": _pushes("<H"),
-        "G": _pushes(">d"),
+        "J": _push_number("<i"),
+        "K": _push_number("<B"),
+        "M": _push_number("<H"),
+        "G": _push_number(">d"),
         "\x8a": lambda m: m.integer(m.unpack("<B")),
         "\x8b": lambda m: m.integer(m.unpack("<i")),
-        "X": _texts("<I"),
-        "\x8c": _texts("<B"),
-        "\x8d": _texts("<Q"),
-        "B": _bytes("<I"),
-        "C": _bytes("<B"),
-        "\x8e": _bytes("<Q"),
-        "\x96": _bytes("<Q"),  # a byte array
+        "X": _push_text("<I"),
+        "\x8c": _push_text("<B"),
+        "\x8d": _push_text("<Q"),
+        "B": _push_bytes("<I"),
+        "C": _push_bytes("<B"),
+        "\x8e": _push_bytes("<Q"),
+        "\x96": _push_bytes("<Q"),  # a byte array
         "]": lambda m: m.push([]),
         "}": lambda m: m.push({}),
         ")": lambda m: m.push(()),
         "\x8f": lambda m: m.push(set()),
-        "l": _collects(list),
-        "t": _collects(tuple),
-        "\x85": _tuples(1),
-        "\x86": _tuples(2),
-        "\x87": _tuples(3),
-        "a": _append,
-        "e": _extend,
-        "\x90": _add,
+        "l": _push_collected(list),
+        "t": _push_collected(tuple),
+        "\x85": _push_tuple(1),
+        "\x86": _push_tuple(2),
+        "\x87": _push_tuple(3),
+        "a": _append_to_list,
+        "e": _extend_list,
+        "\x90": _add_to_set,
         "s": lambda m: m.set_items(list(m.pop_n(2))),
         "u": lambda m: m.set_items(m.since_mark()),
-        "q": _stores("<B"),
-        "r": _stores("<I"),
+        "q": _store_memo("<B"),
+        "r": _store_memo("<I"),
         "\x94": lambda m: m.remember(len(m.memo)),
-        "h": _recalls("<B"),
-        "j": _recalls("<I"),
+        "h": _push_memo("<B"),
+        "j": _push_memo("<I"),
         "c": lambda m: m.name(m.line(), m.line()),
         "\x93": lambda m: m.name(*m.pop_n(2)),
-        "R": _Machine.call,
-        "b": _Machine.build,
+        "R": _Unpickler.call,
+        "b": _Unpickler.build,
     }.items()
 }

@@ -12,17 +12,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from dhtorch.data.io.decode import MAX_BYTES, FormatError
-from dhtorch.data.io.safe_open import opened, unreadable
+from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
+from dhtorch.data.io.safe_open import open_regular, unreadable_error
 
-_BLOCK = 512
+_BLOCK_BYTES = 512
 _MAX_NAME_BYTES = 1_000_000  # of a long name or a pax header
-_MAX_DIGITS = 18  # of a size in a pax header
+_MAX_SIZE_DIGITS = 18  # of a size in a pax header
 _FILES, _PAX, _LONG_NAME, _SPARSE = b"0\x007", b"x", b"L", b"S"
-_NO_DATA = b"123456"  # links, devices, folders: whatever size they claim
+_KINDS_WITHOUT_DATA = b"123456"  # links, devices, folders: whatever size they claim
 
 
-class Member(NamedTuple):
+class TarMember(NamedTuple):
     """A plain file in an archive."""
 
     name: str
@@ -30,20 +30,20 @@ class Member(NamedTuple):
     size: int
 
 
-def members(file: Path) -> Iterator[Member]:
+def iter_tar_members(file: Path) -> Iterator[TarMember]:
     """The plain files of an archive in their order.
 
     Raises:
         FormatError: missing file, a damaged header, or an archive that ends too early.
     """
     try:
-        with opened(file) as stream:
-            yield from _walk(file, stream.fileno())
+        with open_regular(file) as stream:
+            yield from _iter_headers(file, stream.fileno())
     except OSError as error:
-        raise unreadable(file, error) from None
+        raise unreadable_error(file, error) from None
 
 
-def read_member(file: Path, offset: int, size: int, limit: int = MAX_BYTES) -> bytes:
+def read_tar_member(file: Path, offset: int, size: int, limit: int = MAX_FILE_BYTES) -> bytes:
     """The bytes of a member.
 
     Raises:
@@ -52,36 +52,36 @@ def read_member(file: Path, offset: int, size: int, limit: int = MAX_BYTES) -> b
     if size > limit:
         raise FormatError(file, f"member at byte {offset}", f"{size} bytes", f"at most {limit} bytes")
     try:
-        with opened(file) as stream:
+        with open_regular(file) as stream:
             data = os.pread(stream.fileno(), size, offset)
     except OSError as error:
-        raise unreadable(file, error) from None
+        raise unreadable_error(file, error) from None
     if len(data) != size:
         raise FormatError(file, f"member at byte {offset}", f"{len(data)} bytes", f"{size} bytes")
     return data
 
 
-def _walk(file: Path, stream: int) -> Iterator[Member]:
+def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
     total, at = os.fstat(stream).st_size, 0
     special: dict[str, str] = {}  # what an extra header says about the member that follows
-    while at + _BLOCK <= total:
-        header = os.pread(stream, _BLOCK, at)
+    while at + _BLOCK_BYTES <= total:
+        header = os.pread(stream, _BLOCK_BYTES, at)
         if not header.strip(b"\0"):
             return
-        name, kind, size = _header(file, header, at)
-        size = _said_size(file, special["size"], at) if "size" in special else size
-        size = 0 if kind in _NO_DATA else size
-        data, at = at + _BLOCK, at + _BLOCK + (size + _BLOCK - 1) // _BLOCK * _BLOCK
+        name, kind, size = _parse_header(file, header, at)
+        size = _parse_pax_size(file, special["size"], at) if "size" in special else size
+        size = 0 if kind in _KINDS_WITHOUT_DATA else size
+        data, at = at + _BLOCK_BYTES, at + _BLOCK_BYTES + (size + _BLOCK_BYTES - 1) // _BLOCK_BYTES * _BLOCK_BYTES
         if data + size > total:
             raise FormatError(file, special.get("path", name), f"{total - data} of {size} bytes", "a whole archive")
         if kind in _LONG_NAME + _PAX:
             if size > _MAX_NAME_BYTES:
                 raise FormatError(file, f"header at byte {data}", f"{size} bytes", f"at most {_MAX_NAME_BYTES} bytes")
             text = os.pread(stream, size, data)
-            special |= _pax(text) if kind == _PAX else {"path": _text(text)}
+            special |= _parse_pax(text) if kind == _PAX else {"path": _decode_text(text)}
             continue
         if kind in _FILES:
-            yield Member(special.get("path", name), data, size)
+            yield TarMember(special.get("path", name), data, size)
         elif kind == _SPARSE:
             raise FormatError(file, name, "a sparse member", "plain files")
         special = {}
@@ -89,26 +89,26 @@ def _walk(file: Path, stream: int) -> Iterator[Member]:
         raise FormatError(file, "content", f"{total} bytes", "a tar archive")
 
 
-def _header(file: Path, header: bytes, at: int) -> tuple[str, bytes, int]:
+def _parse_header(file: Path, header: bytes, at: int) -> tuple[str, bytes, int]:
     """Name, kind and size of a member."""
-    stored = _number(header[148:156])
+    stored = _parse_number(header[148:156])
     if stored != sum(header[:148]) + 8 * 32 + sum(header[156:]):
         raise FormatError(file, f"header at byte {at}", "a wrong check sum", "a tar header, not compressed")
-    size = _number(header[124:136])
+    size = _parse_number(header[124:136])
     if size is None or size < 0:
         raise FormatError(file, f"header at byte {at}", f"size {header[124:136]!r}", "a number of bytes")
-    name, folder = _text(header[:100]), _text(header[345:500]) if header[257:263] == b"ustar\0" else ""
+    name, folder = _decode_text(header[:100]), _decode_text(header[345:500]) if header[257:263] == b"ustar\0" else ""
     return (f"{folder}/{name}" if folder else name), header[156:157], size
 
 
-def _said_size(file: Path, text: str, at: int) -> int:
+def _parse_pax_size(file: Path, text: str, at: int) -> int:
     """The size that a pax header says."""
-    if not (text.isascii() and text.isdecimal() and len(text) <= _MAX_DIGITS):
+    if not (text.isascii() and text.isdecimal() and len(text) <= _MAX_SIZE_DIGITS):
         raise FormatError(file, f"header at byte {at}", f"size {text}", "a number of bytes")
     return int(text)
 
 
-def _number(field: bytes) -> int | None:
+def _parse_number(field: bytes) -> int | None:
     """Octal digits, or GNU's big-endian number with the top bit set."""
     if field[0] & 0x80:
         return int.from_bytes(bytes([field[0] & 0x7F]) + field[1:], "big") if field[0] == 0x80 else None
@@ -116,11 +116,11 @@ def _number(field: bytes) -> int | None:
     return int(digits or b"0", 8) if all(48 <= c < 56 for c in digits) else None
 
 
-def _text(field: bytes) -> str:
+def _decode_text(field: bytes) -> str:
     return field.split(b"\0", 1)[0].decode("utf-8", "replace")
 
 
-def _pax(text: bytes) -> dict[str, str]:
+def _parse_pax(text: bytes) -> dict[str, str]:
     """``length key=value`` lines; damaged ones end the list."""
     found, at = {}, 0
     while (space := text.find(b" ", at, at + 12)) > at and text[at:space].isdigit():

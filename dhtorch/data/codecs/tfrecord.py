@@ -18,74 +18,74 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.io.decode import MAX_BYTES, FormatError
-from dhtorch.data.io.safe_open import opened, unreadable
+from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
+from dhtorch.data.io.safe_open import open_regular, unreadable_error
 
-MAX_RECORDS = 10_000_000
-MAX_FIELDS = 2_000_000  # of one record: names, pictures, runs of numbers
+_MAX_RECORDS = 10_000_000
+_MAX_FIELDS = 2_000_000  # of one record: names, pictures, runs of numbers
 
-_HEAD, _TAIL = 12, 4  # bytes around a record
-_POLYNOMIAL, _MASK = 0x82F63B78, 0xA282EAD8  # bits reflected
-_BLOCK = 512  # bytes whose check sum is made beside those of all other blocks
-_PIECE = 4 << 20  # bytes of which blocks are made at once
-_KINDS = {1: "bytes", 2: "float", 3: "int64"}
+_HEADER_BYTES, _FOOTER_BYTES = 12, 4  # bytes around a record
+_CRC_POLYNOMIAL, _CRC_MASK = 0x82F63B78, 0xA282EAD8  # bits reflected
+_CRC_BLOCK_BYTES = 512  # bytes whose check sum is made beside those of all other blocks
+_CRC_BATCH_BYTES = 4 << 20  # bytes of which blocks are made at once
+_FEATURE_KINDS = {1: "bytes", 2: "float", 3: "int64"}
 
 
-class Span(NamedTuple):
+class ByteSpan(NamedTuple):
     """Some bytes of a file."""
 
     offset: int
     length: int
 
 
-class Feature(NamedTuple):
+class ExampleFeature(NamedTuple):
     """One feature of a record, not yet decoded."""
 
     kind: str  # "bytes", "float" or "int64"
-    spans: tuple[Span, ...]  # of bytes: each value's; of numbers: runs of them, packed
+    spans: tuple[ByteSpan, ...]  # of bytes: each value's; of numbers: runs of them, packed
 
 
-def record_spans(file: Path) -> list[Span]:
+def index_records(file: Path) -> list[ByteSpan]:
     """Where the records of a file lie; only their lengths are read, and held against their check sums.
 
     Raises:
         FormatError: unreadable, a wrong check sum, a file that ends inside a record, or no record at all.
     """
-    found: list[Span] = []
+    found: list[ByteSpan] = []
     try:
-        with opened(file) as stream:
+        with open_regular(file) as stream:
             total, at = os.fstat(stream.fileno()).st_size, 0
             while at < total:
-                head = os.pread(stream.fileno(), _HEAD, at)
-                length = _length(file, head, at)
-                if at + _HEAD + length + _TAIL > total:
+                head = os.pread(stream.fileno(), _HEADER_BYTES, at)
+                length = _parse_length(file, head, at)
+                if at + _HEADER_BYTES + length + _FOOTER_BYTES > total:
                     raise FormatError(file, f"record {len(found)}", f"{total - at} bytes", f"{length} and 16 more")
-                found.append(Span(at + _HEAD, length))
-                at += _HEAD + length + _TAIL
-                if len(found) > MAX_RECORDS:
-                    raise FormatError(file, "records", "more", f"at most {MAX_RECORDS}")
+                found.append(ByteSpan(at + _HEADER_BYTES, length))
+                at += _HEADER_BYTES + length + _FOOTER_BYTES
+                if len(found) > _MAX_RECORDS:
+                    raise FormatError(file, "records", "more", f"at most {_MAX_RECORDS}")
     except OSError as error:
-        raise unreadable(file, error) from None
+        raise unreadable_error(file, error) from None
     if not found:
         raise FormatError(file, "records", "none", "at least one")
     return found
 
 
-def read_record(file: Path, span: Span) -> bytes:
+def read_record(file: Path, span: ByteSpan) -> bytes:
     """The bytes of a record, held against their check sum.
 
     Raises:
         FormatError: unreadable, too long, cut off, or another check sum.
     """
-    data = read_span(file, Span(span.offset, span.length + _TAIL))
+    data = read_span(file, ByteSpan(span.offset, span.length + _FOOTER_BYTES))
     body, stored = data[: span.length], int.from_bytes(data[span.length :], "little")
-    if masked(crc32c(body)) != stored:
-        found = f"check sum {masked(crc32c(body)):08x}"
+    if mask_crc(crc32c(body)) != stored:
+        found = f"check sum {mask_crc(crc32c(body)):08x}"
         raise FormatError(file, f"record at byte {span.offset}", found, f"{stored:08x}")
     return body
 
 
-def read_span(file: Path, span: Span) -> bytes:
+def read_span(file: Path, span: ByteSpan) -> bytes:
     """Bytes of a file.
 
     Raises:
@@ -94,7 +94,7 @@ def read_span(file: Path, span: Span) -> bytes:
     return read_spans(file, [span])[0]
 
 
-def read_spans(file: Path, spans: Sequence[Span]) -> list[bytes]:
+def read_spans(file: Path, spans: Sequence[ByteSpan]) -> list[bytes]:
     """Bytes of several places of a file, which is opened once.
 
     Raises:
@@ -102,20 +102,20 @@ def read_spans(file: Path, spans: Sequence[Span]) -> list[bytes]:
     """
     found = []
     try:
-        with opened(file) as stream:
+        with open_regular(file) as stream:
             for offset, length in spans:
-                if length > MAX_BYTES:
-                    raise FormatError(file, f"record at byte {offset}", f"{length} bytes", f"at most {MAX_BYTES}")
+                if length > MAX_FILE_BYTES:
+                    raise FormatError(file, f"record at byte {offset}", f"{length} bytes", f"at most {MAX_FILE_BYTES}")
                 data = os.pread(stream.fileno(), length, offset)
                 if len(data) != length:
                     raise FormatError(file, f"record at byte {offset}", f"{len(data)} bytes", f"{length} bytes")
                 found.append(data)
     except OSError as error:
-        raise unreadable(file, error) from None
+        raise unreadable_error(file, error) from None
     return found
 
 
-def example(body: bytes, file: Path, start: int) -> dict[str, Feature]:
+def parse_example(body: bytes, file: Path, start: int) -> dict[str, ExampleFeature]:
     """Name → feature of an ``Example``; spans count in the file, in which the message begins at ``start``.
 
     Raises:
@@ -124,7 +124,7 @@ def example(body: bytes, file: Path, start: int) -> dict[str, Feature]:
     return _Message(body, file, start).features()
 
 
-def numbers(file: Path, name: str, feature: Feature, most: int) -> np.ndarray:
+def read_feature_numbers(file: Path, name: str, feature: ExampleFeature, most: int) -> np.ndarray:
     """The numbers of a feature: float64 of floats, int64 of whole numbers.
 
     Raises:
@@ -139,31 +139,33 @@ def numbers(file: Path, name: str, feature: Feature, most: int) -> np.ndarray:
     if not feature.spans:
         return np.zeros(0)
     first, last = feature.spans[0].offset, feature.spans[-1].offset + feature.spans[-1].length
-    data = read_span(file, Span(first, last - first))
+    data = read_span(file, ByteSpan(first, last - first))
     runs = [data[at - first : at - first + length] for at, length in feature.spans]
     if feature.kind == "float":
         data = b"".join(runs)
         if len(data) % 4:
             raise FormatError(file, name, f"{len(data)} bytes", "floats of 4 bytes")
         return np.frombuffer(data, "<f4").astype(np.float64)
-    return np.concatenate([np.zeros(0, np.int64), *(_whole(run, file, name) for run in runs)])
+    return np.concatenate([np.zeros(0, np.int64), *(_decode_varints(run, file, name) for run in runs)])
 
 
-def masked(crc: int) -> int:
+def mask_crc(crc: int) -> int:
     """A check sum as it is stored."""
-    return (((crc >> 15) | (crc << 17)) + _MASK) & 0xFFFFFFFF
+    return (((crc >> 15) | (crc << 17)) + _CRC_MASK) & 0xFFFFFFFF
 
 
 def crc32c(data: bytes) -> int:
     """CRC-32C. The sums of many blocks are made side by side and then joined: the sum is linear in its bits."""
-    state, table = 0xFFFFFFFF, _table()
-    head = len(data) % _BLOCK
+    state, table = 0xFFFFFFFF, _crc_table()
+    head = len(data) % _CRC_BLOCK_BYTES
     for byte in data[:head]:
         state = int(table[(state ^ byte) & 0xFF]) ^ (state >> 8)
-    ahead = [t.tolist() for t in _ahead()]
-    for at in range(head, len(data), _PIECE // _BLOCK * _BLOCK):
-        piece = np.frombuffer(data, np.uint8, min(_PIECE // _BLOCK * _BLOCK, len(data) - at), at)
-        columns = np.ascontiguousarray(piece.reshape(-1, _BLOCK).T)
+    ahead = [t.tolist() for t in _crc_shift_table()]
+    for at in range(head, len(data), _CRC_BATCH_BYTES // _CRC_BLOCK_BYTES * _CRC_BLOCK_BYTES):
+        piece = np.frombuffer(
+            data, np.uint8, min(_CRC_BATCH_BYTES // _CRC_BLOCK_BYTES * _CRC_BLOCK_BYTES, len(data) - at), at
+        )
+        columns = np.ascontiguousarray(piece.reshape(-1, _CRC_BLOCK_BYTES).T)
         sums = np.zeros(columns.shape[1], np.uint32)
         for column in columns:
             sums = table[(sums ^ column) & 0xFF] ^ (sums >> 8)
@@ -174,28 +176,28 @@ def crc32c(data: bytes) -> int:
 
 
 @cache
-def _table() -> np.ndarray:
+def _crc_table() -> np.ndarray:
     """What one byte does to the state (256,)."""
     state = np.arange(256, dtype=np.uint32)
     for _ in range(8):
-        state = np.where(state & 1, (state >> 1) ^ np.uint32(_POLYNOMIAL), state >> 1)
+        state = np.where(state & 1, (state >> 1) ^ np.uint32(_CRC_POLYNOMIAL), state >> 1)
     return state
 
 
 @cache
-def _ahead() -> np.ndarray:
+def _crc_shift_table() -> np.ndarray:
     """What a block of zeros does to each byte of the state (4, 256)."""
     state = (np.arange(256, dtype=np.uint32)[None] << (8 * np.arange(4, dtype=np.uint32))[:, None]).astype(np.uint32)
-    for _ in range(_BLOCK):
-        state = _table()[state & 0xFF] ^ (state >> 8)
+    for _ in range(_CRC_BLOCK_BYTES):
+        state = _crc_table()[state & 0xFF] ^ (state >> 8)
     return state
 
 
-def _length(file: Path, head: bytes, at: int) -> int:
-    if len(head) < _HEAD:
+def _parse_length(file: Path, head: bytes, at: int) -> int:
+    if len(head) < _HEADER_BYTES:
         raise FormatError(file, f"record at byte {at}", f"{len(head)} bytes", "a TFRecord header of 12")
     length, stored = struct.unpack("<QI", head)
-    if masked(crc32c(head[:8])) != stored:
+    if mask_crc(crc32c(head[:8])) != stored:
         raise FormatError(file, f"record at byte {at}", "a wrong check sum of its length", "a TFRecord")
     return length
 
@@ -205,11 +207,11 @@ class _Message:
 
     def __init__(self, body: bytes, file: Path, start: int) -> None:
         self.body, self.file, self.start = body, file, start
-        self.left = MAX_FIELDS
+        self.left = _MAX_FIELDS
 
-    def features(self) -> dict[str, Feature]:
+    def features(self) -> dict[str, ExampleFeature]:
         """Name → feature, the last of a name."""
-        found: dict[str, Feature] = {}
+        found: dict[str, ExampleFeature] = {}
         for _, features in self._inner((0, len(self.body)), 1):
             for _, entry in self._inner(features, 1):
                 name, feature = "", None
@@ -222,10 +224,10 @@ class _Message:
                     found[name] = feature
         return found
 
-    def _feature(self, within: tuple[int, int]) -> Feature | None:
-        for number, inner in self._inner(within, *_KINDS):
-            spans = (Span(self.start + at, size) for field, _, (at, size) in self._fields(inner) if field == 1)
-            return Feature(_KINDS[number], tuple(spans))
+    def _feature(self, within: tuple[int, int]) -> ExampleFeature | None:
+        for number, inner in self._inner(within, *_FEATURE_KINDS):
+            spans = (ByteSpan(self.start + at, size) for field, _, (at, size) in self._fields(inner) if field == 1)
+            return ExampleFeature(_FEATURE_KINDS[number], tuple(spans))
         return None
 
     def _inner(self, within: tuple[int, int], *numbers: int) -> Iterator[tuple[int, tuple[int, int]]]:
@@ -238,7 +240,7 @@ class _Message:
         while at < end:
             self.left -= 1
             if self.left < 0:
-                raise FormatError(self.file, "message", "more fields", f"at most {MAX_FIELDS} in a record")
+                raise FormatError(self.file, "message", "more fields", f"at most {_MAX_FIELDS} in a record")
             tag, at = self._varint(at, end)
             wire, size = tag & 7, 0
             if wire == 2:
@@ -272,7 +274,7 @@ class _Message:
             raise FormatError(self.file, "name of a feature", error.reason, "UTF-8") from None
 
 
-def _whole(run: bytes, file: Path, name: str) -> np.ndarray:
+def _decode_varints(run: bytes, file: Path, name: str) -> np.ndarray:
     """Packed varints of 64 bits, two's complement."""
     raw = np.frombuffer(run, np.uint8)
     ends = np.flatnonzero(raw < 0x80)

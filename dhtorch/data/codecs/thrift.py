@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from typing import Any
 
 #: Structures and lists inside one another; in a Parquet footer they are nine deep.
-MAX_DEPTH = 12
+_MAX_NESTING = 12
 
 
-def fields(data: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
+def parse_struct(data: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
     """A structure, field number → value, and where it ends.
 
     Raises:
@@ -18,13 +18,13 @@ def fields(data: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
     found: dict[int, Any] = {}
     number = 0
     while True:
-        number, kind, at = _head(data, at, number)
+        number, kind, at = _parse_field_header(data, at, number)
         if kind == 0:
             return found, at
-        found[number], at = _value(data, at, kind, depth)
+        found[number], at = _parse_value(data, at, kind, depth)
 
 
-def items(data: bytes, at: int, wanted: int) -> Iterator[dict[int, Any]]:
+def iter_list_structs(data: bytes, at: int, wanted: int) -> Iterator[dict[int, Any]]:
     """The structures in the list that is field ``wanted`` of a structure, one after the other.
 
     Raises:
@@ -32,21 +32,21 @@ def items(data: bytes, at: int, wanted: int) -> Iterator[dict[int, Any]]:
     """
     number = 0
     while True:
-        number, kind, at = _head(data, at, number)
+        number, kind, at = _parse_field_header(data, at, number)
         if number == wanted and kind == 9:
-            count, kind, at = _list(data, at)
+            count, kind, at = _parse_list_header(data, at)
             if kind != 12:
                 raise ValueError(f"a list of type {kind}")
             for _ in range(count):
-                item, at = fields(data, at, 1)
+                item, at = parse_struct(data, at, 1)
                 yield item
             return
         if kind == 0:
             raise ValueError(f"no list in field {wanted}")
-        _, at = _value(data, at, kind, 0)
+        _, at = _parse_value(data, at, kind, 0)
 
 
-def _head(data: bytes, at: int, number: int) -> tuple[int, int, int]:
+def _parse_field_header(data: bytes, at: int, number: int) -> tuple[int, int, int]:
     """Number and type of the next field (type 0: there is none), and where its value begins."""
     head = data[at]
     kind, step = head & 15, head >> 4
@@ -54,55 +54,55 @@ def _head(data: bytes, at: int, number: int) -> tuple[int, int, int]:
         return number, 0, at + 1
     if step:
         return number + step, kind, at + 1
-    number, at = zigzag(data, at + 1)
+    number, at = _parse_zigzag(data, at + 1)
     return number, kind, at
 
 
-def _value(data: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]:
-    if depth > MAX_DEPTH:
+def _parse_value(data: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]:
+    if depth > _MAX_NESTING:
         raise ValueError("structures nested too deep")
     if kind in (1, 2):  # true and false have no bytes of their own
         return kind == 1, at
     if kind in (4, 5, 6):
-        return zigzag(data, at)
+        return _parse_zigzag(data, at)
     if kind in (3, 7):  # a byte, or a number with a point, which nobody asks for
         return (data[at], at + 1) if kind == 3 else (None, at + 8)
     if kind == 8:
-        length, at = varint(data, at)
+        length, at = _parse_varint(data, at)
         if length > len(data) - at:
             raise ValueError("a text beyond the end")
         return data[at : at + length], at + length
     if kind in (9, 10):
-        return _values(data, at, depth + 1)
+        return _parse_list(data, at, depth + 1)
     if kind == 12:
-        return fields(data, at, depth + 1)
+        return parse_struct(data, at, depth + 1)
     raise ValueError(f"a field of type {kind}")
 
 
-def _values(data: bytes, at: int, depth: int) -> tuple[list[Any], int]:
-    count, kind, at = _list(data, at)
+def _parse_list(data: bytes, at: int, depth: int) -> tuple[list[Any], int]:
+    count, kind, at = _parse_list_header(data, at)
     found = []
     for _ in range(count):
         if kind in (1, 2):  # in a list a truth value has a byte
             item, at = data[at] == 1, at + 1
         else:
-            item, at = _value(data, at, kind, depth)
+            item, at = _parse_value(data, at, kind, depth)
         found.append(item)
     return found, at
 
 
-def _list(data: bytes, at: int) -> tuple[int, int, int]:
+def _parse_list_header(data: bytes, at: int) -> tuple[int, int, int]:
     """Length and type of a list, and where its first value begins."""
     count, kind = data[at] >> 4, data[at] & 15
     at += 1
     if count == 15:
-        count, at = varint(data, at)
+        count, at = _parse_varint(data, at)
     if count > len(data) - at:  # every value has a byte at least
         raise ValueError(f"a list of {count} values in {len(data) - at} bytes")
     return count, kind, at
 
 
-def varint(data: bytes, at: int) -> tuple[int, int]:
+def _parse_varint(data: bytes, at: int) -> tuple[int, int]:
     """A whole number without sign, and where it ends."""
     number = 0
     for shift in range(0, 70, 7):
@@ -114,7 +114,7 @@ def varint(data: bytes, at: int) -> tuple[int, int]:
     raise ValueError("an endless number")
 
 
-def zigzag(data: bytes, at: int) -> tuple[int, int]:
+def _parse_zigzag(data: bytes, at: int) -> tuple[int, int]:
     """A whole number with a sign, and where it ends."""
-    number, at = varint(data, at)
+    number, at = _parse_varint(data, at)
     return (number >> 1) ^ -(number & 1), at

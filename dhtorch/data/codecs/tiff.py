@@ -15,12 +15,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.io.decode import DEFLATE, MAX_PIXELS, FormatError, need, read_bytes
-from dhtorch.data.io.safe_open import allow
+from dhtorch.data.io.decode import MAX_DEFLATE_RATIO, MAX_PIXELS, FormatError, import_optional, read_bytes
+from dhtorch.data.io.safe_open import check_memory
 
-_SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 8, 6: 1, 7: 1, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}  # bytes of a tag's value by type
-_KINDS = {1: "u", 2: "i", 3: "f"}  # sample format
-_BITS = {"u": (8, 16, 32), "i": (8, 16, 32), "f": (16, 32, 64)}
+_TAG_VALUE_BYTES = {
+    1: 1,
+    2: 1,
+    3: 2,
+    4: 4,
+    5: 8,
+    6: 1,
+    7: 1,
+    8: 2,
+    9: 4,
+    10: 8,
+    11: 4,
+    12: 8,
+}  # bytes of a tag's value by type
+_SAMPLE_KINDS = {1: "u", 2: "i", 3: "f"}  # sample format
+_SAMPLE_BITS = {"u": (8, 16, 32), "i": (8, 16, 32), "f": (16, 32, 64)}
 _COMPRESSIONS = {1: "none", 5: "LZW", 8: "deflate", 32773: "PackBits", 32946: "deflate"}
 
 
@@ -47,15 +60,17 @@ def read_tiff(file: Path, hw: tuple[int, int] | None = None, samples: Sequence[i
     return decode_tiff(read_bytes(file), file, hw, samples)
 
 
-def tiff_header(file: Path) -> TiffHeader:
+def read_tiff_header(file: Path) -> TiffHeader:
     """Size and type of a TIFF file without decoding it.
 
     Raises:
         FormatError: missing, truncated or unknown file.
     """
-    tags = _first_directory(read_bytes(file), file)
+    tags = _read_first_directory(read_bytes(file), file)
     return TiffHeader(
-        (_one(tags, 257, None, file), _one(tags, 256, None, file)), _one(tags, 277, 1, file), _dtype(tags, file)
+        (_single_tag_value(tags, 257, None, file), _single_tag_value(tags, 256, None, file)),
+        _single_tag_value(tags, 277, 1, file),
+        _dtype(tags, file),
     )
 
 
@@ -63,9 +78,9 @@ def decode_tiff(
     data: bytes, file: Path, hw: tuple[int, int] | None = None, samples: Sequence[int] = (1,)
 ) -> np.ndarray:
     """As :func:`read_tiff`, of bytes that lie in an archive; ``file`` names them in errors."""
-    tags = _first_directory(data, file)
+    tags = _read_first_directory(data, file)
     keys = ((256, None), (257, None), (259, 1), (262, 1), (277, 1), (284, 1))
-    one = {key: _one(tags, key, default, file) for key, default in keys}
+    one = {key: _single_tag_value(tags, key, default, file) for key, default in keys}
     size, count, dtype = (one[257], one[256]), one[277], _dtype(tags, file)
     shape = size if count == 1 else (*size, count)
     if hw is not None and size != tuple(hw):
@@ -80,10 +95,17 @@ def decode_tiff(
         )
         raise FormatError(file, "layout", found, wanted)
     _check_strips(tags, data, file, math.prod(shape) * dtype.itemsize if one[259] == 1 else None)
-    tile = _one(tags, 322, size[1], file) * _one(tags, 323, size[0], file) * count * dtype.itemsize
-    asked = math.prod(shape) * dtype.itemsize if math.prod(shape) * dtype.itemsize <= DEFLATE * len(data) else 0
-    allow(file, "tile", len(tags.get(324, (0,))) * tile, f"tiles of {tile} bytes", asked)
-    library = need("tifffile")
+    tile = (
+        _single_tag_value(tags, 322, size[1], file)
+        * _single_tag_value(tags, 323, size[0], file)
+        * count
+        * dtype.itemsize
+    )
+    asked = (
+        math.prod(shape) * dtype.itemsize if math.prod(shape) * dtype.itemsize <= MAX_DEFLATE_RATIO * len(data) else 0
+    )
+    check_memory(file, "tile", len(tags.get(324, (0,))) * tile, f"tiles of {tile} bytes", asked)
+    library = import_optional("tifffile")
     try:
         with library.TiffFile(io.BytesIO(data)) as tiff:
             page = tiff.pages.first
@@ -99,7 +121,7 @@ def decode_tiff(
     return np.ascontiguousarray(picture)
 
 
-def _first_directory(data: bytes, file: Path) -> dict[int, tuple[int, ...]]:
+def _read_first_directory(data: bytes, file: Path) -> dict[int, tuple[int, ...]]:
     """Tag → its whole numbers (tags of other types are left out)."""
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None or len(data) < 8:
@@ -110,10 +132,10 @@ def _first_directory(data: bytes, file: Path) -> dict[int, tuple[int, ...]]:
         (count,) = struct.unpack_from(f"{order}H", data, at)
         for k in range(count):
             tag, kind, n = struct.unpack_from(f"{order}HHI", data, at + 2 + 12 * k)
-            if kind not in (1, 3, 4) or n < 1 or n * _SIZES[kind] > len(data):
+            if kind not in (1, 3, 4) or n < 1 or n * _TAG_VALUE_BYTES[kind] > len(data):
                 continue
             place = at + 10 + 12 * k
-            if n * _SIZES[kind] > 4:
+            if n * _TAG_VALUE_BYTES[kind] > 4:
                 (place,) = struct.unpack_from(f"{order}I", data, place)
             tags[tag] = struct.unpack_from(f"{order}{n}{' BXHI'[kind]}", data, place)
     except struct.error:
@@ -121,7 +143,7 @@ def _first_directory(data: bytes, file: Path) -> dict[int, tuple[int, ...]]:
     return tags
 
 
-def _one(tags: dict[int, tuple[int, ...]], tag: int, default: int | None, file: Path) -> int:
+def _single_tag_value(tags: dict[int, tuple[int, ...]], tag: int, default: int | None, file: Path) -> int:
     """The number of a tag; where there is one for each sample they must agree."""
     values = set(tags.get(tag, () if default is None else (default,)))
     if len(values) != 1:
@@ -130,8 +152,8 @@ def _one(tags: dict[int, tuple[int, ...]], tag: int, default: int | None, file: 
 
 
 def _dtype(tags: dict[int, tuple[int, ...]], file: Path) -> np.dtype:
-    bits, kind = _one(tags, 258, 1, file), _KINDS.get(_one(tags, 339, 1, file), "?")
-    if bits not in _BITS.get(kind, ()):
+    bits, kind = _single_tag_value(tags, 258, 1, file), _SAMPLE_KINDS.get(_single_tag_value(tags, 339, 1, file), "?")
+    if bits not in _SAMPLE_BITS.get(kind, ()):
         wanted = "8, 16 or 32 bits integer, 16, 32 or 64 floating"
         raise FormatError(file, "samples", f"{bits} bits of kind {kind}", wanted)
     return np.dtype(f"{kind}{bits // 8}")

@@ -19,15 +19,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.codecs.mp4 import FIRST, check_samples
-from dhtorch.data.io.decode import FormatError, need
-from dhtorch.data.io.safe_open import last_change, opened
+from dhtorch.data.codecs.mp4 import MP4_FIRST_BOXES, check_sample_count
+from dhtorch.data.io.decode import FormatError, import_optional
+from dhtorch.data.io.safe_open import modification_time_ns, open_regular
 
-MAX_VIDEO_PIXELS = 36_000_000  # 8K; a decoder holds up to 17 pictures
+_MAX_VIDEO_PIXELS = 36_000_000  # 8K; a decoder holds up to 17 pictures
 _MAX_FRAMES = 10_000_000
-_MAX_OPEN = 8  # decoders in a process
-_MAX_FAILED = 100  # packets in a row: behind them nothing is worth the time
-_SEEK_AHEAD = 60  # frames: nearer than this, decoding on is cheaper than starting at a key frame
+_MAX_OPEN_DECODERS = 8  # decoders in a process
+_MAX_FAILED_PACKETS = 100  # packets in a row: behind them nothing is worth the time
+_MAX_DECODE_AHEAD_FRAMES = 60  # frames: nearer than this, decoding on is cheaper than starting at a key frame
 
 
 class VideoHeader(NamedTuple):
@@ -40,7 +40,7 @@ class VideoHeader(NamedTuple):
     pixels: str  # format of the stored pixels, such as yuv420p
 
 
-def video_header(file: Path, *, all_frames: bool = False) -> VideoHeader:
+def read_video_header(file: Path, *, all_frames: bool = False) -> VideoHeader:
     """Size, number of frames and rate of a video, without decoding any.
 
     Args:
@@ -51,16 +51,16 @@ def video_header(file: Path, *, all_frames: bool = False) -> VideoHeader:
         FormatError: missing or unknown file, no video stream, or an absurd size.
         ImportError: no decoder is installed.
     """
-    return _decoder(file, all_frames).header
+    return _get_decoder(file, all_frames).header
 
 
-def video_times(file: Path, *, all_frames: bool = False) -> np.ndarray:
+def read_video_times(file: Path, *, all_frames: bool = False) -> np.ndarray:
     """Presentation time (n,) s of every frame, increasing. Reads all packets once, decodes none.
 
     Raises:
-        FormatError: as :func:`video_header`, or packets that have no time.
+        FormatError: as :func:`read_video_header`, or packets that have no time.
     """
-    decoder = _decoder(file, all_frames)
+    decoder = _get_decoder(file, all_frames)
     return decoder.table() * float(decoder.stream.time_base)
 
 
@@ -85,15 +85,16 @@ def read_video_frame(
         all_frames: count also frames that an edit list hides.
 
     Raises:
-        FormatError: as :func:`video_header`, another size than ``hw``, or a frame that is not there or not decodable.
+        FormatError: as :func:`read_video_header`, another size than ``hw``, or a frame that is not there or not
+            decodable.
     """
-    decoder = _decoder(file, all_frames)
+    decoder = _get_decoder(file, all_frames)
     frame = decoder.frame(i)
     wanted = tuple(hw) if hw is not None else decoder.header.hw
     if (frame.height, frame.width) != wanted:
         raise FormatError(file, f"frame {i} size", f"{frame.width}x{frame.height}", f"{wanted[1]}x{wanted[0]}")
     if pixels == "luma":
-        return _luma(frame)
+        return _extract_luma(frame)
     try:
         way = "POINT" if nearest else "BICUBIC"
         return np.asarray(frame.to_ndarray(format=pixels, interpolation=way, **decoder.one_thread))
@@ -101,7 +102,7 @@ def read_video_frame(
         raise FormatError(file, f"frame {i}", error, f"pixels that convert to {pixels}") from None
 
 
-def _luma(frame: Any) -> np.ndarray:
+def _extract_luma(frame: Any) -> np.ndarray:
     plane, deep = frame.planes[0], frame.format.components[0].bits > 8
     rows = np.frombuffer(plane, "<u2" if deep else np.uint8).reshape(-1, plane.line_size // (2 if deep else 1))
     return rows[: frame.height, : frame.width].copy()
@@ -109,17 +110,17 @@ def _luma(frame: Any) -> np.ndarray:
 
 def close_videos() -> None:
     """Close the decoders of this process."""
-    for decoder in _open.values():
+    for decoder in _open_decoders.values():
         decoder.container.close()
-    _open.clear()
+    _open_decoders.clear()
 
 
-def _container(file: Path) -> str:
+def _check_container(file: Path) -> str:
     """The names of a container's format, by its first bytes; what it claims fits the file."""
-    with opened(file) as stream:
+    with open_regular(file) as stream:
         head = stream.read(16)
-        if head[4:8] in FIRST:
-            check_samples(stream, file)
+        if head[4:8] in MP4_FIRST_BOXES:
+            check_sample_count(stream, file)
             return "mov,mp4,m4a,3gp,3g2,mj2"
     if head.startswith(b"\x1a\x45\xdf\xa3"):
         return "matroska,webm"
@@ -128,7 +129,7 @@ def _container(file: Path) -> str:
     raise FormatError(file, "content", repr(head[:12]), "a video file: mp4, mov, mkv, webm or avi")
 
 
-def _index(stream: Any) -> Any:
+def _index_entries(stream: Any) -> Any:
     """What the file's index says of its frames, from PyAV 17; before, packets say the same, more slowly."""
     return getattr(stream, "index_entries", ())
 
@@ -142,15 +143,15 @@ class _Decoder:
         self.keys = np.empty((0, 2), np.int64)  # presentation and decoding stamp of the key frames
         self.frames: Iterator[Any] = iter(())
         self.next = -1  # number of the frame that comes next; −1 = unknown
-        av = need("av")
+        av = import_optional("av")
         # PyAV before 17 converts with one thread and knows no such option.
         self.one_thread = {"threads": 1} if int(av.__version__.partition(".")[0]) >= 17 else {}
         self.errors: tuple[type[Exception], ...] = (av.FFmpegError, ValueError, MemoryError, OverflowError, EOFError)
         if not file.exists():
             raise FormatError(file, "file", "no such file", "a video")
-        kind = _container(file)
+        kind = _check_container(file)
         # No list of other files, no network: the decoder is told what this is and may open nothing else.
-        limits = {"max_pixels": str(MAX_VIDEO_PIXELS), "protocol_whitelist": "file", "format_whitelist": kind}
+        limits = {"max_pixels": str(_MAX_VIDEO_PIXELS), "protocol_whitelist": "file", "format_whitelist": kind}
         edits = {"advanced_editlist": "0"} if all_frames else {}
         try:
             self.container = av.open(str(file), format=kind.split(",")[0], options=limits, container_options=edits)
@@ -171,9 +172,9 @@ class _Decoder:
             raise FormatError(self.file, "codec", "an unknown one", "one that decodes")
         context.thread_count = 1  # a data loader has its own workers
         h, w = context.height, context.width
-        if not 0 < h * w <= MAX_VIDEO_PIXELS:
-            raise FormatError(self.file, "size", f"{w}x{h}", f"1 to {MAX_VIDEO_PIXELS} pixels")
-        index = _index(self.stream)
+        if not 0 < h * w <= _MAX_VIDEO_PIXELS:
+            raise FormatError(self.file, "size", f"{w}x{h}", f"1 to {_MAX_VIDEO_PIXELS} pixels")
+        index = _index_entries(self.stream)
         shown = [entry for entry in index if not entry.is_discard]
         n = len(shown) if len(index) >= self.stream.frames > 0 else len(self.table())
         if not 0 < n <= _MAX_FRAMES or self.stream.time_base is None:
@@ -205,7 +206,7 @@ class _Decoder:
         if not 0 <= i < len(pts):
             raise FormatError(self.file, f"frame {i}", f"{len(pts)} frames", f"{self.header.n} frames")
         try:
-            if not 0 <= self.next <= i <= self.next + _SEEK_AHEAD:
+            if not 0 <= self.next <= i <= self.next + _MAX_DECODE_AHEAD_FRAMES:
                 self._seek(int(pts[i]))
             for frame in self.frames:
                 if frame.pts is None or frame.pts < pts[i]:
@@ -235,32 +236,32 @@ class _Decoder:
                 frames = packet.decode()
             except self.errors:
                 failed += 1
-                if failed > _MAX_FAILED:
+                if failed > _MAX_FAILED_PACKETS:
                     raise
                 continue
             failed = 0
             yield from frames
 
 
-_open: OrderedDict[tuple[Path, bool, int], _Decoder] = OrderedDict()
-_inherited: list[_Decoder] = []
+_open_decoders: OrderedDict[tuple[Path, bool, int], _Decoder] = OrderedDict()
+_inherited_decoders: list[_Decoder] = []
 
 
-def _decoder(file: Path, all_frames: bool) -> _Decoder:
+def _get_decoder(file: Path, all_frames: bool) -> _Decoder:
     """An open decoder of this process."""
-    key = (file, all_frames, last_change(file))
-    if key not in _open:
-        while len(_open) >= _MAX_OPEN:
-            _open.popitem(last=False)[1].container.close()
-        _open[key] = _Decoder(file, all_frames)
-    _open.move_to_end(key)
-    return _open[key]
+    key = (file, all_frames, modification_time_ns(file))
+    if key not in _open_decoders:
+        while len(_open_decoders) >= _MAX_OPEN_DECODERS:
+            _open_decoders.popitem(last=False)[1].container.close()
+        _open_decoders[key] = _Decoder(file, all_frames)
+    _open_decoders.move_to_end(key)
+    return _open_decoders[key]
 
 
-def _leave_to_parent() -> None:
+def _abandon_inherited_decoders() -> None:
     """A forked process shares its parent's file positions, and threads that it would wait for are not there."""
-    _inherited.extend(_open.values())  # kept, because freeing would wait
-    _open.clear()
+    _inherited_decoders.extend(_open_decoders.values())  # kept, because freeing would wait
+    _open_decoders.clear()
 
 
-os.register_at_fork(after_in_child=_leave_to_parent)
+os.register_at_fork(after_in_child=_abandon_inherited_decoders)

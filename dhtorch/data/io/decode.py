@@ -25,26 +25,26 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from dhtorch.data.io.safe_open import FormatError, allow, opened, unreadable
+from dhtorch.data.io.safe_open import FormatError, check_memory, open_regular, unreadable_error
 
 #: No camera of ours comes near this; a header that claims more is damaged or hostile.
 MAX_PIXELS = 64_000_000
-MAX_BYTES = 256_000_000  # of an array or a file
+MAX_FILE_BYTES = 256_000_000  # of an array or a file
 MAX_TEXT_BYTES = 64_000_000  # of a table or a JSON document
 #: Numbers that an error message shows.
-LISTED = 64
+_MAX_NUMBERS_SHOWN = 64
 
 #: Bytes that Python's own objects take, at most: of a line and a word of a table; of an object, a list, a text and an
 #: entry of a JSON document.
-_LINE, _WORD = 250, 64
-_JSON = {"{": 240, "[": 64, '"': 32, ",": 40}
+_LINE_BYTES, _WORD_BYTES = 250, 64
+_JSON_BYTES = {"{": 240, "[": 64, '"': 32, ",": 40}
 
 _LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
 
 #: Deflate makes at most 1032 bytes of one, a JPEG at most a square of pixels of one bit.
-DEFLATE = 1032
-_JPEG_PIXELS = 8 * 1024
-_MAX_SCANS, _MAX_SCANNED = 1000, 20 * MAX_PIXELS  # of a JPEG: passes over the picture, and pixels of all of them
+MAX_DEFLATE_RATIO = 1032
+_MAX_JPEG_PIXELS_PER_BYTE = 8 * 1024
+_MAX_SCANS, _MAX_SCANNED_PIXELS = 1000, 20 * MAX_PIXELS  # of a JPEG: passes over the picture, and pixels of all of them
 
 
 class ImageHeader(NamedTuple):
@@ -56,7 +56,7 @@ class ImageHeader(NamedTuple):
     kind: str  # "png" or "jpeg"
 
 
-def need(*libraries: str, extra: str = "data") -> ModuleType:
+def import_optional(*libraries: str, extra: str = "data") -> ModuleType:
     """The first of ``libraries`` that is installed: decoders of rare formats are not a dependency of the package.
 
     Raises:
@@ -90,11 +90,11 @@ def read_image(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
 
 def decode_image(data: bytes, file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
     """As :func:`read_image`, of bytes that lie in an archive; ``file`` names them in errors."""
-    header = _checked_header(file, data, hw)
+    header = _check_header(file, data, hw)
     if header.bits != 8:
         raise FormatError(file, "bits per channel", header.bits, 8)
     flag = cv2.IMREAD_GRAYSCALE if header.channels == 1 else cv2.IMREAD_COLOR
-    image = _decode(file, data, flag | cv2.IMREAD_IGNORE_ORIENTATION, header.hw)
+    image = _decode_with_opencv(file, data, flag | cv2.IMREAD_IGNORE_ORIENTATION, header.hw)
     if image.ndim == 2:
         return image[None]
     return np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB).transpose(2, 0, 1))
@@ -122,11 +122,11 @@ def decode_depth_png(
     invalid: Sequence[int] = (0,),
 ) -> np.ndarray:
     """As :func:`read_depth_png`, of bytes that lie in an archive; ``file`` names them in errors."""
-    header = _checked_header(file, data, hw)
+    header = _check_header(file, data, hw)
     if (header.kind, header.channels, header.bits) != ("png", 1, 16):
         found = f"{header.kind} with {header.channels} channels of {header.bits} bits"
         raise FormatError(file, "depth", found, "png with 1 channel of 16 bits")
-    code = _decode(file, data, cv2.IMREAD_UNCHANGED, header.hw)
+    code = _decode_with_opencv(file, data, cv2.IMREAD_UNCHANGED, header.hw)
     return to_metres(code, units_per_metre, invalid)
 
 
@@ -138,7 +138,7 @@ def to_metres(code: np.ndarray, units_per_metre: float, invalid: Sequence[int] =
     return depth
 
 
-def image_header(file: Path) -> ImageHeader:
+def read_image_header(file: Path) -> ImageHeader:
     """Size and type of a PNG or JPEG file without decoding it.
 
     Raises:
@@ -148,20 +148,22 @@ def image_header(file: Path) -> ImageHeader:
 
 
 def decode_image_header(data: bytes, file: Path) -> ImageHeader:
-    """As :func:`image_header`, of bytes that lie in an archive; ``file`` names them in errors."""
+    """As :func:`read_image_header`, of bytes that lie in an archive; ``file`` names them in errors."""
     return _parse_header(file, data)
 
 
-def _checked_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageHeader:
+def _check_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageHeader:
     header = _parse_header(file, data)
     if hw is not None and header.hw != tuple(hw):
-        raise FormatError(file, "size", _size(header.hw), _size(hw))
-    whole = _png_is_whole(data) if header.kind == "png" else data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
+        raise FormatError(file, "size", _format_size(header.hw), _format_size(hw))
+    whole = _is_whole_png(data) if header.kind == "png" else data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
     if not whole:
         raise FormatError(file, "data", f"a truncated or damaged {header.kind} file of {len(data)} bytes", "all of it")
     scans = data.count(b"\xff\xda") if header.kind == "jpeg" else 1
-    if scans > _MAX_SCANS or (scans > 1 and scans * header.hw[0] * header.hw[1] > _MAX_SCANNED):
-        raise FormatError(file, "scans", f"{scans} passes over {_size(header.hw)} pixels", "a picture of few passes")
+    if scans > _MAX_SCANS or (scans > 1 and scans * header.hw[0] * header.hw[1] > _MAX_SCANNED_PIXELS):
+        raise FormatError(
+            file, "scans", f"{scans} passes over {_format_size(header.hw)} pixels", "a picture of few passes"
+        )
     return header
 
 
@@ -170,17 +172,21 @@ def _parse_header(file: Path, data: bytes) -> ImageHeader:
         w, h, bits, colour = struct.unpack(">IIBB", data[16:26])
         header = ImageHeader((h, w), {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0), 8 if colour == 3 else bits, "png")
     elif data.startswith(b"\xff\xd8"):
-        header = _jpeg_header(file, data)
+        header = _parse_jpeg_header(file, data)
     else:
         raise FormatError(file, "content", f"{data[:8]!r}", "a PNG or JPEG image")
     if not 0 < header.hw[0] * header.hw[1] <= MAX_PIXELS:
-        raise FormatError(file, "size", _size(header.hw), f"1 to {MAX_PIXELS} pixels")
-    if header.hw[0] * header.hw[1] > len(data) * (_JPEG_PIXELS if header.kind == "jpeg" else 8 * DEFLATE):
-        raise FormatError(file, "size", f"{_size(header.hw)} in {len(data)} bytes", "as many bytes as pixels need")
+        raise FormatError(file, "size", _format_size(header.hw), f"1 to {MAX_PIXELS} pixels")
+    if header.hw[0] * header.hw[1] > len(data) * (
+        _MAX_JPEG_PIXELS_PER_BYTE if header.kind == "jpeg" else 8 * MAX_DEFLATE_RATIO
+    ):
+        raise FormatError(
+            file, "size", f"{_format_size(header.hw)} in {len(data)} bytes", "as many bytes as pixels need"
+        )
     return header
 
 
-def _jpeg_header(file: Path, data: bytes) -> ImageHeader:
+def _parse_jpeg_header(file: Path, data: bytes) -> ImageHeader:
     at = 2
     while at + 9 < len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
@@ -191,7 +197,7 @@ def _jpeg_header(file: Path, data: bytes) -> ImageHeader:
     raise FormatError(file, "content", f"a JPEG of {len(data)} bytes without a frame header", "a whole JPEG image")
 
 
-def _png_is_whole(data: bytes) -> bool:
+def _is_whole_png(data: bytes) -> bool:
     """Walk the chunks: every length fits, every check sum holds, the last one is IEND."""
     at = 8
     while at + 12 <= len(data):
@@ -205,13 +211,13 @@ def _png_is_whole(data: bytes) -> bool:
     return False
 
 
-def _decode(file: Path, data: bytes, flags: int, hw: tuple[int, int]) -> np.ndarray:
+def _decode_with_opencv(file: Path, data: bytes, flags: int, hw: tuple[int, int]) -> np.ndarray:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise FormatError(file, "data", error.err, "a decodable image") from None
     if image is None or image.shape[:2] != tuple(hw):
-        raise FormatError(file, "data", "pixels that do not decode", f"an image of {_size(hw)}")
+        raise FormatError(file, "data", "pixels that do not decode", f"an image of {_format_size(hw)}")
     return image
 
 
@@ -251,7 +257,9 @@ def read_lines(file: Path) -> list[str]:
     """
     text = read_text(file)
     lines, words = (sum(map(text.count, marks)) for marks in (_LINE_ENDS, " ,\t"))
-    allow(file, "text", _LINE * lines + _WORD * words, f"{lines} lines with {words} gaps between words")
+    check_memory(
+        file, "text", _LINE_BYTES * lines + _WORD_BYTES * words, f"{lines} lines with {words} gaps between words"
+    )
     return text.splitlines()
 
 
@@ -274,15 +282,15 @@ def decode_json(text: str | bytes, file: Path) -> Any:
         FormatError: no JSON, or more values than memory is allowed for.
     """
     raw = text.encode("utf-8", "replace") if isinstance(text, str) else text
-    counts = {mark: raw.count(mark.encode()) for mark in _JSON}
-    allow(file, "JSON", sum(_JSON[mark] * n for mark, n in counts.items()), f"{counts[',']} entries")
+    counts = {mark: raw.count(mark.encode()) for mark in _JSON_BYTES}
+    check_memory(file, "JSON", sum(_JSON_BYTES[mark] * n for mark, n in counts.items()), f"{counts[',']} entries")
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:  # ValueError: bytes that are no text, too
         raise FormatError(file, "JSON", error, "a JSON document") from None
 
 
-def get(value: Any, path: str, kind: type | tuple[type, ...], file: Path) -> Any:
+def get_entry(value: Any, path: str, kind: type | tuple[type, ...], file: Path) -> Any:
     """The entry ``"a.b.c"`` of nested JSON objects, of type ``kind``.
 
     Raises:
@@ -313,7 +321,7 @@ def to_array(value: Any, shape: tuple[int, ...], file: Path, field: str) -> np.n
     except (TypeError, ValueError, OverflowError):
         raise FormatError(file, field, repr(value), expected) from None
     if array.shape != shape or not np.isfinite(array).all():
-        found = array.tolist() if array.size <= LISTED else f"numbers of shape {array.shape}"
+        found = array.tolist() if array.size <= _MAX_NUMBERS_SHOWN else f"numbers of shape {array.shape}"
         raise FormatError(file, field, found, expected)
     return array
 
@@ -334,39 +342,39 @@ def read_text(file: Path) -> str:
     """The UTF-8 text of a file of at most ``MAX_TEXT_BYTES``."""
     try:
         data = read_bytes(file, MAX_TEXT_BYTES)
-        allow(file, "text", len(data) * (2 if data.isascii() else 5), f"{len(data)} bytes")
+        check_memory(file, "text", len(data) * (2 if data.isascii() else 5), f"{len(data)} bytes")
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise FormatError(file, "text", error.reason, "UTF-8") from None
 
 
-def read_bytes(file: Path, limit: int = MAX_BYTES) -> bytes:
+def read_bytes(file: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     """All bytes of a file, at least one and at most ``limit``.
 
     Raises:
         FormatError: the file is missing, unreadable, no regular file, outside the capture, empty or too large.
     """
-    with opened(file) as stream:
+    with open_regular(file) as stream:
         size = os.fstat(stream.fileno()).st_size
         if not 0 < size <= limit:
             raise FormatError(file, "file size", f"{size} bytes", f"1 to {limit} bytes")
         try:
             return stream.read(limit)
         except OSError as error:
-            raise unreadable(file, error) from None
+            raise unreadable_error(file, error) from None
 
 
-def natural(name: Path | str) -> tuple[object, ...]:
+def natural_sort_key(name: Path | str) -> tuple[object, ...]:
     """Key of an order in which 1, 2 and 10 follow one another, with or without leading zeros."""
     parts = re.split(r"(\d+)", str(name))
-    return tuple((not part.isdecimal(), int(part[:_DIGITS]) if part.isdecimal() else part) for part in parts)
+    return tuple((not part.isdecimal(), int(part[:_MAX_NUMBER_DIGITS]) if part.isdecimal() else part) for part in parts)
 
 
 #: Digits of a number in a file's name that count.
-_DIGITS = 300
+_MAX_NUMBER_DIGITS = 300
 
 
-def left_out(names: Sequence[int | str], why: str) -> list[str]:
+def format_left_out(names: Sequence[int | str], why: str) -> list[str]:
     """A line for a recording's report about frames that are not in it; none for none."""
     if not names:
         return []
@@ -380,5 +388,5 @@ def _kind_name(kind: type | tuple[type, ...]) -> str:
     return " or ".join(dict.fromkeys(words.get(k, "a number") for k in kinds))
 
 
-def _size(hw: tuple[int, int]) -> str:
+def _format_size(hw: tuple[int, int]) -> str:
     return f"{hw[1]}x{hw[0]}"

@@ -23,34 +23,34 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import convert
-from dhtorch.data.clocks import nearest, poses_at
+from dhtorch.data.clocks import interpolate_poses, nearest_stamps
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.laser import judged
+from dhtorch.data.laser import resample_laser_depth
 from dhtorch.data.recording import MeasuredRecording, Recording
 from dhtorch.geometry.camera import resize
 from dhtorch.records import Camera, Frame
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
 #: Colour assets and their folders, in the order in which one is chosen.
-IMAGES = {"lowres_wide": ("lowres_wide",), "vga_wide": ("vga_wide",), "wide": ("wide", "color")}
+_COLOUR_ASSETS = {"lowres_wide": ("lowres_wide",), "vga_wide": ("vga_wide",), "wide": ("wide", "color")}
 
 _SUBSETS, _SPLITS = ("raw", "3dod", "upsampling"), ("Training", "Validation")
-_STAMP = re.compile(r"[^/]*_(\d{1,10}(?:\.\d{1,9})?)\.(png|pincam)")
+_STAMP_PATTERN = re.compile(r"[^/]*_(\d{1,10}(?:\.\d{1,9})?)\.(png|pincam)")
 _UNITS_PER_METRE = 1000.0
 
 #: File names carry milliseconds: stamps this close are one instant.
-_SAME = 0.0011  # s
+_SAME_INSTANT_S = 0.0011  # s
 #: A pose and an image this close have the same stamp once both are rounded to milliseconds.
-_ROUNDING = 0.00051  # s
+_STAMP_ROUNDING_S = 0.00051  # s
 #: A mean direction of gravity shorter than this in the plane of the picture names no side of it.
-_MIN_SIDEWAYS = 0.1
+_MIN_GRAVITY_IN_PLANE = 0.1
 
 
 def recognise(root: Path) -> str | None:
     """What makes ``root`` a recording of this format, in words; None if nothing does."""
-    assets = [name for names in IMAGES.values() for name in names] + ["lowres_depth", "highres_depth"]
-    found = [name for name in assets if any((place / name).is_dir() for place in _places(root)[:2])]
+    assets = [name for names in _COLOUR_ASSETS.values() for name in names] + ["lowres_depth", "highres_depth"]
+    found = [name for name in assets if any((place / name).is_dir() for place in _asset_folders(root)[:2])]
     telling = {"lowres_wide", "vga_wide", "lowres_depth", "highres_depth"}
     return f"ARKitScenes assets {', '.join(found)}" if len(found) > 1 and telling & {*found} else None
 
@@ -104,34 +104,34 @@ def read(
     limits |= {"max_pose_gap": max_pose_gap, "max_truth_gap": max_truth_gap, "max_disagreement": max_disagreement}
     for option, limit in limits.items():
         files.to_positive(limit, root, f"option {option}")
-    places = _places(root)
-    name, pictures = _pictures(root, places, image)
-    links, report = _links(root, places, name, pictures.times, max_difference)
+    places = _asset_folders(root)
+    name, pictures = _choose_pictures(root, places, image)
+    links, report = _match_assets(root, places, name, pictures.times, max_difference)
     has = {what: link.at >= 0 for what, link in links.items()}
-    trajectory = _find(places, "lowres_wide.traj") if poses else None
+    trajectory = _find_folder(places, "lowres_wide.traj") if poses else None
     if poses and trajectory is None:
         report.append("no lowres_wide.traj: frames have no pose, and stay as stored")
     c2w = np.eye(4)[None]
     if trajectory is not None:
         gap = max_pose_gap if interpolate else 0.0
         c2w, has["a pose"] = _read_poses(trajectory, pictures.times, max_pose_difference, gap)
-    kept = _kept(root, name, has, report)
+    kept = _select_complete(root, name, has, report)
     turns, c2w = 0, c2w[kept] if trajectory else c2w
     if upright and trajectory:
-        turns = _turns(c2w, report)
-    load = _loader(name, pictures, links, kept, turns)
+        turns = _count_quarter_turns(c2w, report)
+    load = _make_loader(name, pictures, links, kept, turns)
     times = pictures.times[kept]
     fields: dict[str, Any] = {"name": _video_id(root), "format": "arkitscenes", "root": root, "load": load}
     fields |= {"number": torch.from_numpy(kept), "times": torch.from_numpy(times)}
     fields |= {"rate_hz": float(1 / np.median(np.diff(times))) if len(times) > 1 else None}
     if trajectory:
-        fields["poses"] = convert.to_poses(convert.turn_pose(c2w, turns), trajectory)
-    laser = _stamped(places, ("highres_depth",), "png") if truth else None
+        fields["poses"] = convert.to_poses(convert.rot90_pose(c2w, turns), trajectory)
+    laser = _list_asset_files(places, ("highres_depth",), "png") if truth else None
     if laser is None:
         return [Recording(**fields, report=tuple(report))]
-    load_truth = _truth_loader(places, laser, times, load, max_truth_gap, max_disagreement)
+    load_truth = _make_truth_loader(places, laser, times, load, max_truth_gap, max_disagreement)
     if (without := load_truth.depths.count(None)) > 0:
-        report.append(f"{many(without, 'frame')} without laser depth within {max_truth_gap} s: no truth")
+        report.append(f"{format_count(without, 'frame')} without laser depth within {max_truth_gap} s: no truth")
     return [MeasuredRecording(**fields, load_truth=load_truth, report=tuple(report))]
 
 
@@ -155,26 +155,26 @@ class _Load:
         image = torch.from_numpy(files.read_image(self.images[i], hw))
         depth, depth_camera = self.sensor(i)
         depth_hw = (depth.shape[0], depth.shape[1])
-        conf = None if self.confs is None else torch.from_numpy(_confidence(self.confs[i], depth_hw))
+        conf = None if self.confs is None else torch.from_numpy(_read_confidence(self.confs[i], depth_hw))
         return Frame(
-            image=convert.turn_picture(image, self.turns)[None],
-            depth=convert.turn_picture(depth, self.turns)[None],
-            camera=convert.turn_camera(camera, hw, self.turns),
-            depth_camera=depth_camera and convert.turn_camera(depth_camera, depth_hw, self.turns),
-            conf=None if conf is None else convert.turn_picture(conf, self.turns)[None],
+            image=convert.rot90_image(image, self.turns)[None],
+            depth=convert.rot90_image(depth, self.turns)[None],
+            camera=convert.rot90_camera(camera, hw, self.turns),
+            depth_camera=depth_camera and convert.rot90_camera(depth_camera, depth_hw, self.turns),
+            conf=None if conf is None else convert.rot90_image(conf, self.turns)[None],
         )
 
     def view(self, i: int) -> tuple[tuple[int, int], Camera]:
         """Size and camera of image ``i`` as stored."""
-        hw, camera = _pincam(self.pincams[i])
+        hw, camera = _read_pincam(self.pincams[i])
         if not self.borrowed:
             return hw, camera
-        own = files.image_header(self.images[i]).hw
+        own = files.read_image_header(self.images[i]).hw
         return own, resize(camera, hw, own)
 
     def sensor(self, i: int) -> tuple[Tensor, Camera | None]:
         """LiDAR depth of frame ``i`` as stored, and its camera."""
-        hw, camera = (None, None) if self.depth_pincams is None else _pincam(self.depth_pincams[i])
+        hw, camera = (None, None) if self.depth_pincams is None else _read_pincam(self.depth_pincams[i])
         return torch.from_numpy(files.read_depth_png(self.depths[i], _UNITS_PER_METRE, hw)), camera
 
 
@@ -191,26 +191,28 @@ class _LoadTruth:
         (hw, camera), file, pincam = self.load.view(i), self.depths[i], self.pincams[i]
         depth, off = torch.zeros(hw), float("nan")
         if file is not None:
-            laser_hw, laser_camera = (None, None) if pincam is None else _pincam(pincam)
+            laser_hw, laser_camera = (None, None) if pincam is None else _read_pincam(pincam)
             laser = torch.from_numpy(files.read_depth_png(file, _UNITS_PER_METRE, laser_hw))
             sensor, sensor_camera = self.load.sensor(i)
             laser_camera = laser_camera or resize(camera, hw, (laser.shape[0], laser.shape[1]))
             sensor_camera = sensor_camera or resize(camera, hw, (sensor.shape[0], sensor.shape[1]))
-            depth, off = judged(laser, laser_camera, sensor, sensor_camera, camera, hw, self.max_disagreement)
-        return convert.turn_picture(depth, self.load.turns), off
+            depth, off = resample_laser_depth(
+                laser, laser_camera, sensor, sensor_camera, camera, hw, self.max_disagreement
+            )
+        return convert.rot90_image(depth, self.load.turns), off
 
 
-def _pincam(file: Path) -> tuple[tuple[int, int], Camera]:
+def _read_pincam(file: Path) -> tuple[tuple[int, int], Camera]:
     """Size of the picture that the intrinsics belong to, and its camera."""
     rows = files.read_table(file, 6)
     w, h, fx, fy, cx, cy = files.to_array(rows[0] if len(rows) == 1 else None, (6,), file, "intrinsics").tolist()
     if min(w, h) < 1 or w * h > files.MAX_PIXELS or w % 1 or h % 1:
         raise FormatError(file, "width and height", f"{w:g} {h:g}", "the size of a picture")
     hw = (int(h), int(w))
-    return hw, convert.to_camera(convert.matrix_of(fx, fy, cx, cy), hw, file, "intrinsics")
+    return hw, convert.to_camera(convert.make_K(fx, fy, cx, cy), hw, file, "intrinsics")
 
 
-def _confidence(file: Path, hw: tuple[int, int]) -> np.ndarray:
+def _read_confidence(file: Path, hw: tuple[int, int]) -> np.ndarray:
     """Levels (h, w) uint8, 0 low to 2 high."""
     level = files.read_image(file, hw)
     if level.shape[0] != 1 or level.max() > 2:
@@ -222,17 +224,17 @@ def _confidence(file: Path, hw: tuple[int, int]) -> np.ndarray:
 # --------------------------------------------------------------------------------------------- what is there, and when
 
 
-class _Stamped(NamedTuple):
+class _AssetFiles(NamedTuple):
     """Files of one asset."""
 
     times: np.ndarray  # (n,) s, strictly increasing
     files: tuple[Path, ...]
 
 
-class _Link(NamedTuple):
+class _AssetMatch(NamedTuple):
     """For each image the file of another asset that belongs to it."""
 
-    stamped: _Stamped
+    stamped: _AssetFiles
     at: np.ndarray  # index of the file, −1 = none
 
 
@@ -240,7 +242,7 @@ def _video_id(root: Path) -> str:
     return root.resolve().name.removesuffix("_frames")
 
 
-def _places(root: Path) -> list[Path]:
+def _asset_folders(root: Path) -> list[Path]:
     """Folders that may hold assets of the capture: its own two, then those of the other downloads."""
     frames, own = f"{_video_id(root)}_frames", root.resolve()
     capture = own.parent if own.name == frames and own.parent.name == _video_id(root) else own
@@ -251,73 +253,77 @@ def _places(root: Path) -> list[Path]:
     return places
 
 
-def _find(places: Sequence[Path], *names: str) -> Path | None:
+def _find_folder(places: Sequence[Path], *names: str) -> Path | None:
     """The first of ``names`` that exists, own folders first."""
     return next((place / name for place in places for name in names if (place / name).exists()), None)
 
 
-def _stamped(places: Sequence[Path], names: Sequence[str], suffix: str) -> _Stamped | None:
+def _list_asset_files(places: Sequence[Path], names: Sequence[str], suffix: str) -> _AssetFiles | None:
     """Files of an asset by the number in their names (in the order of letters 100.0 comes before 99.9)."""
-    folder = _find(places, *names)
+    folder = _find_folder(places, *names)
     listed: dict[float, Path] = {}
     for entry in sorted(folder.iterdir()) if folder is not None and folder.is_dir() else ():
-        if (match := _STAMP.fullmatch(entry.name)) and match[2] == suffix:
+        if (match := _STAMP_PATTERN.fullmatch(entry.name)) and match[2] == suffix:
             listed.setdefault(float(match[1]), entry)
     times = sorted(listed)
-    return _Stamped(np.array(times), tuple(listed[t] for t in times)) if times else None
+    return _AssetFiles(np.array(times), tuple(listed[t] for t in times)) if times else None
 
 
-def _pictures(root: Path, places: Sequence[Path], image: str | None) -> tuple[str, _Stamped]:
-    if image not in (None, *IMAGES):
-        raise FormatError(root, "option image", image, f"one of {', '.join(IMAGES)}")
-    for name in (image,) if image else IMAGES:
-        if (pictures := _stamped(places, IMAGES[name], "png")) is not None:
+def _choose_pictures(root: Path, places: Sequence[Path], image: str | None) -> tuple[str, _AssetFiles]:
+    if image not in (None, *_COLOUR_ASSETS):
+        raise FormatError(root, "option image", image, f"one of {', '.join(_COLOUR_ASSETS)}")
+    for name in (image,) if image else _COLOUR_ASSETS:
+        if (pictures := _list_asset_files(places, _COLOUR_ASSETS[name], "png")) is not None:
             return name, pictures
     raise FormatError(root, image or "images", "none", "<video id>_<seconds>.png in a folder of that name")
 
 
-def _links(
+def _match_assets(
     root: Path, places: Sequence[Path], name: str, times: np.ndarray, max_difference: float
-) -> tuple[dict[str, _Link], list[str]]:
+) -> tuple[dict[str, _AssetMatch], list[str]]:
     """What belongs to each image, named as the report needs it, and remarks."""
     report = []
-    depths = _stamped(places, ("lowres_depth",), "png")
+    depths = _list_asset_files(places, ("lowres_depth",), "png")
     if depths is None:
         raise FormatError(root, "lowres_depth", "none", "<video id>_<seconds>.png in a folder of that name")
-    depth = nearest(times, depths.times, max_difference)
-    links = {"depth": _Link(depths, depth)}
-    if (confs := _stamped(places, ("confidence",), "png")) is None:
+    depth = nearest_stamps(times, depths.times, max_difference)
+    links = {"depth": _AssetMatch(depths, depth)}
+    if (confs := _list_asset_files(places, ("confidence",), "png")) is None:
         report.append("no confidence: every return counts alike")
     else:
-        links["confidence"] = _Link(confs, np.where(depth < 0, -1, nearest(depths.times[depth], confs.times, _SAME)))
-    own = _stamped(places, [f"{folder}_intrinsics" for folder in IMAGES[name]], "pincam")
-    small = _stamped(places, ("lowres_wide_intrinsics",), "pincam")
-    pincams = own or _stamped(places, ("vga_wide_intrinsics",), "pincam") or small
+        links["confidence"] = _AssetMatch(
+            confs, np.where(depth < 0, -1, nearest_stamps(depths.times[depth], confs.times, _SAME_INSTANT_S))
+        )
+    own = _list_asset_files(places, [f"{folder}_intrinsics" for folder in _COLOUR_ASSETS[name]], "pincam")
+    small = _list_asset_files(places, ("lowres_wide_intrinsics",), "pincam")
+    pincams = own or _list_asset_files(places, ("vga_wide_intrinsics",), "pincam") or small
     if pincams is None:
         raise FormatError(root, f"{name}_intrinsics", "none, nor any to scale", "<video id>_<seconds>.pincam")
     if own is not None:
-        links["intrinsics"] = _Link(own, nearest(times, own.times, _SAME))
+        links["intrinsics"] = _AssetMatch(own, nearest_stamps(times, own.times, _SAME_INSTANT_S))
     else:
         report.append(f"no {name}_intrinsics: {pincams.files[0].parent.name}, scaled")
-        links["borrowed intrinsics"] = _Link(pincams, nearest(times, pincams.times, max_difference))
+        links["borrowed intrinsics"] = _AssetMatch(pincams, nearest_stamps(times, pincams.times, max_difference))
     if small is not None and name != "lowres_wide":
-        links["intrinsics of the depth"] = _Link(small, nearest(times, small.times, max_difference))
+        links["intrinsics of the depth"] = _AssetMatch(small, nearest_stamps(times, small.times, max_difference))
     return links, report
 
 
-def _kept(root: Path, name: str, has: dict[str, np.ndarray], report: list[str]) -> np.ndarray:
+def _select_complete(root: Path, name: str, has: dict[str, np.ndarray], report: list[str]) -> np.ndarray:
     """Numbers of the images that have everything; how many lack what goes into the report."""
     keep = np.ones_like(has["depth"])
     for what, mask in has.items():
         if (lost := int((keep & ~mask).sum())) > 0:
-            report.append(f"{many(lost, 'image')} without {what}: left out")
+            report.append(f"{format_count(lost, 'image')} without {what}: left out")
         keep &= mask
     if not keep.any():
         raise FormatError(root, f"frames of {name}", "; ".join(report), "images with depth, intrinsics and pose")
     return np.flatnonzero(keep)
 
 
-def _loader(name: str, pictures: _Stamped, links: dict[str, _Link], kept: np.ndarray, turns: int) -> _Load:
+def _make_loader(
+    name: str, pictures: _AssetFiles, links: dict[str, _AssetMatch], kept: np.ndarray, turns: int
+) -> _Load:
     chosen = {what: tuple(link.stamped.files[j] for j in link.at[kept]) for what, link in links.items()}
     return _Load(
         images=tuple(pictures.files[i] for i in kept),
@@ -330,14 +336,14 @@ def _loader(name: str, pictures: _Stamped, links: dict[str, _Link], kept: np.nda
     )
 
 
-def _truth_loader(
-    places: Sequence[Path], laser: _Stamped, times: np.ndarray, load: _Load, max_gap: float, max_disagreement: float
+def _make_truth_loader(
+    places: Sequence[Path], laser: _AssetFiles, times: np.ndarray, load: _Load, max_gap: float, max_disagreement: float
 ) -> _LoadTruth:
-    at = nearest(times, laser.times, max_gap)
+    at = nearest_stamps(times, laser.times, max_gap)
     depths = tuple(laser.files[j] if j >= 0 else None for j in at)
     pincams: tuple[Path | None, ...] = (None,) * len(at)
-    if (wide := _stamped(places, ("wide_intrinsics", "color_intrinsics"), "pincam")) is not None:
-        own = nearest(laser.times[at], wide.times, _SAME)
+    if (wide := _list_asset_files(places, ("wide_intrinsics", "color_intrinsics"), "pincam")) is not None:
+        own = nearest_stamps(laser.times[at], wide.times, _SAME_INSTANT_S)
         pincams = tuple(wide.files[k] if j >= 0 and k >= 0 else None for j, k in zip(at, own, strict=True))
     return _LoadTruth(load, depths, pincams, max_disagreement)
 
@@ -353,15 +359,15 @@ def _read_poses(file: Path, times: np.ndarray, max_difference: float, max_gap: f
     R = convert.to_c2w(q, rows[:, 4:], file, "rotation")[:, :3, :3]  # world to camera
     centre = -np.einsum("nji,nj->ni", R, rows[:, 4:])
     inverse = q * [-1, -1, -1, 1]
-    limits = {"same": _ROUNDING, "max_difference": max_difference, "max_gap": max_gap}
-    q_at, t_at, covered = poses_at(times, rows[:, 0], inverse, centre, **limits)
+    limits = {"same": _STAMP_ROUNDING_S, "max_difference": max_difference, "max_gap": max_gap}
+    q_at, t_at, covered = interpolate_poses(times, rows[:, 0], inverse, centre, **limits)
     return convert.to_c2w(q_at, t_at, file, "rotation"), covered
 
 
-def _turns(c2w: np.ndarray, report: list[str]) -> int:
+def _count_quarter_turns(c2w: np.ndarray, report: list[str]) -> int:
     """Quarter turns clockwise that bring the sky to the top in the mean over the frames."""
     x, y, _ = c2w[:, 2, :3].mean(0)  # the world's up in the axes of the camera
-    if max(abs(x), abs(y)) < _MIN_SIDEWAYS:
+    if max(abs(x), abs(y)) < _MIN_GRAVITY_IN_PLANE:
         report.append("the camera looks straight up or down: pictures stay as stored")
         return 0
     if abs(x) > abs(y):

@@ -25,17 +25,17 @@ from dhtorch.data import convert
 from dhtorch.data.codecs import tarballs, tiff
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.laser import judged
+from dhtorch.data.laser import resample_laser_depth
 from dhtorch.data.recording import MeasuredRecording, Recording, Recordings
 from dhtorch.geometry.camera import resize
 from dhtorch.records import Camera, Frame
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
-_MEMBER = re.compile(r"(?:\./)?(\d{1,15})/(\d{1,18})\.([a-z_/]{1,80})\.[a-z]{1,8}", re.IGNORECASE)
-_NEEDED = ("wide/image", "wide/image/k", "wide/depth", "gt/rt")
-_OPTIONAL = ("wide/depth/k", "wide/depth/confidence")  # where some frames have it, all must
-_TRUTH = ("gt/depth", "gt/depth/k")
-_KNOWN = {*_NEEDED, *_OPTIONAL, *_TRUTH}
+_MEMBER_PATTERN = re.compile(r"(?:\./)?(\d{1,15})/(\d{1,18})\.([a-z_/]{1,80})\.[a-z]{1,8}", re.IGNORECASE)
+_REQUIRED_MEMBERS = ("wide/image", "wide/image/k", "wide/depth", "gt/rt")
+_OPTIONAL_MEMBERS = ("wide/depth/k", "wide/depth/confidence")  # where some frames have it, all must
+_TRUTH_MEMBERS = ("gt/depth", "gt/depth/k")
+_KNOWN_MEMBERS = {*_REQUIRED_MEMBERS, *_OPTIONAL_MEMBERS, *_TRUTH_MEMBERS}
 _UNITS_PER_METRE = 1000.0
 
 
@@ -47,11 +47,11 @@ def recognise(root: Path) -> str | None:
     if root.suffix != ".tar":
         return None
     try:
-        names = [member.name for member in islice(tarballs.members(root), 32)]
+        names = [member.name for member in islice(tarballs.iter_tar_members(root), 32)]
     except FormatError:
         return None
-    found = {match[3].lower() for name in names if (match := _MEMBER.fullmatch(name))}
-    return "a tar archive of <video>/<time>.wide and .gt members" if found & _KNOWN else None
+    found = {match[3].lower() for name in names if (match := _MEMBER_PATTERN.fullmatch(name))}
+    return "a tar archive of <video>/<time>.wide and .gt members" if found & _KNOWN_MEMBERS else None
 
 
 def read(
@@ -90,12 +90,12 @@ def read(
     skip = {"wide/depth/confidence"} if confidence is None else set()
     skip |= set() if truth else {"gt/depth"}
     return Recordings(
-        [archive.stem for archive in archives], _Make(tuple(archives), skip, confidence, max_disagreement)
+        [archive.stem for archive in archives], _MakeRecording(tuple(archives), skip, confidence, max_disagreement)
     )
 
 
 @dataclass(frozen=True)
-class _Make:
+class _MakeRecording:
     """Position → recording."""
 
     archives: tuple[Path, ...]
@@ -105,7 +105,7 @@ class _Make:
 
     def __call__(self, i: int) -> Recording:
         archive = self.archives[i]
-        return _recording(archive, _index(archive, self.skip), self.confidence, self.max_disagreement)
+        return _make_recording(archive, _index_archive(archive, self.skip), self.confidence, self.max_disagreement)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +123,9 @@ class _Load:
         hw = (depth.shape[0], depth.shape[1])
         conf = None
         if "wide/depth/confidence" in self.spans:
-            conf = torch.from_numpy(_levels(*self.member(i, "wide/depth/confidence"), hw, self.confidence))[None]
+            conf = torch.from_numpy(_decode_confidence(*self.member(i, "wide/depth/confidence"), hw, self.confidence))[
+                None
+            ]
         return Frame(
             image=image[None],
             depth=depth[None],
@@ -135,7 +137,7 @@ class _Load:
     def member(self, i: int, what: str) -> tuple[bytes, Path]:
         """Bytes of a member and the name it has in errors."""
         offset, size = self.spans[what][i].tolist()
-        return tarballs.read_member(self.archive, offset, size), self.archive / f"{self.stamps[i]}.{what}"
+        return tarballs.read_tar_member(self.archive, offset, size), self.archive / f"{self.stamps[i]}.{what}"
 
     def depth(self, i: int, what: str) -> Tensor:
         """Depth (h, w) m."""
@@ -144,7 +146,7 @@ class _Load:
     def camera(self, i: int, what: str, hw: tuple[int, int]) -> Camera:
         """Intrinsics of a picture of size ``hw``."""
         data, file = self.member(i, what)
-        return convert.to_camera(_matrix(data, file, 3), hw, file, "K")
+        return convert.to_camera(_parse_matrix(data, file, 3), hw, file, "K")
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,34 +169,34 @@ class _LoadTruth:
             has = own is not None and own[i, 0] >= 0
             seen_by.append(load.camera(i, f"{what}/k", size) if has else resize(camera, hw, size))
             maps.append(depth)
-        return judged(maps[0], seen_by[0], maps[1], seen_by[1], camera, hw, self.max_disagreement)
+        return resample_laser_depth(maps[0], seen_by[0], maps[1], seen_by[1], camera, hw, self.max_disagreement)
 
 
-def _index(archive: Path, skip: set[str]) -> dict[tuple[int, str], dict[str, tuple[int, int]]]:
+def _index_archive(archive: Path, skip: set[str]) -> dict[tuple[int, str], dict[str, tuple[int, int]]]:
     """(time in ns, its member prefix) → what → (offset, size); times in their order."""
     frames: dict[tuple[int, str], dict[str, tuple[int, int]]] = {}
-    for member in tarballs.members(archive):
-        match = _MEMBER.fullmatch(member.name)
-        if match and (what := match[3].lower()) in _KNOWN - skip:
+    for member in tarballs.iter_tar_members(archive):
+        match = _MEMBER_PATTERN.fullmatch(member.name)
+        if match and (what := match[3].lower()) in _KNOWN_MEMBERS - skip:
             frame = frames.setdefault((int(match[2]), f"{match[1]}/{match[2]}"), {})
             frame[what] = member.offset, member.size
     return dict(sorted(frames.items()))
 
 
-def _recording(
+def _make_recording(
     archive: Path,
     frames: dict[tuple[int, str], dict[str, tuple[int, int]]],
     confidence: str | None,
     max_disagreement: float,
 ) -> Recording:
     there = set().union(*frames.values())
-    needed = [*_NEEDED, *(what for what in _OPTIONAL if what in there)]
+    needed = [*_REQUIRED_MEMBERS, *(what for what in _OPTIONAL_MEMBERS if what in there)]
     report = []
     keys = list(frames)
     for what in needed:
         kept = [key for key in keys if what in frames[key]]
         if len(kept) < len(keys):
-            report.append(f"{many(len(keys) - len(kept), 'frame')} without {what}: left out")
+            report.append(f"{format_count(len(keys) - len(kept), 'frame')} without {what}: left out")
         keys = kept
     if not keys:
         raise FormatError(archive, "frames", "; ".join(report) or "none", f"members {', '.join(needed)}")
@@ -202,10 +204,10 @@ def _recording(
         report.append("no confidence: every return counts alike")
     spans = {
         what: np.array([frames[key].get(what, (-1, 0)) for key in keys], dtype=np.int64)
-        for what in {*needed, *_TRUTH} & there
+        for what in {*needed, *_TRUTH_MEMBERS} & there
     }
     load = _Load(archive, tuple(stamp for _, stamp in keys), spans, confidence)
-    c2w = np.stack([_matrix(*load.member(i, "gt/rt"), 4) for i in range(len(keys))])
+    c2w = np.stack([_parse_matrix(*load.member(i, "gt/rt"), 4) for i in range(len(keys))])
     times = np.array([time for time, _ in keys]) / 1e9
     place = {key: number for number, key in enumerate(frames)}
     fields: dict[str, Any] = {"name": archive.stem, "format": "ca1m", "load": load, "root": archive}
@@ -215,18 +217,18 @@ def _recording(
     if "gt/depth" not in spans:
         return Recording(**fields, report=tuple(report))
     if (without := int((spans["gt/depth"][:, 0] < 0).sum())) > 0:
-        report.append(f"{many(without, 'frame')} without gt/depth: no truth")
+        report.append(f"{format_count(without, 'frame')} without gt/depth: no truth")
     return MeasuredRecording(**fields, load_truth=_LoadTruth(load, max_disagreement), report=tuple(report))
 
 
-def _matrix(data: bytes, file: Path, n: int) -> np.ndarray:
+def _parse_matrix(data: bytes, file: Path, n: int) -> np.ndarray:
     """n×n numbers of a JSON document: rows, or all of them in one list."""
     value = files.decode_json(data, file)
     flat = isinstance(value, list) and len(value) == n * n
     return files.to_array(value, (n * n,) if flat else (n, n), file, "matrix").reshape(n, n)
 
 
-def _levels(data: bytes, file: Path, hw: tuple[int, int], stored: str | None) -> np.ndarray:
+def _decode_confidence(data: bytes, file: Path, hw: tuple[int, int], stored: str | None) -> np.ndarray:
     """Confidence (h, w) uint8, 0 low to 2 high."""
     value = tiff.decode_tiff(data, file, hw).astype(np.float64)
     top = 2 if stored == "level" else 1

@@ -62,14 +62,14 @@ def read(
     scenes = sorted(root.glob("scene_*.json")) if root.is_dir() else []
     if len(scenes) != 1:
         raise FormatError(root, "scene_*.json", f"{len(scenes)} such files", "exactly one")
-    shots = _shots(scenes[0])
+    shots = _read_shots(scenes[0])
     present = sorted({name for name, list_ in shots.items() if any((root / s.image).is_file() for s in list_)})
     unknown = sorted(set(cameras or ()) - set(present))
     if unknown or not present:
         raise FormatError(root, "cameras", ", ".join(unknown or ["no image"]), f"images of {', '.join(shots)}")
     report = [f"{name}: no image on disk: left out" for name in shots if name not in present]
     options = {"crop_bottom": crop_bottom, "hide_px": hide_px}
-    return [_recording(scenes[0], name, shots[name], report, **options) for name in cameras or present]
+    return [_make_recording(scenes[0], name, shots[name], report, **options) for name in cameras or present]
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +103,13 @@ class _Load:
         shot, camera = self.shots[i], self.cameras[i]
         image = torch.from_numpy(files.read_image(self.root / shot.image, shot.hw))
         T = se3.relative(self.T_world_from_lidar[i : i + 1], self.T_world_from_cam[i : i + 1])
-        xyz = se3.apply(T, torch.from_numpy(_sweep(self.root / shot.sweep, shot.fields))[None])
-        depth = convert.splat(xyz[0], camera, shot.hw, self.hide_px)
+        xyz = se3.apply(T, torch.from_numpy(_read_sweep(self.root / shot.sweep, shot.fields))[None])
+        depth = convert.splat_depth(xyz[0], camera, shot.hw, self.hide_px)
         rows = shot.hw[0] - round(self.crop_bottom * shot.hw[0])
         return Frame(image[None, :, :rows].contiguous(), depth[None, :rows].contiguous(), camera)
 
 
-def _recording(scene: Path, name: str, shots: list[_Shot], report: list[str], **options: Any) -> Recording:
+def _make_recording(scene: Path, name: str, shots: list[_Shot], report: list[str], **options: Any) -> Recording:
     root = scene.parent
     whole = [s for s in shots if (root / s.image).is_file() and (root / s.sweep).is_file()]
     if not whole:
@@ -121,7 +121,7 @@ def _recording(scene: Path, name: str, shots: list[_Shot], report: list[str], **
         convert.to_poses(np.stack([getattr(s, key) for s in whole]), scene, f"{name} {key}")
         for key in ("c2w", "lidar_to_world")
     )
-    cameras = tuple(_camera(root / "calibration" / f"{s.calibration}.json", name, s.hw) for s in whole)
+    cameras = tuple(_read_camera(root / "calibration" / f"{s.calibration}.json", name, s.hw) for s in whole)
     times = torch.tensor([s.stamp for s in whole], dtype=torch.float64)
     return Recording(
         name=f"{root.resolve().name}/{name}",
@@ -138,23 +138,23 @@ def _recording(scene: Path, name: str, shots: list[_Shot], report: list[str], **
     )
 
 
-def _shots(scene: Path) -> dict[str, list[_Shot]]:
+def _read_shots(scene: Path) -> dict[str, list[_Shot]]:
     """Camera name → its shots in the order of the samples."""
     top = files.read_json(scene)
-    data = {files.get(d, "key", str, scene): d for d in files.get(top, "data", list, scene)}
+    data = {files.get_entry(d, "key", str, scene): d for d in files.get_entry(top, "data", list, scene)}
     shots: dict[str, list[_Shot]] = {}
-    for number, sample in enumerate(files.get(top, "samples", list, scene)):
-        calibration = files.get(sample, "calibration_key", str, scene)
-        keys = [key for key in files.get(sample, "datum_keys", list, scene) if isinstance(key, str)]
+    for number, sample in enumerate(files.get_entry(top, "samples", list, scene)):
+        calibration = files.get_entry(sample, "calibration_key", str, scene)
+        keys = [key for key in files.get_entry(sample, "datum_keys", list, scene) if isinstance(key, str)]
         members = [data[key] for key in keys if key in data]
-        kinds = [files.get(d, "datum", dict, scene) for d in members]
+        kinds = [files.get_entry(d, "datum", dict, scene) for d in members]
         sweeps = [k["point_cloud"] for k in kinds if "point_cloud" in k]
         if len(sweeps) != 1:
             raise FormatError(scene, f"samples.{number}", f"{len(sweeps)} LiDAR sweeps", "one")
         for member, kind in zip(members, kinds, strict=True):
             if "image" in kind:
-                name = files.get(member, "id.name", str, scene)
-                shot = _shot(scene, member, kind["image"], sweeps[0], number=number, calibration=calibration)
+                name = files.get_entry(member, "id.name", str, scene)
+                shot = _make_shot(scene, member, kind["image"], sweeps[0], number=number, calibration=calibration)
                 same = shots.setdefault(name, [])
                 if same and same[-1].number == number:
                     raise FormatError(scene, f"samples.{number}", f"two images of {name}", "one of each camera")
@@ -164,10 +164,10 @@ def _shots(scene: Path) -> dict[str, list[_Shot]]:
     return shots
 
 
-def _shot(
+def _make_shot(
     scene: Path, member: dict[str, Any], image: dict[str, Any], sweep: dict[str, Any], *, number: int, calibration: str
 ) -> _Shot:
-    stamp = files.get(member, "id.timestamp", str, scene)
+    stamp = files.get_entry(member, "id.timestamp", str, scene)
     try:
         seconds = datetime.fromisoformat(stamp).timestamp()
     except (ValueError, OverflowError):
@@ -175,34 +175,36 @@ def _shot(
     return _Shot(
         number=number,
         stamp=seconds,
-        image=_inside(files.get(image, "filename", str, scene), scene),
-        sweep=_inside(files.get(sweep, "filename", str, scene), scene),
-        fields=tuple(map(str, files.get(sweep, "point_format", list, scene))),
-        c2w=_pose(image, scene),
-        lidar_to_world=_pose(sweep, scene),
-        calibration=_inside(calibration, scene),
-        hw=(files.get(image, "height", int, scene), files.get(image, "width", int, scene)),
+        image=_check_relative_path(files.get_entry(image, "filename", str, scene), scene),
+        sweep=_check_relative_path(files.get_entry(sweep, "filename", str, scene), scene),
+        fields=tuple(map(str, files.get_entry(sweep, "point_format", list, scene))),
+        c2w=_parse_pose(image, scene),
+        lidar_to_world=_parse_pose(sweep, scene),
+        calibration=_check_relative_path(calibration, scene),
+        hw=(files.get_entry(image, "height", int, scene), files.get_entry(image, "width", int, scene)),
     )
 
 
-def _pose(datum: dict[str, Any], scene: Path) -> np.ndarray:
-    rotation, translation = (files.get(datum, f"pose.{part}", dict, scene) for part in ("rotation", "translation"))
+def _parse_pose(datum: dict[str, Any], scene: Path) -> np.ndarray:
+    rotation, translation = (
+        files.get_entry(datum, f"pose.{part}", dict, scene) for part in ("rotation", "translation")
+    )
     q = files.to_array([rotation.get(k) for k in ("qx", "qy", "qz", "qw")], (4,), scene, "pose.rotation")
     t = files.to_array([translation.get(k) for k in "xyz"], (3,), scene, "pose.translation")
     return convert.to_c2w(q[None], t[None], scene, "pose.rotation")[0]
 
 
-def _camera(file: Path, name: str, hw: tuple[int, int]) -> Camera:
+def _read_camera(file: Path, name: str, hw: tuple[int, int]) -> Camera:
     calibration = files.read_json(file)
-    names, intrinsics = (files.get(calibration, key, list, file) for key in ("names", "intrinsics"))
+    names, intrinsics = (files.get_entry(calibration, key, list, file) for key in ("names", "intrinsics"))
     if name not in names or len(names) != len(intrinsics):
         raise FormatError(file, "names", ", ".join(map(str, names)), f"{name} among as many names as intrinsics")
     entry = intrinsics[names.index(name)]
-    fx, fy, cx, cy, skew = (files.get(entry, key, (int, float), file) for key in ("fx", "fy", "cx", "cy", "skew"))
+    fx, fy, cx, cy, skew = (files.get_entry(entry, key, (int, float), file) for key in ("fx", "fy", "cx", "cy", "skew"))
     return convert.to_camera([[fx, skew, cx], [0, fy, cy], [0, 0, 1]], hw, file, f"{name} intrinsics")
 
 
-def _sweep(file: Path, fields: tuple[str, ...]) -> np.ndarray:
+def _read_sweep(file: Path, fields: tuple[str, ...]) -> np.ndarray:
     """Points (M, 3) m in the LiDAR's frame."""
     data = npy.read_npz(file, "data")
     if not {"X", "Y", "Z"} <= set(fields) or data.ndim != 2 or data.shape[1] != len(fields):
@@ -210,7 +212,7 @@ def _sweep(file: Path, fields: tuple[str, ...]) -> np.ndarray:
     return np.ascontiguousarray(data[:, [fields.index(axis) for axis in "XYZ"]], dtype=np.float64)
 
 
-def _inside(name: str, scene: Path) -> str:
+def _check_relative_path(name: str, scene: Path) -> str:
     """A relative file name that stays in the scene's folder."""
     if not name or Path(name).is_absolute() or ".." in Path(name).parts:
         raise FormatError(scene, "filename", name, "a file inside the scene's folder")

@@ -24,28 +24,28 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert
-from dhtorch.data import intrinsics as told
+from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.codecs import pgm
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.records import Camera, Frame, Pose
 
-_PART = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(?:png|jpg|jpeg|txt)")
-_IMAGE = re.compile(r"(.+)\.(?:png|jpg|jpeg|pgm)")
-_FOLDERS = ("images", "color", "rgb")  # of pictures that are counted
-_POSES = ("poses.txt", "pose.txt")
-_INTRINSICS = ("K.txt", "camera-intrinsics.txt", "intrinsics.txt")
+_NAMED_FRAME_PATTERN = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(?:png|jpg|jpeg|txt)")
+_IMAGE_PATTERN = re.compile(r"(.+)\.(?:png|jpg|jpeg|pgm)")
+_IMAGE_FOLDERS = ("images", "color", "rgb")  # of pictures that are counted
+_POSE_FILES = ("poses.txt", "pose.txt")
+_INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt", "intrinsics.txt")
 
 
 def recognise(root: Path) -> str | None:
     """What makes ``root`` a recording of this format, in words; None if nothing does."""
-    pictures, poses = _folder(root), _first(root, _POSES)
-    if pictures is not None and any(map(_IMAGE.fullmatch, _names(root / "depth"))):
+    pictures, poses = _find_image_folder(root), _first_existing(root, _POSE_FILES)
+    if pictures is not None and any(map(_IMAGE_PATTERN.fullmatch, _list_names(root / "depth"))):
         return f"{pictures.name}/ and depth/" + (f" and {poses.name}" if poses else "")
     if _single(root) is not None:
         return "rgb, raw_depth.png and intrinsics.txt"
-    if root.is_dir() and any(_PART.fullmatch(file.name) for file in root.iterdir()):
+    if root.is_dir() and any(_NAMED_FRAME_PATTERN.fullmatch(file.name) for file in root.iterdir()):
         return "frame-XXXXXX.{color,depth,pose} files"
     return None
 
@@ -53,7 +53,7 @@ def recognise(root: Path) -> str | None:
 def read(
     root: str | Path,
     *,
-    intrinsics: told.Intrinsics | None = None,
+    intrinsics: intrinsics_options.IntrinsicsOption | None = None,
     K: Sequence[float] | None = None,
     fov: float | None = None,
     K_depth: Sequence[float] | None = None,
@@ -88,20 +88,20 @@ def read(
     root = Path(root)
     side = root / "meta.json"
     meta = files.read_json(side) if side.is_file() else {}
-    frames, poses, report = _frames(root)
-    hw = files.image_header(frames[0].image).hw
+    frames, poses, report = _list_frames(root)
+    hw = files.read_image_header(frames[0].image).hw
     depth_hw = _depth_hw(frames[0].depth)
-    said = told.stated(root, hw, intrinsics, K, fov)
+    said = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
     if said.feature is not None:
         raise FormatError(root, "option intrinsics", said.feature, "fx fy cx cy, or degrees: there are no features")
-    own = _intrinsics(root, "K", said.K, meta)
+    own = _read_intrinsics(root, "K", said.K, meta)
     if own is None:
-        raise told.missing(root, None, "a file K.txt, intrinsics.txt or meta.json")
+        raise intrinsics_options.missing_intrinsics_error(root, None, "a file K.txt, intrinsics.txt or meta.json")
     colour = convert.to_camera(own[0], hw, *own[1:], distortion if distortion is not None else meta.get("dist"))
     # Depth has a camera of its own only where someone says so: most sets of this layout are registered.
-    of_depth = _intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
+    of_depth = _read_intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
     units = units_per_metre if units_per_metre is not None else meta.get("depth_scale", 1000.0)
-    rate = _rate(fps if fps is not None else meta.get("fps"), side)
+    rate = _parse_rate(fps if fps is not None else meta.get("fps"), side)
     number = torch.tensor([frame.number for frame in frames])
     load = _Load(
         frames=tuple(frames),
@@ -110,7 +110,7 @@ def read(
         camera=colour,
         depth_camera=convert.to_camera(of_depth[0], depth_hw, *of_depth[1:]) if of_depth else None,
         units_per_metre=files.to_positive(units, side, "depth_scale"),
-        invalid=_codes(invalid if invalid is not None else meta.get("invalid", (0, 65535)), side),
+        invalid=_parse_codes(invalid if invalid is not None else meta.get("invalid", (0, 65535)), side),
         register=register,
     )
     return [
@@ -165,44 +165,46 @@ class _Load:
         return files.read_depth_png(file, self.units_per_metre, self.depth_hw, self.invalid)
 
 
-def _names(folder: Path) -> list[str]:
+def _list_names(folder: Path) -> list[str]:
     return [file.name for file in folder.iterdir()] if folder.is_dir() else []
 
 
-def _first(root: Path, names: Sequence[str]) -> Path | None:
+def _first_existing(root: Path, names: Sequence[str]) -> Path | None:
     return next((root / name for name in names if (root / name).is_file()), None)
 
 
-def _folder(root: Path) -> Path | None:
+def _find_image_folder(root: Path) -> Path | None:
     """The folder of counted pictures."""
-    return next((root / name for name in _FOLDERS if any(map(_IMAGE.fullmatch, _names(root / name)))), None)
+    return next(
+        (root / name for name in _IMAGE_FOLDERS if any(map(_IMAGE_PATTERN.fullmatch, _list_names(root / name)))), None
+    )
 
 
 def _single(root: Path) -> _Files | None:
-    image = _first(root, ("rgb.png", "rgb.jpg", "rgb.jpeg"))
+    image = _first_existing(root, ("rgb.png", "rgb.jpg", "rgb.jpeg"))
     depth, K = root / "raw_depth.png", root / "intrinsics.txt"
     return _Files(0, image, depth) if image is not None and depth.is_file() and K.is_file() else None
 
 
 def _depth_hw(file: Path) -> tuple[int, int]:
     if file.suffix != ".pgm":
-        return files.image_header(file).hw
+        return files.read_image_header(file).hw
     h, w = pgm.read_pgm(file).shape
     return h, w
 
 
-def _frames(root: Path) -> tuple[list[_Files], Pose | None, list[str]]:
+def _list_frames(root: Path) -> tuple[list[_Files], Pose | None, list[str]]:
     """The frames of whatever layout this is, their poses where there are any, and what was left out."""
-    if (pictures := _folder(root)) is not None or (root / "images").is_dir():
-        return _counted_frames(root, pictures or root / "images")
+    if (pictures := _find_image_folder(root)) is not None or (root / "images").is_dir():
+        return _list_counted_frames(root, pictures or root / "images")
     single = _single(root)
-    return ([single], None, ["no poses in this layout"]) if single is not None else _named_frames(root)
+    return ([single], None, ["no poses in this layout"]) if single is not None else _list_named_frames(root)
 
 
-def _named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
+def _list_named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
     parts: dict[int, dict[str, Path]] = {}
     for file in root.iterdir() if root.is_dir() else ():
-        if match := _PART.fullmatch(file.name):
+        if match := _NAMED_FRAME_PATTERN.fullmatch(file.name):
             parts.setdefault(int(match[1]), {})[match[2]] = file
     frames, poses, report = [], list[np.ndarray](), []
     for number, found in sorted(parts.items()):
@@ -228,9 +230,9 @@ def _named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
         raise
 
 
-def _counted_frames(root: Path, folder: Path) -> tuple[list[_Files], Pose | None, list[str]]:
-    images, depths = _pictures(folder), _pictures(root / "depth")
-    file = _first(root, _POSES)
+def _list_counted_frames(root: Path, folder: Path) -> tuple[list[_Files], Pose | None, list[str]]:
+    images, depths = _list_pictures(folder), _list_pictures(root / "depth")
+    file = _first_existing(root, _POSE_FILES)
     rows = None if file is None else files.read_table(file)
     if not images:
         raise FormatError(folder, "frames", "no image", "at least one .png or .jpg")
@@ -242,7 +244,7 @@ def _counted_frames(root: Path, folder: Path) -> tuple[list[_Files], Pose | None
     if images.keys() != depths.keys():
         odd = min(images.keys() ^ depths.keys())
         raise FormatError(root, "file names", f"{odd} in one of {folder.name}/ and depth/", "the same names in both")
-    stems = sorted(images, key=files.natural)
+    stems = sorted(images, key=files.natural_sort_key)
     digits = [re.search(r"(\d+)\D*$", stem) for stem in stems]
     values = [int(m[1]) for m in digits if m]
     counted = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
@@ -250,10 +252,10 @@ def _counted_frames(root: Path, folder: Path) -> tuple[list[_Files], Pose | None
     frames = [_Files(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
     if file is None or rows is None:
         return frames, None, ["no poses.txt: no poses"]
-    return frames, _poses(rows, file), []
+    return frames, _parse_poses(rows, file), []
 
 
-def _poses(rows: np.ndarray, file: Path) -> Pose:
+def _parse_poses(rows: np.ndarray, file: Path) -> Pose:
     if rows.shape[1] not in (7, 16):
         raise FormatError(file, "columns", rows.shape[1], "16 (4x4 by rows) or 7 (tx ty tz qx qy qz qw) numbers")
     if rows.shape[1] == 7:
@@ -261,28 +263,28 @@ def _poses(rows: np.ndarray, file: Path) -> Pose:
     return convert.to_poses(rows.reshape(-1, 4, 4), file)
 
 
-def _pictures(folder: Path) -> dict[str, Path]:
-    return {m[1]: file for file in sorted(folder.glob("*")) if (m := _IMAGE.fullmatch(file.name))}
+def _list_pictures(folder: Path) -> dict[str, Path]:
+    return {m[1]: file for file in sorted(folder.glob("*")) if (m := _IMAGE_PATTERN.fullmatch(file.name))}
 
 
-def _intrinsics(
+def _read_intrinsics(
     root: Path, key: str, option: Sequence[float] | None, meta: dict[str, object]
 ) -> tuple[object, Path, str] | None:
     """K with the file and the field it comes from: the option, else the side-car, else the layout's own file."""
     if option is not None:
-        return convert.matrix_of(*files.to_array(option, (4,), root, f"option {key}")), root, f"option {key}"
+        return convert.make_K(*files.to_array(option, (4,), root, f"option {key}")), root, f"option {key}"
     if key in meta:
         return meta[key], root / "meta.json", key
-    file = _first(root, _INTRINSICS)
+    file = _first_existing(root, _INTRINSICS_FILES)
     return (files.read_table(file, 3), file, "K") if file else None
 
 
-def _rate(value: object, file: Path) -> float | None:
+def _parse_rate(value: object, file: Path) -> float | None:
     """Frames per second where a number is given; a remark in words is no rate."""
     return None if value is None or isinstance(value, str) else files.to_positive(value, file, "fps")
 
 
-def _codes(value: object, file: Path) -> tuple[int, ...]:
+def _parse_codes(value: object, file: Path) -> tuple[int, ...]:
     if not isinstance(value, Sequence) or not all(isinstance(code, int) for code in value):
         raise FormatError(file, "invalid", value, "a list of depth codes")
     return tuple(value)

@@ -20,27 +20,27 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import convert
-from dhtorch.data import intrinsics as told
+from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.codecs.parquet import read_cell
-from dhtorch.data.codecs.video import read_video_frame, video_times
+from dhtorch.data.codecs.video import read_video_frame, read_video_times
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.lerobot_depth import decode_codes, decode_picture, depth_of
+from dhtorch.data.readers.lerobot_depth import decode_depth_picture, dequantise_depth, find_depth_feature
 from dhtorch.data.readers.lerobot_meta import (
-    Episode,
-    Episodes,
-    Feature,
-    Meta,
-    colour_keys,
-    inside,
-    read_episodes,
-    read_meta,
+    LeRobotEpisode,
+    LeRobotEpisodes,
+    LeRobotFeature,
+    LeRobotMeta,
+    read_lerobot_episodes,
+    read_lerobot_meta,
+    resolve_inside,
+    select_colour_keys,
 )
-from dhtorch.data.readers.lerobot_rows import episode_rows, read_table
+from dhtorch.data.readers.lerobot_rows import read_row_table, select_episode_rows
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.records import Camera, Frame
 
-_UNITS = {"m": 1.0, "mm": 1000.0}
+_UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
 
 
 def recognise(root: Path) -> str | None:
@@ -61,7 +61,7 @@ def read(
     fov: float | None = None,
     K_depth: Sequence[float] | None = None,
     distortion: Sequence[float] | None = None,
-    intrinsics: told.Intrinsics | None = None,
+    intrinsics: intrinsics_options.IntrinsicsOption | None = None,
     pose: str | None = None,
     depth_unit: str | None = None,
     depth_range: Sequence[float] | None = None,
@@ -100,22 +100,22 @@ def read(
             values no camera or pose can have.
     """
     root = Path(root)
-    meta = read_meta(root)
-    if depth_unit not in (None, *_UNITS):
+    meta = read_lerobot_meta(root)
+    if depth_unit not in (None, *_UNITS_PER_METRE):
         raise FormatError(root, "option depth_unit", depth_unit, "m or mm")
     span = (
         (0.0, np.inf) if depth_range is None else tuple(files.to_array(depth_range, (2,), root, "option depth_range"))
     )
-    keys = colour_keys(meta, camera)
+    keys = select_colour_keys(meta, camera)
     wanted = None if episode is None else [episode] if isinstance(episode, int) else [int(e) for e in episode]
-    episodes = read_episodes(meta, wanted)
-    keys = keys if camera is not None else _filmed(keys, episodes)
+    episodes = read_lerobot_episodes(meta, wanted)
+    keys = keys if camera is not None else _recorded_cameras(keys, episodes)
     rigs = [
-        _Rig(
+        _CameraSpec(
             meta,
             key,
             depth,
-            told.stated(meta.root, meta.features[key].hw, intrinsics, K, fov),
+            intrinsics_options.parse_intrinsics(meta.root, meta.features[key].hw, intrinsics, K, fov),
             K_depth,
             distortion,
             pose,
@@ -127,26 +127,26 @@ def read(
     ]
     columns = sorted({c for rig in rigs for c in (rig.K_key, rig.pose_key) if c})
     names = [rig.name(number) for number in episodes.numbers for rig in rigs]
-    return Recordings(names, _Make(episodes, tuple(rigs), tuple(columns)))
+    return Recordings(names, _MakeRecording(episodes, tuple(rigs), tuple(columns)))
 
 
-def _filmed(keys: list[str], episodes: Episodes) -> list[str]:
+def _recorded_cameras(keys: list[str], episodes: LeRobotEpisodes) -> list[str]:
     """Keys of the cameras that there are: a feature that is only declared is none."""
     videos = episodes[0].videos
     return [key for key in keys if key not in videos or videos[key][0].is_file()] or keys
 
 
 @dataclass(frozen=True, eq=False)
-class _Make:
+class _MakeRecording:
     """Position → recording: the cameras of the first episode, then those of the second, …"""
 
-    episodes: Episodes
-    rigs: tuple[_Rig, ...]
+    episodes: LeRobotEpisodes
+    rigs: tuple[_CameraSpec, ...]
     columns: tuple[str, ...]  # of the tables, beside those that place a row
 
     def __call__(self, i: int) -> Recording:
         episode = self.episodes[i // len(self.rigs)]
-        return self.rigs[i % len(self.rigs)].recording(episode, read_table(episode.data, self.columns))
+        return self.rigs[i % len(self.rigs)].recording(episode, read_row_table(episode.data, self.columns))
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +157,8 @@ class _Load:
     root: Path
     rows: np.ndarray  # (n,) place in the table
     times: np.ndarray  # (n,) s from the start of the episode
-    image: Feature
-    depth: Feature | None
+    image: LeRobotFeature
+    depth: LeRobotFeature | None
     videos: dict[str, tuple[Path, float]]
     cameras: Camera  # (n), or (1) for all
     depth_camera: Camera | None
@@ -177,29 +177,29 @@ class _Load:
         data, file = self._bytes(i, self.image.key)
         return torch.from_numpy(files.decode_image(data, file, self.image.hw))
 
-    def _depth(self, i: int, feature: Feature) -> Tensor:
+    def _depth(self, i: int, feature: LeRobotFeature) -> Tensor:
         if feature.dtype == "video":
-            return self._within(decode_codes(feature, self._video(i, feature, "luma"), self.videos[feature.key][0]))
+            return self._within(dequantise_depth(feature, self._video(i, feature, "luma"), self.videos[feature.key][0]))
         if feature.dtype == "image":
             data, file = self._bytes(i, feature.key)
-            values = decode_picture(data, file, feature.hw)
+            values = decode_depth_picture(data, file, feature.hw)
         else:
             values, file = np.asarray(read_cell(self.data, feature.key, int(self.rows[i]))), self.data
             if values.size != feature.hw[0] * feature.hw[1] or values.dtype.kind not in "fiu":
                 raise FormatError(file, feature.key, f"shape {values.shape}", f"{feature.hw} numbers")
         unit = self.unit or feature.info.get("depth_unit") or ("m" if values.dtype.kind == "f" else "mm")
-        if not isinstance(unit, str) or unit not in _UNITS:
+        if not isinstance(unit, str) or unit not in _UNITS_PER_METRE:
             raise FormatError(self.data, f"{feature.key} depth_unit", unit, "m or mm")
-        return self._within(values.reshape(feature.hw).astype(np.float64) / _UNITS[unit])
+        return self._within(values.reshape(feature.hw).astype(np.float64) / _UNITS_PER_METRE[unit])
 
     def _within(self, depth: np.ndarray) -> Tensor:
         low, high = self.span
         keep = np.isfinite(depth) & (depth > 0) & (depth >= low) & (depth <= min(high, 1e6))
         return torch.from_numpy(np.where(keep, depth, 0).astype(np.float32))
 
-    def _video(self, i: int, feature: Feature, pixels: str) -> np.ndarray:
+    def _video(self, i: int, feature: LeRobotFeature, pixels: str) -> np.ndarray:
         file, start = self.videos[feature.key]
-        times, want = video_times(file), start + float(self.times[i])
+        times, want = read_video_times(file), start + float(self.times[i])
         if start == 0 and len(times):
             want += float(times[0])  # a film of its own begins with the episode, whatever its clock says
         at = int(np.abs(times - want).argmin()) if len(times) else -1
@@ -218,18 +218,18 @@ class _Load:
             return data, self.data
         if not isinstance(path, str):
             raise FormatError(self.data, key, "neither bytes nor path", "a picture")
-        file = inside(self.root, path, self.data, key)
+        file = resolve_inside(self.root, path, self.data, key)
         return files.read_bytes(file), file
 
 
 @dataclass(frozen=True, eq=False)
-class _Rig:
+class _CameraSpec:
     """One camera of the data set and the options."""
 
-    meta: Meta
+    meta: LeRobotMeta
     key: str
     depth_key: str | None
-    stated: told.Stated
+    stated: intrinsics_options.ParsedIntrinsics
     K_depth: Sequence[float] | None
     distortion: Sequence[float] | None
     pose: str | None
@@ -238,7 +238,7 @@ class _Rig:
     tolerance: float
 
     @property
-    def image(self) -> Feature:
+    def image(self) -> LeRobotFeature:
         return self.meta.features[self.key]
 
     @property
@@ -266,17 +266,17 @@ class _Rig:
         """Of the recording."""
         return f"{self.meta.name}/episode_{episode:06d}/{self.key.split('.')[-1]}"
 
-    def recording(self, episode: Episode, table: dict[str, np.ndarray]) -> Recording:
+    def recording(self, episode: LeRobotEpisode, table: dict[str, np.ndarray]) -> Recording:
         meta, image = self.meta, self.image
-        rows, numbers, times, report = episode_rows(meta, episode, table)
+        rows, numbers, times, report = select_episode_rows(meta, episode, table)
         report += self.stated.report
-        depth = depth_of(meta, self.key, self.depth_key)
+        depth = find_depth_feature(meta, self.key, self.depth_key)
         if depth is None:
             report.append(f"{self.key}: no depth feature: depth is empty")
         cameras, depth_camera = self._cameras(table, rows, depth)
         poses = None
         if self.pose_key is not None:
-            poses = convert.to_poses_of(table[self.pose_key][rows], episode.data, self.pose_key)
+            poses = convert.parse_poses(table[self.pose_key][rows], episode.data, self.pose_key)
         load = _Load(
             data=episode.data,
             root=meta.root,
@@ -306,7 +306,7 @@ class _Rig:
         )
 
     def _cameras(
-        self, table: dict[str, np.ndarray], rows: np.ndarray, depth: Feature | None
+        self, table: dict[str, np.ndarray], rows: np.ndarray, depth: LeRobotFeature | None
     ) -> tuple[Camera, Camera | None]:
         root, hw = self.meta.root, self.image.hw
         side = root / "meta" / "intrinsics.json"
@@ -316,15 +316,19 @@ class _Rig:
         lens = self.distortion if self.distortion is not None else entry.get("dist")
         of_depth = None
         if depth is not None and (self.K_depth is not None or entry.get("K_depth") is not None):
-            value = convert.K_of(self.K_depth, root, "option K_depth") if self.K_depth is not None else entry["K_depth"]
+            value = (
+                convert.parse_K_option(self.K_depth, root, "option K_depth")
+                if self.K_depth is not None
+                else entry["K_depth"]
+            )
             of_depth = convert.to_camera(value, depth.hw, side, "K_depth")
         if self.stated.K is not None:
-            K = convert.matrix_of(*self.stated.K)
+            K = convert.make_K(*self.stated.K)
             return convert.to_camera(K, hw, root, "option K", lens), of_depth
         if self.K_key is not None:
             values = table[self.K_key][rows]
             return convert.to_cameras(values, hw, root / "data", self.K_key, lens), of_depth
         if "K" not in entry:
             others = "data.intrinsics=FEATURE", "meta/intrinsics.json"
-            raise told.missing(root, self.key, *others, depth=depth is not None)
+            raise intrinsics_options.missing_intrinsics_error(root, self.key, *others, depth=depth is not None)
         return convert.to_camera(entry["K"], hw, side, f"{self.key} K", lens), of_depth

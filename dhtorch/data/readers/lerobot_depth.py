@@ -15,43 +15,43 @@ import numpy as np
 from dhtorch.data.codecs.tiff import decode_tiff
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.lerobot_meta import Feature, Meta, colour_keys
+from dhtorch.data.readers.lerobot_meta import LeRobotFeature, LeRobotMeta, select_colour_keys
 
-_CODES = 4096
-_DEFAULTS = {"depth_min": 0.01, "depth_max": 10.0, "shift": 3.5}  # m
+_N_DEPTH_CODES = 4096
+_DEFAULT_DEPTH_RANGE = {"depth_min": 0.01, "depth_max": 10.0, "shift": 3.5}  # m
 
 
-def depth_of(meta: Meta, camera: str, asked: str | None) -> Feature | None:
+def find_depth_feature(meta: LeRobotMeta, camera: str, asked: str | None) -> LeRobotFeature | None:
     """The depth feature of a camera: the one asked for, the one named like it, or the only one."""
     depths = {key: f for key, f in meta.features.items() if f.is_depth and len(f.shape) >= 2}
     if asked is not None:
         if asked not in meta.features or len(meta.features[asked].shape) < 2:
             raise FormatError(meta.root, "option depth", asked, f"one of {', '.join(depths) or 'none'}")
         return meta.features[asked]
-    named = [f for key, f in depths.items() if _words(key) == _words(camera)]
+    named = [f for key, f in depths.items() if _distinctive_words(key) == _distinctive_words(camera)]
     if len(named) == 1:
         return named[0]
-    return next(iter(depths.values())) if len(depths) == 1 and len(colour_keys(meta)) == 1 else None
+    return next(iter(depths.values())) if len(depths) == 1 and len(select_colour_keys(meta)) == 1 else None
 
 
-def _words(key: str) -> frozenset[str]:
+def _distinctive_words(key: str) -> frozenset[str]:
     """What remains of a key without the words that say what kind of picture it is."""
     kinds = {"observation", "images", "image", "depth", "depths", "rgb", "color", "colour", ""}
     return frozenset(re.split(r"[._\-]", key.lower())) - kinds
 
 
-def decode_codes(feature: Feature, codes: np.ndarray, file: Path) -> np.ndarray:
+def dequantise_depth(feature: LeRobotFeature, codes: np.ndarray, file: Path) -> np.ndarray:
     """Metres (h, w) of 12-bit codes, 0 for no return.
 
     Raises:
         FormatError: codes of more bits, or a range in the feature's info that is none.
     """
-    if codes.dtype != np.uint16 or codes.max(initial=0) >= _CODES:
+    if codes.dtype != np.uint16 or codes.max(initial=0) >= _N_DEPTH_CODES:
         raise FormatError(file, f"{feature.key} pixels", f"{codes.dtype} up to {codes.max(initial=0)}", "12-bit codes")
-    return _metres(feature, file)[codes]
+    return _metres_by_code(feature, file)[codes]
 
 
-def decode_picture(data: bytes, file: Path, hw: tuple[int, int]) -> np.ndarray:
+def decode_depth_picture(data: bytes, file: Path, hw: tuple[int, int]) -> np.ndarray:
     """Numbers (h, w) as stored in a TIFF or a 16-bit PNG.
 
     Raises:
@@ -62,17 +62,17 @@ def decode_picture(data: bytes, file: Path, hw: tuple[int, int]) -> np.ndarray:
     return files.decode_depth_png(data, file, 1.0, hw).astype(np.uint16)
 
 
-def _metres(feature: Feature, file: Path) -> np.ndarray:
+def _metres_by_code(feature: LeRobotFeature, file: Path) -> np.ndarray:
     """Code → m, 0 for the codes at either end, where what was lost has gone."""
     numbers = []
-    for key, default in _DEFAULTS.items():
+    for key, default in _DEFAULT_DEPTH_RANGE.items():
         value = feature.info.get(f"video.{key}", feature.info.get(key, default))
         numbers.append(float(files.to_array(value, (), file, f"{feature.key} {key}")))
     low, high, shift = numbers
     log = feature.info.get("video.use_log", feature.info.get("use_log", True))
     if not 0 <= low < high <= 1e4 or (log and not 1e-6 < low + shift <= 1e4):  # only the logarithm needs a shift
         raise FormatError(file, f"{feature.key} depth_min, depth_max, shift", numbers, "a range of metres")
-    share = np.arange(_CODES) / (_CODES - 1)
+    share = np.arange(_N_DEPTH_CODES) / (_N_DEPTH_CODES - 1)
     if log:
         table = np.exp((1 - share) * np.log(low + shift) + share * np.log(high + shift)) - shift
     else:

@@ -16,7 +16,7 @@ from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 
 _MAX_EPISODES = 10_000_000
-_PARTS = ("chunk_index", "file_index")
+_FILE_INDEX_COLUMNS = ("chunk_index", "file_index")
 _V2_DATA = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 _V2_VIDEO = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
 _V3_DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -24,7 +24,7 @@ _V3_VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp
 
 
 @dataclass(frozen=True)
-class Feature:
+class LeRobotFeature:
     """One column or video."""
 
     key: str
@@ -48,7 +48,7 @@ class Feature:
 
 
 @dataclass(frozen=True)
-class Episode:
+class LeRobotEpisode:
     """Place of one episode."""
 
     number: int
@@ -58,14 +58,14 @@ class Episode:
 
 
 @dataclass(frozen=True)
-class Meta:
+class LeRobotMeta:
     """``meta/info.json``, checked."""
 
     root: Path
     name: str  # of the data set
     version: int  # 2 or 3
     fps: float
-    features: dict[str, Feature]
+    features: dict[str, LeRobotFeature]
     chunks_size: int
     data_path: str
     video_path: str
@@ -77,36 +77,36 @@ class Meta:
 
 
 @dataclass(frozen=True, eq=False)
-class Episodes:
+class LeRobotEpisodes:
     """The episodes asked for, in that order. There may be tens of thousands: places are made out one at a time."""
 
-    meta: Meta
+    meta: LeRobotMeta
     numbers: np.ndarray  # (n,)
     columns: dict[str, np.ndarray]  # (n,) each: ``length``, and in v3 the places under their names in meta/episodes
 
     def __len__(self) -> int:
         return len(self.numbers)
 
-    def __getitem__(self, i: int) -> Episode:
+    def __getitem__(self, i: int) -> LeRobotEpisode:
         meta, number = self.meta, int(self.numbers[i])
         row = {name: values[i].item() for name, values in self.columns.items()}
 
         def index(prefix: str) -> dict[str, Any]:
             if meta.version == 2:
                 return {"episode_chunk": number // meta.chunks_size, "episode_index": number}
-            return {part: row[f"{prefix}/{part}"] for part in _PARTS}
+            return {part: row[f"{prefix}/{part}"] for part in _FILE_INDEX_COLUMNS}
 
         videos = {
             key: (
-                _path(meta, "video_path", {**index(f"videos/{key}"), "video_key": key}),
+                _fill_path_template(meta, "video_path", {**index(f"videos/{key}"), "video_key": key}),
                 row.get(f"videos/{key}/from_timestamp", 0.0),
             )
             for key in meta.videos
         }
-        return Episode(number, row.get("length"), _path(meta, "data_path", index("data")), videos)
+        return LeRobotEpisode(number, row.get("length"), _fill_path_template(meta, "data_path", index("data")), videos)
 
 
-def read_meta(root: Path) -> Meta:
+def read_lerobot_meta(root: Path) -> LeRobotMeta:
     """The data set's own description.
 
     Raises:
@@ -114,7 +114,7 @@ def read_meta(root: Path) -> Meta:
     """
     file = root / "meta" / "info.json"
     info = files.read_json(file)
-    text = files.get(info, "codebase_version", str, file)
+    text = files.get_entry(info, "codebase_version", str, file)
     version = re.fullmatch(r"v?([23])\.\d{1,3}", text)
     if not version:
         raise FormatError(file, "codebase_version", text, "v2.x or v3.x")
@@ -127,26 +127,26 @@ def read_meta(root: Path) -> Meta:
     for key, value in paths.items():
         if not isinstance(value, str):
             raise FormatError(file, key, type(value).__name__, "a path")
-    features = files.get(info, "features", dict, file)
-    return Meta(
+    features = files.get_entry(info, "features", dict, file)
+    return LeRobotMeta(
         root=root,
         name=root.resolve().name,
         version=number,
         fps=files.to_positive(info.get("fps"), file, "fps"),
-        features={key: _feature(key, value, file) for key, value in features.items()},
+        features={key: _parse_feature(key, value, file) for key, value in features.items()},
         chunks_size=chunks,
         data_path=paths["data_path"],
         video_path=paths["video_path"],
     )
 
 
-def read_episodes(meta: Meta, wanted: Sequence[int] | None) -> Episodes:
+def read_lerobot_episodes(meta: LeRobotMeta, wanted: Sequence[int] | None) -> LeRobotEpisodes:
     """The wanted episodes (None = all, by number); of two with one number the first counts.
 
     Raises:
         FormatError: missing or damaged tables, a path that cannot be, or an episode that is not there.
     """
-    columns = _columns_v3(meta) if meta.version == 3 else _columns_v2(meta)
+    columns = _read_columns_v3(meta) if meta.version == 3 else _read_columns_v2(meta)
     numbers, rows = np.unique(columns.pop("episode_index"), return_index=True)
     place = dict(zip(numbers.tolist(), rows.tolist(), strict=True))
     chosen = numbers.tolist() if wanted is None else list(wanted)
@@ -155,46 +155,46 @@ def read_episodes(meta: Meta, wanted: Sequence[int] | None) -> Episodes:
         found = f"{len(chosen) - len(missing)} of those asked for"
         raise FormatError(meta.root / "meta", "episodes", found, missing or "at least one")
     rows = np.array([place[n] for n in chosen])
-    episodes = Episodes(meta, np.array(chosen), {name: values[rows] for name, values in columns.items()})
+    episodes = LeRobotEpisodes(meta, np.array(chosen), {name: values[rows] for name, values in columns.items()})
     _ = episodes[0]  # paths that cannot be are found now
     return episodes
 
 
-def _columns_v3(meta: Meta) -> dict[str, np.ndarray]:
+def _read_columns_v3(meta: LeRobotMeta) -> dict[str, np.ndarray]:
     tables = sorted((meta.root / "meta" / "episodes").glob("*/*.parquet"))
     if not tables:
         raise FormatError(meta.root / "meta" / "episodes", "tables", "none", "chunk-000/file-000.parquet")
     places = ["data", *(f"videos/{key}" for key in meta.videos)]
-    counts = ["episode_index", *(f"{place}/{part}" for place in places for part in _PARTS)]
+    counts = ["episode_index", *(f"{place}/{part}" for place in places for part in _FILE_INDEX_COLUMNS)]
     starts = [f"videos/{key}/from_timestamp" for key in meta.videos]
     found: list[dict[str, np.ndarray]] = []
     for table in tables:
         spans = ["dataset_from_index", "dataset_to_index"]
         read = read_columns(table, [*counts, *starts], optional=spans)
-        columns = {name: _counts(read[name], table, name) for name in counts}
-        columns |= {name: _numbers(read[name], table, name, np.isfinite) for name in starts}
+        columns = {name: _check_counts(read[name], table, name) for name in counts}
+        columns |= {name: _check_numbers(read[name], table, name, np.isfinite) for name in starts}
         if {*spans} <= {*read}:
-            first, end = (_counts(read[name], table, name, 2**53) for name in spans)
+            first, end = (_check_counts(read[name], table, name, 2**53) for name in spans)
             columns["length"] = end - first
         found.append(columns)
     shared = set.intersection(*({*columns} for columns in found))
     return {name: np.concatenate([columns[name] for columns in found]) for name in shared}
 
 
-def _columns_v2(meta: Meta) -> dict[str, np.ndarray]:
+def _read_columns_v2(meta: LeRobotMeta) -> dict[str, np.ndarray]:
     table = meta.root / "meta" / "episodes.jsonl"
     rows = []
     for line, text in enumerate(files.read_lines(table), 1):
         if text.strip():
             row = files.decode_json(text, table)
-            rows.append([files.get(row, key, int, table) for key in ("episode_index", "length")])
+            rows.append([files.get_entry(row, key, int, table) for key in ("episode_index", "length")])
             if not all(0 <= value < _MAX_EPISODES for value in rows[-1]):
                 raise FormatError(table, f"line {line}", rows[-1], f"counts below {_MAX_EPISODES}")
     numbers = np.array(rows, dtype=np.int64).reshape(-1, 2)
     return {"episode_index": numbers[:, 0], "length": numbers[:, 1]}
 
 
-def colour_keys(meta: Meta, asked: str | Sequence[str] | None = None) -> list[str]:
+def select_colour_keys(meta: LeRobotMeta, asked: str | Sequence[str] | None = None) -> list[str]:
     """Keys of the colour features asked for; None = all.
 
     Raises:
@@ -211,7 +211,7 @@ def colour_keys(meta: Meta, asked: str | Sequence[str] | None = None) -> list[st
     return keys
 
 
-def inside(root: Path, name: str, file: Path, field: str) -> Path:
+def resolve_inside(root: Path, name: str, file: Path, field: str) -> Path:
     """A file below ``root``.
 
     Raises:
@@ -222,7 +222,7 @@ def inside(root: Path, name: str, file: Path, field: str) -> Path:
     return root / name
 
 
-def _path(meta: Meta, key: str, values: dict[str, Any]) -> Path:
+def _fill_path_template(meta: LeRobotMeta, key: str, values: dict[str, Any]) -> Path:
     """A path template filled in. Python's own ``format`` would also follow attributes and pad to any width."""
     file, template = meta.root / "meta" / "info.json", getattr(meta, key)
 
@@ -235,11 +235,11 @@ def _path(meta: Meta, key: str, values: dict[str, Any]) -> Path:
     name = re.sub(r"\{(\w{1,40})(?::0(\d)d)?\}", fill, template[:500])
     if "{" in name or "}" in name:
         raise FormatError(file, key, template, "a path with fields such as {file_index:03d}")
-    return inside(meta.root, name, file, key)
+    return resolve_inside(meta.root, name, file, key)
 
 
-def _feature(key: str, value: Any, file: Path) -> Feature:
-    dtype = files.get(value, "dtype", str, file)
+def _parse_feature(key: str, value: Any, file: Path) -> LeRobotFeature:
+    dtype = files.get_entry(value, "dtype", str, file)
     shape = value.get("shape") or ()
     if (
         not isinstance(shape, list | tuple)
@@ -252,14 +252,14 @@ def _feature(key: str, value: Any, file: Path) -> Feature:
     info = value.get("info") or value.get("video_info") or {}
     if not isinstance(info, dict) or any(c in key for c in "/\\\x00") or key in ("", ".", ".."):
         raise FormatError(file, f"features.{key}", type(info).__name__, "an object under a plain name")
-    return Feature(key, dtype, tuple(shape), info)
+    return LeRobotFeature(key, dtype, tuple(shape), info)
 
 
-def _counts(values: Any, file: Path, field: str, limit: int = _MAX_EPISODES) -> np.ndarray:
-    return _numbers(values, file, field, lambda x: (x >= 0) & (x < limit) & (x == np.floor(x))).astype(np.int64)
+def _check_counts(values: Any, file: Path, field: str, limit: int = _MAX_EPISODES) -> np.ndarray:
+    return _check_numbers(values, file, field, lambda x: (x >= 0) & (x < limit) & (x == np.floor(x))).astype(np.int64)
 
 
-def _numbers(values: Any, file: Path, field: str, sound: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+def _check_numbers(values: Any, file: Path, field: str, sound: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
     """A column (n,) as float64, all of its values sound."""
     if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu":
         raise FormatError(file, field, "no numbers", "one number a row")

@@ -28,15 +28,15 @@ from dhtorch.data.codecs import exr as codec_exr
 from dhtorch.data.codecs import lzfse
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.members import Member, folder_members, member, zip_members
+from dhtorch.data.members import Member, get_member, list_folder_members, list_zip_members
 from dhtorch.data.readers import record3d_video
 from dhtorch.data.recording import Recording
 from dhtorch.records import Frame
 
-_PART = re.compile(r"(?:rgbd|rgb|depth)/(0|[1-9]\d{0,8})\.(jpg|depth|conf|exr)")
+_MEMBER_PATTERN = re.compile(r"(?:rgbd|rgb|depth)/(0|[1-9]\d{0,8})\.(jpg|depth|conf|exr)")
 #: Portrait sizes of depth maps, by their pixels: LiDAR, front camera, front camera of later devices.
 _DEPTH_SIZES = {256 * 192: (256, 192), 640 * 480: (640, 480), 960 * 720: (960, 720)}
-_JPEG = (b"\xff\xd8", b"\xff\xd9")
+_JPEG_MARKERS = (b"\xff\xd8", b"\xff\xd9")
 
 
 def recognise(root: Path) -> str | None:
@@ -45,7 +45,7 @@ def recognise(root: Path) -> str | None:
         if root.suffix.lower() == ".r3d":
             return ".r3d archive"
         return record3d_video.recognise(root)
-    inner = _enclosed(root)
+    inner = _find_export_folder(root)
     if (inner / "metadata.json").is_file() and (inner / "rgb").is_dir() and any((inner / "depth").glob("*.exr")):
         return "metadata.json, rgb/ and depth/*.exr"
     if (root / "metadata").is_file() and any((root / "rgbd").glob("*.depth")):
@@ -90,28 +90,28 @@ def read(
     if root.is_file() and root.suffix.lower() != ".r3d":
         return record3d_video.read(root, depth_range=depth_range, max_step=max_step)
     if root.is_file():
-        members, inner, name = zip_members(root), root, root.stem
+        members, inner, name = list_zip_members(root), root, root.stem
     elif root.is_dir():
-        inner, name = _enclosed(root), root.resolve().name
-        members = folder_members(inner)
+        inner, name = _find_export_folder(root), root.resolve().name
+        members = list_folder_members(inner)
     else:
         raise FormatError(root, "path", "no such file or folder", "a Record3D capture")
-    table = member(members, "metadata.json" if "metadata.json" in members else "metadata", inner)
-    meta = _metadata(table, per_frame)
-    shots, report = _shots(members, inner)
-    shots, late = _covered(shots, meta)
-    c2w, lost, said = _poses([shot.number for shot in shots], meta, poses)
+    table = get_member(members, "metadata.json" if "metadata.json" in members else "metadata", inner)
+    meta = _parse_metadata(table, per_frame)
+    shots, report = _list_shots(members, inner)
+    shots, late = _select_covered(shots, meta)
+    c2w, lost, said = _select_posed([shot.number for shot in shots], meta, poses)
     kept = [shot for shot in shots if shot.number not in lost]
-    report += late + said + files.left_out(sorted(lost), "its pose is not usable (tracking lost)")
+    report += late + said + files.format_left_out(sorted(lost), "its pose is not usable (tracking lost)")
     if not kept:
         raise FormatError(inner, "frames", "; ".join(report) or "none", "frames with picture, depth and metadata")
-    load = _Load(tuple(kept), meta, *_sizes(kept, meta), exr_channel)
-    good = [i for i, shot in enumerate(kept) if not (verify or _suspect(shot)) or _decodes(load, i)]
-    report += files.left_out([shot.number for i, shot in enumerate(kept) if i not in set(good)], "damaged")
+    load = _Load(tuple(kept), meta, *_find_sizes(kept, meta), exr_channel)
+    good = [i for i, shot in enumerate(kept) if not (verify or _is_damaged(shot)) or _can_decode(load, i)]
+    report += files.format_left_out([shot.number for i, shot in enumerate(kept) if i not in set(good)], "damaged")
     if not good:
         raise FormatError(inner, "frames", "; ".join(report), "frames that decode")
     number = torch.tensor([kept[i].number for i in good])
-    times, said = _times(number, meta)
+    times, said = _frame_times(number, meta)
     return [
         Recording(
             name=name,
@@ -164,7 +164,7 @@ class _Load:
         shot, meta = self.shots[i], self.meta
         image = files.decode_image(shot.image.read(), shot.image.path, self.hw)
         row = meta.K[shot.number if len(meta.K) > 1 else 0]
-        K = convert.resize_matrix(convert.matrix_of(*row), meta.hw, self.hw)
+        K = convert.resize_K(convert.make_K(*row), meta.hw, self.hw)
         return Frame(
             image=torch.from_numpy(image)[None],
             depth=torch.from_numpy(self._depth(shot.depth))[None],
@@ -177,19 +177,21 @@ class _Load:
             depth = codec_exr.decode_exr(part.read(), part.path, self.exr_channel, self.depth_hw)
         else:
             h, w = self.depth_hw
-            depth = np.frombuffer(lzfse.unpack(part.read(), 4 * h * w, part.path, "depth"), "<f4").reshape(h, w)
+            depth = np.frombuffer(lzfse.decompress_lzfse(part.read(), 4 * h * w, part.path, "depth"), "<f4").reshape(
+                h, w
+            )
         with np.errstate(invalid="ignore"):
             return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
     def _conf(self, part: Member) -> np.ndarray:
         h, w = self.depth_hw
-        conf = np.frombuffer(lzfse.unpack(part.read(), h * w, part.path, "confidence"), np.uint8)
+        conf = np.frombuffer(lzfse.decompress_lzfse(part.read(), h * w, part.path, "confidence"), np.uint8)
         if conf.max() > 2:
             raise FormatError(part.path, "confidence", int(conf.max()), "0, 1 or 2")
         return conf.reshape(h, w).copy()
 
 
-def _enclosed(root: Path) -> Path:
+def _find_export_folder(root: Path) -> Path:
     """The folder of the EXR export: the app puts it into one of that name."""
     return root / "EXR_RGBD" if (root / "EXR_RGBD").is_dir() else root
 
@@ -197,15 +199,15 @@ def _enclosed(root: Path) -> Path:
 # --------------------------------------------------------------------------------------------------------- metadata
 
 
-def _metadata(table: Member, per_frame: bool) -> _Metadata:
+def _parse_metadata(table: Member, per_frame: bool) -> _Metadata:
     file = table.path
     value = files.decode_json(table.read(), file)
     if not isinstance(value, dict):
         raise FormatError(file, "JSON", type(value).__name__, "an object")
-    hw = _size(value, "h", "w", file)
+    hw = _parse_size(value, "h", "w", file)
     if hw is None:
         raise FormatError(file, "w, h", "nothing", "the size of the pictures")
-    coefficients = _rows(value, "perFrameIntrinsicCoeffs", 4, file) if per_frame else None
+    coefficients = _parse_rows(value, "perFrameIntrinsicCoeffs", 4, file) if per_frame else None
     if coefficients is None:
         K = files.to_array(value.get("K"), (9,), file, "K").reshape(3, 3).T  # column after column
         if K[2].tolist() != [0, 0, 1] or K[0, 1] != 0 or K[1, 0] != 0:
@@ -214,19 +216,19 @@ def _metadata(table: Member, per_frame: bool) -> _Metadata:
     elif not np.isfinite(coefficients).all():
         raise FormatError(file, "perFrameIntrinsicCoeffs", "a number that is not finite", "fx fy cx cy of each frame")
     fps = value.get("fps")
-    stamps = _rows(value, "frameTimestamps", 1, file)
+    stamps = _parse_rows(value, "frameTimestamps", 1, file)
     return _Metadata(
         file=file,
         hw=hw,
-        depth_hw=_size(value, "dh", "dw", file),
+        depth_hw=_parse_size(value, "dh", "dw", file),
         fps=None if fps is None else files.to_positive(fps, file, "fps"),
         K=coefficients,
-        poses=_rows(value, "poses", 7, file),
+        poses=_parse_rows(value, "poses", 7, file),
         stamps=None if stamps is None else stamps[:, 0],
     )
 
 
-def _size(value: Mapping[str, Any], high: str, wide: str, file: Path) -> tuple[int, int] | None:
+def _parse_size(value: Mapping[str, Any], high: str, wide: str, file: Path) -> tuple[int, int] | None:
     """(height, width), or None where the table does not say."""
     if value.get(high) is None and value.get(wide) is None:
         return None
@@ -236,7 +238,7 @@ def _size(value: Mapping[str, Any], high: str, wide: str, file: Path) -> tuple[i
     return int(h), int(w)
 
 
-def _rows(value: Mapping[str, Any], key: str, width: int, file: Path) -> np.ndarray | None:
+def _parse_rows(value: Mapping[str, Any], key: str, width: int, file: Path) -> np.ndarray | None:
     """(n, width) numbers, NaN allowed; None where the table has no such key or nothing in it."""
     rows = value.get(key)
     if rows is None or rows == []:
@@ -251,11 +253,11 @@ def _rows(value: Mapping[str, Any], key: str, width: int, file: Path) -> np.ndar
 # ------------------------------------------------------------------------------------------------------------ frames
 
 
-def _shots(members: Mapping[str, Member], root: Path) -> tuple[list[_Shot], list[str]]:
+def _list_shots(members: Mapping[str, Member], root: Path) -> tuple[list[_Shot], list[str]]:
     """Frames with picture and depth (and confidence, if any frame has it) in numerical order; what is missing."""
     parts: dict[int, dict[str, Member]] = {}
     for name, part in members.items():
-        if match := _PART.fullmatch(name):
+        if match := _MEMBER_PATTERN.fullmatch(name):
             parts.setdefault(int(match[1]), {})["depth" if match[2] == "exr" else match[2]] = part
     if not parts:
         raise FormatError(root, "frames", "none", "rgbd/<i>.jpg and .depth, or rgb/<i>.jpg and depth/<i>.exr")
@@ -270,19 +272,19 @@ def _shots(members: Mapping[str, Member], root: Path) -> tuple[list[_Shot], list
             shots.append(_Shot(number, found["jpg"], found["depth"], found.get("conf")))
     gap = sorted(set(range(min(parts), max(parts))) - set(parts)) if max(parts) - min(parts) < 10 * len(parts) else []
     missing |= {"no file": gap} if gap else {}
-    return shots, [line for why, numbers in missing.items() for line in files.left_out(numbers, why)]
+    return shots, [line for why, numbers in missing.items() for line in files.format_left_out(numbers, why)]
 
 
-def _covered(shots: list[_Shot], meta: _Metadata) -> tuple[list[_Shot], list[str]]:
+def _select_covered(shots: list[_Shot], meta: _Metadata) -> tuple[list[_Shot], list[str]]:
     """Frames that every list of the table reaches."""
     lengths = [len(rows) for rows in (meta.poses, meta.stamps) if rows is not None]
     lengths += [len(meta.K)] if len(meta.K) > 1 else []
     known = [shot for shot in shots if shot.number < min(lengths, default=shot.number + 1)]
     late = [shot.number for shot in shots if shot not in known] if len(known) < len(shots) else []
-    return known, files.left_out(late, f"beyond the metadata's {min(lengths, default=0)} rows")
+    return known, files.format_left_out(late, f"beyond the metadata's {min(lengths, default=0)} rows")
 
 
-def _poses(numbers: list[int], meta: _Metadata, wanted: bool) -> tuple[np.ndarray | None, set[int], list[str]]:
+def _select_posed(numbers: list[int], meta: _Metadata, wanted: bool) -> tuple[np.ndarray | None, set[int], list[str]]:
     """(camera-to-world of the usable frames, numbers of the others, what to report)."""
     if meta.poses is None or not wanted or not numbers:
         return None, set(), []
@@ -296,7 +298,7 @@ def _poses(numbers: list[int], meta: _Metadata, wanted: bool) -> tuple[np.ndarra
     return convert.cv_from_gl(c2w), lost, []
 
 
-def _times(number: torch.Tensor, meta: _Metadata) -> tuple[torch.Tensor | None, list[str]]:
+def _frame_times(number: torch.Tensor, meta: _Metadata) -> tuple[torch.Tensor | None, list[str]]:
     """Seconds since the first stamp of the capture; frame number over rate where the stamps are no clock."""
     counted = None if meta.fps is None else number.double() / meta.fps
     if meta.stamps is None:
@@ -308,25 +310,25 @@ def _times(number: torch.Tensor, meta: _Metadata) -> tuple[torch.Tensor | None, 
     return counted, [f"time stamps do not increase: {instead}"]
 
 
-def _sizes(shots: list[_Shot], meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
+def _find_sizes(shots: list[_Shot], meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
     """(height, width) of picture and depth map, from the first frame that is whole enough to say."""
     first: FormatError | None = None
     for shot in shots:
         try:
-            return _sizes_of(shot, meta)
+            return _read_sizes(shot, meta)
         except FormatError as error:
             first = first or error
     raise first or FormatError(meta.file, "frames", "none", "at least one")
 
 
-def _sizes_of(shot: _Shot, meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
+def _read_sizes(shot: _Shot, meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
     hw = files.decode_image_header(shot.image.read(), shot.image.path).hw
     if shot.depth.path.suffix == ".exr":
         return hw, codec_exr.decode_exr_header(shot.depth.read(), shot.depth.path).hw
     if meta.depth_hw is not None:
         return hw, meta.depth_hw
     data = shot.depth.read()
-    count = lzfse.unpacked_size(data, shot.depth.path, "depth") if data.startswith(b"bvx") else len(data)
+    count = lzfse.lzfse_unpacked_size(data, shot.depth.path, "depth") if data.startswith(b"bvx") else len(data)
     if count / 4 not in _DEPTH_SIZES:
         expected = "dw and dh in the metadata, or 4 for each of " + ", ".join(map(str, _DEPTH_SIZES))
         raise FormatError(shot.depth.path, "depth", f"{count} bytes", expected)
@@ -334,17 +336,17 @@ def _sizes_of(shot: _Shot, meta: _Metadata) -> tuple[tuple[int, int], tuple[int,
     return hw, ((h, w) if meta.hw[0] > meta.hw[1] else (w, h))
 
 
-def _suspect(shot: _Shot) -> bool:
+def _is_damaged(shot: _Shot) -> bool:
     """Whether a part begins or ends as no whole one does."""
     ends = shot.image.ends(2)
-    return (ends is not None and ends != _JPEG) or any(
+    return (ends is not None and ends != _JPEG_MARKERS) or any(
         part.path.suffix != ".exr" and (ends := part.ends(4)) is not None and ends[0][:3] + ends[1] != b"bvxbvx$"
         for part in (shot.depth, shot.conf)
         if part is not None
     )
 
 
-def _decodes(load: _Load, i: int) -> bool:
+def _can_decode(load: _Load, i: int) -> bool:
     try:
         load(i)
     except FormatError:

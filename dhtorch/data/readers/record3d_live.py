@@ -19,11 +19,11 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert
-from dhtorch.data.io.decode import FormatError, need
+from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.records import Frame, Pose
 
 _SOURCE = Path("record3d:usb")
-_LIDAR = 1  # device type; 0 is the front camera, which has neither confidence nor poses
+_LIDAR_DEVICE_TYPE = 1  # device type; 0 is the front camera, which has neither confidence nor poses
 
 
 class LiveFrames:
@@ -53,7 +53,7 @@ class LiveFrames:
         ahead: int = 2,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.stream = need("record3d", extra="live").Record3DStream() if stream is None else stream
+        self.stream = import_optional("record3d", extra="live").Record3DStream() if stream is None else stream
         self.device, self.timeout, self.clock = device, timeout, clock
         self.dropped = 0  # frames that came faster than they were read
         self.start: float | None = None
@@ -114,16 +114,16 @@ class LiveFrames:
     def _frame(self) -> Frame:
         now = self.clock()
         self.start = now if self.start is None else self.start
-        rgb = _copy(self.stream.get_rgb_frame(), "rgb", np.uint8, 3)
-        depth = _copy(self.stream.get_depth_frame(), "depth", np.float32, 2)
-        conf = _copy(self.stream.get_confidence_frame(), "confidence", np.uint8, 2)
+        rgb = _copy_buffer(self.stream.get_rgb_frame(), "rgb", np.uint8, 3)
+        depth = _copy_buffer(self.stream.get_depth_frame(), "depth", np.float32, 2)
+        conf = _copy_buffer(self.stream.get_confidence_frame(), "confidence", np.uint8, 2)
         if conf.size and (conf.shape != depth.shape or conf.max() > 2):
             raise FormatError(_SOURCE, "confidence", f"{conf.shape} up to {conf.max()}", f"{depth.shape}, 0, 1 or 2")
         k = self.stream.get_intrinsic_mat()
         hw = (rgb.shape[0], rgb.shape[1])
-        camera = convert.to_camera(convert.matrix_of(k.fx, k.fy, k.tx, k.ty), hw, _SOURCE, "intrinsics")
+        camera = convert.to_camera(convert.make_K(k.fx, k.fy, k.tx, k.ty), hw, _SOURCE, "intrinsics")
         usable = np.isfinite(depth) & (depth > 0)
-        lidar = self.stream.get_device_type() == _LIDAR
+        lidar = self.stream.get_device_type() == _LIDAR_DEVICE_TYPE
         return Frame(
             image=torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))[None],
             depth=torch.from_numpy(np.where(usable, depth, np.float32(0)))[None],
@@ -139,7 +139,7 @@ class LiveFrames:
         return convert.to_poses(convert.cv_from_gl(c2w), _SOURCE)
 
 
-def _copy(buffer: Any, field: str, dtype: type, ndim: int) -> np.ndarray:
+def _copy_buffer(buffer: Any, field: str, dtype: type, ndim: int) -> np.ndarray:
     """The library's buffer as an array of our own."""
     array = np.array(buffer, copy=True)
     shape_fits = array.ndim == ndim and (ndim == 2 or array.shape[2] == 3)

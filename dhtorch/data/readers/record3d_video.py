@@ -25,10 +25,10 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.records import Camera, Frame
 
-_MARK = b'{"intrinsicMatrix"'
-_TAIL = 1 << 20  # bytes at the end of the file in which the intrinsics are looked for
-_RANGE = (0.0, 3.0)  # m
-_SHARE = (0.1 / 3, 2.8 / 3)  # of the range: what the app's own viewer keeps
+_METADATA_START = b'{"intrinsicMatrix"'
+_TAIL_BYTES = 1 << 20  # bytes at the end of the file in which the intrinsics are looked for
+_DEFAULT_RANGE_M = (0.0, 3.0)  # m
+_KEPT_RANGE_RATIO = (0.1 / 3, 2.8 / 3)  # of the range: what the app's own viewer keeps
 _MIN_CHROMA = 0.25  # of full: every coded pixel has full colour, grey has no hue
 
 
@@ -36,21 +36,21 @@ def recognise(file: Path) -> str | None:
     """What makes ``file`` an RGBD mp4, in words; None if nothing does."""
     if file.suffix.lower() != ".mp4":
         return None
-    if _MARK in _tail(file):
+    if _METADATA_START in _read_tail(file):
         return "an mp4 with an intrinsicMatrix at its end"
     side = file.parent / "metadata.json"
-    if side.is_file() and _MARK.strip(b'{"') in files.read_bytes(side, files.MAX_TEXT_BYTES):
+    if side.is_file() and _METADATA_START.strip(b'{"') in files.read_bytes(side, files.MAX_TEXT_BYTES):
         return "an mp4 beside a metadata.json with an intrinsicMatrix"
     return None
 
 
 def read(file: Path, *, depth_range: Sequence[float] | None = None, max_step: float = 0.05) -> list[Recording]:
     """Open one video; see :func:`dhtorch.data.readers.record3d.read`."""
-    meta, source = _metadata(file)
-    header = video.video_header(file)
+    meta, source = _read_metadata(file)
+    header = video.read_video_header(file)
     hw = (header.hw[0], header.hw[1] // 2)
     K = files.to_array(meta.get("intrinsicMatrix", meta.get("K")), (9,), source, "intrinsicMatrix").reshape(3, 3).T
-    limits = depth_range if depth_range is not None else meta.get("rangeOfEncodedDepth", _RANGE)
+    limits = depth_range if depth_range is not None else meta.get("rangeOfEncodedDepth", _DEFAULT_RANGE_M)
     near, far = files.to_array(limits, (2,), source, "rangeOfEncodedDepth")
     if not 0 <= near < far <= 1e4 or header.hw[1] % 2:
         found = f"{near} to {far} m in a picture {header.hw[1]} wide"
@@ -88,11 +88,11 @@ class _Load:
         picture = video.read_video_frame(self.file, i, self.hw, nearest=True)
         half = self.hw[1] // 2
         image = np.ascontiguousarray(picture[:, half:].transpose(2, 0, 1))
-        depth = hue_depth(picture[:, :half], self.near, self.far, self.max_step)
+        depth = decode_hue_depth(picture[:, :half], self.near, self.far, self.max_step)
         return Frame(torch.from_numpy(image)[None], torch.from_numpy(depth)[None], self.camera)
 
 
-def hue_depth(
+def decode_hue_depth(
     rgb: np.ndarray,  # (h, w, 3) uint8
     near: float,  # m, of hue 0
     far: float,  # m, of a full turn
@@ -106,22 +106,22 @@ def hue_depth(
     sixth = np.where(top == r, (g - b) / c % 6, np.where(top == g, (b - r) / c + 2, (r - g) / c + 4))
     hue = sixth / 6
     depth = near + hue * (far - near)
-    usable = (hue >= _SHARE[0]) & (hue < _SHARE[1]) & (chroma >= 255 * _MIN_CHROMA)
-    jump = np.maximum(_around(depth, np.maximum) - depth, depth - _around(depth, np.minimum)) > max_step
+    usable = (hue >= _KEPT_RANGE_RATIO[0]) & (hue < _KEPT_RANGE_RATIO[1]) & (chroma >= 255 * _MIN_CHROMA)
+    jump = np.maximum(_window_extreme(depth, np.maximum) - depth, depth - _window_extreme(depth, np.minimum)) > max_step
     return np.where(usable & ~jump, depth, 0).astype(np.float32)
 
 
-def _around(x: np.ndarray, extreme: np.ufunc) -> np.ndarray:
+def _window_extreme(x: np.ndarray, extreme: np.ufunc) -> np.ndarray:
     """Largest or smallest value (``np.maximum``, ``np.minimum``) in the 3×3 window of every pixel."""
     x = np.pad(x, 1, mode="edge")
     x = extreme(extreme(x[:-2], x[1:-1]), x[2:])
     return np.asarray(extreme(extreme(x[:, :-2], x[:, 1:-1]), x[:, 2:]))
 
 
-def _metadata(file: Path) -> tuple[dict[str, Any], Path]:
+def _read_metadata(file: Path) -> tuple[dict[str, Any], Path]:
     """The JSON object with the intrinsics, and where it stood."""
-    tail = _tail(file)
-    at = tail.rfind(_MARK)
+    tail = _read_tail(file)
+    at = tail.rfind(_METADATA_START)
     if at < 0:
         side = file.parent / "metadata.json"
         if not side.is_file():
@@ -133,10 +133,10 @@ def _metadata(file: Path) -> tuple[dict[str, Any], Path]:
         raise FormatError(file, "intrinsicMatrix", error, "a JSON object") from None
 
 
-def _tail(file: Path) -> bytes:
+def _read_tail(file: Path) -> bytes:
     try:
-        with doors.opened(file) as stream:
-            stream.seek(-min(_TAIL, stream.seek(0, 2)), 2)
+        with doors.open_regular(file) as stream:
+            stream.seek(-min(_TAIL_BYTES, stream.seek(0, 2)), 2)
             return stream.read()
     except OSError as error:
         raise FormatError(file, "file", error, "a readable file") from None

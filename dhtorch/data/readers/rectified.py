@@ -22,11 +22,11 @@ from dhtorch.data import convert
 from dhtorch.data.codecs import npy, pfm
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.recording import Recording, numbers
+from dhtorch.data.recording import Recording, consecutive_frame_numbers
 from dhtorch.records import Camera, Frame, Pose
 
 #: px; a smaller difference of directions has never been measured, its depth would be any number.
-_MIN_DISPARITY = 1e-3
+_MIN_DISPARITY_PX = 1e-3
 
 
 def recognise(root: Path) -> str | None:
@@ -47,7 +47,7 @@ def read(root: str | Path) -> list[Recording]:
         FormatError: a missing or damaged file, or a calibration that cannot be one.
     """
     root = Path(root)
-    pair = _calib_pair(root) if (root / "calib.txt").is_file() else _npz_pair(root)
+    pair = _read_calib_pair(root) if (root / "calib.txt").is_file() else _read_npz_pair(root)
     eye = torch.eye(3, dtype=torch.float64).expand(2, 3, 3).clone()
     t = torch.tensor([[0.0, 0.0, 0.0], [pair.baseline, 0.0, 0.0]], dtype=torch.float64)
     return [
@@ -55,7 +55,7 @@ def read(root: str | Path) -> list[Recording]:
             name=root.resolve().name,
             format="rectified",
             load=pair,
-            number=numbers(2),
+            number=consecutive_frame_numbers(2),
             root=root,
             poses=Pose(eye, t),
         )
@@ -63,7 +63,7 @@ def read(root: str | Path) -> list[Recording]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pair:
+class _LoadPair:
     """0 → left frame, 1 → right frame."""
 
     images: tuple[Path, Path]
@@ -78,30 +78,30 @@ class _Pair:
         camera, file = self.cameras[i], self.disparities[i]
         depth = np.zeros(self.hw, np.float32)
         if file is not None:
-            disparity = _disparity(file, self.hw).astype(np.float64) + self.doffs
-            usable = np.isfinite(disparity) & (disparity > _MIN_DISPARITY)
+            disparity = _read_disparity(file, self.hw).astype(np.float64) + self.doffs
+            usable = np.isfinite(disparity) & (disparity > _MIN_DISPARITY_PX)
             f = camera.f[0, 0].double().item()
             depth = np.where(usable, f * self.baseline / np.where(usable, disparity, 1), 0).astype(np.float32)
         return Frame(image[None], torch.from_numpy(depth)[None], camera)
 
 
-def _calib_pair(root: Path) -> _Pair:
+def _read_calib_pair(root: Path) -> _LoadPair:
     file = root / "calib.txt"
     entries = dict(re.findall(r"^\s*(\w+)\s*=\s*(.*?)\s*$", files.read_text(file), re.MULTILINE))
     images = (root / "im0.png", root / "im1.png")
-    hw = files.image_header(images[0]).hw
-    size = (_number(entries, "height", file), _number(entries, "width", file))
+    hw = files.read_image_header(images[0]).hw
+    size = (_parse_number(entries, "height", file), _parse_number(entries, "width", file))
     if size != hw:
         raise FormatError(file, "width and height", f"{size[1]:g}x{size[0]:g}", f"{hw[1]}x{hw[0]}, as im0.png")
-    first, second = (_first(root, f"disp{i}.pfm", f"disp{i}GT.pfm") for i in (0, 1))
+    first, second = (_find_first(root, f"disp{i}.pfm", f"disp{i}GT.pfm") for i in (0, 1))
     if first is None:
         raise FormatError(root / "disp0.pfm", "file", "no such file", "a disparity map disp0.pfm or disp0GT.pfm")
-    cameras = [convert.to_camera(_matrix(entries, f"cam{i}", file), hw, file, f"cam{i}") for i in (0, 1)]
-    baseline, doffs = _number(entries, "baseline", file) / 1000, _number(entries, "doffs", file)
-    return _checked(_Pair(images, (first, second), (cameras[0], cameras[1]), hw, baseline, doffs), file)
+    cameras = [convert.to_camera(_parse_matrix(entries, f"cam{i}", file), hw, file, f"cam{i}") for i in (0, 1)]
+    baseline, doffs = _parse_number(entries, "baseline", file) / 1000, _parse_number(entries, "doffs", file)
+    return _check_pair(_LoadPair(images, (first, second), (cameras[0], cameras[1]), hw, baseline, doffs), file)
 
 
-def _npz_pair(root: Path) -> _Pair:
+def _read_npz_pair(root: Path) -> _LoadPair:
     names = {}
     for kind in ("left.png", "right.png", "disp.npz"):
         found = sorted(root.glob(f"*_{kind}")) if root.is_dir() else []
@@ -110,16 +110,18 @@ def _npz_pair(root: Path) -> _Pair:
         names[kind] = found[0]
     file = root / "meta.json"
     meta = files.read_json(file)
-    hw = files.image_header(names["left.png"]).hw
+    hw = files.read_image_header(names["left.png"]).hw
     cameras = [convert.to_camera(meta.get(key), hw, file, key) for key in ("K_left", "K_right")]
     baseline, doffs = (float(files.to_array(meta.get(key), (), file, key)) for key in ("baseline_m", "doffs"))
     images = (names["left.png"], names["right.png"])
-    return _checked(_Pair(images, (names["disp.npz"], None), (cameras[0], cameras[1]), hw, baseline, doffs), file)
+    return _check_pair(
+        _LoadPair(images, (names["disp.npz"], None), (cameras[0], cameras[1]), hw, baseline, doffs), file
+    )
 
 
-def _checked(pair: _Pair, file: Path) -> _Pair:
+def _check_pair(pair: _LoadPair, file: Path) -> _LoadPair:
     """The right view of a rectified pair keeps rows and scale, and ``doffs`` is no free number."""
-    if not 0 < pair.baseline <= convert.MAX_COORDINATE:
+    if not 0 < pair.baseline <= convert.MAX_COORDINATE_M:
         raise FormatError(file, "baseline", pair.baseline, "a positive length")
     left, right = pair.cameras
     if not torch.equal(left.f, right.f):
@@ -130,7 +132,7 @@ def _checked(pair: _Pair, file: Path) -> _Pair:
     return pair
 
 
-def _disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
+def _read_disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
     if file.suffix == ".pfm":
         return pfm.read_pfm(file, hw)
     disparity = npy.read_npz(file, "arr_0")
@@ -139,14 +141,14 @@ def _disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
     return disparity
 
 
-def _matrix(entries: dict[str, str], key: str, file: Path) -> list[list[str]]:
+def _parse_matrix(entries: dict[str, str], key: str, file: Path) -> list[list[str]]:
     """``[a b c; d e f; g h i]``, as Matlab writes it."""
     return [row.split() for row in entries.get(key, "").strip("[]").split(";")]
 
 
-def _number(entries: dict[str, str], key: str, file: Path) -> float:
+def _parse_number(entries: dict[str, str], key: str, file: Path) -> float:
     return float(files.to_array(entries.get(key), (), file, key))
 
 
-def _first(root: Path, *names: str) -> Path | None:
+def _find_first(root: Path, *names: str) -> Path | None:
     return next((root / name for name in names if (root / name).is_file()), None)

@@ -24,27 +24,27 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import convert
-from dhtorch.data.clocks import nearest
+from dhtorch.data.clocks import nearest_stamps
 from dhtorch.data.codecs.pickles import read_npy
-from dhtorch.data.codecs.video import read_video_frame, video_header
+from dhtorch.data.codecs.video import read_video_frame, read_video_header
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.rh20t_robot import (
-    ARMS,
-    Arm,
-    Stream,
-    calibration_tcp,
-    hand_poses,
-    seconds,
-    streams,
-    tcp_base,
+    ROBOT_ARMS,
+    RobotArm,
+    RobotStream,
+    hand_camera_poses,
+    ms_to_seconds,
+    read_calibration_tcp,
+    read_robot_streams,
+    read_tcp_in_base,
 )
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame, Pose
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
-__all__ = ["Stream", "read", "recognise", "streams"]
+__all__ = ["RobotStream", "read", "read_robot_streams", "recognise"]
 
 _RATE_HZ = 10.0
 
@@ -100,14 +100,14 @@ def read(
     beside = root.parent.parent if root.parent.name == "action" else root.parent
     folder = (Path(calibration) if calibration is not None else beside / "calib") / str(stamp)
     hw = files.to_array(calibrated_hw, (2,), root, "option calibrated_hw")
-    rig = _Rig(
+    rig = _SceneCameras(
         root=root,
         depth_root=Path(depth_root) if depth_root is not None else root,
         folder=folder,
-        K=_by_serial(folder / "intrinsics.npy"),
-        E=_by_serial(folder / "extrinsics.npy"),
+        K=_read_by_serial(folder / "intrinsics.npy"),
+        E=_read_by_serial(folder / "extrinsics.npy"),
         hw=(int(hw[0]), int(hw[1])),
-        arm=_arm(root, configuration, in_hand),
+        arm=_find_arm(root, configuration, in_hand),
         max_difference=max_difference,
         max_gap=max_gap,
         outlier=outlier,
@@ -148,11 +148,11 @@ class _Load:
             return torch.zeros(h, w)
         planes = read_video_frame(self.depth, j, (2 * h, w), pixels="gray")
         depth = torch.from_numpy(planes[:h].astype(np.float32) + planes[h:].astype(np.float32) * 256) / 1000
-        return _without_outliers(depth, self.outlier) if self.outlier > 0 else depth
+        return _remove_outliers(depth, self.outlier) if self.outlier > 0 else depth
 
 
 @dataclass(frozen=True, eq=False)
-class _Rig:
+class _SceneCameras:
     """All that the cameras of a scene share."""
 
     root: Path
@@ -161,7 +161,7 @@ class _Rig:
     K: dict[str, Any]
     E: dict[str, Any]
     hw: tuple[int, int]
-    arm: Arm | None
+    arm: RobotArm | None
     max_difference: float
     max_gap: float
     outlier: float
@@ -177,11 +177,11 @@ class _Rig:
         home = self.root / f"cam_{serial}"
         colour, depth = home / "color.mp4", self.depth_root / f"cam_{serial}" / "depth.mp4"
         notes = list(report) + ([f"camera {serial}: metadata doubts its calibration"] if doubted else [])
-        header = video_header(colour)
+        header = read_video_header(colour)
         size = header.hw
         depth_size = size
         if depth.is_file():
-            high, wide = video_header(depth).hw
+            high, wide = read_video_header(depth).hw
             depth_size = (high // 2, wide)
             if high % 2 or depth_size[0] * size[1] != depth_size[1] * size[0]:
                 raise FormatError(
@@ -240,15 +240,15 @@ class _Rig:
     ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
         """(colour frame, depth frame) and the time of every pair, in the order of time."""
         lists = read_npy(file)
-        colour = _stamps(lists, "color", n_colour, file, notes)
+        colour = _frame_stamps(lists, "color", n_colour, file, notes)
         if depth is None:
             return tuple((k, -1) for k, _ in colour), np.array([t for _, t in colour])
-        other = _stamps(lists, "depth", video_header(depth).n, file, notes)
-        at = nearest(np.array([t for _, t in colour]), np.array([t for _, t in other]), self.max_difference)
+        other = _frame_stamps(lists, "depth", read_video_header(depth).n, file, notes)
+        at = nearest_stamps(np.array([t for _, t in colour]), np.array([t for _, t in other]), self.max_difference)
         pairs = [(k, other[j][0], t) for (k, t), j in zip(colour, at, strict=True) if j >= 0]
         if len(pairs) < len(colour):
             notes.append(
-                f"{many(len(colour) - len(pairs), 'image')} without depth within {self.max_difference} s: left out"
+                f"{format_count(len(colour) - len(pairs), 'image')} without depth within {self.max_difference} s: left out"
             )
         if not pairs:
             raise FormatError(file, "time stamps", f"no depth within {self.max_difference} s of any image", "pairs")
@@ -268,7 +268,7 @@ class _Rig:
             what = lacking[0].name if lacking else f"extrinsics of {self.arm.in_hand[0]}"
             notes.append(f"camera {serial} is on the hand and there is no {what}: no poses")
             return None, every
-        stream = tcp_base(self.root)
+        stream = read_tcp_in_base(self.root)
         if not len(stream.times):
             raise FormatError(self.root / "transformed" / "tcp_base.npy", "entries", "none that is usable", "poses")
         tcp, covered = stream.at(times, self.max_gap)
@@ -278,32 +278,32 @@ class _Rig:
             )
         if not covered.all():
             notes.append(
-                f"camera {serial}: {many(int((~covered).sum()), 'frame')} in a gap of the tcp stream: left out"
+                f"camera {serial}: {format_count(int((~covered).sum()), 'frame')} in a gap of the tcp stream: left out"
             )
-        T = calibration_tcp(self.folder / "tcp.npy", self.arm)
+        T = read_calibration_tcp(self.folder / "tcp.npy", self.arm)
         hand = self._extrinsics(self.arm.in_hand[0])
-        c2w = hand_poses(self.arm, E, hand, T, tcp[covered], file)
+        c2w = hand_camera_poses(self.arm, E, hand, T, tcp[covered], file)
         return convert.to_poses(c2w, file, serial), covered
 
 
-def _arm(root: Path, configuration: int | None, in_hand: Sequence[str] | None) -> Arm | None:
-    if configuration is not None and configuration not in ARMS:
+def _find_arm(root: Path, configuration: int | None, in_hand: Sequence[str] | None) -> RobotArm | None:
+    if configuration is not None and configuration not in ROBOT_ARMS:
         raise FormatError(root, "option configuration", configuration, "1 to 7")
     named = re.search(r"cfg_0*([1-7])(?!\d)", root.resolve().name)
     number = configuration or (int(named[1]) if named else None)
     if number is None:
         return None
-    return ARMS[number]._replace(in_hand=tuple(in_hand)) if in_hand is not None else ARMS[number]
+    return ROBOT_ARMS[number]._replace(in_hand=tuple(in_hand)) if in_hand is not None else ROBOT_ARMS[number]
 
 
-def _by_serial(file: Path) -> dict[str, Any]:
+def _read_by_serial(file: Path) -> dict[str, Any]:
     value = read_npy(file)
     if not isinstance(value, dict):
         raise FormatError(file, "content", type(value).__name__, "a dict by camera serial")
     return {str(key): entry for key, entry in value.items()}
 
 
-def _stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -> list[tuple[int, float]]:
+def _frame_stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -> list[tuple[int, float]]:
     """(frame number, s) of the frames that are in the video, in increasing time."""
     stamps = lists.get(kind) if isinstance(lists, dict) else None
     if isinstance(stamps, np.ndarray):
@@ -312,19 +312,19 @@ def _stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -> list
         raise FormatError(file, kind, type(stamps).__name__, "a list of Unix milliseconds")
     if len(stamps) != n:
         notes.append(
-            f"{many(len(stamps), f'{kind} stamp')} for {many(n, 'frame')}: the first {min(n, len(stamps))} are used"
+            f"{format_count(len(stamps), f'{kind} stamp')} for {format_count(n, 'frame')}: the first {min(n, len(stamps))} are used"
         )
     kept: list[tuple[int, float]] = []
     for k, stamp in enumerate(stamps[:n]):
-        t = seconds(stamp, file, kind)
+        t = ms_to_seconds(stamp, file, kind)
         if not kept or t > kept[-1][1]:
             kept.append((k, t))
     if (lost := min(n, len(stamps)) - len(kept)) > 0:
-        notes.append(f"{many(lost, f'{kind} frame')} whose stamp is not later than the one before: left out")
+        notes.append(f"{format_count(lost, f'{kind} frame')} whose stamp is not later than the one before: left out")
     return kept
 
 
-def _without_outliers(depth: Tensor, limit: float) -> Tensor:
+def _remove_outliers(depth: Tensor, limit: float) -> Tensor:
     """Returns further than ``limit`` from the median of the returns in their 5×5 neighbourhood become no return."""
     empty = torch.where(depth > 0, depth, torch.full_like(depth, torch.nan))
     around = torch.nn.functional.pad(empty, (2, 2, 2, 2), value=torch.nan).unfold(0, 5, 1).unfold(1, 5, 1)

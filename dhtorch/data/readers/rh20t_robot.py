@@ -17,11 +17,11 @@ from dhtorch.data.codecs.pickles import read_npy
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 
-_LATEST_MS = 4_102_444_800_000  # the year 2100
-_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
+_MAX_STAMP_MS = 4_102_444_800_000  # the year 2100
+_HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-class Arm(NamedTuple):
+class RobotArm(NamedTuple):
     """One of the seven robot set-ups, from the configuration file of the data set's own tools."""
 
     robot: str
@@ -31,33 +31,33 @@ class Arm(NamedTuple):
     align_base: np.ndarray  # (4, 4) published base axes → the robot's own
 
 
-def _arm(robot: str, in_hand: str, X: str, tcp: float = 0, base: float = 0) -> Arm:
+def _make_arm(robot: str, in_hand: str, X: str, tcp: float = 0, base: float = 0) -> RobotArm:
     """``X``: quarter turns about z, then x y z; ``tcp``, ``base``: quarter turns about z."""
     turns, *t = map(float, X.split())
-    matrix = _quarter_turns(turns)
+    matrix = _rotate_quarter_turns(turns)
     matrix[:3, 3] = t
-    return Arm(robot, tuple(in_hand.split()), matrix, _quarter_turns(tcp), _quarter_turns(base))
+    return RobotArm(robot, tuple(in_hand.split()), matrix, _rotate_quarter_turns(tcp), _rotate_quarter_turns(base))
 
 
-def _quarter_turns(n: float) -> np.ndarray:
+def _rotate_quarter_turns(n: float) -> np.ndarray:
     matrix = np.eye(4)
     c, s = np.round([np.cos(n * np.pi / 2), np.sin(n * np.pi / 2)])
     matrix[:2, :2] = [[c, -s], [s, c]]
     return matrix
 
 
-ARMS = {
-    1: _arm("flexiv", "043322070878", "1 0 .077 .2665"),
-    2: _arm("flexiv", "104422070042", "1 0 .077 .2915"),
-    3: _arm("ur5", "045322071843", "0 .027 .0775 .240", tcp=1, base=2),
-    4: _arm("ur5", "045322071843", "0 .027 .0775 .210", tcp=1, base=2),
-    5: _arm("franka", "104422070042 135122079702", "3 .033 -.05 .09", tcp=2),
-    6: _arm("kuka", "135122075425 135122070361", "1 .035 .055 .20"),
-    7: _arm("kuka", "135122075425 135122070361", "1 .035 .055 .20"),
+ROBOT_ARMS = {
+    1: _make_arm("flexiv", "043322070878", "1 0 .077 .2665"),
+    2: _make_arm("flexiv", "104422070042", "1 0 .077 .2915"),
+    3: _make_arm("ur5", "045322071843", "0 .027 .0775 .240", tcp=1, base=2),
+    4: _make_arm("ur5", "045322071843", "0 .027 .0775 .210", tcp=1, base=2),
+    5: _make_arm("franka", "104422070042 135122079702", "3 .033 -.05 .09", tcp=2),
+    6: _make_arm("kuka", "135122075425 135122070361", "1 .035 .055 .20"),
+    7: _make_arm("kuka", "135122075425 135122070361", "1 .035 .055 .20"),
 }
 
 
-class Stream(NamedTuple):
+class RobotStream(NamedTuple):
     """One quantity at its own clock."""
 
     times: np.ndarray  # (m,) s, increasing
@@ -86,7 +86,7 @@ class Stream(NamedTuple):
 
 #: Lists of entries by camera: the fields of an entry that are streams, what these are called, and their length (None =
 #: as stored). The name of a list that holds for all cameras ends in ``_base``.
-_FIELDS: dict[str, dict[str, tuple[str, int | None]]] = {
+_STREAM_FIELDS: dict[str, dict[str, tuple[str, int | None]]] = {
     "tcp": {"tcp": ("tcp", 7)},
     "tcp_base": {"tcp": ("tcp_base", 7), "robot_ft": ("robot_ft", None)},
     "force_torque": {"zeroed": ("force_torque", 6), "raw": ("force_torque_raw", 6)},
@@ -94,11 +94,11 @@ _FIELDS: dict[str, dict[str, tuple[str, int | None]]] = {
 }
 
 
-def streams(root: str | Path) -> dict[str, Stream]:
+def read_robot_streams(root: str | Path) -> dict[str, RobotStream]:
     """What the robot recorded in one scene folder.
 
     Returns:
-        ``tcp_base`` (m, 7) in the robot's base frame and ``tcp/<serial>`` (m, 7) in that camera's frame;
+        ``read_tcp_in_base`` (m, 7) in the robot's base frame and ``tcp/<serial>`` (m, 7) in that camera's frame;
         ``force_torque_base`` and ``force_torque/<serial>`` (m, 6) of the sensor at the wrist, its zero taken off, and
         ``force_torque_base_raw``, ``force_torque_raw/<serial>`` without; ``robot_ft``, what the robot itself says;
         ``joint`` (m, d) rad, with velocities where the set-up has them; ``gripper_command`` and ``gripper_info``
@@ -110,29 +110,29 @@ def streams(root: str | Path) -> dict[str, Stream]:
         FormatError: a damaged file.
     """
     folder = Path(root) / "transformed"
-    found: dict[str, Stream] = {}
-    for kind, fields in _FIELDS.items():
+    found: dict[str, RobotStream] = {}
+    for kind, fields in _STREAM_FIELDS.items():
         if (file := folder / f"{kind}.npy").is_file():
             for field, (name, width) in fields.items():
-                found |= _by_field(file, field, name, width)
+                found |= _read_field_streams(file, field, name, width)
     if (file := folder / "joint.npy").is_file():
-        found["joint"] = _stream(file, _stamped(file, None))
+        found["joint"] = _make_stream(file, _iter_stamped(file, None))
     if (file := folder / "gripper.npy").is_file():
-        found |= {part: _stream(file, _stamped(file, part)) for part in ("gripper_command", "gripper_info")}
+        found |= {part: _make_stream(file, _iter_stamped(file, part)) for part in ("gripper_command", "gripper_info")}
     return {name: stream for name, stream in found.items() if len(stream.times)}
 
 
-def tcp_base(root: Path) -> Stream:
+def read_tcp_in_base(root: Path) -> RobotStream:
     """The tcp in the base frame, entries of all cameras' clocks merged; entries that are all zero or NaN left out.
 
     Raises:
         FormatError: missing or damaged file.
     """
-    return _by_field(root / "transformed" / "tcp_base.npy", "tcp", "tcp_base", 7)["tcp_base"]
+    return _read_field_streams(root / "transformed" / "tcp_base.npy", "tcp", "tcp_base", 7)["tcp_base"]
 
 
-def hand_poses(
-    arm: Arm,
+def hand_camera_poses(
+    arm: RobotArm,
     serial_E: np.ndarray,  # (4, 4) of the camera asked for, when calibrated
     hand_E: np.ndarray,  # (4, 4) of the first camera on the hand, when calibrated
     tcp_calibration: np.ndarray,  # (4, 4) T when calibrated
@@ -151,7 +151,7 @@ def hand_poses(
     return world_from_base @ T @ np.linalg.inv(cam_from_tcp)
 
 
-def calibration_tcp(file: Path, arm: Arm) -> np.ndarray:
+def read_calibration_tcp(file: Path, arm: RobotArm) -> np.ndarray:
     """T (4, 4) at calibration, from ``tcp.npy`` of the calibration folder in the robot's own notation.
 
     Flexiv and UR5 store a quaternion; KUKA mm and Euler angles (about x, y, z in this order, fixed axes); Franka a
@@ -172,16 +172,16 @@ def calibration_tcp(file: Path, arm: Arm) -> np.ndarray:
     for q in convert.to_quaternions(np.stack(turns)):
         T = convert.to_c2w(q[None], np.zeros((1, 3)), file, "tcp")[0] @ T
     T[:3, 3] = pose[:3] if arm.robot == "franka" else pose[:3] / 1000
-    return T @ _TURN if arm.robot == "franka" else T
+    return T @ _HALF_TURN_ABOUT_X if arm.robot == "franka" else T
 
 
-def seconds(value: Any, file: Path, field: str) -> float:
+def ms_to_seconds(value: Any, file: Path, field: str) -> float:
     """Unix milliseconds → s.
 
     Raises:
         FormatError: no number, or a time outside 1970 to 2100.
     """
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _LATEST_MS:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _MAX_STAMP_MS:
         raise FormatError(file, field, value if isinstance(value, float) else type(value).__name__, "Unix milliseconds")
     return value / 1000
 
@@ -189,25 +189,25 @@ def seconds(value: Any, file: Path, field: str) -> float:
 # ---------------------------------------------------------------------------------------------------------- entries
 
 
-def _stream(file: Path, entries: Iterator[tuple[float, np.ndarray]], pose: bool = False) -> Stream:
+def _make_stream(file: Path, entries: Iterator[tuple[float, np.ndarray]], pose: bool = False) -> RobotStream:
     """Entries in any order, those with one stamp once."""
     merged = dict(entries)
     if len({len(value) for value in merged.values()}) > 1:
         raise FormatError(file, "entries", "vectors of several lengths", "one length")
     times = np.array(sorted(merged), dtype=np.float64)
-    return Stream(times, np.stack([merged[t] for t in times.tolist()]) if merged else np.zeros((0, 0)), pose)
+    return RobotStream(times, np.stack([merged[t] for t in times.tolist()]) if merged else np.zeros((0, 0)), pose)
 
 
-def _by_field(file: Path, field: str, name: str, width: int | None) -> dict[str, Stream]:
+def _read_field_streams(file: Path, field: str, name: str, width: int | None) -> dict[str, RobotStream]:
     """One field of all entries as one stream, or as one for each camera."""
-    by_camera = _mapping(read_npy(file), file, "content")
+    by_camera = _check_mapping(read_npy(file), file, "content")
     every = {name: list(by_camera.values())}
     groups = every if file.stem.endswith("_base") else {f"{name}/{s}": [entries] for s, entries in by_camera.items()}
     pose = field == "tcp"
-    return {key: _stream(file, _entries(file, lists, field, width), pose) for key, lists in groups.items()}
+    return {key: _make_stream(file, _iter_entries(file, lists, field, width), pose) for key, lists in groups.items()}
 
 
-def _entries(file: Path, lists: list[Any], field: str, width: int | None) -> Iterator[tuple[float, np.ndarray]]:
+def _iter_entries(file: Path, lists: list[Any], field: str, width: int | None) -> Iterator[tuple[float, np.ndarray]]:
     """(s, values) of the entries that have the field; numbers that are not finite, and poses of zeros, are none."""
     for entries in lists:
         if not isinstance(entries, list):
@@ -215,35 +215,35 @@ def _entries(file: Path, lists: list[Any], field: str, width: int | None) -> Ite
         for entry in entries:
             if not isinstance(entry, dict) or "timestamp" not in entry:
                 raise FormatError(file, "entries", "something else", "objects with a timestamp")
-            time, value = seconds(entry["timestamp"], file, "timestamp"), entry.get(field)
+            time, value = ms_to_seconds(entry["timestamp"], file, "timestamp"), entry.get(field)
             if value is None:
                 continue
-            value = _vector(value, file, field)
+            value = _parse_vector(value, file, field)
             if width is not None and len(value) != width:
                 raise FormatError(file, field, f"{len(value)} numbers", width)
             if np.isfinite(value).all() and (field != "tcp" or np.linalg.norm(value[3:]) > 1e-6):
                 yield time, value
 
 
-def _stamped(file: Path, part: str | None) -> Iterator[tuple[float, np.ndarray]]:
-    for serial, entries in _mapping(read_npy(file), file, "content").items():
-        for stamp, entry in _mapping(entries, file, serial, texts=False).items():
+def _iter_stamped(file: Path, part: str | None) -> Iterator[tuple[float, np.ndarray]]:
+    for serial, entries in _check_mapping(read_npy(file), file, "content").items():
+        for stamp, entry in _check_mapping(entries, file, serial, texts=False).items():
             value = entry.get(part) if part and isinstance(entry, dict) else entry
-            yield seconds(stamp, file, "timestamp"), _vector(value, file, part or "entry")
+            yield ms_to_seconds(stamp, file, "timestamp"), _parse_vector(value, file, part or "entry")
 
 
-def _vector(value: Any, file: Path, field: str) -> np.ndarray:
-    flat = value if isinstance(value, np.ndarray) else np.array(value) if _numbers(value) else None
+def _parse_vector(value: Any, file: Path, field: str) -> np.ndarray:
+    flat = value if isinstance(value, np.ndarray) else np.array(value) if _parse_numbers(value) else None
     if flat is None or flat.dtype.kind not in "fiu" or flat.ndim != 1 or len(flat) > 64:
         raise FormatError(file, field, type(value).__name__, "a vector of numbers")
     return flat.astype(np.float64)
 
 
-def _numbers(value: Any) -> bool:
+def _parse_numbers(value: Any) -> bool:
     return isinstance(value, list | tuple) and all(isinstance(x, int | float) for x in value)
 
 
-def _mapping(value: Any, file: Path, field: str, texts: bool = True) -> dict[Any, Any]:
+def _check_mapping(value: Any, file: Path, field: str, texts: bool = True) -> dict[Any, Any]:
     """A dict; its keys as texts, since a serial may be stored as a number."""
     if not isinstance(value, dict):
         raise FormatError(file, field, type(value).__name__, "a dict")

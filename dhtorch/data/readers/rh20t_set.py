@@ -11,10 +11,10 @@ from typing import Any
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import rh20t
-from dhtorch.data.readers.rh20t_robot import ARMS
+from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS
 from dhtorch.data.recording import Recording, Recordings
 
-_SCENE = re.compile(r"task_\d+_user_\d+_scene_\d+_cfg_0*([1-7])")
+_SCENE_PATTERN = re.compile(r"task_\d+_user_\d+_scene_\d+_cfg_0*([1-7])")
 
 
 def open_set(
@@ -49,18 +49,18 @@ def open_set(
     base = Path(root)
     if not base.is_dir():
         raise FormatError(base, "path", "no such folder", "a folder of RH20T scenes")
-    found = list(_scenes(base, camera))[:limit]
+    found = list(_list_scenes(base, camera))[:limit]
     if not found:
         wanted = f"task_…_cfg_… folders with a calibration and the camera {camera!r}"
         raise FormatError(base, "scenes", "none", wanted)
     options = {"max_difference": max_difference, "max_gap": max_gap, "outlier": outlier}
     names = [f"{folder.name}/{serial}" for folder, serial in found]
     depth = None if depth_root is None else Path(depth_root)
-    return Recordings(names, _Open(base, tuple(found), depth, options))
+    return Recordings(names, _OpenScene(base, tuple(found), depth, options))
 
 
 @dataclass(frozen=True)
-class _Open:
+class _OpenScene:
     """Position → recording."""
 
     root: Path
@@ -74,13 +74,13 @@ class _Open:
         return rh20t.read(scene, serials=[serial], depth_root=depth, **self.options)[0]
 
 
-def _scenes(root: Path, camera: str) -> Iterator[tuple[Path, str]]:
+def _list_scenes(root: Path, camera: str) -> Iterator[tuple[Path, str]]:
     folders = sorted({f for pattern in ("task_*", "*/task_*") for f in root.glob(pattern)}, key=lambda f: f.name)
     for folder in folders:
-        named = _SCENE.fullmatch(folder.name)
+        named = _SCENE_PATTERN.fullmatch(folder.name)
         if named is None or not (folder / "metadata.json").is_file():
             continue
-        wanted = ARMS[int(named[1])].in_hand if camera == "hand" else (camera,)
+        wanted = ROBOT_ARMS[int(named[1])].in_hand if camera == "hand" else (camera,)
         serial = next((s for s in wanted if (folder / f"cam_{s}" / "color.mp4").is_file()), None)
         calibrated = files.read_json(folder / "metadata.json").get("calib", -1) not in (-1, "-1")
         if serial is not None and calibrated:

@@ -21,25 +21,25 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import convert
-from dhtorch.data import intrinsics as told
+from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.codecs import tfrecord
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.recording import Recording, Recordings, numbers
+from dhtorch.data.recording import Recording, Recordings, consecutive_frame_numbers
 from dhtorch.records import Camera, Frame, Pose
 
-MAX_STEPS = 100_000  # of an episode
+_MAX_EPISODE_STEPS = 100_000  # of an episode
 
-_SHARD = re.compile(r"^(?P<set>.+)-(?P<split>[^-]+)\.tfrecord-(?P<shard>\d{5})-of-(?P<of>\d{5})$")
-_UNITS = {"m": 1.0, "mm": 1000.0}
-_STEPS = "steps"
+_SHARD_PATTERN = re.compile(r"^(?P<set>.+)-(?P<split>[^-]+)\.tfrecord-(?P<shard>\d{5})-of-(?P<of>\d{5})$")
+_UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
+_STEPS_FEATURE = "steps"
 
 
 def recognise(root: Path) -> str | None:
     """What makes ``root`` a recording of this format, in words; None if nothing does."""
     if not root.is_dir() or not (root / "features.json").is_file():
         return None
-    shard = next((file for file in root.iterdir() if _SHARD.match(file.name)), None)
+    shard = next((file for file in root.iterdir() if _SHARD_PATTERN.match(file.name)), None)
     return None if shard is None else f"features.json and {shard.name}"
 
 
@@ -54,7 +54,7 @@ def read(
     fov: float | None = None,
     K_depth: Sequence[float] | None = None,
     distortion: Sequence[float] | None = None,
-    intrinsics: told.Intrinsics | None = None,
+    intrinsics: intrinsics_options.IntrinsicsOption | None = None,
     pose: str | None = None,
     depth_unit: str | None = None,
     rate_hz: float | None = None,
@@ -87,39 +87,41 @@ def read(
             damaged record, or values no camera or pose can have.
     """
     root = Path(root)
-    if depth_unit not in (None, *_UNITS):
+    if depth_unit not in (None, *_UNITS_PER_METRE):
         raise FormatError(root, "option depth_unit", depth_unit, "m or mm")
     rate = None if rate_hz is None else files.to_positive(rate_hz, root, "option rate_hz")
-    features = read_features(root)
-    keys = _colour(root, features, camera)
+    features = _read_step_features(root)
+    keys = _select_colour(root, features, camera)
     rigs = []
     for key in keys:
-        hw = _size(root, features, key)
-        said = told.stated(root, hw, intrinsics, K, fov)
-        rig = _Rig(
+        hw = _picture_size(root, features, key)
+        said = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
+        rig = _CameraSpec(
             root=root,
             features=features,
             image=key,
             hw=hw,
-            depth=_depth_of(root, features, key, depth),
+            depth=_find_depth_feature(root, features, key, depth),
             stated=said,
             K_depth=K_depth,
             distortion=distortion,
-            intrinsics=_beside(root, features, key, said.feature, "intrinsics"),
-            pose=_beside(root, features, key, pose, "pose", "T_world_from_cam"),
+            intrinsics=_find_companion(root, features, key, said.feature, "intrinsics"),
+            pose=_find_companion(root, features, key, pose, "pose", "T_world_from_cam"),
             unit=depth_unit,
             rate_hz=rate,
         )
         rigs.append(rig)
-    episodes = _episodes(root, split, episode)
+    episodes = _locate_episodes(root, split, episode)
     names = [
-        f"{_set_name(root)}/{e.split}_{e.number:06d}/{rig.image.rpartition('/')[2]}" for e in episodes for rig in rigs
+        f"{_read_set_name(root)}/{e.split}_{e.number:06d}/{rig.image.rpartition('/')[2]}"
+        for e in episodes
+        for rig in rigs
     ]
-    return Recordings(names, _Make(tuple(names), tuple(episodes), tuple(rigs)))
+    return Recordings(names, _MakeRecording(tuple(names), tuple(episodes), tuple(rigs)))
 
 
 @dataclass(frozen=True)
-class Described:
+class StepFeature:
     """What ``features.json`` says of one feature of a step."""
 
     kind: str  # "image", "text", or "tensor"
@@ -128,7 +130,7 @@ class Described:
     encoded: bool = False  # an array whose bytes are kept as one text
 
 
-def read_features(root: Path) -> dict[str, Described]:
+def _read_step_features(root: Path) -> dict[str, StepFeature]:
     """Name → feature of the steps, such as ``observation/image_0``.
 
     Raises:
@@ -136,29 +138,29 @@ def read_features(root: Path) -> dict[str, Described]:
     """
     file = root / "features.json"
     tree = files.read_json(file)
-    steps = files.get(tree, f"featuresDict.features.{_STEPS}.sequence.feature", dict, file)
-    found: dict[str, Described] = {}
+    steps = files.get_entry(tree, f"featuresDict.features.{_STEPS_FEATURE}.sequence.feature", dict, file)
+    found: dict[str, StepFeature] = {}
     _flatten(steps, "", found, file, 0)
     return found
 
 
-def _flatten(node: Any, name: str, found: dict[str, Described], file: Path, deep: int) -> None:
+def _flatten(node: Any, name: str, found: dict[str, StepFeature], file: Path, deep: int) -> None:
     if not isinstance(node, dict) or deep > 32:
-        raise FormatError(file, name or _STEPS, type(node).__name__, "a feature")
+        raise FormatError(file, name or _STEPS_FEATURE, type(node).__name__, "a feature")
     if isinstance(inner := node.get("featuresDict"), dict):
-        for key, value in files.get(inner, "features", dict, file).items():
+        for key, value in files.get_entry(inner, "features", dict, file).items():
             _flatten(value, f"{name}/{key}" if name else key, found, file, deep + 1)
         return
     if isinstance(image := node.get("image"), dict):
-        found[name] = Described("image", str(image.get("dtype", "uint8")), _shape(image, file, name))
+        found[name] = StepFeature("image", str(image.get("dtype", "uint8")), _parse_shape(image, file, name))
     elif isinstance(tensor := node.get("tensor"), dict):
         encoded = tensor.get("encoding", "none") not in ("none", "")
-        found[name] = Described("tensor", str(tensor.get("dtype", "")), _shape(tensor, file, name), encoded)
+        found[name] = StepFeature("tensor", str(tensor.get("dtype", "")), _parse_shape(tensor, file, name), encoded)
     elif "text" in node:
-        found[name] = Described("text", "string", ())
+        found[name] = StepFeature("text", "string", ())
 
 
-def _shape(node: dict[str, Any], file: Path, name: str) -> tuple[int, ...]:
+def _parse_shape(node: dict[str, Any], file: Path, name: str) -> tuple[int, ...]:
     shape = node.get("shape")
     sizes = shape.get("dimensions", []) if isinstance(shape, dict) else []
     try:
@@ -170,16 +172,16 @@ def _shape(node: dict[str, Any], file: Path, name: str) -> tuple[int, ...]:
     return found
 
 
-def _set_name(root: Path) -> str:
+def _read_set_name(root: Path) -> str:
     """As the set calls itself, else as its folders are called."""
     file = root / "dataset_info.json"
     name = files.read_json(file).get("name") if file.is_file() else None
     return name if isinstance(name, str) and name else root.resolve().parent.name
 
 
-def _colour(root: Path, features: dict[str, Described], camera: str | Sequence[str] | None) -> list[str]:
+def _select_colour(root: Path, features: dict[str, StepFeature], camera: str | Sequence[str] | None) -> list[str]:
     known = [name for name, f in features.items() if f.kind == "image" and f.dtype == "uint8" and f.shape[-1:] != (1,)]
-    known = sorted((name for name in known if "depth" not in name), key=lambda name: files.natural(Path(name)))
+    known = sorted((name for name in known if "depth" not in name), key=lambda name: files.natural_sort_key(Path(name)))
     wanted = known if camera is None else [camera] if isinstance(camera, str) else list(camera)
     unknown = [name for name in wanted if name not in known]
     if unknown or not wanted:
@@ -188,66 +190,68 @@ def _colour(root: Path, features: dict[str, Described], camera: str | Sequence[s
     return wanted
 
 
-def _size(root: Path, features: dict[str, Described], key: str) -> tuple[int, int]:
+def _picture_size(root: Path, features: dict[str, StepFeature], key: str) -> tuple[int, int]:
     """Height and width of a feature's pictures; of those that do not say, of the first one."""
     shape = features[key].shape
     if len(shape) >= 2 and min(shape[:2]) > 0:
         return shape[0], shape[1]
-    place = _episodes(root, None, None)[0]
+    place = _locate_episodes(root, None, None)[0]
     body = tfrecord.read_record(place.file, place.span)
-    pictures = tfrecord.example(body, place.file, place.span.offset).get(f"{_STEPS}/{key}")
+    pictures = tfrecord.parse_example(body, place.file, place.span.offset).get(f"{_STEPS_FEATURE}/{key}")
     if pictures is None or pictures.kind != "bytes" or not pictures.spans:
         raise FormatError(place.file, key, "no pictures", "encoded pictures")
     return files.decode_image_header(tfrecord.read_span(place.file, pictures.spans[0]), place.file).hw
 
 
-def _depth_of(root: Path, features: dict[str, Described], image: str, option: str | None) -> str | None:
+def _find_depth_feature(root: Path, features: dict[str, StepFeature], image: str, option: str | None) -> str | None:
     if option is not None:
-        return _known(root, features, option, "depth")
+        return _check_feature(root, features, option, "depth")
     names = (re.sub(word, "depth", image) for word in ("image", "rgb"))
     return next((name for name in names if name != image and name in features), None)
 
 
-def _beside(
-    root: Path, features: dict[str, Described], image: str, given: str | None, option: str, ending: str = ""
+def _find_companion(
+    root: Path, features: dict[str, StepFeature], image: str, given: str | None, option: str, ending: str = ""
 ) -> str | None:
     """The feature as given, else the one named after the camera."""
     name = f"{image}_{ending or option}"
-    return _known(root, features, given, option) if given is not None else name if name in features else None
+    return _check_feature(root, features, given, option) if given is not None else name if name in features else None
 
 
-def _known(root: Path, features: dict[str, Described], name: str | None, option: str) -> str | None:
+def _check_feature(root: Path, features: dict[str, StepFeature], name: str | None, option: str) -> str | None:
     if name is not None and name not in features:
         raise FormatError(root, f"option {option}", name, f"one of {', '.join(features)}")
     return name
 
 
 @dataclass(frozen=True)
-class Place:
+class RecordLocation:
     """Where an episode lies: one record of a file."""
 
     split: str
     number: int  # in its split
     place: int  # among all of the splits that are opened
     file: Path
-    span: tfrecord.Span
+    span: tfrecord.ByteSpan
 
 
-def _episodes(root: Path, split: str | None, wanted: int | Sequence[int] | None) -> list[Place]:
+def _locate_episodes(root: Path, split: str | None, wanted: int | Sequence[int] | None) -> list[RecordLocation]:
     shards: dict[str, list[Path]] = {}
-    for file in sorted(root.iterdir(), key=files.natural):
-        if match := _SHARD.match(file.name):
+    for file in sorted(root.iterdir(), key=files.natural_sort_key):
+        if match := _SHARD_PATTERN.match(file.name):
             shards.setdefault(match["split"], []).append(file)
     if split is not None and split not in shards:
         raise FormatError(root, "option split", split, f"one of {', '.join(sorted(shards))}")
     chosen = None if wanted is None else {wanted} if isinstance(wanted, int) else {int(each) for each in wanted}
-    found: list[Place] = []
+    found: list[RecordLocation] = []
     before = 0
     for name in sorted(shards) if split is None else [split]:
-        places = [(file, span) for file in shards[name] for span in tfrecord.record_spans(file)]
+        places = [(file, span) for file in shards[name] for span in tfrecord.index_records(file)]
         if chosen is not None and (missing := chosen - set(range(len(places)))):
             raise FormatError(root, "option episode", min(missing), f"0 to {len(places) - 1} in {name}")
-        found += [Place(name, i, before + i, *at) for i, at in enumerate(places) if chosen is None or i in chosen]
+        found += [
+            RecordLocation(name, i, before + i, *at) for i, at in enumerate(places) if chosen is None or i in chosen
+        ]
         before += len(places)
     if not found:
         raise FormatError(root, "records", "none", "TFRecord files named <set>-<split>.tfrecord-<shard>-of-<shards>")
@@ -255,34 +259,34 @@ def _episodes(root: Path, split: str | None, wanted: int | Sequence[int] | None)
 
 
 @dataclass(frozen=True, eq=False)
-class _Make:
+class _MakeRecording:
     """Position → recording: the cameras of the first episode, then those of the second, …"""
 
     names: tuple[str, ...]
-    episodes: tuple[Place, ...]
-    rigs: tuple[_Rig, ...]
+    episodes: tuple[RecordLocation, ...]
+    rigs: tuple[_CameraSpec, ...]
 
     def __call__(self, i: int) -> Recording:
         episode, rig = self.episodes[i // len(self.rigs)], self.rigs[i % len(self.rigs)]
         body = tfrecord.read_record(episode.file, episode.span)
-        found = tfrecord.example(body, episode.file, episode.span.offset)
+        found = tfrecord.parse_example(body, episode.file, episode.span.offset)
         return rig.recording(self.names[i], episode, found)
 
 
 @dataclass(frozen=True, eq=False)
-class Load:
+class LoadStep:
     """Position → frame."""
 
     file: Path
-    images: tuple[tfrecord.Span, ...]
+    images: tuple[tfrecord.ByteSpan, ...]
     hw: tuple[int, int]
-    depths: tuple[tfrecord.Span, ...]  # of pictures, or of arrays' numbers, one for each step
-    depth: Described | None
+    depths: tuple[tfrecord.ByteSpan, ...]  # of pictures, or of arrays' numbers, one for each step
+    depth: StepFeature | None
     cameras: Camera  # (n), or (1) for all
     depth_camera: Camera | None
     unit: str | None
-    place: Place
-    features: dict[str, Described]  # of a step
+    place: RecordLocation
+    features: dict[str, StepFeature]  # of a step
 
     def __call__(self, i: int) -> Frame:
         """Frame ``i``."""
@@ -291,27 +295,27 @@ class Load:
         depth = torch.zeros(self.hw) if self.depth is None else self._depth(i, self.depth)
         return Frame(torch.from_numpy(image)[None], depth[None], camera, self.depth_camera)
 
-    def _depth(self, i: int, feature: Described) -> Tensor:
+    def _depth(self, i: int, feature: StepFeature) -> Tensor:
         data = tfrecord.read_span(self.file, self.depths[i])
         if feature.kind == "image":
-            units = _UNITS[self.unit or "mm"]
+            units = _UNITS_PER_METRE[self.unit or "mm"]
             return torch.from_numpy(files.decode_depth_png(data, self.file, units))
         values = np.frombuffer(data, "<f4").astype(np.float64)
-        depth = values.reshape(feature.shape[:2]) / _UNITS[self.unit or "m"]
+        depth = values.reshape(feature.shape[:2]) / _UNITS_PER_METRE[self.unit or "m"]
         keep = np.isfinite(depth) & (depth > 0) & (depth < 1e6)
         return torch.from_numpy(np.where(keep, depth, 0).astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Rig:
+class _CameraSpec:
     """One camera of the set and the options."""
 
     root: Path
-    features: dict[str, Described]
+    features: dict[str, StepFeature]
     image: str
     hw: tuple[int, int]
     depth: str | None
-    stated: told.Stated
+    stated: intrinsics_options.ParsedIntrinsics
     K_depth: Sequence[float] | None
     distortion: Sequence[float] | None
     intrinsics: str | None
@@ -319,16 +323,16 @@ class _Rig:
     unit: str | None
     rate_hz: float | None
 
-    def recording(self, name: str, episode: Place, found: dict[str, tfrecord.Feature]) -> Recording:
+    def recording(self, name: str, episode: RecordLocation, found: dict[str, tfrecord.ExampleFeature]) -> Recording:
         """The recording of an episode whose features are known."""
         file = episode.file
         images = self._pictures(file, found, self.image)
         n = len(images)
-        if not 0 < n <= MAX_STEPS:
-            raise FormatError(file, self.image, f"{n} steps", f"1 to {MAX_STEPS}")
+        if not 0 < n <= _MAX_EPISODE_STEPS:
+            raise FormatError(file, self.image, f"{n} steps", f"1 to {_MAX_EPISODE_STEPS}")
         depths = () if self.depth is None else self._depths(file, found, self.depth, n)
         cameras, depth_camera = self._cameras(file, found, n)
-        load = Load(
+        load = LoadStep(
             file=file,
             images=images,
             hw=self.hw,
@@ -344,9 +348,9 @@ class _Rig:
             name=name,
             format="rlds",
             load=load,
-            number=numbers(n),
+            number=consecutive_frame_numbers(n),
             root=self.root,
-            times=None if self.rate_hz is None else numbers(n).double() / self.rate_hz,
+            times=None if self.rate_hz is None else consecutive_frame_numbers(n).double() / self.rate_hz,
             poses=None if self.pose is None else self._poses(file, found, self.pose, n),
             rate_hz=self.rate_hz,
             report=self.stated.report + (() if self.depth else (f"{self.image}: no depth feature: depth is empty",)),
@@ -354,13 +358,17 @@ class _Rig:
             camera_name=self.image,
         )
 
-    def _pictures(self, file: Path, found: dict[str, tfrecord.Feature], key: str) -> tuple[tfrecord.Span, ...]:
-        feature = found.get(f"{_STEPS}/{key}")
+    def _pictures(
+        self, file: Path, found: dict[str, tfrecord.ExampleFeature], key: str
+    ) -> tuple[tfrecord.ByteSpan, ...]:
+        feature = found.get(f"{_STEPS_FEATURE}/{key}")
         if feature is None or feature.kind != "bytes":
             raise FormatError(file, key, "nothing" if feature is None else "numbers", "encoded pictures")
         return feature.spans
 
-    def _depths(self, file: Path, found: dict[str, tfrecord.Feature], key: str, n: int) -> tuple[tfrecord.Span, ...]:
+    def _depths(
+        self, file: Path, found: dict[str, tfrecord.ExampleFeature], key: str, n: int
+    ) -> tuple[tfrecord.ByteSpan, ...]:
         """Where each step's depth lies."""
         described = self.features[key]
         if described.kind == "image":
@@ -368,7 +376,7 @@ class _Rig:
             if len(spans) != n:
                 raise FormatError(file, key, f"{len(spans)} pictures", f"{n}, as many as {self.image}")
             return spans
-        shape, feature = described.shape, found.get(f"{_STEPS}/{key}")
+        shape, feature = described.shape, found.get(f"{_STEPS_FEATURE}/{key}")
         h, w = (*shape, 0, 0)[:2]
         single = len(shape) == 2 or (len(shape) == 3 and shape[2] == 1)
         if described.dtype != "float32" or described.encoded or not single or min(h, w) < 1:
@@ -378,36 +386,38 @@ class _Rig:
         whole = feature is not None and feature.kind == "float" and len(feature.spans) == 1
         if feature is None or not whole or feature.spans[0].length != n * size:
             raise FormatError(file, key, "other numbers", f"{n} arrays of {h}x{w} floats")
-        return tuple(tfrecord.Span(feature.spans[0].offset + i * size, size) for i in range(n))
+        return tuple(tfrecord.ByteSpan(feature.spans[0].offset + i * size, size) for i in range(n))
 
-    def _numbers(self, file: Path, found: dict[str, tfrecord.Feature], key: str, sizes: tuple[int, ...], n: int):
+    def _numbers(self, file: Path, found: dict[str, tfrecord.ExampleFeature], key: str, sizes: tuple[int, ...], n: int):
         """(rows, size): one row a step, or one for all."""
         described = self.features[key]
         size = int(np.prod(described.shape)) if described.shape and min(described.shape) > 0 else 0
-        feature = found.get(f"{_STEPS}/{key}")
+        feature = found.get(f"{_STEPS_FEATURE}/{key}")
         if feature is None or size not in sizes:
             expected = " or ".join(map(str, sizes))
             raise FormatError(file, key, f"{size} numbers a step" if feature else "nothing", f"{expected} numbers")
-        values = tfrecord.numbers(file, key, feature, n * size)
+        values = tfrecord.read_feature_numbers(file, key, feature, n * size)
         if len(values) != n * size:
             raise FormatError(file, key, f"{len(values)} numbers", f"{size} for each of {n} steps")
         return values.reshape(n, size).astype(np.float64)
 
-    def _cameras(self, file: Path, found: dict[str, tfrecord.Feature], n: int) -> tuple[Camera, Camera | None]:
+    def _cameras(self, file: Path, found: dict[str, tfrecord.ExampleFeature], n: int) -> tuple[Camera, Camera | None]:
         of_depth = None
         if self.depth is not None and self.K_depth is not None:
             shape = self.features[self.depth].shape
             hw = (shape[0], shape[1]) if len(shape) >= 2 and min(shape[:2]) > 0 else self.hw
             of_depth = convert.to_camera(
-                convert.K_of(self.K_depth, self.root, "option K_depth"), hw, self.root, "K_depth"
+                convert.parse_K_option(self.K_depth, self.root, "option K_depth"), hw, self.root, "K_depth"
             )
         if self.stated.K is not None:
-            K = convert.matrix_of(*self.stated.K)
+            K = convert.make_K(*self.stated.K)
             return convert.to_camera(K, self.hw, self.root, "option K", self.distortion), of_depth
         if self.intrinsics is None:
-            raise told.missing(self.root, self.image, "data.intrinsics=FEATURE", depth=self.depth is not None)
+            raise intrinsics_options.missing_intrinsics_error(
+                self.root, self.image, "data.intrinsics=FEATURE", depth=self.depth is not None
+            )
         values = self._numbers(file, found, self.intrinsics, (4, 9), n)
         return convert.to_cameras(values, self.hw, file, self.intrinsics, self.distortion), of_depth
 
-    def _poses(self, file: Path, found: dict[str, tfrecord.Feature], key: str, n: int) -> Pose:
-        return convert.to_poses_of(self._numbers(file, found, key, (7, 16), n), file, key)
+    def _poses(self, file: Path, found: dict[str, tfrecord.ExampleFeature], key: str, n: int) -> Pose:
+        return convert.parse_poses(self._numbers(file, found, key, (7, 16), n), file, key)

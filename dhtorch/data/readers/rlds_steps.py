@@ -20,21 +20,21 @@ from dhtorch.data.recording import Recording
 _STEPS, _EPISODE = "steps/", "episode_metadata/"
 
 #: Texts that say what is to be done, the likeliest first.
-INSTRUCTIONS = ("language_instruction", "natural_language_instruction", "instruction", "task")
+_INSTRUCTION_FEATURES = ("language_instruction", "natural_language_instruction", "instruction", "task")
 
 
 @dataclass(frozen=True)
-class Steps:
+class EpisodeSteps:
     """The steps of one episode."""
 
-    place: rlds.Place
+    place: rlds.RecordLocation
     n: int
-    features: Mapping[str, rlds.Described]  # those that can be read
-    found: Mapping[str, tfrecord.Feature]  # of the record
+    features: Mapping[str, rlds.StepFeature]  # those that can be read
+    found: Mapping[str, tfrecord.ExampleFeature]  # of the record
     numbers: dict[str, np.ndarray] = field(default_factory=dict)  # that can only be read all at once
 
     @classmethod
-    def of(cls, recording: Recording) -> Steps:
+    def of(cls, recording: Recording) -> EpisodeSteps:
         """Those of the episode that a recording belongs to.
 
         Raises:
@@ -42,12 +42,12 @@ class Steps:
             ValueError: a recording of another format.
         """
         load = recording.load
-        if not isinstance(load, rlds.Load):
+        if not isinstance(load, rlds.LoadStep):
             raise ValueError(f"{recording.name}: found {recording.format}, expected rlds")
         body = tfrecord.read_record(load.place.file, load.place.span)
-        found = tfrecord.example(body, load.place.file, load.place.span.offset)
+        found = tfrecord.parse_example(body, load.place.file, load.place.span.offset)
         n = len(load.images)
-        there = {name: f for name, f in load.features.items() if _readable(f) and f"{_STEPS}{name}" in found}
+        there = {name: f for name, f in load.features.items() if _is_readable(f) and f"{_STEPS}{name}" in found}
         for name, feature in there.items():
             spans = found[f"{_STEPS}{name}"].spans
             if feature.kind != "tensor" and len(spans) != n:
@@ -58,7 +58,7 @@ class Steps:
     def instruction(self) -> str | None:
         """The text that says what is to be done."""
         texts = [name for name, f in self.features.items() if f.kind == "text"]
-        known = [name for end in INSTRUCTIONS for name in texts if name.rpartition("/")[2] == end]
+        known = [name for end in _INSTRUCTION_FEATURES for name in texts if name.rpartition("/")[2] == end]
         return known[0] if known else None
 
     def values(self, name: str, steps: range) -> list[Any] | np.ndarray:
@@ -79,16 +79,16 @@ class Steps:
         packed = feature.kind == "float" and len(feature.spans) == 1
         if packed and feature.spans[0].length == 4 * size * self.n:
             at = feature.spans[0].offset + 4 * size * steps.start
-            data = tfrecord.read_span(self.place.file, tfrecord.Span(at, 4 * size * len(steps)))
+            data = tfrecord.read_span(self.place.file, tfrecord.ByteSpan(at, 4 * size * len(steps)))
             read = np.frombuffer(data, "<f4")
         else:
             read = self._whole(name, feature, size)[size * steps.start : size * steps.stop]
         return read.astype(described.dtype).reshape(len(steps), size)
 
-    def _whole(self, name: str, feature: tfrecord.Feature, size: int) -> np.ndarray:
+    def _whole(self, name: str, feature: tfrecord.ExampleFeature, size: int) -> np.ndarray:
         """The numbers of all steps, decoded once."""
         if name not in self.numbers:
-            whole = tfrecord.numbers(self.place.file, name, feature, size * self.n)
+            whole = tfrecord.read_feature_numbers(self.place.file, name, feature, size * self.n)
             if len(whole) != size * self.n:
                 raise FormatError(self.place.file, name, f"{len(whole)} numbers", f"{size} for each of {self.n} steps")
             self.numbers[name] = whole.astype(self.features[name].dtype)
@@ -107,12 +107,12 @@ class Steps:
                 ]
                 values = [v.decode("utf-8", "replace") for v in values]
             else:
-                values = tfrecord.numbers(self.place.file, name, feature, 1 << 16).tolist()
+                values = tfrecord.read_feature_numbers(self.place.file, name, feature, 1 << 16).tolist()
             said[name.removeprefix(_EPISODE)] = values[0] if len(values) == 1 else values
         return said
 
 
-def _readable(feature: rlds.Described) -> bool:
+def _is_readable(feature: rlds.StepFeature) -> bool:
     if feature.kind != "tensor":
         return True
     known = feature.dtype in (

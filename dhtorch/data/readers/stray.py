@@ -23,19 +23,19 @@ import torch
 
 from dhtorch.data import convert
 from dhtorch.data.codecs import pickles
-from dhtorch.data.codecs.video import read_video_frame, video_header
+from dhtorch.data.codecs.video import read_video_frame, read_video_header
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Frame
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
-_COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
-_OWN_K = ("fx", "fy", "cx", "cy")
-_HW = (1440, 1920)  # of the pictures, where there is no video to ask
+_ODOMETRY_COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
+_INTRINSICS_COLUMNS = ("fx", "fy", "cx", "cy")
+_DEFAULT_HW = (1440, 1920)  # of the pictures, where there is no video to ask
 _UNITS_PER_METRE = 1000.0
-_TRIALS = 6  # frames that are decoded to find out which picture was lost
+_N_TRIAL_FRAMES = 6  # frames that are decoded to find out which picture was lost
 
 
 def recognise(root: Path) -> str | None:
@@ -75,22 +75,22 @@ def read(
         ImportError: no decoder of videos is installed.
     """
     root = Path(root)
-    rows, report = _odometry(root / "odometry.csv")
+    rows, report = _read_odometry(root / "odometry.csv")
     video = root / "rgb.mp4" if images else None
     if video is not None and not video.is_file():
         raise FormatError(
             video, "file", "no such file", "the pictures (images=False reads depth alone, for what needs none)"
         )
-    hw = video_header(video, all_frames=True).hw if video is not None else _size(K_hw, root) or _HW
-    shots, missing = _shots(root, rows, poses)
+    hw = read_video_header(video, all_frames=True).hw if video is not None else _parse_size(K_hw, root) or _DEFAULT_HW
+    shots, missing = _list_shots(root, rows, poses)
     report += missing
     if (root / "distortion").is_dir():
         report.append("distortion/ holds lens tables of each frame: they are not applied")
     if not shots:
         raise FormatError(root, "frames", "; ".join(report) or "none", "rows with depth and pose")
-    load = _Load(root, tuple(shots), video, hw, _intrinsics(root, hw, K_hw, per_frame), _depth_hw(shots))
+    load = _Load(root, tuple(shots), video, hw, _read_intrinsics(root, hw, K_hw, per_frame), _depth_hw(shots))
     if video is not None:
-        load, said = _with_pictures(load, len(rows), lost_first)
+        load, said = _match_pictures(load, len(rows), lost_first)
         report += said
     kept = load.shots
     times = torch.tensor([shot.row.time for shot in kept], dtype=torch.float64)
@@ -142,8 +142,8 @@ class _Intrinsics:
     per_frame: bool
 
     def of(self, row: _Row, hw: tuple[int, int]) -> np.ndarray:
-        K = convert.matrix_of(*row.K) if self.per_frame and row.K is not None else self.K
-        return convert.resize_matrix(K, self.hw, hw)
+        K = convert.make_K(*row.K) if self.per_frame and row.K is not None else self.K
+        return convert.resize_K(K, self.hw, hw)
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ class _Load:
 # ------------------------------------------------------------------------------------------------------------- tables
 
 
-def _odometry(file: Path) -> tuple[list[_Row], list[str]]:
+def _read_odometry(file: Path) -> tuple[list[_Row], list[str]]:
     """The rows, by the names in the header: other columns may come and cells may be empty."""
     try:
         lines = [[cell.strip() for cell in line] for line in csv.reader(files.read_lines(file))]
@@ -203,8 +203,8 @@ def _odometry(file: Path) -> tuple[list[_Row], list[str]]:
         raise FormatError(file, "table", error, "comma-separated columns") from None
     lines = [line for line in lines if any(line)]
     head = lines[0] if lines else []
-    if not set(_COLUMNS) <= set(head):
-        raise FormatError(file, "header", ", ".join(head) or "nothing", ", ".join(_COLUMNS))
+    if not set(_ODOMETRY_COLUMNS) <= set(head):
+        raise FormatError(file, "header", ", ".join(head) or "nothing", ", ".join(_ODOMETRY_COLUMNS))
     body, report = lines[1:], list[str]()
     if body and len(body[-1]) < len(head):
         body, report = body[:-1], ["the last row of odometry.csv is cut off: left out"]
@@ -212,42 +212,45 @@ def _odometry(file: Path) -> tuple[list[_Row], list[str]]:
     for place, line in enumerate(body):
         if len(line) != len(head):
             raise FormatError(file, f"row {place}", f"{len(line)} columns", f"{len(head)}, as the header")
-        row = _row(place, dict(zip(head, line, strict=True)), file)
+        row = _parse_row(place, dict(zip(head, line, strict=True)), file)
         if rows and row.number <= rows[-1].number:
             raise FormatError(file, f"row {place} frame", row.number, f"a number beyond {rows[-1].number}")
         rows.append(row)
     return rows, report
 
 
-def _row(place: int, cells: dict[str, str], file: Path) -> _Row:
+def _parse_row(place: int, cells: dict[str, str], file: Path) -> _Row:
     number = cells["frame"]
     if not (number.isascii() and number.isdigit() and len(number) <= 9):
         raise FormatError(file, f"row {place} frame", number, "a frame number")
-    value = {name: _number(cells[name], file, f"row {place} {name}") for name in _COLUMNS[:1] + _COLUMNS[2:]}
+    value = {
+        name: _parse_number(cells[name], file, f"row {place} {name}")
+        for name in _ODOMETRY_COLUMNS[:1] + _ODOMETRY_COLUMNS[2:]
+    }
     if not np.isfinite(value["timestamp"]):
         raise FormatError(file, f"row {place} timestamp", cells["timestamp"], "a time in s")
-    t, q = (np.array([[value[name] for name in names]]) for names in (_COLUMNS[2:5], _COLUMNS[5:9]))
+    t, q = (np.array([[value[name] for name in names]]) for names in (_ODOMETRY_COLUMNS[2:5], _ODOMETRY_COLUMNS[5:9]))
     with np.errstate(over="ignore"):
         usable = np.isfinite(t).all() and 1e-6 < np.linalg.norm(q) < np.inf
     c2w = convert.to_c2w(q, t, file)[0] if usable else np.full((4, 4), np.nan)
-    own = [_number(cells.get(name, ""), file, f"row {place} {name}") for name in _OWN_K]
+    own = [_parse_number(cells.get(name, ""), file, f"row {place} {name}") for name in _INTRINSICS_COLUMNS]
     return _Row(place, int(number), value["timestamp"], c2w, np.array(own) if np.isfinite(own).all() else None)
 
 
-def _number(cell: str, file: Path, field: str) -> float:
+def _parse_number(cell: str, file: Path, field: str) -> float:
     try:
         return float(cell) if cell else float("nan")
     except ValueError:
         raise FormatError(file, field, cell, "a number") from None
 
 
-def _intrinsics(root: Path, hw: tuple[int, int], K_hw: Sequence[int] | None, per_frame: bool) -> _Intrinsics:
+def _read_intrinsics(root: Path, hw: tuple[int, int], K_hw: Sequence[int] | None, per_frame: bool) -> _Intrinsics:
     file = root / "camera_matrix.csv"
     lines = [line.replace(",", " ").split() for line in files.read_lines(file) if line.strip()]
-    return _Intrinsics(file, files.to_array(lines, (3, 3), file, "K"), _size(K_hw, root) or hw, per_frame)
+    return _Intrinsics(file, files.to_array(lines, (3, 3), file, "K"), _parse_size(K_hw, root) or hw, per_frame)
 
 
-def _size(value: Sequence[int] | None, root: Path) -> tuple[int, int] | None:
+def _parse_size(value: Sequence[int] | None, root: Path) -> tuple[int, int] | None:
     if value is None:
         return None
     h, w = files.to_array(value, (2,), root, "option K_hw")
@@ -257,7 +260,7 @@ def _size(value: Sequence[int] | None, root: Path) -> tuple[int, int] | None:
 # ------------------------------------------------------------------------------------------------------------- frames
 
 
-def _shots(root: Path, rows: list[_Row], poses: bool) -> tuple[list[_Shot], list[str]]:
+def _list_shots(root: Path, rows: list[_Row], poses: bool) -> tuple[list[_Shot], list[str]]:
     """Rows whose files are there, and a line for each reason why others are not."""
     depth = {file.stem: file for kind in ("npy", "png") for file in sorted((root / "depth").glob(f"*.{kind}"))}
     conf = {file.stem: file for file in sorted((root / "confidence").glob("*.png"))}
@@ -273,8 +276,8 @@ def _shots(root: Path, rows: list[_Row], poses: bool) -> tuple[list[_Shot], list
         else:
             shots.append(_Shot(row, depth[name], conf.get(name)))
     extra = sorted(depth.keys() - {f"{row.number:06d}" for row in rows})
-    report = [line for why, numbers in missing.items() for line in files.left_out(numbers, why)]
-    return shots, report + files.left_out(extra, "no row in odometry.csv")
+    report = [line for why, numbers in missing.items() for line in files.format_left_out(numbers, why)]
+    return shots, report + files.format_left_out(extra, "no row in odometry.csv")
 
 
 def _depth_hw(shots: list[_Shot]) -> tuple[int, int]:
@@ -283,7 +286,7 @@ def _depth_hw(shots: list[_Shot]) -> tuple[int, int]:
     for shot in shots:
         try:
             if shot.depth.suffix == ".png":
-                return files.image_header(shot.depth).hw
+                return files.read_image_header(shot.depth).hw
             h, w = np.shape(pickles.read_npy(shot.depth))
             return int(h), int(w)
         except ValueError as found:
@@ -294,44 +297,44 @@ def _depth_hw(shots: list[_Shot]) -> tuple[int, int]:
 # ---------------------------------------------------------------------------------------------- rows and the pictures
 
 
-def _with_pictures(load: _Load, n_rows: int, lost_first: bool | None) -> tuple[_Load, list[str]]:
+def _match_pictures(load: _Load, n_rows: int, lost_first: bool | None) -> tuple[_Load, list[str]]:
     """The shots that have a picture, with its number."""
     assert load.video is not None
-    n = video_header(load.video, all_frames=True).n
+    n = read_video_header(load.video, all_frames=True).n
     report, shift = [], 0
     if n == n_rows - 1:
-        first = _first_is_lost(load, n) if lost_first is None else lost_first
+        first = _is_first_picture_lost(load, n) if lost_first is None else lost_first
         shift = 1 if first else 0
         why = "the edges of depth and picture say so" if lost_first is None else "option lost_first"
         report.append(f"rgb.mp4 lacks its {'first' if first else 'last'} picture ({why})")
     elif n != n_rows:
-        report.append(f"rgb.mp4 has {many(n, 'picture')} for {many(n_rows, 'row')}: the shorter counts")
+        report.append(f"rgb.mp4 has {format_count(n, 'picture')} for {format_count(n_rows, 'row')}: the shorter counts")
     shots = [_Shot(s.row, s.depth, s.conf, s.row.place - shift) for s in load.shots if 0 <= s.row.place - shift < n]
     if not shots:
         raise FormatError(load.video, "frames", f"{n} pictures", "at least one with depth and pose")
     lost = sorted({s.row.number for s in load.shots} - {s.row.number for s in shots})
     return _Load(load.root, tuple(shots), load.video, load.hw, load.intrinsics, load.depth_hw), [
         *report,
-        *files.left_out(lost, "no picture"),
+        *files.format_left_out(lost, "no picture"),
     ]
 
 
-def _first_is_lost(load: _Load, n: int) -> bool:
+def _is_first_picture_lost(load: _Load, n: int) -> bool:
     """Whether row i fits picture i − 1 better than picture i, by where depth and brightness have their edges."""
     inner = [shot for shot in load.shots if 1 <= shot.row.place < n]
     score = np.zeros(2)
-    for shot in inner[:: max(1, len(inner) // _TRIALS)]:
+    for shot in inner[:: max(1, len(inner) // _N_TRIAL_FRAMES)]:
         try:
             depth = load.depth(shot)
-            edges = _edges(np.log(np.where(depth > 0, depth, np.inf)))
+            edges = _edge_strength(np.log(np.where(depth > 0, depth, np.inf)))
             pictures = [load.picture(shot.row.place - shift) for shift in (0, 1)]
         except FormatError:
             continue
-        score += [_likeness(edges, _edges(_shrink(picture, load.depth_hw))) for picture in pictures]
+        score += [_edge_correlation(edges, _edge_strength(_block_mean(picture, load.depth_hw))) for picture in pictures]
     return bool(score[1] >= score[0])
 
 
-def _edges(x: np.ndarray) -> np.ndarray:
+def _edge_strength(x: np.ndarray) -> np.ndarray:
     """(h, w) size of the gradient, limited so that one silhouette does not outweigh all the rest."""
     with np.errstate(invalid="ignore"):
         size = np.hypot(*np.gradient(x))
@@ -339,13 +342,13 @@ def _edges(x: np.ndarray) -> np.ndarray:
     return np.minimum(size, 4 * size.mean() + 1e-12)
 
 
-def _likeness(a: np.ndarray, b: np.ndarray) -> float:
+def _edge_correlation(a: np.ndarray, b: np.ndarray) -> float:
     """Correlation of two edge maps."""
     a, b = a - a.mean(), b - b.mean()
     return float((a * b).sum() / max(float(np.sqrt((a * a).sum() * (b * b).sum())), 1e-12))
 
 
-def _shrink(picture: np.ndarray, hw: tuple[int, int]) -> np.ndarray:
+def _block_mean(picture: np.ndarray, hw: tuple[int, int]) -> np.ndarray:
     """(h, w) mean brightness of the blocks of a picture that fit ``hw``."""
     step = [max(1, big // small) for big, small in zip(picture.shape, hw, strict=False)]
     grey = picture.mean(-1, dtype=np.float32)[: step[0] * hw[0], : step[1] * hw[1]]

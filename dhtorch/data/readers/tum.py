@@ -16,24 +16,24 @@ import numpy as np
 import torch
 
 from dhtorch.data import convert
-from dhtorch.data import intrinsics as told
+from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.records import Camera, Frame
 
 #: Published calibration of the three colour cameras at 640×480: fx fy cx cy, then k1 k2 p1 p2 k3.
-_CALIBRATION = {
+_CAMERA_CALIBRATIONS = {
     1: ((517.306408, 516.469215, 318.643040, 255.313989), (0.262383, -0.953104, -0.005358, 0.002628, 1.163314)),
     2: ((520.908620, 521.007327, 325.141442, 249.701764), (0.231222, -0.784899, -0.003257, -0.000105, 0.917205)),
     3: ((535.4, 539.2, 320.1, 247.6), (0.0, 0.0, 0.0, 0.0, 0.0)),
 }
-_ROS = (525.0, 525.0, 319.5, 239.5)
-_HW = (480, 640)
+_ROS_INTRINSICS = (525.0, 525.0, 319.5, 239.5)
+_IMAGE_HW = (480, 640)
 _RATE_HZ = 30.0
 
 #: Two poses further apart than this are not interpolated: the capture system had lost the camera in between.
-_MAX_POSE_GAP = 0.05  # s
+_MAX_POSE_GAP_S = 0.05  # s
 
 
 def recognise(root: Path) -> str | None:
@@ -49,7 +49,7 @@ def recognise(root: Path) -> str | None:
 def read(
     root: str | Path,
     *,
-    intrinsics: told.Intrinsics = "camera",
+    intrinsics: intrinsics_options.IntrinsicsOption = "camera",
     K: Sequence[float] | None = None,
     fov: float | None = None,
     camera: int | None = None,
@@ -82,25 +82,25 @@ def read(
         FormatError: no image, nothing associates, an unknown camera, or a damaged file.
     """
     root = Path(root)
-    colour, depth = _listing(root, "rgb"), _listing(root, "depth")
+    colour, depth = _read_listing(root, "rgb"), _read_listing(root, "depth")
     pairs = associate([t for t, _ in colour], [t for t, _ in depth], max_difference)
     if not pairs:
         found = f"{len(colour)} images and {len(depth)} depth maps, none within {max_difference} s of one another"
         raise FormatError(root, "time stamps", found, "pairs")
-    report = _left_out(len(colour) - len(pairs), "images", "depth map", max_difference)
+    report = _format_unmatched(len(colour) - len(pairs), "images", "depth map", max_difference)
     trajectory = root / "groundtruth.txt"
     c2w = None
     if poses and trajectory.is_file():
-        c2w, covered = _poses_at(trajectory, np.array([colour[i][0] for i, _ in pairs]), max_difference)
-        report += _left_out(int((~covered).sum()), "RGB-D frames", "pose", max_difference)
+        c2w, covered = _interpolate_trajectory(trajectory, np.array([colour[i][0] for i, _ in pairs]), max_difference)
+        report += _format_unmatched(int((~covered).sum()), "RGB-D frames", "pose", max_difference)
         pairs = [pair for pair, keep in zip(pairs, covered, strict=True) if keep]
-    hw = files.image_header(colour[pairs[0][0]][1]).hw
-    said = told.stated(root, hw, None if isinstance(intrinsics, str) else intrinsics, K, fov)
+    hw = files.read_image_header(colour[pairs[0][0]][1]).hw
+    said = intrinsics_options.parse_intrinsics(root, hw, None if isinstance(intrinsics, str) else intrinsics, K, fov)
     load = _Load(
         images=tuple(colour[i][1] for i, _ in pairs),
         depths=tuple(depth[j][1] for _, j in pairs),
         hw=hw,
-        camera=_camera(root, intrinsics, camera, hw, said.K),
+        camera=_make_camera(root, intrinsics, camera, hw, said.K),
         units_per_metre=files.to_positive(units_per_metre, root, "option units_per_metre"),
     )
     return [
@@ -151,11 +151,11 @@ class _Load:
         return Frame(torch.from_numpy(image)[None], torch.from_numpy(depth)[None], self.camera)
 
 
-def _left_out(count: int, what: str, without: str, max_difference: float) -> list[str]:
+def _format_unmatched(count: int, what: str, without: str, max_difference: float) -> list[str]:
     return [f"{count} {what} without a {without} within {max_difference} s: left out"] if count else []
 
 
-def _listing(root: Path, kind: str) -> list[tuple[float, Path]]:
+def _read_listing(root: Path, kind: str) -> list[tuple[float, Path]]:
     """(stamp, file) of every picture of ``kind`` ("rgb" or "depth"), by time; two with one stamp count once."""
     table, joint = root / f"{kind}.txt", root / "associations.txt"
     if table.is_file():
@@ -179,7 +179,7 @@ def _listing(root: Path, kind: str) -> list[tuple[float, Path]]:
     return sorted(listed.items())
 
 
-def _poses_at(file: Path, times: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
+def _interpolate_trajectory(file: Path, times: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world matrices of the covered ``times``, and which are covered."""
     rows = files.read_table(file, 8)
     rows = rows[np.isfinite(rows).all(-1) & (np.linalg.norm(rows[:, 4:], axis=-1) > 1e-6)]
@@ -193,7 +193,7 @@ def _poses_at(file: Path, times: np.ndarray, max_difference: float) -> tuple[np.
     share = (times - a[:, 0]) / np.where(span > 0, span, 1)
     near_share = np.where(share > 0.5, 1.0, 0.0)
     nearest = np.minimum(np.abs(times - a[:, 0]), np.abs(times - b[:, 0]))
-    between = (share >= 0) & (share <= 1) & (span < _MAX_POSE_GAP)
+    between = (share >= 0) & (share <= 1) & (span < _MAX_POSE_GAP_S)
     covered = between | (nearest < max_difference)
     if not covered.any():
         raise FormatError(file, "time stamps", f"no pose within {max_difference} s of any image", "overlapping clocks")
@@ -205,29 +205,35 @@ def _poses_at(file: Path, times: np.ndarray, max_difference: float) -> tuple[np.
     return convert.to_c2w(q, (1 - share) * a[:, 1:4] + share * b[:, 1:4], file), covered
 
 
-def _camera(
-    root: Path, intrinsics: told.Intrinsics, number: int | None, hw: tuple[int, int], K: tuple[float, ...] | None
+def _make_camera(
+    root: Path,
+    intrinsics: intrinsics_options.IntrinsicsOption,
+    number: int | None,
+    hw: tuple[int, int],
+    K: tuple[float, ...] | None,
 ) -> Camera:
     if K is not None:
-        return convert.to_camera(convert.matrix_of(*K), hw, root, "option K")
+        return convert.to_camera(convert.make_K(*K), hw, root, "option K")
     if intrinsics not in ("camera", "ros"):
         raise FormatError(root, "option intrinsics", intrinsics, "camera or ros")
-    if number not in (None, *_CALIBRATION):
+    if number not in (None, *_CAMERA_CALIBRATIONS):
         raise FormatError(root, "option camera", number, "1, 2 or 3")
     side = root / "meta.json"
-    number = number or _camera_number(root)
+    number = number or _find_camera_number(root)
     if number is None and intrinsics == "camera":
         if not side.is_file():
-            raise told.missing(root, None, "data.camera=1, 2 or 3 (freiburg), data.intrinsics=ros", "meta.json")
+            raise intrinsics_options.missing_intrinsics_error(
+                root, None, "data.camera=1, 2 or 3 (freiburg), data.intrinsics=ros", "meta.json"
+            )
         meta = files.read_json(side)
         return convert.to_camera(meta.get("K"), hw, side, "K", meta.get("dist"))
-    if hw != _HW:
+    if hw != _IMAGE_HW:
         raise FormatError(root, "image size", f"{hw[1]}x{hw[0]}", "640x480, the size of the published calibration")
-    values, distortion = _CALIBRATION[number] if number and intrinsics == "camera" else (_ROS, None)
-    return convert.to_camera(convert.matrix_of(*values), hw, root, "K", distortion)
+    values, distortion = _CAMERA_CALIBRATIONS[number] if number and intrinsics == "camera" else (_ROS_INTRINSICS, None)
+    return convert.to_camera(convert.make_K(*values), hw, root, "K", distortion)
 
 
-def _camera_number(root: Path) -> int | None:
+def _find_camera_number(root: Path) -> int | None:
     """1, 2 or 3 from the folder's name, else from the comments on top of the trajectory."""
     texts = [root.resolve().name]
     if (root / "groundtruth.txt").is_file():

@@ -9,7 +9,7 @@ from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose, PoseFit
 
 
-def given_pose(
+def known_pose_fit(
     T_1_from_0: Pose,
     n: int,
 ) -> PoseFit:
@@ -34,7 +34,7 @@ def given_pose(
     )
 
 
-def device_pose(frame_0: Frame, frame_1: Frame, n: int) -> PoseFit:
+def device_pose_fit(frame_0: Frame, frame_1: Frame, n: int) -> PoseFit:
     """The data set's own trajectory as the pose of a pair.
 
     Raises:
@@ -43,4 +43,4 @@ def device_pose(frame_0: Frame, frame_1: Frame, n: int) -> PoseFit:
     if frame_0.T_world_from_cam is None or frame_1.T_world_from_cam is None:
         raise ValueError("device_pose: frame.T_world_from_cam is absent, expected the data set's camera-to-world pose")
     T = se3.relative(frame_0.T_world_from_cam, frame_1.T_world_from_cam)
-    return given_pose(T.to(frame_0.camera.f.dtype), n)
+    return known_pose_fit(T.to(frame_0.camera.f.dtype), n)

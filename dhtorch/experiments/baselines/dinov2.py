@@ -16,13 +16,13 @@ from torch import Tensor
 from dhtorch.geometry.checks import check
 
 #: What to install where the library is missing.
-INSTALL = 'pip install "dhtorch[learned]"'
+_INSTALL_HINT = 'pip install "dhtorch[learned]"'
 
 #: Mean and standard deviation of the colours the network was trained with.
 COLOUR_MEAN, COLOUR_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
-def library() -> tuple[Any, Any]:
+def import_dinov2() -> tuple[Any, Any]:
     """``Dinov2Config`` and ``Dinov2Model`` of ``transformers``, imported only here.
 
     Raises:
@@ -31,11 +31,11 @@ def library() -> tuple[Any, Any]:
     try:
         from transformers import Dinov2Config, Dinov2Model  # noqa: PLC0415  (seconds, and optional)
     except ImportError as error:
-        raise ImportError(f"DINOv2 needs transformers ({error}): {INSTALL}") from error
+        raise ImportError(f"DINOv2 needs transformers ({error}): {_INSTALL_HINT}") from error
     return Dinov2Config, Dinov2Model
 
 
-def load(
+def load_dinov2(
     weights: str | Path | None = None,
     *,
     hidden: int = 1024,
@@ -47,7 +47,7 @@ def load(
 ) -> torch.nn.Module:
     """A DINOv2 network in evaluation mode; the default sizes are those of DINOv2-L (ViT-L/14 at 224×224).
 
-    Call it with ``pixel_values=`` (B, 3, H, W), from :func:`pixel_values`; ``last_hidden_state`` of its answer is
+    Call it with ``pixel_values=`` (B, 3, H, W), from :func:`preprocess_image`; ``last_hidden_state`` of its answer is
     (B, 1 + patches, hidden), the class token first.
 
     Args:
@@ -61,7 +61,7 @@ def load(
         ImportError: ``transformers`` is not installed.
         FileNotFoundError: no such folder.
     """
-    Config, Model = library()
+    Config, Model = import_dinov2()
     if weights is not None:
         if not Path(weights).is_dir():
             raise FileNotFoundError(f"{weights}: found no folder, expected one with config.json and DINOv2 weights")
@@ -75,7 +75,7 @@ def load(
     return network.eval()
 
 
-def pixel_values(image: Tensor, side: int = 224) -> Tensor:
+def preprocess_image(image: Tensor, side: int = 224) -> Tensor:
     """A picture as the network expects it: square, colours centred and scaled.
 
     Args:

@@ -13,14 +13,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.experiments.baselines.relative import RelativeDepth, fitted
+from dhtorch.experiments.baselines.relative import RelativeDepth, resize_and_crop
 from dhtorch.records import Frame
 
 #: What to do where the package is missing.
-INSTALL = "clone github.com/naver/dust3r with its submodules, install its requirements, put the clone on PYTHONPATH"
+_INSTALL_HINT = (
+    "clone github.com/naver/dust3r with its submodules, install its requirements, put the clone on PYTHONPATH"
+)
 
 #: Sides of the network's input are multiples of it, px.
-MULTIPLE = 16
+_SIDE_MULTIPLE_PX = 16
 
 
 class DUSt3R:
@@ -45,7 +47,7 @@ class DUSt3R:
             from dust3r.inference import inference  # noqa: PLC0415  (optional)
             from dust3r.model import AsymmetricCroCo3DStereo  # noqa: PLC0415
         except ImportError as error:
-            raise ImportError(f"DUSt3R cannot be imported ({error}): {INSTALL}") from error
+            raise ImportError(f"DUSt3R cannot be imported ({error}): {_INSTALL_HINT}") from error
         if not Path(weights).exists():
             raise FileNotFoundError(f"{weights}: found nothing, expected DUSt3R weights, a file or a folder")
         # The file holds the options of its training run, which torch refuses to read unless told of the class.
@@ -76,10 +78,10 @@ class DUSt3R:
         height, width = image.shape[-2:]
         s = self.size / max(height, width)
         hw = (round(height * s), round(width * s))
-        crop_h, crop_w = (side // MULTIPLE * MULTIPLE for side in hw)
+        crop_h, crop_w = (side // _SIDE_MULTIPLE_PX * _SIDE_MULTIPLE_PX for side in hw)
         if hw[0] == hw[1]:
-            crop_h = 3 * crop_w // 4 // MULTIPLE * MULTIPLE
-        return fitted(image, hw, (crop_h, crop_w))
+            crop_h = 3 * crop_w // 4 // _SIDE_MULTIPLE_PX * _SIDE_MULTIPLE_PX
+        return resize_and_crop(image, hw, (crop_h, crop_w))
 
 
 def _view(image: Tensor, index: int) -> dict[str, Any]:

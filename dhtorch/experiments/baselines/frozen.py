@@ -14,7 +14,7 @@ from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.holes import classify
 from dhtorch.stages.pose import map_pose, pnp_ransac
 from dhtorch.stages.sample import spiral
-from dhtorch.stages.score import rank_by_error
+from dhtorch.stages.score import confidence_from_error
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.triangulate import two_view
 
@@ -107,7 +107,7 @@ MAP_1 = Method(
         solver=triangulate,
     ),
     score=partial(
-        rank_by_error,
+        confidence_from_error,
         residual_scale_px=0.5,
         photometric_scale=None,
         round_trip_scale_px=0.4,

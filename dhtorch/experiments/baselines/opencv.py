@@ -19,7 +19,7 @@ from dhtorch.pipeline.presets import PAPER
 from dhtorch.records import NO_HINT, Camera, Pose, PoseFit, Samples, TrackHint, Tracks
 
 
-def lucas_kanade(
+def opencv_lucas_kanade(
     image_0: Tensor,
     image_1: Tensor,
     uv_0: Tensor,  # (B, N, 2) px
@@ -40,14 +40,14 @@ def lucas_kanade(
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon_px)
     levels = levels if hint.levels is None else hint.levels
     options = {"winSize": (window, window), "maxLevel": levels - 1, "criteria": criteria}
-    images = zip(_grey(image_0), _grey(image_1), _array(uv_0, np.float32), strict=True)
-    columns = zip(*(_track(*views, options, max_round_trip_px) for views in images), strict=True)
+    images = zip(_grey_uint8(image_0), _grey_uint8(image_1), _as_numpy(uv_0, np.float32), strict=True)
+    columns = zip(*(_track_pair(*views, options, max_round_trip_px) for views in images), strict=True)
     uv_1, error, photometric, valid = (torch.from_numpy(np.stack(c)).to(uv_0.device) for c in columns)
     cov = torch.full((*uv_0.shape, 2), torch.nan, dtype=uv_0.dtype, device=uv_0.device)
     return Tracks(uv_0, uv_1.to(uv_0), error.to(uv_0), photometric.to(uv_0), cov, valid)
 
 
-def _track(
+def _track_pair(
     grey_0: np.ndarray, grey_1: np.ndarray, start: np.ndarray, options: dict[str, Any], max_round_trip_px: float
 ) -> tuple[np.ndarray, ...]:
     """Position, round trip, mean grey difference and validity of one pair's points."""
@@ -69,7 +69,7 @@ def _track(
     )  # undefined elsewhere
 
 
-def pnp_ransac(
+def opencv_pnp_ransac(
     samples: Samples,
     tracks: Tracks,
     camera_0: Camera,
@@ -82,12 +82,14 @@ def pnp_ransac(
 ) -> PoseFit:
     """Seat 5 with ``cv2.solvePnPRansac`` (EPnP) and ``cv2.solvePnPRefineLM`` on the inliers."""
     near = tracks.valid & samples.usable
-    K = _array(cam.to_matrix(camera_1), np.float64)
+    K = _as_numpy(cam.to_matrix(camera_1), np.float64)
     R, t, inlier, code = [], [], [], []
     for b in range(near.shape[0]):
         index = near[b].nonzero()[:, 0].cpu().numpy()
-        xyz, uv = _array(samples.xyz[b], np.float64)[index], _array(tracks.uv_1[b], np.float64)[index]
-        solution = _solve(xyz, uv, K[b], draws.shape[1], threshold_px, confidence) if len(index) >= min_inlier else None
+        xyz, uv = _as_numpy(samples.xyz[b], np.float64)[index], _as_numpy(tracks.uv_1[b], np.float64)[index]
+        solution = (
+            _solve_pnp(xyz, uv, K[b], draws.shape[1], threshold_px, confidence) if len(index) >= min_inlier else None
+        )
         mask = np.zeros(near.shape[1], bool)
         fine = solution is not None and len(solution[2]) >= min_inlier
         if solution is not None and fine:
@@ -99,22 +101,24 @@ def pnp_ransac(
     like, device = samples.xyz, samples.xyz.device
     pose = Pose(torch.from_numpy(np.stack(R)).to(like), torch.from_numpy(np.stack(t)).to(like))
     codes = torch.tensor(code, dtype=torch.int32, device=device)
-    return _describe(samples, tracks, camera_1, pose, torch.from_numpy(np.stack(inlier)).to(device), codes)
+    return _make_pose_fit(samples, tracks, camera_1, pose, torch.from_numpy(np.stack(inlier)).to(device), codes)
 
 
-def triangulate(uv_0: Tensor, uv_1: Tensor, camera_0: Camera, camera_1: Camera, T_1_from_0: Pose) -> epipolar.TwoView:
+def opencv_triangulate(
+    uv_0: Tensor, uv_1: Tensor, camera_0: Camera, camera_1: Camera, T_1_from_0: Pose
+) -> epipolar.TwoView:
     """``cv2.triangulatePoints`` as the ``solver`` of :func:`dhtorch.stages.triangulate.two_view`."""
     points = []
-    K_0, K_1 = _array(cam.to_matrix(camera_0), np.float64), _array(cam.to_matrix(camera_1), np.float64)
-    T = _array(se3.to_matrix(T_1_from_0), np.float64)
-    for b, (u, v) in enumerate(zip(_array(uv_0, np.float64), _array(uv_1, np.float64), strict=True)):
+    K_0, K_1 = _as_numpy(cam.to_matrix(camera_0), np.float64), _as_numpy(cam.to_matrix(camera_1), np.float64)
+    T = _as_numpy(se3.to_matrix(T_1_from_0), np.float64)
+    for b, (u, v) in enumerate(zip(_as_numpy(uv_0, np.float64), _as_numpy(uv_1, np.float64), strict=True)):
         X = cv2.triangulatePoints(K_0[b] @ np.eye(3, 4), K_1[b] @ T[b, :3], u.T, v.T) if len(u) else np.ones((4, 0))
         points.append((X[:3] / np.where(np.abs(X[3]) < 1e-12, 1e-12, X[3])).T)
     xyz = torch.from_numpy(np.stack(points)).to(uv_0)
-    return epipolar.describe(xyz, uv_0, uv_1, camera_0, camera_1, T_1_from_0)
+    return epipolar.describe_triangulation(xyz, uv_0, uv_1, camera_0, camera_1, T_1_from_0)
 
 
-def _solve(
+def _solve_pnp(
     xyz: np.ndarray, uv: np.ndarray, K: np.ndarray, hypotheses: int, threshold_px: float, confidence: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """R (3, 3), t (3,) and inlier indices of one pair, or None."""
@@ -128,7 +132,9 @@ def _solve(
     return (R, t, inlier) if np.isfinite(R).all() and np.isfinite(t).all() else None
 
 
-def _describe(samples: Samples, tracks: Tracks, camera_1: Camera, pose: Pose, inlier: Tensor, code: Tensor) -> PoseFit:
+def _make_pose_fit(
+    samples: Samples, tracks: Tracks, camera_1: Camera, pose: Pose, inlier: Tensor, code: Tensor
+) -> PoseFit:
     """Residuals, covariance and signal-to-noise ratio of OpenCV's pose, by the formulas of our own seat."""
     R, t = pose.R.nan_to_num().double(), pose.t.nan_to_num().double()
     xyz = se3.apply(Pose(R, t), torch.where(inlier[..., None], samples.xyz, torch.ones_like(samples.xyz)).double())
@@ -139,7 +145,7 @@ def _describe(samples: Samples, tracks: Tracks, camera_1: Camera, pose: Pose, in
     count = inlier.sum(-1)
     squares = (miss * miss).sum((-1, -2))
     sigma_px = (squares / (2 * count - 6).clamp_min(1)).sqrt()
-    cov, _ = covariance.from_normal(J.mT @ J, sigma_px)
+    cov, _ = covariance.covariance_from_normal(J.mT @ J, sigma_px)
     t_snr = covariance.mahalanobis(t, cov[:, 3:, 3:])
     lost, like = code != PoseCode.OK, samples.xyz
 
@@ -158,22 +164,24 @@ def _describe(samples: Samples, tracks: Tracks, camera_1: Camera, pose: Pose, in
     )
 
 
-def _grey(image: Tensor) -> list[np.ndarray]:
+def _grey_uint8(image: Tensor) -> list[np.ndarray]:
     """uint8 grey images, as OpenCV's own conversion makes them."""
     if image.dtype == torch.uint8 and image.shape[1] == 3:
         return [
             cv2.cvtColor(np.ascontiguousarray(x), cv2.COLOR_RGB2GRAY) for x in image.permute(0, 2, 3, 1).cpu().numpy()
         ]
-    grey = image if image.dtype == torch.uint8 else (filters.grey(image) * 255).round().clamp(0, 255).to(torch.uint8)
+    grey = (
+        image if image.dtype == torch.uint8 else (filters.grayscale(image) * 255).round().clamp(0, 255).to(torch.uint8)
+    )
     return list(grey[:, 0].cpu().numpy())
 
 
-def _array(x: Tensor, dtype: type) -> np.ndarray:
+def _as_numpy(x: Tensor, dtype: type) -> np.ndarray:
     return np.ascontiguousarray(x.detach().cpu().numpy(), dtype=dtype)
 
 
 #: The same seats filled by OpenCV: LK forward and back, EPnP-RANSAC with LM refinement, triangulatePoints.
-OPENCV = PAPER.replace(track=lucas_kanade, pose=pnp_ransac, triangulate={"solver": triangulate})
+OPENCV = PAPER.replace(track=opencv_lucas_kanade, pose=opencv_pnp_ransac, triangulate={"solver": opencv_triangulate})
 
 #: ``PAPER`` with OpenCV's linear triangulation: the residual is shared by both views instead of resting on the second.
-PAPER_DLT = PAPER.replace(triangulate={"solver": triangulate})
+PAPER_DLT = PAPER.replace(triangulate={"solver": opencv_triangulate})

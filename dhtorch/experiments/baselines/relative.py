@@ -11,7 +11,7 @@ from torch import Tensor
 
 from dhtorch.codes import Gate
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.patches import nearest
+from dhtorch.geometry.patches import sample_nearest
 from dhtorch.pytree import Record, record
 from dhtorch.records import Estimate, Frame
 
@@ -26,7 +26,7 @@ class RelativeDepth(Record):
     shift: Tensor  # (B, 2)
 
 
-class Constant:
+class ConstantDepth:
     """The control: a "network" without weights that says the same depth everywhere.
 
     With an oracle's scale it shows what the oracle alone is worth on a scene.
@@ -42,7 +42,7 @@ class Constant:
         return RelativeDepth(one, 2 * one, torch.zeros_like(like), torch.zeros_like(like))
 
 
-def fitted(image: Tensor, hw: tuple[int, int], crop_hw: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+def resize_and_crop(image: Tensor, hw: tuple[int, int], crop_hw: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
     """The picture resized to ``hw`` and cropped to ``crop_hw`` around its centre, with the way there.
 
     Args:
@@ -66,15 +66,15 @@ def fitted(image: Tensor, hw: tuple[int, int], crop_hw: tuple[int, int]) -> tupl
     return x[..., top : top + crop_hw[0], left : left + crop_hw[1]], gain, shift
 
 
-def read(relative: RelativeDepth, uv: Tensor) -> tuple[Tensor, Tensor]:
+def sample_relative_depth(relative: RelativeDepth, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Depth (B, N), NaN where there is none, and confidence (B, N) at image pixels ``uv`` (B, N, 2).
 
     The nearest network pixel is read, so values are never mixed across an edge.
     """
     check("read", depth=(relative.depth, "B h w"), uv=(uv, "B N 2"), gain=(relative.gain, "B 2"))
     place = uv * relative.gain[:, None].to(uv) + relative.shift[:, None].to(uv)
-    depth, inside = nearest(relative.depth.to(uv), place)
-    confidence, _ = nearest(relative.confidence.to(uv), place)
+    depth, inside = sample_nearest(relative.depth.to(uv), place)
+    confidence, _ = sample_nearest(relative.confidence.to(uv), place)
     known = inside & depth.isfinite() & (depth > 0)
     return torch.where(known, depth, torch.nan), torch.where(known, confidence, torch.ones_like(confidence))
 
@@ -93,7 +93,7 @@ def to_estimate(relative: RelativeDepth, uv: Tensor, scale: Tensor) -> Estimate:
         without a scale, NO_TRACK where the network has no depth (cut away, not positive).
     """
     check("to_estimate", uv=(uv, "B N 2"), scale=(scale, "B"))
-    depth, confidence = read(relative, uv)
+    depth, confidence = sample_relative_depth(relative, uv)
     depth = depth * scale[:, None].to(depth)
     gate = torch.where(depth.isfinite(), Gate.ANSWER, Gate.NO_TRACK)
     gate = torch.where(scale.isfinite()[:, None], gate, Gate.NO_POSE).to(torch.int32)

@@ -8,16 +8,16 @@ from torch import Tensor
 from dhtorch.geometry.checks import check
 
 #: Trials of RANSAC, and the relative miss up to which a pixel agrees.
-TRIALS, AGREES = 200, 0.05
+_N_RANSAC_TRIALS, _MAX_INLIER_ERROR = 200, 0.05
 
 
-def median_ratio(x: Tensor, z: Tensor) -> tuple[float, float]:
+def fit_median_scale(x: Tensor, z: Tensor) -> tuple[float, float]:
     """Scale that makes the median ratio one, shift 0; (n,) each, NaN of nothing."""
     check("median_ratio", x=(x, "n"), z=(z, "n"))
     return (float((z / x).median()), 0.0) if len(x) else (float("nan"), 0.0)
 
 
-def least_squares(x: Tensor, z: Tensor) -> tuple[float, float]:
+def fit_scale_shift(x: Tensor, z: Tensor) -> tuple[float, float]:
     """Scale and shift of the least squares of ``s x + t − z``, (n,) each; NaN of fewer than two points."""
     check("least_squares", x=(x, "n"), z=(z, "n"))
     if len(x) < 2:
@@ -27,15 +27,15 @@ def least_squares(x: Tensor, z: Tensor) -> tuple[float, float]:
     return s, t
 
 
-def ransac(x: Tensor, z: Tensor, *, seed: int = 0) -> tuple[float, float]:
+def fit_scale_shift_ransac(x: Tensor, z: Tensor, *, seed: int = 0) -> tuple[float, float]:
     """Scale and shift that most points agree with, then least squares of these; (n,) each."""
     check("ransac", x=(x, "n"), z=(z, "n"))
     if len(x) < 2:
         return float("nan"), float("nan")
-    draw = torch.randint(len(x), (TRIALS, 2), generator=torch.Generator().manual_seed(seed))
+    draw = torch.randint(len(x), (_N_RANSAC_TRIALS, 2), generator=torch.Generator().manual_seed(seed))
     (x0, x1), (z0, z1) = x[draw].double().unbind(-1), z[draw].double().unbind(-1)
     s = (z1 - z0) / torch.where(x1 == x0, torch.nan, x1 - x0)
     t = z0 - s * x0
-    agrees = (s[:, None] * x + t[:, None] - z).abs() < AGREES * z
+    agrees = (s[:, None] * x + t[:, None] - z).abs() < _MAX_INLIER_ERROR * z
     best = agrees[agrees.sum(-1).argmax()]
-    return least_squares(x[best], z[best])
+    return fit_scale_shift(x[best], z[best])

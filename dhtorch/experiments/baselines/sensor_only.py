@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from dhtorch.codes import Gate
-from dhtorch.experiments.baselines.device_pose import given_pose
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.geometry import se3
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
@@ -44,6 +44,6 @@ def sensor_only(
     )
     if trace is not None:
         eye = se3.identity(like.shape[0], like)
-        fit = given_pose(eye.replace(t=torch.full_like(eye.t, torch.nan)), samples.uv.shape[1])
+        fit = known_pose_fit(eye.replace(t=torch.full_like(eye.t, torch.nan)), samples.uv.shape[1])
         trace.update(samples=samples, fit=fit, estimate=estimate, ms={"sensor": 1e3 * (time.perf_counter() - start)})
     return estimate

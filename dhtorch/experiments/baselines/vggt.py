@@ -10,14 +10,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from dhtorch.experiments.baselines.relative import RelativeDepth, fitted
+from dhtorch.experiments.baselines.relative import RelativeDepth, resize_and_crop
 from dhtorch.records import Frame
 
 #: What to do where the package is missing.
-INSTALL = "clone github.com/facebookresearch/vggt and pip install it"
+_INSTALL_HINT = "clone github.com/facebookresearch/vggt and pip install it"
 
 #: Sides of the network's input are multiples of it, px.
-PATCH = 14
+_PATCH_PX = 14
 
 
 class VGGT:
@@ -41,7 +41,7 @@ class VGGT:
         try:
             from vggt.models.vggt import VGGT as Network  # noqa: PLC0415  (optional)
         except ImportError as error:
-            raise ImportError(f"VGGT cannot be imported ({error}): {INSTALL}") from error
+            raise ImportError(f"VGGT cannot be imported ({error}): {_INSTALL_HINT}") from error
         path = Path(weights)
         if not path.exists():
             raise FileNotFoundError(f"{weights}: found nothing, expected VGGT weights, a file or a folder")
@@ -80,5 +80,5 @@ class VGGT:
 
     def _fit(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         height, width = image.shape[-2:]
-        tall = max(round(height * self.width / width / PATCH), 1) * PATCH
-        return fitted(image, (tall, self.width), (min(tall, self.width), self.width))
+        tall = max(round(height * self.width / width / _PATCH_PX), 1) * _PATCH_PX
+        return resize_and_crop(image, (tall, self.width), (min(tall, self.width), self.width))

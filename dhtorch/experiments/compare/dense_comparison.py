@@ -20,18 +20,18 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import Gate, Source
-from dhtorch.data.pairs import around
-from dhtorch.data.scene import Given, scenes_of
+from dhtorch.data.pairs import candidate_frames
+from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import filling, stereo
-from dhtorch.experiments.compare.exact_rooms import within_one
-from dhtorch.experiments.outcome import join
-from dhtorch.experiments.protocol import Batch, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.experiments.compare.exact_rooms import share_within_1_percent
+from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.protocol import Batch, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.geometry.patches import nearest
+from dhtorch.geometry.patches import sample_nearest
 from dhtorch.metrics import bootstrap, errors, holdout, risk
 from dhtorch.metrics.errors import Points
 from dhtorch.pipeline import dense
@@ -45,7 +45,7 @@ EXPECTATION = (
 )
 
 #: Number → (bar, whether it holds).
-BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
+DENSE_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
     "dense.answered": (0.50, lambda value, bar: value >= bar),
     "dense.error_ratio_to_sparse": (1.15, lambda value, bar: value <= bar),
     "dense.coverage_ratio_at_5_indoor": (1.0, lambda value, bar: value >= bar),
@@ -60,20 +60,20 @@ BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
 
 #: Variants: all pixels of the map; the map read where the sparse method looks; the map of one other view, as peers of
 #: two views have no more.
-DENSE, AT_SAMPLES, ONE_VIEW = "dense", "dense, at samples", "dense, one view"
-PEERS = ("sgbm", "sgbm, own calibration", "dis flow", "bilateral")
+DENSE_VARIANT, _AT_SAMPLES, _ONE_VIEW = "dense", "dense, at samples", "dense, one view"
+_PEERS = ("sgbm", "sgbm, own calibration", "dis flow", "bilateral")
 
 #: Cohorts: pairs that can be rectified, and all.
-RECTIFIABLE, FULL = "rectifiable", "full"
+_RECTIFIABLE, FULL_COHORT = "rectifiable", "full"
 
 
 @dataclass(frozen=True)
-class Looked:
+class ReferenceSweep:
     """What was found out about one anchor, once for all variants."""
 
     anchor: Frame
     trace: Trace  # of the sparse method
-    asked: dense.Asked
+    asked: dense.SelectedViews
     maps: Mapping[int, DepthMap]  # by the number of other views
     grid: Samples  # pixels of the map that are judged
     other: Frame  # the view that is worth most
@@ -81,16 +81,16 @@ class Looked:
     ms: Mapping[str, float]
 
 
-class Looking:
+class SweepCache:
     """Answers of all variants about one anchor: the sparse method runs once, and the sweep once for each number of
     views."""
 
     def __init__(self, options: Mapping[str, Any], stride: int) -> None:
         self.options, self.stride = dict(options), stride
-        self._last: Looked | None = None
+        self._last: ReferenceSweep | None = None
 
     def ask(
-        self, say: Callable[[Looked], tuple[Samples, Estimate]], method: Method, *views: Frame, **told: Any
+        self, say: Callable[[ReferenceSweep], tuple[Samples, Estimate]], method: Method, *views: Frame, **told: Any
     ) -> Estimate:
         """One variant's answer, as the protocol asks for it."""
         trace = told.pop("trace")
@@ -100,32 +100,32 @@ class Looking:
         looked = self._last
         trace |= looked.trace
         samples, estimate = say(looked)
-        trace |= {"samples": samples, "ms": dict(looked.ms), "rectifiable": rectifiable(looked)}
+        trace |= {"samples": samples, "ms": dict(looked.ms), "rectifiable": is_rectifiable(looked)}
         return estimate
 
-    def _look(self, method: Method, anchor: Frame, others: Frame, told: Mapping[str, Any]) -> Looked:
+    def _look(self, method: Method, anchor: Frame, others: Frame, told: Mapping[str, Any]) -> ReferenceSweep:
         trace: Trace = {}
         method = method.replace(track=told["track"])
         began = time.perf_counter()
         joined = method(anchor, others, seed=told["seed"], hint=told["hint"], trace=trace)
-        asked = dense.views_asked(joined, others, trace)
+        asked = dense.selected_views(joined, others, trace)
         ms = {"sparse": 1e3 * (time.perf_counter() - began)}
         maps = {}
         for partners in (self.options.get("partners", 3), 1):
             began = time.perf_counter()
-            maps[partners] = dense.swept(anchor, asked, method=method, **{**self.options, "partners": partners})
+            maps[partners] = dense.sweep_depth(anchor, asked, method=method, **{**self.options, "partners": partners})
             ms[f"sweep_{partners}"] = 1e3 * (time.perf_counter() - began)
         hw = next(iter(maps.values())).depth.shape[-2:]
-        place = dense.pixels(anchor, (hw[0], hw[1])).unflatten(0, hw)
+        place = dense.map_pixel_centres(anchor, (hw[0], hw[1])).unflatten(0, hw)
         half = self.stride // 2
         grid = method.backproject(anchor, place[half :: self.stride, half :: self.stride].reshape(-1, 2))
-        index, _ = dense.worthiest(asked, 1)
+        index, _ = dense.top_views(asked, 1)
         at = index[0], torch.arange(len(index[0]), device=index.device)
         fit = asked.fits[at]
         lost = ~fit.ok
         R = torch.where(lost[:, None, None], torch.nan, fit.T_1_from_0.R)
         t = torch.where(lost[:, None], torch.nan, fit.T_1_from_0.t)
-        return Looked(
+        return ReferenceSweep(
             anchor=anchor,
             trace={**trace, "sparse": joined},
             asked=asked,
@@ -138,9 +138,9 @@ class Looking:
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     chosen: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     method: Method | None = None,
@@ -149,9 +149,9 @@ def run(
     anchors: int | None = None,
     peers: bool = True,
     indoor: Sequence[str] = (),
-    rotations: Sequence[Given] = (),
+    rotations: Sequence[SceneLike] = (),
     rooms: Sequence[int] = (0, 1, 2),
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """Dense maps beside the sparse answers that they stand on, and beside dense peers under the same motion.
 
@@ -161,7 +161,7 @@ def run(
     samples that both answer), ``dense.coverage_at_5_indoor`` and ``sparse.coverage_at_5_indoor`` (means over scenes of
     some rooms, on the samples) with their ratio ``dense.coverage_ratio_at_5_indoor``, ``dense.pixels_at_5_indoor``
     (on all pixels), ``dense.ause_ratio`` (median over scenes), ``dense.within_sigma`` and the other promises of
-    :func:`dhtorch.experiments.compare_methods.promises`, ``dense.wrong_share`` (mean over scenes),
+    :func:`dhtorch.experiments.compare_methods.evaluate_promises`, ``dense.wrong_share`` (mean over scenes),
     ``dense.error_ratio_to_sgbm`` (one other view each, pairs that can be rectified, equal coverage; geometric mean),
     ``dense.error_ratio_to_<peer>`` alike, ``dense.rotation_answered`` and ``dense.room_within_1``.
 
@@ -169,7 +169,7 @@ def run(
         scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`; of ``pairs`` the anchors
             count.
         method: the sparse method; None = the job's.
-        sweep: options of :func:`dhtorch.pipeline.dense.swept`.
+        sweep: options of :func:`dhtorch.pipeline.dense.sweep_depth`.
         stride: every so many pixels of the map, both ways, are judged.
         anchors: so many of a scene's, evenly spread; None = all.
         peers: ask the peers as well.
@@ -180,32 +180,32 @@ def run(
     Raises:
         ValueError: an option out of range; else as the main job.
     """
-    _check(stride=stride, **({} if anchors is None else {"anchors": anchors}))
+    _check_options(stride=stride, **({} if anchors is None else {"anchors": anchors}))
     sparse = method or next(iter(chosen.values()))
     options = dict(sweep or {})
     every = list(scenes_of(scenes))
     every += [scene for scene in scenes_of(rotations) if scene.name not in {known.name for known in every}]
-    looking = Looking(options, stride)
+    looking = SweepCache(options, stride)
     variants = _variants(sparse, looking, settings.seed, peers)
-    some = partial(protocol.spread, pairs, anchors)
+    some = partial(protocol.spread_pairs, pairs, anchors)
     parts = []
     for turning in (False, True):
         asked = [scene for scene in every if (scene.role == "rotation") == turning]
-        cohorts: dict[str, protocol.Cohort] = {RECTIFIABLE: partial(_far, only=True), FULL: _far}
+        cohorts: dict[str, protocol.Cohort] = {_RECTIFIABLE: partial(_far_cohort, only=True), FULL_COHORT: _far_cohort}
         whole = Protocol(variants, cohorts=cohorts, min_candidates=0 if turning else protocol.MIN_CANDIDATES)
         parts.append(protocol.run(asked, whole, some, settings, progress=progress))
-    outcome = join(parts)
+    outcome = join_outcomes(parts)
     outcome.summary |= _summary(outcome, {scene.name: scene.place for scene in every}, indoor, peers)
-    outcome.summary["dense.rotation_answered"] = turned(outcome)
+    outcome.summary["dense.rotation_answered"] = rotation_answered(outcome)
     if rooms:
-        outcome.summary |= within_one(rooms, sparse, options)
+        outcome.summary |= share_within_1_percent(rooms, sparse, options)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, peers))
 
 
 def verdict(outcome: Outcome, peers: bool = True) -> tuple[bool | None, str]:
     """Hold the summary against the bars, and name what is missed or could not be measured."""
     missed, undefined, n_held = [], [], 0
-    for name, (bar, holds) in BARS.items():
+    for name, (bar, holds) in DENSE_BARS.items():
         value = outcome.summary.get(name, {}).get("value")
         if value is None:
             undefined.append(name)
@@ -215,7 +215,7 @@ def verdict(outcome: Outcome, peers: bool = True) -> tuple[bool | None, str]:
             missed.append(f"{name} {value:.3f} (bar {bar:g})")
     notes = [f"not measured: {', '.join(undefined)}"] if undefined else []
     crossed = (
-        sorted(s for s, row in outcome.scenes("sgbm", RECTIFIABLE).items() if not row.get("n_candidates"))
+        sorted(s for s, row in outcome.scenes("sgbm", _RECTIFIABLE).items() if not row.get("n_candidates"))
         if peers
         else []
     )
@@ -224,19 +224,20 @@ def verdict(outcome: Outcome, peers: bool = True) -> tuple[bool | None, str]:
     return (None if undefined and not missed else not missed), said
 
 
-def rectifiable(looked: Looked) -> Tensor:
+def is_rectifiable(looked: ReferenceSweep) -> Tensor:
     """Whether both epipoles lie outside their pictures, (B,) bool."""
     views = tuple((view.camera, view.hw) for view in (looked.anchor, looked.other))
-    inside = stereo.epipole_inside(views, looked.T_1_from_0)
+    inside = stereo.is_epipole_inside(views, looked.T_1_from_0)
     return ~inside & looked.T_1_from_0.t.isfinite().all(-1)
 
 
-def read(found: DepthMap, samples: Samples, frame: Frame) -> Estimate:
+def sample_map(found: DepthMap, samples: Samples, frame: Frame) -> Estimate:
     """The map of a frame at samples of it: swept depths of the nearest pixel, else its reason for silence."""
     h, w = found.depth.shape[-2:]
     place = cam.depth_pixels(frame.camera, frame.hw, None, (h, w), samples.uv)
     depth, sigma, score, source, gate = (
-        nearest(x.to(found.depth), place)[0] for x in (found.depth, found.sigma, found.score, found.source, found.gate)
+        sample_nearest(x.to(found.depth), place)[0]
+        for x in (found.depth, found.sigma, found.score, found.source, found.gate)
     )
     keep = source == Source.SWEPT
     gate = torch.where(gate == Gate.ANSWER, Gate.NO_TRACK, gate)
@@ -248,123 +249,128 @@ def read(found: DepthMap, samples: Samples, frame: Frame) -> Estimate:
     )
 
 
-def _variants(method: Method, looking: Looking, seed: int, peers: bool) -> dict[str, Variant]:
+def _variants(method: Method, looking: SweepCache, seed: int, peers: bool) -> dict[str, Variant]:
     most = looking.options.get("partners", 3)
 
-    def at(k: int) -> Callable[[Looked], tuple[Samples, Estimate]]:
-        return lambda x: (x.grid, read(x.maps[k], x.grid, x.anchor))
+    def at(k: int) -> Callable[[ReferenceSweep], tuple[Samples, Estimate]]:
+        return lambda x: (x.grid, sample_map(x.maps[k], x.grid, x.anchor))
 
-    says: dict[str, Callable[[Looked], tuple[Samples, Estimate]]] = {
+    says: dict[str, Callable[[ReferenceSweep], tuple[Samples, Estimate]]] = {
         "sparse": lambda x: (x.trace["samples"], x.trace["sparse"]),
-        AT_SAMPLES: lambda x: (x.trace["samples"], read(x.maps[most], x.trace["samples"], x.anchor)),
-        ONE_VIEW: at(1),
-        DENSE: at(most),
+        _AT_SAMPLES: lambda x: (x.trace["samples"], sample_map(x.maps[most], x.trace["samples"], x.anchor)),
+        _ONE_VIEW: at(1),
+        DENSE_VARIANT: at(most),
     }
     if peers:
         says |= {
-            "sgbm": lambda x: (x.grid, _matched(x, x.T_1_from_0)),
-            "dis flow": lambda x: (x.grid, stereo.flow(x.anchor, x.other, x.T_1_from_0, x.grid)),
-            "bilateral": lambda x: (x.grid, filling.bilateral(x.anchor, x.grid)),
+            "sgbm": lambda x: (x.grid, _match_semi_global(x, x.T_1_from_0)),
+            "dis flow": lambda x: (x.grid, stereo.match_optical_flow(x.anchor, x.other, x.T_1_from_0, x.grid)),
+            "bilateral": lambda x: (x.grid, filling.fill_bilateral(x.anchor, x.grid)),
         }
     variants = {
-        name: Variant(method, ask=partial(looking.ask, say), seed=seed, offers=around) for name, say in says.items()
+        name: Variant(method, ask=partial(looking.ask, say), seed=seed, offers=candidate_frames)
+        for name, say in says.items()
     }
     if peers:
-        own = partial(looking.ask, _own_calibration)
-        variants["sgbm, own calibration"] = Variant(method, ask=own, seed=seed, offers=around, needs=_is_rectified)
+        own = partial(looking.ask, _match_own_calibration)
+        variants["sgbm, own calibration"] = Variant(
+            method, ask=own, seed=seed, offers=candidate_frames, needs=_not_rectified_reason
+        )
     return variants
 
 
-def _matched(looked: Looked, T_1_from_0: Pose) -> Estimate:
+def _match_semi_global(looked: ReferenceSweep, T_1_from_0: Pose) -> Estimate:
     near = looked.trace["samples"]
     reach = torch.where(near.usable, near.depth, 0.0).amax(-1)
     reach = torch.where(reach > 0, 0.7 * reach, 1.0)
-    return stereo.semi_global(looked.anchor, looked.other, T_1_from_0, looked.grid, nearest_m=reach)
+    return stereo.match_semi_global(looked.anchor, looked.other, T_1_from_0, looked.grid, nearest_m=reach)
 
 
-def _own_calibration(looked: Looked) -> tuple[Samples, Estimate]:
+def _match_own_calibration(looked: ReferenceSweep) -> tuple[Samples, Estimate]:
     """What the pictures give under the motion that their data set states."""
     a, b = looked.anchor.T_world_from_cam, looked.other.T_world_from_cam
     assert a is not None and b is not None
     T = se3.compose(se3.invert(b), a).map(lambda x: x.to(looked.grid.uv))
-    return looked.grid, _matched(looked, T)
+    return looked.grid, _match_semi_global(looked, T)
 
 
-def _is_rectified(scene: Any) -> str | None:
+def _not_rectified_reason(scene: Any) -> str | None:
     return None if scene.recording.format == "rectified" else "not a rectified pair"
 
 
-def _far(batch: Batch, trace: Trace, *, only: bool = False) -> holdout.Truth:
+def _far_cohort(batch: Batch, trace: Trace, *, only: bool = False) -> holdout.Truth:
     """Hidden returns that pass the truth test; of the method's own samples those with texture, of pixels all."""
     samples: Samples = trace["samples"]
-    truth = protocol.held_back(batch, trace)
+    truth = protocol.held_back_truth(batch, trace)
     everywhere = samples.uv.shape[1] != trace["sparse"].uv.shape[1]
     code = truth.code
     if everywhere:
-        code = torch.where(code == holdout.Rule.TEXTURE, holdout.Rule.CANDIDATE, code)
+        code = torch.where(code == holdout.TruthCode.TEXTURE, holdout.TruthCode.CANDIDATE, code)
     if only:
-        code = torch.where(trace["rectifiable"][:, None], code, holdout.Rule.EXCLUDED)
+        code = torch.where(trace["rectifiable"][:, None], code, holdout.TruthCode.EXCLUDED)
     return truth.replace(code=code)
 
 
 def _summary(outcome: Outcome, rooms: Mapping[str, str], indoor: Sequence[str], peers: bool) -> Row:
-    found = {name: _points(outcome, name) for name in ("sparse", AT_SAMPLES, DENSE)}
-    rows: dict[str, Row] = {scene: {} for scene in found[DENSE]}
+    found = {name: _scene_points(outcome, name) for name in ("sparse", _AT_SAMPLES, DENSE_VARIANT)}
+    rows: dict[str, Row] = {scene: {} for scene in found[DENSE_VARIANT]}
     summary: Row = {}
-    for number, value in compare.promises({s: [p] for s, p in found[DENSE].items()}, rooms, rows, 2000, 0).items():
-        summary[f"dense.{number}"] = value.entry(errors.unit(number))
-    for scene, points in found[DENSE].items():
+    for number, value in compare.evaluate_promises(
+        {s: [p] for s, p in found[DENSE_VARIANT].items()}, rooms, rows, 2000, 0
+    ).items():
+        summary[f"dense.{number}"] = value.entry(errors.metric_unit(number))
+    for scene, points in found[DENSE_VARIANT].items():
         rows[scene] |= {"ause_ratio": risk.ause(points)}
-        rows[scene]["error_ratio_to_sparse"] = _ratio(found[AT_SAMPLES][scene], found["sparse"][scene])
-    measured = {scene: errors.measure(points) for scene, points in found[DENSE].items()}
-    summary["dense.answered"] = _over([m["coverage"] for m in measured.values()], "median")
-    summary["dense.wrong_share"] = _over([m["wrong_share"] for m in measured.values()], "mean")
-    summary["dense.ause_ratio"] = _over([row["ause_ratio"] for row in rows.values()], "median")
+        rows[scene]["error_ratio_to_sparse"] = _error_ratio(found[_AT_SAMPLES][scene], found["sparse"][scene])
+    measured = {scene: errors.measure_errors(points) for scene, points in found[DENSE_VARIANT].items()}
+    summary["dense.answered"] = _interval_over([m["coverage"] for m in measured.values()], "median")
+    summary["dense.wrong_share"] = _interval_over([m["wrong_share"] for m in measured.values()], "mean")
+    summary["dense.ause_ratio"] = _interval_over([row["ause_ratio"] for row in rows.values()], "median")
     ratios = [row["error_ratio_to_sparse"] for row in rows.values()]
-    summary["dense.error_ratio_to_sparse"] = _over(ratios, "geometric_mean")
-    summary |= _indoor(found, {scene for scene in rows if rooms[scene] in indoor})
-    for peer in PEERS if peers else ():
-        ours, theirs = (_points(outcome, name, RECTIFIABLE) for name in (ONE_VIEW, peer))
+    summary["dense.error_ratio_to_sparse"] = _interval_over(ratios, "geometric_mean")
+    summary |= _indoor_coverage(found, {scene for scene in rows if rooms[scene] in indoor})
+    for peer in _PEERS if peers else ():
+        ours, theirs = (_scene_points(outcome, name, _RECTIFIABLE) for name in (_ONE_VIEW, peer))
         both = [scene for scene in ours if scene in theirs]
-        cut = compare.equal_coverage({s: [ours[s]] for s in both}, {s: [theirs[s]] for s in both})
-        equal, _ = compare.ratio_over_seeds(*cut, lambda p: errors.measure(p)["median_rel"])
+        cut = compare.cut_to_equal_coverage({s: [ours[s]] for s in both}, {s: [theirs[s]] for s in both})
+        equal, _ = compare.ratio_over_seeds(*cut, lambda p: errors.measure_errors(p)["median_rel"])
         name = f"error_ratio_to_{peer.replace(', ', '_').replace(' ', '_')}"
         for scene, ratio in equal.items():
             rows[scene][name] = ratio
-        summary[f"dense.{name}"] = _over(list(equal.values()), "geometric_mean")
-    for scene, row in outcome.scenes(DENSE).items():
+        summary[f"dense.{name}"] = _interval_over(list(equal.values()), "geometric_mean")
+    for scene, row in outcome.scenes(DENSE_VARIANT).items():
         row["dense"] = rows.get(scene, {})
     return summary
 
 
-def _indoor(found: Mapping[str, Mapping[str, Points]], scenes: set[str]) -> Row:
+def _indoor_coverage(found: Mapping[str, Mapping[str, Points]], scenes: set[str]) -> Row:
     """Coverage at 5 % mean risk on scenes of some rooms."""
     reached = {
-        name: [risk.measure(points)["coverage_at_5"] for scene, points in of.items() if scene in scenes]
+        name: [risk.measure_risk(points)["coverage_at_5"] for scene, points in of.items() if scene in scenes]
         for name, of in found.items()
     }
     summary: Row = {
-        "dense.coverage_at_5_indoor": _over(reached[AT_SAMPLES], "mean"),
-        "sparse.coverage_at_5_indoor": _over(reached["sparse"], "mean"),
-        "dense.pixels_at_5_indoor": _over(reached[DENSE], "mean"),
+        "dense.coverage_at_5_indoor": _interval_over(reached[_AT_SAMPLES], "mean"),
+        "sparse.coverage_at_5_indoor": _interval_over(reached["sparse"], "mean"),
+        "dense.pixels_at_5_indoor": _interval_over(reached[DENSE_VARIANT], "mean"),
     }
     ours, theirs = (summary[f"{name}.coverage_at_5_indoor"]["value"] for name in ("dense", "sparse"))
-    summary["dense.coverage_ratio_at_5_indoor"] = bootstrap.single(
+    summary["dense.coverage_ratio_at_5_indoor"] = bootstrap.without_interval(
         ours / theirs if ours is not None and theirs else None, len(scenes)
     )
     return summary
 
 
-def _ratio(ours: Points, theirs: Points) -> float | None:
+def _error_ratio(ours: Points, theirs: Points) -> float | None:
     """Ratio of the median errors where both answer."""
     both = ours.keep & theirs.keep
-    if int(both.sum()) < compare.MIN_ANSWERS:
+    if int(both.sum()) < compare.MIN_COMPARED_ANSWERS:
         return None
     a, b = (float(p.error[both].median()) for p in (ours, theirs))
-    return max(a, compare.SMALLEST) / max(b, compare.SMALLEST)
+    return max(a, compare.MIN_COMPARED_ERROR) / max(b, compare.MIN_COMPARED_ERROR)
 
 
-def _points(outcome: Outcome, variant: str, cohort: str = FULL) -> dict[str, Points]:
+def _scene_points(outcome: Outcome, variant: str, cohort: str = FULL_COHORT) -> dict[str, Points]:
     """Scene → candidates; of scenes without a role that have some."""
     apart = {row["scene"] for row in outcome.rows if row.get("role")}
     return {
@@ -374,23 +380,25 @@ def _points(outcome: Outcome, variant: str, cohort: str = FULL) -> dict[str, Poi
     }
 
 
-def turned(outcome: Outcome) -> Row:
+def rotation_answered(outcome: Outcome) -> Row:
     """Share of the pixels without a return that are answered where the camera only turns, pooled over its scenes."""
     turning = {row["scene"] for row in outcome.rows if row.get("role") == "rotation"}
     asked = [
         row
         for row in outcome.rows
-        if row["scene"] in turning and row["pair"] is not None and (row["method"], row["truth"]) == (DENSE, FULL)
+        if row["scene"] in turning
+        and row["pair"] is not None
+        and (row["method"], row["truth"]) == (DENSE_VARIANT, FULL_COHORT)
     ]
     holes = sum(row["n_holes"] for row in asked)
-    return bootstrap.single(sum(row["n_recovered"] for row in asked) / holes if holes else None, len(turning))
+    return bootstrap.without_interval(sum(row["n_recovered"] for row in asked) / holes if holes else None, len(turning))
 
 
-def _over(values: Sequence[float | None], statistic: str) -> Row:
-    return bootstrap.interval(values, statistic=statistic).entry("1")
+def _interval_over(values: Sequence[float | None], statistic: str) -> Row:
+    return bootstrap.interval_over_scenes(values, statistic=statistic).entry("1")
 
 
-def _check(**options: int) -> None:
+def _check_options(**options: int) -> None:
     for name, value in options.items():
         if not isinstance(value, int) or value < 1:
             raise ValueError(f"experiment.{name}: found {value!r}, expected a whole number of at least 1")

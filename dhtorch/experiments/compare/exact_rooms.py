@@ -17,8 +17,8 @@ from dhtorch.codes import PoseCode, Source
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.geometry.filters import grey
-from dhtorch.geometry.patches import nearest
+from dhtorch.geometry.filters import grayscale
+from dhtorch.geometry.patches import sample_nearest
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
@@ -27,47 +27,49 @@ from dhtorch.records import Frame, PoseFit
 from dhtorch.synthetic import SyntheticRoom
 
 #: The rooms: their frames' size, near limit in m, and the frames of anchor and other view.
-HW, NEAR, VIEWS = (480, 640), 2.0, (3, 11)
+_ROOM_HW, _NEAR_LIMIT_M, _VIEW_FRAMES = (480, 640), 2.0, (3, 11)
 
 #: Standard deviation of grey values in a window of 9 x 9 pixels that counts as texture, and the step of depth in one of
 #: 11 x 11 from which on a pixel lies at an edge.
-TEXTURE, EDGE = 0.02, 0.05
+_MIN_TEXTURE_SIGMA, _MAX_DEPTH_STEP = 0.02, 0.05
 
 #: Relative error within which a pixel counts as right, and by which surfaces differ that do not hide each other.
-RIGHT, SAME = 0.01, 0.03
+_MAX_RELATIVE_ERROR, _SAME_SURFACE_RATIO = 0.01, 0.03
 
 
-def within_one(seeds: Sequence[int], method: Method, options: Mapping[str, Any]) -> Row:
+def share_within_1_percent(seeds: Sequence[int], method: Method, options: Mapping[str, Any]) -> Row:
     """``dense.room_within_1``: share of the answered pixels within 1 %, its mean over rooms; and the same of all asked,
     silence counted as a miss, as ``dense.room_within_1_of_all``."""
     answered, asked = [], []
     for seed in seeds:
-        fine, told, wanted = _room(seed, method, options)
+        fine, told, wanted = _evaluate_room(seed, method, options)
         answered.append(fine / max(told, 1))
         asked.append(fine / max(wanted, 1))
     return {
-        "dense.room_within_1": bootstrap.interval(answered, statistic="mean").entry("1"),
-        "dense.room_within_1_of_all": bootstrap.interval(asked, statistic="mean").entry("1"),
+        "dense.room_within_1": bootstrap.interval_over_scenes(answered, statistic="mean").entry("1"),
+        "dense.room_within_1_of_all": bootstrap.interval_over_scenes(asked, statistic="mean").entry("1"),
     }
 
 
-def _room(seed: int, method: Method, options: Mapping[str, Any]) -> tuple[int, int, int]:
+def _evaluate_room(seed: int, method: Method, options: Mapping[str, Any]) -> tuple[int, int, int]:
     """Numbers of pixels: within 1 %, answered, asked."""
-    room = SyntheticRoom(n_frames=max(VIEWS) + 1, hw=HW, depth_hw=HW, lidar="exact", image_noise=0.0, seed=seed)
-    anchor, other = (room[k] for k in VIEWS)
-    near = range_split(anchor, NEAR)
-    fit = exact_pose(anchor, other, method.n)
+    room = SyntheticRoom(
+        n_frames=max(_VIEW_FRAMES) + 1, hw=_ROOM_HW, depth_hw=_ROOM_HW, lidar="exact", image_noise=0.0, seed=seed
+    )
+    anchor, other = (room[k] for k in _VIEW_FRAMES)
+    near = range_split(anchor, _NEAR_LIMIT_M)
+    fit = exact_pose_fit(anchor, other, method.n)
     with torch.no_grad():
-        found = dense.complete(
-            near, range_split(other, NEAR), method=method.replace(views=1, choose=None), fit=fit, **options
+        found = dense.complete_depth(
+            near, range_split(other, _NEAR_LIMIT_M), method=method.replace(views=1, choose=None), fit=fit, **options
         )
-    wanted = judged(anchor, other, _odd(room, VIEWS[0]))
+    wanted = evaluated_pixels(anchor, other, _odd_surface_mask(room, _VIEW_FRAMES[0]))
     told = wanted & (found.source == Source.SWEPT)
-    right = told & ((found.depth - anchor.depth).abs() < RIGHT * anchor.depth)
+    right = told & ((found.depth - anchor.depth).abs() < _MAX_RELATIVE_ERROR * anchor.depth)
     return int(right.sum()), int(told.sum()), int(wanted.sum())
 
 
-def exact_pose(anchor: Frame, other: Frame, n: int) -> PoseFit:
+def exact_pose_fit(anchor: Frame, other: Frame, n: int) -> PoseFit:
     """The motion between two frames that know where they stand, as known to a tenth of a millimetre."""
     a, b = anchor.T_world_from_cam, other.T_world_from_cam
     if a is None or b is None:
@@ -89,29 +91,29 @@ def exact_pose(anchor: Frame, other: Frame, n: int) -> PoseFit:
     )
 
 
-def judged(anchor: Frame, other: Frame, odd: Tensor) -> Tensor:
+def evaluated_pixels(anchor: Frame, other: Frame, odd: Tensor) -> Tensor:
     """Which pixels (B, h, w) are asked for.
 
     Args:
         anchor, other: frames whose depth is exact and of their picture's size.
         odd: (B, h, w) bool, surfaces on which a picture shows something else.
     """
-    depth, picture = anchor.depth, grey(anchor.image)
+    depth, picture = anchor.depth, grayscale(anchor.image)
     mean = F.avg_pool2d(picture, 9, 1, 4)
     contrast = (F.avg_pool2d(picture.square(), 9, 1, 4) - mean.square()).clamp_min(0).sqrt()[:, 0]
     low, high = (sign * F.max_pool2d(sign * depth, 11, 1, 5) for sign in (-1, 1))
     xyz = se3.apply(
-        exact_pose(anchor, other, 1).T_1_from_0,
-        cam.unproject(anchor.camera, dense.pixels(anchor, anchor.hw)[None], depth.flatten(1)),
+        exact_pose_fit(anchor, other, 1).T_1_from_0,
+        cam.unproject(anchor.camera, dense.map_pixel_centres(anchor, anchor.hw)[None], depth.flatten(1)),
     )
-    seen, inside = nearest(other.depth, cam.project(other.camera, xyz))
-    shown = inside & ((seen - xyz[..., 2]).abs() < SAME * xyz[..., 2])
-    smooth = high < (1 + EDGE) * low
+    seen, inside = sample_nearest(other.depth, cam.project(other.camera, xyz))
+    shown = inside & ((seen - xyz[..., 2]).abs() < _SAME_SURFACE_RATIO * xyz[..., 2])
+    smooth = high < (1 + _MAX_DEPTH_STEP) * low
     beside = F.max_pool2d(odd.to(depth), 9, 1, 4) > 0
-    return (depth > NEAR) & (contrast > TEXTURE) & smooth & shown.unflatten(1, anchor.hw) & ~beside
+    return (depth > _NEAR_LIMIT_M) & (contrast > _MIN_TEXTURE_SIGMA) & smooth & shown.unflatten(1, anchor.hw) & ~beside
 
 
-def _odd(room: SyntheticRoom, k: int) -> Tensor:
+def _odd_surface_mask(room: SyntheticRoom, k: int) -> Tensor:
     surface = room.truth(k)["surface"]
     codes = [code for code, name in room.surfaces.items() if name in room.odd_surfaces]
     return torch.isin(surface, torch.tensor(codes, dtype=surface.dtype))

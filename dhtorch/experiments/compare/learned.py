@@ -22,22 +22,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.data.scene import Given
+from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import memory, protocol
-from dhtorch.experiments.baselines.device_pose import given_pose
-from dhtorch.experiments.baselines.relative import RelativeDepth, read, to_estimate
+from dhtorch.experiments.baselines.device_pose import known_pose_fit
+from dhtorch.experiments.baselines.relative import RelativeDepth, sample_relative_depth, to_estimate
 from dhtorch.experiments.protocol import (
     Batch,
     Method,
     Outcome,
-    Pairs,
     Progress,
     Protocol,
+    ScenePairs,
     Settings,
     Variant,
-    quiet,
+    no_progress,
 )
-from dhtorch.experiments.rows import Row, median, summarise
+from dhtorch.experiments.rows import Row, median_or_none, summarise_rows
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.patches import round_half_up
 from dhtorch.metrics import errors, holdout
@@ -51,19 +51,19 @@ EXPECTATION = (
 )
 
 #: Where a network's scale may come from, and whether the answer is then metric.
-SCALES = {"oracle": "no", "near": "yes"}
+_SCALE_SOURCES = {"oracle": "no", "near": "yes"}
 
 #: The network that the verdict is about.
-JUDGED = "vggt"
+_DECIDING_NETWORK = "vggt"
 
 #: Fewest pixels that fix a scale.
-MIN_PIXELS = 20
+_MIN_SCALE_PIXELS = 20
 
-Network = Callable[[Frame, Frame], RelativeDepth]
+DepthNetwork = Callable[[Frame, Frame], RelativeDepth]
 
 
 @record
-class Scale(Record):
+class NetworkScale(Record):
     """Metres per unit of a network."""
 
     factor: Tensor  # (B,); NaN where nothing fixes it
@@ -71,15 +71,15 @@ class Scale(Record):
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     chosen: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
-    models: Mapping[str, Callable[..., Network]] | None = None,
+    models: Mapping[str, Callable[..., DepthNetwork]] | None = None,
     scales: Sequence[str] = ("oracle", "near"),
     scale_pixels: int = 4096,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Run the chosen method and the networks on the same pairs, samples and candidates.
 
@@ -101,8 +101,8 @@ def run(
         ValueError: no network at all, or an unknown scale.
     """
     for scale in scales:
-        if scale not in SCALES:
-            raise ValueError(f"experiment.scales: found {scale!r}, expected some of {', '.join(SCALES)}")
+        if scale not in _SCALE_SOURCES:
+            raise ValueError(f"experiment.scales: found {scale!r}, expected some of {', '.join(_SCALE_SOURCES)}")
     wanted = {k: build for k, build in (models or {}).items() if _has_weights(build)}
     if not wanted:
         names = ", ".join(f"experiment.models.{k}.weights" for k in models or ())
@@ -110,25 +110,25 @@ def run(
     networks = {k: build(device=settings.device) for k, build in wanted.items()}
     ours, method = next(iter(chosen.items()))
     variants = {ours: Variant(method)}
-    labels: dict[str, Row] = {ours: {"scale": "sensor", "metric": "yes", **memory.weights(method)}}
+    labels: dict[str, Row] = {ours: {"scale": "sensor", "metric": "yes", **memory.count_weights(method)}}
     for name, network in networks.items():
-        once = Once(network)
+        once = CachedNetwork(network)
         for scale in scales:
-            asked = partial(ask, network=once, scale_pixels=scale_pixels)
-            given = partial(_given, scale=scale, seed=settings.seed)
+            asked = partial(estimate_with_network, network=once, scale_pixels=scale_pixels)
+            given = partial(_scale_reference, scale=scale, seed=settings.seed)
             variants[f"{name}_{scale}"] = Variant(method, ask=asked, given=given)
-            labels[f"{name}_{scale}"] = {"scale": scale, "metric": SCALES[scale], **_described(network)}
-    whole = Protocol(variants, columns=_columns)
+            labels[f"{name}_{scale}"] = {"scale": scale, "metric": _SCALE_SOURCES[scale], **_count_weights(network)}
+    whole = Protocol(variants, columns=_scale_columns)
     outcome = protocol.run(scenes, whole, pairs, settings, progress=progress)
-    _complete(outcome, ours, labels, settings.device)
-    outcome.summary = summarise(outcome.rows, list(variants), list(whole.cohorts))
-    return outcome.decide(QUESTION, EXPECTATION, *judge(outcome, ours, f"{JUDGED}_oracle"))
+    _complete_rows(outcome, ours, labels, settings.device)
+    outcome.summary = summarise_rows(outcome.rows, list(variants), list(whole.cohorts))
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, ours, f"{_DECIDING_NETWORK}_oracle"))
 
 
-class Once:
+class CachedNetwork:
     """A network that is asked once about the same pictures, for all its scales; keeps the milliseconds it took."""
 
-    def __init__(self, network: Network) -> None:
+    def __init__(self, network: DepthNetwork) -> None:
         self.network = network
         self._pictures: tuple[Tensor, Tensor] | None = None
         self._found: tuple[RelativeDepth, float] | None = None
@@ -144,12 +144,12 @@ class Once:
         return self._found
 
 
-def ask(
+def estimate_with_network(
     method: Method,
     near: Frame,
     other: Frame,
     *,
-    network: Once,
+    network: CachedNetwork,
     scale_pixels: int,
     known: Frame,
     seed: int,
@@ -164,11 +164,11 @@ def ask(
     nowhere = Pose(
         torch.full_like(like, torch.nan)[:, :1, None].expand(-1, 3, 3), like.new_full((len(like), 3), torch.nan)
     )
-    trace.update(samples=samples, fit=given_pose(nowhere, method.n), scale=scale, ms={"network": ms})
+    trace.update(samples=samples, fit=known_pose_fit(nowhere, method.n), scale=scale, ms={"network": ms})
     return to_estimate(relative, samples.uv, scale.factor)
 
 
-def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pixels: int, seed: int) -> Scale:
+def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pixels: int, seed: int) -> NetworkScale:
     """Metres per unit: median ratio of known to relative depth over pixels that no sample reads.
 
     Image pixels are drawn from the seed, the same for all pairs. One whose pixel of the depth map lies within the
@@ -185,18 +185,18 @@ def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pi
     h, w = known.hw
     draws = torch.rand(n_pixels, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     uv = (draws * torch.tensor([w, h]) - 0.5).to(samples_uv).expand(samples_uv.shape[0], -1, -1)
-    true_depth = holdout.truth_at(known, uv, truth="raw").depth
-    reach = uv.new_zeros(1, 1) if known.sparse is None else (holdout.CLOSE_SPARSE - 1) * known.sparse[:, None]
-    taken = _near_a_sample(known, uv, samples_uv, reach)
-    depth, _ = read(relative, uv)
+    true_depth = holdout.sample_truth(known, uv, truth="raw").depth
+    reach = uv.new_zeros(1, 1) if known.sparse is None else (holdout.SPARSE_CLOSE_WINDOW_PX - 1) * known.sparse[:, None]
+    taken = _is_near_sample(known, uv, samples_uv, reach)
+    depth, _ = sample_relative_depth(relative, uv)
     use = (true_depth > 0) & depth.isfinite() & ~taken
     ratio = torch.where(use, true_depth / torch.where(use, depth, torch.ones_like(depth)), torch.nan)
     count = use.sum(-1)
     factor = ratio.nanmedian(-1).values
-    return Scale(torch.where(count >= MIN_PIXELS, factor, torch.full_like(factor, torch.nan)), count)
+    return NetworkScale(torch.where(count >= _MIN_SCALE_PIXELS, factor, torch.full_like(factor, torch.nan)), count)
 
 
-def judge(outcome: Outcome, ours: str, theirs: str) -> tuple[bool | None, str]:
+def verdict(outcome: Outcome, ours: str, theirs: str) -> tuple[bool | None, str]:
     """Whether the network has the smaller median error on the candidates ours answered, on most scenes; and why."""
     mine, yours = outcome.scenes(ours), outcome.scenes(theirs)
     both = {}
@@ -207,22 +207,22 @@ def judge(outcome: Outcome, ours: str, theirs: str) -> tuple[bool | None, str]:
     if not both:
         return None, "no scene on which both answered" if yours else f"{theirs} was not run: give its weights"
     better = [scene for scene, (a, b) in both.items() if a < b]
-    a, b = (median([pair[k] for pair in both.values()]) or 0.0 for k in (0, 1))
+    a, b = (median_or_none([pair[k] for pair in both.values()]) or 0.0 for k in (0, 1))
     why = f"{theirs} is more accurate on {len(better)} of {len(both)} scenes, median of medians {a:.2%} against {b:.2%}"
     return 2 * len(better) > len(both), why
 
 
-def _has_weights(build: Callable[..., Network]) -> bool:
+def _has_weights(build: Callable[..., DepthNetwork]) -> bool:
     return getattr(build, "keywords", {}).get("weights", "none asked for") is not None
 
 
-def _given(batch: Batch, *, scale: str, seed: int) -> dict[str, Any]:
+def _scale_reference(batch: Batch, *, scale: str, seed: int) -> dict[str, Any]:
     """What fixes the scale: the truth of the anchor, or the returns that ours sees too."""
     known = batch.exact if scale == "oracle" else holdout.range_split(batch.anchor, batch.cutoff)
     return {"known": known, "seed": seed}
 
 
-def _near_a_sample(frame: Frame, uv: Tensor, samples_uv: Tensor, reach: Tensor) -> Tensor:
+def _is_near_sample(frame: Frame, uv: Tensor, samples_uv: Tensor, reach: Tensor) -> Tensor:
     """Which of the pixels (B, M) lie, in the depth map, within ``reach`` (B, 1) pixels of one that a sample reads."""
     size = (frame.depth.shape[-2], frame.depth.shape[-1])
     place = partial(cam.depth_pixels, frame.camera, frame.hw, frame.depth_camera, size)
@@ -231,16 +231,16 @@ def _near_a_sample(frame: Frame, uv: Tensor, samples_uv: Tensor, reach: Tensor) 
     return torch.stack(near) <= reach
 
 
-def _described(network: Any) -> dict[str, int]:
-    return memory.weights(getattr(network, "network", network))
+def _count_weights(network: Any) -> dict[str, int]:
+    return memory.count_weights(getattr(network, "network", network))
 
 
-def _columns(answer: protocol.Answer) -> Row:
+def _scale_columns(answer: protocol.Answer) -> Row:
     scale = answer.trace.get("scale")
     return {} if scale is None else {"scale_factor": float(scale.factor[0]), "scale_pixels": float(scale.n_pixels[0])}
 
 
-def _complete(outcome: Outcome, ours: str, labels: Mapping[str, Row], device: str) -> None:
+def _complete_rows(outcome: Outcome, ours: str, labels: Mapping[str, Row], device: str) -> None:
     """Fill in what rows of the protocol do not know: labels, time for the video, numbers on what ours answered."""
     for row in outcome.rows:
         name, scene = row["method"], row["scene"]
@@ -253,5 +253,5 @@ def _complete(outcome: Outcome, ours: str, labels: Mapping[str, Row], device: st
         row["seconds_per_video"] = sum(sum(r["ms"].values()) for r in mine) / 1e3
         if name != ours:
             answered = outcome.points[scene, ours, row["truth"]].keep
-            numbers = errors.measure(outcome.points[scene, name, row["truth"]][answered])
+            numbers = errors.measure_errors(outcome.points[scene, name, row["truth"]][answered])
             row["on_ours"] = {k: numbers[k] for k in ("n_kept", "coverage", "median_rel", "p90_rel", "corr")}

@@ -13,13 +13,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 
-from dhtorch import pytree as tree
-from dhtorch.data.pairs import around, fixed
-from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch import pytree
+from dhtorch.data.pairs import candidate_frames, to_fixed_pairs
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import xfeat
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap, errors
 from dhtorch.metrics.errors import Points
@@ -30,7 +30,7 @@ EXPECTATION = (
 )
 
 #: Number → (bar, whether it holds); the second of two bars is for a method of several views.
-BARS: dict[str, tuple[float, float, Callable[[float, float], bool]]] = {
+METHOD_BARS: dict[str, tuple[float, float, Callable[[float, float], bool]]] = {
     "median_rel_ratio": (0.70, 0.60, lambda value, bar: value <= bar),
     "worst_scene_ratio": (1.15, 1.15, lambda value, bar: value <= bar),
     "aurc_ratio": (0.65, 0.55, lambda value, bar: value <= bar),
@@ -44,9 +44,9 @@ BARS: dict[str, tuple[float, float, Callable[[float, float], bool]]] = {
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     chosen: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     methods: Mapping[str, Method] | None = None,
@@ -57,7 +57,7 @@ def run(
     baseline: str = "window",
     indoor: Sequence[str] = (),
     moving: Sequence[str] = (),
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """Run several methods on the same pairs, several seeds each, and compare them with the reference.
 
@@ -87,37 +87,37 @@ def run(
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {reference} and one more")
     fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
     variants = {
-        named(name, k): _variant(method, settings.seed + k, pairs if name in fallback else None)
+        seed_variant_name(name, k): _make_variant(method, settings.seed + k, pairs if name in fallback else None)
         for name, method in methods.items()
         for k in range(1 if name in once else seeds)
     }
     outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
     rooms = {scene.name: scene.place for scene in scenes_of(scenes)}
     apart = {scene.name for scene in scenes_of(scenes) if scene.role is not None}
-    everywhere = {name: seeds_of(outcome, name, seeds) for name in (reference, *compared)}
+    everywhere = {name: points_by_seed(outcome, name, seeds) for name in (reference, *compared)}
     found = {name: {s: p for s, p in of.items() if s not in apart} for name, of in everywhere.items()}
-    complete = compare.completed(found, reference, fallback)
+    complete = compare.complete_scenes(found, reference, fallback)
     judged = compare.method_ratios(complete, reference=reference, rooms=rooms)
-    leave_first_seed(outcome, methods, seeds)
+    keep_first_seed(outcome, methods, seeds)
     outcome.summary |= judged.summary
-    outcome.summary |= _indoor(judged, rooms, indoor)
+    outcome.summary |= _indoor_coverage(judged, rooms, indoor)
     for name, of in everywhere.items():
-        outcome.summary |= _convoy_wrong(name, [p for scene, p in of.items() if rooms[scene] in moving])
+        outcome.summary |= _worst_wrong_share(name, [p for scene, p in of.items() if rooms[scene] in moving])
     several = [name for name in compared if methods[name].views > 1]
     for name in (n for n in several if n != baseline and baseline in compared):
-        numbers, by_scene = compare.against(complete[name], complete[baseline], baseline)
+        numbers, by_scene = compare.multiview_ratios(complete[name], complete[baseline], baseline)
         outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in numbers.items()}
         for scene, row in outcome.scenes(name).items():
             row.update(by_scene.get(scene, {}))  # none where there were too few candidates
-    _annotate(outcome.rows, judged.rows, f"against_{reference}")
+    _add_to_scene_rows(outcome.rows, judged.rows, f"against_{reference}")
     return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, compared, set(several)))
 
 
-def verdict(judged: compare.Comparison, compared: Sequence[str], several: set[str]) -> tuple[bool | None, str]:
+def verdict(judged: compare.MethodComparison, compared: Sequence[str], several: set[str]) -> tuple[bool | None, str]:
     """Hold the summary against the bars, and name what is missed, left out or silenced."""
     missed, n_held = [], 0
     for method in compared:
-        for number, (one, many, holds) in BARS.items():
+        for number, (one, many, holds) in METHOD_BARS.items():
             value, bar = judged.summary.get(f"{method}.{number}", {}).get("value"), many if method in several else one
             if value is None:
                 return None, f"{method}.{number} is not defined on these scenes"
@@ -128,66 +128,68 @@ def verdict(judged: compare.Comparison, compared: Sequence[str], several: set[st
     return not missed, "; ".join([f"{n_held} of {n_held + len(missed)} bars met", *missed, *notes])
 
 
-def _indoor(judged: compare.Comparison, rooms: Mapping[str, str], indoor: Sequence[str]) -> Row:
+def _indoor_coverage(judged: compare.MethodComparison, rooms: Mapping[str, str], indoor: Sequence[str]) -> Row:
     """Coverage at 5 % risk, its mean over the scenes of some rooms."""
     reached: dict[str, list[float]] = {}
     for row in judged.rows:
         if rooms[row["scene"]] in indoor and row["coverage_at_5"] is not None:
             reached.setdefault(row["method"], []).append(row["coverage_at_5"])
     return {
-        f"{name}.coverage_at_5_indoor": bootstrap.interval(values, statistic="mean").entry("1")
+        f"{name}.coverage_at_5_indoor": bootstrap.interval_over_scenes(values, statistic="mean").entry("1")
         for name, values in reached.items()
     }
 
 
-def _convoy_wrong(name: str, scenes: Sequence[Sequence[Points]]) -> Row:
+def _worst_wrong_share(name: str, scenes: Sequence[Sequence[Points]]) -> Row:
     """The worst of the scenes' shares of candidates that are answered and wrong, over the seeds of each."""
-    pools = [pool for pool in map(tree.collate, scenes) if pool.keep.numel()]
+    pools = [pool for pool in map(pytree.collate, scenes) if pool.keep.numel()]
     if not pools:
         return {}
-    shares = [float((pool.keep & (pool.error > errors.WRONG)).double().mean()) for pool in pools]
-    return {f"{name}.convoy_wrong": bootstrap.single(max(shares), len(shares))}
+    shares = [float((pool.keep & (pool.error > errors.GROSS_ERROR_REL)).double().mean()) for pool in pools]
+    return {f"{name}.convoy_wrong": bootstrap.without_interval(max(shares), len(shares))}
 
 
-def _variant(method: Method, seed: int, pairs: Pairs | None) -> Variant:
+def _make_variant(method: Method, seed: int, pairs: ScenePairs | None) -> Variant:
     """A method that chooses its views is offered those around the anchor; another takes the pair's own.
 
     With ``pairs`` it is not asked on scenes of too few views.
     """
     if method.choose is not None:
-        return Variant(method, seed=seed, offers=around, needs=partial(_views, None, method))
-    return Variant(method, seed=seed, needs=partial(_views, pairs, method))
+        return Variant(method, seed=seed, offers=candidate_frames, needs=partial(_skip_reason, None, method))
+    return Variant(method, seed=seed, needs=partial(_skip_reason, pairs, method))
 
 
-def named(method: str, k: int) -> str:
+def seed_variant_name(method: str, k: int) -> str:
     """The variant that is a method with its seed ``k``; the first bears the method's own name."""
     return method if k == 0 else f"{method}, seed {k}"
 
 
-def _views(pairs: Pairs | None, method: Method, scene: Scene) -> str | None:
+def _skip_reason(pairs: ScenePairs | None, method: Method, scene: Scene) -> str | None:
     """Why a method is not asked on a scene: a package, or views that there are not; None where it is."""
-    short = pairs is not None and method.views > 1 and min((j - i for i, j in fixed(pairs(scene))), default=2) < 2
-    return xfeat.lacking(method) or ("fewer than 3 views" if short else None)
+    short = (
+        pairs is not None and method.views > 1 and min((j - i for i, j in to_fixed_pairs(pairs(scene))), default=2) < 2
+    )
+    return xfeat.method_missing_reason(method) or ("fewer than 3 views" if short else None)
 
 
-def leave_first_seed(outcome: Outcome, methods: Iterable[str], seeds: int) -> None:
+def keep_first_seed(outcome: Outcome, methods: Iterable[str], seeds: int) -> None:
     """Take the later seeds out of the rows and the summary; their points stay."""
-    later = {named(name, k) for name in methods for k in range(1, seeds)}
+    later = {seed_variant_name(name, k) for name in methods for k in range(1, seeds)}
     outcome.rows = [r for r in outcome.rows if r["method"] not in later]
     outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
 
 
-def seeds_of(outcome: Outcome, method: str, seeds: int, apart: Collection[str] = ()) -> dict[str, list[Points]]:
+def points_by_seed(outcome: Outcome, method: str, seeds: int, apart: Collection[str] = ()) -> dict[str, list[Points]]:
     """Scene → candidates of every seed; scenes that stand apart stay out."""
     scenes: dict[str, list[Points]] = {}
     for k in range(seeds):
         for (scene, variant, cohort), points in outcome.points.items():
-            if (variant, cohort) == (named(method, k), "full") and scene not in apart:
+            if (variant, cohort) == (seed_variant_name(method, k), "full") and scene not in apart:
                 scenes.setdefault(scene, []).append(points)
     return scenes
 
 
-def _annotate(rows: Sequence[Row], numbers: Sequence[Row], key: str) -> None:
+def _add_to_scene_rows(rows: Sequence[Row], numbers: Sequence[Row], key: str) -> None:
     """Put the comparison's numbers of a scene into its row."""
     known = {(n["scene"], n["method"]): {k: v for k, v in n.items() if k not in ("scene", "method")} for n in numbers}
     for row in rows:

@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from dhtorch.data.scene import Given
+from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import pair
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 
 QUESTION = "Does the torch pipeline give what the same seats filled by OpenCV give, scene by scene?"
@@ -21,16 +21,16 @@ EXPECTATION = "On every scene median error and coverage of ours are at most 10 %
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     chosen: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     methods: Mapping[str, Method] | None = None,
     reference: str = "opencv",
     truths: Sequence[str] = ("raw", "5x5", "full"),
     tolerance: float = 0.1,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Run several methods side by side on the same pairs, for several truth tests.
 
@@ -49,7 +49,7 @@ def run(
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {reference} and one more")
     ours = next(name for name in methods if name != reference)
     outcome = pair.run(scenes, methods, pairs, replace(settings, truth=tuple(truths)), progress=progress)
-    compared, worse = compare(outcome.rows, ours, reference, truths[-1], tolerance)
+    compared, worse = compare_scenes(outcome.rows, ours, reference, truths[-1], tolerance)
     outcome.question, outcome.expectation = QUESTION, EXPECTATION
     if not compared:
         outcome.verdict, outcome.why = "undecided", "no scene on which both methods answered"
@@ -60,7 +60,9 @@ def run(
     return outcome
 
 
-def compare(rows: Sequence[Row], ours: str, reference: str, truth: str, tolerance: float) -> tuple[int, list[str]]:
+def compare_scenes(
+    rows: Sequence[Row], ours: str, reference: str, truth: str, tolerance: float
+) -> tuple[int, list[str]]:
     """Number of scenes compared, and one line for every number that is worse by more than ``tolerance``."""
     scenes = {
         (r["scene"], r["method"]): r for r in rows if r["pair"] is None and r["truth"] == truth and r["role"] is None

@@ -13,13 +13,13 @@ import statistics
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 
-from dhtorch.data.pairs import LADDER, around
+from dhtorch.data.pairs import CANDIDATE_STEPS, candidate_frames
 from dhtorch.data.recording import Recording
-from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import protocol
-from dhtorch.experiments.compare.method_comparison import leave_first_seed, named, seeds_of
-from dhtorch.experiments.outcome import join
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.experiments.compare.method_comparison import keep_first_seed, points_by_seed, seed_variant_name
+from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap, risk
 from dhtorch.metrics.errors import Points
@@ -28,25 +28,25 @@ QUESTION = "Does a method that chooses its views reach the best fixed gap, and i
 EXPECTATION = "On every scene as much at 5 % mean risk as at the gap that is best in hindsight, and silence in a turn."
 
 #: The smallest ratio to the best gap that counts as reaching it, and the largest share answered that counts as silence.
-REACHED, SILENT = 0.95, 0.005
+_MIN_REACHED_RATIO, _MAX_SILENT_RATIO = 0.95, 0.005
 
 #: Added to both coverages of a ratio: below a few of a hundred they are noise.
-FLOOR = 0.01
+_COVERAGE_FLOOR = 0.01
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     chosen: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     methods: Mapping[str, Method] | None = None,
-    gaps: Sequence[int] = LADDER,
+    gaps: Sequence[int] = CANDIDATE_STEPS,
     anchors: int | None = 6,
-    rotations: Sequence[Given] = (),
+    rotations: Sequence[SceneLike] = (),
     rotation_gaps: Sequence[int] = tuple(range(1, 12)),
     seeds: int = 1,
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """``auto`` beside ``map`` at fixed gaps (variants ``map, gap <frames>``), on the same anchors of every scene.
 
@@ -74,10 +74,10 @@ def run(
         ValueError: one of the two methods is missing, no gap, or fewer than one anchor; else as the main job.
     """
     methods = dict(methods or chosen)
-    _check(methods, gaps, rotation_gaps, anchors)
+    _check_options(methods, gaps, rotation_gaps, anchors)
     every = list(scenes_of(scenes))
     every += [scene for scene in scenes_of(rotations) if scene.name not in {known.name for known in every}]
-    asked = partial(protocol.spread, pairs, anchors)
+    asked = partial(protocol.spread_pairs, pairs, anchors)
     turning = [scene for scene in every if scene.role == "rotation"]
     moving = [scene for scene in every if scene.role != "rotation"]
     fixed = {gap: f"map, gap {gap}" for gap in (*gaps, *rotation_gaps)}
@@ -86,18 +86,20 @@ def run(
         variants = _variants(methods, {gap: fixed[gap] for gap in asked_gaps}, settings.seed, seeds)
         whole = Protocol(variants, min_candidates=least)  # a turn is judged by its holes
         parts.append(protocol.run(some, whole, asked, settings, progress=progress))
-    outcome = join(parts)
-    leave_first_seed(outcome, (*fixed.values(), "auto"), seeds)
+    outcome = join_outcomes(parts)
+    keep_first_seed(outcome, (*fixed.values(), "auto"), seeds)
     apart = {scene.name for scene in every if scene.role is not None}
-    alone = {scene.name for scene in every if scene.name not in apart and _one_partner(scene, asked)}
-    reached = {name: _reached(outcome, name, seeds, apart) for name in ("auto", *(fixed[gap] for gap in gaps))}
+    alone = {scene.name for scene in every if scene.name not in apart and _has_one_source_view(scene, asked)}
+    reached = {
+        name: _coverage_by_scene(outcome, name, seeds, apart) for name in ("auto", *(fixed[gap] for gap in gaps))
+    }
     outcome.summary |= _coverages(reached, alone)
-    outcome.summary |= _against_best(outcome, reached, {fixed[gap]: gap for gap in gaps}, alone)
-    outcome.summary |= _answered(outcome, {scene.name for scene in turning})
+    outcome.summary |= _compare_with_best_gap(outcome, reached, {fixed[gap]: gap for gap in gaps}, alone)
+    outcome.summary |= _rotation_answered(outcome, {scene.name for scene in turning})
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, alone))
 
 
-def partner(recording: Recording, anchor: int, *, gap: int) -> list[int]:
+def view_at_gap(recording: Recording, anchor: int, *, gap: int) -> list[int]:
     """The position of the frame ``gap`` numbers after the anchor's, where there is none before it; else nothing."""
     for step in (gap, -gap):
         found: list[int] = (recording.number == recording.number[anchor] + step).nonzero()[:, 0].tolist()
@@ -106,9 +108,9 @@ def partner(recording: Recording, anchor: int, *, gap: int) -> list[int]:
     return []
 
 
-def ratio(auto: float, best: float) -> float:
+def coverage_ratio(auto: float, best: float) -> float:
     """How much of the best gap's coverage is reached."""
-    return (auto + FLOOR) / (best + FLOOR)
+    return (auto + _COVERAGE_FLOOR) / (best + _COVERAGE_FLOOR)
 
 
 def verdict(outcome: Outcome, alone: Collection[str] = ()) -> tuple[bool | None, str]:
@@ -118,18 +120,18 @@ def verdict(outcome: Outcome, alone: Collection[str] = ()) -> tuple[bool | None,
     apart = f"; one partner only: {', '.join(sorted(alone))}" if alone else ""
     if worst is None:
         return None, f"no scene whose anchors have several partners{apart}"
-    below = {s: r for s, r in _ratios(outcome).items() if r < REACHED}
+    below = {s: r for s, r in _gap_ratios(outcome).items() if r < _MIN_REACHED_RATIO}
     missed = ", ".join(f"{scene} {r:.2f}" for scene, r in sorted(below.items(), key=lambda item: item[1]))
     why = f"of the best fixed gap's coverage at 5 % risk at least {worst:.2f} on every scene"
-    why += f" (below {REACHED:g}: {missed or 'none'})"
+    why += f" (below {_MIN_REACHED_RATIO:g}: {missed or 'none'})"
     if answered is None:
         return None, f"{why}; no scene in which the camera only turns{apart}"
     beside = "–" if fixed is None else f"{fixed:.2%}"
     why += f"; in a turn {answered:.2%} of the samples without a return answered, map at fixed gaps {beside}{apart}"
-    return worst >= REACHED and answered <= SILENT, why
+    return worst >= _MIN_REACHED_RATIO and answered <= _MAX_SILENT_RATIO, why
 
 
-def _check(
+def _check_options(
     methods: Mapping[str, Method], gaps: Sequence[int], rotation_gaps: Sequence[int], anchors: int | None
 ) -> None:
     if missing := {"map", "auto"} - methods.keys():
@@ -145,21 +147,23 @@ def _variants(methods: Mapping[str, Method], fixed: Mapping[int, str], seed: int
     """``auto`` with the frames around the anchor, and ``map`` at every gap, with so many seeds each."""
     found = {}
     for k in range(seeds):
-        found[named("auto", k)] = Variant(methods["auto"], seed=seed + k, offers=around)
+        found[seed_variant_name("auto", k)] = Variant(methods["auto"], seed=seed + k, offers=candidate_frames)
         for gap, name in fixed.items():
-            found[named(name, k)] = Variant(methods["map"], seed=seed + k, offers=partial(partner, gap=gap))
+            found[seed_variant_name(name, k)] = Variant(
+                methods["map"], seed=seed + k, offers=partial(view_at_gap, gap=gap)
+            )
     return found
 
 
-def _one_partner(scene: Scene, pairs: Pairs) -> bool:
+def _has_one_source_view(scene: Scene, pairs: ScenePairs) -> bool:
     """Whether there is nothing to choose from at any of the anchors."""
-    return all(len(around(scene.recording, i)) == 1 for i, _ in pairs(scene))
+    return all(len(candidate_frames(scene.recording, i)) == 1 for i, _ in pairs(scene))
 
 
-def _reached(outcome: Outcome, name: str, seeds: int, apart: Collection[str]) -> dict[str, float]:
+def _coverage_by_scene(outcome: Outcome, name: str, seeds: int, apart: Collection[str]) -> dict[str, float]:
     """Scene → coverage at 5 % risk, the median over seeds; scenes without a candidate have none."""
     found = {}
-    for scene, points in seeds_of(outcome, name, seeds, apart).items():
+    for scene, points in points_by_seed(outcome, name, seeds, apart).items():
         values = [v for v in map(_coverage_at_5, points) if v is not None]
         if values:
             found[scene] = statistics.median(values)
@@ -167,20 +171,20 @@ def _reached(outcome: Outcome, name: str, seeds: int, apart: Collection[str]) ->
 
 
 def _coverage_at_5(points: Points) -> float | None:
-    return risk.measure(points)["coverage_at_5"]
+    return risk.measure_risk(points)["coverage_at_5"]
 
 
 def _coverages(reached: Mapping[str, Mapping[str, float]], alone: Collection[str]) -> Row:
     """Every variant's coverage at 5 % risk, its mean over scenes with several partners."""
     return {
-        f"{name}.coverage_at_5": bootstrap.interval(
+        f"{name}.coverage_at_5": bootstrap.interval_over_scenes(
             [v for scene, v in by_scene.items() if scene not in alone], statistic="mean"
         ).entry("1")
         for name, by_scene in reached.items()
     }
 
 
-def _against_best(
+def _compare_with_best_gap(
     outcome: Outcome, reached: Mapping[str, Mapping[str, float]], gaps: Mapping[str, int], alone: Collection[str]
 ) -> Row:
     """Note the best gap and the ratio to it in the rows of ``auto``, and join the ratios over scenes."""
@@ -188,33 +192,37 @@ def _against_best(
     for scene, auto in reached["auto"].items():
         best = max(gaps, key=lambda name: reached[name][scene])  # the first of equals
         rows[scene]["best_gap"] = gaps[best]
-        rows[scene]["fixed_gap_ratio"] = ratio(auto, reached[best][scene])
+        rows[scene]["fixed_gap_ratio"] = coverage_ratio(auto, reached[best][scene])
         rows[scene]["one_partner"] = scene in alone
-    ratios = list(_ratios(outcome).values())
+    ratios = list(_gap_ratios(outcome).values())
     return {
-        "auto.fixed_gap_ratio": bootstrap.interval(ratios, statistic="geometric_mean").entry("1"),
-        "auto.fixed_gap_ratio_worst": bootstrap.single(min(ratios, default=None), len(ratios)),
+        "auto.fixed_gap_ratio": bootstrap.interval_over_scenes(ratios, statistic="geometric_mean").entry("1"),
+        "auto.fixed_gap_ratio_worst": bootstrap.without_interval(min(ratios, default=None), len(ratios)),
     }
 
 
-def _ratios(outcome: Outcome) -> dict[str, float]:
+def _gap_ratios(outcome: Outcome) -> dict[str, float]:
     """Scene → ratio to the best gap; scenes with one partner are left out."""
     rows = outcome.scenes("auto")
     return {s: r["fixed_gap_ratio"] for s, r in rows.items() if "fixed_gap_ratio" in r and not r["one_partner"]}
 
 
-def _answered(outcome: Outcome, turning: Collection[str]) -> Row:
+def _rotation_answered(outcome: Outcome, turning: Collection[str]) -> Row:
     """Share of the samples without a return that are answered, over the scenes in which the camera only turns."""
     asked = [r for r in outcome.rows if r["scene"] in turning and r["pair"] is not None and r["views"]]
     for row in outcome.rows:
         if row["scene"] in turning and row["pair"] is None:
             name = row["scene"], row["method"]
-            row["recovered_share"] = _share([r for r in asked if (r["scene"], r["method"]) == name])
-    shares = {name: _share([r for r in asked if r["method"].partition(",")[0] == name]) for name in ("auto", "map")}
-    return {f"{name}.rotation_answered": bootstrap.single(share, len(turning)) for name, share in shares.items()}
+            row["recovered_share"] = _answered_share([r for r in asked if (r["scene"], r["method"]) == name])
+    shares = {
+        name: _answered_share([r for r in asked if r["method"].partition(",")[0] == name]) for name in ("auto", "map")
+    }
+    return {
+        f"{name}.rotation_answered": bootstrap.without_interval(share, len(turning)) for name, share in shares.items()
+    }
 
 
-def _share(rows: Sequence[Row]) -> float | None:
+def _answered_share(rows: Sequence[Row]) -> float | None:
     """Samples without a return that some pairs answered, of all that they had; None of none."""
     holes = sum(row["n_holes"] for row in rows)
     return sum(row["n_recovered"] for row in rows) / holes if holes else None

@@ -15,13 +15,13 @@ from torch import Tensor
 
 from dhtorch.geometry import filters
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.filters import gaussian, gaussian_taps, separable
+from dhtorch.geometry.filters import correlate_separable, gaussian_blur, gaussian_taps
 from dhtorch.geometry.thin_lens import GAUSSIAN_OF_DISC, Lens, depth_of_spot
 from dhtorch.pytree import Record, record
 
 
 @record
-class Blur(Record):
+class BlurMap(Record):
     """How blurred a picture is, pixel by pixel."""
 
     sigma: Tensor  # (B, H, W) px; 0 where not valid
@@ -29,7 +29,7 @@ class Blur(Record):
     valid: Tensor  # (B, H, W) bool: edges well above the noise, and a ratio that some blur explains
 
 
-def local_blur(
+def estimate_blur(
     image: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     *,
     fine_px: float = 1.0,
@@ -38,7 +38,7 @@ def local_blur(
     noise: float = 1 / 255,
     min_snr: float = 60.0,
     max_sigma_px: float = 8.0,
-) -> Blur:
+) -> BlurMap:
     """Standard deviation of the blur around every pixel, from gradients at two scales.
 
     An edge of blur σ, seen through a Gaussian derivative of width w, has a gradient energy in 1 / √(σ² + w²). The ratio
@@ -62,7 +62,7 @@ def local_blur(
     check("local_blur", image=(image, "B C H W"))
     if not 0 < fine_px < coarse_px:
         raise ValueError(f"local_blur: widths are {fine_px} and {coarse_px} px, expected 0 < fine_px < coarse_px")
-    grey = filters.grey(image)
+    grey = filters.grayscale(image)
     fine, fine_noise = _gradient_energy(grey, fine_px, window_px, noise)
     coarse, coarse_noise = _gradient_energy(grey, coarse_px, window_px, noise)
     seen = (fine > min_snr * max(fine_noise, 1e-12)) & (coarse > min_snr * max(coarse_noise, 1e-12))
@@ -75,11 +75,11 @@ def local_blur(
     variance = (coarse_px**2 - squared * fine_px**2) / excess
     some = valid & (variance > 0)
     sigma = torch.where(some, torch.where(some, variance, torch.ones_like(variance)).sqrt(), torch.zeros_like(variance))
-    return Blur(sigma, torch.where(seen, fine, torch.zeros_like(fine)), valid)
+    return BlurMap(sigma, torch.where(seen, fine, torch.zeros_like(fine)), valid)
 
 
-def inverse_depth(
-    blur: Blur,
+def inverse_depth_from_blur(
+    blur: BlurMap,
     side: Tensor,  # (B, H, W) −1 or +1
     lens: Lens,
     focus_m: Tensor,  # (B,)
@@ -89,7 +89,7 @@ def inverse_depth(
     """Inverse depth (B, H, W) in dioptres of a blur whose side of the focus is given; NaN where there is none.
 
     Args:
-        blur: from :func:`local_blur`.
+        blur: from :func:`estimate_blur`.
         side: from an oracle or a guess.
         lens, focus_m: of the picture.
         sharp_px: blur of a picture in focus, taken off in squares.
@@ -111,7 +111,7 @@ def inverse_depth(
     return torch.where(blur.valid, dioptres, torch.full_like(dioptres, torch.nan))
 
 
-def side_by_height(blur: Blur) -> Tensor:
+def guess_side_by_height(blur: BlurMap) -> Tensor:
     """Side (B, H, W) guessed as a photographer would: what stands above the sharpest rows is beyond them.
 
     In upright pictures of rooms and streets the lower half is nearer. The level of focus is the mean row of the valid
@@ -130,7 +130,7 @@ def side_by_height(blur: Blur) -> Tensor:
     return side[..., None].expand(blur.sigma.shape)
 
 
-def side_by_colour(
+def guess_side_by_colour(
     image: Tensor,  # (B, 3, H, W) float in [0, 1] or uint8
     *,
     window_px: float = 6.0,
@@ -145,16 +145,16 @@ def side_by_colour(
         ValueError: wrong shapes.
     """
     check("side_by_colour", image=(image, "B 3 H W"))
-    red, blue = (local_blur(image[:, k : k + 1], window_px=window_px, noise=noise) for k in (0, 2))
+    red, blue = (estimate_blur(image[:, k : k + 1], window_px=window_px, noise=noise) for k in (0, 2))
     both = red.valid & blue.valid
     lead = torch.where(both, blue.sigma * blue.sigma - red.sigma * red.sigma, torch.zeros_like(red.sigma))
-    return torch.where(both, torch.sign(gaussian(lead[:, None], window_px / 2)[:, 0]), 0.0)
+    return torch.where(both, torch.sign(gaussian_blur(lead[:, None], window_px / 2)[:, 0]), 0.0)
 
 
 def _gradient_energy(grey: Tensor, width_px: float, window_px: float, noise: float) -> tuple[Tensor, float]:
     """Mean squared gradient (B, H, W) in a window, and what of it is expected of noise (already taken off)."""
     smooth = gaussian_taps(width_px)
     slope = gaussian_taps(width_px, derivative=True)
-    across, down = separable(grey, smooth, slope), separable(grey, slope, smooth)
+    across, down = correlate_separable(grey, smooth, slope), correlate_separable(grey, slope, smooth)
     expected = 2 * noise * noise * sum([w * w for w in smooth]) * sum([w * w for w in slope])
-    return (gaussian(across * across + down * down, window_px) - expected)[:, 0], expected
+    return (gaussian_blur(across * across + down * down, window_px) - expected)[:, 0], expected

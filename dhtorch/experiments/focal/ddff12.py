@@ -20,12 +20,12 @@ import torch
 from torch import Tensor
 
 from dhtorch.data import convert
-from dhtorch.data.codecs.hdf5 import Hdf5Array, hdf5_arrays
-from dhtorch.data.codecs.npy import real_header
+from dhtorch.data.codecs.hdf5 import Hdf5Array, list_hdf5_arrays
+from dhtorch.data.codecs.npy import parse_real_npy_header
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.experiments.focal.light_field import refocus
-from dhtorch.experiments.focal.stacks import FocalStack, Stacks, focus_distances
+from dhtorch.experiments.focal.stacks import FocalStack, FocalStacks, parse_focus_distances
 
 _DEPTH_DISPARITY = 0.1412376  # m px: 521.4052 px focal length times 0.27088 mm between two sub-apertures
 _DISPARITIES = (0.28247513, 0.02017679)  # px, of the first slice (0.5 m) and the last (7 m)
@@ -42,7 +42,7 @@ def recognise(root: Path) -> str | None:
     if (root / "LightField").is_dir() and next((root / "LightField").glob("*/*/LF_*.npy"), None):
         return "light fields LightField/<split>/<scene>/LF_<n>.npy"
     sources = [root] if root.suffix in (".h5", ".hdf5") and root.is_file() else sorted(root.glob("*.h5"))[:1]
-    if sources and any(key.startswith(("stack_", "stacks_")) for key in hdf5_arrays(sources[0])):
+    if sources and any(key.startswith(("stack_", "stacks_")) for key in list_hdf5_arrays(sources[0])):
         return "HDF5 arrays stack_<split>"
     return None
 
@@ -55,7 +55,7 @@ def read(
     depth_disparity: float = _DEPTH_DISPARITY,
     depth_folder: str = "DepthRegistered",
     per_scene: int | None = None,
-) -> Stacks:
+) -> FocalStacks:
     """Open DDFF-12.
 
     Args:
@@ -79,7 +79,7 @@ def read(
     root = Path(root)
     constant = files.to_positive(depth_disparity, root, "option depth_disparity")
     steps = torch.linspace(*_DISPARITIES, _SLICES, dtype=torch.float64)
-    focus = (constant / steps).float() if focus_m is None else focus_distances(focus_m, root)
+    focus = (constant / steps).float() if focus_m is None else parse_focus_distances(focus_m, root)
     if per_scene is not None and per_scene < 1:
         raise FormatError(root, "option per_scene", per_scene, "at least 1")
     raw = (root / "LightField").is_dir()
@@ -87,13 +87,13 @@ def read(
     shots = [shot for shot in shots if split in (None, shot.split)]
     if not shots:
         raise FormatError(root, "stacks", f"none of split {split or 'any'}", "stack_<split> or LightField/<split>/")
-    load = _Load(tuple(shots), focus, constant)
+    load = _StackLoader(tuple(shots), focus, constant)
     names, scenes = (tuple(found) for found in zip(*((s.name, s.scene) for s in shots), strict=True))
-    return Stacks(root.resolve().stem, "ddff12", load, names, root=root, report=tuple(report), scenes=scenes)
+    return FocalStacks(root.resolve().stem, "ddff12", load, names, root=root, report=tuple(report), scenes=scenes)
 
 
 @dataclass(frozen=True, eq=False)
-class _Shot:
+class _StackLocation:
     """Where one stack lies: a row of an array, or a light field."""
 
     name: str
@@ -105,10 +105,10 @@ class _Shot:
 
 
 @dataclass(frozen=True, eq=False)
-class _Load:
+class _StackLoader:
     """Position → stack."""
 
-    shots: tuple[_Shot, ...]
+    shots: tuple[_StackLocation, ...]
     focus: Tensor  # (S,)
     depth_disparity: float
 
@@ -118,10 +118,10 @@ class _Load:
             images = refocus(_light_field(shot.stack), self.depth_disparity / self.focus.double())
         else:
             images = _as_images(shot.stack.row(shot.row), shot.stack)
-        source, hw = _file(shot.stack), (images.shape[-2], images.shape[-1])
+        source, hw = _source_file(shot.stack), (images.shape[-2], images.shape[-1])
         if len(images) != len(self.focus):
             raise FormatError(
-                _file(shot.stack), "slices", len(images), f"{len(self.focus)}, one for each focus distance"
+                _source_file(shot.stack), "slices", len(images), f"{len(self.focus)}, one for each focus distance"
             )
         depth = None
         if isinstance(shot.truth, Path):
@@ -131,15 +131,15 @@ class _Load:
             usable = np.isfinite(disparity) & (disparity > _MIN_DISPARITY)
             metres = np.where(usable, self.depth_disparity / np.where(usable, disparity, 1), 0)
             depth = torch.from_numpy(metres.astype(np.float32))[None]
-        camera = convert.to_camera(convert.matrix_of(*_K), hw, source) if hw == _HW else None
+        camera = convert.to_camera(convert.make_K(*_K), hw, source) if hw == _HW else None
         return FocalStack(images[None], self.focus[None], depth, camera)
 
 
-def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_Shot], list[str]]:
+def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_StackLocation], list[str]]:
     sources = [root] if root.is_file() else sorted(root.glob("*.h5"))
     shots = []
     for file in sources:
-        arrays = hdf5_arrays(file)
+        arrays = list_hdf5_arrays(file)
         for key, stack in arrays.items():
             match = re.fullmatch(r"stacks?_(\w+)", key)
             if not match:
@@ -152,11 +152,11 @@ def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_Shot], list[s
                 raise FormatError(file, truth.key, f"shape {truth.shape}", f"{(n, *hw)}, as {key}")
             prefix = f"{file.stem}/{match[1]}" if len(sources) > 1 else match[1]
             rooms = [prefix if per_scene is None else f"{prefix}/scene_{i // per_scene:02d}" for i in range(n)]
-            shots += [_Shot(f"{prefix}/{i:04d}", match[1], rooms[i], stack, truth, i) for i in range(n)]
+            shots += [_StackLocation(f"{prefix}/{i:04d}", match[1], rooms[i], stack, truth, i) for i in range(n)]
     return shots, []
 
 
-def _light_fields(root: Path, depth_folder: str) -> tuple[list[_Shot], list[str]]:
+def _light_fields(root: Path, depth_folder: str) -> tuple[list[_StackLocation], list[str]]:
     shots, report = [], []
     for file in sorted((root / "LightField").glob("*/*/LF_*.npy")):
         scene = file.parent.relative_to(root / "LightField")
@@ -168,14 +168,14 @@ def _light_fields(root: Path, depth_folder: str) -> tuple[list[_Shot], list[str]
         else:
             label = truth if folder.is_dir() else None
             room = scene.as_posix()
-            shots.append(_Shot(f"{room}/{number}", scene.parts[0], room, file, label))
+            shots.append(_StackLocation(f"{room}/{number}", scene.parts[0], room, file, label))
     return shots, report
 
 
 def _light_field(file: Path) -> Tensor:
     """(U, V, H, W, 3) uint8."""
     raw = files.read_bytes(file)
-    header = real_header(file, "light field", raw)
+    header = parse_real_npy_header(file, "light field", raw)
     shape = header.shape
     usable = len(shape) == 5 and shape[4] in (1, 3) and max(shape[:2]) <= _MAX_APERTURES and min(shape) > 0
     if header.dtype != np.uint8 or header.fortran or not usable:
@@ -198,5 +198,5 @@ def _as_images(stack: np.ndarray, source: Hdf5Array) -> Tensor:
     return images.to(torch.uint8) if bool((images == images.round()).all()) else images / 255
 
 
-def _file(source: Hdf5Array | Path) -> Path:
+def _source_file(source: Hdf5Array | Path) -> Path:
     return source if isinstance(source, Path) else source.file

@@ -22,17 +22,23 @@ import torch
 from torch import Tensor
 
 from dhtorch.data.recording import Recording
-from dhtorch.data.scene import Given, Scene, scenes_of
-from dhtorch.experiments.focal.blur import Blur, inverse_depth, local_blur, side_by_colour, side_by_height
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
-from dhtorch.experiments.rows import Row, median
-from dhtorch.experiments.screening import Item, screen
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.experiments.focal.blur import (
+    BlurMap,
+    estimate_blur,
+    guess_side_by_colour,
+    guess_side_by_height,
+    inverse_depth_from_blur,
+)
+from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
+from dhtorch.experiments.rows import Row, median_or_none
+from dhtorch.experiments.screening import ScreenedItem, screen_scenes
 from dhtorch.geometry.thin_lens import GAUSSIAN_OF_DISC, Lens, spot_diameter
 from dhtorch.metrics import bootstrap, holdout
 from dhtorch.metrics.correlation import pearson, spearman
 from dhtorch.records import Frame
 from dhtorch.synthetic.recording import SyntheticRoom
-from dhtorch.synthetic.thin_lens import lens_of, photograph
+from dhtorch.synthetic.thin_lens import make_lens, render_defocus
 
 QUESTION = "How much depth is there in the defocus of a single picture?"
 EXPECTATION = (
@@ -40,23 +46,23 @@ EXPECTATION = (
 )
 
 #: Ways to produce the side without an oracle.
-DEPLOYABLE = ("by_height", "by_colour", "all_beyond")
-VARIANTS = ("oracle_side", *DEPLOYABLE, "height_alone", "texture_alone", "natural")
+_DEPLOYABLE_SIDES = ("by_height", "by_colour", "all_beyond")
+VARIANTS = ("oracle_side", *_DEPLOYABLE_SIDES, "height_alone", "texture_alone", "natural")
 
 #: Fewest pixels on which a correlation is said.
-MIN_SITES = 50
+_MIN_CORRELATION_SITES = 50
 
 #: Inverse distance beyond which nothing is focused, 1/m.
-FARTHEST_DPT = 0.01
+_MIN_FOCUS_DPT = 0.01
 
 #: What counts as weak, as a working oracle, and how much of it a deployable estimator may keep.
-WEAK, USEFUL, KEPT = 0.5, 0.4, 0.5
+_MAX_WEAK_CORRELATION, _MIN_ORACLE_CORRELATION, _MAX_KEPT_RATIO = 0.5, 0.4, 0.5
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     focal_length_m: float = 0.035,
@@ -65,7 +71,7 @@ def run(
     noise: float = 1 / 255,
     stride_px: int = 4,
     window_px: float = 6.0,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Measure blur in every picture at valid pixels of a grid whose depth passes the truth test.
 
@@ -73,7 +79,8 @@ def run(
     claimed and true inverse depth; ``side_right``, share of pixels whose side is right; ``blur_corr``, Pearson of
     measured and true blur; ``texture_corr``, Pearson of measured blur and the blur measured without a lens;
     ``rho_perfect``, what ``rho_abs`` would be with the true blur; ``coverage``, share of the candidates with edges.
-    The two ambiguities stand apart in the summary: ``blank_wall.*`` and ``two_sides.*``, see :func:`ambiguities`.
+    The two ambiguities stand apart in the summary: ``blank_wall.*`` and ``two_sides.*``, see
+    :func:`measure_ambiguities`.
 
     Args:
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`. One with exact depth
@@ -91,23 +98,25 @@ def run(
     """
     optics = {"focal_length_m": focal_length_m, "f_number": f_number}
 
-    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         frame = scene.recording[item[0]].to(settings.dtype).to(settings.device)
-        uv = _grid(frame.hw, stride_px, frame.camera.f)
-        if not is_exact(scene.recording):
-            blur = local_blur(frame.image, noise=noise, window_px=window_px)
-            return {"natural": _unsigned(frame, uv, blur)}
-        lens = lens_of(float(frame.camera.f[0, 0]), **optics).to(settings.dtype)
-        return _through_lens(
+        uv = _pixel_grid(frame.hw, stride_px, frame.camera.f)
+        if not has_exact_depth(scene.recording):
+            blur = estimate_blur(frame.image, noise=noise, window_px=window_px)
+            return {"natural": _correlate_unsigned(frame, uv, blur)}
+        lens = make_lens(float(frame.camera.f[0, 0]), **optics).to(settings.dtype)
+        return _measure_through_lens(
             frame, uv, lens, colour=axial_colour_dpt, noise=noise, window_px=window_px, seed=settings.seed
         )
 
-    outcome = screen(scenes_of(scenes), lambda _r: [(0, 0)], ask, VARIANTS, truth="full", progress=progress)
-    outcome.summary |= {k: bootstrap.single(v, 1) for k, v in ambiguities(noise=noise, window_px=window_px).items()}
+    outcome = screen_scenes(scenes_of(scenes), lambda _r: [(0, 0)], ask, VARIANTS, truth="full", progress=progress)
+    outcome.summary |= {
+        k: bootstrap.without_interval(v, 1) for k, v in measure_ambiguities(noise=noise, window_px=window_px).items()
+    }
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
-def is_exact(recording: Recording) -> bool:
+def has_exact_depth(recording: Recording) -> bool:
     """Whether every pixel of a recording has exact depth, so that a lens can be put in front of it."""
     return isinstance(recording, SyntheticRoom) and recording.lidar == "exact"
 
@@ -116,10 +125,10 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     """Weak without a side, useful with the oracle's, and mostly lost when the side has to be produced?"""
 
     def over_scenes(variant: str, metric: str) -> float | None:
-        return bootstrap.interval([r.get(metric) for r in outcome.scenes(variant).values()]).value
+        return bootstrap.interval_over_scenes([r.get(metric) for r in outcome.scenes(variant).values()]).value
 
     rho, oracle = over_scenes("oracle_side", "rho_abs"), over_scenes("oracle_side", "corr")
-    tried = {v: r for v in DEPLOYABLE if (r := over_scenes(v, "corr")) is not None}
+    tried = {v: r for v in _DEPLOYABLE_SIDES if (r := over_scenes(v, "corr")) is not None}
     if rho is None or oracle is None or not tried:
         natural = over_scenes("natural", "rho_abs")
         found = "" if natural is None else f"; |rho| of the pictures as they are {natural:.2f} (paper 0.22)"
@@ -130,10 +139,12 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
         f" side {oracle:.2f} (0.66), best deployable {best} {tried[best]:+.2f} (0.06);"
         f" the height in the picture alone, without any blur, {over_scenes('height_alone', 'corr') or 0:+.2f}"
     )
-    return rho <= WEAK and oracle >= USEFUL and tried[best] < KEPT * oracle, why
+    return rho <= _MAX_WEAK_CORRELATION and oracle >= _MIN_ORACLE_CORRELATION and tried[
+        best
+    ] < _MAX_KEPT_RATIO * oracle, why
 
 
-def ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int = 0) -> dict[str, float | None]:
+def measure_ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int = 0) -> dict[str, float | None]:
     """The two things that one picture cannot tell apart, each alone, on a wall facing a lens.
 
     Returns:
@@ -143,18 +154,18 @@ def ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int = 0) ->
         ratio of the two claims, 1 = nothing tells them apart.
     """
     hw, focus = (120, 160), torch.tensor([[2.0]])
-    lens = lens_of(265.0, f_number=0.35)
+    lens = make_lens(265.0, f_number=0.35)
     draw = torch.Generator().manual_seed(seed)
     blocks = torch.rand(1, 1, 8, 10, generator=draw).repeat_interleave(15, 2).repeat_interleave(16, 3)
     shadow = torch.linspace(0.3, 0.7, hw[1]).expand(1, 1, *hw)
 
     def claimed(paint: Tensor, z: float) -> tuple[float | None, float]:
-        seen = photograph(paint, torch.full((1, *hw), z), lens, focus)[:, 0]
+        seen = render_defocus(paint, torch.full((1, *hw), z), lens, focus)[:, 0]
         seen = seen + noise * torch.randn(seen.shape, generator=draw)
-        blur = local_blur(seen, noise=noise, window_px=window_px)
-        return median(blur.sigma[blur.valid].tolist()), float(blur.valid.float().mean())
+        blur = estimate_blur(seen, noise=noise, window_px=window_px)
+        return median_or_none(blur.sigma[blur.valid].tolist()), float(blur.valid.float().mean())
 
-    soft = photograph(blocks, torch.full((1, *hw), 8.0), lens, focus)[:, 0]  # paint as soft as a spot of 6 m off
+    soft = render_defocus(blocks, torch.full((1, *hw), 8.0), lens, focus)[:, 0]  # paint as soft as a spot of 6 m off
     near, far = (claimed(blocks, 1 / (0.5 + d))[0] for d in (0.25, -0.25))
     true = GAUSSIAN_OF_DISC * abs(float(spot_diameter(lens, torch.tensor([[4.0]]), focus[:, 0])))
     return {
@@ -168,7 +179,7 @@ def ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int = 0) ->
     }
 
 
-def _through_lens(
+def _measure_through_lens(
     frame: Frame, uv: Tensor, lens: Lens, *, colour: float, noise: float, window_px: float, seed: int
 ) -> dict[str, Row]:
     """Variant → numbers of one picture, focused on its middle."""
@@ -178,26 +189,26 @@ def _through_lens(
     shifts = (-colour / 2, 0.0, colour / 2) if sharp.shape[1] == 3 else (0.0,)
     parts = [(sharp, 0.0)] if not colour else [(sharp[:, k : k + 1], shift) for k, shift in enumerate(shifts)]
     # Red of a lens focused far may be in focus nowhere: as far as can be stands for that.
-    focused = [(x, (1 / (1 / focus + d).clamp_min(FARTHEST_DPT))[:, None]) for x, d in parts]
-    seen = torch.cat([photograph(x, depth, lens, s)[:, 0] for x, s in focused], 1)
+    focused = [(x, (1 / (1 / focus + d).clamp_min(_MIN_FOCUS_DPT))[:, None]) for x, d in parts]
+    seen = torch.cat([render_defocus(x, depth, lens, s)[:, 0] for x, s in focused], 1)
     grain = noise * torch.randn(seen.shape, generator=torch.Generator().manual_seed(seed)).to(seen)
     seen = seen + grain
-    blur = local_blur(seen, noise=noise, window_px=window_px)
-    pinhole = local_blur(sharp + grain, noise=noise, window_px=window_px)
+    blur = estimate_blur(seen, noise=noise, window_px=window_px)
+    pinhole = estimate_blur(sharp + grain, noise=noise, window_px=window_px)
     spot = spot_diameter(lens, depth.flatten(1), focus).view(depth.shape)
     true_side = torch.where(spot < 0, -torch.ones_like(spot), torch.ones_like(spot))
     row_up = torch.arange(h, 0, -1, dtype=depth.dtype)[:, None].expand(depth.shape)
     sides = {
         "oracle_side": true_side,
-        "by_height": side_by_height(blur),
-        "by_colour": side_by_colour(seen, window_px=window_px, noise=noise) if colour else None,
+        "by_height": guess_side_by_height(blur),
+        "by_colour": guess_side_by_colour(seen, window_px=window_px, noise=noise) if colour else None,
         "all_beyond": torch.ones_like(spot),
     }
     sites = _Sites(frame, uv)
     rows = {}
     for name, side in sides.items():
         if side is not None:
-            claim = inverse_depth(blur, side, lens, focus)
+            claim = inverse_depth_from_blur(blur, side, lens, focus)
             rows[name] = sites.numbers(blur.valid & (side != 0), claim, blur.sigma)
             rows[name] |= {"side_right": sites.share(blur.valid & (side != 0), side == true_side)}
             rows[name] |= {"blur_corr": sites.against(blur.valid, blur.sigma, GAUSSIAN_OF_DISC * spot.abs())}
@@ -212,7 +223,7 @@ class _Sites:
     """The candidates of a picture: pixels of the grid whose depth passes the truth test."""
 
     def __init__(self, frame: Frame, uv: Tensor) -> None:
-        truth = holdout.truth_at(frame, uv)
+        truth = holdout.sample_truth(frame, uv)
         self.index = (uv[0, :, 1].long(), uv[0, :, 0].long())
         self.candidate, self.depth = truth.ok[0], truth.depth[0].double()
 
@@ -223,7 +234,7 @@ class _Sites:
     def numbers(self, valid: Tensor, claim: Tensor, blur: Tensor) -> Row:
         """How a claim of inverse depth (1, H, W), and the blur under it, go with the true one."""
         use = self.candidate & self.at(valid)
-        enough = int(use.sum()) >= MIN_SITES
+        enough = int(use.sum()) >= _MIN_CORRELATION_SITES
         n = int(self.candidate.sum())
         x, y = self.at(claim)[use].double(), 1 / self.depth[use]
         return {
@@ -238,13 +249,21 @@ class _Sites:
     def rho(self, valid: Tensor, x: Tensor) -> float | None:
         """|Spearman| of a map with true inverse depth."""
         use = self.candidate & self.at(valid)
-        found = spearman(self.at(x)[use].double(), 1 / self.depth[use]) if int(use.sum()) >= MIN_SITES else None
+        found = (
+            spearman(self.at(x)[use].double(), 1 / self.depth[use])
+            if int(use.sum()) >= _MIN_CORRELATION_SITES
+            else None
+        )
         return None if found is None else abs(found)
 
     def against(self, valid: Tensor, x: Tensor, y: Tensor) -> float | None:
         """Pearson's r of two maps."""
         use = self.candidate & self.at(valid)
-        return pearson(self.at(x)[use].double(), self.at(y)[use].double()) if int(use.sum()) >= MIN_SITES else None
+        return (
+            pearson(self.at(x)[use].double(), self.at(y)[use].double())
+            if int(use.sum()) >= _MIN_CORRELATION_SITES
+            else None
+        )
 
     def share(self, valid: Tensor, right: Tensor) -> float | None:
         """Share of the valid candidates where a mask holds."""
@@ -252,11 +271,11 @@ class _Sites:
         return float(self.at(right)[use].double().mean()) if bool(use.any()) else None
 
 
-def _unsigned(frame: Frame, uv: Tensor, blur: Blur) -> Row:
+def _correlate_unsigned(frame: Frame, uv: Tensor, blur: BlurMap) -> Row:
     return {"rho_abs": _Sites(frame, uv).rho(blur.valid, blur.sigma)}
 
 
-def _grid(hw: tuple[int, int], stride: int, like: Tensor) -> Tensor:
+def _pixel_grid(hw: tuple[int, int], stride: int, like: Tensor) -> Tensor:
     """Whole pixels (1, N, 2) of a grid."""
     v = torch.arange(stride // 2, hw[0], stride, dtype=like.dtype, device=like.device)
     u = torch.arange(stride // 2, hw[1], stride, dtype=like.dtype, device=like.device)

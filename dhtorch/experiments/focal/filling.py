@@ -15,16 +15,16 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.experiments.focal.blur import Blur
+from dhtorch.experiments.focal.blur import BlurMap
 from dhtorch.geometry import filters
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.filters import box, gaussian
+from dhtorch.geometry.filters import box_mean, gaussian_blur
 
 #: Least weight of returns that makes an answer.
-LEAST = 1e-6
+_MIN_WEIGHT = 1e-6
 
 
-def bilinear(
+def fill_bilinear(
     coarse: Tensor,  # (B, h, w) m, 0 = no return
     hw: tuple[int, int],
 ) -> Tensor:
@@ -37,12 +37,12 @@ def bilinear(
     """
     check("bilinear", coarse=(coarse, "B h w"))
     there = (coarse > 0).to(coarse.dtype)
-    total, weight = (_resized(x, hw) for x in (coarse * there, there))
-    seen = weight > LEAST
+    total, weight = (_resize(x, hw) for x in (coarse * there, there))
+    seen = weight > _MIN_WEIGHT
     return torch.where(seen, total / torch.where(seen, weight, torch.ones_like(weight)), torch.zeros_like(total))
 
 
-def joint_bilateral(
+def fill_joint_bilateral(
     coarse: Tensor,  # (B, h, w) m, 0 = no return
     guide: Tensor,  # (B, C, H, W) float in [0, 1] or uint8
     *,
@@ -67,7 +67,7 @@ def joint_bilateral(
     sizes = check("joint_bilateral", coarse=(coarse, "B h w"), guide=(guide, "B C H W"))
     picture = (guide / 255.0 if guide.dtype == torch.uint8 else guide).to(coarse.dtype)
     H, W, h, w = (sizes[k] for k in "HWhw")
-    y, x = _coarse_steps(H, h, coarse), _coarse_steps(W, w, coarse)
+    y, x = _coarse_coordinates(H, h, coarse), _coarse_coordinates(W, w, coarse)
     row, column = torch.floor(y + 0.5).long(), torch.floor(x + 0.5).long()
     # The guide at a return is the mean over the pixels it stands for.
     small = F.interpolate(picture, (h, w), mode="area")
@@ -82,11 +82,11 @@ def joint_bilateral(
             share = torch.exp(-0.5 * (near / spatial**2 + unlike / contrast**2))
             share = torch.where(inside & (value > 0), share, 0.0)
             total, weight = total + share * value, weight + share
-    seen = weight > LEAST
+    seen = weight > _MIN_WEIGHT
     return torch.where(seen, total / torch.where(seen, weight, torch.ones_like(weight)), torch.zeros_like(total))
 
 
-def guided_filter(
+def fill_guided(
     coarse: Tensor,  # (B, h, w) m, 0 = no return
     guide: Tensor,  # (B, C, H, W) float in [0, 1] or uint8
     *,
@@ -112,29 +112,29 @@ def guided_filter(
     Source: K. He, J. Sun, "Fast guided filter", 2015.
     """
     sizes = check("guided_filter", coarse=(coarse, "B h w"), guide=(guide, "B C H W"))
-    grey = filters.grey(guide).to(coarse.dtype)
+    grey = filters.grayscale(guide).to(coarse.dtype)
     there = (coarse > 0).to(coarse.dtype)[:, None]
-    count = box(there, radius)
-    some = count > LEAST
+    count = box_mean(there, radius)
+    some = count > _MIN_WEIGHT
     safe = torch.where(some, count, torch.ones_like(count))
 
     def mean(x: Tensor) -> Tensor:
-        return box(x * there, radius) / safe
+        return box_mean(x * there, radius) / safe
 
     z, small = coarse[:, None], F.interpolate(grey, coarse.shape[-2:], mode="area")
     middle, level = mean(small), mean(z)
     slope = (mean(small * z) - middle * level) / (mean(small * small) - middle * middle).clamp_min(0).add(smooth)
     hw = (sizes["H"], sizes["W"])
-    slope, offset = (_resized(mean(x)[:, 0], hw) for x in (slope, level - slope * middle))
+    slope, offset = (_resize(mean(x)[:, 0], hw) for x in (slope, level - slope * middle))
     found = slope * grey[:, 0] + offset
-    seen = (_resized(some.to(coarse.dtype)[:, 0], hw) > 1 - LEAST) & (found > 0)
+    seen = (_resize(some.to(coarse.dtype)[:, 0], hw) > 1 - _MIN_WEIGHT) & (found > 0)
     return torch.where(seen, found, torch.zeros_like(found))
 
 
-def defocus_guided(
+def fill_defocus_guided(
     dense: Tensor,  # (B, H, W) m, 0 = none: interpolated returns
     coarse: Tensor,  # (B, h, w) m, 0 = no return
-    blur: Blur,
+    blur: BlurMap,
     *,
     reach_px: float = 4.0,
     steps: int = 12,
@@ -149,7 +149,7 @@ def defocus_guided(
 
     Args:
         dense, coarse: from one sensor.
-        blur: of the picture, from :func:`dhtorch.experiments.focal.blur.local_blur`.
+        blur: of the picture, from :func:`dhtorch.experiments.focal.blur.estimate_blur`.
         reach_px: over which claims are averaged.
         steps: distances in focus tried, in equal steps of inverse depth.
         distrust: factor on the variance of the claims; below 1 they are believed more than they have earned.
@@ -166,7 +166,7 @@ def defocus_guided(
     known = dense > 0
     inverse = torch.where(known, 1 / torch.where(known, dense, torch.ones_like(dense)), torch.zeros_like(dense))
     use = (blur.valid & known).to(dense.dtype)
-    focus, offset, gain = _explain(inverse, blur.sigma, use, steps)
+    focus, offset, gain = _fit_focus_model(inverse, blur.sigma, use, steps)
     side = torch.where(inverse > focus, torch.ones_like(inverse), -torch.ones_like(inverse))
     works = gain > 0
     claim = focus + side * ((blur.sigma - offset) / torch.where(works, gain, torch.ones_like(gain))).clamp_min(0)
@@ -175,16 +175,16 @@ def defocus_guided(
     claim_variance = (deviation * deviation).sum((1, 2), keepdim=True) / count + 1e-12
     # What interpolation cannot know: half the change from one return to the next.
     step = sizes["H"] / sizes["h"]
-    slack = gaussian(inverse[:, None], step / 2)[:, 0] - inverse
+    slack = gaussian_blur(inverse[:, None], step / 2)[:, 0] - inverse
     prior_variance = slack * slack + 1e-12
     weight = use * prior_variance / (prior_variance + distrust * claim_variance)
-    near = gaussian(torch.stack((weight * deviation, weight, torch.ones_like(weight)), 1), reach_px)
+    near = gaussian_blur(torch.stack((weight * deviation, weight, torch.ones_like(weight)), 1), reach_px)
     fused = inverse + near[:, 0] / near[:, 2]
     better = known & works & (fused > 0)
     return torch.where(better, 1 / torch.where(better, fused, torch.ones_like(fused)), dense)
 
 
-def _explain(inverse: Tensor, sigma: Tensor, use: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor]:
+def _fit_focus_model(inverse: Tensor, sigma: Tensor, use: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor]:
     """Focus, blur in focus and gain (B, 1, 1) such that sigma = offset + gain |inverse − focus|, by least squares."""
     far = torch.where(use > 0, inverse, torch.full_like(inverse, math.inf)).amin((1, 2))
     near = torch.where(use > 0, inverse, torch.full_like(inverse, -math.inf)).amax((1, 2))
@@ -209,11 +209,11 @@ def _explain(inverse: Tensor, sigma: Tensor, use: Tensor, steps: int) -> tuple[T
     return focus, offset, gain
 
 
-def _resized(x: Tensor, hw: tuple[int, int]) -> Tensor:
+def _resize(x: Tensor, hw: tuple[int, int]) -> Tensor:
     return F.interpolate(x[:, None], hw, mode="bilinear", align_corners=False)[:, 0]
 
 
-def _coarse_steps(size: int, small: int, like: Tensor) -> Tensor:
+def _coarse_coordinates(size: int, small: int, like: Tensor) -> Tensor:
     """Where the pixels (size,) of one side lie on the coarse map."""
     place = torch.arange(size, dtype=like.dtype, device=like.device)
     return (place + 0.5) * (small / size) - 0.5

@@ -18,17 +18,17 @@ from torch import Tensor
 from dhtorch.data.codecs import exr
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.experiments.focal.stacks import FocalStack, Stacks, focus_distances, read_pictures
-from dhtorch.runtime.console import many
+from dhtorch.experiments.focal.stacks import FocalStack, FocalStacks, parse_focus_distances, read_pictures
+from dhtorch.runtime.console import format_count
 
-_FOCUS = (0.1, 0.15, 0.3, 0.7, 1.5)  # m
-_SAMPLE = re.compile(r"(\d{6}).*(All\.tif|Dpt\.exr)")
+_FOCUS_M = (0.1, 0.15, 0.3, 0.7, 1.5)  # m
+_SAMPLE_PATTERN = re.compile(r"(\d{6}).*(All\.tif|Dpt\.exr)")
 _FIRST_VALIDATION = 400
 
 
 def recognise(root: Path) -> str | None:
     """What makes ``root`` focal stacks of this format, in words; None if nothing does."""
-    names = {m[2] for file in root.iterdir() if (m := _SAMPLE.fullmatch(file.name))} if root.is_dir() else set()
+    names = {m[2] for file in root.iterdir() if (m := _SAMPLE_PATTERN.fullmatch(file.name))} if root.is_dir() else set()
     return "files <index>…All.tif" if "All.tif" in names else None
 
 
@@ -36,11 +36,11 @@ def read(
     root: str | Path,
     *,
     split: str | None = None,
-    focus_m: Sequence[float] = _FOCUS,
+    focus_m: Sequence[float] = _FOCUS_M,
     focal_length_m: float = 2.9e-3,
     f_number: float = 1.0,
     max_depth: float | None = 3.0,
-) -> Stacks:
+) -> FocalStacks:
     """Open FoD500.
 
     Args:
@@ -60,7 +60,7 @@ def read(
         FormatError: no whole sample, or an option that cannot be.
     """
     root = Path(root)
-    focus = focus_distances(focus_m, root)
+    focus = parse_focus_distances(focus_m, root)
     if split not in (None, "train", "val"):
         raise FormatError(root, "option split", split, "train or val")
     if max_depth is not None:
@@ -71,7 +71,7 @@ def read(
     if not whole:
         expected = f"{len(focus)} *All.tif and one *Dpt.exr"
         raise FormatError(root, "samples", f"none whole among {len(samples)}", expected)
-    load = _Load(
+    load = _StackLoader(
         pictures=tuple(tuple(pictures) for pictures, _ in whole.values()),
         depths=tuple(depths[0] if depths else None for _, depths in whole.values()),
         focus=focus,
@@ -81,13 +81,14 @@ def read(
     )
     odd = [(k, *v) for k, v in samples.items() if k not in whole]
     report = tuple(
-        f"sample {k}: {many(len(a), 'picture')} and {many(len(b), 'depth map')}: left out" for k, a, b in odd
+        f"sample {k}: {format_count(len(a), 'picture')} and {format_count(len(b), 'depth map')}: left out"
+        for k, a, b in odd
     )
-    return Stacks(root.resolve().name, "fod500", load, tuple(whole), root, report)
+    return FocalStacks(root.resolve().name, "fod500", load, tuple(whole), root, report)
 
 
 @dataclass(frozen=True, eq=False)
-class _Load:
+class _StackLoader:
     """Position → stack."""
 
     pictures: tuple[tuple[Path, ...], ...]
@@ -112,7 +113,7 @@ def _samples(root: Path) -> dict[str, tuple[list[Path], list[Path]]]:
     """Index → its pictures and its depth maps, by name."""
     samples: dict[str, tuple[list[Path], list[Path]]] = {}
     for file in sorted(root.iterdir()) if root.is_dir() else ():
-        if match := _SAMPLE.fullmatch(file.name):
+        if match := _SAMPLE_PATTERN.fullmatch(file.name):
             samples.setdefault(match[1], ([], []))[match[2] == "Dpt.exr"].append(file)
     return samples
 

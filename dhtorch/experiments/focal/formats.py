@@ -11,15 +11,15 @@ from typing import Any, Final
 
 from dhtorch.data import scenes_root
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import inside
+from dhtorch.data.io.safe_open import restrict_links
 from dhtorch.experiments.focal import ddff12, fod500, image_folder
-from dhtorch.experiments.focal.stacks import Stacks
+from dhtorch.experiments.focal.stacks import FocalStacks
 
 #: Name → reader, asked in this order; the first that recognises a folder reads it.
 STACK_FORMATS: Final[dict[str, ModuleType]] = {"fod500": fod500, "ddff12": ddff12, "images": image_folder}
 
 
-def open_stacks(root: str | Path, format: str = "auto", *, follow_links: bool = False, **options: Any) -> Stacks:
+def open_stacks(root: str | Path, format: str = "auto", *, follow_links: bool = False, **options: Any) -> FocalStacks:
     """The focal stacks at ``root``, opened lazily: nothing is decoded before a stack is asked for.
 
     Args:
@@ -46,7 +46,7 @@ def open_stacks(root: str | Path, format: str = "auto", *, follow_links: bool = 
         if option not in known:
             raise ValueError(f"stacks: format {format} has no option {option!r}, expected one of {', '.join(known)}")
     bounds = None if follow_links else root
-    with inside(bounds):
+    with restrict_links(bounds):
         return replace(read(root, **options), bounds=bounds)
 
 
@@ -56,14 +56,14 @@ def recognise_stacks(root: str | Path, *, follow_links: bool = False) -> tuple[s
     Raises:
         FormatError: no format recognises it.
     """
-    with inside(None if follow_links else Path(root)):
+    with restrict_links(None if follow_links else Path(root)):
         for name, reader in STACK_FORMATS.items():
             if evidence := reader.recognise(Path(root)):
                 return name, evidence
     raise FormatError(root, "format", "no focal stack", f"one of {', '.join(STACK_FORMATS)}")
 
 
-def open_collections(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[Stacks]:
+def open_collections(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[FocalStacks]:
     """Focal stacks of a list of scenes below one folder.
 
     Args:

@@ -4,7 +4,8 @@ The classical recipe: a measure of sharpness for every pixel of every picture, t
 parabola through the measure around it, so that the answer falls between pictures. Pictures that moved or breathed
 (changed their magnification with the focus) are first laid over each other.
 
-Alphabet: ``images`` (B, S, C, H, W), S pictures of one view; ``sharpness`` (B, S, H, W); ``place`` (B, H, W) position
+Alphabet: ``images`` (B, S, C, H, W), S pictures of one view; ``measure_sharpness`` (B, S, H, W); ``place`` (B, H, W)
+    position
 in the stack, in pictures, fractions allowed.
 """
 
@@ -16,22 +17,22 @@ from torch import Tensor
 
 from dhtorch.geometry import filters
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.filters import gaussian, separable
+from dhtorch.geometry.filters import correlate_separable, gaussian_blur
 from dhtorch.pytree import Record, record
 
 #: Measures of sharpness.
-MEASURES = ("modified_laplacian", "gradient_energy", "variance")
+SHARPNESS_MEASURES = ("modified_laplacian", "gradient_energy", "variance")
 
 
 @record
-class Focus(Record):
+class FocusMap(Record):
     """Where in the stack every pixel is sharpest."""
 
     place: Tensor  # (B, H, W) pictures from the first, in [0, S − 1]
     confidence: Tensor  # (B, H, W) in [0, 1]: how far the peak stands out of the other pictures
 
 
-def sharpness(
+def measure_sharpness(
     images: Tensor,  # (B, S, C, H, W) C 1 or 3; float in [0, 1] or uint8
     measure: str = "modified_laplacian",
     *,
@@ -45,7 +46,7 @@ def sharpness(
 
     Args:
         images: B stacks of at least two pictures.
-        measure: one of :data:`MEASURES`.
+        measure: one of :data:`SHARPNESS_MEASURES`.
         window_px: standard deviation of the window.
 
     Raises:
@@ -55,26 +56,26 @@ def sharpness(
     Source: S. Pertuz, D. Puig, M. A. García, "Analysis of focus measure operators for shape-from-focus", 2013.
     """
     sizes = check("sharpness", images=(images, "B S C H W"))
-    _at_least_two("sharpness", sizes["S"])
-    if measure not in MEASURES:
-        raise ValueError(f"sharpness: measure is {measure!r}, expected one of {', '.join(MEASURES)}")
-    grey = filters.grey(images.flatten(0, 1))
+    _check_two_images("sharpness", sizes["S"])
+    if measure not in SHARPNESS_MEASURES:
+        raise ValueError(f"sharpness: measure is {measure!r}, expected one of {', '.join(SHARPNESS_MEASURES)}")
+    grey = filters.grayscale(images.flatten(0, 1))
     if measure == "modified_laplacian":
         second = [-1.0, 2.0, -1.0]
-        raw = separable(grey, [1.0], second).abs() + separable(grey, second, [1.0]).abs()
+        raw = correlate_separable(grey, [1.0], second).abs() + correlate_separable(grey, second, [1.0]).abs()
     elif measure == "gradient_energy":
         slope, smooth = [-0.5, 0.0, 0.5], [0.25, 0.5, 0.25]
-        across, down = separable(grey, smooth, slope), separable(grey, slope, smooth)
+        across, down = correlate_separable(grey, smooth, slope), correlate_separable(grey, slope, smooth)
         raw = across * across + down * down
     else:
-        centred = grey - gaussian(grey, window_px)
+        centred = grey - gaussian_blur(grey, window_px)
         raw = centred * centred
-    return gaussian(raw, window_px).view(sizes["B"], sizes["S"], sizes["H"], sizes["W"])
+    return gaussian_blur(raw, window_px).view(sizes["B"], sizes["S"], sizes["H"], sizes["W"])
 
 
-def sharpest(
+def find_sharpest(
     measured: Tensor,  # (B, S, H, W) not negative
-) -> Focus:
+) -> FocusMap:
     """The sharpest picture of every pixel, placed between pictures by a Gaussian through three of them.
 
     Confidence is 1 minus the mean over the peak: 0 where no picture stands out, at most 1 − 1 / S. A peak at either end
@@ -86,7 +87,7 @@ def sharpest(
     Gradient: through the three sharpnesses to ``measured``; the choice carries none.
     """
     sizes = check("sharpest", measured=(measured, "B S H W"))
-    _at_least_two("sharpest", sizes["S"])
+    _check_two_images("sharpest", sizes["S"])
     best = measured.detach().argmax(1, keepdim=True)
     left, peak, right = (measured.gather(1, (best + k).clamp(0, sizes["S"] - 1)) for k in (-1, 0, 1))
     seen = peak > 0
@@ -97,10 +98,10 @@ def sharpest(
     shift = torch.where(inner, 0.5 * (a - c) / torch.where(inner, bend, -torch.ones_like(bend)), torch.zeros_like(bend))
     mean = measured.mean(1, keepdim=True)
     confidence = torch.where(seen, 1 - mean / torch.where(seen, peak, torch.ones_like(peak)), torch.zeros_like(peak))
-    return Focus((best + shift.clamp(-0.5, 0.5))[:, 0], confidence[:, 0])
+    return FocusMap((best + shift.clamp(-0.5, 0.5))[:, 0], confidence[:, 0])
 
 
-def depth_at(
+def depth_at_focus(
     place: Tensor,  # (B, H, W)
     focus_m: Tensor | None,  # (B, S) m, of the pictures in their order
 ) -> Tensor:
@@ -115,7 +116,7 @@ def depth_at(
     if focus_m is None:
         raise ValueError("depth_at: focus_m is None, expected distances: without them only the order in depth is known")
     sizes = check("depth_at", place=(place, "B H W"), focus_m=(focus_m, "B S"))
-    _at_least_two("depth_at", sizes["S"])
+    _check_two_images("depth_at", sizes["S"])
     step = focus_m.diff(dim=1)
     if not bool(((step > 0).all(1) | (step < 0).all(1)).all()):
         raise ValueError("depth_at: focus_m expected to rise or to fall throughout: sort the pictures by distance")
@@ -126,7 +127,7 @@ def depth_at(
     return 1 / (first + (place - low) * (second - first))
 
 
-def align(
+def align_stack(
     images: Tensor,  # (B, S, C, H, W) float in [0, 1] or uint8
     *,
     reference: int | None = None,
@@ -157,37 +158,37 @@ def align(
     """
     sizes = check("align", images=(images, "B S C H W"))
     B, S = sizes["B"], sizes["S"]
-    _at_least_two("align", S)
+    _check_two_images("align", S)
     middle = S // 2 if reference is None else reference
     if not 0 <= middle < S:
         raise ValueError(f"align: reference is {reference}, expected a position from 0 to {S - 1}")
     pictures = images / 255.0 if images.dtype == torch.uint8 else images
     with torch.no_grad():
-        soft = [gaussian(filters.grey(pictures[:, k]), blur_px) for k in range(S)]
+        soft = [gaussian_blur(filters.grayscale(pictures[:, k]), blur_px) for k in range(S)]
         found = [pictures.new_zeros(B, 3) for _ in range(S)]
         for k in [*range(middle - 1, -1, -1), *range(middle + 1, S)]:
             start = found[k + 1] if k < middle else found[k - 1]
-            found[k] = _register(soft[middle], soft[k], start, iterations)
+            found[k] = _register_similarity(soft[middle], soft[k], start, iterations)
     moved = [_resample(pictures[:, k], found[k]) if k != middle else pictures[:, k] for k in range(S)]
     return torch.stack(moved, 1), torch.stack(found, 1)
 
 
-def _register(fixed: Tensor, moving: Tensor, motion: Tensor, iterations: int) -> Tensor:
+def _register_similarity(fixed: Tensor, moving: Tensor, motion: Tensor, iterations: int) -> Tensor:
     """Gauss–Newton for magnification and shift (B, 3) of ``moving`` against ``fixed`` (B, 1, H, W)."""
     inner = slice(8, -8)
-    x, y = _from_middle(fixed)
+    x, y = _offsets_from_centre(fixed)
     scale = float(max(fixed.shape[-2:])) / 2  # magnification in pixels at the border: unknowns of like size
-    target = _standard(fixed[..., inner, inner])
+    target = _standardise(fixed[..., inner, inner])
     for _ in range(iterations):
         seen = _resample(moving, motion)
-        across = separable(seen, [1.0], [-0.5, 0.0, 0.5])[..., inner, inner]
-        down = separable(seen, [-0.5, 0.0, 0.5], [1.0])[..., inner, inner]
+        across = correlate_separable(seen, [1.0], [-0.5, 0.0, 0.5])[..., inner, inner]
+        down = correlate_separable(seen, [-0.5, 0.0, 0.5], [1.0])[..., inner, inner]
         part = seen[..., inner, inner]
         spread = part.var((-2, -1), correction=0, keepdim=True).clamp_min(1e-12).sqrt()
         radial = (across * x[:, inner] + down * y[inner]) / scale
         J = torch.stack((radial, across, down), -1) / spread[..., None]
         J = (J - J.mean((-3, -2), keepdim=True)).flatten(1, 3).double()  # (B, P, 3)
-        r = (target - _standard(part)).flatten(1).double()
+        r = (target - _standardise(part)).flatten(1).double()
         normal = (J[..., :, None] * J[..., None, :]).sum(1) + 1e-9 * torch.eye(3, dtype=torch.float64, device=J.device)
         step = torch.linalg.solve(normal, (J * r[..., None]).sum(1)).to(motion.dtype)
         step = step.clamp(-4, 4)
@@ -198,14 +199,14 @@ def _register(fixed: Tensor, moving: Tensor, motion: Tensor, iterations: int) ->
 def _resample(picture: Tensor, motion: Tensor) -> Tensor:
     """Pictures (B, C, H, W) read at x (1 + m) + shift, bicubic, by kornia."""
     H, W = picture.shape[-2:]
-    x, y = _from_middle(picture)
+    x, y = _offsets_from_centre(picture)
     m, du, dv = (motion[:, k, None, None] for k in range(3))
     u, v = x * (1 + m) + du + (W - 1) / 2, y * (1 + m) + dv + (H - 1) / 2
     u, v = u.expand(-1, H, W), v.expand(-1, H, W)
     return remap(picture, u, v, mode="bicubic", padding_mode="border", align_corners=True)
 
 
-def _from_middle(picture: Tensor) -> tuple[Tensor, Tensor]:
+def _offsets_from_centre(picture: Tensor) -> tuple[Tensor, Tensor]:
     """Pixels right of (1, W) and below (H, 1) the middle of the picture."""
     H, W = picture.shape[-2:]
     x = torch.arange(W, dtype=picture.dtype, device=picture.device) - (W - 1) / 2
@@ -213,12 +214,12 @@ def _from_middle(picture: Tensor) -> tuple[Tensor, Tensor]:
     return x[None], y[:, None]
 
 
-def _standard(x: Tensor) -> Tensor:
+def _standardise(x: Tensor) -> Tensor:
     """Zero mean, unit variance over each picture."""
     x = x - x.mean((-2, -1), keepdim=True)
     return x / (x * x).mean((-2, -1), keepdim=True).clamp_min(1e-12).sqrt()
 
 
-def _at_least_two(where: str, count: int) -> None:
+def _check_two_images(where: str, count: int) -> None:
     if count < 2:
         raise ValueError(f"{where}: found {count} picture, expected a stack of at least two, at different focus")

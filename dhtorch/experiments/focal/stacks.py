@@ -14,13 +14,13 @@ from torch import Tensor
 from dhtorch.data.codecs import tiff
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import inside
+from dhtorch.data.io.safe_open import restrict_links
 from dhtorch.pytree import Record, record
 from dhtorch.records import Camera
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 
 #: A folder of a thousand photographs is no focal stack.
-MAX_STACK_BYTES = 2_000_000_000
+_MAX_STACK_BYTES = 2_000_000_000
 
 
 @record
@@ -41,7 +41,7 @@ class FocalStack(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class Stacks(Sequence[FocalStack]):
+class FocalStacks(Sequence[FocalStack]):
     """A lazy sequence of focal stacks (B = 1): nothing is decoded before a stack is asked for, and it pickles.
 
     Raises:
@@ -61,7 +61,7 @@ class Stacks(Sequence[FocalStack]):
         if not self.names:
             raise ValueError(f"stacks {self.name}: found none, expected at least one")
         if self.scenes is not None and len(self.scenes) != len(self.names):
-            found = f"{many(len(self.scenes), 'scene')} of {many(len(self.names), 'stack')}"
+            found = f"{format_count(len(self.scenes), 'scene')} of {format_count(len(self.names), 'stack')}"
             raise ValueError(f"stacks {self.name}: found {found}, expected one for each")
 
     def by_scene(self) -> dict[str, list[int]]:
@@ -78,7 +78,7 @@ class Stacks(Sequence[FocalStack]):
         i, n = operator.index(index), len(self)
         if not -n <= i < n:
             raise IndexError(f"stacks {self.name}: stack {i} of {n}")
-        with inside(self.bounds):
+        with restrict_links(self.bounds):
             return self.load(i % n)
 
     def __repr__(self) -> str:
@@ -91,13 +91,13 @@ def read_pictures(sources: Sequence[Path]) -> Tensor:
     Raises:
         FormatError: missing or damaged file, pictures of different size or kind, or too many to hold.
     """
-    first = _picture(sources[0])
+    first = _read_picture(sources[0])
     total = len(sources) * first.numel() * first.element_size()
-    if total > MAX_STACK_BYTES:
-        raise FormatError(sources[0].parent, "pictures", f"{total} bytes", f"at most {MAX_STACK_BYTES}")
+    if total > _MAX_STACK_BYTES:
+        raise FormatError(sources[0].parent, "pictures", f"{total} bytes", f"at most {_MAX_STACK_BYTES}")
     images = [first]
     for file in sources[1:]:
-        image = _picture(file)
+        image = _read_picture(file)
         if image.shape != first.shape or image.dtype != first.dtype:
             found, expected = (f"{x.shape[2]}x{x.shape[1]}, {len(x)} channels, {x.dtype}" for x in (image, first))
             raise FormatError(file, "picture", found, f"{expected}, as {sources[0].name}")
@@ -105,7 +105,7 @@ def read_pictures(sources: Sequence[Path]) -> Tensor:
     return torch.stack(images)
 
 
-def _picture(file: Path) -> Tensor:
+def _read_picture(file: Path) -> Tensor:
     """(C, H, W); an alpha channel of a TIFF is dropped."""
     if file.suffix.lower() not in (".tif", ".tiff"):
         return torch.from_numpy(files.read_image(file))
@@ -116,7 +116,7 @@ def _picture(file: Path) -> Tensor:
     return torch.from_numpy(picture if picture.dtype == np.uint8 else picture.astype(np.float32) / 65535)
 
 
-def focus_distances(values: Sequence[float], root: Path, count: int | None = None) -> Tensor:
+def parse_focus_distances(values: Sequence[float], root: Path, count: int | None = None) -> Tensor:
     """(S,) m, of an option ``focus_m``.
 
     Raises:

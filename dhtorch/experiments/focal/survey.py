@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dhtorch.data.survey import Survey, Tile, camera_words, pixel_kind, say_depths, warn_of_duplicates
-from dhtorch.experiments.focal.stacks import FocalStack, Stacks
-from dhtorch.runtime.console import many
+from dhtorch.data.survey import Survey, Tile, describe_camera, describe_pixels, report_depths, warn_of_duplicates
+from dhtorch.experiments.focal.stacks import FocalStack, FocalStacks
+from dhtorch.runtime.console import format_count
 
 
-def survey_stacks(stacks: Stacks, shown: int = 8) -> Survey:
+def survey_stacks(stacks: FocalStacks, shown: int = 8) -> Survey:
     """Facts of focal stacks, from the first of them."""
     out = Survey(stacks.name, stacks.format)
     stack: FocalStack = stacks[0]
     images = stack.images[0]
     s, c, h, w = images.shape
-    out.say("focal stacks", f"{len(stacks)}, of {many(s, 'picture')} each")
-    out.say("pictures", f"{w}x{h}, {pixel_kind(c, images)}")
+    out.say("focal stacks", f"{len(stacks)}, of {format_count(s, 'picture')} each")
+    out.say("pictures", f"{w}x{h}, {describe_pixels(c, images)}")
     if stack.focus_m is None:
         out.warn("no focus distances: the order of the pictures is all that is known")
     else:
@@ -22,9 +22,9 @@ def survey_stacks(stacks: Stacks, shown: int = 8) -> Survey:
     if stack.focal_length_m is not None and stack.f_number is not None:
         out.say("lens", f"f = {1e3 * float(stack.focal_length_m):g} mm, N = {float(stack.f_number):g}")
     if stack.camera is not None:
-        out.say("intrinsics", camera_words(stack.camera, (h, w)))
+        out.say("intrinsics", describe_camera(stack.camera, (h, w)))
     if stack.depth is not None:
-        say_depths([stack.depth[0]], out)
+        report_depths([stack.depth[0]], out)
     warn_of_duplicates(list(images), out, "pictures")
     out.warnings.extend(stacks.report)
     for k in sorted({round(k * (s - 1) / max(shown - 1, 1)) for k in range(shown)}):

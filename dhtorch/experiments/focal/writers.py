@@ -10,24 +10,24 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from dhtorch.data.io.decode import need
+from dhtorch.data.io.decode import import_optional
 from dhtorch.experiments.focal.stacks import FocalStack
-from dhtorch.testing.parts import depth_codes, png, write
+from dhtorch.testing.parts import encode_depth_codes, encode_unfiltered_png, save_file
 
 
 def write_fod500(root: Path, stacks: Mapping[int, FocalStack]) -> None:
     """``<index>_<slice>All.tif`` and ``<index>Dpt.exr`` (half floats) of each index."""
-    exr = need("OpenEXR")
+    exr = import_optional("OpenEXR")
     for index, stack in stacks.items():
         for k, image in enumerate(stack.images[0]):
-            write(root / f"{index:06d}_{k:02d}All.tif", rgb_tiff(image.permute(1, 2, 0).numpy()))
+            save_file(root / f"{index:06d}_{k:02d}All.tif", rgb_tiff(image.permute(1, 2, 0).numpy()))
         if stack.depth is not None:
             # The library takes memory as it lies, whatever the strides say.
             plane = np.ascontiguousarray(stack.depth[0].numpy(), np.float16)
             picture = io.BytesIO()
             header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
             exr.File(header, dict.fromkeys("RGB", plane)).write(picture)
-            write(root / f"{index:06d}Dpt.exr", picture.getvalue())
+            save_file(root / f"{index:06d}Dpt.exr", picture.getvalue())
 
 
 def write_ddff12(
@@ -40,7 +40,7 @@ def write_ddff12(
 ) -> None:
     """``stack_<split>`` (N, S, H, W, 3), 0 to 255; with depth, ``disp_<split>`` (N, H, W) px, 0 = invalid."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    with need("h5py").File(file, "w") as group:
+    with import_optional("h5py").File(file, "w") as group:
         for split, stacks in splits.items():
             values = np.stack([stack.images[0].permute(0, 2, 3, 1).numpy() for stack in stacks]).astype(dtype)
             group.create_dataset(f"stack_{split}", data=values, compression=compression)
@@ -60,15 +60,18 @@ def write_light_field(
     """``LightField/<scene>/LF_<n>.npy`` and ``DepthRegistered/<scene>/DEPTH_<n>.png`` (16 bits, mm)."""
     content = io.BytesIO()
     np.save(content, light_field.contiguous().numpy())
-    write(root / "LightField" / scene / f"LF_{number:04d}.npy", content.getvalue())
+    save_file(root / "LightField" / scene / f"LF_{number:04d}.npy", content.getvalue())
     if depth is not None:
-        write(root / "DepthRegistered" / scene / f"DEPTH_{number:04d}.png", png(depth_codes(depth, 1000.0)))
+        save_file(
+            root / "DepthRegistered" / scene / f"DEPTH_{number:04d}.png",
+            encode_unfiltered_png(encode_depth_codes(depth, 1000.0)),
+        )
 
 
 def write_image_folder(root: Path, stack: FocalStack) -> None:
     """``image<n>.png``, n from 1 without leading zeros."""
     for k, image in enumerate(stack.images[0], 1):
-        write(root / f"image{k}.png", png(image.permute(1, 2, 0).numpy()))
+        save_file(root / f"image{k}.png", encode_unfiltered_png(image.permute(1, 2, 0).numpy()))
 
 
 def rgb_tiff(picture: np.ndarray) -> bytes:

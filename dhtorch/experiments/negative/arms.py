@@ -15,11 +15,11 @@ from dhtorch.geometry.checks import check
 from dhtorch.pytree import Record, record
 
 #: Variance of a window (grey values in [0, 1]) below which it has no shape to recognise.
-FLAT = 1e-6
+_FLAT_VARIANCE = 1e-6
 
 
 @record
-class Shift(Record):
+class ArmShift(Record):
     """Where the window around each site is found again."""
 
     lag: Tensor  # (B, K) steps along the arm; 0 where not valid
@@ -27,7 +27,7 @@ class Shift(Record):
     valid: Tensor  # (B, K) bool: windows inside, not flat, and the peak no end of the search
 
 
-def read_arm(
+def sample_arm(
     image: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     arm: Tensor,  # (L, 2) px
     *,
@@ -48,11 +48,11 @@ def read_arm(
     Gradient: to the image and to ``arm``.
     """
     check("read_arm", image=(image, "B C H W"), arm=(arm, "L 2"))
-    grey = filters.grey(image).to(arm.dtype)
+    grey = filters.grayscale(image).to(arm.dtype)
     H, W = grey.shape[-2:]
     if blur_px > 0:
         reach = max(1, int(3 * blur_px + 0.5))
-        grey = filters.gaussian(grey, blur_px, reach_px=reach)
+        grey = filters.gaussian_blur(grey, blur_px, reach_px=reach)
     limit = torch.tensor([W - 1, H - 1], dtype=arm.dtype, device=arm.device)
     x = torch.minimum(arm.clamp_min(0), limit)
     low = torch.minimum(x.detach().floor(), (limit - 1).clamp_min(0))
@@ -65,7 +65,7 @@ def read_arm(
     return top * (1 - b) + bottom * b
 
 
-def correlate(
+def correlate_windows(
     signal_0: Tensor,  # (B, L)
     signal_1: Tensor,  # (B, M)
     site_0: Tensor,  # (B, K) int64, index into signal 0
@@ -74,7 +74,7 @@ def correlate(
     window: int = 41,
     max_lag: int = 40,
     min_peak: float = 0.5,
-) -> Shift:
+) -> ArmShift:
     """Windowed normalised cross-correlation of two signals, its highest peak placed between steps by a parabola.
 
     Args:
@@ -104,9 +104,9 @@ def correlate(
     start_0, start_1 = site_0 - window // 2, site_1 - span // 2
     last_0, last_1 = signal_0.shape[1] - window, signal_1.shape[1] - span
     inside = (start_0 >= 0) & (start_0 <= last_0) & (start_1 >= 0) & (start_1 <= last_1)
-    template = _read(signal_0, start_0.clamp(0, last_0), window)  # (B, K, window)
-    search = _read(signal_1, start_1.clamp(0, last_1), span)  # (B, K, span)
-    score, textured = _normalised(template, search)
+    template = _read_windows(signal_0, start_0.clamp(0, last_0), window)  # (B, K, window)
+    search = _read_windows(signal_1, start_1.clamp(0, last_1), span)  # (B, K, span)
+    score, textured = _normalised_correlation(template, search)
     best = score.detach()[..., 1:-1].argmax(-1) + 1
     left, peak, right = (score.gather(-1, (best + k)[..., None])[..., 0] for k in (-1, 0, 1))
     bend = left - 2 * peak + right
@@ -115,16 +115,16 @@ def correlate(
     ends = torch.maximum(score.detach()[..., 0], score.detach()[..., -1])
     valid = inside & textured & (ends <= peak) & (peak >= min_peak)
     zero = torch.zeros_like(peak)
-    return Shift(torch.where(valid, best - max_lag + offset, zero), torch.where(valid, peak, zero), valid)
+    return ArmShift(torch.where(valid, best - max_lag + offset, zero), torch.where(valid, peak, zero), valid)
 
 
-def _read(signal: Tensor, start: Tensor, length: int) -> Tensor:
+def _read_windows(signal: Tensor, start: Tensor, length: int) -> Tensor:
     """Windows (B, K, length)."""
     index = start[..., None] + torch.arange(length, device=signal.device)
     return signal.gather(1, index.flatten(1)).view(index.shape)
 
 
-def _normalised(template: Tensor, search: Tensor) -> tuple[Tensor, Tensor]:
+def _normalised_correlation(template: Tensor, search: Tensor) -> tuple[Tensor, Tensor]:
     """Correlation (B, K, lags) of a window with every window of the search, means and contrast removed; textured."""
     window = template.shape[-1]
     places = search.unfold(-1, window, 1)  # (B, K, lags, window), a view
@@ -135,6 +135,6 @@ def _normalised(template: Tensor, search: Tensor) -> tuple[Tensor, Tensor]:
     mean_p = p.mean(-1)
     power_p = (p * p).mean(-1) - mean_p * mean_p
     both = (p * t[..., None, :]).mean(-1)
-    shaped = (power_t > FLAT) & (power_p > FLAT)
+    shaped = (power_t > _FLAT_VARIANCE) & (power_p > _FLAT_VARIANCE)
     size = torch.where(shaped, power_t * power_p, torch.ones_like(power_p)).sqrt()
-    return torch.where(shaped, both / size, torch.zeros_like(both)), (power_t > FLAT)[..., 0]
+    return torch.where(shaped, both / size, torch.zeros_like(both)), (power_t > _FLAT_VARIANCE)[..., 0]

@@ -62,7 +62,7 @@ def largest_cluster(
     with torch.no_grad():
         near = torch.cdist(uv, uv, compute_mode="donot_use_mm_for_euclid_dist").topk(neighbours + 1, -1, largest=False)
         area = math.pi * near.values[..., -1].square() / (neighbours + 1)  # (B, N) px² that each stands for
-        label = _connect(near.indices, hole)
+        label = _label_clusters(near.indices, hole)
         covered = torch.zeros_like(area).scatter_add(1, label, torch.where(hole, area, 0.0))
         largest = covered.argmax(-1, keepdim=True)
         member = hole & (label == largest)
@@ -80,7 +80,7 @@ def largest_cluster(
     )
 
 
-def _connect(nearest: Tensor, hole: Tensor) -> Tensor:
+def _label_clusters(nearest: Tensor, hole: Tensor) -> Tensor:
     """Labels (B, N): the smallest index of a hole's cluster; that of a sample that is no hole is its own."""
     B, N, K = nearest.shape
     own = torch.arange(N, device=hole.device).expand(B, N)

@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.data.pairs import fixed
-from dhtorch.data.scene import Given, Scene, scenes_of
-from dhtorch.experiments.negative.arms import Shift, correlate, read_arm
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
-from dhtorch.experiments.rows import Row, median
-from dhtorch.experiments.screening import Item, paired, screen
+from dhtorch.data.pairs import to_fixed_pairs
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.experiments.negative.arms import ArmShift, correlate_windows, sample_arm
+from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
+from dhtorch.experiments.rows import Row, median_or_none
+from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
 from dhtorch.metrics import bootstrap, holdout
 from dhtorch.metrics.correlation import pearson, spearman
 from dhtorch.records import Frame, TrackHint
@@ -40,19 +40,19 @@ EXPECTATION = "No: its shifts hardly correlate with inverse depth, plain 2-D flo
 VARIANTS = ("own_arm", "between_arms", "best_arm", "flow", "flow_along_arm")
 
 #: Fewest sites on which a correlation is said.
-MIN_SITES = 20
+_MIN_CORRELATION_SITES = 20
 
 #: Flow below it (px) has no share that could be seen.
-MOVED_PX = 1.0
+_MIN_FLOW_PX = 1.0
 
 #: Shifts this near to each other (px) are the same.
-ALIKE_PX = 2.0
+_SAME_SHIFT_PX = 2.0
 
 #: Points of the sampler per step (1 px) of an arm, from which its even steps are read: plenty.
-DENSE = 4
+_POINTS_PER_STEP = 4
 
 
-class Arm(NamedTuple):
+class SpiralArm(NamedTuple):
     """One arm as a curve of even steps of 1 px."""
 
     uv: Tensor  # (L, 2) px
@@ -61,9 +61,9 @@ class Arm(NamedTuple):
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     window: int = 41,
@@ -74,7 +74,7 @@ def run(
     foveation: float = 1.0,
     gaze: tuple[float, float] | None = None,
     round_arms: bool = False,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Shifts along the arms and plain flow at as many sites as the method has samples, against inverse depth.
 
@@ -100,25 +100,25 @@ def run(
     """
     method = next(iter(methods.values()))
 
-    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         views = [scene.recording[k].to(settings.dtype).to(settings.device) for k in item]
         lag = max(2, round(max_lag_share * views[0].hw[1]))
-        arms = partial(arms_of, turns=turns, foveation=foveation, gaze=gaze, round_arms=round_arms)
-        correlated = partial(correlate, window=window, max_lag=lag, min_peak=min_peak)
-        return _pair(scene.hint, method, views[0], views[1], correlated=correlated, blur_px=blur_px, wind=arms)
+        arms = partial(make_arms, turns=turns, foveation=foveation, gaze=gaze, round_arms=round_arms)
+        correlated = partial(correlate_windows, window=window, max_lag=lag, min_peak=min_peak)
+        return _evaluate_pair(scene.hint, method, views[0], views[1], correlated=correlated, blur_px=blur_px, wind=arms)
 
-    outcome = screen(
-        scenes_of(scenes), lambda scene: fixed(pairs(scene)), ask, VARIANTS, truth="full", progress=progress
+    outcome = screen_scenes(
+        scenes_of(scenes), lambda scene: to_fixed_pairs(pairs(scene)), ask, VARIANTS, truth="full", progress=progress
     )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     """Is the helix's correlation below half of that of plain flow, and below it on most scenes?"""
-    both = paired(outcome, "full", "own_arm", "flow", "corr")
+    both = paired_metric(outcome, "full", "own_arm", "flow", "corr")
     if not both:
         return None, "no scene on which both have enough sites"
-    helix, flow = (bootstrap.interval([pair[k] for pair in both]) for k in (0, 1))
+    helix, flow = (bootstrap.interval_over_scenes([pair[k] for pair in both]) for k in (0, 1))
     lower = sum(h < f for h, f in both)
     assert helix.value is not None and flow.value is not None
     why = (
@@ -130,7 +130,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     return helix.value < 0.5 * flow.value and lower > len(both) / 2, why
 
 
-def arms_of(
+def make_arms(
     hw: tuple[int, int],
     n: int,
     like: Tensor,
@@ -139,10 +139,10 @@ def arms_of(
     foveation: float = 1.0,
     gaze: tuple[float, float] | None = None,
     round_arms: bool = False,
-) -> tuple[Arm, Arm]:
+) -> tuple[SpiralArm, SpiralArm]:
     """The two arms of a spiral of ``n`` points as curves of even steps, or the same wound in circles."""
     turns = turns or math.sqrt(foveation * n / (2 * math.pi))
-    total = int(DENSE * turns * math.pi * math.hypot(*hw)) & ~1
+    total = int(_POINTS_PER_STEP * turns * math.pi * math.hypot(*hw)) & ~1
     uv = spiral(hw, total, turns=turns, foveation=foveation, gaze=gaze, dtype=torch.float64)
     s = (torch.arange(total // 2, dtype=torch.float64) + 0.5) / (total / 2)
     if round_arms:
@@ -150,10 +150,12 @@ def arms_of(
         centre = limit / 2 if gaze is None else torch.tensor(gaze, dtype=torch.float64)
         radius = torch.minimum(centre, limit - centre).min() * s**foveation
         uv = centre + radius.repeat_interleave(2)[:, None] * torch.nn.functional.normalize(uv - centre, dim=-1)
-    return _even(uv[0::2], 2 * turns * s.sqrt(), like), _even(uv[1::2], 2 * turns * s.sqrt(), like)
+    return _resample_evenly(uv[0::2], 2 * turns * s.sqrt(), like), _resample_evenly(
+        uv[1::2], 2 * turns * s.sqrt(), like
+    )
 
 
-def _even(uv: Tensor, turn: Tensor, like: Tensor) -> Arm:
+def _resample_evenly(uv: Tensor, turn: Tensor, like: Tensor) -> SpiralArm:
     """A finely sampled curve (M, 2) read at steps of 1 px."""
     length = torch.cat((uv.new_zeros(1), uv.diff(dim=0).norm(dim=-1).cumsum(0)))
     at = torch.arange(int(length[-1]), dtype=torch.float64)
@@ -162,10 +164,10 @@ def _even(uv: Tensor, turn: Tensor, like: Tensor) -> Arm:
     even = uv[after - 1] + share * (uv[after] - uv[after - 1])
     (tangent,) = torch.gradient(even, dim=0)
     tangent = tangent / tangent.norm(dim=-1, keepdim=True).clamp_min(1e-12)
-    return Arm(*(x.to(like) for x in (even, tangent, turn[after - 1])))
+    return SpiralArm(*(x.to(like) for x in (even, tangent, turn[after - 1])))
 
 
-def _pair(
+def _evaluate_pair(
     hint: TrackHint, method: Method, frame_0: Frame, frame_1: Frame, *, correlated: Any, blur_px: float, wind: Any
 ) -> dict[str, Row]:
     """Variant → numbers of one pair."""
@@ -174,17 +176,17 @@ def _pair(
     sites = [torch.linspace(0, len(a.uv) - 1, n // 2, device=a.uv.device).round().long() for a in arms]
     uv = torch.cat([a.uv[s] for a, s in zip(arms, sites, strict=True)])
     tangent = torch.cat([a.tangent[s] for a, s in zip(arms, sites, strict=True)])
-    signals = [[read_arm(f.image, a.uv, blur_px=blur_px) for a in arms] for f in (frame_0, frame_1)]
+    signals = [[sample_arm(f.image, a.uv, blur_px=blur_px) for a in arms] for f in (frame_0, frame_1)]
 
     samples = method.look_at(frame_0, uv)
-    truth = holdout.truth_at(frame_0, samples.uv)
-    candidate = holdout.candidates(samples, truth, 0.0).ok[0]
+    truth = holdout.sample_truth(frame_0, samples.uv)
+    candidate = holdout.select_candidates(samples, truth, 0.0).ok[0]
     tracks = method.track(frame_0.image, frame_1.image, samples.uv, hint=hint)
     flow = (tracks.uv_1 - tracks.uv_0)[0]
 
-    own = [_against(signals, arms, sites, a=k, b=k, step=0.0, correlated=correlated) for k in (0, 1)]
+    own = [_correlate_arms(signals, arms, sites, a=k, b=k, step=0.0, correlated=correlated) for k in (0, 1)]
     other = [
-        [_against(signals, arms, sites, a=k, b=1 - k, step=step, correlated=correlated) for k in (0, 1)]
+        [_correlate_arms(signals, arms, sites, a=k, b=1 - k, step=step, correlated=correlated) for k in (0, 1)]
         for step in (-1.0, 1.0)
     ]
     along, lags, peaks = (torch.cat([part[i] for part in own]) for i in (0, 1, 2))
@@ -205,7 +207,7 @@ def _pair(
     return {name: _numbers(*shift, samples.depth[0], candidate, **plain) for name, shift in found.items()}
 
 
-def _against(
+def _correlate_arms(
     signals: Any, arms: Any, sites: Any, *, a: int, b: int, step: float, correlated: Any
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Arm a of view 0 against arm b of view 1, ``step`` half turns on: way in the picture, lag and peak (K,).
@@ -216,7 +218,7 @@ def _against(
     there = site
     if a != b:
         there = torch.searchsorted(arms[b].turn, arms[a].turn[site] + step).clamp_max(len(arms[b].turn) - 1)
-    shift: Shift = correlated(signals[0][a], signals[1][b], site[None], there[None])
+    shift: ArmShift = correlated(signals[0][a], signals[1][b], site[None], there[None])
     curve = arms[b].uv
     place = (there + shift.lag[0]).clamp(0, len(curve) - 1)
     low = place.floor().long().clamp_max(len(curve) - 2)
@@ -234,10 +236,10 @@ def _numbers(
     def over(mask: Tensor, how: Any) -> float | None:
         x = shift[mask].double()
         y = 1 / depth[mask].double()
-        found: float | None = how(x, y) if x.numel() >= MIN_SITES else None
+        found: float | None = how(x, y) if x.numel() >= _MIN_CORRELATION_SITES else None
         return found
 
-    n, moved = int(candidate.sum()), same & (flow > MOVED_PX)
+    n, moved = int(candidate.sum()), same & (flow > _MIN_FLOW_PX)
     return {
         "n_candidates": n,
         "n_kept": int(mine.sum()),
@@ -245,7 +247,9 @@ def _numbers(
         "corr": over(same, pearson),
         "rank_corr": over(same, spearman),
         "corr_answered": over(mine, pearson),
-        "median_shift_px": median(shift[mine].tolist()),
-        "along_share": float(((shift - along).abs() < ALIKE_PX)[same].float().mean()) if bool(same.any()) else None,
-        "flow_share": median((shift / flow.clamp_min(MOVED_PX))[moved].tolist()),
+        "median_shift_px": median_or_none(shift[mine].tolist()),
+        "along_share": float(((shift - along).abs() < _SAME_SHIFT_PX)[same].float().mean())
+        if bool(same.any())
+        else None,
+        "flow_share": median_or_none((shift / flow.clamp_min(_MIN_FLOW_PX))[moved].tolist()),
     }

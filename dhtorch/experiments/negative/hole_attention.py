@@ -18,32 +18,32 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import Hole
-from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.negative.clusters import Cluster, largest_cluster
-from dhtorch.experiments.paper.hole_census import census, look
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.paper.hole_census import classify_frame, count_holes
+from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
-from dhtorch.experiments.screening import Item, paired, screen
+from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
 from dhtorch.metrics import bootstrap
 from dhtorch.records import Samples
-from dhtorch.stages.sample import vogel
+from dhtorch.stages.sample import vogel_spiral
 
 QUESTION = "Does looking at the holes fill them?"
 EXPECTATION = "No: the hole rate rises; the classes of the holes say what could fill them."
 
 VARIANTS = ("centre", "attention", "random", "even")
-TRUTH = "sensor"
+_TRUTH = "sensor"
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     stride: int = 1,
     neighbours: int = 6,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Sample every frame four times and count the holes; nothing is hidden and no second view is read.
 
@@ -67,36 +67,39 @@ def run(
     """
     method = next(iter(methods.values()))
     try:
-        _gazing(method, torch.full((2,), 50.0)).sample((100, 100), 1)
+        _with_gaze(method, torch.full((2,), 50.0)).sample((100, 100), 1)
     except TypeError as error:
         raise ValueError(f"hole_attention: expected a sampler with an option gaze in method.sample: {error}") from error
     if stride < 1:
         raise ValueError(f"hole_attention: stride is {stride}, expected at least 1")
 
-    def items(scene: Scene) -> list[Item]:
+    def items(scene: Scene) -> list[ScreenedItem]:
         return [(i, i) for i in range(0, len(scene.recording), stride)]
 
-    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         frame = scene.recording[item[0]].to(settings.dtype).to(settings.device)
-        before = look(method, frame)
+        before = classify_frame(method, frame)
         hole = before.hole != Hole.NONE
         cluster = largest_cluster(before.uv, hole, neighbours=neighbours)
-        looked = {"centre": before, "random": look(_gazing(method, _anywhere(frame.hw, settings.seed, item[0])), frame)}
-        looked["even"] = look(method.replace(sample=vogel), frame)
+        looked = {
+            "centre": before,
+            "random": classify_frame(_with_gaze(method, _random_gaze(frame.hw, settings.seed, item[0])), frame),
+        }
+        looked["even"] = classify_frame(method.replace(sample=vogel_spiral), frame)
         if bool(hole.any()):
-            looked["attention"] = look(_gazing(method, cluster.gaze[0]), frame)
-        return {v: _count(looked[v], before, cluster, frame.hw) for v in VARIANTS if v in looked}
+            looked["attention"] = classify_frame(_with_gaze(method, cluster.gaze[0]), frame)
+        return {v: _count_holes(looked[v], before, cluster, frame.hw) for v in VARIANTS if v in looked}
 
-    outcome = screen(scenes_of(scenes), items, ask, VARIANTS, truth=TRUTH, progress=progress)
+    outcome = screen_scenes(scenes_of(scenes), items, ask, VARIANTS, truth=_TRUTH, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     """Does the hole rate rise on more than half of the scenes, and where do the holes' classes point?"""
-    both = paired(outcome, TRUTH, "centre", "attention", "hole_rate")
+    both = paired_metric(outcome, _TRUTH, "centre", "attention", "hole_rate")
     if not both:
         return None, "no scene with holes"
-    before, after = (bootstrap.interval([pair[k] for pair in both]).value for k in (0, 1))
+    before, after = (bootstrap.interval_over_scenes([pair[k] for pair in both]).value for k in (0, 1))
     more = sum(a > b for b, a in both)
     route = {k: outcome.summary[f"centre.route_share.{k}"]["value"] for k in ("triangulate", "change_exposure")}
     turn = outcome.summary["centre.route_share.turn_head"]["value"]
@@ -108,22 +111,22 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     return more > len(both) / 2, why
 
 
-def _gazing(method: Method, gaze: Tensor) -> Method:
+def _with_gaze(method: Method, gaze: Tensor) -> Method:
     """The method with its sampler looking at a pixel."""
     u, v = gaze.tolist()
     return method.replace(sample={"gaze": (u, v)})
 
 
-def _anywhere(hw: tuple[int, int], seed: int, i: int) -> Tensor:
+def _random_gaze(hw: tuple[int, int], seed: int, i: int) -> Tensor:
     """A pixel (2,) in the middle nine tenths of a picture."""
     generator = torch.Generator().manual_seed(seed + 1000 * (i + 1))
     share = 0.05 + 0.9 * torch.rand(2, generator=generator)
     return share * torch.tensor([hw[1] - 1.0, hw[0] - 1.0])
 
 
-def _count(samples: Samples, before: Samples, cluster: Cluster, hw: tuple[int, int]) -> Row:
+def _count_holes(samples: Samples, before: Samples, cluster: Cluster, hw: tuple[int, int]) -> Row:
     """Holes of one sampling, and what it found inside the cluster that the first one saw."""
-    row = census(samples)
+    row = count_holes(samples)
     first = float((before.hole != Hole.NONE).float().mean())
     nearest = torch.cdist(samples.uv, before.uv).argmin(-1)
     inside = cluster.member.gather(1, nearest)

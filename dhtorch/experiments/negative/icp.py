@@ -22,33 +22,33 @@ import torch
 from torch import Tensor
 
 from dhtorch.data.recording import Recording
-from dhtorch.data.scene import Given, Scene, scenes_of
-from dhtorch.experiments.negative.registration import Registration, normals, register
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.experiments.negative.registration import IcpRegistration, estimate_normals, register_icp
+from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
-from dhtorch.experiments.screening import Item, paired, screen
+from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
 from dhtorch.geometry import se3, sparse_grid
 from dhtorch.metrics import bootstrap
 from dhtorch.records import Frame, Pose
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 from dhtorch.synthetic.recording import SyntheticRoom
 
 QUESTION = "Does ICP between independently sampled sparse sets add anything to a good device pose?"
 EXPECTATION = "No: it covers fewer voxels than the pose alone; without a pose it ends nearer to the truth than nothing."
 
-SOURCES = ("good", "poor", "none")
-SOLVERS = ("", " + icp points", " + icp planes")
-VARIANTS = tuple(source + solver for source in SOURCES for solver in SOLVERS)
-TRUTH = "trajectory"
+ICP_POSE_SOURCES = ("good", "poor", "none")
+_SOLVERS = ("", " + icp points", " + icp planes")
+VARIANTS = tuple(source + solver for source in ICP_POSE_SOURCES for solver in _SOLVERS)
+_TRUTH = "trajectory"
 
 #: A set of fewer points is no set: links that meet one are not asked.
-MIN_POINTS = 16
+_MIN_SET_POINTS = 16
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     n: int = 1024,
@@ -60,7 +60,7 @@ def run(
     min_condition: float = 1e-3,
     poor_deg: float = 3.0,
     poor_shift: float = 0.03,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Chain the frames of every recording with each source of poses, alone and refined.
 
@@ -88,46 +88,46 @@ def run(
     method = next(iter(methods.values())).replace(n=n)
     worlds: dict[str, _Chain] = {}
 
-    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         chain = worlds.setdefault(scene.name, _Chain(scene.recording, method, settings, voxel))
-        if not all(chain.cloud(k)[0].isfinite().all(-1).sum() >= MIN_POINTS for k in item):
+        if not all(chain.cloud(k)[0].isfinite().all(-1).sum() >= _MIN_SET_POINTS for k in item):
             return {}
         starts = {"good": chain.relative(item), "none": se3.identity(1, chain.cloud(item[0]).double())}
         starts["poor"] = se3.compose(chain.error(item, poor_deg, poor_shift), starts["good"])
         found: dict[str, Row] = {}
-        for source in SOURCES:
-            for solver in SOLVERS:
+        for source in ICP_POSE_SOURCES:
+            for solver in _SOLVERS:
                 fit = chain.refine(item, starts[source], solver, reach, least_reach)
                 sure = fit is None or bool(
                     fit.ok & (fit.inlier_share >= min_inlier_share) & (fit.condition >= min_condition)
                 )
                 T = starts[source] if fit is None or not sure else fit.T_1_from_0.to(torch.float64)
                 chain.keep(source + solver, item, T, sure)
-                found[source + solver] = _link(chain, item, T, fit, sure)
+                found[source + solver] = _evaluate_link(chain, item, T, fit, sure)
         return found
 
     def whole(scene: Scene, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
         chain = worlds.pop(scene.name, None)
         return {v: chain.summary(v) for v in VARIANTS} if chain and any(found) else {}
 
-    def items(scene: Scene) -> list[Item]:
-        return chain_of(scene.recording, links)
+    def items(scene: Scene) -> list[ScreenedItem]:
+        return consecutive_links(scene.recording, links)
 
-    outcome = screen(scenes_of(scenes), items, ask, VARIANTS, truth=TRUTH, whole=whole, progress=progress)
+    outcome = screen_scenes(scenes_of(scenes), items, ask, VARIANTS, truth=_TRUTH, whole=whole, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     """Fewer voxels over a good pose, and less drift than with none, each on more than half of the scenes?"""
-    covered = paired(outcome, TRUTH, "good + icp points", "good", "n_voxels")
-    lost = paired(outcome, TRUTH, "none + icp points", "none", "drift_rel")
+    covered = paired_metric(outcome, _TRUTH, "good + icp points", "good", "n_voxels")
+    lost = paired_metric(outcome, _TRUTH, "none + icp points", "none", "drift_rel")
     if not covered or not lost:
         return None, "no scene with a trajectory and depth in two frames"
     fewer, nearer = (sum(a < b for a, b in both) for both in (covered, lost))
     total = [sum(pair[k] for pair in covered) for k in (0, 1)]
-    ratio = bootstrap.interval([a / max(b, 1) for a, b in covered])
+    ratio = bootstrap.interval_over_scenes([a / max(b, 1) for a, b in covered])
     low, high = (ratio.value if bound is None else bound for bound in (ratio.low, ratio.high))
-    sure = [r["confident_share"] for r in outcome.scenes("good + icp points", TRUTH).values() if r["n_pairs"]]
+    sure = [r["confident_share"] for r in outcome.scenes("good + icp points", _TRUTH).values() if r["n_pairs"]]
     why = (
         f"over a good pose ICP covers {total[0]:.0f} voxels, the pose alone {total[1]:.0f} (paper: 5417, 6200), fewer"
         f" on {fewer} of {len(covered)} scenes, median ratio {ratio.value:.2f} ({low:.2f} to {high:.2f}),"
@@ -137,14 +137,14 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     return fewer > len(covered) / 2 and nearer > len(lost) / 2, why
 
 
-def chain_of(recording: Recording, links: int) -> list[Item]:
+def consecutive_links(recording: Recording, links: int) -> list[ScreenedItem]:
     """Consecutive frames, evenly spread; none without a trajectory.
 
     Raises:
         ValueError: fewer than two frames, or no link to make.
     """
     if len(recording) < 2 or links < 1:
-        found = f"{many(len(recording), 'frame')} of {recording.name} and links={links}"
+        found = f"{format_count(len(recording), 'frame')} of {recording.name} and links={links}"
         raise ValueError(f"icp: found {found}, expected at least two frames and one link")
     if recording.poses is None:
         return []
@@ -178,28 +178,30 @@ class _Chain:
             self.clouds[i] = seats.backproject(frame, uv).xyz
         return self.clouds[i]
 
-    def relative(self, item: Item, true: bool = False) -> Pose:
+    def relative(self, item: ScreenedItem, true: bool = False) -> Pose:
         """Pose of the later frame from the earlier one."""
         poses = self.true_poses if true else self.poses
         return se3.relative(*(poses[k : k + 1].to(torch.float64) for k in item))
 
-    def error(self, item: Item, degrees: float, shift: float) -> Pose:
+    def error(self, item: ScreenedItem, degrees: float, shift: float) -> Pose:
         """A motion of the given size in a seeded direction."""
         generator = torch.Generator().manual_seed(self.settings.seed + 7919 * (item[0] + 1))
         way = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
         return se3.exp(torch.cat((way[0] * math.radians(degrees), way[1] * shift * self.scale))[None])
 
-    def refine(self, item: Item, start: Pose, solver: str, reach: float, least: float) -> Registration | None:
+    def refine(
+        self, item: ScreenedItem, start: Pose, solver: str, reach: float, least: float
+    ) -> IcpRegistration | None:
         """ICP from a start; None where no solver is asked."""
         if not solver:
             return None
         first, second = self.cloud(item[0]), self.cloud(item[1])
-        planes = normals(second) if solver.endswith("planes") else None
-        return register(
+        planes = estimate_normals(second) if solver.endswith("planes") else None
+        return register_icp(
             first, second, start, normals_1=planes, reach_m=reach * self.scale, least_reach_m=least * self.scale
         )
 
-    def keep(self, variant: str, item: Item, T: Pose, sure: bool) -> None:
+    def keep(self, variant: str, item: ScreenedItem, T: Pose, sure: bool) -> None:
         """Put the later frame of a link into the map of a variant."""
         placed = self.placed[variant]
         if item[0] not in placed:
@@ -209,7 +211,7 @@ class _Chain:
     def voxels(self, placed: Mapping[int, tuple[Pose, bool]], sure_only: bool) -> Tensor:
         """Numbers (V,) of the cells that the points of the frames fall into."""
         points = [se3.apply(T, self.cloud(i).double())[0] for i, (T, sure) in placed.items() if sure or not sure_only]
-        return sparse_grid.occupied(torch.cat(points), self.voxel)
+        return sparse_grid.occupied_cells(torch.cat(points), self.voxel)
 
     def summary(self, variant: str) -> Row:
         """What a variant's chain covers and where it ends."""
@@ -218,13 +220,13 @@ class _Chain:
         covered, real = self.voxels(placed, sure_only=True), self.voxels(true, sure_only=False)
         alone = self.voxels(self.placed[variant.split(" + ", maxsplit=1)[0]], sure_only=False)
         last = max(placed)
-        drift = _off(placed[last][0], true[last][0])
+        drift = _pose_difference(placed[last][0], true[last][0])
         links = [sure for i, (_, sure) in placed.items() if i != min(placed)]
         return {
             "n_voxels": len(covered),
             "voxels_vs_pose": len(covered) / max(len(alone), 1),
             "n_voxels_all": len(self.voxels(placed, sure_only=False)),
-            "right_share": float(sparse_grid.near(covered, real).double().mean()) if len(covered) else None,
+            "right_share": float(sparse_grid.touches_cells(covered, real).double().mean()) if len(covered) else None,
             "confident_share": sum(links) / len(links),
             "drift_deg": drift[0],
             "drift_rel": drift[1] / self.scale,
@@ -232,8 +234,8 @@ class _Chain:
         }
 
 
-def _link(chain: _Chain, item: Item, T: Pose, fit: Registration | None, sure: bool) -> Row:
-    angle, distance = _off(T, chain.relative(item, true=True))
+def _evaluate_link(chain: _Chain, item: ScreenedItem, T: Pose, fit: IcpRegistration | None, sure: bool) -> Row:
+    angle, distance = _pose_difference(T, chain.relative(item, true=True))
     row: Row = {"rotation_deg": angle, "translation_m": distance, "translation_rel": distance / chain.scale}
     row |= {"confident": int(sure), "inlier_share": None, "rms_m": None, "condition": None}
     if fit is not None:
@@ -241,6 +243,6 @@ def _link(chain: _Chain, item: Item, T: Pose, fit: Registration | None, sure: bo
     return row
 
 
-def _off(T: Pose, true: Pose) -> tuple[float, float]:
+def _pose_difference(T: Pose, true: Pose) -> tuple[float, float]:
     """Angle (degrees) and distance (m) between two motions."""
     return math.degrees(float(se3.rotation_angle(T.R @ true.R.mT)[0])), float((T.t - true.t).norm())

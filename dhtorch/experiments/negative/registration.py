@@ -12,17 +12,17 @@ from torch import Tensor
 
 from dhtorch.geometry import se3
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.least_squares import choose, gauss_newton_step
-from dhtorch.geometry.linalg import product
+from dhtorch.geometry.least_squares import gauss_newton_step, select_batch
+from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.se3 import Pose
 from dhtorch.pytree import Record, record
 
 #: Fewest matched points that fix a rigid motion with something to spare.
-MIN_MATCHES = 6
+_MIN_MATCHES = 6
 
 
 @record
-class Registration(Record):
+class IcpRegistration(Record):
     """The motion between two sets and the evidence for it."""
 
     T_1_from_0: Pose
@@ -33,7 +33,7 @@ class Registration(Record):
     ok: Tensor  # (B,) bool: there were enough matches and they fix all six degrees of freedom
 
 
-def register(
+def register_icp(
     xyz_0: Tensor,  # (B, N, 3) m in frame 0, NaN = no point
     xyz_1: Tensor,  # (B, M, 3) m in frame 1, NaN = no point
     T_init: Pose,  # (B) 1 from 0
@@ -44,7 +44,7 @@ def register(
     least_reach_m: float = 0.1,
     keep: float = 0.8,
     iterations: int = 30,
-) -> Registration:
+) -> IcpRegistration:
     """Register set 0 to set 1 from a start: match every point with its nearest, keep the best matches, step, repeat.
 
     Every iteration is one Gauss–Newton step over the kept matches, which for points is the closed-form alignment up to
@@ -79,10 +79,10 @@ def register(
         given = f"keep={keep}, shrink={shrink}, least_reach_m={least_reach_m}, reach_m={reach_m}"
         raise ValueError(f"icp.register: found {given}, expected shares in (0, 1], a least reach up to the reach")
     with torch.no_grad():
-        sets = _Sets(xyz_0, xyz_1, normals_1)
+        sets = _PointSets(xyz_0, xyz_1, normals_1)
         start = Pose(T_init.R.double(), T_init.t.double())
         finite = start.R.isfinite().all(-1).all(-1) & start.t.isfinite().all(-1)
-        T = choose(finite, start, se3.identity(len(start.t), start.t))
+        T = select_batch(finite, start, se3.identity(len(start.t), start.t))
         reach = reach_m
         for _ in range(iterations):
             H, g, _, _ = sets.linearise(T, reach, keep)
@@ -91,15 +91,15 @@ def register(
         H, _, matched, square = sets.linearise(T, least_reach_m, 1.0)
     n = matched.sum(-1)
     condition = sets.condition(T, H)
-    ok = finite & (n >= MIN_MATCHES) & (condition > 1e-9)
+    ok = finite & (n >= _MIN_MATCHES) & (condition > 1e-9)
     rms = torch.where(n > 0, (torch.where(matched, square, 0.0).sum(-1) / n.clamp_min(1)).sqrt(), torch.nan)
     share = n / sets.valid_0.sum(-1).clamp_min(1)
-    pose = choose(ok, T, start).to(xyz_0.dtype)
+    pose = select_batch(ok, T, start).to(xyz_0.dtype)
     share, rms, condition = (v.to(xyz_0.dtype) for v in (share, rms, condition))
-    return Registration(pose, matched, share, rms, condition, ok)
+    return IcpRegistration(pose, matched, share, rms, condition, ok)
 
 
-def normals(
+def estimate_normals(
     xyz: Tensor,  # (B, M, 3) m, NaN = no point
     *,
     neighbours: int = 8,
@@ -122,7 +122,7 @@ def normals(
         raise ValueError(f"icp.normals: found {sizes['M']} points, {neighbours} neighbours, expected 3 or more of more")
     with torch.no_grad():
         valid = xyz.isfinite().all(-1)
-        x = _away(xyz, valid, 1e6)
+        x = _move_invalid_away(xyz, valid, 1e6)
         near = torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").topk(neighbours + 1, -1, largest=False)
         group = x.gather(1, near.indices.flatten(1)[..., None].expand(-1, -1, 3)).view(*near.indices.shape, 3)
         off = (group - group.mean(-2, keepdim=True)).double()
@@ -136,7 +136,7 @@ def normals(
     return torch.where(flat[..., None], normal, torch.nan)
 
 
-class _Sets:
+class _PointSets:
     """Two sets without NaN, in float64 where sums are taken."""
 
     def __init__(self, xyz_0: Tensor, xyz_1: Tensor, normals_1: Tensor | None) -> None:
@@ -144,7 +144,7 @@ class _Sets:
         if normals_1 is not None:
             valid_1 = valid_1 & normals_1.isfinite().all(-1)
         self.x = torch.where(self.valid_0[..., None], xyz_0, 0.0).double()
-        self.q = _away(xyz_1, valid_1, 1e6)
+        self.q = _move_invalid_away(xyz_1, valid_1, 1e6)
         self.normals = None if normals_1 is None else torch.where(valid_1[..., None], normals_1, 0.0)
         weight = self.valid_0[..., None].double()
         count = weight.sum(1).clamp_min(1)
@@ -161,10 +161,10 @@ class _Sets:
             ranked = torch.where(taking_part, distance, torch.inf).sort(-1).values
             last = (keep * taking_part.sum(-1, keepdim=True)).ceil().long().sub(1).clamp_min(0)
             taking_part = taking_part & (distance <= ranked.gather(-1, last))
-        r = Y - _at(self.q, index).double()  # (B, N, 3)
+        r = Y - _gather_rows(self.q, index).double()  # (B, N, 3)
         J = torch.cat((-se3.hat(Y), torch.eye(3, dtype=Y.dtype, device=Y.device).expand(*Y.shape, 3)), -1)
         if self.normals is not None:
-            m = _at(self.normals, index).double()
+            m = _gather_rows(self.normals, index).double()
             r = (m * r).sum(-1, keepdim=True)
             J = (m[..., None] * J).sum(-2, keepdim=True)
         w = taking_part.double()[..., None, None]
@@ -182,15 +182,15 @@ class _Sets:
         c = se3.apply(T, self.centre[:, None])[:, 0]
         size = self.size[:, None, None]
         A = torch.cat((torch.cat((eye / size, 0 * eye), -1), torch.cat((se3.hat(c) / size, eye), -1)), -2)
-        values = torch.linalg.eigvalsh(product(A.mT, product(H, A)))
+        values = torch.linalg.eigvalsh(small_matmul(A.mT, small_matmul(H, A)))
         return (values[:, 0].clamp_min(0) / values[:, -1].clamp_min(1e-300)).clamp(0, 1)
 
 
-def _at(values: Tensor, index: Tensor) -> Tensor:
+def _gather_rows(values: Tensor, index: Tensor) -> Tensor:
     """Rows (B, N, 3) of (B, M, 3)."""
     return values.gather(1, index[..., None].expand(-1, -1, 3))
 
 
-def _away(xyz: Tensor, valid: Tensor, far: float) -> Tensor:
+def _move_invalid_away(xyz: Tensor, valid: Tensor, far: float) -> Tensor:
     """Points with those that do not exist put where nothing is near."""
     return torch.where(valid[..., None], xyz, far)

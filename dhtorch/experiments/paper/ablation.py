@@ -12,27 +12,27 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from dhtorch.data.scene import Given
+from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
-from dhtorch.experiments.outcome import join
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.metrics import bootstrap
-from dhtorch.stages.sample import grid, vogel
+from dhtorch.stages.sample import regular_grid, vogel_spiral
 
 QUESTION = "Which part of the method does the result hang on?"
 EXPECTATION = "No change of a single part lowers the median error by more than a tenth."
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     n: Sequence[int] = (512, 1024, 4096),
     windows: Sequence[int] = (15, 31),
     others: Mapping[str, Method] | None = None,
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """One change at a time on the range split: sampler, number of samples, tracker, whole methods, cutoff.
 
@@ -50,8 +50,8 @@ def run(
     name, method = next(iter(methods.items()))
     changed: dict[str, Method] = {
         name: method,
-        "sampler grid": method.replace(sample=grid),
-        "sampler vogel": method.replace(sample=vogel),
+        "sampler grid": method.replace(sample=regular_grid),
+        "sampler vogel": method.replace(sample=vogel_spiral),
         **{f"n {count}": method.replace(n=count) for count in n},
         **{f"window {side}": method.replace(track={"window": side}) for side in windows},
         **{other: m for other, m in (others or {}).items() if other != name},
@@ -66,10 +66,10 @@ def run(
         progress=progress,
     )
     near.summary = {f"cutoff x0.5.{k}": v for k, v in near.summary.items()}
-    outcome = join([main, near])
-    ratios = {k: _ratio(outcome, k, name) for k in [*changed, "cutoff x0.5"] if k != name}
+    outcome = join_outcomes([main, near])
+    ratios = {k: _error_ratio(outcome, k, name) for k in [*changed, "cutoff x0.5"] if k != name}
     for k, (value, count) in ratios.items():
-        outcome.summary[f"{k}.median_rel_ratio"] = bootstrap.single(value, count)
+        outcome.summary[f"{k}.median_rel_ratio"] = bootstrap.without_interval(value, count)
     return outcome.decide(QUESTION, EXPECTATION, *verdict({k: v for k, (v, _) in ratios.items()}))
 
 
@@ -83,7 +83,7 @@ def verdict(ratios: Mapping[str, float | None]) -> tuple[bool | None, str]:
     return known[best] >= 0.9, f"error ratio to the method, geometric mean over scenes: {shown}"
 
 
-def _ratio(outcome: Outcome, variant: str, reference: str) -> tuple[float | None, int]:
+def _error_ratio(outcome: Outcome, variant: str, reference: str) -> tuple[float | None, int]:
     ours, base = outcome.scenes(variant), outcome.scenes(reference)
     logs = [
         math.log(ours[s]["median_rel"] / base[s]["median_rel"])

@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dhtorch.data.scene import Given
+from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
-from dhtorch.experiments.cohorts import HeldOut, everything
-from dhtorch.experiments.outcome import join
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
-from dhtorch.experiments.rows import Row, summarise
+from dhtorch.experiments.cohorts import HeldOut, hide_nothing
+from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
+from dhtorch.experiments.rows import Row, summarise_rows
 from dhtorch.metrics import bootstrap, errors, reliability, risk
 
 QUESTION = "Does the score order answers by risk, and is it a probability?"
@@ -24,13 +24,13 @@ EXPECTATION = "It orders (AURC below the mean risk) without being calibrated (EC
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     thresholds: Sequence[float] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """Reliability, risk–coverage and thresholds of every method, on the range split and on the hold-out.
 
@@ -48,14 +48,14 @@ def run(
     parts = [protocol.run(scenes, split, pairs, settings, progress=progress)]
     for name, method in methods.items():
         held = HeldOut(method, settings.seed)
-        asked = Protocol({name: held.variant()}, {"heldout": held.heldout}, everything)
+        asked = Protocol({name: held.variant()}, {"heldout": held.heldout}, hide_nothing)
         parts.append(protocol.run(scenes, asked, pairs, settings, progress=progress))
-    outcome = join(parts)
+    outcome = join_outcomes(parts)
     for row in outcome.rows:
         key = (row["scene"], row["method"], row["truth"])
         if row["pair"] is None and key in outcome.points:
             row.update(_at_thresholds(outcome.points[key], thresholds))
-    outcome.summary = summarise(outcome.rows, list(methods), ["heldout", "full"])
+    outcome.summary = summarise_rows(outcome.rows, list(methods), ["heldout", "full"])
     for name in methods:
         outcome.summary |= _pooled(outcome, name)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, next(iter(methods))))
@@ -67,7 +67,10 @@ def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:
     if not scenes:
         return None, "no scene with answers"
     orders = sum(r["aurc"] < r["mean_risk"] for r in scenes)
-    found = {k: bootstrap.interval([r[k] for r in scenes]).value for k in ("aurc", "mean_risk", "ece", "monotonicity")}
+    found = {
+        k: bootstrap.interval_over_scenes([r[k] for r in scenes]).value
+        for k in ("aurc", "mean_risk", "ece", "monotonicity")
+    }
     shown = ", ".join(f"{k} {v:.3f}" for k, v in found.items() if v is not None)
     holds = orders > len(scenes) / 2 and found["ece"] is not None and found["ece"] > 0.1
     return holds, f"orders answers on {orders} of {len(scenes)} scenes; scene medians: {shown}"
@@ -75,10 +78,10 @@ def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:
 
 def _at_thresholds(points: errors.Points, thresholds: Sequence[float]) -> Row:
     answered = points.answered()
-    row: Row = {"mean_risk": float(risk.capped(answered.error).mean()) if answered.error.numel() else None}
+    row: Row = {"mean_risk": float(risk.cap_error(answered.error).mean()) if answered.error.numel() else None}
     for threshold in thresholds:
         above = points.replace(keep=points.keep & (points.score >= threshold))
-        found = errors.measure(above)
+        found = errors.measure_errors(above)
         row[f"at_{threshold:g}"] = {k: found[k] for k in ("n_kept", "coverage", "median_rel", "p90_rel")}
     return row
 
@@ -86,4 +89,6 @@ def _at_thresholds(points: errors.Points, thresholds: Sequence[float]) -> Row:
 def _pooled(outcome: Outcome, method: str) -> dict[str, Any]:
     apart = {r["scene"] for r in outcome.rows if r.get("role")}
     scenes = [p for (s, m, t), p in outcome.points.items() if (m, t) == (method, "full") and s not in apart]
-    return {f"{method}.ece_pooled": bootstrap.single(reliability.measure(scenes)["ece"], len(scenes))}
+    return {
+        f"{method}.ece_pooled": bootstrap.without_interval(reliability.measure_reliability(scenes)["ece"], len(scenes))
+    }

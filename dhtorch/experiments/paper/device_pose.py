@@ -14,10 +14,16 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from dhtorch.data.scene import Given
+from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
-from dhtorch.experiments.cohorts import HeldOut, device_fit, everything, has_trajectory, trajectory
-from dhtorch.experiments.protocol import Answer, Method, Outcome, Pairs, Progress, Protocol, Settings
+from dhtorch.experiments.cohorts import (
+    HeldOut,
+    hide_nothing,
+    missing_trajectory_reason,
+    trajectory_pose,
+    trajectory_pose_fit,
+)
+from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import se3
 
@@ -26,12 +32,12 @@ EXPECTATION = "No: depth correlates with truth better, and errs less, under the 
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """Triangulate held-out samples under the device's trajectory, raw and converted, and under the anchored pose.
 
@@ -44,18 +50,18 @@ def run(
     """
     split = HeldOut(next(iter(methods.values())), settings.seed)
     variants = {
-        "device_raw": split.variant(fit=partial(device_fit, raw=True), needs=has_trajectory),
-        "device_gl_to_cv": split.variant(fit=device_fit, needs=has_trajectory),
+        "device_raw": split.variant(fit=partial(trajectory_pose_fit, raw=True), needs=missing_trajectory_reason),
+        "device_gl_to_cv": split.variant(fit=trajectory_pose_fit, needs=missing_trajectory_reason),
         "anchored": split.variant(),
     }
-    asked = Protocol(variants, {"heldout": split.heldout}, everything, disagreement)
+    asked = Protocol(variants, {"heldout": split.heldout}, hide_nothing, _trajectory_disagreement)
     outcome = protocol.run(scenes, asked, pairs, settings, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
-def disagreement(answer: Answer) -> Row:
+def _trajectory_disagreement(answer: Answer) -> Row:
     """By how much the relative pose of a pair differs from that of the device's trajectory."""
-    given, found = trajectory(answer.batch), answer.trace["fit"]
+    given, found = trajectory_pose(answer.batch), answer.trace["fit"]
     if given is None or not bool(found.ok[0]):
         return {"rotation_deg": None, "translation_m": None, "direction_deg": None, "baseline_m": None}
     given, T = given.to(found.cov.dtype), found.T_1_from_0

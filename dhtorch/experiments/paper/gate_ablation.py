@@ -14,27 +14,27 @@ from functools import partial
 from typing import Any
 
 from dhtorch.data.pairs import Pair, by_gap, by_scaled_gap
-from dhtorch.data.scene import Given, Scene
+from dhtorch.data.scene import Scene, SceneLike
 from dhtorch.experiments import protocol
-from dhtorch.experiments.cohorts import HeldOut, everything
-from dhtorch.experiments.outcome import join
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings
+from dhtorch.experiments.cohorts import HeldOut, hide_nothing
+from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings
 
 QUESTION = "Which gate carries the abstention, and how does the frame gap trade error for coverage?"
 EXPECTATION = "Without the parallax gate correlation falls by more than without the reprojection gate."
 
-Gaps = dict[str, Callable[[Any], list[Pair]]]
+GapPairs = dict[str, Callable[[Any], list[Pair]]]
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     factors: Sequence[float] = (0.5, 2.0),
     gaps: Sequence[int] = (),
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """The hold-out with each gate off, and at other frame gaps.
 
@@ -61,23 +61,23 @@ def run(
         whole = split.variant()
         variants[name] = replace(whole, method=whole.method.replace(triangulate=off))
     main = protocol.run(
-        scenes, Protocol(variants, {"heldout": split.heldout}, everything), pairs, settings, progress=progress
+        scenes, Protocol(variants, {"heldout": split.heldout}, hide_nothing), pairs, settings, progress=progress
     )
-    parts = [main, *sweep(scenes, split, at_gaps(factors, gaps), settings, progress)]
-    outcome = join(parts)
+    parts = [main, *sweep_gaps(scenes, split, pairs_at_gaps(factors, gaps), settings, progress)]
+    outcome = join_outcomes(parts)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 
-def at_gaps(factors: Sequence[float], gaps: Sequence[int]) -> Gaps:
+def pairs_at_gaps(factors: Sequence[float], gaps: Sequence[int]) -> GapPairs:
     """Name → pairs of a recording at that gap, none where it is too short."""
-    scaled: Gaps = {f"gap x{f:g}": partial(by_scaled_gap, factor=f) for f in factors}
-    return scaled | {f"gap {g}": partial(_fixed, gap=g) for g in gaps}
+    scaled: GapPairs = {f"gap x{f:g}": partial(by_scaled_gap, factor=f) for f in factors}
+    return scaled | {f"gap {g}": partial(_pairs_at_gap, gap=g) for g in gaps}
 
 
-def sweep(
-    scenes: Sequence[Given],
+def sweep_gaps(
+    scenes: Sequence[SceneLike],
     split: HeldOut,
-    gaps: Gaps,
+    gaps: GapPairs,
     settings: Settings,
     progress: Progress,
     columns: Callable[[protocol.Answer], dict[str, Any]] = protocol.no_columns,
@@ -85,7 +85,7 @@ def sweep(
     """The hold-out once for every gap."""
     parts = []
     for name, pairs in gaps.items():
-        asked = Protocol({name: split.variant()}, {"heldout": split.heldout}, everything, columns)
+        asked = Protocol({name: split.variant()}, {"heldout": split.heldout}, hide_nothing, columns)
         part = protocol.run(scenes, asked, pairs, settings, progress=progress)
         part.summary = {f"{name}.{k}": v for k, v in part.summary.items()}
         parts.append(part)
@@ -103,7 +103,7 @@ def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
     return both - without_parallax > both - without_residual, f"correlation: {why} (medians over scenes)"
 
 
-def _fixed(scene: Scene, gap: int) -> list[Pair]:
+def _pairs_at_gap(scene: Scene, gap: int) -> list[Pair]:
     number = scene.recording.number
     span = int(number[-1] - number[0])
     return by_gap(scene, gap) if gap <= span else []

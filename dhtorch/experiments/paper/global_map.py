@@ -21,33 +21,41 @@ from torch import Tensor
 
 from dhtorch import integrate
 from dhtorch.codes import Source
-from dhtorch.data.pairs import fixed
+from dhtorch.data.pairs import to_fixed_pairs
 from dhtorch.data.recording import Recording
-from dhtorch.data.scene import Given, Scene, scenes_of
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
-from dhtorch.experiments.screening import Item, paired, screen
+from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
 from dhtorch.geometry import sparse_grid
-from dhtorch.integrate.recording import POSES, PairEstimate, Places, build, chain, coverage, place
-from dhtorch.integrate.recording import ask as ask_pairs
+from dhtorch.integrate.recording import (
+    POSE_SOURCES,
+    PairEstimate,
+    PlacedFrames,
+    fuse_recording,
+    linking_pairs,
+    measure_coverage,
+    place_frames,
+)
+from dhtorch.integrate.recording import estimate_pairs as ask_pairs
 from dhtorch.metrics import bootstrap
 
 QUESTION = "Does fusing recovered points widen the map, and do they stitch its fragments into one?"
 EXPECTATION = "Wider, but not stitched: the fused map covers more voxels than the sensor's and has no fewer islands."
 
-TRUTH = "whole sensor"
-VARIANTS = tuple(f"{what} {poses}" for poses in POSES for what in ("sensor", "fused"))
+MAP_TRUTH = "whole sensor"
+VARIANTS = tuple(f"{what} {poses}" for poses in POSE_SOURCES for what in ("sensor", "fused"))
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     n: int = 2048,
     voxel: float = 0.02,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Fuse every recording four ways: the sensor alone and with recovered points, by device and by anchored poses.
 
@@ -60,20 +68,20 @@ def run(
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
         methods: name → method; the first is asked.
         pairs: anchors and their partners; further links for ``anchored`` come from
-            :func:`dhtorch.integrate.recording.chain`.
+            :func:`dhtorch.integrate.recording.linking_pairs`.
         n: samples of a pair.
         voxel: side of a voxel, in median depths.
 
     Source: paper, "Global integration (scope note)" and the limitation "map fragmentation".
     """
     method = next(iter(methods.values())).replace(n=n)
-    answers: dict[str, dict[Item, PairEstimate]] = {}
+    answers: dict[str, dict[ScreenedItem, PairEstimate]] = {}
 
-    def items(scene: Scene) -> list[Item]:
-        chosen = fixed(pairs(scene))
-        return [*chosen, *chain(chosen)]
+    def items(scene: Scene) -> list[ScreenedItem]:
+        chosen = to_fixed_pairs(pairs(scene))
+        return [*chosen, *linking_pairs(chosen)]
 
-    def ask(scene: Scene, item: Item) -> dict[str, Row]:
+    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         common: dict[str, Any] = {"seed": settings.seed, "device": settings.device, "dtype": settings.dtype}
         cutoff = settings.cutoff_of(scene)
         (answer,) = ask_pairs(scene, method, [item], cutoff=cutoff, **common)
@@ -86,28 +94,28 @@ def run(
 
     def whole(scene: Scene, _found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
         recording, found = scene.recording, answers.pop(scene.name, {})
-        maps = _Maps(recording, [found[p] for p in fixed(pairs(scene))], settings.cutoff_of(scene), voxel)
+        maps = _Maps(recording, [found[p] for p in to_fixed_pairs(pairs(scene))], settings.cutoff_of(scene), voxel)
         rows: dict[str, Row] = {}
-        for poses in POSES:
+        for poses in POSE_SOURCES:
             if poses == "anchored" or recording.poses is not None:
                 every = list(found.values()) if poses == "anchored" else maps.answers
-                rows |= maps.rows(place(recording, every, poses=poses), poses)
+                rows |= maps.rows(place_frames(recording, every, poses=poses), poses)
         return rows
 
-    outcome = screen(scenes_of(scenes), items, ask, VARIANTS, truth=TRUTH, whole=whole, progress=progress)
+    outcome = screen_scenes(scenes_of(scenes), items, ask, VARIANTS, truth=MAP_TRUTH, whole=whole, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     """More voxels, and no fewer islands, along the device's poses, each on more than half of the scenes?"""
-    voxels = paired(outcome, TRUTH, "fused device", "sensor device", "n_voxels")
-    islands = paired(outcome, TRUTH, "fused device", "sensor device", "n_islands")
+    voxels = paired_metric(outcome, MAP_TRUTH, "fused device", "sensor device", "n_voxels")
+    islands = paired_metric(outcome, MAP_TRUTH, "fused device", "sensor device", "n_islands")
     if not voxels:
         return None, "no scene with a trajectory"
     wider, stitched = sum(a > b for a, b in voxels), sum(a < b for a, b in islands)
-    ratio = bootstrap.interval([a / max(b, 1) for a, b in voxels])
+    ratio = bootstrap.interval_over_scenes([a / max(b, 1) for a, b in voxels])
     low, high = (ratio.value if bound is None else bound for bound in (ratio.low, ratio.high))
-    anchored = [r["n_fragments"] for r in outcome.scenes("fused anchored", TRUTH).values() if r.get("n_fragments")]
+    anchored = [r["n_fragments"] for r in outcome.scenes("fused anchored", MAP_TRUTH).values() if r.get("n_fragments")]
     whole = sum(n == 1 for n in anchored)
     why = (
         f"the fused map covers more voxels on {wider} of {len(voxels)} scenes, {ratio.value:.2f} times as many in the"
@@ -126,29 +134,31 @@ class _Maps:
         there = depth[depth.isfinite() & (depth > 0)]
         self.voxel = voxel * (float(there.median()) if len(there) else 1.0)
 
-    def rows(self, places: Places, poses: str) -> dict[str, Row]:
+    def rows(self, places: PlacedFrames, poses: str) -> dict[str, Row]:
         """What the sensor's map and the fused one cover."""
         everything = self.covered(self.fused(places, [Source.SENSOR], None))
         near = self.fused(places, [Source.SENSOR], self.cutoff)
-        both = build(self.recording, near, self.answers, places, sources=[Source.RECOVERED])
+        both = fuse_recording(self.recording, near, self.answers, places, sources=[Source.RECOVERED])
         total = len(places.poses) + places.n_unplaced
         common: Row = {"n_fragments": places.n_fragments, "placed_share": len(places.poses) / max(total, 1)}
         rows = {}
         for what, volume in (("sensor", near), ("fused", both)):
             found = self.covered(volume)
-            row = common | coverage(integrate.points(volume).xyz, self.voxel)
-            row["right_share"] = float(sparse_grid.near(found, everything).double().mean()) if len(found) else None
+            row = common | measure_coverage(integrate.extract_points(volume).xyz, self.voxel)
+            row["right_share"] = (
+                float(sparse_grid.touches_cells(found, everything).double().mean()) if len(found) else None
+            )
             row["voxel_m"] = self.voxel
             rows[f"{what} {poses}"] = row
         alone = rows[f"sensor {poses}"]["n_voxels"]
         rows[f"fused {poses}"]["voxels_vs_sensor"] = rows[f"fused {poses}"]["n_voxels"] / alone if alone else None
         return rows
 
-    def fused(self, places: Places, sources: Sequence[int], cutoff: float | None) -> integrate.Volume:
+    def fused(self, places: PlacedFrames, sources: Sequence[int], cutoff: float | None) -> integrate.Volume:
         """A new map along these poses."""
-        empty = integrate.empty(self.voxel)
-        return build(self.recording, empty, self.answers, places, sources=sources, cutoff=cutoff)
+        empty = integrate.make_volume(self.voxel)
+        return fuse_recording(self.recording, empty, self.answers, places, sources=sources, cutoff=cutoff)
 
     def covered(self, volume: integrate.Volume) -> Tensor:
         """Numbers of the voxels that the surface passes through."""
-        return sparse_grid.occupied(integrate.points(volume).xyz, self.voxel)
+        return sparse_grid.occupied_cells(integrate.extract_points(volume).xyz, self.voxel)

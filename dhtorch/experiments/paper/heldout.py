@@ -15,11 +15,11 @@ from typing import Any
 
 import torch
 
-from dhtorch.data.scene import Given
+from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
-from dhtorch.experiments.cohorts import HeldOut, everything
-from dhtorch.experiments.outcome import join
-from dhtorch.experiments.protocol import Answer, Method, Outcome, Pairs, Progress, Protocol, Settings
+from dhtorch.experiments.cohorts import HeldOut, hide_nothing
+from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 
@@ -27,16 +27,16 @@ QUESTION = "How good is triangulated depth on points that the pose never saw, an
 EXPECTATION = "Judging by the pose's own inliers flatters; at least half of the scenes pass the strict line."
 
 #: The strict line of a scene: correlation above, errors and residual below, and answers enough to speak of.
-MIN_CORR, MAX_MEDIAN_REL, MAX_RESIDUAL_PX, MIN_ANSWERS = 0.8, 0.1, 3.0, 10
+_MIN_CORR, _MAX_MEDIAN_REL, _MAX_RESIDUAL_PX, _MIN_ANSWERS = 0.8, 0.1, 3.0, 10
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """Split the returns of every pair in halves A (pose) and B (evaluation); judge by B, and naively by A's inliers.
 
@@ -51,15 +51,15 @@ def run(
     for name, method in methods.items():
         split = HeldOut(method, settings.seed)
         cohorts = {"cyclic": split.cyclic, "heldout": split.heldout}
-        asked = Protocol({name: split.variant()}, cohorts, everything, partial(reach, split))
+        asked = Protocol({name: split.variant()}, cohorts, hide_nothing, partial(recovery_columns, split))
         part = protocol.run(scenes, asked, pairs, settings, progress=progress)
-        part.summary |= {f"{name}.{k}": v for k, v in _judge(part.rows, name).items()}
+        part.summary |= {f"{name}.{k}": v for k, v in _mark_passes(part.rows, name).items()}
         parts.append(part)
-    outcome = join(parts)
+    outcome = join_outcomes(parts)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, next(iter(methods))))
 
 
-def reach(split: HeldOut, answer: Answer) -> Row:
+def recovery_columns(split: HeldOut, answer: Answer) -> Row:
     """How many of the sensor's true holes were recovered and how far they lie, beside how far the sensor sees."""
     whole = split.whole(answer.batch, answer.samples.uv)
     hole = ~whole.usable
@@ -73,23 +73,23 @@ def reach(split: HeldOut, answer: Answer) -> Row:
     return numbers
 
 
-def passes(row: Mapping[str, Any]) -> bool:
+def passes_strict_line(row: Mapping[str, Any]) -> bool:
     """Whether a scene passes the strict line; one with fewer than 10 answers does not."""
     numbers = [row.get(k) for k in ("corr", "median_rel", "residual_px")]
-    if row.get("n_kept", 0) < MIN_ANSWERS or any(v is None for v in numbers):
+    if row.get("n_kept", 0) < _MIN_ANSWERS or any(v is None for v in numbers):
         return False
     corr, median_rel, residual_px = (float(v) for v in numbers if v is not None)
-    return corr > MIN_CORR and median_rel < MAX_MEDIAN_REL and residual_px < MAX_RESIDUAL_PX
+    return corr > _MIN_CORR and median_rel < _MAX_MEDIAN_REL and residual_px < _MAX_RESIDUAL_PX
 
 
-def _judge(rows: Sequence[Row], method: str) -> dict[str, Any]:
+def _mark_passes(rows: Sequence[Row], method: str) -> dict[str, Any]:
     """Mark the scene rows of the hold-out with ``passes``; their count, and the number of scenes."""
     judged = [r for r in rows if r["pair"] is None and (r["method"], r["truth"]) == (method, "heldout")]
     for row in judged:
-        row["passes"] = passes(row)
+        row["passes"] = passes_strict_line(row)
     counted = [r for r in judged if r["role"] is None]
     values = {"n_passes": sum(r["passes"] for r in counted), "n_scenes": len(counted)}
-    return {k: bootstrap.single(v, len(counted), "count") for k, v in values.items()}
+    return {k: bootstrap.without_interval(v, len(counted), "count") for k, v in values.items()}
 
 
 def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:
@@ -101,7 +101,7 @@ def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:
     ratios = torch.tensor([honest[s]["median_rel"] / max(naive[s]["median_rel"], 1e-9) for s in both])
     flatters = int((ratios > 1).sum())
     n_passes = sum(r["passes"] for r in honest.values())
-    typical = bootstrap.interval(ratios.tolist()).value
+    typical = bootstrap.interval_over_scenes(ratios.tolist()).value
     holds = flatters > len(both) / 2 and n_passes >= len(honest) / 2
     return holds, (
         f"{n_passes} of {len(honest)} scenes pass the strict line; hold-out error over the naive protocol's: "

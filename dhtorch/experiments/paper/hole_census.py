@@ -14,9 +14,9 @@ from typing import Any
 import torch
 
 from dhtorch.codes import ROUTE_OF_HOLE, Hole, Route, names
-from dhtorch.data.scene import Given, Scene, scenes_of
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
-from dhtorch.experiments.rows import Row, mean, median
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
+from dhtorch.experiments.rows import Row, mean_or_none, median_or_none
 from dhtorch.metrics import errors
 from dhtorch.records import Samples
 
@@ -25,13 +25,13 @@ EXPECTATION = "At least half of the holes are TRACKABLE_NO_LIDAR, of trackabilit
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     stride: int = 1,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Classify the samples of every frame; nothing is hidden and no second view is read.
 
@@ -55,11 +55,13 @@ def run(
         rows = []
         for i in progress(frames, recording.name, len(frames)):
             rows.append({"scene": recording.name, "pair": [i, i], "method": name, "truth": None})
-            rows[-1] |= census(look(method, recording[i].to(settings.dtype).to(settings.device)))
-        outcome.rows += [*rows, _scene(rows, scene)]
+            rows[-1] |= count_holes(classify_frame(method, recording[i].to(settings.dtype).to(settings.device)))
+        outcome.rows += [*rows, _join_frames(rows, scene)]
         outcome.n_pairs += len(rows)
     whole = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]
-    outcome.summary = errors.summarise([{k: v for k, v in r.items() if k not in ("pair", "role")} for r in whole])
+    outcome.summary = errors.summarise_scenes(
+        [{k: v for k, v in r.items() if k not in ("pair", "role")} for r in whole]
+    )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 
@@ -73,13 +75,13 @@ def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
     return share >= 0.5 and hole >= 0.1 * valid, why
 
 
-def look(method: Method, frame: Any) -> Samples:
+def classify_frame(method: Method, frame: Any) -> Samples:
     """Seats 1 to 3 of a method: what its samples find in a frame."""
     with torch.no_grad():
         return method.look(frame)
 
 
-def census(samples: Samples) -> Row:
+def count_holes(samples: Samples) -> Row:
     """Holes of one frame (B = 1): how many, of which class, and what could fill them."""
     hole, quality = samples.hole[0], samples.trackability[0]
     n_holes = int((hole != Hole.NONE).sum())
@@ -92,12 +94,12 @@ def census(samples: Samples) -> Row:
         "hole_rate": n_holes / max(hole.numel(), 1),
         "hole_share": {names(Hole)[k].lower(): v for k, v in share.items()},
         "route_share": {names(Route)[r].lower(): v if n_holes else None for r, v in route.items()},
-        "trackability_hole": median(open_hole.tolist()),
-        "trackability_valid": median(valid.tolist()),
+        "trackability_hole": median_or_none(open_hole.tolist()),
+        "trackability_valid": median_or_none(valid.tolist()),
     }
 
 
-def _scene(rows: Sequence[Row], scene: Scene) -> Row:
+def _join_frames(rows: Sequence[Row], scene: Scene) -> Row:
     """Frames joined: counts added up, shares by mean over frames that have holes, trackability by median."""
     row: Row = {"scene": scene.name, "pair": None, "method": rows[0]["method"], "truth": None}
     row |= {"role": scene.role, "n_pairs": len(rows)}
@@ -105,7 +107,7 @@ def _scene(rows: Sequence[Row], scene: Scene) -> Row:
     row["hole_rate"] = row["n_holes"] / max(row["n_samples"], 1)
     for group in ("hole_share", "route_share"):
         some = [r[group] for r in rows if r["n_holes"]]
-        row[group] = {k: mean([g[k] for g in some]) for k in rows[0][group]}
+        row[group] = {k: mean_or_none([g[k] for g in some]) for k in rows[0][group]}
     for key in ("trackability_hole", "trackability_valid"):
-        row[key] = median([r[key] for r in rows if r[key] is not None])
+        row[key] = median_or_none([r[key] for r in rows if r[key] is not None])
     return row

@@ -28,11 +28,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from dhtorch.data.pairs import fixed
-from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch.data.pairs import to_fixed_pairs
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import memory
 from dhtorch.experiments.baselines import dinov2 as visual
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.metrics import holdout
@@ -47,17 +47,23 @@ EXPECTATION = (
 )
 
 #: The paper's figures (Apple M4 Pro, OpenCV on 14 threads): ms, and the two ratios that another machine can test.
-PAPER = {"front_end_ms": 1.11, "front_end_large_ms": 3.81, "dinov2_ms": 106.5, "speedup": 96.0, "growth": 3.81 / 1.11}
+_PAPER_FIGURES = {
+    "front_end_ms": 1.11,
+    "front_end_large_ms": 3.81,
+    "dinov2_ms": 106.5,
+    "speedup": 96.0,
+    "growth": 3.81 / 1.11,
+}
 
 #: Fewest repeats that can show the tail: one in 20 and one in 100.
-TAILS = {"p50_ms": (0.5, 1), "p95_ms": (0.95, 20), "p99_ms": (0.99, 100)}
+_TAIL_PERCENTILES = {"p50_ms": (0.5, 1), "p95_ms": (0.95, 20), "p99_ms": (0.99, 100)}
 
 #: Name of the visual branch in rows and summary.
-VISUAL = "dinov2_l"
+VISUAL_BRANCH = "dinov2_l"
 
 
 @dataclass
-class Branch:
+class TimedBranch:
     """One thing to time, and the times found: milliseconds by stage, one list per round."""
 
     method: str
@@ -78,9 +84,9 @@ class Branch:
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     chosen: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     sizes: Sequence[tuple[int, int]] = ((224, 224), (1440, 1920)),
@@ -91,8 +97,8 @@ def run(
     dinov2_repeats: int = 4,
     warm_up: int = 2,
     peak: bool = True,
-    dinov2: Callable[..., torch.nn.Module] = visual.load,
-    progress: Progress = quiet,
+    dinov2: Callable[..., torch.nn.Module] = visual.load_dinov2,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Time the method and DINOv2 in turn, on the first pair of the first scene, resampled to each size.
 
@@ -124,48 +130,48 @@ def run(
     name, method = next(iter(chosen.items()))
     scene = scenes_of(scenes)[0]
     told: dict[str, Any] = {"seed": settings.seed, "hint": scene.hint}
-    views = _views(scene, pairs, settings)
-    branches: list[Branch] = []
+    views = _first_pair(scene, pairs, settings)
+    branches: list[TimedBranch] = []
     for hw in sizes:
-        frame_0, frame_1 = (_resampled(view, (hw[0], hw[1])) for view in views)
+        frame_0, frame_1 = (_resample_frame(view, (hw[0], hw[1])) for view in views)
         timed: list[tuple[str, Callable[[], Any], int]] = [
-            ("front_end", partial(front_end, method, frame_0, n), front_end_repeats),
-            ("pair", partial(whole_pair, partial(method, n=n, **told), frame_0, frame_1), pair_repeats),
+            ("front_end", partial(run_front_end, method, frame_0, n), front_end_repeats),
+            ("pair", partial(run_pair, partial(method, n=n, **told), frame_0, frame_1), pair_repeats),
         ]
         for stage, call, repeats in timed:
-            more = memory.weights(method) | {"peak_mib": _peak_mib(call, settings, peak)}
-            branches.append(Branch(name, stage, frame_0.hw, call, repeats, more))
-    theirs, note = _visual(dinov2, views[0], settings, peak, dinov2_repeats)
+            more = memory.count_weights(method) | {"peak_mib": _peak_mib(call, settings, peak)}
+            branches.append(TimedBranch(name, stage, frame_0.hw, call, repeats, more))
+    theirs, note = _make_visual_branch(dinov2, views[0], settings, peak, dinov2_repeats)
     branches += theirs
     for _ in progress(range(rounds), f"{len(branches)} timings", rounds):
         for branch in branches:
-            _time(branch, warm_up, settings.device)
-    rows = [_row(scene.name, b, stage, settings, n) for b in branches for stage in b.rounds[0]]
+            _time_round(branch, warm_up, settings.device)
+    rows = [_timing_row(scene.name, b, stage, settings, n) for b in branches for stage in b.rounds[0]]
     if note:
-        rows.append({"scene": scene.name, "pair": None, "method": VISUAL, "stage": "forward", "note": note})
-    outcome = Outcome(rows=rows, summary=summarise(branches), n_pairs=1)
-    return outcome.decide(QUESTION, EXPECTATION, *judge(name, outcome.summary, sizes, note))
+        rows.append({"scene": scene.name, "pair": None, "method": VISUAL_BRANCH, "stage": "forward", "note": note})
+    outcome = Outcome(rows=rows, summary=summarise_timings(branches), n_pairs=1)
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(name, outcome.summary, sizes, note))
 
 
-def front_end(method: Method, frame: Frame, n: int) -> Samples:
+def run_front_end(method: Method, frame: Frame, n: int) -> Samples:
     """Seats 1 to 3 of a method: what the paper times."""
     return method.replace(n=n).look(frame)
 
 
-def whole_pair(method: Callable[..., Estimate], frame_0: Frame, frame_1: Frame) -> dict[str, float]:
+def run_pair(method: Callable[..., Estimate], frame_0: Frame, frame_1: Frame) -> dict[str, float]:
     """All seven seats; returns the milliseconds of each."""
     trace: Trace = {}
     method(frame_0, frame_1, trace=trace)
     return dict(trace["ms"])
 
 
-def forward(make: Callable[[], torch.nn.Module], pixels: Tensor) -> None:
+def run_forward(make: Callable[[], torch.nn.Module], pixels: Tensor) -> None:
     """Make the network and ask it once: what a process needs that has nothing else to do."""
     with torch.no_grad():
         make()(pixel_values=pixels)
 
 
-def judge(
+def verdict(
     method: str, summary: Mapping[str, Any], sizes: Sequence[Sequence[int]], note: str = ""
 ) -> tuple[bool | None, str]:
     """Whether both of the paper's ratios hold, None where the spread from round to round leaves it open; and why."""
@@ -174,7 +180,7 @@ def judge(
     said = [f"{first}: {', '.join(said)}"]
     claims: list[bool | None] = []
     for ratio, words in (("speedup", "DINOv2-L / front end"), ("growth", "growth of the front end")):
-        entry, paper = summary.get(f"{method}.{ratio}"), PAPER[ratio]
+        entry, paper = summary.get(f"{method}.{ratio}"), _PAPER_FIGURES[ratio]
         if entry is None:
             claims.append(None)
             said.append(f"{words} {note if ratio == 'speedup' and note else 'not measured'}")
@@ -186,9 +192,9 @@ def judge(
     return False if False in claims else None if None in claims else True, "; ".join(said)
 
 
-def _views(scene: Scene, pairs: Pairs, settings: Settings) -> tuple[Frame, Frame]:
+def _first_pair(scene: Scene, pairs: ScenePairs, settings: Settings) -> tuple[Frame, Frame]:
     """The first pair, as a method may see it."""
-    chosen = fixed(pairs(scene))
+    chosen = to_fixed_pairs(pairs(scene))
     if not chosen:
         raise ValueError(f"latency: {scene.name} has no pair, expected at least one")
     cutoff = settings.cutoff_of(scene)
@@ -196,7 +202,7 @@ def _views(scene: Scene, pairs: Pairs, settings: Settings) -> tuple[Frame, Frame
     return holdout.range_split(anchor, cutoff), holdout.range_split(other, cutoff)
 
 
-def _resampled(frame: Frame, hw: tuple[int, int]) -> Frame:
+def _resample_frame(frame: Frame, hw: tuple[int, int]) -> Frame:
     """The frame with a picture of another size; the depth map keeps its own."""
     image = frame.image / 255 if frame.image.dtype == torch.uint8 else frame.image
     image = interpolate(image, hw, mode="bilinear", antialias=True, align_corners=False).clamp(0, 1)
@@ -205,25 +211,25 @@ def _resampled(frame: Frame, hw: tuple[int, int]) -> Frame:
     return frame.replace(image=image, camera=cam.resize(frame.camera, frame.hw, hw))
 
 
-def _visual(
+def _make_visual_branch(
     make: Callable[..., torch.nn.Module], frame: Frame, settings: Settings, peak: bool, repeats: int
-) -> tuple[list[Branch], str]:
+) -> tuple[list[TimedBranch], str]:
     """The forward pass of DINOv2, or no branch and why not."""
     try:
-        visual.library()
+        visual.import_dinov2()
     except ImportError as error:
         return [], f"not measured: {error}"
     side = make.keywords.get("side", 224) if isinstance(make, partial) else 224
-    pixels = visual.pixel_values(frame.image, side).to(settings.dtype)
+    pixels = visual.preprocess_image(frame.image, side).to(settings.dtype)
     # Before this process holds the network, so that there is memory for both.
-    highest = _peak_mib(partial(forward, make, pixels), settings, peak, visual.library)
+    highest = _peak_mib(partial(run_forward, make, pixels), settings, peak, visual.import_dinov2)
     network = make().to(settings.device, settings.dtype)
 
     def call() -> None:
         network(pixel_values=pixels)
 
-    more = memory.weights(network) | {"peak_mib": highest}
-    return [Branch(VISUAL, "forward", (side, side), call, repeats, more)], ""
+    more = memory.count_weights(network) | {"peak_mib": highest}
+    return [TimedBranch(VISUAL_BRANCH, "forward", (side, side), call, repeats, more)], ""
 
 
 def _peak_mib(
@@ -233,7 +239,7 @@ def _peak_mib(
     return memory.peak_mib(call, before) if wanted and settings.device == "cpu" else None
 
 
-def _time(branch: Branch, warm_up: int, device: str) -> None:
+def _time_round(branch: TimedBranch, warm_up: int, device: str) -> None:
     """One round of a branch."""
     found: dict[str, list[float]] = {branch.stage: []}
     with torch.no_grad():
@@ -252,19 +258,19 @@ def _time(branch: Branch, warm_up: int, device: str) -> None:
     branch.rounds.append(found)
 
 
-def _row(scene: str, branch: Branch, stage: str, settings: Settings, n: int) -> Row:
+def _timing_row(scene: str, branch: TimedBranch, stage: str, settings: Settings, n: int) -> Row:
     """One branch or stage at one size."""
     times = sorted(branch.times(stage))
     row: Row = {"scene": scene, "pair": None, "method": branch.method, "stage": stage, "hw": list(branch.hw)}
-    row |= {"n": None if branch.method == VISUAL else n, "repeats": len(times)}
-    row |= {"threads": torch.get_num_threads(), "device": settings.device, **_machine()}
-    for name, (share, least) in TAILS.items():
+    row |= {"n": None if branch.method == VISUAL_BRANCH else n, "repeats": len(times)}
+    row |= {"threads": torch.get_num_threads(), "device": settings.device, **_describe_machine()}
+    for name, (share, least) in _TAIL_PERCENTILES.items():
         row[name] = percentile(times, share) if len(times) >= least else None
     row |= {"low_ms": min(branch.medians(stage)), "high_ms": max(branch.medians(stage))}
     return row | branch.more if stage == branch.stage else row
 
 
-def summarise(branches: Sequence[Branch]) -> dict[str, Any]:
+def summarise_timings(branches: Sequence[TimedBranch]) -> dict[str, Any]:
     """Medians by ``<method>.<stage>.<height>x<width>``, memory, and the paper's two ratios, round by round."""
     summary: dict[str, Any] = {}
     front = [b for b in branches if b.stage == "front_end"]
@@ -273,27 +279,27 @@ def summarise(branches: Sequence[Branch]) -> dict[str, Any]:
         for stage in b.rounds[0]:
             medians = b.medians(stage)
             middle = statistics.median(b.times(stage))
-            summary[f"{b.method}.{stage}.{size}"] = _entry(middle, medians, len(b.times(stage)), "ms")
+            summary[f"{b.method}.{stage}.{size}"] = _summary_entry(middle, medians, len(b.times(stage)), "ms")
         if b.more["peak_mib"] is not None:
-            summary[f"{b.method}.{b.stage}.{size}.peak_mib"] = _entry(b.more["peak_mib"], [], 1, "MiB")
-    for b in (front[0], *(b for b in branches if b.method == VISUAL)):
+            summary[f"{b.method}.{b.stage}.{size}.peak_mib"] = _summary_entry(b.more["peak_mib"], [], 1, "MiB")
+    for b in (front[0], *(b for b in branches if b.method == VISUAL_BRANCH)):
         for key, unit in (("parameters", "count"), ("weight_bytes", "B")):
-            summary[f"{b.method}.{key}"] = _entry(b.more[key], [], 1, unit)
+            summary[f"{b.method}.{key}"] = _summary_entry(b.more[key], [], 1, unit)
     small = front[0].medians("front_end")
     above_it = [("growth", b.medians("front_end")) for b in front[1:][-1:]]
-    above_it += [("speedup", b.medians("forward")) for b in branches if b.method == VISUAL]
+    above_it += [("speedup", b.medians("forward")) for b in branches if b.method == VISUAL_BRANCH]
     for name, above in above_it:
         ratios = [a / b for a, b in zip(above, small, strict=True)]
-        summary[f"{front[0].method}.{name}"] = _entry(statistics.median(ratios), ratios, len(ratios), "1")
+        summary[f"{front[0].method}.{name}"] = _summary_entry(statistics.median(ratios), ratios, len(ratios), "1")
     return summary
 
 
-def _entry(value: float, spread: Sequence[float], n: int, unit: str) -> dict[str, Any]:
+def _summary_entry(value: float, spread: Sequence[float], n: int, unit: str) -> dict[str, Any]:
     low, high = (min(spread), max(spread)) if spread else (None, None)
     return Interval(value, low, high, n).entry(unit)
 
 
-def _machine() -> Row:
+def _describe_machine() -> Row:
     """What milliseconds depend on: processor, cores, and how busy it is (runnable processes, last minute)."""
     name = ""
     with contextlib.suppress(OSError):

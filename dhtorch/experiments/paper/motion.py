@@ -14,13 +14,13 @@ from functools import partial
 
 import torch
 
-from dhtorch.data.scene import Given
+from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import HeldOut
-from dhtorch.experiments.outcome import join
-from dhtorch.experiments.paper.gate_ablation import at_gaps, sweep
-from dhtorch.experiments.paper.heldout import reach
-from dhtorch.experiments.protocol import Answer, Method, Outcome, Pairs, Progress, Settings
+from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.paper.gate_ablation import pairs_at_gaps, sweep_gaps
+from dhtorch.experiments.paper.heldout import recovery_columns
+from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, ScenePairs, Settings
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.correlation import spearman
@@ -30,13 +30,13 @@ EXPECTATION = "With a longer baseline more holes are recovered, and answers err 
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     factors: Sequence[float] = (0.25, 0.5, 1.0, 2.0),
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """The hold-out at several frame gaps; every pair's row carries ``baseline_m`` and ``recovered_share``.
 
@@ -52,19 +52,19 @@ def run(
     Source: paper, "Held-out triangulation on in-house captures" and "Limitations" (motion dependence).
     """
     split = HeldOut(next(iter(methods.values())), settings.seed)
-    parts = sweep(scenes, split, at_gaps(factors, ()), settings, progress, partial(columns, split))
-    outcome = join(parts)
+    parts = sweep_gaps(scenes, split, pairs_at_gaps(factors, ()), settings, progress, partial(_baseline_columns, split))
+    outcome = join_outcomes(parts)
     for name in dict.fromkeys(r["scene"] for r in outcome.rows):
-        trend = _trend([r for r in outcome.rows if r["scene"] == name and r["pair"] is not None])
+        trend = _baseline_trend([r for r in outcome.rows if r["scene"] == name and r["pair"] is not None])
         for row in outcome.rows:
             if row["scene"] == name and row["pair"] is None:
                 row.update(trend)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
-def columns(split: HeldOut, answer: Answer) -> Row:
+def _baseline_columns(split: HeldOut, answer: Answer) -> Row:
     """Baseline and recovery of one pair."""
-    numbers = reach(split, answer)
+    numbers = recovery_columns(split, answer)
     fit = answer.trace["fit"]
     baseline = float(fit.T_1_from_0.t[0].norm()) if bool(fit.ok[0]) else None
     share = numbers["n_recovered"] / numbers["n_holes"] if numbers["n_holes"] else None
@@ -74,8 +74,8 @@ def columns(split: HeldOut, answer: Answer) -> Row:
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     """The trends of the median scene."""
     scenes = {r["scene"]: r for r in outcome.rows if r["pair"] is None and r["role"] is None}.values()
-    recovered = bootstrap.interval([r["rank_corr_recovered"] for r in scenes])
-    error = bootstrap.interval([r["rank_corr_error"] for r in scenes])
+    recovered = bootstrap.interval_over_scenes([r["rank_corr_recovered"] for r in scenes])
+    error = bootstrap.interval_over_scenes([r["rank_corr_error"] for r in scenes])
     if recovered.value is None or error.value is None:
         return None, "no scene with pairs of different baselines"
     return recovered.value > 0 and error.value < 0, (
@@ -84,7 +84,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     )
 
 
-def _trend(rows: Sequence[Row]) -> Row:
+def _baseline_trend(rows: Sequence[Row]) -> Row:
     return {
         "rank_corr_recovered": _spearman(rows, "recovered_share"),
         "rank_corr_error": _spearman(rows, "median_rel"),

@@ -14,12 +14,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from dhtorch.data.scene import Given
+from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines.sensor_only import sensor_only
-from dhtorch.experiments.cohorts import device_fit, has_trajectory
-from dhtorch.experiments.outcome import join
-from dhtorch.experiments.protocol import Answer, Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.experiments.cohorts import missing_trajectory_reason, trajectory_pose_fit
+from dhtorch.experiments.outcome import join_outcomes
+from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
 
 QUESTION = "Can near returns alone recover far depth, and is it the anchored pose that does it?"
@@ -33,14 +33,14 @@ NO_GATES = {"min_parallax_deg": None, "max_residual_px": None}
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     cutoff_factors: Sequence[float] = (0.75, 1.25),
     cutoffs: Sequence[float] = (),
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """Five ways to far depth on one cohort, and the gated one at other cutoffs.
 
@@ -58,22 +58,26 @@ def run(
     Source: paper, "Strict near/far range split".
     """
     method = next(iter(methods.values()))
-    device = {name: partial(device_fit, raw=raw) for name, raw in (("device_raw", True), ("device_gl_to_cv", False))}
+    device = {
+        name: partial(trajectory_pose_fit, raw=raw) for name, raw in (("device_raw", True), ("device_gl_to_cv", False))
+    }
     variants = {
         "sensor_only": Variant(method, ask=sensor_only),
-        **{name: Variant(method, fit=fit, needs=has_trajectory) for name, fit in device.items()},
+        **{name: Variant(method, fit=fit, needs=missing_trajectory_reason) for name, fit in device.items()},
         "no_gates": Variant(method.replace(triangulate=NO_GATES)),
         "gated": Variant(method),
     }
-    main = protocol.run(scenes, Protocol(variants, columns=_truth), pairs, settings, progress=progress)
+    main = protocol.run(scenes, Protocol(variants, columns=_truth_columns), pairs, settings, progress=progress)
     sweep = {f"gated, cutoff x{f:g}": replace(settings, cutoff_factor=f) for f in cutoff_factors}
     sweep |= {f"gated, cutoff {c:g} m": replace(settings, cutoff=c, cutoff_factor=1.0) for c in cutoffs}
     parts = [main]
     for name, at in sweep.items():
-        part = protocol.run(scenes, Protocol({name: Variant(method)}, columns=_truth), pairs, at, progress=progress)
+        part = protocol.run(
+            scenes, Protocol({name: Variant(method)}, columns=_truth_columns), pairs, at, progress=progress
+        )
         part.summary = {f"{name}.{k}": v for k, v in part.summary.items()}
         parts.append(part)
-    outcome = join(parts)
+    outcome = join_outcomes(parts)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 
@@ -96,6 +100,6 @@ def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
     return coverage >= 0.25 and (raw is None or error < raw) and p90 < loose, why
 
 
-def _truth(answer: Answer) -> Row:
+def _truth_columns(answer: Answer) -> Row:
     value = float(answer.batch.disagreement[0])
     return {"truth_disagreement": value if value == value else None}  # noqa: PLR0124  (NaN is not equal to itself)

@@ -9,39 +9,39 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from dhtorch.data.scene import Given
+from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
-from dhtorch.experiments.cohorts import has_truth, real_holes
+from dhtorch.experiments.cohorts import missing_truth_reason, real_holes
 from dhtorch.experiments.paper.range_split import NO_GATES
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Protocol, Settings, Variant
+from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 
 QUESTION = "Are the sensor's real holes recovered as well as returns that were merely hidden?"
 EXPECTATION = "No: on the median scene the error on real holes is larger, and some scenes have no answer."
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
-    progress: Progress = protocol.quiet,
+    progress: Progress = protocol.no_progress,
 ) -> Outcome:
     """Gated and ungated on the sensor's true drop-outs, beside the same method on hidden far returns.
 
     Needs independent truth: other scenes keep a row that says so. A drop-out counts when it survives the filter of
-    :func:`dhtorch.metrics.holdout.drop_outs`; ``n_dropped`` says what did not. Cohorts: ``full`` (hidden returns) and
-    ``real_holes``; variants ``no_gates`` and ``gated``.
+    :func:`dhtorch.metrics.holdout.select_real_holes`; ``n_dropped`` says what did not. Cohorts: ``full`` (hidden
+    returns) and ``real_holes``; variants ``no_gates`` and ``gated``.
 
     Args and errors: as :func:`dhtorch.experiments.protocol.run`; of ``methods`` the first is asked.
     Source: paper, "Real holes are harder than masked ones".
     """
     method = next(iter(methods.values()))
     variants = {
-        "no_gates": Variant(method.replace(triangulate=NO_GATES), needs=has_truth),
-        "gated": Variant(method, needs=has_truth),
+        "no_gates": Variant(method.replace(triangulate=NO_GATES), needs=missing_truth_reason),
+        "gated": Variant(method, needs=missing_truth_reason),
     }
-    cohorts = {"full": protocol.held_back, "real_holes": real_holes}
+    cohorts = {"full": protocol.held_back_truth, "real_holes": real_holes}
     asked = Protocol(variants, cohorts, min_candidates=1)
     outcome = protocol.run(scenes, asked, pairs, settings, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))

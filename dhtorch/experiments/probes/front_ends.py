@@ -18,13 +18,13 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
 from dhtorch.pipeline.method import Method
 from dhtorch.records import NO_HINT, Frame, TrackHint
-from dhtorch.transforms import CHANNELS, ExtendDepth, grid
+from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth, token_grid
 
 #: Channels of a depth token that say something only where the patch has an answer.
-_OF_ANSWERS = ("inverse_depth", "sigma")
+_ANSWER_CHANNELS = ("inverse_depth", "sigma")
 
 #: Pictures that a network is given at once.
-_AT_ONCE = 8
+_MAX_IMAGES_PER_CALL = 8
 
 
 class FrontEnd(Protocol):
@@ -35,21 +35,21 @@ class FrontEnd(Protocol):
         ...
 
 
-def pixels(frame: Frame, other: Frame | None = None, *, side: int = 16) -> Tensor:
+def resize_to_square(frame: Frame, other: Frame | None = None, *, side: int = 16) -> Tensor:
     """The picture shrunk to ``side`` × ``side`` by area, three channels in [0, 1]."""
     image = frame.image / 255 if frame.image.dtype == torch.uint8 else frame.image
     small = torch.nn.functional.adaptive_avg_pool2d(image.float(), side)
     return small.expand(-1, 3, -1, -1).flatten(1)
 
 
-def pooled(tokens: Tensor, valid: Tensor, patches: tuple[int, int], cells: int) -> Tensor:
+def pool_tokens(tokens: Tensor, valid: Tensor, patches: tuple[int, int], cells: int) -> Tensor:
     """Depth tokens of a patch grid → ``cells`` × ``cells`` larger cells, (B, cells² · C).
 
     Shares are averaged over the patches of a cell; what speaks of answers (inverse depth, sigma) over the patches that
     have one, 0 where none has.
 
     Args:
-        tokens: (B, P, C) of :data:`dhtorch.transforms.CHANNELS`.
+        tokens: (B, P, C) of :data:`dhtorch.transforms.TOKEN_CHANNELS`.
         valid: (B, P).
         patches: rows and columns, P in all.
         cells: cells a side.
@@ -59,10 +59,10 @@ def pooled(tokens: Tensor, valid: Tensor, patches: tuple[int, int], cells: int) 
 
     Gradient: to the tokens.
     """
-    check("pooled", tokens=(tokens, f"B P {len(CHANNELS)}"), valid=(valid, "B P"))
+    check("pooled", tokens=(tokens, f"B P {len(TOKEN_CHANNELS)}"), valid=(valid, "B P"))
     if patches[0] * patches[1] != tokens.shape[1]:
         raise ValueError(f"pooled: found {tokens.shape[1]} tokens, expected {patches[0]} x {patches[1]}")
-    of_answers = torch.tensor([name in _OF_ANSWERS for name in CHANNELS], device=tokens.device)
+    of_answers = torch.tensor([name in _ANSWER_CHANNELS for name in TOKEN_CHANNELS], device=tokens.device)
     use = torch.where(of_answers, valid[..., None], True).to(tokens)
 
     def mean(x: Tensor) -> Tensor:
@@ -87,7 +87,7 @@ class DepthTokens:
         sparse: bool = False,
     ) -> None:
         self.views, self.cells = views, cells
-        self.patches = grid((side, side), patch=patch)
+        self.patches = token_grid((side, side), patch=patch)
         self._extended = partial(
             ExtendDepth,
             method=method,
@@ -111,7 +111,7 @@ class DepthTokens:
         given: dict[str, Any] = {k: k for k in ("depth_intrinsics", "confidence") if k in sample}
         transform = self._extended(**given)
         added = {k.removeprefix(transform.prefix): v for k, v in (transform(sample) or {}).items()}
-        features = pooled(added["tokens"][None], added["tokens_valid"][None], self.patches, self.cells)
+        features = pool_tokens(added["tokens"][None], added["tokens_valid"][None], self.patches, self.cells)
         return features.float(), added
 
 
@@ -129,8 +129,10 @@ class PatchTokens:
     def many(self, frames: list[Frame]) -> Tensor:
         """Features (len(frames), (1 + cells²) · hidden)."""
         found = []
-        for k in range(0, len(frames), _AT_ONCE):
-            image = torch.cat([dinov2.pixel_values(f.image, self.side) for f in frames[k : k + _AT_ONCE]])
+        for k in range(0, len(frames), _MAX_IMAGES_PER_CALL):
+            image = torch.cat(
+                [dinov2.preprocess_image(f.image, self.side) for f in frames[k : k + _MAX_IMAGES_PER_CALL]]
+            )
             hidden = self.network(pixel_values=image.float()).last_hidden_state
             across = round((hidden.shape[1] - 1) ** 0.5)
             patches = hidden[:, 1:].mT.unflatten(-1, (across, across))
@@ -148,15 +150,17 @@ class DenseFeatures:
     @torch.no_grad()
     def __call__(self, frame: Frame, other: Frame | None = None) -> Tensor:
         """Features (1, cells² · 64)."""
-        (found,) = xfeat.features(self.network, frame.image, scale=1.0, longest_px=self.longest_px)
+        (found,) = xfeat.extract_xfeat(self.network, frame.image, scale=1.0, longest_px=self.longest_px)
         return torch.nn.functional.adaptive_avg_pool2d(found.D[None], self.cells).flatten(1).float()
 
 
-def visual(build: Callable[..., torch.nn.Module] | None, *, cells: int, device: str) -> tuple[PatchTokens | None, bool]:
+def load_visual_front_end(
+    build: Callable[..., torch.nn.Module] | None, *, cells: int, device: str
+) -> tuple[PatchTokens | None, bool]:
     """The DINOv2 front end that the settings ask for, and whether its weights are real; None where left out.
 
     Args:
-        build: such as a partial of :func:`dhtorch.experiments.baselines.dinov2.load`; None = leave it out.
+        build: such as a partial of :func:`dhtorch.experiments.baselines.dinov2.load_dinov2`; None = leave it out.
         cells, device: of the front end.
 
     Raises:
@@ -169,24 +173,24 @@ def visual(build: Callable[..., torch.nn.Module] | None, *, cells: int, device: 
     return PatchTokens(network, cells=cells, side=options.get("side", 224)), options.get("weights") is not None
 
 
-def networks(
+def load_network_front_ends(
     dinov2: Callable[..., torch.nn.Module] | None, *, cells: int, xfeat_too: bool, device: str
 ) -> tuple[dict[str, FrontEnd], bool]:
     """The front ends of networks by the name of their block, and whether DINOv2's weights are real.
 
     Args:
-        dinov2, cells, device: as :func:`visual` takes them.
+        dinov2, cells, device: as :func:`load_visual_front_end` takes them.
         xfeat_too: XFeat as well, with the weights of its package.
 
     Raises:
         ImportError: a network's package is missing; the message says what to install.
     """
-    network, real = visual(dinov2, cells=cells, device=device)
+    network, real = load_visual_front_end(dinov2, cells=cells, device=device)
     found: dict[str, FrontEnd] = {} if network is None else {"dinov2": network}
-    return found | ({"xfeat": DenseFeatures(xfeat.packaged(device))} if xfeat_too else {}), real
+    return found | ({"xfeat": DenseFeatures(xfeat.load_xfeat(device))} if xfeat_too else {}), real
 
 
-def adapted(method: Method, scene: Scene, **options: Any) -> DepthTokens:
+def depth_tokens_for_scene(method: Method, scene: Scene, **options: Any) -> DepthTokens:
     """Depth tokens of a method with what a scene asks for."""
     return DepthTokens(method, hint=scene.hint, sparse=scene.recording.sparse, **options)
 

@@ -29,42 +29,42 @@ from torch import Tensor
 from dhtorch.data import convert
 from dhtorch.data.readers import rh20t
 from dhtorch.data.recording import Recording
-from dhtorch.data.scene import Given, scenes_of
+from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments.baselines import dinov2 as visual_branch
 from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes import ridge as probe
 from dhtorch.experiments.probes.probing import (
-    ALL,
-    ARMS,
-    CONTEXT,
-    MOVING,
-    PENALTIES,
-    REFERENCE,
-    TRUTH,
-    XFEAT,
-    Judged,
-    Shard,
-    Shards,
+    ALL_COHORT,
+    CONTEXT_BLOCK,
+    MOVING_COHORT,
+    PROBE_ARMS,
+    PROBE_PENALTIES,
+    PROBE_TRUTH,
+    REFERENCE_BLOCK,
+    XFEAT_BLOCK,
+    ProbeErrors,
+    ProbeShard,
+    ProbeShards,
 )
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 
 QUESTION = "Do depth features tell a ridge probe as much of a robot's next motion as DINOv2's do?"
 EXPECTATION = "Yes: its error is that of DINOv2 within 2 %, over all samples and over those that move."
 
 #: Angles of the context; an arm with fewer joints leaves the rest 0.
-JOINTS = 7
+_N_JOINTS = 7
 
 #: Decimals of the context: micrometres and microradians, less than a robot knows of itself.
-DIGITS = 6
+_CONTEXT_DECIMALS = 6
 
-OURS = "dhtorch"
+_OURS = "dhtorch"
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     horizon: float = 0.4,
@@ -73,13 +73,13 @@ def run(
     moving: float = 0.01,
     margin: float = 0.02,
     n_folds: int = 5,
-    penalties: Sequence[float] = PENALTIES,
+    penalties: Sequence[float] = PROBE_PENALTIES,
     depth_cells: int = 4,
     dinov2_cells: int = 1,
     rgb_side: int = 16,
-    dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load,
+    dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load_dinov2,
     xfeat: bool = False,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Compute the features of every scene once, fit the probes on tasks, judge them on others.
 
@@ -110,35 +110,39 @@ def run(
 
     Source: paper, section 6.7, "Downstream behaviour as a visual front-end".
     """
-    networks, real = front_ends.networks(dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device)
+    networks, real = front_ends.load_network_front_ends(
+        dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device
+    )
     method = next(iter(methods.values()))
     outcome = Outcome()
-    with Shards() as shards:
+    with ProbeShards() as shards:
         for scene in scenes_of(scenes):
             recording = scene.recording
-            index, before, context, target = robot(recording, horizon=horizon, history=history, stride=stride)
+            index, before, context, target = select_robot_samples(
+                recording, horizon=horizon, history=history, stride=stride
+            )
             if not len(index):
-                outcome.rows.append(_left_out(recording))
+                outcome.rows.append(_skip_reason(recording))
                 continue
             options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
-            two, one = (front_ends.adapted(method, scene, views=v, **options) for v in (2, 1))
-            look = partial(_look, recording, settings, two=two, one=one, networks=networks, rgb_side=rgb_side)
+            two, one = (front_ends.depth_tokens_for_scene(method, scene, views=v, **options) for v in (2, 1))
+            look = partial(_frame_features, recording, settings, two=two, one=one, networks=networks, rgb_side=rgb_side)
             looked = progress(list(zip(index, before, strict=True)), recording.name, len(index))
             rows = [look(i, j) for i, j in looked]
             blocks = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
             far = target[:, :3].norm(dim=-1) > moving
-            shards.add(Shard(task_of(recording), {CONTEXT: context, **blocks}, target, far))
+            shards.add(ProbeShard(task_name(recording), {CONTEXT_BLOCK: context, **blocks}, target, far))
         if not shards.n:
             raise ValueError(f"rh20t_probe: found no sample, expected scenes longer than {history + horizon} s")
-        arms = {k: blocks for k, blocks in ARMS.items() if set(blocks) <= set(shards.widths)}
-        judged = probing.judge(shards, arms, n_folds=n_folds, penalties=penalties, seed=settings.seed)
+        arms = {k: blocks for k, blocks in PROBE_ARMS.items() if set(blocks) <= set(shards.widths)}
+        judged = probing.evaluate_probes(shards, arms, n_folds=n_folds, penalties=penalties, seed=settings.seed)
         outcome.n_pairs = shards.n
-    probing.record(outcome, judged)
-    outcome.summary = probing.summarise(judged)
+    probing.record_probes(outcome, judged)
+    outcome.summary = probing.summarise_probes(judged)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, real, margin))
 
 
-def robot(
+def select_robot_samples(
     recording: Recording, *, horizon: float, history: float, stride: int
 ) -> tuple[list[int], list[int], Tensor, Tensor]:
     """The samples of one scene.
@@ -159,20 +163,20 @@ def robot(
     if recording.format != "rh20t" or recording.root is None or recording.times is None:
         expected = "an RH20T scene (data=rh20t_set data.root=PATH, or data=rh20t_synthetic)"
         raise ValueError(f"rh20t_probe: {recording.name} is {recording.format}, expected {expected}")
-    streams = rh20t.streams(recording.root)
+    streams = rh20t.read_robot_streams(recording.root)
     if "tcp_base" not in streams:
-        return [], [], torch.zeros(0, 16 + JOINTS), torch.zeros(0, 6)
+        return [], [], torch.zeros(0, 16 + _N_JOINTS), torch.zeros(0, 6)
     times, tcp = recording.times.numpy(), streams["tcp_base"]
     (now, a), (then, b), (past, c) = (tcp.at(times + shift) for shift in (0.0, horizon, -history))
     before = np.abs(times[:, None] - history - times[None]).argmin(1)
     use = a & b & c & (before < np.arange(len(times)))
     index = np.flatnonzero(use)[::stride]
-    T, ahead, behind = (_matrices(x[index], recording.root) for x in (now, then, past))
+    T, ahead, behind = (_pose_matrices(x[index], recording.root) for x in (now, then, past))
     hand = np.linalg.inv(T)
-    target, last = (_motion(hand @ other) for other in (ahead, behind))
-    angles = np.zeros((len(index), JOINTS))
+    target, last = (_motion_vectors(hand @ other) for other in (ahead, behind))
+    angles = np.zeros((len(index), _N_JOINTS))
     if "joint" in streams:
-        found = streams["joint"].at(times[index])[0][:, :JOINTS]
+        found = streams["joint"].at(times[index])[0][:, :_N_JOINTS]
         angles[:, : found.shape[1]] = found
     grip = next(
         (streams[k].at(times[index])[0][:, :1] for k in ("gripper_info", "gripper_command") if k in streams), None
@@ -182,43 +186,52 @@ def robot(
     known = np.concatenate((T[:, :3, 3], turned, angles, width), 1)
     context = torch.cat((torch.from_numpy(known), last), 1)
     # A number that varies by rounding alone, as an angle that a task never uses, would be standardised into a signal.
-    return index.tolist(), before[index].tolist(), context.round(decimals=DIGITS), target
+    return index.tolist(), before[index].tolist(), context.round(decimals=_CONTEXT_DECIMALS), target
 
 
-def verdict(judged: Judged, real: bool, margin: float) -> tuple[bool | None, str]:
+def verdict(judged: ProbeErrors, real: bool, margin: float) -> tuple[bool | None, str]:
     """Equivalent over all samples and over those that move? Never decided without DINOv2's own weights."""
     n = len(judged.groups)
-    own = judged.mean(OURS, ALL).value or 0.0
-    times = judged.ratio(OURS, CONTEXT, ALL)
-    text = f"error {own:.3f} of the targets' variance, {_interval(times)} times that of the context alone ({n} tasks)"
-    if (XFEAT, ALL) in judged.squares:
-        beside = {c: judged.ratio(OURS, XFEAT, c) for c in (ALL, MOVING)}
-        text += probing.beside_xfeat({c: (r.value, r.low, r.high) for c, r in beside.items()})
-    if (REFERENCE, ALL) not in judged.squares:
+    own = judged.mean(_OURS, ALL_COHORT).value or 0.0
+    times = judged.ratio(_OURS, CONTEXT_BLOCK, ALL_COHORT)
+    text = f"error {own:.3f} of the targets' variance, {_format_interval(times)} times that of the context alone ({n} tasks)"
+    if (XFEAT_BLOCK, ALL_COHORT) in judged.squares:
+        beside = {c: judged.ratio(_OURS, XFEAT_BLOCK, c) for c in (ALL_COHORT, MOVING_COHORT)}
+        text += probing.compare_with_xfeat({c: (r.value, r.low, r.high) for c, r in beside.items()})
+    if (REFERENCE_BLOCK, ALL_COHORT) not in judged.squares:
         return None, f"DINOv2 was left out; with depth features: {text}"
-    found = {c: judged.ratio(OURS, REFERENCE, c, level=probe.EQUIVALENCE_LEVEL) for c in (ALL, MOVING)}
-    ratios = ", ".join(f"{c} {_interval(r)}" for c, r in found.items())
+    found = {
+        c: judged.ratio(_OURS, REFERENCE_BLOCK, c, level=probe.EQUIVALENCE_LEVEL) for c in (ALL_COHORT, MOVING_COHORT)
+    }
+    ratios = ", ".join(f"{c} {_format_interval(r)}" for c, r in found.items())
     published = "paper: 1.006, 1.013"
     if not real:
-        said = f"{probing.RANDOM}; ratio to the random network, 90 % intervals: {ratios} ({published})"
+        said = f"{probing.RANDOM_WEIGHTS_NOTE}; ratio to the random network, 90 % intervals: {ratios} ({published})"
         return None, f"{said}. With depth features: {text}"
-    answers = [probe.equivalent(r, margin) for r in found.values()]
+    answers = [probe.is_equivalent(r, margin) for r in found.values()]
     holds = False if False in answers else True if all(answers) else None
     return holds, f"ratio to DINOv2, 90 % intervals, margin {margin:.0%}: {ratios}; {published}. {text}"
 
 
-def task_of(recording: Recording) -> str:
+def task_name(recording: Recording) -> str:
     """The task that a scene shows, by the name of its folder."""
     named = re.search(r"task_\d+", recording.name)
     return named[0] if named else str(recording.name)
 
 
-def _left_out(recording: Recording) -> Row:
+def _skip_reason(recording: Recording) -> Row:
     note = "no sample: no pose of the hand over so long a time"
-    return {"scene": recording.name, "pair": None, "method": CONTEXT, "truth": TRUTH, "role": None, "note": note}
+    return {
+        "scene": recording.name,
+        "pair": None,
+        "method": CONTEXT_BLOCK,
+        "truth": PROBE_TRUTH,
+        "role": None,
+        "note": note,
+    }
 
 
-def _look(
+def _frame_features(
     recording: Recording,
     settings: Settings,
     i: int,
@@ -233,7 +246,7 @@ def _look(
     frame, other = (recording[k].to(settings.dtype).to(settings.device) for k in (i, j))
     with torch.no_grad():
         found = {
-            "rgb": front_ends.pixels(frame, side=rgb_side),
+            "rgb": front_ends.resize_to_square(frame, side=rgb_side),
             "depth": two(frame, other),
             "depth_one_view": one(frame),
             **{name: network(frame) for name, network in networks.items()},
@@ -241,7 +254,9 @@ def _look(
     return {name: x.cpu() for name, x in found.items()}
 
 
-def _first(streams: Mapping[str, rh20t.Stream], names: Sequence[str], times: np.ndarray, size: int) -> np.ndarray:
+def _first_stream(
+    streams: Mapping[str, rh20t.RobotStream], names: Sequence[str], times: np.ndarray, size: int
+) -> np.ndarray:
     """The first ``size`` numbers (n, size) of the first of these streams that there is, filled up with zeros."""
     whole = np.zeros((len(times), size))
     for name in names:
@@ -252,18 +267,18 @@ def _first(streams: Mapping[str, rh20t.Stream], names: Sequence[str], times: np.
     return whole
 
 
-def _matrices(tcp: np.ndarray, file: Path) -> np.ndarray:
+def _pose_matrices(tcp: np.ndarray, file: Path) -> np.ndarray:
     return convert.to_c2w(tcp[:, [4, 5, 6, 3]], tcp[:, :3], file, "tcp")
 
 
-def _motion(T: np.ndarray) -> Tensor:
+def _motion_vectors(T: np.ndarray) -> Tensor:
     """(n, 6) translation and rotation vector of (n, 4, 4)."""
     R = torch.from_numpy(np.ascontiguousarray(T[:, :3, :3]))
     turn = rotation_matrix_to_axis_angle(R) if len(R) else R.new_zeros(0, 3)
     return torch.cat((torch.from_numpy(T[:, :3, 3]), turn), 1)
 
 
-def _interval(found: Any) -> str:
+def _format_interval(found: Any) -> str:
     if found.value is None:
         return "–"
     return f"{found.value:.3f}" + ("" if found.low is None else f" ({found.low:.3f} to {found.high:.3f})")

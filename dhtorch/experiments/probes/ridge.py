@@ -1,9 +1,9 @@
 """A linear probe: how much of a target a ridge regression reads off given features, in closed form.
 
 A ridge regression needs no more of the data than means and scatter matrices. So shards of any length pass through one
-by one (:class:`Stream`), what is kept is a square of the number of features, and every penalty and every selection of
-features is solved from the same numbers. Features are standardised by their own spread inside; a feature that does not
-vary has the weight 0.
+by one (:class:`MomentStream`), what is kept is a square of the number of features, and every penalty and every
+selection of features is solved from the same numbers. Features are standardised by their own spread inside; a feature
+that does not vary has the weight 0.
 
 Alphabet: N samples, F features, D targets, P penalties, G groups (tasks) that a split never tears apart; ``*`` any
 leading dimensions. Penalties are per sample and in units of standardised features: the loss is the *mean* squared
@@ -26,17 +26,17 @@ from dhtorch.metrics.bootstrap import Interval
 from dhtorch.pytree import Record, record
 
 #: Smaller penalties count as this much: what keeps the equations solvable when features repeat each other.
-FLOOR = 1e-12
+_MIN_PENALTY = 1e-12
 
 #: A feature whose standard deviation is a smaller part of its mean does not vary: what is left is rounding.
-CONSTANT = 1e-9
+_MIN_RELATIVE_SPREAD = 1e-9
 
 #: Confidence of the interval that decides on equivalence: two one-sided tests at 5 % each.
 EQUIVALENCE_LEVEL = 0.90
 
 
 @record
-class Moments(Record):
+class SampleMoments(Record):
     """All that a ridge regression needs of some samples; float64."""
 
     n: Tensor  # (*,) samples that count
@@ -48,14 +48,14 @@ class Moments(Record):
 
 
 @record
-class Linear(Record):
+class LinearProbe(Record):
     """One linear map for each penalty; float64."""
 
     weight: Tensor  # (*, P, F, D), for features as they come
     bias: Tensor  # (*, P, D)
 
 
-class Fold(NamedTuple):
+class ProbeFold(NamedTuple):
     """Which groups a probe learns from, which choose its penalty, and which it is judged on."""
 
     train: tuple[str, ...]
@@ -63,7 +63,7 @@ class Fold(NamedTuple):
     test: tuple[str, ...]
 
 
-def moments(x: Tensor, y: Tensor) -> Moments:
+def compute_moments(x: Tensor, y: Tensor) -> SampleMoments:
     """Means and scatter of samples; one with a number that is not finite does not count.
 
     Args:
@@ -76,10 +76,10 @@ def moments(x: Tensor, y: Tensor) -> Moments:
     Gradient: to x and y.
     """
     dx, dy, n, x_mean, y_mean = _centred(x, y)
-    return Moments(n, x_mean, y_mean, dx.mT @ dx, dx.mT @ dy, (dy * dy).sum(-2))
+    return SampleMoments(n, x_mean, y_mean, dx.mT @ dx, dx.mT @ dy, (dy * dy).sum(-2))
 
 
-def join(a: Moments, b: Moments) -> Moments:
+def join_moments(a: SampleMoments, b: SampleMoments) -> SampleMoments:
     """Moments of the samples of both, as if they had been seen together.
 
     Raises:
@@ -93,7 +93,7 @@ def join(a: Moments, b: Moments) -> Moments:
     share = b.n / n.clamp_min(1)
     between = (a.n * share)[..., None]
     dx, dy = b.x - a.x, b.y - a.y
-    return Moments(
+    return SampleMoments(
         n,
         a.x + dx * share[..., None],
         a.y + dy * share[..., None],
@@ -103,23 +103,24 @@ def join(a: Moments, b: Moments) -> Moments:
     )
 
 
-def columns(of: Moments, index: Tensor) -> Moments:
+def select_features(of: SampleMoments, index: Tensor) -> SampleMoments:
     """The same samples with some features only: ``index`` (f,) int64 into the F."""
     xx = of.xx.index_select(-1, index).index_select(-2, index)
     return of.replace(x=of.x.index_select(-1, index), xx=xx, xy=of.xy.index_select(-2, index))
 
 
-class Stream:
+class MomentStream:
     """Moments of shards that pass by, added in place: F² numbers are kept, however many samples there were.
 
-    Equal to :func:`moments` of all shards together up to rounding. With :func:`ridge` behind it the peak is four F × F
-    matrices of float64 and a few copies of a shard: 3.3 GB measured for F = 10,000 in shards of 1,000. No gradients.
+    Equal to :func:`compute_moments` of all shards together up to rounding. With :func:`solve_ridge` behind it the peak
+    is four F × F matrices of float64 and a few copies of a shard: 3.3 GB measured for F = 10,000 in shards of 1,000. No
+    gradients.
     """
 
     def __init__(self, features: int, targets: int, device: torch.device | str = "cpu") -> None:
         zeros = {"dtype": torch.float64, "device": device}
         F, D = features, targets
-        self.moments = Moments(*(torch.zeros(size, **zeros) for size in ((), (F,), (D,), (F, F), (F, D), (D,))))  # type: ignore[call-overload]
+        self.moments = SampleMoments(*(torch.zeros(size, **zeros) for size in ((), (F,), (D,), (F, F), (F, D), (D,))))  # type: ignore[call-overload]
 
     @torch.no_grad()
     def add(self, x: Tensor, y: Tensor) -> None:
@@ -141,12 +142,12 @@ class Stream:
         m.n.add_(n)
 
 
-def ridge(of: Moments, penalty: Tensor) -> Linear:
+def solve_ridge(of: SampleMoments, penalty: Tensor) -> LinearProbe:
     """Ridge regressions with an intercept, one for each penalty.
 
     Args:
         of: the samples to learn from.
-        penalty: (P,), or (P, F) where blocks of features are to be held back differently. Below :data:`FLOOR` it
+        penalty: (P,), or (P, F) where blocks of features are to be held back differently. Below :data:`_MIN_PENALTY` it
             counts as that.
 
     Returns:
@@ -165,18 +166,18 @@ def ridge(of: Moments, penalty: Tensor) -> Linear:
         raise ValueError(f"ridge: penalty has shape {tuple(penalty.shape)}, expected (P,) or (P, {F})")
     n = of.n.clamp_min(1)[..., None]
     variance = of.xx.diagonal(dim1=-2, dim2=-1) / n
-    varies = variance > (CONSTANT * of.x).square().clamp_min(1e-300)
+    varies = variance > (_MIN_RELATIVE_SPREAD * of.x).square().clamp_min(1e-300)
     unit = torch.where(varies, torch.where(varies, variance, 1.0).rsqrt(), 0.0)
     gram = of.xx * (unit / n)[..., :, None] * unit[..., None, :]
     known = of.xy * (unit / n)[..., None]
-    weights = [_solve(gram, p, known) for p in penalty.to(gram).clamp_min(FLOOR).unbind(0)]
+    weights = [_solve_gram(gram, p, known) for p in penalty.to(gram).clamp_min(_MIN_PENALTY).unbind(0)]
     weight = torch.stack(weights, -3) if weights else known.new_zeros(*known.shape[:-2], 0, *known.shape[-2:])
     weight = weight * unit[..., None, :, None]
     bias = of.y[..., None, :] - (weight * of.x[..., None, :, None]).sum(-2)
-    return Linear(weight, bias)
+    return LinearProbe(weight, bias)
 
 
-def predict(linear: Linear, x: Tensor) -> Tensor:
+def predict_targets(linear: LinearProbe, x: Tensor) -> Tensor:
     """Targets (*, P, N, D), float64, that every map of ``linear`` gives for features (*, N, F).
 
     Raises:
@@ -186,7 +187,7 @@ def predict(linear: Linear, x: Tensor) -> Tensor:
     return x.double()[..., None, :, :] @ linear.weight + linear.bias[..., None, :]
 
 
-def folds(groups: Sequence[str], n: int = 5, *, seed: int = 0) -> list[Fold]:
+def make_folds(groups: Sequence[str], n: int = 5, *, seed: int = 0) -> list[ProbeFold]:
     """Every group is judged on once: part k tests, the next part chooses the penalty, the others teach.
 
     Args:
@@ -204,7 +205,7 @@ def folds(groups: Sequence[str], n: int = 5, *, seed: int = 0) -> list[Fold]:
     Random(f"folds {seed}").shuffle(names)
     parts = [tuple(names[k::n]) for k in range(n)]
     return [
-        Fold(
+        ProbeFold(
             tuple(name for j in range(n) if j not in (k, (k + 1) % n) for name in parts[j]),
             parts[(k + 1) % n],
             parts[k],
@@ -213,7 +214,9 @@ def folds(groups: Sequence[str], n: int = 5, *, seed: int = 0) -> list[Fold]:
     ]
 
 
-def mean_error(squares: Tensor, counts: Tensor, *, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Interval:
+def mean_squared_error(
+    squares: Tensor, counts: Tensor, *, level: float = 0.95, draws: int = 2000, seed: int = 0
+) -> Interval:
     """Mean squared error over all samples, its interval by resampling groups.
 
     Args:
@@ -222,10 +225,10 @@ def mean_error(squares: Tensor, counts: Tensor, *, level: float = 0.95, draws: i
         level, draws, seed: of the bootstrap.
     """
     check("mean_error", squares=(squares, "G"), counts=(counts, "G"))
-    return _quotient(squares, counts, counts > 0, level, draws, seed)
+    return _bootstrap_quotient(squares, counts, counts > 0, level, draws, seed)
 
 
-def ratio(ours: Tensor, theirs: Tensor, *, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Interval:
+def error_ratio(ours: Tensor, theirs: Tensor, *, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Interval:
     """Quotient of two errors on the same samples, its interval by resampling groups, both sides alike (paired).
 
     Args:
@@ -233,10 +236,10 @@ def ratio(ours: Tensor, theirs: Tensor, *, level: float = 0.95, draws: int = 200
         level, draws, seed: of the bootstrap.
     """
     check("ratio", ours=(ours, "G"), theirs=(theirs, "G"))
-    return _quotient(ours, theirs, (ours > 0) | (theirs > 0), level, draws, seed)
+    return _bootstrap_quotient(ours, theirs, (ours > 0) | (theirs > 0), level, draws, seed)
 
 
-def equivalent(found: Interval, margin: float = 0.02) -> bool | None:
+def is_equivalent(found: Interval, margin: float = 0.02) -> bool | None:
     """Whether a ratio is 1 within ``margin``: True or False where its interval says so, else None.
 
     True: the whole interval lies within. False: the whole interval lies beyond, on one side. With an interval of
@@ -266,17 +269,17 @@ def _centred(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tens
     return parts[0], parts[2], n, parts[1], parts[3]
 
 
-def _solve(gram: Tensor, penalty: Tensor, known: Tensor) -> Tensor:
+def _solve_gram(gram: Tensor, penalty: Tensor, known: Tensor) -> Tensor:
     diagonal = gram.diagonal(dim1=-2, dim2=-1) + penalty
     lower, _ = torch.linalg.cholesky_ex(torch.diagonal_scatter(gram, diagonal, dim1=-2, dim2=-1))
     return torch.cholesky_solve(known, lower)
 
 
-def _quotient(above: Tensor, below: Tensor, use: Tensor, level: float, draws: int, seed: int) -> Interval:
+def _bootstrap_quotient(above: Tensor, below: Tensor, use: Tensor, level: float, draws: int, seed: int) -> Interval:
     above, below = above[use].double(), below[use].double()
 
     def number(index: Tensor) -> Tensor:
         total = below[index].sum(-1)
         return torch.where(total > 0, above[index].sum(-1) / total, math.nan)
 
-    return bootstrap.interval_of(number, len(above), level=level, draws=draws, seed=seed)
+    return bootstrap.interval_of_statistic(number, len(above), level=level, draws=draws, seed=seed)

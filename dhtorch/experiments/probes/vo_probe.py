@@ -24,20 +24,20 @@ from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
 from dhtorch.data.recording import Recording
-from dhtorch.data.scene import Given, Scene, scenes_of
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.baselines import dinov2 as visual_branch
 from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes.probing import (
-    ARMS,
-    CONTEXT,
-    PENALTIES,
-    REFERENCE,
-    TRUTH,
-    XFEAT,
-    Shard,
-    Shards,
+    CONTEXT_BLOCK,
+    PROBE_ARMS,
+    PROBE_PENALTIES,
+    PROBE_TRUTH,
+    REFERENCE_BLOCK,
+    XFEAT_BLOCK,
+    ProbeShard,
+    ProbeShards,
 )
-from dhtorch.experiments.protocol import Method, Outcome, Pairs, Progress, Settings, quiet
+from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import se3
 from dhtorch.records import Frame
@@ -46,28 +46,28 @@ QUESTION = "Within one scene, do depth features tell a ridge probe more of the c
 EXPECTATION = "Yes: on every scene the error with depth features is smaller than DINOv2's."
 
 #: Block of a shard that holds the method's own answer.
-OWN = "pose"
+_OWN_POSE_BLOCK = "pose"
 
-OURS, POSE = "dhtorch", "two_view_pose"
+_OURS, _POSE_ARM = "dhtorch", "two_view_pose"
 
 
 def run(
-    scenes: Sequence[Given],
+    scenes: Sequence[SceneLike],
     methods: Mapping[str, Method],
-    pairs: Pairs,
+    pairs: ScenePairs,
     settings: Settings,
     *,
     gap_parts: int = 3,
     blocks: int = 5,
     min_pairs: int = 30,
     moving: float = 0.01,
-    penalties: Sequence[float] = PENALTIES,
+    penalties: Sequence[float] = PROBE_PENALTIES,
     depth_cells: int = 4,
     dinov2_cells: int = 1,
     rgb_side: int = 16,
-    dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load,
+    dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load_dinov2,
     xfeat: bool = False,
-    progress: Progress = quiet,
+    progress: Progress = no_progress,
 ) -> Outcome:
     """Probes of every scene alone; scenes of one room are one.
 
@@ -94,39 +94,44 @@ def run(
     """
     if blocks < 3:
         raise ValueError(f"vo_probe: blocks is {blocks}, expected at least 3")
-    networks, real = front_ends.networks(dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device)
-    every = [*(arm for arm, blocks in ARMS.items() if xfeat or XFEAT not in blocks), POSE]
+    networks, real = front_ends.load_network_front_ends(
+        dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device
+    )
+    every = [*(arm for arm, blocks in PROBE_ARMS.items() if xfeat or XFEAT_BLOCK not in blocks), _POSE_ARM]
     outcome = Outcome()
     rooms: dict[str, list[Scene]] = {}
     for scene in scenes_of(scenes):
         rooms.setdefault(scene.place, []).append(scene)
     for room, members in rooms.items():
-        cut = {s.name: in_blocks(s, gap_parts, max(1, -(-blocks // len(members)))) for s in members}
+        cut = {s.name: split_into_blocks(s, gap_parts, max(1, -(-blocks // len(members)))) for s in members}
         n = sum(len(block) for own in cut.values() for block in own)
         if n < min_pairs:
             note = f"{n} pairs with known motion, fewer than {min_pairs}"
-            outcome.rows += [_silent(room, arm, note) for arm in every]
+            outcome.rows += [_empty_row(room, arm, note) for arm in every]
             continue
-        with Shards() as shards:
+        with ProbeShards() as shards:
             for scene in members:
                 options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
-                two, one = (front_ends.adapted(next(iter(methods.values())), scene, views=v, **options) for v in (2, 1))
-                look = _Look(scene.recording, settings, two, one, networks, rgb_side)
+                two, one = (
+                    front_ends.depth_tokens_for_scene(next(iter(methods.values())), scene, views=v, **options)
+                    for v in (2, 1)
+                )
+                look = _PairFeatures(scene.recording, settings, two, one, networks, rgb_side)
                 found = [pair for block in cut[scene.name] for pair in block]
                 rows = iter([look(*pair) for pair in progress(found, scene.name, len(found))])
                 for k, block in enumerate(cut[scene.name]):
                     own = [next(rows) for _ in block]
-                    shards.add(_shard(f"{scene.name} {k}", own, scene.recording, block, moving))
-            arms = {k: names for k, names in ARMS.items() if set(names) <= set(shards.widths)}
+                    shards.add(_make_shard(f"{scene.name} {k}", own, scene.recording, block, moving))
+            arms = {k: names for k, names in PROBE_ARMS.items() if set(names) <= set(shards.widths)}
             options = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
-            judged = probing.judge(shards, arms, told={POSE: OWN}, **options)
-        probing.record(outcome, judged, room)
+            judged = probing.evaluate_probes(shards, arms, told={_POSE_ARM: _OWN_POSE_BLOCK}, **options)
+        probing.record_probes(outcome, judged, room)
         outcome.n_pairs += n
-    outcome.summary = probing.over_scenes(outcome, every)
+    outcome.summary = probing.summarise_over_scenes(outcome, every)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, real))
 
 
-def in_blocks(scene: Scene, gap_parts: int, n: int) -> list[list[tuple[int, int]]]:
+def split_into_blocks(scene: Scene, gap_parts: int, n: int) -> list[list[tuple[int, int]]]:
     """Pairs of frames in ``n`` consecutive blocks that share no frame; none where the motion is not known."""
     length = len(scene.recording)
     if scene.recording.poses is None or scene.role is not None or length < 2 * n:
@@ -138,25 +143,25 @@ def in_blocks(scene: Scene, gap_parts: int, n: int) -> list[list[tuple[int, int]
 
 def verdict(outcome: Outcome, real: bool) -> tuple[bool | None, str]:
     """Is the error smaller than DINOv2's on every scene? Never decided without DINOv2's own weights."""
-    ours, theirs = outcome.scenes(OURS, TRUTH), outcome.scenes(REFERENCE, TRUTH)
-    beside = probing.beside_xfeat(
+    ours, theirs = outcome.scenes(_OURS, PROBE_TRUTH), outcome.scenes(REFERENCE_BLOCK, PROBE_TRUTH)
+    beside = probing.compare_with_xfeat(
         {s: (row.get("vs_xfeat"), row.get("vs_xfeat_low"), row.get("vs_xfeat_high")) for s, row in ours.items()}
     )
     scenes = [s for s in ours if ours[s].get("mse") is not None and theirs.get(s, {}).get("mse") is not None]
     if not scenes:
         known = any(row.get("mse") is not None for row in ours.values())
         return None, f"{'DINOv2 was left out' if known else 'no scene with enough pairs'}{beside}"
-    parts = [f"{s} {ours[s]['mse']:.2f} against {theirs[s]['mse']:.2f}{_between(ours[s])}" for s in scenes]
+    parts = [f"{s} {ours[s]['mse']:.2f} against {theirs[s]['mse']:.2f}{_format_interval(ours[s])}" for s in scenes]
     text = f"{'; '.join(parts)} (paper: 1.32 against 1.63, ratio 0.81){beside}"
     if not real:
-        return None, f"{probing.RANDOM}; error with depth features and with the random network: {text}"
+        return None, f"{probing.RANDOM_WEIGHTS_NOTE}; error with depth features and with the random network: {text}"
     below = [ours[s]["vs_dinov2_high"] is not None and ours[s]["vs_dinov2_high"] < 1 for s in scenes]
     above = [ours[s]["vs_dinov2_low"] is not None and ours[s]["vs_dinov2_low"] > 1 for s in scenes]
     holds = True if all(below) else False if 2 * sum(above) >= len(scenes) else None
     return holds, text
 
 
-class _Look:
+class _PairFeatures:
     """Features of the pairs of one recording; a frame's own are computed once."""
 
     def __init__(
@@ -181,45 +186,45 @@ class _Look:
         found = {name: torch.cat((x, alone_b[name] - x), 1) for name, x in alone_a.items()}
         found["depth"] = torch.cat((forth, back - forth), 1)
         # The transform's pose maps the anchor into the other view: the same way round as the target.
-        found[OWN] = torch.where(added["pose_ok"], _motion(added["T_1_from_0"][None].double()), 0.0)
+        found[_OWN_POSE_BLOCK] = torch.where(added["pose_ok"], _motion_vectors(added["T_1_from_0"][None].double()), 0.0)
         return {name: x.cpu() for name, x in found.items()}
 
     def _alone(self, i: int) -> tuple[Frame, dict[str, Tensor]]:
         if i not in self._known:
             self._known = {k: v for k, v in self._known.items() if k >= i - 64}  # a long recording is not kept whole
             frame = self.recording[i].to(self.settings.dtype).to(self.settings.device)
-            found = {"rgb": front_ends.pixels(frame, side=self.rgb_side), "depth_one_view": self.one(frame)}
+            found = {"rgb": front_ends.resize_to_square(frame, side=self.rgb_side), "depth_one_view": self.one(frame)}
             found |= {name: network(frame) for name, network in self.networks.items()}
             self._known[i] = frame, found
         return self._known[i]
 
 
-def _shard(
+def _make_shard(
     group: str,
     rows: Sequence[Mapping[str, Tensor]],
     recording: Recording,
     block: Sequence[tuple[int, int]],
     moving: float,
-) -> Shard:
+) -> ProbeShard:
     i, j = torch.tensor(list(block), dtype=torch.int64).view(-1, 2).unbind(-1)
     poses = recording.poses
     assert poses is not None  # else there are no blocks
-    target = _motion(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
+    target = _motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
     blocks = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
-    return Shard(
-        group, {CONTEXT: target.new_zeros(len(target), 0), **blocks}, target, target[:, 3:].norm(dim=-1) > moving
+    return ProbeShard(
+        group, {CONTEXT_BLOCK: target.new_zeros(len(target), 0), **blocks}, target, target[:, 3:].norm(dim=-1) > moving
     )
 
 
-def _motion(T: Tensor) -> Tensor:
+def _motion_vectors(T: Tensor) -> Tensor:
     """(n, 6) rotation vector (rad) and translation (m) of (n, 4, 4)."""
     return torch.cat((rotation_matrix_to_axis_angle(T[:, :3, :3].contiguous()), T[:, :3, 3]), 1)
 
 
-def _silent(scene: str, arm: str, note: str) -> Row:
-    return {"scene": scene, "pair": None, "method": arm, "truth": TRUTH, "role": None, "note": note}
+def _empty_row(scene: str, arm: str, note: str) -> Row:
+    return {"scene": scene, "pair": None, "method": arm, "truth": PROBE_TRUTH, "role": None, "note": note}
 
 
-def _between(row: Row) -> str:
+def _format_interval(row: Row) -> str:
     low, high = row.get("vs_dinov2_low"), row.get("vs_dinov2_high")
     return "" if low is None or high is None else f", ratio {row['vs_dinov2']:.2f} ({low:.2f} to {high:.2f})"

@@ -18,40 +18,40 @@ from typing import Any
 
 from dhtorch.experiments.report import jobs, page, text
 from dhtorch.experiments.report.advice import advice
-from dhtorch.experiments.report.layouts import SHOWN, in_layout
-from dhtorch.experiments.report.reading import Result, describe
-from dhtorch.experiments.report.tables import INTERVAL, Table, generic
-from dhtorch.runtime import results as archive
-from dhtorch.runtime.console import EPILOG, many, progress, verbosity
+from dhtorch.experiments.report.layouts import SHOWN_COLUMNS, layout_tables
+from dhtorch.experiments.report.reading import Result, describe_result
+from dhtorch.experiments.report.tables import INTERVAL_LABEL, ReportTable, generic_tables
+from dhtorch.runtime import results as result_files
+from dhtorch.runtime.console import HELP_EPILOG, format_count, get_verbosity, progress
 
 #: Of more scenes a first look shows the summary alone.
-MOST_ROWS = 8
+_MAX_BRIEF_ROWS = 8
 
 __all__ = [
-    "INTERVAL",
+    "INTERVAL_LABEL",
+    "ReportTable",
     "Result",
-    "Table",
     "advice",
-    "describe",
+    "describe_result",
     "main",
-    "markdown",
     "print_brief",
     "print_sweep",
     "print_tables",
     "tables",
+    "to_markdown",
 ]
 
 
-def tables(result: Result) -> list[Table]:
+def tables(result: Result) -> list[ReportTable]:
     """The tables of one result: the paper's, where it has this experiment, then those of every result."""
-    return [*in_layout(result), *generic(result, SHOWN)]
+    return [*layout_tables(result), *generic_tables(result, SHOWN_COLUMNS)]
 
 
 def print_tables(result: Result, console: Any = None) -> None:
     """Print the tables of a result with rich.
 
     Args:
-        result: valid, as from :func:`dhtorch.runtime.results.read`.
+        result: valid, as from :func:`dhtorch.runtime.results.read_result`.
         console: a ``rich.console.Console``; None = standard output.
     """
     for table in tables(result):
@@ -60,9 +60,9 @@ def print_tables(result: Result, console: Any = None) -> None:
 
 def print_brief(result: Result) -> None:
     """Print the first look at a result: its main table, of many scenes the summary alone."""
-    for table in (in_layout(result) or generic(result, SHOWN))[:1]:
+    for table in (layout_tables(result) or generic_tables(result, SHOWN_COLUMNS))[:1]:
         n_body = len(table.rows) - table.footer - table.quoted
-        many, one = n_body > MOST_ROWS and table.footer > 0, n_body == 1 and table.footer > 0
+        many, one = n_body > _MAX_BRIEF_ROWS and table.footer > 0, n_body == 1 and table.footer > 0
         start, end = (n_body, None) if many else (0, 1 if one else None)  # a summary of one scene says it again
         footer, quoted = (0, 0) if one else (table.footer, table.quoted)
         text.print_table(replace(table, rows=table.rows[start:end], footer=footer, quoted=quoted))
@@ -70,24 +70,24 @@ def print_brief(result: Result) -> None:
 
 def print_sweep(results: Sequence[Result], folder: Path, *, markdown: bool = False) -> None:
     """Print the table of a sweep's jobs and write it beside them as ``sweep.csv``; nothing for fewer than two."""
-    table = jobs.table(results)
+    table = jobs.jobs_table(results)
     if table is None:
         return
     if markdown:
-        print(text.markdown([table]))
+        print(text.tables_to_markdown([table]))
     else:
         text.print_table(table)
     try:
-        said = f"wrote {jobs.write_csv(folder / 'sweep.csv', results)}"
+        said = f"wrote {jobs.write_jobs_csv(folder / 'sweep.csv', results)}"
     except OSError as error:  # a folder that is only read
         said = f"{folder}: no sweep.csv written ({error.strerror})"
     if not markdown:
         print(said)
 
 
-def markdown(result: Result) -> str:
+def to_markdown(result: Result) -> str:
     """The tables of a result as Markdown."""
-    return text.markdown(tables(result))
+    return text.tables_to_markdown(tables(result))
 
 
 def main(argv: Sequence[str]) -> int:
@@ -97,7 +97,7 @@ def main(argv: Sequence[str]) -> int:
         FileNotFoundError, ValueError: a result is missing or not valid, or the page cannot be written there.
     """
     parser = argparse.ArgumentParser(
-        prog="dhtorch report", description="Tables and a page from archived results.", epilog=EPILOG
+        prog="dhtorch report", description="Tables and a page from archived results.", epilog=HELP_EPILOG
     )
     parser.add_argument("result", nargs="+", type=Path, help="result.json, or a folder with one or many below it")
     form = parser.add_mutually_exclusive_group()
@@ -105,20 +105,20 @@ def main(argv: Sequence[str]) -> int:
     form.add_argument("--html", type=Path, metavar="FILE", help="write one page with tables and figures instead")
     parser.add_argument("--traceback", action="store_true", help="show where an error came from")
     options = parser.parse_args(argv)
-    paths = list(_found(options.result))
-    results = [archive.read(path) for path in progress(paths, "results", len(paths))]
+    paths = list(_find_results(options.result))
+    results = [result_files.read_result(path) for path in progress(paths, "results", len(paths))]
     if options.html:
-        print(f"wrote {page.write(options.html, results)}: {many(len(results), 'result')}")
+        print(f"wrote {page.write_report(options.html, results)}: {format_count(len(results), 'result')}")
         return 0
     for folder in options.result:
         mine = [r for path, r in zip(paths, results, strict=True) if path != folder and path.is_relative_to(folder)]
         print_sweep(mine, folder, markdown=options.markdown)
     apart = {r["experiment"] for r in results}
-    if len(options.result) == 1 and len(results) > 1 and len(apart) == 1 and verbosity() != "verbose":
+    if len(options.result) == 1 and len(results) > 1 and len(apart) == 1 and get_verbosity() != "verbose":
         return 0  # one table says it; -v shows every job
     for path, result in zip(paths, results, strict=True):
         if options.markdown:
-            print(markdown(result))
+            print(to_markdown(result))
             continue
         print(path)
         print_tables(result)
@@ -127,7 +127,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _found(paths: Iterable[Path]) -> Iterable[Path]:
+def _find_results(paths: Iterable[Path]) -> Iterable[Path]:
     """Files as they are; a folder without a result of its own stands for all below it, as a sweep writes them."""
     for path in paths:
         below = sorted(path.rglob("result.json")) if path.is_dir() and not (path / "result.json").is_file() else []

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dhtorch.codes import words
-from dhtorch.experiments.report.reading import Result, scene_rows, value
+from dhtorch.experiments.report.reading import Result, metric_value, scene_rows
 
 #: Share of the samples up to which answers are next to none.
-SILENT = 0.005
+_MAX_SILENT_SHARE = 0.005
 
 #: Gate → what it means, and what to try.
-HELP = {
+_GATE_HELP = {
     "no_track": (
         "hardly a sample was found again in the other view",
         "the two views lie too far apart or show nothing in common: try a smaller pairs.gap, or pairs=auto",
@@ -28,11 +28,11 @@ def advice(result: Result) -> list[str]:
     """One line for every scene and variant that is silent for one reason."""
     said = []
     for row in scene_rows(result):
-        shares = value(row, "gate_share") or {}
-        if "answer" not in shares or shares["answer"] > SILENT:
+        shares = metric_value(row, "gate_share") or {}
+        if "answer" not in shares or shares["answer"] > _MAX_SILENT_SHARE:
             continue
         gate = max((g for g in shares if g != "answer"), key=lambda g: shares[g])
-        if gate in HELP:
-            found, tried = HELP[gate]
+        if gate in _GATE_HELP:
+            found, tried = _GATE_HELP[gate]
             said.append(f"{row['scene']}: no answer, {found} ({words(gate)}: {shares[gate]:.0%}); {tried}")
     return list(dict.fromkeys(said))

@@ -8,10 +8,10 @@ from typing import Any
 from dhtorch.codes import words
 
 #: Where nothing is defined.
-NOTHING = "–"
+EMPTY_CELL = "–"
 
 #: Metric → heading; the others are headed by their own name.
-HEADS = {
+_METRIC_HEADINGS = {
     "n_candidates": "candidates",
     "n_kept": "answers",
     "n_scenes": "scenes",
@@ -73,27 +73,32 @@ HEADS = {
     "rmse_m": "RMSE m",
     "changed_rel": "changed",
 }
-#: Metric → style, where its name does not give it away (see :func:`style`).
-STYLES = {"coverage": "percent", "pnp_success": "percent", "within_sigma": "percent", "within_2sigma": "percent"}
-STYLES |= dict.fromkeys(("rho_abs", "corr", "rank_corr", "abs_corr", "gated_corr", "gated_abs_corr"), "ratio")
-STYLES |= {"order_corr": "ratio", "halves_corr": "ratio", "side_right": "percent", "mean_rel_ratio": "fine"}
-STYLES |= {"ece": "fine", "ece_equal_mass": "fine", "ece_pooled": "fine", "monotonicity": "fine"}
-STYLES |= {"parameters": "large", "weight_bytes": "bytes", "peak_mib": "mebibytes"}
-DECIMALS = {"count": 0, "number": 1, "ratio": 2, "fine": 3}
+#: Metric → style, where its name does not give it away (see :func:`metric_style`).
+_METRIC_STYLES = {
+    "coverage": "percent",
+    "pnp_success": "percent",
+    "within_sigma": "percent",
+    "within_2sigma": "percent",
+}
+_METRIC_STYLES |= dict.fromkeys(("rho_abs", "corr", "rank_corr", "abs_corr", "gated_corr", "gated_abs_corr"), "ratio")
+_METRIC_STYLES |= {"order_corr": "ratio", "halves_corr": "ratio", "side_right": "percent", "mean_rel_ratio": "fine"}
+_METRIC_STYLES |= {"ece": "fine", "ece_equal_mass": "fine", "ece_pooled": "fine", "monotonicity": "fine"}
+_METRIC_STYLES |= {"parameters": "large", "weight_bytes": "bytes", "peak_mib": "mebibytes"}
+_STYLE_DECIMALS = {"count": 0, "number": 1, "ratio": 2, "fine": 3}
 _LARGE = ((1e9, "B"), (1e6, "M"), (1e3, "k"))
 _BYTES = ((1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 
 
-def head(metric: str) -> str:
+def metric_heading(metric: str) -> str:
     """Heading of a metric."""
-    return HEADS.get(metric) or words(metric.replace(".", " "))
+    return _METRIC_HEADINGS.get(metric) or words(metric.replace(".", " "))
 
 
-def style(metric: str) -> str:
+def metric_style(metric: str) -> str:
     """percent | ratio | fine | number | count | large | bytes | mebibytes | plain, by a metric's name."""
     group, _, last = metric.rpartition(".")
-    if last in STYLES:
-        return STYLES[last]
+    if last in _METRIC_STYLES:
+        return _METRIC_STYLES[last]
     if last.startswith("n_") or group.endswith("n_dropped"):
         return "count"
     if last.startswith("coverage_") or last.endswith(("_rel", "_share", "_success")) or group.endswith("_share"):
@@ -105,65 +110,65 @@ def style(metric: str) -> str:
     return "ratio" if last.endswith(("_px", "_ratio")) else "plain"
 
 
-def show(value: Any, metric: str = "", how: str | None = None) -> str:
+def format_value(value: Any, metric: str = "", how: str | None = None) -> str:
     """A value as a cell; ``how`` overrides the style of the metric's name."""
     if value is None:
-        return NOTHING
+        return EMPTY_CELL
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, str):
         return value
     if isinstance(value, list):
-        return "×".join(show(v, how="plain") for v in value)
-    how = how or style(metric)
+        return "×".join(format_value(v, how="plain") for v in value)
+    how = how or metric_style(metric)
     whole = isinstance(value, int) and how == "plain"
-    return (str(value) if whole else _number(float(value), how)).replace("-", "−")
+    return (str(value) if whole else _format_number(float(value), how)).replace("-", "−")
 
 
-def exact(value: Any) -> str:
+def format_exact(value: Any) -> str:
     """A value with five significant digits, for the tables that hold everything."""
     if isinstance(value, list):
-        return ", ".join(map(exact, value))
+        return ", ".join(map(format_exact, value))
     if isinstance(value, float):
         return f"{value:.5g}"
-    return show(value, how="plain")
+    return format_value(value, how="plain")
 
 
-def between(low: float | None, high: float | None, metric: str) -> str:
+def format_metric_interval(low: float | None, high: float | None, metric: str) -> str:
     """An interval as a cell, nothing where there is none."""
     if low is None or high is None:
         return ""
-    return f"{show(low, metric).removesuffix(' %')}–{show(high, metric)}"
+    return f"{format_value(low, metric).removesuffix(' %')}–{format_value(high, metric)}"
 
 
-def _number(value: float, how: str) -> str:
+def _format_number(value: float, how: str) -> str:
     if how == "percent":
-        return _percent(value)
+        return _format_percent(value)
     if how == "count":
         return f"{value:,.0f}"
     if how in ("large", "bytes"):
-        return _with_unit(value, _LARGE if how == "large" else _BYTES)
+        return _format_with_unit(value, _LARGE if how == "large" else _BYTES)
     if how == "mebibytes":
-        return _with_unit(value * 2**20, _BYTES)
-    return f"{value:.{DECIMALS[how]}f}" if how in DECIMALS else _three_digits(value)
+        return _format_with_unit(value * 2**20, _BYTES)
+    return f"{value:.{_STYLE_DECIMALS[how]}f}" if how in _STYLE_DECIMALS else _format_three_digits(value)
 
 
-def _percent(value: float) -> str:
+def _format_percent(value: float) -> str:
     """Two decimals below 10 %, one above, none at 0 and 100."""
     percent = 100 * value
     decimals = 0 if percent in (0, 100) else 2 if abs(percent) < 9.995 else 1
     return f"{percent:.{decimals}f} %"
 
 
-def _three_digits(value: float) -> str:
+def _format_three_digits(value: float) -> str:
     if value == 0:
         return "0"
     decimals = max(0, 2 - math.floor(math.log10(abs(value))))
     return f"{value:.{decimals}f}" if decimals <= 5 else f"{value:.1e}"
 
 
-def _with_unit(value: float, units: tuple[tuple[float, str], ...]) -> str:
+def _format_with_unit(value: float, units: tuple[tuple[float, str], ...]) -> str:
     for size, unit in units:
         if abs(value) >= size:
-            return f"{_three_digits(value / size)} {unit}"
+            return f"{_format_three_digits(value / size)} {unit}"
     return f"{value:.0f}"

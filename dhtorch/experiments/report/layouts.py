@@ -6,218 +6,237 @@ import re
 from collections.abc import Callable
 
 from dhtorch.experiments.report import negatives, probes, published, timings
-from dhtorch.experiments.report.cells import NOTHING, head, show
-from dhtorch.experiments.report.reading import Result, cohorts, entry, last_cohort, variants
+from dhtorch.experiments.report.cells import EMPTY_CELL, format_value, metric_heading
+from dhtorch.experiments.report.reading import Result, cohort_names, last_cohort, summary_entry, variant_names
 from dhtorch.experiments.report.tables import (
-    DERIVED,
-    OURS,
-    PUBLISHED,
-    Known,
-    Line,
-    Table,
-    by_scene,
-    by_variant,
-    lines,
-    source,
+    DERIVED_NUMBERS,
+    OURS_LABEL,
+    PUBLISHED_LABEL,
+    KnownLines,
+    ReportTable,
+    TableLine,
+    match_lines,
+    published_source,
+    scene_table,
+    variant_table,
 )
 
-CUTOFF = r"(?:gated,? )?cutoff .*"
-RANGE_SPLIT: Known = (
+_CUTOFF_PATTERN = r"(?:gated,? )?cutoff .*"
+_RANGE_SPLIT_LINES: KnownLines = (
     ("sensor_only", "sensor-only (after cutoff)", "sensor-only (after cutoff)"),
     ("device_raw", "device pose (raw)", "device pose (raw)"),
     ("device_gl_to_cv", "device pose (GL→CV)", "device pose (GL→CV)"),
     ("no_gates", "no gates", "no gates"),
     ("gated", "gated", "gated"),
 )
-CUTOFFS: Known = (
+_CUTOFF_LINES: KnownLines = (
     (r"gated, cutoff (?:[x×]0\.75|1\.5 m)", None, "1.5 m"),
     (r"gated(?:, cutoff (?:[x×]1(?:\.0)?|2(?:\.0)? m))?", None, "2.0 m"),
     (r"gated, cutoff (?:[x×]1\.25|2\.5 m)", None, "2.5 m"),
 )
-GATES: Known = (
+_GATE_LINES: KnownLines = (
     (r"gap (?:[x×]0\.5|16)", None, "gap 16"),
     (r"both gates|gap (?:[x×]1(?:\.0)?|30)", None, "gap 30 (default)"),
     (r"gap (?:[x×]2(?:\.0)?|60)", None, "gap 60"),
     (r"parallax gate off.*", None, "parallax gate OFF (gap 30)"),
     (r"reprojection gate off.*", None, "reprojection gate OFF (gap 30)"),
 )
-REAL_HOLES: Known = (("no_gates", "no gates", "no gates"), ("gated", "gated", "gated"))
-LEARNED: Known = (
+_REAL_HOLES_LINES: KnownLines = (("no_gates", "no gates", "no gates"), ("gated", "gated", "gated"))
+_LEARNED_LINES: KnownLines = (
     (r"(?!dust3r|vggt|constant).*", None, "DH-Active"),
     (r"dust3r(?:_oracle)?", None, "DUSt3R"),
     (r"vggt(?:_oracle)?", None, "VGGT-1B"),
 )
 
 
-def in_layout(result: Result) -> list[Table]:
+def layout_tables(result: Result) -> list[ReportTable]:
     """The tables of a known experiment as the paper has them; of another with several variants, one by variant."""
-    known = LAYOUTS.get(result["experiment"])
+    known = EXPERIMENT_LAYOUTS.get(result["experiment"])
     if known:
         return known(result)
     columns = ("n_scenes", "coverage", "median_rel", "p90_rel", "corr", "pnp_success")
-    measured = [m for m in columns[1:] if any(entry(result, v, m) for v in variants(result))]
-    if len(variants(result)) < 3 or not measured:
+    measured = [m for m in columns[1:] if any(summary_entry(result, v, m) for v in variant_names(result))]
+    if len(variant_names(result)) < 3 or not measured:
         return []
-    return [by_variant(result, "Medians over scenes", ("n_scenes", *measured))]
+    return [variant_table(result, "Medians over scenes", ("n_scenes", *measured))]
 
 
-def _range_split(result: Result) -> list[Table]:
+def _range_split(result: Result) -> list[ReportTable]:
     title = "Controlled far-field recovery, medians over scenes"
     columns = ("n_scenes", "coverage", "corr", "median_rel", "p90_rel")
-    mine = lines(result, RANGE_SPLIT, without=CUTOFF)
-    found = [by_variant(result, title, columns, mine, published.RANGE_SPLIT)]
-    if any(re.fullmatch(CUTOFF, v) for v in variants(result)):
+    mine = match_lines(result, _RANGE_SPLIT_LINES, without=_CUTOFF_PATTERN)
+    found = [variant_table(result, title, columns, mine, published.RANGE_SPLIT)]
+    if any(re.fullmatch(_CUTOFF_PATTERN, v) for v in variant_names(result)):
         title = "Cutoff sensitivity, gated, medians over scenes; candidates added up"
         swept = ("cutoff_m", "pnp_success", "n_candidates", "coverage", "median_rel")
-        mine = [line for line in lines(result, CUTOFFS) if line.paper or re.fullmatch(CUTOFF, line.variant or "")]
-        found.append(by_variant(result, title, swept, mine, published.CUTOFF))
+        mine = [
+            line
+            for line in match_lines(result, _CUTOFF_LINES)
+            if line.paper or re.fullmatch(_CUTOFF_PATTERN, line.variant or "")
+        ]
+        found.append(variant_table(result, title, swept, mine, published.CUTOFF_SWEEP))
     return found
 
 
-def _real_holes(result: Result) -> list[Table]:
+def _real_holes(result: Result) -> list[ReportTable]:
     columns = ("n_scenes", "n_candidates", "coverage", "median_rel", "p90_rel")
     found, title = [], "The sensor's true drop-outs, medians over scenes"
-    found.append(by_variant(result, title, columns, lines(result, REAL_HOLES), published.REAL_HOLES))
-    if "full" in cohorts(result) and last_cohort(result) != "full":
-        found.append(by_variant(result, "The same on hidden far returns", columns, truth="full"))
+    found.append(variant_table(result, title, columns, match_lines(result, _REAL_HOLES_LINES), published.REAL_HOLES))
+    if "full" in cohort_names(result) and last_cohort(result) != "full":
+        found.append(variant_table(result, "The same on hidden far returns", columns, truth="full"))
     return found
 
 
-def _gate_ablation(result: Result) -> list[Table]:
+def _gate_ablation(result: Result) -> list[ReportTable]:
     columns = ("n_scenes", "corr", "median_rel", "coverage", "p90_rel")
-    return [by_variant(result, "Gate ablation, medians over scenes", columns, lines(result, GATES), published.GATES)]
+    return [
+        variant_table(
+            result,
+            "Gate ablation, medians over scenes",
+            columns,
+            match_lines(result, _GATE_LINES),
+            published.GATE_ABLATION,
+        )
+    ]
 
 
-def _held_out(result: Result) -> list[Table]:
-    truth = "heldout" if "heldout" in cohorts(result) else None
+def _held_out(result: Result) -> list[ReportTable]:
+    truth = "heldout" if "heldout" in cohort_names(result) else None
     columns: tuple[str, ...] = ("n_kept", "corr", "median_rel", "residual_px", "passes", "coverage")
     columns += ("n_recovered", "reach_p95_m", "reach_max_m", "returns_p95_m")
     title = "Hold-out triangulation (set B never sees the pose calibration)"
-    found = [by_scene(result, title, columns, truth, published.HELD_OUT)]
-    if "cyclic" in cohorts(result):
-        found.append(_cyclic(result))
+    found = [scene_table(result, title, columns, truth, published.HELD_OUT)]
+    if "cyclic" in cohort_names(result):
+        found.append(_naive_protocol(result))
     across = ("n_scenes", "median_rel", "range", "corr", "ece", "coverage", "passes")
     title = "Cross-dataset depth-anchored geometry, medians over scenes"
     name = result["data"]["name"]
-    mine = [Line(name if len(variants(result)) == 1 else f"{name}, {v}", v) for v in variants(result)]
-    return [*found, by_variant(result, title, across, mine, published.CROSS_DATA, truth)]
+    mine = [TableLine(name if len(variant_names(result)) == 1 else f"{name}, {v}", v) for v in variant_names(result)]
+    return [*found, variant_table(result, title, across, mine, published.CROSS_DATA, truth)]
 
 
-def _cyclic(result: Result) -> Table:
+def _naive_protocol(result: Result) -> ReportTable:
     """What the naive protocol hides: the pose's own inliers against points it never saw."""
     rows = []
-    for v in variants(result):
-        naive, honest = (entry(result, v, "median_rel", t).get("value") for t in ("cyclic", "heldout"))
-        ratio = show(honest / naive, how="number") + "×" if naive and honest is not None else NOTHING
-        rows.append([v, show(naive, "median_rel"), show(honest, "median_rel"), ratio])
+    for v in variant_names(result):
+        naive, honest = (summary_entry(result, v, "median_rel", t).get("value") for t in ("cyclic", "heldout"))
+        ratio = format_value(honest / naive, how="number") + "×" if naive and honest is not None else EMPTY_CELL
+        rows.append([v, format_value(naive, "median_rel"), format_value(honest, "median_rel"), ratio])
     cited = [
-        [f"{PUBLISHED}: {name}", *(c.get(m, NOTHING) for m in ("cyclic", "heldout", "ratio"))]
+        [f"{PUBLISHED_LABEL}: {name}", *(c.get(m, EMPTY_CELL) for m in ("cyclic", "heldout", "ratio"))]
         for name, c in published.CYCLIC.lines.items()
     ]
     title = "Median error: cyclic, held out"
     heads = ["", "cyclic", "held out", "ratio of the two"]
-    return Table(title, heads, rows + cited, quoted=len(cited), note=source(result, published.CYCLIC))
+    return ReportTable(title, heads, rows + cited, quoted=len(cited), note=published_source(result, published.CYCLIC))
 
 
-def _calibration(result: Result) -> list[Table]:
+def _calibration(result: Result) -> list[ReportTable]:
     """The paper gives the calibration error of its hold-outs and the thresholds of its range split."""
     columns = ("n_scenes", "ece", "ece_pooled", "aurc", "aurc_excess", "mean_risk", "monotonicity")
     found = []
-    for truth in reversed(cohorts(result)):
-        held_out = truth == "heldout" or len(cohorts(result)) == 1
+    for truth in reversed(cohort_names(result)):
+        held_out = truth == "heldout" or len(cohort_names(result)) == 1
         title = f"Calibration, held against {truth}, medians over scenes"
-        found.append(by_variant(result, title, columns, None, published.CALIBRATION if held_out else None, truth))
-    return found + [table for v in variants(result) if (table := _thresholds(result, v))]
+        found.append(
+            variant_table(result, title, columns, None, published.SCORE_CALIBRATION if held_out else None, truth)
+        )
+    return found + [table for v in variant_names(result) if (table := _thresholds(result, v))]
 
 
-def _thresholds(result: Result, variant: str) -> Table | None:
+def _thresholds(result: Result, variant: str) -> ReportTable | None:
     """What a threshold on the score leaves, and how wrong that is."""
     rows = []
-    for name, numbers in thresholds(result, variant):
+    for name, numbers in threshold_points(result, variant):
         theirs, cells = published.THRESHOLDS.lines.get(name, {}), [name]
         for m in ("coverage", "median_rel"):
-            cells += [show(numbers[m], m), theirs.get(m, NOTHING)]
-        rows.append([*cells, show(numbers["p90_rel"], "p90_rel")])
-    over = (("", 1), (head("coverage"), 2), (head("median_rel"), 2), ("", 1))
-    heads = ["score from", OURS, PUBLISHED, OURS, PUBLISHED, head("p90_rel")]
+            cells += [format_value(numbers[m], m), theirs.get(m, EMPTY_CELL)]
+        rows.append([*cells, format_value(numbers["p90_rel"], "p90_rel")])
+    over = (("", 1), (metric_heading("coverage"), 2), (metric_heading("median_rel"), 2), ("", 1))
+    heads = ["score from", OURS_LABEL, PUBLISHED_LABEL, OURS_LABEL, PUBLISHED_LABEL, metric_heading("p90_rel")]
     title = f"Selective threshold, {variant}, medians over scenes"
-    return Table(title, heads, rows, over=over, note=source(result, published.THRESHOLDS)) if len(rows) > 1 else None
+    return (
+        ReportTable(title, heads, rows, over=over, note=published_source(result, published.THRESHOLDS))
+        if len(rows) > 1
+        else None
+    )
 
 
-def thresholds(result: Result, variant: str) -> list[tuple[str, dict[str, float | None]]]:
+def threshold_points(result: Result, variant: str) -> list[tuple[str, dict[str, float | None]]]:
     """Thresholds on the score, rising, with coverage and errors of the answers that reach them; 0 keeps all."""
     found = {m[1] for name in result["summary"] if (m := re.search(r"(?:^|\.)at_(\d+(?:\.\d+)?)\.coverage$", name))}
     at = {f"{float(name):g}": f"at_{name}." for name in sorted(found, key=float)}
     at = {"0": "", **at} if at else {}
     metrics = ("coverage", "median_rel", "p90_rel")
     return [
-        (name, {m: entry(result, variant, prefix + m).get("value") for m in metrics}) for name, prefix in at.items()
+        (name, {m: summary_entry(result, variant, prefix + m).get("value") for m in metrics})
+        for name, prefix in at.items()
     ]
 
 
-def _census(result: Result) -> list[Table]:
+def _census(result: Result) -> list[ReportTable]:
     columns = ("hole_share.trackable_no_lidar", "trackability_hole", "trackability_valid")
-    return [by_scene(result, "Why returns are missing: the key class", columns, None, published.CENSUS)]
+    return [scene_table(result, "Why returns are missing: the key class", columns, None, published.HOLE_CENSUS)]
 
 
-def _device_pose(result: Result) -> list[Table]:
+def _device_pose(result: Result) -> list[ReportTable]:
     columns = ("n_scenes", "rotation_deg", "translation_m", "direction_deg", "corr", "coverage", "median_rel")
     title = "Triangulation from the device's trajectory and from the anchored pose, medians over scenes"
-    return [by_variant(result, title, columns, None, published.POSE)]
+    return [variant_table(result, title, columns, None, published.DEVICE_POSE)]
 
 
-def _motion(result: Result) -> list[Table]:
+def _motion(result: Result) -> list[ReportTable]:
     columns = ("n_scenes", "baseline_m", "coverage", "median_rel", "n_recovered", "recovered_share")
-    return [by_variant(result, "Motion dependence, medians over scenes", columns, None, published.MOTION)]
+    return [variant_table(result, "Motion dependence, medians over scenes", columns, None, published.BASELINE_MOTION)]
 
 
-def _learned(result: Result) -> list[Table]:
+def _learned(result: Result) -> list[ReportTable]:
     columns: tuple[str, ...] = ("n_scenes", "median_rel", "corr", "coverage", "scale", "metric", "parameters")
     columns += ("weight_bytes", "device", "seconds_per_video")
     title = "Reference results under different inputs and scale protocols, medians over scenes"
-    return [by_variant(result, title, columns, lines(result, LEARNED), published.LEARNED)]
+    return [variant_table(result, title, columns, match_lines(result, _LEARNED_LINES), published.LEARNED)]
 
 
-def _ablation(result: Result) -> list[Table]:
+def _ablation(result: Result) -> list[ReportTable]:
     columns = ("n_scenes", "coverage", "median_rel", "p90_rel", "corr", "aurc", "median_rel_ratio")
-    return [by_variant(result, "Ablation, medians over scenes", columns)]
+    return [variant_table(result, "Ablation, medians over scenes", columns)]
 
 
-def _comparison(result: Result) -> list[Table]:
+def _comparison(result: Result) -> list[ReportTable]:
     """Methods, and the ratios of their numbers to those of the reference."""
     columns = ["coverage", "median_rel", "median_rel_ratio", "worst_scene_ratio", "aurc", "aurc_ratio", "coverage_at_5"]
     columns += ["within_sigma", "within_2sigma", "ece", "realised_risk_5", "realised_risk_10"]
-    measured = [m for m in columns if any(entry(result, v, m) for v in variants(result))]
-    return [by_variant(result, "Methods, over scenes", ["n_scenes", *measured])]
+    measured = [m for m in columns if any(summary_entry(result, v, m) for v in variant_names(result))]
+    return [variant_table(result, "Methods, over scenes", ["n_scenes", *measured])]
 
 
-def _part_ablation(result: Result) -> list[Table]:
+def _part_ablation(result: Result) -> list[ReportTable]:
     columns: tuple[str, ...] = ("n_scenes", "coverage", "median_rel_ratio_at_equal_coverage", "aurc_ratio")
     columns += ("coverage_at_5", "within_sigma", "within_2sigma", "ece", "pair_ms", "extra_ms")
     beside = ("error_ratio_to_window", "aurc_full_ratio_to_window")
-    columns += tuple(m for m in beside if any(entry(result, v, m) for v in variants(result)))
-    return [by_variant(result, "Parts alone and left out, ratios to the paper's method", columns)]
+    columns += tuple(m for m in beside if any(summary_entry(result, v, m) for v in variant_names(result)))
+    return [variant_table(result, "Parts alone and left out, ratios to the paper's method", columns)]
 
 
-def _views_study(result: Result) -> list[Table]:
+def _views_study(result: Result) -> list[ReportTable]:
     chosen = {**result, "rows": [row for row in result["rows"] if row["method"] == "auto" and not row.get("role")]}
     return [
-        by_variant(result, "Chosen views and fixed gaps, over scenes", ("n_scenes", "coverage", "coverage_at_5")),
-        by_scene(chosen, "Against the best gap", ("coverage_at_5", "best_gap", "fixed_gap_ratio", "one_partner")),
+        variant_table(result, "Chosen views and fixed gaps, over scenes", ("n_scenes", "coverage", "coverage_at_5")),
+        scene_table(chosen, "Against the best gap", ("coverage_at_5", "best_gap", "fixed_gap_ratio", "one_partner")),
     ]
 
 
-def _dense(result: Result) -> list[Table]:
+def _dense(result: Result) -> list[ReportTable]:
     columns = ("n_scenes", "n_kept", "coverage", "median_rel", "wrong_share", "coverage_at_5", "aurc")
-    return [by_variant(result, "Every pixel beside the samples, and peers under the same motion", columns)]
+    return [variant_table(result, "Every pixel beside the samples, and peers under the same motion", columns)]
 
 
-def _learned_score(result: Result) -> list[Table]:
+def _learned_score(result: Result) -> list[ReportTable]:
     columns = ("n_scenes", "n_kept", "aurc", "aurc_excess", "aurc_ratio", "aurc_ratio_by_error", "coverage_at_5")
-    return [by_variant(result, "The same answers in the order of each score, over scenes", columns)]
+    return [variant_table(result, "The same answers in the order of each score, over scenes", columns)]
 
 
-LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
+EXPERIMENT_LAYOUTS: dict[str, Callable[[Result], list[ReportTable]]] = {
     "range_split": _range_split,
     "real_holes": _real_holes,
     "gate_ablation": _gate_ablation,
@@ -228,39 +247,39 @@ LAYOUTS: dict[str, Callable[[Result], list[Table]]] = {
     "motion": _motion,
     "learned": _learned,
     "ablation": _ablation,
-    "latency": timings.latency,
+    "latency": timings.latency_tables,
     "method_comparison": _comparison,
     "learned_score": _learned_score,
     "part_ablation": _part_ablation,
     "views_study": _views_study,
     "dense_comparison": _dense,
-    "helix_correlation": negatives.helix,
-    "icp": negatives.icp,
-    "hole_attention": negatives.attention,
-    "defocus": negatives.defocus,
-    "focus_stack": negatives.focus_stack,
-    "defocus_fusion": negatives.fusion,
-    "rh20t_probe": probes.future_motion,
-    "vo_probe": probes.visual_odometry,
+    "helix_correlation": negatives.helix_tables,
+    "icp": negatives.icp_tables,
+    "hole_attention": negatives.attention_tables,
+    "defocus": negatives.defocus_tables,
+    "focus_stack": negatives.focus_stack_tables,
+    "defocus_fusion": negatives.fusion_tables,
+    "rh20t_probe": probes.future_motion_tables,
+    "vo_probe": probes.visual_odometry_tables,
 }
 #: Columns that stand in these tables and need not be repeated.
-SHOWN = ("trackability_hole", "trackability_valid", "passes", "parameters", "weight_bytes", *DERIVED)
+SHOWN_COLUMNS = ("trackability_hole", "trackability_valid", "passes", "parameters", "weight_bytes", *DERIVED_NUMBERS)
 
 #: Experiments whose variants have a counterpart in the paper.
-_COUNTERPARTS: dict[str, tuple[Known, published.Published]] = {
-    "range_split": (RANGE_SPLIT, published.RANGE_SPLIT),
-    "real_holes": (REAL_HOLES, published.REAL_HOLES),
-    "gate_ablation": (GATES, published.GATES),
-    "learned": (LEARNED, published.LEARNED),
+_COUNTERPARTS: dict[str, tuple[KnownLines, published.PublishedTable]] = {
+    "range_split": (_RANGE_SPLIT_LINES, published.RANGE_SPLIT),
+    "real_holes": (_REAL_HOLES_LINES, published.REAL_HOLES),
+    "gate_ablation": (_GATE_LINES, published.GATE_ABLATION),
+    "learned": (_LEARNED_LINES, published.LEARNED),
 }
 
 
-def counterparts(result: Result) -> dict[str, dict[str, float]]:
+def published_counterparts(result: Result) -> dict[str, dict[str, float]]:
     """Variant → metric → the paper's figure, for figures that show both."""
     known, theirs = _COUNTERPARTS.get(result["experiment"], ((), None))
     found: dict[str, dict[str, float]] = {}
-    for line in lines(result, known):
+    for line in match_lines(result, known):
         if theirs and line.variant and line.paper:
-            cells = {m: published.number(cell) for m, cell in theirs.lines[line.paper].items()}
+            cells = {m: published.parse_printed(cell) for m, cell in theirs.lines[line.paper].items()}
             found[line.variant] = {m: number for m, number in cells.items() if number is not None}
     return found

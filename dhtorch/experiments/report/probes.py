@@ -6,58 +6,87 @@ from collections.abc import Mapping
 from typing import Any
 
 from dhtorch.experiments.report import published
-from dhtorch.experiments.report.cells import NOTHING, between, show
-from dhtorch.experiments.report.published import Published
-from dhtorch.experiments.report.reading import Result, Row, entry, scene_rows, variants
-from dhtorch.experiments.report.tables import INTERVAL, PUBLISHED, Table, source
+from dhtorch.experiments.report.cells import EMPTY_CELL, format_metric_interval, format_value
+from dhtorch.experiments.report.published import PublishedTable
+from dhtorch.experiments.report.reading import Result, Row, scene_rows, summary_entry, variant_names
+from dhtorch.experiments.report.tables import INTERVAL_LABEL, PUBLISHED_LABEL, ReportTable, published_source
 
 #: Our arm → the paper's line.
-KNOWN = {"dhtorch": "DH-Active", "dinov2": "DINOv2"}
+_PUBLISHED_ARMS = {"dhtorch": "DH-Active", "dinov2": "DINOv2"}
 
 #: Of a scene that was left out one line is enough.
-_FIRST = "context"
+_FIRST_ARM = "context"
 
-_RANDOM = "DINOv2 with random weights: its lines say nothing about DINOv2."
+_RANDOM_WEIGHTS_NOTE = "DINOv2 with random weights: its lines say nothing about DINOv2."
 
 
-def future_motion(result: Result) -> list[Table]:
+def future_motion_tables(result: Result) -> list[ReportTable]:
     """Tables of the probe of future motion: all samples, and those that move."""
-    cohorts = (("", "all samples", published.PROBE), ("moving.", "samples that move", published.PROBE_MOVING))
-    heads = ["", "error", INTERVAL, "× context", INTERVAL, "× DINOv2", INTERVAL, "90 % interval", PUBLISHED]
+    cohorts = (
+        ("", "all samples", published.FUTURE_MOTION),
+        ("moving.", "samples that move", published.FUTURE_MOTION_MOVING),
+    )
+    heads = [
+        "",
+        "error",
+        INTERVAL_LABEL,
+        "× context",
+        INTERVAL_LABEL,
+        "× DINOv2",
+        INTERVAL_LABEL,
+        "90 % interval",
+        PUBLISHED_LABEL,
+    ]
     found = []
     for prefix, words, theirs in cohorts:
         rows = []
-        for arm in variants(result):
+        for arm in variant_names(result):
             cells = [_label(result, arm)]
             for name in ("mse", "vs_context", "vs_dinov2"):
-                e = entry(result, arm, prefix + name)
-                cells += [_number(e.get("value")), _spread(e)]
-            cells += [_spread(entry(result, arm, f"{prefix}vs_dinov2_90"))]
-            rows.append([*cells, theirs.lines.get(KNOWN.get(arm, ""), {}).get("vs_dinov2", NOTHING)])
+                e = summary_entry(result, arm, prefix + name)
+                cells += [_format_number(e.get("value")), _format_spread(e)]
+            cells += [_format_spread(summary_entry(result, arm, f"{prefix}vs_dinov2_90"))]
+            rows.append([*cells, theirs.lines.get(_PUBLISHED_ARMS.get(arm, ""), {}).get("vs_dinov2", EMPTY_CELL)])
         title = f"Future motion of the hand, tasks held out, {words}; error in units of the targets' variance"
-        found.append(Table(title, heads, rows, note=_note(result, theirs)))
+        found.append(ReportTable(title, heads, rows, note=_note(result, theirs)))
     return found
 
 
-def visual_odometry(result: Result) -> list[Table]:
+def visual_odometry_tables(result: Result) -> list[ReportTable]:
     """One row per scene and arm, then the paper's."""
-    heads = ["scene", "arm", "pairs", "error", "× mean motion", "× DINOv2", INTERVAL]
+    heads = ["scene", "arm", "pairs", "error", "× mean motion", "× DINOv2", INTERVAL_LABEL]
     rows = []
     for row in scene_rows(result):
         if row.get("note"):
-            if row["method"] == _FIRST:
-                rows.append([row["scene"], row["note"], *[NOTHING] * 5])
+            if row["method"] == _FIRST_ARM:
+                rows.append([row["scene"], row["note"], *[EMPTY_CELL] * 5])
             continue
-        numbers = [_number(row.get(name)) for name in ("mse", "vs_context", "vs_dinov2")]
+        numbers = [_format_number(row.get(name)) for name in ("mse", "vs_context", "vs_dinov2")]
         arm = "mean motion" if row["method"] == "context" else _label(result, row["method"])
-        rows.append([row["scene"], arm, show(row["n_samples"], how="count"), *numbers, _spread(_interval(row))])
+        rows.append(
+            [
+                row["scene"],
+                arm,
+                format_value(row["n_samples"], how="count"),
+                *numbers,
+                _format_spread(_format_interval(row)),
+            ]
+        )
     theirs = published.VISUAL_ODOMETRY
     cited = [
-        [f"{PUBLISHED}: one scene", name, NOTHING, cells["mse"], NOTHING, cells.get("vs_dinov2", NOTHING), ""]
+        [
+            f"{PUBLISHED_LABEL}: one scene",
+            name,
+            EMPTY_CELL,
+            cells["mse"],
+            EMPTY_CELL,
+            cells.get("vs_dinov2", EMPTY_CELL),
+            "",
+        ]
         for name, cells in theirs.lines.items()
     ]
     title = "Motion of the camera within a scene, blocks held out; error in units of the targets' variance"
-    return [Table(title, heads, rows + cited, 2, quoted=len(cited), note=_note(result, theirs))]
+    return [ReportTable(title, heads, rows + cited, 2, quoted=len(cited), note=_note(result, theirs))]
 
 
 def _label(result: Result, arm: str) -> str:
@@ -69,17 +98,17 @@ def _weights(result: Result) -> Any:
     return network.get("weights")
 
 
-def _note(result: Result, theirs: Published) -> str:
-    return " ".join((source(result, theirs), *([] if _weights(result) else [_RANDOM])))
+def _note(result: Result, theirs: PublishedTable) -> str:
+    return " ".join((published_source(result, theirs), *([] if _weights(result) else [_RANDOM_WEIGHTS_NOTE])))
 
 
-def _interval(row: Row) -> dict[str, float | None]:
+def _format_interval(row: Row) -> dict[str, float | None]:
     return {"low": row.get("vs_dinov2_low"), "high": row.get("vs_dinov2_high")}
 
 
-def _number(value: float | None) -> str:
-    return show(value, how="fine")
+def _format_number(value: float | None) -> str:
+    return format_value(value, how="fine")
 
 
-def _spread(found: Mapping[str, Any]) -> str:
-    return between(found.get("low"), found.get("high"), "ece")
+def _format_spread(found: Mapping[str, Any]) -> str:
+    return format_metric_interval(found.get("low"), found.get("high"), "ece")

@@ -1,8 +1,9 @@
 """What the paper reports, word for word: figures to stand beside ours, each with the place it is from.
 
-Cells are kept as printed, so that no digit is added; :func:`number` reads one back for a figure. The paper is "Double-
-Helix Active Geometry: LiDAR-Anchored Multi-View Depth with Selective Abstention" (J. Wen). Its data sets are its own:
-none of these figures was measured on the scenes of a result that is shown beside it, unless that result says so.
+Cells are kept as printed, so that no digit is added; :func:`parse_printed` reads one back for a figure. The paper is
+"Double- Helix Active Geometry: LiDAR-Anchored Multi-View Depth with Selective Abstention" (J. Wen). Its data sets are
+its own: none of these figures was measured on the scenes of a result that is shown beside it, unless that result says
+so.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-PAPER = "Double-Helix Active Geometry: LiDAR-Anchored Multi-View Depth with Selective Abstention (J. Wen)"
+PAPER_CITATION = "Double-Helix Active Geometry: LiDAR-Anchored Multi-View Depth with Selective Abstention (J. Wen)"
 
 
 @dataclass(frozen=True)
-class Published:
+class PublishedTable:
     """Some lines of the paper: line → metric → what is printed."""
 
     where: str
@@ -24,19 +25,19 @@ class Published:
     notes: tuple[str, ...] = field(default=())
 
 
-def _table(metrics: str, lines: Mapping[str, str]) -> dict[str, dict[str, str]]:
+def _parse_lines(metrics: str, lines: Mapping[str, str]) -> dict[str, dict[str, str]]:
     """Lines of cells between bars, in the order of the metrics' names; a dash is no figure."""
     names = metrics.split()
     cells = {line: [c.strip() for c in row.split("|")] for line, row in lines.items()}
     return {line: {n: c for n, c in zip(names, row, strict=True) if c != "–"} for line, row in cells.items()}
 
 
-ARKIT = "ARKitScenes, five sequences"
+_ARKIT = "ARKitScenes, five sequences"
 
-LATENCY = Published(
+LATENCY = PublishedTable(
     "Table 1, section 6.1",
     "one Apple M4 Pro, 224×224, batch 1, fp32; OpenCV on 14 threads",
-    _table(
+    _parse_lines(
         "device p50_ms p95_ms p99_ms parameters weight_bytes peak_mib",
         {
             "DINOv2-L": "CPU | 106.5 | – | – | 303 M | 1.2 GB | –",
@@ -48,10 +49,10 @@ LATENCY = Published(
     ("Latency of the front end is 96 times lower than DINOv2-L's on the CPU and 38 times lower than on the GPU.",),
 )
 
-HELD_OUT = Published(
+HELD_OUT = PublishedTable(
     "Table 2, section 6.2",
     "two iPhone captures of its own",
-    _table(
+    _parse_lines(
         "n_kept corr median_rel residual_px n_recovered reach_max_m passes",
         {
             "indoor (near-static)": "225 | 0.963 | 3.5 % | 0.96 | 105 | – | yes",
@@ -60,16 +61,16 @@ HELD_OUT = Published(
     ),
 )
 
-CYCLIC = Published(
+CYCLIC = PublishedTable(
     "section 6.2",
     "an iPhone capture of its own, not named",
-    _table("cyclic heldout ratio", {"in-house": "0.7 % | – | 5×"}),
+    _parse_lines("cyclic heldout ratio", {"in-house": "0.7 % | – | 5×"}),
 )
 
-CROSS_DATA = Published(
+CROSS_DATA = PublishedTable(
     "Table 3, section 6.3",
     "its own captures and two public benchmarks",
-    _table(
+    _parse_lines(
         "n_scenes median_rel range corr ece passes",
         {
             "in-house iPhone": "2 | 1.4–3.5 % | – | 0.96–0.97 | – | 2/2",
@@ -80,10 +81,10 @@ CROSS_DATA = Published(
     ("Coverage is as low as 1 % of the candidates on a sequence with large rotation.",),
 )
 
-RANGE_SPLIT = Published(
+RANGE_SPLIT = PublishedTable(
     "Table 4, section 6.4",
-    f"{ARKIT}, cutoff 2 m, 32,690 candidates, laser truth",
-    _table(
+    f"{_ARKIT}, cutoff 2 m, 32,690 candidates, laser truth",
+    _parse_lines(
         "coverage corr median_rel p90_rel",
         {
             "sensor-only (after cutoff)": "0.0 % | – | – | –",
@@ -99,20 +100,20 @@ RANGE_SPLIT = Published(
     ),
 )
 
-REAL_HOLES = Published(
+REAL_HOLES = PublishedTable(
     "section 6.4",
-    f"{ARKIT}, 260 stable points of the laser truth",
-    _table(
+    f"{_ARKIT}, 260 stable points of the laser truth",
+    _parse_lines(
         "coverage median_rel p90_rel",
         {"no gates": "58.9 % | 46.4 % | 71.8 %", "gated": "53.5 % | 42.4 % | 47.2 %"},
     ),
     ("One of the five sequences has no gated answer on its 12 real-hole candidates.",),
 )
 
-CUTOFF = Published(
+CUTOFF_SWEEP = PublishedTable(
     "Table 5, section 6.4",
-    ARKIT,
-    _table(
+    _ARKIT,
+    _parse_lines(
         "cutoff_m pnp_success n_candidates coverage median_rel",
         {
             "1.5 m": "1.5 | 69.6 % | 113,556 | 66.5 % | 11.3 %",
@@ -122,10 +123,10 @@ CUTOFF = Published(
     ),
 )
 
-GATES = Published(
+GATE_ABLATION = PublishedTable(
     "Table 6, section 6.5",
-    ARKIT,
-    _table(
+    _ARKIT,
+    _parse_lines(
         "corr median_rel",
         {
             "gap 16": "0.803 | 7.1 %",
@@ -137,10 +138,10 @@ GATES = Published(
     ),
 )
 
-LEARNED = Published(
+LEARNED = PublishedTable(
     "Table 7, section 6.6",
-    ARKIT,
-    _table(
+    _ARKIT,
+    _parse_lines(
         "median_rel corr scale metric parameters seconds_per_video",
         {
             "DH-Active": "6.7 % | 0.745 | sensor | yes | 0 | –",
@@ -151,66 +152,66 @@ LEARNED = Published(
     ("Contextual measurements, not a ranking: inputs, density and scale treatment differ.",),
 )
 
-THRESHOLDS = Published(
+THRESHOLDS = PublishedTable(
     "section 6.4",
-    ARKIT,
-    _table("coverage median_rel", {"0": "64.2 % | 13.4 %", "0.3": "34.3 % | 9.5 %"}),
+    _ARKIT,
+    _parse_lines("coverage median_rel", {"0": "64.2 % | 13.4 %", "0.3": "34.3 % | 9.5 %"}),
     ("Stricter thresholds no longer improve the error monotonically.",),
 )
 
-CALIBRATION = Published(
+SCORE_CALIBRATION = PublishedTable(
     "Table 3, section 6.3",
     "public benchmarks",
-    _table("ece", {"TUM RGB-D": "0.284", "ARKitScenes": "0.224"}),
+    _parse_lines("ece", {"TUM RGB-D": "0.284", "ARKitScenes": "0.224"}),
 )
 
-CENSUS = Published(
+HOLE_CENSUS = PublishedTable(
     "section 3.1",
     "two iPhone captures of its own",
-    _table("hole_share.trackable_no_lidar", {"indoor": "90.4 %", "outdoor": "86.1 %"}),
+    _parse_lines("hole_share.trackable_no_lidar", {"indoor": "90.4 %", "outdoor": "86.1 %"}),
     ("Trackability of these holes is of the same order as that of samples with a return.",),
 )
 
-POSE = Published(
+DEVICE_POSE = PublishedTable(
     "section 3.2",
     "iPhone captures of its own; axes of the trajectory not stated",
-    _table("rotation_deg corr", {"device (VIO) pose": "∼5 | ≈ 0.16"}),
+    _parse_lines("rotation_deg corr", {"device (VIO) pose": "∼5 | ≈ 0.16"}),
 )
 
-MOTION = Published(
+BASELINE_MOTION = PublishedTable(
     "Table 2, section 6.2",
     "two iPhone captures of its own",
-    _table(
+    _parse_lines(
         "median_rel n_recovered",
         {"indoor (near-static)": "3.5 % | 105", "outdoor (walking)": "1.4 % | 663"},
     ),
 )
 
-HELIX = Published(
+HELIX = PublishedTable(
     "section 4",
     "captures of its own, mostly; inverse depth of the LiDAR",
-    _table("corr", {"dual-helix correlation": "−0.04", "plain 2-D optical flow": "+0.34"}),
+    _parse_lines("corr", {"dual-helix correlation": "−0.04", "plain 2-D optical flow": "+0.34"}),
     ("Under forward motion the flow is radial, and a tangential correlation does not see it.",),
 )
 
-ICP = Published(
+ICP = PublishedTable(
     "section 4",
     "captures of its own, mostly",
-    _table("n_voxels", {"device pose (VIO) alone": "6,200", "ICP over it": "5,417"}),
+    _parse_lines("n_voxels", {"device pose (VIO) alone": "6,200", "ICP over it": "5,417"}),
     ("Rarely confident over a good pose; of use where there is none.",),
 )
 
-ATTENTION = Published(
+HOLE_ATTENTION = PublishedTable(
     "section 4",
     "captures of its own, mostly",
-    _table("hole_rate", {"before": "0.67", "gaze on the largest hole cluster": "0.78"}),
+    _parse_lines("hole_rate", {"before": "0.67", "gaze on the largest hole cluster": "0.78"}),
     ("Use of the holes: routing, what may need a head turn.",),
 )
 
-DEFOCUS = Published(
+DEFOCUS = PublishedTable(
     "section 4",
     "captures of its own, mostly",
-    _table(
+    _parse_lines(
         "rho_abs corr",
         {"unsigned": "0.22 | –", "side from an oracle": "0.22 | 0.66", "side has to be produced": "– | 0.06"},
     ),
@@ -220,50 +221,50 @@ DEFOCUS = Published(
     ),
 )
 
-FOCUS_STACK = Published(
+FOCUS_STACK = PublishedTable(
     "section 4",
     "FoD500 (clean synthetic), DDFF-12 (real light fields)",
-    _table(
+    _parse_lines(
         "rank_corr gated_corr flip_share abs_corr gated_abs_corr",
         {"clean synthetic": "0.69 | 0.76 | – | – | –", "real light fields": "– | – | ∼1/5 | 0.15 | 0.21"},
     ),
 )
 
-FUSION = Published(
+DEFOCUS_FUSION = PublishedTable(
     "section 4",
     "captures of its own, mostly",
-    _table("corr", {"bilinear": "0.82–0.99"}),
+    _parse_lines("corr", {"bilinear": "0.82–0.99"}),
     ("Defocus never beats plain interpolation and slightly raises the error.",),
 )
 
 
-_PROBES = (
+_PROBE_NOTES = (
     "No test of equivalence was run. Features of any kind gain 0.6–2.4 % on the context; raw RGB is not beaten.",
 )
 
-PROBE = Published(
+FUTURE_MOTION = PublishedTable(
     "section 6.7",
     "RH20T, 799 tasks, ∼100k samples, DINOv2-L",
-    _table("vs_dinov2", {"DH-Active": "1.006"}),
-    _PROBES,
+    _parse_lines("vs_dinov2", {"DH-Active": "1.006"}),
+    _PROBE_NOTES,
 )
 
-PROBE_MOVING = Published(
+FUTURE_MOTION_MOVING = PublishedTable(
     "section 6.7",
     "RH20T, 799 tasks, DINOv2-L, moving samples",
-    _table("vs_dinov2", {"DH-Active": "1.013"}),
-    _PROBES,
+    _parse_lines("vs_dinov2", {"DH-Active": "1.013"}),
+    _PROBE_NOTES,
 )
 
-VISUAL_ODOMETRY = Published(
+VISUAL_ODOMETRY = PublishedTable(
     "section 6.7",
     "a single scene, not named",
-    _table("mse vs_dinov2", {"DH-Active": "1.32 | 0.81", "DINOv2": "1.63 | –"}),
+    _parse_lines("mse vs_dinov2", {"DH-Active": "1.32 | 0.81", "DINOv2": "1.63 | –"}),
     ("The paper itself calls the task geometry-favoured.",),
 )
 
 
-def number(text: str | None) -> float | None:
+def parse_printed(text: str | None) -> float | None:
     """A printed figure as a number, per cent as a share; None where it is a range, a word or nothing."""
     found = re.fullmatch(r"([+−-]?[\d,]+(?:\.\d+)?) ?(%|M|B)?", text or "")
     if not found:

@@ -6,87 +6,87 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 
 from dhtorch.experiments.report import published
-from dhtorch.experiments.report.cells import show
+from dhtorch.experiments.report.cells import format_value
 from dhtorch.experiments.report.figure import (
-    PUBLISHED,
-    SCENE,
+    PUBLISHED_KEY,
+    SCENE_STROKE,
     Figure,
-    axis_of,
-    deciding,
-    legend,
-    series,
-    share,
+    deciding_rows,
+    metric_axis,
+    share_axis,
+    variant_legend,
+    variant_strokes,
 )
-from dhtorch.experiments.report.layouts import thresholds
-from dhtorch.experiments.report.reading import Result, Row, entry, value, variants
-from dhtorch.viz.plots import Key, Panel, Stroke, spanning
+from dhtorch.experiments.report.layouts import threshold_points
+from dhtorch.experiments.report.reading import Result, Row, metric_value, summary_entry, variant_names
+from dhtorch.viz.plots import LegendKey, Panel, Stroke, fit_axis
 from dhtorch.viz.plots.colours import INK
 
-METRICS = (("coverage", "coverage, %"), ("median_rel", "median error, %"))
+_SWEPT_METRICS = (("coverage", "coverage, %"), ("median_rel", "median error, %"))
 #: The paper's usual cutoff, m.
-USUAL_CUTOFF = 2.0
+_USUAL_CUTOFF_M = 2.0
 
 
-def cutoffs(result: Result) -> Figure | None:
+def cutoff_figure(result: Result) -> Figure | None:
     """Coverage and error against the cutoff, as parts of the usual one."""
-    parts = {v: part for v in variants(result) if (part := _cutoff_part(v)) is not None}
+    parts = {v: part for v in variant_names(result) if (part := _cutoff_part(v)) is not None}
     cited = {}
-    for cells in published.CUTOFF.lines.values():
-        numbers = {m: published.number(cell) for m, cell in cells.items()}
-        cited[(numbers["cutoff_m"] or 0.0) / USUAL_CUTOFF] = numbers
-    panels = _sweep(result, parts, lambda row: parts[row["method"]], "cutoff, parts of the usual one", cited)
+    for cells in published.CUTOFF_SWEEP.lines.values():
+        numbers = {m: published.parse_printed(cell) for m, cell in cells.items()}
+        cited[(numbers["cutoff_m"] or 0.0) / _USUAL_CUTOFF_M] = numbers
+    panels = _sweep_figure(result, parts, lambda row: parts[row["method"]], "cutoff, parts of the usual one", cited)
     caption = "The usual cutoff is 2 m in the paper, and in ours each scene's own near limit or the job's cutoff."
-    return Figure("Cutoff sweep", caption, panels, [*_LEGEND, PUBLISHED], wide=True) if panels else None
+    return Figure("Cutoff sweep", caption, panels, [*_SWEEP_LEGEND, PUBLISHED_KEY], wide=True) if panels else None
 
 
-def motion(result: Result) -> Figure | None:
+def motion_figure(result: Result) -> Figure | None:
     """Coverage and error against the baseline."""
     if result["experiment"] != "motion":
         return None
-    panels = _sweep(result, variants(result), lambda row: row.get("baseline_m"), "baseline, m", {})
+    panels = _sweep_figure(result, variant_names(result), lambda row: row.get("baseline_m"), "baseline, m", {})
     caption = "Every dot is one gap between the two views; its place on the axis is the median baseline of that gap."
-    return Figure("Motion dependence", caption, panels, _LEGEND, wide=True) if panels else None
+    return Figure("Motion dependence", caption, panels, _SWEEP_LEGEND, wide=True) if panels else None
 
 
-def threshold(result: Result) -> Figure | None:
+def threshold_figure(result: Result) -> Figure | None:
     """What a threshold on the score buys: the paper's figure of selective risk against coverage."""
-    paths = {v: path for v in variants(result) if len(path := _path(result, v)) > 1}
+    paths = {v: path for v in variant_names(result) if len(path := _threshold_path(result, v)) > 1}
     if not paths:
         return None
     cited = {
-        name: (published.number(cells["coverage"]), published.number(cells["median_rel"]))
+        name: (published.parse_printed(cells["coverage"]), published.parse_printed(cells["median_rel"]))
         for name, cells in published.THRESHOLDS.lines.items()
     }
     errors = [e for path in paths.values() for _, _, e in path] + [e for _, e in cited.values()]
-    panel = Panel("", share("coverage, %"), axis_of("median_rel", errors, "median error, %"), size=(560, 320))
-    strokes = series(result)
+    panel = Panel("", share_axis("coverage, %"), metric_axis("median_rel", errors, "median error, %"), size=(560, 320))
+    strokes = variant_strokes(result)
     for v, path in paths.items():
         panel.line([c for _, c, _ in path], [e for _, _, e in path], strokes[v])
         for name, c, e in path:
-            panel.dot(c, e, strokes[v], f"{v}, {_at(name, c, e)}")
+            panel.dot(c, e, strokes[v], f"{v}, {_sweep_point(name, c, e)}")
     for name, (coverage, error) in cited.items():
         if coverage is not None and error is not None:
-            panel.diamond(coverage, error, f"published, {_at(name, coverage, error)}")
+            panel.diamond(coverage, error, f"published, {_sweep_point(name, coverage, error)}")
     caption = "Each dot is a threshold on the score, medians over scenes; the paper gives two (0 and 0.3)."
-    drawn = [*legend(result, list(paths)), PUBLISHED]
+    drawn = [*variant_legend(result, list(paths)), PUBLISHED_KEY]
     return Figure("Threshold on the score", caption, [panel], drawn, wide=True)
 
 
-def _at(name: str, coverage: float, error: float) -> str:
-    return f"score from {name}: {show(error, 'median_rel')} at {show(coverage, 'coverage')}"
+def _sweep_point(name: str, coverage: float, error: float) -> str:
+    return f"score from {name}: {format_value(error, 'median_rel')} at {format_value(coverage, 'coverage')}"
 
 
-def _path(result: Result, variant: str) -> list[tuple[str, float, float]]:
+def _threshold_path(result: Result, variant: str) -> list[tuple[str, float, float]]:
     """(threshold, coverage, median error) where both are known."""
     found = []
-    for name, numbers in thresholds(result, variant):
+    for name, numbers in threshold_points(result, variant):
         c, e = numbers["coverage"], numbers["median_rel"]
         if c is not None and e is not None:
             found.append((name, c, e))
     return found
 
 
-def _sweep(
+def _sweep_figure(
     result: Result,
     swept: Mapping[str, float] | Sequence[str],  # variants
     at: Callable[[Row], float | None],  # row → its place on the axis
@@ -94,35 +94,37 @@ def _sweep(
     cited: Mapping[float, Mapping[str, float | None]],  # place → the paper's figures
 ) -> list[Panel]:
     """Coverage and error: a line per scene, the medians over scenes, the paper. Nothing with fewer than two places."""
-    rows = [row for row in deciding(result) if row["method"] in swept and not row.get("role")]
+    rows = [row for row in deciding_rows(result) if row["method"] in swept and not row.get("role")]
     placed = [(x, row) for row in rows if (x := at(row)) is not None and not row.get("note")]
     if len({x for x, _ in placed}) < 2:
         return []
-    axis, panels = spanning([*(x for x, _ in placed), *cited], label), []
-    for metric, words in METRICS:
+    axis, panels = fit_axis([*(x for x, _ in placed), *cited], label), []
+    for metric, words in _SWEPT_METRICS:
         theirs = {x: cells.get(metric) for x, cells in cited.items()}
-        y = axis_of(metric, [*(value(row, metric) for _, row in placed), *theirs.values()], words)
+        y = metric_axis(metric, [*(metric_value(row, metric) for _, row in placed), *theirs.values()], words)
         panel = Panel(words, axis, y, size=(400, 250))
         for scene in dict.fromkeys(row["scene"] for _, row in placed):
-            mine = sorted(((x, value(row, metric)) for x, row in placed if row["scene"] == scene), key=lambda m: m[0])
-            panel.line([x for x, _ in mine], [v for _, v in mine], SCENE)
-        _medians(panel, result, placed, metric)
+            mine = sorted(
+                ((x, metric_value(row, metric)) for x, row in placed if row["scene"] == scene), key=lambda m: m[0]
+            )
+            panel.line([x for x, _ in mine], [v for _, v in mine], SCENE_STROKE)
+        _draw_medians(panel, result, placed, metric)
         for x, number in theirs.items():
             if number is not None:
-                panel.diamond(x, number, f"published: {show(number, metric)}")
+                panel.diamond(x, number, f"published: {format_value(number, metric)}")
         panels.append(panel)
     return panels
 
 
-def _medians(panel: Panel, result: Result, placed: Sequence[tuple[float, Row]], metric: str) -> None:
+def _draw_medians(panel: Panel, result: Result, placed: Sequence[tuple[float, Row]], metric: str) -> None:
     """The summary over scenes at the median place of each variant."""
     names = dict.fromkeys(row["method"] for _, row in placed)
     middle = sorted((_median([x for x, row in placed if row["method"] == v]), v) for v in names)
-    found = [entry(result, v, metric).get("value") for _, v in middle]
-    panel.line([x for x, _ in middle], found, _MEDIAN)
+    found = [summary_entry(result, v, metric).get("value") for _, v in middle]
+    panel.line([x for x, _ in middle], found, _MEDIAN_STROKE)
     for (x, v), number in zip(middle, found, strict=True):
         if number is not None:
-            panel.dot(x, number, _MEDIAN, f"{v}: {show(number, metric)}", width=8)
+            panel.dot(x, number, _MEDIAN_STROKE, f"{v}: {format_value(number, metric)}", width=8)
 
 
 def _median(values: Sequence[float]) -> float:
@@ -135,8 +137,11 @@ def _cutoff_part(variant: str) -> float | None:
     found = re.fullmatch(r"gated(?:, cutoff (?:[x×]([\d.]+)|([\d.]+) m))?", variant)
     if not found:
         return None
-    return float(found[1]) if found[1] else float(found[2]) / USUAL_CUTOFF if found[2] else 1.0
+    return float(found[1]) if found[1] else float(found[2]) / _USUAL_CUTOFF_M if found[2] else 1.0
 
 
-_MEDIAN = Stroke(INK, 2.8)
-_LEGEND = [Key("median over scenes", INK, stroke=_MEDIAN), Key("single scenes", SCENE.colour, stroke=SCENE)]
+_MEDIAN_STROKE = Stroke(INK, 2.8)
+_SWEEP_LEGEND = [
+    LegendKey("median over scenes", INK, stroke=_MEDIAN_STROKE),
+    LegendKey("single scenes", SCENE_STROKE.colour, stroke=SCENE_STROKE),
+]

@@ -6,57 +6,62 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
-from dhtorch.experiments.report.tables import INTERVAL, Table
-from dhtorch.runtime.console import markup, terminal
+from dhtorch.experiments.report.tables import INTERVAL_LABEL, ReportTable
+from dhtorch.runtime.console import escape_markup, unwrap_terminal
 
 
-def print_table(table: Table, console: Any = None) -> None:
+def print_table(table: ReportTable, console: Any = None) -> None:
     """Print a table with rich; ``console`` is a ``rich.console.Console``, None = standard output."""
     from rich import box  # noqa: PLC0415
     from rich.console import Console  # noqa: PLC0415
     from rich.table import Table as RichTable  # noqa: PLC0415
 
-    console = console or Console(file=terminal(sys.stdout))
+    console = console or Console(file=unwrap_terminal(sys.stdout))
     if not console.is_terminal:
         console.width = max(console.width, 240)  # a file has no edge to wrap at
     shown = RichTable(
-        title=markup(table.title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False
+        title=escape_markup(table.title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False
     )
     for k, head in enumerate(table.flat_head()):
-        shown.add_column(markup(head), justify="left" if k < table.n_label else "right", overflow="fold")
+        shown.add_column(escape_markup(head), justify="left" if k < table.n_label else "right", overflow="fold")
     n_body = len(table.rows) - table.footer - table.quoted
     for k, cells in enumerate(table.rows):
         summed = n_body <= k < n_body + table.footer
-        style = "bold" if summed and cells[0] != INTERVAL else "dim" if summed else "yellow" if k >= n_body else None
+        style = (
+            "bold" if summed and cells[0] != INTERVAL_LABEL else "dim" if summed else "yellow" if k >= n_body else None
+        )
         last_of_part = k + 1 in (n_body, n_body + table.footer) and k + 1 < len(table.rows)
-        texts = [f"[bold]{markup(c)}[/bold]" if (k, n) in table.best else markup(c) for n, c in enumerate(cells)]
+        texts = [
+            f"[bold]{escape_markup(c)}[/bold]" if (k, n) in table.best else escape_markup(c)
+            for n, c in enumerate(cells)
+        ]
         shown.add_row(*texts, style=style, end_section=last_of_part)
     console.print(shown)
     if table.note:
-        console.print(f"{markup(table.note)}\n", style="dim", highlight=False)
+        console.print(f"{escape_markup(table.note)}\n", style="dim", highlight=False)
 
 
-def markdown(tables: Iterable[Table]) -> str:
+def tables_to_markdown(tables: Iterable[ReportTable]) -> str:
     """Tables as Markdown, each under its title in bold and above its note."""
     parts = []
     for table in tables:
-        parts.append(f"**{_plain(table.title)}**\n\n{grid(table)}\n")
+        parts.append(f"**{_escape_cell(table.title)}**\n\n{table_to_markdown(table)}\n")
         if table.note:
-            parts.append(f"{_plain(table.note)}\n")
+            parts.append(f"{_escape_cell(table.note)}\n")
     return "\n".join(parts)
 
 
-def grid(table: Table) -> str:
+def table_to_markdown(table: ReportTable) -> str:
     """A table's lines alone as Markdown."""
     align = [":--" if k < table.n_label else "--:" for k in range(len(table.head))]
     marked = [
-        [f"**{_plain(c)}**" if (k, n) in table.best else _plain(c) for n, c in enumerate(cells)]
+        [f"**{_escape_cell(c)}**" if (k, n) in table.best else _escape_cell(c) for n, c in enumerate(cells)]
         for k, cells in enumerate(table.rows)
     ]
-    rows = ([_plain(c) for c in table.flat_head()], align, *marked)
+    rows = ([_escape_cell(c) for c in table.flat_head()], align, *marked)
     return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
 
 
-def _plain(cell: str) -> str:
+def _escape_cell(cell: str) -> str:
     """A cell that cannot end its own row or begin markup."""
     return " ".join(cell.split()).replace("|", "\\|").replace("<", "&lt;")

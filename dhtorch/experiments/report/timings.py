@@ -3,60 +3,73 @@
 from __future__ import annotations
 
 from dhtorch.experiments.report import published
-from dhtorch.experiments.report.cells import NOTHING, between, head, show
-from dhtorch.experiments.report.reading import Result, Row, entry, scene_rows, variants
-from dhtorch.experiments.report.tables import OURS, PUBLISHED, Table, source
+from dhtorch.experiments.report.cells import EMPTY_CELL, format_metric_interval, format_value, metric_heading
+from dhtorch.experiments.report.reading import Result, Row, scene_rows, summary_entry, variant_names
+from dhtorch.experiments.report.tables import OURS_LABEL, PUBLISHED_LABEL, ReportTable, published_source
 
-COLUMNS = ("device", "p50_ms", "p95_ms", "p99_ms", "parameters", "weight_bytes", "peak_mib")
-STAGE_COLUMNS = ("p50_ms", "p95_ms", "p99_ms")
+_TIMING_COLUMNS = ("device", "p50_ms", "p95_ms", "p99_ms", "parameters", "weight_bytes", "peak_mib")
+_STAGE_COLUMNS = ("p50_ms", "p95_ms", "p99_ms")
 #: Summary's name → (words, what the paper has).
-RATIOS = {"speedup": ("DINOv2-L / front end", "96"), "growth": ("front end at 1440×1920 / 224×224", "3.81 / 1.11")}
+_PUBLISHED_RATIOS = {
+    "speedup": ("DINOv2-L / front end", "96"),
+    "growth": ("front end at 1440×1920 / 224×224", "3.81 / 1.11"),
+}
 
 
-def latency(result: Result) -> list[Table]:
+def latency_tables(result: Result) -> list[ReportTable]:
     """Tables of a result of timings."""
-    whole = [row for row in scene_rows(result) if is_whole(row)]
+    whole = [row for row in scene_rows(result) if is_whole_branch(row)]
     cited = [
-        [f"{PUBLISHED}: {name}", *(cells.get(m, NOTHING) for m in COLUMNS)]
+        [f"{PUBLISHED_LABEL}: {name}", *(cells.get(m, EMPTY_CELL) for m in _TIMING_COLUMNS)]
         for name, cells in published.LATENCY.lines.items()
     ]
-    note = f"{source(result, published.LATENCY)} {_machine(result)}".strip()
-    rows = [_line(row, COLUMNS) for row in whole]
-    found = [Table("Measured latency", ["branch", *map(head, COLUMNS)], rows + cited, quoted=len(cited), note=note)]
+    note = f"{published_source(result, published.LATENCY)} {_machine_note(result)}".strip()
+    rows = [_table_row(row, _TIMING_COLUMNS) for row in whole]
+    found = [
+        ReportTable(
+            "Measured latency",
+            ["branch", *map(metric_heading, _TIMING_COLUMNS)],
+            rows + cited,
+            quoted=len(cited),
+            note=note,
+        )
+    ]
     ratios = [
-        [words, show(e["value"], how="plain"), between(e["low"], e["high"], name), theirs]
-        for name, (words, theirs) in RATIOS.items()
-        for v in variants(result)
-        if (e := entry(result, v, name))
+        [words, format_value(e["value"], how="plain"), format_metric_interval(e["low"], e["high"], name), theirs]
+        for name, (words, theirs) in _PUBLISHED_RATIOS.items()
+        for v in variant_names(result)
+        if (e := summary_entry(result, v, name))
     ]
     if ratios:
-        found.append(Table("Ratios", ["", OURS, "lowest–highest round", PUBLISHED], ratios))
-    stages = [_line(row, STAGE_COLUMNS) for row in scene_rows(result) if not is_whole(row)]
+        found.append(ReportTable("Ratios", ["", OURS_LABEL, "lowest–highest round", PUBLISHED_LABEL], ratios))
+    stages = [_table_row(row, _STAGE_COLUMNS) for row in scene_rows(result) if not is_whole_branch(row)]
     if stages:
-        found.append(Table("Latency by stage", ["stage", *map(head, STAGE_COLUMNS)], stages))
+        found.append(ReportTable("Latency by stage", ["stage", *map(metric_heading, _STAGE_COLUMNS)], stages))
     return found
 
 
-def branch(row: Row) -> str:
+def branch_name(row: Row) -> str:
     """What a row of timings is about."""
-    size = f", {show(row['hw'])}" if row.get("hw") else ""
+    size = f", {format_value(row['hw'])}" if row.get("hw") else ""
     return f"{row['method']} {row.get('stage', '').replace('_', ' ')}".strip() + size
 
 
-def is_whole(row: Row) -> bool:
+def is_whole_branch(row: Row) -> bool:
     """Whether a row is about a branch and not about one stage of it."""
     return row.get("stage") in ("front_end", "pair", "forward") or "parameters" in row
 
 
-def _line(row: Row, columns: tuple[str, ...]) -> list[str]:
-    missing = row.get("note", NOTHING)
-    return [branch(row), *(missing if row.get(m) is None else show(row[m], m) for m in columns)]
+def _table_row(row: Row, columns: tuple[str, ...]) -> list[str]:
+    missing = row.get("note", EMPTY_CELL)
+    return [branch_name(row), *(missing if row.get(m) is None else format_value(row[m], m) for m in columns)]
 
 
-def _machine(result: Result) -> str:
+def _machine_note(result: Result) -> str:
     """On what ours were measured."""
     said = []
     for name, words in (("cpu", "CPU"), ("cores", "cores"), ("threads", "threads"), ("load", "load of the machine")):
-        known = dict.fromkeys(show(row[name], how="plain") for row in scene_rows(result) if row.get(name) is not None)
+        known = dict.fromkeys(
+            format_value(row[name], how="plain") for row in scene_rows(result) if row.get(name) is not None
+        )
         said += [f"{words} {', '.join(known)}"] if known else []
     return f"Measured with {'; '.join(said)}." if said else ""

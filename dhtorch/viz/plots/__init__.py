@@ -8,45 +8,45 @@ matplotlib is imported when something is drawn.
 
 from __future__ import annotations
 
-from dhtorch.viz.plots.axis import Axis, spanning
-from dhtorch.viz.plots.canvas import Canvas, Key, Mark, at_cutoff, frame_of, headed, save
-from dhtorch.viz.plots.colours import Stroke, series
-from dhtorch.viz.plots.maps import draw_anchored, draw_completed
+from dhtorch.viz.plots.axis import Axis, fit_axis
+from dhtorch.viz.plots.canvas import Canvas, LegendKey, Mark, append_cutoff, format_frame, prefix_title, save_figure
+from dhtorch.viz.plots.colours import Stroke, assign_strokes
+from dhtorch.viz.plots.maps import draw_aligned, draw_completed
 from dhtorch.viz.plots.panel import Panel
 from dhtorch.viz.plots.pictures import (
-    FEWEST,
-    Layer,
-    Picture,
+    MIN_CURVE_ANSWERS,
+    LayeredPicture,
+    PointLayer,
     draw_depth,
     draw_holes,
     draw_risk_coverage,
     draw_samples,
 )
-from dhtorch.viz.plots.svg import inline
-from dhtorch.viz.plots.validation import draw_verdict
+from dhtorch.viz.plots.svg import render_inline_svg
+from dhtorch.viz.plots.validation import draw_validation
 
 __all__ = [
-    "FEWEST",
+    "MIN_CURVE_ANSWERS",
     "Axis",
     "Canvas",
-    "Key",
-    "Layer",
+    "LayeredPicture",
+    "LegendKey",
     "Mark",
     "Panel",
-    "Picture",
+    "PointLayer",
     "Stroke",
-    "at_cutoff",
-    "draw_anchored",
+    "append_cutoff",
+    "assign_strokes",
+    "draw_aligned",
     "draw_completed",
     "draw_depth",
     "draw_holes",
     "draw_risk_coverage",
     "draw_samples",
-    "draw_verdict",
-    "frame_of",
-    "headed",
-    "inline",
-    "save",
-    "series",
-    "spanning",
+    "draw_validation",
+    "fit_axis",
+    "format_frame",
+    "prefix_title",
+    "render_inline_svg",
+    "save_figure",
 ]

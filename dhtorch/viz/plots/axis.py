@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-Numbers = Sequence[float | None]
+OptionalNumbers = Sequence[float | None]
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Axis:
         return f"{100 * tick:.4g}" if self.percent else f"{tick:.4g}"
 
 
-def spanning(values: Numbers, label: str, *, log: bool = False, percent: bool = False, **ends: float) -> Axis:
+def fit_axis(values: OptionalNumbers, label: str, *, log: bool = False, percent: bool = False, **ends: float) -> Axis:
     """An axis that holds all values; ``low`` and ``high`` fix an end, ``floor`` and ``cap`` bound it."""
     known = [v for v in values if v is not None and (not log or v > 0)]
     low, high = (min(known), max(known)) if known else (0.1 if log else 0.0, 1.0)

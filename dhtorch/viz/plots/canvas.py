@@ -10,17 +10,17 @@ import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from dhtorch.viz.plots.colours import GREY, INK, SOFT, THEIRS, Stroke
+from dhtorch.viz.plots.colours import GREY_CMAP, INK, PAPER_EDGE, SOFT, Stroke
 
 #: Height of letters, points; their width by which words are cut, as a share of it.
-SMALL, TITLE, LETTER = 10.0, 11.0, 0.59
+TEXT_SIZE_PT, _TITLE_SIZE_PT, LETTER_WIDTH_EM = 10.0, 11.0, 0.59
 #: Of a title: least height of its letters, points, and their width, as they are bold.
-LEAST, BOLD = 8.0, 0.66
+_MIN_TITLE_SIZE_PT, _BOLD_LETTER_WIDTH_EM = 8.0, 0.66
 
-Place = tuple[float, float]
+CanvasPoint = tuple[float, float]
 
 
-class Key(NamedTuple):
+class LegendKey(NamedTuple):
     """An entry of a legend."""
 
     text: str
@@ -33,7 +33,7 @@ class Mark(NamedTuple):
     """Something drawn: its kind, its corners (places in the panel), how, and what it says when pointed at."""
 
     kind: str  # line | dot | diamond | bar
-    places: tuple[Place, ...]
+    places: tuple[CanvasPoint, ...]
     stroke: Stroke
     said: str = ""
     edge: str | None = None  # colour of the edge of a bar
@@ -50,30 +50,32 @@ class Canvas:
         self.points = Affine2D().scale(1 / width, 1 / height) + self.figure.transFigure
         self.said: list[str] = []  # what the artists named said-0, said-1, … say
 
-    def text(self, text: str, u: float, v: float, *, size: float = SMALL, said: str = "", **options: Any) -> None:
+    def text(
+        self, text: str, u: float, v: float, *, size: float = TEXT_SIZE_PT, said: str = "", **options: Any
+    ) -> None:
         """Words at a place; ``said`` where they had to be cut."""
         from matplotlib.text import Text  # noqa: PLC0415
 
-        text = plain(text)
+        text = to_plain_line(text)
         if not text:
             return
         weight = "bold" if options.pop("bold", False) else "normal"
         made = Text(u, v, text, color=INK if weight == "bold" else SOFT, fontsize=size, fontweight=weight, **options)
         made.set(parse_math=False, rotation_mode="anchor", transform=self.points)
-        self._add(made, said if plain(said) != text else "")
+        self._add(made, said if to_plain_line(said) != text else "")
 
     def title(self, text: str, width: float, height: float, left: float = 0.0) -> None:
         """Words along the upper edge: long ones are set smaller, then cut in their middle."""
-        text = plain(text)
-        size = min(TITLE, max(LEAST, width / (BOLD * max(len(text), 1))))
-        shown = cut(text, width * LETTER / BOLD, size, end=len(text) // 3)
+        text = to_plain_line(text)
+        size = min(_TITLE_SIZE_PT, max(_MIN_TITLE_SIZE_PT, width / (_BOLD_LETTER_WIDTH_EM * max(len(text), 1))))
+        shown = truncate_text(text, width * LETTER_WIDTH_EM / _BOLD_LETTER_WIDTH_EM, size, end=len(text) // 3)
         self.text(shown, left + 2, height - 14, size=size, bold=True, said=text)
 
-    def lines(self, segments: Iterable[Sequence[Place]], stroke: Stroke, said: str = "") -> None:
+    def lines(self, segments: Iterable[Sequence[CanvasPoint]], stroke: Stroke, said: str = "") -> None:
         """Lines through places, all in one path."""
         from matplotlib.path import Path  # noqa: PLC0415
 
-        places: list[Place] = []
+        places: list[CanvasPoint] = []
         codes: list[Any] = []
         for segment in segments:
             places += segment
@@ -82,7 +84,7 @@ class Canvas:
         dashes = (0, stroke.dashes) if stroke.dashes else "solid"
         self._path(places, codes, said, fill=False, edgecolor=stroke.colour, linestyle=dashes, **options)
 
-    def dots(self, places: Iterable[Place], stroke: Stroke, said: str = "") -> None:
+    def dots(self, places: Iterable[CanvasPoint], stroke: Stroke, said: str = "") -> None:
         """Dots as wide as the stroke: lines without length and with round ends, the shortest that SVG knows."""
         from matplotlib.path import Path  # noqa: PLC0415
 
@@ -102,7 +104,7 @@ class Canvas:
 
     def area(
         self,
-        corners: Sequence[Place],
+        corners: Sequence[CanvasPoint],
         colour: str,
         said: str = "",
         edge: str | None = None,
@@ -130,7 +132,7 @@ class Canvas:
         axes.set_zorder(-1)
         axes.imshow(
             pixels,
-            cmap=GREY,
+            cmap=GREY_CMAP,
             vmin=0,
             vmax=1,
             extent=(left, left + width, bottom, bottom + height),
@@ -139,11 +141,11 @@ class Canvas:
         )
         axes.set(xlim=(0, limits[0]), ylim=(0, limits[1]))
 
-    def finished(self, keys: Sequence[Key]) -> Any:
+    def finished(self, keys: Sequence[LegendKey]) -> Any:
         """The figure with a legend beside it, where it covers nothing."""
         if keys:
             options = {"bbox_to_anchor": (1.0, 1.0), "frameon": False, "fontsize": 9, "labelcolor": INK}
-            self.figure.legend(handles=list(map(_handle, keys)), loc="upper left", **options)
+            self.figure.legend(handles=list(map(_make_legend_handle, keys)), loc="upper left", **options)
         return self.figure
 
     def _path(self, places: Sequence[Any], codes: Sequence[Any], said: str, **options: Any) -> None:
@@ -159,55 +161,55 @@ class Canvas:
     def _add(self, artist: Any, said: str) -> None:
         if said:
             artist.set_gid(f"said-{len(self.said)}")
-            self.said.append(plain(said))
+            self.said.append(to_plain_line(said))
         artist.set_figure(self.figure)
         artist.set_zorder(len(self.figure.artists))  # in the order in which they come
         self.figure.artists.append(artist)
 
 
-def plain(text: str) -> str:
+def to_plain_line(text: str) -> str:
     """Words as a figure can hold them: on one line, without control characters and halves of surrogate pairs."""
     text = str(text).encode("utf-8", "replace").decode()
     return " ".join("".join(c if c.isprintable() or c.isspace() else "\ufffd" for c in text).split())
 
 
-def cut(text: str, width: float, size: float, end: int = 0) -> str:
+def truncate_text(text: str, width: float, size: float, end: int = 0) -> str:
     """As much of a text as a width has room for, points; with up to ``end`` letters of its end, a third of all."""
-    most = int(width / (LETTER * size) + 1e-6)
+    most = int(width / (LETTER_WIDTH_EM * size) + 1e-6)
     if len(text) <= most:
         return text
     last = min(end, most // 3)
     return f"{text[: most - 1 - last]}…{text[len(text) - last :]}"
 
 
-def frame_of(scene: str, frame: object, views: Sequence[object] = ()) -> str:
+def format_frame(scene: str, frame: object, views: Sequence[object] = ()) -> str:
     """A frame of a scene, and those that were asked beside it, by their names."""
-    beside = f", with {_frames(views)}" if views else ""
+    beside = f", with {_format_frames(views)}" if views else ""
     return f"{scene}, frame {frame}{beside}"
 
 
-def _frames(views: Sequence[object]) -> str:
+def _format_frames(views: Sequence[object]) -> str:
     return f"frame{'s' * (len(views) > 1)} {', '.join(map(str, views))}"
 
 
-def at_cutoff(place: str, cutoff: float | None) -> str:
+def append_cutoff(place: str, cutoff: float | None) -> str:
     """What is shown, and how much of the sensor's depth was kept, m."""
     return place if cutoff is None else f"{place}, cutoff {cutoff:g} m"
 
 
-def headed(words: str, title: str) -> str:
+def prefix_title(words: str, title: str) -> str:
     """What a figure shows, behind the scene that it shows."""
     return f"{title}: {words[0].lower()}{words[1:]}" if title else words
 
 
-def save(figure: Any, path: Any) -> None:
+def save_figure(figure: Any, path: Any) -> None:
     """Write a figure with what lies around its axes."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # a name in letters that the font lacks
         figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
 
 
-def _handle(key: Key) -> Any:
+def _make_legend_handle(key: LegendKey) -> Any:
     """What stands for an entry in matplotlib's legend."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
 
@@ -216,9 +218,9 @@ def _handle(key: Key) -> Any:
         stroke = key.stroke or Stroke(key.colour)
         dashes: Any = (0, stroke.dashes) if stroke.dashes else "solid"
         return Line2D([], [], color=key.colour, linewidth=stroke.width, linestyle=dashes, label=key.text)
-    marker, edge = _MARKERS[key.shape]
+    marker, edge = _LEGEND_MARKERS[key.shape]
     return Line2D([], [], marker=marker, markeredgecolor=edge or key.colour, **made)
 
 
 #: Shape of an entry → matplotlib's marker and the colour of its edge, None = its own.
-_MARKERS = {"dot": ("o", "none"), "box": ("s", "none"), "cross": ("x", None), "diamond": ("D", THEIRS)}
+_LEGEND_MARKERS = {"dot": ("o", "none"), "box": ("s", "none"), "cross": ("x", None), "diamond": ("D", PAPER_EDGE)}

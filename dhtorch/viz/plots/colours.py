@@ -17,10 +17,10 @@ import numpy as np
 from dhtorch.codes import Gate, Hole, Source, State
 
 #: What a depth comes from; what is silent is paler than what was answered.
-SENSOR, RECOVERED, SWEPT, ANCHORED, SILENT = "#0072B2", "#E69F00", "#C653A6", "#3F8F6B", "#B4B4B4"
+SENSOR, RECOVERED, SWEPT, ALIGNED, SILENT = "#0072B2", "#E69F00", "#C653A6", "#3F8F6B", "#B4B4B4"
 
 #: Variable of the pages → its colour by day and in the dark. Figures are drawn in those of the day.
-PAGE = {
+PAGE_COLOURS = {
     "ground": ("#fdfdfb", "#15181b"),
     "card": ("#ffffff", "#1b2024"),
     "stage": ("#e9ebea", "#0b0d0f"),
@@ -36,16 +36,16 @@ PAGE = {
     "picture": ("#efeeea", "#c9c8c3"),
     "rim": ("#40331a", "#0d0d0d"),
 }
-INK, SOFT, FAINT, PICTURE = (PAGE[name][0] for name in ("ink", "soft", "faint", "picture"))
+INK, SOFT, FAINT, PICTURE = (PAGE_COLOURS[name][0] for name in ("ink", "soft", "faint", "picture"))
 #: Figures of the paper, beside ours: edge and inside.
-THEIRS, THEIRS_INSIDE = PAGE["theirs"][0], PAGE["theirs-ground"][0]
+PAPER_EDGE, PAPER_FILL = PAGE_COLOURS["theirs"][0], PAGE_COLOURS["theirs-ground"][0]
 #: In space: what another colouring leaves aside, and the returns that were held back.
 PALE, HELD = "#737880", "#739E80"
 #: Around a mark, so that it is seen on any picture.
 WHITE, BLACK = "#ffffff", "#000000"
 
 #: Method → its colour.
-METHODS = {
+METHOD_COLOURS = {
     "paper": INK,
     "map": "#009E73",
     "window": "#CC79A7",
@@ -54,11 +54,11 @@ METHODS = {
     "xfeat": "#7A5CC8",
 }
 #: Series that are no method, in turn.
-OTHERS = ("#2A9DA8", "#D55E00", "#6B8E23", "#A0529C", "#7D7D7D", "#4F6D8F")
+SERIES_COLOURS = ("#2A9DA8", "#D55E00", "#6B8E23", "#A0529C", "#7D7D7D", "#4F6D8F")
 #: Where the colours are used up they come again in these dashes, points.
-DASHES: tuple[tuple[float, ...], ...] = ((), (5.0, 2.5), (1.5, 1.8), (7.0, 2.0, 1.5, 2.0))
+_SERIES_DASHES: tuple[tuple[float, ...], ...] = ((), (5.0, 2.5), (1.5, 1.8), (7.0, 2.0, 1.5, 2.0))
 
-GATES = {
+GATE_COLOURS = {
     Gate.NO_TRACK: "#9A9A9A",
     Gate.NO_TEXTURE: "#5E5E5E",
     Gate.NO_POSE: "#5C7391",
@@ -72,7 +72,7 @@ GATES = {
     Gate.CONTRADICTED: "#6B4A1F",
     Gate.POSE_REFUTED: "#8C2D6B",
 }
-HOLES = {
+HOLE_COLOURS = {
     Hole.TRACKABLE_NO_LIDAR: "#D55E00",
     Hole.LOW_TEXTURE: "#5E5E5E",
     Hole.TOO_BRIGHT: "#F0E442",
@@ -80,21 +80,21 @@ HOLES = {
     Hole.HIGHLIGHT: "#CC79A7",
     Hole.AT_BORDER: "#009E73",
 }
-SOURCES = {
+SOURCE_COLOURS = {
     Source.NONE: SILENT,
     Source.SENSOR: SENSOR,
     Source.RECOVERED: RECOVERED,
     Source.SWEPT: SWEPT,
-    Source.ANCHORED: ANCHORED,
+    Source.ANCHORED: ALIGNED,
 }
 
 #: What is said of a pixel of a judged map.
-STATES = {State.CANNOT_KNOW: PICTURE, State.CONSISTENT: "#63c98a", State.WRONG: "#a8321f"}
+STATE_COLOURS = {State.CANNOT_KNOW: PICTURE, State.CONSISTENT: "#63c98a", State.WRONG: "#a8321f"}
 
 #: Quantity → matplotlib's name of its colour map.
-DEPTH, SCORE, ERROR, SIGNED, GREY = "turbo", "viridis", "Spectral_r", "RdBu_r", "gray"
+DEPTH_CMAP, SCORE_CMAP, ERROR_CMAP, SIGNED_CMAP, GREY_CMAP = "turbo", "viridis", "Spectral_r", "RdBu_r", "gray"
 #: Where 1/m is drawn: near is large, and blue as well.
-INVERSE_DEPTH = f"{DEPTH}_r"
+INVERSE_DEPTH_CMAP = f"{DEPTH_CMAP}_r"
 
 
 class Stroke(NamedTuple):
@@ -106,29 +106,29 @@ class Stroke(NamedTuple):
     opacity: float = 1.0
 
 
-def series(names: Iterable[str]) -> dict[str, Stroke]:
+def assign_strokes(names: Iterable[str]) -> dict[str, Stroke]:
     """Name → stroke: a method's own colour, the others in turn and then dashed."""
     names = list(dict.fromkeys(names))
-    others = [name for name in names if name not in METHODS]
-    found = {name: Stroke(METHODS[name]) for name in names if name in METHODS}
+    others = [name for name in names if name not in METHOD_COLOURS]
+    found = {name: Stroke(METHOD_COLOURS[name]) for name in names if name in METHOD_COLOURS}
     for k, name in enumerate(others):
-        again, colour = divmod(k, len(OTHERS))
-        found[name] = Stroke(OTHERS[colour], dashes=DASHES[again % len(DASHES)])
+        again, colour = divmod(k, len(SERIES_COLOURS))
+        found[name] = Stroke(SERIES_COLOURS[colour], dashes=_SERIES_DASHES[again % len(_SERIES_DASHES)])
     return {name: found[name] for name in names}
 
 
-def rgb(colour: str) -> tuple[int, int, int]:
+def parse_rgb(colour: str) -> tuple[int, int, int]:
     """``#rrggbb`` as three numbers from 0 to 255."""
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
-def of_source(source: Any) -> np.ndarray:
+def colour_by_source(source: Any) -> np.ndarray:
     """Colours (P, 3) uint8 of points by codes.Source (P,): sensor blue, recovered orange, swept purple."""
     code = np.asarray(source.detach().cpu() if hasattr(source, "detach") else source).astype(np.int64)
-    return np.array([rgb(SOURCES[k]) for k in sorted(SOURCES)], np.uint8)[code]
+    return np.array([parse_rgb(SOURCE_COLOURS[k]) for k in sorted(SOURCE_COLOURS)], np.uint8)[code]
 
 
-def ramp(name: str, n: int = 17) -> list[str]:
+def sample_cmap(name: str, n: int = 17) -> list[str]:
     """A colour map at n places from its low to its high end, for drawers that do not have it."""
     from matplotlib import colormaps  # noqa: PLC0415
     from matplotlib.colors import to_hex  # noqa: PLC0415
@@ -136,22 +136,22 @@ def ramp(name: str, n: int = 17) -> list[str]:
     return [to_hex(colour) for colour in colormaps[name](np.linspace(0, 1, n))]
 
 
-def variable(colour: str) -> str:
+def to_css_colour(colour: str) -> str:
     """A colour as a page says it: by the name of its variable where it changes in the dark."""
-    return _VARIABLES.get(colour.lower(), colour.lower())
+    return _CSS_VARIABLES.get(colour.lower(), colour.lower())
 
 
-def style_sheet() -> str:
+def build_colour_variables() -> str:
     """The variables of a page by day and in the dark, and those of the colours that are the same in both."""
     fixed = {"sensor": SENSOR, "recovered": RECOVERED, "swept": SWEPT, "silent": SILENT, "white": WHITE, "black": BLACK}
-    day, night = ({name: pair[k] for name, pair in PAGE.items()} for k in (0, 1))
-    dark = f"@media (prefers-color-scheme: dark) {{ {_root(night)} }}"
-    return f"{_root({**day, **fixed})}\n{dark}\n"
+    day, night = ({name: pair[k] for name, pair in PAGE_COLOURS.items()} for k in (0, 1))
+    dark = f"@media (prefers-color-scheme: dark) {{ {_format_root_rule(night)} }}"
+    return f"{_format_root_rule({**day, **fixed})}\n{dark}\n"
 
 
-def _root(variables: dict[str, str]) -> str:
+def _format_root_rule(variables: dict[str, str]) -> str:
     said = " ".join(f"--{name}: {colour};" for name, colour in variables.items())
     return f":root {{ color-scheme: light dark; {said} }}"
 
 
-_VARIABLES = {day.lower(): f"var(--{name})" for name, (day, _) in PAGE.items()}
+_CSS_VARIABLES = {day.lower(): f"var(--{name})" for name, (day, _) in PAGE_COLOURS.items()}

@@ -7,19 +7,28 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dhtorch.viz.plots.colours import style_sheet
-from dhtorch.viz.plots.markup import Markup, tag
+from dhtorch.viz.plots.colours import build_colour_variables
+from dhtorch.viz.plots.markup import Markup, make_tag
 
-_SHEET = Path(__file__).with_name("page.css")
+_STYLE_SHEET = Path(__file__).with_name("page.css")
 
 
-def sheet(own: Path | None = None) -> Markup:
+def build_style_sheet(own: Path | None = None) -> Markup:
     """The style sheet of a page, with its own rules last."""
-    return Markup("\n".join([style_sheet(), *(p.read_text(encoding="utf-8") for p in (_SHEET, own) if p is not None)]))
+    return Markup(
+        "\n".join(
+            [build_colour_variables(), *(p.read_text(encoding="utf-8") for p in (_STYLE_SHEET, own) if p is not None)]
+        )
+    )
 
 
-def document(title: str, *body: object, own: Path | None = None) -> str:
+def build_document(title: str, *body: object, own: Path | None = None) -> str:
     """A page of its title and the children of its body; text is escaped unless it is markup."""
     metas = ({"charset": "utf-8"}, {"name": "viewport", "content": "width=device-width, initial-scale=1"})
-    head = tag("head", *(tag("meta", **m) for m in metas), tag("title", title), tag("style", sheet(own)))
-    return "<!doctype html>\n" + tag("html", head, tag("body", *body), lang="en") + "\n"
+    head = make_tag(
+        "head",
+        *(make_tag("meta", **m) for m in metas),
+        make_tag("title", title),
+        make_tag("style", build_style_sheet(own)),
+    )
+    return "<!doctype html>\n" + make_tag("html", head, make_tag("body", *body), lang="en") + "\n"

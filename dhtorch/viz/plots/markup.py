@@ -22,7 +22,7 @@ class Markup(str):
     __slots__ = ()
 
 
-def escape(text: object) -> Markup:
+def escape_html(text: object) -> Markup:
     """Text as it stands in markup; markup stays as it is."""
     if isinstance(text, Markup):
         return text
@@ -33,29 +33,29 @@ def escape(text: object) -> Markup:
     return Markup(html.escape(_FORBIDDEN.sub("\ufffd", plain)))
 
 
-def tag(name: str, /, *children: object, **attributes: object) -> Markup:
+def make_tag(name: str, /, *children: object, **attributes: object) -> Markup:
     """An element: children are escaped unless they are markup, attributes that are None are left out.
 
     An underscore at the end of an attribute's name is dropped (``class_``), others become hyphens.
     """
     said = "".join(
-        f' {key.removesuffix("_").replace("_", "-")}="{escape(value)}"'
+        f' {key.removesuffix("_").replace("_", "-")}="{escape_html(value)}"'
         for key, value in attributes.items()
         if value is not None
     )
-    inner = join(children)
-    return Markup(f"<{name}{said}>{inner}</{name}>" if inner or name not in _EMPTY else f"<{name}{said}/>")
+    inner = join_markup(children)
+    return Markup(f"<{name}{said}>{inner}</{name}>" if inner or name not in _VOID_ELEMENTS else f"<{name}{said}/>")
 
 
-def join(parts: Iterable[object], between: str = "") -> Markup:
+def join_markup(parts: Iterable[object], between: str = "") -> Markup:
     """Parts one after the other, escaped unless they are markup."""
-    return Markup(between.join(escape(part) for part in parts))
+    return Markup(between.join(escape_html(part) for part in parts))
 
 
-def png_address(picture: bytes) -> str:
+def encode_png_uri(picture: bytes) -> str:
     """A picture as an address that holds it: a page needs nothing beside itself."""
     return f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
 
 
 #: Elements that have no content; any other without content keeps its closing tag.
-_EMPTY = frozenset(["meta", "link", "br", "hr", "img"])
+_VOID_ELEMENTS = frozenset(["meta", "link", "br", "hr", "img"])

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 #: Width of a figure, inches.
-WIDTH = 7.2
+FIGURE_WIDTH_IN = 7.2
 
 #: For ``matplotlib.pyplot.rcParams``; sizes in points.
-SETTINGS: Mapping[str, Any] = {
+NOTEBOOK_RC_PARAMS: Mapping[str, Any] = {
     "figure.dpi": 160,
     "figure.labelsize": 8,
     "font.size": 8,

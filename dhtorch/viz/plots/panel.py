@@ -10,16 +10,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from dhtorch.viz.plots.axis import Axis, Numbers
-from dhtorch.viz.plots.canvas import LETTER, SMALL, Canvas, Key, Mark, Place, cut, plain
-from dhtorch.viz.plots.colours import FAINT, THEIRS, THEIRS_INSIDE, Stroke
+from dhtorch.viz.plots.axis import Axis, OptionalNumbers
+from dhtorch.viz.plots.canvas import (
+    LETTER_WIDTH_EM,
+    TEXT_SIZE_PT,
+    Canvas,
+    CanvasPoint,
+    LegendKey,
+    Mark,
+    to_plain_line,
+    truncate_text,
+)
+from dhtorch.viz.plots.colours import FAINT, PAPER_EDGE, PAPER_FILL, Stroke
 
 #: Height of a named row, and of what lies around the rows, points.
-ROW, AROUND = 19, 66
+_ROW_HEIGHT_PT, _ROWS_MARGIN_PT = 19, 66
 
 
 class Panel:
-    """One pair of axes; draw, then :meth:`figure` or :func:`dhtorch.viz.plots.svg.inline`."""
+    """One pair of axes; draw, then :meth:`figure` or :func:`dhtorch.viz.plots.svg.render_inline_svg`."""
 
     def __init__(
         self,
@@ -27,14 +36,14 @@ class Panel:
         x: Axis,
         y: Axis | None,  # None = named rows, see ``rows``
         *,
-        size: Place = (300, 216),  # points; the height of named rows follows from them
+        size: CanvasPoint = (300, 216),  # points; the height of named rows follows from them
         rows: Sequence[str] = (),
     ) -> None:
         self.title, self.x, self.y, self.rows = title, x, y, list(rows)
         longest = max((len(r) for r in rows), default=0)
         self.width: float = size[0]
-        self.height: float = size[1] if y else AROUND + ROW * len(rows)
-        self.left = min(0.4 * size[0], 12 + LETTER * SMALL * longest) if rows else 46.0
+        self.height: float = size[1] if y else _ROWS_MARGIN_PT + _ROW_HEIGHT_PT * len(rows)
+        self.left = min(0.4 * size[0], 12 + LETTER_WIDTH_EM * TEXT_SIZE_PT * longest) if rows else 46.0
         self.right, self.top, self.bottom = 14.0, 26.0 if title else 10.0, 40.0 if x.label else 22.0
         self.marks: list[Mark] = []
 
@@ -55,9 +64,9 @@ class Panel:
         part = 1 - (y + 0.5) / len(self.rows) if self.y is None else self.y.place(y)
         return self.width * (left + self.x.place(x) * width), self.height * (bottom + part * height)
 
-    def line(self, xs: Numbers, ys: Numbers, stroke: Stroke) -> None:
+    def line(self, xs: OptionalNumbers, ys: OptionalNumbers, stroke: Stroke) -> None:
         """A line, broken where a value is missing; a value that stands alone becomes a dot."""
-        run: list[Place] = []
+        run: list[CanvasPoint] = []
         for x, y in [*zip(xs, ys, strict=True), (None, None)]:
             if x is not None and y is not None:
                 run.append(self.at(x, y))
@@ -76,7 +85,7 @@ class Panel:
         """The paper's mark."""
         (u, v), r = self.at(x, y), 5
         corners = ((u, v - r), (u + r, v), (u, v + r), (u - r, v))
-        self.marks.append(Mark("diamond", corners, Stroke(THEIRS_INSIDE), said, THEIRS))
+        self.marks.append(Mark("diamond", corners, Stroke(PAPER_FILL), said, PAPER_EDGE))
 
     def bar(self, x_0: float, x_1: float, y_0: float, y_1: float, colour: str, edge: str | None = None) -> None:
         """A filled rectangle."""
@@ -95,7 +104,7 @@ class Panel:
         self.draw(canvas)
         return canvas
 
-    def figure(self, *, dpi: float = 160, keys: Sequence[Key] = ()) -> Any:
+    def figure(self, *, dpi: float = 160, keys: Sequence[LegendKey] = ()) -> Any:
         """The panel as a matplotlib ``Figure``, with a legend beside it."""
         return self.canvas(dpi).finished(keys)
 
@@ -115,7 +124,13 @@ class Panel:
         for k, name in enumerate(self.rows):
             v = self.at(self.x.low, k)[1]
             grid.append(((self.left, v), (right, v)))
-            canvas.text(cut(plain(name), self.left - 8, SMALL), self.left - 8, v - 3.5, ha="right", said=name)
+            canvas.text(
+                truncate_text(to_plain_line(name), self.left - 8, TEXT_SIZE_PT),
+                self.left - 8,
+                v - 3.5,
+                ha="right",
+                said=name,
+            )
         for tick in self.y.ticks() if self.y else ():
             v = self.at(self.x.low, tick)[1]
             grid.append(((self.left, v), (right, v)))

@@ -12,20 +12,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dhtorch.codes import ROUTE_OF_HOLE, Gate, Hole, Route, Source, names, words
-from dhtorch.runtime.console import many
+from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import colours
-from dhtorch.viz.plots.axis import Axis, spanning
-from dhtorch.viz.plots.canvas import Canvas, Key, headed, save
-from dhtorch.viz.plots.colours import FAINT, GATES, HOLES, INK, RECOVERED, SENSOR, Stroke, series
+from dhtorch.viz.plots.axis import Axis, fit_axis
+from dhtorch.viz.plots.canvas import Canvas, LegendKey, prefix_title, save_figure
+from dhtorch.viz.plots.colours import FAINT, GATE_COLOURS, HOLE_COLOURS, INK, RECOVERED, SENSOR, Stroke, assign_strokes
 from dhtorch.viz.plots.panel import Panel
 
 #: Fewest answers whose mean error is drawn.
-FEWEST = 10
+MIN_CURVE_ANSWERS = 10
 #: How the points of a layer are drawn: shape, points across, and the width of a white edge.
-MARKS = {"sensor": ("dot", 2.8, 0.0), "silent": ("cross", 2.8, 0.0), "answer": ("dot", 3.8, 0.6)}
+_LAYER_MARKS = {"sensor": ("dot", 2.8, 0.0), "silent": ("cross", 2.8, 0.0), "answer": ("dot", 3.8, 0.6)}
 
 
-class Layer(NamedTuple):
+class PointLayer(NamedTuple):
     """Points of one kind in a picture."""
 
     label: str
@@ -34,10 +34,12 @@ class Layer(NamedTuple):
     mark: str  # one of MARKS
 
 
-class Picture:
+class LayeredPicture:
     """Layers of points over a picture; where there is none, over an empty ground."""
 
-    def __init__(self, title: str, hw: Sequence[float], layers: Sequence[Layer], image: Any = None, *, width: float):
+    def __init__(
+        self, title: str, hw: Sequence[float], layers: Sequence[PointLayer], image: Any = None, *, width: float
+    ):
         self.title = self.words = title
         self.hw, self.layers, self.image = (float(hw[0]), float(hw[1])), list(layers), image
         self.width, self.inner = width, width * self.hw[0] / self.hw[1]
@@ -47,8 +49,8 @@ class Picture:
         """The picture as a matplotlib ``Figure`` with its title and a legend that counts the points."""
         canvas = Canvas(self.width, self.height, dpi)
         self.draw(canvas)
-        shapes = {layer.label: MARKS[layer.mark][0] for layer in self.layers}
-        keys = [Key(f"{x.label}  {len(x.uv)}", x.colour, shapes[x.label]) for x in reversed(self.layers)]
+        shapes = {layer.label: _LAYER_MARKS[layer.mark][0] for layer in self.layers}
+        keys = [LegendKey(f"{x.label}  {len(x.uv)}", x.colour, shapes[x.label]) for x in reversed(self.layers)]
         return canvas.finished(keys)
 
     def draw(self, canvas: Canvas) -> None:
@@ -58,9 +60,9 @@ class Picture:
         if self.image is None:
             canvas.area(((0, 0), (w, 0), (w, h), (0, h)), colours.PICTURE)
         else:
-            canvas.picture(_grey(self.image), (0, 0, w, h))
+            canvas.picture(_to_pale_grey(self.image), (0, 0, w, h))
         for layer in self.layers:
-            shape, size, edge = MARKS[layer.mark]
+            shape, size, edge = _LAYER_MARKS[layer.mark]
             places = [self._at(u, v) for u, v in layer.uv.tolist()]
             if shape == "cross":
                 r = 0.5 * size
@@ -87,9 +89,9 @@ def draw_samples(
     title: str = "",
 ) -> None:
     """Draw what became of every sample: a sensor return, a recovered depth, or the reason for silence."""
-    source, gate = _array(source), _array(gate)
+    source, gate = _to_array(source), _to_array(gate)
     layers = [
-        (words(name), (source == Source.NONE) & (gate == code), GATES[code], "silent")
+        (words(name), (source == Source.NONE) & (gate == code), GATE_COLOURS[code], "silent")
         for code, name in names(Gate).items()
         if code != Gate.ANSWER
     ]
@@ -97,7 +99,7 @@ def draw_samples(
         ("sensor", source == Source.SENSOR, SENSOR, "sensor"),
         ("recovered", source == Source.RECOVERED, RECOVERED, "answer"),
     ]
-    _overlay(path, image, uv, layers, headed("What became of the samples", title))
+    _draw_layers(path, image, uv, layers, prefix_title("What became of the samples", title))
 
 
 def draw_holes(
@@ -109,14 +111,14 @@ def draw_holes(
     title: str = "",
 ) -> None:
     """Draw where the sensor is silent and why, with what could be done about it."""
-    hole = _array(hole)
+    hole = _to_array(hole)
     routes = names(Route)
     layers = [("sensor", hole == Hole.NONE, SENSOR, "sensor")]
     for code, name in reversed(names(Hole).items()):
         if code != Hole.NONE:
             label = f"{words(name)} → {words(routes[ROUTE_OF_HOLE[code]])}"
-            layers.append((label, hole == code, HOLES[code], "answer"))
-    _overlay(path, image, uv, layers, headed("Why there is no return", title))
+            layers.append((label, hole == code, HOLE_COLOURS[code], "answer"))
+    _draw_layers(path, image, uv, layers, prefix_title("Why there is no return", title))
 
 
 def draw_depth(
@@ -131,40 +133,42 @@ def draw_depth(
 
     NaN is silence and left out; answers beyond the axes are drawn on their edge and counted.
     """
-    true, found = _array(true_depth).ravel(), _array(depth).ravel()
+    true, found = _to_array(true_depth).ravel(), _to_array(depth).ravel()
     good = np.isfinite(true) & np.isfinite(found) & (true > 0) & (found > 0)
-    shade = None if score is None else _array(score).ravel()[good]
+    shade = None if score is None else _to_array(score).ravel()[good]
     true, found = true[good], found[good]
     low, high = (true.min() / 1.5, true.max() * 1.5) if len(true) else (1.0, 10.0)
     x, y = (Axis(float(low), float(high), f"{kind} depth, m", log=True) for kind in ("true", "recovered"))
-    panel = Panel(headed("Recovered against true", title), x, y, size=(380, 386))
+    panel = Panel(prefix_title("Recovered against true", title), x, y, size=(380, 386))
     corners = ((low, low / 0.9, high, high, high / 1.1, low), (low, low, 0.9 * high, high, high, 1.1 * low))
     panel.fill(*corners, FAINT)
     panel.line([low, high], [low, high], Stroke(INK, 1))
-    keys = [Key("± 10 %", FAINT, "box"), Key("no error", INK, stroke=Stroke(INK, 1))]
+    keys = [LegendKey("± 10 %", FAINT, "box"), LegendKey("no error", INK, stroke=Stroke(INK, 1))]
     canvas = panel.canvas()
-    _scatter(canvas, panel, true, found, shade)
-    for k, line in enumerate(_said(true, found, low, high) if len(true) else ()):
+    _draw_scatter(canvas, panel, true, found, shade)
+    for k, line in enumerate(_describe_errors(true, found, low, high) if len(true) else ()):
         canvas.text(line, panel.left + 10, panel.height - panel.top - 18 - 14 * k)
-    save(canvas.finished(keys), path)
+    save_figure(canvas.finished(keys), path)
 
 
-def _scatter(canvas: Canvas, panel: Panel, true: np.ndarray, found: np.ndarray, shade: np.ndarray | None) -> None:
+def _draw_scatter(canvas: Canvas, panel: Panel, true: np.ndarray, found: np.ndarray, shade: np.ndarray | None) -> None:
     """Answers as dots, the surest on top, with a scale of the scores beside the panel."""
     order = np.arange(len(true)) if shade is None else np.argsort(shade, kind="stable")
     places = np.array([panel.at(x, y) for x, y in zip(true[order].tolist(), found[order].tolist(), strict=True)])
     axes = canvas.axes()
-    options = {"color": SENSOR} if shade is None else {"c": shade[order], "cmap": colours.SCORE, "vmin": 0, "vmax": 1}
+    options = (
+        {"color": SENSOR} if shade is None else {"c": shade[order], "cmap": colours.SCORE_CMAP, "vmin": 0, "vmax": 1}
+    )
     dots = axes.scatter(*places.reshape(-1, 2).T, s=9, alpha=0.75, linewidth=0, clip_on=False, **options)
     if shade is not None and len(true):
         inside = canvas.figure.add_axes((1.04, 0.12, 0.025, 0.5))
         canvas.figure.colorbar(dots, cax=inside, label="score").outline.set_visible(False)
 
 
-def _said(true: np.ndarray, found: np.ndarray, low: float, high: float) -> list[str]:
+def _describe_errors(true: np.ndarray, found: np.ndarray, low: float, high: float) -> list[str]:
     """The answers in numbers."""
     error = np.abs(found / true - 1)
-    said = [many(len(true), "answer"), f"median error {100 * np.median(error):.1f} %"]
+    said = [format_count(len(true), "answer"), f"median error {100 * np.median(error):.1f} %"]
     said.append(f"within 10 %: {100 * (error < 0.1).mean():.0f} %")
     outside = int(((found < low) | (found > high)).sum())
     return [*said, *([f"{outside} beyond the axes"] if outside else [])]
@@ -181,42 +185,42 @@ def draw_risk_coverage(
 
     A mean over fewer than ten answers is not drawn.
     """
-    strokes = series(curves)
-    drawn = {name: [_array(v)[FEWEST - 1 :].tolist() for v in curve] for name, curve in curves.items()}
+    strokes = assign_strokes(curves)
+    drawn = {name: [_to_array(v)[MIN_CURVE_ANSWERS - 1 :].tolist() for v in curve] for name, curve in curves.items()}
     drawn = {name: curve for name, curve in drawn.items() if curve[0]}
-    right = spanning([0.1, *(x for c, _ in drawn.values() for x in c)], "", low=0.0).high
-    top = spanning([0.12, *(y for _, r in drawn.values() for y in r)], "", low=0.0).high
+    right = fit_axis([0.1, *(x for c, _ in drawn.values() for x in c)], "", low=0.0).high
+    top = fit_axis([0.12, *(y for _, r in drawn.values() for y in r)], "", low=0.0).high
     x = Axis(0.0, min(1.0, right), "answered share of the candidates, %", percent=True)
     y = Axis(0.0, min(1.0, top), "mean relative error (at most 1), %", percent=True)
-    panel = Panel(headed("Error of the surest", title), x, y, size=(400, 290))
+    panel = Panel(prefix_title("Error of the surest", title), x, y, size=(400, 290))
     for level in (0.05, 0.1):
         panel.line([x.low, x.high], [level, level], Stroke(colours.SILENT, 0.8))
-    keys = [Key(name, strokes[name].colour, stroke=strokes[name]) for name in drawn]
+    keys = [LegendKey(name, strokes[name].colour, stroke=strokes[name]) for name in drawn]
     if oracle is not None:
         best = Stroke(INK, 1, (4, 3))
-        panel.line(_array(oracle[0]).tolist(), _array(oracle[1]).tolist(), best)
-        keys.append(Key("best order", INK, stroke=best))
+        panel.line(_to_array(oracle[0]).tolist(), _to_array(oracle[1]).tolist(), best)
+        keys.append(LegendKey("best order", INK, stroke=best))
     for name, (coverage, risk) in drawn.items():
         panel.line(coverage, risk, strokes[name])
         panel.dot(coverage[-1], risk[-1], strokes[name], width=5)
-    save(panel.figure(keys=keys), path)
+    save_figure(panel.figure(keys=keys), path)
 
 
-def _overlay(
+def _draw_layers(
     path: str | Path, image: Any, uv: Any, layers: Sequence[tuple[str, np.ndarray, str, str]], title: str
 ) -> None:
     """Draw groups of pixels (label, mask, colour, mark) over a picture, with their counts in a legend beside it."""
-    uv, hw = _array(uv), tuple(image.shape[-2:])
-    shown = [Layer(label, uv[mask], colour, mark) for label, mask, colour, mark in layers if mask.any()]
-    save(Picture(title, hw, shown, image, width=520).figure(), path)
+    uv, hw = _to_array(uv), tuple(image.shape[-2:])
+    shown = [PointLayer(label, uv[mask], colour, mark) for label, mask, colour, mark in layers if mask.any()]
+    save_figure(LayeredPicture(title, hw, shown, image, width=520).figure(), path)
 
 
-def _array(x: Any) -> np.ndarray:
+def _to_array(x: Any) -> np.ndarray:
     return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)
 
 
-def _grey(image: Any) -> np.ndarray:
+def _to_pale_grey(image: Any) -> np.ndarray:
     """Picture (H, W) in [0, 1] to draw on: colourless and of little contrast, so that what is drawn stands out."""
-    pixels = _array(image)
+    pixels = _to_array(image)
     pixels = pixels / 255.0 if pixels.dtype == np.uint8 else pixels
     return 0.45 + 0.5 * np.clip(pixels.mean(0), 0, 1)

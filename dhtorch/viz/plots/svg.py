@@ -12,29 +12,29 @@ import re
 import warnings
 from collections.abc import Callable, Sequence
 
-from dhtorch.viz.plots.canvas import Canvas, plain
-from dhtorch.viz.plots.colours import variable
+from dhtorch.viz.plots.canvas import Canvas, to_plain_line
+from dhtorch.viz.plots.colours import to_css_colour
 from dhtorch.viz.plots.panel import Panel
-from dhtorch.viz.plots.pictures import Picture
+from dhtorch.viz.plots.pictures import LayeredPicture
 
-_COLOUR = re.compile(r"#[0-9a-f]{6}\b")
-_NUMBER = re.compile(r"-?\d+\.\d+(?:e-\d+)?")
-_PLACES = re.compile(r'\b(d|x|y|transform)="([^"]*)"')
+_HEX_COLOUR = re.compile(r"#[0-9a-f]{6}\b")
+_DECIMAL = re.compile(r"-?\d+\.\d+(?:e-\d+)?")
+_COORDINATES = re.compile(r'\b(d|x|y|transform)="([^"]*)"')
 
 
-def inline(panel: Panel | Picture) -> str:
+def render_inline_svg(panel: Panel | LayeredPicture) -> str:
     """A panel as an SVG element for the middle of a page."""
     canvas = Canvas(panel.width, panel.height, dpi=72)
     canvas.figure.patch.set_visible(False)
     panel.draw(canvas)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # a name in letters that the font lacks: the page's has them
-        body = slim(_text(canvas), canvas.said)
-    box, label = f"0 0 {panel.width:g} {panel.height:g}", html.escape(plain(panel.words))
+        body = _strip_svg(_render_svg(canvas), canvas.said)
+    box, label = f"0 0 {panel.width:g} {panel.height:g}", html.escape(to_plain_line(panel.words))
     return f'<svg viewBox="{box}" role="img" aria-label="{label}" style="--width: {panel.width:g}px">{body}</svg>'
 
 
-def slim(svg: str, said: Sequence[str] = ()) -> str:
+def _strip_svg(svg: str, said: Sequence[str] = ()) -> str:
     """The inside of matplotlib's SVG without what a page does not need.
 
     Args:
@@ -43,15 +43,15 @@ def slim(svg: str, said: Sequence[str] = ()) -> str:
     """
     body = svg[svg.index(">", svg.index("<svg")) + 1 : svg.rindex("</svg>")]
     body = re.sub(r"<metadata>.*?</metadata>|<defs>\s*<style.*?</style>\s*</defs>|<!--.*?-->", "", body, flags=re.S)
-    body = re.sub(r'<g id="said-(\d+)">\s*(<(?:path|text)[^>]*?)(?:/>|>([^<]*)</text>)', _with_title(said), body)
+    body = re.sub(r'<g id="said-(\d+)">\s*(<(?:path|text)[^>]*?)(?:/>|>([^<]*)</text>)', _make_title_writer(said), body)
     body = re.sub(r"</?g\b[^>]*>|<defs/>", "", body)
-    body = _PLACES.sub(lambda m: f'{m[1]}="{_short(m[2])}"', body)
+    body = _COORDINATES.sub(lambda m: f'{m[1]}="{_round_coordinates(m[2])}"', body)
     body = re.sub(r' transform="rotate\(-?0 [^"]*\)"', "", body)
-    body = re.sub(r'\bstyle="([^"]*)"', lambda m: f'style="{_styled(m[1])}"', body)
+    body = re.sub(r'\bstyle="([^"]*)"', lambda m: f'style="{_reduce_style(m[1])}"', body)
     return re.sub(r">\s+<", "><", body).strip()
 
 
-def _text(canvas: Canvas) -> str:
+def _render_svg(canvas: Canvas) -> str:
     from matplotlib import rc_context  # noqa: PLC0415
     from matplotlib.backends.backend_svg import FigureCanvasSVG  # noqa: PLC0415
 
@@ -61,7 +61,7 @@ def _text(canvas: Canvas) -> str:
     return out.getvalue()
 
 
-def _with_title(said: Sequence[str]) -> Callable[[re.Match[str]], str]:
+def _make_title_writer(said: Sequence[str]) -> Callable[[re.Match[str]], str]:
     def write(m: re.Match[str]) -> str:
         title = f"<title>{html.escape(said[int(m[1])])}</title>"
         return f"{m[2]}>{m[3]}{title}</text>" if m[3] is not None else f"{m[2]}>{title}</path>"
@@ -69,15 +69,15 @@ def _with_title(said: Sequence[str]) -> Callable[[re.Match[str]], str]:
     return write
 
 
-def _styled(style: str) -> str:
+def _reduce_style(style: str) -> str:
     """Rules that say more than the page's own, in its colours."""
     rules = [rule.strip().replace(": ", ":") for rule in style.split(";")]
     kept = [r for r in rules if not r.startswith(("font-family", "stroke-linejoin", "text-anchor:start"))]
-    return _COLOUR.sub(lambda m: variable(m[0]), ";".join(kept))
+    return _HEX_COLOUR.sub(lambda m: to_css_colour(m[0]), ";".join(kept))
 
 
-def _short(places: str) -> str:
+def _round_coordinates(places: str) -> str:
     """Numbers with one decimal; a line without length in fewer letters."""
-    places = " ".join(_NUMBER.sub(lambda m: f"{float(m[0]):.1f}".removesuffix(".0"), places).split())
+    places = " ".join(_DECIMAL.sub(lambda m: f"{float(m[0]):.1f}".removesuffix(".0"), places).split())
     places = re.sub(r"M (\S+ \S+) L \1(?= M|$)", r"M\1h0", places)
     return re.sub(r" ?([MLz]) ?", r"\1", places).replace("-0 ", "0 ")

@@ -13,26 +13,26 @@ import numpy as np
 from dhtorch.codes import State
 from dhtorch.viz.plots import colours
 from dhtorch.viz.plots.axis import Axis
-from dhtorch.viz.plots.canvas import Canvas, save
+from dhtorch.viz.plots.canvas import Canvas, save_figure
 from dhtorch.viz.plots.maps import (
-    GAP,
-    HEAD,
-    SCALE,
-    TITLE,
-    WIDTH,
+    HEADER_HEIGHT_PT,
+    PICTURE_GAP_PT,
+    PICTURE_WIDTH_PT,
+    SCALE_HEIGHT_PT,
+    TITLE_HEIGHT_PT,
+    apply_cmap,
+    apply_log_cmap,
     as_array,
-    coloured,
-    depths,
-    mapped,
-    rgb_of,
-    scale,
+    draw_scale,
+    fit_depth_axis,
+    to_unit_rgb,
 )
 
 #: Sigmas at the ends of the colour map of evidence.
-END = 6.0
+_MAX_EVIDENCE_SIGMAS = 6.0
 
 
-def draw_verdict(
+def draw_validation(
     path: str | Path | IO[bytes],
     image: Any,  # (C, H, W) uint8, or float in [0, 1]
     depth: Any,  # (h, w) m, 0 or NaN where nothing is known
@@ -47,31 +47,40 @@ def draw_verdict(
     """
     z, code, sigmas = (as_array(x) for x in (depth, state, evidence))
     known = np.isfinite(z) & (z > 0)
-    height = WIDTH * z.shape[0] / z.shape[1]
-    top = 2 * (height + TITLE) + SCALE
-    canvas = Canvas(2 * WIDTH + GAP, top + HEAD * bool(title), dpi=160)
-    canvas.title(title, 2 * WIDTH + GAP, top + HEAD)
-    ground = np.array(colours.rgb(colours.PICTURE)) / 255
-    states = np.array([colours.rgb(colours.STATES[k]) for k in sorted(colours.STATES)])[code.astype(np.int64)] / 255
+    height = PICTURE_WIDTH_PT * z.shape[0] / z.shape[1]
+    top = 2 * (height + TITLE_HEIGHT_PT) + SCALE_HEIGHT_PT
+    canvas = Canvas(2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT * bool(title), dpi=160)
+    canvas.title(title, 2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT)
+    ground = np.array(colours.parse_rgb(colours.PICTURE)) / 255
+    states = (
+        np.array([colours.parse_rgb(colours.STATE_COLOURS[k]) for k in sorted(colours.STATE_COLOURS)])[
+            code.astype(np.int64)
+        ]
+        / 255
+    )
     wrong, fine = (((code == k) & known).sum() for k in (State.WRONG, State.CONSISTENT))
-    metres, ends = depths(z[known]), Axis(-END, END, "evidence, sigmas")
-    strength = mapped((np.nan_to_num(sigmas).clip(-END, END) + END) / (2 * END), colours.SIGNED)
+    metres, ends = fit_depth_axis(z[known]), Axis(-_MAX_EVIDENCE_SIGMAS, _MAX_EVIDENCE_SIGMAS, "evidence, sigmas")
+    strength = apply_cmap(
+        (np.nan_to_num(sigmas).clip(-_MAX_EVIDENCE_SIGMAS, _MAX_EVIDENCE_SIGMAS) + _MAX_EVIDENCE_SIGMAS)
+        / (2 * _MAX_EVIDENCE_SIGMAS),
+        colours.SIGNED_CMAP,
+    )
     shown = [
-        ("Picture", 1, rgb_of(image)),
-        (_said(int(wrong), int(fine), int(known.sum())), 1, states),
-        ("Depth", 0, coloured(z, known, metres, colours.DEPTH)),
+        ("Picture", 1, to_unit_rgb(image)),
+        (_describe_states(int(wrong), int(fine), int(known.sum())), 1, states),
+        ("Depth", 0, apply_log_cmap(z, known, metres, colours.DEPTH_CMAP)),
         ("Evidence: red too far, blue too near", 0, np.where(np.isnan(sigmas)[..., None], ground, strength)),
     ]
     for k, (words, row, pixels) in enumerate(shown):
-        left, bottom = (k % 2) * (WIDTH + GAP), SCALE + row * (height + TITLE)
-        canvas.title(words, WIDTH, bottom + height + TITLE, left)
-        canvas.picture(pixels, (left, bottom, WIDTH, height))
-    scale(canvas, metres, colours.DEPTH, 0.0)
-    scale(canvas, ends, colours.SIGNED, WIDTH + GAP)
-    save(canvas.figure, path)
+        left, bottom = (k % 2) * (PICTURE_WIDTH_PT + PICTURE_GAP_PT), SCALE_HEIGHT_PT + row * (height + TITLE_HEIGHT_PT)
+        canvas.title(words, PICTURE_WIDTH_PT, bottom + height + TITLE_HEIGHT_PT, left)
+        canvas.picture(pixels, (left, bottom, PICTURE_WIDTH_PT, height))
+    draw_scale(canvas, metres, colours.DEPTH_CMAP, 0.0)
+    draw_scale(canvas, ends, colours.SIGNED_CMAP, PICTURE_WIDTH_PT + PICTURE_GAP_PT)
+    save_figure(canvas.figure, path)
 
 
-def _said(wrong: int, fine: int, size: int) -> str:
+def _describe_states(wrong: int, fine: int, size: int) -> str:
     """The states in words: known is a share of the pixels with a depth, wrong one of what is known, as in tables and
     limits."""
     known = wrong + fine

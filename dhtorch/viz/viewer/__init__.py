@@ -5,6 +5,14 @@
 is to be seen of a recording is computed by ``dhtorch.experiments.exhibits``.
 """
 
-from dhtorch.viz.viewer.exhibit import Cloud, DepthImage, Exhibit, Opening, Picture, Shot, SweptCloud
+from dhtorch.viz.viewer.exhibit import (
+    DepthImage,
+    Exhibit,
+    ExhibitView,
+    PageOpening,
+    PairExhibit,
+    PointCloud,
+    SweptPointCloud,
+)
 
-__all__ = ["Cloud", "DepthImage", "Exhibit", "Opening", "Picture", "Shot", "SweptCloud"]
+__all__ = ["DepthImage", "Exhibit", "ExhibitView", "PageOpening", "PairExhibit", "PointCloud", "SweptPointCloud"]

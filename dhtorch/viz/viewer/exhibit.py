@@ -15,7 +15,7 @@ from dhtorch.codes import Gate, Source, names
 
 
 @dataclass(frozen=True)
-class Picture:
+class ExhibitView:
     """A picture and where it was taken."""
 
     number: int  # place of the frame in the recording
@@ -28,7 +28,7 @@ class Picture:
 
 
 @dataclass(frozen=True)
-class Cloud:
+class PointCloud:
     """Points of a depth map in the colours of its picture."""
 
     xyz: np.ndarray  # (P, 3) m, camera 0, float32
@@ -36,7 +36,7 @@ class Cloud:
 
 
 @dataclass(frozen=True)
-class SweptCloud(Cloud):
+class SweptPointCloud(PointCloud):
     """Points of swept pixels."""
 
     sigma: np.ndarray  # (P,) m, float32
@@ -53,12 +53,12 @@ class DepthImage:
     c: tuple[float, float]  # px
 
 
-NO_POINTS = Cloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
-NO_SWEPT = SweptCloud(NO_POINTS.xyz, NO_POINTS.rgb, np.zeros(0, np.float32), np.zeros(0, np.float32))
+EMPTY_CLOUD = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+EMPTY_SWEPT_CLOUD = SweptPointCloud(EMPTY_CLOUD.xyz, EMPTY_CLOUD.rgb, np.zeros(0, np.float32), np.zeros(0, np.float32))
 
 
 @dataclass(frozen=True)
-class Shot:
+class PairExhibit:
     """One pair: what the sensor said, what was answered, and what became of the N samples.
 
     ``samples`` holds arrays of N rows: ``uv_0``, ``uv_1`` (N, 2) px, ``tracked`` bool, ``xyz`` (N, 3) m in camera 0
@@ -73,9 +73,9 @@ class Shot:
     T_world_from_1: np.ndarray | None = None  # (4, 4), by the pose that was fitted; None = there is none
     view_0: int | None = None  # positions in ``Exhibit.views``; None = no pictures
     view_1: int | None = None
-    seen: Cloud = NO_POINTS  # returns that the method saw
-    held: Cloud = NO_POINTS  # returns that it did not see, or the exact depth there
-    swept: SweptCloud = NO_SWEPT  # swept pixels of view 0, where a map of every pixel was asked for
+    seen: PointCloud = EMPTY_CLOUD  # returns that the method saw
+    held: PointCloud = EMPTY_CLOUD  # returns that it did not see, or the exact depth there
+    swept: SweptPointCloud = EMPTY_SWEPT_CLOUD  # swept pixels of view 0, where a map of every pixel was asked for
     depth_image: DepthImage | None = None  # that the method saw
     facts: Mapping[str, str] = field(default_factory=dict)
 
@@ -89,7 +89,7 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Opening:
+class PageOpening:
     """What a page begins with, before anything can be turned."""
 
     numbers: Mapping[str, str]  # what it is → how much
@@ -103,11 +103,11 @@ class Exhibit:
     """All that is shown of one recording."""
 
     name: str
-    shots: Sequence[Shot]
-    views: Sequence[Picture] = ()
+    shots: Sequence[PairExhibit]
+    views: Sequence[ExhibitView] = ()
     path: np.ndarray | None = None  # (n, 3) m, camera centres of the whole recording; None = no trajectory
     facts: Mapping[str, str] = field(default_factory=dict)
-    opening: Opening | None = None
+    opening: PageOpening | None = None
 
     @property
     def placed(self) -> bool:

@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch.runtime import storage
-from dhtorch.viz.plots.document import document
-from dhtorch.viz.plots.markup import Markup, png_address, tag
+from dhtorch.viz.plots.document import build_document
+from dhtorch.viz.plots.markup import Markup, encode_png_uri, make_tag
 
 #: Under the numbers of a judged data set.
-JUDGED = "Green is consistent, red is wrong; of all else nothing can be known."
+_STATES_NOTE = "Green is consistent, red is wrong; of all else nothing can be known."
 
 
 @dataclass(frozen=True)
-class JudgedFrame:
+class ValidatedFrame:
     """One frame of the page."""
 
     name: str
@@ -28,45 +28,56 @@ class JudgedFrame:
     picture: bytes | None = None  # PNG
 
 
-def page(
+def _build_page(
     title: str,
     said: Sequence[str],
     columns: Sequence[str],
-    frames: Sequence[JudgedFrame],
+    frames: Sequence[ValidatedFrame],
     *,
     failed: Sequence[str] = (),
     word: str = "judge",
-    note: str = JUDGED,
+    note: str = _STATES_NOTE,
 ) -> str:
     """The page: what is said of the whole, a table of all frames in the order given, and the pictures."""
-    top = [tag("h1", title), *(tag("p", text) for text in said), *(tag("p", text, class_="bad") for text in failed)]
-    heads = (tag("th", name, scope="col", class_="num" if k else None) for k, name in enumerate(("frame", *columns)))
+    top = [
+        make_tag("h1", title),
+        *(make_tag("p", text) for text in said),
+        *(make_tag("p", text, class_="bad") for text in failed),
+    ]
+    heads = (
+        make_tag("th", name, scope="col", class_="num" if k else None) for k, name in enumerate(("frame", *columns))
+    )
     rows = (
-        tag("tr", tag("th", frame.name, scope="row"), *(tag("td", cell, class_="num") for cell in frame.cells))
+        make_tag(
+            "tr", make_tag("th", frame.name, scope="row"), *(make_tag("td", cell, class_="num") for cell in frame.cells)
+        )
         for frame in frames
     )
-    table = tag("table", tag("thead", tag("tr", *heads)), tag("tbody", *rows))
+    table = make_tag("table", make_tag("thead", make_tag("tr", *heads)), make_tag("tbody", *rows))
     about = {"class_": "scroll", "tabindex": "0", "role": "region", "aria_label": "All frames"}
-    figures = (_figure(frame.name, frame.picture) for frame in frames if frame.picture is not None)
-    parts = (tag("header", *top, tag("p", note, class_="note")), tag("main", tag("div", table, **about), *figures))
-    return document(f"{title} · dhtorch {word}", *parts)
+    figures = (_build_figure(frame.name, frame.picture) for frame in frames if frame.picture is not None)
+    parts = (
+        make_tag("header", *top, make_tag("p", note, class_="note")),
+        make_tag("main", make_tag("div", table, **about), *figures),
+    )
+    return build_document(f"{title} · dhtorch {word}", *parts)
 
 
-def _figure(name: str, picture: bytes) -> Markup:
-    scrolled = tag("div", tag("img", alt=name, src=png_address(picture)), class_="scroll", tabindex="0")
-    return tag("figure", tag("figcaption", tag("strong", name)), scrolled)
+def _build_figure(name: str, picture: bytes) -> Markup:
+    scrolled = make_tag("div", make_tag("img", alt=name, src=encode_png_uri(picture)), class_="scroll", tabindex="0")
+    return make_tag("figure", make_tag("figcaption", make_tag("strong", name)), scrolled)
 
 
-def write(path: Path, title: str, **shown: Any) -> Path:
-    """Write the page; ``shown`` as :func:`page` takes it.
+def write_validation_page(path: Path, title: str, **shown: Any) -> Path:
+    """Write the page; ``shown`` as :func:`_build_page` takes it.
 
     Raises:
         OSError: the file cannot be written.
     """
-    return storage.replace_file(path, page(title, **shown).encode("utf-8"))
+    return storage.replace_file(path, _build_page(title, **shown).encode("utf-8"))
 
 
-def cell(number: Mapping[str, float | None] | None, digits: int = 3) -> str:
+def format_estimate(number: Mapping[str, float | None] | None, digits: int = 3) -> str:
     """A number with its interval, as a table shows it; – where it cannot be known."""
     if number is None or number.get("value") is None:
         return "–"
