@@ -59,7 +59,8 @@ def answered_numbers(rows: list[dict[str, Any]]) -> str:
     keys = ("median_rel", "within_sigma", "within_2sigma")
     error, one, two = (percent(statistics.median(row[key] for row in of)) for key in keys)
     near = [row["near"]["median_rel"] for row in of if row["near"]["median_rel"] is not None]
-    return f"{error} ({percent(statistics.median(near)) if near else '–'}), {one}, {two}; {format_count(len(of), 'capture')}"
+    captures = format_count(len(of), "capture")
+    return f"{error} ({percent(statistics.median(near)) if near else '–'}), {one}, {two}; {captures}"
 
 
 def by_capture(method: str) -> dict[str, list[dict[str, Any]]]:

@@ -146,7 +146,8 @@ def _describe_content(path: Path) -> str:
     below = {file.suffix.lower(): file.name for file in path.iterdir() if file.is_file()}
     for suffix in (*_ARCHIVE_SUFFIXES, *_VIDEO_SUFFIXES):
         if suffix in below:
-            return f"{below[suffix]}: {_VIDEO_MESSAGE if suffix in _VIDEO_SUFFIXES else 'an archive, to be unpacked first'}"
+            content = _VIDEO_MESSAGE if suffix in _VIDEO_SUFFIXES else "an archive, to be unpacked first"
+            return f"{below[suffix]}: {content}"
     return "no capture here or two folders below"
 
 

@@ -380,7 +380,8 @@ def _format_next_step(made: RecoveredFrames, shown: str) -> str:
         return f"Next: open {shown}; {more}.{broken}"
     read = {name: value for name, value in made.task.settings["data"].items() if value is not None}
     also = "".join(f" data.{name}={_format_value(value)}" for name, value in read.items())
-    judged = f"dhtorch run data=auto data.root={made.task.settings['path']}{also} holdout.cutoff={_median_sensor_depth(made):.2g}"
+    path, cutoff = made.task.settings["path"], _median_sensor_depth(made)
+    judged = f"dhtorch run data=auto data.root={path}{also} holdout.cutoff={cutoff:.2g}"
     return f"Next: open {shown}; {judged} says how good it is on yours.{broken}"
 
 

@@ -84,4 +84,5 @@ def _format_summary(scene: Row) -> str:
     share = "no sample lacks a return" if scene["recovered"] is None else f"{scene['recovered']:.1%} of holes answered"
     cuts = f"; cuts at {', '.join(map(str, scene['cuts']))}" if scene["cuts"] else ""
     speed = f"{scene['frames_per_second']:.2f} frames/s"
-    return f"{scene['scene']}: {format_count(scene['n_frames'], 'frame')}, {speed}, {share}, {scene['mib']:.0f} MiB held{cuts}"
+    frames = format_count(scene["n_frames"], "frame")
+    return f"{scene['scene']}: {frames}, {speed}, {share}, {scene['mib']:.0f} MiB held{cuts}"

@@ -201,9 +201,8 @@ def _print_summary(folder: Path, counts: Mapping[str, Counter[str]], n_before: i
     skipped = total.pop("skipped", 0)
     size = sum(file.stat().st_size for file in shards.shard_files(folder))
     before = f" ({n_before} left untouched)" if n_before else ""
-    print(
-        f"{folder}: {format_count(len(counts), 'shard')}{before}, {format_count(total.total(), 'row')}, {size / 1e6:.1f} MB"
-    )
+    rows = format_count(total.total(), "row")
+    print(f"{folder}: {format_count(len(counts), 'shard')}{before}, {rows}, {size / 1e6:.1f} MB")
     said = [
         f"{n} {name.replace('_', ' ')}" for name, n in (*total.items(), ("skipped", skipped)) if n and name != "none"
     ]

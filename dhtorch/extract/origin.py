@@ -23,8 +23,15 @@ TABLE_GROUP_ROWS = 8
 DEFAULT_FPS = 30.0
 
 #: Files of ``meta/`` that are written anew.
-_REWRITTEN_META_FILES = ("info.json", "stats.json", "tasks.parquet", "tasks.jsonl", "episodes.jsonl", "episodes_stats.jsonl",
-         "intrinsics.json")  # fmt: skip
+_REWRITTEN_META_FILES = (
+    "info.json",
+    "stats.json",
+    "tasks.parquet",
+    "tasks.jsonl",
+    "episodes.jsonl",
+    "episodes_stats.jsonl",
+    "intrinsics.json",
+)
 
 
 class DatasetSource(Protocol):

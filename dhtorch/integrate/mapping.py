@@ -314,7 +314,8 @@ def _pair_rows(scene: MappedScene) -> list[Row]:
 
 def _describe_scene(row: Row, cell: float) -> str:
     """One scene in words."""
-    placed = f"{row['n_frames']} of {format_count(row['n_frames'] + row['n_unplaced'], 'frame')} placed by {row['truth']} poses"
+    frames = format_count(row["n_frames"] + row["n_unplaced"], "frame")
+    placed = f"{row['n_frames']} of {frames} placed by {row['truth']} poses"
     fragments = format_count(row["n_fragments"], "fragment")
     if not row["n_voxels"]:
         return f"{row['scene']}: {placed}, {fragments}; no surface"

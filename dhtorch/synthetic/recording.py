@@ -126,7 +126,8 @@ class SyntheticRoom(TruthRecording):
         return {**self.__dict__, "_frames": {}}  # a worker renders what it needs
 
     def __repr__(self) -> str:
-        return f"SyntheticRoom(seed={self.seed}, path={self.path!r}, lidar={self.lidar!r}, {format_count(len(self), 'frame')})"
+        frames = format_count(len(self), "frame")
+        return f"SyntheticRoom(seed={self.seed}, path={self.path!r}, lidar={self.lidar!r}, {frames})"
 
     def truth(self, index: int) -> dict[str, Tensor]:
         """What is really there at the centre of every image pixel of frame ``index``.

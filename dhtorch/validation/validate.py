@@ -103,10 +103,9 @@ def validate_depth(
     Gradient: none; a verdict.
     Cost: that of the method, and with ``views`` eleven fits of every grid pixel for each partner.
     """
-    if not 0 < tolerance < evidence.DETECTABLE_LOG_RATIO / REFUTING_EVIDENCE_SIGMAS:
-        raise ValueError(
-            f"judge: tolerance is {tolerance}, expected above 0 and below {evidence.DETECTABLE_LOG_RATIO / REFUTING_EVIDENCE_SIGMAS:.3f}"
-        )
+    limit = evidence.DETECTABLE_LOG_RATIO / REFUTING_EVIDENCE_SIGMAS
+    if not 0 < tolerance < limit:
+        raise ValueError(f"judge: tolerance is {tolerance}, expected above 0 and below {limit:.3f}")
     if size < 16 or partners < 1:
         raise ValueError(f"judge: size is {size}, partners {partners}, expected at least 16 and 1")
     check("judge", image=(anchor.image, "B C H W"), depth_map=(depth_map, "B h w"))

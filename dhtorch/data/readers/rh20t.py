@@ -247,9 +247,8 @@ class _SceneCameras:
         at = nearest_stamps(np.array([t for _, t in colour]), np.array([t for _, t in other]), self.max_difference)
         pairs = [(k, other[j][0], t) for (k, t), j in zip(colour, at, strict=True) if j >= 0]
         if len(pairs) < len(colour):
-            notes.append(
-                f"{format_count(len(colour) - len(pairs), 'image')} without depth within {self.max_difference} s: left out"
-            )
+            images = format_count(len(colour) - len(pairs), "image")
+            notes.append(f"{images} without depth within {self.max_difference} s: left out")
         if not pairs:
             raise FormatError(file, "time stamps", f"no depth within {self.max_difference} s of any image", "pairs")
         return tuple((k, j) for k, j, _ in pairs), np.array([t for _, _, t in pairs])
@@ -311,9 +310,8 @@ def _frame_stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -
     if not isinstance(stamps, list) or not stamps:
         raise FormatError(file, kind, type(stamps).__name__, "a list of Unix milliseconds")
     if len(stamps) != n:
-        notes.append(
-            f"{format_count(len(stamps), f'{kind} stamp')} for {format_count(n, 'frame')}: the first {min(n, len(stamps))} are used"
-        )
+        counts = f"{format_count(len(stamps), f'{kind} stamp')} for {format_count(n, 'frame')}"
+        notes.append(f"{counts}: the first {min(n, len(stamps))} are used")
     kept: list[tuple[int, float]] = []
     for k, stamp in enumerate(stamps[:n]):
         t = ms_to_seconds(stamp, file, kind)

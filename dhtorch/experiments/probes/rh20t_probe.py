@@ -194,7 +194,8 @@ def verdict(judged: ProbeErrors, real: bool, margin: float) -> tuple[bool | None
     n = len(judged.groups)
     own = judged.mean(_OURS, ALL_COHORT).value or 0.0
     times = judged.ratio(_OURS, CONTEXT_BLOCK, ALL_COHORT)
-    text = f"error {own:.3f} of the targets' variance, {_format_interval(times)} times that of the context alone ({n} tasks)"
+    ratio = _format_interval(times)
+    text = f"error {own:.3f} of the targets' variance, {ratio} times that of the context alone ({n} tasks)"
     if (XFEAT_BLOCK, ALL_COHORT) in judged.squares:
         beside = {c: judged.ratio(_OURS, XFEAT_BLOCK, c) for c in (ALL_COHORT, MOVING_COHORT)}
         text += probing.compare_with_xfeat({c: (r.value, r.low, r.high) for c, r in beside.items()})
