@@ -30,10 +30,10 @@ def main() -> None:
         recording = data.open(Path(os.environ["DHTORCH_DATA"]) / name)
         pairs = by_gap(recording, gap)
         for i, j in pairs[:: max(len(pairs) // PAIRS, 1)][:PAIRS]:
-            anchor, other = (holdout.range_split(recording[k], near) for k in (i, j))
+            reference, other = (holdout.range_split(recording[k], near) for k in (i, j))
             for method, ask in (("paper", PAPER), ("map", MAP)):
                 with torch.no_grad():
-                    estimate = ask(anchor, other)
+                    estimate = ask(reference, other)
                 found[name, method, i] = {"depth": estimate.depth[0], "gate": estimate.gate[0]}
     torch.save(found, sys.argv[1])
 

@@ -4,7 +4,7 @@
 
 Kinds of trouble (``degenerate_pairs``) take turns in batches of 64, 96×128 pixels, 128 samples. For every method and
 kind: exceptions, pairs that break a promise of the records, share of pairs with a pose, share of the samples answered,
-and how far those answers are from what the anchor's pixels really show.
+and how far those answers are from what the reference view's pixels really show.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Batch:
 
     numbers: list[int]
     kinds: list[str]
-    anchor: Frame
+    reference: Frame
     other: Frame
     uv: Tensor  # (B, N, 2) px
     truth: Tensor  # (B, H, W) m
@@ -48,7 +48,7 @@ class Batch:
     def one(self, b: int) -> Batch:
         """Pair ``b`` alone."""
         s = slice(b, b + 1)
-        parts = (self.anchor[s], self.other[s], self.uv[s], self.truth[s])
+        parts = (self.reference[s], self.other[s], self.uv[s], self.truth[s])
         return Batch(self.numbers[s], self.kinds[s], *parts)
 
     def ask(self, method: str) -> tuple[Estimate, Trace]:
@@ -56,7 +56,7 @@ class Batch:
         trace: Trace = {}
         seed = torch.tensor(self.numbers)
         estimate = METHODS[method](
-            self.anchor, self.other, sample=lambda *_a, **_k: self.uv, n=self.uv.shape[1], seed=seed, trace=trace
+            self.reference, self.other, sample=lambda *_a, **_k: self.uv, n=self.uv.shape[1], seed=seed, trace=trace
         )
         return estimate, trace
 
@@ -77,9 +77,9 @@ def batches(n: int, *, seed: int = 0, size: int = BATCH) -> Iterator[Batch]:
 def join(made: list[tuple[int, str, Pair]]) -> Batch:
     """A batch of numbers, kinds and pairs."""
     numbers, kinds, pairs = zip(*made, strict=True)
-    anchors, others = zip(*(pair.frames() for pair in pairs), strict=True)
+    references, others = zip(*(pair.frames() for pair in pairs), strict=True)
     uv, truth = torch.stack([pair.uv for pair in pairs]), torch.stack([pair.truth for pair in pairs])
-    return Batch([*numbers], [*kinds], pytree.collate(anchors), pytree.collate(others), uv, truth)
+    return Batch([*numbers], [*kinds], pytree.collate(references), pytree.collate(others), uv, truth)
 
 
 def broken(estimate: Estimate, trace: Trace) -> dict[str, Tensor]:
@@ -110,7 +110,7 @@ def broken(estimate: Estimate, trace: Trace) -> dict[str, Tensor]:
 def _broken_pose(fit: PoseFit) -> dict[str, Tensor]:
     T, d = fit.T_1_from_0, fit.cov.diagonal(dim1=-2, dim2=-1)
     values = [T.R, T.t, fit.cov, fit.rms_px, fit.sigma_px, fit.t_snr]
-    values += [] if fit.shutter is None else [fit.shutter.turn, fit.shutter.cov]
+    values += [] if fit.shutter is None else [fit.shutter.shutter_rate, fit.shutter.cov]
     flat = torch.cat([v.reshape(len(fit.code), -1) for v in values], -1)
     off = (T.R.double() @ T.R.double().mT - torch.eye(3, dtype=torch.float64)).abs().amax((-1, -2))
     return {

@@ -2,7 +2,7 @@
 
 A pair is a function of the seed and its number alone. The room is a box with three smaller boxes in it, painted with
 noise that is the same from both sides; depth is exact up to 1 % of noise and reaches 2 m. Then one kind of trouble is
-made. ``truth`` is what the anchor's pixels really show, NaN where a pair has no such thing.
+made. ``truth`` is what the reference view's pixels really show, NaN where a pair has no such thing.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Pair:
         """What a method is given."""
         lens = None if self.lens is None else self.lens[None]
         cameras = [Camera(f[None], c[None], lens) for f, c in zip(self.f, self.c, strict=True)]
-        anchor = Frame(self.image_0[None], self.depth[None], cameras[0])
-        return anchor, Frame(self.image_1[None], torch.zeros_like(self.depth)[None], cameras[1])
+        reference = Frame(self.image_0[None], self.depth[None], cameras[0])
+        return reference, Frame(self.image_1[None], torch.zeros_like(self.depth)[None], cameras[1])
 
 
 class Room:
@@ -167,7 +167,7 @@ def _passed(pair: Pair) -> None:
 
 
 def _swapped(pair: Pair) -> None:
-    """View 1 is called the anchor, with the depth of view 0."""
+    """View 1 is called the reference view, with the depth of view 0."""
     pair.image_0, pair.image_1 = pair.image_1, pair.image_0
     pair.truth = pair.room.view(se3.compose(pair.room.start, se3.invert(pair.motion)))[1]
 

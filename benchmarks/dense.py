@@ -24,7 +24,7 @@ from dhtorch.pipeline import dense
 from dhtorch.records import Frame
 from dhtorch.synthetic import SyntheticRoom
 
-#: The room's frames: height and width, anchor and other view, near limit in m.
+#: The room's frames: height and width, reference view and other view, near limit in m.
 SIZES, VIEWS, NEAR = ((480, 640), (1440, 1920)), (1, 9), 2.0
 
 
@@ -32,18 +32,18 @@ def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, A
     """The sweep beside its peer: in torch, and with compiled code."""
     harness.set_threads(threads)
     room = SyntheticRoom(n_frames=max(VIEWS) + 1, hw=hw, depth_hw=(192, 256))
-    anchor, other = (range_split(room[k], NEAR) for k in VIEWS)
+    reference, other = (range_split(room[k], NEAR) for k in VIEWS)
     trace: dict[str, Any] = {}
     with torch.no_grad():
-        joined = MAP(anchor, other, trace=trace)
+        joined = MAP(reference, other, trace=trace)
     asked = dense.selected_views(joined, other, trace)
-    bytes_0, bytes_1 = (_bytes(frame) for frame in (anchor, other))
+    bytes_0, bytes_1 = (_bytes(frame) for frame in (reference, other))
     size = dense.map_hw(hw, 640)
-    cameras = [dense.downscale_grey(frame, 640)[1] for frame in (anchor, other)]
+    cameras = [dense.downscale_grey(frame, 640)[1] for frame in (reference, other)]
 
     def ours() -> None:
         with torch.no_grad():
-            dense.sweep_depth(anchor, asked, method=MAP, partners=1)
+            dense.sweep_depth(reference, asked, method=MAP, source_views=1)
 
     def peer() -> None:
         small = [
@@ -52,12 +52,14 @@ def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, A
         views = (small[0], cameras[0]), (small[1], cameras[1])
         stereo.match_disparity(stereo.rectify_pair(*views, trace["fit"].T_1_from_0, nearest_m=0.7 * NEAR).pictures)
 
-    a, b, c = harness.in_turn([ours, peer, harness.natively()(ours)], repeats=options.repeats, clock=options.clock)
+    a, b, c = harness.in_turn(
+        [ours, peer, harness.with_compiled_operators()(ours)], repeats=options.repeats, clock=options.clock
+    )
     more: dict[str, Any] = {"n": size[0] * size[1], "bar": True}
     name, other_side = f"sweep_{hw[1]}x{hw[0]}", "rectify + SGBM"
     return [
         harness.row(name, a, other_side, b, **more),
-        harness.row(name, c, other_side, b, mode="native", **more),
+        harness.row(name, c, other_side, b, mode="compiled", **more),
     ]
 
 

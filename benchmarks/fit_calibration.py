@@ -4,7 +4,7 @@ python benchmarks/fit_calibration.py      on the shared scenes, five seeds; writ
 python benchmarks/fit_calibration.py --method auto --seeds 2          the same of methods of several views, whose
 python benchmarks/fit_calibration.py --method window_1 --seeds 2      thresholds nine scenes in ten keep, one by one
 python benchmarks/fit_calibration.py --dense                          of swept pixels under the motions of auto, four
-                                      anchors a scene, one seed; writes dhtorch/calibration/dense.json
+                                      reference views a scene, one seed; writes dhtorch/calibration/dense.json
 
 Scenes with a role are left out; every scene has the same weight, its seeds are pooled. What the same recipe is worth in
 rooms it was not fitted on is measured by ``dhtorch experiment=method_comparison`` (rows ``ece``, ``realised_risk_…``).
@@ -33,7 +33,7 @@ from dhtorch.experiments.compare_methods import MIN_ANSWERS_ABOVE_THRESHOLD as F
 from dhtorch.metrics import control
 from dhtorch.metrics.errors import Points
 
-#: Anchors of every scene whose maps a calibration of swept pixels is fitted on.
+#: Reference views of every scene whose maps a calibration of swept pixels is fitted on.
 ANCHORS = 4
 
 HERE = Path(__file__).resolve().parent
@@ -48,15 +48,15 @@ def settings(method: str) -> tuple[protocol.Method, list[Any]]:
 
 def _sparse(method: protocol.Method, chosen: list[Any], seeds: int) -> dict[str, list[Points]]:
     """Scene → candidates of every seed."""
-    offers = None if method.choose is None else candidate_frames
+    offers = None if method.select_views is None else candidate_frames
     variants = {f"{k}": protocol.Variant(method, seed=k, offers=offers) for k in range(seeds)}
     return _by_scene(protocol.run(chosen, protocol.Protocol(variants), by_gap, protocol.Settings()).points)
 
 
 def _dense(method: protocol.Method, chosen: list[Any]) -> dict[str, list[Points]]:
-    """Scene → hidden pixels of the maps of some anchors."""
+    """Scene → hidden pixels of the maps of some reference views."""
     study = dense_comparison.run(
-        chosen, {"auto": method}, by_gap, protocol.Settings(), anchors=ANCHORS, peers=False, rooms=()
+        chosen, {"auto": method}, by_gap, protocol.Settings(), reference_views=ANCHORS, peers=False, rooms=()
     )
     wanted = (dense_comparison.DENSE_VARIANT, dense_comparison.FULL_COHORT)
     return _by_scene({k: p for k, p in study.points.items() if k[1:] == wanted and p.keep.numel()})
@@ -94,7 +94,7 @@ def main() -> int:
         if method.views == 1
         else partial(control.scene_quantile_threshold, few=FEW * options.seeds)
     )
-    fitted = score_calibration.fit_calibration(list(pooled.values()), choose=choose, provenance=origin)
+    fitted = score_calibration.fit_calibration(list(pooled.values()), select_views=choose, provenance=origin)
     target = options.output or HERE.parent / "dhtorch" / "calibration" / f"{name}.json"
     print(calibration.save_calibration(fitted, target))
     return 0

@@ -143,7 +143,7 @@ def measure(size: str, n: int, batch: int, options: Any, compile_too: bool) -> l
     calls: list[Callable[[], Any]] = [
         peer,
         partial(front_end, frame, n),
-        partial(harness.natively()(front_end), frame, n),
+        partial(harness.with_compiled_operators()(front_end), frame, n),
     ]
     seconds = 0.0
     if compile_too:
@@ -161,10 +161,12 @@ def measure(size: str, n: int, batch: int, options: Any, compile_too: bool) -> l
     print(f"{name}: {agreement(calls[1](), theirs)}" + (f"; compiled in {seconds:.0f} s" if compile_too else ""))
     more = {"n": n, "batch": batch, "bar": True, "ours_error": errors[0], "peer_error": errors[1]}
     rows = [
-        harness.row(name, times[k], "numpy_opencv", times[0], **more, mode=("eager", "native")[k - 1]) for k in (1, 2)
+        harness.row(name, times[k], "numpy_opencv", times[0], **more, mode=("eager", "compiled")[k - 1]) for k in (1, 2)
     ]
     if compile_too:
-        rows.append(harness.row(name, times[3], "numpy_opencv", times[0], **more, mode="compiled", warm_up_s=seconds))
+        rows.append(
+            harness.row(name, times[3], "numpy_opencv", times[0], **more, mode="torch.compile", warm_up_s=seconds)
+        )
     return rows
 
 
@@ -183,14 +185,14 @@ def against_dinov2(options: Any) -> list[dict[str, Any]]:
     eager = harness.row("frontend_224", times[0], "dinov2_l", times[2], n=1024)
     return [
         eager,
-        harness.row("frontend_224", times[1], "dinov2_l", times[2], n=1024, mode="compiled", warm_up_s=seconds),
+        harness.row("frontend_224", times[1], "dinov2_l", times[2], n=1024, mode="torch.compile", warm_up_s=seconds),
     ]
 
 
 def growth(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the time at 1440x1920 beside the own time at 224x224."""
     found = []
-    for mode in ("eager", "native", "compiled"):
+    for mode in ("eager", "compiled", "torch.compile"):
         small, large = ([r for r in rows if r["name"] == f"frontend_{s}" and r["mode"] == mode] for s in SIZES)
         if small and large:
             a, b = large[0]["ours_ms"], small[0]["ours_ms"]

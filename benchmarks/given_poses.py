@@ -79,7 +79,7 @@ class Asked:
 
     scene: Scene
     pairs: list[tuple[int, int]]
-    anchor: Frame  # with the returns up to the cutoff
+    reference: Frame  # with the returns up to the cutoff
     others: Frame
     truth: holdout.Truth
     method: Method  # its tracks and near returns' pose are known
@@ -92,7 +92,7 @@ class Asked:
             track=lambda *_, hint: self.method.track(*_, hint=hint)[at],
             pose=lambda *_: self.found[at],
         )
-        estimate = method(self.anchor[at], self.others[at], fit=fit, trace=trace)
+        estimate = method(self.reference[at], self.others[at], fit=fit, trace=trace)
         return errors.points_from_estimate(estimate, self.truth[at]), trace["fit"]
 
 
@@ -109,12 +109,12 @@ def tracked(scene: Scene, method: Method) -> Asked:
     assert scene.gap is not None
     pairs = pairs_of(scene.recording, scene.gap)
     whole, others = (collate(scene.recording[k] for k in side) for side in zip(*pairs, strict=True))
-    anchor, others = (holdout.range_split(frame, scene.near) for frame in (whole, others))
+    reference, others = (holdout.range_split(frame, scene.near) for frame in (whole, others))
     trace: dict[str, Any] = {}
-    method(anchor, others, hint=scene.hint, trace=trace)
+    method(reference, others, hint=scene.hint, trace=trace)
     truth = holdout.select_candidates(trace["samples"], holdout.sample_truth(whole, trace["samples"].uv), scene.near)
     known = method.replace(track=lambda *_, hint: trace["tracks"])
-    return Asked(scene, pairs, anchor, others, truth, known, trace["fit"])
+    return Asked(scene, pairs, reference, others, truth, known, trace["fit"])
 
 
 def stated(world: Pose) -> Iterator[tuple[str, Pose, list[int] | None]]:
@@ -140,7 +140,7 @@ def motions(asked: Asked, world: Pose, source: list[int] | None, **use: Any) -> 
         return None, torch.tensor(there)
     ends = ([place[asked.pairs[b][side]] for b in there] for side in (0, 1))
     T_0, T_1 = (world.map(lambda x, k=k: x[k]) for k in ends)
-    return pose_prior.relative_prior(T_0, T_1, **use).to(asked.anchor.camera.f.dtype), torch.tensor(there)
+    return pose_prior.relative_prior(T_0, T_1, **use).to(asked.reference.camera.f.dtype), torch.tensor(there)
 
 
 def off(asked: Asked, motion: PosePrior, world: Pose, at: Tensor) -> dict[str, float]:
@@ -158,7 +158,9 @@ def numbers(points: errors.Points, fit: PoseFit) -> dict[str, Any]:
     """A row's numbers."""
     refuted = fit.code == PoseCode.REFUTED
     looks = (
-        Counter("" if fit.looks is None else CONVENTIONS[int(k)] for k in fit.looks[refuted]) if refuted.any() else {}
+        Counter("" if fit.matched_convention is None else CONVENTIONS[int(k)] for k in fit.matched_convention[refuted])
+        if refuted.any()
+        else {}
     )
     return {
         "n_pairs": len(fit.code),

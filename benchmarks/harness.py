@@ -86,7 +86,7 @@ def _time(call: Callable[[], Any], count: int, clock: str, device: str) -> float
 
 
 @contextmanager
-def natively() -> Iterator[None]:
+def with_compiled_operators() -> Iterator[None]:
     """Compiled code is used in this block, and in processes forked from it; as a decorator, in each call."""
     before, loader._loaded = loader._loaded, [_library()]  # no mock, which takes longer than a small call
     try:

@@ -431,7 +431,7 @@ PEERS = (
         two_views,
         lambda a, b, c, T: epipolar.triangulate(a, b, c, c, T).residual_px,
         lambda a, b, c, T: ke.sampson_epipolar_distance(a, b, fundamental(c, T), squared=False),
-        "another question: both pixels may move, here the anchor's is exact",
+        "another question: both pixels may move, here the reference view's is exact",
         points=(0, 1),
     ),
     Peer(

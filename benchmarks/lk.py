@@ -2,10 +2,10 @@
 
     python benchmarks/lk.py --json benchmarks/results/lk.json
 
-*Forward* is both pyramids and one search; mode ``cached`` has the pyramid of image 0 made before, as for an anchor seen
-from many views. Mode ``compiled`` has the steps on maps compiled: the whole search under ``torch.compile`` would unroll
-every map that the eager search makes for few points only, and was not compiled after 400 s. Mode ``native`` uses
-``python -m dhtorch.ops.loader``. *Forward-backward* is
+*Forward* is both pyramids and one search; mode ``cached`` has the pyramid of image 0 made before, as for a reference
+view seen from many views. Mode ``compiled`` has the steps on maps compiled: the whole search under ``torch.compile``
+would unroll every map that the eager search makes for few points only, and was not compiled after 400 s. Mode
+``native`` uses ``python -m dhtorch.ops.loader``. *Forward-backward* is
 ``lucas_kanade`` with all its fields against two calls of OpenCV. Times are of real pairs where DHTORCH_DATA is set,
 else of the built-in room; both sides take turns in one process.
 
@@ -131,22 +131,22 @@ def accuracy(images: Tensor, uv: Tensor, window: int) -> list[tuple[float, float
 
 
 def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any]]:
-    """Rows of one size: forward, the same compiled or with the anchor's pyramid cached, forward-backward."""
+    """Rows of one size: forward, the same compiled or with the reference view's pyramid cached, forward-backward."""
     image_0, image_1 = pairs(batch)
     uv = spiral(tuple(image_0.shape[-2:]), n).float().expand(batch, n, 2).contiguous()
     views, suffix = (image_0, image_1, uv), f"_w{window}_n{n}" + (f"_b{batch}" if batch > 1 else "")
     kept = PyramidCache(image_0)
-    anchor = kept(LEVELS, window)
+    reference = kept(LEVELS, window)
     options: Any = {"window": window, "levels": LEVELS}
     calls = [
         partial(forward, *views, window),
-        partial(forward, *views, window, anchor),
+        partial(forward, *views, window, reference),
         partial(forward_opencv, *views, window),
         partial(track.lucas_kanade, *views, **options),
         partial(track.lucas_kanade, *views, hint=TrackHint(pyramid=kept), **options),
         partial(opencv.opencv_lucas_kanade, *views, **options),
-        partial(harness.natively()(forward), *views, window),
-        partial(harness.natively()(track.lucas_kanade), *views, **options),
+        partial(harness.with_compiled_operators()(forward), *views, window),
+        partial(harness.with_compiled_operators()(track.lucas_kanade), *views, **options),
         partial(forward_compiled, *views, window),
     ]
     begin = time.perf_counter()
@@ -154,19 +154,19 @@ def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any
     warm_up = time.perf_counter() - begin
     times = [[t / batch for t in side] for side in harness.in_turn(calls, repeats=repeats, warm_up=2)]
     (missed, median), (peer_missed, peer_median) = accuracy(image_0, uv, window)
-    differ, differ_native = ((calls[k]().valid != calls[5]().valid).double().mean().item() for k in (3, 7))
+    differ, differ_compiled = ((calls[k]().valid != calls[5]().valid).double().mean().item() for k in (3, 7))
     print(
         f"{suffix[1:]}: misses {missed:.4f}, OpenCV {peer_missed:.4f}; median distance {median:.4f}, {peer_median:.4f}"
         f" px; same verdict {1 - differ:.3f}; first compiled call {warm_up:.1f} s"
     )
     common: dict[str, Any] = {"n": n, "batch": batch, "bar": window == 21}
-    more = {"mode": "compiled", "warm_up_s": warm_up, **common, "ours_error": missed, "peer_error": peer_missed}
+    more = {"mode": "torch.compile", "warm_up_s": warm_up, **common, "ours_error": missed, "peer_error": peer_missed}
     rows = [harness.row(f"lk{suffix}", times[8], "opencv", times[2], **more)]
-    with harness.natively():
-        (missed_native, _), _ = accuracy(image_0, uv, window)
-    errors = (missed, differ), (missed, differ), (missed_native, differ_native)
+    with harness.with_compiled_operators():
+        (missed_compiled, _), _ = accuracy(image_0, uv, window)
+    errors = (missed, differ), (missed, differ), (missed_compiled, differ_compiled)
     for (there, back), mode, (lost, other) in zip(
-        ((0, 3), (1, 4), (6, 7)), ("eager", "cached", "native"), errors, strict=True
+        ((0, 3), (1, 4), (6, 7)), ("eager", "cached", "compiled"), errors, strict=True
     ):
         more = {"mode": mode, **common, "ours_error": lost, "peer_error": peer_missed}
         rows.append(harness.row(f"lk{suffix}", times[there], "opencv", times[2], **more))

@@ -47,7 +47,7 @@ ROUNDS = 3  # turns of each loader
 SIZES = {"224x224": (SIDE, SIDE), "640x480": (480, 640)}
 BARS = "640x480"
 #: Loaders that use compiled code, and which transform they are.
-NATIVE = {"transform_native": "transform", "by_batch_native": "by_batch"}
+COMPILED_SIDES = {"transform_compiled": "transform", "by_batch_compiled": "by_batch"}
 NETWORKS = {"dinov2_l": {}, "dinov2_s": {"hidden": 384, "layers": 12, "heads": 6}}
 OPENCV = PAPER.replace(
     track=opencv.opencv_lucas_kanade,
@@ -126,7 +126,7 @@ def per_sample(dataset: Encoded | ExtendedDataset, workers: int, repeats: int, c
 
 def mode_of(side: str) -> str:
     """How a result file calls what a loader uses."""
-    return "native" if side in NATIVE else "eager"
+    return "compiled" if side in COMPILED_SIDES else "eager"
 
 
 class Bench:
@@ -138,7 +138,7 @@ class Bench:
         self.keys = ("image",) if mode == "single" else ("image", "other")
         self.transforms = {"transform": self.transform(), "by_batch": self.transform(batched=True)}
         self.transforms["plain_loader"] = None
-        self.transforms |= {side: self.transforms[NATIVE[side]] for side in NATIVE}
+        self.transforms |= {side: self.transforms[COMPILED_SIDES[side]] for side in COMPILED_SIDES}
         if mode == "pair":
             self.transforms["opencv_seats"] = self.transform(method=OPENCV)
         self.times: dict[tuple[str, int], list[float]] = {}
@@ -166,7 +166,7 @@ class Bench:
         """Loaders and numbers of workers take turns, so that a busy minute hits all alike."""
         for _, name, workers in product(range(ROUNDS), self.transforms, counts):
             dataset = self.dataset(self.transforms[name], workers)
-            with harness.natively() if name in NATIVE else nullcontext():
+            with harness.with_compiled_operators() if name in COMPILED_SIDES else nullcontext():
                 found = list(per_sample(dataset, workers, self.repeats, self.clock))
             self.times.setdefault((name, workers), []).extend(found)
         for workers in counts:
@@ -205,7 +205,7 @@ class Bench:
 
     def ours(self) -> list[str]:
         """The loaders that are no peer."""
-        return [side for side in self.transforms if NATIVE.get(side, side) in ("transform", "by_batch")]
+        return [side for side in self.transforms if COMPILED_SIDES.get(side, side) in ("transform", "by_batch")]
 
     def common(self, bar: bool) -> dict[str, Any]:
         """Fields of a row."""

@@ -27,14 +27,20 @@ WINGS = {
     "probes": ("learned_score", "rh20t_probe", "vo_probe"),
 }
 
-#: Function or module in an earlier version → its present name.
+#: Function or module in an earlier version → its present name. The longest prefix of a dotted name counts.
 NAMES = {
     "dhtorch.pair.extend": "dhtorch.pipeline.method.Method",
     "dhtorch.window.extend_window": "dhtorch.pipeline.method.Method",
     "dhtorch.window.inverse_variance": "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.method": "dhtorch.pipeline.method",
-    "dhtorch.views": "dhtorch.pipeline.view_selection",
+    "dhtorch.views.by_probes": "dhtorch.pipeline.view_selection.select_views_by_preview",
     "dhtorch.geometry.start": "dhtorch.geometry.coarse_flow",
+    "dhtorch.stages.fuse.agree": "dhtorch.stages.fuse.fuse_consistent",
+    "dhtorch.stages.sample.grid": "dhtorch.stages.sample.regular_grid",
+    "dhtorch.stages.sample.vogel": "dhtorch.stages.sample.vogel_spiral",
+    "dhtorch.stages.score.rank": "dhtorch.stages.score.confidence",
+    "dhtorch.stages.score.rank_by_error": "dhtorch.stages.score.confidence_from_error",
+    "dhtorch.stages.score.rank_by_sigma": "dhtorch.stages.score.confidence_from_sigma",
     "dhtorch.data.open_all": "dhtorch.data.open_capture",
     "dhtorch.data.synthetic.SyntheticRoom": "dhtorch.synthetic.recording.open_room",
     "dhtorch.synthetic.recording.SyntheticRoom": "dhtorch.synthetic.recording.open_room",
@@ -52,7 +58,47 @@ NAMES = {
     "dhtorch.studies.compare.anchor_study": "dhtorch.experiments.compare.align_study",
     "dhtorch.studies.compare.judge_study": "dhtorch.experiments.compare.validate_study",
     "dhtorch.studies": "dhtorch.experiments",
+    **{
+        f"dhtorch.{package}.opencv.{name}": f"dhtorch.experiments.baselines.opencv.opencv_{name}"
+        for package in ("baselines", "studies.baselines")
+        for name in ("lucas_kanade", "pnp_ransac", "triangulate")
+    },
+    **{
+        f"dhtorch.{package}.dinov2.load": "dhtorch.experiments.baselines.dinov2.load_dinov2"
+        for package in ("baselines", "studies.baselines")
+    },
+    "dhtorch.studies.baselines.xfeat.search": "dhtorch.experiments.baselines.xfeat.search_matches",
     "dhtorch.baselines": "dhtorch.experiments.baselines",
+}
+
+_STUDY_OPTIONS = {"anchors": "reference_views"}
+
+#: Present name of a function → its options of an earlier version and their present names.
+OPTIONS: dict[str, dict[str, str]] = {
+    "dhtorch.pipeline.method.Method": {"choose": "select_views", "given": "pose_prior"},
+    "dhtorch.stages.fuse.inverse_variance": {"max_still": "max_static_ratio"},
+    "dhtorch.stages.fuse.fuse_consistent": {"max_still": "max_static_ratio", "max_against": "max_conflict_ratio"},
+    "dhtorch.stages.pose.map_pose": {"turn_sigma": "shutter_sigma", "turn_gain": "shutter_gain"},
+    "dhtorch.geometry.coarse_flow.coarse_flow": {"turns_deg": "rotations_deg"},
+    "dhtorch.data.pairs.by_cameras": {"anchor": "reference"},
+    **{
+        f"dhtorch.experiments.compare.{study}.run": _STUDY_OPTIONS
+        for study in ("align_study", "dense_comparison", "validate_study", "views_study")
+    },
+}
+
+#: Options of a dense sweep, which settings hold as a mapping.
+SWEEP_OPTIONS = {"partners": "source_views"}
+
+#: Beginning of a summary key, name of a column or name of an experiment in an earlier version → its present name.
+KEYS = {
+    "anchor.": "align.",
+    "judge.": "validate.",
+    "anchor_study": "align_study",
+    "judge_study": "validate_study",
+    "one_partner": "one_source_view",
+    "worth": "gain",
+    "n_mute": "n_no_answer",
 }
 
 _FUSE = {"_target_": "dhtorch.stages.fuse.inverse_variance", "_partial_": True, "min_views": 2, "max_chi2": 9.0}
@@ -62,7 +108,7 @@ IMPLIED: dict[str, dict[str, Any]] = {
     "dhtorch.pipeline.method.Method": {
         "views": 1,
         "chain": True,
-        "fuse": {**_FUSE, "correlation": 1.0, "max_sigma_rel": 0.1, "max_still": 0.5},
+        "fuse": {**_FUSE, "correlation": 1.0, "max_sigma_rel": 0.1, "max_static_ratio": 0.5},
     },
     **{f"dhtorch.experiments.probes.{name}.run": {"xfeat": False} for name in ("rh20t_probe", "vo_probe")},
     "dhtorch.experiments.negative.helix_correlation.run": {"turns": None, "foveation": 1.0, "gaze": None},
@@ -84,7 +130,7 @@ def present_settings(settings: Any) -> Any:
         return [present_settings(value) for value in settings]
     if not isinstance(settings, Mapping):
         return settings
-    node = {key: present_settings(value) for key, value in settings.items()}
+    node = {SWEEP_OPTIONS.get(key, key): present_settings(value) for key, value in settings.items()}
     if not isinstance(node.get("_target_"), str):
         return node
     name = node["_target_"] = present_name(node["_target_"])
@@ -92,24 +138,62 @@ def present_settings(settings: Any) -> Any:
         node.pop("_partial_", None)  # a method was a function with its options bound, and is a record
     if name == "dhtorch.stages.backproject.backproject" and node.get("search_px") == 0:
         node["search_px"] = None  # the radius that the density of the returns asks for
-    return {**IMPLIED.get(name, {}), **node}
+    present = OPTIONS.get(name, {})
+    return {**IMPLIED.get(name, {}), **{present.get(option, option): value for option, value in node.items()}}
+
+
+def present_key(key: str) -> str:
+    """The present name of a summary key, column or experiment."""
+    if key in KEYS:
+        return KEYS[key]
+    old = next((old for old in KEYS if old.endswith(".") and key.startswith(old)), "")
+    return KEYS[old] + key.removeprefix(old) if old else key
+
+
+def present_rows(value: Any) -> Any:
+    """Rows with the present names of their columns, at every depth; a method called ``anchor`` is ``align``."""
+    if isinstance(value, list):
+        return [present_rows(item) for item in value]
+    if not isinstance(value, Mapping):
+        return value
+    row = {present_key(key): present_rows(item) for key, item in value.items()}
+    return row | {"method": "align"} if row.get("method") == "anchor" else row
 
 
 def migrate(path: Path) -> None:
     """Rewrite one file; one without earlier names stays as it is, byte for byte."""
     content = json.loads(path.read_text(encoding="utf-8"))
     if isinstance(content, dict) and "schema" in content:
-        new = content | {"config": present_settings(content["config"])}
+        new = content | {
+            "experiment": present_key(content["experiment"]),
+            "config": present_settings(content["config"]),
+            "summary": {present_key(key): value for key, value in content["summary"].items()},
+            "rows": present_rows(content["rows"]),
+        }
         if new != content:
             result_files.write_result(path, new)
-    elif isinstance(content, list):
-        new_rows = [row | {"mode": MODES.get(row["mode"], row["mode"])} if "mode" in row else row for row in content]
-        if new_rows != content:
-            replace_file(path, (json.dumps(new_rows, indent=1, ensure_ascii=False) + "\n").encode())
+    elif isinstance(content, list) and any(_is_earlier(row) for row in content):
+        rows = [{**row, **_present_row(row)} for row in content]
+        replace_file(path, (json.dumps(rows, indent=1, ensure_ascii=False) + "\n").encode())
 
+
+def _is_earlier(row: Mapping[str, Any]) -> bool:
+    """Whether the names of a benchmark row are an earlier version's."""
+    torch_alone = str(row.get("name")).startswith(("triangulate", "start"))  # rows that have no compiled operators
+    return row.get("mode") == "native" or row.get("name") in ROW_NAMES or (torch_alone and row["mode"] == "compiled")
+
+
+def _present_row(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Name and mode of a benchmark row, where they have other names now."""
+    table = {"name": ROW_NAMES, "mode": MODES}
+    return {key: names[row[key]] for key, names in table.items() if row.get(key) in names}
+
+
+#: Name of a benchmark row in an earlier version → its present name.
+ROW_NAMES = {"anchor_auto": "auto_reference_view", "auto_anchor": "auto_reference_view"}
 
 #: Mode of a benchmark row in an earlier version → its present name.
-MODES: dict[str, str] = {}
+MODES = {"native": "compiled", "compiled": "torch.compile"}
 
 
 def main() -> None:

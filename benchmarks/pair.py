@@ -7,8 +7,10 @@ Pairs of TUM fr1/desk (640×480, near limit 1 m, gap 4) where DHTORCH_DATA is se
 take turns in one process; errors are medians of the relative depth error over the same candidates. Rows
 ``per_far_answer`` are milliseconds per candidate answered within 5 %: their ratio turned over is how many times as many
 such answers ours gives in the same time. ``every_pixel`` is the same for ``complete``, whose answers are pixels,
-counted on every fourth row and column and multiplied by sixteen. ``anchor_auto`` is ``auto`` beside the first release's
-``WINDOW_1``: one anchor, the same frames around it offered to both, from which each chooses. Mode ``native`` is ours
+counted on every fourth row and column and multiplied by sixteen. ``auto_reference_view`` is ``auto`` beside the first
+release's
+``WINDOW_1``: one reference view, the same frames around it offered to both, from which each chooses. Mode ``native`` is
+    ours
 with the compiled code of ``python -m dhtorch.ops.loader``; the peer stays as it is.
 """
 
@@ -42,7 +44,7 @@ from dhtorch.synthetic.recording import SyntheticRoom
 OURS = {"paper": PAPER, "map": MAP}
 
 #: What ours runs in, by mode.
-MODES: dict[str, Callable[[], Any]] = {"eager": nullcontext, "native": harness.natively}
+MODES: dict[str, Callable[[], Any]] = {"eager": nullcontext, "compiled": harness.with_compiled_operators}
 
 #: Relative error of a far answer that counts.
 GOOD = 0.05
@@ -68,8 +70,8 @@ def load(batch: int) -> tuple[str, Frame, Frame, Frame, float]:
     recording, near, gap = _recording()
     chosen = by_gap(recording, gap)
     chosen = [chosen[k % len(chosen)] for k in range(batch)]
-    anchor, other = (pytree.collate([recording[p[k]] for p in chosen]) for k in (0, 1))
-    return recording.name, holdout.range_split(anchor, near), holdout.range_split(other, near), anchor, near
+    reference, other = (pytree.collate([recording[p[k]] for p in chosen]) for k in (0, 1))
+    return recording.name, holdout.range_split(reference, near), holdout.range_split(other, near), reference, near
 
 
 def median_error(method: Any, pair: tuple[str, Frame, Frame, Frame, float]) -> float | None:
@@ -79,10 +81,10 @@ def median_error(method: Any, pair: tuple[str, Frame, Frame, Frame, float]) -> f
 
 def answers(method: Any, pair: tuple[str, Frame, Frame, Frame, float]) -> errors.Points:
     """What the method says of the candidates, beside their true depth."""
-    _, near, other, anchor, cutoff = pair
+    _, near, other, reference, cutoff = pair
     trace: dict[str, Any] = {}
     estimate = method(near, other, trace=trace)
-    truth = holdout.select_candidates(trace["samples"], holdout.sample_truth(anchor, estimate.uv), cutoff)
+    truth = holdout.select_candidates(trace["samples"], holdout.sample_truth(reference, estimate.uv), cutoff)
     return errors.points_from_estimate(estimate, truth)
 
 
@@ -133,7 +135,7 @@ def measure_every_pixel(threads: int, options: Any, n: int = 2048) -> list[dict[
 
     def ours(mode: str = "eager") -> DepthMap:
         with torch.no_grad(), MODES[mode]():
-            return dense.complete_depth(near, other, method=MAP, partners=1)
+            return dense.complete_depth(near, other, method=MAP, source_views=1)
 
     def peer() -> None:
         with torch.no_grad():
@@ -154,22 +156,22 @@ def measure_every_pixel(threads: int, options: Any, n: int = 2048) -> list[dict[
 
 def pixel_errors(found: DepthMap, pair: tuple[str, Frame, Frame, Frame, float]) -> torch.Tensor:
     """Relative errors of the swept pixels in every so many rows and columns that have truth beyond the cutoff."""
-    _, near, _, anchor, cutoff = pair
+    _, near, _, reference, cutoff = pair
     chosen = torch.zeros_like(found.keep)
     chosen[:, ::EVERY, ::EVERY] = True
     chosen &= found.source == Source.SWEPT
     _, h, w = found.depth.shape
-    truth = holdout.sample_truth(anchor, dense.map_pixel_centres(near, (h, w))[chosen.flatten()][None])
+    truth = holdout.sample_truth(reference, dense.map_pixel_centres(near, (h, w))[chosen.flatten()][None])
     counts = truth.ok & (truth.depth > cutoff)
     return (found.depth[chosen][None] / truth.depth - 1).abs()[counts]
 
 
 def measure_anchor(threads: int, options: Any, n: int = 2048) -> list[dict[str, Any]]:
-    """The rows of one anchor in the middle of the recording, all other frames being offered."""
+    """The rows of one reference view in the middle of the recording, all other frames being offered."""
     harness.set_threads(threads)
     recording, near, _ = _recording()
     middle = len(recording) // 2
-    anchor, *others = (
+    reference, *others = (
         holdout.range_split(recording[k], near) for k in (middle, *(i for i in range(len(recording)) if i != middle))
     )
     truth_of = recording[middle]
@@ -178,7 +180,7 @@ def measure_anchor(threads: int, options: Any, n: int = 2048) -> list[dict[str, 
     def call(name: str, method: Any, mode: str = "eager") -> None:
         trace: dict[str, Any] = {}
         with torch.no_grad(), MODES[mode]():
-            estimate = method(anchor, others, n=n, trace=trace)
+            estimate = method(reference, others, n=n, trace=trace)
         truth = holdout.select_candidates(trace["samples"], holdout.sample_truth(truth_of, estimate.uv), near)
         found[name] = errors.measure_errors(errors.points_from_estimate(estimate, truth))["median_rel"]
 
@@ -189,7 +191,7 @@ def measure_anchor(threads: int, options: Any, n: int = 2048) -> list[dict[str, 
     for mode, times in zip(MODES, ours, strict=True):
         more: dict[str, Any] = {"n": n, "mode": mode, "bar": True}
         more |= {"ours_error": found[mode], "peer_error": found["window_1"]}
-        rows.append(harness.row("anchor_auto", times, "window_1", peer, **more))
+        rows.append(harness.row("auto_reference_view", times, "window_1", peer, **more))
     return rows
 
 

@@ -135,37 +135,37 @@ def measure(batch: int, n: int, outliers: float, options: Any, compile_too: bool
     draws = uniform_draws(torch.arange(batch), batch, HYPOTHESES)
     samples, tracks, camera, _ = scene(batch, n, outliers, seed=1)
     seat = partial(pnp_ransac, samples, tracks, camera, camera, draws)
-    calls: dict[str, Callable[[], Any]] = {"eager": seat, "native": harness.natively()(seat)}
+    calls: dict[str, Callable[[], Any]] = {"eager": seat, "compiled": harness.with_compiled_operators()(seat)}
     seconds = 0.0
     if compile_too:
         torch.compiler.reset()
         fast = torch.compile(pnp_ransac, options={"cpp_wrapper": True})
         start = time.perf_counter()
-        calls["compiled"] = partial(fast, samples, tracks, camera, camera, draws)
-        calls["compiled"]()
+        calls["torch.compile"] = partial(fast, samples, tracks, camera, camera, draws)
+        calls["torch.compile"]()
         seconds = time.perf_counter() - start
     pairs = arrays(samples, tracks)
     calls |= {name: partial(each, peer, pairs) for name, peer in PEERS.items()}
     found = harness.in_turn([*calls.values()], repeats=options.repeats, clock=options.clock, warm_up=2)
     times = {name: [t / batch for t in side] for name, side in zip(calls, found, strict=True)}
-    wrong: dict[str, list[tuple[float, float]]] = {name: [] for name in ("eager", "native", *PEERS)}
+    wrong: dict[str, list[tuple[float, float]]] = {name: [] for name in ("eager", "compiled", *PEERS)}
     for seed in range(-(-96 // batch)):
         samples, tracks, camera, T = scene(batch, n, outliers, seed=100 + seed)
         ask = partial(pnp_ransac, samples, tracks, camera, camera, draws)
         wrong["eager"] += errors(ask().T_1_from_0, T)
-        wrong["native"] += errors(harness.natively()(ask)().T_1_from_0, T)
+        wrong["compiled"] += errors(harness.with_compiled_operators()(ask)().T_1_from_0, T)
         for name, peer in PEERS.items():
             wrong[name] += errors(each(peer, arrays(samples, tracks)), T)
     middle = {name: np.nanmedian(np.array(w), 0) for name, w in wrong.items()}
     title = f"pnp_n{n}_b{batch}" + (f"_o{outliers:.0%}".rstrip("%") if outliers != 0.3 else "")
     print(f"{title}: " + ", ".join(f"{k} {a:.4f}° {b:.3f} mm" for k, (a, b) in middle.items()))
     rows = []
-    for mode in ("eager", "native", "compiled") if compile_too else ("eager", "native"):
+    for mode in ("eager", "compiled", "torch.compile") if compile_too else ("eager", "compiled"):
         for name in PEERS:
             more: dict[str, Any] = {"mode": mode, "n": n, "batch": batch, "bar": name == "opencv_ap3p"}
-            own = "native" if mode == "native" else "eager"
+            own = "compiled" if mode == "compiled" else "eager"
             more |= {"ours_error": middle[own][0], "peer_error": middle[name][0]}
-            more |= {"warm_up_s": seconds} if mode == "compiled" else {}
+            more |= {"warm_up_s": seconds} if mode == "torch.compile" else {}
             rows.append(harness.row(title, times[mode], name, times[name], **more))
     return rows
 

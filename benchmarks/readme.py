@@ -144,7 +144,7 @@ def beside_chosen() -> str:
         ["coverage at 5 % risk over that of the best fixed gap, worst scene", number(worst), "≥ 0.9"],
         ["samples without a return that are answered where the camera only turns", percent(turned), "≤ 0.5 %"],
         ["answered and wrong by a fifth where what is near moves, worst room", percent(wrong), "≤ 1 %"],
-        ["time of a whole anchor, ratio to `window`", number(timed["auto_anchor"]), "≤ 1.0"],
+        ["time of a whole reference view, ratio to `window`", number(timed["auto_reference_view"]), "≤ 1.0"],
         ["time of `Stream.push`, ratio to OpenCV's seats on the same views", number(timed["stream_push"]), "≤ 1.2"],
     ]
     return table(["number", "`auto`", "bar"], rows)
@@ -229,7 +229,7 @@ def how_good() -> str:
     rows.append(["answered where the camera only turns", *turned, percent(pixels["dense.rotation_answered"]["value"])])
     timed = [timing(*name) for name in TIMED]
     where = " and ".join(sorted({r["processor"] for r in timed}))
-    rows.append([f"ms an anchor of 640×480, one thread ({where})", *(f"{r['ours_ms']:,.0f}" for r in timed)])
+    rows.append([f"ms a reference view of 640×480, one thread ({where})", *(f"{r['ours_ms']:,.0f}" for r in timed)])
     rows[-1][-1] = f"as `auto` + {rows[-1][-1]}"
     return table(["median over eleven scenes", "`paper`", "`map`", "`auto`", "`dense`"], rows)
 
@@ -254,7 +254,7 @@ TURNED = "tum_fr1_rpy_a"
 TIMED = (
     ("pair", "pair_paper_b1"),
     ("pair", "pair_map_b1"),
-    ("stream", "auto_anchor"),
+    ("stream", "auto_reference_view"),
     ("dense_speed", "sweep_640x480"),
 )
 
@@ -274,7 +274,7 @@ def loader_times() -> str:
 
     plain, _ = taken("single", "eager")
     after = f"; after `python -m dhtorch.ops.loader`, which compiles inner loops, {said('native')}" * bool(
-        said("native")
+        said("compiled")
     )
     return (
         f"A sample of 640×480 takes {said('eager')}{after}; {plain['peer_ms']:.2g} ms of it is decoding\n"
@@ -360,7 +360,7 @@ def enriched() -> str:
 
 #: What the judge is to find, in words, and its bars.
 FOUND = {
-    "scale_found": ("metre off by a tenth: found, anchors with a baseline", "≥ 0.95"),
+    "scale_found": ("metre off by a tenth: found, reference views with a baseline", "≥ 0.95"),
     "scale_found_5": ("metre off by a twentieth: found", "≥ 0.90"),
     "false_alarm": ("sound maps whose metre is called wrong", "≤ 0.02"),
     "scale_found_far": ("a tenth, by triangulated points alone", ""),
@@ -382,12 +382,12 @@ FOUND = {
 
 #: Columns of the judge's table: result, whose number, head.
 JUDGES = (
-    ("judge_study", "judge", "`judge`"),
-    ("judge_study_streams", "judge", "`judge`, streams"),
-    ("judge_study_unseen", "judge", "`judge`, rooms"),
-    ("judge_study", "quick", "`QUICK`, no pictures"),
-    ("judge_study_streams", "quick", "`QUICK`, streams"),
-    ("judge_study", "photometric", "photometric check"),
+    ("validate_study", "judge", "`judge`"),
+    ("validate_study_streams", "judge", "`judge`, streams"),
+    ("validate_study_unseen", "judge", "`judge`, rooms"),
+    ("validate_study", "quick", "`QUICK`, no pictures"),
+    ("validate_study_streams", "quick", "`QUICK`, streams"),
+    ("validate_study", "photometric", "photometric check"),
 )
 
 
@@ -420,7 +420,7 @@ def named_registration(rows: list[dict[str, Any]]) -> str:
 def judged_real() -> str:
     """What is said of real sensors' own depth."""
     rows = []
-    for row in json.loads((RESULTS / "judge_real.json").read_text()):
+    for row in json.loads((RESULTS / "validate_real.json").read_text()):
         whole, held = row["whole"], row["whole"]["held"]
         wrong = "nothing is known" if whole["wrong"] is None else f"{whole['wrong']:.1%}, at least {held['wrong']:.1%}"
         causes = "; ".join(f"{cause} ({n} of {whole['windows']})" for cause, n in whole["causes"].items())
@@ -431,7 +431,7 @@ def judged_real() -> str:
 
 
 #: What anchoring is to reach, in words, and its bars.
-ANCHORED = {
+ALIGNED = {
     "simulated_median": ("far error, map off by 1.3 % in shape and 5 % in scale, median", "≤ 0.02"),
     "ratio_to_near_affine": ("far error, ratio to an affine fit to near returns, median over faults", "≤ 0.5"),
     "worst_ratio_to_better": ("worst scene and fault: (error − 0.002) / the better of raw and near-only", "≤ 1.05"),
@@ -445,7 +445,7 @@ def anchored(*results: str) -> str:
     found = [json.loads((RESULTS / f"{name}.json").read_text()) for name in results]
     rows = [
         [words, *(f"{result['summary'][f'anchor.{name}']['value']:.3f}" for result in found), bar]
-        for name, (words, bar) in ANCHORED.items()
+        for name, (words, bar) in ALIGNED.items()
     ]
     seeds = [result["config"]["data"].get("seed") for result in found]
     names = [
@@ -501,8 +501,8 @@ TABLES |= {
     "clients": clients,
     "anchor": partial(
         anchored,
-        *("anchor_study", "anchor_study_streams", "anchor_study_rooms"),
-        *("anchor_study_unseen", "anchor_study_unseen_2", "anchor_study_unseen_3"),
+        *("align_study", "align_study_streams", "align_study_rooms"),
+        *("align_study_unseen", "align_study_unseen_2", "align_study_unseen_3"),
     ),
 }
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}

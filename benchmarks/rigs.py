@@ -55,13 +55,13 @@ class Pairing:
 
     name: str
     rig: Scene  # its recording is a Rig, or two frames of one
-    anchors: tuple[int, ...]  # positions
+    references: tuple[int, ...]  # positions
     others: tuple[int, ...]
     calibration: Pose  # (1) T_1_from_0
 
     def frames(self) -> tuple[Frame, Frame, Frame]:
-        """Anchors with all their returns; anchors and others without those beyond the cutoff."""
-        whole, others = (collate(self.rig.recording[k] for k in side) for side in (self.anchors, self.others))
+        """Reference views with all their returns; reference views and others without those beyond the cutoff."""
+        whole, others = (collate(self.rig.recording[k] for k in side) for side in (self.references, self.others))
         return whole, holdout.range_split(whole, self.rig.near), holdout.range_split(others, self.rig.near)
 
 
@@ -92,9 +92,9 @@ def of_rig(scene: Scene, name: str | None = None) -> Iterator[Pairing]:
 
 def measured(pairing: Pairing, seat: str) -> tuple[dict[str, Any], Pose | None, Tensor | None]:
     """A row ``pose``, and the pose with its covariance where there is one."""
-    _, anchor, others = pairing.frames()
+    _, reference, others = pairing.frames()
     trace: dict[str, Any] = {}
-    mean = estimate_rig_pose(anchor, others, method=SEATS[seat], hint=pairing.rig.hint, trace=trace)
+    mean = estimate_rig_pose(reference, others, method=SEATS[seat], hint=pairing.rig.hint, trace=trace)
     fit = trace["fit"]
     several = len(fit.code) > 1
     T, cov, scale = (mean.T, mean.cov, float(mean.scale[0])) if several else (fit.T_1_from_0, fit.cov, 1.0)
@@ -129,16 +129,16 @@ def held_against(estimate: Any, samples: Any, whole: Frame, near: float | None) 
 
 def answers(pairing: Pairing, pose: Pose | None, cov: Tensor | None, seat: str) -> Iterator[dict[str, Any]]:
     """Rows ``answers`` of pairs at one instant, by where the pose comes from."""
-    whole, anchor, others = pairing.frames()
+    whole, reference, others = pairing.frames()
     method = SEATS[seat]
     sources: dict[str, Any] = {"near returns": None, "calibration": calibrated(pairing)}
-    if pose is not None and len(pairing.anchors) > 1:
+    if pose is not None and len(pairing.references) > 1:
         sources["measured once"] = ConstantPose(pose, cov)
     for source, rigid in sources.items():
         trace: dict[str, Any] = {}
-        estimate = method.replace(given=rigid)(anchor, others, hint=pairing.rig.hint, trace=trace)
+        estimate = method.replace(pose_prior=rigid)(reference, others, hint=pairing.rig.hint, trace=trace)
         found = held_against(estimate, trace["samples"], whole, pairing.rig.near)
-        yield row(pairing, source, seat, "space", len(pairing.anchors), int(trace["fit"].ok.sum()), [found])
+        yield row(pairing, source, seat, "space", len(pairing.references), int(trace["fit"].ok.sum()), [found])
 
 
 def calibrated(pairing: Pairing) -> ConstantPose:
@@ -152,7 +152,7 @@ def mixed(scene: Scene, name: str) -> dict[str, Any]:
     rig = scene.recording
     assert isinstance(rig, Rig)
     found, n_ok = [], 0
-    pairs = by_cameras(rig, instants=[0, 1], anchor=rig.cameras[0], stride=2)
+    pairs = by_cameras(rig, instants=[0, 1], reference=rig.cameras[0], stride=2)
     for i, offered in pairs:
         whole = rig[i]
         places: Sequence[int] = offered if isinstance(offered, tuple) else (offered,)

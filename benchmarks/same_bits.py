@@ -79,7 +79,12 @@ NAMES: dict[str, tuple[str, ...]] = {
         "alignment.align.anchor",
         "metric.anchor",
     ),
-    "map_kinds": ("alignment.align.KINDS", "alignment.KINDS", "metric.KINDS"),
+    "map_kinds": (
+        "alignment.align.ALIGNMENT_KINDS",
+        "alignment.ALIGNMENT_KINDS",
+        "alignment.align.KINDS",
+        "metric.KINDS",
+    ),
     "validate_depth": (
         "validate_depth",
         "validation.validate.validate_depth",
@@ -87,7 +92,12 @@ NAMES: dict[str, tuple[str, ...]] = {
         "validation.validate.judge",
         "verdict.judge",
     ),
-    "quick_method": ("validation.validate.QUICK", "validation.QUICK", "verdict.QUICK"),
+    "quick_method": (
+        "validation.validate.QUICK_METHOD",
+        "validation.QUICK_METHOD",
+        "validation.validate.QUICK",
+        "verdict.QUICK",
+    ),
     "ExtendDepth": ("transforms.ExtendDepth", "transform.ExtendDepth"),
     "ValidateDepth": (
         "transforms.ValidateDepth",
@@ -123,7 +133,8 @@ FIELDS: dict[str, str] = {
     "ruler": "scale_vs_trajectory",
     "by_answers": "sparse_evidence",
     "by_views": "photometric_evidence",
-    "by_maps": "depth_consistency_evidence",
+    "by_maps": "consistency_evidence",
+    "ceiling": "clip_depth",
 }
 
 #: Modules whose command builds the compiled operators, the current one first, and the variables that switch them on.
@@ -146,6 +157,9 @@ LADDER = (1, 2, 3, 5, 8, 12, 20, 30)
 
 #: Frames between an anchor and the other view, at most, for a method of several views.
 WINDOW = 5
+
+#: Longer side of a map that is aligned, at most, px.
+ALIGNED = 720
 
 #: Values kept of a tensor for the size of a difference, and tensors named in a row.
 KEPT, NAMED = 2048, 4
@@ -221,9 +235,13 @@ class Case:
     levels: int | None = None  # pyramid levels that the motion asks for
 
     def frame(self, k: int) -> Any:
-        """Frame ``k`` without the returns beyond the near limit."""
+        """Frame ``k`` without the returns beyond the near limit.
+
+        The image is contiguous: compiled operators decline others, such as those of the built-in room.
+        """
         frame = self.recording[k]
-        return frame.replace(depth=torch.where(frame.depth > self.near, torch.zeros_like(frame.depth), frame.depth))
+        depth = torch.where(frame.depth > self.near, torch.zeros_like(frame.depth), frame.depth)
+        return frame.replace(image=frame.image.contiguous(), depth=depth)
 
     @property
     def view(self) -> Any:
@@ -373,7 +391,8 @@ def completed(case: Case, name: str, others: Any, **options: Any) -> Any:
 
 def aligned(case: Case, kind: int) -> Any:
     """A map of the kind at that place of the list of kinds, brought to metres by near returns and far answers."""
-    depth = case.depth
+    every = -(-max(case.depth.shape[-2:]) // ALIGNED)
+    depth = case.depth[:, ::every, ::every]
     known = depth > 0
     value = [0.9 * depth + 0.05, 7 * depth, 3 * depth - 1, 40 / depth.clamp_min(1e-3) + 3, depth.square()][kind]
     trace: dict[str, Any] = {}
@@ -653,13 +672,14 @@ def run(checkout: Path, mode: str, path: Path, options: argparse.Namespace) -> N
 
 def state(checkout: Path) -> str:
     """What tells the code of a checkout from another: its commit, or path, sizes and times where it has changes."""
-    git = ["git", "--no-optional-locks", "-C", str(checkout)]
-    commit, changes = (
-        subprocess.run([*git, *words], capture_output=True, text=True, check=False)
-        for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--", "dhtorch", "conf"])
-    )
-    if commit.returncode == 0 and changes.returncode == 0 and not changes.stdout.strip():
-        return commit.stdout.strip()
+    if shutil.which("git"):
+        git = ["git", "--no-optional-locks", "-C", str(checkout)]
+        commit, changes = (
+            subprocess.run([*git, *words], capture_output=True, text=True, check=False)
+            for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--", "dhtorch", "conf"])
+        )
+        if commit.returncode == 0 and changes.returncode == 0 and not changes.stdout.strip():
+            return commit.stdout.strip()
     files = sorted(path for part in ("dhtorch", "conf") for path in (checkout / part).rglob("*") if path.is_file())
     stats = [(str(path), path.stat()) for path in files if "__pycache__" not in path.parts]
     return "\n".join(f"{path} {found.st_size} {found.st_mtime_ns}" for path, found in stats)

@@ -36,7 +36,7 @@ MOST = 1.05
 
 
 def views(count: int) -> list[Frame]:
-    """The anchor's near returns and ``count`` further views of the built-in room, 240x320."""
+    """The reference view's near returns and ``count`` further views of the built-in room, 240x320."""
     room = SyntheticRoom()
     step = max(6 // count, 1)
     frames = [holdout.range_split(room[k * step], 2.0) for k in range(count + 1)]
@@ -58,22 +58,22 @@ def repeated(frame: Frame, batch: int) -> Frame:
 
 def series(full: bool) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
     """Calls by name of what grows, each with its size."""
-    anchor, other = views(1)
+    reference, other = views(1)
     doublings = range(5 if full else 4)
     found: dict[str, list[tuple[int, Callable[[], Any]]]] = {}
     for method in ("paper", "map"):
-        pair = partial(METHODS[method], anchor, other)
+        pair = partial(METHODS[method], reference, other)
         found[f"{method}.samples"] = [(512 << k, partial(pair, n=512 << k)) for k in doublings]
-        pairs = [partial(METHODS[method], repeated(anchor, 1 << k), repeated(other, 1 << k)) for k in doublings]
+        pairs = [partial(METHODS[method], repeated(reference, 1 << k), repeated(other, 1 << k)) for k in doublings]
         found[f"{method}.pairs"] = [(1 << k, partial(p, n=512)) for k, p in zip(doublings, pairs, strict=True)]
     samples, tracks, camera, _ = pnp.scene(16, 500, 0.3, seed=1)
     seat = partial(pnp_ransac, samples, tracks, camera, camera)
     found["pose.hypotheses"] = [(128 << k, partial(seat, uniform_draws(0, 16, 128 << k))) for k in doublings]
     sizes = [(120, 160), (240, 160), (240, 320), (480, 320), (480, 640)][-len(doublings) :]
-    shown = [(hw, partial(METHODS["paper"], resized(anchor, hw), resized(other, hw), n=512)) for hw in sizes]
+    shown = [(hw, partial(METHODS["paper"], resized(reference, hw), resized(other, hw), n=512)) for hw in sizes]
     found["paper.pixels"] = [(hw[0] * hw[1], call) for hw, call in shown]
     counts = [1 << k for k in doublings]
-    windows = [partial(PAPER.replace(views=v), anchor, pytree.stack(views(v)[1:]), n=512) for v in counts]
+    windows = [partial(PAPER.replace(views=v), reference, pytree.stack(views(v)[1:]), n=512) for v in counts]
     found["window.views"] = [*zip(counts, windows, strict=True)]
     return found
 
@@ -81,10 +81,10 @@ def series(full: bool) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
 def small_calls() -> None:
     """One small call of everything that is measured: libraries are loaded at first use, and belong to no size."""
     frame = Frame(torch.rand(1, 3, 120, 160), torch.ones(1, 120, 160), cam.Camera(*torch.full((2, 1, 2), 80.0)))
-    anchor, other = frame, frame.replace(image=frame.image.roll(2, -1))
+    reference, other = frame, frame.replace(image=frame.image.roll(2, -1))
     for method in METHODS.values():
-        method(anchor, other, n=64)
-    PAPER(anchor, pytree.stack([other]), n=64)
+        method(reference, other, n=64)
+    PAPER(reference, pytree.stack([other]), n=64)
 
 
 def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:

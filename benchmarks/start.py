@@ -83,7 +83,7 @@ def compiled(options: Any) -> dict[str, Any]:
             for code, record in ((cold, times[1]), (warm, times[0])):
                 cache = Path(folder) / f"{k}{len(record)}{code is warm}"
                 record.append(took(code, options.clock, TORCHINDUCTOR_CACHE_DIR=str(cache)))
-    return harness.row("start_compiled", times[0], "compiling", times[1], mode="compiled")
+    return harness.row("start_compiled", times[0], "compiling", times[1], mode="torch.compile")
 
 
 def main() -> None:

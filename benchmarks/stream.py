@@ -40,7 +40,7 @@ PEER = partial(
 
 
 def load() -> tuple[Recording, float, int, int]:
-    """A recording, its near limit and gap, and the anchor that is asked."""
+    """A recording, its near limit and gap, and the reference view that is asked."""
     root = os.environ.get("DHTORCH_DATA")
     if root:
         return data.open(Path(root) / "7s_redkitchen_stream_200"), 2.0, 20, 40
@@ -48,7 +48,7 @@ def load() -> tuple[Recording, float, int, int]:
 
 
 def measure(threads: int, options: Any) -> list[dict[str, Any]]:
-    """A row for a whole anchor and one for a frame of the stream."""
+    """A row for a whole reference view and one for a frame of the stream."""
     harness.set_threads(threads)
     recording, near, gap, i = load()
     seen: dict[int, Frame] = {}
@@ -70,7 +70,7 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
             WINDOW(view(i), five)
 
     ours, theirs = harness.in_turn([auto, window], repeats=options.repeats, clock=options.clock)
-    rows = [harness.row("auto_anchor", ours, "window", theirs, n=AUTO.n, batch=1, bar=True)]
+    rows = [harness.row("auto_reference_view", ours, "window", theirs, n=AUTO.n, batch=1, bar=True)]
 
     method = AUTO.replace(n=1024)
     stream = Stream(method)

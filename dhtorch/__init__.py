@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dhtorch.alignment.align import align_depth
+    from dhtorch.pipeline.dense import complete_depth
     from dhtorch.pipeline.method import Method
     from dhtorch.pipeline.pair import merge
     from dhtorch.pipeline.presets import AUTO, MAP, PAPER, WINDOW, extend
@@ -56,34 +57,36 @@ __all__ = [
     "ValidateDepth",
     "align_depth",
     "collate",
+    "complete_depth",
     "extend",
     "merge",
     "validate_depth",
 ]
 
-#: Where a public name lives, if not among the records.
+#: Public name → the module that defines it, where it is not ``records``.
 _HOMES = dict.fromkeys(("AUTO", "MAP", "PAPER", "WINDOW", "extend"), "pipeline.presets")
 _HOMES |= {
     "ExtendDepth": "transforms",
-    "JudgeDepth": "transforms",
     "Method": "pipeline.method",
     "Stream": "pipeline.stream",
-    "anchor": "alignment.align",
+    "ValidateDepth": "transforms",
+    "align_depth": "alignment.align",
     "collate": "pytree",
-    "judge": "validation.validate",
+    "complete_depth": "pipeline.dense",
     "merge": "pipeline.pair",
+    "validate_depth": "validation.validate",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name in __all__:
-        found = getattr(importlib.import_module(f"dhtorch.{_HOMES.get(name, 'records')}"), name)
+        value = getattr(importlib.import_module(f"dhtorch.{_HOMES.get(name, 'records')}"), name)
     elif not name.startswith("_") and importlib.util.find_spec(f"dhtorch.{name}") is not None:
-        found = importlib.import_module(f"dhtorch.{name}")
+        value = importlib.import_module(f"dhtorch.{name}")
     else:
         raise AttributeError(f"module 'dhtorch' has no attribute {name!r}")
-    globals()[name] = found
-    return found
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

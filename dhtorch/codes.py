@@ -86,7 +86,7 @@ class Source:
     SENSOR: Final = 1
     RECOVERED: Final = 2  #: a tracked sample, triangulated
     SWEPT: Final = 3  #: a pixel of a dense map, found on its epipolar line
-    ANCHORED: Final = 4  #: a pixel of somebody else's map, tied to returns and answers
+    ALIGNED: Final = 4  #: a pixel of somebody else's map, tied to returns and answers
 
 
 class State:

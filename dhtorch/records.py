@@ -115,9 +115,9 @@ NO_HINT = TrackHint()
 
 @record
 class Shutter(Record):
-    """How much further camera 1 is turned, row by row: y · turn, y the height of the anchor's ray (z = 1)."""
+    """How much further camera 1 is turned, row by row: y · turn, y the height of the reference view's ray (z = 1)."""
 
-    turn: Tensor  # (B, 3) rad per unit of y; 0 for a global shutter
+    shutter_rate: Tensor  # (B, 3) rad per unit of y; 0 for a global shutter
     cov: Tensor  # (B, 9, 9) of rotation (rad), translation (m) and turn together
 
 
@@ -134,7 +134,9 @@ class PoseFit(Record):
     t_snr: Tensor  # (B,) translation over its standard deviation, sqrt(tᵀ Σ_t⁻¹ t)
     code: Tensor  # (B,) int32, codes.PoseCode
     shutter: Shutter | None = None  # absent: one pose for all rows
-    looks: Tensor | None = None  # (B,) int32, which of geometry.conventions.CONVENTIONS fits where a pose is refuted
+    matched_convention: Tensor | None = (
+        None  # (B,) int32, which of geometry.pose_conventions.CONVENTIONS fits where a pose is refuted
+    )
 
     @property
     def ok(self) -> Tensor:
@@ -152,7 +154,7 @@ class PosePrior(Record):
 
     T_1_from_0: Pose  # not finite = not known
     cov: Tensor | None = None  # (B, 6, 6) of the left perturbation (rad, m); None = not stated
-    readings: Pose | None = None  # (B, K) the same numbers in geometry.conventions.CONVENTIONS; None = not asked
+    hypotheses: Pose | None = None  # (B, K) the same numbers in geometry.pose_conventions.CONVENTIONS; None = not asked
 
 
 @record
@@ -165,8 +167,10 @@ class ViewSelection(Record):
     """Which of V offered views are asked, and why these."""
 
     index: Tensor  # (views, B) int64, rising
-    worth: Tensor | None = None  # (views, B) what each added to those chosen before it; None = nobody said
-    mute: Tensor | None = None  # (V, B) bool: the view answered nothing, no pose or no baseline; None = nobody said
+    gain: Tensor | None = None  # (views, B) what each added to those chosen before it; None = nobody said
+    no_answer: Tensor | None = (
+        None  # (V, B) bool: the view answered nothing, no pose or no baseline; None = nobody said
+    )
 
 
 @record
@@ -244,17 +248,17 @@ class DepthValidation(Record):
     state: Tensor  # (B, h, w) int32, codes.State
     evidence: Tensor  # (B, h, w) of the kind that decided
     view: Tensor  # (B, h, w) int32, the other view that decided, in the order asked; -1 = our own answers, -2 = none
-    by_answers: Tensor  # (B, h, w) against near returns and triangulated points
-    by_views: Tensor  # (B, h, w) against the pictures of other views
-    by_maps: Tensor  # (B, h, w) against the same source's maps of other views; negative only: seen through
+    sparse_evidence: Tensor  # (B, h, w) against near returns and triangulated points
+    photometric_evidence: Tensor  # (B, h, w) against the pictures of other views
+    consistency_evidence: Tensor  # (B, h, w) against the same source's maps of other views; negative only: seen through
     scale: Tensor  # (B, 3) the map's metre over the true one; NaN where nothing but the map itself says what a metre is
     scale_near: Tensor  # (B, 3) by near returns alone
     scale_far: Tensor  # (B, 3) by triangulated points alone
-    ruler: Tensor  # (B, 3) the sensor's metre over that of the given trajectory
+    scale_vs_trajectory: Tensor  # (B, 3) the sensor's metre over that of the given trajectory
     shift: Tensor  # (B, 3) m, in the map = scale · truth + shift
     tilt: Tensor  # (B, 3) relative error from one side of the picture to the other, along its steepest direction
     wrong: Tensor  # (B, 3) share of wrong ones among pixels of which something is known
-    ceiling: Tensor  # (B,) m, where the map is cut: what is farther is said to lie there; NaN = it is not
+    clip_depth: Tensor  # (B,) m, where the map is cut: what is farther is said to lie there; NaN = it is not
 
     @property
     def known(self) -> Tensor:

@@ -70,7 +70,7 @@ def triptych(path: Path) -> None:
     """A picture, what the sensor may say of it, and what is known of it now, on one scale of depth."""
     scene = kitchen()
     recording = scene.recording
-    (pair,) = (p for p in by_choice(scene, stride=1) if p.anchor == FRAME)
+    (pair,) = (p for p in by_choice(scene, stride=1) if p.reference == FRAME)
     whole = recording[FRAME]
     near = range_split(whole, CUTOFF)
     others = stack([range_split(recording[k], CUTOFF) for k in pair.offered])

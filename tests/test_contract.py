@@ -1,4 +1,4 @@
-"""One contract, one table: every public function of geometry, stages and evaluate has a row, or the last test fails."""
+"""One contract, one table: every public function of geometry, stages and metrics has a row, or the last test fails."""
 
 import functools
 import importlib
@@ -596,7 +596,10 @@ ELSEWHERE = {
         f"dhtorch.validation.evidence.{name}"
         for name in ("references", "extent", "coarser", "centres", "loosened", "silent")
     ),
-    *(f"dhtorch.validation.evidence.{name}" for name in ("by_answers", "by_views", "by_maps", "nearest_surface")),
+    *(
+        f"dhtorch.validation.evidence.{name}"
+        for name in ("sparse_evidence", "by_views", "consistency_evidence", "nearest_surface")
+    ),
     *(f"dhtorch.validation.faults.{name}" for name in ("turned", "name_cause", "decided", "watch", "ray_lengths")),
     "dhtorch.metrics.detection.auroc",
     "dhtorch.alignment.align.align_depth",
@@ -835,7 +838,7 @@ def public_functions():
         validate,
         *ESTIMATORS,
     ]
-    for package in ("geometry", "stages", "evaluate", "integrate"):
+    for package in ("geometry", "stages", "metrics", "calibration", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
         found = pkgutil.iter_modules(module.__path__, f"dhtorch.{package}.")
         parts += [importlib.import_module(info.name) for info in found]

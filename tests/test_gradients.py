@@ -199,7 +199,7 @@ def recovered(*args):
 
 WHOLE = {
     "pnp_ransac": posed(pose.pnp_ransac),
-    "map_pose": posed(partial(pose.map_pose, turn_sigma=0.0, isotropic=1.0)),
+    "map_pose": posed(partial(pose.map_pose, shutter_sigma=0.0, isotropic=1.0)),
     "pose, two_view, merge": recovered,
 }
 
@@ -362,8 +362,8 @@ def test_half_precision_is_lifted_where_it_is_read(single, name, what, dtype):
 
 
 def test_a_window_of_half_precision():
-    anchor, *others = (f.to(torch.bfloat16) for f in views(room(), 0, 8, 16))
-    estimate = extend_window(anchor, pytree.stack(others), n=N)
+    reference, *others = (f.to(torch.bfloat16) for f in views(room(), 0, 8, 16))
+    estimate = extend_window(reference, pytree.stack(others), n=N)
     assert estimate.depth.dtype == torch.float32 and int(estimate.keep.sum()) > 20
     assert estimate.depth[estimate.keep].isfinite().all()
 
@@ -384,7 +384,7 @@ class Task:
         pairs = [views(each, 0, 16, dtype=torch.float32) for each in rooms]
         whole = pytree.collate([each[0] for each in rooms])
         self.near, self.other = (pytree.collate(frames) for frames in zip(*pairs, strict=True))
-        self.method = METHODS["map"].replace(n=n, pose={"turn_sigma": 0.0})  # a global shutter
+        self.method = METHODS["map"].replace(n=n, pose={"shutter_sigma": 0.0})  # a global shutter
         trace = {}
         self.method(self.near, self.other, trace=trace)
         self.tracks, self.samples = trace["tracks"], trace["samples"]

@@ -15,8 +15,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "extract.enriched": [
         ("MAP_SIGMA_STEPS", "8", "4"),
         ("camera_feature", '.replace("/", "_")', ""),
-        ("MapRowDataset.features", "if anchor.hw != view.hw:", "if False:"),
-        ("MapRowDataset.features", "if get_distortion(anchor) != view.lens:", "if False:"),
+        ("MapRowDataset.features", "if reference.hw != view.hw:", "if False:"),
+        ("MapRowDataset.features", "if get_distortion(reference) != view.lens:", "if False:"),
         ("MapRowDataset.features", "why[source == Source.NONE]", "why[source != Source.NONE]"),
         ("MapRowDataset.features", "self.step / MAP_SIGMA_STEPS", "self.step"),
         ("_refuted_code", "1 + looks if", "looks if"),
@@ -56,7 +56,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("RldsSource.batches", "at / self.fps", "at"),
         ("RldsSource.batches", "if text not in tasks]", "]"),
         ("_column_name", 'f"source.{found}" if found in _RESERVED_COLUMNS else found', "found"),
-        ("_read_cells", "content[:2] == _JPEG_MAGIC", "content[:2] != _JPEG_MAGIC"),
+        ("_read_cells", "content[:2] == _JPEG", "content[:2] != _JPEG"),
     ],
     "extract.targets": [
         ("MapCounts.summary", "max(1, pixels[at].sum())", "1"),

@@ -86,10 +86,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "stages.holes": [
         (
             "_class_of_flag",
-            "((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),\n"
-            "        ((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),",
-            "((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),\n"
-            "        ((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),",
+            "((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),\n        ((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),",
+            "((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),\n        ((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),",
         ),
         ("_class_of_flag", "torch.arange(256", "torch.arange(129"),
         ("_first_class", " & (hole == Hole.TRACKABLE_NO_LIDAR)", ""),
@@ -156,7 +154,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "geometry, cov, fit.cov.nan_to_num()",
         ),
         ("_relative_noise", "fit.inlier & (samples.depth > 0)", "samples.depth > 0"),
-        ("_relative_noise", "masked_median(relative, used), 0.0", "masked_median(relative, used), 1.0"),
+        ("_relative_noise", "median(relative, used), 0.0", "median(relative, used), 1.0"),
         ("_fitted", "* (scale * scale)", "* scale"),
         ("_fitted", "noise_shape(cov, tracked, isotropic)", "noise_shape(cov, tracked, 0.1)"),
         (

@@ -50,7 +50,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "transforms.poses": [
         ("check_constant_pose", 'or kind != "1_from_0"', ""),
         ("parse_pose_sigmas", "0 <= s < ", "0 < s < "),
-        ("read_pose_priors", "refuted_pose_keys[1] or name", "name"),
+        ("read_pose_priors", "keys[1] or name", "name"),
         (
             "read_pose_priors",
             "conventions.motion_from_axes(_read_pose(leaves, name, T[1], place, unit, checks), M)",

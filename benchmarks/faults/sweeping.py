@@ -65,14 +65,14 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_check_options", "low <= value <= high", "value <= high"),
         ("dense_options", "isinstance(value, bool) or not", "not"),
         ("top_views", "& ~asked.samples.usable", "& asked.samples.usable"),
-        ("top_views", "worth[:partners] > MIN_VIEW_GAIN", "worth[:partners] >= 0"),
+        ("top_views", "gain[:source_views] > MIN_VIEW_GAIN", "gain[:source_views] >= 0"),
         (
             "source_view_of",
             "torch.where(fit.ok[:, None], fit.T_1_from_0.t.to(like), eye[0])",
             "fit.T_1_from_0.t.to(like)",
         ),
         ("_nearest", "torch.where(sparse, ((1 - REACH_QUANTILE) * n).long(), last)", "last"),
-        ("_nearest", "SWEEP_OVERLAP * found", "found"),
+        ("_nearest", "OVERLAP * found", "found"),
         ("_pair_gate", "(none & still.any(0), Gate.NO_BASELINE),\n", ""),
         ("_pair_gate", "(moving, Gate.CONTRADICTED),\n", ""),
         ("_gated", "(found.correlation < min_correlation)", "(found.correlation > 1)"),
@@ -91,7 +91,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "pipeline.surface": [
         ("sweep_planes", "(best.plane + best.shift) * step", "best.plane * step"),
         ("sweep_planes", ">= MIN_SECOND_BEST_MARGIN * each", ">= 0 * each"),
-        ("_idle_cost", "plane_sweep.N_PATHS * plane_sweep.UNSEEN_COST", "plane_sweep.UNSEEN_COST"),
+        ("_idle_cost", "plane_sweep.N_PATHS * plane_sweep.UNSEEN", "plane_sweep.UNSEEN"),
         ("_second_best_reach", "torch.stack(moved).amax(0)", "torch.stack(moved).amin(0)"),
         ("refine_surface", "(start.misfit / NOMINAL_COST).square()", "(NOMINAL_COST / start.misfit).square()"),
         ("refine_surface", "+ edge.square()", ""),
@@ -106,7 +106,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("pose_variance", "-(gx * x + gy * y) * inv_z", "(gx * x + gy * y) * inv_z"),
     ],
     "transforms.maps": [
-        ("DenseMaps.swept", "self.sensed(read.anchor, method), found", "found, found"),
+        ("DenseMaps.swept", "self.sensed(read.reference, method), found", "found, found"),
         ("DenseMaps.swept", '"calibration": self.calibration, ', ""),
         ("map_to_keys", "torch.where(found.keep, found.depth, 0.0)", "found.depth"),
         ("map_to_keys", '"gate_map": found.gate', '"gate_map": found.source'),
@@ -115,7 +115,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "ops.loader": [
         ("cache", "if own:", "if not own:"),
         ("library", "torch.__version__, ", ""),
-        ("library", "describe_processor(), ", ""),
+        ("library", "processor(), ", ""),
         ("build", "if done.returncode:", "if False:"),
         ("load", "if not path.is_file():", "if False:"),
         ("serves", "torch.compiler.is_compiling() or forward_ad._current_level >= 0", "torch.compiler.is_compiling()"),

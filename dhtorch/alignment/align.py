@@ -1,11 +1,11 @@
 """Anybody's depth in metres: a map tied to near returns and far answers, with a sigma for every pixel.
 
     map ─┐                ┌─ right as it is ───────┐
-         ├─ robust fits ──┼─ scale, shift, or both ┼─ the one under which the anchors are most probable ─ DepthMap
-    anchors ┘             └─ and a smooth field ───┘        └─ its rivals, and anchors left out: sigma
+         ├─ robust fits ──┼─ scale, shift, or both ┼─ the one under which the references are most probable ─ DepthMap
+    references ┘             └─ and a smooth field ───┘        └─ its rivals, and references left out: sigma
 
 What a map lacks is a metre, then a shift, then a slow drift over picture and depth
-(:mod:`dhtorch.alignment.error_model`). More is believed only as far as it makes the anchors more probable than its
+(:mod:`dhtorch.alignment.error_model`). More is believed only as far as it makes the references more probable than its
 freedom costs, and tells those that were left out better; where it does not, the map is left alone.
 
 Alphabet: ``x`` value of the map, ``r`` residual of log depth, ``K`` models, ``M`` the most probable ones.
@@ -52,13 +52,13 @@ _OF_KIND: Final = {
     "ordinal": tuple(MODEL_HEADS),
 }
 
-#: Fewest anchors of a fit, and most models that share in sigma.
+#: Fewest references of a fit, and most models that share in sigma.
 MIN_REFERENCES, MAX_MODELS = 8, 3
 
 #: Pixels between places where what varies slowly over the picture is found.
 FIELD_STRIDE_PX: Final = 8
 
-#: Anchors are left out in so many turns: scattered blocks, and quarters of the picture.
+#: References are left out in so many turns: scattered blocks, and quarters of the picture.
 N_SCATTERED_FOLDS, N_QUADRANT_FOLDS = 4, 4
 
 #: Relative error below which nobody asks which of two models fits a near return better.
@@ -73,7 +73,7 @@ LOSS_ROUNDING: Final = 1e-6
 #: What is lost by a model that could not be fitted.
 FAILED_FIT_LOSS: Final = 10.0
 
-#: Bounds of what the anchors left out do to sigma, and how many leave it as it is.
+#: Bounds of what the references left out do to sigma, and how many leave it as it is.
 SIGMA_SCALE_RANGE, SIGMA_SCALE_PRIOR = (0.3, 4.0), 20
 
 #: Least probability of a power that is part of sigma: less changes no interval that nine of ten errors lie in.
@@ -87,17 +87,17 @@ HUBER_BEND: Final = 0.03
 
 
 class ModelSelection(NamedTuple):
-    """How probable the models are, and what the anchors say of sigma; for reports."""
+    """How probable the models are, and what the references say of sigma; for reports."""
 
     model: Tensor  # (B,) int64, the taken one's place in ``names``; -1 where there is none
     names: tuple[str, ...]
-    weight: Tensor  # (B, K) probability by the evidence of all anchors; the taken one need not be the likeliest
+    weight: Tensor  # (B, K) probability by the evidence of all references; the taken one need not be the likeliest
     factor: Tensor  # (B,) by which sigma was stretched
 
 
 def align_depth(
     depth_map: Tensor,  # (B, h, w) or DepthMap
-    anchors: Samples | Estimate | DepthMap | Sequence[Samples | Estimate | DepthMap],
+    references: Samples | Estimate | DepthMap | Sequence[Samples | Estimate | DepthMap],
     *,
     hw: tuple[int, int] | None = None,
     kind: str = "metric",
@@ -106,24 +106,24 @@ def align_depth(
 ) -> DepthMap:
     """A map of anybody's, in metres, with a sigma for every pixel.
 
-    Robust fits (Student's t) tie the map to the anchors: nothing, a scale, a shift, both; on top a tilt or a field
+    Robust fits (Student's t) tie the map to the references: nothing, a scale, a shift, both; on top a tilt or a field
     over the picture and a correction over depth, both Gaussian processes, so that they are zero away from
-    anchors. How far anchors are off by themselves is found with each fit, and how heavy the tails of near returns are
-    with the answer's. How probable the anchors are under a fit (its evidence) says which may be taken; it is, in place
-    of a plain head, only where anchors that were left out bear it out. Its two nearest rivals are part of sigma. An
-    error that all far answers share (the motion's) is an unknown of the fit and no part of the answer.
+    references. How far references are off by themselves is found with each fit, and how heavy the tails of near returns
+    are with the answer's. How probable the references are under a fit (its evidence) says which may be taken; it is, in
+    place of a plain head, only where references that were left out bear it out. Its two nearest rivals are part of
+    sigma. An error that all far answers share (the motion's) is an unknown of the fit and no part of the answer.
 
-    Sigma is the covariance of what was fitted, stretched until anchors that were left out (scattered blocks, and whole
-    quarters of the picture) lie within it as often as they should; what the models disagree by, and a power of the map
-    where near returns do not tell it from them; and how far near
+    Sigma is the covariance of what was fitted, stretched until references that were left out (scattered blocks, and
+    whole quarters of the picture) lie within it as often as they should; what the models disagree by, and a power of
+    the map where near returns do not tell it from them; and how far near
     returns scatter about the map where it is as rough as around a pixel, more where they are off in places
-    (:mod:`dhtorch.alignment.residual_noise`). It is against the anchors' own metre: what all near returns are wrong by,
-    nothing here can tell.
+    (:mod:`dhtorch.alignment.residual_noise`). It is against the references' own metre: what all near returns are wrong
+    by, nothing here can tell.
 
     Args:
         depth_map: values (B, h, w) over the field of the picture; not finite, or not positive where depth is meant,
             is no value.
-        anchors: near returns (usable ``Samples``), far answers (``Estimate``) or maps (``DepthMap``; pixels whose
+        references: near returns (usable ``Samples``), far answers (``Estimate``) or maps (``DepthMap``; pixels whose
             source is the sensor count as near), one or several.
         hw: height and width of the picture in whose pixels samples and estimates are; None = the map's.
         kind: ``metric`` (may be right as it is), ``scale``, ``affine`` (depth up to scale and shift), ``inverse``
@@ -132,13 +132,13 @@ def align_depth(
         trace: gets ``chosen``.
 
     Returns:
-        DepthMap of source ANCHORED. Score is 0.1 / (0.1 + sigma / depth). Gates: NO_TRACK where the map has no value,
-        NO_POSE where the anchors are fewer than eight or no model can be fitted, UNCERTAIN.
+        DepthMap of source ALIGNED. Score is 0.1 / (0.1 + sigma / depth). Gates: NO_TRACK where the map has no value,
+        NO_POSE where the references are fewer than eight or no model can be fitted, UNCERTAIN.
 
     Raises:
-        ValueError: wrong shapes, an unknown kind, no anchors, a limit that is not positive.
+        ValueError: wrong shapes, an unknown kind, no references, a limit that is not positive.
 
-    Gradient: depth to the map and to the anchors' depth, by the implicit function theorem (first order); the
+    Gradient: depth to the map and to the references' depth, by the implicit function theorem (first order); the
     choice of the model, where fits start, ``ordinal``'s order of values and the answer's sigma carry none.
     Cost: mostly that of the fits, which does not grow with the map's size.
     Source: Student's t by expectation and maximisation: K. Lange et al., "Robust statistical modeling using the t
@@ -146,14 +146,14 @@ def align_depth(
     "Cross-validation strategies for data with structure", 2017.
     """
     values = depth_map.depth if isinstance(depth_map, DepthMap) else depth_map
-    check("anchor", depth_map=(values, "B h w"))
+    check("align_depth", depth_map=(values, "B h w"))
     if kind not in ALIGNMENT_KINDS:
-        raise ValueError(f"anchor: kind is {kind!r}, expected one of {', '.join(ALIGNMENT_KINDS)}")
+        raise ValueError(f"align_depth: kind is {kind!r}, expected one of {', '.join(ALIGNMENT_KINDS)}")
     if not max_sigma_rel > 0:
-        raise ValueError(f"anchor: max_sigma_rel is {max_sigma_rel}, expected a positive number")
-    given = [anchors] if isinstance(anchors, Samples | Estimate | DepthMap) else list(anchors)
+        raise ValueError(f"align_depth: max_sigma_rel is {max_sigma_rel}, expected a positive number")
+    given = [references] if isinstance(references, Samples | Estimate | DepthMap) else list(references)
     if not given:
-        raise ValueError("anchor: found no anchors, expected near returns, far answers, or both")
+        raise ValueError("align_depth: found no references, expected near returns, far answers, or both")
     x = values.double()
     known = x.isfinite() & ((x > 0) if kind in ("metric", "scale") else torch.ones_like(x, dtype=torch.bool))
     known = known & (depth_map.keep if isinstance(depth_map, DepthMap) else known)
@@ -163,7 +163,7 @@ def align_depth(
         x, at = _isotonic_map(x, points), _isotonic_map(points.x, points)
         within = sample_at_references(local_spread(torch.where(known, x, torch.nan)), points.share)[0]
         points = points._replace(x=at, within=torch.where(points.used, within, 0.0))
-    elif kind != "metric":  # values of any unit: 1 is the median of the anchored ones
+    elif kind != "metric":  # values of any unit: 1 is the median of the aligned ones
         unit = masked_median(points.x.detach().abs(), points.used).clamp_min(1e-12)
         x, points = x / unit[..., None], points._replace(x=points.x / unit, within=points.within / unit)
     task = _task(x, known, points, of_depth=kind != "inverse")
@@ -204,7 +204,7 @@ def _initial_heads(x: Tensor, y: Tensor, points: MetricReferences) -> Tensor:
 
 
 class _LeftOut(NamedTuple):
-    """Anchors left out in turns T, as C models predict them."""
+    """References left out in turns T, as C models predict them."""
 
     r: Tensor  # (B, C, T, N) residuals of log depth, NaN where they were not left out
     var: Tensor  # (B, C, T, N) of the residual, as the model states it
@@ -229,7 +229,7 @@ def _select_model(task: AlignmentProblem, names: tuple[str, ...]) -> tuple[Error
         taken = _simplest(points, left, heads, head)[:, None]
         factor = _sigma_scale(points, left, taken)
         best = asked.gather(1, taken)
-        # What the anchors left out do not tell from the most probable model shares alike with it.
+        # What the references left out do not tell from the most probable model shares alike with it.
         share = weight.scatter(1, best, weight.amax(-1, keepdim=True))
         rivals = share.scatter(1, best, 2.0).topk(min(MAX_MODELS, len(names)), -1).indices
         model = torch.where(some, best[:, 0], -1)
@@ -240,7 +240,7 @@ def _select_model(task: AlignmentProblem, names: tuple[str, ...]) -> tuple[Error
 
 
 def _cross_validate(task: AlignmentProblem, model: Tensor) -> _LeftOut:
-    """Anchors as models (B, C) predict them that were fitted without them."""
+    """References as models (B, C) predict them that were fitted without them."""
     points = task.points
     cell = points.block // 2
     row, column = cell // ERROR_BLOCKS[1], cell % ERROR_BLOCKS[1]
@@ -299,14 +299,14 @@ class _BlockLosses(NamedTuple):
     """What models lose in blocks of the picture, near and far ones being two."""
 
     mean: Tensor  # (B, C, blocks)
-    mass: Tensor  # (B, 1, blocks) share of all, as far as anchors of one block count as fewer
+    mass: Tensor  # (B, 1, blocks) share of all, as far as references of one block count as fewer
     met: Tensor  # (B, C) median relative error of near returns
 
 
 def _block_losses(points: MetricReferences, left: _LeftOut) -> _BlockLosses:
-    """The loss of an anchor is the logarithm of how far it is off, above what it may be off by itself: for far answers
-    what they state, for near returns the least median that any model leaves, since returns are often better than they
-    say. A core that a model fits exactly so outweighs a tail that another makes shorter."""
+    """The loss of a reference is the logarithm of how far it is off, above what it may be off by itself: for far
+    answers what they state, for near returns the least median that any model leaves, since returns are often better
+    than they say. A core that a model fits exactly so outweighs a tail that another makes shorter."""
     r = left.r.square().nanmean(2).sqrt()
     near = torch.where(points.near[:, None], r, torch.nan).nanmedian(-1).values
     core = near.nan_to_num(torch.inf).amin(-1).clamp(EXACT_FIT_ERROR, MIN_RETURN_ERROR)[:, None]
@@ -323,7 +323,7 @@ def _block_losses(points: MetricReferences, left: _LeftOut) -> _BlockLosses:
 
 
 def _sigma_scale(points: MetricReferences, left: _LeftOut, taken: Tensor) -> Tensor:
-    """By how much sigma (B,) must grow or shrink for 68 % of the near anchors left out to lie within one."""
+    """By how much sigma (B,) must grow or shrink for 68 % of the near references left out to lie within one."""
     r, var = (part.gather(1, taken[..., None, None].expand(-1, 1, *part.shape[2:]))[:, 0] for part in left)
     ratio = torch.where(points.near[:, None], r.abs() / var.sqrt(), torch.nan).flatten(1)
     n = ratio.isfinite().sum(-1)
@@ -360,7 +360,7 @@ def _average_models(
 
 def _power_law_variance(task: AlignmentProblem, found: tuple[Tensor, Tensor, Tensor], x: Tensor, log: Tensor) -> Tensor:
     """Variance (B, h, w) of log depth: how far a power of the map, fitted to near returns, is from the answer, as far
-    as anchors leave it as probable. Over a short range a line and a power are alike, and beyond it they are not; far
+    as references leave it as probable. Over a short range a line and a power are alike, and beyond it they are not; far
     answers tell them apart as far as an error that all of them may share lets them."""
     points = task.points
     mean, noise, model = found
@@ -447,14 +447,14 @@ def _aligned_map(
         depth=torch.where(keep, depth, torch.nan).to(dtype),
         sigma=torch.where(keep, sigma_rel * depth.detach(), torch.nan).to(dtype),
         score=torch.where(keep, 0.1 / (0.1 + sigma_rel), 0.0).to(dtype),
-        source=torch.where(keep, Source.ANCHORED, Source.NONE).to(torch.int32),
+        source=torch.where(keep, Source.ALIGNED, Source.NONE).to(torch.int32),
         gate=gate,
     )
 
 
 def _isotonic_map(x: Tensor, points: MetricReferences) -> Tensor:
-    """Values through the rising broken line that fits the anchors' depths best: means of equally many anchors, joined
-    where they fall (isotonic regression as its min-max formula)."""
+    """Values through the rising broken line that fits the references' depths best: means of equally many references,
+    joined where they fall (isotonic regression as its min-max formula)."""
     n_knots = 12
     huge = torch.where(points.used, points.x.detach(), torch.inf)
     order = huge.argsort(-1)

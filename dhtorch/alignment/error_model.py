@@ -1,8 +1,8 @@
-"""What may be wrong with somebody's map, fitted to anchors: a metre, a shift, a tilt, a slow drift.
+"""What may be wrong with somebody's map, fitted to references: a metre, a shift, a tilt, a slow drift.
 
 All models are one line of unknowns, nested by what is believed of them beforehand: what a model does not have is held
-at zero. They are fitted together, robustly, with the anchors' own noise among the unknowns, and each says how probable
-the anchors are under it: what it explains, less what it could have explained as well.
+at zero. They are fitted together, robustly, with the references' own noise among the unknowns, and each says how
+probable the references are under it: what it explains, less what it could have explained as well.
 
 Alphabet: ``x`` value of the map, ``y = s x + t`` its head, depth or inverse depth; ``phi`` what else may be wrong with
 log depth; ``xi`` all unknowns in standard deviations of what is believed; ``r`` residual of log depth; ``M`` fits, of
@@ -30,7 +30,7 @@ N_TILT_SLOPES, N_MOTION_ERRORS = 2, 4
 #: of the range.
 FIELD_LENGTHS, CURVE_LENGTH = (0.3, 0.13), 0.4
 
-#: Degrees of freedom of Student's t: as heavy a tail as keeps a fit where nearly half of the anchors are wrong; and
+#: Degrees of freedom of Student's t: as heavy a tail as keeps a fit where nearly half of the references are wrong; and
 #: lighter ones, for near returns that are found to have no such tail.
 STUDENT_FREEDOM: Final = 1.0
 LIGHTER_FREEDOMS: Final = (2.0, 4.0, 8.0, 30.0)
@@ -38,14 +38,14 @@ LIGHTER_FREEDOMS: Final = (2.0, 4.0, 8.0, 30.0)
 #: Share of a t distribution's scale that 68 % lie within.
 T1_68_QUANTILE: Final = 1.84
 
-#: Least relative noise of an anchor; bounds of the factors on what near and far anchors state.
+#: Least relative noise of a reference; bounds of the factors on what near and far references state.
 MIN_REFERENCE_NOISE: Final = 3e-4
 NEAR_NOISE_RANGE, FAR_NOISE_RANGE = (1e-4, 1e4), (0.4, 8.0)
 
-#: Anchors for which what is stated of their noise counts.
+#: References for which what is stated of their noise counts.
 STATED_NOISE_WEIGHT: Final = 0.1
 
-#: Standard deviations of what is believed of scale (as a share) and shift (as a share of the anchors' median).
+#: Standard deviations of what is believed of scale (as a share) and shift (as a share of the references' median).
 SCALE_PRIOR_SIGMA, SHIFT_PRIOR_SIGMA = 1.0, 0.5
 
 #: Least head, as a share of where a fit starts and of a usual value.
@@ -114,7 +114,7 @@ class ErrorBasis(NamedTuple):
 
 
 class AlignmentProblem(NamedTuple):
-    """A map and its anchors, ready to be fitted."""
+    """A map and its references, ready to be fitted."""
 
     points: MetricReferences
     basis: ErrorBasis
@@ -123,14 +123,14 @@ class AlignmentProblem(NamedTuple):
 
 
 class ErrorModelFit(NamedTuple):
-    """Models fitted to the anchors of a map, (B, K, …)."""
+    """Models fitted to the references of a map, (B, K, …)."""
 
     model: Tensor  # (B, K) int64, place in MODELS
     head: Tensor  # (B, K, 2) s and t
     beta: Tensor  # (B, K, SLOPES + F + KNOTS) slopes, nodes, knots
     spread: Tensor  # (B, K, P', P): times its transpose it is the covariance of head and beta
-    noise: Tensor  # (B, K, 2) factors of what near and far anchors state
-    evidence: Tensor  # (B, K) log probability of the anchors; -inf where it could not be fitted
+    noise: Tensor  # (B, K, 2) factors of what near and far references state
+    evidence: Tensor  # (B, K) log probability of the references; -inf where it could not be fitted
 
     def pick(self, at: Tensor) -> ErrorModelFit:
         """The models (B, K') at places ``at`` among these."""
@@ -215,7 +215,7 @@ def predict_log_depth(head: Tensor, x: Tensor, basis: ErrorBasis) -> tuple[Tenso
 
 
 def predict_references(fit: ErrorModelFit, task: AlignmentProblem) -> tuple[Tensor, Tensor]:
-    """Log depth (B, K, N) at the anchors and its variance."""
+    """Log depth (B, K, N) at the references and its variance."""
     points, basis = task.points, task.basis
     x = points.x[:, None].expand(-1, fit.head.shape[1], -1)
     log, slope = predict_log_depth(fit.head, x, basis)
@@ -228,7 +228,7 @@ def predict_references(fit: ErrorModelFit, task: AlignmentProblem) -> tuple[Tens
 
 
 def placement_variance(head: Tensor, points: MetricReferences) -> Tensor:
-    """Variance (B, K, N) of the log depth that heads (B, K, 2) give anchors, by where in its pixel each stands.
+    """Variance (B, K, N) of the log depth that heads (B, K, 2) give references, by where in its pixel each stands.
     Gradient: none."""
     with torch.no_grad():
         y = (points.x[:, None] * head[..., :1] + head[..., 1:]).clamp_min(MIN_HEAD)
@@ -260,7 +260,7 @@ class _Problem(NamedTuple):
         return r, torch.cat((slope * self.head_sd[:, None], self.phi), -1)
 
     def square(self, noise: Tensor) -> Tensor:
-        """Variance (M, N) of the anchors' own noise under factors (M, 2)."""
+        """Variance (M, N) of the references' own noise under factors (M, 2)."""
         factor = torch.where(self.near, noise[:, :1], noise[:, 1:])
         return (factor.square() * self.var).clamp_min(MIN_REFERENCE_NOISE**2)
 
@@ -299,14 +299,15 @@ def fit_models(
     model: Tensor,  # (B, K) int64
     used: Tensor,  # (B, N) bool, or (B, K, N)
     steps: int = SELECTION_STEPS,
-    freedom: Tensor | None = None,  # (B,) of near anchors
+    freedom: Tensor | None = None,  # (B,) of near references
 ) -> ErrorModelFit:
-    """Models fitted to the anchors that are used.
+    """Models fitted to the references that are used.
 
     Student's t by expectation and maximisation, noise and all, on Gauss–Newton steps; the evidence is Laplace's, with
-    anchors of one block counting as fewer.
+    references of one block counting as fewer.
 
-    Gradient: head and beta to the map's values and the anchors' depth and variance, by the implicit function theorem.
+    Gradient: head and beta to the map's values and the references' depth and variance, by the implicit function
+        theorem.
     """
     p = _problem(task, model, used)
     if freedom is not None:
@@ -332,7 +333,7 @@ def fit_models(
 
 
 def estimate_freedom(r: Tensor, points: MetricReferences) -> Tensor:
-    """Degrees of freedom (B,) under which residuals (B, N) of near anchors are likeliest. Gradient: none."""
+    """Degrees of freedom (B,) under which residuals (B, N) of near references are likeliest. Gradient: none."""
     with torch.no_grad():
         near = points.used & points.near
         weight = points.weight(points.used) * near
@@ -414,7 +415,7 @@ def _optimum(p: _Problem, steps: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _laplace(p: _Problem, xi: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """A root (M, P, P) of the covariance, log probability (M,) of the anchors, whether there is one (M,)."""
+    """A root (M, P, P) of the covariance, log probability (M,) of the references, whether there is one (M,)."""
     r, A = p.missed(xi)
     square = p.square(noise)
     eye = torch.eye(xi.shape[1]).to(xi)

@@ -1,6 +1,7 @@
 """What is known in metres on the pixels of somebody's map: near returns, far answers, other maps.
 
-Alphabet: ``x`` value of the map at an anchor, ``depth`` what the anchor says, ``var`` the variance of its logarithm.
+Alphabet: ``x`` value of the map at a reference, ``depth`` what the reference says, ``var`` the variance of its
+    logarithm.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.records import DepthMap, Estimate, Samples
 
-#: Anchors of one source that are used at most, evenly spread over its samples or pixels.
+#: References of one source that are used at most, evenly spread over its samples or pixels.
 MAX_REFERENCES_PER_SOURCE: Final = 512
 
 #: Relative error that every return may have beside what it states.
@@ -30,7 +31,8 @@ FAR_OWN_ERROR, FAR_SHARED_ERROR = 0.02, 0.05
 #: Share of a far map's variance that all its pixels share (its motion's).
 MAP_SHARED_RATIO: Final = 0.5
 
-#: Blocks (rows, columns) of the picture whose anchors have errors in common, and share of the variance that they have.
+#: Blocks (rows, columns) of the picture whose references have errors in common, and share of the variance that they
+#: have.
 ERROR_BLOCKS: Final = (6, 8)
 BLOCK_CORRELATION: Final = 0.3
 
@@ -57,11 +59,11 @@ class MetricReferences(NamedTuple):
 
     @property
     def of_block(self) -> Tensor:
-        """Which anchors are in which block (B, N, blocks): 1, else 0."""
+        """Which references are in which block (B, N, blocks): 1, else 0."""
         return F.one_hot(self.block, 2 * ERROR_BLOCKS[0] * ERROR_BLOCKS[1]).to(self.x)
 
     def weight(self, used: Tensor) -> Tensor:
-        """How many anchors each of those ``used`` (B, N) counts as among its block's, 0 of the others."""
+        """How many references each of those ``used`` (B, N) counts as among its block's, 0 of the others."""
         count = self.x.new_zeros(len(used), 2 * ERROR_BLOCKS[0] * ERROR_BLOCKS[1])
         count = count.scatter_add(1, self.block, used.to(count)).gather(1, self.block)
         return used / (1 + BLOCK_CORRELATION * (count - 1).clamp_min(0))
@@ -72,7 +74,7 @@ def collect_references(
     given: Sequence[Samples | Estimate | DepthMap],
     hw: tuple[int, int],
 ) -> MetricReferences:
-    """All anchors on the pixels of a map, NaN where it has no value; those without one are not used.
+    """All references on the pixels of a map, NaN where it has no value; those without one are not used.
 
     Args:
         x: the map.
@@ -84,7 +86,7 @@ def collect_references(
     parts = [_of_map(one) if isinstance(one, DepthMap) else _of_points(one, hw) for one in given]
     found = []
     for share, depth, sigma, together, near, keep in parts:
-        check("anchor", depth_map=(x, "B h w"), anchors=(share, "B N 2"))
+        check("collect_references", depth_map=(x, "B h w"), references=(share, "B N 2"))
         n = depth.shape[1]
         pick = torch.linspace(0, n - 1, min(n, MAX_REFERENCES_PER_SOURCE), device=x.device).round().long()
         found.append(_read(x, share[:, pick], tuple(part[:, pick] for part in (depth, sigma, together, near, keep))))
@@ -109,7 +111,7 @@ def _of_points(one: Samples | Estimate, hw: tuple[int, int]) -> tuple[Tensor, ..
 
 
 def _read(x: Tensor, share: Tensor, told: tuple[Tensor, ...]) -> MetricReferences:
-    """The map at anchors, and their variances."""
+    """The map at references, and their variances."""
     depth, sigma, together, near, keep = told
     value, inside = sample_at_references(x, share)
     use = keep & inside & value.isfinite() & depth.isfinite() & (depth > 0) & sigma.isfinite() & (sigma >= 0)

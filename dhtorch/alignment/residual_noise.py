@@ -7,7 +7,7 @@ left goes with how rough the map is around: two levels, of the flatter and the r
 returns are off by far more than that, so are the pixels around them on the same surface. What chance alone may have
 made is nobody's error: both kinds of going together count as far as they exceed their standard error.
 
-Alphabet: ``r`` residual of log depth at anchors; ``read`` its variance by where in the pixel they stand; ``h`` how
+Alphabet: ``r`` residual of log depth at references; ``read`` its variance by where in the pixel they stand; ``h`` how
 rough the map is; ``G`` candidates of a level.
 """
 
@@ -82,7 +82,7 @@ def residual_variance(
 
     What the fit itself may be off by is no scatter: as far as its sigma reaches, residuals are taken from their middle.
 
-    Gradient: none. Cost: that of a few images; anchors are seen on a coarse grid of places and depths.
+    Gradient: none. Cost: that of a few images; references are seen on a coarse grid of places and depths.
     Raises ValueError for wrong shapes.
     """
     read, of_fit = told
@@ -219,7 +219,7 @@ def _levels(r: Tensor, read: Tensor, h: Tensor, among: tuple[Tensor, Tensor]) ->
 
 
 def _inlier_probability(r: Tensor, levels: Tensor, read: Tensor, among: Tensor) -> Tensor:
-    """How probable (B, N) it is that anchors are read where they stand, under the likeliest of ``levels`` (B, G, N),
+    """How probable (B, N) it is that references are read where they stand, under the likeliest of ``levels`` (B, G, N),
     squared scales of their errors; 0 of those that are not ``among`` them."""
     there, beside = (
         1 / (v.sqrt() * (1 + r[:, None].square() / v)) for v in (levels, levels + read[:, None] / CAUCHY_68_QUANTILE**2)
@@ -239,12 +239,12 @@ def _quantile_68(value: Tensor, weight: Tensor) -> Tensor:
 
 def _local_variance(
     share: Tensor,  # (B, N, 2)
-    level: Tensor,  # (B, N) log depth of the map at anchors
+    level: Tensor,  # (B, N) log depth of the map at references
     found: tuple[Tensor, Tensor],  # (B, N) what they are off by, squared; which count
     log: Tensor,  # (B, h, w)
     known: Tensor,  # (B, h, w)
 ) -> Tensor:
-    """Mean (B, h, w) of what anchors are off by, of those around each pixel and about as deep: a bilateral grid."""
+    """Mean (B, h, w) of what references are off by, of those around each pixel and about as deep: a bilateral grid."""
     excess, used = found
     rows, columns = log.shape[-2:]
     sides = _sides(log)

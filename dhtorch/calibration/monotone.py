@@ -84,12 +84,12 @@ def fit_isotonic(
     Source: M. Ayer et al., "An empirical distribution function for sampling with incomplete information", 1955;
     A. Oron, N. Flournoy, "Centered isotonic regression", 2017 (the middles of blocks).
     """
-    check("isotonic", x=(x, "n"), y=(y, "n"), weight=(weight, "n"))
+    check("fit_isotonic", x=(x, "n"), y=(y, "n"), weight=(weight, "n"))
     x, y = x.detach().double(), y.detach().double()
     weight = torch.ones_like(x) if weight is None else weight.detach().double()
     x, y, weight = (v[weight > 0] for v in (x, y, weight))
     if not x.numel():
-        raise ValueError("isotonic: found no point with weight, expected at least one")
+        raise ValueError("fit_isotonic: found no point with weight, expected at least one")
     at, group = x.unique(return_inverse=True)
     mass = torch.zeros_like(at).index_add(0, group, weight)
     mean = torch.zeros_like(at).index_add(0, group, weight * y) / mass
@@ -142,7 +142,7 @@ def fit_platt(
     Source: J. Platt, "Probabilistic outputs for support vector machines", 1999; C. Guo et al., "On calibration of
     modern neural networks", 2017.
     """
-    check("platt", p=(p, "n"), good=(good, "n"), weight=(weight, "n"))
+    check("fit_platt", p=(p, "n"), good=(good, "n"), weight=(weight, "n"))
     weight = torch.ones_like(p) if weight is None else weight
     share = weight.double() / weight.double().sum().clamp_min(torch.finfo(torch.float64).tiny)
     feature = torch.stack((_logit(p.detach().double()), torch.ones_like(p, dtype=torch.float64)), -1)

@@ -122,7 +122,7 @@ def fit_calibration(
     """
     score, good, weight = pool_answers(scenes)
     if not score.numel():
-        raise ValueError("fit: found no answer in any scene, expected some")
+        raise ValueError("fit_calibration: found no answer in any scene, expected some")
     loss = cap_error(torch.cat([s.answered().error for s in scenes]))
     ends = (0.0, 1.0) if bool(((score >= 0) & (score <= 1)).all()) else None
     note = {**(provenance or {}), "n_scenes": sum(bool(s.keep.any()) for s in scenes), "n_answers": score.numel()}

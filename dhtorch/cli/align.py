@@ -1,8 +1,8 @@
-"""``dhtorch anchor``: maps of any depth network or sensor in metres, anchored in a recording's own returns.
+"""``dhtorch reference``: maps of any depth network or sensor in metres, aligned in a recording's own returns.
 
 Frames are written as ``dhtorch complete`` writes them: whole or not there, a recording again where the format can hold
-it. ``anchor.json`` holds what was done to every map, ``anchor.html`` shows it, worst first. The exit code is 1 where a
-limit of ``fail_on`` is exceeded.
+it. ``reference.json`` holds what was done to every map, ``reference.html`` shows it, worst first. The exit code is 1
+where a limit of ``fail_on`` is exceeded.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ _ALIGNMENT_LIMITS = {
     "change": "median share by which depths were changed, of kind=metric",
     "sigma": "median sigma / depth of the frames",
     "silent": "share of the pixels of the maps that are silent",
-    "unanchored": "share of the frames with a map that could not be anchored",
+    "unanchored": "share of the frames with a map that could not be aligned",
 }
 
 #: Columns of the page's table.
-_TABLE_COLUMNS = ("model", "scale", "sigma / depth", "silent", "near anchors", "far anchors")
+_TABLE_COLUMNS = ("model", "scale", "sigma / depth", "silent", "near references", "far references")
 
 #: Options that decide what the files of a frame hold.
 _KEY_OPTIONS = (
@@ -86,7 +86,7 @@ _PAGE_NOTE = "Maps are coloured from near (blue) to far (red), each by its own r
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
-    """Anchor the maps of a recording; returns the exit code, 1 where a limit is exceeded.
+    """Reference the maps of a recording; returns the exit code, 1 where a limit is exceeded.
 
     Raises:
         ValueError, OSError: bad options or data, a folder that holds something else.
@@ -114,7 +114,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     content = {"scene": scene.name, "kind": settings["kind"], "fail_on": settings["fail_on"], "exceeded": over}
     keep = ("frame", "anchored", "views")
     content |= {"maps": maps.report, "whole": whole, "frames": [{k: row[k] for k in keep} for row in rows]}
-    storage.write_json(out / "anchor.json", storage.to_strict_json(content))
+    storage.write_json(out / "align.json", storage.to_strict_json(content))
     said = [*_format_summary(scene.name, settings["kind"], whole, before), *(f"  {note}" for note in maps.notes)]
     _write_page(task, maps, said, over)
     print("\n".join([*said, *(f"  exceeded: {line}" for line in over), "wrote", f"  {out}"]))
@@ -173,15 +173,15 @@ def _align_frame(task: CompletionTask, maps: DepthMaps, i: int) -> tuple[Frame, 
             others = stack([_load_frame(task, k) for k in offered])
             method = with_view_selection(task.method)
             told = method(frame, others, seed=s["seed"], hint=task.scene.hint, trace=trace)
-            anchors, views = [trace["samples"], told], [int(task.recording.number[k]) for k in offered]
+            references, views = [trace["samples"], told], [int(task.recording.number[k]) for k in offered]
         else:
             whole = upcast_intrinsics(frame)
             uv = task.method.sample(frame.hw, task.method.n).to(frame.camera.f)[None]
-            anchors = [task.method.backproject(whole, uv)]
+            references = [task.method.backproject(whole, uv)]
         chosen: dict[str, align.ModelSelection] = {}
         options = {"kind": s["kind"], "max_sigma_rel": s["max_sigma_rel"], "hw": frame.hw, "trace": chosen}
-        found = align.align_depth(x, anchors, **options).to("cpu")
-    points = [int((a.usable if k == 0 else a.keep).sum()) for k, a in enumerate(anchors)]
+        found = align.align_depth(x, references, **options).to("cpu")
+    points = [int((a.usable if k == 0 else a.keep).sum()) for k, a in enumerate(references)]
     row = _summarise_frame(x.cpu(), found, chosen["chosen"]) | {"near": points[0], "far": sum(points[1:])}
     return frame, found, {"views": views, "anchored": row}
 
@@ -227,8 +227,8 @@ def _summarise_recording(rows: Sequence[Row]) -> Row:
         "unanchored": 1 - len(done) / len(told),
     }
     models = Counter(row["model"] for row in done)
-    anchors = {k: statistics.median(row[k] for row in told) for k in ("near", "far")}
-    return {"frames": len(told), "models": dict(models), "median": middle, "anchors": anchors, "held": held}
+    references = {k: statistics.median(row[k] for row in told) for k in ("near", "far")}
+    return {"frames": len(told), "models": dict(models), "median": middle, "reference_views": references, "held": held}
 
 
 def _format_summary(name: str, kind: str, whole: Row, before: int) -> list[str]:
@@ -236,7 +236,7 @@ def _format_summary(name: str, kind: str, whole: Row, before: int) -> list[str]:
     held, middle, n = whole["held"], whole["median"], whole["frames"]
     again = f" ({before} left untouched)" if before else ""
     if middle["scale"] is None:
-        return [f"{name}: none of {format_count(n, 'map')} could be anchored{again}: too few near returns."]
+        return [f"{name}: none of {format_count(n, 'map')} could be aligned{again}: too few near returns."]
     alone = sum(count for model, count in whole["models"].items() if model == "raw")
     maps = format_count(n, "map")
     first = f"{name}: {maps}{again} put into metres."
@@ -257,7 +257,7 @@ def _format_summary(name: str, kind: str, whole: Row, before: int) -> list[str]:
         ),
         f"  Sigma is {middle['sigma']:.1%} of the depth (median), {held['silent']:.1%} of the pixels are silent.",
         f"  A map is held by {near} near returns and {far} far answers (medians); "
-        f"{held['unanchored']:.0%} of the maps could not be anchored.",
+        f"{held['unanchored']:.0%} of the maps could not be aligned.",
     ]
 
 
@@ -272,7 +272,7 @@ def _write_page(task: CompletionTask, maps: DepthMaps, said: Sequence[str], over
             pages.ValidatedFrame(f"frame {row['frame']}", cells, _render_frame(task, maps, i) if i in shown else None)
         )
     failed = [f"Exceeded: {line}" for line in over]
-    place, told = task.folder / "anchor.html", {"columns": _TABLE_COLUMNS, "frames": frames, "failed": failed}
+    place, told = task.folder / "align.html", {"columns": _TABLE_COLUMNS, "frames": frames, "failed": failed}
     return pages.write_validation_page(place, task.scene.name, said=said, word="anchor", note=_PAGE_NOTE, **told)
 
 

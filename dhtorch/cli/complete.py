@@ -123,7 +123,7 @@ def make_completion_task(
         method=method,
         settings=settings,
         frames=frames,
-        offers={pair.anchor: pair.offered for pair in pairs},
+        offers={pair.reference: pair.offered for pair in pairs},
         shared=completed.build_shared_metadata(
             scene,
             layout,
@@ -187,10 +187,10 @@ def _close_folder(task: CompletionTask) -> None:
 def _compute_map(task: CompletionTask, i: int) -> tuple[Frame, DepthMap, Row]:
     """The map of one frame, on the CPU, and which views were asked for it."""
     s, offered = task.settings, task.offers.get(i, ())
-    anchor = _load_frame(task, i)
+    reference = _load_frame(task, i)
     if not offered:
-        found = dense.sensor_depth_map(anchor, method=task.method, size=s["size"])
-        return anchor, found.to("cpu"), {"views": [], "n_offered": 0}
+        found = dense.sensor_depth_map(reference, method=task.method, size=s["size"])
+        return reference, found.to("cpu"), {"views": [], "n_offered": 0}
     others = stack([_load_frame(task, k) for k in offered])
     options: dict[str, Any] = {k: s[k] for k in (*dense.DENSE_OPTIONS, "seed")}
     options |= {
@@ -200,10 +200,10 @@ def _compute_map(task: CompletionTask, i: int) -> tuple[Frame, DepthMap, Row]:
     }
     trace: Trace = {}
     with torch.no_grad():
-        found = dense.complete_depth(anchor, others, **options, trace=trace)
+        found = dense.complete_depth(reference, others, **options, trace=trace)
     choice = report_selection(i, offered, trace)
     number = task.recording.number
-    return anchor, found.to("cpu"), {"views": [int(number[k]) for k in choice.views], **choice.row()["why"]}
+    return reference, found.to("cpu"), {"views": [int(number[k]) for k in choice.views], **choice.row()["why"]}
 
 
 def _load_frame(task: CompletionTask, i: int) -> Frame:
@@ -213,13 +213,13 @@ def _load_frame(task: CompletionTask, i: int) -> Frame:
     return range_split(frame, s["cutoff"])
 
 
-def write_frame(task: CompletionTask, i: int, anchor: Frame, found: DepthMap, asked: Row) -> None:
+def write_frame(task: CompletionTask, i: int, reference: Frame, found: DepthMap, asked: Row) -> None:
     """The files of one frame; the one that makes it whole comes last."""
     name, layout, one = task.name(i), task.layout, found[0]
     steps = export.quantise_depth(one.depth, one.sigma, one.source, layout.unit)
     pictures = {"depth": steps.depth, "sigma": steps.sigma, "source": steps.source}
     if layout.pictures:
-        pictures[layout.pictures] = _resize_picture(anchor, steps.depth.shape)
+        pictures[layout.pictures] = _resize_picture(reference, steps.depth.shape)
     if layout.confidence:
         pictures["confidence"] = stray_confidence(steps.source)
     if not (about := task.folder / "complete.json").is_file():
@@ -228,21 +228,21 @@ def write_frame(task: CompletionTask, i: int, anchor: Frame, found: DepthMap, as
         storage.replace_file(layout.file(task.folder, kind, name), export.encode_png(pixels))
     if layout.arrays:
         storage.replace_file(layout.file(task.folder, "arrays", name), _encode_arrays(one))
-    row = storage.to_strict_json(_describe_frame(task, i, anchor, steps) | asked | _count_pixels(steps, one))
+    row = storage.to_strict_json(_describe_frame(task, i, reference, steps) | asked | _count_pixels(steps, one))
     storage.write_json(layout.file(task.folder, "meta", name), row)
     task.done[name] = row
 
 
-def _describe_frame(task: CompletionTask, i: int, anchor: Frame, steps: export.QuantisedDepth) -> Row:
+def _describe_frame(task: CompletionTask, i: int, reference: Frame, steps: export.QuantisedDepth) -> Row:
     """What a reader of one frame has to know."""
-    camera = cameras.resize(anchor.camera, anchor.hw, steps.depth.shape).to("cpu")
+    camera = cameras.resize(reference.camera, reference.hw, steps.depth.shape).to("cpu")
     poses = task.recording.poses
     same = ("key", "version", "method", "calibration", "unit_m", "sigma_unit_m")
     return {
         **{k: task.shared[k] for k in same},
         "cutoff_m": task.settings["cutoff"],
         "frame": int(task.recording.number[i]),
-        "time": None if anchor.time is None else float(anchor.time[0]),
+        "time": None if reference.time is None else float(reference.time[0]),
         "hw": list(steps.depth.shape),
         "K": cameras.to_matrix(camera)[0],
         "distortion": None if camera.distortion is None else camera.distortion[0],
@@ -254,7 +254,7 @@ def _count_pixels(steps: export.QuantisedDepth, one: DepthMap) -> Row:
     """Pixels by source, and the shares of all pixels that are silent, by reason."""
     kinds = {code: name.lower() for code, name in names(Source).items() if name.lower() in _SOURCE_LABELS}
     pixels = {name: int((steps.source == code).sum()) for code, name in kinds.items()}
-    if anchored := int((steps.source == Source.ANCHORED).sum()):
+    if anchored := int((steps.source == Source.ALIGNED).sum()):
         pixels["anchored"] = anchored
     gates = {name.lower(): float((one.gate == code).double().mean()) for code, name in names(Gate).items()}
     silent = {name: share for name, share in gates.items() if share and name != "answer"}

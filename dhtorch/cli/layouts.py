@@ -33,7 +33,7 @@ Row = Mapping[str, Any]
 _SPARSE_DEPTH_STEP_M = 0.005
 
 #: What a Stray capture says of a depth, by codes.Source.
-_STRAY_CONFIDENCE = {Source.NONE: 0, Source.SENSOR: 2, Source.RECOVERED: 1, Source.SWEPT: 1, Source.ANCHORED: 1}
+_STRAY_CONFIDENCE = {Source.NONE: 0, Source.SENSOR: 2, Source.RECOVERED: 1, Source.SWEPT: 1, Source.ALIGNED: 1}
 
 #: Files of a Stray capture that hold for whatever depth it has.
 _STRAY_FILES = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")

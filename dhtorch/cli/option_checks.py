@@ -88,7 +88,7 @@ _OPTION_RULES: dict[str, _OptionRule] = {
     "dense": _DENSE_OPTIONS,
     "most": _or_null(_whole_number(1)),
     "every": _whole_number(1),
-    "partners": _whole_number(1),
+    "source_views": _whole_number(1),
     "planes": _whole_number(2),
     "size": _whole_number(8),
     "refinements": _whole_number(0),

@@ -63,7 +63,7 @@ def stream_scene(scene: Scene, method: Method, settings: Mapping[str, Any], *, p
         row: Row = {"frame": int(recording.number[k]), "ms": 1e3 * (time.perf_counter() - began)}
         row["cut"] = len(stream.cuts) > cuts
         row["back"] = sorted(trace["back"][:, 0].tolist()) if "back" in trace else []
-        hole = ~(trace["samples"] if "samples" in trace else method.look_at(frame, estimate.uv[0])).usable
+        hole = ~(trace["samples"] if "samples" in trace else method.sample_depth_at(frame, estimate.uv[0])).usable
         row |= {"n_holes": int(hole.sum()), "n_recovered": int((estimate.keep & hole).sum())}
         rows.append(row)
     seconds = sum(row["ms"] for row in rows) / 1e3

@@ -1,8 +1,8 @@
-"""``dhtorch judge``: whether the depth of a recording is right, its sensor's own or maps from elsewhere.
+"""``dhtorch validate``: whether the depth of a recording is right, its sensor's own or maps from elsewhere.
 
-Writes ``judge.json`` (a row for every frame, what they come to, the causes named in windows of frames) and
-``judge.html``, worst first. The exit code is 1 where a limit of ``fail_on`` is exceeded, so that it can stand in a data
-pipeline.
+Writes ``validate.json`` (a row for every frame, what they come to, the causes named in windows of frames) and
+``validate.html``, worst first. The exit code is 1 where a limit of ``fail_on`` is exceeded, so that it can stand in a
+data pipeline.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
 
 #: Numbers of a frame with their interval.
-_INTERVAL_FIELDS = ("scale", "scale_near", "scale_far", "ruler", "shift", "tilt", "wrong")
+_INTERVAL_FIELDS = ("scale", "scale_near", "scale_far", "scale_vs_trajectory", "shift", "tilt", "wrong")
 
 #: What ``fail_on`` may name → what is held against the limit, in words. All are of a whole recording, and all but the
 #: last are bounds that the number exceeds with 95 %: few frames, or unsure ones, exceed no limit by chance.
@@ -114,7 +114,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         content |= {"intrinsics_guessed": intrinsics_options.find_guess_report(scene.recording.report)}
         content |= {"exceeded": over, "whole": whole, "windows": found.windows, "frames": found.rows}
         written += [
-            storage.write_json(place / "judge.json", storage.to_strict_json(content)),
+            storage.write_json(place / "validate.json", storage.to_strict_json(content)),
             _write_page(place, found, whole, over),
         ]
         lines += [*_format_summary(found.scene.name, whole, found.notes), *(f"  exceeded: {line}" for line in over)]
@@ -200,7 +200,7 @@ def _validate_frame(
         known = [m for m in maps if m is not None]
         if known and len({m.shape for m in known}) == 1:
             beside = torch.stack([torch.zeros_like(known[0]) if m is None else m for m in maps])
-    options = {k: settings[k] for k in ("views", "partners", "size", "tolerance", "seed")}
+    options = {k: settings[k] for k in ("views", "source_views", "size", "tolerance", "seed")}
     return validate_depth(depth, frame, others, other_maps=beside, method=method, hint=found.scene.hint, **options)
 
 
@@ -214,12 +214,12 @@ def _summarise_frame(number: int, verdict: DepthValidation) -> Row:
     for name in _INTERVAL_FIELDS:
         value, low, high = (float(x) for x in getattr(verdict, name)[0])
         row[name] = None if math.isnan(value) else {"value": value, "low": low, "high": high}
-    for name in ("by_answers", "by_views", "by_maps"):
+    for name in ("sparse_evidence", "photometric_evidence", "consistency_evidence"):
         said = getattr(verdict, name)[there]
         against = said.abs() > 3
         row[name] = {"told": float(said.isfinite().double().mean()) if n else None, "against": int(against.sum())}
-    ceiling = float(verdict.ceiling[0])
-    return row | {"ceiling": None if math.isnan(ceiling) else ceiling}
+    clip_depth = float(verdict.clip_depth[0])
+    return row | {"clip_depth": None if math.isnan(clip_depth) else clip_depth}
 
 
 def _keep_worst(
@@ -260,7 +260,7 @@ def _diagnose_window(found: RecordingValidation, first: int, size: int, settings
             named = faults.diagnose(frames, [blank if m is None else m for m in given], seed=settings["seed"])
     number = found.scene.recording.number
     row: Row = {"frames": [int(number[first]), int(number[first + size - 1])], "pairs": named.n_pairs, "by": named.by}
-    cut = _find_shared_ceiling(
+    cut = _find_shared_clip_depth(
         [found.by_number[k] for k in number[first : first + size].tolist() if k in found.by_number]
     )
     if named.cause is None and cut is not None:
@@ -268,9 +268,9 @@ def _diagnose_window(found: RecordingValidation, first: int, size: int, settings
     return row | {"cause": named.cause, "kind": named.kind, "loss": dict(named.loss)}
 
 
-def _find_shared_ceiling(rows: Sequence[Row]) -> float | None:
+def _find_shared_clip_depth(rows: Sequence[Row]) -> float | None:
     """Where the maps of some frames are cut, if those of most of them are, all at one depth."""
-    at = [row["ceiling"] for row in rows if row["ceiling"] is not None]
+    at = [row["clip_depth"] for row in rows if row["clip_depth"] is not None]
     if 2 * len(at) <= len(rows):
         return None
     middle = statistics.median(at)
@@ -288,7 +288,7 @@ def _summarise_recording(found: RecordingValidation) -> Row:
     count = {name: sum(row[f"share_{name}"] * row["pixels"] for row in rows if row["pixels"]) for name in states}
     known = count["wrong"] + count["consistent"]
     middle = {}
-    for name in ("scale", "ruler", "shift", "tilt"):
+    for name in ("scale", "scale_vs_trajectory", "shift", "tilt"):
         values = [row[name]["value"] for row in rows if row[name] is not None]
         middle[name] = statistics.median(values) if values else None
     able = [row for row in found.windows if row["pairs"] >= faults.MIN_WINDOW_PAIRS or row["cause"] is not None]
@@ -309,7 +309,7 @@ def _summarise_recording(found: RecordingValidation) -> Row:
         "wrong": count["wrong"] / known if known else None,
         "causes": dict(kinds),
         "windows": len(able),
-        "ceiling": _find_shared_ceiling(rows),
+        "clip_depth": _find_shared_clip_depth(rows),
         "held": held,
     }
 
@@ -362,8 +362,8 @@ def _format_summary(name: str, whole: Row, notes: Sequence[str] = ()) -> list[st
         lines.append(f"  the scale differs by {held['drift']:.3f} at least between frames")
     for cause, n in sorted(whole["causes"].items(), key=lambda item: -item[1]):
         lines.append(f"  likely cause in {n} of {format_count(whole['windows'], 'window')}: {cause}")
-    if whole["ceiling"] is not None and not any(cause.startswith("cut at") for cause in whole["causes"]):
-        lines.append(f"  cut at {whole['ceiling']:.3g} m: what is farther is said to lie there")
+    if whole["clip_depth"] is not None and not any(cause.startswith("cut at") for cause in whole["causes"]):
+        lines.append(f"  cut at {whole['clip_depth']:.3g} m: what is farther is said to lie there")
     return lines + [f"  {note}" for note in notes]
 
 
@@ -379,19 +379,19 @@ def _write_page(place: Path, found: RecordingValidation, whole: Row, over: Seque
         known = None if row["share_cannot_know"] is None else 1 - row["share_cannot_know"]
         cells = [pages.format_estimate(row["wrong"]), "–" if known is None else f"{known:.2f}"]
         cells += [pages.format_estimate(row[name]) for name in ("scale", "shift", "tilt")]
-        cells.append("–" if row["ceiling"] is None else f"{row['ceiling']:.3g}")
+        cells.append("–" if row["clip_depth"] is None else f"{row['clip_depth']:.3g}")
         frames.append(pages.ValidatedFrame(f"frame {row['frame']}", cells, found.pictures.get(row["frame"])))
     failed = [f"Exceeded: {line}" for line in over]
     guess = intrinsics_options.find_guess_report(found.scene.recording.report)
     said = _format_summary(found.scene.name, whole, found.notes) + ([f"Its {guess}."] if guess else [])
     return pages.write_validation_page(
-        place / "judge.html", found.scene.name, said=said, columns=_TABLE_COLUMNS, frames=frames, failed=failed
+        place / "validate.html", found.scene.name, said=said, columns=_TABLE_COLUMNS, frames=frames, failed=failed
     )
 
 
 def _check_options(settings: Mapping[str, Any]) -> dict[str, float]:
     """The limits; options that would only fail later."""
-    for name, low in (("every", 1), ("most", 1), ("window", 0), ("pictures", 0), ("partners", 1), ("size", 16)):
+    for name, low in (("every", 1), ("most", 1), ("window", 0), ("pictures", 0), ("source_views", 1), ("size", 16)):
         value = settings[name]
         whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
         if not whole and not (name == "most" and value is None):

@@ -1,6 +1,6 @@
 """Streams that tick apart: which entry of another stream belongs to an instant, and the pose in between.
 
-Nothing is taken over from an earlier instant: what has no partner within the limit has none, index −1.
+Nothing is taken over from an earlier instant: what has no source view within the limit has none, index −1.
 Alphabet: ``times`` (n,) s asked for; ``others`` (m,) s, sorted, at least one.
 """
 

@@ -1,7 +1,8 @@
-"""What an anchor may see: one other frame, by frame gap, by time or by baseline; or several, to choose among.
+"""What a reference view may see: one other frame, by frame gap, by time or by baseline; or several, to choose among.
 
-Positions are those in the recording; the anchor is the frame whose depth is extended. Gaps and steps are counted in the
-capture's own frame numbers: where a frame was lost the pairs that need it are missing, the others do not shift.
+Positions are those in the recording; the reference view is the frame whose depth is extended. Gaps and steps are
+counted in the capture's own frame numbers: where a frame was lost the pairs that need it are missing, the others do not
+shift.
 """
 
 from __future__ import annotations
@@ -16,20 +17,20 @@ from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Scene, SceneLike
 from dhtorch.runtime.console import format_count
 
-#: From this many frames on, neighbouring anchors are nearly the same picture: take every other one.
+#: From this many frames on, neighbouring reference views are nearly the same picture: take every other one.
 _MANY_FRAMES = 25
 
-#: Steps from an anchor, in frames, to those around it that are offered to a method which chooses for itself.
+#: Steps from a reference view, in frames, to those around it that are offered to a method which chooses for itself.
 CANDIDATE_STEPS = (1, 2, 3, 5, 8, 12, 20, 30)
 
 
 class Pair(NamedTuple):
-    """An anchor and what it may see: one other frame, or several among which the method chooses.
+    """A reference view and what it may see: one other frame, or several among which the method chooses.
 
     Equal to the plain tuple ``(i, j)`` or ``(i, (k1, k2, …))``, which ``Pair(*item)`` reads.
     """
 
-    anchor: int
+    reference: int
     other: int | tuple[int, ...]
 
     @property
@@ -57,24 +58,24 @@ def to_fixed_pairs(pairs: Iterable[Sequence[int]] | Iterable[Pair]) -> list[tupl
 def by_choice(
     scene: SceneLike, steps: Sequence[int] = CANDIDATE_STEPS, stride: int | None = None, past: bool = False
 ) -> list[Pair]:
-    """Every anchor with the frames around it, among which a method chooses: nobody has to know a gap.
+    """Every reference view with the frames around it, among which a method chooses: nobody has to know a gap.
 
     Args:
         scene: its recording's frames.
-        steps: how far before and after the anchor frames are offered, see :func:`candidate_frames`.
-        stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
-        past: only frames before the anchor; the first frame is none then.
+        steps: how far before and after the reference view frames are offered, see :func:`candidate_frames`.
+        stride: step from reference view to reference view. None = 2 where there are 25 frames or more, else 1.
+        past: only frames before the reference view; the first frame is none then.
 
     Raises:
-        ValueError: one frame alone, no steps or one below 1, stride below 1, or no anchor.
+        ValueError: one frame alone, no steps or one below 1, stride below 1, or no reference view.
     """
     recording = Scene.of(scene).recording
     number = recording.number.tolist()
     if len(number) < 2:
         raise ValueError(f"pairs: {recording.name} has one frame, expected two at least")
     steps, place = _check_steps(steps), {k: p for p, k in enumerate(number)}
-    anchors = [i for i in range(0, len(number), _choose_stride(recording, stride)) if i > 0 or not past]
-    pairs = [Pair(i, tuple(_candidates_of_numbers(number, place, i, steps, past))) for i in anchors]
+    references = [i for i in range(0, len(number), _choose_stride(recording, stride)) if i > 0 or not past]
+    pairs = [Pair(i, tuple(_candidates_of_numbers(number, place, i, steps, past))) for i in references]
     return _require_pairs(pairs, recording, f"stride {stride}, past frames alone")
 
 
@@ -84,7 +85,7 @@ def by_gap(scene: SceneLike, gap: int | None = None, stride: int | None = None) 
     Args:
         scene: its recording's frames.
         gap: step in frames. None = the scene's own.
-        stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
+        stride: step from reference view to reference view. None = 2 where there are 25 frames or more, else 1.
 
     Raises:
         ValueError: no gap given and none known, gap or stride below 1, or no two frames that far apart.
@@ -99,8 +100,8 @@ def by_gap(scene: SceneLike, gap: int | None = None, stride: int | None = None) 
         span = f"{format_count(len(number), 'frame')} ({recording.name}, frame numbers {number[0]} to {number[-1]})"
         raise ValueError(f"pairs.gap: found {gap} for {span}, expected at most {number[-1] - number[0]}")
     place = {k: i for i, k in enumerate(number)}
-    anchors = range(0, len(number), _choose_stride(recording, stride))
-    pairs = [Pair(i, place[number[i] + gap]) for i in anchors if number[i] + gap in place]
+    references = range(0, len(number), _choose_stride(recording, stride))
+    pairs = [Pair(i, place[number[i] + gap]) for i in references if number[i] + gap in place]
     return _require_pairs(pairs, recording, f"gap {gap}")
 
 
@@ -109,9 +110,9 @@ def by_time(scene: SceneLike, seconds: float, tolerance: float | None = None, st
 
     Args:
         scene: its recording's frames; needs time stamps.
-        seconds: time from anchor to partner.
+        seconds: time from reference view to source view.
         tolerance: s. None = half the median step from frame to frame.
-        stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
+        stride: step from reference view to reference view. None = 2 where there are 25 frames or more, else 1.
 
     Raises:
         ValueError: no time stamps, seconds not positive, tolerance negative, or no two frames that far apart.
@@ -141,7 +142,7 @@ def by_baseline(
         scene: its recording's frames; needs poses.
         metres: distance of the two camera centres.
         tolerance: m. None = a quarter of ``metres``.
-        stride: step from anchor to anchor. None = 2 where there are 25 frames or more, else 1.
+        stride: step from reference view to reference view. None = 2 where there are 25 frames or more, else 1.
 
     Raises:
         ValueError: no poses, metres not positive, tolerance negative, or no two frames that far apart.
@@ -163,21 +164,21 @@ def by_baseline(
 def by_cameras(
     scene: SceneLike,
     instants: Sequence[int] = (0,),
-    anchor: str | None = None,
+    reference: str | None = None,
     stride: int | None = None,
     past: bool = False,
 ) -> list[Pair]:
-    """Every anchor of a rig with what its other cameras saw: at the same instant, and ``instants`` away.
+    """Every reference view of a rig with what its other cameras saw: at the same instant, and ``instants`` away.
 
-    Where one is not 0 the anchor's own camera is offered, too: views in space and in time. One frame alone is a
+    Where one is not 0 the reference view's own camera is offered, too: views in space and in time. One frame alone is a
     fixed pair, several are offered to the method.
 
     Args:
         scene: its recording is a :class:`dhtorch.data.rig.Rig`.
-        instants: how many instants from the anchor to those offered; 0 = the same.
-        anchor: name of the camera whose depth is extended. None = all.
-        stride: step from anchor to anchor, in instants. None = 2 where there are 25 or more, else 1.
-        past: only instants up to the anchor's.
+        instants: how many instants from the reference view to those offered; 0 = the same.
+        reference: name of the camera whose depth is extended. None = all.
+        stride: step from reference view to reference view, in instants. None = 2 where there are 25 or more, else 1.
+        past: only instants up to the reference view's.
 
     Raises:
         ValueError: one camera alone, an unknown one, instants below 0, or no pair.
@@ -186,12 +187,12 @@ def by_cameras(
     if not isinstance(recording, Rig):
         expected = "several cameras as one recording (data=rig, dhtorch.data.rig.join_cameras)"
         raise ValueError(f"pairs=cameras: {recording.name} is one camera, expected {expected}")
-    if anchor is not None and anchor not in recording.cameras:
-        raise ValueError(f"pairs.anchor: found {anchor}, expected one of {', '.join(recording.cameras)}")
+    if reference is not None and reference not in recording.cameras:
+        raise ValueError(f"pairs.anchor: found {reference}, expected one of {', '.join(recording.cameras)}")
     if not instants or any(isinstance(s, bool) or int(s) != s or s < 0 for s in instants):
         raise ValueError(f"pairs.instants: found {list(instants)}, expected whole numbers of at least 0")
     C, n = len(recording.cameras), len(recording) // len(recording.cameras)
-    chosen = range(C) if anchor is None else [recording.cameras.index(anchor)]
+    chosen = range(C) if reference is None else [recording.cameras.index(reference)]
     every = (2 if n >= _MANY_FRAMES else 1) if stride is None else _check_positive_int("pairs.stride", stride)
     pairs = []
     for k in range(0, n, every):

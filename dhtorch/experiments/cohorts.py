@@ -48,7 +48,7 @@ class HeldOut:
 
     def whole(self, batch: Batch, uv: Tensor) -> Samples:
         """The samples with every return."""
-        return self.method.look_at(batch.anchor, uv)
+        return self.method.sample_depth_at(batch.reference, uv)
 
     def heldout(self, batch: Batch, trace: Trace) -> holdout.Truth:
         """Set B: trackable samples whose return never took part in the pose."""
@@ -63,7 +63,7 @@ class HeldOut:
 
     def _truth(self, batch: Batch, trace: Trace) -> tuple[Samples, holdout.Truth]:
         whole = self.whole(batch, trace["samples"].uv)
-        found = holdout.sample_truth(batch.anchor, whole.uv)
+        found = holdout.sample_truth(batch.reference, whole.uv)
         return whole, holdout.select_candidates(whole, found, 0.0)
 
 
@@ -77,7 +77,7 @@ def real_holes(batch: Batch, trace: Trace) -> holdout.Truth:
     if kinds is not None:
         odd = torch.isin(kinds, torch.tensor([*batch.odd], dtype=kinds.dtype).to(kinds.device))
         found = found.replace(code=torch.where(odd, holdout.TruthCode.EXCLUDED, found.code))
-    return holdout.select_real_holes(batch.anchor, samples, found)
+    return holdout.select_real_holes(batch.reference, samples, found)
 
 
 def trajectory_pose(batch: Batch, *, raw: bool = False) -> Pose | None:
@@ -88,7 +88,7 @@ def trajectory_pose(batch: Batch, *, raw: bool = False) -> Pose | None:
         raw: as the device writes it. A trajectory in OpenGL axes is then used as if its axes were OpenCV's, the
             mistake that the conversion mends; one in OpenCV axes is the same either way.
     """
-    first, second = batch.anchor.T_world_from_cam, batch.others[-1].T_world_from_cam
+    first, second = batch.reference.T_world_from_cam, batch.others[-1].T_world_from_cam
     if first is None or second is None:
         return None
     T = se3.relative(first, second)
@@ -100,7 +100,7 @@ def trajectory_pose(batch: Batch, *, raw: bool = False) -> Pose | None:
 
 def trajectory_pose_fit(batch: Batch, n: int, *, raw: bool = False) -> PoseFit:
     """The device's trajectory in the shape of seat 5's answer; not ok where there is none."""
-    T, like = trajectory_pose(batch, raw=raw), batch.anchor.camera.f
+    T, like = trajectory_pose(batch, raw=raw), batch.reference.camera.f
     if T is None:
         eye = se3.identity(like.shape[0], like)
         T = Pose(eye.R * torch.nan, eye.t)

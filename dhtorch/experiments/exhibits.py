@@ -59,10 +59,10 @@ def make_exhibit(
     Args:
         given: one scene, or a recording as a scene without notes.
         method: of one other view or several.
-        pairs: scene → list of :class:`dhtorch.data.pairs.Pair`, or plain (anchor, other).
+        pairs: scene → list of :class:`dhtorch.data.pairs.Pair`, or plain (reference view, other).
         settings: cutoff, seed, device, batch, workers.
         most: pairs that are shown; of more, as many spread evenly.
-        sweep: also make a map of every pixel of the anchors.
+        sweep: also make a map of every pixel of the reference views.
         progress: wraps the loop over the pairs.
 
     Raises:
@@ -75,7 +75,7 @@ def make_exhibit(
 
     def keep(answer: Answer) -> protocol.Row:
         batch = answer.batch
-        for k, frame in ((batch.pairs[0][0], batch.anchor), answer.other):
+        for k, frame in ((batch.pairs[0][0], batch.reference), answer.other):
             if k not in views:
                 views[k] = _make_picture(recording, k, frame)
         shots.append(_make_shot(answer, list(views)))
@@ -90,16 +90,16 @@ def make_exhibit(
 def _make_shot(answer: Answer, shown: Sequence[int]) -> PairExhibit:
     batch, samples, estimate = answer.batch, answer.samples, answer.estimate
     tracks, fit, truth = answer.trace["tracks"], answer.trace["fit"], answer.truths["full"]
-    whole, anchor, i, j = merge(samples, estimate), batch.anchor, batch.pairs[0].anchor, answer.other[0]
+    whole, reference, i, j = merge(samples, estimate), batch.reference, batch.pairs[0].reference, answer.other[0]
     filled = whole.source != Source.NONE
-    xyz = cam.unproject(anchor.camera, whole.uv, whole.depth)
+    xyz = cam.unproject(reference.camera, whole.uv, whole.depth)
     error = (estimate.depth - truth.depth).abs() / truth.depth.clamp_min(1e-9)
     columns = {
         "uv_0": whole.uv,
         "uv_1": tracks.uv_1,
         "tracked": tracks.valid,
         "xyz": torch.where(filled[..., None], xyz, torch.nan),
-        "rgb": _sample_colours(anchor, whole.uv),
+        "rgb": _sample_colours(reference, whole.uv),
         **{name: getattr(whole, name) for name in ("depth", "sigma", "score", "source")},
         "gate": estimate.gate,
         "hole": samples.hole,
@@ -108,8 +108,8 @@ def _make_shot(answer: Answer, shown: Sequence[int]) -> PairExhibit:
         "error": torch.where(truth.ok & estimate.keep, error, torch.nan),
         "candidate": truth.ok,
     }
-    T_world_from_0 = _in_world(anchor)
-    held = anchor.replace(depth=batch.exact.depth, depth_camera=batch.exact.depth_camera)
+    T_world_from_0 = _in_world(reference)
+    held = reference.replace(depth=batch.exact.depth, depth_camera=batch.exact.depth_camera)
     ok = bool(fit.ok[0])
     cutoff = batch.cutoff if batch.cutoff is not None else float("inf")
     facts = {"pose": "none found"}
@@ -125,10 +125,10 @@ def _make_shot(answer: Answer, shown: Sequence[int]) -> PairExhibit:
         T_world_from_1=T_world_from_0 @ _pose_matrix(se3.invert(fit.T_1_from_0)) if ok else None,
         view_0=shown.index(i),
         view_1=shown.index(j),
-        seen=_return_cloud(anchor, (anchor.depth > 0) & (anchor.depth <= cutoff)),
+        seen=_return_cloud(reference, (reference.depth > 0) & (reference.depth <= cutoff)),
         held=_return_cloud(held, held.depth > cutoff),
-        swept=_swept_cloud(anchor, answer.trace["dense"]) if "dense" in answer.trace else EMPTY_SWEPT_CLOUD,
-        depth_image=_depth_image(anchor, cutoff),
+        swept=_swept_cloud(reference, answer.trace["dense"]) if "dense" in answer.trace else EMPTY_SWEPT_CLOUD,
+        depth_image=_depth_image(reference, cutoff),
         facts=facts,
     )
 

@@ -16,10 +16,10 @@ from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.records import Frame
 from dhtorch.runtime.parent_watch import exit_with_parent
 
-CandidateViews = Callable[[Recording, int], Sequence[int]]  # (recording, anchor) → positions of other views
+CandidateViews = Callable[[Recording, int], Sequence[int]]  # (recording, reference view) → positions of other views
 
-#: anchor, further views, anchor with its truth as depth, kinds of surface, disagreement of truth and sensor, views
-#: around it
+#: reference view, further views, reference view with its truth as depth, kinds of surface, disagreement of truth and
+#: sensor, views around it
 LoadedPair = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor, tuple[Frame, ...]]
 
 
@@ -44,14 +44,14 @@ class PairDataset(Dataset[LoadedPair]):
         own = spaced_frames(i, other, self.views) if isinstance(other, int) else []
         around = candidate_views(pair, self.recording, self.offers)
         frames = {k: self.recording[k].to(self.dtype) for k in sorted({i, *own, *around})}
-        anchor = frames[i]
+        reference = frames[i]
         others, choice = (tuple(frames[k] for k in some) for some in (own, around))
         if not isinstance(self.recording, TruthRecording):
-            return anchor, others, anchor, torch.zeros(1, 1, 1), torch.full((1,), torch.nan), choice
+            return reference, others, reference, torch.zeros(1, 1, 1), torch.full((1,), torch.nan), choice
         exact = self.recording.truth(i)
-        known = anchor.replace(depth=exact["depth"].to(self.dtype), depth_camera=None)
+        known = reference.replace(depth=exact["depth"].to(self.dtype), depth_camera=None)
         disagreement = exact.get("disagreement", torch.full((1,), torch.nan))
-        return anchor, others, known, exact["surface"].float(), disagreement, choice
+        return reference, others, known, exact["surface"].float(), disagreement, choice
 
 
 def load_pairs(data: PairDataset, *, batch: int, workers: int) -> DataLoader[LoadedPair]:
@@ -70,13 +70,13 @@ def load_pairs(data: PairDataset, *, batch: int, workers: int) -> DataLoader[Loa
 
 def candidate_views(pair: Pair, recording: Recording, offers: CandidateViews | None) -> Sequence[int]:
     """The frames among which a variant chooses; none where it takes the pair's own."""
-    return pair.offered or (() if offers is None else offers(recording, pair.anchor))
+    return pair.offered or (() if offers is None else offers(recording, pair.reference))
 
 
 def _collate(items: list[LoadedPair]) -> LoadedPair:
-    anchor, others, exact, surface, disagreement, around = zip(*items, strict=True)
+    reference, others, exact, surface, disagreement, around = zip(*items, strict=True)
     views, choice = (tuple(pytree.collate(v) for v in zip(*many, strict=True)) for many in (others, around))
-    return pytree.collate(anchor), views, pytree.collate(exact), torch.cat(surface), torch.cat(disagreement), choice
+    return pytree.collate(reference), views, pytree.collate(exact), torch.cat(surface), torch.cat(disagreement), choice
 
 
 def move_to_device(item: Any, device: str) -> Any:

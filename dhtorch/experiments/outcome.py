@@ -21,7 +21,7 @@ class Example:
     samples: Samples
     estimate: Estimate
     truth: holdout.Truth
-    pair: str = ""  # the anchor and the views that were used, as numbers of the recording
+    pair: str = ""  # the reference view and the views that were used, as numbers of the recording
     cutoff: float | None = None  # m
     asked: dict[str, Any] | None = (
         None  # as dhtorch.pipeline.dense.complete_depth takes it; None where the method was not simply asked

@@ -73,9 +73,9 @@ class Batch:
     scene: Scene
     pairs: Sequence[Pair]
     cutoff: float | None  # m
-    anchor: Frame
+    reference: Frame
     others: tuple[Frame, ...]  # further views, the pair's own last; none where frames are offered instead
-    exact: Frame  # the anchor with the depth it is held against
+    exact: Frame  # the reference view with the depth it is held against
     surface: Tensor  # (B, H, W) kind of surface, (B, 1, 1) where the recording knows none
     disagreement: Tensor  # (B,) median relative difference of the independent truth from the sensor; NaN = not known
     around: tuple[Frame, ...] = ()  # offered to one variant or another, in the order of the recording
@@ -110,7 +110,9 @@ class Variant:
     """A method as an experiment runs it."""
 
     method: Method
-    ask: Callable[..., Estimate] | None = None  # in the place of the method's line: (method, anchor, others, *, …)
+    ask: Callable[..., Estimate] | None = (
+        None  # in the place of the method's line: (method, reference view, others, *, …)
+    )
     fit: Callable[[Batch, int], PoseFit] | None = None  # a pose from elsewhere: (batch, number of samples) → fit
     seed: int | None = None  # None = the job's
     given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
@@ -155,7 +157,7 @@ class Answer:
             batch=replace(
                 self.batch,
                 pairs=self.batch.pairs[cut],
-                anchor=self.batch.anchor[cut],
+                reference=self.batch.reference[cut],
                 others=tuple(f[cut] for f in self.batch.others),
                 around=tuple(f[cut] for f in self.batch.around),
                 exact=self.batch.exact[cut],
@@ -177,12 +179,12 @@ def held_back_truth(batch: Batch, trace: Trace, *, test: str = "full") -> holdou
     return holdout.select_candidates(samples, found, batch.cutoff if _has_cutoff(batch.cutoff) else None, excluded=odd)
 
 
-def spread_pairs(pairs: ScenePairs, anchors: int | None, scene: Scene) -> list[tuple[int, int]]:
+def spread_pairs(pairs: ScenePairs, references: int | None, scene: Scene) -> list[tuple[int, int]]:
     """Some of the scene's pairs of two frames, evenly spread; None = all."""
     found = to_fixed_pairs(pairs(scene))
-    if anchors is None or len(found) <= anchors:
+    if references is None or len(found) <= references:
         return found
-    return [found[(2 * k + 1) * len(found) // (2 * anchors)] for k in range(anchors)]
+    return [found[(2 * k + 1) * len(found) // (2 * references)] for k in range(references)]
 
 
 def no_columns(_answer: Answer) -> Row:
@@ -212,7 +214,7 @@ class Protocol:
         return min([wanted, *(max(1, j - i) for i, j in pairs if isinstance(j, int))])
 
     def batch(self, settings: Settings, pairs: Sequence[Pair]) -> int:
-        """Pairs per call: one where anchors are offered differently many views."""
+        """Pairs per call: one where reference views are offered differently many views."""
         return settings.batch if self.offers is None and not any(pair.offered for pair in pairs) else 1
 
     def allows(self, pairs: Sequence[Pair]) -> None:
@@ -236,14 +238,14 @@ def run(
 ) -> Outcome:
     """Run every variant on every pair of every scene.
 
-    Truth is the held-back return of the anchor, or, for a recording that knows it, the exact depth (``truth(i)``);
-    surfaces such as mirrors are then counted apart. Points are pooled inside a scene; the summary is the median over
-    scenes without a role. A scene for which ``pairs`` gives none keeps a row that says "too short".
+    Truth is the held-back return of the reference view, or, for a recording that knows it, the exact depth
+    (``truth(i)``); surfaces such as mirrors are then counted apart. Points are pooled inside a scene; the summary is
+    the median over scenes without a role. A scene for which ``pairs`` gives none keeps a row that says "too short".
 
     Args:
         scenes: see :class:`dhtorch.data.scene.Scene`; a recording is a scene without notes.
         protocol: variants, cohorts and what is hidden.
-        pairs: scene → list of :class:`dhtorch.data.pairs.Pair`, or plain (anchor, other).
+        pairs: scene → list of :class:`dhtorch.data.pairs.Pair`, or plain (reference view, other).
         settings: cutoff, seed, device, batch, workers.
         progress: wraps the loop over a scene's batches: (items, text, number of items) → items.
 
@@ -291,7 +293,7 @@ class _SceneCollector:
 
     def add(self, batch: Batch) -> None:
         """Run all variants on one batch of pairs."""
-        near = self.protocol.hide(batch.anchor, self.cutoff)
+        near = self.protocol.hide(batch.reference, self.cutoff)
         views = tuple(self.protocol.hide(view, self.cutoff) for view in batch.others)
         offered = self._offered(batch)
         seen: dict[Any, Frame | None] = {}
@@ -304,7 +306,7 @@ class _SceneCollector:
             truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
             answer = Answer(batch, name, estimate, trace, truths)
             if k == 0:
-                self._count_holes(variant.method, batch.anchor, answer.samples.uv)
+                self._count_holes(variant.method, batch.reference, answer.samples.uv)
                 enough = [int(ok.sum()) >= self.least for ok in truths[self.last].ok]
                 self.n_few += enough.count(False)
             choices = []
@@ -317,7 +319,7 @@ class _SceneCollector:
                 self.examples.append(self._example(answer.one(0), choices[0], near[:1], seen[which]))
 
     def _example(self, first: Answer, choice: ViewReport | None, near: Frame, seen: Frame | None) -> Example:
-        variant, (anchor, other) = self.protocol.variants[first.variant], first.batch.pairs[0]
+        variant, (reference, other) = self.protocol.variants[first.variant], first.batch.pairs[0]
         views = choice.views if choice is not None else (other,)
         asked: dict[str, Any] | None = None
         if seen is not None and variant.ask is None and variant.fit is None:
@@ -328,7 +330,7 @@ class _SceneCollector:
             first.variant,
             near,
             *(first.samples, first.estimate, first.truths[self.last]),
-            pair=f"{anchor} → {', '.join(map(str, views))}",
+            pair=f"{reference} → {', '.join(map(str, views))}",
             cutoff=self.cutoff,
             asked=asked,
         )
@@ -397,12 +399,12 @@ class _SceneCollector:
         pair, offers = answer.batch.pairs[0], self.variants[answer.variant].offers
         offered = candidate_views(pair, self.scene.recording, offers)
         if not offered:  # silent, where frames were asked for and there are none
-            return None if offers is None else ViewReport(pair.anchor, (), 0)
-        return report_selection(pair.anchor, offered, answer.trace)
+            return None if offers is None else ViewReport(pair.reference, (), 0)
+        return report_selection(pair.reference, offered, answer.trace)
 
-    def _count_holes(self, method: Method, anchor: Frame, uv: Tensor) -> None:
+    def _count_holes(self, method: Method, reference: Frame, uv: Tensor) -> None:
         """The sensor's own holes, before anything is held back."""
-        for hole in method.look_at(anchor, uv).hole:
+        for hole in method.sample_depth_at(reference, uv).hole:
             total = max(int((hole != Hole.NONE).sum()), 1)
             self.census.append({k: float((hole == k).sum()) / total for k in names(Hole)})
 
@@ -411,12 +413,12 @@ class _SceneCollector:
         estimate, fit, kinds = answer.estimate, answer.trace["fit"], answer.batch.kinds(answer.samples.uv)
         hole = ~answer.samples.usable
         share = {gate.lower(): float((estimate.gate == code).float().mean()) for code, gate in names(Gate).items()}
-        pair = [answer.batch.pairs[0].anchor, answer.other[0]]
+        pair = [answer.batch.pairs[0].reference, answer.other[0]]
         common: Row = {"scene": self.scene.name, "pair": pair, "method": answer.variant}
         found: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
         found |= {"n_recovered": int((estimate.keep & hole).sum()), "gate_share": share, "ms": answer.trace["ms"]}
         more = self.protocol.columns(answer) | ({} if choice is None else choice.row())
-        self.overlays.setdefault(answer.variant, overlay_points(answer.samples, estimate, answer.batch.anchor.hw))
+        self.overlays.setdefault(answer.variant, overlay_points(answer.samples, estimate, answer.batch.reference.hw))
         for cohort, truth in answer.truths.items():
             points = errors.points_from_estimate(estimate, truth)
             self.pooled.setdefault((answer.variant, cohort), []).append(points)
@@ -429,8 +431,8 @@ class _SceneCollector:
                 )
 
 
-def _all_candidates(asked: Sequence[CandidateViews], recording: Recording, anchor: int) -> list[int]:
-    return sorted({k for offers in asked for k in offers(recording, anchor)})
+def _all_candidates(asked: Sequence[CandidateViews], recording: Recording, reference: int) -> list[int]:
+    return sorted({k for offers in asked for k in offers(recording, reference)})
 
 
 def _track_nothing(image_0: Tensor, image_1: Tensor, uv_0: Tensor, *, hint: TrackHint = NO_HINT) -> Tracks:

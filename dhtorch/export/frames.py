@@ -53,7 +53,7 @@ def quantise_depth(
     )
     code = to_numpy(source)
     if not z.shape == s.shape == code.shape:
-        raise ValueError(f"in_steps: found shapes {z.shape}, {s.shape}, {code.shape}, expected three alike")
+        raise ValueError(f"quantise_depth: found shapes {z.shape}, {s.shape}, {code.shape}, expected three alike")
     z = z.round()
     s = s.round().clip(1)
     wanted = code != Source.NONE

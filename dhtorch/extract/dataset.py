@@ -99,8 +99,8 @@ class RowDataset(Dataset[ExtractedRow]):
 
     def features(self, opened: OpenRecording, i: int) -> Row:
         """The columns of frame ``i`` of an opened recording, beside those of its place."""
-        anchor = opened.frame(i)
-        added = opened.answer(anchor, opened.others(i))
+        reference = opened.frame(i)
+        added = opened.answer(reference, opened.others(i))
         _check_shapes(added, self.wanted)
         keep = {k: c for k, c in self.wanted.items() if k not in KEY_COLUMNS}
         return {k: added[k].numpy().astype(c.kind) for k, c in keep.items()}
@@ -136,9 +136,9 @@ class OpenRecording:
         self._forget()
         return frame
 
-    def answer(self, anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Tensor]:
+    def answer(self, reference: Frame, others: Sequence[Frame | None]) -> dict[str, Tensor]:
         """What the transform adds to the sample of a frame and its other views."""
-        sample = _make_sample(anchor, others)
+        sample = _make_sample(reference, others)
         optional = tuple(key for key in ("confidence", "distortion", "depth_intrinsics") if key in sample)
         kind = (len(sample["image"]), *optional)
         if kind not in self.transforms:
@@ -204,7 +204,7 @@ def common_map_hw(scenes: Sequence[Scene], maps: DenseMaps) -> tuple[int, int]:
 
 
 def try_read_frame(recording: Recording, at: int) -> Frame | None:
-    """A frame, None where it cannot be read: said where that frame is the anchor."""
+    """A frame, None where it cannot be read: said where that frame is the reference view."""
     try:
         return recording[at]
     except MemoryError:
@@ -225,24 +225,24 @@ def _format_hw(hw: Sequence[int]) -> str:
     return f"{hw[0]}x{hw[1]}"
 
 
-def _make_sample(anchor: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:
-    """Frames along time, the anchor last, as the transform reads them."""
-    frames = [*(anchor if other is None else other for other in others), anchor]
+def _make_sample(reference: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:
+    """Frames along time, the reference view last, as the transform reads them."""
+    frames = [*(reference if other is None else other for other in others), reference]
     cameras = [frame.camera for frame in frames]
     sample = {
         "image": torch.cat([frame.image for frame in frames]),
         "image_is_pad": torch.tensor([*(other is None for other in others), False]),
-        "depth": anchor.depth,
+        "depth": reference.depth,
         "intrinsics": torch.cat([cam.to_matrix(camera) for camera in cameras]),
     }
-    if anchor.conf is not None:
-        sample["confidence"] = anchor.conf
+    if reference.conf is not None:
+        sample["confidence"] = reference.conf
     lenses = [camera.distortion for camera in cameras if camera.distortion is not None]
     if lenses:
         size = max(lens.shape[-1] for lens in lenses)
         sample["distortion"] = torch.cat([_pad_distortion(camera, lenses[0], size) for camera in cameras])
-    if anchor.depth_camera is not None:
-        sample["depth_intrinsics"] = cam.to_matrix(anchor.depth_camera)[0]
+    if reference.depth_camera is not None:
+        sample["depth_intrinsics"] = cam.to_matrix(reference.depth_camera)[0]
     poses = [frame.T_world_from_cam for frame in frames]
     if all(pose is not None for pose in poses):
         sample["pose"] = torch.cat([se3.to_matrix(pose) for pose in poses if pose is not None])

@@ -132,31 +132,31 @@ class MapRowDataset(RowDataset):
     def features(self, opened: OpenRecording, i: int) -> Row:
         """What is kept of frame ``i``."""
         recording = opened.recording
-        anchor = opened.frame(i)
+        reference = opened.frame(i)
         view = self.views[camera_key(recording)]
-        if anchor.hw != view.hw:
+        if reference.hw != view.hw:
             raise SampleError(
-                f"picture of {_format_hw(anchor.hw)}, expected {_format_hw(view.hw)} as of the first frame"
+                f"picture of {_format_hw(reference.hw)}, expected {_format_hw(view.hw)} as of the first frame"
             )
-        if get_distortion(anchor) != view.lens:
+        if get_distortion(reference) != view.lens:
             expected = list(view.lens) or "none"
             raise SampleError(
-                f"lens {list(get_distortion(anchor)) or 'none'}, expected {expected} as of the first frame"
+                f"lens {list(get_distortion(reference)) or 'none'}, expected {expected} as of the first frame"
             )
         others = opened.others(i)
-        added = opened.answer(anchor, others)
+        added = opened.answer(reference, others)
         depth, sigma, source, gate = _extract_maps(added, view)
         why = gate if any(other is not None for other in others) else np.full_like(gate, NO_OTHER_VIEW)
         depth = _quantise(depth, self.step)
         sigma = _quantise(sigma, self.step / MAP_SIGMA_STEPS)
-        image = to_rgb_uint8(anchor)
+        image = to_rgb_uint8(reference)
         poses = recording.poses
         pose = np.full(16, np.nan) if poses is None else se3.to_matrix(poses[i : i + 1])[0].double().flatten().numpy()
         found = {
             "depth": encode_float_tiff(depth, deflate=True),
             "sigma": encode_float_tiff(sigma, deflate=True),
             "source": encode_png(source),
-            "K": cam.to_matrix(anchor.camera)[0].double().flatten().numpy(),
+            "K": cam.to_matrix(reference.camera)[0].double().flatten().numpy(),
             "pose": pose,
             "pixels": np.bincount(source.ravel(), minlength=_N_SOURCES),
             "silent": np.bincount(why[source == Source.NONE], minlength=len(NO_ANSWER_REASONS)),
@@ -200,7 +200,7 @@ def _extract_maps(added: Mapping[str, Tensor], view: DatasetCamera) -> tuple[np.
 
 def _refuted_code(added: Mapping[str, Tensor]) -> np.ndarray:
     """Whether the near returns refute a pose that was given, and what it looks like, as the column has it."""
-    looks = int(added.get("pose_looks", torch.zeros(())))
+    looks = int(added.get("pose_convention", torch.zeros(())))
     refuted = (
         looks > 0 or int(added["pose_code"]) == PoseCode.REFUTED or bool((added["gate"] == Gate.POSE_REFUTED).any())
     )

@@ -139,7 +139,9 @@ def register_affine(
     Twin: ``register_affine`` of ``tests/support/reference.py``, one point at a time.
     Cost: reads a patch of image 1 once and 441 pixels of it per point and step.
     """
-    B, N = (check("register", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), wanted=(wanted, "B N"))[k] for k in "BN")
+    B, N = (
+        check("register_affine", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), wanted=(wanted, "B N"))[k] for k in "BN"
+    )
     with torch.no_grad():
         here, there, batch, usable = _rows(source, target, uv_0, uv_1)
         if wanted is not None:
@@ -179,7 +181,10 @@ def registration_step(
     Gradient: to both pyramids and ``uv_0``; ``uv_1`` and ``linear`` are detached.
     Twin: ``register_step`` of ``tests/support/reference.py``.
     """
-    B, N = (check("step", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), linear=(linear, "B N 2 2"))[k] for k in "BN")
+    B, N = (
+        check("registration_step", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), linear=(linear, "B N 2 2"))[k]
+        for k in "BN"
+    )
     here, there, batch, usable = _rows(source, target, uv_0, uv_1)
     q = round_half_up(here)
     place = _place(here - q, window)

@@ -92,7 +92,7 @@ def coarse_flow(
     *,
     linear: Tensor | None = None,  # (B, 2, 2)
     reach: float = 0.25,
-    turns_deg: tuple[float, ...] = ROTATIONS_DEG,
+    rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
     zooms: tuple[float, ...] = ZOOMS,
 ) -> CoarseFlow:
     """The coarse motion of the picture from image 0 to image 1, whatever their exposures.
@@ -100,7 +100,7 @@ def coarse_flow(
     Args:
         linear: turn and zoom, where they are known; None = they are looked for.
         reach: longest displacement beside turn and zoom, as a share of the longer side of image 1.
-        turns_deg, zooms: in-plane turns and magnifications that are tried, the first of each being none.
+        rotations_deg, zooms: in-plane turns and magnifications that are tried, the first of each being none.
 
     Returns:
         Flow, in whole small pixels made smooth over neighbouring cells: the fine search does the rest. A cell whose own
@@ -117,7 +117,7 @@ def coarse_flow(
     a, b = _quantised(small_0), _quantised(small_1)
     larger = small_1.scale / small_0.scale  # turns and zooms are those of small pictures from here on
     if linear is None:
-        found = _best_similarity(image_0, image_1, reach, turns_deg, zooms)
+        found = _best_similarity(image_0, image_1, reach, rotations_deg, zooms)
         plain = torch.eye(2, device=a.device).expand_as(found)
         some = any_possible(is_not_identity(found))
         rivals = torch.stack([plain, found], 1) if some else plain[:, None]
@@ -169,7 +169,7 @@ def undo_similarity(
     Beyond the image its border repeats. Where there is nothing to undo the picture is the image's, bit for bit.
     Gradient: to the image.
     """
-    check("upright", image=(image, "B C H W"), linear=(linear, "B 2 2"), gain=(gain, "B"))
+    check("undo_similarity", image=(image, "B C H W"), linear=(linear, "B 2 2"), gain=(gain, "B"))
     picture = _grey(image)
     H, W = picture.shape[-2:]
     if any_possible(is_not_identity(linear)):
@@ -206,7 +206,7 @@ def downscale(image: Tensor, long: int) -> DownscaledImage:
     Of squares wider than sixteen pixels only every so many rows and columns are read: a hundred pixels tell a mean as
     well as a thousand do. Gradient: to the image.
     """
-    check("small", image=(image, "B C H W"))
+    check("downscale", image=(image, "B C H W"))
     scale = max(1, math.ceil(max(image.shape[-2:]) / long))
     thin = max(1, scale // 8)
     side = scale // thin
@@ -221,12 +221,12 @@ def _grey(image: Tensor) -> Tensor:
 
 
 def _best_similarity(
-    image_0: Tensor, image_1: Tensor, reach: float, turns_deg: tuple[float, ...], zooms: tuple[float, ...]
+    image_0: Tensor, image_1: Tensor, reach: float, rotations_deg: tuple[float, ...], zooms: tuple[float, ...]
 ):
     """The similarity (B, 2, 2) among the candidates under which the pictures agree best."""
     a, b = (_quantised(downscale(image, ROTATION_SIDE_PX)) for image in (image_0, image_1))
-    angle = torch.tensor([math.radians(t) for z in zooms for t in turns_deg], device=a.device)
-    zoom = torch.tensor([z for z in zooms for t in turns_deg], device=a.device)
+    angle = torch.tensor([math.radians(t) for z in zooms for t in rotations_deg], device=a.device)
+    zoom = torch.tensor([z for z in zooms for t in rotations_deg], device=a.device)
     c, s = zoom * angle.cos(), zoom * angle.sin()
     candidates = torch.stack([c, -s, s, c], -1).reshape(1, -1, 2, 2).expand(len(a), -1, -1, -1)
     total = _match(a, b, candidates, reach, ROTATION_WINDOW_PX, ROTATION_STEP_PX)[3]

@@ -23,7 +23,7 @@ def covariance_from_normal(
 
     Gradient: to H and sigma. Raises ValueError for wrong shapes.
     """
-    check("from_normal", H=(H, "B n n"), sigma=(sigma, "B"))
+    check("covariance_from_normal", H=(H, "B n n"), sigma=(sigma, "B"))
     eye = torch.eye(H.shape[-1], dtype=H.dtype, device=H.device).expand_as(H)
     inverse, ok = solve_spd(H, eye)
     inverse = 0.5 * (inverse + inverse.transpose(1, 2))
@@ -78,7 +78,7 @@ def masked_median(
 
     Gradient: to the entry that is the median. Raises ValueError for wrong shapes.
     """
-    check("median", x=(x, "B N"), used=(used, "B N"))
+    check("masked_median", x=(x, "B N"), used=(used, "B N"))
     if x.shape[-1] == 0:
         return x.new_ones((*x.shape[:-1], 1))
     middle = x.masked_fill(~used, torch.nan).nanmedian(-1, keepdim=True).values

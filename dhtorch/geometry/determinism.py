@@ -47,7 +47,7 @@ def pad_elementwise(fn: Callable[..., Tensor], *xs: Tensor) -> Tensor:
     """
     shape = xs[0].shape
     if any(x.shape != shape for x in xs):
-        raise ValueError(f"steady: shapes are {[tuple(x.shape) for x in xs]}, expected equal shapes")
+        raise ValueError(f"pad_elementwise: shapes are {[tuple(x.shape) for x in xs]}, expected equal shapes")
     tail = -xs[0].numel() % ELEMENTWISE_LANES
     padded = [torch.nn.functional.pad(x.reshape(-1), (0, tail), value=0.5) for x in xs]
     return fn(*padded)[: xs[0].numel()].reshape(shape)

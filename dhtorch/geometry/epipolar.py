@@ -1,6 +1,7 @@
 """Two-view geometry of one point: closed-form depth, and how errors reach it.
 
-Alphabet: view 0 is the anchor and its pixel ``uv_0`` is exact; ``x`` = viewing ray of view 0 with z = 1; the point is
+Alphabet: view 0 is the reference view and its pixel ``uv_0`` is exact; ``x`` = viewing ray of view 0 with z = 1; the
+    point is
 X = depth · x in camera 0 and Y = R X + t in camera 1; ``uv_1`` is its measured pixel. Everything is ideal pinhole; the
 two cameras may differ. Coordinates travel as separate (B, N) planes: each operation is contiguous, and rounding cannot
 depend on the batch.
@@ -43,7 +44,7 @@ def triangulate(
     camera_1: Camera,
     T_1_from_0: Pose,
 ) -> TwoView:
-    """One-sided optimal triangulation: the anchor's pixel is exact, the other is moved onto its epipolar line.
+    """One-sided optimal triangulation: the reference view's pixel is exact, the other is moved onto its epipolar line.
 
     ``uv_1`` drops perpendicularly (in pixels) onto the epipolar line of ``uv_0``, which is the maximum-likelihood
     correction for isotropic noise in view 1; the two rays then meet, and depth is a quotient of lengths along the line.
@@ -82,7 +83,9 @@ def triangulate_depth(
 
     Gradient: as :func:`triangulate`.
     """
-    check("depths", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
+    check(
+        "triangulate_depth", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2")
+    )
     step = max(MAX_CHUNK_TRIANGULATED // max(uv_0.shape[0], 1), 1)
     pieces = (
         [(uv_0, uv_1)] if torch.compiler.is_compiling() else zip(uv_0.split(step, 1), uv_1.split(step, 1), strict=True)
@@ -92,7 +95,7 @@ def triangulate_depth(
 
 
 def _directions(uv_0: Tensor, camera_0: Camera, T_1_from_0: Pose) -> tuple[Tensor, Tensor, Tensor]:
-    """The anchor's rays turned into camera 1, R x, as three planes (B, N)."""
+    """The reference view's rays turned into camera 1, R x, as three planes (B, N)."""
     (u, v), (cx, cy) = uv_0.unbind(-1), camera_0.c.split(1, 1)
     x, y = u - cx, v - cy
     R = torch.cat((T_1_from_0.R[..., :2] / camera_0.f[:, None], T_1_from_0.R[..., 2:]), -1)[..., None]
@@ -101,7 +104,7 @@ def _directions(uv_0: Tensor, camera_0: Camera, T_1_from_0: Pose) -> tuple[Tenso
 
 
 def _meet(direction: tuple[Tensor, Tensor, Tensor], uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose) -> Tensor:
-    """Depth (B, N) where the anchor's rays meet those of ``uv_1`` moved onto the epipolar lines."""
+    """Depth (B, N) where the reference view's rays meet those of ``uv_1`` moved onto the epipolar lines."""
     (a0, a1, a2), (t0, t1, t2) = direction, T_1_from_0.t.split(1, 1)
     u, v = uv_1.unbind(-1)
     (fx, fy), (cx, cy) = camera_1.f.split(1, 1), camera_1.c.split(1, 1)
@@ -124,7 +127,7 @@ def describe_triangulation(
     T_1_from_0: Pose,
 ) -> TwoView:
     """The same quantities for points found by another triangulation; the residual is the larger of the two views."""
-    check("describe", xyz_0=(xyz_0, "B N 3"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))
+    check("describe_triangulation", xyz_0=(xyz_0, "B N 3"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))
     z = xyz_0[..., 2]
     x = xyz_0 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)[..., None]
     found = _describe(z, se3.rotate(T_1_from_0.R, x), uv_1, camera_1, T_1_from_0)
@@ -133,7 +136,7 @@ def describe_triangulation(
 
 
 def _describe(depth: Tensor, direction: Tensor, uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose) -> TwoView:
-    """``direction`` (B, N, 3) = R x, the anchor's ray turned into camera 1."""
+    """``direction`` (B, N, 3) = R x, the reference view's ray turned into camera 1."""
     t = T_1_from_0.t[:, None]
     Y = depth[..., None] * direction + t
     miss = uv_1 - cam.project(cam.ideal(camera_1), Y)

@@ -41,9 +41,9 @@ def correlate_separable(x: Tensor, down: Sequence[float], across: Sequence[float
 
     Gradient: to ``x``.
     """
-    sizes = check("separable", x=(x, "B C H W"))
+    sizes = check("correlate_separable", x=(x, "B C H W"))
     if len(down) % 2 == 0 or len(across) % 2 == 0:
-        raise ValueError(f"separable: {len(down)} and {len(across)} taps, expected odd numbers")
+        raise ValueError(f"correlate_separable: {len(down)} and {len(across)} taps, expected odd numbers")
     i, k = len(down) // 2, len(across) // 2
     padded = F.pad(x, (k, k, i, i), mode="replicate")
     rows = _sum([padded[..., t : t + sizes["H"], :] for t in range(len(down))], down)
@@ -77,7 +77,7 @@ def gaussian_blur(x: Tensor, sigma_px: float, *, reach_px: int | None = None) ->
     """
     from kornia.filters import gaussian_blur2d  # noqa: PLC0415  (imported where it is used: 0.2 s)
 
-    check("gaussian", x=(x, "B C H W"))
+    check("gaussian_blur", x=(x, "B C H W"))
     size = len(gaussian_taps(sigma_px)) if reach_px is None else 2 * reach_px + 1
     if size == 1 or len(x) == 0:
         return x

@@ -49,8 +49,8 @@ def free_space_violations(
 
     Gradient: none.
     """
-    check("within_reach", uv=(uv, "B N 2"), sensed=(sensed, "B N"), held=(held, "B N"), asked=(asked, "B N"))
-    check("within_reach", uv=(uv, "B N 2"), depth=(depth, "B N"), sigma=(sigma, "B N"))
+    check("free_space_violations", uv=(uv, "B N 2"), sensed=(sensed, "B N"), held=(held, "B N"), asked=(asked, "B N"))
+    check("free_space_violations", uv=(uv, "B N 2"), depth=(depth, "B N"), sigma=(sigma, "B N"))
     given = sensed > 0
     held = held & given
     around = _share_around(uv, given)

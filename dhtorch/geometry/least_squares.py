@@ -89,7 +89,7 @@ def reprojection_residuals(
 
     Gradient: to pose, f, c, xyz and uv. Raises ValueError for wrong shapes.
     """
-    check("reprojection", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
+    check("reprojection_residuals", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
     plane, _, z = _seen(T, xyz)
     f = f[..., None]
     return (plane - (uv - c[..., None]) / f) * f, z
@@ -132,7 +132,7 @@ def robust_loss(square: Tensor, kernel: str | None, scale: float) -> tuple[Tenso
     if kernel == "geman_mcclure":
         bend = 1 + square / k2
         return square / bend, (bend * bend).reciprocal()
-    raise ValueError(f"robust: kernel is {kernel!r}, expected None, 'huber', 'cauchy' or 'geman_mcclure'")
+    raise ValueError(f"robust_loss: kernel is {kernel!r}, expected None, 'huber', 'cauchy' or 'geman_mcclure'")
 
 
 def robust_weight_slope(square: Tensor, kernel: str | None, scale: float) -> Tensor:
@@ -242,7 +242,7 @@ def implicit_step(equations: Callable[[Tensor], Tensor], g: Tensor) -> Tensor:
     Gradient: to what g depends on, first order; zero where the equations are singular or g has no graph.
     Raises ValueError for wrong shapes.
     """
-    n = check("implicit", g=(g, "B n"))["n"]
+    n = check("implicit_step", g=(g, "B n"))["n"]
     if not has_graph(g):
         return torch.zeros_like(g)
     with torch.no_grad():
@@ -280,7 +280,7 @@ def move_pose(
 
     Gradient: to T and xi. Raises ValueError for wrong shapes.
     """
-    check("move", R=(T.R, "B 3 3"), xi=(xi, "B 6"))
+    check("move_pose", R=(T.R, "B 3 3"), xi=(xi, "B 6"))
     half, t = (0.5 * xi).split(3, 1)
     half = half[..., None]
     M = torch.cat((T.R, T.t[..., None]), -1)
@@ -298,7 +298,7 @@ def trial_pose_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
 
     Gradient: none. Raises ValueError for wrong shapes.
     """
-    check("trial_step", H=(H, "B 6 6"), g=(g, "B 6"))
+    check("trial_pose_step", H=(H, "B 6 6"), g=(g, "B 6"))
     with torch.no_grad():
         xi, info = torch.linalg.solve_ex(H.double(), -g.double())
         return move_pose(T, xi.to(g.dtype)), info == 0

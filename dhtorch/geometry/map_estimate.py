@@ -64,8 +64,8 @@ class FitOptions(NamedTuple):
 
     far_weight: float = 0.1
     max_rise: float = 0.1
-    turn_sigma: float = 0.01
-    turn_gain: float = 0.02
+    shutter_sigma: float = 0.01
+    shutter_gain: float = 0.02
     translation_gain: float = 0.55
     kernel: str | None = "geman_mcclure"
     bend: float = 2.0
@@ -79,7 +79,7 @@ class MapSolution(NamedTuple):
     at: Unknowns  # with a turn, zero where none was believed
     noise: Tensor  # (B, N) px²
     far_weight: Tensor  # (B,) 0 where far tracks were not believed
-    turn_precision: Tensor  # (B,) 1/rad²
+    shutter_precision: Tensor  # (B,) 1/rad²
     translates: Tensor  # (B,) bool, a pure rotation does not explain the tracks
 
 
@@ -88,7 +88,7 @@ def estimate_map_pose(problem: PoseDepthProblem, start: Pose, o: FitOptions) -> 
     """Solve for the near tracks, then for all, then for all with a turn; go on only where that is borne out.
 
     *Far tracks* are believed unless the near tracks' robust cost rises by more than ``max_rise`` with them. A *turn* is
-    believed where it takes away more than ``turn_gain`` of the whole cost, a *translation* where it takes away more
+    believed where it takes away more than ``shutter_gain`` of the whole cost, a *translation* where it takes away more
     than ``translation_gain`` of the cost of the best pure rotation. More parameters always fit better; by how much they
     do without need is a matter of systematic errors, which no number of tracks averages out: hence shares. Returns from
     far away move little and lose little: their number dilutes the share. So a translation is also believed where the
@@ -116,15 +116,15 @@ def estimate_map_pose(problem: PoseDepthProblem, start: Pose, o: FitOptions) -> 
     near, _ = solve(near, estimate_noise_variance(close, near), none, rigid, o.near_steps - half, close)
     both, _ = solve(near, estimate_noise_variance(problem, near), far, rigid, o.steps)
     noise, precision = estimate_noise_variance(problem, both), rigid
-    if o.turn_sigma > 0:
+    if o.shutter_sigma > 0:
         both, least = solve(both, noise, far, rigid, o.steps // 2)
-        both = both._replace(turn=straight)
-        loose = torch.full_like(rigid, o.turn_sigma**-2)
+        both = both._replace(shutter_rate=straight)
+        loose = torch.full_like(rigid, o.shutter_sigma**-2)
         turned, lower = solve(both, noise, far, loose, o.steps)
-        worth = least - lower > o.turn_gain * least + COST_SLACK
+        worth = least - lower > o.shutter_gain * least + COST_SLACK
         both, precision = select_batch(worth, turned, both), torch.where(worth, loose, rigid)
-    near = near._replace(turn=straight)
-    both = both if o.turn_sigma > 0 else both._replace(turn=straight)
+    near = near._replace(shutter_rate=straight)
+    both = both if o.shutter_sigma > 0 else both._replace(shutter_rate=straight)
     scales = noise[:, : close.near.shape[1]]
     cost_near, cost_both = (_near_cost(close, x, scales, o) for x in (near, both))
     believed = cost_both <= cost_near * (1 + o.max_rise) + COST_SLACK
@@ -170,7 +170,7 @@ def _translates(
         there, H, g = normal(at)
         return NormalEquations(there, H * free * free[:, None] + torch.diag(1 - free), g * free)
 
-    still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.turn)
+    still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.shutter_rate)
     turned, rotation = minimise(evaluate, still, o.steps, cost=judge, step=trial_unknowns_step)
     shown = rotation - judge(at) > o.translation_gain * rotation + COST_SLACK
     if all_known(shown):
@@ -237,8 +237,8 @@ def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     rows = whitened_residuals(problem, linear, solution.noise).double()
     A, _ = normal_equations(rows, bread.double(), block=SUM_LANES)
     M, _ = normal_equations(rows, meat.double(), block=SUM_LANES)
-    free = o.turn_sigma**-2 if o.turn_sigma > 0 else GLOBAL_SHUTTER_PRECISION
-    known = torch.diag_embed(shutter_prior(torch.full_like(solution.turn_precision, free).double()))
+    free = o.shutter_sigma**-2 if o.shutter_sigma > 0 else GLOBAL_SHUTTER_PRECISION
+    known = torch.diag_embed(shutter_prior(torch.full_like(solution.shutter_precision, free).double()))
     A, M = A + known, M + known
     inverse, ok = solve_spd(A, torch.eye(9, dtype=A.dtype, device=A.device).expand_as(A))
     whole = small_matmul(small_matmul(inverse, M), inverse)

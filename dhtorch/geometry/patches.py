@@ -60,9 +60,9 @@ def reduce_patches(
     Gradient: to the image, through ``reduce``.
     Twin: ``patch`` of ``tests/support/reference.py``, one point at a time.
     """
-    sizes = check("lookup.summarise", image=(image, "B C H W"), pixel=(pixel, "B N 2"))
+    sizes = check("reduce_patches", image=(image, "B C H W"), pixel=(pixel, "B N 2"))
     B, N, C, H, W = (sizes[k] for k in "BNCHW")
-    _must_fit("summarise", size, H, W)
+    _must_fit("reduce_patches", size, H, W)
     flat, (b, c, v, u) = flatten_images(image)
     if compiled is not None and size <= MAX_COMPILED_WINDOW_PX and loader.serves(flat, pixel):
         kind, count = COMPILED_REDUCTIONS[compiled]
@@ -194,9 +194,9 @@ def extract_patches(image: Tensor, corner: Tensor, size: int) -> Tensor:
     Raises:
         ValueError: the image is smaller than a patch.
     """
-    sizes = check("lookup.patches", image=(image, "B C H W"), corner=(corner, "B N 2"))
+    sizes = check("extract_patches", image=(image, "B C H W"), corner=(corner, "B N 2"))
     B, C, H, W = (sizes[k] for k in "BCHW")
-    _must_fit("patches", size, H, W)
+    _must_fit("extract_patches", size, H, W)
     u = corner[..., 0].clamp(0, W - size)
     v = corner[..., 1].clamp(0, H - size)
     plane = torch.arange(B * C, device=image.device).view(B, 1, C) * (H * W)
@@ -247,7 +247,7 @@ def sample_nearest(grid: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     Outside the grid, and for non-finite ``uv``, the value is that of some border pixel and ``inside`` is false.
     Twin: ``nearest`` of ``tests/support/reference.py``.
     """
-    sizes = check("lookup.nearest", grid=(grid, "B h w"), uv=(uv, "B N 2"))
+    sizes = check("sample_nearest", grid=(grid, "B h w"), uv=(uv, "B N 2"))
     index, inside = nearest_pixel_index((sizes["h"], sizes["w"]), containing_pixels(uv))
     return grid.flatten(1).gather(1, index), inside
 

@@ -75,7 +75,7 @@ class SweptView(Record):
     image: Tensor  # (B, 1, H, W) grey
     camera: Camera
     T_1_from_0: Pose
-    turn: Tensor | None = None  # (B, 3) rad per unit of y, of a rolling shutter
+    shutter_rate: Tensor | None = None  # (B, 3) rad per unit of y, of a rolling shutter
 
 
 class EpipolarWarp(NamedTuple):
@@ -128,7 +128,7 @@ def pixel_rays(camera: Camera, hw: tuple[int, int], margin: int = 0) -> Tensor:
 
 def make_reference_view(image: Tensor, camera: Camera) -> ReferenceView:
     """View 0 of a grey picture (B, 1, h, w). Gradient: to the picture and, through the rays, to the camera."""
-    check("sweep.base", image=(image, "B 1 h w"), f=(camera.f, "B 2"))
+    check("make_reference_view", image=(image, "B 1 h w"), f=(camera.f, "B 2"))
     ray = pixel_rays(camera, (image.shape[-2], image.shape[-1]))
     known = all_finite(ray, -1) if camera.distortion is not None else _sees(camera, ray)
     if not (known.is_cpu and all_known(known)):
@@ -145,18 +145,26 @@ def _sees(camera: Camera, ray: Tensor) -> Tensor:
 def project_inverse_depth(view: SweptView, ray: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
     """Where view 1 sees the points on rays (B, N, 3) at inverse depths q (B, N): pixels (B, N, 2) of its picture, and
     whether they lie before it (B, N). Gradient: to everything."""
-    check("seen_at", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
+    check("project_inverse_depth", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
     R, t, f, c = view.T_1_from_0.R, view.T_1_from_0.t, view.camera.f, view.camera.c
     if view.camera.distortion is None:
-        given = ray.mT.contiguous(), q, R, t, torch.zeros_like(t) if view.turn is None else view.turn, f, c
+        given = (
+            ray.mT.contiguous(),
+            q,
+            R,
+            t,
+            torch.zeros_like(t) if view.shutter_rate is None else view.shutter_rate,
+            f,
+            c,
+        )
         if loader.serves(*given):
             uv = torch.empty_like(given[0][:, :2])
             front = torch.empty_like(q, dtype=torch.bool)
             torch.ops.dhtorch.seen_at(*given, uv, front)
             return uv.mT, front
     x, y, z = (part + q * t[:, None] for part, t in zip(rotate_rays(R, ray), t.unbind(-1), strict=True))
-    if view.turn is not None:
-        p, o, s = (view.turn[:, k, None] * ray[..., 1] for k in range(3))
+    if view.shutter_rate is not None:
+        p, o, s = (view.shutter_rate[:, k, None] * ray[..., 1] for k in range(3))
         x, y, z = x + (o * z - s * y), y + (s * x - p * z), z + (p * y - o * x)
     front = z > 1e-3
     x, y, z = (torch.where(front, part, 1.0) for part in (x, y, z))
@@ -200,7 +208,7 @@ def epipolar_warp(base: ReferenceView, view: SweptView) -> EpipolarWarp:
 
 def census_transform(grey: Tensor) -> Tensor:
     """Codes (B, h, w) int32 of pictures (B, 1, h, w): of each of 31 neighbours whether it is darker than the middle."""
-    check("census", grey=(grey, "B 1 h w"))
+    check("census_transform", grey=(grey, "B 1 h w"))
     h, w = grey.shape[-2:]
     if loader.serves(grey) and grey.dtype == torch.float32:
         code = torch.empty_like(grey[:, 0], dtype=torch.int32)
@@ -287,7 +295,7 @@ def aggregate_costs(
     Memory: two bytes for every place. Gradient: none.
     Source: H. Hirschmueller, "Stereo processing by semiglobal matching and mutual information", 2008, of four paths.
     """
-    check("aggregate", C=(C, "B h w D"))
+    check("aggregate_costs", C=(C, "B h w D"))
     price = torch.as_tensor(views, dtype=torch.int16, device=C.device).reshape(-1, 1, 1)
     S = torch.zeros_like(C, dtype=torch.int16)
     for dim in (1, 2):
@@ -332,7 +340,7 @@ class BestPlane(NamedTuple):
 
 def best_plane(S: Tensor) -> BestPlane:
     """The plane of least cost S (B, h, w, D), the first of equals, and the parabola through its neighbours' costs."""
-    check("winner", S=(S, "B h w D"))
+    check("best_plane", S=(S, "B h w D"))
     return BestPlane(*(torch.cat(part, 1) for part in zip(*map(_winner, S.split(ROWS_PER_BLOCK, 1)), strict=True)))
 
 

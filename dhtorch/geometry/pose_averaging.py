@@ -66,9 +66,9 @@ def average_poses(
     Source: T. Barfoot, P. Furgale, "Associating uncertainty with three-dimensional poses for use in estimation
     problems", 2014; the scale is R. Birge's ratio.
     """
-    V = check("rigid_mean", t=(T.t, "B V 3"), R=(T.R, "B V 3 3"), cov=(cov, "B V 6 6"), valid=(valid, "B V"))["V"]
+    V = check("average_poses", t=(T.t, "B V 3"), R=(T.R, "B V 3 3"), cov=(cov, "B V 6 6"), valid=(valid, "B V"))["V"]
     if V == 0:
-        raise ValueError("rigid_mean: found no measurement, expected at least one")
+        raise ValueError("average_poses: found no measurement, expected at least one")
     with torch.no_grad():
         B, dtype = len(valid), T.t.dtype
         valid = valid & T.R.isfinite().all((-1, -2)) & T.t.isfinite().all(-1) & cov.isfinite().all((-1, -2))

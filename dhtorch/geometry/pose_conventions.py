@@ -53,7 +53,9 @@ def pose_hypotheses(
 
     Gradient: to both.
     """
-    check("readings", R=(T.R, "B 3 3"), t=(T.t, "B 3"), R_back=(other_way.R, "B 3 3"), t_back=(other_way.t, "B 3"))
+    check(
+        "pose_hypotheses", R=(T.R, "B 3 3"), t=(T.t, "B 3"), R_back=(other_way.R, "B 3 3"), t_back=(other_way.t, "B 3")
+    )
     found = []
     for axes, way, unit in _ALL:
         motion = motion_from_axes(other_way if way else T, CAMERA_AXES[axes])

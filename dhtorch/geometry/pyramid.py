@@ -101,7 +101,8 @@ def _first(planes: tuple[int, ...], size: int, shift: int, *, device: torch.devi
 
 
 class PyramidCache:
-    """The pyramids of a batch of images, each built when it is first asked for: of an anchor tracked into many views.
+    """The pyramids of a batch of images, each built when it is first asked for: of a reference view tracked into many
+    views.
 
     Carries no graph. ``pyramids[i:j]`` are those of some of the images.
     """
@@ -120,7 +121,8 @@ class PyramidCache:
         return self._built[levels, window]
 
     def once(self, key: Hashable, make: Callable[[Tensor], Any]) -> Any:
-        """``make(image)``, made once for all who name it by ``key``: what else a tracker knows of its anchor."""
+        """``make(image)``, made once for all who name it by ``key``: what else a tracker knows of its reference
+        view."""
         if key not in self._more:
             with torch.no_grad():
                 self._more[key] = make(self.image)

@@ -125,10 +125,10 @@ def search_hypotheses(
     Raises:
         ValueError: wrong shapes, fewer hypotheses (4 H) than ``keep``.
     """
-    sizes = check("search", points=(points, "B 5 M"), f=(f, "B 2"), c=(c, "B 2"), draws=(draws, "B H 3"))
+    sizes = check("search_hypotheses", points=(points, "B 5 M"), f=(f, "B 2"), c=(c, "B 2"), draws=(draws, "B H 3"))
     M, K = sizes["M"], 4 * sizes["H"]
     if keep > K:
-        raise ValueError(f"search: draws has shape {tuple(draws.shape)}, expected at least {keep} solutions")
+        raise ValueError(f"search_hypotheses: draws has shape {tuple(draws.shape)}, expected at least {keep} solutions")
     xyz, uv = points[:, :3], points[:, 3:]
     uv, one = uv - c[..., None], torch.ones_like(uv[:, :1])
     triples = distinct_triples(draws, count)
@@ -164,7 +164,7 @@ def is_collinear(
     Raises:
         ValueError: wrong shapes.
     """
-    check("collinear", xyz=(xyz, "B 3 M"), used=(used, "B M"))
+    check("is_collinear", xyz=(xyz, "B 3 M"), used=(used, "B M"))
     reach = xyz.detach().abs().amax(1)
     used = (used & (reach <= MAX_DISTANCE_RATIO * masked_median(reach, used)))[:, None]
     x = xyz.masked_fill(~used, 0.0).double()

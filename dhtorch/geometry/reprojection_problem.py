@@ -1,6 +1,7 @@
 """One least-squares problem from two kinds of tracks: near ones, whose depth a sensor knows, and far ones, without.
 
-Alphabet: view 0 is the anchor; ``x`` its viewing ray with z = 1 and ``q`` the inverse depth along it (1/m), so that the
+Alphabet: view 0 is the reference view; ``x`` its viewing ray with z = 1 and ``q`` the inverse depth along it (1/m), so
+    that the
 point seen from camera 1 is R x + q t, up to scale, and q = 0 is a point at infinity. ``r`` = projected − measured (px),
 ``S`` its covariance, ``s`` = d r / d q. Every track has its own q, which is eliminated from the problem (a Schur
 complement that is one number): with a sensor that states variance v of q, r has the covariance S + v s sᵀ; a far track
@@ -8,7 +9,7 @@ has v = ∞ and keeps only the part of r across its epipolar line. So both kinds
 
 Unknowns of a pair: the pose T (left perturbation) and the *turn* b (rad): a camera that reads row by row while it moves
 sees each row from a place of its own, which for short exposures is mainly a rotation y · b more, y being the height of
-x in the anchor. A turn of zero is a global shutter.
+x in the reference view. A turn of zero is a global shutter.
 
 Source: bundle adjustment with one free camera (B. Triggs et al., "Bundle adjustment: a modern synthesis", 2000);
 tracks with and without depth in one problem: J. Zhang, M. Kaess, S. Singh, "Real-time depth enhanced monocular
@@ -39,7 +40,7 @@ from dhtorch.geometry.se3 import Pose, hat
 from dhtorch.ops import loader
 from dhtorch.pytree import Record, record
 
-#: A far track is not closer to the anchor than the nearest point of the sensor by more than this factor.
+#: A far track is not closer to the reference view than the nearest point of the sensor by more than this factor.
 NEAREST_DEPTH_DIVISOR = 2.0
 
 #: The robust kernel that compiled code knows.
@@ -68,7 +69,7 @@ class Unknowns(NamedTuple):
     """What is solved for."""
 
     T: Pose
-    turn: Tensor | None  # (B, 3) rad per unit of y; None: none, and none is looked for
+    shutter_rate: Tensor | None  # (B, 3) rad per unit of y; None: none, and none is looked for
 
 
 def retract_unknowns(at: Unknowns, xi: Tensor) -> Unknowns:
@@ -76,8 +77,10 @@ def retract_unknowns(at: Unknowns, xi: Tensor) -> Unknowns:
 
     Gradient: to both. Raises ValueError for wrong shapes.
     """
-    check("moved", turn=(at.turn, "B 3"), xi=(xi, "B 6" if at.turn is None else "B 9"))
-    return Unknowns(move_pose(at.T, xi[:, :6]), None if at.turn is None else at.turn + xi[:, 6:])
+    check(
+        "retract_unknowns", shutter_rate=(at.shutter_rate, "B 3"), xi=(xi, "B 6" if at.shutter_rate is None else "B 9")
+    )
+    return Unknowns(move_pose(at.T, xi[:, :6]), None if at.shutter_rate is None else at.shutter_rate + xi[:, 6:])
 
 
 def unknowns_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
@@ -87,7 +90,7 @@ def unknowns_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]
 
     Gradient: to all three. Raises ValueError for wrong shapes.
     """
-    check("step", turn=(at.turn, "B 3"), H=(H, "B n n"), g=(g, "B n"))
+    check("unknowns_step", shutter_rate=(at.shutter_rate, "B 3"), H=(H, "B n n"), g=(g, "B n"))
     xi, ok = solve_spd(H, -g[..., None])
     return retract_unknowns(at, xi[..., 0]), ok
 
@@ -98,7 +101,7 @@ def trial_unknowns_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, T
 
     Gradient: none. Raises ValueError for wrong shapes.
     """
-    check("trial_step", turn=(at.turn, "B 3"), H=(H, "B n n"), g=(g, "B n"))
+    check("trial_unknowns_step", shutter_rate=(at.shutter_rate, "B 3"), H=(H, "B n n"), g=(g, "B n"))
     with torch.no_grad():
         xi, info = torch.linalg.solve_ex(H.double(), -g.double())
         return retract_unknowns(at, xi.to(g.dtype)), info == 0
@@ -108,22 +111,29 @@ def undo_rolling_shutter(
     uv: Tensor,  # (B, 2, N) ideal px of camera 1, planes
     f: Tensor,  # (B, 2) px
     c: Tensor,  # (B, 2) px
-    y: Tensor,  # (B, N) height of the anchor's ray
-    turn: Tensor,  # (B, 3) rad per unit of y
+    y: Tensor,  # (B, N) height of the reference view's ray
+    shutter_rate: Tensor,  # (B, 3) rad per unit of y
 ) -> Tensor:
     """Pixels as a camera without rolling shutter would have seen them: each ray is turned back by y · turn.
 
     Gradient: to all. Raises ValueError for wrong shapes.
     """
-    check("straighten", uv=(uv, "B 2 N"), f=(f, "B 2"), c=(c, "B 2"), y=(y, "B N"), turn=(turn, "B 3"))
+    check(
+        "undo_rolling_shutter",
+        uv=(uv, "B 2 N"),
+        f=(f, "B 2"),
+        c=(c, "B 2"),
+        y=(y, "B N"),
+        shutter_rate=(shutter_rate, "B 3"),
+    )
     f, c = f[..., None], c[..., None]
-    return _straight((uv - c) / f, y, turn) * f + c
+    return _straight((uv - c) / f, y, shutter_rate) * f + c
 
 
-def _straight(seen: Tensor, y: Tensor, turn: Tensor) -> Tensor:
+def _straight(seen: Tensor, y: Tensor, shutter_rate: Tensor) -> Tensor:
     """:func:`undo_rolling_shutter` at z = 1: where (u, v, 1) - y · turn x (u, v, 1) passes it."""
     ray = torch.cat((seen, torch.ones_like(seen[:, :1])), 1)
-    ray = ray - y[:, None] * rotate_planes(hat(turn), ray)
+    ray = ray - y[:, None] * rotate_planes(hat(shutter_rate), ray)
     z = ray[:, 2:]
     return ray[:, :2] / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter: stays finite
 
@@ -172,9 +182,11 @@ def linearise_tracks(
     Gradient: to measurements, cameras, rays and the sensor's q; the far tracks' q is held at its optimum, where it has
     no first-order effect. Raises ValueError for wrong shapes.
     """
-    check("linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), turn=(at.turn, "B 3"))
+    check(
+        "linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), shutter_rate=(at.shutter_rate, "B 3")
+    )
     known = track_constants(problem) if known is None else known
-    seen = known.seen if at.turn is None else _straight(known.seen, known.height, at.turn)
+    seen = known.seen if at.shutter_rate is None else _straight(known.seen, known.height, at.shutter_rate)
     t = at.T.t[..., None]
     # Where the ray and the plane of the epipolar line go, in one product.
     a, line = rotate_planes(torch.cat((at.T.R, torch.linalg.cross(t, at.T.R, dim=1)), 1), problem.ray).chunk(2, 1)
@@ -207,7 +219,7 @@ def whitened_residuals(
     linear: LinearisedTracks,
     noise: Tensor,  # (B, N) px²
     *,
-    turn: bool = True,
+    shutter_rate: bool = True,
 ) -> Tensor:
     """Whitened rows (B, 10, 2, N), inverse depths eliminated: six columns of the pose, three of the turn, the residual.
 
@@ -218,14 +230,14 @@ def whitened_residuals(
 
     Gradient: to ``linear`` and noise. Raises ValueError for wrong shapes.
     """
-    check("residuals", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
-    return _rows(linear, _sphere(linear.fixed, noise), turn)
+    check("whitened_residuals", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
+    return _rows(linear, _sphere(linear.fixed, noise), shutter_rate)
 
 
-def _rows(linear: LinearisedTracks, sphere: tuple[Tensor, Tensor, Tensor], turn: bool) -> Tensor:
+def _rows(linear: LinearisedTracks, sphere: tuple[Tensor, Tensor, Tensor], shutter_rate: bool) -> Tensor:
     m0, m1 = (m[:, None] for m in _whitener(linear, sphere))
     rows = m0 * linear.u[:, :, None] + m1 * linear.v[:, :, None]
-    if not turn:
+    if not shutter_rate:
         return rows
     return torch.cat((rows[:, :6], rows[:, :3] * linear.fixed.height[:, None, None], rows[:, 6:]), 1)
 
@@ -240,7 +252,7 @@ def squared_residuals(
 
     Gradient: as :func:`whitened_residuals`. Raises ValueError for wrong shapes.
     """
-    check("squares", u=(linear.u, "B n N"), noise=(noise, "B N"))
+    check("squared_residuals", u=(linear.u, "B n N"), noise=(noise, "B N"))
     return _lengths(linear, _sphere(linear.fixed, noise))
 
 
@@ -278,7 +290,7 @@ def pose_normal_equations(
     at: Unknowns,
     noise: Tensor,  # (B, N) px²
     far_weight: Tensor,  # (B,)
-    turn_precision: Tensor,  # (B,) 1/rad²
+    shutter_precision: Tensor,  # (B,) 1/rad²
     *,
     kernel: str | None,
     bend: float,
@@ -288,19 +300,19 @@ def pose_normal_equations(
     Args:
         problem, at, noise: as in :func:`linearise_tracks` and :func:`whitened_residuals`. Without a turn n = 6.
         far_weight: of a far track's robust cost; 0 leaves them out.
-        turn_precision: of the turn around zero; a huge one holds it there.
+        shutter_precision: of the turn around zero; a huge one holds it there.
         kernel, bend: robust kernel of a whitened residual and where it bends, see ``least_squares.robust``.
 
     Gradient: as :func:`whitened_residuals`. Raises ValueError for wrong shapes or an unknown kernel.
     """
-    return pose_normal_equations_at(problem, noise, far_weight, turn_precision, kernel=kernel, bend=bend)[0](at)
+    return pose_normal_equations_at(problem, noise, far_weight, shutter_precision, kernel=kernel, bend=bend)[0](at)
 
 
 def pose_normal_equations_at(
     problem: PoseDepthProblem,
     noise: Tensor,  # (B, N) px²
     far_weight: Tensor,  # (B,)
-    turn_precision: Tensor,  # (B,) 1/rad²
+    shutter_precision: Tensor,  # (B,) 1/rad²
     *,
     kernel: str | None,
     bend: float,
@@ -314,15 +326,15 @@ def pose_normal_equations_at(
     sphere = _sphere(known, noise)
     share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
 
-    def total(cost: Tensor, turn: Tensor | None) -> Tensor:
-        return cost if turn is None else cost + turn_precision * (turn * turn).sum(-1)
+    def total(cost: Tensor, shutter_rate: Tensor | None) -> Tensor:
+        return cost if shutter_rate is None else cost + shutter_precision * (shutter_rate * shutter_rate).sum(-1)
 
-    def with_prior(cost: Tensor, H: Tensor, g: Tensor, turn: Tensor | None) -> NormalEquations:
-        if turn is None:
+    def with_prior(cost: Tensor, H: Tensor, g: Tensor, shutter_rate: Tensor | None) -> NormalEquations:
+        if shutter_rate is None:
             return NormalEquations(cost, H, g)
-        precision = shutter_prior(turn_precision.to(g.dtype))
-        towards = torch.cat((torch.zeros_like(g[:, :6]), turn), -1)
-        return NormalEquations(total(cost, turn), H + torch.diag_embed(precision), g + precision * towards)
+        precision = shutter_prior(shutter_precision.to(g.dtype))
+        towards = torch.cat((torch.zeros_like(g[:, :6]), shutter_rate), -1)
+        return NormalEquations(total(cost, shutter_rate), H + torch.diag_embed(precision), g + precision * towards)
 
     def compiled(at: Unknowns, columns: bool) -> NormalEquations | None:
         """Cost, H and g of the tracks in compiled code (:mod:`dhtorch.ops.loader`), up to the rounding of sums."""
@@ -333,7 +345,7 @@ def pose_normal_equations_at(
         )
         if given is None:
             return None
-        B, n = len(share) if columns else 0, 6 if at.turn is None else 9
+        B, n = len(share) if columns else 0, 6 if at.shutter_rate is None else 9
         found = NormalEquations(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
         torch.ops.dhtorch.track_equations(**given, share=share, **found._asdict(), bend=bend)
         return found
@@ -341,19 +353,19 @@ def pose_normal_equations_at(
     def normal(at: Unknowns) -> NormalEquations:
         found = compiled(at, columns=True)
         if found is not None:
-            return with_prior(*found, at.turn)
+            return with_prior(*found, at.shutter_rate)
         linear = linearise_tracks(problem, at, known=known)
-        rows = _rows(linear, sphere, at.turn is not None)
+        rows = _rows(linear, sphere, at.shutter_rate is not None)
         rho, weight = robust_loss(_square(linear, rows[:, -1]), kernel, bend)
         H, g = normal_equations(rows, torch.where(linear.front, weight * share, 0.0), block=SUM_LANES)
-        return with_prior((rho * share).sum(-1), H, g, at.turn)
+        return with_prior((rho * share).sum(-1), H, g, at.shutter_rate)
 
     def cost(at: Unknowns) -> Tensor:
         found = compiled(at, columns=False)
         if found is not None:
-            return total(found.cost, at.turn)
+            return total(found.cost, at.shutter_rate)
         square = _lengths(linearise_tracks(problem, at, columns=False, known=known), sphere)
-        return total((robust_loss(square, kernel, bend)[0] * share).sum(-1), at.turn)
+        return total((robust_loss(square, kernel, bend)[0] * share).sum(-1), at.shutter_rate)
 
     return normal, cost
 
@@ -363,9 +375,9 @@ def _compiled_arguments(
 ) -> dict[str, Tensor] | None:
     """What compiled code is told of tracks and unknowns; None where it cannot be told."""
     a, b, d = sphere
-    turn = at.T.t.new_empty(0, 3) if at.turn is None else at.turn.contiguous()
+    shutter_rate = at.T.t.new_empty(0, 3) if at.shutter_rate is None else at.shutter_rate.contiguous()
     told = {k: getattr(problem, k) for k in ("ray", "inverse", "near")} | known._asdict()
-    told |= {"a": a, "b": b, "d": d, "R": at.T.R.contiguous(), "t": at.T.t.contiguous(), "turn": turn}
+    told |= {"a": a, "b": b, "d": d, "R": at.T.R.contiguous(), "t": at.T.t.contiguous(), "turn": shutter_rate}
     whole = problem.ray.shape[-1] % SUM_LANES == 0
     return told if whole and loader.serves(*told.values()) else None
 
@@ -375,17 +387,17 @@ def _square(linear: LinearisedTracks, r: Tensor) -> Tensor:
     return torch.where(linear.front, (r * r).sum(1), BEHIND_CAMERA_RESIDUAL)
 
 
-def shutter_prior(turn_precision: Tensor) -> Tensor:
+def shutter_prior(shutter_precision: Tensor) -> Tensor:
     """Information (B, 9) that is there before any track: none on the pose."""
-    zero = torch.zeros_like(turn_precision)
-    return torch.stack((*[zero] * 6, *[turn_precision] * 3), -1)
+    zero = torch.zeros_like(shutter_precision)
+    return torch.stack((*[zero] * 6, *[shutter_precision] * 3), -1)
 
 
 def _inverse_depth(a: Tensor, t: Tensor, line: Tensor, seen: Tensor, shape: Tensor) -> Tensor:
     """Maximum-likelihood q (B, N) of a track without depth: its pixel, moved onto the epipolar line along the noise.
 
-    ``a`` (B, 3, N) is the anchor's ray turned into camera 1, ``line`` = t × a. Negative where the rays part; 0 without
-    baseline.
+    ``a`` (B, 3, N) is the reference view's ray turned into camera 1, ``line`` = t × a. Negative where the rays part; 0
+    without baseline.
     """
     n, last = line[:, :2], line[:, 2]
     m = shape[:, :2] * n[:, :1] + shape[:, 1:] * n[:, 1:]

@@ -21,7 +21,7 @@ OUT_OF_RANGE = -1
 
 def pack_cells(ijk: Tensor) -> Tensor:
     """Numbers (…,) of cells (…, 3) int64; NOWHERE for a place out of reach. Gradient: none."""
-    check("sparse_grid.pack", ijk=(ijk, "* 3"))
+    check("pack_cells", ijk=(ijk, "* 3"))
     shifted = ijk + CELL_RANGE
     inside = ((shifted >= 0) & (shifted < 2 * CELL_RANGE)).all(-1)
     x, y, z = shifted.unbind(-1)
@@ -43,7 +43,7 @@ def find_cells(
     Raises:
         ValueError: wrong shapes.
     """
-    K = check("sparse_grid.find", keys=(keys, "K"))["K"]
+    K = check("find_cells", keys=(keys, "K"))["K"]
     if not K:
         return torch.zeros_like(wanted), torch.zeros_like(wanted, dtype=torch.bool)
     at = torch.searchsorted(keys, wanted).clamp_max(K - 1)
@@ -60,9 +60,9 @@ def occupied_cells(
     Raises:
         ValueError: wrong shapes, or a side that is not positive.
     """
-    check("sparse_grid.occupied", xyz=(xyz, "* 3"))
+    check("occupied_cells", xyz=(xyz, "* 3"))
     if not side > 0:
-        raise ValueError(f"sparse_grid.occupied: side is {side}, expected a positive length")
+        raise ValueError(f"occupied_cells: side is {side}, expected a positive length")
     scaled = xyz.reshape(-1, 3).double() / side
     there = (scaled.abs() < CELL_RANGE).all(-1)  # false for NaN
     return pack_cells(scaled[there].floor().long()).unique()
@@ -77,7 +77,7 @@ def touches_cells(
     Raises:
         ValueError: wrong shapes.
     """
-    check("sparse_grid.near", keys=(keys, "K"), others=(others, "V"))
+    check("touches_cells", keys=(keys, "K"), others=(others, "V"))
     around = pack_cells(unpack_cells(keys)[:, None] + _steps(keys))
     return find_cells(others, around)[1].any(-1)
 
@@ -92,7 +92,7 @@ def connected_components(keys: Tensor) -> Tensor:
 
     Cost: the logarithm of the longest chain, times 13 look-ups of all cells.
     """
-    check("sparse_grid.components", keys=(keys, "K"))
+    check("connected_components", keys=(keys, "K"))
     at, found = find_cells(
         keys, pack_cells(unpack_cells(keys)[:, None] + _steps(keys)[14:])
     )  # each pair of neighbours once

@@ -255,7 +255,7 @@ def write_surface(path: Path, surface: integrate.Surface, axes: str, up: Sequenc
 
 
 def _collect_samples(scene: MappedScene) -> dict[str, Tensor]:
-    """Every sample with depth, the sensor's or recovered, of every placed anchor, in the world."""
+    """Every sample with depth, the sensor's or recovered, of every placed reference view, in the world."""
     parts: dict[str, list[Tensor]] = {k: [] for k in ("xyz", "rgb", "sigma", "score", "hole", "source")}
     for answer in scene.answers:
         if answer.pair[0] in scene.places.poses:

@@ -57,11 +57,11 @@ class PairEstimate:
     tracks: Tracks  # as tracked, in the pictures' own pixels
     fit: PoseFit
     rgb: Tensor  # (1, N, 3) in [0, 1] at the samples
-    camera: Camera  # of the anchor
+    camera: Camera  # of the reference view
     hw: tuple[int, int]
     picked: ViewReport | None = None  # where the method chose among several
     others: Mapping[int, PoseFit] = field(default_factory=dict)  # the poses of all views that it chose
-    swept: StoredSweep | None = None  # pixels of the anchor's map, where one was asked for
+    swept: StoredSweep | None = None  # pixels of the reference view's map, where one was asked for
 
     @property
     def links(self) -> dict[int, PoseFit]:
@@ -102,7 +102,7 @@ def estimate_pairs(
         method: of one view or several; the others lie between the two of the pair, or are chosen among those offered.
         cutoff: m; returns beyond it are hidden from the method. None hides nothing.
         seed, device, dtype: of the method's run; answers come back on the CPU.
-        sweep: also make a map of every pixel of the anchors; the method runs once all the same.
+        sweep: also make a map of every pixel of the reference views; the method runs once all the same.
         shelf: where the maps wait; None = one of this call.
 
     Raises:
@@ -349,7 +349,7 @@ def view_from_recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius:
 
 
 def view_from_sweep(recording: Recording, answer: PairEstimate, places: PlacedFrames) -> DepthView:
-    """The swept pixels of an anchor's map, with colours from its picture."""
+    """The swept pixels of a reference view's map, with colours from its picture."""
     assert answer.swept is not None
     return view_from_depth_map(
         recording[answer.pair[0]], *answer.swept.read(), T_world_from_cam=places.poses[answer.pair[0]]

@@ -79,7 +79,9 @@ def extract_mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     try:
         from skimage.measure import marching_cubes  # noqa: PLC0415
     except ImportError as error:
-        raise ImportError("mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'") from error
+        raise ImportError(
+            "extract_mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'"
+        ) from error
     vertices, faces, count = [], [], 0
     for origin, distance, known in _dense_bricks(volume, min_weight):
         cell = _meshable_cells(distance, known, _MAX_STEP_TRUNCATIONS * volume.truncation)

@@ -38,19 +38,19 @@ class DenseSweep:
         return None if options is None else cls(options)
 
     def __call__(
-        self, method: Method, anchor: Frame, others: Frame, *, trace: Trace, track: Any = None, **told: Any
+        self, method: Method, reference: Frame, others: Frame, *, trace: Trace, track: Any = None, **told: Any
     ) -> Estimate:
-        """The sparse answers, as ``method(anchor, others)`` gives them; ``trace`` also has ``dense``, the maps.
+        """The sparse answers, as ``method(reference view, others)`` gives them; ``trace`` also has ``dense``, the maps.
 
         Args:
-            method, anchor, others: as :func:`dhtorch.pipeline.dense.complete_depth` takes them.
+            method, reference, others: as :func:`dhtorch.pipeline.dense.complete_depth` takes them.
             trace: receives what the method tells.
             track: another function in the method's seat 4; None = its own.
             told: ``seed``, ``fit`` and ``hint``.
         """
         method = method if track is None else method.replace(track=track)
         own: dict[str, Any] = {**self.options, "calibration": self.calibration, **told}
-        trace["dense"] = dense.complete_depth(anchor, others, method=method, trace=trace, **own)
+        trace["dense"] = dense.complete_depth(reference, others, method=method, trace=trace, **own)
         sparse: Estimate = trace["sparse"]
         return sparse
 

@@ -128,7 +128,7 @@ def fuse_views(
     """
     _check_view(volume, view)
     if source not in VOLUME_SOURCES:
-        raise ValueError(f"integrate.fuse: source is {source}, expected SENSOR, RECOVERED or SWEPT {VOLUME_SOURCES}")
+        raise ValueError(f"fuse_views: source is {source}, expected SENSOR, RECOVERED or SWEPT {VOLUME_SOURCES}")
     with torch.no_grad():
         views = [_ViewIntegrator(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
         volume = _grow(volume, [s.blocks() for s in views])
@@ -155,13 +155,13 @@ def drop_unconfirmed(volume: Volume, least: int = 2) -> Volume:
     """The volume without what swept depth alone says and fewer than ``least`` swept views agree on; asked at the end.
 
     A view whose motion is wrong is wrong in all its pixels, and its neighbours in a patch err alike; what another view
-    found as well, with other partners, is seldom wrong in the same way.
+    found as well, with other source views, is seldom wrong in the same way.
 
     Raises:
         ValueError: ``least`` is not positive.
     """
     if least < 1:
-        raise ValueError(f"integrate.confirmed: least is {least}, expected at least 1")
+        raise ValueError(f"drop_unconfirmed: least is {least}, expected at least 1")
     keep = (volume.n_swept >= least) | (volume.weight[..., : VOLUME_SOURCES.index(Source.SWEPT)] > 0).any(-1)
     return volume.replace(weight=torch.where(keep[..., None], volume.weight, 0.0))
 
@@ -195,8 +195,8 @@ def splat_points(
 
     Gradient: none.
     """
-    sizes = check("integrate.splat", f=(camera.f, "B 2"), uv=(uv, "B N 2"), depth=(depth, "B N"), sigma=(sigma, "B N"))
-    check("integrate.splat", depth=(depth, "B N"), features=(features, "B N C"))
+    sizes = check("splat_points", f=(camera.f, "B 2"), uv=(uv, "B N 2"), depth=(depth, "B N"), sigma=(sigma, "B N"))
+    check("splat_points", depth=(depth, "B N"), features=(features, "B N C"))
     (h, w), B, C = hw, sizes["B"], features.shape[-1]
     with torch.no_grad():
         usable = depth.isfinite() & (depth > 0) & sigma.isfinite() & (sigma > 0) & uv.isfinite().all(-1)
@@ -339,12 +339,12 @@ def _border_pixels(h: int, w: int) -> Tensor:
 
 
 def _check_view(volume: Volume, view: DepthView) -> None:
-    check("integrate.fuse", key=(volume.key, "K"), distance=(volume.distance, f"K {BLOCK_VOXELS}"))
-    check("integrate.fuse", depth=(view.depth, "B h w"), sigma=(view.sigma, "B h w"), f=(view.camera.f, "B 2"))
-    sizes = check("integrate.fuse", depth=(view.depth, "B h w"), features=(view.features, "B h w C"))
-    check("integrate.fuse", R=(view.T_world_from_cam.R, "B 3 3"), t=(view.T_world_from_cam.t, "B 3"))
+    check("fuse_views", key=(volume.key, "K"), distance=(volume.distance, f"K {BLOCK_VOXELS}"))
+    check("fuse_views", depth=(view.depth, "B h w"), sigma=(view.sigma, "B h w"), f=(view.camera.f, "B 2"))
+    sizes = check("fuse_views", depth=(view.depth, "B h w"), features=(view.features, "B h w C"))
+    check("fuse_views", R=(view.T_world_from_cam.R, "B 3 3"), t=(view.T_world_from_cam.t, "B 3"))
     kept = volume.features.shape[-1] - 1
     if sizes["C"] != kept or sizes["B"] != len(view.camera.f):
-        raise ValueError(f"integrate.fuse: features have {sizes['C']} channels, expected the volume's {kept}, B equal")
+        raise ValueError(f"fuse_views: features have {sizes['C']} channels, expected the volume's {kept}, B equal")
     if len(view.T_world_from_cam.t) != sizes["B"]:
-        raise ValueError(f"integrate.fuse: {len(view.T_world_from_cam.t)} poses, expected one for each of {sizes['B']}")
+        raise ValueError(f"fuse_views: {len(view.T_world_from_cam.t)} poses, expected one for each of {sizes['B']}")

@@ -79,7 +79,7 @@ def make_points(
     for name, value in {**given, "candidate": candidate}.items():
         if value is not None and value.shape != true_depth.shape:
             found, expected = tuple(value.shape), tuple(true_depth.shape)
-            raise ValueError(f"points: {name} has shape {found}, expected {expected}, the shape of true_depth")
+            raise ValueError(f"make_points: {name} has shape {found}, expected {expected}, the shape of true_depth")
     counts = true_depth.isfinite() & (true_depth > 0)
     counts = counts if candidate is None else counts & candidate.bool()
     said = depth.isfinite() & (depth > 0)
@@ -108,7 +108,7 @@ def points_from_estimate(
     Raises:
         ValueError: wrong shapes.
     """
-    check("select", gate=(estimate.gate, "B N"), depth=(truth.depth, "B N"))
+    check("points_from_estimate", gate=(estimate.gate, "B N"), depth=(truth.depth, "B N"))
     return make_points(
         estimate.depth,
         truth.depth,

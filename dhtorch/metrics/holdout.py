@@ -99,7 +99,7 @@ def split_half(
 
     Source: paper, "Held-out triangulation on in-house captures".
     """
-    sizes = check("half", xyz=(samples.xyz, "B N 3"), trackability=(samples.trackability, "B N"))
+    sizes = check("split_half", xyz=(samples.xyz, "B N 3"), trackability=(samples.trackability, "B N"))
     if not 0 < share < 1:
         raise ValueError(f"holdout.share: found {share}, expected a number between 0 and 1")
     draw = torch.rand(sizes["N"], generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
@@ -116,7 +116,7 @@ def hide_returns(samples: Samples, hidden: Tensor) -> Samples:
 
     Gradient: to the returns that stay.
     """
-    check("without_returns", xyz=(samples.xyz, "B N 3"), hidden=(hidden, "B N"))
+    check("hide_returns", xyz=(samples.xyz, "B N 3"), hidden=(hidden, "B N"))
     zero = torch.zeros_like(samples.depth)
     return samples.replace(
         depth=torch.where(hidden, zero, samples.depth),
@@ -159,7 +159,7 @@ def sample_truth(
     Gradient: ``depth`` to the depth map; the choice of the pixel and codes carry none.
     Cost: reads window² depth pixels per sample, whatever the image size.
     """
-    sizes = check("truth_at", image=(frame.image, "B C H W"), depth=(frame.depth, "B h w"), uv=(uv, "B N 2"))
+    sizes = check("sample_truth", image=(frame.image, "B C H W"), depth=(frame.depth, "B h w"), uv=(uv, "B N 2"))
     if truth not in _TRUTH_TESTS:
         raise ValueError(f"holdout.truth: found {truth!r}, expected one of {', '.join(_TRUTH_TESTS)}")
     scale = sizes["w"] / sizes["W"]
@@ -267,7 +267,9 @@ def select_real_holes(
 
     Source: paper, "Real holes are harder than masked ones"; its filter is not published, this one is stated above.
     """
-    sizes = check("drop_outs", depth=(frame.depth, "B h w"), uv=(samples.uv, "B N 2"), truth=(truth.depth, "B N"))
+    sizes = check(
+        "select_real_holes", depth=(frame.depth, "B h w"), uv=(samples.uv, "B N 2"), truth=(truth.depth, "B N")
+    )
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (sizes["h"], sizes["w"]), samples.uv)
     answered = _nearest_pixel(frame.depth, place) > 0
     around = _window_returns(frame.depth, place, window)[0].flatten(-2)

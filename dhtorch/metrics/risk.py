@@ -145,7 +145,7 @@ def cap_error(error: Tensor) -> Tensor:
 
 
 def _running_sum(loss: Tensor, score: Tensor) -> Tensor:
-    check("curve", loss=(loss, "n"), score=(score, "n"))
+    check("risk_curve", loss=(loss, "n"), score=(score, "n"))
     order = score.argsort(descending=True, stable=True)
     _, group, size = score[order].unique_consecutive(return_inverse=True, return_counts=True)
     total = torch.zeros(size.numel(), dtype=torch.float64, device=loss.device)

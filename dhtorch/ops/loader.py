@@ -3,7 +3,7 @@ samples, of the search for points, of the registration of their windows and of p
 for it; nothing needs it.
 
     python -m dhtorch.ops.loader            compile ``native*.cpp``, with the system's C++ compiler, into the user's
-    cache DHTORCH_NATIVE=1 python …           use it, in loader workers as well; or dhtorch.ops.loader.load() in a
+    cache DHTORCH_OPS=1 python …           use it, in loader workers as well; or dhtorch.ops.loader.load() in a
     program
 
 ``dhtorch.pipeline.surface`` and ``pair``, ``dhtorch.stages.backproject``, ``holes`` and ``pose``,
@@ -121,17 +121,17 @@ def load() -> None:
 
 
 def serves(*tensors: Tensor) -> bool:
-    """Whether tensors may be handed to the compiled code: it is loaded, or DHTORCH_NATIVE=1 asks for that, and they are
+    """Whether tensors may be handed to the compiled code: it is loaded, or DHTORCH_OPS=1 asks for that, and they are
     contiguous ones of the CPU, in whole numbers or single precision, and nobody transforms or differentiates them
     (backward, or forward: ``torch.autograd.forward_ad`` hides its tangents within plain tensors).
 
     Raises:
-        FileNotFoundError: DHTORCH_NATIVE=1 asks for what was not compiled.
+        FileNotFoundError: DHTORCH_OPS=1 asks for what was not compiled.
     """
     if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
         return False
     if not _loaded:
-        if os.environ.get("DHTORCH_NATIVE", "") in ("", "0"):
+        if os.environ.get("DHTORCH_OPS", "") in ("", "0"):
             return False
         load()
     graph = torch.is_grad_enabled()

@@ -1,7 +1,7 @@
 """Every pixel: a depth with a sigma beyond the sensor's reach, and silence where the pictures do not tell.
 
     method ─ motions, worth of the views ─┐
-    anchor picture ───────────────────────┼─ sweep ─ surface ─ fit ─ gates ─┐
+    reference picture ───────────────────────┼─ sweep ─ surface ─ fit ─ gates ─┐
     other pictures ───────────────────────┘                                 ├─ DepthMap
     sensor ─────────────────────────────────────────────────────────────────┘
 
@@ -49,7 +49,7 @@ MIN_OVERLAP_PIXELS, REFUTING_SIGMAS, REFUTING_RATIO = 200, 3.0, 0.1
 
 #: What the options of a sweep may be.
 DENSE_RANGES: dict[str, tuple[float, float]] = {
-    "partners": (1, plane_sweep.MAX_SWEPT_VIEWS),
+    "source_views": (1, plane_sweep.MAX_SWEPT_VIEWS),
     "planes": (3, 1024),
     "size": (16, math.inf),
     "refinements": (0, math.inf),
@@ -60,21 +60,21 @@ DENSE_OPTIONS = tuple(DENSE_RANGES)
 
 
 class SelectedViews(NamedTuple):
-    """The other views of an anchor and what the sparse method made of them."""
+    """The other views of a reference view and what the sparse method made of them."""
 
     joined: Estimate  # (B, N) what they say together
     frames: Frame  # (V, B)
     estimates: Estimate  # (V, B, N)
     fits: PoseFit  # (V, B)
-    samples: Samples  # (B, N) of the anchor
+    samples: Samples  # (B, N) of the reference view
 
 
 def complete_depth(
-    anchor: Frame,
+    reference: Frame,
     others: Frame | Sequence[Frame],
     *,
     method: Method = AUTO,
-    partners: int = 3,
+    source_views: int = 3,
     planes: int = 96,
     size: int = 640,
     refinements: int = 2,
@@ -86,15 +86,15 @@ def complete_depth(
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> DepthMap:
-    """A depth for every pixel of the anchor views that the sensor left out and the other views tell.
+    """A depth for every pixel of the reference views that the sensor left out and the other views tell.
 
     Args:
-        anchor: B views.
+        reference: B views.
         others: as :class:`dhtorch.pipeline.method.Method` takes them: B views, or V × B of them, or a sequence of V.
         method: the sparse method that gives motions; it chooses among the views as it does by itself.
-        partners: views that are swept at most, those worth most (at most eight).
-        planes: inverse depths that are tried, evenly from infinity to within the sensor's reach; where an anchor's
-            returns are ``sparse``, to as near as they are.
+        source_views: views that are swept at most, those worth most (at most eight).
+        planes: inverse depths that are tried, evenly from infinity to within the sensor's reach; where a reference
+            view's returns are ``sparse``, to as near as they are.
         size: longer side of the map and of the pictures that are swept, px; smaller pictures stay as they are.
         refinements: Gauss-Newton steps from the best plane.
         min_correlation: of the windows of a pixel in the view that fits best, below which it is silent.
@@ -104,8 +104,8 @@ def complete_depth(
             the sparse answers.
 
     Returns:
-        DepthMap (B, h, w) over the field of the anchor's picture: returns of the sensor where it has usable ones (as
-        ``method.backproject`` reads them), swept depths, silence. Score is h / (h + sigma / depth), h = 0.1.
+        DepthMap (B, h, w) over the field of the reference view's picture: returns of the sensor where it has usable
+        ones (as ``method.backproject`` reads them), swept depths, silence. Score is h / (h + sigma / depth), h = 0.1.
 
     Gates: that of the pair for all pixels where no other view is of use (NO_BASELINE, NO_POSE, CONTRADICTED, or
     UNCERTAIN where all are worth too little); NO_TRACK (seen by no view, nearer than what is swept, or found in none),
@@ -115,17 +115,17 @@ def complete_depth(
         ValueError: wrong shapes, no other view, or an option out of range.
 
     Gradient: swept depth to all images, to intrinsics and through the motions to the near depth, by the implicit
-    function theorem where the last fit ends; planes, partners, sigma and gates carry none.
+    function theorem where the last fit ends; planes, source views, sigma and gates carry none.
     Memory: less than four bytes for every pixel and plane, whatever the number of views, and pictures.
-    Cost: linear in planes, pixels and partners.
+    Cost: linear in planes, pixels and source views.
     """
     trace = {} if trace is None else trace
-    joined = trace["sparse"] = method(anchor, others, seed=seed, fit=fit, hint=hint, trace=trace)
+    joined = trace["sparse"] = method(reference, others, seed=seed, fit=fit, hint=hint, trace=trace)
     return sweep_depth(
-        anchor,
+        reference,
         selected_views(joined, others, trace),
         method=method,
-        partners=partners,
+        source_views=source_views,
         planes=planes,
         size=size,
         refinements=refinements,
@@ -136,11 +136,11 @@ def complete_depth(
 
 
 def sweep_depth(
-    anchor: Frame,
+    reference: Frame,
     asked: SelectedViews,
     *,
     method: Method = AUTO,
-    partners: int = 3,
+    source_views: int = 3,
     planes: int = 96,
     size: int = 640,
     refinements: int = 2,
@@ -152,32 +152,32 @@ def sweep_depth(
 
     Arguments, result, errors, gradient, memory and cost as there; of ``method`` the reading of the sensor counts.
     """
-    given = (partners, planes, size, refinements, min_correlation, max_sigma_rel)
-    _check_options("complete", dict(zip(DENSE_OPTIONS, given, strict=True)))
-    index, wanted = top_views(asked, partners)
-    base = plane_sweep.make_reference_view(*downscale_grey(anchor, size))
-    partner = [source_view_of(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
-    q = torch.linspace(0, 1, planes).to(base.ray) / _nearest(asked.samples, anchor.sparse)[:, None].to(base.ray)
-    start = surface.sweep_planes(base, partner, q)
-    found = surface.refine_surface(base, partner, start, q, refinements)
+    given = (source_views, planes, size, refinements, min_correlation, max_sigma_rel)
+    _check_options("complete_depth", dict(zip(DENSE_OPTIONS, given, strict=True)))
+    index, wanted = top_views(asked, source_views)
+    base = plane_sweep.make_reference_view(*downscale_grey(reference, size))
+    source_view = [source_view_of(asked, k, size, use, base.image) for k, use in zip(index, wanted, strict=True)]
+    q = torch.linspace(0, 1, planes).to(base.ray) / _nearest(asked.samples, reference.sparse)[:, None].to(base.ray)
+    start = surface.sweep_planes(base, source_view, q)
+    found = surface.refine_surface(base, source_view, start, q, refinements)
     beyond = start.q >= q[:, -1, None, None] * (1 - 1e-6)
     silent = _pair_gate(asked, wanted)
     told = _gated(base, found, (beyond, start.alone), silent, min_correlation, max_sigma_rel)
-    returns = _returns(anchor, method, base.hw)
+    returns = _returns(reference, method, base.hw)
     told = _check_against_returns(told, returns, asked.samples)
     return _merge_returns(told if calibration is None else calibration.apply(told), returns)
 
 
-def sensor_depth_map(anchor: Frame, *, method: Method = AUTO, size: int = 640) -> DepthMap:
+def sensor_depth_map(reference: Frame, *, method: Method = AUTO, size: int = 640) -> DepthMap:
     """The map of views that have no other view: the sensor where it answers, else silence (NO_TRACK).
 
     Arguments, result, errors and gradient as of :func:`complete_depth`.
     """
     _check_options("sensed", {"size": size})
-    nan = torch.full((len(anchor.camera.f), *map_hw(anchor.hw, size)), torch.nan).to(anchor.camera.f)
+    nan = torch.full((len(reference.camera.f), *map_hw(reference.hw, size)), torch.nan).to(reference.camera.f)
     code = torch.zeros_like(nan, dtype=torch.int32)
     silent = DepthMap(nan, nan, torch.zeros_like(nan), code, torch.full_like(code, Gate.NO_TRACK))
-    return _merge_returns(silent, _returns(anchor, method, map_hw(anchor.hw, size)))
+    return _merge_returns(silent, _returns(reference, method, map_hw(reference.hw, size)))
 
 
 def map_hw(hw: tuple[int, int], size: int) -> tuple[int, int]:
@@ -186,10 +186,10 @@ def map_hw(hw: tuple[int, int], size: int) -> tuple[int, int]:
     return hw if longer <= size else (max(1, round(hw[0] * size / longer)), max(1, round(hw[1] * size / longer)))
 
 
-def map_pixel_centres(anchor: Frame, hw: tuple[int, int]) -> Tensor:
+def map_pixel_centres(reference: Frame, hw: tuple[int, int]) -> Tensor:
     """Where the picture shows what the pixels of its map of size ``hw`` stand for: (h · w, 2) px, row by row."""
-    rows, columns = (torch.arange(n, device=anchor.camera.f.device).to(anchor.camera.f) for n in hw)
-    scale = anchor.hw[0] / hw[0], anchor.hw[1] / hw[1]
+    rows, columns = (torch.arange(n, device=reference.camera.f.device).to(reference.camera.f) for n in hw)
+    scale = reference.hw[0] / hw[0], reference.hw[1] / hw[1]
     v, u = torch.meshgrid((rows + 0.5) * scale[0] - 0.5, (columns + 0.5) * scale[1] - 0.5, indexing="ij")
     return torch.stack([u, v]).flatten(1).mT  # each axis by itself in memory
 
@@ -252,13 +252,13 @@ def selected_views(joined: Estimate, others: Frame | Sequence[Frame], trace: Tra
     return SelectedViews(joined, frames, estimates, fits, trace["samples"])
 
 
-def top_views(asked: SelectedViews, partners: int) -> tuple[Tensor, Tensor]:
+def top_views(asked: SelectedViews, source_views: int) -> tuple[Tensor, Tensor]:
     """Which views are swept, (K, B) indices, those worth most first, and which of them are worth it (K, B) bool."""
     said = asked.estimates.keep & ~asked.samples.usable & (asked.estimates.sigma > 0)
     ratio = torch.where(said, 0.1 * asked.estimates.depth / asked.estimates.sigma, 0.0).detach()
-    worth = torch.where(asked.fits.ok, torch.log1p(ratio.square()).sum(-1), -1.0)
-    worth, index = worth.sort(dim=0, descending=True, stable=True)
-    return index[:partners], worth[:partners] > MIN_VIEW_GAIN
+    gain = torch.where(asked.fits.ok, torch.log1p(ratio.square()).sum(-1), -1.0)
+    gain, index = gain.sort(dim=0, descending=True, stable=True)
+    return index[:source_views], gain[:source_views] > MIN_VIEW_GAIN
 
 
 def source_view_of(asked: SelectedViews, index: Tensor, size: int, use: Tensor, like: Tensor) -> surface.SourceView:
@@ -269,10 +269,10 @@ def source_view_of(asked: SelectedViews, index: Tensor, size: int, use: Tensor, 
     eye = torch.eye(3).to(like)
     R = torch.where(fit.ok[:, None, None], fit.T_1_from_0.R.to(like), eye)
     t = torch.where(fit.ok[:, None], fit.T_1_from_0.t.to(like), eye[0])
-    turn = None if fit.shutter is None else torch.where(fit.ok[:, None], fit.shutter.turn.to(like), 0.0)
+    shutter_rate = None if fit.shutter is None else torch.where(fit.ok[:, None], fit.shutter.shutter_rate.to(like), 0.0)
     image = image.to(like)
     return surface.SourceView(
-        plane_sweep.SweptView(image, camera, Pose(R, t), turn), plane_sweep.stack_gradients(image), fit, use
+        plane_sweep.SweptView(image, camera, Pose(R, t), shutter_rate), plane_sweep.stack_gradients(image), fit, use
     )
 
 
@@ -292,7 +292,7 @@ def _nearest(samples: Samples, sparse: Tensor | None = None) -> Tensor:
 
 
 def _pair_gate(asked: SelectedViews, wanted: Tensor) -> Tensor:
-    """Gate (B,) for all pixels of anchors that no other view is of use for, else ANSWER."""
+    """Gate (B,) for all pixels of reference views that no other view is of use for, else ANSWER."""
     still = (asked.fits.code == PoseCode.NO_BASELINE) | (asked.estimates.gate == Gate.NO_BASELINE).any(-1)
     moving = (asked.joined.gate == Gate.CONTRADICTED).any(-1) & ~asked.joined.keep.any(-1)
     none = ~wanted.any(0)
@@ -342,9 +342,9 @@ class SensorReturns(NamedTuple):
     usable: Tensor  # bool
 
 
-def _returns(anchor: Frame, method: Method, hw: tuple[int, int]) -> SensorReturns:
+def _returns(reference: Frame, method: Method, hw: tuple[int, int]) -> SensorReturns:
     """What the sensor says at every pixel of a map of that size."""
-    samples = method.backproject(anchor, map_pixel_centres(anchor, hw))
+    samples = method.backproject(reference, map_pixel_centres(reference, hw))
     told = samples.depth, samples.sigma, samples.confidence, samples.usable
     return SensorReturns(*(x.unflatten(1, hw) for x in told))
 

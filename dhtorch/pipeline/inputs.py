@@ -10,13 +10,13 @@ from torch import Tensor
 from dhtorch import pytree
 from dhtorch.records import Camera, Frame
 
-#: What a method reads of its anchor and of the other views: times and poses of the data set are not for it.
+#: What a method reads of its reference view and of the other views: times and poses of the data set are not for it.
 REFERENCE_FIELDS = "image", "depth", "conf", "sparse", "camera", "depth_camera"
 SOURCE_FIELDS = "image", "camera"
 
 
-def validate_views(anchor: Frame, others: Frame | Sequence[Frame]) -> tuple[Frame, Frame]:
-    """The anchor and its other views, stacked to V × B where there are several, in one precision.
+def validate_views(reference: Frame, others: Frame | Sequence[Frame]) -> tuple[Frame, Frame]:
+    """The reference view and its other views, stacked to V × B where there are several, in one precision.
 
     Frames of several data sets come in several precisions: cameras become the widest of them, and pictures that differ
     become floating in the widest of theirs (uint8 counts as float32). Equal ones stay as they are, byte for byte.
@@ -31,14 +31,14 @@ def validate_views(anchor: Frame, others: Frame | Sequence[Frame]) -> tuple[Fram
     given = [others] if isinstance(others, Frame) else list(others or ())
     if not given:
         raise ValueError("method: found no other view, expected at least one")
-    frames = [anchor, *given]
-    names = ["anchor", *("other" if single else f"others[{k}]" for k in range(len(given)))]
+    frames = [reference, *given]
+    names = ["reference", *("other" if single else f"others[{k}]" for k in range(len(given)))]
     for name, frame in zip(names, frames, strict=True):
         if not isinstance(frame, Frame):
             raise TypeError(f"method: {name} is a {type(frame).__name__}, expected a dhtorch.Frame")
-        _check(name, frame, SOURCE_FIELDS if name != "anchor" else REFERENCE_FIELDS, anchor.image.device)
-    anchor, *given = _one_precision(frames)
-    return anchor, given[0] if single else pytree.stack(given)
+        _check(name, frame, SOURCE_FIELDS if name != "reference" else REFERENCE_FIELDS, reference.image.device)
+    reference, *given = _one_precision(frames)
+    return reference, given[0] if single else pytree.stack(given)
 
 
 def _check(name: str, frame: Frame, fields: tuple[str, ...], device: torch.device) -> None:
@@ -47,7 +47,9 @@ def _check(name: str, frame: Frame, fields: tuple[str, ...], device: torch.devic
             lacks = "pixel" if 0 in x.shape[-2:] else "view"
             raise ValueError(f"method: {name}.{field} has shape {tuple(x.shape)}, expected at least one {lacks}")
         if x.device != device:
-            raise ValueError(f"method: {name}.{field} is on {x.device}, anchor.image on {device}, expected one device")
+            raise ValueError(
+                f"method: {name}.{field} is on {x.device}, reference.image on {device}, expected one device"
+            )
 
 
 def _tensors(frame: Frame, fields: tuple[str, ...]) -> Iterator[tuple[str, Tensor]]:

@@ -28,7 +28,7 @@ class Method(MethodSpec):
 
     def __call__(
         self,
-        anchor: Frame,
+        reference: Frame,
         others: Frame | Sequence[Frame],
         *,
         seed: int | Tensor = 0,
@@ -37,14 +37,14 @@ class Method(MethodSpec):
         trace: Trace | None = None,
         **changes: Any,
     ) -> Estimate:
-        """Depth along the samples of ``anchor``, by the parallax to one other view or several.
+        """Depth along the samples of ``reference``, by the parallax to one other view or several.
 
         Args:
-            anchor: B views.
-            others: B other views; or several of each anchor, V × B in one record or a sequence of V, in the order in
-                which the camera took them. Their depth is not read. Cameras may differ.
+            reference: B views.
+            others: B other views; or several of each reference view, V × B in one record or a sequence of V, in the
+                order in which the camera took them. Their depth is not read. Cameras may differ.
             seed: an int gives every pair the same draws; a (B,) int64 tensor gives each pair its own. All views of an
-                anchor have the same.
+                reference view have the same.
             fit: a pose that is believed, (B,) or (V, B): seat 5 is then skipped; or a :class:`PosePrior` from
                 elsewhere, which near returns may refute (:func:`dhtorch.stages.pose_prior.check_pose_prior`). None = as
                 ``given`` says.
@@ -66,12 +66,12 @@ class Method(MethodSpec):
         Memory: grows with the answers; pyramids are held of eight pairs at most, unless a graph keeps them.
         Gradient: recovered depth to all images, to the near depth and to intrinsics; choices (flags, inliers, gates)
         carry none.
-        Cost: linear in views; the anchor's pyramid is built once.
+        Cost: linear in views; the reference view's pyramid is built once.
         Source: paper, section "Method".
         """
         method = self.replace(**changes) if changes else self
-        anchor, others = validate_views(anchor, others)
-        if fit is None and method.given is not None:
-            fit = method.given(anchor, others)
+        reference, others = validate_views(reference, others)
+        if fit is None and method.pose_prior is not None:
+            fit = method.pose_prior(reference, others)
         ask = estimate_pair if others.image.dim() == 4 else estimate_multiview
-        return ask(method, anchor, others, seed=seed, fit=fit, hint=hint, trace=trace)
+        return ask(method, reference, others, seed=seed, fit=fit, hint=hint, trace=trace)

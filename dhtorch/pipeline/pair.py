@@ -55,7 +55,7 @@ def estimate_pair(
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> Estimate:
-    """The method's answer for B anchors with one other view each; what ``method(frame_0, frame_1)`` calls.
+    """The method's answer for B reference views with one other view each; what ``method(frame_0, frame_1)`` calls.
 
     Arguments, answer and errors are those of :class:`dhtorch.pipeline.method.Method`.
     """
@@ -136,10 +136,12 @@ def _apply_prior(
     if not isinstance(given, InitialPose):
         return check_pose_prior(given, samples, tracks, camera_0, camera_1, found)
     held = check_pose_prior(
-        given.replace(cov=None), samples, tracks, camera_0, camera_1, found, max_miss=MAX_START_RESIDUAL
+        given.replace(cov=None), samples, tracks, camera_0, camera_1, found, max_residual=MAX_START_RESIDUAL
     )
     unused = samples.uv.new_zeros(len(samples.uv), 1, 3)
-    refined = map_pose(samples, tracks, camera_0, camera_1, unused, start=lambda *_: held).replace(looks=held.looks)
+    refined = map_pose(samples, tracks, camera_0, camera_1, unused, start=lambda *_: held).replace(
+        matched_convention=held.matched_convention
+    )
     # From far off a search may end where near returns do not: they are asked again, now as of any pose.
     end = PosePrior(refined.T_1_from_0)
     ended = check_pose_prior(end, samples, tracks, camera_0, camera_1, found, min_confirmed=MIN_NEAR_INLIERS)

@@ -46,17 +46,17 @@ MAP = PAPER.replace(
 #: ``MAP`` for several views of one anchor: each view a pair, their inverse depths fused where they agree.
 WINDOW = MAP.replace(views=5)
 
-#: Several views chosen among those around the anchor; the search begins where the whole picture went, whatever the
-#: exposures; an answer needs views that agree or one that is sure by itself, and near returns that what lies far does
-#: not contradict. A view may be unsure: what counts is how sure they are together.
+#: Several views chosen among those around the reference view; the search begins where the whole picture went, whatever
+#: the exposures; an answer needs views that agree or one that is sure by itself, and near returns that what lies far
+#: does not contradict. A view may be unsure: what counts is how sure they are together.
 AUTO = MAP.replace(
     track=partial(
         lucas_kanade_affine, levels=MAP_PYRAMID_LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="bias")
     ),
     triangulate={"max_sigma_rel": 1.0, "max_far_noise": 0.0025, "max_in_reach": 0.18},
-    fuse=partial(fuse_consistent, max_still=0.7),
+    fuse=partial(fuse_consistent, max_static_ratio=0.7),
     score=confidence_from_sigma,
-    choose=select_views_by_preview,
+    select_views=select_views_by_preview,
     views=5,
     chain=False,
 )

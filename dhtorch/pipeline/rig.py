@@ -19,7 +19,7 @@ from dhtorch.stages.pose_prior import make_prior
 
 
 def estimate_rig_pose(
-    anchors: Frame,  # (B,), one camera at B instants
+    references: Frame,  # (B,), one camera at B instants
     others: Frame,  # (B,), the other one at the same instants
     *,
     method: Method = MAP,
@@ -29,13 +29,13 @@ def estimate_rig_pose(
     trace: Trace | None = None,
     **options: Any,
 ) -> AveragePose:
-    """The pose of the other camera relative to the anchors', ``T`` (1) with its covariance, from B instants.
+    """The pose of the other camera relative to the reference views', ``T`` (1) with its covariance, from B instants.
 
     Instants that look at one place share most of their errors: those of the sensor there, of tracks on its edges. So
     their mean is called no surer than one of them is; only other ``places`` make it surer.
 
     Args:
-        anchors, others: views of the two cameras; both may move, together.
+        reference views, others: views of the two cameras; both may move, together.
         method: whose seats 1 to 5 are asked. Where the cameras see the scene very differently a learned tracker helps.
         seed, hint, trace: as :class:`Method` takes them.
         places: that the instants look at, in about equal shares.
@@ -51,9 +51,9 @@ def estimate_rig_pose(
     Gradient: none; a calibration.
     """
     if places < 1:
-        raise ValueError(f"rig_pose: places is {places}, expected at least 1")
+        raise ValueError(f"estimate_rig_pose: places is {places}, expected at least 1")
     trace = {} if trace is None else trace
-    method(anchors, others, seed=seed, hint=hint, trace=trace)
+    method(references, others, seed=seed, hint=hint, trace=trace)
     fit = trace["fit"]
     T = fit.T_1_from_0.map(lambda x: x[None])
     mean = average_poses(T, fit.cov[None], fit.ok[None], **options)
@@ -63,13 +63,14 @@ def estimate_rig_pose(
 
 @dataclass(frozen=True, eq=False)
 class ConstantPose:
-    """What stands in a method's ``given`` where all pairs are of the same two cameras of a rig: ``given=Rigid(…)``."""
+    """What stands in a method's ``pose_prior`` where all pairs are of the same two cameras of a rig:
+    ``pose_prior=ConstantPose(…)``."""
 
     T_1_from_0: Pose  # (1)
     cov: Tensor | None = None  # (1, 6, 6); None = not stated
 
-    def __call__(self, anchor: Frame, others: Frame) -> PosePrior:
-        """The pose for B anchors, and for V × B other views."""
+    def __call__(self, reference: Frame, others: Frame) -> PosePrior:
+        """The pose for B reference views, and for V × B other views."""
         lead = others.camera.f.shape[:-1]
-        made = make_prior(self.T_1_from_0, cov=self.cov).to(anchor.camera.f.dtype)
-        return made.map(lambda x: x[0].to(anchor.camera.f.device).expand(*lead, *x.shape[1:]))
+        made = make_prior(self.T_1_from_0, cov=self.cov).to(reference.camera.f.dtype)
+        return made.map(lambda x: x[0].to(reference.camera.f.device).expand(*lead, *x.shape[1:]))

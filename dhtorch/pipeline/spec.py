@@ -1,6 +1,6 @@
 """A method is a record: seven functions in a row, and the few options that belong to none of them.
 
-    anchor view ─ sample ─ backproject ─ classify ─┬─ near, with depth ──── pose ────┐
+    reference view ─ sample ─ backproject ─ classify ─┬─ near, with depth ──── pose ────┐
                                                    └─ trackable, without ─ track ────┴─ triangulate ─ score
 
 A seat takes any callable with the seat's signature: a function, a ``functools.partial`` of one, a lambda, an
@@ -35,7 +35,7 @@ Trace = dict[str, Any]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MethodSpec:
-    """Seven seats and the options beside them; called, it extends the depth sensor of an anchor view.
+    """Seven seats and the options beside them; called, it extends the depth sensor of a reference view.
 
     Near returns fix the metric relative pose of two views; every tracked sample, those without a return above all, is
     triangulated under that pose; gates leave a hole with a reason where the geometry is weak. Of several other views
@@ -53,10 +53,12 @@ class MethodSpec:
     triangulate: Callable[..., Estimate] = two_view  # (samples, tracks, fit, camera_0, camera_1)
     score: Callable[..., Estimate] = confidence  # (estimate, samples, tracks, fit)
     fuse: Callable[..., Estimate] = inverse_variance  # (estimates (V, B, N)); asked where there are several views
-    choose: Callable[..., Tensor | ViewSelection] | None = None  # (anchor, others, views, *, fit) -> (views, B) indices
-    given: Callable[..., PosePrior] | None = None  # (anchor, others) -> motions from elsewhere, or None
+    select_views: Callable[..., Tensor | ViewSelection] | None = (
+        None  # (reference, others, views, *, fit) -> (views, B)
+    )
+    pose_prior: Callable[..., PosePrior] | None = None  # (reference, others) -> relative poses, or None
 
-    n: int = 2048  # samples per anchor
+    n: int = 2048  # samples per reference view
     hypotheses: int = 200  # minimal samples drawn by the pose search
     min_trackability: float = 1e-5  # samples below it are not used (gate NO_TEXTURE)
     views: int = 1  # other views that are used, of more the best are chosen
@@ -76,12 +78,12 @@ class MethodSpec:
         given: Any = {k: partial(getattr(self, k), **v) if isinstance(v, Mapping) else v for k, v in changes.items()}
         return replace(self, **given)
 
-    def look(self, frame: Frame) -> Samples:
+    def sample_depth(self, frame: Frame) -> Samples:
         """Seats 1 to 3, the front end: where to look, what the sensor says there, why a return is missing."""
         like = frame.camera.f
-        return self.look_at(frame, self.sample(frame.hw, self.n, device=like.device, dtype=like.dtype))
+        return self.sample_depth_at(frame, self.sample(frame.hw, self.n, device=like.device, dtype=like.dtype))
 
-    def look_at(self, frame: Frame, uv: Tensor) -> Samples:
+    def sample_depth_at(self, frame: Frame, uv: Tensor) -> Samples:
         """Seats 2 and 3: the samples (B, N) at pixels ``uv`` (N, 2) or (B, N, 2)."""
         return self.classify(frame, self.backproject(frame, uv))
 

@@ -37,7 +37,7 @@ class Stream:
     on how they came, nor on the process that held the stream (it pickles, with its memory).
 
     Args:
-        method: of one other view or several; it chooses among past frames (``method.choose``, else by samples).
+        method: of one other view or several; it chooses among past frames (``method.select_views``, else by samples).
         steps: how many frames back the other views may lie.
         seed: of the pose search, the same for every frame.
         hint: what is known of the motion.
@@ -102,7 +102,7 @@ class Stream:
                     index = trace["choice"].index
                     trace["back"] = torch.tensor(list(reversed(steps)), device=index.device)[index]
             else:
-                estimate = Estimate.silent(self.method.look(frame), Gate.NO_BASELINE, n_views=1)
+                estimate = Estimate.silent(self.method.sample_depth(frame), Gate.NO_BASELINE, n_views=1)
             self.past.append(frame)
             self.pushed += 1
         return estimate

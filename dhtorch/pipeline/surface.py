@@ -1,4 +1,4 @@
-"""The surface that a view and its partners show together: found among planes, then fitted by grey values.
+"""The surface that a view and its source views show together: found among planes, then fitted by grey values.
 
 What is searched for is one number a pixel, its inverse depth. Signs of a census find the plane, whatever the light;
 grey values then say where the surface lies between planes, every view by its own variance, and how surely.
@@ -83,29 +83,29 @@ class SweptSurface(NamedTuple):
 
 
 @torch.no_grad()
-def sweep_planes(base: plane_sweep.ReferenceView, partners: list[SourceView], q: Tensor) -> SweptSurface:
+def sweep_planes(base: plane_sweep.ReferenceView, source_views: list[SourceView], q: Tensor) -> SweptSurface:
     """The best surface through the planes q (B, D) 1/m, rising from 0. Gradient: none."""
-    views = torch.stack([partner.use for partner in partners]).sum(0).clamp_min(1)
-    best, some = plane_sweep.aggregate_best_plane(_costs(base, partners, q), views)
+    views = torch.stack([source_view.use for source_view in source_views]).sum(0).clamp_min(1)
+    best, some = plane_sweep.aggregate_best_plane(_costs(base, source_views, q), views)
     step = q[:, 1] - q[:, 0]
     place = (best.plane + best.shift) * step[:, None, None]
     each = views[:, None, None]
     alone = (
-        plane_sweep.second_best_margin(some, best, _second_best_reach(base, partners, place, step))
+        plane_sweep.second_best_margin(some, best, _second_best_reach(base, source_views, place, step))
         >= MIN_SECOND_BEST_MARGIN * each
     )
-    return SweptSurface(place, (best.cost - _idle_cost(partners, best.cost)[:, None, None]) / each.to(q), alone)
+    return SweptSurface(place, (best.cost - _idle_cost(source_views, best.cost)[:, None, None]) / each.to(q), alone)
 
 
-def _idle_cost(partners: list[SourceView], like: Tensor) -> Tensor:
+def _idle_cost(source_views: list[SourceView], like: Tensor) -> Tensor:
     """What a surface costs (B,) by views that are read for others of the batch alone: the same at all its planes."""
-    unused = [~partner.use for partner in partners if any_possible(partner.use)]
+    unused = [~source_view.use for source_view in source_views if any_possible(source_view.use)]
     if not unused:
-        return torch.zeros_like(partners[0].use, dtype=like.dtype)
+        return torch.zeros_like(source_views[0].use, dtype=like.dtype)
     return plane_sweep.N_PATHS * plane_sweep.UNSEEN_COST * torch.stack(unused).sum(0).to(like.dtype)
 
 
-def _costs(base: plane_sweep.ReferenceView, partners: list[SourceView], q: Tensor) -> Tensor:
+def _costs(base: plane_sweep.ReferenceView, source_views: list[SourceView], q: Tensor) -> Tensor:
     """How badly every pixel fits all views at every plane, (B, h, w, D) uint8."""
     shape, planes = base.hw, q.shape[1]
     if loader.serves(q):  # compiled code goes from pixel to pixel, torch from plane to plane
@@ -113,7 +113,7 @@ def _costs(base: plane_sweep.ReferenceView, partners: list[SourceView], q: Tenso
     else:
         C = torch.empty(len(q), planes, *shape, dtype=torch.uint8, device=q.device)
     fresh = True
-    for view, _, _, use in partners:
+    for view, _, _, use in source_views:
         if any_possible(use):
             plane_sweep.add_census_costs(C, base, view, q, use, fresh=fresh)
             fresh = False
@@ -127,11 +127,13 @@ def _costs(base: plane_sweep.ReferenceView, partners: list[SourceView], q: Tenso
     return last
 
 
-def _second_best_reach(base: plane_sweep.ReferenceView, partners: list[SourceView], q: Tensor, step: Tensor) -> Tensor:
+def _second_best_reach(
+    base: plane_sweep.ReferenceView, source_views: list[SourceView], q: Tensor, step: Tensor
+) -> Tensor:
     """Planes (B,) beyond which a pixel has moved by more than a few in the view that moves most."""
     moved = []
     some = q.flatten(1)[:, ::MOTION_STRIDE_PX]  # whose median is that of all
-    for view, _, _, use in partners:
+    for view, _, _, use in source_views:
         go = plane_sweep.epipolar_warp(base, view)
         go = go._replace(a=go.a[..., ::MOTION_STRIDE_PX])
         (u_0, v_0), (u_1, v_1) = (go.at(some + k * step[:, None]) for k in (0, 1))
@@ -141,7 +143,7 @@ def _second_best_reach(base: plane_sweep.ReferenceView, partners: list[SourceVie
 
 
 def refine_surface(
-    base: plane_sweep.ReferenceView, partners: list[SourceView], start: SweptSurface, q: Tensor, steps: int
+    base: plane_sweep.ReferenceView, source_views: list[SourceView], start: SweptSurface, q: Tensor, steps: int
 ) -> RefinedSurface:
     """The surface through ``start``, fitted in so many ``steps`` by grey values to all views that are of use.
 
@@ -150,15 +152,15 @@ def refine_surface(
     plane = q[:, 1] - q[:, 0]
     near = MAX_TOTAL_PLANES * plane[:, None, None]
     with torch.no_grad():
-        goes = [plane_sweep.epipolar_warp(base, partner.view) for partner in partners]
+        goes = [plane_sweep.epipolar_warp(base, source_view.view) for source_view in source_views]
         at = neighbours.smooth_within_tolerance(start.q, SURFACE_PLANES * plane)
         for _ in range(steps):
-            moved = at + _joined(base, partners, goes, at, plane)[0]
+            moved = at + _joined(base, source_views, goes, at, plane)[0]
             at = torch.minimum(torch.maximum(moved, start.q - near), start.q + near).clamp_min(0)
             at = neighbours.smooth_within_tolerance(at, SURFACE_PLANES * plane)
-    step, found = _joined(base, partners, goes, at, plane, last=True)
+    step, found = _joined(base, source_views, goes, at, plane, last=True)
     if step.requires_grad:
-        step = step / _slope(base, partners, goes, at, plane)
+        step = step / _slope(base, source_views, goes, at, plane)
     edge = EDGE_SIGMA_RATIO * neighbours.window_range(at, EDGE_RADIUS_PX)
     own = found.own * (start.misfit / NOMINAL_COST).square() + edge.square()
     return found._replace(q=at + (step - step.detach()), own=own)
@@ -167,7 +169,7 @@ def refine_surface(
 @torch.no_grad()
 def _slope(
     base: plane_sweep.ReferenceView,
-    partners: list[SourceView],
+    source_views: list[SourceView],
     goes: list[plane_sweep.EpipolarWarp],
     at: Tensor,
     plane: Tensor,
@@ -175,13 +177,13 @@ def _slope(
     """How much smaller a step gets (B, h, w) as a surface comes nearer to where it fits best: 1 where grey values are
     straight between pixels. By it the gradient of the step becomes that of the place where it ends."""
     little = DERIVATIVE_PLANES * plane[:, None, None]
-    before, after = (_joined(base, partners, goes, at + sign * little, plane)[0] for sign in (-1, 1))
+    before, after = (_joined(base, source_views, goes, at + sign * little, plane)[0] for sign in (-1, 1))
     return ((before - after) / (2 * little)).clamp_min(MIN_STEP_DERIVATIVE)
 
 
 def _joined(
     base: plane_sweep.ReferenceView,
-    partners: list[SourceView],
+    source_views: list[SourceView],
     goes: list[plane_sweep.EpipolarWarp],
     at: Tensor,
     plane: Tensor,
@@ -192,7 +194,7 @@ def _joined(
     well they fit there; what the motions add to that (``shared``) where it is the last. The gradient is the step's."""
     none = torch.zeros_like(at)
     said = _ViewSums(none, none.clone(), none.clone(), best=torch.full_like(at, -1), seen=torch.zeros_like(at).bool())
-    for (view, picture, fit, use), go in zip(partners, goes, strict=True):
+    for (view, picture, fit, use), go in zip(source_views, goes, strict=True):
         one = plane_sweep.fit_windows(base, view, picture, at)
         with torch.no_grad():
             here = one.seen & use[:, None, None] & ~plane_sweep.occlusion_mask(go, at, OCCLUSION_PLANES * plane)

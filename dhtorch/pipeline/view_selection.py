@@ -1,4 +1,4 @@
-"""Which other views of an anchor to ask: those that are expected to say most, told by small pictures.
+"""Which other views of a reference view to ask: those that are expected to say most, told by small pictures.
 
 Every candidate answers a few samples as a pair, on pictures of a few ten thousand pixels. That costs a small part of
 asking it in full, and what a view is worth there (does the motion leave enough in sight, is it wide enough for a depth,
@@ -32,13 +32,13 @@ PREVIEW_METHOD = MethodSpec(
     n=128,
     hypotheses=100,
     track=partial(lucas_kanade, levels=4, window=15, normalise="bias"),
-    pose=partial(map_pose, turn_sigma=0.0),
+    pose=partial(map_pose, shutter_sigma=0.0),
     triangulate=partial(two_view, min_parallax_deg=None, min_t_snr=1.0, fitted_noise=True, sensor_share=1.0),
 )
 
 
 def select_views_by_preview(
-    anchor: Frame,
+    reference: Frame,
     others: Frame,  # (V, B)
     views: int,
     *,
@@ -49,7 +49,7 @@ def select_views_by_preview(
     """The views to ask of many candidates, and what each is worth.
 
     Args:
-        anchor: B views.
+        reference: B views.
         others: V candidates of each.
         views: how many to choose.
         fit: known poses of the candidates; their search is then skipped.
@@ -62,12 +62,12 @@ def select_views_by_preview(
     Gradient: none; a choice.
     Cost: V pairs of :data:`PREVIEW_METHOD` on small pictures.
     """
-    check("by_probes", image_0=(anchor.image, "B C H W"), images=(others.image, "V B c h w"))
+    check("select_views_by_preview", image_0=(reference.image, "B C H W"), images=(others.image, "V B c h w"))
     with torch.no_grad():
-        anchor, k = downscale_frame(anchor, long)
+        reference, k = downscale_frame(reference, long)
         V, B = others.image.shape[:2]
         flat = others.map(lambda x: x.flatten(0, 1))
-        several = anchor.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
+        several = reference.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
         known = None if fit is None else fit.map(lambda x: x.flatten(0, 1))
         estimate = estimate_pair(PREVIEW_METHOD, several, downscale_frame(flat, long)[0], fit=known)
         estimate = estimate.map(lambda x: x.unflatten(0, (V, B)))
@@ -105,20 +105,20 @@ def rank_views(
 
     Gradient: none; a choice.
     """
-    V = check("weighed", gate=(estimates.gate, "V B N"), sigma=(estimates.sigma, "V B N"))["V"]
+    V = check("rank_views", gate=(estimates.gate, "V B N"), sigma=(estimates.sigma, "V B N"))["V"]
     if not 1 <= views <= V:
-        raise ValueError(f"weighed: views is {views}, expected 1 to {V}")
+        raise ValueError(f"rank_views: views is {views}, expected 1 to {V}")
     said = estimates.keep & (estimates.sigma > 0) & estimates.sigma.isfinite()
     ratio = good_sigma_rel * estimates.depth / torch.where(said, estimates.sigma, 1.0)
-    worth = torch.where(said, ratio, 0.0).detach().double().square().flip(0)  # argmax takes the first of equals
-    known = torch.zeros_like(worth[0])
-    free = torch.ones_like(worth[:, :, 0], dtype=torch.bool)
-    added = torch.zeros_like(worth[:, :, 0])
+    information = torch.where(said, ratio, 0.0).detach().double().square().flip(0)  # argmax takes the first of equals
+    known = torch.zeros_like(information[0])
+    free = torch.ones_like(information[:, :, 0], dtype=torch.bool)
+    added = torch.zeros_like(information[:, :, 0])
     for _ in range(views):
-        gain = pad_elementwise(torch.log1p, known + worth).sum(-1).masked_fill(~free, -torch.inf)
+        gain = pad_elementwise(torch.log1p, known + information).sum(-1).masked_fill(~free, -torch.inf)
         best = F.one_hot(gain.argmax(0), V).T.bool()
         added = torch.where(best, gain - pad_elementwise(torch.log1p, known).sum(-1), added)
-        known = known + torch.where(best[..., None], worth, 0.0).sum(0)
+        known = known + torch.where(best[..., None], information, 0.0).sum(0)
         free = free & ~best
     index = free.flip(0).long().argsort(dim=0, stable=True)[:views]
     return ViewSelection(index, added.flip(0).gather(0, index), ~said.any(-1))

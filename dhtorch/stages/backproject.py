@@ -264,9 +264,8 @@ def _around(image: Tensor, radius: int) -> Iterator[tuple[slice, slice]]:
 def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> Tensor:
     """The pixel (B, N, 2) with a return nearest to each ``place``, ``place`` itself where none is within reach."""
     h, w = depth.shape[-2:]
-    pixel = containing_pixels(place).clamp(
-        -1 - search_px, max(h, w) + search_px
-    )  # farther outside, nothing is within reach
+    # farther outside, nothing is within reach
+    pixel = containing_pixels(place).clamp(-1 - search_px, max(h, w) + search_px)
     window = extract_patches(depth.detach()[:, None], pixel - size // 2, size).flatten(2)  # moved inside at the border
     last = torch.tensor([w - size, h - size], device=depth.device)
     first = torch.minimum((pixel - size // 2).clamp_min(0), last)

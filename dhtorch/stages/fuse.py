@@ -1,4 +1,4 @@
-"""The seat beside the line: what several views of one anchor say about its samples, joined into one answer."""
+"""The seat beside the line: what several views of one reference view say about its samples, joined into one answer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def inverse_variance(
     max_chi2: float = 9.0,
     correlation: float = 1.0,
     max_sigma_rel: float | None = 0.1,
-    max_still: float = 0.5,
+    max_static_ratio: float = 0.5,
 ) -> Estimate:
     """Join the answers of several views of the same samples; where they contradict each other, say nothing.
 
@@ -33,20 +33,22 @@ def inverse_variance(
     Args:
         min_views: fewer answering views (or all, where there are not so many) make no answer.
         max_chi2: sum of squared differences from the mean, in variances, per view beyond the first.
-        correlation: of the views' own errors, which share the anchor's window. At 1 sigma is the weighted mean of the
-            views', at 0 it shrinks with the root of their number. The poses' parts are always taken to be common to the
+        correlation: of the views' own errors, which share the reference view's window. At 1 sigma is the weighted mean
+            of the views', at 0 it shrinks with the root of their number. The poses' parts are always taken to be common
+            to the
             views: all poses rest on the same near returns.
         max_sigma_rel: sigma / depth of the fused answer above which it is withheld; None asks nothing. Views may answer
             far less surely than that.
-        max_still: share of the views without a baseline above which none is believed: the few that found one where the
-            camera hardly moved have most likely taken something else for it.
+        max_static_ratio: share of the views without a baseline above which none is believed: the few that found one
+            where the camera hardly moved have most likely taken something else for it.
 
     Returns:
-        Estimate (B, N); a single view's as it is. ``n_views`` counts the anchor; ``parallax_deg`` is the largest of
-        all views, ``residual_px`` the weighted rms of those that answered (of none: the last view's); ``score`` is 1
-        where answered.
+        Estimate (B, N); a single view's as it is. ``n_views`` counts the reference view; ``parallax_deg`` is the
+        largest of all views, ``residual_px`` the weighted rms of those that answered (of none: the last view's);
+        ``score`` is 1 where answered.
 
-    Gates: NO_BASELINE for all points of an anchor whose views mostly have none; with too few views, the reason of the
+    Gates: NO_BASELINE for all points of a reference view whose views mostly have none; with too few views, the reason
+        of the
     last view that is silent; INCONSISTENT, UNCERTAIN.
 
     Raises:
@@ -74,7 +76,7 @@ def inverse_variance(
     gate = torch.where(n < min(max(min_views, 1), V), _last_reason(estimates.gate, said), gate)
     return _joint(
         estimates,
-        _static_gate(estimates, gate, max_still),
+        _static_gate(estimates, gate, max_static_ratio),
         said,
         weight,
         depth=depth,
@@ -88,11 +90,11 @@ def fuse_consistent(
     estimates: Estimate,  # (V, B, N), one per view
     *,
     max_chi2: float = 9.0,
-    max_against: float = 0.25,
+    max_conflict_ratio: float = 0.25,
     sure_rel: float = 0.05,
     sure_rel_each: float = 0.08,
     max_sigma_rel: float | None = 0.2,
-    max_still: float = 0.5,
+    max_static_ratio: float = 0.5,
 ) -> Estimate:
     """Join the views that agree about a sample; one view alone answers where it is sure by itself.
 
@@ -103,21 +105,22 @@ def fuse_consistent(
     Args:
         max_chi2: squared difference of two views' inverse depths, over the sum of their variances, up to which they
             agree.
-        max_against: (depth / sigma)² of the views that disagree, as a share of that of the views that agree, above
-            which the point is silenced.
+        max_conflict_ratio: (depth / sigma)² of the views that disagree, as a share of that of the views that agree,
+            above which the point is silenced.
         sure_rel: sigma / depth up to which one view answers without another that agrees.
         sure_rel_each: sigma / depth up to which several answer, for each that agrees: what is unsure needs many.
         max_sigma_rel: sigma / depth of the joint answer above which it is withheld; None asks nothing.
-        max_still: share of the views without a baseline above which none is believed.
+        max_static_ratio: share of the views without a baseline above which none is believed.
 
     Returns:
         Estimate (B, N); a single view's as it is. The joint inverse depth is the mean of those that agree, by inverse
-        variance. Sigma is the weighted mean of theirs and never less: the views share the anchor's window and the near
-        returns, so what they have in common is not averaged out; where they differ by more than they say it grows with
-        the root of that ratio. ``n_views`` counts the anchor and those that agree; ``parallax_deg`` is their largest,
-        ``residual_px`` their weighted rms; ``score`` is 1 where answered.
+        variance. Sigma is the weighted mean of theirs and never less: the views share the reference view's window and
+        the near returns, so what they have in common is not averaged out; where they differ by more than they say it
+        grows with the root of that ratio. ``n_views`` counts the reference view and those that agree; ``parallax_deg``
+        is their largest, ``residual_px`` their weighted rms; ``score`` is 1 where answered.
 
-    Gates: NO_BASELINE for all points of an anchor whose views mostly have none; where no view answers, the reason of
+    Gates: NO_BASELINE for all points of a reference view whose views mostly have none; where no view answers, the
+        reason of
     the last; INCONSISTENT (other views disagree), UNCERTAIN (a sigma too large for so many views);
     CONTRADICTED for all answers where it silences more views than answer.
 
@@ -127,9 +130,9 @@ def fuse_consistent(
     Gradient: depth and sigma to those of the views; which of them agree, and gates, carry none.
     Cost: linear in views but for comparing them with each other, a few operations on (V, V, B, N).
     """
-    V = check("agree", gate=(estimates.gate, "V B N"), depth=(estimates.depth, "V B N"))["V"]
+    V = check("fuse_consistent", gate=(estimates.gate, "V B N"), depth=(estimates.depth, "V B N"))["V"]
     if V < 1:
-        raise ValueError("agree: expected at least one view")
+        raise ValueError("fuse_consistent: expected at least one view")
     if V == 1:
         return estimates[0]
     said = _is_answered(estimates)
@@ -138,7 +141,7 @@ def fuse_consistent(
     sureness = torch.where(said, inverse.square() / variance, torch.zeros_like(variance)).detach()  # (depth / sigma)²
     joined = _largest_agreement(inverse.detach(), variance.detach(), sureness, said, max_chi2)
     n = joined.sum(0)
-    against = torch.where(joined, 0.0, sureness).sum(0) > max_against * torch.where(joined, sureness, 0.0).sum(0)
+    against = torch.where(joined, 0.0, sureness).sum(0) > max_conflict_ratio * torch.where(joined, sureness, 0.0).sum(0)
     weight, mean, chi2 = _mean(inverse, variance, joined)
     own_2, shared_2 = ((weight * part).sum(0).square() * chi2.clamp_min(1) for part in (own, shared))
     depth = 1 / mean
@@ -152,7 +155,7 @@ def fuse_consistent(
     parallax = torch.where(joined | (n < 1), estimates.parallax_deg, torch.zeros_like(estimates.parallax_deg))
     return _joint(
         estimates,
-        _static_gate(estimates, gate, max_still),
+        _static_gate(estimates, gate, max_static_ratio),
         joined,
         weight,
         depth=depth,
@@ -187,15 +190,15 @@ def _mean(inverse: Tensor, variance: Tensor, among: Tensor) -> tuple[Tensor, Ten
     return weight, mean, chi2 / (n - 1).clamp_min(1)
 
 
-def _static_gate(estimates: Estimate, gate: Tensor, max_still: float) -> Tensor:
-    """The gates (B, N); NO_BASELINE for all points of an anchor whose views mostly have none."""
-    still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_still * len(estimates.gate)
+def _static_gate(estimates: Estimate, gate: Tensor, max_static_ratio: float) -> Tensor:
+    """The gates (B, N); NO_BASELINE for all points of a reference view whose views mostly have none."""
+    still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_static_ratio * len(estimates.gate)
     return torch.where(still[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
 
 
 def _contradicted_gate(estimates: Estimate, gate: Tensor) -> Tensor:
-    """The gates (B, N); CONTRADICTED for what an anchor answers of whose views more are contradicted than answer: what
-    moves on its own is near in all of them."""
+    """The gates (B, N); CONTRADICTED for what a reference view answers of whose views more are contradicted than
+    answer: what moves on its own is near in all of them."""
     against = (estimates.gate == Gate.CONTRADICTED).any(-1).sum(0)
     answering = (estimates.gate == Gate.ANSWER).any(-1).sum(0)
     moving = against > answering

@@ -328,8 +328,8 @@ def map_pose(
     far_weight: float = 0.1,
     max_rise: float = 0.1,
     isotropic: float = 0.1,
-    turn_sigma: float = 0.01,
-    turn_gain: float = 0.02,
+    shutter_sigma: float = 0.01,
+    shutter_gain: float = 0.02,
     translation_gain: float = 0.55,
     kernel: str | None = "geman_mcclure",
     bend: float = 2.0,
@@ -357,9 +357,9 @@ def map_pose(
         far_weight: weight of a far track's cost: not its inverse variance, because neighbours share their errors.
         max_rise: share by which the near cost may rise over that of the near tracks alone.
         isotropic: share of a track's noise that does not depend on its patch, see ``covariance.noise_shape``.
-        turn_sigma: one standard deviation of how far rows may turn against each other, rad per unit of height (of a
+        shutter_sigma: one standard deviation of how far rows may turn against each other, rad per unit of height (of a
             ray with z = 1); 0 for a global shutter.
-        turn_gain: share of the cost that such a turn must take away to be believed.
+        shutter_gain: share of the cost that such a turn must take away to be believed.
         translation_gain: share of the cost of the best pure rotation that the translation must take away.
         kernel, bend: robust kernel and the residual, in standard deviations, at which it bends.
         near_steps, steps: Levenberg–Marquardt steps of the two solutions.
@@ -397,7 +397,7 @@ def map_pose(
         >>> cov = torch.eye(2).expand(1, 60, 2, 2)
         >>> tracks = Tracks(uv_0, uv_1, error=zero, photometric=zero, cov=cov, valid=zero == 0)
         >>> fit = map_pose(samples, tracks, camera, camera, torch.rand(1, 100, 3, generator=draw))
-        >>> fit.T_1_from_0.R.shape, fit.cov.shape, fit.shutter.turn.shape
+        >>> fit.T_1_from_0.R.shape, fit.cov.shape, fit.shutter.shutter_rate.shape
         (torch.Size([1, 3, 3]), torch.Size([1, 6, 6]), torch.Size([1, 3]))
         >>> off = fit.T_1_from_0.t - torch.tensor([0.2, 0.0, 0.0])
         >>> sigma = fit.cov.diagonal(dim1=1, dim2=2).sqrt()[:, 3:]  # m
@@ -409,8 +409,8 @@ def map_pose(
     options = FitOptions(
         far_weight=far_weight,
         max_rise=max_rise,
-        turn_sigma=turn_sigma,
-        turn_gain=turn_gain,
+        shutter_sigma=shutter_sigma,
+        shutter_gain=shutter_gain,
         translation_gain=translation_gain,
         kernel=kernel,
         bend=bend,
@@ -435,7 +435,7 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: PoseDe
         reprojection_problem.pose_normal_equations,
         noise=found.noise,
         far_weight=found.far_weight,
-        turn_precision=found.turn_precision,
+        shutter_precision=found.shutter_precision,
         kernel=o.kernel,
         bend=o.bend,
     )
@@ -458,7 +458,7 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: PoseDe
         far_noise = torch.where(problem.far, found.noise, 0.0).amax(-1)
         variance = torch.where(problem.far.any(-1), far_noise, found.noise.amax(-1))
         t_snr = covariance.mahalanobis(at.T.t, cov[:, 3:6, 3:6])
-    assert at.turn is not None  # most_probable answers one, of zeros where it believes none
+    assert at.shutter_rate is not None  # most_probable answers one, of zeros where it believes none
 
     def answer(x: Tensor) -> Tensor:
         return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan).to(tracks.uv_1.dtype)
@@ -472,7 +472,7 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: PoseDe
         sigma_px=answer(variance.sqrt()),
         t_snr=answer(t_snr),
         code=code,
-        shutter=Shutter(answer(at.turn), answer(cov)),
+        shutter=Shutter(answer(at.shutter_rate), answer(cov)),
     )
 
 
@@ -518,8 +518,8 @@ def _reprojection(
 ) -> tuple[Tensor, Tensor]:
     """Near tracks (B, N) whose point, at the sensor's depth, falls close to where they were seen; rms px of these."""
     uv = problem.uv
-    if at.turn is not None:
-        uv = reprojection_problem.undo_rolling_shutter(uv, problem.f, problem.c, problem.ray[:, 1], at.turn)
+    if at.shutter_rate is not None:
+        uv = reprojection_problem.undo_rolling_shutter(uv, problem.f, problem.c, problem.ray[:, 1], at.shutter_rate)
     r, depth = reprojection_residuals(at.T, problem.f, problem.c, problem.ray / problem.inverse[:, None], uv)
     square = (r * r).sum(1)
     inlier = problem.near & (depth > MIN_DEPTH) & (square < threshold_px**2)

@@ -54,36 +54,36 @@ def check_pose_prior(
     camera_1: Camera,
     found: PoseFit,
     *,
-    max_miss: float = 0.01,
+    max_residual: float = 0.01,
     min_near: int = 8,
-    min_explained: float = 0.5,
+    min_inlier_ratio: float = 0.5,
     min_confirmed: int = 4,
     max_deviation: float = 4.74,
-    assumed: tuple[float, float] = (0.01, 0.02),
+    default_sigma: tuple[float, float] = (0.01, 0.02),
 ) -> PoseFit:
     """A pose from elsewhere as seat 5's answer, or the reason why it is not used.
 
     It is refuted where near returns that one rigid motion explains (``found``, from seat 5) mostly miss it: fewer than
-    ``min_explained`` of them lie within three standard deviations or ``max_miss``; or, where its covariance
+    ``min_inlier_ratio`` of them lie within three standard deviations or ``max_residual``; or, where its covariance
     is stated, where the two motions differ by more than ``max_deviation`` standard deviations of both. Near returns
     that no rigid motion explains, or too few of them, refute nothing.
 
     A covariance that is not stated is taken from the near returns: their own, and the square of how far they say the
-    pose is off. Where they have no pose of their own, it is ``assumed`` if a few of them, and most of those there are,
-    confirm the pose: one that nobody confirms and for which nobody vouches is not used. Exact is a pose only where
+    pose is off. Where they have no pose of their own, it is ``default_sigma`` if a few of them, and most of those there
+    are, confirm the pose: one that nobody confirms and for which nobody vouches is not used. Exact is a pose only where
     that is stated, as a covariance of zero.
 
     Args:
         given: B poses.
         samples, tracks, camera_0, camera_1: what seat 5 is given.
         found: what seat 5 says.
-        max_miss: residual of a near return that is forgiven in any case, of a ray with z = 1; a pixel at least.
+        max_residual: residual of a near return that is forgiven in any case, of a ray with z = 1; a pixel at least.
         min_near: fewer near returns refute nothing.
-        min_explained: share of them that a pose must explain.
+        min_inlier_ratio: share of them that a pose must explain.
         min_confirmed: near returns that must be explained by a pose whose covariance nobody knows.
         max_deviation: length of xi in standard deviations, those of ``found`` counted threefold; as it is, one right
             pose in a thousand is refuted.
-        assumed: standard deviations (rad, m) of a pose that near returns confirm and do not measure.
+        default_sigma: standard deviations (rad, m) of a pose that near returns confirm and do not measure.
 
     Returns:
         PoseFit with the given pose. Codes: TOO_FEW: not a finite pose, or too few near returns to know a covariance
@@ -98,8 +98,8 @@ def check_pose_prior(
     Gradient: R and t to the given pose; whether it is used, its covariance and the rest carry none.
     Cost: linear in N.
     """
-    check("hold", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), R=(given.T_1_from_0.R, "B 3 3"))
-    check("hold", t=(given.T_1_from_0.t, "B 3"), cov=(given.cov, "B 6 6"), f_1=(camera_1.f, "B 2"))
+    check("check_pose_prior", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), R=(given.T_1_from_0.R, "B 3 3"))
+    check("check_pose_prior", t=(given.T_1_from_0.t, "B 3"), cov=(given.cov, "B 6 6"), f_1=(camera_1.f, "B 2"))
     T = given.T_1_from_0.to(samples.xyz.dtype)
     N = samples.uv.shape[1]
     with torch.no_grad():
@@ -107,7 +107,7 @@ def check_pose_prior(
         if given.cov is not None:
             finite = finite & given.cov.isfinite().flatten(1).all(1)
         near = _near(samples, tracks)
-        miss_px = (max_miss * camera_1.f.detach().amin(-1)).clamp_min(DEFAULT_TRACK_NOISE_PX)
+        miss_px = (max_residual * camera_1.f.detach().amin(-1)).clamp_min(DEFAULT_TRACK_NOISE_PX)
         own = select_batch(found.ok, found.T_1_from_0.detach().to(T.t.dtype), se3.identity(len(T.t), T.t))
         stood = select_batch(finite, T.detach(), se3.identity(len(T.t), T.t))
         own_cov = torch.where(found.ok[:, None, None], found.cov, 0.0).nan_to_num().to(T.t.dtype)
@@ -118,12 +118,12 @@ def check_pose_prior(
         rigid = near.used & (_square(near, own, camera_1, miss_px, None) < INLIER_SIGMAS**2) & found.ok[:, None]
         rigid = rigid | (near.used & still[:, None])
         enough = rigid.sum(-1) >= min_near
-        refuted = enough & ((explained & rigid).sum(-1) < min_explained * rigid.sum(-1))
+        refuted = enough & ((explained & rigid).sum(-1) < min_inlier_ratio * rigid.sum(-1))
         count = (explained & near.used).sum(-1)
-        unknown = (count < min_confirmed) | (count < min_explained * near.used.sum(-1))
+        unknown = (count < min_confirmed) | (count < min_inlier_ratio * near.used.sum(-1))
         unknown = unknown & ~found.ok & (stated is None)
         if stated is None:
-            spread = torch.tensor([assumed[0] ** 2] * 3 + [assumed[1] ** 2] * 3).to(T.t)
+            spread = torch.tensor([default_sigma[0] ** 2] * 3 + [default_sigma[1] ** 2] * 3).to(T.t)
             cov = torch.where(found.ok[:, None, None], own_cov + xi[:, :, None] * xi[:, None], torch.diag(spread))
         else:
             cov = stated
@@ -142,8 +142,8 @@ def check_pose_prior(
         square = _square(near, stood, camera_1, None, None)
         rms_px = (torch.where(inlier, square, 0.0).sum(-1) / inlier.sum(-1).clamp_min(1)).sqrt()
         looks = torch.zeros_like(code)
-        if given.readings is not None:
-            looks = torch.where(refuted, _matched_convention(near, given.readings, camera_1, rigid, miss_px), looks)
+        if given.hypotheses is not None:
+            looks = torch.where(refuted, _matched_convention(near, given.hypotheses, camera_1, rigid, miss_px), looks)
 
     def answer(x: Tensor) -> Tensor:
         return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan)
@@ -157,7 +157,7 @@ def check_pose_prior(
         sigma_px=answer(torch.where(found.ok, found.sigma_px.to(rms_px), DEFAULT_TRACK_NOISE_PX)),
         t_snr=answer(t_snr),
         code=code,
-        looks=looks,
+        matched_convention=looks,
     )
 
 
@@ -166,7 +166,7 @@ def reject_poses(fit: PoseFit, held: PoseFit) -> PoseFit:
 
     Raises ValueError for wrong shapes. Gradient: to the poses that stay.
     """
-    check("without", R=(fit.T_1_from_0.R, "B 3 3"), code=(fit.code, "B"), code_held=(held.code, "B"))
+    check("reject_poses", R=(fit.T_1_from_0.R, "B 3 3"), code=(fit.code, "B"), code_held=(held.code, "B"))
     gone = fit.ok & ((held.code == PoseCode.REFUTED) | (held.code == PoseCode.TOO_FEW))
 
     def left(x: Tensor) -> Tensor:
@@ -185,7 +185,7 @@ def reject_poses(fit: PoseFit, held: PoseFit) -> PoseFit:
 
 
 def priors_from_frames(
-    anchor: Frame,
+    reference: Frame,
     others: Frame,
     *,
     sigma: tuple[float, float] | None = None,
@@ -194,7 +194,7 @@ def priors_from_frames(
     """The motions that frames carry (``T_world_from_cam``), for the ``given`` of a method.
 
     Args:
-        anchor: B views.
+        reference: B views.
         others: B other views, or V × B of them.
         sigma: standard deviations of a relative pose, rad and m; None = not stated.
         refine: only start the search for the most probable pose from it.
@@ -204,17 +204,17 @@ def priors_from_frames(
 
     Gradient: to the poses.
     """
-    if anchor.T_world_from_cam is None or others.T_world_from_cam is None:
+    if reference.T_world_from_cam is None or others.T_world_from_cam is None:
         raise ValueError("given: frame.T_world_from_cam is absent, expected a data set that has camera-to-world poses")
     if sigma is not None and not (len(sigma) == 2 and all(0 <= s < float("inf") for s in sigma)):
         raise ValueError(f"given.sigma: found {sigma}, expected two numbers of at least 0: rad and m")
-    world_0, world_1 = anchor.T_world_from_cam, others.T_world_from_cam
+    world_0, world_1 = reference.T_world_from_cam, others.T_world_from_cam
     several = world_1.t.dim() == 3
     if several:
         world_0 = world_0.map(lambda x: x.expand(len(world_1.t), *x.shape))
     flat_0, flat_1 = (T.map(lambda x: x.flatten(0, 1)) if several else T for T in (world_0, world_1))
     # In float64: places far from the world's origin differ by little of their size.
-    made = relative_prior(flat_0, flat_1, sigma=sigma, refine=refine).to(anchor.camera.f.dtype)
+    made = relative_prior(flat_0, flat_1, sigma=sigma, refine=refine).to(reference.camera.f.dtype)
     return made.map(lambda x: x.unflatten(0, world_1.t.shape[:2])) if several else made
 
 
@@ -226,7 +226,7 @@ def relative_prior(
     cov: Tensor | None = None,  # (B, 6, 6) of T_1_from_0
     refine: bool = False,
 ) -> PosePrior:
-    """A given motion of two poses in one world, with all its readings. Gradient: to poses and covariance."""
+    """A given motion of two poses in one world, with all its hypotheses. Gradient: to poses and covariance."""
     T = se3.relative(T_world_from_0, T_world_from_1)
     back = se3.compose(T_world_from_1, se3.invert(T_world_from_0))
     return make_prior(T, back, sigma=sigma, cov=cov, refine=refine)
@@ -240,7 +240,7 @@ def make_prior(
     cov: Tensor | None = None,  # (B, 6, 6)
     refine: bool = False,
 ) -> PosePrior:
-    """A given motion with all its readings; ``sigma``: standard deviations, rad and m, where ``cov`` is not given.
+    """A given motion with all its hypotheses; ``sigma``: standard deviations, rad and m, where ``cov`` is not given.
 
     Gradient: to poses and covariance.
     """
@@ -282,9 +282,9 @@ def _square(near: _Near, T: Pose, camera: Camera, miss_px: Tensor | None, cov: T
     return torch.where((depth > MIN_DEPTH) & near.used, square, torch.inf)
 
 
-def _matched_convention(near: _Near, readings: Pose, camera: Camera, rigid: Tensor, miss_px: Tensor) -> Tensor:
+def _matched_convention(near: _Near, hypotheses: Pose, camera: Camera, rigid: Tensor, miss_px: Tensor) -> Tensor:
     """Which reading (B,) explains most of the near returns that move rigidly, and at least half; 0 = none."""
-    B, K = readings.t.shape[:2]
+    B, K = hypotheses.t.shape[:2]
     index, count = ransac.usable_first(rigid, min(MAX_CONVENTION_RETURNS, rigid.shape[1]))
     slot = torch.arange(index.shape[1], device=index.device) < count[:, None]
 
@@ -293,7 +293,7 @@ def _matched_convention(near: _Near, readings: Pose, camera: Camera, rigid: Tens
         return some.repeat_interleave(K, 0)
 
     fewer = _Near(thin(near.xyz), thin(near.uv), thin(near.sigma), slot.repeat_interleave(K, 0))
-    flat = readings.map(lambda x: x.flatten(0, 1).to(near.xyz.dtype))
+    flat = hypotheses.map(lambda x: x.flatten(0, 1).to(near.xyz.dtype))
     camera = camera.map(lambda x: x.repeat_interleave(K, 0))
     square = (
         _square(fewer, flat, camera, miss_px.repeat_interleave(K, 0), None)

@@ -76,7 +76,7 @@ def confidence(
     Gradient: to parallax and residual; the threshold carries none.
     Source: paper, "Selective confidence".
     """
-    check("rank", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
+    check("confidence", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
     parallax, residual = estimate.parallax_deg, estimate.residual_px
     stated = estimate.keep & parallax.isfinite() & residual.isfinite()
     parallax, residual = (torch.where(stated, x, torch.zeros_like(x)) for x in (parallax, residual))
@@ -123,7 +123,7 @@ def confidence_from_error(
 
     Gradient: to sigma, depth, residual and what else is asked; the threshold carries none.
     """
-    check("rank_by_error", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
+    check("confidence_from_error", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
     terms = [(estimate.residual_px, residual_scale_px)]
     if photometric_scale is not None:
         terms.append((tracks.photometric, photometric_scale))
@@ -165,7 +165,7 @@ def confidence_from_sigma(
 
     Gradient: to sigma and depth; the threshold carries none.
     """
-    check("rank_by_sigma", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
+    check("confidence_from_sigma", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
     stated = estimate.keep & (estimate.depth > 0) & estimate.sigma.isfinite()
     depth = torch.where(stated, estimate.depth, torch.ones_like(estimate.depth))
     sigma = torch.where(stated, estimate.sigma, torch.ones_like(estimate.sigma))
@@ -188,7 +188,7 @@ def score_features(estimate: Estimate, samples: Samples, tracks: Tracks, fit: Po
 
     Gradient: to depth, sigma, parallax and residual; zero beyond the limits and where there is no answer.
     """
-    check("evidence", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
+    check("score_features", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
     terms = [(estimate.residual_px, SCORE_RESIDUAL_PX), (tracks.error, SCORE_ROUND_TRIP_PX)]
     expected, stated = _expected_error(estimate, terms)
     others = (estimate.parallax_deg, estimate.residual_px, tracks.error, tracks.photometric, samples.trackability)

@@ -164,8 +164,8 @@ def refine_tracks(
 
     Gradient: to both images and ``uv_0``; ``uv_1`` is detached.
     """
-    check("refine", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))
-    check("refine", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
+    check("refine_tracks", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))
+    check("refine_tracks", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     _check_options(1, normalise)
     source = build_pyramid(image_0, 1, window)
     target = build_pyramid(image_1, 1, window, gradients=False)

@@ -114,8 +114,8 @@ def two_view(
     y = None
     if fit.shutter is not None:
         y = cam.rays(cam.ideal(camera_0), uv_0)[..., 1]
-        turn = torch.where(posed, fit.shutter.turn, torch.zeros_like(fit.shutter.turn))
-        uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, turn).transpose(1, 2)
+        shutter_rate = torch.where(posed, fit.shutter.shutter_rate, torch.zeros_like(fit.shutter.shutter_rate))
+        uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, shutter_rate).transpose(1, 2)
     geometry = solver(uv_0, uv_1, camera_0, camera_1, _stand_in(fit))
     parallax_deg = geometry.parallax * (180 / math.pi)
     mismatch = grey / texture.clamp_min(MIN_TRACKABILITY).sqrt()

@@ -197,15 +197,15 @@ def apply_fault(
 
     Gradient: to ``depth`` where the fault is a function of values, not through places.
     """
-    check("spoil", depth=(depth, "B h w"), other=(other, "B h w"))
+    check("apply_fault", depth=(depth, "B h w"), other=(other, "B h w"))
     if name == WRONG_TIME:
         if other is None:
-            raise ValueError("spoil: found no map of another time, expected other=")
+            raise ValueError("apply_fault: found no map of another time, expected other=")
         found = other
     elif name in (known := DEPTH_FAULTS | FORMAT_FAULTS):
         found = known[name](depth, Generator().manual_seed(seed))
     else:
-        raise ValueError(f"spoil: found {name!r}, expected one of {', '.join((*known, WRONG_TIME))}")
+        raise ValueError(f"apply_fault: found {name!r}, expected one of {', '.join((*known, WRONG_TIME))}")
     wrong = (found > 0) & (depth > 0) & ((found - depth).abs() > _MIN_WRONG_REL * depth)
     return found, wrong
 

@@ -63,7 +63,7 @@ class StressRoom(SyntheticRoom):
         places: for ``few_near``, where a method will look, with ``n_places``: returns are kept there. None = anywhere.
         n_places: number of places.
         near: m; returns up to here are what a stress of the sensor is about.
-        gap: the first so many frames are anchors, which ``moved`` leaves alone.
+        gap: the first so many frames are reference views, which ``moved`` leaves alone.
         options: of :class:`SyntheticRoom`; those that make the stress are set by it.
 
     Raises:
@@ -273,7 +273,7 @@ def _add_depth_noise(room: StressRoom, i: int, frame: Frame) -> Frame:
 def _displace_tiles(room: StressRoom, i: int, frame: Frame) -> Frame:
     """Squares of the later views show what lies beside them, so that tracks end in the wrong place, and fit there.
 
-    The first ``gap`` frames are left alone: anchors show what is there.
+    The first ``gap`` frames are left alone: reference views show what is there.
     """
     if i < room.gap:
         return frame

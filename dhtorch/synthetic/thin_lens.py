@@ -57,12 +57,12 @@ def render_defocus(
 
     Gradient: to the image; layers are chosen without one.
     """
-    sizes = check("photograph", image=(image, "B C H W"), depth=(depth, "B H W"), focus_m=(focus_m, "B S"))
+    sizes = check("render_defocus", image=(image, "B C H W"), depth=(depth, "B H W"), focus_m=(focus_m, "B S"))
     if not bool((depth > 0).all()):
-        raise ValueError("photograph: depth has pixels without a value, expected positive depth everywhere")
+        raise ValueError("render_defocus: depth has pixels without a value, expected positive depth everywhere")
     lens = lens.map(lambda x: x.expand(sizes["B"]))
     if not bool((focus_m > lens.focal_length_m[:, None]).all()):
-        raise ValueError("photograph: focus_m expected beyond the focal length of the lens")
+        raise ValueError("render_defocus: focus_m expected beyond the focal length of the lens")
     picture = image / 255.0 if image.dtype == torch.uint8 else image
     made = [
         _render_scene(picture[b] ** gamma, 1 / depth[b], spot_gain(lens, focus_m)[b], 1 / focus_m[b], step_px)

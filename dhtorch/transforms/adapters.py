@@ -49,7 +49,7 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
     Args:
         dataset: ``dataset[i]`` is a dict.
         transform: for single samples; with ``by_batch`` for batches.
-        gap: places from the other view to the anchor; None = the sample itself holds both.
+        gap: places from the other view to the reference view; None = the sample itself holds both.
         episode_key: key of a number that items of one episode share; None = there is one episode.
         by_batch: items stay as they are, and :meth:`collate`, then needed as the loader's ``collate_fn``, extends the
             whole batch in the worker: the same bits in less time.

@@ -42,7 +42,7 @@ class ExtendDepth(torch.nn.Module):
         index_key: key of a whole number that tells samples apart; None = the same draws for all.
         dense: True = a map of every pixel as well, with the defaults of :func:`dhtorch.pipeline.dense.complete_depth`;
             a mapping =
-            options for it: ``partners``, ``planes``, ``size``, ``refinements``, ``min_correlation``,
+            options for it: ``source_views``, ``planes``, ``size``, ``refinements``, ``min_correlation``,
             ``max_sigma_rel``. Sigma and score of swept pixels are calibrated by what travels with the package.
         patch, tokens_hw, fit: the network's patches, see :func:`dhtorch.transforms.patch_tokens`.
         on_error: what to do with a sample that cannot be read, or whose values contradict what was stated. ``raise``;
@@ -57,12 +57,12 @@ class ExtendDepth(torch.nn.Module):
 
     Returns:
         The sample and, behind the prefix (N = n, P patches, with B in front of a batch): ``uv`` (N, 2) px;
-        ``xyz`` (N, 3) m in the anchor's camera; ``depth``, ``sigma`` (N,) m; ``score`` (N,) in [0, 1]; ``valid`` (N,)
-        there is a depth; ``source``, ``flag``, ``hole``, ``gate`` (N,) codes of ``dhtorch.codes``; ``T_1_from_0``
-        (4, 4) and its ``pose_cov`` (6, 6), ``pose_ok``, ``pose_code``; with ``pose`` also ``pose_looks``, in which of
-        :data:`dhtorch.geometry.pose_conventions.CONVENTIONS` a pose would fit that the near returns refute;
-        ``tokens`` (P, 10) of :data:`dhtorch.transforms.TOKEN_CHANNELS` and ``tokens_valid`` (P,); ``problem``. What is
-        not valid is 0.
+        ``xyz`` (N, 3) m in the reference view's camera; ``depth``, ``sigma`` (N,) m; ``score`` (N,) in [0, 1];
+        ``valid`` (N,) there is a depth; ``source``, ``flag``, ``hole``, ``gate`` (N,) codes of ``dhtorch.codes``;
+        ``T_1_from_0`` (4, 4) and its ``pose_cov`` (6, 6), ``pose_ok``, ``pose_code``; with ``pose`` also
+        ``pose_convention``, in which of :data:`dhtorch.geometry.pose_conventions.CONVENTIONS` a pose would fit that the
+        near returns refute; ``tokens`` (P, 10) of :data:`dhtorch.transforms.TOKEN_CHANNELS` and ``tokens_valid`` (P,);
+        ``problem``. What is not valid is 0.
 
         With ``dense`` also ``depth_map``, ``sigma_map`` (h, w) m, ``score_map`` (h, w) in [0, 1], ``source_map`` and
         ``gate_map`` (h, w) codes, over the field of the picture and of its size unless that is longer than ``size``.
@@ -141,7 +141,7 @@ class ExtendDepth(torch.nn.Module):
             if flagged:
                 warnings.warn(f"flagged: {read.complaint()}", stacklevel=2)
             added = self._answer(read, seed, flagged)
-        self._counted(added["problem"], read.anchor.hw)
+        self._counted(added["problem"], read.reference.hw)
         return self._joined(sample, added)
 
     def uncollated(self, samples: Sequence[Any]) -> dict[str, Tensor] | None:
@@ -187,7 +187,7 @@ class ExtendDepth(torch.nn.Module):
         return None if self.on_error == "skip" or hw is None else self._joined(sample, self._blank(hw))
 
     def _answer(self, read: SampleViews, seed: int | Tensor, flagged: bool) -> dict[str, Tensor]:
-        frame, paired, bad = read.anchor, read.paired, read.bad
+        frame, paired, bad = read.reference, read.paired, read.bad
         samples, estimate, fits, dense = self._asked(read, seed)
         fit = fits[-1] if fits else None
         found = merge(samples, estimate)
@@ -214,15 +214,15 @@ class ExtendDepth(torch.nn.Module):
         """What the method says, and of which views' poses, the last of which stands for all, and the maps where they
         are wanted; the front end alone, and no estimate, where nothing is paired."""
         if read.other is None or not bool(read.paired.any()):
-            samples = self.method.look(read.anchor)
-            dense = None if self.maps is None else self.maps.sensed(read.anchor, self.method)
+            samples = self.method.sample_depth(read.reference)
+            dense = None if self.maps is None else self.maps.sensed(read.reference, self.method)
             return samples, None, [], dense
         trace: dict[str, Any] = {}
         told: dict[str, Any] = {"seed": seed, "hint": self.hint, "trace": trace}
         told |= {} if read.given is None else {"fit": read.given}
         if self.maps is None:
             dense = None
-            estimate = self.method(read.anchor, read.other, **told)
+            estimate = self.method(read.reference, read.other, **told)
         else:
             dense = self.maps.swept(read, self.method, **told)
             estimate = trace["sparse"]
@@ -252,7 +252,7 @@ class ExtendDepth(torch.nn.Module):
         for key, size in {"source": (n,), "flag": (n,), "hole": (n,), "gate": (n,), "pose_code": ()}.items():
             out[key] = torch.zeros(1, *size, dtype=torch.int32)
         if self.views.pose is not None:
-            out["pose_looks"] = torch.zeros(1, dtype=torch.int32)
+            out["pose_convention"] = torch.zeros(1, dtype=torch.int32)
         if self.maps is not None:
             size = self.maps.hw(hw)
             out |= {key: torch.zeros(1, *size) for key in maps.MAP_NUMBER_KEYS}

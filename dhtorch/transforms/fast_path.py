@@ -144,7 +144,7 @@ class Alone:
         if len(self.kept) >= MAX_CACHED_CAMERAS or torch.is_inference_mode_enabled() or is_transformed():
             return None
         read = self.views.read(sample)
-        frame = read.anchor
+        frame = read.reference
         if read.complaints or read.other is not None or not bool(read.sensed.all()):
             return None
         uv = self.method.sample(frame.hw, self.n, device=frame.camera.f.device, dtype=frame.camera.f.dtype)[None]

@@ -1,4 +1,5 @@
-"""Maps of samples: a depth for every pixel of the anchor, as :func:`dhtorch.pipeline.dense.complete_depth` finds it."""
+"""Maps of samples: a depth for every pixel of the reference view, as :func:`dhtorch.pipeline.dense.complete_depth`
+finds it."""
 
 from __future__ import annotations
 
@@ -47,15 +48,15 @@ class DenseMaps:
         """
         assert read.other is not None
         options = {**self.options, "method": method, "calibration": self.calibration, **asked}
-        found = dense.complete_depth(read.anchor, read.other, **options)
+        found = dense.complete_depth(read.reference, read.other, **options)
         if bool(read.paired.all()):
             return found
         rows = torch.arange(len(read.paired), device=read.paired.device)
-        return pytree.stack([self.sensed(read.anchor, method), found])[read.paired.long(), rows]
+        return pytree.stack([self.sensed(read.reference, method), found])[read.paired.long(), rows]
 
-    def sensed(self, anchor: Frame, method: Method) -> DepthMap:
+    def sensed(self, reference: Frame, method: Method) -> DepthMap:
         """The maps of samples without a second view: the sensor where it answers, else silence."""
-        return dense.sensor_depth_map(anchor, method=method, size=self.options["size"])
+        return dense.sensor_depth_map(reference, method=method, size=self.options["size"])
 
 
 def map_to_keys(found: DepthMap) -> dict[str, Tensor]:
@@ -76,6 +77,6 @@ def map_to_samples(found: DepthMap, frame: Frame, method: Method) -> tuple[Merge
     """
     uv = dense.map_pixel_centres(frame, (found.depth.shape[-2], found.depth.shape[-1]))
     with torch.no_grad():
-        hole = method.look_at(frame, uv).hole
+        hole = method.sample_depth_at(frame, uv).hole
     flat = {name.removesuffix("_map"): x.flatten(1) for name, x in map_to_keys(found).items() if name != "gate_map"}
     return MergedDepth(uv=uv.expand(len(hole), -1, -1), **flat), hole

@@ -78,12 +78,12 @@ def read_pose_priors(
     unit: float,
     refine: bool,
 ) -> PosePrior:
-    """The motions (V, B) from the anchor to the other views, as samples state them.
+    """The motions (V, B) from the reference view to the other views, as samples state them.
 
     Args:
         leaves: the samples.
-        at: the anchor's place along time, and those of the V other views.
-        T: frames along time of the anchor's images and of the others'.
+        at: the reference view's place along time, and those of the V other views.
+        T: frames along time of the reference view's images and of the others'.
         checks: gets what contradicts that these are poses: mask, value and text.
         keys: of the pose, or the matrix of all; and of the other views' where it is another.
         cov, kind, axes, unit, refine: see :class:`dhtorch.transforms.SampleSpec`.
@@ -125,13 +125,13 @@ def refuted_pose_keys(fits: Sequence[PoseFit], paired: Tensor, name: str) -> dic
     for fit in fits:
         here = paired & (fit.code == PoseCode.REFUTED)
         refuted = refuted | here
-        if fit.looks is not None:
-            looks = torch.where(here & (looks == 0), fit.looks.to(looks.dtype), looks)
+        if fit.matched_convention is not None:
+            looks = torch.where(here & (looks == 0), fit.matched_convention.to(looks.dtype), looks)
     if bool(refuted.any()):
         seen = [conventions.CONVENTIONS[i] for i in sorted(set(looks[refuted].tolist())) if i]
         like = f"; looks like {' or '.join(seen)}" if seen else ""
         warnings.warn(f"{name}: the near returns contradict the pose{like}", stacklevel=4)
-    return {"pose_looks": looks}
+    return {"pose_convention": looks}
 
 
 def _read_matrix(

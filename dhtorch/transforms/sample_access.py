@@ -144,7 +144,7 @@ class SampleReader:
 
     def __init__(self, sample: Mapping[str, Any], batched: bool, dtype: torch.dtype) -> None:
         self.sample, self.batched, self.dtype = sample, batched, dtype
-        self.like: Tensor | None = None  # the anchor's images: everything follows their device and number
+        self.like: Tensor | None = None  # the reference view's images: everything follows their device and number
 
     def get(self, key: str, *, signed: bool = True) -> Tensor:
         """(B, …) on the device of the first one asked for."""

@@ -51,11 +51,11 @@ _KEY_OPTIONS = (
 class SampleViews(NamedTuple):
     """The views of B samples."""
 
-    anchor: Frame
+    reference: Frame
     other: Frame | None  # with a leading dimension where several were asked for; None = there is none
     paired: Tensor  # (B,) bool: the other view is a view of its own, no copy that pads the start of an episode
     bad: Tensor  # (B,) bool: values contradict what was stated
-    sensed: Tensor  # (B,) bool: the anchor's map has a return
+    sensed: Tensor  # (B,) bool: the reference view's map has a return
     complaints: tuple[tuple[Tensor, Tensor, str], ...]  # mask (B,), value (B,) and what to say about it
     given: PosePrior | None = None  # the motion to the other view, where samples state it; leading dims as of other
 
@@ -79,20 +79,22 @@ class SampleSpec:
     """
 
     depth_unit: str | float = ""  # "m", "mm", or metres per unit; must be said
-    image: str = "image"  # key of the anchor's image
-    depth: str = "depth"  # key of the anchor's depth map
+    image: str = "image"  # key of the reference view's image
+    depth: str = "depth"  # key of the reference view's depth map
     intrinsics: KeyOrNumbers = "intrinsics"  # 3×3, or fx fy cx cy, px of the image
     distortion: KeyOrNumbers | None = None  # of the image, OpenCV's order
     depth_intrinsics: KeyOrNumbers | None = None  # px of the depth map; None = it covers the same field as the image
     confidence: str | None = None  # key of the sensor's confidence: 0 low, 1 medium, 2 high
     other_image: str | None = None  # key of the other view's image; None = another frame along time
-    other_intrinsics: KeyOrNumbers | None = None  # None = those of the anchor
+    other_intrinsics: KeyOrNumbers | None = None  # None = those of the reference view
     sparse: bool = False  # the depth map is a projected LiDAR sweep, mostly empty between returns
-    at: int = -1  # the anchor's place along time
+    at: int = -1  # the reference view's place along time
     other_at: int | Sequence[int] = 0  # the other view's; several are for a method of many views
     pose: str | poses.PoseMatrix | None = None  # key of a pose from elsewhere, 4x4 or 3x4, NaN where it is not
     # known; or, with "1_from_0", the matrix itself: two cameras of a rig
-    pose_kind: str = "world_from_cam"  # of each frame; or "1_from_0": maps points of the anchor into the other view
+    pose_kind: str = (
+        "world_from_cam"  # of each frame; or "1_from_0": maps points of the reference view into the other view
+    )
     pose_cov: KeyOrNumbers | None = (
         None  # of each such pose: key of 6x6 (left perturbation, rad and m); or two standard
     )
@@ -152,15 +154,15 @@ class SampleSpec:
                     f"{self.confidence}: found {_format_hw(conf)}, expected {_format_hw(depth)} as {self.depth}"
                 )
         camera = self._camera(leaves, self.intrinsics, hw, T, at, checks)
-        anchor = Frame(image, depth, camera, self._depth_camera(leaves, depth, hw, T, at), conf)
+        reference = Frame(image, depth, camera, self._depth_camera(leaves, depth, hw, T, at), conf)
         if self.sparse:
-            anchor = anchor.replace(sparse=torch.ones(len(depth), dtype=torch.bool, device=depth.device))
-        other, paired = self._other(leaves, images, depths, anchor, checks)
+            reference = reference.replace(sparse=torch.ones(len(depth), dtype=torch.bool, device=depth.device))
+        other, paired = self._other(leaves, images, depths, reference, checks)
         motion = None if other is None else self._motion(leaves, T, checks)
         if other is not None:  # tracking reads all pixels, the front end alone a few where they lie
-            anchor = anchor.replace(image=anchor.image.contiguous())
+            reference = reference.replace(image=reference.image.contiguous())
         bad = torch.stack([c[0] for c in checks]).any(0) if checks else paired.new_zeros(len(depth))
-        return SampleViews(anchor, other, paired, bad, sensed=sensed, complaints=tuple(checks), given=motion)
+        return SampleViews(reference, other, paired, bad, sensed=sensed, complaints=tuple(checks), given=motion)
 
     @property
     def in_metres(self) -> str:
@@ -198,7 +200,7 @@ class SampleSpec:
         return tuple(dict.fromkeys(key for key in said if isinstance(key, str)))
 
     def image_hw(self, sample: Mapping[str, Any]) -> tuple[int, int] | None:
-        """Size of the anchor's image, None where it cannot be read."""
+        """Size of the reference view's image, None where it cannot be read."""
         try:
             images = SampleReader(sample, batched=False, dtype=torch.float32).images(self.image, self.layout)
         except SampleError:
@@ -206,7 +208,7 @@ class SampleSpec:
         return images.shape[-2], images.shape[-1]
 
     def _other(
-        self, leaves: SampleReader, images: Tensor, depths: Tensor, anchor: Frame, checks: list[Any]
+        self, leaves: SampleReader, images: Tensor, depths: Tensor, reference: Frame, checks: list[Any]
     ) -> tuple[Frame | None, Tensor]:
         T = images.shape[1]
         at = _frame_index(self.at, T, self.image)
@@ -223,16 +225,16 @@ class SampleSpec:
             own.append(~pad[:, p] if self.other_image is not None or p != at else torch.zeros_like(pad[:, p]))
             image = images[:, p].contiguous()
             checks += _unit_range_checks(image, key)
-            depth = torch.zeros_like(anchor.depth)
+            depth = torch.zeros_like(reference.depth)
             if self.other_image is None and depths.shape[1] > 1:
                 depth = depths[:, p].contiguous()
             hw = image.shape[-2], image.shape[-1]
             numbers = self.intrinsics if self.other_intrinsics is None else self.other_intrinsics
-            # The anchor's numbers along time belong to its own frames, not to those of another image.
+            # The reference view's numbers along time belong to its own frames, not to those of another image.
             shared = self.other_image is not None and self.other_intrinsics is None
             count, when = (T, at) if shared else (images.shape[1], p)
             camera = self._camera(leaves, numbers, hw, count, when, checks)
-            frames.append(Frame(image, depth, camera, anchor.depth_camera))
+            frames.append(Frame(image, depth, camera, reference.depth_camera))
         return (frames[0] if isinstance(self.other_at, int) else stack(frames)), torch.stack(own).any(0)
 
     def _motion(self, leaves: SampleReader, T: int, checks: list[Any]) -> PosePrior | None:

@@ -32,7 +32,7 @@ class ValidateDepth(torch.nn.Module):
         map_unit: metres a step of the map.
         method: a name (:data:`dhtorch.pipeline.presets.METHODS`) or a :class:`dhtorch.pipeline.method.Method`.
         n: samples per image; None = the method's own number.
-        judging: options of :func:`dhtorch.validation.validate.validate_depth`: ``views``, ``partners``, ``size``,
+        judging: options of :func:`dhtorch.validation.validate.validate_depth`: ``views``, ``source_views``, ``size``,
             ``tolerance``.
         hint: what is known of the motion between the views, for the tracker.
         seed: of the pose search.
@@ -45,8 +45,8 @@ class ValidateDepth(torch.nn.Module):
         The sample and, behind the prefix (with B in front of a batch): ``state`` (h, w) of
         :class:`dhtorch.codes.State`; ``evidence`` (h, w) sigmas, 0 where nothing is said; ``state_share`` (3,) of the
         pixels with a depth, by state; ``scale``, ``shift``, ``tilt``, ``wrong`` (3,) value, low, high, with
-        ``<name>_known``; ``ceiling`` () m, where the map is cut, with ``ceiling_known``; what cannot be known, or is
-        not so, is 0. Without a second view near returns alone speak.
+        ``<name>_known``; ``clip_depth`` () m, where the map is cut, with ``clip_depth_known``; what cannot be known, or
+        is not so, is 0. Without a second view near returns alone speak.
 
     Raises:
         ValueError: options that cannot be.
@@ -72,7 +72,7 @@ class ValidateDepth(torch.nn.Module):
     ) -> None:
         super().__init__()
         method = get_method(method, n)
-        known = ("views", "partners", "size", "tolerance")
+        known = ("views", "source_views", "size", "tolerance")
         if unknown := [name for name in judging or {} if name not in known]:
             raise ValueError(f"judging: found {', '.join(unknown)}, expected some of {', '.join(known)}")
         if not map_unit > 0:
@@ -89,24 +89,26 @@ class ValidateDepth(torch.nn.Module):
             read = self.views.read(sample, batched=self.batched)
             if bool(read.bad.any()):
                 raise SampleError(read.complaint())
-            depth = self._map(sample, read.anchor)
-            verdict = self._judged(depth, read.anchor, None)
+            depth = self._map(sample, read.reference)
+            verdict = self._judged(depth, read.reference, None)
             if read.other is not None and bool(read.paired.any()):
-                seen = self._judged(depth, read.anchor, read.other)
+                seen = self._judged(depth, read.reference, read.other)
                 rows = torch.arange(len(read.paired), device=read.paired.device)
                 verdict = stack([verdict, seen])[read.paired.long(), rows]
         added = _validation_keys(verdict)
         return {**sample, **{self.prefix + key: x if self.batched else x[0].contiguous() for key, x in added.items()}}
 
-    def _judged(self, depth: Tensor | None, anchor: Frame, others: Frame | None) -> DepthValidation:
-        return validate_depth(depth, anchor, others, method=self.method, seed=self.seed, hint=self.hint, **self.judging)
+    def _judged(self, depth: Tensor | None, reference: Frame, others: Frame | None) -> DepthValidation:
+        return validate_depth(
+            depth, reference, others, method=self.method, seed=self.seed, hint=self.hint, **self.judging
+        )
 
-    def _map(self, sample: Mapping[str, Any], anchor: Frame) -> Tensor | None:
+    def _map(self, sample: Mapping[str, Any], reference: Frame) -> Tensor | None:
         if self.map is None:
             return None
-        leaves = SampleReader(sample, batched=self.batched, dtype=anchor.camera.f.dtype)
-        leaves.like = anchor.image
-        planes = leaves.planes(self.map, 1).to(anchor.camera.f)
+        leaves = SampleReader(sample, batched=self.batched, dtype=reference.camera.f.dtype)
+        leaves.like = reference.image
+        planes = leaves.planes(self.map, 1).to(reference.camera.f)
         return planes[:, 0] * self.map_unit
 
 
@@ -123,4 +125,4 @@ def _validation_keys(verdict: DepthValidation) -> dict[str, Tensor]:
     for name in _INTERVAL_KEYS:
         value = getattr(verdict, name)
         added |= {name: value.nan_to_num(0.0, 0.0, 0.0), f"{name}_known": value.isfinite().all(-1)}
-    return added | {"ceiling": verdict.ceiling.nan_to_num(0.0), "ceiling_known": verdict.ceiling.isfinite()}
+    return added | {"clip_depth": verdict.clip_depth.nan_to_num(0.0), "clip_depth_known": verdict.clip_depth.isfinite()}

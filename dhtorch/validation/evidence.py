@@ -1,8 +1,8 @@
 """What speaks for or against a depth map, pixel by pixel, each kind of evidence by itself.
 
-    near returns, triangulated points ── by_answers ─┐
-    pictures of other views ──────────── by_views ───┼─ Said: sigmas, and whether an error would have been told
-    maps of other views ──────────────── by_maps ────┘
+    near returns, triangulated points ── sparse_evidence ─┐
+    pictures of other views ──────────── photometric_evidence ───┼─ Said: sigmas, and whether an error would have been
+    told maps of other views ──────────────── consistency_evidence ────┘
 
 Alphabet: d a depth of the map, m; r = log(d / what it is held against), positive where the map is too far; a *grid* is
 the picture over which a map is judged, (h, w), each of its pixels the mean of what it covers.
@@ -69,7 +69,7 @@ class ValidationReferences(NamedTuple):
 
 def validation_references(samples: Samples, estimate: Estimate, *, near: bool) -> ValidationReferences:
     """Near returns away from edges (where ``near``), else answers of the sparse method. Gradient: none."""
-    check("references", depth=(samples.depth, "B N"), answer=(estimate.depth, "B N"))
+    check("validation_references", depth=(samples.depth, "B N"), answer=(estimate.depth, "B N"))
     returned = samples.usable & ((samples.flag & (Flag.DEPTH_EDGE | Flag.SPECULAR)) == 0) & near
     told = estimate.keep & (estimate.depth > 0) & (estimate.sigma > 0) & ~returned
     used = returned | told
@@ -87,7 +87,7 @@ def resolution_sigma(depth: Tensor, hw: tuple[int, int]) -> Tensor:
     pixel of the grid that is a share o of the way from one to the other it is the other's depth that is true with
     probability o. Gradient: none.
     """
-    check("extent", depth_map=(depth, "B y x"))
+    check("resolution_sigma", depth_map=(depth, "B y x"))
     if not is_coarser(depth, hw):
         return depth.new_zeros(len(depth), *hw)
     log = torch.where(depth > 0, depth.detach(), torch.nan).log()
@@ -122,7 +122,7 @@ def _between(n: int, m: int, device: torch.device) -> tuple[Tensor, Tensor, Tens
 def inflate_sigma(found: ValidationReferences, loose: Tensor, hw: tuple[int, int]) -> ValidationReferences:
     """Depths to hold a map against whose pixels (B, h, w) stand for depths that differ by so much (log); ``hw`` of the
     picture. Gradient: none."""
-    check("loosened", loose=(loose, "B h w"), uv=(found.uv, "B N 2"))
+    check("inflate_sigma", loose=(loose, "B h w"), uv=(found.uv, "B N 2"))
     at = sample_nearest(loose, resize_pixels(found.uv, hw, (loose.shape[-2], loose.shape[-1])))[0]
     return found._replace(sigma=(found.sigma.square() + at.square()).sqrt())
 
@@ -145,7 +145,7 @@ def sparse_evidence(
     Answers around a pixel are not taken for independent: together they are as unsure as one of them, and more so by as
     much as they disagree. Gradient: none.
     """
-    check("by_answers", depth=(depth, "B h w"), uv=(found.uv, "B N 2"))
+    check("sparse_evidence", depth=(depth, "B h w"), uv=(found.uv, "B N 2"))
     h, w = depth.shape[-2:]
     place = resize_pixels(found.uv, hw, (h, w))
     at, inside = sample_nearest(depth, place)
@@ -174,7 +174,7 @@ def sparse_evidence(
 def photometric_evidence(
     depth: Tensor,  # (B, h, w) m, 0 = the map says nothing
     base: plane_sweep.ReferenceView,
-    partners: list[surface.SourceView],
+    source_views: list[surface.SourceView],
     tolerance: float | Tensor,  # (B, h, w) or one for all
 ) -> Evidence:
     """How the map fits the pictures of other views, whatever their exposure, beside other depths along the same rays.
@@ -188,9 +188,9 @@ def photometric_evidence(
     """
     said = no_evidence(depth)
     q, solid = _filled(depth)
-    for k, partner in enumerate(partners):
-        misfit, sure = _view_evidence(q, base, partner, tolerance)
-        there = misfit.isfinite() & solid & partner.use[:, None, None]
+    for k, source_view in enumerate(source_views):
+        misfit, sure = _view_evidence(q, base, source_view, tolerance)
+        there = misfit.isfinite() & solid & source_view.use[:, None, None]
         milder = there & (said.misfit.isnan() | (misfit.abs() < said.misfit.abs()))
         index = torch.full_like(said.view, k)
         said = Evidence(*(torch.where(milder, a, b) for a, b in zip((misfit, sure, index), said, strict=True)))
@@ -200,8 +200,8 @@ def photometric_evidence(
 def depth_consistency_evidence(
     depth: Tensor,  # (B, h, w) m, 0 = the map says nothing
     base: plane_sweep.ReferenceView,
-    partners: list[surface.SourceView],
-    maps: list[Tensor],  # (B, h', w') m of each partner, 0 = says nothing
+    source_views: list[surface.SourceView],
+    maps: list[Tensor],  # (B, h', w') m of each source view, 0 = says nothing
     tolerance: float | Tensor,  # (B, h, w) or one for all
 ) -> Evidence:
     """What lies in front of a surface that another view's map shows: one of the two maps is wrong.
@@ -211,14 +211,14 @@ def depth_consistency_evidence(
     """
     said = no_evidence(depth)
     q = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
-    for k, (partner, there) in enumerate(zip(partners, maps, strict=True)):
-        view = partner.view
+    for k, (source_view, there) in enumerate(zip(source_views, maps, strict=True)):
+        view = source_view.view
         uv, front = plane_sweep.project_inverse_depth(view, base.ray, q.flatten(1))
         z = (se3.rotate(view.T_1_from_0.R, base.ray)[..., 2] + q.flatten(1) * view.T_1_from_0.t[:, None, 2]) / (
             q.flatten(1).clamp_min(1e-6)
         )
         at, inside = sample_nearest(nearest_surface(there), uv)
-        fine = front & inside & at.isfinite() & (z > 0) & partner.use[:, None]
+        fine = front & inside & at.isfinite() & (z > 0) & source_view.use[:, None]
         r = torch.where(fine, z / torch.where(fine, at, 1.0), 1.0).clamp_min(1e-9).log().unflatten(-1, base.hw)
         wide = _moves(base, view, q) >= 1.5
         through = fine.unflatten(-1, base.hw) & (depth > 0) & wide & (r < 0)
@@ -239,10 +239,10 @@ def nearest_surface(depth: Tensor) -> Tensor:
 
 
 def _view_evidence(
-    q: Tensor, base: plane_sweep.ReferenceView, partner: surface.SourceView, tolerance: float | Tensor
+    q: Tensor, base: plane_sweep.ReferenceView, source_view: surface.SourceView, tolerance: float | Tensor
 ) -> tuple[Tensor, Tensor]:
     """Evidence (B, h, w) of one view in sigmas, NaN where it says nothing, and whether it would have told an error."""
-    view, picture, fit, _ = partner
+    view, picture, fit, _ = source_view
     here = plane_sweep.fit_windows(base, view, picture, q, radius=EVIDENCE_RADIUS_PX)
     plane = 0.03 * q.flatten(1).amax(-1)
     seen = (
@@ -254,7 +254,7 @@ def _view_evidence(
     shared = surface.pose_variance(base, view, fit, q, here.motion)
     sigma = ((own + shared) / q.square().clamp_min(1e-12) + tolerance**2).sqrt()
     step = torch.where(q > 0, here.step / q.clamp_min(1e-9), 0.0)  # of log(1 / d)
-    best, factor, beside = _rivals(q, base, partner)
+    best, factor, beside = _rivals(q, base, source_view)
     ours = here.correlation.clamp(-0.99, 0.999)
     fits = ours >= MATCH_CORRELATION
     # A window's log-likelihood goes by its unexplained share of variance.
@@ -274,13 +274,17 @@ def _view_evidence(
     return misfit, fits & alone & (DETECTION_SIGMAS * sigma <= DETECTABLE_LOG_RATIO) & seen
 
 
-def _rivals(q: Tensor, base: plane_sweep.ReferenceView, partner: surface.SourceView) -> tuple[Tensor, Tensor, Tensor]:
+def _rivals(
+    q: Tensor, base: plane_sweep.ReferenceView, source_view: surface.SourceView
+) -> tuple[Tensor, Tensor, Tensor]:
     """Of other depths along the rays: the best correlation, its factor on q, and the best of those a fifth away or a
     little more; (B, h, w) each."""
     best, factor = torch.zeros_like(q), torch.ones_like(q)
     beside = torch.zeros_like(q)
     for rival in RIVAL_FACTORS:
-        there = plane_sweep.fit_windows(base, partner.view, partner.picture, q * rival, radius=EVIDENCE_RADIUS_PX)
+        there = plane_sweep.fit_windows(
+            base, source_view.view, source_view.picture, q * rival, radius=EVIDENCE_RADIUS_PX
+        )
         value = torch.where(there.seen, there.correlation, 0.0).clamp(0, 0.999)
         factor = torch.where(value > best, rival, factor)
         best = torch.maximum(best, value)

@@ -225,7 +225,7 @@ def diagnose(
     """
     if len(frames) < 2 or (maps is not None and len(maps) != len(frames)):
         found = "none" if maps is None else len(maps)
-        raise ValueError(f"name_cause: found {len(frames)} frames and {found} maps, expected two or more, as many maps")
+        raise ValueError(f"diagnose: found {len(frames)} frames and {found} maps, expected two or more, as many maps")
     with torch.no_grad():
         named = _by_tracks(frames, maps, method, seed, track_window(frames, method) if watched is None else watched)
         moves = named.n_pairs >= MIN_WINDOW_PAIRS and not _stands(frames)
@@ -242,7 +242,7 @@ def _by_tracks(
     if not watched.pairs:
         return Diagnosis(None, None, {}, 0)
     window = FaultWindow(
-        anchors=pytree.collate([frames[i] for i, _ in watched.pairs]),
+        references=pytree.collate([frames[i] for i, _ in watched.pairs]),
         others=pytree.collate([frames[j] for _, j in watched.pairs]),
         samples=pytree.collate(watched.samples),
         tracks=pytree.collate(watched.tracks),
@@ -355,7 +355,7 @@ class WindowTracks(NamedTuple):
 class FaultWindow:
     """Pairs of a window, tracked: what stays the same whatever the depth."""
 
-    anchors: Frame  # (P, …)
+    references: Frame  # (P, …)
     others: Frame  # (P, …)
     samples: Samples  # (P, N) as the sensor has them
     tracks: Tracks  # (P, N)
@@ -368,7 +368,7 @@ class FaultWindow:
     def hypotheses(self) -> Sequence[KnownFault]:
         """What could be known: a motion fitted to near returns swallows a focal length, and the unit of its own."""
         swallowed: set[str] = {"inverse"} if self.maps is None else set()
-        if self.anchors.T_world_from_cam is None or self.others.T_world_from_cam is None:
+        if self.references.T_world_from_cam is None or self.others.T_world_from_cam is None:
             swallowed |= {"focal length", "unit"} if self.maps is None else {"focal length"}
         asked = [NO_FAULT, *(cause for cause in KNOWN_FAULTS if cause.kind not in swallowed)]
         ratio = 0.0 if self.maps is None else self._returned_over(self.maps)
@@ -376,10 +376,10 @@ class FaultWindow:
 
     def _returned_over(self, maps: Sequence[Tensor]) -> float:
         """Median ratio of near returns to what maps say there; 0 without one."""
-        samples = self.method.backproject(self.anchors, self.samples.uv)
+        samples = self.method.backproject(self.references, self.samples.uv)
         depth = torch.cat([maps[i] for i, _ in self.pairs]).to(samples.depth)
         told = torch.where(samples.usable, samples.depth, 0.0)
-        found = _ratio(told, _said(depth, self.samples.uv, self.anchors.hw))
+        found = _ratio(told, _said(depth, self.samples.uv, self.references.hw))
         return float(found[found > 0].median()) if bool((found > 0).any()) else 0.0
 
     def explains(self, cause: KnownFault) -> bool:
@@ -409,9 +409,9 @@ class FaultWindow:
         there = torch.tensor([0 <= i < len(self.depths) for i in place], device=self.samples.uv.device)
         place = [min(max(i, 0), len(self.depths) - 1) for i in place]
         factor = cause.focal if focal is None else focal
-        scaled = (self._scaled(self.anchors, factor), self._scaled(self.others, factor))
+        scaled = (self._scaled(self.references, factor), self._scaled(self.others, factor))
         own = self.maps is None
-        returns = self.anchors.depth
+        returns = self.references.depth
         if own:
             returns = _undone(torch.cat([self.depths[i] for i in place]), cause, scaled[0])
         view = scaled[0].replace(depth=returns)
@@ -464,7 +464,7 @@ class FaultWindow:
         there = se3.apply(T, torch.where(used[..., None], xyz, 1.0))
         ahead = used & (there[..., 2] > 1e-6)
         uv = cam.project(cameras[1], torch.where(ahead[..., None], there, 1.0))
-        miss = (uv - self.tracks.uv_1).norm(dim=-1) * (640 / self.anchors.hw[1])
+        miss = (uv - self.tracks.uv_1).norm(dim=-1) * (640 / self.references.hw[1])
         loss = torch.where(ahead, miss.square() / (miss.square() + HALF_LOSS_PX**2), 1.0)
         return _mean_over(loss, used)
 
@@ -520,14 +520,14 @@ def track_window(frames: Sequence[Frame], method: Method = TRACKING_METHOD) -> W
     return WindowTracks(pairs, [found[i][1] for i in order], [found[i][2] for i in order])
 
 
-def _tracked(anchors: Sequence[Frame], others: Sequence[Frame], method: Method) -> tuple[Samples, Tracks]:
+def _tracked(references: Sequence[Frame], others: Sequence[Frame], method: Method) -> tuple[Samples, Tracks]:
     """Samples of some frames found again in others."""
-    samples = method.look(pytree.collate(anchors))
-    tracks = method.track(pytree.collate(anchors).image, pytree.collate(others).image, samples.uv)
+    samples = method.sample_depth(pytree.collate(references))
+    tracks = method.track(pytree.collate(references).image, pytree.collate(others).image, samples.uv)
     return samples, tracks.replace(valid=tracks.valid & (samples.trackability >= method.min_trackability))
 
 
 def _reference_frames(n: int) -> list[int]:
-    """Anchors of a window, spread evenly, not so near its ends that no earlier or later map is known."""
+    """Reference views of a window, spread evenly, not so near its ends that no earlier or later map is known."""
     low, high = (MAX_LAG_FRAMES, n - 1 - MAX_LAG_FRAMES) if n > 3 * MAX_LAG_FRAMES else (0, n - 2)
     return sorted({low + round((high - low) * k / (MAX_WINDOW_PAIRS - 1)) for k in range(MAX_WINDOW_PAIRS)})

@@ -1,8 +1,8 @@
 """Is this depth right? Of every pixel consistent, wrong or cannot know; of the frame scale, shift, tilt, share wrong.
 
-    method ─ near returns, triangulated points ─ by_answers ─┐
-           └ motions ─ pictures of other views ─ by_views ───┼─ states ─┐
-                     └ maps of other views ───── by_maps ────┘          ├─ Verdict
+    method ─ near returns, triangulated points ─ sparse_evidence ─┐
+           └ motions ─ pictures of other views ─ photometric_evidence ───┼─ states ─┐
+                     └ maps of other views ───── consistency_evidence ────┘          ├─ Verdict
              ratios to the answers ─ scale, shift, tilt ────────────────┘
 
 The map may come from anywhere. Where it is the sensor's own, its returns fix the motions' metre: a wrong scale passes
@@ -34,7 +34,8 @@ from dhtorch.validation import evidence
 from dhtorch.validation.evidence import Evidence, ValidationReferences
 
 #: The sparse method of a verdict in little time, by one other view (with ``views=False``): a metre is told by some
-#: dozens of points, and their motion by as few. ``experiment=judge_study`` holds what it says against the whole method.
+#: dozens of points, and their motion by as few. ``experiment=validate_study`` holds what it says against the whole
+#: method.
 QUICK_METHOD = MAP.replace(n=256, hypotheses=64, pose={"near_steps": 2, "steps": 3})
 
 #: Sigmas from which on evidence speaks against a pixel, and up to which it speaks for it.
@@ -60,13 +61,13 @@ MIN_PLATEAU_RATIO, MIN_CLIPPED_WRONG_RATIO, CLIPPED_RATE_FACTOR = 0.01, 0.1, 2.0
 
 def validate_depth(
     depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = says nothing; None = the sensor's own
-    anchor: Frame,
+    reference: Frame,
     others: Frame | Sequence[Frame] | None = None,
     *,
     other_maps: Tensor | None = None,  # (V, B, h', w') m
     method: Method = AUTO,
     views: bool = True,
-    partners: int = 2,
+    source_views: int = 2,
     size: int = 320,
     tolerance: float = 0.025,
     seed: int | Tensor = 0,
@@ -77,22 +78,22 @@ def validate_depth(
     """Whether a depth map is right, by what the sensor and other views of the same scene say.
 
     Args:
-        depth_map: over the field of the anchor's picture, of any size.
-        anchor: B views whose near returns fix the metre.
+        depth_map: over the field of the reference view's picture, of any size.
+        reference: B views whose near returns fix the metre.
         others: as :class:`dhtorch.pipeline.method.Method` takes them; None = there is no other view, and near returns
             alone speak.
         other_maps: the same source's maps of the other views; of the sensor they are their own depth.
         method: the sparse method that gives answers and motions; it chooses among the views.
         views: ask the pictures of other views as well; False is the fast way, sparse evidence alone.
-        partners: views at most whose pictures are asked, those worth most.
+        source_views: views at most whose pictures are asked, those worth most.
         size: longer side of the grid that is judged, px.
         tolerance: relative error that nobody calls wrong; a third of what must be told is the least that helps.
         seed, fit, hint, trace: as :class:`dhtorch.pipeline.method.Method` takes them.
 
     Returns:
-        Verdict (B, h, w) over the field of the anchor's picture. CONSISTENT only where evidence that would have told
-        an error of a fifth tells none; WRONG where some speaks against the depth by three sigmas; where kinds of
-        evidence contradict each other, or none speaks, CANNOT_KNOW. Where a map is cut (``ceiling``: all that is
+        Verdict (B, h, w) over the field of the reference view's picture. CONSISTENT only where evidence that would have
+        told an error of a fifth tells none; WRONG where some speaks against the depth by three sigmas; where kinds of
+        evidence contradict each other, or none speaks, CANNOT_KNOW. Where a map is cut (``clip_depth``: all that is
         farther is said to lie at one depth) the pixels at the cut are WRONG or unknown, since they say no more than
         that the depth is at least that.
 
@@ -101,39 +102,39 @@ def validate_depth(
             range.
 
     Gradient: none; a verdict.
-    Cost: that of the method, and with ``views`` eleven fits of every grid pixel for each partner.
+    Cost: that of the method, and with ``views`` eleven fits of every grid pixel for each source view.
     """
     limit = evidence.DETECTABLE_LOG_RATIO / REFUTING_EVIDENCE_SIGMAS
     if not 0 < tolerance < limit:
-        raise ValueError(f"judge: tolerance is {tolerance}, expected above 0 and below {limit:.3f}")
-    if size < 16 or partners < 1:
-        raise ValueError(f"judge: size is {size}, partners {partners}, expected at least 16 and 1")
-    check("judge", image=(anchor.image, "B C H W"), depth_map=(depth_map, "B h w"))
-    check("judge", depth=(anchor.depth, "B y x"), depth_map=(depth_map, "B h w"))
-    check("judge", other_maps=(other_maps, "V B h w"))
+        raise ValueError(f"validate_depth: tolerance is {tolerance}, expected above 0 and below {limit:.3f}")
+    if size < 16 or source_views < 1:
+        raise ValueError(f"validate_depth: size is {size}, source views {source_views}, expected at least 16 and 1")
+    check("validate_depth", image=(reference.image, "B C H W"), depth_map=(depth_map, "B h w"))
+    check("validate_depth", depth=(reference.depth, "B y x"), depth_map=(depth_map, "B h w"))
+    check("validate_depth", other_maps=(other_maps, "V B h w"))
     for name, given in (("depth_map", depth_map), ("other_maps", other_maps)):
         _check_metric(name, given)
     trace = {} if trace is None else trace
     with torch.no_grad():
         asked = (
-            None if others is None else _estimate_views(method, anchor, others, trace, seed=seed, fit=fit, hint=hint)
+            None if others is None else _estimate_views(method, reference, others, trace, seed=seed, fit=fit, hint=hint)
         )
         offered = trace["choice"].index if "choice" in trace else None
-        options: dict[str, Any] = {"views": views, "partners": partners, "size": size, "tolerance": tolerance}
-        return validate_against(depth_map, anchor, asked, offered, other_maps=other_maps, method=method, **options)
+        options: dict[str, Any] = {"views": views, "source_views": source_views, "size": size, "tolerance": tolerance}
+        return validate_against(depth_map, reference, asked, offered, other_maps=other_maps, method=method, **options)
 
 
 @torch.no_grad()
 def validate_against(
     depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = says nothing; None = the sensor's own
-    anchor: Frame,
+    reference: Frame,
     asked: dense.SelectedViews | None,
     offered: Tensor | None = None,  # (views, B) which of those offered were asked; None = all
     *,
     other_maps: Tensor | None = None,  # (V, B, h', w') m
     method: Method = AUTO,
     views: bool = True,
-    partners: int = 2,
+    source_views: int = 2,
     size: int = 320,
     tolerance: float = 0.025,
 ) -> DepthValidation:
@@ -141,58 +142,60 @@ def validate_against(
 
     Arguments, result, errors and cost as there. Gradient: none.
     """
-    hw = dense.map_hw(anchor.hw, size)
+    hw = dense.map_hw(reference.hw, size)
     # A depth is held against a depth of the same pixel: without a depth camera of its own no lens stands between them.
-    straight = anchor if anchor.depth_camera is not None else anchor.replace(camera=cam.ideal(anchor.camera))
-    returns = method.backproject(straight, dense.map_pixel_centres(anchor, hw)).map(lambda x: x.unflatten(1, hw))
+    straight = (
+        reference if reference.depth_camera is not None else reference.replace(camera=cam.ideal(reference.camera))
+    )
+    returns = method.backproject(straight, dense.map_pixel_centres(reference, hw)).map(lambda x: x.unflatten(1, hw))
     own = depth_map is None
-    grid = _usable(returns.depth if depth_map is None else _resized(depth_map.to(anchor.camera.f), hw))
-    samples = method.look(anchor) if asked is None else asked.samples
+    grid = _usable(returns.depth if depth_map is None else _resized(depth_map.to(reference.camera.f), hw))
+    samples = method.sample_depth(reference) if asked is None else asked.samples
     joined = Estimate.silent(samples, Gate.NO_TRACK, n_views=0) if asked is None else asked.joined
     found = evidence.validation_references(samples, joined, near=not own)
     loose = torch.zeros_like(grid) if depth_map is None else evidence.resolution_sigma(depth_map.to(grid), hw)
-    found = evidence.inflate_sigma(found, loose, anchor.hw)
+    found = evidence.inflate_sigma(found, loose, reference.hw)
     allowed = (loose.square() + tolerance**2).sqrt()
-    answers = evidence.sparse_evidence(grid, anchor.hw, found, allowed, None if own else returns)
+    answers = evidence.sparse_evidence(grid, reference.hw, found, allowed, None if own else returns)
     kinds = [answers]
     if asked is not None and views:
         number = offered if offered is not None else torch.arange(len(asked.fits.code))[:, None].expand(-1, len(grid))
         source = None if own else other_maps
-        of = _ValidatedMap(grid, anchor, asked, number.to(grid.device), own)
-        kinds += _view_evidences(of, source, partners, allowed)
+        of = _ValidatedMap(grid, reference, asked, number.to(grid.device), own)
+        kinds += _view_evidences(of, source, source_views, allowed)
     none = torch.full((len(grid), 3), torch.nan).to(grid)
-    ruler = none if asked is None else _scale_vs_trajectory(anchor, asked)
-    return _joined(grid, kinds, _of_frame(grid, anchor, found, own), ruler, own)
+    scale_vs_trajectory = none if asked is None else _scale_vs_trajectory(reference, asked)
+    return _joined(grid, kinds, _of_frame(grid, reference, found, own), scale_vs_trajectory, own)
 
 
 class _ValidatedMap(NamedTuple):
     """A map on its grid, and the views that may speak of it."""
 
     grid: Tensor  # (B, h, w) m
-    anchor: Frame
+    reference: Frame
     asked: dense.SelectedViews
     number: Tensor  # (views, B) of those asked, among those offered
     own: bool  # the sensor's own map
 
 
 def _estimate_views(
-    method: Method, anchor: Frame, others: Frame | Sequence[Frame], trace: Trace, **told: Any
+    method: Method, reference: Frame, others: Frame | Sequence[Frame], trace: Trace, **told: Any
 ) -> dense.SelectedViews:
-    """What the method says of the anchor; it chooses where it is offered more than it looks at."""
+    """What the method says of the reference view; it chooses where it is offered more than it looks at."""
     others = others if isinstance(others, Frame) else pytree.stack(others)
     several = others.image.dim() == 5
     method = with_view_selection(method) if several and len(others.image) > method.views else method
-    joined = method(anchor, others, trace=trace, **told)
+    joined = method(reference, others, trace=trace, **told)
     return dense.selected_views(joined, others, trace)
 
 
 def _view_evidences(
-    of: _ValidatedMap, other_maps: Tensor | None, partners: int, tolerance: Tensor
+    of: _ValidatedMap, other_maps: Tensor | None, source_views: int, tolerance: Tensor
 ) -> tuple[Evidence, Evidence]:
     """What pictures and maps of the views say that are worth most; a view's number is its place among those offered."""
     grid, asked = of.grid, of.asked
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(of.anchor, max(grid.shape[-2:])))
-    index, wanted = dense.top_views(asked, partners)
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(of.reference, max(grid.shape[-2:])))
+    index, wanted = dense.top_views(asked, source_views)
     wanted = asked.fits.ok.gather(0, index) & (wanted | _moved(asked).gather(0, index))
     chosen = [
         dense.source_view_of(asked, k, max(base.hw), use, base.image) for k, use in zip(index, wanted, strict=True)
@@ -236,9 +239,11 @@ def _check_metric(name: str, maps: Tensor | None) -> None:
     if maps is None:
         return
     if maps.dtype == torch.bool or maps.is_complex():
-        raise ValueError(f"judge: {name} is of {str(maps.dtype).removeprefix('torch.')}, expected real numbers, m")
+        raise ValueError(
+            f"validate_depth: {name} is of {str(maps.dtype).removeprefix('torch.')}, expected real numbers, m"
+        )
     if min(maps.shape[-2:]) < 2:
-        raise ValueError(f"judge: {name} has shape {tuple(maps.shape)}, expected at least 2×2 pixels")
+        raise ValueError(f"validate_depth: {name} has shape {tuple(maps.shape)}, expected at least 2×2 pixels")
 
 
 def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
@@ -271,14 +276,14 @@ def _of_sensor(frame: Frame, hw: tuple[int, int]) -> Tensor:
 
 
 def _joined(
-    grid: Tensor, kinds: Sequence[Evidence], numbers: FrameNumbers, ruler: Tensor, own: bool
+    grid: Tensor, kinds: Sequence[Evidence], numbers: FrameNumbers, scale_vs_trajectory: Tensor, own: bool
 ) -> DepthValidation:
     """What answers say and, where they were asked, pictures and maps of other views."""
     state, said, view = combine_evidence(*kinds)
-    ceiling, at_ceiling = clipped_depth(grid, state, said)
-    state = torch.where(at_ceiling & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
+    clip_depth, at_clip_depth = clipped_depth(grid, state, said)
+    state = torch.where(at_clip_depth & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
     answers, pictures, maps = list(kinds) + [evidence.no_evidence(grid)] * (3 - len(kinds))
-    none = torch.full_like(ruler, torch.nan)
+    none = torch.full_like(scale_vs_trajectory, torch.nan)
     n_wrong, n_known = (
         (m.sum((1, 2)) / SHARE_WINDOW_PIXELS) for m in (state == State.WRONG, state != State.CANNOT_KNOW)
     )
@@ -287,17 +292,17 @@ def _joined(
         state=state,
         evidence=said,
         view=view,
-        by_answers=answers.misfit,
-        by_views=pictures.misfit,
-        by_maps=maps.misfit,
-        scale=ruler if own else numbers.scale,
+        sparse_evidence=answers.misfit,
+        photometric_evidence=pictures.misfit,
+        consistency_evidence=maps.misfit,
+        scale=scale_vs_trajectory if own else numbers.scale,
         scale_near=numbers.near,
         scale_far=none if own else numbers.far,
-        ruler=ruler,
+        scale_vs_trajectory=scale_vs_trajectory,
         shift=numbers.shift,
         tilt=numbers.tilt,
         wrong=share_interval(n_wrong.to(grid), n_known.to(grid)),
-        ceiling=ceiling,
+        clip_depth=clip_depth,
     )
 
 
@@ -369,9 +374,9 @@ class FrameNumbers(NamedTuple):
     tilt: Tensor
 
 
-def _of_frame(grid: Tensor, anchor: Frame, found: ValidationReferences, own: bool) -> FrameNumbers:
+def _of_frame(grid: Tensor, reference: Frame, found: ValidationReferences, own: bool) -> FrameNumbers:
     h, w = grid.shape[-2:]
-    at, inside = sample_nearest(grid, cam.resize_pixels(found.uv, anchor.hw, (h, w)))
+    at, inside = sample_nearest(grid, cam.resize_pixels(found.uv, reference.hw, (h, w)))
     used = found.used & inside & (at > 0)
     ratio = torch.where(used, at / found.depth, 1.0)
     log = ratio.log()
@@ -384,7 +389,7 @@ def _of_frame(grid: Tensor, anchor: Frame, found: ValidationReferences, own: boo
     both = _weighed(near, far)
     if own:
         near = both = (torch.full_like(near[0], torch.nan), near[1])
-    shift, tilt = _shape(ratio, found, used, own_sigma, anchor.hw)
+    shift, tilt = _shape(ratio, found, used, own_sigma, reference.hw)
     return FrameNumbers(_as_factor(*both), _as_factor(*near), _as_factor(*far), shift, tilt)
 
 
@@ -457,13 +462,13 @@ def _shape(
     return tuple(torch.where(few, torch.nan, x.to(ratio)) for x in (shift, tilt))  # type: ignore[return-value]
 
 
-def _scale_vs_trajectory(anchor: Frame, asked: dense.SelectedViews) -> Tensor:
+def _scale_vs_trajectory(reference: Frame, asked: dense.SelectedViews) -> Tensor:
     """The sensor's metre over the trajectory's, (B, 3), by the ways between the views; NaN without a trajectory."""
-    none = torch.full((len(anchor.camera.f), 3), torch.nan).to(anchor.camera.f)
-    if anchor.T_world_from_cam is None or asked.frames.T_world_from_cam is None:
+    none = torch.full((len(reference.camera.f), 3), torch.nan).to(reference.camera.f)
+    if reference.T_world_from_cam is None or asked.frames.T_world_from_cam is None:
         return none
     V = len(asked.fits.t_snr)
-    here = anchor.T_world_from_cam.map(lambda x: x.expand(V, *x.shape))
+    here = reference.T_world_from_cam.map(lambda x: x.expand(V, *x.shape))
     way = torch.stack([se3.relative(here[k], asked.frames.T_world_from_cam[k]).t.norm(dim=-1) for k in range(V)]).to(
         none
     )

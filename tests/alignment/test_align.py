@@ -1,4 +1,4 @@
-"""A map of anybody's in metres: its faults taken out as far as anchors tell, alone where they do not, and honest."""
+"""A map of anybody's in metres: its faults taken out as far as references tell, alone where they do not, and honest."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ from dhtorch.alignment.error_model import estimate_freedom
 from dhtorch.alignment.references import MetricReferences, collect_references
 from dhtorch.codes import Gate, Source
 from dhtorch.experiments.baselines import scale_shift
-from dhtorch.experiments.compare import align_study as anchor_study
+from dhtorch.experiments.compare import align_study
 from dhtorch.records import DepthMap, Estimate, Samples
 from dhtorch.synthetic import depth_faults
 
@@ -43,7 +43,7 @@ def test_faults_are_taken_out(name):
     truth, near, far = world()
     x, _ = depth_faults.apply_fault(name, truth)
     found = align_depth(x, [near, far])
-    assert found.keep.all() and (found.source == Source.ANCHORED).all()
+    assert found.keep.all() and (found.source == Source.ALIGNED).all()
     assert error(found, truth) < 0.015 < ((x - truth).abs() / truth).median()
     if name in ("scale_short", "shift"):  # a slope that goes with depth is not told from a scale by few returns
         assert ((found.depth - truth).abs() <= 2 * found.sigma).double().mean() > 0.9
@@ -210,7 +210,7 @@ def test_bad_input_is_named():
     truth, near, _ = world()
     with pytest.raises(ValueError, match="expected one of metric"):
         align_depth(truth, near, kind="depth")
-    with pytest.raises(ValueError, match="no anchors"):
+    with pytest.raises(ValueError, match="no references"):
         align_depth(truth, [])
     with pytest.raises(ValueError, match="B h w"):
         align_depth(truth[0], near)
@@ -230,13 +230,13 @@ def test_usual_fits():
 def test_summary_and_verdict_of_the_study():
     rows = [
         {"scene": "a", "truth": "simulated", "method": by, "median_rel": e, "within_sigma": 0.7, "within_2sigma": 0.95}
-        for by, e in {"anchor": 0.01, "raw": 0.05, "near least squares": 0.04}.items()
+        for by, e in {"align": 0.01, "raw": 0.05, "near least squares": 0.04}.items()
     ]
-    found = anchor_study.summarise_alignment(rows, ["simulated"])
-    assert found["anchor.ratio_to_near_affine"]["value"] == pytest.approx(0.25)
-    assert found["anchor.worst_ratio_to_better"]["value"] == pytest.approx(0.2)
-    assert anchor_study.verdict(found) == (True, "5 of 5 bars met")
-    assert anchor_study.verdict({})[0] is None
+    found = align_study.summarise_alignment(rows, ["simulated"])
+    assert found["align.ratio_to_near_affine"]["value"] == pytest.approx(0.25)
+    assert found["align.worst_ratio_to_better"]["value"] == pytest.approx(0.2)
+    assert align_study.verdict(found) == (True, "5 of 5 bars met")
+    assert align_study.verdict({})[0] is None
 
 
 def test_exact_returns_outweigh_edges_that_an_affine_map_would_hide():
@@ -301,11 +301,11 @@ def test_numbers_with_one_scene_left_out():
         {"scene": scene, "truth": "simulated", "method": by, "median_rel": e * k, "within_sigma": 0.7 + 0.01 * k}
         | {"within_2sigma": 0.95}
         for k, scene in enumerate("abc", 1)
-        for by, e in {"anchor": 0.01, "raw": 0.05, "near least squares": 0.04}.items()
+        for by, e in {"align": 0.01, "raw": 0.05, "near least squares": 0.04}.items()
     ]
-    found = anchor_study.leave_one_scene_out(rows, ["simulated"])["anchor.within_sigma_one_left_out"]
+    found = align_study.leave_one_scene_out(rows, ["simulated"])["align.within_sigma_one_left_out"]
     assert [found[k] for k in ("value", "low", "high")] == pytest.approx([0.72, 0.715, 0.725])
-    assert not anchor_study.leave_one_scene_out(rows[:3], ["simulated"])
+    assert not align_study.leave_one_scene_out(rows[:3], ["simulated"])
 
 
 def test_disparity_may_have_zeros_and_holes():
@@ -327,7 +327,7 @@ def test_what_is_not_positive_is_no_depth(kind):
 
 
 def near_points(n, seed=0):
-    """Anchors at random places of a map of values from 1 to 4, with a hundredth of noise."""
+    """References at random places of a map of values from 1 to 4, with a hundredth of noise."""
     g = torch.Generator().manual_seed(seed)
     share, x = torch.rand(1, n, 2, generator=g).double(), 1 + 3 * torch.rand(1, n, generator=g).double()
     one = torch.ones_like(x)

@@ -60,7 +60,7 @@ def test_freedom_is_less_likely_than_none():
 
 
 def test_what_a_fit_does_not_know_is_carried_to_the_anchors():
-    anchors, of = points(), basis()
+    references, of = points(), basis()
     size = error_model.N_TILT_SLOPES + len(of.node) + error_model.N_CURVE_KNOTS
     head = torch.tensor([[[1.5, 0.2]]], dtype=torch.float64)
     spread = torch.zeros(1, 1, 2 + size, 2 + size, dtype=torch.float64)
@@ -74,12 +74,12 @@ def test_what_a_fit_does_not_know_is_carried_to_the_anchors():
         evidence=torch.zeros(1, 1, dtype=torch.float64),
     )
     mean, var = error_model.predict_references(
-        fit, AlignmentProblem(anchors, of, head.expand(1, len(MODEL_HEADS), 2), anchors.x[:, :1])
+        fit, AlignmentProblem(references, of, head.expand(1, len(MODEL_HEADS), 2), references.x[:, :1])
     )
-    y = 1.5 * anchors.x + 0.2
+    y = 1.5 * references.x + 0.2
     torch.testing.assert_close(mean[0], y.log())
-    torch.testing.assert_close(var[0], ((0.03 * anchors.x) ** 2 + 0.05**2) / y**2)
-    torch.testing.assert_close(error_model.placement_variance(head, anchors)[0], (0.1 * 1.5 / y) ** 2)
+    torch.testing.assert_close(var[0], ((0.03 * references.x) ** 2 + 0.05**2) / y**2)
+    torch.testing.assert_close(error_model.placement_variance(head, references)[0], (0.1 * 1.5 / y) ** 2)
 
 
 def test_what_lies_between_nodes_is_part_of_what_is_believed_of_a_field():
@@ -99,12 +99,12 @@ def test_what_lies_between_nodes_is_part_of_what_is_believed_of_a_field():
 
 
 def test_a_fit_that_knows_all_its_nodes_is_unsure_between_them():
-    """At the anchors and at every pixel, of the map whose anchors they are."""
-    anchors, of = points(), basis()
+    """At the references and at every pixel, of the map whose references they are."""
+    references, of = points(), basis()
     size = error_model.N_TILT_SLOPES + len(of.node) + error_model.N_CURVE_KNOTS
     head = torch.tensor([[[1.0, 0.0]]], dtype=torch.float64)
     x = torch.ones(1, 120, 160, dtype=torch.float64)
-    task = AlignmentProblem(anchors, of, head.expand(1, len(MODEL_HEADS), 2), anchors.x[:, :1])
+    task = AlignmentProblem(references, of, head.expand(1, len(MODEL_HEADS), 2), references.x[:, :1])
     for name, low in (("raw", 0.0), ("raw_tilt", 0.0), ("raw_short_1", 6e-4), ("raw_short_4", 2.4e-3)):
         fit = ErrorModelFit(
             model=torch.tensor([[list(ERROR_MODELS).index(name)]]),
@@ -119,38 +119,40 @@ def test_a_fit_that_knows_all_its_nodes_is_unsure_between_them():
 
 
 def test_anchors_of_which_there_are_none_are_as_good_as_they_would_have_said():
-    anchors = points()
+    references = points()
     task = AlignmentProblem(
-        anchors, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(MODEL_HEADS), 2), anchors.x[:, :1]
+        references, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(MODEL_HEADS), 2), references.x[:, :1]
     )
     raw = torch.tensor([[list(ERROR_MODELS).index("raw")]])
     for near in (True, False):
-        alone = anchors._replace(near=torch.full_like(anchors.near, near))
+        alone = references._replace(near=torch.full_like(references.near, near))
         noise = error_model.fit_models(task._replace(points=alone), raw, alone.used).noise[0, 0]
         assert noise[int(near)] == 1, "near answers, far ones"
 
 
 def test_far_answers_lean_together_and_near_returns_do_not():
-    anchors = points()
+    references = points()
     far = torch.arange(40)[None] % 2 == 0
-    anchors = anchors._replace(near=~far, shared=torch.where(far, 0.05, 0.0).double())
-    lean = error_model.motion_error_basis(anchors)
+    references = references._replace(near=~far, shared=torch.where(far, 0.05, 0.0).double())
+    lean = error_model.motion_error_basis(references)
     assert lean.shape == (1, 40, error_model.N_MOTION_ERRORS) and (lean[~far] == 0).all()
     torch.testing.assert_close(lean[far][:, 0], torch.full((20,), 0.05).double())
     assert (lean[far].abs().amax(0) > 0.02).all() and lean.abs().max() <= 3 * 0.05
 
 
 def worth_of_a_scale(scale):
-    """What a model of a scale says that anchors are worth, and the integral over all scales that it believed possible."""
-    anchors = points(n=12)
+    """What a model of a scale says that references are worth, and the integral over all scales that it believed possible."""
+    references = points(n=12)
     noise = 0.05 * torch.randn(1, 12, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    anchors = anchors._replace(depth=scale * anchors.x * noise.exp(), var=torch.full_like(anchors.var, 0.05**2))
+    references = references._replace(
+        depth=scale * references.x * noise.exp(), var=torch.full_like(references.var, 0.05**2)
+    )
     task = AlignmentProblem(
-        anchors, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(MODEL_HEADS), 2), anchors.x[:, :1]
+        references, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(MODEL_HEADS), 2), references.x[:, :1]
     )
     model = torch.tensor([[list(ERROR_MODELS).index("scale")]])
-    found = error_model.fit_models(task, model, anchors.used, error_model.FINAL_STEPS)
-    problem = error_model._problem(task, model, anchors.used)
+    found = error_model.fit_models(task, model, references.used, error_model.FINAL_STEPS)
+    problem = error_model._problem(task, model, references.used)
     spread = problem.square(found.noise[0]).sqrt()
     tails = torch.distributions.StudentT(problem.freedom)
     xi = torch.zeros(1, problem.phi.shape[-1] + 2, dtype=torch.float64)

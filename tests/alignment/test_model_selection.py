@@ -1,4 +1,4 @@
-"""Which model is taken for a map: the simplest of those that tell left-out anchors as well."""
+"""Which model is taken for a map: the simplest of those that tell left-out references as well."""
 
 import pytest
 import torch
@@ -26,10 +26,10 @@ def points():
 
 
 def taken(points, near, far, seed=0):
-    """The model that is taken where left-out anchors are missed by so much, of each model the near and the far ones;
+    """The model that is taken where left-out references are missed by so much, of each model the near and the far ones;
     None = it could not be fitted."""
     draw = torch.Generator().manual_seed(seed)
-    noise = torch.randn(points.x.shape[1], generator=draw, dtype=torch.float64)  # an anchor's own, to all models
+    noise = torch.randn(points.x.shape[1], generator=draw, dtype=torch.float64)  # a reference's own, to all models
     size = [torch.where(points.near[0], a or torch.nan, b or torch.nan) for a, b in zip(near, far, strict=True)]
     r = (torch.stack(size) * noise)[None, :, None]
     return int(_simplest(points, _LeftOut(r, torch.full_like(r, 1e-4)), list(MODEL_HEADS), torch.tensor([AFFINE])))

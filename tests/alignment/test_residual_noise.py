@@ -1,4 +1,4 @@
-"""How far an anchored map is off from pixel to pixel: only as far as near returns show it, and where they do."""
+"""How far an aligned map is off from pixel to pixel: only as far as near returns show it, and where they do."""
 
 import pytest
 import torch

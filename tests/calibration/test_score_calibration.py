@@ -228,7 +228,7 @@ def test_calibration_changes_no_order_and_keeps_silence():
 def test_a_calibration_of_nothing_raises():
     silent = errors.make_points(torch.full((4,), math.nan), torch.ones(4))
     for scenes in ([], [silent]):
-        with pytest.raises(ValueError, match="fit: found no answer"):
+        with pytest.raises(ValueError, match="fit_calibration: found no answer"):
             score_calibration.fit_calibration(scenes)
 
 

@@ -1,4 +1,4 @@
-"""``dhtorch anchor``: maps in other units written in metres, frames that are whole stay, limits decide the exit code."""
+"""``dhtorch reference``: maps in other units written in metres, frames that are whole stay, limits decide the exit code."""
 
 import json
 
@@ -33,7 +33,7 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     asked = ["anchor", *ROOM, *LITTLE, f"depth={maps}", f"out={out}", "kind=inverse", 'fail_on="silent>0.9"']
     assert run.main(asked) == run.EXIT_DONE
     assert "2 maps" in capsys.readouterr().out
-    found = json.loads((out / "anchor.json").read_text())
+    found = json.loads((out / "align.json").read_text())
     assert [row["frame"] for row in found["frames"]] == [0, 3]
     assert found["whole"]["held"]["unanchored"] == 0
     for row in (frame["anchored"] for frame in found["frames"]):
@@ -45,7 +45,7 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     known = (truth > 0) & (depth > 0)
     assert known.double().mean() > 0.9
     assert ((depth - truth).abs() / truth)[known].median() < 0.02
-    assert (out / "anchor.html").read_text().count("data:image/png;base64,") == 2
+    assert (out / "align.html").read_text().count("data:image/png;base64,") == 2
     before = {p: p.stat().st_mtime_ns for p in (out / "depth").iterdir()}
     (out / "meta" / "000003.json").unlink()
     assert run.main(asked) == run.EXIT_DONE
@@ -62,7 +62,7 @@ def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
     words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "most=1", 'fail_on="scale>0.2,silent>0.99"']
     assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.EXIT_SOME_FAILED
     assert "exceeded: scale is 0.33" in capsys.readouterr().out
-    assert "Exceeded" in (tmp_path / "out" / "anchor.html").read_text()
+    assert "Exceeded" in (tmp_path / "out" / "align.html").read_text()
 
 
 def test_a_hole_in_a_file_is_no_value_of_any_kind_and_a_sensor_beside_itself_is_told(tmp_path, room, capsys):

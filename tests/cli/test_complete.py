@@ -347,7 +347,7 @@ def test_other_settings_data_or_files_are_refused(captures, numbered, tmp_path):
         ({"figures": "some"}, "figures: found 'some', expected one of false, true, all"),
         ({"min_correlation": 2}, "min_correlation: found 2"),
         ({"steps": []}, "steps: found none"),
-        ({"partners": 0}, "partners is 0"),
+        ({"source_views": 0}, "source_views is 0"),
         ({"size": 3}, "size is 3"),
     ],
 )

@@ -1,4 +1,4 @@
-"""``dhtorch judge``: files, limits and exit codes; maps beside a recording; the transform; what a study counts."""
+"""``dhtorch validate``: files, limits and exit codes; maps beside a recording; the transform; what a study counts."""
 
 import json
 import math
@@ -14,7 +14,7 @@ from dhtorch.cli import run
 from dhtorch.cli.validate import (
     _deviation_lower_bound,
     _drift_lower_bound,
-    _find_shared_ceiling,
+    _find_shared_clip_depth,
     _format_factor,
     _format_summary,
     _share_lower_bound,
@@ -25,7 +25,7 @@ from dhtorch.cli.validate import (
 from dhtorch.codes import State
 from dhtorch.data.depth_maps import open_depth_maps
 from dhtorch.data.io.decode import FormatError
-from dhtorch.experiments.compare import validate_study as judge_study
+from dhtorch.experiments.compare import validate_study
 from dhtorch.experiments.protocol import Settings
 from dhtorch.export import encode_png
 from dhtorch.pipeline.presets import AUTO
@@ -50,7 +50,7 @@ def maps(tmp_path, room):
 
 def judged(out, *words, capsys=None):
     code = run.main(["judge", *ROOM, *LITTLE, f"output={out}", *words])
-    return code, json.loads((out / "judge.json").read_text())
+    return code, json.loads((out / "validate.json").read_text())
 
 
 def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
@@ -60,13 +60,13 @@ def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
     assert len(found["exceeded"]) == 1
     assert found["whole"]["held"]["scale"] == pytest.approx(0.999, abs=0.002)
     assert [row["frame"] for row in found["frames"]] == [0, 3]
-    page = (out / "judge.html").read_text()
+    page = (out / "validate.html").read_text()
     assert page.count("data:image/png;base64,") == 2
     assert "Exceeded: scale" in page
     code, found = judged(out, f"depth={maps}", 'fail_on="scale>0.5"', "pictures=0", "views=false")
     assert code == run.EXIT_DONE
     assert found["exceeded"] == []
-    assert "data:image" not in (out / "judge.html").read_text()
+    assert "data:image" not in (out / "validate.html").read_text()
 
 
 def test_a_guessed_camera_is_told_on_the_page_and_one_frame_is_one(tmp_path, room):
@@ -75,10 +75,10 @@ def test_a_guessed_camera_is_told_on_the_page_and_one_frame_is_one(tmp_path, roo
     (capture / "K.txt").unlink()
     words = ["data=frames_dir", f"data.root={capture}", "data.fov=60", *LITTLE, "most=1", f"output={tmp_path / 'out'}"]
     assert run.main(["judge", *words]) == run.EXIT_DONE
-    page = (tmp_path / "out/judge.html").read_text()
+    page = (tmp_path / "out/validate.html").read_text()
     assert "<p>Its intrinsics are a guess from a field of view of 60°" in page
     assert "capture: 1 frame: " in page and "known, of the depth" in page
-    assert "60°" in json.loads((tmp_path / "out/judge.json").read_text())["intrinsics_guessed"]
+    assert "60°" in json.loads((tmp_path / "out/validate.json").read_text())["intrinsics_guessed"]
 
 
 @pytest.mark.parametrize(
@@ -141,14 +141,16 @@ def test_maps_that_are_cut_are_told(tmp_path, maps, room):
         np.save(file, np.minimum(np.load(file), np.float32(2.55)))
     code, found = judged(tmp_path / "out", f"depth={maps}", "window=6", "every=2", "most=3", "method.n=512")
     assert code == run.EXIT_DONE
-    assert [row["ceiling"] for row in found["frames"]] == pytest.approx([2.55] * 3)
+    assert [row["clip_depth"] for row in found["frames"]] == pytest.approx([2.55] * 3)
     assert [(row["cause"], row["kind"]) for row in found["windows"]] == [("cut at 2.55 m", "cut")]
-    assert found["whole"]["ceiling"] == pytest.approx(2.55) and "2.55" in (tmp_path / "out/judge.html").read_text()
+    assert (
+        found["whole"]["clip_depth"] == pytest.approx(2.55) and "2.55" in (tmp_path / "out/validate.html").read_text()
+    )
     unnamed = _format_summary("room", found["whole"] | {"causes": {}})
     assert unnamed[-1] == "  cut at 2.55 m: what is farther is said to lie there"
     assert not any("farther" in line for line in _format_summary("room", found["whole"])), "said once"
-    assert _find_shared_ceiling([{"ceiling": 2.55}, {"ceiling": None}]) is None, "not most of them"
-    assert _find_shared_ceiling([{"ceiling": 2.55}, {"ceiling": 3.0}]) is None, "not at one depth"
+    assert _find_shared_clip_depth([{"clip_depth": 2.55}, {"clip_depth": None}]) is None, "not most of them"
+    assert _find_shared_clip_depth([{"clip_depth": 2.55}, {"clip_depth": 3.0}]) is None, "not at one depth"
 
 
 def test_a_guessed_field_of_view_is_told(tmp_path, room):
@@ -160,7 +162,7 @@ def test_a_guessed_field_of_view_is_told(tmp_path, room):
     words = ["judge", str(tmp_path / "capture"), "data.fov=60", "method.n=256", "size=96", "window=0", "most=1"]
     with pytest.warns(UserWarning, match="intrinsics are a guess"):
         assert run.main([*words, f"output={tmp_path}"]) == run.EXIT_DONE
-    told = json.loads((tmp_path / "judge.json").read_text())["intrinsics_guessed"]
+    told = json.loads((tmp_path / "validate.json").read_text())["intrinsics_guessed"]
     assert told.startswith("intrinsics are a guess") and "60" in told
 
 
@@ -262,9 +264,9 @@ def test_a_loader_gets_verdicts_of_one_shape():
         metres = sample["depth"].astype(np.float32) / 1000
         samples.append(transform({**sample, "map": factor * metres}))
     batch = next(iter(DataLoader(samples, batch_size=2)))
-    assert batch["dhtorch.ceiling_known"].tolist() == [False, False] and not batch["dhtorch.ceiling"].any()
+    assert batch["dhtorch.clip_depth_known"].tolist() == [False, False] and not batch["dhtorch.clip_depth"].any()
     cut = transform({**sample, "map": np.minimum(metres, np.float32(1.6))})
-    assert bool(cut["dhtorch.ceiling_known"]) and float(cut["dhtorch.ceiling"]) == pytest.approx(1.6)
+    assert bool(cut["dhtorch.clip_depth_known"]) and float(cut["dhtorch.clip_depth"]) == pytest.approx(1.6)
     in_mm = ValidateDepth(map="map", map_unit=0.001, judging={"size": 64}, **OPTIONS)({**sample, "map": 1400 * metres})
     assert float(in_mm["dhtorch.scale"][0]) == pytest.approx(float(batch["dhtorch.scale"][1, 0]), abs=1e-4)
     assert batch["dhtorch.state"].shape == (2, 64, 64)
@@ -319,33 +321,33 @@ def test_a_study_counts_what_was_planted():
     rows += [window("unit_mm", "unit", "unit", 50.0), window("unit_m", "unit", None, 50.0)]
     rows += [window("mirrored", "mirrored", "mirrored", 9.0), window("mirrored", "mirrored", None, 1.0)]
     rows += [window("none", None, None, 0.0), window("none", None, "rolled", 0.0)]
-    found = judge_study.summarise_validation([*rows, {**rows[0], "judge.called_right_wrong": 0.02}])
+    found = validate_study.summarise_validation([*rows, {**rows[0], "judge.called_right_wrong": 0.02}])
     assert found["judge.called_right_wrong_worst"]["value"] == 0.02
-    found = judge_study.summarise_validation(rows)
+    found = validate_study.summarise_validation(rows)
     assert found["judge.scale_found"]["value"] == 0.75
     assert found["judge.known"]["value"] == 0.5
     assert found["judge.named.unit"]["value"] == 0.5
     assert found["judge.named.mirrored"]["value"] == 1.0, "what moves less than two pixels does not count"
     assert found["judge.named_worst"]["value"] == 0.5
     assert found["judge.misnamed"]["value"] == 0.5
-    holds, why = judge_study.verdict(found)
+    holds, why = validate_study.verdict(found)
     assert holds is False
     assert "judge.scale_found 0.750" in why
     assert "not measured: " in why
 
 
 def test_an_alarm_needs_an_interval_without_one_and_a_distance():
-    assert judge_study.scale_alarm(torch.tensor([1.1, 1.05, 1.15])) is True
-    assert judge_study.scale_alarm(torch.tensor([1.1, 0.99, 1.2])) is False
-    assert judge_study.scale_alarm(torch.tensor([1.02, 1.01, 1.03])) is False
-    assert judge_study.scale_alarm(torch.full((3,), math.nan)) is None
+    assert validate_study.scale_alarm(torch.tensor([1.1, 1.05, 1.15])) is True
+    assert validate_study.scale_alarm(torch.tensor([1.1, 0.99, 1.2])) is False
+    assert validate_study.scale_alarm(torch.tensor([1.02, 1.01, 1.03])) is False
+    assert validate_study.scale_alarm(torch.full((3,), math.nan)) is None
 
 
 @pytest.mark.slow
 def test_the_study_runs_on_a_room(room):
 
-    options = {"anchors": 1, "windows": 0, "rooms": [], "size": 96}
-    found = judge_study.run([room], {"auto": AUTO.replace(n=512)}, None, Settings(cutoff=2.0), **options)
+    options = {"reference_views": 1, "windows": 0, "rooms": [], "size": 96}
+    found = validate_study.run([room], {"auto": AUTO.replace(n=512)}, None, Settings(cutoff=2.0), **options)
     told = {"called_right_wrong", "called_right_wrong_worst", "called_right_wrong_cut"}
     assert {f"{who}.{name}" for who in ("judge", "quick", "photometric") for name in told} <= set(found.summary)
     assert found.summary["judge.scale_found_quick_far"]["n"] <= 1

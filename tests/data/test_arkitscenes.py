@@ -425,10 +425,10 @@ def test_laser_truth_enters_the_main_job(tmp_path: Path) -> None:
     writers.write_arkitscenes(
         root, {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": laser}, trajectory=frames
     )
-    anchor, _, exact, surface, *_ = PairDataset(stored(root), [(0, 3)], torch.float32)[0]
+    reference, _, exact, surface, *_ = PairDataset(stored(root), [(0, 3)], torch.float32)[0]
     assert exact.depth_camera is None and surface.shape == exact.depth.shape
     uv = torch.tensor([[[20.0, 20.0], [40.0, 30.0], [50.0, 10.0]]])
-    assert (holdout.sample_truth(anchor, uv, truth="raw").depth > 0).tolist() == [[True, False, False]]
+    assert (holdout.sample_truth(reference, uv, truth="raw").depth > 0).tolist() == [[True, False, False]]
     found = holdout.sample_truth(exact, uv, truth="full")
     assert found.ok.all() and float((found.depth - 1.8).abs().max()) < 0.1
 

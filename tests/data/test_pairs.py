@@ -113,8 +113,8 @@ def test_scaled_gaps_of_a_short_recording_are_missing_not_fatal() -> None:
 def test_by_choice_offers_every_anchor_the_frames_around_it() -> None:
     assert pairs.by_choice(line(4)) == [(0, (1, 2, 3)), (1, (0, 2, 3)), (2, (0, 1, 3)), (3, (0, 1, 2))]
     long = pairs.by_choice(line(60))
-    assert [p.anchor for p in long] == [*range(0, 60, 2)], "the stride is that of the other ways"
-    assert all(list(p.offered) == pairs.candidate_frames(line(60), p.anchor) for p in long)
+    assert [p.reference for p in long] == [*range(0, 60, 2)], "the stride is that of the other ways"
+    assert all(list(p.offered) == pairs.candidate_frames(line(60), p.reference) for p in long)
     assert pairs.by_choice(line(9), steps=[4, 1, 4], stride=4) == [(0, (1, 4)), (4, (0, 3, 5, 8)), (8, (4, 7))]
     lost = line(5, number=torch.tensor([0, 1, 4, 5, 9]))
     assert pairs.by_choice(lost, steps=(1, 4)) == [(0, (1, 2)), (1, (0, 3)), (2, (0, 3)), (3, (1, 2, 4)), (4, (3,))]
@@ -124,7 +124,7 @@ def test_by_choice_offers_every_anchor_the_frames_around_it() -> None:
 def test_past_frames_alone_leave_the_first_without_an_anchor() -> None:
     assert pairs.by_choice(line(4), past=True) == [(1, (0,)), (2, (0, 1)), (3, (0, 1, 2))]
     assert pairs.by_choice(line(2), past=True) == [(1, (0,))]
-    assert all(max(p.offered) < p.anchor > 0 for p in pairs.by_choice(line(40), past=True))
+    assert all(max(p.offered) < p.reference > 0 for p in pairs.by_choice(line(40), past=True))
     far = line(3, number=torch.tensor([0, 50, 51]))
     assert pairs.by_choice(far, past=True) == [(1, (0,)), (2, (1,))], "where no step fits, the nearest before it"
     with pytest.raises(ValueError, match="line has nothing before frame 0, expected a later one"):

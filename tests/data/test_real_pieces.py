@@ -18,7 +18,7 @@ from dhtorch.records import Pose
 ROOT = os.environ.get("DHTORCH_DATA")
 real = pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
 
-# Largest median disagreement of points carried from the first and the last anchor into their partner with the data set's
+# Largest median disagreement of points carried from the first and the last reference view into their source view with the data set's
 # own poses: about 1.5 times what was measured (holo_a 0.27 %, kitchens 0.38, 0.66, 0.53, 0.54 %, desk9 0.44 %, rpy 0.89 %).
 # Transposed, inverted or GL poses gave 2.0 % at the very least, mostly 5 to 40 %.
 WORLD = [

@@ -154,7 +154,7 @@ def test_depth_is_paired_by_time(tmp_path: Path) -> None:
         data.open(root, serials=[FIXED], max_difference=0.01)
     file = root / f"cam_{FIXED}" / "timestamps.npy"
     stamps = read_npy(file)
-    stamps["depth"][1] += 40  # nobody's partner now
+    stamps["depth"][1] += 40  # nobody's source view now
     np.save(file, stamps, allow_pickle=True)
     recording = data.open(root, serials=[FIXED])
     assert recording.number.tolist() == [0, 2] and "1 image without depth within 0.02 s" in recording.report[0]

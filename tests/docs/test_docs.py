@@ -58,7 +58,7 @@ def test_there_is_a_page_for_every_promise(site):
 
 @pytest.mark.slow
 def test_no_internal_link_leads_nowhere(site):
-    """Pages, anchors, pictures, scripts and styles; other people's sites are not asked."""
+    """Pages, reference views, pictures, scripts and styles; other people's sites are not asked."""
     folder, pages = site
     targets = {name: set(re.findall(r'\bid="([^"]+)"', text)) for name, text in pages.items()}
     found = 0

@@ -18,7 +18,7 @@ from dhtorch.synthetic import SyntheticRoom
 
 NEAR = 2.0
 METHOD = MAP.replace(n=768)
-SWEEP = {"planes": 32, "partners": 2, "size": 160}
+SWEEP = {"planes": 32, "source_views": 2, "size": 160}
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def outcome(room):
             Settings(),
             sweep=SWEEP,
             stride=1,
-            anchors=1,
+            reference_views=1,
             indoor=["hall"],
             rooms=(),
         )
@@ -45,10 +45,16 @@ def outcome(room):
 
 @pytest.fixture(scope="module")
 def pair(room):
-    """An anchor, another view that lies beside it, the motion that the room knows, and a grid of samples."""
-    anchor, other = room[3], room[11]
-    grid = METHOD.backproject(range_split(anchor, NEAR), dense.map_pixel_centres(anchor, (40, 53)))
-    return range_split(anchor, NEAR), other, exact_rooms.exact_pose_fit(anchor, other, 1).T_1_from_0, grid, anchor
+    """A reference view, another view that lies beside it, the motion that the room knows, and a grid of samples."""
+    reference, other = room[3], room[11]
+    grid = METHOD.backproject(range_split(reference, NEAR), dense.map_pixel_centres(reference, (40, 53)))
+    return (
+        range_split(reference, NEAR),
+        other,
+        exact_rooms.exact_pose_fit(reference, other, 1).T_1_from_0,
+        grid,
+        reference,
+    )
 
 
 def test_every_variant_is_judged_where_it_belongs(outcome):
@@ -95,15 +101,15 @@ def test_bars_are_held_one_by_one():
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("tipped", [False, True])
 def test_rectified_matching_is_right_whichever_way_the_other_camera_lies(room, mirrored, tipped):
-    anchor, other = (room[k] for k in ((11, 3) if mirrored else (3, 11)))
-    T = exact_rooms.exact_pose_fit(anchor, other, 1).T_1_from_0
+    reference, other = (room[k] for k in ((11, 3) if mirrored else (3, 11)))
+    T = exact_rooms.exact_pose_fit(reference, other, 1).T_1_from_0
     if tipped:  # both cameras rolled by a right angle: the other view is above or below
-        anchor, other = (rolled(frame) for frame in (anchor, other))
+        reference, other = (rolled(frame) for frame in (reference, other))
         roll = se3.exp(torch.tensor([[0.0, 0.0, torch.pi / 2, 0.0, 0.0, 0.0]]))
         T = se3.compose(roll, se3.compose(T, se3.invert(roll)))
-    grid = METHOD.backproject(anchor, dense.map_pixel_centres(anchor, (40, 40)))
-    found = stereo.match_semi_global(anchor, other, T, grid, nearest_m=torch.tensor([1.4]))
-    truth = _truth(anchor, grid)
+    grid = METHOD.backproject(reference, dense.map_pixel_centres(reference, (40, 40)))
+    found = stereo.match_semi_global(reference, other, T, grid, nearest_m=torch.tensor([1.4]))
+    truth = _truth(reference, grid)
     keep = found.keep & (truth > NEAR)
     error = ((found.depth - truth).abs() / truth)[keep]
     assert keep.sum() > 200 and float(error.median()) < 0.05
@@ -162,17 +168,17 @@ def test_a_map_is_read_at_the_nearest_pixel_and_the_sensor_is_no_answer(pair):
 
 
 def test_rooms_are_judged_where_both_views_see_texture(room):
-    anchor, other = room[3], room[11]
+    reference, other = room[3], room[11]
     odd = torch.zeros(1, 120, 160, dtype=torch.bool)
-    asked = exact_rooms.evaluated_pixels(anchor, other, odd)
-    assert 500 < asked.sum() < 0.9 * asked.numel() and bool((anchor.depth[asked] > NEAR).all())
+    asked = exact_rooms.evaluated_pixels(reference, other, odd)
+    assert 500 < asked.sum() < 0.9 * asked.numel() and bool((reference.depth[asked] > NEAR).all())
     odd[:, :, 80:] = True
-    assert not bool(exact_rooms.evaluated_pixels(anchor, other, odd)[:, :, 76:].any())
+    assert not bool(exact_rooms.evaluated_pixels(reference, other, odd)[:, :, 76:].any())
     away = other.replace(depth=0.5 * other.depth)
-    assert not bool(exact_rooms.evaluated_pixels(anchor, away, odd).any()), "another surface stands before it"
+    assert not bool(exact_rooms.evaluated_pixels(reference, away, odd).any()), "another surface stands before it"
 
 
-@pytest.mark.parametrize("option", [{"stride": 0}, {"anchors": 0}, {"stride": 1.5}])
+@pytest.mark.parametrize("option", [{"stride": 0}, {"reference_views": 0}, {"stride": 1.5}])
 def test_bad_options_are_refused(option):
     with pytest.raises(ValueError, match=f"experiment.{next(iter(option))}"):
         dense_comparison.run([], {"map": METHOD}, by_gap, Settings(), **option)

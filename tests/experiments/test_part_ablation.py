@@ -57,7 +57,7 @@ def differences(a, b, path=""):
         ("+ views", "paper", {"views"}),
         ("- affine tracks", "map", {"track"}),
         ("- far tracks", "map", {"pose.far_weight"}),
-        ("- turn", "map", {"pose.turn_sigma"}),
+        ("- turn", "map", {"pose.shutter_sigma"}),
         ("- pose", "map", {"pose"}),
         ("- score by error", "map", {"score"}),
     ],
@@ -86,7 +86,7 @@ def test_gates_and_sigma_are_told_apart(methods):
 PARTS_OF_AUTO = {
     "start": {"track.start", "chain"},
     "exposure": {"track.track.normalise"},
-    "chosen views": {"choose", "chain"},
+    "chosen views": {"select_views", "chain"},
     "agreement": {"fuse"},
     "score by sigma": {"score"},
     "unsure views": {"triangulate.max_sigma_rel"},

@@ -194,7 +194,7 @@ def test_raw_trajectory_forgets_the_conversion_and_nothing_else():
     same = batch_of(room())
     assert torch.equal(trajectory_pose(same, raw=True).R, trajectory_pose(same).R)
     none = batch_of(recording)
-    none = Batch(**{**vars(none), "anchor": none.anchor.replace(T_world_from_cam=None)})
+    none = Batch(**{**vars(none), "anchor": none.reference.replace(T_world_from_cam=None)})
     assert not bool(trajectory_pose_fit(none, 5).ok.any())
 
 
@@ -337,9 +337,14 @@ SMALLER = {
     "defocus": ["data=synthetic_views"],
     "defocus_fusion": ["data=synthetic_views"],
     "focus_stack": ["data=synthetic_views", "experiment.slices=5"],
-    "anchor_study": ["experiment.anchors=1", "experiment.size=64", "experiment.faults=[simulated]"],
+    "align_study": ["experiment.reference_views=1", "experiment.size=64", "experiment.faults=[simulated]"],
     "dense_comparison": [
-        *("experiment.anchors=1", "experiment.sweep.planes=16", "experiment.sweep.size=128", "experiment.rooms=[]"),
+        *(
+            "experiment.reference_views=1",
+            "experiment.sweep.planes=16",
+            "experiment.sweep.size=128",
+            "experiment.rooms=[]",
+        ),
         *("experiment.rotations.hw=[96,128]", "experiment.rotations.n_frames=4", "experiment.rotations.gap=2"),
     ],
     "icp": ["experiment.n=256", "experiment.links=2"],
@@ -360,7 +365,7 @@ SMALLER = {
         *("experiment.dinov2=null", "experiment.n_folds=3"),
     ],
     "views_study": [
-        *("experiment.anchors=1", "experiment.rotation_gaps=[1,3]", "experiment.rotations.hw=[96,128]"),
+        *("experiment.reference_views=1", "experiment.rotation_gaps=[1,3]", "experiment.rotations.hw=[96,128]"),
         *("experiment.rotations.n_frames=4", "experiment.rotations.gap=2"),
     ],
     "vo_probe": [

@@ -14,7 +14,7 @@ from dhtorch.experiments.protocol import Outcome, Protocol, Settings, Variant
 
 def study(scenes, *, step=1, **options):
     methods = {"map": MAP, "auto": choosing(step)}
-    given = {"gaps": (1, 2, 5, 12), "anchors": 2, "rotation_gaps": (1, 2)} | options
+    given = {"gaps": (1, 2, 5, 12), "reference_views": 2, "rotation_gaps": (1, 2)} | options
     return views_study.run(scenes, methods, by_gap, Settings(), **given)
 
 
@@ -30,7 +30,7 @@ def views(outcome, name, place="hall"):
 
 
 def test_a_gap_looks_ahead_and_behind_where_nothing_is_ahead(outcome):
-    assert views(outcome, "map, gap 1") == {2: [3], 6: [7]}, "two of eight anchors, evenly spread"
+    assert views(outcome, "map, gap 1") == {2: [3], 6: [7]}, "two of eight reference views, evenly spread"
     assert views(outcome, "map, gap 2") == {2: [4], 6: [8]}
     assert views(outcome, "map, gap 5") == {2: [7], 6: [1]}
     assert views(outcome, "map, gap 12") == {2: [], 6: []}
@@ -69,7 +69,7 @@ def test_scenes_with_one_partner_stand_apart(outcome):
     row = outcome.scenes("auto")["pair"]
     assert row["one_partner"] is True and row["best_gap"] == 1 and row["fixed_gap_ratio"] == pytest.approx(1)
     assert outcome.scenes("auto")["hall"]["one_partner"] is False
-    assert outcome.why.endswith("one partner only: pair")
+    assert outcome.why.endswith("one source view only: pair")
 
 
 def test_what_is_answered_in_a_turn_is_pooled_over_scenes_and_gaps(outcome):
@@ -86,7 +86,7 @@ def test_what_is_answered_in_a_turn_is_pooled_over_scenes_and_gaps(outcome):
 def test_an_anchor_that_no_frame_was_offered_for_says_nothing_about_silence():
     found = study([scene("carousel", role="rotation")], rotation_gaps=(2, 12))
     assert found.summary["map.rotation_answered"]["value"] == pytest.approx(0.5, abs=0.01)
-    assert found.verdict == "undecided" and "several partners" in found.why
+    assert found.verdict == "undecided" and "several source views" in found.why
     nothing = study([scene(), scene("carousel", role="rotation")], rotation_gaps=(12,))
     assert nothing.summary["map.rotation_answered"]["value"] is None and "map at fixed gaps –" in nothing.why
 
@@ -98,7 +98,7 @@ def test_few_candidates_do_not_keep_a_turn_from_being_judged():
 
 
 def test_all_anchors_and_several_seeds():
-    found = study([scene()], anchors=None, seeds=2, gaps=(2,))
+    found = study([scene()], reference_views=None, seeds=2, gaps=(2,))
     assert set(views(found, "auto")) == set(range(8)) and {r["method"] for r in found.rows} == {"auto", "map, gap 2"}
     assert not [name for name in found.summary if "seed" in name]
     assert found.verdict == "undecided" and "no scene in which the camera only turns" in found.why
@@ -136,7 +136,7 @@ def test_verdict_goes_either_way(worst, answered, expected):
 def test_what_cannot_be_asked_is_an_error():
     with pytest.raises(ValueError, match=r"experiment\.methods: found map, expected auto too"):
         views_study.run([], {"map": MAP}, by_gap, Settings())
-    for options in ({"gaps": ()}, {"rotation_gaps": (0, 1)}, {"anchors": 0}):
+    for options in ({"gaps": ()}, {"rotation_gaps": (0, 1)}, {"reference_views": 0}):
         with pytest.raises(ValueError, match=rf"experiment\.{next(iter(options))}: found"):
             study([scene()], **options)
 

@@ -63,9 +63,9 @@ class Seen:
 
     calls: ClassVar[list] = []
 
-    def __call__(self, anchor, other, *, n=N, seed=0, trace=None):
-        Seen.calls.append((anchor, other, seed))
-        return Told()(anchor, other, n=n, seed=seed, trace=trace)
+    def __call__(self, reference, other, *, n=N, seed=0, trace=None):
+        Seen.calls.append((reference, other, seed))
+        return Told()(reference, other, n=n, seed=seed, trace=trace)
 
 
 @pytest.fixture(autouse=True)
@@ -144,8 +144,10 @@ def test_a_row_looks_back_by_frame_number_inside_its_episode():
         answer = made[position]
         where = answer.place["episode_index"], answer.place["frame_index"]
         assert answer.features["problem"] == (0 if Seen.calls else 1)
-        for anchor, other, _ in Seen.calls:
-            pairs[where] = [next(s for s in range(60) if torch.equal(frame(s).image, x.image)) for x in (other, anchor)]
+        for reference, other, _ in Seen.calls:
+            pairs[where] = [
+                next(s for s in range(60) if torch.equal(frame(s).image, x.image)) for x in (other, reference)
+            ]
     assert pairs == {(1, 2): [50, 52], (3, 2): [10, 12], (3, 7): [13, 15]}
 
 
@@ -179,20 +181,21 @@ def test_features_are_those_of_the_transform_in_the_types_of_the_columns():
 def test_a_method_is_given_what_the_frames_know():
     one = recording(load=Load(20, confidence=True, bent=True, own=True))
     answer = rows([one], 2, Seen(), seed=9)[3]
-    ((anchor, other, seed),) = Seen.calls
+    ((reference, other, seed),) = Seen.calls
     before, now = frame(21, True, True, True), frame(23, True, True, True)
     assert seed == 9 and answer.features["problem"] == 0
-    for mine, theirs in ((anchor, now), (other, before)):
+    for mine, theirs in ((reference, now), (other, before)):
         assert torch.equal(mine.image, theirs.image) and torch.equal(mine.camera.f, theirs.camera.f)
         assert torch.equal(mine.camera.c, theirs.camera.c)
         assert torch.allclose(mine.camera.distortion, theirs.camera.distortion)
-    assert torch.equal(anchor.depth, now.depth) and torch.equal(anchor.conf, now.conf)
-    assert torch.equal(anchor.depth_camera.f, now.depth_camera.f)
+    assert torch.equal(reference.depth, now.depth) and torch.equal(reference.conf, now.conf)
+    assert torch.equal(reference.depth_camera.f, now.depth_camera.f)
     mixed = recording(load=lambda i: frame(i, bent=i == 3))
     rows([mixed], 1, Seen())[3]
-    anchor, other, _ = Seen.calls[-1]
+    reference, other, _ = Seen.calls[-1]
     assert (
-        torch.allclose(anchor.camera.distortion, torch.tensor([[0.03, 0, 0, 0]])) and not other.camera.distortion.any()
+        torch.allclose(reference.camera.distortion, torch.tensor([[0.03, 0, 0, 0]]))
+        and not other.camera.distortion.any()
     )
 
 

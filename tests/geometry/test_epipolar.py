@@ -75,7 +75,7 @@ def test_exact_points_are_those_of_opencv_and_kornia():
 
 
 def test_the_depth_brings_the_point_nearest_to_its_measured_pixel():
-    """Least squares along the anchor's ray by Newton's method from the truth, in pixels that are not square."""
+    """Least squares along the reference view's ray by Newton's method from the truth, in pixels that are not square."""
     uv_0, uv_1, xyz = scene(noise_px=3.0)
     found = triangulated(uv_0, uv_1)
 

@@ -105,7 +105,7 @@ def plain_covariance(problem, solution, o, b):
         for k, x in zip(used, w, strict=True):
             bread[k], meat[k] = omega * x * slope, omega**2 * x**2 * scatter
     A, M = dense.reduced(tracks, bread)[0], dense.reduced(tracks, meat)[0]
-    known = np.diag([0.0] * 6 + [o.turn_sigma**-2 if o.turn_sigma else 1e18] * 3)
+    known = np.diag([0.0] * 6 + [o.shutter_sigma**-2 if o.shutter_sigma else 1e18] * 3)
     inverse = np.linalg.inv(A + known)
     return inverse @ (M + known) @ inverse
 
@@ -114,9 +114,9 @@ def plain_covariance(problem, solution, o, b):
     "o",
     [
         FitOptions(far_weight=0.1),
-        FitOptions(far_weight=0.7, kernel="huber", bend=1.0, turn_sigma=1e-3),
-        FitOptions(far_weight=1.0, kernel="cauchy", bend=1.5, turn_sigma=0.0),
-        FitOptions(far_weight=0.3, kernel=None, turn_sigma=0.1),
+        FitOptions(far_weight=0.7, kernel="huber", bend=1.0, shutter_sigma=1e-3),
+        FitOptions(far_weight=1.0, kernel="cauchy", bend=1.5, shutter_sigma=0.0),
+        FitOptions(far_weight=0.3, kernel=None, shutter_sigma=0.1),
         FitOptions(far_weight=0.3, kernel="geman_mcclure", bend=0.3),  # all residuals beyond the bend
     ],
 )
@@ -168,7 +168,7 @@ def contradiction():
 
 def test_far_tracks_are_believed_up_to_the_rise_of_the_near_cost_that_is_allowed():
     tracks, at = contradiction()
-    o = FitOptions(far_weight=0.5, turn_sigma=0.0, **LONG)
+    o = FitOptions(far_weight=0.5, shutter_sigma=0.0, **LONG)
     near, both = (estimate_map_pose(tracks, at.T, o._replace(max_rise=x)) for x in (-9.0, 1e9))
     assert float(near.far_weight) == 0 and float(both.far_weight) == 0.5
     noise = estimate_noise_variance(tracks, both.at)
@@ -184,33 +184,35 @@ def test_far_tracks_are_believed_up_to_the_rise_of_the_near_cost_that_is_allowed
 
 def test_a_turn_is_believed_from_the_share_of_the_cost_that_is_asked():
     tracks, at = problem(1, 30, 40, noise=0.3, depth=0.003, turn=0.002, seed=6)
-    o = FitOptions(far_weight=0.5, max_rise=1e9, turn_sigma=0.003, translation_gain=-1e9, **LONG)
-    rigid, turned = (estimate_map_pose(tracks, at.T, o._replace(turn_gain=x)) for x in (1e9, -1e9))
-    assert float(rigid.turn_precision) > 1e12 and rigid.at.turn.abs().max() < 1e-9
-    assert float(turned.turn_precision) == pytest.approx(0.003**-2) and turned.at.turn.abs().max() > 1e-4
+    o = FitOptions(far_weight=0.5, max_rise=1e9, shutter_sigma=0.003, translation_gain=-1e9, **LONG)
+    rigid, turned = (estimate_map_pose(tracks, at.T, o._replace(shutter_gain=x)) for x in (1e9, -1e9))
+    assert float(rigid.shutter_precision) > 1e12 and rigid.at.shutter_rate.abs().max() < 1e-9
+    assert float(turned.shutter_precision) == pytest.approx(0.003**-2) and turned.at.shutter_rate.abs().max() > 1e-4
     noise = estimate_noise_variance(tracks, rigid.at)
-    held = float((turned.at.turn**2).sum()) / 0.003**2
+    held = float((turned.at.shutter_rate**2).sum()) / 0.003**2
     before, after = costs(tracks, rigid.at, noise, o, 0.5), costs(tracks, turned.at, noise, o, 0.5) + held
     gain = (before - after - 1.0) / before
     assert 0.05 < gain < 0.9
     for share, believed in ((0.97, True), (1.03, False)):
-        found = estimate_map_pose(tracks, at.T, o._replace(turn_gain=share * gain))
-        torch.testing.assert_close(found.at.turn, (turned if believed else rigid).at.turn, rtol=0, atol=1e-9)
+        found = estimate_map_pose(tracks, at.T, o._replace(shutter_gain=share * gain))
+        torch.testing.assert_close(
+            found.at.shutter_rate, (turned if believed else rigid).at.shutter_rate, rtol=0, atol=1e-9
+        )
 
 
 def test_a_prior_holds_the_turn_to_its_standard_deviation():
     tracks, at = problem(1, 30, 40, noise=0.3, depth=0.003, turn=0.002, seed=6)
     sizes = []
     for sigma in (1e-4, 1e-3, 0.1):
-        o = FitOptions(turn_sigma=sigma, turn_gain=-1e9, max_rise=1e9, **LONG)
-        sizes.append(float(estimate_map_pose(tracks, at.T, o).at.turn.norm()))
+        o = FitOptions(shutter_sigma=sigma, shutter_gain=-1e9, max_rise=1e9, **LONG)
+        sizes.append(float(estimate_map_pose(tracks, at.T, o).at.shutter_rate.norm()))
     assert sizes[0] < 0.2 * sizes[1] < 0.2 * sizes[2]
 
 
 def test_a_translation_is_believed_from_the_share_that_no_rotation_takes_away():
     """The best pure rotation by scipy, from the written-out cost."""
     tracks, at = problem(1, 14, 30, noise=0.5, depth=0.003, baseline=0.004, seed=8)
-    o = FitOptions(far_weight=0.5, max_rise=1e9, turn_sigma=0.0, **LONG)
+    o = FitOptions(far_weight=0.5, max_rise=1e9, shutter_sigma=0.0, **LONG)
     solution = estimate_map_pose(tracks, at.T, o)
     noise = estimate_noise_variance(tracks, solution.at)
     ray, uv, xx_xy_yy = (getattr(tracks, k)[0].numpy() for k in ("ray", "uv", "shape"))
@@ -236,7 +238,7 @@ def test_steps_are_counted():
     start = se3.retract(at.T, torch.full((1, 6), 0.01, dtype=D))
 
     def off(**options):
-        found = estimate_map_pose(tracks, start, FitOptions(turn_sigma=0.0, max_rise=1e9, **options)).at.T
+        found = estimate_map_pose(tracks, start, FitOptions(shutter_sigma=0.0, max_rise=1e9, **options)).at.T
         return float((found.t - at.T.t).norm())
 
     still = off(near_steps=0, steps=0)
@@ -267,7 +269,7 @@ def test_where_they_stand_and_who_stands_beside_them_does_not_matter_to_tracks()
 def test_a_few_near_tracks_behind_very_many_far_ones_are_the_first_to_be_solved():
     tracks, at = problem(1, 12, 300, seed=5)
     turned = tracks.map(lambda x: x.flip(-1) if x.shape[-1] == 312 else x)
-    o = FitOptions(max_rise=-9.0, turn_sigma=0.0)  # the near tracks alone are answered
+    o = FitOptions(max_rise=-9.0, shutter_sigma=0.0)  # the near tracks alone are answered
     first, last = estimate_map_pose(tracks, at.T, o), estimate_map_pose(turned, at.T, o)
     alone = estimate_map_pose(tracks.replace(far=tracks.far & False), at.T, o)
     for found in (first, last):

@@ -56,11 +56,11 @@ def every(problem, at):
 def test_pixels_are_turned_back_by_their_row():
     problem, at = scene()
     y = problem.ray[:, 1] / problem.ray[:, 2]
-    found = reprojection_problem.undo_rolling_shutter(problem.uv, problem.f, problem.c, y, at.turn)
+    found = reprojection_problem.undo_rolling_shutter(problem.uv, problem.f, problem.c, y, at.shutter_rate)
     for b in range(2):
         for k in range(N):
             ray = np.append(((problem.uv[b, :, k] - problem.c[b]) / problem.f[b]).numpy(), 1.0)
-            ray = ray - float(y[b, k]) * np.cross(at.turn[b], ray)
+            ray = ray - float(y[b, k]) * np.cross(at.shutter_rate[b], ray)
             wanted = ray[:2] / ray[2] * problem.f[b].numpy() + problem.c[b].numpy()
             np.testing.assert_allclose(found[b, :, k], wanted, rtol=1e-12)
     f = torch.ones(1, 2, dtype=D)
@@ -155,14 +155,14 @@ def test_without_a_turn_the_equations_are_those_of_the_pose_at_a_turn_of_zero():
     normal, cost = reprojection_problem.pose_normal_equations_at(
         problem, NOISE, weight, precision, kernel="cauchy", bend=1.5
     )
-    still = at._replace(turn=torch.zeros_like(at.turn))
-    whole, pose = normal(still), normal(at._replace(turn=None))
+    still = at._replace(shutter_rate=torch.zeros_like(at.shutter_rate))
+    whole, pose = normal(still), normal(at._replace(shutter_rate=None))
     torch.testing.assert_close(pose.H, whole.H[:, :6, :6], rtol=1e-12, atol=1e-9)
     torch.testing.assert_close(pose.g, whole.g[:, :6], rtol=1e-12, atol=1e-9)
     assert torch.equal(pose.cost, whole.cost)
-    for x in (at, still, at._replace(turn=None)):
+    for x in (at, still, at._replace(shutter_rate=None)):
         assert torch.equal(cost(x), normal(x).cost)
-    moved, ok = reprojection_problem.unknowns_step(at._replace(turn=None), pose.H, pose.g)
+    moved, ok = reprojection_problem.unknowns_step(at._replace(shutter_rate=None), pose.H, pose.g)
     assert moved.turn is None and ok.all() and not torch.equal(moved.T.R, at.T.R)
 
 
@@ -177,7 +177,7 @@ def test_normal_equations_are_the_schur_complement_of_one_with_all_inverse_depth
         share = [(x.near + float(weight[b]) * x.far) * dense.weight(x.square, kernel, 1.5)[1] for x in tracks]
         wanted_H, wanted_g = dense.reduced(tracks, share)
         known = np.diag([0.0] * 6 + [float(precision[b])] * 3)
-        turn = np.append(np.zeros(6), at.turn[b].numpy())
+        turn = np.append(np.zeros(6), at.shutter_rate[b].numpy())
         np.testing.assert_allclose(H[b], wanted_H + known, rtol=1e-6, atol=1e-7 * np.abs(wanted_H).max())
         np.testing.assert_allclose(g[b], wanted_g + known @ turn, rtol=1e-6, atol=1e-7 * np.abs(wanted_g).max())
         wanted = dense.cost(tracks, float(weight[b]), kernel, 1.5) + turn @ known @ turn
@@ -194,7 +194,7 @@ def test_the_gradient_is_half_that_of_the_cost(kernel):
         precision = torch.tensor([3e5, 1e6], dtype=D)
 
         def cost(x, problem=problem, at=at, precision=precision):
-            moved = Unknowns(se3.retract(at.T, x[:, :6]), at.turn + x[:, 6:])
+            moved = Unknowns(se3.retract(at.T, x[:, :6]), at.shutter_rate + x[:, 6:])
             return reprojection_problem.pose_normal_equations(
                 problem, moved, NOISE, torch.ones(2, dtype=D), precision, kernel=kernel, bend=2.0
             ).cost.sum()
@@ -215,8 +215,8 @@ def test_a_prior_adds_its_own_cost_gradient_and_information_and_nothing_else():
         reprojection_problem.pose_normal_equations(problem, at, NOISE, one, p, kernel="cauchy", bend=2.0)
         for p in (0 * one, precision)
     )
-    torch.testing.assert_close(held.cost - free.cost, precision * (at.turn**2).sum(-1))
-    torch.testing.assert_close((held.g - free.g)[:, 6:], precision[:, None] * at.turn)
+    torch.testing.assert_close(held.cost - free.cost, precision * (at.shutter_rate**2).sum(-1))
+    torch.testing.assert_close((held.g - free.g)[:, 6:], precision[:, None] * at.shutter_rate)
     torch.testing.assert_close(
         held.H - free.H, torch.diag_embed(reprojection_problem.shutter_prior(precision)), rtol=1e-9, atol=1e-6
     )
@@ -277,6 +277,6 @@ def test_a_step_solves_for_the_pose_and_the_turn(step):
         turn = np.linalg.inv(np.eye(3) - W) @ (np.eye(3) + W)
         np.testing.assert_allclose(moved.T.R[b], turn @ at.T.R[b].numpy(), rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(moved.T.t[b], turn @ at.T.t[b].numpy() + xi[3:6], rtol=1e-9)
-        np.testing.assert_allclose(moved.turn[b], at.turn[b].numpy() + xi[6:], rtol=1e-9)
+        np.testing.assert_allclose(moved.turn[b], at.shutter_rate[b].numpy() + xi[6:], rtol=1e-9)
     if step is reprojection_problem.unknowns_step:
-        assert torch.equal(moved.turn[1], at.turn[1]) and torch.equal(moved.T.R[1], at.T.R[1])
+        assert torch.equal(moved.turn[1], at.shutter_rate[1]) and torch.equal(moved.T.R[1], at.T.R[1])

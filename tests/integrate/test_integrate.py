@@ -631,8 +631,8 @@ def test_a_shelf_holds_maps_of_all_sizes_and_leaves_nothing_behind(tmp_path):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        ("yes", "dense: found 'yes', expected true, false or options among partners, planes"),
-        ({"planse": 3}, "dense: found 'planse', expected some of partners, planes"),
+        ("yes", "dense: found 'yes', expected true, false or options among source views, planes"),
+        ({"planse": 3}, "dense: found 'planse', expected some of source views, planes"),
         ({"planes": 3.5}, r"dense\.planes: found 3\.5, expected a whole number"),
         ({"min_correlation": "high"}, r"dense\.min_correlation: found 'high', expected a number"),
         ({"size": True}, r"dense\.size: found True, expected a whole number"),

@@ -128,7 +128,7 @@ def command(tmp_path, monkeypatch, capsys):
         ("pairs.gap=99", "pairs.gap: found 99"),
         ("voxle=1", "voxle"),
         ("dense=often", "dense: found 'often', expected true, false or options as"),
-        ("dense={planse: 32}", "dense: found 'planse', expected some of partners"),
+        ("dense={planse: 32}", "dense: found 'planse', expected some of source views"),
         ("dense={planes: few}", "dense.planes: found 'few', expected a whole number"),
         ("min_maps=0", "min_maps: found 0, expected a whole number of at least 1"),
     ],

@@ -63,7 +63,7 @@ def test_points_of_an_estimate_are_its_candidates():
     p = errors.points_from_estimate(estimate, truth)
     assert p.true_depth.tolist() == [2, 2, 2] and p.keep.tolist() == [True, False, False]
     assert p.error[0] == 0.5 and p.error[1:].isnan().all() and p.score[1:].tolist() == [0, 0]
-    with pytest.raises(ValueError, match="points: score has shape"):
+    with pytest.raises(ValueError, match="make_points: score has shape"):
         errors.make_points(torch.ones(3), torch.ones(3), torch.ones(2))
 
 
@@ -258,7 +258,7 @@ def test_points_takes_any_shape_and_counts_what_may_count():
     assert refused.keep.tolist() == [False, False, True] and refused.depth[0].isnan()
     assert refused.score.tolist() == [0, 0, 1] and refused.residual_px.isnan().all()
     for name in ("depth", "sigma", "residual_px", "keep", "candidate"):
-        with pytest.raises(ValueError, match=f"points: {name} has shape \\(3,\\), expected \\(2, 3\\)"):
+        with pytest.raises(ValueError, match=f"make_points: {name} has shape \\(3,\\), expected \\(2, 3\\)"):
             errors.make_points(**{"depth": depth, "true_depth": true, name: torch.ones(3)})
 
 

@@ -82,7 +82,7 @@ def test_a_perfect_order_has_no_excess_and_a_reversed_one_falls():
     best, worst = risk.measure_risk(p.replace(score=-p.error)), risk.measure_risk(p.replace(score=p.error))
     assert best["aurc_excess"] == pytest.approx(0, abs=1e-12) and best["monotonicity"] == 1
     assert worst["aurc"] > best["aurc"] and worst["monotonicity"] == 0
-    with pytest.raises(ValueError, match="curve: score"):
+    with pytest.raises(ValueError, match="risk_curve: score"):
         risk.risk_curve(torch.ones(3), torch.ones(2))
 
 

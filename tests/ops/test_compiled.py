@@ -62,7 +62,7 @@ needs_compiler = pytest.mark.skipif(COMPILER is None or sys.platform == "win32",
 @pytest.fixture(autouse=True)
 def unused(monkeypatch):
     """Every test begins and ends without compiled code."""
-    monkeypatch.delenv("DHTORCH_NATIVE", raising=False)
+    monkeypatch.delenv("DHTORCH_OPS", raising=False)
     monkeypatch.setattr(loader, "_loaded", [])
 
 
@@ -477,16 +477,17 @@ def test_what_hides_and_how_sure_motions_are_agrees(loaded, monkeypatch, turning
 
 
 @needs_compiler
-@pytest.mark.parametrize("partners", [1, 2])
-def test_maps_agree_to_far_less_than_their_sigma(loaded, monkeypatch, partners):
+@pytest.mark.parametrize("source_views", [1, 2])
+def test_maps_agree_to_far_less_than_their_sigma(loaded, monkeypatch, source_views):
     room = SyntheticRoom(n_frames=9, hw=(96, 128), depth_hw=(48, 64))
-    anchor, *others = (range_split(room[k], 2.0) for k in (1, 6, 8))
+    reference, *others = (range_split(room[k], 2.0) for k in (1, 6, 8))
     with monkeypatch.context() as patch:
         patch.setattr(loader, "_loaded", [])
         trace = {}
-        asked = dense.selected_views(WINDOW(anchor, others, trace=trace), others, trace)
+        asked = dense.selected_views(WINDOW(reference, others, trace=trace), others, trace)
     found, expected = both_ways(
-        lambda: dense.sweep_depth(anchor, asked, partners=partners, planes=48, max_sigma_rel=0.5), monkeypatch
+        lambda: dense.sweep_depth(reference, asked, source_views=source_views, planes=48, max_sigma_rel=0.5),
+        monkeypatch,
     )
     assert (found.gate != expected.gate).float().mean() <= 0.005 and torch.equal(found.gate == 0, found.depth > 0)
     both = (found.source == Source.SWEPT) & (expected.source == Source.SWEPT)
@@ -802,7 +803,7 @@ def every_track(turning):
     noise = test_reprojection_problem.NOISE.repeat(1, 16)
     return (
         problem.to(torch.float32),
-        at._replace(T=at.T.to(torch.float32), turn=at.turn.float() if turning else None),
+        at._replace(T=at.T.to(torch.float32), turn=at.shutter_rate.float() if turning else None),
         noise.float(),
     )
 
@@ -827,7 +828,10 @@ def test_equations_of_tracks_agree_up_to_rounding(loaded, monkeypatch, turning):
         torch.testing.assert_close(found[1][:, i, i], expected[1][:, i, i], rtol=1e-3, atol=0)
     ask(kernel="cauchy")
     wide = [x.to(torch.float64) for x in told]
-    ask(told=wide, at=at._replace(T=at.T.to(torch.float64), turn=None if at.turn is None else at.turn.double()))
+    ask(
+        told=wide,
+        at=at._replace(T=at.T.to(torch.float64), turn=None if at.shutter_rate is None else at.shutter_rate.double()),
+    )
     leaf = at.T.t.clone().requires_grad_()
     assert ask(at=at._replace(T=at.T.replace(t=leaf)))[0].requires_grad
     assert len(asked) == 2, "in torch"
@@ -916,9 +920,9 @@ def test_tangents_are_carried_though_compiled_code_is_loaded(loaded):
 def test_the_environment_asks_for_it(cache, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(cache))
     assert not loader.serves(torch.zeros(1))
-    monkeypatch.setenv("DHTORCH_NATIVE", "0")
+    monkeypatch.setenv("DHTORCH_OPS", "0")
     assert not loader.serves(torch.zeros(1)) and not loader._loaded
-    monkeypatch.setenv("DHTORCH_NATIVE", "1")
+    monkeypatch.setenv("DHTORCH_OPS", "1")
     assert loader.serves(torch.zeros(1)) and loader._loaded == [loader.library()]
     assert list(cache.iterdir()) == [loader.library()], "nothing unfinished stays"
     monkeypatch.setattr(loader, "describe_processor", lambda: "another one")
@@ -927,7 +931,7 @@ def test_the_environment_asks_for_it(cache, monkeypatch):
 
 def test_nothing_is_compiled_silently(tmp_path, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "none"))
-    monkeypatch.setenv("DHTORCH_NATIVE", "1")
+    monkeypatch.setenv("DHTORCH_OPS", "1")
     with pytest.raises(FileNotFoundError, match=f"not compiled .*; {loader.COMMAND} does it"):
         plane_sweep.aggregate_best_plane(volume(1, 2, 2, 3, most=31), torch.tensor(1))
     assert not (tmp_path / "none").exists()

@@ -50,7 +50,7 @@ def test_the_hopeless_stay_silent_and_the_healthy_answer(rows):
 
 
 def test_truth_is_what_both_views_show():
-    """A healthy pair: the anchor's pixels, carried over by depth and motion, look the same in view 1."""
+    """A healthy pair: the reference view's pixels, carried over by depth and motion, look the same in view 1."""
     _, pair = make(0)
     v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in HW), indexing="ij")
     at = camera.Camera(pair.f[0][None], pair.c[0][None])

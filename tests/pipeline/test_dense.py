@@ -26,7 +26,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def views(room):
-    """An anchor whose returns end at two metres, another view, and what is true of all pixels."""
+    """A reference view whose returns end at two metres, another view, and what is true of all pixels."""
     return range_split(room[3], NEAR), range_split(room[11], NEAR), room[3].depth
 
 
@@ -71,14 +71,14 @@ def test_under_the_true_motion_textured_pixels_are_within_hundredths(room, views
 
 
 def test_the_sensor_speaks_where_it_answers_and_is_no_input(views, found):
-    anchor, other, depth = views
-    sensed = anchor.depth > 0
+    reference, other, depth = views
+    sensed = reference.depth > 0
     assert bool((found.source[sensed] == Source.SENSOR).all()) and torch.equal(found.depth[sensed], depth[sensed])
     assert bool((found.source[~sensed] != Source.SENSOR).all())
-    half = anchor.depth.clone()
+    half = reference.depth.clone()
     half[:, :, ::2] = 0  # every other column of returns
     with torch.no_grad():
-        fewer = complete_depth(anchor.replace(depth=half), other, fit=None, **FAST)
+        fewer = complete_depth(reference.replace(depth=half), other, fit=None, **FAST)
     swept = sensed & (half == 0) & (fewer.source == Source.SWEPT)
     assert swept.sum() > 500
     assert float(((fewer.depth - depth).abs() / depth)[swept].median()) < 0.03, "the sweep knows near surfaces, too"
@@ -101,10 +101,10 @@ def test_a_camera_that_only_turns_gets_the_sensor_alone():
 
 
 def test_without_another_view_the_map_is_the_sensors(views):
-    anchor = views[0]
-    got = sensor_depth_map(anchor, method=FAST["method"])
-    seen = anchor.depth > 0
-    assert torch.equal(got.depth[seen], anchor.depth[seen]) and bool((got.source[seen] == Source.SENSOR).all())
+    reference = views[0]
+    got = sensor_depth_map(reference, method=FAST["method"])
+    seen = reference.depth > 0
+    assert torch.equal(got.depth[seen], reference.depth[seen]) and bool((got.source[seen] == Source.SENSOR).all())
     assert bool((got.gate[~seen] == Gate.NO_TRACK).all()) and bool(got.depth[~seen].isnan().all())
 
 
@@ -137,8 +137,8 @@ def test_more_views_say_more(room, views):
     others = stack([range_split(room[k], NEAR) for k in (0, 11)])
     method = MAP.replace(n=512, views=2)
     with torch.no_grad():
-        one = complete_depth(views[0], others, method=method, planes=48, partners=1)
-        two = complete_depth(views[0], others, method=method, planes=48, partners=2)
+        one = complete_depth(views[0], others, method=method, planes=48, source_views=1)
+        two = complete_depth(views[0], others, method=method, planes=48, source_views=2)
     share = [float((m.source == Source.SWEPT).float().mean()) for m in (one, two)]
     assert share[1] > share[0] > 0.1
 
@@ -146,25 +146,25 @@ def test_more_views_say_more(room, views):
 def test_a_batch_is_a_loop_bit_for_bit():
     torch.set_num_threads(1)
     room = SyntheticRoom(n_frames=12, hw=(120, 160), depth_hw=(60, 80))
-    anchors = [range_split(room[k], NEAR) for k in (1, 3)]
+    references = [range_split(room[k], NEAR) for k in (1, 3)]
     others = [range_split(room[k], NEAR) for k in (9, 11)]
     with torch.no_grad():
-        together = complete_depth(collate(anchors), collate(others), **FAST)
+        together = complete_depth(collate(references), collate(others), **FAST)
         assert bool((together.source == Source.SWEPT).flatten(1).any(1).all())
         for b in range(2):
-            alone = complete_depth(anchors[b], others[b], **FAST)
+            alone = complete_depth(references[b], others[b], **FAST)
             for name in ("depth", "sigma", "score", "source", "gate"):
                 x, y = getattr(together, name)[b : b + 1], getattr(alone, name)
                 assert torch.equal(x.nan_to_num(-1), y.nan_to_num(-1)), name
 
 
 def test_depth_carries_gradients_to_pictures_near_depth_and_intrinsics(views):
-    anchor, other, _ = views
-    inputs = [anchor.image.float(), other.image.float(), anchor.depth, anchor.camera.f]
-    if anchor.image.dtype == torch.uint8:
+    reference, other, _ = views
+    inputs = [reference.image.float(), other.image.float(), reference.depth, reference.camera.f]
+    if reference.image.dtype == torch.uint8:
         inputs[:2] = [x / 255 for x in inputs[:2]]
     image_0, image_1, depth, f = (x.clone().requires_grad_() for x in inputs)
-    asked = anchor.replace(image=image_0, depth=depth, camera=anchor.camera.replace(f=f))
+    asked = reference.replace(image=image_0, depth=depth, camera=reference.camera.replace(f=f))
     got = complete_depth(asked, other.replace(image=image_1), **FAST)
     swept = got.source == Source.SWEPT
     got.depth[swept].sum().backward()
@@ -177,21 +177,21 @@ def test_depth_carries_gradients_to_pictures_near_depth_and_intrinsics(views):
 
 def test_double_precision_goes_in_beside_pictures_of_bytes():
     room = SyntheticRoom(n_frames=8, hw=(60, 80), depth_hw=(60, 80), lidar="exact")
-    anchor, other = (range_split(room[i], NEAR).to(torch.float64) for i in (1, 6))
+    reference, other = (range_split(room[i], NEAR).to(torch.float64) for i in (1, 6))
     for as_given in (lambda x: (255 * x).byte(), lambda x: x.float()):
-        asked, view = (frame.replace(image=as_given(frame.image)) for frame in (anchor, other))
+        asked, view = (frame.replace(image=as_given(frame.image)) for frame in (reference, other))
         assert complete_depth(asked, view, **FAST).depth.dtype == torch.float64
 
 
 def test_half_precision_goes_in_and_single_comes_out(views, found):
-    anchor, other, depth = views
+    reference, other, depth = views
 
     def half(frame):
         image = frame.image.float() / 255 if frame.image.dtype == torch.uint8 else frame.image
         return frame.replace(image=image.half(), depth=frame.depth.half())
 
     with torch.no_grad():
-        got = complete_depth(half(anchor), half(other), **FAST)
+        got = complete_depth(half(reference), half(other), **FAST)
     assert got.depth.dtype == got.sigma.dtype == torch.float32
     swept = (got.source == Source.SWEPT) & (found.source == Source.SWEPT)
     assert swept.sum() > 0.8 * (found.source == Source.SWEPT).sum()
@@ -201,11 +201,11 @@ def test_half_precision_goes_in_and_single_comes_out(views, found):
 def test_between_the_returns_of_a_sparse_sensor_places_are_swept_as_near_as_they_are(room):
     """Returns at every depth, 2 % of the pixels."""
     told = torch.rand(room[3].depth.shape, generator=torch.Generator().manual_seed(0)) < 0.02
-    anchor = room[3].replace(depth=torch.where(told, room[3].depth, 0.0), sparse=torch.tensor([True]))
+    reference = room[3].replace(depth=torch.where(told, room[3].depth, 0.0), sparse=torch.tensor([True]))
     fit = exact(room, 3, 11, n=512)
     with torch.no_grad():
         swept_near, dense_sensor = (
-            complete_depth(one, room[11], fit=fit, **FAST) for one in (anchor, anchor.replace(sparse=None))
+            complete_depth(one, room[11], fit=fit, **FAST) for one in (reference, reference.replace(sparse=None))
         )
     near = (room[3].depth < 0.6 * room[3].depth.amax()) & ~told
     found, missed = (near & (one.source == Source.SWEPT) for one in (swept_near, dense_sensor))
@@ -225,23 +225,25 @@ def test_a_large_picture_is_swept_at_the_size_asked(views):
     assert got.depth.shape == (1, 120, 160) and bool((got.source == Source.SWEPT).any())
 
 
-@pytest.mark.parametrize("wrong", [{"partners": 0}, {"partners": 9}, {"planes": 2}, {"size": 8}, {"refinements": -1}])
+@pytest.mark.parametrize(
+    "wrong", [{"source_views": 0}, {"source_views": 9}, {"planes": 2}, {"size": 8}, {"refinements": -1}]
+)
 def test_options_out_of_range_raise(views, wrong):
-    with pytest.raises(ValueError, match=f"complete: {next(iter(wrong))} is .*, expected at least"):
+    with pytest.raises(ValueError, match=f"complete_depth: {next(iter(wrong))} is .*, expected at least"):
         complete_depth(views[0], views[1], **{**FAST, **wrong})
 
 
 def boards(*far):
     """What the map of two views says of boards beyond the sensor, and what is true: (map, depth, which board)."""
     near = [Board(1.5, x=(-9, -0.35), seed=7), Board(1.5, y=(0.42, 9), seed=8)]
-    anchor, which = look([*near, *far], (0.0, 0.0, 0.0))
+    reference, which = look([*near, *far], (0.0, 0.0, 0.0))
     other, _ = look([*near, *far], (0.15, 0.02, 0.01), angle=(0.01, -0.02, 0.01))
-    fit = exact_pose_fit(anchor, other, 512)
+    fit = exact_pose_fit(reference, other, 512)
     with torch.no_grad():
         got = complete_depth(
-            range_split(anchor, NEAR), range_split(other, NEAR), fit=fit, method=FAST["method"], planes=64
+            range_split(reference, NEAR), range_split(other, NEAR), fit=fit, method=FAST["method"], planes=64
         )
-    return got, anchor.depth, torch.where(anchor.depth > NEAR, which - len(near), -1)
+    return got, reference.depth, torch.where(reference.depth > NEAR, which - len(near), -1)
 
 
 def judged(got, depth, where):
@@ -296,16 +298,16 @@ def test_a_mirror_shows_what_stands_behind_it():
 @pytest.mark.slow
 def test_a_sweep_is_captured_as_one_graph():
     room = SyntheticRoom(n_frames=12, hw=(60, 80), depth_hw=(60, 80))
-    anchor, other = (range_split(room[k], NEAR) for k in (1, 9))
+    reference, other = (range_split(room[k], NEAR) for k in (1, 9))
     method, trace = MAP.replace(n=256), {}
     with torch.no_grad():
-        joined = method(anchor, other, trace=trace)
+        joined = method(reference, other, trace=trace)
         asked = selected_views(joined, other, trace)
 
-        def sweep(anchor, asked):
-            return sweep_depth(anchor, asked, method=method, planes=16, partners=1)
+        def sweep(reference, asked):
+            return sweep_depth(reference, asked, method=method, planes=16, source_views=1)
 
-        plain = sweep(anchor, asked)
-        captured = torch.compile(sweep, fullgraph=True, backend="eager")(anchor, asked)
+        plain = sweep(reference, asked)
+        captured = torch.compile(sweep, fullgraph=True, backend="eager")(reference, asked)
     for name in ("depth", "sigma", "score", "source", "gate"):
         torch.testing.assert_close(getattr(captured, name), getattr(plain, name), rtol=0, atol=0, equal_nan=True)

@@ -21,15 +21,15 @@ def double(frame):
 
 @pytest.mark.parametrize("method", [PAPER, MAP, AUTO], ids=["paper", "map", "auto"])
 def test_frames_without_views_or_pixels_are_refused(views, method):
-    anchor, other, _ = views
-    with pytest.raises(ValueError, match=r"anchor.image has shape \(1, 3, 96, 0\), expected at least one pixel"):
-        method(anchor.replace(image=anchor.image[..., :0]), other)
+    reference, other, _ = views
+    with pytest.raises(ValueError, match=r"reference.image has shape \(1, 3, 96, 0\), expected at least one pixel"):
+        method(reference.replace(image=reference.image[..., :0]), other)
     with pytest.raises(ValueError, match=r"other.image has shape \(1, 3, 0, 128\), expected at least one pixel"):
-        method(anchor, other.replace(image=other.image[:, :, :0]))
-    with pytest.raises(ValueError, match=r"anchor.depth has shape \(1, 48, 0\), expected at least one pixel"):
-        method(anchor.replace(depth=anchor.depth[..., :0]), other)
-    with pytest.raises(ValueError, match=r"anchor.image has shape \(0, 3, 96, 128\), expected at least one view"):
-        method(anchor[:0], other[:0])
+        method(reference, other.replace(image=other.image[:, :, :0]))
+    with pytest.raises(ValueError, match=r"reference.depth has shape \(1, 48, 0\), expected at least one pixel"):
+        method(reference.replace(depth=reference.depth[..., :0]), other)
+    with pytest.raises(ValueError, match=r"reference.image has shape \(0, 3, 96, 128\), expected at least one view"):
+        method(reference[:0], other[:0])
 
 
 @pytest.mark.parametrize("others", [None, [], ()])
@@ -39,44 +39,44 @@ def test_no_other_view_is_refused(views, others):
 
 
 def test_what_is_no_frame_is_named(views):
-    with pytest.raises(TypeError, match=r"anchor is a Tensor, expected a dhtorch.Frame"):
+    with pytest.raises(TypeError, match=r"reference is a Tensor, expected a dhtorch.Frame"):
         PAPER(views[0].image, views[1])
     with pytest.raises(TypeError, match=r"others\[1\] is a NoneType, expected a dhtorch.Frame"):
         PAPER(views[0], [views[1], None])
 
 
 def test_devices_are_named(views):
-    anchor, other, _ = views
-    with pytest.raises(ValueError, match=r"others\[0\].image is on meta, anchor.image on cpu, expected one device"):
-        PAPER(anchor, [other.replace(image=other.image.to("meta")), other])
-    with pytest.raises(ValueError, match=r"anchor.camera.f is on meta"):
-        PAPER(anchor.replace(camera=anchor.camera.to("meta")), other)
+    reference, other, _ = views
+    with pytest.raises(ValueError, match=r"others\[0\].image is on meta, reference.image on cpu, expected one device"):
+        PAPER(reference, [other.replace(image=other.image.to("meta")), other])
+    with pytest.raises(ValueError, match=r"reference.camera.f is on meta"):
+        PAPER(reference.replace(camera=reference.camera.to("meta")), other)
 
 
 def test_the_depth_of_other_views_may_be_missing(views):
-    anchor, other, _ = views
+    reference, other, _ = views
     blind = other.replace(depth=other.depth[:, :0, :0])
-    assert torch.equal(PAPER(anchor, blind, n=64).gate, PAPER(anchor, other, n=64).gate)
+    assert torch.equal(PAPER(reference, blind, n=64).gate, PAPER(reference, other, n=64).gate)
 
 
 def test_frames_of_several_precisions_give_one_answer(views):
-    anchor, *others = views
-    expected = PAPER(anchor, others[0], n=128)
-    for frames in ((anchor, double(others[0])), (double(anchor), others[0])):
+    reference, *others = views
+    expected = PAPER(reference, others[0], n=128)
+    for frames in ((reference, double(others[0])), (double(reference), others[0])):
         found = PAPER(*frames, n=128)
         assert found.depth.dtype == expected.depth.dtype
         both = found.keep & expected.keep
         assert both.sum() > 0.9 * expected.keep.sum() > 0
         assert torch.allclose(found.depth[both], expected.depth[both], rtol=1e-2)
-    wide = PAPER(anchor, others[0].replace(camera=others[0].camera.to(torch.float64)), n=128)
+    wide = PAPER(reference, others[0].replace(camera=others[0].camera.to(torch.float64)), n=128)
     assert wide.depth.dtype == torch.float64
-    mixed = AUTO(anchor, [others[0], double(others[1])], n=128)
+    mixed = AUTO(reference, [others[0], double(others[1])], n=128)
     assert mixed.depth.shape == (1, 128)
 
 
 def test_equal_precisions_stay_byte_for_byte(views):
-    anchor, others = validate_views(views[0], views[1])
-    assert anchor.image is views[0].image and others.image is views[1].image
-    anchor, others = validate_views(views[0], list(views[1:]))
+    reference, others = validate_views(views[0], views[1])
+    assert reference.image is views[0].image and others.image is views[1].image
+    reference, others = validate_views(views[0], list(views[1:]))
     assert others.image.dtype == torch.uint8 and others.image.shape == (2, 1, 3, 96, 128)
     assert isinstance(others, Frame)

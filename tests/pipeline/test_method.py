@@ -182,7 +182,7 @@ def test_a_pose_from_elsewhere_takes_the_place_of_seat_5(room):
 
 def test_the_front_end_looks_in_the_precision_of_the_intrinsics(room):
     for dtype in (torch.float32, torch.float64):
-        samples = PAPER.replace(n=16).look(room[0].to(dtype))
+        samples = PAPER.replace(n=16).sample_depth(room[0].to(dtype))
         assert samples.uv.dtype == samples.xyz.dtype == dtype
         assert torch.equal(samples.uv[0], spiral(room[0].hw, 16, dtype=dtype))
 

@@ -100,10 +100,10 @@ def test_the_truth_of_a_rig_is_that_of_its_cameras() -> None:
 def test_pairs_in_space_and_in_time() -> None:
     rig = robot()
     assert [tuple(p) for p in by_cameras(rig)][:3] == [(0, 1), (1, 0), (2, 3)]
-    assert [tuple(p) for p in by_cameras(rig, anchor="left")] == [(2 * k, 2 * k + 1) for k in range(6)]
-    mixed = by_cameras(rig, instants=[0, 1], anchor="right", stride=2)
+    assert [tuple(p) for p in by_cameras(rig, reference="left")] == [(2 * k, 2 * k + 1) for k in range(6)]
+    mixed = by_cameras(rig, instants=[0, 1], reference="right", stride=2)
     assert [tuple(p) for p in mixed] == [(1, (0, 2, 3)), (5, (2, 3, 4, 6, 7)), (9, (6, 7, 8, 10, 11))]
-    past = by_cameras(rig, instants=[0, 2], anchor="left", past=True)
+    past = by_cameras(rig, instants=[0, 2], reference="left", past=True)
     assert tuple(past[0]) == (0, 1) and tuple(past[3]) == (6, (2, 3, 7))
     assert spaced_frames(1, 0, 1) == [0]
     for options, said in (
@@ -187,7 +187,7 @@ def test_a_robots_cameras_are_measured_once() -> None:
     with pytest.raises(ValueError, match="places is 0"):
         estimate_rig_pose(left, right, places=0)
     trace: dict[str, Any] = {}
-    given = PAPER.replace(n=300, given=ConstantPose(found.T, found.cov))
+    given = PAPER.replace(n=300, pose_prior=ConstantPose(found.T, found.cov))
     estimate = given(left, right, trace=trace)
     assert (trace["fit"].code == PoseCode.OK).all() and estimate.keep.float().mean() > 0.5
     assert torch.equal(trace["fit"].T_1_from_0.t, found.T.t.expand(6, 3))
@@ -211,7 +211,7 @@ def test_a_sample_of_two_cameras_under_a_calibration() -> None:
     assert fixed is not None and fixed["dhtorch.pose_ok"]
     torch.testing.assert_close(fixed["dhtorch.T_1_from_0"], se3.to_matrix(TRUE)[0].float(), atol=1e-6, rtol=0)
     free = ExtendDepth(**keys)(sample)
-    assert free is not None and free["dhtorch.pose_ok"] and "dhtorch.pose_looks" not in free
+    assert free is not None and free["dhtorch.pose_ok"] and "dhtorch.pose_convention" not in free
     for wrong in ({"pose": matrix}, {"pose": [[1.0]], "pose_kind": "1_from_0"}, {"pose": 3, "pose_kind": "1_from_0"}):
         with pytest.raises(ValueError, match="pose: found"):
             ExtendDepth(**keys, **{"other_pose": "x"} | wrong)

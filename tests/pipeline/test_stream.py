@@ -17,7 +17,7 @@ from dhtorch.pytree import stack
 from dhtorch.records import Frame
 from dhtorch.synthetic import open_room
 
-FAST = MAP.replace(n=256, views=2, choose=select_views_by_preview)
+FAST = MAP.replace(n=256, views=2, select_views=select_views_by_preview)
 
 
 @pytest.fixture(scope="module")

@@ -19,26 +19,26 @@ METHOD = MAP.replace(n=N)
 
 @pytest.fixture(scope="module")
 def scene():
-    """A wall beyond the sensor between boards within its reach; the anchor, two other views, and what is known."""
+    """A wall beyond the sensor between boards within its reach; the reference view, two other views, and what is known."""
     boards = [Board(1.5, x=(-9, -0.35), seed=7), Board(1.5, y=(0.42, 9), seed=8), Board(3.0, seed=2)]
     small = {"hw": (60, 80), "f": 70.0}
     frames = [look(boards, at, **small)[0] for at in ((0.0, 0.0, 0.0), (0.15, 0.02, 0.01), (-0.04, 0.01, 0.0))]
-    anchor, *others = (range_split(frame, NEAR) for frame in frames)
+    reference, *others = (range_split(frame, NEAR) for frame in frames)
     fits = [exact_pose_fit(frames[0], frame, N) for frame in frames[1:]]
     cov = torch.diag(torch.tensor([1e-8] * 3 + [1e-6] * 3)).expand(1, 6, 6)
     estimates, samples = [], None
     for other, fit in zip(others, fits, strict=True):
         trace = {}
-        estimates.append(METHOD(anchor, other, fit=fit.replace(cov=cov), trace=trace))
+        estimates.append(METHOD(reference, other, fit=fit.replace(cov=cov), trace=trace))
         samples = trace["samples"]
     given = stack([fit.replace(cov=cov) for fit in fits])
-    return anchor, dense.SelectedViews(estimates[0], stack(others), stack(estimates), given, samples)
+    return reference, dense.SelectedViews(estimates[0], stack(others), stack(estimates), given, samples)
 
 
 def mapped(scene, **options):
-    anchor, asked = scene
+    reference, asked = scene
     with torch.no_grad():
-        return dense.sweep_depth(anchor, asked, **{"method": METHOD, "planes": 24, "partners": 1, **options})
+        return dense.sweep_depth(reference, asked, **{"method": METHOD, "planes": 24, "source_views": 1, **options})
 
 
 def only(asked, *views):
@@ -67,12 +67,12 @@ def test_the_wall_is_found(scene):
 
 
 def test_pixels_of_a_map_stand_for_what_they_cover(scene):
-    anchor, _ = scene
-    uv = dense.map_pixel_centres(anchor, (30, 40)).unflatten(0, (30, 40))
+    reference, _ = scene
+    uv = dense.map_pixel_centres(reference, (30, 40)).unflatten(0, (30, 40))
     assert uv[0, 0].tolist() == [0.5, 0.5] and uv[29, 39].tolist() == [78.5, 58.5] and uv[0, 1].tolist() == [2.5, 0.5]
-    picture, camera = dense.downscale_grey(anchor, 40)
-    torch.testing.assert_close(picture[0, 0, 3, 5], anchor.image[0, 0, 6:8, 10:12].mean())
-    torch.testing.assert_close(camera.c, (anchor.camera.c + 0.5) / 2 - 0.5)
+    picture, camera = dense.downscale_grey(reference, 40)
+    torch.testing.assert_close(picture[0, 0, 3, 5], reference.image[0, 0, 6:8, 10:12].mean())
+    torch.testing.assert_close(camera.c, (reference.camera.c + 0.5) / 2 - 0.5)
 
 
 def test_true_is_no_number():
@@ -81,26 +81,26 @@ def test_true_is_no_number():
 
 
 def test_what_the_motion_does_not_know_is_in_sigma(scene):
-    anchor, asked = scene
-    sure, unsure = mapped(scene), mapped((anchor, asked._replace(fits=asked.fits.replace(cov=400 * asked.fits.cov))))
+    reference, asked = scene
+    sure, unsure = mapped(scene), mapped((reference, asked._replace(fits=asked.fits.replace(cov=400 * asked.fits.cov))))
     both = (sure.source == Source.SWEPT) & (unsure.source == Source.SWEPT)
     assert both.sum() > 100 and float((unsure.sigma / sure.sigma)[both].median()) > 1.5
 
 
 def test_no_depth_is_surer_than_the_sensors_metre(scene):
-    anchor, asked = scene
+    reference, asked = scene
     samples = asked.samples.replace(sigma=0.03 * asked.samples.depth)
     share = masked_median(samples.sigma / samples.depth, samples.usable & (samples.depth > 0))
-    found = mapped((anchor, asked._replace(samples=samples)))
+    found = mapped((reference, asked._replace(samples=samples)))
     told = found.source == Source.SWEPT
     assert float(share) == pytest.approx(0.03, rel=1e-4)
     assert bool((found.sigma[told] >= 0.0299 * found.depth[told]).all())
 
 
 def test_what_moves_on_its_own_silences_every_pixel(scene):
-    anchor, asked = scene
+    reference, asked = scene
     gate = torch.where(asked.joined.keep, Gate.CONTRADICTED, asked.joined.gate)
-    found = mapped((anchor, asked._replace(joined=asked.joined.replace(gate=gate))))
+    found = mapped((reference, asked._replace(joined=asked.joined.replace(gate=gate))))
     silent = found.source == Source.NONE
     assert (
         silent.any()
@@ -110,16 +110,16 @@ def test_what_moves_on_its_own_silences_every_pixel(scene):
 
 
 def test_a_few_returns_refute_no_motion(scene):
-    anchor, asked = scene
+    reference, asked = scene
     fits = asked.fits.replace(T_1_from_0=asked.fits.T_1_from_0.replace(t=1.5 * asked.fits.T_1_from_0.t))
     wrong = asked._replace(fits=fits)
-    refuted = mapped((anchor, wrong))
+    refuted = mapped((reference, wrong))
     silent = refuted.gate[refuted.source == Source.NONE]
     assert not bool((refuted.source == Source.SWEPT).any()) and bool((silent == Gate.CONTRADICTED).any())
-    few = torch.zeros_like(anchor.depth)
-    few[:, 10:14, :30] = anchor.depth[:, 10:14, :30]
+    few = torch.zeros_like(reference.depth)
+    few[:, 10:14, :30] = reference.depth[:, 10:14, :30]
     assert 20 < int((few > 0).sum()) < dense.MIN_OVERLAP_PIXELS
-    assert bool((mapped((anchor.replace(depth=few), wrong)).source == Source.SWEPT).any())
+    assert bool((mapped((reference.replace(depth=few), wrong)).source == Source.SWEPT).any())
 
 
 def test_a_pixel_that_fits_elsewhere_as_well_is_silent(scene, monkeypatch):
@@ -132,31 +132,31 @@ def test_a_pixel_that_fits_elsewhere_as_well_is_silent(scene, monkeypatch):
 
 def test_a_rival_is_a_place_that_costs_nearly_as_little(scene, monkeypatch):
     """Costs made by hand: one plane that fits, and another far away that fits as well, or not at all."""
-    anchor, asked = scene
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(anchor, 80))
+    reference, asked = scene
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, 80))
     index, wanted = dense.top_views(asked, 1)
-    partner = [dense.source_view_of(asked, index[0], 80, wanted[0], base.image)]
+    source_view = [dense.source_view_of(asked, index[0], 80, wanted[0], base.image)]
     q = torch.linspace(0, 1, 32)[None]
     for second, alone in ((0, False), (25, True)):
         costs = torch.full((1, *base.hw, 32), 30, dtype=torch.uint8)
         costs[..., 8], costs[..., 28] = 0, second
         monkeypatch.setattr(surface, "_costs", lambda *_, costs=costs: costs)
-        found = surface.sweep_planes(base, partner, q)
+        found = surface.sweep_planes(base, source_view, q)
         assert bool((found.alone == alone).all())
         torch.testing.assert_close(found.q, torch.full_like(found.q, 8 / 31), atol=0.5 / 31, rtol=0)
 
 
 def test_how_far_away_is_elsewhere_says_the_view_that_moves_most(scene, monkeypatch):
-    anchor, asked = scene
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(anchor, 80))
+    reference, asked = scene
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, 80))
     q = torch.linspace(0, 1, 24)[None]
     each = [dense.source_view_of(asked, torch.tensor([v]), 80, torch.tensor([True]), base.image) for v in (0, 1)]
     reach, rivals = [], plane_sweep.second_best_margin
     monkeypatch.setattr(
         plane_sweep, "second_best_margin", lambda some, best, far: reach.append(float(far)) or rivals(some, best, far)
     )
-    for partners in ([each[0]], [each[1]], each):
-        surface.sweep_planes(base, partners, q)
+    for source_views in ([each[0]], [each[1]], each):
+        surface.sweep_planes(base, source_views, q)
     assert reach[0] < reach[1] and reach[2] == reach[0]
 
 
@@ -168,16 +168,16 @@ def test_what_a_nearer_surface_hides_is_not_found(scene, monkeypatch):
 
 
 def test_views_that_are_of_no_use_to_one_of_a_batch_say_nothing_of_it(scene):
-    anchor, asked = scene
-    alone, both = mapped((anchor, only(asked, 0))), mapped(scene, partners=2)
+    reference, asked = scene
+    alone, both = mapped((reference, only(asked, 0))), mapped(scene, source_views=2)
     assert not equal(alone, both), "the second view says something"
-    assert equal(mapped((anchor, lost(asked, 1)), partners=2), alone)
+    assert equal(mapped((reference, lost(asked, 1)), source_views=2), alone)
     twice = asked._replace(
         joined=collate([asked.joined] * 2),
         samples=collate([asked.samples] * 2),
         **{k: getattr(asked, k)[:, [0, 0]] for k in ("frames", "estimates", "fits")},
     )
-    found = mapped((collate([anchor] * 2), lost(twice, 1, 0)), partners=2)
+    found = mapped((collate([reference] * 2), lost(twice, 1, 0)), source_views=2)
     assert equal(found[:1], alone) and equal(found[1:], both)
 
 
@@ -196,9 +196,9 @@ def test_one_view_in_which_a_pixel_fits_is_enough(scene, monkeypatch):
     def of_the_second(view, f):
         return f._replace(correlation=0 * f.correlation + 0.6) if view.T_1_from_0.t[0, 0] > 0 else f
 
-    plain = mapped(scene, partners=2)
+    plain = mapped(scene, source_views=2)
     changed(monkeypatch, of_the_second)
-    found = mapped(scene, partners=2)
+    found = mapped(scene, source_views=2)
     assert int((found.source == Source.SWEPT).sum()) > 0.6 * int((plain.source == Source.SWEPT).sum()) > 100
 
 
@@ -211,14 +211,14 @@ def test_pixels_of_a_window_err_together(scene, monkeypatch):
 
 
 def test_a_fit_moves_a_pixel_no_further_than_a_few_planes(scene, monkeypatch):
-    anchor, asked = scene
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(anchor, 80))
-    partner = [dense.source_view_of(asked, torch.tensor([0]), 80, torch.tensor([True]), base.image)]
+    reference, asked = scene
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, 80))
+    source_view = [dense.source_view_of(asked, torch.tensor([0]), 80, torch.tensor([True]), base.image)]
     q = torch.linspace(0, 1, 24)[None]
-    start = surface.sweep_planes(base, partner, q)
+    start = surface.sweep_planes(base, source_view, q)
     changed(monkeypatch, lambda _view, f: f._replace(step=1e4 * f.step))
     with torch.no_grad():
-        found = surface.refine_surface(base, partner, start, q, 2)
+        found = surface.refine_surface(base, source_view, start, q, 2)
     assert (
         float((found.q - start.q).abs().max()) * 23
         < surface.MAX_TOTAL_PLANES + surface.MAX_STEP_PLANES + surface.SURFACE_PLANES
@@ -228,9 +228,9 @@ def test_a_fit_moves_a_pixel_no_further_than_a_few_planes(scene, monkeypatch):
 @pytest.mark.parametrize(("views", "planes"), [((1,), 1.0), ((0, 1), 0.5)])
 def test_a_view_that_goes_astray_asks_for_no_more_than_a_plane(views, planes, scene, monkeypatch):
     """The second view asks for a place far away, the first, as sure, for none: they meet in between."""
-    anchor, asked = scene
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(anchor, 80))
-    partners = [dense.source_view_of(asked, torch.tensor([v]), 80, torch.tensor([True]), base.image) for v in views]
+    reference, asked = scene
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, 80))
+    source_views = [dense.source_view_of(asked, torch.tensor([v]), 80, torch.tensor([True]), base.image) for v in views]
     q = torch.linspace(0, 1, 24)[None]
     start = surface.SweptSurface(torch.full((1, *base.hw), 0.4), torch.zeros(1, *base.hw), torch.tensor(True))
     even = dict.fromkeys(("contrast", "noise", "correlation"), torch.ones(1, *base.hw))
@@ -240,14 +240,14 @@ def test_a_view_that_goes_astray_asks_for_no_more_than_a_plane(views, planes, sc
 
     changed(monkeypatch, astray)
     with torch.no_grad():
-        found = surface.refine_surface(base, partners, start, q, 1)
+        found = surface.refine_surface(base, source_views, start, q, 1)
     assert float((found.q - start.q).median()) * 23 == pytest.approx(planes * surface.MAX_STEP_PLANES, rel=1e-3)
 
 
 def test_what_a_motion_does_not_know_of_a_depth_is_its_derivative_along_the_line(scene):
     """How far the depth must go for a pixel to stay where it is seen, for each of six displacements of the pose."""
-    anchor, asked = scene
-    base = plane_sweep.make_reference_view(*(x.to(torch.float64) for x in dense.downscale_grey(anchor, 80)))
+    reference, asked = scene
+    base = plane_sweep.make_reference_view(*(x.to(torch.float64) for x in dense.downscale_grey(reference, 80)))
     view = dense.source_view_of(asked, torch.tensor([0]), 80, torch.tensor([True]), base.image).view.to(torch.float64)
     A = torch.randn(6, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     cov, q = (A @ A.T)[None], torch.full((1, *base.hw), 0.3, dtype=torch.float64)

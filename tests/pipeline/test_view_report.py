@@ -1,4 +1,4 @@
-"""Frames offered around an anchor: who chooses, what is chosen, why, and what a job, a map and a word make of it."""
+"""Frames offered around a reference view: who chooses, what is chosen, why, and what a job, a map and a word make of it."""
 
 import logging
 import math
@@ -25,7 +25,7 @@ from dhtorch.synthetic import SyntheticRoom
 N = 256
 SMALL = {"paper": PAPER, "map": MAP, "window": WINDOW.replace(views=2), "auto": AUTO.replace(views=2)}
 SMALL = {name: method.replace(n=N) for name, method in SMALL.items()}
-OFFERED = partial(by_choice, steps=(1, 2, 4), stride=3)  # anchors 0 and 3 of five frames
+OFFERED = partial(by_choice, steps=(1, 2, 4), stride=3)  # reference views 0 and 3 of five frames
 
 
 @pytest.fixture(scope="module")
@@ -46,19 +46,19 @@ def test_every_method_chooses_among_what_is_offered(outcome):
         (i, j), views = row["pair"], row["views"]
         assert len(views) == SMALL[row["method"]].views and set(views) <= offered[i] and views == sorted(views)
         assert j == views[-1], "tracks and pose of the row are those of the last"
-        assert row["why"]["n_offered"] == 3 and len(row["why"]["worth"]) == len(views)
-        assert max(row["why"]["worth"]) > 0 and 0 <= row["why"]["n_mute"] < 3
+        assert row["why"]["n_offered"] == 3 and len(row["why"]["gain"]) == len(views)
+        assert max(row["why"]["gain"]) > 0 and 0 <= row["why"]["n_no_answer"] < 3
     of = {name: [r["views"] for r in rows if r["method"] == name] for name in SMALL}
     assert of["paper"] == of["map"] and of["window"] == of["auto"], "all choose alike"
     assert all(one[0] in two for one, two in zip(of["map"], of["auto"], strict=True)), "the best is chosen first"
 
 
 def test_a_single_view_answers_as_the_pair_does(room):
-    anchor, others = room[0], [room[k] for k in (1, 2, 4)]
+    reference, others = room[0], [room[k] for k in (1, 2, 4)]
     trace = {}
-    found = with_view_selection(SMALL["map"])(anchor, stack(others), trace=trace)
+    found = with_view_selection(SMALL["map"])(reference, stack(others), trace=trace)
     k = int(trace["choice"].index[0, 0])
-    alone = SMALL["map"](anchor, others[k])
+    alone = SMALL["map"](reference, others[k])
     for name in ("depth", "sigma", "gate", "score"):
         assert torch.equal(getattr(found, name).nan_to_num(), getattr(alone, name).nan_to_num()), name
     assert bool(found.keep.any())
@@ -84,7 +84,7 @@ def test_what_chooses_for_itself_is_asked_as_it_is():
     assert with_view_selection(AUTO) is AUTO
     for method in (PAPER, MAP, WINDOW):
         assert (
-            with_view_selection(method).choose is select_views_by_preview
+            with_view_selection(method).select_views is select_views_by_preview
             and with_view_selection(method).views == method.views
         )
         assert not with_view_selection(method).chain, "views lie on both sides: none says where the next search begins"
@@ -92,11 +92,11 @@ def test_what_chooses_for_itself_is_asked_as_it_is():
 
 def test_a_seat_may_give_indices_alone(room):
     last = SMALL["map"].replace(
-        choose=lambda _anchor, others, views, *, fit: torch.full((views, 1), len(others.image) - 1)
+        select_views=lambda _anchor, others, views, *, fit: torch.full((views, 1), len(others.image) - 1)
     )
     trace = {}
     last(room[0], stack([room[k] for k in (1, 2, 4)]), trace=trace)
-    assert trace["choice"].index.tolist() == [[2]] and trace["choice"].worth is None
+    assert trace["choice"].index.tolist() == [[2]] and trace["choice"].gain is None
     assert str(report_selection(0, (1, 2, 4), trace)) == "frame 0: view 4, chosen of 3"
 
 
@@ -106,29 +106,29 @@ def test_why_is_said_in_one_line(caplog):
     )
     with caplog.at_level(logging.DEBUG, "dhtorch"):
         found = report_selection(12, (4, 9, 20, 31), {"choice": choice})
-    line = "frame 12: views 4, 31, chosen of 4 (worth 12.3, 310; 1 had no baseline or no pose)"
+    line = "frame 12: views 4, 31, chosen of 4 (gain 12.3, 310; 1 had no baseline or no pose)"
     assert [r.getMessage() for r in caplog.records] == [line] == [str(found)]
-    assert found.row() == {"views": [4, 31], "why": {"n_offered": 4, "worth": [12.35, 310.4], "n_mute": 1}}
+    assert found.row() == {"views": [4, 31], "why": {"n_offered": 4, "gain": [12.35, 310.4], "n_no_answer": 1}}
     assert report_selection(0, (1,), {}) == ViewReport(0, (1,), 1) and str(report_selection(0, (1,), {})).endswith(
         "1, all that were offered"
     )
 
 
 def test_each_anchor_of_a_batch_is_told_of_its_own():
-    index, worth = torch.tensor([[0, 1], [3, 2]]), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
-    mute = torch.tensor([[False, True]] * 4)
-    found = report_selection(7, (4, 9, 20, 31), {"choice": ViewSelection(index, worth, mute)}, b=1)
+    index, gain = torch.tensor([[0, 1], [3, 2]]), torch.tensor([[1.0, 2.0], [3.0, 4.0]])
+    no_answer = torch.tensor([[False, True]] * 4)
+    found = report_selection(7, (4, 9, 20, 31), {"choice": ViewSelection(index, gain, no_answer)}, b=1)
     assert found == ViewReport(7, (9, 20), 4, (2.0, 4.0), 4)
 
 
 def test_what_a_view_adds_and_which_say_nothing(room):
     choice = select_views_by_preview(
         room[0], stack([room[k] for k in (0, 1, 2, 4)]), 3
-    )  # the anchor itself has no baseline
-    assert choice.mute[0, 0] and not choice.mute[3, 0] and choice.index[:, 0].tolist() == [1, 2, 3]
+    )  # the reference view itself has no baseline
+    assert choice.no_answer[0, 0] and not choice.no_answer[3, 0] and choice.index[:, 0].tolist() == [1, 2, 3]
     one = select_views_by_preview(room[0], stack([room[k] for k in (0, 1, 2, 4)]), 1)
     best = int(one.index[0, 0])
-    assert float(choice.worth[best - 1, 0]) == float(one.worth[0, 0]) == float(choice.worth.max())
+    assert float(choice.gain[best - 1, 0]) == float(one.gain[0, 0]) == float(choice.gain.max())
 
 
 def test_experiments_that_cannot_choose_say_what_to_say(room):
@@ -141,7 +141,7 @@ def test_two_frames_are_each_others_view():
     two = SyntheticRoom(hw=(120, 160), n_frames=2, supersample=1, step_m=0.08, lidar="exact")
     found = pair.run([noted(two)], {"auto": SMALL["auto"]}, by_choice, protocol.Settings(cutoff=math.inf))
     rows = [r for r in found.rows if r["pair"] is not None]
-    assert [(r["pair"], r["views"], r["why"]["worth"]) for r in rows] == [([0, 1], [1], None), ([1, 0], [0], None)]
+    assert [(r["pair"], r["views"], r["why"]["gain"]) for r in rows] == [([0, 1], [1], None), ([1, 0], [0], None)]
 
 
 def test_what_is_shown_is_the_last_view_that_was_asked(room):

@@ -17,7 +17,7 @@ from dhtorch.stages.score import confidence_from_sigma
 from dhtorch.synthetic import open_room
 
 
-def one_point(q, variance, weight_of, *, max_chi2, max_against):
+def one_point(q, variance, weight_of, *, max_chi2, max_conflict_ratio):
     """Indices of the views that stand together, and whether the others silence them."""
     best, stand = -1.0, []
     for v in range(len(q)):
@@ -26,7 +26,7 @@ def one_point(q, variance, weight_of, *, max_chi2, max_against):
         if support > best:
             best, stand = support, side
     mine = sum(weight_of[u] for u in stand)
-    return stand, sum(weight_of) - mine > max_against * mine
+    return stand, sum(weight_of) - mine > max_conflict_ratio * mine
 
 
 @pytest.mark.parametrize(
@@ -34,15 +34,21 @@ def one_point(q, variance, weight_of, *, max_chi2, max_against):
     [
         {},
         {"max_chi2": 1.0},
-        {"max_against": 0.0},
-        {"max_against": 10.0},
+        {"max_conflict_ratio": 0.0},
+        {"max_conflict_ratio": 10.0},
         {"sure_rel": 0.0},
         {"max_sigma_rel": 0.03},
         {"sure_rel_each": 0.01},
     ],
 )
 def test_views_are_joined_as_a_loop_over_points_joins_them(options):
-    o = {"max_chi2": 9.0, "max_against": 0.25, "sure_rel": 0.05, "sure_rel_each": 0.08, "max_sigma_rel": 0.2} | options
+    o = {
+        "max_chi2": 9.0,
+        "max_conflict_ratio": 0.25,
+        "sure_rel": 0.05,
+        "sure_rel_each": 0.08,
+        "max_sigma_rel": 0.2,
+    } | options
     views = views_of(spread=3.0, N=60)
     found = fuse_consistent(views, **options)
     seen = set()
@@ -62,7 +68,9 @@ def test_views_are_joined_as_a_loop_over_points_joins_them(options):
             assert gate == views.gate[-1, b, k] and found.n_views[b, k] == 1
             continue
         sure = [x * x / s for x, s in zip(q, variance, strict=True)]
-        stand, against = one_point(q, variance, sure, max_chi2=o["max_chi2"], max_against=o["max_against"])
+        stand, against = one_point(
+            q, variance, sure, max_chi2=o["max_chi2"], max_conflict_ratio=o["max_conflict_ratio"]
+        )
         assert found.n_views[b, k] == len(stand) + 1
         total = sum(weight[u] for u in stand)
         mean = sum(weight[u] * q[u] for u in stand) / total
@@ -122,7 +130,7 @@ def test_where_most_views_stand_still_none_is_believed():
         gate[:still, 1, 2] = Gate.NO_BASELINE
         found = fuse_consistent(views.replace(gate=gate), sure_rel=1.0)
         assert bool((found.gate[1] == Gate.NO_BASELINE).all()) == silenced and bool((found.gate[0] == 0).all())
-    assert bool((fuse_consistent(views.replace(gate=gate), max_still=1.0, sure_rel=1.0).gate[0] == 0).all())
+    assert bool((fuse_consistent(views.replace(gate=gate), max_static_ratio=1.0, sure_rel=1.0).gate[0] == 0).all())
 
 
 def test_a_single_partner_is_its_own_answer_and_none_is_refused():
@@ -186,25 +194,25 @@ def room():
 @pytest.mark.slow
 def test_small_pictures_choose_views_as_large_ones_do(room):
     frames = [room[k] for k in (0, 1, 2, 4, 6, 9)]
-    anchor = frames[0]
-    candidates = stack([*frames[1:], frames[0]])  # the anchor itself is among them and says nothing
-    chosen = select_views_by_preview(anchor, candidates, 2).index
+    reference = frames[0]
+    candidates = stack([*frames[1:], frames[0]])  # the reference view itself is among them and says nothing
+    chosen = select_views_by_preview(reference, candidates, 2).index
     assert chosen.shape == (2, 1) and bool((chosen[:-1] < chosen[1:]).all())
     assert 5 not in chosen[:, 0].tolist()
-    again = select_views_by_preview(anchor, candidates, 2, long=120).index
+    again = select_views_by_preview(reference, candidates, 2, long=120).index
     assert len(set(again[:, 0].tolist()) & set(chosen[:, 0].tolist())) >= 1
     with pytest.raises(ValueError, match="views is 9"):
-        select_views_by_preview(anchor, candidates, 9)
+        select_views_by_preview(reference, candidates, 9)
 
 
 def test_each_anchor_of_a_batch_gets_its_own(room):
-    anchors = [room[0], room[11]]
+    references = [room[0], room[11]]
     others = [[room[k] for k in ks] for ks in ((1, 3, 6, 9), (10, 8, 5, 2))]
     both = select_views_by_preview(
-        collate(anchors), stack([collate(list(pair)) for pair in zip(*others, strict=True)]), 2
+        collate(references), stack([collate(list(pair)) for pair in zip(*others, strict=True)]), 2
     ).index
     for b in range(2):
-        assert select_views_by_preview(anchors[b], stack(others[b]), 2).index[:, 0].tolist() == both[:, b].tolist()
+        assert select_views_by_preview(references[b], stack(others[b]), 2).index[:, 0].tolist() == both[:, b].tolist()
 
 
 def test_a_small_frame_sees_the_same_rays(room):
@@ -227,7 +235,7 @@ def test_a_small_picture_is_no_reason_to_be_less_sure(room):
     large, little = (
         select_views_by_preview(frames[0], stack(frames[1:]), 3, long=n, good_sigma_rel=1e-4) for n in (400, 160)
     )
-    ratio = little.worth / large.worth
+    ratio = little.gain / large.gain
     assert bool((ratio > 1 / 3).all() and (ratio < 3).all()), ratio
 
 

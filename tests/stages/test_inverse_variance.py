@@ -54,7 +54,7 @@ def views_of(V=4, B=2, N=30, seed=0, silent=0.3, spread=1.0):
     )
 
 
-def plain_fusion(views, *, min_views=2, max_chi2=9.0, correlation=1.0, max_sigma_rel=0.1, max_still=0.5):
+def plain_fusion(views, *, min_views=2, max_chi2=9.0, correlation=1.0, max_sigma_rel=0.1, max_static_ratio=0.5):
     """{field: array (B, N)} by a loop over the points."""
     V, B, N = views.gate.shape
     get = {name: getattr(views, name).numpy() for name in (*FIELDS, "gate")}
@@ -76,7 +76,7 @@ def plain_fusion(views, *, min_views=2, max_chi2=9.0, correlation=1.0, max_sigma
             else at["residual_px"][-1]
         )
         silent = [int(g) for g in at["gate"] if g]
-        if sum((get["gate"][v, b] == Gate.NO_BASELINE).any() for v in range(V)) > max_still * V:
+        if sum((get["gate"][v, b] == Gate.NO_BASELINE).any() for v in range(V)) > max_static_ratio * V:
             gate = Gate.NO_BASELINE
         elif len(said) < min(max(min_views, 1), V):
             gate = silent[-1]
@@ -192,12 +192,12 @@ def test_one_view_is_its_own_answer_and_none_is_refused():
 
 
 def test_a_standstill_is_what_more_than_the_share_of_views_say():
-    """Even of one point of the anchor; and of each anchor for itself."""
+    """Even of one point of the reference view; and of each reference view for itself."""
     views = views_of(V=4, B=2, N=5, silent=0.0, spread=0.1)
     for n, share, still in ((2, 0.5, False), (3, 0.5, True), (1, 0.25, False), (2, 0.25, True), (4, 1.0, False)):
         gate = views.gate.clone()
         gate[:n, 1, 3] = Gate.NO_BASELINE
-        found = inverse_variance(views.replace(gate=gate), max_still=share, max_sigma_rel=None, min_views=1)
+        found = inverse_variance(views.replace(gate=gate), max_static_ratio=share, max_sigma_rel=None, min_views=1)
         assert (found.gate[0] == 0).all() and bool((found.gate[1] == Gate.NO_BASELINE).all()) == still, (n, share)
         assert torch.equal(found.depth.isnan(), found.gate != 0) and torch.equal(found.score, found.keep.double())
 
@@ -258,7 +258,7 @@ def test_what_a_view_adds_stands_beside_it():
             added[best], known = gains[best], known + worth[best, b]
             left.remove(best)
         assert choice.index[:, b].tolist() == sorted(added)
-        assert choice.worth[:, b].tolist() == pytest.approx([added[v] for v in sorted(added)])
+        assert choice.gain[:, b].tolist() == pytest.approx([added[v] for v in sorted(added)])
 
 
 def test_answers_without_a_sigma_add_nothing():
@@ -282,7 +282,7 @@ class Seats:
     """Seats that remember what they were given; view k of the window is known by its picture."""
 
     def __init__(self, V=3, n=8):
-        self.anchor, self.others = frame(), stack([frame(seed=10 + k) for k in range(V)])
+        self.reference, self.others = frame(), stack([frame(seed=10 + k) for k in range(V)])
         self.n, self.calls, self.asked = n, [], {"track": [], "pose": [], "triangulate": []}
         self.uv = 10 + rand(2, n, 2, seed=30, high=40).float()
         self.answers = views_of(V=V, N=n, silent=0.2, spread=0.2).to(torch.float32)
@@ -340,11 +340,11 @@ class Seats:
 
 def test_the_anchor_is_sampled_once_and_every_view_is_a_pair_with_it():
     seats, trace = Seats(), {}
-    found = extend_window(seats.anchor, seats.others, **seats.seats(), seed=4, trace=trace)
+    found = extend_window(seats.reference, seats.others, **seats.seats(), seed=4, trace=trace)
     names = [call[0] for call in seats.calls]
     assert names == ["sample", "backproject", "classify", "score"]
     assert seats.calls[0][1:] == (HW, 8, {"device": torch.device("cpu"), "dtype": torch.float32})
-    assert seats.calls[1][1].image is seats.anchor.image and seats.calls[2][1].image is seats.anchor.image
+    assert seats.calls[1][1].image is seats.reference.image and seats.calls[2][1].image is seats.reference.image
     assert [k for k, *_ in seats.asked["track"]] == [0, 1, 2]
     ((samples, tracks, draws),) = seats.asked["pose"]
     assert (samples.hole == 3).all(), "what classify made of the samples"
@@ -366,7 +366,7 @@ def test_the_anchor_is_sampled_once_and_every_view_is_a_pair_with_it():
 
 def test_every_anchor_has_its_own_draws_in_all_its_views():
     seats = Seats()
-    extend_window(seats.anchor, seats.others, **seats.seats(), seed=torch.tensor([4, 9]))
+    extend_window(seats.reference, seats.others, **seats.seats(), seed=torch.tensor([4, 9]))
     ((_, _, draws),) = seats.asked["pose"]
     assert torch.equal(draws, uniform_draws(torch.tensor([4, 9] * 3), 6, 5).float())
     assert not torch.equal(draws[0], draws[1])
@@ -374,7 +374,7 @@ def test_every_anchor_has_its_own_draws_in_all_its_views():
 
 def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pace():
     seats = Seats(V=4)
-    extend_window(seats.anchor, seats.others, **seats.seats())
+    extend_window(seats.reference, seats.others, **seats.seats())
     starts = [hint.start for *_, hint in seats.asked["track"]]
     assert starts[0] is None
     for k in (1, 2, 3):
@@ -385,16 +385,16 @@ def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pa
             torch.testing.assert_close(starts[k][b, i], expected)
     assert not last.valid.all() and last.valid.any()
     alone = Seats(V=4)
-    extend_window(alone.anchor, alone.others, **alone.seats(), chain=False)
+    extend_window(alone.reference, alone.others, **alone.seats(), chain=False)
     assert all(hint.start is None for *_, hint in alone.asked["track"])
 
 
 def test_the_anchors_pyramid_is_built_once_for_every_view():
     seats = Seats()
-    extend_window(seats.anchor, seats.others, **seats.seats(), hint=TrackHint(levels=3))
+    extend_window(seats.reference, seats.others, **seats.seats(), hint=TrackHint(levels=3))
     first, *others = (hint for *_, hint in seats.asked["track"])
     assert all(hint.pyramid is first.pyramid and hint.levels == 3 for hint in others)
-    made, expected = first.pyramid(2, 7), build_pyramid(seats.anchor.image, 2, 7)
+    made, expected = first.pyramid(2, 7), build_pyramid(seats.reference.image, 2, 7)
     assert first.pyramid(2, 7) is made and first.pyramid(1, 7) is not made
     leaves = [torch.utils._pytree.tree_leaves(x) for x in (made, expected)]
     assert len(leaves[0]) == len(leaves[1]) > 2
@@ -422,12 +422,12 @@ def test_a_chain_changes_the_start_and_not_what_is_searched_for(track):
 
 
 def test_of_more_views_the_key_views_are_asked_again_with_their_own_poses():
-    """They are chosen by few of the samples: each anchor has its own choice."""
+    """They are chosen by few of the samples: each reference view has its own choice."""
     n = 512
     seats = Seats(V=5, n=n)
     fits = stack(seats.fits)
     known = rank_views(seats.answers[:, :, ::2], 2).index
-    assert not torch.equal(known[:, 0], known[:, 1]), "the two anchors choose otherwise"
+    assert not torch.equal(known[:, 0], known[:, 1]), "the two reference views choose otherwise"
     options = seats.seats() | {"track": lambda image_0, image_1, uv, hint: seats.tracks(0, uv)}
     asked = []
 
@@ -438,7 +438,7 @@ def test_of_more_views_the_key_views_are_asked_again_with_their_own_poses():
 
     trace = {}
     options |= {"triangulate": triangulate, "views": 2, "fit": fits, "trace": trace}
-    extend_window(seats.anchor, seats.others, **options)
+    extend_window(seats.reference, seats.others, **options)
     (probes, first), (uv, second) = asked
     assert probes.shape == (10, n // 2, 2) and uv.shape == (4, n, 2), "256 samples, every second"
     assert torch.equal(probes[:2], seats.uv[:, ::2]) and len(trace["views"]) == 2
@@ -460,7 +460,7 @@ def test_five_views_are_used_by_default_and_as_many_as_asked_for_are_not_chosen_
         given["triangulate"] = lambda samples, *_, seats=seats: seats.answers.map(
             lambda x: x.flatten(0, 1)[: len(samples.uv), : samples.uv.shape[1]]
         )
-        extend_window(seats.anchor, seats.others, **given, **options)
+        extend_window(seats.reference, seats.others, **given, **options)
         assert len(count) == asked, (V, options)
 
 
@@ -472,7 +472,7 @@ def test_the_trace_sums_the_milliseconds_over_the_views(monkeypatch):
     times = itertools.accumulate(itertools.count(1))
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(times)))
     seats, trace = Seats(), {}
-    extend_window(seats.anchor, seats.others, **seats.seats(), trace=trace)
+    extend_window(seats.reference, seats.others, **seats.seats(), trace=trace)
     assert trace["ms"] == expected
 
 
@@ -482,7 +482,7 @@ def test_what_a_window_asks_by_default():
     given = {k: v for k, v in seats.seats().items() if k != "hypotheses"}
     texture = torch.where(torch.arange(seats.n) % 2 == 0, 1.01e-5, 0.99e-5).expand(2, -1)
     given["classify"] = lambda _, samples: samples.replace(trackability=texture)
-    extend_window(seats.anchor, seats.others, **given)
+    extend_window(seats.reference, seats.others, **given)
     ((_, tracks, draws),) = seats.asked["pose"]
     for k in range(3):
         of_view = slice(2 * k, 2 * k + 2)
@@ -496,6 +496,6 @@ def test_a_samples_texture_is_asked_in_every_view():
     seats.answers = seats.answers.replace(gate=gate)
     for limit, reason in ((1.0, Gate.NO_TRACK), (1.01, Gate.NO_TEXTURE)):
         seats.asked["track"].clear()
-        found = extend_window(seats.anchor, seats.others, **seats.seats(), min_trackability=limit)
+        found = extend_window(seats.reference, seats.others, **seats.seats(), min_trackability=limit)
         last = seats.tracks(2, seats.uv).valid
         assert (found.gate[last] == reason).all() and (found.gate[~last] == Gate.NO_TRACK).all()

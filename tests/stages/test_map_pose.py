@@ -85,7 +85,7 @@ def test_exact_tracks_give_the_exact_pose(planar):
     args, T, _, _ = pairs(4, 12, 30, noise=0.0, depth=0.0, planar=planar)
     fit = map_pose(*args)
     assert (fit.code == PoseCode.OK).all() and fit.inlier[:, :12].all() and not fit.inlier[:, 12:].any()
-    assert errors(fit, T).abs().max() < 1e-8 and fit.shutter.turn.abs().max() < 1e-8
+    assert errors(fit, T).abs().max() < 1e-8 and fit.shutter.shutter_rate.abs().max() < 1e-8
 
 
 def test_far_tracks_and_weights_beat_near_points_alone():
@@ -101,7 +101,7 @@ def test_far_tracks_and_weights_beat_near_points_alone():
 def test_covariance_is_that_of_the_errors(trials, band):
     """Trials with the assumed noise: the mean of the normalised squared error lies in the band of chi² / 6."""
     args, T, _, _ = pairs(trials, 60, 140)
-    fit = map_pose(*args, turn_sigma=0.0, isotropic=0.0)
+    fit = map_pose(*args, shutter_sigma=0.0, isotropic=0.0)
     assert (fit.code == PoseCode.OK).all()
     assert abs(nees(fit, T).mean() - 1) < band  # 1.96 of its deviations are 1.96 sqrt(2 / (6 trials))
     assert abs(fit.sigma_px.mean() / (0.3 * 2.5**0.5) - 1) < 0.05  # the shapes' median mean variance is 2.5
@@ -123,12 +123,12 @@ def test_sigma_is_the_spread_of_far_depths():
 def newton_step(args, fit, o, isotropic):
     """Of one pair: how far the written-out problem (``support/dense_reprojection.py``) would still go from the answer, in its deviations."""
     problem = dense.problem_of(args, isotropic)
-    at = dense.unknowns(fit.T_1_from_0.R, fit.T_1_from_0.t, fit.shutter.turn)
+    at = dense.unknowns(fit.T_1_from_0.R, fit.T_1_from_0.t, fit.shutter.shutter_rate)
     tracks = dense.tracks(problem, at, map_estimate.estimate_noise_variance(problem, at))
     weights = [dense.weight(x.square, o.kernel, o.bend)[1] * (x.near + o.far_weight * x.far) for x in tracks]
     H, g = dense.reduced(tracks, weights)
-    known = np.diag([0.0] * 6 + [o.turn_sigma**-2 if fit.shutter.turn.abs().amax() > 1e-9 else 1e18] * 3)
-    step = np.linalg.solve(H + known, g + known @ np.append(np.zeros(6), at.turn[0].numpy()))
+    known = np.diag([0.0] * 6 + [o.shutter_sigma**-2 if fit.shutter.shutter_rate.abs().amax() > 1e-9 else 1e18] * 3)
+    step = np.linalg.solve(H + known, g + known @ np.append(np.zeros(6), at.shutter_rate[0].numpy()))
     return np.abs(step[:6] / np.sqrt(np.diag(np.linalg.inv(H + known)))[:6]).max()
 
 
@@ -141,20 +141,22 @@ def newton_step(args, fit, o, isotropic):
         (0.1, {"bend": 0.7}),
         (0.1, {"kernel": "huber", "bend": 0.7}),
         (0.1, {"kernel": None}),
-        (0.1, {"turn_sigma": 0.002, "turn_gain": -1.0}),
+        (0.1, {"shutter_sigma": 0.002, "shutter_gain": -1.0}),
     ],
 )
 def test_the_answer_is_the_optimum_of_the_problem_that_its_options_describe(isotropic, options):
     """And not the optimum of the default's, so every option reaches the problem."""
     args, *_ = pairs(1, 20, 40, depth=0.01 if "bend" in options else 0.03, turn=0.002, seed=2)
-    base = map_estimate.FitOptions(max_rise=10.0, near_steps=8, steps=16, turn_sigma=0.0, translation_gain=-9.0)
+    base = map_estimate.FitOptions(max_rise=10.0, near_steps=8, steps=16, shutter_sigma=0.0, translation_gain=-9.0)
     o = base._replace(**options)
     fit = map_pose(*args, isotropic=isotropic, **o._asdict())
-    assert fit.code.tolist() == [PoseCode.OK] and (fit.shutter.turn.abs().amax() > 1e-5) == (o.turn_sigma > 0)
+    assert fit.code.tolist() == [PoseCode.OK] and (fit.shutter.shutter_rate.abs().amax() > 1e-5) == (
+        o.shutter_sigma > 0
+    )
     assert newton_step(args, fit, o, isotropic) < 0.1
     if options or isotropic != 0.1:
         plain = map_pose(*args, **base._asdict())
-        assert newton_step(args, plain, o, isotropic) > 0.2 or o.turn_sigma > 0
+        assert newton_step(args, plain, o, isotropic) > 0.2 or o.shutter_sigma > 0
 
 
 def test_the_near_cost_may_rise_by_the_share_that_is_allowed():
@@ -162,7 +164,7 @@ def test_the_near_cost_may_rise_by_the_share_that_is_allowed():
     args, *_ = pairs(1, 12, 60, noise=0.3, depth=0.003, baseline=0.3, seed=4)
     shift = torch.tensor([3.3, 2.1], dtype=D) * (torch.arange(72) >= 12)[:, None]
     args = put(args, uv_1=args[1].uv_1 + shift)
-    o = map_estimate.FitOptions(far_weight=0.5, turn_sigma=0.0, translation_gain=-9.0, near_steps=12, steps=12)
+    o = map_estimate.FitOptions(far_weight=0.5, shutter_sigma=0.0, translation_gain=-9.0, near_steps=12, steps=12)
     ask = lambda rise: map_pose(*args, **o._replace(max_rise=rise)._asdict())  # noqa: E731
     problem, start = dense.problem_of(args, 0.1), pnp_ransac(*args).T_1_from_0
     places = [map_estimate.estimate_map_pose(problem, start, o._replace(max_rise=x)).at for x in (-9.0, 1e9)]
@@ -187,7 +189,9 @@ def test_steps_of_the_near_tracks_and_of_all_are_counted_apart():
     miss = [
         float(
             errors(
-                map_pose(*args, start=off, max_rise=-9.0, turn_sigma=0.0, translation_gain=-9.0, near_steps=a, steps=b),
+                map_pose(
+                    *args, start=off, max_rise=-9.0, shutter_sigma=0.0, translation_gain=-9.0, near_steps=a, steps=b
+                ),
                 T,
             )
             .abs()
@@ -208,9 +212,9 @@ def test_what_is_said_about_a_pose_follows_from_its_tracks():
     args = put(args, uv_1=wrong)
     for limit in (1.5, 3.0):
         fit = map_pose(*args, threshold_px=limit)
-        assert fit.ok.all() and fit.shutter.turn.abs().amax(-1).min() > 1e-4
+        assert fit.ok.all() and fit.shutter.shutter_rate.abs().amax(-1).min() > 1e-4
         problem = dense.problem_of(args, 0.1)
-        at = dense.unknowns(fit.T_1_from_0.R, fit.T_1_from_0.t, fit.shutter.turn)
+        at = dense.unknowns(fit.T_1_from_0.R, fit.T_1_from_0.t, fit.shutter.shutter_rate)
         for b in range(2):
             error = np.array([np.linalg.norm(x.r) for x in dense.tracks(problem, at, problem.inverse, b) if x.near])
             assert fit.inlier[b, :24].tolist() == (error < limit).tolist() and not fit.inlier[b, 24:].any()
@@ -223,7 +227,7 @@ def test_what_is_said_about_a_pose_follows_from_its_tracks():
         assert torch.equal(fit.cov, fit.shutter.cov[:, :6, :6])
     args = put(args, uv_1=tracks.uv_1, valid=tracks.valid & (torch.arange(64) < 24))
     alone = map_pose(*args, translation_gain=-9.0)  # without far tracks their noise is that of the near ones
-    at = dense.unknowns(alone.T_1_from_0.R, alone.T_1_from_0.t, alone.shutter.turn)
+    at = dense.unknowns(alone.T_1_from_0.R, alone.T_1_from_0.t, alone.shutter.shutter_rate)
     noise = map_estimate.estimate_noise_variance(dense.problem_of(args, 0.1), at)[:, 0]
     assert alone.ok.all()
     torch.testing.assert_close(alone.sigma_px**2, noise, rtol=0.2, atol=0)
@@ -234,9 +238,9 @@ def test_what_is_said_about_a_pose_follows_from_its_tracks():
 
 def test_rows_that_turn_are_found_and_undone():
     args, T, b, z = pairs(12, 80, 160, turn=0.01)
-    loose, rigid = map_pose(*args), map_pose(*args, turn_sigma=0.0)
+    loose, rigid = map_pose(*args), map_pose(*args, shutter_sigma=0.0)
     assert loose.ok.all()
-    assert (loose.shutter.turn - b).norm(dim=-1).median() < 0.1 * b.norm(dim=-1).median()
+    assert (loose.shutter.shutter_rate - b).norm(dim=-1).median() < 0.1 * b.norm(dim=-1).median()
     assert errors(loose, T)[:, :3].norm(dim=-1).median() < 0.5 * errors(rigid, T)[:, :3].norm(dim=-1).median()
     far = torch.arange(240) >= 80
     error = []
@@ -245,7 +249,9 @@ def test_rows_that_turn_are_found_and_undone():
         error.append((estimate.depth / z - 1).abs()[estimate.keep & far].median())
     assert error[0] < 0.7 * error[1]
     still = map_pose(*pairs(16, 80, 160)[0])
-    assert (still.shutter.turn.abs() < 1e-9).double().mean() > 0.9  # 2 % of the cost is not taken away by chance
+    assert (
+        still.shutter.shutter_rate.abs() < 1e-9
+    ).double().mean() > 0.9  # 2 % of the cost is not taken away by chance
 
 
 def test_a_given_pose_brings_its_shutter_along():
@@ -267,8 +273,8 @@ def test_a_given_pose_brings_its_shutter_along():
 def test_a_turn_that_was_not_believed_is_not_known_to_be_none():
     """Where turns are too small to be seen the pose takes their part, and its covariance says so."""
     args, T, _, _ = pairs(40, 60, 140, turn=0.0015)
-    fit, rigid = (map_pose(*args, isotropic=0.0, turn_gain=9.0, turn_sigma=sigma) for sigma in (0.01, 0.0))
-    assert fit.ok.all() and fit.shutter.turn.abs().amax() < 1e-9
+    fit, rigid = (map_pose(*args, isotropic=0.0, shutter_gain=9.0, shutter_sigma=sigma) for sigma in (0.01, 0.0))
+    assert fit.ok.all() and fit.shutter.shutter_rate.abs().amax() < 1e-9
     assert 0.8 < nees(fit, T).mean() < 1.6 and nees(rigid, T).mean() > 1.35 * nees(fit, T).mean()
 
 
@@ -281,7 +287,7 @@ def test_far_tracks_that_contradict_are_left_out():
     far = (torch.arange(480) >= 80)[:, None]
     moved = put(args, uv_1=torch.where(far, cam.project(camera_1, turned), uv_1))
     fit, believed, near = (
-        map_pose(*moved, turn_sigma=0.0, far_weight=weight, max_rise=rise)
+        map_pose(*moved, shutter_sigma=0.0, far_weight=weight, max_rise=rise)
         for weight, rise in ((1.0, 0.1), (1.0, 1e9), (1e-9, 0.1))
     )
     assert (fit.code == PoseCode.KEPT_PNP).all() and (believed.code == PoseCode.OK).all()
@@ -306,7 +312,15 @@ def test_without_a_start_there_is_no_pose():
     valid[0, 3:30], valid[1, :] = False, False
     fit = map_pose(*put(args, valid=valid))
     assert fit.code.tolist() == [PoseCode.TOO_FEW, PoseCode.TOO_FEW, PoseCode.OK]
-    for x in (fit.T_1_from_0.R, fit.T_1_from_0.t, fit.cov, fit.sigma_px, fit.t_snr, fit.shutter.turn, fit.shutter.cov):
+    for x in (
+        fit.T_1_from_0.R,
+        fit.T_1_from_0.t,
+        fit.cov,
+        fit.sigma_px,
+        fit.t_snr,
+        fit.shutter.shutter_rate,
+        fit.shutter.cov,
+    ):
         assert x[:2].isnan().all() and x[2].isfinite().all()
     assert not fit.inlier[:2].any()
 

@@ -33,9 +33,9 @@ def pairs():
 
 
 def asked(pairs, motion, method="map", **options):
-    anchor, other, truth, _ = pairs
+    reference, other, truth, _ = pairs
     trace = {}
-    estimate = METHODS[method](anchor, other, n=N, fit=motion.to(torch.float32), trace=trace, **options)
+    estimate = METHODS[method](reference, other, n=N, fit=motion.to(torch.float32), trace=trace, **options)
     uv = (estimate.uv + 0.5).floor().long()
     z = truth[torch.arange(len(truth))[:, None], uv[..., 1], uv[..., 0]]
     far = estimate.keep & ~trace["samples"].usable
@@ -57,7 +57,7 @@ def test_a_right_pose_is_used_as_it_is(pairs, method):
     assert fit.ok.all() and error.numel() > 150 and error.abs().median() < 0.03
     assert torch.equal(fit.T_1_from_0.R, T.R.float()) and torch.equal(fit.T_1_from_0.t, T.t.float())
     assert torch.equal(fit.cov, torch.diag(torch.tensor([1e-8] * 6)).expand(3, 6, 6))
-    assert (fit.looks == 0).all() and fit.n_inlier.amin() > 50
+    assert (fit.matched_convention == 0).all() and fit.n_inlier.amin() > 50
 
 
 def test_a_stated_covariance_makes_sigma_honest(pairs):
@@ -149,20 +149,20 @@ WRONG["OpenGL axes (x right, y up, z backward), the inverse"] = lambda T: se3.in
 def test_a_wrong_pose_is_refuted_and_named(pairs, name):
     estimate, fit, *_ = asked(pairs, pose_prior.make_prior(WRONG[name](se3.relative(*pairs[3]))), "paper")
     assert (fit.code == PoseCode.REFUTED).all() and not fit.ok.any() and fit.T_1_from_0.t.isnan().all()
-    assert {conventions.CONVENTIONS[i] for i in fit.looks.tolist()} == {name}
+    assert {conventions.CONVENTIONS[i] for i in fit.matched_convention.tolist()} == {name}
     silent = set(estimate.gate.unique().tolist())
     assert Gate.POSE_REFUTED in silent and not silent - {Gate.NO_TRACK, Gate.NO_TEXTURE, Gate.POSE_REFUTED}
 
 
 def test_poses_of_the_camera_read_as_poses_of_the_world_are_named(pairs):
     _, fit, *_ = asked(pairs, pose_prior.relative_prior(*(se3.invert(T) for T in pairs[3])), "paper")
-    assert {conventions.CONVENTIONS[i] for i in fit.looks.tolist()} == {"the inverse"}
+    assert {conventions.CONVENTIONS[i] for i in fit.matched_convention.tolist()} == {"the inverse"}
 
 
 def test_a_nonsense_pose_is_refuted_without_a_name(pairs):
     T = off_by(se3.relative(*pairs[3]), (0.5, 0.5))
     _, fit, *_ = asked(pairs, pose_prior.make_prior(T), "paper")
-    assert (fit.code == PoseCode.REFUTED).all() and (fit.looks == 0).all()
+    assert (fit.code == PoseCode.REFUTED).all() and (fit.matched_convention == 0).all()
 
 
 def test_one_wrong_pose_of_a_batch_silences_its_pair_alone(pairs):
@@ -188,13 +188,13 @@ def test_a_pose_that_explains_a_third_of_the_returns_in_some_reading_has_no_name
     tracks = Tracks(uv, uv, zero, zero, torch.eye(2).expand(1, 60, 2, 2), zero == 0)
     motion = pose_prior.make_prior(T.replace(t=-2 * T.t), sigma=(1e-3, 1e-3))
     fit = pose_prior.check_pose_prior(motion, samples, tracks, camera, camera, known_pose_fit(T, 60))
-    assert fit.code.tolist() == [PoseCode.REFUTED] and fit.looks.tolist() == [0] and not fit.inlier.any()
+    assert fit.code.tolist() == [PoseCode.REFUTED] and fit.matched_convention.tolist() == [0] and not fit.inlier.any()
     motion = pose_prior.make_prior(T.replace(t=0.5 * T.t), sigma=(1e-3, 1e-3))
     fit = pose_prior.check_pose_prior(motion, samples, tracks, camera, camera, known_pose_fit(T, 60))
     assert fit.code.tolist() == [PoseCode.REFUTED] and int(fit.n_inlier) == 21 and not fit.inlier.any()
     motion = pose_prior.make_prior(T.replace(t=-T.t), sigma=(1e-3, 1e-3))
     fit = pose_prior.check_pose_prior(motion, samples, tracks, camera, camera, known_pose_fit(T, 60))
-    assert conventions.CONVENTIONS[int(fit.looks)] == "the inverse"
+    assert conventions.CONVENTIONS[int(fit.matched_convention)] == "the inverse"
 
 
 def test_refining_starts_from_the_given_pose(pairs):
@@ -207,7 +207,7 @@ def test_refining_starts_from_the_given_pose(pairs):
     distance = lambda A: (A.t.double() - T.t).norm(dim=-1)  # noqa: E731
     assert (distance(fit.T_1_from_0) < distance(rough)).all()
     _, refuted, *_ = asked(pairs, pose_prior.make_prior(se3.invert(T), refine=True))
-    assert (refuted.code == PoseCode.REFUTED).all() and (refuted.looks > 0).all()
+    assert (refuted.code == PoseCode.REFUTED).all() and (refuted.matched_convention > 0).all()
 
 
 def test_where_a_search_ends_is_held_against_the_near_returns(pairs):
@@ -216,13 +216,13 @@ def test_where_a_search_ends_is_held_against_the_near_returns(pairs):
     left = pose_prior.reject_poses(fit, fit.replace(code=codes))
     assert left.code.tolist() == codes.tolist() and left.ok.tolist() == [False, True, False]
     assert left.T_1_from_0.t.isnan().all(1).tolist() == [True, False, True] and not left.inlier[0].any()
-    assert torch.equal(left.shutter.cov[1], fit.shutter.cov[1]) and left.shutter.turn[2].isnan().all()
+    assert torch.equal(left.shutter.cov[1], fit.shutter.cov[1]) and left.shutter.shutter_rate[2].isnan().all()
 
 
 def test_a_pose_without_translation_or_unknown_is_not_used(pairs):
     T = se3.relative(*pairs[3])
-    anchor, _, truth, worlds = pairs
-    estimate, fit, *_ = asked((anchor, anchor, truth, worlds), pose_prior.make_prior(se3.identity(3, T.t)))
+    reference, _, truth, worlds = pairs
+    estimate, fit, *_ = asked((reference, reference, truth, worlds), pose_prior.make_prior(se3.identity(3, T.t)))
     assert (fit.code == PoseCode.NO_BASELINE).all() and not estimate.keep.any()
     estimate, fit, *_ = asked(pairs, pose_prior.make_prior(T.replace(t=T.t * torch.nan)))
     assert (fit.code == PoseCode.TOO_FEW).all() and not estimate.keep.any() and (estimate.gate == Gate.NO_POSE).any()
@@ -237,7 +237,7 @@ def test_gradients_reach_the_given_pose(pairs):
 
 
 def test_frames_may_carry_the_pose(pairs):
-    method = METHODS["paper"].replace(n=N, given=lambda a, b: pose_prior.priors_from_frames(a, b, sigma=SIGMA))
+    method = METHODS["paper"].replace(n=N, pose_prior=lambda a, b: pose_prior.priors_from_frames(a, b, sigma=SIGMA))
     placed = [f.replace(T_world_from_cam=T) for f, T in zip(pairs[:2], pairs[3], strict=True)]
     trace = {}
     method(*placed, trace=trace)
@@ -298,7 +298,7 @@ def test_samples_state_poses_in_many_ways(sample):
     T = se3.to_matrix(se3.relative(world_0, world_1))[0].float()
     plain = transform()(sample)
     torch.testing.assert_close(plain["dhtorch.T_1_from_0"], T, atol=1e-5, rtol=0)
-    assert plain["dhtorch.pose_ok"] and plain["dhtorch.pose_looks"] == 0
+    assert plain["dhtorch.pose_ok"] and plain["dhtorch.pose_convention"] == 0
     gl = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64)).numpy()
     turned = {**sample, "pose": sample["pose"] @ gl, "pose_before": sample["pose_before"] @ gl}
     torch.testing.assert_close(transform(pose_axes="gl")(turned)["dhtorch.T_1_from_0"], T, atol=1e-5, rtol=0)
@@ -340,7 +340,7 @@ def test_a_wrong_pose_in_a_sample_is_named(sample):
     }
     with pytest.warns(UserWarning, match="pose: the near returns contradict the pose; looks like the inverse"):
         out = transform()(sample)
-    assert conventions.CONVENTIONS[out["dhtorch.pose_looks"]] == "the inverse" and not out["dhtorch.pose_ok"]
+    assert conventions.CONVENTIONS[out["dhtorch.pose_convention"]] == "the inverse" and not out["dhtorch.pose_ok"]
 
 
 @pytest.mark.parametrize(
@@ -359,16 +359,16 @@ def test_what_is_no_pose_is_refused(sample, change, said):
         transform()(sample)
     with pytest.warns(UserWarning, match="flagged"):
         blank = transform(on_error="flag")(sample)
-    assert not blank["dhtorch.valid"].any() and blank["dhtorch.pose_looks"] == 0
+    assert not blank["dhtorch.valid"].any() and blank["dhtorch.pose_convention"] == 0
 
 
 def test_of_several_views_the_first_that_is_refuted_gives_the_name(pairs):
     _, fit, *_ = asked(pairs, pose_prior.make_prior(se3.relative(*pairs[3])))
     wrong = fit.replace(code=torch.full_like(fit.code, PoseCode.REFUTED))
-    both = [wrong.replace(looks=torch.tensor(looks)) for looks in ([0, 3, 5], [4, 6, 7])]
+    both = [wrong.replace(matched_convention=torch.tensor(looks)) for looks in ([0, 3, 5], [4, 6, 7])]
     with pytest.warns(UserWarning, match="camera: the near returns contradict the pose; looks like"):
         found = poses.refuted_pose_keys([fit, *both], torch.tensor([True, True, False]), "camera")
-    assert found["pose_looks"].tolist() == [4, 3, 0]
+    assert found["pose_convention"].tolist() == [4, 3, 0]
 
 
 def test_a_pose_that_is_not_known_leaves_a_hole(sample):
@@ -405,12 +405,12 @@ def test_a_gap_brings_the_pose_along():
 
 
 def test_maps_are_swept_under_the_given_pose(sample):
-    out = transform(dense={"size": 56, "planes": 24, "partners": 1})(sample)
+    out = transform(dense={"size": 56, "planes": 24, "source_views": 1})(sample)
     T = se3.relative(room().true_poses[GAP : GAP + 1], room().true_poses[:1])
     assert torch.allclose(out["dhtorch.T_1_from_0"][:3, 3], T.t[0].float(), atol=1e-5)
     sample["pose"] = torch.linalg.inv(torch.as_tensor(sample["pose"]))
     with pytest.warns(UserWarning, match="contradict"):
-        out = transform(dense={"size": 56, "planes": 24, "partners": 1})(sample)
+        out = transform(dense={"size": 56, "planes": 24, "source_views": 1})(sample)
     silent = out["dhtorch.gate_map"][out["dhtorch.source_map"] == 0]
     assert (silent == Gate.POSE_REFUTED).all()
 
@@ -419,5 +419,5 @@ def test_a_given_pose_is_a_record():
     T = se3.identity(2, torch.zeros(1))
     assert (
         isinstance(pose_prior.make_prior(T, refine=True)[0:1], InitialPose)
-        and pose_prior.make_prior(T).readings.t.shape[1] == 42
+        and pose_prior.make_prior(T).hypotheses.t.shape[1] == 42
     )

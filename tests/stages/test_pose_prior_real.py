@@ -21,12 +21,12 @@ from dhtorch.stages import pose_prior
 ROOT = Path(os.environ.get("DHTORCH_DATA", "/nowhere"))
 GL = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
 
-#: Set → frames between two views, cutoff in m, anchors, frames by which a trajectory is late.
+#: Set → frames between two views, cutoff in m, reference views, frames by which a trajectory is late.
 SETS = {"holo_a": (3, 2.5, (0, 12), 3), "tum_fr1_desk9": (4, 1.0, (0, 2), -2), "r3d_door": (10, 9.0, (5, 10), 10)}
 
 
 def views(name: str) -> tuple[Frame, Frame, Frame, Frame, float]:
-    """Anchors and others with returns up to the cutoff, the frames whose poses a late trajectory has, anchors whole."""
+    """Reference views and others with returns up to the cutoff, the frames whose poses a late trajectory has, reference views whole."""
     gap, near, at, late = SETS[name]
     recording = data.open(ROOT / name)
     whole = collate(recording[i] for i in at)
@@ -40,11 +40,11 @@ def world(frame: Frame) -> Tensor:
     return se3.to_matrix(frame.T_world_from_cam).double()
 
 
-def asked(anchor: Frame, others: Frame, poses: tuple[Tensor, Tensor], **options):
+def asked(reference: Frame, others: Frame, poses: tuple[Tensor, Tensor], **options):
     """Estimate and fit under poses that a data set would state so."""
     motion = pose_prior.relative_prior(*(Pose(M[:, :3, :3], M[:, :3, 3]) for M in poses), **options).to(torch.float32)
     trace: dict = {}
-    return MAP.replace(n=1000)(anchor, others, fit=motion, trace=trace), trace["fit"]
+    return MAP.replace(n=1000)(reference, others, fit=motion, trace=trace), trace["fit"]
 
 
 def error(estimate, whole: Frame, near: float) -> float:
@@ -61,9 +61,9 @@ def error(estimate, whole: Frame, near: float) -> float:
 def test_true_poses_are_used_and_wrong_ones_named(name: str) -> None:
     if not (ROOT / name).is_dir():
         pytest.skip(f"DHTORCH_DATA has no {name}")
-    anchor, others, later, whole, near = views(name)
-    T_0, T_1 = world(anchor), world(others)
-    estimate, fit = asked(anchor, others, (T_0, T_1))
+    reference, others, later, whole, near = views(name)
+    T_0, T_1 = world(reference), world(others)
+    estimate, fit = asked(reference, others, (T_0, T_1))
     assert fit.ok.any() and (fit.code != PoseCode.REFUTED).all(), "true"
     if name == "holo_a":
         assert error(estimate, whole, near) < 0.1
@@ -75,7 +75,7 @@ def test_true_poses_are_used_and_wrong_ones_named(name: str) -> None:
         "": (T_0, world(later)),  # late: no convention
     }
     for said, poses in wrong.items():
-        estimate, fit = asked(anchor, others, poses)
+        estimate, fit = asked(reference, others, poses)
         assert (fit.code == PoseCode.REFUTED).all() and not estimate.keep.any(), said or "late"
-        looks = [CONVENTIONS[i] for i in fit.looks.tolist()]
+        looks = [CONVENTIONS[i] for i in fit.matched_convention.tolist()]
         assert said in looks if said else set(looks) == {""}, looks

@@ -69,7 +69,7 @@ def test_agrees_with_opencv_and_is_the_maximum_likelihood_depth():
     theirs = torch.from_numpy(X[2] / X[3])
     errors = [((z - depth[0]) / depth[0]).abs().median() for z in (ours.depth[0], theirs)]
     assert errors[0] <= errors[1] * 1.02
-    # No other depth along the anchor's ray comes closer to the measured pixel.
+    # No other depth along the reference view's ray comes closer to the measured pixel.
     for step in (-1e-3, 1e-3):
         moved = cam.unproject(camera_0, tracks.uv_0, ours.depth * (1 + step))
         miss = (cam.project(camera_1, se3.apply(fit.T_1_from_0, moved)) - tracks.uv_1).norm(dim=-1)

@@ -292,7 +292,7 @@ def test_a_point_must_lie_in_front_of_both_cameras():
 
 
 def test_a_point_behind_the_other_camera_alone_is_not_answered():
-    """View 1 looks back at the anchor: what the anchor sees far ahead is in front of both, what is near is not."""
+    """View 1 looks back at the anchor: what the reference view sees far ahead is in front of both, what is near is not."""
     samples, tracks, fit = flat(2)
     T = Pose(torch.diag(torch.tensor([-1.0, 1.0, -1.0]))[None].double(), torch.tensor([[0.4, 0.0, 3.0]]).double())
     one = [c[:1] for c in (CAMERA_0, CAMERA_1)]

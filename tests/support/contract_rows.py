@@ -1,4 +1,4 @@
-"""The contract that every public function of geometry, stages and evaluate signs, as one table's vocabulary.
+"""The contract that every public function of geometry, stages and metrics signs, as one table's vocabulary.
 
 A :class:`Row` says how to make a function's inputs and which promises hold; ``test_contract.py`` holds the rows and
 turns each promise into a test. Leaves are the tensors of records, tuples and dicts, in order.

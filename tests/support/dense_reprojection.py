@@ -54,7 +54,7 @@ def tracks(problem: PoseDepthProblem, at: Unknowns, noise: torch.Tensor, b: int 
     """All tracks of pair ``b``; ``noise`` (B, N) px²."""
     P = {k: getattr(problem, k)[b].double().numpy() for k in ("f", "c", "ray", "uv", "inverse", "variance", "shape")}
     near, far = problem.near[b].tolist(), problem.far[b].tolist()
-    R, t, turn = at.T.R[b].double().numpy(), at.T.t[b].double().numpy(), at.turn[b].double().numpy()
+    R, t, shutter_rate = at.T.R[b].double().numpy(), at.T.t[b].double().numpy(), at.shutter_rate[b].double().numpy()
     nearest = max((P["inverse"][k] for k in range(len(near)) if near[k]), default=0.0)
     found = []
     for k in range(len(near)):
@@ -63,7 +63,7 @@ def tracks(problem: PoseDepthProblem, at: Unknowns, noise: torch.Tensor, b: int 
         W = np.linalg.inv(scale * np.array([[xx, xy], [xy, yy]]))
         y = x[1] / x[2]
         seen = np.append((P["uv"][:, k] - P["c"]) / P["f"], 1.0)
-        seen = seen - y * np.cross(turn, seen)
+        seen = seen - y * np.cross(shutter_rate, seen)
         seen = P["f"] * seen[:2] / seen[2]
 
         def parts(q, x=x, seen=seen):
@@ -156,5 +156,7 @@ def problem_of(args: tuple, isotropic: float) -> PoseDepthProblem:
     return PoseDepthProblem(f=camera_1.f.double(), c=camera_1.c.double(), near=near, far=far, **out)
 
 
-def unknowns(R: torch.Tensor, t: torch.Tensor, turn: torch.Tensor | None = None) -> Unknowns:
-    return Unknowns(Pose(R.to(D), t.to(D)), torch.zeros_like(t, dtype=D) if turn is None else turn.to(D))
+def unknowns(R: torch.Tensor, t: torch.Tensor, shutter_rate: torch.Tensor | None = None) -> Unknowns:
+    return Unknowns(
+        Pose(R.to(D), t.to(D)), torch.zeros_like(t, dtype=D) if shutter_rate is None else shutter_rate.to(D)
+    )

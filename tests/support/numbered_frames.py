@@ -1,4 +1,4 @@
-"""Scenes whose pictures show their own number, and methods whose answers depend on the step from the anchor alone."""
+"""Scenes whose pictures show their own number, and methods whose answers depend on the step from the reference view alone."""
 
 import torch
 
@@ -11,7 +11,7 @@ from dhtorch.pipeline.method import Method
 from dhtorch.records import Estimate, Pose, Tracks
 from dhtorch.stages.sample import regular_grid
 
-#: Step from the anchor → share of the samples that is answered, rightly.
+#: Step from the reference view → share of the samples that is answered, rightly.
 SHARES = {1: 0.2, 2: 0.5, -2: 0.1, 5: 0.3, -5: 0.4}
 NEAR, FAR = 1.0, 3.0
 
@@ -63,8 +63,8 @@ MAP = Method(
 def choosing(*steps):
     """A method that takes the frames so many steps on, in this order."""
 
-    def choose(anchor, others, views, *, fit=None):
-        found = (others.image.double() - anchor.image.double()).mean((2, 3, 4))
+    def choose(reference, others, views, *, fit=None):
+        found = (others.image.double() - reference.image.double()).mean((2, 3, 4))
         return torch.stack([(found == step).double().argmax(0) for step in steps])
 
-    return MAP.replace(choose=choose, views=len(steps))
+    return MAP.replace(select_views=choose, views=len(steps))

@@ -40,10 +40,10 @@ class Told:
     def __init__(self, codes=None):
         self.codes, self.asked, self.calls = codes, {}, 0
 
-    def __call__(self, anchor, other, *, n=N, seed=0, trace=None):
-        self.asked, self.calls = {"anchor": anchor, "other": other, "n": n, "seed": seed}, self.calls + 1
+    def __call__(self, reference, other, *, n=N, seed=0, trace=None):
+        self.asked, self.calls = {"anchor": reference, "other": other, "n": n, "seed": seed}, self.calls + 1
         g = torch.Generator().manual_seed(7)
-        B = anchor.image.shape[0]
+        B = reference.image.shape[0]
         uv = torch.rand(1, n, 2, generator=g).expand(B, n, 2) * torch.tensor([W - 1.0, H - 1.0])
         depth = 1 + torch.rand(1, n, generator=g).expand(B, n)
         place = torch.arange(n).expand(B, n) % N
@@ -75,8 +75,8 @@ class Stub(Method):
 
     answer: Callable[..., Estimate] = None
 
-    def __call__(self, anchor, other, *, seed=0, hint=None, trace=None):
-        return self.answer(anchor, other, n=self.n, seed=seed, trace=trace)
+    def __call__(self, reference, other, *, seed=0, hint=None, trace=None):
+        return self.answer(reference, other, n=self.n, seed=seed, trace=trace)
 
 
 def tiny(method=None, **options):

@@ -80,15 +80,15 @@ def test_maps_and_tokens_are_those_of_the_dense_method(sample, pair):
     read = SampleSpec(depth_unit="mm", other_image="before").read(sample)
     with torch.no_grad():
         found = dense.complete_depth(
-            read.anchor, read.other, method=METHOD, calibration=dense.default_calibration(), **DENSE
+            read.reference, read.other, method=METHOD, calibration=dense.default_calibration(), **DENSE
         )
     swept = found.source == Source.SWEPT
     assert swept.sum() > 500 and (~found.keep).sum() > 500, "or there is nothing to compare"
     for key in ("depth", "sigma", "score", "source", "gate"):
         expected = torch.where(found.keep | (key == "gate"), getattr(found, key), 0)[0]
         assert torch.equal(out[f"{key}_map"], expected), key
-    uv = dense.map_pixel_centres(read.anchor, (SIZE, SIZE))
-    hole = METHOD.look_at(read.anchor, uv).hole
+    uv = dense.map_pixel_centres(read.reference, (SIZE, SIZE))
+    hole = METHOD.sample_depth_at(read.reference, uv).hole
     every = MergedDepth(uv[None], *(out[f"{key}_map"].reshape(1, -1) for key in ("depth", "sigma", "score", "source")))
     tokens, known = patch_tokens(every, hole, (SIDE, SIDE))
     assert torch.equal(out["tokens"], tokens[0]) and torch.equal(out["tokens_valid"], known[0])
@@ -130,8 +130,8 @@ def test_a_batch_is_its_samples_and_the_unpaired_get_the_sensor_alone(items):
     alone = added(default_collate([single(s) for s in samples]))
     assert [k for k in alone if not torch.equal(alone[k], together[k])] == []
     assert (together["source_map"] == Source.SWEPT).flatten(1).any(1).tolist() == [True, False, True, True]
-    anchor = SampleSpec(depth_unit="mm").read(items[GAP + 1]).anchor
-    sensed = dense.sensor_depth_map(anchor, method=METHOD, size=SIZE)
+    reference = SampleSpec(depth_unit="mm").read(items[GAP + 1]).reference
+    sensed = dense.sensor_depth_map(reference, method=METHOD, size=SIZE)
     assert torch.equal(together["depth_map"][1], sensed.depth[0].nan_to_num())
     assert torch.equal(together["gate_map"][1], sensed.gate[0])
     none = added(transform(other_image=None, **options)(items[GAP + 1]))
@@ -160,7 +160,7 @@ def test_maps_and_tokens_learn_from_pictures_and_depth(items):
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"sise": 224}, "dense: found 'sise', expected some of partners, planes, size, refinements, min_corr"),
+        ({"sise": 224}, "dense: found 'sise', expected some of source views, planes, size, refinements, min_corr"),
         ({"method": MAP}, "dense: found 'method', expected some of"),
         ({"planes": 12.5}, "dense.planes: found 12.5, expected a whole number"),
         ({"size": True}, "dense.size: found True, expected a whole number"),
@@ -266,7 +266,7 @@ def test_maps_are_written_read_back_and_resumed(command, tmp_path):
 
 def test_a_misspelt_option_is_said_before_anything_is_read(command, tmp_path):
     code, _, err = command(dense="{sise: 48}")
-    assert code == 2 and "extract.dense: found 'sise', expected some of partners" in err
+    assert code == 2 and "extract.dense: found 'sise', expected some of source views" in err
     assert len(err.strip().splitlines()) == 1 and not list(tmp_path.iterdir())
 
 

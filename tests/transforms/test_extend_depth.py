@@ -29,9 +29,7 @@ from dhtorch.transforms import (
     collate_kept,
     one_thread,
     sample_spec,
-)
-from dhtorch.transforms import (
-    validate_depth as judge_depth,
+    validate_depth,
 )
 
 extend_window = PAPER.replace(views=5)
@@ -74,7 +72,7 @@ def test_it_adds_what_the_method_answers(sample, items):
     assert all(np.array_equal(sample[k], before[k]) for k in sample), "the sample is not changed in place"
     read = SampleSpec(depth_unit="mm", other_image="before").read(sample)
     trace = {}
-    estimate = dhtorch.extend(read.anchor, read.other, n=N, trace=trace)
+    estimate = dhtorch.extend(read.reference, read.other, n=N, trace=trace)
     found, mine = dhtorch.merge(trace["samples"], estimate), added(out)
     assert torch.equal(mine["depth"], found.depth[0]) and torch.equal(mine["uv"], found.uv[0])
     assert torch.equal(mine["gate"], estimate.gate[0]) and torch.equal(mine["source"], found.source[0])
@@ -231,7 +229,7 @@ def test_a_depth_map_of_its_own_size_and_camera(sample):
     # Pixels 1, 3, 5, … of the image: a camera whose pixel centres are exactly those.
     own = [K[0, 0] / 2, K[1, 1] / 2, (K[0, 2] - 1) / 2, (K[1, 2] - 1) / 2]
     read = SampleSpec(depth_unit="mm", depth_intrinsics=own).read({**sample, "depth": half})
-    assert read.anchor.depth_camera is not None and read.anchor.depth.shape == (1, SIDE // 2, SIDE // 2)
+    assert read.reference.depth_camera is not None and read.reference.depth.shape == (1, SIDE // 2, SIDE // 2)
     out = added(transform(depth_intrinsics=own)({**sample, "depth": half}))
     whole = added(transform()(sample))
     both = (out["source"] == Source.SENSOR) & (whole["source"] == Source.SENSOR)
@@ -506,16 +504,16 @@ def test_what_a_verdict_does_not_know_is_0_and_said_to_be_unknown():
     """A number is known with both its bounds; a map that is cut at 0 m is cut."""
     pixel, number, nan = torch.zeros(3, 1, 2), torch.tensor([[1.0, 0.9, 1.1]]).repeat(3, 1), float("nan")
     number[1, 2], number[2] = nan, nan
-    told = {"state": pixel.int(), "view": pixel.int(), "ceiling": torch.tensor([0.0, 3.0, nan])}
+    told = {"state": pixel.int(), "view": pixel.int(), "clip_depth": torch.tensor([0.0, 3.0, nan])}
     told["depth"] = torch.tensor([[[1.0, 0.0]]]).expand(3, 1, 2)
-    told |= dict.fromkeys(("evidence", "by_answers", "by_views", "by_maps"), pixel)
-    numbers = ("scale", "scale_near", "scale_far", "ruler", "shift", "tilt", "wrong")
-    keys = judge_depth._validation_keys(DepthValidation(**told, **dict.fromkeys(numbers, number)))
+    told |= dict.fromkeys(("evidence", "sparse_evidence", "photometric_evidence", "consistency_evidence"), pixel)
+    numbers = ("scale", "scale_near", "scale_far", "scale_vs_trajectory", "shift", "tilt", "wrong")
+    keys = validate_depth._validation_keys(DepthValidation(**told, **dict.fromkeys(numbers, number)))
     assert keys["state_share"].tolist() == [[1.0, 0.0, 0.0]] * 3, "where the map says nothing, nothing is shared out"
-    for name in judge_depth._INTERVAL_KEYS:
+    for name in validate_depth._INTERVAL_KEYS:
         assert keys[f"{name}_known"].tolist() == [True, False, False] and keys[name].isfinite().all()
         assert torch.equal(keys[name][0], number[0]) and keys[name][2].tolist() == [0.0] * 3
-    assert keys["ceiling_known"].tolist() == [True, True, False] and keys["ceiling"].tolist() == [0.0, 3.0, 0.0]
+    assert keys["clip_depth_known"].tolist() == [True, True, False] and keys["clip_depth"].tolist() == [0.0, 3.0, 0.0]
 
 
 @pytest.mark.parametrize("transform", [ExtendDepth, ValidateDepth])

@@ -183,7 +183,7 @@ def test_networks_in_the_seats_of_a_method_are_parts_of_the_module():
 
 def front_end(given, n):
     """The sensor's own samples, stage by stage."""
-    frame = tiny().views.read(given).anchor
+    frame = tiny().views.read(given).reference
     return classify(frame, backproject(frame, dhtorch.stages.sample.spiral(frame.hw, n)))
 
 

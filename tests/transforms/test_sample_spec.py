@@ -52,7 +52,7 @@ def refused(given, match, **options):
 
 def test_pixels_are_those_of_the_picture_in_channels_first():
     image = picture()
-    frame = read(sample(image=image)).anchor
+    frame = read(sample(image=image)).reference
     assert frame.image.dtype == torch.uint8 and frame.image.shape == (1, 3, H, W)
     for v, u, c in [(0, 0, 0), (5, 7, 2), (2, 6, 1), (4, 1, 0)]:
         assert frame.image[0, c, v, u] == image[v, u, c]
@@ -63,10 +63,10 @@ def test_both_layouts_and_a_time_axis_hold_the_same_picture(channels):
     image = picture(shape=(H, W, channels))
     wanted = torch.from_numpy(image).permute(2, 0, 1)[None]
     for given in (image, image.transpose(2, 0, 1), image[None], image.transpose(2, 0, 1)[None]):
-        assert torch.equal(read(sample(image=given)).anchor.image, wanted)
+        assert torch.equal(read(sample(image=given)).reference.image, wanted)
     stated = {"hwc": image, "chw": image.transpose(2, 0, 1)}
     for layout, given in stated.items():
-        assert torch.equal(read(sample(image=given), layout=layout).anchor.image, wanted)
+        assert torch.equal(read(sample(image=given), layout=layout).reference.image, wanted)
 
 
 def test_an_axis_that_could_be_either_must_be_stated():
@@ -74,9 +74,9 @@ def test_an_axis_that_could_be_either_must_be_stated():
         image = picture(shape=shape)
         refused(sample(image=image), r"image: found shape \(\d, 5, \d\), expected one axis of 1 or 3.*state layout")
         given = sample(image=image, depth=np.ones((shape[0], 5), np.float32), intrinsics=[4, 4, 2, shape[0] / 2 - 0.5])
-        assert torch.equal(read(given, layout="hwc").anchor.image[0], torch.from_numpy(image).permute(2, 0, 1))
+        assert torch.equal(read(given, layout="hwc").reference.image[0], torch.from_numpy(image).permute(2, 0, 1))
         given["depth"], given["intrinsics"] = np.ones((5, shape[2]), np.float32), [4, 4, shape[2] / 2 - 0.5, 2]
-        assert torch.equal(read(given, layout="chw").anchor.image[0], torch.from_numpy(image))
+        assert torch.equal(read(given, layout="chw").reference.image[0], torch.from_numpy(image))
 
 
 def test_a_stated_layout_is_not_guessed_at():
@@ -92,7 +92,7 @@ def test_a_stated_layout_is_not_guessed_at():
 def test_floating_pictures_take_the_type_that_is_asked_for(dtype):
     image = (picture() / 255).astype(dtype)
     for wanted in (torch.float32, torch.float64):
-        frame = read(sample(image=image), dtype=wanted).anchor
+        frame = read(sample(image=image), dtype=wanted).reference
         assert frame.image.dtype == frame.depth.dtype == frame.camera.f.dtype == wanted
         assert torch.equal(frame.image[0], torch.from_numpy(image).permute(2, 0, 1).to(wanted))
 
@@ -120,14 +120,14 @@ def test_values_of_a_picture_may_miss_the_unit_range_by_a_thousandth():
 
 
 def test_a_sweep_says_that_it_is_sparse():
-    assert read(sample()).anchor.sparse is None
-    assert read(sample(), sparse=True).anchor.sparse.tolist() == [True]
+    assert read(sample()).reference.sparse is None
+    assert read(sample(), sparse=True).reference.sparse.tolist() == [True]
 
 
 def test_units_are_metres_millimetres_or_metres_per_unit():
     depth = metres()
     for unit, per_metre in (("m", 1), ("mm", 1000), (0.001, 1000), (0.25, 4), (2, 0.5)):
-        found = read(sample(depth=depth * per_metre), depth_unit=unit).anchor.depth
+        found = read(sample(depth=depth * per_metre), depth_unit=unit).reference.depth
         assert found.dtype == torch.float32
         np.testing.assert_allclose(found[0].numpy(), depth, rtol=3e-7)
 
@@ -135,11 +135,11 @@ def test_units_are_metres_millimetres_or_metres_per_unit():
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", ">u2", "int16", "uint32", "int32", "int64"])
 def test_whole_numbers_of_any_width_are_read(dtype):
     units = rng().integers(1, 250, (H, W))
-    found = read(sample(depth=units.astype(dtype)), depth_unit="mm").anchor.depth
+    found = read(sample(depth=units.astype(dtype)), depth_unit="mm").reference.depth
     assert np.allclose(found[0], units / 1000, rtol=3e-7) and found.dtype == torch.float32
     high = units + (0 if dtype == "uint8" else 32000)  # above 32767 a signed word would be negative
     if "u" in dtype:
-        found = read(sample(depth=high.astype(dtype)), depth_unit=0.001).anchor.depth
+        found = read(sample(depth=high.astype(dtype)), depth_unit=0.001).reference.depth
         assert np.allclose(found[0], high / 1000, rtol=3e-7)
     refused(sample(depth=units.astype(dtype)), r"depth: found whole numbers \(torch\.\w+\), expected metres.*mm")
 
@@ -147,7 +147,7 @@ def test_whole_numbers_of_any_width_are_read(dtype):
 def test_unsigned_words_of_torch_are_read_too():
     units = torch.from_numpy(rng().integers(40000, 60000, (H, W)))
     for dtype in (torch.uint16, torch.uint32):
-        found = read(sample(depth=units.to(dtype)), depth_unit="mm").anchor.depth
+        found = read(sample(depth=units.to(dtype)), depth_unit="mm").reference.depth
         assert torch.allclose(found[0], units / 1000)
 
 
@@ -159,14 +159,14 @@ def test_what_is_no_return_is_zero():
     for unit, scale in (("m", 1), ("mm", 1000), (0.01, 100)):
         given = depth * np.float32(scale)
         before = given.copy()
-        found = read(sample(depth=given), depth_unit=unit).anchor.depth[0].numpy()
+        found = read(sample(depth=given), depth_unit=unit).reference.depth[0].numpy()
         np.testing.assert_allclose(found, wanted, rtol=1e-6)
         assert np.array_equal(given, before, equal_nan=True), "the sample is left as it was"
     for kind in (np.int32, np.int16):
         whole = np.full((H, W), -7, kind)
         whole[1, 1] = 500
         for unit in ("mm", 0.001):
-            found = read(sample(depth=whole), depth_unit=unit).anchor.depth
+            found = read(sample(depth=whole), depth_unit=unit).reference.depth
             assert found.sum() == found[0, 1, 1] == 0.5 and whole[0, 0] == -7 and whole[1, 1] == 500
 
 
@@ -185,10 +185,10 @@ def test_the_depth_range_is_open_below_and_closed_above():
     depth[0] = [0.5, 0.5001, 1.0, 2.0, 2.0001, 0.0, 3.0, 0.1]
     wanted = [0, 0.5001, 1.0, 2.0, 0, 0, 0, 0]
     for unit, scale in (("m", 1), ("mm", 1000)):
-        found = read(sample(depth=depth * scale), depth_unit=unit, depth_range=(0.5, 2.0)).anchor.depth
+        found = read(sample(depth=depth * scale), depth_unit=unit, depth_range=(0.5, 2.0)).reference.depth
         assert np.allclose(found[0, 0], wanted) and (found[0, 1:] == 1.5).all()
-    below = read(sample(depth=depth), depth_range=(0.5, np.inf)).anchor.depth[0, 0]
-    above = read(sample(depth=depth), depth_range=(0.0, 2.0)).anchor.depth[0, 0]
+    below = read(sample(depth=depth), depth_range=(0.5, np.inf)).reference.depth[0, 0]
+    above = read(sample(depth=depth), depth_range=(0.0, 2.0)).reference.depth[0, 0]
     assert np.allclose(below, [0, 0.5001, 1, 2, 2.0001, 0, 3, 0]) and np.allclose(
         above, [0.5, 0.5001, 1, 2, 0, 0, 0, 0.1]
     )
@@ -199,7 +199,7 @@ def test_gradient_of_the_depth_is_the_unit():
         depth = torch.from_numpy(metres()) / factor
         depth[0, 0], depth[0, 1] = torch.nan, -1.0
         depth.requires_grad_()
-        read(sample(depth=depth), depth_unit=unit).anchor.depth.sum().backward()
+        read(sample(depth=depth), depth_unit=unit).reference.depth.sum().backward()
         wanted = torch.full((H, W), factor)
         wanted[0, :2] = 0
         assert torch.allclose(depth.grad, wanted)
@@ -208,14 +208,14 @@ def test_gradient_of_the_depth_is_the_unit():
 def test_planes_come_with_or_without_channel_and_time():
     depth = metres()
     one = (depth, depth[None], depth[..., None], depth[None, None], depth[None, ..., None])
-    assert all(np.array_equal(read(sample(depth=x)).anchor.depth, depth[None]) for x in one)
+    assert all(np.array_equal(read(sample(depth=x)).reference.depth, depth[None]) for x in one)
     images, stack = np.stack([picture(k) for k in range(3)]), np.stack([metres(k) for k in range(3)])
     for x in (stack, stack[:, None], stack[..., None]):
         found = read(sample(image=images, depth=x), other_at=1)
-        assert np.array_equal(found.anchor.depth[0], stack[2]) and np.array_equal(found.other.depth[0], stack[1])
+        assert np.array_equal(found.reference.depth[0], stack[2]) and np.array_equal(found.other.depth[0], stack[1])
     shared = read(sample(image=images, depth=depth), other_at=1)
-    assert np.array_equal(shared.anchor.depth[0], depth) and (shared.other.depth == 0).all(), (
-        "one depth map is the anchor's"
+    assert np.array_equal(shared.reference.depth[0], depth) and (shared.other.depth == 0).all(), (
+        "one depth map is the reference view's"
     )
     for shape in ((2, H, W), (H, W, 2), (H,), (1, 1, 1, H, W), (0, W)):
         refused(
@@ -226,7 +226,7 @@ def test_planes_come_with_or_without_channel_and_time():
 def test_maps_one_pixel_wide_along_time_are_no_channels():
     images, depths = picture(shape=(3, 5, 1, 3)), metres(shape=(3, 5, 1))
     found = read(sample(image=images, depth=depths, intrinsics=[4, 4, 0, 2]), layout="hwc", other_at=1)
-    assert np.array_equal(found.anchor.depth[0], depths[2]) and np.array_equal(found.other.depth[0], depths[1])
+    assert np.array_equal(found.reference.depth[0], depths[2]) and np.array_equal(found.other.depth[0], depths[1])
 
 
 def test_a_median_return_beyond_the_limits_is_a_wrong_unit():
@@ -263,19 +263,19 @@ def test_confidence_is_one_of_three_levels():
     level = rng().integers(0, 3, (H, W))
     for given in (level.astype(np.uint8), level.astype(np.float32), level[None], level[..., None].astype(np.int64)):
         found = read(sample(conf=given), confidence="conf")
-        assert found.anchor.conf.dtype == torch.uint8 and not found.bad
-        assert np.array_equal(found.anchor.conf[0], level)
-    assert read(sample()).anchor.conf is None
+        assert found.reference.conf.dtype == torch.uint8 and not found.bad
+        assert np.array_equal(found.reference.conf[0], level)
+    assert read(sample()).reference.conf is None
     for wrong, value in ((level + 1, 3), (np.where(level == 1, 0.5, level), 2)):
         found = read(sample(conf=wrong), confidence="conf")
         assert found.complaint() == f"conf: found the value {value}, expected 0 low, 1 medium, 2 high"
-        assert found.anchor.conf.max() <= 2
+        assert found.reference.conf.max() <= 2
     one = np.zeros((H, W))
     one[4, 2] = 1.5
     assert read(sample(conf=one), confidence="conf").bad
     images, levels = np.stack([picture(k) for k in range(2)]), np.stack([level, 2 - level])
     along = read(sample(image=images, conf=levels), confidence="conf", at=0, other_at=1)
-    assert np.array_equal(along.anchor.conf[0], level)
+    assert np.array_equal(along.reference.conf[0], level)
     refused(sample(conf=level[:3]), "conf: found 3x8, expected 6x8 as depth", confidence="conf")
 
 
@@ -287,11 +287,11 @@ def test_keys_are_flat_or_lead_into_nested_dicts():
     nested = {"a": {"b": {"image": plain["image"]}, "depth": plain["depth"]}, "a.K": plain["intrinsics"]}
     for image, depth in (("a.b.image", "a.depth"), ("a/b/image", "a/depth"), ("a/b.image", "a.depth")):
         found = read(nested, image=image, depth=depth, intrinsics="a.K")
-        assert torch.equal(found.anchor.image, read(plain).anchor.image)
-        assert torch.equal(found.anchor.depth, read(plain).anchor.depth)
+        assert torch.equal(found.reference.image, read(plain).reference.image)
+        assert torch.equal(found.reference.depth, read(plain).reference.depth)
     both = {**nested, "a.depth": plain["depth"] + 1}
     found = read(both, image="a.b.image", depth="a.depth", intrinsics="a.K")
-    assert np.allclose(found.anchor.depth[0], plain["depth"] + 1), "a key as it stands goes first"
+    assert np.allclose(found.reference.depth[0], plain["depth"] + 1), "a key as it stands goes first"
 
 
 def test_a_missing_key_is_named_with_those_there_are():
@@ -307,7 +307,7 @@ def test_a_missing_key_is_named_with_those_there_are():
 def test_arrays_of_any_make_hold_the_same_numbers():
     pil = pytest.importorskip("PIL.Image")
     image, depth = picture(), metres()
-    wanted = read(sample()).anchor
+    wanted = read(sample()).reference
     frozen = image.copy()
     frozen.setflags(write=False)
     for same in (
@@ -317,9 +317,9 @@ def test_arrays_of_any_make_hold_the_same_numbers():
         pil.fromarray(image),
         torch.from_numpy(image),
     ):
-        assert torch.equal(read(sample(image=same)).anchor.image, wanted.image)
+        assert torch.equal(read(sample(image=same)).reference.image, wanted.image)
     for same in (depth.astype(">f4"), depth.astype(np.float64), depth.tolist(), torch.from_numpy(depth)):
-        assert torch.equal(read(sample(depth=same)).anchor.depth, wanted.depth)
+        assert torch.equal(read(sample(depth=same)).reference.depth, wanted.depth)
     for text in ("depth.png", None, np.array(["a"]), np.array([1j]), object()):
         refused(sample(depth=text), "depth: found .*, expected an array of numbers")
 
@@ -327,7 +327,7 @@ def test_arrays_of_any_make_hold_the_same_numbers():
 def test_a_shared_array_is_not_written_to():
     frozen = np.full((H, W), 1000, np.uint16)
     frozen.setflags(write=False)
-    assert (read(sample(depth=frozen), depth_unit="mm").anchor.depth == 1).all() and (frozen == 1000).all()
+    assert (read(sample(depth=frozen), depth_unit="mm").reference.depth == 1).all() and (frozen == 1000).all()
 
 
 def test_unsigned_words_become_signed_ones_that_hold_them():
@@ -345,7 +345,7 @@ def test_subclasses_of_tensors_become_plain():
         pass
 
     given = sample(image=torch.from_numpy(picture()).as_subclass(Wrapped))
-    assert type(read(given).anchor.image) is torch.Tensor
+    assert type(read(given).reference.image) is torch.Tensor
 
 
 # ---------------------------------------------------------------------------------------------------- cameras
@@ -354,8 +354,8 @@ def test_subclasses_of_tensors_become_plain():
 def test_intrinsics_are_a_matrix_or_four_numbers():
     wanted = torch.tensor([K])
     for given in (matrix(*K), matrix(*K).ravel(), K, np.array(K), torch.tensor(K), matrix(*K).tolist()):
-        assert torch.equal(numbers(read(sample(intrinsics=given)).anchor.camera), wanted)
-        assert torch.equal(numbers(read(sample(intrinsics="unused"), intrinsics=given).anchor.camera), wanted)
+        assert torch.equal(numbers(read(sample(intrinsics=given)).reference.camera), wanted)
+        assert torch.equal(numbers(read(sample(intrinsics="unused"), intrinsics=given).reference.camera), wanted)
     for wrong, count in ((np.ones(6), 6), (np.ones(3), 3), (np.ones(16), 16)):
         refused(sample(intrinsics=wrong), f"intrinsics: found {count} numbers, expected 3x3, or fx fy cx cy")
         refused(sample(), f"intrinsics: found {count} numbers, expected", intrinsics=wrong.tolist())
@@ -376,13 +376,13 @@ def test_numbers_along_time_are_those_of_the_frame():
             at=1,
             other_at=-1,
         )
-        assert torch.equal(numbers(found.anchor.camera), torch.tensor([rows[1]]))
-        assert torch.equal(numbers(found.anchor.depth_camera), torch.tensor([rows[1]]))
+        assert torch.equal(numbers(found.reference.camera), torch.tensor([rows[1]]))
+        assert torch.equal(numbers(found.reference.depth_camera), torch.tensor([rows[1]]))
         assert torch.equal(numbers(found.other.camera), torch.tensor([rows[2]]))
-        assert torch.allclose(found.anchor.camera.distortion, torch.tensor([bends[1]]))
+        assert torch.allclose(found.reference.camera.distortion, torch.tensor([bends[1]]))
         assert torch.allclose(found.other.camera.distortion, torch.tensor([bends[2]]))
     once = read(sample(image=images, intrinsics=np.array([K])), at=2, other_at=1)
-    assert torch.equal(numbers(once.anchor.camera), torch.tensor([K])), "given once it holds for all"
+    assert torch.equal(numbers(once.reference.camera), torch.tensor([K])), "given once it holds for all"
     assert torch.equal(numbers(once.other.camera), torch.tensor([K]))
 
 
@@ -399,25 +399,25 @@ def test_the_same_numbers_are_read_once_and_others_never_taken_for_them():
     for value in (*given, *given):
         found = views.read(sample(intrinsics=value))
         alone = read(sample(intrinsics=value))
-        assert torch.equal(numbers(found.anchor.camera), numbers(alone.anchor.camera))
+        assert torch.equal(numbers(found.reference.camera), numbers(alone.reference.camera))
         assert torch.equal(found.bad, alone.bad)
-    first, again = (views.read(sample()).anchor.camera for _ in range(2))
+    first, again = (views.read(sample()).reference.camera for _ in range(2))
     assert first is again
     for k in range(200):  # one for each frame: never more than some are kept
         views.read(sample(intrinsics=matrix(20 + k / 100, *K[1:])))
     assert len(views._cameras) <= 64 and SampleSpec(depth_unit="m") == views
-    small = views.read(sample(image=picture(shape=(2 * H, 2 * W, 3)))).anchor.camera
+    small = views.read(sample(image=picture(shape=(2 * H, 2 * W, 3)))).reference.camera
     assert torch.equal(small.c, first.c) and views.read(sample(image=picture(shape=(6 * H, 6 * W, 3)))).bad
     leaf = torch.tensor(matrix(*K), requires_grad=True)
-    views.read(sample(intrinsics=leaf)).anchor.camera.f.sum().backward()
+    views.read(sample(intrinsics=leaf)).reference.camera.f.sum().backward()
     assert leaf.grad.sum() == 2
     views = SampleSpec(depth_unit="m")
     with torch.inference_mode():
         views.read(sample())
-    assert not views.read(sample()).anchor.camera.f.is_inference(), "a graph could not go through it"
+    assert not views.read(sample()).reference.camera.f.is_inference(), "a graph could not go through it"
     with forward_ad.dual_level():
         tangent = forward_ad.make_dual(torch.tensor(matrix(*K)), torch.ones(3, 3))
-        assert forward_ad.unpack_dual(views.read(sample(intrinsics=tangent)).anchor.camera.f).tangent is not None
+        assert forward_ad.unpack_dual(views.read(sample(intrinsics=tangent)).reference.camera.f).tangent is not None
     flat, views = np.array(K, np.float32), SampleSpec(depth_unit="m")
     views.read(sample(intrinsics=flat))
     with pytest.raises(SampleError, match="expected"):
@@ -440,12 +440,12 @@ def test_one_return_that_no_probe_meets_is_a_return(place):
 def test_intrinsics_of_another_size_are_scaled_about_the_corner():
     big = [2 * K[0], 3 * K[1], 2 * (K[2] + 0.5) - 0.5, 3 * (K[3] + 0.5) - 0.5]
     found = read(sample(intrinsics=big), intrinsics_hw=(3 * H, 2 * W), other_image="image", max_offset=0.2)
-    assert torch.allclose(numbers(found.anchor.camera), torch.tensor([K])) and not found.bad
+    assert torch.allclose(numbers(found.reference.camera), torch.tensor([K])) and not found.bad
     assert torch.allclose(numbers(found.other.camera), torch.tensor([K]))
     small = picture(1, (H // 2, W // 2, 3))
     found = read(sample(small=small), intrinsics_hw=(H, W), other_image="small", layout="hwc")
     halved = [K[0] / 2, K[1] / 2, (K[2] + 0.5) / 2 - 0.5, (K[3] + 0.5) / 2 - 0.5]
-    assert torch.allclose(numbers(found.anchor.camera), torch.tensor([K])), "the size they belong to changes nothing"
+    assert torch.allclose(numbers(found.reference.camera), torch.tensor([K])), "the size they belong to changes nothing"
     assert torch.allclose(numbers(found.other.camera), torch.tensor([halved])), "each picture by its own size"
 
 
@@ -504,18 +504,18 @@ def test_a_depth_map_has_the_shape_of_the_picture_or_a_camera_of_its_own():
     ):
         given["depth"] = np.ones((h, w), np.float32)
         if fits:
-            assert read(given).anchor.depth_camera is None
+            assert read(given).reference.depth_camera is None
         else:
             refused(
                 given, f"depth: found {h}x{w} .height x width., which is no scaled image of 100x100; .*depth_intrinsics"
             )
-        own = read(given, depth_intrinsics=[5, 6, 7, 8]).anchor
+        own = read(given, depth_intrinsics=[5, 6, 7, 8]).reference
         assert (
             torch.equal(numbers(own.depth_camera), torch.tensor([[5.0, 6, 7, 8]]))
             and own.depth_camera.distortion is None
         )
     wide = sample(image=picture(shape=(10, 40, 3)), intrinsics=[9, 9, 19.5, 4.5], depth=np.ones((5, 20), np.float32))
-    assert read(wide).anchor.depth_camera is None
+    assert read(wide).reference.depth_camera is None
     refused({**wide, "depth": np.ones((20, 5), np.float32)}, "found 20x5 .*image of 10x40; is it transposed")
 
 
@@ -524,9 +524,9 @@ def test_a_depth_map_has_the_shape_of_the_picture_or_a_camera_of_its_own():
 
 def test_frames_along_time_are_picked_by_place():
     images = np.stack([picture(k) for k in range(4)])
-    for at, other_at, anchor, other in ((-1, 0, 3, 0), (2, 1, 2, 1), (0, -1, 0, 3), (-4, 3, 0, 3), (1, -3, 1, None)):
+    for at, other_at, reference, other in ((-1, 0, 3, 0), (2, 1, 2, 1), (0, -1, 0, 3), (-4, 3, 0, 3), (1, -3, 1, None)):
         found = read(sample(image=images), at=at, other_at=other_at)
-        assert np.array_equal(found.anchor.image[0].permute(1, 2, 0), images[anchor])
+        assert np.array_equal(found.reference.image[0].permute(1, 2, 0), images[reference])
         if other is None:
             assert found.other is None and found.paired.tolist() == [False], "the same place twice is one view"
         else:
@@ -562,7 +562,7 @@ def test_several_other_views_are_stacked_in_their_order():
     mixed = read(sample(image=images, image_is_pad=[True] * 4), other_at=(0, 3))
     assert (some.paired.tolist(), none.paired.tolist(), mixed.paired.tolist()) == ([True], [False], [False])
     same = read(sample(image=images, image_is_pad=[True, False, False, False]), other_at=(0, 3))
-    assert same.paired.tolist() == [False], "the anchor is no view beside itself"
+    assert same.paired.tolist() == [False], "the reference view is no view beside itself"
     both = read(sample(image=images), other_at=(0, 3))
     assert both.paired.tolist() == [True] and both.other.image.shape[0] == 2, "but one of several"
 
@@ -573,13 +573,13 @@ def test_another_key_names_the_other_view():
     assert found.other is None
     found = read(sample(right=other), other_image="right")
     assert np.array_equal(found.other.image[0].permute(1, 2, 0), other) and found.paired.tolist() == [True]
-    assert np.array_equal(found.anchor.image[0].permute(1, 2, 0), picture())
-    assert (found.other.depth == 0).all() and found.other.depth.shape == found.anchor.depth.shape
+    assert np.array_equal(found.reference.image[0].permute(1, 2, 0), picture())
+    assert (found.other.depth == 0).all() and found.other.depth.shape == found.reference.depth.shape
     window = np.stack([picture(k) for k in range(3)])
     found = read(sample(right=window), other_image="right", other_at=1)
     assert np.array_equal(found.other.image[0].permute(1, 2, 0), window[1])
     depths = read(sample(image=window, depth=np.stack([metres(k) for k in range(3)]), right=other), other_image="right")
-    assert (depths.other.depth == 0).all(), "depth along time is the anchor's camera's"
+    assert (depths.other.depth == 0).all(), "depth along time is the reference view's camera's"
     refused(
         sample(right=window), "right: found 3 frames along time, expected one at 3", other_image="right", other_at=3
     )
@@ -594,7 +594,7 @@ def test_the_other_view_has_intrinsics_of_its_own():
     for option in ("K_right", theirs, np.array(theirs), matrix(*theirs).tolist()):
         found = read(given, other_image="right", other_intrinsics=option)
         assert torch.equal(numbers(found.other.camera), torch.tensor([theirs]))
-        assert torch.equal(numbers(found.anchor.camera), torch.tensor([K]))
+        assert torch.equal(numbers(found.reference.camera), torch.tensor([K]))
     shared = read(given, other_image="right")
     assert torch.equal(numbers(shared.other.camera), torch.tensor([K]))
     wrong = read({**given, "K_right": matrix(30, 31, 30, 2)}, other_image="right", other_intrinsics="K_right")
@@ -604,7 +604,7 @@ def test_the_other_view_has_intrinsics_of_its_own():
 
 
 def test_numbers_along_time_belong_to_the_picture_that_they_are_given_for():
-    """The anchor's own frames have rows of numbers; another picture shares the anchor's, or has rows itself."""
+    """The reference view's own frames have rows of numbers; another picture shares the reference view's, or has rows itself."""
     images = np.stack([picture(k) for k in range(3)])
     rows = np.array([[20.0 + k, 21.0, 3.5, 2.5] for k in range(3)], np.float32)
     given = sample(image=images, intrinsics=rows, right=np.stack([picture(k) for k in (7, 8)]))
@@ -612,7 +612,7 @@ def test_numbers_along_time_belong_to_the_picture_that_they_are_given_for():
     assert torch.equal(numbers(shared.other.camera), torch.from_numpy(rows[1:2]))
     theirs = rows[:2] + np.float32([5, 5, 0, 0])
     own = read({**given, "K_right": theirs}, other_image="right", other_intrinsics="K_right", at=2, other_at=1)
-    assert torch.equal(numbers(own.anchor.camera), torch.from_numpy(rows[2:]))
+    assert torch.equal(numbers(own.reference.camera), torch.from_numpy(rows[2:]))
     assert torch.equal(numbers(own.other.camera), torch.from_numpy(theirs[1:]))
 
 
@@ -650,11 +650,11 @@ def test_a_batch_is_read_as_its_samples():
     assert together.paired.tolist() == [True, False, True] and together.bad.tolist() == [False] * 3
     for k, one in enumerate(given):
         alone = read(one, **options)
-        for mine, theirs in ((together.anchor, alone.anchor), (together.other, alone.other)):
+        for mine, theirs in ((together.reference, alone.reference), (together.other, alone.other)):
             assert torch.equal(mine.image[k], theirs.image[0]) and torch.equal(mine.depth[k], theirs.depth[0])
             assert torch.equal(numbers(mine.camera)[k], numbers(theirs.camera)[0])
             assert torch.equal(mine.camera.distortion[k], theirs.camera.distortion[0])
-        assert torch.equal(together.anchor.conf[k], alone.anchor.conf[0])
+        assert torch.equal(together.reference.conf[k], alone.reference.conf[0])
 
 
 def test_the_first_bad_sample_of_a_batch_speaks():

@@ -35,7 +35,7 @@ def told(uv, depth, sigma=0.01, shared=0.0, near=False):
 
 
 def a_view(t, use=True):
-    """A partner that stands ``t`` m beside, and the grid."""
+    """A source view that stands ``t`` m beside, and the grid."""
     camera = Camera(torch.tensor([[40.0, 40.0]]), torch.tensor([[15.5, 11.5]]))
     picture = torch.rand(1, 1, *HW, generator=torch.Generator().manual_seed(0))
     T = se3.exp(torch.tensor([[0.0, 0.0, 0.0, *t]]))
@@ -101,26 +101,26 @@ def test_the_extent_of_a_pixel_is_how_far_the_next_one_may_be_true():
 
 def test_of_several_views_the_mildest_counts(monkeypatch):
     said = {0: 5.0, 1: -2.0, 2: 4.0}
-    base, partner = a_view((0.1, 0, 0))
+    base, source_view = a_view((0.1, 0, 0))
     flat = torch.full((1, *HW), 2.0)
     monkeypatch.setattr(
         evidence,
         "_view_evidence",
         lambda q, base, p, tolerance: (torch.full_like(q, said[p.fit]), torch.ones_like(q) > 0),
     )
-    found = photometric_evidence(flat, base, [partner._replace(fit=k) for k in said], 0.02)
+    found = photometric_evidence(flat, base, [source_view._replace(fit=k) for k in said], 0.02)
     assert (found.misfit == -2).all()
     assert (found.view == 1).all()
 
 
 def test_a_pixel_without_a_depth_has_none_from_its_window(monkeypatch):
-    base, partner = a_view((0.1, 0, 0))
+    base, source_view = a_view((0.1, 0, 0))
     holed = torch.full((1, *HW), 2.0)
     holed[0, 10, 10] = 0
     monkeypatch.setattr(
         evidence, "_view_evidence", lambda q, base, p, tolerance: (torch.full_like(q, 1.0), torch.ones_like(q) > 0)
     )
-    found = photometric_evidence(holed, base, [partner], 0.02)
+    found = photometric_evidence(holed, base, [source_view], 0.02)
     assert found.misfit[0, 10, 10].isnan()
     assert found.misfit[0, 10, 11] == 1
 
@@ -134,8 +134,8 @@ def test_the_best_of_other_depths_is_named_with_its_factor(monkeypatch):
         return SimpleNamespace(correlation=torch.full_like(at, value), seen=torch.ones_like(at) > 0)
 
     monkeypatch.setattr(plane_sweep, "fit_windows", fit)
-    base, partner = a_view((0.1, 0, 0))
-    best, factor, beside = evidence._rivals(q, base, partner)
+    base, source_view = a_view((0.1, 0, 0))
+    best, factor, beside = evidence._rivals(q, base, source_view)
     assert best[0, 5, 5] == pytest.approx(0.95)
     assert factor[0, 5, 5] == pytest.approx(0.58)
     assert beside[0, 5, 5] == pytest.approx(
@@ -145,19 +145,19 @@ def test_the_best_of_other_depths_is_named_with_its_factor(monkeypatch):
 
 def test_what_another_view_does_not_see_it_says_nothing_of():
     """The right edge of the picture leaves the other view's field."""
-    base, partner = a_view((0.4, 0, 0))
+    base, source_view = a_view((0.4, 0, 0))
     pose = SimpleNamespace(
-        cov=1e-8 * torch.eye(6)[None], shutter=None, ok=torch.tensor([True]), T_1_from_0=partner.view.T_1_from_0
+        cov=1e-8 * torch.eye(6)[None], shutter=None, ok=torch.tensor([True]), T_1_from_0=source_view.view.T_1_from_0
     )
-    misfit, sure = evidence._view_evidence(torch.full((1, *HW), 1.0), base, partner._replace(fit=pose), 0.02)
+    misfit, sure = evidence._view_evidence(torch.full((1, *HW), 1.0), base, source_view._replace(fit=pose), 0.02)
     assert misfit[0, :, -10:].isnan().all()
     assert not sure[0, :, -10:].any()
 
 
 def test_windows_that_fit_say_nothing_where_the_lens_knows_no_ray(monkeypatch):
-    base, partner = a_view((0.1, 0, 0))
+    base, source_view = a_view((0.1, 0, 0))
     pose = SimpleNamespace(
-        cov=1e-8 * torch.eye(6)[None], shutter=None, ok=torch.tensor([True]), T_1_from_0=partner.view.T_1_from_0
+        cov=1e-8 * torch.eye(6)[None], shutter=None, ok=torch.tensor([True]), T_1_from_0=source_view.view.T_1_from_0
     )
     like = torch.full((1, *HW), 0.5)
     window = SimpleNamespace(
@@ -168,7 +168,9 @@ def test_windows_that_fit_say_nothing_where_the_lens_knows_no_ray(monkeypatch):
     monkeypatch.setattr(evidence, "_rivals", lambda *args: (like * 0 + 0.1, like * 0 + 1.14, like * 0 + 0.1))
     known = torch.ones(1, *HW, dtype=torch.bool)
     known[0, :, :5] = False
-    misfit, sure = evidence._view_evidence(like, base.replace(known=known.flatten(1)), partner._replace(fit=pose), 0.02)
+    misfit, sure = evidence._view_evidence(
+        like, base.replace(known=known.flatten(1)), source_view._replace(fit=pose), 0.02
+    )
     assert misfit[known].isfinite().all()
     assert sure[known].all()
     assert misfit[~known].isnan().all()

@@ -37,7 +37,7 @@ def room():
 
 
 @pytest.fixture(scope="module")
-def anchor(room):
+def reference(room):
     return range_split(room[ANCHOR], NEAR)
 
 
@@ -52,15 +52,15 @@ def true(room):
 
 
 @pytest.fixture(scope="module")
-def asked(anchor, others):
-    """What the sparse method makes of the views: the same for every map of the anchor."""
+def asked(reference, others):
+    """What the sparse method makes of the views: the same for every map of the reference view."""
     trace = {}
-    return dense.selected_views(METHOD(anchor, others, trace=trace), others, trace)
+    return dense.selected_views(METHOD(reference, others, trace=trace), others, trace)
 
 
 @pytest.fixture(scope="module")
-def sound(true, anchor, others):
-    return validate_depth(true, anchor, others, **SMALL)
+def sound(true, reference, others):
+    return validate_depth(true, reference, others, **SMALL)
 
 
 def at_grid(x, verdict):
@@ -79,15 +79,17 @@ def test_a_true_map_is_consistent_and_its_numbers_hold(sound):
     assert sound.shift[0, 1] < 0 < sound.shift[0, 2]
 
 
-@pytest.mark.parametrize(("name", "good_for"), [("scale_near", SENSOR_SCALE_SIGMA), ("ruler", TRAJECTORY_SCALE_SIGMA)])
+@pytest.mark.parametrize(
+    ("name", "good_for"), [("scale_near", SENSOR_SCALE_SIGMA), ("scale_vs_trajectory", TRAJECTORY_SCALE_SIGMA)]
+)
 def test_a_metre_is_told_no_closer_than_what_tells_it_is_good_for(name, good_for, sound):
     """However many points agree: they share one sensor, or one trajectory."""
     _, low, high = getattr(sound, name)[0]
     assert math.log(high / low) > 2 * 1.96 * good_for
 
 
-def test_near_and_far_that_contradict_each_other_leave_the_scale_open(true, anchor, asked):
-    found = validate_against(torch.where(true > NEAR, 1.3 * true, true), anchor, asked, **SMALL, views=False)
+def test_near_and_far_that_contradict_each_other_leave_the_scale_open(true, reference, asked):
+    found = validate_against(torch.where(true > NEAR, 1.3 * true, true), reference, asked, **SMALL, views=False)
     near, far, both = (x[0].log() for x in (found.scale_near, found.scale_far, found.scale))
     assert near[2] < far[1]
     assert near[0] < both[0] < far[0]
@@ -96,17 +98,17 @@ def test_near_and_far_that_contradict_each_other_leave_the_scale_open(true, anch
 
 @pytest.mark.parametrize("tilt", [0.2, 0.4])
 @pytest.mark.parametrize("side", [-1, -2])
-def test_a_tilt_is_the_error_from_one_side_of_the_picture_to_the_other(side, tilt, true, anchor):
+def test_a_tilt_is_the_error_from_one_side_of_the_picture_to_the_other(side, tilt, true, reference):
     n = true.shape[side]
     place = ((torch.arange(n) + 0.5) / n - 0.5).reshape((n, 1) if side == -2 else (n,))
-    value, low, high = validate_depth((1 + tilt * place) * true, anchor, **SMALL).tilt[0]
+    value, low, high = validate_depth((1 + tilt * place) * true, reference, **SMALL).tilt[0]
     assert value == pytest.approx(tilt, rel=0.05)
     assert 0 < low < tilt < high
 
 
 @pytest.mark.parametrize("factor", [1.1, 1 / 1.1])
-def test_a_wrong_metre_is_found_by_near_returns_and_by_far_answers(factor, true, anchor, others, sound):
-    found = validate_depth(factor * true, anchor, others, **SMALL, views=False)
+def test_a_wrong_metre_is_found_by_near_returns_and_by_far_answers(factor, true, reference, others, sound):
+    found = validate_depth(factor * true, reference, others, **SMALL, views=False)
     for name in ("scale", "scale_near", "scale_far"):
         value, low, high = getattr(found, name)[0] / factor
         assert abs(math.log(value)) < 0.03
@@ -114,10 +116,10 @@ def test_a_wrong_metre_is_found_by_near_returns_and_by_far_answers(factor, true,
     assert (found.state == State.CONSISTENT).sum() < 0.4 * (sound.state == State.CONSISTENT).sum()
 
 
-def test_a_surface_that_stands_elsewhere_is_wrong_and_its_surroundings_are_not(true, anchor, others):
+def test_a_surface_that_stands_elsewhere_is_wrong_and_its_surroundings_are_not(true, reference, others):
     moved = torch.zeros_like(true, dtype=torch.bool)
     moved[:, 60:120, 70:140] = True
-    found = validate_depth(torch.where(moved, 1.6 * true, true), anchor, others, **SMALL)
+    found = validate_depth(torch.where(moved, 1.6 * true, true), reference, others, **SMALL)
     inside = at_grid(moved, found) > 0
     assert ((found.state == State.CONSISTENT) & inside).sum() <= 0.003 * inside.sum()
     assert auroc(found.evidence.abs()[found.known], inside[found.known]) > 0.97
@@ -125,14 +127,14 @@ def test_a_surface_that_stands_elsewhere_is_wrong_and_its_surroundings_are_not(t
     assert (signs > 0).float().mean() > 0.9, "too far"
 
 
-def test_without_another_view_near_returns_alone_speak(true, anchor):
-    found = validate_depth(true, anchor, **SMALL)
+def test_without_another_view_near_returns_alone_speak(true, reference):
+    found = validate_depth(true, reference, **SMALL)
     near = at_grid(true, found) < 0.9 * NEAR
     far = at_grid(true, found) > 1.2 * NEAR
     assert (found.known & near).sum() > 0.5 * near.sum()
     assert not (found.state == State.CONSISTENT)[far].any(), "nothing tells"
     assert found.known[far].float().mean() < 0.02, "but for returns that mix an edge"
-    assert found.by_views.isnan().all()
+    assert found.photometric_evidence.isnan().all()
     assert found.scale_far.isnan().all()
 
 
@@ -152,13 +154,13 @@ def test_a_camera_that_only_turns_knows_nothing_of_what_is_far():
     assert (found.state == State.CONSISTENT)[far].float().mean() < 0.003
 
 
-def test_quick_leaves_a_metre_unknown_where_the_motion_comes_out_short(room, true, anchor):
+def test_quick_leaves_a_metre_unknown_where_the_motion_comes_out_short(room, true, reference):
     """Motions that few points hold loosely are too short: of a true map they would say that it is too far."""
 
     def by_points(method, k):
-        return validate_depth(true, anchor, range_split(room[k], NEAR), method=method, views=False, size=160).scale_far[
-            0
-        ]
+        return validate_depth(
+            true, reference, range_split(room[k], NEAR), method=method, views=False, size=160
+        ).scale_far[0]
 
     beside = (ANCHOR - 1, ANCHOR + 1)
     loose = torch.stack([by_points(QUICK_METHOD.replace(triangulate={"min_t_snr": 10.0}), k) for k in beside])
@@ -168,9 +170,9 @@ def test_quick_leaves_a_metre_unknown_where_the_motion_comes_out_short(room, tru
     assert by_points(QUICK_METHOD, ANCHOR + 3).isfinite().all(), "a wider way is known well enough"
 
 
-@pytest.mark.parametrize("name", ["judge_study", "judge_study_streams"])
+@pytest.mark.parametrize("name", ["validate_study", "validate_study_streams"])
 def test_what_quick_missed_by_points_alone_it_was_silent_on(name):
-    """As docs/judge.md says of the committed results."""
+    """As docs/validate.md says of the committed results."""
     rows = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
     wide = [row for row in rows if row["method"] == "judge" and row["pair"] is not None and row["baseline"]]
     told = [row for row in wide if row["quick_far.none"] is not None]
@@ -190,51 +192,51 @@ def test_the_sensors_own_metre_is_told_by_a_trajectory_alone(room, others):
     assert validate_depth(None, lost[0], stack(lost[1:]), **SMALL, views=False).scale.isnan().all()
 
 
-def test_exposure_of_other_views_changes_little(true, anchor, others, sound):
+def test_exposure_of_other_views_changes_little(true, reference, others, sound):
     dim = others.replace(image=(others.image.float() / 255 * 0.7 + 0.05))
-    found = validate_depth(true, anchor.replace(image=anchor.image.float() / 255), dim, **SMALL)
+    found = validate_depth(true, reference.replace(image=reference.image.float() / 255), dim, **SMALL)
     both = found.known & sound.known
     assert both.sum() > 0.8 * sound.known.sum()
     assert (found.state == sound.state)[both].float().mean() > 0.95
 
 
-def test_maps_of_other_views_see_through_what_stands_too_near(room, true, anchor, others):
+def test_maps_of_other_views_see_through_what_stands_too_near(room, true, reference, others):
     maps = torch.stack([room.truth(k)["depth"] for k in OTHERS])
     blob = true.clone()
     blob[:, 60:120, 70:140] *= 0.6
-    found = validate_depth(blob, anchor, others, other_maps=maps, **SMALL)
+    found = validate_depth(blob, reference, others, other_maps=maps, **SMALL)
     inside = at_grid(blob < 0.9 * true, found) > 0
-    told = found.by_maps.isfinite()
-    assert (found.by_maps[told & inside] < -3).float().mean() > 0.8
+    told = found.consistency_evidence.isfinite()
+    assert (found.consistency_evidence[told & inside] < -3).float().mean() > 0.8
     assert (told & inside).sum() > 0.3 * inside.sum()
-    assert (found.by_maps[told & ~inside] < -3).float().mean() < 0.1
+    assert (found.consistency_evidence[told & ~inside] < -3).float().mean() < 0.1
 
 
 @pytest.mark.parametrize("fewer", [4, 8])
-def test_coarse_maps_of_other_views_see_through_no_true_outline(fewer, room, true, anchor, asked):
+def test_coarse_maps_of_other_views_see_through_no_true_outline(fewer, room, true, reference, asked):
     """An outline lies anywhere between two of their pixels, and what is before it may be either's."""
     maps = torch.stack([room.truth(k)["depth"][:, fewer // 2 :: fewer, fewer // 2 :: fewer] for k in OTHERS])
-    assert not (validate_against(true, anchor, asked, other_maps=maps, **SMALL).by_maps < -3).any()
+    assert not (validate_against(true, reference, asked, other_maps=maps, **SMALL).consistency_evidence < -3).any()
 
 
 @pytest.mark.parametrize(("n", "good"), [(2, (1,)), (7, (3, 6))])  # more than are looked at, too
-def test_a_view_that_tells_is_named_by_its_place_among_those_offered(n, good, true, anchor, others):
+def test_a_view_that_tells_is_named_by_its_place_among_those_offered(n, good, true, reference, others):
     blank = torch.full_like(others.image[0], 128)
     offered = [others[k % len(OTHERS)] for k in range(n)]
     offered = [view if k in good else view.replace(image=blank) for k, view in enumerate(offered)]
-    found = validate_depth(true, anchor, stack(offered), **SMALL)
+    found = validate_depth(true, reference, stack(offered), **SMALL)
     assert set(found.view.unique().tolist()) == {-2, -1, *good}
 
 
-def test_a_map_that_is_cut_is_wrong_or_unknown_where_it_is(true, anchor, others):
+def test_a_map_that_is_cut_is_wrong_or_unknown_where_it_is(true, reference, others):
     """A byte in centimetres: nothing is farther than 2.55 m, as windows at the outline of what is near would have it."""
     byte = (true * 100).round().clamp_max(255) / 100
-    found = validate_depth(byte, anchor, others, **SMALL)
+    found = validate_depth(byte, reference, others, **SMALL)
     off = at_grid(true, found) > 1.2 * found.depth
     assert off.float().mean() > 0.3
     assert not (found.state == State.CONSISTENT)[off].any()
     assert ((found.state == State.CONSISTENT) & ~off).sum() > 0.5 * (~off).sum()
-    assert found.ceiling[0] == pytest.approx(2.55)
+    assert found.clip_depth[0] == pytest.approx(2.55)
 
 
 def test_a_wall_that_ends_a_map_is_no_cut_and_neither_is_a_wrong_metre():
@@ -258,39 +260,39 @@ def test_a_wall_that_ends_a_map_is_no_cut_and_neither_is_a_wrong_metre():
         (lambda d: d[:, :, :1], "at least 2×2 pixels"),
     ],
 )
-def test_what_is_no_map_is_refused(bad, said, true, anchor):
+def test_what_is_no_map_is_refused(bad, said, true, reference):
     with pytest.raises(ValueError, match=said):
-        validate_depth(bad(true), anchor)
+        validate_depth(bad(true), reference)
     with pytest.raises(ValueError, match=said.replace("depth_map", "other_maps")):
-        validate_depth(true, anchor, other_maps=bad(true)[None])
+        validate_depth(true, reference, other_maps=bad(true)[None])
 
 
 @pytest.mark.parametrize("fewer", [4, 8])
-def test_a_sound_map_of_few_pixels_is_not_wrong_at_its_outlines(fewer, room, true, anchor, others, sound):
+def test_a_sound_map_of_few_pixels_is_not_wrong_at_its_outlines(fewer, room, true, reference, others, sound):
     """A value of a coarse map stands for many pixels of the grid: beside an outline either surface may be theirs."""
 
     def coarse(x):
         return x[:, fewer // 2 :: fewer, fewer // 2 :: fewer]
 
     maps = torch.stack([coarse(room.truth(k)["depth"]) for k in OTHERS])
-    found = validate_depth(coarse(true), anchor, others, other_maps=maps, **SMALL)
+    found = validate_depth(coarse(true), reference, others, other_maps=maps, **SMALL)
 
     def called(verdict):
         return float((verdict.state == State.WRONG).sum() / verdict.known.sum())
 
     assert called(found) < called(sound) + 0.02
     assert found.known.float().mean() > 0.6 * sound.known.float().mean()
-    off = validate_depth(1.1 * coarse(true), anchor, others, **SMALL, views=False)
+    off = validate_depth(1.1 * coarse(true), reference, others, **SMALL, views=False)
     assert not off.scale[0, 1] <= 1 <= off.scale[0, 2]
 
 
-def test_no_depth_is_never_right_or_wrong(true, anchor, others):
+def test_no_depth_is_never_right_or_wrong(true, reference, others):
     holes = true.clone()
     holes[:, :, :120] = torch.nan
     holes[:, :60] = 0
-    found = validate_depth(holes, anchor, others, **SMALL)
+    found = validate_depth(holes, reference, others, **SMALL)
     assert not found.known[at_grid((~(holes > 0)), found) > 0].any()
-    nothing = validate_depth(torch.zeros_like(true), anchor, others, **SMALL)
+    nothing = validate_depth(torch.zeros_like(true), reference, others, **SMALL)
     assert not nothing.known.any()
     assert nothing.wrong.isnan().all()
 
@@ -353,21 +355,21 @@ def test_area_under_the_curve():
     assert auroc(score, torch.zeros(4, dtype=torch.bool)) is None
 
 
-@pytest.mark.parametrize("option", [{"tolerance": 0.2}, {"tolerance": 0}, {"size": 4}, {"partners": 0}])
-def test_options_out_of_range_are_refused(option, true, anchor, others):
-    with pytest.raises(ValueError, match="judge: "):
-        validate_depth(true, anchor, others, **option)
+@pytest.mark.parametrize("option", [{"tolerance": 0.2}, {"tolerance": 0}, {"size": 4}, {"source_views": 0}])
+def test_options_out_of_range_are_refused(option, true, reference, others):
+    with pytest.raises(ValueError, match="validate_depth: "):
+        validate_depth(true, reference, others, **option)
 
 
-def test_a_map_of_another_batch_is_refused(true, anchor, others):
-    with pytest.raises(ValueError, match="judge"):
-        validate_depth(true.expand(2, -1, -1), anchor, others)
+def test_a_map_of_another_batch_is_refused(true, reference, others):
+    with pytest.raises(ValueError, match="validate_depth"):
+        validate_depth(true.expand(2, -1, -1), reference, others)
 
 
-def test_a_batch_is_judged_as_its_members_are(room, true, anchor, others):
+def test_a_batch_is_judged_as_its_members_are(room, true, reference, others):
     other = range_split(room[6], NEAR)
 
-    both = collate([anchor, other])
+    both = collate([reference, other])
     maps = torch.cat([true, 1.1 * room.truth(6)["depth"]])
     views = others[:2]
     found = validate_depth(maps, both, views.map(lambda x: x.expand(-1, 2, *x.shape[2:])), **SMALL, views=False)

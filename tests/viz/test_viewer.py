@@ -409,7 +409,7 @@ def test_a_recording_of_ones_own(command, tmp_path):
     [
         (["nowhere"], ["nowhere"]),
         ([*TINY, "most=0"], ["most", "0"]),
-        ([*TINY, "dense={sise: 3}"], ["dense", "sise", "partners"]),
+        ([*TINY, "dense={sise: 3}"], ["dense", "sise", "source_views"]),
         ([*TINY, "scene=hall", "html=x.html"], ["scene", "hall", "synthetic_room"]),
         (["html=x.txt"], ["x.txt", ".html"]),
         (["save=view.rerun"], ["view.rerun", ".rrd"]),

@@ -72,7 +72,7 @@ def read(
     """Open one capture.
 
     The depth is ``lowres_depth`` with its confidence. Nothing is ever taken over from an earlier frame: an image
-    without a partner in time is left out and reported.
+    without a source view in time is left out and reported.
 
     Args:
         root: the capture's folder, named by its video id, or its ``<video id>_frames``.

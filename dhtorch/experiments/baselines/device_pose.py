@@ -41,6 +41,8 @@ def device_pose_fit(frame_0: Frame, frame_1: Frame, n: int) -> PoseFit:
         ValueError: a frame without ``T_world_from_cam``.
     """
     if frame_0.T_world_from_cam is None or frame_1.T_world_from_cam is None:
-        raise ValueError("device_pose: frame.T_world_from_cam is absent, expected the data set's camera-to-world pose")
+        raise ValueError(
+            "device_pose_fit: frame.T_world_from_cam is absent, expected the data set's camera-to-world pose"
+        )
     T = se3.relative(frame_0.T_world_from_cam, frame_1.T_world_from_cam)
     return known_pose_fit(T.to(frame_0.camera.f.dtype), n)

@@ -85,7 +85,7 @@ def preprocess_image(image: Tensor, side: int = 224) -> Tensor:
     Returns:
         (B, 3, side, side).
     """
-    check("pixel_values", image=(image, "B C H W"))
+    check("preprocess_image", image=(image, "B C H W"))
     x = image / 255 if image.dtype == torch.uint8 else image
     x = torch.nn.functional.interpolate(x, (side, side), mode="bicubic", antialias=True, align_corners=False)
     return normalize(x.clamp(0, 1).expand(-1, 3, -1, -1), x.new_tensor(COLOUR_MEAN), x.new_tensor(COLOUR_STD))

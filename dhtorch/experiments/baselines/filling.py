@@ -27,16 +27,16 @@ _N_ROUNDS = 30
 _MIN_WEIGHT = 1e-3
 
 
-def fill_bilateral(anchor: Frame, samples: Samples) -> Estimate:
+def fill_bilateral(reference: Frame, samples: Samples) -> Estimate:
     """Depth at the samples by joint bilateral filling (kornia's filter), round after round from the rim of a hole.
 
     Score falls with the rounds it took. Gate NO_TRACK where none reached.
     """
-    picture = downscale_grey(anchor, _MAX_SIDE_PX)[0]
+    picture = downscale_grey(reference, _MAX_SIDE_PX)[0]
     h, w = picture.shape[-2:]
-    known = (anchor.depth > 0) & anchor.depth.isfinite()
+    known = (reference.depth > 0) & reference.depth.isfinite()
     weight = F.interpolate(known[:, None].to(picture), (h, w), mode="area")
-    depth = F.interpolate(torch.where(known, anchor.depth, 0.0)[:, None].to(picture), (h, w), mode="area")
+    depth = F.interpolate(torch.where(known, reference.depth, 0.0)[:, None].to(picture), (h, w), mode="area")
     depth = depth / weight.clamp_min(_MIN_WEIGHT)
     told = weight > _MIN_WEIGHT
     age = torch.zeros_like(depth)
@@ -46,7 +46,7 @@ def fill_bilateral(anchor: Frame, samples: Samples) -> Estimate:
         depth = torch.where(new, total / mass.clamp_min(_MIN_WEIGHT), depth)
         age = torch.where(new, 1.0 + k, age)
         told = told | new
-    uv = cam.depth_pixels(anchor.camera, anchor.hw, None, (h, w), samples.uv)
+    uv = cam.depth_pixels(reference.camera, reference.hw, None, (h, w), samples.uv)
     found = sample_nearest(torch.where(told, depth, torch.nan)[:, 0], uv)[0]
     noise = 0.01 * (1 + sample_nearest(age[:, 0], uv)[0])
     return estimate_from_depth(samples, found, noise, torch.where(found > 0, Gate.ANSWER, Gate.NO_TRACK))

@@ -79,8 +79,8 @@ MAP_1 = Method(
         far_weight=0.1,
         max_rise=0.1,
         isotropic=0.1,
-        turn_sigma=0.01,
-        turn_gain=0.02,
+        shutter_sigma=0.01,
+        shutter_gain=0.02,
         translation_gain=0.55,
         kernel="geman_mcclure",
         bend=2.0,
@@ -121,9 +121,9 @@ MAP_1 = Method(
         max_chi2=9.0,
         correlation=1.0,
         max_sigma_rel=0.1,
-        max_still=0.5,
+        max_static_ratio=0.5,
     ),
-    choose=None,
+    select_views=None,
     n=2048,
     hypotheses=200,
     min_trackability=1e-05,
@@ -131,5 +131,5 @@ MAP_1 = Method(
     chain=True,
 )
 
-#: Five views of one anchor, those on the way to the last; their inverse depths fused where two of them agree.
+#: Five views of one reference view, those on the way to the last; their inverse depths fused where two of them agree.
 WINDOW_1 = MAP_1.replace(views=5)

@@ -55,9 +55,9 @@ def resize_and_crop(image: Tensor, hw: tuple[int, int], crop_hw: tuple[int, int]
     Raises:
         ValueError: wrong shapes, or a crop larger than the picture.
     """
-    sizes = check("fitted", image=(image, "B C H W"))
+    sizes = check("resize_and_crop", image=(image, "B C H W"))
     if crop_hw[0] > hw[0] or crop_hw[1] > hw[1]:
-        raise ValueError(f"fitted: crop is {crop_hw[0]}x{crop_hw[1]}, expected at most {hw[0]}x{hw[1]}")
+        raise ValueError(f"resize_and_crop: crop is {crop_hw[0]}x{crop_hw[1]}, expected at most {hw[0]}x{hw[1]}")
     x = (image / 255 if image.dtype == torch.uint8 else image).float().expand(-1, 3, -1, -1)
     x = torch.nn.functional.interpolate(x, hw, mode="bicubic", antialias=True, align_corners=False).clamp(0, 1)
     top, left = (hw[0] - crop_hw[0]) // 2, (hw[1] - crop_hw[1]) // 2
@@ -71,7 +71,7 @@ def sample_relative_depth(relative: RelativeDepth, uv: Tensor) -> tuple[Tensor, 
 
     The nearest network pixel is read, so values are never mixed across an edge.
     """
-    check("read", depth=(relative.depth, "B h w"), uv=(uv, "B N 2"), gain=(relative.gain, "B 2"))
+    check("sample_relative_depth", depth=(relative.depth, "B h w"), uv=(uv, "B N 2"), gain=(relative.gain, "B 2"))
     place = uv * relative.gain[:, None].to(uv) + relative.shift[:, None].to(uv)
     depth, inside = sample_nearest(relative.depth.to(uv), place)
     confidence, _ = sample_nearest(relative.confidence.to(uv), place)

@@ -13,13 +13,13 @@ _N_RANSAC_TRIALS, _MAX_INLIER_ERROR = 200, 0.05
 
 def fit_median_scale(x: Tensor, z: Tensor) -> tuple[float, float]:
     """Scale that makes the median ratio one, shift 0; (n,) each, NaN of nothing."""
-    check("median_ratio", x=(x, "n"), z=(z, "n"))
+    check("fit_median_scale", x=(x, "n"), z=(z, "n"))
     return (float((z / x).median()), 0.0) if len(x) else (float("nan"), 0.0)
 
 
 def fit_scale_shift(x: Tensor, z: Tensor) -> tuple[float, float]:
     """Scale and shift of the least squares of ``s x + t − z``, (n,) each; NaN of fewer than two points."""
-    check("least_squares", x=(x, "n"), z=(z, "n"))
+    check("fit_scale_shift", x=(x, "n"), z=(z, "n"))
     if len(x) < 2:
         return float("nan"), float("nan")
     A = torch.stack((x, torch.ones_like(x)), -1).double()
@@ -29,7 +29,7 @@ def fit_scale_shift(x: Tensor, z: Tensor) -> tuple[float, float]:
 
 def fit_scale_shift_ransac(x: Tensor, z: Tensor, *, seed: int = 0) -> tuple[float, float]:
     """Scale and shift that most points agree with, then least squares of these; (n,) each."""
-    check("ransac", x=(x, "n"), z=(z, "n"))
+    check("fit_scale_shift_ransac", x=(x, "n"), z=(z, "n"))
     if len(x) < 2:
         return float("nan"), float("nan")
     draw = torch.randint(len(x), (_N_RANSAC_TRIALS, 2), generator=torch.Generator().manual_seed(seed))

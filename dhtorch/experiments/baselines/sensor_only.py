@@ -27,7 +27,7 @@ def sensor_only(
     """
     start = time.perf_counter()
     like = frame_0.camera.f
-    samples = method.look(frame_0)
+    samples = method.sample_depth(frame_0)
     keep = samples.usable
     nan = torch.full_like(samples.depth, torch.nan)
     zero = torch.zeros_like(samples.depth)

@@ -62,7 +62,7 @@ def is_epipole_inside(views: tuple[tuple[Camera, tuple[int, int]], ...], T_1_fro
 
 
 def match_semi_global(
-    anchor: Frame,
+    reference: Frame,
     other: Frame,
     T_1_from_0: Pose,
     samples: Samples,
@@ -76,12 +76,12 @@ def match_semi_global(
     shrink. Gates: NO_TRACK where nothing is matched, NO_POSE without a motion, NO_BASELINE where an epipole lies
     inside a picture.
     """
-    (grey_0, camera_0), (grey_1, camera_1) = (downscale_grey(frame, size) for frame in (anchor, other))
+    (grey_0, camera_0), (grey_1, camera_1) = (downscale_grey(frame, size) for frame in (reference, other))
     hw = _image_hw(grey_0)
     inside = is_epipole_inside(((camera_0, hw), (camera_1, _image_hw(grey_1))), T_1_from_0)
     depth = torch.full_like(samples.depth, torch.nan)
     noise = torch.ones_like(depth)
-    uv = cam.depth_pixels(anchor.camera, anchor.hw, None, hw, samples.uv)
+    uv = cam.depth_pixels(reference.camera, reference.hw, None, hw, samples.uv)
     known = T_1_from_0.t.isfinite().all(-1)
     for b in (known & ~inside).nonzero()[:, 0].tolist():
         one = slice(b, b + 1)
@@ -162,15 +162,17 @@ def _depth_from_disparity(
     return np.where(told, abs(rectified.reach) / (known * ray[:, 2].reshape(h, w)), np.nan), _MATCH_NOISE_PX / known
 
 
-def match_optical_flow(anchor: Frame, other: Frame, T_1_from_0: Pose, samples: Samples, *, size: int = 640) -> Estimate:
+def match_optical_flow(
+    reference: Frame, other: Frame, T_1_from_0: Pose, samples: Samples, *, size: int = 640
+) -> Estimate:
     """``cv2.DISOpticalFlow`` (medium) there and back, triangulated in closed form under the known motion.
 
     Gates: NO_TRACK where the round trip misses by more than a pixel, BEHIND where rays meet behind a camera, NO_POSE.
     """
-    (grey_0, camera_0), (grey_1, camera_1) = (downscale_grey(frame, size) for frame in (anchor, other))
+    (grey_0, camera_0), (grey_1, camera_1) = (downscale_grey(frame, size) for frame in (reference, other))
     hw = _image_hw(grey_0)
     engine = _CV.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    uv = cam.depth_pixels(anchor.camera, anchor.hw, None, hw, samples.uv)
+    uv = cam.depth_pixels(reference.camera, reference.hw, None, hw, samples.uv)
     moved = torch.full_like(uv, torch.nan)
     for b in range(len(uv) if _image_hw(grey_1) == hw else 0):
         there, back = _flow_both_ways(

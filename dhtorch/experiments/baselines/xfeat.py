@@ -136,7 +136,7 @@ def match(
         ImportError: no network is given and the package is missing.
 
     Gradient: none; ``lucas_kanade_affine(track=match)`` lends it one.
-    Cost: linear in cells × samples; one pass of the network for each picture, an anchor's is kept in the hint.
+    Cost: linear in cells × samples; one pass of the network for each picture, a reference view's is kept in the hint.
     Source: Potje et al. 2024, "XFeat: accelerated features for lightweight image matching".
     """
     check("xfeat.match", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"))

@@ -1,4 +1,5 @@
-"""Question: does a map of anybody's become as metric as our anchors allow, and is it left alone where it is right?
+"""Question: does a map of anybody's become as metric as our reference views allow, and is it left alone where it is
+right?
 
 The true map of a frame is made wrong in known ways, near returns and far answers of the frame are told, and what comes
 out beyond the near limit is held against the truth. A fault that lies in shape and metre like a network's counts in the
@@ -44,20 +45,20 @@ from dhtorch.records import DepthMap, Frame
 from dhtorch.synthetic import depth_faults
 from dhtorch.synthetic.depth_faults import NETWORK_FAULTS, WRONG_TIME
 
-QUESTION = "Does anybody's map become as metric as the anchors allow, and is it left alone where it is right?"
+QUESTION = "Does anybody's map become as metric as the reference views allow, and is it left alone where it is right?"
 EXPECTATION = "Every number of the list of bars is met; scenes are the unit."
 
 #: Number → (bar, whether it holds).
 ALIGN_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
-    "anchor.simulated_median": (0.02, lambda value, bar: value <= bar),
-    "anchor.ratio_to_near_affine": (0.5, lambda value, bar: value <= bar),
-    "anchor.worst_ratio_to_better": (1.05, lambda value, bar: value <= bar),
-    "anchor.within_sigma": (0.68, lambda value, bar: abs(value - bar) <= 0.07),
-    "anchor.within_2sigma": (0.90, lambda value, bar: value >= bar),
+    "align.simulated_median": (0.02, lambda value, bar: value <= bar),
+    "align.ratio_to_near_affine": (0.5, lambda value, bar: value <= bar),
+    "align.worst_ratio_to_better": (1.05, lambda value, bar: value <= bar),
+    "align.within_sigma": (0.68, lambda value, bar: abs(value - bar) <= 0.07),
+    "align.within_2sigma": (0.90, lambda value, bar: value >= bar),
 }
 
 #: Ours, and what stands beside it.
-_OURS, _RAW, _NEAR_ONLY = "anchor", "raw", "near least squares"
+_OURS, _RAW, _NEAR_ONLY = "align", "raw", "near least squares"
 _PEERS = (_RAW, _NEAR_ONLY, "least squares", "median ratio", "ransac")
 
 #: Error up to which nobody asks which of two maps is the better one.
@@ -75,7 +76,7 @@ class AlignmentCase(NamedTuple):
 
     truth: Tensor  # (1, h, w) m, 0 = not known
     other: Tensor  # the same of another time
-    anchors: Sequence[Any]  # near returns, far answers
+    references: Sequence[Any]  # near returns, far answers
     hw: tuple[int, int]
     near: float  # m
 
@@ -86,25 +87,25 @@ def run(
     pairs: ScenePairs,
     settings: Settings,
     *,
-    anchors: int | None = 2,
+    reference_views: int | None = 2,
     size: int = 320,
     swept: bool = False,
     faults: Sequence[str] | None = None,
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """Every fault of some frames of every scene, anchored by us and by the usual fits.
+    """Every fault of some frames of every scene, aligned by us and by the usual fits.
 
     Rows: one a scene, fault (``truth``) and method, with ``median_rel`` (median relative error beyond the near limit),
     ``within_sigma`` and ``within_2sigma`` (pixels with truth, answered) and ``answered``; of ours also ``models``, how
     often each was taken. Summary: see :data:`ALIGN_BARS`, each also as ``<number>_one_left_out`` (median, least and
-    greatest with one scene left out); ``anchor.<fault>_median`` for every fault (median over scenes).
+    greatest with one scene left out); ``reference view.<fault>_median`` for every fault (median over scenes).
 
     Args:
         scenes: with a near limit; those without, sparse ones and those with a role are noted and left out.
         methods: name → method; the first gives near returns and far answers.
-        pairs: of which the anchors count.
+        pairs: of which the reference views count.
         settings: of the job.
-        anchors: so many of a scene's, evenly spread; None = all.
+        reference_views: so many of a scene's, evenly spread; None = all.
         size: longer side of the maps, px.
         swept: far answers are those of a dense sweep as well.
         faults: of :data:`dhtorch.synthetic.depth_faults.DEPTH_FAULTS`, or ``time``; None = all.
@@ -127,7 +128,7 @@ def run(
             continue
         assert near is not None
         found: dict[tuple[str, str], list[Row]] = {}
-        frames = sorted({pair[0] for pair in protocol.spread_pairs(pairs, anchors, scene)})
+        frames = sorted({pair[0] for pair in protocol.spread_pairs(pairs, reference_views, scene)})
         for i in progress(frames, scene.name, len(frames)):
             look = _make_case(scene, i, method, settings, near, size=size, swept=swept)
             for name, by, row in _evaluate_case(look, names, i):
@@ -174,11 +175,11 @@ def summarise_alignment(rows: Sequence[Row], names: Sequence[str]) -> Row:
     networks = [r for (_, name, by), r in at.items() if by == _OURS and name in NETWORK_FAULTS]
     some = ratios[ratios.isfinite().any(1)]
     of_scenes = bootstrap.interval_of_statistic(lambda index: some[index].flatten(1).nanquantile(0.5, -1), len(some))
-    found["anchor.ratio_to_near_affine"] = of_scenes.entry("1")
-    found["anchor.worst_ratio_to_better"] = bootstrap.without_interval(max(worst) if worst else None, len(scenes))
+    found["align.ratio_to_near_affine"] = of_scenes.entry("1")
+    found["align.worst_ratio_to_better"] = bootstrap.without_interval(max(worst) if worst else None, len(scenes))
     for key in ("within_sigma", "within_2sigma"):
         means = [_mean_or_none([r[key] for r in networks if r["scene"] == scene]) for scene in scenes]
-        found[f"anchor.{key}"] = bootstrap.interval_over_scenes(means, statistic="mean").entry("1")
+        found[f"align.{key}"] = bootstrap.interval_over_scenes(means, statistic="mean").entry("1")
     return found
 
 
@@ -219,19 +220,21 @@ def _make_case(
         return range_split(recording[k].to(settings.dtype).to(settings.device), near)
 
     offered = candidate_frames(recording, i)
-    anchor = shown(i)
+    reference = shown(i)
     trace: Trace = {}
     with torch.no_grad():
         others = stack([shown(k) for k in offered])
-        told = method(anchor, others, seed=settings.seed, hint=scene.hint, trace=trace)
+        told = method(reference, others, seed=settings.seed, hint=scene.hint, trace=trace)
         far: list[Any] = [told]
         if swept:
             asked = dense.selected_views(told, others, trace)
-            found = dense.sweep_depth(anchor, asked, method=method, size=size, calibration=dense.default_calibration())
+            found = dense.sweep_depth(
+                reference, asked, method=method, size=size, calibration=dense.default_calibration()
+            )
             far.append(_swept_only(found))
     later = i + _WRONG_TIME_FRAMES if i + _WRONG_TIME_FRAMES < len(recording) else max(i - _WRONG_TIME_FRAMES, 0)
     true, other = (_true_map(scene, k, recording[k].to(settings.dtype), size) for k in (i, later))
-    return AlignmentCase(true, other, [trace["samples"], *far], anchor.hw, near)
+    return AlignmentCase(true, other, [trace["samples"], *far], reference.hw, near)
 
 
 def _swept_only(found: DepthMap) -> DepthMap:
@@ -270,7 +273,7 @@ def _evaluate_case(look: AlignmentCase, names: Sequence[str], seed: int) -> Iter
         x, _ = depth_faults.apply_fault(name, look.truth, seed=seed, other=look.other)
         trace: dict[str, align.ModelSelection] = {}
         with torch.no_grad():
-            ours = align.align_depth(x, look.anchors, hw=look.hw, trace=trace)
+            ours = align.align_depth(x, look.references, hw=look.hw, trace=trace)
         off = (ours.depth - look.truth).abs()
         both = ours.keep & known
         row = {
@@ -288,7 +291,7 @@ def _evaluate_case(look: AlignmentCase, names: Sequence[str], seed: int) -> Iter
 def _fit_peers(x: Tensor, look: AlignmentCase) -> dict[str, Tensor]:
     """The usual fits."""
     known = torch.where(x > 0, x, torch.nan)
-    points = collect_references(known, look.anchors, look.hw)
+    points = collect_references(known, look.references, look.hw)
     use = points.used[0]
     value, z, near = points.x[0][use], points.depth[0][use], points.near[0][use]
     fits = {

@@ -69,9 +69,9 @@ _RECTIFIABLE, FULL_COHORT = "rectifiable", "full"
 
 @dataclass(frozen=True)
 class ReferenceSweep:
-    """What was found out about one anchor, once for all variants."""
+    """What was found out about one reference view, once for all variants."""
 
-    anchor: Frame
+    reference: Frame
     trace: Trace  # of the sparse method
     asked: dense.SelectedViews
     maps: Mapping[int, DepthMap]  # by the number of other views
@@ -94,31 +94,33 @@ class SweepCache:
     ) -> Estimate:
         """One variant's answer, as the protocol asks for it."""
         trace = told.pop("trace")
-        anchor, others = views
-        if self._last is None or self._last.anchor is not anchor:
-            self._last = self._look(method, anchor, others, told)
+        reference, others = views
+        if self._last is None or self._last.reference is not reference:
+            self._last = self._look(method, reference, others, told)
         looked = self._last
         trace |= looked.trace
         samples, estimate = say(looked)
         trace |= {"samples": samples, "ms": dict(looked.ms), "rectifiable": is_rectifiable(looked)}
         return estimate
 
-    def _look(self, method: Method, anchor: Frame, others: Frame, told: Mapping[str, Any]) -> ReferenceSweep:
+    def _look(self, method: Method, reference: Frame, others: Frame, told: Mapping[str, Any]) -> ReferenceSweep:
         trace: Trace = {}
         method = method.replace(track=told["track"])
         began = time.perf_counter()
-        joined = method(anchor, others, seed=told["seed"], hint=told["hint"], trace=trace)
+        joined = method(reference, others, seed=told["seed"], hint=told["hint"], trace=trace)
         asked = dense.selected_views(joined, others, trace)
         ms = {"sparse": 1e3 * (time.perf_counter() - began)}
         maps = {}
-        for partners in (self.options.get("partners", 3), 1):
+        for source_views in (self.options.get("source_views", 3), 1):
             began = time.perf_counter()
-            maps[partners] = dense.sweep_depth(anchor, asked, method=method, **{**self.options, "partners": partners})
-            ms[f"sweep_{partners}"] = 1e3 * (time.perf_counter() - began)
+            maps[source_views] = dense.sweep_depth(
+                reference, asked, method=method, **{**self.options, "source_views": source_views}
+            )
+            ms[f"sweep_{source_views}"] = 1e3 * (time.perf_counter() - began)
         hw = next(iter(maps.values())).depth.shape[-2:]
-        place = dense.map_pixel_centres(anchor, (hw[0], hw[1])).unflatten(0, hw)
+        place = dense.map_pixel_centres(reference, (hw[0], hw[1])).unflatten(0, hw)
         half = self.stride // 2
-        grid = method.backproject(anchor, place[half :: self.stride, half :: self.stride].reshape(-1, 2))
+        grid = method.backproject(reference, place[half :: self.stride, half :: self.stride].reshape(-1, 2))
         index, _ = dense.top_views(asked, 1)
         at = index[0], torch.arange(len(index[0]), device=index.device)
         fit = asked.fits[at]
@@ -126,7 +128,7 @@ class SweepCache:
         R = torch.where(lost[:, None, None], torch.nan, fit.T_1_from_0.R)
         t = torch.where(lost[:, None], torch.nan, fit.T_1_from_0.t)
         return ReferenceSweep(
-            anchor=anchor,
+            reference=reference,
             trace={**trace, "sparse": joined},
             asked=asked,
             maps=maps,
@@ -146,7 +148,7 @@ def run(
     method: Method | None = None,
     sweep: Mapping[str, Any] | None = None,
     stride: int = 4,
-    anchors: int | None = None,
+    reference_views: int | None = None,
     peers: bool = True,
     indoor: Sequence[str] = (),
     rotations: Sequence[SceneLike] = (),
@@ -166,8 +168,8 @@ def run(
     ``dense.error_ratio_to_<peer>`` alike, ``dense.rotation_answered`` and ``dense.room_within_1``.
 
     Args:
-        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`; of ``pairs`` the anchors
-            count.
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`; of ``pairs`` the
+            reference views count.
         method: the sparse method; None = the job's.
         sweep: options of :func:`dhtorch.pipeline.dense.sweep_depth`.
         stride: every so many pixels of the map, both ways, are judged.
@@ -180,14 +182,14 @@ def run(
     Raises:
         ValueError: an option out of range; else as the main job.
     """
-    _check_options(stride=stride, **({} if anchors is None else {"anchors": anchors}))
+    _check_options(stride=stride, **({} if reference_views is None else {"reference_views": reference_views}))
     sparse = method or next(iter(chosen.values()))
     options = dict(sweep or {})
     every = list(scenes_of(scenes))
     every += [scene for scene in scenes_of(rotations) if scene.name not in {known.name for known in every}]
     looking = SweepCache(options, stride)
     variants = _variants(sparse, looking, settings.seed, peers)
-    some = partial(protocol.spread_pairs, pairs, anchors)
+    some = partial(protocol.spread_pairs, pairs, reference_views)
     parts = []
     for turning in (False, True):
         asked = [scene for scene in every if (scene.role == "rotation") == turning]
@@ -226,7 +228,7 @@ def verdict(outcome: Outcome, peers: bool = True) -> tuple[bool | None, str]:
 
 def is_rectifiable(looked: ReferenceSweep) -> Tensor:
     """Whether both epipoles lie outside their pictures, (B,) bool."""
-    views = tuple((view.camera, view.hw) for view in (looked.anchor, looked.other))
+    views = tuple((view.camera, view.hw) for view in (looked.reference, looked.other))
     inside = stereo.is_epipole_inside(views, looked.T_1_from_0)
     return ~inside & looked.T_1_from_0.t.isfinite().all(-1)
 
@@ -250,22 +252,22 @@ def sample_map(found: DepthMap, samples: Samples, frame: Frame) -> Estimate:
 
 
 def _variants(method: Method, looking: SweepCache, seed: int, peers: bool) -> dict[str, Variant]:
-    most = looking.options.get("partners", 3)
+    most = looking.options.get("source_views", 3)
 
     def at(k: int) -> Callable[[ReferenceSweep], tuple[Samples, Estimate]]:
-        return lambda x: (x.grid, sample_map(x.maps[k], x.grid, x.anchor))
+        return lambda x: (x.grid, sample_map(x.maps[k], x.grid, x.reference))
 
     says: dict[str, Callable[[ReferenceSweep], tuple[Samples, Estimate]]] = {
         "sparse": lambda x: (x.trace["samples"], x.trace["sparse"]),
-        _AT_SAMPLES: lambda x: (x.trace["samples"], sample_map(x.maps[most], x.trace["samples"], x.anchor)),
+        _AT_SAMPLES: lambda x: (x.trace["samples"], sample_map(x.maps[most], x.trace["samples"], x.reference)),
         _ONE_VIEW: at(1),
         DENSE_VARIANT: at(most),
     }
     if peers:
         says |= {
             "sgbm": lambda x: (x.grid, _match_semi_global(x, x.T_1_from_0)),
-            "dis flow": lambda x: (x.grid, stereo.match_optical_flow(x.anchor, x.other, x.T_1_from_0, x.grid)),
-            "bilateral": lambda x: (x.grid, filling.fill_bilateral(x.anchor, x.grid)),
+            "dis flow": lambda x: (x.grid, stereo.match_optical_flow(x.reference, x.other, x.T_1_from_0, x.grid)),
+            "bilateral": lambda x: (x.grid, filling.fill_bilateral(x.reference, x.grid)),
         }
     variants = {
         name: Variant(method, ask=partial(looking.ask, say), seed=seed, offers=candidate_frames)
@@ -283,12 +285,12 @@ def _match_semi_global(looked: ReferenceSweep, T_1_from_0: Pose) -> Estimate:
     near = looked.trace["samples"]
     reach = torch.where(near.usable, near.depth, 0.0).amax(-1)
     reach = torch.where(reach > 0, 0.7 * reach, 1.0)
-    return stereo.match_semi_global(looked.anchor, looked.other, T_1_from_0, looked.grid, nearest_m=reach)
+    return stereo.match_semi_global(looked.reference, looked.other, T_1_from_0, looked.grid, nearest_m=reach)
 
 
 def _match_own_calibration(looked: ReferenceSweep) -> tuple[Samples, Estimate]:
     """What the pictures give under the motion that their data set states."""
-    a, b = looked.anchor.T_world_from_cam, looked.other.T_world_from_cam
+    a, b = looked.reference.T_world_from_cam, looked.other.T_world_from_cam
     assert a is not None and b is not None
     T = se3.compose(se3.invert(b), a).map(lambda x: x.to(looked.grid.uv))
     return looked.grid, _match_semi_global(looked, T)

@@ -26,7 +26,7 @@ from dhtorch.pipeline.method import Method
 from dhtorch.records import Frame, PoseFit
 from dhtorch.synthetic import SyntheticRoom
 
-#: The rooms: their frames' size, near limit in m, and the frames of anchor and other view.
+#: The rooms: their frames' size, near limit in m, and the frames of reference view and other view.
 _ROOM_HW, _NEAR_LIMIT_M, _VIEW_FRAMES = (480, 640), 2.0, (3, 11)
 
 #: Standard deviation of grey values in a window of 9 x 9 pixels that counts as texture, and the step of depth in one of
@@ -56,25 +56,29 @@ def _evaluate_room(seed: int, method: Method, options: Mapping[str, Any]) -> tup
     room = SyntheticRoom(
         n_frames=max(_VIEW_FRAMES) + 1, hw=_ROOM_HW, depth_hw=_ROOM_HW, lidar="exact", image_noise=0.0, seed=seed
     )
-    anchor, other = (room[k] for k in _VIEW_FRAMES)
-    near = range_split(anchor, _NEAR_LIMIT_M)
-    fit = exact_pose_fit(anchor, other, method.n)
+    reference, other = (room[k] for k in _VIEW_FRAMES)
+    near = range_split(reference, _NEAR_LIMIT_M)
+    fit = exact_pose_fit(reference, other, method.n)
     with torch.no_grad():
         found = dense.complete_depth(
-            near, range_split(other, _NEAR_LIMIT_M), method=method.replace(views=1, choose=None), fit=fit, **options
+            near,
+            range_split(other, _NEAR_LIMIT_M),
+            method=method.replace(views=1, select_views=None),
+            fit=fit,
+            **options,
         )
-    wanted = evaluated_pixels(anchor, other, _odd_surface_mask(room, _VIEW_FRAMES[0]))
+    wanted = evaluated_pixels(reference, other, _odd_surface_mask(room, _VIEW_FRAMES[0]))
     told = wanted & (found.source == Source.SWEPT)
-    right = told & ((found.depth - anchor.depth).abs() < _MAX_RELATIVE_ERROR * anchor.depth)
+    right = told & ((found.depth - reference.depth).abs() < _MAX_RELATIVE_ERROR * reference.depth)
     return int(right.sum()), int(told.sum()), int(wanted.sum())
 
 
-def exact_pose_fit(anchor: Frame, other: Frame, n: int) -> PoseFit:
+def exact_pose_fit(reference: Frame, other: Frame, n: int) -> PoseFit:
     """The motion between two frames that know where they stand, as known to a tenth of a millimetre."""
-    a, b = anchor.T_world_from_cam, other.T_world_from_cam
+    a, b = reference.T_world_from_cam, other.T_world_from_cam
     if a is None or b is None:
-        raise ValueError("exact_pose: found a frame without T_world_from_cam, expected two that have one")
-    T = se3.compose(se3.invert(b), a).map(lambda x: x.to(anchor.camera.f))
+        raise ValueError("exact_pose_fit: found a frame without T_world_from_cam, expected two that have one")
+    T = se3.compose(se3.invert(b), a).map(lambda x: x.to(reference.camera.f))
     one = torch.ones_like(T.t[:, 0])
     inlier = torch.ones(len(one), n, dtype=torch.bool, device=one.device)
     code = torch.full_like(one, PoseCode.OK, dtype=torch.int32)
@@ -91,26 +95,28 @@ def exact_pose_fit(anchor: Frame, other: Frame, n: int) -> PoseFit:
     )
 
 
-def evaluated_pixels(anchor: Frame, other: Frame, odd: Tensor) -> Tensor:
+def evaluated_pixels(reference: Frame, other: Frame, odd: Tensor) -> Tensor:
     """Which pixels (B, h, w) are asked for.
 
     Args:
-        anchor, other: frames whose depth is exact and of their picture's size.
+        reference, other: frames whose depth is exact and of their picture's size.
         odd: (B, h, w) bool, surfaces on which a picture shows something else.
     """
-    depth, picture = anchor.depth, grayscale(anchor.image)
+    depth, picture = reference.depth, grayscale(reference.image)
     mean = F.avg_pool2d(picture, 9, 1, 4)
     contrast = (F.avg_pool2d(picture.square(), 9, 1, 4) - mean.square()).clamp_min(0).sqrt()[:, 0]
     low, high = (sign * F.max_pool2d(sign * depth, 11, 1, 5) for sign in (-1, 1))
     xyz = se3.apply(
-        exact_pose_fit(anchor, other, 1).T_1_from_0,
-        cam.unproject(anchor.camera, dense.map_pixel_centres(anchor, anchor.hw)[None], depth.flatten(1)),
+        exact_pose_fit(reference, other, 1).T_1_from_0,
+        cam.unproject(reference.camera, dense.map_pixel_centres(reference, reference.hw)[None], depth.flatten(1)),
     )
     seen, inside = sample_nearest(other.depth, cam.project(other.camera, xyz))
     shown = inside & ((seen - xyz[..., 2]).abs() < _SAME_SURFACE_RATIO * xyz[..., 2])
     smooth = high < (1 + _MAX_DEPTH_STEP) * low
     beside = F.max_pool2d(odd.to(depth), 9, 1, 4) > 0
-    return (depth > _NEAR_LIMIT_M) & (contrast > _MIN_TEXTURE_SIGMA) & smooth & shown.unflatten(1, anchor.hw) & ~beside
+    return (
+        (depth > _NEAR_LIMIT_M) & (contrast > _MIN_TEXTURE_SIGMA) & smooth & shown.unflatten(1, reference.hw) & ~beside
+    )
 
 
 def _odd_surface_mask(room: SyntheticRoom, k: int) -> Tensor:

@@ -1,11 +1,11 @@
 """Question: what do feed-forward networks give on the same points, once somebody tells them the scale?
 
 DUSt3R and VGGT answer with dense depth up to scale. Beside our metric answers they get (a) the scale of an oracle: the
-median ratio to the truth over pixels of the anchor that no sample reads, one scale for each pair, as in the paper; and
-(b), beyond the paper, the scale of the sensor: the same ratio over the near returns that our method sees too. Only (b)
-is metric. The inputs are not equal (networks see no depth, ours sees near depth), and neither is silence: ours
-abstains, so the networks are also scored on exactly the candidates that ours answered. The control ``constant`` says
-the same depth everywhere: its error is what an oracle's scale is worth without any network.
+median ratio to the truth over pixels of the reference view that no sample reads, one scale for each pair, as in the
+paper; and (b), beyond the paper, the scale of the sensor: the same ratio over the near returns that our method sees
+too. Only (b) is metric. The inputs are not equal (networks see no depth, ours sees near depth), and neither is silence:
+ours abstains, so the networks are also scored on exactly the candidates that ours answered. The control ``constant``
+says the same depth everywhere: its error is what an oracle's scale is worth without any network.
 
 Expectation (written before the run): with the oracle's scale, VGGT has the smaller median error on most scenes, also on
 the candidates that ours answered (the paper: 2.5 % against 6.7 %).
@@ -158,7 +158,7 @@ def estimate_with_network(
 ) -> Estimate:
     """A network in the place of a method: our samples, its depth, a scale from ``known``."""
     like = near.camera.f
-    samples = method.look(near)
+    samples = method.sample_depth(near)
     relative, ms = network(near, other)
     scale = fit_scale(relative, known, samples.uv, n_pixels=scale_pixels, seed=seed)
     nowhere = Pose(
@@ -177,7 +177,7 @@ def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pi
 
     Args:
         relative: of B pairs.
-        known: the anchors with the depth that fixes the scale.
+        known: the reference views with the depth that fixes the scale.
         samples_uv: (B, N, 2) px.
         n_pixels: pixels drawn.
         seed: of the pixels.
@@ -217,8 +217,8 @@ def _has_weights(build: Callable[..., DepthNetwork]) -> bool:
 
 
 def _scale_reference(batch: Batch, *, scale: str, seed: int) -> dict[str, Any]:
-    """What fixes the scale: the truth of the anchor, or the returns that ours sees too."""
-    known = batch.exact if scale == "oracle" else holdout.range_split(batch.anchor, batch.cutoff)
+    """What fixes the scale: the truth of the reference view, or the returns that ours sees too."""
+    known = batch.exact if scale == "oracle" else holdout.range_split(batch.reference, batch.cutoff)
     return {"known": known, "seed": seed}
 
 

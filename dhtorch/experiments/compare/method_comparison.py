@@ -150,11 +150,11 @@ def _worst_wrong_share(name: str, scenes: Sequence[Sequence[Points]]) -> Row:
 
 
 def _make_variant(method: Method, seed: int, pairs: ScenePairs | None) -> Variant:
-    """A method that chooses its views is offered those around the anchor; another takes the pair's own.
+    """A method that chooses its views is offered those around the reference view; another takes the pair's own.
 
     With ``pairs`` it is not asked on scenes of too few views.
     """
-    if method.choose is not None:
+    if method.select_views is not None:
         return Variant(method, seed=seed, offers=candidate_frames, needs=partial(_skip_reason, None, method))
     return Variant(method, seed=seed, needs=partial(_skip_reason, pairs, method))
 

@@ -33,7 +33,7 @@ _MIN_TELLING_RATIO = 1.05
 
 #: Options of the pose that leave out far tracks, and a turn of the rows.
 _NEAR_ONLY_OPTIONS: dict[str, Any] = {"far_weight": 0.0}
-_GLOBAL_SHUTTER_OPTIONS: dict[str, Any] = {"turn_sigma": 0.0}
+_GLOBAL_SHUTTER_OPTIONS: dict[str, Any] = {"shutter_sigma": 0.0}
 
 #: Seat 6 as the paper has it: its gates, and how its sigma is made. The whole sets both differently.
 PAPER_GATE_OPTIONS: dict[str, Any] = {
@@ -175,8 +175,8 @@ def _swap_exposure(method: Method, other: Method) -> Method:
 
 
 def _swap_views(method: Method, other: Method) -> Method:
-    """The other's views; those on both sides of an anchor are no chain."""
-    return method.replace(choose=other.choose, views=other.views, chain=method.chain and other.chain)
+    """The other's views; those on both sides of a reference view are no chain."""
+    return method.replace(select_views=other.select_views, views=other.views, chain=method.chain and other.chain)
 
 
 def _swap_gates(names: Sequence[str], method: Method, other: Method) -> Method:

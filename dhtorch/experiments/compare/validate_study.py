@@ -123,7 +123,7 @@ def run(
     settings: Settings,
     *,
     method: Method | None = None,
-    anchors: int = 3,
+    reference_views: int = 3,
     windows: int = 2,
     size: int = 320,
     rooms: Sequence[int] = (0, 1, 2),
@@ -131,9 +131,10 @@ def run(
 ) -> Outcome:
     """Plant faults in true maps, with near returns alone shown to the method, and hold what is said against them.
 
-    Rows: one per anchor (``pair`` [i, i], method ``judge``), one per window and fault (``pair`` [first, last], method
-    ``causes``), one per scene. In the summary shares of anchors are means over scenes with intervals over these:
-    ``judge.scale_found`` and ``judge.false_alarm`` (all evidence), the same with ``_5`` for a twentieth and with
+    Rows: one per reference view (``pair`` [i, i], method ``judge``), one per window and fault (``pair`` [first, last],
+        method
+    ``causes``), one per scene. In the summary shares of reference views are means over scenes with intervals over
+    these: ``judge.scale_found`` and ``judge.false_alarm`` (all evidence), the same with ``_5`` for a twentieth and with
     ``_far`` by triangulated points alone; ``judge.jump_auroc`` of pixels without a shown return, ``_all`` of all;
     ``judge.called_right_wrong``, ``_worst`` of the worst scene, ``_cut`` of maps that are cut alone; ``judge.known``;
     ``photometric.<the same>`` of the peer, ``quick.<the same>`` of :data:`dhtorch.validation.validate.QUICK_METHOD`
@@ -143,7 +144,7 @@ def run(
 
     Args:
         scenes, chosen, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        pairs: not used; other views are chosen among those around an anchor.
+        pairs: not used; other views are chosen among those around a reference view.
         method: the sparse method; None = the job's.
         anchors: of each scene, evenly spread.
         windows: of each scene that is long enough.
@@ -153,7 +154,7 @@ def run(
     Raises:
         ValueError: an option out of range; else as the main job.
     """
-    for name, value in {"anchors": anchors, "windows": windows}.items():
+    for name, value in {"reference_views": reference_views, "windows": windows}.items():
         if not isinstance(value, int) or value < 0:
             raise ValueError(f"experiment.{name}: found {value!r}, expected a whole number of at least 0")
     ask = with_view_selection(method or next(iter(chosen.values())))
@@ -163,7 +164,9 @@ def run(
     for scene in every:
         look = partial(_load_frame, scene, settings)
         rows = []
-        for i in progress(_evenly_spaced(len(scene.recording), anchors), f"{scene.name}: anchors", anchors):
+        for i in progress(
+            _evenly_spaced(len(scene.recording), reference_views), f"{scene.name}: reference views", reference_views
+        ):
             rows.append(_reference_row(scene, i, look, ask, settings, size))
         firsts = _first_frames(len(scene.recording), windows)
         found = [
@@ -260,13 +263,13 @@ def _reference_row(
 def _make_validator(
     ask: Method, scene: Scene, near: Frame, others: Frame, settings: Settings, size: int
 ) -> tuple[dense.SelectedViews, Callable[..., DepthValidation]]:
-    """What a method finds at an anchor, and what is said of a map by it."""
+    """What a method finds at a reference view, and what is said of a map by it."""
     trace: Trace = {}
     with torch.no_grad():
         joined = ask(near, others, seed=settings.seed, hint=scene.hint, trace=trace)
     asked = dense.selected_views(joined, others, trace)
     offered = trace["choice"].index if "choice" in trace else None
-    return asked, partial(validate_against, anchor=near, asked=asked, offered=offered, method=ask, size=size)
+    return asked, partial(validate_against, reference=near, asked=asked, offered=offered, method=ask, size=size)
 
 
 def _validated_counts(
@@ -305,7 +308,7 @@ def _baseline_columns(asked: dense.SelectedViews) -> Row:
 
 
 def _scene_row(scene: Scene, rows: Sequence[Row]) -> Row:
-    """Shares over a scene's anchors."""
+    """Shares over a scene's reference views."""
     wide = [row for row in rows if row["baseline"]]
     out: Row = {"scene": scene.name, "pair": None, "method": "judge", "role": scene.role, "n_wide": len(wide)}
     for way, tail in _SCALE_COLUMN_SUFFIXES.items():

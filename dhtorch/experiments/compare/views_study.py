@@ -1,8 +1,8 @@
 """Question: does a method that chooses its views reach the best fixed gap, and is it silent without a baseline?
 
-Expectation (written before the run): yes; on every scene whose anchors have several partners ``auto`` answers, at 5 %
-mean risk, at least nineteen twentieths of what ``map`` answers at the gap that is the best of that scene in hindsight;
-where the camera only turns it answers at most one in two hundred of the samples without a return.
+Expectation (written before the run): yes; on every scene whose reference views have several source views ``auto``
+answers, at 5 % mean risk, at least nineteen twentieths of what ``map`` answers at the gap that is the best of that
+scene in hindsight; where the camera only turns it answers at most one in two hundred of the samples without a return.
 What would refute it: one scene on which a fixed gap answers more than that, or a larger share answered where the camera
 only turns.
 """
@@ -42,27 +42,29 @@ def run(
     *,
     methods: Mapping[str, Method] | None = None,
     gaps: Sequence[int] = CANDIDATE_STEPS,
-    anchors: int | None = 6,
+    reference_views: int | None = 6,
     rotations: Sequence[SceneLike] = (),
     rotation_gaps: Sequence[int] = tuple(range(1, 12)),
     seeds: int = 1,
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """``auto`` beside ``map`` at fixed gaps (variants ``map, gap <frames>``), on the same anchors of every scene.
+    """``auto`` beside ``map`` at fixed gaps (variants ``map, gap <frames>``), on the same reference views of every
+    scene.
 
-    The partner of an anchor at a gap is the frame of that much larger number, where there is none of that much smaller;
-    where there is neither the anchor's candidates count as silent. The summary holds, over scenes without a role whose
-    anchors have several partners: ``<variant>.coverage_at_5`` (mean), ``auto.fixed_gap_ratio`` (geometric mean) and
-    ``auto.fixed_gap_ratio_worst`` (smallest) of (auto + 0.01) / (best gap + 0.01), of the coverages at 5 % mean risk.
-    Scene rows of ``auto`` carry ``best_gap``, ``fixed_gap_ratio`` and ``one_partner``.
+    The source view of a reference view at a gap is the frame of that much larger number, where there is none of that
+    much smaller; where there is neither the reference view's candidates count as silent. The summary holds, over scenes
+    without a role whose reference views have several source views: ``<variant>.coverage_at_5`` (mean),
+    ``auto.fixed_gap_ratio`` (geometric mean) and ``auto.fixed_gap_ratio_worst`` (smallest) of (auto + 0.01) / (best gap
+    + 0.01), of the coverages at 5 % mean risk. Scene rows of ``auto`` carry ``best_gap``, ``fixed_gap_ratio`` and
+    ``one_partner``.
 
     ``auto.rotation_answered`` and ``map.rotation_answered`` are the share of samples without a return that are
-    answered, pooled over scenes of the role ``rotation``; of ``map`` over all its gaps, where an anchor has a partner.
-    Scene rows of such scenes carry it as ``recovered_share``.
+    answered, pooled over scenes of the role ``rotation``; of ``map`` over all its gaps, where a reference view has a
+    source view. Scene rows of such scenes carry it as ``recovered_share``.
 
     Args:
-        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`; of ``pairs`` the anchors
-            count.
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`; of ``pairs`` the
+            reference views count.
         methods: ``map``, of one other view, and ``auto``, which chooses; None = ``chosen``.
         gaps: frames.
         anchors: so many of a scene's, evenly spread; None = all.
@@ -71,13 +73,13 @@ def run(
         seeds: how many, from the job's own upwards; coverages are medians over them, rows and shares the first's.
 
     Raises:
-        ValueError: one of the two methods is missing, no gap, or fewer than one anchor; else as the main job.
+        ValueError: one of the two methods is missing, no gap, or fewer than one reference view; else as the main job.
     """
     methods = dict(methods or chosen)
-    _check_options(methods, gaps, rotation_gaps, anchors)
+    _check_options(methods, gaps, rotation_gaps, reference_views)
     every = list(scenes_of(scenes))
     every += [scene for scene in scenes_of(rotations) if scene.name not in {known.name for known in every}]
-    asked = partial(protocol.spread_pairs, pairs, anchors)
+    asked = partial(protocol.spread_pairs, pairs, reference_views)
     turning = [scene for scene in every if scene.role == "rotation"]
     moving = [scene for scene in every if scene.role != "rotation"]
     fixed = {gap: f"map, gap {gap}" for gap in (*gaps, *rotation_gaps)}
@@ -99,10 +101,11 @@ def run(
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, alone))
 
 
-def view_at_gap(recording: Recording, anchor: int, *, gap: int) -> list[int]:
-    """The position of the frame ``gap`` numbers after the anchor's, where there is none before it; else nothing."""
+def view_at_gap(recording: Recording, reference: int, *, gap: int) -> list[int]:
+    """The position of the frame ``gap`` numbers after the reference view's, where there is none before it; else
+    nothing."""
     for step in (gap, -gap):
-        found: list[int] = (recording.number == recording.number[anchor] + step).nonzero()[:, 0].tolist()
+        found: list[int] = (recording.number == recording.number[reference] + step).nonzero()[:, 0].tolist()
         if found:
             return found
     return []
@@ -117,9 +120,9 @@ def verdict(outcome: Outcome, alone: Collection[str] = ()) -> tuple[bool | None,
     """The worst scene against the best gap, and the share answered in a turn."""
     names = ("auto.fixed_gap_ratio_worst", "auto.rotation_answered", "map.rotation_answered")
     worst, answered, fixed = (outcome.summary.get(name, {}).get("value") for name in names)
-    apart = f"; one partner only: {', '.join(sorted(alone))}" if alone else ""
+    apart = f"; one source view only: {', '.join(sorted(alone))}" if alone else ""
     if worst is None:
-        return None, f"no scene whose anchors have several partners{apart}"
+        return None, f"no scene whose reference views have several source views{apart}"
     below = {s: r for s, r in _gap_ratios(outcome).items() if r < _MIN_REACHED_RATIO}
     missed = ", ".join(f"{scene} {r:.2f}" for scene, r in sorted(below.items(), key=lambda item: item[1]))
     why = f"of the best fixed gap's coverage at 5 % risk at least {worst:.2f} on every scene"
@@ -132,19 +135,19 @@ def verdict(outcome: Outcome, alone: Collection[str] = ()) -> tuple[bool | None,
 
 
 def _check_options(
-    methods: Mapping[str, Method], gaps: Sequence[int], rotation_gaps: Sequence[int], anchors: int | None
+    methods: Mapping[str, Method], gaps: Sequence[int], rotation_gaps: Sequence[int], reference_views: int | None
 ) -> None:
     if missing := {"map", "auto"} - methods.keys():
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {', '.join(sorted(missing))} too")
     for option, given in (("gaps", gaps), ("rotation_gaps", rotation_gaps)):
         if not given or min(given) < 1:
             raise ValueError(f"experiment.{option}: found {list(given)}, expected numbers of frames from 1 on")
-    if anchors is not None and anchors < 1:
-        raise ValueError(f"experiment.anchors: found {anchors}, expected at least 1, or null for all")
+    if reference_views is not None and reference_views < 1:
+        raise ValueError(f"experiment.reference_views: found {reference_views}, expected at least 1, or null for all")
 
 
 def _variants(methods: Mapping[str, Method], fixed: Mapping[int, str], seed: int, seeds: int) -> dict[str, Variant]:
-    """``auto`` with the frames around the anchor, and ``map`` at every gap, with so many seeds each."""
+    """``auto`` with the frames around the reference view, and ``map`` at every gap, with so many seeds each."""
     found = {}
     for k in range(seeds):
         found[seed_variant_name("auto", k)] = Variant(methods["auto"], seed=seed + k, offers=candidate_frames)
@@ -156,7 +159,7 @@ def _variants(methods: Mapping[str, Method], fixed: Mapping[int, str], seed: int
 
 
 def _has_one_source_view(scene: Scene, pairs: ScenePairs) -> bool:
-    """Whether there is nothing to choose from at any of the anchors."""
+    """Whether there is nothing to choose from at any of the reference views."""
     return all(len(candidate_frames(scene.recording, i)) == 1 for i, _ in pairs(scene))
 
 
@@ -175,7 +178,7 @@ def _coverage_at_5(points: Points) -> float | None:
 
 
 def _coverages(reached: Mapping[str, Mapping[str, float]], alone: Collection[str]) -> Row:
-    """Every variant's coverage at 5 % risk, its mean over scenes with several partners."""
+    """Every variant's coverage at 5 % risk, its mean over scenes with several source views."""
     return {
         f"{name}.coverage_at_5": bootstrap.interval_over_scenes(
             [v for scene, v in by_scene.items() if scene not in alone], statistic="mean"
@@ -202,7 +205,7 @@ def _compare_with_best_gap(
 
 
 def _gap_ratios(outcome: Outcome) -> dict[str, float]:
-    """Scene → ratio to the best gap; scenes with one partner are left out."""
+    """Scene → ratio to the best gap; scenes with one source view are left out."""
     rows = outcome.scenes("auto")
     return {s: r["fixed_gap_ratio"] for s, r in rows.items() if "fixed_gap_ratio" in r and not r["one_partner"]}
 

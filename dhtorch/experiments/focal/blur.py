@@ -59,9 +59,9 @@ def estimate_blur(
     Gradient: to the image, where valid and blurred.
     Source: S. Zhuo, T. Sim, "Defocus map estimation from a single image", 2011 (the ratio); summed energies are ours.
     """
-    check("local_blur", image=(image, "B C H W"))
+    check("estimate_blur", image=(image, "B C H W"))
     if not 0 < fine_px < coarse_px:
-        raise ValueError(f"local_blur: widths are {fine_px} and {coarse_px} px, expected 0 < fine_px < coarse_px")
+        raise ValueError(f"estimate_blur: widths are {fine_px} and {coarse_px} px, expected 0 < fine_px < coarse_px")
     grey = filters.grayscale(image)
     fine, fine_noise = _gradient_energy(grey, fine_px, window_px, noise)
     coarse, coarse_noise = _gradient_energy(grey, coarse_px, window_px, noise)
@@ -99,7 +99,7 @@ def inverse_depth_from_blur(
 
     Gradient: to blur, lens and distance.
     """
-    check("inverse_depth", sigma=(blur.sigma, "B H W"), side=(side, "B H W"), focus_m=(focus_m, "B"))
+    check("inverse_depth_from_blur", sigma=(blur.sigma, "B H W"), side=(side, "B H W"), focus_m=(focus_m, "B"))
     excess = blur.sigma * blur.sigma - sharp_px**2
     some = excess > 0
     spot = torch.where(some, torch.where(some, excess, torch.ones_like(excess)).sqrt(), torch.zeros_like(excess))
@@ -120,7 +120,7 @@ def guess_side_by_height(blur: BlurMap) -> Tensor:
     Raises:
         ValueError: wrong shapes.
     """
-    sizes = check("side_by_height", sigma=(blur.sigma, "B H W"))
+    sizes = check("guess_side_by_height", sigma=(blur.sigma, "B H W"))
     row = torch.arange(sizes["H"], dtype=blur.sigma.dtype, device=blur.sigma.device)
     sharp = blur.sigma * blur.sigma + 0.25
     weight = torch.where(blur.valid, 1 / (sharp * sharp), torch.zeros_like(sharp)).sum(-1)  # (B, H)
@@ -144,7 +144,7 @@ def guess_side_by_colour(
     Raises:
         ValueError: wrong shapes.
     """
-    check("side_by_colour", image=(image, "B 3 H W"))
+    check("guess_side_by_colour", image=(image, "B 3 H W"))
     red, blue = (estimate_blur(image[:, k : k + 1], window_px=window_px, noise=noise) for k in (0, 2))
     both = red.valid & blue.valid
     lead = torch.where(both, blue.sigma * blue.sigma - red.sigma * red.sigma, torch.zeros_like(red.sigma))

@@ -35,7 +35,7 @@ def fill_bilinear(
 
     Gradient: to the returns.
     """
-    check("bilinear", coarse=(coarse, "B h w"))
+    check("fill_bilinear", coarse=(coarse, "B h w"))
     there = (coarse > 0).to(coarse.dtype)
     total, weight = (_resize(x, hw) for x in (coarse * there, there))
     seen = weight > _MIN_WEIGHT
@@ -64,7 +64,7 @@ def fill_joint_bilateral(
     Gradient: to the returns and the guide.
     Source: J. Kopf, M. Cohen, D. Lischinski, M. Uyttendaele, "Joint bilateral upsampling", 2007.
     """
-    sizes = check("joint_bilateral", coarse=(coarse, "B h w"), guide=(guide, "B C H W"))
+    sizes = check("fill_joint_bilateral", coarse=(coarse, "B h w"), guide=(guide, "B C H W"))
     picture = (guide / 255.0 if guide.dtype == torch.uint8 else guide).to(coarse.dtype)
     H, W, h, w = (sizes[k] for k in "HWhw")
     y, x = _coarse_coordinates(H, h, coarse), _coarse_coordinates(W, w, coarse)
@@ -111,7 +111,7 @@ def fill_guided(
     Gradient: to the returns and the guide.
     Source: K. He, J. Sun, "Fast guided filter", 2015.
     """
-    sizes = check("guided_filter", coarse=(coarse, "B h w"), guide=(guide, "B C H W"))
+    sizes = check("fill_guided", coarse=(coarse, "B h w"), guide=(guide, "B C H W"))
     grey = filters.grayscale(guide).to(coarse.dtype)
     there = (coarse > 0).to(coarse.dtype)[:, None]
     count = box_mean(there, radius)
@@ -162,7 +162,7 @@ def fill_defocus_guided(
 
     Gradient: to depth and blur; the choice of the focus carries none.
     """
-    sizes = check("defocus_guided", dense=(dense, "B H W"), coarse=(coarse, "B h w"), sigma=(blur.sigma, "B H W"))
+    sizes = check("fill_defocus_guided", dense=(dense, "B H W"), coarse=(coarse, "B h w"), sigma=(blur.sigma, "B H W"))
     known = dense > 0
     inverse = torch.where(known, 1 / torch.where(known, dense, torch.ones_like(dense)), torch.zeros_like(dense))
     use = (blur.valid & known).to(dense.dtype)

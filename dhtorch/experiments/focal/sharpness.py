@@ -55,10 +55,10 @@ def measure_sharpness(
     Gradient: to the images.
     Source: S. Pertuz, D. Puig, M. A. García, "Analysis of focus measure operators for shape-from-focus", 2013.
     """
-    sizes = check("sharpness", images=(images, "B S C H W"))
+    sizes = check("measure_sharpness", images=(images, "B S C H W"))
     _check_two_images("sharpness", sizes["S"])
     if measure not in SHARPNESS_MEASURES:
-        raise ValueError(f"sharpness: measure is {measure!r}, expected one of {', '.join(SHARPNESS_MEASURES)}")
+        raise ValueError(f"measure_sharpness: measure is {measure!r}, expected one of {', '.join(SHARPNESS_MEASURES)}")
     grey = filters.grayscale(images.flatten(0, 1))
     if measure == "modified_laplacian":
         second = [-1.0, 2.0, -1.0]
@@ -86,7 +86,7 @@ def find_sharpest(
 
     Gradient: through the three sharpnesses to ``measured``; the choice carries none.
     """
-    sizes = check("sharpest", measured=(measured, "B S H W"))
+    sizes = check("find_sharpest", measured=(measured, "B S H W"))
     _check_two_images("sharpest", sizes["S"])
     best = measured.detach().argmax(1, keepdim=True)
     left, peak, right = (measured.gather(1, (best + k).clamp(0, sizes["S"] - 1)) for k in (-1, 0, 1))
@@ -114,12 +114,16 @@ def depth_at_focus(
     Gradient: to place and distances.
     """
     if focus_m is None:
-        raise ValueError("depth_at: focus_m is None, expected distances: without them only the order in depth is known")
-    sizes = check("depth_at", place=(place, "B H W"), focus_m=(focus_m, "B S"))
+        raise ValueError(
+            "depth_at_focus: focus_m is None, expected distances: without them only the order in depth is known"
+        )
+    sizes = check("depth_at_focus", place=(place, "B H W"), focus_m=(focus_m, "B S"))
     _check_two_images("depth_at", sizes["S"])
     step = focus_m.diff(dim=1)
     if not bool(((step > 0).all(1) | (step < 0).all(1)).all()):
-        raise ValueError("depth_at: focus_m expected to rise or to fall throughout: sort the pictures by distance")
+        raise ValueError(
+            "depth_at_focus: focus_m expected to rise or to fall throughout: sort the pictures by distance"
+        )
     low = place.detach().floor().clamp(0, sizes["S"] - 2)
     index = low.long().flatten(1)
     inverse = 1 / focus_m
@@ -156,12 +160,12 @@ def align_stack(
     Gradient: of the resampling to the images; the motion carries none.
     Source: G. Evangelidis, E. Psarakis, "Parametric image alignment using enhanced correlation coefficient", 2008.
     """
-    sizes = check("align", images=(images, "B S C H W"))
+    sizes = check("align_stack", images=(images, "B S C H W"))
     B, S = sizes["B"], sizes["S"]
     _check_two_images("align", S)
     middle = S // 2 if reference is None else reference
     if not 0 <= middle < S:
-        raise ValueError(f"align: reference is {reference}, expected a position from 0 to {S - 1}")
+        raise ValueError(f"align_stack: reference is {reference}, expected a position from 0 to {S - 1}")
     pictures = images / 255.0 if images.dtype == torch.uint8 else images
     with torch.no_grad():
         soft = [gaussian_blur(filters.grayscale(pictures[:, k]), blur_px) for k in range(S)]

@@ -47,7 +47,7 @@ def sample_arm(
 
     Gradient: to the image and to ``arm``.
     """
-    check("read_arm", image=(image, "B C H W"), arm=(arm, "L 2"))
+    check("sample_arm", image=(image, "B C H W"), arm=(arm, "L 2"))
     grey = filters.grayscale(image).to(arm.dtype)
     H, W = grey.shape[-2:]
     if blur_px > 0:
@@ -93,14 +93,16 @@ def correlate_windows(
 
     Gradient: of the parabola through three correlations to both signals; the choice of the peak carries none.
     """
-    check("correlate", signal_0=(signal_0, "B L"), signal_1=(signal_1, "B M"), site_0=(site_0, "B K"))
-    check("correlate", signal_0=(signal_0, "B L"), site_1=(site_1, "B K"), site_0=(site_0, "B K"))
+    check("correlate_windows", signal_0=(signal_0, "B L"), signal_1=(signal_1, "B M"), site_0=(site_0, "B K"))
+    check("correlate_windows", signal_0=(signal_0, "B L"), site_1=(site_1, "B K"), site_0=(site_0, "B K"))
     if window < 3 or window % 2 == 0 or max_lag < 1:
-        raise ValueError(f"correlate: window is {window} and max_lag {max_lag}, expected odd from 3, and from 1")
+        raise ValueError(
+            f"correlate_windows: window is {window} and max_lag {max_lag}, expected odd from 3, and from 1"
+        )
     span = window + 2 * max_lag
     if signal_0.shape[1] < window or signal_1.shape[1] < span:
         lengths = f"{signal_0.shape[1]} and {signal_1.shape[1]} steps"
-        raise ValueError(f"correlate: signals have {lengths}, expected at least {window} and {span}")
+        raise ValueError(f"correlate_windows: signals have {lengths}, expected at least {window} and {span}")
     start_0, start_1 = site_0 - window // 2, site_1 - span // 2
     last_0, last_1 = signal_0.shape[1] - window, signal_1.shape[1] - span
     inside = (start_0 >= 0) & (start_0 <= last_0) & (start_1 >= 0) & (start_1 <= last_1)

@@ -178,7 +178,7 @@ def _evaluate_pair(
     tangent = torch.cat([a.tangent[s] for a, s in zip(arms, sites, strict=True)])
     signals = [[sample_arm(f.image, a.uv, blur_px=blur_px) for a in arms] for f in (frame_0, frame_1)]
 
-    samples = method.look_at(frame_0, uv)
+    samples = method.sample_depth_at(frame_0, uv)
     truth = holdout.sample_truth(frame_0, samples.uv)
     candidate = holdout.select_candidates(samples, truth, 0.0).ok[0]
     tracks = method.track(frame_0.image, frame_1.image, samples.uv, hint=hint)

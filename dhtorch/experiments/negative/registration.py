@@ -71,13 +71,13 @@ def register_icp(
     Cost: iterations × N × M distances.
     Source: P. Besl, N. McKay 1992 (points); Y. Chen, G. Medioni 1991 (planes); D. Chetverikov et al. 2002 (trimming).
     """
-    sizes = check("icp.register", xyz_0=(xyz_0, "B N 3"), xyz_1=(xyz_1, "B M 3"), R=(T_init.R, "B 3 3"))
-    check("icp.register", xyz_1=(xyz_1, "B M 3"), normals_1=(normals_1, "B M 3"))
+    sizes = check("register_icp", xyz_0=(xyz_0, "B N 3"), xyz_1=(xyz_1, "B M 3"), R=(T_init.R, "B 3 3"))
+    check("register_icp", xyz_1=(xyz_1, "B M 3"), normals_1=(normals_1, "B M 3"))
     if not (sizes["N"] and sizes["M"]):
-        raise ValueError(f"icp.register: sets have {sizes['N']} and {sizes['M']} points, expected at least one each")
+        raise ValueError(f"register_icp: sets have {sizes['N']} and {sizes['M']} points, expected at least one each")
     if not (0 < keep <= 1 and 0 < shrink <= 1 and 0 < least_reach_m <= reach_m and iterations > 0):
         given = f"keep={keep}, shrink={shrink}, least_reach_m={least_reach_m}, reach_m={reach_m}"
-        raise ValueError(f"icp.register: found {given}, expected shares in (0, 1], a least reach up to the reach")
+        raise ValueError(f"register_icp: found {given}, expected shares in (0, 1], a least reach up to the reach")
     with torch.no_grad():
         sets = _PointSets(xyz_0, xyz_1, normals_1)
         start = Pose(T_init.R.double(), T_init.t.double())
@@ -117,9 +117,11 @@ def estimate_normals(
 
     Gradient: none.
     """
-    sizes = check("icp.normals", xyz=(xyz, "B M 3"))
+    sizes = check("estimate_normals", xyz=(xyz, "B M 3"))
     if not 3 <= neighbours < sizes["M"]:
-        raise ValueError(f"icp.normals: found {sizes['M']} points, {neighbours} neighbours, expected 3 or more of more")
+        raise ValueError(
+            f"estimate_normals: found {sizes['M']} points, {neighbours} neighbours, expected 3 or more of more"
+        )
     with torch.no_grad():
         valid = xyz.isfinite().all(-1)
         x = _move_invalid_away(xyz, valid, 1e6)

@@ -67,7 +67,7 @@ def run(
     Args:
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
         methods: name → method; the first is asked.
-        pairs: anchors and their partners; further links for ``anchored`` come from
+        pairs: reference views and their source views; further links for ``anchored`` come from
             :func:`dhtorch.integrate.recording.linking_pairs`.
         n: samples of a pair.
         voxel: side of a voxel, in median depths.

@@ -78,7 +78,7 @@ def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
 def classify_frame(method: Method, frame: Any) -> Samples:
     """Seats 1 to 3 of a method: what its samples find in a frame."""
     with torch.no_grad():
-        return method.look(frame)
+        return method.sample_depth(frame)
 
 
 def count_holes(samples: Samples) -> Row:

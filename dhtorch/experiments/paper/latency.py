@@ -155,7 +155,7 @@ def run(
 
 def run_front_end(method: Method, frame: Frame, n: int) -> Samples:
     """Seats 1 to 3 of a method: what the paper times."""
-    return method.replace(n=n).look(frame)
+    return method.replace(n=n).sample_depth(frame)
 
 
 def run_pair(method: Callable[..., Estimate], frame_0: Frame, frame_1: Frame) -> dict[str, float]:
@@ -198,8 +198,8 @@ def _first_pair(scene: Scene, pairs: ScenePairs, settings: Settings) -> tuple[Fr
     if not chosen:
         raise ValueError(f"latency: {scene.name} has no pair, expected at least one")
     cutoff = settings.cutoff_of(scene)
-    anchor, other = (scene.recording[k].to(settings.dtype).to(settings.device) for k in chosen[0])
-    return holdout.range_split(anchor, cutoff), holdout.range_split(other, cutoff)
+    reference, other = (scene.recording[k].to(settings.dtype).to(settings.device) for k in chosen[0])
+    return holdout.range_split(reference, cutoff), holdout.range_split(other, cutoff)
 
 
 def _resample_frame(frame: Frame, hw: tuple[int, int]) -> Frame:

@@ -59,9 +59,9 @@ def pool_tokens(tokens: Tensor, valid: Tensor, patches: tuple[int, int], cells: 
 
     Gradient: to the tokens.
     """
-    check("pooled", tokens=(tokens, f"B P {len(TOKEN_CHANNELS)}"), valid=(valid, "B P"))
+    check("pool_tokens", tokens=(tokens, f"B P {len(TOKEN_CHANNELS)}"), valid=(valid, "B P"))
     if patches[0] * patches[1] != tokens.shape[1]:
-        raise ValueError(f"pooled: found {tokens.shape[1]} tokens, expected {patches[0]} x {patches[1]}")
+        raise ValueError(f"pool_tokens: found {tokens.shape[1]} tokens, expected {patches[0]} x {patches[1]}")
     of_answers = torch.tensor([name in _ANSWER_CHANNELS for name in TOKEN_CHANNELS], device=tokens.device)
     use = torch.where(of_answers, valid[..., None], True).to(tokens)
 
@@ -104,7 +104,7 @@ class DepthTokens:
         """Features (1, cells² · 10)."""
         return self.look(frame, other)[0]
 
-    def look(self, frame: Frame, other: Frame | None = None) -> tuple[Tensor, Mapping[str, Any]]:
+    def sample_depth(self, frame: Frame, other: Frame | None = None) -> tuple[Tensor, Mapping[str, Any]]:
         """Features, and all that the transform added."""
         frames = [frame] if other is None or self.views == 1 else [other, frame]
         sample = _as_sample(frames)

@@ -130,7 +130,7 @@ def train_score(
     """
     lessons = [v[:: max(1, -(-v.error.numel() // most))] for v in lessons if v.error.numel()]
     if not lessons:
-        raise ValueError("learned_score.train: found no answer with truth, expected some")
+        raise ValueError("train_score: found no answer with truth, expected some")
     every = collate(lessons)
     x, error = every.x.detach().float(), every.error.detach().float()
     weight = torch.cat([torch.full_like(v.error, 1 / v.error.numel() / len(lessons)) for v in lessons]).float()

@@ -88,7 +88,7 @@ def join_moments(a: SampleMoments, b: SampleMoments) -> SampleMoments:
     Source: T. Chan, G. Golub, R. LeVeque, "Updating formulae and a pairwise algorithm for computing sample variances",
     1979.
     """
-    check("probe.join", a_x=(a.x, "* F"), b_x=(b.x, "* F"), a_y=(a.y, "* D"), b_y=(b.y, "* D"))
+    check("join_moments", a_x=(a.x, "* F"), b_x=(b.x, "* F"), a_y=(a.y, "* D"), b_y=(b.y, "* D"))
     n = a.n + b.n
     share = b.n / n.clamp_min(1)
     between = (a.n * share)[..., None]
@@ -160,10 +160,10 @@ def solve_ridge(of: SampleMoments, penalty: Tensor) -> LinearProbe:
     Cost: P Cholesky factorisations of F × F.
     Source: A. Hoerl, R. Kennard, "Ridge regression: biased estimation for nonorthogonal problems", 1970.
     """
-    check("ridge", x=(of.x, "* F"), xx=(of.xx, "* F F"), xy=(of.xy, "* F D"), y=(of.y, "* D"))
+    check("solve_ridge", x=(of.x, "* F"), xx=(of.xx, "* F F"), xy=(of.xy, "* F D"), y=(of.y, "* D"))
     F = of.x.shape[-1]
     if penalty.dim() not in (1, 2) or penalty.shape[1:] not in ((), (F,)):
-        raise ValueError(f"ridge: penalty has shape {tuple(penalty.shape)}, expected (P,) or (P, {F})")
+        raise ValueError(f"solve_ridge: penalty has shape {tuple(penalty.shape)}, expected (P,) or (P, {F})")
     n = of.n.clamp_min(1)[..., None]
     variance = of.xx.diagonal(dim1=-2, dim2=-1) / n
     varies = variance > (_MIN_RELATIVE_SPREAD * of.x).square().clamp_min(1e-300)
@@ -183,7 +183,7 @@ def predict_targets(linear: LinearProbe, x: Tensor) -> Tensor:
     Raises:
         ValueError: another number of features.
     """
-    check("probe.predict", weight=(linear.weight, "* F D"), x=(x, "* N F"))
+    check("predict_targets", weight=(linear.weight, "* F D"), x=(x, "* N F"))
     return x.double()[..., None, :, :] @ linear.weight + linear.bias[..., None, :]
 
 
@@ -201,7 +201,7 @@ def make_folds(groups: Sequence[str], n: int = 5, *, seed: int = 0) -> list[Prob
     names = sorted(set(groups))
     n = min(n, len(names))
     if n < 3:
-        raise ValueError(f"folds: found {n} parts of {len(names)} groups, expected at least three of each")
+        raise ValueError(f"make_folds: found {n} parts of {len(names)} groups, expected at least three of each")
     Random(f"folds {seed}").shuffle(names)
     parts = [tuple(names[k::n]) for k in range(n)]
     return [
@@ -224,7 +224,7 @@ def mean_squared_error(
             left out.
         level, draws, seed: of the bootstrap.
     """
-    check("mean_error", squares=(squares, "G"), counts=(counts, "G"))
+    check("mean_squared_error", squares=(squares, "G"), counts=(counts, "G"))
     return _bootstrap_quotient(squares, counts, counts > 0, level, draws, seed)
 
 
@@ -235,7 +235,7 @@ def error_ratio(ours: Tensor, theirs: Tensor, *, level: float = 0.95, draws: int
         ours, theirs: (G,) sum of squared errors of each group; groups where neither has any are left out.
         level, draws, seed: of the bootstrap.
     """
-    check("ratio", ours=(ours, "G"), theirs=(theirs, "G"))
+    check("error_ratio", ours=(ours, "G"), theirs=(theirs, "G"))
     return _bootstrap_quotient(ours, theirs, (ours > 0) | (theirs > 0), level, draws, seed)
 
 
@@ -256,9 +256,11 @@ def is_equivalent(found: Interval, margin: float = 0.02) -> bool | None:
 
 def _centred(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Deviations, number and means of the samples that count; float64."""
-    check("moments", x=(x, "* N F"), y=(y, "* N D"))
+    check("compute_moments", x=(x, "* N F"), y=(y, "* N D"))
     if x.shape[:-1] != y.shape[:-1]:
-        raise ValueError(f"moments: x has shape {tuple(x.shape)}, y {tuple(y.shape)}, expected the same samples")
+        raise ValueError(
+            f"compute_moments: x has shape {tuple(x.shape)}, y {tuple(y.shape)}, expected the same samples"
+        )
     use = (x.isfinite().all(-1) & y.isfinite().all(-1))[..., None]
     n = use.sum((-2, -1)).double()
     parts = []

@@ -185,7 +185,7 @@ class _PairFeatures:
         back = self.two(b, a)
         found = {name: torch.cat((x, alone_b[name] - x), 1) for name, x in alone_a.items()}
         found["depth"] = torch.cat((forth, back - forth), 1)
-        # The transform's pose maps the anchor into the other view: the same way round as the target.
+        # The transform's pose maps the reference view into the other view: the same way round as the target.
         found[_OWN_POSE_BLOCK] = torch.where(added["pose_ok"], _motion_vectors(added["T_1_from_0"][None].double()), 0.0)
         return {name: x.cpu() for name, x in found.items()}
 

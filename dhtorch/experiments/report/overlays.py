@@ -40,7 +40,7 @@ def overlay_figures(result: Result) -> list[Figure]:
             LayeredPicture(scene_label(row), row["overlay"]["hw"], overlay_layers(row["overlay"]), width=300)
             for row in mine
         ]
-        caption = "Some samples of each scene's first pair, where they lie in the anchor's picture. The picture itself "
+        caption = "Some samples of each scene's first pair, where they lie in the reference view. The picture itself "
         caption += "is not shown: licences of many data sets do not allow it." + missing_scenes_note(
             result, [r["scene"] for r in mine]
         )

@@ -91,10 +91,10 @@ def _about(results: Sequence[Result]) -> Markup:
     return join_markup((count, make_tag("span", PUBLISHED_LABEL, class_="theirs-word"), " ".join(said)))
 
 
-def _overview(results: Sequence[Result], anchors: Sequence[str]) -> Markup:
+def _overview(results: Sequence[Result], references: Sequence[str]) -> Markup:
     heads = ("experiment", "data", "scenes", "pairs", "verdict", "why")
     rows = []
-    for result, name in zip(results, anchors, strict=True):
+    for result, name in zip(results, references, strict=True):
         data = result["data"]
         link = make_tag("th", make_tag("a", result["experiment"], href=f"#{name}"), scope="row")
         cells = [

@@ -85,7 +85,7 @@ SOURCE_COLOURS = {
     Source.SENSOR: SENSOR,
     Source.RECOVERED: RECOVERED,
     Source.SWEPT: SWEPT,
-    Source.ANCHORED: ALIGNED,
+    Source.ALIGNED: ALIGNED,
 }
 
 #: What is said of a pixel of a judged map.

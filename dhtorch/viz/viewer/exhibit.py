@@ -111,5 +111,5 @@ class Exhibit:
 
     @property
     def placed(self) -> bool:
-        """Whether all pairs stand in one world; otherwise each stands in its own anchor's frame."""
+        """Whether all pairs stand in one world; otherwise each stands in its own reference view's frame."""
         return self.path is not None or len(self.shots) == 1

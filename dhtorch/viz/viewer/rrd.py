@@ -1,7 +1,7 @@
 """A scene as a Rerun recording: for its viewer, or for an ``.rrd`` file where there is no screen.
 
-Everything stands below ``world`` in metres, on two time lines: ``pair`` counts, ``time`` is the anchor's. ``gates``
-holds the counts of every pair, ``pair`` the same in words.
+Everything stands below ``world`` in metres, on two time lines: ``pair`` counts, ``time`` is the reference view's.
+``gates`` holds the counts of every pair, ``pair`` the same in words.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Time of a verdict on a frame, beside a fixed-threshold photometric check of the same frame.
 
-    python benchmarks/judge.py --json benchmarks/results/judge_speed.json --clock cpu --repeats 9
+    python benchmarks/validate.py --json benchmarks/results/validate_speed.json --clock cpu --repeats 9
 
 ``judge_sparse``: :func:`dhtorch.validate_depth` of a map of 640×480 with one other view, by sparse evidence
     (``views=False``) of
@@ -32,19 +32,19 @@ METHOD = MAP.replace(n=512)
 def measure(threads: int, options: Any) -> list[dict[str, Any]]:
     """A row for each way to ask."""
     harness.set_threads(threads)
-    _, near, other, anchor, _ = pairs.load(1)
+    _, near, other, reference, _ = pairs.load(1)
 
     def check() -> None:
         trace: dict[str, Any] = {}
         with torch.no_grad():
             asked = dense.selected_views(METHOD(near, other, trace=trace), other, trace)
-            photometric.photometric_difference(anchor.depth, near, asked)
+            photometric.photometric_difference(reference.depth, near, asked)
 
     def ours(method: Method, views: bool) -> None:
-        validate_depth(anchor.depth, near, other, method=method, views=views)
+        validate_depth(reference.depth, near, other, method=method, views=views)
 
     asked = {"judge_sparse": (QUICK_METHOD, False), "judge_sparse_512": (METHOD, False), "judge_views": (METHOD, True)}
-    modes = {"eager": ours, "native": harness.natively()(ours)}
+    modes = {"eager": ours, "compiled": harness.with_compiled_operators()(ours)}
     sides = [(name, mode) for mode in modes for name in asked]
     calls = [*(partial(modes[mode], *asked[name]) for name, mode in sides), check]
     *found, peer = harness.in_turn(calls, repeats=options.repeats, clock=options.clock, least_ms=1000.0)

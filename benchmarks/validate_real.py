@@ -1,6 +1,6 @@
-"""``dhtorch judge`` on real sensor depth with real faults, of the captures below DHTORCH_DATA that have some.
+"""``dhtorch validate`` on real sensor depth with real faults, of the captures below DHTORCH_DATA that have some.
 
-    python benchmarks/judge_real.py --json benchmarks/results/judge_real.json
+    python benchmarks/validate_real.py --json benchmarks/results/validate_real.json
 
 A row for each recording: what is said of the sensor's own depth, of the whole and of each frame, and the likely cause.
 With ``--pages`` the pages with the pictures are kept there.
@@ -29,7 +29,15 @@ CAPTURES: dict[str, tuple[str, ...]] = {
 }
 
 #: What is kept of a frame.
-OF_FRAME = ("frame", "share_wrong", "share_consistent", "share_cannot_know", "ceiling", "by_views", "by_maps")
+OF_FRAME = (
+    "frame",
+    "share_wrong",
+    "share_consistent",
+    "share_cannot_know",
+    "clip_depth",
+    "photometric_evidence",
+    "consistency_evidence",
+)
 
 
 def rows(path: Path, options: tuple[str, ...], folder: Path) -> list[dict[str, Any]]:
@@ -37,7 +45,7 @@ def rows(path: Path, options: tuple[str, ...], folder: Path) -> list[dict[str, A
     words = [sys.executable, "-m", "dhtorch", "judge", str(path), f"output={folder}", "pictures=30", *options]
     subprocess.run(words, check=True, cwd=folder)
     found = []
-    for file in sorted(folder.rglob("judge.json")):
+    for file in sorted(folder.rglob("validate.json")):
         said = json.loads(file.read_text())
         row = {
             "recording": said["scene"],
