@@ -86,8 +86,10 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "stages.holes": [
         (
             "_class_of_flag",
-            "((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),\n        ((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),",
-            "((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),\n        ((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),",
+            "((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),\n"
+            "        ((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),",
+            "((flag & Flag.SATURATED).bool(), Hole.TOO_BRIGHT),\n"
+            "        ((flag & Flag.UNDEREXPOSED).bool(), Hole.TOO_DARK),",
         ),
         ("_class_of_flag", "torch.arange(256", "torch.arange(129"),
         ("_first_class", " & (hole == Hole.TRACKABLE_NO_LIDAR)", ""),

@@ -240,7 +240,7 @@ def test_a_stream_takes_only_what_it_was_made_for_and_keeps_no_gradient():
     for wrong in ((x[:, :2], y), (x, y[:, :1]), (x[0], y[0])):
         with pytest.raises(ValueError, match=r"probe\.add"):
             stream.add(*wrong)
-    with pytest.raises(ValueError, match="compute_moments: .*y has shape"):
+    with pytest.raises(ValueError, match=r"compute_moments: .*y \("):
         probe.compute_moments(x, y[:3])
     with pytest.raises(ValueError, match="expected the same samples"):
         probe.compute_moments(x.expand(2, 4, 3), y)

@@ -102,9 +102,9 @@ class DepthTokens:
 
     def __call__(self, frame: Frame, other: Frame | None = None) -> Tensor:
         """Features (1, cells² · 10)."""
-        return self.look(frame, other)[0]
+        return self.features_and_keys(frame, other)[0]
 
-    def sample_depth(self, frame: Frame, other: Frame | None = None) -> tuple[Tensor, Mapping[str, Any]]:
+    def features_and_keys(self, frame: Frame, other: Frame | None = None) -> tuple[Tensor, Mapping[str, Any]]:
         """Features, and all that the transform added."""
         frames = [frame] if other is None or self.views == 1 else [other, frame]
         sample = _as_sample(frames)

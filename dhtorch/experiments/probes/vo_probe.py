@@ -181,7 +181,7 @@ class _PairFeatures:
     def __call__(self, i: int, j: int) -> dict[str, Tensor]:
         """Each block: features of ``i``, and those of ``j`` less them."""
         (a, alone_a), (b, alone_b) = self._alone(i), self._alone(j)
-        forth, added = self.two.look(a, b)
+        forth, added = self.two.features_and_keys(a, b)
         back = self.two(b, a)
         found = {name: torch.cat((x, alone_b[name] - x), 1) for name, x in alone_a.items()}
         found["depth"] = torch.cat((forth, back - forth), 1)
