@@ -123,7 +123,7 @@ def make_completion_task(
         method=method,
         settings=settings,
         frames=frames,
-        offers={pair.reference: pair.offered for pair in pairs},
+        offers={pair.reference: pair.candidates for pair in pairs},
         shared=completed.build_shared_metadata(
             scene,
             layout,

@@ -116,7 +116,7 @@ def _make_shot(answer: Answer, shown: Sequence[int]) -> PairExhibit:
     if ok:
         facts["pose"] = f"{int(fit.n_inlier[0])} near returns agree, {float(fit.rms_px[0]):.2f} px"
         facts["baseline"] = f"{100 * float(fit.T_1_from_0.t.norm()):.1f} cm"
-    if offered := batch.pairs[0].offered:
+    if offered := batch.pairs[0].candidates:
         facts["views"] = str(report_selection(i, offered, answer.trace)).partition(": ")[2]
     return PairExhibit(
         label=f"{i} → {j}",

@@ -70,7 +70,7 @@ def load_pairs(data: PairDataset, *, batch: int, workers: int) -> DataLoader[Loa
 
 def candidate_views(pair: Pair, recording: Recording, offers: CandidateViews | None) -> Sequence[int]:
     """The frames among which a variant chooses; none where it takes the pair's own."""
-    return pair.offered or (() if offers is None else offers(recording, pair.reference))
+    return pair.candidates or (() if offers is None else offers(recording, pair.reference))
 
 
 def _collate(items: list[LoadedPair]) -> LoadedPair:

@@ -145,7 +145,7 @@ class Answer:
         if isinstance(pair.other, int):
             return pair.other, self.batch.others[-1]
         k = int(self.trace["choice"].index[-1, 0]) if "choice" in self.trace else 0
-        return pair.offered[k], self.batch.around[k]
+        return pair.candidates[k], self.batch.around[k]
 
     def one(self, b: int) -> Answer:
         """Pair ``b`` alone; milliseconds are the batch's share."""
@@ -215,7 +215,7 @@ class Protocol:
 
     def batch(self, settings: Settings, pairs: Sequence[Pair]) -> int:
         """Pairs per call: one where reference views are offered differently many views."""
-        return settings.batch if self.offers is None and not any(pair.offered for pair in pairs) else 1
+        return settings.batch if self.offers is None and not any(pair.candidates for pair in pairs) else 1
 
     def allows(self, pairs: Sequence[Pair]) -> None:
         """Refuse frames to choose among where a variant cannot choose.
