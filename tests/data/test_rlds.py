@@ -108,11 +108,11 @@ def test_an_episode_is_read_when_it_is_asked_for(tmp_path: Path) -> None:
     file.write_bytes(raw)
     found = data.open_all(tmp_path)
     assert len(found[0]) == 2 and len(found[2]) == 4
-    with pytest.raises(FormatError, match=r"record at byte \d+: found check sum [0-9a-f]{8}, expected [0-9a-f]{8}"):
+    with pytest.raises(FormatError, match=r"record at byte \d+: found checksum [0-9a-f]{8}, expected [0-9a-f]{8}"):
         found[1]
 
 
-# ---------------------------------------------------------------------------------------------------- check sums, messages
+# ---------------------------------------------------------------------------------------------------- checksums, messages
 
 
 def test_check_sums() -> None:
@@ -147,11 +147,11 @@ def record(body: bytes) -> bytes:
         (b"", "found 0 bytes|records: found none"),
         (b"12345", "a TFRecord header of 12"),
         (record(b"abc")[:-1], "record 0"),
-        (struct.pack("<Q", 3) + b"\0\0\0\0abc\0\0\0\0", "wrong check sum of its length"),
-        (record(b"")[:8] + b"\0" * 8, "wrong check sum"),
+        (struct.pack("<Q", 3) + b"\0\0\0\0abc\0\0\0\0", "wrong checksum of its length"),
+        (record(b"")[:8] + b"\0" * 8, "wrong checksum"),
         (record(struct.pack("<Q", 1 << 62)), "observation/image_0: found nothing"),
         (record(b"\x0a\xff\xff\xff\xff\x0f"), "a field of"),
-        (record(b"\x0a" + b"\xff" * 12), "does not end"),
+        (record(b"\x0a" + b"\xff" * 12), "unterminated number"),
         (record(b"\x0b"), "wire type 3"),
     ],
 )
