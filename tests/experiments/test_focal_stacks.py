@@ -300,8 +300,8 @@ def test_a_job_of_pairs_says_why_not(
     monkeypatch.chdir(tmp_path)
     assert run.main(["data=auto", f"data.root={root}", "pairs.gap=1", "holdout.cutoff=1.0"]) != 0
     said = " ".join(capsys.readouterr().err.split())
-    expected = "expected a recording whose camera moves; experiment=focus_stack data=stacks reads them"
-    assert f"sweep holds focal stacks ({name}), pictures of one view, {expected}" in said
+    expected = "expected a recording of a moving camera; for focal stacks use experiment=focus_stack data=stacks"
+    assert f"sweep holds focal stacks ({name}), images of one view, {expected}" in said
     assert run.main(["data=stacks", f"data.root={root}", "pairs.gap=1", "holdout.cutoff=1.0"]) != 0
     said += " ".join(capsys.readouterr().err.split())
     assert f"data: found Stacks('{formats.open_stacks(root).name}', {name}, " in said
@@ -340,7 +340,7 @@ def test_bad_stacks(tmp_path: Path) -> None:
 def test_bad_fod500(tmp_path: Path) -> None:
     stack_writers.write_fod500(tmp_path, {0: stack(0)})
     fails(r"option split: found test, expected train or val", tmp_path, split="test")
-    fails(r"samples: found none whole among 1, expected 4 \*All.tif and one \*Dpt.exr", tmp_path, focus_m=FOCUS[:4])
+    fails(r"samples: found none complete among 1, expected 4 \*All.tif and one \*Dpt.exr", tmp_path, focus_m=FOCUS[:4])
     fails(r"option f_number: found 0.0, expected a positive number", tmp_path, f_number=0)
     fails(r"option max_depth: found -1.0", tmp_path, max_depth=-1)
     good = (tmp_path / "000000Dpt.exr").read_bytes()
