@@ -87,7 +87,7 @@ def test_one_episode_and_its_camera_by_name(tmp_path: Path) -> None:
     write_lerobot(tmp_path, episodes())
     same_scene(data.open(tmp_path, episode=1, camera=KEY), episodes()[1], STEP["video"])
     assert [r.name[-12:] for r in data.open_all(tmp_path, episode=[1, 0])] == ["000001/front", "000000/front"]
-    with pytest.raises(FormatError, match=r"meta: episodes: found 0 of those asked for, expected \[7\]"):
+    with pytest.raises(FormatError, match=r"meta: episodes: found 0 of those requested, expected \[7\]"):
         data.open(tmp_path, episode=7)
     with pytest.raises(
         FormatError, match=r"info.json: cameras: found wrist, expected some of observation.images.front"
@@ -433,7 +433,7 @@ def test_rows_without_numbers_whose_clock_is_late_keep_their_pictures(tmp_path: 
     parquet.write_table(table, file)
     recording = data.open(tmp_path)
     assert (
-        len(recording) == 4 and "times begin at 0.03333 s: pictures taken by the order of rows" in recording.report[0]
+        len(recording) == 4 and "times begin at 0.03333 s: images taken by the order of rows" in recording.report[0]
     )
     for i, shot in enumerate(shots):
         assert float((recording[i].image.float() - shot.image.float()).abs().mean()) < 5

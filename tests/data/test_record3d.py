@@ -211,7 +211,7 @@ def test_front_camera_has_neither_confidence_nor_poses(tmp_path: Path) -> None:
     frames = [f.replace(conf=None, T_world_from_cam=None) for f in walk()]
     recording = data.open(r3d(tmp_path, frames))
     assert recording.poses is None and recording[1].T_world_from_cam is None and recording[1].conf is None
-    assert recording.report == ("every pose is the identity: the device had none",)
+    assert recording.report == ("every pose is the identity: no tracking",)
     assert data.open(tmp_path / "a.r3d", poses=False).report == ()
 
 
@@ -242,7 +242,7 @@ def test_time_stamps_that_do_not_increase(tmp_path: Path) -> None:
     archive = rewrite(r3d(tmp_path), table(frameTimestamps=[5.0, 4.0, 6.0]))
     recording = data.open(archive)
     torch.testing.assert_close(recording.times, torch.arange(3).double() / 60)
-    assert recording.report == ("time stamps do not increase: the frame rate counts instead",)
+    assert recording.report == ("time stamps do not increase: the frame rate is used instead",)
     recording = data.open(rewrite(archive, table(fps=None)))
     assert recording.times is None and recording.report == ("time stamps do not increase: there are no times",)
     recording = data.open(rewrite(archive, table(frameTimestamps=[7.0, 7.5, 9.0])))
@@ -252,7 +252,7 @@ def test_time_stamps_that_do_not_increase(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"w": None, "h": None}, r"metadata: w, h: found nothing, expected the size of the pictures"),
+        ({"w": None, "h": None}, r"metadata: w, h: found nothing, expected the size of the images"),
         ({"w": 1e9}, r"metadata: w: found 1000000000.0"),
         ({"dw": 0.5}, r"metadata: dw, dh: found 0.5x24, expected whole numbers"),
         ({"fps": math.inf}, r"metadata: fps: found inf"),

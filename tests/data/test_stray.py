@@ -186,8 +186,8 @@ def test_first_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Fram
     recording = data.open(tmp_path)
     assert recording.number.tolist() == list(range(1, 9))
     assert recording.report == (
-        "rgb.mp4 lacks its first picture (the edges of depth and picture say so)",
-        "frame 0: no picture: left out",
+        "rgb.mp4 lacks its first frame (by the edges of depth and image)",
+        "frame 0: no image: left out",
     )
     pictures = [f.image if f.image.dtype == torch.uint8 else f.image * 255 for f in room]
     assert all(
@@ -195,7 +195,7 @@ def test_first_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Fram
     )
     torch.testing.assert_close(recording.poses.t[0], room[1].T_world_from_cam.t[0].double())
     other = data.open(tmp_path, lost_first=False)
-    assert other.number.tolist() == list(range(8)) and "its last picture (option lost_first)" in other.report[0]
+    assert other.number.tolist() == list(range(8)) and "its last frame (option lost_first)" in other.report[0]
 
 
 def test_last_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Frame]) -> None:
@@ -204,7 +204,7 @@ def test_last_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Frame
     (tmp_path / "short" / "rgb.mp4").rename(tmp_path / "long" / "rgb.mp4")
     recording = data.open(tmp_path / "long")
     assert recording.number.tolist() == list(range(8))
-    assert recording.report[0] == "rgb.mp4 lacks its last picture (the edges of depth and picture say so)"
+    assert recording.report[0] == "rgb.mp4 lacks its last frame (by the edges of depth and image)"
     assert data.open(tmp_path / "long", lost_first=True).number.tolist() == list(range(1, 9))
 
 
@@ -214,13 +214,13 @@ def test_longer_or_much_shorter_videos(tmp_path: Path) -> None:
         writers.write_stray(tmp_path / name, frames[:count], per_frame=True)
     (tmp_path / "film" / "rgb.mp4").replace(tmp_path / "rows" / "rgb.mp4")
     recording = data.open(tmp_path / "rows")
-    assert recording.report == ("rgb.mp4 has 6 pictures for 4 rows: the shorter counts",)
+    assert recording.report == ("rgb.mp4 has 6 frames for 4 rows: the shorter is used",)
     same_scene(recording, frames[:4])
     (tmp_path / "short" / "rgb.mp4").replace(tmp_path / "rows" / "rgb.mp4")
     recording = data.open(tmp_path / "rows")
     assert recording.report == (
-        "rgb.mp4 has 2 pictures for 4 rows: the shorter counts",
-        "2 frames (2, 3): no picture: left out",
+        "rgb.mp4 has 2 frames for 4 rows: the shorter is used",
+        "2 frames (2, 3): no image: left out",
     )
     same_scene(recording, frames[:2])
 
@@ -256,7 +256,7 @@ def test_missing_parts_keep_the_rest_in_step(tmp_path: Path) -> None:
 def test_no_video(tmp_path: Path) -> None:
     frames = walk()
     writers.write_stray(tmp_path, frames, per_frame=True, video=False)
-    expected = "rgb.mp4: file: found no such file, expected .*images=False reads depth alone"
+    expected = "rgb.mp4: file: found no such file, expected .*images=False reads depth only"
     with pytest.raises(FormatError, match=expected):
         data.open(tmp_path)
     recording = data.open(tmp_path, images=False, K_hw=HW)
@@ -270,7 +270,7 @@ def test_no_video(tmp_path: Path) -> None:
 def test_distortion_tables_are_reported(tmp_path: Path) -> None:
     writers.write_stray(tmp_path, walk(2))
     (tmp_path / "distortion").mkdir()
-    assert data.open(tmp_path).report == ("distortion/ holds lens tables of each frame: they are not applied",)
+    assert data.open(tmp_path).report == ("distortion/ has lens tables of each frame: they are not applied",)
 
 
 def test_cut_off_last_row_and_stamps_out_of_order(tmp_path: Path) -> None:
