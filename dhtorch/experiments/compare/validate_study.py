@@ -135,7 +135,7 @@ def run(
     rooms: Sequence[int] = (0, 1, 2),
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Detection rates of faults planted in true maps, which are validated by near returns and source views.
+    """Detection rates of faults planted in true maps, from near returns and source views.
 
     Rows: one per reference view (``pair`` [i, i], method ``judge``), one per window and fault (``pair`` [first, last],
     method ``causes``), one per scene. In the summary, ratios of reference views are means over scenes with intervals
