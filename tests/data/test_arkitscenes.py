@@ -130,7 +130,7 @@ def test_color_is_another_name_of_wide_and_intrinsics_may_be_borrowed(tmp_path: 
         torch.testing.assert_close(borrowed[1].camera.c, want.c)
         for file in (root / "lowres_wide_intrinsics").iterdir():
             file.unlink()
-        with pytest.raises(FormatError, match="wide_intrinsics: found none, nor any to scale"):
+        with pytest.raises(FormatError, match="wide_intrinsics: found none, also of no other size"):
             stored(root)
 
 
@@ -230,7 +230,7 @@ def test_captures_without_trajectory_keep_their_frames(tmp_path: Path) -> None:
     (root / "lowres_wide.traj").unlink()
     recording = data.open(root)
     assert len(recording) == 4 and recording.poses is None and recording[0].T_world_from_cam is None
-    assert recording.report == ("no lowres_wide.traj: frames have no pose, and stay as stored",)
+    assert recording.report == ("no lowres_wide.traj: frames have no pose and are not rotated",)
     assert data.open(root, poses=False).report == ()
 
 
@@ -277,7 +277,7 @@ def test_no_confidence_at_all(tmp_path: Path) -> None:
     for file in (root / "confidence").iterdir():
         file.unlink()
     recording = stored(root)
-    assert recording[0].conf is None and recording.report == ("no confidence: every return counts alike",)
+    assert recording[0].conf is None and recording.report == ("no confidence: all returns are weighted equally",)
 
 
 def test_nearest_against_brute_force() -> None:
@@ -351,7 +351,7 @@ def test_looking_straight_down_names_no_side(tmp_path: Path) -> None:
     writers.write_arkitscenes(root, {"lowres_wide": [frame], "lowres_depth": [frame]}, trajectory=[frame])
     recording = data.open(root)
     assert recording[0].hw == HW
-    assert "the camera looks straight up or down: pictures stay as stored" in recording.report
+    assert "the camera looks straight up or down: images are not rotated" in recording.report
 
 
 def test_turning_a_lens_keeps_every_ray() -> None:
@@ -462,7 +462,7 @@ def test_bad_files(tmp_path: Path) -> None:
     for text, message in (
         ("64 48 61 58 33", r"pincam: line 1: found 5 columns, expected 6 numbers"),
         ("64 48 nan 58 33 21", r"pincam: intrinsics: found .*nan.*, expected 6 finite numbers"),
-        ("64.5 48 61 58 33 21", r"pincam: width and height: found 64.5 48, expected the size of a picture"),
+        ("64.5 48 61 58 33 21", r"pincam: width and height: found 64.5 48, expected the size of an image"),
         ("0 48 61 58 33 21", r"pincam: width and height: found 0 48"),
         ("1e5 1e5 61 58 33 21", r"pincam: width and height: found 100000 100000"),
         ("640 480 61 58 33 21", r"lowres_wide.*png: size: found 64x48, expected 640x480"),

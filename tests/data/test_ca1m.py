@@ -80,7 +80,7 @@ def test_portrait_pictures_keep_their_orientation(tmp_path: Path) -> None:
     frame, laser = (render(PORTRAIT, T, size, 100.0) for _ in range(2))
     writers.write_ca1m(tmp_path / "ca1m-train-1.tar", [frame], [laser])
     recording = data.open(tmp_path)
-    assert recording[0].hw == size and recording.report == ("no confidence: every return counts alike",)
+    assert recording[0].hw == size and recording.report == ("no confidence: all returns are weighted equally",)
     check_same(recording, [frame], 1 / 1000)
     assert recording.truth(0)["depth"].shape == (1, *size)
 
@@ -129,7 +129,7 @@ def test_without_any_confidence_or_depth_intrinsics(tmp_path: Path) -> None:
     file, _, _ = archive(tmp_path)
     rewrite(file, lambda name, body: None if "confidence" in name or "wide/depth/K" in name else (name, body))
     recording = data.open(file)
-    assert recording.report == ("no confidence: every return counts alike",) and len(recording) == 4
+    assert recording.report == ("no confidence: all returns are weighted equally",) and len(recording) == 4
     assert recording[0].conf is None and recording[0].depth_camera is None
 
 
@@ -212,7 +212,7 @@ def test_what_is_no_archive_of_ours(tmp_path: Path) -> None:
     (tmp_path / "empty.tar").write_bytes(b"")
     for name, message in (
         ("other.tar", r"other.tar: frames: found none, expected members wide/image"),
-        ("noise.tar", r"noise.tar: header at byte 0: found a wrong check sum"),
+        ("noise.tar", r"noise.tar: header at byte 0: found a wrong checksum"),
         ("empty.tar", r"empty.tar: content: found 0 bytes, expected a tar archive"),
         ("gone.tar", r"gone.tar: path: found no such file"),
         ("", r"archives: found none, expected ca1m-<split>-<video id>.tar"),
@@ -280,7 +280,7 @@ def test_damaged_archives_end_the_walk(tmp_path: Path) -> None:
 
     for content, message in (
         (good[: offset + 10], r"wide/image.png: found 10 of \d+ bytes, expected a whole archive"),
-        (b"x" + good[1:], r"header at byte 0: found a wrong check sum, expected a tar header, not compressed"),
+        (b"x" + good[1:], r"header at byte 0: found a wrong checksum, expected a tar header, not compressed"),
         (header(124, b"77777777777\0"), r"wide/image.png: found \d+ of 8589934591 bytes, expected a whole archive"),
         (header(124, b"\x80" + b"\xff" * 11), r"wide/image.png: found \d+ of \d{20,} bytes"),
         (header(124, b"\xff" * 12), r"header at byte 0: found size .*, expected a number of bytes"),
@@ -352,10 +352,10 @@ def test_bad_tiff(tmp_path: Path) -> None:
         (tag(256, 0), "size: found 0x5"),
         (tag(257, 6), "strips: found 140 bytes, expected 168 bytes"),
         (tag(258, 12), "samples: found 12 bits of kind f"),
-        (tag(259, 7), "layout: found 1 samples a pixel, compression 7"),
+        (tag(259, 7), "layout: found 1 samples per pixel, compression 7"),
         (tag(259, 8), "data: found "),  # deflated, it says
-        (tag(273, 300), "strips: found 1 places, 1 sizes, expected all inside the file"),
-        (tag(277, 3), "layout: found 3 samples a pixel"),
+        (tag(273, 300), "strips: found 1 offsets, 1 sizes, expected all inside the file"),
+        (tag(277, 3), "layout: found 3 samples per pixel"),
     ):
         with pytest.raises(FormatError, match=message) as caught:
             tiff.decode_tiff(content, Path("a.tiff"))

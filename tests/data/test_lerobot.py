@@ -455,4 +455,4 @@ def test_a_set_without_intrinsics_can_be_looked_at(tmp_path: Path, capsys: pytes
     write_lerobot(tmp_path / "x", [episodes()[0]], version=2, intrinsics=None, depth=None, poses=False)
     assert run.main(["inspect", str(tmp_path / "x"), "--out", str(tmp_path / "out")]) == 0
     out = capsys.readouterr().out
-    assert "no intrinsics: nothing can be measured" in out and "frames " in out and "field of view" not in out
+    assert "no intrinsics: depth cannot be computed" in out and "frames " in out and "field of view" not in out

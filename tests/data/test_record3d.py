@@ -303,7 +303,7 @@ def test_damage_inside_is_found_when_read_or_when_verified(tmp_path: Path) -> No
     archive.write_bytes(bytes(whole))
     recording = data.open(archive)
     assert len(recording) == 4 and len([recording[i] for i in (0, 1, 3)]) == 3
-    with pytest.raises(FormatError, match=r"a.r3d/rgbd/2.depth: data: found .* check sum"):
+    with pytest.raises(FormatError, match=r"a.r3d/rgbd/2.depth: data: found .* checksum"):
         recording[2]
     verified = data.open(archive, verify=True)
     assert verified.number.tolist() == [0, 1, 3] and verified.report == ("frame 2: damaged: left out",)

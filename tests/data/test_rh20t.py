@@ -170,7 +170,7 @@ def test_stamps_that_do_not_fit_the_video_are_reported(tmp_path: Path) -> None:
     assert len(recording) == 3 and "4 color stamps for 3 frames" in recording.report[1]
     np.save(file, {"color": [stamps[0], stamps[0], stamps[2]], "depth": []}, allow_pickle=True)
     recording = data.open(root, serials=[FIXED])
-    assert recording.number.tolist() == [0, 2] and "1 color frame whose stamp is not later" in recording.report[1]
+    assert recording.number.tolist() == [0, 2] and "1 color frame with a time stamp not later" in recording.report[1]
 
 
 def test_outliers_of_a_lossy_high_byte_are_dropped(tmp_path: Path) -> None:
@@ -235,7 +235,7 @@ def test_a_human_shows_the_task(tmp_path: Path, lacking: tuple[str, ...]) -> Non
     if lacking:
         what = "tcp.npy" if "calib" in lacking else "tcp_base.npy"
         assert recordings[HAND].poses is None and rh20t.read_robot_streams(root) == {}
-        assert recordings[HAND].report == (f"camera {HAND} is on the hand and there is no {what}: no poses",)
+        assert recordings[HAND].report == (f"camera {HAND} is on the hand, without {what}: no poses",)
         torch.testing.assert_close(recordings[HAND][1].depth, moving()[1].depth, atol=0.5e-3 + 1e-6, rtol=0)
     else:
         same_scene(recordings[HAND], moving())
@@ -287,7 +287,7 @@ def test_frames_in_a_gap_of_the_tcp_are_left_out(tmp_path: Path) -> None:
     same_scene(recording, moving()[:2])
     file.unlink()
     recording = data.open(root, serials=[HAND])
-    assert recording.poses is None and "there is no tcp_base.npy: no poses" in recording.report[0]
+    assert recording.poses is None and "without tcp_base.npy: no poses" in recording.report[0]
 
 
 @pytest.mark.parametrize("configuration", [1, 3, 5, 6])
@@ -318,7 +318,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         data.open(root, serials=[HAND])
     meta = json.loads((root / "metadata.json").read_text())
     (root / "metadata.json").write_text(json.dumps({**meta, "bad_calib_view": [FIXED]}))
-    assert data.open(root).report[1] == f"camera {FIXED}: metadata doubts its calibration"
+    assert data.open(root).report[1] == f"camera {FIXED}: calibration marked as bad in the metadata"
     for value in (-1, "../../x", None, 1.5):
         (root / "metadata.json").write_text(json.dumps({"calib": value}))
         with pytest.raises(FormatError, match=r"metadata.json: calib"):
