@@ -1,1 +1,1 @@
-"""alignment."""
+"""Alignment of depth maps to metric references."""
