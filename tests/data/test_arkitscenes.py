@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from support.arkitscenes_frames import VGA, VGA_HW, path, shots
 from support.box_scene import CAMERA, HW, check_same, disagreement, off_wall, render, world_points
 
 from dhtorch import data
@@ -25,28 +26,6 @@ from dhtorch.geometry import se3
 from dhtorch.metrics import holdout
 from dhtorch.records import Camera, Frame, Pose
 from dhtorch.testing import parts
-
-VGA_HW = (96, 128)
-VGA = Camera(torch.tensor([[124.0, 115.5]]), torch.tensor([[68.25, 43.25]]))  # not quite the small camera, scaled
-UPRIGHT = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)  # looks along y, the sky (z) on top
-
-
-def path(time: float) -> Pose:
-    """Constant velocity and turn rate, so that interpolation has an exact answer."""
-    s = time - 100
-    turn = se3.exp(torch.tensor([[0.5 * s, -0.9 * s, 0.4 * s, 0, 0, 0]], dtype=torch.float64))
-    t = torch.tensor([[0.2 + 0.6 * s, -0.3 + 0.2 * s, 0.1 - 0.5 * s]], dtype=torch.float64)
-    return Pose(turn.R @ UPRIGHT, t)
-
-
-def shots(times: object, camera: Camera = CAMERA, hw: tuple[int, int] = HW, turns: int = 0) -> list[Frame]:
-    """What the stored pictures show; ``turns`` quarter turns clockwise would make them upright."""
-    frames = []
-    for time in np.round(np.asarray(times, dtype=float), 6):
-        c2w = convert.rot90_pose(se3.to_matrix(path(float(time))).numpy(), -turns)
-        frame = render(camera, se3.from_matrix(torch.from_numpy(c2w)), hw, float(time))
-        frames.append(frame.replace(conf=frame.image[:, 1] // 86))  # 0, 1 and 2, in patches
-    return frames
 
 
 def capture(root: Path, n: int = 4, **more: list[Frame]) -> list[Frame]:
@@ -512,11 +491,3 @@ def test_settings_hold_the_defaults(reader: object) -> None:
     settings = OmegaConf.load(config_dir() / "data" / f"{reader.__name__.split('.')[-1]}.yaml")
     options = {k: p.default for k, p in inspect.signature(reader.read).parameters.items() if k != "root"}
     assert {k: settings[k] for k in options} == options
-
-
-def hostile_sample(root: Path) -> Path:
-    root = root / "raw" / "Training" / "41048190"
-    frames = shots(100 + np.arange(3) / 60)
-    assets = {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": shots([100.0], VGA, VGA_HW)}
-    writers.write_arkitscenes(root, assets, trajectory=frames)
-    return root

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.rh20t_frames import BASE, CAMERA, FIXED, HAND, HW, moving, still
 
 pytest.importorskip("av")
 
-from support import damage_harness as hostile
 from support.box_scene import off_wall, pose, render, world_points
 
 from dhtorch import data
@@ -25,14 +25,9 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import rh20t, rh20t_robot
 from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS, RobotStream
 from dhtorch.geometry import se3
-from dhtorch.records import Camera, Frame
+from dhtorch.records import Frame
 from dhtorch.testing.lossless import write_lossless
 from dhtorch.testing.rh20t import to_robot_notation, write_rh20t
-
-HW = (36, 64)
-CAMERA = Camera(torch.tensor([[50.0, 48.0]]), torch.tensor([[33.5, 16.75]]))
-FIXED, HAND = "750612070851", ROBOT_ARMS[1].in_hand[0]
-BASE = se3.to_matrix(se3.exp(torch.tensor([[0.4, -0.2, 0.9, 0.7, -0.3, 0.5]]).double()))[0].numpy()
 
 
 @pytest.fixture(autouse=True)
@@ -42,14 +37,6 @@ def _clean() -> Iterator[None]:
 
 
 # ------------------------------------------------------------------------------------------------------ written scenes
-
-
-def still(n: int = 3, start: float = 1_600_000_100.0) -> list[Frame]:
-    return [render(CAMERA, pose(2), HW, start + i / 10) for i in range(n)]
-
-
-def moving(n: int = 3, start: float = 1_600_000_100.0) -> list[Frame]:
-    return [render(CAMERA, pose(i), HW, start + i / 10) for i in range(n)]
 
 
 def scene(tmp_path: Path, **options: object) -> Path:
@@ -338,15 +325,6 @@ def test_folder_without_a_configuration_is_taken_to_stand_still(tmp_path: Path) 
     recording = data.open(root, serials=[FIXED])
     assert "unknown configuration" in recording.report[0]
     same_scene(data.open(root, serials=[HAND], configuration=1), moving())
-
-
-def hostile_sample(root: Path) -> Path:
-    return write_rh20t(root, {FIXED: still(2), HAND: moving(2)}, T_world_from_base=BASE)
-
-
-def read_all(root: Path) -> None:
-    hostile.read_all(root)
-    rh20t.read_robot_streams(root)
 
 
 def test_a_large_array_where_a_pose_is_expected_is_named_by_its_shape(tmp_path):

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 import pickle
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from support.box_scene import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
+from support.box_scene import disagreement, off_wall, own_camera, pose, turned_over, world_points
+from support.stray_frames import DEPTH_HW, HW, camera_of, walk
 
 from dhtorch import data, pytree
 from dhtorch import testing as writers
@@ -20,29 +20,12 @@ from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.io.decode import FormatError
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
-from dhtorch.records import Camera, Frame, Pose
+from dhtorch.records import Frame, Pose
 
 pytest.importorskip("av")
 
 ROOT = os.environ.get("DHTORCH_DATA")
-HW, DEPTH_HW = (72, 96), (24, 32)
 STEP = 1e-3  # m, of the depth codes
-
-
-def camera_of(i: int) -> Camera:
-    return Camera(torch.tensor([[80.0 + i, 78.5 - i]]), torch.tensor([[50.25, 33.5 + 0.25 * i]]))
-
-
-def walk(n: int = 4, place: Callable[[int], Pose] = pose) -> list[Frame]:
-    """Pictures with a smaller depth map, confidence and poses, at 60 Hz; the phone has been on for three days."""
-    frames = []
-    for i in range(n):
-        camera = camera_of(i)
-        shot = render(camera, place(i), HW, 258528.330141458 + i / 60)
-        small = render(cameras.resize(camera, HW, DEPTH_HW), place(i), DEPTH_HW)
-        conf = (torch.arange(24 * 32).view(1, *DEPTH_HW) % 3).to(torch.uint8)
-        frames.append(shot.replace(depth=small.depth, conf=conf))
-    return frames
 
 
 def same_scene(recording: data.Recording, frames: list[Frame], image: float = 12) -> None:
@@ -355,11 +338,3 @@ def test_real_capture() -> None:
     agree, count = disagreement(a, b)
     assert agree < 0.02 and count > 40_000
     assert disagreement(turned_over(a), turned_over(b))[0] > 0.15  # so the check above can tell
-
-
-def hostile_new(root: Path) -> None:
-    writers.write_stray(root, walk(), per_frame=True)
-
-
-def hostile_old(root: Path) -> None:
-    writers.write_stray(root, walk(), depth_format="npy", codec="libx265", first_picture="lost")
