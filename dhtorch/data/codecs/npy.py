@@ -68,7 +68,7 @@ def _decode_real_npy(file: Path, field: str, raw: bytes) -> np.ndarray:
     """The bytes of an ``.npy`` file of real numbers as floating point.
 
     Raises:
-        FormatError: as :func:`parse_real_npy_header`, or another number of bytes than the header says.
+        FormatError: as :func:`parse_real_npy_header`, or another number of bytes than in the header.
     """
     header = parse_real_npy_header(file, field, raw)
     count, left = math.prod(header.shape), len(raw) - header.start
@@ -89,7 +89,7 @@ def read_npz(file: Path, key: str) -> np.ndarray:
     """Array ``key`` of an ``.npz`` archive as floating point; pickled objects are refused.
 
     Raises:
-        FormatError: missing or damaged archive, no such key, not numeric, or larger than it says or than
+        FormatError: missing or damaged archive, no such key, not numeric, or larger than declared or than
             ``MAX_FILE_BYTES``.
     """
     try:
