@@ -1,4 +1,4 @@
-"""``dhtorch inspect``: what it says about written captures, what it warns of, and that it refuses nothing real."""
+"""``dhtorch inspect``: its report on written captures, its warnings, and that it accepts real ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import torch
 from rich.console import Console
 from support import damage_harness as hostile
 from support.box_scene import HW, pose, render
-from test_focal_stacks import stack
+from support.focal_stacks import random_stack
 
 from dhtorch import data
 from dhtorch import testing as writers
@@ -109,9 +109,9 @@ RECORDED: dict[str, tuple[Callable[[Path, int], object], str, int]] = {
 }
 WRITTEN: dict[str, tuple[Callable[[Path], object], str, int]] = {
     **{name: (partial(write, n=3), format, count) for name, (write, format, count) in RECORDED.items()},
-    "fod500": (lambda root: stack_writers.write_fod500(root, {0: stack(0), 1: stack(1)}), "fod500", 1),
-    "ddff12": (lambda root: stack_writers.write_ddff12(root / "a.h5", {"val": [stack(0, 10)]}), "ddff12", 1),
-    "images": (lambda root: stack_writers.write_image_folder(root, stack(0, 5)), "images", 1),
+    "fod500": (lambda root: stack_writers.write_fod500(root, {0: random_stack(0), 1: random_stack(1)}), "fod500", 1),
+    "ddff12": (lambda root: stack_writers.write_ddff12(root / "a.h5", {"val": [random_stack(0, 10)]}), "ddff12", 1),
+    "images": (lambda root: stack_writers.write_image_folder(root, random_stack(0, 5)), "images", 1),
 }
 
 
@@ -170,13 +170,13 @@ def test_facts_of_confidence_and_of_frames_left_out(tmp_path: Path) -> None:
 
 
 def test_facts_of_stacks(tmp_path: Path) -> None:
-    stack_writers.write_fod500(tmp_path, {3: stack(3), 4: stack(4)})
+    stack_writers.write_fod500(tmp_path, {3: random_stack(3), 4: random_stack(4)})
     survey = survey_stacks(formats.open_stacks(tmp_path))
     said = facts(survey)
     assert said["focal stacks"] == "2, of 5 pictures each" and said["in focus at"] == "0.1, 0.15, 0.3, 0.7, 1.5 m"
     assert said["lens"] == "f = 2.9 mm, N = 1" and said["holes"].startswith("0.5 %") and survey.warnings == []
-    same = stack(0, 1).images.expand(1, 4, 3, 12, 16)
-    stack_writers.write_image_folder(tmp_path / "b", stack(0).replace(images=same))
+    same = random_stack(0, 1).images.expand(1, 4, 3, 12, 16)
+    stack_writers.write_image_folder(tmp_path / "b", random_stack(0).replace(images=same))
     survey = survey_stacks(formats.open_stacks(tmp_path / "b"))
     assert survey.warnings == [
         "no focus distances: only the order of the pictures is available",

@@ -1,4 +1,4 @@
-"""ARKitScenes: captures written in its layout, at its clocks, with the traps its users met."""
+"""ARKitScenes: captures written with its layout and clocks and read back, and damaged ones."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from dhtorch.testing import parts
 
 
 def capture(root: Path, n: int = 4, **more: list[Frame]) -> list[Frame]:
-    """The plain case: small pictures with depth, confidence and poses at the same instants."""
+    """Writes a capture of small pictures with depth, confidence and poses at the same times; returns its frames."""
     frames = shots(100 + np.arange(n) / 60)
     assets = {"lowres_wide": frames, "lowres_depth": frames, **more}
     writers.write_arkitscenes(root, assets, trajectory=frames)

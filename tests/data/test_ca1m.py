@@ -343,6 +343,3 @@ def test_bad_tiff(tmp_path: Path) -> None:
         with pytest.raises(FormatError, match=message) as caught:
             tiff.decode_tiff(content, Path("a.tiff"))
         assert "\n" not in str(caught.value)
-
-
-# ----------------------------------------------------------------------------------------------------------- hostile

@@ -1,4 +1,4 @@
-"""Record3D: its three layouts written from a known room and read back, the real piece, the cable, every trap."""
+"""Record3D: its three layouts written from a known room and read back, a real one, live frames, and damaged ones."""
 
 from __future__ import annotations
 
@@ -517,7 +517,7 @@ def test_live_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
         LiveFrames()
 
 
-# ------------------------------------------------------------------------------------------------------ real, hostile
+# --------------------------------------------------------------------------------------------------------------- real
 
 
 @pytest.mark.data

@@ -1,4 +1,4 @@
-"""RLDS data sets in TFRecord files: written with known geometry, read back, the real ones, and damaged."""
+"""RLDS data sets in TFRecord files: written with known geometry and read back, real ones, and damaged ones."""
 
 from __future__ import annotations
 

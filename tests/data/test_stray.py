@@ -1,4 +1,4 @@
-"""Stray Scanner: captures written from a known room and read back, the real piece, every trap."""
+"""Stray Scanner: captures of a known room written and read back, a real one, and damaged ones."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def picture_error(a: Frame, b: Frame) -> float:
 
 
 def steady(i: int) -> Pose:
-    """So fast that a picture too early or too late is plainly wrong."""
+    """Pose ``i`` of a motion so fast that the picture before or after is clearly another."""
     return se3.exp(torch.tensor([[0.0, 0.12 * i, 0.05 * i, 0.05 * i, 0.0, 0.0]]).double())
 
 
@@ -108,7 +108,7 @@ def test_new_odometry_has_K_in_every_row_and_empty_cells(tmp_path: Path) -> None
 
 
 def test_K_of_another_size(tmp_path: Path) -> None:
-    """A capture whose video was made smaller keeps its K: the option says for which size."""
+    """A capture whose video was made smaller keeps its K: an option gives the size of K."""
     frames = walk(2)
     writers.write_stray(tmp_path, [f.replace(camera=cameras.resize(f.camera, HW, (1440, 1920))) for f in frames])
     camera = data.open(tmp_path, K_hw=(1440, 1920))[0].camera
@@ -318,7 +318,7 @@ def test_unsound_files(tmp_path: Path) -> None:
         data.open(tmp_path)
 
 
-# ------------------------------------------------------------------------------------------------------ real, hostile
+# --------------------------------------------------------------------------------------------------------------- real
 
 
 @pytest.mark.data

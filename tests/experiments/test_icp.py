@@ -1,11 +1,11 @@
-"""ICP where the motion is known: dense clouds against a brute-force oracle, sparse sets, and what cannot be registered."""
+"""ICP with known motion: dense clouds against a brute-force search, sparse sets, and sets that cannot be registered."""
 
 import math
 
 import pytest
 import torch
-from support.rooms import Changed
 from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
+from support.rooms import Changed
 
 from dhtorch.experiments.negative import icp as experiment
 from dhtorch.experiments.negative.registration import estimate_normals, register_icp
@@ -146,7 +146,9 @@ def test_empty_sets_and_bad_options_raise():
 
 
 def asked(*recordings, **options):
-    return experiment.run(list(recordings), {"paper": configured_method()}, None, Settings(), **{"n": 300, "links": 3, **options})
+    return experiment.run(
+        list(recordings), {"paper": configured_method()}, None, Settings(), **{"n": 300, "links": 3, **options}
+    )
 
 
 def test_the_exact_pose_cannot_be_improved_and_no_pose_can():

@@ -12,9 +12,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import test_map_pose
-import test_reprojection_problem
 import torch
+from support.pose_problems import NOISE, map_pose_inputs, pose_depth_problem
 from torch.autograd import forward_ad
 from torch.utils._pytree import tree_leaves
 
@@ -280,7 +279,7 @@ def test_depths_that_compiled_code_does_not_take_are_torchs(loaded, monkeypatch)
 
 
 @needs_compiler
-def test_what_some_depths_say_is_what_torch_says(loaded, monkeypatch):
+def test_the_unit_found_from_depths_is_that_of_torch(loaded, monkeypatch):
     views, random = SampleSpec(depth_unit="m"), torch.Generator().manual_seed(5)
     depth = 3 * torch.rand(6, 60, 80, generator=random)
     depth[0, ::2], depth[1], depth[2], depth[3, :40] = 0, 0, 0, 300.0
@@ -661,7 +660,7 @@ def test_a_magnified_window_is_registered_on_the_half_size_level_alike(loaded, m
 
 
 @needs_compiler
-def test_a_registration_is_told_the_same_in_any_company_and_without_texture_nothing(loaded, monkeypatch, seen_twice):
+def test_a_registration_is_the_same_in_any_batch_and_without_texture_none(loaded, monkeypatch, seen_twice):
     here, there, uv = seen_twice
     together = registered(here, there, uv)
     some = torch.rand(uv.shape[:2], generator=torch.Generator().manual_seed(7)) < 0.3
@@ -715,7 +714,7 @@ def test_a_registration_of_pixels_that_are_no_numbers_is_rejected_alike(loaded, 
 
 
 def near_pairs(batch, n, wrong, seed=0):
-    """Points 0.5 to 2.5 m away seen again with 0.3 px of noise, a share of them anywhere: what seat 5 is asked with."""
+    """Points 0.5 to 2.5 m away seen again with 0.3 px of noise, a share of them anywhere: input of ``pnp_ransac`` and ``map_pose``."""
     g = torch.Generator().manual_seed(seed)
 
     def uniform(*shape):
@@ -757,7 +756,7 @@ def test_a_pose_from_near_points_agrees_up_to_rounding(loaded, monkeypatch, batc
 
 
 @needs_compiler
-def test_what_leaves_no_pose_is_told_alike(loaded, monkeypatch):
+def test_the_reasons_for_no_pose_agree(loaded, monkeypatch):
     samples, tracks, *rest = near_pairs(7, 60, 0.2)
     xyz, uv_1, valid = samples.xyz.clone(), tracks.uv_1.clone(), tracks.valid.clone()
     valid[0] = False
@@ -796,11 +795,11 @@ def test_poses_in_another_type_by_a_kernel_or_with_a_graph_are_torchs(loaded, mo
 
 def every_track(turning):
     """Tracks of every kind, as many as compiled code takes; their unknowns and noise."""
-    problem, at = test_reprojection_problem.scene()
+    problem, at = pose_depth_problem()
     problem = PoseDepthProblem(
         problem.f, problem.c, *(x.repeat(*[1] * (x.ndim - 1), 16) for x in tree_leaves(problem)[2:])
     )
-    noise = test_reprojection_problem.NOISE.repeat(1, 16)
+    noise = NOISE.repeat(1, 16)
     return (
         problem.to(torch.float32),
         at._replace(T=at.T.to(torch.float32), turn=at.shutter_rate.float() if turning else None),
@@ -844,7 +843,7 @@ def test_equations_of_tracks_agree_up_to_rounding(loaded, monkeypatch, turning):
 
 @needs_compiler
 def test_a_pose_from_all_tracks_agrees_to_far_less_than_its_sigma(loaded, monkeypatch):
-    args, _, _, _ = test_map_pose.pairs(6, near=80, far=220, turn=0.01)
+    args, _, _, _ = map_pose_inputs(6, near=80, far=220, turn=0.01)
     args = [x.to(torch.float32) for x in args]
     found, expected = both_ways(lambda: map_pose(*args), monkeypatch)
     assert poses_alike(found, expected) == 6
@@ -854,7 +853,7 @@ def test_a_pose_from_all_tracks_agrees_to_far_less_than_its_sigma(loaded, monkey
 
 
 @needs_compiler
-def test_a_point_is_told_the_same_in_any_company(loaded, seen_twice):
+def test_a_point_is_the_same_in_any_batch(loaded, seen_twice):
     here, there, uv = seen_twice
     together = lucas_kanade(here, there, uv)
     for k in range(len(uv)):
@@ -955,7 +954,7 @@ def test_another_torch_and_another_processor_have_a_file_of_their_own(monkeypatc
     assert len({*files, loader.library()}) == 3
 
 
-def test_a_compiler_that_is_missing_or_fails_is_told(tmp_path, monkeypatch):
+def test_a_compiler_that_is_missing_or_fails_is_reported(tmp_path, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path))
     monkeypatch.setenv("CXX", "no-such-compiler-7")
     asked = [sys.executable, "-m", "dhtorch.ops.loader"]
@@ -988,7 +987,7 @@ def decoded(kind, unit, *, hw=(61, 83), map_hw=(61, 83), channels=3, seed=0):
 
 
 def by_stages(transform, monkeypatch, *calls):
-    """The same calls, of which the stages are asked."""
+    """The same calls, which run the stages."""
     with monkeypatch.context() as patch:
         patch.setattr(transform._alone, "limits", None)
         return [call() for call in calls]
@@ -1023,7 +1022,7 @@ SEATS = [
         ((60, 80), (240, 320), "hwc"),
     ],
 )
-def test_a_view_alone_at_once_is_what_the_stages_say(loaded, monkeypatch, kind, unit, seats, hw, map_hw, layout):
+def test_a_view_alone_in_one_call_is_that_of_the_stages(loaded, monkeypatch, kind, unit, seats, hw, map_hw, layout):
     transform = ExtendDepth(depth_unit=unit, method=PAPER.replace(**seats, n=50), patch=2, layout=layout)
     samples = [decoded(kind, unit, hw=hw, map_hw=map_hw, seed=seed) for seed in range(3)]
     samples += [decoded(kind, unit, hw=hw, map_hw=map_hw, seed=seed) for seed in range(3)]
@@ -1088,7 +1087,7 @@ def test_the_layouts_of_a_map_are_one(loaded, monkeypatch):
 
 
 @needs_compiler
-def test_what_is_not_as_usual_is_asked_of_the_stages(loaded, monkeypatch):
+def test_unusual_calls_run_the_stages(loaded, monkeypatch):
     calls, plain = counted(monkeypatch, "look"), decoded("uint16", "mm")
 
     def said(sample, unit="mm", **options):
@@ -1132,7 +1131,7 @@ def test_what_is_not_as_usual_is_asked_of_the_stages(loaded, monkeypatch):
 
 @needs_compiler
 @pytest.mark.parametrize("on_error", ["raise", "skip", "flag"])
-def test_what_contradicts_its_unit_is_told_as_the_stages_tell_it(loaded, monkeypatch, on_error):
+def test_depths_that_contradict_their_unit_are_reported_as_by_the_stages(loaded, monkeypatch, on_error):
     transform, plain = ExtendDepth(depth_unit="mm", n=50, on_error=on_error), decoded("uint16", "mm")
     none, wrong = np.zeros((61, 83), np.uint16), plain["depth"] // 500
     transform(plain)
@@ -1155,7 +1154,7 @@ def test_what_contradicts_its_unit_is_told_as_the_stages_tell_it(loaded, monkeyp
 
 
 @needs_compiler
-def test_words_of_a_kind_that_was_seen_in_metres_are_still_asked_for_their_unit(loaded):
+def test_whole_numbers_are_checked_for_their_unit_after_metres_were_seen(loaded):
     transform = ExtendDepth(depth_unit="m", n=50)
     transform(decoded("float32", "m"))
     words = decoded("uint16", "mm")

@@ -9,44 +9,15 @@ import stat
 import subprocess
 import sys
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from support.small_result import KEY, result
 
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
-
-KEY = "0123456789abcdef" * 4
-
-
-@cache
-def meta_now():
-    return result_files.collect_run_metadata(device="cpu", dtype=torch.float32, threads=1, seed=0)
-
-
-def result(**changes):
-    parts = {
-        "experiment": "pair",
-        "key": KEY,
-        "meta": meta_now(),
-        "config": {"method": {"n": 2048}, "holdout": {"cutoff": math.inf}},
-        "data": {"name": "room", "scenes": ["room"], "n_pairs": 1, "digest": result_files.compute_data_digest({})},
-        "summary": {"coverage": {"value": 0.5, "low": None, "high": None, "n": 1, "unit": "1"}},
-        "rows": [
-            {
-                "scene": "room",
-                "pair": (0, 5),
-                "method": "paper",
-                "n_kept": np.int64(3),
-                "median_rel": torch.tensor(0.5),
-            },
-            {"scene": "room", "pair": None, "method": "paper", "corr": math.nan, "ms": {"track": np.float32(1.5)}},
-        ],
-    }
-    return result_files.build_result(**{**parts, **changes})
 
 
 def test_a_result_survives_the_disk_and_is_strict(tmp_path):
