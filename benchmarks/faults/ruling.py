@@ -17,6 +17,8 @@ TESTS: dict[str, list[str]] = {
         "tests/alignment/test_align.py",
         "tests/alignment/test_error_model.py",
     ],
+    "alignment.options": ["tests/alignment/test_residual_noise.py"],
+    "validation.options": ["tests/validation/test_evidence.py"],
     "validation.evidence": ["tests/validation/test_evidence.py", "tests/validation/test_validate.py"],
     "validation.faults": ["tests/validation/test_faults.py"],
     "validation.validate": ["tests/validation/test_validate.py"],
@@ -106,6 +108,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_aligned_map", "(~valid, Gate.NO_TRACK)", "(~valid, Gate.UNCERTAIN)"),
         ("_aligned_map", "~(sigma_rel <= max_sigma_rel)", "(sigma_rel <= 0)"),
         ("_isotonic_map", "cummin(-1)", "cummax(-1)"),
+    ],
+    "alignment.options": [
+        ("AlignmentOptions.map_correlation_length", "min(self.field_lengths)", "max(self.field_lengths)"),
+    ],
+    "validation.options": [
+        ("ValidationOptions.share_window_pixels", "(2 * self.evidence_radius_px + 1)", "(2 * self.evidence_radius_px)"),
     ],
     "validation.evidence": [
         ("validation_references", "samples.usable & ((samples.flag", "samples.usable | ((samples.flag"),

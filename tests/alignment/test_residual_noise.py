@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS
+from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS, AlignmentOptions
 from dhtorch.alignment.references import MetricReferences, local_spread, sample_at_references
 from dhtorch.alignment.residual_noise import (
     _edge_gain,
@@ -101,6 +101,11 @@ def test_chance_is_no_error_of_a_map():
     truth = wall()
     found = [float(sigma(truth, truth, n=250, seed=seed, noise=0.006, stated=0.01).median()) for seed in range(20)]
     assert sum(found) / len(found) < 0.0009 and sum(level < 0.00055 for level in found) >= 9
+
+
+def test_smooth_errors_have_the_length_of_the_shorter_field():
+    assert OPTIONS.map_correlation_length == 0.13
+    assert AlignmentOptions(field_lengths=(0.4, 0.2)).map_correlation_length == 0.2
 
 
 @pytest.mark.parametrize("seed", range(4))

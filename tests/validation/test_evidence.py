@@ -200,3 +200,7 @@ def test_maps_speak_only_between_views_that_stand_apart():
     assert not depth_consistency_evidence(far, base, [apart], [near], 0.02).misfit.isfinite().any(), (
         "what lies behind may be hidden"
     )
+
+
+def test_a_window_is_one_independent_pixel():
+    assert DEFAULT_VALIDATION_OPTIONS.share_window_pixels == 81
