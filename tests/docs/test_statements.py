@@ -29,7 +29,7 @@ SAYS_SO = re.compile(
     re.I,
 )
 PAGE_SAYS_SO = re.compile(r"\b(?:checked|tested|verified|validated)\b", re.I)
-TEST = re.compile(r"tests/test_\w+\.py")
+TEST = re.compile(r"tests/(?:\w+/)?test_\w+\.py")
 
 
 def sentences(text: str) -> list[str]:

@@ -48,11 +48,11 @@ EXPECTATION = "Every number of the list of bars is met; scenes, and of causes wi
 
 #: Number → (bar, whether it holds).
 VALIDATE_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
-    "judge.scale_found": (0.95, lambda value, bar: value >= bar),
-    "judge.false_alarm": (0.02, lambda value, bar: value <= bar),
-    "judge.jump_auroc": (0.95, lambda value, bar: value >= bar),
-    "judge.called_right_wrong": (0.01, lambda value, bar: value <= bar),
-    "judge.named_worst": (0.90, lambda value, bar: value >= bar),
+    "validate.scale_found": (0.95, lambda value, bar: value >= bar),
+    "validate.false_alarm": (0.02, lambda value, bar: value <= bar),
+    "validate.jump_auroc": (0.95, lambda value, bar: value >= bar),
+    "validate.called_right_wrong": (0.01, lambda value, bar: value <= bar),
+    "validate.named_worst": (0.90, lambda value, bar: value >= bar),
 }
 
 #: Scale factors that are planted: name in rows → factor.
@@ -84,7 +84,7 @@ _MIN_FAULT_MOTION_PX = 2.0
 _SCALE_COLUMN_SUFFIXES = {"scale": "", "scale_far": "_far", "quick_far": "_quick_far"}
 
 #: Predictor of the pixels' states → prefix of its columns.
-_PREDICTOR_PREFIXES = {"judge": "", "quick": "quick_", "photometric": "peer_"}
+_PREDICTOR_PREFIXES = {"validate": "", "quick": "quick_", "photometric": "peer_"}
 
 
 @dataclass(frozen=True)
@@ -137,19 +137,19 @@ def run(
 ) -> Outcome:
     """Detection rates of faults planted in true maps, from near returns and source views.
 
-    Rows: one per reference view (``pair`` [i, i], method ``judge``), one per window and fault (``pair`` [first, last],
+    Rows: one per reference view (``pair`` [i, i], method ``validate``), one per window and fault (``pair`` [first, last],
     method ``causes``), one per scene. In the summary, ratios of reference views are means over scenes with intervals
     over scenes:
 
-    * ``judge.scale_found`` and ``judge.false_alarm`` (all evidence); suffix ``_5`` for a scale wrong by a twentieth,
+    * ``validate.scale_found`` and ``validate.false_alarm`` (all evidence); suffix ``_5`` for a scale wrong by a twentieth,
       ``_far`` for triangulated points alone;
-    * ``judge.jump_auroc`` of pixels without a near return, ``_all`` of all pixels;
-    * ``judge.called_right_wrong``, ``_worst`` of the worst scene, ``_cut`` of clipped maps alone; ``judge.known``;
+    * ``validate.jump_auroc`` of pixels without a near return, ``_all`` of all pixels;
+    * ``validate.called_right_wrong``, ``_worst`` of the worst scene, ``_cut`` of clipped maps alone; ``validate.known``;
     * ``photometric.<key>`` of the photometric baseline; ``quick.<key>`` of
       :data:`dhtorch.validation.validate.QUICK_METHOD` without the images of other views, whose scale from
       triangulated points alone is ``_quick_far``.
 
-    Ratios of windows: ``judge.named.<kind>``, their minimum ``judge.named_worst``, and ``judge.misnamed`` where no
+    Ratios of windows: ``validate.named.<kind>``, their minimum ``validate.named_worst``, and ``validate.misnamed`` where no
     fault was planted. Nothing is fitted to the scenes.
 
     Args:
@@ -228,12 +228,12 @@ def summarise_validation(rows: Sequence[Row]) -> Row:
     for kind in sorted({row["planted_kind"] for row in counted}):
         right = [float(row["named_kind"] == kind) for row in counted if row["planted_kind"] == kind]
         named_ratio[kind] = sum(right) / len(right)
-        summary[f"judge.named.{kind.replace(' ', '_')}"] = bootstrap.without_interval(named_ratio[kind], len(right))
-    summary["judge.named_worst"] = bootstrap.without_interval(min(named_ratio.values(), default=None), len(counted))
+        summary[f"validate.named.{kind.replace(' ', '_')}"] = bootstrap.without_interval(named_ratio[kind], len(right))
+    summary["validate.named_worst"] = bootstrap.without_interval(min(named_ratio.values(), default=None), len(counted))
     clean = [
         float(row["named_kind"] is not None) for row in rows if row["method"] == "causes" and row["fault"] == "none"
     ]
-    summary["judge.misnamed"] = bootstrap.without_interval(mean_or_none(clean), len(clean))
+    summary["validate.misnamed"] = bootstrap.without_interval(mean_or_none(clean), len(clean))
     return summary
 
 
@@ -259,7 +259,7 @@ def _reference_row(
     selected, validate = _make_validator(method, scene, near, others, settings, size)
     _, validate_quick = _make_validator(with_view_selection(QUICK_METHOD), scene, near, others, settings, size)
     true_map = _true_map(scene.recording, i, full, size, method)
-    row: Row = {"scene": scene.name, "pair": [i, i], "method": "judge", **_baseline_columns(selected)}
+    row: Row = {"scene": scene.name, "pair": [i, i], "method": "validate", **_baseline_columns(selected)}
     for name, factor in {"none": 1.0, **_SCALE_FAULTS}.items():
         validation, quick = (check(true_map * factor, views=False) for check in (validate, validate_quick))
         scale = {"scale": validation.scale[0], "scale_far": validation.scale_far[0], "quick_far": quick.scale_far[0]}
@@ -331,12 +331,12 @@ def _baseline_columns(selected: dense.SelectedViews) -> Row:
 def _scene_row(scene: Scene, rows: Sequence[Row]) -> Row:
     """Rows of a scene's reference views → the scene's row of ratios."""
     with_baseline = [row for row in rows if row["baseline"]]
-    out: Row = {"scene": scene.name, "pair": None, "method": "judge", "role": scene.role, "n_wide": len(with_baseline)}
+    out: Row = {"scene": scene.name, "pair": None, "method": "validate", "role": scene.role, "n_wide": len(with_baseline)}
     for column, suffix in _SCALE_COLUMN_SUFFIXES.items():
         for percent, ending in (("10", ""), ("5", "_5")):
             alarms = [row[f"{column}.{percent}_{side}"] for row in with_baseline for side in ("long", "short")]
-            out[f"judge.scale_found{ending}{suffix}"] = mean_or_none([float(bool(x)) for x in alarms])
-        out[f"judge.false_alarm{suffix}"] = mean_or_none([float(bool(row[f"{column}.none"])) for row in with_baseline])
+            out[f"validate.scale_found{ending}{suffix}"] = mean_or_none([float(bool(x)) for x in alarms])
+        out[f"validate.false_alarm{suffix}"] = mean_or_none([float(bool(row[f"{column}.none"])) for row in with_baseline])
     for name, prefix in _PREDICTOR_PREFIXES.items():
         for key, column in (("jump_auroc", "auroc"), ("jump_auroc_all", "auroc_all")):
             out[f"{name}.{key}"] = mean_or_none(
