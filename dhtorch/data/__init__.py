@@ -1,8 +1,8 @@
 """Files to frames: the only place with file decoding, unit changes and axis changes.
 
 ``open(path)`` recognises a capture by its content and returns its :class:`Recording`, a lazy sequence of frames. A
-format is one module with ``recognise(root)`` and ``read(root, *, options)``, and one line in the table below. Focal
-stacks show one view without depth of their own: ``dhtorch.experiments.focal`` reads them.
+format is one module of ``readers`` with ``recognise(root)`` and ``read(root, *, options)``, and one line in the table
+below. Focal stacks show one view without depth of their own: ``dhtorch.experiments.focal`` reads them.
 """
 
 from __future__ import annotations
@@ -13,27 +13,30 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Protocol
+from types import ModuleType
+from typing import Any, Final, Protocol, cast
 
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.io.safe_open import restrict_links
-from dhtorch.data.readers import (
-    arkitscenes,
-    ca1m,
-    driving,
-    frames_dir,
-    lerobot,
-    record3d,
-    rectified,
-    rh20t,
-    rlds,
-    stray,
-    tum,
-)
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Scene, SceneLike, Scenes, scenes_of
 from dhtorch.runtime import console
+
+# The table of formats: one line for each reader, in the order in which they are asked. FORMATS is made from it.
+from dhtorch.data.readers import (  # noqa: F401  # isort: skip
+    record3d,  # before tum: its folder, too, holds rgb/ and depth/
+    tum,
+    driving,
+    rectified,
+    arkitscenes,
+    ca1m,
+    rh20t,
+    lerobot,
+    rlds,
+    stray,
+    frames_dir,
+)
 
 __all__ = [
     "FORMATS",
@@ -68,17 +71,9 @@ class Reader(Protocol):
 
 #: Name → reader, asked in this order; the first that recognises a folder reads it.
 FORMATS: Final[dict[str, Reader]] = {
-    "record3d": record3d,  # before tum: its folder, too, holds rgb/ and depth/
-    "tum": tum,
-    "driving": driving,
-    "rectified": rectified,
-    "arkitscenes": arkitscenes,
-    "ca1m": ca1m,
-    "rh20t": rh20t,
-    "lerobot": lerobot,
-    "rlds": rlds,
-    "stray": stray,
-    "frames_dir": frames_dir,
+    name: cast(Reader, module)
+    for name, module in list(vars().items())
+    if isinstance(module, ModuleType) and module.__name__ == f"{__name__}.readers.{name}"
 }
 
 #: The variable that says where a collection of scenes lies.

@@ -52,12 +52,7 @@ def draw_validation(
     canvas = Canvas(2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT * bool(title), dpi=160)
     canvas.title(title, 2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT)
     ground = np.array(colours.parse_rgb(colours.PICTURE)) / 255
-    states = (
-        np.array([colours.parse_rgb(colours.STATE_COLOURS[k]) for k in sorted(colours.STATE_COLOURS)])[
-            code.astype(np.int64)
-        ]
-        / 255
-    )
+    states = colours.colour_by_code(colours.STATE_COLOURS, code.astype(np.int64)) / 255
     wrong, fine = (((code == k) & known).sum() for k in (State.WRONG, State.CONSISTENT))
     metres, ends = fit_depth_axis(z[known]), Axis(-_MAX_EVIDENCE_SIGMAS, _MAX_EVIDENCE_SIGMAS, "evidence, sigmas")
     strength = apply_cmap(
