@@ -17,7 +17,7 @@ TESTS: dict[str, list[str]] = {
     "transforms.schema": [
         "tests/transforms/test_extend_depth_stub.py",
         "tests/transforms/test_dense_loader.py",
-        "tests/extract/test_extract_stub.py",
+        "tests/extract/test_shards.py",
     ],
     "runtime.allocator": ["tests/runtime/test_allocator.py"],
     "runtime.results": ["tests/runtime/test_results.py", "tests/extract/test_shards.py"],

@@ -67,7 +67,7 @@ def select_columns(found: Mapping[str, Column], wanted: Sequence[str] | None) ->
     """
     for name in wanted or ():
         if name not in found:
-            raise ValueError(f"columns: found {name!r}, expected some of {', '.join(found)}")
+            raise ValueError(f"extract.columns: found {name!r}, expected some of {', '.join(found)}")
     keep = set(found if wanted is None else wanted) | {*KEY_COLUMNS, "problem"}
     return {name: column for name, column in found.items() if name in keep}
 

@@ -160,7 +160,7 @@ def test_maps_and_tokens_learn_from_pictures_and_depth(items):
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [
-        ({"sise": 224}, "dense: found 'sise', expected some of source views, planes, size, refinements, min_corr"),
+        ({"sise": 224}, "dense: found 'sise', expected some of source_views, planes, size, refinements, min_corr"),
         ({"method": MAP}, "dense: found 'method', expected some of"),
         ({"planes": 12.5}, "dense.planes: found 12.5, expected a whole number"),
         ({"size": True}, "dense.size: found True, expected a whole number"),
@@ -266,7 +266,7 @@ def test_maps_are_written_read_back_and_resumed(command, tmp_path):
 
 def test_a_misspelt_option_is_said_before_anything_is_read(command, tmp_path):
     code, _, err = command(dense="{sise: 48}")
-    assert code == 2 and "extract.dense: found 'sise', expected some of source views" in err
+    assert code == 2 and "extract.dense: found 'sise', expected some of source_views" in err
     assert len(err.strip().splitlines()) == 1 and not list(tmp_path.iterdir())
 
 
