@@ -2,99 +2,185 @@
 
 Codes are plain integers (an ``IntEnum`` member compared with a tensor inside ``torch.compile(fullgraph=True)`` becomes
 a Python bool). The numbers are fixed once published; the names in the tables are what results and figures print.
+
+A code is one entry: ``NAME: Final = code(number, definition, …)``. Everything that shows codes reads the entries, so
+that a new code has a text wherever codes are described and, until ``viz.plots.colours`` gives it one of its own, a
+common colour.
 """
 
 from __future__ import annotations
 
-from typing import Final
+from dataclasses import dataclass
+from typing import ClassVar, Final
 
 import torch
 from torch import Tensor
 
 
-class Flag:
+@dataclass(frozen=True)
+class CodeEntry:
+    """What is written about one code."""
+
+    number: int
+    definition: str  # the condition that sets it
+    meaning: str  # the same as a short clause for people; the definition where none is given
+    advice: str = ""  # what would help at the next recording; empty = nothing
+    retry: str = ""  # which options of a job to try; empty = none
+
+
+_pending: list[CodeEntry] = []  # entries of the table whose class body is being executed
+
+
+def code(number: int, definition: str, *, meaning: str = "", advice: str = "", retry: str = "") -> int:
+    """An entry of the code table in whose class body it stands: its number, see :class:`CodeEntry`."""
+    _pending.append(CodeEntry(number, definition, meaning or definition, advice, retry))
+    return number
+
+
+class CodeTable:
+    """Base of the code tables: class attributes are plain integers, ``entries`` is what is written about them."""
+
+    entries: ClassVar[dict[int, CodeEntry]]
+
+    def __init_subclass__(cls) -> None:
+        cls.entries = {entry.number: entry for entry in _pending}
+        _pending.clear()
+
+
+class Flag(CodeTable):
     """Bits of ``Samples.flag``: several may hold at once. The first five are the paper's."""
 
-    NO_DEPTH: Final = 1  #: the sensor gave no return at this pixel
-    LOW_CONF: Final = 2  #: the sensor's own confidence is below the accepted level
-    SPECULAR: Final = 4  #: a bright, colourless highlight: returns there are unreliable
-    SATURATED: Final = 8  #: the image is clipped at white
-    UNDEREXPOSED: Final = 16  #: the image is too dark to see texture
-    DEPTH_EDGE: Final = 32  #: returns around the pixel differ: foreground and background meet
-    BEYOND_NEAR: Final = 64  #: a return beyond the user's near limit; kept in ``depth``, not in ``xyz``
-    BORDER: Final = 128  #: too close to the image border for a full neighbourhood
+    NO_DEPTH: Final = code(1, "the sensor gave no return at this pixel")
+    LOW_CONF: Final = code(2, "the sensor's own confidence is below the accepted level")
+    SPECULAR: Final = code(4, "a bright, colourless highlight: returns there are unreliable")
+    SATURATED: Final = code(8, "the image is clipped at white")
+    UNDEREXPOSED: Final = code(16, "the image is too dark to see texture")
+    DEPTH_EDGE: Final = code(32, "returns around the pixel differ: foreground and background meet")
+    BEYOND_NEAR: Final = code(64, "a return beyond the user's near limit; kept in ``depth``, not in ``xyz``")
+    BORDER: Final = code(128, "too close to the image border for a full neighbourhood")
 
     #: Any of these bits makes a return unusable (``xyz`` is NaN).
     UNUSABLE: Final = NO_DEPTH | LOW_CONF | BEYOND_NEAR
 
 
-class Hole:
+class Hole(CodeTable):
     """Classes of ``Samples.hole``: why a sample has no usable return, and so what could be done about it."""
 
-    NONE: Final = 0  #: not a hole: the sensor answered
-    TRACKABLE_NO_LIDAR: Final = 1  #: normal brightness, enough texture, no usable depth: the key class
-    LOW_TEXTURE: Final = 2  #: normal brightness, but nothing to track
-    TOO_BRIGHT: Final = 3  #: clipped at white
-    TOO_DARK: Final = 4  #: underexposed
-    HIGHLIGHT: Final = 5  #: a specular highlight, which moves with the viewer
-    AT_BORDER: Final = 6  #: at the image border, where no track can start
+    NONE: Final = code(0, "not a hole: the sensor answered")
+    TRACKABLE_NO_LIDAR: Final = code(1, "normal brightness, enough texture, no usable depth: the key class")
+    LOW_TEXTURE: Final = code(2, "normal brightness, but nothing to track")
+    TOO_BRIGHT: Final = code(3, "clipped at white")
+    TOO_DARK: Final = code(4, "underexposed")
+    HIGHLIGHT: Final = code(5, "a specular highlight, which moves with the viewer")
+    AT_BORDER: Final = code(6, "at the image border, where no track can start")
 
 
-class Route:
+class Route(CodeTable):
     """A hint to the user of the map: what could fill this hole (one per :class:`Hole` class)."""
 
-    NOTHING: Final = 0
-    TRIANGULATE: Final = 1
-    CHANGE_EXPOSURE: Final = 2
-    GET_CLOSER: Final = 3
-    TURN_HEAD: Final = 4
+    NOTHING: Final = code(0, "")
+    TRIANGULATE: Final = code(1, "")
+    CHANGE_EXPOSURE: Final = code(2, "")
+    GET_CLOSER: Final = code(3, "")
+    TURN_HEAD: Final = code(4, "")
 
 
-class Gate:
+class Gate(CodeTable):
     """Codes of ``Estimate.gate``, in the order asked; the first reason for silence wins."""
 
-    ANSWER: Final = 0  #: answered
-    NO_TRACK: Final = 1  #: not tracked into the other view, or lost on the way back
-    NO_TEXTURE: Final = 2  #: trackability below the limit
-    NO_POSE: Final = 3  #: no metric relative pose for this pair
-    NO_BASELINE: Final = 4  #: the cameras did not translate (significantly)
-    BEHIND: Final = 5  #: the rays meet behind a camera
-    PARALLAX: Final = 6  #: the rays are too close to parallel
-    RESIDUAL: Final = 7  #: the rays miss each other by too many pixels
-    INCONSISTENT: Final = 8  #: another view, or the patch itself, contradicts the answer
-    UNCERTAIN: Final = 9  #: sigma / depth above the limit
-    LOW_SCORE: Final = 10  #: score below the threshold
-    CONTRADICTED: Final = 11  #: what lies far contradicts the near returns: these move on their own
-    POSE_REFUTED: Final = 12  #: a pose was given, and the near returns contradict it
+    ANSWER: Final = code(0, "answered")
+    NO_TRACK: Final = code(
+        1,
+        "not tracked into the other view, or lost on the way back",
+        meaning="what has no return could not be found in other views",
+        advice="texture and a view from the side would help",
+        retry="the two views lie too far apart or show nothing in common: try a smaller pairs.gap, or pairs=auto",
+    )
+    NO_TEXTURE: Final = code(
+        2,
+        "trackability below the limit",
+        meaning="blank surfaces, on which nothing can be followed",
+        retry="try frames with more detail in sight",
+    )
+    NO_POSE: Final = code(
+        3,
+        "no metric relative pose for this pair",
+        meaning="too few returns could be tracked",
+        advice="slower motion, more light and texture would help",
+        retry="try a larger holdout.cutoff, or holdout=none",
+    )
+    NO_BASELINE: Final = code(
+        4,
+        "the cameras did not translate (significantly)",
+        meaning="the camera only turned or stood still",
+        advice="moving it sideways by a tenth of the distance would help",
+        retry="try a larger pairs.gap, or pairs=auto",
+    )
+    BEHIND: Final = code(5, "the rays meet behind a camera", meaning="what would lie behind a camera")
+    PARALLAX: Final = code(
+        6, "the rays are too close to parallel", meaning="seen from nearly the same direction in all views"
+    )
+    RESIDUAL: Final = code(
+        7, "the rays miss each other by too many pixels", meaning="the views do not meet in one point"
+    )
+    INCONSISTENT: Final = code(
+        8, "another view, or the patch itself, contradicts the answer", meaning="the views do not agree"
+    )
+    UNCERTAIN: Final = code(
+        9,
+        "sigma / depth above the limit",
+        meaning="the views lie too close together for what is far",
+        advice="moving sideways would help",
+    )
+    LOW_SCORE: Final = code(10, "score below the threshold", meaning="answers that are not sure enough")
+    CONTRADICTED: Final = code(
+        11,
+        "what lies far contradicts the near returns: these move on their own",
+        meaning="what the sensor sees moves, or contradicts the pictures",
+        advice="a still scene would help",
+        retry="try frames in which nothing else moves",
+    )
+    POSE_REFUTED: Final = code(
+        12,
+        "a pose was given, and the near returns contradict it",
+        meaning="the poses given contradict the near returns",
+        advice="see their axes, direction and unit",
+    )
 
 
-class PoseCode:
+class PoseCode(CodeTable):
     """Codes of ``PoseFit.code``."""
 
-    OK: Final = 0
-    TOO_FEW: Final = 1  #: fewer usable correspondences or inliers than the minimum
-    DEGENERATE: Final = 2  #: the points do not determine a pose (collinear, coincident)
-    NO_BASELINE: Final = 3  #: the camera did not translate significantly, or stood still
-    KEPT_PNP: Final = 4  #: refinement did not improve the fit; the PnP pose was kept
-    REFUTED: Final = 5  #: a pose was given, and the near returns contradict it
+    OK: Final = code(0, "")
+    TOO_FEW: Final = code(1, "fewer usable correspondences or inliers than the minimum")
+    DEGENERATE: Final = code(2, "the points do not determine a pose (collinear, coincident)")
+    NO_BASELINE: Final = code(3, "the camera did not translate significantly, or stood still")
+    KEPT_PNP: Final = code(4, "refinement did not improve the fit; the PnP pose was kept")
+    REFUTED: Final = code(5, "a pose was given, and the near returns contradict it")
 
 
-class Source:
+class Source(CodeTable):
     """Where a value of a merged map comes from."""
 
-    NONE: Final = 0
-    SENSOR: Final = 1
-    RECOVERED: Final = 2  #: a tracked sample, triangulated
-    SWEPT: Final = 3  #: a pixel of a dense map, found on its epipolar line
-    ALIGNED: Final = 4  #: a pixel of somebody else's map, tied to returns and answers
+    NONE: Final = code(0, "")
+    SENSOR: Final = code(1, "")
+    RECOVERED: Final = code(2, "a tracked sample, triangulated")
+    SWEPT: Final = code(3, "a pixel of a dense map, found on its epipolar line")
+    ALIGNED: Final = code(4, "a pixel of somebody else's map, tied to returns and answers")
 
 
-class State:
+class State(CodeTable):
     """What is said of a pixel of a judged depth map."""
 
-    CANNOT_KNOW: Final = 0  #: nothing that was seen could tell: no baseline, no texture, hidden, or no depth
-    CONSISTENT: Final = 1  #: what would have told an error of a fifth speaks for it
-    WRONG: Final = 2  #: something speaks against it, and nothing for it
+    CANNOT_KNOW: Final = code(0, "nothing that was seen could tell: no baseline, no texture, hidden, or no depth")
+    CONSISTENT: Final = code(1, "what would have told an error of a fifth speaks for it")
+    WRONG: Final = code(2, "something speaks against it, and nothing for it")
+
+
+def describe(table: type[CodeTable], name: str) -> CodeEntry | None:
+    """The entry of a code by its name in any case; None where the table has no such code."""
+    numbers = {known: number for number, known in names(table).items()}
+    return table.entries.get(numbers.get(name.upper(), -1))
 
 
 def names(table: type) -> dict[int, str]:
@@ -108,14 +194,12 @@ def words(name: str) -> str:
     return name.lower().replace("_no_lidar", ", no LiDAR").replace("_", " ")
 
 
-#: What to try for each class of hole.
-ROUTE_OF_HOLE: Final[dict[int, int]] = {
-    Hole.NONE: Route.NOTHING,
+#: What to try for each class of hole; nothing for one that is not listed.
+ROUTE_OF_HOLE: Final[dict[int, int]] = dict.fromkeys(names(Hole), Route.NOTHING) | {
     Hole.TRACKABLE_NO_LIDAR: Route.TRIANGULATE,
     Hole.LOW_TEXTURE: Route.GET_CLOSER,
     Hole.TOO_BRIGHT: Route.CHANGE_EXPOSURE,
     Hole.TOO_DARK: Route.CHANGE_EXPOSURE,
-    Hole.HIGHLIGHT: Route.NOTHING,
     Hole.AT_BORDER: Route.TURN_HEAD,
 }
 

@@ -11,6 +11,7 @@ import ast
 import base64
 import contextlib
 import importlib
+import inspect
 import io
 import json
 import re
@@ -30,8 +31,10 @@ import licences as terms  # noqa: E402
 from docstrings import markdown as as_markdown  # noqa: E402
 
 import dhtorch  # noqa: E402
+from dhtorch import codes as code_tables  # noqa: E402
 from dhtorch.cli import run  # noqa: E402
-from dhtorch.codes import Gate, Hole, Source, names, words  # noqa: E402
+from dhtorch.codes import CodeTable, Gate, Hole, Source, names, words  # noqa: E402
+from dhtorch.transforms import schema  # noqa: E402
 from dhtorch.viz.plots import colours as palette  # noqa: E402
 
 #: Words of the command with a help text of their own.
@@ -257,16 +260,31 @@ def choices(group: str) -> str:
 
 
 def codes() -> str:
-    """The code tables: number, name, meaning."""
-    source, shown = (PACKAGE / "codes.py").read_text(encoding="utf-8"), []
-    for node in _tree(PACKAGE / "codes.py").body:
-        if not isinstance(node, ast.ClassDef):
+    """The code tables: number, name, definition, and what would help where that is known of some code."""
+    shown = []
+    for table in (x for x in vars(code_tables).values() if isinstance(x, type) and issubclass(x, CodeTable)):
+        if table is CodeTable:
             continue
-        body = "\n".join(source.splitlines()[node.lineno : node.end_lineno])
-        rows = re.findall(r"^ +([A-Z_]+): Final = (\d+)(?: +#: (.*))?$", body, re.M)
-        table = "\n".join(f"| {number} | `{name}` | {words} |" for name, number, words in rows)
-        shown.append(f"### {node.name}\n\n{_first(ast.get_docstring(node))}\n\n| | | |\n| --: | :-- | :-- |\n{table}")
+        helped = any(entry.advice for entry in table.entries.values())
+        rows = ["| | | | |", "| --: | :-- | :-- | :-- |"] if helped else ["| | | |", "| --: | :-- | :-- |"]
+        for number, name in names(table).items():
+            entry = table.entries[number]
+            more = f" {entry.advice} |" if helped else ""
+            rows.append(f"| {number} | `{name}` | {entry.definition} |{more}")
+        body = "\n".join(rows)
+        shown.append(f"### {table.__name__}\n\n{_first(inspect.getdoc(table))}\n\n{body}")
     return "\n\n".join(shown)
+
+
+def sample_columns() -> str:
+    """The columns that ExtendDepth adds to a sample."""
+    rows = ["| key | shape | type | unit | meaning | option |", "| :-- | :-- | :-- | :-- | :-- | :-- |"]
+    for c in schema.COLUMNS:
+        shape = f"({', '.join(map(str, c.shape))}{',' * (len(c.shape) == 1)})"
+        kind = c.dtype if c.codes is None else f"{c.dtype}, `{c.codes.__name__}`"
+        option = f"`{c.option}`" if c.option else ""
+        rows.append(f"| `{c.key}` | {shape} | {kind} | {c.unit} | {c.meaning} | {option} |")
+    return "\n".join(rows)
 
 
 def asked() -> dict[str, dict[str, str]]:
@@ -375,5 +393,6 @@ def licences() -> str:
 
 
 MAKERS: dict[str, Callable[..., str]] = {
-    f.__name__: f for f in (module, reader, choices, codes, experiments, helps, exit_codes, licences, colours)
+    f.__name__: f
+    for f in (module, reader, choices, codes, sample_columns, experiments, helps, exit_codes, licences, colours)
 }

@@ -108,9 +108,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "transforms.maps": [
         ("DenseMaps.swept", "self.sensed(read.reference, method), found", "found, found"),
         ("DenseMaps.swept", '"calibration": self.calibration, ', ""),
-        ("map_to_keys", "torch.where(found.keep, found.depth, 0.0)", "found.depth"),
-        ("map_to_keys", '"gate_map": found.gate', '"gate_map": found.source'),
-        ("map_to_samples", 'if name != "gate_map"', 'if name != "sigma_map"'),
+        ("zero_unanswered", "torch.where(found.keep, values, 0.0)", "values"),
+        ("map_to_samples", "(found.depth, found.sigma)", "(found.depth, found.depth)"),
     ],
     "ops.loader": [
         ("cache", "if own:", "if not own:"),

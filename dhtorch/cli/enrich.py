@@ -17,7 +17,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from dhtorch.cli import enrich_page
-from dhtorch.codes import Gate, Source, names, words
+from dhtorch.codes import words
 from dhtorch.data.io.decode import import_optional
 from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Scene, scenes_of
@@ -172,7 +172,7 @@ def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJo
     format = _resolve_format(settings["format"], first)
     found = scenes, whole, views
     origin = None if _OUTPUT_FORMATS[format] is None else _open_origin(settings, found)
-    wanted = map_columns(pictures=origin is None)
+    wanted = map_columns(pictures=origin is None, n=method.n)
     shared = _build_metadata(settings, whole, wanted)
     rows = MapRowDataset(
         scenes,
@@ -188,7 +188,7 @@ def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJo
         dense=settings["dense"],
         **_pose_options(settings),
     )
-    target = _open_target(settings, found, out, format, shared["key"], origin)
+    target = _open_target(settings, found, out, format, shared["key"], origin, n=method.n)
     notes = []
     if _OUTPUT_FORMATS[format] is not None and settings["fps"] is None and not has_frame_rate(first[0].recording):
         notes.append(f"frame rate unknown: time stamps assume {DEFAULT_FPS:g} frames per second (set fps=N)")
@@ -247,6 +247,8 @@ def _open_target(
     format: str,
     key: str,
     origin: DatasetSource | None,
+    *,
+    n: int,
 ) -> DatasetTarget:
     scenes, whole, views = found
     version, of_episode = _OUTPUT_FORMATS[format], _group_by_episode(whole)
@@ -269,6 +271,7 @@ def _open_target(
         fps=settings["fps"] or fps,
         task=settings["task"],
         key=key,
+        n=n,
         cut=settings["frames"] is not None,
     )
 
@@ -336,8 +339,6 @@ def _build_metadata(
             "columns": {k: c._asdict() for k, c in wanted.items()},
             "codes": {
                 **columns.code_tables(),
-                "source": names(Source),
-                "gate": names(Gate),
                 "silent": NO_ANSWER_REASONS,
             },
         }

@@ -26,7 +26,7 @@ from dhtorch.pipeline.method import Method
 from dhtorch.runtime import file_lock, storage
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import format_count
-from dhtorch.transforms import TOKEN_CHANNELS, DenseMaps, maps, token_grid
+from dhtorch.transforms import TOKEN_CHANNELS, DenseMaps, schema, token_grid
 from dhtorch.transforms.extend_depth import ON_ERROR_CHOICES
 from dhtorch.transforms.tokens import FIT_MODES
 
@@ -153,7 +153,8 @@ def _make_rows(
 def _map_hw(scenes: Sequence[Scene], options: ExtractOptions) -> tuple[int, int] | None:
     """Size of the maps, where there is a column of one: all pictures must then have one shape."""
     asked = DenseMaps.asked(options.dense, "extract.dense")
-    named = options.columns is None or not {*maps.MAP_NUMBER_KEYS, *maps.MAP_CODE_KEYS}.isdisjoint(options.columns)
+    dense = {spec.key for spec in schema.COLUMNS if spec.option == "dense"}
+    named = options.columns is None or not dense.isdisjoint(options.columns)
     return common_map_hw(scenes, asked) if asked is not None and named else None
 
 

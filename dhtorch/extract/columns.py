@@ -11,30 +11,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source, names
+from dhtorch.codes import names
 from dhtorch.data.io.decode import import_optional
-from dhtorch.transforms import TOKEN_CHANNELS, SampleProblem, maps
+from dhtorch.transforms import SampleProblem, schema
 
 Row = dict[str, Any]  # column → number, text or array
 
 #: Where a row belongs: these columns come first, and every shard has them.
 KEY_COLUMNS = ("episode_index", "frame_index", "timestamp", "recording")
-
-#: Columns with codes → their table.
-_COLUMN_CODES: dict[str, type] = {
-    "source": Source,
-    "flag": Flag,
-    "hole": Hole,
-    "gate": Gate,
-    "pose_code": PoseCode,
-    "problem": SampleProblem,
-    "source_map": Source,
-    "gate_map": Gate,
-}
-
-#: Columns of floats that keep their meaning with eleven bits; pixels and poses do not.
-_HALF_COLUMNS = ("xyz", "depth", "sigma", "score", "tokens", *maps.MAP_NUMBER_KEYS)
-
 
 #: Kinds that are no numbers → bytes of one, roughly.
 _GUESSED_BYTES = {"str": 1, "bytes": 1 << 18}
@@ -58,47 +42,21 @@ def feature_columns(
     n: int, patches: int, *, half: bool = False, map_hw: tuple[int, int] | None = None
 ) -> dict[str, Column]:
     """All columns of rows with ``n`` samples, ``patches`` tokens and maps of that size (None = no maps), in order."""
-    f, byte, flag = "float32", "uint8", "bool"
-    found = {
+    sizes = {"N": n, "P": patches, **({} if map_hw is None else dict(zip("HW", map_hw, strict=True)))}
+    added = schema.select_columns(() if map_hw is None else ("dense",))
+    return {
         "episode_index": Column("int64", (), "1", "number of the episode in its data set, else of the recording"),
         "frame_index": Column("int64", (), "1", "number of the frame in its capture"),
         "timestamp": Column("float64", (), "s", "time stamp of the frame as its data set has it; NaN = none"),
         "recording": Column("str", (), "1", "name of the recording"),
-        "uv": Column(f, (n, 2), "px", "where the samples are: x right, y down, whole numbers are pixel centres"),
-        "xyz": Column(f, (n, 3), "m", "points in the camera of the frame: x right, y down, z forward"),
-        "depth": Column(f, (n,), "m", "z of the points, by sensor or triangulation; 0 = none"),
-        "sigma": Column(f, (n,), "m", "standard deviation of depth; 0 = none"),
-        "score": Column(f, (n,), "1", "confidence of the sensor, or score of the recovered depth, in [0, 1]"),
-        "valid": Column(flag, (n,), "1", "there is a depth"),
-        "source": Column(byte, (n,), "code", "where the depth comes from"),
-        "flag": Column(byte, (n,), "bits", "what is wrong with the sensor's return"),
-        "hole": Column(byte, (n,), "code", "why the sensor gave no usable return"),
-        "gate": Column(byte, (n,), "code", "why no depth was recovered"),
-        "T_1_from_0": Column(f, (4, 4), "1, m", "pose of the other view: its points from those of the frame; 0 = none"),
-        "pose_cov": Column(f, (6, 6), "rad², rad m, m²", "covariance of that pose, rotation first, left perturbation"),
-        "pose_ok": Column(flag, (), "1", "there is a pose"),
-        "pose_code": Column(byte, (), "code", "how the search for the pose ended"),
-        "tokens": Column(
-            f, (patches, len(TOKEN_CHANNELS)), "1/m, 1/m, share", "depth tokens of the patches, row by row"
-        ),
-        "tokens_valid": Column(flag, (patches,), "1", "a sample of the patch has a depth"),
-        **({} if map_hw is None else _map_columns(map_hw)),
-        "problem": Column(byte, (), "code", "what was wrong with the frame"),
+        **{spec.key: stored_column(spec, sizes, half=half) for spec in added},
     }
-    half_names = _HALF_COLUMNS if half else ()
-    return {k: c._replace(kind="float16") if k in half_names else c for k, c in found.items()}
 
 
-def _map_columns(hw: tuple[int, int]) -> dict[str, Column]:
-    """Columns of every pixel, over the field of the picture (:func:`dhtorch.pipeline.dense.map_pixel_centres`)."""
-    f, byte, none = "float32", "uint8", "0 = none, where a DepthMap has NaN"
-    return {
-        "depth_map": Column(f, hw, "m", f"z of every pixel, by sensor or sweep; {none}"),
-        "sigma_map": Column(f, hw, "m", f"standard deviation of depth_map; {none}"),
-        "score_map": Column(f, hw, "1", "confidence of the sensor, or score of the swept depth, in [0, 1]"),
-        "source_map": Column(byte, hw, "code", "where the depth of a pixel comes from"),
-        "gate_map": Column(byte, hw, "code", "why a pixel has no depth"),
-    }
+def stored_column(spec: schema.ColumnSpec, sizes: Mapping[str, int], *, half: bool = False) -> Column:
+    """A column of the transform as files hold it: codes as bytes, with ``half`` what allows it as float16."""
+    kind = "uint8" if spec.codes is not None else "float16" if half and spec.half else spec.dtype
+    return Column(kind, schema.resolve_shape(spec.shape, sizes), spec.unit, spec.meaning)
 
 
 def select_columns(found: Mapping[str, Column], wanted: Sequence[str] | None) -> dict[str, Column]:
@@ -109,7 +67,7 @@ def select_columns(found: Mapping[str, Column], wanted: Sequence[str] | None) ->
     """
     for name in wanted or ():
         if name not in found:
-            raise ValueError(f"columns: found {name!r}, expected some of {', '.join(found)}")
+            raise ValueError(f"extract.columns: found {name!r}, expected some of {', '.join(found)}")
     keep = set(found if wanted is None else wanted) | {*KEY_COLUMNS, "problem"}
     return {name: column for name, column in found.items() if name in keep}
 
@@ -124,7 +82,7 @@ def blank_features(wanted: Mapping[str, Column]) -> Row:
 
 def code_tables() -> dict[str, dict[int, str]]:
     """Column → what its codes mean, for the metadata of a file."""
-    return {column: names(table) for column, table in _COLUMN_CODES.items()}
+    return {spec.key: names(spec.codes) for spec in schema.COLUMNS if spec.codes is not None}
 
 
 def arrow_schema(wanted: Mapping[str, Column], metadata: Mapping[str, str]) -> Any:

@@ -16,19 +16,23 @@ from dhtorch.data.scene import Scene
 from dhtorch.export import encode_png
 from dhtorch.export.lerobot import FeatureMoments
 from dhtorch.export.tiff import encode_float_tiff
-from dhtorch.extract.columns import KEY_COLUMNS, Column, Row
+from dhtorch.extract.columns import KEY_COLUMNS, Column, Row, stored_column
 from dhtorch.extract.dataset import OpenRecording, RowDataset, try_read_frame
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.pipeline import dense
 from dhtorch.records import Frame
-from dhtorch.transforms import SampleError
+from dhtorch.transforms import SampleError, schema
 
-#: Steps of sigma in one of depth.
-MAP_SIGMA_STEPS: Final = 8
+#: Map -> its steps in one of depth, where they are finer.
+MAP_STEPS: Final = {"sigma": 8}
 
-#: Maps of a frame, and what each is: files.
-_MAP_FILES = {"depth": "depth as TIFF, m", "sigma": "its standard deviation as TIFF, m", "source": "codes as PNG"}
+#: File type of a map -> numpy's type of its pixels.
+_MAP_DTYPES: Final = {"tiff": np.float32, "png": np.uint8}
+
+#: Columns of the transform that an enriched data set holds: a file for each picture, by name of the map, and numbers.
+MAP_FILES: Final = {c.key.removesuffix("_map"): c for c in schema.COLUMNS if c.enrich in ("tiff", "png")}
+NUMBER_COLUMNS: Final = {c.key: c for c in schema.COLUMNS if c.enrich == "numbers"}
 
 #: Columns of the counts: pixels by source, and silent ones by reason.
 _N_SOURCES, NO_OTHER_VIEW = max(names(Source)) + 1, max(names(Gate)) + 1
@@ -91,9 +95,10 @@ def camera_feature(name: str) -> str:
     return "observation.images." + name.removeprefix("observation/").removeprefix("images/").replace("/", "_")
 
 
-def map_columns(pictures: bool) -> dict[str, Column]:
-    """What is kept of a frame until its episode is whole."""
+def map_columns(pictures: bool, n: int = 0) -> dict[str, Column]:
+    """What is kept of a frame, of ``n`` samples, until its episode is whole."""
     f, whole = "float64", "int64"
+    files = {name: f"{c.meaning}, {c.unit}, as {str(c.enrich).upper()}" for name, c in MAP_FILES.items()}
     place = {
         "episode_index": Column(whole, (), "1", "number of the episode"),
         "frame_index": Column(whole, (), "1", "number of the frame in its capture"),
@@ -103,7 +108,8 @@ def map_columns(pictures: bool) -> dict[str, Column]:
     assert tuple(place) == KEY_COLUMNS
     return {
         **place,
-        **{name: Column("bytes", (), "file", about) for name, about in _MAP_FILES.items()},
+        **{name: Column("bytes", (), "file", about) for name, about in files.items()},
+        **{key: number_column(c, n) for key, c in NUMBER_COLUMNS.items()},
         **({"picture": Column("bytes", (), "file", "the picture as PNG")} if pictures else {}),
         "K": Column(f, (9,), "px", "of the picture"),
         "pose": Column(f, (16,), "1, m", "T_world_from_cam by rows; NaN = none"),
@@ -113,6 +119,11 @@ def map_columns(pictures: bool) -> dict[str, Column]:
         "moments": Column(f, _MOMENTS_SHAPE, "m, 1", "of depth, sigma, red, green, blue"),
         "problem": Column("uint8", (), "code", "what was wrong with the frame"),
     }
+
+
+def number_column(spec: schema.ColumnSpec, n: int) -> Column:
+    """A column of numbers as shards and data sets hold it; its shape is fixed by ``n`` samples, not by the picture."""
+    return stored_column(spec, {"N": n})
 
 
 class MapRowDataset(RowDataset):
@@ -145,23 +156,24 @@ class MapRowDataset(RowDataset):
             )
         others = opened.others(i)
         added = opened.answer(reference, others)
-        depth, sigma, source, gate = _extract_maps(added, view)
+        maps = _extract_maps(added, view)
+        source, gate = maps["source"], maps.pop("gate")
         why = gate if any(other is not None for other in others) else np.full_like(gate, NO_OTHER_VIEW)
-        depth = _quantise(depth, self.step)
-        sigma = _quantise(sigma, self.step / MAP_SIGMA_STEPS)
+        for name in maps:
+            if MAP_FILES[name].enrich == "tiff":
+                maps[name] = _quantise(maps[name], self.step / MAP_STEPS.get(name, 1))
         image = to_rgb_uint8(reference)
         poses = recording.poses
         pose = np.full(16, np.nan) if poses is None else se3.to_matrix(poses[i : i + 1])[0].double().flatten().numpy()
         found = {
-            "depth": encode_float_tiff(depth, deflate=True),
-            "sigma": encode_float_tiff(sigma, deflate=True),
-            "source": encode_png(source),
+            **{name: _encode_map(field, name) for name, field in maps.items()},
+            **{key: added[key].numpy().astype(self.wanted[key].kind) for key in NUMBER_COLUMNS},
             "K": cam.to_matrix(reference.camera)[0].double().flatten().numpy(),
             "pose": pose,
             "pixels": np.bincount(source.ravel(), minlength=_N_SOURCES),
             "silent": np.bincount(why[source == Source.NONE], minlength=len(NO_ANSWER_REASONS)),
             "refuted": _refuted_code(added),
-            "moments": _compute_moments(depth, sigma, image),
+            "moments": _compute_moments(maps["depth"], maps["sigma"], image),
             "problem": added["problem"].numpy(),
         }
         return found if "picture" not in self.wanted else {**found, "picture": encode_png(image)}
@@ -177,25 +189,27 @@ def to_rgb_uint8(frame: Frame) -> np.ndarray:
 
 def blank_maps(view: DatasetCamera) -> dict[str, bytes]:
     """The maps of a frame that could not be read: no depth anywhere."""
-    nothing = encode_float_tiff(np.zeros(view.map_hw, np.float32), deflate=True)
-    return {"depth": nothing, "sigma": nothing, "source": encode_png(np.zeros(view.map_hw, np.uint8))}
+    return {name: _encode_map(np.zeros(view.map_hw, _MAP_DTYPES[str(c.enrich)]), name) for name, c in MAP_FILES.items()}
 
 
-def _extract_maps(added: Mapping[str, Tensor], view: DatasetCamera) -> tuple[np.ndarray, ...]:
-    """Depth, sigma, source and gate (h, w); of samples alone where they stand, elsewhere silence without a reason."""
+def _encode_map(field: np.ndarray, name: str) -> bytes:
+    return encode_float_tiff(field, deflate=True) if MAP_FILES[name].enrich == "tiff" else encode_png(field)
+
+
+def _extract_maps(added: Mapping[str, Tensor], view: DatasetCamera) -> dict[str, np.ndarray]:
+    """The maps that become files, and the gates (h, w); of samples alone where they stand, elsewhere zeros."""
+    kinds: dict[str, Any] = {name: _MAP_DTYPES[str(c.enrich)] for name, c in MAP_FILES.items()} | {"gate": np.int64}
     if "depth_map" in added:
-        depth, sigma, source, gate = (added[f"{k}_map"].numpy() for k in ("depth", "sigma", "source", "gate"))
-        return depth, sigma, source.astype(np.uint8), gate
+        return {name: added[f"{name}_map"].numpy().astype(kind) for name, kind in kinds.items()}
     h, w = view.map_hw
     scale = np.array([w / view.hw[1], h / view.hw[0]])
     at = np.rint((added["uv"].double().numpy() + 0.5) * scale - 0.5).astype(np.int64).clip(0, (w - 1, h - 1))
-    fields: dict[str, Any] = {"depth": np.float32, "sigma": np.float32, "source": np.uint8, "gate": np.int64}
-    found = []
-    for name, kind in fields.items():
-        field = np.zeros((h, w), kind)
-        field[at[:, 1], at[:, 0]] = added[name].numpy()
-        found.append(field)
-    return tuple(found)
+    found = {}
+    for name, kind in kinds.items():
+        found[name] = np.zeros((h, w), kind)
+        if name in added:
+            found[name][at[:, 1], at[:, 0]] = added[name].numpy()
+    return found
 
 
 def _refuted_code(added: Mapping[str, Tensor]) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 
 from dhtorch.data.codecs.tiff import decode_tiff
 from dhtorch.export import encode_png, nerfstudio
-from dhtorch.extract.enriched import DatasetCamera
+from dhtorch.extract.enriched import NUMBER_COLUMNS, DatasetCamera
 from dhtorch.extract.instants import iter_rows
 from dhtorch.extract.targets import MapCounts, Row
 from dhtorch.runtime import storage
@@ -77,4 +77,5 @@ def _write_shot(folder: Path, row: Row, view: DatasetCamera) -> Row:
     for name, content in pictures.items():
         storage.replace_file(folder / name / f"{stem}.png", content)
     K, pose = np.reshape(row["K"], (3, 3)), np.reshape(row["pose"], (4, 4))
-    return nerfstudio.make_nerfstudio_frame(stem, view.hw, K, pose, view.lens)
+    numbers = {f"dhtorch_{key}": np.asarray(row[key]).tolist() for key in NUMBER_COLUMNS}
+    return {**nerfstudio.make_nerfstudio_frame(stem, view.hw, K, pose, view.lens), **numbers}

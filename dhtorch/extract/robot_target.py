@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -9,11 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from dhtorch.codes import Source, names
+from dhtorch.codes import names
 from dhtorch.data.io.decode import import_optional
 from dhtorch.export import lerobot
 from dhtorch.export.lerobot import FeatureMoments, FeatureSpec
-from dhtorch.extract.enriched import MAP_SIGMA_STEPS, DatasetCamera, blank_maps
+from dhtorch.extract.columns import Column
+from dhtorch.extract.enriched import (
+    MAP_FILES,
+    MAP_STEPS,
+    NUMBER_COLUMNS,
+    DatasetCamera,
+    blank_maps,
+    number_column,
+)
 from dhtorch.extract.instants import PeekableRows, iter_groups, iter_instants, iter_rows
 from dhtorch.extract.origin import DatasetSource, LeRobotSource
 from dhtorch.extract.targets import MapCounts, Row
@@ -38,6 +47,7 @@ class LeRobotTarget:
         fps: of a recording.
         task: of a recording.
         key: of the settings and data, which every table notes.
+        n: samples of a frame, where columns of them are in the set.
         cut: some rows of the origin are left out, so that others have another index.
 
     Raises:
@@ -57,12 +67,13 @@ class LeRobotTarget:
         fps: float,
         task: str | None,
         key: str,
+        n: int = 0,
         cut: bool = False,
     ) -> None:
         self.root, self.version, self.views = root, version, views
         self.origin, self.numbers, self.step, self.fps = origin, numbers, step, fps
         self.tasks = origin.tasks if origin is not None else (task or _DEFAULT_TASK,)
-        self.key, self.cut = key, cut
+        self.key, self.n, self.cut = key, n, cut
         self.given: dict[str, FeatureSpec] = {} if origin is None else origin.features
         self.keys = {view.key: self._keys(view) for view in views.values()}
         self.renumbered = cut or list(numbers) != list(range(len(numbers)))
@@ -78,7 +89,11 @@ class LeRobotTarget:
         """What is added for a camera: kind → column."""
         depth = f"{view.key}_depth"
         depth = f"{depth}_enriched" if depth in self.given else depth
-        found = {"depth": depth, "sigma": f"{depth}_sigma", "source": f"{view.key}_dhtorch_source"}
+        found = {
+            name: f"{view.key}_dhtorch_{name}" if c.enrich == "png" else depth if name == "depth" else f"{depth}_{name}"
+            for name, c in MAP_FILES.items()
+        }
+        found |= {key: f"observation.{view.name}.dhtorch_{key}" for key in NUMBER_COLUMNS}
         found["K"] = f"observation.{view.name}.intrinsics"
         if view.posed:
             found["pose"] = f"observation.{view.name}.T_world_from_cam"
@@ -93,11 +108,9 @@ class LeRobotTarget:
         """The features beside those of the source."""
         found: dict[str, FeatureSpec] = {}
         for key, view in self.views.items():
-            codes = {str(code): name.lower() for code, name in names(Source).items()}
             of: dict[str, FeatureSpec] = {
-                "depth": lerobot.depth_feature(view.map_hw, self.step),
-                "sigma": lerobot.depth_feature(view.map_hw, self.step / MAP_SIGMA_STEPS),
-                "source": lerobot.image_feature(view.map_hw, 1, codes=codes),
+                **{name: self._map_feature(name, view) for name in MAP_FILES},
+                **{key: _number_feature(number_column(c, self.n)) for key, c in NUMBER_COLUMNS.items()},
                 "K": lerobot.number_feature("float64", 9),
                 "pose": lerobot.number_feature("float64", 16),
             }
@@ -105,6 +118,13 @@ class LeRobotTarget:
                 found[key] = lerobot.image_feature(view.hw)
             found |= {column: of[kind] for kind, column in self.keys[key].items()}
         return found
+
+    def _map_feature(self, name: str, view: DatasetCamera) -> FeatureSpec:
+        spec = MAP_FILES[name]
+        if spec.enrich == "tiff":
+            return lerobot.depth_feature(view.map_hw, self.step / MAP_STEPS.get(name, 1))
+        table = {} if spec.codes is None else names(spec.codes)
+        return lerobot.image_feature(view.map_hw, 1, codes={str(k): name.lower() for k, name in table.items()})
 
     def features(self, columns: Iterable[str]) -> dict[str, FeatureSpec]:
         """Of all columns of the tables, and the videos."""
@@ -237,9 +257,14 @@ class LeRobotTarget:
         values: list[Any]
         for kind, column in self.keys[key].items():
             if kind in nothing:
-                end = "png" if kind == "source" else "tiff"
+                end = MAP_FILES[kind].enrich
                 files = [row[kind] if row is not None and row["depth"] else nothing[kind] for row in found]
                 values = [{"bytes": file, "path": f"frame-{done + i:06d}.{end}"} for i, file in enumerate(files)]
+            elif kind in NUMBER_COLUMNS:
+                stored = number_column(NUMBER_COLUMNS[kind], self.n)
+                blank = np.zeros(stored.shape, stored.kind)
+                rows = [row[kind] if row is not None and row["depth"] else blank for row in found]
+                values = [_flat_number(row) for row in rows]
             else:
                 n = 9 if kind == "K" else 16
                 values = [row[kind] if row is not None and row["depth"] else [float("nan")] * n for row in found]
@@ -386,6 +411,16 @@ class LeRobotTarget:
         lenses = {view.key: {"dist": list(view.lens)} for view in self.views.values() if view.lens}
         if lenses:
             storage.write_json(self.root / "meta" / "intrinsics.json", lenses)
+
+
+def _number_feature(column: Column) -> FeatureSpec:
+    return lerobot.number_feature(column.kind, math.prod(column.shape))
+
+
+def _flat_number(value: Any) -> Any:
+    """A number, or a list of several, as a table of the format holds it."""
+    flat = np.asarray(value).reshape(-1).tolist()
+    return flat[0] if len(flat) == 1 else flat
 
 
 def _column_types(table: Any) -> dict[str, Any]:

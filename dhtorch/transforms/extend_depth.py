@@ -10,19 +10,19 @@ import torch
 from torch import Tensor
 from torch.utils.data import get_worker_info
 
-from dhtorch.codes import Gate, Source
+from dhtorch.codes import Gate
 from dhtorch.geometry import camera as cam
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.pair import merge
 from dhtorch.pipeline.presets import get_method
 from dhtorch.pipeline.spec import iter_networks
-from dhtorch.records import NO_HINT, DepthMap, Estimate, MergedDepth, PoseFit, Samples, TrackHint
-from dhtorch.transforms import maps, poses
+from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
+from dhtorch.transforms import maps, poses, schema
 from dhtorch.transforms.fast_path import Alone
 from dhtorch.transforms.sample_access import SampleError, check_sample, get_value, to_tensor
 from dhtorch.transforms.sample_spec import SampleSpec, SampleViews
 from dhtorch.transforms.status import ProblemCounts, SampleProblem
-from dhtorch.transforms.tokens import FIT_MODES, TOKEN_CHANNELS, patch_tokens, token_grid
+from dhtorch.transforms.tokens import FIT_MODES, patch_tokens, token_grid
 
 ON_ERROR_CHOICES = ("raise", "skip", "flag")
 
@@ -56,16 +56,12 @@ class ExtendDepth(torch.nn.Module):
             :class:`dhtorch.transforms.SampleSpec`. ``depth_unit`` must be given.
 
     Returns:
-        The sample and, behind the prefix (N = n, P patches, with B in front of a batch): ``uv`` (N, 2) px;
-        ``xyz`` (N, 3) m in the reference view's camera; ``depth``, ``sigma`` (N,) m; ``score`` (N,) in [0, 1];
-        ``valid`` (N,) there is a depth; ``source``, ``flag``, ``hole``, ``gate`` (N,) codes of ``dhtorch.codes``;
-        ``T_1_from_0`` (4, 4) and its ``pose_cov`` (6, 6), ``pose_ok``, ``pose_code``; with ``pose`` also
-        ``pose_convention``, in which of :data:`dhtorch.geometry.pose_conventions.CONVENTIONS` a pose would fit that the
-        near returns refute; ``tokens`` (P, 10) of :data:`dhtorch.transforms.TOKEN_CHANNELS` and ``tokens_valid`` (P,);
-        ``problem``. What is not valid is 0.
+        The sample and, behind the prefix and with B in front of a batch, the columns of
+        :data:`dhtorch.transforms.schema.COLUMNS`: key, shape, unit and meaning of each stand there. What is not valid
+        is 0; tokens have the channels :data:`dhtorch.transforms.TOKEN_CHANNELS`. ``pose_convention`` is there with
+        ``pose``.
 
-        With ``dense`` also ``depth_map``, ``sigma_map`` (h, w) m, ``score_map`` (h, w) in [0, 1], ``source_map`` and
-        ``gate_map`` (h, w) codes, over the field of the picture and of its size unless that is longer than ``size``.
+        With ``dense`` also the maps, over the field of the picture and of its size unless that is longer than ``size``.
         A silent pixel, NaN in a :class:`dhtorch.records.DepthMap`, is 0 here; where there is no second view the map
         is the sensor's. Tokens are then pooled from all pixels of the map, no longer from the samples; every other key
         is what it is without maps.
@@ -161,12 +157,12 @@ class ExtendDepth(torch.nn.Module):
         found, B = seen.found, len(samples)
         pooled = patch_tokens(found, seen.hole, seen.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
         paired = found.depth.new_zeros(B, dtype=torch.bool)
-        added = _sample_keys(
-            found, pooled, xyz=seen.xyz, flag=seen.flag, hole=seen.hole, gate=None, fit=None, paired=paired
-        )
         problem = found.source.new_full((B,), SampleProblem.NO_SECOND_VIEW)
+        nan = torch.full_like(found.depth, torch.nan)  # trackability is not computed here
+        front_end = Samples(found.uv, found.depth, found.sigma, seen.xyz, found.score, seen.flag, nan, seen.hole)
+        results = schema.SampleResults(front_end, found, seen.xyz, None, [], paired, pooled, None, problem)
         self._counted(problem, seen.hw)
-        return {self.prefix + key: x for key, x in {**added, "problem": problem}.items()}
+        return {self.prefix + key: x for key, x in schema.compute_columns(results, self._column_options()).items()}
 
     def report(self) -> dict[str, int]:
         """Number of samples by problem since the transform was made, those of all workers together."""
@@ -189,24 +185,17 @@ class ExtendDepth(torch.nn.Module):
     def _answer(self, read: SampleViews, seed: int | Tensor, flagged: bool) -> dict[str, Tensor]:
         frame, paired, bad = read.reference, read.paired, read.bad
         samples, estimate, fits, dense = self._asked(read, seed)
-        fit = fits[-1] if fits else None
-        found = merge(samples, estimate)
-        pooled = (found, samples.hole) if dense is None else maps.map_to_samples(dense, frame, self.method)
+        merged = merge(samples, estimate)
+        pooled = (merged, samples.hole) if dense is None else maps.map_to_samples(dense, frame, self.method)
         tokens = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
-        xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, found.uv, found.depth)
-        xyz = torch.where((found.source != Source.NONE)[..., None], xyz, 0.0)
-        gate = None if estimate is None else estimate.gate
-        added = _sample_keys(
-            found, tokens, xyz=xyz, flag=samples.flag, hole=samples.hole, gate=gate, fit=fit, paired=paired
-        )
-        added |= (
-            {} if self.views.pose is None else poses.refuted_pose_keys(fits, paired, poses.pose_label(self.views.pose))
-        )
-        added |= {} if dense is None else maps.map_to_keys(dense)
-        if flagged:
-            added = {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), 0) for key, x in added.items()}
+        xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, merged.uv, merged.depth)
         problem = torch.tensor(_problem_codes(read, flagged), dtype=torch.int32, device=xyz.device)
-        return {**added, "problem": problem}
+        found = schema.SampleResults(samples, merged, xyz, estimate, fits, paired, tokens, dense, problem)
+        added = schema.compute_columns(found, self._column_options())
+        if self.views.pose is not None:
+            label = poses.pose_label(self.views.pose)
+            poses.warn_refuted_poses(fits, paired, added["pose_convention"], label)
+        return schema.fill_unreadable(added, bad) if flagged else added
 
     def _asked(
         self, read: SampleViews, seed: int | Tensor
@@ -242,22 +231,16 @@ class ExtendDepth(torch.nn.Module):
 
     def _blank(self, hw: tuple[int, int]) -> dict[str, Tensor]:
         """What is added to a sample that cannot be read: zeros of the usual shapes."""
-        rows, columns = token_grid(hw, patch=self.patch, tokens_hw=self.tokens_hw)
-        n, p = self.method.n, rows * columns
-        sizes = {"uv": (n, 2), "xyz": (n, 3), "depth": (n,), "sigma": (n,), "score": (n,), "T_1_from_0": (4, 4)}
-        sizes |= {"pose_cov": (6, 6), "tokens": (p, len(TOKEN_CHANNELS))}
-        out = {key: torch.zeros(1, *size) for key, size in sizes.items()}
-        for key, size in {"valid": (n,), "pose_ok": (), "tokens_valid": (p,)}.items():
-            out[key] = torch.zeros(1, *size, dtype=torch.bool)
-        for key, size in {"source": (n,), "flag": (n,), "hole": (n,), "gate": (n,), "pose_code": ()}.items():
-            out[key] = torch.zeros(1, *size, dtype=torch.int32)
-        if self.views.pose is not None:
-            out["pose_convention"] = torch.zeros(1, dtype=torch.int32)
+        rows, across = token_grid(hw, patch=self.patch, tokens_hw=self.tokens_hw)
+        sizes = {"N": self.method.n, "P": rows * across}
         if self.maps is not None:
-            size = self.maps.hw(hw)
-            out |= {key: torch.zeros(1, *size) for key in maps.MAP_NUMBER_KEYS}
-            out |= {key: torch.zeros(1, *size, dtype=torch.int32) for key in maps.MAP_CODE_KEYS}
-        return {**out, "problem": torch.full((1,), SampleProblem.UNREADABLE, dtype=torch.int32)}
+            sizes |= dict(zip("HW", self.maps.hw(hw), strict=True))
+        return schema.blank_columns(sizes, self._column_options())
+
+    def _column_options(self) -> list[str]:
+        """The options that bring columns of their own, see :mod:`dhtorch.transforms.schema`."""
+        given = {"pose": self.views.pose is not None, "dense": self.maps is not None}
+        return [option for option, stated in given.items() if stated]
 
     def _counted(self, problem: Tensor, hw: tuple[int, int]) -> None:
         self.tally.add(problem)
@@ -282,47 +265,3 @@ def _problem_codes(read: SampleViews, flagged: bool) -> list[int]:
         return SampleProblem.NONE if paired else SampleProblem.NO_SECOND_VIEW
 
     return list(map(code, bad, read.sensed.tolist(), read.paired.tolist()))
-
-
-def _sample_keys(
-    found: MergedDepth,
-    tokens: tuple[Tensor, Tensor],
-    *,
-    xyz: Tensor,
-    flag: Tensor,
-    hole: Tensor,
-    gate: Tensor | None,
-    fit: PoseFit | None,
-    paired: Tensor,
-) -> dict[str, Tensor]:
-    """Keys of what was found; without an estimate nothing was tracked."""
-    return {
-        "uv": found.uv,
-        "xyz": xyz,
-        "depth": found.depth,
-        "sigma": found.sigma,
-        "score": found.score,
-        "valid": found.source != Source.NONE,
-        "source": found.source,
-        "flag": flag,
-        "hole": hole,
-        "gate": torch.full_like(hole, Gate.NO_TRACK) if gate is None else gate,
-        **_pose_keys(fit, paired, found.depth),
-        "tokens": tokens[0],
-        "tokens_valid": tokens[1],
-    }
-
-
-def _pose_keys(fit: PoseFit | None, paired: Tensor, like: Tensor) -> dict[str, Tensor]:
-    B = paired.shape[0]
-    if fit is None:
-        code = torch.zeros(B, dtype=torch.int32, device=like.device)
-        blank = {"T_1_from_0": like.new_zeros(B, 4, 4), "pose_cov": like.new_zeros(B, 6, 6)}
-        return {**blank, "pose_ok": torch.zeros_like(paired), "pose_code": code}
-    ok = fit.ok & paired
-    last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=like.dtype, device=like.device).expand(B, 1, 4)
-    top = torch.cat((fit.T_1_from_0.R, fit.T_1_from_0.t[..., None]), -1)
-    T = torch.where(ok[:, None, None], torch.cat((top, last), 1), 0.0)
-    cov = torch.where(ok[:, None, None], fit.cov, 0.0)
-    code = torch.where(paired, fit.code, torch.zeros_like(fit.code))
-    return {"T_1_from_0": T, "pose_cov": cov, "pose_ok": ok, "pose_code": code}

@@ -17,9 +17,6 @@ from dhtorch.pipeline.method import Method
 from dhtorch.records import DepthMap, Frame, MergedDepth
 from dhtorch.transforms.sample_spec import SampleViews
 
-#: Keys of a map: numbers, and codes.
-MAP_NUMBER_KEYS, MAP_CODE_KEYS = ("depth_map", "sigma_map", "score_map"), ("source_map", "gate_map")
-
 
 @dataclass(frozen=True, eq=False)
 class DenseMaps:
@@ -59,15 +56,9 @@ class DenseMaps:
         return dense.sensor_depth_map(reference, method=method, size=self.options["size"])
 
 
-def map_to_keys(found: DepthMap) -> dict[str, Tensor]:
-    """What is added to a sample: the fields of its map, 0 where it is silent. Gradient: to depth and sigma."""
-    return {
-        "depth_map": torch.where(found.keep, found.depth, 0.0),
-        "sigma_map": torch.where(found.keep, found.sigma, 0.0),
-        "score_map": found.score,
-        "source_map": found.source,
-        "gate_map": found.gate,
-    }
+def zero_unanswered(found: DepthMap, values: Tensor) -> Tensor:
+    """Values (B, h, w) of a map, 0 where there is no depth. Gradient: to the values."""
+    return torch.where(found.keep, values, 0.0)
 
 
 def map_to_samples(found: DepthMap, frame: Frame, method: Method) -> tuple[MergedDepth, Tensor]:
@@ -78,5 +69,6 @@ def map_to_samples(found: DepthMap, frame: Frame, method: Method) -> tuple[Merge
     uv = dense.map_pixel_centres(frame, (found.depth.shape[-2], found.depth.shape[-1]))
     with torch.no_grad():
         hole = method.sample_depth_at(frame, uv).hole
-    flat = {name.removesuffix("_map"): x.flatten(1) for name, x in map_to_keys(found).items() if name != "gate_map"}
-    return MergedDepth(uv=uv.expand(len(hole), -1, -1), **flat), hole
+    depth, sigma = (zero_unanswered(found, values).flatten(1) for values in (found.depth, found.sigma))
+    score, source = found.score.flatten(1), found.source.flatten(1)
+    return MergedDepth(uv.expand(len(hole), -1, -1), depth, sigma, score, source), hole

@@ -112,26 +112,37 @@ def read_pose_priors(
     return stack(found).to(leaves.dtype)
 
 
-def refuted_pose_keys(fits: Sequence[PoseFit], paired: Tensor, name: str) -> dict[str, Tensor]:
-    """What is added to a sample beside its pose: which convention a refuted one looks like; with a warning.
+def match_refuted_poses(fits: Sequence[PoseFit], paired: Tensor) -> Tensor:
+    """(B,) int32: which of CONVENTIONS a given pose would fit that the near returns refute; 0 = none.
 
     Args:
-        fits: of the views that were asked; the first that is refuted and looks like something counts.
+        fits: of the source views; the first that is refuted and fits a convention counts.
         paired: (B,) whether a sample has another view.
-        name: of the pose, for the warning.
     """
-    looks = torch.zeros_like(paired, dtype=torch.int32)
+    matched = torch.zeros_like(paired, dtype=torch.int32)
+    for fit in fits:
+        if fit.matched_convention is not None:
+            here = paired & (fit.code == PoseCode.REFUTED)
+            matched = torch.where(here & (matched == 0), fit.matched_convention.to(matched.dtype), matched)
+    return matched
+
+
+def warn_refuted_poses(fits: Sequence[PoseFit], paired: Tensor, matched: Tensor, name: str) -> None:
+    """Warn where a given pose is refuted, with the conventions that it would fit.
+
+    Args:
+        fits: of the source views.
+        paired: (B,) whether a sample has another view.
+        matched: (B,) of :func:`match_refuted_poses`.
+        name: of the pose.
+    """
     refuted = torch.zeros_like(paired)
     for fit in fits:
-        here = paired & (fit.code == PoseCode.REFUTED)
-        refuted = refuted | here
-        if fit.matched_convention is not None:
-            looks = torch.where(here & (looks == 0), fit.matched_convention.to(looks.dtype), looks)
+        refuted = refuted | (paired & (fit.code == PoseCode.REFUTED))
     if bool(refuted.any()):
-        seen = [conventions.CONVENTIONS[i] for i in sorted(set(looks[refuted].tolist())) if i]
+        seen = [conventions.CONVENTIONS[i] for i in sorted(set(matched[refuted].tolist())) if i]
         like = f"; looks like {' or '.join(seen)}" if seen else ""
         warnings.warn(f"{name}: the near returns contradict the pose{like}", stacklevel=4)
-    return {"pose_convention": looks}
 
 
 def _read_matrix(

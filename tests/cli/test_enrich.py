@@ -145,7 +145,7 @@ def test_interrupted_anywhere_the_same_command_gives_the_same_bytes(
         return called
 
     target, name, after = {
-        "shard": (shards, "write", 2),
+        "shard": (shards, "write_shard", 2),
         "table": (LeRobotTarget, "_copy_videos", 1),
         "meta": (storage, "write_json", 2),
     }[place]

@@ -367,8 +367,10 @@ def test_of_several_views_the_first_that_is_refuted_gives_the_name(pairs):
     wrong = fit.replace(code=torch.full_like(fit.code, PoseCode.REFUTED))
     both = [wrong.replace(matched_convention=torch.tensor(looks)) for looks in ([0, 3, 5], [4, 6, 7])]
     with pytest.warns(UserWarning, match="camera: the near returns contradict the pose; looks like"):
-        found = poses.refuted_pose_keys([fit, *both], torch.tensor([True, True, False]), "camera")
-    assert found["pose_convention"].tolist() == [4, 3, 0]
+        paired = torch.tensor([True, True, False])
+        found = poses.match_refuted_poses([fit, *both], paired)
+        poses.warn_refuted_poses([fit, *both], paired, found, "camera")
+    assert found.tolist() == [4, 3, 0]
 
 
 def test_a_pose_that_is_not_known_leaves_a_hole(sample):

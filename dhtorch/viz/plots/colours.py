@@ -9,12 +9,12 @@ on light and on dark ground alike. Only what belongs to a page, as its ink and g
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.codes import Gate, Hole, Source, State
+from dhtorch.codes import CodeTable, Gate, Hole, Source, State, names
 
 #: What a depth comes from; what is silent is paler than what was answered.
 SENSOR, RECOVERED, SWEPT, ALIGNED, SILENT = "#0072B2", "#E69F00", "#C653A6", "#3F8F6B", "#B4B4B4"
@@ -58,7 +58,16 @@ SERIES_COLOURS = ("#2A9DA8", "#D55E00", "#6B8E23", "#A0529C", "#7D7D7D", "#4F6D8
 #: Where the colours are used up they come again in these dashes, points.
 _SERIES_DASHES: tuple[tuple[float, ...], ...] = ((), (5.0, 2.5), (1.5, 1.8), (7.0, 2.0, 1.5, 2.0))
 
-GATE_COLOURS = {
+#: Of codes without a colour of their own.
+DEFAULT_CODE_COLOUR = "#7C6F64"
+
+
+def _with_defaults(table: type[CodeTable], own: dict[int, str], leave_out: int | None = None) -> dict[int, str]:
+    """Code -> colour for every code of a table but one: its own, else the default."""
+    return {code: own.get(code, DEFAULT_CODE_COLOUR) for code in names(table) if code != leave_out}
+
+
+_GATE_COLOURS = {
     Gate.NO_TRACK: "#9A9A9A",
     Gate.NO_TEXTURE: "#5E5E5E",
     Gate.NO_POSE: "#5C7391",
@@ -72,7 +81,8 @@ GATE_COLOURS = {
     Gate.CONTRADICTED: "#6B4A1F",
     Gate.POSE_REFUTED: "#8C2D6B",
 }
-HOLE_COLOURS = {
+GATE_COLOURS = _with_defaults(Gate, _GATE_COLOURS, Gate.ANSWER)
+_HOLE_COLOURS = {
     Hole.TRACKABLE_NO_LIDAR: "#D55E00",
     Hole.LOW_TEXTURE: "#5E5E5E",
     Hole.TOO_BRIGHT: "#F0E442",
@@ -80,7 +90,8 @@ HOLE_COLOURS = {
     Hole.HIGHLIGHT: "#CC79A7",
     Hole.AT_BORDER: "#009E73",
 }
-SOURCE_COLOURS = {
+HOLE_COLOURS = _with_defaults(Hole, _HOLE_COLOURS, Hole.NONE)
+_SOURCE_COLOURS = {
     Source.NONE: SILENT,
     Source.SENSOR: SENSOR,
     Source.RECOVERED: RECOVERED,
@@ -88,8 +99,11 @@ SOURCE_COLOURS = {
     Source.ALIGNED: ALIGNED,
 }
 
+SOURCE_COLOURS = _with_defaults(Source, _SOURCE_COLOURS)
+
 #: What is said of a pixel of a judged map.
-STATE_COLOURS = {State.CANNOT_KNOW: PICTURE, State.CONSISTENT: "#63c98a", State.WRONG: "#a8321f"}
+_STATE_COLOURS = {State.CANNOT_KNOW: PICTURE, State.CONSISTENT: "#63c98a", State.WRONG: "#a8321f"}
+STATE_COLOURS = _with_defaults(State, _STATE_COLOURS)
 
 #: Quantity → matplotlib's name of its colour map.
 DEPTH_CMAP, SCORE_CMAP, ERROR_CMAP, SIGNED_CMAP, GREY_CMAP = "turbo", "viridis", "Spectral_r", "RdBu_r", "gray"
@@ -125,7 +139,15 @@ def parse_rgb(colour: str) -> tuple[int, int, int]:
 def colour_by_source(source: Any) -> np.ndarray:
     """Colours (P, 3) uint8 of points by codes.Source (P,): sensor blue, recovered orange, swept purple."""
     code = np.asarray(source.detach().cpu() if hasattr(source, "detach") else source).astype(np.int64)
-    return np.array([parse_rgb(SOURCE_COLOURS[k]) for k in sorted(SOURCE_COLOURS)], np.uint8)[code]
+    return colour_by_code(SOURCE_COLOURS, code)
+
+
+def colour_by_code(table: Mapping[int, str], code: np.ndarray) -> np.ndarray:
+    """Colours (…, 3) uint8 of codes (…) by a table of this module."""
+    rows = np.zeros((max(table) + 1, 3), np.uint8)
+    for number, colour in table.items():
+        rows[number] = parse_rgb(colour)
+    return rows[code]
 
 
 def sample_cmap(name: str, n: int = 17) -> list[str]:

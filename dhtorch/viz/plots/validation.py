@@ -52,12 +52,7 @@ def draw_validation(
     canvas = Canvas(2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT * bool(title), dpi=160)
     canvas.title(title, 2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT)
     background = np.array(colours.parse_rgb(colours.PICTURE)) / 255
-    states = (
-        np.array([colours.parse_rgb(colours.STATE_COLOURS[k]) for k in sorted(colours.STATE_COLOURS)])[
-            code.astype(np.int64)
-        ]
-        / 255
-    )
+    states = colours.colour_by_code(colours.STATE_COLOURS, code.astype(np.int64)) / 255
     n_wrong, n_consistent = (((code == k) & has_depth).sum() for k in (State.WRONG, State.CONSISTENT))
     depth_axis, evidence_axis = (
         fit_depth_axis(z[has_depth]),

@@ -1,0 +1,318 @@
+"""The columns that :class:`dhtorch.transforms.ExtendDepth` adds to a sample, in one table.
+
+A column is one row of :data:`COLUMNS` and the function that it names. The keys of a sample, the zeros of a sample that
+cannot be read, the Parquet columns of ``dhtorch extract``, the features of ``dhtorch enrich`` and the table of keys in
+the documentation are derived from it.
+
+Alphabet: B samples; of each N points, P patches of its token grid, H × W pixels of its dense map.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import Flag, Gate, Hole, PoseCode, Source
+from dhtorch.records import DepthMap, Estimate, MergedDepth, PoseFit, Samples
+from dhtorch.transforms.maps import zero_unanswered
+from dhtorch.transforms.poses import match_refuted_poses
+from dhtorch.transforms.status import SampleProblem
+from dhtorch.transforms.tokens import TOKEN_CHANNELS
+
+
+@dataclass(frozen=True, eq=False)
+class SampleResults:
+    """What the method found in B samples: the input of every column's function."""
+
+    samples: Samples  # the front end, in the reference view
+    merged: MergedDepth  # sensor and recovered depth
+    xyz: Tensor  # (B, N, 3) m in camera 0, of the merged depth; any value where there is none
+    estimate: Estimate | None  # None = no sample has a second view
+    fits: Sequence[PoseFit]  # of the source views, the one that stands for all last; empty without a second view
+    paired: Tensor  # (B,) bool: the sample has a second view
+    tokens: tuple[Tensor, Tensor]  # (B, P, channels) and (B, P) bool, of patch_tokens
+    dense: DepthMap | None  # None = dense maps were not requested
+    problem: Tensor  # (B,) int32, codes.SampleProblem
+
+
+class ColumnSpec(NamedTuple):
+    """One column."""
+
+    key: str  # behind the prefix
+    shape: tuple[str | int, ...]  # of one sample: letters of the alphabet, or numbers
+    dtype: str  # bool, int32, or float32, which stands for the floating type of the sample's camera
+    unit: str
+    meaning: str
+    compute: Callable[[SampleResults], Tensor]  # results of B samples -> (B, *shape)
+    codes: type | None = None  # code table of its values
+    option: str | None = None  # of ExtendDepth without which the column is left out; None = always there
+    half: bool = False  # float16 is exact enough to store it
+    enrich: str | None = None  # file type of a map, or "numbers", in an enriched data set; None = not in it
+    unreadable: int = 0  # value in a sample that cannot be read
+
+
+# ------------------------------------------------------------------------------------------------ one function each
+
+
+def _uv(found: SampleResults) -> Tensor:
+    return found.merged.uv
+
+
+def _xyz(found: SampleResults) -> Tensor:
+    return torch.where(_valid(found)[..., None], found.xyz, 0.0)
+
+
+def _depth(found: SampleResults) -> Tensor:
+    return found.merged.depth
+
+
+def _sigma(found: SampleResults) -> Tensor:
+    return found.merged.sigma
+
+
+def _score(found: SampleResults) -> Tensor:
+    return found.merged.score
+
+
+def _valid(found: SampleResults) -> Tensor:
+    return found.merged.source != Source.NONE
+
+
+def _source(found: SampleResults) -> Tensor:
+    return found.merged.source
+
+
+def _flag(found: SampleResults) -> Tensor:
+    return found.samples.flag
+
+
+def _hole(found: SampleResults) -> Tensor:
+    return found.samples.hole
+
+
+def _gate(found: SampleResults) -> Tensor:
+    if found.estimate is None:
+        return torch.full_like(found.samples.hole, Gate.NO_TRACK)
+    return found.estimate.gate
+
+
+def _T_1_from_0(found: SampleResults) -> Tensor:
+    if not found.fits:
+        return found.merged.depth.new_zeros(len(found.paired), 4, 4)
+    T = found.fits[-1].T_1_from_0
+    top = torch.cat((T.R, T.t[..., None]), -1)
+    last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=top.dtype, device=top.device).expand(len(top), 1, 4)
+    return torch.where(_pose_ok(found)[:, None, None], torch.cat((top, last), 1), 0.0)
+
+
+def _pose_cov(found: SampleResults) -> Tensor:
+    if not found.fits:
+        return found.merged.depth.new_zeros(len(found.paired), 6, 6)
+    return torch.where(_pose_ok(found)[:, None, None], found.fits[-1].cov, 0.0)
+
+
+def _pose_ok(found: SampleResults) -> Tensor:
+    return found.fits[-1].ok & found.paired if found.fits else torch.zeros_like(found.paired)
+
+
+def _pose_code(found: SampleResults) -> Tensor:
+    if not found.fits:
+        return torch.zeros_like(found.paired, dtype=torch.int32)
+    code = found.fits[-1].code
+    return torch.where(found.paired, code, torch.zeros_like(code))
+
+
+def _tokens(found: SampleResults) -> Tensor:
+    return found.tokens[0]
+
+
+def _tokens_valid(found: SampleResults) -> Tensor:
+    return found.tokens[1]
+
+
+def _pose_convention(found: SampleResults) -> Tensor:
+    return match_refuted_poses(found.fits, found.paired)
+
+
+def _depth_map(found: SampleResults) -> Tensor:
+    return zero_unanswered(_dense(found), _dense(found).depth)
+
+
+def _sigma_map(found: SampleResults) -> Tensor:
+    return zero_unanswered(_dense(found), _dense(found).sigma)
+
+
+def _score_map(found: SampleResults) -> Tensor:
+    return _dense(found).score
+
+
+def _source_map(found: SampleResults) -> Tensor:
+    return _dense(found).source
+
+
+def _gate_map(found: SampleResults) -> Tensor:
+    return _dense(found).gate
+
+
+def _problem(found: SampleResults) -> Tensor:
+    return found.problem
+
+
+def _dense(found: SampleResults) -> DepthMap:
+    assert found.dense is not None  # columns of the option "dense" alone ask for it
+    return found.dense
+
+
+# ------------------------------------------------------------------------------------------------------- the table
+
+_N, _P, _MAP, _F = ("N",), ("P",), ("H", "W"), "float32"
+_ZERO = "0 = none, where a DepthMap has NaN"
+
+COLUMNS: tuple[ColumnSpec, ...] = (
+    ColumnSpec(
+        "uv", ("N", 2), _F, "px", "where the samples are: x right, y down, whole numbers are pixel centres", _uv
+    ),
+    ColumnSpec(
+        "xyz", ("N", 3), _F, "m", "points in the camera of the frame: x right, y down, z forward", _xyz, half=True
+    ),
+    ColumnSpec("depth", _N, _F, "m", "z of the points, by sensor or triangulation; 0 = none", _depth, half=True),
+    ColumnSpec("sigma", _N, _F, "m", "standard deviation of depth; 0 = none", _sigma, half=True),
+    ColumnSpec(
+        "score",
+        _N,
+        _F,
+        "1",
+        "confidence of the sensor, or score of the recovered depth, in [0, 1]",
+        _score,
+        half=True,
+    ),
+    ColumnSpec("valid", _N, "bool", "1", "there is a depth", _valid),
+    ColumnSpec("source", _N, "int32", "code", "where the depth comes from", _source, Source),
+    ColumnSpec("flag", _N, "int32", "bits", "what is wrong with the sensor's return", _flag, Flag),
+    ColumnSpec("hole", _N, "int32", "code", "why the sensor gave no usable return", _hole, Hole),
+    ColumnSpec("gate", _N, "int32", "code", "why no depth was recovered", _gate, Gate),
+    ColumnSpec(
+        "T_1_from_0",
+        (4, 4),
+        _F,
+        "1, m",
+        "pose of the other view: its points from those of the frame; 0 = none",
+        _T_1_from_0,
+    ),
+    ColumnSpec(
+        "pose_cov",
+        (6, 6),
+        _F,
+        "rad², rad m, m²",
+        "covariance of that pose, rotation first, left perturbation",
+        _pose_cov,
+    ),
+    ColumnSpec("pose_ok", (), "bool", "1", "there is a pose", _pose_ok),
+    ColumnSpec("pose_code", (), "int32", "code", "how the search for the pose ended", _pose_code, PoseCode),
+    ColumnSpec(
+        "tokens",
+        ("P", len(TOKEN_CHANNELS)),
+        _F,
+        "1/m, 1/m, share",
+        "depth tokens of the patches, row by row",
+        _tokens,
+        half=True,
+    ),
+    ColumnSpec("tokens_valid", _P, "bool", "1", "a sample of the patch has a depth", _tokens_valid),
+    ColumnSpec(
+        "pose_convention",
+        (),
+        "int32",
+        "index",
+        "which of geometry.pose_conventions.CONVENTIONS a given pose would fit that the near returns refute; 0 = none",
+        _pose_convention,
+        option="pose",
+    ),
+    ColumnSpec(
+        "depth_map",
+        _MAP,
+        _F,
+        "m",
+        f"z of every pixel, by sensor or sweep; {_ZERO}",
+        _depth_map,
+        option="dense",
+        half=True,
+        enrich="tiff",
+    ),
+    ColumnSpec(
+        "sigma_map",
+        _MAP,
+        _F,
+        "m",
+        f"standard deviation of depth_map; {_ZERO}",
+        _sigma_map,
+        option="dense",
+        half=True,
+        enrich="tiff",
+    ),
+    ColumnSpec(
+        "score_map",
+        _MAP,
+        _F,
+        "1",
+        "confidence of the sensor, or score of the swept depth, in [0, 1]",
+        _score_map,
+        option="dense",
+        half=True,
+    ),
+    ColumnSpec(
+        "source_map",
+        _MAP,
+        "int32",
+        "code",
+        "where the depth of a pixel comes from",
+        _source_map,
+        Source,
+        option="dense",
+        enrich="png",
+    ),
+    ColumnSpec("gate_map", _MAP, "int32", "code", "why a pixel has no depth", _gate_map, Gate, option="dense"),
+    ColumnSpec(
+        "problem",
+        (),
+        "int32",
+        "code",
+        "what was wrong with the frame",
+        _problem,
+        SampleProblem,
+        unreadable=SampleProblem.UNREADABLE,
+    ),
+)
+
+
+def select_columns(options: Collection[str]) -> list[ColumnSpec]:
+    """The columns that are there with some options of ExtendDepth (``pose``, ``dense``), in order."""
+    return [column for column in COLUMNS if column.option is None or column.option in options]
+
+
+def compute_columns(found: SampleResults, options: Collection[str]) -> dict[str, Tensor]:
+    """Key → (B, …) of what was found. Gradient: as the records' fields."""
+    return {column.key: column.compute(found) for column in select_columns(options)}
+
+
+def fill_unreadable(added: Mapping[str, Tensor], bad: Tensor) -> dict[str, Tensor]:
+    """Columns (B, …) in which the samples of the mask ``bad`` (B,) are those that cannot be read. Gradient: kept."""
+    value = {column.key: column.unreadable for column in COLUMNS}
+    return {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), value[key]) for key, x in added.items()}
+
+
+def blank_columns(sizes: Mapping[str, int], options: Collection[str]) -> dict[str, Tensor]:
+    """Key → (1, …) of a sample that cannot be read; ``sizes``: letter of the alphabet → number."""
+    return {
+        c.key: torch.full((1, *resolve_shape(c.shape, sizes)), c.unreadable, dtype=getattr(torch, c.dtype))
+        for c in select_columns(options)
+    }
+
+
+def resolve_shape(shape: Sequence[str | int], sizes: Mapping[str, int]) -> tuple[int, ...]:
+    """A shape in numbers; ``sizes``: letter of the alphabet → number."""
+    return tuple(sizes[size] if isinstance(size, str) else size for size in shape)
