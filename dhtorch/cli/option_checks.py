@@ -1,6 +1,6 @@
 """Validation of command-line arguments before a run: arguments, option names, values; one-line errors with suggestions.
 
-Values of a function's options are checked against its annotations, options of no function against
+Values of a function's options are compared with its annotations, options of no function against
 :data:`_OPTION_RULES`, and lower limits of numbers follow from their names. A new stage or reader needs no entry here.
 """
 

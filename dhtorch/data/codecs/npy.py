@@ -1,7 +1,7 @@
 """Codec of ``.npy`` and ``.npz`` without pickled objects (for those see :mod:`dhtorch.data.codecs.pickles`).
 
 The header is a Python expression, and numpy's parser of it is not written for damaged files: all its errors become
-``FormatError`` here. An array's declared size is checked against its bytes.
+``FormatError`` here. An array's declared size is compared with its bytes.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A pickle is a program for a stack machine whose instructions can call any function of the interpreter. This is a
 separate machine for the same instructions: names in the file (``numpy.ndarray``) are never resolved but stay tokens,
 and *call* accepts only the few tokens that rebuild arrays, implemented here. No code of the file can run, and sizes are
-checked against the available bytes. Protocols 2 to 5, module paths of numpy 1 and 2.
+limited to the available bytes. Protocols 2 to 5, module paths of numpy 1 and 2.
 """
 
 from __future__ import annotations

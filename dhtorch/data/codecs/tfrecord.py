@@ -74,7 +74,7 @@ def index_records(file: Path) -> list[ByteSpan]:
 
 
 def read_record(file: Path, span: ByteSpan) -> bytes:
-    """The data of a record, verified by its checksum.
+    """The data of a record, whose checksum must match.
 
     Raises:
         FormatError: unreadable, too long, cut off, or a wrong checksum.

@@ -1,6 +1,6 @@
 """Codec of TIFF: the first image of a file, with one sample per pixel (confidence, depth) or several (colour).
 
-The first directory is parsed here, so that size, type and the position of every strip are checked against the file
+The first directory is parsed here, so that size, type and the position of every strip are compared with the file
 before the decoder unpacks the strips.
 """
 

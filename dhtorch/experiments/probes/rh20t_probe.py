@@ -4,7 +4,7 @@ Samples are frames of the wrist camera. The target is the pose of the hand after
 translation and rotation vector. The context, shared by all arms, is the robot's state, which needs no image: pose,
 joints, gripper, and the motion over the last ``history``. An arm adds one or two blocks of features: the downsampled
 image, depth tokens with the frame ``history`` ago as second view, depth tokens of the single-view front end, DINOv2's
-class token and mean patch token, or depth tokens and DINOv2. Whole tasks are held out: every task is tested once, by
+class token and mean patch token, or depth tokens and DINOv2. Whole tasks are held out: every task is evaluated once, by
 probes whose penalty was chosen on other tasks.
 
 Expectation (written before the run): equivalent; the error with depth features is DINOv2's within 2 %, over all samples
