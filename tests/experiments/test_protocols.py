@@ -303,11 +303,11 @@ def test_drop_outs_and_halves_refuse_wrong_shapes():
         ),
     )
     truth = holdout.sample_truth(frame, samples.uv)
-    with pytest.raises(ValueError, match="drop_outs"):
+    with pytest.raises(ValueError, match="select_real_holes"):
         holdout.select_real_holes(frame, samples, truth[:, :5])
     with pytest.raises(ValueError, match=r"holdout.share: found 1"):
         holdout.split_half(samples, 0, share=1)
-    with pytest.raises(ValueError, match="without_returns"):
+    with pytest.raises(ValueError, match="hide_returns"):
         holdout.hide_returns(samples, torch.zeros(1, 4, dtype=torch.bool))
 
 

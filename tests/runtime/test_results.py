@@ -258,9 +258,9 @@ def test_what_json_cannot_hold_is_refused():
         (("expectation",), [], "a text or null"),
         (("verdict",), 1, "a text or null"),
         (("why",), {}, "a text or null"),
-        (("expectation",), "x", "null, this job asks no question"),
-        (("verdict",), "supported", "null, this job asks no question"),
-        (("why",), "x", "null, this job asks no question"),
+        (("expectation",), "x", "null for this experiment"),
+        (("verdict",), "supported", "null for this experiment"),
+        (("why",), "x", "null for this experiment"),
         (("key",), None, "a text"),
         (("key",), "0" * 63, "64 hexadecimal digits"),
         (("key",), "0" * 65, "64 hexadecimal digits"),
@@ -353,7 +353,7 @@ def test_every_field_must_be_there_and_no_other(part):
 
 
 @pytest.mark.parametrize("experiment", ["pair", "integrate", "motion"])
-def test_only_an_experiment_is_asked_something(experiment):
+def test_only_experiments_have_a_question(experiment):
     asked = {"question": "Q", "expectation": "E", "why": "W", "verdict": "refuted"}
     if experiment == "motion":
         for verdict in ("supported", "refuted", "undecided"):
@@ -365,7 +365,7 @@ def test_only_an_experiment_is_asked_something(experiment):
     else:
         assert result(experiment=experiment)["verdict"] is None
         for name, text in asked.items():
-            with pytest.raises(ValueError, match=rf"^result\.{name}: found '{text}', expected null, this job asks no"):
+            with pytest.raises(ValueError, match=rf"^result\.{name}: found '{text}', expected null for this experiment"):
                 result(experiment=experiment, **{name: text})
 
 
@@ -394,7 +394,7 @@ def test_strict_makes_of_everything_what_json_holds():
         "deep": {"a": {"b": [[None]]}},
     }
     assert storage.to_strict_json(True) is True and type(storage.to_strict_json(np.int64(3))) is int
-    with pytest.raises(TypeError, match="result: found a complex, expected something that JSON can hold"):
+    with pytest.raises(TypeError, match="result: found a complex, expected a value that JSON can hold"):
         storage.to_strict_json([1j])
 
 
