@@ -272,12 +272,12 @@ def _format_summary(name: str, kind: str, summary: Row, n_untouched: int) -> lis
         ),
         f"  Median sigma {medians['sigma']:.1%} of the depth; {limited['silent']:.1%} of the pixels have no answer.",
         f"  References per map: {near} near returns and {far} far answers (medians); "
-        f"{limited['unanchored']:.0%} of the maps could not be aligned.",
+        f"{limited['unaligned']:.0%} of the maps could not be aligned.",
     ]
 
 
 def _write_page(task: CompletionTask, maps: DepthMaps, lines: Sequence[str], exceeded: Sequence[str]) -> Path:
-    order = sorted(task.frames, key=lambda i: -_severity(task.done[task.name(i)]["anchored"]))
+    order = sorted(task.frames, key=lambda i: -_severity(task.done[task.name(i)]["aligned"]))
     shown = set(order[: task.settings["pictures"]])
     frames = []
     for i in order:

@@ -336,7 +336,7 @@ def _run_hydra(argv: list[str]) -> int:
             resume_command = _format_resume_command(argv, folder)
             with file_lock.acquire_file_lock(folder.parent / f".{folder.name}.lock", f"output: {folder}"):
                 if sweep:
-                    return _run_sweep(engine, overrides, folder, resume_command, show=cfg.traceback)
+                    return _run_sweep(engine, overrides, folder, resume_command, show_traceback=cfg.traceback)
                 return _run_single(engine, overrides, resume_command)
     except (HydraException, OmegaConfBaseException) as error:
         return _report_failure(error)
