@@ -37,6 +37,7 @@ from dhtorch.ops import constants, dispatch, loader
 from dhtorch.pipeline import dense, surface
 from dhtorch.pipeline.pair import merge
 from dhtorch.records import NO_HINT, Frame, MergedDepth, PoseFit, Samples, Shutter, TrackHint, Tracks
+from dhtorch.stages import pose
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.holes import classify, min_eigenvalue
 from dhtorch.stages.pose import map_pose, pnp_ransac
