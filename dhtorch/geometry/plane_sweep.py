@@ -156,7 +156,8 @@ def project_inverse_depth(view: SweptView, ray: Tensor, q: Tensor) -> tuple[Tens
     check("project_inverse_depth", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
     T, camera = view.T_1_from_0, view.camera
     if camera.distortion is None:
-        return _project_pinhole(ray, q, T.R, T.t, view.shutter_rate, camera.f, camera.c)
+        motion = T.R, T.t, view.shutter_rate
+        return _project_pinhole(ray, q, *motion, camera.f, camera.c)
     xyz, front = _move_points(ray, q, T.R, T.t, view.shutter_rate)
     return cam.project(camera, torch.stack(xyz, -1)), front
 
@@ -176,9 +177,10 @@ def _move_points(
 def _project_pinhole_kernel(*tensors: Any) -> tuple[Tensor, Tensor]:
     ray, q, R, t, shutter_rate, f, c = tensors
     planes = ray.mT.contiguous()
-    uv, front = torch.empty_like(planes[:, :2]), torch.empty_like(q, dtype=torch.bool)
-    turn = torch.zeros_like(t) if shutter_rate is None else shutter_rate
-    torch.ops.dhtorch.project_inverse_depth.default(planes, q, R, t, turn, f, c, uv, front, MIN_DEPTH_RATIO)
+    uv = torch.empty_like(planes[:, :2])
+    front = torch.empty_like(q, dtype=torch.bool)
+    motion = R, t, torch.zeros_like(t) if shutter_rate is None else shutter_rate
+    torch.ops.dhtorch.project_inverse_depth.default(planes, q, *motion, f, c, *(uv, front), MIN_DEPTH_RATIO)
     return uv.mT, front
 
 
@@ -205,7 +207,8 @@ def rotate_rays(R: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 def _sample_bilinear_kernel(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     axes = uv.mT.contiguous()
-    values, inside = image.new_empty(*image.shape[:2], uv.shape[1]), torch.empty_like(axes[:, 0], dtype=torch.bool)
+    values = image.new_empty(*image.shape[:2], uv.shape[1])
+    inside = torch.empty_like(axes[:, 0], dtype=torch.bool)
     torch.ops.dhtorch.sample_bilinear.default(image, axes, values, inside)
     return values, inside
 
@@ -329,7 +332,8 @@ def _add_costs(*tensors: Any, places: tuple[tuple[int, int], int], fresh: bool) 
     """:func:`add_census_costs` to C (B, h, w, D), of codes (B, N) and (B, H · W), the fields of :class:`EpipolarWarp`
     and the size and margin of the rectified view."""
     C, code_0, code_1, a, b, c, q = tensors
-    seen, go = RectifiedView(code_1, *places), EpipolarWarp(a, b, c)
+    seen = RectifiedView(code_1, *places)
+    go = EpipolarWarp(a, b, c)
     if fresh:
         C.zero_()
     for k in range(q.shape[1]):
@@ -545,7 +549,8 @@ def _fit_windows_kernel(
 ) -> WindowFit:
     places = uv.mT.contiguous(), further.mT.contiguous(), little[:, 0]
     outputs = step, contrast, noise, correlation = tuple(torch.empty_like(grey[:, 0]) for _ in range(4))
-    inside, motion = torch.empty_like(step, dtype=torch.bool), torch.empty_like(places[0])
+    inside = torch.empty_like(step, dtype=torch.bool)
+    motion = torch.empty_like(places[0])
     limits = *WINDOW_GAIN_RANGE, FLAT_VARIANCE, FLAT_GRADIENT_VARIANCE
     torch.ops.dhtorch.fit_windows.default(grey, picture_1, *places, *outputs, inside, motion, *limits)
     seen = inside & front.view_as(inside)

@@ -408,7 +408,8 @@ def _is_geman_mcclure(ray: Tensor, *_: Tensor | None, linear: Callable[[], Linea
 def _sum_tracks(*tensors: Any, bend: float, with_equations: bool) -> NormalEquations:
     *tracks, share = tensors
     given = _kernel_arguments(*tracks)
-    B, n = len(share) if with_equations else 0, 9 if len(given[-1]) else 6
+    B = len(share) if with_equations else 0
+    n = 9 if len(given[-1]) else 6
     found = NormalEquations(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
     limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
     torch.ops.dhtorch.pose_normal_equations.default(*given, share, *found, bend, *limits)

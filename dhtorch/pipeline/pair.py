@@ -179,8 +179,9 @@ def _sensor_values_kernel(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     z, noise, score = (torch.empty_like(x) for x in (depth, sigma, confidence))
     source = torch.empty_like(depth, dtype=torch.int32)
-    torch.ops.dhtorch.sensor_values.default(depth, sigma, confidence, xyz, z, noise, score, source)
-    return z, noise, score, source
+    outputs = z, noise, score, source
+    torch.ops.dhtorch.sensor_values.default(depth, sigma, confidence, xyz, *outputs)
+    return outputs
 
 
 @operator(

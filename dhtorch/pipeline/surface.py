@@ -217,7 +217,7 @@ def _add_view(
 ) -> _ViewSums:
     """What they said with one view more, where it sees pixels ``here`` (B, h, w): a step of at ``most`` (B,) 1/m, and
     the variance by its motion if that is asked for."""
-    return _add_to_sums(one.step, one.contrast, one.noise, one.correlation, here, most, moved, *said)
+    return _add_to_sums(*(one.step, one.contrast, one.noise, one.correlation), here, most, moved, *said)
 
 
 def _add_to_sums_kernel(*tensors: Tensor | None) -> _ViewSums:
@@ -260,14 +260,16 @@ def pose_variance(
     cov = fit.cov if fit.shutter is None else fit.shutter.cov
     cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(q)
     T = view.T_1_from_0
-    return _pose_variance(base.ray, q.flatten(1), T.R, T.t, view.camera.f, cov, motion.flatten(1, 2)).view_as(q)
+    known = T.R, T.t, view.camera.f, cov
+    return _pose_variance(base.ray, q.flatten(1), *known, motion.flatten(1, 2)).view_as(q)
 
 
 def _pose_variance_kernel(*tensors: Tensor) -> Tensor:
     ray, q, R, t, f, cov, motion = tensors
-    variance, moved = torch.empty_like(q), motion.mT.contiguous()
+    variance = torch.empty_like(q)
     limits = MIN_INVERSE_DEPTH, MIN_SQUARED_MOTION, MIN_ABS_DEPTH
-    torch.ops.dhtorch.pose_variance.default(ray.mT.contiguous(), q, R, t, f, cov.contiguous(), moved, variance, *limits)
+    planes, moved = (x.mT.contiguous() for x in (ray, motion))
+    torch.ops.dhtorch.pose_variance.default(planes, q, *(R, t, f), cov.contiguous(), moved, variance, *limits)
     return variance
 
 

@@ -148,28 +148,26 @@ def _read_samples_kernel(
     pixel, at, ray = _project_samples(frame, uv)
     picture, steps = flatten_images(image)
     outputs = found, sigma, confidence = tuple(ray.new_empty(ray.shape[:2]) for _ in range(3))
-    xyz, flag = torch.empty_like(ray), torch.empty_like(found, dtype=torch.int32)
+    xyz = torch.empty_like(ray)
+    flag = torch.empty_like(found, dtype=torch.int32)
     hw, map_hw, n = frame.hw, (depth.shape[-2], depth.shape[-1]), uv.shape[1]
     size, reach = min(NEIGHBOURHOOD_PX, *hw), min(NEIGHBOURHOOD_PX, *map_hw)
+    levels = depth.new_empty(0, dtype=torch.uint8) if conf is None else conf
+    returns, windows = (depth, levels, at), (picture, pixel)
+    limits = limits._replace(near_limit=torch.inf if limits.near_limit is None else limits.near_limit)
     torch.ops.dhtorch.backproject.default(
-        depth,
-        depth.new_empty(0, dtype=torch.uint8) if conf is None else conf,
-        at,
-        picture,
-        pixel,
+        *returns,
+        *windows,
         ray,
         *outputs,
-        xyz,
-        flag,
+        *(xyz, flag),
         reach,
-        *steps,
-        *image.shape[1:],
-        size,
-        *limits._replace(near_limit=torch.inf if limits.near_limit is None else limits.near_limit),
-        MAX_HIGHLIGHT_COLOUR_REL,
-        MIN_HIGHLIGHT_CONTRAST,
-        whole_is_faster(map_hw, n, reach),
-        whole_is_faster(hw, n, size),
+        *(*steps, *image.shape[1:], size),
+        *limits,
+        max_colour_rel=MAX_HIGHLIGHT_COLOUR_REL,
+        min_contrast=MIN_HIGHLIGHT_CONTRAST,
+        whole_map=whole_is_faster(map_hw, n, reach),
+        whole_picture=whole_is_faster(hw, n, size),
     )
     none = {"trackability": torch.zeros_like(found), "hole": torch.zeros_like(flag)}
     return Samples(uv=uv, depth=found, sigma=sigma, xyz=xyz, confidence=confidence, flag=flag, **none)

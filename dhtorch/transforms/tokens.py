@@ -95,9 +95,8 @@ def _pool_tokens_kernel(
 ) -> tuple[Tensor, Tensor]:
     tokens = depth.new_empty(len(depth), grid[1] * grid[2], len(TOKEN_CHANNELS))
     known = torch.empty_like(tokens[..., 0], dtype=torch.bool)
-    torch.ops.dhtorch.patch_tokens.default(
-        uv.contiguous(), depth, sigma, source, hole, tokens, known, *grid, *scale, *margin
-    )
+    samples = uv.contiguous(), depth, sigma, source, hole
+    torch.ops.dhtorch.patch_tokens.default(*samples, tokens, known, *grid, *scale, *margin)
     return tokens, known
 
 

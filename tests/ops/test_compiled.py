@@ -136,7 +136,7 @@ def counted(monkeypatch, *names):
     calls = []
     for name in names:
         was = getattr(torch.ops.dhtorch, name).default
-        noted = SimpleNamespace(default=lambda *a, was=was, name=name: (calls.append(name), was(*a)))
+        noted = SimpleNamespace(default=lambda *a, was=was, name=name, **k: (calls.append(name), was(*a, **k)))
         monkeypatch.setattr(torch.ops.dhtorch, name, noted)
     return calls
 
