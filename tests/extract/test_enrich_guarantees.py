@@ -477,7 +477,7 @@ def test_a_row_is_taken_by_its_own_frame_alone():
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["cameras=true"], "two or more of one size"),
+        (["cameras=true"], "two or more cameras of one image size"),
         (["pose_sigma=[0.01,0.02]"], "pose=near"),
         (["pose=device", "pose_sigma=[0.01]"], "pose_sigma"),
         (["frames=0"], "frames"),
