@@ -6,7 +6,7 @@ One view of the built-in room with its LiDAR model (depth 192x256 with confidenc
 1440x1920, three channels uint8, interleaved in memory as decoders leave them. The peer answers the same questions about
 the same pixels in numpy + OpenCV: depth, points, noise, confidence, flags, texture, class. Both sides keep the spiral,
 which depends on the picture's size alone. Mode ``compiled`` is ``torch.compile`` of the three stages with calls in C++
-(``options={"cpp_wrapper": True}``), ``native`` the stages with the compiled code of ``python -m dhtorch.ops.loader``.
+(``options={"cpp_wrapper": True}``), ``native`` the stages with the compiled code of ``python -m dhtorch.ops``.
 
 Errors: median relative difference of the trackability from float64 arithmetic on grey values that were not rounded.
 """

@@ -5,7 +5,7 @@
 *Forward* is both pyramids and one search; mode ``cached`` has the pyramid of image 0 made before, as for a reference
 view seen from many views. Mode ``compiled`` has the steps on maps compiled: the whole search under ``torch.compile``
 would unroll every map that the eager search makes for few points only, and was not compiled after 400 s. Mode
-``native`` uses ``python -m dhtorch.ops.loader``. *Forward-backward* is
+``native`` uses ``python -m dhtorch.ops``. *Forward-backward* is
 ``lucas_kanade`` with all its fields against two calls of OpenCV. Times are of real pairs where DHTORCH_DATA is set,
 else of the built-in room; both sides take turns in one process.
 

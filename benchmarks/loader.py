@@ -5,7 +5,7 @@
 The plain loader decodes a JPEG and a 16-bit PNG with the depth, resizes both where asked for, and resizes the picture
 to 224×224 for a network; only that leaves the worker. ``single`` is one view per sample, of which the transform's
 front end alone is asked; ``pair`` is two views, and beside the transform stands the same with OpenCV in its seats. Rows
-of mode ``native`` use the compiled code of ``python -m dhtorch.ops.loader``. Rows
+of mode ``native`` use the compiled code of ``python -m dhtorch.ops``. Rows
 with ``by_batch`` collate in the worker first and extend the whole batch at once (``batched=True``): the same answers.
 Bars are about rows without workers (``workers0``).
 ``ours_ms`` and ``peer_ms`` are milliseconds per sample in the steady state, workers included. In ``scaling`` rows

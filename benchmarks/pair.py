@@ -11,7 +11,7 @@ counted on every fourth row and column and multiplied by sixteen. ``auto_referen
 release's
 ``WINDOW_1``: one reference view, the same frames around it offered to both, from which each chooses. Mode ``native`` is
     ours
-with the compiled code of ``python -m dhtorch.ops.loader``; the peer stays as it is.
+with the compiled code of ``python -m dhtorch.ops``; the peer stays as it is.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ after pair: ``cv2.solvePnPRansac`` with AP3P and with USAC MAGSAC, both followed
 inliers; PoseLib with at least 100 iterations (its default of 1000 would be no fair peer); pycolmap where it is
 installed. Mode ``compiled`` is ``torch.compile`` of the seat with calls from kernel to kernel in C++ as well
 (``options={"cpp_wrapper": True}``), which takes longer to compile once, mode ``native`` the seat with the compiled code
-of ``python -m dhtorch.ops.loader``. Ours runs under ``torch.inference_mode``, as one would run it where nothing is to
+of ``python -m dhtorch.ops``. Ours runs under ``torch.inference_mode``, as one would run it where nothing is to
 be learned.
 
 Errors: median rotation error in degrees over a hundred pairs; that of the translation is printed above the table.

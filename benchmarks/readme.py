@@ -273,7 +273,7 @@ def loader_times() -> str:
         return " and ".join(f"{a['ours_ms']:.2g} ms with {x} ({b['ours_ms']:.2g} by batch)" for a, b, x in times)
 
     plain, _ = taken("single", "eager")
-    after = f"; after `python -m dhtorch.ops.loader`, which compiles inner loops, {said('compiled')}" * bool(
+    after = f"; after `python -m dhtorch.ops`, which compiles inner loops, {said('compiled')}" * bool(
         said("compiled")
     )
     return (

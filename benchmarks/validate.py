@@ -6,7 +6,7 @@
     (``views=False``) of
 :data:`dhtorch.validation.validate.QUICK_METHOD`, from the frames to the verdict; ``validate_sparse_512`` the same by 512
 samples of ``map``, and ``validate_views`` asks the pictures of the view as well. Rows of mode ``compiled`` use the compiled
-code of ``python -m dhtorch.ops.loader``. All take turns in one process, a second or more of frames in a row each, as a
+code of ``python -m dhtorch.ops``. All take turns in one process, a second or more of frames in a row each, as a
 data set is judged. The peer needs a motion like ours and gets one by the same method. Frames of TUM fr1/desk where
 DHTORCH_DATA is set, else of the built-in room; frames a second are 1000 / ms.
 """

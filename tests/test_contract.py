@@ -478,6 +478,8 @@ ELSEWHERE = {
     "dhtorch.geometry.inference_mode.run_without_grad",
     "dhtorch.geometry.least_squares.has_graph",
     "dhtorch.geometry.patches.product_is_exact",
+    *(f"dhtorch.geometry.patches.{name}" for name in ("fits_window_kernel", "window_arguments")),
+    *(f"dhtorch.geometry.plane_sweep.{name}" for name in ("new_cost_volume", "planes_last")),
     "dhtorch.geometry.reprojection_problem.squared_residuals_at",
     "dhtorch.geometry.windows.row_bands",
     "dhtorch.geometry.p3p.p3p_of_planes",
