@@ -159,8 +159,27 @@ class ExtendDepth(torch.nn.Module):
         paired = found.depth.new_zeros(B, dtype=torch.bool)
         problem = found.source.new_full((B,), SampleProblem.NO_SECOND_VIEW)
         nan = torch.full_like(found.depth, torch.nan)  # trackability is not computed here
-        front_end = Samples(found.uv, found.depth, found.sigma, seen.xyz, found.score, seen.flag, nan, seen.hole)
-        results = schema.SampleResults(front_end, found, seen.xyz, None, [], paired, pooled, None, problem)
+        front_end = Samples(
+            uv=found.uv,
+            depth=found.depth,
+            sigma=found.sigma,
+            xyz=seen.xyz,
+            confidence=found.score,
+            flag=seen.flag,
+            trackability=nan,
+            hole=seen.hole,
+        )
+        results = schema.SampleResults(
+            samples=front_end,
+            merged=found,
+            xyz=seen.xyz,
+            estimate=None,
+            fits=[],
+            paired=paired,
+            tokens=pooled,
+            dense=None,
+            problem=problem,
+        )
         self._counted(problem, seen.hw)
         return {self.prefix + key: x for key, x in schema.compute_columns(results, self._column_options()).items()}
 
@@ -190,7 +209,17 @@ class ExtendDepth(torch.nn.Module):
         tokens = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
         xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, merged.uv, merged.depth)
         problem = torch.tensor(_problem_codes(read, flagged), dtype=torch.int32, device=xyz.device)
-        found = schema.SampleResults(samples, merged, xyz, estimate, fits, paired, tokens, dense, problem)
+        found = schema.SampleResults(
+            samples=samples,
+            merged=merged,
+            xyz=xyz,
+            estimate=estimate,
+            fits=fits,
+            paired=paired,
+            tokens=tokens,
+            dense=dense,
+            problem=problem,
+        )
         added = schema.compute_columns(found, self._column_options())
         if self.views.pose is not None:
             label = poses.pose_label(self.views.pose)
