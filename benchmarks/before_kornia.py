@@ -84,7 +84,7 @@ def quaternion(R: list[list[float]]) -> list[float]:
 
 
 def resample(picture: Tensor, motion: Tensor) -> Tensor:
-    """That of ``studies.focal.sharpness``: pictures read at x (1 + m) + shift, bicubic."""
+    """That of ``experiments.focal.sharpness``: pictures read at x (1 + m) + shift, bicubic."""
     H, W = picture.shape[-2:]
     x = torch.arange(W, dtype=picture.dtype, device=picture.device)[None] - (W - 1) / 2
     y = torch.arange(H, dtype=picture.dtype, device=picture.device)[:, None] - (H - 1) / 2

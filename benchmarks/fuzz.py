@@ -24,10 +24,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
 
-import hostile  # noqa: E402
-import mutations  # noqa: E402
-import recoders  # noqa: E402
-from test_hostile import SAMPLES  # noqa: E402
+from support import byte_damage, damage_harness, format_damage  # noqa: E402
+from support.captures_by_format import SAMPLES  # noqa: E402
 
 from dhtorch.data.io.safe_open import MAX_MEMORY_BYTES  # noqa: E402
 from dhtorch.runtime import storage  # noqa: E402
@@ -46,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--case", type=int, help="one case of it")
     parser.add_argument("--json", type=Path, help="write a summary")
     options = parser.parse_args(argv)
-    hostile.SECONDS, hostile.BYTES = SECONDS, MAX_MEMORY_BYTES
+    damage_harness.SECONDS, damage_harness.BYTES = SECONDS, MAX_MEMORY_BYTES
     names = [options.only] if options.only else list(SAMPLES)
     numbers = [options.case] if options.case is not None else range(MANY if options.full else SOME)
     end = time.monotonic() + (MINUTES * 60 if not options.full else float("inf"))
@@ -69,17 +67,17 @@ def attack(name: str, numbers: Sequence[int], seed: int, stop: float) -> dict[st
     slowest = largest = 0.0
     with (
         tempfile.TemporaryDirectory(prefix="dhtorch-fuzz-") as folder,
-        hostile.sample(*SAMPLES[name], Path(folder)) as (good, outcome_of),
+        damage_harness.sample(*SAMPLES[name], Path(folder)) as (good, outcome_of),
     ):
         for number in numbers:
             if time.monotonic() > stop:
                 break
             draw = random.Random(f"{name}/{seed}/{number}")
-            what, want = (mutations.mutate if number % 2 else recoders.recode)(good, draw)
+            what, want = (byte_damage.mutate if number % 2 else format_damage.recode)(good, draw)
             outcome = outcome_of(want)
             counts[outcome.kind] += 1
             slowest, largest = max(slowest, outcome.seconds), max(largest, outcome.bytes / 2**20)
-            if outcome.kind not in hostile.FINE:
+            if outcome.kind not in damage_harness.FINE:
                 failures.append(f"{name} case {number} ({what}): {outcome.kind}: {outcome.detail[-500:]}")
                 print(failures[-1], flush=True)
     print(f"{name:20} {counts.total():5} cases, {dict(counts)}, at most {slowest:.1f} s, {largest:.0f} MiB", flush=True)

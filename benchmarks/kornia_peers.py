@@ -538,7 +538,7 @@ PEERS = (
         lambda d, B, N: (picture(d, B, 1, (64, 80)),),
         lambda x: before.gaussian(x, 2.0),
         lambda x: kf.gaussian_blur2d(x, 17, (2.0, 2.0), border_type="replicate"),
-        "slower on small pictures; those of the studies have 640×480 pixels",
+        "slower on small pictures; those of the experiments have 640×480 pixels",
         used="kornia",
         size=(2, 1),
         note="80×64, σ = 2 px",
@@ -564,7 +564,7 @@ PEERS = (
         note="640×480, second difference",
     ),
     Peer(
-        "studies.focal.sharpness (gradients)",
+        "experiments.focal.sharpness (gradients)",
         "filters.spatial_gradient",
         lambda d, B, N: (picture(d, B, 1),),
         lambda x: torch.stack(
@@ -576,7 +576,7 @@ PEERS = (
         note="640×480",
     ),
     Peer(
-        "studies.focal.filling.guided_filter",
+        "experiments.focal.filling.guided_filter",
         "filters.guided_blur",
         lambda d, B, N: (depths(d, B, 192 * 256).view(B, 192, 256), picture(d, B, 3, (192, 256))),
         filling.fill_guided,
@@ -586,7 +586,7 @@ PEERS = (
         note="256×192, every pixel with a return",
     ),
     Peer(
-        "studies.focal.sharpness (resampling)",
+        "experiments.focal.sharpness (resampling)",
         "geometry.transform.remap",
         lambda d, B, N: (picture(d, B), torch.tensor([[0.01, 1.3, -0.7]], dtype=d).repeat(B, 1)),
         before.resample,
@@ -597,7 +597,7 @@ PEERS = (
         note="640×480, bicubic",
     ),
     Peer(
-        "studies.baselines.dinov2.pixel_values (colours)",
+        "experiments.baselines.dinov2.pixel_values (colours)",
         "enhance.normalize",
         lambda d, B, N: (picture(d, B, 3, (224, 224)),),
         _normalised,

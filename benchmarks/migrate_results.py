@@ -142,6 +142,10 @@ def present_settings(settings: Any) -> Any:
     return {**IMPLIED.get(name, {}), **{present.get(option, option): value for option, value in node.items()}}
 
 
+#: Name of a row's method in an earlier version → its present name.
+METHODS = {"anchor": "align", "judge": "validate"}
+
+
 def present_key(key: str) -> str:
     """The present name of a summary key, column or experiment."""
     if key in KEYS:
@@ -151,13 +155,13 @@ def present_key(key: str) -> str:
 
 
 def present_rows(value: Any) -> Any:
-    """Rows with the present names of their columns, at every depth; a method called ``anchor`` is ``align``."""
+    """Rows with the present names of their columns, at every depth; and of their methods."""
     if isinstance(value, list):
         return [present_rows(item) for item in value]
     if not isinstance(value, Mapping):
         return value
     row = {present_key(key): present_rows(item) for key, item in value.items()}
-    return row | {"method": "align"} if row.get("method") == "anchor" else row
+    return row | {"method": METHODS[row["method"]]} if row.get("method") in METHODS else row
 
 
 def migrate(path: Path) -> None:
@@ -190,7 +194,9 @@ def _present_row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 #: Name of a benchmark row in an earlier version → its present name.
-ROW_NAMES = {"anchor_auto": "auto_reference_view", "auto_anchor": "auto_reference_view"}
+ROW_NAMES = {"anchor_auto": "auto_reference_view", "auto_anchor": "auto_reference_view"} | {
+    f"judge_{way}": f"validate_{way}" for way in ("sparse", "sparse_512", "views")
+}
 
 #: Mode of a benchmark row in an earlier version → its present name.
 MODES = {"native": "compiled", "compiled": "torch.compile"}

@@ -53,6 +53,7 @@ PLACES = (
     "pipeline/dense",
     "pipeline/surface",
     "ops/loader",
+    "ops/dispatch",
     "alignment",
     "validation",
     "metrics",

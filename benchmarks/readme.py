@@ -273,7 +273,7 @@ def loader_times() -> str:
         return " and ".join(f"{a['ours_ms']:.2g} ms with {x} ({b['ours_ms']:.2g} by batch)" for a, b, x in times)
 
     plain, _ = taken("single", "eager")
-    after = f"; after `python -m dhtorch.ops.loader`, which compiles inner loops, {said('native')}" * bool(
+    after = f"; after `python -m dhtorch.ops.loader`, which compiles inner loops, {said('compiled')}" * bool(
         said("compiled")
     )
     return (
@@ -358,7 +358,7 @@ def enriched() -> str:
     return f"{grid}\n\n{options}; processor time of {first['processor']}, {first['cores']} cores, beside other work."
 
 
-#: What the judge is to find, in words, and its bars.
+#: What validation is to find, in words, and its bars.
 FOUND = {
     "scale_found": ("metre off by a tenth: found, reference views with a baseline", "≥ 0.95"),
     "scale_found_5": ("metre off by a twentieth: found", "≥ 0.90"),
@@ -373,42 +373,42 @@ FOUND = {
     "called_right_wrong": ("pixels called consistent that are a fifth off", "≤ 0.01"),
     "called_right_wrong_worst": ("the same in the worst scene", ""),
     "called_right_wrong_cut": ("the same of maps that are cut at the depth that six in ten pixels are nearer than", ""),
-    "called_wrong_right": ("pixels of sound maps called wrong, of those judged", ""),
+    "called_wrong_right": ("pixels of sound maps called wrong, of those validated", ""),
     "known": ("pixels of sound maps of which something is said", ""),
     "named_worst": ("cause named, worst kind, windows moved by two pixels", "≥ 0.90"),
     "misnamed": ("cause named in sound windows", ""),
 }
 
 
-#: Columns of the judge's table: result, whose number, head.
-JUDGES = (
-    ("validate_study", "judge", "`judge`"),
-    ("validate_study_streams", "judge", "`judge`, streams"),
-    ("validate_study_unseen", "judge", "`judge`, rooms"),
+#: Columns of the table of validation: result, whose number, head.
+VALIDATIONS = (
+    ("validate_study", "validate", "`validate`"),
+    ("validate_study_streams", "validate", "`validate`, streams"),
+    ("validate_study_unseen", "validate", "`validate`, rooms"),
     ("validate_study", "quick", "`QUICK`, no pictures"),
     ("validate_study_streams", "quick", "`QUICK`, streams"),
     ("validate_study", "photometric", "photometric check"),
 )
 
 
-def judge() -> str:
-    """What the judge finds, beside a fixed-threshold photometric check and the bars."""
-    found = {name: json.loads((RESULTS / f"{name}.json").read_text()) for name, _, _ in JUDGES}
+def validated() -> str:
+    """What validation finds, beside a fixed-threshold photometric check and the bars."""
+    found = {name: json.loads((RESULTS / f"{name}.json").read_text()) for name, _, _ in VALIDATIONS}
     summary = {name: result["summary"] for name, result in found.items()}
     rows = []
     for name, (words, bar) in FOUND.items():
         values = []
-        for result, who, _ in JUDGES:
+        for result, who, _ in VALIDATIONS:
             key = (
-                f"judge.{name.removesuffix('_far')}_quick_far"
+                f"validate.{name.removesuffix('_far')}_quick_far"
                 if who == "quick" and name.endswith("_far")
                 else f"{who}.{name}"
             )
             values.append(summary[result].get(key, {}).get("value"))
         rows.append([words, *("" if value is None else f"{value:.3f}" for value in values), bar])
-    shares = [named_registration(found[result]["rows"]) if who == "judge" else "" for result, who, _ in JUDGES]
+    shares = [named_registration(found[result]["rows"]) if who == "validate" else "" for result, who, _ in VALIDATIONS]
     rows.append(["depth that is not registered: named, all windows", *shares, ""])
-    return table(["number", *(head for _, _, head in JUDGES), "bar"], rows)
+    return table(["number", *(head for _, _, head in VALIDATIONS), "bar"], rows)
 
 
 def named_registration(rows: list[dict[str, Any]]) -> str:
@@ -417,7 +417,7 @@ def named_registration(rows: list[dict[str, Any]]) -> str:
     return f"{names.count('registration')} of {len(names)}"
 
 
-def judged_real() -> str:
+def validated_real() -> str:
     """What is said of real sensors' own depth."""
     rows = []
     for row in json.loads((RESULTS / "validate_real.json").read_text()):
@@ -430,7 +430,7 @@ def judged_real() -> str:
     return table(["capture", "frames", "wrong, of what is known", "cannot be known", "likely cause (windows)"], rows)
 
 
-#: What anchoring is to reach, in words, and its bars.
+#: What alignment is to reach, in words, and its bars.
 ALIGNED = {
     "simulated_median": ("far error, map off by 1.3 % in shape and 5 % in scale, median", "≤ 0.02"),
     "ratio_to_near_affine": ("far error, ratio to an affine fit to near returns, median over faults", "≤ 0.5"),
@@ -440,11 +440,11 @@ ALIGNED = {
 }
 
 
-def anchored(*results: str) -> str:
-    """What anchoring reaches, of several results, beside its bars."""
+def aligned(*results: str) -> str:
+    """What alignment reaches, of several results, beside its bars."""
     found = [json.loads((RESULTS / f"{name}.json").read_text()) for name in results]
     rows = [
-        [words, *(f"{result['summary'][f'anchor.{name}']['value']:.3f}" for result in found), bar]
+        [words, *(f"{result['summary'][f'align.{name}']['value']:.3f}" for result in found), bar]
         for name, (words, bar) in ALIGNED.items()
     ]
     seeds = [result["config"]["data"].get("seed") for result in found]
@@ -496,11 +496,11 @@ TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": 
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
 TABLES |= {
-    "judge": judge,
-    "judge real": judged_real,
+    "validate": validated,
+    "validate real": validated_real,
     "clients": clients,
-    "anchor": partial(
-        anchored,
+    "align": partial(
+        aligned,
         *("align_study", "align_study_streams", "align_study_rooms"),
         *("align_study_unseen", "align_study_unseen_2", "align_study_unseen_3"),
     ),

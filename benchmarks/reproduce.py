@@ -13,7 +13,6 @@ import argparse
 import json
 import math
 import shlex
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -114,7 +113,7 @@ AGAIN = {"avx2": ("frontend", "lk", "pnp", "pair", "loader", "dense_speed"), "ke
 SCRIPTS |= {f"{name}_{how}": f"--{how} {SCRIPTS[name]}".strip() for how, names in AGAIN.items() for name in names}
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
-NAMED = {"kornia": "beside_kornia", "dense_speed": "dense", "clients": "clients/all", "validate_speed": "judge"}
+NAMED = {"kornia": "beside_kornia", "dense_speed": "dense", "clients": "clients/all", "validate_speed": "validate"}
 NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items() for name in names}
 
 #: Options that change no number, and which a file may hold otherwise.
@@ -164,6 +163,22 @@ def check(name: str) -> list[str]:
     return [f"{path.name}: {line}; run: {command(name)}" for line in differences(config, settings(name))]
 
 
+#: Experiments of whose single pairs a page reads numbers; of the others it only counts them.
+PAIR_ROWS_READ = {"validate_study"}
+
+_IDENTITY = ("scene", "pair", "method", "truth", "role", "note")
+
+
+def without_detail(result: Mapping[str, Any]) -> dict[str, Any]:
+    """A result as it is committed, without what no page reads: numbers of single pairs and overlays on pictures."""
+
+    def kept(row: Mapping[str, Any]) -> dict[str, Any]:
+        counted = row["pair"] is not None and result["experiment"] not in PAIR_ROWS_READ
+        return {k: v for k, v in row.items() if (k in _IDENTITY if counted else k != "overlay")}
+
+    return {**result, "rows": [kept(row) for row in result["rows"]]}
+
+
 def run(name: str) -> bool:
     """Make one result file; whether that went well."""
     print(f"== {command(name)}", flush=True)
@@ -174,7 +189,8 @@ def run(name: str) -> bool:
         words = [*command(name).split()[1:], f"output={folder}"]
         done = subprocess.run([sys.executable, "-m", "dhtorch", *words], cwd=folder, check=False)
         if done.returncode == 0:
-            shutil.copyfile(Path(folder) / "result.json", RESULTS / f"{name}.json")
+            result = result_files.read_result(Path(folder) / "result.json")
+            result_files.write_result(RESULTS / f"{name}.json", without_detail(result))
     return done.returncode == 0
 
 

@@ -138,7 +138,7 @@ FIELDS: dict[str, str] = {
 }
 
 #: Modules whose command builds the compiled operators, the current one first, and the variables that switch them on.
-BUILDERS = ("ops.loader", "ops.build", "ops", "native")
+BUILDERS = ("ops", "ops.loader", "ops.build", "native")
 SWITCHES = ("DHTORCH_OPS", "DHTORCH_NATIVE")
 
 #: Folders of the settings in a checkout.

@@ -2,10 +2,10 @@
 
     python benchmarks/validate.py --json benchmarks/results/validate_speed.json --clock cpu --repeats 9
 
-``judge_sparse``: :func:`dhtorch.validate_depth` of a map of 640×480 with one other view, by sparse evidence
+``validate_sparse``: :func:`dhtorch.validate_depth` of a map of 640×480 with one other view, by sparse evidence
     (``views=False``) of
-:data:`dhtorch.validation.validate.QUICK_METHOD`, from the frames to the verdict; ``judge_sparse_512`` the same by 512
-samples of ``map``, and ``judge_views`` asks the pictures of the view as well. Rows of mode ``native`` use the compiled
+:data:`dhtorch.validation.validate.QUICK_METHOD`, from the frames to the verdict; ``validate_sparse_512`` the same by 512
+samples of ``map``, and ``validate_views`` asks the pictures of the view as well. Rows of mode ``compiled`` use the compiled
 code of ``python -m dhtorch.ops.loader``. All take turns in one process, a second or more of frames in a row each, as a
 data set is judged. The peer needs a motion like ours and gets one by the same method. Frames of TUM fr1/desk where
 DHTORCH_DATA is set, else of the built-in room; frames a second are 1000 / ms.
@@ -43,7 +43,7 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
     def ours(method: Method, views: bool) -> None:
         validate_depth(reference.depth, near, other, method=method, views=views)
 
-    asked = {"judge_sparse": (QUICK_METHOD, False), "judge_sparse_512": (METHOD, False), "judge_views": (METHOD, True)}
+    asked = {"validate_sparse": (QUICK_METHOD, False), "validate_sparse_512": (METHOD, False), "validate_views": (METHOD, True)}
     modes = {"eager": ours, "compiled": harness.with_compiled_operators()(ours)}
     sides = [(name, mode) for mode in modes for name in asked]
     calls = [*(partial(modes[mode], *asked[name]) for name, mode in sides), check]

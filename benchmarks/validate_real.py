@@ -42,7 +42,7 @@ OF_FRAME = (
 
 def rows(path: Path, options: tuple[str, ...], folder: Path) -> list[dict[str, Any]]:
     """What is said of the recordings of a capture."""
-    words = [sys.executable, "-m", "dhtorch", "judge", str(path), f"output={folder}", "pictures=30", *options]
+    words = [sys.executable, "-m", "dhtorch", "validate", str(path), f"output={folder}", "pictures=30", *options]
     subprocess.run(words, check=True, cwd=folder)
     found = []
     for file in sorted(folder.rglob("validate.json")):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import base64
 import contextlib
+import importlib
 import inspect
 import io
 import json
@@ -19,6 +20,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 REPO = Path(__file__).resolve().parents[1]
@@ -36,7 +38,7 @@ from dhtorch.transforms import schema  # noqa: E402
 from dhtorch.viz.plots import colours as palette  # noqa: E402
 
 #: Words of the command with a help text of their own.
-WORDS = ("", "inspect", "report", "complete", "anchor", "judge", "extract", "integrate", "stream", "view")
+WORDS = ("", "inspect", "report", "complete", "align", "validate", "extract", "integrate", "stream", "view")
 
 _MARK = re.compile(r"^<!-- .*? -->\n", re.M)
 _ASKED = re.compile(
@@ -153,17 +155,29 @@ def parts() -> list[str]:
 def api_page(part: str) -> str:
     """One page for a module, or for a package with all its modules."""
     if part == "dhtorch":
-        head = ["| name | |", "| :-- | :-- |"]
-        names = [(name, getattr(dhtorch, name)) for name in dhtorch.__all__]
-        public = [f"| [`{n}`][{_home(n, x)}] | {_first(x.__doc__)} |" for n, x in names]
         others = [f"| [`{p}`]({p}.md) | {_first(_doc(p))} |" for p in parts()]
-        return "\n".join(["# dhtorch", "", module("dhtorch"), "", *head, *public, "", *head, *others])
+        return "\n".join(["# dhtorch", "", module("dhtorch"), "", *_public_table(dhtorch), "", *_TABLE_HEAD, *others])
     files = sorted((PACKAGE / part).rglob("*.py")) if (PACKAGE / part).is_dir() else [PACKAGE / f"{part}.py"]
-    return "\n\n".join([f"# {part}", *(_module(file) for file in files)])
+    package = importlib.import_module(f"dhtorch.{part}")
+    if not hasattr(package, "__all__"):
+        return "\n\n".join([f"# {part}", *(_module(file) for file in files)])
+    public = ["## Public names", "\n".join(_public_table(package)), "## Modules, internals included"]
+    return "\n\n".join([f"# {part}", *public, *(_module(file) for file in files)])
+
+
+_TABLE_HEAD = ["| name | |", "| :-- | :-- |"]
+
+
+def _public_table(package: ModuleType) -> list[str]:
+    """``__all__`` of a package as a table: each name, linked to where it is described, and its first sentence."""
+    names = [(name, getattr(package, name)) for name in package.__all__]
+    return [*_TABLE_HEAD, *(f"| [`{n}`][{_home(n, x)}] | {_first(x.__doc__)} |" for n, x in names)]
 
 
 def _home(name: str, value: Any) -> str:
     """The dotted name under which a public name is described."""
+    if isinstance(value, ModuleType):
+        return value.__name__
     return (
         f"dhtorch.pipeline.presets.{name}"
         if isinstance(value, dhtorch.Method)
@@ -220,7 +234,11 @@ def module(dotted: str) -> str:
 
 def reader(name: str) -> str:
     """What a reader says of its format, and how its options are named."""
-    wing = "dhtorch.data" if (REPO / "dhtorch" / "data" / f"{name}.py").is_file() else "dhtorch.experiments.focal"
+    wing = (
+        "dhtorch.data.readers"
+        if (REPO / "dhtorch/data/readers" / f"{name}.py").is_file()
+        else "dhtorch.experiments.focal"
+    )
     home = "dhtorch.synthetic.recording" if name == "synthetic" else f"{wing}.{name}"
     text = f"**`{home}`** — {module(home)}\n"
     options = REPO / "conf" / "data" / f"{name}.yaml"
@@ -272,7 +290,7 @@ def sample_columns() -> str:
 def asked() -> dict[str, dict[str, str]]:
     """Experiment → question, idea, expectation and refutation, as its docstring has them."""
     found = {}
-    for file in sorted((PACKAGE / "studies").rglob("*.py"), key=lambda p: p.stem):
+    for file in sorted((PACKAGE / "experiments").rglob("*.py"), key=lambda p: p.stem):
         text = ast.get_docstring(_tree(file)) or ""
         if text.startswith("Question:"):
             said = _ASKED.fullmatch(text)

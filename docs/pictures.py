@@ -73,7 +73,7 @@ def triptych(path: Path) -> None:
     (pair,) = (p for p in by_choice(scene, stride=1) if p.reference == FRAME)
     whole = recording[FRAME]
     near = range_split(whole, CUTOFF)
-    others = stack([range_split(recording[k], CUTOFF) for k in pair.offered])
+    others = stack([range_split(recording[k], CUTOFF) for k in pair.candidates])
     found = dense.complete_depth(near, others, calibration=calibration.load_calibration("dense"))
     image = whole.image[0].permute(1, 2, 0)
     depth, source = found.depth[0].numpy(), found.source[0].numpy()

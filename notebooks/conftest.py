@@ -1,15 +1,16 @@
-"""The first two articles run with every ``make test``, the others, which take minutes, with the slow tests."""
+"""Notebooks run in kernels of their own, which get minutes to start: the first import of torch on a busy machine with a
+cold disk cache takes longer than nbclient's 60 s."""
 
-import pytest
+from functools import partial
 
-QUICK = ("1_one_pair", "2_what_the_gate_buys")
+import nbmake.nb_run
+
+#: Time that a kernel may take until it answers, s.
+KERNEL_START_S = 600
+
+nbmake.nb_run.NotebookClient = partial(nbmake.nb_run.NotebookClient, startup_timeout=KERNEL_START_S)
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark them before the runner chooses."""
-    for item in items:
-        if item.path.suffix == ".ipynb":
-            item.add_marker(pytest.mark.timeout(1800))
-            if item.path.stem not in QUICK:
-                item.add_marker(pytest.mark.slow)
+    """Notebooks run last: by then the test processes have loaded torch from disk."""
+    items.sort(key=lambda item: item.path.suffix == ".ipynb")

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -74,7 +75,8 @@ def test_imports_go_down_only(path):
         other = module.parts[0]
         assert other in FLOOR, f"{relative}: imports {name}, which has no floor"
         assert other == part or FLOOR[other] < FLOOR[part], f"{relative}: imports {name}"
-        assert part != "stages" or other != part or module == Path("stages"), f"{relative}: a stage imports a stage"
+        alone = part != "stages" or other != part or path.stem == "__init__"
+        assert alone, f"{relative}: a stage imports a stage"
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
@@ -162,3 +164,50 @@ def test_no_module_shadows_the_standard_library_or_its_own_function():
         exported = {name for name in dir(dhtorch) if not name.startswith("_")}
         assert path.stem not in sys.stdlib_module_names or path.parent != ROOT, path
         assert not (path.stem in functions and path.stem in exported and path.parent == ROOT), path
+
+
+def functions_that_run_operators(tree):
+    """Of a module: names of functions that name ``torch.ops.dhtorch`` (None outside any), and of those passed to the
+    dispatch as kernels."""
+    inside, kernels = set(), set()
+    scopes = [(None, node) for node in tree.body]
+    while scopes:
+        name, node = scopes.pop()
+        name = node.name if name is None and isinstance(node, ast.FunctionDef) else name
+        if isinstance(node, ast.Attribute) and ast.unparse(node) == "torch.ops.dhtorch":
+            inside.add(name)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "operator":
+            kernels |= {ast.unparse(word.value) for word in node.keywords if word.arg == "kernel"}
+        scopes += [(name, child) for child in ast.iter_child_nodes(node)]
+    return inside, kernels
+
+
+def callers_of(tree, name):
+    """Names of a module's functions that call another one."""
+    functions = [f for f in tree.body if isinstance(f, ast.FunctionDef)]
+    calls = {f.name: {ast.unparse(n.func) for n in ast.walk(f) if isinstance(n, ast.Call)} for f in functions}
+    return {caller for caller, called in calls.items() if name in called}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_compiled_operators_run_through_the_dispatch_alone(path):
+    """Only kernels registered by ``operator(kernel=...)``, and what they alone call, name ``torch.ops.dhtorch``; nobody
+    outside ``dhtorch.ops`` imports the loader or asks whether tensors may be dispatched."""
+    relative = path.relative_to(ROOT)
+    if relative.parts[0] == "ops":
+        return
+    imported = {name for name, _ in imports(path) if name.startswith("dhtorch.ops")}
+    assert all(
+        name == "dhtorch.ops.dispatch.operator" or name.startswith("dhtorch.ops.constants.") for name in imported
+    )
+    tree = ast.parse(path.read_text())
+    inside, kernels = functions_that_run_operators(tree)
+    for name in inside - kernels:
+        assert name is not None and callers_of(tree, name), f"{relative}: {name} is no kernel"
+        assert callers_of(tree, name) <= kernels, f"{relative}: {name} is no kernel"
+
+
+def test_every_compiled_operator_has_a_kernel_that_runs_it():
+    named = {m for path in FILES for m in re.findall(r"torch\.ops\.dhtorch\.(\w+)", path.read_text())}
+    defined = {m for path in ROOT.glob("ops/csrc/*.cpp") for m in re.findall(r'm\.impl\("(\w+)"', path.read_text())}
+    assert named - {"scale"} == defined, "scale is the example of the dispatch"

@@ -7,6 +7,7 @@ import pkgutil
 
 import pytest
 import torch
+from support.contract_inputs import HW, cameras, generator, pixels, poses, shifted, tracked, uniform
 from support.contract_rows import PROMISES, NoMasksAsNumbers, Row, equal, leaves, reorder, take, tensor_map
 
 from dhtorch.alignment import (
@@ -15,7 +16,6 @@ from dhtorch.alignment import (
     references,
     residual_noise,
 )
-from dhtorch.experiments.baselines.device_pose import known_pose_fit
 from dhtorch.experiments.focal import blur, filling, sharpness
 from dhtorch.experiments.negative import arms, clusters, registration
 from dhtorch.experiments.probes import ridge as probe
@@ -63,42 +63,15 @@ from dhtorch.pipeline import (
     view_selection,
 )
 from dhtorch.pipeline.presets import MAP, PAPER, WINDOW
-from dhtorch.records import Camera, Frame, Samples, Tracks
+from dhtorch.records import Frame
 from dhtorch.stages import backproject, holes, pose, pose_prior, score, track, triangulate
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.validation import evidence, faults, validate
 
-HW = (48, 64)
 FEW = 11  # points; no other axis of any answer is as long
 
 
 # ---------------------------------------------------------------------------------------------------- inputs
-
-
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def uniform(*shape, dtype, low=0.0, high=1.0, seed=0):
-    return (low + (high - low) * torch.rand(*shape, generator=generator(seed), dtype=torch.float64)).to(dtype)
-
-
-def cameras(batch, dtype, distorted=False, seed=0):
-    f = uniform(batch, 2, dtype=dtype, low=60, high=70, seed=seed)
-    c = uniform(batch, 2, dtype=dtype, low=22, high=32, seed=seed + 1)
-    k = torch.tensor([0.05, -0.02, 0.001, -0.002, 0.01], dtype=dtype).expand(batch, 5).clone() if distorted else None
-    return Camera(f, c, k)
-
-
-def pixels(batch, n, dtype, margin=3.0, seed=0):
-    low, high = torch.tensor([margin, margin]), torch.tensor([HW[1] - 1 - margin, HW[0] - 1 - margin])
-    return uniform(batch, n, 2, dtype=dtype, seed=seed) * (high - low).to(dtype) + low.to(dtype)
-
-
-def poses(batch, dtype, seed=0):
-    xi = uniform(batch, 6, dtype=dtype, low=-0.1, high=0.1, seed=seed)
-    xi[:, 3] += 0.3
-    return se3.exp(xi)
 
 
 def frames(batch, n, dtype):
@@ -114,22 +87,6 @@ def frames(batch, n, dtype):
 def sampled(batch, n, dtype):
     frame, uv = frames(batch, n, dtype)
     return frame, backproject.backproject(frame, uv)
-
-
-def tracked(batch, n, dtype, noise=0.2):
-    """Samples, tracks, exact pose and two different cameras."""
-    camera_0, camera_1 = cameras(batch, dtype), cameras(batch, dtype, seed=5)
-    uv_0, depth, T = pixels(batch, n, dtype), uniform(batch, n, dtype=dtype, low=1, high=4, seed=3), poses(batch, dtype)
-    uv_1 = camera.project(camera_1, se3.apply(T, camera.unproject(camera_0, uv_0, depth)))
-    uv_1 = uv_1 + noise * uniform(batch, n, 2, dtype=dtype, low=-1, seed=4)
-    xyz = camera.unproject(camera_0, uv_0, depth)
-    zero = torch.zeros_like(depth)
-    code = zero.to(torch.int32)
-    samples = Samples(uv_0, depth, 0.01 * depth, xyz, zero + 1, code, zero + 1, code)
-    eye = torch.eye(2, dtype=dtype).expand(batch, n, 2, 2) * 0.04
-    tracks = Tracks(uv_0, uv_1, zero, zero, eye.clone(), zero == 0)
-    cov = (1e-6 * torch.eye(6, dtype=dtype)).expand(batch, 6, 6).clone()
-    return samples, tracks, known_pose_fit(T, n).replace(cov=cov), camera_0, camera_1
 
 
 def held(batch, n, dtype):
@@ -177,15 +134,6 @@ def posed(batch, n, dtype):
     samples, tracks, _, camera_0, camera_1 = tracked(batch, n, dtype, noise=0.0)
     tracks = tracks.replace(valid=tracks.valid & (torch.arange(n) < 17))
     return samples, tracks, camera_0, camera_1, uniform(1, 64, 3, dtype=torch.float64).expand(batch, 64, 3)
-
-
-def shifted(batch, n, dtype):
-    """A band-limited picture and its copy moved by a few pixels."""
-    size = (batch, 1, HW[0] + 4, HW[1] + 4)
-    rough = uniform(*size, dtype=torch.float64, seed=7)
-    smooth = torch.nn.functional.avg_pool2d(rough, 5, 1, 2)
-    smooth = ((smooth - 0.5) * 4 + 0.5).clamp(0, 1).to(dtype)
-    return smooth[..., :-4, :-4], smooth[..., 2:-2, 1:-3], pixels(batch, n, dtype, margin=14.0)
 
 
 def pyramids(batch, n, dtype):
@@ -525,18 +473,18 @@ ROWS = [
 #: Functions without a batch of points: samplers, loops over a callable, flat lists of pooled points. Their promises are
 #: tested where they are at home (test_front_end.py, test_pose.py, test_errors.py, test_integrate.py).
 ELSEWHERE = {
-    *(f"dhtorch.stages.pose_prior.{name}" for name in ("from_frames", "without")),
-    *(f"dhtorch.stages.backproject.{name}" for name in ("around", "places")),
+    *(f"dhtorch.stages.pose_prior.{name}" for name in ("priors_from_frames", "reject_poses")),
+    *(f"dhtorch.stages.backproject.{name}" for name in ("window_sizes", "project_samples")),
     "dhtorch.geometry.inference_mode.run_without_grad",
     "dhtorch.geometry.least_squares.has_graph",
     "dhtorch.geometry.patches.product_is_exact",
     "dhtorch.geometry.reprojection_problem.squared_residuals_at",
     "dhtorch.geometry.windows.row_bands",
     "dhtorch.geometry.p3p.p3p_of_planes",
-    *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel", "grid")),
+    *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel_spiral", "regular_grid")),
     *(
         f"dhtorch.geometry.checks.{name}"
-        for name in ("all_finite", "check", "is_static", "is_transformed", "perhaps_any", "surely_all")
+        for name in ("all_finite", "check", "is_static", "is_transformed", "any_possible", "all_known")
     ),
     *(f"support.reference.{name}" for name in ("patch", "nearest", "luma", "offsets", "levels")),
     *(
@@ -544,71 +492,71 @@ ELSEWHERE = {
         for name in ("lucas_kanade", "search", "descend", "template", "one_step", "leap", "difference", "within")
     ),
     *(f"support.reference.{name}" for name in ("register", "register_step", "composed", "believed", "nearest_inside")),
-    *(f"dhtorch.geometry.sparse_grid.{name}" for name in ("occupied", "components")),
-    *(f"dhtorch.integrate.volume.{name}" for name in ("empty", "fuse", "reserve", "confirmed", "splat")),
+    *(f"dhtorch.geometry.sparse_grid.{name}" for name in ("occupied_cells", "connected_components")),
+    *(f"dhtorch.integrate.volume.{name}" for name in ("make_volume", "fuse_views", "reserve_blocks", "drop_unconfirmed", "splat_points")),
     "dhtorch.integrate.sweeps.depth_step_rel",
-    *(f"dhtorch.integrate.surface.{name}" for name in ("points", "mesh")),
+    *(f"dhtorch.integrate.surface.{name}" for name in ("extract_points", "extract_mesh")),
     "dhtorch.integrate.picture.draw_map",
     "dhtorch.integrate.from_maps.fuse_frame_maps",
-    *(f"dhtorch.integrate.scales.{name}" for name in ("coarse", "union")),
-    *(f"dhtorch.integrate.mapping.{name}" for name in ("make", "run", "voxel_of", "meshed", "write", "write_surface")),
-    *(f"dhtorch.integrate.level.{name}" for name in ("upwards", "mean_upwards", "floor", "standing", "directions")),
+    *(f"dhtorch.integrate.scales.{name}" for name in ("choose_coarse_voxel", "merge_surfaces")),
+    *(f"dhtorch.integrate.mapping.{name}" for name in ("map_scene", "run", "choose_voxel", "should_mesh", "write_mapped_scene", "write_surface")),
+    *(f"dhtorch.integrate.level.{name}" for name in ("estimate_up", "mean_camera_up", "_fit_floor_normal", "_fit_upright_direction", "_spiral_directions")),
     "dhtorch.geometry.se3.turn_between",
     *(
         f"dhtorch.integrate.recording.{name}"
         for name in (
-            "ask",
-            "place",
-            "chain",
-            "build",
-            "build_grids",
-            "coverage",
-            "sensed",
-            "recovered",
-            "swept",
-            "mapped",
+            "estimate_pairs",
+            "place_frames",
+            "linking_pairs",
+            "fuse_recording",
+            "fuse_recording_grids",
+            "measure_coverage",
+            "view_from_sensor",
+            "view_from_recovered",
+            "view_from_sweep",
+            "view_from_depth_map",
         )
     ),
     "dhtorch.geometry.filters.gaussian_taps",
     "dhtorch.pipeline.multiview.estimate_multiview",
     *(
         f"dhtorch.pipeline.pair.{name}"
-        for name in ("ask_pair", "tracked", "under_pose", "merge", "lifted", "undistort_tracks", "uniform_draws")
+        for name in ("estimate_pair", "track_in_chunks", "solve_pose_and_triangulate", "merge", "upcast_intrinsics", "undistort_tracks", "uniform_draws")
     ),
     *(f"dhtorch.pipeline.method.{name}" for name in ("parts", "networks", "options")),
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.fuse_consistent",
     "dhtorch.geometry.free_space.free_space_violations",
-    *(f"dhtorch.pipeline.view_selection.{name}" for name in ("by_probes", "shrunk", "weighed")),
-    *(f"dhtorch.geometry.coarse_flow.{name}" for name in ("small", "is_turned", "inverse")),
+    *(f"dhtorch.pipeline.view_selection.{name}" for name in ("select_views_by_preview", "downscale_frame", "rank_views")),
+    *(f"dhtorch.geometry.coarse_flow.{name}" for name in ("downscale", "is_not_identity", "invert_similarity")),
     "dhtorch.stages.track.resolve_coarse_flow",
     "dhtorch.geometry.patches.whole_is_faster",
-    *(f"dhtorch.geometry.plane_sweep.{name}" for name in ("add_costs", "level", "misfit", "rivals")),
+    *(f"dhtorch.geometry.plane_sweep.{name}" for name in ("add_census_costs", "rectify_view", "census_cost", "second_best_margin")),
     *(
         f"dhtorch.pipeline.dense.{name}"
-        for name in ("complete", "map_hw", "options", "pixels", "resized", "sensed", "shipped")
+        for name in ("complete_depth", "map_hw", "dense_options", "map_pixel_centres", "downscale_grey", "sensor_depth_map", "default_calibration")
     ),
-    *(f"dhtorch.pipeline.dense.{name}" for name in ("swept", "views_asked", "worthiest")),
+    *(f"dhtorch.pipeline.dense.{name}" for name in ("sweep_depth", "selected_views", "top_views")),
     "dhtorch.pipeline.dense.source_view_of",
-    *(f"dhtorch.pipeline.surface.{name}" for name in ("best_planes", "fitted", "pose_variance")),
-    *(f"dhtorch.validation.validate.{name}" for name in ("judge", "judged", "decided", "cut", "share")),
+    *(f"dhtorch.pipeline.surface.{name}" for name in ("sweep_planes", "refine_surface", "pose_variance")),
+    *(f"dhtorch.validation.validate.{name}" for name in ("validate_depth", "validate_against", "combine_evidence", "clipped_depth", "share_interval")),
     *(
         f"dhtorch.validation.evidence.{name}"
-        for name in ("references", "extent", "coarser", "centres", "loosened", "silent")
+        for name in ("validation_references", "resolution_sigma", "is_coarser", "pixel_centres", "inflate_sigma", "no_evidence")
     ),
     *(
         f"dhtorch.validation.evidence.{name}"
-        for name in ("sparse_evidence", "by_views", "consistency_evidence", "nearest_surface")
+        for name in ("sparse_evidence", "photometric_evidence", "consistency_evidence", "nearest_surface")
     ),
-    *(f"dhtorch.validation.faults.{name}" for name in ("turned", "name_cause", "decided", "watch", "ray_lengths")),
+    *(f"dhtorch.validation.faults.{name}" for name in ("rot90_map", "diagnose", "select_cause", "track_window", "ray_lengths")),
     "dhtorch.metrics.detection.auroc",
     "dhtorch.alignment.align.align_depth",
-    *(f"dhtorch.alignment.references.{name}" for name in ("gathered", "at_anchors", "spread_within")),
+    *(f"dhtorch.alignment.references.{name}" for name in ("collect_references", "sample_at_references", "local_spread")),
     *(
         f"dhtorch.alignment.error_model.{name}"
-        for name in ("basis_of", "fields", "curves", "log_depth", "predicted", "fit")
+        for name in ("make_basis", "evaluate_fields", "evaluate_curves", "predict_log_depth", "predict_references", "fit_models")
     ),
-    *(f"dhtorch.alignment.error_model.{name}" for name in ("reading", "freedom_of", "leans", "between_nodes")),
+    *(f"dhtorch.alignment.error_model.{name}" for name in ("placement_variance", "estimate_freedom", "motion_error_basis", "interpolation_variance")),
     "dhtorch.alignment.residual_noise.residual_variance",
     "dhtorch.geometry.determinism.round_up",
     "dhtorch.geometry.least_squares.minimise",
@@ -617,30 +565,30 @@ ELSEWHERE = {
         f"dhtorch.geometry.lucas_kanade.{n}"
         for n in ("search", "step", "squares", "window_covariance", "for_some", "within")
     ),
-    *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search")),
-    *(f"dhtorch.metrics.errors.{name}" for name in ("points", "select", "measure", "summarise", "unit")),
+    *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search_hypotheses")),
+    *(f"dhtorch.metrics.errors.{name}" for name in ("make_points", "points_from_estimate", "measure_errors", "summarise_scenes", "metric_unit")),
     *(
         f"dhtorch.metrics.risk.{name}"
-        for name in ("ause", "capped", "curve", "measure", "realised", "risk_coverage", "surest")
+        for name in ("ause", "cap_error", "risk_curve", "measure_risk", "realised_risk", "risk_coverage", "keep_surest")
     ),
     *(
         f"dhtorch.metrics.reliability.{n}"
         for n in ("diagram", "excess_ece", "pool", "measure", "ece_interval", "leave_one_room_out")
     ),
-    *(f"dhtorch.calibration.score_calibration.{name}" for name in ("fit", "fit_sigma", "from_json")),
-    *(f"dhtorch.calibration.monotone.{name}" for name in ("isotonic", "pool_adjacent_violators", "platt")),
+    *(f"dhtorch.calibration.score_calibration.{name}" for name in ("fit_calibration", "fit_sigma_model", "parse_calibration")),
+    *(f"dhtorch.calibration.monotone.{name}" for name in ("fit_isotonic", "_pool_adjacent_violators", "fit_platt")),
     *(
         f"dhtorch.metrics.control.{name}"
-        for name in ("plug_in", "most_scenes", "conformal", "scenes_needed", "p_value")
+        for name in ("plug_in_threshold", "scene_quantile_threshold", "conformal_threshold", "scenes_needed", "_hoeffding_bentkus_p_value")
     ),
     *(
         f"dhtorch.experiments.compare_methods.{name}"
-        for name in ("against", "completed", "equal_coverage", "method_ratios", "promises", "ratio_over_seeds")
+        for name in ("multiview_ratios", "complete_scenes", "cut_to_equal_coverage", "method_ratios", "evaluate_promises", "ratio_over_seeds")
     ),
     "dhtorch.metrics.curves.sample_curves",
-    *(f"dhtorch.metrics.correlation.{name}" for name in ("pearson", "spearman", "ranks")),
-    *(f"dhtorch.metrics.bootstrap.{name}" for name in ("interval", "interval_of", "resample", "single")),
-    *(f"dhtorch.experiments.probes.ridge.{name}" for name in ("columns", "folds", "mean_error", "ratio", "equivalent")),
+    *(f"dhtorch.metrics.correlation.{name}" for name in ("pearson", "spearman", "_ranks")),
+    *(f"dhtorch.metrics.bootstrap.{name}" for name in ("interval_over_scenes", "interval_of_statistic", "resample_scenes", "without_interval")),
+    *(f"dhtorch.experiments.probes.ridge.{name}" for name in ("select_features", "make_folds", "mean_squared_error", "error_ratio", "is_equivalent")),
 }
 
 
@@ -672,7 +620,7 @@ def test_masks_are_no_numbers(row):
 
 
 def test_no_method_counts_with_masks():
-    """The seats in a row, of a view, of several, and the room that they look at."""
+    """All stages of a method with one and several source views, and the synthetic room."""
     room = SyntheticRoom(n_frames=3, hw=(96, 128), depth_hw=(24, 32))
     frames = [room[i] for i in range(3)]
     with NoMasksAsNumbers():

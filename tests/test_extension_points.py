@@ -129,6 +129,7 @@ def read(root):
 def test_a_reader_is_a_module_and_a_line(fork):
     fork.write("dhtorch/data/readers/stacked.py", READER)
     fork.insert("dhtorch/data/__init__.py", "    frames_dir,\n", "    stacked,\n")
+    fork.insert("dhtorch/data/__init__.py", '    "frames_dir": frames_dir,\n', '    "stacked": stacked,\n')
     assert len(fork.changed()) == 2
     said = fork.run("""
 import numpy as np

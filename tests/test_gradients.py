@@ -1,4 +1,4 @@
-"""Gradients at work: what they recover, and that compiled graphs, vmap, forward and reverse mode agree about them."""
+"""Gradients through the stages: what they recover, and that compiled graphs, vmap, forward and reverse mode agree."""
 
 import math
 import shutil
@@ -6,8 +6,8 @@ from functools import partial
 
 import pytest
 import torch
+from support.contract_inputs import shifted, tracked
 from support.contract_rows import leaves, tensor_map
-from test_contract import shifted, tracked
 from torch.func import jacfwd, jacrev, vmap
 from torch.utils import _pytree as torch_pytree
 
@@ -295,7 +295,7 @@ def test_gradients_reach_everything_a_pair_is_made_of(pair, name):
 
 
 @pytest.mark.parametrize("name", [*CHEAP, *MORE, *LARGE])
-def test_silent_points_pass_no_nan(stages, name):
+def test_points_without_an_answer_pass_no_nan(stages, name):
     """Half of the points are spoilt (no number, no track, no return): gradients stay finite everywhere."""
     fn, args = stages[name]
 
@@ -334,7 +334,7 @@ def test_a_pair_without_any_answer_has_finite_gradients(pair, name):
 
 @pytest.fixture(scope="module")
 def single():
-    """Frames in single precision and what each method says about them."""
+    """Frames in single precision and the estimate of each method."""
     frames = [f.to(torch.float32) for f in views(room(), 0, 16)]
     return frames, {name: METHODS[name](*frames, n=N) for name in ("paper", "map")}
 

@@ -1,7 +1,6 @@
-"""What is known in metres on the pixels of somebody's map: near returns, far answers, other maps.
+"""Metric references on the pixels of a depth map: near returns, far answers and other maps.
 
-Alphabet: ``x`` value of the map at a reference, ``depth`` what the reference says, ``var`` the variance of its
-    logarithm.
+Alphabet: ``x`` value of the map at a reference, ``depth`` of the reference, m, ``var`` variance of its logarithm.
 """
 
 from __future__ import annotations
@@ -13,45 +12,32 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS, AlignmentOptions
 from dhtorch.codes import Source
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.records import DepthMap, Estimate, Samples
 
-#: References of one source that are used at most, evenly spread over its samples or pixels.
-MAX_REFERENCES_PER_SOURCE: Final = 512
-
-#: Relative error that every return may have beside what it states.
-MIN_RETURN_ERROR: Final = 0.01
-
-#: Relative error that far answers have beside what they state, each alone and all together: matches that slip, and
-#: motions that their covariance takes for better than they are.
-FAR_OWN_ERROR, FAR_SHARED_ERROR = 0.02, 0.05
-
-#: Share of a far map's variance that all its pixels share (its motion's).
-MAP_SHARED_RATIO: Final = 0.5
-
-#: Blocks (rows, columns) of the picture whose references have errors in common, and share of the variance that they
-#: have.
+#: Blocks (rows, columns) of the picture within which errors of references are correlated.
+#: Source: chosen on data=shared_scenes, align_study.json.
 ERROR_BLOCKS: Final = (6, 8)
-BLOCK_CORRELATION: Final = 0.3
 
 
 class MetricReferences(NamedTuple):
-    """What is known in metres, on pixels of the map; (B, N) each."""
+    """References in metres on pixels of the map; (B, N) each."""
 
-    share: Tensor  # (B, N, 2) place, share of width and height
-    x: Tensor  # the map there
-    within: Tensor  # standard deviation of the map about the pixel that is read
+    share: Tensor  # (B, N, 2) place, as fractions of width and height
+    x: Tensor  # value of the map there
+    within: Tensor  # standard deviation of the map within the pixel
     depth: Tensor  # m
-    var: Tensor  # of log depth, what each has alone
-    shared: Tensor  # standard deviation of log depth that all far ones have in common
+    var: Tensor  # of log depth, the independent part
+    shared: Tensor  # standard deviation of log depth that all far references share
     near: Tensor  # bool
     used: Tensor  # bool
 
     @property
     def block(self) -> Tensor:
-        """Part (B, N) int64 of the picture; near and far ones of one part are two."""
+        """Index (B, N) int64 of the block of the picture; near and far references of one part have two."""
         rows, columns = ERROR_BLOCKS
         cell = (self.share * self.share.new_tensor([columns, rows])).floor().long()
         column, row = cell[..., 0].clamp(0, columns - 1), cell[..., 1].clamp(0, rows - 1)
@@ -59,76 +45,89 @@ class MetricReferences(NamedTuple):
 
     @property
     def of_block(self) -> Tensor:
-        """Which references are in which block (B, N, blocks): 1, else 0."""
+        """Block membership of references (B, N, blocks): 1 in its block, else 0."""
         return F.one_hot(self.block, 2 * ERROR_BLOCKS[0] * ERROR_BLOCKS[1]).to(self.x)
 
-    def weight(self, used: Tensor) -> Tensor:
-        """How many references each of those ``used`` (B, N) counts as among its block's, 0 of the others."""
+    def weight(self, used: Tensor, options: AlignmentOptions = DEFAULT_ALIGNMENT_OPTIONS) -> Tensor:
+        """Weight (B, N) of each of the ``used`` references (B, N) among correlated ones of its block, else 0."""
         count = self.x.new_zeros(len(used), 2 * ERROR_BLOCKS[0] * ERROR_BLOCKS[1])
         count = count.scatter_add(1, self.block, used.to(count)).gather(1, self.block)
-        return used / (1 + BLOCK_CORRELATION * (count - 1).clamp_min(0))
+        return used / (1 + options.block_correlation * (count - 1).clamp_min(0))
 
 
 def collect_references(
     x: Tensor,  # (B, h, w)
     given: Sequence[Samples | Estimate | DepthMap],
     hw: tuple[int, int],
+    options: AlignmentOptions = DEFAULT_ALIGNMENT_OPTIONS,
 ) -> MetricReferences:
-    """All references on the pixels of a map, NaN where it has no value; those without one are not used.
+    """Map and reference sources -> all references on the pixels of the map; those on a missing value are not used.
 
     Args:
-        x: the map.
+        x: the map, NaN where it has no value.
         given: near returns (usable ``Samples``), far answers (``Estimate``), maps (``DepthMap``).
         hw: height and width of the picture in whose pixels samples and estimates are.
+        options: errors of references beyond the stated ones, and their largest number.
 
     Gradient: to map, depth and sigma. Raises ValueError for wrong shapes.
     """
-    parts = [_of_map(one) if isinstance(one, DepthMap) else _of_points(one, hw) for one in given]
-    found = []
-    for share, depth, sigma, together, near, keep in parts:
+    parts = [
+        _from_map(source, options) if isinstance(source, DepthMap) else _from_points(source, hw) for source in given
+    ]
+    per_source = []
+    for share, depth, sigma, sigma_shared, near, keep in parts:
         check("collect_references", depth_map=(x, "B h w"), references=(share, "B N 2"))
         n = depth.shape[1]
-        pick = torch.linspace(0, n - 1, min(n, MAX_REFERENCES_PER_SOURCE), device=x.device).round().long()
-        found.append(_read(x, share[:, pick], tuple(part[:, pick] for part in (depth, sigma, together, near, keep))))
-    return MetricReferences(*(torch.cat(parts, 1) for parts in zip(*found, strict=True)))
+        pick = torch.linspace(0, n - 1, min(n, options.max_references_per_source), device=x.device).round().long()
+        columns = tuple(part[:, pick] for part in (depth, sigma, sigma_shared, near, keep))
+        per_source.append(_place_on_map(x, share[:, pick], columns, options))
+    return MetricReferences(*(torch.cat(parts, 1) for parts in zip(*per_source, strict=True)))
 
 
-def _of_map(one: DepthMap) -> tuple[Tensor, ...]:
-    depth, sigma = one.depth.double(), one.sigma.double()
+def _from_map(source: DepthMap, options: AlignmentOptions) -> tuple[Tensor, ...]:
+    """Place, depth, sigma, shared sigma, near, keep of every pixel of a map, (B, N) each."""
+    depth, sigma = source.depth.double(), source.sigma.double()
     rows, columns = (torch.arange(n, device=depth.device).double() for n in depth.shape[-2:])
     v, u = torch.meshgrid((rows + 0.5) / len(rows), (columns + 0.5) / len(columns), indexing="ij")
     share = torch.stack([u, v], -1).flatten(0, 1).expand(len(depth), -1, -1)
-    depth, sigma, keep, near = (p.flatten(1) for p in (depth, sigma, one.keep, one.source == Source.SENSOR))
-    return share, depth, sigma, MAP_SHARED_RATIO**0.5 * sigma, near, keep
+    depth, sigma, keep, near = (p.flatten(1) for p in (depth, sigma, source.keep, source.source == Source.SENSOR))
+    return share, depth, sigma, options.map_shared_ratio**0.5 * sigma, near, keep
 
 
-def _of_points(one: Samples | Estimate, hw: tuple[int, int]) -> tuple[Tensor, ...]:
-    depth, sigma = one.depth.double(), one.sigma.double()
-    share = (one.uv.double() + 0.5) / one.uv.new_tensor([hw[1], hw[0]]).double()
-    if isinstance(one, Samples):
-        return share, depth, sigma, torch.zeros_like(sigma), torch.ones_like(one.usable), one.usable
-    return share, depth, sigma, one.sigma_shared.double(), torch.zeros_like(one.keep), one.keep
+def _from_points(source: Samples | Estimate, hw: tuple[int, int]) -> tuple[Tensor, ...]:
+    """Place, depth, sigma, shared sigma, near, keep of samples or estimates, (B, N) each."""
+    depth, sigma = source.depth.double(), source.sigma.double()
+    share = (source.uv.double() + 0.5) / source.uv.new_tensor([hw[1], hw[0]]).double()
+    if isinstance(source, Samples):
+        return share, depth, sigma, torch.zeros_like(sigma), torch.ones_like(source.usable), source.usable
+    return share, depth, sigma, source.sigma_shared.double(), torch.zeros_like(source.keep), source.keep
 
 
-def _read(x: Tensor, share: Tensor, told: tuple[Tensor, ...]) -> MetricReferences:
-    """The map at references, and their variances."""
-    depth, sigma, together, near, keep = told
+def _place_on_map(x: Tensor, share: Tensor, columns: tuple[Tensor, ...], options: AlignmentOptions) -> MetricReferences:
+    """References at places (B, N, 2) with the values of the map there and their variances."""
+    depth, sigma, sigma_shared, near, keep = columns
     value, inside = sample_at_references(x, share)
     use = keep & inside & value.isfinite() & depth.isfinite() & (depth > 0) & sigma.isfinite() & (sigma >= 0)
     z = torch.where(use, depth, 1.0)
-    rel, common = (torch.where(use & (s >= 0), s / z, 0.0) for s in (sigma, together))
-    common = torch.where(near, 0.0, common)
-    var = (rel.square() - common.square()).clamp_min(0) + MIN_RETURN_ERROR**2 + torch.where(near, 0.0, FAR_OWN_ERROR**2)
-    common = torch.where(near, 0.0, (common.square() + FAR_SHARED_ERROR**2).sqrt())
+    rel, shared = (torch.where(use & (s >= 0), s / z, 0.0) for s in (sigma, sigma_shared))
+    shared = torch.where(near, 0.0, shared)
+    var = (
+        (rel.square() - shared.square()).clamp_min(0)
+        + options.min_return_error**2
+        + torch.where(near, 0.0, options.far_own_error**2)
+    )
+    shared = torch.where(near, 0.0, (shared.square() + options.far_shared_error**2).sqrt())
     share = torch.where(use[..., None], share, 0.5)
-    told_x = torch.where(use, value, 1.0)
+    x_at = torch.where(use, value, 1.0)
     within = torch.where(use, sample_at_references(local_spread(x), share)[0], 0.0)
-    return MetricReferences(share=share, x=told_x, within=within, depth=z, var=var, shared=common, near=near, used=use)
+    return MetricReferences(share=share, x=x_at, within=within, depth=z, var=var, shared=shared, near=near, used=use)
 
 
 def local_spread(x: Tensor) -> Tensor:
-    """Standard deviation (B, h, w) by which a map differs about each of its pixels: a return and the value of the map
-    stand somewhere in theirs, evenly up to the next pixel on either side. A step to no value (NaN) is none.
+    """Standard deviation (B, h, w) of a map within each of its pixels.
+
+    A return and the value of the map lie somewhere in their pixels, uniformly up to the next pixel on either side. A
+    step to a missing value (NaN) counts as none.
 
     Gradient: none.
     """

@@ -1,8 +1,8 @@
-"""``dhtorch reference``: maps of any depth network or sensor in metres, aligned in a recording's own returns.
+"""``dhtorch align``: depth maps of any network or sensor -> metric depth and sigma, aligned to a recording's returns.
 
-Frames are written as ``dhtorch complete`` writes them: whole or not there, a recording again where the format can hold
-it. ``reference.json`` holds what was done to every map, ``reference.html`` shows it, worst first. The exit code is 1
-where a limit of ``fail_on`` is exceeded.
+Frames are written as by ``dhtorch complete``: each frame completely or not at all, and the folder is a recording again
+where the format allows. ``align.json`` holds the alignment of every map, ``align.html`` shows the maps, worst first.
+The exit code is 1 where a limit of ``fail_on`` is exceeded.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ from dhtorch.viz.viewer import validation as pages
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
 
-#: What ``fail_on`` may name → what is held against the limit, in words. All are of a whole recording.
+#: Names that ``fail_on`` accepts → the quantity compared with the limit, over a whole recording.
 _ALIGNMENT_LIMITS = {
     "scale": "|median scale - 1| of the frames, of kind=metric",
-    "change": "median share by which depths were changed, of kind=metric",
+    "change": "median relative change of depth, of kind=metric",
     "sigma": "median sigma / depth of the frames",
-    "silent": "share of the pixels of the maps that are silent",
-    "unanchored": "share of the frames with a map that could not be aligned",
+    "silent": "fraction of the maps' pixels without an answer",
+    "unaligned": "fraction of the maps that could not be aligned",
 }
 
 #: Columns of the page's table.
 _TABLE_COLUMNS = ("model", "scale", "sigma / depth", "silent", "near references", "far references")
 
-#: Options that decide what the files of a frame hold.
+#: Options that determine the content of a frame's files; they enter the key.
 _KEY_OPTIONS = (
     "data",
     "method",
@@ -71,7 +71,7 @@ _KEY_OPTIONS = (
     "arrays",
 )
 
-#: Modules that decide what is found beside those that the settings name.
+#: Modules that determine the result, beside those that the settings name.
 _CODE_ROOTS = (
     "dhtorch.alignment.align",
     "dhtorch.pipeline.view_report",
@@ -79,18 +79,19 @@ _CODE_ROOTS = (
     "dhtorch.export.frames",
 )
 
-#: Median sigma / depth below which maps and near returns are of one source: no two sensors agree so well.
+#: Median sigma / depth below which maps and near returns are taken to come from one sensor: two sensors never agree so
+#: well.
 _SAME_SENSOR_SIGMA_REL = 5e-4
 
-_PAGE_NOTE = "Maps are coloured from near (blue) to far (red), each by its own range; silence is left blank."
+_PAGE_NOTE = "Depth is coloured from near (blue) to far (red), each map over its own range. Blank: no answer."
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
-    """Reference the maps of a recording; returns the exit code, 1 where a limit is exceeded.
+    """Align the maps of a recording; returns the exit code, 1 where a limit is exceeded.
 
     Raises:
-        ValueError, OSError: bad options or data, a folder that holds something else.
-        KeyboardInterrupt: Ctrl-C; whole frames stay.
+        ValueError, OSError: bad options or data, or an output folder with other files.
+        KeyboardInterrupt: Ctrl-C; complete frames are kept.
     """
     limits = _check_options(settings)
     if settings["threads"] is not None:
@@ -103,22 +104,25 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     maps = depth_maps.open_depth_maps(settings["depth"], scene.recording, settings["depth_unit"])
     task = _make_alignment_task(scene, maps, parts["method"], settings, out)
     completed.resume_folder(task)
-    before = sum(task.name(i) in task.done for i in task.frames)
+    n_untouched = sum(task.name(i) in task.done for i in task.frames)
     todo = [i for i in task.frames if task.name(i) not in task.done]
     with complete.close_on_exit(task):
         for i in progress(todo, f"{scene.name}: frames", len(todo)):
             complete.write_frame(task, i, *_align_frame(task, maps, i))
     rows = [task.done[task.name(i)] for i in task.frames]
-    whole = _summarise_recording(rows)
-    over = list_exceeded_limits(whole, limits, _ALIGNMENT_LIMITS)
-    content = {"scene": scene.name, "kind": settings["kind"], "fail_on": settings["fail_on"], "exceeded": over}
-    keep = ("frame", "anchored", "views")
-    content |= {"maps": maps.report, "whole": whole, "frames": [{k: row[k] for k in keep} for row in rows]}
+    summary = _summarise_recording(rows)
+    exceeded = list_exceeded_limits(summary, limits, _ALIGNMENT_LIMITS)
+    content = {"scene": scene.name, "kind": settings["kind"], "fail_on": settings["fail_on"], "exceeded": exceeded}
+    keep = ("frame", "aligned", "views")
+    content |= {"maps": maps.report, "whole": summary, "frames": [{k: row[k] for k in keep} for row in rows]}
     storage.write_json(out / "align.json", storage.to_strict_json(content))
-    said = [*_format_summary(scene.name, settings["kind"], whole, before), *(f"  {note}" for note in maps.notes)]
-    _write_page(task, maps, said, over)
-    print("\n".join([*said, *(f"  exceeded: {line}" for line in over), "wrote", f"  {out}"]))
-    return int(bool(over))
+    lines = [
+        *_format_summary(scene.name, settings["kind"], summary, n_untouched),
+        *(f"  {note}" for note in maps.notes),
+    ]
+    _write_page(task, maps, lines, exceeded)
+    print("\n".join([*lines, *(f"  exceeded: {limit_line}" for limit_line in exceeded), "wrote", f"  {out}"]))
+    return int(bool(exceeded))
 
 
 # -------------------------------------------------------------------------------------------------------------- frames
@@ -127,12 +131,12 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
 def _make_alignment_task(
     scene: Scene, maps: DepthMaps, method: Method, settings: Mapping[str, Any], out: Path
 ) -> CompletionTask:
-    """What is wanted of a recording: every frame that has a map."""
+    """The completion task of a recording: every frame that has a map."""
     recording = scene.recording
     frames = maps.frames[:: settings["every"]][: settings["most"]]
     hw = recording[frames[0]].hw
     if 0 in hw:
-        raise ValueError(f"{scene.name}: found frames without pictures, expected pictures (data.images=true)")
+        raise ValueError(f"{scene.name}: found frames without images, expected images (data.images=true)")
     first = maps[frames[0]]
     assert first is not None
     layout = select_layout(recording, settings["format"], settings["unit"], same=first.shape[-2:] == hw)
@@ -147,43 +151,48 @@ def _make_alignment_task(
         frames=frames,
         offers={},
         shared=completed.build_shared_metadata(
-            scene, layout, settings, digest, keyed=_KEY_OPTIONS, roots=_CODE_ROOTS, calibration=None, word="anchor"
+            scene, layout, settings, digest, keyed=_KEY_OPTIONS, roots=_CODE_ROOTS, calibration=None, word="align"
         ),
     )
 
 
 def _list_data_files(scene: Scene, maps: DepthMaps, frames: Sequence[int]) -> dict[str, Path]:
-    """All that is read."""
-    given = {f"depth/{file.name}": file for i in frames if (file := maps.files[i]) is not None}
+    """Name -> path of all input files: the scene's and the maps'."""
+    maps_by_name = {f"depth/{file.name}": file for i in frames if (file := maps.files[i]) is not None}
     root = scene.root
-    return {**result_files.list_files_below([root]), **given}
+    return {**result_files.list_files_below([root]), **maps_by_name}
 
 
 def _align_frame(task: CompletionTask, maps: DepthMaps, i: int) -> tuple[Frame, DepthMap, Row]:
-    """The map of one frame, on the CPU, and what was done to it."""
-    s, given = task.settings, maps[i]
-    assert given is not None  # frames without a map are not asked for
+    """Align the map of frame ``i`` -> the frame, its depth map (CPU), and a row with the views and the alignment."""
+    settings, depth_map = task.settings, maps[i]
+    assert depth_map is not None  # only frames with a map are in the task
     frame = _load_frame(task, i)
-    x = torch.where(given > 0, given, torch.nan).to(frame.camera.f)  # a 0 of a file is no value, of whatever kind
+    x = torch.where(depth_map > 0, depth_map, torch.nan).to(frame.camera.f)  # 0 in a file is no value, for every kind
     trace: Trace = {}
     views: list[int] = []
     with torch.no_grad():
         if len(task.recording) > 1:
-            offered = candidate_frames(task.recording, i, s["steps"], s["past"])
-            others = stack([_load_frame(task, k) for k in offered])
+            offered = candidate_frames(task.recording, i, settings["steps"], settings["past"])
+            source_views = stack([_load_frame(task, k) for k in offered])
             method = with_view_selection(task.method)
-            told = method(frame, others, seed=s["seed"], hint=task.scene.hint, trace=trace)
-            references, views = [trace["samples"], told], [int(task.recording.number[k]) for k in offered]
+            estimate = method(frame, source_views, seed=settings["seed"], hint=task.scene.hint, trace=trace)
+            references, views = [trace["samples"], estimate], [int(task.recording.number[k]) for k in offered]
         else:
-            whole = upcast_intrinsics(frame)
+            upcast = upcast_intrinsics(frame)
             uv = task.method.sample(frame.hw, task.method.n).to(frame.camera.f)[None]
-            references = [task.method.backproject(whole, uv)]
-        chosen: dict[str, align.ModelSelection] = {}
-        options = {"kind": s["kind"], "max_sigma_rel": s["max_sigma_rel"], "hw": frame.hw, "trace": chosen}
-        found = align.align_depth(x, references, **options).to("cpu")
+            references = [task.method.backproject(upcast, uv)]
+        selection: dict[str, align.ModelSelection] = {}
+        options = {
+            "kind": settings["kind"],
+            "max_sigma_rel": settings["max_sigma_rel"],
+            "hw": frame.hw,
+            "trace": selection,
+        }
+        aligned = align.align_depth(x, references, **options).to("cpu")
     points = [int((a.usable if k == 0 else a.keep).sum()) for k, a in enumerate(references)]
-    row = _summarise_frame(x.cpu(), found, chosen["chosen"]) | {"near": points[0], "far": sum(points[1:])}
-    return frame, found, {"views": views, "anchored": row}
+    row = _summarise_frame(x.cpu(), aligned, selection["chosen"]) | {"near": points[0], "far": sum(points[1:])}
+    return frame, aligned, {"views": views, "aligned": row}
 
 
 def _load_frame(task: CompletionTask, i: int) -> Frame:
@@ -191,93 +200,99 @@ def _load_frame(task: CompletionTask, i: int) -> Frame:
     return range_split(task.recording[i].to(getattr(torch, s["dtype"])).to(s["device"]), s["cutoff"])
 
 
-def _summarise_frame(x: Tensor, found: DepthMap, chosen: align.ModelSelection) -> Row:
-    """What was done to a map."""
-    keep, there = found.keep, x > 0
-    best = int(chosen.model)
-    row: Row = {"model": None if best < 0 else chosen.names[best], "silent": 1 - _masked_share(keep, there)}
-    row["probability"] = None if best < 0 else float(chosen.weight[0, best])
-    likeliest = int(chosen.weight[0].argmax())
-    row["likeliest"] = None if best < 0 else chosen.names[likeliest]
-    row["likeliest_probability"] = None if best < 0 else float(chosen.weight[0, likeliest])
+def _summarise_frame(x: Tensor, aligned: DepthMap, selection: align.ModelSelection) -> Row:
+    """Statistics of one alignment: model and its probability, scale, relative change, sigma / depth, gaps."""
+    keep, has_value = aligned.keep, x > 0
+    best = int(selection.model)
+    row: Row = {"model": None if best < 0 else selection.names[best], "silent": 1 - _masked_share(keep, has_value)}
+    row["probability"] = None if best < 0 else float(selection.weight[0, best])
+    likeliest = int(selection.weight[0].argmax())
+    row["likeliest"] = None if best < 0 else selection.names[likeliest]
+    row["likeliest_probability"] = None if best < 0 else float(selection.weight[0, likeliest])
     if not bool(keep.any()):
         return row | {"scale": None, "change": None, "sigma": None}
-    ratio = (found.depth / x)[keep].double()
-    sigma = (found.sigma / found.depth)[keep].double().median()
+    ratio = (aligned.depth / x)[keep].double()
+    sigma = (aligned.sigma / aligned.depth)[keep].double().median()
     return row | {"scale": float(ratio.median()), "change": float((ratio - 1).abs().median()), "sigma": float(sigma)}
 
 
-def _masked_share(part: Tensor, of: Tensor) -> float:
-    return int((part & of).sum()) / max(int(of.sum()), 1)
+def _masked_share(part: Tensor, whole: Tensor) -> float:
+    return int((part & whole).sum()) / max(int(whole.sum()), 1)
 
 
-# -------------------------------------------------------------------------------------------------------- what is said
+# ------------------------------------------------------------------------------------------------------------- summary
 
 
 def _summarise_recording(rows: Sequence[Row]) -> Row:
-    """A recording's numbers, and those that limits are held against."""
-    told = [row["anchored"] for row in rows]
-    done = [row for row in told if row["model"] is not None and row["scale"] is not None]
-    middle = {k: statistics.median(row[k] for row in done) if done else None for k in ("scale", "change", "sigma")}
-    held = {
-        "scale": None if middle["scale"] is None else abs(middle["scale"] - 1),
-        "change": middle["change"],
-        "sigma": middle["sigma"],
-        "silent": statistics.fmean(row["silent"] for row in told),
-        "unanchored": 1 - len(done) / len(told),
+    """Statistics of a recording; ``held`` are those that ``fail_on`` limits."""
+    alignments = [row["aligned"] for row in rows]
+    answered = [row for row in alignments if row["model"] is not None and row["scale"] is not None]
+    medians = {
+        k: statistics.median(row[k] for row in answered) if answered else None for k in ("scale", "change", "sigma")
     }
-    models = Counter(row["model"] for row in done)
-    references = {k: statistics.median(row[k] for row in told) for k in ("near", "far")}
-    return {"frames": len(told), "models": dict(models), "median": middle, "reference_views": references, "held": held}
+    limited = {
+        "scale": None if medians["scale"] is None else abs(medians["scale"] - 1),
+        "change": medians["change"],
+        "sigma": medians["sigma"],
+        "silent": statistics.fmean(row["silent"] for row in alignments),
+        "unaligned": 1 - len(answered) / len(alignments),
+    }
+    models = Counter(row["model"] for row in answered)
+    references = {k: statistics.median(row[k] for row in alignments) for k in ("near", "far")}
+    return {
+        "frames": len(alignments),
+        "models": dict(models),
+        "median": medians,
+        "references": references,
+        "held": limited,
+    }
 
 
-def _format_summary(name: str, kind: str, whole: Row, before: int) -> list[str]:
-    """A recording in three sentences."""
-    held, middle, n = whole["held"], whole["median"], whole["frames"]
-    again = f" ({before} left untouched)" if before else ""
-    if middle["scale"] is None:
-        return [f"{name}: none of {format_count(n, 'map')} could be aligned{again}: too few near returns."]
-    alone = sum(count for model, count in whole["models"].items() if model == "raw")
+def _format_summary(name: str, kind: str, summary: Row, n_untouched: int) -> list[str]:
+    """Printed summary of a recording, one sentence a line."""
+    limited, medians, n = summary["held"], summary["median"], summary["frames"]
+    untouched = f" ({n_untouched} left untouched)" if n_untouched else ""
+    if medians["scale"] is None:
+        return [f"{name}: none of {format_count(n, 'map')} could be aligned{untouched}: too few near returns."]
+    n_unchanged = sum(count for model, count in summary["models"].items() if model == "raw")
     maps = format_count(n, "map")
-    first = f"{name}: {maps}{again} put into metres."
+    first = f"{name}: {maps}{untouched} converted to metres."
     if kind == "metric":
-        times = f"multiplied by {middle['scale']:.4g} (median of all)"
-        left = f"{alone} left as {'they are' if n != 1 else 'it is'}"
-        first = f"{name}: {maps}{again}, {left}{'' if alone == n else f'; the others were {times}'}."
-        first = (
-            first if alone else f"{name}: {maps}{again}, none left as {'they were' if n != 1 else 'it was'}: {times}."
-        )
-    near, far = (f"{whole['anchors'][k]:g}" for k in ("near", "far"))
-    alike = middle["sigma"] < _SAME_SENSOR_SIGMA_REL
+        factor = f"multiplied by {medians['scale']:.4g} (median of all)"
+        unchanged = f"{n_unchanged} unchanged"
+        first = f"{name}: {maps}{untouched}, {unchanged}{'' if n_unchanged == n else f'; the others {factor}'}."
+        first = first if n_unchanged else f"{name}: {maps}{untouched}, none unchanged: {factor}."
+    near, far = (f"{summary['references'][k]:g}" for k in ("near", "far"))
+    is_same_sensor = medians["sigma"] < _SAME_SENSOR_SIGMA_REL
     return [
         first,
         *(
-            ["  The near returns are on the maps as if both were of one sensor: what it is wrong by is not in sigma."]
-            * alike
+            ["  Maps and near returns agree as if from one sensor: sigma does not include that sensor's own error."]
+            * is_same_sensor
         ),
-        f"  Sigma is {middle['sigma']:.1%} of the depth (median), {held['silent']:.1%} of the pixels are silent.",
-        f"  A map is held by {near} near returns and {far} far answers (medians); "
-        f"{held['unanchored']:.0%} of the maps could not be aligned.",
+        f"  Median sigma {medians['sigma']:.1%} of the depth; {limited['silent']:.1%} of the pixels have no answer.",
+        f"  References per map: {near} near returns and {far} far answers (medians); "
+        f"{limited['unaligned']:.0%} of the maps could not be aligned.",
     ]
 
 
-def _write_page(task: CompletionTask, maps: DepthMaps, said: Sequence[str], over: Sequence[str]) -> Path:
-    order = sorted(task.frames, key=lambda i: -_severity(task.done[task.name(i)]["anchored"]))
+def _write_page(task: CompletionTask, maps: DepthMaps, lines: Sequence[str], exceeded: Sequence[str]) -> Path:
+    order = sorted(task.frames, key=lambda i: -_severity(task.done[task.name(i)]["aligned"]))
     shown = set(order[: task.settings["pictures"]])
     frames = []
     for i in order:
         row = task.done[task.name(i)]
-        cells = [_format_cell(row["anchored"][k]) for k in ("model", "scale", "sigma", "silent", "near", "far")]
+        cells = [_format_cell(row["aligned"][k]) for k in ("model", "scale", "sigma", "silent", "near", "far")]
         frames.append(
             pages.ValidatedFrame(f"frame {row['frame']}", cells, _render_frame(task, maps, i) if i in shown else None)
         )
-    failed = [f"Exceeded: {line}" for line in over]
-    place, told = task.folder / "align.html", {"columns": _TABLE_COLUMNS, "frames": frames, "failed": failed}
-    return pages.write_validation_page(place, task.scene.name, said=said, word="anchor", note=_PAGE_NOTE, **told)
+    failed = [f"Exceeded: {limit_line}" for limit_line in exceeded]
+    place, table = task.folder / "align.html", {"columns": _TABLE_COLUMNS, "frames": frames, "failed": failed}
+    return pages.write_validation_page(place, task.scene.name, said=lines, word="align", note=_PAGE_NOTE, **table)
 
 
 def _severity(row: Row) -> float:
-    """By which frames are ordered: silent pixels, then how wide sigma is."""
+    """Sort key of the frames: unanswered fraction plus sigma / depth."""
     return float(row["silent"]) + (1.0 if row["sigma"] is None else float(row["sigma"]))
 
 
@@ -286,23 +301,23 @@ def _format_cell(value: Any) -> str:
 
 
 def _render_frame(task: CompletionTask, maps: DepthMaps, i: int) -> bytes:
-    """PNG of a frame as its files have it."""
-    out, given = io.BytesIO(), maps[i]
-    found, _ = completed.read_completed_maps(task, i)
-    draw_aligned(out, task.recording[i].image[0], given, **found, title=f"{task.scene.name} {task.name(i)}")
+    """The figure of a frame from its written files, as PNG."""
+    out, depth_map = io.BytesIO(), maps[i]
+    aligned, _ = completed.read_completed_maps(task, i)
+    draw_aligned(out, task.recording[i].image[0], depth_map, **aligned, title=f"{task.scene.name} {task.name(i)}")
     return out.getvalue()
 
 
 def _check_options(settings: Mapping[str, Any]) -> dict[str, float]:
-    """The limits; options that would only fail later."""
+    """Validate the options early; returns the limits of ``fail_on``."""
     for name, low in (("every", 1), ("most", 1), ("pictures", 0)):
         value = settings[name]
-        whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
-        if not whole and not (name == "most" and value is None):
+        is_whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
+        if not is_whole and not (name == "most" and value is None):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
-    for name, known in (("dtype", ("float32", "float64")), ("kind", align.ALIGNMENT_KINDS)):
-        if settings[name] not in known:
-            raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(known)}")
+    for name, choices in (("dtype", ("float32", "float64")), ("kind", align.ALIGNMENT_KINDS)):
+        if settings[name] not in choices:
+            raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(choices)}")
     limits = parse_limits(settings["fail_on"], _ALIGNMENT_LIMITS)
     if settings["kind"] != "metric" and (wrong := {"scale", "change"} & set(limits)):
         raise ValueError(

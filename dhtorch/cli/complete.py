@@ -1,8 +1,8 @@
-"""``dhtorch complete``: every frame of a recording with a depth for every pixel that the sensor or the views tell.
+"""``dhtorch complete``: every frame of a recording with depth and sigma from the sensor or from other views.
 
-A frame is a file in each of ``depth/``, ``sigma/``, ``source/`` and, written last, ``meta/``: one that has it is whole.
-``complete.json`` says what all frames of a folder share, and the folder is a recording again, in the capture's own
-format where that can hold what was found. Only whole frames count: the same command makes those that are missing.
+A frame is a file in each of ``depth/``, ``sigma/``, ``source/`` and, written last, ``meta/``: a frame with a meta file
+is complete. ``complete.json`` holds what all frames of a folder share, and the folder is a recording again, in the
+capture's own format where that can hold the maps. A second run of the command makes only the missing frames.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from dhtorch.viz.plots import draw_completed
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
-#: Name of the calibration that travels with the package.
+#: Name of the calibration included in the package.
 _DEFAULT_CALIBRATION_NAME = "dense"
 
-#: Options that decide what the files of a frame hold, beside format and unit as they came out.
+#: Options that determine the content of a frame's files, beside the resolved format and unit; they enter the key.
 _KEY_OPTIONS = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", *dense.DENSE_OPTIONS, "arrays")
 
-#: Numbers and what they must lie between, the upper end among it.
+#: Numeric option → (low, high): valid in low < value <= high.
 _OPTION_RANGES = {
     "unit": (1e-6, 0.1),
     "cutoff": (0, math.inf),
@@ -56,18 +56,18 @@ _OPTION_RANGES = {
     "max_sigma_rel": (0, math.inf),
 }
 
-#: Source in a meta file → in words.
+#: Source name in a meta file → name in printed text.
 _SOURCE_LABELS = {"sensor": "sensor", "swept": "swept", "none": "silent"}
 
-#: Of which frames there are figures and points: of none, the first, or all.
+#: Values of ``figures`` and ``points``: no frame, the first one, or all frames.
 _EXTRAS_CHOICES = (False, True, "all")
 
-#: Modules that decide what is found beside those that the settings name.
+#: Modules that determine the result, beside those that the settings name.
 _CODE_ROOTS = ("dhtorch.pipeline.dense", "dhtorch.pipeline.view_report", "dhtorch.data.pairs", "dhtorch.export.frames")
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
-    """``dhtorch complete``: write the frames of ``out`` that are not there yet; a folder for each of several scenes.
+    """``dhtorch complete``: write the missing frames of ``out``; several scenes get one folder each.
 
     Args:
         settings: the options of ``conf/complete.yaml``, resolved, with ``choices``.
@@ -78,8 +78,8 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         Exit code 0.
 
     Raises:
-        ValueError, OSError, ImportError: bad options or data, a folder that holds something else.
-        KeyboardInterrupt: Ctrl-C; whole frames stay.
+        ValueError, OSError, ImportError: bad options or data, or an output folder with other files.
+        KeyboardInterrupt: Ctrl-C; complete frames are kept.
     """
     _check_options(settings)
     if settings["threads"] is not None:
@@ -87,34 +87,34 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         data_files.set_opencv_threads(settings["threads"])
     scenes = scenes_of(parts["data"])
     out = Path(str(settings["out"])).expanduser()
-    found: dict[Path, str] = {}
+    summaries: dict[Path, str] = {}
     digests: dict[Path | None, str] = {}
     for scene in scenes:
         folder = out if len(scenes) == 1 else out / scene.name
-        if folder in found:
+        if folder in summaries:
             raise ValueError(f"data: found two scenes named {scene.name}, expected one (data.camera=KEY, or one root)")
         if scene.root not in digests:
             digests[scene.root] = completed.digest_scene_files(scene, settings, out)
         task = make_completion_task(scene, folder, parts["method"], settings, digests[scene.root])
         completed.resume_folder(task)
-        before = sum(task.name(i) in task.done for i in task.frames)
+        n_untouched = sum(task.name(i) in task.done for i in task.frames)
         _complete_missing(task, progress)
-        found[folder] = _format_summary(task, before)
-    print("\n".join([*found.values(), "wrote", *(f"  {folder}" for folder in found)]))
+        summaries[folder] = _format_summary(task, n_untouched)
+    print("\n".join([*summaries.values(), "wrote", *(f"  {folder}" for folder in summaries)]))
     return 0
 
 
 def make_completion_task(
     scene: Scene, folder: Path, method: Method, settings: Mapping[str, Any], digest: str, *, sized_as: int = 0
 ) -> CompletionTask:
-    """What is wanted of a scene, whose pictures are as large as that of frame ``sized_as``."""
+    """The completion task of a scene; the image size is that of frame ``sized_as``."""
     frames = range(0, len(scene.recording), settings["every"])[: settings["most"]]
     hw = scene.recording[sized_as].hw
     if 0 in hw:
-        raise ValueError(f"{scene.name}: found frames without pictures, expected pictures (data.images=true)")
-    same = dense.map_hw(hw, settings["size"]) == hw
-    asked = {"unit": settings["unit"], "arrays": settings["arrays"], "same": same}
-    layout = select_layout(scene.recording, settings["format"], **asked)
+        raise ValueError(f"{scene.name}: found frames without images, expected images (data.images=true)")
+    is_same_size = dense.map_hw(hw, settings["size"]) == hw
+    layout_options = {"unit": settings["unit"], "arrays": settings["arrays"], "same": is_same_size}
+    layout = select_layout(scene.recording, settings["format"], **layout_options)
     pairs = [] if len(scene.recording) < 2 else by_choice(scene, settings["steps"], stride=1, past=settings["past"])
     return CompletionTask(
         scene=scene,
@@ -123,7 +123,7 @@ def make_completion_task(
         method=method,
         settings=settings,
         frames=frames,
-        offers={pair.reference: pair.offered for pair in pairs},
+        offers={pair.reference: pair.candidates for pair in pairs},
         shared=completed.build_shared_metadata(
             scene,
             layout,
@@ -140,11 +140,11 @@ def _default_calibration_name() -> str | None:
     return None if dense.default_calibration() is None else _DEFAULT_CALIBRATION_NAME
 
 
-# ------------------------------------------------------------------------------------------------------ what is made
+# ------------------------------------------------------------------------------------------------------------- frames
 
 
 def _complete_missing(task: CompletionTask, progress: Progress) -> None:
-    """Make what is missing, frame by frame; the folder is a recording at every end but a kill."""
+    """Write the missing frames one by one; the folder is a readable recording unless the process is killed."""
     todo = [i for i in task.frames if task.missing(i)]
     with close_on_exit(task):
         for i in progress(todo, f"{task.scene.name}: frames", len(todo)):
@@ -152,7 +152,7 @@ def _complete_missing(task: CompletionTask, progress: Progress) -> None:
 
 
 def complete_frame(task: CompletionTask, i: int) -> None:
-    """Make what is missing of frame ``i``."""
+    """Write the missing files of frame ``i``."""
     if task.name(i) not in task.done:
         write_frame(task, i, *_compute_map(task, i))
     _write_extras(task, i)
@@ -160,10 +160,10 @@ def complete_frame(task: CompletionTask, i: int) -> None:
 
 @contextlib.contextmanager
 def close_on_exit(task: CompletionTask) -> Iterator[None]:
-    """While frames are made: the folder is a recording however this ends, but for a kill.
+    """Context in which frames are written: on exit, also by an exception, the folder is closed as a recording.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C, with what stays.
+        KeyboardInterrupt: Ctrl-C; the message gives the number of complete frames.
     """
     try:
         try:
@@ -172,27 +172,27 @@ def close_on_exit(task: CompletionTask) -> Iterator[None]:
             _close_folder(task)
     except KeyboardInterrupt:
         n = sum(task.name(i) in task.done for i in task.frames)
-        stay = f"{n} of {format_count(len(task.frames), 'frame')} in {task.folder} are whole and stay"
-        raise KeyboardInterrupt(f"{stay}; the same command does the rest") from None
+        stay = f"{n} of {format_count(len(task.frames), 'frame')} in {task.folder} are complete and kept"
+        raise KeyboardInterrupt(f"{stay}; run the same command again for the rest") from None
 
 
 def _close_folder(task: CompletionTask) -> None:
-    """Note what is whole now, and make a recording of it."""
+    """Register the complete frames and write the files that make the folder a recording."""
     task.done.update(completed.read_complete_frames(task))
-    known = [i for i in range(len(task.recording)) if task.name(i) in task.done]
-    if known:
-        task.layout.close(task.folder, task.recording, known, [task.done[task.name(i)] for i in known])
+    complete = [i for i in range(len(task.recording)) if task.name(i) in task.done]
+    if complete:
+        task.layout.close(task.folder, task.recording, complete, [task.done[task.name(i)] for i in complete])
 
 
 def _compute_map(task: CompletionTask, i: int) -> tuple[Frame, DepthMap, Row]:
-    """The map of one frame, on the CPU, and which views were asked for it."""
-    s, offered = task.settings, task.offers.get(i, ())
+    """Complete frame ``i`` -> the reference frame, its depth map (CPU), and a row with the selected views."""
+    settings, offered = task.settings, task.offers.get(i, ())
     reference = _load_frame(task, i)
     if not offered:
-        found = dense.sensor_depth_map(reference, method=task.method, size=s["size"])
-        return reference, found.to("cpu"), {"views": [], "n_offered": 0}
-    others = stack([_load_frame(task, k) for k in offered])
-    options: dict[str, Any] = {k: s[k] for k in (*dense.DENSE_OPTIONS, "seed")}
+        completed_map = dense.sensor_depth_map(reference, method=task.method, size=settings["size"])
+        return reference, completed_map.to("cpu"), {"views": [], "n_offered": 0}
+    source_views = stack([_load_frame(task, k) for k in offered])
+    options: dict[str, Any] = {k: settings[k] for k in (*dense.DENSE_OPTIONS, "seed")}
     options |= {
         "method": with_view_selection(task.method),
         "calibration": dense.default_calibration(),
@@ -200,46 +200,46 @@ def _compute_map(task: CompletionTask, i: int) -> tuple[Frame, DepthMap, Row]:
     }
     trace: Trace = {}
     with torch.no_grad():
-        found = dense.complete_depth(reference, others, **options, trace=trace)
+        completed_map = dense.complete_depth(reference, source_views, **options, trace=trace)
     choice = report_selection(i, offered, trace)
     number = task.recording.number
-    return reference, found.to("cpu"), {"views": [int(number[k]) for k in choice.views], **choice.row()["why"]}
+    return reference, completed_map.to("cpu"), {"views": [int(number[k]) for k in choice.views], **choice.row()["why"]}
 
 
 def _load_frame(task: CompletionTask, i: int) -> Frame:
-    """A frame as the method may see it."""
-    s = task.settings
-    frame = task.recording[i].to(getattr(torch, s["dtype"])).to(s["device"])
-    return range_split(frame, s["cutoff"])
+    """Frame ``i`` in the chosen dtype and device, returns beyond the cutoff hidden."""
+    settings = task.settings
+    frame = task.recording[i].to(getattr(torch, settings["dtype"])).to(settings["device"])
+    return range_split(frame, settings["cutoff"])
 
 
 def write_frame(task: CompletionTask, i: int, reference: Frame, found: DepthMap, asked: Row) -> None:
-    """The files of one frame; the one that makes it whole comes last."""
-    name, layout, one = task.name(i), task.layout, found[0]
-    steps = export.quantise_depth(one.depth, one.sigma, one.source, layout.unit)
+    """Write the files of one frame; the meta file, which marks it complete, comes last."""
+    name, layout, depth_map = task.name(i), task.layout, found[0]
+    steps = export.quantise_depth(depth_map.depth, depth_map.sigma, depth_map.source, layout.unit)
     pictures = {"depth": steps.depth, "sigma": steps.sigma, "source": steps.source}
     if layout.pictures:
         pictures[layout.pictures] = _resize_picture(reference, steps.depth.shape)
     if layout.confidence:
         pictures["confidence"] = stray_confidence(steps.source)
-    if not (about := task.folder / "complete.json").is_file():
-        storage.write_json(about, task.shared)
+    if not (shared_file := task.folder / "complete.json").is_file():
+        storage.write_json(shared_file, task.shared)
     for kind, pixels in pictures.items():
         storage.replace_file(layout.file(task.folder, kind, name), export.encode_png(pixels))
     if layout.arrays:
-        storage.replace_file(layout.file(task.folder, "arrays", name), _encode_arrays(one))
-    row = storage.to_strict_json(_describe_frame(task, i, reference, steps) | asked | _count_pixels(steps, one))
+        storage.replace_file(layout.file(task.folder, "arrays", name), _encode_arrays(depth_map))
+    row = storage.to_strict_json(_describe_frame(task, i, reference, steps) | asked | _count_pixels(steps, depth_map))
     storage.write_json(layout.file(task.folder, "meta", name), row)
     task.done[name] = row
 
 
 def _describe_frame(task: CompletionTask, i: int, reference: Frame, steps: export.QuantisedDepth) -> Row:
-    """What a reader of one frame has to know."""
+    """Metadata of one frame: units, camera, pose, time, size."""
     camera = cameras.resize(reference.camera, reference.hw, steps.depth.shape).to("cpu")
     poses = task.recording.poses
-    same = ("key", "version", "method", "calibration", "unit_m", "sigma_unit_m")
+    shared_keys = ("key", "version", "method", "calibration", "unit_m", "sigma_unit_m")
     return {
-        **{k: task.shared[k] for k in same},
+        **{k: task.shared[k] for k in shared_keys},
         "cutoff_m": task.settings["cutoff"],
         "frame": int(task.recording.number[i]),
         "time": None if reference.time is None else float(reference.time[0]),
@@ -250,19 +250,19 @@ def _describe_frame(task: CompletionTask, i: int, reference: Frame, steps: expor
     }
 
 
-def _count_pixels(steps: export.QuantisedDepth, one: DepthMap) -> Row:
-    """Pixels by source, and the shares of all pixels that are silent, by reason."""
+def _count_pixels(steps: export.QuantisedDepth, depth_map: DepthMap) -> Row:
+    """Pixel counts by source, and fractions of all pixels without an answer, by reason."""
     kinds = {code: name.lower() for code, name in names(Source).items() if name.lower() in _SOURCE_LABELS}
     pixels = {name: int((steps.source == code).sum()) for code, name in kinds.items()}
-    if anchored := int((steps.source == Source.ALIGNED).sum()):
-        pixels["anchored"] = anchored
-    gates = {name.lower(): float((one.gate == code).double().mean()) for code, name in names(Gate).items()}
+    if aligned := int((steps.source == Source.ALIGNED).sum()):
+        pixels["aligned"] = aligned
+    gates = {name.lower(): float((depth_map.gate == code).double().mean()) for code, name in names(Gate).items()}
     silent = {name: share for name, share in gates.items() if share and name != "answer"}
     return {"pixels": pixels, "silent": {**silent, "unfit": float(steps.unfit.mean())}}
 
 
 def _resize_picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:
-    """The picture at the size of the map, (h, w, 3) or (h, w) uint8; each pixel the mean of what it covers."""
+    """Frame image -> (h, w, 3) or (h, w) uint8 at the map's size, by area averaging."""
     image = frame.image[0].cpu()
     if image.is_floating_point():
         image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
@@ -271,26 +271,26 @@ def _resize_picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:
     return image[0].numpy() if len(image) == 1 else image.permute(1, 2, 0).numpy()
 
 
-def _encode_arrays(one: DepthMap) -> bytes:
-    """The map as it was found, as NPZ."""
+def _encode_arrays(depth_map: DepthMap) -> bytes:
+    """Depth, sigma, score, source and gate of a map, unquantised, as NPZ bytes."""
     out = io.BytesIO()
-    codes = {k: getattr(one, k).to(torch.uint8).numpy() for k in ("source", "gate")}
-    np.savez_compressed(out, **{k: getattr(one, k).numpy() for k in ("depth", "sigma", "score")}, **codes)
+    codes = {k: getattr(depth_map, k).to(torch.uint8).numpy() for k in ("source", "gate")}
+    np.savez_compressed(out, **{k: getattr(depth_map, k).numpy() for k in ("depth", "sigma", "score")}, **codes)
     return out.getvalue()
 
 
-# ------------------------------------------------------------------------------------------------- what is shown of it
+# ------------------------------------------------------------------------------------------------- figures and points
 
 
 def _write_extras(task: CompletionTask, i: int) -> None:
-    """Figure and points of a frame, as its files have it."""
-    wanted = [path for path in task.extras(i) if not path.is_file()]
-    if not wanted:
+    """Write the missing figure and point files of a frame, from its written maps."""
+    missing = [path for path in task.extras(i) if not path.is_file()]
+    if not missing:
         return
     maps, source = completed.read_completed_maps(task, i)
     frame = task.recording[i]
     picture = _resize_picture(frame, source.shape)
-    for path in wanted:
+    for path in missing:
         if path.suffix == ".png":
             storage.replace_file(path, render_completed(task, i, frame, maps, source))
         else:
@@ -300,7 +300,7 @@ def _write_extras(task: CompletionTask, i: int) -> None:
 def render_completed(
     task: CompletionTask, i: int, frame: Frame, maps: Mapping[str, np.ndarray], source: np.ndarray
 ) -> bytes:
-    """The figure of a whole frame, PNG; ``maps`` and ``source`` as of :func:`maps_of`."""
+    """The figure of a complete frame as PNG; ``maps`` and ``source`` from ``read_completed_maps``."""
     out = io.BytesIO()
     draw_completed(out, frame.image[0], **maps, source=source, title=completed.format_frame_title(task, i))
     return out.getvalue()
@@ -309,7 +309,7 @@ def render_completed(
 def _write_points(
     path: Path, frame: Frame, picture: np.ndarray, *, depth: np.ndarray, sigma: np.ndarray, source: np.ndarray
 ) -> None:
-    """A frame in its camera's axes: points as PLY, a mesh of what lies on one surface as GLB."""
+    """Write a frame in camera axes: points as PLY, or a mesh (edges across depth steps left out) as GLB."""
     hw = depth.shape[0], depth.shape[1]
     z = torch.from_numpy(np.where(depth > 0, depth, np.nan)).reshape(1, -1)
     xyz = cameras.unproject(frame.camera, dense.map_pixel_centres(frame, hw)[None], z)[0]
@@ -320,8 +320,8 @@ def _write_points(
         export.write_glb(path, [export.Shape("view", xyz, rgb, face=export.mesh_depth_map(depth))])
 
 
-def _format_summary(task: CompletionTask, before: int) -> str:
-    """One scene in words."""
+def _format_summary(task: CompletionTask, n_untouched: int) -> str:
+    """Printed summary of one scene."""
     rows = [task.done[task.name(i)] for i in task.frames]
     pixels: Counter[str] = Counter()
     silent: Counter[str] = Counter()
@@ -333,32 +333,32 @@ def _format_summary(task: CompletionTask, before: int) -> str:
     reasons = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in silent.most_common())
     layout, (h, w) = task.layout, rows[0]["hw"]
     lines = [
-        f"{task.scene.name}: {format_count(len(rows), 'frame')}{f' ({before} left untouched)' * (before > 0)}"
+        f"{task.scene.name}: {format_count(len(rows), 'frame')}{f' ({n_untouched} left untouched)' * (n_untouched > 0)}"
         f" of {w}x{h}: {sensor}, {swept}, {none}{f' ({reasons})' * bool(reasons)}",
-        f"  steps of {1e3 * layout.unit:g} mm reach {layout.reach:.1f} m"
-        + (f": {unfit:.2%} of the pixels do not fit and are silent (unit=, arrays=true)" if unfit else ""),
+        f"  depth in steps of {1e3 * layout.unit:g} mm, up to {layout.reach:.1f} m"
+        + (f": {unfit:.2%} of the pixels are beyond it and left empty (see unit=, arrays=true)" if unfit else ""),
     ]
     if layout.name == "png" != task.settings["format"]:
-        lines.append("  maps alone, no recording: not every frame has a pose")
+        lines.append("  maps only, not a recording: some frames have no pose")
     if layout.pictures and has_varying_camera(rows):
-        lines.append("  the camera changes: K beside the maps is that of the first frame, meta/ has each frame's own")
+        lines.append("  the intrinsics change: K.txt has those of the first frame, meta/ those of every frame")
     return "\n".join(lines)
 
 
 def _check_options(settings: Mapping[str, Any]) -> None:
-    """Options that would only fail after minutes."""
+    """Validate options that would otherwise fail late."""
     for name in ("most", "every"):
         value = settings[name]
         if not (isinstance(value, int) and value >= 1) and not (name == "most" and value is None):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least 1")
-    words_of = {
+    choices_of = {
         "format": ("auto", *FRAME_LAYOUTS),
         "dtype": ("float32", "float64"),
         **dict.fromkeys(EXTRA_FILES, _EXTRAS_CHOICES),
     }
-    for name, known in words_of.items():
-        if settings[name] not in known:
-            shown = ", ".join(str(word).lower() for word in known)
+    for name, choices in choices_of.items():
+        if settings[name] not in choices:
+            shown = ", ".join(str(word).lower() for word in choices)
             raise ValueError(f"{name}: found {settings[name]!r}, expected one of {shown}")
     for name, (low, high) in _OPTION_RANGES.items():
         value = settings[name]
@@ -367,4 +367,6 @@ def _check_options(settings: Mapping[str, Any]) -> None:
     try:
         torch.empty(0, device=settings["device"])
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device: found {settings['device']!r}, expected one that torch can use here") from error
+        raise ValueError(
+            f"device: found {settings['device']!r}, expected a device that torch can use on this machine"
+        ) from error

@@ -1,7 +1,7 @@
-"""A folder of completed frames: what they share, which of them are whole, and what the files of one say.
+"""Folder of completed frames: shared metadata, list of complete frames, reading of their maps.
 
-A frame is a file in each of ``depth/``, ``sigma/``, ``source/`` and, written last, ``meta/``: one that has it is whole.
-``complete.json`` says what all frames of a folder share.
+A frame is a file in each of ``depth/``, ``sigma/``, ``source/`` and, written last, ``meta/``: a frame with a meta file
+is complete. ``complete.json`` holds what all frames of a folder share.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from dhtorch.viz.plots import append_cutoff, format_frame
 
 Row = dict[str, Any]
 
-#: Of the files: raised when a reader of older ones would be wrong.
+#: Version of the file format; increased when older readers would misread the files.
 _FORMAT_VERSION = 1
 
-#: Folders of pictures and points, which are made of the files of a frame.
+#: Folder of derived files → their suffixes.
 EXTRA_FILES = {"figures": (".png",), "points": (".ply", ".glb")}
 
 
 @dataclass(frozen=True)
 class CompletionTask:
-    """One scene, and what is wanted of it."""
+    """The frames of one scene to be completed, and how they are written."""
 
     scene: Scene
     folder: Path
@@ -42,27 +42,27 @@ class CompletionTask:
     method: Method
     settings: Mapping[str, Any]
     frames: Sequence[int]  # positions
-    offers: Mapping[int, Sequence[int]]  # position → frames around it among which the method chooses
+    offers: Mapping[int, Sequence[int]]  # position → candidate source views
     shared: Row  # complete.json
-    done: dict[str, Row] = field(default_factory=dict)  # name of a whole frame → its meta file
+    done: dict[str, Row] = field(default_factory=dict)  # name of a complete frame → its meta file
 
     @property
     def recording(self) -> Recording:
-        """Of the scene."""
+        """The scene's recording."""
         return self.scene.recording
 
     def name(self, i: int) -> str:
-        """Of the files of frame ``i``."""
+        """Stem of the file names of frame ``i``."""
         return self.layout.stem(self.recording, i)
 
     def extras(self, i: int) -> list[Path]:
-        """Figure and points that are wanted of frame ``i``: of all frames, or of the first that has another view."""
+        """Requested figure and point files of frame ``i``: of all frames, or of the first one with a source view."""
         first = next((k for k in self.frames if k in self.offers), self.frames[0])
         kinds = [kind for kind in EXTRA_FILES if self.settings[kind] == "all" or (self.settings[kind] and i == first)]
         return [self.folder / kind / f"{self.name(i)}{end}" for kind in kinds for end in EXTRA_FILES[kind]]
 
     def missing(self, i: int) -> bool:
-        """Whether a file of frame ``i`` is to be made."""
+        """Whether a file of frame ``i`` is missing."""
         return self.name(i) not in self.done or not all(path.is_file() for path in self.extras(i))
 
 
@@ -77,12 +77,14 @@ def build_shared_metadata(
     calibration: str | None,
     **more: str,
 ) -> Row:
-    """What all frames of a scene have in common, and their key: of the options ``keyed``, the modules ``roots``, the
-    data's digest and what ``more`` tells one word's files from another's."""
+    """Metadata shared by all frames of a scene, with their key: a hash of the options ``keyed``, the code of ``roots``
+    (modules), the data digest, and ``more`` (which separates the files of different commands)."""
     config = {k: settings[k] for k in keyed} | {"scene": scene.name, "format": layout.name, "unit": layout.unit}
-    made = result_files.collect_run_metadata(device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"])
+    run_metadata = result_files.collect_run_metadata(
+        device="cpu", dtype=settings["dtype"], threads=1, seed=settings["seed"]
+    )
     name = settings["choices"]["data"]
-    found: Row = storage.to_strict_json(
+    metadata: Row = storage.to_strict_json(
         {
             "format": _FORMAT_VERSION,
             "scene": scene.name,
@@ -90,8 +92,8 @@ def build_shared_metadata(
             "unit_m": layout.unit,
             "sigma_unit_m": layout.sigma_unit,
             "reach_m": layout.reach,
-            "version": made["versions"]["dhtorch"],
-            "git": made["git"],
+            "version": run_metadata["versions"]["dhtorch"],
+            "git": run_metadata["git"],
             "method": settings["choices"]["method"],
             "calibration": calibration,
             "key": result_files.compute_result_key({**config, "files": _FORMAT_VERSION, **more}, digest, roots=roots),
@@ -100,42 +102,46 @@ def build_shared_metadata(
             "codes": {"source": names(Source), "gate": names(Gate)},
         }
     )
-    return found
+    return metadata
 
 
 def digest_scene_files(scene: Scene, settings: Mapping[str, Any], out: Path) -> str:
-    """Of all data files; what is written here may lie beside them."""
+    """Digest of all data files outside the output folder."""
     files = {
         **result_files.list_files_below([scene.root]),
         **result_files.list_files_named({k: settings[k] for k in ("data", "method")}),
     }
-    place = out.resolve()
-    return result_files.compute_data_digest({k: p for k, p in files.items() if not p.resolve().is_relative_to(place)})
+    output = out.resolve()
+    return result_files.compute_data_digest({k: p for k, p in files.items() if not p.resolve().is_relative_to(output)})
 
 
 def resume_folder(task: CompletionTask) -> None:
-    """Note the frames of a folder that are whole; what a killed run left of others is removed.
+    """Register the complete frames of an output folder; remove files of incomplete frames left by a killed run.
 
     Raises:
-        FileExistsError: the folder holds something else; the message says what differs.
-        NotADirectoryError: it is a file.
+        FileExistsError: the folder holds other files; the message names the difference.
+        NotADirectoryError: the path is a file.
     """
-    folder, about = task.folder, task.folder / "complete.json"
+    folder, shared_file = task.folder, task.folder / "complete.json"
     if folder.exists() and not folder.is_dir():
-        raise NotADirectoryError(f"out: {folder} is a file, expected a folder, or a place for one")
-    storage.remove_unfinished_files(about)
+        raise NotADirectoryError(f"out: {folder} is a file, expected a folder or a new path")
+    storage.remove_unfinished_files(shared_file)
     if not storage.has_files(folder):
         return
-    if not about.is_file():
-        raise FileExistsError(f"out: {folder} holds other files, expected an empty folder, or one that this word made")
+    if not shared_file.is_file():
+        raise FileExistsError(
+            f"out: {folder} holds other files, expected an empty folder, or one that this command wrote"
+        )
     try:
-        there = storage.parse_strict_json(about.read_text(encoding="utf-8"))
-        same = there["key"] == task.shared["key"]
-        found = "" if same else result_files.describe_difference(there, task.shared)
+        existing = storage.parse_strict_json(shared_file.read_text(encoding="utf-8"))
+        is_same = existing["key"] == task.shared["key"]
+        difference = "" if is_same else result_files.describe_difference(existing, task.shared)
     except (ValueError, KeyError, TypeError) as error:
-        raise FileExistsError(f"{about}: found {error}, expected what dhtorch complete writes") from None
-    if not same:
-        raise FileExistsError(f"{about}: found other frames ({found}), expected these, or another folder for out")
+        raise FileExistsError(f"{shared_file}: found {error}, expected a file written by dhtorch complete") from None
+    if not is_same:
+        raise FileExistsError(
+            f"{shared_file}: found frames of another run ({difference}), expected the same settings or another out=DIR"
+        )
     task.done.update(read_complete_frames(task))
     for kind in (*task.layout.folders, *EXTRA_FILES):
         for file in (folder / kind).glob("*"):
@@ -144,13 +150,13 @@ def resume_folder(task: CompletionTask) -> None:
 
 
 def read_complete_frames(task: CompletionTask) -> dict[str, Row]:
-    """The frames that are whole, by name."""
+    """Name -> meta row of the complete frames."""
     metas = sorted((task.folder / "meta").glob("*.json"))
     return {path.stem: row for path in metas if (row := _read_meta(task, path))}
 
 
 def _read_meta(task: CompletionTask, path: Path) -> Row | None:
-    """The meta file of a frame that is whole."""
+    """The meta row of a frame, None where a file is missing, invalid or of another key."""
     if any(not task.layout.file(task.folder, kind, path.stem).is_file() for kind in task.layout.folders):
         return None
     try:
@@ -161,13 +167,13 @@ def _read_meta(task: CompletionTask, path: Path) -> Row | None:
 
 
 def format_frame_title(task: CompletionTask, i: int) -> str:
-    """Scene, frame, those that it was completed from, and the cutoff."""
+    """Figure title: scene, frame, source views, cutoff."""
     row = task.done[task.name(i)]
     return append_cutoff(format_frame(task.scene.name, row["frame"], row.get("views", ())), task.settings["cutoff"])
 
 
 def read_completed_maps(task: CompletionTask, i: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """``depth`` and ``sigma`` (h, w) in m and the source (h, w) of a whole frame, as its files have them."""
+    """Files of a complete frame -> ``depth`` and ``sigma`` (h, w) in m, and ``source`` (h, w)."""
     layout, name = task.layout, task.name(i)
     maps = {
         kind: data_files.read_depth_png(layout.file(task.folder, kind, name), 1 / unit)

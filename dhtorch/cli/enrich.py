@@ -1,7 +1,8 @@
-"""``dhtorch enrich SRC DST``: a data set with a depth, a sigma and a camera for every picture.
+"""``dhtorch enrich SRC DST``: data set -> data set with depth, sigma and camera columns for every image.
 
-The maps of the frames are made in shards, as ``dhtorch extract`` makes its rows; when those of an episode are there,
-it is written and they go. What is whole stays: the same command makes what is missing, and gives the same bytes.
+Depth maps are computed in shards, as in ``dhtorch extract``; once all shards of an episode exist, the episode is
+written and its shards are removed. Complete episodes are kept: a second run writes the missing ones, byte for byte as
+one run would have.
 """
 
 from __future__ import annotations
@@ -36,34 +37,35 @@ from dhtorch.transforms import poses
 Progress = Callable[..., Iterable[Any]]
 Row = dict[str, Any]
 
-#: Of the files: raised when a reader of older ones would be wrong.
+#: Version of the file format; increased when older readers would misread the files.
 _FORMAT_VERSION = 1
 
-#: Formats of the new set → version of LeRobot, None = another.
+#: Output format → LeRobot version, None = no LeRobot format.
 _OUTPUT_FORMATS: dict[str, int | None] = {"lerobot": 3, "v3.0": 3, "lerobot_v2.1": 2, "v2.1": 2, "nerfstudio": None}
 
-#: Options that decide what is written.
+#: Options that determine what is written; they enter the key.
 _KEY_OPTIONS = ("data", "method", "seed", "format", "dense", "causal", "gap", "cameras", "pose", "pose_sigma", "frames",
          "step", "fps", "task", "on_error")  # fmt: skip
 
-#: Where the maps of episodes wait that are not whole; and what all share.
+#: Folder of the shards of unfinished episodes; file of the shared metadata.
 _SHARDS_FOLDER, _METADATA_FILE = ".dhtorch", "dhtorch.json"
 
-#: Size of a map where samples alone are wanted, px.
+#: Longer side of a depth map with dense=false (samples only), px.
 _SAMPLED_MAP_SIDE_PX = 640
 
+#: Unreadable frames listed by name in the printed summary.
 _MAX_COMPLAINTS = 3
 
-#: What the system says where nothing more can be written.
+#: errno of a write that fails for lack of space.
 _DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
-#: Where the motion to another view comes from.
+#: Values of ``pose``: relative pose from near returns, from the device, or from the device as a start value.
 _POSE_SOURCES = ("near", "device", "start")
 
 
 @dataclass(frozen=True)
 class EnrichJob:
-    """What is to be done."""
+    """One run: recordings, plan, output, and rows to compute."""
 
     out: Path
     scenes: Sequence[Scene]
@@ -81,7 +83,7 @@ class EnrichJob:
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
-    """``dhtorch enrich``: write the episodes of ``out`` that are not there yet, then what describes them.
+    """``dhtorch enrich``: write the missing episodes of ``out``, then the metadata of the data set.
 
     Args:
         settings: the options of ``conf/enrich.yaml``, resolved, with ``choices``.
@@ -92,22 +94,24 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         Exit code 0.
 
     Raises:
-        ValueError, OSError, ImportError: bad options or data, a folder that holds something else or lies in the source,
-            a full disk.
-        KeyboardInterrupt: Ctrl-C; what is whole stays.
+        ValueError, OSError, ImportError: bad options or data, an output folder with other files or inside the source, a
+            full disk.
+        KeyboardInterrupt: Ctrl-C; complete episodes are kept.
     """
     import_optional("pyarrow.parquet", extra="scale")
     _check_options(settings)
     work = _plan_job(settings, parts)
     home = work.out.absolute()
-    rest = "what is whole stays; the same command does the rest"
+    rest = "complete episodes are kept; run the same command again for the rest"
     try:
         with file_lock.acquire_file_lock(home.parent / f".{home.name}.lock", f"out: {work.out}"):
             before, owns, complaints = _write_missing_episodes(work, settings, progress)
             if settings["report"]:
                 enrich_page.write_enrich_page(work.out / "meta", work.shared, owns)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"what is whole in {work.out} stays; the same command does the rest") from None
+        raise KeyboardInterrupt(
+            f"complete episodes in {work.out} are kept; run the same command again for the rest"
+        ) from None
     except OSError as error:
         if error.errno not in _DISK_FULL_ERRNOS:
             raise
@@ -119,7 +123,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
 def _write_missing_episodes(
     work: EnrichJob, settings: Mapping[str, Any], progress: Progress
 ) -> tuple[int, list[Row], list[str]]:
-    """Make what is missing; how many episodes were whole before, what all amount to, and what could not be read."""
+    """Write the missing episodes -> number of episodes complete before, statistics of all, unreadable frames."""
     of_episode = _group_by_episode(work.whole)
     owns = [work.target.own(k) for k in range(len(of_episode))]
     before = sum(own is not None for own in owns)
@@ -157,7 +161,9 @@ def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJo
     out = Path(str(settings["out"])).expanduser()
     for root in whole.roots:
         if out.resolve().is_relative_to(root.resolve()) or (root.is_file() and out.resolve() == root.resolve()):
-            raise ValueError(f"out: found {out} inside the source {root}, which is only read; expected another folder")
+            raise ValueError(
+                f"out: found {out} inside the source {root}, which is never written to; expected another folder"
+            )
     asked = dense.dense_options(settings["dense"], "dense")
     first = [scenes[whole.order[n]] for n in _group_by_episode(whole)[0]]
     size = _SAMPLED_MAP_SIDE_PX if asked is None else asked["size"]
@@ -185,31 +191,35 @@ def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJo
     target = _open_target(settings, found, out, format, shared["key"], origin, n=method.n)
     notes = []
     if _OUTPUT_FORMATS[format] is not None and settings["fps"] is None and not has_frame_rate(first[0].recording):
-        notes.append(f"no frame rate is known: time stamps are for {DEFAULT_FPS:g} frames a second (fps=N tells)")
+        notes.append(f"frame rate unknown: time stamps assume {DEFAULT_FPS:g} frames per second (set fps=N)")
     return EnrichJob(
         out=out, scenes=scenes, whole=whole, views=views, target=target, shared=shared, rows=rows, notes=notes
     )
 
 
 def _check_views(settings: Mapping[str, Any], first: Sequence[Scene], views: Mapping[str, DatasetCamera]) -> None:
-    """Raises ValueError for what the cameras of an episode cannot be asked."""
+    """Validate the cameras of an episode against the options; raises ValueError."""
     names = ", ".join(scene.name for scene in first)
     if len(views) < len(first):
         raise ValueError(f"data: found several recordings of one camera in one episode ({names}), expected one each")
     if any(isinstance(scene.recording, Rig) for scene in first):
-        raise ValueError(f"data: found a rig ({names}), expected its cameras apart (cameras=true joins them)")
+        raise ValueError(
+            f"data: found a rig ({names}), expected its cameras as separate recordings (cameras=true combines them)"
+        )
     sizes = {view.hw for view in views.values()}
     if settings["cameras"] and (len(views) < 2 or len(sizes) > 1 or settings["gap"] != plan.AUTO_GAP):
         seen = " and ".join(f"{w}x{h}" for h, w in sorted(sizes))
         found = f"{len(views)} of {seen} pixels, gap={settings['gap']}"
-        raise ValueError(f"cameras: found {found}, expected two or more of one size in an episode, and gap=auto")
+        raise ValueError(
+            f"cameras: found {found}, expected two or more cameras of one image size in an episode, and gap=auto"
+        )
     unposed = [view.name for view in views.values() if not view.posed]
     if settings["pose"] != "near" and unposed:
-        raise ValueError(f"pose: found none of {', '.join(unposed)}, expected a posed recording, or pose=near")
+        raise ValueError(f"pose: found no poses of {', '.join(unposed)}, expected a recording with poses, or pose=near")
 
 
 def _pose_options(settings: Mapping[str, Any]) -> Row:
-    """Of :class:`dhtorch.transforms.ExtendDepth`."""
+    """The pose options of :class:`dhtorch.transforms.ExtendDepth`."""
     if settings["pose"] == "near":
         return {}
     return {"pose": "pose", "pose_cov": settings["pose_sigma"], "refine": settings["pose"] == "start"}
@@ -218,7 +228,7 @@ def _pose_options(settings: Mapping[str, Any]) -> Row:
 def _open_origin(
     settings: Mapping[str, Any], found: tuple[Sequence[Scene], plan.ExtractionPlan, dict[str, DatasetCamera]]
 ) -> DatasetSource | None:
-    """The data set with columns of its own that the recordings are of."""
+    """The source data set of the recordings where it has columns to copy (LeRobot, RLDS), else None."""
     scenes, whole, _ = found
     groups = _group_by_episode(whole)
     recording, numbers = scenes[whole.order[0]].recording, [whole.episodes[group[0]] for group in groups]
@@ -245,7 +255,9 @@ def _open_target(
     if version is None:
         unposed = [v.name for v in views.values() if not v.posed]
         if unposed:
-            raise ValueError(f"format=nerfstudio: found no poses of {', '.join(unposed)}, expected a posed recording")
+            raise ValueError(
+                f"format=nerfstudio: found no poses of {', '.join(unposed)}, expected a recording with poses"
+            )
         return NerfstudioTarget(out, views, _name_folders(scenes, whole, of_episode), key)
     recording = scenes[whole.order[0]].recording
     fps = frame_rate(recording) if origin is None else origin.fps
@@ -267,54 +279,56 @@ def _open_target(
 def _name_folders(
     scenes: Sequence[Scene], whole: plan.ExtractionPlan, groups: Sequence[Sequence[int]]
 ) -> list[dict[str, str]]:
-    """Name of the folder of each recording, by episode and then by camera; of the only one empty."""
-    found: list[dict[str, str]] = []
+    """Folder name of each recording, by episode and then by camera; empty for a single recording."""
+    names_by_episode: list[dict[str, str]] = []
     seen: set[str] = set()
     for group in groups:
-        named = {}
+        names = {}
         for n in group:
             scene = scenes[whole.order[n]]
             parts = [part for part in PurePosixPath(f"/{scene.name}").parts[1:] if part != ".."]
-            named[camera_key(scene.recording)] = name = "" if len(whole.order) == 1 else "/".join(parts)
+            names[camera_key(scene.recording)] = name = "" if len(whole.order) == 1 else "/".join(parts)
             if name in seen:
                 raise ValueError(f"data: found two recordings called {name}, expected different names")
             seen.add(name)
-        found.append(named)
-    return found
+        names_by_episode.append(names)
+    return names_by_episode
 
 
 def _resolve_format(asked: str, first: Sequence[Scene]) -> str:
-    """The format to write.
+    """The output format; ``same`` is resolved to that of the source.
 
     Raises:
-        ValueError: the source's own, where nothing writes it.
+        ValueError: ``same`` with a source format that cannot be written.
     """
     if asked != "same":
         return asked
     kind, root = first[0].recording.format, first[0].root
     if kind != "lerobot" or root is None:
-        raise ValueError(f"format=same: found {kind}, which has no writer here; expected {', '.join(_OUTPUT_FORMATS)}")
+        raise ValueError(
+            f"format=same: found {kind}, which dhtorch cannot write; expected {', '.join(_OUTPUT_FORMATS)}"
+        )
     return "v2.1" if LeRobotSource.open(root, [first[0].recording.episode or 0]).meta.version == 2 else "lerobot"
 
 
 def _build_metadata(
     settings: Mapping[str, Any], whole: plan.ExtractionPlan, wanted: Mapping[str, columns.Column]
 ) -> Row:
-    """What all files of the set have in common, and their key."""
+    """Metadata shared by all files of the data set, with their key."""
     config = {k: settings[k] for k in _KEY_OPTIONS}
     files = {
         **result_files.list_files_below(whole.roots),
         **result_files.list_files_named({k: settings[k] for k in ("data", "method")}),
     }
     digest = result_files.compute_data_digest(files)
-    made = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
+    run_metadata = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
     name = settings["choices"]["data"]
     source = whole.roots[0].resolve().name if whole.roots else name
-    found: Row = storage.to_strict_json(
+    metadata: Row = storage.to_strict_json(
         {
             "format": _FORMAT_VERSION,
-            "version": made["versions"]["dhtorch"],
-            "git": made["git"],
+            "version": run_metadata["versions"]["dhtorch"],
+            "git": run_metadata["git"],
             "key": result_files.compute_result_key(
                 {**config, "name": name, "files": _FORMAT_VERSION}, digest, roots=[MapRowDataset.__module__]
             ),
@@ -329,45 +343,47 @@ def _build_metadata(
             },
         }
     )
-    return found
+    return metadata
 
 
 def _prepare_folder(work: EnrichJob) -> None:
-    """The folder, ready for what is missing.
+    """Prepare the output folder for the missing episodes.
 
     Raises:
-        FileExistsError: it holds something else, or was made of other data or with other options.
+        FileExistsError: it holds other files, or was written from other data or with other options.
     """
     if work.out.exists() and not work.out.is_dir():
-        raise NotADirectoryError(f"out: {work.out} is a file, expected a folder, or a place for one")
-    about = work.out / "meta" / _METADATA_FILE
-    storage.remove_unfinished_files(about)  # who was killed while it was written left nothing else
-    if about.is_file():
-        other = storage.parse_strict_json(about.read_text(encoding="utf-8"))
-        if other["key"] != work.shared["key"]:
-            what = result_files.describe_difference(other, work.shared)
-            raise FileExistsError(f"{work.out}: found another enriched set ({what}), expected another folder for out")
+        raise NotADirectoryError(f"out: {work.out} is a file, expected a folder or a new path")
+    metadata_file = work.out / "meta" / _METADATA_FILE
+    storage.remove_unfinished_files(metadata_file)  # left by a run that was killed while writing it
+    if metadata_file.is_file():
+        existing = storage.parse_strict_json(metadata_file.read_text(encoding="utf-8"))
+        if existing["key"] != work.shared["key"]:
+            difference = result_files.describe_difference(existing, work.shared)
+            raise FileExistsError(
+                f"{work.out}: found the data set of another run ({difference}), expected the same settings or out=DIR"
+            )
     elif storage.has_files(work.out):
-        raise FileExistsError(f"{work.out}: found a folder that holds something else, expected an empty or a new one")
+        raise FileExistsError(f"{work.out}: found a folder with other files, expected an empty or a new one")
     else:
-        storage.write_json(about, work.shared)
-    for left in work.out.rglob(".*.tmp"):
-        left.unlink(missing_ok=True)
+        storage.write_json(metadata_file, work.shared)
+    for unfinished in work.out.rglob(".*.tmp"):
+        unfinished.unlink(missing_ok=True)
     work.waiting.mkdir(exist_ok=True)
 
 
 def _group_by_episode(whole: plan.ExtractionPlan) -> list[list[int]]:
-    """Recordings, as places in the plan, by episode."""
-    found: dict[int, list[int]] = {}
+    """Positions of the recordings in the plan, grouped by episode."""
+    groups: dict[int, list[int]] = {}
     for n, number in enumerate(whole.episodes):
-        found.setdefault(number, []).append(n)
-    return list(found.values())
+        groups.setdefault(number, []).append(n)
+    return list(groups.values())
 
 
 def _group_shards(
     every: Sequence[plan.ShardSpec], whole: plan.ExtractionPlan, group: Sequence[int]
 ) -> dict[int, list[plan.ShardSpec]]:
-    """Place of a recording in the plan → its shards."""
+    """Position of a recording in the plan → its shards."""
     spans = whole.spans
     return {n: [p for p in every if spans[n].start <= p.rows.start < spans[n].stop] for n in group}
 
@@ -379,18 +395,18 @@ def _camera_key(work: EnrichJob, n: int) -> str:
 # ------------------------------------------------------------------------------------------------------ what is said
 
 
-def _format_summary(work: EnrichJob, owns: Sequence[Row], before: int, complaints: Sequence[str]) -> list[str]:
+def _format_summary(work: EnrichJob, owns: Sequence[Row], n_untouched: int, complaints: Sequence[str]) -> list[str]:
     """The whole in words."""
     size = sum(path.stat().st_size for path in work.out.rglob("*") if path.is_file())
     frames = sum(own["length"] for own in owns)
-    left = f" ({before} left untouched)" if before else ""
+    kept = f" ({n_untouched} left untouched)" if n_untouched else ""
     lines = [
-        f"{work.out}: {format_count(len(owns), 'episode')}{left}, {format_count(frames, 'frame')}, {size / 1e6:.1f} MB"
+        f"{work.out}: {format_count(len(owns), 'episode')}{kept}, {format_count(frames, 'frame')}, {size / 1e6:.1f} MB"
     ]
     for name, shares, reasons in enrich_page.summarise_cameras(owns):
         kinds = ", ".join(f"{kind} {share:.1%}" for kind, share in shares.items())
-        why = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())
-        lines.append(f"  {name}: {kinds}" + (f" ({why})" if why else ""))
+        breakdown = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())
+        lines.append(f"  {name}: {kinds}" + (f" ({breakdown})" if breakdown else ""))
     lines += [f"  {line}" for line in (*enrich_page.describe_refuted_poses(owns), *work.notes)]
     lines += [f"  {complaint}" for complaint in complaints[:_MAX_COMPLAINTS]]
     lines += [f"  and {len(complaints) - _MAX_COMPLAINTS} more frames"] if len(complaints) > _MAX_COMPLAINTS else []
@@ -398,23 +414,23 @@ def _format_summary(work: EnrichJob, owns: Sequence[Row], before: int, complaint
 
 
 def _check_options(settings: Mapping[str, Any]) -> None:
-    """Options that would only fail after minutes."""
-    known = {
+    """Validate options that would otherwise fail late."""
+    choices_of = {
         "format": (*_OUTPUT_FORMATS, "same"),
         "engine": engines.ENGINES,
         "on_error": ("raise", "flag"),
         "pose": _POSE_SOURCES,
     }
-    for name, among in known.items():
-        if settings[name] not in among:
-            raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(among)}")
+    for name, choices in choices_of.items():
+        if settings[name] not in choices:
+            raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(choices)}")
     for name in ("causal", "report", "cameras"):
         if not isinstance(settings[name], bool):
             raise ValueError(f"{name}: found {settings[name]!r}, expected true or false")
     for name, low in (("workers", 0), ("shard_rows", 1), ("gap", 0)):
         value = settings[name]
-        whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
-        if not whole and not (name == "gap" and value == plan.AUTO_GAP):
+        is_whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
+        if not is_whole and not (name == "gap" and value == plan.AUTO_GAP):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
     if settings["frames"] is not None and not (isinstance(settings["frames"], int) and settings["frames"] >= 1):
         raise ValueError(f"frames: found {settings['frames']!r}, expected a whole number of at least 1, or null")
@@ -424,6 +440,6 @@ def _check_options(settings: Mapping[str, Any]) -> None:
     for name, high in (("step", 1.0), ("fps", 1e4)):
         value = settings[name]
         least = 0.0 if name == "step" else 1e-4
-        number = isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= high
-        if not number and not (name == "fps" and value is None):
+        is_number = isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= high
+        if not is_number and not (name == "fps" and value is None):
             raise ValueError(f"{name}: found {value!r}, expected a number from {least:g} to {high:g}")

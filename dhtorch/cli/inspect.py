@@ -1,7 +1,7 @@
-"""``dhtorch inspect PATH``: what a capture holds, before anything is made of it.
+"""``dhtorch inspect PATH``: facts, warnings and a contact sheet of a capture.
 
-Prints facts and warnings and writes a contact sheet. It looks for captures at the path and up to two folders below; a
-recording, a focal stack, and loose pictures that belong to no format are all shown, nothing is refused.
+Captures are searched for at the path and up to two folders below it: recordings, focal stacks, and loose images of no
+known format.
 """
 
 from __future__ import annotations
@@ -35,82 +35,84 @@ from dhtorch.experiments.focal.survey import survey_stacks
 from dhtorch.runtime.console import HELP_EPILOG, escape_markup, format_count, progress, unwrap_terminal
 from dhtorch.viz.plots.colours import DEPTH_CMAP, GREY_CMAP, INK, SCORE_CMAP, SERIES_COLOURS, SILENT
 
-_MAX_LEVELS = 2  # folders below the path
-_MAX_RECORDINGS = 12  # recordings that are shown of one capture
+_MAX_LEVELS = 2  # levels of folders searched below the path
+_MAX_RECORDINGS = 12  # recordings shown of one capture
 _NO_INTRINSICS_MESSAGE = (
-    "no intrinsics: nothing can be measured in it before data.K=[fx,fy,cx,cy] or data.fov=DEGREES says them"
+    "no intrinsics: depth cannot be computed without them; set data.K=[fx,fy,cx,cy] or data.fov=DEGREES"
 )
-_ASSUMED_FOV_DEG = 60.0  # degrees, to look at what has no K
-_SPARSE_SHARE = 0.1  # share of returns below which they are drawn larger
+_ASSUMED_FOV_DEG = 60.0  # horizontal field of view assumed for a capture without intrinsics, degrees
+_SPARSE_SHARE = 0.1  # fraction of pixels with a return below which returns are drawn larger
 _CAPTURE_SUFFIXES = (".r3d", ".mp4", ".mov", ".tar", ".h5", ".hdf5")  # files that may be a whole capture
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-_ARCHIVE_SUFFIXES = (".zip", ".gz", ".tgz", ".xz", ".bz2", ".zst", ".7z", ".rar")  # nothing is unpacked unasked
+_ARCHIVE_SUFFIXES = (".zip", ".gz", ".tgz", ".xz", ".bz2", ".zst", ".7z", ".rar")  # never unpacked automatically
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm")
-_VIDEO_MESSAGE = "a video without depth; the sensor's depth of what is near gives the metre"
+_VIDEO_MESSAGE = "a video without depth; sensor depth of near surfaces is required for metric scale"
 
 
 @dataclass(frozen=True)
 class FoundCapture:
-    """A capture, and what makes it one."""
+    """Path, format and kind of a capture, and the evidence for its format."""
 
     path: Path
     kind: str  # "recording", "stacks" or "pictures"
     format: str
     evidence: str
     follow_links: bool = False
-    options: Mapping[str, Any] = field(default_factory=dict)  # of its reader
+    options: Mapping[str, Any] = field(default_factory=dict)  # of the reader
 
 
 def main(argv: Sequence[str]) -> int:
-    """``dhtorch inspect PATH``: print what a capture holds, write a contact sheet.
+    """``dhtorch inspect PATH``: print the content of a capture, write a contact sheet.
 
     Raises:
-        FormatError: nothing there, or nothing that could be shown.
-        KeyboardInterrupt: Ctrl-C; contact sheets that are written stay.
+        FormatError: no file, or no capture.
+        KeyboardInterrupt: Ctrl-C; written contact sheets are kept.
     """
     parser = argparse.ArgumentParser(
-        prog="dhtorch inspect", description="What a capture holds, and a contact sheet.", epilog=HELP_EPILOG
+        prog="dhtorch inspect",
+        description="Print the content of a capture and write a contact sheet.",
+        epilog=HELP_EPILOG,
     )
-    parser.add_argument("path", type=Path, help="a capture: a folder, up to two folders above it, or a file")
-    about = "option of the reader as data.NAME=VALUE: data.fov=69, data.K=[600,600,320,240], data.camera=[a,b]"
-    parser.add_argument("options", nargs="*", default=[], metavar="data.NAME=VALUE", help=about)
+    parser.add_argument("path", type=Path, help="a capture: a file, its folder, or up to two folders above it")
+    options_help = "reader option as data.NAME=VALUE: data.fov=69, data.K=[600,600,320,240], data.camera=[a,b]"
+    parser.add_argument("options", nargs="*", default=[], metavar="data.NAME=VALUE", help=options_help)
     parser.add_argument("--out", type=Path, help="folder of the contact sheet (default: outputs/<date>/<time>)")
-    parser.add_argument("--format", default="auto", help="name of the format, where it is not to be recognised")
-    parser.add_argument("--frames", type=int, default=8, help="frames to decode and show (default: 8)")
-    parser.add_argument("--follow-links", action="store_true", help="links may lead out of a capture")
-    parser.add_argument("--traceback", action="store_true", help="show where an error came from")
+    parser.add_argument("--format", default="auto", help="name of the format (default: recognised from the content)")
+    parser.add_argument("--frames", type=int, default=8, help="number of frames to decode and show (default: 8)")
+    parser.add_argument("--follow-links", action="store_true", help="follow links that lead out of the capture")
+    parser.add_argument("--traceback", action="store_true", help="show the traceback of an error")
     options = parser.parse_intermixed_args(argv)
     if options.frames < 1:
         raise ValueError(f"--frames: found {options.frames}, expected at least 1")
-    auto = options.format == "auto"
-    found = (
+    is_auto = options.format == "auto"
+    captures = (
         find_captures(options.path, options.follow_links)
-        if auto
+        if is_auto
         else [_capture_of_format(options.path, options.format)]
     )
-    reading = _parse_reader_options(options.options)
-    found = [replace(capture, follow_links=options.follow_links, options=reading) for capture in found]
+    reader_options = _parse_reader_options(options.options)
+    captures = [replace(capture, follow_links=options.follow_links, options=reader_options) for capture in captures]
     now = datetime.now()
     out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}"
     sheets: list[Path] = []
     try:
-        for capture in found:
+        for capture in captures:
             for survey in survey_capture(capture, options.frames):
                 survey.name = _full_name(options.path, capture.path, survey.name)
                 print_survey(capture, survey)
                 sheets.append(write_contact_sheet(survey, out))
                 print(f"wrote {sheets[-1]}\n")
     except KeyboardInterrupt:
-        stay = f"{format_count(len(sheets), 'contact sheet')} in {out} stay; " if sheets else ""
-        raise KeyboardInterrupt(f"{stay}the same command looks again") from None
+        stay = f"{format_count(len(sheets), 'contact sheet')} in {out} kept; " if sheets else ""
+        raise KeyboardInterrupt(f"{stay}run the same command again for the rest") from None
     return 0
 
 
 def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
-    """The captures at ``path``, else one folder below, else two; the nearest level that has any, folders before files.
+    """Captures at ``path``, else one folder below, else two: the first level with any, folders before files.
 
     Raises:
-        FormatError: there is none.
+        FormatError: no capture.
     """
     if not path.exists():
         raise FormatError(path, "path", "no such file or folder", "a capture")
@@ -123,38 +125,40 @@ def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
             for entry in sorted(folder.iterdir(), key=files.natural_sort_key)
         ]
         for candidates in (level, [entry for entry in inside if entry.suffix.lower() in _CAPTURE_SUFFIXES]):
-            found = [
+            captures = [
                 capture for entry in candidates if (capture := _recognise_capture(entry, follow_links)) is not None
             ]
-            if found:
-                return found
+            if captures:
+                return captures
         level = [entry for entry in inside if entry.is_dir()]
-    known = ", ".join((*data.FORMATS, *formats.STACK_FORMATS))
-    raise FormatError(path, "content", _describe_content(path), f"one of {known}, or pictures")
+    known_formats = ", ".join((*data.FORMATS, *formats.STACK_FORMATS))
+    raise FormatError(path, "content", _describe_content(path), f"one of {known_formats}, or images")
 
 
 def _describe_content(path: Path) -> str:
-    """What there is where no capture is, and what would make it one, in words."""
+    """Description of a path without a capture, with the step that would make it one."""
     if path.is_file():
-        kinds = {
-            **dict.fromkeys(_ARCHIVE_SUFFIXES, "an archive, to be unpacked first"),
+        description_of_suffix = {
+            **dict.fromkeys(_ARCHIVE_SUFFIXES, "an archive, unpack it first"),
             **dict.fromkeys(_VIDEO_SUFFIXES, _VIDEO_MESSAGE),
         }
-        return kinds.get(path.suffix.lower(), f"a {path.suffix or 'plain'} file, which no reader knows")
+        return description_of_suffix.get(
+            path.suffix.lower(), f"a {path.suffix or 'plain'} file, which no reader supports"
+        )
     if not any(path.iterdir()):
         return "an empty folder"
-    below = {file.suffix.lower(): file.name for file in path.iterdir() if file.is_file()}
+    name_of_suffix = {file.suffix.lower(): file.name for file in path.iterdir() if file.is_file()}
     for suffix in (*_ARCHIVE_SUFFIXES, *_VIDEO_SUFFIXES):
-        if suffix in below:
-            content = _VIDEO_MESSAGE if suffix in _VIDEO_SUFFIXES else "an archive, to be unpacked first"
-            return f"{below[suffix]}: {content}"
-    return "no capture here or two folders below"
+        if suffix in name_of_suffix:
+            content = _VIDEO_MESSAGE if suffix in _VIDEO_SUFFIXES else "an archive, unpack it first"
+            return f"{name_of_suffix[suffix]}: {content}"
+    return "no capture here or up to two folders below"
 
 
 def survey_capture(capture: FoundCapture, frames: int = 8) -> Iterator[Survey]:
-    """What each recording (stack, folder of pictures) of a capture holds.
+    """Survey of each recording, focal stack or image folder of a capture.
 
-    A recording that its reader refuses is shown as the loose pictures it has, with the reader's words as a warning.
+    A folder that its reader rejects is surveyed as loose images, with the reader's message as a warning.
     """
     try:
         yield from _SURVEYS_BY_KIND[capture.kind](capture, frames)
@@ -162,21 +166,21 @@ def survey_capture(capture: FoundCapture, frames: int = 8) -> Iterator[Survey]:
         if not capture.path.is_dir() or not any(classify_images(capture.path)):
             raise
         (survey,) = _survey_loose_pictures(capture, frames)
-        survey.warnings.insert(0, f"the {capture.format} reader refuses it: {error}")
+        survey.warnings.insert(0, f"the {capture.format} reader rejects it: {error}")
         yield survey
 
 
-def _parse_reader_options(said: Sequence[str]) -> dict[str, Any]:
-    """Options of a reader, of words ``data.NAME=VALUE``; a list is written a,b or [a,b].
+def _parse_reader_options(arguments: Sequence[str]) -> dict[str, Any]:
+    """Arguments ``data.NAME=VALUE`` -> reader options; a list is written a,b or [a,b].
 
     Raises:
-        ValueError: another word.
+        ValueError: another argument.
     """
     options: dict[str, Any] = {}
-    for word in said:
-        name, sign, text = word.partition("=")
+    for argument in arguments:
+        name, sign, text = argument.partition("=")
         if not (sign and name.startswith("data.") and name.removeprefix("data.").isidentifier()):
-            raise ValueError(f"{word}: found a word that says nothing here, expected data.NAME=VALUE, as data.fov=69")
+            raise ValueError(f"{argument}: found an unknown argument, expected data.NAME=VALUE, e.g. data.fov=69")
         items = [_parse_value(item.strip()) for item in text.removeprefix("[").removesuffix("]").split(",")]
         options[name.removeprefix("data.")] = items if text.startswith("[") or len(items) > 1 else items[0]
     return options
@@ -189,25 +193,25 @@ def _parse_value(text: str) -> Any:
     return {"true": True, "false": False, "null": None}.get(text, text)
 
 
-# ------------------------------------------------------------------------------------------------------------- finding
+# -------------------------------------------------------------------------------------------------------------- search
 
 
-def _full_name(asked: Path, found: Path, name: str) -> str:
-    """A capture further down is named after the way to it: the last folder alone may be called ``9``."""
-    below = found.relative_to(asked).parts
-    return "/".join((asked.resolve().name, *below[:-1], name)) if below else name
+def _full_name(inspected: Path, found: Path, name: str) -> str:
+    """Name of a capture with its folders below the inspected path: the last folder alone may be called ``9``."""
+    parts = found.relative_to(inspected).parts
+    return "/".join((inspected.resolve().name, *parts[:-1], name)) if parts else name
 
 
 def _capture_of_format(path: Path, format: str) -> FoundCapture:
     if format in formats.STACK_FORMATS:
-        return FoundCapture(path, "stacks", format, "as told")
+        return FoundCapture(path, "stacks", format, "format= given")
     if format not in data.FORMATS:
         raise FormatError(path, "format", format, ", ".join(("auto", *data.FORMATS, *formats.STACK_FORMATS)))
-    return FoundCapture(path, "recording", format, "as told")
+    return FoundCapture(path, "recording", format, "format= given")
 
 
 def _recognise_capture(path: Path, follow_links: bool) -> FoundCapture | None:
-    """What stands at this very path: a recording wins over focal stacks, these over loose pictures."""
+    """The capture at exactly this path: recordings take precedence over focal stacks, these over loose images."""
     with doors.restrict_links(None if follow_links else path):
         for name, reader in (data.FORMATS | formats.STACK_FORMATS).items():
             if evidence := reader.recognise(path):
@@ -218,7 +222,7 @@ def _recognise_capture(path: Path, follow_links: bool) -> FoundCapture | None:
 
 
 def _survey_recordings(capture: FoundCapture, frames: int) -> Iterator[Survey]:
-    """Each recording; without its pictures where these are missing and the reader can do so."""
+    """Survey of each recording; without images where these cannot be read and the reader supports it."""
     warning: list[str] = []
     links = capture.follow_links
     try:
@@ -227,9 +231,9 @@ def _survey_recordings(capture: FoundCapture, frames: int) -> Iterator[Survey]:
         if "images" not in inspect.signature(data.FORMATS[capture.format].read).parameters:
             raise
         recordings = data.open_all(capture.path, capture.format, follow_links=links, images=False)
-        warning = [f"no pictures: {error}"]
+        warning = [f"no images: {error}"]
     if len(recordings) > _MAX_RECORDINGS:
-        warning.append(f"{len(recordings)} recordings in this capture: the first {_MAX_RECORDINGS} are shown")
+        warning.append(f"{len(recordings)} recordings in this capture, the first {_MAX_RECORDINGS} shown")
     for recording in islice(recordings, _MAX_RECORDINGS):
         survey = survey_recording(recording, frames, progress=progress)
         if _NO_INTRINSICS_MESSAGE in warning:
@@ -240,16 +244,16 @@ def _survey_recordings(capture: FoundCapture, frames: int) -> Iterator[Survey]:
 
 
 def _open_recordings(capture: FoundCapture, warning: list[str]) -> Sequence[Recording]:
-    """The recordings; where nobody says K with one that serves to look at them, and a warning."""
-    how = {"follow_links": capture.follow_links, **capture.options}
+    """The recordings; without intrinsics, with an assumed field of view and a warning."""
+    reader_options = {"follow_links": capture.follow_links, **capture.options}
     try:
-        recordings = data.open_all(capture.path, capture.format, **how)
+        recordings = data.open_all(capture.path, capture.format, **reader_options)
         _ = recordings[0]
     except intrinsics_options.MissingIntrinsicsError:
         warning.append(_NO_INTRINSICS_MESSAGE)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return data.open_all(capture.path, capture.format, **{**how, "fov": _ASSUMED_FOV_DEG})
+            return data.open_all(capture.path, capture.format, **{**reader_options, "fov": _ASSUMED_FOV_DEG})
     return recordings
 
 
@@ -258,7 +262,7 @@ def _survey_stacks(capture: FoundCapture, frames: int) -> Iterator[Survey]:
 
 
 def classify_images(folder: Path) -> tuple[list[Path], list[Path]]:
-    """Pictures and depth maps (16 bits, one channel) of a folder and of those directly in it."""
+    """Images and depth maps (16 bits, one channel) of a folder and of its direct subfolders."""
     pictures: list[Path] = []
     depths: list[Path] = []
     for file in sorted((*folder.glob("*"), *folder.glob("*/*")), key=files.natural_sort_key):
@@ -273,7 +277,7 @@ def classify_images(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def _survey_loose_pictures(capture: FoundCapture, frames: int) -> Iterator[Survey]:
-    """Some of the pictures and depth maps of a folder, the latter taken to be in millimetres."""
+    """Survey of evenly picked images and depth maps of a folder; 16-bit images are taken as millimetres."""
     with doors.restrict_links(None if capture.follow_links else capture.path):
         yield from _read_loose_pictures(capture, frames)
 
@@ -291,7 +295,7 @@ def _read_loose_pictures(capture: FoundCapture, frames: int) -> Iterator[Survey]
                 unreadable.append(str(error))
     survey = survey_pictures(capture.path.resolve().name, shown["image"], shown["depth"])
     if depths:
-        survey.warn("16-bit pictures are taken to be depth in millimetres")
+        survey.warn("16-bit images are taken as depth in millimetres")
     survey.warnings.extend(unreadable)
     yield survey
 
@@ -304,17 +308,17 @@ def _pick_evenly(items: Sequence[Path], count: int) -> list[Path]:
     return [items[i] for i in sorted({round(k * (n - 1) / max(count - 1, 1)) for k in range(count)})] if n else []
 
 
-# ------------------------------------------------------------------------------------------------------------ showing
+# ------------------------------------------------------------------------------------------------------------- output
 
 
 def print_survey(capture: FoundCapture, survey: Survey, console: Any = None) -> None:
-    """Facts and warnings as a table (``console``: a ``rich.console.Console``; None = standard output)."""
+    """Print facts and warnings as a table (``console``: a ``rich.console.Console``; None = standard output)."""
     from rich.console import Console  # noqa: PLC0415
     from rich.table import Table  # noqa: PLC0415
 
     console = console or Console(file=unwrap_terminal(sys.stdout))
     if not console.is_terminal:
-        console.width = max(console.width, 140)  # a file has no edge to wrap at
+        console.width = max(console.width, 140)  # no line wrapping in a file
     table = Table.grid(padding=(0, 2))
     table.add_column(style="dim", no_wrap=True)
     table.add_column()
@@ -329,7 +333,7 @@ def print_survey(capture: FoundCapture, survey: Survey, console: Any = None) -> 
 
 
 def write_contact_sheet(survey: Survey, out: Path) -> Path:
-    """Write the contact sheet into ``out``: pictures above their depth and confidence, below them depth and path.
+    """Write the contact sheet into ``out``: images, depth, confidence; below, depth histogram and camera path.
 
     Returns:
         The PNG file, named after the recording.
@@ -337,12 +341,12 @@ def write_contact_sheet(survey: Survey, out: Path) -> Path:
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     rows = [kind for kind in ("image", "depth", "conf") if any(getattr(t, kind) is not None for t in survey.tiles)]
-    wanted = ((_plot_depths, survey.depths.numel() > 0), (_plot_path, survey.path is not None))
-    plots = [draw for draw, there in wanted if there]
+    plot_conditions = ((_plot_depths, survey.depths.numel() > 0), (_plot_path, survey.path is not None))
+    plots = [draw for draw, is_available in plot_conditions if is_available]
     first = next((x for t in survey.tiles for x in (t.image, t.depth) if x is not None), torch.zeros(3, 4))
-    tall = 1.6 * min(max(first.shape[-2] / first.shape[-1], 0.5), 1.5) * len(rows) + 0.15
+    tiles_height = 1.6 * min(max(first.shape[-2] / first.shape[-1], 0.5), 1.5) * len(rows) + 0.15
     width = max(1.6 * len(survey.tiles), 3.2 * len(plots), 4.8)
-    heights = [tall, 1.9] if plots else [tall]
+    heights = [tiles_height, 1.9] if plots else [tiles_height]
     figure = Figure(figsize=(width, sum(heights) + 0.3), dpi=120, layout="constrained")
     figure.suptitle(f"{survey.name}: {survey.format}", fontsize=9)
     parts = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
@@ -366,7 +370,7 @@ def _draw_tiles(figure: Any, rows: Sequence[str], survey: Survey) -> None:
             if picture is not None:
                 _draw_tile(axes, picture, kind, limits)
                 axes.set_title(title, fontsize=6, pad=2)
-                title = ""  # above the first picture of a column only
+                title = ""  # only above the first image of a column
 
 
 def _depth_limits(depths: Tensor) -> tuple[float, float]:
@@ -391,21 +395,21 @@ def _draw_tile(axes: Any, picture: Tensor, kind: str, limits: tuple[float, float
 
 
 def _nearest_per_block(depth: Tensor, size: int) -> Tensor:
-    """The nearest return in each block, 0 where there is none: single returns would not be seen."""
-    far = torch.where(depth > 0, -depth, -torch.inf)
-    best = -torch.nn.functional.max_pool2d(far[None], size, ceil_mode=True)[0]
+    """Nearest return in each block of ``size`` px, 0 without one: single sparse returns would be invisible."""
+    negated = torch.where(depth > 0, -depth, -torch.inf)
+    best = -torch.nn.functional.max_pool2d(negated[None], size, ceil_mode=True)[0]
     return torch.where(torch.isfinite(best), best, torch.zeros_like(best))
 
 
 def _make_outline(shape: Sequence[int]) -> Any:
-    """Around a depth map, since its holes are white."""
+    """Outline of a depth map, whose holes are white."""
     from matplotlib.patches import Rectangle  # noqa: PLC0415
 
     return Rectangle((-0.5, -0.5), shape[1], shape[0], fill=False, edgecolor=SILENT, linewidth=0.6)
 
 
 def _plot_depths(axes: Any, survey: Survey) -> None:
-    """How often which depth occurs, in the colours of the depth maps."""
+    """Histogram of depth in the colours of the depth maps."""
     from matplotlib import colormaps  # noqa: PLC0415
 
     low, high = _depth_limits(survey.depths)
@@ -418,7 +422,7 @@ def _plot_depths(axes: Any, survey: Survey) -> None:
 
 
 def _plot_path(axes: Any, survey: Survey) -> None:
-    """The two directions in which the camera moved most, both at the same scale."""
+    """Camera path along the two axes of largest motion, both at one scale."""
     assert survey.path is not None
     t = survey.path.double().numpy()
     a, b = sorted(np.argsort(np.ptp(t, axis=0))[1:])

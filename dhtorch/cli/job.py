@@ -1,6 +1,6 @@
-"""One job: from the parts that the settings name to a result file in the job's own folder.
+"""One experiment job: components named by the settings -> ``result.json`` in the job's own folder.
 
-The result is written last, after its pictures: a folder with a valid ``result.json`` holds everything the job makes.
+The result is written last, after its figures: a folder with a valid ``result.json`` holds all output of the job.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from dhtorch.runtime.console import format_count
 
 _LOG = logging.getLogger(__name__)
 
-#: File beside a result that says where its data lie.
+#: File beside a result with the path of its data on this machine.
 DATA_ROOT_FILE = "data_root.txt"
 
 #: The settings groups; their names enter the key of a result.
@@ -35,7 +35,7 @@ SETTINGS_GROUPS = ("method", "data", "pairs", "holdout", "experiment")
 
 @dataclass(frozen=True)
 class JobStatus:
-    """How a job ended."""
+    """Final state of a job."""
 
     folder: str
     state: str  # finished | untouched | failed
@@ -51,7 +51,7 @@ def run(
     progress: Callable[[Iterable[Any], str, int], Iterable[Any]],
     swept: bool = False,
 ) -> JobStatus:
-    """Run the experiment and write ``folder/result.json``, unless resuming finds the same one there already.
+    """Run the experiment and write ``folder/result.json``; with ``resume``, a finished result of the same key is kept.
 
     Args:
         settings: all options, resolved.
@@ -59,7 +59,7 @@ def run(
         choices: settings group → name of the chosen settings.
         folder: of this job alone.
         progress: wraps a loop, see :func:`dhtorch.experiments.protocol.run`.
-        swept: one job of several, whose results stand in one table at the end.
+        swept: whether the job is one of a sweep, which prints one table at its end.
 
     Raises:
         ValueError, OSError, KeyError, ImportError: bad options or data; nothing is written.
@@ -68,24 +68,24 @@ def run(
         torch.set_num_threads(settings["threads"])
         data_files.set_opencv_threads(settings["threads"])
     names = {group: choices[group] for group in SETTINGS_GROUPS}
-    asked = _resolve_data(parts["data"])
-    digest = result_files.compute_data_digest({**_list_data_files(asked), **_list_settings_files(settings)})
+    data_sets = _resolve_data(parts["data"])
+    digest = result_files.compute_data_digest({**_list_data_files(data_sets), **_list_settings_files(settings)})
     key = result_files.compute_result_key({**settings, "choices": names}, digest)
     target = folder / "result.json"
-    for each in asked if _LOG.isEnabledFor(logging.DEBUG) else ():
-        what = each.recording if isinstance(each, Scene) else each
-        _LOG.debug("data: %s, %d of %s", each.name, len(what), what.format)
+    for data_set in data_sets if _LOG.isEnabledFor(logging.DEBUG) else ():
+        sequence = data_set.recording if isinstance(data_set, Scene) else data_set
+        _LOG.debug("data: %s, %d of %s", data_set.name, len(sequence), sequence.format)
     _LOG.debug("digest %s, key %s", digest, key)
     storage.remove_unfinished_files(target)
     if settings["resume"] and result_files.is_finished(target, key):
         print(f"{target}: finished and valid, left untouched")
         return JobStatus(str(folder), "untouched")
     methods = {names["method"]: parts["method"]}
-    outcome = parts["experiment"](asked, methods, parts["pairs"], _make_pair_settings(settings), progress=progress)
+    outcome = parts["experiment"](data_sets, methods, parts["pairs"], _make_pair_settings(settings), progress=progress)
     _LOG.debug("%d pairs answered", outcome.n_pairs)
     examples = outcome.examples if settings["figures"] else []
     drawn = [path for example in examples for path in draw_example(folder / example.scene, example)]
-    scenes = [each.name for each in asked]
+    scenes = [data_set.name for data_set in data_sets]
     data = {"name": names["data"], "scenes": scenes, "n_pairs": outcome.n_pairs, "digest": digest}
     result = _build_result(settings, names["experiment"], key, data, outcome)
     _write_data_root(folder, settings)
@@ -116,7 +116,7 @@ def _build_result(
 
 
 def _write_data_root(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Where the data lie on this machine: beside the result, which names none."""
+    """Write the absolute data path beside the result (the result itself holds no machine paths)."""
     root = settings["data"].get("root") if isinstance(settings["data"], Mapping) else None
     if root is not None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -124,14 +124,14 @@ def _write_data_root(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def _print_result(result: Mapping[str, Any], written: Sequence[Path], *, swept: bool) -> None:
-    """The first look; all tables where much is to be said, none of a job of a sweep, which has a table at its end."""
+    """Print a brief result; all tables if verbose; no table for a job of a sweep, which prints one at its end."""
     if console.get_verbosity() == "verbose":
         report.print_tables(result)
     elif not swept:
         report.print_brief(result)
-    few = {r["scene"]: r["n_few"] for r in result["rows"] if r["pair"] is None and r.get("n_few")}
-    for scene, n in few.items() if not swept else ():
-        print(f"{scene}: {format_count(n, 'pair')} dropped, fewer than {MIN_CANDIDATES} candidates each")
+    n_skipped = {r["scene"]: r["n_few"] for r in result["rows"] if r["pair"] is None and r.get("n_few")}
+    for scene, n in n_skipped.items() if not swept else ():
+        print(f"{scene}: {format_count(n, 'pair')} skipped: fewer than {MIN_CANDIDATES} candidate samples each")
     if result["verdict"]:
         print(f"{result['verdict']}: {result['why']}")
     advice = report.advice(result)
@@ -139,13 +139,13 @@ def _print_result(result: Mapping[str, Any], written: Sequence[Path], *, swept: 
         "\n".join(advice if len(advice) <= 2 else [f"{advice[0]} (and {len(advice) - 1} more)"]),
         end="\n" * bool(advice),
     )
-    beside = len(written) - 1
-    more = f" and {format_count(beside, 'picture')} and points beside it" if beside else ""
-    print(f"wrote {written[0]}{more}")
+    n_figures = len(written) - 1
+    figures = f" and {format_count(n_figures, 'picture')} and points beside it" if n_figures else ""
+    print(f"wrote {written[0]}{figures}")
 
 
 def _make_pair_settings(settings: Mapping[str, Any]) -> Settings:
-    """The options that every pair of the job shares."""
+    """The options shared by all pairs of the job."""
     dtype = getattr(torch, str(settings["dtype"]), None)
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
@@ -155,7 +155,9 @@ def _make_pair_settings(settings: Mapping[str, Any]) -> Settings:
     try:
         torch.empty(0, device=settings["device"])
     except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device: found {settings['device']!r}, expected one that torch can use here") from error
+        raise ValueError(
+            f"device: found {settings['device']!r}, expected a device that torch can use on this machine"
+        ) from error
     return Settings(
         cutoff=settings["holdout"]["cutoff"],
         truth=(settings["holdout"]["truth"],),
@@ -168,18 +170,18 @@ def _make_pair_settings(settings: Mapping[str, Any]) -> Settings:
 
 
 def _resolve_data(data: Any) -> Sequence[Scene] | Sequence[FocalStacks]:
-    """What the data of a job are: scenes, or focal stacks for the experiments that read them."""
-    given = data if isinstance(data, list) else [data]
-    if given and all(isinstance(each, FocalStacks) for each in given):
-        return given
+    """Data object -> scenes, or focal stacks for the experiments that read them."""
+    data_sets = data if isinstance(data, list) else [data]
+    if data_sets and all(isinstance(each, FocalStacks) for each in data_sets):
+        return data_sets
     return scenes_of(data)
 
 
-def _list_data_files(asked: Iterable[Scene | FocalStacks]) -> dict[str, Path]:
-    """Name → file of all data below their folders."""
-    return result_files.list_files_below(each.root for each in asked)
+def _list_data_files(data_sets: Iterable[Scene | FocalStacks]) -> dict[str, Path]:
+    """Name → path of all data files below the scenes' folders."""
+    return result_files.list_files_below(each.root for each in data_sets)
 
 
 def _list_settings_files(settings: Mapping[str, Any]) -> dict[str, Path]:
-    """Option → file that the settings of a group name."""
+    """Option → path of every file named in the settings."""
     return result_files.list_files_named({k: settings[k] for k in SETTINGS_GROUPS})

@@ -1,4 +1,4 @@
-"""How ``dhtorch complete`` names and stores frames, and what it puts beside them for a reader of :mod:`dhtorch.data`.
+"""File layouts of ``dhtorch complete``: folders, file names, depth units, and the files a reader needs beside them.
 
 - ``frames``: ``images/`` and ``depth/`` by frame number, ``K.txt``, ``poses.txt``; steps of 1 mm, of 5 mm where the
   sensor is a LiDAR of a car. Read by ``frames_dir``.
@@ -29,22 +29,22 @@ from dhtorch.runtime import storage
 #: What the meta file of a frame holds.
 Row = Mapping[str, Any]
 
-#: Step of depth where a sensor sees farther than steps of a millimetre reach.
+#: Depth step for sparse long-range sensors, whose range exceeds that of millimetre steps, m.
 _SPARSE_DEPTH_STEP_M = 0.005
 
-#: What a Stray capture says of a depth, by codes.Source.
+#: codes.Source → confidence value of a Stray capture.
 _STRAY_CONFIDENCE = {Source.NONE: 0, Source.SENSOR: 2, Source.RECOVERED: 1, Source.SWEPT: 1, Source.ALIGNED: 1}
 
-#: Files of a Stray capture that hold for whatever depth it has.
+#: Files of a Stray capture that do not depend on its depth.
 _STRAY_FILES = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")
 
-#: Kind of file → how its name ends; pictures otherwise.
+#: Kind of file → suffix; ``.png`` otherwise.
 _FILE_SUFFIXES = {"meta": ".json", "arrays": ".npz"}
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Names, places and the step of depth."""
+    """File names, folders and depth step."""
 
     name: str
     unit: float  # m
@@ -55,33 +55,33 @@ class Layout:
 
     @property
     def folders(self) -> list[str]:
-        """Of the files of every frame, the last one written last."""
-        others = {"confidence": self.confidence, "arrays": self.arrays}
-        chosen = [kind for kind, wanted in others.items() if wanted]
-        return ["depth", "sigma", "source", *([self.pictures] if self.pictures else []), *chosen, "meta"]
+        """Folders of a frame's files in the order of writing."""
+        optional = {"confidence": self.confidence, "arrays": self.arrays}
+        extra = [kind for kind, is_written in optional.items() if is_written]
+        return ["depth", "sigma", "source", *([self.pictures] if self.pictures else []), *extra, "meta"]
 
     @property
     def sigma_unit(self) -> float:
-        """m, a step of sigma."""
+        """Step of sigma, m."""
         return self.unit / SIGMA_STEPS_PER_DEPTH_STEP
 
     @property
     def reach(self) -> float:
-        """m, the largest depth that it holds."""
+        """Largest depth that fits the 16 bits, m."""
         return self.unit * MAX_DEPTH_CODE
 
     def stem(self, recording: Recording, i: int) -> str:
-        """Name of the files of a frame."""
+        """Stem of the file names of a frame."""
         if self.stamped and recording.times is not None:
             return f"{float(recording.times[i]):.6f}"
         return f"{int(recording.number[i]):06d}"
 
     def file(self, folder: Path, kind: str, stem: str) -> Path:
-        """A file of a frame."""
+        """Path of one file of a frame."""
         return folder / kind / f"{stem}{_FILE_SUFFIXES.get(kind, '.png')}"
 
     def close(self, folder: Path, recording: Recording, frames: Sequence[int], rows: Sequence[Row]) -> None:
-        """Write what makes the frames (positions, with their meta files) a recording."""
+        """Write the camera, pose and time files that make ``frames`` (positions; metadata ``rows``) a recording."""
         poses = None if recording.poses is None else recording.poses[torch.tensor(frames)]
         if self.name == "frames" and poses is not None:
             export.write_frames_dir_metadata(
@@ -113,59 +113,59 @@ def select_layout(recording: Recording, wanted: str, unit: float | None, *, same
         recording: whose frames are completed.
         wanted: a name of ``FRAME_LAYOUTS``, or ``auto``: the recording's own, else ``frames``, else ``png``.
         unit: m, a step of depth. None = the layout's own.
-        same: whether the maps are of the pictures' size.
-        arrays: whether there are arrays, too.
+        same: whether the maps have the size of the images.
+        arrays: whether NPZ files are written as well.
 
     Raises:
-        ValueError: a layout that cannot hold this recording, or another unit than its reader takes.
+        ValueError: the layout cannot hold this recording, or its reader takes another unit.
     """
     names = [_LAYOUT_OF_FORMAT.get(recording.format, "frames"), "frames", "png"] if wanted == "auto" else [wanted]
     missing = {name: _find_lack(name, recording, same) for name in names}
     if missing[names[-1]]:
-        raise ValueError(f"format={wanted}: {recording.name} {missing[names[-1]]}; format=auto takes what fits")
+        raise ValueError(f"format={wanted}: {recording.name} {missing[names[-1]]}; use format=auto")
     layout = FRAME_LAYOUTS[next(name for name in names if not missing[name])]
     if layout.name == "stray" and unit not in (None, layout.unit):
-        raise ValueError(f"unit: found {unit}, expected {layout.unit} m, the only one of format=stray")
+        raise ValueError(f"unit: found {unit}, expected {layout.unit} m, the only unit of format=stray")
     if recording.sparse and layout.name in ("frames", "png"):
         layout = replace(layout, unit=_SPARSE_DEPTH_STEP_M)
     return replace(layout, unit=layout.unit if unit is None else unit, arrays=arrays)
 
 
 def stray_confidence(source: np.ndarray) -> np.ndarray:
-    """Confidence uint8 of a Stray capture of codes.Source, any shape."""
+    """codes.Source (any shape) -> confidence of a Stray capture, uint8."""
     table = np.zeros(max(_STRAY_CONFIDENCE) + 1, np.uint8)
     table[list(_STRAY_CONFIDENCE)] = list(_STRAY_CONFIDENCE.values())
     return table[source]
 
 
 def has_varying_camera(rows: Sequence[Row]) -> bool:
-    """Whether the camera differs from frame to frame, so that one K cannot speak for all."""
+    """Whether the intrinsics differ between frames."""
     return any((row["K"], row["distortion"]) != (rows[0]["K"], rows[0]["distortion"]) for row in rows)
 
 
 def _find_lack(name: str, recording: Recording, same: bool) -> str | None:
-    """What a recording lacks for a layout, in words."""
+    """The reason a recording does not fit a layout, None where it fits."""
     if name == "frames":
         poses = recording.poses
-        known = poses is not None and bool(poses.t.isfinite().all() and poses.R.isfinite().all())
-        return None if known else "has no pose for every frame"
+        has_poses = poses is not None and bool(poses.t.isfinite().all() and poses.R.isfinite().all())
+        return None if has_poses else "has no pose for every frame"
     if name == "tum" and recording.times is None:
         return "has no time stamps"
     if name == "tum" and not same:
-        return "has pictures larger than its maps (size)"
+        return "has images larger than its maps (see size=)"
     if name == "stray" and recording.format != "stray":
-        return f"is {recording.format}, no Stray Scanner capture"
+        return f"is a {recording.format} recording, not a Stray Scanner capture"
     return None
 
 
 def _read_camera(row: Row) -> Camera:
-    """Of the map of a frame."""
+    """Metadata row -> camera of the map."""
     lens = None if row["distortion"] is None else torch.tensor([row["distortion"]])
     return from_matrix(torch.tensor([row["K"]]), lens)
 
 
 def _frame_rate(recording: Recording) -> float | None:
-    """Frames per second where the numbers and this rate give the very time stamps."""
+    """Frames per second where frame number / rate equals the time stamps, else None."""
     rate, times = recording.rate_hz, recording.times
-    steady = rate is not None and times is not None and torch.allclose(recording.number.double() / rate, times)
-    return rate if steady else None
+    is_regular = rate is not None and times is not None and torch.allclose(recording.number.double() / rate, times)
+    return rate if is_regular else None

@@ -1,7 +1,7 @@
-"""``dhtorch PATH``: a capture of one's own, from its files to completed maps, one map and a page to look at.
+"""``dhtorch PATH``: a capture -> completed depth maps, one fused map and a viewer page.
 
-Frames are made as ``dhtorch complete`` makes them, coarse to fine until the time is over, so that the first picture is
-there soon and the same command does more. What cannot work is said in one sentence with what would help.
+Frames are completed as in ``dhtorch complete``, coarse to fine in time, until the time limit; a second run continues.
+A capture from which nothing can be recovered gives one sentence with the reason and the remedy.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from dhtorch.runtime.console import format_count
 from dhtorch.viz.viewer import html, points
 from dhtorch.viz.viewer.exhibit import PageOpening
 
-#: Folder of what is made, where no other is said.
+#: Default output folder.
 _DEFAULT_FOLDER = Path("dhtorch_out")
 
-#: Frames of which the map is made at most: coarse to fine, they see the same.
+#: Maximum number of frames in the fused map; taken coarse to fine, further frames show the same surfaces.
 _MAX_MAPPED_FRAMES = 40
 
-#: Frames that are looked at before a recording is given up.
+#: Frames tried for a readable one with depth before a recording is skipped.
 _MAX_TRIED_FRAMES = 8
 
-#: Options of ``dhtorch complete`` that are not asked for here.
+#: Values of the ``dhtorch complete`` options that this command does not have.
 _COMPLETE_DEFAULTS = {
     "format": "auto",
     "unit": None,
@@ -57,21 +57,21 @@ _COMPLETE_DEFAULTS = {
 
 
 class NothingToRecover(ValueError):
-    """A capture of which nothing can be recovered; the message says why and what would help."""
+    """Nothing can be recovered from a capture; the message gives the reason and the remedy."""
 
 
 @dataclass
 class RecoveredFrames:
-    """What became of one recording."""
+    """Progress on one recording."""
 
     task: CompletionTask
-    frames: list[int]  # whole ones, coarse to fine
-    broken: dict[int, str]  # frames that could not be read
-    left: int  # frames for which there was no time
+    frames: list[int]  # complete frames, coarse to fine
+    broken: dict[int, str]  # position of an unreadable frame → error
+    left: int  # frames left at the time limit
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
-    """Make all that the time allows of every recording of a capture; returns the exit code.
+    """Complete every recording of a capture within the time limit; returns the exit code.
 
     Args:
         settings: the options of ``conf/recover.yaml``, resolved.
@@ -79,79 +79,77 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         progress: wraps a loop: (items, text, number of items) → items.
 
     Raises:
-        ValueError, OSError: bad options or data, or a capture of which nothing can be recovered.
-        KeyboardInterrupt: Ctrl-C; whole frames stay.
+        ValueError, OSError: bad options or data, or nothing can be recovered.
+        KeyboardInterrupt: Ctrl-C; complete frames are kept.
     """
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
         files.set_opencv_threads(settings["threads"])
     path = Path(str(settings["path"])).expanduser()
-    reading = {name: value for name, value in settings["data"].items() if value is not None}
-    found = [replace(capture, options=reading) for capture in _find_recording_captures(path, settings["format"])]
+    reader_options = {name: value for name, value in settings["data"].items() if value is not None}
+    captures = [
+        replace(capture, options=reader_options) for capture in _find_recording_captures(path, settings["format"])
+    ]
     out = _resolve_folder(path, settings["out"])
-    recordings, refused = _open_captures(found)
+    recordings, refused = _open_captures(captures)
     chosen = recordings[: settings["recordings"]]
-    began, made = time.monotonic(), 0
+    start, n_done = time.monotonic(), 0
     for n, recording in enumerate(chosen):
         minutes = settings["minutes"]
-        until = None if minutes is None else began + 60 * minutes * (n + 1) / len(chosen)
+        until = None if minutes is None else start + 60 * minutes * (n + 1) / len(chosen)
         folder = out if len(chosen) == 1 else out / recording.name
         try:
-            said = _process_recording(recording, folder, settings, parts["method"], until, progress)
+            lines = _process_recording(recording, folder, settings, parts["method"], until, progress)
         except NothingToRecover as nothing:
             refused.append(str(nothing))
             continue
-        made += 1
-        print("\n".join(said), flush=True)
-    if made == 0:
+        n_done += 1
+        print("\n".join(lines), flush=True)
+    if n_done == 0:
         raise NothingToRecover("; ".join(refused[:3]))
     for line in refused:
         print(line)
     if len(chosen) < len(recordings):
-        print(f"{len(chosen)} of {len(recordings)} recordings; recordings=null takes all")
+        print(f"{len(chosen)} of {len(recordings)} recordings done; recordings=null does all")
     return 0
 
 
-# -------------------------------------------------------------------------------------------------------- what is there
+# --------------------------------------------------------------------------------------------------------------- input
 
 
 def _find_recording_captures(path: Path, format: str = "auto") -> list[FoundCapture]:
-    """The captures at a path, or up to two folders below, that hold pictures of a moving camera.
+    """Captures at a path, or up to two folders below, that are recordings of a moving camera.
 
     Raises:
-        FormatError: there is no capture.
-        NothingToDo: captures of other kinds.
+        FormatError: no capture.
+        NothingToRecover: only captures of other kinds.
     """
     if format != "auto":
-        return [FoundCapture(path, "recording", format, "as told")]
-    found = find_captures(path)
-    recordings = [each for each in found if each.kind == "recording"]
+        return [FoundCapture(path, "recording", format, "format= given")]
+    captures = find_captures(path)
+    recordings = [each for each in captures if each.kind == "recording"]
     if recordings:
         return recordings
-    if found[0].kind == "stacks":
-        what = f"focal stacks ({found[0].format}) of a still camera"
-        raise NothingToRecover(f"{path}: {what}; pictures from two places are needed, and depth of what is near")
-    pictures, depths = classify_images(found[0].path)
+    if captures[0].kind == "stacks":
+        what = f"focal stacks ({captures[0].format}) of a still camera"
+        raise NothingToRecover(f"{path}: {what}; images from two positions and depth of near surfaces are required")
+    pictures, depths = classify_images(captures[0].path)
     if len(depths) == 1:
-        raise NothingToRecover(
-            f"{path}: one frame; a second view from another place is needed for what the sensor lacks"
-        )
+        raise NothingToRecover(f"{path}: one frame; recovering depth requires a second view from another position")
     if depths:
         what = (
             f"{format_count(len(pictures), 'picture')} and {format_count(len(depths), 'depth map')} of no known format"
         )
-        raise NothingToRecover(f"{path}: {what}; a layout of docs/data.md is needed, as rgb/ beside depth/")
+        raise NothingToRecover(f"{path}: {what}; a layout of docs/data.md is required, e.g. rgb/ beside depth/")
     what = f"{format_count(len(pictures), 'picture')} without depth"
-    raise NothingToRecover(
-        f"{path}: {what}; a sensor's depth of what is near is needed, it gives the metre (docs/data.md)"
-    )
+    raise NothingToRecover(f"{path}: {what}; sensor depth of near surfaces is required for metric scale (docs/data.md)")
 
 
 def _open_captures(found: Sequence[FoundCapture]) -> tuple[list[Recording], list[str]]:
-    """The recordings of several captures, and in a sentence each why others cannot be opened.
+    """The recordings of several captures, and an error message for each capture that cannot be opened.
 
     Raises:
-        NothingToDo, FormatError: the only capture cannot.
+        NothingToRecover, FormatError: the only capture cannot be opened.
     """
     recordings: list[Recording] = []
     refused: list[str] = []
@@ -169,7 +167,7 @@ def _open_capture(capture: FoundCapture) -> Sequence[Recording]:
     """The recordings of a capture.
 
     Raises:
-        NothingToDo: it has depth and no pictures.
+        NothingToRecover: it has depth but no images.
         FormatError: it cannot be read.
     """
     try:
@@ -182,13 +180,11 @@ def _open_capture(capture: FoundCapture) -> Sequence[Recording]:
             open_all(capture.path, capture.format, images=False)
         except FormatError:
             raise error from None
-        raise NothingToRecover(
-            f"{capture.path}: depth only, nothing to track: it needs the pictures ({error})"
-        ) from None
+        raise NothingToRecover(f"{capture.path}: depth without images, which tracking requires ({error})") from None
 
 
 def coarse_to_fine(n: int) -> list[int]:
-    """0 … n − 1 in an order of which every beginning is spread evenly: the middle first, then that of each half, …"""
+    """0 … n − 1 ordered so that every prefix is spread evenly: the middle first, then the middle of each half, …"""
     order, spans = [], [(0, n)]
     while spans:
         order += [(a + b) // 2 for a, b in spans if b > a]
@@ -197,30 +193,30 @@ def coarse_to_fine(n: int) -> list[int]:
 
 
 def _resolve_folder(path: Path, out: Any) -> Path:
-    """The folder of what is made.
+    """The output folder.
 
     Raises:
-        ValueError: it lies in the capture.
+        ValueError: it is inside the capture.
     """
     name = path.resolve().name or "capture"
     folder = _DEFAULT_FOLDER / (path.stem if path.is_file() else name) if out is None else Path(str(out)).expanduser()
     if path.is_dir() and folder.resolve().is_relative_to(path.resolve()):
         raise ValueError(
-            f"out: {folder} lies in the capture, which is never written to; expected another place (out=DIR)"
+            f"out: {folder} is inside the capture, which is never written to; expected another folder (out=DIR)"
         )
     return folder
 
 
 def _find_usable_frame(recording: Recording) -> int:
-    """A frame that can be read, of a recording of which something may be recovered.
+    """Position of a readable frame with images and depth.
 
     Raises:
-        NothingToDo: why nothing can, and what would help.
+        NothingToRecover: no such frame, or fewer than two frames.
     """
     if len(recording) < 2:
-        help = "a second view from another place is needed for what the sensor lacks"
-        raise NothingToRecover(f"{recording.name}: {format_count(len(recording), 'frame')}; {help}")
-    causes, blank = [], 0
+        remedy = "recovering depth requires a second view from another position"
+        raise NothingToRecover(f"{recording.name}: {format_count(len(recording), 'frame')}; {remedy}")
+    causes, n_without_depth = [], 0
     for k in coarse_to_fine(len(recording))[:_MAX_TRIED_FRAMES]:
         try:
             frame = recording[k]
@@ -228,20 +224,18 @@ def _find_usable_frame(recording: Recording) -> int:
             causes.append(str(error))
             continue
         if 0 in frame.hw:
-            what = "depth only, nothing to track: it needs its pictures (rgb.mp4, or a folder of them)"
+            what = "depth without images, which tracking requires (rgb.mp4, or a folder of images)"
             raise NothingToRecover(f"{recording.name}: {what}")
         if bool((frame.depth > 0).any()):
             return k
-        blank += 1
-    if blank:
-        what = f"{format_count(len(recording), 'frame')}, of {blank} looked at none has depth"
-        raise NothingToRecover(
-            f"{recording.name}: {what}; a sensor's depth of what is near is needed, it gives the metre"
-        )
+        n_without_depth += 1
+    if n_without_depth:
+        what = f"{format_count(len(recording), 'frame')}, none of the {n_without_depth} examined has depth"
+        raise NothingToRecover(f"{recording.name}: {what}; sensor depth of near surfaces is required for metric scale")
     raise NothingToRecover(f"{recording.name}: no frame can be read: {causes[0]}")
 
 
-# --------------------------------------------------------------------------------------------------------- what is made
+# ---------------------------------------------------------------------------------------------------------- processing
 
 
 def _process_recording(
@@ -252,72 +246,77 @@ def _process_recording(
     until: float | None,
     progress: Progress,
 ) -> list[str]:
-    """Everything of one recording; what to say of it."""
-    read = {"path": str(settings["path"]), "format": recording.format}
-    read |= {name: value for name, value in settings["data"].items() if value is not None}
-    own = {**_COMPLETE_DEFAULTS, **settings, "out": str(folder), "data": read}
-    own["choices"] = {**settings["choices"], "data": recording.format}
+    """Complete one recording and write all its files -> the printed lines."""
+    reader_options = {"path": str(settings["path"]), "format": recording.format}
+    reader_options |= {name: value for name, value in settings["data"].items() if value is not None}
+    complete_settings = {**_COMPLETE_DEFAULTS, **settings, "out": str(folder), "data": reader_options}
+    complete_settings["choices"] = {**settings["choices"], "data": recording.format}
     scene = Scene.of(recording)
-    first = _find_usable_frame(recording)
+    usable = _find_usable_frame(recording)
     task = complete.make_completion_task(
-        scene, folder, method, own, completed.digest_scene_files(scene, own, folder), sized_as=first
+        scene,
+        folder,
+        method,
+        complete_settings,
+        completed.digest_scene_files(scene, complete_settings, folder),
+        sized_as=usable,
     )
     order = [i for i in coarse_to_fine(len(recording)) if i in task.offers]
     task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
     completed.resume_folder(task)
-    made = _complete_in_time(task, until, progress)
-    if not made.frames:
-        reason = next(iter(made.broken.values()), "no time for a single frame (minutes=)")
+    recovered = _complete_in_time(task, until, progress)
+    if not recovered.frames:
+        reason = next(iter(recovered.broken.values()), "the time limit ended before the first frame (minutes=)")
         raise NothingToRecover(f"{recording.name}: no frame could be completed: {reason}")
-    rows = [task.done[task.name(i)] for i in made.frames]
-    best = max(zip(rows, made.frames, strict=True), key=lambda each: each[0]["pixels"].get("swept", 0))[1]
-    found = recover_page.measure_recovery(task, made.frames)
-    said = recover_page.describe_recovery(task, found, recording[made.frames[0]].hw)
+    rows = [task.done[task.name(i)] for i in recovered.frames]
+    best = max(zip(rows, recovered.frames, strict=True), key=lambda each: each[0]["pixels"].get("swept", 0))[1]
+    stats = recover_page.measure_recovery(task, recovered.frames)
+    lines = recover_page.describe_recovery(task, stats, recording[recovered.frames[0]].hw)
     opening = recover_page.build_opening(
-        said, found, _write_overview(task, best), completed.format_frame_title(task, best)
+        lines, stats, _write_overview(task, best), completed.format_frame_title(task, best)
     )
-    written = ["depth/", "overview.png", *_write_map(made, opening, settings, progress)]
-    return [*said, _format_next_step(made, written[-1]), f"Wrote {', '.join(written)} in {folder}."]
+    written = ["depth/", "overview.png", *_write_map(recovered, opening, settings, progress)]
+    return [*lines, _format_next_step(recovered, written[-1]), f"Wrote {', '.join(written)} in {folder}."]
 
 
 def _complete_in_time(task: CompletionTask, until: float | None, progress: Progress) -> RecoveredFrames:
-    """Frames in their order until the time is over; one that cannot be read is left out, and not offered again."""
-    made = RecoveredFrames(task, [], {}, 0)
+    """Complete the frames in order until the time limit; unreadable frames are skipped, also as source views."""
+    recovered = RecoveredFrames(task, [], {}, 0)
     todo = [i for i in task.frames if task.missing(i)]
-    made.frames = [i for i in task.frames if not task.missing(i)]
-    first = not made.frames
+    recovered.frames = [i for i in task.frames if not task.missing(i)]
+    is_first = not recovered.frames
 
     def in_time() -> Iterator[int]:
         for n, i in enumerate(todo):
-            if until is not None and time.monotonic() > until and made.frames:
-                made.left = len(todo) - n
+            if until is not None and time.monotonic() > until and recovered.frames:
+                recovered.left = len(todo) - n
                 return
             yield i
 
     with complete.close_on_exit(task):
         for i in progress(in_time(), f"{task.scene.name}: frames", len(todo)):
-            if _try_frame(made, i) and first:
+            if _try_frame(recovered, i) and is_first:
                 _write_overview(task, i)
-                first = False
-    return made
+                is_first = False
+    return recovered
 
 
-def _try_frame(made: RecoveredFrames, i: int) -> bool:
-    """Make a frame; where a file cannot be read, without the frame that it belongs to."""
-    task = made.task
-    while i not in made.broken:
+def _try_frame(recovered: RecoveredFrames, i: int) -> bool:
+    """Complete frame ``i`` -> success; unreadable source views are removed and the frame is tried again."""
+    task = recovered.task
+    while i not in recovered.broken:
         try:
             complete.complete_frame(task, i)
         except FormatError:
-            offered: Any = task.offers.get(i, ())
-            broken = {k: error for k in (i, *offered) if (error := _read_error(task.recording, k))}
+            candidates: Any = task.offers.get(i, ())
+            broken = {k: error for k in (i, *candidates) if (error := _read_error(task.recording, k))}
             if not broken:
                 raise
-            made.broken.update(broken)
-            for others in task.offers.values():
-                others[:] = [k for k in others if k not in broken]  # type: ignore[index]
+            recovered.broken.update(broken)
+            for source_views in task.offers.values():
+                source_views[:] = [k for k in source_views if k not in broken]  # type: ignore[index]
         else:
-            made.frames.append(i)
+            recovered.frames.append(i)
             return True
     return False
 
@@ -331,25 +330,25 @@ def _read_error(recording: Recording, k: int) -> str:
 
 
 def _write_overview(task: CompletionTask, i: int) -> bytes:
-    """Write the picture that shows most: what the camera saw, the sensor, the completed map."""
+    """Write ``overview.png`` of frame ``i`` (image, sensor depth, completed depth); returns the PNG."""
     picture = complete.render_completed(task, i, task.recording[i], *completed.read_completed_maps(task, i))
     storage.replace_file(task.folder / "overview.png", picture)
     return picture
 
 
 def _write_map(
-    made: RecoveredFrames, opening: PageOpening, settings: Mapping[str, Any], progress: Progress
+    recovered: RecoveredFrames, opening: PageOpening, settings: Mapping[str, Any], progress: Progress
 ) -> list[str]:
-    """The map of all frames, and the page, which begins with the numbers; the names of what was written."""
-    task = made.task
-    voxel = choose_voxel(task.recording, made.frames) if settings["voxel"] is None else settings["voxel"]
+    """Write the fused map (PLY, GLB) and the viewer page; returns the file names."""
+    task = recovered.task
+    voxel = choose_voxel(task.recording, recovered.frames) if settings["voxel"] is None else settings["voxel"]
 
     def read(k: int) -> FrameMap:
         maps, source = completed.read_completed_maps(task, k)
         depth, sigma = (torch.from_numpy(np.ascontiguousarray(maps[x])).float() for x in ("depth", "sigma"))
         return FrameMap(depth, sigma, torch.from_numpy(np.ascontiguousarray(source)))
 
-    frames = made.frames[:_MAX_MAPPED_FRAMES]
+    frames = recovered.frames[:_MAX_MAPPED_FRAMES]
     surface, up = fuse_frame_maps(
         task.recording, frames, read, voxel=voxel, meshed=should_mesh(settings["mesh"]), progress=progress
     )
@@ -367,32 +366,32 @@ def _write_map(
     return ["map.ply", "map.glb", "view.html"]
 
 
-# ------------------------------------------------------------------------------------------------------ what is said
+# ------------------------------------------------------------------------------------------------------------ summary
 
 
-def _format_next_step(made: RecoveredFrames, shown: str) -> str:
-    """What to do with what is there; ``shown`` is the file to open."""
-    n, name = len(made.broken), made.task.scene.name
-    cause = next(iter(made.broken.values()), "")
+def _format_next_step(recovered: RecoveredFrames, shown: str) -> str:
+    """The printed next step; ``shown`` is the file to open."""
+    n, name = len(recovered.broken), recovered.task.scene.name
+    cause = next(iter(recovered.broken.values()), "")
     broken = f" {format_count(n, 'frame')} of {name} could not be read ({cause})." if n else ""
-    if made.left:
-        more = f"the same command does more of the {format_count(made.left, 'frame')} left (minutes=null: all)"
-        return f"Next: open {shown}; {more}.{broken}"
-    read = {name: value for name, value in made.task.settings["data"].items() if value is not None}
-    also = "".join(f" data.{name}={_format_value(value)}" for name, value in read.items())
-    path, cutoff = made.task.settings["path"], _median_sensor_depth(made)
-    judged = f"dhtorch run data=auto data.root={path}{also} holdout.cutoff={cutoff:.2g}"
-    return f"Next: open {shown}; {judged} says how good it is on yours.{broken}"
+    if recovered.left:
+        again = f"run the same command again for the {format_count(recovered.left, 'frame')} left (minutes=null: all)"
+        return f"Next: open {shown}; {again}.{broken}"
+    reader_options = {name: value for name, value in recovered.task.settings["data"].items() if value is not None}
+    reader_words = "".join(f" data.{name}={_format_value(value)}" for name, value in reader_options.items())
+    path, cutoff = recovered.task.settings["path"], _median_sensor_depth(recovered)
+    command = f"dhtorch run data=auto data.root={path}{reader_words} holdout.cutoff={cutoff:.2g}"
+    return f"Next: open {shown}; to measure the error on your capture: {command}.{broken}"
 
 
 def _format_value(value: Any) -> str:
-    """A value as it is typed."""
+    """A value as written on the command line."""
     listed = isinstance(value, list)
     return f"[{','.join(map(str, value))}]" if listed else str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _median_sensor_depth(made: RecoveredFrames) -> float:
-    """Median depth of the returns of the first frame, m: what is hidden beyond it tells how good the rest is."""
-    maps, source = completed.read_completed_maps(made.task, made.frames[0])
+def _median_sensor_depth(recovered: RecoveredFrames) -> float:
+    """Median return depth of the first frame, m: the suggested cutoff beyond which returns are held out."""
+    maps, source = completed.read_completed_maps(recovered.task, recovered.frames[0])
     near = maps["depth"][(source == Source.SENSOR) & (maps["depth"] > 0)]
     return float(np.median(near)) if len(near) else 2.0

@@ -1,9 +1,8 @@
-"""The ``dhtorch`` command: Hydra turns names into functions, everything else happens in the library.
+"""The ``dhtorch`` command: arguments -> Hydra settings -> library functions; exit code.
 
-A first word that names a sub-command goes to that module, which reads its own arguments or is handed what the settings
-of that name compose to; anything else is a list of Hydra overrides for experiments. Each of their jobs has a folder of
-its own, named by its overrides inside a sweep, and reports how it ended instead of raising: one failing job stops no
-other, whichever launcher runs them.
+If the first argument names a sub-command, its module parses the other arguments or receives the composed settings of
+that name; otherwise all arguments are Hydra overrides of an experiment. Each job has its own folder, named by its
+overrides in a sweep, and returns its state instead of raising, so that a failing job stops no other, with any launcher.
 """
 
 from __future__ import annotations
@@ -35,28 +34,28 @@ from dhtorch.runtime.allocator import disable_malloc_trim
 #: Sub-command → module with ``main(argv) -> int``.
 _COMMANDS = {"inspect": "dhtorch.cli.inspect", "report": "dhtorch.experiments.report"}
 
-#: Sub-command with settings of its own, ``conf/<word>.yaml`` → module with ``run(settings, parts, *, progress)``, which
-#: is given all options as plain values, and as objects those that name a function. It returns the exit code.
+#: Sub-command with its own settings ``conf/<name>.yaml`` → module with ``run(settings, parts, *, progress)`` -> exit
+#: code; ``settings`` are all options as plain values, ``parts`` the instantiated options that name a function.
 _CONFIGURED_COMMANDS = {
-    "anchor": "dhtorch.cli.align",
+    "align": "dhtorch.cli.align",
     "complete": "dhtorch.cli.complete",
     "enrich": "dhtorch.cli.enrich",
     "extract": "dhtorch.extract",
     "integrate": "dhtorch.integrate.mapping",
-    "judge": "dhtorch.cli.validate",
     "recover": "dhtorch.cli.process_capture",
     "stream": "dhtorch.cli.stream",
+    "validate": "dhtorch.cli.validate",
     "view": "dhtorch.cli.view",
 }
 
-#: Sub-command → the options that its first words without a name set.
+#: Sub-command → the options set by its positional arguments.
 _POSITIONAL_OPTIONS = {
-    "anchor": ("data.root",),
+    "align": ("data.root",),
     "complete": ("data.root",),
     "enrich": ("data.root", "out"),
-    "judge": ("data.root",),
     "recover": ("path",),
     "stream": ("data.root",),
+    "validate": ("data.root",),
     "view": ("result",),
 }
 
@@ -66,32 +65,32 @@ EXIT_SIGHUP, EXIT_SIGTERM = 129, 143
 #: Exit codes, as ``dhtorch --help`` lists them.
 EXIT_CODES = {
     EXIT_DONE: "all done or left untouched",
-    EXIT_SOME_FAILED: "some jobs of a sweep failed, or a judged or anchored depth exceeds fail_on",
+    EXIT_SOME_FAILED: "some jobs of a sweep failed, or validated or aligned depth exceeds a limit of fail_on",
     EXIT_FAILED: "bad option, bad data or failed job",
     EXIT_INTERRUPTED: "interrupted",
-    EXIT_SIGHUP: "told to end by SIGHUP, as when a terminal is closed",
-    EXIT_SIGTERM: "told to end by SIGTERM",
-    EXIT_BROKEN_PIPE: "nobody reads the output any more",
+    EXIT_SIGHUP: "ended by SIGHUP, e.g. a closed terminal",
+    EXIT_SIGTERM: "ended by SIGTERM",
+    EXIT_BROKEN_PIPE: "output pipe closed",
 }
 
 _LOG = logging.getLogger("dhtorch.cli.run")
 
-#: Options that only one choice of the group ``pairs`` has: said alone they choose it.
+#: Option of a single choice of the group ``pairs`` → that choice, which the option implies.
 _IMPLIED_CHOICES = {"pairs.gap": "pairs=gap", "pairs.seconds": "pairs=time", "pairs.metres": "pairs=baseline"}
 
-#: Flags of Hydra that show something and run nothing.
+#: Hydra flags that print information and run no job.
 _HYDRA_INFO_FLAGS = {"-h", "--help", "--hydra-help", "-i", "--info", "-sc", "--shell-completion", "-c", "--cfg"}
 _SWEEP_FLAGS = {"-m", "--multirun"}
 
-#: How a job may end, and in words.
+#: Final state of a job → printed text.
 _JOB_STATES = {"finished": "finished", "untouched": "left untouched", "failed": "failed"}
 
-#: Where results lie that are to be resumed, when no ``output`` is given.
+#: Default ``output`` with ``resume=true``.
 _RESUMED_FOLDER = Path("outputs/resumed")
 
 _SEPARATORS = "/\\"
 
-#: A longer folder name is cut and told apart by a hash.
+#: Characters beyond which a folder name is cut and completed by a hash.
 _MAX_NAME_LENGTH = 120
 
 
@@ -103,13 +102,13 @@ def main(argv: list[str] | None = None) -> int:
         [a for a in argv if a not in console.VERBOSITY_FLAGS],
     )
     with console.escape_output(), console.set_verbosity(flags), console.show_warnings_in_a_line():
-        with signals.catch_termination() as told:
+        with signals.catch_termination() as received:
             code = _run_guarded(argv)
-        return told.code(code)
+        return received.code(code)
 
 
 def _run_guarded(argv: list[str]) -> int:
-    """The exit code, with whatever went wrong said in a line."""
+    """Run the command -> exit code; errors are printed in one line."""
     try:
         code = _dispatch(argv)
         sys.stdout.flush()
@@ -119,7 +118,7 @@ def _run_guarded(argv: list[str]) -> int:
         return EXIT_BROKEN_PIPE
     except errors.USER_ERRORS as error:
         return _report_failure(error, show="--traceback" in argv)
-    except KeyboardInterrupt as stop:  # a sub-command may say how to go on
+    except KeyboardInterrupt as stop:  # a sub-command may add how to continue
         print(": ".join(["dhtorch: interrupted", *map(str, stop.args)]), file=sys.stderr)
         return EXIT_INTERRUPTED
 
@@ -142,19 +141,19 @@ def _dispatch(argv: list[str]) -> int:
 
 
 def _is_capture(argv: Sequence[str]) -> bool:
-    """Whether the first word is a place and no word of the command."""
+    """Whether the first argument is an existing path and no sub-command."""
     return bool(argv) and argv[0] not in _CONFIGURED_COMMANDS and argv[0][:1] not in "-~+" and Path(argv[0]).exists()
 
 
 def _add_implied_choice(argv: list[str]) -> list[str]:
-    """The words with the choice of pairs that an option of theirs implies, where none is said."""
+    """The arguments with the choice of ``pairs`` that one of their options implies, unless ``pairs`` is set."""
     names = [a.split("=")[0] for a in argv]
     implied = [_IMPLIED_CHOICES[name] for name in names if name in _IMPLIED_CHOICES]
     return argv if "pairs" in names else [*argv, *implied[:1]]
 
 
 def config_dir() -> Path:
-    """The settings folder: inside an installed package, else beside the package in a checkout."""
+    """The settings folder: inside the installed package, else beside it in a checkout."""
     here = Path(__file__).resolve().parent.parent
     for folder in (here / "conf", here.parent / "conf"):
         if (folder / "run.yaml").is_file():
@@ -163,10 +162,10 @@ def config_dir() -> Path:
 
 
 def job_name(overrides: str) -> str:
-    """Folder name of a job: its overrides, where they are short and every file system takes them.
+    """Folder name of a job from its overrides.
 
-    What a file system or a shell would trip over is left out, what is too long is cut; a hash of the whole text then
-    keeps different jobs apart. Data below the environment variable DHTORCH_DATA is named relative to it.
+    Characters that file systems or shells may reject are removed and long names are cut; a hash of the whole text then
+    keeps the names of different jobs distinct. Paths below the environment variable DHTORCH_DATA become relative to it.
     """
     base = os.environ.get("DHTORCH_DATA")
     text = overrides.replace(base.rstrip(_SEPARATORS) + os.sep, "") if base else overrides
@@ -177,7 +176,7 @@ def job_name(overrides: str) -> str:
 
 
 def _run_configured(word: str, argv: list[str]) -> int:
-    """A sub-command that takes Hydra overrides: one job, in this process."""
+    """Run a sub-command with Hydra overrides as one job in this process."""
     import hydra  # noqa: PLC0415
     from hydra.core.hydra_config import HydraConfig  # noqa: PLC0415
     from hydra.errors import HydraException  # noqa: PLC0415
@@ -197,16 +196,16 @@ def _run_configured(word: str, argv: list[str]) -> int:
     argv = words.quote_words(argv)
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
-            usual, argv = _check_overrides(word, argv)
+            defaults, argv = _check_overrides(word, argv)
             cfg = hydra.compose(word, argv, return_hydra_config=True)
-            HydraConfig.instance().set_config(cfg)  # for what the settings take from Hydra, as the folder's name
+            HydraConfig.instance().set_config(cfg)  # for settings that refer to Hydra's own, e.g. the folder name
             groups = {k: v for k, v in cfg.hydra.runtime.choices.items() if k.isidentifier()}
         OmegaConf.set_struct(cfg, False)
         del cfg["hydra"]
         settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
-        words.validate_values(settings, usual)
-        named = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
-        parts = _instantiate_parts(cfg, named)
+        words.validate_values(settings, defaults)
+        function_options = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
+        parts = _instantiate_parts(cfg, function_options)
     except (HydraException, OmegaConfBaseException) as error:
         return _report_failure(errors.unwrap_cause(error), show="traceback=true" in argv)
     module = importlib.import_module(_CONFIGURED_COMMANDS[word])
@@ -220,11 +219,11 @@ def _run_configured(word: str, argv: list[str]) -> int:
 
 
 def _check_overrides(name: str, argv: Sequence[str]) -> tuple[Any, list[str]]:
-    """Refuse choices and options that the settings ``name`` do not have.
+    """Reject choices and options that the settings ``name`` do not have.
 
     Returns:
-        What the choices alone compose to, and the words as Hydra takes them: with a format that is yet to be
-        recognised, options of its reader are added to the settings.
+        The settings composed from the choices alone, and the arguments for Hydra: while the format is unknown, options
+        of any reader are added to the settings.
     """
     import hydra  # noqa: PLC0415
     from omegaconf import OmegaConf  # noqa: PLC0415
@@ -235,23 +234,27 @@ def _check_overrides(name: str, argv: Sequence[str]) -> tuple[Any, list[str]]:
     chosen = [a for a in argv if a.partition("=")[0] in groups]
     first = [a.partition(",")[0] if "[" not in a else a for a in chosen]
     composed: Any = OmegaConf.to_container(hydra.compose(name, first))
-    swept = [(group, choice) for group, _, some in (a.partition("=") for a in chosen) for choice in some.split(",")[1:]]
-    more = [
+    swept = [
+        (group, choice) for group, _, choices in (a.partition("=") for a in chosen) for choice in choices.split(",")[1:]
+    ]
+    swept_names = [
         f"{g}.{k}" for g, c in swept for k in words.iter_option_names(_load_settings(folder / g / f"{c.strip()}.yaml"))
     ]
     readers = _reader_options(folder) if any(a.startswith("data.") for a in argv) else []
     words.validate_option_names(
-        argv, composed, groups, [*more, *words.list_reader_options(composed, readers)], _IMPLIED_CHOICES
+        argv, composed, groups, [*swept_names, *words.list_reader_options(composed, readers)], _IMPLIED_CHOICES
     )
     return composed, words.add_reader_options(argv, composed, readers)
 
 
 def _reader_options(folder: Path) -> list[str]:
-    """Names of all options that readers of captures have, by the settings of each; those of all are no reader's."""
-    every = [_load_settings(path) for path in sorted((folder / "data").glob("*.yaml"))]
-    reading = [each for each in every if str(each.get("_target_", "")).endswith(".open_capture")]
-    common = set.intersection(*map(set, reading))
-    return list(dict.fromkeys(name for each in reading for name in each if name not in common))
+    """Option names of the capture readers, without those common to all readers."""
+    data_settings = [_load_settings(path) for path in sorted((folder / "data").glob("*.yaml"))]
+    reader_settings = [
+        settings for settings in data_settings if str(settings.get("_target_", "")).endswith(".open_capture")
+    ]
+    common = set.intersection(*map(set, reader_settings))
+    return list(dict.fromkeys(name for settings in reader_settings for name in settings if name not in common))
 
 
 def _load_settings(path: Path) -> Any:
@@ -261,7 +264,7 @@ def _load_settings(path: Path) -> Any:
 
 
 def _name_positionals(argv: list[str], options: Sequence[str]) -> list[str]:
-    """The words with the names of the options that the first of them set."""
+    """The arguments with the option names of the positional ones added."""
     for k, option in enumerate(options[: len(argv)]):
         if "=" in argv[k] and not Path(argv[k]).exists():
             break
@@ -270,7 +273,7 @@ def _name_positionals(argv: list[str], options: Sequence[str]) -> list[str]:
 
 
 def _lacks_result(first: Sequence[str]) -> bool:
-    """Whether a first word, if there is one, is a place that holds no result."""
+    """Whether the first argument is an existing path without a result."""
     place = Path(first[0]) if first and not first[0].startswith("-") else None
     if place is None or not place.exists() or place.suffix in (".json", ".ply"):
         return False
@@ -282,13 +285,13 @@ def _is_chosen(argv: Sequence[str], group: str) -> bool:
 
 
 def _name_output_folder(name: str, argv: Iterable[str]) -> list[str]:
-    """The words with the settings' own name of the folder of what is made, ``out`` or ``output``."""
+    """The arguments with ``out`` or ``output`` replaced by the name that the settings use."""
     own = "out" if "out" in _load_settings(config_dir() / f"{name}.yaml") else "output"
     return [f"{own}={a.partition('=')[2]}" if a.startswith(("out=", "output=")) else a for a in argv]
 
 
 def _show_hydra_info(name: str, argv: list[str]) -> int:
-    """Hydra's own flags: help, the composed settings, shell completion."""
+    """Run Hydra's own flags: help, composed settings, shell completion."""
     import hydra  # noqa: PLC0415
 
     sys.argv = [sys.argv[0], *argv]
@@ -317,42 +320,42 @@ def _run_hydra(argv: list[str]) -> int:
     sweep = bool({*_SWEEP_FLAGS, "hydra.mode=MULTIRUN"} & set(argv))
     overrides = words.quote_words(_name_output_folder("run", [a for a in argv if a not in _SWEEP_FLAGS]), sweep)
     if console.get_verbosity() == "quiet":
-        overrides.append("hydra/hydra_logging=disabled")  # what a launcher says of its jobs
+        overrides.append("hydra/hydra_logging=disabled")  # the launcher's messages
     try:
         with hydra.initialize_config_dir(str(config_dir()), version_base="1.3", job_name="dhtorch"):
             engine: Any = GlobalHydra.instance().hydra
             mode = RunMode.MULTIRUN if sweep else RunMode.RUN
-            # What is misspelt, or cannot be, fails here, in one line, before anything is run.
-            usual, overrides = _check_overrides("run", overrides)
+            # Misspelt names and invalid values fail here, in one line, before anything runs.
+            defaults, overrides = _check_overrides("run", overrides)
             cfg = engine.compose_config("run", overrides, run_mode=mode, with_log_configuration=False)
-            own: Any = OmegaConf.masked_copy(cfg, [k for k in cfg if k not in ("hydra", "output")])
-            plain: Any = OmegaConf.to_container(own)
-            words.validate_values(plain, usual)
+            settings_cfg: Any = OmegaConf.masked_copy(cfg, [k for k in cfg if k not in ("hydra", "output")])
+            plain: Any = OmegaConf.to_container(settings_cfg)
+            words.validate_values(plain, defaults)
             folder = _resolve_output_folder(cfg, overrides, sweep)
             overrides = [o for o in overrides if not o.startswith("output=")] + [f"output={quote_value(str(folder))}"]
-            again = _format_resume_command(argv, folder)
+            resume_command = _format_resume_command(argv, folder)
             with file_lock.acquire_file_lock(folder.parent / f".{folder.name}.lock", f"output: {folder}"):
                 if sweep:
-                    return _run_sweep(engine, overrides, folder, again, show=cfg.traceback)
-                return _run_single(engine, overrides, again)
+                    return _run_sweep(engine, overrides, folder, resume_command, show_traceback=cfg.traceback)
+                return _run_single(engine, overrides, resume_command)
     except (HydraException, OmegaConfBaseException) as error:
         return _report_failure(error)
 
 
-def _run_single(engine: Any, overrides: Sequence[str], again: str) -> int:
+def _run_single(engine: Any, overrides: Sequence[str], resume_command: str) -> int:
     try:
-        ended = engine.run("run", _run_hydra_job, list(overrides)).return_value
+        status = engine.run("run", _run_hydra_job, list(overrides)).return_value
     except KeyboardInterrupt:
-        print(f"dhtorch: interrupted, no result written. Once more:\n  {again}", file=sys.stderr)
+        print(f"dhtorch: interrupted, no result written. To run it again:\n  {resume_command}", file=sys.stderr)
         return EXIT_INTERRUPTED
-    return EXIT_FAILED if ended.state == "failed" else EXIT_DONE
+    return EXIT_FAILED if status.state == "failed" else EXIT_DONE
 
 
-def _run_sweep(engine: Any, overrides: Sequence[str], folder: Path, again: str, show: bool) -> int:
-    """Run all jobs, then say how they ended."""
+def _run_sweep(engine: Any, overrides: Sequence[str], folder: Path, resume_command: str, show_traceback: bool) -> int:
+    """Run all jobs of a sweep, print their states, return the exit code."""
     from hydra.errors import HydraException  # noqa: PLC0415
 
-    go_on = f"What is finished stays. To do the rest:\n  {again}"
+    go_on = f"Finished jobs are kept. To run the rest:\n  {resume_command}"
     try:
         with together.show_sweep_progress(folder, _count_jobs(overrides)):
             batches = engine.multirun("run", _run_hydra_job, list(overrides))
@@ -362,7 +365,7 @@ def _run_sweep(engine: Any, overrides: Sequence[str], folder: Path, again: str, 
     except HydraException:
         raise
     except Exception as error:  # the launcher broke, as when a worker process is killed
-        _report_failure(error, show)
+        _report_failure(error, show_traceback)
         print(go_on, file=sys.stderr)
         return EXIT_SOME_FAILED
     jobs = [job for batch in batches for job in batch]
@@ -383,7 +386,7 @@ def _run_sweep(engine: Any, overrides: Sequence[str], folder: Path, again: str, 
 
 
 def _count_jobs(overrides: Sequence[str]) -> int:
-    """Jobs of a sweep: every combination."""
+    """Number of jobs of a sweep: all combinations."""
     from hydra.core.override_parser.overrides_parser import OverridesParser  # noqa: PLC0415
 
     parsed = OverridesParser.create().parse_overrides(list(overrides))
@@ -391,7 +394,7 @@ def _count_jobs(overrides: Sequence[str]) -> int:
 
 
 def _print_comparison(folders: Sequence[Path], sweep: Path) -> None:
-    """The table of a sweep's jobs, and its file."""
+    """Print and write the table that compares the jobs of a sweep."""
     from dhtorch.experiments import report  # noqa: PLC0415
     from dhtorch.runtime import results as result_files  # noqa: PLC0415
 
@@ -399,10 +402,10 @@ def _print_comparison(folders: Sequence[Path], sweep: Path) -> None:
 
 
 def _run_hydra_job(cfg: Any) -> Any:
-    """One job, in whatever process a launcher runs it: build what the settings name and run it. Never raises."""
+    """Run one job in the process of any launcher. Never raises."""
     if multiprocessing.current_process().name != "MainProcess":  # of a launcher
         parent_watch.exit_with_parent()
-    disable_malloc_trim()  # frame after frame asks for the same memory
+    disable_malloc_trim()  # every frame allocates the same sizes
     with console.escape_output():
         return _run_job(cfg)
 
@@ -428,18 +431,18 @@ def _run_job(cfg: Any) -> Any:
         progress = together.record_progress(sweep, name, scenes) if swept else console.progress
         _LOG.debug("job in %s: %s", runtime.output_dir, HydraConfig.get().job.override_dirname or "defaults")
         with console.mute_if_quiet():
-            ended = job.run(
+            status = job.run(
                 settings, parts, dict(runtime.choices), Path(runtime.output_dir), progress=progress, swept=swept
             )
         if console.get_verbosity() == "quiet":
-            print(Path(ended.folder) / "result.json", flush=True)
-        return ended
+            print(Path(status.folder) / "result.json", flush=True)
+        return status
     except Exception as error:
         cause = errors.unwrap_cause(error)
         expected = isinstance(cause, (*errors.USER_ERRORS, OmegaConfBaseException, InstantiationException))
         _report_failure(cause, show=cfg.traceback or not expected)
         with contextlib.suppress(OSError):
-            Path(runtime.output_dir).rmdir()  # where nothing is in it
+            Path(runtime.output_dir).rmdir()  # only if empty
         return job.JobStatus(runtime.output_dir, "failed", errors.format_error(cause))
     finally:
         if swept:
@@ -447,7 +450,7 @@ def _run_job(cfg: Any) -> Any:
 
 
 def _instantiate_parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
-    """What groups of the settings name, built."""
+    """Settings groups -> instantiated objects."""
     from hydra.utils import instantiate  # noqa: PLC0415
 
     try:
@@ -458,31 +461,33 @@ def _instantiate_parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
 
 
 def _reject_stacks(error: BaseException, root: Any) -> None:
-    """Focal stacks given as a recording: say what they are, and who reads them."""
+    """Raise a clearer error if the data are focal stacks, which are not a recording."""
     from dhtorch.data.io.decode import FormatError  # noqa: PLC0415
     from dhtorch.experiments.focal.formats import recognise_stacks  # noqa: PLC0415
 
     if not isinstance(error, FormatError) or error.args[:2] != (str(root), "format"):
         return
     with contextlib.suppress(FormatError):
-        found = f"data: {root} holds focal stacks ({recognise_stacks(root)[0]}), pictures of one view"
-        expected = "a recording whose camera moves; experiment=focus_stack data=stacks reads them"
+        found = f"data: {root} holds focal stacks ({recognise_stacks(root)[0]}), images of one view"
+        expected = "a recording of a moving camera; for focal stacks use experiment=focus_stack data=stacks"
         raise ValueError(f"{found}, expected {expected}") from error
 
 
 def _resolve_output_folder(cfg: Any, overrides: Iterable[str], sweep: bool) -> Path:
-    """Folder of the job, or of the sweep, as an absolute name: workers may start elsewhere."""
+    """Absolute folder of the job or the sweep (workers may have another working directory)."""
     if not cfg.resume or any(o.startswith("output=") for o in overrides):
         return Path(str(cfg.output)).absolute()
     return (_RESUMED_FOLDER if sweep else _RESUMED_FOLDER / job_name(cfg.hydra.job.override_dirname)).absolute()
 
 
 def _format_resume_command(argv: Iterable[str], folder: Path) -> str:
-    """The command that goes on where this one ended."""
+    """The command line that resumes this run."""
     words = [a for a in argv if not a.startswith(("resume=", "output="))]
-    own = any(a.startswith(("hydra.run.dir=", "hydra.sweep.dir=")) for a in words)
-    place = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
-    return shlex.join(["dhtorch", *words, "resume=true", *([] if own else [f"output={quote_value(str(place))}"])])
+    has_hydra_dir = any(a.startswith(("hydra.run.dir=", "hydra.sweep.dir=")) for a in words)
+    output = folder.relative_to(Path.cwd()) if folder.is_relative_to(Path.cwd()) else folder
+    return shlex.join(
+        ["dhtorch", *words, "resume=true", *([] if has_hydra_dir else [f"output={quote_value(str(output))}"])]
+    )
 
 
 def _report_failure(error: BaseException, show: bool = False) -> int:

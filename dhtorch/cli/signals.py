@@ -1,6 +1,6 @@
-"""How the command ends when it is told to: SIGTERM and SIGHUP as Ctrl-C, with the exit code that says so.
+"""SIGTERM and SIGHUP end the command like Ctrl-C, with exit code 128 + signal number.
 
-Whoever is killed cannot tell its workers. So a worker watches who started it: see :mod:`dhtorch.runtime.parent_watch`.
+A killed process cannot end its workers: a worker watches its parent, see :mod:`dhtorch.runtime.parent_watch`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-#: Signals that end the command in order.
+#: Signals that end the command with clean-up.
 _TERMINATION_SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
@@ -22,37 +22,39 @@ class ReceivedSignal:
     number: int | None = None
 
     def code(self, otherwise: int) -> int:
-        """Exit code: 128 and the number of the signal, as a shell would report it."""
+        """Exit code 128 + signal number, as a shell reports it; ``otherwise`` without a signal."""
         return otherwise if self.number is None else 128 + self.number
 
 
 @contextlib.contextmanager
 def catch_termination() -> Iterator[ReceivedSignal]:
-    """Meanwhile the first SIGTERM or SIGHUP raises KeyboardInterrupt; further ones do not disturb the tidying up.
+    """Context in which the first SIGTERM or SIGHUP raises KeyboardInterrupt; later ones do not interrupt the clean-up.
 
-    A signal that the caller ignores stays ignored (``nohup``); outside the main thread nothing is changed.
+    Signals that are ignored stay ignored (``nohup``); outside the main thread no handler is installed.
     """
-    told = ReceivedSignal()
+    received = ReceivedSignal()
 
-    def tell(number: int, _frame: FrameType | None) -> None:
-        if told.number is None:
-            told.number = number
+    def handle(number: int, _frame: FrameType | None) -> None:
+        if received.number is None:
+            received.number = number
             raise KeyboardInterrupt
 
-    before = {}
+    old_handlers = {}
     if threading.current_thread() is threading.main_thread():
-        before = {n: signal.signal(n, tell) for n in _TERMINATION_SIGNALS if signal.getsignal(n) is not signal.SIG_IGN}
+        old_handlers = {
+            n: signal.signal(n, handle) for n in _TERMINATION_SIGNALS if signal.getsignal(n) is not signal.SIG_IGN
+        }
     try:
-        yield told
+        yield received
     finally:
-        if told.number is not None:
+        if received.number is not None:
             _shutdown_worker_pool()
-        for number, handler in before.items():
+        for number, handler in old_handlers.items():
             signal.signal(number, handler)
 
 
 def _shutdown_worker_pool() -> None:
-    """End the processes of joblib's launcher, where there are any: they outlive a call."""
+    """End the worker processes of joblib's launcher, if any: they outlive a call."""
     pool = sys.modules.get("joblib.externals.loky.reusable_executor")
     executor = getattr(pool, "_executor", None)
     if executor is not None:

@@ -1,4 +1,4 @@
-"""``dhtorch stream``: a recording pushed frame after frame, and how fast and how often it is answered."""
+"""``dhtorch stream``: a recording processed frame by frame -> speed and recovered fraction of every frame."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ Row = dict[str, Any]
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
-    """Stream every scene of the settings, write ``stream.json``, and say what came of it; returns the exit code.
+    """Stream every scene of the settings, write ``stream.json`` and print a summary; returns the exit code.
 
     Raises:
-        ValueError, OSError: bad options or data, as the readers and the method raise them.
+        ValueError, OSError: bad options or data.
     """
     if settings["most"] is not None and (not isinstance(settings["most"], int) or settings["most"] < 1):
         raise ValueError(f"most: found {settings['most']!r}, expected a whole number of at least 1")
@@ -36,18 +36,18 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
         files.set_opencv_threads(settings["threads"])
-    found = [stream_scene(scene, parts["method"], settings, progress=progress) for scene in scenes_of(parts["data"])]
-    path = storage.write_json(Path(settings["output"]) / "stream.json", {"scenes": found})
-    print("\n".join(_format_summary(scene) for scene in found))
+    scenes = [stream_scene(scene, parts["method"], settings, progress=progress) for scene in scenes_of(parts["data"])]
+    path = storage.write_json(Path(settings["output"]) / "stream.json", {"scenes": scenes})
+    print("\n".join(_format_summary(scene) for scene in scenes))
     print(f"wrote\n  {path}")
     return 0
 
 
 def stream_scene(scene: Scene, method: Method, settings: Mapping[str, Any], *, progress: Progress) -> Row:
-    """One scene: a row for every frame, and what they come to.
+    """Stream one scene -> a row for every frame, and their totals.
 
     Raises:
-        ValueError: as the method and the stream raise it.
+        ValueError: from the method or the stream.
     """
     recording, hint = scene.recording, scene.hint
     stream = Stream(method, steps=settings["steps"], seed=settings["seed"], hint=hint)
@@ -58,9 +58,9 @@ def stream_scene(scene: Scene, method: Method, settings: Mapping[str, Any], *, p
         frame = range_split(frame, settings["cutoff"])
         cuts = len(stream.cuts)
         trace: Trace = {}
-        began = time.perf_counter()
+        start = time.perf_counter()
         estimate = stream.push(frame, trace=trace)
-        row: Row = {"frame": int(recording.number[k]), "ms": 1e3 * (time.perf_counter() - began)}
+        row: Row = {"frame": int(recording.number[k]), "ms": 1e3 * (time.perf_counter() - start)}
         row["cut"] = len(stream.cuts) > cuts
         row["back"] = sorted(trace["back"][:, 0].tolist()) if "back" in trace else []
         hole = ~(trace["samples"] if "samples" in trace else method.sample_depth_at(frame, estimate.uv[0])).usable
@@ -81,8 +81,12 @@ def stream_scene(scene: Scene, method: Method, settings: Mapping[str, Any], *, p
 
 
 def _format_summary(scene: Row) -> str:
-    share = "no sample lacks a return" if scene["recovered"] is None else f"{scene['recovered']:.1%} of holes answered"
+    share = (
+        "every sample has a return"
+        if scene["recovered"] is None
+        else f"{scene['recovered']:.1%} of the samples without a return recovered"
+    )
     cuts = f"; cuts at {', '.join(map(str, scene['cuts']))}" if scene["cuts"] else ""
     speed = f"{scene['frames_per_second']:.2f} frames/s"
     frames = format_count(scene["n_frames"], "frame")
-    return f"{scene['scene']}: {frames}, {speed}, {share}, {scene['mib']:.0f} MiB held{cuts}"
+    return f"{scene['scene']}: {frames}, {speed}, {share}, {scene['mib']:.0f} MiB of memory{cuts}"

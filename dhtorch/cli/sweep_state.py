@@ -1,7 +1,7 @@
-"""Progress of all jobs of a sweep together, whichever processes they run in.
+"""One progress bar for all jobs of a sweep, in any number of processes.
 
-Every job notes in a file of its own how far it is, the process that started them reads these files and draws one bar.
-The files lie below the sweep's folder, which all launchers share, and go when the sweep ends.
+Every job writes its progress to a file of its own; the process that started the jobs reads these files and draws one
+bar. The files lie below the sweep's folder, which all launchers share, and are removed when the sweep ends.
 """
 
 from __future__ import annotations
@@ -19,44 +19,44 @@ from typing import Any
 from dhtorch.runtime import console
 from dhtorch.runtime.console import format_count
 
-#: Below the sweep's folder.
+#: Folder of the progress files, below the sweep's folder.
 _NOTES_FOLDER = ".progress"
 
-#: Seconds between two looks, and between two notes of a job.
+#: Seconds between two updates of the bar, and of a job's file.
 _PAUSE_S = 0.25
 
 
 def record_progress(folder: Path, job: str, scenes: int) -> Callable[[Iterable[Any], str, int], Iterator[Any]]:
-    """What wraps the loops of one job: (items, text, number of items) → items; it notes the job's share done.
+    """Wrapper for the loops of one job, (items, text, number of items) -> items, which records the finished fraction.
 
     Args:
-        folder: of the sweep; where nobody looks, nothing is noted.
-        job: a name that no other job has.
-        scenes: loops that are expected; of more the share creeps on.
+        folder: of the sweep; without a progress folder nothing is written.
+        job: unique name of the job.
+        scenes: expected number of loops; with more loops the fraction is of their number so far.
     """
-    note, begun = folder / _NOTES_FOLDER / job, 0
+    note, n_loops = folder / _NOTES_FOLDER / job, 0
 
     def wrap(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
-        nonlocal begun
-        begun += 1
-        before, last = begun - 1, -math.inf
+        nonlocal n_loops
+        n_loops += 1
+        n_finished, last = n_loops - 1, -math.inf
         for k, item in enumerate(items):
             yield item
             if time.monotonic() - last > _PAUSE_S or k + 1 == total:
                 last = time.monotonic()
-                _write_note(note, min(1.0, (before + (k + 1) / max(total, 1)) / max(scenes, begun)), text)
+                _write_note(note, min(1.0, (n_finished + (k + 1) / max(total, 1)) / max(scenes, n_loops)), text)
 
     return wrap
 
 
 def mark_finished(folder: Path, job: str) -> None:
-    """Note that a job has ended, well or not."""
+    """Record that a job has ended, successfully or not."""
     _write_note(folder / _NOTES_FOLDER / job, 1.0, "")
 
 
 @contextlib.contextmanager
 def show_sweep_progress(folder: Path, n_jobs: int) -> Iterator[None]:
-    """A bar over all jobs with the time left, on a terminal, for as long as they run."""
+    """Context that shows one bar over all jobs with the time left, on a terminal."""
     if not sys.stderr.isatty() or console.get_verbosity() == "quiet":
         yield
         return
@@ -74,14 +74,14 @@ def show_sweep_progress(folder: Path, n_jobs: int) -> Iterator[None]:
 
 
 def _read_progress(notes: Path) -> tuple[float, int, list[str]]:
-    """Jobs done with the shares of those that run, the number of whole ones, and what the running ones are at."""
-    shares, at = [], []
+    """Sum of the jobs' finished fractions, number of finished jobs, texts of the running ones."""
+    shares, texts = [], []
     for path in sorted(p for p in notes.glob("*") if not p.name.endswith("~")):
         with contextlib.suppress(OSError, ValueError):
             share, _, text = path.read_text(encoding="utf-8").partition(" ")
             shares.append(float(share))
-            at += [text] if text and float(share) < 1 else []
-    return sum(shares), sum(s >= 1 for s in shares), at
+            texts += [text] if text and float(share) < 1 else []
+    return sum(shares), sum(s >= 1 for s in shares), texts
 
 
 def _draw_bar(notes: Path, n_jobs: int, stop: threading.Event) -> None:
@@ -92,13 +92,15 @@ def _draw_bar(notes: Path, n_jobs: int, stop: threading.Event) -> None:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(f"0 of {format_count(n_jobs, 'job')}", total=n_jobs)
         while not stop.wait(_PAUSE_S):
-            done, whole, at = _read_progress(notes)
-            said = f"{whole} of {format_count(n_jobs, 'job')}" + (f", {', '.join(at[:2])}" if at else "")
-            bar.update(task, completed=done, description=said)
+            done, n_finished, texts = _read_progress(notes)
+            description = f"{n_finished} of {format_count(n_jobs, 'job')}" + (
+                f", {', '.join(texts[:2])}" if texts else ""
+            )
+            bar.update(task, completed=done, description=description)
 
 
 def _write_note(note: Path, share: float, text: str) -> None:
-    """Whole or not at all; a job never fails because nobody looks."""
+    """Write a progress file atomically; errors are ignored."""
     if note.parent.is_dir():
         with contextlib.suppress(OSError):
             part = note.with_name(f"{note.name}~")

@@ -1,8 +1,7 @@
-"""``dhtorch validate``: whether the depth of a recording is right, its sensor's own or maps from elsewhere.
+"""``dhtorch validate``: correctness of a recording's depth, from its sensor or from separate maps.
 
-Writes ``validate.json`` (a row for every frame, what they come to, the causes named in windows of frames) and
-``validate.html``, worst first. The exit code is 1 where a limit of ``fail_on`` is exceeded, so that it can stand in a
-data pipeline.
+Writes ``validate.json`` (a row for every frame, statistics of the recording, likely causes in windows of frames) and
+``validate.html``, worst first. The exit code is 1 where a limit of ``fail_on`` is exceeded, for use in data pipelines.
 """
 
 from __future__ import annotations
@@ -40,30 +39,30 @@ from dhtorch.viz.viewer import validation as pages
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
 
-#: Numbers of a frame with their interval.
+#: Statistics of a frame that have a confidence interval.
 _INTERVAL_FIELDS = ("scale", "scale_near", "scale_far", "scale_vs_trajectory", "shift", "tilt", "wrong")
 
-#: What ``fail_on`` may name → what is held against the limit, in words. All are of a whole recording, and all but the
-#: last are bounds that the number exceeds with 95 %: few frames, or unsure ones, exceed no limit by chance.
+#: Names that ``fail_on`` accepts → the quantity compared with the limit, over a whole recording. All but the last are
+#: lower bounds at 95 % confidence, so that few or uncertain frames exceed no limit by chance.
 _VALIDATION_LIMITS = {
-    "wrong": "share of wrong pixels among those of which something is known, at least",
-    "scale": "|scale - 1| of the median frame, at least",
-    "shift": "|shift| of the median frame, m, at least",
-    "tilt": "tilt of the median frame, at least",
-    "drift": "by how much the scale differs between frames, at least",
-    "causes": "share of the windows in which a cause is named, at least",
-    "unknown": "share of the pixels with a depth of which nothing can be known",
+    "wrong": "fraction of wrong pixels among those that can be checked, lower bound",
+    "scale": "|scale - 1| of the median frame, lower bound",
+    "shift": "|shift| of the median frame, m, lower bound",
+    "tilt": "tilt of the median frame, lower bound",
+    "drift": "difference of scale between frames, lower bound",
+    "causes": "fraction of the windows with a likely cause, lower bound",
+    "unknown": "fraction of the pixels with a depth that cannot be checked",
 }
 
 #: Columns of the page's table.
-_TABLE_COLUMNS = ("wrong, of what is known", "known, of the depth", "scale", "shift, m", "tilt", "cut at, m")
+_TABLE_COLUMNS = ("wrong, of checked", "checked, of depth", "scale", "shift, m", "tilt", "cut at, m")
 
 _LIMIT_PATTERN = re.compile(r"\s*([a-z]+)\s*>\s*([0-9.eE+-]+)\s*")
 
 
 @dataclass
 class RecordingValidation:
-    """What is said of one recording."""
+    """Validation of one recording."""
 
     scene: Scene
     maps: DepthMaps | None
@@ -73,21 +72,21 @@ class RecordingValidation:
 
     @property
     def notes(self) -> list[str]:
-        """How files were matched to frames, where that has to be known."""
+        """Notes on the matching of map files to frames."""
         return [] if self.maps is None else self.maps.notes
 
-    def asked(self, every: int) -> list[int]:
-        """Every so many of the frames that have a map."""
+    def frame_positions(self, every: int) -> list[int]:
+        """Every ``every``-th position of the frames that have a map."""
         return list(range(len(self.scene.recording)) if self.maps is None else self.maps.frames)[::every]
 
     @property
     def by_number(self) -> dict[int, Row]:
-        """Rows of the frames that were looked at, by their number in the capture."""
+        """Rows of the validated frames by frame number."""
         return {row["frame"]: row for row in self.rows}
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
-    """Judge every scene of the settings; returns the exit code, 1 where a limit is exceeded.
+    """Validate every scene of the settings; returns the exit code, 1 where a limit is exceeded.
 
     Raises:
         ValueError, OSError: bad options or data.
@@ -100,46 +99,49 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if settings["depth"] is not None and len(scenes) > 1:
         raise ValueError(f"depth: found {len(scenes)} recordings for one folder of maps, expected one (data.root=…)")
     folder = Path(str(settings["output"])).expanduser()
-    written, failed, lines = [], [], []
+    written, all_exceeded, lines = [], [], []
     for scene in scenes:
         maps = None
         if settings["depth"] is not None:
             maps = depth_maps.open_depth_maps(settings["depth"], scene.recording, settings["depth_unit"])
-        found = _validate_recording(RecordingValidation(scene, maps), parts["method"], settings, progress)
-        whole = _summarise_recording(found)
-        over = list_exceeded_limits(whole, limits)
-        place = folder if len(scenes) == 1 else folder / scene.name
+        validation = _validate_recording(RecordingValidation(scene, maps), parts["method"], settings, progress)
+        summary = _summarise_recording(validation)
+        exceeded = list_exceeded_limits(summary, limits)
+        scene_folder = folder if len(scenes) == 1 else folder / scene.name
         content = {"scene": scene.name, "source": "sensor" if maps is None else "maps", "fail_on": settings["fail_on"]}
         content |= {} if maps is None else {"maps": maps.report}
         content |= {"intrinsics_guessed": intrinsics_options.find_guess_report(scene.recording.report)}
-        content |= {"exceeded": over, "whole": whole, "windows": found.windows, "frames": found.rows}
+        content |= {"exceeded": exceeded, "whole": summary, "windows": validation.windows, "frames": validation.rows}
         written += [
-            storage.write_json(place / "validate.json", storage.to_strict_json(content)),
-            _write_page(place, found, whole, over),
+            storage.write_json(scene_folder / "validate.json", storage.to_strict_json(content)),
+            _write_page(scene_folder, validation, summary, exceeded),
         ]
-        lines += [*_format_summary(found.scene.name, whole, found.notes), *(f"  exceeded: {line}" for line in over)]
-        failed += over
+        lines += [
+            *_format_summary(validation.scene.name, summary, validation.notes),
+            *(f"  exceeded: {limit_line}" for limit_line in exceeded),
+        ]
+        all_exceeded += exceeded
     print("\n".join([*lines, "wrote", *(f"  {path}" for path in written)]))
-    return int(bool(failed))
+    return int(bool(all_exceeded))
 
 
 def list_exceeded_limits(
     whole: Mapping[str, Any], limits: Mapping[str, float], known: Mapping[str, str] = _VALIDATION_LIMITS
 ) -> list[str]:
-    """Limits that a recording's numbers exceed, in words; a number that cannot be known exceeds none."""
-    found = []
+    """Texts of the limits exceeded by a recording; an unknown quantity exceeds no limit."""
+    lines = []
     for name, limit in limits.items():
         value = whole["held"][name]
         if value is not None and value > limit:
-            found.append(f"{name} is {value:.4g}, limit {limit:g} ({known[name]})")
-    return found
+            lines.append(f"{name} is {value:.4g}, limit {limit:g} ({known[name]})")
+    return lines
 
 
 def parse_limits(text: str | None, known: Mapping[str, str] = _VALIDATION_LIMITS) -> dict[str, float]:
-    """``wrong>0.05,scale>0.1`` as numbers by name, of those ``known``.
+    """``wrong>0.05,scale>0.1`` -> limit by name; names must be in ``known``.
 
     Raises:
-        ValueError: something else.
+        ValueError: another syntax or name.
     """
     limits: dict[str, float] = {}
     for part in (text or "").split(",") if text else ():
@@ -160,15 +162,15 @@ def parse_limits(text: str | None, known: Mapping[str, str] = _VALIDATION_LIMITS
 def _validate_recording(
     found: RecordingValidation, method: Method, settings: Mapping[str, Any], progress: Progress
 ) -> RecordingValidation:
-    """Every frame by itself, then windows of frames."""
+    """Validate the frames one by one, then diagnose windows of frames."""
     n = len(found.scene.recording)
-    frames = found.asked(settings["every"])[: settings["most"]]
+    frames = found.frame_positions(settings["every"])[: settings["most"]]
     for i in progress(frames, f"{found.scene.name}: frames", len(frames)):
         frame = _load_frame(found.scene, settings, i)
-        verdict = _validate_frame(found, frame, i, method, settings)
-        row = _summarise_frame(int(found.scene.recording.number[i]), verdict)
+        frame_validation = _validate_frame(found, frame, i, method, settings)
+        row = _summarise_frame(int(found.scene.recording.number[i]), frame_validation)
         found.rows.append(row)
-        _keep_worst(found, frame, verdict, settings)
+        _keep_worst(found, frame, frame_validation, settings)
     if settings["window"]:
         size = min(settings["window"], n)
         firsts = sorted({min(k, n - size) for k in range(0, max(frames[-1] + 1 - size, 0) + 1, size)}) if n > 1 else []
@@ -180,7 +182,7 @@ def _validate_recording(
 def _load_frame(scene: Scene, settings: Mapping[str, Any], i: int) -> Frame:
     frame = scene.recording[i].to(getattr(torch, settings["dtype"])).to(settings["device"])
     if 0 in frame.hw:
-        raise ValueError(f"{scene.name}: found frames without pictures, expected pictures (data.images=true)")
+        raise ValueError(f"{scene.name}: found frames without images, expected images (data.images=true)")
     return range_split(frame, settings["cutoff"])
 
 
@@ -188,137 +190,147 @@ def _validate_frame(
     found: RecordingValidation, frame: Frame, i: int, method: Method, settings: Mapping[str, Any]
 ) -> DepthValidation:
     recording = found.scene.recording
-    depth, others, beside = None, None, None
+    depth, source_views, source_maps = None, None, None
     if found.maps is not None:
-        given = found.maps[i]
-        depth = torch.zeros(1, *frame.hw) if given is None else given
+        depth_map = found.maps[i]
+        depth = torch.zeros(1, *frame.hw) if depth_map is None else depth_map
         depth = depth.to(frame.camera.f)
     if len(recording) > 1:
         offered = candidate_frames(recording, i, settings["steps"])
-        others = stack([_load_frame(found.scene, settings, k) for k in offered])
+        source_views = stack([_load_frame(found.scene, settings, k) for k in offered])
         maps = [] if found.maps is None else [found.maps[k] for k in offered]
-        known = [m for m in maps if m is not None]
-        if known and len({m.shape for m in known}) == 1:
-            beside = torch.stack([torch.zeros_like(known[0]) if m is None else m for m in maps])
+        available = [m for m in maps if m is not None]
+        if available and len({m.shape for m in available}) == 1:
+            source_maps = torch.stack([torch.zeros_like(available[0]) if m is None else m for m in maps])
     options = {k: settings[k] for k in ("views", "source_views", "size", "tolerance", "seed")}
-    return validate_depth(depth, frame, others, other_maps=beside, method=method, hint=found.scene.hint, **options)
+    return validate_depth(
+        depth, frame, source_views, other_maps=source_maps, method=method, hint=found.scene.hint, **options
+    )
 
 
-def _summarise_frame(number: int, verdict: DepthValidation) -> Row:
-    """A frame's numbers."""
-    there = verdict.depth > 0
-    n = int(there.sum())
+def _summarise_frame(number: int, validation: DepthValidation) -> Row:
+    """DepthValidation -> row of a frame: fractions by state, intervals, evidence coverage."""
+    has_depth = validation.depth > 0
+    n = int(has_depth.sum())
     row: Row = {"frame": number, "pixels": n}
     for code, name in names(State).items():
-        row[f"share_{name.lower()}"] = int(((verdict.state == code) & there).sum()) / n if n else None
+        row[f"share_{name.lower()}"] = int(((validation.state == code) & has_depth).sum()) / n if n else None
     for name in _INTERVAL_FIELDS:
-        value, low, high = (float(x) for x in getattr(verdict, name)[0])
+        value, low, high = (float(x) for x in getattr(validation, name)[0])
         row[name] = None if math.isnan(value) else {"value": value, "low": low, "high": high}
     for name in ("sparse_evidence", "photometric_evidence", "consistency_evidence"):
-        said = getattr(verdict, name)[there]
-        against = said.abs() > 3
-        row[name] = {"told": float(said.isfinite().double().mean()) if n else None, "against": int(against.sum())}
-    clip_depth = float(verdict.clip_depth[0])
+        evidence = getattr(validation, name)[has_depth]
+        against = evidence.abs() > 3
+        row[name] = {
+            "coverage": float(evidence.isfinite().double().mean()) if n else None,
+            "against": int(against.sum()),
+        }
+    clip_depth = float(validation.clip_depth[0])
     return row | {"clip_depth": None if math.isnan(clip_depth) else clip_depth}
 
 
 def _keep_worst(
-    found: RecordingValidation, frame: Frame, verdict: DepthValidation, settings: Mapping[str, Any]
+    found: RecordingValidation, frame: Frame, validation: DepthValidation, settings: Mapping[str, Any]
 ) -> None:
-    """The pictures of the worst frames so far."""
+    """Keep the figures of the worst frames so far."""
     order = sorted(range(len(found.rows)), key=lambda k: -_severity(found.rows[k]))[: settings["pictures"]]
-    here = len(found.rows) - 1
-    if here not in order:
+    latest = len(found.rows) - 1
+    if latest not in order:
         return
     out = io.BytesIO()
-    one = verdict[0]
-    number = found.rows[here]["frame"]
+    single = validation[0]
+    number = found.rows[latest]["frame"]
     title = append_cutoff(format_frame(found.scene.name, number), settings["cutoff"])
-    draw_validation(out, frame.image[0].cpu(), one.depth, one.state, one.evidence, title=title)
+    draw_validation(out, frame.image[0].cpu(), single.depth, single.state, single.evidence, title=title)
     found.pictures[number] = out.getvalue()
     kept = {found.rows[k]["frame"] for k in order}
     found.pictures = {k: v for k, v in found.pictures.items() if k in kept}
 
 
 def _severity(row: Row) -> float:
-    """By which frames are ordered: the share of all pixels that are wrong."""
+    """Sort key of the frames: fraction of wrong pixels among all."""
     wrong = row["share_wrong"]
     return float(wrong) if wrong is not None else -1.0
 
 
 def _diagnose_window(found: RecordingValidation, first: int, size: int, settings: Mapping[str, Any]) -> Row:
-    """What is named in some consecutive frames."""
+    """Diagnose ``size`` consecutive frames -> row with the likely cause."""
     frames = [_load_frame(found.scene, settings, k) for k in range(first, first + size)]
-    named = faults.Diagnosis(None, None, {}, 0)
+    diagnosis = faults.Diagnosis(None, None, {}, 0)
     if found.maps is None:
-        named = faults.diagnose(frames, seed=settings["seed"])
+        diagnosis = faults.diagnose(frames, seed=settings["seed"])
     else:
-        given = [found.maps[k] for k in range(first, first + size)]
-        shapes = {m.shape for m in given if m is not None}
-        if len(shapes) == 1:  # maps of several sizes share no fault of the file
+        depth_maps_of_window = [found.maps[k] for k in range(first, first + size)]
+        shapes = {m.shape for m in depth_maps_of_window if m is not None}
+        if len(shapes) == 1:  # maps of different sizes have no common fault
             blank = torch.zeros(next(iter(shapes)))
-            named = faults.diagnose(frames, [blank if m is None else m for m in given], seed=settings["seed"])
+            diagnosis = faults.diagnose(
+                frames, [blank if m is None else m for m in depth_maps_of_window], seed=settings["seed"]
+            )
     number = found.scene.recording.number
-    row: Row = {"frames": [int(number[first]), int(number[first + size - 1])], "pairs": named.n_pairs, "by": named.by}
-    cut = _find_shared_clip_depth(
+    row: Row = {
+        "frames": [int(number[first]), int(number[first + size - 1])],
+        "pairs": diagnosis.n_pairs,
+        "by": diagnosis.by,
+    }
+    clip_depth = _find_shared_clip_depth(
         [found.by_number[k] for k in number[first : first + size].tolist() if k in found.by_number]
     )
-    if named.cause is None and cut is not None:
-        return row | {"cause": f"cut at {cut:.3g} m", "kind": "cut", "loss": dict(named.loss)}
-    return row | {"cause": named.cause, "kind": named.kind, "loss": dict(named.loss)}
+    if diagnosis.cause is None and clip_depth is not None:
+        return row | {"cause": f"cut at {clip_depth:.3g} m", "kind": "cut", "loss": dict(diagnosis.loss)}
+    return row | {"cause": diagnosis.cause, "kind": diagnosis.kind, "loss": dict(diagnosis.loss)}
 
 
 def _find_shared_clip_depth(rows: Sequence[Row]) -> float | None:
-    """Where the maps of some frames are cut, if those of most of them are, all at one depth."""
-    at = [row["clip_depth"] for row in rows if row["clip_depth"] is not None]
-    if 2 * len(at) <= len(rows):
+    """Common depth at which most maps of ``rows`` are clipped, m; None without one."""
+    depths = [row["clip_depth"] for row in rows if row["clip_depth"] is not None]
+    if 2 * len(depths) <= len(rows):
         return None
-    middle = statistics.median(at)
-    return middle if 2 * sum(abs(x - middle) <= 0.01 * middle for x in at) > len(rows) else None
+    median = statistics.median(depths)
+    return median if 2 * sum(abs(x - median) <= 0.01 * median for x in depths) > len(rows) else None
 
 
-# -------------------------------------------------------------------------------------------------------- what is said
+# ------------------------------------------------------------------------------------------------------------- summary
 
 
 def _summarise_recording(found: RecordingValidation) -> Row:
-    """A recording's numbers, and those that limits are held against."""
+    """Statistics of a recording; ``held`` are those that ``fail_on`` limits."""
     rows = found.rows
     pixels = sum(row["pixels"] for row in rows)
     states = [name.lower() for name in names(State).values()]
     count = {name: sum(row[f"share_{name}"] * row["pixels"] for row in rows if row["pixels"]) for name in states}
-    known = count["wrong"] + count["consistent"]
-    middle = {}
+    checked = count["wrong"] + count["consistent"]
+    medians = {}
     for name in ("scale", "scale_vs_trajectory", "shift", "tilt"):
         values = [row[name]["value"] for row in rows if row[name] is not None]
-        middle[name] = statistics.median(values) if values else None
-    able = [row for row in found.windows if row["pairs"] >= faults.MIN_WINDOW_PAIRS or row["cause"] is not None]
-    kinds = Counter(row["cause"] for row in able if row["cause"] is not None)
-    held = {
+        medians[name] = statistics.median(values) if values else None
+    diagnosable = [row for row in found.windows if row["pairs"] >= faults.MIN_WINDOW_PAIRS or row["cause"] is not None]
+    causes = Counter(row["cause"] for row in diagnosable if row["cause"] is not None)
+    limited = {
         "wrong": _wrong_lower_bound(rows),
         "scale": _deviation_lower_bound(rows, "scale", 1.0),
         "shift": _deviation_lower_bound(rows, "shift", 0.0),
         "tilt": _deviation_lower_bound(rows, "tilt", 0.0),
         "drift": _drift_lower_bound(rows),
-        "causes": _share_lower_bound(sum(kinds.values()), len(able)),
+        "causes": _share_lower_bound(sum(causes.values()), len(diagnosable)),
         "unknown": count["cannot_know"] / pixels if pixels else None,
     }
     return {
         "frames": len(rows),
         "pixels": pixels,
-        "median": middle,
-        "wrong": count["wrong"] / known if known else None,
-        "causes": dict(kinds),
-        "windows": len(able),
+        "median": medians,
+        "wrong": count["wrong"] / checked if checked else None,
+        "causes": dict(causes),
+        "windows": len(diagnosable),
         "clip_depth": _find_shared_clip_depth(rows),
-        "held": held,
+        "held": limited,
     }
 
 
 def _deviation_lower_bound(rows: Sequence[Row], name: str, sound: float) -> float | None:
-    """How far a number of the median frame is from what it would be of a sound map, by the nearer bound of its
-    interval; 0 where the interval holds that.
+    """Distance of a statistic's median interval from ``sound``, its value for a correct map; 0 inside the interval.
 
-    What errs in all frames alike is in each frame's interval, so more frames make it no narrower.
+    Errors common to all frames are in every frame's interval, so more frames do not narrow it.
     """
     known = [row[name] for row in rows if row[name] is not None]
     if not known:
@@ -328,8 +340,8 @@ def _deviation_lower_bound(rows: Sequence[Row], name: str, sound: float) -> floa
 
 
 def _drift_lower_bound(rows: Sequence[Row]) -> float | None:
-    """By how much the scales of frames differ: what one is at least where depth is too far, minus what one is at most
-    where it is too near, a tenth of the frames left out at either end; 0 where one scale is in all intervals."""
+    """Lower bound of the difference of scale between frames: largest lower minus smallest upper bound, a tenth of the
+    frames left out at either end; 0 where one scale is in all intervals."""
     known = [row["scale"] for row in rows if row["scale"] is not None]
     if len(known) < 2:
         return None
@@ -339,62 +351,66 @@ def _drift_lower_bound(rows: Sequence[Row]) -> float | None:
 
 
 def _wrong_lower_bound(rows: Sequence[Row]) -> float | None:
-    """Lower bounds of the frames' shares that are wrong, averaged by the pixels of which something is known."""
+    """Lower bounds of the frames' wrong fractions, averaged with the number of checked pixels as weight."""
     known = [(row["wrong"]["low"], row["pixels"] * (1 - row["share_cannot_know"])) for row in rows if row["wrong"]]
     weight = sum(n for _, n in known)
     return sum(low * n for low, n in known) / weight if weight else None
 
 
 def _share_lower_bound(part: int, whole: int) -> float | None:
-    """Lower bound of a share, one of 95 % to both sides."""
+    """Lower bound of the two-sided 95 % interval of a fraction."""
     low = float(share_interval(torch.tensor([float(part)]), torch.tensor([float(whole)]))[0, 1])
     return None if math.isnan(low) else low
 
 
-def _format_summary(name: str, whole: Row, notes: Sequence[str] = ()) -> list[str]:
-    """A recording in words."""
-    held, middle = whole["held"], whole["median"]
-    wrong = "nothing can be known" if whole["wrong"] is None else f"{whole['wrong']:.1%} of what is known is wrong"
-    unknown = "no depth" if held["unknown"] is None else f"{held['unknown']:.1%} cannot be known"
-    scale = "scale cannot be known" if middle["scale"] is None else f"scale {_format_factor(middle['scale'])}"
-    lines = [f"{name}: {format_count(whole['frames'], 'frame')}: {wrong}, {unknown}; {scale}"]
-    if held["drift"]:
-        lines.append(f"  the scale differs by {held['drift']:.3f} at least between frames")
-    for cause, n in sorted(whole["causes"].items(), key=lambda item: -item[1]):
-        lines.append(f"  likely cause in {n} of {format_count(whole['windows'], 'window')}: {cause}")
-    if whole["clip_depth"] is not None and not any(cause.startswith("cut at") for cause in whole["causes"]):
-        lines.append(f"  cut at {whole['clip_depth']:.3g} m: what is farther is said to lie there")
+def _format_summary(name: str, summary: Row, notes: Sequence[str] = ()) -> list[str]:
+    """Printed summary of a recording."""
+    limited, medians = summary["held"], summary["median"]
+    wrong = (
+        "no pixel can be checked"
+        if summary["wrong"] is None
+        else f"{summary['wrong']:.1%} of the checked pixels are wrong"
+    )
+    unknown = "no depth" if limited["unknown"] is None else f"{limited['unknown']:.1%} cannot be checked"
+    scale = "scale unknown" if medians["scale"] is None else f"scale {_format_factor(medians['scale'])}"
+    lines = [f"{name}: {format_count(summary['frames'], 'frame')}: {wrong}, {unknown}; {scale}"]
+    if limited["drift"]:
+        lines.append(f"  the scale differs by at least {limited['drift']:.3f} between frames")
+    for cause, n in sorted(summary["causes"].items(), key=lambda item: -item[1]):
+        lines.append(f"  likely cause in {n} of {format_count(summary['windows'], 'window')}: {cause}")
+    if summary["clip_depth"] is not None and not any(cause.startswith("cut at") for cause in summary["causes"]):
+        lines.append(f"  cut at {summary['clip_depth']:.3g} m: larger depths are set to this value")
     return lines + [f"  {note}" for note in notes]
 
 
 def _format_factor(value: float) -> str:
-    """A factor, legible where it is a unit's or beyond all sense."""
+    """A factor as text; very large or small ones in scientific notation."""
     return f"{value:.3f}" if 0.1 <= value < 1e4 else f"{value:.4g}"
 
 
-def _write_page(place: Path, found: RecordingValidation, whole: Row, over: Sequence[str]) -> Path:
+def _write_page(place: Path, found: RecordingValidation, whole: Row, exceeded: Sequence[str]) -> Path:
     rows = sorted(found.rows, key=_severity, reverse=True)
     frames = []
     for row in rows:
-        known = None if row["share_cannot_know"] is None else 1 - row["share_cannot_know"]
-        cells = [pages.format_estimate(row["wrong"]), "–" if known is None else f"{known:.2f}"]
+        checked = None if row["share_cannot_know"] is None else 1 - row["share_cannot_know"]
+        cells = [pages.format_estimate(row["wrong"]), "–" if checked is None else f"{checked:.2f}"]
         cells += [pages.format_estimate(row[name]) for name in ("scale", "shift", "tilt")]
         cells.append("–" if row["clip_depth"] is None else f"{row['clip_depth']:.3g}")
         frames.append(pages.ValidatedFrame(f"frame {row['frame']}", cells, found.pictures.get(row["frame"])))
-    failed = [f"Exceeded: {line}" for line in over]
+    failed = [f"Exceeded: {limit_line}" for limit_line in exceeded]
     guess = intrinsics_options.find_guess_report(found.scene.recording.report)
-    said = _format_summary(found.scene.name, whole, found.notes) + ([f"Its {guess}."] if guess else [])
+    lines = _format_summary(found.scene.name, whole, found.notes) + ([f"Its {guess}."] if guess else [])
     return pages.write_validation_page(
-        place / "validate.html", found.scene.name, said=said, columns=_TABLE_COLUMNS, frames=frames, failed=failed
+        place / "validate.html", found.scene.name, said=lines, columns=_TABLE_COLUMNS, frames=frames, failed=failed
     )
 
 
 def _check_options(settings: Mapping[str, Any]) -> dict[str, float]:
-    """The limits; options that would only fail later."""
+    """Validate the options early; returns the limits of ``fail_on``."""
     for name, low in (("every", 1), ("most", 1), ("window", 0), ("pictures", 0), ("source_views", 1), ("size", 16)):
         value = settings[name]
-        whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
-        if not whole and not (name == "most" and value is None):
+        is_whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
+        if not is_whole and not (name == "most" and value is None):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
     if settings["window"] == 1:
         raise ValueError("window: found 1, expected 0 or at least 2 frames")

@@ -1,4 +1,4 @@
-"""``dhtorch view``: a result or a recording as something to look at, computed again and shown by the viewer."""
+"""``dhtorch view``: a result or recording -> 3D viewer (Rerun), .rrd file or HTML page."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from dhtorch.viz.viewer.exhibit import Exhibit
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
-    """Show what the settings ask for; returns the exit code.
+    """Show the result or recording of the settings; returns the exit code.
 
-    With ``result``, a result file, its folder or a PLY file, the job's own data, method, pairs, hold-out and seed are
-    used and computed again; where its data are not to be found, its ``points.ply`` is shown. Without, the recording and
-    method of the settings. ``html`` and ``save`` name files; with neither, Rerun's viewer opens, or, where there is no
-    screen, ``view.rrd`` is written (``view.html`` where Rerun is not installed).
+    With ``result`` (a result file, its folder or a PLY file) the job is computed again with its own data, method,
+    pairs, hold-out and seed; where its data are missing, its ``points.ply`` is shown. Without ``result``, the recording
+    and method of the settings are used. ``html`` and ``save`` name files; with neither, Rerun's viewer opens, or,
+    without a screen, ``view.rrd`` is written (``view.html`` where Rerun is not installed).
 
     Raises:
-        ValueError, OSError, ImportError: bad options or data, as the readers and writers raise them.
+        ValueError, OSError, ImportError: bad options or data.
     """
     page, recording = settings["html"], settings["save"]
     for name, endings in ((page, html.HTML_SUFFIXES), (recording, rrd.RRD_SUFFIXES)):
         if name is not None and (Path(name).is_dir() or Path(name).suffix.lower() not in endings):
-            raise ValueError(f"{name}: expected the name of a file that ends in {endings[0]}")
+            raise ValueError(f"{name}: expected a file name that ends in {endings[0]}")
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
     target = None if settings["result"] is None else Path(settings["result"])
@@ -56,27 +56,27 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
 
 
 def _load_result_exhibit(target: Path, settings: Mapping[str, Any], progress: Progress) -> Exhibit:
-    """The scene of a result: computed again, or its points alone."""
+    """The exhibit of a result: computed again, or only its points."""
     result = result_files.read_result(target)
     folder = target if target.is_dir() else target.parent
     config, name = result["config"], settings["scene"]
-    own = {**settings, **{k: config[k] for k in ("seed", "dtype") if k in config}}
+    result_settings = {**settings, **{k: config[k] for k in ("seed", "dtype") if k in config}}
     try:
         parts = again.rebuild_parts(result, settings["root"] or _read_data_root(folder))
-        scene = _compute_exhibit(parts, own, partial(again.read_cutoff, result), progress)
+        scene = _compute_exhibit(parts, result_settings, partial(again.read_cutoff, result), progress)
     except (OSError, FormatError) as error:
         scenes = result["data"]["scenes"]
         ply = folder / str(_select_item(scenes, name, str)) / "points.ply"
         if not ply.is_file():
-            raise ValueError(f"{error}; root=PATH says where the data are") from error
-        print(f"{error}; showing the points of {ply} alone (root=PATH says where the data are)", file=sys.stderr)
+            raise ValueError(f"{error}; set root=PATH to the folder of the data") from error
+        print(f"{error}; showing only the points of {ply} (set root=PATH to the folder of the data)", file=sys.stderr)
         return replace(points.read_ply_exhibit(ply), name=str(_select_item(scenes, name, str)))
     facts = {"experiment": result["experiment"], "data": result["data"]["name"], "made": result["meta"]["utc"]}
     return replace(scene, facts={**facts, **scene.facts})
 
 
 def _read_data_root(folder: Path) -> str | None:
-    """Where the data of a result lay when it was made, if they are there still."""
+    """Data folder recorded beside a result, None where it no longer exists."""
     note = folder / DATA_ROOT_FILE
     root = note.read_text(encoding="utf-8", errors="replace").strip() if note.is_file() else ""
     return root if root and Path(root).exists() else None
@@ -85,58 +85,58 @@ def _read_data_root(folder: Path) -> str | None:
 def _compute_exhibit(
     parts: Mapping[str, Any], settings: Mapping[str, Any], cutoff: Callable[[str], float | None], progress: Progress
 ) -> Exhibit:
-    """The chosen scene of a recording or several, computed; ``cutoff`` says by its name what is held back."""
-    chosen = _select_item(scenes_of(parts["data"]), settings["scene"], lambda scene: scene.name)
+    """Compute the exhibit of the selected scene; ``cutoff``: scene name -> cutoff, m."""
+    scene = _select_item(scenes_of(parts["data"]), settings["scene"], lambda scene: scene.name)
     dtype = getattr(torch, str(settings["dtype"]), None)
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
     if not isinstance(settings["most"], int) or settings["most"] < 1:
         raise ValueError(f"most: found {settings['most']!r}, expected a whole number of at least 1")
-    common = Settings(cutoff=cutoff(chosen.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
+    common = Settings(cutoff=cutoff(scene.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
     options: dict[str, Any] = {
         "most": settings["most"],
         "sweep": DenseSweep.asked(settings["dense"]),
         "progress": progress,
     }
-    shown = make_exhibit(chosen, parts["method"], parts["pairs"], common, **options)
-    limit = common.cutoff_of(chosen)
-    hidden = limit is not None and limit != float("inf")
-    facts = {"samples": f"{parts['method'].n} in each pair"}
-    facts["sensor"] = f"returns beyond {limit:g} m were held back" if hidden else "all returns were used"
-    return replace(shown, facts={**facts, **shown.facts})
+    exhibit = make_exhibit(scene, parts["method"], parts["pairs"], common, **options)
+    cutoff_m = common.cutoff_of(scene)
+    hidden = cutoff_m is not None and cutoff_m != float("inf")
+    facts = {"samples": f"{parts['method'].n} per pair"}
+    facts["sensor"] = f"returns beyond {cutoff_m:g} m held out" if hidden else "all returns used"
+    return replace(exhibit, facts={**facts, **exhibit.facts})
 
 
 def _select_item(items: Sequence[Any], wanted: str | int | None, name: Any) -> Any:
-    """The first item, or the one of that name or number."""
+    """The first item, or the item with the given name or number."""
     if wanted is None:
         return items[0]
-    known = [name(item) for item in items]
-    if str(wanted) in known:
-        return items[known.index(str(wanted))]
-    if isinstance(wanted, int) and 0 <= wanted < len(known):
+    names = [name(item) for item in items]
+    if str(wanted) in names:
+        return items[names.index(str(wanted))]
+    if isinstance(wanted, int) and 0 <= wanted < len(names):
         return items[wanted]
-    raise ValueError(f"scene: found {wanted!r}, expected a number below {len(known)} or one of {', '.join(known[:12])}")
+    raise ValueError(f"scene: found {wanted!r}, expected a number below {len(names)} or one of {', '.join(names[:12])}")
 
 
 def _show_exhibit(scene: Exhibit, page: str | None, save: str | None, folder: Path) -> list[str]:
-    """Write or open what is asked for; lines that say where."""
-    said = []
+    """Write the page or recording, or open the viewer -> printed lines."""
+    lines = []
     if page is None and save is None:
         if importlib.util.find_spec("rerun") is None:
             page = str(folder / "view.html")
-            said.append("Rerun is not installed (pip install 'dhtorch[view]'): made a page instead")
+            lines.append("Rerun is not installed (pip install 'dhtorch[view]'): wrote a page instead")
         elif not _has_screen():
             save = str(folder / "view.rrd")
         else:
             rrd.spawn_viewer(scene)
-            said.append(f"{scene.name}: {format_count(len(scene.shots), 'pair')} in Rerun's viewer")
+            lines.append(f"{scene.name}: {format_count(len(scene.shots), 'pair')} in Rerun's viewer")
     if page is not None:
         path = html.write_viewer_page(Path(page), scene)
-        said.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): open it in any browser")
+        lines.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): open it in any browser")
     if save is not None:
         path = rrd.write_rrd(Path(save), scene)
-        said.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): rerun {path}")
-    return said
+        lines.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): rerun {path}")
+    return lines
 
 
 def _has_screen() -> bool:

@@ -1,8 +1,8 @@
-"""Files to frames: the only place with file decoding, unit changes and axis changes.
+"""Readers: capture files -> recordings of frames; all file decoding and conversion of units and axes is done here.
 
 ``open(path)`` recognises a capture by its content and returns its :class:`Recording`, a lazy sequence of frames. A
-format is one module of ``readers`` with ``recognise(root)`` and ``read(root, *, options)``, and one line in the table
-below. Focal stacks show one view without depth of their own: ``dhtorch.experiments.focal`` reads them.
+format is one module with ``recognise(root)`` and ``read(root, *, options)``, one import and one line in the table below. Focal
+stacks have one view and no depth of their own: they are read by ``dhtorch.experiments.focal``.
 """
 
 from __future__ import annotations
@@ -13,30 +13,27 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Final, Protocol, cast
+from typing import Any, Final, Protocol
 
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.io.safe_open import restrict_links
+from dhtorch.data.readers import (
+    arkitscenes,
+    ca1m,
+    driving,
+    frames_dir,
+    lerobot,
+    record3d,
+    rectified,
+    rh20t,
+    rlds,
+    stray,
+    tum,
+)
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Scene, SceneLike, Scenes, scenes_of
 from dhtorch.runtime import console
-
-# The table of formats: one line for each reader, in the order in which they are asked. FORMATS is made from it.
-from dhtorch.data.readers import (  # noqa: F401  # isort: skip
-    record3d,  # before tum: its folder, too, holds rgb/ and depth/
-    tum,
-    driving,
-    rectified,
-    arkitscenes,
-    ca1m,
-    rh20t,
-    lerobot,
-    rlds,
-    stray,
-    frames_dir,
-)
 
 __all__ = [
     "FORMATS",
@@ -58,46 +55,55 @@ __all__ = [
 
 
 class Reader(Protocol):
-    """A format: the two functions of its module."""
+    """Interface of a format's module: two functions."""
 
     @property
     def recognise(self) -> Callable[[Path], str | None]:
-        """What makes a folder or file one of its captures, in words; None if nothing does."""
+        """Path → the files by which it is recognised as a capture of this format, as text; None if it is not."""
 
     @property
     def read(self) -> Callable[..., Sequence[Recording]]:
-        """Open the recordings at a path; keyword options of its own."""
+        """Path and the format's keyword options → the recordings at that path."""
 
 
-#: Name → reader, asked in this order; the first that recognises a folder reads it.
+#: Name → reader, tried in this order; the first that recognises a path reads it.
 FORMATS: Final[dict[str, Reader]] = {
-    name: cast(Reader, module)
-    for name, module in list(vars().items())
-    if isinstance(module, ModuleType) and module.__name__ == f"{__name__}.readers.{name}"
+    "record3d": record3d,  # before tum: its folder holds rgb/ and depth/, too
+    "tum": tum,
+    "driving": driving,
+    "rectified": rectified,
+    "arkitscenes": arkitscenes,
+    "ca1m": ca1m,
+    "rh20t": rh20t,
+    "lerobot": lerobot,
+    "rlds": rlds,
+    "stray": stray,
+    "frames_dir": frames_dir,
 }
 
-#: The variable that says where a collection of scenes lies.
+#: Environment variable with the folder of a collection of scenes.
 _SCENES_ROOT_VARIABLE: Final = "DHTORCH_DATA"
 
-_UNSET_INTRINSICS = [
-    (name, None) for name in intrinsics_options.INTRINSICS_OPTIONS
-]  # as settings that serve all formats have them
+#: Unset intrinsics options: passed by settings for all formats, ignored by readers without these options.
+_UNSET_INTRINSICS = [(name, None) for name in intrinsics_options.INTRINSICS_OPTIONS]
 
-_MAX_NAMES_SHOWN = 4  # names of many recordings in a message
+_MAX_NAMES_SHOWN = 4  # names of recordings in a message
 
 
 def open(root: str | Path, format: str = "auto", *, follow_links: bool = False, **options: object) -> Recording:
-    """The one recording at ``root``; see :func:`open_all` for the arguments.
+    """Open the only recording at ``root``; see :func:`open_all` for the arguments.
 
     Raises:
-        FormatError: as :func:`open_all`, and where there are several recordings (a car with many cameras).
+        FormatError: as :func:`open_all`, or several recordings (a car with many cameras).
     """
-    found = open_all(root, format, follow_links=follow_links, **options)
-    if len(found) > 1:
-        names = found.names if isinstance(found, Recordings) else [each.name for each in found]
+    recordings = open_all(root, format, follow_links=follow_links, **options)
+    if len(recordings) > 1:
+        names = recordings.names if isinstance(recordings, Recordings) else [recording.name for recording in recordings]
         shown = ", ".join(names[:_MAX_NAMES_SHOWN]) + (" …" if len(names) > _MAX_NAMES_SHOWN else "")
-        raise FormatError(root, "recordings", f"{len(found)} recordings: {shown}", "one (open_all returns them all)")
-    return found[0]
+        raise FormatError(
+            root, "recordings", f"{len(recordings)} recordings: {shown}", "one (open_all returns them all)"
+        )
+    return recordings[0]
 
 
 def open_all(
@@ -107,21 +113,21 @@ def open_all(
     follow_links: bool = False,
     **options: object,
 ) -> Sequence[Recording]:
-    """Every recording at ``root``, opened lazily: nothing is decoded before a frame is asked for.
+    """Open every recording at ``root``, lazily: a frame is decoded on access.
 
     Args:
-        root: a folder (or file) of one of the known formats.
+        root: a folder (or file) of one of the formats in ``FORMATS``.
         format: a name of ``FORMATS``, or ``"auto"`` to recognise it by its content.
-        follow_links: whether symbolic links inside the capture may lead out of it.
-        options: keyword options of the reader, see ``dhtorch.data.<format>.read``. Where its captures may lack a K
-            ``intrinsics``, ``K`` and ``fov`` are among them, see :mod:`dhtorch.data.intrinsics`.
+        follow_links: whether symbolic links inside the capture may point outside it.
+        options: keyword options of the reader, see ``dhtorch.data.<format>.read``. For formats without a stored K
+            they include ``intrinsics``, ``K`` and ``fov``, see :mod:`dhtorch.data.intrinsics`.
 
     Returns:
-        One recording for each camera (and episode), at least one; where there may be tens of thousands each is opened
-        when it is asked for.
+        One recording for each camera (and episode), at least one; formats with up to tens of thousands of recordings
+        open each on access.
 
     Raises:
-        FormatError: nothing there, an unknown format, or a file that is not what its format promises.
+        FormatError: no such path, an unknown format, or a file that does not conform to its format.
         ValueError: an option that the reader does not have.
     """
     root = Path(root)
@@ -133,22 +139,24 @@ def open_all(
     elif not root.exists():
         raise FormatError(root, "path", "no such file or folder", f"a {format} capture")
     read = FORMATS[format].read
-    known = list(inspect.signature(read).parameters)[1:]
+    reader_options = list(inspect.signature(read).parameters)[1:]
     options = {name: value for name, value in options.items() if (name, value) not in _UNSET_INTRINSICS}
     for option in options:
-        if option not in known:
-            shown = f"{option!r}{console.suggest_name(option, known)}"
-            raise ValueError(f"data: format {format} has no option {shown}, expected one of {', '.join(known)}")
+        if option not in reader_options:
+            shown = f"{option!r}{console.suggest_name(option, reader_options)}"
+            raise ValueError(
+                f"data: format {format} has no option {shown}, expected one of {', '.join(reader_options)}"
+            )
     with restrict_links(bounds):
-        found = read(root, **options)
-    if isinstance(found, Recordings):
-        return replace(found, make=_RestrictedOpener(found.make, bounds))
-    return [replace(recording, bounds=bounds) for recording in found]
+        recordings = read(root, **options)
+    if isinstance(recordings, Recordings):
+        return replace(recordings, make=_RestrictedOpener(recordings.make, bounds))
+    return [replace(recording, bounds=bounds) for recording in recordings]
 
 
 @dataclass(frozen=True)
 class _RestrictedOpener:
-    """Opens one of many recordings, no link of which may lead out of the capture."""
+    """Open one of many recordings with symbolic links restricted to the capture."""
 
     make: Callable[[int], Recording]
     bounds: Path | None
@@ -170,7 +178,7 @@ def open_capture(
     follow_links: bool = False,
     **options: object,
 ) -> Scenes:
-    """Every recording at ``root`` as a scene, with the same notes, opened lazily.
+    """Every recording at ``root`` as a scene with the same notes, opened lazily.
 
     Args:
         root, format, follow_links, options: as :func:`open_all`.
@@ -179,15 +187,15 @@ def open_capture(
     Raises:
         FormatError, ValueError: as :func:`open_all`.
     """
-    noted = partial(Scene, near=near, gap=gap, levels=levels, room=room, role=role)
-    return Scenes(open_all(root, format, follow_links=follow_links, **options), noted)
+    make_scene = partial(Scene, near=near, gap=gap, levels=levels, room=room, role=role)
+    return Scenes(open_all(root, format, follow_links=follow_links, **options), make_scene)
 
 
 def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str]:
-    """(format, what makes it one, in words) of a capture.
+    """Path → (format, the files by which it is recognised, as text).
 
     Raises:
-        FormatError: nothing there, or no format recognises it.
+        FormatError: no such path, or a format that no reader recognises.
     """
     root = Path(root)
     if not root.exists():
@@ -196,42 +204,41 @@ def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str
         for name, reader in FORMATS.items():
             if evidence := reader.recognise(root):
                 return name, evidence
-    listed = (
+    listing = (
         sorted(entry.name for entry in root.iterdir())[:6] if root.is_dir() else [f"a {root.suffix or 'plain'} file"]
     )
-    expected = f"one of {', '.join(FORMATS)} (dhtorch inspect looks further down)"
-    raise FormatError(root, "format", ", ".join(listed) or "an empty folder", expected)
+    expected = f"one of {', '.join(FORMATS)} (dhtorch inspect searches subfolders)"
+    raise FormatError(root, "format", ", ".join(listing) or "an empty folder", expected)
 
 
 def open_scenes(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[Scene]:
-    """A list of scenes below one folder.
+    """Open a list of scenes below one folder.
 
     Args:
-        root: folder that the scenes' paths start from. None = the environment variable ``DHTORCH_DATA``.
-        scenes: for each scene ``path``, and the arguments of :func:`open_capture` that it needs (``format``, ``near``,
-            …).
+        root: folder to which the scenes' paths are relative. None = the environment variable ``DHTORCH_DATA``.
+        scenes: for each scene ``path`` and arguments of :func:`open_capture` (``format``, ``near``, …).
 
     Raises:
-        FormatError: no folder given and ``DHTORCH_DATA`` unset, no scene, a scene without a path; else as
+        FormatError: neither ``root`` nor ``DHTORCH_DATA`` set, no scene, a scene without a path; else as
             :func:`open_capture`.
     """
     root = scenes_root(root)
     if not scenes:
         raise FormatError(root, "scenes", "none", "a list of scenes, each with a path")
-    found: list[Scene] = []
+    opened: list[Scene] = []
     for scene in scenes:
         options = dict(scene) if isinstance(scene, Mapping) else {}
         if "path" not in options:
             raise FormatError(root, "scenes", scene, "entries with a path, as {path:holo_a,near:2.5}")
-        found += open_capture(root / str(options.pop("path")), **options)
-    return found
+        opened += open_capture(root / str(options.pop("path")), **options)
+    return opened
 
 
 def scenes_root(root: str | Path | None) -> Path:
-    """The folder that the paths of scenes start from; None = the environment variable ``DHTORCH_DATA``.
+    """The folder to which scenes' paths are relative: ``root``, else the environment variable ``DHTORCH_DATA``.
 
     Raises:
-        FormatError: none given and the variable unset, or no such folder.
+        FormatError: neither is set, or no such folder.
     """
     root = root if root is not None else os.environ.get(_SCENES_ROOT_VARIABLE)
     if not root:

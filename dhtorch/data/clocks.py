@@ -1,7 +1,7 @@
-"""Streams that tick apart: which entry of another stream belongs to an instant, and the pose in between.
+"""Association of streams with different time stamps: nearest stamps, and interpolated poses.
 
-Nothing is taken over from an earlier instant: what has no source view within the limit has none, index −1.
-Alphabet: ``times`` (n,) s asked for; ``others`` (m,) s, sorted, at least one.
+Values are never carried over from an earlier instant: a time without a stamp within the limit has index −1.
+Alphabet: ``times`` (n,) s, query times; ``others`` (m,) s, stamps of the other stream, sorted, at least one.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from dhtorch.data.convert import slerp
 def nearest_stamps(times: np.ndarray, others: np.ndarray, limit: float) -> np.ndarray:
     """Index (n,) of the stamp in ``others`` nearest to each of ``times``; −1 where none is within ``limit`` s."""
     before, after = _bracketing_stamps(times, others)
-    at = np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
-    return np.where(np.abs(others[at] - times) <= limit, at, -1)
+    nearest = np.where(np.abs(times - others[before]) <= np.abs(others[after] - times), before, after)
+    return np.where(np.abs(others[nearest] - times) <= limit, nearest, -1)
 
 
 def interpolate_poses(
@@ -28,24 +28,25 @@ def interpolate_poses(
     max_difference: float,
     max_gap: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Quaternions (n, 4), centres (n, 3) and whether there is a pose (n,) at ``times``.
+    """Poses at ``times``: quaternions (n, 4), centres (n, 3), and the mask (n,) of times with a pose.
 
-    In this order: the pose stamped within ``same`` s; between two poses at most ``max_gap`` s apart, position linear
-    and rotation at constant speed; the nearest one within ``max_difference`` s. ``max_gap`` 0 interpolates nothing.
+    In this order: the pose stamped within ``same`` s; interpolation between two poses at most ``max_gap`` s apart,
+    position linear and rotation at constant speed; the nearest pose within ``max_difference`` s. ``max_gap`` = 0: no
+    interpolation.
     """
     before, after = _bracketing_stamps(times, others)
     span = others[after] - others[before]
-    share = (times - others[before]) / np.where(span > 0, span, 1)
-    own = nearest_stamps(times, others, same)
-    between = (own < 0) & (share > 0) & (share < 1) & (span > 0) & (span <= max_gap)
-    own = np.where(between | (own >= 0), own, nearest_stamps(times, others, max_difference))
-    before, after = np.where(between, before, own), np.where(between, after, own)
-    share = np.where(between, share, 0.0)
-    centre = (1 - share)[:, None] * t[before] + share[:, None] * t[after]
-    return slerp(q[before], q[after], share), centre, between | (own >= 0)
+    weight = (times - others[before]) / np.where(span > 0, span, 1)
+    nearest = nearest_stamps(times, others, same)
+    interpolated = (nearest < 0) & (weight > 0) & (weight < 1) & (span > 0) & (span <= max_gap)
+    nearest = np.where(interpolated | (nearest >= 0), nearest, nearest_stamps(times, others, max_difference))
+    before, after = np.where(interpolated, before, nearest), np.where(interpolated, after, nearest)
+    weight = np.where(interpolated, weight, 0.0)
+    centre = (1 - weight)[:, None] * t[before] + weight[:, None] * t[after]
+    return slerp(q[before], q[after], weight), centre, interpolated | (nearest >= 0)
 
 
 def _bracketing_stamps(times: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the stamps before and after; both the same one where there is only one."""
+    """Indices of the stamps before and after each time; equal where there is only one stamp."""
     after = np.searchsorted(others, times).clip(1, max(len(others) - 1, 1)).clip(max=len(others) - 1)
     return (after - 1).clip(0), after

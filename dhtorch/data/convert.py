@@ -1,8 +1,8 @@
-"""Units, axes and poses of foreign data → ours: metres, x right, y down, z forward, ``T_world_from_cam``.
+"""Conversion of cameras, poses and depth of data sets to metres, x right, y down, z forward, ``T_world_from_cam``.
 
 Alphabet: ``K`` 3×3 intrinsics; ``c2w`` camera-to-world 4×4 (maps camera points into the world); quaternions are
-(x, y, z, w); *GL* axes are x right, y up, z backward (ARKit, OpenGL). Numbers enter as numpy arrays and leave as
-records; a value that cannot be a camera or a rigid motion is a ``FormatError`` with the file it came from.
+(x, y, z, w); *GL* axes are x right, y up, z backward (ARKit, OpenGL). Functions take numpy arrays and
+return records; values that are no camera or rigid motion raise ``FormatError`` with the file they came from.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from dhtorch.geometry import se3
 from dhtorch.geometry.patches import round_half_up
 from dhtorch.records import Camera, Pose
 
-#: How far the determinant of a stored rotation may be from 1 before it is taken for damage instead of rounding.
+#: Largest |det − 1| of a stored rotation that is taken as rounding; larger ones are damage.
 _MAX_DET_ERROR = 0.01
 
-#: No camera of ours has more pixels in a focal length, and no place on this planet is further from another one; numbers
-#: beyond would be infinite in float32.
-_MAX_FOCAL_PX = 1e6  # px
-MAX_COORDINATE_M = 4e7  # m
+#: Largest focal length in px, far above that of real cameras; larger numbers overflow in float32.
+_MAX_FOCAL_PX = 1e6
+#: Largest coordinate in m, the circumference of the Earth.
+MAX_COORDINATE_M = 4e7
+#: Largest magnitude of a distortion coefficient.
 _MAX_DISTORTION_COEFFICIENT = 1e4
 
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -39,7 +40,7 @@ def to_camera(
     field: str = "K",
     distortion: object = None,  # OpenCV's order; all zero = None
 ) -> Camera:
-    """Camera (B = 1, float32) of an intrinsic matrix that could belong to an image of size ``hw``.
+    """Intrinsic matrix → camera (B = 1, float32), checked to be plausible for an image of size ``hw``.
 
     Raises:
         FormatError: not 3×3, not finite, last row not 0 0 1, skewed, focal length not positive, principal point more
@@ -53,36 +54,42 @@ def to_camera(
         raise FormatError(file, f"{field} focal length", f.tolist(), "two positive numbers of pixels")
     if not ((c > -wh) & (c < 2 * wh)).all():
         raise FormatError(file, f"{field} principal point", c.tolist(), f"a place near the {hw[1]}x{hw[0]} image")
-    lens = None if distortion is None else _parse_distortion(distortion, file)
-    return Camera(_to_float32(f)[None], _to_float32(c)[None], None if lens is None else _to_float32(lens)[None])
+    coefficients = None if distortion is None else _parse_distortion(distortion, file)
+    return Camera(
+        _to_float32(f)[None], _to_float32(c)[None], None if coefficients is None else _to_float32(coefficients)[None]
+    )
 
 
 def parse_K_option(values: Sequence[float], root: Path, field: str) -> np.ndarray:
-    """K of an option's fx, fy, cx, cy."""
+    """fx, fy, cx, cy of an option → K."""
     return make_K(*to_array(values, (4,), root, field))
 
 
 def to_cameras(values: np.ndarray, hw: tuple[int, int], file: Path, field: str, lens: object) -> Camera:
-    """Cameras of rows of 4 (fx fy cx cy) or 9 numbers: one for all if they are equal.
+    """Rows of 4 (fx fy cx cy) or 9 numbers → cameras; a single camera if all rows are equal.
 
     Raises:
-        FormatError: another number of numbers, or as :func:`to_camera`.
+        FormatError: another number of columns, or as :func:`to_camera`.
     """
     flat = values.reshape(len(values), -1).astype(np.float64)
     if flat.shape[1] not in (4, 9):
         raise FormatError(file, field, f"{flat.shape[1]} numbers", "4 (fx fy cx cy) or 9")
     if (flat == flat[:1]).all():
         flat = flat[:1]
-    made = [to_camera(make_K(*k) if len(k) == 4 else k.reshape(3, 3), hw, file, field, lens) for k in flat]
-    distortion = None if made[0].distortion is None else made[0].distortion.expand(len(made), -1)
-    return Camera(torch.cat([m.f for m in made]), torch.cat([m.c for m in made]), distortion)
+    cameras_of_rows = [to_camera(make_K(*k) if len(k) == 4 else k.reshape(3, 3), hw, file, field, lens) for k in flat]
+    distortion = (
+        None
+        if cameras_of_rows[0].distortion is None
+        else cameras_of_rows[0].distortion.expand(len(cameras_of_rows), -1)
+    )
+    return Camera(torch.cat([m.f for m in cameras_of_rows]), torch.cat([m.c for m in cameras_of_rows]), distortion)
 
 
 def parse_poses(values: np.ndarray, file: Path, field: str) -> Pose:
-    """Poses of rows of 16 (4×4 by rows) or 7 numbers (x y z qx qy qz qw).
+    """Rows of 16 (4×4 by rows) or 7 numbers (x y z qx qy qz qw) → poses.
 
     Raises:
-        FormatError: another number of numbers, or as :func:`to_poses` and :func:`to_c2w`.
+        FormatError: another number of columns, or as :func:`to_poses` and :func:`to_c2w`.
     """
     flat = values.reshape(len(values), -1).astype(np.float64)
     if flat.shape[1] == 7:
@@ -93,7 +100,7 @@ def parse_poses(values: np.ndarray, file: Path, field: str) -> Pose:
 
 
 def make_K(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
-    """K of four numbers."""
+    """fx, fy, cx, cy → K (3, 3) float64."""
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
 
 
@@ -111,9 +118,9 @@ def to_poses(
     file: Path,
     field: str = "pose",
 ) -> Pose:
-    """Poses (n, float64) of camera-to-world matrices; rotations are moved to the nearest true rotation.
+    """Camera-to-world matrices → poses (n, float64) with rotations projected to the nearest true rotation.
 
-    A matrix that is already a rotation to rounding of float64 is returned as it stands.
+    A matrix that is a rotation to float64 rounding is returned unchanged.
 
     Raises:
         FormatError: not finite, last row not 0 0 0 1, or determinant further than ``_MAX_DET_ERROR`` from 1 (a
@@ -123,25 +130,27 @@ def to_poses(
         raise FormatError(
             file, field, f"a non-finite number in matrix {_first_index(~np.isfinite(c2w))}", "finite numbers"
         )
-    bad = np.abs(c2w).max((-1, -2), initial=0) > MAX_COORDINATE_M
-    if bad.any():
+    invalid = np.abs(c2w).max((-1, -2), initial=0) > MAX_COORDINATE_M
+    if invalid.any():
         raise FormatError(
-            file, f"{field} {_first_index(bad)}", c2w[bad][0, :3].tolist(), f"at most {MAX_COORDINATE_M:g} m"
+            file, f"{field} {_first_index(invalid)}", c2w[invalid][0, :3].tolist(), f"at most {MAX_COORDINATE_M:g} m"
         )
-    bad = np.abs(c2w[:, 3] - [0, 0, 0, 1]).max(-1, initial=0) > 1e-6
-    if bad.any():
-        raise FormatError(file, f"{field} {_first_index(bad)} last row", c2w[bad][0, 3].tolist(), "0 0 0 1")
+    invalid = np.abs(c2w[:, 3] - [0, 0, 0, 1]).max(-1, initial=0) > 1e-6
+    if invalid.any():
+        raise FormatError(file, f"{field} {_first_index(invalid)} last row", c2w[invalid][0, 3].tolist(), "0 0 0 1")
     R = c2w[:, :3, :3]
     det = np.linalg.det(R)
-    bad = np.abs(det - 1) > _MAX_DET_ERROR
-    if bad.any():
-        raise FormatError(file, f"{field} {_first_index(bad)} determinant", f"{det[bad][0]:.6g}", "1 (a rotation)")
-    off = np.abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max((-1, -2), initial=0)
-    bad = off > 0.1
-    if bad.any():
-        raise FormatError(file, f"{field} {_first_index(bad)}", "axes that are not at right angles", "a rotation")
+    invalid = np.abs(det - 1) > _MAX_DET_ERROR
+    if invalid.any():
+        raise FormatError(
+            file, f"{field} {_first_index(invalid)} determinant", f"{det[invalid][0]:.6g}", "1 (a rotation)"
+        )
+    orthogonality_error = np.abs(R @ R.swapaxes(-1, -2) - np.eye(3)).max((-1, -2), initial=0)
+    invalid = orthogonality_error > 0.1
+    if invalid.any():
+        raise FormatError(file, f"{field} {_first_index(invalid)}", "axes that are not at right angles", "a rotation")
     u, _, vt = np.linalg.svd(R)
-    R = np.where((off > 1e-14)[:, None, None], u @ vt, R)
+    R = np.where((orthogonality_error > 1e-14)[:, None, None], u @ vt, R)
     return Pose(torch.from_numpy(R), torch.from_numpy(c2w[:, :3, 3].copy()))
 
 
@@ -151,7 +160,7 @@ def to_c2w(
     file: Path,
     field: str = "quaternion",
 ) -> np.ndarray:
-    """Matrices (n, 4, 4) of quaternions and translations, by kornia (whose quaternions begin with w).
+    """Quaternions and translations → matrices (n, 4, 4), by kornia (whose quaternions start with w).
 
     Raises:
         FormatError: a quaternion that is zero or not finite.
@@ -159,10 +168,10 @@ def to_c2w(
     from kornia.geometry.conversions import quaternion_to_rotation_matrix  # noqa: PLC0415
 
     norm = np.linalg.norm(quaternion, axis=-1)
-    bad = ~((norm > 1e-6) & np.isfinite(norm))
-    if bad.any():
+    invalid = ~((norm > 1e-6) & np.isfinite(norm))
+    if invalid.any():
         raise FormatError(
-            file, f"{field} {_first_index(bad)}", quaternion[bad][0].tolist(), "four numbers, not all zero"
+            file, f"{field} {_first_index(invalid)}", quaternion[invalid][0].tolist(), "four numbers, not all zero"
         )
     c2w = np.zeros((len(t), 4, 4))
     c2w[:, :3, :3] = quaternion_to_rotation_matrix(torch.from_numpy(quaternion[:, [3, 0, 1, 2]])).numpy()
@@ -173,7 +182,7 @@ def to_c2w(
 def to_quaternions(
     rotation: np.ndarray,  # (n, 3) rad, axis times angle
 ) -> np.ndarray:
-    """Unit quaternions (n, 4) of rotation vectors, by kornia."""
+    """Rotation vectors → unit quaternions (n, 4), by kornia."""
     from kornia.geometry.conversions import axis_angle_to_quaternion  # noqa: PLC0415
 
     return axis_angle_to_quaternion(torch.from_numpy(rotation)).numpy()[:, [1, 2, 3, 0]]
@@ -182,11 +191,11 @@ def to_quaternions(
 def slerp(
     a: np.ndarray,  # (n, 4) unit quaternions
     b: np.ndarray,  # (n, 4)
-    share: np.ndarray,  # (n,) of the way from a to b
+    share: np.ndarray,  # (n,) fraction of the arc from a to b
 ) -> np.ndarray:
-    """Rotations (n, 4) on the shortest way from ``a`` to ``b``, at constant speed; both ends come back bit for bit.
+    """Spherical linear interpolation (n, 4) along the shortest arc from ``a`` to ``b``; both ends bit for bit.
 
-    kornia's ``Quaternion.slerp`` rounds them, and takes five times as long.
+    kornia's ``Quaternion.slerp`` rounds them and takes five times as long.
     """
     dot = (a * b).sum(-1)
     b = np.where(dot < 0, -1.0, 1.0)[:, None] * b  # q and −q are one rotation
@@ -198,13 +207,13 @@ def slerp(
 
 
 def rot90_camera(camera: Camera, hw: tuple[int, int], turns: int) -> Camera:
-    """Camera of the picture of size ``hw`` after ``turns`` quarter turns clockwise; see :func:`rot90_pose`."""
+    """Camera of an image of size ``hw`` rotated by ``turns`` quarter turns clockwise; see :func:`rot90_pose`."""
     for _ in range(turns % 4):
         c = torch.stack((hw[0] - 1 - camera.c[:, 1], camera.c[:, 0]), -1)
-        lens = camera.distortion
-        if lens is not None:  # the tangential pair turns with the axes
-            lens = torch.cat((lens[:, :2], lens[:, 3:4], -lens[:, 2:3], lens[:, 4:]), -1)
-        camera, hw = camera.replace(f=camera.f.flip(-1), c=c, distortion=lens), (hw[1], hw[0])
+        distortion = camera.distortion
+        if distortion is not None:  # the tangential coefficients rotate with the axes
+            distortion = torch.cat((distortion[:, :2], distortion[:, 3:4], -distortion[:, 2:3], distortion[:, 4:]), -1)
+        camera, hw = camera.replace(f=camera.f.flip(-1), c=c, distortion=distortion), (hw[1], hw[0])
     return camera
 
 
@@ -212,40 +221,40 @@ def rot90_pose(
     c2w: np.ndarray,  # (n, 4, 4)
     turns: int,
 ) -> np.ndarray:
-    """Camera-to-world of a picture after ``turns`` quarter turns clockwise: the camera rolls, the world stays."""
+    """Camera-to-world of an image rotated by ``turns`` quarter turns clockwise: only the camera rolls."""
     quarter = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     return c2w @ np.linalg.matrix_power(quarter, turns % 4)
 
 
 def rot90_image(x: Tensor, turns: int) -> Tensor:
-    """The picture (…, H, W) after ``turns`` quarter turns clockwise."""
+    """Image (…, H, W) rotated by ``turns`` quarter turns clockwise."""
     return torch.rot90(x, -turns % 4, (-2, -1)).contiguous()
 
 
 def resample_depth(
     depth: Tensor,  # (h, w) m, 0 = no return
     depth_camera: Camera,  # B = 1, no distortion
-    camera: Camera,  # B = 1, no distortion, same place, same axes
+    camera: Camera,  # B = 1, no distortion, same centre and axes
     hw: tuple[int, int],
 ) -> Tensor:
-    """Depth (H, W) at the pixel centres of ``camera``: the nearest pixel of the map, nothing blended; 0 outside it."""
+    """Depth (H, W) at the pixel centres of ``camera``, by the nearest pixel, not interpolated; 0 outside the map."""
     if camera.distortion is not None or depth_camera.distortion is not None:
-        raise ValueError("resample_depth: found a camera with distortion, expected ideal ones")
+        raise ValueError("resample_depth: found a camera with distortion, expected cameras without distortion")
 
-    def places(axis: int, count: int, size: int) -> tuple[Tensor, Tensor]:
+    def nearest_pixels(axis: int, count: int, size: int) -> tuple[Tensor, Tensor]:
         ray = (torch.arange(count, dtype=torch.float64) - camera.c[0, axis]) / camera.f[0, axis]
         at = round_half_up(ray * depth_camera.f[0, axis] + depth_camera.c[0, axis])
         return at.clamp(0, size - 1).long(), (at >= 0) & (at <= size - 1)
 
-    (v, inside_v), (u, inside_u) = places(1, hw[0], depth.shape[0]), places(0, hw[1], depth.shape[1])
-    found = depth.index_select(0, v).index_select(1, u)
-    return torch.where(inside_v[:, None] & inside_u, found, torch.zeros_like(found))
+    (v, inside_v), (u, inside_u) = nearest_pixels(1, hw[0], depth.shape[0]), nearest_pixels(0, hw[1], depth.shape[1])
+    sampled = depth.index_select(0, v).index_select(1, u)
+    return torch.where(inside_v[:, None] & inside_u, sampled, torch.zeros_like(sampled))
 
 
 def cv_from_gl(
     c2w: np.ndarray,  # (n, 4, 4) pose of a camera with GL axes
 ) -> np.ndarray:
-    """The same camera with our axes: the world stays, the camera's y and z turn round."""
+    """The same poses with OpenCV camera axes: the camera's y and z are negated, the world is unchanged."""
     return c2w @ _GL_FROM_CV
 
 
@@ -255,11 +264,11 @@ def splat_depth(
     hw: tuple[int, int],
     hide_px: int = 0,
 ) -> Tensor:
-    """Depth map (H, W) of points: each goes to its nearest pixel, the nearest point wins, nothing is filled in.
+    """Points → depth map (H, W): nearest pixel, nearest point (z-buffer), no filling of holes.
 
-    ``hide_px``: a point is also hidden by one that is more than 10 % nearer and lies within so many pixels. Needed
-    where the points were seen from another place than the camera and are sparse: the background then shines through
-    the gaps between the returns of the foreground.
+    ``hide_px``: a point is also occluded by one more than 10 % nearer within this many pixels. Needed for sparse points
+    seen from another centre than the camera's: the background otherwise appears in the gaps between the foreground's
+    returns.
     """
     h, w = hw
     uv = round_half_up(cameras.project(camera, xyz_cam[None].to(camera.f.dtype))[0])
@@ -278,9 +287,9 @@ def register_depth(
     depth_camera: Camera,  # B = 1
     camera: Camera,  # B = 1
     hw: tuple[int, int],
-    T_cam_from_depth: Pose | None = None,  # None = same place, same axes
+    T_cam_from_depth: Pose | None = None,  # None = same centre and axes
 ) -> Tensor:
-    """Depth map (H, W) as the colour camera sees it: forward warp with a z-buffer, holes stay holes."""
+    """Depth map → depth map (H, W) of the colour camera: forward warp with a z-buffer, holes are not filled."""
     v, u = torch.nonzero(depth > 0, as_tuple=True)
     uv = torch.stack((u, v), -1).to(depth_camera.f.dtype)
     xyz = cameras.unproject(depth_camera, uv[None], depth[v, u][None])
@@ -290,34 +299,36 @@ def register_depth(
 
 
 def _window_min(depth: Tensor, reach: int) -> Tensor:
-    """Smallest value within ``reach`` rows and columns (a square window), by doubling the window along each axis.
+    """Minimum within ``reach`` rows and columns (square window), by doubling the window along each axis.
 
     kornia's ``erosion`` takes twenty times as long.
     """
-    least = torch.nn.functional.pad(depth, (reach,) * 4, value=torch.inf)
+    minimum = torch.nn.functional.pad(depth, (reach,) * 4, value=torch.inf)
     for dim in (0, 1):
         width = 1
         while width < 2 * reach + 1:
             step = min(width, 2 * reach + 1 - width)
-            count = least.shape[dim] - step
-            least = torch.minimum(least.narrow(dim, 0, count), least.narrow(dim, step, count))
+            count = minimum.shape[dim] - step
+            minimum = torch.minimum(minimum.narrow(dim, 0, count), minimum.narrow(dim, step, count))
             width += step
-    return least
+    return minimum
 
 
 def _parse_distortion(value: object, file: Path) -> np.ndarray | None:
     count = len(value) if isinstance(value, (Sequence, np.ndarray)) else -1
     if count not in (4, 5, 8):
         raise FormatError(file, "distortion", value, "4, 5 or 8 numbers k1 k2 p1 p2 [k3 [k4 k5 k6]]")
-    lens = to_array(value, (count,), file, "distortion")
-    if np.abs(lens).max() > _MAX_DISTORTION_COEFFICIENT:
-        raise FormatError(file, "distortion", lens.tolist(), f"numbers of at most {_MAX_DISTORTION_COEFFICIENT:g}")
-    return lens if lens.any() else None
+    coefficients = to_array(value, (count,), file, "distortion")
+    if np.abs(coefficients).max() > _MAX_DISTORTION_COEFFICIENT:
+        raise FormatError(
+            file, "distortion", coefficients.tolist(), f"numbers of at most {_MAX_DISTORTION_COEFFICIENT:g}"
+        )
+    return coefficients if coefficients.any() else None
 
 
 def _to_float32(x: np.ndarray) -> Tensor:
     return torch.from_numpy(x.astype(np.float32))
 
 
-def _first_index(bad: np.ndarray) -> int:
-    return int(np.argwhere(bad)[0, 0])
+def _first_index(mask: np.ndarray) -> int:
+    return int(np.argwhere(mask)[0, 0])

@@ -1,9 +1,9 @@
-"""Depth maps beside a recording: a folder with one file a frame, from a network or any other source.
+"""Reader of depth maps for a recording's frames: a folder with one file per frame, from a network or another source.
 
-``*.png`` of 16 bits in steps of a stated unit; ``*.npy``, ``*.npz`` (its one array, or the one named depth),
-``*.tiff``, ``*.pfm`` or ``*.exr`` of numbers in the same unit; (h, w) over the field of the frame's picture, of any
-size, stretched where its sides have another ratio. 0, and what is not finite, is no depth. What ``dhtorch complete``
-wrote is read as it is: its ``complete.json`` says the unit.
+Formats: 16-bit ``*.png`` in steps of a unit; ``*.npy``, ``*.npz`` (its only array, or the one named depth), ``*.tiff``,
+``*.pfm`` or ``*.exr`` with numbers in that unit. A map (h, w) covers the field of view of its frame's image at any size
+and is stretched where the aspect ratios differ. 0 and non-finite values are no depth. Output of ``dhtorch complete`` is
+read directly: the unit comes from its ``complete.json``.
 """
 
 from __future__ import annotations
@@ -36,45 +36,45 @@ _UNIT_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 
 _SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".pfm", ".exr")
 
-#: By which share the ratio of a map's sides may differ from the picture's before it counts as another.
+#: Relative difference between the aspect ratios of a map and its image up to which they count as equal.
 _MAX_ASPECT_DIFFERENCE = 0.05
 
-#: Array of an archive that is taken where it has several.
+#: Name of the depth array in an archive with several arrays.
 _NPZ_KEY = "depth"
 
 
 @dataclass(frozen=True)
 class DepthMaps:
-    """The maps of a folder, by position in a recording."""
+    """Depth maps of a folder, indexed by position in the recording."""
 
     files: Sequence[Path | None]  # of every frame
     unit: float  # m
-    hw: tuple[int, int]  # of the pictures
+    hw: tuple[int, int]  # of the images
     by: str = "number"  # how files were matched to frames: number | order
 
     @property
     def frames(self) -> list[int]:
-        """The frames that have a map."""
+        """Positions of the frames with a map."""
         return [i for i, file in enumerate(self.files) if file is not None]
 
     @property
     def notes(self) -> list[str]:
-        """What a reader of the answer has to know of how files were matched."""
+        """Remarks for the user on how files were matched: missing maps, matching by order."""
         missing, n = len(self.files) - len(self.frames), len(self.files)
-        found = [f"{missing} of {n} frames {'has' if missing == 1 else 'have'} no map."] if missing else []
+        gaps = [f"{missing} of {n} frames {'has' if missing == 1 else 'have'} no map."] if missing else []
         ordered = ["No file has a frame's number: files were matched in their order."]
-        return found + (ordered if self.by == "order" else [])
+        return gaps + (ordered if self.by == "order" else [])
 
     @property
     def report(self) -> dict[str, Any]:
-        """The same as numbers."""
+        """How files were matched, as a record: number of missing maps, matched by number or order."""
         return {"missing": len(self.files) - len(self.frames), "matched_by": self.by}
 
     def __getitem__(self, i: int) -> Tensor | None:
         """(1, h, w) m float32 of frame ``i``, 0 = no depth; None where there is no file.
 
         Raises:
-            FormatError: a damaged file, one of another kind, or one that stands upright where the picture lies.
+            FormatError: a damaged file, one of another format, or a portrait map of a landscape image (or vice versa).
         """
         file = self.files[i]
         if file is None:
@@ -86,68 +86,74 @@ class DepthMaps:
 
 
 def open_depth_maps(folder: str | Path, recording: Recording, unit: str | float | None = None) -> DepthMaps:
-    """The maps of a recording's frames.
+    """Open a folder of depth maps and match its files to the frames of a recording.
 
-    A file belongs to the frame whose number is the last one in its name: all frames must have a file, or all files a
-    frame. Where no file has a frame's number, and there are as many files as frames, they are matched in their order,
-    by the numbers in their names.
+    A file belongs to the frame whose number is the last one in the file's name: every frame must have a file, or every
+    file a frame. Where no file has a frame's number, and there are as many files as frames, they are matched in order,
+    sorted by the numbers in their names.
 
     Args:
-        folder: of the files, or one that ``dhtorch complete`` wrote.
-        recording: whose frames they are of.
-        unit: m, cm, mm, inch, or metres a step; None = what ``complete.json`` says, else mm for PNG and m for all
+        folder: of the files, or the output folder of ``dhtorch complete``.
+        recording: with the frames of the maps.
+        unit: m, cm, mm, inch, or metres per step; None = the unit in ``complete.json``, else mm for PNG and m for all
             others.
 
     Raises:
-        FormatError: no folder, no map, maps of several kinds, two of one number, or files that cannot be matched.
+        FormatError: no folder, no map, maps of several formats, two of one number, or files that cannot be matched.
         ValueError: an unknown unit.
     """
     root = Path(folder).expanduser()
     if not root.is_dir():
         raise FormatError(root, "depth", "no folder", f"a folder of files {', '.join(_SUFFIXES)}")
-    about = root / "complete.json" if (root / "complete.json").is_file() else root.parent / "complete.json"
-    place = root / "depth" if (root / "depth").is_dir() else root
-    found = sorted(file for file in place.iterdir() if file.suffix.lower() in _SUFFIXES)
-    kinds = Counter(file.suffix.lower() for file in found)
+    metadata_file = root / "complete.json" if (root / "complete.json").is_file() else root.parent / "complete.json"
+    depth_folder = root / "depth" if (root / "depth").is_dir() else root
+    map_files = sorted(file for file in depth_folder.iterdir() if file.suffix.lower() in _SUFFIXES)
+    kinds = Counter(file.suffix.lower() for file in map_files)
     if len(kinds) != 1:
-        what = " and ".join(f"{n} {kind}" for kind, n in sorted(kinds.items())) or "no such file"
-        raise FormatError(place, "depth", what, f"one file a frame, all of one kind of {', '.join(_SUFFIXES)}")
-    step = _parse_unit(unit)
-    if step is None and about.is_file():
-        step = files.to_positive(files.read_json(about).get("unit_m"), about, "unit_m")
-    if step is None:
-        step = _UNIT_METRES["mm"] if set(kinds) == {".png"} else _UNIT_METRES["m"]
-    mine, by = _match_files(place, found, recording.number.tolist())
-    return DepthMaps(mine, step, recording[0].hw, by)
+        listing = " and ".join(f"{n} {kind}" for kind, n in sorted(kinds.items())) or "no such file"
+        raise FormatError(
+            depth_folder, "depth", listing, f"one file a frame, all of one kind of {', '.join(_SUFFIXES)}"
+        )
+    unit_m = _parse_unit(unit)
+    if unit_m is None and metadata_file.is_file():
+        unit_m = files.to_positive(files.read_json(metadata_file).get("unit_m"), metadata_file, "unit_m")
+    if unit_m is None:
+        unit_m = _UNIT_METRES["mm"] if set(kinds) == {".png"} else _UNIT_METRES["m"]
+    matched, matched_by = _match_files(depth_folder, map_files, recording.number.tolist())
+    return DepthMaps(matched, unit_m, recording[0].hw, matched_by)
 
 
-def _match_files(place: Path, found: Sequence[Path], number: Sequence[int]) -> tuple[list[Path | None], str]:
-    """Every frame's file, and whether numbers or order told it."""
-    named = [_numbers_in_name(file)[-1:] for file in found]
-    frames, told = set(number), {n for numbers in named for n in numbers}
-    if told & frames and all(named):
-        if frames <= told or told <= frames:
-            by_number = _index_by_number(found, [numbers[0] for numbers in named])
-            return [by_number.get(k) for k in number], "number"
-    elif not told & frames and len(found) == len(number):
-        in_order = sorted(found, key=_numbers_in_name)
+def _match_files(folder: Path, map_files: Sequence[Path], frames: Sequence[int]) -> tuple[list[Path | None], str]:
+    """The file of every frame (None = no map), and whether they were matched by ``"number"`` or ``"order"``."""
+    numbers_of = [_numbers_in_name(file)[-1:] for file in map_files]
+    frame_numbers, file_numbers = set(frames), {n for numbers in numbers_of for n in numbers}
+    if file_numbers & frame_numbers and all(numbers_of):
+        if frame_numbers <= file_numbers or file_numbers <= frame_numbers:
+            by_number = _index_by_number(map_files, [numbers[0] for numbers in numbers_of])
+            return [by_number.get(k) for k in frames], "number"
+    elif not file_numbers & frame_numbers and len(map_files) == len(frames):
+        in_order = sorted(map_files, key=_numbers_in_name)
         return [*in_order], "order"
-    said = format_count(len(found), "file")
-    if told:
-        said += f" numbered {_format_range(told)}, {len(told & frames)} of them with a frame's number"
+    description = format_count(len(map_files), "file")
+    if file_numbers:
+        n_shared = len(file_numbers & frame_numbers)
+        description += f" numbered {_format_range(file_numbers)}, {n_shared} of them with a frame's number"
     raise FormatError(
-        place, "depth", said, f"one for each of {format_count(len(number), 'frame')}, numbered {_format_range(frames)}"
+        folder,
+        "depth",
+        description,
+        f"one for each of {format_count(len(frames), 'frame')}, numbered {_format_range(frame_numbers)}",
     )
 
 
 def _numbers_in_name(file: Path) -> list[int]:
-    """All whole numbers in a file's name, so that 10 comes after 9."""
+    """All integers in a file's name, as a key for natural order (10 after 9)."""
     return [int(digits) for digits in re.findall(r"\d+", file.stem)]
 
 
-def _index_by_number(found: Sequence[Path], named: Sequence[int]) -> dict[int, Path]:
+def _index_by_number(map_files: Sequence[Path], numbers: Sequence[int]) -> dict[int, Path]:
     by_number: dict[int, Path] = {}
-    for file, n in zip(found, named, strict=True):
+    for file, n in zip(map_files, numbers, strict=True):
         first = by_number.setdefault(n, file)
         if first is not file:
             raise FormatError(file, "name", f"number {n} as {first.name} has", "a number of its own in every name")
@@ -159,30 +165,30 @@ def _format_range(numbers: set[int]) -> str:
 
 
 def _check_shape(file: Path, shape: tuple[int, ...], hw: tuple[int, int]) -> None:
-    """A map is laid over the whole picture; one that is upright where the picture lies cannot be meant."""
+    """Refuse a portrait map of a landscape image (or vice versa); warn where aspect ratios differ otherwise."""
     if 0 in hw:
         return
     ratio, expected = shape[1] / shape[0], hw[1] / hw[0]
     size, picture = f"{shape[1]}x{shape[0]}", f"{hw[1]}x{hw[0]}"
     if (ratio - 1) * (expected - 1) < 0 and abs(ratio / expected - 1) > _MAX_ASPECT_DIFFERENCE:
-        raise FormatError(file, "depth", f"a map of {size}", f"one over the field of its picture, {picture}")
+        raise FormatError(file, "depth", f"a map of {size}", f"one over the field of view of its image, {picture}")
     if abs(ratio / expected - 1) > _MAX_ASPECT_DIFFERENCE:
-        text = f"{file.parent}: maps of {size} are taken to be stretched over the whole picture, {picture}"
+        text = f"{file.parent}: maps of {size} are stretched over the whole image, {picture}"
         warnings.warn(text, UserWarning, stacklevel=3)
 
 
-def _parse_unit(given: str | float | None) -> float | None:
-    if given is None:
+def _parse_unit(unit: str | float | None) -> float | None:
+    if unit is None:
         return None
-    if isinstance(given, str) and given in _UNIT_METRES:
-        return _UNIT_METRES[given]
-    if isinstance(given, int | float) and not isinstance(given, bool) and given > 0:
-        return float(given)
-    raise ValueError(f"depth_unit: found {given!r}, expected {', '.join(_UNIT_METRES)}, or metres a step")
+    if isinstance(unit, str) and unit in _UNIT_METRES:
+        return _UNIT_METRES[unit]
+    if isinstance(unit, int | float) and not isinstance(unit, bool) and unit > 0:
+        return float(unit)
+    raise ValueError(f"depth_unit: found {unit!r}, expected {', '.join(_UNIT_METRES)}, or metres per step")
 
 
 def _read_npy_map(file: Path) -> np.ndarray:
-    """Numbers (h, w) of a NPY file; never objects, which could run code."""
+    """NPY file → numbers (h, w); object arrays are refused, since unpickling can run code."""
     try:
         array = np.load(io.BytesIO(files.read_bytes(file)), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
@@ -193,7 +199,7 @@ def _read_npy_map(file: Path) -> np.ndarray:
 
 
 def _read_npz_map(file: Path) -> np.ndarray:
-    """The one array (h, w) of an archive, or that named depth."""
+    """NPZ file → its only array (h, w), or the one named depth."""
     try:
         with zipfile.ZipFile(io.BytesIO(files.read_bytes(file))) as archive:
             keys = [name.removesuffix(".npy") for name in archive.namelist()]

@@ -1,8 +1,8 @@
-"""Depth rendered from a laser scan, as the truth of a frame: taken to the image's pixels, held against the sensor.
+"""True depth from a laser scan: rendered depth -> image pixels, rejected where it disagrees with the sensor.
 
-Registration to the scan can fail, and the scan may be matched at another instant than the image. Both show as
-disagreement with the frame's own sensor over the pixels where both answer; the sensor is good enough to notice, though
-not good enough to judge by.
+Registration to the scan can fail, and the scan may be associated with another instant than the image. Both cause
+disagreement with the frame's own sensor over their common pixels; the sensor is accurate enough to detect this, though
+not to serve as truth.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ def resample_laser_depth(
     hw: tuple[int, int],
     max_disagreement: float,
 ) -> tuple[Tensor, float]:
-    """Laser depth (H, W) at the image's pixels, and its disagreement with the sensor.
+    """Laser depth → (depth (H, W) at the image's pixels, its disagreement with the sensor).
 
     Returns:
-        The depth is 0 everywhere where the disagreement exceeds the limit, or where no pixel is shared (then NaN).
+        The depth is 0 everywhere if the disagreement exceeds the limit or no pixel is common (then it is NaN).
     """
-    seen = resample_depth(laser, laser_camera, sensor_camera, (sensor.shape[0], sensor.shape[1]))
-    off = _median_relative_difference(seen, sensor)
-    if not off <= max_disagreement:
-        return torch.zeros(hw, dtype=laser.dtype), off
-    return resample_depth(laser, laser_camera, camera, hw), off
+    at_sensor = resample_depth(laser, laser_camera, sensor_camera, (sensor.shape[0], sensor.shape[1]))
+    disagreement = _median_relative_difference(at_sensor, sensor)
+    if not disagreement <= max_disagreement:
+        return torch.zeros(hw, dtype=laser.dtype), disagreement
+    return resample_depth(laser, laser_camera, camera, hw), disagreement
 
 
 def _median_relative_difference(truth: Tensor, sensor: Tensor) -> float:
-    """Median of |sensor − truth| / truth over the pixels where both answer; NaN where there is none."""
-    both = (truth > 0) & (sensor > 0)
-    if not bool(both.any()):
+    """Median of |sensor − truth| / truth over the pixels with both depths; NaN where there is none."""
+    common = (truth > 0) & (sensor > 0)
+    if not bool(common.any()):
         return math.nan
-    return float(((sensor - truth).abs() / truth)[both].median())
+    return float(((sensor - truth).abs() / truth)[common].median())

@@ -1,7 +1,7 @@
-"""The members of a capture: files of a folder, or entries of a zip archive read in place.
+"""Members of a capture: files of a folder, or entries of a zip archive read in place.
 
-Nothing is ever unpacked to disk. A member remembers where its bytes lie, so it pickles, an archive of any length costs
-nothing to open in a worker, and a member's size is known before its bytes are read.
+Nothing is unpacked to disk. A member stores the position of its bytes: it is picklable, workers open archives of any
+length at no cost, and its size is known before its bytes are read.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LOCAL_HEADER_BYTES = 30  # bytes before the name
 class Member:
     """One file of a capture."""
 
-    path: Path  # for an archive: the archive's path, then the name inside
+    path: Path  # for an archive: the archive's path / the entry's name
 
     def read(self) -> bytes:
         """All bytes; at least one, at most ``MAX_FILE_BYTES``.
@@ -37,7 +37,7 @@ class Member:
         return read_bytes(self.path)
 
     def ends(self, count: int) -> tuple[bytes, bytes] | None:
-        """First and last ``count`` bytes without reading the rest; None where that is not possible."""
+        """First and last ``count`` bytes without reading the rest; None if impossible, empty if unreadable."""
         try:
             with open_regular(self.path) as stream:
                 first = stream.read(count)
@@ -52,14 +52,14 @@ class ZipMember(Member):
     """One entry of a zip archive."""
 
     archive: Path
-    offset: int  # of the entry's own header
+    offset: int  # of the entry's local header
     packed: int  # bytes in the archive
     size: int  # bytes when unpacked
     method: int
     crc: int
 
     def read(self) -> bytes:
-        """As :meth:`Member.read`; a bomb stops at the size that the archive's directory names."""
+        """As :meth:`Member.read`; decompression stops at the size in the archive's directory."""
         if not 0 < self.size <= MAX_FILE_BYTES or self.packed > MAX_FILE_BYTES:
             raise FormatError(self.path, "file size", f"{self.size} bytes", f"1 to {MAX_FILE_BYTES} bytes")
         if self.method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
@@ -71,12 +71,12 @@ class ZipMember(Member):
             except zlib.error as error:
                 raise FormatError(self.path, "data", error, "a deflated member") from None
         if len(data) != self.size or zlib.crc32(data) != self.crc:
-            found = f"{len(data)} bytes with check sum {zlib.crc32(data):08x}"
-            raise FormatError(self.path, "data", found, f"{self.size} bytes with check sum {self.crc:08x}")
+            problem = f"{len(data)} bytes with checksum {zlib.crc32(data):08x}"
+            raise FormatError(self.path, "data", problem, f"{self.size} bytes with checksum {self.crc:08x}")
         return data
 
     def ends(self, count: int) -> tuple[bytes, bytes] | None:
-        """As :meth:`Member.ends`; None for a compressed one."""
+        """As :meth:`Member.ends`; None for a compressed entry."""
         if self.method != zipfile.ZIP_STORED:
             return None
         count = min(count, self.size)
@@ -87,40 +87,42 @@ class ZipMember(Member):
             return b"", b""
 
     def _stored(self, *spans: tuple[int, int]) -> list[bytes]:
-        """(start, count) bytes as they lie in the archive; the entry's header says how far behind it they begin."""
+        """Stored bytes of spans (start, count), relative to the entry's data, which follows its local header."""
         try:
             with open_regular(self.archive) as stream:
                 stream.seek(self.offset)
-                mark, name, extra = struct.unpack("<4s22xHH", stream.read(_LOCAL_HEADER_BYTES))
+                signature, name, extra = struct.unpack("<4s22xHH", stream.read(_LOCAL_HEADER_BYTES))
                 begin = self.offset + _LOCAL_HEADER_BYTES + name + extra
-                found = [_read_at(stream, begin + start, count) for start, count in spans]
+                parts = [_read_at(stream, begin + start, count) for start, count in spans]
         except (OSError, ValueError, struct.error) as error:
             raise FormatError(self.path, "entry", error, "a zip entry") from None
-        short = [(len(data), count) for data, (_, count) in zip(found, spans, strict=True) if len(data) != count]
-        if short or mark != b"PK\x03\x04":
-            have, want = short[0] if short else (self.packed, self.packed)
-            raise FormatError(self.path, "entry", f"{have} bytes behind {mark!r}", f"{want} bytes of a zip entry")
-        return found
+        short = [(len(data), count) for data, (_, count) in zip(parts, spans, strict=True) if len(data) != count]
+        if short or signature != b"PK\x03\x04":
+            n_read, n_expected = short[0] if short else (self.packed, self.packed)
+            raise FormatError(
+                self.path, "entry", f"{n_read} bytes behind {signature!r}", f"{n_expected} bytes of a zip entry"
+            )
+        return parts
 
 
 def _read_at(stream: BinaryIO, start: int, count: int) -> bytes:
-    """Up to ``count`` bytes."""
+    """Up to ``count`` bytes from ``start``."""
     stream.seek(start)
     return stream.read(count)
 
 
 def list_folder_members(root: Path) -> dict[str, Member]:
-    """Name → member of the files of a folder and of its folders, one level down."""
-    inside = [entry for entry in root.iterdir() if entry.is_dir()]
-    files = [entry for folder in (root, *inside) for entry in folder.iterdir() if not entry.is_dir()]
+    """Name → member for the files of a folder and of its direct subfolders."""
+    subfolders = [entry for entry in root.iterdir() if entry.is_dir()]
+    files = [entry for folder in (root, *subfolders) for entry in folder.iterdir() if not entry.is_dir()]
     return {file.relative_to(root).as_posix(): Member(file) for file in files}
 
 
 def list_zip_members(archive: Path) -> dict[str, Member]:
-    """Name → member of the files of a zip archive. A name that occurs twice means the last one.
+    """Name → member for the files of a zip archive; of entries with the same name the last.
 
     Raises:
-        FormatError: no zip archive, or more than ``_MAX_MEMBERS`` entries.
+        FormatError: not a zip archive, or more than ``_MAX_MEMBERS`` entries.
     """
     try:
         with open_regular(archive) as stream:
@@ -137,10 +139,10 @@ def list_zip_members(archive: Path) -> dict[str, Member]:
 
 
 def get_member(members: Mapping[str, Member], name: str, root: Path) -> Member:
-    """The member of that name.
+    """The member called ``name``.
 
     Raises:
-        FormatError: there is none.
+        FormatError: no such member.
     """
     if name not in members:
         raise FormatError(root, name, f"no such file among {len(members)}", "a file of that name")

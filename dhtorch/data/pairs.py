@@ -1,8 +1,7 @@
-"""What a reference view may see: one other frame, by frame gap, by time or by baseline; or several, to choose among.
+"""Pairs of a recording: a reference view with one source view (by gap, time, baseline) or with candidates.
 
-Positions are those in the recording; the reference view is the frame whose depth is extended. Gaps and steps are
-counted in the capture's own frame numbers: where a frame was lost the pairs that need it are missing, the others do not
-shift.
+Indices are positions in the recording; the reference view is the frame whose depth is extended. Gaps and steps count in
+the capture's own frame numbers: where a frame was lost the pairs that need it are missing and the others do not shift.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Scene, SceneLike
 from dhtorch.runtime.console import format_count
 
-#: From this many frames on, neighbouring reference views are nearly the same picture: take every other one.
+#: From this many frames on every second frame is a reference view: neighbouring ones show nearly the same picture.
 _MANY_FRAMES = 25
 
-#: Steps from a reference view, in frames, to those around it that are offered to a method which chooses for itself.
+#: Distances in frames from a reference view to its candidate source views, before and after it.
 CANDIDATE_STEPS = (1, 2, 3, 5, 8, 12, 20, 30)
 
 
 class Pair(NamedTuple):
-    """A reference view and what it may see: one other frame, or several among which the method chooses.
+    """A reference view with one source view, or several candidates among which the method selects.
 
     Equal to the plain tuple ``(i, j)`` or ``(i, (k1, k2, …))``, which ``Pair(*item)`` reads.
     """
@@ -34,40 +33,41 @@ class Pair(NamedTuple):
     other: int | tuple[int, ...]
 
     @property
-    def offered(self) -> tuple[int, ...]:
-        """The frames to choose among, in rising order; none where the other frame is fixed."""
+    def candidates(self) -> tuple[int, ...]:
+        """The candidate source views in rising order; empty where the source view is fixed."""
         return () if isinstance(self.other, int) else tuple(self.other)
 
 
 def to_fixed_pairs(pairs: Iterable[Sequence[int]] | Iterable[Pair]) -> list[tuple[int, int]]:
-    """The pairs as (i, j), for what cannot let a method choose.
+    """The pairs as tuples (i, j), for callers without view selection.
 
     Raises:
-        ValueError: frames to choose among.
+        ValueError: a pair with candidates instead of one source view.
     """
-    found = []
+    fixed = []
     for i, j in pairs:
         if not isinstance(j, int):
             raise ValueError(
-                f"pairs: found {len(j)} frames to choose among (pairs=auto), expected one: pairs=gap, time or baseline"
+                f"pairs: found {len(j)} candidate frames (pairs=auto), "
+                "expected one source view (pairs=gap, time or baseline)"
             )
-        found.append((i, j))
-    return found
+        fixed.append((i, j))
+    return fixed
 
 
 def by_choice(
     scene: SceneLike, steps: Sequence[int] = CANDIDATE_STEPS, stride: int | None = None, past: bool = False
 ) -> list[Pair]:
-    """Every reference view with the frames around it, among which a method chooses: nobody has to know a gap.
+    """Every reference view with the frames around it as candidates, among which a method selects its source views.
 
     Args:
         scene: its recording's frames.
-        steps: how far before and after the reference view frames are offered, see :func:`candidate_frames`.
+        steps: distances of the candidates before and after the reference view, see :func:`candidate_frames`.
         stride: step from reference view to reference view. None = 2 where there are 25 frames or more, else 1.
-        past: only frames before the reference view; the first frame is none then.
+        past: only frames before the reference view; the first frame is then no reference view.
 
     Raises:
-        ValueError: one frame alone, no steps or one below 1, stride below 1, or no reference view.
+        ValueError: a single frame, no steps or one below 1, stride below 1, or no reference view.
     """
     recording = Scene.of(scene).recording
     number = recording.number.tolist()
@@ -76,7 +76,7 @@ def by_choice(
     steps, place = _check_steps(steps), {k: p for p, k in enumerate(number)}
     references = [i for i in range(0, len(number), _choose_stride(recording, stride)) if i > 0 or not past]
     pairs = [Pair(i, tuple(_candidates_of_numbers(number, place, i, steps, past))) for i in references]
-    return _require_pairs(pairs, recording, f"stride {stride}, past frames alone")
+    return _require_pairs(pairs, recording, f"stride {stride}, past frames only")
 
 
 def by_gap(scene: SceneLike, gap: int | None = None, stride: int | None = None) -> list[Pair]:
@@ -88,12 +88,12 @@ def by_gap(scene: SceneLike, gap: int | None = None, stride: int | None = None) 
         stride: step from reference view to reference view. None = 2 where there are 25 frames or more, else 1.
 
     Raises:
-        ValueError: no gap given and none known, gap or stride below 1, or no two frames that far apart.
+        ValueError: neither ``gap`` nor the scene's own gap, gap or stride below 1, or no two frames that far apart.
     """
     scene = Scene.of(scene)
     recording, gap = scene.recording, scene.gap if gap is None else gap
     if gap is None:
-        raise ValueError(f"pairs.gap: {recording.name} knows no gap of its own, expected a number of frames")
+        raise ValueError(f"pairs.gap: {recording.name} has no gap of its own, expected a number of frames")
     gap = _check_positive_int("pairs.gap", gap)
     number = recording.number.tolist()
     if gap > number[-1] - number[0]:
@@ -106,7 +106,7 @@ def by_gap(scene: SceneLike, gap: int | None = None, stride: int | None = None) 
 
 
 def by_time(scene: SceneLike, seconds: float, tolerance: float | None = None, stride: int | None = None) -> list[Pair]:
-    """Pairs whose stamps differ by ``seconds``, give or take ``tolerance``; the closest frame counts.
+    """Pairs whose time stamps differ by ``seconds`` ± ``tolerance``; the closest frame is taken.
 
     Args:
         scene: its recording's frames; needs time stamps.
@@ -134,9 +134,9 @@ def by_time(scene: SceneLike, seconds: float, tolerance: float | None = None, st
 def by_baseline(
     scene: SceneLike, metres: float, tolerance: float | None = None, stride: int | None = None
 ) -> list[Pair]:
-    """Pairs whose camera centres lie ``metres`` apart, give or take ``tolerance``; the earliest such frame counts.
+    """Pairs whose camera centres are ``metres`` ± ``tolerance`` apart; the earliest such frame is taken.
 
-    The earliest, because a camera that comes back later has seldom the same view.
+    The earliest, because a camera that returns later seldom has the same view.
 
     Args:
         scene: its recording's frames; needs poses.
@@ -168,68 +168,67 @@ def by_cameras(
     stride: int | None = None,
     past: bool = False,
 ) -> list[Pair]:
-    """Every reference view of a rig with what its other cameras saw: at the same instant, and ``instants`` away.
+    """Every reference view of a rig with frames of its other cameras, at the same instant and ``instants`` away.
 
-    Where one is not 0 the reference view's own camera is offered, too: views in space and in time. One frame alone is a
-    fixed pair, several are offered to the method.
+    At instants other than 0 the reference view's own camera is a candidate too: views in space and in time. A single
+    frame gives a fixed pair, several are candidates.
 
     Args:
         scene: its recording is a :class:`dhtorch.data.rig.Rig`.
-        instants: how many instants from the reference view to those offered; 0 = the same.
+        instants: distances of the candidates from the reference view, in instants; 0 = the same instant.
         reference: name of the camera whose depth is extended. None = all.
         stride: step from reference view to reference view, in instants. None = 2 where there are 25 or more, else 1.
         past: only instants up to the reference view's.
 
     Raises:
-        ValueError: one camera alone, an unknown one, instants below 0, or no pair.
+        ValueError: a single camera, an unknown camera, instants below 0, or no pair.
     """
     recording = Scene.of(scene).recording
     if not isinstance(recording, Rig):
         expected = "several cameras as one recording (data=rig, dhtorch.data.rig.join_cameras)"
         raise ValueError(f"pairs=cameras: {recording.name} is one camera, expected {expected}")
     if reference is not None and reference not in recording.cameras:
-        raise ValueError(f"pairs.anchor: found {reference}, expected one of {', '.join(recording.cameras)}")
+        raise ValueError(f"pairs.reference: found {reference}, expected one of {', '.join(recording.cameras)}")
     if not instants or any(isinstance(s, bool) or int(s) != s or s < 0 for s in instants):
         raise ValueError(f"pairs.instants: found {list(instants)}, expected whole numbers of at least 0")
     C, n = len(recording.cameras), len(recording) // len(recording.cameras)
     chosen = range(C) if reference is None else [recording.cameras.index(reference)]
-    every = (2 if n >= _MANY_FRAMES else 1) if stride is None else _check_positive_int("pairs.stride", stride)
+    step = (2 if n >= _MANY_FRAMES else 1) if stride is None else _check_positive_int("pairs.stride", stride)
     pairs = []
-    for k in range(0, n, every):
-        near = {k + way * s for s in instants for way in ((-1,) if past else (-1, 1)) if 0 <= k + way * s < n}
+    for k in range(0, n, step):
+        near = {k + sign * s for s in instants for sign in ((-1,) if past else (-1, 1)) if 0 <= k + sign * s < n}
         for c in chosen:
-            offered = sorted(q * C + d for q in near for d in range(C) if (q, d) != (k, c))
-            if offered:
-                pairs.append(Pair(k * C + c, offered[0] if len(offered) == 1 else tuple(offered)))
+            candidates = sorted(q * C + d for q in near for d in range(C) if (q, d) != (k, c))
+            if candidates:
+                pairs.append(Pair(k * C + c, candidates[0] if len(candidates) == 1 else tuple(candidates)))
     return _require_pairs(pairs, recording, f"instants {list(instants)}")
 
 
 def by_scaled_gap(scene: SceneLike, factor: float, stride: int | None = None) -> list[Pair]:
-    """Pairs at ``factor`` times the scene's own gap, rounded, at least one frame; none where it is too short.
+    """Pairs at ``factor`` times the scene's own gap, rounded, at least one frame; none if the recording is too short.
 
     Raises:
-        ValueError: no gap known, factor not positive, or stride below 1.
+        ValueError: the scene has no gap, factor not positive, or stride below 1.
     """
     scene = Scene.of(scene)
     recording = scene.recording
     if scene.gap is None:
-        raise ValueError(f"pairs.factor: {recording.name} knows no gap of its own, expected one with a gap")
+        raise ValueError(f"pairs.factor: {recording.name} has no gap of its own, expected a scene with a gap")
     gap = max(1, int(_check_positive("pairs.factor", factor) * scene.gap + 0.5))
     span = int(recording.number[-1] - recording.number[0])
     try:
         return by_gap(scene, gap, stride) if gap <= span else []
-    except ValueError:  # frames were lost: no two of those left are that far apart
+    except ValueError:  # frames were lost: no two of the remaining ones are that far apart
         return []
 
 
 def candidate_frames(
     recording: Recording, i: int, steps: Sequence[int] = CANDIDATE_STEPS, past: bool = False
 ) -> list[int]:
-    """Positions of frames before and after ``i`` among which a method may choose its other views, in rising order.
+    """Positions of the candidate source views of frame ``i``, before and after it, in rising order.
 
-    Steps count in the capture's own frame numbers; a frame that was lost is left out. A recording that is shorter than
-    the longest step offers what it has, and where no step fits the nearest frame is offered. ``past``: frames before
-    ``i`` alone.
+    Steps count in the capture's own frame numbers; lost frames are left out, and steps beyond the recording's ends too.
+    Where no step fits, the nearest frame is the candidate. ``past``: only frames before ``i``.
 
     Raises:
         ValueError: no such frame, no steps or one below 1, or no other frame.
@@ -237,18 +236,18 @@ def candidate_frames(
     number = recording.number.tolist()
     if not 0 <= i < len(number):
         raise ValueError(f"pairs: found frame {i} of {recording.name}, expected 0 to {len(number) - 1}")
-    offered = _candidates_of_numbers(number, {k: p for p, k in enumerate(number)}, i, _check_steps(steps), past)
-    if not offered:
-        found, expected = ("nothing before frame 0", "a later one") if past else ("one frame", "two at least")
-        raise ValueError(f"pairs: {recording.name} has {found}, expected {expected}")
-    return offered
+    candidates = _candidates_of_numbers(number, {k: p for p, k in enumerate(number)}, i, _check_steps(steps), past)
+    if not candidates:
+        extent, expected = ("nothing before frame 0", "a later one") if past else ("one frame", "two at least")
+        raise ValueError(f"pairs: {recording.name} has {extent}, expected {expected}")
+    return candidates
 
 
 def spaced_frames(i: int, j: int, views: int) -> list[int]:
-    """``views`` different positions spread evenly over the way from ``i`` to ``j``: ``j`` is the last, ``i`` no part.
+    """``views`` different positions evenly spaced from ``i`` (excluded) to ``j`` (the last one).
 
     Raises:
-        ValueError: there are not that many. One alone is ``j``, wherever it lies.
+        ValueError: fewer than ``views`` frames lie in between. A single view is ``j``, also where ``j`` < ``i``.
     """
     if views == 1 and i != j:
         return [j]
@@ -260,13 +259,13 @@ def spaced_frames(i: int, j: int, views: int) -> list[int]:
 def _candidates_of_numbers(
     number: Sequence[int], place: Mapping[int, int], i: int, steps: Sequence[int], past: bool
 ) -> list[int]:
-    """:func:`candidate_frames`, of frame numbers whose places are known; empty where there is no other frame."""
-    ways = (-1,) if past else (-1, 1)
-    offered = sorted(place[k] for s in steps for k in (number[i] + way * s for way in ways) if k in place)
-    if offered:
-        return offered
-    others = [p for p in (i - 1, i + 1) if 0 <= p < len(number) and (p < i or not past)]
-    return [min(others, key=lambda p: abs(number[p] - number[i]))] if others else []
+    """:func:`candidate_frames` from frame numbers and number → position; empty where there is no other frame."""
+    signs = (-1,) if past else (-1, 1)
+    candidates = sorted(place[k] for s in steps for k in (number[i] + sign * s for sign in signs) if k in place)
+    if candidates:
+        return candidates
+    neighbours = [p for p in (i - 1, i + 1) if 0 <= p < len(number) and (p < i or not past)]
+    return [min(neighbours, key=lambda p: abs(number[p] - number[i]))] if neighbours else []
 
 
 def _check_steps(steps: Sequence[int]) -> list[int]:
@@ -281,10 +280,10 @@ def _choose_stride(recording: Recording, stride: int | None) -> int:
     return _check_positive_int("pairs.stride", stride)
 
 
-def _require_pairs(pairs: list[Pair], recording: Recording, wanted: str) -> list[Pair]:
+def _require_pairs(pairs: list[Pair], recording: Recording, criterion: str) -> list[Pair]:
     if not pairs:
-        found = f"no two of {format_count(len(recording), 'frame')} of {recording.name}"
-        raise ValueError(f"pairs: found {found} at {wanted}, expected at least one pair")
+        shortage = f"no two of {format_count(len(recording), 'frame')} of {recording.name}"
+        raise ValueError(f"pairs: found {shortage} at {criterion}, expected at least one pair")
     return pairs
 
 

@@ -1,8 +1,8 @@
-"""What a pickle may call, as functions of our own: arrays and other plain data, rebuilt from their parts.
+"""Functions that a pickle may call, implemented here: arrays and other plain data, rebuilt from their parts.
 
-A pickle makes an array in steps: an empty shell, an element type, then the state that fills the shell with bytes.
-Nothing of numpy's own unpickling is used. ``spend(n)`` is called before ``n`` bytes are made; it raises when a file
-makes more than a file of its size can hold.
+A pickle creates an array in steps: an empty array, an element type, then the state with the array's bytes. numpy's own
+unpickling is not used. ``spend(n)`` is called before ``n`` bytes are created; it raises when a file creates more bytes
+than a file of its size can hold.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _SpendBytes = Callable[[int], None]
 
 
 class PermittedName(str):
-    """A permitted name. Nothing stands behind it."""
+    """Token of a permitted name; it is never resolved."""
 
 
 class _PendingDtype:
@@ -33,17 +33,17 @@ class _PendingDtype:
 
 
 class PendingArray:
-    """An array under construction: an empty shell until its state arrives."""
+    """An array under construction, empty until its state is set."""
 
     value: np.ndarray | list[Any] | None = None
     shape: tuple[int, ...] = ()
 
 
 def apply_state(spend: _SpendBytes, target: Any, state: Any) -> Any:
-    """``target``, an array or an element type under construction, with its state.
+    """Set the state of ``target``, an array or an element type under construction, and return it.
 
     Raises:
-        ValueError, TypeError: anything else, or a state that does not fit.
+        ValueError, TypeError: another target, or an invalid state.
     """
     if type(target) is _PendingDtype:
         _, order, subarray, names = state[:4]
@@ -54,19 +54,19 @@ def apply_state(spend: _SpendBytes, target: Any, state: Any) -> Any:
         _, shape, dtype, fortran, raw = state
         _fill_array(spend, target, shape, dtype, fortran, raw)
     else:
-        raise TypeError("state for something else than an array or its element type")
+        raise TypeError("state of an object that is no array or element type")
     return target
 
 
 def array_from_bytes(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw: bytes) -> np.ndarray:
-    """An array of raw bytes; its size is what the bytes say, not what the header says.
+    """Raw bytes → array, after checking that its shape matches the number of bytes.
 
     Raises:
-        ValueError: no plain numbers or texts, or a shape that the bytes do not fill.
+        ValueError: not plain numbers or strings, or a shape that does not match the bytes.
     """
     if dtype.kind not in "biufSU" or dtype.itemsize == 0 or dtype.names or dtype.subdtype:
         raise ValueError(f"array of {dtype}")
-    # Beside a zero any other number would fit no bytes at all, and whoever walks along that axis would not come back.
+    # With a zero in the shape any other length matches 0 bytes, and loops over that axis would not end: limit it.
     if len(shape) > 8 or any(type(n) is not int or not 0 <= n <= max(len(raw), 4096) for n in shape):
         raise ValueError(f"array shape {shape}")
     if math.prod(shape) * dtype.itemsize != len(raw):
@@ -76,10 +76,10 @@ def array_from_bytes(dtype: np.dtype, shape: tuple[int, ...], fortran: bool, raw
 
 
 def check_scalar(value: Any) -> Any:
-    """A key or a member of a set: nothing whose hash could run long or deep.
+    """``value``, checked to be a scalar as key of a dict or member of a set (hashes of others may be expensive).
 
     Raises:
-        TypeError: anything else.
+        TypeError: any other value.
     """
     if type(value) not in SCALAR_TYPES or (type(value) is int and abs(value) >= 1 << 63):
         raise TypeError(f"a key of type {type(value).__name__}")
@@ -90,7 +90,7 @@ def _fill_array(
     spend: _SpendBytes, target: PendingArray, shape: Any, dtype: Any, fortran: Any, raw: Any
 ) -> PendingArray:
     if target.value is not None or type(dtype) is not _PendingDtype or type(shape) is not tuple:
-        raise TypeError("an array with a state that is none")
+        raise TypeError("an array with an invalid state")
     if dtype.code.lstrip("<>|=").startswith("O"):
         if type(raw) is not list or len(shape) > 1 or len(raw) != math.prod(shape):
             raise ValueError(f"an object array of shape {shape}")
@@ -105,7 +105,7 @@ def _fill_array(
 
 def _new_dtype(_spend: _SpendBytes, code: Any, *_flags: Any) -> _PendingDtype:
     if type(code) is not str or not _DTYPE_PATTERN.fullmatch(code):
-        raise ValueError("an element type that is no plain number, text or object")
+        raise ValueError("an element type other than number, string or object")
     return _PendingDtype(code)
 
 
@@ -135,22 +135,22 @@ def _encode(spend: _SpendBytes, text: Any, encoding: Any) -> bytes:
 
 def _new_set(_spend: _SpendBytes, items: Any = ()) -> set[Any]:
     if type(items) not in (list, tuple):
-        raise TypeError("a set of something else than a list")
+        raise TypeError("a set that is not made from a list")
     return set(map(check_scalar, items))
 
 
-#: What stands behind the names of functions.
+#: Name of a permitted function → its implementation.
 PERMITTED_CALLS: Final[dict[str, Callable[..., Any]]] = {
     "numpy.dtype": _new_dtype,
     "numpy.core.multiarray._reconstruct": _new_array,
     "numpy.core.multiarray.scalar": _new_scalar,
     "numpy.core.numeric._frombuffer": _from_buffer,
-    "_codecs.encode": _encode,  # how protocol 2 writes bytes
+    "_codecs.encode": _encode,  # bytes in protocol 2
     "collections.OrderedDict": lambda _spend: {},
     "builtins.bytes": lambda _spend: b"",
-    "builtins.set": _new_set,  # how protocols 2 and 3 write sets
+    "builtins.set": _new_set,  # sets in protocols 2 and 3
 }
 
-#: The only names a pickle may mention; ``numpy._core`` of numpy 2 counts as ``numpy.core``, ``__builtin__`` of Python 2
-#: as ``builtins``.
+#: Names permitted in a pickle; ``numpy._core`` of numpy 2 is mapped to ``numpy.core``, ``__builtin__`` of Python 2 to
+#: ``builtins``.
 PERMITTED_NAMES: Final = {*PERMITTED_CALLS, _ARRAY_NAME}

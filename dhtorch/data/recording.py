@@ -1,7 +1,7 @@
-"""A recording: the frames of one camera through one scene, read when asked for.
+"""Recording: a lazy sequence of the frames of one camera through one scene; a frame is decoded on access.
 
-Opening a recording touches names, headers and text tables; pixels are decoded by ``recording[i]`` alone. So a large
-set opens at once and streams at constant memory, also from the workers of a data loader (a recording pickles).
+Opening a recording reads names, headers and text tables; only ``recording[i]`` decodes pixels. Large sets therefore
+open quickly and stream at constant memory, also from data-loader workers (recordings are picklable).
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ _Item = TypeVar("_Item")
 class Recording(Sequence[Frame]):
     """A lazy sequence of frames (B = 1) of one scene.
 
-    A reader must give ``name``, ``format``, ``load``, which decodes image, depth and cameras of position ``i``, and
-    ``number``, the place of every frame in the capture: where a frame was skipped the numbers have a gap, so that pairs
-    never shift silently. It may give ``root``, ``times``, ``poses`` with their ``pose_axes``, ``rate_hz``, ``sparse``,
-    ``episode``, ``camera_name`` and ``report``, where the capture says so; the recording adds time, pose and ``sparse``
-    to its frames. What a benchmark makes of a recording is no property of it: see :class:`dhtorch.data.scene.Scene`.
+    A reader must set ``name``, ``format``, ``load``, which decodes image, depth and cameras of position ``i``, and
+    ``number``, the place of every frame in the capture: skipped frames leave a gap in the numbers, so that pairs do not
+    shift. It may set ``root``, ``times``, ``poses`` with their ``pose_axes``, ``rate_hz``, ``sparse``, ``episode``,
+    ``camera_name`` and ``report``, where the capture contains them; the recording adds time, pose and ``sparse`` to its
+    frames. Notes of a benchmark are not part of a recording: see :class:`dhtorch.data.scene.Scene`.
 
     Raises:
         ValueError: no frame, or fields of unequal length.
     """
 
     name: str  # of the scene, for tables and figures
-    format: str  # the reader that made it
+    format: str  # name of the reader
     load: Callable[[int], Frame]  # picklable; position → frame without time and pose
-    number: Tensor  # (n,) int64, strictly increasing place of each frame in the capture
-    root: Path | None = None  # folder or file that was opened; None = not from disk
+    number: Tensor  # (n,) int64, strictly increasing frame numbers of the capture
+    root: Path | None = None  # opened folder or file; None = not from disk
     times: Tensor | None = None  # (n,) s, float64
     poses: Pose | None = None  # (n) T_world_from_cam, float64
-    pose_axes: str = "cv"  # axes in which the capture writes its trajectory, cv or gl; ``poses`` are cv in any case
+    pose_axes: str = "cv"  # camera axes of the capture's trajectory, cv or gl; ``poses`` are always cv
     rate_hz: float | None = None  # nominal frame rate
     sparse: bool = False  # depth is a projected LiDAR sweep: mostly empty between returns
     episode: int | None = None  # its number in the data set, where episodes have one
-    report: tuple[str, ...] = ()  # what was left out, and why
-    camera_name: str | None = None  # as the data set calls it, where several cameras see an episode
-    bounds: Path | None = None  # no link below it may lead out of it; None = links are followed
+    report: tuple[str, ...] = ()  # what was left out or guessed, and why
+    camera_name: str | None = None  # the data set's name of the camera, where an episode has several
+    bounds: Path | None = None  # symbolic links must not point outside it; None = no restriction
 
     def __post_init__(self) -> None:
         n = self.number.shape[0]
@@ -92,17 +92,17 @@ class Recording(Sequence[Frame]):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TruthRecording(Recording):
-    """A recording that also knows what is really there: its own sensor is not its judge."""
+    """A recording with ground truth that is independent of its own depth sensor."""
 
     surfaces: ClassVar[dict[int, str]] = {0: "ordinary"}  # values of ``truth(i)["surface"]``
-    odd_surfaces: ClassVar[tuple[str, ...]] = ()  # where triangulation rightly finds something else than the surface
+    odd_surfaces: ClassVar[tuple[str, ...]] = ()  # where triangulation correctly differs from the surface's depth
 
     def truth(self, index: int) -> dict[str, Tensor]:
-        """What is really there at the centre of every image pixel of frame ``index``, as far as it is known.
+        """True depth and surface kind at the centre of every image pixel of frame ``index``, where available.
 
         Returns:
-            ``depth`` (1, H, W) m float32, 0 where it is not known; ``surface`` (1, H, W) uint8, a key of ``surfaces``;
-            where an instrument measured it ``disagreement`` (1,), its median relative difference from the frame's
+            ``depth`` (1, H, W) m float32, 0 where unknown; ``surface`` (1, H, W) uint8, a key of ``surfaces``; where an
+            instrument measured the truth also ``disagreement`` (1,), its median relative difference from the frame's
             own sensor.
         """
         raise NotImplementedError
@@ -110,16 +110,16 @@ class TruthRecording(Recording):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeasuredRecording(TruthRecording):
-    """A recording with depth measured by another, better instrument."""
+    """A recording with true depth measured by a second, more accurate instrument."""
 
     load_truth: Callable[[int], tuple[Tensor, float]] = field(kw_only=True)  # position → depth (H, W), disagreement
 
     def truth(self, index: int) -> dict[str, Tensor]:
-        """As :meth:`TruthRecording.truth`, as far as it was measured.
+        """As :meth:`TruthRecording.truth`, where it was measured.
 
         Returns:
-            ``surface`` is all 0: kinds of surface are not told apart. ``disagreement`` counts where both instruments
-            answer, NaN where they share no pixel. A truth that was rejected for it is 0 everywhere.
+            ``surface`` is all 0: kinds of surface are not distinguished. ``disagreement`` is over pixels where both
+            instruments have depth, NaN where they share none. A truth rejected for its disagreement is 0 everywhere.
         """
         with restrict_links(self.bounds):
             depth, disagreement = self.load_truth(self._position(index))
@@ -128,10 +128,10 @@ class MeasuredRecording(TruthRecording):
 
 
 class LazySequence(Sequence[_Item]):
-    """A sequence whose items are made when they are asked for; a subclass says how many, and makes each."""
+    """A sequence whose items are created on access; subclasses define ``__len__`` and :meth:`made`."""
 
     def made(self, place: int) -> _Item:
-        """The item at ``place``, from 0 on."""
+        """Create the item at ``place``, counted from 0."""
         raise NotImplementedError
 
     @overload
@@ -147,11 +147,11 @@ class LazySequence(Sequence[_Item]):
 
 @dataclass(frozen=True, eq=False)
 class Recordings(LazySequence[Recording]):
-    """Many recordings of one data set, each opened when it is asked for.
+    """Many recordings of one data set, each opened on access.
 
-    A set of robot episodes holds tens of thousands, with tables of their own, and a folder of archives hundreds of
-    gigabytes: opening all takes minutes, listing them does not. Nothing is kept, so asking twice opens twice. What is
-    wrong with one shows when that one is opened.
+    A set of robot episodes has tens of thousands of recordings, each with tables of its own, and a folder of archives
+    hundreds of gigabytes: opening all takes minutes, listing them does not. Nothing is cached: each access opens the
+    recording again. Errors of a recording are raised when it is opened.
     """
 
     names: Sequence[str]  # of the recordings
@@ -161,7 +161,7 @@ class Recordings(LazySequence[Recording]):
         return len(self.names)
 
     def made(self, place: int) -> Recording:
-        """As ``make`` opens it."""
+        """Open the recording at ``place``."""
         return self.make(place)
 
     def __repr__(self) -> str:

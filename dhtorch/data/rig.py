@@ -1,7 +1,7 @@
-"""Several cameras that see one scene at the same instants, as one recording: pairs may then lie in space and in time.
+"""Rigs: several cameras with common instants joined into one recording, for pairs in space and in time.
 
-Frames stand instant by instant, and in each by camera, every one with its own intrinsics. Which position is whose say
-``camera`` and ``instant``.
+Frames are ordered by instant, then by camera, each with its own intrinsics; ``camera`` and ``instant`` map a position
+to its camera and instant.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from dhtorch.runtime.console import format_count
 class Rig(Recording):
     """The frames of several cameras."""
 
-    cameras: tuple[str, ...] = field(kw_only=True)  # their names
-    camera: Tensor = field(kw_only=True)  # (n,) int64, which of them took a frame
-    instant: Tensor = field(kw_only=True)  # (n,) int64, place of its instant among those of the rig
+    cameras: tuple[str, ...] = field(kw_only=True)  # names of the cameras
+    camera: Tensor = field(kw_only=True)  # (n,) int64, index in ``cameras`` of each frame
+    instant: Tensor = field(kw_only=True)  # (n,) int64, index of each frame's instant
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TruthRig(Rig, TruthRecording):
-    """A rig all of whose cameras know what is really there."""
+    """A rig whose cameras all have ground truth."""
 
     def truth(self, index: int) -> dict[str, Tensor]:
         """As :meth:`TruthRecording.truth`, of the camera that took the frame."""
         i = self._position(index)
         assert isinstance(self.load, _Load)
-        found = self.load.recordings[int(self.camera[i])]
-        assert isinstance(found, TruthRecording)
-        return found.truth(int(self.load.places[i]))
+        recording = self.load.recordings[int(self.camera[i])]
+        assert isinstance(recording, TruthRecording)
+        return recording.truth(int(self.load.places[i]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,23 +50,23 @@ class _Load:
 
     recordings: tuple[Recording, ...]
     camera: Tensor  # (n,)
-    places: Tensor  # (n,) in the recording of that camera
+    places: Tensor  # (n,) positions in the recording of that camera
 
     def __call__(self, i: int) -> Frame:
         return self.recordings[int(self.camera[i])][int(self.places[i])]
 
 
 def join_cameras(recordings: Sequence[Recording], *, tolerance: float | None = None, name: str | None = None) -> Rig:
-    """The cameras of a rig as one recording of the instants that all of them saw.
+    """Recordings of a rig's cameras → one recording of the instants common to all of them.
 
     Args:
-        recordings: one for each camera. Where all have time stamps frames of one instant are those nearest in time to
-            the first camera's; else those with the same number.
-        tolerance: s, between stamps of one instant. None = half the shortest median step.
-        name: of the rig. None = what the recordings' names have in common.
+        recordings: one for each camera. Where all have time stamps, the frames of an instant are those nearest in time
+            to the first camera's frame; else those with the same number.
+        tolerance: s, largest time difference within an instant. None = half the shortest median step.
+        name: of the rig. None = the common prefix of the recordings' names.
 
     Raises:
-        FormatError: fewer than two cameras, or no instant that all of them saw.
+        FormatError: fewer than two cameras, or no instant common to all.
     """
     where = recordings[0].root or Path(recordings[0].name) if recordings else Path("rig")
     names = [r.name.rpartition("/")[2] for r in recordings]
@@ -74,14 +74,14 @@ def join_cameras(recordings: Sequence[Recording], *, tolerance: float | None = N
         raise FormatError(where, "cameras", ", ".join(names) or "none", "two or more cameras of different names")
     places = _common_instants(recordings, tolerance)
     if not len(places):
-        found = "no instant that all cameras saw"
-        raise FormatError(where, ", ".join(names), found, "frames of the same times or numbers")
+        problem = "no instant common to all cameras"
+        raise FormatError(where, ", ".join(names), problem, "frames of the same times or numbers")
     n, C = places.shape
     camera, flat = torch.arange(C).repeat(n), places.flatten()
     first = recordings[0].number[places[:, 0]]
     truth = all(isinstance(r, TruthRecording) for r in recordings)
-    left = [
-        f"{r.name}: {format_count(len(r) - n, 'frame')} without their instant: left out"
+    dropped = [
+        f"{r.name}: {format_count(len(r) - n, 'frame')} without a common instant: left out"
         for r in recordings
         if len(r) > n
     ]
@@ -97,7 +97,7 @@ def join_cameras(recordings: Sequence[Recording], *, tolerance: float | None = N
         rate_hz=recordings[0].rate_hz,
         sparse=all(r.sparse for r in recordings),
         episode=recordings[0].episode,
-        report=tuple(dict.fromkeys([line for r in recordings for line in r.report] + left)),
+        report=tuple(dict.fromkeys([line for r in recordings for line in r.report] + dropped)),
         cameras=tuple(names),
         camera=camera,
         instant=torch.arange(n).repeat_interleave(C),
@@ -117,27 +117,27 @@ def open_rig(
     follow_links: bool = False,
     **options: object,
 ) -> Scenes:
-    """The cameras at ``root`` as rigs, one for each scene or episode, opened lazily; notes as of ``open_capture``.
+    """Open the cameras at ``root`` as rigs, one for each scene or episode, lazily; notes as in ``open_capture``.
 
     Args:
-        root, format, follow_links, options: as :func:`dhtorch.data.open_all`; an option of the reader chooses cameras.
+        root, format, follow_links, options: as :func:`dhtorch.data.open_all`; the reader's options select cameras.
         tolerance: as :func:`join_cameras`.
         near, gap, levels, room, role: notes of the :class:`Scene`.
 
     Raises:
-        FormatError: as there, or no scene with two cameras.
+        FormatError: as :func:`dhtorch.data.open_all`, or no scene with two cameras.
     """
-    found = open_all(root, format, follow_links=follow_links, **options)
-    names = found.names if isinstance(found, Recordings) else [r.name for r in found]
+    recordings = open_all(root, format, follow_links=follow_links, **options)
+    names = recordings.names if isinstance(recordings, Recordings) else [r.name for r in recordings]
     groups: dict[str, list[int]] = {}
     for i, name in enumerate(names):
         groups.setdefault(name.rpartition("/")[0], []).append(i)
     rigs = {scene: places for scene, places in groups.items() if scene and len(places) > 1}
     if not rigs:
         shown = ", ".join(names[:4])
-        raise FormatError(root, "cameras", f"{len(names)} recordings: {shown}", "two cameras or more of one scene")
-    made = Recordings(list(rigs), _MakeRig(found, tuple(map(tuple, rigs.values())), tolerance))
-    return Scenes(made, partial(Scene, near=near, gap=gap, levels=levels, room=room, role=role))
+        raise FormatError(root, "cameras", f"{len(names)} recordings: {shown}", "two or more cameras of one scene")
+    lazy_rigs = Recordings(list(rigs), _MakeRig(recordings, tuple(map(tuple, rigs.values())), tolerance))
+    return Scenes(lazy_rigs, partial(Scene, near=near, gap=gap, levels=levels, room=room, role=role))
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +157,7 @@ def _common_instants(recordings: Sequence[Recording], tolerance: float | None) -
     times = [r.times for r in recordings]
     first = recordings[0]
     columns = [torch.arange(len(first))]
-    good = torch.ones(len(first), dtype=torch.bool)
+    matched = torch.ones(len(first), dtype=torch.bool)
     stamps = [t for t in times if t is not None]
     if len(stamps) == len(times):
         steps = [float(t.diff().median()) for t in stamps if len(t) > 1]
@@ -165,39 +165,41 @@ def _common_instants(recordings: Sequence[Recording], tolerance: float | None) -
         for other in stamps[1:]:
             at = _nearest_stamp(stamps[0], other)
             columns.append(at)
-            good &= (other[at] - stamps[0]).abs() <= limit
-            good &= _nearest_stamp(other, stamps[0])[at] == columns[0]  # nearest to each other: one instant a frame
+            matched &= (other[at] - stamps[0]).abs() <= limit
+            matched &= (
+                _nearest_stamp(other, stamps[0])[at] == columns[0]
+            )  # mutual nearest neighbours: one instant per frame
     else:
         for r in recordings[1:]:
             at = torch.searchsorted(r.number, first.number).clamp(max=len(r) - 1)
             columns.append(at)
-            good &= r.number[at] == first.number
-    return torch.stack(columns, 1)[good]
+            matched &= r.number[at] == first.number
+    return torch.stack(columns, 1)[matched]
 
 
 def _nearest_stamp(stamps: Tensor, among: Tensor) -> Tensor:
-    """Position (n,) of the stamp nearest to each of ``stamps``, the earlier of two; (m,) ``among`` in any order."""
+    """Position (n,) in ``among`` (m,), in any order, of the nearest to each of ``stamps``; of two the earlier."""
     order = among.argsort(stable=True)
-    known = among[order]
-    right = torch.searchsorted(known, stamps).clamp(max=len(known) - 1)
+    ordered = among[order]
+    right = torch.searchsorted(ordered, stamps).clamp(max=len(ordered) - 1)
     left = (right - 1).clamp_min(0)
-    return order[torch.where((stamps - known[left]).abs() <= (known[right] - stamps).abs(), left, right)]
+    return order[torch.where((stamps - ordered[left]).abs() <= (ordered[right] - stamps).abs(), left, right)]
 
 
 def match_instants(recording: Recording, other: Recording) -> list[int]:
-    """Position in ``other`` of the frame of the instant of each frame of a recording; -1 = there is none."""
-    found = [-1] * len(recording)
+    """For each frame of ``recording`` the position in ``other`` of the frame of its instant; -1 = none."""
+    positions = [-1] * len(recording)
     for i, k in _common_instants([recording, other], None).tolist():
-        found[i] = k
-    return found
+        positions[i] = k
+    return positions
 
 
 def _gather_by_camera(values: Sequence[Tensor | None], camera: Tensor, places: Tensor) -> Tensor | None:
-    """What every frame has, from each camera's own."""
-    known = [v for v in values if v is not None]
-    if len(known) < len(values):
+    """Values of the rig's frames gathered from each camera's (n, …); None where a camera lacks them."""
+    available = [v for v in values if v is not None]
+    if len(available) < len(values):
         return None
-    return torch.stack([known[c][p] for c, p in zip(camera.tolist(), places.tolist(), strict=True)])
+    return torch.stack([available[c][p] for c, p in zip(camera.tolist(), places.tolist(), strict=True)])
 
 
 def _gather_poses(recordings: Sequence[Recording], camera: Tensor, places: Tensor) -> Pose | None:

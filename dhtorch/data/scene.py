@@ -1,8 +1,7 @@
-"""A scene: a recording, and what whoever chose it for a benchmark notes about it.
+"""Scene: a recording with the notes of a benchmark (near cutoff, gap, pyramid levels, room, role).
 
-A recording holds what a capture says of itself. From where on its returns are to be held back, which step gives a
-usable baseline, which room it shows and whether it may enter a mean are decisions; they stand beside it, in the
-settings of the data.
+A recording holds only what the capture itself contains. The depth from which returns are held out, the step with a
+usable baseline, the room and whether the scene enters a mean are decisions of a benchmark, kept in the data settings.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from dhtorch.records import TrackHint
 class Scene:
     """A recording and a benchmark's notes on it.
 
-    Where a recording has two frames alone and no ``gap`` is said, it is the step between them.
+    Where a recording has only two frames and no ``gap`` is set, the gap is the step between them.
     """
 
     recording: Recording
-    near: float | None = None  # m, the cutoff to use for a range split
+    near: float | None = None  # m, cutoff of a range split
     gap: int | None = None  # frame step that gives a usable baseline
-    levels: int | None = None  # pyramid levels that the motion asks for
-    room: str | None = None  # scenes of one place bear one name: what is learnt on one says little about the others
-    role: str | None = None  # "rotation" = almost no baseline, "moving" = what is near moves; never enters a mean
+    levels: int | None = None  # pyramid levels that the motion requires
+    room: str | None = None  # scenes of one place share one name: they are not independent samples
+    role: str | None = None  # "rotation" = almost no baseline, "moving" = near objects move; excluded from means
 
     def __post_init__(self) -> None:
         if not isinstance(self.recording, Recording):
@@ -46,7 +45,7 @@ class Scene:
 
     @property
     def name(self) -> str:
-        """Of the recording, for tables and figures."""
+        """Name of the recording, for tables and figures."""
         return self.recording.name
 
     @property
@@ -56,22 +55,22 @@ class Scene:
 
     @property
     def place(self) -> str:
-        """The room, or the recording's own name where none is noted."""
+        """The room, or the recording's name where no room is noted."""
         return self.room or self.name
 
     @property
     def hint(self) -> TrackHint:
-        """What a tracker is told of the motion."""
+        """Hint on the motion for a tracker."""
         return TrackHint(levels=self.levels)
 
 
-#: What is asked for a scene; a recording is one without notes.
+#: Accepted where a scene is expected: a recording is a scene without notes.
 SceneLike = Scene | Recording
 
 
 @dataclass(frozen=True, eq=False)
 class Scenes(LazySequence[Scene]):
-    """Scenes of one data set with the same notes, each recording opened when its scene is asked for."""
+    """Scenes of one data set with the same notes, each recording opened on access to its scene."""
 
     recordings: Sequence[Recording]
     noted: Callable[[Recording], Scene] = Scene  # picklable; recording → scene
@@ -80,7 +79,7 @@ class Scenes(LazySequence[Scene]):
         return len(self.recordings)
 
     def made(self, place: int) -> Scene:
-        """The recording there, noted."""
+        """The scene at ``place``."""
         return self.noted(self.recordings[place])
 
     def __repr__(self) -> str:
@@ -88,10 +87,10 @@ class Scenes(LazySequence[Scene]):
 
 
 def scenes_of(given: SceneLike | Sequence[SceneLike]) -> Sequence[Scene]:
-    """One scene or several, given as such or as recordings; lazy where the recordings are.
+    """One scene or recording, or a sequence of them → sequence of scenes; lazy where the recordings are.
 
     Raises:
-        ValueError: something that is neither.
+        ValueError: an item that is neither.
     """
     if isinstance(given, Scenes):
         return given
@@ -99,4 +98,4 @@ def scenes_of(given: SceneLike | Sequence[SceneLike]) -> Sequence[Scene]:
         return Scenes(given)
     if isinstance(given, Scene | Recording):
         return [Scene.of(given)]
-    return [Scene.of(each) for each in (given if isinstance(given, list | tuple) else (given,))]
+    return [Scene.of(item) for item in (given if isinstance(given, list | tuple) else (given,))]

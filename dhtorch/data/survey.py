@@ -1,7 +1,7 @@
-"""What a capture holds, in words: facts, warnings, and a few pictures to look at.
+"""Summary of a recording for inspection: facts, warnings, and a contact sheet of a few frames.
 
-Only some frames, spread over the capture, are decoded, so that a large one answers at once. Nothing here refuses: a
-frame that cannot be read, a missing pose or an empty depth map becomes a warning.
+Only a few frames, spread over the recording, are decoded, so that large captures are summarised quickly. Nothing here
+raises for bad content: an unreadable frame, a missing pose or an empty depth map becomes a warning.
 """
 
 from __future__ import annotations
@@ -22,20 +22,33 @@ from dhtorch.runtime.console import format_count
 
 _DEPTH_PERCENTILES = (1, 5, 25, 50, 75, 95, 99)
 
-_MIN_MOTION_M, _MIN_MOTION_RAD = 1e-3, 1e-3  # poses that move less do not move
-_MAX_SPEED_M_S = 5.0  # m/s; nobody carries a phone so fast
+#: Total translation (m) and rotation (rad) below which a trajectory counts as constant.
+_MIN_MOTION_M = 1e-3
+_MIN_MOTION_RAD = 1e-3
+
+#: Speed in m/s above which a step of the trajectory counts as a jump: hand-held cameras do not move so fast.
+_MAX_SPEED_M_S = 5.0
+
+#: Fraction of a depth map's pixels without depth above which a warning is issued.
 _MAX_HOLE_RATIO = 0.5
-_MAX_MEDIAN_DEPTH_M = 200.0  # m; more is millimetres taken for metres
-_MAX_DISAGREEMENT = (
-    0.02  # median relative difference of depth carried from frame to frame; sound captures have 0.3 to 1.3 %
-)
-_AGREEMENT_STEP_FRAMES = 5  # frames from one to the other that is held against it
-_MAX_SAMPLED_VALUES = 200_000  # depth values a frame that enter the percentiles
+
+#: Median depth in m above which the unit is doubted: millimetres read as metres.
+_MAX_MEDIAN_DEPTH_M = 200.0
+
+#: Median relative difference of depth warped from frame to frame above which poses and depth contradict each other;
+#: sound captures have 0.3 to 1.3 %.
+_MAX_DISAGREEMENT = 0.02
+
+#: Frames between the two frames whose depth is compared.
+_AGREEMENT_STEP_FRAMES = 5
+
+#: Depth values per frame that enter the percentiles.
+_MAX_SAMPLED_VALUES = 200_000
 
 
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """One picture of the contact sheet, as it is stored."""
+    """One frame of the contact sheet: its image, depth and confidence as stored."""
 
     title: str
     image: Tensor | None = None  # (C, H, W)
@@ -45,15 +58,15 @@ class Tile:
 
 @dataclass(eq=False)
 class Survey:
-    """What was found in one recording, stack, or folder; filled in as it is read."""
+    """Facts, warnings and contact sheet of one recording, stack or folder; filled in while it is read."""
 
     name: str
     format: str
     facts: list[tuple[str, str]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     tiles: list[Tile] = field(default_factory=list)
-    depths: Tensor = field(default_factory=lambda: torch.zeros(0))  # (M,) m, returns of the frames that were read
-    path: Tensor | None = None  # (n, 3) m, places of the camera
+    depths: Tensor = field(default_factory=lambda: torch.zeros(0))  # (M,) m, returns of the decoded frames
+    path: Tensor | None = None  # (n, 3) m, camera centres
 
     def say(self, what: str, text: str) -> None:
         """Add a fact."""
@@ -70,9 +83,9 @@ def survey_recording(
     *,
     progress: Callable[..., Iterable[int]] = lambda items, _text, _total: items,
 ) -> Survey:
-    """Facts of a recording, from its tables and ``frames`` of its frames.
+    """Survey of a recording, from its tables and ``frames`` decoded frames spread over it.
 
-    ``progress`` wraps the loop that decodes them: (items, text, number of items) → items.
+    ``progress`` wraps the decoding loop: (items, text, number of items) → items.
     """
     out = Survey(recording.name, recording.format)
     n = len(recording)
@@ -102,12 +115,12 @@ def survey_recording(
 
 
 def survey_pictures(name: str, images: dict[str, Tensor], depths: dict[str, Tensor]) -> Survey:
-    """Facts of loose pictures and depth maps that no format claims: no intrinsics, no poses, no order."""
+    """Survey of loose images and depth maps of no recognised format: without intrinsics, poses and order."""
     out = Survey(name, "loose pictures")
-    for what, found in (("pictures", images), ("depth maps", depths)):
-        if found:
-            sizes = sorted({f"{x.shape[-1]}x{x.shape[-2]}" for x in found.values()})
-            out.say(what, f"{len(found)}, {', '.join(sizes)}")
+    for what, maps in (("pictures", images), ("depth maps", depths)):
+        if maps:
+            sizes = sorted({f"{x.shape[-1]}x{x.shape[-2]}" for x in maps.values()})
+            out.say(what, f"{len(maps)}, {', '.join(sizes)}")
     if depths:
         report_depths(list(depths.values()), out)
     out.warn("no intrinsics and no poses: nothing can be measured in it")
@@ -127,13 +140,13 @@ def _report_times(times: Tensor | None, rate_hz: float | None, out: Survey) -> N
             out.warn("no time stamps")
         return
     step = times.diff()
-    middle = float(step.median())
-    measured = f"{1 / middle:.4g} Hz" if middle > 0 else "0 s from frame to frame"
+    median_step = float(step.median())
+    measured = f"{1 / median_step:.4g} Hz" if median_step > 0 else "0 s from frame to frame"
     out.say("rate", f"{measured} measured" + (f", {nominal}" if nominal else ""))
     out.say("duration", f"{float(times[-1] - times[0]):.3f} s")
     if bool((step <= 0).any()):
         out.warn(f"time stamps do not increase at {format_count(int((step <= 0).sum()), 'place')}")
-    gaps = step > 2.5 * middle
+    gaps = step > 2.5 * median_step
     if bool(gaps.any()):
         out.warn(f"{format_count(int(gaps.sum()), 'gap')} in time, the longest {float(step.max()):.3f} s")
 
@@ -147,18 +160,18 @@ def _report_pictures(shots: Sequence[Frame], out: Survey) -> None:
     h, w = shots[0].hw
     out.say("pictures", f"{w}x{h}, {describe_pixels(image.shape[1], image)}")
     warn_of_duplicates([s.image[0] for s in shots], out, "frames")
-    grey = torch.stack([patches.luma(s.image[:, :, ::4, ::4], 1).mean() for s in shots])
-    if float(grey.max()) < 0.02:
+    brightness = torch.stack([patches.luma(s.image[:, :, ::4, ::4], 1).mean() for s in shots])
+    if float(brightness.max()) < 0.02:
         out.warn("all pictures are black")
 
 
 def describe_pixels(channels: int, images: Tensor) -> str:
-    """Colour and depth of pixels, in words."""
+    """Channels and bit depth of pixels as text, such as ``colour, 8 bits``."""
     return f"{'colour' if channels == 3 else 'grey'}, {'8 bits' if images.dtype == torch.uint8 else 'float'}"
 
 
 def warn_of_duplicates(images: Sequence[Tensor], out: Survey, what: str) -> None:
-    """A warning where all of several pictures are the same."""
+    """Add a warning where several images are all equal."""
     if len(images) > 1 and all(x.shape == images[0].shape and torch.equal(x, images[0]) for x in images[1:]):
         out.warn(f"all {what} that were read are the same picture")
 
@@ -169,7 +182,7 @@ def _report_depth_maps(shots: Sequence[Frame], sparse: bool, out: Survey) -> Non
 
 
 def report_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", sparse: bool = False) -> None:
-    """Sizes, holes and percentiles of depth maps (h, w), m."""
+    """Add facts and warnings on depth maps (h, w) in m: sizes, fraction of holes, percentiles, range."""
     sizes = sorted({f"{d.shape[1]}x{d.shape[0]}" for d in depths})
     out.say("depth", ", ".join(sizes) + remark)
     holes = torch.stack([(d == 0).double().mean() for d in depths])
@@ -202,10 +215,10 @@ def _report_confidence(maps: Sequence[Tensor], out: Survey) -> None:
     if not maps:
         return
     counts = torch.stack([torch.bincount(m.flatten().long(), minlength=3)[:3] for m in maps]).sum(0)
-    share = (100 * counts / counts.sum().clamp(min=1)).tolist()
-    named = zip(("low", "medium", "high"), share, strict=True)
-    out.say("confidence", ", ".join(f"{word} {x:.1f} %" for word, x in named))
-    if max(share) > 99.99:
+    percent = (100 * counts / counts.sum().clamp(min=1)).tolist()
+    levels = zip(("low", "medium", "high"), percent, strict=True)
+    out.say("confidence", ", ".join(f"{word} {x:.1f} %" for word, x in levels))
+    if max(percent) > 99.99:
         out.warn("confidence is the same everywhere")
 
 
@@ -228,7 +241,7 @@ def _report_cameras(shots: Sequence[Frame], out: Survey) -> None:
 
 
 def describe_camera(camera: Camera, hw: tuple[int, int]) -> str:
-    """A camera in words."""
+    """Focal lengths, principal point, field of view and distortion of a camera as text."""
     (fx, fy), (cx, cy) = camera.f[0].tolist(), camera.c[0].tolist()
     view = [2 * math.degrees(math.atan(n / 2 / f)) for n, f in ((hw[1], fx), (hw[0], fy))]
     lens = "no distortion" if camera.distortion is None else f"{camera.distortion.shape[-1]} distortion coefficients"
@@ -249,20 +262,20 @@ def _report_poses(recording: Recording, out: Survey) -> None:
         out.say("poses", "none")
         return
     out.path = poses.t
-    off = float((torch.linalg.det(poses.R) - 1).abs().max())
-    out.say("poses", f"{len(recording)}, determinant within {off:.1e} of 1")
+    determinant_error = float((torch.linalg.det(poses.R) - 1).abs().max())
+    out.say("poses", f"{len(recording)}, determinant within {determinant_error:.1e} of 1")
     if len(recording) < 2:
         return
     step = poses.t.diff(dim=0).norm(dim=-1)
-    turn = se3.rotation_angle(se3.relative(poses[1:], poses[:-1]).R)
-    size = float((poses.t.amax(0) - poses.t.amin(0)).norm())
-    length, turned = float(step.sum()), _to_degrees(turn.sum())
-    out.say("path", f"{length:.3f} m long inside a box of {size:.3f} m, {turned:.1f}° of turning")
-    usual = f"{float(step.median()):.4f} m and {_to_degrees(turn.median()):.2f}° from frame to frame"
-    out.say("step", f"{usual}, at most {float(step.max()):.3f} m")
-    if float(step.sum()) < _MIN_MOTION_M and float(turn.sum()) < _MIN_MOTION_RAD:
+    rotation = se3.rotation_angle(se3.relative(poses[1:], poses[:-1]).R)
+    extent = float((poses.t.amax(0) - poses.t.amin(0)).norm())
+    length, total_deg = float(step.sum()), _to_degrees(rotation.sum())
+    out.say("path", f"{length:.3f} m long inside a box of {extent:.3f} m, {total_deg:.1f}° of turning")
+    median = f"{float(step.median()):.4f} m and {_to_degrees(rotation.median()):.2f}° from frame to frame"
+    out.say("step", f"{median}, at most {float(step.max()):.3f} m")
+    if float(step.sum()) < _MIN_MOTION_M and float(rotation.sum()) < _MIN_MOTION_RAD:
         out.warn("poses are constant")
-    elif size < _MIN_MOTION_M:
+    elif extent < _MIN_MOTION_M:
         out.warn("the camera turns but does not move: there is no baseline")
     if recording.times is not None:
         speed = step / recording.times.diff().clamp(min=1e-9)
@@ -277,33 +290,34 @@ def _to_degrees(angle: Tensor) -> float:
 
 
 def _report_agreement(recording: Recording, shots: dict[int, Frame], out: Survey) -> None:
-    """Depth carried by the poses into a later frame against the depth there, and against poses that do not move."""
+    """Compare depth warped by the poses into a later frame with the depth there, and with that of identity poses."""
     if recording.poses is None or recording.sparse or len(recording) < 2:
         return
     step = min(_AGREEMENT_STEP_FRAMES, len(recording) - 1)  # at least 1
-    found: list[tuple[float, float]] = []
+    errors: list[tuple[float, float]] = []
     for i in list(shots)[:: max(1, len(shots) // 3)]:
         j = i + step if i + step < len(recording) else max(i - step, 0)
         try:
             later = shots.get(j) or recording[j]
         except FormatError:
             continue
-        moved = _relative_disagreement(
+        with_poses = _relative_disagreement(
             shots[i], later, se3.relative(recording.poses[i : i + 1], recording.poses[j : j + 1])
         )
-        still = _relative_disagreement(shots[i], later, se3.identity(1, recording.poses.t))
-        found += [(moved, still)] if moved is not None and still is not None else []
-    if found:
-        moved, still = (sorted(errors)[len(found) // 2] for errors in zip(*found, strict=True))
+        without_poses = _relative_disagreement(shots[i], later, se3.identity(1, recording.poses.t))
+        errors += [(with_poses, without_poses)] if with_poses is not None and without_poses is not None else []
+    if errors:
+        with_poses, without_poses = (sorted(column)[len(errors) // 2] for column in zip(*errors, strict=True))
         out.say(
-            "depth and poses", f"agree to {100 * moved:.2f} % from frame to frame ({100 * still:.2f} % without poses)"
+            "depth and poses",
+            f"agree to {100 * with_poses:.2f} % from frame to frame ({100 * without_poses:.2f} % without poses)",
         )
-        if moved > max(_MAX_DISAGREEMENT, still):
+        if with_poses > max(_MAX_DISAGREEMENT, without_poses):
             out.warn("depth and poses contradict each other: axes, units or scale may be wrong")
 
 
 def _relative_disagreement(a: Frame, b: Frame, T_b_from_a: Pose) -> float | None:
-    """Median of |z − z'| / z' of the returns of ``a`` carried into ``b``; None where too few meet."""
+    """Median of |z − z'| / z' of the returns of ``a`` warped into ``b``; None for fewer than 50 common pixels."""
     v, u = (x[::7] for x in torch.nonzero(a.depth[0] > 0, as_tuple=True))
     uv = torch.stack((u, v), -1)[None].to(a.camera.f.dtype)
     xyz = se3.apply(T_b_from_a, cameras.unproject(_get_depth_camera(a), uv, a.depth[0, v, u][None]).double())
@@ -315,6 +329,7 @@ def _relative_disagreement(a: Frame, b: Frame, T_b_from_a: Pose) -> float | None
 
 
 def _get_depth_camera(frame: Frame) -> Camera:
+    """The camera of a frame's depth map: its own, else the image's at the map's size."""
     hw = (frame.depth.shape[-2], frame.depth.shape[-1])
     if frame.depth_camera is not None:
         return frame.depth_camera

@@ -1,6 +1,6 @@
-"""The laboratory: one question per file; each ``run(...)`` returns rows, a summary and a verdict.
+"""Experiments, one question per file; each ``run(...)`` returns rows, a summary and a verdict.
 
-``protocol`` is the loop behind all of them, ``paper`` asks what the paper asks, ``compare`` holds methods against each
-other, ``negative`` and ``focal`` keep what did not survive its test, ``probes`` asks what features are good for;
-``baselines`` fill seats with other libraries and networks, ``report`` shows results.
+``protocol`` is the evaluation loop of all of them. ``paper`` has the experiments of the paper, ``compare`` comparisons
+of methods, ``negative`` and ``focal`` ideas that were refuted, ``probes`` evaluations of features; ``baselines`` has
+stages by other libraries and networks, ``report`` figures and tables of results.
 """

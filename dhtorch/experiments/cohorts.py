@@ -1,4 +1,4 @@
-"""What answers are held against beyond the range split, and where poses come from beyond seat 5."""
+"""Cohorts beyond the range split (hold-out, real holes), and relative poses from the device's trajectory."""
 
 from __future__ import annotations
 
@@ -18,75 +18,75 @@ from dhtorch.records import Frame, Pose, PoseFit, Samples
 
 
 def hide_nothing(frame: Frame, _cutoff: float | None) -> Frame:
-    """Hides nothing: the sensor may say all it knows."""
+    """Frame with all its returns: hides nothing."""
     return frame
 
 
 class PoseHalfClassifier:
-    """Seat 3 of the hold-out: classifies, then takes the returns of set B away, so that only set A fixes the pose."""
+    """Classify stage of the hold-out: removes the returns of set B after it, so that only set A determines the pose."""
 
     def __init__(self, classify: Any, seed: int, min_trackability: float) -> None:
         self.classify, self.seed, self.min_trackability = classify, seed, min_trackability
 
     def __call__(self, frame: Frame, samples: Samples) -> Samples:
-        """Samples with the returns of set A alone."""
-        whole: Samples = self.classify(frame, samples)
-        _, second = holdout.split_half(whole, self.seed, min_trackability=self.min_trackability)
-        return holdout.hide_returns(whole, second)
+        """Classified samples with the returns of set A alone."""
+        all_returns: Samples = self.classify(frame, samples)
+        _, set_b = holdout.split_half(all_returns, self.seed, min_trackability=self.min_trackability)
+        return holdout.hide_returns(all_returns, set_b)
 
 
 class HeldOut:
-    """The cohorts of the hold-out: set B, and, naively, those inliers of set A that RANSAC itself chose."""
+    """Cohorts of the hold-out: set B, and for the naive protocol the pose's own inliers of set A."""
 
     def __init__(self, method: Method, seed: int) -> None:
         self.method, self.seed = method, seed
 
     def variant(self, **more: Any) -> Variant:
-        """The method with set B hidden from it; views chosen by the returns of both sets would know B."""
+        """Variant with set B hidden from the method; without view selection, which would use the returns of set B."""
         half = PoseHalfClassifier(self.method.classify, self.seed, self.method.min_trackability)
         return Variant(self.method.replace(classify=half), two_frames=True, **more)
 
     def whole(self, batch: Batch, uv: Tensor) -> Samples:
-        """The samples with every return."""
+        """Samples at pixels ``uv`` (B, N, 2) with every return."""
         return self.method.sample_depth_at(batch.reference, uv)
 
     def heldout(self, batch: Batch, trace: Trace) -> holdout.Truth:
-        """Set B: trackable samples whose return never took part in the pose."""
-        whole, truth = self._truth(batch, trace)
-        _, second = holdout.split_half(whole, self.seed, min_trackability=self.method.min_trackability)
-        return _restrict_candidates(truth, second)
+        """Truth of set B: trackable samples whose return took no part in the pose."""
+        samples, truth = self._truth(batch, trace)
+        _, set_b = holdout.split_half(samples, self.seed, min_trackability=self.method.min_trackability)
+        return _restrict_candidates(truth, set_b)
 
     def cyclic(self, batch: Batch, trace: Trace) -> holdout.Truth:
-        """The inliers of the pose: what RANSAC optimised."""
+        """Truth of the pose's inliers, which RANSAC optimised."""
         _, truth = self._truth(batch, trace)
         return _restrict_candidates(truth, trace["fit"].inlier)
 
     def _truth(self, batch: Batch, trace: Trace) -> tuple[Samples, holdout.Truth]:
-        whole = self.whole(batch, trace["samples"].uv)
-        found = holdout.sample_truth(batch.reference, whole.uv)
-        return whole, holdout.select_candidates(whole, found, 0.0)
+        samples = self.whole(batch, trace["samples"].uv)
+        truth_at_samples = holdout.sample_truth(batch.reference, samples.uv)
+        return samples, holdout.select_candidates(samples, truth_at_samples, 0.0)
 
 
 def real_holes(batch: Batch, trace: Trace) -> holdout.Truth:
-    """The sensor's own drop-outs, held against independent truth; nothing where there is none."""
+    """Truth of the sensor's own drop-outs, from independent truth; no candidates where there is none."""
     samples: Samples = trace["samples"]
-    found = holdout.sample_truth(batch.exact, samples.uv)
+    truth = holdout.sample_truth(batch.exact, samples.uv)
     if missing_truth_reason(batch.scene) is not None:
-        return found.replace(code=torch.full_like(found.code, holdout.TruthCode.NO_RETURN))
+        return truth.replace(code=torch.full_like(truth.code, holdout.TruthCode.NO_RETURN))
     kinds = batch.kinds(samples.uv)
     if kinds is not None:
         odd = torch.isin(kinds, torch.tensor([*batch.odd], dtype=kinds.dtype).to(kinds.device))
-        found = found.replace(code=torch.where(odd, holdout.TruthCode.EXCLUDED, found.code))
-    return holdout.select_real_holes(batch.reference, samples, found)
+        truth = truth.replace(code=torch.where(odd, holdout.TruthCode.EXCLUDED, truth.code))
+    return holdout.select_real_holes(batch.reference, samples, truth)
 
 
 def trajectory_pose(batch: Batch, *, raw: bool = False) -> Pose | None:
-    """Relative pose of each pair from the device's trajectory; None where the capture has none.
+    """Relative pose of each pair of a batch from the device's trajectory; None if the recording has none.
 
     Args:
         batch: pairs of one scene.
-        raw: as the device writes it. A trajectory in OpenGL axes is then used as if its axes were OpenCV's, the
-            mistake that the conversion mends; one in OpenCV axes is the same either way.
+        raw: without conversion of axes: a trajectory in OpenGL axes is used as if its axes were OpenCV's. One in
+            OpenCV axes is the same either way.
     """
     first, second = batch.reference.T_world_from_cam, batch.others[-1].T_world_from_cam
     if first is None or second is None:
@@ -99,7 +99,7 @@ def trajectory_pose(batch: Batch, *, raw: bool = False) -> Pose | None:
 
 
 def trajectory_pose_fit(batch: Batch, n: int, *, raw: bool = False) -> PoseFit:
-    """The device's trajectory in the shape of seat 5's answer; not ok where there is none."""
+    """Relative pose from the device's trajectory as a pose fit over ``n`` samples; not ok where there is none."""
     T, like = trajectory_pose(batch, raw=raw), batch.reference.camera.f
     if T is None:
         eye = se3.identity(like.shape[0], like)
@@ -108,16 +108,16 @@ def trajectory_pose_fit(batch: Batch, n: int, *, raw: bool = False) -> PoseFit:
 
 
 def missing_trajectory_reason(scene: Scene) -> str | None:
-    """Why the device's trajectory cannot be used; None where it can."""
+    """Reason why the device's trajectory cannot be used; None if it can."""
     return "no device trajectory" if scene.recording.poses is None else None
 
 
 def missing_truth_reason(scene: Scene) -> str | None:
-    """Why nothing but the sensor can be asked; None where an independent instrument was there."""
+    """Reason for missing independent truth; None if the recording has it."""
     return None if isinstance(scene.recording, TruthRecording) else "no independent truth"
 
 
 def _restrict_candidates(truth: holdout.Truth, mask: Tensor) -> holdout.Truth:
-    """The candidates among the masked samples; the others were not held back."""
+    """Truth whose candidates are restricted to ``mask``; the others get the code NEAR."""
     near = torch.full_like(truth.code, holdout.TruthCode.NEAR)
     return truth.replace(code=torch.where(mask, truth.code, near))

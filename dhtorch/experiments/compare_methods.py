@@ -1,8 +1,8 @@
-"""One method against a reference, scene by scene: ratios over seeds, and promises kept in rooms not learnt from.
+"""Ratios of error and coverage of methods to a reference method, and calibration in rooms that were held out.
 
-A ratio asks first for the median over seeds, of either method, then divides, then takes the geometric mean over
-scenes: a scene where the error halves and one where it doubles cancel. Promises (calibrated score, sigma, thresholds)
-are learnt on the other rooms, with the seeds of a scene pooled and every scene of the same weight.
+A ratio divides the medians over seeds of the two methods, then takes the geometric mean over scenes: a scene where the
+error halves and one where it doubles cancel. Calibrated score, sigma and thresholds are fitted on all rooms but one and
+evaluated on that one, with the seeds of a scene pooled and every scene of the same weight.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from dhtorch.metrics import bootstrap, control, errors, reliability, risk
 from dhtorch.metrics.bootstrap import Interval
 from dhtorch.metrics.errors import Points
 
-#: A scene on which either method answers fewer points says nothing about their ratio.
+#: Fewest answers of either method for a scene to have a ratio.
 MIN_COMPARED_ANSWERS = 20
 
-#: A scene with fewer answers above a threshold (mean over seeds) says nothing about keeping its target.
+#: Fewest answers above a threshold (mean over seeds) for a scene to count in ``within_target_<per cent>``.
 MIN_ANSWERS_ABOVE_THRESHOLD = 100
 
-#: Targets of the plug-in control, per cent of mean error.
+#: Targets of the risk control, per cent of mean error.
 _TARGET_PERCENT = (10, 5)
 
-#: Errors below this count as this much: a ratio of two roundings is no ratio.
+#: Errors are raised to this relative error before a division: below it they are rounding.
 MIN_COMPARED_ERROR = 1e-6
 
 #: Scene → the candidates of every seed.
@@ -39,12 +39,14 @@ SeedPoints = Mapping[str, Sequence[Points]]
 
 @dataclass
 class MethodComparison:
-    """Summary keys ``<method>.<number>``, one row per method and scene, and the scenes that need naming."""
+    """Summary keys ``<method>.<number>``, one row per method and scene, and the scenes without a number."""
 
     summary: dict[str, dict[str, Any]] = field(default_factory=dict)
     rows: list[dict[str, Any]] = field(default_factory=list)  # {method, scene, number: value}
     left_out: dict[str, list[str]] = field(default_factory=dict)  # method → scenes without a ratio: too few answers
-    silent: dict[str, list[str]] = field(default_factory=dict)  # "<method>.<per cent>" → scenes its threshold silences
+    silent: dict[str, list[str]] = field(
+        default_factory=dict
+    )  # "<method>.<per cent>" → scenes without an answer above its threshold
 
 
 def method_ratios(
@@ -56,14 +58,14 @@ def method_ratios(
     draws: int = 2000,
     seed: int = 0,
 ) -> MethodComparison:
-    """What every other method gains on the reference, and whether it keeps its promises.
+    """Ratios of every other method to the reference, and calibration of every other method.
 
     Args:
         methods: method → scene → candidates of every seed, with the method's own uncalibrated score and sigma. Seed k
             of one method is paired with seed k of the reference.
         reference: the method to compare with.
-        rooms: scene → room, for what is learnt elsewhere; a scene that is not named is a room of its own.
-        fallback: method → the method that stands in for it on scenes where it has no candidates of its own, such as
+        rooms: scene → room, the unit that is held out of calibration; a scene without an entry is its own room.
+        fallback: method → the method that replaces it on scenes where it has no candidates of its own, such as
             ``{"window": "map"}`` where a scene has too few views.
         draws, seed: of the bootstrap over scenes.
 
@@ -71,50 +73,50 @@ def method_ratios(
         Comparison. For every other method, geometric means over scenes: ``median_rel_ratio`` (each method on its own
         answers), ``median_rel_ratio_at_equal_coverage`` (both cut by their own score to the smaller number of answers,
         seed by seed), ``aurc_ratio``. ``worst_scene_ratio``: the largest ratio at equal coverage. ``coverage_at_5``:
-        mean over scenes (on many it is zero, so that their median jumps). In rooms not learnt from, means over
-        scenes: ``within_sigma`` and ``within_2sigma`` after the correction of sigma; ``realised_risk_<per cent>``,
-        mean capped error at the threshold that nine in ten of the other scenes keep, where a silent scene counts 0
-        (``risk_of_speaking_<per cent>``: without those); ``coverage_within_<per cent>``, what is answered above it;
-        ``within_target_<per cent>``, share of the scenes that meet it among those with a hundred answers above the
-        threshold; ``ece_scenes``, scene by scene what :func:`dhtorch.metrics.reliability.excess_ece` says. And over
-        all answers, every scene of the same weight: ``ece`` of the table, ``ece_sigmoid`` of the simple control,
-        ``ece_raw`` of the score as it came.
+        mean over scenes (on many it is zero, so that their median jumps). In held-out rooms, means over scenes:
+        ``within_sigma`` and ``within_2sigma`` after the correction of sigma; ``realised_risk_<per cent>``, mean capped
+        error at the threshold that nine in ten of the other scenes keep, where a scene without an answer above it
+        counts 0 (``risk_of_speaking_<per cent>``: without those scenes); ``coverage_within_<per cent>``, coverage above
+        the threshold; ``within_target_<per cent>``, fraction of scenes that meet the target among those with a hundred
+        answers above the threshold; ``ece_scenes``, :func:`dhtorch.metrics.reliability.excess_ece` scene by scene. And
+        over all answers, every scene of the same weight: ``ece`` of the calibrated table, ``ece_sigmoid`` of the
+        sigmoid control, ``ece_raw`` of the uncalibrated score.
 
     Raises:
         ValueError: no reference, or methods that differ in scenes or number of seeds.
     """
     complete = complete_scenes(methods, reference, fallback or {})
-    found = MethodComparison()
+    comparison = MethodComparison()
     for method, ours in complete.items():
         if method == reference:
             continue
         rows: dict[str, dict[str, Any]] = {scene: {"method": method, "scene": scene} for scene in ours}
-        numbers = _ratios(ours, complete[reference], rows, found.left_out.setdefault(method, []), draws, seed)
+        numbers = _ratios(ours, complete[reference], rows, comparison.left_out.setdefault(method, []), draws, seed)
         numbers |= evaluate_promises(ours, rooms, rows, draws, seed)
         for percent in _TARGET_PERCENT:
             key = f"realised_risk_{percent}"
-            found.silent[f"{method}.{percent}"] = [s for s, row in rows.items() if key in row and row[key] is None]
+            comparison.silent[f"{method}.{percent}"] = [s for s, row in rows.items() if key in row and row[key] is None]
         for name, value in numbers.items():
-            found.summary[f"{method}.{name}"] = value.entry(errors.metric_unit(name))
-        found.rows += rows.values()
-    return found
+            comparison.summary[f"{method}.{name}"] = value.entry(errors.metric_unit(name))
+        comparison.rows += rows.values()
+    return comparison
 
 
 def multiview_ratios(
     ours: SeedPoints, theirs: SeedPoints, name: str, *, draws: int = 2000, seed: int = 0
 ) -> tuple[dict[str, Interval], dict[str, dict[str, float]]]:
-    """What one method of several views gains on another, with what it leaves silent counted as well.
+    """Ratios of one multi-view method to another, with unanswered candidates counted as well.
 
     Args:
         ours, theirs: the same scenes and seeds.
-        name: of the other method, for the names of the numbers.
+        name: of the other method, part of the keys.
         draws, seed: of the bootstrap over scenes.
 
     Returns:
         ``error_ratio_to_<name>``, geometric mean over scenes of the ratio of median errors, both cut by their own score
         to the smaller number of answers; ``worst_scene_ratio_to_<name>``, the largest of them;
-        ``aurc_full_ratio_to_<name>``, geometric mean of the ratio of the areas over all candidates, where silence
-        counts as an error of one. And the same scene by scene, where it is defined.
+        ``aurc_full_ratio_to_<name>``, geometric mean of the ratio of the areas over all candidates, where an
+        unanswered candidate counts as an error of one. And the same scene by scene, where it is defined.
     """
     equal, _ = ratio_over_seeds(*cut_to_equal_coverage(ours, theirs), _median_rel)
     full, _ = ratio_over_seeds(ours, theirs, lambda p: risk.measure_risk(p)["aurc_full"], min_answers=0)
@@ -136,28 +138,28 @@ def ratio_over_seeds(
     *,
     min_answers: int = MIN_COMPARED_ANSWERS,
 ) -> tuple[dict[str, float], list[str]]:
-    """Ratio of the medians over seeds of one number, scene by scene, and the scenes that have none.
+    """(scene → ratio of the medians over seeds of a metric, scenes without a ratio).
 
     Args:
         ours, theirs: the same scenes.
-        measure: number of a scene's candidates, None where undefined.
-        min_answers: a scene where either answers fewer (median over seeds) is left out.
+        measure: candidates of a scene → metric, None where undefined.
+        min_answers: a scene with fewer answers of either method (median over seeds) is left out.
     """
-    found, left_out = {}, []
+    ratios, left_out = {}, []
     for scene in ours:
         kept = [statistics.median(int(p.keep.sum()) for p in side[scene]) for side in (ours, theirs)]
         a, b = (_median_over_seeds(side[scene], measure) for side in (ours, theirs))
         if min(kept) < min_answers or a is None or b is None:
             left_out.append(scene)
         else:
-            found[scene] = max(a, MIN_COMPARED_ERROR) / max(b, MIN_COMPARED_ERROR)
-    return found, left_out
+            ratios[scene] = max(a, MIN_COMPARED_ERROR) / max(b, MIN_COMPARED_ERROR)
+    return ratios, left_out
 
 
 def cut_to_equal_coverage(
     ours: SeedPoints, theirs: SeedPoints
 ) -> tuple[dict[str, list[Points]], dict[str, list[Points]]]:
-    """Both methods, cut by their own score to the smaller number of answers, seed by seed."""
+    """Candidates of both methods, each cut by its own score to the smaller number of answers, seed by seed."""
     cut_ours: dict[str, list[Points]] = {}
     cut_theirs: dict[str, list[Points]] = {}
     for scene in ours:
@@ -182,43 +184,45 @@ def _ratios(
     ranked, _ = ratio_over_seeds(ours, theirs, lambda p: risk.measure_risk(p)["aurc"])
     for scene, row in rows.items():
         row["coverage_at_5"] = _median_over_seeds(ours[scene], lambda p: risk.measure_risk(p)["coverage_at_5"])
-    reached = [row["coverage_at_5"] for row in rows.values()]
+    coverages = [row["coverage_at_5"] for row in rows.values()]
     return {
         "median_rel_ratio": geometric(own, "median_rel_ratio"),
         "median_rel_ratio_at_equal_coverage": geometric(equal, "median_rel_ratio_at_equal_coverage"),
         "worst_scene_ratio": _worst_ratio(equal),
         "aurc_ratio": geometric(ranked, "aurc_ratio"),
-        "coverage_at_5": bootstrap.interval_over_scenes(reached, statistic="mean", draws=draws, seed=seed),
+        "coverage_at_5": bootstrap.interval_over_scenes(coverages, statistic="mean", draws=draws, seed=seed),
     }
 
 
 def evaluate_promises(
     ours: SeedPoints, rooms: Mapping[str, str] | None, rows: dict[str, dict[str, Any]], draws: int, seed: int
 ) -> dict[str, Interval]:
-    """What was promised in every room by what the other rooms taught: the second half of :func:`method_ratios`.
+    """Calibration numbers of a method, fitted on all rooms but one and evaluated there; see :func:`method_ratios`.
 
     Args:
         ours: scene → candidates of every seed.
         rooms: scene → room.
-        rows: scene → its numbers, filled.
+        rows: scene → its numbers; filled in place.
         draws, seed: of the bootstrap over scenes.
     """
     pooled = {scene: pytree.collate(points) for scene, points in ours.items()}
-    table, sigmoid = {}, {}
-    for others, held in reliability.leave_one_room_out(pooled, rooms):
+    calibrated, sigmoid = {}, {}
+    for others, held_out in reliability.leave_one_room_out(pooled, rooms):
         if not any(bool(s.keep.any()) for s in others.values()):
-            continue  # nothing to learn from: these scenes have no such number
-        few = MIN_ANSWERS_ABOVE_THRESHOLD * max(map(len, ours.values()))
-        learnt = fit_calibration(
-            list(others.values()), targets=_TARGET_PERCENT, choose=partial(control.scene_quantile_threshold, few=few)
+            continue  # nothing to fit on: these scenes have no such number
+        min_answers = MIN_ANSWERS_ABOVE_THRESHOLD * max(map(len, ours.values()))
+        calibration = fit_calibration(
+            list(others.values()),
+            targets=_TARGET_PERCENT,
+            choose=partial(control.scene_quantile_threshold, few=min_answers),
         )
-        for scene, points in held.items():
-            table[scene] = learnt.apply(points)
-            sigmoid[scene] = points.replace(score=torch.where(points.keep, learnt.sigmoid(points.score), 0.0))
-            stated = errors.measure_errors(table[scene])
-            rows[scene] |= {k: stated[k] for k in ("within_sigma", "within_2sigma")}
-            rows[scene]["ece"] = reliability.excess_ece(table[scene], seed=seed)
-            for percent, threshold in learnt.thresholds.items():
+        for scene, points in held_out.items():
+            calibrated[scene] = calibration.apply(points)
+            sigmoid[scene] = points.replace(score=torch.where(points.keep, calibration.sigmoid(points.score), 0.0))
+            metrics = errors.measure_errors(calibrated[scene])
+            rows[scene] |= {k: metrics[k] for k in ("within_sigma", "within_2sigma")}
+            rows[scene]["ece"] = reliability.excess_ece(calibrated[scene], seed=seed)
+            for percent, threshold in calibration.thresholds.items():
                 rows[scene][f"realised_risk_{percent}"] = risk.realised_risk(points, threshold)
                 above = 0 if threshold is None else int((points.keep & (points.score >= threshold)).sum())
                 rows[scene][f"n_above_{percent}"] = above / len(ours[scene])
@@ -227,44 +231,48 @@ def evaluate_promises(
     def mean(values: list[float | None]) -> Interval:
         return bootstrap.interval_over_scenes(values, statistic="mean", draws=draws, seed=seed)
 
-    judged = [rows[scene] for scene in table]
-    numbers = {name: mean([row[name] for row in judged]) for name in ("within_sigma", "within_2sigma")}
+    evaluated = [rows[scene] for scene in calibrated]
+    numbers = {name: mean([row[name] for row in evaluated]) for name in ("within_sigma", "within_2sigma")}
     for percent in _TARGET_PERCENT:
-        realised = [row[f"realised_risk_{percent}"] or 0.0 for row in judged]
+        realised = [row[f"realised_risk_{percent}"] or 0.0 for row in evaluated]
         numbers[f"realised_risk_{percent}"] = mean(realised)
-        enough = [
+        well_answered = [
             r
-            for r, row in zip(realised, judged, strict=True)
+            for r, row in zip(realised, evaluated, strict=True)
             if row[f"n_above_{percent}"] >= MIN_ANSWERS_ABOVE_THRESHOLD
         ]
-        spoke = [row[f"realised_risk_{percent}"] for row in judged if row[f"realised_risk_{percent}"] is not None]
-        numbers[f"risk_of_speaking_{percent}"] = mean(spoke)
-        numbers[f"coverage_within_{percent}"] = mean([row[f"coverage_within_{percent}"] for row in judged])
-        numbers[f"within_target_{percent}"] = mean([float(r <= percent / 100) for r in enough])
-    numbers["ece_scenes"] = mean([row["ece"] for row in judged])
-    for name, scenes in (("ece", table), ("ece_sigmoid", sigmoid), ("ece_raw", pooled)):
-        numbers[name] = reliability.ece_interval([scenes[s] for s in table], draws=draws, seed=seed)
+        answered_risks = [
+            row[f"realised_risk_{percent}"] for row in evaluated if row[f"realised_risk_{percent}"] is not None
+        ]
+        numbers[f"risk_of_speaking_{percent}"] = mean(answered_risks)
+        numbers[f"coverage_within_{percent}"] = mean([row[f"coverage_within_{percent}"] for row in evaluated])
+        numbers[f"within_target_{percent}"] = mean([float(r <= percent / 100) for r in well_answered])
+    numbers["ece_scenes"] = mean([row["ece"] for row in evaluated])
+    for name, scenes in (("ece", calibrated), ("ece_sigmoid", sigmoid), ("ece_raw", pooled)):
+        numbers[name] = reliability.ece_interval([scenes[s] for s in calibrated], draws=draws, seed=seed)
     return numbers
 
 
 def complete_scenes(
     methods: Mapping[str, SeedPoints], reference: str, fallback: Mapping[str, str]
 ) -> dict[str, dict[str, Sequence[Points]]]:
-    """Every method on the reference's scenes, in its order; arguments and errors as :func:`method_ratios`."""
+    """Candidates of every method on the scenes of the reference, in its order; Args, Raises: :func:`method_ratios`."""
     if reference not in methods:
         raise ValueError(
             f"compare.reference: found {', '.join(methods) or 'no method'}, expected {reference} among them"
         )
     complete: dict[str, dict[str, Sequence[Points]]] = {}
-    for method, given in methods.items():
-        scenes = {**methods.get(fallback.get(method, method), {}), **given}
+    for method, own_scenes in methods.items():
+        scenes = {**methods.get(fallback.get(method, method), {}), **own_scenes}
         for scene, seeds in methods[reference].items():
             if scene not in scenes or len(scenes[scene]) != len(seeds):
-                found = f"{len(scenes[scene])} seeds" if scene in scenes else "nothing"
-                raise ValueError(f"compare.{method}.{scene}: found {found}, expected {len(seeds)} seeds as {reference}")
-        unknown = sorted(scenes.keys() - methods[reference].keys())
-        if unknown:
-            raise ValueError(f"compare.{method}.{unknown[0]}: found a scene that {reference} does not have")
+                message = f"{len(scenes[scene])} seeds" if scene in scenes else "nothing"
+                raise ValueError(
+                    f"compare.{method}.{scene}: found {message}, expected {len(seeds)} seeds as {reference}"
+                )
+        extra = sorted(scenes.keys() - methods[reference].keys())
+        if extra:
+            raise ValueError(f"compare.{method}.{extra[0]}: found a scene that {reference} does not have")
         complete[method] = {scene: scenes[scene] for scene in methods[reference]}
     return complete
 
@@ -275,7 +283,7 @@ def _geometric_mean(ratios: Mapping[str, float], draws: int, seed: int) -> Inter
 
 
 def _worst_ratio(ratios: Mapping[str, float]) -> Interval:
-    """The largest over scenes."""
+    """Largest ratio over scenes, without an interval."""
     return Interval(max(ratios.values(), default=None), None, None, len(ratios))
 
 

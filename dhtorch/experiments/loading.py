@@ -16,15 +16,15 @@ from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.records import Frame
 from dhtorch.runtime.parent_watch import exit_with_parent
 
-CandidateViews = Callable[[Recording, int], Sequence[int]]  # (recording, reference view) → positions of other views
+CandidateViews = Callable[[Recording, int], Sequence[int]]  # (recording, reference view) → positions of source views
 
-#: reference view, further views, reference view with its truth as depth, kinds of surface, disagreement of truth and
-#: sensor, views around it
+#: (reference view, source views, reference view with its true depth, kinds of surface, disagreement of truth and
+#: sensor, candidate views around it)
 LoadedPair = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor, tuple[Frame, ...]]
 
 
 class PairDataset(Dataset[LoadedPair]):
-    """Pairs of one recording for a data loader."""
+    """Data set of the pairs of one recording."""
 
     def __init__(
         self,
@@ -41,21 +41,21 @@ class PairDataset(Dataset[LoadedPair]):
 
     def __getitem__(self, index: int) -> LoadedPair:
         i, other = pair = Pair(*self.pairs[index])
-        own = spaced_frames(i, other, self.views) if isinstance(other, int) else []
-        around = candidate_views(pair, self.recording, self.offers)
-        frames = {k: self.recording[k].to(self.dtype) for k in sorted({i, *own, *around})}
+        pair_views = spaced_frames(i, other, self.views) if isinstance(other, int) else []
+        candidates = candidate_views(pair, self.recording, self.offers)
+        frames = {k: self.recording[k].to(self.dtype) for k in sorted({i, *pair_views, *candidates})}
         reference = frames[i]
-        others, choice = (tuple(frames[k] for k in some) for some in (own, around))
+        others, candidate_frames = (tuple(frames[k] for k in positions) for positions in (pair_views, candidates))
         if not isinstance(self.recording, TruthRecording):
-            return reference, others, reference, torch.zeros(1, 1, 1), torch.full((1,), torch.nan), choice
+            return reference, others, reference, torch.zeros(1, 1, 1), torch.full((1,), torch.nan), candidate_frames
         exact = self.recording.truth(i)
-        known = reference.replace(depth=exact["depth"].to(self.dtype), depth_camera=None)
+        true_reference = reference.replace(depth=exact["depth"].to(self.dtype), depth_camera=None)
         disagreement = exact.get("disagreement", torch.full((1,), torch.nan))
-        return reference, others, known, exact["surface"].float(), disagreement, choice
+        return reference, others, true_reference, exact["surface"].float(), disagreement, candidate_frames
 
 
 def load_pairs(data: PairDataset, *, batch: int, workers: int) -> DataLoader[LoadedPair]:
-    """The pairs in batches of so many, read by so many processes besides."""
+    """Data loader of the pairs, in batches of ``batch``, read by ``workers`` processes."""
     workers = workers if len(data) else 0
     return DataLoader(
         data,
@@ -63,29 +63,36 @@ def load_pairs(data: PairDataset, *, batch: int, workers: int) -> DataLoader[Loa
         num_workers=workers,
         collate_fn=_collate,
         worker_init_fn=_init_worker,
-        # A fork would copy the locks of whatever threads torch and OpenCV run here, and may never return.
+        # A fork would copy locks held by threads of torch and OpenCV in this process, and may deadlock.
         multiprocessing_context="spawn" if workers else None,
     )
 
 
 def candidate_views(pair: Pair, recording: Recording, offers: CandidateViews | None) -> Sequence[int]:
-    """The frames among which a variant chooses; none where it takes the pair's own."""
-    return pair.offered or (() if offers is None else offers(recording, pair.reference))
+    """Positions of the candidate views of a pair; empty if it has a source view of its own."""
+    return pair.candidates or (() if offers is None else offers(recording, pair.reference))
 
 
 def _collate(items: list[LoadedPair]) -> LoadedPair:
     reference, others, exact, surface, disagreement, around = zip(*items, strict=True)
-    views, choice = (tuple(pytree.collate(v) for v in zip(*many, strict=True)) for many in (others, around))
-    return pytree.collate(reference), views, pytree.collate(exact), torch.cat(surface), torch.cat(disagreement), choice
+    views, candidates = (tuple(pytree.collate(v) for v in zip(*columns, strict=True)) for columns in (others, around))
+    return (
+        pytree.collate(reference),
+        views,
+        pytree.collate(exact),
+        torch.cat(surface),
+        torch.cat(disagreement),
+        candidates,
+    )
 
 
 def move_to_device(item: Any, device: str) -> Any:
-    """Tensors and records of nested tuples on a device."""
+    """Nested tuples of tensors and records → the same on a device."""
     return tuple(move_to_device(i, device) for i in item) if isinstance(item, tuple) else item.to(device)
 
 
 def _init_worker(_number: int) -> None:
-    """One thread in a worker of a loader, which ends with this process."""
+    """Initialise a loader's worker: one thread, and exit together with the parent process."""
     exit_with_parent()
     torch.set_num_threads(1)
     set_opencv_threads(1)

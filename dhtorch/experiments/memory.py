@@ -1,4 +1,4 @@
-"""What a call costs in memory: its learned weights, and the peak of a process that does nothing else."""
+"""Memory of a call: its learned weights, and the peak of a process that runs nothing else."""
 
 from __future__ import annotations
 
@@ -32,23 +32,23 @@ def count_weights(*parts: Any) -> dict[str, int]:
 
 
 def peak_mib(call: Callable[[], Any], before: Callable[[], Any] | None = None) -> float | None:
-    """Highest resident memory (MiB) while ``call`` runs once, above what the process held before it.
+    """Highest resident memory (MiB) while ``call`` runs once, above that of the process before it.
 
     Measured in a fresh process that has imported dhtorch and holds the inputs.
 
     Args:
-        call: a picklable partial; its arguments are inputs and are copied before anything is measured.
-        before: called first, uncounted: what is loaded at first use.
+        call: a picklable partial; its arguments are inputs and are copied before the measurement.
+        before: called first and not counted, for what is loaded at first use.
 
     Returns:
-        MiB; None where the system does not tell.
+        MiB; None where the system does not report it.
     """
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as process:
         return process.submit(_child_peak, call, before, torch.get_num_threads()).result()
 
 
 def _child_peak(call: Callable[[], Any], before: Callable[[], Any] | None, threads: int) -> float | None:
-    """The child's part."""
+    """Peak memory (MiB) of ``call``, measured in the child process."""
     torch.set_num_threads(threads)
     set_opencv_threads(threads)
     if before is not None:
@@ -65,7 +65,7 @@ def _child_peak(call: Callable[[], Any], before: Callable[[], Any] | None, threa
 
 
 def _call_on_copies(call: Any) -> Any:
-    """The same call on private copies: what came through shared memory would count on first touch."""
+    """Call on private copies of its inputs: shared memory would count on first access."""
     if isinstance(call, partial):
         copies = [a.map(torch.clone) if isinstance(a, Record) else _call_on_copies(a) for a in call.args]
         return partial(call.func, *copies, **call.keywords)
@@ -73,24 +73,27 @@ def _call_on_copies(call: Any) -> Any:
 
 
 def _resident_bytes() -> int | None:
-    """Bytes resident now."""
+    """Resident bytes now."""
     return _read_proc_status("VmRSS") or _rusage()
 
 
 def _peak_bytes() -> int | None:
-    """Bytes resident at most so far. The kernel's own high-water mark of this address space comes first:
-    ``ru_maxrss`` of a new process starts at the size of the one that made it."""
+    """Peak of the resident bytes so far.
+
+    The kernel's high-water mark of this address space comes first: ``ru_maxrss`` of a new process starts at the size of
+    its parent.
+    """
     return _read_proc_status("VmHWM") or _rusage()
 
 
 def _trim_heap() -> None:
-    """Hand free memory back to the system, where the C library can: what is kept would be used again, uncounted."""
+    """Return free memory to the system where the C library can, as memory that it reuses is not counted."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)
 
 
 def _reset_peak() -> None:
-    """Set the high-water mark back to what is resident now, where the kernel allows it."""
+    """Reset the high-water mark to the resident bytes, where the kernel allows it."""
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
 
@@ -100,8 +103,8 @@ def _read_proc_status(name: str) -> int | None:
         lines = Path("/proc/self/status").read_text().splitlines()
     except OSError:
         return None
-    found = [int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:")]
-    return found[0] if found else None
+    sizes = [int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:")]
+    return sizes[0] if sizes else None
 
 
 def _rusage() -> int | None:

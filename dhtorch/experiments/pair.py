@@ -1,6 +1,6 @@
-"""The main job: methods on every pair of every scene, held against the returns that were kept back.
+"""Main job: methods on every pair of every scene, evaluated on the returns that were held back.
 
-It asks no question (its question, expectation and verdict are null); the experiments beside it do.
+It has no question (question, expectation and verdict are null), unlike the other experiments.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a pair found, as its pictures and its point cloud."""
+"""Figures and point cloud of one pair."""
 
 from __future__ import annotations
 
@@ -26,36 +26,36 @@ from dhtorch.viz.plots.colours import colour_by_source
 
 
 def draw_example(folder: str | Path, example: Any) -> list[Path]:
-    """Figures and the point cloud of one pair; returns the files written.
+    """Write the figures and the point cloud of one pair → files written.
 
     Args:
-        folder: made if need be.
-        example: a :class:`dhtorch.experiments.protocol.Example`.
+        folder: folder of the files, made if missing.
+        example: a :class:`dhtorch.experiments.outcome.Example`.
     """
     e = example.cpu()
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    place = append_cutoff(f"{e.scene} {e.pair}", e.cutoff)
+    title = append_cutoff(f"{e.scene} {e.pair}", e.cutoff)
     whole, image, uv = merge(e.samples, e.estimate), e.frame.image[0], e.samples.uv[0]
-    draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0], title=place)
-    draw_holes(folder / "holes.png", image, uv, e.samples.hole[0], title=place)
+    draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0], title=title)
+    draw_holes(folder / "holes.png", image, uv, e.samples.hole[0], title=title)
     written = ["samples.png", "holes.png", "points.ply"]
-    if example.asked is not None:  # where the method was asked
+    if example.asked is not None:  # where the method ran without further options
         with torch.no_grad():
             maps = dense.complete_depth(example.frame, calibration=dense.default_calibration(), **example.asked).to(
                 "cpu"
             )[0]
-        draw_completed(folder / "completed.png", image, maps.depth, maps.sigma, maps.source, title=place)
+        draw_completed(folder / "completed.png", image, maps.depth, maps.sigma, maps.source, title=title)
         written.append("completed.png")
     pooled = errors.points_from_estimate(e.estimate, e.truth)
     if pooled.keep.any():
-        draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score, title=place)
+        draw_depth(folder / "depth.png", pooled.true_depth, pooled.depth, pooled.score, title=title)
         curves = {e.method: risk_coverage(pooled)}
-        draw_risk_coverage(folder / "risk_coverage.png", curves, oracle=risk_coverage(pooled, oracle=True), title=place)
+        draw_risk_coverage(folder / "risk_coverage.png", curves, oracle=risk_coverage(pooled, oracle=True), title=title)
         written += ["depth.png", "risk_coverage.png"]
-    filled = whole.source[0] != Source.NONE
-    xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][filled]
-    columns = {name: getattr(whole, name)[0][filled] for name in ("sigma", "score")}
-    columns |= {"hole": e.samples.hole[0][filled], "source": whole.source[0][filled]}
+    answered = whole.source[0] != Source.NONE
+    xyz = unproject(e.frame.camera, whole.uv, whole.depth)[0][answered]
+    columns = {name: getattr(whole, name)[0][answered] for name in ("sigma", "score")}
+    columns |= {"hole": e.samples.hole[0][answered], "source": whole.source[0][answered]}
     write_ply(folder / "points.ply", xyz, colour_by_source(columns["source"]), **columns)
     return [folder / name for name in written]

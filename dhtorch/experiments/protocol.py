@@ -1,8 +1,8 @@
-"""The one loop behind every experiment: pairs of a scene in, rows of a result out.
+"""Evaluation loop of all experiments: run variants of a method on the pairs of every scene → rows of a result.
 
-A *variant* is a method as an experiment runs it. A *cohort* is what its answers are held against; it is counted for
-every variant alike, also where the pose fails. A *protocol* joins both and says what the methods may see. An
-experiment is a protocol, a question about the rows it gives, and a verdict.
+A *variant* is a method with the options of an experiment. A *cohort* selects the samples with truth that are evaluated;
+it is the same for every variant, also where the pose fails. A *protocol* combines both and hides part of the input from
+the methods. An experiment is a protocol, a question about its rows, and a verdict.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHin
 ScenePairs = Callable[[Scene], Sequence[Pair] | Sequence[tuple[int, int]]]
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
-#: A pair with fewer candidates says nothing: it is dropped and counted.
+#: Fewest candidates of a pair; a pair with fewer is dropped and counted.
 MIN_CANDIDATES = 20
 
-#: A track looks at this many pixels across (LK window and a margin): what lies within may pull at it.
+#: Side of the window that influences a track (LK window and a margin), px.
 _TRACK_REACH_PX = 25
 
 
@@ -49,10 +49,10 @@ def no_progress(items: Iterable[Any], _text: str, _total: int) -> Iterable[Any]:
 
 @dataclass(frozen=True)
 class Settings:
-    """What all pairs of a job share."""
+    """Options shared by all pairs of a job."""
 
     cutoff: float | None = None  # m; None = the scene's own near limit
-    cutoff_factor: float = 1.0  # on either
+    cutoff_factor: float = 1.0  # multiplies either cutoff
     truth: tuple[str, ...] = ("full",)  # truth tests to report: raw | 5x5 | full
     seed: int = 0
     device: str = "cpu"
@@ -61,35 +61,35 @@ class Settings:
     workers: int = 0
 
     def cutoff_of(self, scene: Scene) -> float | None:
-        """The cutoff on one scene, m; None where nothing is known to be near."""
+        """Cutoff of a scene, m; None where it has no near limit."""
         cutoff = scene.near if self.cutoff is None else self.cutoff
         return None if cutoff is None else cutoff * self.cutoff_factor
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Some pairs of one scene, loaded: all that a protocol may look at."""
+    """Pairs of one scene, loaded: the input of cohorts and columns."""
 
     scene: Scene
     pairs: Sequence[Pair]
     cutoff: float | None  # m
     reference: Frame
-    others: tuple[Frame, ...]  # further views, the pair's own last; none where frames are offered instead
-    exact: Frame  # the reference view with the depth it is held against
-    surface: Tensor  # (B, H, W) kind of surface, (B, 1, 1) where the recording knows none
-    disagreement: Tensor  # (B,) median relative difference of the independent truth from the sensor; NaN = not known
-    around: tuple[Frame, ...] = ()  # offered to one variant or another, in the order of the recording
+    others: tuple[Frame, ...]  # source views, the pair's own last; empty if candidate frames are offered instead
+    exact: Frame  # the reference view with its true depth
+    surface: Tensor  # (B, H, W) kind of surface, (B, 1, 1) where the recording has none
+    disagreement: Tensor  # (B,) median relative difference of the independent truth from the sensor; NaN = none
+    around: tuple[Frame, ...] = ()  # candidate source views of any variant, in the order of the recording
 
     @property
     def odd(self) -> dict[int, str]:
-        """Kinds of surface that are counted apart: code → name."""
+        """Kinds of surface that are evaluated separately: code → name."""
         room = self.scene.recording
         if not isinstance(room, TruthRecording):
             return {}
         return {k: name for k, name in room.surfaces.items() if name in room.odd_surfaces}
 
     def kinds(self, uv: Tensor) -> Tensor | None:
-        """Kind of surface (B, N) at samples; one whose track window touches an odd surface counts with that."""
+        """Kind of surface (B, N) at samples; an odd surface within the track's window takes precedence."""
         if self.surface.shape[-1] == 1:
             return None
         kind = sample_nearest(self.surface, uv)[0]
@@ -107,24 +107,30 @@ Cohort = Callable[[Batch, Trace], holdout.Truth]
 
 @dataclass(frozen=True)
 class Variant:
-    """A method as an experiment runs it."""
+    """A method with the options of an experiment."""
 
     method: Method
     ask: Callable[..., Estimate] | None = (
-        None  # in the place of the method's line: (method, reference view, others, *, …)
+        None  # replaces the method's call: (method, reference view, source views, *, …)
     )
-    fit: Callable[[Batch, int], PoseFit] | None = None  # a pose from elsewhere: (batch, number of samples) → fit
+    fit: Callable[[Batch, int], PoseFit] | None = None  # replaces the estimated pose: (batch, number of samples) → fit
     seed: int | None = None  # None = the job's
-    given: Callable[[Batch], Mapping[str, Any]] = lambda _batch: {}  # further options: an oracle may see it all
-    offers: CandidateViews | None = None  # other views in the place of the pair's own; silent where it is offered none
-    needs: Callable[[Scene], str | None] = lambda _scene: None  # scene → why it cannot run there, None = it can
-    chooses: bool = False  # ``ask`` chooses among several views, as the method does
-    two_frames: bool = False  # cannot choose: what it is judged by would take part in the choice
+    given: Callable[[Batch], Mapping[str, Any]] = (
+        lambda _batch: {}
+    )  # further options of the call, from the whole batch (for oracles)
+    offers: CandidateViews | None = (
+        None  # candidate source views instead of the pair's own; unanswered if there are none
+    )
+    needs: Callable[[Scene], str | None] = lambda _scene: (
+        None
+    )  # scene → reason why the variant cannot run there, None = it can
+    chooses: bool = False  # ``ask`` selects among candidate views, as the method does
+    two_frames: bool = False  # no view selection: the held-out samples would influence it
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What one variant said about the pairs of a batch, and what it is held against."""
+    """Estimate of one variant on the pairs of a batch, with the truth of every cohort."""
 
     batch: Batch
     variant: str
@@ -134,21 +140,21 @@ class Answer:
 
     @property
     def samples(self) -> Samples:
-        """The samples as the method saw them."""
+        """Samples of the method's input, after hiding."""
         samples: Samples = self.trace["samples"]
         return samples
 
     @property
     def other(self) -> tuple[int, Frame]:
-        """The view (B = 1) that tracks and pose of the trace belong to: its position in the recording, and the view."""
+        """Source view (B = 1) of the trace's tracks and pose: (position in the recording, frame)."""
         pair = self.batch.pairs[0]
         if isinstance(pair.other, int):
             return pair.other, self.batch.others[-1]
         k = int(self.trace["choice"].index[-1, 0]) if "choice" in self.trace else 0
-        return pair.offered[k], self.batch.around[k]
+        return pair.candidates[k], self.batch.around[k]
 
     def one(self, b: int) -> Answer:
-        """Pair ``b`` alone; milliseconds are the batch's share."""
+        """Answer of pair ``b`` alone; its milliseconds are those of the batch divided by the number of pairs."""
         size, cut = len(self.batch.pairs), slice(b, b + 1)
         records = {k: v[cut] for k, v in self.trace.items() if isinstance(v, pytree.Record)}
         records |= {k: self.trace[k][:, cut] for k in ("choice",) if k in self.trace}
@@ -171,57 +177,61 @@ class Answer:
 
 
 def held_back_truth(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Truth:
-    """The cohort of the range split: samples whose return was held back and passes the truth test."""
+    """Cohort of the range split: truth at samples whose return was held back and passes the truth test."""
     samples: Samples = trace["samples"]
     kinds = batch.kinds(samples.uv)
     odd = None if kinds is None else torch.isin(kinds, torch.tensor([*batch.odd], dtype=kinds.dtype).to(kinds.device))
-    found = holdout.sample_truth(batch.exact, samples.uv, truth=test)
-    return holdout.select_candidates(samples, found, batch.cutoff if _has_cutoff(batch.cutoff) else None, excluded=odd)
+    truth_at_samples = holdout.sample_truth(batch.exact, samples.uv, truth=test)
+    return holdout.select_candidates(
+        samples, truth_at_samples, batch.cutoff if _has_cutoff(batch.cutoff) else None, excluded=odd
+    )
 
 
 def spread_pairs(pairs: ScenePairs, references: int | None, scene: Scene) -> list[tuple[int, int]]:
-    """Some of the scene's pairs of two frames, evenly spread; None = all."""
-    found = to_fixed_pairs(pairs(scene))
-    if references is None or len(found) <= references:
-        return found
-    return [found[(2 * k + 1) * len(found) // (2 * references)] for k in range(references)]
+    """Pairs of two frames of a scene, ``references`` of them evenly spaced; None = all."""
+    fixed = to_fixed_pairs(pairs(scene))
+    if references is None or len(fixed) <= references:
+        return fixed
+    return [fixed[(2 * k + 1) * len(fixed) // (2 * references)] for k in range(references)]
 
 
 def no_columns(_answer: Answer) -> Row:
-    """Nothing beyond the usual columns."""
+    """Default of :attr:`Protocol.columns`: no further columns."""
     return {}
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """Which variants run, what they may see, what they are held against, and what else is noted of each pair."""
+    """Variants to run, the input they see, the cohorts that are evaluated, and further columns of each pair."""
 
     variants: Mapping[str, Variant]
-    cohorts: Mapping[str, Cohort] = field(default_factory=lambda: {"full": held_back_truth})  # the last one decides
-    hide: Callable[[Frame, float | None], Frame] = holdout.range_split  # (view, cutoff) → what a method may see
-    columns: Callable[[Answer], Row] = no_columns  # of one pair; numbers are joined over the pairs of a scene by median
+    cohorts: Mapping[str, Cohort] = field(
+        default_factory=lambda: {"full": held_back_truth}
+    )  # the last one selects the pairs
+    hide: Callable[[Frame, float | None], Frame] = holdout.range_split  # (view, cutoff) → the view as a method sees it
+    columns: Callable[[Answer], Row] = no_columns  # of one pair; numbers enter the scene's row as medians over pairs
     min_candidates: int = MIN_CANDIDATES
 
     @property
     def offers(self) -> CandidateViews | None:
-        """All frames that are offered to any variant, in the order of the recording; None where none asks for them."""
-        asked = list(dict.fromkeys(v.offers for v in self.variants.values() if v.offers is not None))
-        return partial(_all_candidates, asked) if asked else None
+        """Union of the candidate views of all variants, in the order of the recording; None if no variant has any."""
+        functions = list(dict.fromkeys(v.offers for v in self.variants.values() if v.offers is not None))
+        return partial(_all_candidates, functions) if functions else None
 
     def views(self, pairs: Sequence[Pair]) -> int:
-        """Views that are loaded of every pair: as many as some variant asks for, and as a short gap holds."""
-        wanted = max((v.method.views for v in self.variants.values() if v.offers is None), default=1)
-        return min([wanted, *(max(1, j - i) for i, j in pairs if isinstance(j, int))])
+        """Number of source views loaded per pair: the maximum over variants, at most the smallest gap of a pair."""
+        most = max((v.method.views for v in self.variants.values() if v.offers is None), default=1)
+        return min([most, *(max(1, j - i) for i, j in pairs if isinstance(j, int))])
 
     def batch(self, settings: Settings, pairs: Sequence[Pair]) -> int:
-        """Pairs per call: one where reference views are offered differently many views."""
-        return settings.batch if self.offers is None and not any(pair.offered for pair in pairs) else 1
+        """Pairs per call: one where the number of candidate views may differ between reference views."""
+        return settings.batch if self.offers is None and not any(pair.candidates for pair in pairs) else 1
 
     def allows(self, pairs: Sequence[Pair]) -> None:
-        """Refuse frames to choose among where a variant cannot choose.
+        """Check that pairs have a fixed source view if a variant cannot select views.
 
         Raises:
-            ValueError: such a variant and such pairs.
+            ValueError: pairs with candidate views for such a variant.
         """
         for v in self.variants.values():
             if v.two_frames or v.fit is not None or (v.ask is not None and not v.chooses):
@@ -236,15 +246,15 @@ def run(
     *,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Run every variant on every pair of every scene.
+    """Run every variant on every pair of every scene → rows, summary, examples and pooled points.
 
-    Truth is the held-back return of the reference view, or, for a recording that knows it, the exact depth
-    (``truth(i)``); surfaces such as mirrors are then counted apart. Points are pooled inside a scene; the summary is
-    the median over scenes without a role. A scene for which ``pairs`` gives none keeps a row that says "too short".
+    Truth is the held-back return of the reference view, or the exact depth of a recording that has it (``truth(i)``);
+    surfaces such as mirrors are then evaluated separately. Points are pooled inside a scene; the summary is the median
+    over scenes without a role. A scene without pairs has a row with the note "too short".
 
     Args:
-        scenes: see :class:`dhtorch.data.scene.Scene`; a recording is a scene without notes.
-        protocol: variants, cohorts and what is hidden.
+        scenes: see :class:`dhtorch.data.scene.Scene`; a recording is a scene without a near limit or role.
+        protocol: variants, cohorts and the function that hides input.
         pairs: scene → list of :class:`dhtorch.data.pairs.Pair`, or plain (reference view, other).
         settings: cutoff, seed, device, batch, workers.
         progress: wraps the loop over a scene's batches: (items, text, number of items) → items.
@@ -254,38 +264,38 @@ def run(
     """
     outcome = Outcome()
     for scene in scenes_of(scenes):
-        chosen = [Pair(*pair) for pair in pairs(scene)]  # first: a data set without pairs of views says so
+        chosen = [Pair(*pair) for pair in pairs(scene)]  # first: raises for a data set without pairs of views
         protocol.allows(chosen)
-        collected = _SceneCollector(scene, protocol, settings)
+        collector = _SceneCollector(scene, protocol, settings)
         data = PairDataset(scene.recording, chosen, settings.dtype, protocol.views(chosen), protocol.offers)
         size = protocol.batch(settings, chosen)
         loader = load_pairs(data, batch=size, workers=settings.workers)
-        for at, items in zip(range(0, len(chosen), size), progress(loader, scene.name, len(loader)), strict=True):
-            shown = move_to_device(tuple(items), settings.device)
-            collected.add(Batch(scene, chosen[at : at + size], collected.cutoff, *shown))
-        outcome.rows += collected.rows()
-        outcome.examples += collected.examples
+        for start, items in zip(range(0, len(chosen), size), progress(loader, scene.name, len(loader)), strict=True):
+            on_device = move_to_device(tuple(items), settings.device)
+            collector.add(Batch(scene, chosen[start : start + size], collector.cutoff, *on_device))
+        outcome.rows += collector.rows()
+        outcome.examples += collector.examples
         outcome.n_pairs += len(chosen)
-        outcome.points |= {(scene.name, *k): pytree.collate(p) for k, p in collected.pooled.items()}
+        outcome.points |= {(scene.name, *k): pytree.collate(p) for k, p in collector.pooled.items()}
     outcome.summary = summarise_rows(outcome.rows, list(protocol.variants), list(protocol.cohorts))
     return outcome
 
 
 class _SceneCollector:
-    """Collects the answers on one scene and turns them into rows."""
+    """Accumulator of the answers on one scene → its rows."""
 
     def __init__(self, scene: Scene, protocol: Protocol, settings: Settings) -> None:
         self.scene, self.protocol, self.settings = scene, protocol, settings
         self.cutoff = settings.cutoff_of(scene)
         self.missing = {k: reason for k, v in protocol.variants.items() if (reason := v.needs(scene))}
         self.variants = {k: v for k, v in protocol.variants.items() if k not in self.missing}
-        self.last = list(protocol.cohorts)[-1]
-        blind = protocol.hide is holdout.range_split and not _has_cutoff(self.cutoff)
-        self.least = 0 if blind else protocol.min_candidates
+        self.deciding_cohort = list(protocol.cohorts)[-1]
+        nothing_hidden = protocol.hide is holdout.range_split and not _has_cutoff(self.cutoff)
+        self.fewest_candidates = 0 if nothing_hidden else protocol.min_candidates
         self.examples: list[Example] = []
         self.pair_rows: list[Row] = []
         self.pooled: dict[tuple[str, str], list[errors.Points]] = {}
-        self.apart: dict[tuple[str, str, str], list[errors.Points]] = {}
+        self.separate_points: dict[tuple[str, str, str], list[errors.Points]] = {}
         self.census: list[dict[int, float]] = []
         self.dropped: dict[tuple[str, str], list[dict[str, int]]] = {}
         self.overlays: dict[str, Row] = {}
@@ -293,46 +303,51 @@ class _SceneCollector:
 
     def add(self, batch: Batch) -> None:
         """Run all variants on one batch of pairs."""
-        near = self.protocol.hide(batch.reference, self.cutoff)
+        reference = self.protocol.hide(batch.reference, self.cutoff)
         views = tuple(self.protocol.hide(view, self.cutoff) for view in batch.others)
-        offered = self._offered(batch)
-        seen: dict[Any, Frame | None] = {}
+        candidates = self._candidate_frames(batch)
+        inputs: dict[Any, Frame | None] = {}
         shared, enough = SharedTracks(), [True] * len(batch.pairs)
         for k, (name, variant) in enumerate(self.variants.items()):
-            which, some = self._view_of(variant, batch, views, offered)
-            if which not in seen:  # one record for all who see the same, so that they share tracks
-                seen[which] = pytree.stack(some) if len(some) > 1 else next(iter(some), None)
-            estimate, trace = self._ask(variant, batch, near, seen[which], shared)
+            view_key, frames = self._source_views(variant, batch, views, candidates)
+            if view_key not in inputs:  # one record for all variants with equal input, so that they share tracks
+                inputs[view_key] = pytree.stack(frames) if len(frames) > 1 else next(iter(frames), None)
+            estimate, trace = self._run_variant(variant, batch, reference, inputs[view_key], shared)
             truths = {cohort: of(batch, trace) for cohort, of in self.protocol.cohorts.items()}
             answer = Answer(batch, name, estimate, trace, truths)
             if k == 0:
                 self._count_holes(variant.method, batch.reference, answer.samples.uv)
-                enough = [int(ok.sum()) >= self.least for ok in truths[self.last].ok]
+                enough = [int(ok.sum()) >= self.fewest_candidates for ok in truths[self.deciding_cohort].ok]
                 self.n_few += enough.count(False)
-            choices = []
-            for b, counts in enumerate(enough):
-                one = answer.one(b)
-                choices.append(self._picked(one))
-                if counts:
-                    self._note(one, choices[-1])
+            reports = []
+            for b, is_counted in enumerate(enough):
+                pair_answer = answer.one(b)
+                reports.append(self._selection_report(pair_answer))
+                if is_counted:
+                    self._add_pair(pair_answer, reports[-1])
             if not self.examples:
-                self.examples.append(self._example(answer.one(0), choices[0], near[:1], seen[which]))
+                self.examples.append(self._example(answer.one(0), reports[0], reference[:1], inputs[view_key]))
 
-    def _example(self, first: Answer, choice: ViewReport | None, near: Frame, seen: Frame | None) -> Example:
-        variant, (reference, other) = self.protocol.variants[first.variant], first.batch.pairs[0]
-        views = choice.views if choice is not None else (other,)
-        asked: dict[str, Any] | None = None
-        if seen is not None and variant.ask is None and variant.fit is None:
-            others = seen[:, :1] if seen.image.dim() == 5 else seen[:1]
-            asked = {"others": others, "method": variant.method, "seed": self.settings.seed, "hint": self.scene.hint}
+    def _example(self, answer: Answer, report: ViewReport | None, near: Frame, others: Frame | None) -> Example:
+        variant, (reference, other) = self.protocol.variants[answer.variant], answer.batch.pairs[0]
+        views = report.views if report is not None else (other,)
+        options: dict[str, Any] | None = None
+        if others is not None and variant.ask is None and variant.fit is None:
+            selected = others[:, :1] if others.image.dim() == 5 else others[:1]
+            options = {
+                "others": selected,
+                "method": variant.method,
+                "seed": self.settings.seed,
+                "hint": self.scene.hint,
+            }
         return Example(
             self.scene.name,
-            first.variant,
+            answer.variant,
             near,
-            *(first.samples, first.estimate, first.truths[self.last]),
+            *(answer.samples, answer.estimate, answer.truths[self.deciding_cohort]),
             pair=f"{reference} → {', '.join(map(str, views))}",
             cutoff=self.cutoff,
-            asked=asked,
+            asked=options,
         )
 
     def rows(self) -> list[Row]:
@@ -341,106 +356,111 @@ class _SceneCollector:
         for name in self.protocol.variants:
             for cohort in self.protocol.cohorts:
                 key = (name, cohort)
-                mine = [r for r in self.pair_rows if (r["method"], r["truth"]) == key]
+                pair_rows = [r for r in self.pair_rows if (r["method"], r["truth"]) == key]
                 row: Row = {"scene": self.scene.name, "pair": None, "method": name, "truth": cohort}
                 row |= {"role": self.scene.role, "cutoff_m": self.cutoff}
-                row |= {"n_pairs": len(mine), "n_few": self.n_few}
-                if not mine:
+                row |= {"n_pairs": len(pair_rows), "n_few": self.n_few}
+                if not pair_rows:
                     row["note"] = self.missing.get(name) or ("too few candidates" if self.n_few else "too short")
                 else:
-                    shares = {
+                    hole_ratios = {
                         names(Hole)[k].lower(): sum(c[k] for c in self.census) / len(self.census)
                         for k in names(Hole)
                         if k
                     }
-                    apart = {k[2]: p for k, p in self.apart.items() if k[:2] == key}
-                    row |= scene_row(mine, self.pooled[key], self.dropped[key], apart) | {"hole_share": shares}
-                    row |= {"overlay": self.overlays[name]} if cohort == self.last else {}
+                    separate = {k[2]: p for k, p in self.separate_points.items() if k[:2] == key}
+                    row |= scene_row(pair_rows, self.pooled[key], self.dropped[key], separate) | {
+                        "hole_share": hole_ratios
+                    }
+                    row |= {"overlay": self.overlays[name]} if cohort == self.deciding_cohort else {}
                 rows.append(row)
         return rows
 
-    def _offered(self, batch: Batch) -> dict[int, Frame]:
-        """Position → frame, as variants see it, of all that are offered."""
+    def _candidate_frames(self, batch: Batch) -> dict[int, Frame]:
+        """Candidate views of all variants, after hiding: position → frame."""
         positions = candidate_views(batch.pairs[0], self.scene.recording, self.protocol.offers)
         return {k: self.protocol.hide(view, self.cutoff) for k, view in zip(positions, batch.around, strict=True)}
 
-    def _view_of(
+    def _source_views(
         self, variant: Variant, batch: Batch, views: Sequence[Frame], offered: Mapping[int, Frame]
     ) -> tuple[Any, list[Frame]]:
-        """Other views of one variant, and what they are told apart by from those of others."""
+        """(key, source views) of one variant; variants with an equal key have equal source views."""
         if variant.offers is None and views:
             return variant.method.views, list(views[-variant.method.views :])
         positions = tuple(candidate_views(batch.pairs[0], self.scene.recording, variant.offers))
         return positions, [offered[k] for k in positions]
 
-    def _ask(
-        self, variant: Variant, batch: Batch, near: Frame, seen: Frame | None, shared: SharedTracks
+    def _run_variant(
+        self, variant: Variant, batch: Batch, reference: Frame, others: Frame | None, shared: SharedTracks
     ) -> tuple[Estimate, Trace]:
         method = variant.method if batch.others and variant.offers is None else with_view_selection(variant.method)
         trace: Trace = {}
-        spoil = getattr(
-            self.scene.recording, "spoil_track", lambda track: track
-        )  # some recordings lead trackers astray
+        # some synthetic recordings distort tracks
+        distort = getattr(self.scene.recording, "spoil_track", lambda track: track)
         seed = self.settings.seed if variant.seed is None else variant.seed
-        told: dict[str, Any] = {"seed": seed, "hint": self.scene.hint, "track": spoil(shared.seat(method.track))}
+        options: dict[str, Any] = {"seed": seed, "hint": self.scene.hint, "track": distort(shared.seat(method.track))}
         if variant.fit is not None:
-            told["fit"] = variant.fit(batch, method.n)
-        told |= variant.given(batch)
-        if seen is None:  # every sample is counted, none is found again
-            told["track"] = _track_nothing
+            options["fit"] = variant.fit(batch, method.n)
+        options |= variant.given(batch)
+        if others is None:  # no source view: all samples count, none is tracked
+            options["track"] = _track_nothing
         with torch.no_grad():
             ask = method if variant.ask is None else partial(variant.ask, method)
-            estimate = ask(near, near if seen is None else seen, trace=trace, **told)
+            estimate = ask(reference, reference if others is None else others, trace=trace, **options)
         shared.charge(trace["ms"])
         return estimate, trace
 
-    def _picked(self, answer: Answer) -> ViewReport | None:
-        """Which frames a variant chose that was offered some."""
+    def _selection_report(self, answer: Answer) -> ViewReport | None:
+        """Report of the view selection of one answer; None for a variant without candidate views."""
         pair, offers = answer.batch.pairs[0], self.variants[answer.variant].offers
         offered = candidate_views(pair, self.scene.recording, offers)
-        if not offered:  # silent, where frames were asked for and there are none
+        if not offered:  # unanswered: the variant needs candidate views and there are none
             return None if offers is None else ViewReport(pair.reference, (), 0)
         return report_selection(pair.reference, offered, answer.trace)
 
     def _count_holes(self, method: Method, reference: Frame, uv: Tensor) -> None:
-        """The sensor's own holes, before anything is held back."""
+        """Add the fraction of each kind of hole of the sensor, before any return is held back."""
         for hole in method.sample_depth_at(reference, uv).hole:
             total = max(int((hole != Hole.NONE).sum()), 1)
             self.census.append({k: float((hole == k).sum()) / total for k in names(Hole)})
 
-    def _note(self, answer: Answer, choice: ViewReport | None) -> None:
-        """Rows and points of one pair."""
+    def _add_pair(self, answer: Answer, report: ViewReport | None) -> None:
+        """Add the rows and points of one pair."""
         estimate, fit, kinds = answer.estimate, answer.trace["fit"], answer.batch.kinds(answer.samples.uv)
         hole = ~answer.samples.usable
-        share = {gate.lower(): float((estimate.gate == code).float().mean()) for code, gate in names(Gate).items()}
+        gate_ratio = {gate.lower(): float((estimate.gate == code).float().mean()) for code, gate in names(Gate).items()}
         pair = [answer.batch.pairs[0].reference, answer.other[0]]
-        common: Row = {"scene": self.scene.name, "pair": pair, "method": answer.variant}
-        found: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
-        found |= {"n_recovered": int((estimate.keep & hole).sum()), "gate_share": share, "ms": answer.trace["ms"]}
-        more = self.protocol.columns(answer) | ({} if choice is None else choice.row())
+        identity: Row = {"scene": self.scene.name, "pair": pair, "method": answer.variant}
+        columns: Row = {"pnp_ok": bool(fit.ok[0]), "n_inlier": int(fit.n_inlier[0]), "n_holes": int(hole.sum())}
+        columns |= {
+            "n_recovered": int((estimate.keep & hole).sum()),
+            "gate_share": gate_ratio,
+            "ms": answer.trace["ms"],
+        }
+        extra = self.protocol.columns(answer) | ({} if report is None else report.row())
         self.overlays.setdefault(answer.variant, overlay_points(answer.samples, estimate, answer.batch.reference.hw))
         for cohort, truth in answer.truths.items():
             points = errors.points_from_estimate(estimate, truth)
             self.pooled.setdefault((answer.variant, cohort), []).append(points)
             self.dropped.setdefault((answer.variant, cohort), []).append(truth.dropped())
-            self.pair_rows.append({**common, "truth": cohort, **found, **errors.measure_errors(points), **more})
+            self.pair_rows.append({**identity, "truth": cohort, **columns, **errors.measure_errors(points), **extra})
             for code, kind in answer.batch.odd.items() if kinds is not None else ():
-                there = truth.replace(code=_reopen_kind(truth, kinds, code))
-                self.apart.setdefault((answer.variant, cohort, kind), []).append(
-                    errors.points_from_estimate(estimate, there)
+                on_kind = truth.replace(code=_reopen_kind(truth, kinds, code))
+                self.separate_points.setdefault((answer.variant, cohort, kind), []).append(
+                    errors.points_from_estimate(estimate, on_kind)
                 )
 
 
-def _all_candidates(asked: Sequence[CandidateViews], recording: Recording, reference: int) -> list[int]:
-    return sorted({k for offers in asked for k in offers(recording, reference)})
+def _all_candidates(functions: Sequence[CandidateViews], recording: Recording, reference: int) -> list[int]:
+    return sorted({k for offers in functions for k in offers(recording, reference)})
 
 
 def _track_nothing(image_0: Tensor, image_1: Tensor, uv_0: Tensor, *, hint: TrackHint = NO_HINT) -> Tracks:
-    """No sample is found again: there is no other view."""
+    """Tracker without a source view: no track is valid."""
     zero = torch.zeros_like(uv_0[..., 0])
-    lost = torch.zeros_like(zero, dtype=torch.bool)
+    invalid = torch.zeros_like(zero, dtype=torch.bool)
     cov = torch.eye(2).to(uv_0).expand(*zero.shape, 2, 2)
-    return Tracks(uv_0=uv_0, uv_1=uv_0, error=zero, photometric=zero, cov=cov, valid=lost)
+    return Tracks(uv_0=uv_0, uv_1=uv_0, error=zero, photometric=zero, cov=cov, valid=invalid)
 
 
 def _has_cutoff(cutoff: float | None) -> bool:
@@ -448,7 +468,7 @@ def _has_cutoff(cutoff: float | None) -> bool:
 
 
 def _reopen_kind(truth: holdout.Truth, kinds: Tensor | None, kind: int) -> Tensor:
-    """Codes in which the samples on one kind of surface, turned away as EXCLUDED, count, and no others."""
+    """Truth codes with the EXCLUDED samples on one kind of surface as candidates, and all others EXCLUDED."""
     if kinds is None:
         return truth.code
     code = torch.where(truth.code == holdout.TruthCode.EXCLUDED, holdout.TruthCode.CANDIDATE, truth.code)

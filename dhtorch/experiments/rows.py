@@ -1,4 +1,4 @@
-"""Rows of a result: how the pairs of a scene become one row, and the rows of scenes a summary."""
+"""Rows of a result: rows of pairs → row of a scene → summary over scenes."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from dhtorch.records import Estimate, Samples
 
 Row = dict[str, Any]
 
-#: Points of an overlay.
+#: Maximum number of points of an overlay.
 MAX_OVERLAY_POINTS = 200
 
-#: Columns of a pair that a scene row measures anew on its pooled points, or that name the pair.
+#: Columns of a pair that a scene row recomputes from its pooled points, or that identify the pair.
 _RECOMPUTED_COLUMNS = {
     "scene",
     "pair",
@@ -40,13 +40,13 @@ def scene_row(
     dropped: Sequence[Mapping[str, int]],
     apart: Mapping[str, Sequence[errors.Points]],
 ) -> Row:
-    """One scene and variant: metrics over the pooled points, means and medians over the pairs.
+    """Rows and points of the pairs of one scene and variant → scene row: pooled metrics, means and medians over pairs.
 
     Args:
         pairs: rows of the pairs.
-        points: their candidates.
-        dropped: their counts of what the truth test removed.
-        apart: candidates on surfaces that are counted apart.
+        points: candidates of each pair.
+        dropped: counts of returns that the truth test removed, of each pair.
+        apart: kind of surface → candidates on it, of surfaces that are evaluated separately.
     """
     pool = pytree.collate(points)
     row: Row = errors.measure_errors(pool) | risk.measure_risk(pool) | reliability.measure_reliability([pool])
@@ -57,19 +57,19 @@ def scene_row(
     row["ms"] = {k: median_or_none([r["ms"].get(k, 0.0) for r in pairs]) for k in pairs[0]["ms"]}
     row["apart"] = {kind: errors.measure_errors(pytree.collate(p)) for kind, p in apart.items()}
     row["curves"] = curves.sample_curves(pool)
-    more = {
+    extra = {
         k
         for r in pairs
         for k, v in r.items()
         if k not in _RECOMPUTED_COLUMNS | row.keys() and isinstance(v, int | float)
     }
-    return row | {k: median_or_none([r[k] for r in pairs if r.get(k) is not None]) for k in sorted(more)}
+    return row | {k: median_or_none([r[k] for r in pairs if r.get(k) is not None]) for k in sorted(extra)}
 
 
 def summarise_rows(rows: Sequence[Row], variants: Sequence[str], cohorts: Sequence[str]) -> dict[str, Any]:
     """Scene rows → ``<variant>.<metric>`` and, for further cohorts, ``<variant>.<cohort>.<metric>``.
 
-    With one variant and one cohort the prefix is left out. Scenes with a role stay out of every number.
+    With one variant and one cohort the prefix is left out. Scenes with a role enter no number.
     """
     summary: dict[str, Any] = {}
     for variant in variants:
@@ -87,24 +87,23 @@ def summarise_rows(rows: Sequence[Row], variants: Sequence[str], cohorts: Sequen
 
 
 def overlay_points(samples: Samples, estimate: Estimate, hw: tuple[int, int]) -> Row:
-    """The first pair as points to draw: pixels, gates, sources and depths of at most :data:`MAX_OVERLAY_POINTS`
-    samples.
+    """Pixels, gates, sources and depths of at most :data:`MAX_OVERLAY_POINTS` samples of the first pair, for drawing.
 
-    No picture goes along: result files are published, and licences of many data sets do not allow that.
+    Without the image: result files are published, and licences of many data sets do not allow that.
     """
     whole = merge(samples, estimate)
     step = max(1, math.ceil(samples.uv.shape[1] / MAX_OVERLAY_POINTS))
-    found: Row = {"hw": list(hw), "u": whole.uv[0, ::step, 0].round(), "v": whole.uv[0, ::step, 1].round()}
-    found |= {"gate": estimate.gate[0, ::step], "source": whole.source[0, ::step]}
-    found |= {"depth": [float(f"{v:.4g}") for v in whole.depth[0, ::step].tolist()]}
-    return {k: v.int().tolist() if isinstance(v, Tensor) else v for k, v in found.items()}
+    columns: Row = {"hw": list(hw), "u": whole.uv[0, ::step, 0].round(), "v": whole.uv[0, ::step, 1].round()}
+    columns |= {"gate": estimate.gate[0, ::step], "source": whole.source[0, ::step]}
+    columns |= {"depth": [float(f"{v:.4g}") for v in whole.depth[0, ::step].tolist()]}
+    return {k: v.int().tolist() if isinstance(v, Tensor) else v for k, v in columns.items()}
 
 
 def mean_or_none(values: Sequence[float]) -> float | None:
-    """Mean, None of nothing."""
+    """Mean; None if there are no values."""
     return sum(values) / len(values) if values else None
 
 
 def median_or_none(values: Sequence[float]) -> float | None:
-    """Lower median, None of nothing."""
+    """Lower median; None if there are no values."""
     return float(torch.tensor(values, dtype=torch.float64).median()) if values else None

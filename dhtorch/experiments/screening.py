@@ -1,4 +1,4 @@
-"""The loop of an experiment whose estimator is no method: items of a scene in, rows of every variant out."""
+"""Evaluation loop of experiments whose estimator is not a method: items of every scene → rows of every variant."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ ScreenedItem = tuple[int, int]
 
 
 class HasSceneRow(Protocol):
-    """What has a row of its own in a result."""
+    """A scene as the loop uses it: its name and role."""
 
     @property
     def name(self) -> str:
-        """Of the row."""
+        """Name of the scene in rows."""
 
     @property
     def role(self) -> str | None:
-        """Not None: enters no mean."""
+        """Role of the scene; one with a role enters no mean."""
 
 
 ScreenedScene = TypeVar("ScreenedScene", bound=HasSceneRow)
@@ -39,44 +39,54 @@ def screen_scenes(
     whole: Callable[[ScreenedScene, Sequence[Mapping[str, Row]]], Mapping[str, Row]] = lambda _scene, _found: {},
     progress: Progress,
 ) -> Outcome:
-    """Ask every item of every scene, one after the other.
+    """Evaluate every item of every scene → rows of items and scenes, and their summary.
 
-    Rows: one per item and variant, then one per scene and variant, in which counts are added up and everything else
-    is joined: shares of a group (a dict) by mean over the items that have them, other numbers by median. The summary
+    Rows: one per item and variant, then one per scene and variant, in which counts are summed, ratios of a
+    group (a dict) are means over the items that have them, and other numbers are medians. The summary
     is the median over scenes without a role; intervals come from resampling scenes.
 
     Args:
-        scenes: what there is a row for.
-        items: scene → what to ask.
-        ask: scene, item → variant → numbers; a variant that is left out has nothing to say there.
+        scenes: scenes, each with a row per variant.
+        items: scene → pairs or frames to evaluate.
+        ask: scene, item → variant → numbers; a variant may be left out of an item.
         variants: their names, in order.
-        truth: what the numbers are held against, for the rows.
-        whole: scene, all that ``ask`` found there → variant → numbers of the scene, in place of the joined ones.
+        truth: name of the truth, for the rows.
+        whole: scene, results of ``ask`` on all its items → variant → numbers that replace those of the scene's row.
         progress: wraps the loop over a scene's items: (items, text, number of items) → items.
     """
     outcome = Outcome()
     for scene in scenes:
         chosen = list(items(scene))
         with torch.no_grad():
-            found = [ask(scene, item) for item in progress(chosen, scene.name, len(chosen))]
-            over = whole(scene, found)
-        name = {"scene": scene.name}
-        for item, answer in zip(chosen, found, strict=True):
-            outcome.rows += [{**name, "pair": list(item), "method": v, "truth": truth, **answer[v]} for v in answer]
+            results = [ask(scene, item) for item in progress(chosen, scene.name, len(chosen))]
+            replacements = whole(scene, results)
+        scene_name = {"scene": scene.name}
+        for item, result in zip(chosen, results, strict=True):
+            outcome.rows += [
+                {**scene_name, "pair": list(item), "method": v, "truth": truth, **result[v]} for v in result
+            ]
         for variant in variants:
-            mine = [answer[variant] for answer in found if variant in answer]
-            row = {**name, "pair": None, "method": variant, "truth": truth, "role": scene.role}
-            note = {} if mine else {"note": "nothing to ask"}
-            outcome.rows.append(row | {"n_pairs": len(mine)} | note | _join_rows(mine) | over.get(variant, {}))
+            variant_results = [result[variant] for result in results if variant in result]
+            row = {**scene_name, "pair": None, "method": variant, "truth": truth, "role": scene.role}
+            note = {} if variant_results else {"note": "nothing to ask"}
+            outcome.rows.append(
+                row
+                | {"n_pairs": len(variant_results)}
+                | note
+                | _join_rows(variant_results)
+                | replacements.get(variant, {})
+            )
         outcome.n_pairs += len(chosen)
     outcome.summary = summarise_rows(outcome.rows, variants, [truth])
     return outcome
 
 
 def paired_metric(outcome: Outcome, truth: str, first: str, second: str, metric: str) -> list[tuple[float, float]]:
-    """A metric of two variants on the scenes without a role on which both have it."""
-    one, other = outcome.scenes(first, truth), outcome.scenes(second, truth)
-    both = [(row.get(metric), other[scene].get(metric)) for scene, row in one.items() if scene in other]
+    """[(first variant's metric, second variant's metric)] of scenes without a role on which both have it."""
+    first_rows, second_rows = outcome.scenes(first, truth), outcome.scenes(second, truth)
+    both = [
+        (row.get(metric), second_rows[scene].get(metric)) for scene, row in first_rows.items() if scene in second_rows
+    ]
     return [(a, b) for a, b in both if a is not None and b is not None]
 
 

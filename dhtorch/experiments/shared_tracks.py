@@ -1,4 +1,4 @@
-"""Tracks asked once: variants that differ in the pose, the gates or the seed look at the same ones."""
+"""Cache of tracks: variants that differ only in pose, gates or seed share the tracks of a batch."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ TrackStage = Callable[..., Tracks]
 
 
 class SharedTracks:
-    """Remembers the tracks of one batch of pairs.
+    """Cache of the tracks of one batch of pairs.
 
-    A seat filled by the same function with the same options, asked about the same images, pixels and initial values,
-    gets the same record. Its time is charged to every variant as if each had tracked.
+    The same function with the same options, images, pixels and initial values returns the cached record. Its time is
+    added to every variant as if each had tracked.
     """
 
     def __init__(self) -> None:
-        self._known: list[tuple[Any, tuple[Tensor, ...], Tracks, float]] = []
-        self._owed = 0.0
+        self._cached: list[tuple[Any, tuple[Tensor, ...], Tracks, float]] = []
+        self._uncharged_ms = 0.0
 
     def seat(self, track: TrackStage) -> TrackStage:
-        """The track seat of one variant."""
-        self._owed = 0.0
+        """Cached track stage of one variant."""
+        self._uncharged_ms = 0.0
         return partial(self._track, track)
 
     def charge(self, ms: dict[str, float]) -> None:
-        """Add to ``ms["track"]`` what the tracks that were remembered had cost."""
-        if self._owed:
-            ms["track"] = ms.get("track", 0.0) + self._owed
-            self._owed = 0.0
+        """Add the time of the cached tracks to ``ms["track"]``."""
+        if self._uncharged_ms:
+            ms["track"] = ms.get("track", 0.0) + self._uncharged_ms
+            self._uncharged_ms = 0.0
 
     def _track(
         self,
@@ -44,30 +44,29 @@ class SharedTracks:
         image_1: Tensor,
         uv_0: Tensor,
         *,
-        hint: TrackHint = NO_HINT,  # its pyramid says nothing that the image does not
+        hint: TrackHint = NO_HINT,  # its pyramid is a function of the image
     ) -> Tracks:
         start = time.perf_counter()
         key = stage_key(track), hint.levels
-        question = (image_0, image_1, uv_0, uv_0 if hint.start is None else hint.start)
-        for known, asked, tracks, ms in self._known:
-            if known == key and all(map(_is_same_tensor, asked, question)):
-                self._owed += ms
+        inputs = (image_0, image_1, uv_0, uv_0 if hint.start is None else hint.start)
+        for cached_key, cached_inputs, tracks, ms in self._cached:
+            if cached_key == key and all(map(_is_same_tensor, cached_inputs, inputs)):
+                self._uncharged_ms += ms
                 return tracks
         tracks = track(image_0, image_1, uv_0, hint=hint)
-        self._known.append((key, question, tracks, 1e3 * (time.perf_counter() - start)))
+        self._cached.append((key, inputs, tracks, 1e3 * (time.perf_counter() - start)))
         return tracks
 
 
 def _is_same_tensor(a: Tensor, b: Tensor) -> bool:
-    """The same memory, or equal values: views that were chosen stand in new memory."""
+    """Whether two tensors share memory or have equal values (selected views are copies)."""
     if a.shape != b.shape or a.dtype != b.dtype:
         return False
     return (a.data_ptr() == b.data_ptr() and a.stride() == b.stride()) or torch.equal(a, b)
 
 
 def stage_key(fn: Any) -> Any:
-    """What a seat does, comparable: partials of one function with equal options are equal, however often they are
-    nested."""
+    """Comparable key of a stage: partials of one function with equal options have equal keys, however nested."""
     if not isinstance(fn, partial):
         return fn
     options = {k: stage_key(v) for k, v in fn.keywords.items()}

@@ -1,6 +1,6 @@
-"""Points, meshes, views and maps → files that other programs open: PLY, GLB (glTF 2.0), COLMAP's text model, PNG.
+"""Writers: points, meshes, views and depth maps → PLY, GLB (glTF 2.0), COLMAP's text model, PNG.
 
-Arrays may be torch tensors or numpy arrays, on any device. Every file is written whole or not at all.
+Arrays may be torch tensors or numpy arrays, on any device. Files are written atomically.
 """
 
 from dhtorch.export.colmap import ColmapImage, write_colmap

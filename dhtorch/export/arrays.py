@@ -1,4 +1,4 @@
-"""What the writers share: arrays from anywhere, colours, and which points can be written."""
+"""Helpers of the writers: tensors -> numpy arrays, colours -> uint8, and selection of finite points."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def to_numpy(x: Any) -> np.ndarray:
-    """A numpy array of a tensor (detached, on the CPU) or of anything numpy takes."""
+    """Tensor (detached and moved to the CPU) or any array-like → numpy array."""
     return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)
 
 
@@ -28,31 +28,31 @@ def check_rows(where: str, name: str, x: Any, n: int | None, width: int | None) 
 
 
 def colour_to_uint8(rgb: np.ndarray) -> np.ndarray:
-    """Colours as uint8: those are kept, others are in [0, 1], rounded and cut off there; NaN is black."""
+    """Colours → uint8: uint8 is unchanged, floats in [0, 1] are clipped and rounded; NaN is black."""
     if rgb.dtype == np.uint8:
         return rgb
     return np.round(255 * np.clip(np.nan_to_num(rgb.astype(np.float64)), 0, 1)).astype(np.uint8)
 
 
 def select_finite(xyz: np.ndarray, face: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Which points (P,) are finite, and the triangles between such points, numbered among them.
+    """(mask (P,) of finite points, triangles of finite points, renumbered among these).
 
     Raises:
         ValueError: a triangle with a corner that does not exist.
     """
-    good = np.isfinite(xyz).all(1)
+    finite = np.isfinite(xyz).all(1)
     if face is None:
-        return good, None
+        return finite, None
     if face.size and not (face.min() >= 0 and face.max() < len(xyz)):
         raise ValueError(f"export: face names points {face.min()} to {face.max()}, expected 0 to {len(xyz) - 1}")
-    renumbered = np.cumsum(good) - 1
-    return good, renumbered[face[good[face].all(1)]] if face.size else face.reshape(0, 3)
+    renumbered = np.cumsum(finite) - 1
+    return finite, renumbered[face[finite[face].all(1)]] if face.size else face.reshape(0, 3)
 
 
 def rotation_to_wxyz(
     R: Tensor,  # (3, 3)
 ) -> list[float]:
-    """Quaternion w, x, y, z (kornia's) of a rotation, w >= 0."""
+    """Rotation → quaternion w, x, y, z (kornia's order), w >= 0."""
     from kornia.geometry.conversions import rotation_matrix_to_quaternion  # noqa: PLC0415
 
     q = rotation_matrix_to_quaternion(R[None])[0]

@@ -1,7 +1,7 @@
-"""COLMAP's text model: cameras.txt, images.txt and points3D.txt, for structure-from-motion tools and splat trainers.
+"""Writer of COLMAP's text model: cameras.txt, images.txt and points3D.txt.
 
-COLMAP counts pixels from the corner of the image, so that the centre of the first pixel is (0.5, 0.5); ours is (0, 0).
-Half a pixel is added to everything written here. Poses there map the world into the camera.
+In COLMAP the centre of the first pixel is (0.5, 0.5), here (0, 0): half a pixel is added to all written coordinates.
+COLMAP's poses map world to camera.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from dhtorch.runtime import storage
 
 @dataclass(frozen=True)
 class ColmapImage:
-    """A picture and where it was taken from (batch size 1)."""
+    """An image with its camera and pose (batch size 1)."""
 
-    name: str  # of the picture's file
+    name: str  # of the image file
     camera: Camera
     hw: tuple[int, int]
     T_world_from_cam: Pose
@@ -37,14 +37,14 @@ def write_colmap(
     *,
     rgb: Any,  # (P, 3) uint8, or float in [0, 1]
     error: Any,  # (P,) px, reprojection error
-    seen_by: Any,  # (P, V) numbers of shots, -1 = none
-    uv: Any,  # (P, V, 2) px in those shots, as photographed
+    seen_by: Any,  # (P, V) indices of shots, -1 = none
+    uv: Any,  # (P, V, 2) px in those shots, distorted
 ) -> None:
-    """Write a model: cameras, pictures with their observations, and points with their tracks.
+    """Write a model: cameras, images with their observations, and points with their tracks.
 
-    Equal cameras are written once. Lenses without distortion become PINHOLE, those with up to four coefficients OPENCV,
-    others FULL_OPENCV. Non-finite points, and observations that are not finite, are left out; a point that nothing
-    observes is written with an empty track. All numbers in the files count from 1, in the order given.
+    Equal cameras are written once. Cameras without distortion become PINHOLE, those with up to four coefficients
+    OPENCV, others FULL_OPENCV. Non-finite points and observations are left out; a point without observations is written
+    with an empty track. All ids in the files count from 1, in the order of the arguments.
 
     Raises:
         ValueError: wrong shapes, or an observation in a shot that does not exist.
@@ -59,45 +59,50 @@ def write_colmap(
         raise ValueError(f"write_colmap: uv has shape {pixels.shape}, expected {(*seen.shape, 2)}")
     if seen.size and seen.max() >= len(shots):
         raise ValueError(f"write_colmap: seen_by names shot {seen.max()}, expected at most {len(shots) - 1}")
-    observed: list[list[str]] = [[] for _ in shots]
+    observations: list[list[str]] = [[] for _ in shots]
     lines = []
     for number, p in enumerate(np.nonzero(np.isfinite(points).all(1))[0], start=1):
         track = []
         for shot, (u, v) in zip(seen[p], pixels[p], strict=True):
             if shot >= 0 and math.isfinite(u + v):
-                track += [str(shot + 1), str(len(observed[shot]))]
-                observed[shot].append(f"{_format_number(u + 0.5)} {_format_number(v + 0.5)} {number}")
-        head = " ".join(
+                track += [str(shot + 1), str(len(observations[shot]))]
+                observations[shot].append(f"{_format_number(u + 0.5)} {_format_number(v + 0.5)} {number}")
+        point = " ".join(
             [str(number), *map(_format_number, points[p]), *map(str, colours[p]), _format_number(errors[p])]
         )
-        lines.append(" ".join([head, *track]))
+        lines.append(" ".join([point, *track]))
     cameras = [_camera_parameters(shot) for shot in shots]
-    known = list(dict.fromkeys(cameras))
-    pictures = []
+    distinct = list(dict.fromkeys(cameras))
+    image_lines = []
     for k, shot in enumerate(shots):
-        pictures.append(f"{k + 1} {_pose_parameters(shot)} {known.index(cameras[k]) + 1} {shot.name}")
-        pictures.append(" ".join(observed[k]))
+        image_lines.append(f"{k + 1} {_pose_parameters(shot)} {distinct.index(cameras[k]) + 1} {shot.name}")
+        image_lines.append(" ".join(observations[k]))
     files = {
-        "cameras.txt": ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", *(f"{k + 1} {c}" for k, c in enumerate(known))],
+        "cameras.txt": [
+            "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
+            *(f"{k + 1} {c}" for k, c in enumerate(distinct)),
+        ],
         "images.txt": ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; POINTS2D[] as X, Y, POINT3D_ID"],
         "points3D.txt": ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)", *lines],
     }
-    files["images.txt"] += pictures
+    files["images.txt"] += image_lines
     for name, text in files.items():
         storage.replace_file(Path(folder) / name, ("\n".join(text) + "\n").encode("utf-8"))
 
 
 def _camera_parameters(shot: ColmapImage) -> str:
-    """Model, size and parameters."""
+    """COLMAP's line of a camera: model, size and parameters."""
     (fx, fy), (cx, cy) = shot.camera.f[0].tolist(), shot.camera.c[0].tolist()
-    lens = [] if shot.camera.distortion is None else shot.camera.distortion[0].tolist()
-    model, length = ("PINHOLE", 0) if not any(lens) else ("OPENCV", 4) if not any(lens[4:]) else ("FULL_OPENCV", 8)
-    numbers = [fx, fy, cx + 0.5, cy + 0.5, *(lens + [0.0] * 8)[:length]]
+    distortion = [] if shot.camera.distortion is None else shot.camera.distortion[0].tolist()
+    model, length = (
+        ("PINHOLE", 0) if not any(distortion) else ("OPENCV", 4) if not any(distortion[4:]) else ("FULL_OPENCV", 8)
+    )
+    numbers = [fx, fy, cx + 0.5, cy + 0.5, *(distortion + [0.0] * 8)[:length]]
     return " ".join([model, str(shot.hw[1]), str(shot.hw[0]), *map(_format_number, numbers)])
 
 
 def _pose_parameters(shot: ColmapImage) -> str:
-    """Quaternion w, x, y, z and translation, of the camera from the world."""
+    """Quaternion w, x, y, z and translation of the pose world → camera, as text."""
     T = se3.invert(shot.T_world_from_cam.map(lambda v: v.double()))
     return " ".join(map(_format_number, [*rotation_to_wxyz(T.R[0]), *T.t[0].tolist()]))
 

@@ -1,7 +1,6 @@
-"""GLB, the binary form of glTF 2.0: browsers, Blender, MeshLab and Windows show it without a plug-in.
+"""Writer of GLB, the binary form of glTF 2.0, for points and meshes; read by browsers, Blender and MeshLab.
 
-glTF's world is y up and its colours of points are linear light; ours are turned and converted here, so that a room
-stands upright and looks as photographed.
+glTF's world has y up and linear vertex colours: scenes are rotated and colours converted from sRGB here.
 """
 
 from __future__ import annotations
@@ -20,47 +19,47 @@ from dhtorch.runtime import storage
 
 _FLOAT, _UINT = 5126, 5125
 _POINTS, _TRIANGLES = 0, 4
-_VERTICES, _INDICES = 34962, 34963  # what a buffer view is for
+_VERTICES, _INDICES = 34962, 34963  # targets of a buffer view
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A cloud of points, or a mesh where it has triangles."""
+    """A point cloud, or a mesh if it has triangles."""
 
     name: str
     xyz: Any  # (P, 3) m
     rgb: Any = None  # (P, 3) uint8, or float in [0, 1]; None = grey
     normal: Any = None  # (P, 3)
     face: Any = None  # (F, 3)
-    values: Mapping[str, Any] = field(default_factory=dict)  # (P,) each; become attributes _NAME of float
+    values: Mapping[str, Any] = field(default_factory=dict)  # (P,) each; written as float attributes _NAME
 
 
 def write_glb(path: str | Path, shapes: Sequence[Shape], *, up: Sequence[float] = (0.0, -1.0, 0.0)) -> None:
-    """Write clouds and meshes into one file, each a node of its own.
+    """Write point clouds and meshes into one file, each as a node.
 
     Args:
         path: of the file.
-        shapes: non-finite points are left out, with their triangles; a shape without any point is left out.
-        up: the direction in the shapes' own axes that points upwards; becomes glTF's +y. The default suits camera axes.
+        shapes: non-finite points and their triangles are left out, and shapes without points.
+        up: the up direction in the shapes' axes; becomes glTF's +y. The default is for OpenCV camera axes.
 
     Raises:
-        ValueError: wrong shapes, a triangle without its corners, or an ``up`` without a direction.
+        ValueError: wrong array shapes, a triangle with an invalid corner, or an ``up`` without direction.
     """
-    parts = _GltfBuilder()
-    turn = _rotation_to_y_up(np.asarray(up, np.float64))
+    builder = _GltfBuilder()
+    rotation = _rotation_to_y_up(np.asarray(up, np.float64))
     for shape in shapes:
-        parts.add(shape, turn)
-    document = parts.document()
+        builder.add(shape, rotation)
+    document = builder.document()
     text = storage.dump_strict_json(document, ensure_ascii=True, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text
-    if parts.data:
-        chunks += struct.pack("<I4s", len(parts.data), b"BIN\0") + bytes(parts.data)
+    if builder.data:
+        chunks += struct.pack("<I4s", len(builder.data), b"BIN\0") + bytes(builder.data)
     storage.replace_file(path, struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
 
 
 class _GltfBuilder:
-    """Collects nodes, meshes, accessors and the one binary buffer."""
+    """Collects nodes, meshes, accessors and the binary buffer of a file."""
 
     def __init__(self) -> None:
         self.data = bytearray()
@@ -69,42 +68,42 @@ class _GltfBuilder:
         self.meshes: list[dict[str, Any]] = []
         self.nodes: list[dict[str, Any]] = []
 
-    def add(self, shape: Shape, turn: list[float]) -> None:
+    def add(self, shape: Shape, rotation: list[float]) -> None:
         points = check_rows("write_glb", "xyz", shape.xyz, None, 3)
         n = len(points)
         corners = None if shape.face is None else check_rows("write_glb", "face", to_numpy(shape.face), None, 3)
-        good, corners = select_finite(points, corners)
-        if not good.any():
+        finite, corners = select_finite(points, corners)
+        if not finite.any():
             return
         rgb = np.full((n, 3), 0.6) if shape.rgb is None else check_rows("write_glb", "rgb", shape.rgb, n, 3)
-        attributes = {"POSITION": self._floats(points[good], bounds=True), "COLOR_0": self._colours(rgb[good])}
+        attributes = {"POSITION": self._floats(points[finite], bounds=True), "COLOR_0": self._colours(rgb[finite])}
         if shape.normal is not None:
-            normal = check_rows("write_glb", "normal", shape.normal, n, 3)[good].astype(np.float64)
+            normal = check_rows("write_glb", "normal", shape.normal, n, 3)[finite].astype(np.float64)
             length = np.linalg.norm(normal, axis=1, keepdims=True)
-            known = np.isfinite(length) & (length > 0)
+            valid = np.isfinite(length) & (length > 0)
             up = np.array([0.0, 1.0, 0.0])
-            attributes["NORMAL"] = self._floats(np.where(known, normal / np.where(known, length, 1), up))
+            attributes["NORMAL"] = self._floats(np.where(valid, normal / np.where(valid, length, 1), up))
         for name, value in shape.values.items():
-            column = check_rows("write_glb", name, value, n, None)[good].astype(np.float64)
+            column = check_rows("write_glb", name, value, n, None)[finite].astype(np.float64)
             attributes[f"_{name.upper()}"] = self._floats(np.nan_to_num(column))
         primitive: dict[str, Any] = {"attributes": attributes, "material": 0, "mode": _POINTS}
         if corners is not None and len(corners):
             index = self._accessor(corners.astype("<u4").reshape(-1), _UINT, "SCALAR", target=_INDICES)
             primitive |= {"indices": index, "mode": _TRIANGLES}
-        self.nodes.append({"name": shape.name, "mesh": len(self.meshes), "rotation": turn})
+        self.nodes.append({"name": shape.name, "mesh": len(self.meshes), "rotation": rotation})
         self.meshes.append({"name": shape.name, "primitives": [primitive]})
 
     def document(self) -> dict[str, Any]:
-        """The JSON part."""
-        whole: dict[str, Any] = {"asset": {"version": "2.0", "generator": "dhtorch"}, "scene": 0}
-        whole["scenes"] = [{"nodes": list(range(len(self.nodes)))}] if self.nodes else [{}]
+        """The JSON chunk's document."""
+        document: dict[str, Any] = {"asset": {"version": "2.0", "generator": "dhtorch"}, "scene": 0}
+        document["scenes"] = [{"nodes": list(range(len(self.nodes)))}] if self.nodes else [{}]
         if not self.nodes:
-            return whole
-        plain = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
-        unlit = "KHR_materials_unlit"  # the light is in the pictures already
-        whole |= {"extensionsUsed": [unlit], "nodes": self.nodes, "meshes": self.meshes}
-        whole["materials"] = [{"pbrMetallicRoughness": plain, "doubleSided": True, "extensions": {unlit: {}}}]
-        return whole | {
+            return document
+        material = {"baseColorFactor": [1, 1, 1, 1], "metallicFactor": 0, "roughnessFactor": 1}
+        unlit = "KHR_materials_unlit"  # the colours contain the lighting already
+        document |= {"extensionsUsed": [unlit], "nodes": self.nodes, "meshes": self.meshes}
+        document["materials"] = [{"pbrMetallicRoughness": material, "doubleSided": True, "extensions": {unlit: {}}}]
+        return document | {
             "accessors": self.accessors,
             "bufferViews": self.views,
             "buffers": [{"byteLength": len(self.data)}],
@@ -115,7 +114,7 @@ class _GltfBuilder:
         return self._accessor(np.ascontiguousarray(values, "<f4"), _FLOAT, kind, bounds=bounds)
 
     def _colours(self, rgb: np.ndarray) -> int:
-        """Linear light as floats: 8 bits would not keep what is dark apart, and some readers trip over 16."""
+        """sRGB → linear colours as floats: 8 bits are too coarse for dark colours, and some readers fail on 16."""
         display = colour_to_uint8(rgb) / 255.0
         return self._floats(np.where(display <= 0.04045, display / 12.92, ((display + 0.055) / 1.055) ** 2.4))
 
@@ -140,12 +139,12 @@ class _GltfBuilder:
 
 
 def _rotation_to_y_up(up: np.ndarray) -> list[float]:
-    """The quaternion x, y, z, w of the smallest turn that takes ``up`` to +y; half a turn goes about x."""
+    """Quaternion x, y, z, w of the smallest rotation from ``up`` to +y; a half turn is about x."""
     length = np.linalg.norm(up)
     if up.shape != (3,) or not length > 0 or not math.isfinite(length):
         raise ValueError(f"write_glb: up is {up.tolist()}, expected a direction of three numbers")
     x, y, z = (up / length).tolist()
     if y < -1 + 1e-9:
         return [1.0, 0.0, 0.0, 0.0]
-    turn = np.array([-z, 0.0, x, 1 + y])  # (up × y, 1 + up · y)
-    return (turn / np.linalg.norm(turn)).tolist()
+    q = np.array([-z, 0.0, x, 1 + y])  # (up × y, 1 + up · y)
+    return (q / np.linalg.norm(q)).tolist()

@@ -1,7 +1,7 @@
-"""LeRobot data sets, v3.0 and v2.1: features, table layouts, statistics and the files below ``meta/``.
+"""Writer of LeRobot data sets v3.0 and v2.1: features, table schemas, statistics and the files below ``meta/``.
 
-A depth map is a picture of the table: float32 TIFF in metres, 0 = no depth, which is how LeRobot itself stores depth
-images (``is_depth_map`` and ``depth_unit`` in the feature's info). Its other form, 12-bit video, has no code for *no
+A depth map is an image in the table: float32 TIFF in metres, 0 = no depth, as LeRobot itself stores depth images
+(``is_depth_map`` and ``depth_unit`` in the feature's info). LeRobot's other form, 12-bit video, has no code for *no
 return*. Tables hold one episode each, in both versions; ``meta/info.json`` is written last.
 """
 
@@ -19,10 +19,10 @@ from dhtorch.runtime import storage
 
 FeatureSpec = dict[str, Any]  # as in meta/info.json
 
-#: Version → what its info says.
+#: Version → ``codebase_version`` in ``meta/info.json``.
 _CODEBASE_VERSIONS = {3: "v3.0", 2: "v2.1"}
 
-#: Files of a folder.
+#: Files per chunk folder.
 FILES_PER_CHUNK = 1000
 
 _HWC_NAMES = ["height", "width", "channels"]
@@ -35,7 +35,7 @@ _PATH_TEMPLATES = {
 
 
 class VideoSegment(NamedTuple):
-    """Where the video of an episode lies."""
+    """The video file and time span of an episode."""
 
     chunk: int
     file: int
@@ -45,7 +45,7 @@ class VideoSegment(NamedTuple):
 
 @dataclass(frozen=True)
 class EpisodeSpec:
-    """One episode, as ``meta/`` describes it; its table is the file of its number."""
+    """Metadata of one episode for ``meta/``; its table is the file with its number."""
 
     number: int
     length: int
@@ -56,17 +56,17 @@ class EpisodeSpec:
 
 
 class FeatureMoments(NamedTuple):
-    """What statistics are made of: of some numbers for each of k channels, float64."""
+    """Moments of numbers in k channels, float64, from which statistics are computed; sums combine sets."""
 
     n: np.ndarray  # (k,)
     mean: np.ndarray
-    spread: np.ndarray  # sum of squared deviations from the mean: a time stamp's squares would hide how it varies
+    spread: np.ndarray  # sum of squared deviations from the mean: sums of squares lose the variance of time stamps
     low: np.ndarray
     high: np.ndarray
 
     @classmethod
     def of(cls, values: np.ndarray, valid: np.ndarray | None = None) -> FeatureMoments:
-        """Of numbers (n, k), those that are finite and ``valid``; none of them give no statistics."""
+        """Moments of numbers (n, k), over those that are finite and ``valid``; may be over none."""
         x = np.asarray(values, np.float64)
         keep = np.isfinite(x) if valid is None else np.isfinite(x) & valid
         n = keep.sum(0).astype(np.float64)
@@ -77,45 +77,45 @@ class FeatureMoments(NamedTuple):
 
     @classmethod
     def parse(cls, packed: Sequence[Sequence[float | None]]) -> FeatureMoments:
-        """Of what :meth:`pack` gave."""
+        """Inverse of :meth:`pack`."""
         rows = [np.array([np.nan if x is None else x for x in row]) for row in packed]
         rows[3], rows[4] = np.where(np.isnan(rows[3]), np.inf, rows[3]), np.where(np.isnan(rows[4]), -np.inf, rows[4])
         return cls(*rows)
 
     def pack(self) -> list[list[float | None]]:
-        """Lists for strict JSON; an end that is not there is null."""
+        """Lists for strict JSON; non-finite limits (of no numbers) become null."""
         return [[float(x) if np.isfinite(x) else None for x in row] for row in self]
 
     def __add__(self, other: FeatureMoments) -> FeatureMoments:  # type: ignore[override]
-        """Of both sets of numbers (Chan, Golub and LeVeque 1979)."""
-        n, apart = self.n + other.n, other.mean - self.mean
-        part = other.n / np.maximum(n, 1.0)
-        mean, spread = self.mean + apart * part, self.spread + other.spread + apart**2 * self.n * part
+        """Moments of the union of both sets of numbers (Chan, Golub and LeVeque 1979)."""
+        n, difference = self.n + other.n, other.mean - self.mean
+        weight = other.n / np.maximum(n, 1.0)
+        mean, spread = self.mean + difference * weight, self.spread + other.spread + difference**2 * self.n * weight
         return FeatureMoments(n, mean, spread, np.minimum(self.low, other.low), np.maximum(self.high, other.high))
 
     def stats(self, frames: int, shape: Sequence[int]) -> dict[str, Any] | None:
-        """The entry of ``meta/stats``, each in that shape; None where there is no number."""
+        """The entry of ``meta/stats`` with values of ``shape``; None where a channel has no number."""
         if not (self.n > 0).all():
             return None
-        found = {"min": self.low, "max": self.high, "mean": self.mean, "std": np.sqrt(self.spread / self.n)}
-        return {**{k: x.reshape(shape).tolist() for k, x in found.items()}, "count": [frames]}
+        values = {"min": self.low, "max": self.high, "mean": self.mean, "std": np.sqrt(self.spread / self.n)}
+        return {**{k: x.reshape(shape).tolist() for k, x in values.items()}, "count": [frames]}
 
 
 # -------------------------------------------------------------------------------------------------------- features
 
 
 def number_feature(kind: str, n: int = 1, names: Sequence[str] | None = None) -> FeatureSpec:
-    """A feature of ``n`` numbers a frame."""
+    """Specification of a feature with ``n`` numbers per frame."""
     return {"dtype": kind, "shape": [n], "names": None if names is None else list(names)}
 
 
 def image_feature(hw: Sequence[int], channels: int = 3, **info: Any) -> FeatureSpec:
-    """A feature of pictures in the table."""
+    """Specification of a feature of images in the table."""
     return {"dtype": "image", "shape": [*hw, channels], "names": list(_HWC_NAMES), **({"info": info} if info else {})}
 
 
 def depth_feature(hw: Sequence[int], step: float) -> FeatureSpec:
-    """A feature of maps in metres (see the module), whose values are whole numbers of ``step`` m."""
+    """Specification of depth maps in metres (see the module), whose values are multiples of ``step`` m."""
     return image_feature(hw, 1, is_depth_map=True, depth_unit="m", quantiser_step_m=step, no_depth=0.0)
 
 
@@ -141,32 +141,32 @@ def make_arrow_schema(
 
 
 def _huggingface_metadata(features: Mapping[str, FeatureSpec]) -> bytes:
-    """What tells the library ``datasets`` which columns are pictures."""
-    found: dict[str, Any] = {}
+    """Schema metadata by which the library ``datasets`` recognises image and array columns."""
+    columns: dict[str, Any] = {}
     for key, feature in features.items():
         kind, shape = feature["dtype"], list(feature["shape"])
         value = {"dtype": kind, "_type": "Value"}
         if kind == "image":
-            found[key] = {"_type": "Image"}
+            columns[key] = {"_type": "Image"}
         elif kind != "video" and shape in ([], [1]):
-            found[key] = value
+            columns[key] = value
         elif kind != "video" and len(shape) == 1:
-            found[key] = {"feature": value, "length": shape[0], "_type": "Sequence"}
+            columns[key] = {"feature": value, "length": shape[0], "_type": "Sequence"}
         elif kind != "video":
-            found[key] = {"shape": shape, "dtype": kind, "_type": f"Array{len(shape)}D"}
-    return json.dumps({"info": {"features": found}}).encode()
+            columns[key] = {"shape": shape, "dtype": kind, "_type": f"Array{len(shape)}D"}
+    return json.dumps({"info": {"features": columns}}).encode()
 
 
 # ----------------------------------------------------------------------------------------------------------- places
 
 
 def episode_table_path(version: int, number: int) -> str:
-    """Name of the table of an episode."""
+    """Relative path of an episode's table."""
     return _fill_template(_PATH_TEMPLATES[version][0], *divmod(number, FILES_PER_CHUNK), number)
 
 
 def episode_video_path(version: int, key: str, clip: VideoSegment, number: int) -> str:
-    """Name of the video of an episode."""
+    """Relative path of an episode's video."""
     return _fill_template(_PATH_TEMPLATES[version][1].replace("{video_key}", key), clip.chunk, clip.file, number)
 
 
@@ -188,7 +188,7 @@ def make_info(
     n_tasks: int,
     robot: str,
 ) -> dict[str, Any]:
-    """``meta/info.json``."""
+    """Contents of ``meta/info.json``."""
     data, video = _PATH_TEMPLATES[version]
     videos = [key for key, feature in features.items() if feature["dtype"] == "video"]
     first, last = episodes[0].number, episodes[-1].number
@@ -202,7 +202,7 @@ def make_info(
         "codebase_version": _CODEBASE_VERSIONS[version],
         "robot_type": robot,
         "total_episodes": len(episodes),
-        "total_frames": sum(each.length for each in episodes),
+        "total_frames": sum(episode.length for episode in episodes),
         "total_tasks": n_tasks,
         **counts,
         "chunks_size": FILES_PER_CHUNK,
@@ -218,21 +218,21 @@ def make_info(
 def write_lerobot_meta(
     root: Path,
     version: int,
-    about: Mapping[str, Any],  # of `info`
+    about: Mapping[str, Any],  # contents of info.json, see make_info
     episodes: Sequence[EpisodeSpec],
     tasks: Sequence[str],  # by task_index
     stats: Mapping[str, Any] | None = None,
 ) -> list[Path]:
-    """The files below ``meta/``, each whole or not at all; ``info.json`` is the last and makes a folder a data set."""
+    """Write the files below ``meta/`` atomically → their paths; ``info.json``, which marks a data set, is last."""
     meta, written = root / "meta", []
     if version == 2:
         rows = [{"episode_index": e.number, "tasks": list(e.tasks), "length": e.length} for e in episodes]
         written.append(_write_json_lines(meta / "episodes.jsonl", rows))
-        named = [{"task_index": k, "task": task} for k, task in enumerate(tasks)]
-        written.append(_write_json_lines(meta / "tasks.jsonl", named))
+        task_rows = [{"task_index": k, "task": task} for k, task in enumerate(tasks)]
+        written.append(_write_json_lines(meta / "tasks.jsonl", task_rows))
         if stats is not None:
-            of_episodes = [{"episode_index": e.number, "stats": e.stats} for e in episodes]
-            written.append(_write_json_lines(meta / "episodes_stats.jsonl", of_episodes))
+            stat_rows = [{"episode_index": e.number, "stats": e.stats} for e in episodes]
+            written.append(_write_json_lines(meta / "episodes_stats.jsonl", stat_rows))
     else:
         columns = _make_episode_columns(episodes)
         written.append(_write_table(meta / "episodes" / "chunk-000" / "file-000.parquet", columns))
@@ -267,19 +267,29 @@ def _write_json_lines(path: Path, rows: Iterable[Any]) -> Path:
 
 
 def _write_table(path: Path, columns: Mapping[str, list[Any]], index: str | None = None) -> Path:
-    """A small table; ``index`` is the column that pandas takes as its index."""
+    """Write a small parquet table; ``index`` is the column that pandas uses as index."""
     import pyarrow  # noqa: PLC0415
     from pyarrow import parquet  # noqa: PLC0415
 
     table = pyarrow.table(dict(columns))
     if index is not None:
-        kinds = {name: "unicode" if isinstance(cells[0], str) else "int64" for name, cells in columns.items()}
-        named = [
-            {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": kind.replace("unicode", "object")}
-            for name, kind in kinds.items()
+        pandas_types = {name: "unicode" if isinstance(cells[0], str) else "int64" for name, cells in columns.items()}
+        column_entries = [
+            {
+                "name": name,
+                "field_name": name,
+                "pandas_type": pandas_type,
+                "numpy_type": pandas_type.replace("unicode", "object"),
+            }
+            for name, pandas_type in pandas_types.items()
         ]
-        about = {"index_columns": [index], "column_indexes": [], "columns": named, "pandas_version": "2.0.0"}
-        table = table.replace_schema_metadata({b"pandas": json.dumps(about).encode()})
+        pandas_metadata = {
+            "index_columns": [index],
+            "column_indexes": [],
+            "columns": column_entries,
+            "pandas_version": "2.0.0",
+        }
+        table = table.replace_schema_metadata({b"pandas": json.dumps(pandas_metadata).encode()})
     sink = pyarrow.BufferOutputStream()
     parquet.write_table(table, sink)
     return storage.replace_file(path, sink.getvalue().to_pybytes())

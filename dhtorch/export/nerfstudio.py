@@ -1,6 +1,6 @@
-"""A posed recording as nerfstudio reads it: ``transforms.json`` beside pictures, depth and confidence.
+"""Writer of nerfstudio data: ``transforms.json`` beside images, depth and confidence.
 
-Pixel centres stand at whole numbers here and at halves there; cameras look along −z there, with y upwards.
+Pixel centres are at integers here and at half-integers in nerfstudio, whose cameras look along −z, with y up.
 """
 
 from __future__ import annotations
@@ -10,33 +10,33 @@ from typing import Any
 
 import numpy as np
 
-#: Camera axes of OpenGL from those of OpenCV.
+#: Transformation from OpenCV camera axes to those of OpenGL.
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 
-#: m, a step of the depth pictures: nerfstudio's ``depth_unit_scale_factor``.
+#: Step in m of the depth images: nerfstudio's ``depth_unit_scale_factor``.
 _DEPTH_UNIT_M = 1e-3
 
-#: Relative sigma at which confidence is one half.
+#: Relative sigma whose confidence is one half.
 _HALF_CONFIDENCE_SIGMA = 0.1
 
-#: Names of a lens's first numbers, in OpenCV's order.
+#: nerfstudio's names of the first distortion coefficients, in OpenCV's order.
 _LENS_NAMES = ("k1", "k2", "p1", "p2", "k3")
 
 
 def make_nerfstudio_frame(
     stem: str,
     hw: Sequence[int],
-    K: np.ndarray,  # (3, 3), whole numbers are pixel centres
+    K: np.ndarray,  # (3, 3), pixel centres at integers
     T_world_from_cam: np.ndarray,  # (4, 4), OpenCV axes
     lens: Sequence[float] = (),  # OpenCV's order
 ) -> dict[str, Any]:
-    """One of the ``frames`` of a ``transforms.json``.
+    """One entry of ``frames`` in a ``transforms.json``.
 
     Raises:
-        ValueError: a lens with more numbers than nerfstudio's.
+        ValueError: more distortion coefficients than nerfstudio has.
     """
     if any(lens[len(_LENS_NAMES) :]):
-        raise ValueError(f"nerfstudio: found a lens of {len(lens)} numbers, expected {' '.join(_LENS_NAMES)}")
+        raise ValueError(f"nerfstudio: found {len(lens)} distortion coefficients, expected {' '.join(_LENS_NAMES)}")
     return {
         "file_path": f"images/{stem}.png",
         "depth_file_path": f"depth/{stem}.png",
@@ -53,7 +53,7 @@ def make_nerfstudio_frame(
 
 
 def make_transforms(shots: Sequence[Mapping[str, Any]], **more: Any) -> dict[str, Any]:
-    """``transforms.json``; ``more`` is what else it says, which nerfstudio passes over."""
+    """Contents of ``transforms.json``; ``more`` are further entries, which nerfstudio ignores."""
     return {
         "camera_model": "OPENCV",
         "depth_unit_scale_factor": _DEPTH_UNIT_M,
@@ -63,16 +63,18 @@ def make_transforms(shots: Sequence[Mapping[str, Any]], **more: Any) -> dict[str
 
 
 def quantise_nerfstudio_depth(depth: np.ndarray) -> np.ndarray:
-    """(h, w) uint16 of metres, 0 = none; what is beyond the last step becomes none."""
+    """Depth (h, w) in m → uint16 steps, 0 = no depth; depths beyond the last step become 0."""
     z = np.rint(np.asarray(depth, np.float64) / _DEPTH_UNIT_M)
     return np.where((z >= 1) & (z <= 65534), z, 0).astype(np.uint16)
 
 
 def encode_confidence(depth: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """(h, w) uint8 of depth and sigma in m: 255 is sure, one half of it a relative sigma of
-    :data:`_HALF_CONFIDENCE_SIGMA`, 0 none."""
-    known = depth > 0
-    ratio = np.where(known, sigma, 1) / np.where(known, depth, 1)
-    return np.where(known, np.rint(255 * _HALF_CONFIDENCE_SIGMA / (_HALF_CONFIDENCE_SIGMA + ratio)).clip(1), 0).astype(
+    """Depth and sigma (h, w) in m → confidence (h, w) uint8, 0 = no depth.
+
+    255 · s / (s + sigma / depth), at least 1, with s = :data:`_HALF_CONFIDENCE_SIGMA`.
+    """
+    valid = depth > 0
+    ratio = np.where(valid, sigma, 1) / np.where(valid, depth, 1)
+    return np.where(valid, np.rint(255 * _HALF_CONFIDENCE_SIGMA / (_HALF_CONFIDENCE_SIGMA + ratio)).clip(1), 0).astype(
         np.uint8
     )

@@ -1,4 +1,4 @@
-"""PLY, the Stanford polygon format, binary and little-endian: MeshLab, CloudCompare, Blender and Open3D read it."""
+"""Writer of PLY (binary, little-endian) for points and meshes; read by MeshLab, CloudCompare, Blender and Open3D."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ def write_ply(
     comments: Sequence[str] = ("metres; x right, y down, z forward",),
     **values: Any,  # (P,) each
 ) -> int:
-    """Write points, or a mesh, with any numbers beside each point.
+    """Write points, or a mesh, with further values per point; returns the number of points.
 
-    Properties: x y z, nx ny nz, red green blue, then ``values`` in the order given. Small whole numbers (codes) become
-    uchar, other whole numbers int, everything else float. ``sigma``, ``score``, ``hole`` (why the sensor is silent
-    there, codes.Hole; written as ``class``) and ``source`` (codes.Source) are the names used throughout.
+    Properties: x y z, nx ny nz, red green blue, then ``values`` in their order. Integers from 0 to 255 (codes) become
+    uchar, other integers int, everything else float. ``sigma``, ``score``, ``hole`` (class of the sensor's hole,
+    codes.Hole; written as ``class``) and ``source`` (codes.Source) are the names used throughout.
 
     Args:
         path: of the file.
-        xyz: points; non-finite ones are left out, with their triangles.
+        xyz: points; non-finite ones and their triangles are left out.
         rgb, normal, values: of each point.
-        face: corners as numbers of points; makes it a mesh.
+        face: corners as indices of points; makes it a mesh.
         comments: lines of the header.
 
     Returns:
         Number of points written.
 
     Raises:
-        ValueError: arrays of unequal length or wrong shape, or a triangle without its corners.
+        ValueError: arrays of unequal length or wrong shape, or a triangle with an invalid corner.
     """
     points = check_rows("write_ply", "xyz", xyz, None, 3)
     n = len(points)
@@ -56,26 +56,26 @@ def write_ply(
         if value is not None:
             columns["class" if name == "hole" else name] = _to_ply_number(check_rows("write_ply", name, value, n, None))
     corners = None if face is None else check_rows("write_ply", "face", to_numpy(face), None, 3)
-    good, corners = select_finite(points, corners)
+    finite, corners = select_finite(points, corners)
     vertex = np.zeros(n, [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         vertex[name] = column
-    vertex = vertex[good]
-    head = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
-    head += [f"element vertex {len(vertex)}"]
-    head += [f"property {_PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
+    vertex = vertex[finite]
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    header += [f"element vertex {len(vertex)}"]
+    header += [f"property {_PLY_TYPES[column.dtype.str[1:]]} {name}" for name, column in columns.items()]
     body = vertex.tobytes()
     if corners is not None:
-        head += [f"element face {len(corners)}", "property list uchar int vertex_indices"]
+        header += [f"element face {len(corners)}", "property list uchar int vertex_indices"]
         triangles = np.zeros(len(corners), [("n", "u1"), ("corner", "<i4", 3)])
         triangles["n"], triangles["corner"] = 3, corners
         body += triangles.tobytes()
-    storage.replace_file(path, "\n".join([*head, "end_header\n"]).encode("ascii") + body)
+    storage.replace_file(path, "\n".join([*header, "end_header\n"]).encode("ascii") + body)
     return len(vertex)
 
 
 def _to_ply_number(values: np.ndarray) -> np.ndarray:
-    """As uchar, int or float, little-endian."""
+    """Values as uchar, int or float, little-endian."""
     if values.dtype.kind == "b" or (values.dtype.kind in "iu" and (not values.size or values.min() >= 0)):
         small = not values.size or values.max() <= 255
         return values.astype("u1" if small else "<i4")

@@ -69,7 +69,7 @@ def candidates_by_frame(scene: Scene, past: bool = True) -> dict[int, tuple[int,
     """Frame → the frames (``past``: before it) among which the method chooses; the first has none before it."""
     if len(scene.recording) < 2:
         return {}
-    return {pair.reference: pair.offered for pair in by_choice(scene, stride=1, past=past)}
+    return {pair.reference: pair.candidates for pair in by_choice(scene, stride=1, past=past)}
 
 
 def view_offsets(scene: Scene, gap: int | None, views: int) -> list[int]:

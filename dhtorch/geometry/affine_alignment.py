@@ -13,7 +13,7 @@ Such steps shrink by a factor that is nearly constant and, where the noise in T'
 small. Two of them tell it, and the third takes part of what would follow at once (Anderson 1965, with a memory of one
 step).
 
-The steps on one level in compiled code: :mod:`dhtorch.ops.loader`.
+The steps on one level have a compiled kernel.
 """
 
 from __future__ import annotations
@@ -33,8 +33,15 @@ from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
 from dhtorch.geometry.linalg import matmul_planes as product
 from dhtorch.geometry.lucas_kanade import masked_apply
 from dhtorch.geometry.patches import QUANTISATION_VARIANCE, round_half_up
-from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, SEARCH_PADDING_PX, Pyramid
-from dhtorch.ops import loader
+from dhtorch.geometry.pyramid import (
+    GRAD_X_PLANE,
+    GRAD_Y_PLANE,
+    GREY_PLANE,
+    OUTSIDE_MARGIN_PX,
+    SEARCH_PADDING_PX,
+    Pyramid,
+)
+from dhtorch.ops.dispatch import operator
 
 #: Of what would follow a step, at most so many times that step is taken at once; more overshoots under large warps.
 MAX_EXTRAPOLATION = 0.5
@@ -244,65 +251,92 @@ def _search(
     warp: Tensor,  # (3, 2, M) px
     batch: Tensor,  # (M,)
 ) -> _State:
-    """Steps of all points, a chunk at a time, reading image 1 from one level."""
-    source, target, o = views
-    zoom = 0.5**level
-    if _compilable(views, level, q, place, warp, batch):
-        return _compiled(views, level, q, place, warp * zoom, batch)
-    fine = o._replace(epsilon_px=o.epsilon_px * zoom)
-    memory = None if is_static(warp) else warp.new_empty(2, min(MAX_CHUNK_POINTS, len(batch)), 8, o.window * o.window)
-    parts = []
-    for q_, place_, warp_, batch_ in zip(
-        *(y.split(MAX_CHUNK_POINTS, -1) for y in (q, place, warp * zoom, batch)), strict=True
-    ):
-        patch, corner = _patch(target, level, warp_[0], batch_, o.window)
-        Q = _pictures(source, q_, batch_, o.window, None if memory is None else memory[0, : len(batch_)])
-        products = None if memory is None else memory[1, : len(batch_)]
-        state = _descend(Q, patch, _from(corner, warp_), fine, products)
-        inverse = (state.inverse[:6].unflatten(0, (3, 2)) * place_[:, None, None]).sum(0)
-        parts.append(state._replace(warp=_from(-corner, state.warp) / zoom, inverse=inverse))
-    return _State(*(torch.cat(field, -1) for field in zip(*parts, strict=True)))
+    """Steps of all points, reading image 1 from one level."""
+    levels = views.source.levels[0], views.target.levels[level]
+    return _register_level(*levels, q, place, warp, batch, views=views, level=level)
 
 
-def _compilable(views: _Views, level: int, *points: Tensor) -> bool:
-    """Whether compiled code may search: it takes these tensors, and finds a window wherever it looks."""
-    source, target, o = views
-    levels = source.levels[0], target.levels[level]
-    room = min(source.pad, target.pad) >= o.window // 2 + SEARCH_PADDING_PX
-    told = (
-        room
-        and source.levels[0].shape[1] > GRAD_Y_PLANE
-        and all(y.dtype == torch.float32 for y in (*levels, *points[:3]))
-    )
-    return told and loader.serves(*levels, *points)
+def _reads_whole_windows(source: Tensor, *_: Tensor, views: _Views, level: int) -> bool:
+    """Whether the source has gradients, and every window, with room to move, lies within the padding."""
+    padding = min(views.source.pad, views.target.pad)
+    return source.shape[1] > GRAD_Y_PLANE and padding >= views.o.window // 2 + SEARCH_PADDING_PX
 
 
-def _compiled(views: _Views, level: int, q: Tensor, place: Tensor, begin: Tensor, batch: Tensor) -> _State:
-    """:func:`_search` in compiled code (:mod:`dhtorch.ops.loader`), the same up to the rounding of sums over a
-    window."""
-    source, target, o = views
-    zoom, textured = 0.5**level, torch.empty_like(batch, dtype=torch.bool)
-    warp, fit, first = torch.empty_like(begin), torch.empty_like(place), torch.empty_like(place)
-    inverse = begin.new_empty(2, 8, len(batch))
-    torch.ops.dhtorch.align(
-        source=source.levels[0],
-        target=target.levels[level],
+def _register_level_kernel(
+    source: Tensor,
+    target: Tensor,
+    q: Tensor,
+    place: Tensor,
+    warp: Tensor,
+    batch: Tensor,
+    *,
+    views: _Views,
+    level: int,
+) -> _State:
+    o, zoom = views.o, 0.5**level
+    textured = torch.empty_like(batch, dtype=torch.bool)
+    found, fit, first = torch.empty_like(warp), torch.empty_like(place), torch.empty_like(place)
+    inverse = warp.new_empty(2, 8, len(batch))
+    torch.ops.dhtorch.register_affine.default(
+        source=source,
+        target=target,
         q=q,
         place=place,
-        begin=begin,
+        begin=warp * zoom,
         batch=batch,
-        warp=warp,
+        warp=found,
         textured=textured,
         fit=fit,
         first=first,
         inverse=inverse,
         window=o.window,
         steps=o.steps,
-        source_pad=source.pad,
-        target_pad=target.pad,
+        source_pad=views.source.pad,
+        target_pad=views.target.pad,
         epsilon=o.epsilon_px * zoom,
+        search_padding=SEARCH_PADDING_PX,
+        margin=OUTSIDE_MARGIN_PX,
+        max_extrapolation=MAX_EXTRAPOLATION,
+        min_gain=REGISTRATION_GAIN_RANGE[0],
+        max_gain=REGISTRATION_GAIN_RANGE[1],
+        damping=AFFINE_DAMPING,
+        min_pivot=MIN_PIVOT,
     )
-    return _State(warp / zoom, textured, fit, first, inverse)
+    return _State(found / zoom, textured, fit, first, inverse)
+
+
+@operator(
+    kernel=_register_level_kernel,
+    dtypes=dict.fromkeys(("source", "target", "q", "place", "warp"), torch.float32) | {"batch": torch.int64},
+    when=_reads_whole_windows,
+)
+def _register_level(
+    source: Tensor,
+    target: Tensor,
+    q: Tensor,
+    place: Tensor,
+    warp: Tensor,
+    batch: Tensor,
+    *,
+    views: _Views,
+    level: int,
+) -> _State:
+    """:func:`_search` on the levels ``source`` and ``target``, a chunk of points at a time."""
+    pyramid_0, pyramid_1, o = views
+    zoom = 0.5**level
+    fine = o._replace(epsilon_px=o.epsilon_px * zoom)
+    memory = None if is_static(warp) else warp.new_empty(2, min(MAX_CHUNK_POINTS, len(batch)), 8, o.window * o.window)
+    parts = []
+    for q_, place_, warp_, batch_ in zip(
+        *(y.split(MAX_CHUNK_POINTS, -1) for y in (q, place, warp * zoom, batch)), strict=True
+    ):
+        patch, corner = _patch(pyramid_1, level, warp_[0], batch_, o.window)
+        Q = _pictures(pyramid_0, q_, batch_, o.window, None if memory is None else memory[0, : len(batch_)])
+        products = None if memory is None else memory[1, : len(batch_)]
+        state = _descend(Q, patch, _from(corner, warp_), fine, products)
+        inverse = (state.inverse[:6].unflatten(0, (3, 2)) * place_[:, None, None]).sum(0)
+        parts.append(state._replace(warp=_from(-corner, state.warp) / zoom, inverse=inverse))
+    return _State(*(torch.cat(field, -1) for field in zip(*parts, strict=True)))
 
 
 def _descend(

@@ -29,6 +29,9 @@ MIN_DEPTH = 1e-6
 MIN_PIVOT = 1e-6
 
 
+#: First factor of the diagonal in :func:`minimise`.
+INITIAL_DAMPING = 1e-4
+
 #: Displacement, rad or m, by which the derivative of equations in float64 is found.
 DERIVATIVE_STEP = 1e-7
 
@@ -310,7 +313,7 @@ def minimise(
     steps: int,
     *,
     cost: Callable[[S], Tensor] | None = None,
-    damping: float = 1e-4,
+    damping: float = INITIAL_DAMPING,
     step: Callable[[Any, Tensor, Tensor], tuple[Any, Tensor]] = gauss_newton_step,
 ) -> tuple[S, Tensor]:
     """Levenberg–Marquardt with a fixed number of steps; each batch element accepts or rejects its own.

@@ -11,8 +11,8 @@ C[o] = sum_p g(p) J(p + o), o an offset in whole pixels. This *map* C is compute
 a depthwise convolution whose channels are the points. After that a step touches eight numbers per point, and no pixel.
 Coarse levels only provide a start: there the points of a small *cell* of the image share one search.
 
-The same without maps, one point at a time: ``search`` of ``tests/support/reference.py``; one level of it in compiled
-code: :mod:`dhtorch.ops.loader`.
+The same without maps, one point at a time: ``search`` of ``tests/support/reference.py``. One level of the search has a
+compiled kernel.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from dhtorch.geometry.checks import all_finite, is_static
 from dhtorch.geometry.determinism import ELEMENTWISE_LANES, MAX_CHUNK_POINTS
 from dhtorch.geometry.linalg import adjugate_2x2, determinant_2x2, eigenvalues_2x2
 from dhtorch.geometry.patches import QUANTISATION_VARIANCE
-from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, Pyramid
-from dhtorch.ops import loader
+from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, OUTSIDE_MARGIN_PX, Pyramid
+from dhtorch.ops.dispatch import operator
 
 #: Width of a cell, px of its level, and the finest level with cells. Coarse levels only say where the next one starts:
 #: there the points of a cell share one search. Cells are nested, so that they share its start as well.
@@ -132,10 +132,10 @@ def search_displacements(
         radii = TOP_RADII if level == top or level + 1 == near_levels else MIDDLE_RADII
         pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
         every = torch.ones_like(batch, dtype=torch.bool)
-        return _descend(pair, radii, pixel, start(level, x, d, batch, begun), batch, every)[0]
+        return _search_level(pair, radii, pixel, start(level, x, d, batch, begun), batch, every)[0]
 
     pair = _Pair(source, target, o, 0, *target.bounds(0))
-    d, held, textured, A = _descend(
+    d, held, textured, A = _search_level(
         pair, FINEST_RADII if top else TOP_RADII, x, start(0, x, d, batch, begun), batch, known
     )
     return d, known & textured & held & is_between(x + d, pair.low, pair.high), A
@@ -233,38 +233,32 @@ def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, b
     return search(cells).index_select(-1, (wanted.cumsum(0) - 1)[own])
 
 
-def _descend(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
+def _search_level(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
     """One level: all points on a first map, then those that need it on further ones.
 
     Returns the displacement; who stayed on the last map, and whose window is textured (both (M,)); and A (3, M).
     """
-    o = pair.o
     levels = pair.source.levels[pair.level], pair.target.levels[pair.level]
-    if loader.serves(*levels, x, d, batch, known) and levels[0].dtype == levels[1].dtype == x.dtype == torch.float32:
-        return _compiled(pair, radii, x, d, batch, known)
-    corner = pair.target.corner(pair.level, x + d) - radii[0]
-    C, moments = _map(pair, radii[0], x, corner, batch)
-    A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
-    windows = _Templates(x, batch, moments, A_inv)
-    live = known & textured & is_between(x + d, pair.low, pair.high)
-    first, *further = (min(STEPS_PER_MAP, o.iterations - k * STEPS_PER_MAP) for k in range(len(radii)))
-    state = _on_map(pair, first, _steps(C, moments, A_inv), corner, x, _State(d, live, live))
-    for radius, steps in zip(radii[1:], further, strict=True):
-        if steps > 0:
-            again = partial(_on_new_map, pair, radius, steps)
-            state = _State(*masked_apply(state.live, again, state, (windows, state)))
-    return state.d, state.held, textured, moments[2:5]
+    return _lk_level(*levels, x, d, batch, known, pair=pair, radii=radii)
 
 
-def _compiled(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
-    """:func:`_descend` in compiled code (:mod:`dhtorch.ops.loader`), the same up to the rounding of sums over a
-    window."""
+def _lk_level_kernel(
+    source: Tensor,
+    target: Tensor,
+    x: Tensor,
+    d: Tensor,
+    batch: Tensor,
+    known: Tensor,
+    *,
+    pair: _Pair,
+    radii: tuple[int, ...],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     o = pair.o
     found, A = d.new_empty(2, d.shape[-1]), d.new_empty(3, d.shape[-1])
     held, textured = torch.empty_like(known), torch.empty_like(known)
-    torch.ops.dhtorch.descend(
-        source=pair.source.levels[pair.level],
-        target=pair.target.levels[pair.level],
+    torch.ops.dhtorch.lk_level.default(
+        source=source,
+        target=target,
         x=x,
         d=d,
         batch=batch,
@@ -277,13 +271,52 @@ def _compiled(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: 
         textured=textured,
         window=o.window,
         iterations=o.iterations,
-        level=pair.level,
+        steps_per_map=STEPS_PER_MAP,
         pad=pair.source.pad,
-        normalise=NORMALISATIONS.index(o.normalise),
+        margin=OUTSIDE_MARGIN_PX,
+        remove_bias=o.normalise != "none",
+        estimate_gain=o.normalise == "gain_bias",
         epsilon=o.epsilon_px,
         min_eigenvalue=o.min_eigenvalue,
+        min_gain=CONTRAST_RATIO_RANGE[0],
+        max_gain=CONTRAST_RATIO_RANGE[1],
+        finest=pair.level == 0,
+        aitken_step=AITKEN_STEP,
+        min_ratio=AITKEN_RATIO_RANGE[0],
+        max_ratio=AITKEN_RATIO_RANGE[1],
     )
     return found, held, textured, A
+
+
+@operator(
+    kernel=_lk_level_kernel,
+    dtypes=dict.fromkeys(("source", "target", "x", "d"), torch.float32) | {"batch": torch.int64, "known": torch.bool},
+)
+def _lk_level(
+    source: Tensor,
+    target: Tensor,
+    x: Tensor,
+    d: Tensor,
+    batch: Tensor,
+    known: Tensor,
+    *,
+    pair: _Pair,
+    radii: tuple[int, ...],
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """:func:`_search_level` on the level of ``pair`` that ``source`` and ``target`` are."""
+    o = pair.o
+    corner = pair.target.corner(pair.level, x + d) - radii[0]
+    C, moments = _map(pair, radii[0], x, corner, batch)
+    A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
+    windows = _Templates(x, batch, moments, A_inv)
+    live = known & textured & is_between(x + d, pair.low, pair.high)
+    first, *further = (min(STEPS_PER_MAP, o.iterations - k * STEPS_PER_MAP) for k in range(len(radii)))
+    state = _on_map(pair, first, _steps(C, moments, A_inv), corner, x, _State(d, live, live))
+    for radius, steps in zip(radii[1:], further, strict=True):
+        if steps > 0:
+            again = partial(_on_new_map, pair, radius, steps)
+            state = _State(*masked_apply(state.live, again, state, (windows, state)))
+    return state.d, state.held, textured, moments[2:5]
 
 
 def _on_new_map(pair: _Pair, radius: int, steps: int, windows: _Templates, state: _State) -> _State:

@@ -15,20 +15,14 @@ from torch import Tensor
 
 from dhtorch.geometry.checks import check, is_transformed
 from dhtorch.geometry.determinism import ELEMENTWISE_LANES
-from dhtorch.ops import loader
+from dhtorch.ops.constants import LUMA_THOUSANDTHS, MAX_KERNEL_WINDOW_PX
+from dhtorch.ops.dispatch import operator
 
 #: ITU-R BT.601 luma, the weights of ``cv2.cvtColor`` (``tests/geometry/test_patches.py``).
-LUMA_WEIGHTS = (0.299, 0.587, 0.114)
-_THOUSANDTHS = (299.0, 587.0, 114.0)
+LUMA_WEIGHTS = tuple(k / 1000 for k in LUMA_THOUSANDTHS)
 
 #: Numbers of patches that are summarised together: few enough to stay in cache, and to need no fresh memory pages.
 MAX_CHUNK_NUMBERS = 1 << 18
-
-#: Operations of compiled code → the type of pixels that they read, and how many numbers they find.
-COMPILED_REDUCTIONS = {"extremes": (torch.float32, 2), "brightness": (torch.uint8, 4), "texture": (torch.uint8, 1)}
-
-#: Widest windows that compiled code reads, px.
-MAX_COMPILED_WINDOW_PX = 16
 
 #: Share of an image's pixels from which on windows of the whole image are faster than as many patches.
 WHOLE_IMAGE_RATIO = 0.25
@@ -44,15 +38,13 @@ def reduce_patches(
     reduce: Callable[[Tensor], tuple[Tensor, ...]],
     *,
     grey: bool = False,
-    compiled: str | None = None,
 ) -> tuple[Tensor, ...]:
     """A few numbers (B, N) about the patch around each pixel, without keeping the patches.
 
     ``reduce`` sees some points at a time and turns their pixels (C, size, size, P), points last, into tensors (P,);
     with ``grey`` their grey values (size, size, P). Whatever it does pixel by pixel then runs along contiguous points.
     It must treat every point alike and may not count on P, which is a multiple of LANES: the last ones are there to
-    fill up. A patch that would leave the image is moved back inside. ``compiled`` names the operation of
-    :data:`COMPILED_REDUCTIONS` that does the same.
+    fill up. A patch that would leave the image is moved back inside.
 
     Raises:
         ValueError: wrong shapes, or an image smaller than a patch.
@@ -64,14 +56,6 @@ def reduce_patches(
     B, N, C, H, W = (sizes[k] for k in "BNCHW")
     _must_fit("reduce_patches", size, H, W)
     flat, (b, c, v, u) = flatten_images(image)
-    if compiled is not None and size <= MAX_COMPILED_WINDOW_PX and loader.serves(flat, pixel):
-        kind, count = COMPILED_REDUCTIONS[compiled]
-        if image.dtype == kind:
-            found = image.new_empty(count, B, N, dtype=torch.float32)
-            shape = (b, c, v, u, C, H, W, size)
-            exact = (u == 3 and product_is_exact(image),) if grey else ()
-            getattr(torch.ops.dhtorch, f"window_{compiled}").default(flat, pixel, found, *shape, *exact)
-            return found.unbind(0)
     x, y = _moved_inside(pixel if image.numel() < 1 << 31 else pixel.long(), (H, W), size)
     middle = torch.add(x if u == 1 else x * u, y, alpha=v)
     whole: Any = {"device": image.device, "dtype": middle.dtype}
@@ -93,6 +77,24 @@ def reduce_patches(
     numbers = [reduce(luma(pixels, 0)[0] if grey else pixels) for pixels in seen]
     joined = numbers[0] if len(parts) == 1 else [torch.cat(x) for x in zip(*numbers, strict=True)]
     return tuple((x[: B * N] if fill else x).view(B, N) for x in joined)
+
+
+def fits_window_kernel(_image: Tensor, _pixel: Tensor, *, size: int) -> bool:
+    """Whether kernels read windows of this size."""
+    return size <= MAX_KERNEL_WINDOW_PX
+
+
+def window_arguments(image: Tensor, pixel: Tensor, size: int) -> tuple[Tensor, Tensor, tuple[int, ...]]:
+    """What a kernel reads of windows (B, N): the images as one row of numbers, the pixels, and the steps from image to
+    image, channel, row and column, channels, height, width and window size.
+
+    Raises:
+        ValueError: as :func:`reduce_patches`.
+    """
+    sizes = check("reduce_patches", image=(image, "B C H W"), pixel=(pixel, "B N 2"))
+    _must_fit("reduce_patches", size, sizes["H"], sizes["W"])
+    flat, steps = flatten_images(image)
+    return flat, pixel, (*steps, *(sizes[k] for k in "CHW"), size)
 
 
 def whole_is_faster(hw: tuple[int, int], n: int, size: int) -> bool:
@@ -148,7 +150,7 @@ def _read_rows(flat: Tensor, grey: bool, around: Tensor, middle: Tensor) -> Tens
 def _weights(size: int, device: torch.device) -> Tensor:
     """The matrix (size, 3 size) that makes a row of pixels grey."""
     weight = torch.eye(size, dtype=torch.float32, device=device)[..., None]
-    return (weight * torch.tensor(_THOUSANDTHS, dtype=torch.float32, device=device)).flatten(1)
+    return (weight * torch.tensor(LUMA_THOUSANDTHS, dtype=torch.float32, device=device)).flatten(1)
 
 
 def _in_memory(x: Tensor) -> Tensor:
@@ -262,13 +264,16 @@ def nearest_pixel_index(hw: tuple[int, int], pixel: Tensor) -> tuple[Tensor, Ten
     return torch.add(x, y, alpha=hw[1]).long(), (x == pixel[..., 0]) & (y == pixel[..., 1])
 
 
+def _containing_pixels_kernel(uv: Tensor) -> Tensor:
+    uv = uv.contiguous()  # samples that a batch shares are a view
+    pixel = torch.empty_like(uv, dtype=torch.int32)
+    torch.ops.dhtorch.containing_pixels.default(uv, pixel)
+    return pixel
+
+
+@operator(kernel=_containing_pixels_kernel, dtypes={"uv": torch.float32}, any_layout=("uv",))
 def containing_pixels(uv: Tensor) -> Tensor:
     """The pixel that each ``uv`` lies in, int32; one outside of any image where it is no place at all."""
-    near = uv.contiguous()  # samples that a batch shares are a view
-    if loader.serves(near) and near.dtype == torch.float32:
-        pixel = torch.empty_like(near, dtype=torch.int32)
-        torch.ops.dhtorch.pixels.default(near, pixel)
-        return pixel
     return round_half_up(uv.nan_to_num(-1.0)).int()
 
 

@@ -14,7 +14,7 @@ All costs are whole numbers: they depend on no order of summation, so not on bat
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -26,7 +26,8 @@ from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.checks import all_finite, all_known, check
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.windows import window_sum
-from dhtorch.ops import loader
+from dhtorch.ops.constants import FIT_RADIUS_PX
+from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import Record, record
 
 #: Offsets (down, right) of the signs of a census: a checkerboard of 9 x 7 pixels without its middle.
@@ -48,8 +49,15 @@ ROWS_PER_BLOCK = 32
 #: How far beyond view 0's border its points are looked for: the longer side over this.
 BORDER_DIVISOR = 4
 
+#: Least variance in a window of the grey value's change with inverse depth, m².
+FLAT_GRADIENT_VARIANCE = 1e-12
+
 #: Gains between two windows that are believed, and the variance of grey values under which nothing is seen.
 WINDOW_GAIN_RANGE, FLAT_VARIANCE = (0.5, 2.0), 1e-8
+
+#: A point at less than this depth in view 1, as a share of its depth in view 0, is behind it; and the factor by which
+#: its pixel is then moved out of every picture.
+MIN_DEPTH_RATIO, BEHIND_SCALE = 1e-3, 1e9
 
 
 @record
@@ -88,7 +96,7 @@ class EpipolarWarp(NamedTuple):
     def at(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels u and v, (B, N) each, at inverse depths q (B, N) or (B, 1); far outside where behind view 1."""
         z = 1 + q * self.c
-        scale = torch.where(z > 1e-3, 1 / z, 1e9)
+        scale = torch.where(z > MIN_DEPTH_RATIO, 1 / z, BEHIND_SCALE)
         u, v = ((self.a[:, k] + q * self.b[:, k]) * scale for k in (0, 1))
         return u, v
 
@@ -146,30 +154,45 @@ def project_inverse_depth(view: SweptView, ray: Tensor, q: Tensor) -> tuple[Tens
     """Where view 1 sees the points on rays (B, N, 3) at inverse depths q (B, N): pixels (B, N, 2) of its picture, and
     whether they lie before it (B, N). Gradient: to everything."""
     check("project_inverse_depth", ray=(ray, "B N 3"), q=(q, "B N"), t=(view.T_1_from_0.t, "B 3"))
-    R, t, f, c = view.T_1_from_0.R, view.T_1_from_0.t, view.camera.f, view.camera.c
-    if view.camera.distortion is None:
-        given = (
-            ray.mT.contiguous(),
-            q,
-            R,
-            t,
-            torch.zeros_like(t) if view.shutter_rate is None else view.shutter_rate,
-            f,
-            c,
-        )
-        if loader.serves(*given):
-            uv = torch.empty_like(given[0][:, :2])
-            front = torch.empty_like(q, dtype=torch.bool)
-            torch.ops.dhtorch.seen_at(*given, uv, front)
-            return uv.mT, front
+    T, camera = view.T_1_from_0, view.camera
+    if camera.distortion is None:
+        motion = T.R, T.t, view.shutter_rate
+        return _project_pinhole(ray, q, *motion, camera.f, camera.c)
+    xyz, front = _move_points(ray, q, T.R, T.t, view.shutter_rate)
+    return cam.project(camera, torch.stack(xyz, -1)), front
+
+
+def _move_points(
+    ray: Tensor, q: Tensor, R: Tensor, t: Tensor, shutter_rate: Tensor | None
+) -> tuple[list[Tensor], Tensor]:
+    """Points R r + q t of view 1, three planes (B, N) with 1 where they are behind it, and whether they are not."""
     x, y, z = (part + q * t[:, None] for part, t in zip(rotate_rays(R, ray), t.unbind(-1), strict=True))
-    if view.shutter_rate is not None:
-        p, o, s = (view.shutter_rate[:, k, None] * ray[..., 1] for k in range(3))
+    if shutter_rate is not None:
+        p, o, s = (shutter_rate[:, k, None] * ray[..., 1] for k in range(3))
         x, y, z = x + (o * z - s * y), y + (s * x - p * z), z + (p * y - o * x)
-    front = z > 1e-3
-    x, y, z = (torch.where(front, part, 1.0) for part in (x, y, z))
-    if view.camera.distortion is not None:
-        return cam.project(view.camera, torch.stack([x, y, z], -1)), front
+    front = z > MIN_DEPTH_RATIO
+    return [torch.where(front, part, 1.0) for part in (x, y, z)], front
+
+
+def _project_pinhole_kernel(*tensors: Any) -> tuple[Tensor, Tensor]:
+    ray, q, R, t, shutter_rate, f, c = tensors
+    planes = ray.mT.contiguous()
+    uv = torch.empty_like(planes[:, :2])
+    front = torch.empty_like(q, dtype=torch.bool)
+    motion = R, t, torch.zeros_like(t) if shutter_rate is None else shutter_rate
+    torch.ops.dhtorch.project_inverse_depth.default(planes, q, *motion, f, c, *(uv, front), MIN_DEPTH_RATIO)
+    return uv.mT, front
+
+
+@operator(
+    kernel=_project_pinhole_kernel,
+    dtypes=dict.fromkeys(("ray", "q", "R", "t", "shutter_rate", "f", "c"), torch.float32),
+    any_layout=("ray",),
+)
+def _project_pinhole(*tensors: Any) -> tuple[Tensor, Tensor]:
+    """:func:`project_inverse_depth` into a camera without distortion."""
+    ray, q, R, t, shutter_rate, f, c = tensors
+    (x, y, z), front = _move_points(ray, q, R, t, shutter_rate)
     places = [part / z * f[:, k, None] + c[:, k, None] for k, part in enumerate((x, y))]
     return torch.stack(places, 1).mT, front
 
@@ -182,14 +205,17 @@ def rotate_rays(R: Tensor, ray: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return right, down, ahead
 
 
+def _sample_bilinear_kernel(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
+    axes = uv.mT.contiguous()
+    values = image.new_empty(*image.shape[:2], uv.shape[1])
+    inside = torch.empty_like(axes[:, 0], dtype=torch.bool)
+    torch.ops.dhtorch.sample_bilinear.default(image, axes, values, inside)
+    return values, inside
+
+
+@operator(kernel=_sample_bilinear_kernel, dtypes={"image": torch.float32, "uv": torch.float32}, any_layout=("uv",))
 def sample_bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
     """Values (B, C, N) of pictures (B, C, H, W) at pixels (B, N, 2), and which lie inside (B, N). Gradient: to both."""
-    axes = uv.mT.contiguous()
-    if loader.serves(image, axes) and image.dtype == axes.dtype == torch.float32:
-        found = image.new_empty(*image.shape[:2], uv.shape[1])
-        shown = torch.empty_like(axes[:, 0], dtype=torch.bool)
-        torch.ops.dhtorch.bilinear(image, axes, found, shown)
-        return found, shown
     H, W = image.shape[-2:]
     size = uv.new_tensor([W, H])
     inside = ((uv >= 0) & (uv <= size - 1)).all(-1)
@@ -209,11 +235,18 @@ def epipolar_warp(base: ReferenceView, view: SweptView) -> EpipolarWarp:
 def census_transform(grey: Tensor) -> Tensor:
     """Codes (B, h, w) int32 of pictures (B, 1, h, w): of each of 31 neighbours whether it is darker than the middle."""
     check("census_transform", grey=(grey, "B 1 h w"))
+    return _census(grey)
+
+
+def _census_kernel(grey: Tensor) -> Tensor:
+    code = torch.empty_like(grey[:, 0], dtype=torch.int32)
+    torch.ops.dhtorch.census_transform.default(grey[:, 0], torch.tensor(CENSUS_OFFSETS), code)
+    return code
+
+
+@operator(kernel=_census_kernel, dtypes={"grey": torch.float32})
+def _census(grey: Tensor) -> Tensor:
     h, w = grey.shape[-2:]
-    if loader.serves(grey) and grey.dtype == torch.float32:
-        code = torch.empty_like(grey[:, 0], dtype=torch.int32)
-        torch.ops.dhtorch.census(grey[:, 0], torch.tensor(CENSUS_OFFSETS), code)
-        return code
     padded, middle = F.pad(grey, (4, 4, 3, 3), mode="replicate")[:, 0], grey[:, 0]
     code = torch.zeros_like(middle, dtype=torch.int32)
     for first in range(0, len(CENSUS_OFFSETS), 8):  # a byte at a time is a quarter of the memory
@@ -249,8 +282,12 @@ def rectify_view(base: ReferenceView, view: SweptView, wanted: Tensor) -> Rectif
 def census_cost(base: ReferenceView, seen: RectifiedView, go: EpipolarWarp, q: Tensor) -> Tensor:
     """How badly pixels fit at inverse depths q (B, N) or (B, 1): signs that differ, (B, N) int32; UNSEEN where view 1
     does not show them. Gradient: none."""
+    return _census_cost(base.code.flatten(1), seen, go, q)
+
+
+def _census_cost(code_0: Tensor, seen: RectifiedView, go: EpipolarWarp, q: Tensor) -> Tensor:
     code = seen.code.gather(1, go.cell(q, seen.hw, seen.margin))
-    count = count_set_bits(code ^ base.code.flatten(1))
+    count = count_set_bits(code ^ code_0)
     unseen = code.bitwise_right_shift(31)  # all bits or none; masks take three times as long
     return count.add_(unseen.bitwise_and_(UNSEEN_COST - count))
 
@@ -267,20 +304,63 @@ def add_census_costs(
 ) -> None:
     """Add to C how badly every pixel fits a view at every plane; ``fresh``: C holds nothing yet.
 
-    At most :data:`MAX_SWEPT_VIEWS` views fit into a byte. C may lie in memory with its planes last, as compiled code
-    wants it (:mod:`dhtorch.ops.loader`). Memory: pictures of view 0's size, whatever D. Gradient: none.
+    At most :data:`MAX_SWEPT_VIEWS` views fit into a byte. C is of :func:`new_cost_volume`, or has its planes first in
+    memory. Memory: pictures of view 0's size, whatever D. Gradient: none.
     """
-    go = epipolar_warp(base, view)
     seen = rectify_view(base, view, wanted)
-    given = base.code.flatten(1), seen.code, go.a, go.b[..., 0].contiguous(), go.c[:, 0].contiguous(), q.contiguous()
-    last = C.movedim(1, -1)
-    if loader.serves(last, *given):
-        torch.ops.dhtorch.add_costs(last, *given, *seen.hw, seen.margin, UNSEEN_COST, fresh)
-        return
+    places = seen.hw, seen.margin
+    _add_costs(
+        C.movedim(1, -1), base.code.flatten(1), seen.code, *epipolar_warp(base, view), q, places=places, fresh=fresh
+    )
+
+
+def _add_costs_kernel(*tensors: Any, places: tuple[tuple[int, int], int], fresh: bool) -> None:
+    C, code_0, code_1, a, b, c, q = tensors
+    hw, margin = places
+    warp = a, b[..., 0].contiguous(), c[:, 0].contiguous()
+    limits = UNSEEN_COST, MIN_DEPTH_RATIO, BEHIND_SCALE
+    torch.ops.dhtorch.add_census_costs.default(C, code_0, code_1, *warp, q.contiguous(), *hw, margin, *limits, fresh)
+
+
+@operator(
+    kernel=_add_costs_kernel,
+    dtypes={"C": torch.uint8, "code_0": torch.int32, "code_1": torch.int32}
+    | dict.fromkeys(("a", "b", "c", "q"), torch.float32),
+    any_layout=("b", "c", "q"),
+)
+def _add_costs(*tensors: Any, places: tuple[tuple[int, int], int], fresh: bool) -> None:
+    """:func:`add_census_costs` to C (B, h, w, D), of codes (B, N) and (B, H · W), the fields of :class:`EpipolarWarp`
+    and the size and margin of the rectified view."""
+    C, code_0, code_1, a, b, c, q = tensors
+    seen = RectifiedView(code_1, *places)
+    go = EpipolarWarp(a, b, c)
     if fresh:
         C.zero_()
     for k in range(q.shape[1]):
-        C[:, k] += census_cost(base, seen, go, q[:, k, None]).to(torch.uint8).unflatten(-1, base.hw)
+        C[..., k] += _census_cost(code_0, seen, go, q[:, k, None]).to(torch.uint8).unflatten(-1, C.shape[1:3])
+
+
+def _new_cost_volume_kernel(q: Tensor, *, hw: tuple[int, int]) -> Tensor:
+    return torch.empty(len(q), *hw, q.shape[1], dtype=torch.uint8).movedim(-1, 1)  # the kernel adds pixel by pixel
+
+
+@operator(kernel=_new_cost_volume_kernel, dtypes={"q": torch.float32})
+def new_cost_volume(q: Tensor, *, hw: tuple[int, int]) -> Tensor:
+    """Memory for costs (B, D, h, w) uint8 at planes q (B, D), in the layout that :func:`add_census_costs` fills in the
+    least time; its values are undefined. Gradient: none."""
+    return torch.empty(*q.shape, *hw, dtype=torch.uint8, device=q.device)
+
+
+def planes_last(C: Tensor) -> Tensor:
+    """Costs (B, D, h, w) as (B, h, w, D), contiguous; a view of those of :func:`new_cost_volume` where that is
+    possible. Gradient: none."""
+    view = C.movedim(1, -1)
+    if view.is_contiguous():
+        return view
+    last = C.new_empty(view.shape)
+    for pixels_last, planes_last in zip(C.flatten(2), last.flatten(1, 2), strict=True):
+        planes_last.copy_(pixels_last.t())  # of a matrix at once takes a quarter of what a permutation does
+    return last
 
 
 def aggregate_costs(
@@ -357,24 +437,30 @@ def _winner(S: Tensor) -> tuple[Tensor, ...]:
     return index, shift, cost.to(S.dtype)
 
 
+def _aggregate_best_plane_kernel(C: Tensor, views: Tensor) -> tuple[BestPlane, Tensor]:
+    B, h, w, D = C.shape
+    prices = ((price * views).to(torch.int16).expand(B).contiguous() for price in (STEP_COST, JUMP_COST))
+    best = BestPlane(*(torch.empty(B, h, w, dtype=dtype) for dtype in (torch.int64, torch.float32, torch.int16)))
+    some = torch.empty(B, (h + 1) // 2, (w + 1) // 2, D, dtype=torch.int16)
+    torch.ops.dhtorch.aggregate_best_plane.default(C, *prices, *best, some)
+    return best, some
+
+
+@operator(
+    kernel=_aggregate_best_plane_kernel,
+    dtypes={"C": torch.uint8, "views": (torch.int64, torch.int32, torch.int16)},
+    any_layout=("views",),
+)
 def aggregate_best_plane(
     C: Tensor,  # (B, h, w, D) uint8
     views: Tensor,  # (B,) how many views' costs are in C
 ) -> tuple[BestPlane, Tensor]:
     """The best planes of the best surface, and its cost (B, ⌈h/2⌉, ⌈w/2⌉, D) at every other pixel, both ways.
 
-    What :func:`best_plane` says of :func:`aggregate_costs`, whose answer compiled code (:mod:`dhtorch.ops.loader`)
-    never writes down.
+    :func:`best_plane` of :func:`aggregate_costs`; the kernel keeps the costs of two rows only.
     """
-    if not loader.serves(C) or C.dtype != torch.uint8:
-        S = aggregate_costs(C, views)
-        return best_plane(S), S[:, ::2, ::2]
-    B, h, w, D = C.shape
-    prices = ((price * views).to(torch.int16).expand(B).contiguous() for price in (STEP_COST, JUMP_COST))
-    best = BestPlane(*(torch.empty(B, h, w, dtype=dtype) for dtype in (torch.int64, torch.float32, torch.int16)))
-    some = torch.empty(B, (h + 1) // 2, (w + 1) // 2, D, dtype=torch.int16)
-    torch.ops.dhtorch.surface(C, *prices, *best, some)
-    return best, some
+    S = aggregate_costs(C, views)
+    return best_plane(S), S[:, ::2, ::2]
 
 
 def second_best_margin(some: Tensor, best: BestPlane, reach: Tensor) -> Tensor:
@@ -384,28 +470,34 @@ def second_best_margin(some: Tensor, best: BestPlane, reach: Tensor) -> Tensor:
     :func:`aggregate_best_plane`; its neighbours have its answer. Gradient: none.
     """
     plane, cost = (x[:, ::2, ::2].contiguous() for x in (best.plane, best.cost))
-    if loader.serves(some, plane) and some.dtype == torch.int16:
-        more = torch.empty_like(cost)
-        for b, far in enumerate(reach.tolist()):
-            torch.ops.dhtorch.elsewhere(some[b].flatten(0, 1), plane[b], more[b], int(far))
-        return _for_all(more - cost, best.cost)
+    return _for_all(_second_best(some, plane, reach) - cost, best.cost)
+
+
+def _second_best_kernel(some: Tensor, plane: Tensor, reach: Tensor) -> Tensor:
+    least = torch.empty_like(plane, dtype=torch.int16)
+    for b, far in enumerate(reach.tolist()):
+        torch.ops.dhtorch.second_best.default(some[b].flatten(0, 1), plane[b], least[b], int(far))
+    return least
+
+
+@operator(
+    kernel=_second_best_kernel,
+    dtypes={"some": torch.int16, "plane": torch.int64, "reach": torch.float32},
+    any_layout=("reach",),
+)
+def _second_best(some: Tensor, plane: Tensor, reach: Tensor) -> Tensor:
+    """Least cost (B, h, w) of ``some`` (B, h, w, D) further than ``reach`` (B,) planes from ``plane`` (B, h, w)."""
     places = torch.arange(some.shape[-1], dtype=torch.int16, device=some.device)
     reach, found = reach.to(torch.int16)[:, None, None, None], []
-    for part, at, least in zip(
-        *(x.split(ROWS_PER_BLOCK // 2, 1) for x in (some, plane, cost)), strict=True
-    ):  # as it is read
+    for part, at in zip(*(x.split(ROWS_PER_BLOCK // 2, 1) for x in (some, plane)), strict=True):  # as it is read
         near = (places - at[..., None].to(torch.int16)).abs() <= reach
-        found.append(part.masked_fill(near, torch.iinfo(some.dtype).max).amin(-1) - least)
-    return _for_all(torch.cat(found, 1), best.cost)
+        found.append(part.masked_fill(near, torch.iinfo(some.dtype).max).amin(-1))
+    return torch.cat(found, 1)
 
 
 def _for_all(x: Tensor, like: Tensor) -> Tensor:
     """What was asked at every other pixel, both ways, also for its neighbours."""
     return x.repeat_interleave(2, 1).repeat_interleave(2, 2)[:, : like.shape[1], : like.shape[2]]
-
-
-#: Radius of a window that is fitted.
-FIT_RADIUS_PX = 4
 
 
 class WindowFit(NamedTuple):
@@ -445,52 +537,91 @@ def fit_windows(
     little = 1e-3 * flat.detach().amax(1, keepdim=True).clamp_min(1e-3)
     uv, front = project_inverse_depth(view, base.ray, flat)
     further = project_inverse_depth(view, base.ray, flat + little)[0]
-    given = base.image, picture_1, uv.mT.contiguous(), further.mT.contiguous(), little[:, 0]
-    if radius == FIT_RADIUS_PX and loader.serves(*given) and all(x.dtype == torch.float32 for x in given):
-        return _compiled_fit(*given, front=front)
+    return _fit_windows(base.image, picture_1, uv, further, little, front, radius=radius)
+
+
+def _has_kernel_radius(*_: Tensor, radius: int) -> bool:
+    return radius == FIT_RADIUS_PX
+
+
+def _fit_windows_kernel(
+    grey: Tensor, picture_1: Tensor, uv: Tensor, further: Tensor, little: Tensor, front: Tensor, *, radius: int
+) -> WindowFit:
+    places = uv.mT.contiguous(), further.mT.contiguous(), little[:, 0]
+    outputs = step, contrast, noise, correlation = tuple(torch.empty_like(grey[:, 0]) for _ in range(4))
+    inside = torch.empty_like(step, dtype=torch.bool)
+    motion = torch.empty_like(places[0])
+    limits = *WINDOW_GAIN_RANGE, FLAT_VARIANCE, FLAT_GRADIENT_VARIANCE
+    torch.ops.dhtorch.fit_windows.default(grey, picture_1, *places, *outputs, inside, motion, *limits)
+    seen = inside & front.view_as(inside)
+    return WindowFit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
+
+
+@operator(
+    kernel=_fit_windows_kernel,
+    dtypes=dict.fromkeys(("grey", "picture_1", "uv", "further", "little"), torch.float32) | {"front": torch.bool},
+    any_layout=("uv", "further", "front"),
+    when=_has_kernel_radius,
+)
+def _fit_windows(
+    grey: Tensor, picture_1: Tensor, uv: Tensor, further: Tensor, little: Tensor, front: Tensor, *, radius: int
+) -> WindowFit:
+    """:func:`fit_windows` of view 0's grey values (B, 1, h, w), where view 1 shows its pixels, ``uv`` (B, N, 2), and
+    would show them nearer by ``little`` (B, 1) 1/m, ``further`` (B, N, 2); ``front`` (B, N): not behind it."""
+    hw = grey.shape[-2:]
     motion = (further - uv) / little[..., None]
     values, inside = sample_bilinear(picture_1, uv)
-    J, du, dv = (x.unflatten(-1, base.hw) for x in values.unbind(1))
-    du_dq, dv_dq = (x.unflatten(-1, base.hw) for x in motion.unbind(-1))
+    J, du, dv = (x.unflatten(-1, hw) for x in values.unbind(1))
+    du_dq, dv_dq = (x.unflatten(-1, hw) for x in motion.unbind(-1))
     g = du * du_dq + dv * dv_dq
-    I = base.image[:, 0]  # noqa: E741  (the alphabet of registration)
+    I = grey[:, 0]  # noqa: E741  (the alphabet of registration)
     share = 1 / (2 * radius + 1) ** 2
     products = (I, J, g, I * I, J * J, I * J, g * g, g * I, g * J)
     i, j, k, ii, jj, ij, kk, ki, kj = (share * window_sum(x, radius) for x in products)
     ii, jj, ij = (ii - i * i).clamp_min(FLAT_VARIANCE), (jj - j * j).clamp_min(FLAT_VARIANCE), ij - i * j
-    kk = (kk - k * k).clamp_min(1e-12)
+    kk = (kk - k * k).clamp_min(FLAT_GRADIENT_VARIANCE)
     gain = (ij / jj).clamp(*WINDOW_GAIN_RANGE)
     return WindowFit(
         step=((ki - k * i) - gain * (kj - k * j)) / (gain * kk),
         contrast=kk * gain * gain,
         noise=(ii + gain * gain * jj - 2 * gain * ij).clamp_min(0),
         correlation=ij / (ii * jj).sqrt(),
-        seen=(inside & front).unflatten(-1, base.hw),
-        motion=motion.unflatten(1, base.hw),
+        seen=(inside & front).unflatten(-1, hw),
+        motion=motion.unflatten(1, hw),
     )
-
-
-def _compiled_fit(grey: Tensor, picture_1: Tensor, *places: Tensor, front: Tensor) -> WindowFit:
-    """What :func:`fit_windows` finds at places of every pixel, and of those a little nearer, by how much."""
-    told = step, contrast, noise, correlation = [torch.empty_like(grey[:, 0]) for _ in range(4)]
-    inside = torch.empty_like(step, dtype=torch.bool)
-    motion = torch.empty_like(places[0])
-    torch.ops.dhtorch.fit_windows(grey, picture_1, *places, *told, inside, motion)
-    seen = inside & front.view_as(inside)
-    return WindowFit(step, contrast, noise, correlation, seen, motion.mT.unflatten(1, inside.shape[1:]))
 
 
 def occlusion_mask(go: EpipolarWarp, q: Tensor, tolerance: Tensor) -> Tensor:
     """Which pixels (B, h, w) of a map of inverse depths another one covers in view 1, nearer by more than
     ``tolerance`` (B,) 1/m. Gradient: none."""
-    B, h, w = q.shape
-    edge = max(h, w) // BORDER_DIVISOR
-    given = go.a, go.b[..., 0].contiguous(), go.c[:, 0].contiguous(), q.flatten(1), tolerance
-    if loader.serves(*given) and all(x.dtype == torch.float32 for x in given):
-        covered = torch.empty_like(q, dtype=torch.bool)
-        torch.ops.dhtorch.hidden(*given, covered, rows=h + 2 * edge, columns=w + 2 * edge, margin=edge)
-        return covered
-    index = go.cell(q.flatten(1), (h + 2 * edge, w + 2 * edge), edge)
-    front = q.new_full((B, (h + 2 * edge) * (w + 2 * edge)), -1.0)
-    front = front.scatter_reduce(1, index, q.flatten(1), "amax")
-    return (front.gather(1, index) > q.flatten(1) + tolerance[:, None]).unflatten(1, (h, w))
+    return _occlusion_mask(*go, q.flatten(1), tolerance, hw=(q.shape[1], q.shape[2])).unflatten(1, q.shape[1:])
+
+
+def _with_border(hw: tuple[int, int]) -> tuple[tuple[int, int], int]:
+    """Height and width of a picture with the border in which points beside it are looked for; the border's width."""
+    edge = max(hw) // BORDER_DIVISOR
+    return (hw[0] + 2 * edge, hw[1] + 2 * edge), edge
+
+
+def _occlusion_mask_kernel(
+    a: Tensor, b: Tensor, c: Tensor, q: Tensor, tolerance: Tensor, *, hw: tuple[int, int]
+) -> Tensor:
+    size, edge = _with_border(hw)
+    covered = torch.empty_like(q, dtype=torch.bool)
+    warp = a, b[..., 0].contiguous(), c[:, 0].contiguous()
+    limits = MIN_DEPTH_RATIO, BEHIND_SCALE
+    torch.ops.dhtorch.occlusion_mask.default(*warp, q, tolerance, covered, *size, edge, *limits)
+    return covered
+
+
+@operator(
+    kernel=_occlusion_mask_kernel,
+    dtypes=dict.fromkeys(("a", "b", "c", "q", "tolerance"), torch.float32),
+    any_layout=("b", "c"),
+)
+def _occlusion_mask(a: Tensor, b: Tensor, c: Tensor, q: Tensor, tolerance: Tensor, *, hw: tuple[int, int]) -> Tensor:
+    """:func:`occlusion_mask` (B, N) of a map (B, N) of size ``hw`` and the fields of :class:`EpipolarWarp`."""
+    size, edge = _with_border(hw)
+    index = EpipolarWarp(a, b, c).cell(q, size, edge)
+    front = q.new_full((len(q), size[0] * size[1]), -1.0).scatter_reduce(1, index, q, "amax")
+    return front.gather(1, index) > q + tolerance[:, None]

@@ -18,7 +18,7 @@ from dhtorch.geometry import filters
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.patches import extract_windows
 from dhtorch.geometry.windows import row_bands
-from dhtorch.ops import loader
+from dhtorch.ops.dispatch import operator
 
 #: Padding beyond half a window: how far from a pixel of the image (or of ``OUTSIDE_MARGIN_PX`` around it) a search may
 #: look.
@@ -175,25 +175,26 @@ def build_pyramid(
     h, w = image.shape[-2:]
     while len(chain) < levels and min(h, w) > smallest:
         level = image.new_empty(len(image), 3 if gradients else 1, h + 2 * pad, w + 2 * pad, dtype=dtype)
-        below = chain[-1] if chain else image
-        if loader.serves(below, level) and below.dtype in (torch.uint8, torch.float32):
-            torch.ops.dhtorch.pyramid_level(below, level, pad, bool(chain), below.dtype == torch.uint8)
-        else:
-            _fill(level, pad, image, chain[-1] if chain else None)
+        _fill_level(chain[-1] if chain else image, level, pad=pad, finest=not chain)
         chain.append(level)
         h, w = (h + 1) // 2, (w + 1) // 2
     return Pyramid(tuple(chain), pad)
 
 
-def _fill(level: Tensor, pad: int, image: Tensor, below: Tensor | None) -> None:
-    """Fill a padded level of ``image``, of whose own pixels it is made, or of those of the level ``below`` it."""
+def _fill_level_kernel(below: Tensor, level: Tensor, *, pad: int, finest: bool) -> None:
+    torch.ops.dhtorch.pyramid_level.default(below, level, pad, not finest, below.dtype == torch.uint8)
+
+
+@operator(kernel=_fill_level_kernel, dtypes={"below": (torch.uint8, torch.float32), "level": torch.float32})
+def _fill_level(below: Tensor, level: Tensor, *, pad: int, finest: bool) -> None:
+    """Fill a padded ``level`` from the level ``below`` it, or the ``finest`` from the images themselves."""
     grey = level[:, GREY_PLANE : GREY_PLANE + 1]
     inside = grey[..., pad:-pad, pad:-pad]
-    for part in row_bands(image, inside.shape[-2:]):
-        inside[..., part, :] = filters.grayscale(image[..., part, :]) if below is None else _half(below, pad, part)
+    for part in row_bands(below, inside.shape[-2:]):
+        inside[..., part, :] = filters.grayscale(below[..., part, :]) if finest else _half(below, pad, part)
     _mirror(grey, pad)
     if level.shape[1] > 1:
-        _add_gradients(level, pad, image)
+        _add_gradients(level, pad, below)
 
 
 def _half(level: Tensor, pad: int, part: slice) -> Tensor:
@@ -227,17 +228,17 @@ def _mirror(grey: Tensor, pad: int) -> None:
     grey[..., -pad:, :] = grey[..., -2 * pad - 1 : -pad - 1, :].flip(-2)
 
 
-def _add_gradients(level: Tensor, pad: int, image: Tensor) -> None:
+def _add_gradients(level: Tensor, pad: int, below: Tensor) -> None:
     """Fill the planes beside the grey one: Scharr's filter (3 10 3) x (-1 0 1) / 32, kornia has none; 0 outside."""
     planes, grey = level[:, GRAD_X_PLANE:], level[:, GREY_PLANE : GREY_PLANE + 1]
     for border in (planes[..., :pad, :], planes[..., -pad:, :], planes[..., :pad], planes[..., -pad:]):
         border.zero_()
     rows, width = grey.shape[-2:]
-    for part in row_bands(image, (rows - 2 * pad, width)):
+    for part in row_bands(below, (rows - 2 * pad, width)):
         top, bottom = part.start + pad, part.stop + pad
-        above, here, below = (grey[..., top + k : bottom + k, pad - 1 : width - pad + 1] for k in (-1, 0, 1))
-        across = torch.add(here * (10 / 32), above + below, alpha=3 / 32)
-        slope = below - above
+        above, here, under = (grey[..., top + k : bottom + k, pad - 1 : width - pad + 1] for k in (-1, 0, 1))
+        across = torch.add(here * (10 / 32), above + under, alpha=3 / 32)
+        slope = under - above
         down = torch.add(slope[..., 1:-1] * (10 / 32), slope[..., :-2] + slope[..., 2:], alpha=3 / 32)
         planes[:, :1, top:bottom, pad:-pad] = across[..., 2:] - across[..., :-2]
         planes[:, 1:, top:bottom, pad:-pad] = down

@@ -25,6 +25,9 @@ MAX_DISTANCE_RATIO = 100.0
 #: Residuals of hypotheses that are looked at together: three planes of them stay in cache.
 MAX_CHUNK_RESIDUALS = 1 << 15
 
+#: Points that all hypotheses are scored on first; hypotheses that are then scored on all points; those that are kept.
+PREVIEW_POINTS, SHORTLISTED_POSES, KEPT_POSES = 32, 32, 2
+
 
 def usable_first(
     usable: Tensor,  # (B, N) bool
@@ -110,9 +113,9 @@ def search_hypotheses(
     draws: Tensor,  # (B, H, 3) uniform in [0, 1)
     *,
     threshold_px: float,
-    keep: int = 2,
-    preview: int = 32,
-    shortlist: int = 32,
+    keep: int = KEPT_POSES,
+    preview: int = PREVIEW_POINTS,
+    shortlist: int = SHORTLISTED_POSES,
 ) -> tuple[Pose, Tensor]:
     """The ``keep`` best poses among four solutions of each of H minimal triples.
 

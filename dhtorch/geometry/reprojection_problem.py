@@ -20,7 +20,7 @@ shutter bundle adjustment", 2012.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -37,14 +37,11 @@ from dhtorch.geometry.least_squares import (
 )
 from dhtorch.geometry.linalg import rotate_planes
 from dhtorch.geometry.se3 import Pose, hat
-from dhtorch.ops import loader
+from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import Record, record
 
 #: A far track is not closer to the reference view than the nearest point of the sensor by more than this factor.
 NEAREST_DEPTH_DIVISOR = 2.0
-
-#: The robust kernel that compiled code knows.
-COMPILED_KERNEL = "geman_mcclure"
 
 #: Squared residual (in units of its variance) of a point behind a camera: far beyond every kernel.
 BEHIND_CAMERA_RESIDUAL = 1e4
@@ -264,20 +261,64 @@ def squared_residuals_at(problem: PoseDepthProblem, at: Unknowns) -> Callable[[T
     """
     known = track_constants(problem)
 
-    linear: LinearisedTracks | None = None
+    kept: LinearisedTracks | None = None
+
+    def linear() -> LinearisedTracks:
+        nonlocal kept
+        kept = linearise_tracks(problem, at, columns=False, known=known) if kept is None else kept
+        return kept
 
     def found(noise: Tensor) -> tuple[Tensor, Tensor]:
-        nonlocal linear
-        sphere = _sphere(known, noise)
-        given = _compiled_arguments(problem, known, sphere, at) if loader.serves(noise) else None
-        if given is not None:  # in compiled code, up to rounding: see dhtorch.ops.loader
-            square, front = torch.empty_like(noise), torch.empty_like(problem.near)
-            torch.ops.dhtorch.track_squares(**given, square=square, front=front)
-            return square, front
-        linear = linearise_tracks(problem, at, columns=False, known=known) if linear is None else linear
-        return _lengths(linear, sphere), linear.front
+        return _squares(*_track_tensors(problem, known, _sphere(known, noise), at), linear=linear)
 
     return found
+
+
+#: Dtypes of what the kernels read, in the order of :func:`_track_tensors`.
+_TRACK_DTYPES = {
+    name: torch.bool if name == "near" else torch.float32
+    for name in (
+        *("ray", "inverse", "near"),
+        *("seen", "shape", "height", "nearest", "variance"),
+        *("a", "b", "d"),
+        *("R", "t", "shutter_rate"),
+    )
+}
+
+
+def _track_tensors(
+    problem: PoseDepthProblem, known: TrackConstants, sphere: tuple[Tensor, Tensor, Tensor], at: Unknowns
+) -> tuple[Tensor | None, ...]:
+    """Tracks and unknowns, as the operators on them take them."""
+    return problem.ray, problem.inverse, problem.near, *known, *sphere, at.T.R, at.T.t, at.shutter_rate
+
+
+def _kernel_arguments(*tensors: Any) -> tuple[Tensor, ...]:
+    """The same for a C++ operator: unknowns contiguous, a turn of shape (0, 3) where there is none."""
+    *tracks, R, t, shutter_rate = tensors
+    turn = t.new_empty(0, 3) if shutter_rate is None else shutter_rate.contiguous()
+    return *tracks, R.contiguous(), t.contiguous(), turn
+
+
+def _has_whole_lanes(ray: Tensor, *_: Tensor | None, **__: Any) -> bool:
+    """Whether there are as many tracks as a kernel's vectors divide."""
+    return ray.shape[-1] % SUM_LANES == 0
+
+
+def _squares_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks]) -> tuple[Tensor, Tensor]:
+    given = _kernel_arguments(*tensors)
+    square, front = torch.empty_like(given[1]), torch.empty_like(given[2])
+    limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
+    torch.ops.dhtorch.squared_residuals.default(*given, square, front, *limits)
+    return square, front
+
+
+@operator(kernel=_squares_kernel, dtypes=_TRACK_DTYPES, any_layout=("R", "t", "shutter_rate"), when=_has_whole_lanes)
+def _squares(*tensors: Any, linear: Callable[[], LinearisedTracks]) -> tuple[Tensor, Tensor]:
+    """Squared whitened residuals (B, N) of :func:`_track_tensors`, which are ``linear`` there, and which tracks are in
+    front."""
+    tracks, (a, b, d) = linear(), tensors[8:11]
+    return _lengths(tracks, (a, b, d)), tracks.front
 
 
 def _lengths(linear: LinearisedTracks, sphere: tuple[Tensor, Tensor, Tensor]) -> Tensor:
@@ -336,50 +377,78 @@ def pose_normal_equations_at(
         towards = torch.cat((torch.zeros_like(g[:, :6]), shutter_rate), -1)
         return NormalEquations(total(cost, shutter_rate), H + torch.diag_embed(precision), g + precision * towards)
 
-    def compiled(at: Unknowns, columns: bool) -> NormalEquations | None:
-        """Cost, H and g of the tracks in compiled code (:mod:`dhtorch.ops.loader`), up to the rounding of sums."""
-        given = (
-            _compiled_arguments(problem, known, sphere, at)
-            if kernel == COMPILED_KERNEL and loader.serves(share)
-            else None
-        )
-        if given is None:
-            return None
-        B, n = len(share) if columns else 0, 6 if at.shutter_rate is None else 9
-        found = NormalEquations(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
-        torch.ops.dhtorch.track_equations(**given, share=share, **found._asdict(), bend=bend)
-        return found
+    robust = kernel, bend
 
     def normal(at: Unknowns) -> NormalEquations:
-        found = compiled(at, columns=True)
-        if found is not None:
-            return with_prior(*found, at.shutter_rate)
-        linear = linearise_tracks(problem, at, known=known)
-        rows = _rows(linear, sphere, at.shutter_rate is not None)
-        rho, weight = robust_loss(_square(linear, rows[:, -1]), kernel, bend)
-        H, g = normal_equations(rows, torch.where(linear.front, weight * share, 0.0), block=SUM_LANES)
-        return with_prior((rho * share).sum(-1), H, g, at.shutter_rate)
+        def linear() -> LinearisedTracks:
+            return linearise_tracks(problem, at, known=known)
+
+        tensors = _track_tensors(problem, known, sphere, at)
+        return with_prior(*_equations(*tensors, share, linear=linear, robust=robust), at.shutter_rate)
 
     def cost(at: Unknowns) -> Tensor:
-        found = compiled(at, columns=False)
-        if found is not None:
-            return total(found.cost, at.shutter_rate)
-        square = _lengths(linearise_tracks(problem, at, columns=False, known=known), sphere)
-        return total((robust_loss(square, kernel, bend)[0] * share).sum(-1), at.shutter_rate)
+        def linear() -> LinearisedTracks:
+            return linearise_tracks(problem, at, columns=False, known=known)
+
+        tensors = _track_tensors(problem, known, sphere, at)
+        return total(_robust_cost(*tensors, share, linear=linear, robust=robust), at.shutter_rate)
 
     return normal, cost
 
 
-def _compiled_arguments(
-    problem: PoseDepthProblem, known: TrackConstants, sphere: tuple[Tensor, Tensor, Tensor], at: Unknowns
-) -> dict[str, Tensor] | None:
-    """What compiled code is told of tracks and unknowns; None where it cannot be told."""
-    a, b, d = sphere
-    shutter_rate = at.T.t.new_empty(0, 3) if at.shutter_rate is None else at.shutter_rate.contiguous()
-    told = {k: getattr(problem, k) for k in ("ray", "inverse", "near")} | known._asdict()
-    told |= {"a": a, "b": b, "d": d, "R": at.T.R.contiguous(), "t": at.T.t.contiguous(), "turn": shutter_rate}
-    whole = problem.ray.shape[-1] % SUM_LANES == 0
-    return told if whole and loader.serves(*told.values()) else None
+#: A robust kernel's name and where it bends, as ``least_squares.robust_loss`` takes them.
+_Robust = tuple[str | None, float]
+
+
+def _is_geman_mcclure(ray: Tensor, *_: Tensor | None, linear: Callable[[], LinearisedTracks], robust: _Robust) -> bool:
+    """Whether the compiled kernels have the robust kernel, and as many tracks as their vectors divide."""
+    return robust[0] == "geman_mcclure" and _has_whole_lanes(ray)
+
+
+def _sum_tracks(*tensors: Any, bend: float, with_equations: bool) -> NormalEquations:
+    *tracks, share = tensors
+    given = _kernel_arguments(*tracks)
+    B = len(share) if with_equations else 0
+    n = 9 if len(given[-1]) else 6
+    found = NormalEquations(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
+    limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
+    torch.ops.dhtorch.pose_normal_equations.default(*given, share, *found, bend, *limits)
+    return found
+
+
+def _equations_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> NormalEquations:
+    return _sum_tracks(*tensors, bend=robust[1], with_equations=True)
+
+
+@operator(
+    kernel=_equations_kernel,
+    dtypes=_TRACK_DTYPES | {"share": torch.float32},
+    any_layout=("R", "t", "shutter_rate"),
+    when=_is_geman_mcclure,
+)
+def _equations(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> NormalEquations:
+    """Cost, H and g of :func:`_track_tensors` and the share (B, N) of each in the cost, before any prior."""
+    tracks, (a, b, d), shutter_rate, share = linear(), tensors[8:11], tensors[-2], tensors[-1]
+    rows = _rows(tracks, (a, b, d), shutter_rate is not None)
+    rho, weight = robust_loss(_square(tracks, rows[:, -1]), *robust)
+    H, g = normal_equations(rows, torch.where(tracks.front, weight * share, 0.0), block=SUM_LANES)
+    return NormalEquations((rho * share).sum(-1), H, g)
+
+
+def _robust_cost_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> Tensor:
+    return _sum_tracks(*tensors, bend=robust[1], with_equations=False).cost
+
+
+@operator(
+    kernel=_robust_cost_kernel,
+    dtypes=_TRACK_DTYPES | {"share": torch.float32},
+    any_layout=("R", "t", "shutter_rate"),
+    when=_is_geman_mcclure,
+)
+def _robust_cost(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> Tensor:
+    """The cost (B,) of :func:`_equations` alone."""
+    square = _lengths(linear(), tensors[8:11])
+    return (robust_loss(square, *robust)[0] * tensors[-1]).sum(-1)
 
 
 def _square(linear: LinearisedTracks, r: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from dhtorch.ops import loader
+from dhtorch.ops.dispatch import operator
 
 #: Pixels that are worked on at once: few enough to stay in the cache, and to need no fresh memory.
 MAX_BAND_PIXELS = 1 << 17
@@ -61,6 +61,13 @@ def window_range(q: Tensor, radius: int) -> Tensor:
     return window_extreme(q, radius, torch.maximum) - window_extreme(q, radius, torch.minimum)
 
 
+def _smooth_kernel(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
+    out = torch.empty_like(q)
+    torch.ops.dhtorch.smooth_within_tolerance.default(q, tolerance, out, radius)
+    return out
+
+
+@operator(kernel=_smooth_kernel, dtypes={"q": torch.float32, "tolerance": torch.float32})
 def smooth_within_tolerance(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
     """Inverse depths (B, h, w), each the mean of those along its column, then along its row, up to ``radius`` away that
     differ from it by no more than ``tolerance`` (B,) 1/m: planes stay what they are, and so do edges.
@@ -68,10 +75,6 @@ def smooth_within_tolerance(q: Tensor, tolerance: Tensor, *, radius: int = 4) ->
     A window cannot see how its pixels scatter about their mean, so what is fitted by windows must be smooth within
     them. Gradient: to q.
     """
-    if loader.serves(q, tolerance) and q.dtype == tolerance.dtype == torch.float32:
-        out = torch.empty_like(q)
-        torch.ops.dhtorch.smooth(q, tolerance, out, radius)
-        return out
     near = tolerance[:, None, None]
     for dim in (1, 2):
         n = q.shape[dim]

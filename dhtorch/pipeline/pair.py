@@ -10,9 +10,9 @@ from torch import Tensor
 
 from dhtorch.codes import Gate, PoseCode, Source
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.checks import check, is_transformed
+from dhtorch.geometry.checks import all_finite, check, is_transformed
 from dhtorch.geometry.linalg import small_matmul
-from dhtorch.ops import loader
+from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline.spec import MethodSpec, Trace
 from dhtorch.pytree import chunked_apply
 from dhtorch.records import (
@@ -155,16 +155,9 @@ def merge(samples: Samples, estimate: Estimate | None) -> MergedDepth:
 
     Gradient: to both sources.
     """
-    told = (samples.depth, samples.sigma, samples.confidence)
-    if estimate is None and loader.serves(*told, samples.xyz) and {x.dtype for x in told} == {torch.float32}:
-        depth, sigma, score = (torch.empty_like(x) for x in told)
-        source = torch.empty_like(depth, dtype=torch.int32)
-        torch.ops.dhtorch.sensed.default(*told, samples.xyz, depth, sigma, score, source)
-        return MergedDepth(samples.uv, depth, sigma, score, source)
-    sensed = samples.usable
     if estimate is None:
-        depth, sigma, score = (torch.where(sensed, x, 0.0) for x in told)
-        return MergedDepth(samples.uv, depth, sigma, score, sensed.int() * Source.SENSOR)
+        return MergedDepth(samples.uv, *_sensor_values(samples.depth, samples.sigma, samples.confidence, samples.xyz))
+    sensed = samples.usable
     recovered = estimate.keep & ~sensed
     zero = torch.zeros_like(samples.depth)
 
@@ -179,6 +172,29 @@ def merge(samples: Samples, estimate: Estimate | None) -> MergedDepth:
         score=choose(samples.confidence, estimate.score),
         source=source.to(torch.int32),
     )
+
+
+def _sensor_values_kernel(
+    depth: Tensor, sigma: Tensor, confidence: Tensor, xyz: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    z, noise, score = (torch.empty_like(x) for x in (depth, sigma, confidence))
+    source = torch.empty_like(depth, dtype=torch.int32)
+    outputs = z, noise, score, source
+    torch.ops.dhtorch.sensor_values.default(depth, sigma, confidence, xyz, *outputs)
+    return outputs
+
+
+@operator(
+    kernel=_sensor_values_kernel,
+    dtypes={"depth": torch.float32, "sigma": torch.float32, "confidence": torch.float32, "xyz": torch.float32},
+)
+def _sensor_values(
+    depth: Tensor, sigma: Tensor, confidence: Tensor, xyz: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Depth, sigma, score and source (B, N) of samples with a point (B, N, 3), 0 for the others."""
+    sensed = all_finite(xyz, -1)
+    depth, sigma, score = (torch.where(sensed, x, 0.0) for x in (depth, sigma, confidence))
+    return depth, sigma, score, sensed.int() * Source.SENSOR
 
 
 def upcast_intrinsics(frame: Frame) -> Frame:

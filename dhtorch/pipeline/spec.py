@@ -10,7 +10,6 @@ tracker as its ``hint``.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -97,15 +96,6 @@ def iter_components(*seats: Any) -> Iterator[Any]:
             yield from iter_components(seat.func, *seat.args, *seat.keywords.values())
         else:
             yield seat
-
-
-def options(seat: Any, function: Callable[..., Any]) -> dict[str, Any] | None:
-    """The options by name with which ``function`` sits in a seat, itself or in a partial; None where another does."""
-    own = seat.keywords if isinstance(seat, partial) and seat.func is function and not seat.args else {}
-    if seat is not function and not own:
-        return None
-    known = inspect.signature(function).parameters.values()
-    return {**{p.name: p.default for p in known if p.kind is p.KEYWORD_ONLY}, **own}
 
 
 def iter_networks(*seats: Any) -> Iterator[torch.nn.Module]:

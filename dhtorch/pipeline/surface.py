@@ -8,7 +8,7 @@ Alphabet: q inverse depth (1/m), as in :mod:`dhtorch.geometry.plane_sweep`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from torch import Tensor
 from dhtorch.geometry import plane_sweep
 from dhtorch.geometry import windows as neighbours
 from dhtorch.geometry.checks import any_possible
-from dhtorch.ops import loader
+from dhtorch.ops.dispatch import operator
 from dhtorch.records import PoseFit
 
 #: A pixel's own noise of grey values (a step of eight bits is 0.004), and how many of a window's pixels err by
@@ -41,6 +41,10 @@ EDGE_RADIUS_PX, EDGE_SIGMA_RATIO = 4, 0.17
 
 #: Correlation of its windows from which on a view has a say in a pixel's depth.
 MIN_WINDOW_CORRELATION = 0.5
+
+#: Least values of what the variance by a motion divides by: inverse depth (1/m), squared motion of a pixel ((px·m)²),
+#: depth (m).
+MIN_INVERSE_DEPTH, MIN_SQUARED_MOTION, MIN_ABS_DEPTH = 1e-6, 1e-12, 1e-9
 
 #: Below any weight that a view can have.
 MIN_WEIGHT = 1e-37
@@ -107,11 +111,7 @@ def _idle_cost(source_views: list[SourceView], like: Tensor) -> Tensor:
 
 def _costs(base: plane_sweep.ReferenceView, source_views: list[SourceView], q: Tensor) -> Tensor:
     """How badly every pixel fits all views at every plane, (B, h, w, D) uint8."""
-    shape, planes = base.hw, q.shape[1]
-    if loader.serves(q):  # compiled code goes from pixel to pixel, torch from plane to plane
-        C = torch.empty(len(q), *shape, planes, dtype=torch.uint8).movedim(-1, 1)
-    else:
-        C = torch.empty(len(q), planes, *shape, dtype=torch.uint8, device=q.device)
+    C = plane_sweep.new_cost_volume(q, hw=base.hw)
     fresh = True
     for view, _, _, use in source_views:
         if any_possible(use):
@@ -119,12 +119,7 @@ def _costs(base: plane_sweep.ReferenceView, source_views: list[SourceView], q: T
             fresh = False
     if fresh:
         C.zero_()
-    if loader.serves(q):
-        return C.movedim(1, -1)
-    last = C.new_empty(len(q), *shape, planes)
-    for pixels_last, planes_last in zip(C.flatten(2), last.flatten(1, 2), strict=True):
-        planes_last.copy_(pixels_last.t())  # of a matrix at once takes a quarter of what a permutation does
-    return last
+    return plane_sweep.planes_last(C)
 
 
 def _second_best_reach(
@@ -222,26 +217,36 @@ def _add_view(
 ) -> _ViewSums:
     """What they said with one view more, where it sees pixels ``here`` (B, h, w): a step of at ``most`` (B,) 1/m, and
     the variance by its motion if that is asked for."""
-    given = one.step, one.contrast, one.noise, one.correlation, here, most
-    if loader.serves(*given, *said) and all(x.dtype == torch.float32 for x in (one.step, said.step, most)):
-        variance = most.new_empty(0) if moved is None else moved
-        torch.ops.dhtorch.weigh(
-            *given,
-            variance,
-            *said,
-            grey=GREY_NOISE**2,
-            independent=INDEPENDENT_WINDOW_PIXELS,
-            say=MIN_WINDOW_CORRELATION,
-        )
-        return said
+    return _add_to_sums(*(one.step, one.contrast, one.noise, one.correlation), here, most, moved, *said)
+
+
+def _add_to_sums_kernel(*tensors: Tensor | None) -> _ViewSums:
+    *given, most, moved, step, weight, shared, best, seen = tensors
+    sums = _ViewSums(step, weight, shared, best, seen)  # type: ignore[arg-type]
+    variance = step.new_empty(0) if moved is None else moved  # type: ignore[union-attr]
+    limits = GREY_NOISE**2, INDEPENDENT_WINDOW_PIXELS, MIN_WINDOW_CORRELATION
+    torch.ops.dhtorch.add_view.default(*given, most, variance, *sums, *limits)  # in place
+    return sums
+
+
+@operator(
+    kernel=_add_to_sums_kernel,
+    dtypes=dict.fromkeys(("step", "contrast", "noise", "correlation"), torch.float32)
+    | {"here": torch.bool}
+    | dict.fromkeys(("most", "moved", "sum_step", "sum_weight", "sum_shared", "best"), torch.float32)
+    | {"seen": torch.bool},
+)
+def _add_to_sums(*tensors: Any) -> _ViewSums:
+    """:func:`_add_view` of the fields of a fit and of the sums, which may be overwritten."""
+    step, contrast, noise, correlation, here, most, moved, sum_step, sum_weight, sum_shared, best, seen = tensors
     with torch.no_grad():
-        own = (one.noise + GREY_NOISE**2) / (INDEPENDENT_WINDOW_PIXELS * one.contrast)
-        say = torch.where(here & (one.correlation > MIN_WINDOW_CORRELATION), 1 / own, 0.0)
-        shared = said.shared if moved is None else said.shared + say * moved
-        best = torch.where(here, torch.maximum(said.best, one.correlation), said.best)
+        own = (noise + GREY_NOISE**2) / (INDEPENDENT_WINDOW_PIXELS * contrast)
+        weight = torch.where(here & (correlation > MIN_WINDOW_CORRELATION), 1 / own, 0.0)
+        shared = sum_shared if moved is None else sum_shared + weight * moved
+        best = torch.where(here, torch.maximum(best, correlation), best)
     limit = most[:, None, None]
-    step = said.step + say * torch.minimum(torch.maximum(one.step, -limit), limit)
-    return _ViewSums(step, said.weight + say, shared, best, said.seen | here)
+    total = sum_step + weight * torch.minimum(torch.maximum(step, -limit), limit)
+    return _ViewSums(total, sum_weight + weight, shared, best, seen | here)
 
 
 def pose_variance(
@@ -254,31 +259,45 @@ def pose_variance(
     """
     cov = fit.cov if fit.shutter is None else fit.shutter.cov
     cov = torch.where(fit.ok[:, None, None], cov, 0.0).nan_to_num().to(q)
-    at, T = q.flatten(1), view.T_1_from_0
-    moved = motion.flatten(1, 2).mT.contiguous()
-    given = base.ray.mT.contiguous(), at, T.R, T.t, view.camera.f, cov.contiguous(), moved
-    if loader.serves(*given) and all(x.dtype == torch.float32 for x in given):
-        variance = torch.empty_like(q)
-        torch.ops.dhtorch.pose_variance(*given, variance)
-        return variance
-    flat = at.clamp_min(1e-6)
-    x, y, z = (
-        part / flat + t[:, None] for part, t in zip(plane_sweep.rotate_rays(T.R, base.ray), T.t.unbind(-1), strict=True)
-    )
-    du, dv = motion.flatten(1, 2).unbind(-1)
-    share = 1 / (du * du + dv * dv).clamp_min(1e-12)
+    T = view.T_1_from_0
+    known = T.R, T.t, view.camera.f, cov
+    return _pose_variance(base.ray, q.flatten(1), *known, motion.flatten(1, 2)).view_as(q)
+
+
+def _pose_variance_kernel(*tensors: Tensor) -> Tensor:
+    ray, q, R, t, f, cov, motion = tensors
+    variance = torch.empty_like(q)
+    limits = MIN_INVERSE_DEPTH, MIN_SQUARED_MOTION, MIN_ABS_DEPTH
+    planes, moved = (x.mT.contiguous() for x in (ray, motion))
+    torch.ops.dhtorch.pose_variance.default(planes, q, *(R, t, f), cov.contiguous(), moved, variance, *limits)
+    return variance
+
+
+@operator(
+    kernel=_pose_variance_kernel,
+    dtypes=dict.fromkeys(("ray", "q", "R", "t", "f", "cov", "motion"), torch.float32),
+    any_layout=("ray", "cov", "motion"),
+)
+def _pose_variance(*tensors: Any) -> Tensor:
+    """:func:`pose_variance` (B, N) on rays (B, N, 3) that move by ``motion`` (B, N, 2) px·m in a view with focal
+    lengths f (B, 2), from the covariance (B, 6, 6) of its motion R, t, or (B, 9, 9) with a shutter's turn."""
+    ray, q, R, t, f, cov, motion = tensors
+    flat = q.clamp_min(MIN_INVERSE_DEPTH)
+    x, y, z = (part / flat + t[:, None] for part, t in zip(plane_sweep.rotate_rays(R, ray), t.unbind(-1), strict=True))
+    du, dv = motion.unbind(-1)
+    share = 1 / (du * du + dv * dv).clamp_min(MIN_SQUARED_MOTION)
     # what a shift of the point does along the motion, as epipolar.point_jacobians, one number a tensor
-    inv_z = 1 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
-    gx, gy = (f[:, None] * inv_z * d * share for f, d in zip(view.camera.f.unbind(-1), (du, dv), strict=True))
+    inv_z = 1 / torch.where(z.abs() < MIN_ABS_DEPTH, torch.full_like(z, MIN_ABS_DEPTH), z)
+    gx, gy = (f[:, None] * inv_z * d * share for f, d in zip(f.unbind(-1), (du, dv), strict=True))
     gz = -(gx * x + gy * y) * inv_z
     turned = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
     row = [*turned, gx, gy, gz]
-    if fit.shutter is not None:
-        row += [r * base.ray[..., 1] for r in turned]
+    if cov.shape[-1] > len(row):
+        row += [r * ray[..., 1] for r in turned]
     total = torch.zeros_like(z)
     for i, r in enumerate(row):  # written out: a matrix product differs with the batch
         carried = row[0] * cov[:, i, 0, None]
         for j in range(1, len(row)):
             carried = torch.addcmul(carried, row[j], cov[:, i, j, None])
         total = torch.addcmul(total, carried, r)
-    return total.clamp_min(0).unflatten(-1, base.hw)
+    return total.clamp_min(0)

@@ -1,7 +1,7 @@
-"""The code that a job can reach: modules that its settings name, what these import, and the data beside them.
+"""Source files that a job depends on: modules named in its settings, their imports, and the data files beside them.
 
-A result counts as finished as long as none of this changes: another experiment, a viewer or the command may be edited
-under a sweep that goes on, a stage may not.
+A result stays valid while none of these files change: editing another experiment, a viewer or the command does not
+invalidate a running sweep, editing a stage does.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 _PACKAGE = "dhtorch"
 
-#: An import of this package at any depth of a file; also one in a docstring, which reaches too far and no harm.
+#: An import of this package anywhere in a file; also matches docstrings, which adds dependencies but misses none.
 _IMPORT_PATTERN = re.compile(
     r"^[ \t]*(?:from[ \t]+(dhtorch[\w.]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+(dhtorch[\w.]*))",
     re.MULTILINE,
@@ -22,7 +22,7 @@ _IMPORT_PATTERN = re.compile(
 
 
 def iter_targets(settings: Any) -> Iterator[str]:
-    """Dotted names of the functions that settings name, at every depth."""
+    """Dotted names of all ``_target_`` functions in nested settings."""
     if isinstance(settings, Mapping):
         if isinstance(settings.get("_target_"), str):
             yield settings["_target_"]
@@ -32,14 +32,13 @@ def iter_targets(settings: Any) -> Iterator[str]:
 
 
 def find_reachable_modules(names: Iterable[str], folder: str | Path | None = None) -> dict[str, Path]:
-    """Name → file of all code behind the dotted ``names`` of modules and functions, and of the data beside it.
+    """Name → file of all code reachable from the dotted ``names`` of modules and functions, and of the data beside it.
 
-    Imports inside functions count like others. Of a package of somebody else the module that is named counts, and what
-    it imports of this one. What files a module may read is told by its folder: all that is no code in the folder of a
-    subpackage counts with its modules.
+    Imports inside functions count. Of a third-party package only the named module counts, and what it imports of this
+    package. All files other than code in the folder of a subpackage count with its modules, which may read them.
 
     Args:
-        names: dotted; what does not exist is passed over.
+        names: dotted; unknown names are ignored.
         folder: of this package; None = the installed package.
     """
     folder = Path(__file__).parents[1] if folder is None else Path(folder)
@@ -51,17 +50,17 @@ def find_reachable_modules(names: Iterable[str], folder: str | Path | None = Non
             if key in found:
                 continue
             found[key] = path
-            # What the package itself names is imported when it is asked for, and then stands here as its own module.
+            # The package's own __init__ imports lazily: such modules appear under their own names.
             if key != "__init__.py":
                 waiting += iter_imports(path.read_text(encoding="utf-8"))
-    beside = {p.parent for key, p in found.items() if "/" in key and not key.startswith(_EXTERNAL_PREFIX)}
-    for place in beside:
-        found |= {p.relative_to(folder).as_posix(): p for p in place.iterdir() if p.is_file() and p.suffix != ".py"}
+    folders = {p.parent for key, p in found.items() if "/" in key and not key.startswith(_EXTERNAL_PREFIX)}
+    for subfolder in folders:
+        found |= {p.relative_to(folder).as_posix(): p for p in subfolder.iterdir() if p.is_file() and p.suffix != ".py"}
     return dict(sorted(found.items()))
 
 
 def iter_imports(source: str) -> Iterator[str]:
-    """Dotted names that a file imports of this package, ``from a import b`` as a.b."""
+    """Source text -> dotted names imported from this package, ``from a import b`` as a.b."""
     for module, names, plain in _IMPORT_PATTERN.findall(source):
         yield plain or module
         for name in re.sub(r"#[^\n]*", "", names).strip("() \n").split(","):
@@ -69,12 +68,12 @@ def iter_imports(source: str) -> Iterator[str]:
                 yield f"{module}.{name.split()[0]}"
 
 
-#: Begins the name of a module of somebody else.
+#: Prefix of the names of third-party modules.
 _EXTERNAL_PREFIX = "elsewhere:"
 
 
 def _find_module_files(name: str, folder: Path) -> dict[str, Path]:
-    """The module that holds ``name``, and the packages that are loaded with it."""
+    """Files of the module with ``name``, and of the packages loaded with it."""
     first, *rest = name.split(".")
     if first != _PACKAGE:
         return _find_external_file(name)
@@ -91,7 +90,7 @@ def _find_module_files(name: str, folder: Path) -> dict[str, Path]:
 
 
 def _find_external_file(name: str) -> dict[str, Path]:
-    """The file of somebody else's module that holds ``name``."""
+    """File of the third-party module with ``name``."""
     parts = name.split(".")
     for length in range(len(parts), 0, -1):
         try:
@@ -99,6 +98,6 @@ def _find_external_file(name: str) -> dict[str, Path]:
         except (ImportError, ValueError, AttributeError):
             continue
         if spec is not None:
-            ours = spec.origin is not None and spec.origin.endswith(".py")
-            return {_EXTERNAL_PREFIX + spec.name: Path(str(spec.origin))} if ours else {}
+            is_python = spec.origin is not None and spec.origin.endswith(".py")
+            return {_EXTERNAL_PREFIX + spec.name: Path(str(spec.origin))} if is_python else {}
     return {}

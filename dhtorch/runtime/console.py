@@ -1,7 +1,7 @@
-"""How the command speaks: progress, how much is said, and whose warnings are heard.
+"""Console output: progress bar, verbosity, warnings, escaping of control characters.
 
-Three levels: ``quiet`` (results and errors), ``normal``, ``verbose`` (what is read and done, and when). The level
-stands in the environment variable ``_VERBOSITY_VARIABLE``, so that the processes of a launcher have it, too.
+Verbosity: ``quiet`` (results and errors), ``normal``, ``verbose`` (log of inputs and steps, with times). It is kept in
+the environment variable ``_VERBOSITY_VARIABLE``, which a launcher's processes inherit.
 """
 
 from __future__ import annotations
@@ -21,30 +21,32 @@ from typing import Any, TextIO
 VERBOSITY_FLAGS = {"-q": "quiet", "--quiet": "quiet", "-v": "verbose", "--verbose": "verbose"}
 _VERBOSITY_VARIABLE = "DHTORCH_VERBOSITY"
 
-#: Below the options of a sub-command that reads its own arguments.
+#: End of the help text of sub-commands with their own argument parser.
 HELP_EPILOG = (
-    "-q says no more than what was asked for and -v what is read and done, as for every word of dhtorch. "
-    "Exit code: 0 done, 2 bad option or bad data, 130 interrupted, 143 or 129 told to end (SIGTERM, SIGHUP)."
+    "-q prints only results and errors, -v also logs inputs and steps, as in every dhtorch command. "
+    "Exit code: 0 done, 2 bad option or bad data, 130 interrupted, 143 or 129 ended by SIGTERM or SIGHUP."
 )
 
 
 def format_count(n: int, word: str) -> str:
-    """A number of things, the word with an s unless there is one."""
+    """Number and noun: ``1 frame``, ``2 frames``."""
     return f"{n} {word}{'s' * (n != 1)}"
 
 
 def suggest_name(found: str, known: Iterable[str]) -> str:
-    """The name nearest to what was found, as a question; nothing where none is near."""
+    """`` (did you mean NAME?)`` with the known name nearest to ``found``; empty without a near one."""
     names = list(dict.fromkeys(known))
-    ends = {name.rpartition(".")[2]: name for name in reversed(names)}
+    full_names = {name.rpartition(".")[2]: name for name in reversed(names)}
     near = difflib.get_close_matches(found, names, 1, 0.6)
-    near = near or [ends[k] for k in difflib.get_close_matches(found.rpartition(".")[2], list(ends), 1, 0.7)]
+    near = near or [
+        full_names[k] for k in difflib.get_close_matches(found.rpartition(".")[2], list(full_names), 1, 0.7)
+    ]
     return f" (did you mean {near[0]}?)" if near else ""
 
 
 def escape_control(text: str) -> str:
-    """The text without what a terminal would obey: control characters, and marks that turn the direction of writing,
-    are spelt out. Line ends and tabs stay."""
+    """Text with control and bidirectional characters escaped, so that a terminal does not interpret them; line ends and
+    tabs are kept."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(
@@ -58,35 +60,34 @@ def _escape_character(c: str) -> str:
 
 
 def escape_markup(text: str) -> str:
-    """The text as rich takes it, with nothing in it that rich or a terminal would obey."""
+    """Text for rich in which neither rich markup nor control characters are interpreted."""
     from rich.markup import escape  # noqa: PLC0415
 
     return escape(escape_control(text))
 
 
 def unwrap_terminal(stream: Any) -> TextIO:
-    """The stream for a writer that commands a terminal on purpose, and passes the rest through
-    :func:`escape_markup`."""
-    found: TextIO = stream.stream if isinstance(stream, EscapingStream) else stream
-    return found
+    """The raw stream, for writers that control the terminal and escape other text by :func:`escape_markup`."""
+    raw: TextIO = stream.stream if isinstance(stream, EscapingStream) else stream
+    return raw
 
 
 class EscapingStream:
-    """A stream that names from files, values and errors pass on their way to a terminal; see :func:`escape_control`.
+    """Stream wrapper that escapes written text by :func:`escape_control`; everything else is delegated.
 
-    All but writing is the stream's own. It is no subclass of Python's streams, which close what they hold when they go.
+    Not a subclass of Python's streams, which would close the wrapped stream on deletion.
     """
 
     def __init__(self, stream: TextIO) -> None:
-        self.stream = stream  # what goes there directly is obeyed: a progress bar
+        self.stream = stream  # unescaped, for the progress bar
 
     def write(self, text: str) -> int:
-        """As of every stream."""
+        """Write escaped text."""
         self.stream.write(escape_control(text))
         return len(text)
 
     def writelines(self, lines: Iterable[str]) -> None:
-        """As of every stream."""
+        """Write escaped text."""
         for line in lines:
             self.write(line)
 
@@ -96,24 +97,26 @@ class EscapingStream:
 
 @contextlib.contextmanager
 def escape_output() -> Iterator[None]:
-    """Meanwhile nothing that is printed reaches a terminal as a command."""
-    before: Any = sys.stdout, sys.stderr
-    guarded: Any = tuple(s if isinstance(s, EscapingStream) else EscapingStream(s) for s in before)
-    sys.stdout, sys.stderr = guarded
+    """Context in which stdout and stderr escape control characters."""
+    old_streams: Any = sys.stdout, sys.stderr
+    escaping: Any = tuple(s if isinstance(s, EscapingStream) else EscapingStream(s) for s in old_streams)
+    sys.stdout, sys.stderr = escaping
     try:
         yield
     finally:
-        sys.stdout, sys.stderr = before
+        sys.stdout, sys.stderr = old_streams
 
 
 def progress(items: Iterable[Any], text: str, total: int) -> Iterator[Any]:
-    """A progress bar with rate and time left on a terminal, nothing elsewhere."""
+    """Iterate over ``items`` with a progress bar (rate, time left) on a terminal, without one elsewhere."""
     from rich.console import Console  # noqa: PLC0415
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn  # noqa: PLC0415
 
     columns = ("{task.description:24}", BarColumn(), MofNCompleteColumn(), "{task.fields[rate]}", TimeRemainingColumn())
-    hidden = not sys.stderr.isatty() or get_verbosity() == "quiet"
-    with Progress(*columns, console=Console(file=unwrap_terminal(sys.stderr)), disable=hidden, transient=True) as bar:
+    is_hidden = not sys.stderr.isatty() or get_verbosity() == "quiet"
+    with Progress(
+        *columns, console=Console(file=unwrap_terminal(sys.stderr)), disable=is_hidden, transient=True
+    ) as bar:
         task = bar.add_task(escape_markup(text), total=total, rate="")
         for item in items:
             yield item
@@ -128,30 +131,30 @@ def get_verbosity() -> str:
 
 @contextlib.contextmanager
 def set_verbosity(flags: Sequence[str]) -> Iterator[None]:
-    """Set how much is said for one call of the command and the processes it starts."""
-    before = os.environ.get(_VERBOSITY_VARIABLE)
+    """Context that sets the verbosity for one call of the command and the processes it starts."""
+    old_level = os.environ.get(_VERBOSITY_VARIABLE)
     if flags:
         os.environ[_VERBOSITY_VARIABLE] = VERBOSITY_FLAGS[flags[-1]]
     configure_logging()
     try:
         yield
     finally:
-        if before is None:
+        if old_level is None:
             os.environ.pop(_VERBOSITY_VARIABLE, None)
         else:
-            os.environ[_VERBOSITY_VARIABLE] = before
+            os.environ[_VERBOSITY_VARIABLE] = old_level
         configure_logging()
 
 
 def configure_logging() -> None:
-    """Debug messages of dhtorch go to stderr where much is to be said; nobody else's do."""
+    """With verbose output, send the debug messages of dhtorch, and only these, to stderr."""
     logger = logging.getLogger("dhtorch")
     verbose = get_verbosity() == "verbose"
     for handler in [h for h in logger.handlers if h.get_name() == _VERBOSITY_VARIABLE]:
         logger.removeHandler(handler)
-    for name, known in logging.root.manager.loggerDict.items():
-        if name.startswith("dhtorch") and isinstance(known, logging.Logger):
-            known.disabled = False  # Hydra's own set-up silences whatever logger is there before it
+    for name, existing in logging.root.manager.loggerDict.items():
+        if name.startswith("dhtorch") and isinstance(existing, logging.Logger):
+            existing.disabled = False  # Hydra's set-up disables loggers that exist before it
     logger.setLevel(logging.DEBUG if verbose else logging.NOTSET)
     logger.propagate = not verbose
     if verbose:
@@ -162,31 +165,30 @@ def configure_logging() -> None:
 
 
 def mute_if_quiet() -> contextlib.AbstractContextManager[Any]:
-    """What is printed meanwhile is not heard where nothing is to be said."""
+    """Context that discards printed text with quiet output."""
     return contextlib.redirect_stdout(io.StringIO()) if get_verbosity() == "quiet" else contextlib.nullcontext()
 
 
 def discard_broken_pipe() -> None:
-    """Let Python's own last flush go nowhere instead of failing once more."""
+    """Redirect stdout to the null device, so that Python's final flush does not fail again."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextlib.contextmanager
 def show_warnings_in_a_line() -> Iterator[None]:
-    """:func:`ignore_foreign_warnings`, for as long as a call of the command takes; what is heard is one line, as errors
-    are."""
-    usual = warnings.formatwarning
+    """Context with :func:`ignore_foreign_warnings` in which warnings are printed in one line, as errors are."""
+    old_format = warnings.formatwarning
     with warnings.catch_warnings():
         ignore_foreign_warnings()
         warnings.formatwarning = lambda message, *where, **more: f"dhtorch: warning: {message}\n"
         try:
             yield
         finally:
-            warnings.formatwarning = usual
+            warnings.formatwarning = old_format
 
 
 def ignore_foreign_warnings() -> None:
-    """Warnings that other libraries cause are not the user's business, unless Python's -W asks for them."""
+    """Ignore warnings raised in other libraries, unless Python's -W is used."""
     if not sys.warnoptions:
         warnings.filterwarnings("ignore", module=r"(?!dhtorch\b)")

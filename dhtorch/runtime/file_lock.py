@@ -1,7 +1,7 @@
-"""One writer for a folder: a file beside its content that says who writes there, and that nobody forgets.
+"""Exclusive lock on a folder by a lock file, so that one process writes to it.
 
-The system holds the lock, not the file: it ends with its owner, however that ended, so that a dead owner blocks nobody.
-What stands in the file is for the message.
+The operating system holds the lock (fcntl) and releases it when the owner ends, however it ends. The content of the
+file (process, host, time) only serves the error message.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from dhtorch.runtime.storage import dump_strict_json, parse_strict_json
 fcntl: ModuleType | None
 try:
     import fcntl
-except ImportError:  # not on this system: nothing is locked there
+except ImportError:  # not on this system: no locking
     fcntl = None
 
-#: Locks of this process: the system would give it a second one.
+#: Locks held by this process, to which the system would grant a second lock.
 _held_locks: set[Path] = set()
 
 
 @contextlib.contextmanager
 def acquire_file_lock(file: str | Path, what: str) -> Iterator[None]:
-    """Meanwhile this process alone writes what ``file`` stands for. The file is gone afterwards.
+    """Context that holds the lock ``file``; the file is removed at the end.
 
     Args:
-        file: of the lock; its folder is made where it is missing.
-        what: the option and the folder that it names, for the message.
+        file: lock file; its folder is created if missing.
+        what: option and folder, for the error message.
 
     Raises:
-        BlockingIOError: another process holds it; the message names that and since when.
+        BlockingIOError: another process holds the lock; the message names it and for how long.
     """
     path = Path(file).absolute()
     if fcntl is None:
@@ -43,7 +43,7 @@ def acquire_file_lock(file: str | Path, what: str) -> Iterator[None]:
         return
     path.parent.mkdir(parents=True, exist_ok=True)
     if path in _held_locks:
-        raise BlockingIOError(f"{what}: found this process writing there already, expected one writer")
+        raise BlockingIOError(f"{what}: found this process already writing there, expected one writer")
     handle = _open_locked(path, what)
     _held_locks.add(path)
     try:
@@ -54,19 +54,19 @@ def acquire_file_lock(file: str | Path, what: str) -> Iterator[None]:
         yield
     finally:
         _held_locks.discard(path)
-        path.unlink(missing_ok=True)  # before it is let go, so that nobody's newer file is removed
+        path.unlink(missing_ok=True)  # before release, so that no newer lock file is removed
         os.close(handle)
 
 
 def _open_locked(path: Path, what: str) -> int:
-    """An open, locked file that still stands at ``path``."""
+    """Open and lock the file at ``path`` -> descriptor; retries if the file was replaced meanwhile."""
     assert fcntl is not None
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
         try:
             fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if path.exists() and path.stat().st_ino == os.fstat(handle).st_ino:
-                os.truncate(handle, 0)  # what a dead owner said of itself
+                os.truncate(handle, 0)  # content left by a dead owner
                 return handle
         except BlockingIOError:
             owner = _describe_owner(os.pread(handle, 1000, 0))
@@ -80,8 +80,8 @@ def _open_locked(path: Path, what: str) -> int:
 
 def _describe_owner(text: bytes) -> str:
     try:
-        said = parse_strict_json(text.decode())
-        age = max(0, round(time.time() - float(said["since"])))
-        return f"process {int(said['process'])} on {said['host']} (for {age} s)"
+        record = parse_strict_json(text.decode())
+        age = max(0, round(time.time() - float(record["since"])))
+        return f"process {int(record['process'])} on {record['host']} (for {age} s)"
     except (ValueError, KeyError, TypeError):
         return "another process"

@@ -1,4 +1,4 @@
-"""Workers that end with the process that started them, even where that one was killed and could not tell them."""
+"""Worker processes end with their parent, also where the parent was killed."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import os
 import threading
 import time
 
-#: Seconds between two looks.
+#: Period of the check, s.
 _POLL_PERIOD_S = 1.0
 
-_watching_pids: set[int] = set()  # processes that watch already: a fork inherits the note and not the thread
+_watching_pids: set[int] = set()  # processes with a watching thread; a fork inherits the set but not the thread
 
 
 def exit_with_parent() -> None:
-    """End this process at once when its parent is gone. Called in a worker; a second call changes nothing."""
+    """End this worker process when its parent ends. A second call has no effect."""
     if os.getpid() in _watching_pids or not hasattr(os, "getppid"):
         return
     _watching_pids.add(os.getpid())
@@ -23,4 +23,4 @@ def exit_with_parent() -> None:
 def _wait_for_exit(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(_POLL_PERIOD_S)
-    os._exit(1)  # what is half written is no result, and nobody waits for one
+    os._exit(1)  # immediate: partial output is never a valid result

@@ -1,7 +1,7 @@
-"""Result files: one strict JSON per job, written whole or not at all, and recognised when it need not be redone.
+"""Result files: one strict JSON per job, written atomically, with a key that identifies finished jobs.
 
-A result answers three questions: what was asked (``experiment``, ``config``, ``data``), what came out (``summary``,
-``rows``, ``verdict``) and whether the same question would give the same answer today (``key``).
+A result holds the input (``experiment``, ``config``, ``data``), the output (``summary``, ``rows``, ``verdict``) and
+``key``, a hash of settings, code and data: a job with an equal key need not run again.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ _RESULT_SCHEMA = 1
 
 _VERDICTS = ("supported", "refuted", "undecided")
 
-#: Jobs that ask no question: the main job, and the map of a recording.
+#: Jobs without a research question: the main job, and the map of a recording.
 _JOBS_WITHOUT_QUESTION = ("pair", "integrate")
 
-#: Options that do not change what is computed: where files lie, what else is written, on which machine part it runs.
+#: Options that do not change the result: locations of files, additional output, device.
 _NON_KEY_OPTIONS = frozenset(
     {"root", "folder", "cache", "output", "figures", "device", "resume", "traceback", "workers", "hydra"}
 )
 
-#: Bytes of a data file's head and tail that enter a digest: enough to tell recordings apart, cheap for large ones.
+#: Bytes of the head and of the tail of a data file that enter its digest: fast for large files.
 _DIGEST_EDGE_BYTES = 64 * 1024
 
-#: Options that say nothing about a result to its reader.
+#: Options left out of a stored result.
 _LOCAL_OPTIONS = ("hydra", "output")
 
-#: Flags of x86 processors, widest vectors first, and what they are called.
+#: x86 processor flag → name of the vector extension, widest first.
 _VECTOR_FLAGS = {"amx_tile": "AVX-512 and AMX", "avx512f": "AVX-512", "avx2": "AVX2"}
 
 _PACKAGES = ("dhtorch", "torch", "kornia", "numpy", "opencv-python-headless", "hydra-core")
@@ -60,7 +60,7 @@ _RESULT_FIELDS: dict[str, Any] = {
 }
 _META_FIELDS: dict[str, Any] = {"utc": str, "git": _OPTIONAL_TEXT, "versions": dict}
 _META_FIELDS |= {"device": str, "dtype": str, "threads": int, "seed": int}
-#: What results did not hold from the start.
+#: Fields added later: optional when reading.
 _ADDED_RESULT_FIELDS: dict[str, Any] = {"seal": str}
 _ADDED_META_FIELDS: dict[str, Any] = {"processor": str}
 _DATA_FIELDS: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
@@ -88,20 +88,20 @@ def build_result(
     verdict: str | None = None,
     why: str | None = None,
 ) -> dict[str, Any]:
-    """A valid result, made strict: what is not finite becomes null, tuples and tensors become lists.
+    """Fields -> valid result in strict JSON: non-finite numbers become null, tuples and tensors lists.
 
     Args:
-        experiment: its name; ``pair`` for the main job, which asks no question.
+        experiment: its name; ``pair`` for the main job, which has no question.
         key: from :func:`compute_result_key`.
         meta: from :func:`collect_run_metadata`.
         config: resolved settings; file names are shortened as by :func:`make_portable`.
         data: ``{name, scenes, n_pairs, digest}``.
         summary: metric → ``{value, low, high, n, unit}``.
         rows: one per pair and, with pair null, one per scene.
-        question, expectation, verdict, why: of an experiment that asks something.
+        question, expectation, verdict, why: of an experiment with a question.
 
     Raises:
-        ValueError: a field is missing, unknown or of the wrong kind; the message names it.
+        ValueError: a field is missing, unknown or of the wrong type; the message names it.
     """
     fields = {"question": question, "expectation": expectation, "verdict": verdict, "why": why, "key": key}
     parts = {"meta": meta, "config": make_portable(config), "data": data, "summary": summary, "rows": rows}
@@ -111,7 +111,7 @@ def build_result(
 
 
 def compute_seal(result: Mapping[str, Any]) -> str:
-    """SHA-256 over all of a result but itself, so that a change by hand shows."""
+    """SHA-256 over all fields of a result except the seal, to detect changes by hand."""
     content = {name: value for name, value in result.items() if name != "seal"}
     return hashlib.sha256(dump_strict_json(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
@@ -120,7 +120,7 @@ def validate_result(result: Any, where: str = "result") -> None:
     """Check a result against schema 1.
 
     Raises:
-        ValueError: names the first field that is missing, unknown, of the wrong kind or out of range.
+        ValueError: names the first field that is missing, unknown, of the wrong type or out of range.
     """
     _check_fields(
         result,
@@ -131,21 +131,23 @@ def validate_result(result: Any, where: str = "result") -> None:
     _check_verdict(result, where)
     key = result["key"]
     _expect(len(key) == 64 and set(key) <= set("0123456789abcdef"), f"{where}.key", key, "64 hexadecimal digits")
-    later = {k: v for k, v in _ADDED_META_FIELDS.items() if isinstance(result["meta"], dict) and k in result["meta"]}
-    _check_fields(result["meta"], _META_FIELDS | later, f"{where}.meta")
+    added_meta = {
+        k: v for k, v in _ADDED_META_FIELDS.items() if isinstance(result["meta"], dict) and k in result["meta"]
+    }
+    _check_fields(result["meta"], _META_FIELDS | added_meta, f"{where}.meta")
     _check_fields(result["data"], _DATA_FIELDS, f"{where}.data")
     for name, entry in result["summary"].items():
         _check_fields(entry, _SUMMARY_FIELDS, f"{where}.summary.{name}")
     for k, row in enumerate(result["rows"]):
         _check_fields(row, _ROW_FIELDS, f"{where}.rows.{k}", more=True)
         pair = row["pair"]
-        pairs = pair is None or (len(pair) == 2 and all(_is_of_kind(v, int) for v in pair))
-        _expect(pairs, f"{where}.rows.{k}.pair", pair, "[i, j] or null")
+        is_pair = pair is None or (len(pair) == 2 and all(_is_of_kind(v, int) for v in pair))
+        _expect(is_pair, f"{where}.rows.{k}.pair", pair, "[i, j] or null")
     _check_finite(result, where)
 
 
 def write_result(path: str | Path, result: Mapping[str, Any]) -> Path:
-    """Write a result so that, whatever happens, ``path`` holds either the old file or the whole new one.
+    """Write a result atomically: ``path`` holds either the old file or all of the new one.
 
     Raises:
         ValueError: the result is not valid; nothing is written.
@@ -156,7 +158,7 @@ def write_result(path: str | Path, result: Mapping[str, Any]) -> Path:
 
 
 def _format_result(result: Mapping[str, Any]) -> str:
-    """JSON in which every summary entry and every row is a line: small, and two versions can be compared."""
+    """Result -> JSON text with one line per summary entry and row: compact, and suited to diff."""
 
     lines = []
     for name, value in result.items():
@@ -175,7 +177,7 @@ def _format_result(result: Mapping[str, Any]) -> str:
 
 
 def read_result(path: str | Path) -> dict[str, Any]:
-    """Read and check a result; a folder stands for the ``result.json`` in it.
+    """Read and validate a result; a folder means its ``result.json``.
 
     Raises:
         FileNotFoundError: no such file.
@@ -194,7 +196,7 @@ def read_result(path: str | Path) -> dict[str, Any]:
 
 
 def is_finished(path: str | Path, key: str) -> bool:
-    """Whether ``path`` holds a valid result of this key as it was written, so that the job need not run again."""
+    """Whether ``path`` holds a valid, unmodified result of this key, so that the job need not run again."""
     try:
         result = read_result(path)
         return bool(result["key"] == key and result.get("seal") == compute_seal(result))
@@ -205,14 +207,14 @@ def is_finished(path: str | Path, key: str) -> bool:
 def compute_result_key(
     config: Mapping[str, Any], digest: str, *, roots: Iterable[str] = (), code_dir: str | Path | None = None
 ) -> str:
-    """SHA-256 over everything that decides a result: the settings, the code that they reach, and the data.
+    """SHA-256 over everything that determines a result: settings, reachable code, data digest.
 
     Args:
-        config: resolved settings; the options in ``_NON_KEY_OPTIONS`` are left out at every depth, and of an absolute
-            file name only what :func:`make_portable` keeps counts.
+        config: resolved settings, without ``_NON_KEY_OPTIONS`` at every depth; absolute file names are shortened by
+            :func:`make_portable`.
         digest: of the data, from :func:`compute_data_digest`.
-        roots: modules that take part beside those that the settings name.
-        code_dir: the folder of this package; None = where this file lies.
+        roots: further modules that take part, beside those named in the settings.
+        code_dir: folder of this package; None = the installed one.
     """
     settings = json.dumps(_drop_non_key_options(make_portable(config)), sort_keys=True, default=str)
     total = hashlib.sha256()
@@ -227,24 +229,24 @@ def compute_result_key(
 
 
 def list_files_below(roots: Iterable[Path | None]) -> dict[str, Path]:
-    """Name → file of everything below some folders (or files); a folder's own name and place do not count."""
+    """Name → path of all files below folders (or single files); names are independent of the folders' locations."""
     files: dict[str, Path] = {}
     for k, root in enumerate(dict.fromkeys(root for root in roots if root is not None)):
-        below = [p for p in root.rglob("*") if p.is_file()] if root.is_dir() else [root]
-        files |= {f"{k}/{p.relative_to(root).as_posix() if p != root else p.name}": p for p in below}
+        paths = [p for p in root.rglob("*") if p.is_file()] if root.is_dir() else [root]
+        files |= {f"{k}/{p.relative_to(root).as_posix() if p != root else p.name}": p for p in paths}
     return files
 
 
 def list_files_named(settings: Mapping[str, Any]) -> dict[str, Path]:
-    """Option → file that it names, as weights are: the place leaves the key of a result, the content enters it."""
+    """Option → path of the existing file it names, e.g. weights: its content, not its path, enters the key."""
     return {f"settings/{name}": path for name, path in _iter_paths("", settings) if path.is_file()}
 
 
 def compute_data_digest(files: Mapping[str, str | Path]) -> str:
-    """SHA-256 over data files: their relative names, sizes, first and last 64 KiB. No file: data made by the code.
+    """SHA-256 over data files: relative names, sizes, first and last 64 KiB; no files for synthetic data.
 
     Args:
-        files: relative name → where the file lies now; the place itself does not count.
+        files: relative name → path; the path itself does not enter.
     """
     total = hashlib.sha256()
     for name in sorted(files):
@@ -259,12 +261,11 @@ def compute_data_digest(files: Mapping[str, str | Path]) -> str:
 
 
 def describe_difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """The first thing that differs between what two runs note of themselves (``config``, ``data``, ``git`` and
-    ``version``), in words."""
-    ours, theirs = _flatten("", here["config"]), _flatten("", there["config"])
-    for name in sorted(ours.keys() | theirs.keys()):
-        if ours.get(name) != theirs.get(name):
-            return f"{name} {theirs.get(name)} there, {ours.get(name)} here"
+    """Text of the first difference between the metadata of two runs (``config``, ``data``, ``git``, ``version``)."""
+    here_values, there_values = _flatten("", here["config"]), _flatten("", there["config"])
+    for name in sorted(here_values.keys() | there_values.keys()):
+        if here_values.get(name) != there_values.get(name):
+            return f"{name} {there_values.get(name)} there, {here_values.get(name)} here"
     if there["data"]["digest"] != here["data"]["digest"]:
         return "other data"
     versions = [meta["git"] or meta["version"] for meta in (there, here)]
@@ -272,7 +273,7 @@ def describe_difference(there: Mapping[str, Any], here: Mapping[str, Any]) -> st
 
 
 def collect_run_metadata(*, device: str, dtype: str, threads: int, seed: int) -> dict[str, Any]:
-    """When, with which code and on what a job runs."""
+    """Time, code version, package versions, hardware and seed of a job."""
     versions = {"python": platform.python_version(), **{name: _package_version(name) for name in _PACKAGES}}
     return {
         "utc": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -287,31 +288,31 @@ def collect_run_metadata(*, device: str, dtype: str, threads: int, seed: int) ->
 
 
 def describe_processor(info: str | Path = "/proc/cpuinfo") -> str:
-    """The processor by its maker's name, family and model, and the widest vectors it has: speeds depend on them.
+    """Processor name, family, model and widest vector extension, on which speed depends.
 
-    Where ATEN_CPU_CAPABILITY holds torch to narrower ones, that is said as well.
+    A narrower extension set by ATEN_CPU_CAPABILITY is added.
 
     Args:
-        info: where Linux describes it; elsewhere only what Python knows is said.
+        info: Linux' description; on other systems the name from :mod:`platform` is used.
     """
-    held = os.environ.get("ATEN_CPU_CAPABILITY", "").upper()
+    capability = os.environ.get("ATEN_CPU_CAPABILITY", "").upper()
     try:
         lines = Path(info).read_text(encoding="utf-8", errors="replace").split("\n\n")[0].splitlines()
     except OSError:
         return platform.processor() or platform.machine()
-    known = {k.strip(): v.strip() for k, _, v in (line.partition(":") for line in lines)}
-    flags = known.get("flags", "").split()
+    fields = {k.strip(): v.strip() for k, _, v in (line.partition(":") for line in lines)}
+    flags = fields.get("flags", "").split()
     vectors = next((word for flag, word in _VECTOR_FLAGS.items() if flag in flags), platform.machine())
-    model = f"family {known['cpu family']} model {known['model']}" if {"cpu family", "model"} <= set(known) else ""
-    vectors = f"{vectors} held to {held}" if held and vectors != held else vectors
-    return ", ".join(word for word in (known.get("model name", ""), model, vectors) if word)
+    model = f"family {fields['cpu family']} model {fields['model']}" if {"cpu family", "model"} <= set(fields) else ""
+    vectors = f"{vectors} held to {capability}" if capability and vectors != capability else vectors
+    return ", ".join(word for word in (fields.get("model name", ""), model, vectors) if word)
 
 
 def make_portable(config: Mapping[str, Any], base: str | Path | None = None) -> dict[str, Any]:
-    """Settings without what belongs to one machine.
+    """Settings without machine-specific paths.
 
-    An absolute file name, and any ``root``, is written relative to ``base`` (None: the environment variable
-    DHTORCH_DATA) where it lies below it, else as its last component; ``hydra`` and ``output`` are left out.
+    An absolute file name, and any ``root``, becomes relative to ``base`` (None: the environment variable DHTORCH_DATA)
+    if below it, else its last component; ``hydra`` and ``output`` are left out.
     """
     base = os.environ.get("DHTORCH_DATA") if base is None else base
 
@@ -341,7 +342,7 @@ def _check_fields(value: Any, kinds: Mapping[str, Any], where: str, more: bool =
 def _check_verdict(result: Mapping[str, Any], where: str) -> None:
     for name in ("question", "expectation", "verdict", "why"):
         if result["experiment"] in _JOBS_WITHOUT_QUESTION:
-            _expect(result[name] is None, f"{where}.{name}", result[name], "null, this job asks no question")
+            _expect(result[name] is None, f"{where}.{name}", result[name], "null for this experiment")
         else:
             _expect(bool(result[name]), f"{where}.{name}", result[name], "a text")
     if result["experiment"] not in _JOBS_WITHOUT_QUESTION:
@@ -357,8 +358,15 @@ def _is_of_kind(value: Any, kind: Any) -> bool:
 
 
 def _describe_kind(kind: Any) -> str:
-    words = {int: "a whole number", float: "a number", str: "a text", dict: "an object", list: "a list", None: "null"}
-    return " or ".join(words[k] for k in (kind if isinstance(kind, tuple) else (kind,)))
+    kind_names = {
+        int: "a whole number",
+        float: "a number",
+        str: "a text",
+        dict: "an object",
+        list: "a list",
+        None: "null",
+    }
+    return " or ".join(kind_names[k] for k in (kind if isinstance(kind, tuple) else (kind,)))
 
 
 def _expect(condition: bool, where: str, found: Any, expected: str) -> None:
@@ -379,7 +387,7 @@ def _check_finite(value: Any, where: str) -> None:
 
 
 def _update_digest(total: Any, part: bytes) -> None:
-    """Length first, so that no two sequences of parts make the same stream."""
+    """Add a part with its length, so that different sequences of parts differ."""
     total.update(len(part).to_bytes(8, "big"))
     total.update(part)
 
@@ -408,12 +416,12 @@ def _iter_paths(name: str, value: Any) -> Iterator[tuple[str, Path]]:
 
 
 def _shorten_path(path: Path, base: str | Path | None) -> str:
-    place = path.expanduser().resolve()
+    resolved = path.expanduser().resolve()
     if base is not None:
-        home = Path(base).expanduser().resolve()
-        if place != home and place.is_relative_to(home):
-            return place.relative_to(home).as_posix()
-    return place.name
+        resolved_base = Path(base).expanduser().resolve()
+        if resolved != resolved_base and resolved.is_relative_to(resolved_base):
+            return resolved.relative_to(resolved_base).as_posix()
+    return resolved.name
 
 
 def _package_version(package: str) -> str | None:
@@ -424,16 +432,16 @@ def _package_version(package: str) -> str | None:
 
 
 def read_git_revision(folder: Path) -> str | None:
-    """What ``git describe`` calls the code in ``folder``, None where it is not under version control."""
+    """Output of ``git describe`` for ``folder``, None without version control."""
 
-    def ask(*words: str) -> str | None:
+    def run_git(*words: str) -> str | None:
         try:
             command = ["git", "-C", str(folder), *words]
-            done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=10)
+            completed = subprocess.run(command, check=False, capture_output=True, text=True, timeout=10)
         except (OSError, subprocess.SubprocessError):
             return None
-        return done.stdout.strip() if done.returncode == 0 else None
+        return completed.stdout.strip() if completed.returncode == 0 else None
 
-    if ask("ls-files", "--error-unmatch", "__init__.py") is None:
+    if run_git("ls-files", "--error-unmatch", "__init__.py") is None:
         return None
-    return ask("describe", "--always", "--dirty", "--tags") or None
+    return run_git("describe", "--always", "--dirty", "--tags") or None

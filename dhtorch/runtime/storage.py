@@ -1,6 +1,6 @@
-"""Strict JSON, and files that hold either what they held before or all of the new content.
+"""Strict JSON and atomic file writing.
 
-Strict JSON is what every reader of JSON understands alike: no ``NaN``, no ``Infinity``, and no key twice in an object.
+Strict JSON is the subset that all JSON parsers read alike: no ``NaN``, no ``Infinity``, no duplicate keys in an object.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-#: Lists and objects inside one another that a file may hold: whoever walks through them does so by recursion.
+#: Maximum nesting of lists and objects in a file, as they are traversed by recursion.
 _MAX_NESTING = 64
 
-#: How the name of a file ends while it is written.
+#: Suffix of a file while it is written.
 _UNFINISHED_SUFFIX = ".tmp"
 
 
 def to_strict_json(value: Any) -> Any:
-    """The same value in what strict JSON can hold: finite numbers, strings, lists, objects with string keys, null.
+    """Python value -> value that strict JSON can hold: finite numbers, strings, lists, objects with string keys, null.
 
     Non-finite numbers become null; numpy and torch values become numbers and lists, paths become strings.
 
     Raises:
-        TypeError: a value that has no counterpart.
+        TypeError: a value without a JSON counterpart.
     """
     if value is None or isinstance(value, bool | int | str):
         return value
@@ -42,24 +42,24 @@ def to_strict_json(value: Any) -> Any:
         return str(value)
     if hasattr(value, "tolist"):  # torch.Tensor, numpy.ndarray and numpy scalars
         return to_strict_json(value.tolist())
-    raise TypeError(f"result: found a {type(value).__name__}, expected something that JSON can hold")
+    raise TypeError(f"result: found a {type(value).__name__}, expected a value that JSON can hold")
 
 
 def dump_strict_json(value: Any, **layout: Any) -> str:
-    """Strict JSON of what has a counterpart in it; ``layout`` as for :func:`json.dumps`.
+    """Value -> text in strict JSON; ``layout`` as for :func:`json.dumps`.
 
     Raises:
         ValueError: a number that is not finite (see :func:`to_strict_json`).
-        TypeError: a value that JSON does not know.
+        TypeError: a value that JSON cannot hold.
     """
     return json.dumps(value, **{"ensure_ascii": False, **layout}, allow_nan=False)
 
 
 def parse_strict_json(text: str) -> Any:
-    """The value of a text in strict JSON.
+    """Text in strict JSON -> value.
 
     Raises:
-        ValueError: no JSON, a number that is not finite, a key that stands twice in one object, or values nested
+        ValueError: no JSON, a number that is not finite, a duplicate key in an object, or values nested
             deeper than ``_MAX_NESTING``.
     """
     try:
@@ -68,15 +68,15 @@ def parse_strict_json(text: str) -> Any:
         raise ValueError(f"values nested deeper than {_MAX_NESTING}") from None
     level = [value] if isinstance(value, dict | list) else []
     for _ in range(_MAX_NESTING):
-        level = [inner for each in level for inner in (each.values() if isinstance(each, dict) else each)]
-        level = [each for each in level if isinstance(each, dict | list)]
+        level = [inner for item in level for inner in (item.values() if isinstance(item, dict) else item)]
+        level = [item for item in level if isinstance(item, dict | list)]
     if level:
         raise ValueError(f"values nested deeper than {_MAX_NESTING}")
     return value
 
 
 def write_json(path: str | Path, value: Any) -> Path:
-    """Write a value as strict JSON, a line for every member, so that ``path`` never holds half of it.
+    """Write a value atomically as strict JSON, one line per member.
 
     Raises:
         ValueError: a number that is not finite; nothing is written.
@@ -86,7 +86,7 @@ def write_json(path: str | Path, value: Any) -> Path:
 
 @contextlib.contextmanager
 def _add_path_to_errors(path: Path) -> Iterator[None]:
-    """An error of the system that names no file (a full disk, a limit of size) names ``path``."""
+    """Context that adds ``path`` to an OSError without a file name (full disk, file size limit)."""
     try:
         yield
     except OSError as error:
@@ -96,7 +96,7 @@ def _add_path_to_errors(path: Path) -> Iterator[None]:
 
 
 def replace_file(path: str | Path, content: bytes) -> Path:
-    """Write a file so that, whatever happens, ``path`` holds either what it held before or all of the new content."""
+    """Write a file atomically: ``path`` holds either its old content or all of the new content."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED_SUFFIX, dir=path.parent)
@@ -110,8 +110,8 @@ def replace_file(path: str | Path, content: bytes) -> Path:
 
 @contextlib.contextmanager
 def write_atomically(path: Path, unfinished: Path) -> Iterator[IO[bytes]]:
-    """The file ``unfinished``, in the folder of ``path``, to be written: it is ``path`` once the block ends, and gone
-    where the block fails."""
+    """Context with the open file ``unfinished`` (in the folder of ``path``): renamed to ``path`` at the end, removed if
+    the block fails."""
     try:
         with _add_path_to_errors(path), unfinished.open("wb") as file:
             yield file
@@ -124,29 +124,28 @@ def write_atomically(path: Path, unfinished: Path) -> Iterator[IO[bytes]]:
 
 
 def copy_file(source: str | Path, path: str | Path) -> Path:
-    """Copy a file, however large, so that ``path`` never holds half of it; nothing is done where there is no source, or
-    a copy of its size already."""
+    """Copy a file atomically; does nothing if the source is missing or ``path`` already has its size."""
     source, path = Path(source), Path(path)
     if not source.is_file() or (path.is_file() and path.stat().st_size == source.stat().st_size):
         return path
     path.parent.mkdir(parents=True, exist_ok=True)
     with (
-        source.open("rb") as found,
+        source.open("rb") as source_file,
         write_atomically(path, path.with_name(f".{path.name}.copy{_UNFINISHED_SUFFIX}")) as file,
     ):
-        shutil.copyfileobj(found, file)
+        shutil.copyfileobj(source_file, file)
     return path
 
 
 def remove_unfinished_files(path: str | Path) -> None:
-    """Remove what a writer of ``path`` left beside it when it was killed. Nobody may be writing ``path`` meanwhile."""
+    """Remove unfinished files left by a killed writer of ``path``. No other process may be writing ``path``."""
     path = Path(path)
-    for left in path.parent.glob(f".{path.name}.*{_UNFINISHED_SUFFIX}"):
-        left.unlink(missing_ok=True)
+    for unfinished in path.parent.glob(f".{path.name}.*{_UNFINISHED_SUFFIX}"):
+        unfinished.unlink(missing_ok=True)
 
 
 def has_files(folder: Path) -> bool:
-    """Whether a file lies in a folder or below; what an interrupted write left of one does not count."""
+    """Whether a folder or its subfolders hold a file, unfinished files excluded."""
     inside = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
     return any(not (f.name.startswith(".") and f.name.endswith(_UNFINISHED_SUFFIX)) for f in inside)
 
@@ -156,15 +155,15 @@ def _reject_constant(word: str) -> None:
 
 
 def _reject_duplicate_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    members = dict(pairs)
+    if len(members) < len(pairs):
         names = [name for name, _ in pairs]
         raise ValueError(f"the key {next(n for n in names if names.count(n) > 1)!r} twice")
-    return found
+    return members
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a rename durable, where the system lets a folder be opened."""
+    """Flush a folder to disk, so that a rename is durable, where the system can open folders."""
     try:
         handle = os.open(folder, os.O_RDONLY)
     except OSError:

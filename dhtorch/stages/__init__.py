@@ -1,1 +1,5 @@
 """The paper's stages, one file each, in the order of the method. No stage imports another."""
+
+from dhtorch.stages import backproject, fuse, holes, pose, pose_prior, sample, score, track, triangulate
+
+__all__ = ["backproject", "fuse", "holes", "pose", "pose_prior", "sample", "score", "track", "triangulate"]

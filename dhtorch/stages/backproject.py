@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,6 +18,7 @@ from dhtorch.geometry.checks import all_finite, check, is_transformed
 from dhtorch.geometry.patches import (
     containing_pixels,
     extract_patches,
+    fits_window_kernel,
     flatten_images,
     gather_reduced,
     is_patch_inside,
@@ -25,16 +26,21 @@ from dhtorch.geometry.patches import (
     nearest_pixel_index,
     reduce_patches,
     whole_is_faster,
+    window_arguments,
 )
 from dhtorch.geometry.windows import row_bands, window_extreme, window_sum
-from dhtorch.ops import loader
-from dhtorch.records import Frame, Samples
+from dhtorch.ops.dispatch import operator
+from dhtorch.records import Camera, Frame, Samples
 
 #: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
 SPARSE_SEARCH_PX = 3
 
 #: Side of the neighbourhood that appearance and depth edges are judged on, px.
 NEIGHBOURHOOD_PX = 5
+
+#: A highlight is colourless: its channels differ by no more than this share of the largest; and it is brighter than the
+#: mean of its neighbourhood by this much of the range of grey values.
+MAX_HIGHLIGHT_COLOUR_REL, MIN_HIGHLIGHT_CONTRAST = 0.15, 0.1
 
 
 def backproject(
@@ -99,8 +105,18 @@ def backproject(
         saturated=saturated,
         highlight=highlight,
     )
-    found = None if search_px or frame.sparse is not None else _compiled(frame, uv, limits)
-    return _in_torch(frame, uv, search_px, limits) if found is None else found
+    camera, own = frame.camera, frame.depth_camera
+    return _read_samples(
+        frame.image,
+        frame.depth,
+        frame.conf,
+        uv,
+        *_lens(camera),
+        *((None, None, None) if own is None else _lens(own)),
+        frame=frame,
+        search_px=search_px,
+        limits=limits,
+    )
 
 
 class ReturnLimits(NamedTuple):
@@ -115,13 +131,84 @@ class ReturnLimits(NamedTuple):
     saturated: float
     highlight: float
 
-    def told(self) -> ReturnLimits:
-        """As compiled code is told them, which knows no None."""
-        return self if self.near_limit is not None else self._replace(near_limit=torch.inf)
+
+def _lens(camera: Camera) -> tuple[Tensor, Tensor, Tensor | None]:
+    return camera.f, camera.c, camera.distortion
 
 
-def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: ReturnLimits) -> Samples:
-    """The reference, on any device, with a graph."""
+def _is_dense_read(*_: Tensor | None, frame: Frame, search_px: int | None, limits: ReturnLimits) -> bool:
+    """Whether samples read the nearest pixel of a dense map, with a limit of confidence that a byte can hold."""
+    return not search_px and frame.sparse is None and 0 <= limits.min_conf <= 255
+
+
+def _read_samples_kernel(
+    image: Tensor, depth: Tensor, conf: Tensor | None, uv: Tensor, *_: Tensor | None, **options: Any
+) -> Samples:
+    frame, limits = options["frame"], options["limits"]
+    pixel, at, ray = _project_samples(frame, uv)
+    picture, steps = flatten_images(image)
+    outputs = found, sigma, confidence = tuple(ray.new_empty(ray.shape[:2]) for _ in range(3))
+    xyz = torch.empty_like(ray)
+    flag = torch.empty_like(found, dtype=torch.int32)
+    hw, map_hw, n = frame.hw, (depth.shape[-2], depth.shape[-1]), uv.shape[1]
+    size, reach = min(NEIGHBOURHOOD_PX, *hw), min(NEIGHBOURHOOD_PX, *map_hw)
+    levels = depth.new_empty(0, dtype=torch.uint8) if conf is None else conf
+    returns, windows = (depth, levels, at), (picture, pixel)
+    limits = limits._replace(near_limit=torch.inf if limits.near_limit is None else limits.near_limit)
+    torch.ops.dhtorch.backproject.default(
+        *returns,
+        *windows,
+        ray,
+        *outputs,
+        *(xyz, flag),
+        reach,
+        *(*steps, *image.shape[1:], size),
+        *limits,
+        max_colour_rel=MAX_HIGHLIGHT_COLOUR_REL,
+        min_contrast=MIN_HIGHLIGHT_CONTRAST,
+        whole_map=whole_is_faster(map_hw, n, reach),
+        whole_picture=whole_is_faster(hw, n, size),
+    )
+    none = {"trackability": torch.zeros_like(found), "hole": torch.zeros_like(flag)}
+    return Samples(uv=uv, depth=found, sigma=sigma, xyz=xyz, confidence=confidence, flag=flag, **none)
+
+
+def _project_samples(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels of picture and map (B, N, 2) int32, and rays (B, N, 3), of samples (B, N, 2), for the kernel."""
+    camera, own = frame.camera, frame.depth_camera
+    (h, w), (H, W) = frame.depth.shape[-2:], frame.hw
+    if camera.distortion is None and (own is None or own.distortion is None):
+        own_lens = [camera.f.new_empty(0)] * 2 if own is None else [own.f, own.c]
+        start, *lens = (x.contiguous() for x in (uv, camera.f, camera.c, *own_lens))
+        pixel, at = (torch.empty_like(start, dtype=torch.int32) for _ in range(2))
+        ray = start.new_empty(*uv.shape[:2], 3)
+        torch.ops.dhtorch.project_samples.default(start, *lens, pixel, at, ray, w / W, h / H)
+        return pixel, at, ray
+    place = cam.depth_pixels(camera, frame.hw, own, (h, w), uv)
+    ray = cam.rays(camera, uv.nan_to_num(0.0, 0.0, 0.0)).contiguous()
+    return containing_pixels(uv).contiguous(), containing_pixels(place).contiguous(), ray
+
+
+@operator(
+    kernel=_read_samples_kernel,
+    dtypes={
+        "image": torch.uint8,
+        "depth": torch.float32,
+        "conf": torch.uint8,
+        "uv": torch.float32,
+        "f": torch.float32,
+        "c": torch.float32,
+        "distortion": torch.float32,
+        "depth_f": torch.float32,
+        "depth_c": torch.float32,
+        "depth_distortion": torch.float32,
+    },
+    any_layout=("image", "uv", "f", "c", "distortion", "depth_f", "depth_c", "depth_distortion"),
+    when=_is_dense_read,
+)
+def _read_samples(*tensors: Any, frame: Frame, search_px: int | None, limits: ReturnLimits) -> Samples:
+    """:func:`backproject` of a frame; ``tensors`` are those of it that the kernel reads, and uv (B, N, 2)."""
+    uv = tensors[3]
     pixel = containing_pixels(uv)
     depth, level, edge = _read_depth(frame, uv, pixel, search_px or 0, limits.edge_rel)
     if search_px is None and frame.sparse is not None:
@@ -159,57 +246,6 @@ def _in_torch(frame: Frame, uv: Tensor, search_px: int | None, limits: ReturnLim
     )
 
 
-def _compiled(frame: Frame, uv: Tensor, limits: ReturnLimits) -> Samples | None:
-    """The same bits (sigma up to the rounding of its root) of dense maps and pictures of bytes; None where compiled
-    code is not loaded or does not serve."""
-    conf = frame.depth.new_empty(0, dtype=torch.uint8) if frame.conf is None else frame.conf
-    bytes_alone = frame.image.dtype == conf.dtype == torch.uint8 and 0 <= limits.min_conf <= 255
-    if not bytes_alone or frame.depth.dtype != uv.dtype or not loader.serves(frame.depth, conf):
-        return None
-    found = project_samples(frame, uv)
-    if found is None:
-        return None
-    pixel, at, ray = found
-    picture, steps = flatten_images(frame.image)
-    depth, sigma, confidence = (ray.new_empty(ray.shape[:2]) for _ in range(3))
-    flag = torch.empty_like(depth, dtype=torch.int32)
-    xyz = torch.empty_like(ray)
-    said = (depth, sigma, confidence, xyz, flag)
-    size, reach = window_sizes(frame)
-    shape = (reach, *steps, *frame.image.shape[1:], size)
-    torch.ops.dhtorch.samples.default(frame.depth, conf, at, picture, pixel, ray, *said, *shape, *limits.told())
-    none = {"trackability": torch.zeros_like(depth), "hole": torch.zeros_like(flag)}
-    return Samples(uv=uv, depth=depth, sigma=sigma, xyz=xyz, confidence=confidence, flag=flag, **none)
-
-
-def window_sizes(frame: Frame) -> tuple[int, int]:
-    """Sides of the neighbourhoods in the picture and in the map, px."""
-    hw = frame.depth.shape[-2], frame.depth.shape[-1]
-    return min(NEIGHBOURHOOD_PX, *frame.hw), min(NEIGHBOURHOOD_PX, *hw)
-
-
-def project_samples(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Where compiled code reads for samples (B, N, 2): pixels of picture and map (B, N, 2), and rays (B, N, 3); None
-    where it does not serve."""
-    camera, own = frame.camera, frame.depth_camera
-    (h, w), (H, W) = frame.depth.shape[-2:], frame.hw
-    if camera.distortion is None and (own is None or own.distortion is None):
-        lens = [camera.f, camera.c]
-        lens += [camera.f.new_empty(0)] * 2 if own is None else [own.f, own.c]
-        start, *lens = (x.contiguous() for x in (uv, *lens))
-        if {x.dtype for x in (start, *lens)} != {torch.float32} or not loader.serves(start, *lens):
-            return None
-        pixel, at = (torch.empty_like(start, dtype=torch.int32) for _ in range(2))
-        ray = start.new_empty(*uv.shape[:2], 3)
-        torch.ops.dhtorch.places.default(start, *lens, pixel, at, ray, w / W, h / H)
-        return pixel, at, ray
-    place = cam.depth_pixels(camera, frame.hw, own, (h, w), uv)
-    ray = cam.rays(camera, uv.nan_to_num(0.0, 0.0, 0.0))
-    if ray.dtype != torch.float32 or not loader.serves(place.contiguous(), ray):
-        return None
-    return containing_pixels(uv).contiguous(), containing_pixels(place).contiguous(), ray
-
-
 def _read_depth(
     frame: Frame, uv: Tensor, pixel: Tensor, search_px: int, edge_rel: float
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -224,7 +260,7 @@ def _read_depth(
     if whole_is_faster((h, w), uv.shape[1], size):
         low, high = (gather_reduced(x, pixel, size) for x in _whole_extremes(frame.depth, size))
     else:
-        low, high = reduce_patches(frame.depth[:, None], pixel, size, _extremes, compiled="extremes")
+        low, high = _window_extremes(frame.depth[:, None], pixel, size=size)
     if search_px > 0:
         pixel = containing_pixels(_nearest_return(frame.depth, place, size, search_px))
     index, inside = nearest_pixel_index((h, w), pixel)
@@ -234,6 +270,26 @@ def _read_depth(
     edge = (value > 0) & (high > low * (1 + edge_rel))
     level = torch.full_like(value, 2) if frame.conf is None else frame.conf.flatten(1).gather(1, index)
     return value, level, edge
+
+
+def _window_extremes_kernel(depth: Tensor, pixel: Tensor, *, size: int) -> tuple[Tensor, Tensor]:
+    *windows, shape = window_arguments(depth, pixel, size)
+    found = depth.new_empty(2, *pixel.shape[:2])
+    torch.ops.dhtorch.window_extremes.default(*windows, found, *shape)
+    low, high = found.unbind(0)
+    return low, high
+
+
+@operator(
+    kernel=_window_extremes_kernel,
+    dtypes={"depth": torch.float32, "pixel": torch.int32},
+    any_layout=("depth",),
+    when=fits_window_kernel,
+)
+def _window_extremes(depth: Tensor, pixel: Tensor, *, size: int) -> tuple[Tensor, Tensor]:
+    """Smallest and largest return (B, N) of maps (B, 1, h, w) around pixels (B, N, 2)."""
+    low, high = reduce_patches(depth, pixel, size, _extremes)
+    return low, high
 
 
 def _extremes(window: Tensor) -> tuple[Tensor, Tensor]:
@@ -286,16 +342,36 @@ def _appearance(image: Tensor, pixel: Tensor, limits: ReturnLimits) -> tuple[Ten
     size = min(NEIGHBOURHOOD_PX, *hw)
     white = 1 if image.is_floating_point() else 255
 
-    def told(mean: Tensor, centre: Tensor, top: Tensor, bottom: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        shine = (top - bottom <= 0.15 * top) & (centre >= limits.highlight * white) & (centre - mean >= 0.1 * white)
+    def doubts_of(mean: Tensor, centre: Tensor, top: Tensor, bottom: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        colourless = top - bottom <= MAX_HIGHLIGHT_COLOUR_REL * top
+        bright = (centre >= limits.highlight * white) & (centre - mean >= MIN_HIGHLIGHT_CONTRAST * white)
+        shine = colourless & bright
         return mean <= limits.dark * white, mean >= limits.saturated * white, shine
 
     if whole_is_faster(hw, pixel.shape[1], size) and image.dtype == torch.uint8:
-        found = zip(*(told(*seen) for seen in _whole_brightness(image, size)), strict=True)
+        found = zip(*(doubts_of(*seen) for seen in _whole_brightness(image, size)), strict=True)
         doubts = tuple(gather_reduced(torch.cat(rows, 1), pixel, size) for rows in found)
     else:
-        doubts = told(*reduce_patches(image.detach(), pixel, size, _brightness, compiled="brightness"))
+        doubts = doubts_of(*_window_brightness(image.detach(), pixel, size=size))
     return ~is_patch_inside(pixel, hw, size), *doubts
+
+
+def _window_brightness_kernel(image: Tensor, pixel: Tensor, *, size: int) -> tuple[Tensor, ...]:
+    *windows, shape = window_arguments(image, pixel, size)
+    found = image.new_empty(4, *pixel.shape[:2], dtype=torch.float32)
+    torch.ops.dhtorch.window_brightness.default(*windows, found, *shape)
+    return found.unbind(0)
+
+
+@operator(
+    kernel=_window_brightness_kernel,
+    dtypes={"image": torch.uint8, "pixel": torch.int32},
+    any_layout=("image",),
+    when=fits_window_kernel,
+)
+def _window_brightness(image: Tensor, pixel: Tensor, *, size: int) -> tuple[Tensor, ...]:
+    """What :func:`_brightness` is around pixels (B, N, 2) of images (B, C, H, W), four tensors (B, N)."""
+    return reduce_patches(image, pixel, size, _brightness)
 
 
 def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -13,10 +13,16 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import ROUTE_OF_HOLE, Flag, Hole, first_reason
-from dhtorch.geometry.checks import check, is_transformed
+from dhtorch.geometry.checks import all_finite, check, is_transformed
 from dhtorch.geometry.linalg import eigenvalues_2x2
-from dhtorch.geometry.patches import containing_pixels, reduce_patches
-from dhtorch.ops import loader
+from dhtorch.geometry.patches import (
+    containing_pixels,
+    fits_window_kernel,
+    product_is_exact,
+    reduce_patches,
+    window_arguments,
+)
+from dhtorch.ops.dispatch import operator
 from dhtorch.records import Frame, Samples
 
 
@@ -50,19 +56,25 @@ def classify(
     """
     check("classify", image=(frame.image, "B C H W"), uv=(samples.uv, "B N 2"), flag=(samples.flag, "B N"))
     trackability = min_eigenvalue(frame.image, samples.uv, block=block)
-    if loader.serves(samples.xyz, samples.flag, trackability):
-        hole = torch.empty_like(samples.flag)
-        torch.ops.dhtorch.holes.default(samples.xyz, samples.flag, trackability, hole, min_trackability)
-    else:
-        hole = _first_class(samples, trackability, min_trackability)
+    hole = _classify_holes(samples.xyz, samples.flag, trackability, min_trackability=min_trackability)
     return samples.replace(trackability=trackability.to(samples.depth.dtype), hole=hole)
 
 
-def _first_class(samples: Samples, trackability: Tensor, min_trackability: float) -> Tensor:
-    device = samples.flag.device
-    hole = (_class_of_flag.__wrapped__ if is_transformed() else _class_of_flag)(device)[samples.flag]
+def _classify_holes_kernel(xyz: Tensor, flag: Tensor, trackability: Tensor, *, min_trackability: float) -> Tensor:
+    hole = torch.empty_like(flag)
+    torch.ops.dhtorch.classify_holes.default(xyz, flag, trackability, hole, min_trackability)
+    return hole
+
+
+@operator(
+    kernel=_classify_holes_kernel,
+    dtypes={"xyz": torch.float32, "flag": torch.int32, "trackability": torch.float32},
+)
+def _classify_holes(xyz: Tensor, flag: Tensor, trackability: Tensor, *, min_trackability: float) -> Tensor:
+    """Hole class (B, N) int32 of points (B, N, 3), flags (B, N) and trackability (B, N)."""
+    hole = (_class_of_flag.__wrapped__ if is_transformed() else _class_of_flag)(flag.device)[flag]
     flat = (trackability.detach() < min_trackability) & (hole == Hole.TRACKABLE_NO_LIDAR)
-    return hole.masked_fill_(flat, Hole.LOW_TEXTURE).masked_fill_(samples.usable, Hole.NONE)
+    return hole.masked_fill_(flat, Hole.LOW_TEXTURE).masked_fill_(all_finite(xyz, -1), Hole.NONE)
 
 
 @lru_cache(maxsize=8)
@@ -93,7 +105,26 @@ def min_eigenvalue(
     Gradient: to the image; at equal eigenvalues the subgradient without the split is taken.
     """
     check("min_eigenvalue", image=(image, "B C H W"), uv=(uv, "B N 2"))
-    (found,) = reduce_patches(image, containing_pixels(uv), block + 2, _texture, grey=True, compiled="texture")
+    return _window_texture(image, containing_pixels(uv), size=block + 2)
+
+
+def _window_texture_kernel(image: Tensor, pixel: Tensor, *, size: int) -> Tensor:
+    *windows, shape = window_arguments(image, pixel, size)
+    found = image.new_empty(pixel.shape[:2], dtype=torch.float32)
+    interleaved = shape[3] == 3
+    torch.ops.dhtorch.window_texture.default(*windows, found, *shape, interleaved and product_is_exact(image))
+    return found
+
+
+@operator(
+    kernel=_window_texture_kernel,
+    dtypes={"image": torch.uint8, "pixel": torch.int32},
+    any_layout=("image",),
+    when=fits_window_kernel,
+)
+def _window_texture(image: Tensor, pixel: Tensor, *, size: int) -> Tensor:
+    """What :func:`min_eigenvalue` is around pixels (B, N, 2) of images (B, C, H, W), in windows of ``size`` px."""
+    (found,) = reduce_patches(image, pixel, size, _texture, grey=True)
     return found
 
 

@@ -12,11 +12,12 @@ from torch.utils import _pytree as pytree
 
 from dhtorch.codes import PoseCode, first_reason
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry import covariance, ransac, reprojection_problem, se3
+from dhtorch.geometry import covariance, p3p, ransac, reprojection_problem, se3
 from dhtorch.geometry.checks import all_finite, all_known, check
 from dhtorch.geometry.determinism import PRODUCT_LANES, SUM_LANES, round_up
 from dhtorch.geometry.inference_mode import run_without_grad
 from dhtorch.geometry.least_squares import (
+    INITIAL_DAMPING,
     MIN_DEPTH,
     NormalEquations,
     has_graph,
@@ -34,7 +35,7 @@ from dhtorch.geometry.least_squares import (
 from dhtorch.geometry.linalg import upper_triangle
 from dhtorch.geometry.map_estimate import FitOptions, estimate_map_pose, pose_covariance
 from dhtorch.geometry.reprojection_problem import PoseDepthProblem
-from dhtorch.ops import loader
+from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import chunked_apply
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 
@@ -162,7 +163,7 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
     N, f, c = xyz.shape[1], camera.f, camera.c
     points, usable = _planes(xyz, uv, valid)
     with torch.no_grad():
-        start, found = _robust_pose(points, usable, f, c, draws, options)
+        start, found = _robust_pose(points, usable, f, c, draws, options=options)
     start = start.detach()  # forward mode looks through no_grad, into a search that may stand beside a singular triple
     # The last step, in float64 and with the graph on.
     f, c = f.double(), c.double()
@@ -238,13 +239,51 @@ def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     return torch.nn.functional.pad(points, more), torch.nn.functional.pad(usable, more)
 
 
+def _is_truncated_only(*_: Tensor, options: _Options) -> bool:
+    """Whether costs are squares, truncated and not bent by a robust kernel."""
+    return options.kernel is None
+
+
+def _robust_pose_kernel(
+    points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tensor, *, options: _Options
+) -> tuple[Pose, Tensor]:
+    B = len(points)
+    R, t = (points.new_empty(B, *size, dtype=torch.float64) for size in ((3, 3), (3,)))
+    found = torch.empty_like(usable[:, 0])
+    torch.ops.dhtorch.robust_pose.default(
+        points=points,
+        usable=usable,
+        f=f.contiguous(),
+        c=c.contiguous(),
+        draws=draws.contiguous(),
+        R=R,
+        t=t,
+        found=found,
+        threshold_px=options.threshold_px,
+        local_optimisation=options.local_optimisation,
+        polish_steps=options.polish_steps,
+        search_points=MAX_SEARCH_POINTS,
+        preview_points=ransac.PREVIEW_POINTS,
+        shortlist=ransac.SHORTLISTED_POSES,
+        keep=ransac.KEPT_POSES,
+        damping=INITIAL_DAMPING,
+        min_depth=MIN_DEPTH,
+        min_height=p3p.MIN_HEIGHT_RATIO,
+        max_cosine=p3p.MAX_RAY_COSINE,
+    )
+    return Pose(R, t), found
+
+
+@operator(
+    kernel=_robust_pose_kernel,
+    dtypes={"points": torch.float32, "usable": torch.bool} | dict.fromkeys(("f", "c", "draws"), torch.float32),
+    any_layout=("f", "c", "draws"),
+    when=_is_truncated_only,
+)
 def _robust_pose(
-    points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tensor, options: _Options
+    points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tensor, *, options: _Options
 ) -> tuple[Pose, Tensor]:
     """Search, refine the best two, polish the better: a float64 pose (exactly a rotation) and whether there is one."""
-    given = (points, usable, f.contiguous(), c.contiguous(), draws.contiguous())
-    if options.kernel is None and loader.serves(*given):
-        return _compiled(given, options)
     index, count = ransac.usable_first(usable, min(MAX_SEARCH_POINTS, usable.shape[1]))
     near = points.gather(2, index[:, None].expand(-1, 5, -1))
     poses, cost = ransac.search_hypotheses(near, count, f, c, draws, threshold_px=options.threshold_px)
@@ -260,29 +299,6 @@ def _robust_pose(
     )
     T, _ = minimise(normal, flat[best], options.polish_steps, cost=cost_of, step=trial_pose_step)
     return Pose(se3.orthonormal(T.R.double()), T.t.double()), found
-
-
-def _compiled(given: tuple[Tensor, ...], o: _Options) -> tuple[Pose, Tensor]:
-    """:func:`_robust_pose` in compiled code (:mod:`dhtorch.ops.loader`), the same up to the rounding of sums."""
-    points, usable, f, c, draws = given
-    B = len(points)
-    R = points.new_empty(B, 3, 3, dtype=torch.float64)
-    t = points.new_empty(B, 3, dtype=torch.float64)
-    found = torch.empty_like(usable[:, 0])
-    torch.ops.dhtorch.robust_pose(
-        points=points,
-        usable=usable,
-        f=f,
-        c=c,
-        draws=draws,
-        R=R,
-        t=t,
-        found=found,
-        threshold_px=o.threshold_px,
-        local_optimisation=o.local_optimisation,
-        polish_steps=o.polish_steps,
-    )
-    return Pose(R, t), found
 
 
 def _truncated(

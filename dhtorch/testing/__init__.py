@@ -1,8 +1,8 @@
-"""Writers: every format we read, tiny and complete, from given frames.
+"""Test writers: frames -> a small, complete capture of every supported format.
 
-They exist so that a reader can be held against a scene whose geometry is known exactly, and so that a notebook can show
-a format without a download. Nothing is compressed cleverly and no decoder of ours is used: the PNG bytes are put
-together here. Frames have B = 1; those with poses carry them in ``T_world_from_cam``.
+They serve to test readers on scenes with exactly known geometry, and to show a format in a notebook without a download.
+They share no code with the decoders: PNG bytes, for example, are assembled here. Frames have B = 1 and their poses in
+``T_world_from_cam``.
 """
 
 from dhtorch.testing.arkitscenes import write_arkitscenes

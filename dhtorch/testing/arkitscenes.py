@@ -1,4 +1,4 @@
-"""Writer of ARKitScenes captures."""
+"""Test writer of ARKitScenes captures."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ from dhtorch.testing.parts import (
 
 def write_arkitscenes(
     root: Path,
-    assets: Mapping[str, Sequence[Frame]],  # asset → its frames, each at its own times
+    assets: Mapping[str, Sequence[Frame]],  # asset → its frames, each with its own times
     *,
     trajectory: Sequence[Frame] | None = None,
 ) -> None:
-    """Assets of one capture: pictures, depth, confidence, intrinsics and ``lowres_wide.traj``.
+    """Write assets of one capture: images, depth, confidence, intrinsics and ``lowres_wide.traj``.
 
     ``lowres_wide``, ``vga_wide``, ``wide`` (``color``): image and intrinsics. ``lowres_depth``: depth, its
     intrinsics (``lowres_wide_intrinsics``) and confidence, where the frames have one. ``highres_depth``: depth and its
-    intrinsics (``wide_intrinsics``). ``<asset>_intrinsics``: intrinsics alone.
+    intrinsics (``wide_intrinsics``). ``<asset>_intrinsics``: only intrinsics.
 
     Args:
         root: the capture's folder; its name is the video id.
         assets: what to write.
-        trajectory: frames whose poses the trajectory holds. None = no trajectory, as 24 captures have it.
+        trajectory: frames with the poses of the trajectory. None = no trajectory, as for 24 captures.
     """
     for asset, frames in assets.items():
         for frame in frames:
             name = f"{root.name}_{frame_time_s(frame):.3f}"
             if asset.endswith("_depth"):
                 save_file(root / asset / f"{name}.png", encode_unfiltered_png(encode_depth_codes(frame.depth, 1000)))
-                of = "lowres_wide" if asset == "lowres_depth" else "wide"
+                colour_asset = "lowres_wide" if asset == "lowres_depth" else "wide"
                 hw = (frame.depth.shape[-2], frame.depth.shape[-1])
                 camera = frame.depth_camera or cameras.resize(frame.camera, frame.hw, hw)
-                _write_pincam(root / f"{of}_intrinsics" / f"{name}.pincam", camera, hw)
+                _write_pincam(root / f"{colour_asset}_intrinsics" / f"{name}.pincam", camera, hw)
                 if asset == "lowres_depth" and frame.conf is not None:
                     save_file(root / "confidence" / f"{name}.png", encode_unfiltered_png(frame.conf[0].numpy()))
                 continue
@@ -66,13 +66,13 @@ def _write_pincam(file: Path, camera: Camera, hw: tuple[int, int]) -> None:
 
 
 def _trajectory_row(time: float, c2w: np.ndarray) -> str:
-    """Stamp, rotation vector and translation, world to camera."""
+    """Line with stamp, rotation vector and translation, world to camera."""
     R = c2w[:3, :3].T
     return format_row([time, *_rotation_vector(R), *(-R @ c2w[:3, 3])])
 
 
 def _rotation_vector(R: np.ndarray) -> np.ndarray:
-    """Axis times angle (3,) of a rotation, by way of its quaternion (exact near 0 and near half a turn)."""
+    """Rotation → axis · angle (3,), via its quaternion (exact near 0 and near 180°)."""
     q = rotation_to_xyzw(R)
     q = -q if q[3] < 0 else q
     length = float(np.linalg.norm(q[:3]))

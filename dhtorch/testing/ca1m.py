@@ -1,4 +1,4 @@
-"""Writer of CA-1M archives."""
+"""Test writer of CA-1M archives."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from dhtorch.testing.parts import (
 def write_ca1m(
     file: Path,
     frames: Sequence[Frame],
-    lasers: Sequence[Frame],  # one for each frame: its depth is the truth
+    lasers: Sequence[Frame],  # one per frame, with the true depth
     *,
     without: Sequence[tuple[int, str]] = (),
 ) -> None:
-    """One WebDataset archive, ``ca1m-<split>-<video id>.tar``.
+    """Write one WebDataset archive, ``ca1m-<split>-<video id>.tar``.
 
     Args:
         file: the archive; its name ends in the video id.
         frames: image, LiDAR depth, confidence (levels 0, 1, 2 become 0, ½, 1) and pose.
-        lasers: laser depth, at a size of its own.
+        lasers: laser depth, of any size.
         without: (frame, member) to leave out, ``(3, "gt/depth.png")``.
     """
     video = file.stem.rsplit("-", 1)[-1]
@@ -58,7 +58,7 @@ def write_ca1m(
 
 
 def _make_members(frame: Frame, laser: Frame) -> dict[str, bytes]:
-    """The members of one frame."""
+    """Member name → content, of one frame."""
     members = {
         "wide/image.png": encode_unfiltered_png(frame_to_hwc(frame)),
         "wide/image/K.json": _matrix_json(K_matrix(frame.camera)),

@@ -1,4 +1,4 @@
-"""Writers of the plain layouts: TUM RGB-D, numbered frames, rectified pairs, LiDAR with cameras."""
+"""Test writers of simple layouts: TUM RGB-D, numbered frames, rectified pairs, LiDAR with cameras."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ from dhtorch.testing.parts import (
     save_file,
 )
 
-#: TUM's colour, depth and pose streams tick apart; the written depth stamps lag by this.
-_TUM_DEPTH_LAG_S = 0.0125  # s
+#: Lag in s of the depth stamps behind the colour stamps: TUM's streams are not synchronous.
+_TUM_DEPTH_LAG_S = 0.0125
 
 
 def write_tum(
     root: Path, frames: Sequence[Frame], *, camera: int | None = None, units_per_metre: float = 5000.0
 ) -> None:
-    """A TUM RGB-D sequence: ``rgb/``, ``depth/``, their lists and ``groundtruth.txt``.
+    """Write a TUM RGB-D sequence: ``rgb/``, ``depth/``, their lists and ``groundtruth.txt``.
 
     The format has no place for K. ``camera`` 1, 2 or 3 names the freiburg camera in the trajectory's header, so that a
-    reader takes the published calibration (frames of 640×480); None puts the frames' own into ``meta.json``. The
-    trajectory ticks at the colour stamps.
+    reader uses the published calibration (frames of 640×480); None writes the frames' own to ``meta.json``. The
+    trajectory has the colour stamps.
     """
     lists: dict[str, list[str]] = {"rgb": ["# color images"], "depth": ["# depth maps"]}
     poses = ["# ground truth trajectory", f"# file: 'rgbd_dataset_{f'freiburg{camera}' if camera else 'own'}.bag'"]
@@ -54,15 +54,18 @@ def write_tum(
     for name, lines in (("rgb", lists["rgb"]), ("depth", lists["depth"]), ("groundtruth", poses)):
         save_file(root / f"{name}.txt", "\n".join(lines) + "\n")
     if camera is None:
-        lens = frames[0].camera.distortion
-        meta = {"K": K_matrix(frames[0].camera).tolist(), "dist": [0.0] * 5 if lens is None else lens[0].tolist()}
+        distortion = frames[0].camera.distortion
+        meta = {
+            "K": K_matrix(frames[0].camera).tolist(),
+            "dist": [0.0] * 5 if distortion is None else distortion[0].tolist(),
+        }
         save_file(root / "meta.json", json.dumps(meta))
 
 
 def write_named_frames(
     root: Path, frames: Sequence[Frame], *, units_per_metre: float = 1000.0, fps: float | None = None
 ) -> None:
-    """``frame-XXXXXX.{color.png,depth.png,pose.txt}`` and ``camera-intrinsics.txt``, as 7-Scenes and its descendants.
+    """``frame-XXXXXX.{color.png,depth.png,pose.txt}`` and ``camera-intrinsics.txt``, as 7-Scenes.
 
     Where the frames' depth has a camera of its own, the intrinsics file holds that one and ``meta.json`` holds both.
     """
@@ -81,7 +84,7 @@ def write_named_frames(
 
 
 def write_counted_frames(root: Path, frames: Sequence[Frame], *, units_per_metre: float = 1000.0) -> None:
-    """``images/``, ``depth/``, ``poses.txt`` (a row-major matrix a line) and ``K.txt``."""
+    """``images/``, ``depth/``, ``poses.txt`` (one row-major matrix per line) and ``K.txt``."""
     for i, frame in enumerate(frames):
         save_file(root / "images" / f"{i:05d}.png", encode_unfiltered_png(frame_to_hwc(frame)))
         save_file(
@@ -92,7 +95,7 @@ def write_counted_frames(root: Path, frames: Sequence[Frame], *, units_per_metre
 
 
 def write_calib_pair(root: Path, left: Frame, right: Frame) -> None:
-    """A rectified pair as Middlebury and ETH3D write it: ``calib.txt``, ``im0.png``, ``im1.png``, ``disp0.pfm``."""
+    """Write a rectified pair as in Middlebury and ETH3D: ``calib.txt``, ``im0.png``, ``im1.png``, ``disp0.pfm``."""
     baseline, doffs = _rectification(left, right)
     h, w = left.hw
     lines = [f"cam{i}={_format_matlab(K_matrix(frame.camera))}" for i, frame in enumerate((left, right))]
@@ -105,7 +108,7 @@ def write_calib_pair(root: Path, left: Frame, right: Frame) -> None:
 
 
 def write_npz_pair(root: Path, left: Frame, right: Frame, *, name: str = "scene") -> None:
-    """A rectified pair as scikit-image ships one: ``*_left.png``, ``*_right.png``, ``*_disp.npz``, ``meta.json``."""
+    """Write a rectified pair as in scikit-image: ``*_left.png``, ``*_right.png``, ``*_disp.npz``, ``meta.json``."""
     baseline, doffs = _rectification(left, right)
     save_file(root / f"{name}_left.png", encode_unfiltered_png(frame_to_hwc(left)))
     save_file(root / f"{name}_right.png", encode_unfiltered_png(frame_to_hwc(right)))
@@ -122,9 +125,10 @@ def write_driving(
     *,
     lidar_lag: float = 0.09,
 ) -> None:
-    """A DGP scene folder: ``scene_*.json``, ``calibration/``, ``rgb/<camera>/``, ``point_cloud/LIDAR/*.npz``.
+    """Write a DGP scene folder: ``scene_*.json``, ``calibration/``, ``rgb/<camera>/``, ``point_cloud/LIDAR/*.npz``.
 
-    The sweep of an instant holds every return of its frames' depth maps, in the LiDAR's frame, stamped later.
+    The sweep of an instant contains all returns of its frames' depth maps in the LiDAR's frame, stamped ``lidar_lag`` s
+    later.
     """
     key = "0" * 40
     data, samples = [], []

@@ -1,4 +1,4 @@
-"""Writer of LeRobot data sets: v3 with its shared tables and videos, v2.1 with files for each episode."""
+"""Test writer of LeRobot data sets: v3 with shared tables and videos, v2.1 with files per episode."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def write_lerobot(
     depth_pixels: str = "gray12le",
     group: int = 3,
 ) -> None:
-    """A data set of one camera, with frames every 1/``fps`` s.
+    """Write a data set of one camera, with frames every 1/``fps`` s.
 
     Args:
         root: an empty folder.
@@ -52,12 +52,12 @@ def write_lerobot(
         camera: key of the colour feature; depth is ``<camera>_depth``.
         fps: frame rate.
         image: ``"video"`` or ``"image"`` (PNG in the table).
-        depth: ``"video"`` (12-bit logarithmic codes), ``"tiff"`` (float, m), ``"png"`` (mm), ``"array"`` (whole mm in
+        depth: ``"video"`` (12-bit logarithmic codes), ``"tiff"`` (float, m), ``"png"`` (mm), ``"array"`` (integer mm in
             the table), None.
         intrinsics: ``"feature"`` (``<camera>.intrinsics``, 9 numbers), ``"side-car"`` or None.
         poses: write ``<camera>.pose``, 16 numbers.
         depth_pixels: pixel format of the depth video.
-        group: rows of a row group.
+        group: rows per row group.
     """
     first = episodes[0][0]
     key, frames = f"{camera}_depth", [frame for episode in episodes for frame in episode]
@@ -77,36 +77,38 @@ def write_lerobot(
     if poses:
         features[f"{camera}.pose"] = _plain_feature("float64", 16)
     rows = _make_columns(episodes, fps, features, camera, depth)
-    parts = [range(len(frames))] if version == 3 else _episode_row_ranges(episodes)
-    for number, span in enumerate(parts):
-        part = {name: [cells[i] for i in span] for name, cells in rows.items()}
-        _write_table(root / _file_path("data", "", number, version, "parquet"), part, group)
-        of = [frames[i] for i in span]
+    spans = [range(len(frames))] if version == 3 else _episode_row_ranges(episodes)
+    for number, span in enumerate(spans):
+        part_rows = {name: [cells[i] for i in span] for name, cells in rows.items()}
+        _write_table(root / _file_path("data", "", number, version, "parquet"), part_rows, group)
+        part_frames = [frames[i] for i in span]
         if image == "video":
-            pictures = [frame_to_hwc(frame) for frame in of]
+            pictures = [frame_to_hwc(frame) for frame in part_frames]
             write_lossless(
                 root / _file_path("videos", camera, number, version, "mp4"), pictures, "rgb24", rate=Fraction(fps)
             )
         if depth == "video":
-            codes = [quantise_lerobot_depth(frame) for frame in of]
+            codes = [quantise_lerobot_depth(frame) for frame in part_frames]
             write_lossless(
                 root / _file_path("videos", key, number, version, "mp4"), codes, depth_pixels, rate=Fraction(fps)
             )
     videos = [name for name, feature in features.items() if feature["dtype"] == "video"]
     _write_meta(root, episodes, version, fps, features, videos)
     if intrinsics == "side-car":
-        lens = first.camera.distortion
-        entry = {"K": K_matrix(first.camera).tolist()} | ({} if lens is None else {"dist": lens[0].tolist()})
+        distortion = first.camera.distortion
+        entry = {"K": K_matrix(first.camera).tolist()} | (
+            {} if distortion is None else {"dist": distortion[0].tolist()}
+        )
         entry |= {} if first.depth_camera is None else {"K_depth": K_matrix(first.depth_camera).tolist()}
         save_file(root / "meta" / "intrinsics.json", json.dumps({camera: entry}))
 
 
 def quantise_lerobot_depth(frame: Frame) -> np.ndarray:
-    """12-bit codes of a depth map: 0 m goes to code 0 like all that is too near, what is too far to the last one."""
+    """Depth map → 12-bit codes: no return and too near become code 0, too far the last code."""
     low, high, shift = (_DEPTH_QUANTISATION[f"video.{name}"] for name in ("depth_min", "depth_max", "shift"))
     z = frame.depth[0].double().numpy()
-    share = np.log((z + shift) / (low + shift)) / math.log((high + shift) / (low + shift))
-    return np.rint(share * 4095).clip(0, 4095).astype(np.uint16)
+    fraction = np.log((z + shift) / (low + shift)) / math.log((high + shift) / (low + shift))
+    return np.rint(fraction * 4095).clip(0, 4095).astype(np.uint16)
 
 
 def _picture_feature(dtype: str, shape: Sequence[int], info: dict[str, Any]) -> dict[str, Any]:
@@ -131,12 +133,12 @@ def _file_path(top: str, key: str, number: int, version: int, suffix: str) -> st
 def _make_columns(
     episodes: Sequence[Sequence[Frame]], fps: int, features: dict[str, Any], camera: str, depth: str | None
 ) -> dict[str, list[Any]]:
-    """Column → a value for every frame of the set."""
+    """Column → one value per frame of the set."""
     rows: dict[str, list[Any]] = {name: [] for name, feature in features.items() if feature["dtype"] != "video"}
     for number, episode in enumerate(episodes):
         for i, frame in enumerate(episode):
-            places = {"timestamp": i / fps, "frame_index": i, "episode_index": number, "task_index": 0}
-            values: dict[str, Any] = {**places, "index": len(rows["timestamp"])}
+            indices = {"timestamp": i / fps, "frame_index": i, "episode_index": number, "task_index": 0}
+            values: dict[str, Any] = {**indices, "index": len(rows["timestamp"])}
             name = f"frame-{i:06d}"
             values[camera] = {"bytes": encode_unfiltered_png(frame_to_hwc(frame)), "path": f"{name}.png"}
             if depth in ("tiff", "png"):

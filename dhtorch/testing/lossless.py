@@ -1,4 +1,4 @@
-"""Videos that lose nothing: byte planes and coded depth, where a single wrong bit is half a metre."""
+"""Writer of lossless videos, for byte planes and coded depth, where one wrong bit can be half a metre."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 from dhtorch.data.io.decode import import_optional
 
 _H264 = {"qp": "0", "preset": "ultrafast"}
-# No B-frames: with them the muxer refuses films of two pictures, at some sizes always and at others now and then.
+# No B-frames: with them the muxer fails on videos of two frames, at some sizes always, at others sometimes.
 _HEVC = {"preset": "ultrafast", "x265-params": "lossless=1:bframes=0:log-level=none:pools=none:frame-threads=1"}
 
-#: Pixel format → encoder and options that lose nothing.
+#: Pixel format → encoder and lossless options.
 _LOSSLESS_ENCODERS: dict[str, tuple[str, dict[str, str]]] = {
     "rgb24": ("libx264rgb", _H264),
     "yuv420p": ("libx264", _H264),
@@ -33,16 +33,16 @@ def write_lossless(
     rate: Fraction = Fraction(30),
     options: Mapping[str, str] | None = None,
 ) -> None:
-    """Pictures as an mp4 in one of the pixel formats of the table above; single-channel ones become the luma.
+    """Write images as an mp4 in a pixel format of ``_LOSSLESS_ENCODERS``; single-channel ones become the luma.
 
-    ``options`` replace those of the encoder, for a file that does lose something.
+    ``options`` replace those of the encoder, for a lossy file.
     """
     av = import_optional("av")
     encoder, lossless = _LOSSLESS_ENCODERS[pixels]
-    chosen = dict(lossless if options is None else options)
+    encoder_options = dict(lossless if options is None else options)
     file.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(file), "w", format="mp4") as container:
-        stream = container.add_stream(encoder, rate=rate, options=chosen)
+        stream = container.add_stream(encoder, rate=rate, options=encoder_options)
         stream.pix_fmt = pixels
         stream.height, stream.width = pictures[0].shape[:2]
         stream.codec_context.thread_count = 1
@@ -55,7 +55,7 @@ def write_lossless(
 
 
 def _fill_planes(frame: Any, picture: np.ndarray) -> None:
-    """The first plane takes the picture, the colour planes the value that means grey."""
+    """Fill the first plane with the image and the colour planes with grey."""
     for k, plane in enumerate(frame.planes):
         rows = np.full(
             (plane.height, plane.line_size // picture.itemsize), 128 << 4 * (picture.itemsize - 1), picture.dtype

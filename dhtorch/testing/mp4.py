@@ -1,4 +1,4 @@
-"""Videos from pictures, for the formats that keep their pictures in one."""
+"""Writer of H.264 and HEVC videos as phones write them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from dhtorch.data.io.decode import import_optional
 
-_TICKS_PER_S = 600  # per second: 24, 25, 30 and 60 Hz are whole numbers of them
+_TICKS_PER_S = 600  # time base: divisible by 24, 25, 30 and 60 Hz
 
 
 def write_video(
@@ -25,10 +25,10 @@ def write_video(
     stored: str = "yuv420p",
     hide_first: bool = False,
 ) -> None:
-    """An mp4 with a key frame now and then and frames stored out of order in between, as phones write them.
+    """Write an mp4 with periodic key frames and B-frames (stored out of order), as phones write them.
 
-    ``stored``: format of the pixels in the file; ``yuv420p10le`` has ten bits. ``hide_first``: an edit list lets the
-    film begin with the second frame, so that the first one lies before time 0.
+    ``stored``: pixel format of the file; ``yuv420p10le`` has ten bits. ``hide_first``: an edit list starts the video
+    with the second frame, so that the first one is before time 0.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     h, w = pictures[0].shape[:2]
@@ -54,7 +54,7 @@ def write_video(
 
 
 def _delay_edit(file: Path, ticks: int) -> None:
-    """Move the start of the only edit in the file's edit list: what comes before is decoded but not shown."""
+    """Delay the start of the only edit in the file's edit list: earlier frames are decoded but not presented."""
     content = bytearray(file.read_bytes())
     at = content.index(b"elst") + 16  # version and flags, count, duration, then the start
     start = int.from_bytes(content[at : at + 4], "big") + ticks

@@ -1,4 +1,4 @@
-"""What every writer needs: pixels, depth codes and matrices of a frame, PNG bytes, and files written below a root."""
+"""Helpers of the test writers: a frame's pixels, depth codes and matrices, PNG encoding, saving of files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from dhtorch.records import Camera, Frame
 
 
 def frame_to_hwc(frame: Frame) -> np.ndarray:
-    """(H, W, C) uint8."""
+    """Image of a frame (H, W, C) uint8."""
     image = frame.image[0]
     if image.dtype != torch.uint8:
         image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
@@ -25,13 +25,13 @@ def frame_to_hwc(frame: Frame) -> np.ndarray:
 
 
 def encode_depth_codes(depth: Tensor, units_per_metre: float) -> np.ndarray:
-    """(h, w) uint16, row after row in memory."""
+    """Depth (1, h, w) m → codes (h, w) uint16, C-contiguous."""
     codes = (depth[0].double() * units_per_metre).round().clamp(0, 65534)
     return np.ascontiguousarray(codes.numpy(), np.uint16)
 
 
 def encode_unfiltered_png(picture: np.ndarray) -> bytes:
-    """PNG of (H, W, 1 or 3) uint8 or (H, W) uint16, rows unfiltered."""
+    """(H, W, 1 or 3) uint8 or (H, W) uint16 → bytes of a PNG with unfiltered rows."""
     h, w = picture.shape[:2]
     bits = 8 * picture.dtype.itemsize
     colour = 2 if picture.ndim == 3 and picture.shape[2] == 3 else 0
@@ -43,7 +43,7 @@ def encode_unfiltered_png(picture: np.ndarray) -> bytes:
 
 
 def rotation_to_xyzw(R: np.ndarray) -> np.ndarray:
-    """x y z w of a rotation: the dominant eigenvector of a symmetric 4×4 matrix, exact to rounding at every angle."""
+    """Rotation → quaternion x y z w: dominant eigenvector of a symmetric 4×4 matrix, exact to rounding at any angle."""
     d, s = R - R.T, R + R.T
     Q = np.empty((4, 4))
     Q[:3, :3] = s - np.trace(R) * np.eye(3)
@@ -53,35 +53,35 @@ def rotation_to_xyzw(R: np.ndarray) -> np.ndarray:
 
 
 def pose_matrix(frame: Frame) -> np.ndarray:
-    """4×4 camera-to-world."""
+    """Camera-to-world (4, 4) float64 of a frame."""
     if frame.T_world_from_cam is None:
         raise ValueError("writers: found a frame without T_world_from_cam, expected a pose to write")
     return se3.to_matrix(frame.T_world_from_cam)[0].double().numpy()
 
 
 def frame_time_s(frame: Frame) -> float:
-    """Time stamp of a frame."""
+    """Time stamp of a frame in s."""
     if frame.time is None:
         raise ValueError("writers: found a frame without time, expected a stamp to write")
     return float(frame.time[0])
 
 
 def K_matrix(camera: Camera) -> np.ndarray:
-    """(3, 3) float64."""
+    """Intrinsic matrix (3, 3) float64 of a camera."""
     return cameras.to_matrix(camera)[0].double().numpy()
 
 
 def format_row(values: Any) -> str:
-    """Numbers on one line, every digit kept."""
+    """Numbers → one line of text with all digits of float64."""
     return " ".join(f"{float(x):.17g}" for x in values)
 
 
 def format_rows(matrix: np.ndarray) -> str:
-    """A matrix, one row a line."""
+    """Matrix → text, one row per line."""
     return "".join(format_row(row) + "\n" for row in matrix)
 
 
 def save_file(file: Path, content: bytes | str) -> None:
-    """Write a file, its folder included."""
+    """Write a file and create its folder."""
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(content.encode() if isinstance(content, str) else content)

@@ -1,4 +1,4 @@
-"""Writers of Record3D's three layouts."""
+"""Test writers of Record3D's three layouts."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def write_r3d(
     per_frame: bool = True,
     compression: int = zipfile.ZIP_STORED,
 ) -> None:
-    """An ``.r3d`` archive: ``metadata``, ``rgbd/<i>.jpg``, ``.depth``, and ``.conf`` where the frames have confidence.
+    """Write an ``.r3d`` archive: ``metadata``, ``rgbd/<i>.jpg``, ``.depth``, and ``.conf`` (if any).
 
     Args:
         file: the archive.
-        frames: depth may have its own resolution. Without poses the table says what the front camera says.
+        frames: depth may have its own resolution. Without poses the metadata is that of the front camera.
         fps: nominal rate.
-        declared_hw: size that the metadata and K speak of; None = the pictures'.
+        declared_hw: image size in the metadata and of K; None = the images'.
         depth_size: write ``dw`` and ``dh``, which old files lack.
         per_frame: write the intrinsics of every frame, which old files lack.
         compression: of the archive's entries.
@@ -68,14 +68,14 @@ def write_record3d_exr(
     channel: str = "R",
     dtype: np.typing.DTypeLike = np.float16,
 ) -> None:
-    """The EXR + RGB export: ``EXR_RGBD/`` with ``metadata.json``, ``rgb/<i>.jpg`` and ``depth/<i>.exr``."""
+    """Write the EXR + RGB export: ``EXR_RGBD/`` with ``metadata.json``, ``rgb/<i>.jpg`` and ``depth/<i>.exr``."""
     exr = import_optional("OpenEXR")
     folder = root / "EXR_RGBD"
     for i, frame in enumerate(frames):
         save_file(folder / "rgb" / f"{i}.jpg", _encode_jpeg(frame_to_hwc(frame)))
         header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
         picture = io.BytesIO()
-        # The library takes memory as it lies, whatever the strides say.
+        # The library ignores strides: arrays must be contiguous.
         exr.File(header, {channel: np.ascontiguousarray(frame.depth[0].numpy(), dtype)}).write(picture)
         save_file(folder / "depth" / f"{i}.exr", picture.getvalue())
     meta = _make_metadata(frames, fps, None)
@@ -92,9 +92,9 @@ def write_record3d_mp4(
     crf: int = 4,
     stored: str = "yuv420p",
 ) -> None:
-    """The RGBD mp4: hue and colour side by side, intrinsics as JSON behind the film.
+    """Write the RGBD mp4: hue and colour side by side, intrinsics as JSON behind the video.
 
-    ``depth_range``: m, written into the file; None = 0 to 3 m, unsaid, as older files.
+    ``depth_range``: m, written to the file; None = 0 to 3 m, not written, as in older files.
     """
     near, far = depth_range or (0.0, 3.0)
     pictures = [
@@ -105,21 +105,21 @@ def write_record3d_mp4(
     if depth_range is not None:
         meta["rangeOfEncodedDepth"] = list(depth_range)
     text = json.dumps(meta, separators=(",", ":")).encode()
-    with file.open("ab") as stream:  # as a box of its own, so that the file remains an mp4
+    with file.open("ab") as stream:  # as a separate box, so that the file remains an mp4
         stream.write(struct.pack(">I4s", 8 + len(text) + 1, b"free") + text + b"\0")
 
 
 def _make_metadata(frames: Sequence[Frame], fps: float, declared_hw: tuple[int, int] | None) -> dict[str, Any]:
     hw = declared_hw or frames[0].hw
-    own = [cameras.resize(f.camera, f.hw, hw) if declared_hw else f.camera for f in frames]
+    intrinsics = [cameras.resize(f.camera, f.hw, hw) if declared_hw else f.camera for f in frames]
     return {
         "w": hw[1],
         "h": hw[0],
         "dw": frames[0].depth.shape[-1],
         "dh": frames[0].depth.shape[-2],
         "fps": fps,
-        "K": K_matrix(own[0]).T.ravel().tolist(),
-        "perFrameIntrinsicCoeffs": [[*camera.f[0].tolist(), *camera.c[0].tolist()] for camera in own],
+        "K": K_matrix(intrinsics[0]).T.ravel().tolist(),
+        "perFrameIntrinsicCoeffs": [[*camera.f[0].tolist(), *camera.c[0].tolist()] for camera in intrinsics],
         "frameTimestamps": [frame_time_s(f) - frame_time_s(frames[0]) for f in frames],
         "poses": [_arkit_pose(f) for f in frames],
         "initPose": _NO_POSE,
@@ -127,7 +127,7 @@ def _make_metadata(frames: Sequence[Frame], fps: float, declared_hw: tuple[int, 
 
 
 def _arkit_pose(frame: Frame) -> list[float]:
-    """Quaternion and position of the camera with ARKit's axes."""
+    """Quaternion and position of the camera in ARKit's axes."""
     if frame.T_world_from_cam is None:
         return _NO_POSE
     c2w = pose_matrix(frame) @ np.diag([1.0, -1.0, -1.0, 1.0])
@@ -140,8 +140,8 @@ def _encode_jpeg(picture: np.ndarray) -> bytes:
     return out.getvalue()
 
 
-def _hue_to_rgb(share: np.ndarray) -> np.ndarray:
-    """(h, w, 3) uint8: the colour of full saturation and value at a share of the circle."""
-    distance = np.abs((share[..., None] * 6 - [3.0, 2.0, 4.0] + 3) % 6 - 3)
+def _hue_to_rgb(hue: np.ndarray) -> np.ndarray:
+    """Hue (h, w) in [0, 1] → colour (h, w, 3) uint8 of full saturation and value."""
+    distance = np.abs((hue[..., None] * 6 - [3.0, 2.0, 4.0] + 3) % 6 - 3)
     value = np.stack((distance[..., 0] - 1, 2 - distance[..., 1], 2 - distance[..., 2]), -1)
     return (value.clip(0, 1) * 255).round().astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Writer of RH20T scenes: videos by camera, a calibration folder, and the robot's streams."""
+"""Test writer of RH20T scenes: videos by camera, a calibration folder, and the robot's streams."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from dhtorch.testing.parts import (
     save_file,
 )
 
-_CALIBRATION_STAMP_MS = 1_600_000_000_000  # of the calibration, ms
+_CALIBRATION_STAMP_MS = 1_600_000_000_000  # time of the calibration
 
 
 def write_rh20t(
     root: Path,
-    cameras: Mapping[str, Sequence[Frame]],  # serial → its frames; K belongs to the frames' own size
+    cameras: Mapping[str, Sequence[Frame]],  # serial → its frames; K refers to the frames' own size
     *,
     configuration: int = 1,
     T_world_from_base: np.ndarray | None = None,
@@ -42,13 +42,13 @@ def write_rh20t(
     joint: np.ndarray | None = None,
     width: np.ndarray | None = None,
 ) -> Path:
-    """A scene folder below ``root`` (returned) with the calibration beside it; times are whole milliseconds.
+    """Write a scene folder below ``root`` (returned) with the calibration beside it; times are integer milliseconds.
 
-    The camera whose serial is the first on the hand of ``configuration`` carries the robot with it: the tcp is where
-    the mount puts it. Its extrinsics were taken at another place, ``hand_at_calibration`` (4×4 camera to world), and so
-    were those of the other cameras on the hand, moved along. Colour is coded as RGB without loss, depth as full-range
-    luma without loss, ``lag`` s later. ``joint`` (n, d) rad and ``width`` (n,) of the gripper, in mm, are the robot's
-    at the times of each camera; None = they follow a known law. Scenes that share a ``stamp`` share a calibration.
+    The tcp follows from the poses of the first camera on the hand of ``configuration`` and its mount. The extrinsics of
+    the cameras on the hand were taken at another pose, ``hand_at_calibration`` (4×4 camera to world). Colour is
+    lossless RGB video, depth lossless full-range luma, ``lag`` s later. ``joint`` (n, d) rad and ``width`` (n,) of the
+    gripper, in mm, are the robot's at the times of each camera; None = as in ``_write_streams``. Scenes with one
+    ``stamp`` share a calibration.
     """
     scene = root / f"{name}_cfg_{configuration:04d}"
     arm, folder = ROBOT_ARMS[configuration], root / "calib" / str(stamp)
@@ -56,20 +56,20 @@ def write_rh20t(
     first = cameras.get(arm.in_hand[0])
     start = pose_matrix(first[0]) if first else np.eye(4)
     calibrated = start if hand_at_calibration is None else hand_at_calibration
-    moved = calibrated @ np.linalg.inv(start)
+    offset = calibrated @ np.linalg.inv(start)
     K, E, tcp = {}, {}, {}
     for serial, frames in cameras.items():
-        home = scene / f"cam_{serial}"
+        camera_folder = scene / f"cam_{serial}"
         stamps = [round(1000 * frame_time_s(frame)) for frame in frames]
-        later = [stamp + round(1000 * lag) for stamp in stamps]
-        write_lossless(home / "color.mp4", [frame_to_hwc(f) for f in frames], "rgb24", rate=Fraction(10))
+        depth_stamps = [stamp + round(1000 * lag) for stamp in stamps]
+        write_lossless(camera_folder / "color.mp4", [frame_to_hwc(f) for f in frames], "rgb24", rate=Fraction(10))
         if depth:
-            place = (depth_root or scene) / home.name / "depth.mp4"
-            write_lossless(place, [_encode_depth_planes(f) for f in frames], "yuvj420p", rate=Fraction(10))
-        _save_npy(home / "timestamps.npy", {"color": stamps, "depth": later if depth else []})
+            depth_file = (depth_root or scene) / camera_folder.name / "depth.mp4"
+            write_lossless(depth_file, [_encode_depth_planes(f) for f in frames], "yuvj420p", rate=Fraction(10))
+        _save_npy(camera_folder / "timestamps.npy", {"color": stamps, "depth": depth_stamps if depth else []})
         K[serial] = np.hstack((_full_size_K(frames[0], calibrated_hw), np.zeros((3, 1))))
         poses = [pose_matrix(frame) for frame in frames]
-        c2w = moved @ poses[0] if serial in arm.in_hand else poses[0]
+        c2w = offset @ poses[0] if serial in arm.in_hand else poses[0]
         E[serial] = [np.linalg.inv(c2w), np.eye(4)]
         if first:
             hand = [pose_matrix(frame) for frame in first]
@@ -90,10 +90,10 @@ def write_rh20t(
 
 
 def to_robot_notation(robot: str, T: np.ndarray) -> np.ndarray:
-    """A tcp pose (4×4, base ← tcp) as the robot of that name writes it in a calibration folder."""
+    """Tcp pose (4×4, base ← tcp) → the notation of that robot's calibration file."""
     if robot in ("flexiv", "ur5"):
         return _pose_vector(T)
-    if robot == "franka":  # its own tool looks the other way
+    if robot == "franka":  # its tool axis is reversed
         x, y, z, w = rotation_to_xyzw(T[:3, :3] @ np.diag([1.0, -1.0, -1.0]))
         axis = np.array([x, y, z])
         angle = 2 * np.arctan2(np.linalg.norm([x, y, z]), w)
@@ -118,13 +118,13 @@ def _pose_vector(T: np.ndarray) -> np.ndarray:
 
 
 def _encode_depth_planes(frame: Frame) -> np.ndarray:
-    """Low bytes above high bytes, three equal channels: a grey picture as any player shows it."""
+    """Depth codes as low bytes above high bytes (2h, w) uint8."""
     code = encode_depth_codes(frame.depth, 1000)
     return np.concatenate((code & 255, code >> 8)).astype(np.uint8)
 
 
 def _full_size_K(frame: Frame, calibrated_hw: tuple[int, int]) -> np.ndarray:
-    """K of the full-size image, so that the exact rule gives back the frame's own."""
+    """K of the full-size image, such that exact scaling gives the frame's own K."""
     K = K_matrix(frame.camera)
     for axis, size, full in ((0, frame.hw[1], calibrated_hw[1]), (1, frame.hw[0], calibrated_hw[0])):
         K[axis, axis] *= full / size
@@ -135,9 +135,9 @@ def _full_size_K(frame: Frame, calibrated_hw: tuple[int, int]) -> np.ndarray:
 def _write_streams(
     folder: Path, stamps: Mapping[str, Sequence[int]], joints: np.ndarray | None, widths: np.ndarray | None
 ) -> None:
-    """Streams, where not given by a law of t, in s since the start: joint j is j + t, the width 50 − t, a force t.
+    """Write the robot's streams; by default functions of t (s since the start): joint j + t, width 50 − t, force t.
 
-    The sensor at the wrist has a zero of 3; in the frame of a camera forces are twice those in the frame of the base.
+    The wrist sensor's zero is 3; forces in a camera's frame are twice those in the base frame.
     """
     start = min(min(times) for times in stamps.values())
     joint: dict[str, dict[int, Any]] = {}

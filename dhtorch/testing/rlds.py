@@ -1,4 +1,4 @@
-"""Writer of RLDS data sets: TFRecord files and the two JSON files that TFDS puts beside them."""
+"""Test writer of RLDS data sets: TFRecord files with TFDS's two JSON files."""
 
 from __future__ import annotations
 
@@ -36,26 +36,26 @@ def write_rlds(
     shards: int = 1,
     said: bool = True,
 ) -> None:
-    """A set of one camera; step by step ``observation/<camera>``, an action, and what else is asked for.
+    """Write a set of one camera: per step ``observation/<camera>``, an action and the optional features.
 
     Args:
         root: folder of the set's version.
         episodes: frames of each.
         split: its name.
         camera: name of the colour feature.
-        depth: ``"png"`` (mm) or ``"array"`` (float32, m) under ``depth`` in the place of ``image``; None = none.
+        depth: ``"png"`` (mm) or ``"array"`` (float32, m) with ``depth`` in place of ``image`` in its name; None = none.
         intrinsics: write ``observation/<camera>_intrinsics``, 9 numbers.
         poses: write ``observation/<camera>_T_world_from_cam``, 16 numbers.
         shards: number of files.
-        said: features say the size of pictures.
+        said: write the images' size in the features.
     """
     first = episodes[0][0]
-    of_depth = camera.replace("image", "depth")
+    depth_name = camera.replace("image", "depth")
     observation: dict[str, Any] = {camera: _describe_picture((*first.hw, 3) if said else (-1, -1, 3), "uint8")}
     if depth == "png":
-        observation[of_depth] = _describe_picture((*first.depth.shape[1:], 1), "uint16")
+        observation[depth_name] = _describe_picture((*first.depth.shape[1:], 1), "uint16")
     elif depth == "array":
-        observation[of_depth] = _describe_tensor(tuple(first.depth.shape[1:]), "float32")
+        observation[depth_name] = _describe_tensor(tuple(first.depth.shape[1:]), "float32")
     observation |= {f"{camera}_intrinsics": _describe_tensor((9,), "float32")} if intrinsics else {}
     observation |= {f"{camera}_T_world_from_cam": _describe_tensor((16,), "float32")} if poses else {}
     step = {
@@ -69,10 +69,12 @@ def write_rlds(
     }
     save_file(root / "features.json", json.dumps(_describe_dict({"steps": steps})))
     counts = [len(part) for part in np.array_split(np.arange(len(episodes)), shards)]
-    said_of = {"name": split, "shardLengths": [str(count) for count in counts]}
-    save_file(root / "dataset_info.json", json.dumps({"name": "tiny_robot", "version": "1.0.0", "splits": [said_of]}))
+    split_info = {"name": split, "shardLengths": [str(count) for count in counts]}
+    save_file(
+        root / "dataset_info.json", json.dumps({"name": "tiny_robot", "version": "1.0.0", "splits": [split_info]})
+    )
     records = [
-        _encode_record(_encode_episode(frames, camera, of_depth, depth, intrinsics, poses)) for frames in episodes
+        _encode_record(_encode_episode(frames, camera, depth_name, depth, intrinsics, poses)) for frames in episodes
     ]
     for shard, count in enumerate(counts):
         name = f"tiny_robot-{split}.tfrecord-{shard:05d}-of-{shards:05d}"
@@ -80,9 +82,9 @@ def write_rlds(
 
 
 def _encode_episode(
-    frames: Sequence[Frame], camera: str, of_depth: str, depth: str | None, intrinsics: bool, poses: bool
+    frames: Sequence[Frame], camera: str, depth_name: str, depth: str | None, intrinsics: bool, poses: bool
 ) -> bytes:
-    """One record's message."""
+    """Message of one episode's record."""
     n = len(frames)
     features = {
         f"steps/observation/{camera}": _bytes_feature([encode_unfiltered_png(frame_to_hwc(frame)) for frame in frames]),
@@ -91,11 +93,11 @@ def _encode_episode(
         "episode_metadata/episode_id": _int64s_feature([-1]),
     }
     if depth == "png":
-        features[f"steps/observation/{of_depth}"] = _bytes_feature(
+        features[f"steps/observation/{depth_name}"] = _bytes_feature(
             [encode_unfiltered_png(encode_depth_codes(frame.depth, 1000)) for frame in frames]
         )
     elif depth == "array":
-        features[f"steps/observation/{of_depth}"] = _floats_feature(
+        features[f"steps/observation/{depth_name}"] = _floats_feature(
             np.stack([frame.depth[0].numpy() for frame in frames])
         )
     if intrinsics:

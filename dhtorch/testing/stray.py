@@ -1,4 +1,4 @@
-"""Writer of Stray Scanner captures."""
+"""Test writer of Stray Scanner captures."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ def write_stray(
     confidence_channels: int = 1,
     start: int = 0,
 ) -> None:
-    """``rgb.mp4``, ``depth/``, ``confidence/`` where the frames have it, ``odometry.csv`` and ``camera_matrix.csv``.
+    """Write ``rgb.mp4``, ``depth/``, ``confidence/`` (if any), ``odometry.csv`` and ``camera_matrix.csv``.
 
     Args:
         root: folder of the capture.
-        frames: depth may have its own resolution; the image's sides are even.
+        frames: depth may have its own resolution; the image's sides must be even.
         codec: of the video; the app writes HEVC, ``libx265``.
-        video: write it.
+        video: whether to write it.
         first_picture: ``hidden`` by an edit list, before time 0; or ``lost``.
-        per_frame: columns with K, as newer versions of the app write; the two of the distortion's centre stay empty.
-        depth_format: ``npy`` as the oldest versions.
-        confidence_channels: 3 as some converters leave it.
+        per_frame: write K in every row, as newer versions of the app; the distortion centre's columns stay empty.
+        depth_format: ``npy`` as in the oldest versions.
+        confidence_channels: 3 as written by some converters.
         start: number of the first frame.
     """
     times = [frame_time_s(frame) for frame in frames]

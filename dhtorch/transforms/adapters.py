@@ -119,10 +119,6 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
 
     def _extended(self, samples: Sequence[Any]) -> dict[str, Any]:
         """A whole batch of samples that the transform has not seen."""
-        told = self.transform.uncollated(samples)
-        if told is not None:
-            batch = default_collate([drop_keys(sample, self.consumed) for sample in samples])
-            return self._returned({**batch, **told}) or {}
         # In a worker torch collates into memory that it shares: page by page a new one, several times as slow.
         gone = {key: _collect_key(samples, key) for key in self.consumed if has_key(samples[0], key)}
         views = self.transform.views

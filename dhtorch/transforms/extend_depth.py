@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -18,7 +18,6 @@ from dhtorch.pipeline.presets import get_method
 from dhtorch.pipeline.spec import iter_networks
 from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
 from dhtorch.transforms import maps, poses, schema
-from dhtorch.transforms.fast_path import Alone
 from dhtorch.transforms.sample_access import SampleError, check_sample, get_value, to_tensor
 from dhtorch.transforms.sample_spec import SampleSpec, SampleViews
 from dhtorch.transforms.status import ProblemCounts, SampleProblem
@@ -112,16 +111,12 @@ class ExtendDepth(torch.nn.Module):
         self.on_error, self.batched, self.prefix = on_error, bool(batched), prefix
         self._stated = batched
         self.tally = ProblemCounts()
-        self._alone = Alone(self.views, self.method)
         self._seen_hw: tuple[int, int] | None = None
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
         """The sample with our keys; None where it is skipped."""
         if sample is None and self.on_error == "skip":  # what a data set gives that could not read one
             return self.left_out({}, SampleError("sample: found None, expected a dict with pictures and depth"))
-        at_once = None if self.batched else self.uncollated([sample])
-        if at_once is not None:
-            return {**sample, **{key: x[0] for key, x in at_once.items()}}
         check_sample(sample, self.views.image, self.views.intrinsics, self._stated)
         with torch.set_grad_enabled(torch.is_grad_enabled() and get_worker_info() is None):
             try:
@@ -139,49 +134,6 @@ class ExtendDepth(torch.nn.Module):
             added = self._answer(read, seed, flagged)
         self._counted(added["problem"], read.reference.hw)
         return self._joined(sample, added)
-
-    def uncollated(self, samples: Sequence[Any]) -> dict[str, Tensor] | None:
-        """What is added to the batch that single samples make, without collating what is read of them first.
-
-        None where that cannot be: it needs the compiled code of ``python -m dhtorch.ops.loader``, one view in each
-        sample, pictures of bytes and depth in metres or whole millimetres, and nothing to complain of.
-
-        Gradient: none; None where one is wanted.
-        """
-        if self._alone.method is not self.method or self._alone.views is not self.views:  # somebody put in another one
-            self._alone = Alone(self.views, self.method)
-        stages = self.maps is not None or self.index_key is not None
-        seen = None if stages else self._alone.look(samples)
-        if seen is None:
-            return None
-        found, B = seen.found, len(samples)
-        pooled = patch_tokens(found, seen.hole, seen.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
-        paired = found.depth.new_zeros(B, dtype=torch.bool)
-        problem = found.source.new_full((B,), SampleProblem.NO_SECOND_VIEW)
-        nan = torch.full_like(found.depth, torch.nan)  # trackability is not computed here
-        front_end = Samples(
-            uv=found.uv,
-            depth=found.depth,
-            sigma=found.sigma,
-            xyz=seen.xyz,
-            confidence=found.score,
-            flag=seen.flag,
-            trackability=nan,
-            hole=seen.hole,
-        )
-        results = schema.SampleResults(
-            samples=front_end,
-            merged=found,
-            xyz=seen.xyz,
-            estimate=None,
-            fits=[],
-            paired=paired,
-            tokens=pooled,
-            dense=None,
-            problem=problem,
-        )
-        self._counted(problem, seen.hw)
-        return {self.prefix + key: x for key, x in schema.compute_columns(results, self._column_options()).items()}
 
     def report(self) -> dict[str, int]:
         """Number of samples by problem since the transform was made, those of all workers together."""

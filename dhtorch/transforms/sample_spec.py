@@ -20,7 +20,7 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import pose_conventions as conventions
 from dhtorch.geometry.checks import all_known, is_transformed
-from dhtorch.ops import loader
+from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import stack
 from dhtorch.records import Camera, Frame, PosePrior
 from dhtorch.transforms import poses
@@ -179,18 +179,12 @@ class SampleSpec:
         """
         if self.depth_unit == "m" and not maps[0].is_floating_point():
             raise SampleError(f"{self.depth}: found whole numbers ({maps[0].dtype}), expected metres; is the unit mm?")
-        words = [x.view(torch.int16) for x in maps if x.dtype in (torch.int16, torch.uint16)]
-        if len(words) < len(maps):
+        if any(x.dtype not in (torch.int16, torch.uint16) for x in maps):
             z = self._scaled(torch.stack(list(maps)) if len(maps) > 1 else maps[0][None])
         else:
             z = torch.empty(len(maps), *maps[0].shape, dtype=torch.float32, device=maps[0].device)
-            unit = SAMPLE_UNITS_PER_METRE[self.depth_unit] if isinstance(self.depth_unit, str) else 0.0
-            compiled = unit > 0 and loader.serves(*words)
-            for into, read, x in zip(z, words, maps, strict=True):
-                if compiled:
-                    torch.ops.dhtorch.metres.default(read, into, unit, x.dtype.is_signed)
-                else:
-                    self._scale(into.copy_(x), signed=x.dtype.is_signed)
+            for into, x in zip(z, maps, strict=True):
+                _write_metres(into, x.view(torch.int16), signed=x.dtype.is_signed, unit=self.depth_unit)
         low, high = self.depth_range
         return z if low <= 0 and high == float("inf") else torch.where((z > low) & (z <= high), z, 0.0)
 
@@ -283,33 +277,16 @@ class SampleSpec:
     def _scaled(self, x: Tensor) -> Tensor:
         """Positive numbers in metres, 0 for all others."""
         if not x.is_floating_point():
-            return self._scale(x.float(), signed=x.dtype.is_signed)
+            return _to_metres(x.float(), x.dtype.is_signed, self.depth_unit)
         x = x.nan_to_num(0.0, 0.0, 0.0).relu()
         if not isinstance(self.depth_unit, str):
             return x * float(self.depth_unit)
         return x if self.depth_unit == "m" else x / SAMPLE_UNITS_PER_METRE[self.depth_unit]
 
-    def _scale(self, x: Tensor, *, signed: bool) -> Tensor:
-        """The same of whole numbers, in place."""
-        # Every pass over a whole map costs as much as the front end: no more of them than the numbers ask for.
-        x = x.relu_() if signed else x
-        unit = self.depth_unit
-        return x.div_(SAMPLE_UNITS_PER_METRE[unit]) if isinstance(unit, str) else x.mul_(float(unit))
-
     def _probed(self, depth: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor, str]]]:
         """Which maps (B,) have a return, and what speaks against the unit."""
-        low, high = self.bounds()
-        if loader.serves(depth):
-            counts = depth.new_empty(2, len(depth), dtype=torch.int64)
-            torch.ops.dhtorch.probe.default(depth, counts, probe_stride(depth), low, high)
-            if all_medians_plausible(counts):
-                return torch.ones(len(depth), dtype=torch.bool), []
-        probes = _probe_depth(depth.detach())
-        return _has_return(depth, probes), self._depth_checks(probes, low, high)
-
-    def bounds(self) -> tuple[float, float]:
-        """Between which a median return, m, surely speaks for the unit."""
-        return self.min_depth * (1 + _ROUNDING_REL), self.max_depth * (1 - _ROUNDING_REL)
+        low, high = self.min_depth * (1 + _ROUNDING_REL), self.max_depth * (1 - _ROUNDING_REL)
+        return _check_returns(depth, spec=self, low=low, high=high)
 
     def _depth_checks(self, probes: Tensor, low: float, high: float) -> list[tuple[Tensor, Tensor, str]]:
         median = torch.where(probes > 0, probes, torch.nan).nanmedian(1).values
@@ -367,18 +344,52 @@ class SampleSpec:
 
 def _probe_depth(depth: Tensor) -> Tensor:
     """Some of the numbers (B, k) of each map, evenly spread; far from each other, they are read once for all."""
-    return depth.flatten(1)[:, :: probe_stride(depth)].contiguous()
+    return depth.flatten(1)[:, :: _probe_stride(depth)].contiguous()
 
 
-def probe_stride(depth: Tensor) -> int:
-    """From one of the numbers of maps (…, h, w) by which they are judged to the next."""
+def _probe_stride(depth: Tensor) -> int:
+    """From one of the probed numbers of maps (…, h, w) to the next."""
     return max(1, depth.shape[-2] * depth.shape[-1] // _MAX_PROBES)
 
 
-def all_medians_plausible(counts: Tensor) -> bool:
-    """Whether the median return of every map surely lies between both bounds; of how many of its numbers are returns,
-    and how many of these do (2, B)."""
-    return all(0 < some < 2 * sound for some, sound in zip(*counts.tolist(), strict=True))
+def _check_returns_kernel(depth: Tensor, *, spec: SampleSpec, low: float, high: float) -> tuple[Tensor, list[Any]]:
+    counts = depth.new_empty(2, len(depth), dtype=torch.int64)
+    torch.ops.dhtorch.count_returns.default(depth, counts, _probe_stride(depth), low, high)
+    if all(0 < some < 2 * sound for some, sound in zip(*counts.tolist(), strict=True)):
+        return torch.ones(len(depth), dtype=torch.bool), []  # each median lies between the bounds
+    return _probed_returns(depth, spec, low, high)
+
+
+@operator(kernel=_check_returns_kernel, dtypes={"depth": torch.float32})
+def _check_returns(depth: Tensor, *, spec: SampleSpec, low: float, high: float) -> tuple[Tensor, list[Any]]:
+    """Which maps (B, h, w) have a return (B,), and what contradicts their unit: :meth:`SampleSpec._probed`."""
+    return _probed_returns(depth, spec, low, high)
+
+
+def _probed_returns(depth: Tensor, spec: SampleSpec, low: float, high: float) -> tuple[Tensor, list[Any]]:
+    probes = _probe_depth(depth.detach())
+    return _has_return(depth, probes), spec._depth_checks(probes, low, high)
+
+
+def _has_integer_unit(*_: Tensor, signed: bool, unit: str | float) -> bool:
+    return isinstance(unit, str)
+
+
+def _write_metres_kernel(into: Tensor, words: Tensor, *, signed: bool, unit: str) -> None:
+    torch.ops.dhtorch.write_metres.default(words, into, SAMPLE_UNITS_PER_METRE[unit], signed)
+
+
+@operator(kernel=_write_metres_kernel, dtypes={"into": torch.float32, "words": torch.int16}, when=_has_integer_unit)
+def _write_metres(into: Tensor, words: Tensor, *, signed: bool, unit: str | float) -> None:
+    """Fill ``into`` (…) with metres, from the 16-bit ``words`` (…) of a file, signed or unsigned."""
+    _to_metres(into.copy_(words if signed else words.view(torch.uint16)), signed, unit)
+
+
+def _to_metres(x: Tensor, signed: bool, unit: str | float) -> Tensor:
+    """Whole numbers as floats -> metres in place; 0 for those that are not positive."""
+    # Every pass over a whole map costs as much as the front end: no more of them than the numbers ask for.
+    x = x.relu_() if signed else x
+    return x.div_(SAMPLE_UNITS_PER_METRE[unit]) if isinstance(unit, str) else x.mul_(float(unit))
 
 
 def _has_return(depth: Tensor, probes: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from dhtorch.codes import Hole, Source, names
 from dhtorch.geometry.checks import check
-from dhtorch.ops import loader
+from dhtorch.ops.dispatch import operator
 from dhtorch.records import MergedDepth
 
 #: What the numbers of a token are: 1/m, 1/m, then shares of the patch's samples in [0, 1].
@@ -18,9 +18,6 @@ TOKEN_CHANNELS = ("inverse_depth", "sigma", "answered", *(f"hole_{name.lower()}"
 
 #: How many classes of holes there are; their codes count from 0.
 _N_HOLE_CLASSES = len(names(Hole))
-
-#: Types of uv, depth, sigma, source and hole that compiled code takes.
-_NATIVE_DTYPES = (*[torch.float32] * 3, *[torch.int32] * 2)
 
 #: How a picture is brought to the network's size: stretched, shrunk whole with bars, or cut to fill.
 FIT_MODES = ("stretch", "pad", "crop")
@@ -73,21 +70,69 @@ def patch_tokens(
     check("patch_tokens", depth=(found.depth, "B N"), sigma=(found.sigma, "B N"), source=(found.source, "B N"))
     rows, columns = token_grid(hw, patch=patch, tokens_hw=tokens_hw)
     scale, margin = _placement(hw, tokens_hw or hw, fit)
-    given = found.uv.contiguous(), found.depth, found.sigma, found.source, hole
-    if loader.serves(*given) and tuple(x.dtype for x in given) == _NATIVE_DTYPES:
-        tokens = hole.new_empty(*hole.shape[:1], rows * columns, len(TOKEN_CHANNELS), dtype=torch.float32)
-        known = torch.empty_like(tokens[..., 0], dtype=torch.bool)
-        torch.ops.dhtorch.patch_tokens(*given, tokens, known, patch, rows, columns, *scale, *margin)
-        return tokens, known
-    cell = _patch_index(found.uv, scale, margin, patch=patch, rows=rows, columns=columns)
+    return _pool_tokens(
+        found.uv,
+        found.depth,
+        found.sigma,
+        found.source,
+        hole,
+        grid=(patch, rows, columns),
+        scale=scale,
+        margin=margin,
+    )
+
+
+def _pool_tokens_kernel(
+    uv: Tensor,
+    depth: Tensor,
+    sigma: Tensor,
+    source: Tensor,
+    hole: Tensor,
+    *,
+    grid: tuple[int, int, int],
+    scale: list[float],
+    margin: list[float],
+) -> tuple[Tensor, Tensor]:
+    tokens = depth.new_empty(len(depth), grid[1] * grid[2], len(TOKEN_CHANNELS))
+    known = torch.empty_like(tokens[..., 0], dtype=torch.bool)
+    samples = uv.contiguous(), depth, sigma, source, hole
+    torch.ops.dhtorch.patch_tokens.default(*samples, tokens, known, *grid, *scale, *margin)
+    return tokens, known
+
+
+@operator(
+    kernel=_pool_tokens_kernel,
+    dtypes={
+        "uv": torch.float32,
+        "depth": torch.float32,
+        "sigma": torch.float32,
+        "source": torch.int32,
+        "hole": torch.int32,
+    },
+    any_layout=("uv",),
+)
+def _pool_tokens(
+    uv: Tensor,
+    depth: Tensor,
+    sigma: Tensor,
+    source: Tensor,
+    hole: Tensor,
+    *,
+    grid: tuple[int, int, int],
+    scale: list[float],
+    margin: list[float],
+) -> tuple[Tensor, Tensor]:
+    """:func:`patch_tokens` of samples; ``grid``: side of a patch in px, rows and columns of patches."""
+    patch, rows, columns = grid
+    cell = _patch_index(uv, scale, margin, patch=patch, rows=rows, columns=columns)
 
     def total(x: Tensor) -> Tensor:  # (B, N, k) → (B, P + 1, k), the last of what lies in no patch
         zero = torch.zeros(x.shape[0], rows * columns + 1, x.shape[2], dtype=torch.float64, device=x.device)
         return zero.scatter_add(1, cell[..., None].expand_as(x), x)
 
-    answered = (found.source != Source.NONE) & (found.depth > 0)
-    inverse = torch.where(answered, found.depth, torch.inf).double().reciprocal()
-    noise = torch.where(answered, found.sigma, 0.0).double() * inverse * inverse
+    answered = (source != Source.NONE) & (depth > 0)
+    inverse = torch.where(answered, depth, torch.inf).double().reciprocal()
+    noise = torch.where(answered, sigma, 0.0).double() * inverse * inverse
     is_class = hole[..., None] == torch.arange(_N_HOLE_CLASSES, dtype=hole.dtype, device=hole.device)
     sums = total(
         torch.cat((torch.ones_like(inverse)[..., None], inverse[..., None], answered[..., None], is_class), -1)
@@ -97,9 +142,9 @@ def patch_tokens(
     off = torch.where(answered, inverse - mean[..., 0].gather(1, cell), 0.0)
     variance = total((noise * noise + off * off)[..., None]) * per_answered
     positive = variance > 0
-    sigma = torch.where(positive, torch.where(positive, variance, 1.0).sqrt(), 0.0)
-    tokens = torch.cat((mean, sigma, sums[..., 2:] * per), -1)[:, :-1]
-    return tokens.to(found.depth.dtype), sums[:, :-1, 2] > 0
+    spread = torch.where(positive, torch.where(positive, variance, 1.0).sqrt(), 0.0)
+    tokens = torch.cat((mean, spread, sums[..., 2:] * per), -1)[:, :-1]
+    return tokens.to(depth.dtype), sums[:, :-1, 2] > 0
 
 
 def _placement(hw: tuple[int, int], tokens_hw: tuple[int, int], fit: str) -> tuple[list[float], list[float]]:

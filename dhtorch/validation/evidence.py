@@ -1,13 +1,14 @@
-"""What speaks for or against a depth map, pixel by pixel, each kind of evidence by itself.
+"""Evidence for or against a depth map, pixel by pixel, one function per kind of evidence.
 
-    near returns, triangulated points ── sparse_evidence ─┐
-    pictures of other views ──────────── photometric_evidence ───┼─ Said: sigmas, and whether an error would have been
-    told maps of other views ──────────────── consistency_evidence ────┘
+    near returns, triangulated points ── sparse_evidence ────────────┐
+    pictures of source views ─────────── photometric_evidence ───────┼─ Evidence: misfit in sigmas, and detectability
+    depth maps of source views ───────── depth_consistency_evidence ─┘
 
-Alphabet: d a depth of the map, m; r = log(d / what it is held against), positive where the map is too far; a *grid* is
-the picture over which a map is judged, (h, w), each of its pixels the mean of what it covers.
+Alphabet: d a depth of the map, m; r = log(d / reference depth), positive where the map is too far; a *grid* is the
+picture at the resolution (h, w) at which a map is validated, each of its pixels the mean of what it covers.
 
-Saying nothing is the rule: a kind of evidence counts for a pixel only where it would have told an error of a fifth.
+By default a pixel has no evidence: a kind of evidence supports a pixel only where it would have detected an error of
+20 %.
 """
 
 from __future__ import annotations
@@ -27,76 +28,60 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.patches import containing_pixels, nearest_pixel_index, sample_nearest
 from dhtorch.pipeline import surface
 from dhtorch.records import Estimate, Samples
-
-#: Error as a log ratio that evidence must be able to tell, and the sigmas at which it does.
-DETECTABLE_LOG_RATIO, DETECTION_SIGMAS = math.log(1.2), 3.0
-
-#: Grid pixels that an answer speaks for around it, and the log ratio by which neighbours on one surface of the map
-#: differ at most.
-SUPPORT_RADIUS_PX, SURFACE_LOG_RATIO = 8, 0.06
-
-#: Factors on inverse depth that are tried beside the map's own.
-RIVAL_FACTORS = (0.3, 0.42, 0.58, 0.75, 0.88, 1.14, 1.33, 1.75, 2.4, 3.4)
-
-#: Correlation of windows from which on they show the same, and what a place must correlate to be a rival.
-MATCH_CORRELATION, RIVAL_CORRELATION = 0.75, 0.8
-
-#: Radius of the windows, grid pixels, and how many of a window's pixels err by themselves.
-EVIDENCE_RADIUS_PX, INDEPENDENT_EVIDENCE_PIXELS = 4, 8.0
-
-#: Share of a window that must have a depth.
-MIN_FILLED_RATIO = 0.6
+from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOptions
 
 
 class Evidence(NamedTuple):
-    """What one kind of evidence says of every pixel, (B, h, w) each."""
+    """One kind of evidence for every pixel, (B, h, w) each."""
 
-    misfit: Tensor  # sigmas, positive where the map is too far; NaN where nothing is said
-    sure: Tensor  # bool: an error of a fifth would have been told
-    view: Tensor  # int32, which view said so; -1 = our own answers, -2 = none
+    misfit: Tensor  # sigmas, positive where the map is too far; NaN where there is no evidence
+    sure: Tensor  # bool: an error of 20 % would have been detected
+    view: Tensor  # int32, index of the source view it is from; -1 = sparse references, -2 = none
 
 
 class ValidationReferences(NamedTuple):
-    """Depths that a map is held against at places of the picture, (B, N) each."""
+    """Sparse reference depths at places of the picture, (B, N) each."""
 
     uv: Tensor  # (B, N, 2) px
     depth: Tensor  # m; 1 where there is none
     sigma: Tensor  # relative to depth
-    shared: Tensor  # the part of sigma that all share
+    shared: Tensor  # part of sigma that all share
     used: Tensor  # bool
     near: Tensor  # bool: a near return, else triangulated
 
 
 def validation_references(samples: Samples, estimate: Estimate, *, near: bool) -> ValidationReferences:
-    """Near returns away from edges (where ``near``), else answers of the sparse method. Gradient: none."""
+    """Samples and estimate -> near returns away from edges (if ``near``), else triangulated points. Gradient: none."""
     check("validation_references", depth=(samples.depth, "B N"), answer=(estimate.depth, "B N"))
     returned = samples.usable & ((samples.flag & (Flag.DEPTH_EDGE | Flag.SPECULAR)) == 0) & near
-    told = estimate.keep & (estimate.depth > 0) & (estimate.sigma > 0) & ~returned
-    used = returned | told
-    depth = torch.where(returned, samples.depth, torch.where(told, estimate.depth, 1.0)).detach()
-    sigma = torch.where(returned, samples.sigma, torch.where(told, estimate.sigma, 1.0)).detach()
-    shared = torch.where(told, estimate.sigma_shared, 0.0).detach().nan_to_num()
+    triangulated = estimate.keep & (estimate.depth > 0) & (estimate.sigma > 0) & ~returned
+    used = returned | triangulated
+    depth = torch.where(returned, samples.depth, torch.where(triangulated, estimate.depth, 1.0)).detach()
+    sigma = torch.where(returned, samples.sigma, torch.where(triangulated, estimate.sigma, 1.0)).detach()
+    shared = torch.where(triangulated, estimate.sigma_shared, 0.0).detach().nan_to_num()
     return ValidationReferences(samples.uv, depth, sigma / depth, shared / depth, used, returned)
 
 
 def resolution_sigma(depth: Tensor, hw: tuple[int, int]) -> Tensor:
-    """Standard deviation (B, h, w) of log depth by which a map coarser than the grid ``hw`` may be off at its pixels
-    and not be wrong; 0 where it is as fine.
+    """Depth map and size of the grid -> standard deviation (B, h, w) of log depth due to the map's coarser resolution;
+    0 where it is as fine as the grid.
 
-    A coarse map knows the depths of its pixels' centres. An outline between two centres lies anywhere as likely: at a
-    pixel of the grid that is a share o of the way from one to the other it is the other's depth that is true with
-    probability o. Gradient: none.
+    A coarse map has the depths of its pixels' centres. An outline between two centres lies anywhere with equal
+    probability: at a pixel of the grid that is a fraction o of the way from one to the other, the other's depth is true
+    with probability o. Gradient: none.
     """
     check("resolution_sigma", depth_map=(depth, "B y x"))
     if not is_coarser(depth, hw):
         return depth.new_zeros(len(depth), *hw)
     log = torch.where(depth > 0, depth.detach(), torch.nan).log()
     sides = zip(log.shape[-2:], hw, strict=True)
-    (row, row_beside, off_row), (column, column_beside, off_column) = (_between(n, m, log.device) for n, m in sides)
-    here = log[:, row[:, None], column]
-    down, across = log[:, row_beside[:, None], column], log[:, row[:, None], column_beside]
-    down, across = ((beside - here).square().nan_to_num(0.0) for beside in (down, across))
-    return (off_row[:, None] * down + off_column * across).sqrt()
+    (row, next_row, row_weight), (column, next_column, column_weight) = (
+        _two_nearest_pixels(n, m, log.device) for n, m in sides
+    )
+    centre = log[:, row[:, None], column]
+    down, across = log[:, next_row[:, None], column], log[:, row[:, None], next_column]
+    down, across = ((neighbour - centre).square().nan_to_num(0.0) for neighbour in (down, across))
+    return (row_weight[:, None] * down + column_weight * across).sqrt()
 
 
 def is_coarser(depth: Tensor, hw: tuple[int, int]) -> bool:
@@ -105,45 +90,47 @@ def is_coarser(depth: Tensor, hw: tuple[int, int]) -> bool:
 
 
 def pixel_centres(n: int, m: int, device: torch.device) -> Tensor:
-    """Where the centres (m,) of ``m`` pixels along a side lie, from its edge on, in pixels of ``n`` along that side."""
+    """Centres (m,) of ``m`` pixels along a side, measured from its edge in pixels of ``n`` along that side."""
     return (torch.arange(m, device=device) + 0.5) * n / m
 
 
-def _between(n: int, m: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Of ``m`` pixels along a side of which a map has ``n``: the map's pixel each is in, that on its other side, and
-    which share of the way to that one it stands."""
+def _two_nearest_pixels(n: int, m: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Resampling along a side from n to m pixels: index (m,) of the nearest source pixel, of the second nearest, and
+    the weight of the latter."""
     place = pixel_centres(n, m, device)
     index = place.floor().clamp_max(n - 1)
-    off = place - index - 0.5
-    beside = (index + off.sign()).clamp(0, n - 1)
-    return index.long(), beside.long(), off.abs() * (n < m)
+    offset = place - index - 0.5
+    second = (index + offset.sign()).clamp(0, n - 1)
+    return index.long(), second.long(), offset.abs() * (n < m)
 
 
 def inflate_sigma(found: ValidationReferences, loose: Tensor, hw: tuple[int, int]) -> ValidationReferences:
-    """Depths to hold a map against whose pixels (B, h, w) stand for depths that differ by so much (log); ``hw`` of the
-    picture. Gradient: none."""
+    """References whose sigma includes the resolution of the map, ``loose`` (B, h, w) of log depth at their places;
+    ``hw`` of the picture. Gradient: none."""
     check("inflate_sigma", loose=(loose, "B h w"), uv=(found.uv, "B N 2"))
     at = sample_nearest(loose, resize_pixels(found.uv, hw, (loose.shape[-2], loose.shape[-1])))[0]
     return found._replace(sigma=(found.sigma.square() + at.square()).sqrt())
 
 
 def no_evidence(like: Tensor) -> Evidence:
-    """Nothing is said of any pixel of a grid."""
-    nowhere = torch.full_like(like, -2, dtype=torch.int32)
-    return Evidence(torch.full_like(like, torch.nan), torch.zeros_like(like, dtype=torch.bool), nowhere)
+    """Evidence without a value at any pixel of the grid ``like``."""
+    no_view = torch.full_like(like, -2, dtype=torch.int32)
+    return Evidence(torch.full_like(like, torch.nan), torch.zeros_like(like, dtype=torch.bool), no_view)
 
 
 def sparse_evidence(
-    depth: Tensor,  # (B, h, w) m, 0 = the map says nothing
+    depth: Tensor,  # (B, h, w) m, 0 = no value
     hw: tuple[int, int],  # of the picture
     found: ValidationReferences,
-    tolerance: float | Tensor,  # (B, h, w) or one for all
+    tolerance: float | Tensor,  # (B, h, w), or a number for all pixels
     returns: Samples | None = None,  # (B, h, w) each: near returns at every pixel of the grid
+    options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS,
 ) -> Evidence:
-    """Near returns at the pixel itself, else answers around it that lie on the same surface of the map.
+    """Map and sparse references -> evidence from the near return at the pixel itself, else from the references around
+    it on the same surface of the map.
 
-    Answers around a pixel are not taken for independent: together they are as unsure as one of them, and more so by as
-    much as they disagree. Gradient: none.
+    References around a pixel are not independent: their mean has the variance of one of them, plus the variance
+    between them. Gradient: none.
     """
     check("sparse_evidence", depth=(depth, "B h w"), uv=(found.uv, "B N 2"))
     h, w = depth.shape[-2:]
@@ -153,179 +140,207 @@ def sparse_evidence(
     ratio = torch.where(used, (at / found.depth).clamp_min(1e-9), 1.0).log()
     weight = torch.where(used, 1 / found.sigma.square().clamp_min(1e-8), 0.0)
     columns = torch.stack([torch.ones_like(ratio), ratio, ratio.square(), found.sigma.square()], 1)
-    total, mean, square, own = _spread(columns * weight[:, None], place, depth, at).unbind(1)
-    there = (total > 0) & (depth > 0)
-    total = torch.where(there, total, 1.0)
-    mean, square, own = (torch.where(there, x / total, 0.0) for x in (mean, square, own))
-    variance = own + (square - mean.square()).clamp_min(0)
+    total, mean, mean_square, own_variance = _splat_on_surface(
+        columns * weight[:, None], place, depth, at, options
+    ).unbind(1)
+    valid = (total > 0) & (depth > 0)
+    total = torch.where(valid, total, 1.0)
+    mean, mean_square, own_variance = (torch.where(valid, x / total, 0.0) for x in (mean, mean_square, own_variance))
+    variance = own_variance + (mean_square - mean.square()).clamp_min(0)
     if returns is not None:
-        fine = returns.usable & ((returns.flag & (Flag.DEPTH_EDGE | Flag.SPECULAR)) == 0) & (depth > 0)
-        direct = torch.where(fine, depth / torch.where(fine, returns.depth, 1.0), 1.0).log()
-        mean = torch.where(fine, direct, mean)
-        noise = (returns.sigma / torch.where(fine, returns.depth, 1.0)).square()
-        variance, there = torch.where(fine, noise, variance), there | fine
+        has_return = returns.usable & ((returns.flag & (Flag.DEPTH_EDGE | Flag.SPECULAR)) == 0) & (depth > 0)
+        return_ratio = torch.where(has_return, depth / torch.where(has_return, returns.depth, 1.0), 1.0).log()
+        mean = torch.where(has_return, return_ratio, mean)
+        noise = (returns.sigma / torch.where(has_return, returns.depth, 1.0)).square()
+        variance, valid = torch.where(has_return, noise, variance), valid | has_return
     sigma = (variance + tolerance**2).sqrt()
-    misfit = torch.where(there, mean / sigma, torch.nan)
+    misfit = torch.where(valid, mean / sigma, torch.nan)
     return Evidence(
-        misfit, there & (DETECTION_SIGMAS * sigma <= DETECTABLE_LOG_RATIO), torch.where(there, -1, -2).to(torch.int32)
+        misfit,
+        valid & (options.detection_sigmas * sigma <= options.detectable_log_ratio),
+        torch.where(valid, -1, -2).to(torch.int32),
     )
 
 
 def photometric_evidence(
-    depth: Tensor,  # (B, h, w) m, 0 = the map says nothing
+    depth: Tensor,  # (B, h, w) m, 0 = no value
     base: plane_sweep.ReferenceView,
     source_views: list[surface.SourceView],
-    tolerance: float | Tensor,  # (B, h, w) or one for all
+    tolerance: float | Tensor,  # (B, h, w), or a number for all pixels
+    options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS,
 ) -> Evidence:
-    """How the map fits the pictures of other views, whatever their exposure, beside other depths along the same rays.
+    """Map and source views -> evidence from the photometric match at the map's depth, compared with other depths along
+    the same rays; invariant to exposure.
 
-    Where the windows show the same, the step towards equal grey values is the evidence, as unsure as grey values and
-    motion make it; where they do not, and at another depth they do, how much better it fits there. Where several views
-    tell, the one that speaks least against the map counts: the others may see something that hides the pixel.
+    Where the windows match, the evidence is the depth step towards equal grey values, with the sigma of grey values and
+    motion; where they do not and match at another depth, it is how much better they match there. Of several views the
+    one with the least misfit counts: in the others something may occlude the pixel.
 
-    Says nothing: pixels hidden by the map itself or outside the view, without texture, without baseline (depths of a
-    fifth more or less fit alike), windows with too many holes, or that fit nowhere. Gradient: none.
+    No evidence: pixels occluded by the map itself or outside the view, without texture, without baseline (depths 20 %
+    larger or smaller match as well), windows with too many holes or without a match. Gradient: none.
     """
-    said = no_evidence(depth)
-    q, solid = _filled(depth)
+    best = no_evidence(depth)
+    q, filled = _fill_holes(depth, options)
     for k, source_view in enumerate(source_views):
-        misfit, sure = _view_evidence(q, base, source_view, tolerance)
-        there = misfit.isfinite() & solid & source_view.use[:, None, None]
-        milder = there & (said.misfit.isnan() | (misfit.abs() < said.misfit.abs()))
-        index = torch.full_like(said.view, k)
-        said = Evidence(*(torch.where(milder, a, b) for a, b in zip((misfit, sure, index), said, strict=True)))
-    return said
+        misfit, sure = _view_evidence(q, base, source_view, tolerance, options)
+        valid = misfit.isfinite() & filled & source_view.use[:, None, None]
+        milder = valid & (best.misfit.isnan() | (misfit.abs() < best.misfit.abs()))
+        index = torch.full_like(best.view, k)
+        best = Evidence(*(torch.where(milder, a, b) for a, b in zip((misfit, sure, index), best, strict=True)))
+    return best
 
 
 def depth_consistency_evidence(
-    depth: Tensor,  # (B, h, w) m, 0 = the map says nothing
+    depth: Tensor,  # (B, h, w) m, 0 = no value
     base: plane_sweep.ReferenceView,
     source_views: list[surface.SourceView],
-    maps: list[Tensor],  # (B, h', w') m of each source view, 0 = says nothing
-    tolerance: float | Tensor,  # (B, h, w) or one for all
+    maps: list[Tensor],  # (B, h', w') m of each source view, 0 = no value
+    tolerance: float | Tensor,  # (B, h, w), or a number for all pixels
+    options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS,
 ) -> Evidence:
-    """What lies in front of a surface that another view's map shows: one of the two maps is wrong.
+    """Map and maps of source views -> evidence against pixels in front of a surface of another view's map, where one of
+    the two maps is wrong.
 
-    A point behind the other map's surface may be hidden there, and two maps of one source may err alike, so agreement
-    says nothing of truth: ``sure`` is never set. Gradient: none.
+    A point behind the other map's surface may be occluded there, and two maps of one source may have the same errors,
+    so that agreement is no evidence: ``sure`` is never set. Gradient: none.
     """
-    said = no_evidence(depth)
+    worst = no_evidence(depth)
     q = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
-    for k, (source_view, there) in enumerate(zip(source_views, maps, strict=True)):
+    for k, (source_view, other_map) in enumerate(zip(source_views, maps, strict=True)):
         view = source_view.view
         uv, front = plane_sweep.project_inverse_depth(view, base.ray, q.flatten(1))
         z = (se3.rotate(view.T_1_from_0.R, base.ray)[..., 2] + q.flatten(1) * view.T_1_from_0.t[:, None, 2]) / (
             q.flatten(1).clamp_min(1e-6)
         )
-        at, inside = sample_nearest(nearest_surface(there), uv)
-        fine = front & inside & at.isfinite() & (z > 0) & source_view.use[:, None]
-        r = torch.where(fine, z / torch.where(fine, at, 1.0), 1.0).clamp_min(1e-9).log().unflatten(-1, base.hw)
-        wide = _moves(base, view, q) >= 1.5
-        through = fine.unflatten(-1, base.hw) & (depth > 0) & wide & (r < 0)
-        misfit = torch.where(through, r / (math.sqrt(2) * tolerance), torch.nan)
-        worse = through & (said.misfit.isnan() | (misfit < said.misfit))
-        said = Evidence(
-            torch.where(worse, misfit, said.misfit),
-            said.sure,
-            torch.where(worse, torch.full_like(said.view, k), said.view),
+        surface_depth, inside = sample_nearest(nearest_surface(other_map), uv)
+        valid = front & inside & surface_depth.isfinite() & (z > 0) & source_view.use[:, None]
+        r = (
+            torch.where(valid, z / torch.where(valid, surface_depth, 1.0), 1.0)
+            .clamp_min(1e-9)
+            .log()
+            .unflatten(-1, base.hw)
         )
-    return said
+        has_baseline = _parallax_px(base, view, q, options) >= 1.5
+        in_front = valid.unflatten(-1, base.hw) & (depth > 0) & has_baseline & (r < 0)
+        misfit = torch.where(in_front, r / (math.sqrt(2) * tolerance), torch.nan)
+        worse = in_front & (worst.misfit.isnan() | (misfit < worst.misfit))
+        worst = Evidence(
+            torch.where(worse, misfit, worst.misfit),
+            worst.sure,
+            torch.where(worse, torch.full_like(worst.view, k), worst.view),
+        )
+    return worst
 
 
 def nearest_surface(depth: Tensor) -> Tensor:
-    """The nearest depth of each pixel (B, h, w) of a map and of those beside it; infinite where none has one."""
-    known = torch.where(depth > 0, depth, torch.inf)
-    return -F.max_pool2d(-known[:, None], 3, 1, 1)[:, 0]
+    """Least depth in the 3 × 3 window around each pixel (B, h, w) of a map; infinite where it has no value."""
+    depth_or_inf = torch.where(depth > 0, depth, torch.inf)
+    return -F.max_pool2d(-depth_or_inf[:, None], 3, 1, 1)[:, 0]
 
 
 def _view_evidence(
-    q: Tensor, base: plane_sweep.ReferenceView, source_view: surface.SourceView, tolerance: float | Tensor
+    q: Tensor,
+    base: plane_sweep.ReferenceView,
+    source_view: surface.SourceView,
+    tolerance: float | Tensor,
+    options: ValidationOptions,
 ) -> tuple[Tensor, Tensor]:
-    """Evidence (B, h, w) of one view in sigmas, NaN where it says nothing, and whether it would have told an error."""
+    """Misfit (B, h, w) from one source view in sigmas, NaN without evidence, and whether an error would be detected."""
     view, picture, fit, _ = source_view
-    here = plane_sweep.fit_windows(base, view, picture, q, radius=EVIDENCE_RADIUS_PX)
-    plane = 0.03 * q.flatten(1).amax(-1)
-    seen = (
-        here.seen
-        & ~plane_sweep.occlusion_mask(plane_sweep.epipolar_warp(base, view), q, plane)
+    window = plane_sweep.fit_windows(base, view, picture, q, radius=options.evidence_radius_px)
+    plane_step = 0.03 * q.flatten(1).amax(-1)
+    visible = (
+        window.seen
+        & ~plane_sweep.occlusion_mask(plane_sweep.epipolar_warp(base, view), q, plane_step)
         & base.known.unflatten(-1, base.hw)
     )
-    own = (here.noise + surface.GREY_NOISE**2) / (INDEPENDENT_EVIDENCE_PIXELS * here.contrast)
-    shared = surface.pose_variance(base, view, fit, q, here.motion)
-    sigma = ((own + shared) / q.square().clamp_min(1e-12) + tolerance**2).sqrt()
-    step = torch.where(q > 0, here.step / q.clamp_min(1e-9), 0.0)  # of log(1 / d)
-    best, factor, beside = _rivals(q, base, source_view)
-    ours = here.correlation.clamp(-0.99, 0.999)
-    fits = ours >= MATCH_CORRELATION
-    # A window's log-likelihood goes by its unexplained share of variance.
-    better = (
-        (INDEPENDENT_EVIDENCE_PIXELS * ((1 - ours.square().where(ours > 0, 0.0)) / (1 - best.square())).log())
-        .clamp_min(0)
-        .sqrt()
+    own_var = (window.noise + surface.GREY_NOISE**2) / (options.independent_evidence_pixels * window.contrast)
+    shared_var = surface.pose_variance(base, view, fit, q, window.motion)
+    sigma = ((own_var + shared_var) / q.square().clamp_min(1e-12) + tolerance**2).sqrt()
+    step = torch.where(q > 0, window.step / q.clamp_min(1e-9), 0.0)  # of log(1 / d)
+    best, factor, neighbour = _rivals(q, base, source_view, options)
+    correlation = window.correlation.clamp(-0.99, 0.999)
+    matches = correlation >= options.match_correlation
+    # The log likelihood of a window is that of the unexplained fraction of its variance.
+    n = options.independent_evidence_pixels
+    unexplained = 1 - correlation.square().where(correlation > 0, 0.0)
+    rival_sigmas = (n * (unexplained / (1 - best.square())).log()).clamp_min(0).sqrt()
+    own_sigmas = (n * ((1 - neighbour.square()) / (1 - correlation.square())).log()).clamp_min(0).sqrt()
+    distinct = own_sigmas >= 1.5
+    log_factor = factor.log()
+    refuted = (
+        ~matches
+        & (best >= options.rival_correlation)
+        & (rival_sigmas >= 1.0)
+        & (log_factor.abs() > options.detection_sigmas * tolerance)
     )
-    alone = (INDEPENDENT_EVIDENCE_PIXELS * ((1 - beside.square()) / (1 - ours.square())).log()).clamp_min(
-        0
-    ).sqrt() >= 1.5
-    away = factor.log()
-    far = ~fits & (best >= RIVAL_CORRELATION) & (better >= 1.0) & (away.abs() > DETECTION_SIGMAS * tolerance)
-    misfit = torch.where(fits & alone, step.clamp(-0.5, 0.5) / sigma, torch.nan)
-    misfit = torch.where(far, away.sign() * better * DETECTION_SIGMAS / 2, misfit)
-    misfit = torch.where(seen, misfit, torch.nan)
-    return misfit, fits & alone & (DETECTION_SIGMAS * sigma <= DETECTABLE_LOG_RATIO) & seen
+    misfit = torch.where(matches & distinct, step.clamp(-0.5, 0.5) / sigma, torch.nan)
+    misfit = torch.where(refuted, log_factor.sign() * rival_sigmas * options.detection_sigmas / 2, misfit)
+    misfit = torch.where(visible, misfit, torch.nan)
+    return misfit, matches & distinct & (options.detection_sigmas * sigma <= options.detectable_log_ratio) & visible
 
 
 def _rivals(
-    q: Tensor, base: plane_sweep.ReferenceView, source_view: surface.SourceView
+    q: Tensor, base: plane_sweep.ReferenceView, source_view: surface.SourceView, options: ValidationOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Of other depths along the rays: the best correlation, its factor on q, and the best of those a fifth away or a
-    little more; (B, h, w) each."""
+    """Best correlation at rival depths along the rays, its factor on q, and the best correlation at rivals about 20 %
+    off; (B, h, w) each."""
     best, factor = torch.zeros_like(q), torch.ones_like(q)
-    beside = torch.zeros_like(q)
-    for rival in RIVAL_FACTORS:
-        there = plane_sweep.fit_windows(
-            base, source_view.view, source_view.picture, q * rival, radius=EVIDENCE_RADIUS_PX
+    neighbour = torch.zeros_like(q)
+    for rival in options.rival_factors:
+        window = plane_sweep.fit_windows(
+            base, source_view.view, source_view.picture, q * rival, radius=options.evidence_radius_px
         )
-        value = torch.where(there.seen, there.correlation, 0.0).clamp(0, 0.999)
+        value = torch.where(window.seen, window.correlation, 0.0).clamp(0, 0.999)
         factor = torch.where(value > best, rival, factor)
         best = torch.maximum(best, value)
-        if abs(math.log(rival)) > 0.7 * DETECTABLE_LOG_RATIO and abs(math.log(rival)) < 3 * DETECTABLE_LOG_RATIO:
-            beside = torch.maximum(beside, value)
-    return best, factor, beside
+        if 0.7 * options.detectable_log_ratio < abs(math.log(rival)) < 3 * options.detectable_log_ratio:
+            neighbour = torch.maximum(neighbour, value)
+    return best, factor, neighbour
 
 
-def _moves(base: plane_sweep.ReferenceView, view: plane_sweep.SweptView, q: Tensor) -> Tensor:
-    """Pixels (B, h, w) by which a depth moves in the other view that is a fifth further."""
+def _parallax_px(
+    base: plane_sweep.ReferenceView, view: plane_sweep.SweptView, q: Tensor, options: ValidationOptions
+) -> Tensor:
+    """Image motion (B, h, w) px in the source view when the depth increases by 20 %."""
     flat = q.flatten(1)
-    here, there = (
-        plane_sweep.project_inverse_depth(view, base.ray, flat * s)[0] for s in (1.0, math.exp(-DETECTABLE_LOG_RATIO))
+    uv, uv_farther = (
+        plane_sweep.project_inverse_depth(view, base.ray, flat * s)[0]
+        for s in (1.0, math.exp(-options.detectable_log_ratio))
     )
-    return (here - there).norm(dim=-1).unflatten(-1, base.hw)
+    return (uv - uv_farther).norm(dim=-1).unflatten(-1, base.hw)
 
 
-def _filled(depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Inverse depth (B, h, w), holes filled by the mean around, and which pixels have windows with enough of it."""
-    there = (depth > 0) & depth.isfinite()
-    q = torch.where(there, 1 / depth.clamp_min(1e-6), 0.0)
-    count = neighbours.window_sum(there.to(q), EVIDENCE_RADIUS_PX)
-    mean = neighbours.window_sum(q, EVIDENCE_RADIUS_PX) / count.clamp_min(1)
-    return torch.where(there, q, mean), there & (count >= MIN_FILLED_RATIO * (2 * EVIDENCE_RADIUS_PX + 1) ** 2)
+def _fill_holes(depth: Tensor, options: ValidationOptions) -> tuple[Tensor, Tensor]:
+    """Inverse depth (B, h, w) with holes filled by the window mean, and the pixels whose windows have enough depths."""
+    valid = (depth > 0) & depth.isfinite()
+    q = torch.where(valid, 1 / depth.clamp_min(1e-6), 0.0)
+    radius = options.evidence_radius_px
+    count = neighbours.window_sum(valid.to(q), radius)
+    mean = neighbours.window_sum(q, radius) / count.clamp_min(1)
+    min_count = options.min_filled_ratio * (2 * radius + 1) ** 2
+    return torch.where(valid, q, mean), valid & (count >= min_count)
 
 
-def _spread(columns: Tensor, place: Tensor, depth: Tensor, at: Tensor) -> Tensor:
-    """Sums (B, C, h, w) of columns (B, C, N) over all places around that lie on the same surface of the map, the
-    nearer the more."""
+def _splat_on_surface(
+    columns: Tensor, place: Tensor, depth: Tensor, depth_at: Tensor, options: ValidationOptions
+) -> Tensor:
+    """Sums (B, C, h, w) of columns (B, C, N) over the places around each pixel on the same surface of the map, with
+    weights that decrease with distance."""
     (B, C, _), (h, w) = columns.shape, depth.shape[-2:]
-    step = torch.arange(-SUPPORT_RADIUS_PX, SUPPORT_RADIUS_PX + 1, device=depth.device)
+    radius = options.support_radius_px
+    step = torch.arange(-radius, radius + 1, device=depth.device)
     dv, du = (x.reshape(-1) for x in torch.meshgrid(step, step, indexing="ij"))
     distance = (du.square() + dv.square()).to(depth).sqrt()
-    near = distance <= SUPPORT_RADIUS_PX
-    du, dv, kernel = du[near], dv[near], (1 - distance[near] / (SUPPORT_RADIUS_PX + 1))
+    in_disc = distance <= radius
+    du, dv, kernel = du[in_disc], dv[in_disc], (1 - distance[in_disc] / (radius + 1))
     centre = containing_pixels(place)
-    around = centre[:, :, None] + torch.stack([du, dv], -1).to(centre)
-    index, inside = nearest_pixel_index((h, w), around.flatten(1, 2))
-    there = depth.flatten(1).gather(1, index).unflatten(1, (-1, len(du)))
-    level = (there.clamp_min(1e-9) / at[..., None].clamp_min(1e-9)).log().abs() < SURFACE_LOG_RATIO
-    weight = (level & inside.unflatten(1, (-1, len(du)))).to(depth) * kernel
-    given = (columns[..., None] * weight[:, None]).flatten(2)
+    pixels = centre[:, :, None] + torch.stack([du, dv], -1).to(centre)
+    index, inside = nearest_pixel_index((h, w), pixels.flatten(1, 2))
+    target_depth = depth.flatten(1).gather(1, index).unflatten(1, (-1, len(du)))
+    ratio = target_depth.clamp_min(1e-9) / depth_at[..., None].clamp_min(1e-9)
+    same_surface = ratio.log().abs() < options.surface_log_ratio
+    weight = (same_surface & inside.unflatten(1, (-1, len(du)))).to(depth) * kernel
+    weighted = (columns[..., None] * weight[:, None]).flatten(2)
     total = depth.new_zeros(B, C, h * w)
-    return total.scatter_add(2, index[:, None].expand_as(given), given).unflatten(-1, (h, w))
+    return total.scatter_add(2, index[:, None].expand_as(weighted), weighted).unflatten(-1, (h, w))

@@ -1,12 +1,13 @@
-"""Why a depth is wrong: what was done to a whole recording's maps, told by undoing each known fault in turn.
+"""Diagnosis of the fault that the depth maps of a recording share, by undoing each known fault in turn.
 
-A fault that all frames share leaves a pattern: undo the right one, and the depth explains how points moved between the
-pictures. Points are tracked once; under each hypothesis only their depth changes, and with it where the other picture
-should show them. The one that explains clearly more than none at all, and more than any of another kind, is named.
-Where the camera stands still no depth moves a point; maps beside the sensor are then held against its near returns.
+A fault that all frames share leaves a pattern: with the right one undone, the depth explains how points move between
+the pictures. Points are tracked once; under each hypothesis only their depth changes, and with it their predicted
+position in the other picture. The hypothesis that explains the tracks clearly better than no fault, and better than any
+of another kind, is the diagnosis. Where the camera does not move, no depth moves a point; maps beside the sensor are
+then compared with its near returns.
 
-Alphabet: P pairs of a window of frames, N samples; a *miss* is how far a track ends from where a depth says, in pixels
-of a picture 640 wide; the *loss* of a pair is the mean of miss² / (miss² + c²), between 0 and 1.
+Alphabet: P pairs of a window of frames, N samples; a *miss* is the distance of a track's end from the reprojected
+point, in pixels of a picture 640 wide; the *loss* of a pair is the mean of miss² / (miss² + c²), between 0 and 1.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -33,8 +34,10 @@ from dhtorch.pipeline.pair import StageTimer, solve_pose_and_triangulate
 from dhtorch.records import Frame, Pose, Samples, Tracks
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.track import lucas_kanade
+from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOptions
 
-#: How pairs of a window are tracked and placed.
+#: Method that tracks the pairs of a window and fits their motions.
+#: Source: origin not recorded.
 TRACKING_METHOD = Method(
     n=384,
     hypotheses=100,
@@ -42,35 +45,24 @@ TRACKING_METHOD = Method(
     pose=pnp_ransac,
 )
 
-#: Miss at which the loss of a sample is a half, px of a picture 640 wide.
-HALF_LOSS_PX = 2.0
-
-#: Loss that an explanation must save over none, its standard errors over the pairs, and what it must save over the best
-#: of another kind.
-MIN_LOSS_SAVED, MIN_STANDARD_ERRORS, MIN_MARGIN_OVER_OTHERS = 0.04, 3.0, 0.015
-
-#: Share of what a map misses beyond what the sensor's near returns miss that its cause must explain.
-MIN_EXPLAINED_RATIO = 0.75
-
-#: Without motions: ratio of a map to a near return at which the loss is a half, and the longer side of the grid of
-#: returns.
-HALF_LOSS_RATIO, RETURN_GRID_SIDE = 1.1, 64
-
-#: Way of a camera that stands still at most, as a share of the median return.
-STATIC_BASELINE_RATIO = 0.005
-
-#: Frames that a depth may be early or late at most, and the factors on the focal length that are tried.
+#: Largest delay or lead of a map that is tried, frames.
+#: Source: origin not recorded.
 MAX_LAG_FRAMES = 5
+
+#: Factors on the focal length that are tried.
+#: Source: origin not recorded.
 FOCAL_FACTORS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
 
-#: Fields of view of a depth over that of the picture it should be laid over, and by which share of the width it may lie
-#: beside its place.
-FIELD_OF_VIEW_RATIOS, SIDEWAYS_SHIFTS = (
-    (0.55, 0.62, 0.7, 0.78, 0.87, 1.15, 1.28, 1.43, 1.6, 1.8),
-    (-0.08, -0.04, 0.04, 0.08),
-)
+#: Fields of view of an unregistered depth over that of its picture that are tried, in steps of about an eighth.
+#: Source: origin not recorded.
+FIELD_OF_VIEW_RATIOS = (0.55, 0.62, 0.7, 0.78, 0.87, 1.15, 1.28, 1.43, 1.6, 1.8)
 
-#: Factors that take a depth in another unit to metres; 1/256 m and 1/5000 m are the steps of KITTI's and TUM's files.
+#: Horizontal offsets of an unregistered depth that are tried, as fractions of the width.
+#: Source: origin not recorded.
+SIDEWAYS_SHIFTS = (-0.08, -0.04, 0.04, 0.08)
+
+#: Unit of a depth and the unit it was taken for -> factor that takes it to metres. 1/256 m and 1/5000 m are the steps
+#: of KITTI's and TUM's files. Source: derived, ratios of the units.
 UNIT_FACTORS = {
     "mm read as m": 1e-3,
     "m read as mm": 1e3,
@@ -88,29 +80,26 @@ UNIT_FACTORS = {
     "mm read as 1/256 m": 256 / 1000,
 }
 
-#: Factor by which a unit may fail to bring a map to its near returns, else it is not tried.
-MAX_UNIT_MISFIT = 2.0
 
-#: Pairs of a window, fewest that may name a cause, frames from one of a pair to the other, the widest first in which
-#: such a share of the textured samples is found again.
-MAX_WINDOW_PAIRS, MIN_WINDOW_PAIRS, PAIR_GAPS, MIN_TRACKED_RATIO = 8, 4, (8, 4, 2, 1), 0.4
+#: Fewest pairs (or frames) of a diagnosis with the default options.
+MIN_WINDOW_PAIRS: Final = DEFAULT_VALIDATION_OPTIONS.min_window_pairs
 
 
 @dataclass(frozen=True)
 class KnownFault:
-    """A fault that maps of a recording may share, and how it is undone."""
+    """A fault that the maps of a recording may share, and its inverse."""
 
     kind: str  # unit | mirrored | rolled | registration | along the ray | inverse | time offset | focal length
-    name: str  # of this one
-    undo: Callable[[Tensor], Tensor] = lambda depth: depth  # map (B, h, w) → as it should be
+    name: str  # of this fault
+    undo: Callable[[Tensor], Tensor] = lambda depth: depth  # map (B, h, w) → map without the fault
     lag: int = 0  # frames by which the maps come late
-    focal: float = 1.0  # what the focal length is to be multiplied by
-    ray: bool = False  # depth is to be divided by the length of its ray
-    scaled: bool = False  # what was undone is known up to a scale, which near returns tell
+    focal: float = 1.0  # factor that corrects the focal length
+    ray: bool = False  # whether depth is to be divided by the length of its ray
+    scaled: bool = False  # whether the undone map has an unknown scale, which near returns determine
 
 
 def rot90_map(depth: Tensor, quarters: int) -> Tensor:
-    """A map (…, h, w) rolled counter-clockwise by quarter turns and stretched to its old size (nearest pixels)."""
+    """Map (…, h, w) rolled counter-clockwise by quarter turns and resized to its old size (nearest pixels)."""
     rolled = torch.rot90(depth, quarters, (-2, -1))
     if rolled.shape == depth.shape:
         return rolled
@@ -118,8 +107,8 @@ def rot90_map(depth: Tensor, quarters: int) -> Tensor:
     return F.interpolate(flat, depth.shape[-2:], mode="nearest-exact").reshape(depth.shape)
 
 
-def _seen_over(field: float) -> str:
-    """The field in words; beyond the last one that is tried, nobody has looked."""
+def _registration_name(field: float) -> str:
+    """Name of the registration fault with that field of view; the first and the last one tried are bounds."""
     bound = {FIELD_OF_VIEW_RATIOS[0]: "at most ", FIELD_OF_VIEW_RATIOS[-1]: "at least "}.get(field, "")
     return f"not registered: seen over {bound}{field:.2f} of the picture's field"
 
@@ -132,26 +121,31 @@ def ray_lengths(camera: cam.Camera, hw: tuple[int, int]) -> Tensor:
         return cam.rays(camera, uv).norm(dim=-1).unflatten(1, hw)
 
 
-def _is_possible(cause: KnownFault, ratio: float) -> bool:
-    """Whether it can be a cause where near returns stand at so many times what the maps say; 0 = not known."""
+def _is_possible(cause: KnownFault, ratio: float, options: ValidationOptions) -> bool:
+    """Whether a fault is possible at a median ``ratio`` of near returns to the maps; 0 = unknown."""
     factor = UNIT_FACTORS.get(cause.name)
-    return factor is None or ratio == 0 or abs(math.log(ratio / factor)) < math.log(MAX_UNIT_MISFIT)
+    return factor is None or ratio == 0 or abs(math.log(ratio / factor)) < math.log(options.max_unit_misfit)
 
 
 def _mirrored(depth: Tensor, axis: int) -> Tensor:
+    """Map (…, h, w) flipped along an axis."""
     return depth.flip(axis)
 
 
 def _inverse(depth: Tensor) -> Tensor:
+    """Reciprocal of a map (…, h, w); 0 where it has no value."""
     return torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)
 
 
 def _times(depth: Tensor, factor: float) -> Tensor:
+    """Map (…, h, w) times a factor."""
     return depth * factor
 
 
-#: Hypotheses: nothing first, then what is undone.
+#: Hypothesis without a fault.
 NO_FAULT = KnownFault("none", "none")
+
+#: Hypotheses with a fault.
 KNOWN_FAULTS: tuple[KnownFault, ...] = (
     *(KnownFault("unit", name, partial(_times, factor=factor)) for name, factor in UNIT_FACTORS.items()),
     KnownFault("mirrored", "mirrored left to right", partial(_mirrored, axis=-1)),
@@ -160,7 +154,7 @@ KNOWN_FAULTS: tuple[KnownFault, ...] = (
     KnownFault("inverse", "inverse depth or disparity, not depth", _inverse, scaled=True),
     *(KnownFault("rolled", f"rolled by {90 * k} degrees", partial(rot90_map, quarters=4 - k)) for k in (1, 2, 3)),
     *(
-        KnownFault("registration", _seen_over(field), partial(rescale_field_of_view, factor=field))
+        KnownFault("registration", _registration_name(field), partial(rescale_field_of_view, factor=field))
         for field in FIELD_OF_VIEW_RATIOS
     ),
     *(
@@ -184,14 +178,14 @@ KNOWN_FAULTS: tuple[KnownFault, ...] = (
 
 
 class Diagnosis(NamedTuple):
-    """What was found out about a window of frames."""
+    """Diagnosis of a window of frames."""
 
-    cause: str | None  # name; None = nothing explains better than no fault, or it cannot be known
+    cause: str | None  # name; None = no fault explains the window clearly better, or it is not observable
     kind: str | None  # of the cause
     loss: Mapping[str, float]  # hypothesis → mean loss over the pairs, "none" among them
-    n_pairs: int  # pairs that could tell
-    pairs: Sequence[tuple[int, int]] = ()  # that were looked at, as places in the window
-    by: str = "tracks"  # what told: tracks | returns (then n_pairs counts frames)
+    n_pairs: int  # pairs with a loss
+    pairs: Sequence[tuple[int, int]] = ()  # evaluated pairs, as indices in the window
+    by: str = "tracks"  # tracks | returns (then n_pairs counts frames)
 
 
 def diagnose(
@@ -201,20 +195,23 @@ def diagnose(
     method: Method = TRACKING_METHOD,
     seed: int = 0,
     watched: WindowTracks | None = None,
+    options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS,
 ) -> Diagnosis:
-    """The known fault that the maps of a window of frames share, if one explains the pictures clearly best.
+    """Window of frames and their maps -> the known fault that they share, if one explains the pictures clearly best.
 
     Args:
         frames: some twenty views in their order, B = 1 each, of equal sizes.
-        maps: (1, h, w) m of each, over the field of the picture, held against the motions that the sensor's near
-            returns give; None = the sensor's own depth, whose hypotheses each give motions of their own.
-        method: how pairs are tracked and placed; its seats 1 to 5 count.
+        maps: (1, h, w) m of each, over the field of view of the picture, evaluated under the motions that are fitted to
+            the sensor's near returns; None = the sensor's own depth, under whose hypotheses motions are fitted each
+            time.
+        method: its stages 1 to 5 track the pairs and fit their motions.
         seed: of the pose search.
-        watched: what :func:`track_window` found in the same pictures; None = it is asked.
+        watched: result of :func:`track_window` on the same pictures; None = computed here.
+        options: tuning constants of tracks, losses and their comparison.
 
-    Where all frames carry a pose of their own (``T_world_from_cam``) misses under that motion count half, so that a
-    unit or a focal length, which motions fitted to the same depth swallow, shows. Without, a unit of the sensor's own
-    depth cannot be known and is not named. Where fewer than four pairs have a motion, ``maps`` are held against the
+    Where all frames have a pose (``T_world_from_cam``), misses under that motion count half, so that a unit or a focal
+    length is observable, which motions fitted to the same depth absorb. Without poses a unit of the sensor's own depth
+    is not observable and no hypothesis. Where fewer than four pairs have a motion, ``maps`` are compared with the
     sensor's near returns in the frames themselves.
 
     Raises:
@@ -224,21 +221,29 @@ def diagnose(
     Cost: a track of each pair, and a pose of each pair and hypothesis.
     """
     if len(frames) < 2 or (maps is not None and len(maps) != len(frames)):
-        found = "none" if maps is None else len(maps)
-        raise ValueError(f"diagnose: found {len(frames)} frames and {found} maps, expected two or more, as many maps")
+        n_maps = "none" if maps is None else len(maps)
+        raise ValueError(
+            f"diagnose: found {len(frames)} frames and {n_maps} maps, expected two or more frames, and as many maps"
+        )
     with torch.no_grad():
-        named = _by_tracks(frames, maps, method, seed, track_window(frames, method) if watched is None else watched)
-        moves = named.n_pairs >= MIN_WINDOW_PAIRS and not _stands(frames)
-        if maps is None or named.cause is not None or moves:
-            return named
-        told = _by_returns(frames, maps, method)
-        return told if told.n_pairs >= MIN_WINDOW_PAIRS else named
+        window_tracks = track_window(frames, method, options) if watched is None else watched
+        diagnosis = _diagnose_by_tracks(frames, maps, method, seed, window_tracks, options)
+        has_motion = diagnosis.n_pairs >= options.min_window_pairs and not _is_static(frames, options)
+        if maps is None or diagnosis.cause is not None or has_motion:
+            return diagnosis
+        by_returns = _diagnose_by_returns(frames, maps, method, options)
+        return by_returns if by_returns.n_pairs >= options.min_window_pairs else diagnosis
 
 
-def _by_tracks(
-    frames: Sequence[Frame], maps: Sequence[Tensor] | None, method: Method, seed: int, watched: WindowTracks
+def _diagnose_by_tracks(
+    frames: Sequence[Frame],
+    maps: Sequence[Tensor] | None,
+    method: Method,
+    seed: int,
+    watched: WindowTracks,
+    options: ValidationOptions,
 ) -> Diagnosis:
-    """What the motion of points between pictures names."""
+    """Diagnosis by the motion of points between pictures."""
     if not watched.pairs:
         return Diagnosis(None, None, {}, 0)
     window = FaultWindow(
@@ -251,100 +256,112 @@ def _by_tracks(
         pairs=watched.pairs,
         method=method,
         seed=seed,
+        options=options,
     )
-    asked = {cause.name: cause for cause in window.hypotheses()}
-    named = select_cause({name: window.loss(cause) for name, cause in asked.items()})._replace(pairs=watched.pairs)
-    if named.cause is None or window.explains(asked[named.cause]):
-        return named
-    return named._replace(cause=None, kind=None)
+    hypotheses = {cause.name: cause for cause in window.hypotheses()}
+    losses = {name: window.loss(cause) for name, cause in hypotheses.items()}
+    diagnosis = select_cause(losses, options)._replace(pairs=watched.pairs)
+    if diagnosis.cause is None or window.explains(hypotheses[diagnosis.cause]):
+        return diagnosis
+    return diagnosis._replace(cause=None, kind=None)
 
 
-def _stands(frames: Sequence[Frame]) -> bool:
-    """Whether a trajectory says that the camera stays in its place, so that motions tell depths nothing apart."""
+def _is_static(frames: Sequence[Frame], options: ValidationOptions) -> bool:
+    """Whether the given trajectory has no baseline, so that the motion of points is independent of depth."""
     poses = [frame.T_world_from_cam for frame in frames]
-    at = [pose.t for pose in poses if pose is not None]
-    if len(at) < len(poses):
+    positions = [pose.t for pose in poses if pose is not None]
+    if len(positions) < len(poses):
         return False
-    way = (torch.cat(at) - at[0]).norm(dim=-1).max()
+    baseline = (torch.cat(positions) - positions[0]).norm(dim=-1).max()
     returns = torch.cat([frame.depth[frame.depth > 0] for frame in frames])
-    return len(returns) > 0 and bool(way < STATIC_BASELINE_RATIO * returns.median())
+    return len(returns) > 0 and bool(baseline < options.static_baseline_ratio * returns.median())
 
 
-def _by_returns(frames: Sequence[Frame], maps: Sequence[Tensor], method: Method) -> Diagnosis:
-    """What near returns name where no motion is known; a frame is one witness here as a pair is elsewhere."""
-    places = sorted({round((len(frames) - 1) * k / (MAX_WINDOW_PAIRS - 1)) for k in range(MAX_WINDOW_PAIRS)})
-    told = {i: _returns(frames[i], method) for i in places}
-    # Those of one place in the picture know no focal length.
-    asked = [NO_FAULT, *(cause for cause in KNOWN_FAULTS if cause.kind != "focal length")]
+def _diagnose_by_returns(
+    frames: Sequence[Frame], maps: Sequence[Tensor], method: Method, options: ValidationOptions
+) -> Diagnosis:
+    """Diagnosis by near returns, where there is no motion; frames take the place of pairs."""
+    indices = sorted(
+        {round((len(frames) - 1) * k / (options.max_window_pairs - 1)) for k in range(options.max_window_pairs)}
+    )
+    returns = {i: _near_returns(frames[i], method, options) for i in indices}
+    # A focal length does not change the map at a pixel.
+    hypotheses = [NO_FAULT, *(cause for cause in KNOWN_FAULTS if cause.kind != "focal length")]
     losses = {}
-    for cause in asked:
-        held = [
-            _return_loss(told[i], maps[i + cause.lag], cause, frames[i]) if 0 <= i + cause.lag < len(maps) else None
-            for i in places
+    for cause in hypotheses:
+        loss_of_frame = [
+            _return_loss(returns[i], maps[i + cause.lag], cause, frames[i], options)
+            if 0 <= i + cause.lag < len(maps)
+            else None
+            for i in indices
         ]
-        losses[cause.name] = torch.stack([torch.tensor(torch.nan) if x is None else x for x in held])
-    named = select_cause(losses)._replace(by="returns")
-    if named.cause is None:
-        return named
-    before, after = losses[NO_FAULT.name], losses[named.cause]
-    known = before.isfinite() & after.isfinite()
-    explained = (before - after)[known].mean() >= MIN_EXPLAINED_RATIO * before[known].mean()
-    return named if bool(explained) else named._replace(cause=None, kind=None)
+        losses[cause.name] = torch.stack([torch.tensor(torch.nan) if x is None else x for x in loss_of_frame])
+    diagnosis = select_cause(losses, options)._replace(by="returns")
+    if diagnosis.cause is None:
+        return diagnosis
+    before, after = losses[NO_FAULT.name], losses[diagnosis.cause]
+    valid = before.isfinite() & after.isfinite()
+    is_explained = (before - after)[valid].mean() >= options.min_explained_ratio * before[valid].mean()
+    return diagnosis if bool(is_explained) else diagnosis._replace(cause=None, kind=None)
 
 
-def _returns(frame: Frame, method: Method) -> tuple[Tensor, Tensor]:
+def _near_returns(frame: Frame, method: Method, options: ValidationOptions) -> tuple[Tensor, Tensor]:
     """Places (1, N, 2) px of a grid over a picture, and the near return (1, N) m there, 0 without one or at an edge."""
-    straight = frame if frame.depth_camera is not None else frame.replace(camera=cam.ideal(frame.camera))
-    found = method.backproject(straight, dense.map_pixel_centres(frame, dense.map_hw(frame.hw, RETURN_GRID_SIDE)))
-    fine = found.usable & ((found.flag & (Flag.DEPTH_EDGE | Flag.SPECULAR)) == 0)
-    return found.uv, torch.where(fine, found.depth, 0.0)
+    view = frame if frame.depth_camera is not None else frame.replace(camera=cam.ideal(frame.camera))
+    samples = method.backproject(view, dense.map_pixel_centres(frame, dense.map_hw(frame.hw, options.return_grid_side)))
+    valid = samples.usable & ((samples.flag & (Flag.DEPTH_EDGE | Flag.SPECULAR)) == 0)
+    return samples.uv, torch.where(valid, samples.depth, 0.0)
 
 
-def _return_loss(told: tuple[Tensor, Tensor], depth: Tensor, cause: KnownFault, frame: Frame) -> Tensor:
-    """Mean loss of a map (1, h, w) with a fault undone at near returns; NaN where it meets too few."""
-    uv, returned = told
-    depth = _undone(depth.to(returned), cause, frame.replace(depth_camera=None))
-    at = _said(depth, uv, frame.hw)
-    at = at * _ratio(returned, at) if cause.scaled else at
-    both = (returned > 0) & (at > 0)
-    miss = torch.where(both, at / torch.where(both, returned, 1.0), 1.0).log() / math.log(HALF_LOSS_RATIO)
-    return _mean_over(miss.square() / (miss.square() + 1), both)[0].cpu()
+def _return_loss(
+    uv_and_depth: tuple[Tensor, Tensor], depth: Tensor, cause: KnownFault, frame: Frame, options: ValidationOptions
+) -> Tensor:
+    """Mean loss of a map (1, h, w) with a fault undone at near returns; NaN where too few have a value."""
+    uv, returned = uv_and_depth
+    depth = _undo_fault(depth.to(returned), cause, frame.replace(depth_camera=None))
+    map_depth = _sample_map(depth, uv, frame.hw)
+    map_depth = map_depth * _median_ratio(returned, map_depth) if cause.scaled else map_depth
+    both = (returned > 0) & (map_depth > 0)
+    miss = torch.where(both, map_depth / torch.where(both, returned, 1.0), 1.0).log() / math.log(
+        options.half_loss_ratio
+    )
+    return _mean_loss(miss.square() / (miss.square() + 1), both)[0].cpu()
 
 
-def select_cause(losses: Mapping[str, Tensor]) -> Diagnosis:
-    """What is named by losses (P,) of the pairs under each hypothesis, NaN where a pair cannot tell. Gradient: none."""
+def select_cause(losses: Mapping[str, Tensor], options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS) -> Diagnosis:
+    """Losses (P,) of the pairs under each hypothesis (NaN = no loss) -> diagnosis. Gradient: none."""
     kinds = {cause.name: cause.kind for cause in (NO_FAULT, *KNOWN_FAULTS)}
     base = losses[NO_FAULT.name]
-    able = base.isfinite()
-    mean = {name: float(loss[able & loss.isfinite()].mean()) for name, loss in losses.items()}
-    nothing = Diagnosis(
-        None, None, {name: value for name, value in mean.items() if math.isfinite(value)}, int(able.sum())
+    valid = base.isfinite()
+    mean = {name: float(loss[valid & loss.isfinite()].mean()) for name, loss in losses.items()}
+    no_cause = Diagnosis(
+        None, None, {name: value for name, value in mean.items() if math.isfinite(value)}, int(valid.sum())
     )
     saved = {
         name: (base - loss)[base.isfinite() & loss.isfinite()] for name, loss in losses.items() if name != NO_FAULT.name
     }
-    saved = {name: each for name, each in saved.items() if len(each) >= MIN_WINDOW_PAIRS}
+    saved = {name: differences for name, differences in saved.items() if len(differences) >= options.min_window_pairs}
     if not saved:
-        return nothing
+        return no_cause
     best = max(saved, key=lambda name: float(saved[name].mean()))
     error = float(saved[best].std() / len(saved[best]) ** 0.5)
-    beyond = [_mean_of_both(losses[name] - losses[best]) for name in saved if kinds[name] != kinds[best]]
-    clear = float(saved[best].mean()) > max(MIN_LOSS_SAVED, MIN_STANDARD_ERRORS * error)
+    margins = [_mean_over_common_pairs(losses[name] - losses[best]) for name in saved if kinds[name] != kinds[best]]
+    is_clear = float(saved[best].mean()) > max(options.min_loss_saved, options.min_standard_errors * error)
     return (
-        nothing._replace(cause=best, kind=kinds[best])
-        if clear and all(x > MIN_MARGIN_OVER_OTHERS for x in beyond)
-        else nothing
+        no_cause._replace(cause=best, kind=kinds[best])
+        if is_clear and all(margin > options.min_margin_over_others for margin in margins)
+        else no_cause
     )
 
 
-def _mean_of_both(more: Tensor) -> float:
-    """Of the pairs that both can tell, since some are easier than others; infinite without any."""
-    known = more[more.isfinite()]
-    return float(known.mean()) if len(known) else math.inf
+def _mean_over_common_pairs(difference: Tensor) -> float:
+    """Mean difference of two losses over the pairs with both, since some pairs are easier; infinite without any."""
+    valid = difference[difference.isfinite()]
+    return float(valid.mean()) if len(valid) else math.inf
 
 
 class WindowTracks(NamedTuple):
-    """Pairs of a window, and the samples of each first picture with where the second shows them."""
+    """Pairs of a window, with the samples of each first picture and their tracks into the second."""
 
     pairs: Sequence[tuple[int, int]]
     samples: Sequence[Samples]
@@ -353,131 +370,140 @@ class WindowTracks(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FaultWindow:
-    """Pairs of a window, tracked: what stays the same whatever the depth."""
+    """Tracked pairs of a window: the data of all hypotheses, independent of depth."""
 
     references: Frame  # (P, …)
     others: Frame  # (P, …)
-    samples: Samples  # (P, N) as the sensor has them
+    samples: Samples  # (P, N) with the sensor's own depth
     tracks: Tracks  # (P, N)
     maps: Sequence[Tensor] | None  # of all frames
     depths: Sequence[Tensor]  # of all frames, the sensor's own
     pairs: Sequence[tuple[int, int]]  # frames of each
     method: Method
     seed: int
+    options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS
 
     def hypotheses(self) -> Sequence[KnownFault]:
-        """What could be known: a motion fitted to near returns swallows a focal length, and the unit of its own."""
-        swallowed: set[str] = {"inverse"} if self.maps is None else set()
+        """Observable hypotheses: a motion fitted to near returns absorbs a focal length and their unit."""
+        absorbed: set[str] = {"inverse"} if self.maps is None else set()
         if self.references.T_world_from_cam is None or self.others.T_world_from_cam is None:
-            swallowed |= {"focal length", "unit"} if self.maps is None else {"focal length"}
-        asked = [NO_FAULT, *(cause for cause in KNOWN_FAULTS if cause.kind not in swallowed)]
-        ratio = 0.0 if self.maps is None else self._returned_over(self.maps)
-        return [each for each in asked if _is_possible(each, ratio)]
+            absorbed |= {"focal length", "unit"} if self.maps is None else {"focal length"}
+        hypotheses = [NO_FAULT, *(cause for cause in KNOWN_FAULTS if cause.kind not in absorbed)]
+        ratio = 0.0 if self.maps is None else self._return_to_map_ratio(self.maps)
+        return [cause for cause in hypotheses if _is_possible(cause, ratio, self.options)]
 
-    def _returned_over(self, maps: Sequence[Tensor]) -> float:
-        """Median ratio of near returns to what maps say there; 0 without one."""
+    def _return_to_map_ratio(self, maps: Sequence[Tensor]) -> float:
+        """Median ratio of near returns to the maps there; 0 without any."""
         samples = self.method.backproject(self.references, self.samples.uv)
         depth = torch.cat([maps[i] for i, _ in self.pairs]).to(samples.depth)
-        told = torch.where(samples.usable, samples.depth, 0.0)
-        found = _ratio(told, _said(depth, self.samples.uv, self.references.hw))
-        return float(found[found > 0].median()) if bool((found > 0).any()) else 0.0
+        returned = torch.where(samples.usable, samples.depth, 0.0)
+        ratio = _median_ratio(returned, _sample_map(depth, self.samples.uv, self.references.hw))
+        return float(ratio[ratio > 0].median()) if bool((ratio > 0).any()) else 0.0
 
     def explains(self, cause: KnownFault) -> bool:
-        """Whether maps with that fault undone come near to the sensor's returns, where there are any: an explanation
-        that is only better than none is none. The sensor's own depth is held against nothing."""
+        """Whether undoing the fault removes most of the maps' loss beyond that of the sensor's returns.
+
+        A fault that is only better than none is no explanation. True where too few pairs have near returns, and for the
+        sensor's own depth, for which there is no other depth to compare with.
+        """
         if self.maps is None:
             return True
-        before, after = (self.loss(each, near=True) for each in (NO_FAULT, cause))
-        least = self.loss(NO_FAULT, near=True, sensor=True, focal=cause.focal)
-        known = before.isfinite() & after.isfinite() & least.isfinite()
-        if int(known.sum()) < MIN_WINDOW_PAIRS:
+        before, after = (self.loss(fault, near=True) for fault in (NO_FAULT, cause))
+        sensor_loss = self.loss(NO_FAULT, near=True, sensor=True, focal=cause.focal)
+        valid = before.isfinite() & after.isfinite() & sensor_loss.isfinite()
+        if int(valid.sum()) < self.options.min_window_pairs:
             return True
-        return float((before - after)[known].mean()) >= MIN_EXPLAINED_RATIO * float((before - least)[known].mean())
+        return float((before - after)[valid].mean()) >= self.options.min_explained_ratio * float(
+            (before - sensor_loss)[valid].mean()
+        )
 
     def loss(
         self, cause: KnownFault, *, near: bool = False, sensor: bool = False, focal: float | None = None
     ) -> Tensor:
-        """(P,) loss with that fault undone; NaN where a pair cannot tell.
+        """(P,) loss with that fault undone; NaN where a pair has none.
 
         Args:
-            cause: what is undone.
-            near: of samples with a near return alone.
-            sensor: of the sensor's returns, whatever the maps.
-            focal: another factor on the focal lengths than the cause's.
+            cause: the fault that is undone.
+            near: only of samples with a near return.
+            sensor: of the sensor's returns instead of the maps.
+            focal: factor on the focal lengths; None = the cause's.
         """
-        place = [i + cause.lag for i, _ in self.pairs]
-        there = torch.tensor([0 <= i < len(self.depths) for i in place], device=self.samples.uv.device)
-        place = [min(max(i, 0), len(self.depths) - 1) for i in place]
+        frame_index = [i + cause.lag for i, _ in self.pairs]
+        in_window = torch.tensor([0 <= i < len(self.depths) for i in frame_index], device=self.samples.uv.device)
+        frame_index = [min(max(i, 0), len(self.depths) - 1) for i in frame_index]
         factor = cause.focal if focal is None else focal
-        scaled = (self._scaled(self.references, factor), self._scaled(self.others, factor))
-        own = self.maps is None
+        views = (self._scaled(self.references, factor), self._scaled(self.others, factor))
+        is_sensor_map = self.maps is None
         returns = self.references.depth
-        if own:
-            returns = _undone(torch.cat([self.depths[i] for i in place]), cause, scaled[0])
-        view = scaled[0].replace(depth=returns)
+        if is_sensor_map:
+            returns = _undo_fault(torch.cat([self.depths[i] for i in frame_index]), cause, views[0])
+        view = views[0].replace(depth=returns)
         samples = self.method.backproject(view, self.samples.uv).replace(trackability=self.samples.trackability)
-        told = torch.where(samples.usable, samples.depth, 0.0)
-        depth = told
+        returned = torch.where(samples.usable, samples.depth, 0.0)
+        depth = returned
         if self.maps is not None and not sensor:
-            picture = scaled[0].replace(depth_camera=None)
-            depth = _undone(torch.cat([self.maps[i] for i in place]).to(told), cause, picture)
-            depth = _said(depth, self.samples.uv, view.hw)
-            depth = depth * _ratio(told, depth) if cause.scaled else depth
+            picture_view = views[0].replace(depth_camera=None)
+            depth = _undo_fault(torch.cat([self.maps[i] for i in frame_index]).to(returned), cause, picture_view)
+            depth = _sample_map(depth, self.samples.uv, view.hw)
+            depth = depth * _median_ratio(returned, depth) if cause.scaled else depth
             depth = torch.where(samples.usable, depth, 0.0) if near else depth
-        found = self._under_fit(samples, depth, scaled)
-        given = self._under_trajectory(depth, scaled)
-        if given is not None:
-            found = 0.5 * (torch.where(found.isfinite(), found, 1.0) + given)
-        return torch.where(there, found, torch.nan)
+        loss = self._loss_under_fitted_motion(samples, depth, views)
+        trajectory_loss = self._loss_under_trajectory(depth, views)
+        if trajectory_loss is not None:
+            loss = 0.5 * (torch.where(loss.isfinite(), loss, 1.0) + trajectory_loss)
+        return torch.where(in_window, loss, torch.nan)
 
     @staticmethod
     def _scaled(frame: Frame, factor: float) -> Frame:
+        """Frames with the focal lengths of both cameras times a factor."""
         camera = frame.camera.replace(f=frame.camera.f * factor)
         depth_camera = frame.depth_camera
         if depth_camera is not None:
             depth_camera = depth_camera.replace(f=depth_camera.f * factor)
         return frame.replace(camera=camera, depth_camera=depth_camera)
 
-    def _under_fit(self, samples: Samples, depth: Tensor, views: tuple[Frame, Frame]) -> Tensor:
-        """Under motions fitted to near returns; a pair without one misses everything, of the sensor's own depth."""
+    def _loss_under_fitted_motion(self, samples: Samples, depth: Tensor, views: tuple[Frame, Frame]) -> Tensor:
+        """Loss (P,) under motions fitted to near returns; without a motion 1 for the sensor's own depth, else NaN."""
         cameras = views[0].camera, views[1].camera
         _, usable, fit = solve_pose_and_triangulate(
             self.method, samples, self.tracks, *cameras, seed=self.seed, fit=None, clock=StageTimer(None)
         )
-        still = fit.t_snr < 3
-        loss = self._missed(depth, usable, fit.T_1_from_0, cameras)
-        lost = 1.0 if self.maps is None else torch.nan
-        return torch.where(fit.ok & ~(still & (self.maps is not None)), loss, lost)
+        is_static = fit.t_snr < 3
+        loss = self._reprojection_loss(depth, usable, fit.T_1_from_0, cameras)
+        failed_loss = 1.0 if self.maps is None else torch.nan
+        return torch.where(fit.ok & ~(is_static & (self.maps is not None)), loss, failed_loss)
 
-    def _under_trajectory(self, depth: Tensor, views: tuple[Frame, Frame]) -> Tensor | None:
-        """Under the motions of the frames' own poses; None where they have none."""
+    def _loss_under_trajectory(self, depth: Tensor, views: tuple[Frame, Frame]) -> Tensor | None:
+        """Loss (P,) under the motions of the frames' own poses; None where they have none."""
         a, b = views[0].T_world_from_cam, views[1].T_world_from_cam
         if a is None or b is None:
             return None
         T = se3.relative(a, b).map(lambda x: x.to(depth))
-        return self._missed(depth, self.tracks, T, (views[0].camera, views[1].camera))
+        return self._reprojection_loss(depth, self.tracks, T, (views[0].camera, views[1].camera))
 
-    def _missed(self, depth: Tensor, tracks: Tracks, T: Pose, cameras: tuple[cam.Camera, cam.Camera]) -> Tensor:
+    def _reprojection_loss(
+        self, depth: Tensor, tracks: Tracks, T: Pose, cameras: tuple[cam.Camera, cam.Camera]
+    ) -> Tensor:
         """Mean loss (P,) of the samples that have a depth and a track."""
         xyz = cam.unproject(cameras[0], self.samples.uv, depth)
         used = tracks.valid & (depth > 0) & xyz.isfinite().all(-1)
-        there = se3.apply(T, torch.where(used[..., None], xyz, 1.0))
-        ahead = used & (there[..., 2] > 1e-6)
-        uv = cam.project(cameras[1], torch.where(ahead[..., None], there, 1.0))
+        xyz_1 = se3.apply(T, torch.where(used[..., None], xyz, 1.0))
+        in_front = used & (xyz_1[..., 2] > 1e-6)
+        uv = cam.project(cameras[1], torch.where(in_front[..., None], xyz_1, 1.0))
         miss = (uv - self.tracks.uv_1).norm(dim=-1) * (640 / self.references.hw[1])
-        loss = torch.where(ahead, miss.square() / (miss.square() + HALF_LOSS_PX**2), 1.0)
-        return _mean_over(loss, used)
+        loss = torch.where(in_front, miss.square() / (miss.square() + self.options.half_loss_px**2), 1.0)
+        return _mean_loss(loss, used)
 
 
-def _mean_over(loss: Tensor, used: Tensor) -> Tensor:
-    """Mean (P,) of the losses (P, N) that count; NaN of too few."""
+def _mean_loss(loss: Tensor, used: Tensor) -> Tensor:
+    """Mean (P,) of the used losses (P, N); NaN of fewer than 12."""
     n = used.sum(-1)
     mean = torch.where(used, loss, 0.0).sum(-1) / n.clamp_min(1)
     return torch.where(n >= 12, mean, torch.nan)
 
 
-def _undone(depth: Tensor, cause: KnownFault, view: Frame) -> Tensor:
-    """Maps (P, h, w) as they should be, over the field of the pictures or of a camera of their own."""
+def _undo_fault(depth: Tensor, cause: KnownFault, view: Frame) -> Tensor:
+    """Maps (P, h, w) with a fault undone, over the field of view of the pictures or of a depth camera."""
     depth = cause.undo(depth)
     if not cause.ray:
         return depth
@@ -485,49 +511,59 @@ def _undone(depth: Tensor, cause: KnownFault, view: Frame) -> Tensor:
     return depth / ray_lengths(view.depth_camera or cam.resize(view.camera, view.hw, hw), hw)
 
 
-def _said(depth: Tensor, uv: Tensor, hw: tuple[int, int]) -> Tensor:
-    """What maps (P, h, w) say at pixels (P, N, 2) of pictures of size ``hw``; 0 where nothing finite."""
+def _sample_map(depth: Tensor, uv: Tensor, hw: tuple[int, int]) -> Tensor:
+    """Values (P, N) of maps (P, h, w) at pixels (P, N, 2) of pictures of size ``hw``; 0 where they are not finite."""
     at = cam.resize_pixels(uv, hw, (depth.shape[-2], depth.shape[-1]))
     return sample_nearest(depth, at)[0].nan_to_num(0.0, 0.0, 0.0)
 
 
-def _ratio(told: Tensor, depth: Tensor) -> Tensor:
-    """Median ratio (P, 1) of near returns ``told`` (P, N) to what a map says there; 0 where no return meets it."""
-    both = (told > 0) & (depth > 0)
-    ratio = torch.where(both, told / torch.where(both, depth, 1.0), torch.nan)
+def _median_ratio(returned: Tensor, depth: Tensor) -> Tensor:
+    """Median ratio (P, 1) of near returns (P, N) to a map's depth (P, N) there; 0 where no return meets it."""
+    both = (returned > 0) & (depth > 0)
+    ratio = torch.where(both, returned / torch.where(both, depth, 1.0), torch.nan)
     return ratio.nanmedian(-1, keepdim=True).values.nan_to_num(0.0)
 
 
-def track_window(frames: Sequence[Frame], method: Method = TRACKING_METHOD) -> WindowTracks:
-    """How points move between the pictures of a window, in pairs as wide as tracks hold: what no depth changes.
+def track_window(
+    frames: Sequence[Frame],
+    method: Method = TRACKING_METHOD,
+    options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS,
+) -> WindowTracks:
+    """Window of frames -> tracks between pairs with the widest gap over which enough samples are tracked.
 
     Gradient: none.
     """
-    found: dict[int, tuple[int, Samples, Tracks]] = {}
-    for gap in [gap for gap in PAIR_GAPS if gap < len(frames)]:
-        firsts = [i for i in _reference_frames(len(frames)) if i not in found and i + gap < len(frames)]
-        if not firsts:
+    pair_of_frame: dict[int, tuple[int, Samples, Tracks]] = {}
+    for gap in [gap for gap in options.pair_gaps if gap < len(frames)]:
+        first_frames = [
+            i for i in _reference_frames(len(frames), options) if i not in pair_of_frame and i + gap < len(frames)
+        ]
+        if not first_frames:
             continue
         with torch.no_grad():
-            samples, tracks = _tracked([frames[i] for i in firsts], [frames[i + gap] for i in firsts], method)
+            samples, tracks = _track_pairs(
+                [frames[i] for i in first_frames], [frames[i + gap] for i in first_frames], method
+            )
         textured = (samples.trackability >= method.min_trackability).sum(-1).clamp_min(1)
-        holds = tracks.valid.sum(-1) >= MIN_TRACKED_RATIO * textured
-        for k, i in enumerate(firsts):
-            if bool(holds[k]):
-                found[i] = gap, samples[k : k + 1], tracks[k : k + 1]
-    order = sorted(found)
-    pairs = [(i, i + found[i][0]) for i in order]
-    return WindowTracks(pairs, [found[i][1] for i in order], [found[i][2] for i in order])
+        is_tracked = tracks.valid.sum(-1) >= options.min_tracked_ratio * textured
+        for k, i in enumerate(first_frames):
+            if bool(is_tracked[k]):
+                pair_of_frame[i] = gap, samples[k : k + 1], tracks[k : k + 1]
+    frame_order = sorted(pair_of_frame)
+    pairs = [(i, i + pair_of_frame[i][0]) for i in frame_order]
+    return WindowTracks(pairs, [pair_of_frame[i][1] for i in frame_order], [pair_of_frame[i][2] for i in frame_order])
 
 
-def _tracked(references: Sequence[Frame], others: Sequence[Frame], method: Method) -> tuple[Samples, Tracks]:
-    """Samples of some frames found again in others."""
+def _track_pairs(references: Sequence[Frame], others: Sequence[Frame], method: Method) -> tuple[Samples, Tracks]:
+    """Samples of frames, and their tracks into other frames."""
     samples = method.sample_depth(pytree.collate(references))
     tracks = method.track(pytree.collate(references).image, pytree.collate(others).image, samples.uv)
     return samples, tracks.replace(valid=tracks.valid & (samples.trackability >= method.min_trackability))
 
 
-def _reference_frames(n: int) -> list[int]:
-    """Reference views of a window, spread evenly, not so near its ends that no earlier or later map is known."""
+def _reference_frames(n: int, options: ValidationOptions) -> list[int]:
+    """Reference views of a window, evenly spread, far enough from its ends for earlier and later maps."""
     low, high = (MAX_LAG_FRAMES, n - 1 - MAX_LAG_FRAMES) if n > 3 * MAX_LAG_FRAMES else (0, n - 2)
-    return sorted({low + round((high - low) * k / (MAX_WINDOW_PAIRS - 1)) for k in range(MAX_WINDOW_PAIRS)})
+    return sorted(
+        {low + round((high - low) * k / (options.max_window_pairs - 1)) for k in range(options.max_window_pairs)}
+    )

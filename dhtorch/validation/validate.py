@@ -1,12 +1,13 @@
-"""Is this depth right? Of every pixel consistent, wrong or cannot know; of the frame scale, shift, tilt, share wrong.
+"""Validation of a depth map: consistent, wrong or unknown per pixel; scale, shift, tilt and wrong fraction per frame.
 
-    method ─ near returns, triangulated points ─ sparse_evidence ─┐
-           └ motions ─ pictures of other views ─ photometric_evidence ───┼─ states ─┐
-                     └ maps of other views ───── consistency_evidence ────┘          ├─ Verdict
-             ratios to the answers ─ scale, shift, tilt ────────────────┘
+    method ─ near returns, triangulated points ─ sparse_evidence ────────────┐
+           └ motions ─ pictures of source views ─ photometric_evidence ──────┼─ states ─┐
+                     └ maps of source views ──── depth_consistency_evidence ─┘          ├─ DepthValidation
+             ratios to the sparse references ─ scale, shift, tilt ──────────────────────┘
 
-The map may come from anywhere. Where it is the sensor's own, its returns fix the motions' metre: a wrong scale passes
-through everything that stands on it, and only a given trajectory (``T_world_from_cam``) can tell.
+The map may come from anywhere. The metric scale of the motions is that of the sensor's returns: where the map is the
+sensor's own, a wrong scale is common to the map and to all references, and only a given trajectory
+(``T_world_from_cam``) can detect it.
 """
 
 from __future__ import annotations
@@ -32,35 +33,16 @@ from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.records import NO_HINT, DepthValidation, Estimate, Frame, PoseFit, TrackHint
 from dhtorch.validation import evidence
 from dhtorch.validation.evidence import Evidence, ValidationReferences
+from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOptions
 
-#: The sparse method of a verdict in little time, by one other view (with ``views=False``): a metre is told by some
-#: dozens of points, and their motion by as few. ``experiment=validate_study`` holds what it says against the whole
-#: method.
+#: Sparse method of a fast validation, with one source view and ``views=False``: some dozens of points determine the
+#: scale, and as few their motion. ``experiment=validate_study`` compares it with the whole method.
+#: Source: origin not recorded.
 QUICK_METHOD = MAP.replace(n=256, hypotheses=64, pose={"near_steps": 2, "steps": 3})
-
-#: Sigmas from which on evidence speaks against a pixel, and up to which it speaks for it.
-REFUTING_EVIDENCE_SIGMAS, SUPPORTING_EVIDENCE_SIGMAS = 3.0, 2.0
-
-#: References that count as independent at most: they share tracks' neighbourhoods, lens and sensor.
-MAX_INDEPENDENT_REFERENCES = 60
-
-#: What a sensor's metre, and a trajectory's, are good for.
-SENSOR_SCALE_SIGMA, TRAJECTORY_SCALE_SIGMA = 0.005, 0.02
-
-#: Fewest references of a kind that say something of a frame, and fewest for shift and tilt.
-MIN_SCALE_REFERENCES, MIN_SHAPE_REFERENCES = 8, 24
-
-#: Pixels of a grid that count as one when a share is counted: a window.
-SHARE_WINDOW_PIXELS = 81
-
-#: Least share of a map's pixels that all stand exactly as far as its farthest; the least share of those of which
-#: something is known that are wrong for standing too near, and how many times the share of all others that is: from
-#: there on the map is cut, and what it gives is a bound.
-MIN_PLATEAU_RATIO, MIN_CLIPPED_WRONG_RATIO, CLIPPED_RATE_FACTOR = 0.01, 0.1, 2.0
 
 
 def validate_depth(
-    depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = says nothing; None = the sensor's own
+    depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = no value; None = the sensor's own
     reference: Frame,
     others: Frame | Sequence[Frame] | None = None,
     *,
@@ -70,41 +52,44 @@ def validate_depth(
     source_views: int = 2,
     size: int = 320,
     tolerance: float = 0.025,
+    options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS,
     seed: int | Tensor = 0,
     fit: PoseFit | None = None,
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> DepthValidation:
-    """Whether a depth map is right, by what the sensor and other views of the same scene say.
+    """Depth map, reference view and source views -> state of every pixel and numbers of the frame, with intervals.
 
     Args:
-        depth_map: over the field of the reference view's picture, of any size.
-        reference: B views whose near returns fix the metre.
-        others: as :class:`dhtorch.pipeline.method.Method` takes them; None = there is no other view, and near returns
-            alone speak.
-        other_maps: the same source's maps of the other views; of the sensor they are their own depth.
-        method: the sparse method that gives answers and motions; it chooses among the views.
-        views: ask the pictures of other views as well; False is the fast way, sparse evidence alone.
-        source_views: views at most whose pictures are asked, those worth most.
-        size: longer side of the grid that is judged, px.
-        tolerance: relative error that nobody calls wrong; a third of what must be told is the least that helps.
+        depth_map: over the field of view of the reference view's picture, of any size.
+        reference: B reference views, whose near returns determine the metric scale.
+        others: source views, as :class:`dhtorch.pipeline.method.Method` takes them; None = near returns are the only
+            evidence.
+        other_maps: maps of the source views from the same source as ``depth_map``; for the sensor's own map it is the
+            views' own depth.
+        method: the sparse method that triangulates points and estimates motions; it selects among the views.
+        views: also use the pictures of source views; False is faster, with sparse evidence alone.
+        source_views: most source views whose pictures are used, those with the most information.
+        size: longer side of the validation grid, px.
+        tolerance: relative error that never counts as wrong; at most a third of the error that must be detected.
+        options: tuning constants of evidence, states and numbers.
         seed, fit, hint, trace: as :class:`dhtorch.pipeline.method.Method` takes them.
 
     Returns:
-        Verdict (B, h, w) over the field of the reference view's picture. CONSISTENT only where evidence that would have
-        told an error of a fifth tells none; WRONG where some speaks against the depth by three sigmas; where kinds of
-        evidence contradict each other, or none speaks, CANNOT_KNOW. Where a map is cut (``clip_depth``: all that is
-        farther is said to lie at one depth) the pixels at the cut are WRONG or unknown, since they say no more than
-        that the depth is at least that.
+        DepthValidation (B, h, w) over the field of view of the reference view's picture. CONSISTENT only where evidence
+        that would have detected an error of 20 % finds none; WRONG where some refutes the depth by three sigmas;
+        CANNOT_KNOW where kinds of evidence contradict each other, or there is none. Where a map is clipped
+        (``clip_depth``: all larger depths have that value) the pixels at that depth are WRONG or CANNOT_KNOW, since
+        their depth is only a lower bound.
 
     Raises:
         ValueError: wrong shapes, maps that are no real numbers or have fewer than 2×2 pixels, or an option out of
             range.
 
-    Gradient: none; a verdict.
+    Gradient: none.
     Cost: that of the method, and with ``views`` eleven fits of every grid pixel for each source view.
     """
-    limit = evidence.DETECTABLE_LOG_RATIO / REFUTING_EVIDENCE_SIGMAS
+    limit = options.detectable_log_ratio / options.refuting_evidence_sigmas
     if not 0 < tolerance < limit:
         raise ValueError(f"validate_depth: tolerance is {tolerance}, expected above 0 and below {limit:.3f}")
     if size < 16 or source_views < 1:
@@ -112,24 +97,33 @@ def validate_depth(
     check("validate_depth", image=(reference.image, "B C H W"), depth_map=(depth_map, "B h w"))
     check("validate_depth", depth=(reference.depth, "B y x"), depth_map=(depth_map, "B h w"))
     check("validate_depth", other_maps=(other_maps, "V B h w"))
-    for name, given in (("depth_map", depth_map), ("other_maps", other_maps)):
-        _check_metric(name, given)
+    for name, maps in (("depth_map", depth_map), ("other_maps", other_maps)):
+        _check_map(name, maps)
     trace = {} if trace is None else trace
     with torch.no_grad():
-        asked = (
+        selected_views = (
             None if others is None else _estimate_views(method, reference, others, trace, seed=seed, fit=fit, hint=hint)
         )
-        offered = trace["choice"].index if "choice" in trace else None
-        options: dict[str, Any] = {"views": views, "source_views": source_views, "size": size, "tolerance": tolerance}
-        return validate_against(depth_map, reference, asked, offered, other_maps=other_maps, method=method, **options)
+        view_index = trace["choice"].index if "choice" in trace else None
+        map_args: dict[str, Any] = {"views": views, "source_views": source_views, "size": size, "tolerance": tolerance}
+        return validate_against(
+            depth_map,
+            reference,
+            selected_views,
+            view_index,
+            other_maps=other_maps,
+            method=method,
+            options=options,
+            **map_args,
+        )
 
 
 @torch.no_grad()
 def validate_against(
-    depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = says nothing; None = the sensor's own
+    depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = no value; None = the sensor's own
     reference: Frame,
     asked: dense.SelectedViews | None,
-    offered: Tensor | None = None,  # (views, B) which of those offered were asked; None = all
+    offered: Tensor | None = None,  # (views, B) index of the selected views among those passed; None = all
     *,
     other_maps: Tensor | None = None,  # (V, B, h', w') m
     method: Method = AUTO,
@@ -137,105 +131,119 @@ def validate_against(
     source_views: int = 2,
     size: int = 320,
     tolerance: float = 0.025,
+    options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS,
 ) -> DepthValidation:
-    """The second half of :func:`validate_depth`: what was asked already says of a map; for several maps of one frame.
+    """Depth map and the result of the sparse method -> validation: the second half of :func:`validate_depth`, for
+    several maps of one frame.
 
     Arguments, result, errors and cost as there. Gradient: none.
     """
     hw = dense.map_hw(reference.hw, size)
-    # A depth is held against a depth of the same pixel: without a depth camera of its own no lens stands between them.
-    straight = (
+    # Depths of the same pixel are compared: without a separate depth camera the lens distortion does not matter.
+    undistorted = (
         reference if reference.depth_camera is not None else reference.replace(camera=cam.ideal(reference.camera))
     )
-    returns = method.backproject(straight, dense.map_pixel_centres(reference, hw)).map(lambda x: x.unflatten(1, hw))
-    own = depth_map is None
-    grid = _usable(returns.depth if depth_map is None else _resized(depth_map.to(reference.camera.f), hw))
+    returns = method.backproject(undistorted, dense.map_pixel_centres(reference, hw)).map(lambda x: x.unflatten(1, hw))
+    is_sensor_map = depth_map is None
+    grid = _finite_positive(
+        returns.depth if depth_map is None else _resize_nearest(depth_map.to(reference.camera.f), hw)
+    )
     samples = method.sample_depth(reference) if asked is None else asked.samples
-    joined = Estimate.silent(samples, Gate.NO_TRACK, n_views=0) if asked is None else asked.joined
-    found = evidence.validation_references(samples, joined, near=not own)
-    loose = torch.zeros_like(grid) if depth_map is None else evidence.resolution_sigma(depth_map.to(grid), hw)
-    found = evidence.inflate_sigma(found, loose, reference.hw)
-    allowed = (loose.square() + tolerance**2).sqrt()
-    answers = evidence.sparse_evidence(grid, reference.hw, found, allowed, None if own else returns)
-    kinds = [answers]
+    estimate = Estimate.silent(samples, Gate.NO_TRACK, n_views=0) if asked is None else asked.joined
+    points = evidence.validation_references(samples, estimate, near=not is_sensor_map)
+    resolution = torch.zeros_like(grid) if depth_map is None else evidence.resolution_sigma(depth_map.to(grid), hw)
+    points = evidence.inflate_sigma(points, resolution, reference.hw)
+    allowed_sigma = (resolution.square() + tolerance**2).sqrt()
+    sparse = evidence.sparse_evidence(
+        grid, reference.hw, points, allowed_sigma, None if is_sensor_map else returns, options
+    )
+    kinds = [sparse]
     if asked is not None and views:
         number = offered if offered is not None else torch.arange(len(asked.fits.code))[:, None].expand(-1, len(grid))
-        source = None if own else other_maps
-        of = _ValidatedMap(grid, reference, asked, number.to(grid.device), own)
-        kinds += _view_evidences(of, source, source_views, allowed)
-    none = torch.full((len(grid), 3), torch.nan).to(grid)
-    scale_vs_trajectory = none if asked is None else _scale_vs_trajectory(reference, asked)
-    return _joined(grid, kinds, _of_frame(grid, reference, found, own), scale_vs_trajectory, own)
+        source_maps = None if is_sensor_map else other_maps
+        validated = _ValidatedMap(grid, reference, asked, number.to(grid.device), is_sensor_map)
+        kinds += _view_evidences(validated, source_maps, source_views, allowed_sigma, options)
+    no_scale = torch.full((len(grid), 3), torch.nan).to(grid)
+    scale_vs_trajectory = no_scale if asked is None else _scale_vs_trajectory(reference, asked, options)
+    numbers = _frame_numbers(grid, reference, points, is_sensor_map, options)
+    return _assemble_validation(grid, kinds, numbers, scale_vs_trajectory, is_sensor_map, options)
 
 
 class _ValidatedMap(NamedTuple):
-    """A map on its grid, and the views that may speak of it."""
+    """A map on the validation grid with the selected source views."""
 
     grid: Tensor  # (B, h, w) m
     reference: Frame
-    asked: dense.SelectedViews
-    number: Tensor  # (views, B) of those asked, among those offered
-    own: bool  # the sensor's own map
+    selected: dense.SelectedViews
+    number: Tensor  # (views, B) index of the selected views among those passed
+    is_sensor_map: bool
 
 
 def _estimate_views(
-    method: Method, reference: Frame, others: Frame | Sequence[Frame], trace: Trace, **told: Any
+    method: Method, reference: Frame, others: Frame | Sequence[Frame], trace: Trace, **method_args: Any
 ) -> dense.SelectedViews:
-    """What the method says of the reference view; it chooses where it is offered more than it looks at."""
+    """Result of the sparse method on the reference view, with view selection if there are more than it uses."""
     others = others if isinstance(others, Frame) else pytree.stack(others)
     several = others.image.dim() == 5
     method = with_view_selection(method) if several and len(others.image) > method.views else method
-    joined = method(reference, others, trace=trace, **told)
-    return dense.selected_views(joined, others, trace)
+    estimate = method(reference, others, trace=trace, **method_args)
+    return dense.selected_views(estimate, others, trace)
 
 
 def _view_evidences(
-    of: _ValidatedMap, other_maps: Tensor | None, source_views: int, tolerance: Tensor
+    validated: _ValidatedMap,
+    other_maps: Tensor | None,
+    source_views: int,
+    tolerance: Tensor,
+    options: ValidationOptions,
 ) -> tuple[Evidence, Evidence]:
-    """What pictures and maps of the views say that are worth most; a view's number is its place among those offered."""
-    grid, asked = of.grid, of.asked
-    base = plane_sweep.make_reference_view(*dense.downscale_grey(of.reference, max(grid.shape[-2:])))
-    index, wanted = dense.top_views(asked, source_views)
-    wanted = asked.fits.ok.gather(0, index) & (wanted | _moved(asked).gather(0, index))
-    chosen = [
-        dense.source_view_of(asked, k, max(base.hw), use, base.image) for k, use in zip(index, wanted, strict=True)
+    """Photometric and depth consistency evidence of the most informative views, numbered among the views passed."""
+    grid, selected = validated.grid, validated.selected
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(validated.reference, max(grid.shape[-2:])))
+    index, use_view = dense.top_views(selected, source_views)
+    use_view = selected.fits.ok.gather(0, index) & (use_view | _has_baseline(selected).gather(0, index))
+    source_view_list = [
+        dense.source_view_of(selected, k, max(base.hw), use, base.image) for k, use in zip(index, use_view, strict=True)
     ]
-    pictures = evidence.photometric_evidence(grid, base, chosen, tolerance)
+    pictures = evidence.photometric_evidence(grid, base, source_view_list, tolerance, options)
     batch = torch.arange(len(grid), device=grid.device)
-    number = of.number.gather(0, index)
+    number = validated.number.gather(0, index)
     maps = evidence.no_evidence(grid)
-    if of.own or other_maps is not None:
-        if of.own:
-            depths = [_of_sensor(asked.frames[k, batch], base.hw) for k in index]
+    if validated.is_sensor_map or other_maps is not None:
+        if validated.is_sensor_map:
+            depths = [_sensor_map(selected.frames[k, batch], base.hw) for k in index]
         else:
             assert other_maps is not None
-            depths = [_surfaces(other_maps.to(grid)[n, batch], base.hw) for n in number]
-        maps = evidence.depth_consistency_evidence(grid, base, chosen, [_usable(depth) for depth in depths], tolerance)
-    return _numbered(pictures, number), _numbered(maps, number)
+            depths = [_nearest_surfaces(other_maps.to(grid)[n, batch], base.hw) for n in number]
+        maps = evidence.depth_consistency_evidence(
+            grid, base, source_view_list, [_finite_positive(depth) for depth in depths], tolerance, options
+        )
+    return _renumber_views(pictures, number), _renumber_views(maps, number)
 
 
-def _moved(asked: dense.SelectedViews) -> Tensor:
-    """Whether a view stands significantly elsewhere, (V, B)."""
-    return asked.fits.t_snr > 5
+def _has_baseline(selected: dense.SelectedViews) -> Tensor:
+    """Whether the translation to a view is significant, (V, B)."""
+    return selected.fits.t_snr > 5
 
 
-def _numbered(said: Evidence, number: Tensor) -> Evidence:
-    """Views by their place among those offered."""
+def _renumber_views(kind: Evidence, number: Tensor) -> Evidence:
+    """Evidence with view indices among the views passed, ``number`` (V, B) of the selected ones."""
     batch = torch.arange(number.shape[1], device=number.device)[:, None, None]
-    place = number[said.view.clamp_min(0).long(), batch].to(torch.int32)
-    return said._replace(view=torch.where(said.view >= 0, place, said.view))
+    place = number[kind.view.clamp_min(0).long(), batch].to(torch.int32)
+    return kind._replace(view=torch.where(kind.view >= 0, place, kind.view))
 
 
 # -------------------------------------------------------------------------------------------------- maps on one grid
 
 
-def _usable(depth: Tensor) -> Tensor:
+def _finite_positive(depth: Tensor) -> Tensor:
+    """Depth with 0 where it is not finite or not positive."""
     depth = depth.nan_to_num(0.0, 0.0, 0.0)
     return torch.where(depth > 0, depth, 0.0)
 
 
-def _check_metric(name: str, maps: Tensor | None) -> None:
-    """Refuse what is no map of metres."""
+def _check_map(name: str, maps: Tensor | None) -> None:
+    """ValueError where maps are no real numbers or too small."""
     if maps is None:
         return
     if maps.dtype == torch.bool or maps.is_complex():
@@ -246,7 +254,8 @@ def _check_metric(name: str, maps: Tensor | None) -> None:
         raise ValueError(f"validate_depth: {name} has shape {tuple(maps.shape)}, expected at least 2×2 pixels")
 
 
-def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
+def _resize_nearest(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
+    """Map (…, h, w) resampled to a grid of size ``hw`` by the nearest pixel."""
     rows, columns = (
         evidence.pixel_centres(n, m, depth_map.device).floor().long().clamp_max(n - 1)
         for n, m in zip(depth_map.shape[-2:], hw, strict=True)
@@ -254,50 +263,55 @@ def _resized(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
     return depth_map[..., rows[:, None], columns]
 
 
-def _surfaces(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
-    """What a map shows on a grid: where it is coarser, the nearest of its pixels around, since an outline lies anywhere
+def _nearest_surfaces(depth_map: Tensor, hw: tuple[int, int]) -> Tensor:
+    """Map resampled to a grid; a coarser one by the least depth of the pixels around, since an outline lies anywhere
     between two."""
     if evidence.is_coarser(depth_map, hw):
-        known = _usable(depth_map)
-        depth_map = torch.where(known > 0, evidence.nearest_surface(known), 0.0)
-    return _resized(depth_map, hw)
+        valid_depth = _finite_positive(depth_map)
+        depth_map = torch.where(valid_depth > 0, evidence.nearest_surface(valid_depth), 0.0)
+    return _resize_nearest(depth_map, hw)
 
 
-def _of_sensor(frame: Frame, hw: tuple[int, int]) -> Tensor:
-    """A view's own depth at the pixels of a grid over its picture."""
+def _sensor_map(frame: Frame, hw: tuple[int, int]) -> Tensor:
+    """Sensor depth of a view at the pixels of a grid over its picture."""
     uv = dense.map_pixel_centres(frame, hw).expand(len(frame.camera.f), -1, -1)
-    own = frame.depth.shape[-2], frame.depth.shape[-1]
-    place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, own, uv)
+    depth_hw = frame.depth.shape[-2], frame.depth.shape[-1]
+    place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, depth_hw, uv)
     depth, inside = sample_nearest(frame.depth.to(uv), place)
     return torch.where(inside, depth, 0.0).unflatten(1, hw)
 
 
-# ------------------------------------------------------------------------------------------------------------ verdicts
+# -------------------------------------------------------------------------------------------------------------- states
 
 
-def _joined(
-    grid: Tensor, kinds: Sequence[Evidence], numbers: FrameNumbers, scale_vs_trajectory: Tensor, own: bool
+def _assemble_validation(
+    grid: Tensor,
+    kinds: Sequence[Evidence],
+    numbers: FrameNumbers,
+    scale_vs_trajectory: Tensor,
+    is_sensor_map: bool,
+    options: ValidationOptions,
 ) -> DepthValidation:
-    """What answers say and, where they were asked, pictures and maps of other views."""
-    state, said, view = combine_evidence(*kinds)
-    clip_depth, at_clip_depth = clipped_depth(grid, state, said)
+    """Evidence and numbers of the frame -> DepthValidation; photometric and consistency evidence may be missing."""
+    state, misfit, view = combine_evidence(*kinds, options=options)
+    clip_depth, at_clip_depth = clipped_depth(grid, state, misfit, options)
     state = torch.where(at_clip_depth & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
-    answers, pictures, maps = list(kinds) + [evidence.no_evidence(grid)] * (3 - len(kinds))
-    none = torch.full_like(scale_vs_trajectory, torch.nan)
+    sparse, photometric, consistency = list(kinds) + [evidence.no_evidence(grid)] * (3 - len(kinds))
+    no_scale = torch.full_like(scale_vs_trajectory, torch.nan)
     n_wrong, n_known = (
-        (m.sum((1, 2)) / SHARE_WINDOW_PIXELS) for m in (state == State.WRONG, state != State.CANNOT_KNOW)
+        (m.sum((1, 2)) / options.share_window_pixels) for m in (state == State.WRONG, state != State.CANNOT_KNOW)
     )
     return DepthValidation(
         depth=grid,
         state=state,
-        evidence=said,
+        evidence=misfit,
         view=view,
-        sparse_evidence=answers.misfit,
-        photometric_evidence=pictures.misfit,
-        consistency_evidence=maps.misfit,
-        scale=scale_vs_trajectory if own else numbers.scale,
+        sparse_evidence=sparse.misfit,
+        photometric_evidence=photometric.misfit,
+        consistency_evidence=consistency.misfit,
+        scale=scale_vs_trajectory if is_sensor_map else numbers.scale,
         scale_near=numbers.near,
-        scale_far=none if own else numbers.far,
+        scale_far=no_scale if is_sensor_map else numbers.far,
         scale_vs_trajectory=scale_vs_trajectory,
         shift=numbers.shift,
         tilt=numbers.tilt,
@@ -306,53 +320,59 @@ def _joined(
     )
 
 
-def clipped_depth(grid: Tensor, state: Tensor, said: Tensor) -> tuple[Tensor, Tensor]:
-    """Depth (B,) at which a map is cut, NaN where it is not, and the pixels (B, h, w) that stand there.
+def clipped_depth(
+    grid: Tensor, state: Tensor, said: Tensor, options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS
+) -> tuple[Tensor, Tensor]:
+    """Map, states and misfits -> depth (B,) at which the map is clipped, NaN where it is not, and the pixels (B, h, w)
+    at that depth.
 
-    A surface that is said to stand exactly as far as the farthest of a map may be a wall in front of the camera: it is
-    a cut where evidence tells that much of it stands too near. Windows that straddle its outline show what is before
-    it, and answers at the outline lie on a "surface" that the cut has made of two: both speak for pixels that are off.
+    A plateau at the largest depth of a map may be a wall in front of the camera: it is a clip depth where evidence
+    shows that much of it is too near. Correlation windows across its outline show the foreground, and sparse references
+    at the outline lie on a "surface" that clipping has merged from two: both support pixels that are wrong.
 
     Gradient: none.
     """
     farthest = grid.amax((1, 2))
-    there = (grid > 0) & (grid >= farthest[:, None, None])
+    at_plateau = (grid > 0) & (grid >= farthest[:, None, None])
     n = (grid > 0).sum((1, 2)).clamp_min(1)
-    near, known = (state == State.WRONG) & (said < 0), state != State.CANNOT_KNOW
-    here, elsewhere = (
-        (near & m).sum((1, 2)) / (known & m).sum((1, 2)).clamp_min(1) for m in (there, (grid > 0) & ~there)
+    too_near, decided = (state == State.WRONG) & (said < 0), state != State.CANNOT_KNOW
+    rate, other_rate = (
+        (too_near & m).sum((1, 2)) / (decided & m).sum((1, 2)).clamp_min(1)
+        for m in (at_plateau, (grid > 0) & ~at_plateau)
     )
-    ends = (
-        (there.sum((1, 2)) >= MIN_PLATEAU_RATIO * n)
-        & (here >= MIN_CLIPPED_WRONG_RATIO)
-        & (here > CLIPPED_RATE_FACTOR * elsewhere)
+    is_clipped = (
+        (at_plateau.sum((1, 2)) >= options.min_plateau_ratio * n)
+        & (rate >= options.min_clipped_wrong_ratio)
+        & (rate > options.clipped_rate_factor * other_rate)
     )
-    return torch.where(ends, farthest, torch.nan), there & ends[:, None, None]
+    return torch.where(is_clipped, farthest, torch.nan), at_plateau & is_clipped[:, None, None]
 
 
-def combine_evidence(*kinds: Evidence) -> tuple[Tensor, Tensor, Tensor]:
-    """State, evidence and view (B, h, w) of what all kinds of evidence say: answers, pictures, maps.
+def combine_evidence(
+    *kinds: Evidence, options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Sparse, photometric and consistency evidence -> state, misfit and view (B, h, w).
 
-    What speaks against a pixel counts unless another kind, that would have told, speaks for it. Gradient: none.
+    A pixel is wrong where one kind refutes it, unless another kind supports it. Gradient: none.
     """
-    against = torch.stack([k.misfit.abs() > REFUTING_EVIDENCE_SIGMAS for k in kinds])
-    speaks_for = torch.stack([k.sure & (k.misfit.abs() < SUPPORTING_EVIDENCE_SIGMAS) for k in kinds])
-    wrong, fine = against.any(0), speaks_for.any(0)
-    state = torch.where(wrong, State.WRONG, torch.where(fine, State.CONSISTENT, State.CANNOT_KNOW))
-    state = torch.where(wrong & fine, State.CANNOT_KNOW, state).to(torch.int32)
+    refuting = torch.stack([k.misfit.abs() > options.refuting_evidence_sigmas for k in kinds])
+    supporting = torch.stack([k.sure & (k.misfit.abs() < options.supporting_evidence_sigmas) for k in kinds])
+    wrong, consistent = refuting.any(0), supporting.any(0)
+    state = torch.where(wrong, State.WRONG, torch.where(consistent, State.CONSISTENT, State.CANNOT_KNOW))
+    state = torch.where(wrong & consistent, State.CANNOT_KNOW, state).to(torch.int32)
     misfit = torch.stack([k.misfit for k in kinds])
     size = misfit.abs().nan_to_num(-1.0)
-    most = torch.where(against, size, -1.0).argmax(0)
-    least = torch.where(speaks_for, size, torch.inf).argmin(0)
-    any_said = size.argmax(0)
-    pick = torch.where(wrong, most, torch.where(fine, least, any_said))[None]
+    most = torch.where(refuting, size, -1.0).argmax(0)
+    least = torch.where(supporting, size, torch.inf).argmin(0)
+    largest = size.argmax(0)
+    pick = torch.where(wrong, most, torch.where(consistent, least, largest))[None]
     view = torch.stack([k.view for k in kinds]).gather(0, pick)[0]
-    said = misfit.gather(0, pick)[0]
-    return state, said, torch.where(said.isnan(), -2, view).to(torch.int32)
+    picked = misfit.gather(0, pick)[0]
+    return state, picked, torch.where(picked.isnan(), -2, view).to(torch.int32)
 
 
 def share_interval(part: Tensor, whole: Tensor) -> Tensor:
-    """Share (B, 3) of counts (B,) with its interval of 95 %; NaN of none. Gradient: none.
+    """Counts (B,) of a part and of the whole -> ratio (B, 3) with its interval of 95 %; NaN of none. Gradient: none.
 
     Source: E. B. Wilson, "Probable inference, the law of succession, and statistical inference", 1927.
     """
@@ -365,7 +385,7 @@ def share_interval(part: Tensor, whole: Tensor) -> Tensor:
 
 
 class FrameNumbers(NamedTuple):
-    """What is said of a frame as a whole, (B, 3) each: value, low, high."""
+    """Numbers of a frame as a whole, (B, 3) each: value, low, high."""
 
     scale: Tensor
     near: Tensor
@@ -374,46 +394,53 @@ class FrameNumbers(NamedTuple):
     tilt: Tensor
 
 
-def _of_frame(grid: Tensor, reference: Frame, found: ValidationReferences, own: bool) -> FrameNumbers:
+def _frame_numbers(
+    grid: Tensor, reference: Frame, points: ValidationReferences, is_sensor_map: bool, options: ValidationOptions
+) -> FrameNumbers:
+    """Map and sparse references -> scale, shift and tilt with intervals."""
     h, w = grid.shape[-2:]
-    at, inside = sample_nearest(grid, cam.resize_pixels(found.uv, reference.hw, (h, w)))
-    used = found.used & inside & (at > 0)
-    ratio = torch.where(used, at / found.depth, 1.0)
+    depth_at, inside = sample_nearest(grid, cam.resize_pixels(points.uv, reference.hw, (h, w)))
+    used = points.used & inside & (depth_at > 0)
+    ratio = torch.where(used, depth_at / points.depth, 1.0)
     log = ratio.log()
-    own_sigma = (found.sigma.square() - found.shared.square()).clamp_min(1e-6).sqrt()
+    own_sigma = (points.sigma.square() - points.shared.square()).clamp_min(1e-6).sqrt()
     kinds = []
-    for kind, metre in ((found.near, SENSOR_SCALE_SIGMA), (~found.near, 0.0)):
-        common = masked_median(found.shared, used & kind)[:, 0].nan_to_num()
-        kinds.append(_location(log, own_sigma, used & kind, (common.square() + metre**2).sqrt()))
+    for mask, scale_sigma in ((points.near, options.sensor_scale_sigma), (~points.near, 0.0)):
+        shared = masked_median(points.shared, used & mask)[:, 0].nan_to_num()
+        common = (shared.square() + scale_sigma**2).sqrt()
+        kinds.append(_robust_mean(log, own_sigma, used & mask, common, options))
     near, far = kinds
-    both = _weighed(near, far)
-    if own:
+    both = _inverse_variance_mean(near, far)
+    if is_sensor_map:
         near = both = (torch.full_like(near[0], torch.nan), near[1])
-    shift, tilt = _shape(ratio, found, used, own_sigma, reference.hw)
-    return FrameNumbers(_as_factor(*both), _as_factor(*near), _as_factor(*far), shift, tilt)
+    shift, tilt = _shift_and_tilt(ratio, points, used, own_sigma, reference.hw, options)
+    return FrameNumbers(_factor_interval(*both), _factor_interval(*near), _factor_interval(*far), shift, tilt)
 
 
-def _location(x: Tensor, sigma: Tensor, used: Tensor, common: Tensor) -> tuple[Tensor, Tensor]:
-    """Robust mean (B,) of x (B, N) and its standard deviation, the common part included; NaN of too few."""
-    at = masked_median(x, used)
-    spread = 1.483 * masked_median((x - at).abs(), used)
+def _robust_mean(
+    x: Tensor, sigma: Tensor, used: Tensor, common: Tensor, options: ValidationOptions
+) -> tuple[Tensor, Tensor]:
+    """Robust mean (B,) of x (B, N) by Tukey's biweight, and its standard deviation, which includes the ``common`` (B,)
+    one; NaN of too few."""
+    mean = masked_median(x, used)
+    spread = 1.483 * masked_median((x - mean).abs(), used)
     n = used.sum(-1)
     for _ in range(5):
         width = (sigma.square() + spread.square()).sqrt().clamp_min(1e-4)
-        t = (x - at) / (3.0 * width)
+        t = (x - mean) / (3.0 * width)
         weight = torch.where(used & (t.abs() < 1), (1 - t.square()).square() / width.square(), 0.0)
-        at = ((weight * x).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp_min(1e-12)).where(
-            weight.sum(-1, keepdim=True) > 0, at
+        mean = ((weight * x).sum(-1, keepdim=True) / weight.sum(-1, keepdim=True).clamp_min(1e-12)).where(
+            weight.sum(-1, keepdim=True) > 0, mean
         )
-    effective = n.clamp(1, MAX_INDEPENDENT_REFERENCES).to(x)
-    own = (spread[:, 0].square() + masked_median(sigma, used)[:, 0].square()).sqrt() / effective.sqrt()
-    sd = (own.square() * 1.5 + common.square()).sqrt()
-    few = n < MIN_SCALE_REFERENCES
-    return torch.where(few, torch.nan, at[:, 0]), torch.where(few, torch.inf, sd)
+    effective = n.clamp(1, options.max_independent_references).to(x)
+    own_sd = (spread[:, 0].square() + masked_median(sigma, used)[:, 0].square()).sqrt() / effective.sqrt()
+    sd = (own_sd.square() * 1.5 + common.square()).sqrt()
+    too_few = n < options.min_scale_references
+    return torch.where(too_few, torch.nan, mean[:, 0]), torch.where(too_few, torch.inf, sd)
 
 
-def _weighed(*parts: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Mean of what is defined, by inverse variance; the interval widens where the parts contradict each other."""
+def _inverse_variance_mean(*parts: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Inverse variance mean (B,) of the defined parts, and its standard deviation, larger where the parts disagree."""
     value = torch.stack([v for v, _ in parts])
     weight = torch.stack([torch.where(v.isfinite(), 1 / s.square().clamp_min(1e-12), 0.0) for v, s in parts])
     total = weight.sum(0)
@@ -423,24 +450,29 @@ def _weighed(*parts: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     return torch.where(total > 0, mean, torch.nan), sd
 
 
-def _as_factor(log: Tensor, sd: Tensor) -> Tensor:
-    """(B, 3): value and interval of 95 % of a factor whose logarithm is known."""
+def _factor_interval(log: Tensor, sd: Tensor) -> Tensor:
+    """Logarithm of a factor and its standard deviation -> the factor (B, 3) with its interval of 95 %."""
     return torch.stack([log, log - 1.96 * sd, log + 1.96 * sd], -1).exp().where(log.isfinite()[:, None], torch.nan)
 
 
-def _shape(
-    ratio: Tensor, found: ValidationReferences, used: Tensor, sigma: Tensor, hw: tuple[int, int]
+def _shift_and_tilt(
+    ratio: Tensor,
+    points: ValidationReferences,
+    used: Tensor,
+    sigma: Tensor,
+    hw: tuple[int, int],
+    options: ValidationOptions,
 ) -> tuple[Tensor, Tensor]:
     """Shift in m and tilt, (B, 3) each, of map / reference = scale + shift / reference + tilt · place."""
     size = torch.tensor([hw[1], hw[0]]).to(ratio)
-    place = (found.uv + 0.5) / size - 0.5
-    inverse = torch.where(used, 1 / found.depth, 0.0)
+    place = (points.uv + 0.5) / size - 0.5
+    inverse = torch.where(used, 1 / points.depth, 0.0)
     X = torch.cat([torch.ones_like(inverse)[..., None], inverse[..., None], place], -1).double()
     y = ratio.double()
-    at = masked_median(ratio, used).double()
-    spread = 1.483 * masked_median((ratio - at.to(ratio)).abs(), used).double()
+    median = masked_median(ratio, used).double()
+    spread = 1.483 * masked_median((ratio - median.to(ratio)).abs(), used).double()
     width = (sigma.double().square() + spread.square()).sqrt().clamp_min(1e-4)
-    residual = y - at
+    residual = y - median
     eye = 1e-9 * torch.eye(4).to(X)
     for _ in range(6):
         t = residual / (3.0 * width)
@@ -449,35 +481,36 @@ def _shape(
         beta = torch.linalg.solve(normal, ((X * weight[..., None]).mT @ y[..., None]))[..., 0]
         residual = y - (X @ beta[..., None])[..., 0]
     n = used.sum(-1).clamp_min(1)
-    inflation = (n / n.clamp_max(MAX_INDEPENDENT_REFERENCES)).double()[:, None, None]
+    inflation = (n / n.clamp_max(options.max_independent_references)).double()[:, None, None]
     cov = torch.linalg.inv(normal) * inflation * 1.5
-    few = (n < MIN_SHAPE_REFERENCES)[:, None]
+    too_few = (n < options.min_shape_references)[:, None]
     sd = cov.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     shift = torch.stack([beta[:, 1], beta[:, 1] - 1.96 * sd[:, 1], beta[:, 1] + 1.96 * sd[:, 1]], -1)
     gradient = beta[:, 2:]
-    size_of = gradient.norm(dim=-1)
-    along = gradient / size_of.clamp_min(1e-12)[:, None]
-    sd_tilt = ((along[:, None] @ cov[:, 2:, 2:] @ along[..., None])[:, 0, 0]).clamp_min(0).sqrt()
-    tilt = torch.stack([size_of, (size_of - 1.96 * sd_tilt).clamp_min(0), size_of + 1.96 * sd_tilt], -1)
-    return tuple(torch.where(few, torch.nan, x.to(ratio)) for x in (shift, tilt))  # type: ignore[return-value]
+    magnitude = gradient.norm(dim=-1)
+    direction = gradient / magnitude.clamp_min(1e-12)[:, None]
+    sd_tilt = ((direction[:, None] @ cov[:, 2:, 2:] @ direction[..., None])[:, 0, 0]).clamp_min(0).sqrt()
+    tilt = torch.stack([magnitude, (magnitude - 1.96 * sd_tilt).clamp_min(0), magnitude + 1.96 * sd_tilt], -1)
+    return tuple(torch.where(too_few, torch.nan, x.to(ratio)) for x in (shift, tilt))  # type: ignore[return-value]
 
 
-def _scale_vs_trajectory(reference: Frame, asked: dense.SelectedViews) -> Tensor:
-    """The sensor's metre over the trajectory's, (B, 3), by the ways between the views; NaN without a trajectory."""
-    none = torch.full((len(reference.camera.f), 3), torch.nan).to(reference.camera.f)
-    if reference.T_world_from_cam is None or asked.frames.T_world_from_cam is None:
-        return none
-    V = len(asked.fits.t_snr)
-    here = reference.T_world_from_cam.map(lambda x: x.expand(V, *x.shape))
-    way = torch.stack([se3.relative(here[k], asked.frames.T_world_from_cam[k]).t.norm(dim=-1) for k in range(V)]).to(
-        none
-    )
-    length = asked.fits.T_1_from_0.t.norm(dim=-1)
-    used = asked.fits.ok & (asked.fits.t_snr > 10) & (way > 0.01) & length.isfinite()
-    log = torch.where(used, length / way.clamp_min(1e-6), 1.0).clamp_min(1e-6).log().T
+def _scale_vs_trajectory(reference: Frame, selected: dense.SelectedViews, options: ValidationOptions) -> Tensor:
+    """Ratio (B, 3) of the sensor's metric scale to the trajectory's, by the baselines of the views; NaN
+    without a trajectory."""
+    no_scale = torch.full((len(reference.camera.f), 3), torch.nan).to(reference.camera.f)
+    if reference.T_world_from_cam is None or selected.frames.T_world_from_cam is None:
+        return no_scale
+    V = len(selected.fits.t_snr)
+    T_world_from_reference = reference.T_world_from_cam.map(lambda x: x.expand(V, *x.shape))
+    given_baseline = torch.stack(
+        [se3.relative(T_world_from_reference[k], selected.frames.T_world_from_cam[k]).t.norm(dim=-1) for k in range(V)]
+    ).to(no_scale)
+    baseline = selected.fits.T_1_from_0.t.norm(dim=-1)
+    used = selected.fits.ok & (selected.fits.t_snr > 10) & (given_baseline > 0.01) & baseline.isfinite()
+    log = torch.where(used, baseline / given_baseline.clamp_min(1e-6), 1.0).clamp_min(1e-6).log().T
     n = used.sum(0)
-    at = masked_median(log, used.T)
-    spread = 1.483 * masked_median((log - at).abs(), used.T)[:, 0].where(n > 2, 0.0)
-    noise = masked_median(1 / asked.fits.t_snr.clamp_min(1).T, used.T)[:, 0].where(n > 0, 1.0)
-    sd = (spread.square() + noise.square() + TRAJECTORY_SCALE_SIGMA**2).sqrt()
-    return _as_factor(torch.where(n > 0, at[:, 0], torch.nan), sd)
+    median = masked_median(log, used.T)
+    spread = 1.483 * masked_median((log - median).abs(), used.T)[:, 0].where(n > 2, 0.0)
+    noise = masked_median(1 / selected.fits.t_snr.clamp_min(1).T, used.T)[:, 0].where(n > 0, 1.0)
+    sd = (spread.square() + noise.square() + options.trajectory_scale_sigma**2).sqrt()
+    return _factor_interval(torch.where(n > 0, median[:, 0], torch.nan), sd)

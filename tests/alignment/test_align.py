@@ -6,6 +6,7 @@ import torch
 from dhtorch import align_depth
 from dhtorch.alignment import align, error_model
 from dhtorch.alignment.error_model import estimate_freedom
+from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS, AlignmentOptions
 from dhtorch.alignment.references import MetricReferences, collect_references
 from dhtorch.codes import Gate, Source
 from dhtorch.experiments.baselines import scale_shift
@@ -103,7 +104,7 @@ def test_a_shift_makes_no_sense_of_maps_without_a_metre():
         trace = {}
         align_depth(truth, [near, far], kind=kind, trace=trace)
         assert not any(name.startswith(("raw", "shift")) for name in trace["chosen"].names)
-    assert any(name.startswith("scale") for name in align._OF_KIND["scale"])
+    assert any(name.startswith("scale") for name in align._MODELS_OF_KIND["scale"])
 
 
 @pytest.mark.parametrize("kind", ["scale", "affine", "inverse", "ordinal"])
@@ -338,7 +339,9 @@ def test_fits_start_from_what_most_anchors_say():
     points = near_points(200)
     y = 2 * points.x + 1
     wrong = torch.arange(200)[None] % 10 < 3
-    none, scale, shift, line = align._initial_heads(points.x, torch.where(wrong, 5 * y, y), points)[0]
+    none, scale, shift, line = align._initial_heads(
+        points.x, torch.where(wrong, 5 * y, y), points, DEFAULT_ALIGNMENT_OPTIONS
+    )[0]
     assert none.tolist() == [1, 0] and scale[1] == 0 and shift[0] == 1
     torch.testing.assert_close(line, torch.tensor([2.0, 1.0]).double(), rtol=0.03, atol=0.03)
 
@@ -346,7 +349,7 @@ def test_fits_start_from_what_most_anchors_say():
 def test_anchors_that_are_left_out_are_not_fitted(monkeypatch):
     points = near_points(150)
     values = torch.linspace(1, 4, 48, dtype=torch.float64).view(1, 6, 8)
-    task = align._task(values, values > 0, points, of_depth=True)
+    task = align._alignment_problem(values, values > 0, points, DEFAULT_ALIGNMENT_OPTIONS, of_depth=True)
     seen = []
     fit = error_model.fit_models
     monkeypatch.setattr(
@@ -363,11 +366,13 @@ def test_few_anchors_that_were_left_out_move_sigma_little():
     for n in (8, 4000):
         points = near_points(n)
         r = 6 * 0.01 * torch.randn(1, 1, 1, n, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        left = align._LeftOut(r, torch.full_like(r, 1e-4))
-        sixfold.append(float(align._sigma_scale(points, left, torch.zeros(1, 1, dtype=torch.int64))))
+        left = align._HeldOut(r, torch.full_like(r, 1e-4))
+        sixfold.append(
+            float(align._sigma_scale(points, left, torch.zeros(1, 1, dtype=torch.int64), DEFAULT_ALIGNMENT_OPTIONS))
+        )
     few, many = sixfold
     assert 1 < few < 0.6 * many, sixfold
-    assert many == pytest.approx(min(6, align.SIGMA_SCALE_RANGE[1]), rel=0.05)
+    assert many == pytest.approx(min(6, DEFAULT_ALIGNMENT_OPTIONS.sigma_scale_range[1]), rel=0.05)
 
 
 def test_a_rising_line_through_what_rises_is_what_it_goes_through():
@@ -389,3 +394,20 @@ def test_a_pixel_that_is_not_sure_enough_is_silent():
     found = align_depth(x, [near, far], max_sigma_rel=limit)
     assert torch.equal(found.gate == Gate.UNCERTAIN, rel > limit) and 0.3 < (rel > limit).double().mean() < 0.7
     assert ((found.gate == Gate.UNCERTAIN) | found.keep).all() and found.depth[~found.keep].isnan().all()
+
+
+def test_options_change_what_they_name():
+    """One option of each stage: the references, the fits, the selection and the noise."""
+    truth, near, far = world()
+    x, _ = depth_faults.apply_fault("simulated", truth)
+    plain = align_depth(x, [near, far])
+    for changed in (
+        AlignmentOptions(min_return_error=0.05),
+        AlignmentOptions(field_lengths=(0.5, 0.2)),
+        AlignmentOptions(max_models=1),
+        AlignmentOptions(roughness_window=0.2),
+    ):
+        assert not torch.equal(align_depth(x, [near, far], options=changed).sigma, plain.sigma), changed
+    many = AlignmentOptions(min_references=10_000)
+    assert (align_depth(x, [near, far], options=many).gate == Gate.NO_POSE).all()
+    assert torch.equal(align_depth(x, [near, far], options=AlignmentOptions()).sigma, plain.sigma)

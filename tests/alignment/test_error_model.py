@@ -5,6 +5,7 @@ import torch
 
 from dhtorch.alignment import align, error_model
 from dhtorch.alignment.error_model import ERROR_MODELS, MODEL_HEADS, AlignmentProblem, ErrorModelFit
+from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS
 from dhtorch.alignment.references import MetricReferences
 
 HW = (6, 8)
@@ -27,7 +28,7 @@ def basis(of_depth=True):
 def test_a_head_gives_depth_or_its_inverse(of_depth):
     x, head = torch.tensor([0.5, 2.0, -9.0]).double(), torch.tensor([2.0, 1.0], dtype=torch.float64)
     log, slope = error_model.predict_log_depth(head, x, basis(of_depth))
-    y = torch.tensor([2.0, 5.0, error_model.MIN_HEAD]).double()
+    y = torch.tensor([2.0, 5.0, DEFAULT_ALIGNMENT_OPTIONS.min_head]).double()
     torch.testing.assert_close(log, y.log() * (1 if of_depth else -1))
     by_hand = torch.func.jacrev(lambda h: error_model.predict_log_depth(h, x, basis(of_depth))[0])(head)
     torch.testing.assert_close(slope[:2], by_hand[:2])
@@ -53,7 +54,7 @@ def test_short_fields_are_those_of_near_neighbours():
 
 
 def test_freedom_is_less_likely_than_none():
-    prior = {name: model.prior for name, model in ERROR_MODELS.items()}
+    prior = {name: model.prior() for name, model in ERROR_MODELS.items()}
     assert prior["shift"] == prior["scale"] and prior["shift_tilt"] == prior["scale_tilt"] == prior["affine"]
     assert prior["raw"] == 0 > prior["scale"] > prior["affine"] > prior["affine_tilt"] > prior["affine_long_4"]
     assert prior["raw"] > prior["raw_tilt"]
@@ -151,15 +152,15 @@ def worth_of_a_scale(scale):
         references, basis(), torch.tensor([[[1.0, 0.0]]]).double().expand(1, len(MODEL_HEADS), 2), references.x[:, :1]
     )
     model = torch.tensor([[list(ERROR_MODELS).index("scale")]])
-    found = error_model.fit_models(task, model, references.used, error_model.FINAL_STEPS)
+    found = error_model.fit_models(task, model, references.used, DEFAULT_ALIGNMENT_OPTIONS.final_steps)
     problem = error_model._problem(task, model, references.used)
-    spread = problem.square(found.noise[0]).sqrt()
+    spread = problem.noise_variance(found.noise[0]).sqrt()
     tails = torch.distributions.StudentT(problem.freedom)
     xi = torch.zeros(1, problem.phi.shape[-1] + 2, dtype=torch.float64)
     at, told = torch.linspace(-0.5, 4.0, 2001, dtype=torch.float64), []
     for x in at:
         xi[0, 0] = x
-        r, _ = problem.missed(xi)
+        r, _ = problem.residuals(xi)
         each = tails.log_prob(r / spread) - tails.log_prob(torch.zeros_like(r)) - spread.log()
         told.append((problem.weight * each).sum() - 0.5 * x.square())
     whole = torch.stack(told).logsumexp(0) + (at[1] - at[0]).log() - 0.5 * torch.log(torch.tensor(2 * torch.pi))

@@ -3,8 +3,9 @@
 import pytest
 import torch
 
-from dhtorch.alignment.align import _LeftOut, _simplest
+from dhtorch.alignment.align import _HeldOut, _one_standard_error_choice
 from dhtorch.alignment.error_model import MODEL_HEADS
+from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS
 from dhtorch.alignment.references import ERROR_BLOCKS, MetricReferences
 
 RAW, SCALE, SHIFT, AFFINE, DRIFT = range(5)
@@ -25,6 +26,13 @@ def points():
     )
 
 
+def choice(points, r):
+    """Index of the selected model under residuals (1, C, 1, N) of left-out references."""
+    held_out = _HeldOut(r, torch.full_like(r, 1e-4))
+    heads, head = list(MODEL_HEADS), torch.tensor([AFFINE])
+    return _one_standard_error_choice(points, held_out, heads, head, DEFAULT_ALIGNMENT_OPTIONS)
+
+
 def taken(points, near, far, seed=0):
     """The model that is taken where left-out references are missed by so much, of each model the near and the far ones;
     None = it could not be fitted."""
@@ -32,7 +40,7 @@ def taken(points, near, far, seed=0):
     noise = torch.randn(points.x.shape[1], generator=draw, dtype=torch.float64)  # a reference's own, to all models
     size = [torch.where(points.near[0], a or torch.nan, b or torch.nan) for a, b in zip(near, far, strict=True)]
     r = (torch.stack(size) * noise)[None, :, None]
-    return int(_simplest(points, _LeftOut(r, torch.full_like(r, 1e-4)), list(MODEL_HEADS), torch.tensor([AFFINE])))
+    return int(choice(points, r))
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -78,8 +86,7 @@ def test_a_shift_that_near_returns_meet_exactly_is_not_refuted_by_one_standard_e
             far = torch.tensor([0.020, 0.020, 0.1, 0.023, 0.1])[:, None] * noise
             near = torch.tensor([0.1, 0.1, 0.1, met, 0.1])[:, None] * noise[:1]
             r = torch.where(points.near, near, far)[None, :, None]
-            place = _simplest(points, _LeftOut(r, torch.full_like(r, 1e-4)), list(MODEL_HEADS), torch.tensor([AFFINE]))
-            kept[met] += int(place) == AFFINE
+            kept[met] += int(choice(points, r)) == AFFINE
     assert kept[0.0005] > kept[0.01] + 5
 
 

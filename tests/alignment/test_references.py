@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from dhtorch.alignment import references
+from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS
 from dhtorch.codes import Gate, Source
 from dhtorch.records import DepthMap, Estimate, Samples
 
@@ -38,10 +39,10 @@ def test_samples_and_answers_stand_on_the_pixels_of_the_map():
     torch.testing.assert_close(found.share[0, 1], torch.tensor([79.5 / 80, 39.5 / 40], dtype=torch.float64))
     assert found.x[0].tolist() == [0, 19 * 40 + 39, 10 * 40 + 20, 1 * 40 + 1]
     assert found.near[0].tolist() == [True, True, True, False] and found.used.all()
-    own, beside = references.MIN_RETURN_ERROR**2, references.FAR_OWN_ERROR**2
+    own, beside = DEFAULT_ALIGNMENT_OPTIONS.min_return_error**2, DEFAULT_ALIGNMENT_OPTIONS.far_own_error**2
     variance = [0.005**2 + own] * 3 + [0.05**2 - 0.025**2 + own + beside]
     torch.testing.assert_close(found.var[0], torch.tensor(variance, dtype=torch.float64), rtol=1e-5, atol=0)
-    together = [0.0] * 3 + [math.hypot(0.025, references.FAR_SHARED_ERROR)]
+    together = [0.0] * 3 + [math.hypot(0.025, DEFAULT_ALIGNMENT_OPTIONS.far_shared_error)]
     torch.testing.assert_close(found.shared[0], torch.tensor(together, dtype=torch.float64), rtol=1e-5, atol=0)
 
 
@@ -62,14 +63,14 @@ def test_a_map_s_pixels_are_anchors_and_half_of_what_its_far_ones_do_not_know_is
     assert found.x[0].tolist() == list(range(8)) and found.near[0].tolist() == [True] * 4 + [False] * 4
     assert found.share[0, 5].tolist() == [1.5 / 4, 1.5 / 2]
     assert float(found.shared[0, 7]) == pytest.approx(
-        math.hypot(0.1 * references.MAP_SHARED_RATIO**0.5, references.FAR_SHARED_ERROR)
+        math.hypot(0.1 * DEFAULT_ALIGNMENT_OPTIONS.map_shared_ratio**0.5, DEFAULT_ALIGNMENT_OPTIONS.far_shared_error)
     )
 
 
 def test_of_many_some_are_used_from_all_over():
     uv = torch.stack(torch.meshgrid(torch.arange(80), torch.arange(40), indexing="xy"), -1).flatten(0, 1)
     found = references.collect_references(torch.ones(1, *HW).double(), [near(uv, 2.0)], HW)
-    assert found.x.shape == (1, references.MAX_REFERENCES_PER_SOURCE)
+    assert found.x.shape == (1, DEFAULT_ALIGNMENT_OPTIONS.max_references_per_source)
     assert float(found.share[0, 0, 1]) < 0.05 and float(found.share[0, -1, 1]) > 0.95
 
 
@@ -77,7 +78,7 @@ def test_anchors_of_one_block_count_as_fewer_and_near_and_far_ones_are_two():
     points = [near([[0, 0], [1, 1], [60, 30]], 2.0), far([[2, 2]], 4.0, 0.2, 0.1)]
     found = references.collect_references(torch.ones(1, *HW).double(), points, HW)
     assert found.block[0].tolist() == [1, 1, 2 * (4 * 8 + 6) + 1, 0]
-    together = 1 / (1 + references.BLOCK_CORRELATION)
+    together = 1 / (1 + DEFAULT_ALIGNMENT_OPTIONS.block_correlation)
     torch.testing.assert_close(found.weight(found.used)[0], torch.tensor([together, together, 1, 1]).double())
     alone = found.used & torch.tensor([[True, False, True, False]])
     assert found.weight(alone)[0].tolist() == [1, 0, 1, 0]

@@ -3,18 +3,17 @@
 import pytest
 import torch
 
-from dhtorch.alignment.error_model import FIELD_LENGTHS
-from dhtorch.alignment.references import MIN_RETURN_ERROR, MetricReferences, local_spread, sample_at_references
+from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS, AlignmentOptions
+from dhtorch.alignment.references import MetricReferences, local_spread, sample_at_references
 from dhtorch.alignment.residual_noise import (
-    DEFAULT_RESIDUAL,
-    MAP_CORRELATION_LENGTH,
-    _edge_noise,
+    _edge_gain,
+    _local_deviation,
     _local_variance,
-    _standing_out,
     residual_variance,
 )
 
 HW = (60, 80)
+OPTIONS = DEFAULT_ALIGNMENT_OPTIONS
 
 
 def seen(log, truth, n=500, seed=0, noise=0.0, stated=0.0):
@@ -28,7 +27,7 @@ def seen(log, truth, n=500, seed=0, noise=0.0, stated=0.0):
     r = r + noise * torch.randn(r.shape, generator=g, dtype=torch.float64)
     one = torch.ones_like(r)
     points = MetricReferences(
-        share, one, 0 * one, one, (stated**2 + MIN_RETURN_ERROR**2) * one, 0 * one, one > 0, one > 0
+        share, one, 0 * one, one, (stated**2 + OPTIONS.min_return_error**2) * one, 0 * one, one > 0, one > 0
     )
     return points, r, (sample_at_references(local_spread(log), share)[0].square(), 0 * one)
 
@@ -104,8 +103,9 @@ def test_chance_is_no_error_of_a_map():
     assert sum(found) / len(found) < 0.0009 and sum(level < 0.00055 for level in found) >= 9
 
 
-def test_slow_errors_are_as_smooth_as_the_shortest_field():
-    assert min(FIELD_LENGTHS) == MAP_CORRELATION_LENGTH
+def test_smooth_errors_have_the_length_of_the_shorter_field():
+    assert OPTIONS.map_correlation_length == 0.13
+    assert AlignmentOptions(field_lengths=(0.4, 0.2)).map_correlation_length == 0.2
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -143,8 +143,8 @@ def test_less_than_returns_state_is_the_maps_where_it_goes_with_its_edges(goes_w
         points, *_ = seen(wall(), wall(), n=300, seed=seed)
         r = goes_with * stands + (1 - abs(goes_with)) * noise
         of_map, levels = (stands, 0.01 * one, points.of_block), (0.001 * one[:, :1], 0.5 * one[:, :1])
-        found.append(float(_edge_noise(r, of_map, levels, one > 0, 0.01**2 * one[:, :1])))
-        assert float(_edge_noise(r, of_map, levels, one > 0, 0 * one[:, :1])) == pytest.approx(0.5)
+        found.append(float(_edge_gain(r, of_map, levels, one > 0, 0.01**2 * one[:, :1], OPTIONS)))
+        assert float(_edge_gain(r, of_map, levels, one > 0, 0 * one[:, :1], OPTIONS)) == pytest.approx(0.5)
     assert sorted(found)[6] == pytest.approx(kept, abs=0.02)
 
 
@@ -169,7 +169,7 @@ def test_without_near_returns_a_usual_map_is_meant():
     points, r, told = seen(truth, truth)
     none = points._replace(near=points.near & False)
     found = residual_variance(none, r, told, truth, torch.ones_like(truth, dtype=torch.bool)).sqrt()
-    assert torch.allclose(found.amin(), torch.tensor(DEFAULT_RESIDUAL, dtype=torch.float64), rtol=0.2)
+    assert torch.allclose(found.amin(), torch.tensor(OPTIONS.default_residual, dtype=torch.float64), rtol=0.2)
 
 
 def test_alone_as_in_a_batch():
@@ -190,7 +190,7 @@ def test_a_flat_map_stands_out_nowhere_not_even_beside_its_holes_and_borders():
     flat = torch.full((1, *HW), 2.0, dtype=torch.float64)
     known = torch.ones_like(flat, dtype=torch.bool)
     known[:, 20:30, :40], known[:, ::7, ::5] = False, False
-    out = _standing_out(torch.where(known, flat, torch.nan), known)
+    out = _local_deviation(torch.where(known, flat, torch.nan), known, OPTIONS)
     assert out[known].abs().max() < 1e-12
 
 
@@ -199,5 +199,5 @@ def test_what_is_off_in_one_place_is_no_doubt_in_another():
     flat = torch.zeros_like(log)
     share = 0.1 * torch.rand(1, 50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     one = torch.ones(1, 50, dtype=torch.float64)
-    found = _local_variance(share, 0 * one, (one, one > 0), flat, torch.ones_like(flat, dtype=torch.bool))[0]
+    found = _local_variance(share, 0 * one, (one, one > 0), flat, torch.ones_like(flat, dtype=torch.bool), OPTIONS)[0]
     assert found[2, 3] > 0.9 and found[:3, 22:].max() < 0.01 and found[-10:].max() < 0.01

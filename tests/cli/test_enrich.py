@@ -1,4 +1,4 @@
-"""dhtorch enrich: what the source had is there value for value, depth stands beside it, whatever interrupts it."""
+"""``dhtorch enrich``: the source is kept value for value, depth is added, and an interrupted run can be finished."""
 
 import io
 import itertools
@@ -14,6 +14,7 @@ pytest.importorskip("av")
 
 from PIL import Image
 from pyarrow import parquet
+from support.dataset_folders import decode_map, read_files, read_rows
 
 from dhtorch import data
 from dhtorch import testing as writers
@@ -60,19 +61,6 @@ def enriched(tmp_path_factory, robot):
     return out
 
 
-def tree(root):
-    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(Path(root).rglob("*")) if p.is_file()}
-
-
-def rows(root):
-    tables = sorted((Path(root) / "data").rglob("*.parquet"))
-    return [row for table in tables for row in parquet.read_table(table).to_pylist()]
-
-
-def map_of(row, key):
-    return np.array(Image.open(io.BytesIO(row[key]["bytes"])))
-
-
 def test_statistics_of_large_numbers_keep_their_spread():
     """A time stamp of today squared has no digits left for how far apart two frames are."""
     x = 1.7e9 + np.arange(600).reshape(-1, 1) / 30
@@ -82,10 +70,10 @@ def test_statistics_of_large_numbers_keep_their_spread():
 
 
 def test_what_the_source_had_is_there_value_for_value(robot, enriched):
-    for before, after in zip(rows(robot), rows(enriched), strict=True):
+    for before, after in zip(read_rows(robot), read_rows(enriched), strict=True):
         assert {k: after[k] for k in before} == before
-    videos = {k: v for k, v in tree(robot).items() if k.startswith("videos/")}
-    assert videos and videos.items() <= tree(enriched).items()
+    videos = {k: v for k, v in read_files(robot).items() if k.startswith("videos/")}
+    assert videos and videos.items() <= read_files(enriched).items()
     before, after = (json.loads((r / "meta" / "info.json").read_text())["features"] for r in (robot, enriched))
     assert {k: after[k] for k in before} == before
 
@@ -98,8 +86,8 @@ def test_an_episode_begins_and_ends_in_its_video_where_it_did(robot, enriched):
 
 
 def test_depth_is_in_steps_and_the_sensor_is_within_half_of_one(enriched, shots):
-    for row, frame in zip(rows(enriched), shots, strict=True):
-        depth, sigma, source = (map_of(row, k) for k in (DEPTH, f"{DEPTH}_sigma", f"{CAMERA}_dhtorch_source"))
+    for row, frame in zip(read_rows(enriched), shots, strict=True):
+        depth, sigma, source = (decode_map(row, k) for k in (DEPTH, f"{DEPTH}_sigma", f"{CAMERA}_dhtorch_source"))
         assert depth.dtype == np.float32 and np.array_equal(np.round(depth / STEP) * STEP, depth)
         assert np.array_equal(np.round(sigma / (STEP / 8)) * (STEP / 8), sigma) and (sigma % STEP).any()
         assert np.array_equal(depth > 0, source > 0) and np.array_equal(sigma > 0, source > 0)
@@ -111,15 +99,17 @@ def test_depth_is_in_steps_and_the_sensor_is_within_half_of_one(enriched, shots)
 def test_what_is_known_to_less_than_half_a_step_is_known_to_one(robot, tmp_path):
     """Depth in whole metres: nothing that has a depth is said to have none, or to be known exactly."""
     assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED, "step=1"]) == 0
-    for row in rows(tmp_path / "set"):
-        depth, sigma, source = (map_of(row, k) for k in (DEPTH, f"{DEPTH}_sigma", f"{CAMERA}_dhtorch_source"))
+    for row in read_rows(tmp_path / "set"):
+        depth, sigma, source = (decode_map(row, k) for k in (DEPTH, f"{DEPTH}_sigma", f"{CAMERA}_dhtorch_source"))
         assert set(np.unique(depth)) <= set(range(8)) and np.array_equal(depth > 0, source > 0)
         assert sigma[depth > 0].min() == 1 / 8
 
 
 def test_statistics_are_of_what_is_known(enriched):
     stats = json.loads((enriched / "meta" / "stats.json").read_text())
-    known = np.concatenate([m[m > 0] for m in (map_of(row, DEPTH) for row in rows(enriched))]).astype(np.float64)
+    known = np.concatenate([m[m > 0] for m in (decode_map(row, DEPTH) for row in read_rows(enriched))]).astype(
+        np.float64
+    )
     found = stats[DEPTH]
     want = {"min": known.min(), "max": known.max(), "mean": known.mean(), "std": known.std()}
     assert {k: np.shape(found[k]) for k in want} == dict.fromkeys(want, (1, 1, 1))
@@ -164,9 +154,9 @@ def test_interrupted_anywhere_the_same_command_gives_the_same_bytes(
         patch.setattr(target, name, stops(getattr(target, name), after))
         assert main(["enrich", str(robot), str(out), *ASKED]) == 130
     assert not (out / "meta" / "info.json").exists()
-    assert "the same command does the rest" in capsys.readouterr().err
+    assert "run the same command again for the rest" in capsys.readouterr().err
     assert main(["enrich", str(robot), str(out), *ASKED]) == 0
-    assert tree(out) == tree(enriched)
+    assert read_files(out) == read_files(enriched)
 
 
 def test_other_options_and_other_folders_are_refused(robot, enriched, tmp_path, capsys):
@@ -183,7 +173,7 @@ def test_an_older_set_becomes_one_of_today_and_its_numbers_stay_beside(shots, tm
     source = robot_set(tmp_path / "old", shots, 2)
     out = tmp_path / "new"
     assert main(["enrich", str(source), str(out), *ASKED, "data=lerobot", "data.episode=1"]) == 0
-    found = rows(out)
+    found = read_rows(out)
     assert [row["episode_index"] for row in found] == [0] * LENGTHS[1]
     assert [row["index"] for row in found] == list(range(LENGTHS[1]))
     assert [row["source.episode_index"] for row in found] == [1] * LENGTHS[1]
@@ -212,7 +202,7 @@ def test_one_episode_of_an_older_set_is_counted_from_0_in_its_own_version(shots,
 def test_a_recording_becomes_a_set_and_a_nerfstudio_folder(tmp_path, capsys):
     folder = tmp_path / "room"
     assert main(["enrich", "out=" + str(folder), "data=synthetic", "data.hw=[48,64]", "data.n_frames=3", *ASKED]) == 0
-    found = rows(folder)
+    found = read_rows(folder)
     assert [row["frame_index"] for row in found] == [0, 1, 2]
     assert np.array(Image.open(io.BytesIO(found[0]["observation.images.camera"]["bytes"]))).shape == (*HW, 3)
     nerf = tmp_path / "nerf"
@@ -221,7 +211,7 @@ def test_a_recording_becomes_a_set_and_a_nerfstudio_folder(tmp_path, capsys):
     about = json.loads((nerf / "transforms.json").read_text())
     assert [frame["file_path"] for frame in about["frames"]] == [f"images/frame_{i:06d}.png" for i in range(3)]
     depth = np.array(Image.open(nerf / about["frames"][1]["depth_file_path"])) * about["depth_unit_scale_factor"]
-    column = map_of(found[1], "observation.images.camera_depth")
+    column = decode_map(found[1], "observation.images.camera_depth")
     assert np.abs(depth - column).max() <= 1e-3
     pose = np.array(found[1]["observation.camera.T_world_from_cam"]).reshape(4, 4)
     assert np.allclose(np.array(about["frames"][1]["transform_matrix"]) @ np.diag([1, -1, -1, 1]), pose)
@@ -271,10 +261,10 @@ def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
     assert any("by the order of rows" in line for line in recording.report)
     out = tmp_path / "new"
     assert main(["enrich", str(source), str(out), *ASKED]) == 0
-    found = rows(out)
+    found = read_rows(out)
     assert found[0]["timestamp"] == 0 and found[0]["source.timestamp"] == pytest.approx(0.05)
     assert [row["frame_index"] for row in found] == [*range(LENGTHS[0]), *range(LENGTHS[1])]
-    assert all((map_of(row, DEPTH) > 0).any() for row in found)
+    assert all((decode_map(row, DEPTH) > 0).any() for row in found)
 
 
 def test_a_write_that_failed_at_the_first_file_is_no_other_set(robot, enriched, tmp_path):
@@ -283,4 +273,4 @@ def test_a_write_that_failed_at_the_first_file_is_no_other_set(robot, enriched, 
     (out / "meta").mkdir(parents=True)
     (out / "meta" / ".dhtorch.json.x1.tmp").write_text("{")
     assert main(["enrich", str(robot), str(out), *ASKED]) == 0
-    assert tree(out) == tree(enriched)
+    assert read_files(out) == read_files(enriched)

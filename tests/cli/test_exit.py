@@ -1,4 +1,4 @@
-"""What the command leaves behind when it is told to end, killed, raced, or its disk is full; and what it prints."""
+"""Files and messages of the command after signals, kills, races and a full disk."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_results import KEY, result
+from support.small_result import KEY, result
 
 from dhtorch.cli import run, signals
 from dhtorch.runtime import console, file_lock, storage

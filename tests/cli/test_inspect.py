@@ -1,4 +1,4 @@
-"""``dhtorch inspect``: what it says about written captures, what it warns of, and that it refuses nothing real."""
+"""``dhtorch inspect``: its report on written captures, its warnings, and that it accepts real ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import torch
 from rich.console import Console
 from support import damage_harness as hostile
 from support.box_scene import HW, pose, render
-from test_focal_stacks import stack
+from support.focal_stacks import random_stack
 
 from dhtorch import data
 from dhtorch import testing as writers
@@ -109,9 +109,9 @@ RECORDED: dict[str, tuple[Callable[[Path, int], object], str, int]] = {
 }
 WRITTEN: dict[str, tuple[Callable[[Path], object], str, int]] = {
     **{name: (partial(write, n=3), format, count) for name, (write, format, count) in RECORDED.items()},
-    "fod500": (lambda root: stack_writers.write_fod500(root, {0: stack(0), 1: stack(1)}), "fod500", 1),
-    "ddff12": (lambda root: stack_writers.write_ddff12(root / "a.h5", {"val": [stack(0, 10)]}), "ddff12", 1),
-    "images": (lambda root: stack_writers.write_image_folder(root, stack(0, 5)), "images", 1),
+    "fod500": (lambda root: stack_writers.write_fod500(root, {0: random_stack(0), 1: random_stack(1)}), "fod500", 1),
+    "ddff12": (lambda root: stack_writers.write_ddff12(root / "a.h5", {"val": [random_stack(0, 10)]}), "ddff12", 1),
+    "images": (lambda root: stack_writers.write_image_folder(root, random_stack(0, 5)), "images", 1),
 }
 
 
@@ -170,16 +170,16 @@ def test_facts_of_confidence_and_of_frames_left_out(tmp_path: Path) -> None:
 
 
 def test_facts_of_stacks(tmp_path: Path) -> None:
-    stack_writers.write_fod500(tmp_path, {3: stack(3), 4: stack(4)})
+    stack_writers.write_fod500(tmp_path, {3: random_stack(3), 4: random_stack(4)})
     survey = survey_stacks(formats.open_stacks(tmp_path))
     said = facts(survey)
     assert said["focal stacks"] == "2, of 5 pictures each" and said["in focus at"] == "0.1, 0.15, 0.3, 0.7, 1.5 m"
     assert said["lens"] == "f = 2.9 mm, N = 1" and said["holes"].startswith("0.5 %") and survey.warnings == []
-    same = stack(0, 1).images.expand(1, 4, 3, 12, 16)
-    stack_writers.write_image_folder(tmp_path / "b", stack(0).replace(images=same))
+    same = random_stack(0, 1).images.expand(1, 4, 3, 12, 16)
+    stack_writers.write_image_folder(tmp_path / "b", random_stack(0).replace(images=same))
     survey = survey_stacks(formats.open_stacks(tmp_path / "b"))
     assert survey.warnings == [
-        "no focus distances: the order of the pictures is all that is known",
+        "no focus distances: only the order of the pictures is available",
         "all pictures that were read are the same picture",
     ]
 
@@ -313,7 +313,7 @@ def test_a_capture_that_its_reader_refuses_is_shown_as_pictures(tmp_path: Path) 
     (tmp_path / "meta.json").write_text('{"K": 3}')  # no calibration: the reader must refuse
     survey = only(tmp_path)
     assert survey.format == "loose pictures" and facts(survey)["pictures"] == "3, 64x48"
-    assert survey.warnings[0].startswith("the tum reader refuses it: ") and "meta.json: K: found" in survey.warnings[0]
+    assert survey.warnings[0].startswith("the tum reader rejects it: ") and "meta.json: K: found" in survey.warnings[0]
     assert facts(survey)["depth maps"] == "3, 64x48"
     check_sheet(capture.write_contact_sheet(survey, tmp_path / "out"))
 
@@ -334,7 +334,7 @@ def test_many_recordings_are_cut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     _driving(tmp_path, 3)
     monkeypatch.setattr(capture, "_MAX_RECORDINGS", 1)
     survey = only(tmp_path)
-    assert "2 recordings in this capture: the first 1 are shown" in survey.warnings
+    assert "2 recordings in this capture, the first 1 shown" in survey.warnings
 
 
 def test_several_captures_in_one_folder(tmp_path: Path) -> None:
@@ -347,15 +347,15 @@ def test_several_captures_in_one_folder(tmp_path: Path) -> None:
     ("name", "said"),
     [
         (None, "an empty folder"),
-        ("room.zip", "room.zip: an archive, to be unpacked first"),
+        ("room.zip", "room.zip: an archive, unpack it first"),
         ("clip.mp4", "clip.mp4: a video without depth"),
-        ("notes.txt", "no capture here or two folders below"),
+        ("notes.txt", "no capture here or up to two folders below"),
     ],
 )
 def test_what_lies_there_instead_of_a_capture_is_said(tmp_path: Path, name: str | None, said: str) -> None:
     if name is not None:
         (tmp_path / name).write_bytes(b"nothing of use")
-        alone = said.partition(": ")[2] or "a .txt file, which no reader knows"
+        alone = said.partition(": ")[2] or "a .txt file, which no reader supports"
         with pytest.raises(FormatError, match=f"{name}: content: found {alone}"):
             capture.find_captures(tmp_path / name)
     with pytest.raises(FormatError, match=f"content: found {said}"):
@@ -366,7 +366,7 @@ def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
     (tmp_path / "a" / "b" / "c").mkdir(parents=True)
     writers.write_named_frames(tmp_path / "a" / "b" / "c", walk(1))
     assert run.main(["inspect", str(tmp_path)]) != 0
-    assert "content: found no capture here or two folders below, expected one of " in " ".join(
+    assert "content: found no capture here or up to two folders below, expected one of " in " ".join(
         capsys.readouterr().err.split()
     )
     assert run.main(["inspect", str(tmp_path / "nowhere")]) != 0
@@ -390,7 +390,7 @@ def test_warnings_are_printed(tmp_path: Path) -> None:
     out = io.StringIO()
     survey = survey_recording(replace(recording(walk(2)), report=("frame [7]: left out",)))
     capture.print_survey(
-        capture.FoundCapture(tmp_path, "recording", "test", "as told"), survey, Console(file=out, width=200)
+        capture.FoundCapture(tmp_path, "recording", "test", "format= given"), survey, Console(file=out, width=200)
     )
     assert "warning" in out.getvalue() and "frame [7]: left out" in out.getvalue()
 

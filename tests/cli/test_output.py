@@ -1,4 +1,4 @@
-"""How the command behaves: what it says and where, how it ends, what it leaves, and that no system is shut out."""
+"""Output of the command, exit codes, files that it leaves, and support of every operating system."""
 
 import ast
 import io
@@ -11,11 +11,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.tiny_runs import ROOM, TINY
 
 import dhtorch
 from dhtorch import testing as writers
 from dhtorch.cli import inspect as capture
-from dhtorch.cli.run import EXIT_CODES, config_dir, job_name, main
+from dhtorch.cli.run import EXIT_CODES, config_dir, job_name
 from dhtorch.experiments.report import page
 from dhtorch.runtime import console
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -23,30 +24,9 @@ from dhtorch.viz.viewer import html
 
 ROOT = Path(dhtorch.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
-ROOM = ["data.hw=[60,80]", "data.n_frames=3", "data.supersample=1", "data.lidar=exact", "pairs.gap=2"]
-TINY = [*ROOM, "method.n=256", "figures=false"]
-
 #: What Windows refuses in a name, and the names that it keeps for itself.
 REFUSED = re.compile(r'[<>:"|?*\\\x00-\x1f]|[. ]$')
 RESERVED = {"con", "prn", "aux", "nul", *(f"{d}{k}" for d in ("com", "lpt") for k in range(10))}
-
-
-@pytest.fixture
-def command(tmp_path, monkeypatch, capsys):
-    """The command in this process, from an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.delenv("DHTORCH_DATA", raising=False)
-    monkeypatch.delenv(console._VERBOSITY_VARIABLE, raising=False)
-
-    def call(*args):
-        try:
-            code = main(list(args))
-        except SystemExit as stop:
-            code = stop.code
-        out, err = capsys.readouterr()
-        return code or 0, out, err
-
-    return call
 
 
 @pytest.fixture(scope="module")
@@ -137,7 +117,7 @@ def test_the_loudness_of_a_job_is_none_of_its_settings(command, tmp_path):
 
 
 class Terminal(io.StringIO):
-    """A stream that says it is a terminal."""
+    """A stream that reports to be a terminal."""
 
     def isatty(self):
         return True

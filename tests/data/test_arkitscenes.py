@@ -1,4 +1,4 @@
-"""ARKitScenes: captures written in its layout, at its clocks, with the traps its users met."""
+"""ARKitScenes: captures written with its layout and clocks and read back, and damaged ones."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
+from support.arkitscenes_frames import VGA, VGA_HW, path, shots
 from support.box_scene import CAMERA, HW, check_same, disagreement, off_wall, render, world_points
 
 from dhtorch import data
@@ -26,31 +27,9 @@ from dhtorch.metrics import holdout
 from dhtorch.records import Camera, Frame, Pose
 from dhtorch.testing import parts
 
-VGA_HW = (96, 128)
-VGA = Camera(torch.tensor([[124.0, 115.5]]), torch.tensor([[68.25, 43.25]]))  # not quite the small camera, scaled
-UPRIGHT = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)  # looks along y, the sky (z) on top
-
-
-def path(time: float) -> Pose:
-    """Constant velocity and turn rate, so that interpolation has an exact answer."""
-    s = time - 100
-    turn = se3.exp(torch.tensor([[0.5 * s, -0.9 * s, 0.4 * s, 0, 0, 0]], dtype=torch.float64))
-    t = torch.tensor([[0.2 + 0.6 * s, -0.3 + 0.2 * s, 0.1 - 0.5 * s]], dtype=torch.float64)
-    return Pose(turn.R @ UPRIGHT, t)
-
-
-def shots(times: object, camera: Camera = CAMERA, hw: tuple[int, int] = HW, turns: int = 0) -> list[Frame]:
-    """What the stored pictures show; ``turns`` quarter turns clockwise would make them upright."""
-    frames = []
-    for time in np.round(np.asarray(times, dtype=float), 6):
-        c2w = convert.rot90_pose(se3.to_matrix(path(float(time))).numpy(), -turns)
-        frame = render(camera, se3.from_matrix(torch.from_numpy(c2w)), hw, float(time))
-        frames.append(frame.replace(conf=frame.image[:, 1] // 86))  # 0, 1 and 2, in patches
-    return frames
-
 
 def capture(root: Path, n: int = 4, **more: list[Frame]) -> list[Frame]:
-    """The plain case: small pictures with depth, confidence and poses at the same instants."""
+    """Writes a capture of small pictures with depth, confidence and poses at the same times; returns its frames."""
     frames = shots(100 + np.arange(n) / 60)
     assets = {"lowres_wide": frames, "lowres_depth": frames, **more}
     writers.write_arkitscenes(root, assets, trajectory=frames)
@@ -130,7 +109,7 @@ def test_color_is_another_name_of_wide_and_intrinsics_may_be_borrowed(tmp_path: 
         torch.testing.assert_close(borrowed[1].camera.c, want.c)
         for file in (root / "lowres_wide_intrinsics").iterdir():
             file.unlink()
-        with pytest.raises(FormatError, match="wide_intrinsics: found none, nor any to scale"):
+        with pytest.raises(FormatError, match="wide_intrinsics: found none, also of no other size"):
             stored(root)
 
 
@@ -230,7 +209,7 @@ def test_captures_without_trajectory_keep_their_frames(tmp_path: Path) -> None:
     (root / "lowres_wide.traj").unlink()
     recording = data.open(root)
     assert len(recording) == 4 and recording.poses is None and recording[0].T_world_from_cam is None
-    assert recording.report == ("no lowres_wide.traj: frames have no pose, and stay as stored",)
+    assert recording.report == ("no lowres_wide.traj: frames have no pose and are not rotated",)
     assert data.open(root, poses=False).report == ()
 
 
@@ -277,7 +256,7 @@ def test_no_confidence_at_all(tmp_path: Path) -> None:
     for file in (root / "confidence").iterdir():
         file.unlink()
     recording = stored(root)
-    assert recording[0].conf is None and recording.report == ("no confidence: every return counts alike",)
+    assert recording[0].conf is None and recording.report == ("no confidence: all returns are weighted equally",)
 
 
 def test_nearest_against_brute_force() -> None:
@@ -351,7 +330,7 @@ def test_looking_straight_down_names_no_side(tmp_path: Path) -> None:
     writers.write_arkitscenes(root, {"lowres_wide": [frame], "lowres_depth": [frame]}, trajectory=[frame])
     recording = data.open(root)
     assert recording[0].hw == HW
-    assert "the camera looks straight up or down: pictures stay as stored" in recording.report
+    assert "the camera looks straight up or down: images are not rotated" in recording.report
 
 
 def test_turning_a_lens_keeps_every_ray() -> None:
@@ -462,7 +441,7 @@ def test_bad_files(tmp_path: Path) -> None:
     for text, message in (
         ("64 48 61 58 33", r"pincam: line 1: found 5 columns, expected 6 numbers"),
         ("64 48 nan 58 33 21", r"pincam: intrinsics: found .*nan.*, expected 6 finite numbers"),
-        ("64.5 48 61 58 33 21", r"pincam: width and height: found 64.5 48, expected the size of a picture"),
+        ("64.5 48 61 58 33 21", r"pincam: width and height: found 64.5 48, expected the size of an image"),
         ("0 48 61 58 33 21", r"pincam: width and height: found 0 48"),
         ("1e5 1e5 61 58 33 21", r"pincam: width and height: found 100000 100000"),
         ("640 480 61 58 33 21", r"lowres_wide.*png: size: found 64x48, expected 640x480"),
@@ -512,11 +491,3 @@ def test_settings_hold_the_defaults(reader: object) -> None:
     settings = OmegaConf.load(config_dir() / "data" / f"{reader.__name__.split('.')[-1]}.yaml")
     options = {k: p.default for k, p in inspect.signature(reader.read).parameters.items() if k != "root"}
     assert {k: settings[k] for k in options} == options
-
-
-def hostile_sample(root: Path) -> Path:
-    root = root / "raw" / "Training" / "41048190"
-    frames = shots(100 + np.arange(3) / 60)
-    assets = {"lowres_wide": frames, "lowres_depth": frames, "highres_depth": shots([100.0], VGA, VGA_HW)}
-    writers.write_arkitscenes(root, assets, trajectory=frames)
-    return root

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import tifffile
 import torch
+from support.arkitscenes_frames import VGA, VGA_HW, shots
 from support.box_scene import CAMERA, HW, check_same, disagreement, off_wall, render, world_points
-from test_arkitscenes import VGA, VGA_HW, shots
+from support.ca1m_archives import ca1m_archive, ca1m_frames
 
 from dhtorch import data
 from dhtorch import testing as writers
@@ -23,27 +24,9 @@ from dhtorch.data.codecs import tarballs, tiff
 from dhtorch.data.readers import ca1m
 from dhtorch.export.tiff import encode_float_tiff
 from dhtorch.geometry import se3
-from dhtorch.records import Camera, Frame
+from dhtorch.records import Camera
 
-LASER_HW = (72, 96)
-LASER = Camera(torch.tensor([[92.0, 86.0]]), torch.tensor([[50.5, 31.0]]))
 PORTRAIT = Camera(torch.tensor([[58.25, 61.5]]), torch.tensor([[21.75, 30.5]]))
-
-
-def scene(n: int = 4) -> tuple[list[Frame], list[Frame]]:
-    """Frames with a depth camera of their own, and the laser's."""
-    times = 100 + np.arange(n) / 10
-    frames = []
-    for image, depth in zip(shots(times, VGA, VGA_HW), shots(times), strict=True):
-        frames.append(image.replace(depth=depth.depth, conf=depth.conf, depth_camera=CAMERA))
-    return frames, shots(times, LASER, LASER_HW)
-
-
-def archive(folder: Path, n: int = 4, **options: object) -> tuple[Path, list[Frame], list[Frame]]:
-    frames, lasers = scene(n)
-    file = folder / "ca1m-val-42898570.tar"
-    writers.write_ca1m(file, frames, lasers, **options)
-    return file, frames, lasers
 
 
 def rewrite(file: Path, change: Callable[[str, bytes], tuple[str, bytes] | None]) -> None:
@@ -62,7 +45,7 @@ def rewrite(file: Path, change: Callable[[str, bytes], tuple[str, bytes] | None]
 
 
 def test_gives_back_the_scene(tmp_path: Path) -> None:
-    file, frames, _ = archive(tmp_path)
+    file, frames, _ = ca1m_archive(tmp_path)
     assert data.recognise(file)[0] == "ca1m" and data.recognise(tmp_path)[0] == "ca1m"
     recording = data.open(file)
     assert recording.name == "ca1m-val-42898570" and recording.report == () and len(recording) == 4
@@ -80,13 +63,13 @@ def test_portrait_pictures_keep_their_orientation(tmp_path: Path) -> None:
     frame, laser = (render(PORTRAIT, T, size, 100.0) for _ in range(2))
     writers.write_ca1m(tmp_path / "ca1m-train-1.tar", [frame], [laser])
     recording = data.open(tmp_path)
-    assert recording[0].hw == size and recording.report == ("no confidence: every return counts alike",)
+    assert recording[0].hw == size and recording.report == ("no confidence: all returns are weighted equally",)
     check_same(recording, [frame], 1 / 1000)
     assert recording.truth(0)["depth"].shape == (1, *size)
 
 
 def test_laser_depth_is_the_truth_at_the_images_pixels(tmp_path: Path) -> None:
-    file, frames, _ = archive(tmp_path, n=2)
+    file, frames, _ = ca1m_archive(tmp_path, n=2)
     recording = data.open(file)
     for i, frame in enumerate(frames):
         exact = recording.truth(i)
@@ -99,7 +82,7 @@ def test_laser_depth_is_the_truth_at_the_images_pixels(tmp_path: Path) -> None:
 
 
 def test_failed_registration_is_rejected(tmp_path: Path) -> None:
-    frames, lasers = scene(2)
+    frames, lasers = ca1m_frames(2)
     lasers[1] = lasers[1].replace(depth=lasers[1].depth * 0.9)
     writers.write_ca1m(tmp_path / "ca1m-val-1.tar", frames, lasers, without=[(0, "gt/depth.png")])
     recording = data.open(tmp_path)
@@ -112,7 +95,7 @@ def test_failed_registration_is_rejected(tmp_path: Path) -> None:
 
 def test_a_member_missing_in_the_middle_is_skipped_and_reported(tmp_path: Path) -> None:
     missing = [(1, "gt/RT.json"), (3, "wide/depth/confidence.tiff"), (4, "wide/image.png"), (5, "gt/depth/K.json")]
-    file, frames, _ = archive(tmp_path, n=6, without=missing)
+    file, frames, _ = ca1m_archive(tmp_path, n=6, without=missing)
     recording = data.open(file)
     assert recording.number.tolist() == [0, 2, 5]
     assert set(recording.report) == {
@@ -126,15 +109,15 @@ def test_a_member_missing_in_the_middle_is_skipped_and_reported(tmp_path: Path) 
 
 
 def test_without_any_confidence_or_depth_intrinsics(tmp_path: Path) -> None:
-    file, _, _ = archive(tmp_path)
+    file, _, _ = ca1m_archive(tmp_path)
     rewrite(file, lambda name, body: None if "confidence" in name or "wide/depth/K" in name else (name, body))
     recording = data.open(file)
-    assert recording.report == ("no confidence: every return counts alike",) and len(recording) == 4
+    assert recording.report == ("no confidence: all returns are weighted equally",) and len(recording) == 4
     assert recording[0].conf is None and recording[0].depth_camera is None
 
 
 def test_confidence_is_a_share_or_a_level(tmp_path: Path) -> None:
-    file, frames, _ = archive(tmp_path, n=1)
+    file, frames, _ = ca1m_archive(tmp_path, n=1)
     steps = torch.linspace(0, 1, HW[0] * HW[1]).view(HW)
 
     def stored(picture: np.ndarray) -> None:
@@ -157,7 +140,7 @@ def test_confidence_is_a_share_or_a_level(tmp_path: Path) -> None:
 
 
 def test_flat_matrices_other_extensions_and_strange_members(tmp_path: Path) -> None:
-    file, frames, _ = archive(tmp_path)
+    file, frames, _ = ca1m_archive(tmp_path)
 
     def change(name: str, body: bytes) -> tuple[str, bytes]:
         if "RT" in name or "K.json" in name:
@@ -184,7 +167,7 @@ def test_frames_are_sorted_as_numbers(tmp_path: Path) -> None:
 
 
 def test_poses_are_camera_to_world(tmp_path: Path) -> None:
-    file, _, _ = archive(tmp_path)
+    file, _, _ = ca1m_archive(tmp_path)
     recording = data.open(file)
     wrong = se3.invert(recording.poses)
     assert disagreement(recording[0], recording[3])[0] < 0.01
@@ -194,7 +177,7 @@ def test_poses_are_camera_to_world(tmp_path: Path) -> None:
 
 
 def test_opening_reads_only_poses_and_recordings_travel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file, _, _ = archive(tmp_path)
+    file, _, _ = ca1m_archive(tmp_path)
     read: list[int] = []
     member = tarballs.read_tar_member
     monkeypatch.setattr(tarballs, "read_tar_member", lambda *args: read.append(args[2]) or member(*args))
@@ -212,7 +195,7 @@ def test_what_is_no_archive_of_ours(tmp_path: Path) -> None:
     (tmp_path / "empty.tar").write_bytes(b"")
     for name, message in (
         ("other.tar", r"other.tar: frames: found none, expected members wide/image"),
-        ("noise.tar", r"noise.tar: header at byte 0: found a wrong check sum"),
+        ("noise.tar", r"noise.tar: header at byte 0: found a wrong checksum"),
         ("empty.tar", r"empty.tar: content: found 0 bytes, expected a tar archive"),
         ("gone.tar", r"gone.tar: path: found no such file"),
         ("", r"archives: found none, expected ca1m-<split>-<video id>.tar"),
@@ -226,7 +209,7 @@ def test_what_is_no_archive_of_ours(tmp_path: Path) -> None:
 
 def test_a_folder_of_archives_is_listed_and_none_is_opened(tmp_path: Path) -> None:
     """A hundred gigabytes are a hundred archives; one that is damaged leaves the others alone."""
-    file, frames = archive(tmp_path, n=2)[:2]
+    file, frames = ca1m_archive(tmp_path, n=2)[:2]
     (tmp_path / "ca1m-val-99.tar").write_bytes(b"no archive")
     recordings = data.open_all(tmp_path)
     assert list(recordings.names) == [file.stem, "ca1m-val-99"]
@@ -267,7 +250,7 @@ def test_members_against_the_standard_library(tmp_path: Path, format: int) -> No
 
 
 def test_damaged_archives_end_the_walk(tmp_path: Path) -> None:
-    file, _, _ = archive(tmp_path, n=1)
+    file, _, _ = ca1m_archive(tmp_path, n=1)
     good = file.read_bytes()
     offset = next(iter(tarballs.iter_tar_members(file))).offset
 
@@ -280,7 +263,7 @@ def test_damaged_archives_end_the_walk(tmp_path: Path) -> None:
 
     for content, message in (
         (good[: offset + 10], r"wide/image.png: found 10 of \d+ bytes, expected a whole archive"),
-        (b"x" + good[1:], r"header at byte 0: found a wrong check sum, expected a tar header, not compressed"),
+        (b"x" + good[1:], r"header at byte 0: found a wrong checksum, expected a tar header, not compressed"),
         (header(124, b"77777777777\0"), r"wide/image.png: found \d+ of 8589934591 bytes, expected a whole archive"),
         (header(124, b"\x80" + b"\xff" * 11), r"wide/image.png: found \d+ of \d{20,} bytes"),
         (header(124, b"\xff" * 12), r"header at byte 0: found size .*, expected a number of bytes"),
@@ -352,23 +335,11 @@ def test_bad_tiff(tmp_path: Path) -> None:
         (tag(256, 0), "size: found 0x5"),
         (tag(257, 6), "strips: found 140 bytes, expected 168 bytes"),
         (tag(258, 12), "samples: found 12 bits of kind f"),
-        (tag(259, 7), "layout: found 1 samples a pixel, compression 7"),
+        (tag(259, 7), "layout: found 1 samples per pixel, compression 7"),
         (tag(259, 8), "data: found "),  # deflated, it says
-        (tag(273, 300), "strips: found 1 places, 1 sizes, expected all inside the file"),
-        (tag(277, 3), "layout: found 3 samples a pixel"),
+        (tag(273, 300), "strips: found 1 offsets, 1 sizes, expected all inside the file"),
+        (tag(277, 3), "layout: found 3 samples per pixel"),
     ):
         with pytest.raises(FormatError, match=message) as caught:
             tiff.decode_tiff(content, Path("a.tiff"))
         assert "\n" not in str(caught.value)
-
-
-# ----------------------------------------------------------------------------------------------------------- hostile
-
-
-def hostile_sample(root: Path) -> Path:
-    return archive(root, n=2)[0]
-
-
-def hostile_tiff(root: Path) -> Path:
-    tifffile.imwrite(root / "a.tiff", np.ones((40, 50), np.float32), compression="zlib", predictor=True)
-    return root / "a.tiff"

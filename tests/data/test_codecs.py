@@ -136,7 +136,7 @@ def test_exr_header_decides_before_the_decoder(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="version: found 0x1002"):
         codec_exr.read_exr(file)
     file.write_bytes(b"\x89PNG" + whole)
-    with pytest.raises(FormatError, match="expected an OpenEXR picture"):
+    with pytest.raises(FormatError, match="expected an OpenEXR image"):
         codec_exr.read_exr_header(file)
 
 

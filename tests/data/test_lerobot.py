@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from support.box_scene import CAMERA, HW, off_wall, pose, render, world_points
+from support.robot_episodes import two_episodes
 
 pytest.importorskip("av")
 pytest.importorskip("pyarrow")
@@ -42,14 +43,6 @@ def _clean() -> Iterator[None]:
     close_videos()
 
 
-def episodes() -> list[list[Frame]]:
-    """Two episodes of unequal length, so that nothing falls on the same place in both."""
-    return [
-        [render(CAMERA, pose(i), HW, i / 30) for i in range(2)],
-        [render(CAMERA, pose(5 + i), HW, i / 30) for i in range(4)],
-    ]
-
-
 def same_scene(recording: data.Recording, frames: list[Frame], step: float) -> None:
     assert len(recording) == len(frames) and recording.report == ()
     for frame, want in zip(recording, frames, strict=True):
@@ -71,7 +64,7 @@ def same_scene(recording: data.Recording, frames: list[Frame], step: float) -> N
     [("video", "video", "feature"), ("image", "tiff", "side-car"), ("video", "png", "feature"), ("image", "array", "feature")],
 )  # fmt: skip
 def test_gives_back_the_scene(tmp_path: Path, version: int, image: str, depth: str, intrinsics: str) -> None:
-    shots = episodes()
+    shots = two_episodes()
     write_lerobot(tmp_path, shots, version=version, image=image, depth=depth, intrinsics=intrinsics)
     assert data.recognise(tmp_path)[0] == "lerobot"
     recordings = data.open_all(tmp_path)
@@ -84,10 +77,10 @@ def test_gives_back_the_scene(tmp_path: Path, version: int, image: str, depth: s
 
 
 def test_one_episode_and_its_camera_by_name(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, episodes())
-    same_scene(data.open(tmp_path, episode=1, camera=KEY), episodes()[1], STEP["video"])
+    write_lerobot(tmp_path, two_episodes())
+    same_scene(data.open(tmp_path, episode=1, camera=KEY), two_episodes()[1], STEP["video"])
     assert [r.name[-12:] for r in data.open_all(tmp_path, episode=[1, 0])] == ["000001/front", "000000/front"]
-    with pytest.raises(FormatError, match=r"meta: episodes: found 0 of those asked for, expected \[7\]"):
+    with pytest.raises(FormatError, match=r"meta: episodes: found 0 of those requested, expected \[7\]"):
         data.open(tmp_path, episode=7)
     with pytest.raises(
         FormatError, match=r"info.json: cameras: found wrist, expected some of observation.images.front"
@@ -100,7 +93,7 @@ def test_thousands_of_episodes_are_listed_and_none_is_opened(
     tmp_path: Path, version: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Twenty thousand, by copies of the metadata: opening reads no table, and the last one is the right one."""
-    write_lerobot(tmp_path, episodes(), version=version)
+    write_lerobot(tmp_path, two_episodes(), version=version)
     n, meta = 20_000, tmp_path / "meta"
     if version == 2:
         (meta / "episodes.jsonl").write_text("\n".join(json.dumps({"episode_index": i, "length": 4}) for i in range(n)))
@@ -120,7 +113,7 @@ def test_thousands_of_episodes_are_listed_and_none_is_opened(
     recordings = data.open_all(tmp_path)
     assert opened == []
     assert len(recordings) == n and recordings.names[7].endswith("/episode_000007/front")
-    same_scene(recordings[-1], episodes()[1], STEP["video"])
+    same_scene(recordings[-1], two_episodes()[1], STEP["video"])
     assert data.open_capture(tmp_path, gap=3)[-1].gap == 3 and 1 <= len(opened) <= 4
     assert recordings[n - 1].name == recordings.names[-1]
     assert pickle.loads(pickle.dumps(recordings)).names == recordings.names
@@ -145,12 +138,12 @@ def with_column(name: str, value: int, table: pyarrow.Table) -> pyarrow.Table:
 @pytest.mark.parametrize("depth_pixels", ["gray12le", "yuv420p12le"])
 def test_depth_codes_survive_both_pixel_formats(tmp_path: Path, depth_pixels: str) -> None:
     """A conversion of yuv420p12le to grey would stretch its range: codes are read as they stand."""
-    write_lerobot(tmp_path, episodes(), depth_pixels=depth_pixels)
-    same_scene(data.open(tmp_path, episode=0), episodes()[0], STEP["video"])
+    write_lerobot(tmp_path, two_episodes(), depth_pixels=depth_pixels)
+    same_scene(data.open(tmp_path, episode=0), two_episodes()[0], STEP["video"])
 
 
 def test_lost_zeros_are_no_returns(tmp_path: Path) -> None:
-    frame = episodes()[0][0]
+    frame = two_episodes()[0][0]
     depth = frame.depth.clone()
     depth[0, :4], depth[0, 4:6], depth[0, 6:8], depth[0, 8:10] = 0, 12.0, 9.5, 0.011
     write_lerobot(tmp_path, [[frame.replace(depth=depth)]])
@@ -165,7 +158,7 @@ def test_lost_zeros_are_no_returns(tmp_path: Path) -> None:
 
 
 def test_the_mark_of_depth_as_it_was_called_before(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, episodes())
+    write_lerobot(tmp_path, two_episodes())
 
     def older(info: dict[str, Any]) -> None:
         feature = info["features"].pop(f"{KEY}_depth")
@@ -173,7 +166,7 @@ def test_the_mark_of_depth_as_it_was_called_before(tmp_path: Path) -> None:
         info["features"][f"{KEY}_depth"] = feature
 
     edit(tmp_path, older)
-    same_scene(data.open(tmp_path, episode=0), episodes()[0], STEP["video"])
+    same_scene(data.open(tmp_path, episode=0), two_episodes()[0], STEP["video"])
 
 
 @pytest.mark.parametrize("log", [True, False])
@@ -204,7 +197,7 @@ def test_writer_codes_by_the_published_rule() -> None:
 
 def test_depth_unit_of_pictures(tmp_path: Path) -> None:
     """Without a unit in the info whole numbers are mm and others m; the info and the option win."""
-    write_lerobot(tmp_path, episodes(), depth="png")
+    write_lerobot(tmp_path, two_episodes(), depth="png")
     exact = data.open(tmp_path, episode=0)[0].depth
     torch.testing.assert_close(data.open(tmp_path, episode=0, depth_unit="m")[0].depth, exact * 1000)
     edit(tmp_path, lambda info: info["features"][f"{KEY}_depth"]["info"].update(depth_unit="m"))
@@ -227,7 +220,7 @@ def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def test_K_must_come_from_somewhere(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, episodes(), intrinsics=None)
+    write_lerobot(tmp_path, two_episodes(), intrinsics=None)
     with pytest.raises(
         FormatError, match=r"observation.images.front: found no intrinsics, expected data.fov=69 .*meta/intrinsics.json"
     ):
@@ -247,7 +240,7 @@ def test_K_must_come_from_somewhere(tmp_path: Path) -> None:
 
 
 def test_one_option_says_K_in_three_ways(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, episodes(), intrinsics=None)
+    write_lerobot(tmp_path, two_episodes(), intrinsics=None)
     four = data.open(tmp_path, episode=0, intrinsics=[61.5, 58.25, 33.5, 21.75])
     assert torch.equal(four[0].camera.f, CAMERA.f) and not any("guess" in line for line in four.report)
     with pytest.warns(UserWarning, match="are a guess"):
@@ -259,7 +252,7 @@ def test_one_option_says_K_in_three_ways(tmp_path: Path) -> None:
 
 
 def test_two_cameras_by_name_are_told_apart(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, [episodes()[0]], version=2)
+    write_lerobot(tmp_path, [two_episodes()[0]], version=2)
     info = tmp_path / "meta" / "info.json"
     said = json.loads(info.read_text())
     for ending in ("", ".intrinsics"):
@@ -278,12 +271,12 @@ def test_two_cameras_by_name_are_told_apart(tmp_path: Path) -> None:
 def test_K_may_change_from_frame_to_frame(tmp_path: Path) -> None:
     lenses = [Camera(CAMERA.f + i, CAMERA.c) for i in range(3)]
     shots = [render(camera, pose(i), HW, i / 30) for i, camera in enumerate(lenses)]
-    write_lerobot(tmp_path, [episodes()[0], shots])
+    write_lerobot(tmp_path, [two_episodes()[0], shots])
     same_scene(data.open(tmp_path, episode=1), shots, STEP["video"])
 
 
 def test_depth_is_the_one_named_like_the_camera(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, episodes(), depth="array")
+    write_lerobot(tmp_path, two_episodes(), depth="array")
     other = {"dtype": "image", "shape": [*HW, 3], "info": {}}
     edit(tmp_path, lambda info: info["features"].update({"observation.images.wrist": other}))
     recording = data.open(tmp_path, episode=0, camera=KEY)
@@ -307,44 +300,44 @@ def rewrite(file: Path, change: Callable[[pyarrow.Table], pyarrow.Table]) -> Non
 
 def test_episodes_are_not_told_from_the_stamps(tmp_path: Path) -> None:
     """In v3 both start at stamp 0 in one table and one video; the boundary stands in meta/episodes alone."""
-    write_lerobot(tmp_path, episodes())
+    write_lerobot(tmp_path, two_episodes())
     file = tmp_path / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
     name = f"videos/{KEY}/from_timestamp"
     rewrite(file, lambda t: t.set_column(t.schema.get_field_index(name), name, pyarrow.array([0.0, 1 / 30])))
     first, second = data.open_all(tmp_path)
-    assert torch.equal(first[0].image, episodes()[0][0].image)
-    assert torch.equal(second[0].image, episodes()[0][1].image)  # as the table says
+    assert torch.equal(first[0].image, two_episodes()[0][0].image)
+    assert torch.equal(second[0].image, two_episodes()[0][1].image)  # as the table says
     rewrite(file, lambda t: t.set_column(t.schema.get_field_index(name), name, pyarrow.array([0.0, 0.1 + 2e-4])))
     with pytest.raises(FormatError, match=r"time 0.100200 s: found nearest frame at 0.100000 s, expected one within"):
         data.open(tmp_path, episode=1)[0]
-    assert torch.equal(data.open(tmp_path, episode=1, tolerance=1e-3)[0].image, episodes()[1][1].image)
+    assert torch.equal(data.open(tmp_path, episode=1, tolerance=1e-3)[0].image, two_episodes()[1][1].image)
 
 
 def test_missing_and_shuffled_rows_are_reported(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, episodes(), version=2)
+    write_lerobot(tmp_path, two_episodes(), version=2)
     file = tmp_path / "data" / "chunk-000" / "episode_000001.parquet"
     rewrite(file, lambda t: t.take([0, 1, 3]))
     recording = data.open(tmp_path, episode=1)
     assert recording.number.tolist() == [0, 1, 3] and "3 rows, 4 according to meta/episodes" in recording.report[0]
-    assert torch.equal(recording[2].image, episodes()[1][3].image)
+    assert torch.equal(recording[2].image, two_episodes()[1][3].image)
     rewrite(file, lambda t: t.take([0, 2, 1]))
     recording = data.open(tmp_path, episode=1)
     assert recording.number.tolist() == [0, 3] and "1 row out of order: left out" in recording.report[0]
 
 
 def test_a_shorter_video_is_an_error_where_it_ends(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, episodes(), version=2, depth=None)
+    write_lerobot(tmp_path, two_episodes(), version=2, depth=None)
     file = tmp_path / "videos" / "chunk-000" / KEY / "episode_000001.mp4"
-    pictures = [frame.image[0].permute(1, 2, 0).numpy() for frame in episodes()[1][:3]]
+    pictures = [frame.image[0].permute(1, 2, 0).numpy() for frame in two_episodes()[1][:3]]
     write_lossless(file, pictures, "rgb24")
     recording = data.open(tmp_path, episode=1)
-    assert torch.equal(recording[2].image, episodes()[1][2].image)
+    assert torch.equal(recording[2].image, two_episodes()[1][2].image)
     with pytest.raises(FormatError, match=r"episode_000001.mp4: time 0.100000 s: found nearest frame at 0.066667 s"):
         recording[3]
 
 
 def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_lerobot(tmp_path, episodes(), image="image", depth="tiff")
+    write_lerobot(tmp_path, two_episodes(), image="image", depth="tiff")
     asked: list[str] = []
     read = codec_parquet._read_open_columns
     monkeypatch.setattr(codec_parquet, "_read_open_columns", lambda f, t, c, r: asked.extend(c) or read(f, t, c, r))
@@ -375,7 +368,7 @@ def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     ],
 )
 def test_bad_info(tmp_path: Path, key: str, value: object) -> None:
-    write_lerobot(tmp_path, episodes(), depth=None)
+    write_lerobot(tmp_path, two_episodes(), depth=None)
     edit(tmp_path, lambda info: info.update({key: value}))
     with pytest.raises(FormatError, match=rf"info.json: {key}"):
         data.open_all(tmp_path)
@@ -414,17 +407,9 @@ def test_columns_that_cannot_be_arrays(tmp_path: Path) -> None:
         codec_parquet.read_cell(file, "deep", 2)
 
 
-def hostile_v3(root: Path) -> None:
-    write_lerobot(root, [episodes()[0], episodes()[1][:2]], depth="video")
-
-
-def hostile_v2(root: Path) -> None:
-    write_lerobot(root, [episodes()[0]], version=2, image="image", depth="tiff", intrinsics="side-car")
-
-
 def test_rows_without_numbers_whose_clock_is_late_keep_their_pictures(tmp_path: Path) -> None:
     """Times that begin one frame after the video: by time every row would get the next picture."""
-    shots = episodes()[1]
+    shots = two_episodes()[1]
     write_lerobot(tmp_path, [shots], version=2, depth="tiff")
     (file,) = (tmp_path / "data").rglob("*.parquet")
     table = parquet.read_table(file)
@@ -432,16 +417,14 @@ def test_rows_without_numbers_whose_clock_is_late_keep_their_pictures(tmp_path: 
     table = table.set_column(table.column_names.index("timestamp"), "timestamp", late).drop_columns(["frame_index"])
     parquet.write_table(table, file)
     recording = data.open(tmp_path)
-    assert (
-        len(recording) == 4 and "times begin at 0.03333 s: pictures taken by the order of rows" in recording.report[0]
-    )
+    assert len(recording) == 4 and "times begin at 0.03333 s: images taken by the order of rows" in recording.report[0]
     for i, shot in enumerate(shots):
         assert float((recording[i].image.float() - shot.image.float()).abs().mean()) < 5
     assert recording.times is not None and float(recording.times[0]) == 0
 
 
 def test_a_camera_that_is_only_declared_is_none(tmp_path: Path) -> None:
-    write_lerobot(tmp_path, [episodes()[0]], version=2)
+    write_lerobot(tmp_path, [two_episodes()[0]], version=2)
     info = tmp_path / "meta" / "info.json"
     said = json.loads(info.read_text())
     said["features"]["observation.images.ghost"] = said["features"]["observation.images.front"]
@@ -452,7 +435,7 @@ def test_a_camera_that_is_only_declared_is_none(tmp_path: Path) -> None:
 
 
 def test_a_set_without_intrinsics_can_be_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_lerobot(tmp_path / "x", [episodes()[0]], version=2, intrinsics=None, depth=None, poses=False)
+    write_lerobot(tmp_path / "x", [two_episodes()[0]], version=2, intrinsics=None, depth=None, poses=False)
     assert run.main(["inspect", str(tmp_path / "x"), "--out", str(tmp_path / "out")]) == 0
     out = capsys.readouterr().out
-    assert "no intrinsics: nothing can be measured" in out and "frames " in out and "field of view" not in out
+    assert "no intrinsics: depth cannot be computed" in out and "frames " in out and "field of view" not in out

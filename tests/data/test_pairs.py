@@ -82,7 +82,7 @@ def test_by_baseline_takes_the_earliest_within_tolerance() -> None:
         ),
         (lambda: pairs.by_choice(line(5), stride=0), r"pairs.stride: found 0"),
         (lambda: pairs.by_choice(line(3), stride=3, past=True), r"found no two of 3 frames of line at stride 3, past"),
-        (lambda: pairs.by_gap(line(5)), r"pairs.gap: line knows no gap of its own, expected a number of frames"),
+        (lambda: pairs.by_gap(line(5)), r"pairs.gap: line has no gap of its own, expected a number of frames"),
         (lambda: pairs.by_gap(line(1), 1), r"pairs.gap: found 1 for 1 frame"),
         (lambda: pairs.by_time(line(5), -1), r"pairs.seconds: found -1, expected a positive number"),
         (lambda: pairs.by_time(line(5, times=None), 1), r"pairs.seconds: line has no time stamps"),
@@ -106,7 +106,7 @@ def test_scaled_gaps_of_a_short_recording_are_missing_not_fatal() -> None:
     assert pairs.by_scaled_gap(Scene(line(5), gap=1), 0.5) == pairs.by_gap(line(5), 1), "at least one frame"
     assert pairs.by_scaled_gap(Scene(line(5), gap=3), 2.0) == []
     assert pairs.by_scaled_gap(Scene(line(3, number=torch.tensor([0, 2, 4])), gap=3), 1.0) == []
-    with pytest.raises(ValueError, match=r"pairs.factor: line knows no gap"):
+    with pytest.raises(ValueError, match=r"pairs.factor: line has no gap"):
         pairs.by_scaled_gap(line(5), 1.0)
 
 
@@ -114,7 +114,7 @@ def test_by_choice_offers_every_anchor_the_frames_around_it() -> None:
     assert pairs.by_choice(line(4)) == [(0, (1, 2, 3)), (1, (0, 2, 3)), (2, (0, 1, 3)), (3, (0, 1, 2))]
     long = pairs.by_choice(line(60))
     assert [p.reference for p in long] == [*range(0, 60, 2)], "the stride is that of the other ways"
-    assert all(list(p.offered) == pairs.candidate_frames(line(60), p.reference) for p in long)
+    assert all(list(p.candidates) == pairs.candidate_frames(line(60), p.reference) for p in long)
     assert pairs.by_choice(line(9), steps=[4, 1, 4], stride=4) == [(0, (1, 4)), (4, (0, 3, 5, 8)), (8, (4, 7))]
     lost = line(5, number=torch.tensor([0, 1, 4, 5, 9]))
     assert pairs.by_choice(lost, steps=(1, 4)) == [(0, (1, 2)), (1, (0, 3)), (2, (0, 3)), (3, (1, 2, 4)), (4, (3,))]
@@ -124,7 +124,7 @@ def test_by_choice_offers_every_anchor_the_frames_around_it() -> None:
 def test_past_frames_alone_leave_the_first_without_an_anchor() -> None:
     assert pairs.by_choice(line(4), past=True) == [(1, (0,)), (2, (0, 1)), (3, (0, 1, 2))]
     assert pairs.by_choice(line(2), past=True) == [(1, (0,))]
-    assert all(max(p.offered) < p.reference > 0 for p in pairs.by_choice(line(40), past=True))
+    assert all(max(p.candidates) < p.reference > 0 for p in pairs.by_choice(line(40), past=True))
     far = line(3, number=torch.tensor([0, 50, 51]))
     assert pairs.by_choice(far, past=True) == [(1, (0,)), (2, (1,))], "where no step fits, the nearest before it"
     with pytest.raises(ValueError, match="line has nothing before frame 0, expected a later one"):
@@ -133,9 +133,9 @@ def test_past_frames_alone_leave_the_first_without_an_anchor() -> None:
 
 def test_what_cannot_choose_takes_pairs_of_two_frames() -> None:
     assert pairs.to_fixed_pairs(pairs.by_gap(line(5), 3)) == [(0, 3), (1, 4)] == pairs.to_fixed_pairs([(0, 3), (1, 4)])
-    with pytest.raises(ValueError, match=r"pairs: found 2 frames to choose among \(pairs=auto\).*pairs=gap, time or"):
+    with pytest.raises(ValueError, match=r"pairs: found 2 candidate frames \(pairs=auto\).*pairs=gap, time or"):
         pairs.to_fixed_pairs(pairs.by_choice(line(3)))
-    assert pairs.Pair(0, 3).offered == () and pairs.Pair(*(0, (1, 2))).offered == (1, 2)
+    assert pairs.Pair(0, 3).candidates == () and pairs.Pair(*(0, (1, 2))).candidates == (1, 2)
 
 
 def test_views_between_are_different_and_end_at_the_other() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import io
 import pickle
 import struct
@@ -13,35 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.pickled_values import plain_values
 
 from dhtorch.data.codecs import pickles
 from dhtorch.data.io.decode import FormatError
 
 FILE = Path("some.npy")
 FLAG: list[str] = []
-
-
-def plain() -> dict[str, Any]:
-    """Everything that is admitted."""
-    return {
-        "750612070851": [{"timestamp": 1_600_000_000_000, "tcp": np.arange(7.0), "ft": np.float64(2.5)}] * 2,
-        "numbers": (0, 1, 255, 256, 65536, -1, -(2**31), 2**40, 2**62, 1.5, float("inf"), True, False, None),
-        "texts": ["", "é", "x" * 300, b"", b"\x00\xff", bytes(range(256))],
-        "arrays": [
-            np.zeros((0, 3)),
-            np.array(3.0),
-            np.asfortranarray(np.arange(6).reshape(2, 3)),
-            np.arange(3, dtype=">i4"),
-            np.array(["ab", "c"]),
-            np.array([True, False]),
-            np.float16([1, 2]),
-        ],
-        "scalars": [np.int64(3), np.float32(0.5), np.str_("hey"), np.bool_(True)],
-        "objects": np.array([None, {"x": 1}], dtype=object),
-        "set": {1, 2},
-        "ordered": collections.OrderedDict(a=1),
-        "empty": [{}, [], ()],
-    }
 
 
 def same(a: Any, b: Any) -> bool:
@@ -60,10 +37,10 @@ def same(a: Any, b: Any) -> bool:
 
 @pytest.mark.parametrize("protocol", [2, 3, 4, 5])
 def test_plain_data_comes_back(protocol: int) -> None:
-    content = pickle.dumps(plain(), protocol)
-    assert same(pickles.load_pickle(content, FILE), plain())
+    content = pickle.dumps(plain_values(), protocol)
+    assert same(pickles.load_pickle(content, FILE), plain_values())
     old = content.replace(b"numpy._core.", b"numpy.core.") if protocol < 4 else None  # as numpy 1 wrote it
-    assert old is None or same(pickles.load_pickle(old, FILE), plain())
+    assert old is None or same(pickles.load_pickle(old, FILE), plain_values())
 
 
 def test_short_names_of_numpy_1() -> None:
@@ -308,11 +285,6 @@ def test_no_header_raises_anything_else(tmp_path: Path, version: int) -> None:
         with pytest.raises(FormatError, match=r"x.npy: (header|header shape|data): found ") as caught:
             pickles.read_npy(tmp_path / "x.npy")
         assert "\n" not in str(caught.value)
-
-
-def hostile_sample(root: Path) -> Path:
-    np.save(root / "x.npy", plain(), allow_pickle=True)
-    return root / "x.npy"
 
 
 def test_a_minute_of_robot() -> None:

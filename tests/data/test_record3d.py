@@ -1,4 +1,4 @@
-"""Record3D: its three layouts written from a known room and read back, the real piece, the cable, every trap."""
+"""Record3D: its three layouts written from a known room and read back, a real one, live frames, and damaged ones."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from support.box_scene import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
+from support.record3d_captures import DEPTH_HW, HW, camera_of, r3d_archive, rgbd_video, walk
 
 from dhtorch import data, pytree
 from dhtorch import testing as writers
@@ -27,32 +28,13 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import record3d_video
 from dhtorch.data.readers.record3d_live import LiveFrames
 from dhtorch.geometry import camera as cameras
-from dhtorch.records import Camera, Frame
+from dhtorch.records import Frame
 
 lzfse = pytest.importorskip("lzfse")
 OpenEXR = pytest.importorskip("OpenEXR")
 pytest.importorskip("av")
 
 ROOT = os.environ.get("DHTORCH_DATA")
-HW, DEPTH_HW = (48, 64), (24, 32)
-
-
-def camera_of(i: int, hw: tuple[int, int] = HW) -> Camera:
-    """Autofocus: another K in every frame."""
-    c = [[33.5 + 0.25 * i, 21.75] if hw == HW else [21.75 + 0.25 * i, 33.5]]
-    return Camera(torch.tensor([[61.5 + i, 58.25 - i]]), torch.tensor(c))
-
-
-def walk(n: int = 3, hw: tuple[int, int] = HW, depth_hw: tuple[int, int] = DEPTH_HW) -> list[Frame]:
-    """Pictures with a smaller depth map, confidence and poses, as a phone with a LiDAR makes them."""
-    frames = []
-    for i in range(n):
-        camera = camera_of(i, hw)
-        shot = render(camera, pose(i), hw, 100 + i / 60)
-        small = render(cameras.resize(camera, hw, depth_hw), pose(i), depth_hw)
-        conf = (torch.arange(math.prod(depth_hw)).view(1, *depth_hw) % 3).to(torch.uint8)
-        frames.append(shot.replace(depth=small.depth, conf=conf))
-    return frames
 
 
 def same_scene(recording: data.Recording, frames: list[Frame], relative: float = 1e-6) -> None:
@@ -69,11 +51,6 @@ def same_scene(recording: data.Recording, frames: list[Frame], relative: float =
         torch.testing.assert_close(got.T_world_from_cam.t, want.T_world_from_cam.t, atol=1e-12, rtol=0)
         assert float(off_wall(world_points(own_camera(got))).max()) < 2 * relative + 1e-5
     assert disagreement(own_camera(recording[0]), own_camera(recording[1]))[0] < 0.04
-
-
-def r3d(tmp_path: Path, frames: list[Frame] | None = None, **options: Any) -> Path:
-    writers.write_r3d(tmp_path / "a.r3d", frames or walk(), **options)
-    return tmp_path / "a.r3d"
 
 
 def rewrite(archive: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
@@ -106,7 +83,7 @@ def table(**changes: Any) -> Callable[[dict[str, bytes]], None]:
 def test_archive_gives_back_the_scene(tmp_path: Path, portrait: bool, method: int) -> None:
     turn = slice(None, None, -1 if portrait else None)
     frames = walk(3, HW[turn], DEPTH_HW[turn])
-    recording = data.open(r3d(tmp_path, frames, compression=method))
+    recording = data.open(r3d_archive(tmp_path, frames, compression=method))
     assert data.recognise(tmp_path / "a.r3d") == ("record3d", ".r3d archive")
     assert recording.report == () and recording.rate_hz == 60 and recording.number.tolist() == [0, 1, 2]
     same_scene(recording, frames)
@@ -117,7 +94,7 @@ def test_archive_gives_back_the_scene(tmp_path: Path, portrait: bool, method: in
 
 
 def test_unpacked_archive(tmp_path: Path) -> None:
-    archive = r3d(tmp_path)
+    archive = r3d_archive(tmp_path)
     with zipfile.ZipFile(archive) as packed:
         packed.extractall(tmp_path / "folder")
     same_scene(data.open(tmp_path / "folder"), walk())
@@ -152,7 +129,7 @@ def test_exr_channel(tmp_path: Path) -> None:
 
 def test_frames_count_as_numbers(tmp_path: Path) -> None:
     frames = walk(12)
-    recording = data.open(r3d(tmp_path, frames))
+    recording = data.open(r3d_archive(tmp_path, frames))
     assert recording.number.tolist() == list(range(12))  # "10" comes before "2" as a text
     same_scene(recording, frames)
 
@@ -164,12 +141,12 @@ def test_what_means_nothing_changes_nothing(tmp_path: Path) -> None:
         table(initPose=[0.5, 0.5, 0.5, 0.5, 1, 2, 3])(members)
         members |= {"sound.m4a": b"1", "rgbd/.DS_Store": b"1", "rgbd/x.jpg": b"1", "__MACOSX/rgbd/._9.jpg": b"1"}
 
-    same_scene(data.open(rewrite(r3d(tmp_path), change)), walk())
+    same_scene(data.open(rewrite(r3d_archive(tmp_path), change)), walk())
 
 
 def test_K_is_stored_column_after_column(tmp_path: Path) -> None:
     frames = walk(2)
-    archive = r3d(tmp_path, frames, per_frame=False)
+    archive = r3d_archive(tmp_path, frames, per_frame=False)
     K = cameras.to_matrix(frames[0].camera)[0]
     for frame in data.open(archive):
         torch.testing.assert_close(cameras.to_matrix(frame.camera)[0], K)
@@ -179,14 +156,14 @@ def test_K_is_stored_column_after_column(tmp_path: Path) -> None:
 
 
 def test_intrinsics_of_each_frame_or_of_the_first(tmp_path: Path) -> None:
-    archive = r3d(tmp_path)
+    archive = r3d_archive(tmp_path)
     assert [float(f.camera.f[0, 0]) for f in data.open(archive)] == [61.5, 62.5, 63.5]
     assert [float(f.camera.f[0, 0]) for f in data.open(archive, per_frame=False)] == [61.5] * 3
 
 
 def test_K_follows_the_true_size_of_the_picture(tmp_path: Path) -> None:
     frames = walk(2)
-    archive = r3d(tmp_path, frames, declared_hw=(96, 128))
+    archive = r3d_archive(tmp_path, frames, declared_hw=(96, 128))
     with zipfile.ZipFile(archive) as packed:
         meta = json.loads(packed.read("metadata"))
     assert (meta["w"], meta["h"]) == (128, 96) and meta["K"][0] == 123
@@ -199,30 +176,30 @@ def test_old_files_do_not_say_how_large_depth_is(tmp_path: Path, size: tuple[int
     hw, depth_hw = ((64, 48), size) if portrait else ((48, 64), size[::-1])
     depth = torch.linspace(0.5, 3, math.prod(size)).view(1, *depth_hw)
     frames = [f.replace(depth=depth, conf=None) for f in walk(1, hw, (8, 6) if portrait else (6, 8))]
-    assert torch.equal(data.open(r3d(tmp_path, frames, depth_size=False))[0].depth, depth)
+    assert torch.equal(data.open(r3d_archive(tmp_path, frames, depth_size=False))[0].depth, depth)
 
 
 def test_unknown_depth_size(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match=r"0.depth: depth: found 3072 bytes, expected dw and dh in the metadata"):
-        data.open(r3d(tmp_path, depth_size=False))
+        data.open(r3d_archive(tmp_path, depth_size=False))
 
 
 def test_front_camera_has_neither_confidence_nor_poses(tmp_path: Path) -> None:
     frames = [f.replace(conf=None, T_world_from_cam=None) for f in walk()]
-    recording = data.open(r3d(tmp_path, frames))
+    recording = data.open(r3d_archive(tmp_path, frames))
     assert recording.poses is None and recording[1].T_world_from_cam is None and recording[1].conf is None
-    assert recording.report == ("every pose is the identity: the device had none",)
+    assert recording.report == ("every pose is the identity: no tracking",)
     assert data.open(tmp_path / "a.r3d", poses=False).report == ()
 
 
 def test_a_standing_camera_keeps_its_poses(tmp_path: Path) -> None:
     frames = [f.replace(T_world_from_cam=pose(1)) for f in walk()]
-    recording = data.open(r3d(tmp_path, frames))
+    recording = data.open(r3d_archive(tmp_path, frames))
     assert recording.poses is not None and recording.report == ()
 
 
 def test_lost_tracking_and_short_tables(tmp_path: Path) -> None:
-    archive = r3d(tmp_path, walk(6))
+    archive = r3d_archive(tmp_path, walk(6))
     with zipfile.ZipFile(archive) as packed:
         meta = json.loads(packed.read("metadata"))
     rows = meta["poses"]
@@ -239,10 +216,10 @@ def test_lost_tracking_and_short_tables(tmp_path: Path) -> None:
 
 
 def test_time_stamps_that_do_not_increase(tmp_path: Path) -> None:
-    archive = rewrite(r3d(tmp_path), table(frameTimestamps=[5.0, 4.0, 6.0]))
+    archive = rewrite(r3d_archive(tmp_path), table(frameTimestamps=[5.0, 4.0, 6.0]))
     recording = data.open(archive)
     torch.testing.assert_close(recording.times, torch.arange(3).double() / 60)
-    assert recording.report == ("time stamps do not increase: the frame rate counts instead",)
+    assert recording.report == ("time stamps do not increase: the frame rate is used instead",)
     recording = data.open(rewrite(archive, table(fps=None)))
     assert recording.times is None and recording.report == ("time stamps do not increase: there are no times",)
     recording = data.open(rewrite(archive, table(frameTimestamps=[7.0, 7.5, 9.0])))
@@ -252,7 +229,7 @@ def test_time_stamps_that_do_not_increase(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"w": None, "h": None}, r"metadata: w, h: found nothing, expected the size of the pictures"),
+        ({"w": None, "h": None}, r"metadata: w, h: found nothing, expected the size of the images"),
         ({"w": 1e9}, r"metadata: w: found 1000000000.0"),
         ({"dw": 0.5}, r"metadata: dw, dh: found 0.5x24, expected whole numbers"),
         ({"fps": math.inf}, r"metadata: fps: found inf"),
@@ -264,7 +241,7 @@ def test_time_stamps_that_do_not_increase(tmp_path: Path) -> None:
     ],
 )
 def test_unsound_tables(tmp_path: Path, change: dict[str, Any], message: str) -> None:
-    archive = rewrite(r3d(tmp_path), table(**change))
+    archive = rewrite(r3d_archive(tmp_path), table(**change))
     with pytest.raises(FormatError, match=message):
         list(data.open(archive))
 
@@ -281,7 +258,7 @@ def test_what_is_missing_or_damaged_is_left_out_and_reported(tmp_path: Path) -> 
         members["rgbd/5.depth"] = members["rgbd/5.depth"][:-7]
         members["rgbd/6.conf"] = b""
 
-    archive = rewrite(r3d(tmp_path, walk(8)), damage)
+    archive = rewrite(r3d_archive(tmp_path, walk(8)), damage)
     recording = data.open(archive)
     assert recording.number.tolist() == [0, 7]
     assert recording.report == (
@@ -295,7 +272,7 @@ def test_what_is_missing_or_damaged_is_left_out_and_reported(tmp_path: Path) -> 
 
 
 def test_damage_inside_is_found_when_read_or_when_verified(tmp_path: Path) -> None:
-    archive = r3d(tmp_path, walk(4))
+    archive = r3d_archive(tmp_path, walk(4))
     with zipfile.ZipFile(archive) as packed:
         at = packed.getinfo("rgbd/2.depth").header_offset + 200
     whole = bytearray(archive.read_bytes())
@@ -303,14 +280,16 @@ def test_damage_inside_is_found_when_read_or_when_verified(tmp_path: Path) -> No
     archive.write_bytes(bytes(whole))
     recording = data.open(archive)
     assert len(recording) == 4 and len([recording[i] for i in (0, 1, 3)]) == 3
-    with pytest.raises(FormatError, match=r"a.r3d/rgbd/2.depth: data: found .* check sum"):
+    with pytest.raises(FormatError, match=r"a.r3d/rgbd/2.depth: data: found .* checksum"):
         recording[2]
     verified = data.open(archive, verify=True)
     assert verified.number.tolist() == [0, 1, 3] and verified.report == ("frame 2: damaged: left out",)
 
 
 def test_the_first_frame_damaged(tmp_path: Path) -> None:
-    archive = rewrite(r3d(tmp_path), lambda members: members.update({"rgbd/0.jpg": b"\xff\xd8 no picture \xff\xd9"}))
+    archive = rewrite(
+        r3d_archive(tmp_path), lambda members: members.update({"rgbd/0.jpg": b"\xff\xd8 no picture \xff\xd9"})
+    )
     assert data.open(archive, verify=True).number.tolist() == [1, 2]
 
 
@@ -322,7 +301,7 @@ def test_depth_without_a_return(tmp_path: Path) -> None:
         members["rgbd/1.depth"] = depth.tobytes()  # not compressed at all
         members["rgbd/2.conf"] = lzfse.compress(bytes([3]) * math.prod(DEPTH_HW))
 
-    recording = data.open(rewrite(r3d(tmp_path), odd))
+    recording = data.open(rewrite(r3d_archive(tmp_path), odd))
     for i in (0, 1):
         depth = recording[i].depth[0]
         assert depth[0, :5].tolist() == [0] * 5 and bool((depth.flatten()[5:] == 1.5).all())
@@ -337,13 +316,13 @@ def test_names_that_lead_out_of_the_archive_are_not_frames(tmp_path: Path) -> No
         for part in ("jpg", "depth", "conf"):
             members[f"../rgbd/9.{part}"] = members[f"/rgbd/9.{part}"] = members[f"rgbd/0.{part}"]
 
-    archive = rewrite(r3d(tmp_path), lead_out)
+    archive = rewrite(r3d_archive(tmp_path), lead_out)
     assert data.open(archive).number.tolist() == [0, 1, 2]
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a.r3d", "secret.jpg"]
 
 
 def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    archive = r3d(tmp_path, walk(5))
+    archive = r3d_archive(tmp_path, walk(5))
     monkeypatch.setattr(files, "decode_image", lambda *_: pytest.fail("decoded a picture"))
     monkeypatch.setattr("dhtorch.data.codecs.lzfse.decompress_lzfse", lambda *_: pytest.fail("unpacked depth"))
     assert len(data.open(archive)) == 5
@@ -352,19 +331,9 @@ def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 # --------------------------------------------------------------------------------------------------------- RGBD mp4
 
 
-def film(tmp_path: Path, n: int = 3, **options: Any) -> tuple[Path, list[Frame]]:
-    """A room of 1 to 2.6 m, so that no colour lies near the ends of the range."""
-    hw = (96, 128)
-    camera = cameras.resize(camera_of(0), HW, hw)
-    frames = [render(camera, pose(i), hw, i / 30) for i in range(n)]
-    frames = [f.replace(depth=(f.depth * 0.6).clamp(0.2, 2.7)) for f in frames]
-    writers.write_record3d_mp4(tmp_path / "a.mp4", frames, **options)
-    return tmp_path / "a.mp4", frames
-
-
 @pytest.mark.parametrize("depth_range", [None, (0.0, 4.5), (0.15, 2.9)])
 def test_mp4_gives_back_the_scene(tmp_path: Path, depth_range: tuple[float, float] | None) -> None:
-    file, frames = film(tmp_path, depth_range=depth_range)
+    file, frames = rgbd_video(tmp_path, depth_range=depth_range)
     recording = data.open(file)
     assert data.recognise(file) == ("record3d", "an mp4 with an intrinsicMatrix at its end")
     assert recording.poses is None and recording.report == ("no poses in this layout",) and len(recording) == 3
@@ -409,7 +378,7 @@ def test_mp4_colours_are_not_blended_on_the_way(tmp_path: Path, stored: str) -> 
 
 
 def test_mp4_intrinsics_beside_it_or_nowhere(tmp_path: Path) -> None:
-    file, frames = film(tmp_path, 2)
+    file, frames = rgbd_video(tmp_path, 2)
     whole = file.read_bytes()
     at = whole.rindex(b'{"intrinsicMatrix"')
     meta = json.loads(whole[at:-1])
@@ -548,7 +517,7 @@ def test_live_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
         LiveFrames()
 
 
-# ------------------------------------------------------------------------------------------------------ real, hostile
+# --------------------------------------------------------------------------------------------------------------- real
 
 
 @pytest.mark.data
@@ -572,15 +541,3 @@ def test_real_export() -> None:
     agree, count = disagreement(a, b)
     assert agree < 0.04 and count > 40_000
     assert disagreement(turned_over(a), turned_over(b))[0] > 0.15  # so the check above can tell
-
-
-def hostile_archive(root: Path) -> Path:
-    return r3d(root)
-
-
-def hostile_exr(root: Path) -> None:
-    writers.write_record3d_exr(root, walk())
-
-
-def hostile_mp4(root: Path) -> Path:
-    return film(root)[0]

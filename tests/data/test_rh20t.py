@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.rh20t_frames import BASE, CAMERA, FIXED, HAND, HW, moving, still
 
 pytest.importorskip("av")
 
-from support import damage_harness as hostile
 from support.box_scene import off_wall, pose, render, world_points
 
 from dhtorch import data
@@ -25,14 +25,9 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import rh20t, rh20t_robot
 from dhtorch.data.readers.rh20t_robot import ROBOT_ARMS, RobotStream
 from dhtorch.geometry import se3
-from dhtorch.records import Camera, Frame
+from dhtorch.records import Frame
 from dhtorch.testing.lossless import write_lossless
 from dhtorch.testing.rh20t import to_robot_notation, write_rh20t
-
-HW = (36, 64)
-CAMERA = Camera(torch.tensor([[50.0, 48.0]]), torch.tensor([[33.5, 16.75]]))
-FIXED, HAND = "750612070851", ROBOT_ARMS[1].in_hand[0]
-BASE = se3.to_matrix(se3.exp(torch.tensor([[0.4, -0.2, 0.9, 0.7, -0.3, 0.5]]).double()))[0].numpy()
 
 
 @pytest.fixture(autouse=True)
@@ -42,14 +37,6 @@ def _clean() -> Iterator[None]:
 
 
 # ------------------------------------------------------------------------------------------------------ written scenes
-
-
-def still(n: int = 3, start: float = 1_600_000_100.0) -> list[Frame]:
-    return [render(CAMERA, pose(2), HW, start + i / 10) for i in range(n)]
-
-
-def moving(n: int = 3, start: float = 1_600_000_100.0) -> list[Frame]:
-    return [render(CAMERA, pose(i), HW, start + i / 10) for i in range(n)]
 
 
 def scene(tmp_path: Path, **options: object) -> Path:
@@ -170,7 +157,7 @@ def test_stamps_that_do_not_fit_the_video_are_reported(tmp_path: Path) -> None:
     assert len(recording) == 3 and "4 color stamps for 3 frames" in recording.report[1]
     np.save(file, {"color": [stamps[0], stamps[0], stamps[2]], "depth": []}, allow_pickle=True)
     recording = data.open(root, serials=[FIXED])
-    assert recording.number.tolist() == [0, 2] and "1 color frame whose stamp is not later" in recording.report[1]
+    assert recording.number.tolist() == [0, 2] and "1 color frame with a time stamp not later" in recording.report[1]
 
 
 def test_outliers_of_a_lossy_high_byte_are_dropped(tmp_path: Path) -> None:
@@ -235,7 +222,7 @@ def test_a_human_shows_the_task(tmp_path: Path, lacking: tuple[str, ...]) -> Non
     if lacking:
         what = "tcp.npy" if "calib" in lacking else "tcp_base.npy"
         assert recordings[HAND].poses is None and rh20t.read_robot_streams(root) == {}
-        assert recordings[HAND].report == (f"camera {HAND} is on the hand and there is no {what}: no poses",)
+        assert recordings[HAND].report == (f"camera {HAND} is on the hand, without {what}: no poses",)
         torch.testing.assert_close(recordings[HAND][1].depth, moving()[1].depth, atol=0.5e-3 + 1e-6, rtol=0)
     else:
         same_scene(recordings[HAND], moving())
@@ -287,7 +274,7 @@ def test_frames_in_a_gap_of_the_tcp_are_left_out(tmp_path: Path) -> None:
     same_scene(recording, moving()[:2])
     file.unlink()
     recording = data.open(root, serials=[HAND])
-    assert recording.poses is None and "there is no tcp_base.npy: no poses" in recording.report[0]
+    assert recording.poses is None and "without tcp_base.npy: no poses" in recording.report[0]
 
 
 @pytest.mark.parametrize("configuration", [1, 3, 5, 6])
@@ -318,7 +305,7 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
         data.open(root, serials=[HAND])
     meta = json.loads((root / "metadata.json").read_text())
     (root / "metadata.json").write_text(json.dumps({**meta, "bad_calib_view": [FIXED]}))
-    assert data.open(root).report[1] == f"camera {FIXED}: metadata doubts its calibration"
+    assert data.open(root).report[1] == f"camera {FIXED}: calibration marked as bad in the metadata"
     for value in (-1, "../../x", None, 1.5):
         (root / "metadata.json").write_text(json.dumps({"calib": value}))
         with pytest.raises(FormatError, match=r"metadata.json: calib"):
@@ -338,15 +325,6 @@ def test_folder_without_a_configuration_is_taken_to_stand_still(tmp_path: Path) 
     recording = data.open(root, serials=[FIXED])
     assert "unknown configuration" in recording.report[0]
     same_scene(data.open(root, serials=[HAND], configuration=1), moving())
-
-
-def hostile_sample(root: Path) -> Path:
-    return write_rh20t(root, {FIXED: still(2), HAND: moving(2)}, T_world_from_base=BASE)
-
-
-def read_all(root: Path) -> None:
-    hostile.read_all(root)
-    rh20t.read_robot_streams(root)
 
 
 def test_a_large_array_where_a_pose_is_expected_is_named_by_its_shape(tmp_path):

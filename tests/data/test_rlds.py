@@ -1,4 +1,4 @@
-"""RLDS data sets in TFRecord files: written with known geometry, read back, the real ones, and damaged."""
+"""RLDS data sets in TFRecord files: written with known geometry and read back, real ones, and damaged ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.box_scene import CAMERA, HW, pose, render
+from support.box_scene import HW
+from support.robot_episodes import three_episodes
 
 from dhtorch import data
 from dhtorch.cli import inspect
@@ -21,7 +22,6 @@ from dhtorch.data.intrinsics import MissingIntrinsicsError
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import rlds
 from dhtorch.pipeline.presets import METHODS
-from dhtorch.records import Frame
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.testing import write_rlds
 from dhtorch.testing.parts import encode_depth_codes
@@ -31,27 +31,13 @@ needs_data = pytest.mark.skipif(not ROOT.is_dir(), reason="DHTORCH_DATA has no r
 FILE = "tiny_robot-train.tfrecord-00000-of-00001"
 
 
-def episodes() -> list[list[Frame]]:
-    return [[render(CAMERA, pose(5 * e + i), HW, i / 30) for i in range(2 + e)] for e in range(3)]
-
-
-def hostile_sample(root: Path) -> Path:
-    write_rlds(root / "1.0.0", episodes()[:2])
-    return root / "1.0.0"
-
-
-def hostile_array(root: Path) -> Path:
-    write_rlds(root / "1.0.0", episodes()[:1], depth="array", said=False)
-    return root / "1.0.0"
-
-
 # ---------------------------------------------------------------------------------------------------- written
 
 
 @pytest.mark.parametrize("depth", ["png", "array", None])
 @pytest.mark.parametrize("said", [True, False])
 def test_what_is_written_is_read(depth: str | None, said: bool, tmp_path: Path) -> None:
-    want = episodes()
+    want = three_episodes()
     write_rlds(tmp_path, want, depth=depth, shards=2, said=said)  # type: ignore[arg-type]
     found = data.open_all(tmp_path, rate_hz=30)
     assert data.recognise(tmp_path)[0] == "rlds" and len(found) == 3
@@ -69,7 +55,7 @@ def test_what_is_written_is_read(depth: str | None, said: bool, tmp_path: Path) 
 
 
 def test_options(tmp_path: Path) -> None:
-    write_rlds(tmp_path, episodes(), depth="array", intrinsics=False, poses=False)
+    write_rlds(tmp_path, three_episodes(), depth="array", intrinsics=False, poses=False)
     one = data.open(tmp_path, episode=2, K=[100, 100, 32, 24])
     assert (
         one.name == "tiny_robot/train_000002/image_0" and one.episode == 2 and one.poses is None and one.times is None
@@ -100,7 +86,7 @@ def test_options(tmp_path: Path) -> None:
 
 
 def test_an_episode_is_read_when_it_is_asked_for(tmp_path: Path) -> None:
-    write_rlds(tmp_path, episodes())
+    write_rlds(tmp_path, three_episodes())
     file = tmp_path / FILE
     spans = tfrecord.index_records(file)
     raw = bytearray(file.read_bytes())
@@ -108,11 +94,11 @@ def test_an_episode_is_read_when_it_is_asked_for(tmp_path: Path) -> None:
     file.write_bytes(raw)
     found = data.open_all(tmp_path)
     assert len(found[0]) == 2 and len(found[2]) == 4
-    with pytest.raises(FormatError, match=r"record at byte \d+: found check sum [0-9a-f]{8}, expected [0-9a-f]{8}"):
+    with pytest.raises(FormatError, match=r"record at byte \d+: found checksum [0-9a-f]{8}, expected [0-9a-f]{8}"):
         found[1]
 
 
-# ---------------------------------------------------------------------------------------------------- check sums, messages
+# ---------------------------------------------------------------------------------------------------- checksums, messages
 
 
 def test_check_sums() -> None:
@@ -147,16 +133,16 @@ def record(body: bytes) -> bytes:
         (b"", "found 0 bytes|records: found none"),
         (b"12345", "a TFRecord header of 12"),
         (record(b"abc")[:-1], "record 0"),
-        (struct.pack("<Q", 3) + b"\0\0\0\0abc\0\0\0\0", "wrong check sum of its length"),
-        (record(b"")[:8] + b"\0" * 8, "wrong check sum"),
+        (struct.pack("<Q", 3) + b"\0\0\0\0abc\0\0\0\0", "wrong checksum of its length"),
+        (record(b"")[:8] + b"\0" * 8, "wrong checksum"),
         (record(struct.pack("<Q", 1 << 62)), "observation/image_0: found nothing"),
         (record(b"\x0a\xff\xff\xff\xff\x0f"), "a field of"),
-        (record(b"\x0a" + b"\xff" * 12), "does not end"),
+        (record(b"\x0a" + b"\xff" * 12), "unterminated number"),
         (record(b"\x0b"), "wire type 3"),
     ],
 )
 def test_no_records(content: bytes, said: str, tmp_path: Path) -> None:
-    write_rlds(tmp_path, episodes()[:1])
+    write_rlds(tmp_path, three_episodes()[:1])
     (tmp_path / FILE).write_bytes(content)
     with pytest.raises(FormatError, match=said):
         _ = data.open_all(tmp_path, fov=60.0)[0]
@@ -177,7 +163,7 @@ def test_whole_numbers_of_all_sizes(tmp_path: Path) -> None:
 
 
 def test_a_set_that_says_nothing(tmp_path: Path) -> None:
-    write_rlds(tmp_path, episodes()[:1])
+    write_rlds(tmp_path, three_episodes()[:1])
     said = json.loads((tmp_path / "features.json").read_text())
     for content in ({}, {"featuresDict": {"features": {}}}, []):
         (tmp_path / "features.json").write_text(json.dumps(content))
@@ -239,7 +225,7 @@ def test_the_bridge_set_can_be_looked_at(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_sets_are_recognised_by_both_files(tmp_path: Path) -> None:
-    write_rlds(tmp_path, episodes()[:1])
+    write_rlds(tmp_path, three_episodes()[:1])
     assert rlds.recognise(tmp_path) is not None
     (tmp_path / "features.json").unlink()
     assert rlds.recognise(tmp_path) is None

@@ -1,18 +1,18 @@
-"""Stray Scanner: captures written from a known room and read back, the real piece, every trap."""
+"""Stray Scanner: captures of a known room written and read back, a real one, and damaged ones."""
 
 from __future__ import annotations
 
 import os
 import pickle
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from support.box_scene import disagreement, off_wall, own_camera, pose, render, turned_over, world_points
+from support.box_scene import disagreement, off_wall, own_camera, pose, turned_over, world_points
+from support.stray_frames import DEPTH_HW, HW, camera_of, walk
 
 from dhtorch import data, pytree
 from dhtorch import testing as writers
@@ -20,29 +20,12 @@ from dhtorch.data.codecs import video as codec_video
 from dhtorch.data.io.decode import FormatError
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
-from dhtorch.records import Camera, Frame, Pose
+from dhtorch.records import Frame, Pose
 
 pytest.importorskip("av")
 
 ROOT = os.environ.get("DHTORCH_DATA")
-HW, DEPTH_HW = (72, 96), (24, 32)
 STEP = 1e-3  # m, of the depth codes
-
-
-def camera_of(i: int) -> Camera:
-    return Camera(torch.tensor([[80.0 + i, 78.5 - i]]), torch.tensor([[50.25, 33.5 + 0.25 * i]]))
-
-
-def walk(n: int = 4, place: Callable[[int], Pose] = pose) -> list[Frame]:
-    """Pictures with a smaller depth map, confidence and poses, at 60 Hz; the phone has been on for three days."""
-    frames = []
-    for i in range(n):
-        camera = camera_of(i)
-        shot = render(camera, place(i), HW, 258528.330141458 + i / 60)
-        small = render(cameras.resize(camera, HW, DEPTH_HW), place(i), DEPTH_HW)
-        conf = (torch.arange(24 * 32).view(1, *DEPTH_HW) % 3).to(torch.uint8)
-        frames.append(shot.replace(depth=small.depth, conf=conf))
-    return frames
 
 
 def same_scene(recording: data.Recording, frames: list[Frame], image: float = 12) -> None:
@@ -65,7 +48,7 @@ def picture_error(a: Frame, b: Frame) -> float:
 
 
 def steady(i: int) -> Pose:
-    """So fast that a picture too early or too late is plainly wrong."""
+    """Pose ``i`` of a motion so fast that the picture before or after is clearly another."""
     return se3.exp(torch.tensor([[0.0, 0.12 * i, 0.05 * i, 0.05 * i, 0.0, 0.0]]).double())
 
 
@@ -125,7 +108,7 @@ def test_new_odometry_has_K_in_every_row_and_empty_cells(tmp_path: Path) -> None
 
 
 def test_K_of_another_size(tmp_path: Path) -> None:
-    """A capture whose video was made smaller keeps its K: the option says for which size."""
+    """A capture whose video was made smaller keeps its K: an option gives the size of K."""
     frames = walk(2)
     writers.write_stray(tmp_path, [f.replace(camera=cameras.resize(f.camera, HW, (1440, 1920))) for f in frames])
     camera = data.open(tmp_path, K_hw=(1440, 1920))[0].camera
@@ -186,8 +169,8 @@ def test_first_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Fram
     recording = data.open(tmp_path)
     assert recording.number.tolist() == list(range(1, 9))
     assert recording.report == (
-        "rgb.mp4 lacks its first picture (the edges of depth and picture say so)",
-        "frame 0: no picture: left out",
+        "rgb.mp4 lacks its first frame (by the edges of depth and image)",
+        "frame 0: no image: left out",
     )
     pictures = [f.image if f.image.dtype == torch.uint8 else f.image * 255 for f in room]
     assert all(
@@ -195,7 +178,7 @@ def test_first_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Fram
     )
     torch.testing.assert_close(recording.poses.t[0], room[1].T_world_from_cam.t[0].double())
     other = data.open(tmp_path, lost_first=False)
-    assert other.number.tolist() == list(range(8)) and "its last picture (option lost_first)" in other.report[0]
+    assert other.number.tolist() == list(range(8)) and "its last frame (option lost_first)" in other.report[0]
 
 
 def test_last_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Frame]) -> None:
@@ -204,7 +187,7 @@ def test_last_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Frame
     (tmp_path / "short" / "rgb.mp4").rename(tmp_path / "long" / "rgb.mp4")
     recording = data.open(tmp_path / "long")
     assert recording.number.tolist() == list(range(8))
-    assert recording.report[0] == "rgb.mp4 lacks its last picture (the edges of depth and picture say so)"
+    assert recording.report[0] == "rgb.mp4 lacks its last frame (by the edges of depth and image)"
     assert data.open(tmp_path / "long", lost_first=True).number.tolist() == list(range(1, 9))
 
 
@@ -214,13 +197,13 @@ def test_longer_or_much_shorter_videos(tmp_path: Path) -> None:
         writers.write_stray(tmp_path / name, frames[:count], per_frame=True)
     (tmp_path / "film" / "rgb.mp4").replace(tmp_path / "rows" / "rgb.mp4")
     recording = data.open(tmp_path / "rows")
-    assert recording.report == ("rgb.mp4 has 6 pictures for 4 rows: the shorter counts",)
+    assert recording.report == ("rgb.mp4 has 6 frames for 4 rows: the shorter is used",)
     same_scene(recording, frames[:4])
     (tmp_path / "short" / "rgb.mp4").replace(tmp_path / "rows" / "rgb.mp4")
     recording = data.open(tmp_path / "rows")
     assert recording.report == (
-        "rgb.mp4 has 2 pictures for 4 rows: the shorter counts",
-        "2 frames (2, 3): no picture: left out",
+        "rgb.mp4 has 2 frames for 4 rows: the shorter is used",
+        "2 frames (2, 3): no image: left out",
     )
     same_scene(recording, frames[:2])
 
@@ -256,7 +239,7 @@ def test_missing_parts_keep_the_rest_in_step(tmp_path: Path) -> None:
 def test_no_video(tmp_path: Path) -> None:
     frames = walk()
     writers.write_stray(tmp_path, frames, per_frame=True, video=False)
-    expected = "rgb.mp4: file: found no such file, expected .*images=False reads depth alone"
+    expected = "rgb.mp4: file: found no such file, expected .*images=False reads depth only"
     with pytest.raises(FormatError, match=expected):
         data.open(tmp_path)
     recording = data.open(tmp_path, images=False, K_hw=HW)
@@ -270,7 +253,7 @@ def test_no_video(tmp_path: Path) -> None:
 def test_distortion_tables_are_reported(tmp_path: Path) -> None:
     writers.write_stray(tmp_path, walk(2))
     (tmp_path / "distortion").mkdir()
-    assert data.open(tmp_path).report == ("distortion/ holds lens tables of each frame: they are not applied",)
+    assert data.open(tmp_path).report == ("distortion/ has lens tables of each frame: they are not applied",)
 
 
 def test_cut_off_last_row_and_stamps_out_of_order(tmp_path: Path) -> None:
@@ -335,7 +318,7 @@ def test_unsound_files(tmp_path: Path) -> None:
         data.open(tmp_path)
 
 
-# ------------------------------------------------------------------------------------------------------ real, hostile
+# --------------------------------------------------------------------------------------------------------------- real
 
 
 @pytest.mark.data
@@ -355,11 +338,3 @@ def test_real_capture() -> None:
     agree, count = disagreement(a, b)
     assert agree < 0.02 and count > 40_000
     assert disagreement(turned_over(a), turned_over(b))[0] > 0.15  # so the check above can tell
-
-
-def hostile_new(root: Path) -> None:
-    writers.write_stray(root, walk(), per_frame=True)
-
-
-def hostile_old(root: Path) -> None:
-    writers.write_stray(root, walk(), depth_format="npy", codec="libx265", first_picture="lost")

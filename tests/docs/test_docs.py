@@ -52,7 +52,7 @@ def text_of(page):
 def test_there_is_a_page_for_every_promise(site):
     _, pages = site
     assert {p.relative_to(DOCS).with_suffix(".html").as_posix() for p in DOCS.rglob("*.md")} <= set(pages)
-    for module in ("pair", "stages", "geometry", "transform", "data", "studies", "synthetic"):
+    for module in ("pipeline", "stages", "geometry", "transforms", "data", "experiments", "synthetic"):
         assert f"api/{module}.html" in pages
 
 

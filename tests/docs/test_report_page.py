@@ -269,11 +269,11 @@ def test_negative_results_stand_beside_the_papers_figure():
     oracle = "side from an oracle"
     assert beside("defocus", oracle, "corr", "oracle_side.corr") == "0.66"
     assert beside("defocus", oracle, "|ρ| of blur", "oracle_side.rho_abs") == "0.22"
-    assert beside("defocus", "side by height in the picture", "corr", "by_height.corr") == "0.06"
+    assert beside("defocus", "side by height in the image", "corr", "by_height.corr") == "0.06"
     assert beside("focus_stack", "clean", "Spearman", "clean.rank_corr") == "0.69"
     field = "optics of a light field"
     assert beside("focus_stack", field, "sign flipped", "light_field.flip_share") == "∼1/5"
-    assert beside("focus_stack", field, "|corr|, surest quarter", "light_field.gated_abs_corr") == "0.21"
+    assert beside("focus_stack", field, "|corr|, most confident quarter", "light_field.gated_abs_corr") == "0.21"
     assert beside("defocus_fusion", "bilinear", "corr", "bilinear.corr") == "0.82–0.99"
 
 
@@ -293,7 +293,7 @@ def test_a_stack_of_one_measure_and_a_sweep_have_the_tables_that_they_can_have()
 
 def test_what_one_picture_cannot_tell_apart_has_a_table_of_its_own():
     rows = {row[0]: row[1:] for row in layouts.layout_tables(archived.defocus())[1].rows}
-    assert rows["in focus, soft paint"] == ["2.40", "0.00"] and rows["nearer than the focus"] == ["1.66", "1.69"]
+    assert rows["in focus, soft texture"] == ["2.40", "0.00"] and rows["nearer than the focus"] == ["1.66", "1.69"]
 
 
 def test_what_was_not_measured_says_why():
@@ -360,7 +360,7 @@ def titles(result):
 
 def test_figures_are_those_that_the_numbers_allow():
     shared = ["Risk against coverage", "Error against distance", "Coverage against distance", "Reliability"]
-    assert titles(archived.pair()) == [*shared, "What became of the samples"]
+    assert titles(archived.pair()) == [*shared, "Source or gate of the samples"]
     assert "Cutoff sweep" in titles(archived.range_split()) and "Latency" in titles(archived.latency())
     assert "Motion dependence" in titles(archived.motion()) and "Threshold on the score" in titles(
         archived.calibration()
@@ -408,7 +408,7 @@ def test_an_overlay_draws_every_point_once_in_its_class():
     assert len(drawn["recovered"].uv) == source.count(Source.RECOVERED)
     assert drawn["recovered"].colour == colours.RECOVERED
     silent = [g for s, g in zip(source, gate, strict=True) if s == Source.NONE]
-    assert len(drawn["silent: parallax"].uv) == silent.count(Gate.PARALLAX)
+    assert len(drawn["unanswered: parallax"].uv) == silent.count(Gate.PARALLAX)
     assert sum(len(layer.uv) for layer in drawn.values()) == len(source)
     assert {key.text for key in figure.legend} >= set(drawn)
     svg = drawing.render_inline_svg(figure.panels[0])

@@ -28,8 +28,8 @@ SAYS_SO = re.compile(
     r"|\bverified\b|\bequal to `+(?:cv2|kornia|poselib|scipy|sklearn|torch)\b|`(?:cv2|kornia|poselib|scipy|sklearn)\.",
     re.I,
 )
-PAGE_SAYS_SO = re.compile(r"\b(?:checked|tested|verified|validated)\b", re.I)
-TEST = re.compile(r"tests/test_\w+\.py")
+PAGE_SAYS_SO = re.compile(r"\b(?:checked|tested|verified)\b", re.I)
+TEST = re.compile(r"tests/(?:\w+/)?test_\w+\.py")
 
 
 def sentences(text: str) -> list[str]:
@@ -74,7 +74,9 @@ def used(tree: ast.AST) -> set[str]:
 
 def read_with(path: Path) -> list[ast.Module]:
     """A file of tests and the helpers beside it that it imports."""
-    helpers = (path.with_name(f"{name}.py") for name in sorted(roots(parsed(path))))
+    imports = (node for node in ast.walk(parsed(path)) if isinstance(node, ast.ImportFrom))
+    names = {n.module for n in imports if (n.module or "").startswith("support.")}
+    helpers = (REPO / "tests" / f"{name.replace('.', '/')}.py" for name in sorted(names))
     return [parsed(path), *(parsed(helper) for helper in helpers if helper.is_file())]
 
 

@@ -1,4 +1,4 @@
-"""Focal stacks: written in each format and read back, refocused light fields against exact ones, the traps, the real pieces."""
+"""Focal stacks: every format written and read back, refocused light fields, damaged files, real stacks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import OpenEXR
 import pytest
 import tifffile
 import torch
-from torch import Tensor
+from support.focal_stacks import light_field, random_stack, texture
 
 from dhtorch import data
 from dhtorch.cli import run
@@ -22,20 +22,12 @@ from dhtorch.data.codecs import hdf5, npy, tiff
 from dhtorch.experiments.focal import ddff12, fod500, formats, image_folder
 from dhtorch.experiments.focal import writers as stack_writers
 from dhtorch.experiments.focal.light_field import refocus
-from dhtorch.experiments.focal.stacks import FocalStack, FocalStacks
+from dhtorch.experiments.focal.stacks import FocalStacks
 
 ROOT = os.environ.get("DHTORCH_DATA")
 real = pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
 
 FOCUS = (0.1, 0.15, 0.3, 0.7, 1.5)
-
-
-def stack(seed: int, slices: int = 5, hw: tuple[int, int] = (12, 16), depth: bool = True) -> FocalStack:
-    draw = torch.Generator().manual_seed(seed)
-    images = torch.randint(0, 256, (1, slices, 3, *hw), generator=draw).to(torch.uint8)
-    metres = 0.2 + 2.5 * torch.rand(1, *hw, generator=draw)
-    metres[:, 2, 3] = 0
-    return FocalStack(images, depth=metres.half().float() if depth else None)
 
 
 def fails(message: str, root: Path, **options: object) -> None:
@@ -49,7 +41,7 @@ def fails(message: str, root: Path, **options: object) -> None:
 
 
 def test_fod500_gives_back_pictures_depth_and_lens(tmp_path: Path) -> None:
-    want = {0: stack(0), 7: stack(7), 400: stack(400)}
+    want = {0: random_stack(0), 7: random_stack(7), 400: random_stack(400)}
     stack_writers.write_fod500(tmp_path, want)
     stacks = formats.open_stacks(tmp_path)
     assert stacks.format == "fod500" and stacks.names == ("000000", "000007", "000400") and stacks.report == ()
@@ -62,7 +54,7 @@ def test_fod500_gives_back_pictures_depth_and_lens(tmp_path: Path) -> None:
 
 
 def test_fod500_clips_and_masks_depth(tmp_path: Path) -> None:
-    made = stack(0)
+    made = random_stack(0)
     depth = made.depth.clone()
     depth[0, 0, :4] = torch.tensor([5.0, math.nan, -1.0, math.inf])
     stack_writers.write_fod500(tmp_path, {0: made.replace(depth=depth)})
@@ -71,7 +63,7 @@ def test_fod500_clips_and_masks_depth(tmp_path: Path) -> None:
 
 
 def test_fod500_sample_that_lacks_something_is_left_out_and_shifts_nothing(tmp_path: Path) -> None:
-    want = {i: stack(i) for i in range(4)}
+    want = {i: random_stack(i) for i in range(4)}
     stack_writers.write_fod500(tmp_path, want)
     (tmp_path / "000001_02All.tif").unlink()
     (tmp_path / "000002Dpt.exr").unlink()
@@ -88,22 +80,22 @@ def test_fod500_sample_that_lacks_something_is_left_out_and_shifts_nothing(tmp_p
 
 
 def test_fod500_reads_the_red_channel_of_pictures_of_any_kind(tmp_path: Path) -> None:
-    stack_writers.write_fod500(tmp_path, {0: stack(0)})
+    stack_writers.write_fod500(tmp_path, {0: random_stack(0)})
     planes = {c: np.full((12, 16), v, np.float16) for c, v in (("R", 1.5), ("G", 2.5), ("B", 0.5))}
     OpenEXR.File({"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}, planes).write(
         str(tmp_path / "000000Dpt.exr")
     )
-    picture = stack(3).images[0, 0].permute(1, 2, 0).numpy()
+    picture = random_stack(3).images[0, 0].permute(1, 2, 0).numpy()
     tifffile.imwrite(tmp_path / "000000_00All.tif", picture, compression="lzw", predictor=True, photometric="rgb")
     got = formats.open_stacks(tmp_path)[0]
-    assert bool((got.depth == 1.5).all()) and torch.equal(got.images[0, 0], stack(3).images[0, 0])
+    assert bool((got.depth == 1.5).all()) and torch.equal(got.images[0, 0], random_stack(3).images[0, 0])
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "float32"])
 @pytest.mark.parametrize("compression", [None, "gzip"])
 def test_ddff12_gives_back_stacks_and_depth(dtype: str, compression: str | None, tmp_path: Path) -> None:
-    train, val = [stack(i, 10) for i in range(3)], [stack(9, 10)]
-    test = [stack(20, 10, depth=False)]
+    train, val = [random_stack(i, 10) for i in range(3)], [random_stack(9, 10)]
+    test = [random_stack(20, 10, depth=False)]
     file = tmp_path / "ddff.h5"
     stack_writers.write_ddff12(file, {"train": train, "val": val, "test": test}, dtype=dtype, compression=compression)
     stacks = formats.open_stacks(file)
@@ -137,7 +129,7 @@ def test_ddff12_in_full_size_has_its_camera_and_opening_reads_no_picture(
 
 
 def test_ddff12_values_and_keys_as_they_come(tmp_path: Path) -> None:
-    made = stack(0, 10)
+    made = random_stack(0, 10)
     pixels = made.images.permute(0, 1, 3, 4, 2).numpy()
     with h5py.File(tmp_path / "a.h5", "w") as group:
         group["stacks_train"] = pixels.astype("f8") / 255  # the name in the authors' notes
@@ -150,7 +142,7 @@ def test_ddff12_values_and_keys_as_they_come(tmp_path: Path) -> None:
 
 
 def test_image_folder_counts_as_people_do(tmp_path: Path) -> None:
-    made = stack(0, 12)
+    made = random_stack(0, 12)
     stack_writers.write_image_folder(tmp_path, made)
     stacks = formats.open_stacks(tmp_path)
     assert stacks.format == "images" and len(stacks) == 1
@@ -175,22 +167,6 @@ def test_image_folder_of_sixteen_bits_and_alpha(tmp_path: Path) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------- light fields
-
-
-def texture(y: Tensor, x: Tensor) -> Tensor:
-    """(…, 3) smooth but lively, 0 to 255, nothing above 0.3 cycles a pixel."""
-    waves = [torch.sin(1.7 * x + 0.3 * y), torch.sin(1.1 * y - 0.9 * x), torch.sin(1.8 * y + 0.2 * x)]
-    return 127.5 + 110 * torch.stack(waves, -1)
-
-
-def light_field(disparity: Tensor, hw: tuple[int, int], n: int = 9) -> Tensor:
-    """(n, n, H, W, 3) of surfaces whose disparity depends on the column of the centre picture, exactly."""
-    y, x = torch.meshgrid(
-        torch.arange(hw[0], dtype=torch.float64), torch.arange(hw[1], dtype=torch.float64), indexing="ij"
-    )
-    step = torch.arange(n, dtype=torch.float64) - (n - 1) / 2
-    views = [[texture(y + disparity * u, x + disparity * v) for v in step] for u in step]
-    return torch.stack([torch.stack(row) for row in views]).round().to(torch.uint8)
 
 
 def test_refocus_restores_what_lies_at_its_disparity() -> None:
@@ -248,12 +224,12 @@ def test_ddff12_stacks_of_one_room_are_one_scene(tmp_path: Path) -> None:
     assert formats.open_stacks(tmp_path / "raw", split="test").by_scene() == {"test/library": [0]}
 
     file = tmp_path / "a.h5"
-    stack_writers.write_ddff12(file, {"train": [stack(i, 10) for i in range(5)], "val": [stack(9, 10)]})
+    stack_writers.write_ddff12(file, {"train": [random_stack(i, 10) for i in range(5)], "val": [random_stack(9, 10)]})
     assert formats.open_stacks(file).by_scene() == {"train": [0, 1, 2, 3, 4], "val": [5]}, "which rooms is not said"
     known = formats.open_stacks(file, per_scene=2, split="train").by_scene()
     assert known == {"train/scene_00": [0, 1], "train/scene_01": [2, 3], "train/scene_02": [4]}
     fails("option per_scene: found 0, expected at least 1", file, per_scene=0)
-    stack_writers.write_fod500(tmp_path / "fod", {0: stack(0), 7: stack(7)})
+    stack_writers.write_fod500(tmp_path / "fod", {0: random_stack(0), 7: random_stack(7)})
     assert formats.open_stacks(tmp_path / "fod").by_scene() == {"000000": [0], "000007": [1]}, "each a scene of its own"
     with pytest.raises(ValueError, match="found 1 scene of 2 stacks, expected one for each"):
         FocalStacks("x", "images", raw.load, ("a", "b"), scenes=("room",))
@@ -273,17 +249,17 @@ def test_ddff12_raw_without_its_depth_is_left_out(tmp_path: Path) -> None:
 
 
 def test_opening_decodes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stack_writers.write_fod500(tmp_path / "a", {0: stack(0)})
-    stack_writers.write_ddff12(tmp_path / "b.h5", {"train": [stack(0, 10)]})
+    stack_writers.write_fod500(tmp_path / "a", {0: random_stack(0)})
+    stack_writers.write_ddff12(tmp_path / "b.h5", {"train": [random_stack(0, 10)]})
     for module, name in ((tiff, "read_tiff"), (fod500.exr, "read_exr"), (hdf5.Hdf5Array, "row")):
         monkeypatch.setattr(module, name, lambda *a, **k: 1 / 0)
     assert len(formats.open_stacks(tmp_path / "a")) == len(formats.open_stacks(tmp_path / "b.h5")) == 1
 
 
 WRITTEN = {
-    "fod500": lambda root: stack_writers.write_fod500(root, {0: stack(0), 1: stack(1)}),
-    "ddff12": lambda root: stack_writers.write_ddff12(root / "a.h5", {"val": [stack(0, 10)]}),
-    "images": lambda root: stack_writers.write_image_folder(root, stack(0, 5)),
+    "fod500": lambda root: stack_writers.write_fod500(root, {0: random_stack(0), 1: random_stack(1)}),
+    "ddff12": lambda root: stack_writers.write_ddff12(root / "a.h5", {"val": [random_stack(0, 10)]}),
+    "images": lambda root: stack_writers.write_image_folder(root, random_stack(0, 5)),
 }
 
 
@@ -300,8 +276,8 @@ def test_a_job_of_pairs_says_why_not(
     monkeypatch.chdir(tmp_path)
     assert run.main(["data=auto", f"data.root={root}", "pairs.gap=1", "holdout.cutoff=1.0"]) != 0
     said = " ".join(capsys.readouterr().err.split())
-    expected = "expected a recording whose camera moves; experiment=focus_stack data=stacks reads them"
-    assert f"sweep holds focal stacks ({name}), pictures of one view, {expected}" in said
+    expected = "expected a recording of a moving camera; for focal stacks use experiment=focus_stack data=stacks"
+    assert f"sweep holds focal stacks ({name}), images of one view, {expected}" in said
     assert run.main(["data=stacks", f"data.root={root}", "pairs.gap=1", "holdout.cutoff=1.0"]) != 0
     said += " ".join(capsys.readouterr().err.split())
     assert f"data: found Stacks('{formats.open_stacks(root).name}', {name}, " in said
@@ -309,9 +285,9 @@ def test_a_job_of_pairs_says_why_not(
 
 
 def test_stacks_are_a_sequence_and_pickle(tmp_path: Path) -> None:
-    stack_writers.write_fod500(tmp_path, {0: stack(0), 1: stack(1)})
+    stack_writers.write_fod500(tmp_path, {0: random_stack(0), 1: random_stack(1)})
     stacks = pickle.loads(pickle.dumps(formats.open_stacks(tmp_path)))
-    assert torch.equal(stacks[-1].images, stack(1).images) and len(list(stacks)) == 2
+    assert torch.equal(stacks[-1].images, random_stack(1).images) and len(list(stacks)) == 2
     with pytest.raises(IndexError, match="stack 2 of 2"):
         stacks[2]
     with pytest.raises(ValueError, match="found none"):
@@ -325,10 +301,10 @@ def test_bad_stacks(tmp_path: Path) -> None:
     fails(r": pictures: found 0, expected at least two", tmp_path, format="images")
     with pytest.raises(ValueError, match="format images has no option 'split', expected one of focus_m"):
         formats.open_stacks(tmp_path, "images", split="train")
-    stack_writers.write_image_folder(tmp_path, stack(0, 1))
+    stack_writers.write_image_folder(tmp_path, random_stack(0, 1))
     fails(r": pictures: found 1, expected at least two, at different focus", tmp_path, format="images")
-    stack_writers.write_image_folder(tmp_path, stack(0, 3))
-    stack_writers.write_image_folder(tmp_path / "b", stack(0, 2, hw=(12, 17)))
+    stack_writers.write_image_folder(tmp_path, random_stack(0, 3))
+    stack_writers.write_image_folder(tmp_path / "b", random_stack(0, 2, hw=(12, 17)))
     (tmp_path / "b/image2.png").rename(tmp_path / "image2.png")
     fails(
         r"image2.png: picture: found 17x12, 3 channels, .*, expected 16x12.* as image1.png", tmp_path, format="images"
@@ -338,9 +314,9 @@ def test_bad_stacks(tmp_path: Path) -> None:
 
 
 def test_bad_fod500(tmp_path: Path) -> None:
-    stack_writers.write_fod500(tmp_path, {0: stack(0)})
+    stack_writers.write_fod500(tmp_path, {0: random_stack(0)})
     fails(r"option split: found test, expected train or val", tmp_path, split="test")
-    fails(r"samples: found none whole among 1, expected 4 \*All.tif and one \*Dpt.exr", tmp_path, focus_m=FOCUS[:4])
+    fails(r"samples: found none complete among 1, expected 4 \*All.tif and one \*Dpt.exr", tmp_path, focus_m=FOCUS[:4])
     fails(r"option f_number: found 0.0, expected a positive number", tmp_path, f_number=0)
     fails(r"option max_depth: found -1.0", tmp_path, max_depth=-1)
     good = (tmp_path / "000000Dpt.exr").read_bytes()
@@ -358,7 +334,7 @@ def test_bad_ddff12(tmp_path: Path) -> None:
             for key, value in arrays.items():
                 group[key] = value
 
-    good = stack(0, 10).images.permute(0, 1, 3, 4, 2).numpy()
+    good = random_stack(0, 10).images.permute(0, 1, 3, 4, 2).numpy()
     written(stack_train=good, disp_train=np.ones((2, 12, 16)))
     fails(r"a.h5: disp_train: found shape \(2, 12, 16\), expected \(1, 12, 16\), as stack_train", file)
     written(stack_train=good[0])
@@ -398,30 +374,10 @@ def test_bad_light_field(tmp_path: Path) -> None:
 
 
 def test_a_missing_library_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stack_writers.write_ddff12(tmp_path / "a.h5", {"train": [stack(0, 10)]})
+    stack_writers.write_ddff12(tmp_path / "a.h5", {"train": [random_stack(0, 10)]})
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
     with pytest.raises(ImportError, match=r"h5py, which is not installed: pip install 'dhtorch\[data\]'"):
         formats.open_stacks(tmp_path / "a.h5")
-
-
-# ------------------------------------------------------------------------------------------------------------ hostile
-
-
-def _ddff12(root: Path) -> Path:
-    stack_writers.write_ddff12(
-        root / "a.h5", {"train": [stack(0, 10), stack(1, 10)], "val": [stack(2, 10)]}, compression="gzip"
-    )
-    return root / "a.h5"
-
-
-HOSTILE = {
-    "fod500": lambda root: stack_writers.write_fod500(root, {0: stack(0), 1: stack(1)}),
-    "ddff12": _ddff12,
-    "light_field": lambda root: stack_writers.write_light_field(
-        root, "train/a", 1, light_field(torch.tensor(0.1), (12, 16), 3), torch.ones(1, 12, 16)
-    ),
-    "images": lambda root: stack_writers.write_image_folder(root, stack(0, 3)),
-}
 
 
 # --------------------------------------------------------------------------------------------------------- real pieces

@@ -1,8 +1,8 @@
-"""The experiment on global maps: what it counts, and that its verdict can go either way."""
+"""Global maps: the counts of the experiment, and verdicts both ways."""
 
 import pytest
+from support.paper_protocol_runs import configured_method, outcome_of_rows
 from support.rooms import Changed, noted
-from test_protocols import method, rows
 
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.paper import global_map as experiment
@@ -15,7 +15,9 @@ def room(**options):
 
 
 def asked(recording):
-    return experiment.run([noted(recording, gap=2)], {"paper": method()}, by_gap, Settings(), n=700, voxel=0.03)
+    return experiment.run(
+        [noted(recording, gap=2)], {"paper": configured_method()}, by_gap, Settings(), n=700, voxel=0.03
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,7 @@ def test_four_maps_of_one_room(outcome):
     assert links == [[0, 2], [1, 3], [0, 1], [1, 2], [2, 3]]
 
 
-def test_without_a_trajectory_there_are_anchored_maps_alone():
+def test_without_a_trajectory_there_are_maps_of_estimated_poses_alone():
     blind = Changed(room(n_frames=3), poses=None)
     found = asked(blind)
     assert found.verdict == "undecided" and found.why == "no scene with a trajectory"
@@ -49,7 +51,7 @@ def test_without_a_trajectory_there_are_anchored_maps_alone():
     [(120, 9, True), (120, 5, True), (120, 4, False), (100, 9, False), (None, 9, None)],
 )
 def test_verdict_goes_either_way(voxels, islands, expected):
-    outcome = rows(
+    outcome = outcome_of_rows(
         ("a", "sensor device", experiment.MAP_TRUTH, {"n_voxels": 100, "n_islands": 5}),
         ("a", "fused device", experiment.MAP_TRUTH, {"n_voxels": voxels, "n_islands": islands}),
         ("a", "fused anchored", experiment.MAP_TRUTH, {"n_fragments": 3}),

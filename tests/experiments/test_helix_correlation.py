@@ -1,11 +1,11 @@
-"""Shifts along spiral arms where they are known: of a signal, of a picture that slides, and of one that grows."""
+"""Correlation along spiral arms: known shifts of a signal, of a moved picture and of a scaled one."""
 
 import math
 
 import pytest
 import torch
+from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
 from support.rooms import noted
-from test_protocols import method, room, rows
 
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.negative import helix_correlation as experiment
@@ -153,8 +153,8 @@ def test_a_turning_picture_is_seen_and_a_growing_one_is_not():
 
 @pytest.mark.slow
 def test_forward_motion_is_not_seen_where_plain_flow_sees_it():
-    base = method()
-    ahead = room(path="forward", step_m=0.03)
+    base = configured_method()
+    ahead = small_room(path="forward", step_m=0.03)
     up = ahead.camera.f[0, 1] * math.tan(math.radians(9))  # the viewer looks 9 degrees below where it goes
     focus = ahead.camera.c[0] - torch.tensor([0.0, float(up)])
     gaze = tuple(focus.tolist())
@@ -173,5 +173,5 @@ def test_forward_motion_is_not_seen_where_plain_flow_sees_it():
     [(0.0, 0.3, True), (0.2, 0.3, False), (0.4, 0.3, False), (-0.2, -0.1, None), (None, 0.3, None)],
 )
 def test_verdict_goes_either_way(helix, flow, expected):
-    outcome = rows(("a", "own_arm", "full", {"corr": helix}), ("a", "flow", "full", {"corr": flow}))
+    outcome = outcome_of_rows(("a", "own_arm", "full", {"corr": helix}), ("a", "flow", "full", {"corr": flow}))
     assert experiment.verdict(outcome)[0] is expected

@@ -1,9 +1,9 @@
-"""Clusters of holes where they are known, and the gaze that moves onto them."""
+"""Hole attention: clusters of holes at known places, and the gaze that moves onto them."""
 
 import pytest
 import torch
+from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
 from support.rooms import Changed
-from test_protocols import method, room, rows
 
 from dhtorch.experiments.negative import hole_attention as experiment
 from dhtorch.experiments.negative.clusters import largest_cluster
@@ -21,7 +21,7 @@ def lattice(side=20):
 
 
 def drawn(*lines):
-    """Holes (1, N) where a picture of the lattice says x."""
+    """Holes (1, N) at the places of the lattice that are marked x."""
     return torch.tensor([[c == "x" for line in lines for c in line]])
 
 
@@ -111,7 +111,7 @@ def test_no_hole_and_too_few_samples():
 
 
 def asked(*recordings, base=None, **options):
-    return experiment.run(list(recordings), {"paper": base or method()}, None, Settings(), **options)
+    return experiment.run(list(recordings), {"paper": base or configured_method()}, None, Settings(), **options)
 
 
 def shown(outcome):
@@ -126,7 +126,7 @@ def punched(frame):
 
 
 def test_a_known_region_without_returns_is_looked_at_in_vain():
-    outcome = asked(Changed(room(lidar="exact"), punched), stride=2)
+    outcome = asked(Changed(small_room(lidar="exact"), punched), stride=2)
     found = shown(outcome)
     assert found["even"]["hole_rate"] == pytest.approx(0.25, abs=0.02), "a quarter of the picture"
     assert found["attention"]["hole_rate"] > 0.5 > found["centre"]["hole_rate"]
@@ -140,7 +140,7 @@ def test_a_known_region_without_returns_is_looked_at_in_vain():
 
 
 def test_classes_and_routes_are_shares_of_the_holes():
-    outcome = asked(room(), stride=3)
+    outcome = asked(small_room(), stride=3)
     for row in outcome.rows:
         assert sum(row["hole_share"].values()) == pytest.approx(1)
         assert sum(row["route_share"].values()) == pytest.approx(1)
@@ -148,17 +148,19 @@ def test_classes_and_routes_are_shares_of_the_holes():
 
 
 def test_a_scene_without_holes_and_a_sampler_without_a_gaze():
-    full = asked(room(lidar="exact", hw=(96, 128)), stride=5)
+    full = asked(small_room(lidar="exact", hw=(96, 128)), stride=5)
     assert full.verdict == "undecided" and shown(full)["attention"]["note"] == "nothing to ask"
     with pytest.raises(ValueError, match="expected a sampler with an option gaze"):
-        asked(room(), base=method().replace(sample=regular_grid))
+        asked(small_room(), base=configured_method().replace(sample=regular_grid))
     with pytest.raises(ValueError, match="stride is 0"):
-        asked(room(), stride=0)
+        asked(small_room(), stride=0)
 
 
 @pytest.mark.parametrize(("after", "expected"), [(0.7, True), (0.5, False), (None, None)])
 def test_verdict_goes_either_way(after, expected):
-    outcome = rows(("a", "centre", "sensor", {"hole_rate": 0.6}), ("a", "attention", "sensor", {"hole_rate": after}))
+    outcome = outcome_of_rows(
+        ("a", "centre", "sensor", {"hole_rate": 0.6}), ("a", "attention", "sensor", {"hole_rate": after})
+    )
     share = {"value": 0.5}
     outcome.summary = {f"centre.route_share.{k}": share for k in ("triangulate", "change_exposure", "turn_head")}
     assert experiment.verdict(outcome)[0] is expected

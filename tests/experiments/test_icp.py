@@ -1,11 +1,11 @@
-"""ICP where the motion is known: dense clouds against a brute-force oracle, sparse sets, and what cannot be registered."""
+"""ICP with known motion: dense clouds against a brute-force search, sparse sets, and sets that cannot be registered."""
 
 import math
 
 import pytest
 import torch
+from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
 from support.rooms import Changed
-from test_protocols import method, room, rows
 
 from dhtorch.experiments.negative import icp as experiment
 from dhtorch.experiments.negative.registration import estimate_normals, register_icp
@@ -135,9 +135,9 @@ def test_empty_sets_and_bad_options_raise():
     for x, y in ((q[:, :0], q), (q, q[:, :0])):
         with pytest.raises(ValueError, match="expected at least one each"):
             register_icp(x, y, START)
-    with pytest.raises(ValueError, match="expected shares"):
+    with pytest.raises(ValueError, match="expected keep and shrink"):
         register_icp(q, q, START, keep=0.0)
-    with pytest.raises(ValueError, match="least reach up to the reach"):
+    with pytest.raises(ValueError, match="least_reach_m <= reach_m"):
         register_icp(q, q, START, reach_m=0.05)
     with pytest.raises(ValueError, match="normals_1 has shape"):
         register_icp(q, q, START, normals_1=q[:, :10])
@@ -146,11 +146,13 @@ def test_empty_sets_and_bad_options_raise():
 
 
 def asked(*recordings, **options):
-    return experiment.run(list(recordings), {"paper": method()}, None, Settings(), **{"n": 300, "links": 3, **options})
+    return experiment.run(
+        list(recordings), {"paper": configured_method()}, None, Settings(), **{"n": 300, "links": 3, **options}
+    )
 
 
 def test_the_exact_pose_cannot_be_improved_and_no_pose_can():
-    outcome = asked(room(lidar="exact", path="lateral", step_m=0.04), poor_deg=4.0, n=500, min_inlier_share=0.2)
+    outcome = asked(small_room(lidar="exact", path="lateral", step_m=0.04), poor_deg=4.0, n=500, min_inlier_share=0.2)
     found = {v: outcome.scenes(v, "trajectory")["synthetic_room"] for v in experiment.VARIANTS}
     assert found["good"]["drift_rel"] < 1e-9 and found["good"]["right_share"] == 1
     assert found["good + icp points"]["drift_rel"] > 0.001 and found["good + icp points"]["right_share"] < 1
@@ -162,7 +164,7 @@ def test_the_exact_pose_cannot_be_improved_and_no_pose_can():
 
 
 def test_links_without_confidence_leave_the_map_and_keep_the_pose():
-    recording = room(lidar="exact")
+    recording = small_room(lidar="exact")
     outcome = asked(recording, min_inlier_share=1.01)
     found = {v: outcome.scenes(v, "trajectory")["synthetic_room"] for v in experiment.VARIANTS}
     alone, refined = found["good"], found["good + icp points"]
@@ -173,12 +175,12 @@ def test_links_without_confidence_leave_the_map_and_keep_the_pose():
 
 
 def test_a_scene_without_trajectory_or_depth_has_no_answer():
-    blind, empty = Changed(room(), poses=None), room(lidar=None)
+    blind, empty = Changed(small_room(), poses=None), small_room(lidar=None)
     assert experiment.verdict(asked(blind))[0] is None
     silent = asked(empty)
     assert silent.verdict == "undecided" and silent.rows[0]["note"] == "nothing to ask" and len(silent.rows) == 9
     with pytest.raises(ValueError, match="found 1 frame of synthetic_room and links=10, expected at least two"):
-        asked(room(hw=(96, 128), n_frames=1), links=10)
+        asked(small_room(hw=(96, 128), n_frames=1), links=10)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +189,7 @@ def test_a_scene_without_trajectory_or_depth_has_no_answer():
 )
 def test_verdict_goes_either_way(covered, nearer, expected):
     refined = {"n_voxels": covered, "confident_share": 0.5, "n_pairs": 1}
-    outcome = rows(
+    outcome = outcome_of_rows(
         ("a", "good", "trajectory", {"n_voxels": 100}),
         ("a", "good + icp points", "trajectory", refined),
         ("a", "none", "trajectory", {"drift_rel": 0.2}),

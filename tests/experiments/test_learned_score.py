@@ -71,7 +71,7 @@ def test_it_learns_what_makes_answers_err_and_foresees_the_mean_error():
         assert float(expected[some].mean() / unseen.error[some].clamp(max=1).mean()) == pytest.approx(1, abs=0.15)
     once, again = (train_score([made_up(200), made_up(200, seed=1)], steps=3).state_dict() for _ in range(2))
     assert all(torch.equal(a, b) for a, b in zip(once.values(), again.values(), strict=True))
-    with pytest.raises(ValueError, match="no answer with truth"):
+    with pytest.raises(ValueError, match="no answer with ground truth"):
         train_score([LabelledAnswers(torch.zeros(0, 8), torch.zeros(0))])
 
 

@@ -108,7 +108,7 @@ def test_bars_of_many_views_are_higher():
 def test_silent_and_left_out_scenes_are_named():
     found = replace(judged(), left_out={"map": ["terrace"]}, silent={"map.5": ["desk"]})
     why = method_comparison.verdict(found, ["map"], set())[1]
-    assert "without ratio: terrace" in why and "map.5 % risk silences desk" in why
+    assert "without ratio: terrace" in why and "map.5 % risk: no answer on desk" in why
 
 
 def test_nothing_to_compare_is_an_error():

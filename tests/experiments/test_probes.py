@@ -72,7 +72,7 @@ def test_shards_of_other_blocks_are_refused():
     x = torch.zeros(2, 3)
     with probing.ProbeShards() as shards:
         shards.add(probing.ProbeShard("a", {"context": x}, x, x[:, 0] > 0))
-        with pytest.raises(ValueError, match="as before"):
+        with pytest.raises(ValueError, match="as in the earlier groups"):
             shards.add(probing.ProbeShard("b", {"context": x[:, :2]}, x, x[:, 0] > 0))
 
 

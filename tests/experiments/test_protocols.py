@@ -1,13 +1,9 @@
-"""The experiments of the paper on small rooms: cohorts, variants, what is hidden, and verdicts that go either way."""
-
-from functools import cache
+"""Experiments of the paper on small rooms: cohorts, variants, hidden returns, and verdicts both ways."""
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
+from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
 from support.rooms import Changed, noted, untold
-from support.rooms import room as rendered
 
 from dhtorch.cli.run import config_dir, main
 from dhtorch.data.pairs import by_gap
@@ -23,7 +19,7 @@ from dhtorch.experiments.paper import (
     range_split,
     real_holes,
 )
-from dhtorch.experiments.protocol import Batch, Outcome, Settings
+from dhtorch.experiments.protocol import Batch, Settings
 from dhtorch.geometry import se3
 from dhtorch.metrics import holdout
 from dhtorch.metrics.correlation import _ranks
@@ -31,24 +27,9 @@ from dhtorch.records import Pose
 from dhtorch.runtime import results as result_files
 
 
-@cache
-def composed(name):
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
-        return compose("run", [f"method={name}", "method.n=1024"]).method
-
-
-def method(name="paper"):
-    return instantiate(composed(name), _convert_="all")
-
-
-def room(**options):
-    """Two pairs."""
-    return rendered(**{"hw": (192, 256), "n_frames": 5, **options})
-
-
 def asked(experiment, *rooms, **options):
-    scenes = [noted(each, gap=3) for each in rooms or [room()]]
-    return experiment.run(scenes, {"paper": method()}, by_gap, Settings(), **options)
+    scenes = [noted(each, gap=3) for each in rooms or [small_room()]]
+    return experiment.run(scenes, {"paper": configured_method()}, by_gap, Settings(), **options)
 
 
 def scene(outcome, variant, cohort="full"):
@@ -63,14 +44,14 @@ def batch_of(recording, i=0, j=3):
     )
 
 
-def test_set_b_is_hidden_from_the_method_and_judged_by_its_returns():
-    recording, seen = room(), {}
+def test_set_b_is_hidden_from_the_method_and_measured_by_its_returns():
+    recording, seen = small_room(), {}
 
     def pose(samples, tracks, *rest, **options):
         seen.setdefault("xyz", samples.xyz)
         return base.pose(samples, tracks, *rest, **options)
 
-    base = method()
+    base = configured_method()
     split = HeldOut(base, seed=3)
     trace = {}
     variant = split.variant().method.replace(pose=pose)
@@ -88,7 +69,7 @@ def test_set_b_is_hidden_from_the_method_and_judged_by_its_returns():
 
 
 def test_heldout_rows_and_strict_line():
-    outcome = asked(heldout, room(lidar="exact"))
+    outcome = asked(heldout, small_room(lidar="exact"))
     row = scene(outcome, "paper", "heldout")
     assert (
         row["passes"] is True
@@ -105,18 +86,13 @@ def test_heldout_rows_and_strict_line():
 
 
 def test_recovered_holes_reach_beyond_the_sensor():
-    row = scene(asked(heldout, room(range_limit=2.0)), "paper", "heldout")
+    row = scene(asked(heldout, small_room(range_limit=2.0)), "paper", "heldout")
     assert row["n_recovered"] > 300 and row["reach_p95_m"] > 1.3 * row["returns_max_m"] > 1.3 * 1.5
-
-
-def rows(*entries):
-    base = {"pair": None, "role": None}
-    return Outcome(rows=[base | dict(zip(("scene", "method", "truth"), e[:3], strict=True)) | e[3] for e in entries])
 
 
 def test_verdict_of_heldout_goes_either_way():
     def outcome(naive, honest, passed):
-        return rows(
+        return outcome_of_rows(
             ("a", "m", "cyclic", {"median_rel": naive}), ("a", "m", "heldout", {"median_rel": honest, "passes": passed})
         )
 
@@ -127,7 +103,7 @@ def test_verdict_of_heldout_goes_either_way():
 
 
 def test_range_split_has_one_cohort_for_all_variants():
-    recording = room(trajectory_axes="gl", trajectory_offset_deg=5.0)
+    recording = small_room(trajectory_axes="gl", trajectory_offset_deg=5.0)
     outcome = asked(range_split, recording, cutoffs=(1.5,), cutoff_factors=(1.25,))
     five = ("sensor_only", "device_raw", "device_gl_to_cv", "no_gates", "gated")
     found = {v: scene(outcome, v) for v in five}
@@ -159,23 +135,23 @@ def test_verdict_of_range_split_goes_either_way(changed, expected):
 
 
 def test_a_scene_without_a_trajectory_or_truth_says_so():
-    blind = Changed(room(), lambda f: f.replace(T_world_from_cam=None), poses=None)
+    blind = Changed(small_room(), lambda f: f.replace(T_world_from_cam=None), poses=None)
     outcome = asked(range_split, blind, cutoff_factors=())
     assert scene(outcome, "device_raw")["note"] == "no device trajectory"
     assert scene(outcome, "gated")["n_candidates"] > 0
-    outcome = asked(real_holes, untold(room()))
+    outcome = asked(real_holes, untold(small_room()))
     assert outcome.verdict == "undecided" and scene(outcome, "gated", "real_holes")["note"] == "no independent truth"
 
 
 def test_real_holes_are_drop_outs_with_known_depth():
-    recording = room()
+    recording = small_room()
     outcome = asked(real_holes, recording)
     row, hidden = scene(outcome, "gated", "real_holes"), scene(outcome, "gated", "full")
     assert 0 < row["n_candidates"] < hidden["n_candidates"]
     assert row["n_dropped"]["excluded"] > 0 and "drop-outs on 1 of 1 scenes" in outcome.why
 
     def verdict(real, hidden, kept=5):
-        found = rows(("a", "gated", "real_holes", {"n_candidates": 9, "n_kept": kept}))
+        found = outcome_of_rows(("a", "gated", "real_holes", {"n_candidates": 9, "n_kept": kept}))
         found.summary = {"gated.median_rel": {"value": real}, "gated.full.median_rel": {"value": hidden}}
         return real_holes.verdict(found)
 
@@ -184,29 +160,29 @@ def test_real_holes_are_drop_outs_with_known_depth():
 
 
 def test_raw_trajectory_forgets_the_conversion_and_nothing_else():
-    recording = room(trajectory_axes="gl")
+    recording = small_room(trajectory_axes="gl")
     T, raw = trajectory_pose(batch_of(recording)), trajectory_pose(batch_of(recording), raw=True)
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
     assert torch.allclose(raw.R, flip @ T.R @ flip, atol=1e-6) and torch.allclose(raw.t, T.t @ flip, atol=1e-6)
     as_written = Pose(recording[0].T_world_from_cam.R @ flip, recording[0].T_world_from_cam.t)
     other = Pose(recording[3].T_world_from_cam.R @ flip, recording[3].T_world_from_cam.t)
     assert torch.allclose(se3.relative(as_written, other).R, raw.R, atol=1e-5)
-    same = batch_of(room())
+    same = batch_of(small_room())
     assert torch.equal(trajectory_pose(same, raw=True).R, trajectory_pose(same).R)
     none = batch_of(recording)
-    none = Batch(**{**vars(none), "anchor": none.reference.replace(T_world_from_cam=None)})
+    none = Batch(**{**vars(none), "reference": none.reference.replace(T_world_from_cam=None)})
     assert not bool(trajectory_pose_fit(none, 5).ok.any())
 
 
 def test_device_pose_measures_the_disagreement():
-    outcome = asked(device_pose, room(trajectory_offset_deg=15.0, lidar="exact"))
+    outcome = asked(device_pose, small_room(trajectory_offset_deg=15.0, lidar="exact"))
     anchored, given = (scene(outcome, v, "heldout") for v in ("anchored", "device_gl_to_cv"))
     assert given["rotation_deg"] == pytest.approx(0, abs=0.05) and given["translation_m"] == pytest.approx(0, abs=1e-5)
     assert 3.0 < anchored["direction_deg"] < 15.0, "axes turned by 15 degrees turn the baseline by up to as much"
     assert anchored["median_rel"] < given["median_rel"]
 
     def verdict(ours, theirs):
-        found = rows(("a", "anchored", "heldout", ours), ("a", "device_gl_to_cv", "heldout", theirs))
+        found = outcome_of_rows(("a", "anchored", "heldout", ours), ("a", "device_gl_to_cv", "heldout", theirs))
         empty = {f"{v}.{k}": {"value": None} for v in ("device_raw", "device_gl_to_cv", "anchored") for k in ours}
         found.summary = empty
         return device_pose.verdict(found)[0]
@@ -217,7 +193,7 @@ def test_device_pose_measures_the_disagreement():
 
 
 def test_gates_and_gaps():
-    outcome = asked(gate_ablation, room(n_frames=7), gaps=(16,), factors=(2.0,))
+    outcome = asked(gate_ablation, small_room(n_frames=7), gaps=(16,), factors=(2.0,))
     both, free = (scene(outcome, v, "heldout") for v in ("both gates", "parallax gate off"))
     assert both["n_candidates"] == free["n_candidates"] and both["n_kept"] <= free["n_kept"]
     assert both["gate_share"]["parallax"] > 0 == free["gate_share"]["parallax"]
@@ -236,7 +212,7 @@ def test_gates_and_gaps():
 @pytest.mark.slow
 def test_recovery_rises_with_the_baseline():
     rooms = [
-        noted(Changed(room(n_frames=6, hw=(144, 192), path=path), name=f"synthetic_{path}"), gap=2)
+        noted(Changed(small_room(n_frames=6, hw=(144, 192), path=path), name=f"synthetic_{path}"), gap=2)
         for path in ("walk", "static")
     ]
     outcome = asked(motion, *rooms, factors=(0.5, 1.0, 2.0))
@@ -256,7 +232,7 @@ def test_recovery_rises_with_the_baseline():
 
     def verdict(recovered, error):
         row = {"rank_corr_recovered": recovered, "rank_corr_error": error}
-        return motion.verdict(rows(("a", "gap x1", "heldout", row)))[0]
+        return motion.verdict(outcome_of_rows(("a", "gap x1", "heldout", row)))[0]
 
     assert verdict(0.5, -0.5) is True and verdict(None, None) is None
     assert verdict(-0.5, -0.5) is False and verdict(0.5, 0.5) is False
@@ -267,7 +243,7 @@ def test_ranks_share_ties():
 
 
 def test_census_counts_every_class_once():
-    outcome = hole_census.run([room()], {"paper": method()}, by_gap, Settings(), stride=2)
+    outcome = hole_census.run([small_room()], {"paper": configured_method()}, by_gap, Settings(), stride=2)
     row = next(r for r in outcome.rows if r["pair"] is None)
     frames = [r for r in outcome.rows if r["pair"] is not None]
     assert len(frames) == 3 and row["n_samples"] == 3 * 1024
@@ -278,13 +254,15 @@ def test_census_counts_every_class_once():
     for share, hole, expected in ((0.9, 1.0, True), (0.4, 1.0, False), (0.9, 0.05, False), (None, 1.0, None)):
         values = {"hole_share.trackable_no_lidar": share, "trackability_hole": hole, "trackability_valid": 1.0}
         assert hole_census.verdict({k: {"value": v} for k, v in values.items()})[0] is expected
-    full = hole_census.run([room(lidar="exact", hw=(96, 128))], {"paper": method()}, by_gap, Settings(), stride=5)
+    full = hole_census.run(
+        [small_room(lidar="exact", hw=(96, 128))], {"paper": configured_method()}, by_gap, Settings(), stride=5
+    )
     assert full.verdict == "undecided", "no hole, no census"
 
 
 def test_calibration_reads_thresholds_off_the_same_answers():
     thresholds = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.5)
-    outcome = asked(calibration, room(lidar="exact"), thresholds=thresholds)
+    outcome = asked(calibration, small_room(lidar="exact"), thresholds=thresholds)
     row = scene(outcome, "paper")
     points = outcome.points["synthetic_room", "paper", "full"]
     counts = [int((points.answered().score >= t).sum()) for t in thresholds]
@@ -297,14 +275,16 @@ def test_calibration_reads_thresholds_off_the_same_answers():
     assert outcome.summary["paper.ece_pooled"]["value"] == pytest.approx(row["ece"])
 
     def verdict(aurc, ece):
-        found = rows(("a", "m", "full", {"aurc": aurc, "mean_risk": 0.1, "ece": ece, "monotonicity": 1.0}))
+        found = outcome_of_rows(("a", "m", "full", {"aurc": aurc, "mean_risk": 0.1, "ece": ece, "monotonicity": 1.0}))
         return calibration.verdict(found, "m")[0]
 
     assert verdict(0.05, 0.3) is True and verdict(0.05, 0.05) is False and verdict(0.2, 0.3) is False
 
 
 def test_ablation_changes_one_thing_at_a_time():
-    outcome = asked(ablation, room(lidar="exact"), n=(256,), windows=(15,), others={"opencv": method("opencv")})
+    outcome = asked(
+        ablation, small_room(lidar="exact"), n=(256,), windows=(15,), others={"opencv": configured_method("opencv")}
+    )
     variants = {r["method"] for r in outcome.rows}
     assert variants == {"paper", "sampler grid", "sampler vogel", "n 256", "window 15", "opencv", "cutoff x0.5"}
     assert scene(outcome, "n 256")["n_candidates"] < scene(outcome, "paper")["n_candidates"]
@@ -317,17 +297,17 @@ def test_ablation_changes_one_thing_at_a_time():
 
 def test_drop_outs_and_halves_refuse_wrong_shapes():
     frame, samples = (
-        room()[0],
-        HeldOut(method(), 0).whole(
-            batch_of(room()), torch.rand(1, 9, 2, generator=torch.Generator().manual_seed(0)) * 100
+        small_room()[0],
+        HeldOut(configured_method(), 0).whole(
+            batch_of(small_room()), torch.rand(1, 9, 2, generator=torch.Generator().manual_seed(0)) * 100
         ),
     )
     truth = holdout.sample_truth(frame, samples.uv)
-    with pytest.raises(ValueError, match="drop_outs"):
+    with pytest.raises(ValueError, match="select_real_holes"):
         holdout.select_real_holes(frame, samples, truth[:, :5])
     with pytest.raises(ValueError, match=r"holdout.share: found 1"):
         holdout.split_half(samples, 0, share=1)
-    with pytest.raises(ValueError, match="without_returns"):
+    with pytest.raises(ValueError, match="hide_returns"):
         holdout.hide_returns(samples, torch.zeros(1, 4, dtype=torch.bool))
 
 

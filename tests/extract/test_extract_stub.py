@@ -1,12 +1,12 @@
-"""``dhtorch extract`` in this process, with recordings of a few pixels and a method that is told what to say."""
+"""``dhtorch extract`` in this process, on recordings of a few pixels with a stub method."""
 
 import json
 from types import SimpleNamespace
 
 import pytest
 import torch
+from support.stub_recordings import Load, recording
 from support.stub_samples import N, Stub, Told
-from test_plan import Load, recording
 
 pytest.importorskip("pyarrow")
 
@@ -18,7 +18,7 @@ from dhtorch.transforms import SampleError
 
 @pytest.fixture
 def made(tmp_path, capsys):
-    """Runs an extraction of two episodes of three frames; what it said, and the loops it asked to be shown."""
+    """Function that extracts two episodes of three frames: options -> exit code, output, progress bars, folder."""
 
     def call(recordings=None, out="out", options=None, **settings):
         if recordings is None:

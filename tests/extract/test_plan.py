@@ -1,4 +1,4 @@
-"""Which rows an extraction has, and what each is made of: recordings of a few pixels, a method that is told what to say."""
+"""Rows of an extraction and the frames of each, on recordings of a few pixels with a stub method."""
 
 import pickle
 from pathlib import Path
@@ -8,58 +8,17 @@ from typing import ClassVar
 import numpy as np
 import pytest
 import torch
+from support.stub_recordings import Load, P, frame, recording, rows
 from support.stub_samples import H, K, N, Stub, Told, W, added, tiny
 
 from dhtorch import extract
-from dhtorch.data import Recording, Scene
 from dhtorch.extract import columns, plan
 from dhtorch.extract.dataset import RowDataset
 from dhtorch.records import Camera, Frame
 
-P = 6
-
-
-def frame(seed, confidence=False, bent=False, own=False):
-    """A picture of its own, depth in metres, a camera of its own."""
-    g = torch.Generator().manual_seed(seed)
-    image = torch.randint(0, 256, (1, 3, H, W), generator=g, dtype=torch.uint8)
-    depth = 0.5 + torch.rand(1, H, W, generator=g)
-    camera = Camera(torch.tensor([[K[0] + seed, K[1]]]), torch.tensor([K[2:]]))
-    if bent:
-        camera = camera.replace(distortion=torch.tensor([[0.01 * seed, 0.0, 0.0, 0.0]]))
-    conf = torch.randint(0, 3, (1, H, W), generator=g).to(torch.uint8) if confidence else None
-    return Frame(
-        image, depth, camera, Camera(torch.tensor([[9.0, 8.0]]), torch.tensor([[7.0, 6.0]])) if own else None, conf
-    )
-
-
-class Load:
-    """Frames by position; ``bad`` ones cannot be decoded. Counts what is asked for."""
-
-    def __init__(self, first=0, bad=(), error=OSError, **options):
-        self.first, self.bad, self.error, self.options = first, set(bad), error, options
-
-    def __call__(self, i):
-        if i in self.bad:
-            raise self.error(f"position {i}\n  is   damaged")
-        return frame(self.first + i, **self.options)
-
-
-def recording(n=4, numbers=None, name="one", load=None, gap=None, levels=None, **options):
-    number = torch.tensor(numbers if numbers is not None else list(range(n)))
-    made = Recording(name=name, format="made", load=load or Load(), number=number, **options)
-    return Scene(made, gap=gap, levels=levels)
-
-
-def rows(recordings, gap, method=None, wanted=None, **options):
-    method = Stub(answer=method or Told(), n=N)
-    found = columns.feature_columns(N, P)
-    made = plan.make_plan(recordings, gap, 1)
-    return RowDataset(recordings, made, wanted or found, method=method, gap=gap, tokens_hw=(H, W), **options)
-
 
 class Seen:
-    """A method that notes its two views, and answers as it was told."""
+    """A stub method that records the two views of every call."""
 
     calls: ClassVar[list] = []
 
@@ -222,7 +181,7 @@ def test_a_frame_that_cannot_be_read_says_so_and_is_no_other_view():
         rows([recording(load=Load(bad={1}, error=torch.OutOfMemoryError))], 0)[1]
 
 
-def test_many_views_are_the_nearest_first_and_the_anchor_pads():
+def test_many_views_are_the_nearest_first_and_the_reference_pads():
     method = Stub(answer=Seen(), n=N, views=2)
     one = recording(6)
     made = RowDataset(

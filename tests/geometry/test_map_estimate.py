@@ -1,11 +1,11 @@
-"""Noise, choices and the covariance of the most probable pose, against the same written out (``support/dense_reprojection.py``) and scipy."""
+"""Most probable pose: noise, choice of tracks and covariance, against ``support/dense_reprojection.py`` and scipy."""
 
 import numpy as np
 import pytest
 import torch
 from scipy.optimize import minimize
 from support import dense_reprojection as dense
-from test_map_pose import pairs
+from support.pose_problems import map_pose_inputs
 
 from dhtorch.geometry import se3
 from dhtorch.geometry.map_estimate import (
@@ -24,8 +24,8 @@ D = torch.float64
 
 
 def problem(batch=1, near=12, far=20, isotropic=0.2, seed=0, **options):
-    """Tracks as planes, the true unknowns."""
-    args, T, turn, _ = pairs(batch, near, far, seed=seed, **options)
+    """A pose problem with one plane per field, and its true unknowns."""
+    args, T, turn, _ = map_pose_inputs(batch, near, far, seed=seed, **options)
     return dense.problem_of(args, isotropic), dense.unknowns(T.R, T.t, turn)
 
 
@@ -33,7 +33,7 @@ def problem(batch=1, near=12, far=20, isotropic=0.2, seed=0, **options):
 
 
 def plain_noise(problem, at, b, rounds=3):
-    """(near, far) px², by sorting."""
+    """Noise variances (near, far) px² from sorted residuals."""
     near, far = 1.0, 1.0
     for _ in range(rounds):
         scale = torch.where(problem.far, far, near)

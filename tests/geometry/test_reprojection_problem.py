@@ -1,49 +1,15 @@
-"""Near and far tracks in one problem, against the same written out track by track (``support/dense_reprojection.py``) and autograd."""
+"""Reprojection problem of near and far tracks, against ``support/dense_reprojection.py`` (track by track) and autograd."""
 
 import numpy as np
 import pytest
 import torch
 from support import dense_reprojection as dense
+from support.pose_problems import BEHIND, BEYOND, EPIPOLE, FAR, NOISE, UNUSED, N, pose_depth_problem
 
 from dhtorch.geometry import reprojection_problem, se3
-from dhtorch.geometry.reprojection_problem import PoseDepthProblem, Unknowns
+from dhtorch.geometry.reprojection_problem import Unknowns
 
 D = torch.float64
-N = 16
-NOISE = torch.linspace(0.05, 0.4, N, dtype=D).expand(2, N)
-#: What tracks 8 to 15 are.
-FAR, BEYOND, EPIPOLE, NEARLY, BEHIND, UNUSED = (8, 9, 10), 11, 12, 13, 14, 15
-
-
-def scene(off=0.5, turn=0.02, seed=0):
-    """Two pairs with near tracks 0 to 7 and far ones, each ``off`` px beside where it belongs."""
-    g = torch.Generator().manual_seed(seed)
-    rand = lambda *s: torch.rand(*s, generator=g, dtype=D)  # noqa: E731
-    randn = lambda *s: torch.randn(*s, generator=g, dtype=D)  # noqa: E731
-    f, c = 400 + 90 * rand(2, 2), 300 + 20 * rand(2, 2)
-    T = se3.exp(torch.cat((0.1 * randn(2, 3), torch.tensor([[0.3, 0.1, 0.05], [-0.2, 0.2, 0.1]], dtype=D)), -1))
-    turn = turn * randn(2, 3)
-    ray = torch.cat((1.2 * rand(2, 2, N) - 0.6, torch.ones(2, 1, N, dtype=D)), 1)
-    ray = ray * (1 + (torch.arange(N) < 8) * rand(2, 1, N))  # rays of any length
-    q = 0.4 + 0.6 * rand(2, N)
-    q[:, 8:] = 0.2 * rand(2, 8)
-    nearest = q[:, :8].amax(-1)
-    q[:, EPIPOLE], q[:, NEARLY] = 2.1 * nearest, 1.9 * nearest
-    true = torch.where(torch.arange(N) == BEYOND, -0.3, q)
-    Y = T.R @ ray + true[:, None] * T.t[..., None]
-    height = (ray[:, 1] / ray[:, 2])[:, None]
-    Y = Y + torch.linalg.cross(height * turn[..., None], Y, dim=1)  # the rows turn
-    uv = Y[:, :2] / Y[:, 2:] * f[..., None] + c[..., None]
-    ray[:, :, BEHIND] *= -1
-    L = torch.tril(randn(2, N, 2, 2)) + torch.eye(2, dtype=D)
-    S = L @ L.mT
-    uv = uv + off * randn(2, 2, N)
-    number = torch.arange(N).expand(2, N)
-    near, far = (number < 8) | (number == BEHIND), (number >= 8) & (number < BEHIND)
-    variance = (0.02 * (1 + rand(2, N))) ** 2
-    variance[:, 3] = 0
-    shape = torch.stack((S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]), 1)
-    return PoseDepthProblem(f, c, ray, uv, q, variance, shape, near, far), Unknowns(T, turn)
 
 
 def every(problem, at):
@@ -54,7 +20,7 @@ def every(problem, at):
 
 
 def test_pixels_are_turned_back_by_their_row():
-    problem, at = scene()
+    problem, at = pose_depth_problem()
     y = problem.ray[:, 1] / problem.ray[:, 2]
     found = reprojection_problem.undo_rolling_shutter(problem.uv, problem.f, problem.c, y, at.shutter_rate)
     for b in range(2):
@@ -77,7 +43,7 @@ def test_pixels_are_turned_back_by_their_row():
 
 
 def test_tracks_are_linearised_at_their_inverse_depths():
-    problem, at = scene()
+    problem, at = pose_depth_problem()
     linear = reprojection_problem.linearise_tracks(problem, at)
     for b, tracks in enumerate(every(problem, at)):
         f = problem.f[b].numpy()
@@ -95,14 +61,14 @@ def test_tracks_are_linearised_at_their_inverse_depths():
 
 
 def test_far_tracks_are_not_believed_without_a_near_one_to_bound_them():
-    problem, at = scene()
+    problem, at = pose_depth_problem()
     alone = problem.replace(near=problem.near & False)
     assert not reprojection_problem.linearise_tracks(alone, at).front[:, list(FAR)].any()
 
 
 def test_whitened_rows_have_the_gram_matrix_of_the_eliminated_problem():
     """Six columns of the pose, three of the turn and the residual; far, near, known and unbounded inverse depths."""
-    problem, at = scene()
+    problem, at = pose_depth_problem()
     linear = reprojection_problem.linearise_tracks(problem, at)
     rows, squares = (
         reprojection_problem.whitened_residuals(problem, linear, NOISE),
@@ -118,7 +84,7 @@ def test_whitened_rows_have_the_gram_matrix_of_the_eliminated_problem():
 
 
 def test_without_baseline_a_pixel_tells_nothing_of_depth_and_counts_in_full():
-    problem, at = scene()
+    problem, at = pose_depth_problem()
     at = at._replace(T=se3.Pose(at.T.R, 0 * at.T.t))
     linear = reprojection_problem.linearise_tracks(problem, at)
     squares = reprojection_problem.squared_residuals(problem, linear, NOISE)
@@ -133,7 +99,7 @@ def test_without_baseline_a_pixel_tells_nothing_of_depth_and_counts_in_full():
 
 def test_a_baseline_of_a_tenth_of_a_millimetre_is_one():
     """The inverse depth of a far track is then free by metres, and yet eliminated."""
-    problem, at = scene(off=0.0, turn=0.0)
+    problem, at = pose_depth_problem(off=0.0, turn=0.0)
     at = at._replace(T=se3.Pose(at.T.R, 3e-4 * at.T.t))
     Y = at.T.R @ problem.ray + problem.inverse[:, None] * at.T.t[..., None]
     uv = Y[:, :2] / Y[:, 2:] * problem.f[..., None] + problem.c[..., None]
@@ -150,7 +116,7 @@ def test_a_baseline_of_a_tenth_of_a_millimetre_is_one():
 
 
 def test_without_a_turn_the_equations_are_those_of_the_pose_at_a_turn_of_zero():
-    problem, at = scene(turn=0.0)
+    problem, at = pose_depth_problem(turn=0.0)
     weight, precision = torch.tensor([0.3, 0.7], dtype=D), torch.tensor([2e3, 5e4], dtype=D)
     normal, cost = reprojection_problem.pose_normal_equations_at(
         problem, NOISE, weight, precision, kernel="cauchy", bend=1.5
@@ -163,12 +129,12 @@ def test_without_a_turn_the_equations_are_those_of_the_pose_at_a_turn_of_zero():
     for x in (at, still, at._replace(shutter_rate=None)):
         assert torch.equal(cost(x), normal(x).cost)
     moved, ok = reprojection_problem.unknowns_step(at._replace(shutter_rate=None), pose.H, pose.g)
-    assert moved.turn is None and ok.all() and not torch.equal(moved.T.R, at.T.R)
+    assert moved.shutter_rate is None and ok.all() and not torch.equal(moved.T.R, at.T.R)
 
 
 @pytest.mark.parametrize("kernel", [None, "huber", "cauchy", "geman_mcclure"])
 def test_normal_equations_are_the_schur_complement_of_one_with_all_inverse_depths(kernel):
-    problem, at = scene()
+    problem, at = pose_depth_problem()
     weight, precision = torch.tensor([0.3, 0.7], dtype=D), torch.tensor([2e3, 5e4], dtype=D)
     cost, H, g = reprojection_problem.pose_normal_equations(
         problem, at, NOISE, weight, precision, kernel=kernel, bend=1.5
@@ -188,7 +154,7 @@ def test_normal_equations_are_the_schur_complement_of_one_with_all_inverse_depth
 def test_the_gradient_is_half_that_of_the_cost(kernel):
     """By autograd, with a turn and a prior that holds it; exact where near depths are, to first order in the turn."""
     for turn, rtol in ((0.0, 1e-6), (0.003, 0.03)):
-        problem, at = scene(off=0.3, turn=turn)
+        problem, at = pose_depth_problem(off=0.3, turn=turn)
         calm = problem.far & (torch.arange(N) != BEYOND)  # residuals of a pixel or less
         problem = problem.replace(variance=0 * problem.variance, far=calm)
         precision = torch.tensor([3e5, 1e6], dtype=D)
@@ -209,7 +175,7 @@ def test_the_gradient_is_half_that_of_the_cost(kernel):
 
 
 def test_a_prior_adds_its_own_cost_gradient_and_information_and_nothing_else():
-    problem, at = scene()
+    problem, at = pose_depth_problem()
     one, precision = torch.ones(2, dtype=D), torch.tensor([1e4, 3e5], dtype=D)
     free, held = (
         reprojection_problem.pose_normal_equations(problem, at, NOISE, one, p, kernel="cauchy", bend=2.0)
@@ -226,7 +192,7 @@ def test_a_prior_adds_its_own_cost_gradient_and_information_and_nothing_else():
 
 def test_elimination_is_the_schur_complement_of_the_whole_problem():
     """Every residual of pixels and depths as one function of pose, turn and inverse depths, differentiated as a whole."""
-    problem, at = scene(off=1e-3, turn=0.0)
+    problem, at = pose_depth_problem(off=1e-3, turn=0.0)
     used = [k for k in range(N) if k not in (3, BEYOND, EPIPOLE, BEHIND, UNUSED)]
     problem = problem.map(lambda x: x[..., used] if x.shape[-1] == N else x)
     noise, n = NOISE[:, used], len(used)
@@ -277,6 +243,6 @@ def test_a_step_solves_for_the_pose_and_the_turn(step):
         turn = np.linalg.inv(np.eye(3) - W) @ (np.eye(3) + W)
         np.testing.assert_allclose(moved.T.R[b], turn @ at.T.R[b].numpy(), rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(moved.T.t[b], turn @ at.T.t[b].numpy() + xi[3:6], rtol=1e-9)
-        np.testing.assert_allclose(moved.turn[b], at.shutter_rate[b].numpy() + xi[6:], rtol=1e-9)
+        np.testing.assert_allclose(moved.shutter_rate[b], at.shutter_rate[b].numpy() + xi[6:], rtol=1e-9)
     if step is reprojection_problem.unknowns_step:
-        assert torch.equal(moved.turn[1], at.shutter_rate[1]) and torch.equal(moved.T.R[1], at.T.R[1])
+        assert torch.equal(moved.shutter_rate[1], at.shutter_rate[1]) and torch.equal(moved.T.R[1], at.T.R[1])

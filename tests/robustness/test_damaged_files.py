@@ -1,4 +1,4 @@
-"""Every reader against damaged captures, and the harness against readers that misbehave."""
+"""Damaged captures of every format are valid data or a FormatError; the harness finds readers that misbehave."""
 
 from __future__ import annotations
 
@@ -12,107 +12,23 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import test_arkitscenes
-import test_ca1m
-import test_focal_stacks
-import test_lerobot
-import test_pickle
-import test_record3d
-import test_rh20t
-import test_rlds
-import test_stray
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+pytest.importorskip("av")
+pytest.importorskip("h5py")
+pytest.importorskip("lzfse")
+pytest.importorskip("OpenEXR")
+pytest.importorskip("pyarrow")
+
 from support import byte_damage as mutations
 from support import damage_harness as hostile
-from support.box_scene import walk
+from support.captures_by_format import SAMPLES, write_tum
 
 from dhtorch import data
-from dhtorch import testing as writers
 from dhtorch.data import FormatError
-from dhtorch.data.codecs import pickles, tiff
-from dhtorch.geometry import se3
-from dhtorch.records import Frame, Pose
 
 MUTANTS, MANY = 20, 2000  # of every format; the many run with the slow tests
-
-
-def frames(n: int = 3) -> list[Frame]:
-    """A short walk in a box, depth at every pixel."""
-    return walk(n, hw=(24, 32))
-
-
-def _tum(root: Path) -> None:
-    writers.write_tum(root, frames())
-
-
-def _named(root: Path) -> None:
-    writers.write_named_frames(root, frames(), fps=30)
-
-
-def _unregistered(root: Path) -> None:
-    shots = frames()
-    writers.write_named_frames(root, [f.replace(depth_camera=f.camera) for f in shots], fps=30)
-
-
-def _counted(root: Path) -> None:
-    writers.write_counted_frames(root, frames())
-
-
-def _driving(root: Path) -> None:
-    shots = frames()
-    writers.write_driving(
-        root, {"FRONT": shots}, Pose(torch.eye(3).double().expand(3, 3, 3), torch.zeros(3, 3).double())
-    )
-
-
-def _pair(write: Callable[[Path, Frame, Frame], None]) -> Callable[[Path], None]:
-    def write_pair(root: Path) -> None:
-        left = frames(1)[0]
-        left = left.replace(
-            camera=left.camera.replace(f=left.camera.f[:, :1].expand(1, 2)),
-            T_world_from_cam=se3.identity(1, torch.zeros(1).double()),
-        )
-        away = Pose(left.T_world_from_cam.R, torch.tensor([[0.125, 0, 0]], dtype=torch.float64))
-        write(root, left, left.replace(T_world_from_cam=away))
-
-    return write_pair
-
-
-Sample = tuple[Callable[[Path], Path | None], Callable[[Path], Any]]
-
-#: Of every reader: a function that writes a tiny capture below a folder and returns what to open (None = the folder),
-#: and one that opens and reads all of it.
-SAMPLES: dict[str, Sample] = {
-    **{
-        name: (write, hostile.read_all)
-        for name, write in {
-            "tum": _tum,
-            "named": _named,
-            "unregistered": _unregistered,
-            "counted": _counted,
-            "driving": _driving,
-            "calib_pair": _pair(writers.write_calib_pair),
-            "npz_pair": _pair(writers.write_npz_pair),
-            "arkitscenes": test_arkitscenes.hostile_sample,
-            "ca1m": test_ca1m.hostile_sample,
-            "record3d_archive": test_record3d.hostile_archive,
-            "record3d_exr": test_record3d.hostile_exr,
-            "record3d_mp4": test_record3d.hostile_mp4,
-            "stray": test_stray.hostile_new,
-            "stray_old": test_stray.hostile_old,
-            "lerobot_v3": test_lerobot.hostile_v3,
-            "lerobot_v2": test_lerobot.hostile_v2,
-            "rlds": test_rlds.hostile_sample,
-            "rlds_array": test_rlds.hostile_array,
-            **test_focal_stacks.HOSTILE,
-        }.items()
-    },
-    "rh20t": (test_rh20t.hostile_sample, test_rh20t.read_all),
-    "pickle": (test_pickle.hostile_sample, pickles.read_npy),
-    "tiff": (test_ca1m.hostile_tiff, tiff.read_tiff),
-}
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -212,5 +128,5 @@ def test_bomb_is_a_sound_archive(tmp_path: Path) -> None:
 
 
 def test_what_opens_is_what_reads(tmp_path: Path) -> None:
-    _tum(tmp_path)
+    write_tum(tmp_path)
     assert len(data.open(tmp_path)) == 3

@@ -9,44 +9,15 @@ import stat
 import subprocess
 import sys
 from datetime import UTC, datetime
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from support.small_result import KEY, result
 
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
-
-KEY = "0123456789abcdef" * 4
-
-
-@cache
-def meta_now():
-    return result_files.collect_run_metadata(device="cpu", dtype=torch.float32, threads=1, seed=0)
-
-
-def result(**changes):
-    parts = {
-        "experiment": "pair",
-        "key": KEY,
-        "meta": meta_now(),
-        "config": {"method": {"n": 2048}, "holdout": {"cutoff": math.inf}},
-        "data": {"name": "room", "scenes": ["room"], "n_pairs": 1, "digest": result_files.compute_data_digest({})},
-        "summary": {"coverage": {"value": 0.5, "low": None, "high": None, "n": 1, "unit": "1"}},
-        "rows": [
-            {
-                "scene": "room",
-                "pair": (0, 5),
-                "method": "paper",
-                "n_kept": np.int64(3),
-                "median_rel": torch.tensor(0.5),
-            },
-            {"scene": "room", "pair": None, "method": "paper", "corr": math.nan, "ms": {"track": np.float32(1.5)}},
-        ],
-    }
-    return result_files.build_result(**{**parts, **changes})
 
 
 def test_a_result_survives_the_disk_and_is_strict(tmp_path):
@@ -287,9 +258,9 @@ def test_what_json_cannot_hold_is_refused():
         (("expectation",), [], "a text or null"),
         (("verdict",), 1, "a text or null"),
         (("why",), {}, "a text or null"),
-        (("expectation",), "x", "null, this job asks no question"),
-        (("verdict",), "supported", "null, this job asks no question"),
-        (("why",), "x", "null, this job asks no question"),
+        (("expectation",), "x", "null for this experiment"),
+        (("verdict",), "supported", "null for this experiment"),
+        (("why",), "x", "null for this experiment"),
         (("key",), None, "a text"),
         (("key",), "0" * 63, "64 hexadecimal digits"),
         (("key",), "0" * 65, "64 hexadecimal digits"),
@@ -382,7 +353,7 @@ def test_every_field_must_be_there_and_no_other(part):
 
 
 @pytest.mark.parametrize("experiment", ["pair", "integrate", "motion"])
-def test_only_an_experiment_is_asked_something(experiment):
+def test_only_experiments_have_a_question(experiment):
     asked = {"question": "Q", "expectation": "E", "why": "W", "verdict": "refuted"}
     if experiment == "motion":
         for verdict in ("supported", "refuted", "undecided"):
@@ -394,7 +365,7 @@ def test_only_an_experiment_is_asked_something(experiment):
     else:
         assert result(experiment=experiment)["verdict"] is None
         for name, text in asked.items():
-            with pytest.raises(ValueError, match=rf"^result\.{name}: found '{text}', expected null, this job asks no"):
+            with pytest.raises(ValueError, match=rf"^result\.{name}: found '{text}', expected null for this experiment"):
                 result(experiment=experiment, **{name: text})
 
 
@@ -423,7 +394,7 @@ def test_strict_makes_of_everything_what_json_holds():
         "deep": {"a": {"b": [[None]]}},
     }
     assert storage.to_strict_json(True) is True and type(storage.to_strict_json(np.int64(3))) is int
-    with pytest.raises(TypeError, match="result: found a complex, expected something that JSON can hold"):
+    with pytest.raises(TypeError, match="result: found a complex, expected a value that JSON can hold"):
         storage.to_strict_json([1j])
 
 

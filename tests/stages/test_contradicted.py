@@ -1,8 +1,8 @@
-"""Near things that move on their own: what lies far says so, and a still scene is left alone."""
+"""Rejection of pairs in which near things move on their own; a still scene keeps its answers."""
 
 import pytest
 import torch
-from test_inverse_variance import views_of
+from support.view_estimates import random_estimates
 
 from dhtorch.codes import Gate, Hole, PoseCode
 from dhtorch.geometry.free_space import free_space_violations
@@ -106,15 +106,15 @@ def test_where_most_of_what_is_known_holds_the_pose_it_is_no_body_of_its_own():
     assert share(samples, fit.replace(inlier=fit.inlier & (torch.arange(N) % 2 == 0)), 1.5) == 1.0
 
 
-def test_each_pair_is_judged_alone():
+def test_each_pair_is_checked_alone():
     a, b = scene(left(20)), scene(left(20), 1.0)
     samples, fit = collate([a[0], b[0]]), collate([a[1], b[1]])
     both = reach(samples, fit, 1.5)
     assert both.tolist() == [share(*a, 1.5), share(*b, 1.5)] == [1.0, 0.0]
 
 
-def test_a_pair_is_judged_by_the_noise_of_its_far_tracks_and_by_holes_without_a_reason():
-    """Noise counts in rays; a hole that is dark, bright or blank says nothing of the sensor's reach."""
+def test_a_pair_is_checked_by_the_noise_of_its_far_tracks_and_by_holes_without_a_reason():
+    """Noise counts in rays; a dark, bright or blank hole is no measure of the sensor's range."""
     (room,) = open_stress(["lateral"], n_frames=7)
     view = [range_split(room.recording[k], room.near) for k in (0, 6)]
     trace = {}
@@ -145,8 +145,8 @@ def test_a_pair_is_judged_by_the_noise_of_its_far_tracks_and_by_holes_without_a_
     assert not (ask(fit, dark, max_in_reach=0.2) == Gate.CONTRADICTED).any()
 
 
-def test_more_views_contradicted_than_answering_silence_the_anchor():
-    views = views_of(spread=0.5, N=60)
+def test_a_reference_with_more_contradicted_than_answering_views_has_no_answer():
+    views = random_estimates(spread=0.5, N=60)
     code = Gate.CONTRADICTED
 
     def against(n):
@@ -165,8 +165,8 @@ def test_more_views_contradicted_than_answering_silence_the_anchor():
 
 
 @pytest.mark.parametrize(("stress", "answers"), [("convoy_slow", False), ("held_object", False), ("lateral", True)])
-def test_rooms_in_which_near_things_move_are_silent(stress, answers):
-    """A body that goes half the way hides no better from a method that knows where the sensor is silent."""
+def test_rooms_in_which_near_things_move_have_no_answer(stress, answers):
+    """Also where the moving body covers half of the near points."""
     (room,) = open_stress([stress], n_frames=9)
     view = [range_split(room.recording[k], room.near) for k in (0, 3, 6, 8)]
     method = AUTO.replace(n=1536, views=2)

@@ -1,11 +1,11 @@
-"""Views that agree answer together: against a loop over the points, and what a contradiction, a lone view and silence do."""
+"""Fusion of consistent views, against a loop over the points; contradictions, single views and views without an answer."""
 
 import itertools
 import math
 
 import pytest
 import torch
-from test_inverse_variance import still_views, views_of
+from support.view_estimates import given_estimates, random_estimates
 
 from dhtorch.codes import Gate
 from dhtorch.geometry import camera as cam
@@ -49,7 +49,7 @@ def test_views_are_joined_as_a_loop_over_points_joins_them(options):
         "sure_rel_each": 0.08,
         "max_sigma_rel": 0.2,
     } | options
-    views = views_of(spread=3.0, N=60)
+    views = random_estimates(spread=3.0, N=60)
     found = fuse_consistent(views, **options)
     seen = set()
     for b, k in itertools.product(range(2), range(60)):
@@ -96,8 +96,8 @@ def test_views_are_joined_as_a_loop_over_points_joins_them(options):
     assert len(seen) >= 2
 
 
-def test_another_view_that_is_silent_costs_nothing():
-    views = views_of(V=3, N=200, spread=2.0)
+def test_another_view_without_an_answer_costs_nothing():
+    views = random_estimates(V=3, N=200, spread=2.0)
     mute = views[:1].replace(gate=torch.full_like(views.gate[:1], int(Gate.NO_TRACK)))
     more = views.map(lambda x: torch.cat((x, x[:1])))
     more = more.replace(gate=torch.cat((views.gate, mute.gate)))
@@ -109,22 +109,22 @@ def test_another_view_that_is_silent_costs_nothing():
 
 
 def test_a_contradiction_silences_and_an_outvoted_view_does_not():
-    found = fuse_consistent(still_views([4.0, 4.1, 4.05, 9.0], [0.1, 0.1, 0.1, 2.0]))
+    found = fuse_consistent(given_estimates([4.0, 4.1, 4.05, 9.0], [0.1, 0.1, 0.1, 2.0]))
     assert found.keep.all() and float(found.depth) == pytest.approx(4.05, abs=0.05) and int(found.n_views) == 4
-    assert int(fuse_consistent(still_views([4.0, 6.0], [0.1, 0.1])).gate) == Gate.INCONSISTENT
-    assert int(fuse_consistent(still_views([4.0, 4.1, 6.0], [0.1, 0.1, 0.1])).gate) == Gate.INCONSISTENT
+    assert int(fuse_consistent(given_estimates([4.0, 6.0], [0.1, 0.1])).gate) == Gate.INCONSISTENT
+    assert int(fuse_consistent(given_estimates([4.0, 4.1, 6.0], [0.1, 0.1, 0.1])).gate) == Gate.INCONSISTENT
 
 
 def test_one_view_alone_must_be_sure():
     for sigma, gate in ((0.19, Gate.ANSWER), (0.21, Gate.UNCERTAIN)):
-        assert int(fuse_consistent(still_views([4.0, 1.0], [sigma, 1.0], gate=[0, 2])).gate) == gate
-    both = fuse_consistent(still_views([4.0, 4.0], [0.5, 0.5]))
+        assert int(fuse_consistent(given_estimates([4.0, 1.0], [sigma, 1.0], gate=[0, 2])).gate) == gate
+    both = fuse_consistent(given_estimates([4.0, 4.0], [0.5, 0.5]))
     assert both.keep.all() and float(both.sigma) == pytest.approx(0.5), "what views share is not averaged out"
-    assert int(fuse_consistent(still_views([4.0, 4.0], [0.9, 0.9])).gate) == Gate.UNCERTAIN
+    assert int(fuse_consistent(given_estimates([4.0, 4.0], [0.9, 0.9])).gate) == Gate.UNCERTAIN
 
 
-def test_where_most_views_stand_still_none_is_believed():
-    views = views_of(V=5, B=2, N=6, silent=0.0, spread=0.1)
+def test_where_most_views_stand_still_none_is_used():
+    views = random_estimates(V=5, B=2, N=6, silent=0.0, spread=0.1)
     for still, silenced in ((2, False), (3, True), (5, True)):
         gate = views.gate.clone()
         gate[:still, 1, 2] = Gate.NO_BASELINE
@@ -134,14 +134,14 @@ def test_where_most_views_stand_still_none_is_believed():
 
 
 def test_a_single_partner_is_its_own_answer_and_none_is_refused():
-    views = views_of(V=1, N=9)
+    views = random_estimates(V=1, N=9)
     assert torch.equal(fuse_consistent(views).depth.nan_to_num(), views.depth[0].nan_to_num())
     with pytest.raises(ValueError, match="at least one view"):
         fuse_consistent(views[:0])
 
 
 def test_order_of_views_and_of_points_changes_nothing_but_rounding():
-    views = views_of(N=80, spread=2.0)
+    views = random_estimates(N=80, spread=2.0)
     turned, shuffled = torch.tensor([2, 0, 3, 1]), torch.randperm(80, generator=torch.Generator().manual_seed(0))
     a, b, c = fuse_consistent(views), fuse_consistent(views[turned]), fuse_consistent(views[:, :, shuffled])
     keep = a.keep & b.keep
@@ -151,7 +151,7 @@ def test_order_of_views_and_of_points_changes_nothing_but_rounding():
 
 
 def test_gradients_are_finite_and_right():
-    views = views_of(N=6, spread=1.0)
+    views = random_estimates(N=6, spread=1.0)
     keep = fuse_consistent(views).keep
     assert int(keep.sum()) > 3
 
@@ -164,16 +164,16 @@ def test_gradients_are_finite_and_right():
 
 
 def test_it_captures():
-    views = views_of()
+    views = random_estimates()
     plain, compiled = fuse_consistent(views), torch.compile(fuse_consistent, backend="eager", fullgraph=True)(views)
     assert torch.equal(plain.gate, compiled.gate)
     torch.testing.assert_close(plain.depth, compiled.depth, equal_nan=True)
 
 
 def test_an_answer_that_more_views_give_is_surer():
-    views = still_views([4.0] * 4, [0.2] * 4)
+    views = given_estimates([4.0] * 4, [0.2] * 4)
     some = [
-        fuse_consistent(views[:k] if k > 1 else still_views([4.0, 4.0], [0.2, 0.2], gate=[0, 2])) for k in (1, 2, 4)
+        fuse_consistent(views[:k] if k > 1 else given_estimates([4.0, 4.0], [0.2, 0.2], gate=[0, 2])) for k in (1, 2, 4)
     ]
     zero, uv = torch.zeros(1, 1), torch.zeros(1, 1, 2)
     samples = Samples(uv, zero, zero, torch.zeros(1, 1, 3), zero, zero.int(), zero, zero.int())
@@ -205,7 +205,7 @@ def test_small_pictures_choose_views_as_large_ones_do(room):
         select_views_by_preview(reference, candidates, 9)
 
 
-def test_each_anchor_of_a_batch_gets_its_own(room):
+def test_each_reference_of_a_batch_gets_its_own_views(room):
     references = [room[0], room[11]]
     others = [[room[k] for k in ks] for ks in ((1, 3, 6, 9), (10, 8, 5, 2))]
     both = select_views_by_preview(
@@ -240,6 +240,6 @@ def test_a_small_picture_is_no_reason_to_be_less_sure(room):
 
 
 def test_key_views_takes_what_adds_most():
-    views = views_of(V=3, B=1, N=4, silent=0.0)
+    views = random_estimates(V=3, B=1, N=4, silent=0.0)
     sigma = views.depth * torch.tensor([0.5, 0.01, 0.02]).double()[:, None, None]
     assert rank_views(views.replace(sigma=sigma), 1).index.tolist() == [[1]]

@@ -1,4 +1,4 @@
-"""Several views of the same samples: fusion and key views against loops, and the window with seats that only look."""
+"""Fusion by inverse variance and choice of key views, against loops over points; the window with stub stages."""
 
 import itertools
 import math
@@ -7,6 +7,7 @@ import time
 import numpy as np
 import pytest
 import torch
+from support.view_estimates import given_estimates, rand, random_estimates
 
 from dhtorch import PAPER
 from dhtorch.codes import Gate
@@ -16,7 +17,7 @@ from dhtorch.geometry.pyramid import build_pyramid
 from dhtorch.pipeline.pair import uniform_draws
 from dhtorch.pipeline.view_selection import rank_views
 from dhtorch.pytree import collate, stack
-from dhtorch.records import Camera, Estimate, Frame, Samples, TrackHint, Tracks
+from dhtorch.records import Camera, Frame, Samples, TrackHint, Tracks
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 
@@ -24,34 +25,6 @@ extend_window = PAPER.replace(views=5)
 
 HW = (64, 80)
 FIELDS = ("depth", "sigma", "sigma_shared", "parallax_deg", "residual_px", "score")
-
-
-def rand(*shape, seed, low=0.0, high=1.0):
-    return low + (high - low) * torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def views_of(V=4, B=2, N=30, seed=0, silent=0.3, spread=1.0):
-    """Answers (V, B, N) that scatter about a truth by some of their sigmas; some silent, for one reason or another."""
-    z = rand(B, N, seed=seed, low=2, high=8)
-    relative = rand(V, B, N, seed=seed + 1, low=0.01, high=0.08)
-    noise = spread * 4 * (rand(V, B, N, seed=seed + 2) - 0.5)
-    depth = 1 / (1 / z * (1 + relative * noise))
-    gate = torch.where(rand(V, B, N, seed=seed + 3) < silent, 5 + (7 * rand(V, B, N, seed=seed + 4)).int() % 4, 0).int()
-    keep = gate == 0
-    sigma = relative * depth
-    shared = sigma * rand(V, B, N, seed=seed + 5, low=0.0, high=1.0)
-    mute = lambda x: torch.where(keep, x, torch.nan)  # noqa: E731
-    return Estimate(
-        uv=rand(V, B, N, 2, seed=seed + 6),
-        depth=mute(depth),
-        sigma=mute(sigma),
-        sigma_shared=mute(shared),
-        parallax_deg=rand(V, B, N, seed=seed + 7, high=9),
-        residual_px=rand(V, B, N, seed=seed + 8, low=0.1, high=2),
-        n_views=torch.full((V, B, N), 2, dtype=torch.int32),
-        score=keep.double(),
-        gate=gate,
-    )
 
 
 def plain_fusion(views, *, min_views=2, max_chi2=9.0, correlation=1.0, max_sigma_rel=0.1, max_static_ratio=0.5):
@@ -117,7 +90,7 @@ def plain_fusion(views, *, min_views=2, max_chi2=9.0, correlation=1.0, max_sigma
     ],
 )
 def test_views_are_joined_as_a_loop_over_points_joins_them(options):
-    views = views_of()
+    views = random_estimates()
     views.gate[:, 0, :2] = torch.tensor([[Gate.NO_TRACK, Gate.PARALLAX]] * 3 + [[Gate.RESIDUAL, Gate.NO_TRACK]])
     found, expected = inverse_variance(views, **options), plain_fusion(views, **options)
     assert torch.equal(found.gate, torch.tensor(expected["gate"]).int()) and found.gate.dtype == torch.int32
@@ -138,7 +111,7 @@ def test_sigma_is_the_spread_of_the_fused_depth(correlation, V):
     errors = own * (draw(1, N).expand(V, N) if correlation else draw(V, N)) + pose * draw(1, N)
     depth = 1 / (0.25 + errors)
     like = torch.ones(V, 1, N, dtype=torch.float64)
-    views = views_of(V=V, B=1, N=N, silent=0.0).replace(depth=depth[:, None])
+    views = random_estimates(V=V, B=1, N=N, silent=0.0).replace(depth=depth[:, None])
     views = views.replace(
         sigma=depth[:, None] ** 2 * (own**2 + pose**2).sqrt()[:, None] * like,
         sigma_shared=depth[:, None] ** 2 * pose,
@@ -150,40 +123,34 @@ def test_sigma_is_the_spread_of_the_fused_depth(correlation, V):
     assert float(z.std()) == pytest.approx(1, abs=0.03)
 
 
-def still_views(depth, sigma, shared=0.0, gate=0):
-    """Answers (V, 1, 1) that are told."""
-    V = len(depth)
-    column = lambda x: torch.as_tensor(x, dtype=torch.float64).expand(V)[:, None, None].clone()  # noqa: E731
-    views = views_of(V=V, B=1, N=1)
-    gate = torch.as_tensor(gate).expand(V)[:, None, None].int()
-    return views.replace(depth=column(depth), sigma=column(sigma), sigma_shared=column(shared), gate=gate)
-
-
 def test_limits_hold_at_the_limit_itself():
     """Inverse depths 1/4 and 1/2 with a deviation of 1/8 each: each differs from the mean by as much."""
-    two = still_views([4.0, 2.0], [2.0, 0.5])
+    two = given_estimates([4.0, 2.0], [2.0, 0.5])
     gates = [int(inverse_variance(two, max_chi2=x, max_sigma_rel=None).gate) for x in (2.0, 1.9999)]
     assert gates == [Gate.ANSWER, Gate.INCONSISTENT]
-    same = still_views([4.0, 4.0], [0.5, 0.5])
+    same = given_estimates([4.0, 4.0], [0.5, 0.5])
     gates = [int(inverse_variance(same, max_sigma_rel=x).gate) for x in (0.125, 0.1249)]
     assert gates == [Gate.ANSWER, Gate.UNCERTAIN]
-    assert int(inverse_variance(still_views([4.0, 4 / 3], [1e-9, 1e-9]), max_sigma_rel=1e-12).gate) == Gate.INCONSISTENT
-    assert int(inverse_variance(still_views([4.0] * 3, [0.1] * 3, gate=[0, 0, 7])).gate) == Gate.ANSWER
-    assert int(inverse_variance(still_views([4.0] * 3, [0.1] * 3, gate=[6, 0, 7])).gate) == Gate.RESIDUAL
-    assert int(inverse_variance(still_views([4.0] * 3, [0.1] * 3, gate=[6, 0, 0])).gate) == Gate.ANSWER
+    assert (
+        int(inverse_variance(given_estimates([4.0, 4 / 3], [1e-9, 1e-9]), max_sigma_rel=1e-12).gate)
+        == Gate.INCONSISTENT
+    )
+    assert int(inverse_variance(given_estimates([4.0] * 3, [0.1] * 3, gate=[0, 0, 7])).gate) == Gate.ANSWER
+    assert int(inverse_variance(given_estimates([4.0] * 3, [0.1] * 3, gate=[6, 0, 7])).gate) == Gate.RESIDUAL
+    assert int(inverse_variance(given_estimates([4.0] * 3, [0.1] * 3, gate=[6, 0, 0])).gate) == Gate.ANSWER
 
 
-def test_a_view_without_a_positive_depth_and_a_finite_sigma_says_nothing():
-    good = inverse_variance(still_views([4.0, 5.0], [0.5, 0.5]), max_sigma_rel=None)
+def test_a_view_without_a_positive_depth_and_a_finite_sigma_does_not_count():
+    good = inverse_variance(given_estimates([4.0, 5.0], [0.5, 0.5]), max_sigma_rel=None)
     for depth, sigma in ((-4.0, 0.1), (0.0, 0.1), (4.0, 0.0), (4.0, math.inf), (4.0, math.nan), (math.nan, 0.1)):
-        found = inverse_variance(still_views([4.0, depth, 5.0], [0.5, sigma, 0.5]), max_sigma_rel=None)
+        found = inverse_variance(given_estimates([4.0, depth, 5.0], [0.5, sigma, 0.5]), max_sigma_rel=None)
         assert float(found.depth) == float(good.depth) and int(found.n_views) == 3, (depth, sigma)
-        alone = inverse_variance(still_views([4.0, depth], [0.5, sigma]), max_sigma_rel=None)
+        alone = inverse_variance(given_estimates([4.0, depth], [0.5, sigma]), max_sigma_rel=None)
         assert int(alone.gate) == Gate.INCONSISTENT, "an answer that cannot be weighed gives no better reason"
 
 
 def test_one_view_is_its_own_answer_and_none_is_refused():
-    views = views_of(V=1, N=5)
+    views = random_estimates(V=1, N=5)
     found = inverse_variance(views)
     for name in (*FIELDS, "gate", "n_views"):
         assert torch.equal(getattr(found, name).nan_to_num(), getattr(views, name)[0].nan_to_num()), name
@@ -193,7 +160,7 @@ def test_one_view_is_its_own_answer_and_none_is_refused():
 
 def test_a_standstill_is_what_more_than_the_share_of_views_say():
     """Even of one point of the reference view; and of each reference view for itself."""
-    views = views_of(V=4, B=2, N=5, silent=0.0, spread=0.1)
+    views = random_estimates(V=4, B=2, N=5, silent=0.0, spread=0.1)
     for n, share, still in ((2, 0.5, False), (3, 0.5, True), (1, 0.25, False), (2, 0.25, True), (4, 1.0, False)):
         gate = views.gate.clone()
         gate[:n, 1, 3] = Gate.NO_BASELINE
@@ -231,7 +198,7 @@ def plain_key_views(views, count, good=0.1):
 
 @pytest.mark.parametrize("good", [0.1, 0.002])
 def test_key_views_are_added_one_by_one_each_the_one_that_adds_most(good):
-    views = views_of(V=6, B=4, N=6, silent=0.5, seed=3)
+    views = random_estimates(V=6, B=4, N=6, silent=0.5, seed=3)
     lone = views.gate.clone()
     lone[:, 0, 1:] = Gate.NO_TRACK
     lone[:, 0, 0] = 0  # all depends on one point, where further views add little
@@ -247,7 +214,7 @@ def test_key_views_are_added_one_by_one_each_the_one_that_adds_most(good):
 
 
 def test_what_a_view_adds_stands_beside_it():
-    views = views_of(V=4, B=3, N=6, silent=0.0, seed=1)
+    views = random_estimates(V=4, B=3, N=6, silent=0.0, seed=1)
     choice = rank_views(views, 3)
     worth = (0.1 * views.depth / views.sigma).square()
     for b in range(3):
@@ -262,7 +229,7 @@ def test_what_a_view_adds_stands_beside_it():
 
 
 def test_answers_without_a_sigma_add_nothing():
-    views = views_of(V=3, B=1, N=4, silent=0.0)
+    views = random_estimates(V=3, B=1, N=4, silent=0.0)
     sigma = views.sigma.clone()
     sigma[2], sigma[1, 0, :2], sigma[1, 0, 2:] = torch.nan, 0.0, torch.inf
     assert rank_views(views.replace(sigma=sigma), 1).index.tolist() == [[0]]
@@ -285,7 +252,7 @@ class Seats:
         self.reference, self.others = frame(), stack([frame(seed=10 + k) for k in range(V)])
         self.n, self.calls, self.asked = n, [], {"track": [], "pose": [], "triangulate": []}
         self.uv = 10 + rand(2, n, 2, seed=30, high=40).float()
-        self.answers = views_of(V=V, N=n, silent=0.2, spread=0.2).to(torch.float32)
+        self.answers = random_estimates(V=V, N=n, silent=0.2, spread=0.2).to(torch.float32)
         self.fits = [known_pose_fit(se3.exp(rand(2, 6, seed=50 + k).float()), n) for k in range(V)]
 
     def number(self, image):
@@ -338,7 +305,7 @@ class Seats:
         return names | {"triangulate": triangulate, "score": score, "n": self.n, "hypotheses": 5}
 
 
-def test_the_anchor_is_sampled_once_and_every_view_is_a_pair_with_it():
+def test_the_reference_is_sampled_once_and_every_view_is_a_pair_with_it():
     seats, trace = Seats(), {}
     found = extend_window(seats.reference, seats.others, **seats.seats(), seed=4, trace=trace)
     names = [call[0] for call in seats.calls]
@@ -364,7 +331,7 @@ def test_the_anchor_is_sampled_once_and_every_view_is_a_pair_with_it():
         assert torch.equal(t["fit"].T_1_from_0.t, expected.T_1_from_0.t)
 
 
-def test_every_anchor_has_its_own_draws_in_all_its_views():
+def test_every_reference_has_its_own_draws_in_all_its_views():
     seats = Seats()
     extend_window(seats.reference, seats.others, **seats.seats(), seed=torch.tensor([4, 9]))
     ((_, _, draws),) = seats.asked["pose"]
@@ -389,7 +356,7 @@ def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pa
     assert all(hint.start is None for *_, hint in alone.asked["track"])
 
 
-def test_the_anchors_pyramid_is_built_once_for_every_view():
+def test_the_pyramid_of_the_reference_is_built_once_for_all_views():
     seats = Seats()
     extend_window(seats.reference, seats.others, **seats.seats(), hint=TrackHint(levels=3))
     first, *others = (hint for *_, hint in seats.asked["track"])
@@ -421,7 +388,7 @@ def test_a_chain_changes_the_start_and_not_what_is_searched_for(track):
         assert float((a.uv_0 - a.uv_1)[both][:, 0].median()) == pytest.approx(2 * (k + 1), abs=0.1)
 
 
-def test_of_more_views_the_key_views_are_asked_again_with_their_own_poses():
+def test_of_more_views_the_key_views_are_estimated_again_with_their_own_poses():
     """They are chosen by few of the samples: each reference view has its own choice."""
     n = 512
     seats = Seats(V=5, n=n)
@@ -449,7 +416,7 @@ def test_of_more_views_the_key_views_are_asked_again_with_their_own_poses():
     assert "pose" not in [c[0] for c in seats.calls] and not seats.asked["pose"]
 
 
-def test_five_views_are_used_by_default_and_as_many_as_asked_for_are_not_chosen_among():
+def test_five_views_are_used_by_default_and_no_more_than_that_are_not_chosen_among():
     for V, options, asked in ((5, {}, 5), (6, {}, 11), (3, {"views": 3}, 3), (3, {"views": 2}, 5)):
         seats = Seats(V=V)
         count = []
@@ -465,7 +432,7 @@ def test_five_views_are_used_by_default_and_as_many_as_asked_for_are_not_chosen_
 
 
 def test_the_trace_sums_the_milliseconds_over_the_views(monkeypatch):
-    """By a clock that goes on by as many seconds as it has been asked."""
+    """With a clock that advances by as many seconds as it has been read."""
     # 1 and 2 around the samples, 3 before the first view, 9 and 10 around the joining
     seconds = {"samples": 2, "track": 4 + 5 + 6, "pose": 7, "triangulate": 8, "fuse": 10}
     expected = {name: 1e3 * s for name, s in seconds.items()}
@@ -490,7 +457,7 @@ def test_what_a_window_asks_by_default():
         assert torch.equal(draws[of_view], uniform_draws(0, 2, 200).float())
 
 
-def test_a_samples_texture_is_asked_in_every_view():
+def test_the_texture_of_a_sample_is_measured_in_every_view():
     seats = Seats()
     gate = torch.full_like(seats.answers.gate, Gate.NO_TRACK)
     seats.answers = seats.answers.replace(gate=gate)

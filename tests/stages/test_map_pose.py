@@ -1,6 +1,5 @@
-"""Seat 5 with far tracks: accuracy, an honest covariance, what is believed and what is not, gradients."""
+"""``map_pose``: accuracy with far tracks, covariance, which tracks and shutter rates are accepted, gradients."""
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -8,53 +7,17 @@ import pytest
 import torch
 import yaml
 from support import dense_reprojection as dense
+from support.pose_problems import map_pose_inputs
 from torch.utils._pytree import tree_leaves
 
 from dhtorch.codes import Gate, PoseCode
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import covariance, map_estimate, se3
-from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
+from dhtorch.records import Pose, PoseFit, Shutter
 from dhtorch.stages.pose import map_pose, pnp_ransac
 from dhtorch.stages.triangulate import two_view
 
 D = torch.float64
-#: Every pair of the trials gets the same draws: they only choose a start.
-DRAWS = torch.rand(1, 64, 3, generator=torch.Generator().manual_seed(7), dtype=D)
-
-
-def pairs(
-    batch, near=60, far=140, *, noise=0.3, depth=0.01, turn=0.0, baseline=0.1, planar=False, rotation=0.05, seed=0
-):
-    """Arguments of the seat, true pose, true turn and true far depth. ``noise`` px is anisotropic, as tracks' is."""
-    g = torch.Generator().manual_seed(seed)
-    rand = lambda *s: torch.rand(*s, generator=g, dtype=D)  # noqa: E731
-    randn = lambda *s: torch.randn(*s, generator=g, dtype=D)  # noqa: E731
-    n = near + far
-    camera_0 = Camera(500 + 50 * rand(batch, 2), 10 * rand(batch, 2) + torch.tensor([315.0, 235.0], dtype=D))
-    camera_1 = Camera(450 + 50 * rand(batch, 2), 10 * rand(batch, 2) + torch.tensor([315.0, 235.0], dtype=D))
-    uv_0 = rand(batch, n, 2) * torch.tensor([600.0, 440.0], dtype=D) + 20
-    z = torch.cat((0.6 + 1.0 * rand(batch, near), 2.5 + 3 * rand(batch, far)), 1)
-    ray = cam.rays(camera_0, uv_0)
-    if planar:
-        z[:, :near] = 1 / (1 + 0.3 * ray[:, :near, 0] + 0.8 * ray[:, :near, 1])
-    direction = torch.nn.functional.normalize(randn(batch, 3), dim=-1)
-    T = se3.exp(torch.cat((rotation * randn(batch, 3), baseline * direction), -1))
-    b = turn * randn(batch, 3)
-    Y = se3.apply(T, ray * z[..., None])
-    Y = Y + torch.linalg.cross(ray[..., 1:2] * b[:, None], Y)
-    uv_1 = cam.project(camera_1, Y)
-    angle, spread = math.pi * rand(batch, n), 1 + 2 * rand(batch, n)
-    axis = torch.stack((angle.cos(), angle.sin()), -1)
-    cov = torch.eye(2, dtype=D) + (spread**2 - 1)[..., None, None] * axis[..., None] * axis[..., None, :]
-    uv_1 = uv_1 + noise * (torch.linalg.cholesky(cov) @ randn(batch, n, 2, 1))[..., 0]
-    sensed = z * (1 + depth * randn(batch, n))
-    xyz = torch.where((torch.arange(n) < near)[:, None], ray * sensed[..., None], torch.nan)
-    zero = torch.zeros(batch, n, dtype=D)
-    code = zero.to(torch.int32)
-    sigma = max(depth, 1e-3) * sensed
-    samples = Samples(uv_0, sensed * (torch.arange(n) < near), sigma, xyz, zero + 1, code, zero + 1, code)
-    tracks = Tracks(uv_0, uv_1, zero, zero, cov * 0.01, zero == 0)
-    return (samples, tracks, camera_0, camera_1, DRAWS.expand(batch, -1, -1)), T, b, z
 
 
 def errors(fit, T):
@@ -70,7 +33,7 @@ def nees(fit, T):
 
 
 def put(args, **changes):
-    """The seat's arguments with fields of the tracks (or ``xyz``) replaced."""
+    """Arguments of ``map_pose`` with fields of the tracks (or ``xyz``) replaced."""
     samples, tracks, *rest = args
     if "xyz" in changes:
         samples = samples.replace(xyz=changes.pop("xyz"))
@@ -82,14 +45,14 @@ def put(args, **changes):
 
 @pytest.mark.parametrize("planar", [False, True])
 def test_exact_tracks_give_the_exact_pose(planar):
-    args, T, _, _ = pairs(4, 12, 30, noise=0.0, depth=0.0, planar=planar)
+    args, T, _, _ = map_pose_inputs(4, 12, 30, noise=0.0, depth=0.0, planar=planar)
     fit = map_pose(*args)
     assert (fit.code == PoseCode.OK).all() and fit.inlier[:, :12].all() and not fit.inlier[:, 12:].any()
     assert errors(fit, T).abs().max() < 1e-8 and fit.shutter.shutter_rate.abs().max() < 1e-8
 
 
 def test_far_tracks_and_weights_beat_near_points_alone():
-    args, T, _, _ = pairs(24, 30, 200, depth=0.02, planar=True)
+    args, T, _, _ = map_pose_inputs(24, 30, 200, depth=0.02, planar=True)
     plain, joint = errors(pnp_ransac(*args), T), errors(map_pose(*args), T)
     near = errors(map_pose(*args, far_weight=1e-9), T)
     for part in (slice(0, 3), slice(3, 6)):
@@ -100,7 +63,7 @@ def test_far_tracks_and_weights_beat_near_points_alone():
 @pytest.mark.parametrize(("trials", "band"), [(80, 0.25), pytest.param(500, 0.05, marks=pytest.mark.slow)])
 def test_covariance_is_that_of_the_errors(trials, band):
     """Trials with the assumed noise: the mean of the normalised squared error lies in the band of chi² / 6."""
-    args, T, _, _ = pairs(trials, 60, 140)
+    args, T, _, _ = map_pose_inputs(trials, 60, 140)
     fit = map_pose(*args, shutter_sigma=0.0, isotropic=0.0)
     assert (fit.code == PoseCode.OK).all()
     assert abs(nees(fit, T).mean() - 1) < band  # 1.96 of its deviations are 1.96 sqrt(2 / (6 trials))
@@ -108,7 +71,7 @@ def test_covariance_is_that_of_the_errors(trials, band):
 
 
 def test_sigma_is_the_spread_of_far_depths():
-    args, _, _, z = pairs(40, 60, 140)
+    args, _, _, z = map_pose_inputs(40, 60, 140)
     fit = map_pose(*args, isotropic=0.0)
     estimate = two_view(*args[:2], fit, *args[2:4], max_residual_px=None, fitted_noise=True, isotropic=0.0)
     far = estimate.keep & (torch.arange(200) >= 60) & (estimate.sigma < 0.1 * z)
@@ -146,7 +109,7 @@ def newton_step(args, fit, o, isotropic):
 )
 def test_the_answer_is_the_optimum_of_the_problem_that_its_options_describe(isotropic, options):
     """And not the optimum of the default's, so every option reaches the problem."""
-    args, *_ = pairs(1, 20, 40, depth=0.01 if "bend" in options else 0.03, turn=0.002, seed=2)
+    args, *_ = map_pose_inputs(1, 20, 40, depth=0.01 if "bend" in options else 0.03, turn=0.002, seed=2)
     base = map_estimate.FitOptions(max_rise=10.0, near_steps=8, steps=16, shutter_sigma=0.0, translation_gain=-9.0)
     o = base._replace(**options)
     fit = map_pose(*args, isotropic=isotropic, **o._asdict())
@@ -161,7 +124,7 @@ def test_the_answer_is_the_optimum_of_the_problem_that_its_options_describe(isot
 
 def test_the_near_cost_may_rise_by_the_share_that_is_allowed():
     """Far tracks that have moved on their own; how far the near cost rises with them is read from the written-out one."""
-    args, *_ = pairs(1, 12, 60, noise=0.3, depth=0.003, baseline=0.3, seed=4)
+    args, *_ = map_pose_inputs(1, 12, 60, noise=0.3, depth=0.003, baseline=0.3, seed=4)
     shift = torch.tensor([3.3, 2.1], dtype=D) * (torch.arange(72) >= 12)[:, None]
     args = put(args, uv_1=args[1].uv_1 + shift)
     o = map_estimate.FitOptions(far_weight=0.5, shutter_sigma=0.0, translation_gain=-9.0, near_steps=12, steps=12)
@@ -179,7 +142,7 @@ def test_the_near_cost_may_rise_by_the_share_that_is_allowed():
 
 def test_steps_of_the_near_tracks_and_of_all_are_counted_apart():
     """From a start off the truth, with the near tracks alone answered: only their own steps bring it there."""
-    args, T, *_ = pairs(1, 20, 40, noise=0.0, depth=0.0)
+    args, T, *_ = map_pose_inputs(1, 20, 40, noise=0.0, depth=0.0)
 
     def off(samples, tracks, *_):
         zero = torch.zeros(1, dtype=D)
@@ -202,9 +165,9 @@ def test_steps_of_the_near_tracks_and_of_all_are_counted_apart():
     assert miss[0] < 1e-9 and miss[1] > 1e-6
 
 
-def test_what_is_said_about_a_pose_follows_from_its_tracks():
+def test_the_fields_of_a_pose_fit_follow_from_its_tracks():
     """Inliers, their rms, the noise and the significance of the translation, from numpy, one track at a time."""
-    args, *_ = pairs(2, 24, 40, turn=0.004, seed=3)
+    args, *_ = map_pose_inputs(2, 24, 40, turn=0.004, seed=3)
     _samples, tracks, _camera_0, _camera_1, _ = args
     wrong = tracks.uv_1.clone()
     wrong[:, 2, 0] += 2.0
@@ -237,7 +200,7 @@ def test_what_is_said_about_a_pose_follows_from_its_tracks():
 
 
 def test_rows_that_turn_are_found_and_undone():
-    args, T, b, z = pairs(12, 80, 160, turn=0.01)
+    args, T, b, z = map_pose_inputs(12, 80, 160, turn=0.01)
     loose, rigid = map_pose(*args), map_pose(*args, shutter_sigma=0.0)
     assert loose.ok.all()
     assert (loose.shutter.shutter_rate - b).norm(dim=-1).median() < 0.1 * b.norm(dim=-1).median()
@@ -248,15 +211,15 @@ def test_rows_that_turn_are_found_and_undone():
         estimate = two_view(*args[:2], fit, *args[2:4])
         error.append((estimate.depth / z - 1).abs()[estimate.keep & far].median())
     assert error[0] < 0.7 * error[1]
-    still = map_pose(*pairs(16, 80, 160)[0])
+    still = map_pose(*map_pose_inputs(16, 80, 160)[0])
     assert (
         still.shutter.shutter_rate.abs() < 1e-9
     ).double().mean() > 0.9  # 2 % of the cost is not taken away by chance
 
 
 def test_a_given_pose_brings_its_shutter_along():
-    """Depth under a known pose: exact where the turn of the rows is known too, as little sure as its covariance says."""
-    args, T, b, z = pairs(4, 10, 60, noise=0.0, depth=0.0, turn=0.005)
+    """Depth under a given pose: exact where its shutter rate is given too, with a sigma that follows its covariance."""
+    args, T, b, z = map_pose_inputs(4, 10, 60, noise=0.0, depth=0.0, turn=0.005)
     zero, batch = torch.zeros(4, dtype=D), torch.zeros(4, 6, 6, dtype=D)
     known = PoseFit(T, batch, zero[:, None].expand(4, 70) > 1, zero.long(), zero, zero + 1, zero + 1e3, zero.int())
     rows = known.replace(shutter=Shutter(b, torch.zeros(4, 9, 9, dtype=D)))
@@ -270,17 +233,17 @@ def test_a_given_pose_brings_its_shutter_along():
     assert (exact.sigma_shared[exact.keep] == 0).all() and (unsure.sigma_shared[unsure.keep] > 0).all()
 
 
-def test_a_turn_that_was_not_believed_is_not_known_to_be_none():
-    """Where turns are too small to be seen the pose takes their part, and its covariance says so."""
-    args, T, _, _ = pairs(40, 60, 140, turn=0.0015)
+def test_a_rejected_shutter_rate_stays_uncertain():
+    """Where shutter rates are too small to be found, the covariance of the pose contains them."""
+    args, T, _, _ = map_pose_inputs(40, 60, 140, turn=0.0015)
     fit, rigid = (map_pose(*args, isotropic=0.0, shutter_gain=9.0, shutter_sigma=sigma) for sigma in (0.01, 0.0))
     assert fit.ok.all() and fit.shutter.shutter_rate.abs().amax() < 1e-9
     assert 0.8 < nees(fit, T).mean() < 1.6 and nees(rigid, T).mean() > 1.35 * nees(fit, T).mean()
 
 
 def test_far_tracks_that_contradict_are_left_out():
-    """The far scene turns on its own: the near tracks alone are answered, and it is said."""
-    args, T, _, _ = pairs(4, 80, 400, baseline=0.3, noise=0.1, depth=0.002)
+    """The far scene turns on its own: the pose is that of the near tracks, and the fit reports it."""
+    args, T, _, _ = map_pose_inputs(4, 80, 400, baseline=0.3, noise=0.1, depth=0.002)
     camera_1, uv_1 = args[3], args[1].uv_1
     ray = cam.rays(camera_1, uv_1)
     turned = ray + torch.linalg.cross(torch.tensor([0.002, 0.004, 0.003], dtype=D).expand_as(ray), ray)
@@ -296,8 +259,8 @@ def test_far_tracks_that_contradict_are_left_out():
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_pure_rotation_is_silent(noise):
-    args, _, _, _ = pairs(8, 80, 160, baseline=0.0, noise=noise)
+def test_pure_rotation_gives_no_depth(noise):
+    args, _, _, _ = map_pose_inputs(8, 80, 160, baseline=0.0, noise=noise)
     fit = map_pose(*args)
     assert (fit.code == PoseCode.NO_BASELINE).all() and not fit.ok.any() and fit.T_1_from_0.t.isnan().all()
     estimate = two_view(*args[:2], fit, *args[2:4])
@@ -307,7 +270,7 @@ def test_pure_rotation_is_silent(noise):
 
 
 def test_without_a_start_there_is_no_pose():
-    args, _, _, _ = pairs(3, 30, 60)
+    args, _, _, _ = map_pose_inputs(3, 30, 60)
     valid = args[1].valid.clone()
     valid[0, 3:30], valid[1, :] = False, False
     fit = map_pose(*put(args, valid=valid))
@@ -327,7 +290,7 @@ def test_without_a_start_there_is_no_pose():
 
 def test_near_tracks_that_say_nothing_of_their_depth_leave_the_pose_undetermined():
     """Without a standard deviation they are no near tracks, and far ones alone have no scale."""
-    args, *_ = pairs(3, 30, 60)
+    args, *_ = map_pose_inputs(3, 30, 60)
     sigma = args[0].sigma.clone()
     sigma[0], sigma[1] = torch.nan, 0.0
     fit = map_pose(args[0].replace(sigma=sigma), *args[1:])
@@ -339,9 +302,9 @@ def test_near_tracks_that_say_nothing_of_their_depth_leave_the_pose_undetermined
     assert map_pose(*on_line).code[0] in (PoseCode.DEGENERATE, PoseCode.TOO_FEW)
 
 
-def test_the_start_is_another_function_of_the_seat():
+def test_the_start_may_come_from_another_function():
     """From the truth instead of a search: no draws are needed, and its refusal is the answer's."""
-    args, T, *_ = pairs(2, 20, 40)
+    args, T, *_ = map_pose_inputs(2, 20, 40)
 
     def known(samples, tracks, camera_0, camera_1, draws):
         zero, batch = torch.zeros(2, dtype=D), torch.zeros(2, 6, 6, dtype=D)
@@ -354,7 +317,7 @@ def test_the_start_is_another_function_of_the_seat():
 
 
 def test_mistracks_and_values_that_cannot_be_used_do_not_matter():
-    args, T, _, _ = pairs(8, 60, 140, noise=0.2)
+    args, T, _, _ = map_pose_inputs(8, 60, 140, noise=0.2)
     clean = errors(map_pose(*args), T)[:, :3].norm(dim=-1).median()
     wrong = torch.arange(200) % 10 < 3
     g = torch.Generator().manual_seed(3)
@@ -371,7 +334,7 @@ def test_mistracks_and_values_that_cannot_be_used_do_not_matter():
 @pytest.mark.parametrize("dtype", [torch.float32, D])
 def test_a_pair_with_few_tracks_beside_one_with_many_is_answered_as_alone(dtype):
     """Bit for bit: a pair is solved on as many tracks as the fullest of its company has."""
-    args, *_ = pairs(3, 400, 1400)
+    args, *_ = map_pose_inputs(3, 400, 1400)
     share = torch.tensor([1.0, 0.3, 0.05])[:, None]
     used = torch.rand(3, 1800, generator=torch.Generator().manual_seed(4)) < share
     samples, tracks, *rest = (x.to(dtype) for x in put(args, valid=used))
@@ -387,7 +350,7 @@ def test_a_pair_with_few_tracks_beside_one_with_many_is_answered_as_alone(dtype)
 
 
 def test_gradient_of_the_whole_stage_at_exact_data():
-    args, _, _, _ = pairs(1, 9, 3, noise=0.0, depth=0.0)
+    args, _, _, _ = map_pose_inputs(1, 9, 3, noise=0.0, depth=0.0)
     samples, tracks, camera_0, camera_1, draws = args
     leaves = [
         x.clone().requires_grad_() for x in (samples.xyz[:, :9], tracks.uv_0, tracks.uv_1, camera_0.f, camera_1.f)
@@ -403,7 +366,7 @@ def test_gradient_of_the_whole_stage_at_exact_data():
 
 
 def test_gradients_stay_finite_whatever_the_input():
-    args, _, _, _ = pairs(4, 24, 40, noise=0.3)
+    args, _, _, _ = map_pose_inputs(4, 24, 40, noise=0.3)
     xyz, uv_1, valid = args[0].xyz.clone(), args[1].uv_1.clone(), args[1].valid.clone()
     xyz[0, :24:2], uv_1[1, ::3], valid[2] = torch.nan, torch.nan, False
     xyz[3, :24] = xyz[3, :1]
@@ -429,7 +392,7 @@ def test_options_have_one_default():
 @pytest.mark.parametrize("seed", range(3))
 def test_returns_from_far_away_do_not_hide_a_baseline(seed):
     """A pose that is fixed by the near returns alone is fixed with all returns, too."""
-    (samples, *others), _, _, z = pairs(1, 60, 300, noise=0.4, baseline=0.025, rotation=0.0, seed=seed)
+    (samples, *others), _, _, z = map_pose_inputs(1, 60, 300, noise=0.4, baseline=0.025, rotation=0.0, seed=seed)
     cut = map_pose(samples, *others)
     known = torch.where(samples.depth > 0, samples.depth, z)
     ray = cam.rays(others[1], samples.uv)
@@ -439,5 +402,5 @@ def test_returns_from_far_away_do_not_hide_a_baseline(seed):
 
 
 def test_a_turn_alone_is_no_baseline_however_many_returns_there_are():
-    (samples, *others), *_ = pairs(4, 300, 60, noise=0.4, baseline=0.0, rotation=0.05)
+    (samples, *others), *_ = map_pose_inputs(4, 300, 60, noise=0.4, baseline=0.0, rotation=0.05)
     assert (map_pose(samples, *others).code == PoseCode.NO_BASELINE).all()

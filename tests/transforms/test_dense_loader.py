@@ -1,4 +1,4 @@
-"""Maps of every pixel inside a loader and in shards: fixed shapes, the sparse keys untouched, and only what is known."""
+"""Dense maps in a data loader and in shards: fixed shapes, unchanged sparse keys, no depth where there is no answer."""
 
 import pickle
 import warnings
@@ -6,10 +6,10 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from support.loader_batches import join_features, load_batches
 from support.sample_dicts import GAP, SIDE, Frames, frames
+from support.stub_recordings import Load, recording, rows
 from support.stub_samples import added
-from test_extend_depth import in_rows, loaded
-from test_plan import Load, recording, rows
 from torch.utils.data import default_collate
 
 from dhtorch import MAP
@@ -192,8 +192,8 @@ def test_a_worker_says_the_same_also_where_an_item_is_corrupt(items):
         return ExtendedDataset(Frames(items[: GAP + 2], {1}), transform, gap=GAP)
 
     options = {"on_error": "flag", "tokens_hw": (56, 56)}
-    here = in_rows(loaded(dataset(transform(**options)), 0)[0])
-    there = in_rows(loaded(dataset(transform(**options)), 1, "fork")[0])
+    here = join_features(load_batches(dataset(transform(**options)), 0)[0])
+    there = join_features(load_batches(dataset(transform(**options)), 1, "fork")[0])
     assert [k for k, v in here.items() if not torch.equal(v, there[k])] == []
     assert here["dhtorch.problem"].tolist() == [1, 3, 1, 1, 1, 1, 0, 3], "the last one's other view is corrupt"
     flat = here["dhtorch.source_map"].flatten(1)

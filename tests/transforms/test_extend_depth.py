@@ -10,8 +10,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from support.loader_batches import join_features, load_batches
 from support.sample_dicts import GAP, NEAR, SIDE, Frames, frames, room
-from torch.utils.data import DataLoader, default_collate
+from torch.utils.data import default_collate
 
 import dhtorch
 from dhtorch import PAPER
@@ -27,7 +28,6 @@ from dhtorch.transforms import (
     SampleSpec,
     ValidateDepth,
     collate_kept,
-    one_thread,
     sample_spec,
     validate_depth,
 )
@@ -327,29 +327,10 @@ def test_a_batch_on_an_accelerator(items):
 # ---------------------------------------------------------------------------------------------------- workers
 
 
-def loaded(dataset, workers, context=None, batch=2, **options):
-    loader = DataLoader(
-        dataset,
-        batch,
-        num_workers=workers,
-        multiprocessing_context=context,
-        worker_init_fn=one_thread if workers else None,
-        timeout=120 if workers else 0,
-        **options,
-    )
-    return list(loader), loader
-
-
-def in_rows(batches):
-    return {
-        k: torch.cat([b[k] for b in batches]) for k in batches[0] if k.startswith("dhtorch.") and k != "dhtorch.skipped"
-    }
-
-
 @pytest.fixture(scope="module")
 def in_process(items):
     dataset = ExtendedDataset(Frames(items), transform(index_key="index", seed=5), gap=GAP)
-    return in_rows(loaded(dataset, 0)[0])
+    return join_features(load_batches(dataset, 0)[0])
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning", "ignore:.*pin_memory.*:UserWarning")
@@ -364,13 +345,13 @@ def in_process(items):
 def test_workers_and_batch_size_change_nothing(items, in_process, workers, context, batch, options):
     extender = transform(index_key="index", seed=5)
     dataset = ExtendedDataset(Frames(items), extender, gap=GAP)
-    batches, loader = loaded(dataset, workers, context, batch, **options)
-    rows = in_rows(batches)
+    batches, loader = load_batches(dataset, workers, context, batch, **options)
+    rows = join_features(batches)
     assert [k for k, v in in_process.items() if not torch.equal(v, rows[k])] == []
     assert all(not v.requires_grad for v in rows.values())
     assert batches[0]["task"] == ["look around"] * batch and "before" not in batches[0]
     if options.get("persistent_workers"):
-        again = in_rows(list(loader))
+        again = join_features(list(loader))
         assert all(torch.equal(v, again[k]) for k, v in rows.items())
     episodes = 2 if options.get("persistent_workers") else 1
     assert extender.report() == {"none": 3 * episodes, "no_second_view": 9 * episodes, "no_depth": 0, "unreadable": 0}
@@ -380,14 +361,14 @@ def test_workers_and_batch_size_change_nothing(items, in_process, workers, conte
 def test_corrupt_samples_in_the_middle(items):
     corrupt = {3, 8}
     with pytest.raises(OSError, match="premature end"):
-        loaded(ExtendedDataset(Frames(items, corrupt), transform(other_image=None)), 1, "fork")
+        load_batches(ExtendedDataset(Frames(items, corrupt), transform(other_image=None)), 1, "fork")
     skipping = transform(on_error="skip", other_image=None)
-    batches, _ = loaded(ExtendedDataset(Frames(items, corrupt), skipping), 2, "fork", collate_fn=collate_kept)
+    batches, _ = load_batches(ExtendedDataset(Frames(items, corrupt), skipping), 2, "fork", collate_fn=collate_kept)
     assert torch.cat([b["index"] for b in batches]).tolist() == [i for i in range(12) if i not in corrupt]
     assert sum(int(b["dhtorch.skipped"]) for b in batches) == 2 == skipping.report()["unreadable"]
     flagging = transform(on_error="flag", other_image=None)
-    batches, _ = loaded(ExtendedDataset(Frames(items, corrupt), flagging), 2, "fork")
-    rows = in_rows(batches)
+    batches, _ = load_batches(ExtendedDataset(Frames(items, corrupt), flagging), 2, "fork")
+    rows = join_features(batches)
     assert (rows["dhtorch.problem"] == SampleProblem.UNREADABLE).nonzero()[:, 0].tolist() == sorted(corrupt)
     assert flagging.report() == {"none": 0, "no_second_view": 10, "no_depth": 0, "unreadable": 2}
     assert batches[0]["image"].shape[1:] == (SIDE, SIDE, 3) and batches[1]["image"][1].sum() == 0
@@ -406,8 +387,8 @@ class Nested(Frames):
 def test_what_is_added_leaves_a_worker_in_one_piece(items, in_process, by_batch, context):
     extender = transform(index_key="index", seed=5, batched=by_batch or None)
     dataset = ExtendedDataset(Nested(items), extender, gap=GAP, by_batch=by_batch, consumed=("depth",))
-    batches, _ = loaded(dataset, 1, context, 4, collate_fn=dataset.collate)
-    rows = in_rows(batches)
+    batches, _ = load_batches(dataset, 1, context, 4, collate_fn=dataset.collate)
+    rows = join_features(batches)
     assert [k for k, v in in_process.items() if not torch.equal(v, rows[k]) or v.dtype != rows[k].dtype] == []
     for batch in batches:
         ours = {k: x for k, x in batch.items() if k.startswith("dhtorch.")}
@@ -417,7 +398,7 @@ def test_what_is_added_leaves_a_worker_in_one_piece(items, in_process, by_batch,
         assert all(x.is_contiguous() and x.data_ptr() % 8 == 0 for x in ours.values())
         assert all(x.untyped_storage().data_ptr() != batch["image"].untyped_storage().data_ptr() for x in ours.values())
         assert batch["episode"]["number"].tolist() == batch["index"].tolist() and "depth" not in batch
-    (own,) = loaded(dataset, 0, None, 12, collate_fn=dataset.collate)[0]
+    (own,) = load_batches(dataset, 0, None, 12, collate_fn=dataset.collate)[0]
     mine = [x.untyped_storage().data_ptr() for k, x in own.items() if k.startswith("dhtorch.")]
     assert len(set(mine)) == len(mine), "nothing is shared where nothing leaves the process"
 
@@ -425,9 +406,9 @@ def test_what_is_added_leaves_a_worker_in_one_piece(items, in_process, by_batch,
 @pytest.mark.filterwarnings("ignore")
 def test_skipped_samples_leave_a_batch(items):
     skipping = ExtendedDataset(Frames(items, {3, 8}), transform(on_error="skip", other_image=None))
-    batches, _ = loaded(skipping, 2, "fork", 4, collate_fn=skipping.collate)
+    batches, _ = load_batches(skipping, 2, "fork", 4, collate_fn=skipping.collate)
     assert [b["dhtorch.skipped"].item() for b in batches] == [1, 0, 1]
-    rows = in_rows(batches)
+    rows = join_features(batches)
     expected = [transform(other_image=None)(items[i]) for i in range(12) if i not in (3, 8)]
     assert [k for k, x in rows.items() if not torch.equal(x, torch.stack([e[k] for e in expected]))] == []
 
@@ -435,7 +416,7 @@ def test_skipped_samples_leave_a_batch(items):
 @pytest.mark.filterwarnings("ignore")
 def test_a_whole_batch_skipped(items):
     skipping = transform(on_error="skip", other_image=None)
-    batches, _ = loaded(ExtendedDataset(Frames(items[:4], {0, 1}), skipping), 0, collate_fn=collate_kept)
+    batches, _ = load_batches(ExtendedDataset(Frames(items[:4], {0, 1}), skipping), 0, collate_fn=collate_kept)
     assert batches[0] == {"dhtorch.skipped": 2} and batches[1]["dhtorch.depth"].shape == (2, N)
     with pytest.raises(SampleError, match="neither item 0 nor its neighbours"):
         ExtendedDataset(Frames(items[:2], {0, 1}), transform(on_error="flag"))[0]
@@ -449,7 +430,7 @@ class Threads(Frames):
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_one_thread_in_a_worker(items):
     cv2.setNumThreads(2)
-    batches, _ = loaded(Threads(items[:2]), 1, "fork")
+    batches, _ = load_batches(Threads(items[:2]), 1, "fork")
     assert batches[0]["torch"].tolist() == batches[0]["cv2"].tolist() == [1, 1] and cv2.getNumThreads() == 2
     cv2.setNumThreads(1)
 

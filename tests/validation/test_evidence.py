@@ -21,6 +21,7 @@ from dhtorch.validation.evidence import (
     sparse_evidence,
     validation_references,
 )
+from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
 
 HW = (24, 32)
 
@@ -106,7 +107,7 @@ def test_of_several_views_the_mildest_counts(monkeypatch):
     monkeypatch.setattr(
         evidence,
         "_view_evidence",
-        lambda q, base, p, tolerance: (torch.full_like(q, said[p.fit]), torch.ones_like(q) > 0),
+        lambda q, base, p, tolerance, options: (torch.full_like(q, said[p.fit]), torch.ones_like(q) > 0),
     )
     found = photometric_evidence(flat, base, [source_view._replace(fit=k) for k in said], 0.02)
     assert (found.misfit == -2).all()
@@ -118,7 +119,9 @@ def test_a_pixel_without_a_depth_has_none_from_its_window(monkeypatch):
     holed = torch.full((1, *HW), 2.0)
     holed[0, 10, 10] = 0
     monkeypatch.setattr(
-        evidence, "_view_evidence", lambda q, base, p, tolerance: (torch.full_like(q, 1.0), torch.ones_like(q) > 0)
+        evidence,
+        "_view_evidence",
+        lambda q, base, p, tolerance, options: (torch.full_like(q, 1.0), torch.ones_like(q) > 0),
     )
     found = photometric_evidence(holed, base, [source_view], 0.02)
     assert found.misfit[0, 10, 10].isnan()
@@ -127,7 +130,7 @@ def test_a_pixel_without_a_depth_has_none_from_its_window(monkeypatch):
 
 def test_the_best_of_other_depths_is_named_with_its_factor(monkeypatch):
     q = torch.full((1, *HW), 0.5)
-    likes = dict.fromkeys(evidence.RIVAL_FACTORS, 0.1) | {0.58: 0.95, 1.14: 0.6}
+    likes = dict.fromkeys(DEFAULT_VALIDATION_OPTIONS.rival_factors, 0.1) | {0.58: 0.95, 1.14: 0.6}
 
     def fit(base, view, picture, at, *, radius):
         value = likes[min(likes, key=lambda k: abs(k - float(at[0, 0, 0]) / 0.5))]
@@ -135,11 +138,15 @@ def test_the_best_of_other_depths_is_named_with_its_factor(monkeypatch):
 
     monkeypatch.setattr(plane_sweep, "fit_windows", fit)
     base, source_view = a_view((0.1, 0, 0))
-    best, factor, beside = evidence._rivals(q, base, source_view)
+    best, factor, beside = evidence._rivals(q, base, source_view, DEFAULT_VALIDATION_OPTIONS)
     assert best[0, 5, 5] == pytest.approx(0.95)
     assert factor[0, 5, 5] == pytest.approx(0.58)
     assert beside[0, 5, 5] == pytest.approx(
-        0.95 if 0.7 * evidence.DETECTABLE_LOG_RATIO < -math.log(0.58) < 3 * evidence.DETECTABLE_LOG_RATIO else 0.6
+        0.95
+        if 0.7 * DEFAULT_VALIDATION_OPTIONS.detectable_log_ratio
+        < -math.log(0.58)
+        < 3 * DEFAULT_VALIDATION_OPTIONS.detectable_log_ratio
+        else 0.6
     )
 
 
@@ -149,7 +156,9 @@ def test_what_another_view_does_not_see_it_says_nothing_of():
     pose = SimpleNamespace(
         cov=1e-8 * torch.eye(6)[None], shutter=None, ok=torch.tensor([True]), T_1_from_0=source_view.view.T_1_from_0
     )
-    misfit, sure = evidence._view_evidence(torch.full((1, *HW), 1.0), base, source_view._replace(fit=pose), 0.02)
+    misfit, sure = evidence._view_evidence(
+        torch.full((1, *HW), 1.0), base, source_view._replace(fit=pose), 0.02, DEFAULT_VALIDATION_OPTIONS
+    )
     assert misfit[0, :, -10:].isnan().all()
     assert not sure[0, :, -10:].any()
 
@@ -169,7 +178,7 @@ def test_windows_that_fit_say_nothing_where_the_lens_knows_no_ray(monkeypatch):
     known = torch.ones(1, *HW, dtype=torch.bool)
     known[0, :, :5] = False
     misfit, sure = evidence._view_evidence(
-        like, base.replace(known=known.flatten(1)), source_view._replace(fit=pose), 0.02
+        like, base.replace(known=known.flatten(1)), source_view._replace(fit=pose), 0.02, DEFAULT_VALIDATION_OPTIONS
     )
     assert misfit[known].isfinite().all()
     assert sure[known].all()
@@ -191,3 +200,7 @@ def test_maps_speak_only_between_views_that_stand_apart():
     assert not depth_consistency_evidence(far, base, [apart], [near], 0.02).misfit.isfinite().any(), (
         "what lies behind may be hidden"
     )
+
+
+def test_a_window_is_one_independent_pixel():
+    assert DEFAULT_VALIDATION_OPTIONS.share_window_pixels == 81

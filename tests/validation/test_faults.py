@@ -23,6 +23,7 @@ from dhtorch.validation.faults import (
     select_cause,
     track_window,
 )
+from dhtorch.validation.options import ValidationOptions
 
 N, FIRST = 16, 4
 METHOD = TRACKING_METHOD.replace(n=256)
@@ -250,6 +251,13 @@ def test_an_explanation_must_be_clear_and_alone():
     assert select_cause(losses(mirror=torch.tensor([0.9, -0.3] * 4))).cause is None, "some pairs only"
     few = {name: torch.cat([x[:3], torch.full((5,), torch.nan)]) for name, x in losses(mirror=0.2).items()}
     assert select_cause(few).cause is None, "too few pairs tell"
+
+
+def test_options_change_what_they_name(frames, still):
+    """Pairs of a window, and what an explanation must save."""
+    assert track_window(frames[:4], METHOD, ValidationOptions(min_tracked_ratio=2.0)).pairs == []
+    maps = [mirror_depth(frames[0].depth)] * len(still)
+    assert diagnose(still, maps, watched=UNWATCHED, options=ValidationOptions(min_loss_saved=1.0)).cause is None
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])

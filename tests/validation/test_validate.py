@@ -15,10 +15,9 @@ from dhtorch.pipeline import dense
 from dhtorch.pytree import collate, stack
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.validation.evidence import Evidence
+from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOptions
 from dhtorch.validation.validate import (
     QUICK_METHOD,
-    SENSOR_SCALE_SIGMA,
-    TRAJECTORY_SCALE_SIGMA,
     clipped_depth,
     combine_evidence,
     share_interval,
@@ -80,7 +79,11 @@ def test_a_true_map_is_consistent_and_its_numbers_hold(sound):
 
 
 @pytest.mark.parametrize(
-    ("name", "good_for"), [("scale_near", SENSOR_SCALE_SIGMA), ("scale_vs_trajectory", TRAJECTORY_SCALE_SIGMA)]
+    ("name", "good_for"),
+    [
+        ("scale_near", DEFAULT_VALIDATION_OPTIONS.sensor_scale_sigma),
+        ("scale_vs_trajectory", DEFAULT_VALIDATION_OPTIONS.trajectory_scale_sigma),
+    ],
 )
 def test_a_metre_is_told_no_closer_than_what_tells_it_is_good_for(name, good_for, sound):
     """However many points agree: they share one sensor, or one trajectory."""
@@ -174,7 +177,7 @@ def test_quick_leaves_a_metre_unknown_where_the_motion_comes_out_short(room, tru
 def test_what_quick_missed_by_points_alone_it_was_silent_on(name):
     """As docs/validate.md says of the committed results."""
     rows = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
-    wide = [row for row in rows if row["method"] == "judge" and row["pair"] is not None and row["baseline"]]
+    wide = [row for row in rows if row["method"] == "validate" and row["pair"] is not None and row["baseline"]]
     told = [row for row in wide if row["quick_far.none"] is not None]
     assert 0 < len(told) < len(wide)
     assert all(row[f"quick_far.10_{side}"] for row in told for side in ("long", "short"))
@@ -382,3 +385,14 @@ def test_a_map_without_pixels_is_refused():
     room = SyntheticRoom(n_frames=1, hw=(48, 64), depth_hw=(24, 32))
     with pytest.raises(ValueError, match=r"depth_map has shape \(1, 0, 0\), expected at least 2×2 pixels"):
         validate_depth(torch.zeros(1, 0, 0), room[0], None)
+
+
+def test_options_change_what_they_name(true, reference, others, sound):
+    """One option of each kind: evidence, states and numbers of the frame."""
+    maps = {"depth_map": true, "reference": reference, "others": others}
+    strict = validate_depth(**maps, **SMALL, options=ValidationOptions(min_filled_ratio=1.1))
+    assert not strict.photometric_evidence.isfinite().any()
+    harsh = validate_depth(**maps, **SMALL, views=False, options=ValidationOptions(refuting_evidence_sigmas=1.0))
+    assert (harsh.state == State.WRONG).sum() > (sound.state == State.WRONG).sum()
+    few = validate_depth(**maps, **SMALL, views=False, options=ValidationOptions(min_scale_references=10_000))
+    assert few.scale.isnan().all()

@@ -1,1 +1,1 @@
-"""File formats without a meaning of their own: what a container holds, never what a data set says with it."""
+"""Codecs of general file formats: container -> arrays, without any knowledge of data sets."""

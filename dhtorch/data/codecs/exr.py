@@ -1,7 +1,7 @@
-"""OpenEXR pictures of one layer: depth maps in metres, focal stacks.
+"""Codec of single-layer OpenEXR images: depth maps in metres, focal stacks.
 
-The header is parsed here, so that a size is known without decoding and an absurd one never reaches the decoder.
-Single-part files of scan lines only, which is what cameras write.
+The header is parsed here, so that the size is known without decoding and is checked before it reaches the decoder. Only
+single-part scan-line files, as cameras write them.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ _LINES_PER_CHUNK = {
 
 
 class ExrHeader(NamedTuple):
-    """What an EXR file says about itself."""
+    """Size, channels and chunk table of an EXR file."""
 
     hw: tuple[int, int]
     channels: tuple[str, ...]  # as stored, by name
-    start: int  # byte where the table of chunks starts
+    start: int  # offset of the table of chunks
     chunks: int
 
 
@@ -44,9 +44,9 @@ def read_exr(file: Path, channel: str | None = None, hw: tuple[int, int] | None 
     """One channel (h, w) float32, of half, float or integer pixels; NaN and infinity may occur.
 
     Args:
-        file: the picture.
-        channel: its name. None = R, else Y, Z, V, depth, else the only one there is.
-        hw: the size to insist on.
+        file: the image.
+        channel: its name. None = R, else Y, Z, V, depth, else the only channel.
+        hw: required size.
 
     Raises:
         FormatError: missing, truncated or unknown file, another size than ``hw``, or no such channel.
@@ -85,7 +85,7 @@ def read_exr_header(file: Path) -> ExrHeader:
 def decode_exr_header(data: bytes, file: Path) -> ExrHeader:
     """As :func:`read_exr_header`, of bytes in memory; ``file`` names them in errors."""
     if not data.startswith(_MAGIC) or len(data) < 8:
-        raise FormatError(file, "content", f"{data[:4]!r}", "an OpenEXR picture")
+        raise FormatError(file, "content", f"{data[:4]!r}", "an OpenEXR image")
     version = struct.unpack_from("<I", data, 4)[0]
     if version & 0xFF != 2 or version & (_TILED | _DEEP | _MULTIPART):
         raise FormatError(file, "version", f"{version:#x}", "2, one part of scan lines")
@@ -98,13 +98,13 @@ def decode_exr_header(data: bytes, file: Path) -> ExrHeader:
         raise FormatError(file, "header", error, "channels, compression and dataWindow") from None
     h, w = y1 - y0 + 1, x1 - x0 + 1
     if h < 1 or w < 1 or h * w * max(len(channels), 1) > MAX_PIXELS:
-        found = f"{w}x{h} with {len(channels)} channels"
-        raise FormatError(file, "dataWindow", found, f"1 to {MAX_PIXELS} values")
+        problem = f"{w}x{h} with {len(channels)} channels"
+        raise FormatError(file, "dataWindow", problem, f"1 to {MAX_PIXELS} values")
     return ExrHeader((h, w), channels, start, -(-h // per_chunk))
 
 
 def _parse_attributes(data: bytes, file: Path) -> tuple[dict[str, bytes], int]:
-    """Name → value of the header's attributes, and where the header ends."""
+    """(name → value of the header's attributes, offset of the header's end)."""
     attributes: dict[str, bytes] = {}
     at = 8
     while at < len(data) and data[at]:
@@ -132,7 +132,7 @@ def _parse_channels(value: bytes) -> tuple[str, ...]:
 
 
 def _check_chunks(header: ExrHeader, data: bytes, file: Path) -> None:
-    """Every chunk that the table names begins and ends inside the file: a picture cut short has some that do not."""
+    """Check that every chunk of the table lies inside the file, which fails for truncated images."""
     end = header.start + 8 * header.chunks
     if end > len(data):
         raise FormatError(file, "data", f"{len(data)} bytes", f"a table of {header.chunks} chunks and the chunks")
@@ -140,13 +140,13 @@ def _check_chunks(header: ExrHeader, data: bytes, file: Path) -> None:
     for i, offset in enumerate(offsets):
         inside = end <= offset <= len(data) - 8
         if not inside or offset + 8 + struct.unpack_from("<I", data, offset + 4)[0] > len(data):
-            raise FormatError(file, f"chunk {i}", f"bytes beyond the {len(data)} of the file", "a whole picture")
+            raise FormatError(file, f"chunk {i}", f"bytes beyond the {len(data)} of the file", "a whole image")
 
 
 def _select_channel(header: ExrHeader, channel: str | None, file: Path) -> str:
-    wanted = [channel] if channel else ["R", "Y", "Z", "V", "depth", *header.channels[: len(header.channels) == 1]]
-    for name in wanted:
+    candidates = [channel] if channel else ["R", "Y", "Z", "V", "depth", *header.channels[: len(header.channels) == 1]]
+    for name in candidates:
         if name in header.channels:
             return name
-    found = ", ".join(header.channels) or "none"
-    raise FormatError(file, "channels", found, channel or "one of R, Y, Z, V, depth, or a single one")
+    available = ", ".join(header.channels) or "none"
+    raise FormatError(file, "channels", available, channel or "one of R, Y, Z, V, depth, or a single one")

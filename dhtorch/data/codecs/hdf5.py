@@ -1,7 +1,7 @@
-"""HDF5: arrays of numbers of which one row at a time is read.
+"""Codec of HDF5: arrays of numbers, read one row at a time.
 
-The library is asked for shape, type and storage of an array first. What leads out of the file (soft and external links,
-external storage, virtual arrays) and what needs a plug-in to decode is refused.
+Shape, type and storage of an array are checked first. References out of the file (soft and external links, external
+storage, virtual arrays) and filters that need a plug-in are refused.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, import_optional
 from dhtorch.data.io.safe_open import check_regular_file, open_regular, unreadable_error
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
-_FILTERS = {"gzip", "lzf", "shuffle", "fletcher32"}  # come with the library
+_FILTERS = {"gzip", "lzf", "shuffle", "fletcher32"}  # built into the library
 _MAX_NAMES = 10_000
 
 
 class Hdf5Array(NamedTuple):
-    """An array in an HDF5 file: what the file says about it."""
+    """An array in an HDF5 file: its key, shape and type."""
 
     file: Path
     key: str
@@ -42,26 +42,26 @@ class Hdf5Array(NamedTuple):
         with _open_hdf5(self.file) as group:
             array = _check_array(group, self.key, self.file)
             if array.shape != self.shape or array.dtype != self.dtype:
-                found = f"{array.dtype} of {array.shape}"
-                raise FormatError(self.file, self.key, found, f"{self.dtype} of {self.shape}")
+                problem = f"{array.dtype} of {array.shape}"
+                raise FormatError(self.file, self.key, problem, f"{self.dtype} of {self.shape}")
             return np.asarray(array[i])
 
 
 def list_hdf5_arrays(file: Path) -> dict[str, Hdf5Array]:
-    """Name → array of numbers, of the top level of a file. Nothing of the values is read.
+    """Name → array, for the arrays of numbers at the top level of a file; reads no values.
 
     Raises:
-        FormatError: missing or damaged file, an array that lies elsewhere, or rows beyond ``MAX_FILE_BYTES``.
+        FormatError: missing or damaged file, an array stored in another file, or rows beyond ``MAX_FILE_BYTES``.
         ImportError: no decoder is installed.
     """
     with _open_hdf5(file) as group:
         if len(group) > _MAX_NAMES:
             raise FormatError(file, "names", f"{len(group)}", f"at most {_MAX_NAMES}")
-        found = {}
+        arrays = {}
         for key in group:
             array = _check_array(group, key, file)
-            found[key] = Hdf5Array(file, key, array.shape, array.dtype)
-        return found
+            arrays[key] = Hdf5Array(file, key, array.shape, array.dtype)
+        return arrays
 
 
 @contextmanager
@@ -79,12 +79,12 @@ def _open_hdf5(file: Path) -> Iterator[Any]:
             yield group
     except (FormatError, IndexError):
         raise
-    except Exception as error:  # whatever the library raises means damage
+    except Exception as error:  # any error of the library means damage
         raise FormatError(file, "data", error or type(error).__name__, "a whole HDF5 file") from None
 
 
 def _check_array(group: Any, key: str, file: Path) -> Any:
-    """An array of numbers stored in this file, whose rows fit into memory."""
+    """The array ``key``, checked: numbers, stored in this file, with rows that fit into memory."""
     library = import_optional("h5py")
     if not isinstance(group.get(key, getlink=True), library.HardLink):
         raise FormatError(file, key, "a link", "an array in this file")
@@ -99,7 +99,7 @@ def _check_array(group: Any, key: str, file: Path) -> Any:
     if not filters <= _FILTERS:
         raise FormatError(file, f"{key} filters", ", ".join(sorted(filters)), ", ".join(sorted(_FILTERS)))
     if array.shape[0] > (size := check_regular_file(file)):
-        raise FormatError(file, f"{key} size", f"{array.shape[0]} rows in {size} bytes", "at most one a byte")
+        raise FormatError(file, f"{key} size", f"{array.shape[0]} rows in {size} bytes", "at most one per byte")
     row = math.prod(array.shape[1:]) * array.dtype.itemsize
     chunk = math.prod(array.chunks or (1,)) * array.dtype.itemsize
     if max(row, chunk) > MAX_FILE_BYTES:

@@ -1,7 +1,7 @@
-"""LZFSE, Apple's compression: Record3D keeps depth and confidence in it.
+"""Codec of LZFSE, Apple's compression, used by Record3D for depth and confidence.
 
-A stream is a chain of blocks, each with its kind and its unpacked size in front, closed by ``bvx$``. The chain is
-walked before a decoder sees a byte, so a truncated stream, or one that would unpack to another size, never gets there.
+A stream is a sequence of blocks, each starting with its type and unpacked size, terminated by ``bvx$``. The blocks are
+checked before decoding, so that truncated streams, or streams of another size, do not reach the decoder.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _END_OF_STREAM = b"bvx$"
 
 
 def decompress_lzfse(data: bytes, size: int, file: Path, field: str) -> bytes:
-    """Exactly ``size`` bytes of an LZFSE stream; a member that is not compressed and has that size is returned as is.
+    """LZFSE stream → exactly ``size`` bytes; uncompressed data of that size is returned unchanged.
 
     Raises:
         FormatError: truncated, damaged, or of another size.
@@ -24,14 +24,14 @@ def decompress_lzfse(data: bytes, size: int, file: Path, field: str) -> bytes:
     """
     if len(data) == size and not data.startswith(b"bvx"):
         return data
-    claimed = lzfse_unpacked_size(data, file, field)
-    if claimed != size:
-        raise FormatError(file, field, f"{claimed} bytes when unpacked", f"{size} bytes")
-    # imagecodecs is told how much room there is; the other two grow their buffer as long as a hostile stream asks.
+    declared = lzfse_unpacked_size(data, file, field)
+    if declared != size:
+        raise FormatError(file, field, f"{declared} bytes when unpacked", f"{size} bytes")
+    # imagecodecs decodes into a buffer of fixed size; the others grow theirs as far as a hostile stream demands.
     decoder = import_optional("imagecodecs", "liblzfse", "lzfse")
     try:
-        bounded = decoder.__name__ == "imagecodecs"
-        raw = bytes(decoder.lzfse_decode(data, out=size) if bounded else decoder.decompress(data))
+        is_bounded = decoder.__name__ == "imagecodecs"
+        raw = bytes(decoder.lzfse_decode(data, out=size) if is_bounded else decoder.decompress(data))
     except _decoder_errors(decoder) as error:
         raise FormatError(file, field, error or "damaged blocks", "a whole LZFSE stream") from None
     if len(raw) != size:
@@ -40,24 +40,24 @@ def decompress_lzfse(data: bytes, size: int, file: Path, field: str) -> bytes:
 
 
 def lzfse_unpacked_size(data: bytes, file: Path, field: str) -> int:
-    """Bytes that the blocks of a stream say they hold; every block and the end mark lie inside ``data``.
+    """Unpacked size in bytes declared by the blocks of a stream; checks that all blocks lie inside ``data``.
 
     Raises:
-        FormatError: no LZFSE, an unknown block, or the stream ends before its end mark.
+        FormatError: not LZFSE, an unknown block, or the stream ends before its end mark.
     """
     at, size = 0, 0
     while data[at : at + 4] != _END_OF_STREAM:
         try:
             raw, length = _parse_block(data, at)
         except (struct.error, KeyError):
-            found = f"{data[at : at + 4]!r} at byte {at} of {len(data)}"
-            raise FormatError(file, field, found, "a whole LZFSE block") from None
+            problem = f"{data[at : at + 4]!r} at byte {at} of {len(data)}"
+            raise FormatError(file, field, problem, "a whole LZFSE block") from None
         at, size = at + length, size + raw
     return size
 
 
 def _parse_block(data: bytes, at: int) -> tuple[int, int]:
-    """(unpacked bytes, length in the stream) of the block at a place."""
+    """(unpacked bytes, bytes in the stream) of the block at offset ``at``."""
     kind, raw = struct.unpack_from("<4sI", data, at)
     if kind == b"bvx-":  # stored
         length = 8 + raw
@@ -66,7 +66,7 @@ def _parse_block(data: bytes, at: int) -> tuple[int, int]:
     elif kind == b"bvx2":  # packed tables: 20-bit payload sizes, 32-bit size of the header
         first, second, third = struct.unpack_from("<QQQ", data, at + 8)
         length = (third & 0xFFFFFFFF) + (first >> 20 & 0xFFFFF) + (second >> 40 & 0xFFFFF)
-    else:  # bvx1, with its tables unpacked, exists on paper: encoders write bvx2
+    else:  # bvx1, with uncompressed tables, is specified but not written by encoders
         raise KeyError(kind)
     if length < 8:
         raise KeyError(kind)

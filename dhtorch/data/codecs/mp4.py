@@ -1,6 +1,6 @@
-"""What an mp4 says of the number of its samples, held against its length before a decoder makes room for them.
+"""Check of an mp4's declared number of samples against its length, before a decoder allocates memory for them.
 
-Some tables are short however many samples they speak of: all of one size, runs of one duration, fragments of defaults.
+Some tables are short for any number of samples: all of one size, runs of one duration, fragments of defaults.
 """
 
 from __future__ import annotations
@@ -13,42 +13,44 @@ from typing import BinaryIO, Final, NamedTuple
 from dhtorch.data.io.decode import MAX_TEXT_BYTES, FormatError
 from dhtorch.data.io.safe_open import check_memory
 
-#: The first box of a film.
+#: Types of the first box of a file.
 MP4_FIRST_BOXES: Final = (b"ftyp", b"styp", b"moov", b"moof", b"mdat", b"wide", b"free", b"skip", b"uuid", b"pnot")
 
 _CONTAINER_BOXES: Final = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"moof", b"traf", b"edts", b"mvex")
 _RUN_LENGTH_BOXES: Final = (b"stts", b"ctts")  # tables of (count, value)
-_BYTES_PER_SAMPLE: Final = 200  # bytes that a decoder and our own table take for one
+_BYTES_PER_SAMPLE: Final = 200  # memory of a decoder and of our table per sample
 _MAX_DEPTH: Final = 12
 _MAX_BOXES: Final = 200_000
 
 
 class _Box(NamedTuple):
     kind: bytes
-    start: int  # of its content
+    start: int  # offset of its content
     end: int
 
 
 def check_sample_count(stream: BinaryIO, file: Path) -> None:
-    """Refuse a film with more samples than bytes, or than memory is allowed for.
+    """Raise FormatError for a file that declares more samples than bytes, or than the memory limit allows.
 
     Raises:
-        FormatError: that, or boxes without end.
+        FormatError: too many samples or boxes.
     """
     total = stream.seek(0, 2)
-    found = 0
+    n_samples = 0
     for number, box in enumerate(_iter_boxes(stream, _Box(b"", 0, total), 0)):
         if number > _MAX_BOXES:
-            raise FormatError(file, "boxes", f"more than {_MAX_BOXES}", "a film of fewer")
-        claimed = _declared_samples(stream, box, file)
-        if claimed > total:
-            raise FormatError(file, box.kind.decode(), f"{claimed} samples in {total} bytes", "at most one a byte")
-        found += claimed if box.kind in (b"stsz", b"stz2", b"trun") else 0
-        check_memory(file, "samples", _BYTES_PER_SAMPLE * max(found, claimed), f"{max(found, claimed)} samples")
+            raise FormatError(file, "boxes", f"more than {_MAX_BOXES}", "a file with fewer")
+        declared = _declared_samples(stream, box, file)
+        if declared > total:
+            raise FormatError(file, box.kind.decode(), f"{declared} samples in {total} bytes", "at most one per byte")
+        n_samples += declared if box.kind in (b"stsz", b"stz2", b"trun") else 0
+        check_memory(
+            file, "samples", _BYTES_PER_SAMPLE * max(n_samples, declared), f"{max(n_samples, declared)} samples"
+        )
 
 
 def _iter_boxes(stream: BinaryIO, inside: _Box, depth: int) -> Iterator[_Box]:
-    """Boxes in their order, those inside others behind them; one that is damaged ends its folder."""
+    """Boxes in depth-first order; a damaged box ends its container."""
     at = inside.start
     while at + 8 <= inside.end:
         stream.seek(at)
@@ -68,7 +70,7 @@ def _iter_boxes(stream: BinaryIO, inside: _Box, depth: int) -> Iterator[_Box]:
 
 
 def _declared_samples(stream: BinaryIO, box: _Box, file: Path) -> int:
-    """Samples that a table speaks of."""
+    """Number of samples that a table declares; 0 for other boxes."""
     stream.seek(box.start)
     if box.kind in (b"stsz", b"stz2"):
         _, _, n = struct.unpack(">III", stream.read(12).ljust(12, b"\0"))

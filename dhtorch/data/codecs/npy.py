@@ -1,7 +1,7 @@
-"""numpy's own files, ``.npy`` and ``.npz``, without pickled objects; those are read by ``codec_pickle``.
+"""Codec of ``.npy`` and ``.npz`` without pickled objects (for those see :mod:`dhtorch.data.codecs.pickles`).
 
-The header is a Python expression, and numpy's parser of it was not written for damaged files: whatever it raises ends
-as a ``FormatError`` here. An array's size is believed once its bytes are there.
+The header is a Python expression, and numpy's parser of it is not written for damaged files: all its errors become
+``FormatError`` here. An array's declared size is compared with its bytes.
 """
 
 from __future__ import annotations
@@ -21,33 +21,35 @@ from dhtorch.data.codecs.zips import check_zip_directory
 from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, read_bytes
 from dhtorch.data.io.safe_open import check_memory
 
-#: Bytes in which a header ends.
+#: Largest size of a header in bytes.
 _MAX_HEADER_BYTES = 12_288
 
 
 class NpyHeader(NamedTuple):
-    """What a numpy array file says about itself."""
+    """Shape, order and type of an array, from its header."""
 
     shape: tuple[int, ...]
     fortran: bool  # first axis fastest
     dtype: np.dtype
-    start: int  # byte where the values start
+    start: int  # offset of the values
 
 
 def parse_npy_header(file: Path, field: str, head: bytes) -> NpyHeader:
-    """Header of an ``.npy`` file from its first bytes (12 KB are plenty); of numbers, texts or pickled objects.
+    """Header of an ``.npy`` file from its first bytes (12 KB suffice), for numbers, texts or pickled objects.
 
     Raises:
-        FormatError: no such header, or a shape that no array has.
+        FormatError: not such a header, or an invalid shape.
     """
     stream = io.BytesIO(head)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of headers as Python 2 wrote them
+            warnings.simplefilter("ignore")  # on headers written by Python 2
             version = np.lib.format.read_magic(stream)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-            shape, fortran, dtype = read(stream)
-    except Exception as error:  # a parser of Python's and numpy's rules for types: there is no list of what they raise
+            read_header = (
+                np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            )
+            shape, fortran, dtype = read_header(stream)
+    except Exception as error:  # numpy's parser: its exceptions are not specified
         raise FormatError(file, field, f"{type(error).__name__} {error}", "a numpy array header") from None
     if len(shape) > 8 or any(type(n) is not int or not 0 <= n <= 2**40 for n in shape):
         raise FormatError(file, f"{field} shape", shape, "a few counts")
@@ -66,7 +68,7 @@ def _decode_real_npy(file: Path, field: str, raw: bytes) -> np.ndarray:
     """The bytes of an ``.npy`` file of real numbers as floating point.
 
     Raises:
-        FormatError: as :func:`parse_real_npy_header`, or another number of bytes than the header says.
+        FormatError: as :func:`parse_real_npy_header`, or another number of bytes than in the header.
     """
     header = parse_real_npy_header(file, field, raw)
     count, left = math.prod(header.shape), len(raw) - header.start
@@ -78,7 +80,7 @@ def _decode_real_npy(file: Path, field: str, raw: bytes) -> np.ndarray:
 
 
 def _smallest_float_dtype(dtype: np.dtype) -> type[np.floating]:
-    """The smallest floating point that holds all values."""
+    """The smallest floating-point type that represents all values exactly."""
     exact = dtype.itemsize <= (4 if dtype.kind == "f" else 2)
     return np.float32 if exact else np.float64
 
@@ -87,7 +89,7 @@ def read_npz(file: Path, key: str) -> np.ndarray:
     """Array ``key`` of an ``.npz`` archive as floating point; pickled objects are refused.
 
     Raises:
-        FormatError: missing or damaged archive, no such key, not numeric, or larger than it says or than
+        FormatError: missing or damaged archive, no such key, not numeric, or larger than declared or than
             ``MAX_FILE_BYTES``.
     """
     try:

@@ -1,7 +1,7 @@
-"""Parquet tables: some columns of some rows as arrays, without reading the rest of the file.
+"""Codec of parquet tables: selected columns and rows as arrays, without reading the rest of the file.
 
-The footer is checked before the decoder sees it, and every column chunk before it is decoded: the sizes in its page
-headers must add up to what the footer promised and stay below a limit, so that a page cannot unpack into gigabytes.
+The footer is checked before it reaches the decoder, and every column chunk before it is decoded: the sizes in its page
+headers must add up to the footer's and stay below a limit, so that a page cannot unpack into gigabytes.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from dhtorch.data.io.safe_open import (
 )
 
 _MAX_ROWS = 50_000_000
-_MAX_UNPACKED_BYTES = (
-    MAX_MEMORY_BYTES // 4
-)  # bytes of columns asked for, where the file is smaller: decoding makes some copies
+
+#: Limit of the unpacked bytes of the requested columns, where the file is small: decoding makes a few copies.
+_MAX_UNPACKED_BYTES = MAX_MEMORY_BYTES // 4
 
 
 class ParquetHeader(NamedTuple):
-    """What a table says about itself."""
+    """Number of rows, column names and row groups of a table, from its footer."""
 
     rows: int
     columns: tuple[str, ...]
-    groups: tuple[int, ...]  # first row of each row group, and one beyond the last row
+    groups: tuple[int, ...]  # first row of each row group, and the number of rows
 
 
 def read_parquet_header(file: Path) -> ParquetHeader:
-    """Rows, columns and row groups of a table, from its footer alone.
+    """Rows, columns and row groups of a table; reads only its footer.
 
     Raises:
         FormatError: missing, truncated or damaged file, or more than ``_MAX_ROWS`` rows.
@@ -60,7 +60,7 @@ def read_columns(
         file: a table.
         columns: names.
         rows: ``first`` and ``end``; None = all.
-        optional: further columns, of which those are read that are there.
+        optional: further columns, read where the table has them.
 
     Returns:
         For each name an array (rows, …) of numbers, or a list where the column holds texts, bytes or structures. Lists
@@ -76,26 +76,26 @@ def read_columns(
 
 
 def _read_open_columns(
-    file: Path, found: tuple[Any, ParquetHeader], columns: Sequence[str], rows: tuple[int, int]
+    file: Path, opened: tuple[Any, ParquetHeader], columns: Sequence[str], rows: tuple[int, int]
 ) -> dict[str, np.ndarray | list[Any]]:
-    """As :func:`read_columns`, of a table that was opened."""
-    (table, header), (first, end) = found, rows
+    """As :func:`read_columns`, of an opened table."""
+    (table, header), (first, end) = opened, rows
     missing = [name for name in columns if name not in header.columns]
     if missing:
         raise FormatError(file, "columns", ", ".join(header.columns), ", ".join(missing))
     if not 0 <= first <= end <= header.rows:
         raise FormatError(file, "rows", header.rows, f"rows {first} to {end - 1}")
     spans = list(zip(header.groups, header.groups[1:], strict=False))
-    wanted = [i for i, (low, high) in enumerate(spans) if low < end and high > first]
+    groups = [i for i, (low, high) in enumerate(spans) if low < end and high > first]
     pyarrow = import_optional("pyarrow")
     try:
-        _check_pages(file, columns, wanted)
-        got = table.read_row_groups(wanted, columns=list(columns), use_threads=False)
-        start = first - (spans[wanted[0]][0] if wanted else 0)
-        if wanted and got.num_rows != spans[wanted[-1]][1] - spans[wanted[0]][0]:
-            raise FormatError(file, "rows", got.num_rows, "as many as the footer says")
-        part = got.slice(start, end - first)
-        return {name: _column_to_array(part.column(name).combine_chunks(), file, name) for name in columns}
+        _check_pages(file, columns, groups)
+        read = table.read_row_groups(groups, columns=list(columns), use_threads=False)
+        start = first - (spans[groups[0]][0] if groups else 0)
+        if groups and read.num_rows != spans[groups[-1]][1] - spans[groups[0]][0]:
+            raise FormatError(file, "rows", read.num_rows, "as many as in the footer")
+        rows_read = read.slice(start, end - first)
+        return {name: _column_to_array(rows_read.column(name).combine_chunks(), file, name) for name in columns}
     except (pyarrow.ArrowException, OSError, ValueError, TypeError, KeyError, MemoryError) as error:
         if isinstance(error, FormatError):
             raise
@@ -103,7 +103,7 @@ def _read_open_columns(
 
 
 def read_cell(file: Path, column: str, row: int) -> Any:
-    """One value; its row group stays in memory, so that the next row costs nothing.
+    """One value of a column; its row group is cached, so that neighbouring rows are not decoded again.
 
     Raises:
         FormatError: as :func:`read_columns`.
@@ -125,7 +125,7 @@ def read_cell(file: Path, column: str, row: int) -> Any:
     return values[row - first]
 
 
-#: Row groups in memory, by file, time of change and column: first row and values.
+#: Cache of row groups: (file, modification time, column) → first row and values.
 _row_group_cache: OrderedDict[tuple[Path, int, str], tuple[int, Any]] = OrderedDict()
 _MAX_CACHED = 4
 
@@ -196,18 +196,18 @@ def _column_to_array(column: Any, file: Path, name: str) -> np.ndarray | list[An
 
 
 class _Chunk(NamedTuple):
-    """One column of one row group, as the footer tells of it."""
+    """One column of one row group, as described in the footer."""
 
     path: str
-    kind: int  # index of TYPES
-    codec: int  # index of CODECS
+    kind: int  # index in _PHYSICAL_TYPES
+    codec: int  # index in _CODECS
     values: int
     unpacked: int  # bytes, with page headers
     packed: int
     start: int  # of the first page
 
 
-#: Physical types and codecs by their numbers in a footer.
+#: Physical types and codecs, indexed by their numbers in a footer.
 _PHYSICAL_TYPES = ("BOOLEAN", "INT32", "INT64", "INT96", "FLOAT", "DOUBLE", "BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
 _CODECS = ("UNCOMPRESSED", "SNAPPY", "GZIP", "LZO", "BROTLI", "LZ4", "ZSTD", "LZ4_RAW")
 _TYPE_BYTES = {"INT32": 4, "FLOAT": 4, "INT96": 12, "BOOLEAN": 1}
@@ -215,20 +215,20 @@ _STRING_TYPES = ("BYTE_ARRAY", "FIXED_LEN_BYTE_ARRAY")
 
 
 def _check_pages(file: Path, columns: Sequence[str], groups: Sequence[int]) -> None:
-    """Refuse a chunk whose pages, by their own headers, unpack into more than the footer says or than the limit."""
+    """Raise FormatError where a chunk's pages, by their headers, unpack to more than the footer's size or the limit."""
     total = 0
     chunks = _read_chunks(file, frozenset(groups))
     with open_regular(file) as stream:
-        most = max(_MAX_UNPACKED_BYTES, MAX_MEMORY_RATIO * stream.seek(0, 2))
+        limit = max(_MAX_UNPACKED_BYTES, MAX_MEMORY_RATIO * stream.seek(0, 2))
         for chunk in chunks:
             if any(chunk.path == name or chunk.path.startswith(f"{name}.") for name in columns):
                 total += _unpacked_chunk_bytes(file, stream, chunk)
-            if total > most:
-                raise FormatError(file, chunk.path, f"{total} bytes", f"at most {most}")
+            if total > limit:
+                raise FormatError(file, chunk.path, f"{total} bytes", f"at most {limit}")
 
 
 def _read_chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
-    """The chunks of some row groups. Arrow is not asked: it ends the process where what it finds there is damaged."""
+    """The chunks of the given row groups; parsed here, since Arrow aborts the process on damaged chunk metadata."""
     key = (file, modification_time_ns(file), groups)
     if key in _chunk_cache:
         return _chunk_cache[key]
@@ -237,32 +237,32 @@ def _read_chunks(file: Path, groups: frozenset[int]) -> list[_Chunk]:
         stream.seek(-8 - size, 2)
         footer = stream.read(size)
     try:
-        every = enumerate(thrift.iter_list_structs(footer, 0, 4))
-        found = [_parse_chunk(column[3]) for g, group in every if g in groups for column in group[1]]
+        enumerated = enumerate(thrift.iter_list_structs(footer, 0, 4))
+        chunks = [_parse_chunk(column[3]) for g, group in enumerated if g in groups for column in group[1]]
     except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise FormatError(file, "footer", error, "a whole parquet file") from None
     while len(_chunk_cache) >= _MAX_CACHED:
         _chunk_cache.popitem(last=False)
-    _chunk_cache[key] = found
-    return found
+    _chunk_cache[key] = chunks
+    return chunks
 
 
-#: Chunks by file, time of change and row groups.
+#: Cache of chunks: (file, modification time, row groups) → chunks.
 _chunk_cache: OrderedDict[tuple[Path, int, frozenset[int]], list[_Chunk]] = OrderedDict()
 
 
-def _parse_chunk(said: dict[int, Any]) -> _Chunk:
-    path = b".".join(said[3]).decode("utf-8", "replace")
-    start, dictionary = int(said[9]), int(said.get(11) or 0)
+def _parse_chunk(fields: dict[int, Any]) -> _Chunk:
+    path = b".".join(fields[3]).decode("utf-8", "replace")
+    start, dictionary = int(fields[9]), int(fields.get(11) or 0)
     start = dictionary if 0 < dictionary < start else start
-    numbers = [int(said[k]) for k in (1, 4, 5, 6, 7)]
+    numbers = [int(fields[k]) for k in (1, 4, 5, 6, 7)]
     if not (0 <= numbers[0] < len(_PHYSICAL_TYPES) and 0 <= numbers[1] < len(_CODECS)):
         raise ValueError(f"type {numbers[0]} and codec {numbers[1]} of {path}")
     return _Chunk(path, numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], start)
 
 
 def _unpacked_chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
-    """Bytes that the pages of one column chunk unpack into."""
+    """Unpacked bytes of the pages of one column chunk."""
     values = unpacked = at = 0
     width = _TYPE_BYTES.get(_PHYSICAL_TYPES[chunk.kind], 8)
     if chunk.start < 4 or not 0 <= chunk.packed <= MAX_FILE_BYTES:
@@ -278,8 +278,8 @@ def _unpacked_chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
         except (IndexError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise FormatError(file, chunk.path, f"a page header: {error}", "a whole page") from None
         if min(full, packed, count) < 0 or packed > len(data) - at or full > chunk.unpacked:
-            found = f"a page of {packed} bytes that unpack into {full}"
-            raise FormatError(file, chunk.path, found, f"at most {chunk.unpacked}")
+            problem = f"a page of {packed} bytes that unpack into {full}"
+            raise FormatError(file, chunk.path, problem, f"at most {chunk.unpacked}")
         values += count
         if entries and _PHYSICAL_TYPES[chunk.kind] in _STRING_TYPES:
             width = max(width, _longest_dictionary_entry(file, chunk, data[at : at + packed], full))
@@ -291,10 +291,10 @@ def _unpacked_chunk_bytes(file: Path, stream: Any, chunk: _Chunk) -> int:
 
 
 def _longest_dictionary_entry(file: Path, chunk: _Chunk, packed: bytes, full: int) -> int:
-    """Bytes of the longest entry of a dictionary: a row costs some bits in the file and an entry in memory."""
+    """Bytes of a dictionary's longest entry: a row takes a few bits in the file but a whole entry in memory."""
     pyarrow = import_optional("pyarrow")
     if full > _MAX_UNPACKED_BYTES or _PHYSICAL_TYPES[chunk.kind] != "BYTE_ARRAY":
-        return full  # a fixed length is at most all of it
+        return full  # a fixed length is at most the whole page
     try:
         plain = packed
         if _CODECS[chunk.codec] != "UNCOMPRESSED":

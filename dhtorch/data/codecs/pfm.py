@@ -1,4 +1,4 @@
-"""Portable float maps: a picture of numbers behind three lines of text, the last row first."""
+"""Codec of portable float maps (PFM): three lines of text, then float32 values, last row first."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Portable grey maps of 16 bits, as depth is written by some tools: three numbers in text, then the most significant
-byte of every code first."""
+"""Codec of 16-bit portable grey maps (PGM), used for depth by some tools: text header, big-endian codes."""
 
 from __future__ import annotations
 
@@ -19,15 +18,15 @@ def read_pgm(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
     """Codes (h, w) uint16 of a binary grey map.
 
     Raises:
-        FormatError: missing or truncated file, no codes of 16 bits, another size than ``hw``.
+        FormatError: missing or truncated file, not 16 bits, another size than ``hw``.
     """
     data = read_bytes(file)
     head = _HEADER_PATTERN.match(data[:1024])
     if head is None:
         raise FormatError(file, "header", repr(data[:16]), "P5, width, height and largest code")
-    w, h, largest = map(int, head.groups())
-    if not 255 < largest < 65536:
-        raise FormatError(file, "largest code", largest, "256 to 65535")
+    w, h, max_code = map(int, head.groups())
+    if not 255 < max_code < 65536:
+        raise FormatError(file, "largest code", max_code, "256 to 65535")
     if hw is not None and (h, w) != tuple(hw):
         raise FormatError(file, "size", f"{w}x{h}", f"{hw[1]}x{hw[0]}")
     if not 0 < h * w <= MAX_PIXELS or len(data) - head.end() != 2 * h * w:

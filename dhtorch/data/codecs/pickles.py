@@ -1,9 +1,9 @@
-"""Pickled ``.npy`` files, read as data: numbers, texts, plain containers and numpy arrays, nothing else.
+"""Safe codec of pickled ``.npy`` files: numbers, strings, plain containers and numpy arrays only.
 
-A pickle is a program for a stack machine whose instructions may call any function of the interpreter. This is another
-machine for the same instructions: a name in the file (``numpy.ndarray``) is never looked up, it stays a token, and
-*call* knows the few tokens that rebuild arrays, with code of our own. So there is nothing to escape to, and no size is
-believed before the bytes for it are there. Protocols 2 to 5, the module paths of numpy 1 and 2.
+A pickle is a program for a stack machine whose instructions can call any function of the interpreter. This is a
+separate machine for the same instructions: names in the file (``numpy.ndarray``) are never resolved but stay tokens,
+and *call* accepts only the few tokens that rebuild arrays, implemented here. No code of the file can run, and sizes are
+limited to the available bytes. Protocols 2 to 5, module paths of numpy 1 and 2.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MAX_PICKLE_BYTES: Final = 128_000_000
 _MAX_INSTRUCTIONS: Final = 10_000_000  # instructions of one pickle
 _MAX_NESTING: Final = 32  # containers inside containers
 
-#: Bytes that a value takes on the stack, in its container, in the memo and in the copy that is handed out, at most.
+#: Upper bounds in bytes of a value's memory: on the stack, in its container, in the memo and in the returned copy.
 _BYTES_PER_VALUE: Final = {set: 500, dict: 500, list: 250, tuple: 120, float: 40, int: 40, bool: 16, type(None): 16}
 _BYTES_PER_OTHER_VALUE: Final = 100
 
@@ -52,7 +52,7 @@ def read_npy(file: Path) -> Any:
         Arrays (native byte order, read-only), dict, list, tuple, set, str, bytes, int, float, bool, None.
 
     Raises:
-        FormatError: missing or damaged file, or a pickle that contains or does anything else.
+        FormatError: missing or damaged file, or a pickle with any other content or call.
     """
     data = files.read_bytes(file, _MAX_PICKLE_BYTES)
     shape, fortran, dtype, start = parse_npy_header(file, "header", data)
@@ -66,27 +66,27 @@ def read_npy(file: Path) -> Any:
 
 
 def load_pickle(data: bytes, file: Path) -> Any:
-    """The object of a pickle of plain data; ``file`` names it in errors.
+    """Pickle of plain data → its object; ``file`` names it in errors.
 
     Raises:
-        FormatError: anything that is not plain data, or too large, too deep, truncated.
+        FormatError: not plain data, too large, nested too deep, or truncated.
     """
-    collects = gc.isenabled()
-    gc.disable()  # it looks at every new container again and again, and finds no cycle: most of the time went there
+    gc_was_enabled = gc.isenabled()
+    gc.disable()  # no cycles can arise, and the collector's repeated passes would dominate the time
     try:
         return _Unpickler(data, file).run()
     except FormatError:
         raise
     except (IndexError, KeyError, TypeError, ValueError, AttributeError, OverflowError, struct.error) as error:
-        found = f"{type(error).__name__} {error}"
-        raise FormatError(file, "pickle", found, "a whole pickle of arrays and plain containers") from None
+        problem = f"{type(error).__name__} {error}"
+        raise FormatError(file, "pickle", problem, "a whole pickle of arrays and plain containers") from None
     finally:
-        if collects:
+        if gc_was_enabled:
             gc.enable()
 
 
 class _Unpickler:
-    """Runs one pickle: a stack, a memo, and the instructions as methods of one table."""
+    """Stack machine for one pickle: stack, memo, and instructions by the table ``_INSTRUCTIONS``."""
 
     def __init__(self, data: bytes, file: Path) -> None:
         self.data, self.file, self.at = data, file, 0
@@ -96,8 +96,8 @@ class _Unpickler:
         self.taken, self.most = (
             0,
             max(doors.MAX_MEMORY_BYTES, doors.MAX_MEMORY_RATIO * len(data)),
-        )  # bytes of Python's own objects
-        self.budget = 4 * len(data) + 4096  # bytes that calls may make of this file; shared values could multiply
+        )  # memory of Python objects in bytes, and its limit
+        self.budget = 4 * len(data) + 4096  # bytes that calls may still create: shared values could multiply
 
     def run(self) -> Any:
         while True:
@@ -110,7 +110,9 @@ class _Unpickler:
                 return self._plain(self.stack.pop(), 0)
             step = _INSTRUCTIONS.get(code)
             if step is None:
-                raise FormatError(self.file, "pickle", f"instruction {bytes([code])!r}", "one that builds plain data")
+                raise FormatError(
+                    self.file, "pickle", f"instruction {bytes([code])!r}", "an instruction for plain data"
+                )
             step(self)
 
     # ------------------------------------------------------------------------------------------------- bytes and stack
@@ -118,9 +120,9 @@ class _Unpickler:
     def take(self, n: int) -> bytes:
         end = self.at + n
         if n < 0 or end > len(self.data):
-            raise ValueError(f"{n} bytes wanted, {len(self.data) - self.at} left")
-        part, self.at = self.data[self.at : end], end
-        return part
+            raise ValueError(f"{n} bytes expected, {len(self.data) - self.at} left")
+        content, self.at = self.data[self.at : end], end
+        return content
 
     def unpack(self, form: str) -> Any:
         return struct.unpack(form, self.take(struct.calcsize(form)))[0]
@@ -192,7 +194,7 @@ class _Unpickler:
     def call(self) -> None:
         function, args = self.pop_n(2)
         if type(function) is not PermittedName or type(args) is not tuple:
-            raise TypeError("a call of something else than a permitted name")
+            raise TypeError("a call of a name that is not permitted")
         self.push(PERMITTED_CALLS[function](self.spend, *args))
 
     def build(self) -> None:
@@ -207,14 +209,14 @@ class _Unpickler:
     # ---------------------------------------------------------------------------------------------------------- result
 
     def _plain(self, value: Any, depth: int) -> Any:
-        """The finished value: shells replaced by their arrays, a fresh copy of every container.
+        """The result: pending arrays replaced by arrays, every container copied.
 
-        A container that holds itself is endlessly deep, and one whose parts are shared over and over (each list ten
-        times the one before) has more nodes than the file has instructions: both end here.
+        Raises for containers that contain themselves (too deep) or that share parts repeatedly, such as each list ten
+        times in the next (more nodes than the file has instructions).
         """
         self.nodes += 1
         if depth > _MAX_NESTING or self.nodes > 8 * self.steps + 64:
-            raise FormatError(self.file, "pickle", "containers nested beyond measure", f"at most {_MAX_NESTING} deep")
+            raise FormatError(self.file, "pickle", "containers nested too deep", f"at most {_MAX_NESTING} deep")
         kind = type(value)
         if kind in SCALAR_TYPES or kind is bytearray:
             return value
@@ -231,7 +233,7 @@ class _Unpickler:
 
 
 def _push_number(form: str) -> Callable[[_Unpickler], None]:
-    """A number, stored as ``form`` of the struct module."""
+    """Instruction that pushes a number stored as ``form`` of the struct module."""
     return lambda m: m.push(m.unpack(form))
 
 
@@ -277,7 +279,7 @@ def _add_to_set(machine: _Unpickler) -> None:
 _INSTRUCTIONS: Final[dict[int, Callable[[_Unpickler], Any]]] = {
     ord(code): step
     for code, step in {
-        "\x80": lambda m: m.take(1),  # PROTO: an instruction we do not know stops us, a number would not
+        "\x80": lambda m: m.take(1),  # PROTO: the version is ignored, unknown instructions raise
         "\x95": lambda m: m.take(8),  # FRAME
         "(": lambda m: m.push(_MARK),
         "0": lambda m: m.pop_n(1),

@@ -1,8 +1,8 @@
-"""Tar archives read in place: where every member lies, and its bytes. Nothing is unpacked, so no name leads anywhere.
+"""Codec of tar archives read in place: offset and bytes of every member; nothing is unpacked to disk.
 
-One walk over the headers makes the index; a header that is damaged, or a member that would end beyond the archive, ends
-the walk with a ``FormatError``. Understood are the old, ustar, GNU (long names) and pax (path, size) headers, not
-compressed; members that are no plain files (folders, links, devices) are passed over.
+The index is made in one pass over the headers; a damaged header, or a member that ends beyond the archive, raises
+``FormatError``. Supported are old, ustar, GNU (long names) and pax (path, size) headers, uncompressed; members other
+than regular files (folders, links, devices) are skipped.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ _BLOCK_BYTES = 512
 _MAX_NAME_BYTES = 1_000_000  # of a long name or a pax header
 _MAX_SIZE_DIGITS = 18  # of a size in a pax header
 _FILES, _PAX, _LONG_NAME, _SPARSE = b"0\x007", b"x", b"L", b"S"
-_KINDS_WITHOUT_DATA = b"123456"  # links, devices, folders: whatever size they claim
+_KINDS_WITHOUT_DATA = b"123456"  # links, devices, folders: their declared size is ignored
 
 
 class TarMember(NamedTuple):
-    """A plain file in an archive."""
+    """A regular file in an archive."""
 
     name: str
     offset: int  # of its first byte in the archive
@@ -31,7 +31,7 @@ class TarMember(NamedTuple):
 
 
 def iter_tar_members(file: Path) -> Iterator[TarMember]:
-    """The plain files of an archive in their order.
+    """The regular files of an archive, in stored order.
 
     Raises:
         FormatError: missing file, a damaged header, or an archive that ends too early.
@@ -47,7 +47,7 @@ def read_tar_member(file: Path, offset: int, size: int, limit: int = MAX_FILE_BY
     """The bytes of a member.
 
     Raises:
-        FormatError: the archive cannot be read or has become shorter, or more bytes than ``limit``.
+        FormatError: unreadable or truncated archive, or more bytes than ``limit``.
     """
     if size > limit:
         raise FormatError(file, f"member at byte {offset}", f"{size} bytes", f"at most {limit} bytes")
@@ -63,7 +63,7 @@ def read_tar_member(file: Path, offset: int, size: int, limit: int = MAX_FILE_BY
 
 def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
     total, at = os.fstat(stream).st_size, 0
-    special: dict[str, str] = {}  # what an extra header says about the member that follows
+    special: dict[str, str] = {}  # path and size of the next member, from an extra header
     while at + _BLOCK_BYTES <= total:
         header = os.pread(stream, _BLOCK_BYTES, at)
         if not header.strip(b"\0"):
@@ -90,10 +90,10 @@ def _iter_headers(file: Path, stream: int) -> Iterator[TarMember]:
 
 
 def _parse_header(file: Path, header: bytes, at: int) -> tuple[str, bytes, int]:
-    """Name, kind and size of a member."""
+    """(name, type, size) of a member, from its header."""
     stored = _parse_number(header[148:156])
     if stored != sum(header[:148]) + 8 * 32 + sum(header[156:]):
-        raise FormatError(file, f"header at byte {at}", "a wrong check sum", "a tar header, not compressed")
+        raise FormatError(file, f"header at byte {at}", "a wrong checksum", "a tar header, not compressed")
     size = _parse_number(header[124:136])
     if size is None or size < 0:
         raise FormatError(file, f"header at byte {at}", f"size {header[124:136]!r}", "a number of bytes")
@@ -102,14 +102,14 @@ def _parse_header(file: Path, header: bytes, at: int) -> tuple[str, bytes, int]:
 
 
 def _parse_pax_size(file: Path, text: str, at: int) -> int:
-    """The size that a pax header says."""
+    """The size in a pax header."""
     if not (text.isascii() and text.isdecimal() and len(text) <= _MAX_SIZE_DIGITS):
         raise FormatError(file, f"header at byte {at}", f"size {text}", "a number of bytes")
     return int(text)
 
 
 def _parse_number(field: bytes) -> int | None:
-    """Octal digits, or GNU's big-endian number with the top bit set."""
+    """Octal digits, or GNU's big-endian number with the top bit set → number; None if it is neither."""
     if field[0] & 0x80:
         return int.from_bytes(bytes([field[0] & 0x7F]) + field[1:], "big") if field[0] == 0x80 else None
     digits = field.strip(b" \0")
@@ -121,14 +121,14 @@ def _decode_text(field: bytes) -> str:
 
 
 def _parse_pax(text: bytes) -> dict[str, str]:
-    """``length key=value`` lines; damaged ones end the list."""
-    found, at = {}, 0
+    """``length key=value`` lines → path and size, as far as present; a damaged line ends the list."""
+    entries, at = {}, 0
     while (space := text.find(b" ", at, at + 12)) > at and text[at:space].isdigit():
         end = at + int(text[at:space])
         if not space < end <= len(text):
             break
         key, _, value = text[space + 1 : end - 1].partition(b"=")
         if key in (b"path", b"size"):
-            found[key.decode()] = value.decode("utf-8", "replace")
+            entries[key.decode()] = value.decode("utf-8", "replace")
         at = end
-    return found
+    return entries

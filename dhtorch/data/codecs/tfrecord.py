@@ -1,8 +1,8 @@
-"""TFRecord files and the ``tf.train.Example`` messages in them, read without TensorFlow.
+"""Codec of TFRecord files and their ``tf.train.Example`` messages, without TensorFlow.
 
-A file is a row of records: length (8 bytes, little end first), a check sum of these, the bytes, a check sum of them.
-Check sums are CRC-32C (Castagnoli), *masked*: turned right by 15 bits, plus a constant. A message is a protocol buffer:
-``Example{1: Features{1: map<text, Feature>}}``, a feature being a list of bytes (1), floats (2) or whole numbers (3).
+A file is a sequence of records: length (8 bytes, little-endian), its checksum, the data, its checksum. Checksums are
+CRC-32C (Castagnoli), *masked*: rotated right by 15 bits, plus a constant. A message is a protocol buffer:
+``Example{1: Features{1: map<text, Feature>}}``, a feature being a list of bytes (1), floats (2) or integers (3).
 
 Alphabet: a span is (offset, length) of bytes in the file.
 """
@@ -22,36 +22,38 @@ from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError
 from dhtorch.data.io.safe_open import open_regular, unreadable_error
 
 _MAX_RECORDS = 10_000_000
-_MAX_FIELDS = 2_000_000  # of one record: names, pictures, runs of numbers
+_MAX_FIELDS = 2_000_000  # of one record: names, images, runs of numbers
 
-_HEADER_BYTES, _FOOTER_BYTES = 12, 4  # bytes around a record
-_CRC_POLYNOMIAL, _CRC_MASK = 0x82F63B78, 0xA282EAD8  # bits reflected
-_CRC_BLOCK_BYTES = 512  # bytes whose check sum is made beside those of all other blocks
-_CRC_BATCH_BYTES = 4 << 20  # bytes of which blocks are made at once
+_HEADER_BYTES = 12  # before a record's data: length and its checksum
+_FOOTER_BYTES = 4  # after a record's data: its checksum
+_CRC_POLYNOMIAL = 0x82F63B78  # bits reflected
+_CRC_MASK = 0xA282EAD8
+_CRC_BLOCK_BYTES = 512  # block whose checksum is computed in parallel with those of the other blocks
+_CRC_BATCH_BYTES = 4 << 20  # bytes split into blocks at a time
 _FEATURE_KINDS = {1: "bytes", 2: "float", 3: "int64"}
 
 
 class ByteSpan(NamedTuple):
-    """Some bytes of a file."""
+    """A span of bytes in a file."""
 
     offset: int
     length: int
 
 
 class ExampleFeature(NamedTuple):
-    """One feature of a record, not yet decoded."""
+    """One feature of a record, undecoded: its type and spans of bytes."""
 
     kind: str  # "bytes", "float" or "int64"
-    spans: tuple[ByteSpan, ...]  # of bytes: each value's; of numbers: runs of them, packed
+    spans: tuple[ByteSpan, ...]  # bytes: one per value; numbers: one per packed run
 
 
 def index_records(file: Path) -> list[ByteSpan]:
-    """Where the records of a file lie; only their lengths are read, and held against their check sums.
+    """Spans of the records of a file; reads only their lengths and verifies the lengths' checksums.
 
     Raises:
-        FormatError: unreadable, a wrong check sum, a file that ends inside a record, or no record at all.
+        FormatError: unreadable, a wrong checksum, a file that ends inside a record, or no record.
     """
-    found: list[ByteSpan] = []
+    spans: list[ByteSpan] = []
     try:
         with open_regular(file) as stream:
             total, at = os.fstat(stream.fileno()).st_size, 0
@@ -59,34 +61,34 @@ def index_records(file: Path) -> list[ByteSpan]:
                 head = os.pread(stream.fileno(), _HEADER_BYTES, at)
                 length = _parse_length(file, head, at)
                 if at + _HEADER_BYTES + length + _FOOTER_BYTES > total:
-                    raise FormatError(file, f"record {len(found)}", f"{total - at} bytes", f"{length} and 16 more")
-                found.append(ByteSpan(at + _HEADER_BYTES, length))
+                    raise FormatError(file, f"record {len(spans)}", f"{total - at} bytes", f"{length} and 16 more")
+                spans.append(ByteSpan(at + _HEADER_BYTES, length))
                 at += _HEADER_BYTES + length + _FOOTER_BYTES
-                if len(found) > _MAX_RECORDS:
+                if len(spans) > _MAX_RECORDS:
                     raise FormatError(file, "records", "more", f"at most {_MAX_RECORDS}")
     except OSError as error:
         raise unreadable_error(file, error) from None
-    if not found:
+    if not spans:
         raise FormatError(file, "records", "none", "at least one")
-    return found
+    return spans
 
 
 def read_record(file: Path, span: ByteSpan) -> bytes:
-    """The bytes of a record, held against their check sum.
+    """The data of a record, whose checksum must match.
 
     Raises:
-        FormatError: unreadable, too long, cut off, or another check sum.
+        FormatError: unreadable, too long, cut off, or a wrong checksum.
     """
     data = read_span(file, ByteSpan(span.offset, span.length + _FOOTER_BYTES))
     body, stored = data[: span.length], int.from_bytes(data[span.length :], "little")
     if mask_crc(crc32c(body)) != stored:
-        found = f"check sum {mask_crc(crc32c(body)):08x}"
-        raise FormatError(file, f"record at byte {span.offset}", found, f"{stored:08x}")
+        actual = f"checksum {mask_crc(crc32c(body)):08x}"
+        raise FormatError(file, f"record at byte {span.offset}", actual, f"{stored:08x}")
     return body
 
 
 def read_span(file: Path, span: ByteSpan) -> bytes:
-    """Bytes of a file.
+    """The bytes of one span of a file.
 
     Raises:
         FormatError: unreadable, too long, or cut off.
@@ -95,12 +97,12 @@ def read_span(file: Path, span: ByteSpan) -> bytes:
 
 
 def read_spans(file: Path, spans: Sequence[ByteSpan]) -> list[bytes]:
-    """Bytes of several places of a file, which is opened once.
+    """The bytes of several spans of a file, which is opened once.
 
     Raises:
         FormatError: as :func:`read_span`.
     """
-    found = []
+    contents = []
     try:
         with open_regular(file) as stream:
             for offset, length in spans:
@@ -109,32 +111,32 @@ def read_spans(file: Path, spans: Sequence[ByteSpan]) -> list[bytes]:
                 data = os.pread(stream.fileno(), length, offset)
                 if len(data) != length:
                     raise FormatError(file, f"record at byte {offset}", f"{len(data)} bytes", f"{length} bytes")
-                found.append(data)
+                contents.append(data)
     except OSError as error:
         raise unreadable_error(file, error) from None
-    return found
+    return contents
 
 
 def parse_example(body: bytes, file: Path, start: int) -> dict[str, ExampleFeature]:
-    """Name → feature of an ``Example``; spans count in the file, in which the message begins at ``start``.
+    """Bytes of an ``Example`` → name → feature; spans are offsets in the file, where the message begins at ``start``.
 
     Raises:
-        FormatError: no such message.
+        FormatError: not such a message.
     """
     return _Message(body, file, start).features()
 
 
 def read_feature_numbers(file: Path, name: str, feature: ExampleFeature, most: int) -> np.ndarray:
-    """The numbers of a feature: float64 of floats, int64 of whole numbers.
+    """The numbers of a feature: floats as float64, integers as int64.
 
     Raises:
-        FormatError: bytes, or more than ``most`` numbers.
+        FormatError: a feature of bytes, or more than ``most`` numbers.
     """
     if feature.kind == "bytes":
         raise FormatError(file, name, "bytes", "numbers")
     size = sum(span.length for span in feature.spans)
-    least = 4 if feature.kind == "float" else 1
-    if size > least * most * (1 if least == 4 else 10):
+    min_bytes = 4 if feature.kind == "float" else 1
+    if size > min_bytes * most * (1 if min_bytes == 4 else 10):
         raise FormatError(file, name, f"{size} bytes of numbers", f"at most {most} numbers")
     if not feature.spans:
         return np.zeros(0)
@@ -150,34 +152,34 @@ def read_feature_numbers(file: Path, name: str, feature: ExampleFeature, most: i
 
 
 def mask_crc(crc: int) -> int:
-    """A check sum as it is stored."""
+    """The masked checksum, as stored in a file."""
     return (((crc >> 15) | (crc << 17)) + _CRC_MASK) & 0xFFFFFFFF
 
 
 def crc32c(data: bytes) -> int:
-    """CRC-32C. The sums of many blocks are made side by side and then joined: the sum is linear in its bits."""
+    """CRC-32C of ``data``: checksums of many blocks in parallel, then combined, since the CRC is linear in its bits."""
     state, table = 0xFFFFFFFF, _crc_table()
     head = len(data) % _CRC_BLOCK_BYTES
     for byte in data[:head]:
         state = int(table[(state ^ byte) & 0xFF]) ^ (state >> 8)
-    ahead = [t.tolist() for t in _crc_shift_table()]
+    shifts = [t.tolist() for t in _crc_shift_table()]
     for at in range(head, len(data), _CRC_BATCH_BYTES // _CRC_BLOCK_BYTES * _CRC_BLOCK_BYTES):
-        piece = np.frombuffer(
+        batch = np.frombuffer(
             data, np.uint8, min(_CRC_BATCH_BYTES // _CRC_BLOCK_BYTES * _CRC_BLOCK_BYTES, len(data) - at), at
         )
-        columns = np.ascontiguousarray(piece.reshape(-1, _CRC_BLOCK_BYTES).T)
+        columns = np.ascontiguousarray(batch.reshape(-1, _CRC_BLOCK_BYTES).T)
         sums = np.zeros(columns.shape[1], np.uint32)
         for column in columns:
             sums = table[(sums ^ column) & 0xFF] ^ (sums >> 8)
         for block in sums.tolist():
-            a, b, c, d = ahead
+            a, b, c, d = shifts
             state = a[state & 0xFF] ^ b[(state >> 8) & 0xFF] ^ c[(state >> 16) & 0xFF] ^ d[state >> 24] ^ block
     return state ^ 0xFFFFFFFF
 
 
 @cache
 def _crc_table() -> np.ndarray:
-    """What one byte does to the state (256,)."""
+    """Table (256,) of the state's change by one byte."""
     state = np.arange(256, dtype=np.uint32)
     for _ in range(8):
         state = np.where(state & 1, (state >> 1) ^ np.uint32(_CRC_POLYNOMIAL), state >> 1)
@@ -186,7 +188,7 @@ def _crc_table() -> np.ndarray:
 
 @cache
 def _crc_shift_table() -> np.ndarray:
-    """What a block of zeros does to each byte of the state (4, 256)."""
+    """Table (4, 256) of the state's change by a block of zeros, for each byte of the state."""
     state = (np.arange(256, dtype=np.uint32)[None] << (8 * np.arange(4, dtype=np.uint32))[:, None]).astype(np.uint32)
     for _ in range(_CRC_BLOCK_BYTES):
         state = _crc_table()[state & 0xFF] ^ (state >> 8)
@@ -198,20 +200,20 @@ def _parse_length(file: Path, head: bytes, at: int) -> int:
         raise FormatError(file, f"record at byte {at}", f"{len(head)} bytes", "a TFRecord header of 12")
     length, stored = struct.unpack("<QI", head)
     if mask_crc(crc32c(head[:8])) != stored:
-        raise FormatError(file, f"record at byte {at}", "a wrong check sum of its length", "a TFRecord")
+        raise FormatError(file, f"record at byte {at}", "a wrong checksum of its length", "a TFRecord")
     return length
 
 
 class _Message:
-    """A protocol buffer, taken apart field by field; only so many, for each costs more than its bytes."""
+    """Parser of a protocol buffer; at most ``_MAX_FIELDS`` fields, since one costs more memory than its bytes."""
 
     def __init__(self, body: bytes, file: Path, start: int) -> None:
         self.body, self.file, self.start = body, file, start
         self.left = _MAX_FIELDS
 
     def features(self) -> dict[str, ExampleFeature]:
-        """Name → feature, the last of a name."""
-        found: dict[str, ExampleFeature] = {}
+        """Name → feature; of several with one name the last."""
+        result: dict[str, ExampleFeature] = {}
         for _, features in self._inner((0, len(self.body)), 1):
             for _, entry in self._inner(features, 1):
                 name, feature = "", None
@@ -221,8 +223,8 @@ class _Message:
                     else:
                         feature = self._feature(span)
                 if feature is not None:
-                    found[name] = feature
-        return found
+                    result[name] = feature
+        return result
 
     def _feature(self, within: tuple[int, int]) -> ExampleFeature | None:
         for number, inner in self._inner(within, *_FEATURE_KINDS):
@@ -231,11 +233,11 @@ class _Message:
         return None
 
     def _inner(self, within: tuple[int, int], *numbers: int) -> Iterator[tuple[int, tuple[int, int]]]:
-        """Fields that hold bytes, texts and messages, of these numbers."""
+        """Length-delimited fields (bytes, strings, messages) with one of ``numbers``: (field number, span)."""
         return ((n, span) for n, wire, span in self._fields(within) if wire == 2 and n in numbers)
 
     def _fields(self, within: tuple[int, int]) -> Iterator[tuple[int, int, tuple[int, int]]]:
-        """(field number, wire type, where its bytes are) of a message."""
+        """(field number, wire type, span) of each field of a message."""
         at, end = within[0], within[0] + within[1]
         while at < end:
             self.left -= 1
@@ -265,7 +267,7 @@ class _Message:
             value |= (byte & 0x7F) << shift
             if byte < 0x80:
                 return value, at
-        raise FormatError(self.file, "message", f"a number that does not end by byte {at}", "a tf.train.Example")
+        raise FormatError(self.file, "message", f"an unterminated number at byte {at}", "a tf.train.Example")
 
     def _text(self, span: tuple[int, int]) -> str:
         try:
@@ -275,14 +277,14 @@ class _Message:
 
 
 def _decode_varints(run: bytes, file: Path, name: str) -> np.ndarray:
-    """Packed varints of 64 bits, two's complement."""
+    """Packed 64-bit varints, two's complement → int64 array."""
     raw = np.frombuffer(run, np.uint8)
     ends = np.flatnonzero(raw < 0x80)
     if len(raw) and (not len(ends) or ends[-1] != len(raw) - 1):
-        raise FormatError(file, name, "a whole number that does not end", "packed whole numbers")
+        raise FormatError(file, name, "an unterminated integer", "packed integers")
     starts = np.concatenate([[0], ends[:-1] + 1]).astype(np.int64) if len(ends) else np.zeros(0, np.int64)
     if len(ends) and int((ends - starts).max()) >= 10:
-        raise FormatError(file, name, "a whole number of more than 10 bytes", "packed whole numbers")
+        raise FormatError(file, name, "an integer of more than 10 bytes", "packed integers")
     place = (np.arange(len(raw)) - np.repeat(starts, np.diff(np.append(starts, len(raw))))).astype(np.uint64)
     parts = (raw & 0x7F).astype(np.uint64) << (np.uint64(7) * place)
     summed = np.bitwise_or.reduceat(parts, starts) if len(starts) else np.zeros(0, np.uint64)

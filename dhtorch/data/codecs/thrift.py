@@ -1,34 +1,34 @@
-"""Thrift's compact protocol, as far as Parquet writes it: structures as dicts from field numbers to values."""
+"""Parser of Thrift's compact protocol, as far as Parquet uses it: structures → dicts field number → value."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
 
-#: Structures and lists inside one another; in a Parquet footer they are nine deep.
+#: Limit of the nesting of structures and lists; a Parquet footer has nine levels.
 _MAX_NESTING = 12
 
 
 def parse_struct(data: bytes, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
-    """A structure, field number → value, and where it ends.
+    """(structure at ``at`` as dict field number → value, position of its end).
 
     Raises:
-        ValueError, IndexError: it is damaged.
+        ValueError, IndexError: damaged data.
     """
-    found: dict[int, Any] = {}
+    fields: dict[int, Any] = {}
     number = 0
     while True:
         number, kind, at = _parse_field_header(data, at, number)
         if kind == 0:
-            return found, at
-        found[number], at = _parse_value(data, at, kind, depth)
+            return fields, at
+        fields[number], at = _parse_value(data, at, kind, depth)
 
 
 def iter_list_structs(data: bytes, at: int, wanted: int) -> Iterator[dict[int, Any]]:
-    """The structures in the list that is field ``wanted`` of a structure, one after the other.
+    """The structures in the list that is field ``wanted`` of the structure at ``at``, one by one.
 
     Raises:
-        ValueError, IndexError: it is damaged, or there is no such list.
+        ValueError, IndexError: damaged data, or no such list.
     """
     number = 0
     while True:
@@ -47,7 +47,7 @@ def iter_list_structs(data: bytes, at: int, wanted: int) -> Iterator[dict[int, A
 
 
 def _parse_field_header(data: bytes, at: int, number: int) -> tuple[int, int, int]:
-    """Number and type of the next field (type 0: there is none), and where its value begins."""
+    """(number, type, position of the value) of the next field; type 0 = end of the structure."""
     head = data[at]
     kind, step = head & 15, head >> 4
     if head == 0:
@@ -61,16 +61,16 @@ def _parse_field_header(data: bytes, at: int, number: int) -> tuple[int, int, in
 def _parse_value(data: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]:
     if depth > _MAX_NESTING:
         raise ValueError("structures nested too deep")
-    if kind in (1, 2):  # true and false have no bytes of their own
+    if kind in (1, 2):  # true and false are encoded in the type
         return kind == 1, at
     if kind in (4, 5, 6):
         return _parse_zigzag(data, at)
-    if kind in (3, 7):  # a byte, or a number with a point, which nobody asks for
+    if kind in (3, 7):  # a byte, or a double, which is not needed
         return (data[at], at + 1) if kind == 3 else (None, at + 8)
     if kind == 8:
         length, at = _parse_varint(data, at)
         if length > len(data) - at:
-            raise ValueError("a text beyond the end")
+            raise ValueError("a string beyond the end")
         return data[at : at + length], at + length
     if kind in (9, 10):
         return _parse_list(data, at, depth + 1)
@@ -81,29 +81,29 @@ def _parse_value(data: bytes, at: int, kind: int, depth: int) -> tuple[Any, int]
 
 def _parse_list(data: bytes, at: int, depth: int) -> tuple[list[Any], int]:
     count, kind, at = _parse_list_header(data, at)
-    found = []
+    values = []
     for _ in range(count):
-        if kind in (1, 2):  # in a list a truth value has a byte
+        if kind in (1, 2):  # in a list a boolean takes a byte
             item, at = data[at] == 1, at + 1
         else:
             item, at = _parse_value(data, at, kind, depth)
-        found.append(item)
-    return found, at
+        values.append(item)
+    return values, at
 
 
 def _parse_list_header(data: bytes, at: int) -> tuple[int, int, int]:
-    """Length and type of a list, and where its first value begins."""
+    """(length, type, position of the first value) of a list."""
     count, kind = data[at] >> 4, data[at] & 15
     at += 1
     if count == 15:
         count, at = _parse_varint(data, at)
-    if count > len(data) - at:  # every value has a byte at least
+    if count > len(data) - at:  # every value takes at least a byte
         raise ValueError(f"a list of {count} values in {len(data) - at} bytes")
     return count, kind, at
 
 
 def _parse_varint(data: bytes, at: int) -> tuple[int, int]:
-    """A whole number without sign, and where it ends."""
+    """(unsigned varint, position of its end)."""
     number = 0
     for shift in range(0, 70, 7):
         byte = data[at]
@@ -111,10 +111,10 @@ def _parse_varint(data: bytes, at: int) -> tuple[int, int]:
         number |= (byte & 127) << shift
         if byte < 128:
             return number, at
-    raise ValueError("an endless number")
+    raise ValueError("an unterminated number")
 
 
 def _parse_zigzag(data: bytes, at: int) -> tuple[int, int]:
-    """A whole number with a sign, and where it ends."""
+    """(signed zigzag varint, position of its end)."""
     number, at = _parse_varint(data, at)
     return (number >> 1) ^ -(number & 1), at

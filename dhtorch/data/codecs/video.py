@@ -1,12 +1,12 @@
-"""Frames of a video file by their number or their time, at constant memory.
+"""Codec of videos: frames of a file by number or time, at constant memory.
 
-Frame ``i`` is the ``i``-th *to be shown*, whatever the order in the file. A table of presentation times, made by
-reading the packets once without decoding them, says which one that is; so a picture that cannot be decoded is an error
-and never shifts its successors. Reading in order decodes every frame once, reading elsewhere starts at the key frame
-before.
+Frame ``i`` is the ``i``-th in *presentation order*, whatever the order in the file. It is located by a table of
+presentation times, made by reading the packets once without decoding; a frame that cannot be decoded is therefore an
+error and does not shift its successors. Sequential reading decodes every frame once, random access starts at the
+previous key frame.
 
-Decoders stay open, a few per process, and are found by file name: whoever holds a path can be pickled, and a forked
-worker opens its own.
+A few decoders per process stay open, cached by file name: callers hold only paths and are picklable, and a forked
+worker opens its own decoders.
 """
 
 from __future__ import annotations
@@ -23,42 +23,42 @@ from dhtorch.data.codecs.mp4 import MP4_FIRST_BOXES, check_sample_count
 from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.data.io.safe_open import modification_time_ns, open_regular
 
-_MAX_VIDEO_PIXELS = 36_000_000  # 8K; a decoder holds up to 17 pictures
+_MAX_VIDEO_PIXELS = 36_000_000  # pixels, 8K; a decoder holds up to 17 frames
 _MAX_FRAMES = 10_000_000
 _MAX_OPEN_DECODERS = 8  # decoders in a process
-_MAX_FAILED_PACKETS = 100  # packets in a row: behind them nothing is worth the time
-_MAX_DECODE_AHEAD_FRAMES = 60  # frames: nearer than this, decoding on is cheaper than starting at a key frame
+_MAX_FAILED_PACKETS = 100  # consecutive undecodable packets after which decoding stops
+_MAX_DECODE_AHEAD_FRAMES = 60  # frames up to which decoding on is cheaper than seeking a key frame
 
 
 class VideoHeader(NamedTuple):
-    """What a video file says about itself."""
+    """Size, number of frames, rate and codec of a video."""
 
     hw: tuple[int, int]  # as stored: a rotation tag is not applied
-    n: int  # frames by the index; a truncated file has fewer
+    n: int  # frames in the index; a truncated file has fewer
     rate_hz: float | None
     codec: str
     pixels: str  # format of the stored pixels, such as yuv420p
 
 
 def read_video_header(file: Path, *, all_frames: bool = False) -> VideoHeader:
-    """Size, number of frames and rate of a video, without decoding any.
+    """Size, number of frames and rate of a video; decodes no frame.
 
     Args:
         file: the video.
         all_frames: count also frames that an edit list hides, such as one stamped before time 0.
 
     Raises:
-        FormatError: missing or unknown file, no video stream, or an absurd size.
+        FormatError: missing file, unknown format, no video stream, or a size beyond the limit.
         ImportError: no decoder is installed.
     """
     return _get_decoder(file, all_frames).header
 
 
 def read_video_times(file: Path, *, all_frames: bool = False) -> np.ndarray:
-    """Presentation time (n,) s of every frame, increasing. Reads all packets once, decodes none.
+    """Presentation times (n,) in s of all frames, increasing. Reads all packets once, decodes none.
 
     Raises:
-        FormatError: as :func:`read_video_header`, or packets that have no time.
+        FormatError: as :func:`read_video_header`, or packets without time stamps.
     """
     decoder = _get_decoder(file, all_frames)
     return decoder.table() * float(decoder.stream.time_base)
@@ -77,34 +77,35 @@ def read_video_frame(
 
     Args:
         file: the video.
-        i: place in the order of presentation, from 0.
-        hw: the size to insist on.
+        i: index in presentation order, from 0.
+        hw: required size.
         pixels: ``rgb24`` gives (h, w, 3) uint8, ``gray`` (h, w) uint8, ``gray16le`` and ``gray12le`` (h, w) uint16.
-            ``luma`` gives the first plane as stored, (h, w) uint8 or uint16, no range stretched: coded numbers.
-        nearest: repeat colour samples that are stored at a lower resolution, instead of interpolating them.
+            ``luma`` gives the first plane as stored, (h, w) uint8 or uint16, without range conversion: coded numbers.
+        nearest: repeat colour samples stored at lower resolution instead of interpolating them.
         all_frames: count also frames that an edit list hides.
 
     Raises:
-        FormatError: as :func:`read_video_header`, another size than ``hw``, or a frame that is not there or not
-            decodable.
+        FormatError: as :func:`read_video_header`, another size than ``hw``, or a missing or undecodable frame.
     """
     decoder = _get_decoder(file, all_frames)
     frame = decoder.frame(i)
-    wanted = tuple(hw) if hw is not None else decoder.header.hw
-    if (frame.height, frame.width) != wanted:
-        raise FormatError(file, f"frame {i} size", f"{frame.width}x{frame.height}", f"{wanted[1]}x{wanted[0]}")
+    expected_hw = tuple(hw) if hw is not None else decoder.header.hw
+    if (frame.height, frame.width) != expected_hw:
+        raise FormatError(
+            file, f"frame {i} size", f"{frame.width}x{frame.height}", f"{expected_hw[1]}x{expected_hw[0]}"
+        )
     if pixels == "luma":
         return _extract_luma(frame)
     try:
-        way = "POINT" if nearest else "BICUBIC"
-        return np.asarray(frame.to_ndarray(format=pixels, interpolation=way, **decoder.one_thread))
+        interpolation = "POINT" if nearest else "BICUBIC"
+        return np.asarray(frame.to_ndarray(format=pixels, interpolation=interpolation, **decoder.one_thread))
     except decoder.errors as error:
         raise FormatError(file, f"frame {i}", error, f"pixels that convert to {pixels}") from None
 
 
 def _extract_luma(frame: Any) -> np.ndarray:
-    plane, deep = frame.planes[0], frame.format.components[0].bits > 8
-    rows = np.frombuffer(plane, "<u2" if deep else np.uint8).reshape(-1, plane.line_size // (2 if deep else 1))
+    plane, is_16bit = frame.planes[0], frame.format.components[0].bits > 8
+    rows = np.frombuffer(plane, "<u2" if is_16bit else np.uint8).reshape(-1, plane.line_size // (2 if is_16bit else 1))
     return rows[: frame.height, : frame.width].copy()
 
 
@@ -116,7 +117,7 @@ def close_videos() -> None:
 
 
 def _check_container(file: Path) -> str:
-    """The names of a container's format, by its first bytes; what it claims fits the file."""
+    """FFmpeg's names of a container format, from its first bytes; checks an mp4's sample count."""
     with open_regular(file) as stream:
         head = stream.read(16)
         if head[4:8] in MP4_FIRST_BOXES:
@@ -130,31 +131,37 @@ def _check_container(file: Path) -> str:
 
 
 def _index_entries(stream: Any) -> Any:
-    """What the file's index says of its frames, from PyAV 17; before, packets say the same, more slowly."""
+    """The index entries of a stream (PyAV ≥ 17), else empty: then packets are read instead, more slowly."""
     return getattr(stream, "index_entries", ())
 
 
 class _Decoder:
-    """One open video and the place where it stands."""
+    """One open video, its table of frames and its current position."""
 
     def __init__(self, file: Path, all_frames: bool) -> None:
         self.file = file
         self.pts: np.ndarray | None = None
         self.keys = np.empty((0, 2), np.int64)  # presentation and decoding stamp of the key frames
         self.frames: Iterator[Any] = iter(())
-        self.next = -1  # number of the frame that comes next; −1 = unknown
+        self.next = -1  # number of the next decoded frame; −1 = unknown
         av = import_optional("av")
-        # PyAV before 17 converts with one thread and knows no such option.
+        # PyAV before 17 converts with one thread and has no such option.
         self.one_thread = {"threads": 1} if int(av.__version__.partition(".")[0]) >= 17 else {}
         self.errors: tuple[type[Exception], ...] = (av.FFmpegError, ValueError, MemoryError, OverflowError, EOFError)
         if not file.exists():
             raise FormatError(file, "file", "no such file", "a video")
-        kind = _check_container(file)
-        # No list of other files, no network: the decoder is told what this is and may open nothing else.
-        limits = {"max_pixels": str(_MAX_VIDEO_PIXELS), "protocol_whitelist": "file", "format_whitelist": kind}
+        container_format = _check_container(file)
+        # No playlists, no network: the format is fixed and no other file may be opened.
+        limits = {
+            "max_pixels": str(_MAX_VIDEO_PIXELS),
+            "protocol_whitelist": "file",
+            "format_whitelist": container_format,
+        }
         edits = {"advanced_editlist": "0"} if all_frames else {}
         try:
-            self.container = av.open(str(file), format=kind.split(",")[0], options=limits, container_options=edits)
+            self.container = av.open(
+                str(file), format=container_format.split(",")[0], options=limits, container_options=edits
+            )
         except self.errors as error:
             raise FormatError(file, "content", error, "a video file") from None
         try:
@@ -169,14 +176,14 @@ class _Decoder:
         self.stream = self.container.streams.video[0]
         context = self.stream.codec_context
         if context is None:
-            raise FormatError(self.file, "codec", "an unknown one", "one that decodes")
+            raise FormatError(self.file, "codec", "an unknown one", "a codec with a decoder")
         context.thread_count = 1  # a data loader has its own workers
         h, w = context.height, context.width
         if not 0 < h * w <= _MAX_VIDEO_PIXELS:
             raise FormatError(self.file, "size", f"{w}x{h}", f"1 to {_MAX_VIDEO_PIXELS} pixels")
         index = _index_entries(self.stream)
-        shown = [entry for entry in index if not entry.is_discard]
-        n = len(shown) if len(index) >= self.stream.frames > 0 else len(self.table())
+        visible = [entry for entry in index if not entry.is_discard]
+        n = len(visible) if len(index) >= self.stream.frames > 0 else len(self.table())
         if not 0 < n <= _MAX_FRAMES or self.stream.time_base is None:
             raise FormatError(self.file, "frames", n, f"1 to {_MAX_FRAMES}, with a time base")
         rate = self.stream.average_rate
@@ -194,9 +201,9 @@ class _Decoder:
                 ]
             except self.errors as error:
                 raise FormatError(self.file, "packets", error, "a whole video") from None
-            shown = [pts for pts, _, _, hidden in packets if not hidden]
+            visible = [pts for pts, _, _, hidden in packets if not hidden]
             keys = sorted((pts, dts) for pts, dts, key, _ in packets if key)
-            self.pts, self.keys = np.unique(np.array(shown, np.int64)), np.array(keys, np.int64).reshape(-1, 2)
+            self.pts, self.keys = np.unique(np.array(visible, np.int64)), np.array(keys, np.int64).reshape(-1, 2)
             self.next = -1
         return self.pts
 
@@ -222,14 +229,14 @@ class _Decoder:
         raise FormatError(self.file, f"frame {i}", "nothing", "a decodable frame")
 
     def _seek(self, pts: int) -> None:
-        """To the last key frame shown at or before ``pts``; one decoded earlier but shown later does not lead there."""
+        """Seek the last key frame presented at or before ``pts``; not one decoded earlier but presented later."""
         before = int(np.searchsorted(self.keys[:, 0], pts, "right")) - 1
         start = int(self.keys[before, 1]) if before >= 0 else int(self.table()[0])
         self.container.seek(start, stream=self.stream, backward=True)
         self.frames = self._decoded()
 
     def _decoded(self) -> Iterator[Any]:
-        """Frames from where the file stands; packets that do not decode are passed over."""
+        """Decoded frames from the current position on; undecodable packets are skipped."""
         failed = 0
         for packet in self.container.demux(self.stream):
             try:
@@ -248,7 +255,7 @@ _inherited_decoders: list[_Decoder] = []
 
 
 def _get_decoder(file: Path, all_frames: bool) -> _Decoder:
-    """An open decoder of this process."""
+    """A cached decoder of this process, opened if needed."""
     key = (file, all_frames, modification_time_ns(file))
     if key not in _open_decoders:
         while len(_open_decoders) >= _MAX_OPEN_DECODERS:
@@ -259,8 +266,8 @@ def _get_decoder(file: Path, all_frames: bool) -> _Decoder:
 
 
 def _abandon_inherited_decoders() -> None:
-    """A forked process shares its parent's file positions, and threads that it would wait for are not there."""
-    _inherited_decoders.extend(_open_decoders.values())  # kept, because freeing would wait
+    """Drop the parent's decoders after a fork: file positions are shared and the decoders' threads do not exist."""
+    _inherited_decoders.extend(_open_decoders.values())  # kept alive, because freeing would wait for those threads
     _open_decoders.clear()
 
 

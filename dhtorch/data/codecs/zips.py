@@ -1,4 +1,4 @@
-"""Zip archives: what the end of one says about its directory, before anybody reads that into memory."""
+"""Check of a zip archive's directory size, from its end record, before the directory is read into memory."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from dhtorch.data.io.safe_open import check_memory
 _END_RECORD, _ZIP64_LOCATOR, _ZIP64_END = b"PK\x05\x06", b"PK\x06\x07", b"PK\x06\x06"
 _END_RECORD_BYTES, _ZIP64_LOCATOR_BYTES, _ZIP64_END_BYTES = 22, 20, 56
 _MAX_COMMENT_BYTES = 1 << 16
-_MIN_ENTRY_BYTES = 46  # bytes of an entry without its name
-_MEMORY_PER_ENTRY_BYTES = 1200  # bytes that Python takes for one
+_MIN_ENTRY_BYTES = 46  # size of an entry in the directory without its name
+_MEMORY_PER_ENTRY_BYTES = 1200  # memory that Python takes per entry
 
 
 def check_zip_directory(stream: BinaryIO, file: Path) -> None:
-    """Hold the size of an archive's directory against the archive, and its entries against memory.
+    """Check the declared directory size against the archive's size, and its entries against the memory limit.
 
     Raises:
-        FormatError: no end of an archive, a directory that does not fit into it, or more entries than are allowed.
+        FormatError: no end record, a directory larger than the archive, or too many entries.
     """
     total = stream.seek(0, 2)
     tail_at = max(0, total - _MAX_COMMENT_BYTES - _END_RECORD_BYTES)
@@ -30,11 +30,11 @@ def check_zip_directory(stream: BinaryIO, file: Path) -> None:
     if at < 0 or len(tail) - at < _END_RECORD_BYTES:
         raise FormatError(file, "archive", f"{total} bytes without a directory", "a whole zip archive")
     (size,) = struct.unpack_from("<I", tail, at + 12)
-    place = tail_at + at - _ZIP64_LOCATOR_BYTES
-    stream.seek(max(0, place))
-    long = stream.read(_ZIP64_LOCATOR_BYTES) if place >= 0 else b""
-    if long.startswith(_ZIP64_LOCATOR):
-        stream.seek(max(0, place - _ZIP64_END_BYTES))
+    locator_at = tail_at + at - _ZIP64_LOCATOR_BYTES
+    stream.seek(max(0, locator_at))
+    locator = stream.read(_ZIP64_LOCATOR_BYTES) if locator_at >= 0 else b""
+    if locator.startswith(_ZIP64_LOCATOR):
+        stream.seek(max(0, locator_at - _ZIP64_END_BYTES))
         record = stream.read(_ZIP64_END_BYTES)
         if len(record) == _ZIP64_END_BYTES and record.startswith(_ZIP64_END):
             (size,) = struct.unpack_from("<Q", record, 40)

@@ -1,10 +1,7 @@
-"""Decoding: the only place where bytes become arrays.
+"""Decoding of images, tables, text and JSON: file bytes -> numpy arrays or Python values.
 
-Every function returns plain numpy arrays or Python values and checks lengths and headers *before* a decoder sees the
-bytes. Whatever is wrong with a file is a :class:`FormatError`: one line with the file, the field, what was found and
-what was expected.
-
-Bytes come through the doors of :mod:`dhtorch.data.io.safe_open`.
+Lengths and headers are checked *before* decoding. Any defect of a file raises :class:`FormatError`: one line with the
+file, the field, what was found and what was expected. Files are opened by :mod:`dhtorch.data.io.safe_open`.
 
 Alphabet: ``hw`` (height, width); depth and disparity maps are (h, w) float32.
 """
@@ -27,28 +24,34 @@ import numpy as np
 
 from dhtorch.data.io.safe_open import FormatError, check_memory, open_regular, unreadable_error
 
-#: No camera of ours comes near this; a header that claims more is damaged or hostile.
+#: Largest number of pixels of an image, above that of all supported cameras; larger headers are damaged or hostile.
 MAX_PIXELS = 64_000_000
-MAX_FILE_BYTES = 256_000_000  # of an array or a file
-MAX_TEXT_BYTES = 64_000_000  # of a table or a JSON document
-#: Numbers that an error message shows.
+#: Largest size in bytes of an array or a file.
+MAX_FILE_BYTES = 256_000_000
+#: Largest size in bytes of a table or a JSON document.
+MAX_TEXT_BYTES = 64_000_000
+#: Numbers shown in an error message.
 _MAX_NUMBERS_SHOWN = 64
 
-#: Bytes that Python's own objects take, at most: of a line and a word of a table; of an object, a list, a text and an
-#: entry of a JSON document.
-_LINE_BYTES, _WORD_BYTES = 250, 64
+#: Upper bounds of the memory of Python objects in bytes: per line and per word of a table.
+_LINE_BYTES = 250
+_WORD_BYTES = 64
+#: The same for a JSON document: per object, list, string and entry, counted by their characters.
 _JSON_BYTES = {"{": 240, "[": 64, '"': 32, ",": 40}
 
 _LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
 
-#: Deflate makes at most 1032 bytes of one, a JPEG at most a square of pixels of one bit.
+#: Largest expansion of deflate: 1032 bytes from one.
 MAX_DEFLATE_RATIO = 1032
+#: Largest number of pixels per byte of a JPEG: a block of pixels from one bit.
 _MAX_JPEG_PIXELS_PER_BYTE = 8 * 1024
-_MAX_SCANS, _MAX_SCANNED_PIXELS = 1000, 20 * MAX_PIXELS  # of a JPEG: passes over the picture, and pixels of all of them
+#: Limits of a progressive JPEG: number of scans, and pixels summed over all scans.
+_MAX_SCANS = 1000
+_MAX_SCANNED_PIXELS = 20 * MAX_PIXELS
 
 
 class ImageHeader(NamedTuple):
-    """What an image file says about itself."""
+    """Size, channels and bit depth of an image file."""
 
     hw: tuple[int, int]
     channels: int
@@ -57,10 +60,10 @@ class ImageHeader(NamedTuple):
 
 
 def import_optional(*libraries: str, extra: str = "data") -> ModuleType:
-    """The first of ``libraries`` that is installed: decoders of rare formats are not a dependency of the package.
+    """Import the first installed one of ``libraries``: decoders of rare formats are optional dependencies.
 
     Raises:
-        ImportError: none is; the message names the extra that brings one.
+        ImportError: none is installed; the message names the extra that installs one.
     """
     for library in libraries:
         try:
@@ -72,7 +75,7 @@ def import_optional(*libraries: str, extra: str = "data") -> ModuleType:
 
 
 def set_opencv_threads(threads: int) -> None:
-    """Threads of OpenCV in this process; torch has its own count, and a data-loader worker should have one of each."""
+    """Set OpenCV's number of threads in this process; torch has its own; data-loader workers use one of each."""
     cv2.setNumThreads(threads)
 
 
@@ -80,7 +83,7 @@ def set_opencv_threads(threads: int) -> None:
 
 
 def read_image(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
-    """Image (C, H, W) uint8, RGB or grey, as stored: an orientation tag is not applied, K belongs to these pixels.
+    """Image (C, H, W) uint8, RGB or grey, as stored: an orientation tag is not applied, K refers to these pixels.
 
     Raises:
         FormatError: missing, truncated or unknown file; not 8 bits; another size than ``hw``.
@@ -89,7 +92,7 @@ def read_image(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
 
 
 def decode_image(data: bytes, file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
-    """As :func:`read_image`, of bytes that lie in an archive; ``file`` names them in errors."""
+    """As :func:`read_image`, of bytes in memory; ``file`` names them in errors."""
     header = _check_header(file, data, hw)
     if header.bits != 8:
         raise FormatError(file, "bits per channel", header.bits, 8)
@@ -121,11 +124,11 @@ def decode_depth_png(
     hw: tuple[int, int] | None = None,
     invalid: Sequence[int] = (0,),
 ) -> np.ndarray:
-    """As :func:`read_depth_png`, of bytes that lie in an archive; ``file`` names them in errors."""
+    """As :func:`read_depth_png`, of bytes in memory; ``file`` names them in errors."""
     header = _check_header(file, data, hw)
     if (header.kind, header.channels, header.bits) != ("png", 1, 16):
-        found = f"{header.kind} with {header.channels} channels of {header.bits} bits"
-        raise FormatError(file, "depth", found, "png with 1 channel of 16 bits")
+        problem = f"{header.kind} with {header.channels} channels of {header.bits} bits"
+        raise FormatError(file, "depth", problem, "png with 1 channel of 16 bits")
     code = _decode_with_opencv(file, data, cv2.IMREAD_UNCHANGED, header.hw)
     return to_metres(code, units_per_metre, invalid)
 
@@ -148,7 +151,7 @@ def read_image_header(file: Path) -> ImageHeader:
 
 
 def decode_image_header(data: bytes, file: Path) -> ImageHeader:
-    """As :func:`read_image_header`, of bytes that lie in an archive; ``file`` names them in errors."""
+    """As :func:`read_image_header`, of bytes in memory; ``file`` names them in errors."""
     return _parse_header(file, data)
 
 
@@ -156,13 +159,15 @@ def _check_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageH
     header = _parse_header(file, data)
     if hw is not None and header.hw != tuple(hw):
         raise FormatError(file, "size", _format_size(header.hw), _format_size(hw))
-    whole = _is_whole_png(data) if header.kind == "png" else data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
-    if not whole:
-        raise FormatError(file, "data", f"a truncated or damaged {header.kind} file of {len(data)} bytes", "all of it")
+    is_whole = _is_whole_png(data) if header.kind == "png" else data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
+    if not is_whole:
+        raise FormatError(
+            file, "data", f"a truncated or damaged {header.kind} file of {len(data)} bytes", "a whole file"
+        )
     scans = data.count(b"\xff\xda") if header.kind == "jpeg" else 1
     if scans > _MAX_SCANS or (scans > 1 and scans * header.hw[0] * header.hw[1] > _MAX_SCANNED_PIXELS):
         raise FormatError(
-            file, "scans", f"{scans} passes over {_format_size(header.hw)} pixels", "a picture of few passes"
+            file, "scans", f"{scans} scans of {_format_size(header.hw)} pixels", "an image with fewer scans"
         )
     return header
 
@@ -181,7 +186,7 @@ def _parse_header(file: Path, data: bytes) -> ImageHeader:
         _MAX_JPEG_PIXELS_PER_BYTE if header.kind == "jpeg" else 8 * MAX_DEFLATE_RATIO
     ):
         raise FormatError(
-            file, "size", f"{_format_size(header.hw)} in {len(data)} bytes", "as many bytes as pixels need"
+            file, "size", f"{_format_size(header.hw)} in {len(data)} bytes", "enough bytes for its pixels"
         )
     return header
 
@@ -198,7 +203,7 @@ def _parse_jpeg_header(file: Path, data: bytes) -> ImageHeader:
 
 
 def _is_whole_png(data: bytes) -> bool:
-    """Walk the chunks: every length fits, every check sum holds, the last one is IEND."""
+    """Whether all chunks have a valid length and checksum up to the final IEND."""
     at = 8
     while at + 12 <= len(data):
         length = int.from_bytes(data[at : at + 4], "big")
@@ -217,7 +222,7 @@ def _decode_with_opencv(file: Path, data: bytes, flags: int, hw: tuple[int, int]
     except cv2.error as error:
         raise FormatError(file, "data", error.err, "a decodable image") from None
     if image is None or image.shape[:2] != tuple(hw):
-        raise FormatError(file, "data", "pixels that do not decode", f"an image of {_format_size(hw)}")
+        raise FormatError(file, "data", "undecodable pixels", f"an image of {_format_size(hw)}")
     return image
 
 
@@ -228,7 +233,7 @@ def read_table(file: Path, columns: int | None = None) -> np.ndarray:
     """Numbers (rows, columns) float64 of a white-space separated table; ``#`` starts a comment. NaN may occur.
 
     Raises:
-        FormatError: missing file, something that is no number, or a row of another length.
+        FormatError: missing file, a word that is not a number, or a row of another length.
     """
     rows = read_rows(file)
     width = columns or (len(rows[0][1]) if rows else 0)
@@ -244,16 +249,16 @@ def read_table(file: Path, columns: int | None = None) -> np.ndarray:
 
 
 def read_rows(file: Path) -> list[tuple[int, list[str]]]:
-    """(line number, words) of every line of a text file that is neither blank nor a ``#`` comment."""
+    """(line number, words) of the lines of a text file, without blank lines and ``#`` comments."""
     lines = enumerate(read_lines(file), 1)
     return [(i, line.split()) for i, line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
 def read_lines(file: Path) -> list[str]:
-    """The lines of a text file, which may be taken apart into words.
+    """The lines of a text file, after checking the memory of its lines and words.
 
     Raises:
-        FormatError: no such text, or more lines and words than memory is allowed for.
+        FormatError: no such text, or more lines and words than the memory limit allows.
     """
     text = read_text(file)
     lines, words = (sum(map(text.count, marks)) for marks in (_LINE_ENDS, " ,\t"))
@@ -264,10 +269,10 @@ def read_lines(file: Path) -> list[str]:
 
 
 def read_json(file: Path) -> dict[str, Any]:
-    """A JSON object.
+    """Read a JSON file with an object at the top level.
 
     Raises:
-        FormatError: missing file, no JSON, or something else than an object on top.
+        FormatError: missing file, not JSON, or another value at the top level.
     """
     value = decode_json(read_text(file), file)
     if not isinstance(value, dict):
@@ -276,17 +281,17 @@ def read_json(file: Path) -> dict[str, Any]:
 
 
 def decode_json(text: str | bytes, file: Path) -> Any:
-    """Any JSON value; ``file`` names the text in errors.
+    """Text → any JSON value; ``file`` names it in errors.
 
     Raises:
-        FormatError: no JSON, or more values than memory is allowed for.
+        FormatError: not JSON, or more values than the memory limit allows.
     """
     raw = text.encode("utf-8", "replace") if isinstance(text, str) else text
     counts = {mark: raw.count(mark.encode()) for mark in _JSON_BYTES}
     check_memory(file, "JSON", sum(_JSON_BYTES[mark] * n for mark, n in counts.items()), f"{counts[',']} entries")
     try:
         return json.loads(text)
-    except (ValueError, RecursionError) as error:  # ValueError: bytes that are no text, too
+    except (ValueError, RecursionError) as error:  # ValueError: also bytes that are not text
         raise FormatError(file, "JSON", error, "a JSON document") from None
 
 
@@ -294,7 +299,7 @@ def get_entry(value: Any, path: str, kind: type | tuple[type, ...], file: Path) 
     """The entry ``"a.b.c"`` of nested JSON objects, of type ``kind``.
 
     Raises:
-        FormatError: absent or of another type.
+        FormatError: missing or of another type.
     """
     for part in path.split("."):
         if not isinstance(value, dict) or part not in value:
@@ -306,7 +311,7 @@ def get_entry(value: Any, path: str, kind: type | tuple[type, ...], file: Path) 
 
 
 def to_array(value: Any, shape: tuple[int, ...], file: Path, field: str) -> np.ndarray:
-    """Numbers of a given shape, float64 and finite, from JSON lists, options or a table.
+    """JSON lists, options or a table → finite float64 array of ``shape``.
 
     Raises:
         FormatError: not numbers, another shape, or not finite.
@@ -314,20 +319,20 @@ def to_array(value: Any, shape: tuple[int, ...], file: Path, field: str) -> np.n
     expected = f"{'x'.join(map(str, shape))} finite numbers" if shape else "a finite number"
     if value is None:
         raise FormatError(file, field, "nothing", expected)
-    if isinstance(value, np.ndarray) and value.shape != shape:  # before a large one grows eightfold
+    if isinstance(value, np.ndarray) and value.shape != shape:  # before conversion enlarges it eightfold
         raise FormatError(file, field, f"an array of shape {value.shape}", expected)
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise FormatError(file, field, repr(value), expected) from None
     if array.shape != shape or not np.isfinite(array).all():
-        found = array.tolist() if array.size <= _MAX_NUMBERS_SHOWN else f"numbers of shape {array.shape}"
-        raise FormatError(file, field, found, expected)
+        actual = array.tolist() if array.size <= _MAX_NUMBERS_SHOWN else f"numbers of shape {array.shape}"
+        raise FormatError(file, field, actual, expected)
     return array
 
 
 def to_positive(value: object, file: Path, field: str) -> float:
-    """A positive number that may sensibly scale something, 1e-6 to 1e6.
+    """A positive number in the plausible range of scales, 1e-6 to 1e6.
 
     Raises:
         FormatError: anything else.
@@ -365,17 +370,17 @@ def read_bytes(file: Path, limit: int = MAX_FILE_BYTES) -> bytes:
 
 
 def natural_sort_key(name: Path | str) -> tuple[object, ...]:
-    """Key of an order in which 1, 2 and 10 follow one another, with or without leading zeros."""
+    """Sort key for natural order (1, 2, 10), with or without leading zeros."""
     parts = re.split(r"(\d+)", str(name))
     return tuple((not part.isdecimal(), int(part[:_MAX_NUMBER_DIGITS]) if part.isdecimal() else part) for part in parts)
 
 
-#: Digits of a number in a file's name that count.
+#: Digits of a number in a file's name that are used.
 _MAX_NUMBER_DIGITS = 300
 
 
 def format_left_out(names: Sequence[int | str], why: str) -> list[str]:
-    """A line for a recording's report about frames that are not in it; none for none."""
+    """Report line on frames that were left out and the reason ``why``; empty list for no frame."""
     if not names:
         return []
     shown = ", ".join(map(str, names[:6])) + (" …" if len(names) > 6 else "")
@@ -384,8 +389,8 @@ def format_left_out(names: Sequence[int | str], why: str) -> list[str]:
 
 def _kind_name(kind: type | tuple[type, ...]) -> str:
     kinds = kind if isinstance(kind, tuple) else (kind,)
-    words: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}
-    return " or ".join(dict.fromkeys(words.get(k, "a number") for k in kinds))
+    names: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}
+    return " or ".join(dict.fromkeys(names.get(k, "a number") for k in kinds))
 
 
 def _format_size(hw: tuple[int, int]) -> str:

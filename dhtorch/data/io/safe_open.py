@@ -1,8 +1,7 @@
-"""The doors that all readers go through, and the one error they raise.
+"""Safe access to files for all readers: regular files inside the capture only, memory limits, and FormatError.
 
-:func:`open_regular` is the only way to a file's bytes: regular files alone, inside the capture. :func:`check_memory` is
-the law of
-memory: whoever is about to make much of few bytes asks first.
+Readers open every file with :func:`open_regular` and call :func:`check_memory` before decompressing or allocating
+memory whose size comes from a file, against decompression bombs.
 """
 
 from __future__ import annotations
@@ -15,14 +14,17 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO
 
-#: What opening a capture or reading one frame may take: so many bytes, or so many times what was asked for.
-MAX_MEMORY_BYTES, MAX_MEMORY_RATIO = 256 << 20, 8
+#: Memory in bytes that opening a capture or reading one frame may take, whatever the size of the result.
+MAX_MEMORY_BYTES = 256 << 20
+
+#: The same as a multiple of the bytes of the requested arrays; the larger of the two limits applies.
+MAX_MEMORY_RATIO = 8
 
 
 class FormatError(ValueError):
-    """A file is not what its format promises: ``file: field: found …, expected …`` in one line.
+    """A file does not conform to its format: ``file: field: found …, expected …`` in one line.
 
-    Survives pickling, so it arrives intact from a data-loader worker.
+    Picklable, so that it is passed on intact from a data-loader worker.
     """
 
     def __init__(self, file: str | Path, field: str = "", found: object = "", expected: object = "") -> None:
@@ -35,17 +37,17 @@ class FormatError(ValueError):
 
 @contextmanager
 def open_regular(file: Path) -> Iterator[BinaryIO]:
-    """A file of a capture, open for reading: the only way to its bytes.
+    """Open a file of a capture for reading, after checking that it is a regular file inside the capture.
 
     Raises:
-        FormatError: missing, unreadable, a pipe, socket, device or folder (which might never answer), or a link that
-            leads out of the capture (see :func:`restrict_links`).
+        FormatError: missing, unreadable, a pipe, socket, device or folder (reading could block forever), or a link to
+            outside the capture (see :func:`restrict_links`).
     """
     try:
-        kind = file.stat().st_mode  # before it is opened: some devices act on that alone
+        mode = file.stat().st_mode  # before opening: opening alone triggers some devices
         _check_link(file)
-        if not stat.S_ISREG(kind):
-            raise FormatError(file, "file", _FILE_KINDS.get(stat.S_IFMT(kind), "something else"), "a regular file")
+        if not stat.S_ISREG(mode):
+            raise FormatError(file, "file", _FILE_KINDS.get(stat.S_IFMT(mode), "something else"), "a regular file")
         stream = os.fdopen(os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb")
     except FormatError:
         raise
@@ -65,7 +67,7 @@ _FILE_KINDS = {
 
 
 def check_regular_file(file: Path) -> int:
-    """Bytes of a file that a library will open by its name.
+    """Size in bytes of a file that a library will open by name, after the checks of :func:`open_regular`.
 
     Raises:
         FormatError: as :func:`open_regular`.
@@ -74,54 +76,53 @@ def check_regular_file(file: Path) -> int:
         return os.fstat(stream.fileno()).st_size
 
 
-#: The capture that is being read, and whether its links may lead out of it.
+#: The capture being read, whose links must not point outside it; None = no restriction.
 _restricted_root: ContextVar[Path | None] = ContextVar("capture", default=None)
 
 
 @contextmanager
 def restrict_links(root: Path | None) -> Iterator[None]:
-    """Meanwhile links below ``root`` that lead out of it are refused; None: links are followed anywhere."""
-    before = _restricted_root.set(root)
+    """Context in which links below ``root`` that point outside it are refused; None = no restriction."""
+    token = _restricted_root.set(root)
     try:
         yield
     finally:
-        _restricted_root.reset(before)
+        _restricted_root.reset(token)
 
 
 def is_inside(file: Path, root: Path) -> bool:
-    """Whether a file, wherever links lead, lies in a capture: a folder, or the folder of a file."""
-    home = root.resolve()
-    return file.resolve().is_relative_to(home.parent if root.is_file() else home)
+    """Whether a file, with links resolved, lies in the folder ``root``, or in that of the file ``root``."""
+    folder = root.resolve()
+    return file.resolve().is_relative_to(folder.parent if root.is_file() else folder)
 
 
 def _check_link(file: Path) -> None:
-    """Refuse a link that leads out of the capture that is being read."""
+    """Raise FormatError for a link that points outside the capture being read."""
     root = _restricted_root.get()
     if root is None or not file.is_relative_to(root):
         return
     if not is_inside(file, root):
-        raise FormatError(file, "link", "one that leads out of the capture", "a file inside (follow_links=true allows)")
+        raise FormatError(file, "link", "one to outside the capture", "a file inside (follow_links=true allows)")
 
 
 def check_memory(file: Path, field: str, takes: int, found: object, asked: int = 0) -> None:
-    """The law of memory: at most ``MAX_MEMORY_BYTES`` bytes, or ``MAX_MEMORY_RATIO`` times the bytes that were asked
-    for.
+    """Raise if ``takes`` exceeds both ``MAX_MEMORY_BYTES`` and ``MAX_MEMORY_RATIO`` times the bytes ``asked`` for.
 
     Args:
         file, field, found: for the error.
-        takes: bytes that are about to be taken, by a bound that costs nothing.
-        asked: bytes of the arrays asked for, of a shape that the file is long enough for.
+        takes: upper bound of the bytes about to be allocated, computed without allocating them.
+        asked: bytes of the requested arrays, of a shape that the file is long enough for.
 
     Raises:
-        FormatError: more than that.
+        FormatError: the limit is exceeded.
     """
-    most = max(MAX_MEMORY_BYTES, MAX_MEMORY_RATIO * asked)
-    if takes > most:
-        raise FormatError(file, field, f"{found}: {takes} bytes of memory", f"at most {most}")
+    limit = max(MAX_MEMORY_BYTES, MAX_MEMORY_RATIO * asked)
+    if takes > limit:
+        raise FormatError(file, field, f"{found}: {takes} bytes of memory", f"at most {limit}")
 
 
 def modification_time_ns(file: Path) -> int:
-    """When a file was changed last, ns: part of the key of whatever is kept of it in memory.
+    """Time of a file's last modification in ns, used as part of the key of caches of its content.
 
     Raises:
         FormatError: the file is missing or unreadable.
@@ -132,12 +133,12 @@ def modification_time_ns(file: Path) -> int:
         raise unreadable_error(file, error) from None
 
 
-#: What opening a file may raise; ValueError: a name that no file can have.
+#: Errors raised on opening a file; ValueError: an invalid name.
 _OPEN_ERRORS = (OSError, ValueError)
 
 
 def unreadable_error(file: Path, error: Exception) -> FormatError:
-    """What to raise instead of ``error``, one of ``_OPEN_ERRORS``."""
+    """The FormatError to raise instead of ``error``, one of ``_OPEN_ERRORS``."""
     found = "no such file" if isinstance(error, FileNotFoundError) else error
     return FormatError(file, "file", found, "a readable file")
 

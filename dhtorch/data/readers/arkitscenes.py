@@ -1,13 +1,13 @@
-"""ARKitScenes: an iPad's colour, LiDAR depth and confidence, poses, and depth rendered from a laser scan.
+"""Reader of ARKitScenes: an iPad's colour, LiDAR depth, confidence and poses, and depth rendered from a laser scan.
 
-A capture is a folder of *assets*, each a folder of files ``<video id>_<seconds>.png`` with a clock of its own:
+A capture is a folder of *assets*, each a folder of files ``<video id>_<seconds>.png`` with its own time stamps:
 ``lowres_wide``, ``vga_wide`` and ``wide`` (also called ``color``) are one camera at three sizes, ``lowres_depth`` and
 ``confidence`` the LiDAR, ``highres_depth`` the laser scan; ``<asset>_intrinsics`` holds ``.pincam`` lines
 ``width height fx fy cx cy``. ``lowres_wide.traj`` has ``seconds rx ry rz tx ty tz``, *world-to-camera*, at a sixth of
-the frame rate. The world's z axis points up; pictures are stored as the sensor lies, often sideways.
+the frame rate. The world's z axis points up; images are stored in the sensor's orientation, often sideways.
 
-The three downloads of one capture (``raw``, ``3dod``, ``upsampling``) complete each other: what ``root`` lacks is
-looked for in the same capture's folder of the other two, where they lie beside one another as they were downloaded.
+The three downloads of one capture (``raw``, ``3dod``, ``upsampling``) complement each other: assets missing in ``root``
+are taken from the same capture's folder in the other two, where these lie beside each other as downloaded.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ from dhtorch.geometry.camera import resize
 from dhtorch.records import Camera, Frame
 from dhtorch.runtime.console import format_count
 
-#: Colour assets and their folders, in the order in which one is chosen.
+#: Colour assets and their folder names, in order of preference.
 _COLOUR_ASSETS = {"lowres_wide": ("lowres_wide",), "vga_wide": ("vga_wide",), "wide": ("wide", "color")}
 
 _SUBSETS, _SPLITS = ("raw", "3dod", "upsampling"), ("Training", "Validation")
 _STAMP_PATTERN = re.compile(r"[^/]*_(\d{1,10}(?:\.\d{1,9})?)\.(png|pincam)")
 _UNITS_PER_METRE = 1000.0
 
-#: File names carry milliseconds: stamps this close are one instant.
-_SAME_INSTANT_S = 0.0011  # s
-#: A pose and an image this close have the same stamp once both are rounded to milliseconds.
-_STAMP_ROUNDING_S = 0.00051  # s
-#: A mean direction of gravity shorter than this in the plane of the picture names no side of it.
+#: Largest difference in s of stamps of one instant: file names have milliseconds.
+_SAME_INSTANT_S = 0.0011
+#: Largest difference in s of a pose and an image with the same stamp rounded to milliseconds.
+_STAMP_ROUNDING_S = 0.00051
+#: Length of the mean gravity direction's projection onto the image plane below which the image is not rotated.
 _MIN_GRAVITY_IN_PLANE = 0.1
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     assets = [name for names in _COLOUR_ASSETS.values() for name in names] + ["lowres_depth", "highres_depth"]
-    found = [name for name in assets if any((place / name).is_dir() for place in _asset_folders(root)[:2])]
-    telling = {"lowres_wide", "vga_wide", "lowres_depth", "highres_depth"}
-    return f"ARKitScenes assets {', '.join(found)}" if len(found) > 1 and telling & {*found} else None
+    present = [name for name in assets if any((place / name).is_dir() for place in _asset_folders(root)[:2])]
+    distinctive = {"lowres_wide", "vga_wide", "lowres_depth", "highres_depth"}
+    return f"ARKitScenes assets {', '.join(present)}" if len(present) > 1 and distinctive & {*present} else None
 
 
 def read(
@@ -71,33 +71,34 @@ def read(
 ) -> list[Recording]:
     """Open one capture.
 
-    The depth is ``lowres_depth`` with its confidence. Nothing is ever taken over from an earlier frame: an image
-    without a source view in time is left out and reported.
+    The depth is ``lowres_depth`` with its confidence. Values are never reused from an earlier frame: images without
+    depth close in time are left out and reported.
 
     Args:
         root: the capture's folder, named by its video id, or its ``<video id>_frames``.
-        image: ``lowres_wide`` | ``vga_wide`` | ``wide``. None = the first of these that is there.
-        poses: read the trajectory and leave out images it does not cover. False keeps every image with depth. A
-            capture without a trajectory (some have none) keeps every image too, and says so.
-        interpolate: images between two poses get one: position linear, rotation on the shortest way. False keeps only
-            images with a pose of their own.
-        upright: turn image, depth, confidence, intrinsics and pose together so that the sky is on top. The poses
-            decide (the table's ``sky_direction`` is unreliable and never read); without them nothing is turned.
-        truth: take ``highres_depth`` for the truth, where there is any; the recording then has ``truth(i)``.
+        image: ``lowres_wide`` | ``vga_wide`` | ``wide``. None = the first of these that exists.
+        poses: read the trajectory and leave out images that it does not cover. False keeps every image with depth.
+            Captures without a trajectory (some have none) also keep every image, which is reported.
+        interpolate: interpolate poses for images between two poses: position linear, rotation along the shortest arc.
+            False keeps only images with a pose of their own.
+        upright: rotate image, depth, confidence, intrinsics and pose by quarter turns so that the sky is on top, as
+            determined from the poses (the table's ``sky_direction`` is unreliable and not read); without poses nothing
+            is rotated.
+        truth: use ``highres_depth`` as true depth, where available; the recording then has ``truth(i)``.
         max_difference: s, from image to depth, and to borrowed intrinsics. A little more than half a period at 60 Hz.
-        max_pose_difference: s, from an image to a pose of its own.
-        max_pose_gap: s, between two poses that are interpolated. They come at about 10 Hz: one lost pose is a gap.
+        max_pose_difference: s, from an image to its own pose.
+        max_pose_gap: s, between two poses to interpolate in. Poses come at about 10 Hz: one lost pose is a gap.
         max_truth_gap: s, from image to laser depth.
-        max_disagreement: median relative difference of laser and LiDAR over the pixels they share, beyond which a
-            laser depth map is rejected. This limit is our choice: the paper gives only what its accepted maps reached.
+        max_disagreement: median relative difference of laser and LiDAR over their common pixels beyond which a laser
+            depth map is rejected. This limit is our choice: the paper reports only the values of its accepted maps.
 
     Returns:
-        One recording at the stamps of the images, with ``truth(i)`` where there is laser depth. Not every capture may
-        ship intrinsics of ``wide`` (unconfirmed): those of another size of the same camera, nearest in time, then
-        serve, scaled exactly, and the report says so.
+        One recording at the stamps of the images, with ``truth(i)`` where there is laser depth. Captures may
+        lack intrinsics of ``wide`` (unconfirmed): then those of another size of the same camera, nearest in time, are
+        used, scaled exactly, which is reported.
 
     Raises:
-        FormatError: a missing asset, nothing that associates, or a damaged file.
+        FormatError: a missing asset, no associated files, or a damaged file.
     """
     root = Path(root)
     limits = {"max_difference": max_difference, "max_pose_difference": max_pose_difference}
@@ -110,7 +111,7 @@ def read(
     has = {what: link.at >= 0 for what, link in links.items()}
     trajectory = _find_folder(places, "lowres_wide.traj") if poses else None
     if poses and trajectory is None:
-        report.append("no lowres_wide.traj: frames have no pose, and stay as stored")
+        report.append("no lowres_wide.traj: frames have no pose and are not rotated")
     c2w = np.eye(4)[None]
     if trajectory is not None:
         gap = max_pose_gap if interpolate else 0.0
@@ -130,8 +131,8 @@ def read(
     if laser is None:
         return [Recording(**fields, report=tuple(report))]
     load_truth = _make_truth_loader(places, laser, times, load, max_truth_gap, max_disagreement)
-    if (without := load_truth.depths.count(None)) > 0:
-        report.append(f"{format_count(without, 'frame')} without laser depth within {max_truth_gap} s: no truth")
+    if (n_without := load_truth.depths.count(None)) > 0:
+        report.append(f"{format_count(n_without, 'frame')} without laser depth within {max_truth_gap} s: no truth")
     return [MeasuredRecording(**fields, load_truth=load_truth, report=tuple(report))]
 
 
@@ -144,7 +145,7 @@ class _Load:
 
     images: tuple[Path, ...]
     pincams: tuple[Path, ...]
-    borrowed: bool  # the pincams belong to another size of the same camera
+    borrowed: bool  # the pincams are those of another size of the same camera
     depths: tuple[Path, ...]
     depth_pincams: tuple[Path, ...] | None  # None = the camera of the image, scaled
     confs: tuple[Path, ...] | None
@@ -180,7 +181,7 @@ class _Load:
 
 @dataclass(frozen=True, eq=False)
 class _LoadTruth:
-    """Position → laser depth at the pixels of the image, and how far it is from the LiDAR."""
+    """Position → laser depth at the pixels of the image, and its disagreement with the LiDAR."""
 
     load: _Load
     depths: tuple[Path | None, ...]
@@ -189,25 +190,25 @@ class _LoadTruth:
 
     def __call__(self, i: int) -> tuple[Tensor, float]:
         (hw, camera), file, pincam = self.load.view(i), self.depths[i], self.pincams[i]
-        depth, off = torch.zeros(hw), float("nan")
+        depth, disagreement = torch.zeros(hw), float("nan")
         if file is not None:
             laser_hw, laser_camera = (None, None) if pincam is None else _read_pincam(pincam)
             laser = torch.from_numpy(files.read_depth_png(file, _UNITS_PER_METRE, laser_hw))
             sensor, sensor_camera = self.load.sensor(i)
             laser_camera = laser_camera or resize(camera, hw, (laser.shape[0], laser.shape[1]))
             sensor_camera = sensor_camera or resize(camera, hw, (sensor.shape[0], sensor.shape[1]))
-            depth, off = resample_laser_depth(
+            depth, disagreement = resample_laser_depth(
                 laser, laser_camera, sensor, sensor_camera, camera, hw, self.max_disagreement
             )
-        return convert.rot90_image(depth, self.load.turns), off
+        return convert.rot90_image(depth, self.load.turns), disagreement
 
 
 def _read_pincam(file: Path) -> tuple[tuple[int, int], Camera]:
-    """Size of the picture that the intrinsics belong to, and its camera."""
+    """(h, w) of the images that the intrinsics refer to, and the camera."""
     rows = files.read_table(file, 6)
     w, h, fx, fy, cx, cy = files.to_array(rows[0] if len(rows) == 1 else None, (6,), file, "intrinsics").tolist()
     if min(w, h) < 1 or w * h > files.MAX_PIXELS or w % 1 or h % 1:
-        raise FormatError(file, "width and height", f"{w:g} {h:g}", "the size of a picture")
+        raise FormatError(file, "width and height", f"{w:g} {h:g}", "the size of an image")
     hw = (int(h), int(w))
     return hw, convert.to_camera(convert.make_K(fx, fy, cx, cy), hw, file, "intrinsics")
 
@@ -216,23 +217,23 @@ def _read_confidence(file: Path, hw: tuple[int, int]) -> np.ndarray:
     """Levels (h, w) uint8, 0 low to 2 high."""
     level = files.read_image(file, hw)
     if level.shape[0] != 1 or level.max() > 2:
-        found = f"{level.shape[0]} channels up to {level.max()}"
-        raise FormatError(file, "confidence", found, "1 channel of 0, 1 or 2")
+        problem = f"{level.shape[0]} channels up to {level.max()}"
+        raise FormatError(file, "confidence", problem, "1 channel of 0, 1 or 2")
     return level[0]
 
 
-# --------------------------------------------------------------------------------------------- what is there, and when
+# --------------------------------------------------------------------------------------------- files and time stamps
 
 
 class _AssetFiles(NamedTuple):
-    """Files of one asset."""
+    """Files of one asset with their time stamps."""
 
     times: np.ndarray  # (n,) s, strictly increasing
     files: tuple[Path, ...]
 
 
 class _AssetMatch(NamedTuple):
-    """For each image the file of another asset that belongs to it."""
+    """For each image the matching file of another asset."""
 
     stamped: _AssetFiles
     at: np.ndarray  # index of the file, −1 = none
@@ -243,9 +244,9 @@ def _video_id(root: Path) -> str:
 
 
 def _asset_folders(root: Path) -> list[Path]:
-    """Folders that may hold assets of the capture: its own two, then those of the other downloads."""
-    frames, own = f"{_video_id(root)}_frames", root.resolve()
-    capture = own.parent if own.name == frames and own.parent.name == _video_id(root) else own
+    """Folders that may contain assets of the capture: its own two, then those of the other downloads."""
+    frames, resolved = f"{_video_id(root)}_frames", root.resolve()
+    capture = resolved.parent if resolved.name == frames and resolved.parent.name == _video_id(root) else resolved
     places, split = [root, root / frames], capture.parent
     if split.name in _SPLITS and split.parent.name in _SUBSETS:
         others = [split.parent.parent / subset / split.name / capture.name for subset in _SUBSETS]
@@ -254,19 +255,19 @@ def _asset_folders(root: Path) -> list[Path]:
 
 
 def _find_folder(places: Sequence[Path], *names: str) -> Path | None:
-    """The first of ``names`` that exists, own folders first."""
+    """The first existing path ``place / name``, by order of ``places``; None if there is none."""
     return next((place / name for place in places for name in names if (place / name).exists()), None)
 
 
 def _list_asset_files(places: Sequence[Path], names: Sequence[str], suffix: str) -> _AssetFiles | None:
-    """Files of an asset by the number in their names (in the order of letters 100.0 comes before 99.9)."""
+    """Files of an asset sorted by the time stamp in their names (alphabetically, 100.0 comes before 99.9)."""
     folder = _find_folder(places, *names)
-    listed: dict[float, Path] = {}
+    by_stamp: dict[float, Path] = {}
     for entry in sorted(folder.iterdir()) if folder is not None and folder.is_dir() else ():
         if (match := _STAMP_PATTERN.fullmatch(entry.name)) and match[2] == suffix:
-            listed.setdefault(float(match[1]), entry)
-    times = sorted(listed)
-    return _AssetFiles(np.array(times), tuple(listed[t] for t in times)) if times else None
+            by_stamp.setdefault(float(match[1]), entry)
+    times = sorted(by_stamp)
+    return _AssetFiles(np.array(times), tuple(by_stamp[t] for t in times)) if times else None
 
 
 def _choose_pictures(root: Path, places: Sequence[Path], image: str | None) -> tuple[str, _AssetFiles]:
@@ -281,7 +282,7 @@ def _choose_pictures(root: Path, places: Sequence[Path], image: str | None) -> t
 def _match_assets(
     root: Path, places: Sequence[Path], name: str, times: np.ndarray, max_difference: float
 ) -> tuple[dict[str, _AssetMatch], list[str]]:
-    """What belongs to each image, named as the report needs it, and remarks."""
+    """Name for the report → matches of each image with the files of another asset, and the report."""
     report = []
     depths = _list_asset_files(places, ("lowres_depth",), "png")
     if depths is None:
@@ -289,28 +290,28 @@ def _match_assets(
     depth = nearest_stamps(times, depths.times, max_difference)
     links = {"depth": _AssetMatch(depths, depth)}
     if (confs := _list_asset_files(places, ("confidence",), "png")) is None:
-        report.append("no confidence: every return counts alike")
+        report.append("no confidence: all returns are weighted equally")
     else:
         links["confidence"] = _AssetMatch(
             confs, np.where(depth < 0, -1, nearest_stamps(depths.times[depth], confs.times, _SAME_INSTANT_S))
         )
     own = _list_asset_files(places, [f"{folder}_intrinsics" for folder in _COLOUR_ASSETS[name]], "pincam")
-    small = _list_asset_files(places, ("lowres_wide_intrinsics",), "pincam")
-    pincams = own or _list_asset_files(places, ("vga_wide_intrinsics",), "pincam") or small
+    lowres = _list_asset_files(places, ("lowres_wide_intrinsics",), "pincam")
+    pincams = own or _list_asset_files(places, ("vga_wide_intrinsics",), "pincam") or lowres
     if pincams is None:
-        raise FormatError(root, f"{name}_intrinsics", "none, nor any to scale", "<video id>_<seconds>.pincam")
+        raise FormatError(root, f"{name}_intrinsics", "none, also of no other size", "<video id>_<seconds>.pincam")
     if own is not None:
         links["intrinsics"] = _AssetMatch(own, nearest_stamps(times, own.times, _SAME_INSTANT_S))
     else:
         report.append(f"no {name}_intrinsics: {pincams.files[0].parent.name}, scaled")
         links["borrowed intrinsics"] = _AssetMatch(pincams, nearest_stamps(times, pincams.times, max_difference))
-    if small is not None and name != "lowres_wide":
-        links["intrinsics of the depth"] = _AssetMatch(small, nearest_stamps(times, small.times, max_difference))
+    if lowres is not None and name != "lowres_wide":
+        links["intrinsics of the depth"] = _AssetMatch(lowres, nearest_stamps(times, lowres.times, max_difference))
     return links, report
 
 
 def _select_complete(root: Path, name: str, has: dict[str, np.ndarray], report: list[str]) -> np.ndarray:
-    """Numbers of the images that have everything; how many lack what goes into the report."""
+    """Indices of the images with all matches; the report counts the images without each."""
     keep = np.ones_like(has["depth"])
     for what, mask in has.items():
         if (lost := int((keep & ~mask).sum())) > 0:
@@ -349,7 +350,7 @@ def _make_truth_loader(
 
 
 def _read_poses(file: Path, times: np.ndarray, max_difference: float, max_gap: float) -> tuple[np.ndarray, np.ndarray]:
-    """Camera-to-world matrices (n, 4, 4) at ``times``, and which of them are covered."""
+    """Camera-to-world matrices (n, 4, 4) at ``times``, and the mask (n,) of covered times."""
     rows = files.read_table(file, 7)
     rows = rows[np.isfinite(rows).all(-1)]
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
@@ -365,10 +366,10 @@ def _read_poses(file: Path, times: np.ndarray, max_difference: float, max_gap: f
 
 
 def _count_quarter_turns(c2w: np.ndarray, report: list[str]) -> int:
-    """Quarter turns clockwise that bring the sky to the top in the mean over the frames."""
-    x, y, _ = c2w[:, 2, :3].mean(0)  # the world's up in the axes of the camera
+    """Number of clockwise quarter turns that put the sky on top, from the mean gravity over the frames."""
+    x, y, _ = c2w[:, 2, :3].mean(0)  # the world's up direction in camera axes
     if max(abs(x), abs(y)) < _MIN_GRAVITY_IN_PLANE:
-        report.append("the camera looks straight up or down: pictures stay as stored")
+        report.append("the camera looks straight up or down: images are not rotated")
         return 0
     if abs(x) > abs(y):
         return 1 if x < 0 else 3

@@ -1,12 +1,13 @@
-"""CA-1M (Cubify Anything): ARKitScenes captures with a laser pose and laser depth for every frame.
+"""Reader of CA-1M (Cubify Anything): ARKitScenes captures with laser-scan pose and depth for every frame.
 
 One WebDataset archive ``ca1m-<split>-<video id>.tar`` per capture, with members ``<video id>/<nanoseconds>.<what>``:
 ``wide/image`` (PNG), ``wide/depth`` (16 bits, mm, the iPad's LiDAR), ``wide/depth/confidence`` (TIFF), ``gt/depth``
 (16 bits, mm, rendered from the laser scan, 0 = not registered), ``wide/image/K``, ``wide/depth/K``, ``gt/depth/K``
 (JSON, 3×3) and ``gt/RT`` (JSON, 4×4). The archive is read in place.
 
-Pictures are upright already, so sizes may be transposed; K and pose belong to them as they are. ``T_gravity`` and the
-boxes (``instances``) are not read: no stage asks for them. Extensions are ignored, the content says what a member is.
+Images are stored upright, so sizes may be transposed; K and pose refer to the stored images. ``T_gravity`` and the
+boxes (``instances``) are not read: no stage needs them. Extensions are ignored; a member's format is determined by
+content.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ from dhtorch.runtime.console import format_count
 
 _MEMBER_PATTERN = re.compile(r"(?:\./)?(\d{1,15})/(\d{1,18})\.([a-z_/]{1,80})\.[a-z]{1,8}", re.IGNORECASE)
 _REQUIRED_MEMBERS = ("wide/image", "wide/image/k", "wide/depth", "gt/rt")
-_OPTIONAL_MEMBERS = ("wide/depth/k", "wide/depth/confidence")  # where some frames have it, all must
+_OPTIONAL_MEMBERS = ("wide/depth/k", "wide/depth/confidence")  # if any frame has it, all must
 _TRUTH_MEMBERS = ("gt/depth", "gt/depth/k")
 _KNOWN_MEMBERS = {*_REQUIRED_MEMBERS, *_OPTIONAL_MEMBERS, *_TRUTH_MEMBERS}
 _UNITS_PER_METRE = 1000.0
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     if root.is_dir():
         archives = sorted(root.glob("ca1m-*.tar"))
         return f"{len(archives)} CA-1M archives" if archives else None
@@ -50,8 +51,8 @@ def recognise(root: Path) -> str | None:
         names = [member.name for member in islice(tarballs.iter_tar_members(root), 32)]
     except FormatError:
         return None
-    found = {match[3].lower() for name in names if (match := _MEMBER_PATTERN.fullmatch(name))}
-    return "a tar archive of <video>/<time>.wide and .gt members" if found & _KNOWN_MEMBERS else None
+    members = {match[3].lower() for name in names if (match := _MEMBER_PATTERN.fullmatch(name))}
+    return "a tar archive of <video>/<time>.wide and .gt members" if members & _KNOWN_MEMBERS else None
 
 
 def read(
@@ -64,21 +65,20 @@ def read(
     """Open an archive, or a folder of them.
 
     Args:
-        root: ``ca1m-*.tar``, or the folder that holds such archives.
-        confidence: how the confidence is stored. The authors say a value in [0, 1] (no file was at hand: unconfirmed).
-            ``"unit"``: that; below 0.25 counts as low, from 0.75 on as high. ``"level"``: 0, 1 or 2. None: not read.
-        truth: take ``gt/depth`` for the truth; the recording then has ``truth(i)``.
-        max_disagreement: median relative difference of laser and LiDAR over the pixels they share, beyond which a
-            laser depth map is rejected.
+        root: ``ca1m-*.tar``, or a folder of such archives.
+        confidence: how the confidence is stored. Documented as a value in [0, 1] (no file was at hand: unconfirmed).
+            ``"unit"``: that; below 0.25 is low, from 0.75 on high. ``"level"``: 0, 1 or 2. None: not read.
+        truth: use ``gt/depth`` as true depth; the recording then has ``truth(i)``.
+        max_disagreement: median relative difference of laser and LiDAR over their common pixels beyond which a laser
+            depth map is rejected.
 
     Returns:
-        One recording for each archive, opened when that one is asked for, at the capture's own frame rate. A frame that
-        lacks its image, its depth, its intrinsics or its pose is left out and reported; so is one without confidence,
-        or without intrinsics of the depth, where others have them (without any, the depth shares the camera of the
-        image, scaled).
+        One recording per archive, opened on access, at the capture's own frame rate. Frames without image, depth,
+        intrinsics or pose are left out and reported, and so are frames without confidence or intrinsics of the depth
+        where others have them (where none has, the depth uses the camera of the image, scaled).
 
     Raises:
-        FormatError: no archive; of a single one also no complete frame, a damaged archive or member.
+        FormatError: no archive; on access also no complete frame, a damaged archive or member.
     """
     root = Path(root)
     files.to_positive(max_disagreement, root, "option max_disagreement")
@@ -114,7 +114,7 @@ class _Load:
 
     archive: Path
     stamps: tuple[str, ...]  # <video id>/<nanoseconds>
-    spans: dict[str, np.ndarray]  # what → (n, 2) offset and size of the member, −1 = none
+    spans: dict[str, np.ndarray]  # member type → (n, 2) offset and size, −1 = none
     confidence: str | None
 
     def __call__(self, i: int) -> Frame:
@@ -135,7 +135,7 @@ class _Load:
         )
 
     def member(self, i: int, what: str) -> tuple[bytes, Path]:
-        """Bytes of a member and the name it has in errors."""
+        """Bytes of a member and its path for errors."""
         offset, size = self.spans[what][i].tolist()
         return tarballs.read_tar_member(self.archive, offset, size), self.archive / f"{self.stamps[i]}.{what}"
 
@@ -144,14 +144,14 @@ class _Load:
         return torch.from_numpy(files.decode_depth_png(*self.member(i, what), _UNITS_PER_METRE))
 
     def camera(self, i: int, what: str, hw: tuple[int, int]) -> Camera:
-        """Intrinsics of a picture of size ``hw``."""
+        """Camera of an image of size ``hw``."""
         data, file = self.member(i, what)
         return convert.to_camera(_parse_matrix(data, file, 3), hw, file, "K")
 
 
 @dataclass(frozen=True, eq=False)
 class _LoadTruth:
-    """Position → laser depth at the pixels of the image, and how far it is from the LiDAR."""
+    """Position → laser depth at the pixels of the image, and its disagreement with the LiDAR."""
 
     load: _Load
     max_disagreement: float
@@ -162,18 +162,18 @@ class _LoadTruth:
         if load.spans["gt/depth"][i, 0] < 0:
             return torch.zeros(hw), float("nan")
         camera = load.camera(i, "wide/image/k", hw)
-        maps, seen_by = [], []
+        maps, cameras = [], []
         for what in ("gt/depth", "wide/depth"):
             depth = load.depth(i, what)
-            own, size = load.spans.get(f"{what}/k"), (depth.shape[0], depth.shape[1])
-            has = own is not None and own[i, 0] >= 0
-            seen_by.append(load.camera(i, f"{what}/k", size) if has else resize(camera, hw, size))
+            intrinsics, size = load.spans.get(f"{what}/k"), (depth.shape[0], depth.shape[1])
+            has_own = intrinsics is not None and intrinsics[i, 0] >= 0
+            cameras.append(load.camera(i, f"{what}/k", size) if has_own else resize(camera, hw, size))
             maps.append(depth)
-        return resample_laser_depth(maps[0], seen_by[0], maps[1], seen_by[1], camera, hw, self.max_disagreement)
+        return resample_laser_depth(maps[0], cameras[0], maps[1], cameras[1], camera, hw, self.max_disagreement)
 
 
 def _index_archive(archive: Path, skip: set[str]) -> dict[tuple[int, str], dict[str, tuple[int, int]]]:
-    """(time in ns, its member prefix) → what → (offset, size); times in their order."""
+    """(time in ns, member prefix) → member type → (offset, size); sorted by time."""
     frames: dict[tuple[int, str], dict[str, tuple[int, int]]] = {}
     for member in tarballs.iter_tar_members(archive):
         match = _MEMBER_PATTERN.fullmatch(member.name)
@@ -189,40 +189,40 @@ def _make_recording(
     confidence: str | None,
     max_disagreement: float,
 ) -> Recording:
-    there = set().union(*frames.values())
-    needed = [*_REQUIRED_MEMBERS, *(what for what in _OPTIONAL_MEMBERS if what in there)]
+    available = set().union(*frames.values())
+    required = [*_REQUIRED_MEMBERS, *(what for what in _OPTIONAL_MEMBERS if what in available)]
     report = []
     keys = list(frames)
-    for what in needed:
+    for what in required:
         kept = [key for key in keys if what in frames[key]]
         if len(kept) < len(keys):
             report.append(f"{format_count(len(keys) - len(kept), 'frame')} without {what}: left out")
         keys = kept
     if not keys:
-        raise FormatError(archive, "frames", "; ".join(report) or "none", f"members {', '.join(needed)}")
-    if confidence and "wide/depth/confidence" not in there:
-        report.append("no confidence: every return counts alike")
+        raise FormatError(archive, "frames", "; ".join(report) or "none", f"members {', '.join(required)}")
+    if confidence and "wide/depth/confidence" not in available:
+        report.append("no confidence: all returns are weighted equally")
     spans = {
         what: np.array([frames[key].get(what, (-1, 0)) for key in keys], dtype=np.int64)
-        for what in {*needed, *_TRUTH_MEMBERS} & there
+        for what in {*required, *_TRUTH_MEMBERS} & available
     }
     load = _Load(archive, tuple(stamp for _, stamp in keys), spans, confidence)
     c2w = np.stack([_parse_matrix(*load.member(i, "gt/rt"), 4) for i in range(len(keys))])
     times = np.array([time for time, _ in keys]) / 1e9
-    place = {key: number for number, key in enumerate(frames)}
+    number_of = {key: number for number, key in enumerate(frames)}
     fields: dict[str, Any] = {"name": archive.stem, "format": "ca1m", "load": load, "root": archive}
-    fields |= {"number": torch.tensor([place[key] for key in keys]), "times": torch.from_numpy(times)}
+    fields |= {"number": torch.tensor([number_of[key] for key in keys]), "times": torch.from_numpy(times)}
     fields |= {"poses": convert.to_poses(c2w, archive, "gt/RT")}
     fields |= {"rate_hz": float(1 / np.median(np.diff(times))) if len(times) > 1 else None}
     if "gt/depth" not in spans:
         return Recording(**fields, report=tuple(report))
-    if (without := int((spans["gt/depth"][:, 0] < 0).sum())) > 0:
-        report.append(f"{format_count(without, 'frame')} without gt/depth: no truth")
+    if (n_without := int((spans["gt/depth"][:, 0] < 0).sum())) > 0:
+        report.append(f"{format_count(n_without, 'frame')} without gt/depth: no truth")
     return MeasuredRecording(**fields, load_truth=_LoadTruth(load, max_disagreement), report=tuple(report))
 
 
 def _parse_matrix(data: bytes, file: Path, n: int) -> np.ndarray:
-    """n×n numbers of a JSON document: rows, or all of them in one list."""
+    """JSON document → n×n numbers, stored as rows or as one list."""
     value = files.decode_json(data, file)
     flat = isinstance(value, list) and len(value) == n * n
     return files.to_array(value, (n * n,) if flat else (n, n), file, "matrix").reshape(n, n)
@@ -231,8 +231,8 @@ def _parse_matrix(data: bytes, file: Path, n: int) -> np.ndarray:
 def _decode_confidence(data: bytes, file: Path, hw: tuple[int, int], stored: str | None) -> np.ndarray:
     """Confidence (h, w) uint8, 0 low to 2 high."""
     value = tiff.decode_tiff(data, file, hw).astype(np.float64)
-    top = 2 if stored == "level" else 1
-    if not ((value >= 0) & (value <= top)).all():
-        expected = f"0 to {top} (option confidence: unit or level)"
+    largest = 2 if stored == "level" else 1
+    if not ((value >= 0) & (value <= largest)).all():
+        expected = f"0 to {largest} (option confidence: unit or level)"
         raise FormatError(file, "confidence", f"{np.nanmin(value):g} to {np.nanmax(value):g}", expected)
-    return np.floor(value * (2 / top) + 0.5).astype(np.uint8)
+    return np.floor(value * (2 / largest) + 0.5).astype(np.uint8)

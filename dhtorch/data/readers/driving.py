@@ -1,11 +1,12 @@
-"""A car with several cameras and a LiDAR, in the DGP scene layout: one recording per camera.
+"""Reader of DGP driving scenes: a car with several cameras and a LiDAR; one recording per camera.
 
 ``scene_*.json`` lists *samples* (instants), each with its data: an image per camera and one LiDAR sweep, every one with
 its own sensor-to-world pose (quaternion and translation) and stamp; ``calibration/<key>.json`` has the intrinsics by
 sensor name; ``point_cloud/…npz`` holds the points in the LiDAR's own frame, one row each.
 
-The depth map of an image is the sweep of its instant, taken to the world with the sweep's pose and into the camera with
-the image's: sparse, z-buffered, nothing filled in. Things that moved between the two stamps are misplaced by that much.
+The depth map of an image is the sweep of its instant, transformed to the world by the sweep's pose and into the camera
+by the image's: sparse, z-buffered, nothing filled in. Objects that moved between the two stamps are displaced by that
+motion.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from dhtorch.records import Camera, Frame, Pose
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     if (root / "calibration").is_dir() and any(root.glob("scene_*.json")):
         return "scene_*.json and calibration/"
     return None
@@ -42,23 +43,23 @@ def read(
     crop_bottom: float = 0.0,
     hide_px: int = 8,
 ) -> list[Recording]:
-    """Open a scene folder, one recording for each camera whose images are there.
+    """Open a scene folder, one recording for each camera with images on disk.
 
     Args:
         root: the folder of the scene.
         cameras: names of the cameras to open. None = all that have images on disk; the others are reported.
-        crop_bottom: share of the image height to cut off below, from image and depth (the car's own bonnet moves with
-            the camera and would vote for standing still). K does not change.
-        hide_px: a return is hidden by one more than 10 % nearer within so many pixels: the LiDAR sits elsewhere than
-            the camera and sees behind things. 0 = only by one in the same pixel. Larger values also thin out the far
-            road, which grows by 10 % in few rows.
+        crop_bottom: fraction of the image height to cut off at the bottom, from image and depth (the car's bonnet moves
+            with the camera and would be evidence for no motion). K does not change.
+        hide_px: a return is occluded by one more than 10 % nearer within this many pixels: the LiDAR is mounted
+            elsewhere and sees behind objects. 0 = only by one in the same pixel. Larger values also thin out the far
+            road, whose depth grows by 10 % within few rows.
 
     Raises:
-        FormatError: a missing or damaged file, no image, an unknown camera, or values no camera or pose can have.
+        FormatError: a missing or damaged file, no image, an unknown camera, or values that are no camera or pose.
     """
     root = Path(root)
     if not 0 <= crop_bottom < 1:
-        raise FormatError(root, "option crop_bottom", crop_bottom, "a share of the height, 0 to less than 1")
+        raise FormatError(root, "option crop_bottom", crop_bottom, "a fraction of the height, 0 to less than 1")
     scenes = sorted(root.glob("scene_*.json")) if root.is_dir() else []
     if len(scenes) != 1:
         raise FormatError(root, "scene_*.json", f"{len(scenes)} such files", "exactly one")
@@ -74,7 +75,7 @@ def read(
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """One image with the sweep of its instant, as the scene file describes them."""
+    """One image with the LiDAR sweep of its instant, from the scene file."""
 
     number: int
     stamp: float  # s
@@ -111,27 +112,27 @@ class _Load:
 
 def _make_recording(scene: Path, name: str, shots: list[_Shot], report: list[str], **options: Any) -> Recording:
     root = scene.parent
-    whole = [s for s in shots if (root / s.image).is_file() and (root / s.sweep).is_file()]
-    if not whole:
+    complete = [s for s in shots if (root / s.image).is_file() and (root / s.sweep).is_file()]
+    if not complete:
         raise FormatError(root, name, "no instant with image and sweep on disk", "at least one")
     report = report + [
-        f"{name}: instant {s.number} lacks its image or its sweep: left out" for s in shots if s not in whole
+        f"{name}: instant {s.number} lacks its image or its sweep: left out" for s in shots if s not in complete
     ]
     poses, lidar = (
-        convert.to_poses(np.stack([getattr(s, key) for s in whole]), scene, f"{name} {key}")
+        convert.to_poses(np.stack([getattr(s, key) for s in complete]), scene, f"{name} {key}")
         for key in ("c2w", "lidar_to_world")
     )
-    cameras = tuple(_read_camera(root / "calibration" / f"{s.calibration}.json", name, s.hw) for s in whole)
-    times = torch.tensor([s.stamp for s in whole], dtype=torch.float64)
+    cameras = tuple(_read_camera(root / "calibration" / f"{s.calibration}.json", name, s.hw) for s in complete)
+    times = torch.tensor([s.stamp for s in complete], dtype=torch.float64)
     return Recording(
         name=f"{root.resolve().name}/{name}",
         format="driving",
-        load=_Load(root, tuple(whole), lidar, poses, cameras, **options),
-        number=torch.tensor([s.number for s in whole]),
+        load=_Load(root, tuple(complete), lidar, poses, cameras, **options),
+        number=torch.tensor([s.number for s in complete]),
         root=root,
         times=times,
         poses=poses,
-        rate_hz=float(1 / times.diff().median()) if len(whole) > 1 else None,
+        rate_hz=float(1 / times.diff().median()) if len(complete) > 1 else None,
         sparse=True,
         report=tuple(report),
         camera_name=name,
@@ -155,10 +156,10 @@ def _read_shots(scene: Path) -> dict[str, list[_Shot]]:
             if "image" in kind:
                 name = files.get_entry(member, "id.name", str, scene)
                 shot = _make_shot(scene, member, kind["image"], sweeps[0], number=number, calibration=calibration)
-                same = shots.setdefault(name, [])
-                if same and same[-1].number == number:
+                of_camera = shots.setdefault(name, [])
+                if of_camera and of_camera[-1].number == number:
                     raise FormatError(scene, f"samples.{number}", f"two images of {name}", "one of each camera")
-                same.append(shot)
+                of_camera.append(shot)
     if not shots:
         raise FormatError(scene, "samples", "no image", "instants with camera images")
     return shots
@@ -213,7 +214,7 @@ def _read_sweep(file: Path, fields: tuple[str, ...]) -> np.ndarray:
 
 
 def _check_relative_path(name: str, scene: Path) -> str:
-    """A relative file name that stays in the scene's folder."""
+    """``name``, checked to be a relative path inside the scene's folder."""
     if not name or Path(name).is_absolute() or ".." in Path(name).parts:
         raise FormatError(scene, "filename", name, "a file inside the scene's folder")
     return name

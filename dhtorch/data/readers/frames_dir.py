@@ -1,15 +1,15 @@
-"""Folders of numbered RGB-D frames, in three layouts.
+"""Reader of folders of numbered RGB-D frames, in three layouts.
 
-- *named*: ``frame-XXXXXX.color.{jpg,png}``, ``.depth.png``, ``.pose.txt`` (4×4) side by side, as 7-Scenes and its
-  descendants, with or without ``camera-intrinsics.txt`` (3×3).
-- *counted*: ``images/*`` (or ``color/``, ``rgb/``), ``depth/*.png`` or ``.pgm``, and where there are poses
-  ``poses.txt`` or ``pose.txt``: a line a frame, a 4×4 by rows or tx ty tz qx qy qz qw. ``K.txt`` (3×3).
+- *named*: ``frame-XXXXXX.color.{jpg,png}``, ``.depth.png``, ``.pose.txt`` (4×4) in one folder, as in 7-Scenes and
+  its derivatives, with or without ``camera-intrinsics.txt`` (3×3).
+- *counted*: ``images/*`` (or ``color/``, ``rgb/``), ``depth/*.png`` or ``.pgm``, and optionally
+  ``poses.txt`` or ``pose.txt``: one line per frame, a 4×4 by rows or tx ty tz qx qy qz qw. ``K.txt`` (3×3).
 - *single*: ``rgb.{jpg,png}``, ``raw_depth.png`` and ``intrinsics.txt`` (3×3), one frame without a pose.
 
-Poses are camera-to-world with our axes. The intrinsics file holds for colour and depth unless ``K`` says otherwise:
+Poses are camera-to-world with our axes. The intrinsics file applies to colour and depth unless ``K`` is set:
 7-Scenes' depth (f = 585) is not registered to its colour (f = 525), and its file gives the depth camera's. A side-car
 ``meta.json`` (keys ``K``, ``K_depth``, ``dist``, ``depth_scale``, ``invalid``, ``fps``) is read where present; options
-win over it, and it wins over the intrinsics file.
+override it, and it overrides the intrinsics file.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from dhtorch.records import Camera, Frame, Pose
 
 _NAMED_FRAME_PATTERN = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(?:png|jpg|jpeg|txt)")
 _IMAGE_PATTERN = re.compile(r"(.+)\.(?:png|jpg|jpeg|pgm)")
-_IMAGE_FOLDERS = ("images", "color", "rgb")  # of pictures that are counted
+_IMAGE_FOLDERS = ("images", "color", "rgb")  # of the *counted* layout
 _POSE_FILES = ("poses.txt", "pose.txt")
 _INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt", "intrinsics.txt")
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     pictures, poses = _find_image_folder(root), _first_existing(root, _POSE_FILES)
     if pictures is not None and any(map(_IMAGE_PATTERN.fullmatch, _list_names(root / "depth"))):
         return f"{pictures.name}/ and depth/" + (f" and {poses.name}" if poses else "")
@@ -69,48 +69,52 @@ def read(
         root: the folder.
         intrinsics: four numbers as ``K``, or one as ``fov``.
         K: fx, fy, cx, cy of the colour image. None = ``meta.json``, else the intrinsics file.
-        fov: degrees from side to side of the colour image; a guessed K for where none is known.
-        K_depth: the same of a depth map that is not registered to colour. None = ``meta.json``, else as colour.
-        distortion: of the colour image, OpenCV's order. None = ``meta.json``, else none.
+        fov: horizontal field of view of the colour image in degrees, for a guessed K where none is available.
+        K_depth: as ``K``, of a depth map that is not registered to colour. None = ``meta.json``, else as colour.
+        distortion: of the colour image, in OpenCV's order. None = ``meta.json``, else none.
         units_per_metre: of the depth codes. None = ``meta.json``, else 1000 (millimetres).
         invalid: depth codes that mean *no return* beside 0. None = ``meta.json``, else 65535.
         fps: frame rate, for time stamps. None = ``meta.json`` if it has a number, else no time stamps.
-        register: warp depth that has its own intrinsics to the colour image (one z-buffer, holes stay). The places of
-            the two cameras are taken to coincide, since these sets give no extrinsics. False keeps the depth map and
-            sets ``Frame.depth_camera``.
+        register: warp depth with intrinsics of its own to the colour image (one z-buffer, holes are kept). The centres
+            of the two cameras are assumed to coincide, since these sets have no extrinsics. False keeps the depth map
+            and sets ``Frame.depth_camera``.
 
     Returns:
         One recording. In the named layout a frame without depth, pose or colour is left out and reported.
 
     Raises:
-        FormatError: no frame, counts that disagree, a damaged file, or values that no camera or pose can have.
+        FormatError: no frame, counts that disagree, a damaged file, or values that are no camera or pose.
     """
     root = Path(root)
-    side = root / "meta.json"
-    meta = files.read_json(side) if side.is_file() else {}
+    side_car = root / "meta.json"
+    meta = files.read_json(side_car) if side_car.is_file() else {}
     frames, poses, report = _list_frames(root)
     hw = files.read_image_header(frames[0].image).hw
     depth_hw = _depth_hw(frames[0].depth)
-    said = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
-    if said.feature is not None:
-        raise FormatError(root, "option intrinsics", said.feature, "fx fy cx cy, or degrees: there are no features")
-    own = _read_intrinsics(root, "K", said.K, meta)
-    if own is None:
+    stated = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
+    if stated.feature is not None:
+        raise FormatError(
+            root, "option intrinsics", stated.feature, "fx fy cx cy, or degrees (the format has no features)"
+        )
+    colour_K = _read_intrinsics(root, "K", stated.K, meta)
+    if colour_K is None:
         raise intrinsics_options.missing_intrinsics_error(root, None, "a file K.txt, intrinsics.txt or meta.json")
-    colour = convert.to_camera(own[0], hw, *own[1:], distortion if distortion is not None else meta.get("dist"))
-    # Depth has a camera of its own only where someone says so: most sets of this layout are registered.
-    of_depth = _read_intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
+    colour = convert.to_camera(
+        colour_K[0], hw, *colour_K[1:], distortion if distortion is not None else meta.get("dist")
+    )
+    # Depth has a camera of its own only where K_depth is set: most sets of this layout are registered.
+    depth_K = _read_intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
     units = units_per_metre if units_per_metre is not None else meta.get("depth_scale", 1000.0)
-    rate = _parse_rate(fps if fps is not None else meta.get("fps"), side)
+    rate = _parse_rate(fps if fps is not None else meta.get("fps"), side_car)
     number = torch.tensor([frame.number for frame in frames])
     load = _Load(
         frames=tuple(frames),
         hw=hw,
         depth_hw=depth_hw,
         camera=colour,
-        depth_camera=convert.to_camera(of_depth[0], depth_hw, *of_depth[1:]) if of_depth else None,
-        units_per_metre=files.to_positive(units, side, "depth_scale"),
-        invalid=_parse_codes(invalid if invalid is not None else meta.get("invalid", (0, 65535)), side),
+        depth_camera=convert.to_camera(depth_K[0], depth_hw, *depth_K[1:]) if depth_K else None,
+        units_per_metre=files.to_positive(units, side_car, "depth_scale"),
+        invalid=_parse_codes(invalid if invalid is not None else meta.get("invalid", (0, 65535)), side_car),
         register=register,
     )
     return [
@@ -123,14 +127,14 @@ def read(
             times=None if rate is None else number.double() / rate,
             poses=poses,
             rate_hz=rate,
-            report=(*report, *said.report),
+            report=(*report, *stated.report),
         )
     ]
 
 
 @dataclass(frozen=True)
 class _Files:
-    """The two pictures of one frame and its place in the capture."""
+    """Image and depth file of one frame, and its number in the capture."""
 
     number: int
     image: Path
@@ -174,7 +178,7 @@ def _first_existing(root: Path, names: Sequence[str]) -> Path | None:
 
 
 def _find_image_folder(root: Path) -> Path | None:
-    """The folder of counted pictures."""
+    """The image folder of the *counted* layout; None where there is none."""
     return next(
         (root / name for name in _IMAGE_FOLDERS if any(map(_IMAGE_PATTERN.fullmatch, _list_names(root / name)))), None
     )
@@ -194,7 +198,7 @@ def _depth_hw(file: Path) -> tuple[int, int]:
 
 
 def _list_frames(root: Path) -> tuple[list[_Files], Pose | None, list[str]]:
-    """The frames of whatever layout this is, their poses where there are any, and what was left out."""
+    """(frames, poses or None, report of what was left out) of the layout that ``root`` has."""
     if (pictures := _find_image_folder(root)) is not None or (root / "images").is_dir():
         return _list_counted_frames(root, pictures or root / "images")
     single = _single(root)
@@ -207,24 +211,24 @@ def _list_named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
         if match := _NAMED_FRAME_PATTERN.fullmatch(file.name):
             parts.setdefault(int(match[1]), {})[match[2]] = file
     frames, poses, report = [], list[np.ndarray](), []
-    for number, found in sorted(parts.items()):
-        missing = [part for part in ("color", "depth", "pose") if part not in found]
-        matrix = files.read_table(found["pose"], 4) if not missing else None
+    for number, files_of in sorted(parts.items()):
+        missing = [part for part in ("color", "depth", "pose") if part not in files_of]
+        matrix = files.read_table(files_of["pose"], 4) if not missing else None
         if matrix is None:
             report.append(f"frame {number}: no {' and no '.join(missing)}: left out")
         elif not np.isfinite(matrix).all():
             report.append(f"frame {number}: its pose is not finite (tracking lost): left out")
         else:
             if matrix.shape != (4, 4):
-                raise FormatError(found["pose"], "pose", f"{len(matrix)} rows", "4 rows of 4 numbers")
+                raise FormatError(files_of["pose"], "pose", f"{len(matrix)} rows", "4 rows of 4 numbers")
             poses.append(matrix)
-            frames.append(_Files(number, found["color"], found["depth"]))
+            frames.append(_Files(number, files_of["color"], files_of["depth"]))
     if not frames:
-        found_instead = f"none complete among {len(parts)}" if parts else "none"
-        raise FormatError(root, "frames", found_instead, "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt")
+        problem = f"none complete among {len(parts)}" if parts else "none"
+        raise FormatError(root, "frames", problem, "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt")
     try:
         return frames, convert.to_poses(np.stack(poses), root), report
-    except FormatError:  # once more, one by one, to name the file
+    except FormatError:  # check one by one, so that the error names the file
         for frame, matrix in zip(frames, poses, strict=True):
             convert.to_poses(matrix[None], frame.image.with_name(f"{frame.image.name.split('.')[0]}.pose.txt"))
         raise
@@ -236,19 +240,21 @@ def _list_counted_frames(root: Path, folder: Path) -> tuple[list[_Files], Pose |
     rows = None if file is None else files.read_table(file)
     if not images:
         raise FormatError(folder, "frames", "no image", "at least one .png or .jpg")
-    # Rows carry no name: unless all counts agree nobody knows which row belongs to which picture.
+    # Rows have no names: they can be matched to images only if all counts are equal.
     counts = {"depth": len(depths)} | ({} if file is None or rows is None else {file.name: len(rows)})
     for field, count in counts.items():
         if count != len(images):
             raise FormatError(root, f"{field} count", count, f"{len(images)}, one for each file of {folder.name}/")
     if images.keys() != depths.keys():
-        odd = min(images.keys() ^ depths.keys())
-        raise FormatError(root, "file names", f"{odd} in one of {folder.name}/ and depth/", "the same names in both")
+        unpaired = min(images.keys() ^ depths.keys())
+        raise FormatError(
+            root, "file names", f"{unpaired} in one of {folder.name}/ and depth/", "the same names in both"
+        )
     stems = sorted(images, key=files.natural_sort_key)
     digits = [re.search(r"(\d+)\D*$", stem) for stem in stems]
     values = [int(m[1]) for m in digits if m]
-    counted = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
-    numbers = values if counted else range(len(stems))
+    increasing = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
+    numbers = values if increasing else range(len(stems))
     frames = [_Files(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
     if file is None or rows is None:
         return frames, None, ["no poses.txt: no poses"]
@@ -270,7 +276,7 @@ def _list_pictures(folder: Path) -> dict[str, Path]:
 def _read_intrinsics(
     root: Path, key: str, option: Sequence[float] | None, meta: dict[str, object]
 ) -> tuple[object, Path, str] | None:
-    """K with the file and the field it comes from: the option, else the side-car, else the layout's own file."""
+    """(K, its file, its field) from the option, else the side-car, else the layout's own file; None if all lack it."""
     if option is not None:
         return convert.make_K(*files.to_array(option, (4,), root, f"option {key}")), root, f"option {key}"
     if key in meta:
@@ -280,7 +286,7 @@ def _read_intrinsics(
 
 
 def _parse_rate(value: object, file: Path) -> float | None:
-    """Frames per second where a number is given; a remark in words is no rate."""
+    """Frame rate in Hz; None where it is missing or a text."""
     return None if value is None or isinstance(value, str) else files.to_positive(value, file, "fps")
 
 

@@ -1,12 +1,12 @@
-"""LeRobot data sets, v3 and v2.x, read from their parquet tables and videos; one recording per episode and camera.
+"""Reader of LeRobot data sets v3 and v2.x (parquet tables and videos); one recording per episode and camera.
 
-``meta/info.json`` names the features. In v3 a table or a video holds many episodes and ``meta/episodes`` says where
-each one starts; in v2 each episode has files of its own, listed in ``meta/episodes.jsonl``. A row of an episode is a
-frame; its picture is the video frame at the episode's start plus the row's time stamp, or lies in the table.
+``meta/info.json`` names the features. In v3 a table or a video holds many episodes, whose starts are in
+``meta/episodes``; in v2 each episode has files of its own, listed in ``meta/episodes.jsonl``. A row of an episode is a
+frame; its image is the video frame at the episode's start plus the row's time stamp, or is stored in the table.
 
 The format has no place for intrinsics and poses. K comes from option ``K``, else from a feature, else from the side-car
-``meta/intrinsics.json``: ``{camera key: {"K": 3×3, "dist": […], "K_depth": 3×3}}``, the last two as needed. Nor is
-there one for *no return* in a depth video: see :mod:`dhtorch.data.readers.lerobot_depth`.
+``meta/intrinsics.json``: ``{camera key: {"K": 3×3, "dist": […], "K_depth": 3×3}}``, the last two as needed. Depth
+videos have no code for *no return*, see :mod:`dhtorch.data.readers.lerobot_depth`.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     meta = root / "meta"
     if (meta / "info.json").is_file() and ((meta / "episodes").is_dir() or (meta / "episodes.jsonl").is_file()):
         return "meta/info.json and meta/episodes" + ("" if (meta / "episodes").is_dir() else ".jsonl")
@@ -74,30 +74,30 @@ def read(
         episode: number or numbers of the episodes. None = all.
         camera: key or keys of colour features, such as ``observation.images.front``. None = all.
         depth: key of the depth feature. None = the one named like the camera (``…front_depth``, ``…depth.front``), or
-            the only one where there is one camera; without any the depth is empty and the report says so.
+            the only one where there is one camera; where there is none, depth is empty and the report notes it.
         K: fx, fy, cx, cy of the image. None = feature ``intrinsics``, else ``meta/intrinsics.json``.
-        fov: degrees from side to side of the image; a guessed K for where none is known.
-        K_depth: the same of a depth map that is not registered to colour. None = the side-car's, else as colour.
-        distortion: of the image, OpenCV's order. None = the side-car's, else none.
+        fov: horizontal field of view of the image in degrees, for a guessed K where none is available.
+        K_depth: as ``K``, of a depth map that is not registered to colour. None = the side-car's, else as colour.
+        distortion: of the image, in OpenCV's order. None = the side-car's, else none.
         intrinsics: key of a feature with 4 (fx fy cx cy) or 9 numbers a frame; or four numbers as ``K``, or one as
             ``fov``. None = ``<camera>.intrinsics``, ``observation.camera.<name>.intrinsics``,
             ``observation.<name>.intrinsics`` or ``observation.intrinsics.<name>`` where there is one.
         pose: key of a feature with the camera-to-world pose: 16 numbers (4×4 by rows) or 7 (x y z qx qy qz qw). None =
             ``<camera>.pose``, ``observation.camera.<name>.pose`` or ``observation.<name>.T_world_from_cam`` where there
             is one, else no poses.
-        depth_unit: ``"m"`` or ``"mm"`` of depth stored as pictures or arrays. None = ``depth_unit`` of the feature's
-            info, else mm for whole numbers and m for others, as LeRobot takes them.
-        depth_range: m, nearest and farthest return to keep; for depth videos that were not coded without loss, whose
-            lost zeros blur. None = all.
+        depth_unit: ``"m"`` or ``"mm"`` of depth stored as images or arrays. None = ``depth_unit`` of the feature's
+            info, else mm for integers and m for floats, as in LeRobot.
+        depth_range: m, nearest and farthest return to keep; for lossy depth videos, whose zeros are blurred with
+            their surroundings. None = all.
         tolerance: s, largest distance of a video frame from its row's time.
 
     Returns:
         Recordings named ``<data set>/episode_<number>/<camera>``, times from the start of the episode. Rows that are
-        missing or out of order are left out and reported. A table is read when one of its episodes is asked for.
+        missing or out of order are left out and reported. A table is read when one of its episodes is accessed.
 
     Raises:
-        FormatError: an unknown key or episode, or damaged metadata; of a single episode also no K, a damaged table, or
-            values no camera or pose can have.
+        FormatError: an unknown key or episode, or damaged metadata; on access to an episode also no K, a damaged
+            table, or values that are no camera or pose.
     """
     root = Path(root)
     meta = read_lerobot_meta(root)
@@ -131,7 +131,7 @@ def read(
 
 
 def _recorded_cameras(keys: list[str], episodes: LeRobotEpisodes) -> list[str]:
-    """Keys of the cameras that there are: a feature that is only declared is none."""
+    """Keys of the cameras whose videos exist; a feature may be declared without data."""
     videos = episodes[0].videos
     return [key for key in keys if key not in videos or videos[key][0].is_file()] or keys
 
@@ -142,7 +142,7 @@ class _MakeRecording:
 
     episodes: LeRobotEpisodes
     rigs: tuple[_CameraSpec, ...]
-    columns: tuple[str, ...]  # of the tables, beside those that place a row
+    columns: tuple[str, ...]  # further columns of the tables to read
 
     def __call__(self, i: int) -> Recording:
         episode = self.episodes[i // len(self.rigs)]
@@ -199,32 +199,32 @@ class _Load:
 
     def _video(self, i: int, feature: LeRobotFeature, pixels: str) -> np.ndarray:
         file, start = self.videos[feature.key]
-        times, want = read_video_times(file), start + float(self.times[i])
+        times, target = read_video_times(file), start + float(self.times[i])
         if start == 0 and len(times):
-            want += float(times[0])  # a film of its own begins with the episode, whatever its clock says
-        at = int(np.abs(times - want).argmin()) if len(times) else -1
-        if at < 0 or abs(times[at] - want) > self.tolerance:
-            found = f"nearest frame at {times[at]:.6f} s" if at >= 0 else "no frame"
-            raise FormatError(file, f"time {want:.6f} s", found, f"one within {self.tolerance} s")
-        return read_video_frame(file, at, feature.hw, pixels=pixels)
+            target += float(times[0])  # a video of one episode starts with it, whatever its first time stamp
+        nearest = int(np.abs(times - target).argmin()) if len(times) else -1
+        if nearest < 0 or abs(times[nearest] - target) > self.tolerance:
+            problem = f"nearest frame at {times[nearest]:.6f} s" if nearest >= 0 else "no frame"
+            raise FormatError(file, f"time {target:.6f} s", problem, f"one within {self.tolerance} s")
+        return read_video_frame(file, nearest, feature.hw, pixels=pixels)
 
     def _bytes(self, i: int, key: str) -> tuple[bytes, Path]:
-        """A picture kept in the table, or beside it under the path in the table."""
+        """Encoded image and its file: bytes in the table, or the file named in the table."""
         cell = read_cell(self.data, key, int(self.rows[i]))
         if not isinstance(cell, dict):
-            raise FormatError(self.data, key, type(cell).__name__, "a picture: bytes and path")
+            raise FormatError(self.data, key, type(cell).__name__, "an image: bytes and path")
         data, path = cell.get("bytes"), cell.get("path")
         if isinstance(data, bytes) and data:
             return data, self.data
         if not isinstance(path, str):
-            raise FormatError(self.data, key, "neither bytes nor path", "a picture")
+            raise FormatError(self.data, key, "neither bytes nor path", "an image")
         file = resolve_inside(self.root, path, self.data, key)
         return files.read_bytes(file), file
 
 
 @dataclass(frozen=True, eq=False)
 class _CameraSpec:
-    """One camera of the data set and the options."""
+    """One camera of the data set with its features and options."""
 
     meta: LeRobotMeta
     key: str
@@ -243,14 +243,14 @@ class _CameraSpec:
 
     @property
     def K_key(self) -> str | None:
-        """The feature that holds K, if that is where it comes from."""
+        """Key of the feature with K; None where K comes from elsewhere."""
         return None if self.stated.K is not None else self._column(self.stated.feature, "intrinsics")
 
     @property
     def pose_key(self) -> str | None:
-        found = self._column(self.pose, "pose")
-        ours = f"observation.{self.key.split('.')[-1]}.T_world_from_cam"
-        return ours if found is None and ours in self.meta.features else found
+        key = self._column(self.pose, "pose")
+        own_key = f"observation.{self.key.split('.')[-1]}.T_world_from_cam"
+        return own_key if key is None and own_key in self.meta.features else key
 
     def _column(self, option: str | None, what: str) -> str | None:
         if option is not None:
@@ -263,7 +263,7 @@ class _CameraSpec:
         return next((name for name in names if name in self.meta.features), None)
 
     def name(self, episode: int) -> str:
-        """Of the recording."""
+        """Name of the recording of an episode."""
         return f"{self.meta.name}/episode_{episode:06d}/{self.key.split('.')[-1]}"
 
     def recording(self, episode: LeRobotEpisode, table: dict[str, np.ndarray]) -> Recording:
@@ -309,26 +309,26 @@ class _CameraSpec:
         self, table: dict[str, np.ndarray], rows: np.ndarray, depth: LeRobotFeature | None
     ) -> tuple[Camera, Camera | None]:
         root, hw = self.meta.root, self.image.hw
-        side = root / "meta" / "intrinsics.json"
-        entry = files.read_json(side).get(self.key, {}) if side.is_file() else {}
+        side_car = root / "meta" / "intrinsics.json"
+        entry = files.read_json(side_car).get(self.key, {}) if side_car.is_file() else {}
         if not isinstance(entry, dict):
-            raise FormatError(side, self.key, type(entry).__name__, "an object with K")
-        lens = self.distortion if self.distortion is not None else entry.get("dist")
-        of_depth = None
+            raise FormatError(side_car, self.key, type(entry).__name__, "an object with K")
+        distortion = self.distortion if self.distortion is not None else entry.get("dist")
+        depth_camera = None
         if depth is not None and (self.K_depth is not None or entry.get("K_depth") is not None):
             value = (
                 convert.parse_K_option(self.K_depth, root, "option K_depth")
                 if self.K_depth is not None
                 else entry["K_depth"]
             )
-            of_depth = convert.to_camera(value, depth.hw, side, "K_depth")
+            depth_camera = convert.to_camera(value, depth.hw, side_car, "K_depth")
         if self.stated.K is not None:
             K = convert.make_K(*self.stated.K)
-            return convert.to_camera(K, hw, root, "option K", lens), of_depth
+            return convert.to_camera(K, hw, root, "option K", distortion), depth_camera
         if self.K_key is not None:
             values = table[self.K_key][rows]
-            return convert.to_cameras(values, hw, root / "data", self.K_key, lens), of_depth
+            return convert.to_cameras(values, hw, root / "data", self.K_key, distortion), depth_camera
         if "K" not in entry:
             others = "data.intrinsics=FEATURE", "meta/intrinsics.json"
             raise intrinsics_options.missing_intrinsics_error(root, self.key, *others, depth=depth is not None)
-        return convert.to_camera(entry["K"], hw, side, f"{self.key} K", lens), of_depth
+        return convert.to_camera(entry["K"], hw, side_car, f"{self.key} K", distortion), depth_camera

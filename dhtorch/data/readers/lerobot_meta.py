@@ -1,4 +1,4 @@
-"""What a LeRobot data set says about itself: features, episodes, and where the rows and videos of an episode lie."""
+"""Metadata of LeRobot data sets: features, episodes, and the files with an episode's rows and videos."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _V3_VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp
 
 @dataclass(frozen=True)
 class LeRobotFeature:
-    """One column or video."""
+    """One feature of a data set: a column of the tables or a video."""
 
     key: str
     dtype: str  # "video", "image", or a numpy name
@@ -34,7 +34,7 @@ class LeRobotFeature:
 
     @property
     def hw(self) -> tuple[int, int]:
-        """(height, width) of a picture, channels first or last."""
+        """(height, width) of an image feature, channels first or last."""
         h_w = (
             self.shape[1:] if len(self.shape) == 3 and self.shape[0] in (1, 3) and self.shape[2] > 4 else self.shape[:2]
         )
@@ -42,24 +42,24 @@ class LeRobotFeature:
 
     @property
     def is_depth(self) -> bool:
-        """Marked as depth, by the flag of today or of old; a plain array by its name."""
+        """Whether the feature is depth: by its flag (current or older name), a plain array by its key."""
         marked = self.info.get("is_depth_map") is True or self.info.get("video.is_depth_map") is True
         return marked or (self.dtype not in ("video", "image") and len(self.shape) >= 2 and "depth" in self.key)
 
 
 @dataclass(frozen=True)
 class LeRobotEpisode:
-    """Place of one episode."""
+    """Table and video files of one episode."""
 
     number: int
-    length: int | None  # frames, as the metadata have it
+    length: int | None  # frames, from the metadata
     data: Path
-    videos: dict[str, tuple[Path, float]]  # key → file and the time (s) in it at which the episode starts
+    videos: dict[str, tuple[Path, float]]  # key → file and the episode's start in it (s)
 
 
 @dataclass(frozen=True)
 class LeRobotMeta:
-    """``meta/info.json``, checked."""
+    """Contents of ``meta/info.json``, validated."""
 
     root: Path
     name: str  # of the data set
@@ -72,17 +72,17 @@ class LeRobotMeta:
 
     @property
     def videos(self) -> list[str]:
-        """Keys of the features that lie in videos."""
+        """Keys of the features stored as videos."""
         return [key for key, feature in self.features.items() if feature.dtype == "video"]
 
 
 @dataclass(frozen=True, eq=False)
 class LeRobotEpisodes:
-    """The episodes asked for, in that order. There may be tens of thousands: places are made out one at a time."""
+    """The selected episodes, in that order; with tens of thousands of them files are resolved one at a time."""
 
     meta: LeRobotMeta
     numbers: np.ndarray  # (n,)
-    columns: dict[str, np.ndarray]  # (n,) each: ``length``, and in v3 the places under their names in meta/episodes
+    columns: dict[str, np.ndarray]  # (n,) each: ``length``, and in v3 file indices and times as named in meta/episodes
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -91,23 +91,25 @@ class LeRobotEpisodes:
         meta, number = self.meta, int(self.numbers[i])
         row = {name: values[i].item() for name, values in self.columns.items()}
 
-        def index(prefix: str) -> dict[str, Any]:
+        def file_fields(prefix: str) -> dict[str, Any]:
             if meta.version == 2:
                 return {"episode_chunk": number // meta.chunks_size, "episode_index": number}
             return {part: row[f"{prefix}/{part}"] for part in _FILE_INDEX_COLUMNS}
 
         videos = {
             key: (
-                _fill_path_template(meta, "video_path", {**index(f"videos/{key}"), "video_key": key}),
+                _fill_path_template(meta, "video_path", {**file_fields(f"videos/{key}"), "video_key": key}),
                 row.get(f"videos/{key}/from_timestamp", 0.0),
             )
             for key in meta.videos
         }
-        return LeRobotEpisode(number, row.get("length"), _fill_path_template(meta, "data_path", index("data")), videos)
+        return LeRobotEpisode(
+            number, row.get("length"), _fill_path_template(meta, "data_path", file_fields("data")), videos
+        )
 
 
 def read_lerobot_meta(root: Path) -> LeRobotMeta:
-    """The data set's own description.
+    """Read and validate ``meta/info.json``.
 
     Raises:
         FormatError: missing or damaged ``meta/info.json``, or a version other than 2.x and 3.x.
@@ -141,22 +143,22 @@ def read_lerobot_meta(root: Path) -> LeRobotMeta:
 
 
 def read_lerobot_episodes(meta: LeRobotMeta, wanted: Sequence[int] | None) -> LeRobotEpisodes:
-    """The wanted episodes (None = all, by number); of two with one number the first counts.
+    """The ``wanted`` episodes (None = all, by number); of two with the same number the first is used.
 
     Raises:
-        FormatError: missing or damaged tables, a path that cannot be, or an episode that is not there.
+        FormatError: missing or damaged tables, an invalid path, or an episode that does not exist.
     """
     columns = _read_columns_v3(meta) if meta.version == 3 else _read_columns_v2(meta)
     numbers, rows = np.unique(columns.pop("episode_index"), return_index=True)
-    place = dict(zip(numbers.tolist(), rows.tolist(), strict=True))
-    chosen = numbers.tolist() if wanted is None else list(wanted)
-    missing = [n for n in chosen if n not in place]
-    if missing or not chosen:
-        found = f"{len(chosen) - len(missing)} of those asked for"
-        raise FormatError(meta.root / "meta", "episodes", found, missing or "at least one")
-    rows = np.array([place[n] for n in chosen])
-    episodes = LeRobotEpisodes(meta, np.array(chosen), {name: values[rows] for name, values in columns.items()})
-    _ = episodes[0]  # paths that cannot be are found now
+    row_of = dict(zip(numbers.tolist(), rows.tolist(), strict=True))
+    selected = numbers.tolist() if wanted is None else list(wanted)
+    missing = [n for n in selected if n not in row_of]
+    if missing or not selected:
+        problem = f"{len(selected) - len(missing)} of those requested"
+        raise FormatError(meta.root / "meta", "episodes", problem, missing or "at least one")
+    rows = np.array([row_of[n] for n in selected])
+    episodes = LeRobotEpisodes(meta, np.array(selected), {name: values[rows] for name, values in columns.items()})
+    _ = episodes[0]  # raises now for invalid paths
     return episodes
 
 
@@ -164,21 +166,21 @@ def _read_columns_v3(meta: LeRobotMeta) -> dict[str, np.ndarray]:
     tables = sorted((meta.root / "meta" / "episodes").glob("*/*.parquet"))
     if not tables:
         raise FormatError(meta.root / "meta" / "episodes", "tables", "none", "chunk-000/file-000.parquet")
-    places = ["data", *(f"videos/{key}" for key in meta.videos)]
-    counts = ["episode_index", *(f"{place}/{part}" for place in places for part in _FILE_INDEX_COLUMNS)]
+    prefixes = ["data", *(f"videos/{key}" for key in meta.videos)]
+    counts = ["episode_index", *(f"{prefix}/{part}" for prefix in prefixes for part in _FILE_INDEX_COLUMNS)]
     starts = [f"videos/{key}/from_timestamp" for key in meta.videos]
-    found: list[dict[str, np.ndarray]] = []
+    parts: list[dict[str, np.ndarray]] = []
     for table in tables:
         spans = ["dataset_from_index", "dataset_to_index"]
-        read = read_columns(table, [*counts, *starts], optional=spans)
-        columns = {name: _check_counts(read[name], table, name) for name in counts}
-        columns |= {name: _check_numbers(read[name], table, name, np.isfinite) for name in starts}
-        if {*spans} <= {*read}:
-            first, end = (_check_counts(read[name], table, name, 2**53) for name in spans)
+        values = read_columns(table, [*counts, *starts], optional=spans)
+        columns = {name: _check_counts(values[name], table, name) for name in counts}
+        columns |= {name: _check_numbers(values[name], table, name, np.isfinite) for name in starts}
+        if {*spans} <= {*values}:
+            first, end = (_check_counts(values[name], table, name, 2**53) for name in spans)
             columns["length"] = end - first
-        found.append(columns)
-    shared = set.intersection(*({*columns} for columns in found))
-    return {name: np.concatenate([columns[name] for columns in found]) for name in shared}
+        parts.append(columns)
+    shared = set.intersection(*({*columns} for columns in parts))
+    return {name: np.concatenate([columns[name] for columns in parts]) for name in shared}
 
 
 def _read_columns_v2(meta: LeRobotMeta) -> dict[str, np.ndarray]:
@@ -195,13 +197,15 @@ def _read_columns_v2(meta: LeRobotMeta) -> dict[str, np.ndarray]:
 
 
 def select_colour_keys(meta: LeRobotMeta, asked: str | Sequence[str] | None = None) -> list[str]:
-    """Keys of the colour features asked for; None = all.
+    """The requested keys of colour features, checked; None = all.
 
     Raises:
-        FormatError: none, or one that is not there.
+        FormatError: no colour feature, or an unknown key.
     """
     pictures = [key for key, f in meta.features.items() if f.dtype in ("video", "image") and not f.is_depth]
-    colour = [key for key in pictures if "codes" not in meta.features[key].info]  # maps of codes, as we write them
+    colour = [
+        key for key in pictures if "codes" not in meta.features[key].info
+    ]  # without maps of codes, which we write
     keys = colour if asked is None else [asked] if isinstance(asked, str) else list(asked)
     unknown = [key for key in keys if key not in colour]
     if unknown or not keys:
@@ -212,10 +216,10 @@ def select_colour_keys(meta: LeRobotMeta, asked: str | Sequence[str] | None = No
 
 
 def resolve_inside(root: Path, name: str, file: Path, field: str) -> Path:
-    """A file below ``root``.
+    """The path ``root / name``, checked to lie below ``root``.
 
     Raises:
-        FormatError: an absolute name, or one that leads out.
+        FormatError: an absolute name, or one with ``..``.
     """
     if not name or "\x00" in name or len(name) > 1000 or Path(name).is_absolute() or ".." in Path(name).parts:
         raise FormatError(file, field, name, "a file inside the data set")
@@ -223,7 +227,7 @@ def resolve_inside(root: Path, name: str, file: Path, field: str) -> Path:
 
 
 def _fill_path_template(meta: LeRobotMeta, key: str, values: dict[str, Any]) -> Path:
-    """A path template filled in. Python's own ``format`` would also follow attributes and pad to any width."""
+    """A path template with its fields filled in; ``str.format`` would also access attributes and pad to any width."""
     file, template = meta.root / "meta" / "info.json", getattr(meta, key)
 
     def fill(match: re.Match[str]) -> str:
@@ -259,11 +263,11 @@ def _check_counts(values: Any, file: Path, field: str, limit: int = _MAX_EPISODE
     return _check_numbers(values, file, field, lambda x: (x >= 0) & (x < limit) & (x == np.floor(x))).astype(np.int64)
 
 
-def _check_numbers(values: Any, file: Path, field: str, sound: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-    """A column (n,) as float64, all of its values sound."""
+def _check_numbers(values: Any, file: Path, field: str, is_valid: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """A column (n,) as float64, after checking that all values are numbers and valid."""
     if not isinstance(values, np.ndarray) or values.ndim != 1 or values.dtype.kind not in "fiu":
-        raise FormatError(file, field, "no numbers", "one number a row")
+        raise FormatError(file, field, "no numbers", "one number per row")
     column = values.astype(np.float64)
-    if not (good := sound(column)).all():
-        raise FormatError(file, field, column[~good][0], "a count, or a time in s")
+    if not (valid := is_valid(column)).all():
+        raise FormatError(file, field, column[~valid][0], "a count, or a time in s")
     return column

@@ -1,15 +1,14 @@
-"""Record3D: RGB-D recordings of an iPhone or iPad, in the three layouts that the app exports.
+"""Reader of Record3D captures: RGB-D recordings of an iPhone or iPad, in the three layouts that the app exports.
 
 - ``.r3d``: a zip archive (or its folder) with ``metadata``, ``rgbd/<i>.jpg``, ``.depth`` and ``.conf``, the latter two
   compressed with LZFSE: float32 metres and confidence 0, 1 or 2.
 - *EXR + RGB*: a folder with ``metadata.json``, ``rgb/<i>.jpg`` and ``depth/<i>.exr``.
 - *RGBD mp4*: one video, read by :mod:`dhtorch.data.readers.record3d_video`.
 
-Picture, depth, pose and intrinsics of a frame share the number ``<i>``, which starts at 0 and bears no zeros in front.
-Poses are camera-to-world with ARKit's axes (x right, y up, z backward) of the picture *as stored*, portrait or
-landscape, so nothing is turned here. Colour and depth are registered. Taken to be so, since nothing official says it:
-depth that is not finite or not positive is *no return*; time stamps count from the first one; ``initPose`` means
-nothing.
+Image, depth, pose and intrinsics of a frame share the number ``<i>``, which starts at 0 and has no leading zeros. Poses
+are camera-to-world with ARKit's axes (x right, y up, z backward) of the image *as stored*, portrait or landscape, so
+nothing is rotated here. Colour and depth are registered. Assumed, since undocumented: depth that is not finite or not
+positive is *no return*; time stamps count from the first one; ``initPose`` is not used.
 """
 
 from __future__ import annotations
@@ -34,13 +33,13 @@ from dhtorch.data.recording import Recording
 from dhtorch.records import Frame
 
 _MEMBER_PATTERN = re.compile(r"(?:rgbd|rgb|depth)/(0|[1-9]\d{0,8})\.(jpg|depth|conf|exr)")
-#: Portrait sizes of depth maps, by their pixels: LiDAR, front camera, front camera of later devices.
+#: Number of pixels → portrait size of a depth map: LiDAR, front camera, front camera of later devices.
 _DEPTH_SIZES = {256 * 192: (256, 192), 640 * 480: (640, 480), 960 * 720: (960, 720)}
 _JPEG_MARKERS = (b"\xff\xd8", b"\xff\xd9")
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     if root.is_file():
         if root.suffix.lower() == ".r3d":
             return ".r3d archive"
@@ -66,24 +65,24 @@ def read(
     """Open one capture.
 
     Args:
-        root: the ``.r3d`` file or its folder, the folder of the EXR + RGB export or the one around it, or the mp4.
-        poses: take the device's poses. Captures of the front camera have none: theirs are all the identity.
-        per_frame: take the intrinsics of each frame where the app wrote them, since autofocus and stabilisation move
+        root: the ``.r3d`` file or its folder, the folder of the EXR + RGB export or its parent, or the mp4.
+        poses: use the device's poses. Captures of the front camera have none: theirs are all the identity.
+        per_frame: use the intrinsics of each frame where the app wrote them, since autofocus and stabilisation change
             them; False = those of frame 0 for all.
-        exr_channel: that holds depth. None = R, else the only one (R is what the exports at hand have; unconfirmed).
+        exr_channel: name of the depth channel. None = R, else the only one (the exports at hand have R; unconfirmed).
         verify: decode every frame once while opening, and leave out those that do not decode. Without it only frames
-            whose first or last bytes look wrong are tried.
-        depth_range: m, nearest and furthest depth that the mp4's colours stand for. None = as the file says, else 0, 3.
-        max_step: m, largest difference between neighbouring pixels of the mp4's depth: beyond it the codec has mixed
+            whose first or last bytes are wrong are decoded.
+        depth_range: m, nearest and furthest depth encoded by the mp4's colours. None = from the file, else 0, 3.
+        max_step: m, largest difference between neighbouring pixels of the mp4's depth: beyond it the codec has blended
             colours.
 
     Returns:
-        One recording; depth has its own resolution. A frame that lacks a part, a usable pose or its intrinsics is left
-        out and reported; so is one whose bytes are damaged, as far as ``verify`` looks. Damage found later is an error
-        of that frame.
+        One recording; depth has its own resolution. Frames without a part, a usable pose or intrinsics are left out and
+        reported, and so are damaged ones as far as ``verify`` checks. Damage detected later raises an error for that
+        frame.
 
     Raises:
-        FormatError: no frame, or metadata that are damaged.
+        FormatError: no frame, or damaged metadata.
         ImportError: the decoder of depth is not installed.
     """
     root = Path(root)
@@ -99,30 +98,30 @@ def read(
     table = get_member(members, "metadata.json" if "metadata.json" in members else "metadata", inner)
     meta = _parse_metadata(table, per_frame)
     shots, report = _list_shots(members, inner)
-    shots, late = _select_covered(shots, meta)
-    c2w, lost, said = _select_posed([shot.number for shot in shots], meta, poses)
-    kept = [shot for shot in shots if shot.number not in lost]
-    report += late + said + files.format_left_out(sorted(lost), "its pose is not usable (tracking lost)")
-    if not kept:
-        raise FormatError(inner, "frames", "; ".join(report) or "none", "frames with picture, depth and metadata")
-    load = _Load(tuple(kept), meta, *_find_sizes(kept, meta), exr_channel)
-    good = [i for i, shot in enumerate(kept) if not (verify or _is_damaged(shot)) or _can_decode(load, i)]
-    report += files.format_left_out([shot.number for i, shot in enumerate(kept) if i not in set(good)], "damaged")
-    if not good:
+    shots, uncovered = _select_covered(shots, meta)
+    c2w, unposed, remarks = _select_posed([shot.number for shot in shots], meta, poses)
+    posed = [shot for shot in shots if shot.number not in unposed]
+    report += uncovered + remarks + files.format_left_out(sorted(unposed), "its pose is not usable (tracking lost)")
+    if not posed:
+        raise FormatError(inner, "frames", "; ".join(report) or "none", "frames with image, depth and metadata")
+    load = _Load(tuple(posed), meta, *_find_sizes(posed, meta), exr_channel)
+    intact = [i for i, shot in enumerate(posed) if not (verify or _is_damaged(shot)) or _can_decode(load, i)]
+    report += files.format_left_out([shot.number for i, shot in enumerate(posed) if i not in set(intact)], "damaged")
+    if not intact:
         raise FormatError(inner, "frames", "; ".join(report), "frames that decode")
-    number = torch.tensor([kept[i].number for i in good])
-    times, said = _frame_times(number, meta)
+    number = torch.tensor([posed[i].number for i in intact])
+    times, remarks = _frame_times(number, meta)
     return [
         Recording(
             name=name,
             format="record3d",
-            load=replace(load, shots=tuple(kept[i] for i in good)),
+            load=replace(load, shots=tuple(posed[i] for i in intact)),
             number=number,
             root=root,
             times=times,
-            poses=None if c2w is None else convert.to_poses(c2w[good], table.path),
+            poses=None if c2w is None else convert.to_poses(c2w[intact], table.path),
             rate_hz=meta.fps,
-            report=tuple(report + said),
+            report=tuple(report + remarks),
         )
     ]
 
@@ -139,10 +138,10 @@ class _Shot:
 
 @dataclass(frozen=True, eq=False)
 class _Metadata:
-    """What the table of a capture says; rows belong to frame numbers."""
+    """Contents of a capture's metadata; rows are indexed by frame number."""
 
     file: Path
-    hw: tuple[int, int]  # of the picture that K belongs to
+    hw: tuple[int, int]  # of the images that K refers to
     depth_hw: tuple[int, int] | None
     fps: float | None
     K: np.ndarray  # (1 or n, 4) fx fy cx cy
@@ -192,7 +191,7 @@ class _Load:
 
 
 def _find_export_folder(root: Path) -> Path:
-    """The folder of the EXR export: the app puts it into one of that name."""
+    """The folder of the EXR export: ``root/EXR_RGBD`` where it exists, else ``root``."""
     return root / "EXR_RGBD" if (root / "EXR_RGBD").is_dir() else root
 
 
@@ -206,10 +205,10 @@ def _parse_metadata(table: Member, per_frame: bool) -> _Metadata:
         raise FormatError(file, "JSON", type(value).__name__, "an object")
     hw = _parse_size(value, "h", "w", file)
     if hw is None:
-        raise FormatError(file, "w, h", "nothing", "the size of the pictures")
+        raise FormatError(file, "w, h", "nothing", "the size of the images")
     coefficients = _parse_rows(value, "perFrameIntrinsicCoeffs", 4, file) if per_frame else None
     if coefficients is None:
-        K = files.to_array(value.get("K"), (9,), file, "K").reshape(3, 3).T  # column after column
+        K = files.to_array(value.get("K"), (9,), file, "K").reshape(3, 3).T  # stored by columns
         if K[2].tolist() != [0, 0, 1] or K[0, 1] != 0 or K[1, 0] != 0:
             raise FormatError(file, "K", K.T.ravel().tolist(), "fx 0 0 0 fy 0 cx cy 1")
         coefficients = np.array([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]])
@@ -229,7 +228,7 @@ def _parse_metadata(table: Member, per_frame: bool) -> _Metadata:
 
 
 def _parse_size(value: Mapping[str, Any], high: str, wide: str, file: Path) -> tuple[int, int] | None:
-    """(height, width), or None where the table does not say."""
+    """(height, width); None where the metadata have neither."""
     if value.get(high) is None and value.get(wide) is None:
         return None
     h, w = (files.to_positive(value.get(key), file, key) for key in (high, wide))
@@ -239,7 +238,7 @@ def _parse_size(value: Mapping[str, Any], high: str, wide: str, file: Path) -> t
 
 
 def _parse_rows(value: Mapping[str, Any], key: str, width: int, file: Path) -> np.ndarray | None:
-    """(n, width) numbers, NaN allowed; None where the table has no such key or nothing in it."""
+    """(n, width) numbers, NaN allowed; None where the key is missing or its list empty."""
     rows = value.get(key)
     if rows is None or rows == []:
         return None
@@ -254,71 +253,73 @@ def _parse_rows(value: Mapping[str, Any], key: str, width: int, file: Path) -> n
 
 
 def _list_shots(members: Mapping[str, Member], root: Path) -> tuple[list[_Shot], list[str]]:
-    """Frames with picture and depth (and confidence, if any frame has it) in numerical order; what is missing."""
+    """Frames with image and depth (and confidence, if any frame has it) in numerical order; report of missing files."""
     parts: dict[int, dict[str, Member]] = {}
     for name, part in members.items():
         if match := _MEMBER_PATTERN.fullmatch(name):
             parts.setdefault(int(match[1]), {})["depth" if match[2] == "exr" else match[2]] = part
     if not parts:
         raise FormatError(root, "frames", "none", "rgbd/<i>.jpg and .depth, or rgb/<i>.jpg and depth/<i>.exr")
-    wanted = ["jpg", "depth"] + (["conf"] if any("conf" in found for found in parts.values()) else [])
-    words = {"jpg": "picture", "depth": "depth", "conf": "confidence"}
+    required = ["jpg", "depth"] + (["conf"] if any("conf" in files_of for files_of in parts.values()) else [])
+    names = {"jpg": "picture", "depth": "depth", "conf": "confidence"}
     shots, missing = [], dict[str, list[int]]()
-    for number, found in sorted(parts.items()):
-        lacks = " and no ".join(words[part] for part in wanted if part not in found)
-        if lacks:
-            missing.setdefault(f"no {lacks}", []).append(number)
+    for number, files_of in sorted(parts.items()):
+        absent = " and no ".join(names[part] for part in required if part not in files_of)
+        if absent:
+            missing.setdefault(f"no {absent}", []).append(number)
         else:
-            shots.append(_Shot(number, found["jpg"], found["depth"], found.get("conf")))
-    gap = sorted(set(range(min(parts), max(parts))) - set(parts)) if max(parts) - min(parts) < 10 * len(parts) else []
-    missing |= {"no file": gap} if gap else {}
-    return shots, [line for why, numbers in missing.items() for line in files.format_left_out(numbers, why)]
+            shots.append(_Shot(number, files_of["jpg"], files_of["depth"], files_of.get("conf")))
+    gaps = sorted(set(range(min(parts), max(parts))) - set(parts)) if max(parts) - min(parts) < 10 * len(parts) else []
+    missing |= {"no file": gaps} if gaps else {}
+    return shots, [line for reason, numbers in missing.items() for line in files.format_left_out(numbers, reason)]
 
 
 def _select_covered(shots: list[_Shot], meta: _Metadata) -> tuple[list[_Shot], list[str]]:
-    """Frames that every list of the table reaches."""
+    """Frames with a row in every list of the metadata; report of the others."""
     lengths = [len(rows) for rows in (meta.poses, meta.stamps) if rows is not None]
     lengths += [len(meta.K)] if len(meta.K) > 1 else []
-    known = [shot for shot in shots if shot.number < min(lengths, default=shot.number + 1)]
-    late = [shot.number for shot in shots if shot not in known] if len(known) < len(shots) else []
-    return known, files.format_left_out(late, f"beyond the metadata's {min(lengths, default=0)} rows")
+    covered = [shot for shot in shots if shot.number < min(lengths, default=shot.number + 1)]
+    uncovered = [shot.number for shot in shots if shot not in covered] if len(covered) < len(shots) else []
+    return covered, files.format_left_out(uncovered, f"beyond the metadata's {min(lengths, default=0)} rows")
 
 
-def _select_posed(numbers: list[int], meta: _Metadata, wanted: bool) -> tuple[np.ndarray | None, set[int], list[str]]:
-    """(camera-to-world of the usable frames, numbers of the others, what to report)."""
-    if meta.poses is None or not wanted or not numbers:
+def _select_posed(
+    numbers: list[int], meta: _Metadata, use_poses: bool
+) -> tuple[np.ndarray | None, set[int], list[str]]:
+    """(camera-to-world of the frames with a usable pose, numbers of the others, report)."""
+    if meta.poses is None or not use_poses or not numbers:
         return None, set(), []
     if (np.abs(meta.poses - [0, 0, 0, 1, 0, 0, 0]) <= 1e-9).all():  # front camera: no tracking
-        return None, set(), ["every pose is the identity: the device had none"]
+        return None, set(), ["every pose is the identity: no tracking"]
     rows = meta.poses[numbers]
     with np.errstate(invalid="ignore", over="ignore"):
         usable = np.isfinite(rows).all(-1) & (np.linalg.norm(rows[:, :4], axis=-1) > 1e-6)
-    lost = {number for number, good in zip(numbers, usable, strict=True) if not good}
+    unposed = {number for number, ok in zip(numbers, usable, strict=True) if not ok}
     c2w = convert.to_c2w(rows[usable, :4], rows[usable, 4:], meta.file, "poses")
-    return convert.cv_from_gl(c2w), lost, []
+    return convert.cv_from_gl(c2w), unposed, []
 
 
 def _frame_times(number: torch.Tensor, meta: _Metadata) -> tuple[torch.Tensor | None, list[str]]:
-    """Seconds since the first stamp of the capture; frame number over rate where the stamps are no clock."""
-    counted = None if meta.fps is None else number.double() / meta.fps
+    """Times (s) since the first stamp of the capture; frame number / rate where stamps are missing or unordered."""
+    nominal = None if meta.fps is None else number.double() / meta.fps
     if meta.stamps is None:
-        return counted, []
+        return nominal, []
     times = torch.from_numpy(meta.stamps - meta.stamps[0])[number]
     if bool(torch.isfinite(times).all()) and bool((times.diff() > 0).all()):
         return times, []
-    instead = "the frame rate counts instead" if counted is not None else "there are no times"
-    return counted, [f"time stamps do not increase: {instead}"]
+    fallback = "the frame rate is used instead" if nominal is not None else "there are no times"
+    return nominal, [f"time stamps do not increase: {fallback}"]
 
 
 def _find_sizes(shots: list[_Shot], meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
-    """(height, width) of picture and depth map, from the first frame that is whole enough to say."""
-    first: FormatError | None = None
+    """(height, width) of image and depth map, from the first frame whose headers can be read."""
+    first_error: FormatError | None = None
     for shot in shots:
         try:
             return _read_sizes(shot, meta)
         except FormatError as error:
-            first = first or error
-    raise first or FormatError(meta.file, "frames", "none", "at least one")
+            first_error = first_error or error
+    raise first_error or FormatError(meta.file, "frames", "none", "at least one")
 
 
 def _read_sizes(shot: _Shot, meta: _Metadata) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -337,7 +338,7 @@ def _read_sizes(shot: _Shot, meta: _Metadata) -> tuple[tuple[int, int], tuple[in
 
 
 def _is_damaged(shot: _Shot) -> bool:
-    """Whether a part begins or ends as no whole one does."""
+    """Whether the first or last bytes of a part differ from the format's markers."""
     ends = shot.image.ends(2)
     return (ends is not None and ends != _JPEG_MARKERS) or any(
         part.path.suffix != ".exr" and (ends := part.ends(4)) is not None and ends[0][:3] + ends[1] != b"bvxbvx$"

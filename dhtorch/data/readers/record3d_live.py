@@ -1,8 +1,8 @@
-"""Record3D over a USB cable: frames of a phone as it records them.
+"""Live frames of Record3D over USB.
 
-The library ``record3d`` calls back from a thread of its own, without arguments, and overwrites its buffers with the
-next frame; so everything is copied inside the callback. A few frames wait between the two threads. When the reader is
-slower than the phone the oldest frame is dropped: what is read is recent, and memory is bounded.
+The library ``record3d`` calls back from a thread of its own and overwrites its buffers with the next frame; everything
+is therefore copied inside the callback. A few frames are queued between the two threads. When the reader is slower than
+the phone the oldest frame is dropped, so that frames are recent and memory is bounded.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.records import Frame, Pose
 
 _SOURCE = Path("record3d:usb")
-_LIDAR_DEVICE_TYPE = 1  # device type; 0 is the front camera, which has neither confidence nor poses
+_LIDAR_DEVICE_TYPE = 1  # 0 is the front camera, without confidence and poses
 
 
 class LiveFrames:
@@ -36,11 +36,11 @@ class LiveFrames:
         stream: an object with the interface of ``record3d.Record3DStream``. None = a new one.
         device: one of ``stream.get_connected_devices()``. None = the first.
         timeout: s, longest wait for a frame.
-        ahead: frames that may wait; the oldest gives way.
-        clock: seconds, for the time stamps.
+        ahead: size of the queue; when it is full the oldest frame is dropped.
+        clock: returns seconds, for the time stamps.
 
     Raises:
-        FormatError: no phone, it refuses, no frame within ``timeout``, or a frame that cannot be one.
+        FormatError: no phone, a refused connection, no frame within ``timeout``, or an invalid frame.
         ImportError: ``record3d`` is not installed.
     """
 
@@ -55,9 +55,9 @@ class LiveFrames:
     ) -> None:
         self.stream = import_optional("record3d", extra="live").Record3DStream() if stream is None else stream
         self.device, self.timeout, self.clock = device, timeout, clock
-        self.dropped = 0  # frames that came faster than they were read
+        self.dropped = 0  # frames dropped because the queue was full
         self.start: float | None = None
-        self._news = threading.Condition()  # guards what follows
+        self._news = threading.Condition()  # guards the attributes below
         self._frames: deque[Frame] = deque(maxlen=max(ahead, 1))
         self._error: Exception | None = None
         self._stopped = False
@@ -93,7 +93,7 @@ class LiveFrames:
             yield frame
 
     def _on_frame(self) -> None:
-        """On the library's thread: an exception here would be lost, so it travels to the reader."""
+        """Callback on the library's thread; exceptions are passed on to the reading thread."""
         try:
             frame = self._frame()
         except Exception as error:
@@ -140,7 +140,7 @@ class LiveFrames:
 
 
 def _copy_buffer(buffer: Any, field: str, dtype: type, ndim: int) -> np.ndarray:
-    """The library's buffer as an array of our own."""
+    """Checked copy of the library's buffer."""
     array = np.array(buffer, copy=True)
     shape_fits = array.ndim == ndim and (ndim == 2 or array.shape[2] == 3)
     if array.dtype != dtype or not (shape_fits or (array.size == 0 and field == "confidence")):

@@ -1,9 +1,10 @@
-"""Record3D's RGBD mp4: depth as hue in the left half of every picture, colour in the right half.
+"""Reader of Record3D's RGBD mp4: depth as hue in the left half of every image, colour in the right half.
 
 A pixel's hue (full saturation, full value) runs once round the circle from the nearest to the furthest depth, 0 to 3 m
-unless the file says otherwise. Both ends are red, so they cannot be told apart and are dropped, as are pixels next to
-a jump: there the codec has blended two hues into a third one. Intrinsics stand as JSON near the end of the file, behind
-the pictures, or in a ``metadata.json`` beside it; they belong to one half. There is no confidence and no pose.
+unless the file has another range. Both ends are red and cannot be distinguished, so they are dropped, and so are pixels
+next to a depth discontinuity: there the codec has blended two hues into a third one. Intrinsics are stored as JSON near
+the end of the file, behind the images, or in a ``metadata.json`` beside it; they refer to one half. There is no
+confidence and no pose.
 """
 
 from __future__ import annotations
@@ -26,20 +27,20 @@ from dhtorch.data.recording import Recording
 from dhtorch.records import Camera, Frame
 
 _METADATA_START = b'{"intrinsicMatrix"'
-_TAIL_BYTES = 1 << 20  # bytes at the end of the file in which the intrinsics are looked for
+_TAIL_BYTES = 1 << 20  # bytes at the end of the file that are searched for the intrinsics
 _DEFAULT_RANGE_M = (0.0, 3.0)  # m
-_KEPT_RANGE_RATIO = (0.1 / 3, 2.8 / 3)  # of the range: what the app's own viewer keeps
-_MIN_CHROMA = 0.25  # of full: every coded pixel has full colour, grey has no hue
+_KEPT_RANGE_RATIO = (0.1 / 3, 2.8 / 3)  # of the range, as kept by the app's own viewer
+_MIN_CHROMA = 0.25  # of the maximum: coded pixels are saturated, grey has no hue
 
 
 def recognise(file: Path) -> str | None:
-    """What makes ``file`` an RGBD mp4, in words; None if nothing does."""
+    """The content by which ``file`` is recognised as an RGBD mp4, as text; None if it is not."""
     if file.suffix.lower() != ".mp4":
         return None
     if _METADATA_START in _read_tail(file):
         return "an mp4 with an intrinsicMatrix at its end"
-    side = file.parent / "metadata.json"
-    if side.is_file() and _METADATA_START.strip(b'{"') in files.read_bytes(side, files.MAX_TEXT_BYTES):
+    side_car = file.parent / "metadata.json"
+    if side_car.is_file() and _METADATA_START.strip(b'{"') in files.read_bytes(side_car, files.MAX_TEXT_BYTES):
         return "an mp4 beside a metadata.json with an intrinsicMatrix"
     return None
 
@@ -53,8 +54,8 @@ def read(file: Path, *, depth_range: Sequence[float] | None = None, max_step: fl
     limits = depth_range if depth_range is not None else meta.get("rangeOfEncodedDepth", _DEFAULT_RANGE_M)
     near, far = files.to_array(limits, (2,), source, "rangeOfEncodedDepth")
     if not 0 <= near < far <= 1e4 or header.hw[1] % 2:
-        found = f"{near} to {far} m in a picture {header.hw[1]} wide"
-        raise FormatError(source, "rangeOfEncodedDepth", found, "two increasing depths, two halves")
+        problem = f"{near} to {far} m in an image {header.hw[1]} px wide"
+        raise FormatError(source, "rangeOfEncodedDepth", problem, "two increasing depths, two halves")
     camera = convert.to_camera(K, hw, source, "intrinsicMatrix")
     load = _Load(file, header.hw, camera, float(near), float(far), files.to_positive(max_step, file, "option max_step"))
     number = torch.arange(header.n)
@@ -77,14 +78,14 @@ class _Load:
     """Position → frame."""
 
     file: Path
-    hw: tuple[int, int]  # of the whole picture
+    hw: tuple[int, int]  # of the whole image, both halves
     camera: Camera
     near: float  # m
     far: float
     max_step: float
 
     def __call__(self, i: int) -> Frame:
-        # Nearest: hues must not be blended on the way from the half-size colour planes to the full size.
+        # Nearest: interpolating the half-size colour planes would blend hues.
         picture = video.read_video_frame(self.file, i, self.hw, nearest=True)
         half = self.hw[1] // 2
         image = np.ascontiguousarray(picture[:, half:].transpose(2, 0, 1))
@@ -95,10 +96,10 @@ class _Load:
 def decode_hue_depth(
     rgb: np.ndarray,  # (h, w, 3) uint8
     near: float,  # m, of hue 0
-    far: float,  # m, of a full turn
+    far: float,  # m, of hue 1
     max_step: float,  # m
 ) -> np.ndarray:
-    """Depth (h, w) m float32 of hues; 0 near the two ends of the range, beside a jump, and where there is no hue."""
+    """Hues → depth (h, w) m float32; 0 near both ends of the range, beside a discontinuity and without hue."""
     x = rgb.astype(np.float32)
     r, g, b = x[..., 0], x[..., 1], x[..., 2]
     top, chroma = x.max(-1), np.ptp(x, -1)
@@ -119,14 +120,14 @@ def _window_extreme(x: np.ndarray, extreme: np.ufunc) -> np.ndarray:
 
 
 def _read_metadata(file: Path) -> tuple[dict[str, Any], Path]:
-    """The JSON object with the intrinsics, and where it stood."""
+    """The JSON object with the intrinsics, and the file that contains it."""
     tail = _read_tail(file)
     at = tail.rfind(_METADATA_START)
     if at < 0:
-        side = file.parent / "metadata.json"
-        if not side.is_file():
+        side_car = file.parent / "metadata.json"
+        if not side_car.is_file():
             raise FormatError(file, "intrinsicMatrix", "neither in the file nor in a metadata.json", "one of them")
-        return files.read_json(side), side
+        return files.read_json(side_car), side_car
     try:  # other bytes follow
         return json.JSONDecoder().raw_decode(tail[at:].decode("utf-8", errors="replace"))[0], file
     except (ValueError, RecursionError) as error:

@@ -1,10 +1,10 @@
-"""Rectified pairs with a disparity map: two images whose rows coincide, the right one displaced along x alone.
+"""Reader of rectified stereo pairs with a disparity map: corresponding rows, right camera displaced along x.
 
 - *calib.txt* layout (Middlebury 2014, ETH3D two-view): ``im0.png``, ``im1.png``, ``disp0.pfm`` (or ``disp0GT.pfm``; the
   right view's ``disp1…`` where there is one) and ``calib.txt`` with ``cam0=[…]``, ``cam1=[…]``, ``doffs``,
   ``baseline`` in mm.
 - *npz* layout (scikit-image's motorcycle): ``*_left.png``, ``*_right.png``, ``*_disp.npz`` and a side-car ``meta.json``
-  with ``K_left``, ``K_right``, ``baseline_m``, ``doffs``; nothing else says how to turn this disparity into metres.
+  with ``K_left``, ``K_right``, ``baseline_m``, ``doffs``; which is needed to convert this disparity to metres.
 
 Depth is ``f · baseline / (disparity + doffs)`` with ``doffs`` the difference of the principal points.
 """
@@ -25,12 +25,12 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, consecutive_frame_numbers
 from dhtorch.records import Camera, Frame, Pose
 
-#: px; a smaller difference of directions has never been measured, its depth would be any number.
+#: Disparities in px (with ``doffs``) up to this value give no depth: they are too small to be measured.
 _MIN_DISPARITY_PX = 1e-3
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     if (root / "calib.txt").is_file() and (root / "im0.png").is_file():
         return "calib.txt and im0.png"
     if root.is_dir() and any(root.glob("*_disp.npz")) and any(root.glob("*_left.png")):
@@ -39,12 +39,12 @@ def recognise(root: Path) -> str | None:
 
 
 def read(root: str | Path) -> list[Recording]:
-    """Open a pair as a recording of two frames: 0 = left, with depth; 1 = right, without (all 0) unless it is there.
+    """Open a pair as a recording of two frames: 0 = left, with depth; 1 = right, whose depth is 0 where it has no map.
 
     The world is the left camera; each view has its own intrinsics; there are no time stamps.
 
     Raises:
-        FormatError: a missing or damaged file, or a calibration that cannot be one.
+        FormatError: a missing or damaged file, or an invalid calibration.
     """
     root = Path(root)
     pair = _read_calib_pair(root) if (root / "calib.txt").is_file() else _read_npz_pair(root)
@@ -104,10 +104,10 @@ def _read_calib_pair(root: Path) -> _LoadPair:
 def _read_npz_pair(root: Path) -> _LoadPair:
     names = {}
     for kind in ("left.png", "right.png", "disp.npz"):
-        found = sorted(root.glob(f"*_{kind}")) if root.is_dir() else []
-        if len(found) != 1:
-            raise FormatError(root, f"*_{kind}", f"{len(found)} such files", "exactly one")
-        names[kind] = found[0]
+        matching = sorted(root.glob(f"*_{kind}")) if root.is_dir() else []
+        if len(matching) != 1:
+            raise FormatError(root, f"*_{kind}", f"{len(matching)} such files", "exactly one")
+        names[kind] = matching[0]
     file = root / "meta.json"
     meta = files.read_json(file)
     hw = files.read_image_header(names["left.png"]).hw
@@ -120,7 +120,7 @@ def _read_npz_pair(root: Path) -> _LoadPair:
 
 
 def _check_pair(pair: _LoadPair, file: Path) -> _LoadPair:
-    """The right view of a rectified pair keeps rows and scale, and ``doffs`` is no free number."""
+    """Check the calibration: positive baseline, equal focal lengths, ``doffs`` = difference of the principal points."""
     if not 0 < pair.baseline <= convert.MAX_COORDINATE_M:
         raise FormatError(file, "baseline", pair.baseline, "a positive length")
     left, right = pair.cameras
@@ -142,7 +142,7 @@ def _read_disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
 
 
 def _parse_matrix(entries: dict[str, str], key: str, file: Path) -> list[list[str]]:
-    """``[a b c; d e f; g h i]``, as Matlab writes it."""
+    """Matlab's ``[a b c; d e f; g h i]`` → rows of texts."""
     return [row.split() for row in entries.get(key, "").strip("[]").split(";")]
 
 

@@ -1,14 +1,14 @@
-"""RH20T: a robot at work, seen by many cameras, each at its own clock; one recording per camera.
+"""Reader of RH20T scenes: a robot seen by many cameras, each with its own time stamps; one recording per camera.
 
 A scene folder holds ``metadata.json`` and, for each camera, ``cam_<serial>/`` with ``color.mp4``, ``depth.mp4`` (often
 in a parallel tree) and ``timestamps.npy``; beside the scenes lies ``calib/<stamp>/`` with ``intrinsics.npy`` (for
 1280×720), ``extrinsics.npy`` (world → camera; the world is the calibration marker) and ``tcp.npy``. The ``.npy`` files
 are pickles: they are read as data (:mod:`dhtorch.data.codecs.pickles`), no code in them runs.
 
-A depth picture is twice as high as the image, the low bytes above the high bytes, in millimetres. A camera on the hand
-moves: its pose follows the tool centre point (:mod:`dhtorch.data.readers.rh20t_robot`). ``streams`` gives the robot's
-side. Scenes named ``…_human`` show a person at the same task; which arrays they lack is unconfirmed, so nothing but
-videos, time stamps and the calibration is needed of any scene.
+A depth image is twice as high as the colour image, the low bytes above the high bytes, in millimetres. A camera on the
+hand moves with the tool centre point (:mod:`dhtorch.data.readers.rh20t_robot`). :func:`read_robot_streams` reads the
+robot's data. Scenes named ``…_human`` show a person at the same task; which arrays they lack is unconfirmed, so only
+videos, time stamps and the calibration are required of a scene.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _RATE_HZ = 10.0
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     if (root / "metadata.json").is_file() and any(root.glob("cam_*/timestamps.npy")):
         return "metadata.json and cam_<serial>/timestamps.npy"
     return None
@@ -75,30 +75,30 @@ def read(
         root: the folder of the scene.
         serials: cameras to open. None = all; those that cannot be opened are then left out and reported.
         depth_root: the folder of the same scene in the parallel tree of depth videos. None = ``root``.
-        calibration: the folder that holds the calibrations by stamp. None = ``calib`` beside the scene.
-        calibrated_hw: height and width that ``intrinsics.npy`` belongs to; K is scaled to the video by the exact rule.
+        calibration: the folder with the calibrations by stamp. None = ``calib`` beside the scene.
+        calibrated_hw: height and width that ``intrinsics.npy`` refers to; K is scaled exactly to the video's size.
         configuration: 1 to 7, the robot. None = from ``cfg_000N`` in the folder's name.
-        in_hand: serials of the cameras on the hand, the one that the published mount belongs to first. None = those of
-            the configuration.
-        max_difference: s, largest distance in time of a colour and a depth picture that belong together.
-        max_gap: s, longest gap of the tcp stream that the pose of a camera on the hand is interpolated across.
+        in_hand: serials of the cameras on the hand, first the one of the published mount. None = those of the
+            configuration.
+        max_difference: s, largest time difference of associated colour and depth images.
+        max_gap: s, longest gap of the tcp stream across which the pose of a camera on the hand is interpolated.
         outlier: m, a return that differs by more from the median of the returns within two pixels is dropped; 0 = off.
             Whether the depth videos are lossless is unconfirmed; a lossy high byte is off by multiples of 0.256 m.
 
     Returns:
-        Recordings named ``<scene>/<serial>``, colour and depth paired by time. Without ``depth.mp4`` the depth is empty
-        and the report says so. Poses are absent where a camera on the hand cannot be followed.
+        Recordings named ``<scene>/<serial>``, colour and depth paired by time. Without ``depth.mp4`` the depth is
+        empty, which is reported. Poses are absent for a camera on the hand without tcp data.
 
     Raises:
-        FormatError: no camera, no calibration (``calib`` −1), a damaged file, or values no camera or pose can have.
+        FormatError: no camera, no calibration (``calib`` −1), a damaged file, or values that are no camera or pose.
     """
     root = Path(root)
     meta = files.read_json(root / "metadata.json")
     stamp = meta.get("calib", -1)
     if isinstance(stamp, bool) or not isinstance(stamp, int | str) or not re.fullmatch(r"\d{10,16}", str(stamp)):
-        raise FormatError(root / "metadata.json", "calib", stamp, "the stamp of a calibration (-1 = there is none)")
-    beside = root.parent.parent if root.parent.name == "action" else root.parent
-    folder = (Path(calibration) if calibration is not None else beside / "calib") / str(stamp)
+        raise FormatError(root / "metadata.json", "calib", stamp, "the stamp of a calibration (-1 = none)")
+    parent = root.parent.parent if root.parent.name == "action" else root.parent
+    folder = (Path(calibration) if calibration is not None else parent / "calib") / str(stamp)
     hw = files.to_array(calibrated_hw, (2,), root, "option calibrated_hw")
     rig = _SceneCameras(
         root=root,
@@ -115,14 +115,14 @@ def read(
     present = sorted(d.name[4:] for d in root.glob("cam_*") if d.is_dir())
     if unknown := sorted(set(serials or ()) - set(present)):
         raise FormatError(root, "option serials", ", ".join(unknown), f"some of {', '.join(present)}")
-    lacking = {} if serials else {s: why for s in present if (why := rig.lacks(s))}
-    opened = [s for s in serials or present if s not in lacking]
+    incomplete = {} if serials else {s: reason for s in present if (reason := rig.lacks(s))}
+    opened = [s for s in serials or present if s not in incomplete]
     if not opened:
-        raise FormatError(root, "cameras", ", ".join(lacking.values()) or "none", "one with images and calibration")
-    left_out = tuple(f"camera {s}: {why}: left out" for s, why in lacking.items())
-    bad = meta.get("bad_calib_view", ())
-    doubted = {str(s) for s in bad} if isinstance(bad, list) else set()
-    return [rig.recording(s, left_out, s in doubted) for s in opened]
+        raise FormatError(root, "cameras", ", ".join(incomplete.values()) or "none", "one with images and calibration")
+    left_out = tuple(f"camera {s}: {reason}: left out" for s, reason in incomplete.items())
+    doubtful = meta.get("bad_calib_view", ())
+    doubtful_serials = {str(s) for s in doubtful} if isinstance(doubtful, list) else set()
+    return [rig.recording(s, left_out, s in doubtful_serials) for s in opened]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ class _Load:
 
     colour: Path
     depth: Path | None
-    places: tuple[tuple[int, int], ...]  # number of the colour frame, number of the depth frame
+    places: tuple[tuple[int, int], ...]  # index of the colour frame, index of the depth frame
     camera: Camera
     hw: tuple[int, int]
     depth_hw: tuple[int, int]
@@ -153,7 +153,7 @@ class _Load:
 
 @dataclass(frozen=True, eq=False)
 class _SceneCameras:
-    """All that the cameras of a scene share."""
+    """Data and options common to the cameras of a scene."""
 
     root: Path
     depth_root: Path
@@ -167,7 +167,7 @@ class _SceneCameras:
     outlier: float
 
     def lacks(self, serial: str) -> str | None:
-        """Why a camera cannot be opened."""
+        """The reason why a camera cannot be opened; None if it can."""
         for name in ("color.mp4", "timestamps.npy"):
             if not (self.root / f"cam_{serial}" / name).is_file():
                 return f"no {name}"
@@ -176,7 +176,7 @@ class _SceneCameras:
     def recording(self, serial: str, report: tuple[str, ...], doubted: bool) -> Recording:
         home = self.root / f"cam_{serial}"
         colour, depth = home / "color.mp4", self.depth_root / f"cam_{serial}" / "depth.mp4"
-        notes = list(report) + ([f"camera {serial}: metadata doubts its calibration"] if doubted else [])
+        notes = list(report) + ([f"camera {serial}: calibration marked as bad in the metadata"] if doubted else [])
         header = read_video_header(colour)
         size = header.hw
         depth_size = size
@@ -218,15 +218,15 @@ class _SceneCameras:
         value = self.K.get(serial)
         K = value if isinstance(value, np.ndarray) else None
         if K is None or K.shape not in ((3, 3), (3, 4)) or K.dtype.kind not in "fiu" or (K[:, 3:] != 0).any():
-            found = type(value).__name__ if K is None else f"an array of shape {K.shape}"
-            raise FormatError(file, serial, found, "3x3 intrinsics, or 3x4 with zeros behind")
+            problem = type(value).__name__ if K is None else f"an array of shape {K.shape}"
+            raise FormatError(file, serial, problem, "3x3 intrinsics, or 3x4 with a zero column")
         if hw[0] * self.hw[1] != hw[1] * self.hw[0]:
             raise FormatError(file, "image size", f"{hw[1]}x{hw[0]}", f"the shape of {self.hw[1]}x{self.hw[0]}")
         full = convert.to_camera(K[:, :3].astype(np.float64), self.hw, file, serial)
         return cameras.resize(full.to(torch.float64), self.hw, hw).to(torch.float32)
 
     def _extrinsics(self, serial: str) -> np.ndarray:
-        """World → camera: the first of a camera's matrices."""
+        """World → camera (4, 4): the first of a camera's matrices."""
         file = self.folder / "extrinsics.npy"
         value = self.E.get(serial)
         first = value[0] if isinstance(value, list | np.ndarray) and len(value) else None
@@ -238,14 +238,16 @@ class _SceneCameras:
     def _places(
         self, file: Path, n_colour: int, depth: Path | None, notes: list[str]
     ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
-        """(colour frame, depth frame) and the time of every pair, in the order of time."""
+        """Index pairs (colour frame, depth frame) and their times (s), sorted by time."""
         lists = read_npy(file)
         colour = _frame_stamps(lists, "color", n_colour, file, notes)
         if depth is None:
             return tuple((k, -1) for k, _ in colour), np.array([t for _, t in colour])
-        other = _frame_stamps(lists, "depth", read_video_header(depth).n, file, notes)
-        at = nearest_stamps(np.array([t for _, t in colour]), np.array([t for _, t in other]), self.max_difference)
-        pairs = [(k, other[j][0], t) for (k, t), j in zip(colour, at, strict=True) if j >= 0]
+        depth_stamps = _frame_stamps(lists, "depth", read_video_header(depth).n, file, notes)
+        nearest = nearest_stamps(
+            np.array([t for _, t in colour]), np.array([t for _, t in depth_stamps]), self.max_difference
+        )
+        pairs = [(k, depth_stamps[j][0], t) for (k, t), j in zip(colour, nearest, strict=True) if j >= 0]
         if len(pairs) < len(colour):
             images = format_count(len(colour) - len(pairs), "image")
             notes.append(f"{images} without depth within {self.max_difference} s: left out")
@@ -254,22 +256,24 @@ class _SceneCameras:
         return tuple((k, j) for k, j, _ in pairs), np.array([t for _, _, t in pairs])
 
     def _poses(self, serial: str, times: np.ndarray, notes: list[str]) -> tuple[Pose | None, np.ndarray]:
-        """Poses of the covered times, and which are covered."""
-        every = np.ones(len(times), dtype=bool)
+        """Poses at the covered ``times`` (None = no poses), and the mask (n,) of covered times."""
+        all_covered = np.ones(len(times), dtype=bool)
         file = self.folder / "extrinsics.npy"
         E = self._extrinsics(serial)
         if self.arm is None or serial not in self.arm.in_hand:
             if self.arm is None:
-                notes.append("unknown configuration: every camera is taken to stand still (option configuration)")
-            return convert.to_poses(np.repeat(np.linalg.inv(E)[None], len(times), 0), file, serial), every
-        lacking = [f for f in (self.folder / "tcp.npy", self.root / "transformed" / "tcp_base.npy") if not f.is_file()]
-        if lacking or self.arm.in_hand[0] not in self.E:
-            what = lacking[0].name if lacking else f"extrinsics of {self.arm.in_hand[0]}"
-            notes.append(f"camera {serial} is on the hand and there is no {what}: no poses")
-            return None, every
+                notes.append("unknown configuration: every camera is assumed stationary (option configuration)")
+            return convert.to_poses(np.repeat(np.linalg.inv(E)[None], len(times), 0), file, serial), all_covered
+        missing_files = [
+            f for f in (self.folder / "tcp.npy", self.root / "transformed" / "tcp_base.npy") if not f.is_file()
+        ]
+        if missing_files or self.arm.in_hand[0] not in self.E:
+            missing = missing_files[0].name if missing_files else f"extrinsics of {self.arm.in_hand[0]}"
+            notes.append(f"camera {serial} is on the hand, without {missing}: no poses")
+            return None, all_covered
         stream = read_tcp_in_base(self.root)
         if not len(stream.times):
-            raise FormatError(self.root / "transformed" / "tcp_base.npy", "entries", "none that is usable", "poses")
+            raise FormatError(self.root / "transformed" / "tcp_base.npy", "entries", "none usable", "poses")
         tcp, covered = stream.at(times, self.max_gap)
         if not covered.any():
             raise FormatError(
@@ -288,8 +292,8 @@ class _SceneCameras:
 def _find_arm(root: Path, configuration: int | None, in_hand: Sequence[str] | None) -> RobotArm | None:
     if configuration is not None and configuration not in ROBOT_ARMS:
         raise FormatError(root, "option configuration", configuration, "1 to 7")
-    named = re.search(r"cfg_0*([1-7])(?!\d)", root.resolve().name)
-    number = configuration or (int(named[1]) if named else None)
+    match = re.search(r"cfg_0*([1-7])(?!\d)", root.resolve().name)
+    number = configuration or (int(match[1]) if match else None)
     if number is None:
         return None
     return ROBOT_ARMS[number]._replace(in_hand=tuple(in_hand)) if in_hand is not None else ROBOT_ARMS[number]
@@ -303,7 +307,7 @@ def _read_by_serial(file: Path) -> dict[str, Any]:
 
 
 def _frame_stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -> list[tuple[int, float]]:
-    """(frame number, s) of the frames that are in the video, in increasing time."""
+    """(frame index, time in s) of the video's frames, strictly increasing in time."""
     stamps = lists.get(kind) if isinstance(lists, dict) else None
     if isinstance(stamps, np.ndarray):
         stamps = stamps.tolist()
@@ -318,13 +322,15 @@ def _frame_stamps(lists: Any, kind: str, n: int, file: Path, notes: list[str]) -
         if not kept or t > kept[-1][1]:
             kept.append((k, t))
     if (lost := min(n, len(stamps)) - len(kept)) > 0:
-        notes.append(f"{format_count(lost, f'{kind} frame')} whose stamp is not later than the one before: left out")
+        notes.append(
+            f"{format_count(lost, f'{kind} frame')} with a time stamp not later than the previous one: left out"
+        )
     return kept
 
 
 def _remove_outliers(depth: Tensor, limit: float) -> Tensor:
-    """Returns further than ``limit`` from the median of the returns in their 5×5 neighbourhood become no return."""
+    """Depth (h, w) without returns further than ``limit`` m from the median of their 5×5 window; those become 0."""
     empty = torch.where(depth > 0, depth, torch.full_like(depth, torch.nan))
-    around = torch.nn.functional.pad(empty, (2, 2, 2, 2), value=torch.nan).unfold(0, 5, 1).unfold(1, 5, 1)
-    middle = around.reshape(*depth.shape, 25).nanmedian(-1).values
-    return torch.where((depth - middle).abs() > limit, torch.zeros_like(depth), depth)
+    windows = torch.nn.functional.pad(empty, (2, 2, 2, 2), value=torch.nan).unfold(0, 5, 1).unfold(1, 5, 1)
+    median = windows.reshape(*depth.shape, 25).nanmedian(-1).values
+    return torch.where((depth - median).abs() > limit, torch.zeros_like(depth), depth)

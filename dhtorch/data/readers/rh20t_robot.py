@@ -1,4 +1,4 @@
-"""The robot's side of an RH20T scene: its streams at their own clocks, and the camera that the hand carries.
+"""Robot data of RH20T scenes: streams with their own time stamps, and poses of the camera on the hand.
 
 Alphabet: ``E`` world → camera (the world is the calibration marker); ``T`` tool centre point (tcp) → robot base; ``X``
 tcp → camera, constant for a camera on the hand. Poses in files are x y z qw qx qy qz, metres, scalar first.
@@ -22,7 +22,7 @@ _HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 class RobotArm(NamedTuple):
-    """One of the seven robot set-ups, from the configuration file of the data set's own tools."""
+    """Calibration of one of the seven robot set-ups, from the configuration file of the data set's tools."""
 
     robot: str
     in_hand: tuple[str, ...]  # serials of the cameras on the hand; X belongs to the first
@@ -58,34 +58,35 @@ ROBOT_ARMS = {
 
 
 class RobotStream(NamedTuple):
-    """One quantity at its own clock."""
+    """One quantity with its own time stamps."""
 
     times: np.ndarray  # (m,) s, increasing
     values: np.ndarray  # (m, d) as stored
     pose: bool = False  # values are x y z qw qx qy qz
 
     def at(self, times: np.ndarray, max_gap: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-        """Values (n, d) at other ``times`` (n,), and which of these the stream covers, (n,) bool.
+        """Values (n, d) interpolated at ``times`` (n,), and the mask (n,) of the times that the stream covers.
 
         Between two entries at most ``max_gap`` s apart: linear, rotations along the shortest arc at constant speed. The
-        nearest entry where that is less than a millisecond away. Elsewhere not covered, and the value is the nearest.
+        nearest entry where it is less than a millisecond away. Elsewhere the time is not covered and the value is that
+        of the nearest entry.
         """
         after = np.searchsorted(self.times, times).clip(min(1, len(self.times) - 1), len(self.times) - 1)
         before = (after - 1).clip(0)
         a, b, span = self.values[before], self.values[after], self.times[after] - self.times[before]
-        share = ((times - self.times[before]) / np.where(span > 0, span, 1)).clip(0, 1)
+        weight = ((times - self.times[before]) / np.where(span > 0, span, 1)).clip(0, 1)
         inside = (times >= self.times[0]) & (times <= self.times[-1]) & (span <= max_gap)
-        share = np.where(inside, share, np.round(share))
-        values = a + share[:, None] * (b - a)
+        weight = np.where(inside, weight, np.round(weight))
+        values = a + weight[:, None] * (b - a)
         if self.pose:
             q_a, q_b = (x[:, 3:] / np.linalg.norm(x[:, 3:], axis=-1, keepdims=True) for x in (a, b))
-            values[:, 3:] = convert.slerp(q_a, q_b, share)
-        near = np.minimum(np.abs(times - self.times[before]), np.abs(times - self.times[after])) < 1e-3
-        return values, inside | near
+            values[:, 3:] = convert.slerp(q_a, q_b, weight)
+        is_near = np.minimum(np.abs(times - self.times[before]), np.abs(times - self.times[after])) < 1e-3
+        return values, inside | is_near
 
 
-#: Lists of entries by camera: the fields of an entry that are streams, what these are called, and their length (None =
-#: as stored). The name of a list that holds for all cameras ends in ``_base``.
+#: File → fields of its entries that are streams → (name of the stream, length; None = as stored). Files whose names end
+#: in ``_base`` hold values common to all cameras, others one list per camera.
 _STREAM_FIELDS: dict[str, dict[str, tuple[str, int | None]]] = {
     "tcp": {"tcp": ("tcp", 7)},
     "tcp_base": {"tcp": ("tcp_base", 7), "robot_ft": ("robot_ft", None)},
@@ -95,35 +96,36 @@ _STREAM_FIELDS: dict[str, dict[str, tuple[str, int | None]]] = {
 
 
 def read_robot_streams(root: str | Path) -> dict[str, RobotStream]:
-    """What the robot recorded in one scene folder.
+    """Read the robot's streams of one scene folder.
 
     Returns:
         ``read_tcp_in_base`` (m, 7) in the robot's base frame and ``tcp/<serial>`` (m, 7) in that camera's frame;
-        ``force_torque_base`` and ``force_torque/<serial>`` (m, 6) of the sensor at the wrist, its zero taken off, and
-        ``force_torque_base_raw``, ``force_torque_raw/<serial>`` without; ``robot_ft``, what the robot itself says;
+        ``force_torque_base`` and ``force_torque/<serial>`` (m, 6) of the sensor at the wrist with its zero subtracted,
+        ``force_torque_base_raw`` and ``force_torque_raw/<serial>`` without; ``robot_ft``, the robot's own measurement;
         ``joint`` (m, d) rad, with velocities where the set-up has them; ``gripper_command`` and ``gripper_info``
         (m, d) as stored, element 0 the width, by its use in mm (unconfirmed). Entries of all cameras' clocks are
-        merged, except in streams of one camera. What a scene lacks is absent: where a human shows the task
-        (``_human``), perhaps all (unconfirmed). ``high_freq_data``, whose layout nobody describes, is not read.
+        merged, except in streams of one camera. Streams that a scene lacks are absent: in human
+        demonstrations (``_human``) perhaps all (unconfirmed). ``high_freq_data`` is not read: its layout is
+        undocumented.
 
     Raises:
         FormatError: a damaged file.
     """
     folder = Path(root) / "transformed"
-    found: dict[str, RobotStream] = {}
+    streams: dict[str, RobotStream] = {}
     for kind, fields in _STREAM_FIELDS.items():
         if (file := folder / f"{kind}.npy").is_file():
             for field, (name, width) in fields.items():
-                found |= _read_field_streams(file, field, name, width)
+                streams |= _read_field_streams(file, field, name, width)
     if (file := folder / "joint.npy").is_file():
-        found["joint"] = _make_stream(file, _iter_stamped(file, None))
+        streams["joint"] = _make_stream(file, _iter_stamped(file, None))
     if (file := folder / "gripper.npy").is_file():
-        found |= {part: _make_stream(file, _iter_stamped(file, part)) for part in ("gripper_command", "gripper_info")}
-    return {name: stream for name, stream in found.items() if len(stream.times)}
+        streams |= {part: _make_stream(file, _iter_stamped(file, part)) for part in ("gripper_command", "gripper_info")}
+    return {name: stream for name, stream in streams.items() if len(stream.times)}
 
 
 def read_tcp_in_base(root: Path) -> RobotStream:
-    """The tcp in the base frame, entries of all cameras' clocks merged; entries that are all zero or NaN left out.
+    """Tcp poses in the base frame, merged over all cameras' clocks; entries that are zero or NaN are left out.
 
     Raises:
         FormatError: missing or damaged file.
@@ -133,16 +135,16 @@ def read_tcp_in_base(root: Path) -> RobotStream:
 
 def hand_camera_poses(
     arm: RobotArm,
-    serial_E: np.ndarray,  # (4, 4) of the camera asked for, when calibrated
-    hand_E: np.ndarray,  # (4, 4) of the first camera on the hand, when calibrated
-    tcp_calibration: np.ndarray,  # (4, 4) T when calibrated
+    serial_E: np.ndarray,  # (4, 4) of the camera, at calibration
+    hand_E: np.ndarray,  # (4, 4) of the first camera on the hand, at calibration
+    tcp_calibration: np.ndarray,  # (4, 4) T at calibration
     tcp: np.ndarray,  # (n, 7) published tcp in the base frame
     file: Path,
 ) -> np.ndarray:
     """Camera-to-world (n, 4, 4) of a camera on the hand while the tcp moves.
 
-    At calibration the marker gave E of every camera; from the first one on the hand and X follows where the base is,
-    E⁻¹ X T⁻¹ maps base to world. A camera on the hand keeps its place relative to the tcp.
+    Calibration with the marker gives E of every camera. From E of the first camera on the hand, X and T follows the
+    pose of the base: E⁻¹ X T⁻¹ maps base to world. A camera on the hand is fixed relative to the tcp.
     """
     world_from_base = np.linalg.inv(hand_E) @ arm.X @ np.linalg.inv(tcp_calibration)
     cam_from_tcp = serial_E @ np.linalg.inv(hand_E) @ arm.X
@@ -155,10 +157,10 @@ def read_calibration_tcp(file: Path, arm: RobotArm) -> np.ndarray:
     """T (4, 4) at calibration, from ``tcp.npy`` of the calibration folder in the robot's own notation.
 
     Flexiv and UR5 store a quaternion; KUKA mm and Euler angles (about x, y, z in this order, fixed axes); Franka a
-    rotation vector and a tool that looks the other way.
+    rotation vector, with the tool's axis reversed.
 
     Raises:
-        FormatError: missing or damaged file, or a number of values that this robot does not write.
+        FormatError: missing or damaged file, or an unexpected number of values for this robot.
     """
     value = read_npy(file)
     size = {"flexiv": 7, "ur5": 7}.get(arm.robot, 6)
@@ -179,7 +181,7 @@ def ms_to_seconds(value: Any, file: Path, field: str) -> float:
     """Unix milliseconds → s.
 
     Raises:
-        FormatError: no number, or a time outside 1970 to 2100.
+        FormatError: not a number, or a time outside 1970 to 2100.
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _MAX_STAMP_MS:
         raise FormatError(file, field, value if isinstance(value, float) else type(value).__name__, "Unix milliseconds")
@@ -190,7 +192,7 @@ def ms_to_seconds(value: Any, file: Path, field: str) -> float:
 
 
 def _make_stream(file: Path, entries: Iterator[tuple[float, np.ndarray]], pose: bool = False) -> RobotStream:
-    """Entries in any order, those with one stamp once."""
+    """Stream of entries in any order; of several with one stamp the last."""
     merged = dict(entries)
     if len({len(value) for value in merged.values()}) > 1:
         raise FormatError(file, "entries", "vectors of several lengths", "one length")
@@ -199,16 +201,16 @@ def _make_stream(file: Path, entries: Iterator[tuple[float, np.ndarray]], pose: 
 
 
 def _read_field_streams(file: Path, field: str, name: str, width: int | None) -> dict[str, RobotStream]:
-    """One field of all entries as one stream, or as one for each camera."""
+    """One field of all entries as one stream, or as one stream per camera."""
     by_camera = _check_mapping(read_npy(file), file, "content")
-    every = {name: list(by_camera.values())}
-    groups = every if file.stem.endswith("_base") else {f"{name}/{s}": [entries] for s, entries in by_camera.items()}
+    joint = {name: list(by_camera.values())}
+    groups = joint if file.stem.endswith("_base") else {f"{name}/{s}": [entries] for s, entries in by_camera.items()}
     pose = field == "tcp"
     return {key: _make_stream(file, _iter_entries(file, lists, field, width), pose) for key, lists in groups.items()}
 
 
 def _iter_entries(file: Path, lists: list[Any], field: str, width: int | None) -> Iterator[tuple[float, np.ndarray]]:
-    """(s, values) of the entries that have the field; numbers that are not finite, and poses of zeros, are none."""
+    """(time in s, values) of the entries with the field; without non-finite values and zero poses."""
     for entries in lists:
         if not isinstance(entries, list):
             raise FormatError(file, "entries", type(entries).__name__, "a list for each camera")
@@ -226,6 +228,7 @@ def _iter_entries(file: Path, lists: list[Any], field: str, width: int | None) -
 
 
 def _iter_stamped(file: Path, part: str | None) -> Iterator[tuple[float, np.ndarray]]:
+    """(time in s, values) of the entries, or of their field ``part``, of a dict serial → stamp → entry."""
     for serial, entries in _check_mapping(read_npy(file), file, "content").items():
         for stamp, entry in _check_mapping(entries, file, serial, texts=False).items():
             value = entry.get(part) if part and isinstance(entry, dict) else entry
@@ -244,7 +247,7 @@ def _parse_numbers(value: Any) -> bool:
 
 
 def _check_mapping(value: Any, file: Path, field: str, texts: bool = True) -> dict[Any, Any]:
-    """A dict; its keys as texts, since a serial may be stored as a number."""
+    """Checked dict; with ``texts`` its keys as strings, since a serial may be stored as a number."""
     if not isinstance(value, dict):
         raise FormatError(file, field, type(value).__name__, "a dict")
     return {str(key): entry for key, entry in value.items()} if texts else value

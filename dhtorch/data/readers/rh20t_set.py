@@ -1,4 +1,4 @@
-"""Many RH20T scenes as one set: one recording for each scene, seen by the camera that the robot carries."""
+"""Reader of RH20T sets: one recording per scene, from the camera on the robot's hand."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def open_set(
     max_gap: float = 0.5,
     outlier: float = 0.0,
 ) -> Recordings:
-    """The scenes below a folder that a robot moved in, each opened when it is asked for.
+    """Open the robot scenes below a folder, each on access.
 
     A scene is a folder named ``task_…_user_…_scene_…_cfg_…`` in ``root`` or one level below (``RH20T_cfg1``, …).
-    Left out: demonstrations by a person (``_human``), scenes without a calibration, scenes without the camera asked
-    for.
+    Left out: demonstrations by a person (``_human``), scenes without a calibration, scenes without the requested
+    camera.
 
     Args:
         root: folder of the set.
-        camera: ``hand`` = the first camera on the hand that the scene has, or a serial.
+        camera: ``hand`` = the scene's first camera on the hand, or a serial number.
         depth_root: the parallel tree of depth videos; None = ``root``.
-        limit: the first so many scenes, by name; None = all.
+        limit: number of scenes to open, the first by name; None = all.
         max_difference, max_gap, outlier: as :func:`dhtorch.data.readers.rh20t.read`.
 
     Returns:
@@ -49,14 +49,14 @@ def open_set(
     base = Path(root)
     if not base.is_dir():
         raise FormatError(base, "path", "no such folder", "a folder of RH20T scenes")
-    found = list(_list_scenes(base, camera))[:limit]
-    if not found:
-        wanted = f"task_…_cfg_… folders with a calibration and the camera {camera!r}"
-        raise FormatError(base, "scenes", "none", wanted)
+    scenes = list(_list_scenes(base, camera))[:limit]
+    if not scenes:
+        expected = f"task_…_cfg_… folders with a calibration and the camera {camera!r}"
+        raise FormatError(base, "scenes", "none", expected)
     options = {"max_difference": max_difference, "max_gap": max_gap, "outlier": outlier}
-    names = [f"{folder.name}/{serial}" for folder, serial in found]
+    names = [f"{folder.name}/{serial}" for folder, serial in scenes]
     depth = None if depth_root is None else Path(depth_root)
-    return Recordings(names, _OpenScene(base, tuple(found), depth, options))
+    return Recordings(names, _OpenScene(base, tuple(scenes), depth, options))
 
 
 @dataclass(frozen=True)
@@ -64,24 +64,25 @@ class _OpenScene:
     """Position → recording."""
 
     root: Path
-    found: tuple[tuple[Path, str], ...]  # folder of the scene, serial of the camera
+    scenes: tuple[tuple[Path, str], ...]  # folder of the scene, serial of the camera
     depth_root: Path | None
     options: dict[str, Any]
 
     def __call__(self, i: int) -> Recording:
-        scene, serial = self.found[i]
+        scene, serial = self.scenes[i]
         depth = None if self.depth_root is None else str(self.depth_root / scene.relative_to(self.root))
         return rh20t.read(scene, serials=[serial], depth_root=depth, **self.options)[0]
 
 
 def _list_scenes(root: Path, camera: str) -> Iterator[tuple[Path, str]]:
+    """(folder, serial of the camera) of each calibrated robot scene that has the camera."""
     folders = sorted({f for pattern in ("task_*", "*/task_*") for f in root.glob(pattern)}, key=lambda f: f.name)
     for folder in folders:
-        named = _SCENE_PATTERN.fullmatch(folder.name)
-        if named is None or not (folder / "metadata.json").is_file():
+        match = _SCENE_PATTERN.fullmatch(folder.name)
+        if match is None or not (folder / "metadata.json").is_file():
             continue
-        wanted = ROBOT_ARMS[int(named[1])].in_hand if camera == "hand" else (camera,)
-        serial = next((s for s in wanted if (folder / f"cam_{s}" / "color.mp4").is_file()), None)
+        serials = ROBOT_ARMS[int(match[1])].in_hand if camera == "hand" else (camera,)
+        serial = next((s for s in serials if (folder / f"cam_{s}" / "color.mp4").is_file()), None)
         calibrated = files.read_json(folder / "metadata.json").get("calib", -1) not in (-1, "-1")
         if serial is not None and calibrated:
             yield folder, serial

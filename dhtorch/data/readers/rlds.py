@@ -1,11 +1,11 @@
-"""RLDS data sets in TFRecord files, as TFDS writes them, read without TensorFlow; one recording per episode and camera.
+"""Reader of RLDS data sets in TFRecord files (TFDS), without TensorFlow; one recording per episode and camera.
 
-``features.json`` names the features and ``dataset_info.json`` the set; a record is an episode, of which every feature
-holds all steps, one behind the other: ``steps/observation/image_0`` as many encoded pictures, ``steps/action`` seven
-numbers for each. Only the lengths of records are read when a set is opened, and of a frame its own pictures.
+``features.json`` names the features and ``dataset_info.json`` the set. A record is an episode; each feature holds the
+values of all steps in order: ``steps/observation/image_0`` one encoded image a step, ``steps/action`` for example seven
+numbers a step. Opening a set reads only the lengths of its records; reading a frame reads only that frame's images.
 
 The format has no place for intrinsics, poses, time stamps and the unit of depth: they come from options, or from
-features where a set happens to have them. Cameras that stand still give no depth (NO_BASELINE).
+features where a set has them. Stationary cameras give no depth (NO_BASELINE).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings, consecutive_frame_numbers
 from dhtorch.records import Camera, Frame, Pose
 
-_MAX_EPISODE_STEPS = 100_000  # of an episode
+_MAX_EPISODE_STEPS = 100_000  # steps of an episode
 
 _SHARD_PATTERN = re.compile(r"^(?P<set>.+)-(?P<split>[^-]+)\.tfrecord-(?P<shard>\d{5})-of-(?P<of>\d{5})$")
 _UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
@@ -36,7 +36,7 @@ _STEPS_FEATURE = "steps"
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     if not root.is_dir() or not (root / "features.json").is_file():
         return None
     shard = next((file for file in root.iterdir() if _SHARD_PATTERN.match(file.name)), None)
@@ -65,26 +65,26 @@ def read(
         root: the folder, as a rule named after the set's version.
         split: such as ``train``. None = all.
         episode: number or numbers of the episodes, counted through the files of a split. None = all.
-        camera: feature or features of colour pictures, such as ``observation/image_0``. None = all.
-        depth: feature with depth: pictures of 16 bits, or an array. None = the one named like the camera with
-            ``depth`` in the place of ``image`` or ``rgb``; without any, depth is empty and the report says so.
-        K: fx, fy, cx, cy of the picture. None = as ``intrinsics`` says.
-        fov: degrees from side to side of the picture; a guessed K for where none is known.
-        K_depth: the same as K of a depth map that is not registered to colour.
-        distortion: of the picture, OpenCV's order.
+        camera: feature or features of colour images, such as ``observation/image_0``. None = all.
+        depth: feature with depth: 16-bit images, or an array. None = the camera's name with ``depth`` in place of
+            ``image`` or ``rgb``; where there is none, depth is empty and the report notes it.
+        K: fx, fy, cx, cy of the image. None = from ``intrinsics``.
+        fov: horizontal field of view of the image in degrees, for a guessed K where none is available.
+        K_depth: as ``K``, of a depth map that is not registered to colour.
+        distortion: of the image, in OpenCV's order.
         intrinsics: feature with 4 (fx fy cx cy) or 9 numbers a step; or four numbers as ``K``, or one as ``fov``.
             None = ``<camera>_intrinsics`` where there is one.
         pose: feature with the camera-to-world pose of every step: 16 numbers (4×4 by rows) or 7 (x y z qx qy qz qw).
             None = ``<camera>_T_world_from_cam`` where there is one, else no poses.
-        depth_unit: ``"m"`` or ``"mm"``. None = mm for whole numbers and m for others.
-        rate_hz: steps a second; without it there are no times.
+        depth_unit: ``"m"`` or ``"mm"``. None = mm for integers and m for floats.
+        rate_hz: steps per second; without it there are no times.
 
     Returns:
-        Recordings named ``<set>/<split>_<number>/<camera>``; an episode is read when it is asked for.
+        Recordings named ``<set>/<split>_<number>/<camera>``; an episode is read on access.
 
     Raises:
-        FormatError: an unknown split, feature or episode, or damaged metadata; of a single episode also no K, a
-            damaged record, or values no camera or pose can have.
+        FormatError: an unknown split, feature or episode, or damaged metadata; on access to an episode also no K, a
+            damaged record, or values that are no camera or pose.
     """
     root = Path(root)
     if depth_unit not in (None, *_UNITS_PER_METRE):
@@ -95,17 +95,17 @@ def read(
     rigs = []
     for key in keys:
         hw = _picture_size(root, features, key)
-        said = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
+        stated = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
         rig = _CameraSpec(
             root=root,
             features=features,
             image=key,
             hw=hw,
             depth=_find_depth_feature(root, features, key, depth),
-            stated=said,
+            stated=stated,
             K_depth=K_depth,
             distortion=distortion,
-            intrinsics=_find_companion(root, features, key, said.feature, "intrinsics"),
+            intrinsics=_find_companion(root, features, key, stated.feature, "intrinsics"),
             pose=_find_companion(root, features, key, pose, "pose", "T_world_from_cam"),
             unit=depth_unit,
             rate_hz=rate,
@@ -122,76 +122,81 @@ def read(
 
 @dataclass(frozen=True)
 class StepFeature:
-    """What ``features.json`` says of one feature of a step."""
+    """Type and shape of one feature of a step, from ``features.json``."""
 
     kind: str  # "image", "text", or "tensor"
     dtype: str
-    shape: tuple[int, ...]  # of one step; -1 = not said
-    encoded: bool = False  # an array whose bytes are kept as one text
+    shape: tuple[int, ...]  # of one step; -1 = not stated
+    encoded: bool = False  # an array stored as one string of encoded bytes
 
 
 def _read_step_features(root: Path) -> dict[str, StepFeature]:
-    """Name → feature of the steps, such as ``observation/image_0``.
+    """``features.json`` → name → feature of the steps, such as ``observation/image_0``.
 
     Raises:
         FormatError: no such file, or no steps in it.
     """
     file = root / "features.json"
     tree = files.read_json(file)
-    steps = files.get_entry(tree, f"featuresDict.features.{_STEPS_FEATURE}.sequence.feature", dict, file)
-    found: dict[str, StepFeature] = {}
-    _flatten(steps, "", found, file, 0)
-    return found
+    nodes = files.get_entry(tree, f"featuresDict.features.{_STEPS_FEATURE}.sequence.feature", dict, file)
+    features: dict[str, StepFeature] = {}
+    _flatten(nodes, "", features, file, 0)
+    return features
 
 
-def _flatten(node: Any, name: str, found: dict[str, StepFeature], file: Path, deep: int) -> None:
-    if not isinstance(node, dict) or deep > 32:
+def _flatten(node: Any, name: str, features: dict[str, StepFeature], file: Path, depth: int) -> None:
+    """Add the features below ``node`` of the feature tree to ``features``, names joined by ``/``."""
+    if not isinstance(node, dict) or depth > 32:
         raise FormatError(file, name or _STEPS_FEATURE, type(node).__name__, "a feature")
     if isinstance(inner := node.get("featuresDict"), dict):
         for key, value in files.get_entry(inner, "features", dict, file).items():
-            _flatten(value, f"{name}/{key}" if name else key, found, file, deep + 1)
+            _flatten(value, f"{name}/{key}" if name else key, features, file, depth + 1)
         return
     if isinstance(image := node.get("image"), dict):
-        found[name] = StepFeature("image", str(image.get("dtype", "uint8")), _parse_shape(image, file, name))
+        features[name] = StepFeature("image", str(image.get("dtype", "uint8")), _parse_shape(image, file, name))
     elif isinstance(tensor := node.get("tensor"), dict):
         encoded = tensor.get("encoding", "none") not in ("none", "")
-        found[name] = StepFeature("tensor", str(tensor.get("dtype", "")), _parse_shape(tensor, file, name), encoded)
+        features[name] = StepFeature("tensor", str(tensor.get("dtype", "")), _parse_shape(tensor, file, name), encoded)
     elif "text" in node:
-        found[name] = StepFeature("text", "string", ())
+        features[name] = StepFeature("text", "string", ())
 
 
 def _parse_shape(node: dict[str, Any], file: Path, name: str) -> tuple[int, ...]:
     shape = node.get("shape")
     sizes = shape.get("dimensions", []) if isinstance(shape, dict) else []
     try:
-        found = tuple(int(size) for size in sizes)
+        dimensions = tuple(int(size) for size in sizes)
     except (TypeError, ValueError):
         raise FormatError(file, f"{name} shape", sizes, "whole numbers") from None
-    if len(found) > 8 or any(not -1 <= size <= files.MAX_PIXELS for size in found):
-        raise FormatError(file, f"{name} shape", found, "sizes of an array")
-    return found
+    if len(dimensions) > 8 or any(not -1 <= size <= files.MAX_PIXELS for size in dimensions):
+        raise FormatError(file, f"{name} shape", dimensions, "sizes of an array")
+    return dimensions
 
 
 def _read_set_name(root: Path) -> str:
-    """As the set calls itself, else as its folders are called."""
+    """The name in ``dataset_info.json``, else the name of the folder above."""
     file = root / "dataset_info.json"
     name = files.read_json(file).get("name") if file.is_file() else None
     return name if isinstance(name, str) and name else root.resolve().parent.name
 
 
 def _select_colour(root: Path, features: dict[str, StepFeature], camera: str | Sequence[str] | None) -> list[str]:
-    known = [name for name, f in features.items() if f.kind == "image" and f.dtype == "uint8" and f.shape[-1:] != (1,)]
-    known = sorted((name for name in known if "depth" not in name), key=lambda name: files.natural_sort_key(Path(name)))
-    wanted = known if camera is None else [camera] if isinstance(camera, str) else list(camera)
-    unknown = [name for name in wanted if name not in known]
-    if unknown or not wanted:
-        expected = f"one of {', '.join(known)}" if known else "a feature with colour pictures"
-        raise FormatError(root, "option camera", ", ".join(unknown) or "no camera", expected)
-    return wanted
+    colour_features = [
+        name for name, f in features.items() if f.kind == "image" and f.dtype == "uint8" and f.shape[-1:] != (1,)
+    ]
+    colour_features = sorted(
+        (name for name in colour_features if "depth" not in name), key=lambda name: files.natural_sort_key(Path(name))
+    )
+    names = colour_features if camera is None else [camera] if isinstance(camera, str) else list(camera)
+    not_colour = [name for name in names if name not in colour_features]
+    if not_colour or not names:
+        expected = f"one of {', '.join(colour_features)}" if colour_features else "a feature with colour images"
+        raise FormatError(root, "option camera", ", ".join(not_colour) or "no camera", expected)
+    return names
 
 
 def _picture_size(root: Path, features: dict[str, StepFeature], key: str) -> tuple[int, int]:
-    """Height and width of a feature's pictures; of those that do not say, of the first one."""
+    """(h, w) of a feature's images: from its stated shape, else from the header of the first image."""
     shape = features[key].shape
     if len(shape) >= 2 and min(shape[:2]) > 0:
         return shape[0], shape[1]
@@ -199,7 +204,7 @@ def _picture_size(root: Path, features: dict[str, StepFeature], key: str) -> tup
     body = tfrecord.read_record(place.file, place.span)
     pictures = tfrecord.parse_example(body, place.file, place.span.offset).get(f"{_STEPS_FEATURE}/{key}")
     if pictures is None or pictures.kind != "bytes" or not pictures.spans:
-        raise FormatError(place.file, key, "no pictures", "encoded pictures")
+        raise FormatError(place.file, key, "no images", "encoded images")
     return files.decode_image_header(tfrecord.read_span(place.file, pictures.spans[0]), place.file).hw
 
 
@@ -211,11 +216,13 @@ def _find_depth_feature(root: Path, features: dict[str, StepFeature], image: str
 
 
 def _find_companion(
-    root: Path, features: dict[str, StepFeature], image: str, given: str | None, option: str, ending: str = ""
+    root: Path, features: dict[str, StepFeature], image: str, feature: str | None, option: str, suffix: str = ""
 ) -> str | None:
-    """The feature as given, else the one named after the camera."""
-    name = f"{image}_{ending or option}"
-    return _check_feature(root, features, given, option) if given is not None else name if name in features else None
+    """The feature named by the option, else ``<camera>_<suffix or option>`` where there is one."""
+    name = f"{image}_{suffix or option}"
+    return (
+        _check_feature(root, features, feature, option) if feature is not None else name if name in features else None
+    )
 
 
 def _check_feature(root: Path, features: dict[str, StepFeature], name: str | None, option: str) -> str | None:
@@ -226,36 +233,38 @@ def _check_feature(root: Path, features: dict[str, StepFeature], name: str | Non
 
 @dataclass(frozen=True)
 class RecordLocation:
-    """Where an episode lies: one record of a file."""
+    """The record of an episode: its file and span of bytes."""
 
     split: str
     number: int  # in its split
-    place: int  # among all of the splits that are opened
+    place: int  # number among all episodes of the opened splits
     file: Path
     span: tfrecord.ByteSpan
 
 
-def _locate_episodes(root: Path, split: str | None, wanted: int | Sequence[int] | None) -> list[RecordLocation]:
+def _locate_episodes(root: Path, split: str | None, numbers: int | Sequence[int] | None) -> list[RecordLocation]:
     shards: dict[str, list[Path]] = {}
     for file in sorted(root.iterdir(), key=files.natural_sort_key):
         if match := _SHARD_PATTERN.match(file.name):
             shards.setdefault(match["split"], []).append(file)
     if split is not None and split not in shards:
         raise FormatError(root, "option split", split, f"one of {', '.join(sorted(shards))}")
-    chosen = None if wanted is None else {wanted} if isinstance(wanted, int) else {int(each) for each in wanted}
-    found: list[RecordLocation] = []
-    before = 0
+    selected = None if numbers is None else {numbers} if isinstance(numbers, int) else {int(each) for each in numbers}
+    locations: list[RecordLocation] = []
+    n_before = 0
     for name in sorted(shards) if split is None else [split]:
         places = [(file, span) for file in shards[name] for span in tfrecord.index_records(file)]
-        if chosen is not None and (missing := chosen - set(range(len(places)))):
+        if selected is not None and (missing := selected - set(range(len(places)))):
             raise FormatError(root, "option episode", min(missing), f"0 to {len(places) - 1} in {name}")
-        found += [
-            RecordLocation(name, i, before + i, *at) for i, at in enumerate(places) if chosen is None or i in chosen
+        locations += [
+            RecordLocation(name, i, n_before + i, *at)
+            for i, at in enumerate(places)
+            if selected is None or i in selected
         ]
-        before += len(places)
-    if not found:
+        n_before += len(places)
+    if not locations:
         raise FormatError(root, "records", "none", "TFRecord files named <set>-<split>.tfrecord-<shard>-of-<shards>")
-    return found
+    return locations
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,8 +278,8 @@ class _MakeRecording:
     def __call__(self, i: int) -> Recording:
         episode, rig = self.episodes[i // len(self.rigs)], self.rigs[i % len(self.rigs)]
         body = tfrecord.read_record(episode.file, episode.span)
-        found = tfrecord.parse_example(body, episode.file, episode.span.offset)
-        return rig.recording(self.names[i], episode, found)
+        example = tfrecord.parse_example(body, episode.file, episode.span.offset)
+        return rig.recording(self.names[i], episode, example)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +289,7 @@ class LoadStep:
     file: Path
     images: tuple[tfrecord.ByteSpan, ...]
     hw: tuple[int, int]
-    depths: tuple[tfrecord.ByteSpan, ...]  # of pictures, or of arrays' numbers, one for each step
+    depths: tuple[tfrecord.ByteSpan, ...]  # of encoded images or of arrays' numbers, one a step
     depth: StepFeature | None
     cameras: Camera  # (n), or (1) for all
     depth_camera: Camera | None
@@ -308,7 +317,7 @@ class LoadStep:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _CameraSpec:
-    """One camera of the set and the options."""
+    """One camera of the set with its features and options."""
 
     root: Path
     features: dict[str, StepFeature]
@@ -323,15 +332,15 @@ class _CameraSpec:
     unit: str | None
     rate_hz: float | None
 
-    def recording(self, name: str, episode: RecordLocation, found: dict[str, tfrecord.ExampleFeature]) -> Recording:
-        """The recording of an episode whose features are known."""
+    def recording(self, name: str, episode: RecordLocation, example: dict[str, tfrecord.ExampleFeature]) -> Recording:
+        """The recording of this camera in an episode, from the episode's parsed record."""
         file = episode.file
-        images = self._pictures(file, found, self.image)
+        images = self._pictures(file, example, self.image)
         n = len(images)
         if not 0 < n <= _MAX_EPISODE_STEPS:
             raise FormatError(file, self.image, f"{n} steps", f"1 to {_MAX_EPISODE_STEPS}")
-        depths = () if self.depth is None else self._depths(file, found, self.depth, n)
-        cameras, depth_camera = self._cameras(file, found, n)
+        depths = () if self.depth is None else self._depths(file, example, self.depth, n)
+        cameras, depth_camera = self._cameras(file, example, n)
         load = LoadStep(
             file=file,
             images=images,
@@ -351,7 +360,7 @@ class _CameraSpec:
             number=consecutive_frame_numbers(n),
             root=self.root,
             times=None if self.rate_hz is None else consecutive_frame_numbers(n).double() / self.rate_hz,
-            poses=None if self.pose is None else self._poses(file, found, self.pose, n),
+            poses=None if self.pose is None else self._poses(file, example, self.pose, n),
             rate_hz=self.rate_hz,
             report=self.stated.report + (() if self.depth else (f"{self.image}: no depth feature: depth is empty",)),
             episode=episode.place,
@@ -359,40 +368,42 @@ class _CameraSpec:
         )
 
     def _pictures(
-        self, file: Path, found: dict[str, tfrecord.ExampleFeature], key: str
+        self, file: Path, example: dict[str, tfrecord.ExampleFeature], key: str
     ) -> tuple[tfrecord.ByteSpan, ...]:
-        feature = found.get(f"{_STEPS_FEATURE}/{key}")
+        feature = example.get(f"{_STEPS_FEATURE}/{key}")
         if feature is None or feature.kind != "bytes":
-            raise FormatError(file, key, "nothing" if feature is None else "numbers", "encoded pictures")
+            raise FormatError(file, key, "nothing" if feature is None else "numbers", "encoded images")
         return feature.spans
 
     def _depths(
-        self, file: Path, found: dict[str, tfrecord.ExampleFeature], key: str, n: int
+        self, file: Path, example: dict[str, tfrecord.ExampleFeature], key: str, n: int
     ) -> tuple[tfrecord.ByteSpan, ...]:
-        """Where each step's depth lies."""
+        """Span of bytes of each step's depth (n)."""
         described = self.features[key]
         if described.kind == "image":
-            spans = self._pictures(file, found, key)
+            spans = self._pictures(file, example, key)
             if len(spans) != n:
-                raise FormatError(file, key, f"{len(spans)} pictures", f"{n}, as many as {self.image}")
+                raise FormatError(file, key, f"{len(spans)} images", f"{n}, as many as {self.image}")
             return spans
-        shape, feature = described.shape, found.get(f"{_STEPS_FEATURE}/{key}")
+        shape, feature = described.shape, example.get(f"{_STEPS_FEATURE}/{key}")
         h, w = (*shape, 0, 0)[:2]
         single = len(shape) == 2 or (len(shape) == 3 and shape[2] == 1)
         if described.dtype != "float32" or described.encoded or not single or min(h, w) < 1:
-            found_there = f"{described.dtype} {shape}"
-            raise FormatError(self.root / "features.json", key, found_there, "pictures of 16 bits, or float32 (h, w)")
+            stored = f"{described.dtype} {shape}"
+            raise FormatError(self.root / "features.json", key, stored, "16-bit images, or float32 (h, w)")
         size = 4 * h * w
         whole = feature is not None and feature.kind == "float" and len(feature.spans) == 1
         if feature is None or not whole or feature.spans[0].length != n * size:
             raise FormatError(file, key, "other numbers", f"{n} arrays of {h}x{w} floats")
         return tuple(tfrecord.ByteSpan(feature.spans[0].offset + i * size, size) for i in range(n))
 
-    def _numbers(self, file: Path, found: dict[str, tfrecord.ExampleFeature], key: str, sizes: tuple[int, ...], n: int):
-        """(rows, size): one row a step, or one for all."""
+    def _numbers(
+        self, file: Path, example: dict[str, tfrecord.ExampleFeature], key: str, sizes: tuple[int, ...], n: int
+    ):
+        """Values (n, size) float64 of a feature, one row a step; ``size`` must be one of ``sizes``."""
         described = self.features[key]
         size = int(np.prod(described.shape)) if described.shape and min(described.shape) > 0 else 0
-        feature = found.get(f"{_STEPS_FEATURE}/{key}")
+        feature = example.get(f"{_STEPS_FEATURE}/{key}")
         if feature is None or size not in sizes:
             expected = " or ".join(map(str, sizes))
             raise FormatError(file, key, f"{size} numbers a step" if feature else "nothing", f"{expected} numbers")
@@ -401,7 +412,7 @@ class _CameraSpec:
             raise FormatError(file, key, f"{len(values)} numbers", f"{size} for each of {n} steps")
         return values.reshape(n, size).astype(np.float64)
 
-    def _cameras(self, file: Path, found: dict[str, tfrecord.ExampleFeature], n: int) -> tuple[Camera, Camera | None]:
+    def _cameras(self, file: Path, example: dict[str, tfrecord.ExampleFeature], n: int) -> tuple[Camera, Camera | None]:
         of_depth = None
         if self.depth is not None and self.K_depth is not None:
             shape = self.features[self.depth].shape
@@ -416,8 +427,8 @@ class _CameraSpec:
             raise intrinsics_options.missing_intrinsics_error(
                 self.root, self.image, "data.intrinsics=FEATURE", depth=self.depth is not None
             )
-        values = self._numbers(file, found, self.intrinsics, (4, 9), n)
+        values = self._numbers(file, example, self.intrinsics, (4, 9), n)
         return convert.to_cameras(values, self.hw, file, self.intrinsics, self.distortion), of_depth
 
-    def _poses(self, file: Path, found: dict[str, tfrecord.ExampleFeature], key: str, n: int) -> Pose:
-        return convert.parse_poses(self._numbers(file, found, key, (7, 16), n), file, key)
+    def _poses(self, file: Path, example: dict[str, tfrecord.ExampleFeature], key: str, n: int) -> Pose:
+        return convert.parse_poses(self._numbers(file, example, key, (7, 16), n), file, key)

@@ -1,7 +1,7 @@
-"""What an RLDS episode holds beside what a recording reads: actions, states, texts, every picture as it is encoded.
+"""Steps of an RLDS episode beyond its recordings: actions, states, texts and images in their stored encoding.
 
-Values come step by step, few at a time, as they are stored; a feature whose sizes are not said, or that is kept as
-encoded bytes, cannot be told from others and is left out.
+Values are read for a range of steps at a time, as they are stored. Features without a stated shape, or stored as
+encoded bytes, cannot be decoded and are left out.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from dhtorch.data.recording import Recording
 
 _STEPS, _EPISODE = "steps/", "episode_metadata/"
 
-#: Texts that say what is to be done, the likeliest first.
+#: Text features that hold the task's instruction, most common first.
 _INSTRUCTION_FEATURES = ("language_instruction", "natural_language_instruction", "instruction", "task")
 
 
 @dataclass(frozen=True)
 class EpisodeSteps:
-    """The steps of one episode."""
+    """The features of one episode's steps, read from its record."""
 
     place: rlds.RecordLocation
     n: int
-    features: Mapping[str, rlds.StepFeature]  # those that can be read
-    found: Mapping[str, tfrecord.ExampleFeature]  # of the record
-    numbers: dict[str, np.ndarray] = field(default_factory=dict)  # that can only be read all at once
+    features: Mapping[str, rlds.StepFeature]  # the readable ones
+    found: Mapping[str, tfrecord.ExampleFeature]  # parsed record
+    numbers: dict[str, np.ndarray] = field(default_factory=dict)  # cache of features that must be decoded whole
 
     @classmethod
     def of(cls, recording: Recording) -> EpisodeSteps:
-        """Those of the episode that a recording belongs to.
+        """The steps of a recording's episode.
 
         Raises:
             FormatError: a damaged record, or a feature of another length.
@@ -45,27 +45,27 @@ class EpisodeSteps:
         if not isinstance(load, rlds.LoadStep):
             raise ValueError(f"{recording.name}: found {recording.format}, expected rlds")
         body = tfrecord.read_record(load.place.file, load.place.span)
-        found = tfrecord.parse_example(body, load.place.file, load.place.span.offset)
+        example = tfrecord.parse_example(body, load.place.file, load.place.span.offset)
         n = len(load.images)
-        there = {name: f for name, f in load.features.items() if _is_readable(f) and f"{_STEPS}{name}" in found}
-        for name, feature in there.items():
-            spans = found[f"{_STEPS}{name}"].spans
+        readable = {name: f for name, f in load.features.items() if _is_readable(f) and f"{_STEPS}{name}" in example}
+        for name, feature in readable.items():
+            spans = example[f"{_STEPS}{name}"].spans
             if feature.kind != "tensor" and len(spans) != n:
                 raise FormatError(load.place.file, name, f"{len(spans)} values", f"{n}, one a step")
-        return cls(load.place, n, there, found)
+        return cls(load.place, n, readable, example)
 
     @property
     def instruction(self) -> str | None:
-        """The text that says what is to be done."""
+        """Name of the text feature with the task's instruction; None where there is none."""
         texts = [name for name, f in self.features.items() if f.kind == "text"]
-        known = [name for end in _INSTRUCTION_FEATURES for name in texts if name.rpartition("/")[2] == end]
-        return known[0] if known else None
+        instructions = [name for ending in _INSTRUCTION_FEATURES for name in texts if name.rpartition("/")[2] == ending]
+        return instructions[0] if instructions else None
 
     def values(self, name: str, steps: range) -> list[Any] | np.ndarray:
-        """Of some steps in a row: encoded pictures, texts, or numbers (steps, size) as they are stored.
+        """Values of a range of steps: encoded images, texts, or numbers (steps, size) in the stored type.
 
         Raises:
-            FormatError: damaged.
+            FormatError: a damaged record.
         """
         feature, described = self.found[f"{_STEPS}{name}"], self.features[name]
         if described.kind == "tensor":
@@ -80,13 +80,13 @@ class EpisodeSteps:
         if packed and feature.spans[0].length == 4 * size * self.n:
             at = feature.spans[0].offset + 4 * size * steps.start
             data = tfrecord.read_span(self.place.file, tfrecord.ByteSpan(at, 4 * size * len(steps)))
-            read = np.frombuffer(data, "<f4")
+            values = np.frombuffer(data, "<f4")
         else:
-            read = self._whole(name, feature, size)[size * steps.start : size * steps.stop]
-        return read.astype(described.dtype).reshape(len(steps), size)
+            values = self._whole(name, feature, size)[size * steps.start : size * steps.stop]
+        return values.astype(described.dtype).reshape(len(steps), size)
 
     def _whole(self, name: str, feature: tfrecord.ExampleFeature, size: int) -> np.ndarray:
-        """The numbers of all steps, decoded once."""
+        """The numbers of all steps (n · size), decoded once and cached."""
         if name not in self.numbers:
             whole = tfrecord.read_feature_numbers(self.place.file, name, feature, size * self.n)
             if len(whole) != size * self.n:
@@ -96,8 +96,8 @@ class EpisodeSteps:
 
     @property
     def about(self) -> dict[str, Any]:
-        """What the record says of the whole episode, texts and numbers alone."""
-        said: dict[str, Any] = {"split": self.place.split, "number": self.place.number}
+        """Metadata of the whole episode: split, number, and the record's texts and numbers."""
+        metadata: dict[str, Any] = {"split": self.place.split, "number": self.place.number}
         for name, feature in self.found.items():
             if not name.startswith(_EPISODE):
                 continue
@@ -108,14 +108,14 @@ class EpisodeSteps:
                 values = [v.decode("utf-8", "replace") for v in values]
             else:
                 values = tfrecord.read_feature_numbers(self.place.file, name, feature, 1 << 16).tolist()
-            said[name.removeprefix(_EPISODE)] = values[0] if len(values) == 1 else values
-        return said
+            metadata[name.removeprefix(_EPISODE)] = values[0] if len(values) == 1 else values
+        return metadata
 
 
 def _is_readable(feature: rlds.StepFeature) -> bool:
     if feature.kind != "tensor":
         return True
-    known = feature.dtype in (
+    is_numeric = feature.dtype in (
         "bool",
         "float32",
         "float64",
@@ -127,4 +127,4 @@ def _is_readable(feature: rlds.StepFeature) -> bool:
         "uint8",
         "uint16",
     )
-    return known and not feature.encoded and all(size > 0 for size in feature.shape)
+    return is_numeric and not feature.encoded and all(size > 0 for size in feature.shape)

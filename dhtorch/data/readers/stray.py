@@ -1,14 +1,15 @@
-"""Stray Scanner captures: a phone's video, LiDAR depth, confidence and odometry, one folder each.
+"""Reader of Stray Scanner captures: a phone's video, LiDAR depth, confidence and odometry, one folder each.
 
 ``rgb.mp4`` (1920×1440, HEVC or H.264), ``depth/000000.png`` (16 bits, mm; ``.npy`` in very old captures),
 ``confidence/000000.png`` (0, 1, 2), ``odometry.csv`` with a row for every stored frame, and ``camera_matrix.csv``: K of
-the *last* frame. Newer captures have K in every row, which counts. Poses are camera-to-world with our axes in a world
-with y up. Pictures are kept as the sensor gave them, also where the phone was held upright: poses and K belong to them.
-Colour and depth are registered, so depth has the same K at its own size. ``imu.csv`` is not read.
+the *last* frame. Newer captures have K in every row, which is used instead. Poses are camera-to-world with our axes in
+a world with y up. Images are stored in the sensor's orientation, also where the phone was held upright, and poses and K
+refer to that orientation. Colour and depth are registered, so depth has the same K at its own size. ``imu.csv`` is not
+read.
 
-The ``n``-th row belongs to the ``n``-th picture *stored* in the video, shown or not: the app stamps the first one
-before time 0, where an edit list may hide it. If the video still has one picture less than there are rows, either the
-first one was lost or the last. Nobody has documented which; the edges of depth and picture decide.
+The ``n``-th row belongs to the ``n``-th frame *stored* in the video, presented or not: the app stamps the first one
+before time 0, where an edit list may hide it. If the video still has one frame less than there are rows, either the
+first or the last was lost. Which one is not documented; it is determined from the edges of depth and image.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ from dhtorch.runtime.console import format_count
 
 _ODOMETRY_COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 _INTRINSICS_COLUMNS = ("fx", "fy", "cx", "cy")
-_DEFAULT_HW = (1440, 1920)  # of the pictures, where there is no video to ask
+_DEFAULT_HW = (1440, 1920)  # of the images, where there is no video
 _UNITS_PER_METRE = 1000.0
-_N_TRIAL_FRAMES = 6  # frames that are decoded to find out which picture was lost
+_N_TRIAL_FRAMES = 6  # frames decoded to determine whether the first or last video frame was lost
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a recording of this format, in words; None if nothing does."""
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     if (root / "depth").is_dir() and all((root / name).is_file() for name in ("odometry.csv", "camera_matrix.csv")):
         return "odometry.csv, camera_matrix.csv and depth/"
     return None
@@ -58,17 +59,17 @@ def read(
 
     Args:
         root: its folder.
-        images: read ``rgb.mp4``. False for a capture whose video is missing: the image of every frame then has no
-            pixels, (1, 3, 0, 0), so that nothing can mistake it for a dark one.
-        poses: take the device's poses.
-        per_frame: take the intrinsics of each frame where the capture has them; False = ``camera_matrix.csv`` for all.
-        lost_first: where the video has one picture less than there are rows: True = the first was lost, False = the
-            last. None = compare the edges of a few frames, the only case in which opening decodes pictures.
-        K_hw: (height, width) of the pictures that K belongs to. None = the video's own, else 1440, 1920.
+        images: read ``rgb.mp4``. False for a capture without video: the image of every frame then has no pixels,
+            (1, 3, 0, 0), and cannot be mistaken for a dark one.
+        poses: use the device's poses.
+        per_frame: use the intrinsics of each frame where the capture has them; False = ``camera_matrix.csv`` for all.
+        lost_first: where the video has one frame less than there are rows: True = the first was lost, False = the
+            last. None = compare the edges of a few frames, the only case in which opening decodes images.
+        K_hw: (height, width) of the images that K refers to. None = the video's own, else 1440, 1920.
 
     Returns:
-        One recording at the times of the odometry (s since the phone was started; the video's own are a 60 Hz grid).
-        Rows without depth, confidence (if any frame has it), picture or usable pose are left out and reported.
+        One recording with the times of the odometry (s since the phone was started; the video's own are a 60 Hz grid).
+        Rows without depth, confidence (if any frame has it), image or usable pose are left out and reported.
 
     Raises:
         FormatError: no frame, no ``rgb.mp4`` (unless ``images`` is False), or a damaged file.
@@ -78,35 +79,33 @@ def read(
     rows, report = _read_odometry(root / "odometry.csv")
     video = root / "rgb.mp4" if images else None
     if video is not None and not video.is_file():
-        raise FormatError(
-            video, "file", "no such file", "the pictures (images=False reads depth alone, for what needs none)"
-        )
+        raise FormatError(video, "file", "no such file", "the images (images=False reads depth only)")
     hw = read_video_header(video, all_frames=True).hw if video is not None else _parse_size(K_hw, root) or _DEFAULT_HW
     shots, missing = _list_shots(root, rows, poses)
     report += missing
     if (root / "distortion").is_dir():
-        report.append("distortion/ holds lens tables of each frame: they are not applied")
+        report.append("distortion/ has lens tables of each frame: they are not applied")
     if not shots:
         raise FormatError(root, "frames", "; ".join(report) or "none", "rows with depth and pose")
     load = _Load(root, tuple(shots), video, hw, _read_intrinsics(root, hw, K_hw, per_frame), _depth_hw(shots))
     if video is not None:
-        load, said = _match_pictures(load, len(rows), lost_first)
-        report += said
-    kept = load.shots
-    times = torch.tensor([shot.row.time for shot in kept], dtype=torch.float64)
-    steady = bool((times.diff() > 0).all())
-    c2w = np.stack([shot.row.c2w for shot in kept]) if poses else None
+        load, remarks = _match_pictures(load, len(rows), lost_first)
+        report += remarks
+    used = load.shots
+    times = torch.tensor([shot.row.time for shot in used], dtype=torch.float64)
+    increasing = bool((times.diff() > 0).all())
+    c2w = np.stack([shot.row.c2w for shot in used]) if poses else None
     return [
         Recording(
             name=root.resolve().name,
             format="stray",
             load=load,
-            number=torch.tensor([shot.row.number for shot in kept]),
+            number=torch.tensor([shot.row.number for shot in used]),
             root=root,
-            times=times if steady else None,
+            times=times if increasing else None,
             poses=None if c2w is None else convert.to_poses(c2w, root / "odometry.csv"),
-            rate_hz=float(1 / times.diff().median()) if steady and len(kept) > 1 else None,
-            report=tuple(report + ([] if steady else ["time stamps do not increase: there are no times"])),
+            rate_hz=float(1 / times.diff().median()) if increasing and len(used) > 1 else None,
+            report=tuple(report + ([] if increasing else ["time stamps do not increase: there are no times"])),
         )
     ]
 
@@ -115,8 +114,8 @@ def read(
 class _Row:
     """One row of the odometry."""
 
-    place: int  # in the table
-    number: int  # in the names of the files
+    place: int  # index in the table
+    number: int  # frame number in the file names
     time: float  # s
     c2w: np.ndarray  # (4, 4); NaN where tracking was lost
     K: np.ndarray | None  # fx fy cx cy
@@ -129,16 +128,16 @@ class _Shot:
     row: _Row
     depth: Path
     conf: Path | None
-    picture: int = -1  # in the video
+    picture: int = -1  # index in the video
 
 
 @dataclass(frozen=True)
 class _Intrinsics:
-    """fx fy cx cy for pictures of one size, per row or for all."""
+    """K for images of one size, per row or for all."""
 
     file: Path
     K: np.ndarray  # (3, 3)
-    hw: tuple[int, int]  # of the pictures that all K belong to
+    hw: tuple[int, int]  # of the images that K refers to
     per_frame: bool
 
     def of(self, row: _Row, hw: tuple[int, int]) -> np.ndarray:
@@ -196,7 +195,7 @@ class _Load:
 
 
 def _read_odometry(file: Path) -> tuple[list[_Row], list[str]]:
-    """The rows, by the names in the header: other columns may come and cells may be empty."""
+    """(rows, report) of the odometry, by the header's names; extra columns and empty cells are allowed."""
     try:
         lines = [[cell.strip() for cell in line] for line in csv.reader(files.read_lines(file))]
     except csv.Error as error:
@@ -261,7 +260,7 @@ def _parse_size(value: Sequence[int] | None, root: Path) -> tuple[int, int] | No
 
 
 def _list_shots(root: Path, rows: list[_Row], poses: bool) -> tuple[list[_Shot], list[str]]:
-    """Rows whose files are there, and a line for each reason why others are not."""
+    """(rows with all their files, report of those left out by reason)."""
     depth = {file.stem: file for kind in ("npy", "png") for file in sorted((root / "depth").glob(f"*.{kind}"))}
     conf = {file.stem: file for file in sorted((root / "confidence").glob("*.png"))}
     shots, missing = [], dict[str, list[int]]()
@@ -276,12 +275,12 @@ def _list_shots(root: Path, rows: list[_Row], poses: bool) -> tuple[list[_Shot],
         else:
             shots.append(_Shot(row, depth[name], conf.get(name)))
     extra = sorted(depth.keys() - {f"{row.number:06d}" for row in rows})
-    report = [line for why, numbers in missing.items() for line in files.format_left_out(numbers, why)]
+    report = [line for reason, numbers in missing.items() for line in files.format_left_out(numbers, reason)]
     return shots, report + files.format_left_out(extra, "no row in odometry.csv")
 
 
 def _depth_hw(shots: list[_Shot]) -> tuple[int, int]:
-    """Size of the depth maps; a damaged first one must not speak for all, an old one has no header to ask."""
+    """(h, w) of the depth maps, from the first that can be read; old ``.npy`` maps must be read whole."""
     error = None
     for shot in shots:
         try:
@@ -289,8 +288,8 @@ def _depth_hw(shots: list[_Shot]) -> tuple[int, int]:
                 return files.read_image_header(shot.depth).hw
             h, w = np.shape(pickles.read_npy(shot.depth))
             return int(h), int(w)
-        except ValueError as found:
-            error = error or found
+        except ValueError as failure:
+            error = error or failure
     raise error if isinstance(error, FormatError) else FormatError(shots[0].depth, "depth", error, "a depth map")
 
 
@@ -298,29 +297,29 @@ def _depth_hw(shots: list[_Shot]) -> tuple[int, int]:
 
 
 def _match_pictures(load: _Load, n_rows: int, lost_first: bool | None) -> tuple[_Load, list[str]]:
-    """The shots that have a picture, with its number."""
+    """(loader with the shots that have a video frame, numbered; report)."""
     assert load.video is not None
     n = read_video_header(load.video, all_frames=True).n
     report, shift = [], 0
     if n == n_rows - 1:
-        first = _is_first_picture_lost(load, n) if lost_first is None else lost_first
-        shift = 1 if first else 0
-        why = "the edges of depth and picture say so" if lost_first is None else "option lost_first"
-        report.append(f"rgb.mp4 lacks its {'first' if first else 'last'} picture ({why})")
+        first_lost = _is_first_picture_lost(load, n) if lost_first is None else lost_first
+        shift = 1 if first_lost else 0
+        reason = "by the edges of depth and image" if lost_first is None else "option lost_first"
+        report.append(f"rgb.mp4 lacks its {'first' if first_lost else 'last'} frame ({reason})")
     elif n != n_rows:
-        report.append(f"rgb.mp4 has {format_count(n, 'picture')} for {format_count(n_rows, 'row')}: the shorter counts")
+        report.append(f"rgb.mp4 has {format_count(n, 'frame')} for {format_count(n_rows, 'row')}: the shorter is used")
     shots = [_Shot(s.row, s.depth, s.conf, s.row.place - shift) for s in load.shots if 0 <= s.row.place - shift < n]
     if not shots:
-        raise FormatError(load.video, "frames", f"{n} pictures", "at least one with depth and pose")
+        raise FormatError(load.video, "frames", f"{n} frames", "at least one with depth and pose")
     lost = sorted({s.row.number for s in load.shots} - {s.row.number for s in shots})
     return _Load(load.root, tuple(shots), load.video, load.hw, load.intrinsics, load.depth_hw), [
         *report,
-        *files.format_left_out(lost, "no picture"),
+        *files.format_left_out(lost, "no image"),
     ]
 
 
 def _is_first_picture_lost(load: _Load, n: int) -> bool:
-    """Whether row i fits picture i − 1 better than picture i, by where depth and brightness have their edges."""
+    """Whether row i fits video frame i − 1 better than frame i, by the correlation of depth and brightness edges."""
     inner = [shot for shot in load.shots if 1 <= shot.row.place < n]
     score = np.zeros(2)
     for shot in inner[:: max(1, len(inner) // _N_TRIAL_FRAMES)]:
@@ -335,7 +334,7 @@ def _is_first_picture_lost(load: _Load, n: int) -> bool:
 
 
 def _edge_strength(x: np.ndarray) -> np.ndarray:
-    """(h, w) size of the gradient, limited so that one silhouette does not outweigh all the rest."""
+    """(h, w) magnitude of the gradient, capped at 4 × its mean so that one silhouette does not dominate."""
     with np.errstate(invalid="ignore"):
         size = np.hypot(*np.gradient(x))
     size = np.where(np.isfinite(size), size, 0)
@@ -343,16 +342,16 @@ def _edge_strength(x: np.ndarray) -> np.ndarray:
 
 
 def _edge_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Correlation of two edge maps."""
+    """Correlation coefficient of two edge maps."""
     a, b = a - a.mean(), b - b.mean()
     return float((a * b).sum() / max(float(np.sqrt((a * a).sum() * (b * b).sum())), 1e-12))
 
 
 def _block_mean(picture: np.ndarray, hw: tuple[int, int]) -> np.ndarray:
-    """(h, w) mean brightness of the blocks of a picture that fit ``hw``."""
-    step = [max(1, big // small) for big, small in zip(picture.shape, hw, strict=False)]
+    """Image (H, W, 3) → mean brightness (h, w) of its blocks for the size ``hw``."""
+    step = [max(1, size_in // size_out) for size_in, size_out in zip(picture.shape, hw, strict=False)]
     grey = picture.mean(-1, dtype=np.float32)[: step[0] * hw[0], : step[1] * hw[1]]
     rows, columns = np.arange(0, grey.shape[0], step[0]), np.arange(0, grey.shape[1], step[1])
     blocks = np.add.reduceat(np.add.reduceat(grey, rows, 0), columns, 1) / (step[0] * step[1])
-    at = [np.arange(small) * size // small for small, size in zip(hw, blocks.shape, strict=True)]
-    return np.asarray(blocks[np.ix_(*at)])
+    index = [np.arange(size_out) * size // size_out for size_out, size in zip(hw, blocks.shape, strict=True)]
+    return np.asarray(blocks[np.ix_(*index)])

@@ -1,1 +1,1 @@
-"""The same seats filled by other libraries: oracles for the tests, alternatives for the user."""
+"""Baselines: stages of a method and dense depth by other libraries and networks."""

@@ -1,4 +1,4 @@
-"""A pose from elsewhere (a device trajectory, an oracle) in the shape of seat 5's answer, for ``extend(fit=...)``."""
+"""Given relative poses (device trajectory, oracle) as a :class:`PoseFit`, for the option ``fit`` of a method."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ def known_pose_fit(
     T_1_from_0: Pose,
     n: int,
 ) -> PoseFit:
-    """Present a known relative pose of B pairs as a :class:`PoseFit` over ``n`` samples.
+    """Relative pose of B pairs → :class:`PoseFit` over ``n`` samples, with zero covariance.
 
-    The pose is taken as exact: covariance, rms and pixel noise are zero and ``t_snr`` infinite; no sample counts as
-    an inlier because none took part. A non-finite pose gets the code TOO_FEW and is not ok.
+    The pose is taken as exact: covariance, rms and pixel noise are zero and ``t_snr`` infinite; no sample is an
+    inlier because none took part. A non-finite pose gets the code TOO_FEW and is not ok.
     """
     R, t = T_1_from_0.R, T_1_from_0.t
     batch = t.shape[0]
@@ -35,7 +35,7 @@ def known_pose_fit(
 
 
 def device_pose_fit(frame_0: Frame, frame_1: Frame, n: int) -> PoseFit:
-    """The data set's own trajectory as the pose of a pair.
+    """Pose fit of a pair of frames from their stated poses ``T_world_from_cam``.
 
     Raises:
         ValueError: a frame without ``T_world_from_cam``.

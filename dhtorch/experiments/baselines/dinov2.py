@@ -1,7 +1,7 @@
-"""DINOv2 through ``transformers``: the visual branch that the paper times its front end against.
+"""DINOv2 through ``transformers``: the visual branch with which the paper compares the time of its front end.
 
-The cost of a forward pass does not depend on the values of the weights, so random ones will do for timing; features
-need the real ones, from a folder on this machine. Nothing is ever downloaded.
+The cost of a forward pass does not depend on the values of the weights, so random ones suffice for timing; features
+need the real ones, from a local folder. Nothing is ever downloaded.
 """
 
 from __future__ import annotations
@@ -15,18 +15,21 @@ from torch import Tensor
 
 from dhtorch.geometry.checks import check
 
-#: What to install where the library is missing.
+#: Installation of the library.
 _INSTALL_HINT = 'pip install "dhtorch[learned]"'
 
-#: Mean and standard deviation of the colours the network was trained with.
-COLOUR_MEAN, COLOUR_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+#: Mean of the colours with which the network was trained.
+COLOUR_MEAN = (0.485, 0.456, 0.406)
+
+#: Standard deviation of the colours with which the network was trained.
+COLOUR_STD = (0.229, 0.224, 0.225)
 
 
 def import_dinov2() -> tuple[Any, Any]:
     """``Dinov2Config`` and ``Dinov2Model`` of ``transformers``, imported only here.
 
     Raises:
-        ImportError: it is not installed; the message says how to.
+        ImportError: it is not installed; the message has the command.
     """
     try:
         from transformers import Dinov2Config, Dinov2Model  # noqa: PLC0415  (seconds, and optional)
@@ -45,17 +48,17 @@ def load_dinov2(
     side: int = 224,
     seed: int = 0,
 ) -> torch.nn.Module:
-    """A DINOv2 network in evaluation mode; the default sizes are those of DINOv2-L (ViT-L/14 at 224×224).
+    """Build or load a DINOv2 network in evaluation mode; the default sizes are those of DINOv2-L (ViT-L/14 at 224×224).
 
-    Call it with ``pixel_values=`` (B, 3, H, W), from :func:`preprocess_image`; ``last_hidden_state`` of its answer is
+    Call it with ``pixel_values=`` (B, 3, H, W), from :func:`preprocess_image`; ``last_hidden_state`` of its output is
     (B, 1 + patches, hidden), the class token first.
 
     Args:
-        weights: folder with ``config.json`` and weights, as ``save_pretrained`` writes it; its sizes then count.
-            None = random weights of the sizes below.
-        hidden, layers, heads: width, depth and attention heads.
-        patch, side: sides of a patch and of the square picture, px.
-        seed: of random weights; torch's own random state is left alone.
+        weights: folder with ``config.json`` and weights, as ``save_pretrained`` writes it; it then
+            determines the sizes. None = random weights of the sizes below.
+        hidden, layers, heads: width, number of layers and of attention heads.
+        patch, side: sides of a patch and of the square image, px.
+        seed: seed of random weights; torch's global random state is not changed.
 
     Raises:
         ImportError: ``transformers`` is not installed.
@@ -76,11 +79,11 @@ def load_dinov2(
 
 
 def preprocess_image(image: Tensor, side: int = 224) -> Tensor:
-    """A picture as the network expects it: square, colours centred and scaled.
+    """Image (B, C, H, W) → the network's input: resized to a square, colours normalised.
 
     Args:
         image: (B, C, H, W) with C 1 or 3, float in [0, 1] or uint8.
-        side: of the result, px; the picture is stretched to it.
+        side: side of the result, px; the aspect ratio is not kept.
 
     Returns:
         (B, 3, side, side).

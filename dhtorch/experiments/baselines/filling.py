@@ -1,6 +1,6 @@
-"""The simplest dense map: the sensor's own returns carried on to where the picture looks alike.
+"""Dense depth from one view by joint bilateral filling of the sensor's returns, guided by the image.
 
-No second view and no geometry: what it says beyond the sensor's reach is a guess from nearer surfaces.
+It uses no second view and no geometry: beyond the sensor's range it extrapolates nearer surfaces.
 """
 
 from __future__ import annotations
@@ -17,39 +17,50 @@ from dhtorch.geometry.patches import sample_nearest
 from dhtorch.pipeline.dense import downscale_grey
 from dhtorch.records import Estimate, Frame, Samples
 
-#: Longer side of the pictures, px; window and its spreads in space (px) and grey value.
-_MAX_SIDE_PX, _FILTER_WINDOW_PX, _SPATIAL_SIGMA_PX, _GREY_SIGMA = 96, 9, 3.0, 0.1
+#: Longer side of the filtered images, px.
+_MAX_SIDE_PX = 96
 
-#: Times that returns are carried on: windows reach across the picture.
+#: Side of the filter's window, px.
+_FILTER_WINDOW_PX = 9
+
+#: Standard deviation of the filter in space, px.
+_SPATIAL_SIGMA_PX = 3.0
+
+#: Standard deviation of the filter in grey value.
+_GREY_SIGMA = 0.1
+
+#: Rounds of filling; with them windows reach across the image.
 _N_ROUNDS = 30
 
-#: Least weight of returns in a window that fills its middle.
+#: Least weight of returns in a window to fill its centre.
 _MIN_WEIGHT = 1e-3
 
 
 def fill_bilateral(reference: Frame, samples: Samples) -> Estimate:
     """Depth at the samples by joint bilateral filling (kornia's filter), round after round from the rim of a hole.
 
-    Score falls with the rounds it took. Gate NO_TRACK where none reached.
+    The score decreases with the number of rounds until a pixel is filled. Gate NO_TRACK where it is not filled.
     """
-    picture = downscale_grey(reference, _MAX_SIDE_PX)[0]
-    h, w = picture.shape[-2:]
-    known = (reference.depth > 0) & reference.depth.isfinite()
-    weight = F.interpolate(known[:, None].to(picture), (h, w), mode="area")
-    depth = F.interpolate(torch.where(known, reference.depth, 0.0)[:, None].to(picture), (h, w), mode="area")
+    image = downscale_grey(reference, _MAX_SIDE_PX)[0]
+    h, w = image.shape[-2:]
+    has_return = (reference.depth > 0) & reference.depth.isfinite()
+    weight = F.interpolate(has_return[:, None].to(image), (h, w), mode="area")
+    depth = F.interpolate(torch.where(has_return, reference.depth, 0.0)[:, None].to(image), (h, w), mode="area")
     depth = depth / weight.clamp_min(_MIN_WEIGHT)
-    told = weight > _MIN_WEIGHT
-    age = torch.zeros_like(depth)
+    filled = weight > _MIN_WEIGHT
+    round_filled = torch.zeros_like(depth)
     for k in range(_N_ROUNDS):
-        mass, total = (_joint_bilateral_blur(x, picture) for x in (told.to(depth), torch.where(told, depth, 0.0)))
-        new = ~told & (mass > _MIN_WEIGHT)
+        mass, total = (_joint_bilateral_blur(x, image) for x in (filled.to(depth), torch.where(filled, depth, 0.0)))
+        new = ~filled & (mass > _MIN_WEIGHT)
         depth = torch.where(new, total / mass.clamp_min(_MIN_WEIGHT), depth)
-        age = torch.where(new, 1.0 + k, age)
-        told = told | new
+        round_filled = torch.where(new, 1.0 + k, round_filled)
+        filled = filled | new
     uv = cam.depth_pixels(reference.camera, reference.hw, None, (h, w), samples.uv)
-    found = sample_nearest(torch.where(told, depth, torch.nan)[:, 0], uv)[0]
-    noise = 0.01 * (1 + sample_nearest(age[:, 0], uv)[0])
-    return estimate_from_depth(samples, found, noise, torch.where(found > 0, Gate.ANSWER, Gate.NO_TRACK))
+    depth_at_samples = sample_nearest(torch.where(filled, depth, torch.nan)[:, 0], uv)[0]
+    noise = 0.01 * (1 + sample_nearest(round_filled[:, 0], uv)[0])
+    return estimate_from_depth(
+        samples, depth_at_samples, noise, torch.where(depth_at_samples > 0, Gate.ANSWER, Gate.NO_TRACK)
+    )
 
 
 def _joint_bilateral_blur(x: Tensor, guide: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
-"""The first release's methods, every option written out: what later ones are measured against.
+"""Methods of the first release with every option written out, as a fixed reference for later ones.
 
-A default that changes elsewhere changes nothing here.
+Changes of defaults elsewhere do not affect them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from dhtorch.stages.score import confidence_from_error
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.triangulate import two_view
 
-#: One other view: pose from near and far tracks together, a sigma for every answer.
+#: One source view: pose from near and far tracks together, a sigma for every answer.
 MAP_1 = Method(
     sample=partial(
         spiral,
@@ -131,5 +131,5 @@ MAP_1 = Method(
     chain=True,
 )
 
-#: Five views of one reference view, those on the way to the last; their inverse depths fused where two of them agree.
+#: Five source views, evenly spaced up to the last one; their inverse depths are fused where at least two agree.
 WINDOW_1 = MAP_1.replace(views=5)

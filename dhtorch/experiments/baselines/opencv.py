@@ -1,6 +1,6 @@
-"""The same seats filled by OpenCV: oracle for the tests, peer in the benchmarks, ``method=opencv`` for the user.
+"""OpenCV's functions as stages of a method: reference of tests and benchmarks, and ``method=opencv``.
 
-Everything loops over the batch and carries no gradient.
+All functions loop over the batch and have no gradient.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ def opencv_lucas_kanade(
     epsilon_px: float = 0.01,
     max_round_trip_px: float = 1.0,
 ) -> Tracks:
-    """Seat 4 with ``cv2.calcOpticalFlowPyrLK`` forward and back; ``levels`` includes full resolution.
+    """Track stage by ``cv2.calcOpticalFlowPyrLK``, forward and backward; ``levels`` includes full resolution.
 
-    Of a hint it takes the levels, and neither start nor pyramid.
+    Of a hint it uses the levels, and neither start nor pyramid.
 
-    OpenCV reports no covariance: ``cov`` is NaN, and so is every sigma that would follow from it.
+    OpenCV reports no covariance: ``cov`` is NaN, and so is every sigma derived from it.
     """
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon_px)
     levels = levels if hint.levels is None else hint.levels
@@ -50,23 +50,23 @@ def opencv_lucas_kanade(
 def _track_pair(
     grey_0: np.ndarray, grey_1: np.ndarray, start: np.ndarray, options: dict[str, Any], max_round_trip_px: float
 ) -> tuple[np.ndarray, ...]:
-    """Position, round trip, mean grey difference and validity of one pair's points."""
+    """(position, round trip, mean grey difference, validity) of the points of one pair."""
     n = len(start)
     if n == 0:
         return start, np.zeros(n), np.zeros(n), np.zeros(n, bool)
     flow: Any = cv2.calcOpticalFlowPyrLK
-    there, found, residual = flow(grey_0, grey_1, start[:, None], None, **options)
-    back, returned, _ = flow(grey_1, grey_0, there, None, **options)
-    uv, found = there[:, 0], found[:, 0] > 0
-    error = np.linalg.norm(back[:, 0] - start, axis=-1)
+    forward, tracked, residual = flow(grey_0, grey_1, start[:, None], None, **options)
+    backward, tracked_back, _ = flow(grey_1, grey_0, forward, None, **options)
+    uv, tracked = forward[:, 0], tracked[:, 0] > 0
+    error = np.linalg.norm(backward[:, 0] - start, axis=-1)
     inside = ((uv >= 0) & (uv <= [grey_1.shape[1] - 1, grey_1.shape[0] - 1])).all(-1)
-    valid = found & (returned[:, 0] > 0) & inside & (error < max_round_trip_px)
+    valid = tracked & (tracked_back[:, 0] > 0) & inside & (error < max_round_trip_px)
     return (
         uv,
         error,
-        np.where(found, residual[:, 0], 0) / 255,
+        np.where(tracked, residual[:, 0], 0) / 255,
         valid,
-    )  # undefined elsewhere
+    )  # the difference is undefined elsewhere
 
 
 def opencv_pnp_ransac(
@@ -74,13 +74,13 @@ def opencv_pnp_ransac(
     tracks: Tracks,
     camera_0: Camera,
     camera_1: Camera,
-    draws: Tensor,  # (B, H, 3): only H is used, OpenCV draws for itself
+    draws: Tensor,  # (B, H, 3): only H is used, OpenCV draws its own samples
     *,
     threshold_px: float = 3.0,
     min_inlier: int = 8,
     confidence: float = 0.999,
 ) -> PoseFit:
-    """Seat 5 with ``cv2.solvePnPRansac`` (EPnP) and ``cv2.solvePnPRefineLM`` on the inliers."""
+    """Pose stage by ``cv2.solvePnPRansac`` (EPnP) and ``cv2.solvePnPRefineLM`` on the inliers."""
     near = tracks.valid & samples.usable
     K = _as_numpy(cam.to_matrix(camera_1), np.float64)
     R, t, inlier, code = [], [], [], []
@@ -91,13 +91,13 @@ def opencv_pnp_ransac(
             _solve_pnp(xyz, uv, K[b], draws.shape[1], threshold_px, confidence) if len(index) >= min_inlier else None
         )
         mask = np.zeros(near.shape[1], bool)
-        fine = solution is not None and len(solution[2]) >= min_inlier
-        if solution is not None and fine:
+        solved = solution is not None and len(solution[2]) >= min_inlier
+        if solution is not None and solved:
             mask[index[solution[2]]] = True
-        R.append(solution[0] if solution is not None and fine else np.full((3, 3), np.nan))
-        t.append(solution[1] if solution is not None and fine else np.full(3, np.nan))
+        R.append(solution[0] if solution is not None and solved else np.full((3, 3), np.nan))
+        t.append(solution[1] if solution is not None and solved else np.full(3, np.nan))
         inlier.append(mask)
-        code.append(PoseCode.OK if fine else PoseCode.TOO_FEW)
+        code.append(PoseCode.OK if solved else PoseCode.TOO_FEW)
     like, device = samples.xyz, samples.xyz.device
     pose = Pose(torch.from_numpy(np.stack(R)).to(like), torch.from_numpy(np.stack(t)).to(like))
     codes = torch.tensor(code, dtype=torch.int32, device=device)
@@ -135,31 +135,31 @@ def _solve_pnp(
 def _make_pose_fit(
     samples: Samples, tracks: Tracks, camera_1: Camera, pose: Pose, inlier: Tensor, code: Tensor
 ) -> PoseFit:
-    """Residuals, covariance and signal-to-noise ratio of OpenCV's pose, by the formulas of our own seat."""
+    """Residuals, covariance and signal-to-noise ratio of OpenCV's pose, by the formulas of our own pose stage."""
     R, t = pose.R.nan_to_num().double(), pose.t.nan_to_num().double()
     xyz = se3.apply(Pose(R, t), torch.where(inlier[..., None], samples.xyz, torch.ones_like(samples.xyz)).double())
     camera = camera_1.to(torch.float64)
     weight = inlier.double()
-    miss = (cam.project(camera, xyz) - tracks.uv_1.nan_to_num().double()) * weight[..., None]
+    residual = (cam.project(camera, xyz) - tracks.uv_1.nan_to_num().double()) * weight[..., None]
     J = (epipolar.point_jacobians(camera, xyz)[1] * weight[..., None, None]).flatten(1, 2)  # (B, 2N, 6)
     count = inlier.sum(-1)
-    squares = (miss * miss).sum((-1, -2))
+    squares = (residual * residual).sum((-1, -2))
     sigma_px = (squares / (2 * count - 6).clamp_min(1)).sqrt()
     cov, _ = covariance.covariance_from_normal(J.mT @ J, sigma_px)
     t_snr = covariance.mahalanobis(t, cov[:, 3:, 3:])
-    lost, like = code != PoseCode.OK, samples.xyz
+    failed, like = code != PoseCode.OK, samples.xyz
 
-    def answer(x: Tensor) -> Tensor:
-        return torch.where(lost.view(-1, *[1] * (x.ndim - 1)), torch.nan, x).to(like)
+    def nan_if_failed(x: Tensor) -> Tensor:
+        return torch.where(failed.view(-1, *[1] * (x.ndim - 1)), torch.nan, x).to(like)
 
     return PoseFit(
         T_1_from_0=pose,
-        cov=answer(cov),
+        cov=nan_if_failed(cov),
         inlier=inlier,
         n_inlier=count,
-        rms_px=answer((squares / count.clamp_min(1)).sqrt()),
-        sigma_px=answer(sigma_px),
-        t_snr=answer(t_snr),
+        rms_px=nan_if_failed((squares / count.clamp_min(1)).sqrt()),
+        sigma_px=nan_if_failed(sigma_px),
+        t_snr=nan_if_failed(t_snr),
         code=code,
     )
 
@@ -180,8 +180,9 @@ def _as_numpy(x: Tensor, dtype: type) -> np.ndarray:
     return np.ascontiguousarray(x.detach().cpu().numpy(), dtype=dtype)
 
 
-#: The same seats filled by OpenCV: LK forward and back, EPnP-RANSAC with LM refinement, triangulatePoints.
+#: ``PAPER`` with OpenCV's stages: LK forward and backward, EPnP-RANSAC with LM refinement, triangulatePoints.
 OPENCV = PAPER.replace(track=opencv_lucas_kanade, pose=opencv_pnp_ransac, triangulate={"solver": opencv_triangulate})
 
-#: ``PAPER`` with OpenCV's linear triangulation: the residual is shared by both views instead of resting on the second.
+#: ``PAPER`` with OpenCV's linear triangulation: the residual is distributed over both views instead of the second
+#: alone.
 PAPER_DLT = PAPER.replace(triangulate={"solver": opencv_triangulate})

@@ -1,4 +1,4 @@
-"""How a map is usually put into metres: one scale, or a scale and a shift, from pixels where both are known."""
+"""Usual metric alignments of a depth map: scale, or scale and shift, from pixels with depth of both."""
 
 from __future__ import annotations
 
@@ -7,18 +7,21 @@ from torch import Tensor
 
 from dhtorch.geometry.checks import check
 
-#: Trials of RANSAC, and the relative miss up to which a pixel agrees.
-_N_RANSAC_TRIALS, _MAX_INLIER_ERROR = 200, 0.05
+#: Number of RANSAC trials.
+_N_RANSAC_TRIALS = 200
+
+#: Largest relative error of an inlier.
+_MAX_INLIER_ERROR = 0.05
 
 
 def fit_median_scale(x: Tensor, z: Tensor) -> tuple[float, float]:
-    """Scale that makes the median ratio one, shift 0; (n,) each, NaN of nothing."""
+    """Map values x and depths z, (n,) each → (scale with median ratio one, shift 0); scale NaN without points."""
     check("fit_median_scale", x=(x, "n"), z=(z, "n"))
     return (float((z / x).median()), 0.0) if len(x) else (float("nan"), 0.0)
 
 
 def fit_scale_shift(x: Tensor, z: Tensor) -> tuple[float, float]:
-    """Scale and shift of the least squares of ``s x + t − z``, (n,) each; NaN of fewer than two points."""
+    """Map values x and depths z, (n,) each → (s, t) minimising Σ(s x + t − z)²; NaN with fewer than two points."""
     check("fit_scale_shift", x=(x, "n"), z=(z, "n"))
     if len(x) < 2:
         return float("nan"), float("nan")
@@ -28,7 +31,7 @@ def fit_scale_shift(x: Tensor, z: Tensor) -> tuple[float, float]:
 
 
 def fit_scale_shift_ransac(x: Tensor, z: Tensor, *, seed: int = 0) -> tuple[float, float]:
-    """Scale and shift that most points agree with, then least squares of these; (n,) each."""
+    """Map values x and depths z, (n,) each → (s, t) by RANSAC, refined by least squares on the inliers."""
     check("fit_scale_shift_ransac", x=(x, "n"), z=(z, "n"))
     if len(x) < 2:
         return float("nan"), float("nan")
@@ -36,6 +39,6 @@ def fit_scale_shift_ransac(x: Tensor, z: Tensor, *, seed: int = 0) -> tuple[floa
     (x0, x1), (z0, z1) = x[draw].double().unbind(-1), z[draw].double().unbind(-1)
     s = (z1 - z0) / torch.where(x1 == x0, torch.nan, x1 - x0)
     t = z0 - s * x0
-    agrees = (s[:, None] * x + t[:, None] - z).abs() < _MAX_INLIER_ERROR * z
-    best = agrees[agrees.sum(-1).argmax()]
+    inlier = (s[:, None] * x + t[:, None] - z).abs() < _MAX_INLIER_ERROR * z
+    best = inlier[inlier.sum(-1).argmax()]
     return fit_scale_shift(x[best], z[best])

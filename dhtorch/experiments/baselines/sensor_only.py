@@ -1,4 +1,4 @@
-"""The sensor by itself: what there is to have without a second view."""
+"""Baseline without a second view: the sensor's own returns."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from dhtorch.records import Estimate, Frame
 
 
 def sensor_only(
-    method: Method, frame_0: Frame, _frame_1: Frame, *, trace: Trace | None = None, **_told: Any
+    method: Method, frame_0: Frame, _frame_1: Frame, *, trace: Trace | None = None, **_options: Any
 ) -> Estimate:
-    """The front end's usable returns as answers; every other sample is silent (gate NO_TRACK).
+    """Estimate from the front end's usable returns; every other sample is unanswered (gate NO_TRACK).
 
-    Takes the place of a method's line: it asks seats 1 to 3 and reads nothing of the second view.
+    Replaces the call of a method: it runs stages 1 to 3 and does not use the second view.
 
     Returns:
         Estimate whose ``depth`` and ``sigma`` are the sensor's.

@@ -13,24 +13,24 @@ from torch import Tensor
 from dhtorch.experiments.baselines.relative import RelativeDepth, resize_and_crop
 from dhtorch.records import Frame
 
-#: What to do where the package is missing.
+#: Installation of the package.
 _INSTALL_HINT = "clone github.com/facebookresearch/vggt and pip install it"
 
-#: Sides of the network's input are multiples of it, px.
+#: Sides of the network's input are multiples of this, px.
 _PATCH_PX = 14
 
 
 class VGGT:
     """Pairs of frames → :class:`RelativeDepth` of the first, one pair at a time.
 
-    Pictures are resized to ``width`` and a multiple of 14 in height, which is cropped around the centre to at most
-    ``width``, as VGGT's own loader does. The depth head of view 0 answers in that view's camera. On a GPU the trunk
-    runs in bfloat16, as in the authors' examples; on a CPU in float32.
+    Images are resized to ``width`` and a multiple of 14 in height, which is cropped around the centre to at most
+    ``width``, as VGGT's own loader does. The depth head of view 0 gives z-depth in that view's camera. On a GPU the
+    trunk runs in bfloat16, as in the authors' examples; on a CPU in float32.
 
     Args:
         weights: a state dict (``model.pt``), or a folder as ``save_pretrained`` writes it.
-        width: of the input, px.
-        device: where it runs.
+        width: width of the input, px.
+        device: device of the network.
 
     Raises:
         ImportError: VGGT is not importable.
@@ -54,7 +54,7 @@ class VGGT:
         self.width, self.device = width, device
 
     def __call__(self, frame_0: Frame, frame_1: Frame) -> RelativeDepth:
-        """Depth of view 0 from B pairs; their depth is not read.
+        """Depth of view 0 from B pairs; the frames' own depth is not used.
 
         Raises:
             ValueError: the two views are of different size.
@@ -64,12 +64,12 @@ class VGGT:
         view_0, gain, shift = self._fit(frame_0.image)
         view_1, _, _ = self._fit(frame_1.image)
         depth, confidence = [], []
-        kind = torch.device(self.device).type
+        device_type = torch.device(self.device).type
         for pair in torch.stack((view_0, view_1), 1).to(self.device):
-            with torch.no_grad(), torch.autocast(kind, dtype=torch.bfloat16, enabled=kind == "cuda"):
-                found = self.network(pair)
-            depth.append(found["depth"][:, 0, ..., 0])
-            confidence.append(found["depth_conf"][:, 0])
+            with torch.no_grad(), torch.autocast(device_type, dtype=torch.bfloat16, enabled=device_type == "cuda"):
+                prediction = self.network(pair)
+            depth.append(prediction["depth"][:, 0, ..., 0])
+            confidence.append(prediction["depth_conf"][:, 0])
         like = frame_0.camera.f
         return RelativeDepth(
             depth=torch.cat(depth).to(like),
@@ -80,5 +80,5 @@ class VGGT:
 
     def _fit(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         height, width = image.shape[-2:]
-        tall = max(round(height * self.width / width / _PATCH_PX), 1) * _PATCH_PX
-        return resize_and_crop(image, (tall, self.width), (min(tall, self.width), self.width))
+        resized_height = max(round(height * self.width / width / _PATCH_PX), 1) * _PATCH_PX
+        return resize_and_crop(image, (resized_height, self.width), (min(resized_height, self.width), self.width))

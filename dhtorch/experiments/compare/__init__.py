@@ -1,1 +1,1 @@
-"""Methods held against each other, against OpenCV and against networks."""
+"""Comparisons of methods with each other, with OpenCV and with networks."""

@@ -1,9 +1,9 @@
 """Question: does a map of anybody's become as metric as our reference views allow, and is it left alone where it is
 right?
 
-The true map of a frame is made wrong in known ways, near returns and far answers of the frame are told, and what comes
-out beyond the near limit is held against the truth. A fault that lies in shape and metre like a network's counts in the
-ratio; one of files (unit, mirrored, rolled, wrong camera, wrong time) is shown beside.
+The true map of a frame is distorted in controlled ways, aligned to the frame's near returns and far answers, and
+compared with the truth beyond the near limit. Faults in shape and scale like a network's enter the ratio; faults of
+files (unit, mirrored, rolled, wrong camera, wrong time) are reported separately.
 
 Expectation (written before the run): a map off by 1.3 % in shape and 5 % in scale is right to 2 %; over the faults the
 error is at most half that of an affine fit to the near returns; nowhere is it, less .2 %, more than 1.05 times that of
@@ -11,8 +11,8 @@ the better of the raw and the near-only map; sigma is right to .07.
 What would refute it: any of these numbers missed.
 
 The constants of :mod:`dhtorch.alignment.error_model` and :mod:`dhtorch.alignment.references` were chosen on
-``data=shared_scenes``, so its numbers there are no test. Map and
-near returns are of one sensor here: a near-only fit of a rescaled map is nearly exact, more than a network's would be.
+``data=shared_scenes``, so the results on these scenes are no independent test. Map and near returns come from one
+sensor here: a near-only fit of a rescaled map is nearly exact, more than a network's would be.
 """
 
 from __future__ import annotations
@@ -57,25 +57,25 @@ ALIGN_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
     "align.within_2sigma": (0.90, lambda value, bar: value >= bar),
 }
 
-#: Ours, and what stands beside it.
+#: Method names in rows: ours, the unaligned map, and the fit to near returns alone.
 _OURS, _RAW, _NEAR_ONLY = "align", "raw", "near least squares"
 _PEERS = (_RAW, _NEAR_ONLY, "least squares", "median ratio", "ransac")
 
-#: Error up to which nobody asks which of two maps is the better one.
+#: Relative error that is subtracted from ours before the ratio to the better of two maps is taken.
 _NEGLIGIBLE_ERROR = 0.002
 
-#: Frames between a frame and the wrong time.
+#: Offset of the map from another time, frames.
 _WRONG_TIME_FRAMES = 3
 
-#: Fewest pixels beyond the near limit by which a frame is judged.
+#: Fewest pixels with truth beyond the near limit for a frame to be evaluated.
 _MIN_FAR_PIXELS = 200
 
 
 class AlignmentCase(NamedTuple):
-    """One frame: what is known of it, and what is true."""
+    """One frame: its true map, metric references and near limit."""
 
-    truth: Tensor  # (1, h, w) m, 0 = not known
-    other: Tensor  # the same of another time
+    truth: Tensor  # (1, h, w) m, 0 = no truth
+    other: Tensor  # the true map of another time
     references: Sequence[Any]  # near returns, far answers
     hw: tuple[int, int]
     near: float  # m
@@ -93,22 +93,23 @@ def run(
     faults: Sequence[str] | None = None,
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """Every fault of some frames of every scene, aligned by us and by the usual fits.
+    """Errors of faulty maps after alignment by :func:`dhtorch.alignment.align.align_depth` and by global fits.
 
-    Rows: one a scene, fault (``truth``) and method, with ``median_rel`` (median relative error beyond the near limit),
-    ``within_sigma`` and ``within_2sigma`` (pixels with truth, answered) and ``answered``; of ours also ``models``, how
-    often each was taken. Summary: see :data:`ALIGN_BARS`, each also as ``<number>_one_left_out`` (median, least and
-    greatest with one scene left out); ``reference view.<fault>_median`` for every fault (median over scenes).
+    Rows: one per scene, fault (``truth``) and method, with ``median_rel`` (median relative error beyond the near
+    limit), ``within_sigma`` and ``within_2sigma`` (answered pixels with truth) and ``answered``; for ours also
+    ``models``, how often each model was selected. Summary: see :data:`ALIGN_BARS`, each also as ``<key>_one_left_out``
+    (median, minimum and maximum with one scene left out); ``align.<fault>_median`` for every fault (median over
+    scenes).
 
     Args:
-        scenes: with a near limit; those without, sparse ones and those with a role are noted and left out.
-        methods: name → method; the first gives near returns and far answers.
-        pairs: of which the reference views count.
+        scenes: those without a near limit, of a sparse sensor or with a role are left out with a note in their row.
+        methods: name → method; the first one computes near returns and far answers.
+        pairs: scene → pairs, of which only the reference views are used.
         settings: of the job.
-        reference_views: so many of a scene's, evenly spread; None = all.
+        reference_views: number of reference views of a scene, evenly spaced; None = all.
         size: longer side of the maps, px.
-        swept: far answers are those of a dense sweep as well.
-        faults: of :data:`dhtorch.synthetic.depth_faults.DEPTH_FAULTS`, or ``time``; None = all.
+        swept: add the depths of a plane sweep to the far answers.
+        faults: names from :data:`dhtorch.synthetic.depth_faults.DEPTH_FAULTS`, or ``time``; None = all.
         progress: as for the main job.
 
     Raises:
@@ -127,23 +128,26 @@ def run(
             outcome.rows.append(_scene_row(scene, _OURS, None) | {"note": note})
             continue
         assert near is not None
-        found: dict[tuple[str, str], list[Row]] = {}
+        case_rows: dict[tuple[str, str], list[Row]] = {}
         frames = sorted({pair[0] for pair in protocol.spread_pairs(pairs, reference_views, scene)})
         for i in progress(frames, scene.name, len(frames)):
-            look = _make_case(scene, i, method, settings, near, size=size, swept=swept)
-            for name, by, row in _evaluate_case(look, names, i):
-                found.setdefault((name, by), []).append(row)
+            case = _make_case(scene, i, method, settings, near, size=size, swept=swept)
+            for name, method_name, row in _evaluate_case(case, names, i):
+                case_rows.setdefault((name, method_name), []).append(row)
         outcome.n_pairs += len(frames)
-        outcome.rows += [_scene_row(scene, by, name) | _mean_over_frames(rows) for (name, by), rows in found.items()]
+        outcome.rows += [
+            _scene_row(scene, method_name, name) | _mean_over_frames(rows)
+            for (name, method_name), rows in case_rows.items()
+        ]
     outcome.summary = summarise_alignment(outcome.rows, names) | leave_one_scene_out(outcome.rows, names)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 
 def verdict(found: Mapping[str, Any]) -> tuple[bool | None, str]:
-    """Hold the summary against the bars."""
+    """(all bars met, or None if one is undefined; the bars that are missed or undefined)."""
     values = {name: found.get(name, {}).get("value") for name in ALIGN_BARS}
-    if none := [name for name, value in values.items() if value is None]:
-        return None, f"not measured: {', '.join(none)}"
+    if undefined := [name for name, value in values.items() if value is None]:
+        return None, f"not measured: {', '.join(undefined)}"
     missed = [
         f"{k} {values[k]:.3f} (bar {bar:g})" for k, (bar, holds) in ALIGN_BARS.items() if not holds(values[k], bar)
     ]
@@ -151,100 +155,102 @@ def verdict(found: Mapping[str, Any]) -> tuple[bool | None, str]:
 
 
 def summarise_alignment(rows: Sequence[Row], names: Sequence[str]) -> Row:
-    """The numbers of :data:`ALIGN_BARS` and the medians of all faults."""
-    at = {(r["scene"], r["truth"], r["method"]): r for r in rows if r.get("median_rel") is not None}
-    scenes = sorted({scene for scene, _, _ in at})
+    """Scene rows, fault names → the numbers of :data:`ALIGN_BARS` and the median error of every fault and method."""
+    row_of = {(r["scene"], r["truth"], r["method"]): r for r in rows if r.get("median_rel") is not None}
+    scenes = sorted({scene for scene, _, _ in row_of})
 
-    def errors(name: str, by: str) -> list[float | None]:
-        return [at.get((scene, name, by), {}).get("median_rel") for scene in scenes]
+    def errors(name: str, method: str) -> list[float | None]:
+        return [row_of.get((scene, name, method), {}).get("median_rel") for scene in scenes]
 
-    found: Row = {}
-    for by in (_OURS, *_PEERS):
-        key = by.replace(" ", "_")
+    summary: Row = {}
+    for method in (_OURS, *_PEERS):
+        key = method.replace(" ", "_")
         for name in names:
-            found[f"{key}.{name}_median"] = bootstrap.interval_over_scenes(errors(name, by)).entry("1")
+            summary[f"{key}.{name}_median"] = bootstrap.interval_over_scenes(errors(name, method)).entry("1")
     ratios, worst = torch.full((len(scenes), len(names)), torch.nan, dtype=torch.float64), []
     for column, name in enumerate(names):
         for row, (ours, raw, near) in enumerate(
-            zip(*(errors(name, by) for by in (_OURS, _RAW, _NEAR_ONLY)), strict=True)
+            zip(*(errors(name, method) for method in (_OURS, _RAW, _NEAR_ONLY)), strict=True)
         ):
             if name not in NETWORK_FAULTS or ours is None or raw is None or near is None:
                 continue
             ratios[row, column] = ours / max(near, 1e-6)
             worst.append((ours - _NEGLIGIBLE_ERROR) / max(min(raw, near), 1e-6))
-    networks = [r for (_, name, by), r in at.items() if by == _OURS and name in NETWORK_FAULTS]
-    some = ratios[ratios.isfinite().any(1)]
-    of_scenes = bootstrap.interval_of_statistic(lambda index: some[index].flatten(1).nanquantile(0.5, -1), len(some))
-    found["align.ratio_to_near_affine"] = of_scenes.entry("1")
-    found["align.worst_ratio_to_better"] = bootstrap.without_interval(max(worst) if worst else None, len(scenes))
+    network_rows = [r for (_, name, method), r in row_of.items() if method == _OURS and name in NETWORK_FAULTS]
+    with_ratio = ratios[ratios.isfinite().any(1)]
+    median_ratio = bootstrap.interval_of_statistic(
+        lambda index: with_ratio[index].flatten(1).nanquantile(0.5, -1), len(with_ratio)
+    )
+    summary["align.ratio_to_near_affine"] = median_ratio.entry("1")
+    summary["align.worst_ratio_to_better"] = bootstrap.without_interval(max(worst) if worst else None, len(scenes))
     for key in ("within_sigma", "within_2sigma"):
-        means = [_mean_or_none([r[key] for r in networks if r["scene"] == scene]) for scene in scenes]
-        found[f"align.{key}"] = bootstrap.interval_over_scenes(means, statistic="mean").entry("1")
-    return found
+        means = [_mean_or_none([r[key] for r in network_rows if r["scene"] == scene]) for scene in scenes]
+        summary[f"align.{key}"] = bootstrap.interval_over_scenes(means, statistic="mean").entry("1")
+    return summary
 
 
 def leave_one_scene_out(rows: Sequence[Row], names: Sequence[str]) -> Row:
-    """The numbers of :data:`ALIGN_BARS` with one scene after the other left out: median, least and greatest."""
+    """Jackknife of :data:`ALIGN_BARS` over scenes: median, minimum and maximum with one scene left out."""
     scenes = sorted({row["scene"] for row in rows if row.get("median_rel") is not None})
-    turns = [summarise_alignment([row for row in rows if row["scene"] != scene], names) for scene in scenes]
-    found: Row = {}
+    summaries = [summarise_alignment([row for row in rows if row["scene"] != scene], names) for scene in scenes]
+    left_out: Row = {}
     for key in ALIGN_BARS:
-        values = sorted(turn[key]["value"] for turn in turns if turn.get(key, {}).get("value") is not None)
+        values = sorted(summary[key]["value"] for summary in summaries if summary.get(key, {}).get("value") is not None)
         if len(scenes) > 1 and values:
-            middle = float(torch.tensor(values, dtype=torch.float64).median())
-            found[f"{key}_one_left_out"] = bootstrap.without_interval(middle, len(values)) | {
+            median = float(torch.tensor(values, dtype=torch.float64).median())
+            left_out[f"{key}_one_left_out"] = bootstrap.without_interval(median, len(values)) | {
                 "low": values[0],
                 "high": values[-1],
             }
-    return found
+    return left_out
 
 
 def _skip_reason(scene: Scene, near: float | None) -> str | None:
-    """Why a scene cannot be asked."""
+    """Reason to leave a scene out; None if it can be evaluated."""
     if scene.role is not None:
         return f"role {scene.role}"
     if near is None:
         return "no near limit"
     if scene.recording.sparse:
-        return "a sparse sensor: its map is no map"
+        return "sparse sensor: no dense true map"
     return None
 
 
 def _make_case(
     scene: Scene, i: int, method: Method, settings: Settings, near: float, *, size: int, swept: bool
 ) -> AlignmentCase:
-    """What method and sensor tell of a frame."""
+    """Reference view ``i`` → its true map, near returns and far answers."""
     recording = scene.recording
 
-    def shown(k: int) -> Frame:
+    def near_view(k: int) -> Frame:
         return range_split(recording[k].to(settings.dtype).to(settings.device), near)
 
-    offered = candidate_frames(recording, i)
-    reference = shown(i)
+    candidates = candidate_frames(recording, i)
+    reference = near_view(i)
     trace: Trace = {}
     with torch.no_grad():
-        others = stack([shown(k) for k in offered])
-        told = method(reference, others, seed=settings.seed, hint=scene.hint, trace=trace)
-        far: list[Any] = [told]
+        others = stack([near_view(k) for k in candidates])
+        estimate = method(reference, others, seed=settings.seed, hint=scene.hint, trace=trace)
+        far: list[Any] = [estimate]
         if swept:
-            asked = dense.selected_views(told, others, trace)
-            found = dense.sweep_depth(
-                reference, asked, method=method, size=size, calibration=dense.default_calibration()
+            selected = dense.selected_views(estimate, others, trace)
+            swept_map = dense.sweep_depth(
+                reference, selected, method=method, size=size, calibration=dense.default_calibration()
             )
-            far.append(_swept_only(found))
-    later = i + _WRONG_TIME_FRAMES if i + _WRONG_TIME_FRAMES < len(recording) else max(i - _WRONG_TIME_FRAMES, 0)
-    true, other = (_true_map(scene, k, recording[k].to(settings.dtype), size) for k in (i, later))
-    return AlignmentCase(true, other, [trace["samples"], *far], reference.hw, near)
+            far.append(_swept_only(swept_map))
+    other_time = i + _WRONG_TIME_FRAMES if i + _WRONG_TIME_FRAMES < len(recording) else max(i - _WRONG_TIME_FRAMES, 0)
+    truth, other_truth = (_true_map(scene, k, recording[k].to(settings.dtype), size) for k in (i, other_time))
+    return AlignmentCase(truth, other_truth, [trace["samples"], *far], reference.hw, near)
 
 
-def _swept_only(found: DepthMap) -> DepthMap:
-    """What was swept, without the sensor's returns, which are told apart."""
-    swept = found.source == Source.SWEPT
-    return found.replace(gate=torch.where(swept, found.gate, 1).to(torch.int32))
+def _swept_only(depth_map: DepthMap) -> DepthMap:
+    """Map with the swept depths as its only answers; the sensor's returns are references of their own."""
+    swept = depth_map.source == Source.SWEPT
+    return depth_map.replace(gate=torch.where(swept, depth_map.gate, 1).to(torch.int32))
 
 
 def _true_map(scene: Scene, i: int, frame: Frame, size: int) -> Tensor:
-    """What is known to be true (1, h, w) at the pixels of a map, 0 elsewhere."""
+    """True depth (1, h, w) at the pixels of a map: the recording's exact depth or the sensor's; 0 = none."""
     if isinstance(scene.recording, TruthRecording):
         depth = scene.recording.truth(i)["depth"].to(frame.depth)
         frame = frame.replace(depth=depth, depth_camera=frame.camera, conf=None)
@@ -255,45 +261,45 @@ def _true_map_of(frame: Frame, size: int) -> Tensor:
     hw = dense.map_hw(frame.hw, size)
     uv = dense.map_pixel_centres(frame, hw)[None]
     depth_hw = (frame.depth.shape[-2], frame.depth.shape[-1])
-    place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, depth_hw, uv)
-    z, inside = sample_nearest(frame.depth, place)
+    depth_uv = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, depth_hw, uv)
+    z, inside = sample_nearest(frame.depth, depth_uv)
     if frame.conf is not None:
-        z = torch.where(sample_nearest(frame.conf, place)[0] > 0, z, 0.0)
+        z = torch.where(sample_nearest(frame.conf, depth_uv)[0] > 0, z, 0.0)
     z = torch.where(inside & z.isfinite() & (z > 0), z, 0.0)
     return z.unflatten(1, hw)
 
 
-def _evaluate_case(look: AlignmentCase, names: Sequence[str], seed: int) -> Iterator[tuple[str, str, Row]]:
-    """(fault, method, numbers) of one frame."""
-    known = look.truth > 0
-    far = known & (look.truth > look.near)
+def _evaluate_case(case: AlignmentCase, names: Sequence[str], seed: int) -> Iterator[tuple[str, str, Row]]:
+    """Case, fault names → (fault, method, metrics), for our alignment and the baselines."""
+    has_truth = case.truth > 0
+    far = has_truth & (case.truth > case.near)
     if int(far.sum()) < _MIN_FAR_PIXELS:
         return
     for name in names:
-        x, _ = depth_faults.apply_fault(name, look.truth, seed=seed, other=look.other)
+        faulty, _ = depth_faults.apply_fault(name, case.truth, seed=seed, other=case.other)
         trace: dict[str, align.ModelSelection] = {}
         with torch.no_grad():
-            ours = align.align_depth(x, look.references, hw=look.hw, trace=trace)
-        off = (ours.depth - look.truth).abs()
-        both = ours.keep & known
+            ours = align.align_depth(faulty, case.references, hw=case.hw, trace=trace)
+        error = (ours.depth - case.truth).abs()
+        answered = ours.keep & has_truth
         row = {
-            "median_rel": _median_relative_error(ours.depth, look.truth, far & ours.keep),
-            "answered": float(both.sum() / (known & (x > 0)).sum().clamp_min(1)),
-            "within_sigma": float((off <= ours.sigma)[both].double().mean()),
-            "within_2sigma": float((off <= 2 * ours.sigma)[both].double().mean()),
+            "median_rel": _median_relative_error(ours.depth, case.truth, far & ours.keep),
+            "answered": float(answered.sum() / (has_truth & (faulty > 0)).sum().clamp_min(1)),
+            "within_sigma": float((error <= ours.sigma)[answered].double().mean()),
+            "within_2sigma": float((error <= 2 * ours.sigma)[answered].double().mean()),
             "model": "none" if int(trace["chosen"].model) < 0 else trace["chosen"].names[int(trace["chosen"].model)],
         }
         yield name, _OURS, row
-        for peer, told in _fit_peers(x, look).items():
-            yield name, peer, {"median_rel": _median_relative_error(told, look.truth, far & (x > 0))}
+        for peer, aligned in _fit_peers(faulty, case).items():
+            yield name, peer, {"median_rel": _median_relative_error(aligned, case.truth, far & (faulty > 0))}
 
 
-def _fit_peers(x: Tensor, look: AlignmentCase) -> dict[str, Tensor]:
-    """The usual fits."""
-    known = torch.where(x > 0, x, torch.nan)
-    points = collect_references(known, look.references, look.hw)
-    use = points.used[0]
-    value, z, near = points.x[0][use], points.depth[0][use], points.near[0][use]
+def _fit_peers(x: Tensor, case: AlignmentCase) -> dict[str, Tensor]:
+    """Map (1, h, w) aligned by the usual global fits: name → aligned map."""
+    map_or_nan = torch.where(x > 0, x, torch.nan)
+    points = collect_references(map_or_nan, case.references, case.hw)
+    used = points.used[0]
+    value, z, near = points.x[0][used], points.depth[0][used], points.near[0][used]
     fits = {
         _RAW: (1.0, 0.0),
         _NEAR_ONLY: scale_shift.fit_scale_shift(value[near], z[near]),
@@ -304,18 +310,18 @@ def _fit_peers(x: Tensor, look: AlignmentCase) -> dict[str, Tensor]:
     return {name: s * x + t for name, (s, t) in fits.items()}
 
 
-def _median_relative_error(told: Tensor, truth: Tensor, where: Tensor) -> float | None:
-    """Median relative error."""
-    return float(((told - truth).abs() / truth)[where].median()) if bool(where.any()) else None
+def _median_relative_error(depth: Tensor, truth: Tensor, where: Tensor) -> float | None:
+    """Median relative error over ``where``; None if it is empty."""
+    return float(((depth - truth).abs() / truth)[where].median()) if bool(where.any()) else None
 
 
 def _mean_over_frames(rows: Sequence[Row]) -> Row:
-    """Frames of a scene: means of all numbers."""
-    numbers = ("median_rel", "answered", "within_sigma", "within_2sigma")
-    found: Row = {k: _mean_or_none([r[k] for r in rows if r[k] is not None]) for k in numbers if k in rows[0]}
+    """Rows of a scene's frames → the mean of every metric, and how often each model was selected."""
+    metrics = ("median_rel", "answered", "within_sigma", "within_2sigma")
+    means: Row = {k: _mean_or_none([r[k] for r in rows if r[k] is not None]) for k in metrics if k in rows[0]}
     models = [r["model"] for r in rows if "model" in r]
     return (
-        found
+        means
         | {"n_pairs": len(rows)}
         | ({"models": {k: models.count(k) for k in sorted(set(models))}} if models else {})
     )

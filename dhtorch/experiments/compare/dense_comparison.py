@@ -58,8 +58,8 @@ DENSE_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
     "dense.room_within_1": (0.90, lambda value, bar: value >= bar),
 }
 
-#: Variants: all pixels of the map; the map read where the sparse method looks; the map of one other view, as peers of
-#: two views have no more.
+#: Variants: all pixels of the map; the map sampled at the sparse method's samples; the map from one source view, for
+#: comparison with two-view baselines.
 DENSE_VARIANT, _AT_SAMPLES, _ONE_VIEW = "dense", "dense, at samples", "dense, one view"
 _PEERS = ("sgbm", "sgbm, own calibration", "dis flow", "bilateral")
 
@@ -69,71 +69,72 @@ _RECTIFIABLE, FULL_COHORT = "rectifiable", "full"
 
 @dataclass(frozen=True)
 class ReferenceSweep:
-    """What was found out about one reference view, once for all variants."""
+    """Sparse answers and swept maps of one reference view, computed once for all variants."""
 
     reference: Frame
     trace: Trace  # of the sparse method
     asked: dense.SelectedViews
-    maps: Mapping[int, DepthMap]  # by the number of other views
-    grid: Samples  # pixels of the map that are judged
-    other: Frame  # the view that is worth most
-    T_1_from_0: Pose  # NaN where there is none
+    maps: Mapping[int, DepthMap]  # by the number of source views
+    grid: Samples  # pixels of the map that are evaluated
+    other: Frame  # the best source view
+    T_1_from_0: Pose  # NaN where the pose failed
     ms: Mapping[str, float]
 
 
 class SweepCache:
-    """Answers of all variants about one anchor: the sparse method runs once, and the sweep once for each number of
-    views."""
+    """Cache of one reference view: the sparse method runs once, the sweep once per number of source views."""
 
     def __init__(self, options: Mapping[str, Any], stride: int) -> None:
         self.options, self.stride = dict(options), stride
         self._last: ReferenceSweep | None = None
 
     def ask(
-        self, say: Callable[[ReferenceSweep], tuple[Samples, Estimate]], method: Method, *views: Frame, **told: Any
+        self, say: Callable[[ReferenceSweep], tuple[Samples, Estimate]], method: Method, *views: Frame, **options: Any
     ) -> Estimate:
-        """One variant's answer, as the protocol asks for it."""
-        trace = told.pop("trace")
+        """Estimate of one variant at a reference view, in the signature of :attr:`protocol.Variant.ask`."""
+        trace = options.pop("trace")
         reference, others = views
         if self._last is None or self._last.reference is not reference:
-            self._last = self._look(method, reference, others, told)
-        looked = self._last
-        trace |= looked.trace
-        samples, estimate = say(looked)
-        trace |= {"samples": samples, "ms": dict(looked.ms), "rectifiable": is_rectifiable(looked)}
+            self._last = self._sweep(method, reference, others, options)
+        sweep = self._last
+        trace |= sweep.trace
+        samples, estimate = say(sweep)
+        trace |= {"samples": samples, "ms": dict(sweep.ms), "rectifiable": is_rectifiable(sweep)}
         return estimate
 
-    def _look(self, method: Method, reference: Frame, others: Frame, told: Mapping[str, Any]) -> ReferenceSweep:
+    def _sweep(
+        self, method: Method, reference: Frame, others: Frame, call_options: Mapping[str, Any]
+    ) -> ReferenceSweep:
         trace: Trace = {}
-        method = method.replace(track=told["track"])
-        began = time.perf_counter()
-        joined = method(reference, others, seed=told["seed"], hint=told["hint"], trace=trace)
-        asked = dense.selected_views(joined, others, trace)
-        ms = {"sparse": 1e3 * (time.perf_counter() - began)}
+        method = method.replace(track=call_options["track"])
+        start = time.perf_counter()
+        estimate = method(reference, others, seed=call_options["seed"], hint=call_options["hint"], trace=trace)
+        selected = dense.selected_views(estimate, others, trace)
+        ms = {"sparse": 1e3 * (time.perf_counter() - start)}
         maps = {}
         for source_views in (self.options.get("source_views", 3), 1):
-            began = time.perf_counter()
+            start = time.perf_counter()
             maps[source_views] = dense.sweep_depth(
-                reference, asked, method=method, **{**self.options, "source_views": source_views}
+                reference, selected, method=method, **{**self.options, "source_views": source_views}
             )
-            ms[f"sweep_{source_views}"] = 1e3 * (time.perf_counter() - began)
+            ms[f"sweep_{source_views}"] = 1e3 * (time.perf_counter() - start)
         hw = next(iter(maps.values())).depth.shape[-2:]
-        place = dense.map_pixel_centres(reference, (hw[0], hw[1])).unflatten(0, hw)
+        centres = dense.map_pixel_centres(reference, (hw[0], hw[1])).unflatten(0, hw)
         half = self.stride // 2
-        grid = method.backproject(reference, place[half :: self.stride, half :: self.stride].reshape(-1, 2))
-        index, _ = dense.top_views(asked, 1)
-        at = index[0], torch.arange(len(index[0]), device=index.device)
-        fit = asked.fits[at]
-        lost = ~fit.ok
-        R = torch.where(lost[:, None, None], torch.nan, fit.T_1_from_0.R)
-        t = torch.where(lost[:, None], torch.nan, fit.T_1_from_0.t)
+        grid = method.backproject(reference, centres[half :: self.stride, half :: self.stride].reshape(-1, 2))
+        index, _ = dense.top_views(selected, 1)
+        best = index[0], torch.arange(len(index[0]), device=index.device)
+        fit = selected.fits[best]
+        failed = ~fit.ok
+        R = torch.where(failed[:, None, None], torch.nan, fit.T_1_from_0.R)
+        t = torch.where(failed[:, None], torch.nan, fit.T_1_from_0.t)
         return ReferenceSweep(
             reference=reference,
-            trace={**trace, "sparse": joined},
-            asked=asked,
+            trace={**trace, "sparse": estimate},
+            asked=selected,
             maps=maps,
             grid=grid,
-            other=asked.frames[at],
+            other=selected.frames[best],
             T_1_from_0=Pose(R, t),
             ms=ms,
         )
@@ -155,29 +156,29 @@ def run(
     rooms: Sequence[int] = (0, 1, 2),
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """Dense maps beside the sparse answers that they stand on, and beside dense peers under the same motion.
+    """Error, coverage and calibration of dense maps, beside sparse answers and dense baselines under the same poses.
 
-    Rows of the variants ``sparse`` and ``dense, at samples`` are about the method's own samples (with texture, as
-    everywhere else), all others about pixels of the map, with texture or without. The summary holds ``dense.answered``
-    (median over scenes), ``dense.error_ratio_to_sparse`` (geometric mean over scenes of the ratio of median errors,
-    samples that both answer), ``dense.coverage_at_5_indoor`` and ``sparse.coverage_at_5_indoor`` (means over scenes of
-    some rooms, on the samples) with their ratio ``dense.coverage_ratio_at_5_indoor``, ``dense.pixels_at_5_indoor``
-    (on all pixels), ``dense.ause_ratio`` (median over scenes), ``dense.within_sigma`` and the other promises of
-    :func:`dhtorch.experiments.compare_methods.evaluate_promises`, ``dense.wrong_share`` (mean over scenes),
-    ``dense.error_ratio_to_sgbm`` (one other view each, pairs that can be rectified, equal coverage; geometric mean),
-    ``dense.error_ratio_to_<peer>`` alike, ``dense.rotation_answered`` and ``dense.room_within_1``.
+    Rows of the variants ``sparse`` and ``dense, at samples`` cover the method's own samples (with texture, as in every
+    protocol), all others pixels of the map, with or without texture. The summary holds ``dense.answered`` (median over
+    scenes), ``dense.error_ratio_to_sparse`` (geometric mean over scenes of the ratio of median errors on samples that
+    both answer), ``dense.coverage_at_5_indoor`` and ``sparse.coverage_at_5_indoor`` (means over scenes of the
+    ``indoor`` rooms, on the samples) with their ratio ``dense.coverage_ratio_at_5_indoor``,
+    ``dense.pixels_at_5_indoor`` (on all pixels), ``dense.ause_ratio`` (median over scenes), ``dense.within_sigma`` and
+    the other numbers of :func:`dhtorch.experiments.compare_methods.evaluate_promises`, ``dense.wrong_share`` (mean over
+    scenes), ``dense.error_ratio_to_sgbm`` (one source view each, rectifiable pairs, equal coverage; geometric mean),
+    ``dense.error_ratio_to_<peer>`` likewise, ``dense.rotation_answered`` and ``dense.room_within_1``.
 
     Args:
-        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`; of ``pairs`` the
-            reference views count.
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`; of ``pairs``
+            only the reference views are used.
         method: the sparse method; None = the job's.
         sweep: options of :func:`dhtorch.pipeline.dense.sweep_depth`.
-        stride: every so many pixels of the map, both ways, are judged.
-        anchors: so many of a scene's, evenly spread; None = all.
-        peers: ask the peers as well.
-        indoor: rooms of the coverages at 5 %.
+        stride: spacing of the evaluated pixels of the map, in both directions, px.
+        reference_views: number of reference views of a scene, evenly spaced; None = all.
+        peers: run the baselines as well.
+        indoor: rooms over which the coverages at 5 % are averaged.
         rotations: further scenes in which the camera only turns.
-        rooms: seeds of built-in rooms whose exact depth and motion are known.
+        rooms: seeds of built-in rooms with exact depth and poses.
 
     Raises:
         ValueError: an option out of range; else as the main job.
@@ -185,19 +186,24 @@ def run(
     _check_options(stride=stride, **({} if reference_views is None else {"reference_views": reference_views}))
     sparse = method or next(iter(chosen.values()))
     options = dict(sweep or {})
-    every = list(scenes_of(scenes))
-    every += [scene for scene in scenes_of(rotations) if scene.name not in {known.name for known in every}]
-    looking = SweepCache(options, stride)
-    variants = _variants(sparse, looking, settings.seed, peers)
-    some = partial(protocol.spread_pairs, pairs, reference_views)
+    all_scenes = list(scenes_of(scenes))
+    all_scenes += [scene for scene in scenes_of(rotations) if scene.name not in {listed.name for listed in all_scenes}]
+    cache = SweepCache(options, stride)
+    variants = _variants(sparse, cache, settings.seed, peers)
+    spread = partial(protocol.spread_pairs, pairs, reference_views)
     parts = []
-    for turning in (False, True):
-        asked = [scene for scene in every if (scene.role == "rotation") == turning]
-        cohorts: dict[str, protocol.Cohort] = {_RECTIFIABLE: partial(_far_cohort, only=True), FULL_COHORT: _far_cohort}
-        whole = Protocol(variants, cohorts=cohorts, min_candidates=0 if turning else protocol.MIN_CANDIDATES)
-        parts.append(protocol.run(asked, whole, some, settings, progress=progress))
+    for is_rotation in (False, True):
+        selected = [scene for scene in all_scenes if (scene.role == "rotation") == is_rotation]
+        cohorts: dict[str, protocol.Cohort] = {
+            _RECTIFIABLE: partial(_far_cohort, rectifiable_only=True),
+            FULL_COHORT: _far_cohort,
+        }
+        dense_protocol = Protocol(
+            variants, cohorts=cohorts, min_candidates=0 if is_rotation else protocol.MIN_CANDIDATES
+        )
+        parts.append(protocol.run(selected, dense_protocol, spread, settings, progress=progress))
     outcome = join_outcomes(parts)
-    outcome.summary |= _summary(outcome, {scene.name: scene.place for scene in every}, indoor, peers)
+    outcome.summary |= _summary(outcome, {scene.name: scene.place for scene in all_scenes}, indoor, peers)
     outcome.summary["dense.rotation_answered"] = rotation_answered(outcome)
     if rooms:
         outcome.summary |= share_within_1_percent(rooms, sparse, options)
@@ -205,40 +211,40 @@ def run(
 
 
 def verdict(outcome: Outcome, peers: bool = True) -> tuple[bool | None, str]:
-    """Hold the summary against the bars, and name what is missed or could not be measured."""
-    missed, undefined, n_held = [], [], 0
+    """(all bars met, or None if undecided; the bars that are missed and the numbers that are undefined)."""
+    missed, undefined, n_met = [], [], 0
     for name, (bar, holds) in DENSE_BARS.items():
         value = outcome.summary.get(name, {}).get("value")
         if value is None:
             undefined.append(name)
         elif holds(value, bar):
-            n_held += 1
+            n_met += 1
         else:
             missed.append(f"{name} {value:.3f} (bar {bar:g})")
     notes = [f"not measured: {', '.join(undefined)}"] if undefined else []
-    crossed = (
+    unrectifiable = (
         sorted(s for s, row in outcome.scenes("sgbm", _RECTIFIABLE).items() if not row.get("n_candidates"))
         if peers
         else []
     )
-    notes += [f"no pair can be rectified: {', '.join(crossed)}"] if crossed else []
-    said = "; ".join([f"{n_held} of {n_held + len(missed)} bars met", *missed, *notes])
-    return (None if undefined and not missed else not missed), said
+    notes += [f"no pair can be rectified: {', '.join(unrectifiable)}"] if unrectifiable else []
+    why = "; ".join([f"{n_met} of {n_met + len(missed)} bars met", *missed, *notes])
+    return (None if undefined and not missed else not missed), why
 
 
 def is_rectifiable(looked: ReferenceSweep) -> Tensor:
-    """Whether both epipoles lie outside their pictures, (B,) bool."""
+    """Whether the pose is defined and both epipoles lie outside their images, (B,) bool."""
     views = tuple((view.camera, view.hw) for view in (looked.reference, looked.other))
     inside = stereo.is_epipole_inside(views, looked.T_1_from_0)
     return ~inside & looked.T_1_from_0.t.isfinite().all(-1)
 
 
 def sample_map(found: DepthMap, samples: Samples, frame: Frame) -> Estimate:
-    """The map of a frame at samples of it: swept depths of the nearest pixel, else its reason for silence."""
+    """Map at samples of its frame → estimate: swept depth of the nearest pixel, else the gate that rejected it."""
     h, w = found.depth.shape[-2:]
-    place = cam.depth_pixels(frame.camera, frame.hw, None, (h, w), samples.uv)
+    map_uv = cam.depth_pixels(frame.camera, frame.hw, None, (h, w), samples.uv)
     depth, sigma, score, source, gate = (
-        sample_nearest(x.to(found.depth), place)[0]
+        sample_nearest(x.to(found.depth), map_uv)[0]
         for x in (found.depth, found.sigma, found.score, found.source, found.gate)
     )
     keep = source == Source.SWEPT
@@ -251,90 +257,90 @@ def sample_map(found: DepthMap, samples: Samples, frame: Frame) -> Estimate:
     )
 
 
-def _variants(method: Method, looking: SweepCache, seed: int, peers: bool) -> dict[str, Variant]:
-    most = looking.options.get("source_views", 3)
+def _variants(method: Method, cache: SweepCache, seed: int, peers: bool) -> dict[str, Variant]:
+    max_views = cache.options.get("source_views", 3)
 
     def at(k: int) -> Callable[[ReferenceSweep], tuple[Samples, Estimate]]:
         return lambda x: (x.grid, sample_map(x.maps[k], x.grid, x.reference))
 
-    says: dict[str, Callable[[ReferenceSweep], tuple[Samples, Estimate]]] = {
+    answers: dict[str, Callable[[ReferenceSweep], tuple[Samples, Estimate]]] = {
         "sparse": lambda x: (x.trace["samples"], x.trace["sparse"]),
-        _AT_SAMPLES: lambda x: (x.trace["samples"], sample_map(x.maps[most], x.trace["samples"], x.reference)),
+        _AT_SAMPLES: lambda x: (x.trace["samples"], sample_map(x.maps[max_views], x.trace["samples"], x.reference)),
         _ONE_VIEW: at(1),
-        DENSE_VARIANT: at(most),
+        DENSE_VARIANT: at(max_views),
     }
     if peers:
-        says |= {
+        answers |= {
             "sgbm": lambda x: (x.grid, _match_semi_global(x, x.T_1_from_0)),
             "dis flow": lambda x: (x.grid, stereo.match_optical_flow(x.reference, x.other, x.T_1_from_0, x.grid)),
             "bilateral": lambda x: (x.grid, filling.fill_bilateral(x.reference, x.grid)),
         }
     variants = {
-        name: Variant(method, ask=partial(looking.ask, say), seed=seed, offers=candidate_frames)
-        for name, say in says.items()
+        name: Variant(method, ask=partial(cache.ask, answer), seed=seed, offers=candidate_frames)
+        for name, answer in answers.items()
     }
     if peers:
-        own = partial(looking.ask, _match_own_calibration)
+        own_calibration = partial(cache.ask, _match_own_calibration)
         variants["sgbm, own calibration"] = Variant(
-            method, ask=own, seed=seed, offers=candidate_frames, needs=_not_rectified_reason
+            method, ask=own_calibration, seed=seed, offers=candidate_frames, needs=_not_rectified_reason
         )
     return variants
 
 
-def _match_semi_global(looked: ReferenceSweep, T_1_from_0: Pose) -> Estimate:
-    near = looked.trace["samples"]
-    reach = torch.where(near.usable, near.depth, 0.0).amax(-1)
-    reach = torch.where(reach > 0, 0.7 * reach, 1.0)
-    return stereo.match_semi_global(looked.reference, looked.other, T_1_from_0, looked.grid, nearest_m=reach)
+def _match_semi_global(sweep: ReferenceSweep, T_1_from_0: Pose) -> Estimate:
+    samples = sweep.trace["samples"]
+    nearest = torch.where(samples.usable, samples.depth, 0.0).amax(-1)
+    nearest = torch.where(nearest > 0, 0.7 * nearest, 1.0)
+    return stereo.match_semi_global(sweep.reference, sweep.other, T_1_from_0, sweep.grid, nearest_m=nearest)
 
 
-def _match_own_calibration(looked: ReferenceSweep) -> tuple[Samples, Estimate]:
-    """What the pictures give under the motion that their data set states."""
-    a, b = looked.reference.T_world_from_cam, looked.other.T_world_from_cam
+def _match_own_calibration(sweep: ReferenceSweep) -> tuple[Samples, Estimate]:
+    """Semi-global matching under the relative pose that the data set states."""
+    a, b = sweep.reference.T_world_from_cam, sweep.other.T_world_from_cam
     assert a is not None and b is not None
-    T = se3.compose(se3.invert(b), a).map(lambda x: x.to(looked.grid.uv))
-    return looked.grid, _match_semi_global(looked, T)
+    T = se3.compose(se3.invert(b), a).map(lambda x: x.to(sweep.grid.uv))
+    return sweep.grid, _match_semi_global(sweep, T)
 
 
 def _not_rectified_reason(scene: Any) -> str | None:
     return None if scene.recording.format == "rectified" else "not a rectified pair"
 
 
-def _far_cohort(batch: Batch, trace: Trace, *, only: bool = False) -> holdout.Truth:
-    """Hidden returns that pass the truth test; of the method's own samples those with texture, of pixels all."""
+def _far_cohort(batch: Batch, trace: Trace, *, rectifiable_only: bool = False) -> holdout.Truth:
+    """Held-back returns that pass the truth test; those without texture count only for variants on all pixels."""
     samples: Samples = trace["samples"]
     truth = protocol.held_back_truth(batch, trace)
-    everywhere = samples.uv.shape[1] != trace["sparse"].uv.shape[1]
+    on_pixels = samples.uv.shape[1] != trace["sparse"].uv.shape[1]
     code = truth.code
-    if everywhere:
+    if on_pixels:
         code = torch.where(code == holdout.TruthCode.TEXTURE, holdout.TruthCode.CANDIDATE, code)
-    if only:
+    if rectifiable_only:
         code = torch.where(trace["rectifiable"][:, None], code, holdout.TruthCode.EXCLUDED)
     return truth.replace(code=code)
 
 
 def _summary(outcome: Outcome, rooms: Mapping[str, str], indoor: Sequence[str], peers: bool) -> Row:
-    found = {name: _scene_points(outcome, name) for name in ("sparse", _AT_SAMPLES, DENSE_VARIANT)}
-    rows: dict[str, Row] = {scene: {} for scene in found[DENSE_VARIANT]}
+    points_of = {name: _scene_points(outcome, name) for name in ("sparse", _AT_SAMPLES, DENSE_VARIANT)}
+    rows: dict[str, Row] = {scene: {} for scene in points_of[DENSE_VARIANT]}
     summary: Row = {}
     for number, value in compare.evaluate_promises(
-        {s: [p] for s, p in found[DENSE_VARIANT].items()}, rooms, rows, 2000, 0
+        {s: [p] for s, p in points_of[DENSE_VARIANT].items()}, rooms, rows, 2000, 0
     ).items():
         summary[f"dense.{number}"] = value.entry(errors.metric_unit(number))
-    for scene, points in found[DENSE_VARIANT].items():
+    for scene, points in points_of[DENSE_VARIANT].items():
         rows[scene] |= {"ause_ratio": risk.ause(points)}
-        rows[scene]["error_ratio_to_sparse"] = _error_ratio(found[_AT_SAMPLES][scene], found["sparse"][scene])
-    measured = {scene: errors.measure_errors(points) for scene, points in found[DENSE_VARIANT].items()}
-    summary["dense.answered"] = _interval_over([m["coverage"] for m in measured.values()], "median")
-    summary["dense.wrong_share"] = _interval_over([m["wrong_share"] for m in measured.values()], "mean")
+        rows[scene]["error_ratio_to_sparse"] = _error_ratio(points_of[_AT_SAMPLES][scene], points_of["sparse"][scene])
+    metrics = {scene: errors.measure_errors(points) for scene, points in points_of[DENSE_VARIANT].items()}
+    summary["dense.answered"] = _interval_over([m["coverage"] for m in metrics.values()], "median")
+    summary["dense.wrong_share"] = _interval_over([m["wrong_share"] for m in metrics.values()], "mean")
     summary["dense.ause_ratio"] = _interval_over([row["ause_ratio"] for row in rows.values()], "median")
     ratios = [row["error_ratio_to_sparse"] for row in rows.values()]
     summary["dense.error_ratio_to_sparse"] = _interval_over(ratios, "geometric_mean")
-    summary |= _indoor_coverage(found, {scene for scene in rows if rooms[scene] in indoor})
+    summary |= _indoor_coverage(points_of, {scene for scene in rows if rooms[scene] in indoor})
     for peer in _PEERS if peers else ():
         ours, theirs = (_scene_points(outcome, name, _RECTIFIABLE) for name in (_ONE_VIEW, peer))
-        both = [scene for scene in ours if scene in theirs]
-        cut = compare.cut_to_equal_coverage({s: [ours[s]] for s in both}, {s: [theirs[s]] for s in both})
+        shared = [scene for scene in ours if scene in theirs]
+        cut = compare.cut_to_equal_coverage({s: [ours[s]] for s in shared}, {s: [theirs[s]] for s in shared})
         equal, _ = compare.ratio_over_seeds(*cut, lambda p: errors.measure_errors(p)["median_rel"])
         name = f"error_ratio_to_{peer.replace(', ', '_').replace(' ', '_')}"
         for scene, ratio in equal.items():
@@ -345,16 +351,16 @@ def _summary(outcome: Outcome, rooms: Mapping[str, str], indoor: Sequence[str], 
     return summary
 
 
-def _indoor_coverage(found: Mapping[str, Mapping[str, Points]], scenes: set[str]) -> Row:
-    """Coverage at 5 % mean risk on scenes of some rooms."""
-    reached = {
-        name: [risk.measure_risk(points)["coverage_at_5"] for scene, points in of.items() if scene in scenes]
-        for name, of in found.items()
+def _indoor_coverage(points_of: Mapping[str, Mapping[str, Points]], scenes: set[str]) -> Row:
+    """Mean coverage at 5 % mean risk over the given scenes, of map and sparse answers, and their ratio."""
+    coverages = {
+        name: [risk.measure_risk(points)["coverage_at_5"] for scene, points in scene_points.items() if scene in scenes]
+        for name, scene_points in points_of.items()
     }
     summary: Row = {
-        "dense.coverage_at_5_indoor": _interval_over(reached[_AT_SAMPLES], "mean"),
-        "sparse.coverage_at_5_indoor": _interval_over(reached["sparse"], "mean"),
-        "dense.pixels_at_5_indoor": _interval_over(reached[DENSE_VARIANT], "mean"),
+        "dense.coverage_at_5_indoor": _interval_over(coverages[_AT_SAMPLES], "mean"),
+        "sparse.coverage_at_5_indoor": _interval_over(coverages["sparse"], "mean"),
+        "dense.pixels_at_5_indoor": _interval_over(coverages[DENSE_VARIANT], "mean"),
     }
     ours, theirs = (summary[f"{name}.coverage_at_5_indoor"]["value"] for name in ("dense", "sparse"))
     summary["dense.coverage_ratio_at_5_indoor"] = bootstrap.without_interval(
@@ -364,7 +370,7 @@ def _indoor_coverage(found: Mapping[str, Mapping[str, Points]], scenes: set[str]
 
 
 def _error_ratio(ours: Points, theirs: Points) -> float | None:
-    """Ratio of the median errors where both answer."""
+    """Ratio of the median errors on samples that both answer; None if they are too few."""
     both = ours.keep & theirs.keep
     if int(both.sum()) < compare.MIN_COMPARED_ANSWERS:
         return None
@@ -373,27 +379,29 @@ def _error_ratio(ours: Points, theirs: Points) -> float | None:
 
 
 def _scene_points(outcome: Outcome, variant: str, cohort: str = FULL_COHORT) -> dict[str, Points]:
-    """Scene → candidates; of scenes without a role that have some."""
-    apart = {row["scene"] for row in outcome.rows if row.get("role")}
+    """Scene → candidates, for scenes without a role that have any."""
+    with_role = {row["scene"] for row in outcome.rows if row.get("role")}
     return {
         scene: points
-        for (scene, name, kind), points in outcome.points.items()
-        if (name, kind) == (variant, cohort) and scene not in apart and points.keep.numel()
+        for (scene, name, truth_cohort), points in outcome.points.items()
+        if (name, truth_cohort) == (variant, cohort) and scene not in with_role and points.keep.numel()
     }
 
 
 def rotation_answered(outcome: Outcome) -> Row:
-    """Share of the pixels without a return that are answered where the camera only turns, pooled over its scenes."""
-    turning = {row["scene"] for row in outcome.rows if row.get("role") == "rotation"}
-    asked = [
+    """Fraction of pixels without a return that are answered under pure rotation, pooled over such scenes."""
+    rotations = {row["scene"] for row in outcome.rows if row.get("role") == "rotation"}
+    rotation_rows = [
         row
         for row in outcome.rows
-        if row["scene"] in turning
+        if row["scene"] in rotations
         and row["pair"] is not None
         and (row["method"], row["truth"]) == (DENSE_VARIANT, FULL_COHORT)
     ]
-    holes = sum(row["n_holes"] for row in asked)
-    return bootstrap.without_interval(sum(row["n_recovered"] for row in asked) / holes if holes else None, len(turning))
+    holes = sum(row["n_holes"] for row in rotation_rows)
+    return bootstrap.without_interval(
+        sum(row["n_recovered"] for row in rotation_rows) / holes if holes else None, len(rotations)
+    )
 
 
 def _interval_over(values: Sequence[float | None], statistic: str) -> Row:

@@ -1,7 +1,7 @@
-"""Built-in rooms whose depth and motion are known exactly: how near a dense map comes where nothing is in its way.
+"""Accuracy of dense maps in built-in rooms with exact depth and poses.
 
-Judged are pixels beyond the near limit that bear texture, whose surface the other view shows too, away from depth
-steps, and not on mirrors and windows.
+Evaluated are pixels beyond the near limit with texture, visible in the source view too, away from depth steps, and not
+on mirrors and windows.
 """
 
 from __future__ import annotations
@@ -26,55 +26,68 @@ from dhtorch.pipeline.method import Method
 from dhtorch.records import Frame, PoseFit
 from dhtorch.synthetic import SyntheticRoom
 
-#: The rooms: their frames' size, near limit in m, and the frames of reference view and other view.
-_ROOM_HW, _NEAR_LIMIT_M, _VIEW_FRAMES = (480, 640), 2.0, (3, 11)
+#: Height and width of a room's frames, px.
+_ROOM_HW = (480, 640)
 
-#: Standard deviation of grey values in a window of 9 x 9 pixels that counts as texture, and the step of depth in one of
-#: 11 x 11 from which on a pixel lies at an edge.
-_MIN_TEXTURE_SIGMA, _MAX_DEPTH_STEP = 0.02, 0.05
+#: Near limit of a room, m.
+_NEAR_LIMIT_M = 2.0
 
-#: Relative error within which a pixel counts as right, and by which surfaces differ that do not hide each other.
-_MAX_RELATIVE_ERROR, _SAME_SURFACE_RATIO = 0.01, 0.03
+#: Frames of the reference view and the source view.
+_VIEW_FRAMES = (3, 11)
+
+#: Least standard deviation of grey values in a window of 9 x 9 pixels that counts as texture.
+_MIN_TEXTURE_SIGMA = 0.02
+
+#: Largest relative step of depth in a window of 11 x 11 pixels; a pixel with a larger one lies at an edge.
+_MAX_DEPTH_STEP = 0.05
+
+#: Largest relative error of a right pixel.
+_MAX_RELATIVE_ERROR = 0.01
+
+#: Largest relative difference of depth between views for a pixel to count as visible in both.
+_SAME_SURFACE_RATIO = 0.03
 
 
 def share_within_1_percent(seeds: Sequence[int], method: Method, options: Mapping[str, Any]) -> Row:
-    """``dense.room_within_1``: share of the answered pixels within 1 %, its mean over rooms; and the same of all asked,
-    silence counted as a miss, as ``dense.room_within_1_of_all``."""
-    answered, asked = [], []
+    """Fraction of pixels within 1 %, mean over rooms: ``dense.room_within_1`` of answered pixels, ``…_of_all`` of all.
+
+    Unanswered pixels count as misses in ``dense.room_within_1_of_all``.
+    """
+    of_answered, of_all = [], []
     for seed in seeds:
-        fine, told, wanted = _evaluate_room(seed, method, options)
-        answered.append(fine / max(told, 1))
-        asked.append(fine / max(wanted, 1))
+        n_right, n_answered, n_evaluated = _evaluate_room(seed, method, options)
+        of_answered.append(n_right / max(n_answered, 1))
+        of_all.append(n_right / max(n_evaluated, 1))
     return {
-        "dense.room_within_1": bootstrap.interval_over_scenes(answered, statistic="mean").entry("1"),
-        "dense.room_within_1_of_all": bootstrap.interval_over_scenes(asked, statistic="mean").entry("1"),
+        "dense.room_within_1": bootstrap.interval_over_scenes(of_answered, statistic="mean").entry("1"),
+        "dense.room_within_1_of_all": bootstrap.interval_over_scenes(of_all, statistic="mean").entry("1"),
     }
 
 
 def _evaluate_room(seed: int, method: Method, options: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Numbers of pixels: within 1 %, answered, asked."""
+    """Numbers of pixels of one room: (within 1 %, answered, evaluated)."""
     room = SyntheticRoom(
         n_frames=max(_VIEW_FRAMES) + 1, hw=_ROOM_HW, depth_hw=_ROOM_HW, lidar="exact", image_noise=0.0, seed=seed
     )
     reference, other = (room[k] for k in _VIEW_FRAMES)
-    near = range_split(reference, _NEAR_LIMIT_M)
+    near_view = range_split(reference, _NEAR_LIMIT_M)
     fit = exact_pose_fit(reference, other, method.n)
     with torch.no_grad():
-        found = dense.complete_depth(
-            near,
+        depth_map = dense.complete_depth(
+            near_view,
             range_split(other, _NEAR_LIMIT_M),
             method=method.replace(views=1, select_views=None),
             fit=fit,
             **options,
         )
-    wanted = evaluated_pixels(reference, other, _odd_surface_mask(room, _VIEW_FRAMES[0]))
-    told = wanted & (found.source == Source.SWEPT)
-    right = told & ((found.depth - reference.depth).abs() < _MAX_RELATIVE_ERROR * reference.depth)
-    return int(right.sum()), int(told.sum()), int(wanted.sum())
+    evaluated = evaluated_pixels(reference, other, _odd_surface_mask(room, _VIEW_FRAMES[0]))
+    answered = evaluated & (depth_map.source == Source.SWEPT)
+    right = answered & ((depth_map.depth - reference.depth).abs() < _MAX_RELATIVE_ERROR * reference.depth)
+    return int(right.sum()), int(answered.sum()), int(evaluated.sum())
 
 
 def exact_pose_fit(reference: Frame, other: Frame, n: int) -> PoseFit:
-    """The motion between two frames that know where they stand, as known to a tenth of a millimetre."""
+    """Relative pose from the frames' ``T_world_from_cam`` as a fit with standard deviations of 0.1 mm and 0.1 mrad."""
     a, b = reference.T_world_from_cam, other.T_world_from_cam
     if a is None or b is None:
         raise ValueError("exact_pose_fit: found a frame without T_world_from_cam, expected two that have one")
@@ -96,26 +109,30 @@ def exact_pose_fit(reference: Frame, other: Frame, n: int) -> PoseFit:
 
 
 def evaluated_pixels(reference: Frame, other: Frame, odd: Tensor) -> Tensor:
-    """Which pixels (B, h, w) are asked for.
+    """Mask (B, h, w) of the evaluated pixels.
 
     Args:
-        reference, other: frames whose depth is exact and of their picture's size.
-        odd: (B, h, w) bool, surfaces on which a picture shows something else.
+        reference, other: frames with exact depth of their image's size.
+        odd: (B, h, w) bool, surfaces whose image is not their own (mirrors, windows).
     """
-    depth, picture = reference.depth, grayscale(reference.image)
-    mean = F.avg_pool2d(picture, 9, 1, 4)
-    contrast = (F.avg_pool2d(picture.square(), 9, 1, 4) - mean.square()).clamp_min(0).sqrt()[:, 0]
+    depth, grey = reference.depth, grayscale(reference.image)
+    mean = F.avg_pool2d(grey, 9, 1, 4)
+    contrast = (F.avg_pool2d(grey.square(), 9, 1, 4) - mean.square()).clamp_min(0).sqrt()[:, 0]
     low, high = (sign * F.max_pool2d(sign * depth, 11, 1, 5) for sign in (-1, 1))
     xyz = se3.apply(
         exact_pose_fit(reference, other, 1).T_1_from_0,
         cam.unproject(reference.camera, dense.map_pixel_centres(reference, reference.hw)[None], depth.flatten(1)),
     )
-    seen, inside = sample_nearest(other.depth, cam.project(other.camera, xyz))
-    shown = inside & ((seen - xyz[..., 2]).abs() < _SAME_SURFACE_RATIO * xyz[..., 2])
+    depth_1, inside = sample_nearest(other.depth, cam.project(other.camera, xyz))
+    visible = inside & ((depth_1 - xyz[..., 2]).abs() < _SAME_SURFACE_RATIO * xyz[..., 2])
     smooth = high < (1 + _MAX_DEPTH_STEP) * low
-    beside = F.max_pool2d(odd.to(depth), 9, 1, 4) > 0
+    near_odd = F.max_pool2d(odd.to(depth), 9, 1, 4) > 0
     return (
-        (depth > _NEAR_LIMIT_M) & (contrast > _MIN_TEXTURE_SIGMA) & smooth & shown.unflatten(1, reference.hw) & ~beside
+        (depth > _NEAR_LIMIT_M)
+        & (contrast > _MIN_TEXTURE_SIGMA)
+        & smooth
+        & visible.unflatten(1, reference.hw)
+        & ~near_odd
     )
 
 

@@ -1,11 +1,11 @@
 """Question: what do feed-forward networks give on the same points, once somebody tells them the scale?
 
-DUSt3R and VGGT answer with dense depth up to scale. Beside our metric answers they get (a) the scale of an oracle: the
-median ratio to the truth over pixels of the reference view that no sample reads, one scale for each pair, as in the
-paper; and (b), beyond the paper, the scale of the sensor: the same ratio over the near returns that our method sees
-too. Only (b) is metric. The inputs are not equal (networks see no depth, ours sees near depth), and neither is silence:
-ours abstains, so the networks are also scored on exactly the candidates that ours answered. The control ``constant``
-says the same depth everywhere: its error is what an oracle's scale is worth without any network.
+DUSt3R and VGGT estimate dense depth up to scale. For the comparison with our metric depth the scale is (a) an oracle's:
+the median ratio to the truth over pixels of the reference view that no sample reads, one scale for each pair, as in the
+paper; and (b), beyond the paper, the sensor's: the same ratio over the near returns that our method uses too. Only (b)
+is metric. The inputs differ (the networks have no depth, ours has near depth), and so does coverage: ours leaves
+candidates unanswered, so the networks are also evaluated on exactly the candidates that ours answered. The control
+``constant`` predicts the same depth everywhere: its error is that of an oracle's scale without any network.
 
 Expectation (written before the run): with the oracle's scale, VGGT has the smaller median error on most scenes, also on
 the candidates that ours answered (the paper: 2.5 % against 6.7 %).
@@ -50,7 +50,7 @@ EXPECTATION = (
     "With an oracle's scale VGGT has a smaller median error than ours on most scenes, on the points ours answers."
 )
 
-#: Where a network's scale may come from, and whether the answer is then metric.
+#: Source of a network's scale → whether its depth is then metric.
 _SCALE_SOURCES = {"oracle": "no", "near": "yes"}
 
 #: The network that the verdict is about.
@@ -66,8 +66,8 @@ DepthNetwork = Callable[[Frame, Frame], RelativeDepth]
 class NetworkScale(Record):
     """Metres per unit of a network."""
 
-    factor: Tensor  # (B,); NaN where nothing fixes it
-    n_pixels: Tensor  # (B,) pixels it rests on
+    factor: Tensor  # (B,); NaN where too few pixels determine it
+    n_pixels: Tensor  # (B,) pixels that determine it
 
 
 def run(
@@ -81,20 +81,20 @@ def run(
     scale_pixels: int = 4096,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Run the chosen method and the networks on the same pairs, samples and candidates.
+    """Errors of a method and of depth networks on the same pairs, samples and candidates.
 
     Args:
-        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.pair.run`; of the methods, the
-            first one is compared with.
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.pair.run`; the first of the
+            methods is compared with the networks.
         models: name → builder of a network (``device=`` → pair of frames → :class:`RelativeDepth`). A partial whose
             option ``weights`` is None is left out; ``constant`` has none.
         scales: ``oracle``, ``near`` or both; a network's variants are called ``<name>_<scale>``.
         scale_pixels: pixels drawn to fix a scale; those without a return, or read by a sample, do not count.
 
     Returns:
-        Outcome. Rows of networks say ``scale``, ``metric``, ``parameters``, ``device`` and, as all scene rows,
-        ``seconds_per_video``; ``on_ours`` are their numbers on the candidates that ours answered. Having no pose of
-        ours, they have no ``pnp_ok``.
+        Outcome. Rows of networks have ``scale``, ``metric``, ``parameters``, ``device`` and, as all scene rows,
+        ``seconds_per_video``; ``on_ours`` are their numbers on the candidates that ours answered. They have no
+        ``pnp_ok``, as they use no pose of ours.
 
     Raises:
         ImportError: a package is missing; the message says what to install.
@@ -103,45 +103,45 @@ def run(
     for scale in scales:
         if scale not in _SCALE_SOURCES:
             raise ValueError(f"experiment.scales: found {scale!r}, expected some of {', '.join(_SCALE_SOURCES)}")
-    wanted = {k: build for k, build in (models or {}).items() if _has_weights(build)}
-    if not wanted:
+    with_weights = {k: build for k, build in (models or {}).items() if _has_weights(build)}
+    if not with_weights:
         names = ", ".join(f"experiment.models.{k}.weights" for k in models or ())
         raise ValueError(f"experiment.models: found no weights, expected local files or folders in {names or 'it'}")
-    networks = {k: build(device=settings.device) for k, build in wanted.items()}
+    networks = {k: build(device=settings.device) for k, build in with_weights.items()}
     ours, method = next(iter(chosen.items()))
     variants = {ours: Variant(method)}
     labels: dict[str, Row] = {ours: {"scale": "sensor", "metric": "yes", **memory.count_weights(method)}}
     for name, network in networks.items():
-        once = CachedNetwork(network)
+        cached = CachedNetwork(network)
         for scale in scales:
-            asked = partial(estimate_with_network, network=once, scale_pixels=scale_pixels)
-            given = partial(_scale_reference, scale=scale, seed=settings.seed)
-            variants[f"{name}_{scale}"] = Variant(method, ask=asked, given=given)
+            ask = partial(estimate_with_network, network=cached, scale_pixels=scale_pixels)
+            scale_options = partial(_scale_reference, scale=scale, seed=settings.seed)
+            variants[f"{name}_{scale}"] = Variant(method, ask=ask, given=scale_options)
             labels[f"{name}_{scale}"] = {"scale": scale, "metric": _SCALE_SOURCES[scale], **_count_weights(network)}
-    whole = Protocol(variants, columns=_scale_columns)
-    outcome = protocol.run(scenes, whole, pairs, settings, progress=progress)
+    full_protocol = Protocol(variants, columns=_scale_columns)
+    outcome = protocol.run(scenes, full_protocol, pairs, settings, progress=progress)
     _complete_rows(outcome, ours, labels, settings.device)
-    outcome.summary = summarise_rows(outcome.rows, list(variants), list(whole.cohorts))
+    outcome.summary = summarise_rows(outcome.rows, list(variants), list(full_protocol.cohorts))
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, ours, f"{_DECIDING_NETWORK}_oracle"))
 
 
 class CachedNetwork:
-    """A network that is asked once about the same pictures, for all its scales; keeps the milliseconds it took."""
+    """Network with a cache of its last pair of images, for all scales; keeps the milliseconds of the forward pass."""
 
     def __init__(self, network: DepthNetwork) -> None:
         self.network = network
-        self._pictures: tuple[Tensor, Tensor] | None = None
-        self._found: tuple[RelativeDepth, float] | None = None
+        self._images: tuple[Tensor, Tensor] | None = None
+        self._answer: tuple[RelativeDepth, float] | None = None
 
     def __call__(self, frame_0: Frame, frame_1: Frame) -> tuple[RelativeDepth, float]:
-        """The answer, and the time it took when it was first given."""
-        known = self._pictures
-        if self._found is None or known is None or known[0] is not frame_0.image or known[1] is not frame_1.image:
+        """(relative depth of the pair, milliseconds of the forward pass that computed it)."""
+        images = self._images
+        if self._answer is None or images is None or images[0] is not frame_0.image or images[1] is not frame_1.image:
             start = time.perf_counter()
-            answer = self.network(frame_0, frame_1)
-            self._found = answer, 1e3 * (time.perf_counter() - start)
-            self._pictures = frame_0.image, frame_1.image
-        return self._found
+            depth = self.network(frame_0, frame_1)
+            self._answer = depth, 1e3 * (time.perf_counter() - start)
+            self._images = frame_0.image, frame_1.image
+        return self._answer
 
 
 def estimate_with_network(
@@ -154,17 +154,17 @@ def estimate_with_network(
     known: Frame,
     seed: int,
     trace: Trace,
-    **_told: Any,
+    **_options: Any,
 ) -> Estimate:
-    """A network in the place of a method: our samples, its depth, a scale from ``known``."""
+    """Estimate at the method's samples from a network's depth, scaled by the depth of ``known``."""
     like = near.camera.f
     samples = method.sample_depth(near)
     relative, ms = network(near, other)
     scale = fit_scale(relative, known, samples.uv, n_pixels=scale_pixels, seed=seed)
-    nowhere = Pose(
+    no_pose = Pose(
         torch.full_like(like, torch.nan)[:, :1, None].expand(-1, 3, 3), like.new_full((len(like), 3), torch.nan)
     )
-    trace.update(samples=samples, fit=known_pose_fit(nowhere, method.n), scale=scale, ms={"network": ms})
+    trace.update(samples=samples, fit=known_pose_fit(no_pose, method.n), scale=scale, ms={"network": ms})
     return to_estimate(relative, samples.uv, scale.factor)
 
 
@@ -172,12 +172,12 @@ def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pi
     """Metres per unit: median ratio of known to relative depth over pixels that no sample reads.
 
     Image pixels are drawn from the seed, the same for all pairs. One whose pixel of the depth map lies within the
-    reach of a sample's (that pixel itself; in a sparse map twice the radius in which a return is searched) is turned
-    away, so that no candidate's truth takes part.
+    reach of a sample's (that pixel itself; in a sparse map twice the radius in which a return is searched) is left out,
+    so that no candidate's truth takes part.
 
     Args:
-        relative: of B pairs.
-        known: the reference views with the depth that fixes the scale.
+        relative: relative depth of B pairs.
+        known: the reference views with the depth that determines the scale.
         samples_uv: (B, N, 2) px.
         n_pixels: pixels drawn.
         seed: of the pixels.
@@ -187,9 +187,9 @@ def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pi
     uv = (draws * torch.tensor([w, h]) - 0.5).to(samples_uv).expand(samples_uv.shape[0], -1, -1)
     true_depth = holdout.sample_truth(known, uv, truth="raw").depth
     reach = uv.new_zeros(1, 1) if known.sparse is None else (holdout.SPARSE_CLOSE_WINDOW_PX - 1) * known.sparse[:, None]
-    taken = _is_near_sample(known, uv, samples_uv, reach)
+    near_sample = _is_near_sample(known, uv, samples_uv, reach)
     depth, _ = sample_relative_depth(relative, uv)
-    use = (true_depth > 0) & depth.isfinite() & ~taken
+    use = (true_depth > 0) & depth.isfinite() & ~near_sample
     ratio = torch.where(use, true_depth / torch.where(use, depth, torch.ones_like(depth)), torch.nan)
     count = use.sum(-1)
     factor = ratio.nanmedian(-1).values
@@ -197,38 +197,42 @@ def fit_scale(relative: RelativeDepth, known: Frame, samples_uv: Tensor, *, n_pi
 
 
 def verdict(outcome: Outcome, ours: str, theirs: str) -> tuple[bool | None, str]:
-    """Whether the network has the smaller median error on the candidates ours answered, on most scenes; and why."""
-    mine, yours = outcome.scenes(ours), outcome.scenes(theirs)
-    both = {}
-    for scene in mine:
-        row = yours.get(scene, {}).get("on_ours") or {}
-        if mine[scene].get("median_rel") is not None and row.get("median_rel") is not None:
-            both[scene] = (row["median_rel"], mine[scene]["median_rel"])
-    if not both:
-        return None, "no scene on which both answered" if yours else f"{theirs} was not run: give its weights"
-    better = [scene for scene, (a, b) in both.items() if a < b]
-    a, b = (median_or_none([pair[k] for pair in both.values()]) or 0.0 for k in (0, 1))
-    why = f"{theirs} is more accurate on {len(better)} of {len(both)} scenes, median of medians {a:.2%} against {b:.2%}"
-    return 2 * len(better) > len(both), why
+    """(the network has the smaller median error on the candidates ours answered, on most scenes; medians)."""
+    our_rows, their_rows = outcome.scenes(ours), outcome.scenes(theirs)
+    pairs = {}
+    for scene in our_rows:
+        row = their_rows.get(scene, {}).get("on_ours") or {}
+        if our_rows[scene].get("median_rel") is not None and row.get("median_rel") is not None:
+            pairs[scene] = (row["median_rel"], our_rows[scene]["median_rel"])
+    if not pairs:
+        return None, "no scene on which both answered" if their_rows else f"{theirs} was not run: give its weights"
+    better = [scene for scene, (a, b) in pairs.items() if a < b]
+    a, b = (median_or_none([pair[k] for pair in pairs.values()]) or 0.0 for k in (0, 1))
+    why = (
+        f"{theirs} is more accurate on {len(better)} of {len(pairs)} scenes, median of medians {a:.2%} against {b:.2%}"
+    )
+    return 2 * len(better) > len(pairs), why
 
 
 def _has_weights(build: Callable[..., DepthNetwork]) -> bool:
-    return getattr(build, "keywords", {}).get("weights", "none asked for") is not None
+    return getattr(build, "keywords", {}).get("weights", "no such option") is not None
 
 
 def _scale_reference(batch: Batch, *, scale: str, seed: int) -> dict[str, Any]:
-    """What fixes the scale: the truth of the reference view, or the returns that ours sees too."""
-    known = batch.exact if scale == "oracle" else holdout.range_split(batch.reference, batch.cutoff)
-    return {"known": known, "seed": seed}
+    """Reference view whose depth determines the scale: its truth, or the near returns that ours uses too."""
+    reference = batch.exact if scale == "oracle" else holdout.range_split(batch.reference, batch.cutoff)
+    return {"known": reference, "seed": seed}
 
 
 def _is_near_sample(frame: Frame, uv: Tensor, samples_uv: Tensor, reach: Tensor) -> Tensor:
-    """Which of the pixels (B, M) lie, in the depth map, within ``reach`` (B, 1) pixels of one that a sample reads."""
+    """Whether pixels (B, M) lie, in the depth map, within ``reach`` (B, 1) pixels of one that a sample reads."""
     size = (frame.depth.shape[-2], frame.depth.shape[-1])
-    place = partial(cam.depth_pixels, frame.camera, frame.hw, frame.depth_camera, size)
-    here, there = (round_half_up(place(x)) for x in (uv, samples_uv))
-    near = [torch.cdist(a[None], b[None], p=torch.inf)[0].amin(-1) for a, b in zip(here, there, strict=True)]
-    return torch.stack(near) <= reach
+    to_depth_map = partial(cam.depth_pixels, frame.camera, frame.hw, frame.depth_camera, size)
+    pixels, sample_pixels = (round_half_up(to_depth_map(x)) for x in (uv, samples_uv))
+    distance = [
+        torch.cdist(a[None], b[None], p=torch.inf)[0].amin(-1) for a, b in zip(pixels, sample_pixels, strict=True)
+    ]
+    return torch.stack(distance) <= reach
 
 
 def _count_weights(network: Any) -> dict[str, int]:
@@ -241,17 +245,17 @@ def _scale_columns(answer: protocol.Answer) -> Row:
 
 
 def _complete_rows(outcome: Outcome, ours: str, labels: Mapping[str, Row], device: str) -> None:
-    """Fill in what rows of the protocol do not know: labels, time for the video, numbers on what ours answered."""
+    """Add labels, time of the whole video, and metrics on the candidates that ours answered to the protocol's rows."""
     for row in outcome.rows:
         name, scene = row["method"], row["scene"]
         row.update(labels[name], device=device)
         if name != ours:
             row.update({k: None for k in ("pnp_ok", "pnp_success", "n_inlier") if k in row})
-        mine = [r for r in outcome.rows if (r["scene"], r["method"]) == (scene, name) and r["pair"] is not None]
-        if row["pair"] is not None or not mine:
+        pair_rows = [r for r in outcome.rows if (r["scene"], r["method"]) == (scene, name) and r["pair"] is not None]
+        if row["pair"] is not None or not pair_rows:
             continue
-        row["seconds_per_video"] = sum(sum(r["ms"].values()) for r in mine) / 1e3
+        row["seconds_per_video"] = sum(sum(r["ms"].values()) for r in pair_rows) / 1e3
         if name != ours:
             answered = outcome.points[scene, ours, row["truth"]].keep
-            numbers = errors.measure_errors(outcome.points[scene, name, row["truth"]][answered])
-            row["on_ours"] = {k: numbers[k] for k in ("n_kept", "coverage", "median_rel", "p90_rel", "corr")}
+            metrics = errors.measure_errors(outcome.points[scene, name, row["truth"]][answered])
+            row["on_ours"] = {k: metrics[k] for k in ("n_kept", "coverage", "median_rel", "p90_rel", "corr")}

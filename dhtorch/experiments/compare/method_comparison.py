@@ -59,24 +59,25 @@ def run(
     moving: Sequence[str] = (),
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """Run several methods on the same pairs, several seeds each, and compare them with the reference.
+    """Errors and coverages of several methods on the same pairs, several seeds each, relative to a reference.
 
     Rows are those of the first seed; scene rows of a compared method carry ``against_<reference>``: its numbers over
     all seeds. The summary holds, for every compared method, the numbers of
-    :func:`dhtorch.experiments.compare_methods.method_ratios`. A method of several views is replaced, on scenes too
-    short for three, by its stand-in; one that has none is asked there with the views that there are.
+    :func:`dhtorch.experiments.compare_methods.method_ratios`. On scenes with fewer
+    than three views a method of several views is replaced by its stand-in; one without a stand-in uses the views there
+    are.
 
     Args:
         scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
         methods: name → method; None = ``chosen``.
         reference: name of the method to compare with.
-        once: methods that are shown for one seed and not compared.
-        seeds: how many, from the job's own upwards.
+        once: methods that are run with one seed and not compared.
+        seeds: number of seeds, from the job's own upwards.
         stand_ins: method of several views → method of one; None = the first compared method for all.
-        baseline: the method of several views that the others of several views are held against as well.
+        baseline: the method of several views with which the others of several views are compared as well.
         indoor: rooms whose scenes make the mean ``<method>.coverage_at_5_indoor``.
-        moving: rooms in which what is near moves; their scenes, whatever their role, make ``<method>.convoy_wrong``,
-            the largest share of the candidates of one scene (all seeds) that is answered and more than 20 % off.
+        moving: rooms in which near objects move; their scenes, whatever their role, make ``<method>.convoy_wrong``,
+            the largest fraction over scenes of candidates (all seeds) that are answered with an error above 20 %.
 
     Raises:
         ValueError: no reference, or nothing to compare with it; else as the main job.
@@ -93,66 +94,71 @@ def run(
     }
     outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
     rooms = {scene.name: scene.place for scene in scenes_of(scenes)}
-    apart = {scene.name for scene in scenes_of(scenes) if scene.role is not None}
-    everywhere = {name: points_by_seed(outcome, name, seeds) for name in (reference, *compared)}
-    found = {name: {s: p for s, p in of.items() if s not in apart} for name, of in everywhere.items()}
-    complete = compare.complete_scenes(found, reference, fallback)
-    judged = compare.method_ratios(complete, reference=reference, rooms=rooms)
+    with_role = {scene.name for scene in scenes_of(scenes) if scene.role is not None}
+    all_points = {name: points_by_seed(outcome, name, seeds) for name in (reference, *compared)}
+    points_of = {
+        name: {s: p for s, p in scene_points.items() if s not in with_role} for name, scene_points in all_points.items()
+    }
+    complete = compare.complete_scenes(points_of, reference, fallback)
+    comparison = compare.method_ratios(complete, reference=reference, rooms=rooms)
     keep_first_seed(outcome, methods, seeds)
-    outcome.summary |= judged.summary
-    outcome.summary |= _indoor_coverage(judged, rooms, indoor)
-    for name, of in everywhere.items():
-        outcome.summary |= _worst_wrong_share(name, [p for scene, p in of.items() if rooms[scene] in moving])
+    outcome.summary |= comparison.summary
+    outcome.summary |= _indoor_coverage(comparison, rooms, indoor)
+    for name, scene_points in all_points.items():
+        outcome.summary |= _worst_wrong_share(name, [p for scene, p in scene_points.items() if rooms[scene] in moving])
     several = [name for name in compared if methods[name].views > 1]
     for name in (n for n in several if n != baseline and baseline in compared):
         numbers, by_scene = compare.multiview_ratios(complete[name], complete[baseline], baseline)
         outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in numbers.items()}
         for scene, row in outcome.scenes(name).items():
             row.update(by_scene.get(scene, {}))  # none where there were too few candidates
-    _add_to_scene_rows(outcome.rows, judged.rows, f"against_{reference}")
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, compared, set(several)))
+    _add_to_scene_rows(outcome.rows, comparison.rows, f"against_{reference}")
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(comparison, compared, set(several)))
 
 
 def verdict(judged: compare.MethodComparison, compared: Sequence[str], several: set[str]) -> tuple[bool | None, str]:
-    """Hold the summary against the bars, and name what is missed, left out or silenced."""
-    missed, n_held = [], 0
+    """(all bars met, or None if a number is undefined; bars that are missed, scenes without a ratio or an answer)."""
+    missed, n_met = [], 0
     for method in compared:
-        for number, (one, many, holds) in METHOD_BARS.items():
-            value, bar = judged.summary.get(f"{method}.{number}", {}).get("value"), many if method in several else one
+        for number, (two_view_bar, multi_view_bar, holds) in METHOD_BARS.items():
+            value, bar = (
+                judged.summary.get(f"{method}.{number}", {}).get("value"),
+                multi_view_bar if method in several else two_view_bar,
+            )
             if value is None:
                 return None, f"{method}.{number} is not defined on these scenes"
-            n_held += holds(value, bar)
+            n_met += holds(value, bar)
             missed += [] if holds(value, bar) else [f"{method}.{number} {value:.3f} (bar {bar:g})"]
     notes = [f"{m} without ratio: {', '.join(scenes)}" for m, scenes in judged.left_out.items() if scenes]
-    notes += [f"{m} % risk silences {', '.join(scenes)}" for m, scenes in judged.silent.items() if scenes]
-    return not missed, "; ".join([f"{n_held} of {n_held + len(missed)} bars met", *missed, *notes])
+    notes += [f"{m} % risk: no answer on {', '.join(scenes)}" for m, scenes in judged.silent.items() if scenes]
+    return not missed, "; ".join([f"{n_met} of {n_met + len(missed)} bars met", *missed, *notes])
 
 
-def _indoor_coverage(judged: compare.MethodComparison, rooms: Mapping[str, str], indoor: Sequence[str]) -> Row:
-    """Coverage at 5 % risk, its mean over the scenes of some rooms."""
-    reached: dict[str, list[float]] = {}
-    for row in judged.rows:
+def _indoor_coverage(comparison: compare.MethodComparison, rooms: Mapping[str, str], indoor: Sequence[str]) -> Row:
+    """Mean coverage at 5 % risk of every method over the scenes of the indoor rooms."""
+    coverages: dict[str, list[float]] = {}
+    for row in comparison.rows:
         if rooms[row["scene"]] in indoor and row["coverage_at_5"] is not None:
-            reached.setdefault(row["method"], []).append(row["coverage_at_5"])
+            coverages.setdefault(row["method"], []).append(row["coverage_at_5"])
     return {
         f"{name}.coverage_at_5_indoor": bootstrap.interval_over_scenes(values, statistic="mean").entry("1")
-        for name, values in reached.items()
+        for name, values in coverages.items()
     }
 
 
 def _worst_wrong_share(name: str, scenes: Sequence[Sequence[Points]]) -> Row:
-    """The worst of the scenes' shares of candidates that are answered and wrong, over the seeds of each."""
-    pools = [pool for pool in map(pytree.collate, scenes) if pool.keep.numel()]
-    if not pools:
+    """Largest fraction over scenes of candidates that are answered and wrong; seeds of a scene are pooled."""
+    pooled = [points for points in map(pytree.collate, scenes) if points.keep.numel()]
+    if not pooled:
         return {}
-    shares = [float((pool.keep & (pool.error > errors.GROSS_ERROR_REL)).double().mean()) for pool in pools]
-    return {f"{name}.convoy_wrong": bootstrap.without_interval(max(shares), len(shares))}
+    ratios = [float((points.keep & (points.error > errors.GROSS_ERROR_REL)).double().mean()) for points in pooled]
+    return {f"{name}.convoy_wrong": bootstrap.without_interval(max(ratios), len(ratios))}
 
 
 def _make_variant(method: Method, seed: int, pairs: ScenePairs | None) -> Variant:
-    """A method that chooses its views is offered those around the reference view; another takes the pair's own.
+    """Variant of a method: candidate views around the reference view if it selects views, else the pair's own.
 
-    With ``pairs`` it is not asked on scenes of too few views.
+    With ``pairs`` it is skipped on scenes of too few views.
     """
     if method.select_views is not None:
         return Variant(method, seed=seed, offers=candidate_frames, needs=partial(_skip_reason, None, method))
@@ -160,27 +166,27 @@ def _make_variant(method: Method, seed: int, pairs: ScenePairs | None) -> Varian
 
 
 def seed_variant_name(method: str, k: int) -> str:
-    """The variant that is a method with its seed ``k``; the first bears the method's own name."""
+    """Name of the variant of a method with seed ``k``; that of the first seed is the method's own name."""
     return method if k == 0 else f"{method}, seed {k}"
 
 
 def _skip_reason(pairs: ScenePairs | None, method: Method, scene: Scene) -> str | None:
-    """Why a method is not asked on a scene: a package, or views that there are not; None where it is."""
-    short = (
+    """Reason to skip a method on a scene: a missing package or too few views; None if it runs."""
+    too_short = (
         pairs is not None and method.views > 1 and min((j - i for i, j in to_fixed_pairs(pairs(scene))), default=2) < 2
     )
-    return xfeat.method_missing_reason(method) or ("fewer than 3 views" if short else None)
+    return xfeat.method_missing_reason(method) or ("fewer than 3 views" if too_short else None)
 
 
 def keep_first_seed(outcome: Outcome, methods: Iterable[str], seeds: int) -> None:
-    """Take the later seeds out of the rows and the summary; their points stay."""
+    """Remove the later seeds from the rows and the summary; their points remain."""
     later = {seed_variant_name(name, k) for name in methods for k in range(1, seeds)}
     outcome.rows = [r for r in outcome.rows if r["method"] not in later]
     outcome.summary = {k: v for k, v in outcome.summary.items() if not any(k.startswith(f"{m}.") for m in later)}
 
 
 def points_by_seed(outcome: Outcome, method: str, seeds: int, apart: Collection[str] = ()) -> dict[str, list[Points]]:
-    """Scene → candidates of every seed; scenes that stand apart stay out."""
+    """Scene → candidates of every seed, without the scenes in ``apart``."""
     scenes: dict[str, list[Points]] = {}
     for k in range(seeds):
         for (scene, variant, cohort), points in outcome.points.items():
@@ -190,8 +196,10 @@ def points_by_seed(outcome: Outcome, method: str, seeds: int, apart: Collection[
 
 
 def _add_to_scene_rows(rows: Sequence[Row], numbers: Sequence[Row], key: str) -> None:
-    """Put the comparison's numbers of a scene into its row."""
-    known = {(n["scene"], n["method"]): {k: v for k, v in n.items() if k not in ("scene", "method")} for n in numbers}
+    """Add the comparison's numbers of a scene to its row, under ``key``."""
+    of_scene = {
+        (n["scene"], n["method"]): {k: v for k, v in n.items() if k not in ("scene", "method")} for n in numbers
+    }
     for row in rows:
-        if row["pair"] is None and (row["scene"], row["method"]) in known:
-            row[key] = known[row["scene"], row["method"]]
+        if row["pair"] is None and (row["scene"], row["method"]) in of_scene:
+            row[key] = of_scene[row["scene"], row["method"]]

@@ -32,14 +32,14 @@ def run(
     tolerance: float = 0.1,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Run several methods side by side on the same pairs, for several truth tests.
+    """Errors and coverage of several methods on the same pairs and truth tests, compared with a reference.
 
     Args:
         scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.pair.run`.
         methods: name → method; None = ``chosen``. The first that is not the reference is compared with it.
         reference: name of the method to compare with.
-        truths: truth tests to report; the verdict looks at the last.
-        tolerance: share by which a number may be worse.
+        truths: truth tests to report; the last one decides.
+        tolerance: fraction by which a number may be worse.
 
     Raises:
         ValueError: fewer than two methods, or no method of that name; else as the main job.
@@ -63,7 +63,7 @@ def run(
 def compare_scenes(
     rows: Sequence[Row], ours: str, reference: str, truth: str, tolerance: float
 ) -> tuple[int, list[str]]:
-    """Number of scenes compared, and one line for every number that is worse by more than ``tolerance``."""
+    """(number of compared scenes, a line for every number that is worse by more than ``tolerance``)."""
     scenes = {
         (r["scene"], r["method"]): r for r in rows if r["pair"] is None and r["truth"] == truth and r["role"] is None
     }
@@ -73,10 +73,10 @@ def compare_scenes(
         if a.get("median_rel") is None or b.get("median_rel") is None:
             continue
         compared += 1
-        for metric, bad in (
+        for metric, is_worse in (
             ("median_rel", a["median_rel"] > b["median_rel"] * (1 + tolerance)),
             ("coverage", a["coverage"] < b["coverage"] * (1 - tolerance)),
         ):
-            if bad:
+            if is_worse:
                 worse.append(f"{scene} {metric} {a[metric]:.3f} against {b[metric]:.3f}")
     return compared, worse

@@ -28,14 +28,16 @@ from dhtorch.pipeline.presets import MAP_PYRAMID_LEVELS
 QUESTION = "Which part of a method carries its gain over the one before it, and what does each cost?"
 EXPECTATION = "Either whole is better than every part alone, and no part can be left out without loss."
 
-#: A loss in a ratio that is told from none: reordering the points of a search moves it as much.
+#: Least change of a ratio that counts: reordering the points of a search changes it by as much.
 _MIN_TELLING_RATIO = 1.05
 
-#: Options of the pose that leave out far tracks, and a turn of the rows.
+#: Options of the pose without far tracks.
 _NEAR_ONLY_OPTIONS: dict[str, Any] = {"far_weight": 0.0}
+
+#: Options of the pose without a rolling shutter.
 _GLOBAL_SHUTTER_OPTIONS: dict[str, Any] = {"shutter_sigma": 0.0}
 
-#: Seat 6 as the paper has it: its gates, and how its sigma is made. The whole sets both differently.
+#: Gates of the triangulation stage as in the paper; ``map`` has others.
 PAPER_GATE_OPTIONS: dict[str, Any] = {
     "min_parallax_deg": 0.3,
     "max_residual_px": 3.0,
@@ -45,6 +47,8 @@ PAPER_GATE_OPTIONS: dict[str, Any] = {
     "max_far_noise": None,
     "max_in_reach": None,
 }
+
+#: Sigma of the triangulation stage as in the paper; ``map`` has another.
 PAPER_SIGMA_OPTIONS: dict[str, Any] = {
     "fitted_noise": False,
     "isotropic": 0.1,
@@ -55,16 +59,16 @@ PAPER_SIGMA_OPTIONS: dict[str, Any] = {
     "sensor_share": 0.0,
 }
 
-#: What several views are replaced by on scenes that have too few. The others answer there with the views there are.
+#: Variant of several views → variant that replaces it on scenes with too few; others use the views there are.
 _SPARSE_SCENE_STAND_INS = {"+ views": "paper", "window": "map"}
 
-#: Group → the whole, the number by which its parts alone are held against it, and that for what is left out of it.
+#: Group → (complete method, metric that compares it with single parts, metric that compares it without a part).
 ABLATION_GROUPS = {
     "map": ("map", "median_rel_ratio_at_equal_coverage", "aurc_ratio"),
     "auto": ("auto", "aurc_full_ratio_to_window", "aurc_full_ratio_to_window"),
 }
 
-#: What these numbers are called.
+#: Metric → its label in the verdict.
 _NUMBER_LABELS = {
     "median_rel_ratio_at_equal_coverage": "error ratio at equal coverage",
     "aurc_ratio": "ratio of areas under risk–coverage",
@@ -83,17 +87,17 @@ def run(
     seeds: int = 2,
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """Each part of ``map`` put into ``paper`` alone, and each left out; the same of ``auto`` and ``window``.
+    """Ablation: each part of ``map`` added to ``paper`` alone, and each left out of ``map``; likewise for ``auto``.
 
-    Numbers are those of ``method_comparison``, in which every variant is held against ``paper``, and those of several
-    views against ``window`` as well; the summary adds ``<variant>.pair_ms``, the time of one pair (median over the
-    pairs of a scene, then over scenes), and ``<variant>.extra_ms``, what of it the paper's does not take.
+    The metrics are those of ``method_comparison``: every variant is compared with ``paper``, and those of several views
+    with ``window`` as well; the summary adds ``<variant>.pair_ms``, the time of one pair (median over the pairs of a
+    scene, then over scenes), and ``<variant>.extra_ms``, its difference to the time of ``paper``.
 
     Args:
         scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: ``paper``, ``map`` and ``window``, and ``auto`` where that is taken apart; None = ``chosen``.
-        groups: what is taken apart, ``map`` or ``auto`` or both.
-        seeds: how many, from the job's own upwards.
+        methods: ``paper``, ``map`` and ``window``, and ``auto`` if it is in ``groups``; None = ``chosen``.
+        groups: methods to ablate, ``map`` or ``auto`` or both.
+        seeds: number of seeds, from the job's own upwards.
 
     Raises:
         ValueError: one of the methods is missing, or no such group; else as the main job.
@@ -103,28 +107,28 @@ def run(
         raise ValueError(f"experiment.groups: found {list(groups)}, expected some of {', '.join(ABLATION_GROUPS)}")
     if missing := {"paper", "map", "window", *groups} - methods.keys():
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {', '.join(sorted(missing))} too")
-    of_group = {
+    ablations = {
         "map": build_map_ablations(methods["paper"], methods["map"], methods["window"]),
         "auto": build_auto_ablations(methods["window"], methods["auto"]) if "auto" in groups else {},
     }
     variants = {name: methods[name] for name in ("paper", "map", "window")}
     variants |= {
-        name: method for group in ABLATION_GROUPS if group in groups for name, method in of_group[group].items()
+        name: method for group in ABLATION_GROUPS if group in groups for name, method in ablations[group].items()
     }
     options: dict[str, Any] = {"once": (), "seeds": seeds, "stand_ins": _SPARSE_SCENE_STAND_INS, "progress": progress}
     outcome = method_comparison.run(scenes, {}, pairs, settings, methods=variants, **options)
-    cost = {name: _median_pair_ms(outcome, name) for name in variants}
-    for name, ms in cost.items():
-        more = None if ms is None or cost["paper"] is None else ms - cost["paper"]
-        for number, value in (("pair_ms", ms), ("extra_ms", more)):
+    pair_ms = {name: _median_pair_ms(outcome, name) for name in variants}
+    for name, ms in pair_ms.items():
+        extra = None if ms is None or pair_ms["paper"] is None else ms - pair_ms["paper"]
+        for number, value in (("pair_ms", ms), ("extra_ms", extra)):
             outcome.summary[f"{name}.{number}"] = bootstrap.without_interval(value, len(outcome.scenes(name)), "ms")
-    judged = [verdict(outcome.summary, group, list(of_group[group])) for group in ABLATION_GROUPS if group in groups]
-    holds = None if any(held is None for held, _ in judged) else all(held for held, _ in judged)
-    return outcome.decide(QUESTION, EXPECTATION, holds, "; ".join(why for _, why in judged))
+    verdicts = [verdict(outcome.summary, group, list(ablations[group])) for group in ABLATION_GROUPS if group in groups]
+    holds = None if any(met is None for met, _ in verdicts) else all(met for met, _ in verdicts)
+    return outcome.decide(QUESTION, EXPECTATION, holds, "; ".join(why for _, why in verdicts))
 
 
 def build_map_ablations(paper: Method, whole: Method, window: Method) -> dict[str, Method]:
-    """Variant → method: the paper's, with one part of the whole (``+ …``), the whole, without one (``- …``)."""
+    """Variant → method: ``paper``, with one part of ``map`` (``+ …``), ``map``, and without one part (``- …``)."""
     return {
         "paper": paper,
         "+ affine tracks": paper.replace(track=whole.track),
@@ -151,48 +155,50 @@ def build_map_ablations(paper: Method, whole: Method, window: Method) -> dict[st
 def build_auto_ablations(window: Method, auto: Method) -> dict[str, Method]:
     """Variant → method: one part of ``auto`` in ``window`` (``+ …``), ``auto``, and ``auto`` without one (``- …``).
 
-    What is not in one of :data:`_ABLATION_PARTS` is a part of its own, under the name of its seat, where the two differ
-    in it.
+    A stage or option in which the two differ and that is not in :data:`_ABLATION_PARTS` is a part of its own, named
+    after its stage.
     """
     gated = _swap_contradiction_gates(_swap_sigma_gate(window, auto), auto)
     parts = _ABLATION_PARTS | {
-        f"{seat} of auto": partial(_swap_stage, seat)
-        for seat in ("sample", "backproject", "classify", "pose", "triangulate", "n", "hypotheses", "min_trackability")
-        if stage_key(getattr(gated, seat)) != stage_key(getattr(auto, seat))
+        f"{stage} of auto": partial(_swap_stage, stage)
+        for stage in ("sample", "backproject", "classify", "pose", "triangulate", "n", "hypotheses", "min_trackability")
+        if stage_key(getattr(gated, stage)) != stage_key(getattr(auto, stage))
     }
     alone = {f"+ {name}": part(window, auto) for name, part in parts.items()}
     return {**alone, "auto": auto, **{f"- {name}": part(auto, window) for name, part in parts.items()}}
 
 
 def _swap_start(method: Method, other: Method) -> Method:
-    """The other's start of the search; it is not chained where either method's is not."""
+    """Method with the other's initial displacement; chained only if both methods are."""
     return method.replace(track=_with_start(method.track, other.track), chain=method.chain and other.chain)
 
 
 def _swap_exposure(method: Method, other: Method) -> Method:
-    """All that the other's tracker does otherwise, but for the start: what it makes of different exposures."""
+    """Method with the other's tracker except for its start: its handling of different exposures."""
     return method.replace(track=_with_start(other.track, method.track))
 
 
 def _swap_views(method: Method, other: Method) -> Method:
-    """The other's views; those on both sides of a reference view are no chain."""
+    """Method with the other's source views; views on both sides of a reference view are not chained."""
     return method.replace(select_views=other.select_views, views=other.views, chain=method.chain and other.chain)
 
 
 def _swap_gates(names: Sequence[str], method: Method, other: Method) -> Method:
-    """Limits of the other's seat 6."""
+    """Method with the other's limits ``names`` of the triangulation stage."""
     own, theirs = ({name: _find_option(m.triangulate, name) for name in names} for m in (method, other))
     changed = {name: value for name, value in theirs.items() if value != own[name]}
     return method.replace(triangulate=changed) if changed else method
 
 
-#: Views that may be unsure as long as they are sure together, and near returns that what lies far contradicts.
+#: Limit of the sigma of a single view, before views are fused.
 _swap_sigma_gate = partial(_swap_gates, ("max_sigma_rel",))
+
+#: Limits of near returns that contradict far answers.
 _swap_contradiction_gates = partial(_swap_gates, ("max_far_noise", "max_in_reach"))
 
 
-def _swap_stage(seat: str, method: Method, other: Method) -> Method:
-    return method.replace(**{seat: getattr(other, seat)})
+def _swap_stage(stage: str, method: Method, other: Method) -> Method:
+    return method.replace(**{stage: getattr(other, stage)})
 
 
 #: Part → (method, other) → the method with that part of the other.
@@ -208,37 +214,40 @@ _ABLATION_PARTS: dict[str, Callable[[Method, Method], Method]] = {
 
 
 def _with_start(track: Any, other: Any) -> Any:
-    """A tracker with the start of another."""
-    own, start = (_find_option(seat, "start") for seat in (track, other))
+    """Tracker with the start of another."""
+    own, start = (_find_option(stage, "start") for stage in (track, other))
     return track if stage_key(own) == stage_key(start) else partial(track, start=start)
 
 
-def _find_option(seat: Any, name: str) -> Any:
-    """What a partial, or one inside it, says of an option; None where none does."""
-    while isinstance(seat, partial):
-        if name in seat.keywords:
-            return seat.keywords[name]
-        seat = seat.func
+def _find_option(stage: Any, name: str) -> Any:
+    """Value of an option of a partial or of one nested in it; None if it is not set."""
+    while isinstance(stage, partial):
+        if name in stage.keywords:
+            return stage.keywords[name]
+        stage = stage.func
     return None
 
 
 def verdict(summary: Mapping[str, Any], group: str, names: Sequence[str]) -> tuple[bool | None, str]:
-    """Hold the parts of one group against its whole."""
-    whole, equal, area = ABLATION_GROUPS[group]
+    """(no part alone beats the complete method, nor does leaving one out; the ratios), of one group."""
+    whole, alone_metric, without_metric = ABLATION_GROUPS[group]
 
     def value(name: str, number: str) -> float | None:
-        found: float | None = summary.get(f"{name}.{number}", {}).get("value")
-        return found
+        entry: float | None = summary.get(f"{name}.{number}", {}).get("value")
+        return entry
 
-    alone, left_out = ({n: value(n, k) for n in names if n.startswith(sign)} for sign, k in (("+", equal), ("-", area)))
-    limits = value(whole, equal), value(whole, area)
-    if limits[0] is None or limits[1] is None:
-        return None, f"no scene on which {whole} can be held against the method before it"
-    better = [n for n, v in alone.items() if v is not None and v < limits[0] / _MIN_TELLING_RATIO]
-    idle = [n for n, v in left_out.items() if v is not None and v < limits[1] / _MIN_TELLING_RATIO]
-    shown = ", ".join(f"{n} {v:.2f}" for n, v in {**alone, whole: limits[0]}.items() if v is not None)
-    left = ", ".join(f"{n} {v:.2f}" for n, v in {whole: limits[1], **left_out}.items() if v is not None)
-    why = f"{_NUMBER_LABELS[equal]}: {shown}; {_NUMBER_LABELS[area]}: {left}"
+    alone, left_out = (
+        {n: value(n, k) for n in names if n.startswith(sign)}
+        for sign, k in (("+", alone_metric), ("-", without_metric))
+    )
+    whole_values = value(whole, alone_metric), value(whole, without_metric)
+    if whole_values[0] is None or whole_values[1] is None:
+        return None, f"no scene on which {whole} can be compared with the method before it"
+    better = [n for n, v in alone.items() if v is not None and v < whole_values[0] / _MIN_TELLING_RATIO]
+    idle = [n for n, v in left_out.items() if v is not None and v < whole_values[1] / _MIN_TELLING_RATIO]
+    alone_text = ", ".join(f"{n} {v:.2f}" for n, v in {**alone, whole: whole_values[0]}.items() if v is not None)
+    without_text = ", ".join(f"{n} {v:.2f}" for n, v in {whole: whole_values[1], **left_out}.items() if v is not None)
+    why = f"{_NUMBER_LABELS[alone_metric]}: {alone_text}; {_NUMBER_LABELS[without_metric]}: {without_text}"
     if better or idle:
         why = f"{why}; alone better than the whole: {better or 'none'}; better without: {idle or 'none'}"
     return not better and not idle, why

@@ -48,49 +48,55 @@ EXPECTATION = "Every number of the list of bars is met; scenes, and of causes wi
 
 #: Number → (bar, whether it holds).
 VALIDATE_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
-    "judge.scale_found": (0.95, lambda value, bar: value >= bar),
-    "judge.false_alarm": (0.02, lambda value, bar: value <= bar),
-    "judge.jump_auroc": (0.95, lambda value, bar: value >= bar),
-    "judge.called_right_wrong": (0.01, lambda value, bar: value <= bar),
-    "judge.named_worst": (0.90, lambda value, bar: value >= bar),
+    "validate.scale_found": (0.95, lambda value, bar: value >= bar),
+    "validate.false_alarm": (0.02, lambda value, bar: value <= bar),
+    "validate.jump_auroc": (0.95, lambda value, bar: value >= bar),
+    "validate.called_right_wrong": (0.01, lambda value, bar: value <= bar),
+    "validate.named_worst": (0.90, lambda value, bar: value >= bar),
 }
 
-#: Metres that are planted, by their names in rows.
+#: Scale factors that are planted: name in rows → factor.
 _SCALE_FAULTS = {"10_long": 1.1, "10_short": 1 / 1.1, "5_long": 1.05, "5_short": 1 / 1.05}
 
-#: Maps whose pixels are judged one by one: faults of one map, and the map of another time.
+#: Planted maps whose pixels are validated one by one: faults of a single map, and the map of another time.
 _PIXEL_FAULTS = ("none", "jumps", "invented", "warp_large", "cut", "time")
 
-#: A scale is found where its interval leaves out 1 and it lies so far from it, as a logarithm.
+#: A scale is reported wrong if its interval excludes 1 and |log(scale)| exceeds this.
 _MIN_ALARM_LOG_SCALE = 0.03
 
-#: Relative error from which on a pixel is a fifth off.
+#: Relative error above which a pixel of a planted map counts as wrong.
 _WRONG_PIXEL_ERROR = 0.2
 
-#: What makes a pair one with a baseline: median sigma / depth of its answers, and how many there are at least.
-_MAX_BASELINE_SIGMA_REL, _MIN_BASELINE_ANSWERS = 0.05, 20
+#: A reference view has a baseline if the median sigma / depth of its answers is at most this.
+_MAX_BASELINE_SIGMA_REL = 0.05
 
-#: Windows of so many frames, and the motion of the median pixel, of a picture 640 wide, from which on a fault counts.
-_WINDOW_FRAMES, _MIN_FAULT_MOTION_PX = 20, 2.0
+#: Fewest answers of a reference view with a baseline.
+_MIN_BASELINE_ANSWERS = 20
 
-#: Columns that are looked at for the metre, and how their numbers end: ours by all evidence, by triangulated points
-#: alone, and the quick method's by points alone.
+#: Frames of a window.
+_WINDOW_FRAMES = 20
+
+#: A fault counts if it moves the median pixel by at least this, px of an image 640 wide.
+_MIN_FAULT_MOTION_PX = 2.0
+
+#: Columns of the estimated scale → suffix of their summary keys: all evidence, triangulated points alone, and
+#: triangulated points of the quick method alone.
 _SCALE_COLUMN_SUFFIXES = {"scale": "", "scale_far": "_far", "quick_far": "_quick_far"}
 
-#: Whose pixels are counted → how their columns begin.
-_PREDICTOR_PREFIXES = {"judge": "", "quick": "quick_", "photometric": "peer_"}
+#: Predictor of the pixels' states → prefix of its columns.
+_PREDICTOR_PREFIXES = {"validate": "", "quick": "quick_", "photometric": "peer_"}
 
 
 @dataclass(frozen=True)
 class PlantedFault:
-    """A fault that all frames of a window share."""
+    """A depth fault that all frames of a window share."""
 
     kind: str | None  # as dhtorch.validation.faults names it; None = no fault
     spoil: Callable[[Tensor], Tensor] = lambda depth: depth
-    lag: int = 0  # frames by which the maps come late
-    focal: float = 1.0  # factor on the focal lengths that are told
+    lag: int = 0  # frames by which the maps lag behind the images
+    focal: float = 1.0  # factor on the stated focal lengths
     ray: bool = False  # depth becomes the distance along the ray
-    told: bool = True  # of the sensor's own depth as well: nothing holds its order against another
+    told: bool = True  # planted in the sensor's own depth as well as in maps beside it
 
 
 _PLANTED_FAULTS: dict[str, PlantedFault] = {
@@ -129,27 +135,31 @@ def run(
     rooms: Sequence[int] = (0, 1, 2),
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Plant faults in true maps, with near returns alone shown to the method, and hold what is said against them.
+    """Detection rates of faults planted in true maps, from near returns and source views.
 
-    Rows: one per reference view (``pair`` [i, i], method ``judge``), one per window and fault (``pair`` [first, last],
-        method
-    ``causes``), one per scene. In the summary shares of reference views are means over scenes with intervals over
-    these: ``judge.scale_found`` and ``judge.false_alarm`` (all evidence), the same with ``_5`` for a twentieth and with
-    ``_far`` by triangulated points alone; ``judge.jump_auroc`` of pixels without a shown return, ``_all`` of all;
-    ``judge.called_right_wrong``, ``_worst`` of the worst scene, ``_cut`` of maps that are cut alone; ``judge.known``;
-    ``photometric.<the same>`` of the peer, ``quick.<the same>`` of :data:`dhtorch.validation.validate.QUICK_METHOD`
-    without the pictures of other views, whose metre by points alone is ``_quick_far``. Nothing is fitted to the scenes.
-    Named are shares of
-    windows: ``judge.named.<kind>``, their least ``judge.named_worst``; ``judge.misnamed`` where nothing was planted.
+    Rows: one per reference view (``pair`` [i, i], method ``validate``), one per window and fault (``pair`` [first, last],
+    method ``causes``), one per scene. In the summary, ratios of reference views are means over scenes with intervals
+    over scenes:
+
+    * ``validate.scale_found`` and ``validate.false_alarm`` (all evidence); suffix ``_5`` for a scale wrong by a twentieth,
+      ``_far`` for triangulated points alone;
+    * ``validate.jump_auroc`` of pixels without a near return, ``_all`` of all pixels;
+    * ``validate.called_right_wrong``, ``_worst`` of the worst scene, ``_cut`` of clipped maps alone; ``validate.known``;
+    * ``photometric.<key>`` of the photometric baseline; ``quick.<key>`` of
+      :data:`dhtorch.validation.validate.QUICK_METHOD` without the images of other views, whose scale from
+      triangulated points alone is ``_quick_far``.
+
+    Ratios of windows: ``validate.named.<kind>``, their minimum ``validate.named_worst``, and ``validate.misnamed`` where no
+    fault was planted. Nothing is fitted to the scenes.
 
     Args:
         scenes, chosen, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        pairs: not used; other views are chosen among those around a reference view.
+        pairs: not used; source views are chosen among those around a reference view.
         method: the sparse method; None = the job's.
-        anchors: of each scene, evenly spread.
-        windows: of each scene that is long enough.
-        size: longer side of the grid, px.
-        rooms: seeds of built-in rooms, judged beside the scenes.
+        reference_views: number of reference views of each scene, evenly spaced.
+        windows: number of windows of each scene that is long enough.
+        size: longer side of the map, px.
+        rooms: seeds of built-in rooms, validated in addition to the scenes.
 
     Raises:
         ValueError: an option out of range; else as the main job.
@@ -157,72 +167,81 @@ def run(
     for name, value in {"reference_views": reference_views, "windows": windows}.items():
         if not isinstance(value, int) or value < 0:
             raise ValueError(f"experiment.{name}: found {value!r}, expected a whole number of at least 0")
-    ask = with_view_selection(method or next(iter(chosen.values())))
-    every = [scene for scene in scenes_of(scenes) if len(scene.recording) > 1]
-    every += [Scene(_make_room(seed), near=2.0, gap=6) for seed in rooms]
+    selecting_method = with_view_selection(method or next(iter(chosen.values())))
+    all_scenes = [scene for scene in scenes_of(scenes) if len(scene.recording) > 1]
+    all_scenes += [Scene(_make_room(seed), near=2.0, gap=6) for seed in rooms]
     outcome = Outcome()
-    for scene in every:
-        look = partial(_load_frame, scene, settings)
-        rows = []
+    for scene in all_scenes:
+        load = partial(_load_frame, scene, settings)
+        reference_rows = []
         for i in progress(
             _evenly_spaced(len(scene.recording), reference_views), f"{scene.name}: reference views", reference_views
         ):
-            rows.append(_reference_row(scene, i, look, ask, settings, size))
+            reference_rows.append(_reference_row(scene, i, load, selecting_method, settings, size))
         firsts = _first_frames(len(scene.recording), windows)
-        found = [
-            r for k in progress(firsts, f"{scene.name}: windows", len(firsts)) for r in _window_rows(scene, k, look)
+        window_rows = [
+            r for k in progress(firsts, f"{scene.name}: windows", len(firsts)) for r in _window_rows(scene, k, load)
         ]
-        outcome.rows += [*rows, *found, _scene_row(scene, rows)]
-        outcome.n_pairs += len(rows)
+        outcome.rows += [*reference_rows, *window_rows, _scene_row(scene, reference_rows)]
+        outcome.n_pairs += len(reference_rows)
     outcome.summary = summarise_validation(outcome.rows)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 
 def verdict(found: Mapping[str, Any]) -> tuple[bool | None, str]:
-    """Hold the summary against the bars, and name what is missed or could not be measured."""
+    """(all bars met, or None if undecided; the bars that are missed and the numbers that are undefined)."""
     values = {name: found.get(name, {}).get("value") for name in VALIDATE_BARS}
     undefined = [name for name, value in values.items() if value is None]
-    told = {name: value for name, value in values.items() if value is not None}
+    defined = {name: value for name, value in values.items() if value is not None}
     missed = [
         f"{k} {value:.3f} (bar {VALIDATE_BARS[k][0]:g})"
-        for k, value in told.items()
+        for k, value in defined.items()
         if not VALIDATE_BARS[k][1](value, VALIDATE_BARS[k][0])
     ]
     notes = [f"not measured: {', '.join(undefined)}"] if undefined else []
-    said = "; ".join([f"{len(told) - len(missed)} of {len(told)} bars met", *missed, *notes])
-    return (None if undefined and not missed else not missed), said
+    why = "; ".join([f"{len(defined) - len(missed)} of {len(defined)} bars met", *missed, *notes])
+    return (None if undefined and not missed else not missed), why
 
 
 def summarise_validation(rows: Sequence[Row]) -> Row:
-    """All numbers of the result, from rows of scenes and of windows."""
-    whole = [row for row in rows if row["pair"] is None and row["role"] is None]
-    names = sorted({name for row in whole for name, value in row.items() if "." in name and not isinstance(value, str)})
-    found: Row = {
-        n: bootstrap.interval_over_scenes([row.get(n) for row in whole], statistic="mean").entry("1") for n in names
+    """Rows of scenes and of windows → summary: key → value with its interval."""
+    scene_rows = [row for row in rows if row["pair"] is None and row["role"] is None]
+    keys = sorted(
+        {name for row in scene_rows for name, value in row.items() if "." in name and not isinstance(value, str)}
+    )
+    summary: Row = {
+        key: bootstrap.interval_over_scenes([row.get(key) for row in scene_rows], statistic="mean").entry("1")
+        for key in keys
     }
-    for who in _PREDICTOR_PREFIXES:
-        shares = [row[f"{who}.called_right_wrong"] for row in whole if row.get(f"{who}.called_right_wrong") is not None]
-        found[f"{who}.called_right_wrong_worst"] = bootstrap.without_interval(max(shares, default=None), len(shares))
-    told = [row for row in rows if row["method"] == "causes" and row["moved_px"] is not None]
-    counted = [row for row in told if row["planted_kind"] is not None and row["moved_px"] >= _MIN_FAULT_MOTION_PX]
-    right_of = {}
+    for predictor in _PREDICTOR_PREFIXES:
+        rates = [
+            row[f"{predictor}.called_right_wrong"]
+            for row in scene_rows
+            if row.get(f"{predictor}.called_right_wrong") is not None
+        ]
+        summary[f"{predictor}.called_right_wrong_worst"] = bootstrap.without_interval(
+            max(rates, default=None), len(rates)
+        )
+    measured = [row for row in rows if row["method"] == "causes" and row["moved_px"] is not None]
+    counted = [row for row in measured if row["planted_kind"] is not None and row["moved_px"] >= _MIN_FAULT_MOTION_PX]
+    named_ratio = {}
     for kind in sorted({row["planted_kind"] for row in counted}):
         right = [float(row["named_kind"] == kind) for row in counted if row["planted_kind"] == kind]
-        right_of[kind] = sum(right) / len(right)
-        found[f"judge.named.{kind.replace(' ', '_')}"] = bootstrap.without_interval(right_of[kind], len(right))
-    found["judge.named_worst"] = bootstrap.without_interval(min(right_of.values(), default=None), len(counted))
+        named_ratio[kind] = sum(right) / len(right)
+        summary[f"validate.named.{kind.replace(' ', '_')}"] = bootstrap.without_interval(named_ratio[kind], len(right))
+    summary["validate.named_worst"] = bootstrap.without_interval(min(named_ratio.values(), default=None), len(counted))
     clean = [
         float(row["named_kind"] is not None) for row in rows if row["method"] == "causes" and row["fault"] == "none"
     ]
-    found["judge.misnamed"] = bootstrap.without_interval(mean_or_none(clean), len(clean))
-    return found
+    summary["validate.misnamed"] = bootstrap.without_interval(mean_or_none(clean), len(clean))
+    return summary
 
 
 # ------------------------------------------------------------------------------------------------------ single frames
 
 
 def scale_alarm(scale: Tensor) -> bool | None:
-    """Whether a scale (3,) with its interval is said to be wrong; None where nothing is known of it."""
+    """Estimated scale (3,), value and interval → whether it is significantly wrong; None if it was not estimated."""
     value, low, high = (float(x) for x in scale)
     if math.isnan(value):
         return None
@@ -230,76 +249,78 @@ def scale_alarm(scale: Tensor) -> bool | None:
 
 
 def _reference_row(
-    scene: Scene, i: int, look: Callable[[int], Frame], ask: Method, settings: Settings, size: int
+    scene: Scene, i: int, load: Callable[[int], Frame], method: Method, settings: Settings, size: int
 ) -> Row:
-    """All that is planted in one frame's map."""
-    full, cutoff = look(i), settings.cutoff_of(scene)
+    """One reference view → row: estimated scales and pixel counts of every planted map."""
+    full, cutoff = load(i), settings.cutoff_of(scene)
     near = range_split(full, cutoff)
-    offered = candidate_frames(scene.recording, i)
-    others = stack([range_split(look(k), cutoff) for k in offered])
-    asked, say = _make_validator(ask, scene, near, others, settings, size)
-    _, hurry = _make_validator(with_view_selection(QUICK_METHOD), scene, near, others, settings, size)
-    true = _true_map(scene.recording, i, full, size, ask)
-    row: Row = {"scene": scene.name, "pair": [i, i], "method": "judge", **_baseline_columns(asked)}
+    candidates = candidate_frames(scene.recording, i)
+    others = stack([range_split(load(k), cutoff) for k in candidates])
+    selected, validate = _make_validator(method, scene, near, others, settings, size)
+    _, validate_quick = _make_validator(with_view_selection(QUICK_METHOD), scene, near, others, settings, size)
+    true_map = _true_map(scene.recording, i, full, size, method)
+    row: Row = {"scene": scene.name, "pair": [i, i], "method": "validate", **_baseline_columns(selected)}
     for name, factor in {"none": 1.0, **_SCALE_FAULTS}.items():
-        found, fast = (speak(true * factor, views=False) for speak in (say, hurry))
-        scale = {"scale": found.scale[0], "scale_far": found.scale_far[0], "quick_far": fast.scale_far[0]}
-        row |= {f"{way}.{name}": scale_alarm(scale[way]) for way in _SCALE_COLUMN_SUFFIXES}
-        row |= {f"{way}_value.{name}": float(scale[way][0] / factor) for way in _SCALE_COLUMN_SUFFIXES}
-    elsewhere = offered[-1] if offered[-1] > i else offered[0]
-    later = _true_map(scene.recording, elsewhere, look(elsewhere), size, ask)
-    shown = ask.backproject(near, dense.map_pixel_centres(near, (true.shape[-2], true.shape[-1]))).usable.unflatten(
-        1, true.shape[-2:]
-    )
+        validation, quick = (check(true_map * factor, views=False) for check in (validate, validate_quick))
+        scale = {"scale": validation.scale[0], "scale_far": validation.scale_far[0], "quick_far": quick.scale_far[0]}
+        row |= {f"{column}.{name}": scale_alarm(scale[column]) for column in _SCALE_COLUMN_SUFFIXES}
+        row |= {f"{column}_value.{name}": float(scale[column][0] / factor) for column in _SCALE_COLUMN_SUFFIXES}
+    other_time = candidates[-1] if candidates[-1] > i else candidates[0]
+    other_map = _true_map(scene.recording, other_time, load(other_time), size, method)
+    has_return = method.backproject(
+        near, dense.map_pixel_centres(near, (true_map.shape[-2], true_map.shape[-1]))
+    ).usable.unflatten(1, true_map.shape[-2:])
     for name in _PIXEL_FAULTS:
-        spoilt = true if name == "none" else apply_fault(name, true, seed=i, other=later)[0]
-        row |= _validated_counts("", name, spoilt, true, say(spoilt), shown)
-        row |= _validated_counts("quick_", name, spoilt, true, hurry(spoilt, views=False), shown)
-        miss, state = photometric.photometric_difference(spoilt, near, asked)
-        row |= {f"peer_{k}": v for k, v in _pixel_counts(name, spoilt, true, miss, state, shown).items()}
+        faulty = true_map if name == "none" else apply_fault(name, true_map, seed=i, other=other_map)[0]
+        row |= _validated_counts("", name, faulty, true_map, validate(faulty), has_return)
+        row |= _validated_counts("quick_", name, faulty, true_map, validate_quick(faulty, views=False), has_return)
+        difference, state = photometric.photometric_difference(faulty, near, selected)
+        row |= {f"peer_{k}": v for k, v in _pixel_counts(name, faulty, true_map, difference, state, has_return).items()}
     return row
 
 
 def _make_validator(
-    ask: Method, scene: Scene, near: Frame, others: Frame, settings: Settings, size: int
+    method: Method, scene: Scene, reference: Frame, others: Frame, settings: Settings, size: int
 ) -> tuple[dense.SelectedViews, Callable[..., DepthValidation]]:
-    """What a method finds at a reference view, and what is said of a map by it."""
+    """Reference and source views → views selected by the sparse method, and a function that validates maps by them."""
     trace: Trace = {}
     with torch.no_grad():
-        joined = ask(near, others, seed=settings.seed, hint=scene.hint, trace=trace)
-    asked = dense.selected_views(joined, others, trace)
+        estimate = method(reference, others, seed=settings.seed, hint=scene.hint, trace=trace)
+    selected = dense.selected_views(estimate, others, trace)
     offered = trace["choice"].index if "choice" in trace else None
-    return asked, partial(validate_against, reference=near, asked=asked, offered=offered, method=ask, size=size)
+    return selected, partial(
+        validate_against, reference=reference, asked=selected, offered=offered, method=method, size=size
+    )
 
 
 def _validated_counts(
-    begin: str, name: str, spoilt: Tensor, true: Tensor, found: DepthValidation, shown: Tensor
+    prefix: str, name: str, faulty: Tensor, true_map: Tensor, validation: DepthValidation, has_return: Tensor
 ) -> Row:
-    counts = _pixel_counts(name, spoilt, true, found.evidence.abs(), found.state, shown)
-    return {f"{begin}{key}": value for key, value in counts.items()}
+    counts = _pixel_counts(name, faulty, true_map, validation.evidence.abs(), validation.state, has_return)
+    return {f"{prefix}{key}": value for key, value in counts.items()}
 
 
-def _pixel_counts(name: str, spoilt: Tensor, true: Tensor, score: Tensor, state: Tensor, shown: Tensor) -> Row:
-    """What is said of the pixels of one spoilt map, where the truth is known."""
-    there = (true > 0) & (spoilt > 0)
-    off = there & ((spoilt / true.clamp_min(1e-6) - 1).abs() > _WRONG_PIXEL_ERROR)
-    known = there & (state != State.CANNOT_KNOW) & score.isfinite()
-    fine = there & (state == State.CONSISTENT)
-    row: Row = {f"n.{name}": int(there.sum()), f"known.{name}": int(known.sum())}
-    row |= {f"consistent.{name}": int(fine.sum()), f"consistent_off.{name}": int((fine & off).sum())}
-    row |= {f"wrong.{name}": int((known & (state == State.WRONG)).sum())}
+def _pixel_counts(name: str, faulty: Tensor, true_map: Tensor, score: Tensor, state: Tensor, has_return: Tensor) -> Row:
+    """States and scores of one faulty map's pixels → counts per state and AUROC, over pixels with truth."""
+    valid = (true_map > 0) & (faulty > 0)
+    wrong = valid & ((faulty / true_map.clamp_min(1e-6) - 1).abs() > _WRONG_PIXEL_ERROR)
+    answered = valid & (state != State.CANNOT_KNOW) & score.isfinite()
+    consistent = valid & (state == State.CONSISTENT)
+    row: Row = {f"n.{name}": int(valid.sum()), f"known.{name}": int(answered.sum())}
+    row |= {f"consistent.{name}": int(consistent.sum()), f"consistent_off.{name}": int((consistent & wrong).sum())}
+    row |= {f"wrong.{name}": int((answered & (state == State.WRONG)).sum())}
     if name == "jumps":
-        row["auroc_all"] = auroc(score[known], off[known])
-        hidden = known & ~shown
-        row["auroc"] = auroc(score[hidden], off[hidden])
+        row["auroc_all"] = auroc(score[answered], wrong[answered])
+        hidden = answered & ~has_return
+        row["auroc"] = auroc(score[hidden], wrong[hidden])
     return row
 
 
-def _baseline_columns(asked: dense.SelectedViews) -> Row:
-    keep = asked.joined.keep & ~asked.samples.usable
-    stated = (asked.joined.sigma / asked.joined.depth)[keep]
-    n = int(keep.sum())
-    median = float(stated.median()) if n else None
+def _baseline_columns(selected: dense.SelectedViews) -> Row:
+    hidden = selected.joined.keep & ~selected.samples.usable
+    sigma_rel = (selected.joined.sigma / selected.joined.depth)[hidden]
+    n = int(hidden.sum())
+    median = float(sigma_rel.median()) if n else None
     return {
         "n_answers": n,
         "stated": median,
@@ -308,18 +329,18 @@ def _baseline_columns(asked: dense.SelectedViews) -> Row:
 
 
 def _scene_row(scene: Scene, rows: Sequence[Row]) -> Row:
-    """Shares over a scene's reference views."""
-    wide = [row for row in rows if row["baseline"]]
-    out: Row = {"scene": scene.name, "pair": None, "method": "judge", "role": scene.role, "n_wide": len(wide)}
-    for way, tail in _SCALE_COLUMN_SUFFIXES.items():
-        for size, end in (("10", ""), ("5", "_5")):
-            told = [row[f"{way}.{size}_{side}"] for row in wide for side in ("long", "short")]
-            out[f"judge.scale_found{end}{tail}"] = mean_or_none([float(bool(x)) for x in told])
-        out[f"judge.false_alarm{tail}"] = mean_or_none([float(bool(row[f"{way}.none"])) for row in wide])
+    """Rows of a scene's reference views → the scene's row of ratios."""
+    with_baseline = [row for row in rows if row["baseline"]]
+    out: Row = {"scene": scene.name, "pair": None, "method": "validate", "role": scene.role, "n_wide": len(with_baseline)}
+    for column, suffix in _SCALE_COLUMN_SUFFIXES.items():
+        for percent, ending in (("10", ""), ("5", "_5")):
+            alarms = [row[f"{column}.{percent}_{side}"] for row in with_baseline for side in ("long", "short")]
+            out[f"validate.scale_found{ending}{suffix}"] = mean_or_none([float(bool(x)) for x in alarms])
+        out[f"validate.false_alarm{suffix}"] = mean_or_none([float(bool(row[f"{column}.none"])) for row in with_baseline])
     for name, prefix in _PREDICTOR_PREFIXES.items():
         for key, column in (("jump_auroc", "auroc"), ("jump_auroc_all", "auroc_all")):
             out[f"{name}.{key}"] = mean_or_none(
-                [r[prefix + column] for r in wide if r.get(prefix + column) is not None]
+                [r[prefix + column] for r in with_baseline if r.get(prefix + column) is not None]
             )
         count = {
             k: sum(r[f"{prefix}{k}.{p}"] for r in rows for p in _PIXEL_FAULTS) for k in ("consistent", "consistent_off")
@@ -329,99 +350,106 @@ def _scene_row(scene: Scene, rows: Sequence[Row]) -> Row:
         )
         n_cut, off_cut = (sum(row[f"{prefix}{k}.cut"] for row in rows) for k in ("consistent", "consistent_off"))
         out[f"{name}.called_right_wrong_cut"] = off_cut / n_cut if n_cut else None
-        n = sum(row[f"{prefix}n.none"] for row in wide)
-        known, wrong = (sum(row[f"{prefix}{k}.none"] for row in wide) for k in ("known", "wrong"))
-        out[f"{name}.known"] = known / n if n else None
-        out[f"{name}.called_wrong_right"] = wrong / known if known else None
+        n = sum(row[f"{prefix}n.none"] for row in with_baseline)
+        answered, wrong = (sum(row[f"{prefix}{k}.none"] for row in with_baseline) for k in ("known", "wrong"))
+        out[f"{name}.known"] = answered / n if n else None
+        out[f"{name}.called_wrong_right"] = wrong / answered if answered else None
     return out
 
 
 # ------------------------------------------------------------------------------------------------------------ windows
 
 
-def _window_rows(scene: Scene, first: int, look: Callable[[int], Frame]) -> list[Row]:
-    """Every fault in one window: in the sensor's own depth, and in maps beside a sound sensor."""
-    reach = range(first - faults.MAX_LAG_FRAMES, first + _WINDOW_FRAMES + faults.MAX_LAG_FRAMES)
-    around_it = {k: look(k) for k in reach}
-    watched = faults.track_window([around_it[k] for k in range(first, first + _WINDOW_FRAMES)])
+def _window_rows(scene: Scene, first: int, load: Callable[[int], Frame]) -> list[Row]:
+    """Diagnoses of every fault planted in one window → rows: in the sensor's own depth, then in maps beside it."""
+    indices = range(first - faults.MAX_LAG_FRAMES, first + _WINDOW_FRAMES + faults.MAX_LAG_FRAMES)
+    frames_of = {k: load(k) for k in indices}
+    window_tracks = faults.track_window([frames_of[k] for k in range(first, first + _WINDOW_FRAMES)])
     rows = []
-    for own in (True, False):
+    for in_sensor in (True, False):
         for name, planted in _PLANTED_FAULTS.items():
-            if own and not planted.told:
+            if in_sensor and not planted.told:
                 continue
-            frames, maps = _plant_fault(scene, around_it, first, planted, own)
-            found = faults.diagnose(frames, maps, watched=watched)
-            moved = _fault_motion_px(frames, maps, around_it, first, found.pairs) if planted.kind else 0.0
+            frames, maps = _plant_fault(scene, frames_of, first, planted, in_sensor)
+            diagnosis = faults.diagnose(frames, maps, watched=window_tracks)
+            motion_px = _fault_motion_px(frames, maps, frames_of, first, diagnosis.pairs) if planted.kind else 0.0
             row: Row = {"scene": scene.name, "pair": [first, first + _WINDOW_FRAMES - 1], "method": "causes"}
-            row |= {"source": "sensor" if own else "map", "fault": name, "planted_kind": planted.kind}
-            row |= {"named": found.cause, "named_kind": found.kind, "moved_px": moved, "n_pairs_told": found.n_pairs}
+            row |= {"source": "sensor" if in_sensor else "map", "fault": name, "planted_kind": planted.kind}
+            row |= {
+                "named": diagnosis.cause,
+                "named_kind": diagnosis.kind,
+                "moved_px": motion_px,
+                "n_pairs_told": diagnosis.n_pairs,
+            }
             rows.append(row)
     return rows
 
 
 def _plant_fault(
-    scene: Scene, frames: Mapping[int, Frame], first: int, fault: PlantedFault, own: bool
+    scene: Scene, frames_of: Mapping[int, Frame], first: int, fault: PlantedFault, in_sensor: bool
 ) -> tuple[list[Frame], list[Tensor] | None]:
-    shown, maps = [], []
+    faulty_frames, maps = [], []
     for k in range(first, first + _WINDOW_FRAMES):
-        seen = frames[k - fault.lag]
-        spoilt = fault.spoil(seen.depth)
-        camera = frames[k].camera.replace(f=frames[k].camera.f * fault.focal)
-        depth_camera = frames[k].depth_camera
+        source = frames_of[k - fault.lag]
+        depth = fault.spoil(source.depth)
+        camera = frames_of[k].camera.replace(f=frames_of[k].camera.f * fault.focal)
+        depth_camera = frames_of[k].depth_camera
         if depth_camera is not None:
             depth_camera = depth_camera.replace(f=depth_camera.f * fault.focal)
-        frame = frames[k].replace(camera=camera, depth_camera=depth_camera)
-        over = _depth_over_image(seen)
+        frame = frames_of[k].replace(camera=camera, depth_camera=depth_camera)
+        image_depth = _depth_over_image(source)
         if fault.ray:
-            spoilt = spoilt * _ray_lengths(seen.depth_camera, seen, spoilt)
-            over = over * _ray_lengths(None, seen, over)
-        shown.append(frame.replace(depth=spoilt) if own else range_split(frame, scene.near))
-        maps.append(fault.spoil(over))
-    return shown, None if own else maps
+            depth = depth * _ray_lengths(source.depth_camera, source, depth)
+            image_depth = image_depth * _ray_lengths(None, source, image_depth)
+        faulty_frames.append(frame.replace(depth=depth) if in_sensor else range_split(frame, scene.near))
+        maps.append(fault.spoil(image_depth))
+    return faulty_frames, None if in_sensor else maps
 
 
 def _ray_lengths(camera: cam.Camera | None, frame: Frame, depth: Tensor) -> Tensor:
-    """Lengths of the rays through a map's pixels, of a camera of its own or of the picture's."""
+    """Lengths of the rays through a map's pixels, from the depth camera or else the image's camera, resized."""
     hw = (depth.shape[-2], depth.shape[-1])
     return faults.ray_lengths(camera or cam.resize(frame.camera, frame.hw, hw), hw)
 
 
 def _depth_over_image(frame: Frame, size: int = 320) -> Tensor:
-    """A frame's depth over the field of its picture, nearest pixels."""
+    """Frame → its depth (1, h, w) resampled to the field of view of its image, nearest pixel; 0 outside."""
     hw = dense.map_hw(frame.hw, size)
     uv = dense.map_pixel_centres(frame, hw)[None]
-    place = cam.depth_pixels(
+    depth_uv = cam.depth_pixels(
         frame.camera, frame.hw, frame.depth_camera, (frame.depth.shape[-2], frame.depth.shape[-1]), uv
     )
-    depth, inside = sample_nearest(frame.depth.to(uv), place)
+    depth, inside = sample_nearest(frame.depth.to(uv), depth_uv)
     return torch.where(inside, depth, 0.0).unflatten(1, hw)
 
 
 def _fault_motion_px(
     frames: Sequence[Frame],
     maps: Sequence[Tensor] | None,
-    sound: Mapping[int, Frame],
+    true_frames: Mapping[int, Frame],
     first: int,
     pairs: Sequence[tuple[int, int]],
 ) -> float | None:
-    """By how much a fault moves the median pixel into the other picture of a pair, under the frames' own poses."""
-    moved = []
+    """Median displacement (px, image 640 wide) caused by a fault in a pair's second image, under the stated poses."""
+    medians = []
     for i, j in pairs:
-        a, b = sound[first + i], sound[first + j]
+        a, b = true_frames[first + i], true_frames[first + j]
         if a.T_world_from_cam is None or b.T_world_from_cam is None:
             return None
         T = se3.relative(a.T_world_from_cam, b.T_world_from_cam).map(lambda x: x.float())
-        spoilt = _depth_over_image(frames[i]) if maps is None else maps[i]
-        true = _depth_over_image(a)
-        uv = dense.map_pixel_centres(a, (true.shape[-2], true.shape[-1]))[None]
-        ends = []
-        for depth, camera, other in ((true, a.camera, b.camera), (spoilt, frames[i].camera, frames[j].camera)):
+        faulty = _depth_over_image(frames[i]) if maps is None else maps[i]
+        true_depth = _depth_over_image(a)
+        uv = dense.map_pixel_centres(a, (true_depth.shape[-2], true_depth.shape[-1]))[None]
+        projections = []
+        for depth, camera, other in ((true_depth, a.camera, b.camera), (faulty, frames[i].camera, frames[j].camera)):
             xyz = se3.apply(T, cam.unproject(camera, uv, depth.flatten(1)))
-            ends.append(cam.project(other, torch.where(xyz[..., 2:] > 0, xyz, torch.nan)))
-        miss = (ends[0] - ends[1]).norm(dim=-1)[(true > 0).flatten(1) & (spoilt > 0).flatten(1)]
-        if miss.numel():
-            moved.append(miss.nan_to_num(1e3).median())  # behind the other camera: far away
-    return float(torch.stack(moved).median()) * 640 / frames[0].hw[1] if moved else None
+            projections.append(cam.project(other, torch.where(xyz[..., 2:] > 0, xyz, torch.nan)))
+        displacement = (projections[0] - projections[1]).norm(dim=-1)[
+            (true_depth > 0).flatten(1) & (faulty > 0).flatten(1)
+        ]
+        if displacement.numel():
+            medians.append(displacement.nan_to_num(1e3).median())  # behind the other camera: far away
+    return float(torch.stack(medians).median()) * 640 / frames[0].hw[1] if medians else None
 
 
 # ------------------------------------------------------------------------------------------------------------- scenes
@@ -431,15 +459,15 @@ def _load_frame(scene: Scene, settings: Settings, i: int) -> Frame:
     return scene.recording[i].to(settings.dtype).to(settings.device)
 
 
-def _true_map(recording: Recording, i: int, full: Frame, size: int, ask: Method) -> Tensor:
-    """The true map (1, h, w) on the grid: exact where the recording knows it, else all that the sensor returned."""
+def _true_map(recording: Recording, i: int, full: Frame, size: int, method: Method) -> Tensor:
+    """True depth map (1, h, w): the recording's exact depth, else all returns of the sensor."""
     hw = dense.map_hw(full.hw, size)
     if isinstance(recording, TruthRecording):
         exact = full.replace(
             depth=recording.truth(i)["depth"].to(full.camera.f), depth_camera=None, conf=None, sparse=None
         )
         return _depth_over_image(exact, size)
-    samples = ask.backproject(full, dense.map_pixel_centres(full, hw))
+    samples = method.backproject(full, dense.map_pixel_centres(full, hw))
     return torch.where(samples.depth > 0, samples.depth, 0.0).unflatten(1, hw)
 
 
@@ -449,15 +477,15 @@ def _make_room(seed: int) -> SyntheticRoom:
     )
 
 
-def _evenly_spaced(n: int, wanted: int) -> list[int]:
-    wanted = min(n, wanted)
-    return [(2 * k + 1) * n // (2 * wanted) for k in range(wanted)]
+def _evenly_spaced(n: int, count: int) -> list[int]:
+    count = min(n, count)
+    return [(2 * k + 1) * n // (2 * count) for k in range(count)]
 
 
-def _first_frames(n: int, wanted: int) -> list[int]:
-    """First frames of windows, with as many frames before and after as a map may be early or late."""
+def _first_frames(n: int, count: int) -> list[int]:
+    """First frames of evenly spaced windows, at least :data:`faults.MAX_LAG_FRAMES` frames from either end."""
     last = n - _WINDOW_FRAMES - faults.MAX_LAG_FRAMES
-    if last < faults.MAX_LAG_FRAMES or not wanted:
+    if last < faults.MAX_LAG_FRAMES or not count:
         return []
-    step = (last - faults.MAX_LAG_FRAMES) / max(wanted - 1, 1)
-    return sorted({faults.MAX_LAG_FRAMES + round(k * step) for k in range(wanted)})
+    step = (last - faults.MAX_LAG_FRAMES) / max(count - 1, 1)
+    return sorted({faults.MAX_LAG_FRAMES + round(k * step) for k in range(count)})

@@ -1,1 +1,1 @@
-"""Depth from focus and defocus, from one view: what is known of it and what it is worth here."""
+"""Depth from focus and from defocus of a single view: readers of focal stacks, methods and experiments."""

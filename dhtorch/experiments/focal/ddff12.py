@@ -2,9 +2,9 @@
 
 The published HDF5 files (``stack_<split>``, ``disp_<split>``), or the raw light fields
 ``LightField/<split>/<scene>/LF_<n>.npy`` beside ``DepthRegistered/<split>/<scene>/DEPTH_<n>.png`` (16 bits, mm), which
-are refocused here. Depth is a constant over the disparity, 0 = none. The stored type and the number of stacks of the
-HDF5 files are not documented: both are taken from the file, and numbers of which none exceeds 1.5 count as 0 to 1
-instead of 0 to 255.
+are refocused here. Depth is a constant divided by the disparity, 0 = none. The stored type and the number of stacks of
+the HDF5 files are not documented: both are taken from the file, and images without a value above 1.5 are taken as 0 to
+1 instead of 0 to 255.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ _HW = (383, 552)
 _K = (521.4052, 521.4052, 285.114, 187.825)
 _MIN_DISPARITY = 1e-4  # px; 1.4 km
 _MAX_STACKS = 1_000_000
-_MAX_APERTURES = 32  # along one side
+_MAX_APERTURES = 32  # per axis
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` focal stacks of this format, in words; None if nothing does."""
+    """Text of the evidence that ``root`` holds stacks of this format; None without evidence."""
     if (root / "LightField").is_dir() and next((root / "LightField").glob("*/*/LF_*.npy"), None):
         return "light fields LightField/<split>/<scene>/LF_<n>.npy"
     sources = [root] if root.suffix in (".h5", ".hdf5") and root.is_file() else sorted(root.glob("*.h5"))[:1]
@@ -60,21 +60,21 @@ def read(
 
     Args:
         root: an HDF5 file, a folder with some, or the folder that holds ``LightField/``.
-        split: ``"train"``, ``"val"``, ``"test"``. None = all there are.
-        focus_m: distances in focus. None = equal steps of disparity from 0.5 m to 7 m, as the stacks were made; raw
+        split: ``"train"``, ``"val"``, ``"test"``. None = all splits of the files.
+        focus_m: focus distances. None = equal steps of disparity from 0.5 m to 7 m, as in the published stacks; raw
             light fields are refocused at these.
         depth_disparity: m px, depth times disparity: focal length times distance of two neighbouring sub-apertures.
         depth_folder: of the raw depth maps (16-bit PNG, mm).
-        per_scene: stacks of one room, where those of an HDF5 file are known to follow one another. None = not known: as
-            the file does not say which stacks share a room, all of a split count as one scene.
+        per_scene: number of consecutive stacks of an HDF5 file that show one room. None = unknown: the file does not
+            record which stacks share a room, so all of a split count as one scene.
 
     Returns:
         Stacks in the order of the file, near focus first; light fields of one folder are one scene. The published HDF5
-        mixes the rooms of train and val. Depth is None where a split has no labels. The camera is the calibrated one
-        where the size is 552×383.
+        mixes the rooms of train and val. Depth is None for a split without labels. The camera is the calibrated one
+        for images of 552×383.
 
     Raises:
-        FormatError: no stack, a stack and its labels that disagree, a damaged file, or an option that cannot be.
+        FormatError: no stack, a stack and labels of different sizes, a damaged file, or an invalid option.
     """
     root = Path(root)
     constant = files.to_positive(depth_disparity, root, "option depth_disparity")
@@ -83,18 +83,20 @@ def read(
     if per_scene is not None and per_scene < 1:
         raise FormatError(root, "option per_scene", per_scene, "at least 1")
     raw = (root / "LightField").is_dir()
-    shots, report = _light_fields(root, depth_folder) if raw else _hdf5_stacks(root, per_scene)
-    shots = [shot for shot in shots if split in (None, shot.split)]
-    if not shots:
+    locations, report = _light_fields(root, depth_folder) if raw else _hdf5_stacks(root, per_scene)
+    locations = [location for location in locations if split in (None, location.split)]
+    if not locations:
         raise FormatError(root, "stacks", f"none of split {split or 'any'}", "stack_<split> or LightField/<split>/")
-    load = _StackLoader(tuple(shots), focus, constant)
-    names, scenes = (tuple(found) for found in zip(*((s.name, s.scene) for s in shots), strict=True))
+    load = _StackLoader(tuple(locations), focus, constant)
+    names, scenes = (
+        tuple(column) for column in zip(*((location.name, location.scene) for location in locations), strict=True)
+    )
     return FocalStacks(root.resolve().stem, "ddff12", load, names, root=root, report=tuple(report), scenes=scenes)
 
 
 @dataclass(frozen=True, eq=False)
 class _StackLocation:
-    """Where one stack lies: a row of an array, or a light field."""
+    """Location of one stack: a row of an HDF5 array, or the file of a light field."""
 
     name: str
     split: str
@@ -106,28 +108,28 @@ class _StackLocation:
 
 @dataclass(frozen=True, eq=False)
 class _StackLoader:
-    """Position → stack."""
+    """Index → decoded stack."""
 
-    shots: tuple[_StackLocation, ...]
+    locations: tuple[_StackLocation, ...]
     focus: Tensor  # (S,)
     depth_disparity: float
 
     def __call__(self, i: int) -> FocalStack:
-        shot = self.shots[i]
-        if isinstance(shot.stack, Path):
-            images = refocus(_light_field(shot.stack), self.depth_disparity / self.focus.double())
+        location = self.locations[i]
+        if isinstance(location.stack, Path):
+            images = refocus(_light_field(location.stack), self.depth_disparity / self.focus.double())
         else:
-            images = _as_images(shot.stack.row(shot.row), shot.stack)
-        source, hw = _source_file(shot.stack), (images.shape[-2], images.shape[-1])
+            images = _as_images(location.stack.row(location.row), location.stack)
+        source, hw = _source_file(location.stack), (images.shape[-2], images.shape[-1])
         if len(images) != len(self.focus):
             raise FormatError(
-                _source_file(shot.stack), "slices", len(images), f"{len(self.focus)}, one for each focus distance"
+                _source_file(location.stack), "slices", len(images), f"{len(self.focus)}, one for each focus distance"
             )
         depth = None
-        if isinstance(shot.truth, Path):
-            depth = torch.from_numpy(files.read_depth_png(shot.truth, 1000.0, hw))[None]
-        elif shot.truth is not None:
-            disparity = shot.truth.row(shot.row).astype(np.float64)
+        if isinstance(location.truth, Path):
+            depth = torch.from_numpy(files.read_depth_png(location.truth, 1000.0, hw))[None]
+        elif location.truth is not None:
+            disparity = location.truth.row(location.row).astype(np.float64)
             usable = np.isfinite(disparity) & (disparity > _MIN_DISPARITY)
             metres = np.where(usable, self.depth_disparity / np.where(usable, disparity, 1), 0)
             depth = torch.from_numpy(metres.astype(np.float32))[None]
@@ -136,8 +138,9 @@ class _StackLoader:
 
 
 def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_StackLocation], list[str]]:
+    """Stacks of the HDF5 files at ``root``, and an empty report."""
     sources = [root] if root.is_file() else sorted(root.glob("*.h5"))
-    shots = []
+    locations = []
     for file in sources:
         arrays = list_hdf5_arrays(file)
         for key, stack in arrays.items():
@@ -152,12 +155,13 @@ def _hdf5_stacks(root: Path, per_scene: int | None) -> tuple[list[_StackLocation
                 raise FormatError(file, truth.key, f"shape {truth.shape}", f"{(n, *hw)}, as {key}")
             prefix = f"{file.stem}/{match[1]}" if len(sources) > 1 else match[1]
             rooms = [prefix if per_scene is None else f"{prefix}/scene_{i // per_scene:02d}" for i in range(n)]
-            shots += [_StackLocation(f"{prefix}/{i:04d}", match[1], rooms[i], stack, truth, i) for i in range(n)]
-    return shots, []
+            locations += [_StackLocation(f"{prefix}/{i:04d}", match[1], rooms[i], stack, truth, i) for i in range(n)]
+    return locations, []
 
 
 def _light_fields(root: Path, depth_folder: str) -> tuple[list[_StackLocation], list[str]]:
-    shots, report = [], []
+    """Light fields below ``root``, and a report of those left out for a missing depth map."""
+    locations, report = [], []
     for file in sorted((root / "LightField").glob("*/*/LF_*.npy")):
         scene = file.parent.relative_to(root / "LightField")
         number = file.stem.removeprefix("LF_")
@@ -168,12 +172,12 @@ def _light_fields(root: Path, depth_folder: str) -> tuple[list[_StackLocation], 
         else:
             label = truth if folder.is_dir() else None
             room = scene.as_posix()
-            shots.append(_StackLocation(f"{room}/{number}", scene.parts[0], room, file, label))
-    return shots, report
+            locations.append(_StackLocation(f"{room}/{number}", scene.parts[0], room, file, label))
+    return locations, report
 
 
 def _light_field(file: Path) -> Tensor:
-    """(U, V, H, W, 3) uint8."""
+    """Read a light field: (U, V, H, W, C) uint8, C 1 or 3."""
     raw = files.read_bytes(file)
     header = parse_real_npy_header(file, "light field", raw)
     shape = header.shape
@@ -186,7 +190,7 @@ def _light_field(file: Path) -> Tensor:
 
 
 def _as_images(stack: np.ndarray, source: Hdf5Array) -> Tensor:
-    """(S, C, H, W): whole numbers up to 255 as uint8, else float in [0, 1]."""
+    """Images (S, C, H, W) of a stored stack: integers up to 255 as uint8, otherwise float in [0, 1]."""
     if not np.isfinite(stack).all() or stack.min() < 0 or stack.max() > 255:
         raise FormatError(source.file, source.key, f"{stack.min():g} to {stack.max():g}", "values from 0 to 255")
     images = torch.from_numpy(np.ascontiguousarray(stack.transpose(0, 3, 1, 2)))
@@ -199,4 +203,5 @@ def _as_images(stack: np.ndarray, source: Hdf5Array) -> Tensor:
 
 
 def _source_file(source: Hdf5Array | Path) -> Path:
+    """File of a stack's location."""
     return source if isinstance(source, Path) else source.file

@@ -1,12 +1,12 @@
 """Question: how much depth is there in the defocus of a single picture?
 
-On scenes of exact depth the picture is taken through a thin lens focused on what stands in its middle; blur is measured
-edge by edge and turned into inverse depth with the true lens, so that nothing but the measurement and the *side* of the
-focus is open. The side comes from an oracle (``oracle_side``), or has to be produced: from the height in the picture
-(``by_height``), from the colour of the blur (``by_colour``: none without axial colour), or by always saying beyond
-(``all_beyond``). Controls: the height in the picture alone, without any blur (``height_alone``), and the same blur
-measured in the picture that no lens has blurred (``texture_alone``). ``natural`` is the picture as it came, the only
-variant on recordings without exact depth: there the blur is what it is, and only ``rho_abs`` can be asked.
+On scenes of exact depth the image is rendered through a thin lens focused on the depth at its centre; blur is measured
+at edges and converted to inverse depth with the true lens, so that only the measurement and the *side* of the focus are
+unknown. The side is the true one (``oracle_side``) or estimated: from the height in the image (``by_height``), from the
+colour of the blur (``by_colour``: none without axial colour), or always beyond the focus (``all_beyond``). Controls:
+the height in the image alone, without any blur (``height_alone``), and blur measured in the image without lens blur
+(``texture_alone``). ``natural`` is the unchanged image, the only variant on recordings without exact depth: its optics
+are unknown, so only ``rho_abs`` is measured.
 
 Expectation (written before the run): the signal is there and weak (|rho| of blur and inverse depth at most 0.5; the
 paper: 0.22); with the oracle's side r is at least 0.4 (paper: 0.66); a side that has to be produced loses more than
@@ -45,18 +45,22 @@ EXPECTATION = (
     "A weak signal, useful once an oracle gives the side of the focus, next to nothing when it has to be produced."
 )
 
-#: Ways to produce the side without an oracle.
+#: Variants that estimate the side of the focus.
 _DEPLOYABLE_SIDES = ("by_height", "by_colour", "all_beyond")
 VARIANTS = ("oracle_side", *_DEPLOYABLE_SIDES, "height_alone", "texture_alone", "natural")
 
-#: Fewest pixels on which a correlation is said.
+#: Smallest number of pixels for a correlation.
 _MIN_CORRELATION_SITES = 50
 
-#: Inverse distance beyond which nothing is focused, 1/m.
+#: Smallest inverse focus distance, 1/m.
 _MIN_FOCUS_DPT = 0.01
 
-#: What counts as weak, as a working oracle, and how much of it a deployable estimator may keep.
-_MAX_WEAK_CORRELATION, _MIN_ORACLE_CORRELATION, _MAX_KEPT_RATIO = 0.5, 0.4, 0.5
+#: The verdict requires at most this |Spearman| of blur and inverse depth,
+_MAX_WEAK_CORRELATION = 0.5
+#: at least this Pearson correlation with the true side,
+_MIN_ORACLE_CORRELATION = 0.4
+#: and less than this fraction of it with an estimated side.
+_MAX_KEPT_RATIO = 0.5
 
 
 def run(
@@ -73,32 +77,31 @@ def run(
     window_px: float = 6.0,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Measure blur in every picture at valid pixels of a grid whose depth passes the truth test.
+    """Run the experiment: blur of one image per scene at the pixels of a grid with valid ground truth depth.
 
-    Rows, per picture and per scene: ``rho_abs``, |Spearman| of blur and inverse depth; ``corr`` and ``rank_corr`` of
-    claimed and true inverse depth; ``side_right``, share of pixels whose side is right; ``blur_corr``, Pearson of
-    measured and true blur; ``texture_corr``, Pearson of measured blur and the blur measured without a lens;
-    ``rho_perfect``, what ``rho_abs`` would be with the true blur; ``coverage``, share of the candidates with edges.
-    The two ambiguities stand apart in the summary: ``blank_wall.*`` and ``two_sides.*``, see
-    :func:`measure_ambiguities`.
+    Rows, per image and per scene: ``rho_abs``, |Spearman| of blur and inverse depth; ``corr`` and ``rank_corr`` of
+    estimated and true inverse depth; ``side_right``, fraction of pixels with the correct side; ``blur_corr``, Pearson
+    of measured and true blur; ``texture_corr``, Pearson of measured blur and the blur measured without a lens;
+    ``rho_perfect``, ``rho_abs`` of the true blur; ``coverage``, fraction of the candidates with edges. The summary has
+    the two ambiguities as ``blank_wall.*`` and ``two_sides.*``, see :func:`measure_ambiguities`.
 
     Args:
-        scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`. One with exact depth
-            (``lidar`` is "exact") is photographed through the lens; of any other the first frame is taken as it is.
+        scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`. The first
+            frame of each; with exact depth (``lidar`` is "exact") it is rendered through the lens.
         methods, pairs: not used.
-        focal_length_m, f_number: of the lens; its pixel pitch is such that the picture keeps its field of view. What
-            counts is the spot in pixels: in a picture of 320 columns f/0.35 gives the spots of f/1.4 at 1280 columns,
+        focal_length_m, f_number: of the lens; its pixel pitch is such that the image keeps its field of view. The
+            spot in pixels is what matters: in an image of 320 columns f/0.35 gives the spots of f/1.4 at 1280 columns,
             and f/1.8 those of a phone (5.7 mm, f/1.8) at 1920.
-        axial_colour_dpt: by how many dioptres blue is focused nearer than red; a lens of one glass has about 0.5.
+        axial_colour_dpt: dioptres by which blue is focused nearer than red; about 0.5 for a lens of one glass.
         noise: standard deviation of a pixel, added after the lens.
         stride_px: of the grid.
-        window_px: in which blur is measured.
+        window_px: standard deviation of the window in which blur is measured.
 
     Source: paper, "What Does Not Work", single-frame depth from defocus.
     """
     optics = {"focal_length_m": focal_length_m, "f_number": f_number}
 
-    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
+    def evaluate_item(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         frame = scene.recording[item[0]].to(settings.dtype).to(settings.device)
         uv = _pixel_grid(frame.hw, stride_px, frame.camera.f)
         if not has_exact_depth(scene.recording):
@@ -109,7 +112,9 @@ def run(
             frame, uv, lens, colour=axial_colour_dpt, noise=noise, window_px=window_px, seed=settings.seed
         )
 
-    outcome = screen_scenes(scenes_of(scenes), lambda _r: [(0, 0)], ask, VARIANTS, truth="full", progress=progress)
+    outcome = screen_scenes(
+        scenes_of(scenes), lambda _r: [(0, 0)], evaluate_item, VARIANTS, truth="full", progress=progress
+    )
     outcome.summary |= {
         k: bootstrap.without_interval(v, 1) for k, v in measure_ambiguities(noise=noise, window_px=window_px).items()
     }
@@ -117,61 +122,63 @@ def run(
 
 
 def has_exact_depth(recording: Recording) -> bool:
-    """Whether every pixel of a recording has exact depth, so that a lens can be put in front of it."""
+    """Whether every pixel of a recording has exact depth, which rendering through a lens requires."""
     return isinstance(recording, SyntheticRoom) and recording.lidar == "exact"
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
-    """Weak without a side, useful with the oracle's, and mostly lost when the side has to be produced?"""
+    """Verdict and text: weak without a side, useful with the true side, mostly lost with an estimated side."""
 
     def over_scenes(variant: str, metric: str) -> float | None:
         return bootstrap.interval_over_scenes([r.get(metric) for r in outcome.scenes(variant).values()]).value
 
     rho, oracle = over_scenes("oracle_side", "rho_abs"), over_scenes("oracle_side", "corr")
-    tried = {v: r for v in _DEPLOYABLE_SIDES if (r := over_scenes(v, "corr")) is not None}
-    if rho is None or oracle is None or not tried:
+    estimated = {v: r for v in _DEPLOYABLE_SIDES if (r := over_scenes(v, "corr")) is not None}
+    if rho is None or oracle is None or not estimated:
         natural = over_scenes("natural", "rho_abs")
-        found = "" if natural is None else f"; |rho| of the pictures as they are {natural:.2f} (paper 0.22)"
-        return None, f"no scene with exact depth and enough edges{found}"
-    best = max(tried, key=lambda v: tried[v])
+        natural_text = "" if natural is None else f"; |rho| of the pictures as they are {natural:.2f} (paper 0.22)"
+        return None, f"no scene with exact depth and enough edges{natural_text}"
+    best = max(estimated, key=lambda v: estimated[v])
     why = (
         f"medians over {len(outcome.scenes('oracle_side'))} scenes: |rho| {rho:.2f} (paper 0.22), r with the oracle's"
-        f" side {oracle:.2f} (0.66), best deployable {best} {tried[best]:+.2f} (0.06);"
+        f" side {oracle:.2f} (0.66), best deployable {best} {estimated[best]:+.2f} (0.06);"
         f" the height in the picture alone, without any blur, {over_scenes('height_alone', 'corr') or 0:+.2f}"
     )
-    return rho <= _MAX_WEAK_CORRELATION and oracle >= _MIN_ORACLE_CORRELATION and tried[
+    return rho <= _MAX_WEAK_CORRELATION and oracle >= _MIN_ORACLE_CORRELATION and estimated[
         best
     ] < _MAX_KEPT_RATIO * oracle, why
 
 
 def measure_ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int = 0) -> dict[str, float | None]:
-    """The two things that one picture cannot tell apart, each alone, on a wall facing a lens.
+    """Measure the two ambiguities of a single image, texture and side of the focus, on a rendered fronto-parallel wall.
 
     Returns:
-        ``blank_wall.…``: a wall *in focus*: blur claimed in px of paint with sharp edges, of the same paint with soft
-        edges, and the share of a plain wall with a soft shadow on it that is measured at all. ``two_sides.…``: the same
-        sharp paint equally far (in dioptres) in front of the focus and beyond it: blur claimed, true blur, and the
-        ratio of the two claims, 1 = nothing tells them apart.
+        ``blank_wall.…``: a wall *in focus*: measured blur in px of a texture with sharp edges, of the same texture with
+        soft edges, and the fraction of valid pixels of a plain wall with a soft shadow. ``two_sides.…``: the sharp
+        texture equally far (in dioptres) in front of the focus and beyond it: measured blur, true blur, and the ratio
+        of the two measurements, 1 = indistinguishable.
     """
     hw, focus = (120, 160), torch.tensor([[2.0]])
     lens = make_lens(265.0, f_number=0.35)
-    draw = torch.Generator().manual_seed(seed)
-    blocks = torch.rand(1, 1, 8, 10, generator=draw).repeat_interleave(15, 2).repeat_interleave(16, 3)
+    generator = torch.Generator().manual_seed(seed)
+    blocks = torch.rand(1, 1, 8, 10, generator=generator).repeat_interleave(15, 2).repeat_interleave(16, 3)
     shadow = torch.linspace(0.3, 0.7, hw[1]).expand(1, 1, *hw)
 
-    def claimed(paint: Tensor, z: float) -> tuple[float | None, float]:
-        seen = render_defocus(paint, torch.full((1, *hw), z), lens, focus)[:, 0]
-        seen = seen + noise * torch.randn(seen.shape, generator=draw)
-        blur = estimate_blur(seen, noise=noise, window_px=window_px)
+    def measured(texture: Tensor, z: float) -> tuple[float | None, float]:
+        image = render_defocus(texture, torch.full((1, *hw), z), lens, focus)[:, 0]
+        image = image + noise * torch.randn(image.shape, generator=generator)
+        blur = estimate_blur(image, noise=noise, window_px=window_px)
         return median_or_none(blur.sigma[blur.valid].tolist()), float(blur.valid.float().mean())
 
-    soft = render_defocus(blocks, torch.full((1, *hw), 8.0), lens, focus)[:, 0]  # paint as soft as a spot of 6 m off
-    near, far = (claimed(blocks, 1 / (0.5 + d))[0] for d in (0.25, -0.25))
+    soft_blocks = render_defocus(blocks, torch.full((1, *hw), 8.0), lens, focus)[
+        :, 0
+    ]  # soft by the spot of a wall 6 m behind the focus
+    near, far = (measured(blocks, 1 / (0.5 + d))[0] for d in (0.25, -0.25))
     true = GAUSSIAN_OF_DISC * abs(float(spot_diameter(lens, torch.tensor([[4.0]]), focus[:, 0])))
     return {
-        "blank_wall.sharp_paint_px": claimed(blocks, 2.0)[0],
-        "blank_wall.soft_paint_px": claimed(soft, 2.0)[0],
-        "blank_wall.plain_share": claimed(shadow, 2.0)[1],
+        "blank_wall.sharp_paint_px": measured(blocks, 2.0)[0],
+        "blank_wall.soft_paint_px": measured(soft_blocks, 2.0)[0],
+        "blank_wall.plain_share": measured(shadow, 2.0)[1],
         "two_sides.near_px": near,
         "two_sides.far_px": far,
         "two_sides.true_px": true,
@@ -182,45 +189,45 @@ def measure_ambiguities(*, noise: float = 0.0, window_px: float = 6.0, seed: int
 def _measure_through_lens(
     frame: Frame, uv: Tensor, lens: Lens, *, colour: float, noise: float, window_px: float, seed: int
 ) -> dict[str, Row]:
-    """Variant → numbers of one picture, focused on its middle."""
+    """Variant → row of one image, rendered with the focus on the depth at its centre."""
     depth, (h, w) = frame.depth, frame.hw
     sharp = frame.image / 255.0 if frame.image.dtype == torch.uint8 else frame.image
     focus = depth[:, h // 2, w // 2]
     shifts = (-colour / 2, 0.0, colour / 2) if sharp.shape[1] == 3 else (0.0,)
-    parts = [(sharp, 0.0)] if not colour else [(sharp[:, k : k + 1], shift) for k, shift in enumerate(shifts)]
-    # Red of a lens focused far may be in focus nowhere: as far as can be stands for that.
-    focused = [(x, (1 / (1 / focus + d).clamp_min(_MIN_FOCUS_DPT))[:, None]) for x, d in parts]
-    seen = torch.cat([render_defocus(x, depth, lens, s)[:, 0] for x, s in focused], 1)
-    grain = noise * torch.randn(seen.shape, generator=torch.Generator().manual_seed(seed)).to(seen)
-    seen = seen + grain
-    blur = estimate_blur(seen, noise=noise, window_px=window_px)
-    pinhole = estimate_blur(sharp + grain, noise=noise, window_px=window_px)
+    channels = [(sharp, 0.0)] if not colour else [(sharp[:, k : k + 1], shift) for k, shift in enumerate(shifts)]
+    # With axial colour, red of a lens focused far may have no focus distance; the lower bound replaces it.
+    focused = [(x, (1 / (1 / focus + d).clamp_min(_MIN_FOCUS_DPT))[:, None]) for x, d in channels]
+    image = torch.cat([render_defocus(x, depth, lens, s)[:, 0] for x, s in focused], 1)
+    noise_image = noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed)).to(image)
+    image = image + noise_image
+    blur = estimate_blur(image, noise=noise, window_px=window_px)
+    pinhole = estimate_blur(sharp + noise_image, noise=noise, window_px=window_px)
     spot = spot_diameter(lens, depth.flatten(1), focus).view(depth.shape)
     true_side = torch.where(spot < 0, -torch.ones_like(spot), torch.ones_like(spot))
     row_up = torch.arange(h, 0, -1, dtype=depth.dtype)[:, None].expand(depth.shape)
     sides = {
         "oracle_side": true_side,
         "by_height": guess_side_by_height(blur),
-        "by_colour": guess_side_by_colour(seen, window_px=window_px, noise=noise) if colour else None,
+        "by_colour": guess_side_by_colour(image, window_px=window_px, noise=noise) if colour else None,
         "all_beyond": torch.ones_like(spot),
     }
     sites = _Sites(frame, uv)
     rows = {}
     for name, side in sides.items():
         if side is not None:
-            claim = inverse_depth_from_blur(blur, side, lens, focus)
-            rows[name] = sites.numbers(blur.valid & (side != 0), claim, blur.sigma)
-            rows[name] |= {"side_right": sites.share(blur.valid & (side != 0), side == true_side)}
-            rows[name] |= {"blur_corr": sites.against(blur.valid, blur.sigma, GAUSSIAN_OF_DISC * spot.abs())}
-            rows[name] |= {"texture_corr": sites.against(blur.valid & pinhole.valid, blur.sigma, pinhole.sigma)}
+            estimate = inverse_depth_from_blur(blur, side, lens, focus)
+            rows[name] = sites.correlations(blur.valid & (side != 0), estimate, blur.sigma)
+            rows[name] |= {"side_right": sites.fraction(blur.valid & (side != 0), side == true_side)}
+            rows[name] |= {"blur_corr": sites.correlate(blur.valid, blur.sigma, GAUSSIAN_OF_DISC * spot.abs())}
+            rows[name] |= {"texture_corr": sites.correlate(blur.valid & pinhole.valid, blur.sigma, pinhole.sigma)}
             rows[name] |= {"rho_perfect": sites.rho(blur.valid, spot.abs())}
-    rows["height_alone"] = sites.numbers(blur.valid, -row_up, row_up)
-    rows["texture_alone"] = sites.numbers(pinhole.valid, -pinhole.sigma, pinhole.sigma)
+    rows["height_alone"] = sites.correlations(blur.valid, -row_up, row_up)
+    rows["texture_alone"] = sites.correlations(pinhole.valid, -pinhole.sigma, pinhole.sigma)
     return rows
 
 
 class _Sites:
-    """The candidates of a picture: pixels of the grid whose depth passes the truth test."""
+    """Candidates of an image: pixels of the grid with valid ground truth depth, and correlations over them."""
 
     def __init__(self, frame: Frame, uv: Tensor) -> None:
         truth = holdout.sample_truth(frame, uv)
@@ -231,52 +238,53 @@ class _Sites:
         """Values (N,) of a map (1, H, W)."""
         return x[0][self.index]
 
-    def numbers(self, valid: Tensor, claim: Tensor, blur: Tensor) -> Row:
-        """How a claim of inverse depth (1, H, W), and the blur under it, go with the true one."""
-        use = self.candidate & self.at(valid)
-        enough = int(use.sum()) >= _MIN_CORRELATION_SITES
+    def correlations(self, valid: Tensor, estimate: Tensor, blur: Tensor) -> Row:
+        """Row of correlations of estimated inverse depth (1, H, W) and of blur with true inverse depth."""
+        kept = self.candidate & self.at(valid)
+        enough = int(kept.sum()) >= _MIN_CORRELATION_SITES
         n = int(self.candidate.sum())
-        x, y = self.at(claim)[use].double(), 1 / self.depth[use]
+        x, y = self.at(estimate)[kept].double(), 1 / self.depth[kept]
         return {
             "n_candidates": n,
-            "n_kept": int(use.sum()),
-            "coverage": int(use.sum()) / n if n else None,
+            "n_kept": int(kept.sum()),
+            "coverage": int(kept.sum()) / n if n else None,
             "rho_abs": self.rho(valid, blur),
             "corr": pearson(x, y) if enough else None,
             "rank_corr": spearman(x, y) if enough else None,
         }
 
     def rho(self, valid: Tensor, x: Tensor) -> float | None:
-        """|Spearman| of a map with true inverse depth."""
-        use = self.candidate & self.at(valid)
-        found = (
-            spearman(self.at(x)[use].double(), 1 / self.depth[use])
-            if int(use.sum()) >= _MIN_CORRELATION_SITES
+        """|Spearman| of a map with true inverse depth; None with too few pixels."""
+        kept = self.candidate & self.at(valid)
+        correlation = (
+            spearman(self.at(x)[kept].double(), 1 / self.depth[kept])
+            if int(kept.sum()) >= _MIN_CORRELATION_SITES
             else None
         )
-        return None if found is None else abs(found)
+        return None if correlation is None else abs(correlation)
 
-    def against(self, valid: Tensor, x: Tensor, y: Tensor) -> float | None:
-        """Pearson's r of two maps."""
-        use = self.candidate & self.at(valid)
+    def correlate(self, valid: Tensor, x: Tensor, y: Tensor) -> float | None:
+        """Pearson's r of two maps; None with too few pixels."""
+        kept = self.candidate & self.at(valid)
         return (
-            pearson(self.at(x)[use].double(), self.at(y)[use].double())
-            if int(use.sum()) >= _MIN_CORRELATION_SITES
+            pearson(self.at(x)[kept].double(), self.at(y)[kept].double())
+            if int(kept.sum()) >= _MIN_CORRELATION_SITES
             else None
         )
 
-    def share(self, valid: Tensor, right: Tensor) -> float | None:
-        """Share of the valid candidates where a mask holds."""
-        use = self.candidate & self.at(valid)
-        return float(self.at(right)[use].double().mean()) if bool(use.any()) else None
+    def fraction(self, valid: Tensor, mask: Tensor) -> float | None:
+        """Fraction of the valid candidates where a mask is True."""
+        kept = self.candidate & self.at(valid)
+        return float(self.at(mask)[kept].double().mean()) if bool(kept.any()) else None
 
 
 def _correlate_unsigned(frame: Frame, uv: Tensor, blur: BlurMap) -> Row:
+    """Row of an image with unknown optics: |Spearman| of blur and inverse depth."""
     return {"rho_abs": _Sites(frame, uv).rho(blur.valid, blur.sigma)}
 
 
 def _pixel_grid(hw: tuple[int, int], stride: int, like: Tensor) -> Tensor:
-    """Whole pixels (1, N, 2) of a grid."""
+    """Pixel coordinates (1, N, 2) of a grid with the given stride."""
     v = torch.arange(stride // 2, hw[0], stride, dtype=like.dtype, device=like.device)
     u = torch.arange(stride // 2, hw[1], stride, dtype=like.dtype, device=like.device)
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1).reshape(1, -1, 2)

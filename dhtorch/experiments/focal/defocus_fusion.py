@@ -1,16 +1,16 @@
 """Question: does defocus help to fill in between the returns of a depth sensor?
 
-The sensor's map is thinned out to every seventh pixel along both axes (a phone's LiDAR against its picture) and filled
-again: by plain interpolation (``fill_bilinear``), by the guides a user would try first (``fill_joint_bilateral``,
-``fill_guided``), and with the help of defocus (``fill_defocus_guided``: interpolation corrected by what blur says, as
-much as it has earned; ``defocus_bold``: the same, trusting it twenty times as much; ``defocus_bilateral``: the
-bilateral filter with the map of blur as its guide). All are held against the pixels that
-were left out. Scenes of exact depth are photographed through a thin lens; on real recordings blur is what it is.
+The sensor's map is subsampled to every seventh pixel along both axes (like a phone's LiDAR relative to its image) and
+filled again: by plain interpolation (``bilinear``), by standard guided filters (``joint_bilateral``,
+``guided_filter``), and with defocus (``defocus_guided``: interpolation corrected by depth from blur with
+inverse-variance weights; ``defocus_bold``: the same with a twentieth of the variance of that depth;
+``defocus_bilateral``: the bilateral filter with the blur map as its guide). All are compared on the pixels that were
+left out. Scenes of exact depth are rendered through a thin lens; real recordings are used unchanged.
 
 Expectation (written before the run): interpolation is hard to beat (the paper: r 0.82 to 0.99), and defocus never beats
 it but raises the error slightly.
-What would refute it: a mean error of ``fill_defocus_guided`` below that of ``fill_bilinear`` in the median over scenes,
-and on most of them.
+What would refute it: a mean error of ``defocus_guided`` below that of ``bilinear`` in the median over scenes, and on
+most of them.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ EXPECTATION = "No: plain interpolation is hard to beat, and defocus raises its e
 
 VARIANTS = ("bilinear", "joint_bilateral", "guided_filter", "defocus_guided", "defocus_bold", "defocus_bilateral")
 
-#: Blur that counts as one unit of the guide of ``defocus_bilateral``, px.
+#: Blur, px, that is scaled to 1 in the guide of ``defocus_bilateral``.
 _GUIDE_UNIT_PX = 10.0
 
-#: Share of their variance that the claims of ``defocus_bold`` are said to have.
+#: Factor on the variance of depth from defocus in ``defocus_bold``.
 _BOLD_VARIANCE_RATIO = 0.05
 
-#: Spread (max / min − 1) of 5×5 pixels from which one lies at an edge.
+#: Smallest spread of depth (max / min − 1) in 5×5 pixels that counts as a depth edge.
 _EDGE_SPREAD = 0.05
 
 
@@ -62,19 +62,19 @@ def run(
     noise: float = 1 / 255,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Thin out, fill in, compare, on every ``stride``-th frame.
+    """Run the experiment on every ``stride``-th frame: subsample depth, fill by every variant, compare with the truth.
 
-    Rows, per frame and per scene, over the left-out pixels that have a return and that every variant answers:
+    Rows, per frame and per scene, over the left-out pixels with a return and a depth by every variant:
     ``corr``, ``median_rel``, ``mean_rel``, ``rmse_m``, ``edge_mean_rel`` (beside steps in depth), ``changed_rel`` (mean
-    relative change against ``fill_bilinear``) and, in the scene's row, ``mean_rel_ratio`` against ``fill_bilinear``.
+    relative change from ``bilinear``) and, in the scene's row, ``mean_rel_ratio`` to ``bilinear``.
 
     Args:
-        scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`. Depth must be dense and of the
-            picture's size; other recordings keep a row that says so.
+        scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`. Depth must be dense and of
+            the image's size; other recordings get a row with a note.
         methods, pairs: not used.
-        factor: every how many pixels a return stays; odd, so that it is the middle of its square.
+        factor: pixels between the returns that are kept; odd, so that each is the centre of its square.
         sensor_noise: relative noise of the returns, on exact scenes.
-        stride: every how many frames.
+        stride: frames from one evaluated frame to the next.
         focal_length_m, f_number, noise: as in :func:`dhtorch.experiments.focal.defocus.run`.
 
     Raises:
@@ -89,65 +89,65 @@ def run(
         n = len(scene.recording)
         return [(i, i) for i in range(0, n, stride)] if not scene.recording.sparse else []
 
-    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
+    def evaluate_item(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         frame = scene.recording[item[0]].to(settings.dtype).to(settings.device)
         if frame.depth.shape[-2:] != frame.hw:
             return {}
-        draw = torch.Generator().manual_seed(settings.seed)
-        picture, spread = frame.image, 0.0
+        generator = torch.Generator().manual_seed(settings.seed)
+        image, return_noise = frame.image, 0.0
         if has_exact_depth(scene.recording):
             lens = make_lens(float(frame.camera.f[0, 0]), focal_length_m=focal_length_m, f_number=f_number)
-            picture, spread = _render_through_lens(frame, lens.to(settings.dtype), noise, draw), sensor_noise
-        return _evaluate_frame(picture, frame.depth, factor, spread, noise, draw)
+            image, return_noise = _render_through_lens(frame, lens.to(settings.dtype), noise, generator), sensor_noise
+        return _evaluate_frame(image, frame.depth, factor, return_noise, noise, generator)
 
-    outcome = screen_scenes(scenes_of(scenes), items, ask, VARIANTS, truth="left_out", progress=progress)
+    outcome = screen_scenes(scenes_of(scenes), items, evaluate_item, VARIANTS, truth="left_out", progress=progress)
     _add_ratios(outcome)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
-    """Does defocus leave the mean error of plain interpolation as it is, or raise it?"""
-    both = paired_metric(outcome, "left_out", "defocus_guided", "bilinear", "mean_rel")
-    if not both:
+    """Verdict and text: defocus does not lower the mean error of plain interpolation."""
+    error_pairs = paired_metric(outcome, "left_out", "defocus_guided", "bilinear", "mean_rel")
+    if not error_pairs:
         return None, "no scene with dense depth of the picture's size"
-    ratio = bootstrap.interval_over_scenes([a / b for a, b in both]).value or 0.0
-    wins = sum(a < b for a, b in both)
-    r = (
+    ratio = bootstrap.interval_over_scenes([a / b for a, b in error_pairs]).value or 0.0
+    wins = sum(a < b for a, b in error_pairs)
+    correlation = (
         bootstrap.interval_over_scenes(
             [row.get("corr") for row in outcome.scenes("bilinear", "left_out").values()]
         ).value
         or 0.0
     )
     why = (
-        f"bilinear r {r:.3f} (paper 0.82 to 0.99); mean error with defocus over that of bilinear {ratio:.3f}, median of"
-        f" {len(both)} scenes, lower on {wins}"
+        f"bilinear r {correlation:.3f} (paper 0.82 to 0.99); mean error with defocus over that of bilinear"
+        f" {ratio:.3f}, median of {len(error_pairs)} scenes, lower on {wins}"
     )
-    better = ratio < 1 and wins > len(both) / 2
+    better = ratio < 1 and wins > len(error_pairs) / 2
     return (None if ratio < 1 and not better else not better), why
 
 
 def thin_returns(depth: Tensor, factor: int) -> tuple[Tensor, Tensor]:
-    """Returns (B, h, w) in the middle of every square, and the map (B, h·factor, w·factor) they are the middles of."""
+    """Subsample depth: returns (B, h, w) at the centres of squares, and the cropped map (B, h·factor, w·factor)."""
     h, w = depth.shape[-2] // factor, depth.shape[-1] // factor
-    whole = depth[..., : h * factor, : w * factor]
-    return whole[..., factor // 2 :: factor, factor // 2 :: factor], whole
+    cropped = depth[..., : h * factor, : w * factor]
+    return cropped[..., factor // 2 :: factor, factor // 2 :: factor], cropped
 
 
-def _render_through_lens(frame: Frame, lens: Any, noise: float, draw: torch.Generator) -> Tensor:
-    """The picture through the lens, focused on its middle."""
+def _render_through_lens(frame: Frame, lens: Any, noise: float, generator: torch.Generator) -> Tensor:
+    """Image rendered through the lens with the focus on the depth at its centre, with pixel noise."""
     h, w = frame.hw
-    seen = render_defocus(frame.image, frame.depth, lens, frame.depth[:, h // 2, w // 2, None], step_px=1.0)[:, 0]
-    return (seen + noise * torch.randn(seen.shape, generator=draw).to(seen)).clamp(0, 1)
+    image = render_defocus(frame.image, frame.depth, lens, frame.depth[:, h // 2, w // 2, None], step_px=1.0)[:, 0]
+    return (image + noise * torch.randn(image.shape, generator=generator).to(image)).clamp(0, 1)
 
 
 def _evaluate_frame(
-    picture: Tensor, depth: Tensor, factor: int, spread: float, noise: float, draw: torch.Generator
+    image: Tensor, depth: Tensor, factor: int, return_noise: float, noise: float, generator: torch.Generator
 ) -> dict[str, Row]:
-    """Variant → numbers of one frame."""
-    coarse, whole = thin_returns(depth, factor)
-    coarse = coarse * (1 + spread * torch.randn(coarse.shape, generator=draw).to(coarse))
-    h, w = whole.shape[-2:]
-    guide = picture[..., :h, :w]
+    """Variant → row of one frame."""
+    coarse, truth = thin_returns(depth, factor)
+    coarse = coarse * (1 + return_noise * torch.randn(coarse.shape, generator=generator).to(coarse))
+    h, w = truth.shape[-2:]
+    guide = image[..., :h, :w]
     plain = fill_bilinear(coarse, (h, w))
     blur = estimate_blur(guide, noise=noise, window_px=3.0)
     filled = {
@@ -158,50 +158,50 @@ def _evaluate_frame(
         "defocus_bold": fill_defocus_guided(plain, coarse, blur, distrust=_BOLD_VARIANCE_RATIO),
         "defocus_bilateral": fill_joint_bilateral(coarse, blur.sigma[:, None] / _GUIDE_UNIT_PX),
     }
-    left_out = torch.ones_like(whole, dtype=torch.bool)
+    left_out = torch.ones_like(truth, dtype=torch.bool)
     left_out[..., factor // 2 :: factor, factor // 2 :: factor] = False
-    use = left_out & (whole > 0)
-    for claim in filled.values():
-        use = use & (claim > 0)
-    edge = _edge_mask(whole)[use]
+    compared = left_out & (truth > 0)
+    for estimate in filled.values():
+        compared = compared & (estimate > 0)
+    edge = _edge_mask(truth)[compared]
     return {
-        name: _numbers(claim[use].double(), whole[use].double(), plain[use].double(), edge)
-        for name, claim in filled.items()
+        name: _error_metrics(estimate[compared].double(), truth[compared].double(), plain[compared].double(), edge)
+        for name, estimate in filled.items()
     }
 
 
-def _numbers(x: Tensor, y: Tensor, plain: Tensor, edge: Tensor) -> Row:
-    """Claims, truth and plain interpolation (P,) m, and which lie at an edge."""
+def _error_metrics(x: Tensor, y: Tensor, plain: Tensor, edge: Tensor) -> Row:
+    """Error metrics of depths x against truth y (P,) m, given plain interpolation and a mask of depth edges."""
     error = (x - y).abs() / y
-    some = bool(len(y))
-    at_edge = bool(edge.any())
+    has_pixels = bool(len(y))
+    has_edge = bool(edge.any())
     return {
         "n_candidates": len(y),
         "corr": pearson(x, y),
-        "median_rel": float(error.median()) if some else None,
-        "mean_rel": float(error.mean()) if some else None,
-        "rmse_m": float(((x - y) ** 2).mean().sqrt()) if some else None,
-        "edge_mean_rel": float(error[edge].mean()) if at_edge else None,
-        "changed_rel": float(((x - plain).abs() / plain).mean()) if some else None,
+        "median_rel": float(error.median()) if has_pixels else None,
+        "mean_rel": float(error.mean()) if has_pixels else None,
+        "rmse_m": float(((x - y) ** 2).mean().sqrt()) if has_pixels else None,
+        "edge_mean_rel": float(error[edge].mean()) if has_edge else None,
+        "changed_rel": float(((x - plain).abs() / plain).mean()) if has_pixels else None,
     }
 
 
 def _edge_mask(depth: Tensor) -> Tensor:
-    """(B, H, W) bool: the returns of 5×5 pixels spread by more than :data:`_EDGE_SPREAD`."""
+    """Depth edges (B, H, W): returns in 5×5 pixels spread by more than :data:`_EDGE_SPREAD`."""
     high = torch.nn.functional.max_pool2d(depth, 5, 1, 2)
     low = -torch.nn.functional.max_pool2d(-torch.where(depth > 0, depth, torch.inf), 5, 1, 2)
     return high > (1 + _EDGE_SPREAD) * low
 
 
 def _add_ratios(outcome: Outcome) -> None:
-    """Mean error over that of plain interpolation, in the rows of scenes and in the summary."""
+    """Add the ratio of the mean error to that of plain interpolation to the rows of scenes and to the summary."""
     plain = outcome.scenes("bilinear", "left_out")
     for name in VARIANTS[1:]:
         ratios = []
         for scene, row in outcome.scenes(name, "left_out").items():
-            mine = row.get("mean_rel")
-            theirs = plain.get(scene, {}).get("mean_rel")
-            if mine is not None and theirs:
-                row["mean_rel_ratio"] = mine / theirs
-                ratios.append(mine / theirs)
+            error = row.get("mean_rel")
+            baseline = plain.get(scene, {}).get("mean_rel")
+            if error is not None and baseline:
+                row["mean_rel_ratio"] = error / baseline
+                ratios.append(error / baseline)
         outcome.summary[f"{name}.mean_rel_ratio"] = bootstrap.interval_over_scenes(ratios).entry()

@@ -3,9 +3,9 @@
 On scenes of exact depth the stack is rendered through a thin lens, in five conditions: ``clean``; ``noisy`` (4 grey
 levels); ``moved`` (breathing by 2 % and a hand's shifts of about a pixel) and ``aligned`` (the same after alignment);
 ``light_field`` (the optics of DDFF-12, whose spots grow by 1.3 px per dioptre, and 2 grey levels of noise). The control
-``no_focus`` is a stack in which nothing was blurred. Stacks of a data set (FoD500, DDFF-12) are taken as they are
-(``given``), after alignment as well; on sweeps without depth it is asked whether the order of the pictures can be read
-off them, and whether the odd and the even pictures agree.
+``no_focus`` is a stack without any blur. Stacks of a data set (FoD500, DDFF-12) are evaluated as recorded (``given``)
+and after alignment (``given_aligned``); for sweeps without depth the measures are whether sharpness recovers the order
+of the images, and whether the odd and the even images agree.
 
 Expectation (written before the run): on clean stacks yes (the paper: Spearman 0.69, gated Pearson 0.76); on light
 fields it fails, with the sign flipped on some scenes (about 1 in 5), and keeping the most confident quarter of the
@@ -43,22 +43,26 @@ EXPECTATION = "On clean stacks; on light fields it fails, flips sign on some sce
 RENDERED_CONDITIONS = ("clean", "noisy", "moved", "aligned", "light_field", "no_focus")
 _RECORDED_CONDITIONS = ("given", "given_aligned")
 
-#: What the verdict asks of clean stacks, and of light fields.
-_MIN_CLEAN_CORRELATION, _MAX_LIGHT_FIELD_RATIO, _MAX_GATED_CORRELATION = 0.5, 0.5, 0.5
+#: The verdict requires at least this Spearman correlation on clean stacks,
+_MIN_CLEAN_CORRELATION = 0.5
+#: at most this ratio of the light-field to the clean correlation,
+_MAX_LIGHT_FIELD_RATIO = 0.5
+#: and a gated |Pearson| on light fields below this.
+_MAX_GATED_CORRELATION = 0.5
 
-#: Nearest and farthest distance in focus, m, in equal steps of inverse distance, as DDFF-12 has them.
+#: Nearest and farthest focus distance of a rendered stack, m, as in DDFF-12; steps are equal in inverse distance.
 _FOCUS_RANGE_M = (0.5, 7.0)
 
-#: The optics of DDFF-12: spot px per dioptre = focal length 521.4 px times nine sub-apertures 0.271 mm apart.
+#: Blur of DDFF-12 in px per dioptre: focal length 521.4 px × nine sub-apertures 0.271 mm apart.
 _LIGHT_FIELD_PX_PER_DPT = 521.4 * 9 * 2.7088e-4
 
-#: Pixels kept by the gate.
+#: Fraction of the pixels, the most confident ones, that the gate keeps.
 _CONFIDENT_SHARE = 0.25
 
 
 @dataclass(frozen=True, eq=False)
 class _StackRoom:
-    """What the stacks of a data set show: one stack, or all that show the same room."""
+    """One stack of a data set, or all of its stacks that show the same room."""
 
     name: str
     stacks: FocalStacks
@@ -81,53 +85,55 @@ def run(
     max_stacks: int = 50,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Ask every stack, with every measure of sharpness; variants are called ``<condition>`` for the first measure.
+    """Run the experiment on every stack with every sharpness measure; variants: ``<condition>`` for the first measure.
 
-    Rows, per scene: over the pixels of a grid with depth, ``rank_corr`` (Spearman) and ``corr`` (Pearson) of claimed
+    Rows, per scene: over the pixels of a grid with depth, ``rank_corr`` (Spearman) and ``corr`` (Pearson) of estimated
     and true inverse depth, ``gated_corr`` over the most confident quarter, ``abs_corr`` and ``gated_abs_corr`` their
-    sizes, ``flip_share`` 1 where Spearman is negative (a scene and the summary have its mean), ``median_rel`` of
-    depth. Without depth: ``order_corr``, ``halves_corr``, ``motion_px``, see :func:`measure_without_truth`.
+    absolute values, ``flip_share`` 1 if Spearman is negative (its mean for a scene and in the summary), ``median_rel``
+    of depth. Without depth: ``order_corr``, ``halves_corr``, ``motion_px``, see :func:`measure_without_truth`.
 
     Args:
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`; recordings with exact depth
             (``lidar`` is "exact"; their first frame), or focal stacks.
         methods, pairs: not used.
-        measures: of sharpness; the first decides.
-        window_px: in which sharpness is averaged.
-        slices: pictures of a rendered stack.
+        measures: names of sharpness measures; the verdict uses the first.
+        window_px: width over which sharpness is averaged.
+        slices: images of a rendered stack.
         focal_length_m, f_number: of the lens, as in :func:`dhtorch.experiments.focal.defocus.run`.
         stride_px: of the grid.
-        max_stacks: of each data set, evenly spread. Stacks of one room are one scene.
+        max_stacks: of each data set, evenly spaced. Stacks of one room are one scene.
 
     Raises:
-        ValueError: a recording with neither; fewer than two slices.
+        ValueError: a recording without exact depth; fewer than two slices.
 
     Source: paper, "What Does Not Work", classical focus-stack depth.
     """
     if slices < 2:
         raise ValueError(f"experiment.slices: found {slices}, expected at least 2")
-    ask_maps = partial(_numbers, measures=measures, window_px=window_px, stride=stride_px)
+    evaluate = partial(_evaluate_depth, measures=measures, window_px=window_px, stride=stride_px)
 
-    def ask(scene: _StackRoom | Scene, item: ScreenedItem) -> dict[str, Row]:
+    def evaluate_item(scene: _StackRoom | Scene, item: ScreenedItem) -> dict[str, Row]:
         if isinstance(scene, _StackRoom):
             stack = _sort_by_focus(scene.stacks[item[0]].to(settings.dtype).to(settings.device))
             if stack.depth is None or stack.focus_m is None:
                 return measure_without_truth(stack, measures[0], window_px)
-            taken = {"given": stack.images, "given_aligned": align_stack(stack.images)[0]}
-            return _evaluate_stack(taken, stack.focus_m, stack.depth, ask_maps, measures)
+            conditions = {"given": stack.images, "given_aligned": align_stack(stack.images)[0]}
+            return _evaluate_stack(conditions, stack.focus_m, stack.depth, evaluate, measures)
         frame = scene.recording[0].to(settings.dtype).to(settings.device)
         steps = torch.linspace(1 / _FOCUS_RANGE_M[0], 1 / _FOCUS_RANGE_M[1], slices, dtype=settings.dtype)
         lens = {"focal_length_m": focal_length_m, "f_number": f_number}
-        made = render_stacks(frame, 1 / steps[None], lens, settings.seed)
-        return _evaluate_stack(made, 1 / steps[None], frame.depth, ask_maps, measures)
+        rendered = render_stacks(frame, 1 / steps[None], lens, settings.seed)
+        return _evaluate_stack(rendered, 1 / steps[None], frame.depth, evaluate, measures)
 
-    rooms = [room for given in scenes for room in _group_rooms(given, max_stacks)]
+    rooms = [room for source in scenes for room in _group_rooms(source, max_stacks)]
     names = [
         c if m == measures[0] else f"{c}, {m}" for c in (*RENDERED_CONDITIONS, *_RECORDED_CONDITIONS) for m in measures
     ]
-    wanted = _possible_variants(rooms, names)
-    outcome = screen_scenes(rooms, _stack_items, ask, wanted, truth="full", whole=_flip_shares, progress=progress)
-    for name in wanted:
+    variants = _possible_variants(rooms, names)
+    outcome = screen_scenes(
+        rooms, _stack_items, evaluate_item, variants, truth="full", whole=_flip_shares, progress=progress
+    )
+    for name in variants:
         flips = [row.get("flip_share") for row in outcome.scenes(name).values()]
         entry = bootstrap.interval_over_scenes(flips, statistic="mean").entry()
         outcome.summary |= {f"{name}.flip_share": entry} if entry["value"] is not None else {}
@@ -135,22 +141,28 @@ def run(
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
-    """Good on clean stacks, bad on light fields, and not rescued by confidence?"""
+    """Verdict and text: the recipe works on clean stacks, fails on light fields, and the gate does not help."""
 
-    def at(name: str) -> float | None:
+    def summary_value(name: str) -> float | None:
         value = outcome.summary.get(name, {}).get("value")
         return None if value is None else float(value)
 
-    clean, field = at("clean.rank_corr"), at("light_field.rank_corr")
-    plain, gated, flips = (at(f"light_field.{m}") for m in ("abs_corr", "gated_abs_corr", "flip_share"))
-    if clean is None or field is None or plain is None or gated is None or flips is None:
-        known = {"Spearman": at("given.rank_corr"), "order of the pictures recovered": at("given_aligned.order_corr")}
-        said = "; ".join(f"{k} {v:.2f}" for k, v in known.items() if v is not None)
-        return None, f"no rendered stacks: clean and light-field ones are not compared{said and f' ({said})'}"
+    clean, field = summary_value("clean.rank_corr"), summary_value("light_field.rank_corr")
+    absolute, gated, flips = (summary_value(f"light_field.{m}") for m in ("abs_corr", "gated_abs_corr", "flip_share"))
+    if clean is None or field is None or absolute is None or gated is None or flips is None:
+        recorded = {
+            "Spearman": summary_value("given.rank_corr"),
+            "recovered order of the images": summary_value("given_aligned.order_corr"),
+        }
+        recorded_text = "; ".join(f"{k} {v:.2f}" for k, v in recorded.items() if v is not None)
+        return (
+            None,
+            f"no rendered stacks: clean and light-field ones are not compared{recorded_text and f' ({recorded_text})'}",
+        )
     why = (
-        f"clean Spearman {clean:.2f} (paper 0.69), gated r {at('clean.gated_corr') or 0:.2f} (0.76); light"
+        f"clean Spearman {clean:.2f} (paper 0.69), gated r {summary_value('clean.gated_corr') or 0:.2f} (0.76); light"
         f" field Spearman {field:.2f}, flipped on {flips:.0%} of scenes (1/5),"
-        f" |r| {plain:.2f} to {gated:.2f} (0.15 to 0.21)"
+        f" |r| {absolute:.2f} to {gated:.2f} (0.15 to 0.21)"
     )
     return (
         clean >= _MIN_CLEAN_CORRELATION and field <= _MAX_LIGHT_FIELD_RATIO * clean and gated < _MAX_GATED_CORRELATION,
@@ -159,100 +171,104 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
 
 
 def render_stacks(frame: Frame, focus_m: Tensor, lens: Mapping[str, float], seed: int) -> dict[str, Tensor]:
-    """Condition → grey stack (1, S, 1, H, W) of a frame with exact depth."""
+    """Render the grey stacks (1, S, 1, H, W) of every condition from a frame with exact depth."""
     sharp = filters.grayscale(frame.image)
-    draw, count = torch.Generator().manual_seed(seed), focus_m.shape[1]
+    generator, count = torch.Generator().manual_seed(seed), focus_m.shape[1]
     f_px = float(frame.camera.f[0, 0])
-    wide = make_lens(f_px, **lens).to(focus_m.dtype)
-    small = make_lens(f_px, focal_length_m=0.0095, f_number=0.0095 * f_px / _LIGHT_FIELD_PX_PER_DPT).to(focus_m.dtype)
-    clean = render_defocus(sharp, frame.depth, wide, focus_m, step_px=1.0)
-    field = render_defocus(sharp, frame.depth, small, focus_m, step_px=0.25)
+    lens_wide = make_lens(f_px, **lens).to(focus_m.dtype)
+    lens_small = make_lens(f_px, focal_length_m=0.0095, f_number=0.0095 * f_px / _LIGHT_FIELD_PX_PER_DPT).to(
+        focus_m.dtype
+    )
+    clean = render_defocus(sharp, frame.depth, lens_wide, focus_m, step_px=1.0)
+    field = render_defocus(sharp, frame.depth, lens_small, focus_m, step_px=0.25)
 
-    def grain(x: Tensor, levels: float) -> Tensor:
-        return (x + levels / 255 * torch.randn(x.shape, generator=draw).to(x)).clamp(0, 1)
+    def add_noise(x: Tensor, levels: float) -> Tensor:
+        return (x + levels / 255 * torch.randn(x.shape, generator=generator).to(x)).clamp(0, 1)
 
-    noisy = grain(clean, 4)
-    moved = grain(_jitter(clean, draw), 1)
+    noisy = add_noise(clean, 4)
+    moved = add_noise(_jitter(clean, generator), 1)
     return {
         "clean": clean,
         "noisy": noisy,
         "moved": moved,
         "aligned": align_stack(moved)[0],
-        "light_field": grain(field, 2),
-        "no_focus": grain(sharp[:, None].expand(-1, count, -1, -1, -1), 2),
+        "light_field": add_noise(field, 2),
+        "no_focus": add_noise(sharp[:, None].expand(-1, count, -1, -1, -1), 2),
     }
 
 
 def measure_without_truth(stack: FocalStack, measure: str, window_px: float) -> dict[str, Row]:
-    """What can be asked of a sweep without depth, as it is and aligned.
+    """Measures of a sweep without ground truth depth, as recorded and aligned: condition → row.
 
-    ``order_corr``: |Spearman| of the order of the pictures with the order read off their sharpness (neighbours in a
-    sweep are sharp in nearly the same places). ``halves_corr``: Spearman of the places found in the odd and in the even
-    pictures, on the most confident quarter. ``motion_px``: largest motion found by the alignment, at the border.
+    ``order_corr``: |Spearman| of the order of the images with the order estimated from sharpness (neighbours in a sweep
+    are sharp in nearly the same places). ``halves_corr``: Spearman of the sharpest positions in the odd and in the even
+    images, on the most confident quarter. ``motion_px``: largest motion estimated by the alignment, at the border.
     """
-    images, motion = align_stack(stack.images)
+    aligned, motion = align_stack(stack.images)
     half = max(stack.hw) / 2
     largest = float((motion[..., 0].abs() * half + motion[..., 1:].norm(dim=-1)).max())
-    found = {}
-    for name, pictures in (("given", stack.images), ("given_aligned", images)):
-        measured = measure_sharpness(pictures, measure, window_px=window_px)
+    rows = {}
+    for name, stack_images in (("given", stack.images), ("given_aligned", aligned)):
+        sharpness = measure_sharpness(stack_images, measure, window_px=window_px)
         row: Row = {
-            "order_corr": order_correlation(measured),
-            "halves_corr": halves_correlation(measured),
-            "n_pictures": measured.shape[1],
+            "order_corr": order_correlation(sharpness),
+            "halves_corr": halves_correlation(sharpness),
+            "n_pictures": sharpness.shape[1],
         }
-        found[name] = row | {"motion_px": largest if name == "given" else 0.0}
-    return found
+        rows[name] = row | {"motion_px": largest if name == "given" else 0.0}
+    return rows
 
 
 def order_correlation(measured: Tensor) -> float | None:
-    """|Spearman| of the true order of the pictures of (1, S, H, W) with the one read off their sharpness.
+    """|Spearman| of the true order of the images with that estimated from their sharpness (1, S, H, W).
 
-    Every picture is linked to the one that is sharp in most nearly the same places (the shortest tree of links); the
-    order is the way along the tree from the one end of its longest path. The true order takes no part.
+    The images form a minimum spanning tree under the dissimilarity of their sharpness maps; the estimated order is the
+    distance along the tree from one end of its longest path. The true order is not used.
     """
     size = max(4, min(measured.shape[-2:]) // 30)
     level = torch.log(torch.nn.functional.avg_pool2d(measured[0][:, None], size).flatten(1).double() + 1e-9)
-    level = level - level.mean(0)  # what a place has in all pictures is its texture, not its focus
-    unlike = (1 - torch.corrcoef(level)).clamp_min(0).sqrt()
-    end = int(_along_tree(unlike, 0).argmax())
-    found = spearman(_along_tree(unlike, end), torch.arange(len(unlike), dtype=unlike.dtype))
-    return None if found is None else abs(found)
+    level = level - level.mean(0)  # the mean over the images is texture, not focus
+    dissimilarity = (1 - torch.corrcoef(level)).clamp_min(0).sqrt()
+    end = int(_tree_distances(dissimilarity, 0).argmax())
+    correlation = spearman(
+        _tree_distances(dissimilarity, end), torch.arange(len(dissimilarity), dtype=dissimilarity.dtype)
+    )
+    return None if correlation is None else abs(correlation)
 
 
-def _along_tree(distance: Tensor, start: int) -> Tensor:
-    """Way (S,) from one node to every other along the shortest tree that joins all (Prim)."""
-    way = torch.full_like(distance[0], torch.nan)
-    way[start] = 0
+def _tree_distances(distance: Tensor, start: int) -> Tensor:
+    """Path length (S,) from a node to every other along the minimum spanning tree of (S, S) distances (Prim)."""
+    length = torch.full_like(distance[0], torch.nan)
+    length[start] = 0
     for _ in range(len(distance) - 1):
-        links = torch.where(way.isfinite()[:, None] & way.isnan(), distance, torch.inf)
+        links = torch.where(length.isfinite()[:, None] & length.isnan(), distance, torch.inf)
         i, j = divmod(int(links.argmin()), len(distance))
-        way[j] = way[i] + distance[i, j]
-    return way
+        length[j] = length[i] + distance[i, j]
+    return length
 
 
 def halves_correlation(measured: Tensor) -> float | None:
-    """Spearman of the places found in the odd and in the even pictures, on the most confident quarter."""
+    """Spearman of the sharpest positions in the odd and in the even images, on the most confident quarter."""
     if measured.shape[1] < 4:
         return None
     odd, even = find_sharpest(measured[:, 0::2]), find_sharpest(measured[:, 1::2])
-    sure = torch.minimum(odd.confidence, even.confidence).flatten()
-    use = sure >= sure.quantile(1 - _CONFIDENT_SHARE) if sure.numel() < 2**24 else sure > 0
-    return spearman(odd.place.flatten()[use].double(), even.place.flatten()[use].double())
+    confidence = torch.minimum(odd.confidence, even.confidence).flatten()
+    kept = confidence >= confidence.quantile(1 - _CONFIDENT_SHARE) if confidence.numel() < 2**24 else confidence > 0
+    return spearman(odd.place.flatten()[kept].double(), even.place.flatten()[kept].double())
 
 
 def _evaluate_stack(
-    taken: Mapping[str, Tensor], focus_m: Tensor, depth: Tensor, ask: Any, measures: Sequence[str]
+    conditions: Mapping[str, Tensor], focus_m: Tensor, depth: Tensor, evaluate: Any, measures: Sequence[str]
 ) -> Any:
-    """Variant → numbers."""
+    """Evaluate every condition with every measure: variant → row."""
     return {
-        condition if m == measures[0] else f"{condition}, {m}": ask(images, focus_m, depth, measure=m)
-        for condition, images in taken.items()
+        condition if m == measures[0] else f"{condition}, {m}": evaluate(images, focus_m, depth, measure=m)
+        for condition, images in conditions.items()
         for m in measures
     }
 
 
-def _numbers(
+def _evaluate_depth(
     images: Tensor,
     focus_m: Tensor,
     depth: Tensor,
@@ -262,13 +278,17 @@ def _numbers(
     window_px: float,
     stride: int,
 ) -> Row:
-    """How the depth read off a stack goes with the true one."""
+    """Correlations and errors of the inverse depth estimated from a stack against ground truth."""
     focus = find_sharpest(measure_sharpness(images, measure, window_px=window_px))
-    claim = depth_at_focus(focus.place, focus_m)
-    x, y, sure = (v[0, ::stride, ::stride].flatten().double() for v in (claim, depth, focus.confidence))
-    known = y > 0
-    x, y, sure = x[known], y[known], sure[known]
-    kept = sure >= sure.sort().values[int((1 - _CONFIDENT_SHARE) * (len(sure) - 1))] if len(sure) else known[:0]
+    estimate = depth_at_focus(focus.place, focus_m)
+    x, y, confidence = (v[0, ::stride, ::stride].flatten().double() for v in (estimate, depth, focus.confidence))
+    has_truth = y > 0
+    x, y, confidence = x[has_truth], y[has_truth], confidence[has_truth]
+    kept = (
+        confidence >= confidence.sort().values[int((1 - _CONFIDENT_SHARE) * (len(confidence) - 1))]
+        if len(confidence)
+        else has_truth[:0]
+    )
     r = pearson(1 / x, 1 / y)
     gated = pearson(1 / x[kept], 1 / y[kept])
     rank = spearman(1 / x, 1 / y)
@@ -291,53 +311,55 @@ def _stack_items(scene: _StackRoom | Scene) -> list[ScreenedItem]:
 
 
 def _flip_shares(_scene: _StackRoom | Scene, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
-    """Variant → share of a scene's stacks whose sign is flipped; the median of yes and no would not say it."""
-    said: dict[str, list[float]] = {}
-    for answer in found:
-        for variant, row in answer.items():
-            said.setdefault(variant, []).extend([row["flip_share"]] if row.get("flip_share") is not None else [])
-    return {variant: {"flip_share": mean_or_none(shares)} for variant, shares in said.items() if shares}
+    """Variant → fraction of a scene's stacks with a negative correlation: a mean, as a median would be 0 or 1."""
+    flips: dict[str, list[float]] = {}
+    for rows in found:
+        for variant, row in rows.items():
+            flips.setdefault(variant, []).extend([row["flip_share"]] if row.get("flip_share") is not None else [])
+    return {variant: {"flip_share": mean_or_none(values)} for variant, values in flips.items() if values}
 
 
-def _group_rooms(given: FocalStacks | SceneLike, most: int) -> list[_StackRoom | Scene]:
-    """A scene with exact depth, or every room of a data set with those of its stacks that were chosen."""
-    if isinstance(given, FocalStacks):
-        chosen = set(torch.linspace(0, len(given) - 1, min(most, len(given))).round().int().tolist())
-        rooms = {s: tuple(i for i in all_ if i in chosen) for s, all_ in given.by_scene().items()}
-        single = len(given) == 1
-        label = given.name if given.root is None or not single else _folder_name(given)
-        return [_StackRoom(label if single else f"{label}/{s}", given, stacks) for s, stacks in rooms.items() if stacks]
-    scene = Scene.of(given)
+def _group_rooms(source: FocalStacks | SceneLike, most: int) -> list[_StackRoom | Scene]:
+    """A scene with exact depth, or the rooms of a data set, each with the selected stacks (at most ``most`` in all)."""
+    if isinstance(source, FocalStacks):
+        selected = set(torch.linspace(0, len(source) - 1, min(most, len(source))).round().int().tolist())
+        rooms = {s: tuple(i for i in indices if i in selected) for s, indices in source.by_scene().items()}
+        single = len(source) == 1
+        label = source.name if source.root is None or not single else _folder_name(source)
+        return [
+            _StackRoom(label if single else f"{label}/{s}", source, stacks) for s, stacks in rooms.items() if stacks
+        ]
+    scene = Scene.of(source)
     if not has_exact_depth(scene.recording):
-        raise ValueError(f"focus_stack: {scene.name} expected focal stacks, or a recording with exact depth")
+        raise ValueError(f"focus_stack: found {scene.name}, expected focal stacks or a recording with exact depth")
     return [scene]
 
 
 def _folder_name(stacks: FocalStacks) -> str:
-    """Name of a folder of pictures; one that is a mere number takes its parents' along."""
+    """Name of a folder of images; the path of its last three parts if the name is only a number."""
     parts = stacks.root.resolve().parts[-3:] if stacks.root else (stacks.name,)
     return parts[-1] if not parts[-1].isdecimal() else "/".join(parts)
 
 
 def _possible_variants(scenes: Sequence[_StackRoom | Scene], names: Sequence[str]) -> list[str]:
-    """The variants that these scenes can have."""
+    """Subset of the variants ``names`` that applies to the kinds of the scenes."""
     kinds = {isinstance(s, _StackRoom) for s in scenes}
     return [n for n in names if (n.split(",")[0] in _RECORDED_CONDITIONS) in kinds]
 
 
 def _sort_by_focus(stack: FocalStack) -> FocalStack:
-    """The stack from near to far focus, where the distances are known."""
+    """Stack sorted from near to far focus; unchanged without focus distances."""
     if stack.focus_m is None:
         return stack
-    by = stack.focus_m[0].argsort()
-    return stack.replace(images=stack.images[:, by], focus_m=stack.focus_m[:, by])
+    order = stack.focus_m[0].argsort()
+    return stack.replace(images=stack.images[:, order], focus_m=stack.focus_m[:, order])
 
 
-def _jitter(images: Tensor, draw: torch.Generator) -> Tensor:
-    """The stack with a magnification that changes by 2 % and shifts of about a pixel."""
+def _jitter(images: Tensor, generator: torch.Generator) -> Tensor:
+    """Stack (B, S, C, H, W) with magnification changing by 2 % in all and random shifts of about a pixel."""
     B, S, _, H, W = images.shape
     zoom = 1 + torch.linspace(-0.01, 0.01, S)
-    shift = torch.randn(S, 2, generator=draw)
+    shift = torch.randn(S, 2, generator=generator)
     theta = torch.zeros(S, 2, 3)
     theta[:, 0, 0] = theta[:, 1, 1] = zoom
     theta[:, :, 2] = shift * 2 / torch.tensor([W, H])

@@ -1,7 +1,7 @@
-"""FoD500 (Focus on Defocus): five rendered pictures of a table of objects, each in focus elsewhere, with depth.
+"""FoD500 (Focus on Defocus): five rendered images of a table of objects at different focus distances, with depth.
 
-``<index>…All.tif`` five times and ``<index>…Dpt.exr`` (half floats, metres) for each index of six digits. What stands
-between index and suffix is not known from the authors' loaders; the names are taken in their order, near focus first.
+``<index>…All.tif`` five times and ``<index>…Dpt.exr`` (half floats, metres) for each index of six digits. The text
+between index and suffix is not documented in the authors' loaders; files are taken in order of name, near focus first.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _FIRST_VALIDATION = 400
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` focal stacks of this format, in words; None if nothing does."""
+    """Text of the evidence that ``root`` holds stacks of this format; None without evidence."""
     names = {m[2] for file in root.iterdir() if (m := _SAMPLE_PATTERN.fullmatch(file.name))} if root.is_dir() else set()
     return "files <index>…All.tif" if "All.tif" in names else None
 
@@ -44,20 +44,20 @@ def read(
     """Open FoD500.
 
     Args:
-        root: the folder with the pictures (``fs_6``).
+        root: the folder with the images (``fs_6``).
         split: ``"train"`` = index below 400, ``"val"`` = the rest. None = both.
-        focus_m: distances in focus, in the order of the files.
+        focus_m: focus distances, in the order of the files.
         focal_length_m: of the rendering lens.
-        f_number: of the rendering lens. 1.0 is what the authors train with (a default of 0.1 elsewhere in their code
-            is not used).
-        max_depth: depth is clipped here, as the authors do. None = not at all.
+        f_number: of the rendering lens. 1.0 is the value of the authors' training (a default of 0.1 elsewhere in
+            their code is not used).
+        max_depth: depth is clipped to this, as in the authors' code. None = no clipping.
 
     Returns:
-        Stacks with depth where the folder has any; a sample that lacks a picture or its depth is left out and reported.
+        Stacks, with depth if the folder has any; samples that lack an image or depth are left out and reported.
         The pixel pitch is not published, so there is no camera.
 
     Raises:
-        FormatError: no whole sample, or an option that cannot be.
+        FormatError: no complete sample, or an invalid option.
     """
     root = Path(root)
     focus = parse_focus_distances(focus_m, root)
@@ -66,30 +66,30 @@ def read(
     if max_depth is not None:
         files.to_positive(max_depth, root, "option max_depth")
     samples = {k: v for k, v in _samples(root).items() if split in (None, _split(k))}
-    any_depth = any(depths for _, depths in samples.values())
-    whole = {k: v for k, v in samples.items() if (len(v[0]), len(v[1])) == (len(focus), int(any_depth))}
-    if not whole:
+    has_depth = any(depths for _, depths in samples.values())
+    complete = {k: v for k, v in samples.items() if (len(v[0]), len(v[1])) == (len(focus), int(has_depth))}
+    if not complete:
         expected = f"{len(focus)} *All.tif and one *Dpt.exr"
-        raise FormatError(root, "samples", f"none whole among {len(samples)}", expected)
+        raise FormatError(root, "samples", f"none complete among {len(samples)}", expected)
     load = _StackLoader(
-        pictures=tuple(tuple(pictures) for pictures, _ in whole.values()),
-        depths=tuple(depths[0] if depths else None for _, depths in whole.values()),
+        pictures=tuple(tuple(pictures) for pictures, _ in complete.values()),
+        depths=tuple(depths[0] if depths else None for _, depths in complete.values()),
         focus=focus,
         focal_length_m=files.to_positive(focal_length_m, root, "option focal_length_m"),
         f_number=files.to_positive(f_number, root, "option f_number"),
         max_depth=max_depth,
     )
-    odd = [(k, *v) for k, v in samples.items() if k not in whole]
+    incomplete = [(k, *v) for k, v in samples.items() if k not in complete]
     report = tuple(
         f"sample {k}: {format_count(len(a), 'picture')} and {format_count(len(b), 'depth map')}: left out"
-        for k, a, b in odd
+        for k, a, b in incomplete
     )
-    return FocalStacks(root.resolve().name, "fod500", load, tuple(whole), root, report)
+    return FocalStacks(root.resolve().name, "fod500", load, tuple(complete), root, report)
 
 
 @dataclass(frozen=True, eq=False)
 class _StackLoader:
-    """Position → stack."""
+    """Index → decoded stack."""
 
     pictures: tuple[tuple[Path, ...], ...]
     depths: tuple[Path | None, ...]
@@ -110,7 +110,7 @@ class _StackLoader:
 
 
 def _samples(root: Path) -> dict[str, tuple[list[Path], list[Path]]]:
-    """Index → its pictures and its depth maps, by name."""
+    """Sample index → files of its images and of its depth maps, in order of name."""
     samples: dict[str, tuple[list[Path], list[Path]]] = {}
     for file in sorted(root.iterdir()) if root.is_dir() else ():
         if match := _SAMPLE_PATTERN.fullmatch(file.name):
@@ -119,4 +119,5 @@ def _samples(root: Path) -> dict[str, tuple[list[Path], list[Path]]]:
 
 
 def _split(index: str) -> str:
+    """Split of a sample index."""
     return "val" if int(index) >= _FIRST_VALIDATION else "train"

@@ -1,4 +1,4 @@
-"""Focal stacks of any known format: ``open_stacks(path)``. They show one view, so that no pairs are in them."""
+"""Open focal stacks of any supported format: ``open_stacks(path)``."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from dhtorch.data.io.safe_open import restrict_links
 from dhtorch.experiments.focal import ddff12, fod500, image_folder
 from dhtorch.experiments.focal.stacks import FocalStacks
 
-#: Name → reader, asked in this order; the first that recognises a folder reads it.
+#: Name → reader, tried in this order; the first that recognises a folder reads it.
 STACK_FORMATS: Final[dict[str, ModuleType]] = {"fod500": fod500, "ddff12": ddff12, "images": image_folder}
 
 
 def open_stacks(root: str | Path, format: str = "auto", *, follow_links: bool = False, **options: Any) -> FocalStacks:
-    """The focal stacks at ``root``, opened lazily: nothing is decoded before a stack is asked for.
+    """Open the focal stacks at ``root`` lazily: a stack is decoded when it is indexed.
 
     Args:
         root: a folder, or an HDF5 file.
         format: ``fod500``, ``ddff12``, ``images``, or ``auto`` to recognise it by its content.
-        follow_links: whether symbolic links inside may lead out of it.
+        follow_links: whether symbolic links below ``root`` may lead out of it.
         options: keyword options of the reader, see ``dhtorch.experiments.focal.<format>.read`` (``images``:
             ``image_folder``).
 
     Raises:
-        FormatError: nothing there, an unknown format, or a file that is not what its format promises.
-        ValueError: an option that the reader does not have.
+        FormatError: missing path, unknown format, or a file that violates its format.
+        ValueError: an option unknown to the reader.
     """
     root = Path(root)
     if not root.exists():
@@ -41,17 +41,19 @@ def open_stacks(root: str | Path, format: str = "auto", *, follow_links: bool = 
     elif format not in STACK_FORMATS:
         raise FormatError(root, "format", format, f"auto, {', '.join(STACK_FORMATS)}")
     read = STACK_FORMATS[format].read
-    known = list(inspect.signature(read).parameters)[1:]
+    valid_options = list(inspect.signature(read).parameters)[1:]
     for option in options:
-        if option not in known:
-            raise ValueError(f"stacks: format {format} has no option {option!r}, expected one of {', '.join(known)}")
+        if option not in valid_options:
+            raise ValueError(
+                f"stacks: format {format} has no option {option!r}, expected one of {', '.join(valid_options)}"
+            )
     bounds = None if follow_links else root
     with restrict_links(bounds):
         return replace(read(root, **options), bounds=bounds)
 
 
 def recognise_stacks(root: str | Path, *, follow_links: bool = False) -> tuple[str, str]:
-    """(format, what makes it one, in words) of focal stacks.
+    """Format of the focal stacks at ``root`` and the text of the evidence for it.
 
     Raises:
         FormatError: no format recognises it.
@@ -64,11 +66,11 @@ def recognise_stacks(root: str | Path, *, follow_links: bool = False) -> tuple[s
 
 
 def open_collections(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[FocalStacks]:
-    """Focal stacks of a list of scenes below one folder.
+    """Open the focal stacks of a list of scenes below one folder.
 
     Args:
-        root: folder that the scenes' paths start from. None = the environment variable ``DHTORCH_DATA``.
-        scenes: for each ``path``, and the arguments of :func:`open_stacks` that it needs.
+        root: folder to which the scenes' paths are relative. None = the environment variable ``DHTORCH_DATA``.
+        scenes: for each, ``path`` and any arguments of :func:`open_stacks`.
 
     Raises:
         FormatError: as :func:`dhtorch.data.open_scenes`.

@@ -1,4 +1,4 @@
-"""A plain folder of pictures of one view as a focal stack, in the order of the numbers in their names."""
+"""A plain folder of images of one view as a focal stack, in the order of the numbers in their names."""
 
 from __future__ import annotations
 
@@ -14,32 +14,32 @@ from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.experiments.focal.stacks import FocalStack, FocalStacks, parse_focus_distances, read_pictures
 
-_MAX_CHECKED_IMAGES = 16  # pictures of a folder, to tell whether they are of one kind
+_MAX_CHECKED_IMAGES = 16  # number of images whose headers are compared when recognising a folder
 _DEPTH_FOLDERS = ("depth", "depths", "depth_maps")
 _IMAGE_PATTERN = re.compile(r"[^.].*\.(png|jpe?g|tiff?)", re.IGNORECASE)
 
 
 def recognise(root: Path) -> str | None:
-    """What makes ``root`` a focal stack of this format, in words; None if nothing does."""
+    """Text of the evidence that ``root`` is a stack of this format; None without evidence."""
     if any((root / name).is_dir() for name in _DEPTH_FOLDERS):
-        return None  # a camera that measures depth, whatever its pictures are called
+        return None  # an RGB-D recording
     pictures = sorted(_image_files(root), key=files.natural_sort_key)
-    some = pictures[:: max(1, len(pictures) // _MAX_CHECKED_IMAGES)]
-    kinds = {_image_kind(file) for file in (*some, *pictures[-1:])}
+    sampled = pictures[:: max(1, len(pictures) // _MAX_CHECKED_IMAGES)]
+    kinds = {_image_kind(file) for file in (*sampled, *pictures[-1:])}
     if len(pictures) < 2 or None in kinds or len(kinds) != 1:
         return None
     return f"{len(pictures)} pictures of one size"
 
 
 def read(root: str | Path, *, focus_m: Sequence[float] | None = None) -> FocalStacks:
-    """Open a folder of pictures (PNG, JPEG, TIFF) as one focal stack.
+    """Open a folder of images (PNG, JPEG, TIFF) as one focal stack.
 
     Args:
         root: the folder.
-        focus_m: the distances in focus, in the order of the pictures. None = not known.
+        focus_m: focus distances, in the order of the images. None = unknown.
 
     Raises:
-        FormatError: less than two pictures, or another number of distances.
+        FormatError: fewer than two images, or a different number of distances.
     """
     root = Path(root)
     pictures = tuple(sorted(_image_files(root), key=files.natural_sort_key))
@@ -52,7 +52,7 @@ def read(root: str | Path, *, focus_m: Sequence[float] | None = None) -> FocalSt
 
 @dataclass(frozen=True, eq=False)
 class _StackLoader:
-    """0 → the stack."""
+    """Index 0 → decoded stack."""
 
     pictures: tuple[Path, ...]
     focus: Tensor | None
@@ -62,11 +62,12 @@ class _StackLoader:
 
 
 def _image_files(root: Path) -> list[Path]:
+    """Image files in a folder, unsorted."""
     return [file for file in root.iterdir() if _IMAGE_PATTERN.fullmatch(file.name)] if root.is_dir() else []
 
 
 def _image_kind(file: Path) -> tuple[object, ...] | None:
-    """Size, channels and bits of a picture; None of one that is damaged or of a kind that is not read."""
+    """Size, channels and bits of an image file; None if it is damaged or of an unsupported type."""
     try:
         if file.suffix.lower() in (".tif", ".tiff"):
             return tuple(codec_tiff.read_tiff_header(file))

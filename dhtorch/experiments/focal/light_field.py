@@ -1,8 +1,8 @@
-"""Refocusing: a focal stack out of a light field, the many small pictures behind one main lens.
+"""Refocusing: a focal stack from a light field, the array of sub-aperture images of one main lens.
 
-A point at disparity d (px from one picture to the next) stands d further up and left in each next picture. Shifting
-every picture back by that much and taking the mean puts this point, and everything at its depth, into focus; all else
-blurs as behind a lens as wide as the whole array.
+A point of disparity d (px between neighbouring sub-apertures) moves up and left by d from one image to the next.
+Shifting every image back accordingly and averaging brings all points of this depth into focus; others are blurred as by
+a lens with the aperture of the whole array.
 """
 
 from __future__ import annotations
@@ -17,30 +17,30 @@ _LOBES = 3  # of the windowed sinc that interpolates
 
 
 def refocus(
-    light_field: Tensor,  # (U, V, H, W, C) uint8: rows and columns of pictures
+    light_field: Tensor,  # (U, V, H, W, C) uint8: rows and columns of sub-aperture images
     disparity: Tensor,  # (S,) px between neighbours
 ) -> Tensor:
-    """Images (S, C, H, W) uint8, focused at each disparity.
+    """Refocus a light field: images (S, C, H, W) uint8, one focused at each disparity.
 
-    Shifts are fractions of a pixel; a three-lobed Lanczos kernel keeps the sharpness the same for all of them (linear
-    interpolation would make focus depend on the fraction). Rows and columns are shifted apart, each as one convolution
-    that sums over the pictures. The border is repeated.
+    Shifts are sub-pixel; a three-lobed Lanczos kernel gives all of them the same sharpness (with linear interpolation
+    it would depend on the fraction). Rows and columns are shifted separately, each by one convolution that sums over
+    the sub-apertures. The border is repeated.
     """
     u, v, h, w, channels = light_field.shape
-    across, down = _kernels(v, disparity), _kernels(u, disparity)  # (S, V, K), (S, U, K)
-    sides, ends = (across.shape[-1] // 2,) * 2 + (0, 0), (0, 0) + (down.shape[-1] // 2,) * 2
+    row_kernels, column_kernels = _kernels(v, disparity), _kernels(u, disparity)  # (S, V, K), (S, U, K)
+    pad_x, pad_y = (row_kernels.shape[-1] // 2,) * 2 + (0, 0), (0, 0) + (column_kernels.shape[-1] // 2,) * 2
     total = torch.zeros(channels, len(disparity), h, w)
     for i in range(u):
         for c in range(channels):
-            pictures = pad(light_field[i, ..., c][None].float(), sides, mode="replicate")  # (1, V, H, W+)
-            row = conv2d(pictures, across[:, :, None])  # (1, S, H, W)
-            row = pad(row, ends, mode="replicate")
-            total[c] += conv2d(row, down[:, i][:, None, :, None], groups=len(disparity))[0]
+            pictures = pad(light_field[i, ..., c][None].float(), pad_x, mode="replicate")  # (1, V, H, W+)
+            row = conv2d(pictures, row_kernels[:, :, None])  # (1, S, H, W)
+            row = pad(row, pad_y, mode="replicate")
+            total[c] += conv2d(row, column_kernels[:, i][:, None, :, None], groups=len(disparity))[0]
     return (total.transpose(0, 1) / (u * v)).round().clamp(0, 255).to(torch.uint8)
 
 
 def _kernels(n: int, disparity: Tensor) -> Tensor:
-    """(S, n, K) weights that read each of n pictures where the centre's pixel went, K odd."""
+    """Lanczos weights (S, n, K), K odd, that shift each of n sub-aperture images onto the central one."""
     shift = ((n - 1) / 2 - torch.arange(n, dtype=torch.float64)) * disparity.double()[:, None]
     reach = math.ceil(float(shift.abs().max())) + _LOBES
     x = torch.arange(-reach, reach + 1, dtype=torch.float64) - shift[..., None]

@@ -1,12 +1,11 @@
-"""Depth from a focal stack: a pixel is as far as the distance at which it looked sharpest.
+"""Depth from focus: per-pixel sharpness of a focal stack, its maximum over the stack, and depth at that focus.
 
-The classical recipe: a measure of sharpness for every pixel of every picture, the best picture of each pixel, and a
-parabola through the measure around it, so that the answer falls between pictures. Pictures that moved or breathed
-(changed their magnification with the focus) are first laid over each other.
+The classical recipe: a sharpness measure at every pixel of every image, the sharpest image of each pixel, and a
+parabola through the log measure around it for a position between images. Images with motion or breathing
+(magnification that changes with focus) are aligned first.
 
-Alphabet: ``images`` (B, S, C, H, W), S pictures of one view; ``measure_sharpness`` (B, S, H, W); ``place`` (B, H, W)
-    position
-in the stack, in pictures, fractions allowed.
+Alphabet: ``images`` (B, S, C, H, W), S images of one view; ``measured`` (B, S, H, W) sharpness; ``place`` (B, H, W)
+fractional index in the stack.
 """
 
 from __future__ import annotations
@@ -20,16 +19,16 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.filters import correlate_separable, gaussian_blur
 from dhtorch.pytree import Record, record
 
-#: Measures of sharpness.
+#: Names of the sharpness measures.
 SHARPNESS_MEASURES = ("modified_laplacian", "gradient_energy", "variance")
 
 
 @record
 class FocusMap(Record):
-    """Where in the stack every pixel is sharpest."""
+    """Fractional index of the sharpest image at every pixel, with a confidence."""
 
-    place: Tensor  # (B, H, W) pictures from the first, in [0, S − 1]
-    confidence: Tensor  # (B, H, W) in [0, 1]: how far the peak stands out of the other pictures
+    place: Tensor  # (B, H, W) index in the stack, in [0, S − 1]
+    confidence: Tensor  # (B, H, W) in [0, 1]: 1 − mean / peak of the sharpness over the images
 
 
 def measure_sharpness(
@@ -38,19 +37,19 @@ def measure_sharpness(
     *,
     window_px: float = 6.0,
 ) -> Tensor:
-    """Sharpness (B, S, H, W) of every pixel in every picture, averaged over a Gaussian window.
+    """Sharpness (B, S, H, W) of every pixel in every image, averaged over a Gaussian window.
 
     ``modified_laplacian``: sum of the absolute second differences along both axes. ``gradient_energy``: sum of the
     squared first differences (Sobel; kornia's ``spatial_gradient`` takes up to three times as long). ``variance``: of
     the grey values in the window.
 
     Args:
-        images: B stacks of at least two pictures.
+        images: B stacks of at least two images.
         measure: one of :data:`SHARPNESS_MEASURES`.
         window_px: standard deviation of the window.
 
     Raises:
-        ValueError: wrong shapes, fewer than two pictures, or another measure.
+        ValueError: wrong shapes, fewer than two images, or an unknown measure.
 
     Gradient: to the images.
     Source: S. Pertuz, D. Puig, M. A. García, "Analysis of focus measure operators for shape-from-focus", 2013.
@@ -65,8 +64,8 @@ def measure_sharpness(
         raw = correlate_separable(grey, [1.0], second).abs() + correlate_separable(grey, second, [1.0]).abs()
     elif measure == "gradient_energy":
         slope, smooth = [-0.5, 0.0, 0.5], [0.25, 0.5, 0.25]
-        across, down = correlate_separable(grey, smooth, slope), correlate_separable(grey, slope, smooth)
-        raw = across * across + down * down
+        gradient_x, gradient_y = correlate_separable(grey, smooth, slope), correlate_separable(grey, slope, smooth)
+        raw = gradient_x * gradient_x + gradient_y * gradient_y
     else:
         centred = grey - gaussian_blur(grey, window_px)
         raw = centred * centred
@@ -76,42 +75,46 @@ def measure_sharpness(
 def find_sharpest(
     measured: Tensor,  # (B, S, H, W) not negative
 ) -> FocusMap:
-    """The sharpest picture of every pixel, placed between pictures by a Gaussian through three of them.
+    """Index of the sharpest image of every pixel, refined between images by a Gaussian through three values.
 
-    Confidence is 1 minus the mean over the peak: 0 where no picture stands out, at most 1 − 1 / S. A peak at either end
-    stays there: nothing tells how far beyond it the best would be.
+    Confidence is 1 − mean / peak: 0 for equal sharpness in all images, at most 1 − 1 / S. A peak at the first or the
+    last image is not refined, as the maximum may lie outside the stack.
 
     Raises:
-        ValueError: wrong shapes or fewer than two pictures.
+        ValueError: wrong shapes or fewer than two images.
 
-    Gradient: through the three sharpnesses to ``measured``; the choice carries none.
+    Gradient: through the three sharpness values to ``measured``; the argmax carries none.
     """
     sizes = check("find_sharpest", measured=(measured, "B S H W"))
     _check_two_images("sharpest", sizes["S"])
     best = measured.detach().argmax(1, keepdim=True)
     left, peak, right = (measured.gather(1, (best + k).clamp(0, sizes["S"] - 1)) for k in (-1, 0, 1))
-    seen = peak > 0
-    floor = 1e-6 * torch.where(seen, peak, torch.ones_like(peak))
-    a, b, c = (torch.log(torch.where(seen, x, torch.ones_like(x)) + floor) for x in (left, peak, right))
-    bend = a - 2 * b + c
-    inner = (best > 0) & (best < sizes["S"] - 1) & (bend < -1e-9)
-    shift = torch.where(inner, 0.5 * (a - c) / torch.where(inner, bend, -torch.ones_like(bend)), torch.zeros_like(bend))
+    has_peak = peak > 0
+    floor = 1e-6 * torch.where(has_peak, peak, torch.ones_like(peak))
+    a, b, c = (torch.log(torch.where(has_peak, x, torch.ones_like(x)) + floor) for x in (left, peak, right))
+    curvature = a - 2 * b + c
+    inner = (best > 0) & (best < sizes["S"] - 1) & (curvature < -1e-9)
+    shift = torch.where(
+        inner, 0.5 * (a - c) / torch.where(inner, curvature, -torch.ones_like(curvature)), torch.zeros_like(curvature)
+    )
     mean = measured.mean(1, keepdim=True)
-    confidence = torch.where(seen, 1 - mean / torch.where(seen, peak, torch.ones_like(peak)), torch.zeros_like(peak))
+    confidence = torch.where(
+        has_peak, 1 - mean / torch.where(has_peak, peak, torch.ones_like(peak)), torch.zeros_like(peak)
+    )
     return FocusMap((best + shift.clamp(-0.5, 0.5))[:, 0], confidence[:, 0])
 
 
 def depth_at_focus(
     place: Tensor,  # (B, H, W)
-    focus_m: Tensor | None,  # (B, S) m, of the pictures in their order
+    focus_m: Tensor | None,  # (B, S) m, of the images in their order
 ) -> Tensor:
-    """Depth (B, H, W) m at places in a stack: inverse distances are interpolated, in which blur is linear.
+    """Depth (B, H, W) m at fractional stack indices, by interpolating inverse focus distances, in which blur is linear.
 
     Raises:
-        ValueError: no distances (then only the order is known), wrong shapes, or distances that do not rise or fall
-            throughout, so that between two pictures there would be no distance between theirs.
+        ValueError: no distances (which leaves only the order of depths), wrong shapes, or distances that are not
+            strictly monotonic.
 
-    Gradient: to place and distances.
+    Gradient: to ``place`` and the distances.
     """
     if focus_m is None:
         raise ValueError(
@@ -138,26 +141,26 @@ def align_stack(
     blur_px: float = 3.0,
     iterations: int = 20,
 ) -> tuple[Tensor, Tensor]:
-    """The stack with every picture laid over the reference, and the motions found.
+    """Align every image of a stack to the reference: images -> aligned images, motions.
 
-    Magnification and shift of each picture are estimated by Gauss–Newton on pictures that are blurred alike (what
-    focus changes most is fine detail) and freed of brightness and contrast, each starting from its neighbour's, which
-    was focused nearly as it is.
+    Magnification and shift of each image are estimated by Gauss–Newton on equally blurred images (focus mostly affects
+    fine detail) with zero mean and unit variance, starting from the motion of the neighbour in the stack, whose focus
+    is similar.
 
     Args:
         images: B stacks.
-        reference: position of the picture that stays; None = the middle one.
-        blur_px: blur before comparison.
-        iterations: per picture.
+        reference: index of the image that is not moved; None = the middle one.
+        blur_px: standard deviation of the blur before alignment.
+        iterations: per image.
 
     Returns:
         images (B, S, C, H, W), float, borders repeated; motion (B, S, 3): magnification minus one, shift right and
-        down in px, such that the pixel at x (from the middle) of the reference is seen at x (1 + m) + shift.
+        down in px, such that the pixel at x (from the centre) of the reference appears at x (1 + m) + shift.
 
     Raises:
-        ValueError: wrong shapes, fewer than two pictures, or no such reference.
+        ValueError: wrong shapes, fewer than two images, or no such reference.
 
-    Gradient: of the resampling to the images; the motion carries none.
+    Gradient: through the resampling to the images; the motion carries none.
     Source: G. Evangelidis, E. Psarakis, "Parametric image alignment using enhanced correlation coefficient", 2008.
     """
     sizes = check("align_stack", images=(images, "B S C H W"))
@@ -166,33 +169,33 @@ def align_stack(
     middle = S // 2 if reference is None else reference
     if not 0 <= middle < S:
         raise ValueError(f"align_stack: reference is {reference}, expected a position from 0 to {S - 1}")
-    pictures = images / 255.0 if images.dtype == torch.uint8 else images
+    scaled = images / 255.0 if images.dtype == torch.uint8 else images
     with torch.no_grad():
-        soft = [gaussian_blur(filters.grayscale(pictures[:, k]), blur_px) for k in range(S)]
-        found = [pictures.new_zeros(B, 3) for _ in range(S)]
+        blurred = [gaussian_blur(filters.grayscale(scaled[:, k]), blur_px) for k in range(S)]
+        motions = [scaled.new_zeros(B, 3) for _ in range(S)]
         for k in [*range(middle - 1, -1, -1), *range(middle + 1, S)]:
-            start = found[k + 1] if k < middle else found[k - 1]
-            found[k] = _register_similarity(soft[middle], soft[k], start, iterations)
-    moved = [_resample(pictures[:, k], found[k]) if k != middle else pictures[:, k] for k in range(S)]
-    return torch.stack(moved, 1), torch.stack(found, 1)
+            start = motions[k + 1] if k < middle else motions[k - 1]
+            motions[k] = _register_similarity(blurred[middle], blurred[k], start, iterations)
+    aligned = [_resample(scaled[:, k], motions[k]) if k != middle else scaled[:, k] for k in range(S)]
+    return torch.stack(aligned, 1), torch.stack(motions, 1)
 
 
 def _register_similarity(fixed: Tensor, moving: Tensor, motion: Tensor, iterations: int) -> Tensor:
-    """Gauss–Newton for magnification and shift (B, 3) of ``moving`` against ``fixed`` (B, 1, H, W)."""
+    """Gauss–Newton estimate of magnification − 1 and shift (B, 3) of ``moving`` against ``fixed`` (B, 1, H, W)."""
     inner = slice(8, -8)
     x, y = _offsets_from_centre(fixed)
-    scale = float(max(fixed.shape[-2:])) / 2  # magnification in pixels at the border: unknowns of like size
+    scale = float(max(fixed.shape[-2:])) / 2  # magnification in pixels at the border: unknowns of similar scale
     target = _standardise(fixed[..., inner, inner])
     for _ in range(iterations):
-        seen = _resample(moving, motion)
-        across = correlate_separable(seen, [1.0], [-0.5, 0.0, 0.5])[..., inner, inner]
-        down = correlate_separable(seen, [-0.5, 0.0, 0.5], [1.0])[..., inner, inner]
-        part = seen[..., inner, inner]
-        spread = part.var((-2, -1), correction=0, keepdim=True).clamp_min(1e-12).sqrt()
-        radial = (across * x[:, inner] + down * y[inner]) / scale
-        J = torch.stack((radial, across, down), -1) / spread[..., None]
+        warped = _resample(moving, motion)
+        gradient_x = correlate_separable(warped, [1.0], [-0.5, 0.0, 0.5])[..., inner, inner]
+        gradient_y = correlate_separable(warped, [-0.5, 0.0, 0.5], [1.0])[..., inner, inner]
+        cropped = warped[..., inner, inner]
+        spread = cropped.var((-2, -1), correction=0, keepdim=True).clamp_min(1e-12).sqrt()
+        radial = (gradient_x * x[:, inner] + gradient_y * y[inner]) / scale
+        J = torch.stack((radial, gradient_x, gradient_y), -1) / spread[..., None]
         J = (J - J.mean((-3, -2), keepdim=True)).flatten(1, 3).double()  # (B, P, 3)
-        r = (target - _standardise(part)).flatten(1).double()
+        r = (target - _standardise(cropped)).flatten(1).double()
         normal = (J[..., :, None] * J[..., None, :]).sum(1) + 1e-9 * torch.eye(3, dtype=torch.float64, device=J.device)
         step = torch.linalg.solve(normal, (J * r[..., None]).sum(1)).to(motion.dtype)
         step = step.clamp(-4, 4)
@@ -200,30 +203,31 @@ def _register_similarity(fixed: Tensor, moving: Tensor, motion: Tensor, iteratio
     return motion
 
 
-def _resample(picture: Tensor, motion: Tensor) -> Tensor:
-    """Pictures (B, C, H, W) read at x (1 + m) + shift, bicubic, by kornia."""
-    H, W = picture.shape[-2:]
-    x, y = _offsets_from_centre(picture)
+def _resample(images: Tensor, motion: Tensor) -> Tensor:
+    """Images (B, C, H, W) sampled at x (1 + m) + shift, bicubic, by kornia."""
+    H, W = images.shape[-2:]
+    x, y = _offsets_from_centre(images)
     m, du, dv = (motion[:, k, None, None] for k in range(3))
     u, v = x * (1 + m) + du + (W - 1) / 2, y * (1 + m) + dv + (H - 1) / 2
     u, v = u.expand(-1, H, W), v.expand(-1, H, W)
-    return remap(picture, u, v, mode="bicubic", padding_mode="border", align_corners=True)
+    return remap(images, u, v, mode="bicubic", padding_mode="border", align_corners=True)
 
 
-def _offsets_from_centre(picture: Tensor) -> tuple[Tensor, Tensor]:
-    """Pixels right of (1, W) and below (H, 1) the middle of the picture."""
-    H, W = picture.shape[-2:]
-    x = torch.arange(W, dtype=picture.dtype, device=picture.device) - (W - 1) / 2
-    y = torch.arange(H, dtype=picture.dtype, device=picture.device) - (H - 1) / 2
+def _offsets_from_centre(images: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixel coordinates relative to the image centre: x (1, W) and y (H, 1)."""
+    H, W = images.shape[-2:]
+    x = torch.arange(W, dtype=images.dtype, device=images.device) - (W - 1) / 2
+    y = torch.arange(H, dtype=images.dtype, device=images.device) - (H - 1) / 2
     return x[None], y[:, None]
 
 
 def _standardise(x: Tensor) -> Tensor:
-    """Zero mean, unit variance over each picture."""
+    """Images normalised to zero mean and unit variance each."""
     x = x - x.mean((-2, -1), keepdim=True)
     return x / (x * x).mean((-2, -1), keepdim=True).clamp_min(1e-12).sqrt()
 
 
 def _check_two_images(where: str, count: int) -> None:
+    """Raise ValueError for a stack of fewer than two images."""
     if count < 2:
         raise ValueError(f"{where}: found {count} picture, expected a stack of at least two, at different focus")

@@ -1,4 +1,4 @@
-"""Focal stacks: one view, photographed at several focus distances. Not RGB-D, so not a recording."""
+"""Focal stacks: images of one view at several focus distances, as records and lazy sequences, and their file input."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from dhtorch.pytree import Record, record
 from dhtorch.records import Camera
 from dhtorch.runtime.console import format_count
 
-#: A folder of a thousand photographs is no focal stack.
+#: Largest size of the decoded images of one stack, bytes; guards against folders that are no focal stack.
 _MAX_STACK_BYTES = 2_000_000_000
 
 
 @record
 class FocalStack(Record):
-    """Pictures of one view that differ in focus, in the order of the data set."""
+    """Images of one view at different focus distances, in the order of the data set, with optional truth and optics."""
 
     images: Tensor  # (B, S, C, H, W) C 1 or 3; float in [0, 1] or uint8
-    focus_m: Tensor | None = None  # (B, S) m, distance in focus; None = not known
-    depth: Tensor | None = None  # (B, H, W) m, truth, 0 = none at this pixel; None = no truth at all
+    focus_m: Tensor | None = None  # (B, S) m, focus distance; None = unknown
+    depth: Tensor | None = None  # (B, H, W) m, ground truth, 0 = none at this pixel; None = no ground truth
     camera: Camera | None = None
     focal_length_m: Tensor | None = None  # (B,) m, of the lens
     f_number: Tensor | None = None  # (B,) focal length over the diameter of the aperture
@@ -42,34 +42,34 @@ class FocalStack(Record):
 
 @dataclass(frozen=True, eq=False)
 class FocalStacks(Sequence[FocalStack]):
-    """A lazy sequence of focal stacks (B = 1): nothing is decoded before a stack is asked for, and it pickles.
+    """Lazy, picklable sequence of focal stacks (B = 1): a stack is decoded when it is indexed.
 
     Raises:
-        ValueError: no stack, or not one scene for each.
+        ValueError: no stack, or the number of scenes differs from the number of stacks.
     """
 
     name: str  # of the collection, for tables and figures
-    format: str  # the reader that made it
-    load: Callable[[int], FocalStack]  # picklable; position → stack
-    names: tuple[str, ...]  # one for each stack
+    format: str  # name of the reader
+    load: Callable[[int], FocalStack]  # picklable; index → stack
+    names: tuple[str, ...]  # of the stacks
     root: Path | None = None  # folder or file that was opened
-    report: tuple[str, ...] = ()  # what was left out, and why
-    scenes: tuple[str, ...] | None = None  # the scene that each stack shows; None = each its own
-    bounds: Path | None = None  # no link below it may lead out of it; None = links are followed
+    report: tuple[str, ...] = ()  # what the reader left out, and why
+    scenes: tuple[str, ...] | None = None  # scene of each stack; None = every stack is a scene of its own
+    bounds: Path | None = None  # symbolic links may not lead out of it; None = no restriction
 
     def __post_init__(self) -> None:
         if not self.names:
             raise ValueError(f"stacks {self.name}: found none, expected at least one")
         if self.scenes is not None and len(self.scenes) != len(self.names):
-            found = f"{format_count(len(self.scenes), 'scene')} of {format_count(len(self.names), 'stack')}"
-            raise ValueError(f"stacks {self.name}: found {found}, expected one for each")
+            counts = f"{format_count(len(self.scenes), 'scene')} of {format_count(len(self.names), 'stack')}"
+            raise ValueError(f"stacks {self.name}: found {counts}, expected one for each")
 
     def by_scene(self) -> dict[str, list[int]]:
-        """Scene → positions of its stacks. What is said of many scenes resamples these, never stacks of one room."""
-        found: dict[str, list[int]] = {}
+        """Scene → indices of its stacks. Statistics resample scenes, not single stacks."""
+        indices: dict[str, list[int]] = {}
         for i, scene in enumerate(self.names if self.scenes is None else self.scenes):
-            found.setdefault(scene, []).append(i)
-        return found
+            indices.setdefault(scene, []).append(i)
+        return indices
 
     def __len__(self) -> int:
         return len(self.names)
@@ -86,10 +86,10 @@ class FocalStacks(Sequence[FocalStack]):
 
 
 def read_pictures(sources: Sequence[Path]) -> Tensor:
-    """(S, C, H, W) of picture files (PNG, JPEG, TIFF) of one size: uint8, or float in [0, 1] of 16 bits.
+    """Read image files (PNG, JPEG, TIFF) of one size: (S, C, H, W) uint8, or float in [0, 1] for 16-bit files.
 
     Raises:
-        FormatError: missing or damaged file, pictures of different size or kind, or too many to hold.
+        FormatError: missing or damaged file, images of different size or type, or too large a stack.
     """
     first = _read_picture(sources[0])
     total = len(sources) * first.numel() * first.element_size()
@@ -99,14 +99,14 @@ def read_pictures(sources: Sequence[Path]) -> Tensor:
     for file in sources[1:]:
         image = _read_picture(file)
         if image.shape != first.shape or image.dtype != first.dtype:
-            found, expected = (f"{x.shape[2]}x{x.shape[1]}, {len(x)} channels, {x.dtype}" for x in (image, first))
-            raise FormatError(file, "picture", found, f"{expected}, as {sources[0].name}")
+            actual, expected = (f"{x.shape[2]}x{x.shape[1]}, {len(x)} channels, {x.dtype}" for x in (image, first))
+            raise FormatError(file, "picture", actual, f"{expected}, as {sources[0].name}")
         images.append(image)
     return torch.stack(images)
 
 
 def _read_picture(file: Path) -> Tensor:
-    """(C, H, W); an alpha channel of a TIFF is dropped."""
+    """Read one image file: (C, H, W) uint8 or float in [0, 1]; an alpha channel of a TIFF is dropped."""
     if file.suffix.lower() not in (".tif", ".tiff"):
         return torch.from_numpy(files.read_image(file))
     picture = tiff.read_tiff(file, samples=(1, 3, 4))
@@ -117,7 +117,7 @@ def _read_picture(file: Path) -> Tensor:
 
 
 def parse_focus_distances(values: Sequence[float], root: Path, count: int | None = None) -> Tensor:
-    """(S,) m, of an option ``focus_m``.
+    """Focus distances (S,) m from the option ``focus_m``.
 
     Raises:
         FormatError: not positive numbers, or not ``count`` of them.

@@ -1,4 +1,4 @@
-"""What focal stacks hold, in words: facts, warnings, and a few pictures to look at."""
+"""Survey of focal stacks for ``inspect``: facts, warnings and sample images."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dhtorch.runtime.console import format_count
 
 
 def survey_stacks(stacks: FocalStacks, shown: int = 8) -> Survey:
-    """Facts of focal stacks, from the first of them."""
+    """Facts, warnings and at most ``shown`` image tiles of focal stacks, from the first stack."""
     out = Survey(stacks.name, stacks.format)
     stack: FocalStack = stacks[0]
     images = stack.images[0]
@@ -16,7 +16,7 @@ def survey_stacks(stacks: FocalStacks, shown: int = 8) -> Survey:
     out.say("focal stacks", f"{len(stacks)}, of {format_count(s, 'picture')} each")
     out.say("pictures", f"{w}x{h}, {describe_pixels(c, images)}")
     if stack.focus_m is None:
-        out.warn("no focus distances: the order of the pictures is all that is known")
+        out.warn("no focus distances: only the order of the pictures is available")
     else:
         out.say("in focus at", ", ".join(f"{x:.3g}" for x in stack.focus_m[0].tolist()) + " m")
     if stack.focal_length_m is not None and stack.f_number is not None:

@@ -1,4 +1,4 @@
-"""Writers of focal stacks: FoD500, DDFF-12 (HDF5 and raw light fields), a plain folder."""
+"""Writers of focal stacks for tests: FoD500, DDFF-12 (HDF5 and raw light fields), a plain folder of images."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from dhtorch.testing.parts import encode_depth_codes, encode_unfiltered_png, sav
 
 
 def write_fod500(root: Path, stacks: Mapping[int, FocalStack]) -> None:
-    """``<index>_<slice>All.tif`` and ``<index>Dpt.exr`` (half floats) of each index."""
+    """Write ``<index>_<slice>All.tif`` and ``<index>Dpt.exr`` (half floats) of each index."""
     exr = import_optional("OpenEXR")
     for index, stack in stacks.items():
         for k, image in enumerate(stack.images[0]):
             save_file(root / f"{index:06d}_{k:02d}All.tif", rgb_tiff(image.permute(1, 2, 0).numpy()))
         if stack.depth is not None:
-            # The library takes memory as it lies, whatever the strides say.
+            # The library ignores the strides of an array.
             plane = np.ascontiguousarray(stack.depth[0].numpy(), np.float16)
             picture = io.BytesIO()
             header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
@@ -38,7 +38,7 @@ def write_ddff12(
     dtype: str = "float32",
     compression: str | None = None,
 ) -> None:
-    """``stack_<split>`` (N, S, H, W, 3), 0 to 255; with depth, ``disp_<split>`` (N, H, W) px, 0 = invalid."""
+    """Write ``stack_<split>`` (N, S, H, W, 3), 0 to 255; with depth, ``disp_<split>`` (N, H, W) px, 0 = invalid."""
     file.parent.mkdir(parents=True, exist_ok=True)
     with import_optional("h5py").File(file, "w") as group:
         for split, stacks in splits.items():
@@ -57,7 +57,7 @@ def write_light_field(
     light_field: Tensor,  # (U, V, H, W, 3) uint8
     depth: Tensor | None = None,  # (1, H, W) m
 ) -> None:
-    """``LightField/<scene>/LF_<n>.npy`` and ``DepthRegistered/<scene>/DEPTH_<n>.png`` (16 bits, mm)."""
+    """Write ``LightField/<scene>/LF_<n>.npy`` and ``DepthRegistered/<scene>/DEPTH_<n>.png`` (16 bits, mm)."""
     content = io.BytesIO()
     np.save(content, light_field.contiguous().numpy())
     save_file(root / "LightField" / scene / f"LF_{number:04d}.npy", content.getvalue())
@@ -69,17 +69,17 @@ def write_light_field(
 
 
 def write_image_folder(root: Path, stack: FocalStack) -> None:
-    """``image<n>.png``, n from 1 without leading zeros."""
+    """Write ``image<n>.png``, n from 1 without leading zeros."""
     for k, image in enumerate(stack.images[0], 1):
         save_file(root / f"image{k}.png", encode_unfiltered_png(image.permute(1, 2, 0).numpy()))
 
 
 def rgb_tiff(picture: np.ndarray) -> bytes:
-    """TIFF of (H, W, 3) uint8 or uint16: one strip, little-endian, not compressed."""
+    """Encode (H, W, 3) uint8 or uint16 as TIFF: one strip, little-endian, uncompressed."""
     h, w, n = picture.shape
     bits = 8 * picture.dtype.itemsize
     body = picture.astype(picture.dtype.newbyteorder("<")).tobytes()
-    extra = struct.pack(f"<{n}H", *[bits] * n)  # one number a sample does not fit into the entry
+    extra = struct.pack(f"<{n}H", *[bits] * n)  # one number per channel exceeds the four bytes of an entry
     tags = [(256, 1, w), (257, 1, h), (258, n, 8), (259, 1, 1), (262, 1, 2), (273, 1, 8 + len(extra)), (277, 1, n)]
     tags += [(278, 1, h), (279, 1, len(body)), (284, 1, 1)]
     entries = b"".join(struct.pack("<HHII", tag, 3 if tag == 258 else 4, count, value) for tag, count, value in tags)

@@ -1,1 +1,1 @@
-"""Estimators that did not survive their screening tests, each as good as its idea allows, kept runnable."""
+"""Estimators that failed their screening experiments, and these experiments."""

@@ -1,8 +1,8 @@
-"""The idea the project began with: a spiral arm read as a 1-D signal shifts along itself when the camera moves.
+"""Spiral arms as 1-D signals: sampling along an arm, and shifts along it by windowed cross-correlation.
 
-Alphabet: ``signal`` (B, L) grey values at even steps along an arm; a *site* is an index into it; ``lag`` how many steps
-later in the other signal the window around a site is found again. A lag is a displacement along the arm. What moves
-across the arm is not seen: under forward motion every point moves along its radius, and an arm runs across all radii.
+Alphabet: ``signal`` (B, L) grey values at even steps along an arm; a *site* is an index into it; ``lag`` number of
+steps by which the window around a site is shifted in the other signal. A lag is a displacement along the arm; motion
+across the arm is not measured: under forward motion every point moves along its radius, and an arm crosses all radii.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from dhtorch.geometry import filters
 from dhtorch.geometry.checks import check
 from dhtorch.pytree import Record, record
 
-#: Variance of a window (grey values in [0, 1]) below which it has no shape to recognise.
+#: Variance of a window (grey values in [0, 1]) below which it is too flat to be matched.
 _FLAT_VARIANCE = 1e-6
 
 
 @record
 class ArmShift(Record):
-    """Where the window around each site is found again."""
+    """Shift of the window around each site along the arm, with its correlation."""
 
     lag: Tensor  # (B, K) steps along the arm; 0 where not valid
     peak: Tensor  # (B, K) normalised correlation there, in [-1, 1]; 0 where not valid
-    valid: Tensor  # (B, K) bool: windows inside, not flat, and the peak no end of the search
+    valid: Tensor  # (B, K) bool: windows inside, not flat, and the peak not at an end of the search range
 
 
 def sample_arm(
@@ -33,13 +33,13 @@ def sample_arm(
     *,
     blur_px: float = 1.5,
 ) -> Tensor:
-    """Grey values (B, L) along an arm, read between pixels from a picture blurred by a Gaussian.
+    """Grey values (B, L) along an arm by bilinear interpolation of the image after a Gaussian blur.
 
-    The blur lets a window survive a small motion across the arm, and keeps fine texture from folding.
+    The blur makes windows tolerant to small motion across the arm, and prevents aliasing of fine texture.
 
     Args:
-        image: B pictures.
-        arm: positions, the same in all pictures; outside the picture its border is read.
+        image: B images.
+        arm: positions, the same in all images; outside the image the border is repeated.
         blur_px: standard deviation; 0 = none.
 
     Raises:
@@ -75,23 +75,23 @@ def correlate_windows(
     max_lag: int = 40,
     min_peak: float = 0.5,
 ) -> ArmShift:
-    """Windowed normalised cross-correlation of two signals, its highest peak placed between steps by a parabola.
+    """Windowed normalised cross-correlation of two signals, its highest peak refined between steps by a parabola.
 
     Args:
-        signal_0, signal_1: the same arm in two pictures, or two arms.
-        site_0, site_1: middle of each window, and where the search for it is centred.
+        signal_0, signal_1: the same arm in two images, or two arms.
+        site_0, site_1: centre of each window, and centre of its search range.
         window: steps in a window, odd.
-        max_lag: farthest steps looked at, either way.
-        min_peak: a lower correlation is no recognition.
+        max_lag: half width of the search range, in steps.
+        min_peak: smallest correlation of a match.
 
     Returns:
         Shift. Not valid: a window or a search that leaves its signal, a flat window, a peak at the end of the search
         or below ``min_peak``.
 
     Raises:
-        ValueError: wrong shapes, an even window, no lag to look at, or signals shorter than window and search.
+        ValueError: wrong shapes, an even window, ``max_lag`` below 1, or signals shorter than window and search.
 
-    Gradient: of the parabola through three correlations to both signals; the choice of the peak carries none.
+    Gradient: of the parabola through three correlations to both signals; the argmax carries none.
     """
     check("correlate_windows", signal_0=(signal_0, "B L"), signal_1=(signal_1, "B M"), site_0=(site_0, "B K"))
     check("correlate_windows", signal_0=(signal_0, "B L"), site_1=(site_1, "B K"), site_0=(site_0, "B K"))
@@ -111,9 +111,11 @@ def correlate_windows(
     score, textured = _normalised_correlation(template, search)
     best = score.detach()[..., 1:-1].argmax(-1) + 1
     left, peak, right = (score.gather(-1, (best + k)[..., None])[..., 0] for k in (-1, 0, 1))
-    bend = left - 2 * peak + right
-    curved = bend < -1e-6
-    offset = torch.where(curved, 0.5 * (left - right) / torch.where(curved, bend, -torch.ones_like(bend)), 0.0)
+    curvature = left - 2 * peak + right
+    curved = curvature < -1e-6
+    offset = torch.where(
+        curved, 0.5 * (left - right) / torch.where(curved, curvature, -torch.ones_like(curvature)), 0.0
+    )
     ends = torch.maximum(score.detach()[..., 0], score.detach()[..., -1])
     valid = inside & textured & (ends <= peak) & (peak >= min_peak)
     zero = torch.zeros_like(peak)
@@ -121,22 +123,24 @@ def correlate_windows(
 
 
 def _read_windows(signal: Tensor, start: Tensor, length: int) -> Tensor:
-    """Windows (B, K, length)."""
+    """Windows (B, K, length) of a signal from start indices (B, K)."""
     index = start[..., None] + torch.arange(length, device=signal.device)
     return signal.gather(1, index.flatten(1)).view(index.shape)
 
 
 def _normalised_correlation(template: Tensor, search: Tensor) -> tuple[Tensor, Tensor]:
-    """Correlation (B, K, lags) of a window with every window of the search, means and contrast removed; textured."""
+    """Correlation (B, K, lags) of a window with every window of the search range, and whether it is textured (B, K)."""
     window = template.shape[-1]
-    places = search.unfold(-1, window, 1)  # (B, K, lags, window), a view
+    windows = search.unfold(-1, window, 1)  # (B, K, lags, window), a view
     t = template - template.mean(-1, keepdim=True)
     power_t = (t * t).mean(-1, keepdim=True)
-    middle = search.mean(-1, keepdim=True)  # keeps the variances below from cancelling
-    p = places - middle[..., None]
-    mean_p = p.mean(-1)
-    power_p = (p * p).mean(-1) - mean_p * mean_p
-    both = (p * t[..., None, :]).mean(-1)
-    shaped = (power_t > _FLAT_VARIANCE) & (power_p > _FLAT_VARIANCE)
-    size = torch.where(shaped, power_t * power_p, torch.ones_like(power_p)).sqrt()
-    return torch.where(shaped, both / size, torch.zeros_like(both)), (power_t > _FLAT_VARIANCE)[..., 0]
+    offset = search.mean(-1, keepdim=True)  # against cancellation in the variances below
+    centred = windows - offset[..., None]
+    mean_p = centred.mean(-1)
+    power_p = (centred * centred).mean(-1) - mean_p * mean_p
+    covariance = (centred * t[..., None, :]).mean(-1)
+    both_textured = (power_t > _FLAT_VARIANCE) & (power_p > _FLAT_VARIANCE)
+    norm = torch.where(both_textured, power_t * power_p, torch.ones_like(power_p)).sqrt()
+    return torch.where(both_textured, covariance / norm, torch.zeros_like(covariance)), (power_t > _FLAT_VARIANCE)[
+        ..., 0
+    ]

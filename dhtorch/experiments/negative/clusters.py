@@ -1,7 +1,7 @@
-"""Where to look next if holes were a shortage of samples: at the largest cluster of them.
+"""Largest connected cluster of holes among the samples of a view, and a gaze point in it.
 
-Samples are foveated, so that what is near and what is large cannot be counted in samples. Two samples are neighbours
-if one is among the few nearest of the other, and every sample stands for the patch of picture it alone covers.
+Samples are foveated, so distance and area cannot be counted in samples: two samples are neighbours if one is among the
+nearest few of the other, and every sample is weighted by the image area that it covers.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from dhtorch.pytree import Record, record
 class Cluster(Record):
     """The largest connected set of holes among the samples of each view."""
 
-    member: Tensor  # (B, N) bool; none where there is no hole
-    gaze: Tensor  # (B, 2) px: the member nearest to the cluster's middle; NaN where there is no hole
-    area_px: Tensor  # (B,) patch of picture that the members stand for
-    n: Tensor  # (B,) int64 members
+    member: Tensor  # (B, N) bool; all False without a hole
+    gaze: Tensor  # (B, 2) px: the member nearest to the cluster's centroid; NaN without a hole
+    area_px: Tensor  # (B,) image area of the members
+    n: Tensor  # (B,) int64 number of members
 
 
 def largest_cluster(
@@ -31,21 +31,21 @@ def largest_cluster(
     *,
     neighbours: int = 6,
 ) -> Cluster:
-    """The connected cluster of holes that covers most of the picture, and the place in it to look at.
+    """Connected cluster of holes with the largest image area, and a gaze point in it.
 
-    Holes are connected where one is among the nearest ``neighbours`` samples of the other. Labels spread by taking the
-    smallest among neighbours and jumping to the label of the label; the number of rounds is fixed and suffices for any
-    set of samples in general position (twice the logarithm of N, checked against a search that follows every edge,
-    ``oracle`` of ``tests/experiments/test_hole_attention.py``).
+    Holes are connected if one is among the nearest ``neighbours`` samples of the other. Labels propagate by the minimum
+    over neighbours and pointer jumping; the fixed number of rounds (twice the logarithm of N) suffices for samples in
+    general position, which is tested against a search along every edge (``oracle`` of
+    ``tests/experiments/test_hole_attention.py``).
 
     Args:
-        uv: the samples, holes and others.
+        uv: all samples, holes and others.
         hole: which of them are holes.
-        neighbours: how many samples around one count as next to it.
+        neighbours: number of nearest samples that count as neighbours.
 
     Returns:
-        Cluster. The gaze is a member, not the mean: the middle of a ring is no part of it. Of clusters equally large
-        the one with the first sample wins.
+        Cluster. The gaze is a member rather than the centroid, which may lie outside, as for a ring. Ties go to the
+        cluster with the first sample.
 
     Raises:
         ValueError: wrong shapes, fewer than one neighbour, or no more samples than neighbours.
@@ -60,40 +60,42 @@ def largest_cluster(
             f"largest_cluster: found {N} samples, expected more than neighbours = {neighbours}, at least 1"
         )
     with torch.no_grad():
-        near = torch.cdist(uv, uv, compute_mode="donot_use_mm_for_euclid_dist").topk(neighbours + 1, -1, largest=False)
-        area = math.pi * near.values[..., -1].square() / (neighbours + 1)  # (B, N) px² that each stands for
-        label = _label_clusters(near.indices, hole)
+        nearest_samples = torch.cdist(uv, uv, compute_mode="donot_use_mm_for_euclid_dist").topk(
+            neighbours + 1, -1, largest=False
+        )
+        area = math.pi * nearest_samples.values[..., -1].square() / (neighbours + 1)  # (B, N) px² of each sample
+        label = _label_clusters(nearest_samples.indices, hole)
         covered = torch.zeros_like(area).scatter_add(1, label, torch.where(hole, area, 0.0))
         largest = covered.argmax(-1, keepdim=True)
         member = hole & (label == largest)
         weight = torch.where(member, area, 0.0)[..., None]
-        middle = (uv * weight).sum(1) / weight.sum(1).clamp_min(1e-12)
-        off = (uv - middle[:, None]).square().sum(-1)
-        nearest = torch.where(member, off, torch.inf).argmin(-1)
+        centroid = (uv * weight).sum(1) / weight.sum(1).clamp_min(1e-12)
+        squared_distance = (uv - centroid[:, None]).square().sum(-1)
+        nearest = torch.where(member, squared_distance, torch.inf).argmin(-1)
         gaze = uv.gather(1, nearest[:, None, None].expand(-1, 1, 2))[:, 0]
-        some = member.any(-1)
+        has_hole = member.any(-1)
     return Cluster(
         member=member,
-        gaze=torch.where(some[:, None], gaze, torch.nan),
-        area_px=torch.where(some, covered.gather(1, largest)[:, 0], 0.0),
+        gaze=torch.where(has_hole[:, None], gaze, torch.nan),
+        area_px=torch.where(has_hole, covered.gather(1, largest)[:, 0], 0.0),
         n=member.sum(-1),
     )
 
 
 def _label_clusters(nearest: Tensor, hole: Tensor) -> Tensor:
-    """Labels (B, N): the smallest index of a hole's cluster; that of a sample that is no hole is its own."""
+    """Cluster labels (B, N): smallest index of the cluster for a hole, own index for other samples."""
     B, N, K = nearest.shape
-    own = torch.arange(N, device=hole.device).expand(B, N)
-    start = own[..., None].expand(B, N, K).flatten(1)
+    indices = torch.arange(N, device=hole.device).expand(B, N)
+    start = indices[..., None].expand(B, N, K).flatten(1)
     end = nearest.flatten(1)
-    joined = hole.gather(1, start) & hole.gather(1, end)
-    end = torch.where(joined, end, start)
-    label = own
+    connected = hole.gather(1, start) & hole.gather(1, end)
+    end = torch.where(connected, end, start)
+    label = indices
     for _ in range(2 * max(N, 2).bit_length()):
         first, second = label.gather(1, start), label.gather(1, end)
         least = torch.minimum(first, second)
-        # Both ends of an edge, and the roots they hang on, take the smaller label.
-        for place in (start, end, first, second):
-            label = label.scatter_reduce(1, place, least, "amin")
+        # Both ends of an edge and their roots take the smaller label.
+        for index in (start, end, first, second):
+            label = label.scatter_reduce(1, index, least, "amin")
         label = label.gather(1, label)
     return label

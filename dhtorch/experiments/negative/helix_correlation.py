@@ -1,11 +1,11 @@
 """Question: does correlating the two spiral signals in time squeeze out parallax?
 
-The idea: each of the two phase-shifted arms is a 1-D signal; where the camera has moved, near things have shifted
-further along it than far ones, so the size of the shift is a depth cue. Three readings of it: the shift of an arm's
-signal against itself (``own_arm``), against the neighbouring winding of the other arm (``between_arms``), and
-whichever correlates best, with the step across the arms counted in (``best_arm``). The controls are plain 2-D flow of
-our own tracker (``flow``) and its component along the arm (``flow_along_arm``), which is all that a perfect 1-D
-correlation could ever see. All are held against the sensor's inverse depth on the same sites.
+Each of the two phase-shifted arms is a 1-D signal; when the camera moves, near points shift further along it than far
+ones, so the size of the shift is a depth cue. It is measured as the shift of an arm's signal against itself
+(``own_arm``), against the neighbouring winding of the other arm (``between_arms``), and as that of the higher
+correlation, including the step across the arms (``best_arm``). Controls: plain 2-D flow of the package's tracker
+(``flow``) and its component along the arm (``flow_along_arm``), the most that a perfect 1-D correlation could measure.
+All are compared with the sensor's inverse depth at the same sites.
 
 Expectation (written before the run): no; the correlation with inverse depth is near zero (the paper: r = -0.04) and
 below that of plain flow (+0.34), because what moves across an arm is not seen: under forward motion that is everything.
@@ -39,25 +39,25 @@ EXPECTATION = "No: its shifts hardly correlate with inverse depth, plain 2-D flo
 
 VARIANTS = ("own_arm", "between_arms", "best_arm", "flow", "flow_along_arm")
 
-#: Fewest sites on which a correlation is said.
+#: Smallest number of sites for a correlation.
 _MIN_CORRELATION_SITES = 20
 
-#: Flow below it (px) has no share that could be seen.
+#: Smallest flow, px, for a ratio of the shift to it.
 _MIN_FLOW_PX = 1.0
 
-#: Shifts this near to each other (px) are the same.
+#: Largest difference, px, of shifts that count as equal.
 _SAME_SHIFT_PX = 2.0
 
-#: Points of the sampler per step (1 px) of an arm, from which its even steps are read: plenty.
+#: Points of the sampler per step (1 px) of an arm, from which the evenly spaced points are interpolated.
 _POINTS_PER_STEP = 4
 
 
 class SpiralArm(NamedTuple):
-    """One arm as a curve of even steps of 1 px."""
+    """Spiral arm as a curve of points 1 px apart."""
 
     uv: Tensor  # (L, 2) px
     tangent: Tensor  # (L, 2) unit
-    turn: Tensor  # (L,) angle wound since the centre, in half turns
+    turn: Tensor  # (L,) angle from the centre, in half turns
 
 
 def run(
@@ -76,58 +76,65 @@ def run(
     round_arms: bool = False,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Shifts along the arms and plain flow at as many sites as the method has samples, against inverse depth.
+    """Run the experiment: shifts along the arms and plain flow against inverse depth, at as many sites as samples.
 
     Rows, per pair and per scene: ``corr`` (Pearson) and ``rank_corr`` (Spearman) of the size of the shift with inverse
-    depth, over the sites that the own arm and the tracker answer, so that all are judged alike; ``corr_answered``, over
-    those that the variant itself answers; ``coverage``, their share of the candidates; ``median_shift_px``;
-    ``flow_share``, the median of its shift over plain flow's; ``along_share``, of the common sites those whose shift is
-    within 2 px of what plain flow has along the arm: the rest recognised something else. A candidate is a site with
-    texture whose return passes the truth test. Nothing is hidden from anyone.
+    depth, over the sites answered by the own arm and by the tracker, the same for all variants; ``corr_answered``, over
+    the sites answered by the variant; ``coverage``, their fraction of the candidates; ``median_shift_px``;
+    ``flow_share``, the median ratio of its shift to plain flow's; ``along_share``, the fraction of the common sites
+    whose shift is within 2 px of plain flow's component along the arm: the others are false matches. A candidate is a
+    site with texture and a return with valid ground truth. The method sees all returns.
 
     Args:
         scenes, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: name → method; of the first the seats 2 to 4 are asked, at as many places as it has samples.
+        methods: name → method; stages 2 to 4 of the first are run, at as many sites as it has samples.
         window: of the correlation, px along the arm.
-        max_lag_share: farthest shift looked for, share of the image width.
-        min_peak: least correlation that counts as found.
-        blur_px: of the picture, before the arms are read.
+        max_lag_share: half width of the search range, as a fraction of the image width.
+        min_peak: smallest correlation of a match.
+        blur_px: standard deviation of the blur of the image before the arms are sampled.
         turns, foveation, gaze: of the helix, see :func:`dhtorch.stages.sample.spiral`.
-        round_arms: wind in circles, as far as they fit into the picture. The sampler's own arms wind into its corners;
-            there they run partly along the radius, and see a part of forward motion that circles do not.
+        round_arms: arms are circles that fit into the image. The sampler's own arms extend into its corners, where they
+            run partly along the radius and measure a part of forward motion that circles do not.
 
     Source: paper, "What Does Not Work", dual-helix temporal cross-correlation.
     """
     method = next(iter(methods.values()))
 
-    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
+    def evaluate_item(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         views = [scene.recording[k].to(settings.dtype).to(settings.device) for k in item]
         lag = max(2, round(max_lag_share * views[0].hw[1]))
-        arms = partial(make_arms, turns=turns, foveation=foveation, gaze=gaze, round_arms=round_arms)
-        correlated = partial(correlate_windows, window=window, max_lag=lag, min_peak=min_peak)
-        return _evaluate_pair(scene.hint, method, views[0], views[1], correlated=correlated, blur_px=blur_px, wind=arms)
+        make_pair_arms = partial(make_arms, turns=turns, foveation=foveation, gaze=gaze, round_arms=round_arms)
+        correlate = partial(correlate_windows, window=window, max_lag=lag, min_peak=min_peak)
+        return _evaluate_pair(
+            scene.hint, method, views[0], views[1], correlate=correlate, blur_px=blur_px, make_pair_arms=make_pair_arms
+        )
 
     outcome = screen_scenes(
-        scenes_of(scenes), lambda scene: to_fixed_pairs(pairs(scene)), ask, VARIANTS, truth="full", progress=progress
+        scenes_of(scenes),
+        lambda scene: to_fixed_pairs(pairs(scene)),
+        evaluate_item,
+        VARIANTS,
+        truth="full",
+        progress=progress,
     )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
-    """Is the helix's correlation below half of that of plain flow, and below it on most scenes?"""
-    both = paired_metric(outcome, "full", "own_arm", "flow", "corr")
-    if not both:
+    """Verdict and text: correlation of the helix below half of plain flow's, and below it on most scenes."""
+    value_pairs = paired_metric(outcome, "full", "own_arm", "flow", "corr")
+    if not value_pairs:
         return None, "no scene on which both have enough sites"
-    helix, flow = (bootstrap.interval_over_scenes([pair[k] for pair in both]) for k in (0, 1))
-    lower = sum(h < f for h, f in both)
+    helix, flow = (bootstrap.interval_over_scenes([pair[k] for pair in value_pairs]) for k in (0, 1))
+    lower = sum(h < f for h, f in value_pairs)
     assert helix.value is not None and flow.value is not None
     why = (
-        f"r with inverse depth, median over {len(both)} scenes: helix {helix.value:+.2f}, plain flow {flow.value:+.2f}"
-        f" (paper: -0.04, +0.34); helix below flow on {lower}"
+        f"r with inverse depth, median over {len(value_pairs)} scenes: helix {helix.value:+.2f},"
+        f" plain flow {flow.value:+.2f} (paper: -0.04, +0.34); helix below flow on {lower}"
     )
     if max(helix.value, flow.value) <= 0:
         return None, f"{why}; neither is a depth cue here"
-    return helix.value < 0.5 * flow.value and lower > len(both) / 2, why
+    return helix.value < 0.5 * flow.value and lower > len(value_pairs) / 2, why
 
 
 def make_arms(
@@ -140,7 +147,7 @@ def make_arms(
     gaze: tuple[float, float] | None = None,
     round_arms: bool = False,
 ) -> tuple[SpiralArm, SpiralArm]:
-    """The two arms of a spiral of ``n`` points as curves of even steps, or the same wound in circles."""
+    """The two arms of a spiral of ``n`` points as curves of points 1 px apart; circular with ``round_arms``."""
     turns = turns or math.sqrt(foveation * n / (2 * math.pi))
     total = int(_POINTS_PER_STEP * turns * math.pi * math.hypot(*hw)) & ~1
     uv = spiral(hw, total, turns=turns, foveation=foveation, gaze=gaze, dtype=torch.float64)
@@ -156,23 +163,30 @@ def make_arms(
 
 
 def _resample_evenly(uv: Tensor, turn: Tensor, like: Tensor) -> SpiralArm:
-    """A finely sampled curve (M, 2) read at steps of 1 px."""
+    """Resample a dense curve (M, 2) at steps of 1 px."""
     length = torch.cat((uv.new_zeros(1), uv.diff(dim=0).norm(dim=-1).cumsum(0)))
-    at = torch.arange(int(length[-1]), dtype=torch.float64)
-    after = torch.searchsorted(length, at, right=True).clamp(1, len(length) - 1)
-    share = ((at - length[after - 1]) / (length[after] - length[after - 1]).clamp_min(1e-12))[:, None]
-    even = uv[after - 1] + share * (uv[after] - uv[after - 1])
+    position = torch.arange(int(length[-1]), dtype=torch.float64)
+    after = torch.searchsorted(length, position, right=True).clamp(1, len(length) - 1)
+    weight = ((position - length[after - 1]) / (length[after] - length[after - 1]).clamp_min(1e-12))[:, None]
+    even = uv[after - 1] + weight * (uv[after] - uv[after - 1])
     (tangent,) = torch.gradient(even, dim=0)
     tangent = tangent / tangent.norm(dim=-1, keepdim=True).clamp_min(1e-12)
     return SpiralArm(*(x.to(like) for x in (even, tangent, turn[after - 1])))
 
 
 def _evaluate_pair(
-    hint: TrackHint, method: Method, frame_0: Frame, frame_1: Frame, *, correlated: Any, blur_px: float, wind: Any
+    hint: TrackHint,
+    method: Method,
+    frame_0: Frame,
+    frame_1: Frame,
+    *,
+    correlate: Any,
+    blur_px: float,
+    make_pair_arms: Any,
 ) -> dict[str, Row]:
-    """Variant → numbers of one pair."""
+    """Variant → row of one pair of frames."""
     n = method.n
-    arms = wind(frame_0.hw, n, frame_0.camera.f)
+    arms = make_pair_arms(frame_0.hw, n, frame_0.camera.f)
     sites = [torch.linspace(0, len(a.uv) - 1, n // 2, device=a.uv.device).round().long() for a in arms]
     uv = torch.cat([a.uv[s] for a, s in zip(arms, sites, strict=True)])
     tangent = torch.cat([a.tangent[s] for a, s in zip(arms, sites, strict=True)])
@@ -184,72 +198,72 @@ def _evaluate_pair(
     tracks = method.track(frame_0.image, frame_1.image, samples.uv, hint=hint)
     flow = (tracks.uv_1 - tracks.uv_0)[0]
 
-    own = [_correlate_arms(signals, arms, sites, a=k, b=k, step=0.0, correlated=correlated) for k in (0, 1)]
-    other = [
-        [_correlate_arms(signals, arms, sites, a=k, b=1 - k, step=step, correlated=correlated) for k in (0, 1)]
+    own_arm = [_correlate_arms(signals, arms, sites, a=k, b=k, step=0.0, correlate=correlate) for k in (0, 1)]
+    other_arm = [
+        [_correlate_arms(signals, arms, sites, a=k, b=1 - k, step=step, correlate=correlate) for k in (0, 1)]
         for step in (-1.0, 1.0)
     ]
-    along, lags, peaks = (torch.cat([part[i] for part in own]) for i in (0, 1, 2))
-    neighbours = [[torch.cat([part[i] for part in parts]) for i in (0, 1, 2)] for parts in other]
-    (in_way, in_lag, in_peak), (out_way, out_lag, out_peak) = neighbours
+    own_shift, lags, peaks = (torch.cat([part[i] for part in own_arm]) for i in (0, 1, 2))
+    neighbours = [[torch.cat([part[i] for part in parts]) for i in (0, 1, 2)] for parts in other_arm]
+    (inner_shift, in_lag, in_peak), (outer_shift, out_lag, out_peak) = neighbours
     outer = out_peak > in_peak
-    across, across_lag = torch.where(outer, out_way, in_way), torch.where(outer, out_lag, in_lag)
+    other_shift, across_lag = torch.where(outer, outer_shift, inner_shift), torch.where(outer, out_lag, in_lag)
     across_peak = torch.maximum(in_peak, out_peak)
-    found = {
+    shifts = {
         "own_arm": (lags.abs(), peaks > 0),
         "between_arms": (across_lag.abs(), across_peak > 0),
-        "best_arm": (torch.where(across_peak > peaks, across, along), torch.maximum(peaks, across_peak) > 0),
+        "best_arm": (torch.where(across_peak > peaks, other_shift, own_shift), torch.maximum(peaks, across_peak) > 0),
         "flow": (flow.norm(dim=-1), tracks.valid[0]),
         "flow_along_arm": ((flow * tangent).sum(-1).abs(), tracks.valid[0]),
     }
     common = candidate & (peaks > 0) & tracks.valid[0]
-    plain = {"common": common, "flow": flow.norm(dim=-1), "along": found["flow_along_arm"][0]}
-    return {name: _numbers(*shift, samples.depth[0], candidate, **plain) for name, shift in found.items()}
+    plain = {"common": common, "flow": flow.norm(dim=-1), "along": shifts["flow_along_arm"][0]}
+    return {name: _correlation_row(*shift, samples.depth[0], candidate, **plain) for name, shift in shifts.items()}
 
 
 def _correlate_arms(
-    signals: Any, arms: Any, sites: Any, *, a: int, b: int, step: float, correlated: Any
+    signals: Any, arms: Any, sites: Any, *, a: int, b: int, step: float, correlate: Any
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Arm a of view 0 against arm b of view 1, ``step`` half turns on: way in the picture, lag and peak (K,).
+    """Correlate arm a of view 0 with arm b of view 1, ``step`` half turns on: shift in px, lag and peak, (K,) each.
 
-    Windows are searched around the place of the same direction from the centre.
+    The search is centred on the point of the same direction from the image centre.
     """
     site = sites[a]
-    there = site
+    target = site
     if a != b:
-        there = torch.searchsorted(arms[b].turn, arms[a].turn[site] + step).clamp_max(len(arms[b].turn) - 1)
-    shift: ArmShift = correlated(signals[0][a], signals[1][b], site[None], there[None])
+        target = torch.searchsorted(arms[b].turn, arms[a].turn[site] + step).clamp_max(len(arms[b].turn) - 1)
+    shift: ArmShift = correlate(signals[0][a], signals[1][b], site[None], target[None])
     curve = arms[b].uv
-    place = (there + shift.lag[0]).clamp(0, len(curve) - 1)
-    low = place.floor().long().clamp_max(len(curve) - 2)
-    at = curve[low] + (place - low)[:, None] * (curve[low + 1] - curve[low])
-    return (at - arms[a].uv[site]).norm(dim=-1), shift.lag[0], shift.peak[0]
+    position = (target + shift.lag[0]).clamp(0, len(curve) - 1)
+    low = position.floor().long().clamp_max(len(curve) - 2)
+    point = curve[low] + (position - low)[:, None] * (curve[low + 1] - curve[low])
+    return (point - arms[a].uv[site]).norm(dim=-1), shift.lag[0], shift.peak[0]
 
 
-def _numbers(
+def _correlation_row(
     shift: Tensor, answered: Tensor, depth: Tensor, candidate: Tensor, *, common: Tensor, flow: Tensor, along: Tensor
 ) -> Row:
-    """How the size of the shift (K,) goes with inverse depth."""
-    mine = candidate & answered
-    same = mine & common
+    """Row of correlations of the size of a shift (K,) with inverse depth."""
+    own = candidate & answered
+    shared = own & common
 
-    def over(mask: Tensor, how: Any) -> float | None:
+    def over(mask: Tensor, statistic: Any) -> float | None:
         x = shift[mask].double()
         y = 1 / depth[mask].double()
-        found: float | None = how(x, y) if x.numel() >= _MIN_CORRELATION_SITES else None
-        return found
+        correlation: float | None = statistic(x, y) if x.numel() >= _MIN_CORRELATION_SITES else None
+        return correlation
 
-    n, moved = int(candidate.sum()), same & (flow > _MIN_FLOW_PX)
+    n, moving = int(candidate.sum()), shared & (flow > _MIN_FLOW_PX)
     return {
         "n_candidates": n,
-        "n_kept": int(mine.sum()),
-        "coverage": int(mine.sum()) / n if n else None,
-        "corr": over(same, pearson),
-        "rank_corr": over(same, spearman),
-        "corr_answered": over(mine, pearson),
-        "median_shift_px": median_or_none(shift[mine].tolist()),
-        "along_share": float(((shift - along).abs() < _SAME_SHIFT_PX)[same].float().mean())
-        if bool(same.any())
+        "n_kept": int(own.sum()),
+        "coverage": int(own.sum()) / n if n else None,
+        "corr": over(shared, pearson),
+        "rank_corr": over(shared, spearman),
+        "corr_answered": over(own, pearson),
+        "median_shift_px": median_or_none(shift[own].tolist()),
+        "along_share": float(((shift - along).abs() < _SAME_SHIFT_PX)[shared].float().mean())
+        if bool(shared.any())
         else None,
-        "flow_share": median_or_none((shift / flow.clamp_min(_MIN_FLOW_PX))[moved].tolist()),
+        "flow_share": median_or_none((shift / flow.clamp_min(_MIN_FLOW_PX))[moving].tolist()),
     }

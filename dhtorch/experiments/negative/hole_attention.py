@@ -1,8 +1,8 @@
 """Question: does looking at the holes fill them?
 
-The idea: a hole is a place the sampler looked at too rarely, so the gaze moves onto the largest cluster of holes and
-the frame is sampled again (``attention``). Beside it stand the gaze as it was (``centre``), a gaze that moves anywhere
-(``random``) and samples spread evenly (``even``), whose hole rate is the share of the picture that has no return.
+Hypothesis: holes are sampled too sparsely, so the gaze moves onto the largest cluster of holes and the frame is sampled
+again (``attention``). It is compared with the original gaze (``centre``), a random gaze (``random``) and evenly spread
+samples (``even``), whose hole rate is the fraction of the image without a return.
 
 Expectation (written before the run): no; the hole rate rises (the paper: 0.67 to 0.78), because holes are regions
 where the sensor has no return, and a sample taken there is one more hole. What holes are good for is routing: their
@@ -45,20 +45,19 @@ def run(
     neighbours: int = 6,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Sample every frame four times and count the holes; nothing is hidden and no second view is read.
+    """Run the experiment: sample every frame with four gazes and count the holes; single frames with all returns.
 
-    Rows, per frame (``pair`` is [i, i]) and per scene: what :mod:`dhtorch.experiments.paper.hole_census` counts
+    Rows, per frame (``pair`` is [i, i]) and per scene: the counts of :mod:`dhtorch.experiments.paper.hole_census`
     (``hole_rate``, ``hole_share.<class>``, ``route_share.<route>``), ``rise`` of the hole rate over ``centre``,
-    ``cluster_share`` (of the holes, in the largest cluster), ``gaze_way_px`` (from the picture's middle), and
-    ``n_in_cluster`` and ``cluster_returns``: samples that fall into the cluster, and the share of them that found a
-    return.
+    ``cluster_share`` (fraction of the holes in the largest cluster), ``gaze_way_px`` (distance from the image centre),
+    ``n_in_cluster`` and ``cluster_returns``: number of samples in the cluster, and the fraction of them with a return.
 
     Args:
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: name → method; seats 1 to 3 of the first are asked. Its sampler must have a ``gaze``.
+        methods: name → method; stages 1 to 3 of the first are run. Its sampler must have a ``gaze``.
         pairs: not used.
-        stride: every how many frames.
-        neighbours: samples around one that count as next to it.
+        stride: frames from one evaluated frame to the next.
+        neighbours: number of nearest samples that count as neighbours.
 
     Raises:
         ValueError: a sampler without a gaze, or a stride below 1.
@@ -76,69 +75,69 @@ def run(
     def items(scene: Scene) -> list[ScreenedItem]:
         return [(i, i) for i in range(0, len(scene.recording), stride)]
 
-    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
+    def evaluate_item(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         frame = scene.recording[item[0]].to(settings.dtype).to(settings.device)
         before = classify_frame(method, frame)
         hole = before.hole != Hole.NONE
         cluster = largest_cluster(before.uv, hole, neighbours=neighbours)
-        looked = {
+        samples = {
             "centre": before,
             "random": classify_frame(_with_gaze(method, _random_gaze(frame.hw, settings.seed, item[0])), frame),
         }
-        looked["even"] = classify_frame(method.replace(sample=vogel_spiral), frame)
+        samples["even"] = classify_frame(method.replace(sample=vogel_spiral), frame)
         if bool(hole.any()):
-            looked["attention"] = classify_frame(_with_gaze(method, cluster.gaze[0]), frame)
-        return {v: _count_holes(looked[v], before, cluster, frame.hw) for v in VARIANTS if v in looked}
+            samples["attention"] = classify_frame(_with_gaze(method, cluster.gaze[0]), frame)
+        return {v: _count_holes(samples[v], before, cluster, frame.hw) for v in VARIANTS if v in samples}
 
-    outcome = screen_scenes(scenes_of(scenes), items, ask, VARIANTS, truth=_TRUTH, progress=progress)
+    outcome = screen_scenes(scenes_of(scenes), items, evaluate_item, VARIANTS, truth=_TRUTH, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
-    """Does the hole rate rise on more than half of the scenes, and where do the holes' classes point?"""
-    both = paired_metric(outcome, _TRUTH, "centre", "attention", "hole_rate")
-    if not both:
+    """Verdict and text: the hole rate rises on more than half of the scenes; routes of the holes."""
+    rate_pairs = paired_metric(outcome, _TRUTH, "centre", "attention", "hole_rate")
+    if not rate_pairs:
         return None, "no scene with holes"
-    before, after = (bootstrap.interval_over_scenes([pair[k] for pair in both]).value for k in (0, 1))
-    more = sum(a > b for b, a in both)
-    route = {k: outcome.summary[f"centre.route_share.{k}"]["value"] for k in ("triangulate", "change_exposure")}
+    before, after = (bootstrap.interval_over_scenes([pair[k] for pair in rate_pairs]).value for k in (0, 1))
+    n_rises = sum(a > b for b, a in rate_pairs)
+    routes = {k: outcome.summary[f"centre.route_share.{k}"]["value"] for k in ("triangulate", "change_exposure")}
     turn = outcome.summary["centre.route_share.turn_head"]["value"]
     why = (
-        f"hole rate {before:.2f} before, {after:.2f} after (medians of {len(both)} scenes; paper: 0.67, 0.78), more on"
-        f" {more}; routes of the holes: triangulate {route['triangulate']:.0%}, change exposure"
-        f" {route['change_exposure']:.0%}, turn the head {turn:.0%}"
+        f"hole rate {before:.2f} before, {after:.2f} after (medians of {len(rate_pairs)} scenes; paper: 0.67, 0.78),"
+        f" more on {n_rises}; routes of the holes: triangulate {routes['triangulate']:.0%}, change exposure"
+        f" {routes['change_exposure']:.0%}, turn the head {turn:.0%}"
     )
-    return more > len(both) / 2, why
+    return n_rises > len(rate_pairs) / 2, why
 
 
 def _with_gaze(method: Method, gaze: Tensor) -> Method:
-    """The method with its sampler looking at a pixel."""
+    """Method whose sampler has its gaze at a pixel."""
     u, v = gaze.tolist()
     return method.replace(sample={"gaze": (u, v)})
 
 
 def _random_gaze(hw: tuple[int, int], seed: int, i: int) -> Tensor:
-    """A pixel (2,) in the middle nine tenths of a picture."""
+    """Random pixel (2,) in the central nine tenths of an image."""
     generator = torch.Generator().manual_seed(seed + 1000 * (i + 1))
-    share = 0.05 + 0.9 * torch.rand(2, generator=generator)
-    return share * torch.tensor([hw[1] - 1.0, hw[0] - 1.0])
+    relative = 0.05 + 0.9 * torch.rand(2, generator=generator)
+    return relative * torch.tensor([hw[1] - 1.0, hw[0] - 1.0])
 
 
 def _count_holes(samples: Samples, before: Samples, cluster: Cluster, hw: tuple[int, int]) -> Row:
-    """Holes of one sampling, and what it found inside the cluster that the first one saw."""
+    """Row of one sampling: hole counts, and its returns inside the cluster of the first sampling."""
     row = count_holes(samples)
-    first = float((before.hole != Hole.NONE).float().mean())
+    rate_before = float((before.hole != Hole.NONE).float().mean())
     nearest = torch.cdist(samples.uv, before.uv).argmin(-1)
     inside = cluster.member.gather(1, nearest)
-    found = inside & (samples.hole == Hole.NONE)
+    returned = inside & (samples.hole == Hole.NONE)
     n = int(inside.sum())
     n_holes = int((before.hole != Hole.NONE).sum())
-    middle = torch.tensor([(hw[1] - 1) / 2, (hw[0] - 1) / 2]).to(cluster.gaze)
-    way = float((cluster.gaze[0] - middle).norm())
+    centre = torch.tensor([(hw[1] - 1) / 2, (hw[0] - 1) / 2]).to(cluster.gaze)
+    distance = float((cluster.gaze[0] - centre).norm())
     return row | {
-        "rise": row["hole_rate"] - first,
+        "rise": row["hole_rate"] - rate_before,
         "cluster_share": int(cluster.n[0]) / n_holes if n_holes else None,
-        "gaze_way_px": way if n_holes else None,
+        "gaze_way_px": distance if n_holes else None,
         "n_in_cluster": n,
-        "cluster_returns": int(found.sum()) / n if n else None,
+        "cluster_returns": int(returned.sum()) / n if n else None,
     }

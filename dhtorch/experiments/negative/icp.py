@@ -1,10 +1,10 @@
 """Question: does ICP between independently sampled sparse sets add anything to a good device pose?
 
 A chain of frames is placed by relative poses from one of three sources: ``good``, the recording's own trajectory;
-``poor``, the same turned and shifted from link to link; ``none``, the identity. Each is used as it is, and refined by
-ICP, point to point and point to plane, between sets that each frame draws for itself. A refined link counts where it is
-confident; elsewhere the source's pose is kept and the frame leaves the map. Lengths are in units of the median depth
-of the scene's first frame, so that a table and a street are judged alike.
+``poor``, the same with rotation and translation errors per link; ``none``, the identity. Each is used unchanged, and
+refined by ICP, point to point and point to plane, between point sets sampled independently in each frame. A refined
+link is used if it is confident; otherwise the source's pose is kept and the frame is left out of the map. Lengths are
+in units of the median depth of the scene's first frame, so that scenes of different size are comparable.
 
 Expectation (written before the run): no; over a good pose ICP is not always confident, so it covers fewer voxels than
 the pose alone (the paper: 5417 against 6200), and where the trajectory is exact it adds drift. It earns its keep only
@@ -41,7 +41,7 @@ _SOLVERS = ("", " + icp points", " + icp planes")
 VARIANTS = tuple(source + solver for source in ICP_POSE_SOURCES for solver in _SOLVERS)
 _TRUTH = "trajectory"
 
-#: A set of fewer points is no set: links that meet one are not asked.
+#: Smallest number of points in a set; links with a smaller one are skipped.
 _MIN_SET_POINTS = 16
 
 
@@ -62,90 +62,94 @@ def run(
     poor_shift: float = 0.03,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Chain the frames of every recording with each source of poses, alone and refined.
+    """Run the experiment: chains of frames with each source of poses, alone and refined by ICP.
 
     Rows of links: error of the relative pose against the trajectory (``rotation_deg``, ``translation_m``,
     ``translation_rel`` in median depths), ``confident`` (0 or 1), ``inlier_share``, ``rms_m``, ``condition``. Rows of
-    scenes: their medians, ``confident_share``, and of the whole chain ``n_voxels`` covered by the frames whose link is
-    confident, ``voxels_vs_pose``, their number over that of the same poses alone, ``n_voxels_all`` by all frames,
-    ``right_share`` (of the former, within one voxel of the map under the true path: a smeared map covers more),
-    ``drift_deg`` and ``drift_rel`` at its end. A built-in room knows its true path; elsewhere the good pose is the
-    reference, its drift zero by definition, and where it is loose some of ICP's drift is the reference's own.
+    scenes: their medians, ``confident_share``, and of the whole chain ``n_voxels`` covered by the frames with a
+    confident link, ``voxels_vs_pose``, the ratio of that number to that of the same poses alone, ``n_voxels_all`` by
+    all frames, ``right_share`` (fraction of ``n_voxels`` within one voxel of the map on the true path: a smeared map
+    covers more), ``drift_deg`` and ``drift_rel`` at its end. A built-in room has its true path; elsewhere the good pose
+    is the reference, with zero drift by definition, and its errors are part of ICP's drift.
 
     Args:
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`. Scenes without a trajectory or with
-            depth in one frame only have nothing to ask.
-        methods: name → method; of the first the seats 1 and 2 are asked, its sampler with another gaze in every frame.
-        pairs: not used: links follow the recording, evenly.
+            depth in one frame only have no links.
+        methods: name → method; stages 1 and 2 of the first are run, its sampler with a different gaze in every frame.
+        pairs: not used: links are evenly spaced along the recording.
         n: samples of a frame.
-        links: most links of a chain.
-        voxel, reach, least_reach: side of a voxel, farthest match at first and at last, in median depths.
-        min_inlier_share, min_condition: from which on a link is confident.
-        poor_deg, poor_shift: errors of a poor link, degrees and median depths, in seeded directions.
+        links: largest number of links of a chain.
+        voxel, reach, least_reach: voxel size, first and last limit of the match distance, in median depths.
+        min_inlier_share, min_condition: thresholds of a confident link.
+        poor_deg, poor_shift: errors of a poor link, degrees and median depths, in seeded random directions.
 
     Source: paper, "What Does Not Work", point-to-point ICP over a good VIO track.
     """
     method = next(iter(methods.values())).replace(n=n)
-    worlds: dict[str, _Chain] = {}
+    chains: dict[str, _Chain] = {}
 
-    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
-        chain = worlds.setdefault(scene.name, _Chain(scene.recording, method, settings, voxel))
+    def evaluate_item(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
+        chain = chains.setdefault(scene.name, _Chain(scene.recording, method, settings, voxel))
         if not all(chain.cloud(k)[0].isfinite().all(-1).sum() >= _MIN_SET_POINTS for k in item):
             return {}
         starts = {"good": chain.relative(item), "none": se3.identity(1, chain.cloud(item[0]).double())}
         starts["poor"] = se3.compose(chain.error(item, poor_deg, poor_shift), starts["good"])
-        found: dict[str, Row] = {}
+        rows: dict[str, Row] = {}
         for source in ICP_POSE_SOURCES:
             for solver in _SOLVERS:
                 fit = chain.refine(item, starts[source], solver, reach, least_reach)
-                sure = fit is None or bool(
+                confident = fit is None or bool(
                     fit.ok & (fit.inlier_share >= min_inlier_share) & (fit.condition >= min_condition)
                 )
-                T = starts[source] if fit is None or not sure else fit.T_1_from_0.to(torch.float64)
-                chain.keep(source + solver, item, T, sure)
-                found[source + solver] = _evaluate_link(chain, item, T, fit, sure)
-        return found
+                T = starts[source] if fit is None or not confident else fit.T_1_from_0.to(torch.float64)
+                chain.keep(source + solver, item, T, confident)
+                rows[source + solver] = _evaluate_link(chain, item, T, fit, confident)
+        return rows
 
-    def whole(scene: Scene, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
-        chain = worlds.pop(scene.name, None)
-        return {v: chain.summary(v) for v in VARIANTS} if chain and any(found) else {}
+    def whole(scene: Scene, rows: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+        chain = chains.pop(scene.name, None)
+        return {v: chain.summary(v) for v in VARIANTS} if chain and any(rows) else {}
 
     def items(scene: Scene) -> list[ScreenedItem]:
         return consecutive_links(scene.recording, links)
 
-    outcome = screen_scenes(scenes_of(scenes), items, ask, VARIANTS, truth=_TRUTH, whole=whole, progress=progress)
+    outcome = screen_scenes(
+        scenes_of(scenes), items, evaluate_item, VARIANTS, truth=_TRUTH, whole=whole, progress=progress
+    )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
-    """Fewer voxels over a good pose, and less drift than with none, each on more than half of the scenes?"""
-    covered = paired_metric(outcome, _TRUTH, "good + icp points", "good", "n_voxels")
-    lost = paired_metric(outcome, _TRUTH, "none + icp points", "none", "drift_rel")
-    if not covered or not lost:
+    """Verdict and text: fewer voxels over a good pose, less drift than without, each on more than half the scenes."""
+    voxel_pairs = paired_metric(outcome, _TRUTH, "good + icp points", "good", "n_voxels")
+    drift_pairs = paired_metric(outcome, _TRUTH, "none + icp points", "none", "drift_rel")
+    if not voxel_pairs or not drift_pairs:
         return None, "no scene with a trajectory and depth in two frames"
-    fewer, nearer = (sum(a < b for a, b in both) for both in (covered, lost))
-    total = [sum(pair[k] for pair in covered) for k in (0, 1)]
-    ratio = bootstrap.interval_over_scenes([a / max(b, 1) for a, b in covered])
+    n_fewer, n_nearer = (sum(a < b for a, b in value_pairs) for value_pairs in (voxel_pairs, drift_pairs))
+    total = [sum(pair[k] for pair in voxel_pairs) for k in (0, 1)]
+    ratio = bootstrap.interval_over_scenes([a / max(b, 1) for a, b in voxel_pairs])
     low, high = (ratio.value if bound is None else bound for bound in (ratio.low, ratio.high))
-    sure = [r["confident_share"] for r in outcome.scenes("good + icp points", _TRUTH).values() if r["n_pairs"]]
+    confident_shares = [
+        r["confident_share"] for r in outcome.scenes("good + icp points", _TRUTH).values() if r["n_pairs"]
+    ]
     why = (
         f"over a good pose ICP covers {total[0]:.0f} voxels, the pose alone {total[1]:.0f} (paper: 5417, 6200), fewer"
-        f" on {fewer} of {len(covered)} scenes, median ratio {ratio.value:.2f} ({low:.2f} to {high:.2f}),"
-        f" {sum(sure) / len(sure):.0%} of the links confident; without a pose it ends nearer than the identity on"
-        f" {nearer} of {len(lost)}"
+        f" on {n_fewer} of {len(voxel_pairs)} scenes, median ratio {ratio.value:.2f} ({low:.2f} to {high:.2f}),"
+        f" {sum(confident_shares) / len(confident_shares):.0%} of the links confident; without a pose it ends nearer"
+        f" than the identity on {n_nearer} of {len(drift_pairs)}"
     )
-    return fewer > len(covered) / 2 and nearer > len(lost) / 2, why
+    return n_fewer > len(voxel_pairs) / 2 and n_nearer > len(drift_pairs) / 2, why
 
 
 def consecutive_links(recording: Recording, links: int) -> list[ScreenedItem]:
-    """Consecutive frames, evenly spread; none without a trajectory.
+    """Links (pairs of frames) of a chain at a constant step over a recording; empty without a trajectory.
 
     Raises:
-        ValueError: fewer than two frames, or no link to make.
+        ValueError: fewer than two frames, or ``links`` below 1.
     """
     if len(recording) < 2 or links < 1:
-        found = f"{format_count(len(recording), 'frame')} of {recording.name} and links={links}"
-        raise ValueError(f"icp: found {found}, expected at least two frames and one link")
+        actual = f"{format_count(len(recording), 'frame')} of {recording.name} and links={links}"
+        raise ValueError(f"icp: found {actual}, expected at least two frames and one link")
     if recording.poses is None:
         return []
     step = math.ceil((len(recording) - 1) / links)
@@ -153,7 +157,7 @@ def consecutive_links(recording: Recording, links: int) -> list[ScreenedItem]:
 
 
 class _Chain:
-    """The sparse sets of a recording, its trajectory, and where each variant has put the frames so far."""
+    """Point sets and trajectory of a recording, and the frame poses of each variant so far."""
 
     def __init__(self, recording: Recording, method: Method, settings: Settings, voxel: float) -> None:
         self.recording, self.method, self.settings = recording, method, settings
@@ -162,37 +166,37 @@ class _Chain:
         depth = self.cloud(0)[0, :, 2]
         self.scale = float(depth[depth.isfinite()].median()) if bool(depth.isfinite().any()) else 1.0  # m
         self.voxel = voxel * self.scale
-        assert recording.poses is not None  # else it has no links
+        assert recording.poses is not None  # recordings without poses have no links
         self.poses: Pose = recording.poses
         self.true_poses: Pose = recording.true_poses if isinstance(recording, SyntheticRoom) else recording.poses
 
     def cloud(self, i: int) -> Tensor:
-        """Points (1, n, 3) that frame ``i`` drew for itself."""
+        """Points (1, n, 3) of the samples of frame ``i``, with a random gaze."""
         if i not in self.clouds:
             frame: Frame = self.recording[i].to(self.settings.dtype).to(self.settings.device)
             generator = torch.Generator().manual_seed(self.settings.seed + 1000 * (i + 1))
-            share = 0.4 + 0.2 * torch.rand(2, generator=generator)
-            gaze = (float(share[0]) * frame.hw[1], float(share[1]) * frame.hw[0])
-            seats, like = self.method.replace(sample={"gaze": gaze}), frame.camera.f
-            uv = seats.sample(frame.hw, seats.n, device=like.device, dtype=like.dtype)
-            self.clouds[i] = seats.backproject(frame, uv).xyz
+            relative_gaze = 0.4 + 0.2 * torch.rand(2, generator=generator)
+            gaze = (float(relative_gaze[0]) * frame.hw[1], float(relative_gaze[1]) * frame.hw[0])
+            stages, focal_length = self.method.replace(sample={"gaze": gaze}), frame.camera.f
+            uv = stages.sample(frame.hw, stages.n, device=focal_length.device, dtype=focal_length.dtype)
+            self.clouds[i] = stages.backproject(frame, uv).xyz
         return self.clouds[i]
 
     def relative(self, item: ScreenedItem, true: bool = False) -> Pose:
-        """Pose of the later frame from the earlier one."""
+        """Relative pose from the earlier to the later frame, by the trajectory or the true path."""
         poses = self.true_poses if true else self.poses
         return se3.relative(*(poses[k : k + 1].to(torch.float64) for k in item))
 
     def error(self, item: ScreenedItem, degrees: float, shift: float) -> Pose:
-        """A motion of the given size in a seeded direction."""
+        """Pose error of a size in degrees and median depths, in seeded random directions."""
         generator = torch.Generator().manual_seed(self.settings.seed + 7919 * (item[0] + 1))
-        way = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
-        return se3.exp(torch.cat((way[0] * math.radians(degrees), way[1] * shift * self.scale))[None])
+        directions = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
+        return se3.exp(torch.cat((directions[0] * math.radians(degrees), directions[1] * shift * self.scale))[None])
 
     def refine(
         self, item: ScreenedItem, start: Pose, solver: str, reach: float, least: float
     ) -> IcpRegistration | None:
-        """ICP from a start; None where no solver is asked."""
+        """ICP registration of a link from a start; None without a solver."""
         if not solver:
             return None
         first, second = self.cloud(item[0]), self.cloud(item[1])
@@ -201,32 +205,38 @@ class _Chain:
             first, second, start, normals_1=planes, reach_m=reach * self.scale, least_reach_m=least * self.scale
         )
 
-    def keep(self, variant: str, item: ScreenedItem, T: Pose, sure: bool) -> None:
-        """Put the later frame of a link into the map of a variant."""
+    def keep(self, variant: str, item: ScreenedItem, T: Pose, confident: bool) -> None:
+        """Add the later frame of a link to the map of a variant."""
         placed = self.placed[variant]
         if item[0] not in placed:
             placed[item[0]] = (self.true_poses[item[0] : item[0] + 1].to(torch.float64), True)
-        placed[item[1]] = (se3.compose(placed[item[0]][0], se3.invert(T)), sure)
+        placed[item[1]] = (se3.compose(placed[item[0]][0], se3.invert(T)), confident)
 
-    def voxels(self, placed: Mapping[int, tuple[Pose, bool]], sure_only: bool) -> Tensor:
-        """Numbers (V,) of the cells that the points of the frames fall into."""
-        points = [se3.apply(T, self.cloud(i).double())[0] for i, (T, sure) in placed.items() if sure or not sure_only]
+    def voxels(self, placed: Mapping[int, tuple[Pose, bool]], confident_only: bool) -> Tensor:
+        """Indices (V,) of the voxels occupied by the points of the placed frames."""
+        points = [
+            se3.apply(T, self.cloud(i).double())[0]
+            for i, (T, confident) in placed.items()
+            if confident or not confident_only
+        ]
         return sparse_grid.occupied_cells(torch.cat(points), self.voxel)
 
     def summary(self, variant: str) -> Row:
-        """What a variant's chain covers and where it ends."""
+        """Row of a variant's chain: voxels, confident links, and drift at its end."""
         placed = self.placed[variant]
-        true = {i: (self.true_poses[i : i + 1].to(torch.float64), True) for i in placed}
-        covered, real = self.voxels(placed, sure_only=True), self.voxels(true, sure_only=False)
-        alone = self.voxels(self.placed[variant.split(" + ", maxsplit=1)[0]], sure_only=False)
+        true_poses = {i: (self.true_poses[i : i + 1].to(torch.float64), True) for i in placed}
+        covered, true_voxels = self.voxels(placed, confident_only=True), self.voxels(true_poses, confident_only=False)
+        pose_voxels = self.voxels(self.placed[variant.split(" + ", maxsplit=1)[0]], confident_only=False)
         last = max(placed)
-        drift = _pose_difference(placed[last][0], true[last][0])
-        links = [sure for i, (_, sure) in placed.items() if i != min(placed)]
+        drift = _pose_difference(placed[last][0], true_poses[last][0])
+        links = [confident for i, (_, confident) in placed.items() if i != min(placed)]
         return {
             "n_voxels": len(covered),
-            "voxels_vs_pose": len(covered) / max(len(alone), 1),
-            "n_voxels_all": len(self.voxels(placed, sure_only=False)),
-            "right_share": float(sparse_grid.touches_cells(covered, real).double().mean()) if len(covered) else None,
+            "voxels_vs_pose": len(covered) / max(len(pose_voxels), 1),
+            "n_voxels_all": len(self.voxels(placed, confident_only=False)),
+            "right_share": float(sparse_grid.touches_cells(covered, true_voxels).double().mean())
+            if len(covered)
+            else None,
             "confident_share": sum(links) / len(links),
             "drift_deg": drift[0],
             "drift_rel": drift[1] / self.scale,
@@ -234,10 +244,11 @@ class _Chain:
         }
 
 
-def _evaluate_link(chain: _Chain, item: ScreenedItem, T: Pose, fit: IcpRegistration | None, sure: bool) -> Row:
+def _evaluate_link(chain: _Chain, item: ScreenedItem, T: Pose, fit: IcpRegistration | None, confident: bool) -> Row:
+    """Row of a link: pose error, confidence, and the evidence of ICP."""
     angle, distance = _pose_difference(T, chain.relative(item, true=True))
     row: Row = {"rotation_deg": angle, "translation_m": distance, "translation_rel": distance / chain.scale}
-    row |= {"confident": int(sure), "inlier_share": None, "rms_m": None, "condition": None}
+    row |= {"confident": int(confident), "inlier_share": None, "rms_m": None, "condition": None}
     if fit is not None:
         row |= {k: float(v) if bool(v.isfinite()) else None for k in row if (v := getattr(fit, k, None)) is not None}
     return row

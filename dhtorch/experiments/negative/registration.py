@@ -1,4 +1,4 @@
-"""Iterative closest point between two sparse sets, and how far its answer may be believed.
+"""Iterative closest point registration of two sparse point sets, with inlier ratio and conditioning.
 
 Alphabet: ``x`` points of set 0 and ``Y = R x + t`` in frame 1; ``q`` the point of set 1 nearest to Y and ``m`` the
 normal there. Point to point drives Y − q to zero, point to plane only its part along m. ``xi`` is the left
@@ -17,20 +17,20 @@ from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.se3 import Pose
 from dhtorch.pytree import Record, record
 
-#: Fewest matched points that fix a rigid motion with something to spare.
+#: Smallest number of matches for a valid registration; three fix a rigid motion.
 _MIN_MATCHES = 6
 
 
 @record
 class IcpRegistration(Record):
-    """The motion between two sets and the evidence for it."""
+    """Relative pose of two point sets, with matches, residual and conditioning."""
 
     T_1_from_0: Pose
     matched: Tensor  # (B, N) bool: points of set 0 with a point of set 1 within reach, at the final pose
-    inlier_share: Tensor  # (B,) of the points of set 0 that could be matched; 0 without any
-    rms_m: Tensor  # (B,) distance of the matched points (along the normal for planes); NaN without any
+    inlier_share: Tensor  # (B,) fraction of the points of set 0 that are matched; 0 without any
+    rms_m: Tensor  # (B,) RMS distance of the matched points (along the normal for planes); NaN without any
     condition: Tensor  # (B,) smallest over largest eigenvalue of the normal matrix, lengths in units of the set's size
-    ok: Tensor  # (B,) bool: there were enough matches and they fix all six degrees of freedom
+    ok: Tensor  # (B,) bool: enough matches, which constrain all six degrees of freedom
 
 
 def register_icp(
@@ -45,29 +45,29 @@ def register_icp(
     keep: float = 0.8,
     iterations: int = 30,
 ) -> IcpRegistration:
-    """Register set 0 to set 1 from a start: match every point with its nearest, keep the best matches, step, repeat.
+    """Register set 0 to set 1 by trimmed ICP from an initial pose: points, initial pose -> registration.
 
-    Every iteration is one Gauss–Newton step over the kept matches, which for points is the closed-form alignment up to
-    second order in the turn. The reach shrinks from step to step, so that a far start may still be pulled in and the
-    end is not pulled away by what the other view does not show.
+    Every iteration matches each point with its nearest, keeps the best matches and takes one Gauss–Newton step, which
+    for points is the closed-form alignment up to second order in the rotation. The match distance shrinks from step to
+    step: a distant start converges, and regions without overlap do not bias the end.
 
     Args:
         xyz_0, xyz_1: the sets; their numbers of points may differ.
-        T_init: where to start: a device's pose, or the identity.
-        normals_1: gives point to plane; None = point to point.
-        reach_m: farthest match at the start.
-        shrink: factor on the reach from step to step.
-        least_reach_m: the reach never falls below; matches within it count for ``inlier_share`` and ``rms_m``.
-        keep: share of the matches kept in a step, the nearest ones (trimmed ICP).
-        iterations: steps, always all.
+        T_init: initial pose: a device's pose, or the identity.
+        normals_1: for point-to-plane ICP; None = point to point.
+        reach_m: largest match distance at the start.
+        shrink: factor on the match distance from step to step.
+        least_reach_m: lower bound of the match distance; matches within it count for ``inlier_share`` and ``rms_m``.
+        keep: fraction of the matches kept in a step, the nearest ones (trimmed ICP).
+        iterations: number of steps; there is no early stop.
 
     Returns:
-        Registration. Not ok: the pose is the start's.
+        Registration. Where not ok, the pose is the initial one.
 
     Raises:
-        ValueError: wrong shapes or options, or a set with no room for a point (N = 0 or M = 0).
+        ValueError: wrong shapes or options, or an empty set (N = 0 or M = 0).
 
-    Gradient: none; matches are choices.
+    Gradient: none; matches are discrete.
     Cost: iterations × N × M distances.
     Source: P. Besl, N. McKay 1992 (points); Y. Chen, G. Medioni 1991 (planes); D. Chetverikov et al. 2002 (trimming).
     """
@@ -76,8 +76,11 @@ def register_icp(
     if not (sizes["N"] and sizes["M"]):
         raise ValueError(f"register_icp: sets have {sizes['N']} and {sizes['M']} points, expected at least one each")
     if not (0 < keep <= 1 and 0 < shrink <= 1 and 0 < least_reach_m <= reach_m and iterations > 0):
-        given = f"keep={keep}, shrink={shrink}, least_reach_m={least_reach_m}, reach_m={reach_m}"
-        raise ValueError(f"register_icp: found {given}, expected shares in (0, 1], a least reach up to the reach")
+        options = f"keep={keep}, shrink={shrink}, least_reach_m={least_reach_m}, reach_m={reach_m}"
+        raise ValueError(
+            f"register_icp: found {options}, expected keep and shrink in (0, 1], 0 < least_reach_m <= reach_m, and at"
+            " least one iteration"
+        )
     with torch.no_grad():
         sets = _PointSets(xyz_0, xyz_1, normals_1)
         start = Pose(T_init.R.double(), T_init.t.double())
@@ -105,12 +108,12 @@ def estimate_normals(
     neighbours: int = 8,
     max_bend: float = 0.1,
 ) -> Tensor:
-    """Unit normals (B, M, 3) of the planes through each point and its nearest neighbours, towards the camera.
+    """Unit normals (B, M, 3), towards the camera, of planes fitted to each point and its nearest neighbours.
 
     Args:
         xyz: points in a camera's frame.
-        neighbours: how many others take part.
-        max_bend: largest share of the neighbourhood's variance off the plane; where it is larger there is none (NaN).
+        neighbours: number of nearest points in the fit.
+        max_bend: largest fraction of the neighbourhood's variance off the plane; NaN above it.
 
     Raises:
         ValueError: wrong shapes, fewer points than neighbours, or fewer than three neighbours.
@@ -125,21 +128,21 @@ def estimate_normals(
     with torch.no_grad():
         valid = xyz.isfinite().all(-1)
         x = _move_invalid_away(xyz, valid, 1e6)
-        near = torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").topk(neighbours + 1, -1, largest=False)
-        group = x.gather(1, near.indices.flatten(1)[..., None].expand(-1, -1, 3)).view(*near.indices.shape, 3)
-        off = (group - group.mean(-2, keepdim=True)).double()
-        spread = (off[..., :, None] * off[..., None, :]).mean(-3)
-        good = valid & (near.values[..., -1] < 1e5)
-        eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
-        values, vectors = torch.linalg.eigh(torch.where(good[..., None, None], spread, eye))
+        nearest = torch.cdist(x, x, compute_mode="donot_use_mm_for_euclid_dist").topk(neighbours + 1, -1, largest=False)
+        group = x.gather(1, nearest.indices.flatten(1)[..., None].expand(-1, -1, 3)).view(*nearest.indices.shape, 3)
+        deviation = (group - group.mean(-2, keepdim=True)).double()
+        covariance = (deviation[..., :, None] * deviation[..., None, :]).mean(-3)
+        has_neighbours = valid & (nearest.values[..., -1] < 1e5)
+        eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+        values, vectors = torch.linalg.eigh(torch.where(has_neighbours[..., None, None], covariance, eye))
         normal = vectors[..., 0]
         normal = torch.where(((normal * x).sum(-1) > 0)[..., None], -normal, normal).to(xyz.dtype)
-        flat = good & (values[..., 0] <= max_bend * values.sum(-1)) & (values[..., 1] > 2 * values[..., 0])
+        flat = has_neighbours & (values[..., 0] <= max_bend * values.sum(-1)) & (values[..., 1] > 2 * values[..., 0])
     return torch.where(flat[..., None], normal, torch.nan)
 
 
 class _PointSets:
-    """Two sets without NaN, in float64 where sums are taken."""
+    """Two point sets with invalid points replaced; sums are in float64."""
 
     def __init__(self, xyz_0: Tensor, xyz_1: Tensor, normals_1: Tensor | None) -> None:
         self.valid_0, valid_1 = xyz_0.isfinite().all(-1), xyz_1.isfinite().all(-1)
@@ -150,35 +153,35 @@ class _PointSets:
         self.normals = None if normals_1 is None else torch.where(valid_1[..., None], normals_1, 0.0)
         weight = self.valid_0[..., None].double()
         count = weight.sum(1).clamp_min(1)
-        off = (self.x - (self.x * weight).sum(1, keepdim=True) / count[:, None]) * weight
-        self.size = ((off * off).sum((1, 2)) / count[:, 0]).sqrt().clamp_min(1e-9)  # (B,) m
+        deviation = (self.x - (self.x * weight).sum(1, keepdim=True) / count[:, None]) * weight
+        self.size = ((deviation * deviation).sum((1, 2)) / count[:, 0]).sqrt().clamp_min(1e-9)  # (B,) m
         self.centre = (self.x * weight).sum(1) / count
 
     def linearise(self, T: Pose, reach: float, keep: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """H (B, 6, 6), g (B, 6), the matches that take part (B, N) and their squared residuals (B, N)."""
+        """Normal equations H (B, 6, 6), g (B, 6) of the kept matches, their mask and squared residuals (B, N)."""
         Y = se3.apply(T, self.x)
         distance, index = torch.cdist(Y.to(self.q.dtype), self.q, compute_mode="donot_use_mm_for_euclid_dist").min(-1)
-        taking_part = self.valid_0 & (distance < reach)
+        matched = self.valid_0 & (distance < reach)
         if keep < 1:
-            ranked = torch.where(taking_part, distance, torch.inf).sort(-1).values
-            last = (keep * taking_part.sum(-1, keepdim=True)).ceil().long().sub(1).clamp_min(0)
-            taking_part = taking_part & (distance <= ranked.gather(-1, last))
+            ranked = torch.where(matched, distance, torch.inf).sort(-1).values
+            last = (keep * matched.sum(-1, keepdim=True)).ceil().long().sub(1).clamp_min(0)
+            matched = matched & (distance <= ranked.gather(-1, last))
         r = Y - _gather_rows(self.q, index).double()  # (B, N, 3)
         J = torch.cat((-se3.hat(Y), torch.eye(3, dtype=Y.dtype, device=Y.device).expand(*Y.shape, 3)), -1)
         if self.normals is not None:
             m = _gather_rows(self.normals, index).double()
             r = (m * r).sum(-1, keepdim=True)
             J = (m[..., None] * J).sum(-2, keepdim=True)
-        w = taking_part.double()[..., None, None]
+        w = matched.double()[..., None, None]
         Jw = J * w
         H = (Jw[..., :, None] * J[..., None, :]).sum((1, 2))
         g = (Jw * r[..., None]).sum((1, 2))
-        return H, g, taking_part, (r * r).sum(-1)
+        return H, g, matched, (r * r).sum(-1)
 
     def condition(self, T: Pose, H: Tensor) -> Tensor:
-        """Smallest over largest eigenvalue of H (B,), turns about the set's middle counted at its size; 0 if singular.
+        """Reciprocal condition number (B,) of H, rotations about the set's centre scaled by its size; 0 if singular.
 
-        About the middle the motion of a point is ω × (Y − c) + u, so that the translation in H is u − ω × c.
+        About the centre the motion of a point is ω × (Y − c) + u, so that the translation in H is u − ω × c.
         """
         eye = torch.eye(3, dtype=H.dtype, device=H.device).expand(len(H), 3, 3)
         c = se3.apply(T, self.centre[:, None])[:, 0]
@@ -189,10 +192,10 @@ class _PointSets:
 
 
 def _gather_rows(values: Tensor, index: Tensor) -> Tensor:
-    """Rows (B, N, 3) of (B, M, 3)."""
+    """Rows (B, N, 3) of values (B, M, 3) at an index (B, N)."""
     return values.gather(1, index[..., None].expand(-1, -1, 3))
 
 
 def _move_invalid_away(xyz: Tensor, valid: Tensor, far: float) -> Tensor:
-    """Points with those that do not exist put where nothing is near."""
+    """Points with invalid ones moved to a coordinate ``far`` from all others."""
     return torch.where(valid[..., None], xyz, far)

@@ -1,1 +1,1 @@
-"""The protocols and tables of the paper."""
+"""Experiments of the paper: its protocols and tables."""

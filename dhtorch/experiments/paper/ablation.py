@@ -34,7 +34,7 @@ def run(
     others: Mapping[str, Method] | None = None,
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """One change at a time on the range split: sampler, number of samples, tracker, whole methods, cutoff.
+    """Error ratios of single changes on the range split: sampler, number of samples, tracker, method, cutoff.
 
     Variants: the method under its own name, ``sampler grid``, ``sampler vogel``, ``n 512`` …, ``window 15`` …, each of
     ``others``, and ``cutoff x0.5``. The summary adds ``<variant>.median_rel_ratio``, the geometric mean over scenes of
@@ -42,10 +42,10 @@ def run(
 
     Args:
         scenes, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: name → method; the first is taken apart.
+        methods: name → method; the first is ablated.
         n: numbers of samples.
         windows: sides of the tracking window, px.
-        others: further methods in whole.
+        others: name → further methods to run unchanged.
     """
     name, method = next(iter(methods.items()))
     changed: dict[str, Method] = {
@@ -58,15 +58,15 @@ def run(
     }
     variants = {k: Variant(m) for k, m in changed.items()}
     main = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
-    near = protocol.run(
+    half_cutoff = protocol.run(
         scenes,
         Protocol({"cutoff x0.5": Variant(method)}),
         pairs,
         replace(settings, cutoff_factor=0.5),
         progress=progress,
     )
-    near.summary = {f"cutoff x0.5.{k}": v for k, v in near.summary.items()}
-    outcome = join_outcomes([main, near])
+    half_cutoff.summary = {f"cutoff x0.5.{k}": v for k, v in half_cutoff.summary.items()}
+    outcome = join_outcomes([main, half_cutoff])
     ratios = {k: _error_ratio(outcome, k, name) for k in [*changed, "cutoff x0.5"] if k != name}
     for k, (value, count) in ratios.items():
         outcome.summary[f"{k}.median_rel_ratio"] = bootstrap.without_interval(value, count)
@@ -74,13 +74,13 @@ def run(
 
 
 def verdict(ratios: Mapping[str, float | None]) -> tuple[bool | None, str]:
-    """The change that helps most."""
-    known = {k: v for k, v in ratios.items() if v is not None and not k.startswith("cutoff")}
-    if not known:
+    """(no change lowers the error ratio below 0.9; the ratios)."""
+    measured = {k: v for k, v in ratios.items() if v is not None and not k.startswith("cutoff")}
+    if not measured:
         return None, "no scene with answers"
-    best = min(known, key=lambda k: known[k])
-    shown = ", ".join(f"{k} {v:.2f}" for k, v in known.items())
-    return known[best] >= 0.9, f"error ratio to the method, geometric mean over scenes: {shown}"
+    best = min(measured, key=lambda k: measured[k])
+    ratios_text = ", ".join(f"{k} {v:.2f}" for k, v in measured.items())
+    return measured[best] >= 0.9, f"error ratio to the method, geometric mean over scenes: {ratios_text}"
 
 
 def _error_ratio(outcome: Outcome, variant: str, reference: str) -> tuple[float | None, int]:

@@ -32,7 +32,7 @@ def run(
     thresholds: Sequence[float] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """Reliability, risk–coverage and thresholds of every method, on the range split and on the hold-out.
+    """Reliability, risk–coverage and risk at thresholds of every method, on the range split and on the hold-out.
 
     Cohorts ``heldout`` and ``full`` (the range split, which decides). Scene rows carry ``mean_risk`` and, under
     ``at_<threshold>``, coverage, median and p90 error of the answers whose score reaches the threshold. The summary
@@ -40,16 +40,16 @@ def run(
 
     Args:
         scenes, methods, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        thresholds: on the score.
+        thresholds: thresholds of the score.
 
     Source: paper, "Calibration" and the figure on selective risk–coverage.
     """
-    split = Protocol({name: Variant(m) for name, m in methods.items()})
-    parts = [protocol.run(scenes, split, pairs, settings, progress=progress)]
+    range_protocol = Protocol({name: Variant(m) for name, m in methods.items()})
+    parts = [protocol.run(scenes, range_protocol, pairs, settings, progress=progress)]
     for name, method in methods.items():
-        held = HeldOut(method, settings.seed)
-        asked = Protocol({name: held.variant()}, {"heldout": held.heldout}, hide_nothing)
-        parts.append(protocol.run(scenes, asked, pairs, settings, progress=progress))
+        heldout = HeldOut(method, settings.seed)
+        heldout_protocol = Protocol({name: heldout.variant()}, {"heldout": heldout.heldout}, hide_nothing)
+        parts.append(protocol.run(scenes, heldout_protocol, pairs, settings, progress=progress))
     outcome = join_outcomes(parts)
     for row in outcome.rows:
         key = (row["scene"], row["method"], row["truth"])
@@ -62,18 +62,18 @@ def run(
 
 
 def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:
-    """Order and calibration on the range split."""
+    """(the score orders answers on most scenes and its ECE exceeds 0.1; scene medians), on the range split."""
     scenes = [r for r in outcome.scenes(method).values() if r.get("aurc") is not None]
     if not scenes:
         return None, "no scene with answers"
     orders = sum(r["aurc"] < r["mean_risk"] for r in scenes)
-    found = {
+    medians = {
         k: bootstrap.interval_over_scenes([r[k] for r in scenes]).value
         for k in ("aurc", "mean_risk", "ece", "monotonicity")
     }
-    shown = ", ".join(f"{k} {v:.3f}" for k, v in found.items() if v is not None)
-    holds = orders > len(scenes) / 2 and found["ece"] is not None and found["ece"] > 0.1
-    return holds, f"orders answers on {orders} of {len(scenes)} scenes; scene medians: {shown}"
+    medians_text = ", ".join(f"{k} {v:.3f}" for k, v in medians.items() if v is not None)
+    holds = orders > len(scenes) / 2 and medians["ece"] is not None and medians["ece"] > 0.1
+    return holds, f"orders answers on {orders} of {len(scenes)} scenes; scene medians: {medians_text}"
 
 
 def _at_thresholds(points: errors.Points, thresholds: Sequence[float]) -> Row:
@@ -81,14 +81,14 @@ def _at_thresholds(points: errors.Points, thresholds: Sequence[float]) -> Row:
     row: Row = {"mean_risk": float(risk.cap_error(answered.error).mean()) if answered.error.numel() else None}
     for threshold in thresholds:
         above = points.replace(keep=points.keep & (points.score >= threshold))
-        found = errors.measure_errors(above)
-        row[f"at_{threshold:g}"] = {k: found[k] for k in ("n_kept", "coverage", "median_rel", "p90_rel")}
+        metrics = errors.measure_errors(above)
+        row[f"at_{threshold:g}"] = {k: metrics[k] for k in ("n_kept", "coverage", "median_rel", "p90_rel")}
     return row
 
 
 def _pooled(outcome: Outcome, method: str) -> dict[str, Any]:
-    apart = {r["scene"] for r in outcome.rows if r.get("role")}
-    scenes = [p for (s, m, t), p in outcome.points.items() if (m, t) == (method, "full") and s not in apart]
+    with_role = {r["scene"] for r in outcome.rows if r.get("role")}
+    scenes = [p for (s, m, t), p in outcome.points.items() if (m, t) == (method, "full") and s not in with_role]
     return {
         f"{method}.ece_pooled": bootstrap.without_interval(reliability.measure_reliability(scenes)["ece"], len(scenes))
     }

@@ -39,13 +39,13 @@ def run(
     *,
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """Triangulate held-out samples under the device's trajectory, raw and converted, and under the anchored pose.
+    """Errors of held-out samples triangulated under the device's trajectory, raw and converted, and under ours.
 
-    Variants ``device_raw``, ``device_gl_to_cv``, ``anchored``; rows carry ``rotation_deg``, ``translation_m`` and
-    ``direction_deg``, by which each variant's relative pose differs from the converted trajectory's. Cohort: set B of
-    the hold-out, the same for all three.
+    Variants ``device_raw``, ``device_gl_to_cv``, ``anchored`` (the pose estimated from near returns); rows carry
+    ``rotation_deg``, ``translation_m`` and ``direction_deg``, by which each variant's relative pose differs from the
+    converted trajectory's. Cohort: set B of the hold-out, the same for all three.
 
-    Args and errors: as :func:`dhtorch.experiments.protocol.run`; of ``methods`` the first is asked.
+    Args and errors: as :func:`dhtorch.experiments.protocol.run`; of ``methods`` the first is used.
     Source: paper, "LiDAR-anchored relative pose".
     """
     split = HeldOut(next(iter(methods.values())), settings.seed)
@@ -54,41 +54,41 @@ def run(
         "device_gl_to_cv": split.variant(fit=trajectory_pose_fit, needs=missing_trajectory_reason),
         "anchored": split.variant(),
     }
-    asked = Protocol(variants, {"heldout": split.heldout}, hide_nothing, _trajectory_disagreement)
-    outcome = protocol.run(scenes, asked, pairs, settings, progress=progress)
+    heldout_protocol = Protocol(variants, {"heldout": split.heldout}, hide_nothing, _trajectory_disagreement)
+    outcome = protocol.run(scenes, heldout_protocol, pairs, settings, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
 def _trajectory_disagreement(answer: Answer) -> Row:
-    """By how much the relative pose of a pair differs from that of the device's trajectory."""
-    given, found = trajectory_pose(answer.batch), answer.trace["fit"]
-    if given is None or not bool(found.ok[0]):
+    """Difference of a pair's relative pose from that of the device's trajectory: rotation, translation, direction."""
+    device_pose, fit = trajectory_pose(answer.batch), answer.trace["fit"]
+    if device_pose is None or not bool(fit.ok[0]):
         return {"rotation_deg": None, "translation_m": None, "direction_deg": None, "baseline_m": None}
-    given, T = given.to(found.cov.dtype), found.T_1_from_0
-    turn = se3.rotation_angle(T.R @ given.R.mT)[0]
-    size = (T.t.norm(dim=-1) * given.t.norm(dim=-1)).clamp_min(1e-12)
-    direction = ((T.t * given.t).sum(-1) / size).clamp(-1, 1).acos()[0]
+    device_pose, T = device_pose.to(fit.cov.dtype), fit.T_1_from_0
+    angle = se3.rotation_angle(T.R @ device_pose.R.mT)[0]
+    norms = (T.t.norm(dim=-1) * device_pose.t.norm(dim=-1)).clamp_min(1e-12)
+    direction = ((T.t * device_pose.t).sum(-1) / norms).clamp(-1, 1).acos()[0]
     return {
-        "rotation_deg": math.degrees(float(turn)),
-        "translation_m": float((T.t - given.t).norm(dim=-1)[0]),
+        "rotation_deg": math.degrees(float(angle)),
+        "translation_m": float((T.t - device_pose.t).norm(dim=-1)[0]),
         "direction_deg": math.degrees(float(direction)),
         "baseline_m": float(T.t.norm(dim=-1)[0]),
     }
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
-    """Compare correlation and error over the scenes that have a trajectory."""
+    """(the estimated pose is better in correlation and error on most scenes with a trajectory; both numbers)."""
     device = outcome.scenes("device_gl_to_cv", "heldout")
     ours = outcome.scenes("anchored", "heldout")
     both = [s for s in device if None not in (device[s].get("corr"), ours[s].get("corr"))]
     if not both:
         return None, "no scene on which both poses gave answers"
-    wins = [ours[s]["corr"] > device[s]["corr"] and ours[s]["median_rel"] < device[s]["median_rel"] for s in both]
+    better = [ours[s]["corr"] > device[s]["corr"] and ours[s]["median_rel"] < device[s]["median_rel"] for s in both]
     summary = outcome.summary
 
-    def shown(variant: str) -> str:
+    def describe(variant: str) -> str:
         corr, error = (summary[f"{variant}.{k}"]["value"] for k in ("corr", "median_rel"))
         return "no answer" if corr is None else f"corr {corr:.2f}, error {error:.1%}"
 
-    why = "; ".join(f"{v}: {shown(v)}" for v in ("device_raw", "device_gl_to_cv", "anchored"))
-    return sum(wins) > len(both) / 2, f"anchored better in both on {sum(wins)} of {len(both)} scenes; {why}"
+    why = "; ".join(f"{v}: {describe(v)}" for v in ("device_raw", "device_gl_to_cv", "anchored"))
+    return sum(better) > len(both) / 2, f"anchored better in both on {sum(better)} of {len(both)} scenes; {why}"

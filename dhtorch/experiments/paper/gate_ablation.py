@@ -36,30 +36,30 @@ def run(
     gaps: Sequence[int] = (),
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """The hold-out with each gate off, and at other frame gaps.
+    """Hold-out errors with each gate off, and at other frame gaps.
 
     Variants ``both gates``, ``parallax gate off``, ``reprojection gate off`` at the job's own pairs; ``gap x0.5`` for
     each of ``factors`` (on the scene's gap) and ``gap 16`` for each of ``gaps`` (frames). A recording too short for a
-    gap keeps a row that says so.
+    gap has a row with a note.
 
     Args:
         scenes, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: name → method; the first is asked.
+        methods: name → method; the first is used.
         factors: further gaps, as factors on the scene's own.
         gaps: further gaps in frames.
 
     Source: paper, "Effect of the gate".
     """
     split = HeldOut(next(iter(methods.values())), settings.seed)
-    ways = {
+    gate_options = {
         "both gates": {},
         "parallax gate off": {"min_parallax_deg": None},
         "reprojection gate off": {"max_residual_px": None},
     }
     variants = {}
-    for name, off in ways.items():
-        whole = split.variant()
-        variants[name] = replace(whole, method=whole.method.replace(triangulate=off))
+    for name, options in gate_options.items():
+        variant = split.variant()
+        variants[name] = replace(variant, method=variant.method.replace(triangulate=options))
     main = protocol.run(
         scenes, Protocol(variants, {"heldout": split.heldout}, hide_nothing), pairs, settings, progress=progress
     )
@@ -69,7 +69,7 @@ def run(
 
 
 def pairs_at_gaps(factors: Sequence[float], gaps: Sequence[int]) -> GapPairs:
-    """Name → pairs of a recording at that gap, none where it is too short."""
+    """Name of a gap → pairs of a recording at that gap; no pairs if it is too short."""
     scaled: GapPairs = {f"gap x{f:g}": partial(by_scaled_gap, factor=f) for f in factors}
     return scaled | {f"gap {g}": partial(_pairs_at_gap, gap=g) for g in gaps}
 
@@ -82,18 +82,18 @@ def sweep_gaps(
     progress: Progress,
     columns: Callable[[protocol.Answer], dict[str, Any]] = protocol.no_columns,
 ) -> list[Outcome]:
-    """The hold-out once for every gap."""
+    """Outcomes of the hold-out, one per gap."""
     parts = []
     for name, pairs in gaps.items():
-        asked = Protocol({name: split.variant()}, {"heldout": split.heldout}, hide_nothing, columns)
-        part = protocol.run(scenes, asked, pairs, settings, progress=progress)
+        heldout_protocol = Protocol({name: split.variant()}, {"heldout": split.heldout}, hide_nothing, columns)
+        part = protocol.run(scenes, heldout_protocol, pairs, settings, progress=progress)
         part.summary = {f"{name}.{k}": v for k, v in part.summary.items()}
         parts.append(part)
     return parts
 
 
 def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
-    """Compare the correlation that each gate is worth, medians over scenes."""
+    """(the parallax gate costs more correlation than the other when off; correlations, medians over scenes)."""
     corr = {name: summary.get(f"{name}.corr", {}).get("value") for name in ("both gates", "parallax gate off")}
     corr["reprojection gate off"] = summary.get("reprojection gate off.corr", {}).get("value")
     if any(v is None for v in corr.values()):

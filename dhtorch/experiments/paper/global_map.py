@@ -1,9 +1,9 @@
 """Question: does fusing recovered points into one map widen it, and do they stitch its fragments into one?
 
-Returns beyond the scene's cutoff are hidden. What is left of the sensor, and the sensor with what was recovered, are
-each fused into a signed distance field along the recording's own poses (``device``) and along chained poses of the
-method (``anchored``). Lengths are in units of the median depth of the scene's first frame, as in ``icp``; a map covers
-the voxels that its surface passes through, and falls into islands of voxels that touch.
+Returns beyond the scene's cutoff are hidden. The remaining returns alone, and together with recovered points, are each
+fused into a signed distance field along the recording's own poses (``device``) and along chained poses of the method
+(``anchored``). Lengths are in units of the median depth of the scene's first frame, as in ``icp``; a map covers the
+voxels that its surface passes through; an island is a connected component of covered voxels.
 
 Expectation (written before the run): wider, but not stitched, as the paper says of its maps: recovered points are
 sparse and lie where the sensor sees nothing, so that they make new islands. Without a device's trajectory frames fall
@@ -57,16 +57,16 @@ def run(
     voxel: float = 0.02,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Fuse every recording four ways: the sensor alone and with recovered points, by device and by anchored poses.
+    """Voxels and islands of four maps per recording: with or without recovered points, device or chained poses.
 
     Rows of pairs: ``pnp_ok``, ``n_kept``, ``n_recovered``. Rows of scenes: ``n_voxels`` covered, ``n_islands`` and
-    ``largest_island`` (share), ``voxels_vs_sensor``, ``n_fragments`` into which the frames fall, ``placed_share`` of
-    them, ``right_share``: voxels within one step of the map of the sensor without a cutoff, along the same poses; what
-    that sensor never sees counts as wrong.
+    ``largest_island`` (fraction), ``voxels_vs_sensor``, ``n_fragments``: connected groups of frames, ``placed_share``:
+    fraction of frames with a pose, ``right_share``: fraction of voxels within one step of the map of the sensor without
+    a cutoff along the same poses; voxels where that map has none count as wrong.
 
     Args:
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: name → method; the first is asked.
+        methods: name → method; the first is used.
         pairs: reference views and their source views; further links for ``anchored`` come from
             :func:`dhtorch.integrate.recording.linking_pairs`.
         n: samples of a pair.
@@ -75,31 +75,33 @@ def run(
     Source: paper, "Global integration (scope note)" and the limitation "map fragmentation".
     """
     method = next(iter(methods.values())).replace(n=n)
-    answers: dict[str, dict[ScreenedItem, PairEstimate]] = {}
+    estimates: dict[str, dict[ScreenedItem, PairEstimate]] = {}
 
     def items(scene: Scene) -> list[ScreenedItem]:
         chosen = to_fixed_pairs(pairs(scene))
         return [*chosen, *linking_pairs(chosen)]
 
     def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
-        common: dict[str, Any] = {"seed": settings.seed, "device": settings.device, "dtype": settings.dtype}
+        options: dict[str, Any] = {"seed": settings.seed, "device": settings.device, "dtype": settings.dtype}
         cutoff = settings.cutoff_of(scene)
-        (answer,) = ask_pairs(scene, method, [item], cutoff=cutoff, **common)
-        answers.setdefault(scene.name, {})[item] = answer
+        (answer,) = ask_pairs(scene, method, [item], cutoff=cutoff, **options)
+        estimates.setdefault(scene.name, {})[item] = answer
         row: Row = {"pnp_ok": int(answer.fit.ok[0]), "n_kept": int(answer.estimate.keep.sum())}
         row["n_recovered"] = int(answer.recovered.sum())
-        own = item in set(pairs(scene))  # else it only is a link between frames
-        found: dict[str, Row] = {"sensor anchored": {}, "fused anchored": row}
-        return found | ({"sensor device": {}, "fused device": row} if own and scene.recording.poses is not None else {})
+        is_pair = item in set(pairs(scene))  # else it only links frames
+        rows: dict[str, Row] = {"sensor anchored": {}, "fused anchored": row}
+        return rows | (
+            {"sensor device": {}, "fused device": row} if is_pair and scene.recording.poses is not None else {}
+        )
 
     def whole(scene: Scene, _found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
-        recording, found = scene.recording, answers.pop(scene.name, {})
-        maps = _Maps(recording, [found[p] for p in to_fixed_pairs(pairs(scene))], settings.cutoff_of(scene), voxel)
+        recording, of_item = scene.recording, estimates.pop(scene.name, {})
+        maps = _Maps(recording, [of_item[p] for p in to_fixed_pairs(pairs(scene))], settings.cutoff_of(scene), voxel)
         rows: dict[str, Row] = {}
         for poses in POSE_SOURCES:
             if poses == "anchored" or recording.poses is not None:
-                every = list(found.values()) if poses == "anchored" else maps.answers
-                rows |= maps.rows(place_frames(recording, every, poses=poses), poses)
+                links = list(of_item.values()) if poses == "anchored" else maps.answers
+                rows |= maps.rows(place_frames(recording, links, poses=poses), poses)
         return rows
 
     outcome = screen_scenes(scenes_of(scenes), items, ask, VARIANTS, truth=MAP_TRUTH, whole=whole, progress=progress)
@@ -107,7 +109,7 @@ def run(
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
-    """More voxels, and no fewer islands, along the device's poses, each on more than half of the scenes?"""
+    """(more voxels, and no fewer islands, along the device's poses on more than half of the scenes; counts)."""
     voxels = paired_metric(outcome, MAP_TRUTH, "fused device", "sensor device", "n_voxels")
     islands = paired_metric(outcome, MAP_TRUTH, "fused device", "sensor device", "n_islands")
     if not voxels:
@@ -116,49 +118,49 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
     ratio = bootstrap.interval_over_scenes([a / max(b, 1) for a, b in voxels])
     low, high = (ratio.value if bound is None else bound for bound in (ratio.low, ratio.high))
     anchored = [r["n_fragments"] for r in outcome.scenes("fused anchored", MAP_TRUTH).values() if r.get("n_fragments")]
-    whole = sum(n == 1 for n in anchored)
+    n_whole = sum(n == 1 for n in anchored)
     why = (
         f"the fused map covers more voxels on {wider} of {len(voxels)} scenes, {ratio.value:.2f} times as many in the"
         f" median ({low:.2f} to {high:.2f}), and has fewer islands on {stitched}; along anchored poses the frames stay"
-        f" in one piece on {whole} of {len(anchored)}"
+        f" in one piece on {n_whole} of {len(anchored)}"
     )
     return wider > len(voxels) / 2 and stitched <= len(islands) / 2, why
 
 
 class _Maps:
-    """The maps of one recording."""
+    """Builder and metrics of the maps of one recording."""
 
     def __init__(self, recording: Recording, answers: list[PairEstimate], cutoff: float | None, voxel: float) -> None:
         self.recording, self.answers, self.cutoff = recording, answers, cutoff
         depth = recording[0].depth
-        there = depth[depth.isfinite() & (depth > 0)]
-        self.voxel = voxel * (float(there.median()) if len(there) else 1.0)
+        valid = depth[depth.isfinite() & (depth > 0)]
+        self.voxel = voxel * (float(valid.median()) if len(valid) else 1.0)
 
     def rows(self, places: PlacedFrames, poses: str) -> dict[str, Row]:
-        """What the sensor's map and the fused one cover."""
-        everything = self.covered(self.fused(places, [Source.SENSOR], None))
+        """Poses → rows of the sensor's map and of the fused map along them."""
+        sensor_voxels = self.covered(self.fused(places, [Source.SENSOR], None))
         near = self.fused(places, [Source.SENSOR], self.cutoff)
-        both = fuse_recording(self.recording, near, self.answers, places, sources=[Source.RECOVERED])
+        fused = fuse_recording(self.recording, near, self.answers, places, sources=[Source.RECOVERED])
         total = len(places.poses) + places.n_unplaced
         common: Row = {"n_fragments": places.n_fragments, "placed_share": len(places.poses) / max(total, 1)}
         rows = {}
-        for what, volume in (("sensor", near), ("fused", both)):
-            found = self.covered(volume)
+        for map_name, volume in (("sensor", near), ("fused", fused)):
+            voxels = self.covered(volume)
             row = common | measure_coverage(integrate.extract_points(volume).xyz, self.voxel)
             row["right_share"] = (
-                float(sparse_grid.touches_cells(found, everything).double().mean()) if len(found) else None
+                float(sparse_grid.touches_cells(voxels, sensor_voxels).double().mean()) if len(voxels) else None
             )
             row["voxel_m"] = self.voxel
-            rows[f"{what} {poses}"] = row
-        alone = rows[f"sensor {poses}"]["n_voxels"]
-        rows[f"fused {poses}"]["voxels_vs_sensor"] = rows[f"fused {poses}"]["n_voxels"] / alone if alone else None
+            rows[f"{map_name} {poses}"] = row
+        n_sensor = rows[f"sensor {poses}"]["n_voxels"]
+        rows[f"fused {poses}"]["voxels_vs_sensor"] = rows[f"fused {poses}"]["n_voxels"] / n_sensor if n_sensor else None
         return rows
 
     def fused(self, places: PlacedFrames, sources: Sequence[int], cutoff: float | None) -> integrate.Volume:
-        """A new map along these poses."""
+        """New map along ``places``, of the given sources of depth."""
         empty = integrate.make_volume(self.voxel)
         return fuse_recording(self.recording, empty, self.answers, places, sources=sources, cutoff=cutoff)
 
     def covered(self, volume: integrate.Volume) -> Tensor:
-        """Numbers of the voxels that the surface passes through."""
+        """Indices of the voxels that the map's surface passes through."""
         return sparse_grid.occupied_cells(integrate.extract_points(volume).xyz, self.voxel)

@@ -33,7 +33,7 @@ def run(
     stride: int = 1,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Classify the samples of every frame; nothing is hidden and no second view is read.
+    """Classes of holes and trackability of the samples of every frame; nothing is hidden, no second view is used.
 
     Rows: one per frame (``pair`` is [i, i]) and one per scene: ``n_samples``, ``n_holes``, ``hole_rate``,
     ``hole_share.<class>``, ``route_share.<route>`` and the median trackability of trackable holes
@@ -41,9 +41,9 @@ def run(
 
     Args:
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: name → method; seats 1 to 3 of the first are asked.
+        methods: name → method; stages 1 to 3 of the first are used.
         pairs: not used.
-        stride: every how many frames.
+        stride: step between frames.
 
     Source: paper, "Hole taxonomy".
     """
@@ -58,56 +58,56 @@ def run(
             rows[-1] |= count_holes(classify_frame(method, recording[i].to(settings.dtype).to(settings.device)))
         outcome.rows += [*rows, _join_frames(rows, scene)]
         outcome.n_pairs += len(rows)
-    whole = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]
+    scene_rows = [r for r in outcome.rows if r["pair"] is None and r["role"] is None]
     outcome.summary = errors.summarise_scenes(
-        [{k: v for k, v in r.items() if k not in ("pair", "role")} for r in whole]
+        [{k: v for k, v in r.items() if k not in ("pair", "role")} for r in scene_rows]
     )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 
 def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
-    """Read the answer off the scene medians."""
-    share = summary.get("hole_share.trackable_no_lidar", {}).get("value")
+    """(most holes are trackable, about as well as returns; ratio and trackabilities), from scene medians."""
+    ratio = summary.get("hole_share.trackable_no_lidar", {}).get("value")
     hole, valid = (summary.get(f"trackability_{k}", {}).get("value") for k in ("hole", "valid"))
-    if share is None or hole is None or valid is None:
+    if ratio is None or hole is None or valid is None:
         return None, "no scene with both holes and returns"
-    why = f"{share:.1%} of the holes are trackable; their trackability {hole:.2g} against {valid:.2g} (scene medians)"
-    return share >= 0.5 and hole >= 0.1 * valid, why
+    why = f"{ratio:.1%} of the holes are trackable; their trackability {hole:.2g} against {valid:.2g} (scene medians)"
+    return ratio >= 0.5 and hole >= 0.1 * valid, why
 
 
 def classify_frame(method: Method, frame: Any) -> Samples:
-    """Seats 1 to 3 of a method: what its samples find in a frame."""
+    """Classified samples of a frame, by stages 1 to 3 of a method."""
     with torch.no_grad():
         return method.sample_depth(frame)
 
 
 def count_holes(samples: Samples) -> Row:
-    """Holes of one frame (B = 1): how many, of which class, and what could fill them."""
+    """Classified samples (B = 1) → numbers of holes, ratios of their classes and routes, and trackability."""
     hole, quality = samples.hole[0], samples.trackability[0]
     n_holes = int((hole != Hole.NONE).sum())
-    share = {k: float((hole == k).sum()) / n_holes if n_holes else None for k in names(Hole) if k != Hole.NONE}
-    route = {r: sum(v or 0.0 for k, v in share.items() if ROUTE_OF_HOLE[k] == r) for r in names(Route)}
+    class_ratio = {k: float((hole == k).sum()) / n_holes if n_holes else None for k in names(Hole) if k != Hole.NONE}
+    route_ratio = {r: sum(v or 0.0 for k, v in class_ratio.items() if ROUTE_OF_HOLE[k] == r) for r in names(Route)}
     open_hole, valid = quality[hole == Hole.TRACKABLE_NO_LIDAR], quality[hole == Hole.NONE]
     return {
         "n_samples": hole.numel(),
         "n_holes": n_holes,
         "hole_rate": n_holes / max(hole.numel(), 1),
-        "hole_share": {names(Hole)[k].lower(): v for k, v in share.items()},
-        "route_share": {names(Route)[r].lower(): v if n_holes else None for r, v in route.items()},
+        "hole_share": {names(Hole)[k].lower(): v for k, v in class_ratio.items()},
+        "route_share": {names(Route)[r].lower(): v if n_holes else None for r, v in route_ratio.items()},
         "trackability_hole": median_or_none(open_hole.tolist()),
         "trackability_valid": median_or_none(valid.tolist()),
     }
 
 
 def _join_frames(rows: Sequence[Row], scene: Scene) -> Row:
-    """Frames joined: counts added up, shares by mean over frames that have holes, trackability by median."""
+    """Rows of frames → scene row: sums of counts, mean ratios over frames with holes, median trackability."""
     row: Row = {"scene": scene.name, "pair": None, "method": rows[0]["method"], "truth": None}
     row |= {"role": scene.role, "n_pairs": len(rows)}
     row |= {k: sum(r[k] for r in rows) for k in ("n_samples", "n_holes")}
     row["hole_rate"] = row["n_holes"] / max(row["n_samples"], 1)
     for group in ("hole_share", "route_share"):
-        some = [r[group] for r in rows if r["n_holes"]]
-        row[group] = {k: mean_or_none([g[k] for g in some]) for k in rows[0][group]}
+        with_holes = [r[group] for r in rows if r["n_holes"]]
+        row[group] = {k: mean_or_none([g[k] for g in with_holes]) for k in rows[0][group]}
     for key in ("trackability_hole", "trackability_valid"):
         row[key] = median_or_none([r[key] for r in rows if r[key] is not None])
     return row

@@ -1,7 +1,7 @@
 """Question: what does the method cost beside the visual branch of a robot policy, and how does it grow with the image?
 
 The front end (spiral, back-projection, hole taxonomy; n = 1024) is what the paper times, at 224×224 and at 1440×1920,
-beside one forward pass of DINOv2-L at 224×224 on the same machine and threads. Beyond the paper: every stage, the
+next to one forward pass of DINOv2-L at 224×224 on the same machine and threads. Beyond the paper: every stage, the
 whole pair, and the memory both need.
 
 Expectation (written before the run): a forward pass of DINOv2-L takes at least 96 times as long as the front end at
@@ -46,7 +46,7 @@ EXPECTATION = (
     "3.4 times to 1440x1920."
 )
 
-#: The paper's figures (Apple M4 Pro, OpenCV on 14 threads): ms, and the two ratios that another machine can test.
+#: The paper's figures (Apple M4 Pro, OpenCV on 14 threads): times in ms, and two ratios to compare on any machine.
 _PAPER_FIGURES = {
     "front_end_ms": 1.11,
     "front_end_large_ms": 3.81,
@@ -55,7 +55,7 @@ _PAPER_FIGURES = {
     "growth": 3.81 / 1.11,
 }
 
-#: Fewest repeats that can show the tail: one in 20 and one in 100.
+#: Column → (quantile, fewest repeats that determine it).
 _TAIL_PERCENTILES = {"p50_ms": (0.5, 1), "p95_ms": (0.95, 20), "p99_ms": (0.99, 100)}
 
 #: Name of the visual branch in rows and summary.
@@ -64,7 +64,7 @@ VISUAL_BRANCH = "dinov2_l"
 
 @dataclass
 class TimedBranch:
-    """One thing to time, and the times found: milliseconds by stage, one list per round."""
+    """A call to time, and its milliseconds by stage, one list per round."""
 
     method: str
     stage: str  # of the whole call; a call that returns a dict of milliseconds by stage adds those
@@ -76,11 +76,11 @@ class TimedBranch:
 
     def times(self, stage: str) -> list[float]:
         """All milliseconds of a stage."""
-        return [t for found in self.rounds for t in found[stage]]
+        return [t for of_round in self.rounds for t in of_round[stage]]
 
     def medians(self, stage: str) -> list[float]:
         """Median of each round."""
-        return [statistics.median(found[stage]) for found in self.rounds]
+        return [statistics.median(of_round[stage]) for of_round in self.rounds]
 
 
 def run(
@@ -100,21 +100,21 @@ def run(
     dinov2: Callable[..., torch.nn.Module] = visual.load_dinov2,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Time the method and DINOv2 in turn, on the first pair of the first scene, resampled to each size.
+    """Times and memory of the method and DINOv2 on the first pair of the first scene, resampled to each size.
 
-    Everything is timed in rounds, so that a busy minute of the machine falls on all sides; batch size 1. Whatever is
-    reported as an interval is the lowest and highest median of a round.
+    All branches are timed in every round, so that other load of the machine affects them alike; batch size 1.
+    Intervals are the lowest and highest median of a round.
 
     Args:
-        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.pair.run`; the method named first.
-        sizes: (height, width) of the pictures; the first is the one that ratios are taken at, the last the largest.
+        scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.pair.run`; the first method.
+        sizes: (height, width) of the images; ratios are taken at the first, growth from the first to the last.
         n: samples.
-        rounds: how often everything is timed anew.
+        rounds: number of rounds.
         front_end_repeats, pair_repeats, dinov2_repeats: calls per round. A 95th percentile needs 20 calls in all, a
             99th 100, else it is null.
         warm_up: untimed calls before each block.
         peak: also measure peak memory, each in a process of its own.
-        dinov2: makes the network; without ``transformers`` its rows say what to install.
+        dinov2: makes the network; without ``transformers`` its row has a note on what to install.
 
     Returns:
         Outcome with one row per branch, stage and size (``p50_ms``, ``p95_ms``, ``p99_ms``, ``parameters``,
@@ -129,20 +129,20 @@ def run(
             raise ValueError(f"experiment.{name}: found {count}, expected at least 1")
     name, method = next(iter(chosen.items()))
     scene = scenes_of(scenes)[0]
-    told: dict[str, Any] = {"seed": settings.seed, "hint": scene.hint}
+    options: dict[str, Any] = {"seed": settings.seed, "hint": scene.hint}
     views = _first_pair(scene, pairs, settings)
     branches: list[TimedBranch] = []
     for hw in sizes:
         frame_0, frame_1 = (_resample_frame(view, (hw[0], hw[1])) for view in views)
         timed: list[tuple[str, Callable[[], Any], int]] = [
             ("front_end", partial(run_front_end, method, frame_0, n), front_end_repeats),
-            ("pair", partial(run_pair, partial(method, n=n, **told), frame_0, frame_1), pair_repeats),
+            ("pair", partial(run_pair, partial(method, n=n, **options), frame_0, frame_1), pair_repeats),
         ]
         for stage, call, repeats in timed:
-            more = memory.count_weights(method) | {"peak_mib": _peak_mib(call, settings, peak)}
-            branches.append(TimedBranch(name, stage, frame_0.hw, call, repeats, more))
-    theirs, note = _make_visual_branch(dinov2, views[0], settings, peak, dinov2_repeats)
-    branches += theirs
+            resources = memory.count_weights(method) | {"peak_mib": _peak_mib(call, settings, peak)}
+            branches.append(TimedBranch(name, stage, frame_0.hw, call, repeats, resources))
+    visual_branches, note = _make_visual_branch(dinov2, views[0], settings, peak, dinov2_repeats)
+    branches += visual_branches
     for _ in progress(range(rounds), f"{len(branches)} timings", rounds):
         for branch in branches:
             _time_round(branch, warm_up, settings.device)
@@ -154,19 +154,19 @@ def run(
 
 
 def run_front_end(method: Method, frame: Frame, n: int) -> Samples:
-    """Seats 1 to 3 of a method: what the paper times."""
+    """Stages 1 to 3 of a method (sample, backproject, classify): the front end that the paper times."""
     return method.replace(n=n).sample_depth(frame)
 
 
 def run_pair(method: Callable[..., Estimate], frame_0: Frame, frame_1: Frame) -> dict[str, float]:
-    """All seven seats; returns the milliseconds of each."""
+    """All seven stages of a method on a pair → milliseconds of each."""
     trace: Trace = {}
     method(frame_0, frame_1, trace=trace)
     return dict(trace["ms"])
 
 
 def run_forward(make: Callable[[], torch.nn.Module], pixels: Tensor) -> None:
-    """Make the network and ask it once: what a process needs that has nothing else to do."""
+    """Build the network and run one forward pass, for the peak memory of a process with nothing else."""
     with torch.no_grad():
         make()(pixel_values=pixels)
 
@@ -174,26 +174,26 @@ def run_forward(make: Callable[[], torch.nn.Module], pixels: Tensor) -> None:
 def verdict(
     method: str, summary: Mapping[str, Any], sizes: Sequence[Sequence[int]], note: str = ""
 ) -> tuple[bool | None, str]:
-    """Whether both of the paper's ratios hold, None where the spread from round to round leaves it open; and why."""
+    """(both of the paper's ratios hold, None where the spread over rounds does not decide it; the numbers)."""
     first = "x".join(map(str, sizes[0]))
-    said = [f"{stage} {summary[f'{method}.{stage}.{first}']['value']:.3g} ms" for stage in ("front_end", "pair")]
-    said = [f"{first}: {', '.join(said)}"]
+    parts = [f"{stage} {summary[f'{method}.{stage}.{first}']['value']:.3g} ms" for stage in ("front_end", "pair")]
+    parts = [f"{first}: {', '.join(parts)}"]
     claims: list[bool | None] = []
-    for ratio, words in (("speedup", "DINOv2-L / front end"), ("growth", "growth of the front end")):
+    for ratio, label in (("speedup", "DINOv2-L / front end"), ("growth", "growth of the front end")):
         entry, paper = summary.get(f"{method}.{ratio}"), _PAPER_FIGURES[ratio]
         if entry is None:
             claims.append(None)
-            said.append(f"{words} {note if ratio == 'speedup' and note else 'not measured'}")
+            parts.append(f"{label} {note if ratio == 'speedup' and note else 'not measured'}")
             continue
         worst, best = (entry["low"], entry["high"]) if ratio == "speedup" else (-entry["high"], -entry["low"])
-        least = paper if ratio == "speedup" else -paper
-        claims.append(True if worst >= least else False if best < least else None)
-        said.append(f"{words} {entry['value']:.3g} ({entry['low']:.3g} to {entry['high']:.3g}), paper {paper:.3g}")
-    return False if False in claims else None if None in claims else True, "; ".join(said)
+        limit = paper if ratio == "speedup" else -paper
+        claims.append(True if worst >= limit else False if best < limit else None)
+        parts.append(f"{label} {entry['value']:.3g} ({entry['low']:.3g} to {entry['high']:.3g}), paper {paper:.3g}")
+    return False if False in claims else None if None in claims else True, "; ".join(parts)
 
 
 def _first_pair(scene: Scene, pairs: ScenePairs, settings: Settings) -> tuple[Frame, Frame]:
-    """The first pair, as a method may see it."""
+    """First pair of a scene, with returns beyond the cutoff hidden."""
     chosen = to_fixed_pairs(pairs(scene))
     if not chosen:
         raise ValueError(f"latency: {scene.name} has no pair, expected at least one")
@@ -203,7 +203,7 @@ def _first_pair(scene: Scene, pairs: ScenePairs, settings: Settings) -> tuple[Fr
 
 
 def _resample_frame(frame: Frame, hw: tuple[int, int]) -> Frame:
-    """The frame with a picture of another size; the depth map keeps its own."""
+    """Frame with its image resampled to another size; the depth map keeps its own."""
     image = frame.image / 255 if frame.image.dtype == torch.uint8 else frame.image
     image = interpolate(image, hw, mode="bilinear", antialias=True, align_corners=False).clamp(0, 1)
     if frame.image.dtype == torch.uint8:
@@ -214,34 +214,34 @@ def _resample_frame(frame: Frame, hw: tuple[int, int]) -> Frame:
 def _make_visual_branch(
     make: Callable[..., torch.nn.Module], frame: Frame, settings: Settings, peak: bool, repeats: int
 ) -> tuple[list[TimedBranch], str]:
-    """The forward pass of DINOv2, or no branch and why not."""
+    """([branch of DINOv2's forward pass], "") or ([], reason)."""
     try:
         visual.import_dinov2()
     except ImportError as error:
         return [], f"not measured: {error}"
     side = make.keywords.get("side", 224) if isinstance(make, partial) else 224
     pixels = visual.preprocess_image(frame.image, side).to(settings.dtype)
-    # Before this process holds the network, so that there is memory for both.
-    highest = _peak_mib(partial(run_forward, make, pixels), settings, peak, visual.import_dinov2)
+    # Before this process loads the network, so that there is memory for both.
+    peak_memory = _peak_mib(partial(run_forward, make, pixels), settings, peak, visual.import_dinov2)
     network = make().to(settings.device, settings.dtype)
 
     def call() -> None:
         network(pixel_values=pixels)
 
-    more = memory.count_weights(network) | {"peak_mib": highest}
-    return [TimedBranch(VISUAL_BRANCH, "forward", (side, side), call, repeats, more)], ""
+    resources = memory.count_weights(network) | {"peak_mib": peak_memory}
+    return [TimedBranch(VISUAL_BRANCH, "forward", (side, side), call, repeats, resources)], ""
 
 
 def _peak_mib(
     call: Callable[[], Any], settings: Settings, wanted: bool, before: Callable[[], Any] | None = None
 ) -> float | None:
-    """Peak memory on the CPU, in a process of its own; None elsewhere or where it is not asked for."""
+    """Peak memory on the CPU, in a process of its own; None on other devices or if not ``wanted``."""
     return memory.peak_mib(call, before) if wanted and settings.device == "cpu" else None
 
 
 def _time_round(branch: TimedBranch, warm_up: int, device: str) -> None:
-    """One round of a branch."""
-    found: dict[str, list[float]] = {branch.stage: []}
+    """Time one round of a branch, after ``warm_up`` calls, and append it to its rounds."""
+    times: dict[str, list[float]] = {branch.stage: []}
     with torch.no_grad():
         for k in range(-warm_up, branch.repeats):
             start = time.perf_counter()
@@ -251,21 +251,21 @@ def _time_round(branch: TimedBranch, warm_up: int, device: str) -> None:
             total = 1e3 * (time.perf_counter() - start)
             if k < 0:
                 continue
-            found[branch.stage].append(total)
-            if device == "cpu":  # elsewhere a stage returns before it is done
+            times[branch.stage].append(total)
+            if device == "cpu":  # on other devices a stage returns before it is done
                 for stage, ms in stages.items() if isinstance(stages, dict) else ():
-                    found.setdefault(stage, []).append(ms)
-    branch.rounds.append(found)
+                    times.setdefault(stage, []).append(ms)
+    branch.rounds.append(times)
 
 
 def _timing_row(scene: str, branch: TimedBranch, stage: str, settings: Settings, n: int) -> Row:
-    """One branch or stage at one size."""
+    """Row of one branch or stage at one size."""
     times = sorted(branch.times(stage))
     row: Row = {"scene": scene, "pair": None, "method": branch.method, "stage": stage, "hw": list(branch.hw)}
     row |= {"n": None if branch.method == VISUAL_BRANCH else n, "repeats": len(times)}
     row |= {"threads": torch.get_num_threads(), "device": settings.device, **_describe_machine()}
-    for name, (share, least) in _TAIL_PERCENTILES.items():
-        row[name] = percentile(times, share) if len(times) >= least else None
+    for name, (quantile, min_repeats) in _TAIL_PERCENTILES.items():
+        row[name] = percentile(times, quantile) if len(times) >= min_repeats else None
     row |= {"low_ms": min(branch.medians(stage)), "high_ms": max(branch.medians(stage))}
     return row | branch.more if stage == branch.stage else row
 
@@ -278,18 +278,18 @@ def summarise_timings(branches: Sequence[TimedBranch]) -> dict[str, Any]:
         size = "x".join(map(str, b.hw))
         for stage in b.rounds[0]:
             medians = b.medians(stage)
-            middle = statistics.median(b.times(stage))
-            summary[f"{b.method}.{stage}.{size}"] = _summary_entry(middle, medians, len(b.times(stage)), "ms")
+            median = statistics.median(b.times(stage))
+            summary[f"{b.method}.{stage}.{size}"] = _summary_entry(median, medians, len(b.times(stage)), "ms")
         if b.more["peak_mib"] is not None:
             summary[f"{b.method}.{b.stage}.{size}.peak_mib"] = _summary_entry(b.more["peak_mib"], [], 1, "MiB")
     for b in (front[0], *(b for b in branches if b.method == VISUAL_BRANCH)):
         for key, unit in (("parameters", "count"), ("weight_bytes", "B")):
             summary[f"{b.method}.{key}"] = _summary_entry(b.more[key], [], 1, unit)
     small = front[0].medians("front_end")
-    above_it = [("growth", b.medians("front_end")) for b in front[1:][-1:]]
-    above_it += [("speedup", b.medians("forward")) for b in branches if b.method == VISUAL_BRANCH]
-    for name, above in above_it:
-        ratios = [a / b for a, b in zip(above, small, strict=True)]
+    compared = [("growth", b.medians("front_end")) for b in front[1:][-1:]]
+    compared += [("speedup", b.medians("forward")) for b in branches if b.method == VISUAL_BRANCH]
+    for name, numerators in compared:
+        ratios = [a / b for a, b in zip(numerators, small, strict=True)]
         summary[f"{front[0].method}.{name}"] = _summary_entry(statistics.median(ratios), ratios, len(ratios), "1")
     return summary
 
@@ -300,17 +300,17 @@ def _summary_entry(value: float, spread: Sequence[float], n: int, unit: str) -> 
 
 
 def _describe_machine() -> Row:
-    """What milliseconds depend on: processor, cores, and how busy it is (runnable processes, last minute)."""
+    """Processor, number of cores, and load (runnable processes, last minute)."""
     name = ""
     with contextlib.suppress(OSError):
-        found = [x for x in Path("/proc/cpuinfo").read_text().splitlines() if x.startswith("model name")]
-        name = found[0].partition(":")[2].strip() if found else ""
+        lines = [x for x in Path("/proc/cpuinfo").read_text().splitlines() if x.startswith("model name")]
+        name = lines[0].partition(":")[2].strip() if lines else ""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
     return {"cpu": name or platform.processor() or platform.machine(), "cores": os.cpu_count(), "load": load}
 
 
 def percentile(ordered: Sequence[float], share: float) -> float:
     """Percentile with linear interpolation of sorted numbers."""
-    place = share * (len(ordered) - 1)
-    low = int(place)
-    return ordered[low] + (place - low) * (ordered[min(low + 1, len(ordered) - 1)] - ordered[low])
+    position = share * (len(ordered) - 1)
+    low = int(position)
+    return ordered[low] + (position - low) * (ordered[min(low + 1, len(ordered) - 1)] - ordered[low])

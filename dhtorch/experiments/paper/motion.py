@@ -38,15 +38,16 @@ def run(
     factors: Sequence[float] = (0.25, 0.5, 1.0, 2.0),
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """The hold-out at several frame gaps; every pair's row carries ``baseline_m`` and ``recovered_share``.
+    """Rank correlation of recovery and error with the baseline, from the hold-out at several frame gaps.
 
-    Rows of scenes carry ``rank_corr_recovered`` and ``rank_corr_error``: Spearman correlation over the scene's pairs,
-    all gaps together, of the baseline with the share of holes recovered and with the median error.
+    Every pair's row carries ``baseline_m`` and ``recovered_share``. Rows of scenes carry ``rank_corr_recovered`` and
+    ``rank_corr_error``: Spearman correlation over the scene's pairs, all gaps together, of the baseline with the
+    recovered fraction of holes and with the median error.
 
     Args:
         scenes, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: name → method; the first is asked.
-        pairs: not used: the gaps below are.
+        methods: name → method; the first is used.
+        pairs: not used; pairs are made from ``factors``.
         factors: gaps, as factors on the scene's own.
 
     Source: paper, "Held-out triangulation on in-house captures" and "Limitations" (motion dependence).
@@ -63,16 +64,16 @@ def run(
 
 
 def _baseline_columns(split: HeldOut, answer: Answer) -> Row:
-    """Baseline and recovery of one pair."""
-    numbers = recovery_columns(split, answer)
+    """Baseline and recovered fraction of holes of one pair."""
+    columns = recovery_columns(split, answer)
     fit = answer.trace["fit"]
     baseline = float(fit.T_1_from_0.t[0].norm()) if bool(fit.ok[0]) else None
-    share = numbers["n_recovered"] / numbers["n_holes"] if numbers["n_holes"] else None
-    return numbers | {"baseline_m": baseline, "recovered_share": share}
+    ratio = columns["n_recovered"] / columns["n_holes"] if columns["n_holes"] else None
+    return columns | {"baseline_m": baseline, "recovered_share": ratio}
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
-    """The trends of the median scene."""
+    """(recovery rises and error falls with the baseline on the median scene; rank correlations)."""
     scenes = {r["scene"]: r for r in outcome.rows if r["pair"] is None and r["role"] is None}.values()
     recovered = bootstrap.interval_over_scenes([r["rank_corr_recovered"] for r in scenes])
     error = bootstrap.interval_over_scenes([r["rank_corr_error"] for r in scenes])

@@ -28,7 +28,7 @@ EXPECTATION = (
     "of triangulation from the device's raw trajectory; the gates lower p90."
 )
 
-#: Seat options that switch the two gates of the paper off.
+#: Options of the triangulation stage that switch off the paper's two gates.
 NO_GATES = {"min_parallax_deg": None, "max_residual_px": None}
 
 
@@ -42,16 +42,16 @@ def run(
     cutoffs: Sequence[float] = (),
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """Five ways to far depth on one cohort, and the gated one at other cutoffs.
+    """Errors and coverage of five estimates of far depth on one cohort, and of the gated one at other cutoffs.
 
     Variants: ``sensor_only``, ``device_raw``, ``device_gl_to_cv``, ``no_gates``, ``gated`` at the scene's cutoff;
     ``gated, cutoff x0.75`` for each of ``cutoff_factors`` and ``gated, cutoff 1.5 m`` for each of ``cutoffs``.
     Candidates are counted before any of them runs, from independent truth where the recording has it; rows then carry
-    ``truth_disagreement``, the median relative difference of truth and sensor where both answer.
+    ``truth_disagreement``, the median relative difference of truth and sensor where both have depth.
 
     Args:
         scenes, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: name → method; the first is asked.
+        methods: name → method; the first is used.
         cutoff_factors: further cutoffs, as factors on the scene's.
         cutoffs: further cutoffs in metres.
 
@@ -71,9 +71,9 @@ def run(
     sweep = {f"gated, cutoff x{f:g}": replace(settings, cutoff_factor=f) for f in cutoff_factors}
     sweep |= {f"gated, cutoff {c:g} m": replace(settings, cutoff=c, cutoff_factor=1.0) for c in cutoffs}
     parts = [main]
-    for name, at in sweep.items():
+    for name, cutoff_settings in sweep.items():
         part = protocol.run(
-            scenes, Protocol({name: Variant(method)}, columns=_truth_columns), pairs, at, progress=progress
+            scenes, Protocol({name: Variant(method)}, columns=_truth_columns), pairs, cutoff_settings, progress=progress
         )
         part.summary = {f"{name}.{k}": v for k, v in part.summary.items()}
         parts.append(part)
@@ -82,22 +82,22 @@ def run(
 
 
 def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
-    """Read the answer off the scene medians."""
+    """(coverage, error and p90 of the scene medians meet the expectation; the numbers)."""
 
     def value(name: str) -> float | None:
-        found: float | None = summary.get(name, {}).get("value")
-        return found
+        entry: float | None = summary.get(name, {}).get("value")
+        return entry
 
     coverage, error, p90 = (value(f"gated.{k}") for k in ("coverage", "median_rel", "p90_rel"))
-    raw, loose = value("device_raw.median_rel"), value("no_gates.p90_rel")
-    if coverage is None or error is None or p90 is None or loose is None:
+    raw, ungated_p90 = value("device_raw.median_rel"), value("no_gates.p90_rel")
+    if coverage is None or error is None or p90 is None or ungated_p90 is None:
         return None, "no scene on which the gated method answered"
-    device = "no answer" if raw is None else f"{raw:.1%}"
+    raw_text = "no answer" if raw is None else f"{raw:.1%}"
     why = (
-        f"gated: coverage {coverage:.1%}, median error {error:.1%}, p90 {p90:.1%} ({loose:.1%} without gates); "
-        f"raw device trajectory: {device} (medians over scenes)"
+        f"gated: coverage {coverage:.1%}, median error {error:.1%}, p90 {p90:.1%} ({ungated_p90:.1%} without gates); "
+        f"raw device trajectory: {raw_text} (medians over scenes)"
     )
-    return coverage >= 0.25 and (raw is None or error < raw) and p90 < loose, why
+    return coverage >= 0.25 and (raw is None or error < raw) and p90 < ungated_p90, why
 
 
 def _truth_columns(answer: Answer) -> Row:

@@ -27,13 +27,13 @@ def run(
     *,
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """Gated and ungated on the sensor's true drop-outs, beside the same method on hidden far returns.
+    """Errors with and without gates on the sensor's own drop-outs and on hidden far returns.
 
-    Needs independent truth: other scenes keep a row that says so. A drop-out counts when it survives the filter of
-    :func:`dhtorch.metrics.holdout.select_real_holes`; ``n_dropped`` says what did not. Cohorts: ``full`` (hidden
+    Needs independent truth: other scenes have a row with a note. A drop-out counts if it passes the filter of
+    :func:`dhtorch.metrics.holdout.select_real_holes`; ``n_dropped`` counts the others. Cohorts: ``full`` (hidden
     returns) and ``real_holes``; variants ``no_gates`` and ``gated``.
 
-    Args and errors: as :func:`dhtorch.experiments.protocol.run`; of ``methods`` the first is asked.
+    Args and errors: as :func:`dhtorch.experiments.protocol.run`; of ``methods`` the first is used.
     Source: paper, "Real holes are harder than masked ones".
     """
     method = next(iter(methods.values()))
@@ -42,20 +42,20 @@ def run(
         "gated": Variant(method, needs=missing_truth_reason),
     }
     cohorts = {"full": protocol.held_back_truth, "real_holes": real_holes}
-    asked = Protocol(variants, cohorts, min_candidates=1)
-    outcome = protocol.run(scenes, asked, pairs, settings, progress=progress)
+    hole_protocol = Protocol(variants, cohorts, min_candidates=1)
+    outcome = protocol.run(scenes, hole_protocol, pairs, settings, progress=progress)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 
 def verdict(outcome: Outcome) -> tuple[bool | None, str]:
-    """Compare the two cohorts of the gated method, and name the scenes without an answer."""
+    """(the gated method has the larger error on real holes; both errors, scenes without an answer)."""
     holes = outcome.scenes("gated", "real_holes")
     real, hidden = (outcome.summary.get(f"gated.{k}median_rel", {}).get("value") for k in ("", "full."))
     measured = {s: r for s, r in holes.items() if r.get("n_candidates")}
-    silent = [s for s, r in measured.items() if not r["n_kept"]]
+    unanswered = [s for s, r in measured.items() if not r["n_kept"]]
     n = sum(r["n_candidates"] for r in measured.values())
     counted = f"{n} drop-outs on {len(measured)} of {len(holes)} scenes survive the filter"
-    none = f"; no answer on {', '.join(silent)}" if silent else ""
+    note = f"; no answer on {', '.join(unanswered)}" if unanswered else ""
     if real is None or hidden is None:
-        return None, counted + none
-    return real > hidden, f"{counted}; median error {real:.1%} against {hidden:.1%} on hidden returns{none}"
+        return None, counted + note
+    return real > hidden, f"{counted}; median error {real:.1%} against {hidden:.1%} on hidden returns{note}"

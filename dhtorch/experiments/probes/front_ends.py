@@ -1,6 +1,6 @@
-"""What a probe is given of a picture: downsampled pixels, pooled depth tokens, or pooled patch tokens of a network.
+"""Front ends of the probes: image to feature vector, from downsampled pixels, pooled depth tokens or a network.
 
-Every front end turns frames into one row of numbers each, of fixed length and finite, whatever the frame.
+Every front end computes a feature vector of fixed length with finite values, whatever the frame.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from dhtorch.pipeline.method import Method
 from dhtorch.records import NO_HINT, Frame, TrackHint
 from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth, token_grid
 
-#: Channels of a depth token that say something only where the patch has an answer.
+#: Channels of a depth token that are defined only where the patch has a depth.
 _ANSWER_CHANNELS = ("inverse_depth", "sigma")
 
-#: Pictures that a network is given at once.
+#: Batch size of a network, in images.
 _MAX_IMAGES_PER_CALL = 8
 
 
 class FrontEnd(Protocol):
-    """A frame, and another one where there are two views, → features (1, F) float32."""
+    """Protocol of a front end: a frame and, with two views, a second one → features (1, F) float32."""
 
     def __call__(self, frame: Frame, other: Frame | None = None) -> Tensor:
         """Features of ``frame``."""
@@ -36,23 +36,23 @@ class FrontEnd(Protocol):
 
 
 def resize_to_square(frame: Frame, other: Frame | None = None, *, side: int = 16) -> Tensor:
-    """The picture shrunk to ``side`` × ``side`` by area, three channels in [0, 1]."""
+    """Image averaged over areas to ``side`` × ``side`` pixels, three channels in [0, 1], flattened: (B, 3 · side²)."""
     image = frame.image / 255 if frame.image.dtype == torch.uint8 else frame.image
     small = torch.nn.functional.adaptive_avg_pool2d(image.float(), side)
     return small.expand(-1, 3, -1, -1).flatten(1)
 
 
 def pool_tokens(tokens: Tensor, valid: Tensor, patches: tuple[int, int], cells: int) -> Tensor:
-    """Depth tokens of a patch grid → ``cells`` × ``cells`` larger cells, (B, cells² · C).
+    """Depth tokens of a patch grid, averaged over ``cells`` × ``cells`` larger cells: (B, cells² · C).
 
-    Shares are averaged over the patches of a cell; what speaks of answers (inverse depth, sigma) over the patches that
-    have one, 0 where none has.
+    Fractions are averaged over all patches of a cell; inverse depth and sigma over the patches with a depth, 0 if none
+    has one.
 
     Args:
         tokens: (B, P, C) of :data:`dhtorch.transforms.TOKEN_CHANNELS`.
         valid: (B, P).
         patches: rows and columns, P in all.
-        cells: cells a side.
+        cells: cells per side.
 
     Raises:
         ValueError: wrong shapes.
@@ -62,17 +62,17 @@ def pool_tokens(tokens: Tensor, valid: Tensor, patches: tuple[int, int], cells: 
     check("pool_tokens", tokens=(tokens, f"B P {len(TOKEN_CHANNELS)}"), valid=(valid, "B P"))
     if patches[0] * patches[1] != tokens.shape[1]:
         raise ValueError(f"pool_tokens: found {tokens.shape[1]} tokens, expected {patches[0]} x {patches[1]}")
-    of_answers = torch.tensor([name in _ANSWER_CHANNELS for name in TOKEN_CHANNELS], device=tokens.device)
-    use = torch.where(of_answers, valid[..., None], True).to(tokens)
+    needs_depth = torch.tensor([name in _ANSWER_CHANNELS for name in TOKEN_CHANNELS], device=tokens.device)
+    weight = torch.where(needs_depth, valid[..., None], True).to(tokens)
 
     def mean(x: Tensor) -> Tensor:
         return torch.nn.functional.adaptive_avg_pool2d(x.mT.unflatten(-1, patches), cells)
 
-    return (mean(tokens * use) / mean(use).clamp_min(1e-6)).flatten(1)
+    return (mean(tokens * weight) / mean(weight).clamp_min(1e-6)).flatten(1)
 
 
 class DepthTokens:
-    """Depth tokens of :class:`dhtorch.transforms.ExtendDepth`, pooled; with ``views=1`` of the front end alone."""
+    """Pooled depth tokens of :class:`dhtorch.transforms.ExtendDepth`; ``views=1``: without a second view."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class DepthTokens:
     ) -> None:
         self.views, self.cells = views, cells
         self.patches = token_grid((side, side), patch=patch)
-        self._extended = partial(
+        self._make_transform = partial(
             ExtendDepth,
             method=method,
             patch=patch,
@@ -105,18 +105,18 @@ class DepthTokens:
         return self.features_and_keys(frame, other)[0]
 
     def features_and_keys(self, frame: Frame, other: Frame | None = None) -> tuple[Tensor, Mapping[str, Any]]:
-        """Features, and all that the transform added."""
+        """Features (1, cells² · 10), and the entries that the transform added, without its prefix."""
         frames = [frame] if other is None or self.views == 1 else [other, frame]
         sample = _as_sample(frames)
-        given: dict[str, Any] = {k: k for k in ("depth_intrinsics", "confidence") if k in sample}
-        transform = self._extended(**given)
+        optional_keys: dict[str, Any] = {k: k for k in ("depth_intrinsics", "confidence") if k in sample}
+        transform = self._make_transform(**optional_keys)
         added = {k.removeprefix(transform.prefix): v for k, v in (transform(sample) or {}).items()}
         features = pool_tokens(added["tokens"][None], added["tokens_valid"][None], self.patches, self.cells)
         return features.float(), added
 
 
 class PatchTokens:
-    """DINOv2: its class token, and its patch tokens averaged over ``cells`` × ``cells`` parts of the picture."""
+    """DINOv2 features: class token, and patch tokens averaged over ``cells`` × ``cells`` parts of the image."""
 
     def __init__(self, network: torch.nn.Module, *, cells: int = 1, side: int = 224) -> None:
         self.network, self.cells, self.side = network, cells, side
@@ -128,21 +128,21 @@ class PatchTokens:
     @torch.no_grad()
     def many(self, frames: list[Frame]) -> Tensor:
         """Features (len(frames), (1 + cells²) · hidden)."""
-        found = []
+        features = []
         for k in range(0, len(frames), _MAX_IMAGES_PER_CALL):
             image = torch.cat(
                 [dinov2.preprocess_image(f.image, self.side) for f in frames[k : k + _MAX_IMAGES_PER_CALL]]
             )
             hidden = self.network(pixel_values=image.float()).last_hidden_state
-            across = round((hidden.shape[1] - 1) ** 0.5)
-            patches = hidden[:, 1:].mT.unflatten(-1, (across, across))
+            side = round((hidden.shape[1] - 1) ** 0.5)
+            patches = hidden[:, 1:].mT.unflatten(-1, (side, side))
             coarse = torch.nn.functional.adaptive_avg_pool2d(patches, self.cells)
-            found.append(torch.cat((hidden[:, 0], coarse.flatten(1)), 1))
-        return torch.cat(found).float()
+            features.append(torch.cat((hidden[:, 0], coarse.flatten(1)), 1))
+        return torch.cat(features).float()
 
 
 class DenseFeatures:
-    """XFeat: its descriptors of unit length, averaged over ``cells`` × ``cells`` parts of the picture."""
+    """XFeat features: unit-length descriptors averaged over ``cells`` × ``cells`` parts of the image."""
 
     def __init__(self, network: torch.nn.Module, *, cells: int = 2, longest_px: int = 640) -> None:
         self.network, self.cells, self.longest_px = network, cells, longest_px
@@ -150,14 +150,14 @@ class DenseFeatures:
     @torch.no_grad()
     def __call__(self, frame: Frame, other: Frame | None = None) -> Tensor:
         """Features (1, cells² · 64)."""
-        (found,) = xfeat.extract_xfeat(self.network, frame.image, scale=1.0, longest_px=self.longest_px)
-        return torch.nn.functional.adaptive_avg_pool2d(found.D[None], self.cells).flatten(1).float()
+        (features,) = xfeat.extract_xfeat(self.network, frame.image, scale=1.0, longest_px=self.longest_px)
+        return torch.nn.functional.adaptive_avg_pool2d(features.D[None], self.cells).flatten(1).float()
 
 
 def load_visual_front_end(
     build: Callable[..., torch.nn.Module] | None, *, cells: int, device: str
 ) -> tuple[PatchTokens | None, bool]:
-    """The DINOv2 front end that the settings ask for, and whether its weights are real; None where left out.
+    """The DINOv2 front end of the settings (None = left out), and whether its weights are trained ones.
 
     Args:
         build: such as a partial of :func:`dhtorch.experiments.baselines.dinov2.load_dinov2`; None = leave it out.
@@ -176,33 +176,33 @@ def load_visual_front_end(
 def load_network_front_ends(
     dinov2: Callable[..., torch.nn.Module] | None, *, cells: int, xfeat_too: bool, device: str
 ) -> tuple[dict[str, FrontEnd], bool]:
-    """The front ends of networks by the name of their block, and whether DINOv2's weights are real.
+    """Network front ends by the name of their block, and whether the weights of DINOv2 are trained ones.
 
     Args:
         dinov2, cells, device: as :func:`load_visual_front_end` takes them.
-        xfeat_too: XFeat as well, with the weights of its package.
+        xfeat_too: also load XFeat, with the weights of its package.
 
     Raises:
         ImportError: a network's package is missing; the message says what to install.
     """
-    network, real = load_visual_front_end(dinov2, cells=cells, device=device)
-    found: dict[str, FrontEnd] = {} if network is None else {"dinov2": network}
-    return found | ({"xfeat": DenseFeatures(xfeat.load_xfeat(device))} if xfeat_too else {}), real
+    network, trained = load_visual_front_end(dinov2, cells=cells, device=device)
+    front_ends: dict[str, FrontEnd] = {} if network is None else {"dinov2": network}
+    return front_ends | ({"xfeat": DenseFeatures(xfeat.load_xfeat(device))} if xfeat_too else {}), trained
 
 
 def depth_tokens_for_scene(method: Method, scene: Scene, **options: Any) -> DepthTokens:
-    """Depth tokens of a method with what a scene asks for."""
+    """Depth tokens of a method with the track hint and sparsity of a scene."""
     return DepthTokens(method, hint=scene.hint, sparse=scene.recording.sparse, **options)
 
 
 def _as_sample(frames: list[Frame]) -> dict[str, Tensor]:
-    """Frames along time as the dict of one sample; their cameras are one."""
+    """Frames in order of time as one sample dictionary; all have the camera of the last frame."""
     last = frames[-1]
     sample = {
         "image": torch.cat([f.image for f in frames]),
         "depth": torch.cat([f.depth for f in frames]),
         "intrinsics": cam.to_matrix(last.camera)[0],
-        "distortion": _lens(last),
+        "distortion": _distortion(last),
     }
     if last.depth_camera is not None:
         sample["depth_intrinsics"] = cam.to_matrix(last.depth_camera)[0]
@@ -211,6 +211,7 @@ def _as_sample(frames: list[Frame]) -> dict[str, Tensor]:
     return sample
 
 
-def _lens(frame: Frame) -> Tensor:
-    lens = frame.camera.distortion
-    return frame.camera.f.new_zeros(5) if lens is None else lens[0]
+def _distortion(frame: Frame) -> Tensor:
+    """Distortion coefficients of a frame's camera; five zeros without distortion."""
+    coefficients = frame.camera.distortion
+    return frame.camera.f.new_zeros(5) if coefficients is None else coefficients[0]

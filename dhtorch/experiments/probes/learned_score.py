@@ -30,15 +30,15 @@ from dhtorch.stages.score import LearnedScore, confidence, confidence_from_error
 QUESTION = "Does a score learnt from errors order answers better, in rooms it has not seen, than those made by hand?"
 EXPECTATION = "Its AURC is lower than that of the paper's score and of rank_by_error, as a geometric mean over scenes."
 
-#: The scores made by hand.
+#: Hand-designed scores: variant → function.
 _HAND_MADE_SCORES = {"paper": confidence, "by_error": confidence_from_error}
 
 
 @record
 class LabelledAnswers(Record):
-    """Answers of one scene with truth."""
+    """Score features and relative errors of the answers of one scene that have ground truth."""
 
-    x: Tensor  # (P, 8) evidence
+    x: Tensor  # (P, 8) features of the score
     error: Tensor  # (P,) relative error
 
 
@@ -56,54 +56,56 @@ def run(
     save: str | None = None,
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
-    """One method, its answers scored three ways; the learned score of a scene has seen the other rooms only.
+    """Run the experiment: answers of one method with three scores; the learned score is cross-validated over rooms.
 
-    Variants ``paper``, ``by_error`` and ``learned``, whose answers differ in nothing but the score. Recordings of one
+    The answers of the variants ``paper``, ``by_error`` and ``learned`` differ only in the score. Recordings of one
     place (``room``), and those of one folder, are one room.
 
     Args:
         scenes, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
-        methods: name → method of two views; the first is asked.
+        methods: name → method of two views; the first is run.
         hidden, steps, learning_rate, weight_decay, most: of :func:`train_score`.
         save: file for the scorer trained on all scenes, JSON; null = none.
 
     Returns:
-        Outcome; the summary holds ``learned.aurc_ratio`` (against the paper's score), ``by_error.aurc_ratio`` (the
-        same) and ``learned.aurc_ratio_by_error``. With fewer than two rooms there is no ``learned``.
+        Outcome; the summary holds ``learned.aurc_ratio`` (to the paper's score), ``by_error.aurc_ratio``
+        (likewise) and ``learned.aurc_ratio_by_error``. With fewer than two rooms there is no ``learned``.
 
     Raises:
-        ValueError: a method of several views; else as the main job.
+        ValueError: a method of several views; otherwise as the main job.
     """
     name, method = next(iter(methods.items()))
     if method.views > 1:
-        raise ValueError(f"experiment.method: found {name}, which looks at several views, expected one of two views")
+        raise ValueError(f"experiment.method: found {name}, a method of several views, expected a method of two views")
     answers = _AnswerCache()
-    protocol.run(scenes, Protocol({name: Variant(method)}, {"full": answers.look}), pairs, settings, progress=progress)
+    protocol.run(scenes, Protocol({name: Variant(method)}, {"full": answers.store}), pairs, settings, progress=progress)
     options: dict[str, Any] = {"hidden": hidden, "steps": steps, "learning_rate": learning_rate}
     options |= {"weight_decay": weight_decay, "most": most}
     rooms = {scene.name: _room_name(scene) for scene in scenes_of(scenes)}
     learned = {}
     for room in dict.fromkeys(rooms.values()):
-        others = {scene: lesson for scene, lesson in answers.lessons().items() if rooms[scene] != room}
-        if others:
-            learned[room] = train_score(list(others.values()), **options)
-    given: dict[str, Callable[[Batch], Mapping[str, Any]]] = {
-        "learned": lambda batch: answers.again(batch, score=learned[_room_name(batch.scene)])
+        training_answers = {scene: labelled for scene, labelled in answers.labelled().items() if rooms[scene] != room}
+        if training_answers:
+            learned[room] = train_score(list(training_answers.values()), **options)
+    options_by_score: dict[str, Callable[[Batch], Mapping[str, Any]]] = {
+        "learned": lambda batch: answers.rescore(batch, score=learned[_room_name(batch.scene)])
     }
-    given = {score: partial(answers.again, score=fn) for score, fn in _HAND_MADE_SCORES.items()} | given
+    options_by_score = {
+        score: partial(answers.rescore, score=fn) for score, fn in _HAND_MADE_SCORES.items()
+    } | options_by_score
     needs = {"learned": lambda scene: None if _room_name(scene) in learned else "no other room to learn from"}
     variants = {
-        score: Variant(method, fit=answers.fit, given=of, needs=needs.get(score, Variant.needs))
-        for score, of in given.items()
+        score: Variant(method, fit=answers.fit, given=make_options, needs=needs.get(score, Variant.needs))
+        for score, make_options in options_by_score.items()
     }
     outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
-    found = compare_scores(outcome, {scene.name for scene in scenes_of(scenes) if scene.role is not None})
-    outcome.summary |= {k: v.entry() for k, v in found.items()}
-    if save is not None and answers.lessons():
-        scorer = train_score(list(answers.lessons().values()), **options)
-        scorer.provenance = {"method": name, "scenes": [*answers.lessons()], "seed": settings.seed, **options}
+    ratios = compare_scores(outcome, {scene.name for scene in scenes_of(scenes) if scene.role is not None})
+    outcome.summary |= {k: v.entry() for k, v in ratios.items()}
+    if save is not None and answers.labelled():
+        scorer = train_score(list(answers.labelled().values()), **options)
+        scorer.provenance = {"method": name, "scenes": [*answers.labelled()], "seed": settings.seed, **options}
         scorer.save(Path(save))
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(found))
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(ratios))
 
 
 def train_score(
@@ -116,24 +118,28 @@ def train_score(
     most: int = 1000,
     seed: int = 0,
 ) -> LearnedScore:
-    """A scorer fitted to answers with truth, every scene of the same weight.
+    """Train a scorer on answers with ground truth; every scene has the same weight.
 
     Args:
-        lessons: one a scene; empty ones are passed over.
+        lessons: answers of each scene; empty ones are skipped.
         hidden: width of the hidden layer.
-        steps, learning_rate, weight_decay: of AdamW on all answers at once, the rate falling to zero along a cosine.
-        most: answers of a scene that are looked at, taken evenly.
-        seed: of the first weights.
+        steps, learning_rate, weight_decay: of AdamW, full batch; the learning rate decays to zero along a cosine.
+        most: largest number of answers of a scene, evenly spaced.
+        seed: of the initial weights.
 
     Raises:
-        ValueError: no answer in any lesson.
+        ValueError: no answer in any scene.
     """
-    lessons = [v[:: max(1, -(-v.error.numel() // most))] for v in lessons if v.error.numel()]
+    lessons = [
+        labelled[:: max(1, -(-labelled.error.numel() // most))] for labelled in lessons if labelled.error.numel()
+    ]
     if not lessons:
-        raise ValueError("train_score: found no answer with truth, expected some")
-    every = collate(lessons)
-    x, error = every.x.detach().float(), every.error.detach().float()
-    weight = torch.cat([torch.full_like(v.error, 1 / v.error.numel() / len(lessons)) for v in lessons]).float()
+        raise ValueError("train_score: found no answer with ground truth, expected at least one")
+    answers = collate(lessons)
+    x, error = answers.x.detach().float(), answers.error.detach().float()
+    weight = torch.cat(
+        [torch.full_like(labelled.error, 1 / labelled.error.numel() / len(lessons)) for labelled in lessons]
+    ).float()
     scorer = LearnedScore(hidden, seed=seed).to(x.device)
     scorer.mean.copy_(x.mean(0))
     scorer.spread.copy_(x.std(0).clamp_min(1e-3) if len(x) > 1 else torch.ones_like(x[0]))
@@ -149,80 +155,82 @@ def train_score(
 
 
 def label_answers(trace: Trace, true_depth: Tensor, counts: Tensor) -> LabelledAnswers:
-    """The answers of a batch of pairs that count, with evidence and error.
+    """Score features and relative errors of the answers of a batch that have ground truth.
 
     Args:
         trace: of ``extend``.
         true_depth: (B, N) m.
-        counts: (B, N) bool, where it is known; other depths are not read.
+        counts: (B, N) bool, where ``true_depth`` is valid; other depths are not read.
     """
-    x, stated = score_features(trace["estimate"], trace["samples"], trace["tracks_ideal"], trace["fit"])
-    used = counts & stated
+    x, answered = score_features(trace["estimate"], trace["samples"], trace["tracks_ideal"], trace["fit"])
+    used = counts & answered
     return LabelledAnswers(x[used], ((trace["estimate"].depth - true_depth).abs() / true_depth)[used])
 
 
 def compare_scores(outcome: Outcome, apart: set[str]) -> dict[str, bootstrap.Interval]:
-    """Geometric means over scenes of the ratios of AURC; scenes apart and those with few answers stay out."""
+    """Geometric means over scenes of AURC ratios; scenes in ``apart`` and those with few answers are left out."""
     seeds: dict[str, dict[str, list[Any]]] = {}
     for (scene, variant, cohort), points in outcome.points.items():
         if cohort == "full" and scene not in apart:
             seeds.setdefault(variant, {})[scene] = [points]
-    found = {}
+    intervals = {}
     for name, ours, theirs in (
         ("by_error.aurc_ratio", "by_error", "paper"),
         ("learned.aurc_ratio", "learned", "paper"),
         ("learned.aurc_ratio_by_error", "learned", "by_error"),
     ):
-        mine = seeds.get(ours, {})
-        ratios, _ = compare.ratio_over_seeds(mine, seeds.get(theirs, {}), lambda p: risk.measure_risk(p)["aurc"])
-        found[name] = bootstrap.interval_over_scenes(list(ratios.values()), statistic="geometric_mean")
-    return found
+        own_points = seeds.get(ours, {})
+        ratios, _ = compare.ratio_over_seeds(own_points, seeds.get(theirs, {}), lambda p: risk.measure_risk(p)["aurc"])
+        intervals[name] = bootstrap.interval_over_scenes(list(ratios.values()), statistic="geometric_mean")
+    return intervals
 
 
 def verdict(found: Mapping[str, bootstrap.Interval]) -> tuple[bool | None, str]:
-    """Hold the learned score against both made by hand."""
+    """Verdict and text from the AURC ratios of the learned score to both hand-designed scores."""
     ratios = [found["learned.aurc_ratio"], found["learned.aurc_ratio_by_error"]]
-    if any(r.value is None or r.high is None for r in ratios):
+    if any(ratio.value is None or ratio.high is None for ratio in ratios):
         return None, "fewer than two rooms with answers"
-    shown = [f"{r.value:.3f} ({r.low:.3f}–{r.high:.3f})" for r in ratios]
-    why = f"AURC {shown[0]} of the paper's score, {shown[1]} of rank_by_error's, over {ratios[0].n} scenes"
-    worse, better = any(r.value >= 1 for r in ratios), all(r.high < 1 for r in ratios)  # type: ignore[operator]
+    texts = [f"{ratio.value:.3f} ({ratio.low:.3f}–{ratio.high:.3f})" for ratio in ratios]
+    why = f"AURC {texts[0]} of the paper's score, {texts[1]} of rank_by_error's, over {ratios[0].n} scenes"
+    worse, better = any(ratio.value >= 1 for ratio in ratios), all(ratio.high < 1 for ratio in ratios)  # type: ignore[operator]
     return (False if worse else True if better else None), why
 
 
 class _AnswerCache:
-    """What the method found in every batch, so that scoring it again does not track and pose again."""
+    """Tracks and pose of every batch, reused by the other scores."""
 
     def __init__(self) -> None:
-        self._known: dict[Any, tuple[Tracks, PoseFit]] = {}
-        self._lessons: dict[str, list[LabelledAnswers]] = {}
+        self._fits: dict[Any, tuple[Tracks, PoseFit]] = {}
+        self._answers: dict[str, list[LabelledAnswers]] = {}
 
-    def look(self, batch: Batch, trace: Trace) -> Any:
-        """The cohort of the range split; on the way, everything is remembered."""
+    def store(self, batch: Batch, trace: Trace) -> Any:
+        """Ground truth of the held-out returns of a batch; stores its tracks, pose and labelled answers."""
         truth = protocol.held_back_truth(batch, trace)
-        self._known[_batch_key(batch)] = trace["tracks"], trace["fit"]
+        self._fits[_batch_key(batch)] = trace["tracks"], trace["fit"]
         if batch.scene.role is None:
-            self._lessons.setdefault(batch.scene.name, []).append(label_answers(trace, truth.depth, truth.ok))
+            self._answers.setdefault(batch.scene.name, []).append(label_answers(trace, truth.depth, truth.ok))
         return truth
 
-    def lessons(self) -> dict[str, LabelledAnswers]:
-        """Scene → its answers with truth, scenes without any left out."""
-        joined = {scene: collate(parts) for scene, parts in self._lessons.items()}
-        return {scene: whole for scene, whole in joined.items() if whole.error.numel()}
+    def labelled(self) -> dict[str, LabelledAnswers]:
+        """Scene → its labelled answers; scenes without any are left out."""
+        joined = {scene: collate(parts) for scene, parts in self._answers.items()}
+        return {scene: labelled for scene, labelled in joined.items() if labelled.error.numel()}
 
     def fit(self, batch: Batch, _n: int) -> PoseFit:
-        """The pose that was found."""
-        return self._known[_batch_key(batch)][1]
+        """Stored pose of a batch."""
+        return self._fits[_batch_key(batch)][1]
 
-    def again(self, batch: Batch, score: Any) -> dict[str, Any]:
-        """Options that give the same answers with another score."""
-        tracks = self._known[_batch_key(batch)][0]
+    def rescore(self, batch: Batch, score: Any) -> dict[str, Any]:
+        """Options of the method that reuse the stored tracks with another score."""
+        tracks = self._fits[_batch_key(batch)][0]
         return {"track": lambda *_, **__: tracks, "score": score}
 
 
 def _batch_key(batch: Batch) -> tuple[str, tuple[tuple[int, int], ...]]:
+    """Key of a batch: scene and pairs of frames."""
     return batch.scene.name, tuple(to_fixed_pairs(batch.pairs))
 
 
 def _room_name(scene: Scene) -> str:
+    """Room of a scene, or the first folder of its name."""
     return scene.room or scene.name.split("/")[0]

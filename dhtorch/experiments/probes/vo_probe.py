@@ -1,11 +1,11 @@
 """Question: within one scene, do depth features tell a ridge probe more of the camera's own motion than DINOv2's do?
 
 Samples are pairs of frames, a third of the scene's usable gap apart; the target is how the camera moved between them,
-rotation vector and translation by the recording's own trajectory. The probe is given the features of the first frame
-and how they change to the second; depth tokens of either frame have the other one as second view. A sequence is cut
-into consecutive blocks, none of which shares a frame with another, and whole blocks are held out: every block is judged
-on once. There is no context, so the arm ``context`` says the mean motion. ``two_view_pose`` is no probe: it is the
-method's own pose, no motion where there is none, what the geometry says once it is allowed to finish.
+rotation vector and translation from the recording's own trajectory. The input of the probe is the features of the
+first frame and their change to the second; depth tokens of either frame have the other one as second view. A sequence
+is cut into consecutive blocks that share no frame, and whole blocks are held out: every block is evaluated once. There is
+no context, so the arm ``context`` predicts the mean motion. ``two_view_pose`` is no probe but the method's own relative
+pose, no motion if it has none: the estimate of the geometry itself.
 
 Expectation (written before the run): yes; on every scene the error with depth features is smaller than DINOv2's (the
 paper: 1.32 against 1.63, ratio 0.81, one scene, geometry-favoured as it says itself).
@@ -45,7 +45,7 @@ from dhtorch.records import Frame
 QUESTION = "Within one scene, do depth features tell a ridge probe more of the camera's motion than DINOv2's do?"
 EXPECTATION = "Yes: on every scene the error with depth features is smaller than DINOv2's."
 
-#: Block of a shard that holds the method's own answer.
+#: Block of a shard with the method's own relative pose.
 _OWN_POSE_BLOCK = "pose"
 
 _OURS, _POSE_ARM = "dhtorch", "two_view_pose"
@@ -69,22 +69,22 @@ def run(
     xfeat: bool = False,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Probes of every scene alone; scenes of one room are one.
+    """Run the experiment: ridge probes of every scene separately, verdict; scenes of one room are joined.
 
     Args:
-        scenes: with poses; those without, with a role, or of rooms with few pairs are noted and left out.
+        scenes: with poses; those without, with a role, or of rooms with few pairs are left out, with a note.
         methods: name → method; the first fills the depth tokens.
-        pairs: not used: every frame starts a pair, so that there are enough.
-        settings: of the job; nothing is hidden from the method.
-        gap_parts: a pair spans the scene's own gap, divided by this, and at least one frame.
-        blocks: consecutive parts of a scene, at least three; dealt out evenly over the scenes of a room.
-        min_pairs: fewest pairs of a scene.
-        moving: m; a pair moves where the camera has gone farther.
+        pairs: not used: every frame starts a pair, to have enough samples.
+        settings: of the job; the method sees all returns.
+        gap_parts: the frames of a pair are the scene's own gap divided by this apart, at least one frame.
+        blocks: consecutive parts of a scene, at least three; split evenly over the scenes of a room.
+        min_pairs: smallest number of pairs of a scene.
+        moving: m; a pair moves if the camera's translation is larger.
         penalties, depth_cells, dinov2_cells, rgb_side, dinov2, xfeat, progress: as
             :func:`dhtorch.experiments.probes.rh20t_probe.run`.
 
     Returns:
-        Outcome with one row per scene and arm; see :func:`probing.record`.
+        Outcome with one row per scene and arm; see :func:`probing.record_probes`.
 
     Raises:
         ImportError: ``transformers`` or XFeat's package is missing; the message says what to install.
@@ -97,42 +97,42 @@ def run(
     networks, real = front_ends.load_network_front_ends(
         dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device
     )
-    every = [*(arm for arm, blocks in PROBE_ARMS.items() if xfeat or XFEAT_BLOCK not in blocks), _POSE_ARM]
+    arm_names = [*(arm for arm, blocks in PROBE_ARMS.items() if xfeat or XFEAT_BLOCK not in blocks), _POSE_ARM]
     outcome = Outcome()
     rooms: dict[str, list[Scene]] = {}
     for scene in scenes_of(scenes):
         rooms.setdefault(scene.place, []).append(scene)
     for room, members in rooms.items():
-        cut = {s.name: split_into_blocks(s, gap_parts, max(1, -(-blocks // len(members)))) for s in members}
-        n = sum(len(block) for own in cut.values() for block in own)
-        if n < min_pairs:
-            note = f"{n} pairs with known motion, fewer than {min_pairs}"
-            outcome.rows += [_empty_row(room, arm, note) for arm in every]
+        blocks_of = {s.name: split_into_blocks(s, gap_parts, max(1, -(-blocks // len(members)))) for s in members}
+        n_pairs = sum(len(block) for scene_blocks in blocks_of.values() for block in scene_blocks)
+        if n_pairs < min_pairs:
+            note = f"{n_pairs} pairs with known motion, fewer than {min_pairs}"
+            outcome.rows += [_empty_row(room, arm, note) for arm in arm_names]
             continue
         with ProbeShards() as shards:
             for scene in members:
                 options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
-                two, one = (
+                two_view, one_view = (
                     front_ends.depth_tokens_for_scene(next(iter(methods.values())), scene, views=v, **options)
                     for v in (2, 1)
                 )
-                look = _PairFeatures(scene.recording, settings, two, one, networks, rgb_side)
-                found = [pair for block in cut[scene.name] for pair in block]
-                rows = iter([look(*pair) for pair in progress(found, scene.name, len(found))])
-                for k, block in enumerate(cut[scene.name]):
-                    own = [next(rows) for _ in block]
-                    shards.add(_make_shard(f"{scene.name} {k}", own, scene.recording, block, moving))
+                features_of = _PairFeatures(scene.recording, settings, two_view, one_view, networks, rgb_side)
+                pairs_of_scene = [pair for block in blocks_of[scene.name] for pair in block]
+                rows = iter([features_of(*pair) for pair in progress(pairs_of_scene, scene.name, len(pairs_of_scene))])
+                for k, block in enumerate(blocks_of[scene.name]):
+                    features = [next(rows) for _ in block]
+                    shards.add(_make_shard(f"{scene.name} {k}", features, scene.recording, block, moving))
             arms = {k: names for k, names in PROBE_ARMS.items() if set(names) <= set(shards.widths)}
             options = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
             judged = probing.evaluate_probes(shards, arms, told={_POSE_ARM: _OWN_POSE_BLOCK}, **options)
         probing.record_probes(outcome, judged, room)
-        outcome.n_pairs += n
-    outcome.summary = probing.summarise_over_scenes(outcome, every)
+        outcome.n_pairs += n_pairs
+    outcome.summary = probing.summarise_over_scenes(outcome, arm_names)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, real))
 
 
 def split_into_blocks(scene: Scene, gap_parts: int, n: int) -> list[list[tuple[int, int]]]:
-    """Pairs of frames in ``n`` consecutive blocks that share no frame; none where the motion is not known."""
+    """Pairs of frames in ``n`` consecutive blocks that share no frame; empty without poses or with a role."""
     length = len(scene.recording)
     if scene.recording.poses is None or scene.role is not None or length < 2 * n:
         return []
@@ -142,17 +142,17 @@ def split_into_blocks(scene: Scene, gap_parts: int, n: int) -> list[list[tuple[i
 
 
 def verdict(outcome: Outcome, real: bool) -> tuple[bool | None, str]:
-    """Is the error smaller than DINOv2's on every scene? Never decided without DINOv2's own weights."""
+    """Verdict and text: error below DINOv2's on every scene; None with random DINOv2 weights."""
     ours, theirs = outcome.scenes(_OURS, PROBE_TRUTH), outcome.scenes(REFERENCE_BLOCK, PROBE_TRUTH)
-    beside = probing.compare_with_xfeat(
+    xfeat_text = probing.compare_with_xfeat(
         {s: (row.get("vs_xfeat"), row.get("vs_xfeat_low"), row.get("vs_xfeat_high")) for s, row in ours.items()}
     )
     scenes = [s for s in ours if ours[s].get("mse") is not None and theirs.get(s, {}).get("mse") is not None]
     if not scenes:
-        known = any(row.get("mse") is not None for row in ours.values())
-        return None, f"{'DINOv2 was left out' if known else 'no scene with enough pairs'}{beside}"
+        has_error = any(row.get("mse") is not None for row in ours.values())
+        return None, f"{'DINOv2 was left out' if has_error else 'no scene with enough pairs'}{xfeat_text}"
     parts = [f"{s} {ours[s]['mse']:.2f} against {theirs[s]['mse']:.2f}{_format_interval(ours[s])}" for s in scenes]
-    text = f"{'; '.join(parts)} (paper: 1.32 against 1.63, ratio 0.81){beside}"
+    text = f"{'; '.join(parts)} (paper: 1.32 against 1.63, ratio 0.81){xfeat_text}"
     if not real:
         return None, f"{probing.RANDOM_WEIGHTS_NOTE}; error with depth features and with the random network: {text}"
     below = [ours[s]["vs_dinov2_high"] is not None and ours[s]["vs_dinov2_high"] < 1 for s in scenes]
@@ -162,41 +162,47 @@ def verdict(outcome: Outcome, real: bool) -> tuple[bool | None, str]:
 
 
 class _PairFeatures:
-    """Features of the pairs of one recording; a frame's own are computed once."""
+    """Features of the pairs of one recording; single-frame features are computed once per frame."""
 
     def __init__(
         self,
         recording: Recording,
         settings: Settings,
-        two: front_ends.DepthTokens,
-        one: front_ends.DepthTokens,
+        two_view: front_ends.DepthTokens,
+        one_view: front_ends.DepthTokens,
         networks: Mapping[str, front_ends.FrontEnd],
         rgb_side: int,
     ) -> None:
-        self.recording, self.settings, self.two, self.one = recording, settings, two, one
+        self.recording, self.settings, self.two_view, self.one_view = recording, settings, two_view, one_view
         self.networks, self.rgb_side = networks, rgb_side
-        self._known: dict[int, tuple[Frame, dict[str, Tensor]]] = {}
+        self._cache: dict[int, tuple[Frame, dict[str, Tensor]]] = {}
 
     @torch.no_grad()
     def __call__(self, i: int, j: int) -> dict[str, Tensor]:
-        """Each block: features of ``i``, and those of ``j`` less them."""
-        (a, alone_a), (b, alone_b) = self._alone(i), self._alone(j)
-        forth, added = self.two.features_and_keys(a, b)
-        back = self.two(b, a)
-        found = {name: torch.cat((x, alone_b[name] - x), 1) for name, x in alone_a.items()}
-        found["depth"] = torch.cat((forth, back - forth), 1)
+        """Features of a pair by block: those of frame ``i``, concatenated with those of ``j`` minus those of ``i``."""
+        (a, single_a), (b, single_b) = self._single_frame(i), self._single_frame(j)
+        forth, added = self.two_view.features_and_keys(a, b)
+        back = self.two_view(b, a)
+        features = {name: torch.cat((x, single_b[name] - x), 1) for name, x in single_a.items()}
+        features["depth"] = torch.cat((forth, back - forth), 1)
         # The transform's pose maps the reference view into the other view: the same way round as the target.
-        found[_OWN_POSE_BLOCK] = torch.where(added["pose_ok"], _motion_vectors(added["T_1_from_0"][None].double()), 0.0)
-        return {name: x.cpu() for name, x in found.items()}
+        features[_OWN_POSE_BLOCK] = torch.where(
+            added["pose_ok"], _motion_vectors(added["T_1_from_0"][None].double()), 0.0
+        )
+        return {name: x.cpu() for name, x in features.items()}
 
-    def _alone(self, i: int) -> tuple[Frame, dict[str, Tensor]]:
-        if i not in self._known:
-            self._known = {k: v for k, v in self._known.items() if k >= i - 64}  # a long recording is not kept whole
+    def _single_frame(self, i: int) -> tuple[Frame, dict[str, Tensor]]:
+        """Frame ``i`` on the device, and the features that need no second view; the latest frames are cached."""
+        if i not in self._cache:
+            self._cache = {k: v for k, v in self._cache.items() if k >= i - 64}  # bounds the memory of a long recording
             frame = self.recording[i].to(self.settings.dtype).to(self.settings.device)
-            found = {"rgb": front_ends.resize_to_square(frame, side=self.rgb_side), "depth_one_view": self.one(frame)}
-            found |= {name: network(frame) for name, network in self.networks.items()}
-            self._known[i] = frame, found
-        return self._known[i]
+            features = {
+                "rgb": front_ends.resize_to_square(frame, side=self.rgb_side),
+                "depth_one_view": self.one_view(frame),
+            }
+            features |= {name: network(frame) for name, network in self.networks.items()}
+            self._cache[i] = frame, features
+        return self._cache[i]
 
 
 def _make_shard(
@@ -206,9 +212,10 @@ def _make_shard(
     block: Sequence[tuple[int, int]],
     moving: float,
 ) -> ProbeShard:
+    """Shard of one block: concatenated features, target motions, and whether each pair moves more than ``moving`` m."""
     i, j = torch.tensor(list(block), dtype=torch.int64).view(-1, 2).unbind(-1)
     poses = recording.poses
-    assert poses is not None  # else there are no blocks
+    assert poses is not None  # scenes without poses have no blocks
     target = _motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
     blocks = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
     return ProbeShard(
@@ -217,14 +224,16 @@ def _make_shard(
 
 
 def _motion_vectors(T: Tensor) -> Tensor:
-    """(n, 6) rotation vector (rad) and translation (m) of (n, 4, 4)."""
+    """Rotation vector (rad) and translation (m), (n, 6), of motions (n, 4, 4)."""
     return torch.cat((rotation_matrix_to_axis_angle(T[:, :3, :3].contiguous()), T[:, :3, 3]), 1)
 
 
 def _empty_row(scene: str, arm: str, note: str) -> Row:
+    """Row of a scene that was left out, with the reason as its note."""
     return {"scene": scene, "pair": None, "method": arm, "truth": PROBE_TRUTH, "role": None, "note": note}
 
 
 def _format_interval(row: Row) -> str:
+    """Text of the ratio to DINOv2's error with its interval; empty without an interval."""
     low, high = row.get("vs_dinov2_low"), row.get("vs_dinov2_high")
     return "" if low is None or high is None else f", ratio {row['vs_dinov2']:.2f} ({low:.2f} to {high:.2f})"

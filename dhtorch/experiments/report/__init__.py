@@ -1,11 +1,11 @@
-"""What came out, for a person: tables and one page from archived results, and nothing but them.
+"""Reports of archived results: tables on the console, as Markdown, or as an HTML page with figures.
 
-So ``dhtorch report`` shows a result of any age and machine exactly as the job that wrote it did.
+Only the result files are read, so ``dhtorch report`` shows a result of any age and machine as its job did.
 
-``reading`` knows the schema, ``cells`` how a number reads, ``tables`` which numbers stand together; ``layouts`` (and
-``timings``) lay them out as the paper does, beside the figures in ``published``; ``plots`` lists the figures (made by
-``curves``, ``sweeps`` and ``overlays`` in the form of ``figure``, drawn by ``dhtorch.viz.plots``); ``text`` and
-``page`` are the media.
+``reading`` accesses the schema of results, ``cells`` formats numbers, ``tables`` builds tables; ``layouts`` (and
+``timings``) arrange them as the paper does, beside the figures in ``published``; ``plots`` lists the figures (built by
+``curves``, ``sweeps`` and ``overlays`` with the types of ``figure``, drawn by ``dhtorch.viz.plots``); ``text`` and
+``page`` write the output.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dhtorch.experiments.report.tables import INTERVAL_LABEL, ReportTable, gener
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import HELP_EPILOG, format_count, get_verbosity, progress
 
-#: Of more scenes a first look shows the summary alone.
+#: Largest number of rows that the brief table shows; with more, only the summary.
 _MAX_BRIEF_ROWS = 8
 
 __all__ = [
@@ -43,7 +43,7 @@ __all__ = [
 
 
 def tables(result: Result) -> list[ReportTable]:
-    """The tables of one result: the paper's, where it has this experiment, then those of every result."""
+    """Tables of one result: in the layout of the paper if it has this experiment, then the generic ones."""
     return [*layout_tables(result), *generic_tables(result, SHOWN_COLUMNS)]
 
 
@@ -59,12 +59,14 @@ def print_tables(result: Result, console: Any = None) -> None:
 
 
 def print_brief(result: Result) -> None:
-    """Print the first look at a result: its main table, of many scenes the summary alone."""
+    """Print the main table of a result; with many scenes only the summary."""
     for table in (layout_tables(result) or generic_tables(result, SHOWN_COLUMNS))[:1]:
         n_body = len(table.rows) - table.footer - table.quoted
-        many, one = n_body > _MAX_BRIEF_ROWS and table.footer > 0, n_body == 1 and table.footer > 0
-        start, end = (n_body, None) if many else (0, 1 if one else None)  # a summary of one scene says it again
-        footer, quoted = (0, 0) if one else (table.footer, table.quoted)
+        summary_only, single_row = n_body > _MAX_BRIEF_ROWS and table.footer > 0, n_body == 1 and table.footer > 0
+        start, end = (
+            (n_body, None) if summary_only else (0, 1 if single_row else None)
+        )  # the summary of one scene repeats its row
+        footer, quoted = (0, 0) if single_row else (table.footer, table.quoted)
         text.print_table(replace(table, rows=table.rows[start:end], footer=footer, quoted=quoted))
 
 
@@ -78,23 +80,23 @@ def print_sweep(results: Sequence[Result], folder: Path, *, markdown: bool = Fal
     else:
         text.print_table(table)
     try:
-        said = f"wrote {jobs.write_jobs_csv(folder / 'sweep.csv', results)}"
-    except OSError as error:  # a folder that is only read
-        said = f"{folder}: no sweep.csv written ({error.strerror})"
+        message = f"wrote {jobs.write_jobs_csv(folder / 'sweep.csv', results)}"
+    except OSError as error:  # a read-only folder
+        message = f"{folder}: no sweep.csv written ({error.strerror})"
     if not markdown:
-        print(said)
+        print(message)
 
 
 def to_markdown(result: Result) -> str:
-    """The tables of a result as Markdown."""
+    """Tables of a result as Markdown."""
     return text.tables_to_markdown(tables(result))
 
 
 def main(argv: Sequence[str]) -> int:
-    """``dhtorch report RESULT…``: tables from archived results, or a page.
+    """Run ``dhtorch report RESULT…``: print tables of archived results, or write a page; returns the exit code.
 
     Raises:
-        FileNotFoundError, ValueError: a result is missing or not valid, or the page cannot be written there.
+        FileNotFoundError, ValueError: a result is missing or invalid, or the page cannot be written.
     """
     parser = argparse.ArgumentParser(
         prog="dhtorch report", description="Tables and a page from archived results.", epilog=HELP_EPILOG
@@ -103,7 +105,7 @@ def main(argv: Sequence[str]) -> int:
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--markdown", action="store_true", help="Markdown instead of console tables")
     form.add_argument("--html", type=Path, metavar="FILE", help="write one page with tables and figures instead")
-    parser.add_argument("--traceback", action="store_true", help="show where an error came from")
+    parser.add_argument("--traceback", action="store_true", help="show the traceback of an error")
     options = parser.parse_args(argv)
     paths = list(_find_results(options.result))
     results = [result_files.read_result(path) for path in progress(paths, "results", len(paths))]
@@ -111,11 +113,13 @@ def main(argv: Sequence[str]) -> int:
         print(f"wrote {page.write_report(options.html, results)}: {format_count(len(results), 'result')}")
         return 0
     for folder in options.result:
-        mine = [r for path, r in zip(paths, results, strict=True) if path != folder and path.is_relative_to(folder)]
-        print_sweep(mine, folder, markdown=options.markdown)
-    apart = {r["experiment"] for r in results}
-    if len(options.result) == 1 and len(results) > 1 and len(apart) == 1 and get_verbosity() != "verbose":
-        return 0  # one table says it; -v shows every job
+        jobs_of_folder = [
+            r for path, r in zip(paths, results, strict=True) if path != folder and path.is_relative_to(folder)
+        ]
+        print_sweep(jobs_of_folder, folder, markdown=options.markdown)
+    experiments = {r["experiment"] for r in results}
+    if len(options.result) == 1 and len(results) > 1 and len(experiments) == 1 and get_verbosity() != "verbose":
+        return 0  # the table of the sweep is enough; -v shows every job
     for path, result in zip(paths, results, strict=True):
         if options.markdown:
             print(to_markdown(result))
@@ -128,7 +132,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _find_results(paths: Iterable[Path]) -> Iterable[Path]:
-    """Files as they are; a folder without a result of its own stands for all below it, as a sweep writes them."""
+    """Result files of the paths; a folder without a result of its own stands for all below it, as of a sweep."""
     for path in paths:
         below = sorted(path.rglob("result.json")) if path.is_dir() and not (path / "result.json").is_file() else []
         yield from below or [path]

@@ -1,4 +1,4 @@
-"""How a number reads in a table: its heading, its style and its digits, decided by the metric's name alone."""
+"""Headings and number formats of table cells, chosen by the name of the metric."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Any
 
 from dhtorch.codes import words
 
-#: Where nothing is defined.
+#: Cell without a value.
 EMPTY_CELL = "–"
 
-#: Metric → heading; the others are headed by their own name.
+#: Metric → heading; other metrics have their name as heading.
 _METRIC_HEADINGS = {
     "n_candidates": "candidates",
     "n_kept": "answers",
@@ -30,11 +30,11 @@ _METRIC_HEADINGS = {
     "hole_share.trackable_no_lidar": "trackable, no LiDAR",
     "trackability_hole": "trackability, holes",
     "trackability_valid": "trackability, returns",
-    "rotation_deg": "rotation off °",
-    "translation_m": "translation off m",
+    "rotation_deg": "rotation error °",
+    "translation_m": "translation error m",
     "baseline_m": "baseline m",
     "cutoff_m": "cutoff m",
-    "direction_deg": "direction off °",
+    "direction_deg": "direction error °",
     "reach_p95_m": "reach p95 m",
     "reach_max_m": "reach m",
     "returns_p95_m": "sensor p95 m",
@@ -44,7 +44,7 @@ _METRIC_HEADINGS = {
     "aurc_ratio": "AURC ratio",
     "aurc_ratio_by_error": "AURC ratio to by_error",
     "error_ratio_to_window": "error ratio to window",
-    "aurc_full_ratio_to_window": "AURC ratio to window, silence as 1",
+    "aurc_full_ratio_to_window": "AURC ratio to window, unanswered as 1",
     "fixed_gap_ratio": "ratio to the best gap",
     "pair_ms": "ms per pair",
     "extra_ms": "ms more",
@@ -62,8 +62,8 @@ _METRIC_HEADINGS = {
     "rho_abs": "|ρ| of blur",
     "rank_corr": "Spearman",
     "abs_corr": "|corr|",
-    "gated_corr": "corr, surest quarter",
-    "gated_abs_corr": "|corr|, surest quarter",
+    "gated_corr": "corr, most confident quarter",
+    "gated_abs_corr": "|corr|, most confident quarter",
     "flip_share": "sign flipped",
     "order_corr": "order of pictures",
     "halves_corr": "odd against even pictures",
@@ -73,7 +73,7 @@ _METRIC_HEADINGS = {
     "rmse_m": "RMSE m",
     "changed_rel": "changed",
 }
-#: Metric → style, where its name does not give it away (see :func:`metric_style`).
+#: Metric → style, where the rules of :func:`metric_style` do not apply.
 _METRIC_STYLES = {
     "coverage": "percent",
     "pnp_success": "percent",
@@ -95,7 +95,7 @@ def metric_heading(metric: str) -> str:
 
 
 def metric_style(metric: str) -> str:
-    """percent | ratio | fine | number | count | large | bytes | mebibytes | plain, by a metric's name."""
+    """Style of a metric: percent, ratio, fine, number, count, large, bytes, mebibytes or plain."""
     group, _, last = metric.rpartition(".")
     if last in _METRIC_STYLES:
         return _METRIC_STYLES[last]
@@ -111,7 +111,7 @@ def metric_style(metric: str) -> str:
 
 
 def format_value(value: Any, metric: str = "", how: str | None = None) -> str:
-    """A value as a cell; ``how`` overrides the style of the metric's name."""
+    """Cell of a value in the style of the metric, or in the style ``how``."""
     if value is None:
         return EMPTY_CELL
     if isinstance(value, bool):
@@ -126,7 +126,7 @@ def format_value(value: Any, metric: str = "", how: str | None = None) -> str:
 
 
 def format_exact(value: Any) -> str:
-    """A value with five significant digits, for the tables that hold everything."""
+    """Cell of a value with five significant digits, for the full tables."""
     if isinstance(value, list):
         return ", ".join(map(format_exact, value))
     if isinstance(value, float):
@@ -135,13 +135,14 @@ def format_exact(value: Any) -> str:
 
 
 def format_metric_interval(low: float | None, high: float | None, metric: str) -> str:
-    """An interval as a cell, nothing where there is none."""
+    """Cell of an interval; empty without one."""
     if low is None or high is None:
         return ""
     return f"{format_value(low, metric).removesuffix(' %')}–{format_value(high, metric)}"
 
 
 def _format_number(value: float, how: str) -> str:
+    """Text of a number in a style."""
     if how == "percent":
         return _format_percent(value)
     if how == "count":
@@ -161,6 +162,7 @@ def _format_percent(value: float) -> str:
 
 
 def _format_three_digits(value: float) -> str:
+    """Text with three significant digits."""
     if value == 0:
         return "0"
     decimals = max(0, 2 - math.floor(math.log10(abs(value))))
@@ -168,6 +170,7 @@ def _format_three_digits(value: float) -> str:
 
 
 def _format_with_unit(value: float, units: tuple[tuple[float, str], ...]) -> str:
+    """Text of a number with the largest unit that fits."""
     for size, unit in units:
         if abs(value) >= size:
             return f"{_format_three_digits(value / size)} {unit}"

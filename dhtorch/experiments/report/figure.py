@@ -1,4 +1,4 @@
-"""What figures share: their form, one colour per variant, and axes for shares and errors."""
+"""Shared parts of figures: the Figure type, one colour per variant, axes for fractions and errors."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from dhtorch.viz import plots as drawing
 from dhtorch.viz.plots import Axis, LayeredPicture, LegendKey, Panel, Stroke, fit_axis
 from dhtorch.viz.plots.colours import PAPER_FILL, SOFT
 
-#: Relative errors are drawn between these.
-MIN_DRAWN_ERROR, MAX_DRAWN_ERROR = 1e-3, 10.0
-#: Legend of the paper's figures.
+#: Smallest relative error of a logarithmic axis.
+MIN_DRAWN_ERROR = 1e-3
+#: Largest relative error of a logarithmic axis.
+MAX_DRAWN_ERROR = 10.0
+#: Legend entry of the paper's figures.
 PUBLISHED_KEY = LegendKey("published", PAPER_FILL, "diamond")
-#: A single scene among others.
+#: Stroke of a single scene among others.
 SCENE_STROKE = Stroke(SOFT, 0.9, opacity=0.55)
 
 
@@ -27,49 +29,49 @@ class Figure:
     panels: Sequence[Panel | LayeredPicture]
     legend: Sequence[LegendKey] = ()
     wide: bool = False
-    folded: bool = False  # of less interest: shown when asked for
+    folded: bool = False  # hidden until it is unfolded
 
 
 def variant_strokes(result: Result) -> dict[str, Stroke]:
-    """Variant → how it is drawn, the same in every figure of a result."""
+    """Variant → stroke, the same in every figure of a result."""
     return drawing.assign_strokes(variant_names(result))
 
 
 def variant_legend(result: Result, drawn: Sequence[str]) -> list[LegendKey]:
-    """The drawn variants in the order of the result."""
+    """Legend of the drawn variants, in the order of the result."""
     return [LegendKey(v, stroke.colour, stroke=stroke) for v, stroke in variant_strokes(result).items() if v in drawn]
 
 
 def scene_label(row: Row) -> str:
-    """A scene with its role."""
+    """Name of a scene with its role."""
     return f"{row['scene']} ({row['role']})" if row.get("role") else str(row["scene"])
 
 
 def deciding_rows(result: Result) -> list[Row]:
-    """The rows of scenes for the cohort that decides."""
+    """Rows of scenes of the cohort of the verdict."""
     return scene_rows(result, last_cohort(result))
 
 
 def missing_scenes_note(result: Result, drawn: Sequence[str]) -> str:
-    """A sentence that names the scenes a figure lacks, and why; empty where it lacks none."""
-    absent = {row["scene"]: row.get("note") or "nothing answered" for row in deciding_rows(result)}
-    said = [f"{scene} ({why})" for scene, why in absent.items() if scene not in drawn]
-    return f" Not drawn: {', '.join(said)}." if said else ""
+    """Sentence with the scenes missing from a figure and the reasons; empty if none is missing."""
+    absent = {row["scene"]: row.get("note") or "no answer" for row in deciding_rows(result)}
+    reasons = [f"{scene} ({why})" for scene, why in absent.items() if scene not in drawn]
+    return f" Not drawn: {', '.join(reasons)}." if reasons else ""
 
 
 def share_axis(label: str) -> Axis:
-    """0 to 100 %."""
+    """Axis from 0 to 100 %."""
     return Axis(0.0, 1.0, label, percent=True)
 
 
 def metric_axis(metric: str, values: Sequence[float | None], label: str = "") -> Axis:
-    """An axis for coverage (whole), correlation (to 1) or an error (logarithmic where it spans much)."""
-    known = [v for v in values if v is not None]
+    """Axis of coverage (0 to 100 %), correlation (up to 1) or an error (logarithmic for a large range)."""
+    finite = [v for v in values if v is not None]
     if metric == "coverage":
         return share_axis(label)
     if metric == "corr":
-        return Axis(max(-1.0, min([0.0, *known])) - 0.02, 1.0, label)
-    positive = [v for v in known if v > 0]
+        return Axis(max(-1.0, min([0.0, *finite])) - 0.02, 1.0, label)
+    positive = [v for v in finite if v > 0]
     if positive and max(positive) > 8 * min(positive):
-        return fit_axis(known, label, log=True, percent=True, floor=MIN_DRAWN_ERROR, cap=MAX_DRAWN_ERROR)
-    return fit_axis(known, label, percent=True, low=0.0)
+        return fit_axis(finite, label, log=True, percent=True, floor=MIN_DRAWN_ERROR, cap=MAX_DRAWN_ERROR)
+    return fit_axis(finite, label, percent=True, low=0.0)

@@ -1,4 +1,4 @@
-"""Known experiments in the layout of the paper's tables, ours beside the paper's figure."""
+"""Tables of known experiments in the layout of the paper, with the paper's figures beside the result's."""
 
 from __future__ import annotations
 
@@ -50,44 +50,51 @@ _LEARNED_LINES: KnownLines = (
 
 
 def layout_tables(result: Result) -> list[ReportTable]:
-    """The tables of a known experiment as the paper has them; of another with several variants, one by variant."""
-    known = EXPERIMENT_LAYOUTS.get(result["experiment"])
-    if known:
-        return known(result)
+    """Tables of an experiment in the paper's layout; of others with at least three variants, one by variant."""
+    build = EXPERIMENT_LAYOUTS.get(result["experiment"])
+    if build:
+        return build(result)
     columns = ("n_scenes", "coverage", "median_rel", "p90_rel", "corr", "pnp_success")
-    measured = [m for m in columns[1:] if any(summary_entry(result, v, m) for v in variant_names(result))]
+    measured = [
+        metric
+        for metric in columns[1:]
+        if any(summary_entry(result, variant, metric) for variant in variant_names(result))
+    ]
     if len(variant_names(result)) < 3 or not measured:
         return []
     return [variant_table(result, "Medians over scenes", ("n_scenes", *measured))]
 
 
 def _range_split(result: Result) -> list[ReportTable]:
+    """Tables of the range split: far-field recovery by variant, and the sweep over cutoffs."""
     title = "Controlled far-field recovery, medians over scenes"
     columns = ("n_scenes", "coverage", "corr", "median_rel", "p90_rel")
-    mine = match_lines(result, _RANGE_SPLIT_LINES, without=_CUTOFF_PATTERN)
-    found = [variant_table(result, title, columns, mine, published.RANGE_SPLIT)]
+    lines = match_lines(result, _RANGE_SPLIT_LINES, without=_CUTOFF_PATTERN)
+    tables = [variant_table(result, title, columns, lines, published.RANGE_SPLIT)]
     if any(re.fullmatch(_CUTOFF_PATTERN, v) for v in variant_names(result)):
         title = "Cutoff sensitivity, gated, medians over scenes; candidates added up"
-        swept = ("cutoff_m", "pnp_success", "n_candidates", "coverage", "median_rel")
-        mine = [
+        sweep_columns = ("cutoff_m", "pnp_success", "n_candidates", "coverage", "median_rel")
+        lines = [
             line
             for line in match_lines(result, _CUTOFF_LINES)
             if line.paper or re.fullmatch(_CUTOFF_PATTERN, line.variant or "")
         ]
-        found.append(variant_table(result, title, swept, mine, published.CUTOFF_SWEEP))
-    return found
+        tables.append(variant_table(result, title, sweep_columns, lines, published.CUTOFF_SWEEP))
+    return tables
 
 
 def _real_holes(result: Result) -> list[ReportTable]:
+    """Tables of the real holes: drop-outs of the sensor, and hidden far returns if measured."""
     columns = ("n_scenes", "n_candidates", "coverage", "median_rel", "p90_rel")
-    found, title = [], "The sensor's true drop-outs, medians over scenes"
-    found.append(variant_table(result, title, columns, match_lines(result, _REAL_HOLES_LINES), published.REAL_HOLES))
+    tables, title = [], "The sensor's true drop-outs, medians over scenes"
+    tables.append(variant_table(result, title, columns, match_lines(result, _REAL_HOLES_LINES), published.REAL_HOLES))
     if "full" in cohort_names(result) and last_cohort(result) != "full":
-        found.append(variant_table(result, "The same on hidden far returns", columns, truth="full"))
-    return found
+        tables.append(variant_table(result, "The same on hidden far returns", columns, truth="full"))
+    return tables
 
 
 def _gate_ablation(result: Result) -> list[ReportTable]:
+    """Table of the gate ablation by variant."""
     columns = ("n_scenes", "corr", "median_rel", "coverage", "p90_rel")
     return [
         variant_table(
@@ -101,27 +108,28 @@ def _gate_ablation(result: Result) -> list[ReportTable]:
 
 
 def _held_out(result: Result) -> list[ReportTable]:
+    """Tables of the hold-out: by scene, cyclic against held out, and over scenes."""
     truth = "heldout" if "heldout" in cohort_names(result) else None
     columns: tuple[str, ...] = ("n_kept", "corr", "median_rel", "residual_px", "passes", "coverage")
     columns += ("n_recovered", "reach_p95_m", "reach_max_m", "returns_p95_m")
     title = "Hold-out triangulation (set B never sees the pose calibration)"
-    found = [scene_table(result, title, columns, truth, published.HELD_OUT)]
+    tables = [scene_table(result, title, columns, truth, published.HELD_OUT)]
     if "cyclic" in cohort_names(result):
-        found.append(_naive_protocol(result))
-    across = ("n_scenes", "median_rel", "range", "corr", "ece", "coverage", "passes")
+        tables.append(_naive_protocol(result))
+    columns_over_scenes = ("n_scenes", "median_rel", "range", "corr", "ece", "coverage", "passes")
     title = "Cross-dataset depth-anchored geometry, medians over scenes"
     name = result["data"]["name"]
-    mine = [TableLine(name if len(variant_names(result)) == 1 else f"{name}, {v}", v) for v in variant_names(result)]
-    return [*found, variant_table(result, title, across, mine, published.CROSS_DATA, truth)]
+    lines = [TableLine(name if len(variant_names(result)) == 1 else f"{name}, {v}", v) for v in variant_names(result)]
+    return [*tables, variant_table(result, title, columns_over_scenes, lines, published.CROSS_DATA, truth)]
 
 
 def _naive_protocol(result: Result) -> ReportTable:
-    """What the naive protocol hides: the pose's own inliers against points it never saw."""
+    """Table of the median error on the pose's own inliers (cyclic) against that on held-out points."""
     rows = []
     for v in variant_names(result):
-        naive, honest = (summary_entry(result, v, "median_rel", t).get("value") for t in ("cyclic", "heldout"))
-        ratio = format_value(honest / naive, how="number") + "×" if naive and honest is not None else EMPTY_CELL
-        rows.append([v, format_value(naive, "median_rel"), format_value(honest, "median_rel"), ratio])
+        naive, held_out = (summary_entry(result, v, "median_rel", t).get("value") for t in ("cyclic", "heldout"))
+        ratio = format_value(held_out / naive, how="number") + "×" if naive and held_out is not None else EMPTY_CELL
+        rows.append([v, format_value(naive, "median_rel"), format_value(held_out, "median_rel"), ratio])
     cited = [
         [f"{PUBLISHED_LABEL}: {name}", *(c.get(m, EMPTY_CELL) for m in ("cyclic", "heldout", "ratio"))]
         for name, c in published.CYCLIC.lines.items()
@@ -132,25 +140,25 @@ def _naive_protocol(result: Result) -> ReportTable:
 
 
 def _calibration(result: Result) -> list[ReportTable]:
-    """The paper gives the calibration error of its hold-outs and the thresholds of its range split."""
+    """Tables of the calibration by ground truth, and of thresholds; the paper has hold-outs and the range split."""
     columns = ("n_scenes", "ece", "ece_pooled", "aurc", "aurc_excess", "mean_risk", "monotonicity")
-    found = []
+    tables = []
     for truth in reversed(cohort_names(result)):
         held_out = truth == "heldout" or len(cohort_names(result)) == 1
-        title = f"Calibration, held against {truth}, medians over scenes"
-        found.append(
+        title = f"Calibration, ground truth: {truth}, medians over scenes"
+        tables.append(
             variant_table(result, title, columns, None, published.SCORE_CALIBRATION if held_out else None, truth)
         )
-    return found + [table for v in variant_names(result) if (table := _thresholds(result, v))]
+    return tables + [table for v in variant_names(result) if (table := _thresholds(result, v))]
 
 
 def _thresholds(result: Result, variant: str) -> ReportTable | None:
-    """What a threshold on the score leaves, and how wrong that is."""
+    """Table of coverage and errors of the answers above each threshold of the score; None with fewer than two."""
     rows = []
     for name, numbers in threshold_points(result, variant):
-        theirs, cells = published.THRESHOLDS.lines.get(name, {}), [name]
+        published_cells, cells = published.THRESHOLDS.lines.get(name, {}), [name]
         for m in ("coverage", "median_rel"):
-            cells += [format_value(numbers[m], m), theirs.get(m, EMPTY_CELL)]
+            cells += [format_value(numbers[m], m), published_cells.get(m, EMPTY_CELL)]
         rows.append([*cells, format_value(numbers["p90_rel"], "p90_rel")])
     over = (("", 1), (metric_heading("coverage"), 2), (metric_heading("median_rel"), 2), ("", 1))
     heads = ["score from", OURS_LABEL, PUBLISHED_LABEL, OURS_LABEL, PUBLISHED_LABEL, metric_heading("p90_rel")]
@@ -163,34 +171,40 @@ def _thresholds(result: Result, variant: str) -> ReportTable | None:
 
 
 def threshold_points(result: Result, variant: str) -> list[tuple[str, dict[str, float | None]]]:
-    """Thresholds on the score, rising, with coverage and errors of the answers that reach them; 0 keeps all."""
-    found = {m[1] for name in result["summary"] if (m := re.search(r"(?:^|\.)at_(\d+(?:\.\d+)?)\.coverage$", name))}
-    at = {f"{float(name):g}": f"at_{name}." for name in sorted(found, key=float)}
-    at = {"0": "", **at} if at else {}
+    """Thresholds of the score, increasing, with coverage and errors of the answers at or above them; 0 keeps all."""
+    thresholds = {
+        m[1] for name in result["summary"] if (m := re.search(r"(?:^|\.)at_(\d+(?:\.\d+)?)\.coverage$", name))
+    }
+    prefixes = {f"{float(name):g}": f"at_{name}." for name in sorted(thresholds, key=float)}
+    prefixes = {"0": "", **prefixes} if prefixes else {}
     metrics = ("coverage", "median_rel", "p90_rel")
     return [
         (name, {m: summary_entry(result, variant, prefix + m).get("value") for m in metrics})
-        for name, prefix in at.items()
+        for name, prefix in prefixes.items()
     ]
 
 
 def _census(result: Result) -> list[ReportTable]:
+    """Table of the hole census by scene."""
     columns = ("hole_share.trackable_no_lidar", "trackability_hole", "trackability_valid")
     return [scene_table(result, "Why returns are missing: the key class", columns, None, published.HOLE_CENSUS)]
 
 
 def _device_pose(result: Result) -> list[ReportTable]:
+    """Table of triangulation with the device trajectory and with the estimated pose."""
     columns = ("n_scenes", "rotation_deg", "translation_m", "direction_deg", "corr", "coverage", "median_rel")
-    title = "Triangulation from the device's trajectory and from the anchored pose, medians over scenes"
+    title = "Triangulation from the device's trajectory and from the metric pose estimate, medians over scenes"
     return [variant_table(result, title, columns, None, published.DEVICE_POSE)]
 
 
 def _motion(result: Result) -> list[ReportTable]:
+    """Table of errors and recovered holes by baseline."""
     columns = ("n_scenes", "baseline_m", "coverage", "median_rel", "n_recovered", "recovered_share")
     return [variant_table(result, "Motion dependence, medians over scenes", columns, None, published.BASELINE_MOTION)]
 
 
 def _learned(result: Result) -> list[ReportTable]:
+    """Table of the learned methods."""
     columns: tuple[str, ...] = ("n_scenes", "median_rel", "corr", "coverage", "scale", "metric", "parameters")
     columns += ("weight_bytes", "device", "seconds_per_video")
     title = "Reference results under different inputs and scale protocols, medians over scenes"
@@ -198,12 +212,13 @@ def _learned(result: Result) -> list[ReportTable]:
 
 
 def _ablation(result: Result) -> list[ReportTable]:
+    """Table of the ablation by part."""
     columns = ("n_scenes", "coverage", "median_rel", "p90_rel", "corr", "aurc", "median_rel_ratio")
     return [variant_table(result, "Ablation, medians over scenes", columns)]
 
 
 def _comparison(result: Result) -> list[ReportTable]:
-    """Methods, and the ratios of their numbers to those of the reference."""
+    """Table of the method comparison, with ratios to the reference method."""
     columns = ["coverage", "median_rel", "median_rel_ratio", "worst_scene_ratio", "aurc", "aurc_ratio", "coverage_at_5"]
     columns += ["within_sigma", "within_2sigma", "ece", "realised_risk_5", "realised_risk_10"]
     measured = [m for m in columns if any(summary_entry(result, v, m) for v in variant_names(result))]
@@ -211,27 +226,31 @@ def _comparison(result: Result) -> list[ReportTable]:
 
 
 def _part_ablation(result: Result) -> list[ReportTable]:
+    """Table of the ablation of parts, as ratios to the method of the paper."""
     columns: tuple[str, ...] = ("n_scenes", "coverage", "median_rel_ratio_at_equal_coverage", "aurc_ratio")
     columns += ("coverage_at_5", "within_sigma", "within_2sigma", "ece", "pair_ms", "extra_ms")
-    beside = ("error_ratio_to_window", "aurc_full_ratio_to_window")
-    columns += tuple(m for m in beside if any(summary_entry(result, v, m) for v in variant_names(result)))
+    optional_columns = ("error_ratio_to_window", "aurc_full_ratio_to_window")
+    columns += tuple(m for m in optional_columns if any(summary_entry(result, v, m) for v in variant_names(result)))
     return [variant_table(result, "Parts alone and left out, ratios to the paper's method", columns)]
 
 
 def _views_study(result: Result) -> list[ReportTable]:
-    chosen = {**result, "rows": [row for row in result["rows"] if row["method"] == "auto" and not row.get("role")]}
+    """Tables of the study of view selection: over scenes, and by scene against the best fixed gap."""
+    auto_rows = {**result, "rows": [row for row in result["rows"] if row["method"] == "auto" and not row.get("role")]}
     return [
         variant_table(result, "Chosen views and fixed gaps, over scenes", ("n_scenes", "coverage", "coverage_at_5")),
-        scene_table(chosen, "Against the best gap", ("coverage_at_5", "best_gap", "fixed_gap_ratio", "one_partner")),
+        scene_table(auto_rows, "Against the best gap", ("coverage_at_5", "best_gap", "fixed_gap_ratio", "one_partner")),
     ]
 
 
 def _dense(result: Result) -> list[ReportTable]:
+    """Table of the comparison of dense methods."""
     columns = ("n_scenes", "n_kept", "coverage", "median_rel", "wrong_share", "coverage_at_5", "aurc")
-    return [variant_table(result, "Every pixel beside the samples, and peers under the same motion", columns)]
+    return [variant_table(result, "Dense maps, sparse samples, and other methods with the same motion", columns)]
 
 
 def _learned_score(result: Result) -> list[ReportTable]:
+    """Table of the answers in the order of each score."""
     columns = ("n_scenes", "n_kept", "aurc", "aurc_excess", "aurc_ratio", "aurc_ratio_by_error", "coverage_at_5")
     return [variant_table(result, "The same answers in the order of each score, over scenes", columns)]
 
@@ -262,10 +281,10 @@ EXPERIMENT_LAYOUTS: dict[str, Callable[[Result], list[ReportTable]]] = {
     "rh20t_probe": probes.future_motion_tables,
     "vo_probe": probes.visual_odometry_tables,
 }
-#: Columns that stand in these tables and need not be repeated.
+#: Columns of these tables that the generic tables leave out.
 SHOWN_COLUMNS = ("trackability_hole", "trackability_valid", "passes", "parameters", "weight_bytes", *DERIVED_NUMBERS)
 
-#: Experiments whose variants have a counterpart in the paper.
+#: Experiments with variants of the paper: name → (lines, published table).
 _COUNTERPARTS: dict[str, tuple[KnownLines, published.PublishedTable]] = {
     "range_split": (_RANGE_SPLIT_LINES, published.RANGE_SPLIT),
     "real_holes": (_REAL_HOLES_LINES, published.REAL_HOLES),
@@ -276,10 +295,10 @@ _COUNTERPARTS: dict[str, tuple[KnownLines, published.PublishedTable]] = {
 
 def published_counterparts(result: Result) -> dict[str, dict[str, float]]:
     """Variant → metric → the paper's figure, for figures that show both."""
-    known, theirs = _COUNTERPARTS.get(result["experiment"], ((), None))
-    found: dict[str, dict[str, float]] = {}
-    for line in match_lines(result, known):
-        if theirs and line.variant and line.paper:
-            cells = {m: published.parse_printed(cell) for m, cell in theirs.lines[line.paper].items()}
-            found[line.variant] = {m: number for m, number in cells.items() if number is not None}
-    return found
+    known_lines, table = _COUNTERPARTS.get(result["experiment"], ((), None))
+    figures: dict[str, dict[str, float]] = {}
+    for line in match_lines(result, known_lines):
+        if table and line.variant and line.paper:
+            cells = {m: published.parse_printed(cell) for m, cell in table.lines[line.paper].items()}
+            figures[line.variant] = {m: number for m, number in cells.items() if number is not None}
+    return figures

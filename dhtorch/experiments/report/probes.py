@@ -1,4 +1,4 @@
-"""Probes: every arm's error, as it is and as a multiple of the context's and of DINOv2's, beside the paper's ratio."""
+"""Tables of the probes: error of every arm and its ratios to the context and to DINOv2, with the paper's ratio."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from dhtorch.experiments.report.tables import INTERVAL_LABEL, PUBLISHED_LABEL, R
 #: Our arm → the paper's line.
 _PUBLISHED_ARMS = {"dhtorch": "DH-Active", "dinov2": "DINOv2"}
 
-#: Of a scene that was left out one line is enough.
+#: Arm whose row stands for a scene that was left out.
 _FIRST_ARM = "context"
 
-_RANDOM_WEIGHTS_NOTE = "DINOv2 with random weights: its lines say nothing about DINOv2."
+_RANDOM_WEIGHTS_NOTE = "DINOv2 with random weights: its lines are no evidence about DINOv2."
 
 
 def future_motion_tables(result: Result) -> list[ReportTable]:
@@ -37,23 +37,23 @@ def future_motion_tables(result: Result) -> list[ReportTable]:
         "90 % interval",
         PUBLISHED_LABEL,
     ]
-    found = []
-    for prefix, words, theirs in cohorts:
+    tables = []
+    for prefix, label, table in cohorts:
         rows = []
         for arm in variant_names(result):
             cells = [_label(result, arm)]
             for name in ("mse", "vs_context", "vs_dinov2"):
                 e = summary_entry(result, arm, prefix + name)
-                cells += [_format_number(e.get("value")), _format_spread(e)]
-            cells += [_format_spread(summary_entry(result, arm, f"{prefix}vs_dinov2_90"))]
-            rows.append([*cells, theirs.lines.get(_PUBLISHED_ARMS.get(arm, ""), {}).get("vs_dinov2", EMPTY_CELL)])
-        title = f"Future motion of the hand, tasks held out, {words}; error in units of the targets' variance"
-        found.append(ReportTable(title, heads, rows, note=_note(result, theirs)))
-    return found
+                cells += [_format_number(e.get("value")), _format_interval(e)]
+            cells += [_format_interval(summary_entry(result, arm, f"{prefix}vs_dinov2_90"))]
+            rows.append([*cells, table.lines.get(_PUBLISHED_ARMS.get(arm, ""), {}).get("vs_dinov2", EMPTY_CELL)])
+        title = f"Future motion of the hand, tasks held out, {label}; error in units of the targets' variance"
+        tables.append(ReportTable(title, heads, rows, note=_note(result, table)))
+    return tables
 
 
 def visual_odometry_tables(result: Result) -> list[ReportTable]:
-    """One row per scene and arm, then the paper's."""
+    """Table of the probe of camera motion: one row per scene and arm, then the paper's lines."""
     heads = ["scene", "arm", "pairs", "error", "× mean motion", "× DINOv2", INTERVAL_LABEL]
     rows = []
     for row in scene_rows(result):
@@ -69,10 +69,10 @@ def visual_odometry_tables(result: Result) -> list[ReportTable]:
                 arm,
                 format_value(row["n_samples"], how="count"),
                 *numbers,
-                _format_spread(_format_interval(row)),
+                _format_interval(_ratio_interval(row)),
             ]
         )
-    theirs = published.VISUAL_ODOMETRY
+    table = published.VISUAL_ODOMETRY
     cited = [
         [
             f"{PUBLISHED_LABEL}: one scene",
@@ -83,32 +83,38 @@ def visual_odometry_tables(result: Result) -> list[ReportTable]:
             cells.get("vs_dinov2", EMPTY_CELL),
             "",
         ]
-        for name, cells in theirs.lines.items()
+        for name, cells in table.lines.items()
     ]
     title = "Motion of the camera within a scene, blocks held out; error in units of the targets' variance"
-    return [ReportTable(title, heads, rows + cited, 2, quoted=len(cited), note=_note(result, theirs))]
+    return [ReportTable(title, heads, rows + cited, 2, quoted=len(cited), note=_note(result, table))]
 
 
 def _label(result: Result, arm: str) -> str:
+    """Name of an arm, marked if DINOv2 has random weights."""
     return f"{arm} (random weights)" if "dinov2" in arm and not _weights(result) else arm
 
 
 def _weights(result: Result) -> Any:
+    """Folder of the weights of DINOv2 in the configuration; None for random weights."""
     network: Mapping[str, Any] = result["config"].get("experiment", {}).get("dinov2") or {}
     return network.get("weights")
 
 
-def _note(result: Result, theirs: PublishedTable) -> str:
-    return " ".join((published_source(result, theirs), *([] if _weights(result) else [_RANDOM_WEIGHTS_NOTE])))
+def _note(result: Result, table: PublishedTable) -> str:
+    """Source of the paper's figures, and a note on random weights."""
+    return " ".join((published_source(result, table), *([] if _weights(result) else [_RANDOM_WEIGHTS_NOTE])))
 
 
-def _format_interval(row: Row) -> dict[str, float | None]:
+def _ratio_interval(row: Row) -> dict[str, float | None]:
+    """Interval of the ratio to DINOv2 in a row."""
     return {"low": row.get("vs_dinov2_low"), "high": row.get("vs_dinov2_high")}
 
 
 def _format_number(value: float | None) -> str:
+    """Cell with three decimals."""
     return format_value(value, how="fine")
 
 
-def _format_spread(found: Mapping[str, Any]) -> str:
-    return format_metric_interval(found.get("low"), found.get("high"), "ece")
+def _format_interval(entry: Mapping[str, Any]) -> str:
+    """Cell with the interval of an entry."""
+    return format_metric_interval(entry.get("low"), entry.get("high"), "ece")

@@ -1,9 +1,9 @@
-"""What the paper reports, word for word: figures to stand beside ours, each with the place it is from.
+"""Numbers of the paper as printed, with their place in it, for comparison with a result.
 
-Cells are kept as printed, so that no digit is added; :func:`parse_printed` reads one back for a figure. The paper is
-"Double- Helix Active Geometry: LiDAR-Anchored Multi-View Depth with Selective Abstention" (J. Wen). Its data sets are
-its own: none of these figures was measured on the scenes of a result that is shown beside it, unless that result says
-so.
+Cells are kept as printed, so that no digit is added; :func:`parse_printed` converts one to a number. The paper is
+"Double- Helix Active Geometry: LiDAR-Anchored Multi-View Depth with Selective Abstention" (J. Wen). Its data sets
+are its own: none of these figures was measured on the scenes of a result shown beside it, unless that result states
+it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ PAPER_CITATION = "Double-Helix Active Geometry: LiDAR-Anchored Multi-View Depth 
 
 @dataclass(frozen=True)
 class PublishedTable:
-    """Some lines of the paper: line → metric → what is printed."""
+    """Lines of a table of the paper: line → metric → printed cell."""
 
     where: str
     data: str
@@ -26,7 +26,7 @@ class PublishedTable:
 
 
 def _parse_lines(metrics: str, lines: Mapping[str, str]) -> dict[str, dict[str, str]]:
-    """Lines of cells between bars, in the order of the metrics' names; a dash is no figure."""
+    """Parse lines of cells separated by bars, in the order of the metric names; a dash is an empty cell."""
     names = metrics.split()
     cells = {line: [c.strip() for c in row.split("|")] for line, row in lines.items()}
     return {line: {n: c for n, c in zip(names, row, strict=True) if c != "–"} for line, row in cells.items()}
@@ -216,7 +216,7 @@ DEFOCUS = PublishedTable(
         {"unsigned": "0.22 | –", "side from an oracle": "0.22 | 0.66", "side has to be produced": "– | 0.06"},
     ),
     (
-        "|ρ| asks for no side: the one figure stands in two lines.",
+        "|ρ| does not depend on the side: the same figure is in two lines.",
         "Two ambiguities: texture (a blank wall looks defocused), and near against far of the focus.",
     ),
 )
@@ -265,9 +265,9 @@ VISUAL_ODOMETRY = PublishedTable(
 
 
 def parse_printed(text: str | None) -> float | None:
-    """A printed figure as a number, per cent as a share; None where it is a range, a word or nothing."""
-    found = re.fullmatch(r"([+−-]?[\d,]+(?:\.\d+)?) ?(%|M|B)?", text or "")
-    if not found:
+    """Printed cell as a number, per cent as a fraction; None for a range, a word or an empty cell."""
+    match = re.fullmatch(r"([+−-]?[\d,]+(?:\.\d+)?) ?(%|M|B)?", text or "")
+    if not match:
         return None
-    scale = {"%": 0.01, "M": 1e6, "B": 1e9, None: 1.0}[found[2]]
-    return float(found[1].replace(",", "").replace("−", "-")) * scale
+    scale = {"%": 0.01, "M": 1e6, "B": 1e9, None: 1.0}[match[2]]
+    return float(match[1].replace(",", "").replace("−", "-")) * scale

@@ -1,4 +1,4 @@
-"""Reading an archived result: its variants and cohorts, rows of scenes, numbers of rows and summary."""
+"""Access to archived results: variants, cohorts, rows of scenes, metrics of rows and of the summary."""
 
 from __future__ import annotations
 
@@ -8,38 +8,38 @@ from typing import Any
 Result = Mapping[str, Any]
 Row = Mapping[str, Any]
 
-#: Fields of a row that are no measurement.
+#: Fields of a row that are not metrics.
 NON_METRIC_FIELDS = ("scene", "pair", "method", "truth", "role", "note", "curves", "overlay")
 
 
 def variant_names(result: Result) -> list[str]:
-    """Names in the order of the rows."""
+    """Names of the variants, in the order of the rows."""
     return list(dict.fromkeys(row["method"] for row in result["rows"]))
 
 
 def cohort_names(result: Result) -> list[str | None]:
-    """What answers are held against, in the order of the rows."""
+    """Names of the kinds of ground truth, in the order of the rows."""
     return list(dict.fromkeys(row.get("truth") for row in result["rows"]))
 
 
 def last_cohort(result: Result) -> str | None:
-    """The cohort that decides: the one whose name the summary leaves out."""
-    found = cohort_names(result) or [None]
-    if len(found) == 1:
-        return found[0]
-    known, names = variant_names(result), list(result["summary"])
-    unnamed = (t for t in reversed(found) if not any(f"{v}.{t}." in name for v in known for name in names))
-    return next(unnamed, found[-1])
+    """Cohort of the verdict: the one whose name is omitted in the summary."""
+    cohorts = cohort_names(result) or [None]
+    if len(cohorts) == 1:
+        return cohorts[0]
+    variants, names = variant_names(result), list(result["summary"])
+    unnamed = (t for t in reversed(cohorts) if not any(f"{v}.{t}." in name for v in variants for name in names))
+    return next(unnamed, cohorts[-1])
 
 
 def scene_rows(result: Result, truth: str | None = None, variant: str | None = None) -> list[Row]:
-    """Rows of scenes: of one cohort and one variant, or of all."""
-    found = [row for row in result["rows"] if row["pair"] is None and truth in (None, row.get("truth"))]
-    return [row for row in found if variant in (None, row["method"])]
+    """Rows of scenes, of one cohort and variant or of all."""
+    rows = [row for row in result["rows"] if row["pair"] is None and truth in (None, row.get("truth"))]
+    return [row for row in rows if variant in (None, row["method"])]
 
 
 def metric_value(row: Row, metric: str) -> Any:
-    """A number of a row; a dotted name looks into its groups."""
+    """Value of a metric in a row; a dotted name is a member of a group."""
     if metric in row or "." not in metric:
         return row.get(metric)
     group, _, rest = metric.partition(".")
@@ -48,7 +48,7 @@ def metric_value(row: Row, metric: str) -> Any:
 
 
 def summary_entry(result: Result, variant: str, metric: str, truth: str | None = None) -> Mapping[str, Any]:
-    """Summary of a metric; it bears no variant's name where there is but one, and no cohort's for the last."""
+    """Summary entry of a metric; its key omits the name of a single variant and that of the last cohort."""
     last = truth is None or truth == last_cohort(result)
     names = [f"{variant}.{metric}"] if last else [f"{variant}.{truth}.{metric}"]
     names += [metric] if last and len(variant_names(result)) == 1 else []
@@ -56,20 +56,20 @@ def summary_entry(result: Result, variant: str, metric: str, truth: str | None =
 
 
 def flatten_row(row: Row, prefix: str = "") -> dict[str, Any]:
-    """The measurements of a row, groups as ``group.member``; curves and overlays are left to the figures."""
+    """Metrics of a row as a flat dictionary, groups as ``group.member``, without curves and overlays."""
     flat: dict[str, Any] = {}
-    for name, found in row.items():
+    for name, value in row.items():
         if not prefix and name in NON_METRIC_FIELDS:
             continue
-        if isinstance(found, Mapping):
-            flat |= flatten_row(found, f"{prefix}{name}.")
+        if isinstance(value, Mapping):
+            flat |= flatten_row(value, f"{prefix}{name}.")
         else:
-            flat[prefix + name] = found
+            flat[prefix + name] = value
     return flat
 
 
 def describe_result(result: Result) -> str:
-    """One line: experiment, data, verdict, when and with which code."""
+    """One line of text: experiment, data, verdict, time and code version."""
     verdict = f", {result['verdict']}" if result["verdict"] else ""
     meta = result["meta"]
     return (

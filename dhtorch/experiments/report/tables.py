@@ -1,4 +1,4 @@
-"""Archived results as tables of text cells, ready for any medium; every kind of result gets these."""
+"""Archived results as tables of text cells: the generic tables of every experiment and builders for the layouts."""
 
 from __future__ import annotations
 
@@ -31,20 +31,22 @@ from dhtorch.experiments.report.reading import (
 )
 from dhtorch.runtime.console import format_count
 
-#: (pattern of our variant, its label or None = its own name, the paper's line)
+#: Lines of a table: (pattern of our variant, its label or None = its own name, the paper's line or None).
 KnownLines = Sequence[tuple[str, str | None, str | None]]
 
-#: First cell of the row with the intervals over scenes.
+#: Label of the row with the intervals over scenes.
 INTERVAL_LABEL = "95 % interval"
-#: A line of the paper that this result has no counterpart for.
+#: Cell of a line of the paper without a counterpart in the result.
 _NOT_RUN = "not run"
-#: Marks lines and columns that quote the paper.
-PUBLISHED_LABEL, OURS_LABEL = "published", "ours"
+#: Label of lines and columns that quote the paper.
+PUBLISHED_LABEL = "published"
+#: Label of columns with the numbers of the result.
+OURS_LABEL = "ours"
 
-#: The main table, one row per scene. The optional ones appear where a result has them.
+#: Columns of the main table, one row per scene; the optional ones appear if the result has them.
 MAIN_COLUMNS = ("n_candidates", "coverage", "median_rel", "p90_rel", "corr", "residual_px", "pnp_success")
 _OPTIONAL_COLUMNS = ("wrong_share", "aurc", "ece")
-#: Measured of every scene, and too much for the first look.
+#: Metrics of every scene that are only in the full tables.
 _DETAIL_METRICS = {
     "within_sigma",
     "within_2sigma",
@@ -65,39 +67,39 @@ _DETAIL_METRICS |= {
     "n_holes",
 }
 _DETAIL_METRICS |= {"n_recovered"}
-#: Groups of metrics that get a table of their own: name and title.
+#: Groups of metrics with a table of their own: (name, title).
 _METRIC_GROUPS = (
     ("n_dropped", "truth dropped"),
     ("hole_share", "holes by class"),
-    ("route_share", "what could fill the holes"),
-    ("gate_share", "what became of samples"),
+    ("route_share", "ways to fill the holes"),
+    ("gate_share", "samples by gate"),
     ("ms", "milliseconds per pair"),
 )
 
 
 @dataclass(frozen=True)
 class ReportTable:
-    """Text cells."""
+    """Table of text cells, with the kind of its rows and the span of its headings."""
 
     title: str
     head: list[str]
     rows: list[list[str]]
-    n_label: int = 1  # leading columns that are words
-    footer: int = 0  # rows that sum up, after the others
-    quoted: int = 0  # rows of the paper, after these
-    over: tuple[tuple[str, int], ...] = ()  # headings over several columns: (text, columns)
-    note: str = ""  # what must be known to read it
-    best: frozenset[tuple[int, int]] = frozenset()  # (row, column) of cells that stand out
+    n_label: int = 1  # number of leading columns with labels
+    footer: int = 0  # number of summary rows, after the body
+    quoted: int = 0  # number of rows of the paper, last
+    over: tuple[tuple[str, int], ...] = ()  # upper headings: (text, number of columns)
+    note: str = ""  # text below the table
+    best: frozenset[tuple[int, int]] = frozenset()  # (row, column) of highlighted cells
 
     def flat_head(self) -> list[str]:
-        """One heading per column, with what stands over it."""
+        """One heading per column, prefixed by its upper heading."""
         above = [text for text, span in self.over for _ in range(span)] or [""] * len(self.head)
         return [", ".join(filter(None, pair)) for pair in zip(above, self.head, strict=True)]
 
 
 @dataclass(frozen=True)
 class TableLine:
-    """A line of a table by variant: one of ours, one of the paper's, or both side by side."""
+    """Line of a table by variant: one of the result, one of the paper, or both side by side."""
 
     label: str
     variant: str | None
@@ -105,40 +107,40 @@ class TableLine:
 
 
 def generic_tables(result: Result, shown: Sequence[str] = ()) -> list[ReportTable]:
-    """Errors by scene for every cohort, what else was measured, and the groups; ``shown`` stands elsewhere already."""
+    """Tables of any result: errors by scene for every cohort, further columns except ``shown``, and metric groups."""
     rows = scene_rows(result)
-    found = []
+    tables = []
     if any(metric in row for row in rows for metric in MAIN_COLUMNS) or (rows and all(row.get("note") for row in rows)):
-        several = len(cohort_names(result)) > 1
+        has_cohorts = len(cohort_names(result)) > 1
         for truth in cohort_names(result):
             columns = (*MAIN_COLUMNS, *(m for m in _OPTIONAL_COLUMNS if any(row.get(m) is not None for row in rows)))
-            title = f"{describe_result(result)}; held against {truth}" if several else describe_result(result)
-            found.append(scene_table(result, title, columns, truth))
-        known = _DETAIL_METRICS | set(MAIN_COLUMNS) | set(_OPTIONAL_COLUMNS) | set(NON_METRIC_FIELDS) | set(shown)
-        more = [m for m in _scalars(rows) if m not in known]
-        found += [scene_table(result, "further columns", more)] if more else []
+            title = f"{describe_result(result)}; ground truth: {truth}" if has_cohorts else describe_result(result)
+            tables.append(scene_table(result, title, columns, truth))
+        excluded = _DETAIL_METRICS | set(MAIN_COLUMNS) | set(_OPTIONAL_COLUMNS) | set(NON_METRIC_FIELDS) | set(shown)
+        more = [m for m in _scalars(rows) if m not in excluded]
+        tables += [scene_table(result, "further columns", more)] if more else []
     elif rows:
-        found.append(_plain_table(result, rows))
+        tables.append(_plain_table(result, rows))
     groups = [_group_table(result, *group) for group in _METRIC_GROUPS]
-    return found + [table for table in (_odd_surface_table(result), *groups) if table]
+    return tables + [table for table in (_odd_surface_table(result), *groups) if table]
 
 
 def scene_table(
     result: Result,
     title: str,
     columns: Sequence[str],
-    truth: str | None = None,  # None = the cohort that decides
+    truth: str | None = None,  # None = the cohort of the verdict
     quoted: PublishedTable | None = None,
 ) -> ReportTable:
-    """One row per scene and variant, the summary over scenes, then the paper's lines; roles stand apart."""
+    """Table by scene and variant, then the summary over scenes without a role, then the paper's lines."""
     truth = truth or last_cohort(result)
     rows = scene_rows(result, truth)
     order = list(dict.fromkeys(row["scene"] for row in result["rows"]))
-    several = len(variant_names(result)) > 1
+    has_variants = len(variant_names(result)) > 1
     pairs = [(r["scene"], r["method"]) for r in result["rows"] if r["pair"] is not None and r.get("truth") == truth]
 
     def line(scene: str, method: str, count: str, cells: list[str]) -> list[str]:
-        return [*([scene, method] if several else [scene]), count, *cells]
+        return [*([scene, method] if has_variants else [scene]), count, *cells]
 
     body = []
     for row in sorted(rows, key=lambda row: order.index(row["scene"])):
@@ -149,25 +151,28 @@ def scene_table(
         body.append(line(name, row["method"], str(pairs.count((row["scene"], row["method"]))), cells))
     footer = []
     for method in dict.fromkeys(row["method"] for row in rows if not row.get("role")):
-        mine = [row for row in rows if row["method"] == method and not row.get("role")]
-        n_pairs = sum(pairs.count((row["scene"], method)) for row in mine)
+        counted = [row for row in rows if row["method"] == method and not row.get("role")]
+        n_pairs = sum(pairs.count((row["scene"], method)) for row in counted)
         footer.append(
             line(
-                _n_scenes(mine), method, str(n_pairs), [_number_over_scenes(result, method, m, truth) for m in columns]
+                _n_scenes(counted),
+                method,
+                str(n_pairs),
+                [_number_over_scenes(result, method, m, truth) for m in columns],
             )
         )
-        spread = [_format_interval(summary_entry(result, method, m, truth), m) for m in columns]
-        footer += [line(INTERVAL_LABEL, method, "", spread)] if any(spread) else []
-    cited = _published_rows(quoted, columns, (quoted.lines if quoted else {}), 1 + several)
+        intervals = [_format_interval(summary_entry(result, method, m, truth), m) for m in columns]
+        footer += [line(INTERVAL_LABEL, method, "", intervals)] if any(intervals) else []
+    cited = _published_rows(quoted, columns, (quoted.lines if quoted else {}), 1 + has_variants)
     single = all(r["pair"][0] == r["pair"][1] for r in result["rows"] if r["pair"] is not None)
     heads = [
         "scene",
-        *(["method"] if several else []),
+        *(["method"] if has_variants else []),
         "frames" if single and pairs else "pairs",
         *map(metric_heading, columns),
     ]
     note = published_source(result, quoted) if quoted else ""
-    return ReportTable(title, heads, body + footer + cited, 1 + several, len(footer), len(cited), note=note)
+    return ReportTable(title, heads, body + footer + cited, 1 + has_variants, len(footer), len(cited), note=note)
 
 
 def variant_table(
@@ -176,9 +181,9 @@ def variant_table(
     columns: Sequence[str],
     lines: Sequence[TableLine] | None = None,  # None = one per variant
     published: PublishedTable | None = None,
-    truth: str | None = None,  # None = the cohort that decides
+    truth: str | None = None,  # None = the cohort of the verdict
 ) -> ReportTable:
-    """One row per variant, summed up over scenes, the paper's figure beside ours; its other lines follow."""
+    """Table by variant with summaries over scenes and the paper's figures beside them; its other lines follow."""
     truth = truth or last_cohort(result)
     lines = [TableLine(v, v) for v in variant_names(result)] if lines is None else lines
     theirs = published.lines if published else {}
@@ -205,28 +210,28 @@ def variant_table(
 
 
 def match_lines(result: Result, known: KnownLines, without: str = r"(?!)") -> list[TableLine]:
-    """The paper's lines in its order, each with our variant of that kind, then what else we ran."""
-    names = [v for v in variant_names(result) if not re.fullmatch(without, v)]
-    found, used = [], set()
+    """Lines of a table: the paper's in its order, each with the matching variants, then the other variants."""
+    names = [variant for variant in variant_names(result) if not re.fullmatch(without, variant)]
+    lines, used = [], set()
     for pattern, label, paper in known:
-        matching = [v for v in names if v not in used and re.fullmatch(pattern, v)]
+        matching = [variant for variant in names if variant not in used and re.fullmatch(pattern, variant)]
         used.update(matching)
-        for v in matching:
-            alike = paper is None or paper.lower().startswith(v.lower())
-            shown = label or (v if alike else f"{v} ({PUBLISHED_LABEL}: {paper})")
-            found.append(TableLine(shown, v, paper))
+        for variant in matching:
+            same_name = paper is None or paper.lower().startswith(variant.lower())
+            label_shown = label or (variant if same_name else f"{variant} ({PUBLISHED_LABEL}: {paper})")
+            lines.append(TableLine(label_shown, variant, paper))
         if not matching:
-            found.append(TableLine(label or paper or pattern, None, paper))
-    return found + [TableLine(v, v) for v in names if v not in used]
+            lines.append(TableLine(label or paper or pattern, None, paper))
+    return lines + [TableLine(variant, variant) for variant in names if variant not in used]
 
 
 def full_tables(result: Result) -> list[ReportTable]:
-    """All that was measured, with five digits: the summary, every scene, every pair."""
-    found = []
+    """All numbers of a result with five digits: summary, scenes, pairs."""
+    tables = []
     if result["summary"]:
         fields = ("value", "low", "high", "n", "unit")
         rows = [[name, *(format_exact(e[k]) for k in fields)] for name, e in result["summary"].items()]
-        found.append(ReportTable("Summary over scenes", ["metric", "value", "low", "high", "n", "unit"], rows))
+        tables.append(ReportTable("Summary over scenes", ["metric", "value", "low", "high", "n", "unit"], rows))
     for title, pairs in (("Scenes", False), ("Pairs", True)):
         flat = [(row, flatten_row(row)) for row in result["rows"] if (row["pair"] is not None) == pairs]
         if not flat:
@@ -237,12 +242,12 @@ def full_tables(result: Result) -> list[ReportTable]:
             [*(format_exact(row.get(k)) for k in labels), *(format_exact(numbers.get(m)) for m in metrics)]
             for row, numbers in flat
         ]
-        found.append(ReportTable(title, [*labels, *metrics], body, len(labels)))
-    return found
+        tables.append(ReportTable(title, [*labels, *metrics], body, len(labels)))
+    return tables
 
 
 def published_source(result: Result, quoted: PublishedTable) -> str:
-    """Where the paper's figures are from, and that ours are from elsewhere."""
+    """Note with the source and data of the paper's figures and the data of the result."""
     data = result["data"]
     n = len(data["scenes"])
     ours = f"Ours: {data['name']}, {format_count(n, 'scene')}."
@@ -253,16 +258,18 @@ def published_source(result: Result, quoted: PublishedTable) -> str:
 
 
 def _range_over(rows: Sequence[Row]) -> str:
-    found = [row["median_rel"] for row in rows if row.get("median_rel") is not None]
-    return (format_metric_interval(min(found), max(found), "median_rel") or EMPTY_CELL) if found else EMPTY_CELL
+    """Cell with the smallest and the largest median error over scenes."""
+    errors = [row["median_rel"] for row in rows if row.get("median_rel") is not None]
+    return (format_metric_interval(min(errors), max(errors), "median_rel") or EMPTY_CELL) if errors else EMPTY_CELL
 
 
 def _passes(rows: Sequence[Row]) -> str:
-    found = [bool(row["passes"]) for row in rows if row.get("passes") is not None]
-    return f"{sum(found)}/{len(found)}" if found else EMPTY_CELL
+    """Cell with the number of scenes that pass, of those tested."""
+    passed = [bool(row["passes"]) for row in rows if row.get("passes") is not None]
+    return f"{sum(passed)}/{len(passed)}" if passed else EMPTY_CELL
 
 
-#: Numbers over scenes that are no median of the scenes' own: from the rows of the scenes.
+#: Columns computed from the rows of the scenes instead of the summary.
 DERIVED_NUMBERS: dict[str, Callable[[Sequence[Row]], str]] = {
     "n_scenes": lambda rows: str(sum(not row.get("note") for row in rows)),
     "range": _range_over,
@@ -271,25 +278,27 @@ DERIVED_NUMBERS: dict[str, Callable[[Sequence[Row]], str]] = {
 
 
 def _number_over_scenes(result: Result, variant: str, metric: str, truth: str | None) -> str:
-    """One number over scenes without a role; where nothing was measured on any, why."""
+    """Cell of a metric over scenes without a role; the notes of the scenes if none was measured."""
     rows = [row for row in scene_rows(result, truth, variant) if not row.get("role")]
-    found = summary_entry(result, variant, metric, truth).get("value")
-    if found is None:  # words, such as a device, are in the rows alone
-        said = {row[metric] for row in rows if isinstance(row.get(metric), str)}
-        found = said.pop() if len(said) == 1 else None
-    cell = format_value(found, metric) if metric not in DERIVED_NUMBERS else DERIVED_NUMBERS[metric](rows)
+    value = summary_entry(result, variant, metric, truth).get("value")
+    if value is None:  # texts, such as a device, are only in the rows
+        texts = {row[metric] for row in rows if isinstance(row.get(metric), str)}
+        value = texts.pop() if len(texts) == 1 else None
+    cell = format_value(value, metric) if metric not in DERIVED_NUMBERS else DERIVED_NUMBERS[metric](rows)
     notes = [row["note"] for row in rows if row.get("note")]
-    silent = cell == EMPTY_CELL and len(notes) == len(rows) > 0
-    return "; ".join(dict.fromkeys(notes)) if silent else cell
+    all_skipped = cell == EMPTY_CELL and len(notes) == len(rows) > 0
+    return "; ".join(dict.fromkeys(notes)) if all_skipped else cell
 
 
-def _format_interval(found: Mapping[str, Any], metric: str) -> str:
-    return "" if metric in DERIVED_NUMBERS else format_metric_interval(found.get("low"), found.get("high"), metric)
+def _format_interval(entry: Mapping[str, Any], metric: str) -> str:
+    """Cell with the interval of a summary entry; empty for derived numbers."""
+    return "" if metric in DERIVED_NUMBERS else format_metric_interval(entry.get("low"), entry.get("high"), metric)
 
 
 def _n_scenes(rows: Sequence[Row]) -> str:
-    n, silent = len(rows), sum(bool(row.get("note")) for row in rows)
-    return f"{n - silent} of {format_count(n, 'scene')}" if silent else format_count(n, "scene")
+    """Cell with the number of scenes, of how many if some were skipped."""
+    n, n_skipped = len(rows), sum(bool(row.get("note")) for row in rows)
+    return f"{n - n_skipped} of {format_count(n, 'scene')}" if n_skipped else format_count(n, "scene")
 
 
 def _published_rows(
@@ -299,21 +308,21 @@ def _published_rows(
     n_label: int,
     double: frozenset[str] | set[str] | None = None,
 ) -> list[list[str]]:
-    """Lines of the paper without a counterpart of ours; in a table by scene a column counts the pairs."""
-    found = []
+    """Rows of the paper's lines without a counterpart; a table by scene also has a column of pairs."""
+    rows = []
     for name, cells in lines.items() if published else ():
         row = [f"{PUBLISHED_LABEL}: {name}", *[""] * (n_label - 1 + (double is None))]
         for metric in columns:
             row += [""] * (metric in (double or ())) + [cells.get(metric, EMPTY_CELL)]
-        found.append(row)
-    return found
+        rows.append(row)
+    return rows
 
 
 # ---------------------------------------------------------------------------------------------- other tables
 
 
 def _group_table(result: Result, group: str, title: str) -> ReportTable | None:
-    """One row per variant and one column per member of a group of metrics; None where there is none."""
+    """Table with one row per variant and one column per member of a metric group; None without members."""
     split = [f".{name}".split(f".{group}.", 1) for name in result["summary"]]
     members = list(dict.fromkeys(parts[1] for parts in split if len(parts) > 1))
     rows = []
@@ -328,7 +337,7 @@ def _group_table(result: Result, group: str, title: str) -> ReportTable | None:
 
 
 def _odd_surface_table(result: Result) -> ReportTable | None:
-    """Surfaces that are counted apart, such as mirrors."""
+    """Table of surfaces that are evaluated separately, such as mirrors; None without any."""
     columns = ("n_candidates", "coverage", "median_rel", "p90_rel", "corr")
     kinds = dict.fromkeys(kind for row in scene_rows(result) for kind in row.get("apart") or {})
     rows = [
@@ -340,11 +349,15 @@ def _odd_surface_table(result: Result) -> ReportTable | None:
         for kind in kinds
         for variant in variant_names(result)
     ]
-    return ReportTable("counted apart", ["surface", "method", *map(metric_heading, columns)], rows, 2) if rows else None
+    return (
+        ReportTable("surfaces evaluated separately", ["surface", "method", *map(metric_heading, columns)], rows, 2)
+        if rows
+        else None
+    )
 
 
 def _plain_table(result: Result, rows: Sequence[Row]) -> ReportTable:
-    """Rows that are no scenes of candidates, as timings are: every field a column."""
+    """Table of rows without candidates, such as timings: one column per field."""
     names = [k for k in dict.fromkeys(k for row in rows for k in row) if k not in ("pair", "curves", "overlay")]
     names = [k for k in names if any(not isinstance(row.get(k), Mapping) and row.get(k) is not None for row in rows)]
     n_label = next((k for k, n in enumerate(names) if not isinstance(rows[0].get(n), str)), len(names))
@@ -353,6 +366,6 @@ def _plain_table(result: Result, rows: Sequence[Row]) -> ReportTable:
 
 
 def _scalars(rows: Sequence[Row]) -> list[str]:
-    """Fields that are a number in some row."""
-    found = (k for row in rows for k, v in row.items() if isinstance(v, int | float))
-    return list(dict.fromkeys(found))
+    """Names of the fields that are a number in any row."""
+    names = (k for row in rows for k, v in row.items() if isinstance(v, int | float))
+    return list(dict.fromkeys(names))

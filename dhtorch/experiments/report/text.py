@@ -1,4 +1,4 @@
-"""Tables on the console and as Markdown."""
+"""Output of tables on the console and as Markdown."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def print_table(table: ReportTable, console: Any = None) -> None:
 
     console = console or Console(file=unwrap_terminal(sys.stdout))
     if not console.is_terminal:
-        console.width = max(console.width, 240)  # a file has no edge to wrap at
+        console.width = max(console.width, 240)  # output to a file is not wrapped at the terminal width
     shown = RichTable(
         title=escape_markup(table.title), box=box.SIMPLE_HEAD, title_justify="left", title_style="bold", pad_edge=False
     )
@@ -52,7 +52,7 @@ def tables_to_markdown(tables: Iterable[ReportTable]) -> str:
 
 
 def table_to_markdown(table: ReportTable) -> str:
-    """A table's lines alone as Markdown."""
+    """Rows of a table as Markdown, without title and note."""
     align = [":--" if k < table.n_label else "--:" for k in range(len(table.head))]
     marked = [
         [f"**{_escape_cell(c)}**" if (k, n) in table.best else _escape_cell(c) for n, c in enumerate(cells)]
@@ -63,5 +63,5 @@ def table_to_markdown(table: ReportTable) -> str:
 
 
 def _escape_cell(cell: str) -> str:
-    """A cell that cannot end its own row or begin markup."""
+    """Cell on one line with Markdown and HTML characters escaped."""
     return " ".join(cell.split()).replace("|", "\\|").replace("<", "&lt;")

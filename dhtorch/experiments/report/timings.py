@@ -1,4 +1,4 @@
-"""Timings: the paper's branches, the two ratios that any machine can test, and every stage."""
+"""Tables of timings: branches as in the paper, two machine-independent ratios, and every stage."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dhtorch.experiments.report.tables import OURS_LABEL, PUBLISHED_LABEL, Repor
 
 _TIMING_COLUMNS = ("device", "p50_ms", "p95_ms", "p99_ms", "parameters", "weight_bytes", "peak_mib")
 _STAGE_COLUMNS = ("p50_ms", "p95_ms", "p99_ms")
-#: Summary's name → (words, what the paper has).
+#: Name in the summary → (label, the paper's value).
 _PUBLISHED_RATIOS = {
     "speedup": ("DINOv2-L / front end", "96"),
     "growth": ("front end at 1440×1920 / 224×224", "3.81 / 1.11"),
@@ -17,15 +17,15 @@ _PUBLISHED_RATIOS = {
 
 
 def latency_tables(result: Result) -> list[ReportTable]:
-    """Tables of a result of timings."""
-    whole = [row for row in scene_rows(result) if is_whole_branch(row)]
+    """Tables of a latency result: branches, ratios, stages."""
+    branches = [row for row in scene_rows(result) if is_whole_branch(row)]
     cited = [
         [f"{PUBLISHED_LABEL}: {name}", *(cells.get(m, EMPTY_CELL) for m in _TIMING_COLUMNS)]
         for name, cells in published.LATENCY.lines.items()
     ]
     note = f"{published_source(result, published.LATENCY)} {_machine_note(result)}".strip()
-    rows = [_table_row(row, _TIMING_COLUMNS) for row in whole]
-    found = [
+    rows = [_table_row(row, _TIMING_COLUMNS) for row in branches]
+    tables = [
         ReportTable(
             "Measured latency",
             ["branch", *map(metric_heading, _TIMING_COLUMNS)],
@@ -35,41 +35,47 @@ def latency_tables(result: Result) -> list[ReportTable]:
         )
     ]
     ratios = [
-        [words, format_value(e["value"], how="plain"), format_metric_interval(e["low"], e["high"], name), theirs]
-        for name, (words, theirs) in _PUBLISHED_RATIOS.items()
+        [
+            words,
+            format_value(e["value"], how="plain"),
+            format_metric_interval(e["low"], e["high"], name),
+            published_ratio,
+        ]
+        for name, (words, published_ratio) in _PUBLISHED_RATIOS.items()
         for v in variant_names(result)
         if (e := summary_entry(result, v, name))
     ]
     if ratios:
-        found.append(ReportTable("Ratios", ["", OURS_LABEL, "lowest–highest round", PUBLISHED_LABEL], ratios))
+        tables.append(ReportTable("Ratios", ["", OURS_LABEL, "lowest–highest round", PUBLISHED_LABEL], ratios))
     stages = [_table_row(row, _STAGE_COLUMNS) for row in scene_rows(result) if not is_whole_branch(row)]
     if stages:
-        found.append(ReportTable("Latency by stage", ["stage", *map(metric_heading, _STAGE_COLUMNS)], stages))
-    return found
+        tables.append(ReportTable("Latency by stage", ["stage", *map(metric_heading, _STAGE_COLUMNS)], stages))
+    return tables
 
 
 def branch_name(row: Row) -> str:
-    """What a row of timings is about."""
+    """Name of the branch or stage of a row, with its image size."""
     size = f", {format_value(row['hw'])}" if row.get("hw") else ""
     return f"{row['method']} {row.get('stage', '').replace('_', ' ')}".strip() + size
 
 
 def is_whole_branch(row: Row) -> bool:
-    """Whether a row is about a branch and not about one stage of it."""
+    """Whether a row is of a whole branch rather than of one stage."""
     return row.get("stage") in ("front_end", "pair", "forward") or "parameters" in row
 
 
 def _table_row(row: Row, columns: tuple[str, ...]) -> list[str]:
+    """Cells of a row; its note in place of missing values."""
     missing = row.get("note", EMPTY_CELL)
     return [branch_name(row), *(missing if row.get(m) is None else format_value(row[m], m) for m in columns)]
 
 
 def _machine_note(result: Result) -> str:
-    """On what ours were measured."""
-    said = []
-    for name, words in (("cpu", "CPU"), ("cores", "cores"), ("threads", "threads"), ("load", "load of the machine")):
-        known = dict.fromkeys(
+    """Note on the machine of the measurement."""
+    facts = []
+    for name, label in (("cpu", "CPU"), ("cores", "cores"), ("threads", "threads"), ("load", "load of the machine")):
+        values = dict.fromkeys(
             format_value(row[name], how="plain") for row in scene_rows(result) if row.get(name) is not None
         )
-        said += [f"{words} {', '.join(known)}"] if known else []
-    return f"Measured with {'; '.join(said)}." if said else ""
+        facts += [f"{label} {', '.join(values)}"] if values else []
+    return f"Measured with {'; '.join(facts)}." if facts else ""

@@ -1,7 +1,7 @@
-// The steps of dhtorch/geometry/affine_alignment.py on one level as an operator on torch's stable ABI, point after point: the same
-// pictures, steps and rule to stop. Sums over a window are taken in another order than torch's, so that places agree to
-// rounding and not bit for bit; what a point is told depends on no other. One thread, no gradient. Callers check shapes,
-// types and that everything is contiguous; see dhtorch/ops/loader.py.
+// Affine registration of windows on one level, one point after another. Reference: _register_level in
+// dhtorch/geometry/affine_alignment.py; the same steps and stopping criterion. Sums over a window are taken in another
+// order, so that results agree up to rounding; a point's result does not depend on the others. One thread, no gradient. The
+// dispatch checks dtypes and strides, Python the shapes.
 
 #include "vectors.h"
 
@@ -13,17 +13,20 @@
 
 namespace {
 
-// What affine.py, least_squares.py and pyramid.py hold under the same names.
-constexpr int64_t REACH = 8, MARGIN = 4;
-constexpr float AHEAD = 0.5f, LEAST_GAIN = 0.2f, MOST_GAIN = 5.0f;
-constexpr double NOISE = 2.0 / 255 / 2, DAMPING = NOISE * NOISE, MIN_PIVOT = 1e-6;
+// Limits of the search: pixels around a window's start that are read, pixels outside the image where a window may stand,
+// share of an extrapolated step, range of gains, damping of the affine part, least pivot of the normal equations.
+struct Options {
+  int64_t search_padding, margin;
+  float max_extrapolation, min_gain, max_gain;
+  double damping, min_pivot;
+};
 
-// A warp's W_0, W_1 and W_2, or a change of it: each (x, y).
+// A warp W_0, W_1, W_2, or a change of it: each (x, y).
 struct Warp {
   float of[3][2];
 };
 
-// The pixels around which a picture is read, whatever a place may be.
+// The pixel that a window is read around: the position, clamped; NaN becomes `least`.
 inline int64_t pixel(float place, int64_t least, int64_t most) {
   return place > static_cast<float>(least) ? static_cast<int64_t>(std::min(place, static_cast<float>(most))) : least;
 }
@@ -44,8 +47,8 @@ struct Level {
 struct Patch {
   const float* pixels;
   int64_t stride;
-  float corner[2];  // its first pixel
-  float last;       // a place at its far border, in its own pixels
+  float corner[2];  // its first pixel in the image
+  float last;       // its last pixel in its own coordinates
 
   Patch(const Level& level, int64_t batch, const float* x, int64_t reach) : stride(level.width) {
     const int64_t column = pixel(std::floor(x[0] + 0.5f), 0, level.width - 2 * level.pad - 1),
@@ -57,18 +60,20 @@ struct Patch {
   }
 };
 
-inline Vector within(Vector x, float most) {  // what is no number becomes 0
+inline Vector within(Vector x, float most) {  // clamp to [0, most]; NaN becomes 0
   x = x > 0.0f ? x : Vector{};
   return x < most ? x : Vector{} + most;
 }
 
-// The window of image 0 as six pictures, T without its mean, and J, each a row filled up to whole vectors by zeros.
+// The window of image 0: six derivative images and T without its mean, and J, each one row padded with zeros to whole
+// vectors.
 struct Window {
+  const Options& options;
   int64_t size, count, wide;
-  std::vector<float> u, v, inside, pictures, J;  // inside: 1, and 0 in what is filled up
+  std::vector<float> u, v, inside, pictures, J;  // inside: 1 in the window, 0 in the padding
 
-  explicit Window(int64_t size)
-      : size(size), count(size * size), wide((count + LANES - 1) / LANES * LANES), u(wide), v(wide), inside(wide),
+  Window(const Options& options, int64_t size)
+      : options(options), size(size), count(size * size), wide((count + LANES - 1) / LANES * LANES), u(wide), v(wide), inside(wide),
         pictures(7 * wide), J(wide) {
     const float step = 2.0f / static_cast<float>(size - 1);
     std::vector<float> place(size);  // as torch.linspace
@@ -97,8 +102,8 @@ struct Window {
   }
 
   void read(const Level& level, const float* q, int64_t batch) {
-    const int64_t column = pixel(q[0], -MARGIN, level.width - 2 * level.pad - 1 + MARGIN),
-                  row = pixel(q[1], -MARGIN, level.rows - 2 * level.pad - 1 + MARGIN);
+    const int64_t margin = options.margin, column = pixel(q[0], -margin, level.width - 2 * level.pad - 1 + margin),
+                  row = pixel(q[1], -margin, level.rows - 2 * level.pad - 1 + margin);
     for (int64_t k = 0; k < 3; ++k) {
       const float* from = level.at(batch, (k + 1) % 3, column - size / 2, row - size / 2);
       float* to = picture(k < 2 ? k : 6);
@@ -117,18 +122,18 @@ struct Window {
     }
   }
 
-  // Normal equations of the six pictures, T and 1, their lower half.
+  // Lower half of the normal equations of the six derivative images, T and 1.
   void normal(double (*H)[8]) {
     for (int64_t a = 0; a < 7; ++a) {
       for (int64_t b = 0; b <= a; ++b) H[a][b] = sum(picture(a), picture(b));
       H[7][a] = sum(picture(a));
     }
     H[7][7] = static_cast<double>(count);
-    for (int64_t a = 2; a < 6; ++a) H[a][a] = static_cast<float>(H[a][a]) + static_cast<float>(DAMPING);
+    for (int64_t a = 2; a < 6; ++a) H[a][a] = static_cast<float>(H[a][a]) + static_cast<float>(options.damping);
   }
 
-  // J at a warp of the patch's pixels; beyond its border the border's value.
-  void look(const Patch& patch, const Warp& warp) {
+  // Read J at a warp, in pixels of the patch; beyond its border the border's value.
+  void read_warped(const Patch& patch, const Warp& warp) {
     const auto& W = warp.of;
     const int32_t stride = static_cast<int32_t>(patch.stride), most = static_cast<int32_t>(patch.last) - 1;
     for (int64_t i = 0; i < wide; i += LANES) {
@@ -154,7 +159,7 @@ struct Window {
     }
   }
 
-  void project(float* sums) {  // the eight pictures on J
+  void project(float* sums) {  // inner products of the eight images with J
     Vector parts[8] = {};
     for (int64_t i = 0; i < wide; i += LANES) {
       const Vector there = load(&J[i]);
@@ -164,7 +169,7 @@ struct Window {
     for (int64_t k = 0; k < 8; ++k) sums[k] = total(parts[k]);
   }
 
-  // Gain of J over T, and the mean square of what gain and bias leave.
+  // Gain of J over T, and the mean square of the residual.
   void quality(float* fit) {
     float* T = picture(6);
     const float energy = sum(T, T), gain = sum(T, J.data()) / (energy > 0.0f ? energy : 1.0f);
@@ -178,7 +183,7 @@ struct Window {
     fit[1] = total(squares) / static_cast<float>(count);
   }
 
-  // Which share of the variance of white noise is left by reading at a warp.
+  // Share of the variance of white noise that bilinear reading at a warp leaves.
   float share(const Warp& warp) const {
     const auto& W = warp.of;
     Vector sums = {};
@@ -193,15 +198,15 @@ struct Window {
   }
 
   static Vector kept(Vector x) {
-    x = x < 1e6f && x > -1e6f ? x : Vector{};  // no such place is believed
+    x = x < 1e6f && x > -1e6f ? x : Vector{};  // beyond any image
     const Vector whole = __builtin_convertvector(__builtin_convertvector(x, Bits), Vector), fraction = x - whole;
     const Vector off = (fraction < 0.0f ? -fraction : fraction) - 0.5f;
     return off * off * 2.0f + 0.5f;
   }
 };
 
-// Inverse of normal equations whose lower half is given, and whether there is one.
-bool invert(const double (*H)[8], float (*inverse)[8]) {
+// Inverse of normal equations from their lower half; returns whether they are regular.
+bool invert(const double (*H)[8], float (*inverse)[8], const Options& o) {
   double scale[8], L[8][8], R[8][8] = {};  // R = 1 / L
   bool textured = true;
   for (int i = 0; i < 8; ++i) scale[i] = H[i][i] > 0 ? 1 / std::sqrt(H[i][i]) : 1.0;
@@ -210,7 +215,7 @@ bool invert(const double (*H)[8], float (*inverse)[8]) {
       double rest = H[i][j] * (scale[i] * scale[j]);
       for (int k = 0; k < j; ++k) rest -= L[i][k] * L[j][k];
       if (i == j) {
-        textured = textured && rest > MIN_PIVOT * MIN_PIVOT;
+        textured = textured && rest > o.min_pivot * o.min_pivot;
         L[j][j] = std::sqrt(rest);
         R[j][j] = 1 / L[j][j];
       } else {
@@ -218,10 +223,10 @@ bool invert(const double (*H)[8], float (*inverse)[8]) {
       }
     }
   }
-  if (!textured) {  // as if L were a multiple of the identity
+  if (!textured) {  // that of a multiple of the identity
     for (int i = 0; i < 8; ++i) {
       std::fill_n(inverse[i], 8, 0.0f);
-      inverse[i][i] = static_cast<float>(scale[i] * scale[i] / DAMPING);
+      inverse[i][i] = static_cast<float>(scale[i] * scale[i] / o.damping);
     }
     return false;
   }
@@ -242,28 +247,28 @@ bool invert(const double (*H)[8], float (*inverse)[8]) {
   return true;
 }
 
-// The change that regression on the eight pictures says.
-Warp change(const float (*inverse)[8], const float* sums) {
+// The change of the warp by regression on the eight images.
+Warp change(const float (*inverse)[8], const float* sums, const Options& o) {
   float solution[7];
   for (int i = 0; i < 7; ++i) {
     solution[i] = 0.0f;
     for (int k = 0; k < 8; ++k) solution[i] += inverse[i][k] * sums[k];
   }
-  const float gain = std::clamp(solution[6], LEAST_GAIN, MOST_GAIN);
+  const float gain = std::clamp(solution[6], o.min_gain, o.max_gain);
   Warp found;
   for (int i = 0; i < 6; ++i) found.of[i / 2][i % 2] = solution[i] / gain;
   return found;
 }
 
-// The step to take where regression says `now`, having said `before` when `taken` was taken.
-Warp further(const Warp& now, const Warp& taken, const Warp& before) {
+// The step to take where regression gives `now`, after `before`, for which `taken` was taken (Anderson acceleration).
+Warp extrapolate(const Warp& now, const Warp& taken, const Warp& before, float most) {
   float along = 0.0f, square = 0.0f;
   for (int i = 0; i < 6; ++i) {
     const float bend = now.of[i / 2][i % 2] - before.of[i / 2][i % 2];
     along += now.of[i / 2][i % 2] * bend;
     square += bend * bend;
   }
-  const float share = std::clamp(along / std::max(square, 1e-20f), -AHEAD, AHEAD / (1.0f + AHEAD));
+  const float share = std::clamp(along / std::max(square, 1e-20f), -most, most / (1.0f + most));
   Warp found;
   for (int i = 0; i < 6; ++i) {
     const float bend = now.of[i / 2][i % 2] - before.of[i / 2][i % 2];
@@ -289,7 +294,7 @@ Warp compose(const Warp& warp, const Warp& change, float half) {
   return found;
 }
 
-float furthest(const Warp& change) {  // of the window's corners, along an axis
+float furthest(const Warp& change) {  // largest motion of the window's corners along an axis
   float most[2];
   for (int axis = 0; axis < 2; ++axis) {
     most[axis] = std::abs(change.of[0][axis]) + std::abs(change.of[1][axis]) + std::abs(change.of[2][axis]);
@@ -297,32 +302,35 @@ float furthest(const Warp& change) {  // of the window's corners, along an axis
   return std::max(most[0], most[1]);
 }
 
-// Gauss-Newton steps of one point from a warp in pixels of the patch; J is read where they end.
-Warp descend(Window& window, const Patch& patch, const float (*inverse)[8], Warp warp, int64_t steps, float epsilon) {
+// Gauss-Newton steps of one point from a warp in pixels of the patch; leaves J as read at the last warp.
+Warp gauss_newton(Window& window, const Patch& patch, const float (*inverse)[8], Warp warp, int64_t steps, float epsilon) {
   const float half = static_cast<float>(window.size / 2);
   Warp taken, before;
   for (int64_t k = 0; k < steps; ++k) {
     float sums[8];
     window.project(sums);
-    const Warp now = change(inverse, sums);
-    taken = k ? further(now, taken, before) : now;
+    const Warp now = change(inverse, sums, window.options);
+    taken = k ? extrapolate(now, taken, before, window.options.max_extrapolation) : now;
     before = now;
     warp = compose(warp, taken, half);
-    window.look(patch, warp);
+    window.read_warped(patch, warp);
     if (!(furthest(now) > epsilon)) break;
   }
   return warp;
 }
 
-// source (B, 3, ., .), target (B, 1 or 3, ., .), q (2, M) whole pixels, place (3, M) and begin (3, 2, M), px of the
-// target, float32; batch (M) int64. warp (3, 2, M), fit and first (3, M), inverse (2, 8, M) and textured (M) bool: the
-// fields of affine.py's _State.
-void align(Tensor source, Tensor target, Tensor q, Tensor place, Tensor begin, Tensor batch, Tensor warp, Tensor textured,
-           Tensor fit, Tensor first, Tensor inverse, int64_t window, int64_t steps, int64_t source_pad,
-           int64_t target_pad, double epsilon) {
+// source (B, 3, ., .), target (B, 1 or 3, ., .), q (2, M) integer pixels, place (3, M) and begin (3, 2, M), px of the
+// target, float32; batch (M) int64. Outputs, the fields of _State in affine_alignment.py: warp (3, 2, M), fit and first
+// (3, M), inverse (2, 8, M) float32, textured (M) bool.
+void register_affine(Tensor source, Tensor target, Tensor q, Tensor place, Tensor begin, Tensor batch, Tensor warp,
+                     Tensor textured, Tensor fit, Tensor first, Tensor inverse, int64_t window, int64_t steps,
+                     int64_t source_pad, int64_t target_pad, double epsilon, int64_t search_padding, int64_t margin,
+                     double max_extrapolation, double min_gain, double max_gain, double damping, double min_pivot) {
+  const Options options{search_padding, margin, static_cast<float>(max_extrapolation), static_cast<float>(min_gain),
+                        static_cast<float>(max_gain), damping, min_pivot};
   const Level here(source, source_pad), there(target, target_pad);
   const int64_t M = q.size(1);
-  Window own(window);
+  Window own(options, window);
   for (int64_t m = 0; m < M; ++m) {
     const int64_t b = data<int64_t>(batch)[m];
     const float at[2] = {data<float>(q)[m], data<float>(q)[M + m]};
@@ -330,12 +338,12 @@ void align(Tensor source, Tensor target, Tensor q, Tensor place, Tensor begin, T
     double H[8][8];
     own.normal(H);
     float R[8][8];
-    const bool fine = invert(H, R);
+    const bool fine = invert(H, R, options);
     Warp now;
     for (int k = 0; k < 6; ++k) now.of[k / 2][k % 2] = data<float>(begin)[k * M + m];
-    const Patch patch(there, b, now.of[0], window / 2 + REACH);
+    const Patch patch(there, b, now.of[0], window / 2 + search_padding);
     for (int axis = 0; axis < 2; ++axis) now.of[0][axis] -= patch.corner[axis];
-    own.look(patch, now);
+    own.read_warped(patch, now);
     float quality[3], kept[LANES];
     own.quality(quality);
     quality[2] = 1.0f;
@@ -344,7 +352,7 @@ void align(Tensor source, Tensor target, Tensor q, Tensor place, Tensor begin, T
       quality[2] *= kept[0];
     }
     for (int k = 0; k < 3; ++k) data<float>(first)[k * M + m] = quality[k];
-    if (fine) now = descend(own, patch, R, now, steps, static_cast<float>(epsilon));
+    if (fine) now = gauss_newton(own, patch, R, now, steps, static_cast<float>(epsilon));
     if (steps) {
       own.quality(quality);
       quality[2] = own.share(now);
@@ -367,9 +375,10 @@ void align(Tensor source, Tensor target, Tensor q, Tensor place, Tensor begin, T
 
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
   m.def(
-      "align(Tensor source, Tensor target, Tensor q, Tensor place, Tensor begin, Tensor batch, Tensor(a!) warp, "
+      "register_affine(Tensor source, Tensor target, Tensor q, Tensor place, Tensor begin, Tensor batch, Tensor(a!) warp, "
       "Tensor(b!) textured, Tensor(c!) fit, Tensor(d!) first, Tensor(e!) inverse, int window, int steps, "
-      "int source_pad, int target_pad, float epsilon) -> ()");
+      "int source_pad, int target_pad, float epsilon, int search_padding, int margin, float max_extrapolation, "
+      "float min_gain, float max_gain, float damping, float min_pivot) -> ()");
 }
 
-STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) { m.impl("align", TORCH_BOX(&align)); }
+STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) { m.impl("register_affine", TORCH_BOX(&register_affine)); }

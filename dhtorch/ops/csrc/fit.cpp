@@ -1,7 +1,6 @@
-// How dhtorch/pipeline/dense.py fits a surface to another view, as operators on torch's stable ABI: the same products and sums in
-// the same order, fused where torch fuses them, so that they answer alike up to rounding, and here bit for bit but for the
-// correlation. One thread, no gradient. Callers check shapes, types and that everything is contiguous; see
-// dhtorch/ops/loader.py.
+// Fitting a swept surface to another view. References: dhtorch/geometry/plane_sweep.py and dhtorch/pipeline/surface.py;
+// products and sums in the same order, with FMA where torch uses it, so that results agree up to rounding, and all but the
+// correlation usually bit for bit. One thread, no gradient. The dispatch checks dtypes and strides, Python the shapes.
 
 #include <torch/csrc/stable/library.h>
 
@@ -14,22 +13,19 @@
 
 namespace {
 
-// What sweep.py holds under the same names, and the window's radius.
-constexpr int64_t RADIUS = 4;
-constexpr float LEAST_GAIN = 0.5f, MOST_GAIN = 2.0f, FLAT = 1e-8f;
+constexpr int64_t RADIUS = FIT_RADIUS_PX, SIDE = 2 * RADIUS + 1, PRODUCTS = 9;
+static_assert(SIDE == 9);      // of sum_nine
+constexpr int64_t SOME = 512;  // pixels that are processed together, in cache
 
-constexpr int64_t SIDE = 2 * RADIUS + 1, PRODUCTS = 9;
-constexpr int64_t SOME = 512;  // pixels that stay in cache meanwhile
-
-// Nine numbers, summed as sweep.window_sum does: one, and eight by halves.
-inline Vector nine(const Vector* x) {
+// Sum of nine numbers in the order of window_sum in windows.py: one, and eight by halves.
+inline Vector sum_nine(const Vector* x) {
   return x[0] + (((x[1] + x[2]) + (x[3] + x[4])) + ((x[5] + x[6]) + (x[7] + x[8])));
 }
 
-// A pixel of up to four channels, which are loaded together: single numbers that a vector gathers take several times as long.
+// Channels of an interleaved pixel, loaded together: gathering single values takes several times as long.
 constexpr int64_t CHANNELS = 4;
 
-// Pictures (channels, H, W) read at up to w places at once.
+// Bilinear reading of images (channels, H, W) at up to w positions at once.
 struct Reader {
   int64_t channels, H, W;
   std::vector<int32_t> first, right, down;
@@ -38,7 +34,7 @@ struct Reader {
   Reader(const Tensor& picture, int64_t w)
       : channels(picture.size(1)), H(picture.size(2)), W(picture.size(3)), first(w), right(w), down(w), weight(4 * w) {}
 
-  // Where F.grid_sample reads in its border mode, of places that went through its normalised coordinates.
+  // Pixels and weights of F.grid_sample in border mode, after its normalised coordinates.
   void place(const float* u_of, const float* v_of, int64_t w) {
     const float across = static_cast<float>(W), along = static_cast<float>(H);
     const int32_t wide = static_cast<int32_t>(W), last_u = wide - 1, last_v = static_cast<int32_t>(H) - 1;
@@ -51,7 +47,7 @@ struct Reader {
       v = std::min(std::max(v, -2.0f), 2.0f);
       u = fused(u + 1.0f, across / 2.0f, -0.5f);
       v = fused(v + 1.0f, along / 2.0f, -0.5f);
-      u = u > 0.0f ? u : 0.0f;  // no number is 0
+      u = u > 0.0f ? u : 0.0f;  // NaN becomes 0
       v = v > 0.0f ? v : 0.0f;
       u = u < across - 1.0f ? u : across - 1.0f;
       v = v < along - 1.0f ? v : along - 1.0f;
@@ -68,8 +64,8 @@ struct Reader {
     }
   }
 
-  // The picture's three channels, pixel by pixel.
-  std::unique_ptr<float[]> beside(const float* picture) const {
+  // The three channels of an image, interleaved.
+  std::unique_ptr<float[]> interleave(const float* picture) const {
     const int64_t all = H * W;
     std::unique_ptr<float[]> pixels(new float[CHANNELS * all]);
     const float *__restrict a = picture, *__restrict b = a + all, *__restrict c = b + all;
@@ -83,8 +79,8 @@ struct Reader {
     return pixels;
   }
 
-  // What such pixels are at places, as many numbers each.
-  void read_beside(const float* pixels, const float* u_of, const float* v_of, int64_t w, float* __restrict found) {
+  // Values of interleaved pixels at positions.
+  void read_interleaved(const float* pixels, const float* u_of, const float* v_of, int64_t w, float* __restrict found) {
     place(u_of, v_of, w);
     const float *nw = weight.data(), *ne = nw + w, *sw = ne + w, *se = sw + w;
     for (int64_t x = 0; x < w; ++x) {
@@ -97,14 +93,14 @@ struct Reader {
     }
   }
 
-  // The same of single channels that lie one after the other, `apart` numbers from each other.
+  // Values of planar channels; channel k is written at found + k * apart.
   void read(const float* picture, const float* u_of, const float* v_of, int64_t w, float* found, int64_t apart) {
     place(u_of, v_of, w);
     const int32_t *__restrict at = first.data(), *__restrict aside = right.data(), *__restrict below = down.data();
     const float *__restrict nw = weight.data(), *__restrict ne = nw + w, *__restrict sw = ne + w, *__restrict se = sw + w;
     for (int64_t k = 0; k < channels; ++k) {
       const float* plane = picture + k * H * W;
-      float* to = found + k * apart;  // not said to lie apart, for then they would be gathered
+      float* to = found + k * apart;  // not __restrict: the compiler would then gather
       for (int64_t x = 0; x < w; ++x) {
         const float *here = plane + at[x], *under = here + below[x];
         const float upper = fused(here[aside[x]], ne[x], here[0] * nw[x]);
@@ -113,7 +109,7 @@ struct Reader {
     }
   }
 
-  // Whether places lie in the picture.
+  // Whether positions lie in the image.
   void within(const float* __restrict u, const float* __restrict v, int64_t w, bool* __restrict inside) const {
     const float right = static_cast<float>(W - 1), down = static_cast<float>(H - 1);
 #pragma GCC ivdep
@@ -121,8 +117,8 @@ struct Reader {
   }
 };
 
-// values (B, C, N) of picture (B, C, H, W) at uv (B, 2, N), float32, and which lie inside (B, N) bool.
-void bilinear(Tensor picture, Tensor uv, Tensor values, Tensor inside) {
+// Values (B, C, N) of picture (B, C, H, W) at uv (B, 2, N), float32, and which lie inside (B, N) bool.
+void sample_bilinear(Tensor picture, Tensor uv, Tensor values, Tensor inside) {
   const int64_t B = uv.size(0), N = uv.size(2), C = picture.size(1);
   Reader reader(picture, SOME);
   for (int64_t k = 0; k < B; ++k) {
@@ -135,11 +131,12 @@ void bilinear(Tensor picture, Tensor uv, Tensor values, Tensor inside) {
   }
 }
 
-// A pixel's window, in the nine means of it, tells how the pixel must move.
-struct Answers {
+// The fit of every pixel from the nine means over its window.
+struct WindowFit {
   float *step, *contrast, *noise, *correlation;
+  float min_gain, max_gain, flat, flat_gradient;
 
-  void tell(const float* mean, int64_t wide, int64_t place, int64_t w) const {
+  void write(const float* mean, int64_t wide, int64_t place, int64_t w) const {
     const float *__restrict a = mean, *__restrict b = a + wide, *__restrict c = b + wide, *__restrict d = c + wide;
     const float *__restrict e = d + wide, *__restrict f = e + wide, *__restrict p = f + wide, *__restrict r = p + wide;
     const float* __restrict s = r + wide;
@@ -150,12 +147,12 @@ struct Answers {
       const float i = a[x], j = b[x], k = c[x];
       float ii = d[x] - i * i, jj = e[x] - j * j, kk = p[x] - k * k;
       const float ij = f[x] - i * j;
-      ii = ii < FLAT ? FLAT : ii;
-      jj = jj < FLAT ? FLAT : jj;
-      kk = kk < 1e-12f ? 1e-12f : kk;
+      ii = ii < flat ? flat : ii;
+      jj = jj < flat ? flat : jj;
+      kk = kk < flat_gradient ? flat_gradient : kk;
       float gain = ij / jj;
-      gain = gain < LEAST_GAIN ? LEAST_GAIN : gain;
-      gain = gain > MOST_GAIN ? MOST_GAIN : gain;
+      gain = gain < min_gain ? min_gain : gain;
+      gain = gain > max_gain ? max_gain : gain;
       const float more = ii + gain * gain * jj - 2.0f * gain * ij;
       move[x] = ((r[x] - k * i) - gain * (s[x] - k * j)) / (gain * kk);
       clear[x] = kk * gain * gain;
@@ -165,11 +162,12 @@ struct Answers {
   }
 };
 
-// grey (B, 1, h, w), picture (B, 3, H, W), uv and further (B, 2, h * w) where view 1 shows each pixel at its depth and at
-// one nearer by little (B) 1/m, float32; the fields of sweep.py's Fit: step, contrast, noise, correlation (B, h, w)
-// float32, inside (B, h, w) bool, motion (B, 2, h * w) float32.
+// grey (B, 1, h, w), picture (B, 3, H, W): grey and gradients; uv and further (B, 2, h * w): pixels of view 1 at each
+// pixel's inverse depth and at one larger by little (B) 1/m, float32. Outputs, fields of WindowFit in plane_sweep.py: step,
+// contrast, noise, correlation (B, h, w) float32, inside (B, h, w) bool, motion (B, 2, h * w) float32.
 void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor little, Tensor step, Tensor contrast,
-                 Tensor noise, Tensor correlation, Tensor inside, Tensor motion) {
+                 Tensor noise, Tensor correlation, Tensor inside, Tensor motion, double min_gain, double max_gain,
+                 double flat, double flat_gradient) {
   const int64_t B = grey.size(0), h = grey.size(2), w = grey.size(3), H = picture.size(2), W = picture.size(3), N = h * w;
   const int64_t wide = (w + LANES - 1) / LANES * LANES, padded = wide + 2 * RADIUS + LANES;
   const float share = static_cast<float>(1.0 / (SIDE * SIDE));
@@ -177,16 +175,17 @@ void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor 
   Reader reader(picture, w);
   for (int64_t k = 0; k < B; ++k) {
     const float* image = data<float>(grey) + k * N;
-    const std::unique_ptr<float[]> pixels = reader.beside(data<float>(picture) + 3 * k * H * W);
+    const std::unique_ptr<float[]> pixels = reader.interleave(data<float>(picture) + 3 * k * H * W);
     const float *here = data<float>(uv) + 2 * k * N, *there = data<float>(further) + 2 * k * N;
     const float by = data<float>(little)[k];
-    const Answers answers{data<float>(step) + k * N, data<float>(contrast) + k * N, data<float>(noise) + k * N,
-                          data<float>(correlation) + k * N};
+    const WindowFit fit{data<float>(step) + k * N, data<float>(contrast) + k * N, data<float>(noise) + k * N,
+                        data<float>(correlation) + k * N, static_cast<float>(min_gain), static_cast<float>(max_gain),
+                        static_cast<float>(flat), static_cast<float>(flat_gradient)};
     for (int64_t y = 0, next = 0; y < h; ++y) {
       for (; next <= std::min(y + RADIUS, h - 1); ++next) {
         const float *u = here + next * w, *v = u + N, *u_then = there + next * w, *v_then = u_then + N;
         const float* __restrict I = image + next * w;
-        reader.read_beside(pixels.get(), u, v, w, seen.data());
+        reader.read_interleaved(pixels.get(), u, v, w, seen.data());
         reader.within(u, v, w, data<bool>(inside) + k * N + next * w);
         float *__restrict right_by = data<float>(motion) + 2 * k * N + next * w, *__restrict down_by = right_by + N;
 #pragma GCC ivdep
@@ -221,28 +220,30 @@ void fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor 
         for (int64_t x = 0; x < wide; x += LANES) {
           Vector part[SIDE];
           for (int64_t i = 0; i < SIDE; ++i) part[i] = load(rows[i] + x);
-          store(nine(part), middle + x);
+          store(sum_nine(part), middle + x);
         }
         std::fill_n(column.data(), RADIUS, middle[0]);
         std::fill_n(middle + w, RADIUS, middle[w - 1]);
         for (int64_t x = 0; x < wide; x += LANES) {
           Vector part[SIDE];
           for (int64_t i = 0; i < SIDE; ++i) part[i] = load(column.data() + x + i);
-          store(share * nine(part), mean.data() + p * wide + x);
+          store(share * sum_nine(part), mean.data() + p * wide + x);
         }
       }
-      answers.tell(mean.data(), wide, y * w, w);
+      fit.write(mean.data(), wide, y * w, w);
     }
   }
 }
 
-// covered (B, N) bool: which of the inverse depths q (B, N) another covers, nearer by more than `tolerance` (B), where pixels
-// are seen at (a + q b) / (1 + q c), margin further in, of rows * columns; a (B, 2, N), b (B, 2), c (B) float32.
-void hidden(Tensor a, Tensor b, Tensor c, Tensor q, Tensor tolerance, Tensor covered, int64_t rows, int64_t columns,
-            int64_t margin) {
+// covered (B, N) bool: whether another pixel, nearer by more than `tolerance` (B), covers each of the inverse depths q
+// (B, N) in a view of rows * columns pixels that sees them at (a + q b) / (1 + q c) + margin; a (B, 2, N), b (B, 2), c (B)
+// float32.
+void occlusion_mask(Tensor a, Tensor b, Tensor c, Tensor q, Tensor tolerance, Tensor covered, int64_t rows, int64_t columns,
+                    int64_t margin, double min_depth_ratio, double behind_scale) {
   const int64_t B = q.size(0), N = q.size(1);
   const float inside = static_cast<float>(margin + 0.5), right = static_cast<float>(columns - 1),
               down = static_cast<float>(rows - 1);
+  const float min_ratio = static_cast<float>(min_depth_ratio), behind = static_cast<float>(behind_scale);
   const int32_t width = static_cast<int32_t>(columns);
   std::vector<float> nearest(rows * columns);
   std::vector<int32_t> cell(N);
@@ -252,7 +253,7 @@ void hidden(Tensor a, Tensor b, Tensor c, Tensor q, Tensor tolerance, Tensor cov
     int32_t* __restrict at = cell.data();
 #pragma GCC ivdep
     for (int64_t n = 0; n < N; ++n) {
-      const float z = 1.0f + own[n] * z_by, scale = z > 1e-3f ? 1.0f / z : 1e9f;
+      const float z = 1.0f + own[n] * z_by, scale = z > min_ratio ? 1.0f / z : behind;
       float u = (u_0[n] + own[n] * u_by) * scale + inside, v = (v_0[n] + own[n] * v_by) * scale + inside;
       u = u > 0.0f ? u : 0.0f;
       v = v > 0.0f ? v : 0.0f;
@@ -269,10 +270,13 @@ void hidden(Tensor a, Tensor b, Tensor c, Tensor q, Tensor tolerance, Tensor cov
   }
 }
 
-// variance (B, N) of q (B, N) on rays (B, 3, N) that a motion R (B, 9), t (B, 3) moves by (B, 2, N) px a step of q, from the
-// motion's covariance (B, K, K), K 6, or 9 with a shutter's turn; f (B, 2). Callers hand over what a pixel's row is at most.
-void pose_variance(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor f, Tensor cov, Tensor moved, Tensor variance) {
+// Variance (B, N) of q (B, N) on rays (B, 3, N) by the covariance (B, K, K) of a motion R (B, 9), t (B, 3); K is 6, or 9
+// with a shutter's turn; moved (B, 2, N): d pixel / d q, px·m; f (B, 2) px.
+void pose_variance(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor f, Tensor cov, Tensor moved, Tensor variance,
+                   double min_inverse_depth, double min_squared_motion, double min_abs_depth) {
   const int64_t B = q.size(0), N = q.size(1), K = cov.size(1);
+  const float min_q = static_cast<float>(min_inverse_depth), min_square = static_cast<float>(min_squared_motion),
+              min_z = static_cast<float>(min_abs_depth);
   float row[9][SOME], carried[SOME];
   for (int64_t k = 0; k < B; ++k) {
     const float *m = data<float>(R) + 9 * k, *tk = data<float>(t) + 3 * k, *C = data<float>(cov) + K * K * k;
@@ -285,12 +289,12 @@ void pose_variance(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor f, Tensor co
 #pragma GCC ivdep
       for (int64_t i = 0; i < some; ++i) {
         const int64_t n = first + i;
-        const float a = ax[n], b = ay[n], d = az[n], flat = own[n] < 1e-6f ? 1e-6f : own[n];
+        const float a = ax[n], b = ay[n], d = az[n], flat = own[n] < min_q ? min_q : own[n];
         const float x = (a * m[0] + b * m[1] + d * m[2]) / flat + tk[0];
         const float y = (a * m[3] + b * m[4] + d * m[5]) / flat + tk[1];
         const float z = (a * m[6] + b * m[7] + d * m[8]) / flat + tk[2];
-        const float length = u_by[n] * u_by[n] + v_by[n] * v_by[n], share = 1.0f / (length < 1e-12f ? 1e-12f : length);
-        const float inv_z = 1.0f / (std::abs(z) < 1e-9f ? 1e-9f : z);
+        const float length = u_by[n] * u_by[n] + v_by[n] * v_by[n], share = 1.0f / (length < min_square ? min_square : length);
+        const float inv_z = 1.0f / (std::abs(z) < min_z ? min_z : z);
         const float gx = f_u * inv_z * u_by[n] * share, gy = f_v * inv_z * v_by[n] * share;
         const float gz = -(gx * x + gy * y) * inv_z;
         row[0][i] = y * gz - z * gy;
@@ -315,14 +319,16 @@ void pose_variance(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor f, Tensor co
   }
 }
 
-// Add to total, weight and, if there is a variance, to shared what a view says, and to best and seen how well it
-// fits, all (B, h, w): step, contrast, noise, correlation of Fit, and whether it sees the pixel, `here`; most (B) of a step.
-// grey: a pixel's own variance; independent pixels of a window; `say`: correlation from which on it has one.
-void weigh(Tensor step, Tensor contrast, Tensor noise, Tensor correlation, Tensor here, Tensor most, Tensor variance,
-           Tensor total, Tensor weight, Tensor shared, Tensor best, Tensor seen, double grey, double independent, double say) {
+// Add a view's fit to the sums total, weight and, if there is a variance, shared, and update best and seen, all (B, h, w).
+// step, contrast, noise, correlation: fields of WindowFit; here: whether the view sees the pixel; most (B): largest step.
+// grey_variance: of a pixel; independent: independent pixels in a window; min_correlation: below it the weight is 0.
+void add_view(Tensor step, Tensor contrast, Tensor noise, Tensor correlation, Tensor here, Tensor most, Tensor variance,
+              Tensor total, Tensor weight, Tensor shared, Tensor best, Tensor seen, double grey_variance, double independent,
+              double min_correlation) {
   const int64_t B = step.size(0), N = step.size(1) * step.size(2);
   const bool motion = variance.size(0) == B;
-  const float least = static_cast<float>(grey), count = static_cast<float>(independent), from = static_cast<float>(say);
+  const float least = static_cast<float>(grey_variance), count = static_cast<float>(independent),
+              from = static_cast<float>(min_correlation);
   for (int64_t k = 0; k < B; ++k) {
     const int64_t at = k * N;
     const float *__restrict move = data<float>(step) + at, *__restrict clear = data<float>(contrast) + at;
@@ -351,26 +357,27 @@ void weigh(Tensor step, Tensor contrast, Tensor noise, Tensor correlation, Tenso
 }  // namespace
 
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
-  m.def("bilinear(Tensor picture, Tensor uv, Tensor(a!) values, Tensor(b!) inside) -> ()");
+  m.def("sample_bilinear(Tensor picture, Tensor uv, Tensor(a!) values, Tensor(b!) inside) -> ()");
   m.def(
-      "hidden(Tensor a, Tensor b, Tensor c, Tensor q, Tensor tolerance, Tensor(a!) covered, int rows, int columns, "
-      "int margin) -> ()");
+      "occlusion_mask(Tensor a, Tensor b, Tensor c, Tensor q, Tensor tolerance, Tensor(a!) covered, int rows, "
+      "int columns, int margin, float min_depth_ratio, float behind_scale) -> ()");
   m.def(
-      "pose_variance(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor f, Tensor cov, Tensor moved, Tensor(a!) variance) "
-      "-> ()");
+      "pose_variance(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor f, Tensor cov, Tensor moved, Tensor(a!) variance, "
+      "float min_inverse_depth, float min_squared_motion, float min_abs_depth) -> ()");
   m.def(
-      "weigh(Tensor step, Tensor contrast, Tensor noise, Tensor correlation, Tensor here, Tensor most, Tensor variance, "
-      "Tensor(a!) total, Tensor(b!) weight, Tensor(c!) shared, Tensor(d!) best, Tensor(e!) seen, float grey, "
-      "float independent, float say) -> ()");
+      "add_view(Tensor step, Tensor contrast, Tensor noise, Tensor correlation, Tensor here, Tensor most, Tensor variance, "
+      "Tensor(a!) total, Tensor(b!) weight, Tensor(c!) shared, Tensor(d!) best, Tensor(e!) seen, "
+      "float grey_variance, float independent, float min_correlation) -> ()");
   m.def(
       "fit_windows(Tensor grey, Tensor picture, Tensor uv, Tensor further, Tensor little, Tensor(a!) step, "
-      "Tensor(b!) contrast, Tensor(c!) noise, Tensor(d!) correlation, Tensor(e!) inside, Tensor(f!) motion) -> ()");
+      "Tensor(b!) contrast, Tensor(c!) noise, Tensor(d!) correlation, Tensor(e!) inside, Tensor(f!) motion, "
+      "float min_gain, float max_gain, float flat, float flat_gradient) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
-  m.impl("bilinear", TORCH_BOX(&bilinear));
+  m.impl("sample_bilinear", TORCH_BOX(&sample_bilinear));
   m.impl("fit_windows", TORCH_BOX(&fit_windows));
-  m.impl("hidden", TORCH_BOX(&hidden));
+  m.impl("occlusion_mask", TORCH_BOX(&occlusion_mask));
   m.impl("pose_variance", TORCH_BOX(&pose_variance));
-  m.impl("weigh", TORCH_BOX(&weigh));
+  m.impl("add_view", TORCH_BOX(&add_view));
 }

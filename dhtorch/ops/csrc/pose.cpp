@@ -1,7 +1,7 @@
-// The search of dhtorch/stages/pose.py for a pose from near points, as an operator on torch's stable ABI, pair after pair:
-// the same triples, solutions, scores and steps. Sums over points are taken in another order than torch's, and what torch
-// works out in single precision on the way to a triple's poses is worked out in double. One thread, no gradient. Callers
-// check shapes, types and that everything is contiguous; see dhtorch/ops/loader.py.
+// The search for a metric pose from near points, one pair after another. Reference: _robust_pose in
+// dhtorch/stages/pose.py; the same triples, solutions, scores and steps. Sums over points are taken in another order, and
+// the poses of a triple are computed in double precision throughout. One thread, no gradient. The dispatch checks dtypes
+// and strides, Python the shapes.
 
 #include "vectors.h"
 
@@ -15,10 +15,12 @@
 
 namespace {
 
-// What p3p.py, ransac.py, least_squares.py and pose.py hold under the same names.
-constexpr double MIN_HEIGHT = 1e-3, MAX_COSINE = 1 - 1e-12;
-constexpr float MIN_DEPTH = 1e-6f, DAMPING = 1e-4f;
-constexpr int64_t SEARCH_POINTS = 256, PREVIEW = 32, SHORTLIST = 32, KEEP = 2;
+// Options of the search: points, hypotheses, least depth (m), and which triples are degenerate.
+struct Options {
+  int64_t search_points, preview, shortlist, keep;
+  float damping, min_depth;
+  double min_height, max_cosine;
+};
 
 constexpr float INFINITE = std::numeric_limits<float>::infinity();
 
@@ -47,7 +49,7 @@ struct Motion {
   float R[3][3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, t[3] = {0, 0, 0};
 };
 
-// p3p.py's _outer_root.
+// _outer_root of p3p.py.
 double outer_root(const Matrix first, const Matrix second) {
   Matrix one, two;
   cofactors(first, one);
@@ -70,7 +72,7 @@ double outer_root(const Matrix first, const Matrix second) {
   return -third - std::copysign(s * size, q);
 }
 
-// p3p.py's _ranges, the root last.
+// _ranges of p3p.py, the root last.
 void ranges(const double* m, const double* a, double (*d)[4]) {
   Matrix first = {{a[1], -a[1] * m[0], 0}, {-a[1] * m[0], a[1] - a[0], a[0] * m[1]}, {0, a[0] * m[1], -a[0]}};
   Matrix second = {{a[1], 0, -a[1] * m[2]}, {0, -a[2], a[2] * m[1]}, {-a[1] * m[2], a[2] * m[1], a[1] - a[2]}};
@@ -121,7 +123,7 @@ void ranges(const double* m, const double* a, double (*d)[4]) {
   }
 }
 
-// p3p.py's _polish of one root; the longest of the steps.
+// _polish of p3p.py for one root; returns the longest step.
 double polish(double* d, const double* m, const double* a) {
   Three x, y, r, step;
   for (int k = 0; k < 3; ++k) {
@@ -135,13 +137,13 @@ double polish(double* d, const double* m, const double* a) {
   for (int k = 0; k < 3; ++k) {
     const int n = (k + 1) % 3, l = (k + 2) % 3;
     step[k] = by * (x[l] * (r[k] * x[n] - r[n] * y[k]) + r[l] * (y[k] * y[n]));
-    most = !(std::fabs(step[k]) <= most) ? std::fabs(step[k]) : most;  // what is no number stays none
+    most = !(std::fabs(step[k]) <= most) ? std::fabs(step[k]) : most;  // NaN stays NaN
   }
   for (int k = 0; k < 3; ++k) d[k] -= step[k];
   return most;
 }
 
-// Orthonormal axes along a triangle's first side and its normal.
+// Orthonormal axes of a triangle: its first side, its normal and their product.
 inline void axes(const Matrix P, Matrix found) {
   Three first, second;
   for (int i = 0; i < 3; ++i) {
@@ -160,8 +162,8 @@ inline void axes(const Matrix P, Matrix found) {
   }
 }
 
-// p3p.py's p3p of one triple: poses, and which there are.
-void p3p(Matrix j, const Matrix X, Motion* poses, bool* valid) {
+// p3p of p3p.py for one triple: poses, and which are valid.
+void p3p(Matrix j, const Matrix X, Motion* poses, bool* valid, const Options& o) {
   Three m, a;
   for (int k = 0; k < 3; ++k) unit(j[k]);
   for (int k = 0; k < 3; ++k) {
@@ -173,7 +175,7 @@ void p3p(Matrix j, const Matrix X, Motion* poses, bool* valid) {
   const double longest = std::max({a[0], a[1], a[2]}), scale = std::sqrt(longest);
   for (int k = 0; k < 3; ++k) a[k] /= longest;
   const double total = a[0] + a[1] + a[2], flat = total * total - 2 * dot(a, a);
-  const bool sound = flat > 4 * MIN_HEIGHT * MIN_HEIGHT && std::max({m[0], m[1], m[2]}) < MAX_COSINE &&
+  const bool sound = flat > 4 * o.min_height * o.min_height && std::max({m[0], m[1], m[2]}) < o.max_cosine &&
                      longest < std::numeric_limits<double>::infinity();
   std::fill(valid, valid + 4, false);
   if (!sound) return;
@@ -205,15 +207,16 @@ void p3p(Matrix j, const Matrix X, Motion* poses, bool* valid) {
 
 inline Vector least(Vector x, Vector y) { return x < y ? x : y; }
 
-// Points of one pair and where they were seen, in rows filled up to whole vectors with points of no cost.
+// Points of one pair and their pixels in view 1, in rows padded to whole vectors with points of no cost.
 struct Points {
   int64_t count = 0, wide = 0;
+  float min_depth;
   std::vector<float> rows;  // x, y, z (m); u, v at z = 1; largest squared error (px²)
   float fx, fy;
 
-  Points(const float* f) : fx(f[0]), fy(f[1]) {}
+  Points(const float* f, float min_depth) : min_depth(min_depth), fx(f[0]), fy(f[1]) {}
 
-  // Those of `from` (5, N) that `of` numbers.
+  // Take the points of `from` (5, N) with the indices `of`.
   void take(const float* from, int64_t N, const std::vector<int64_t>& of, const float* c, float limit) {
     count = static_cast<int64_t>(of.size());
     wide = std::max<int64_t>((count + LANES - 1) / LANES * LANES, LANES);
@@ -226,7 +229,7 @@ struct Points {
     }
   }
 
-  // Cost of a pose, truncated; and where `sums` are asked for, the upper half of H and g, 27 numbers.
+  // Truncated cost of a pose; with `sums` also the upper half of H and g, 27 numbers.
   float cost(const Motion& T, double* sums = nullptr) const {
     const float *x = rows.data(), *y = x + wide, *z = y + wide, *u = z + wide, *v = u + wide, *most = v + wide;
     const Vector none = Vector{}, wu = none + fx * fx, wv = none + fy * fy;
@@ -236,9 +239,9 @@ struct Points {
       const Vector X = T.R[0][0] * px + T.R[0][1] * py + T.R[0][2] * pz + T.t[0];
       const Vector Y = T.R[1][0] * px + T.R[1][1] * py + T.R[1][2] * pz + T.t[1];
       const Vector Z = T.R[2][0] * px + T.R[2][1] * py + T.R[2][2] * pz + T.t[2];
-      const Vector w = 1.0f / (Z > MIN_DEPTH ? Z : none + MIN_DEPTH), a = X * w, b = Y * w;
+      const Vector w = 1.0f / (Z > min_depth ? Z : none + min_depth), a = X * w, b = Y * w;
       const Vector ra = a - load(u + k), rb = b - load(v + k), square = wu * ra * ra + wv * rb * rb;
-      const auto inside = (Z > MIN_DEPTH) & (square < limit);
+      const auto inside = (Z > min_depth) & (square < limit);
       all += inside ? square : limit;
       if (!sums) continue;
       const Vector su = inside ? wu : none, sv = inside ? wv : none;
@@ -257,7 +260,7 @@ struct Points {
   }
 };
 
-// The step of damped normal equations; false where there is none.
+// The step of damped normal equations by Cholesky factorisation; false where they are singular.
 bool solve(const double* sums, double factor, double* step) {
   double L[6][6], rhs[6];
   const double* from = sums;
@@ -285,7 +288,7 @@ bool solve(const double* sums, double factor, double* step) {
   return true;
 }
 
-// least_squares.py's move.
+// move_pose of least_squares.py.
 Motion moved(const Motion& T, const double* xi) {
   const double half[3] = {0.5 * xi[0], 0.5 * xi[1], 0.5 * xi[2]}, by = 2 / (1 + dot(half, half));
   Motion found;
@@ -302,9 +305,9 @@ Motion moved(const Motion& T, const double* xi) {
   return found;
 }
 
-// least_squares.py's minimise: the best pose seen takes the place of T; its cost.
-float minimise(const Points& points, Motion& T, int64_t steps) {
-  double sums[27], there[27], xi[6], factor = DAMPING;
+// minimise of least_squares.py: replaces T by the best pose; returns its cost.
+float minimise(const Points& points, Motion& T, int64_t steps, float damping) {
+  double sums[27], there[27], xi[6], factor = damping;
   float best = points.cost(T, sums);
   for (int64_t k = 0; k < steps; ++k) {
     const bool last = k == steps - 1, solved = solve(sums, factor, xi);
@@ -322,14 +325,14 @@ float minimise(const Points& points, Motion& T, int64_t steps) {
   return best;
 }
 
-// ransac.py's even_slots.
-std::vector<int64_t> even_slots(int64_t count, int64_t size) {
+// evenly_spaced_slots of ransac.py.
+std::vector<int64_t> evenly_spaced_slots(int64_t count, int64_t size) {
   std::vector<int64_t> found(std::min(count, size));
   for (size_t k = 0; k < found.size(); ++k) found[k] = static_cast<int64_t>(k) * std::max(count, size) / size;
   return found;
 }
 
-// ransac.py's distinct_triples, one of them.
+// One of the distinct_triples of ransac.py.
 void triple(const float* draws, int64_t count, int64_t* found) {
   for (int64_t k = 0; k < 3; ++k) {
     const int64_t left = std::max<int64_t>(count - k, 1);
@@ -342,7 +345,7 @@ void triple(const float* draws, int64_t count, int64_t* found) {
   for (int64_t k = 0; k < 3; ++k) found[k] = std::min(found[k], std::max<int64_t>(count - 1, 0));
 }
 
-// The numbers of the least of costs, in order.
+// Indices of the lowest costs, in order.
 std::vector<int64_t> least_of(const std::vector<float>& cost, int64_t most) {
   std::vector<int64_t> found(cost.size());
   std::iota(found.begin(), found.end(), 0);
@@ -354,8 +357,8 @@ std::vector<int64_t> least_of(const std::vector<float>& cost, int64_t most) {
   return found;
 }
 
-// The best poses of the triples drawn among near points, and the cost of the first.
-float search(const Points& near, const Points& few, const float* draws, int64_t H, Motion* best) {
+// The best poses of the triples drawn among near points, padded with the identity; returns the lowest cost.
+float search(const Points& near, const Points& few, const float* draws, int64_t H, std::vector<Motion>& best, const Options& o) {
   std::vector<Motion> poses(4 * H);
   std::vector<float> cost(4 * H, INFINITE);
   const float* of = near.rows.data();
@@ -370,23 +373,27 @@ float search(const Points& near, const Points& few, const float* draws, int64_t 
       rays[k][1] = of[4 * near.wide + slot[k]];
       rays[k][2] = 1;
     }
-    p3p(rays, places, poses.data() + 4 * h, valid);
+    p3p(rays, places, poses.data() + 4 * h, valid, o);
     for (int k = 0; k < 4; ++k) {
       if (valid[k]) cost[4 * h + k] = few.cost(poses[4 * h + k]);
     }
   }
-  const std::vector<int64_t> some = least_of(cost, SHORTLIST);
+  const std::vector<int64_t> some = least_of(cost, std::max(o.shortlist, o.keep));
   std::vector<float> whole;
   for (const int64_t k : some) whole.push_back(std::max(cost[k], cost[k] < INFINITE ? near.cost(poses[k]) : INFINITE));
-  const std::vector<int64_t> order = least_of(whole, KEEP);
+  const std::vector<int64_t> order = least_of(whole, o.keep);
   for (size_t k = 0; k < order.size(); ++k) best[k] = poses[some[order[k]]];
   return whole[order[0]];
 }
 
-// points (B, 5, N): x, y, z (m), u, v (px); usable (B, N) bool; f and c (B, 2) px; draws (B, H, 3), float32. R (B, 3, 3) and
-// t (B, 3) float64, exactly a rotation; found (B) bool.
+// points (B, 5, N): x, y, z (m), u, v (px); usable (B, N) bool; f and c (B, 2) px; draws (B, H, 3), float32. Outputs: R
+// (B, 3, 3), orthonormal, and t (B, 3) float64; found (B) bool.
 void robust_pose(Tensor points, Tensor usable, Tensor f, Tensor c, Tensor draws, Tensor R, Tensor t, Tensor found,
-                 double threshold_px, int64_t local_optimisation, int64_t polish_steps) {
+                 double threshold_px, int64_t local_optimisation, int64_t polish_steps, int64_t search_points,
+                 int64_t preview_points, int64_t shortlist, int64_t keep, double damping, double min_depth,
+                 double min_height, double max_cosine) {
+  const Options o{search_points, preview_points, shortlist, keep, static_cast<float>(damping), static_cast<float>(min_depth),
+                  min_height, max_cosine};
   const int64_t B = points.size(0), N = points.size(2), H = draws.size(1);
   const float limit = static_cast<float>(threshold_px * threshold_px);
   for (int64_t b = 0; b < B; ++b) {
@@ -395,17 +402,25 @@ void robust_pose(Tensor points, Tensor usable, Tensor f, Tensor c, Tensor draws,
     for (int64_t n = 0; n < N; ++n) {
       if (data<bool>(usable)[N * b + n]) used.push_back(n);
     }
-    for (const int64_t k : even_slots(used.size(), std::min(SEARCH_POINTS, N))) of.push_back(used[k]);
-    for (const int64_t k : even_slots(of.size(), std::min(PREVIEW, N))) preview.push_back(of[k]);
-    Points near(lens), few(lens), all(lens);
+    for (const int64_t k : evenly_spaced_slots(used.size(), std::min(o.search_points, N))) of.push_back(used[k]);
+    for (const int64_t k : evenly_spaced_slots(of.size(), std::min(o.preview, N))) preview.push_back(of[k]);
+    Points near(lens, o.min_depth), few(lens, o.min_depth), all(lens, o.min_depth);
     near.take(from, N, of, middle, limit);
     few.take(from, N, preview, middle, limit);
     all.take(from, N, used, middle, limit);
-    Motion best[KEEP];
-    data<bool>(found)[b] = search(near, few, data<float>(draws) + 3 * H * b, H, best) < INFINITE;
-    const float one = minimise(near, best[0], local_optimisation), other = minimise(near, best[1], local_optimisation);
-    Motion& T = other < one ? best[1] : best[0];
-    minimise(all, T, polish_steps);
+    std::vector<Motion> best(o.keep);
+    data<bool>(found)[b] = search(near, few, data<float>(draws) + 3 * H * b, H, best, o) < INFINITE;
+    size_t first = 0;
+    float least = INFINITE;
+    for (size_t k = 0; k < best.size(); ++k) {
+      const float cost = minimise(near, best[k], local_optimisation, o.damping);
+      if (k == 0 || cost < least) {
+        first = k;
+        least = cost;
+      }
+    }
+    Motion& T = best[first];
+    minimise(all, T, polish_steps, o.damping);
     double rows[3][3];
     for (int i = 0; i < 3; ++i) {
       for (int k = 0; k < 2; ++k) rows[k][i] = T.R[k][i];
@@ -424,7 +439,9 @@ void robust_pose(Tensor points, Tensor usable, Tensor f, Tensor c, Tensor draws,
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
   m.def(
       "robust_pose(Tensor points, Tensor usable, Tensor f, Tensor c, Tensor draws, Tensor(a!) R, Tensor(b!) t, "
-      "Tensor(c!) found, float threshold_px, int local_optimisation, int polish_steps) -> ()");
+      "Tensor(c!) found, float threshold_px, int local_optimisation, int polish_steps, int search_points, "
+      "int preview_points, int shortlist, int keep, float damping, float min_depth, float min_height, float max_cosine) "
+      "-> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) { m.impl("robust_pose", TORCH_BOX(&robust_pose)); }

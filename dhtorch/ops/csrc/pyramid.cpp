@@ -1,7 +1,6 @@
-// A level of an image pyramid, of a picture or of the level below it: grey, mirrored, with Scharr's gradients. Twin of
-// dhtorch/geometry/pyramid.py, which is the reference: the same products and sums in the same order, fused where torch
-// fuses them and the processor can, so that numbers agree up to rounding. One thread, no gradient. Callers check shapes,
-// types and strides.
+// One level of an image pyramid from an image or from the level below: grey value, mirrored border, Scharr gradients.
+// Reference: dhtorch/geometry/pyramid.py. Products and sums are taken in the same order, with FMA where torch uses it, so
+// that values agree up to rounding. One thread, no gradient. The dispatch checks dtypes and strides, Python the shapes.
 
 #include <torch/csrc/stable/library.h>
 
@@ -16,7 +15,7 @@ inline float binomial(float a, float b, float c, float d, float e) {
   return fused(6.0f, c, fused(4.0f, b + d, a + e)) * (1.0f / 16.0f);
 }
 
-// One image of a level (B, planes, rows, width) with its padding.
+// One image of a padded level (B, planes, rows, width).
 struct Padded {
   float* first;
   int64_t rows, width, pad;
@@ -45,7 +44,7 @@ void grey(const T* picture, int64_t channels, const Padded& level) {
     }
     const T *g = r + h * w, *b = g + h * w;
     for (int64_t x = 0; x < w; ++x) {
-      to[x] = fused(unit(b[x]), 0.114f, fused(unit(g[x]), 0.587f, unit(r[x]) * 0.299f));
+      to[x] = luma(unit(r[x]), unit(g[x]), unit(b[x]));
     }
   }
 }
@@ -101,8 +100,8 @@ void gradients(const Padded& level, std::vector<float>& both) {
   }
 }
 
-// source: a picture (B, 1 or 3, h, w), float32 or uint8, or with `halve` the level below (B, 1 or 3, ., .), float32;
-// level (B, 1 or 3, h + 2 pad, w + 2 pad) float32, filled.
+// source: images (B, 1 or 3, h, w), float32 or uint8 (`bytes`), or with `halve` the level below (B, 1 or 3, ., .),
+// float32. Output: level (B, 1 or 3, h + 2 pad, w + 2 pad) float32.
 void pyramid_level(Tensor source, Tensor level, int64_t pad, bool halve, bool bytes) {
   std::vector<float> rows;
   const int64_t channels = source.size(1), one = channels * source.size(2) * source.size(3);

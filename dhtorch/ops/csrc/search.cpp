@@ -1,7 +1,7 @@
-// One level of the search of dhtorch/geometry/lucas_kanade.py as an operator on torch's stable ABI, point after point:
-// the same maps, steps and verdicts. Sums over a window are taken in another order than torch's, so that places agree to
-// rounding and not bit for bit; what a point is told depends on no other. One thread, no gradient. Callers check shapes,
-// types and that everything is contiguous; see dhtorch/ops/loader.py.
+// One level of the Lucas-Kanade search, one point after another. Reference: _lk_level in
+// dhtorch/geometry/lucas_kanade.py; the same maps, steps and criteria. Sums over a window are taken in another order, so
+// that displacements agree up to rounding; a point's result does not depend on the others. One thread, no gradient. The
+// dispatch checks dtypes and strides, Python the shapes.
 
 #include "vectors.h"
 
@@ -13,12 +13,8 @@
 
 namespace {
 
-// What lucas_kanade.py and pyramid.py hold under the same names.
-constexpr int64_t STEPS = 8, LEAP = 6, MARGIN = 4;
-constexpr float RATIO = 0.9f, LEAST_GAIN = 0.2f, MOST_GAIN = 5.0f;
-constexpr int64_t MOST_NODES = 6;  // along a side of a map of radius 2
-static_assert(MOST_NODES * MOST_NODES <= 64);  // a bit each
-enum Normalise : int64_t { NONE, BIAS, GAIN_BIAS };
+constexpr int64_t MAX_NODES = 2 * MAX_MAP_RADIUS_PX + 2;  // along a side of the largest map
+static_assert(MAX_NODES * MAX_NODES <= 64);               // one bit each
 
 inline Vector between(Vector a, Vector b, float weight) {  // as torch.lerp
   return weight < 0.5f ? a + weight * (b - a) : b - (b - a) * (1.0f - weight);
@@ -26,14 +22,14 @@ inline Vector between(Vector a, Vector b, float weight) {  // as torch.lerp
 
 struct Level {
   const float* pixels;
-  int64_t planes, rows, width, pad;
+  int64_t planes, rows, width, pad, margin;
 
-  Level(const Tensor& x, int64_t pad)
-      : pixels(data<float>(x)), planes(x.size(1)), rows(x.size(2)), width(x.size(3)), pad(pad) {}
+  Level(const Tensor& x, int64_t pad, int64_t margin)
+      : pixels(data<float>(x)), planes(x.size(1)), rows(x.size(2)), width(x.size(3)), pad(pad), margin(margin) {}
 
-  // The pixel left of (axis 0) or above (1) a place, on the level or in the margin around it.
+  // The pixel left of (axis 0) or above (1) a position, on the level or in the margin around it.
   float corner(float place, int axis) const {
-    const float most = static_cast<float>((axis ? rows : width) - 2 * pad - 1 + MARGIN), least = -MARGIN;
+    const float most = static_cast<float>((axis ? rows : width) - 2 * pad - 1 + margin), least = static_cast<float>(-margin);
     const float whole = std::floor(place);
     return whole > least ? std::min(whole, most) : least;
   }
@@ -43,15 +39,14 @@ struct Level {
   }
 };
 
-// The window of image 0 as three planes g_x, g_y, T of `size` rows, each filled up to whole vectors by zeros, with what
-// the normalisation leaves free taken out of them; and sums over it: g T, A, T T.
+// The window of image 0 as three planes g_x, g_y, T of `size` rows, padded with zeros to whole vectors, after the
+// normalisation; and sums over it: g T, A, T T.
 //
-// Here and below rows are read in whole vectors, past their end but never past the picture's: where a window can lie,
-// its level has more padding below it.
+// Rows are read in whole vectors, past their end but not past the image's: a level has more padding than a window reaches.
 struct Window {
   int64_t size, wide, count;
-  std::vector<float> planes, inside;  // inside: 1, and 0 in what is filled up
-  Bits last;                          // the bits of a row's last vector that belong to the window
+  std::vector<float> planes, inside;  // inside: 1 in the window, 0 in the padding
+  Bits last;                          // mask of the lanes of a row's last vector that belong to the window
   float moments[6];
 
   explicit Window(int64_t size)
@@ -95,8 +90,8 @@ struct Window {
     for (int64_t i = 0; i < count; ++i) from[i] -= share * what[i];
   }
 
-  void project(Normalise normalise) {
-    if (normalise != NONE) {
+  void project(bool remove_bias, bool estimate_gain) {
+    if (remove_bias) {
       for (int64_t k = 0; k < 3; ++k) {
         const float mean = sum(plane(k), inside.data()) / static_cast<float>(size * size);
         subtract(plane(k), inside.data(), mean);
@@ -104,7 +99,7 @@ struct Window {
     }
     float *g_x = plane(0), *g_y = plane(1), *T = plane(2);
     moments[5] = sum(T, T);
-    if (normalise == GAIN_BIAS) {
+    if (estimate_gain) {
       for (float* g : {g_x, g_y}) subtract(g, T, sum(g, T) / (moments[5] > 0.0f ? moments[5] : 1.0f));
     }
     const float found[5] = {sum(g_x, T), sum(g_y, T), sum(g_x, g_x), sum(g_y, g_x), sum(g_y, g_y)};
@@ -112,17 +107,17 @@ struct Window {
   }
 };
 
-// A map of one point: the window's K planes correlated with J (rows of `stride` pixels from `J` on) at n x n offsets, and
-// what a step makes of it. Steps pass by a few of its nodes, so each is found when a step first asks for it.
+// The correlation map of one point: the window's K planes correlated with J (rows of `stride` pixels) at n x n offsets,
+// as Gauss-Newton steps. Only a few nodes are read, so each is computed on first use.
 template <int K>
 struct Map {
   const Window& window;
   const float *inverse, *moments, *J;
   int64_t stride, n;
-  uint64_t known = 0;  // a bit per node
-  float field[K * MOST_NODES * MOST_NODES];
+  uint64_t known = 0;  // one bit per node
+  float field[K * MAX_NODES * MAX_NODES];
 
-  // R x M nodes whose first is at row v and column u.
+  // R x M nodes, the first at row v and column u.
   template <int R, int M>
   void correlate(int64_t v, int64_t u) {
     Vector sums[K][R][M] = {};
@@ -155,8 +150,8 @@ struct Map {
     known |= uint64_t{1} << node;
   }
 
-  // Nodes of two rows and columns, or of one at a border.
-  void find(int64_t v, int64_t last_v, int64_t u, int64_t last_u) {
+  // Nodes of two rows and columns, or one at a border.
+  void ensure(int64_t v, int64_t last_v, int64_t u, int64_t last_u) {
     const bool square = last_v > v && last_u > u;
     const uint64_t two = uint64_t{3} << (v * n + u), four = two | two << n;
     if (square && !(known & four)) return correlate<2, 2>(v, u);
@@ -168,15 +163,15 @@ struct Map {
     }
   }
 
-  // The field between its nodes; beyond its border it fades to zero.
-  void look(const float* p, float* found) {
+  // Bilinear interpolation of the field, which is zero beyond its border.
+  void interpolate(const float* p, float* found) {
     const float u = std::floor(p[0]), v = std::floor(p[1]);
     std::fill_n(found, K, 0.0f);
     if (!(u >= -1.0f && v >= -1.0f && u < static_cast<float>(n) && v < static_cast<float>(n))) return;
     const int64_t column = static_cast<int64_t>(u), row = static_cast<int64_t>(v);
     const int64_t first[2] = {std::max<int64_t>(column, 0), std::max<int64_t>(row, 0)};
     const int64_t last[2] = {std::min(column + 1, n - 1), std::min(row + 1, n - 1)};
-    find(first[1], last[1], first[0], last[0]);
+    ensure(first[1], last[1], first[0], last[0]);
     for (int k = 0; k < K; ++k) {
       for (int64_t i = first[1]; i <= last[1]; ++i) {
         float along = 0.0f;
@@ -190,18 +185,21 @@ struct Map {
 };
 
 struct Options {
-  int64_t iterations, level, window;
-  Normalise normalise;
+  int64_t iterations, steps_per_map;
   float epsilon;
-  double least_eigenvalue;  // of A, summed over the window
-  float low[2], high[2];    // where points may be
+  double min_eigenvalue;  // of A, summed over the window
+  float min_gain, max_gain;
+  bool extrapolate;  // on the finest level: Aitken's step, and its limits
+  int64_t aitken_step;
+  float min_ratio, max_ratio;
+  float low[2], high[2];  // bounds of the points
 
   bool within(const float* x) const {
     return x[0] >= low[0] && x[0] <= high[0] && x[1] >= low[1] && x[1] <= high[1];
   }
 };
 
-// Inverse of A = ((a, b), (b, c)), zero where its small eigenvalue is not above the limit; and whether it is.
+// Inverse of A = ((a, b), (b, c)), zero where its smaller eigenvalue is not above the limit; returns whether it is.
 bool invert(const float* A, double least, float* inverse) {
   const double a = A[0], b = A[1], c = A[2], half = (a - c) / 2, square = half * half + b * b;
   const bool textured = (a + c) / 2 - std::sqrt(square) > least;
@@ -217,7 +215,7 @@ struct State {
   bool live, held;
 };
 
-// Gauss-Newton steps of one point on one map that begins at the target's pixel `corner`.
+// Gauss-Newton steps of one point on a map whose first node is the target's pixel `corner`.
 template <int K>
 void walk(Map<K>& map, const float* corner, const float* x, int64_t steps, const Options& o, State& s) {
   const float start[2] = {x[0] + s.d[0] - corner[0], x[1] + s.d[1] - corner[1]};
@@ -225,15 +223,15 @@ void walk(Map<K>& map, const float* corner, const float* x, int64_t steps, const
   for (int64_t k = 1; k <= steps; ++k) {
     const float last[2] = {step[0], step[1]};
     float found[K];
-    map.look(p, found);
-    const float gain = K == 3 ? std::clamp(found[K - 1], LEAST_GAIN, MOST_GAIN) : 1.0f;
+    map.interpolate(p, found);
+    const float gain = K == 3 ? std::clamp(found[K - 1], o.min_gain, o.max_gain) : 1.0f;
     step[0] = found[0] / gain;
     step[1] = found[1] / gain;
     square = step[0] * step[0] + step[1] * step[1];
-    if (k == LEAP && k < steps && o.level == 0 && square > o.epsilon * o.epsilon) {
+    if (k == o.aitken_step && k < steps && o.extrapolate && square > o.epsilon * o.epsilon) {
       const float before = std::max(last[0] * last[0] + last[1] * last[1], o.epsilon * o.epsilon);
       const float ratio = (step[0] * last[0] + step[1] * last[1]) / before;
-      for (float& part : step) part /= 1.0f - std::clamp(ratio, -RATIO, RATIO);
+      for (float& part : step) part /= 1.0f - std::clamp(ratio, o.min_ratio, o.max_ratio);
       square = step[0] * step[0] + step[1] * step[1];
     }
     p[0] -= step[0];
@@ -247,7 +245,7 @@ void walk(Map<K>& map, const float* corner, const float* x, int64_t steps, const
   for (int axis = 0; axis < 2; ++axis) s.d[axis] = place[axis] - x[axis];
 }
 
-// Whether rows of numbers are finite, as far as whole vectors reach.
+// Whether rows are finite, in whole vectors.
 bool finite(const float* from, int64_t stride, int64_t rows, int64_t columns) {
   Vector nothing = {};
   for (int64_t i = 0; i < rows; ++i) {
@@ -256,7 +254,7 @@ bool finite(const float* from, int64_t stride, int64_t rows, int64_t columns) {
   return total(nothing) == 0.0f;
 }
 
-// One map of radius (n - 2) / 2 around where a point is, and the steps on it.
+// One map of radius (n - 2) / 2 around a point's position, and the steps on it.
 template <int K>
 void on_map(Window& window, const float* inverse, const Level& target, int64_t batch, std::vector<float>& patch, int64_t n,
             const float* x, int64_t steps, const Options& o, State& s) {
@@ -264,13 +262,13 @@ void on_map(Window& window, const float* inverse, const Level& target, int64_t b
   const float corner[2] = {target.corner(x[0] + s.d[0], 0) - radius, target.corner(x[1] + s.d[1], 1) - radius};
   const int64_t side = window.size + n - 1, stride = window.wide + LANES;
   Map<K> map{window, inverse, window.moments, target.at(batch, 0, corner[0], corner[1], window.size / 2), target.width, n};
-  if (!finite(map.J, map.stride, side, stride)) {  // perhaps beside the patch alone
+  if (!finite(map.J, map.stride, side, stride)) {  // perhaps only beside the patch
     for (int64_t i = 0; i < side; ++i) {
       std::fill_n(std::copy_n(map.J + i * map.stride, side, &patch[i * stride]), stride - side, 0.0f);
     }
     map.J = patch.data();
     map.stride = stride;
-    if (!finite(map.J, map.stride, side, stride)) {  // no step across what is no number, as in torch
+    if (!finite(map.J, map.stride, side, stride)) {  // no step across NaN, as in torch
       std::fill_n(map.field, K * n * n, NAN);
       map.known = ~uint64_t{0};
     }
@@ -279,42 +277,47 @@ void on_map(Window& window, const float* inverse, const Level& target, int64_t b
 }
 
 template <int K>
-void descend_point(Window& window, const float* inverse, const Level& target, int64_t batch, std::vector<float>& patch,
+void search_point(Window& window, const float* inverse, const Level& target, int64_t batch, std::vector<float>& patch,
                    const float* x, const Tensor& radii, const Options& o, State& s) {
   for (int64_t k = 0; k < radii.size(0); ++k) {
-    const int64_t steps = std::min(STEPS, o.iterations - k * STEPS);
+    const int64_t steps = std::min(o.steps_per_map, o.iterations - k * o.steps_per_map);
     if (k && (steps <= 0 || !s.live)) return;
     on_map<K>(window, inverse, target, batch, patch, 2 * data<int64_t>(radii)[k] + 2, x, steps, o, s);
   }
 }
 
-// source (B, 3, ., .), target (B, 1 or 3, ., .), limits (2, 2) low and high, x and d (2, M) float32; batch (M) and radii
-// int64, each 1 or 2; known (M) bool. found (2, M) the displacement, A (3, M), held and textured (M) bool.
-void descend(Tensor source, Tensor target, Tensor x, Tensor d, Tensor batch, Tensor known, Tensor limits, Tensor radii,
-             Tensor found, Tensor A, Tensor held, Tensor textured, int64_t window, int64_t iterations, int64_t level,
-             int64_t pad, int64_t normalise, double epsilon, double min_eigenvalue) {
-  const Level here(source, pad), there(target, pad);
-  Options o{iterations, level, window, static_cast<Normalise>(normalise), static_cast<float>(epsilon),
-            min_eigenvalue * static_cast<double>(window * window), {}, {}};
+// source (B, 3, ., .), target (B, 1 or 3, ., .), x and d (2, M), limits (2, 2): lowest and highest position, float32; batch
+// (M) and radii of the maps, at most MAX_MAP_RADIUS_PX, int64; known (M) bool: points to search for. Outputs: found (2, M)
+// displacement and A (3, M) float32, held on the last map and textured (M) bool. `finest`: the level is read between
+// pixels, and one step extrapolates.
+void lk_level(Tensor source, Tensor target, Tensor x, Tensor d, Tensor batch, Tensor known, Tensor limits, Tensor radii,
+              Tensor found, Tensor A, Tensor held, Tensor textured, int64_t window, int64_t iterations,
+              int64_t steps_per_map, int64_t pad, int64_t margin, bool remove_bias, bool estimate_gain, double epsilon,
+              double min_eigenvalue, double min_gain, double max_gain, bool finest, int64_t aitken_step, double min_ratio,
+              double max_ratio) {
+  const Level here(source, pad, margin), there(target, pad, margin);
+  Options o{iterations, steps_per_map, static_cast<float>(epsilon), min_eigenvalue * static_cast<double>(window * window),
+            static_cast<float>(min_gain), static_cast<float>(max_gain), finest, aitken_step,
+            static_cast<float>(min_ratio), static_cast<float>(max_ratio), {}, {}};
   std::copy_n(data<float>(limits), 2, o.low);
   std::copy_n(data<float>(limits) + 2, 2, o.high);
   const int64_t M = x.size(1);
   Window own(window);
-  std::vector<float> patch((window + MOST_NODES) * (own.wide + LANES));
+  std::vector<float> patch((window + MAX_NODES) * (own.wide + LANES));
   for (int64_t m = 0; m < M; ++m) {
     const float place[2] = {data<float>(x)[m], data<float>(x)[M + m]};
     const int64_t b = data<int64_t>(batch)[m];
     State s{{data<float>(d)[m], data<float>(d)[M + m]}, data<bool>(known)[m], false};
-    own.read(here, place[0], place[1], b, level == 0);
-    own.project(o.normalise);
+    own.read(here, place[0], place[1], b, finest);
+    own.project(remove_bias, estimate_gain);
     float inverse[3];
-    const bool fine = invert(own.moments + 2, o.least_eigenvalue, inverse);
+    const bool fine = invert(own.moments + 2, o.min_eigenvalue, inverse);
     const float begun[2] = {place[0] + s.d[0], place[1] + s.d[1]};
     s.live = s.live && fine && o.within(begun);
-    if (o.normalise == GAIN_BIAS) {
-      descend_point<3>(own, inverse, there, b, patch, place, radii, o, s);
+    if (estimate_gain) {
+      search_point<3>(own, inverse, there, b, patch, place, radii, o, s);
     } else {
-      descend_point<2>(own, inverse, there, b, patch, place, radii, o, s);
+      search_point<2>(own, inverse, there, b, patch, place, radii, o, s);
     }
     for (int axis = 0; axis < 2; ++axis) data<float>(found)[axis * M + m] = s.d[axis];
     for (int k = 0; k < 3; ++k) data<float>(A)[k * M + m] = own.moments[2 + k];
@@ -327,9 +330,11 @@ void descend(Tensor source, Tensor target, Tensor x, Tensor d, Tensor batch, Ten
 
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
   m.def(
-      "descend(Tensor source, Tensor target, Tensor x, Tensor d, Tensor batch, Tensor known, Tensor limits, "
+      "lk_level(Tensor source, Tensor target, Tensor x, Tensor d, Tensor batch, Tensor known, Tensor limits, "
       "Tensor radii, Tensor(a!) found, Tensor(b!) A, Tensor(c!) held, Tensor(d!) textured, int window, int iterations, "
-      "int level, int pad, int normalise, float epsilon, float min_eigenvalue) -> ()");
+      "int steps_per_map, int pad, int margin, bool remove_bias, bool estimate_gain, float epsilon, "
+      "float min_eigenvalue, float min_gain, float max_gain, bool finest, int aitken_step, float min_ratio, "
+      "float max_ratio) -> ()");
 }
 
-STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) { m.impl("descend", TORCH_BOX(&descend)); }
+STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) { m.impl("lk_level", TORCH_BOX(&lk_level)); }

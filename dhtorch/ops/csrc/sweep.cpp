@@ -1,6 +1,6 @@
-// What dhtorch/geometry/plane_sweep.py does in torch as operators on torch's stable ABI, bit for bit the same: whole numbers,
-// and sums of products in torch's order (-ffp-contract=off: none is fused). One thread, no gradient. Callers check shapes,
-// types and that everything is contiguous; see dhtorch/ops/loader.py.
+// Census, costs and the best surface of the plane sweep, and smoothing of inverse depths. References:
+// dhtorch/geometry/plane_sweep.py and windows.py; equal bit for bit: integers, and sums of products in torch's order
+// (-ffp-contract=off: none is fused). One thread, no gradient. The dispatch checks dtypes and strides, Python the shapes.
 
 #include "vectors.h"
 
@@ -18,7 +18,7 @@
 
 namespace {
 
-// Ask for large pages where memory is about to be filled for the first time: small ones come one by one.
+// Advise the kernel to back new memory with large pages, which saves a page fault for every 4 KiB.
 inline void large_pages(void* from, size_t bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
   constexpr uintptr_t PAGE = uintptr_t{1} << 21;
@@ -27,7 +27,7 @@ inline void large_pages(void* from, size_t bytes) {
 #endif
 }
 
-inline int32_t bits(int32_t code) {  // of the lower 31, as count_bits: vectors have no such instruction everywhere
+inline int32_t bits(int32_t code) {  // set bits of the lower 31, as count_set_bits; few vector units have an instruction
 #ifdef __AVX512VPOPCNTDQ__
   return __builtin_popcount(code);
 #else
@@ -39,13 +39,16 @@ inline int32_t bits(int32_t code) {  // of the lower 31, as count_bits: vectors 
 #endif
 }
 
-// Add to C (B, h, w, D) uint8, or write into it where it is `fresh`, how badly each pixel fits at every plane. code_0 (B, N) and code_1 (B, rows * columns)
-// int32; a (B, 2, N), b (B, 2), c (B) and q (B, D) float32: pixels are seen at (a + q b) / (1 + q c), margin further in.
-void add_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int64_t rows,
-               int64_t columns, int64_t margin, int64_t unseen, bool fresh) {
+// Add the census cost of every pixel and plane to C (B, h, w, D) uint8, or write it if C is `fresh`. code_0 (B, N) and
+// code_1 (B, rows * columns) int32; a (B, 2, N), b (B, 2), c (B) and q (B, D) float32: a pixel is seen at
+// (a + q b) / (1 + q c) + margin. `unseen`: cost where view 1 shows nothing.
+void add_census_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int64_t rows,
+                      int64_t columns, int64_t margin, int64_t unseen, double min_depth_ratio, double behind_scale,
+                      bool fresh) {
   const int64_t B = q.size(0), D = q.size(1), N = code_0.size(1), M = code_1.size(1);
   const float inside = static_cast<float>(margin + 0.5), right = static_cast<float>(columns - 1),
               down = static_cast<float>(rows - 1);
+  const float min_ratio = static_cast<float>(min_depth_ratio), behind = static_cast<float>(behind_scale);
   const int32_t width = static_cast<int32_t>(columns), none = static_cast<int32_t>(unseen);
   std::vector<float> scale(D), along(D), across(D);
   std::vector<int32_t> cell(D);
@@ -54,7 +57,7 @@ void add_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tenso
     const float *bk = data<float>(b) + 2 * k, *qk = data<float>(q) + D * k, *ak = data<float>(a) + 2 * N * k;
     for (int64_t d = 0; d < D; ++d) {
       const float z = 1.0f + qk[d] * data<float>(c)[k];
-      scale[d] = z > 1e-3f ? 1.0f / z : 1e9f;
+      scale[d] = z > min_ratio ? 1.0f / z : behind;
       along[d] = qk[d] * bk[0];
       across[d] = qk[d] * bk[1];
     }
@@ -85,14 +88,14 @@ void add_costs(Tensor C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tenso
   }
 }
 
-// The best surface through costs C (h, w, D) uint8, by paths from four sides, and its best planes. Path, Two and Four are
-// the numbers that hold the cost of one path, of two and of all. Twice through the picture: from its first pixel on with
-// the paths from the left and from above, and back, where all four are known.
+// Semiglobal matching over costs C (h, w, D) uint8 along paths from four sides, and the best planes. Path, Two and Four
+// are integer types for the cost of one path, two and four. Two passes over the image: from its first pixel on with the
+// paths from the left and from above, and back with the other two.
 template <typename Path, typename Two, typename Four>
 struct Surface {
-  const int64_t h, w, D, wide;  // paths have a place before and one behind their D planes
+  const int64_t h, w, D, wide;  // paths are padded by one element before and behind their D planes
   const Path step, jump;
-  std::vector<Path> above, under, left, right, low;  // of the row and pixel before, and of this one
+  std::vector<Path> above, under, left, right, low;  // of the previous row and pixel, and of the current ones
   std::unique_ptr<Two[]> half;
   std::vector<Four> all;
 
@@ -102,7 +105,7 @@ struct Surface {
     large_pages(half.get(), h * w * D * sizeof(Two));
   }
 
-  // A path that begins has cost nothing; a step from beyond the ends costs more than any other.
+  // A new path has cost 0; the padding costs more than any path.
   void begin(std::vector<Path>& paths) const {
     std::fill(paths.begin(), paths.end(), static_cast<Path>(0));
     for (size_t i = 0; i < paths.size(); i += wide) {
@@ -114,8 +117,8 @@ struct Surface {
     std::fill(low.begin(), low.end(), static_cast<Path>(0));
   }
 
-  // The cost of the best path to this pixel at a plane, of those to the pixel before: there, one before and one behind.
-  Path go(const Path* from, Path least, Path far, uint8_t cost) const {
+  // Cost of the best path to this pixel at a plane, from the previous pixel's at that plane and its neighbours.
+  Path extend(const Path* from, Path least, Path far, uint8_t cost) const {
     Path best = std::min(from[0], from[2]);
     best = static_cast<Path>(best + step);
     best = std::min(best, from[1]);
@@ -123,8 +126,7 @@ struct Surface {
     return static_cast<Path>(static_cast<Path>(best - least) + cost);
   }
 
-  // Both paths to pixel x, which become those to the pixel before; their sums, with those from the other sides if there
-  // are some, and the least of those.
+  // Extend both paths to pixel x; writes their sums, with those of the other two paths if given, and returns the least.
   template <typename Sum>
   Sum pass(int64_t x, const uint8_t* __restrict cost, Path& least, const Two* __restrict others, Sum* __restrict sum) {
     const Path *__restrict p = left.data(), *__restrict r = above.data() + x * wide;
@@ -135,7 +137,7 @@ struct Surface {
     Sum found = std::numeric_limits<Sum>::max();
 #pragma GCC ivdep
     for (int64_t d = 0; d < D; ++d) {
-      const Path here = go(p + d, p_least, p_far, cost[d]), there = go(r + d, r_least, r_far, cost[d]);
+      const Path here = extend(p + d, p_least, p_far, cost[d]), there = extend(r + d, r_least, r_far, cost[d]);
       p_to[d] = here;
       r_to[d] = there;
       p_found = std::min(p_found, here);
@@ -151,7 +153,7 @@ struct Surface {
     return found;
   }
 
-  // The first plane of the least of all, and between its neighbours where a parabola is least.
+  // The first plane of least cost, and the minimum of the parabola through its neighbours' costs.
   void choose(Four least, int64_t* plane, float* shift, int16_t* cost) const {
     const Four* s = all.data();
     int64_t d = 0;
@@ -195,17 +197,17 @@ struct Surface {
   }
 };
 
-// Of C (B, h, w, D) uint8, step and jump (B) int16: the best planes of the best surface, plane (B, h, w) int64, between
-// planes by shift float32, its cost there int16; and the cost of all planes at every other pixel both ways, `some`
-// (B, (h + 1) / 2, (w + 1) / 2, D) int16. In bytes wherever no sum is larger.
-void surface(Tensor C, Tensor step, Tensor jump, Tensor plane, Tensor shift, Tensor cost, Tensor some) {
+// Semiglobal matching over C (B, h, w, D) uint8 with step and jump (B) int16. Outputs: plane (B, h, w) int64 of least cost,
+// shift float32 towards the minimum between planes, cost int16 of that plane; and the cost of all planes at every other
+// row and column, `some` (B, (h + 1) / 2, (w + 1) / 2, D) int16. Computed in bytes wherever no sum exceeds one.
+void aggregate_best_plane(Tensor C, Tensor step, Tensor jump, Tensor plane, Tensor shift, Tensor cost, Tensor some) {
   const int64_t B = C.size(0), h = C.size(1), w = C.size(2), D = C.size(3), N = h * w, quarter = some.size(1) * some.size(2);
   for (int64_t k = 0; k < B; ++k) {
     const uint8_t* costs = data<uint8_t>(C) + k * N * D;
     const int64_t one = data<int16_t>(step)[k], more = data<int16_t>(jump)[k];
     uint8_t worst = 0;
     for (int64_t i = 0; i < N * D; ++i) worst = std::max(worst, costs[i]);
-    const int64_t most = worst + more;  // of a path: beyond its least it is kept within a jump
+    const int64_t most = worst + more;  // of a path, which exceeds its least by at most a jump
     const auto found = [&]<typename Path, typename Two, typename Four>() {
       Surface<Path, Two, Four>(h, w, D, one, more)
           .find(costs, data<int64_t>(plane) + k * N, data<float>(shift) + k * N, data<int16_t>(cost) + k * N,
@@ -223,9 +225,9 @@ void surface(Tensor C, Tensor step, Tensor jump, Tensor plane, Tensor shift, Ten
   }
 }
 
-// Of S (N, D) int16: the least cost (N) further than `reach` planes from `plane` (N) int64; the type's most where there is
+// Least cost (N) of S (N, D) int16 further than `reach` planes from `plane` (N) int64; the largest int16 where there is
 // none.
-void elsewhere(Tensor S, Tensor plane, Tensor cost, int64_t reach) {
+void second_best(Tensor S, Tensor plane, Tensor cost, int64_t reach) {
   const int64_t N = S.size(0), D = S.size(1);
   const int16_t* s = data<int16_t>(S);
   for (int64_t n = 0; n < N; ++n, s += D) {
@@ -238,9 +240,9 @@ void elsewhere(Tensor S, Tensor plane, Tensor cost, int64_t reach) {
   }
 }
 
-// Codes (B, h, w) int32 of grey (B, h, w) float32: of each of n neighbours, offsets (n, 2) int64 down and right,
-// whether it is darker than the middle. Beyond the border is the border.
-void census(Tensor grey, Tensor offsets, Tensor code) {
+// Codes (B, h, w) int32 of grey (B, h, w) float32: bit i is set where the neighbour at offset i of (n, 2) int64 (down,
+// right) is darker than the pixel. The border is replicated.
+void census_transform(Tensor grey, Tensor offsets, Tensor code) {
   const int64_t B = grey.size(0), h = grey.size(1), w = grey.size(2), n = offsets.size(0), margin = 8;
   const int64_t* step = data<int64_t>(offsets);
   const int64_t wide = w + 2 * margin;
@@ -267,10 +269,12 @@ void census(Tensor grey, Tensor offsets, Tensor code) {
   }
 }
 
-// Where a view without a lens sees points on rays (B, 3, N) at q (B, N): uv (B, 2, N) and whether before it (B, N) bool.
-// R (B, 9), t, turn (B, 3), f, c (B, 2).
-void seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor uv, Tensor front) {
+// Pixels uv (B, 2, N) at which a pinhole camera sees points on rays (B, 3, N) at inverse depths q (B, N), and whether they
+// are in front of it (B, N) bool. R (B, 9), t, turn (B, 3), f, c (B, 2).
+void project_inverse_depth(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor uv, Tensor front,
+                           double min_depth_ratio) {
   const int64_t B = q.size(0), N = q.size(1);
+  const float min_ratio = static_cast<float>(min_depth_ratio);
   for (int64_t k = 0; k < B; ++k) {
     const float *m = data<float>(R) + 9 * k, *tk = data<float>(t) + 3 * k, *w = data<float>(turn) + 3 * k;
     const float *fk = data<float>(f) + 2 * k, *ck = data<float>(c) + 2 * k, *__restrict qk = data<float>(q) + N * k;
@@ -288,7 +292,7 @@ void seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Te
       x = x + dx;
       y = y + dy;
       z = z + dz;
-      const bool ahead = z > 1e-3f;
+      const bool ahead = z > min_ratio;
       before[n] = ahead;
       x = ahead ? x : 1.0f;
       y = ahead ? y : 1.0f;
@@ -338,8 +342,8 @@ void smooth_columns(const float* q, float* out, int64_t h, int64_t w, float near
   }
 }
 
-// out (B, h, w) float32: q, each the mean of those near it along its column, then along its row; tolerance (B).
-void smooth(Tensor q, Tensor tolerance, Tensor out, int64_t radius) {
+// out (B, h, w) float32: mean of the q within `tolerance` (B) along the column, then along the row.
+void smooth_within_tolerance(Tensor q, Tensor tolerance, Tensor out, int64_t radius) {
   const int64_t B = q.size(0), h = q.size(1), w = q.size(2);
   std::vector<float> between(h * w);
   for (int64_t k = 0; k < B; ++k) {
@@ -353,24 +357,24 @@ void smooth(Tensor q, Tensor tolerance, Tensor out, int64_t radius) {
 
 STABLE_TORCH_LIBRARY(dhtorch, m) {
   m.def(
-      "add_costs(Tensor(a!) C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int rows, "
-      "int columns, int margin, int unseen, bool fresh) -> ()");
+      "add_census_costs(Tensor(a!) C, Tensor code_0, Tensor code_1, Tensor a, Tensor b, Tensor c, Tensor q, int rows, "
+      "int columns, int margin, int unseen, float min_depth_ratio, float behind_scale, bool fresh) -> ()");
   m.def(
-      "surface(Tensor C, Tensor step, Tensor jump, Tensor(a!) plane, Tensor(b!) shift, Tensor(c!) cost, "
+      "aggregate_best_plane(Tensor C, Tensor step, Tensor jump, Tensor(a!) plane, Tensor(b!) shift, Tensor(c!) cost, "
       "Tensor(d!) some) -> ()");
-  m.def("census(Tensor grey, Tensor offsets, Tensor(a!) code) -> ()");
+  m.def("census_transform(Tensor grey, Tensor offsets, Tensor(a!) code) -> ()");
   m.def(
-      "seen_at(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor(a!) uv, "
-      "Tensor(b!) front) -> ()");
-  m.def("smooth(Tensor q, Tensor tolerance, Tensor(a!) out, int radius) -> ()");
-  m.def("elsewhere(Tensor S, Tensor plane, Tensor(a!) cost, int reach) -> ()");
+      "project_inverse_depth(Tensor ray, Tensor q, Tensor R, Tensor t, Tensor turn, Tensor f, Tensor c, Tensor(a!) uv, "
+      "Tensor(b!) front, float min_depth_ratio) -> ()");
+  m.def("smooth_within_tolerance(Tensor q, Tensor tolerance, Tensor(a!) out, int radius) -> ()");
+  m.def("second_best(Tensor S, Tensor plane, Tensor(a!) cost, int reach) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
-  m.impl("add_costs", TORCH_BOX(&add_costs));
-  m.impl("surface", TORCH_BOX(&surface));
-  m.impl("census", TORCH_BOX(&census));
-  m.impl("seen_at", TORCH_BOX(&seen_at));
-  m.impl("smooth", TORCH_BOX(&smooth));
-  m.impl("elsewhere", TORCH_BOX(&elsewhere));
+  m.impl("add_census_costs", TORCH_BOX(&add_census_costs));
+  m.impl("aggregate_best_plane", TORCH_BOX(&aggregate_best_plane));
+  m.impl("census_transform", TORCH_BOX(&census_transform));
+  m.impl("project_inverse_depth", TORCH_BOX(&project_inverse_depth));
+  m.impl("smooth_within_tolerance", TORCH_BOX(&smooth_within_tolerance));
+  m.impl("second_best", TORCH_BOX(&second_best));
 }

@@ -1,6 +1,6 @@
-// What a loader's transform does beside the stages: depth maps in metres, depth tokens of samples. Twin of
-// dhtorch/transforms/sample_spec.py and tokens.py, which are the reference: bit for bit, sums in double precision in the same order. One
-// thread, no gradient. Callers check shapes, types and strides.
+// Depth maps of 16-bit integers to metres, and pooling of samples to depth tokens. References:
+// dhtorch/transforms/sample_spec.py and tokens.py; equal bit for bit, sums in double precision in the same order. One
+// thread, no gradient. The dispatch checks dtypes and strides, Python the shapes.
 
 #include <torch/csrc/stable/library.h>
 
@@ -12,16 +12,15 @@
 
 namespace {
 
-// What is known of a patch: how many samples there are, how many with a depth, their inverse depths and those' variance.
+// Sums over the samples of a patch: all, those with a depth, inverse depth and its variance.
 struct Patch {
   double count = 0, answered = 0, inverse = 0, variance = 0;
 };
 
 inline double per(double count) { return 1.0 / (count < 1.0 ? 1.0 : count); }
 
-// uv (B, N, 2), depth, sigma (B, N) float32, source, hole (B, N) int32; tokens (B, P, 3 + classes) float32 and known (B, P)
-// bool, filled. A sample at uv lies at (uv + ½) · scale + margin in the network's picture, whose patches count `rows` and
-// `columns`.
+// uv (B, N, 2), depth, sigma (B, N) float32, source, hole (B, N) int32. Outputs: tokens (B, P, 3 + classes) float32 and
+// known (B, P) bool. A sample at uv lies at (uv + ½) · scale + margin in the network's image of `rows` × `columns` patches.
 void patch_tokens(Tensor uv, Tensor depth, Tensor sigma, Tensor source, Tensor hole, Tensor tokens, Tensor known, int64_t patch,
                   int64_t rows, int64_t columns, double scale_x, double scale_y, double margin_x, double margin_y) {
   const int64_t B = depth.size(0), N = depth.size(1), P = rows * columns, channels = tokens.size(2), classes = channels - 3;
@@ -32,7 +31,7 @@ void patch_tokens(Tensor uv, Tensor depth, Tensor sigma, Tensor source, Tensor h
   for (int64_t b = 0; b < B; ++b) {
     const float *place = data<float>(uv) + 2 * b * N, *z = data<float>(depth) + b * N, *noise = data<float>(sigma) + b * N;
     const int32_t *from = data<int32_t>(source) + b * N, *kind = data<int32_t>(hole) + b * N;
-    const auto answered = [&](int64_t i) { return from[i] != 0 && z[i] > 0.0f; };
+    const auto answered = [&](int64_t i) { return from[i] != SOURCE_NONE && z[i] > 0.0f; };
     patches.assign(P, Patch());
     holes.assign(P * classes, 0.0);
     for (int64_t i = 0; i < N; ++i) {
@@ -76,8 +75,8 @@ void over_unit(const Word* raw, float* __restrict z, int64_t n, float unit) {
   }
 }
 
-// raw: numbers of two bytes, int16 or (without a sign) uint16; z: as many float32, filled: what is positive over `unit`, else 0.
-void metres(Tensor raw, Tensor z, double unit, bool sign) {
+// raw: int16, or with `sign` false uint16 of the same bits. Output: z float32, raw / unit where positive, else 0.
+void write_metres(Tensor raw, Tensor z, double unit, bool sign) {
   const float per_metre = unit;
   if (sign) {
     over_unit(data<int16_t>(raw), data<float>(z), z.numel(), per_metre);
@@ -89,13 +88,13 @@ void metres(Tensor raw, Tensor z, double unit, bool sign) {
 }  // namespace
 
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
-  m.def("metres(Tensor raw, Tensor(a!) z, float unit, bool sign) -> ()");
+  m.def("write_metres(Tensor raw, Tensor(a!) z, float unit, bool sign) -> ()");
   m.def(
       "patch_tokens(Tensor uv, Tensor depth, Tensor sigma, Tensor source, Tensor hole, Tensor(a!) tokens, Tensor(b!) known, int "
       "patch, int rows, int columns, float scale_x, float scale_y, float margin_x, float margin_y) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
-  m.impl("metres", TORCH_BOX(&metres));
+  m.impl("write_metres", TORCH_BOX(&write_metres));
   m.impl("patch_tokens", TORCH_BOX(&patch_tokens));
 }

@@ -1,6 +1,6 @@
-// Cost and normal equations of dhtorch/geometry/reprojection_problem.py, and the squared residuals of its tracks, as operators on
-// torch's stable ABI: the same formulas, sixteen or eight tracks at once. Sums over tracks are taken in another order than
-// torch's. One thread, no gradient. Callers check shapes, types and that everything is contiguous; see dhtorch/ops/loader.py.
+// Cost and normal equations of near and far tracks, and their squared residuals. Reference:
+// dhtorch/geometry/reprojection_problem.py; the same formulas, 16 or 8 tracks per vector, and sums over tracks in another
+// order. One thread, no gradient. The dispatch checks dtypes and strides, Python the shapes.
 
 #include "vectors.h"
 
@@ -10,9 +10,6 @@
 
 namespace {
 
-// What near_far.py and least_squares.py hold under the same names.
-constexpr float MAX_NEARER = 2.0f, BEHIND = 1e4f, MIN_DEPTH = 1e-6f;
-
 inline Vector root(Vector x) {
   float part[LANES];
   store(x, part);
@@ -20,8 +17,19 @@ inline Vector root(Vector x) {
   return load(part);
 }
 
+// Limits of a track: the factor by which a far one may be nearer than the nearest return, the squared residual of a
+// point behind the camera, and the least depth (m).
+struct Limits {
+  float nearest_divisor, behind, min_depth;
+
+  Limits(double nearest_divisor, double behind, double min_depth)
+      : nearest_divisor(static_cast<float>(nearest_divisor)), behind(static_cast<float>(behind)),
+        min_depth(static_cast<float>(min_depth)) {}
+};
+
 // The tracks of one pair, N a multiple of LANES, and the unknowns.
 struct Tracks {
+  Limits limits;
   int64_t N;
   const float *ray, *seen, *height, *shape, *inverse, *variance, *a, *b, *d;
   const bool* near;
@@ -29,7 +37,7 @@ struct Tracks {
   bool turns;
 };
 
-// LANES tracks from `n` on, linearised and whitened.
+// LANES tracks from index `n` on, linearised and whitened.
 struct Whitened {
   Bits front;
   Vector height, square, r[2];  // residuals along the two axes
@@ -53,7 +61,7 @@ struct Whitened {
     Bits near;
     for (int64_t i = 0; i < LANES; ++i) near[i] = of.near[n + i] ? -1 : 0;
     const Vector xx = load(of.shape + n), xy = load(of.shape + N + n), yy = load(of.shape + 2 * N + n);
-    // The most probable inverse depth of a track without one.
+    // Maximum-likelihood inverse depth of a track without one.
     const float *t = of.t;
     const Vector l0 = t[1] * p[2] - t[2] * p[1], l1 = t[2] * p[0] - t[0] * p[2], l2 = t[0] * p[1] - t[1] * p[0];
     const Vector n0 = xx * l0 + xy * l1, n1 = xy * l0 + yy * l1, size = l0 * n0 + l1 * n1;
@@ -62,11 +70,11 @@ struct Whitened {
     const Vector d0 = t[0] - t[2] * u1, d1 = t[1] - t[2] * v1, long_ = d0 * d0 + d1 * d1;
     const Vector free = -((p[0] - p[2] * u1) * d0 + (p[1] - p[2] * v1) * d1) / (long_ < 1e-24f ? none + 1e-24f : long_);
     const Vector q = near ? load(of.inverse + n) : (free < 0.0f ? none : free);
-    const Bits open = ~near & ~(free < 0.0f);  // nothing is known of q
+    const Bits open = ~near & ~(free < 0.0f);  // q is unconstrained
     const Vector variance = near ? load(of.variance + n) : none;
 
     const Vector depth = p[2] + q * t[2];
-    front = (depth > MIN_DEPTH) & (near | (q < MAX_NEARER * of.nearest));
+    front = (depth > of.limits.min_depth) & (near | (q < of.limits.nearest_divisor * of.nearest));
     const Vector w = 1.0f / (front ? depth : one);
     x = (p[0] + q * t[0]) * w;
     y = (p[1] + q * t[1]) * w;
@@ -85,11 +93,11 @@ struct Whitened {
     m1[0] = left * e1 * d;
     m1[1] = e0 * d;
     for (int i = 0; i < 2; ++i) r[i] = m0[i] * (x - u) + m1[i] * (y - v);
-    square = front ? r[0] * r[0] + r[1] * r[1] : none + BEHIND;
+    square = front ? r[0] * r[0] + r[1] * r[1] : none + of.limits.behind;
   }
 };
 
-// Sums of the robust cost, and of J'WJ (upper half) and J'Wr row by row, n = 6 or, with a turn, 9.
+// The robust cost, and with `columns` the upper half of J'WJ and J'Wr row by row; n = 6, or 9 with a shutter's turn.
 template <int n, bool columns>
 float sums(const Tracks& of, const float* share, float bend, float* found) {
   constexpr int COUNT = n * (n + 3) / 2;
@@ -133,11 +141,11 @@ float equations(const Tracks& of, const float* share, float bend, float* H, floa
   return cost;
 }
 
-Tracks pair(int64_t k, const Tensor& ray, const Tensor& seen, const Tensor& height, const Tensor& shape, const Tensor& inverse,
-            const Tensor& variance, const Tensor& near, const Tensor& nearest, const Tensor& a, const Tensor& b, const Tensor& d,
-            const Tensor& R, const Tensor& t, const Tensor& turn) {
+Tracks pair(int64_t k, const Limits& limits, const Tensor& ray, const Tensor& inverse, const Tensor& near, const Tensor& seen,
+            const Tensor& shape, const Tensor& height, const Tensor& nearest, const Tensor& variance, const Tensor& a,
+            const Tensor& b, const Tensor& d, const Tensor& R, const Tensor& t, const Tensor& turn) {
   const int64_t N = ray.size(2);
-  Tracks of;
+  Tracks of = {limits};
   of.N = N;
   of.ray = data<float>(ray) + 3 * N * k;
   of.seen = data<float>(seen) + 2 * N * k;
@@ -159,27 +167,32 @@ Tracks pair(int64_t k, const Tensor& ray, const Tensor& seen, const Tensor& heig
   return of;
 }
 
-// ray (B, 3, N), seen (B, 2, N), height (B, N), shape (B, 3, N), inverse, variance and near (B, N), nearest (B, 1), a, b and d
-// (B, N): near_far.py's Problem, Fixed and _sphere; share (B, N) of a track's cost; R (B, 3, 3), t (B, 3), turn (B, 3) or (0, 3)
-// where there is none. cost (B), H (B, n, n) and g (B, n), or B = 0 where they are not asked for. All float32, near bool.
-void track_equations(Tensor ray, Tensor seen, Tensor height, Tensor shape, Tensor inverse, Tensor variance, Tensor near,
-                     Tensor nearest, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor share, Tensor cost,
-                     Tensor H, Tensor g, double bend) {
+// Tensors of _track_tensors in reprojection_problem.py: ray (B, 3, N), inverse, near (B, N), seen (B, 2, N), shape
+// (B, 3, N), height (B, N), nearest (B, 1), variance, a, b, d (B, N), R (B, 3, 3), t (B, 3), turn (B, 3), or (0, 3) without
+// one; share (B, N): weight of a track in the cost. near is bool, all others float32. Outputs: cost (B), H (B, n, n) and
+// g (B, n), which are not computed where their leading dimension is 0.
+void pose_normal_equations(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor shape, Tensor height, Tensor nearest,
+                           Tensor variance, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor share,
+                           Tensor cost, Tensor H, Tensor g, double bend, double nearest_divisor, double behind,
+                           double min_depth) {
   const int64_t B = ray.size(0), N = ray.size(2), n = turn.size(0) > 0 ? 9 : 6;
+  const Limits limits(nearest_divisor, behind, min_depth);
   for (int64_t k = 0; k < B; ++k) {
-    const Tracks of = pair(k, ray, seen, height, shape, inverse, variance, near, nearest, a, b, d, R, t, turn);
+    const Tracks of = pair(k, limits, ray, inverse, near, seen, shape, height, nearest, variance, a, b, d, R, t, turn);
     float *to = H.size(0) ? data<float>(H) + n * n * k : nullptr, *right = to ? data<float>(g) + n * k : nullptr;
     const float *weight = data<float>(share) + N * k, by = static_cast<float>(bend);
     data<float>(cost)[k] = of.turns ? equations<9>(of, weight, by, to, right) : equations<6>(of, weight, by, to, right);
   }
 }
 
-// As above; squared whitened residuals (B, N), and which tracks are in front (B, N) bool.
-void track_squares(Tensor ray, Tensor seen, Tensor height, Tensor shape, Tensor inverse, Tensor variance, Tensor near,
-                   Tensor nearest, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor square, Tensor front) {
+// The same tensors. Outputs: squared whitened residuals (B, N), and which tracks are in front (B, N) bool.
+void squared_residuals(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor shape, Tensor height, Tensor nearest,
+                       Tensor variance, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor square,
+                       Tensor front, double nearest_divisor, double behind, double min_depth) {
   const int64_t B = ray.size(0), N = ray.size(2);
+  const Limits limits(nearest_divisor, behind, min_depth);
   for (int64_t k = 0; k < B; ++k) {
-    const Tracks of = pair(k, ray, seen, height, shape, inverse, variance, near, nearest, a, b, d, R, t, turn);
+    const Tracks of = pair(k, limits, ray, inverse, near, seen, shape, height, nearest, variance, a, b, d, R, t, turn);
     for (int64_t m = 0; m < N; m += LANES) {
       const Whitened at(of, m);
       store(at.square, data<float>(square) + N * k + m);
@@ -192,16 +205,17 @@ void track_squares(Tensor ray, Tensor seen, Tensor height, Tensor shape, Tensor 
 
 STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
   m.def(
-      "track_equations(Tensor ray, Tensor seen, Tensor height, Tensor shape, Tensor inverse, Tensor variance, Tensor near, "
-      "Tensor nearest, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor share, Tensor(a!) cost, "
-      "Tensor(b!) H, Tensor(c!) g, float bend) -> ()");
-  m.def(
-      "track_squares(Tensor ray, Tensor seen, Tensor height, Tensor shape, Tensor inverse, Tensor variance, Tensor near, "
-      "Tensor nearest, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor(a!) square, Tensor(b!) front) "
+      "pose_normal_equations(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor shape, Tensor height, "
+      "Tensor nearest, Tensor variance, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, Tensor share, "
+      "Tensor(a!) cost, Tensor(b!) H, Tensor(c!) g, float bend, float nearest_divisor, float behind, float min_depth) "
       "-> ()");
+  m.def(
+      "squared_residuals(Tensor ray, Tensor inverse, Tensor near, Tensor seen, Tensor shape, Tensor height, "
+      "Tensor nearest, Tensor variance, Tensor a, Tensor b, Tensor d, Tensor R, Tensor t, Tensor turn, "
+      "Tensor(a!) square, Tensor(b!) front, float nearest_divisor, float behind, float min_depth) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
-  m.impl("track_equations", TORCH_BOX(&track_equations));
-  m.impl("track_squares", TORCH_BOX(&track_squares));
+  m.impl("pose_normal_equations", TORCH_BOX(&pose_normal_equations));
+  m.impl("squared_residuals", TORCH_BOX(&squared_residuals));
 }

@@ -1,5 +1,5 @@
-// What the parts of the compiled code share: a tensor's numbers, and vectors of as many floats as this processor adds at
-// once; see dhtorch/ops/loader.py.
+// Shared by all kernels: access to a tensor's data, vectors of as many floats as one instruction of this processor
+// processes, and the weights of grey values. See dhtorch/ops/loader.py.
 
 #pragma once
 
@@ -7,6 +7,8 @@
 
 #include <cstdint>
 #include <cstring>
+
+#include "constants.h"
 
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_shufflevector)
@@ -39,7 +41,7 @@ inline Vector load(const float* from) {
 
 inline void store(Vector x, float* to) { std::memcpy(to, &x, sizeof(x)); }
 
-// As torch fuses products with sums, where the processor can.
+// a * b + c with one rounding where the processor has FMA instructions, as torch's own kernels compute it.
 inline float fused(float a, float b, float c) {
 #ifdef __FMA__
   return __builtin_fmaf(a, b, c);
@@ -48,8 +50,8 @@ inline float fused(float a, float b, float c) {
 #endif
 }
 
-// A whole number divided, rounded as a division is, which takes longer: right for all bytes over 255, 25 times as much over
-// 25, 255000 over that, and numbers of two bytes over 1000.
+// x / DIVISOR, correctly rounded, faster than a division. Exact for integers up to 255 over 255, 25 * 255 over 25, 255000
+// over 255000 and 65535 over 1000.
 template <int DIVISOR>
 inline float over(float x) {
 #ifdef __FMA__
@@ -61,9 +63,9 @@ inline float over(float x) {
 #endif
 }
 
-// The sum of a vector's numbers, halves added to halves.
+// Sum of the lanes, by halves.
 inline float total(Vector x) {
-#ifdef DHTORCH_SHUFFLES  // without them g++ 12 goes through memory
+#ifdef DHTORCH_SHUFFLES  // g++ 12 has none and would write the vector to memory
 #ifdef __AVX512F__
   const auto eight = __builtin_shufflevector(x, x, 0, 1, 2, 3, 4, 5, 6, 7) +
                      __builtin_shufflevector(x, x, 8, 9, 10, 11, 12, 13, 14, 15);
@@ -82,6 +84,16 @@ inline float total(Vector x) {
   }
   return part[0];
 #endif
+}
+
+// BT.601 weights of red, green and blue.
+constexpr float LUMA[3] = {static_cast<float>(LUMA_THOUSANDTHS[0] / 1000.0), static_cast<float>(LUMA_THOUSANDTHS[1] / 1000.0),
+                           static_cast<float>(LUMA_THOUSANDTHS[2] / 1000.0)};
+constexpr int32_t LUMA_SUM = LUMA_THOUSANDTHS[0] + LUMA_THOUSANDTHS[1] + LUMA_THOUSANDTHS[2];
+constexpr int32_t GREY_UNIT = 255 * LUMA_SUM;  // integer grey value of white bytes
+
+inline float luma(float red, float green, float blue) {
+  return fused(blue, LUMA[2], fused(green, LUMA[1], red * LUMA[0]));
 }
 
 }  // namespace

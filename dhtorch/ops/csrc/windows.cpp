@@ -1,7 +1,7 @@
-// A few numbers about the window around each sample: extremes of depth, brightness, texture; what stages 2 and 3 make of them, and
-// the sensor's own map; the same of one picture at once. Twin of dhtorch/geometry/patches.py, stages/backproject.py and
-// stages/holes.py, of dhtorch/transforms/sample_spec.py and of dhtorch/pipeline/pair.py, merge, which are the reference: whole numbers are exact,
-// textures up to the rounding of their sums. One thread, no gradient. Callers check shapes, types and strides.
+// Values around samples: extremes of depth, brightness and texture of windows, and from them depth, flags and hole classes
+// of the samples, and the sensor's own depth map. References: dhtorch/geometry/patches.py, dhtorch/stages/backproject.py and
+// holes.py, dhtorch/transforms/sample_spec.py and merge of dhtorch/pipeline/pair.py; integers are exact, textures agree up
+// to the rounding of their sums. One thread, no gradient. The dispatch checks dtypes and strides, Python the shapes.
 
 #include <torch/csrc/stable/library.h>
 
@@ -17,21 +17,21 @@
 
 namespace {
 
-// Bytes that come near the processor together, and how many such lines can be read in a row while one is waited for.
+// Bytes of a cache line, and lines that are read in sequence in the time of one random access.
 constexpr int64_t LINE = 64, FAR = 8;
 
 // Rows of a window, with room for the lanes that are computed beside it.
-constexpr int64_t WIDE = 16, ROOM = WIDE + 2;
+constexpr int64_t WIDE = MAX_KERNEL_WINDOW_PX, ROOM = WIDE + 2;
 
-// Images as one row of numbers, the steps in it, and the samples (B, N, 2) whose windows are asked.
+// Images in one row of memory, its strides, and the pixels (B, N, 2) of the windows.
 struct Windows {
   int64_t image, channel, row, column;
   int64_t channels, height, width, size;
   const int32_t* pixel;
   int64_t batch, n;
-  const uint8_t* end = nullptr;  // of a picture
+  const uint8_t* end = nullptr;  // of the images' memory
 
-  // Where the window of a sample begins, moved inside.
+  // Offset of the first pixel of a window, which is moved inside the image.
   int64_t first(int64_t b, int64_t k) const {
     const int32_t* at = pixel + 2 * (b * n + k);
     const int64_t before = size / 2, after = size - before;
@@ -47,12 +47,11 @@ Windows windows(const Tensor& pixel, int64_t image, int64_t channel, int64_t row
 }
 
 struct Extremes {
-  float least = std::numeric_limits<float>::infinity(), most = 0.0f;  // as where there is no return
+  float least = std::numeric_limits<float>::infinity(), most = 0.0f;  // without a return
 };
 
-template <typename Raw>
-inline void extend(Raw raw, Extremes& found) {
-  const float read = raw, z = std::isfinite(read) ? read : 0.0f;
+inline void extend(float read, Extremes& found) {
+  const float z = std::isfinite(read) ? read : 0.0f;
   found.least = z > 0 ? std::min(found.least, z) : found.least;
   found.most = std::max(found.most, z);
 }
@@ -61,19 +60,13 @@ constexpr int64_t EIGHT = 8;
 typedef float Eight __attribute__((vector_size(EIGHT * sizeof(float))));
 typedef int32_t EightWhole __attribute__((vector_size(4 * EIGHT)));
 
-template <typename Raw>
-inline Eight eight(const Raw* at) {
-  typedef Raw EightRaw __attribute__((vector_size(EIGHT * sizeof(Raw))));
-  EightRaw read;
+inline Eight eight(const float* at) {
+  Eight read;
   std::memcpy(&read, at, sizeof(read));
-  if constexpr (std::is_same_v<Raw, float>) {
-    return read;
-  } else {
-    return __builtin_convertvector(__builtin_convertvector(read, EightWhole), Eight);
-  }
+  return read;
 }
 
-// What `join` makes of the first few of eight numbers, two by two.
+// Reduction of the first FEW of eight values by `join`, by halves.
 template <int64_t FEW, typename Join>
 inline float joined(Eight x, float none, const Join& join) {
   for (int64_t k = FEW; k < EIGHT; ++k) x[k] = none;
@@ -89,9 +82,8 @@ inline float joined(Eight x, float none, const Join& join) {
 #endif
 }
 
-// Of five rows of five returns, which are read with the three beside them.
-template <typename Raw>
-inline Extremes five_extremes(const Raw* at, int64_t row) {
+// Of five rows of five returns; three more values of each row are read and ignored.
+inline Extremes five_extremes(const float* at, int64_t row) {
   const Eight none = {};
   const Eight infinity = none + std::numeric_limits<float>::infinity();
   Eight low = infinity, high = none;
@@ -107,9 +99,8 @@ inline Extremes five_extremes(const Raw* at, int64_t row) {
   return {joined<5>(low, std::numeric_limits<float>::infinity(), less), joined<5>(high, 0.0f, more)};
 }
 
-// Of the window that begins at a return; `end` is behind the last one.
-template <typename Raw>
-inline Extremes extremes_at(const Raw* at, const Windows& w, const Raw* end) {
+// Of the window that begins at a return; `end` is the end of the map.
+inline Extremes extremes_at(const float* at, const Windows& w, const float* end) {
   if (w.size == 5 && w.column == 1 && at + 4 * w.row + EIGHT <= end) return five_extremes(at, w.row);
   Extremes found;
   for (int64_t y = 0; y < w.size; ++y) {
@@ -118,7 +109,7 @@ inline Extremes extremes_at(const Raw* at, const Windows& w, const Raw* end) {
   return found;
 }
 
-// depth (B h w) float32; found (2, B, N): the smallest and the largest return, infinity and 0 where there is none.
+// depth (B h w) float32. Output: found (2, B, N), smallest and largest return, infinity and 0 where there is none.
 void window_extremes(Tensor depth, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row, int64_t column,
                      int64_t channels, int64_t height, int64_t width, int64_t size) {
   const Windows w = windows(pixel, image, channel, row, column, channels, height, width, size);
@@ -133,20 +124,20 @@ void window_extremes(Tensor depth, Tensor pixel, Tensor found, int64_t image, in
   }
 }
 
-inline float luma(float red, float green, float blue, int64_t channels) {
-  return channels == 1 ? red : fused(blue, 0.114f, fused(green, 0.587f, red * 0.299f));
+inline float grey_of(float red, float green, float blue, int64_t channels) {
+  return channels == 1 ? red : luma(red, green, blue);
 }
 
 typedef uint8_t Bytes __attribute__((vector_size(WIDE)));
 typedef uint16_t Words __attribute__((vector_size(2 * WIDE)));
 
-// Sums over the window, channel by channel. Rows of interleaved pixels are added as they lie in memory.
+// Sums over the window for each channel. Rows of interleaved pixels are added as they lie in memory.
 template <int64_t SIZE>
 inline void sums(const uint8_t* at, const Windows& w, int32_t* sum) {
   const int64_t size = SIZE ? SIZE : w.size;
   std::fill_n(sum, w.channels, 0);
   if (SIZE == 5 && w.column == 3 && at + 4 * w.row + WIDE <= w.end) {
-    Words all = {};  // of five rows of five pixels, and of the byte beside them
+    Words all = {};  // of five rows of five pixels and one more byte
     for (int64_t y = 0; y < 5; ++y) {
       Bytes read;
       std::memcpy(&read, at + y * w.row, sizeof(read));
@@ -171,10 +162,10 @@ inline void sums(const uint8_t* at, const Windows& w, int32_t* sum) {
 }
 
 struct Brightness {
-  float mean, centre, most, least;  // grey of the window; of the pixel in the middle grey, largest and smallest channel
+  float mean, centre, most, least;  // mean grey of the window; grey, largest and smallest channel of its middle pixel
 };
 
-// Of the sums over a window and its pixel in the middle.
+// From the sums over a window and its middle pixel.
 template <int64_t SIZE, int64_t CHANNELS, typename Sum>
 inline Brightness brightness_of(const Sum& sum, const uint8_t* centre, const Windows& w) {
   const int64_t channels = CHANNELS ? CHANNELS : w.channels;
@@ -189,22 +180,18 @@ inline Brightness brightness_of(const Sum& sum, const uint8_t* centre, const Win
     most = std::max(most, middle[c]);
     least = std::min(least, middle[c]);
   }
-  return {luma(mean[0], mean[1], mean[2], channels), luma(middle[0], middle[1], middle[2], channels), most, least};
+  return {grey_of(mean[0], mean[1], mean[2], channels), grey_of(middle[0], middle[1], middle[2], channels), most, least};
 }
 
 template <int64_t SIZE, int64_t CHANNELS>
 inline Brightness brightness_at(const uint8_t* at, const Windows& w) {
   int32_t sum[3];
   sums<SIZE>(at, w, sum);
-  const auto told = [&](int64_t c) { return sum[c]; };
-  return brightness_of<SIZE, CHANNELS>(told, at + w.size / 2 * (w.row + w.column), w);
+  const auto sum_of = [&](int64_t c) { return sum[c]; };
+  return brightness_of<SIZE, CHANNELS>(sum_of, at + w.size / 2 * (w.row + w.column), w);
 }
 
-// Whether windows of five pixels are asked around so many of an image's that all are found first, each from its neighbours':
-// lookup.py, WHOLE.
-inline bool most_are_asked(const Windows& w) { return w.size == 5 && 4 * w.n >= w.height * w.width; }
-
-// Smallest and largest return around every pixel of a map, but for the outermost two.
+// Smallest and largest return in the 5x5 window of every pixel of a map but the outermost two.
 struct WholeMap {
   std::vector<float> least, most, low, high;
 
@@ -240,7 +227,7 @@ struct WholeMap {
   }
 };
 
-// Sums of the bytes around every pixel of a picture, but for the outermost two, where the picture has those bytes.
+// Sums over the 5x5 window of every pixel of an image but the outermost two, in the image's layout.
 struct WholePicture {
   std::vector<uint16_t> sum, column;
 
@@ -265,8 +252,8 @@ struct WholePicture {
   template <int64_t SIZE, int64_t CHANNELS>
   Brightness at(int64_t first, const uint8_t* picture, const Windows& w) const {
     const int64_t centre = first + 2 * (w.row + w.column);
-    const auto told = [&](int64_t c) { return sum[centre + c * w.channel]; };
-    return brightness_of<SIZE, CHANNELS>(told, picture + centre, w);
+    const auto sum_of = [&](int64_t c) { return sum[centre + c * w.channel]; };
+    return brightness_of<SIZE, CHANNELS>(sum_of, picture + centre, w);
   }
 };
 
@@ -284,7 +271,7 @@ void brightnesses(const uint8_t* from, const Windows& w, float* to) {
   }
 }
 
-// Pictures of bytes, whose windows are usually of five pixels in three channels.
+// Windows of uint8 images; 5x5 pixels and three channels are the usual case, which is compiled by itself.
 Windows of_picture(Windows w, const uint8_t* from) {
   w.end = from + w.batch * w.channels * w.height * w.width;
   return w;
@@ -292,8 +279,8 @@ Windows of_picture(Windows w, const uint8_t* from) {
 
 inline bool usual(const Windows& w) { return w.size == 5 && w.channels == 3; }
 
-// picture of bytes; found (4, B, N): mean grey of the window, and of the pixel in the middle grey, largest and smallest
-// channel, all of them from 0 to 255.
+// picture uint8. Output: found (4, B, N), mean grey of the window, and grey, largest and smallest channel of its middle
+// pixel, 0 to 255.
 void window_brightness(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row,
                        int64_t column, int64_t channels, int64_t height, int64_t width, int64_t size) {
   const uint8_t* from = data<uint8_t>(picture);
@@ -301,36 +288,41 @@ void window_brightness(Tensor picture, Tensor pixel, Tensor found, int64_t image
   (usual(w) ? brightnesses<5, 3> : brightnesses<0, 0>)(from, w, data<float>(found));
 }
 
-// Grey values of a row of a window, and of what happens to lie beside it: of pixels that are interleaved as one division
-// of whole numbers, else as of a picture's channels.
+// Grey value of a pixel in units of 1 / GREY_UNIT: an integer, exact however such values are summed.
+inline float integer_grey(const uint8_t* at) {
+  return static_cast<float>(LUMA_THOUSANDTHS[0] * at[0] + LUMA_THOUSANDTHS[1] * at[1] + LUMA_THOUSANDTHS[2] * at[2]);
+}
+
+// Grey values of a row of a window, and perhaps of pixels beside it: with `whole`, of interleaved pixels, one division of
+// an integer, else the weighted sum of channels.
 inline void grey_row(const uint8_t* at, const Windows& w, bool whole, float* __restrict to) {
   if (whole) {
     for (int64_t x = 0; x < w.size; ++x) {
-      to[x] = over<255000>(static_cast<float>(299 * at[3 * x] + 587 * at[3 * x + 1] + 114 * at[3 * x + 2]));
+      to[x] = over<GREY_UNIT>(integer_grey(at + 3 * x));
     }
     return;
   }
   const uint8_t *red = at, *green = at + (w.channels - 1) / 2 * w.channel, *blue = at + (w.channels - 1) * w.channel;
-  if (w.column == 1 && blue + WIDE <= w.end) {  // what lies beside the window is read with it
+  if (w.column == 1 && blue + WIDE <= w.end) {  // WIDE pixels, the window and some beside it
     float r[WIDE], g[WIDE], b[WIDE];
     for (int64_t x = 0; x < WIDE; ++x) r[x] = over<255>(red[x]);
     for (int64_t x = 0; x < WIDE; ++x) g[x] = over<255>(green[x]);
     for (int64_t x = 0; x < WIDE; ++x) b[x] = over<255>(blue[x]);
-    for (int64_t x = 0; x < WIDE; ++x) to[x] = luma(r[x], g[x], b[x], w.channels);
+    for (int64_t x = 0; x < WIDE; ++x) to[x] = grey_of(r[x], g[x], b[x], w.channels);
     return;
   }
   for (int64_t x = 0; x < w.size; ++x) {
-    to[x] = luma(over<255>(red[x * w.column]), over<255>(green[x * w.column]), over<255>(blue[x * w.column]), w.channels);
+    to[x] = grey_of(over<255>(red[x * w.column]), over<255>(green[x * w.column]), over<255>(blue[x * w.column]), w.channels);
   }
 }
 
-// The smaller eigenvalue of ((a, b), (b, c)), as dhtorch/geometry/linalg.py finds it.
+// Smaller eigenvalue of ((a, b), (b, c)), as in dhtorch/geometry/linalg.py.
 inline float smaller(float a, float b, float c) {
   const float half = (a - c) / 2, middle = (a + c) / 2, square = half * half + b * b;
   return middle - (square > 0 ? std::sqrt(square) : square);
 }
 
-// Where gradient matrices of many windows are kept, so that their eigenvalues are found side by side.
+// Gradient matrices of many windows, whose eigenvalues are computed together.
 struct Matrices {
   static constexpr int64_t ROOM = 64;
   float xx[ROOM], xy[ROOM], yy[ROOM];
@@ -342,10 +334,9 @@ struct Matrices {
   }
 };
 
-// Of the gradient matrix of a window, summed over its inner pixels. What happens to lie beside the window is computed and
-// left out.
+// Gradient matrix of a window, summed over its inner pixels. Lanes beside the window are computed and left out.
 inline void gradients(const uint8_t* at, const Windows& w, bool whole, Matrices& into, int64_t k) {
-  float grey[WIDE * ROOM] = {};  // beside a window as well, where what is no number would cost more
+  float grey[WIDE * ROOM] = {};  // also beside the window: NaN and denormals would be slower
   for (int64_t y = 0; y < w.size; ++y) grey_row(at + y * w.row, w, whole, grey + y * ROOM);
   float xx[WIDE] = {}, xy[WIDE] = {}, yy[WIDE] = {};
   for (int64_t y = 0; y < w.size - 2; ++y) {
@@ -365,13 +356,8 @@ inline void gradients(const uint8_t* at, const Windows& w, bool whole, Matrices&
 #ifdef DHTORCH_SHUFFLES
 typedef uint16_t EightWords __attribute__((vector_size(2 * EIGHT)));
 
-// Grey values of interleaved pixels are 255000 times as large here: whole numbers, exact however they are summed.
-constexpr float UNIT = 255000.0f;
-
-inline float grey_of(const uint8_t* at) { return static_cast<float>(299 * at[0] + 587 * at[1] + 114 * at[2]); }
-
-// Every other byte.
-inline Eight numbers(Bytes from) {
+// Every other byte, as floats.
+inline Eight even_bytes(Bytes from) {
   EightWords words;
   std::memcpy(&words, &from, sizeof(words));
   return __builtin_convertvector(__builtin_convertvector(words & 255, EightWhole), Eight);
@@ -384,27 +370,27 @@ inline Eight eight_greys(const uint8_t* at) {
   const Bytes red = __builtin_shufflevector(a, b, 0, 16, 3, 16, 6, 16, 9, 16, 12, 16, 15, 16, 26, 16, 29, 16);
   const Bytes green = __builtin_shufflevector(a, b, 1, 16, 4, 16, 7, 16, 10, 16, 13, 16, 24, 16, 27, 16, 30, 16);
   const Bytes blue = __builtin_shufflevector(a, b, 2, 16, 5, 16, 8, 16, 11, 16, 14, 16, 25, 16, 28, 16, 31, 16);
-  return 299.0f * numbers(red) + 587.0f * numbers(green) + 114.0f * numbers(blue);
+  const float r = LUMA_THOUSANDTHS[0], g = LUMA_THOUSANDTHS[1], b_ = LUMA_THOUSANDTHS[2];
+  return r * even_bytes(red) + g * even_bytes(green) + b_ * even_bytes(blue);
 }
 
-// A row of nine pixels, as what the Sobel filters make of it: differences and weighted sums of neighbours in the row, seven
-// that count.
+// The horizontal part of both Sobel filters on a row of nine pixels: differences and weighted sums; seven are valid.
 struct Row {
   Eight across, along;
 
   explicit Row(const uint8_t* at) {
-    const Eight left = eight_greys(at), last = Eight{} + grey_of(at + 24);
+    const Eight left = eight_greys(at), last = Eight{} + integer_grey(at + 24);
     *this = {left, __builtin_shufflevector(left, last, 1, 2, 3, 4, 5, 6, 7, 8),
              __builtin_shufflevector(left, last, 2, 3, 4, 5, 6, 7, 8, 8)};
   }
 
-  // What lies beside the nine is read with them.
+  // Reads one value beside the nine.
   explicit Row(const float* at) : Row(eight(at), eight(at + 1), eight(at + 2)) {}
 
   Row(Eight left, Eight middle, Eight right) : across(right - left), along(left + middle + (middle + right)) {}
 };
 
-// Of nine rows of nine pixels, in registers from bytes or grey values on; gradients are exact.
+// Gradient matrix of 9x9 pixels in registers, from bytes or integer grey values; gradients are exact.
 template <typename Pixel>
 inline void nine_gradients(const Pixel* at, int64_t row, Matrices& into, int64_t k) {
   Row above(at), middle(at + row);
@@ -422,7 +408,7 @@ inline void nine_gradients(const Pixel* at, int64_t row, Matrices& into, int64_t
   into.keep(k, sum(xx), sum(xy), sum(yy));
 }
 
-// A whole interleaved picture, where its windows have more pixels than it has; else nothing.
+// Integer grey values of a whole interleaved image, if its windows have more pixels than it has; else nothing.
 std::unique_ptr<float[]> grey_picture(const uint8_t* at, const Windows& w) {
   const int64_t all = w.height * w.width;
   if (w.n * w.size * w.size < all) return {};
@@ -432,23 +418,23 @@ std::unique_ptr<float[]> grey_picture(const uint8_t* at, const Windows& w) {
     const Eight some = eight_greys(at + 3 * k);
     std::memcpy(&grey[k], &some, sizeof(some));
   }
-  for (; k < all; ++k) grey[k] = grey_of(at + 3 * k);
+  for (; k < all; ++k) grey[k] = integer_grey(at + 3 * k);
   std::fill_n(&grey[all], WIDE, 0.0f);  // beside the last windows
   return grey;
 }
 #endif
 
-// Read an image in the order in which it lies, which brings it near the processor several times as fast as its windows would
-// come one by one; where so few rows of windows are asked that they take less, nothing.
+// Read an image in sequence, which fills the cache several times as fast as reading its windows; does nothing where the
+// windows are so few that they take less time.
 template <typename T>
-inline void bring_near(const T* from, int64_t count, const Windows& w) {
+inline void prefetch(const T* from, int64_t count, const Windows& w) {
   const int64_t bytes = count * static_cast<int64_t>(sizeof(T));
   if (w.n * w.size * FAR * LINE < bytes) return;
   const volatile uint8_t* at = reinterpret_cast<const uint8_t*>(from);
   for (int64_t k = 0; k < bytes; k += LINE) (void)at[k];
 }
 
-// Calls `each` with every window and a place in `kept`, and writes the textures (B, N) of as many as that holds at once.
+// Calls `each` for every window, which stores a gradient matrix, and writes the textures of one image.
 template <typename Each>
 void textures(const Windows& w, float unit, float* to, const Each& each) {
   const float count = 16.0f * (w.size - 2) * (w.size - 2);
@@ -460,14 +446,14 @@ void textures(const Windows& w, float unit, float* to, const Each& each) {
   }
 }
 
-// Of one of the pictures that begin at `from`; see window_texture.
+// Textures of one of the images that begin at `from`; see window_texture.
 void textures_of(const uint8_t* from, const Windows& w, int64_t b, bool whole, float* to) {
   const uint8_t* picture = from + b * w.image;
 #ifdef DHTORCH_SHUFFLES
   if (whole && w.size == 9) {
     const std::unique_ptr<float[]> grey = grey_picture(picture, w);
-    if (!grey) bring_near(picture, w.image, w);
-    textures(w, UNIT, to, [&](int64_t i, Matrices& kept, int64_t k) {
+    if (!grey) prefetch(picture, w.image, w);
+    textures(w, static_cast<float>(GREY_UNIT), to, [&](int64_t i, Matrices& kept, int64_t k) {
       const int64_t first = w.first(b, i);
       if (grey) {
         nine_gradients(&grey[(first - b * w.image) / 3], w.width, kept, k);
@@ -478,12 +464,12 @@ void textures_of(const uint8_t* from, const Windows& w, int64_t b, bool whole, f
     return;
   }
 #endif
-  bring_near(picture, w.image, w);
+  prefetch(picture, w.image, w);
   textures(w, 1.0f, to, [&](int64_t i, Matrices& kept, int64_t k) { gradients(from + w.first(b, i), w, whole, kept, k); });
 }
 
-// picture of bytes; found (1, B, N): smaller eigenvalue of the mean gradient matrix, by the Sobel filters over all but the
-// outermost pixels. Windows are at most WIDE pixels wide. With `whole` interleaved pixels become grey as whole numbers.
+// picture uint8. Output: found (B, N), smaller eigenvalue of the mean gradient matrix, by Sobel filters over all but the
+// outermost pixels of windows of at most WIDE pixels. With `whole`, grey values of interleaved pixels are integers first.
 void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, int64_t channel, int64_t row, int64_t column,
                     int64_t channels, int64_t height, int64_t width, int64_t size, bool whole) {
   const uint8_t* from = data<uint8_t>(picture);
@@ -491,26 +477,22 @@ void window_texture(Tensor picture, Tensor pixel, Tensor found, int64_t image, i
   for (int64_t b = 0; b < w.batch; ++b) textures_of(from, w, b, whole, data<float>(found) + b * w.n);
 }
 
-// Bits of dhtorch/codes.py, Flag.
-constexpr int32_t NO_DEPTH = 1, LOW_CONF = 2, SPECULAR = 4, SATURATED = 8, UNDEREXPOSED = 16, DEPTH_EDGE = 32,
-                  BEYOND_NEAR = 64, BORDER = 128;
-
-// Whether a window around a pixel of a picture lies in it.
+// Whether the window around a pixel lies in the image.
 inline bool fits(const int32_t* at, int64_t height, int64_t width, int64_t size) {
   const int64_t before = size / 2, after = size - before;
   return at[0] >= before && at[0] <= width - after && at[1] >= before && at[1] <= height - after;
 }
 
-// The pixel that a place lies in, as dhtorch/geometry/patches.py, pixels, finds it: one outside of any picture where it is none.
+// The pixel that contains a coordinate, as containing_pixels of dhtorch/geometry/patches.py; outside of any image for NaN.
 inline int32_t pixel_of(float at) {
   const float whole = std::floor((std::isnan(at) ? -1.0f : at) + 0.5f);
   return whole >= -2147483648.0f && whole < 2147483648.0f ? static_cast<int32_t>(whole) : std::numeric_limits<int32_t>::min();
 }
 
-// Of places uv (B, N, 2) of pictures without distortion, with focal lengths f and centres c (B, 2): the pixels of picture and
-// map (B, N, 2) and rays (B, N, 3). The map has focal lengths and centres of its own, or none (of no size), where its size
-// over the picture's is (across, down).
-void places(Tensor uv, Tensor f, Tensor c, Tensor map_f, Tensor map_c, Tensor pixel, Tensor at, Tensor ray, double across, double down) {
+// Pixels (B, N, 2) of uv (B, N, 2) in the image and in the depth map (`at`), and rays (B, N, 3), of cameras without
+// distortion with focal lengths f and centres c (B, 2). The map has intrinsics of its own, or empty ones where it covers the
+// image, at (across, down) times its size.
+void project_samples(Tensor uv, Tensor f, Tensor c, Tensor map_f, Tensor map_c, Tensor pixel, Tensor at, Tensor ray, double across, double down) {
   const int64_t batch = uv.size(0), n = uv.size(1);
   const float *from = data<float>(uv), *focal = data<float>(f), *centre = data<float>(c);
   const float scale[2] = {static_cast<float>(across), static_cast<float>(down)};
@@ -532,7 +514,7 @@ void places(Tensor uv, Tensor f, Tensor c, Tensor map_f, Tensor map_c, Tensor pi
   }
 }
 
-void pixels(Tensor uv, Tensor pixel) {
+void containing_pixels(Tensor uv, Tensor pixel) {
   const float* from = data<float>(uv);
   int32_t* to = data<int32_t>(pixel);
   const int64_t all = uv.numel();
@@ -541,33 +523,18 @@ void pixels(Tensor uv, Tensor pixel) {
 
 inline bool is_point(const float* x) { return std::isfinite(x[0]) && std::isfinite(x[1]) && std::isfinite(x[2]); }
 
-// The sensor's own answers: what is said of samples with a point, 0 elsewhere.
-struct Sensed {
-  float *depth, *sigma, *score;
-  int32_t* source;
-
-  bool take(int64_t i, const float* point, const float* z, const float* noise, const float* sure) const {
-    const bool usable = is_point(point);
-    depth[i] = usable ? z[i] : 0.0f;
-    sigma[i] = usable ? noise[i] : 0.0f;
-    score[i] = usable ? sure[i] : 0.0f;
-    source[i] = usable;
-    return usable;
-  }
-};
-
-// What stage 2 takes for a return, and says of it.
+// ReturnLimits of backproject.py, and what makes a highlight.
 struct Limits {
-  float near, conf, fixed, relative, edge, dim, white, bright;
+  float near, conf, fixed, relative, edge, dim, white, bright, colour, contrast;
 
   Limits(double near_limit, double min_conf, double sigma_m, double sigma_rel, double edge_rel, double dark, double saturated,
-         double highlight)
+         double highlight, double colour_rel, double min_contrast)
       : near(near_limit), conf(min_conf), fixed(sigma_m * sigma_m), relative(sigma_rel), edge(1.0 + edge_rel), dim(dark * 255),
-        white(saturated * 255), bright(highlight * 255) {}
+        white(saturated * 255), bright(highlight * 255), colour(colour_rel), contrast(min_contrast * 255) {}
 };
 
-// What is read around a sample, and its ray.
-struct Look {
+// Values around a sample, and its ray.
+struct Reading {
   float z, level;
   Extremes around;
   Brightness seen;
@@ -575,16 +542,16 @@ struct Look {
   bool border;
 };
 
-// Where stage 2 writes what it says of samples: depth, sigma and confidence (B, N), xyz (B, N, 3), flags (B, N).
-struct Said {
+// Outputs of backproject: depth, sigma and confidence (B, N), xyz (B, N, 3), flags (B, N).
+struct Outputs {
   float *depth, *sigma, *confidence, *xyz;
   int32_t* flag;
 
-  void write(int64_t i, const Look& x, const Limits& limits) const {
+  void write(int64_t i, const Reading& x, const Limits& limits) const {
     const bool returned = x.z > 0, beyond = x.z > limits.near, unsure = returned && x.level < limits.conf;
     const bool differs = returned && x.around.most > x.around.least * limits.edge, clipped = x.seen.mean >= limits.white;
-    const bool shine = x.seen.most - x.seen.least <= 0.15f * x.seen.most && x.seen.centre >= limits.bright &&
-                       x.seen.centre - x.seen.mean >= 25.5f;
+    const bool shine = x.seen.most - x.seen.least <= limits.colour * x.seen.most && x.seen.centre >= limits.bright &&
+                       x.seen.centre - x.seen.mean >= limits.contrast;
     bool usable = returned && !unsure && !beyond;
     for (int64_t k = 0; k < 3; ++k) usable = usable && std::isfinite(x.ray[k] * x.z);
     for (int64_t k = 0; k < 3; ++k) xyz[3 * i + k] = usable ? x.ray[k] * x.z : std::numeric_limits<float>::quiet_NaN();
@@ -594,167 +561,109 @@ struct Said {
     depth[i] = x.z;
     sigma[i] = limits.fixed > 0 ? std::sqrt(limits.fixed + noise * noise) : noise;
     confidence[i] = usable ? sure : 0.0f;
-    flag[i] = !returned * NO_DEPTH | unsure * LOW_CONF | beyond * BEYOND_NEAR | differs * DEPTH_EDGE | x.border * BORDER |
-              (x.seen.mean <= limits.dim) * UNDEREXPOSED | clipped * SATURATED | shine * SPECULAR;
+    flag[i] = !returned * FLAG_NO_DEPTH | unsure * FLAG_LOW_CONF | beyond * FLAG_BEYOND_NEAR | differs * FLAG_DEPTH_EDGE |
+              x.border * FLAG_BORDER | (x.seen.mean <= limits.dim) * FLAG_UNDEREXPOSED | clipped * FLAG_SATURATED |
+              shine * FLAG_SPECULAR;
   }
 };
 
-// What is read of a map of float32 or, as files hold it, of numbers of two bytes, `unit` to a metre.
-template <typename Raw>
-struct Returns {
-  const Raw *map, *end;
-  float unit;
-
-  float over_unit(float read) const { return unit == 1.0f ? read : read / unit; }
-
-  // Of the map's k-th number; what is no return is 0.
-  float metres(int64_t k) const {
-    const float read = map[k];
-    return std::isfinite(read) && read > 0 ? over_unit(read) : 0.0f;
-  }
-
-  Extremes around(int64_t first, const Windows& w) const {
-    const Extremes found = extremes_at(map + first, w, end);
-    return {over_unit(found.least), over_unit(found.most)};
-  }
-};
-
-template <int64_t SIZE, int64_t CHANNELS, typename Raw>
-void say(const Returns<Raw>& map, const uint8_t* levels, const Windows& returns, const uint8_t* picture, const Windows& seen,
-         const float* rays, const Said& said, const Limits& limits) {
+template <int64_t SIZE, int64_t CHANNELS>
+void read_samples(const float* map, const uint8_t* levels, const Windows& returns, bool whole_map, const uint8_t* picture,
+                  const Windows& seen, bool whole_picture, const float* rays, const Outputs& outputs, const Limits& limits) {
   const int64_t h = returns.height, w = returns.width;
-  constexpr bool in_metres = std::is_same_v<Raw, float>;
-  const bool whole_map = in_metres && most_are_asked(returns), whole_picture = most_are_asked(seen);
-  WholeMap returned;
-  WholePicture shown;
-  for (int64_t b = returns.batch; b-- > 0;) {  // the last picture was collated just now, the first one's textures are next
-    const uint8_t* grey = picture + b * seen.image;
-    if constexpr (in_metres) {
-      if (whole_map) returned.find(map.map + b * h * w, returns);
-    }
-    if (!whole_map) bring_near(map.map + b * h * w, h * w, returns);
-    whole_picture ? shown.find(grey, seen) : bring_near(grey, seen.image, seen);
+  const float* end = map + returns.batch * h * w;
+  WholeMap extremes;
+  WholePicture sums;
+  for (int64_t b = returns.batch; b-- > 0;) {  // the last image was collated just now and is still in the cache
+    const uint8_t* image = picture + b * seen.image;
+    whole_map ? extremes.find(map + b * h * w, returns) : prefetch(map + b * h * w, h * w, returns);
+    whole_picture ? sums.find(image, seen) : prefetch(image, seen.image, seen);
     for (int64_t k = 0; k < returns.n; ++k) {
       const int64_t i = b * returns.n + k, first = returns.first(b, k), corner = seen.first(b, k) - b * seen.image;
       const int32_t* place = returns.pixel + 2 * i;
       const int64_t x = std::clamp<int64_t>(place[0], 0, w - 1), y = std::clamp<int64_t>(place[1], 0, h - 1);
       const int64_t there = (b * h + y) * w + x;
-      said.write(i,
-                 {fits(place, h, w, 1) ? map.metres(there) : 0.0f, levels ? levels[there] : 2.0f,
-                  whole_map ? returned.at(first - b * h * w, returns) : map.around(first, returns),
-                  whole_picture ? shown.at<SIZE, CHANNELS>(corner, grey, seen)
-                                : brightness_at<SIZE, CHANNELS>(grey + corner, seen),
-                  rays + 3 * i, !fits(seen.pixel + 2 * i, seen.height, seen.width, seen.size)},
-                 limits);
+      const float z = fits(place, h, w, 1) && std::isfinite(map[there]) && map[there] > 0 ? map[there] : 0.0f;
+      outputs.write(i,
+                    {z, levels ? levels[there] : 2.0f,
+                     whole_map ? extremes.at(first - b * h * w, returns) : extremes_at(map + first, returns, end),
+                     whole_picture ? sums.at<SIZE, CHANNELS>(corner, image, seen)
+                                   : brightness_at<SIZE, CHANNELS>(image + corner, seen),
+                     rays + 3 * i, !fits(seen.pixel + 2 * i, seen.height, seen.width, seen.size)},
+                    limits);
     }
   }
 }
 
-// Stage 2: depth (B h w) and levels conf of its size (or of none) at pixels `at` (B, N, 2), returns around them as far as
-// `reach`; a picture of bytes, as window_brightness takes it, at pixels (B, N, 2); rays (B, N, 3). Fills what it says.
-void samples(Tensor depth, Tensor conf, Tensor at, Tensor picture, Tensor pixel, Tensor ray, Tensor found, Tensor sigma,
-             Tensor confidence, Tensor xyz, Tensor flag, int64_t reach, int64_t image, int64_t channel, int64_t row,
-             int64_t column, int64_t channels, int64_t height, int64_t width, int64_t size, double near, double least_conf,
-             double sigma_m, double sigma_rel, double edge_rel, double dark, double saturated, double highlight) {
+// depth (B h w) and conf (B h w) or empty, at pixels `at` (B, N, 2), with windows of `reach` px; a picture of bytes at pixels
+// (B, N, 2), with windows of `size` px; rays (B, N, 3). Outputs: see Outputs. `whole_map` and `whole_picture`: windows of
+// all pixels are computed first, which is possible for windows of 5 px.
+void backproject(Tensor depth, Tensor conf, Tensor at, Tensor picture, Tensor pixel, Tensor ray, Tensor found, Tensor sigma,
+                 Tensor confidence, Tensor xyz, Tensor flag, int64_t reach, int64_t image, int64_t channel, int64_t row,
+                 int64_t column, int64_t channels, int64_t height, int64_t width, int64_t size, double near_limit,
+                 double min_conf, double sigma_m, double sigma_rel, double edge_rel, double dark, double saturated,
+                 double highlight, double max_colour_rel, double min_contrast, bool whole_map, bool whole_picture) {
   const int64_t h = depth.size(1), w = depth.size(2);
-  const float* map = data<float>(depth);
   const uint8_t *from = data<uint8_t>(picture), *levels = conf.numel() > 0 ? data<uint8_t>(conf) : nullptr;
   const Windows returns = windows(at, h * w, 0, w, 1, 1, h, w, reach);
   const Windows seen = of_picture(windows(pixel, image, channel, row, column, channels, height, width, size), from);
-  const Said said = {data<float>(found), data<float>(sigma), data<float>(confidence), data<float>(xyz), data<int32_t>(flag)};
-  const Limits limits(near, least_conf, sigma_m, sigma_rel, edge_rel, dark, saturated, highlight);
-  const Returns<float> read = {map, map + depth.numel(), 1.0f};
-  (usual(seen) ? say<5, 3, float> : say<0, 0, float>)(read, levels, returns, from, seen, data<float>(ray), said, limits);
+  const Outputs outputs = {data<float>(found), data<float>(sigma), data<float>(confidence), data<float>(xyz), data<int32_t>(flag)};
+  const Limits limits(near_limit, min_conf, sigma_m, sigma_rel, edge_rel, dark, saturated, highlight, max_colour_rel,
+                      min_contrast);
+  const bool all_returns = whole_map && reach == 5, all_pixels = whole_picture && size == 5;
+  (usual(seen) ? read_samples<5, 3> : read_samples<0, 0>)(data<float>(depth), levels, returns, all_returns, from, seen,
+                                                          all_pixels, data<float>(ray), outputs, limits);
 }
 
-// Stage 3 from what was read: of a hole the first class of dhtorch/codes.py, Hole, that holds.
-void classes(const float* points, const int32_t* flags, const float* textures, float least, int32_t* kinds, int64_t all) {
-  constexpr int32_t NONE = 0, TRACKABLE_NO_LIDAR = 1, LOW_TEXTURE = 2, TOO_BRIGHT = 3, TOO_DARK = 4, HIGHLIGHT = 5,
-                    AT_BORDER = 6;
+// xyz (B, N, 3), flag, trackability (B, N). Output: hole (B, N), the first class that holds, see Hole in dhtorch/codes.py.
+void classify_holes(Tensor xyz, Tensor flag, Tensor trackability, Tensor hole, double min_trackability) {
+  const float *points = data<float>(xyz), *textures = data<float>(trackability), least = min_trackability;
+  const int32_t* flags = data<int32_t>(flag);
+  int32_t* kinds = data<int32_t>(hole);
+  const int64_t all = hole.numel();
   for (int64_t i = 0; i < all; ++i) {
     const int32_t bits = flags[i];
-    int32_t kind = textures[i] < least ? LOW_TEXTURE : TRACKABLE_NO_LIDAR;
-    if (bits & SPECULAR) kind = HIGHLIGHT;
-    if (bits & SATURATED) kind = TOO_BRIGHT;
-    if (bits & UNDEREXPOSED) kind = TOO_DARK;
-    if (bits & BORDER) kind = AT_BORDER;
-    if (is_point(points + 3 * i)) kind = NONE;
+    int32_t kind = textures[i] < least ? HOLE_LOW_TEXTURE : HOLE_TRACKABLE_NO_LIDAR;
+    if (bits & FLAG_SPECULAR) kind = HOLE_HIGHLIGHT;
+    if (bits & FLAG_SATURATED) kind = HOLE_TOO_BRIGHT;
+    if (bits & FLAG_UNDEREXPOSED) kind = HOLE_TOO_DARK;
+    if (bits & FLAG_BORDER) kind = HOLE_AT_BORDER;
+    if (is_point(points + 3 * i)) kind = HOLE_NONE;
     kinds[i] = kind;
   }
 }
 
-// xyz (B, N, 3), flag, trackability (B, N); hole (B, N), filled.
-void holes(Tensor xyz, Tensor flag, Tensor trackability, Tensor hole, double min_trackability) {
-  classes(data<float>(xyz), data<int32_t>(flag), data<float>(trackability), min_trackability, data<int32_t>(hole), hole.numel());
-}
-
-// Of every `step`-th number of a map how many are positive, and between both bounds.
-template <typename Raw>
-void count(const Returns<Raw>& map, int64_t step, float least, float most, int64_t* positive, int64_t* between) {
-  int64_t some = 0, sound = 0;
-  for (const Raw* at = map.map; at < map.end; at += step) {  // no branch that would wait for the number before
-    const float z = map.over_unit(*at);
-    some += z > 0;
-    sound += (z > least) & (z < most);
-  }
-  *positive = some;
-  *between = sound;
-}
-
-// depth (B h w); counts (2, B), filled: of every `step`-th number how many are positive, and between both bounds.
-void probe(Tensor depth, Tensor counts, int64_t step, double low, double high) {
+// depth (B h w). Output: counts (2, B): of every `step`-th value how many are positive, and between both bounds.
+void count_returns(Tensor depth, Tensor counts, int64_t step, double low, double high) {
   const int64_t batch = depth.size(0), all = depth.size(1) * depth.size(2);
+  const float least = low, most = high;
   int64_t* to = data<int64_t>(counts);
   for (int64_t b = 0; b < batch; ++b) {
-    const float* map = data<float>(depth) + b * all;
-    count<float>({map, map + all, 1.0f}, step, low, high, to + b, to + batch + b);
+    const float *map = data<float>(depth) + b * all, *end = map + all;
+    int64_t positive = 0, between = 0;
+    for (const float* at = map; at < end; at += step) {  // without branches
+      positive += *at > 0;
+      between += (*at > least) & (*at < most);
+    }
+    to[b] = positive;
+    to[batch + b] = between;
   }
 }
 
-// Stages 2 and 3 of one picture and its map as they were decoded, and what dhtorch/pipeline/pair.py, merge, makes of that: b is its row
-// in what is filled, all of it (B, N) but xyz (B, N, 3) and what probe counts (2, B). A map of numbers of two bytes is one of
-// int16, with a sign or without. Places as in `samples`, of one picture.
-void look(Tensor map, Tensor at, Tensor picture, Tensor pixel, Tensor ray, Tensor depth, Tensor sigma, Tensor score, Tensor xyz,
-          Tensor flag, Tensor hole, Tensor source, Tensor counts, int64_t b, double unit, bool sign, int64_t step, double low,
-          double high, int64_t reach, int64_t image, int64_t channel, int64_t row, int64_t column, int64_t channels,
-          int64_t height, int64_t width, int64_t size, double near, double least_conf, double sigma_m, double sigma_rel,
-          double edge_rel, double dark, double saturated, double highlight, int64_t block, bool whole, double min_trackability) {
-  const int64_t h = map.size(0), w = map.size(1), n = at.size(1), first = b * n;
-  const uint8_t* from = data<uint8_t>(picture);
-  const Windows returns = windows(at, h * w, 0, w, 1, 1, h, w, reach);
-  const Windows seen = of_picture(windows(pixel, image, channel, row, column, channels, height, width, size), from);
-  const Windows textured = of_picture(windows(pixel, image, channel, row, column, channels, height, width, block + 2), from);
-  const Limits limits(near, least_conf, sigma_m, sigma_rel, edge_rel, dark, saturated, highlight);
-  const Said said = {data<float>(depth) + first, data<float>(sigma) + first, data<float>(score) + first,
-                     data<float>(xyz) + 3 * first, data<int32_t>(flag) + first};
-  int64_t* counted = data<int64_t>(counts) + b;
-  const auto read = [&]<typename Raw>(const Raw* begin) {
-    const Returns<Raw> told = {begin, begin + h * w, static_cast<float>(unit)};
-    (usual(seen) ? say<5, 3, Raw> : say<0, 0, Raw>)(told, nullptr, returns, from, seen, data<float>(ray), said, limits);
-    count(told, step, low, high, counted, counted + counts.size(1));
-  };
-  if (map.scalar_type() == torch::headeronly::ScalarType::Float) {
-    read(data<float>(map));
-  } else {
-    sign ? read(data<int16_t>(map)) : read(data<uint16_t>(map));
-  }
-  std::vector<float> textures(n);
-  textures_of(from, textured, 0, whole, textures.data());
-  classes(said.xyz, said.flag, textures.data(), min_trackability, data<int32_t>(hole) + first, n);
-  const Sensed sensed = {said.depth, said.sigma, said.confidence, data<int32_t>(source) + first};
-  for (int64_t i = 0; i < n; ++i) {
-    if (sensed.take(i, said.xyz + 3 * i, said.depth, said.sigma, said.confidence)) continue;
-    std::fill_n(said.xyz + 3 * i, 3, 0.0f);
-  }
-}
-
-// Samples as stage 2 says them: depth, sigma, confidence (B, N), xyz (B, N, 3). Fills z, noise, score and source (B, N) of those
-// with a point, 0 elsewhere.
-void sensed(Tensor depth, Tensor sigma, Tensor confidence, Tensor xyz, Tensor z, Tensor noise, Tensor score, Tensor source) {
-  const Sensed to = {data<float>(z), data<float>(noise), data<float>(score), data<int32_t>(source)};
+// depth, sigma, confidence (B, N), xyz (B, N, 3). Outputs: z, noise, score and source (B, N) of samples with a point, 0
+// elsewhere.
+void sensor_values(Tensor depth, Tensor sigma, Tensor confidence, Tensor xyz, Tensor z, Tensor noise, Tensor score, Tensor source) {
+  const float *own_z = data<float>(depth), *own_noise = data<float>(sigma), *own_score = data<float>(confidence);
   const float* points = data<float>(xyz);
-  for (int64_t i = 0; i < depth.numel(); ++i) {
-    to.take(i, points + 3 * i, data<float>(depth), data<float>(sigma), data<float>(confidence));
+  float *to_z = data<float>(z), *to_noise = data<float>(noise), *to_score = data<float>(score);
+  int32_t* to_source = data<int32_t>(source);
+  const int64_t all = depth.numel();
+  for (int64_t i = 0; i < all; ++i) {
+    const bool usable = is_point(points + 3 * i);
+    to_z[i] = usable ? own_z[i] : 0.0f;
+    to_noise[i] = usable ? own_noise[i] : 0.0f;
+    to_score[i] = usable ? own_score[i] : 0.0f;
+    to_source[i] = usable ? SOURCE_SENSOR : SOURCE_NONE;
   }
 }
 
@@ -771,36 +680,30 @@ STABLE_TORCH_LIBRARY_FRAGMENT(dhtorch, m) {
       "window_texture(Tensor picture, Tensor pixel, Tensor(a!) found, int image, int channel, int row, int column, "
       "int channels, int height, int width, int size, bool whole) -> ()");
   m.def(
-      "places(Tensor uv, Tensor f, Tensor c, Tensor map_f, Tensor map_c, Tensor(a!) pixel, Tensor(b!) at, Tensor(c!) ray, "
+      "project_samples(Tensor uv, Tensor f, Tensor c, Tensor map_f, Tensor map_c, Tensor(a!) pixel, Tensor(b!) at, Tensor(c!) ray, "
       "float across, float down) -> ()");
-  m.def("pixels(Tensor uv, Tensor(a!) pixel) -> ()");
+  m.def("containing_pixels(Tensor uv, Tensor(a!) pixel) -> ()");
   m.def(
-      "samples(Tensor depth, Tensor conf, Tensor at, Tensor picture, Tensor pixel, Tensor ray, Tensor(a!) found, "
+      "backproject(Tensor depth, Tensor conf, Tensor at, Tensor picture, Tensor pixel, Tensor ray, Tensor(a!) found, "
       "Tensor(b!) sigma, Tensor(c!) confidence, Tensor(d!) xyz, Tensor(e!) flag, int reach, int image, int channel, int row, "
       "int column, int channels, int height, int width, int size, float near_limit, float min_conf, float sigma_m, "
-      "float sigma_rel, float edge_rel, float dark, float saturated, float highlight) -> ()");
-  m.def("holes(Tensor xyz, Tensor flag, Tensor trackability, Tensor(a!) hole, float min_trackability) -> ()");
-  m.def("probe(Tensor depth, Tensor(a!) counts, int step, float low, float high) -> ()");
+      "float sigma_rel, float edge_rel, float dark, float saturated, float highlight, float max_colour_rel, "
+      "float min_contrast, bool whole_map, bool whole_picture) -> ()");
+  m.def("classify_holes(Tensor xyz, Tensor flag, Tensor trackability, Tensor(a!) hole, float min_trackability) -> ()");
+  m.def("count_returns(Tensor depth, Tensor(a!) counts, int step, float low, float high) -> ()");
   m.def(
-      "sensed(Tensor depth, Tensor sigma, Tensor confidence, Tensor xyz, Tensor(a!) z, Tensor(b!) noise, Tensor(c!) score, "
+      "sensor_values(Tensor depth, Tensor sigma, Tensor confidence, Tensor xyz, Tensor(a!) z, Tensor(b!) noise, Tensor(c!) score, "
       "Tensor(d!) source) -> ()");
-  m.def(
-      "look(Tensor map, Tensor at, Tensor picture, Tensor pixel, Tensor ray, Tensor(a!) depth, Tensor(b!) sigma, Tensor(c!) score, "
-      "Tensor(d!) xyz, Tensor(e!) flag, Tensor(f!) hole, Tensor(g!) source, Tensor(h!) counts, int b, float unit, bool sign, int step, "
-      "float low, float high, int reach, int image, int channel, int row, int column, int channels, int height, int width, int size, "
-      "float near_limit, float min_conf, float sigma_m, float sigma_rel, float edge_rel, float dark, float saturated, "
-      "float highlight, int block, bool whole, float min_trackability) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(dhtorch, CPU, m) {
   m.impl("window_extremes", TORCH_BOX(&window_extremes));
   m.impl("window_brightness", TORCH_BOX(&window_brightness));
   m.impl("window_texture", TORCH_BOX(&window_texture));
-  m.impl("places", TORCH_BOX(&places));
-  m.impl("pixels", TORCH_BOX(&pixels));
-  m.impl("samples", TORCH_BOX(&samples));
-  m.impl("holes", TORCH_BOX(&holes));
-  m.impl("probe", TORCH_BOX(&probe));
-  m.impl("sensed", TORCH_BOX(&sensed));
-  m.impl("look", TORCH_BOX(&look));
+  m.impl("project_samples", TORCH_BOX(&project_samples));
+  m.impl("containing_pixels", TORCH_BOX(&containing_pixels));
+  m.impl("backproject", TORCH_BOX(&backproject));
+  m.impl("classify_holes", TORCH_BOX(&classify_holes));
+  m.impl("count_returns", TORCH_BOX(&count_returns));
+  m.impl("sensor_values", TORCH_BOX(&sensor_values));
 }

@@ -1,9 +1,8 @@
-"""Everything that is drawn: figures of a job, of the report's page and of notebooks, and the project's colours.
+"""Figures of jobs, of the report page and of notebooks, and the project's colours.
 
-``colours`` is the one page of colours; ``axis`` says where a number stands, ``canvas`` is a bare figure, ``panel`` one
-pair of axes, ``pictures`` shows what a pair found, ``maps`` a completed view, ``verdicts`` a judged one, ``svg`` puts a
-panel into a page.
-matplotlib is imported when something is drawn.
+``colours`` defines all colours, ``axis`` the mapping of values to positions, ``canvas`` a bare figure, ``panel`` a pair
+of axes; ``pictures`` draws the samples of a pair, ``maps`` a completed or aligned view, ``validation`` a validated one;
+``svg`` converts a panel to inline SVG. matplotlib is imported on first use.
 """
 
 from __future__ import annotations

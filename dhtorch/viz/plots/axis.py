@@ -1,4 +1,4 @@
-"""Axes: a range of data, where a value stands in it, and which round numbers are written beside it."""
+"""Axis: value -> position in [0, 1], and round tick values."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ OptionalNumbers = Sequence[float | None]
 
 @dataclass(frozen=True)
 class Axis:
-    """A range of data and how it is written."""
+    """Range of values, linear or logarithmic, with its label."""
 
     low: float
     high: float
@@ -20,38 +20,40 @@ class Axis:
     percent: bool = False
 
     def place(self, x: float) -> float:
-        """Place in [0, 1]; beyond the range at its end."""
+        """Value -> position in [0, 1], clamped."""
         low, high = (math.log(self.low), math.log(self.high)) if self.log else (self.low, self.high)
         at = math.log(max(x, self.low)) if self.log else x
         return min(1.0, max(0.0, (at - low) / (high - low)))
 
     def ticks(self, most: int = 5) -> list[float]:
-        """Round numbers within the range, about as many as asked for."""
+        """About ``most`` round values within the range."""
         if self.log and len(self._in_decades(range(1, 10))) > 1:
             sets = (range(1, 10), (1, 2, 3, 5), (1, 2, 5), (1, 3), (1,))
-            found = next((t for steps in sets if len(t := self._in_decades(steps)) <= most + 1), self._in_decades((1,)))
-            return found[:: math.ceil(len(found) / (most + 1))]
-        raw = (self.high - self.low) / most
-        size = 10.0 ** math.floor(math.log10(raw))
-        step = next(size * s for s in (1, 2, 5, 10) if size * s >= raw * 0.999)
+            values = next(
+                (t for steps in sets if len(t := self._in_decades(steps)) <= most + 1), self._in_decades((1,))
+            )
+            return values[:: math.ceil(len(values) / (most + 1))]
+        raw_step = (self.high - self.low) / most
+        decade = 10.0 ** math.floor(math.log10(raw_step))
+        step = next(decade * s for s in (1, 2, 5, 10) if decade * s >= raw_step * 0.999)
         first = math.ceil(self.low / step - 1e-9)
         return [k * step for k in range(first, math.floor(self.high / step + 1e-9) + 1)]
 
     def _in_decades(self, steps: Sequence[int]) -> list[float]:
-        """Multiples of the powers of ten within the range."""
+        """Multiples ``steps`` of the powers of ten, within the range."""
         decades = range(math.floor(math.log10(self.low)), math.ceil(math.log10(self.high)) + 1)
-        found = (s * 10.0**d for d in decades for s in steps)
-        return [t for t in found if self.low * 0.999 <= t <= self.high * 1.001]
+        values = (s * 10.0**d for d in decades for s in steps)
+        return [t for t in values if self.low * 0.999 <= t <= self.high * 1.001]
 
     def write(self, tick: float) -> str:
-        """A tick as text."""
+        """Tick value -> text."""
         return f"{100 * tick:.4g}" if self.percent else f"{tick:.4g}"
 
 
 def fit_axis(values: OptionalNumbers, label: str, *, log: bool = False, percent: bool = False, **ends: float) -> Axis:
-    """An axis that holds all values; ``low`` and ``high`` fix an end, ``floor`` and ``cap`` bound it."""
-    known = [v for v in values if v is not None and (not log or v > 0)]
-    low, high = (min(known), max(known)) if known else (0.1 if log else 0.0, 1.0)
+    """Axis that contains all values; ``low`` and ``high`` fix an end, ``floor`` and ``cap`` bound it."""
+    finite = [v for v in values if v is not None and (not log or v > 0)]
+    low, high = (min(finite), max(finite)) if finite else (0.1 if log else 0.0, 1.0)
     low, high = max(low, ends.get("floor", low)), min(high, ends.get("cap", high))
     pad = 1.15 if log else 0.06 * (high - low)
     low, high = (low / pad, high * pad) if log else (low - pad, high + pad)

@@ -1,7 +1,7 @@
-"""A bare matplotlib figure to draw on in points (1/72 inch), left to right and upwards; and its legend.
+"""Bare matplotlib figure with drawing functions in points (1/72 inch), x to the right, y up; legend.
 
-matplotlib is imported when something is drawn, and only through its figure objects, so that no global state, window or
-font setting is touched.
+matplotlib is imported on first use, and only its figure objects are used: no global state, window or font setting
+changes.
 """
 
 from __future__ import annotations
@@ -12,10 +12,16 @@ from typing import Any, NamedTuple
 
 from dhtorch.viz.plots.colours import GREY_CMAP, INK, PAPER_EDGE, SOFT, Stroke
 
-#: Height of letters, points; their width by which words are cut, as a share of it.
-TEXT_SIZE_PT, _TITLE_SIZE_PT, LETTER_WIDTH_EM = 10.0, 11.0, 0.59
-#: Of a title: least height of its letters, points, and their width, as they are bold.
-_MIN_TITLE_SIZE_PT, _BOLD_LETTER_WIDTH_EM = 8.0, 0.66
+#: Font size of text, points.
+TEXT_SIZE_PT = 10.0
+#: Font size of titles, points.
+_TITLE_SIZE_PT = 11.0
+#: Assumed letter width for truncation, as a fraction of the font size.
+LETTER_WIDTH_EM = 0.59
+#: Smallest font size of a long title, points.
+_MIN_TITLE_SIZE_PT = 8.0
+#: Assumed letter width of bold titles, as a fraction of the font size.
+_BOLD_LETTER_WIDTH_EM = 0.66
 
 CanvasPoint = tuple[float, float]
 
@@ -30,12 +36,12 @@ class LegendKey(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """Something drawn: its kind, its corners (places in the panel), how, and what it says when pointed at."""
+    """A drawn element: kind, corner positions in the panel, stroke, and tooltip."""
 
     kind: str  # line | dot | diamond | bar
     places: tuple[CanvasPoint, ...]
     stroke: Stroke
-    said: str = ""
+    said: str = ""  # tooltip
     edge: str | None = None  # colour of the edge of a bar
 
 
@@ -48,31 +54,31 @@ class Canvas:
 
         self.figure = Figure((width / 72, height / 72), dpi=dpi)
         self.points = Affine2D().scale(1 / width, 1 / height) + self.figure.transFigure
-        self.said: list[str] = []  # what the artists named said-0, said-1, … say
+        self.said: list[str] = []  # tooltips of the artists named said-0, said-1, …
 
     def text(
         self, text: str, u: float, v: float, *, size: float = TEXT_SIZE_PT, said: str = "", **options: Any
     ) -> None:
-        """Words at a place; ``said`` where they had to be cut."""
+        """Draw text at (u, v); ``said``: tooltip with the full text if it was truncated."""
         from matplotlib.text import Text  # noqa: PLC0415
 
         text = to_plain_line(text)
         if not text:
             return
         weight = "bold" if options.pop("bold", False) else "normal"
-        made = Text(u, v, text, color=INK if weight == "bold" else SOFT, fontsize=size, fontweight=weight, **options)
-        made.set(parse_math=False, rotation_mode="anchor", transform=self.points)
-        self._add(made, said if to_plain_line(said) != text else "")
+        artist = Text(u, v, text, color=INK if weight == "bold" else SOFT, fontsize=size, fontweight=weight, **options)
+        artist.set(parse_math=False, rotation_mode="anchor", transform=self.points)
+        self._add(artist, said if to_plain_line(said) != text else "")
 
     def title(self, text: str, width: float, height: float, left: float = 0.0) -> None:
-        """Words along the upper edge: long ones are set smaller, then cut in their middle."""
+        """Draw a title along the upper edge; long titles are set smaller, then truncated in the middle."""
         text = to_plain_line(text)
         size = min(_TITLE_SIZE_PT, max(_MIN_TITLE_SIZE_PT, width / (_BOLD_LETTER_WIDTH_EM * max(len(text), 1))))
         shown = truncate_text(text, width * LETTER_WIDTH_EM / _BOLD_LETTER_WIDTH_EM, size, end=len(text) // 3)
         self.text(shown, left + 2, height - 14, size=size, bold=True, said=text)
 
     def lines(self, segments: Iterable[Sequence[CanvasPoint]], stroke: Stroke, said: str = "") -> None:
-        """Lines through places, all in one path."""
+        """Draw polylines as one path."""
         from matplotlib.path import Path  # noqa: PLC0415
 
         places: list[CanvasPoint] = []
@@ -85,7 +91,7 @@ class Canvas:
         self._path(places, codes, said, fill=False, edgecolor=stroke.colour, linestyle=dashes, **options)
 
     def dots(self, places: Iterable[CanvasPoint], stroke: Stroke, said: str = "") -> None:
-        """Dots as wide as the stroke: lines without length and with round ends, the shortest that SVG knows."""
+        """Draw dots as wide as the stroke: zero-length lines with round caps, the shortest form in SVG."""
         from matplotlib.path import Path  # noqa: PLC0415
 
         ends = [end for u, v in places for end in ((u, v), (u + 1e-4, v))]
@@ -94,7 +100,7 @@ class Canvas:
         self._path(ends, codes, said, fill=False, edgecolor=stroke.colour, **options)
 
     def mark(self, mark: Mark) -> None:
-        """One mark of a panel."""
+        """Draw one mark of a panel."""
         if mark.kind == "line":
             self.lines([mark.places], mark.stroke, mark.said)
         elif mark.kind == "dot":
@@ -110,7 +116,7 @@ class Canvas:
         edge: str | None = None,
         width: float = 0.5,  # of the edge
     ) -> None:
-        """A filled polygon."""
+        """Draw a filled polygon."""
         from matplotlib.path import Path  # noqa: PLC0415
 
         codes = [Path.MOVETO, *[Path.LINETO] * (len(corners) - 1), Path.CLOSEPOLY]
@@ -118,7 +124,7 @@ class Canvas:
         self._path([*corners, corners[0]], codes, said, **options)
 
     def axes(self) -> Any:
-        """matplotlib's axes over the whole canvas, whose data are places: for what has a colour map."""
+        """matplotlib axes over the whole canvas in points, for artists with a colour map."""
         axes = self.figure.add_axes((0, 0, 1, 1), zorder=1e6)
         width, height = 72 * self.figure.get_size_inches()
         axes.set(xlim=(0, width), ylim=(0, height))
@@ -126,7 +132,7 @@ class Canvas:
         return axes
 
     def picture(self, pixels: Any, box: tuple[float, float, float, float]) -> None:
-        """A picture, (H, W) grey or (H, W, 3) in [0, 1], under all else; its box: left, bottom, width, height."""
+        """Draw an image, (H, W) grey or (H, W, 3) in [0, 1], below all else; ``box``: left, bottom, width, height."""
         (left, bottom, width, height), limits = box, 72 * self.figure.get_size_inches()
         axes = self.axes()
         axes.set_zorder(-1)
@@ -142,7 +148,7 @@ class Canvas:
         axes.set(xlim=(0, limits[0]), ylim=(0, limits[1]))
 
     def finished(self, keys: Sequence[LegendKey]) -> Any:
-        """The figure with a legend beside it, where it covers nothing."""
+        """The figure with a legend beside it."""
         if keys:
             options = {"bbox_to_anchor": (1.0, 1.0), "frameon": False, "fontsize": 9, "labelcolor": INK}
             self.figure.legend(handles=list(map(_make_legend_handle, keys)), loc="upper left", **options)
@@ -163,29 +169,29 @@ class Canvas:
             artist.set_gid(f"said-{len(self.said)}")
             self.said.append(to_plain_line(said))
         artist.set_figure(self.figure)
-        artist.set_zorder(len(self.figure.artists))  # in the order in which they come
+        artist.set_zorder(len(self.figure.artists))  # in drawing order
         self.figure.artists.append(artist)
 
 
 def to_plain_line(text: str) -> str:
-    """Words as a figure can hold them: on one line, without control characters and halves of surrogate pairs."""
+    """Text on one line, without control characters and unpaired surrogates."""
     text = str(text).encode("utf-8", "replace").decode()
     return " ".join("".join(c if c.isprintable() or c.isspace() else "\ufffd" for c in text).split())
 
 
 def truncate_text(text: str, width: float, size: float, end: int = 0) -> str:
-    """As much of a text as a width has room for, points; with up to ``end`` letters of its end, a third of all."""
-    most = int(width / (LETTER_WIDTH_EM * size) + 1e-6)
-    if len(text) <= most:
+    """Truncate a text to ``width`` points; up to ``end`` of its last letters are kept (at most a third of all)."""
+    max_letters = int(width / (LETTER_WIDTH_EM * size) + 1e-6)
+    if len(text) <= max_letters:
         return text
-    last = min(end, most // 3)
-    return f"{text[: most - 1 - last]}…{text[len(text) - last :]}"
+    last = min(end, max_letters // 3)
+    return f"{text[: max_letters - 1 - last]}…{text[len(text) - last :]}"
 
 
 def format_frame(scene: str, frame: object, views: Sequence[object] = ()) -> str:
-    """A frame of a scene, and those that were asked beside it, by their names."""
-    beside = f", with {_format_frames(views)}" if views else ""
-    return f"{scene}, frame {frame}{beside}"
+    """Title text of a frame of a scene and its source views."""
+    source_views = f", with {_format_frames(views)}" if views else ""
+    return f"{scene}, frame {frame}{source_views}"
 
 
 def _format_frames(views: Sequence[object]) -> str:
@@ -193,34 +199,34 @@ def _format_frames(views: Sequence[object]) -> str:
 
 
 def append_cutoff(place: str, cutoff: float | None) -> str:
-    """What is shown, and how much of the sensor's depth was kept, m."""
+    """Append the cutoff (m) to a title."""
     return place if cutoff is None else f"{place}, cutoff {cutoff:g} m"
 
 
 def prefix_title(words: str, title: str) -> str:
-    """What a figure shows, behind the scene that it shows."""
+    """Prefix a figure title with the scene title."""
     return f"{title}: {words[0].lower()}{words[1:]}" if title else words
 
 
 def save_figure(figure: Any, path: Any) -> None:
-    """Write a figure with what lies around its axes."""
+    """Write a figure, including artists outside its axes."""
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph")  # a name in letters that the font lacks
+        warnings.filterwarnings("ignore", message="Glyph")  # glyphs missing in the font
         figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
 
 
 def _make_legend_handle(key: LegendKey) -> Any:
-    """What stands for an entry in matplotlib's legend."""
+    """Legend handle of an entry."""
     from matplotlib.lines import Line2D  # noqa: PLC0415
 
-    made: dict[str, Any] = {"label": key.text, "linestyle": "none", "markersize": 6, "markerfacecolor": key.colour}
+    options: dict[str, Any] = {"label": key.text, "linestyle": "none", "markersize": 6, "markerfacecolor": key.colour}
     if key.shape == "line":
         stroke = key.stroke or Stroke(key.colour)
         dashes: Any = (0, stroke.dashes) if stroke.dashes else "solid"
         return Line2D([], [], color=key.colour, linewidth=stroke.width, linestyle=dashes, label=key.text)
     marker, edge = _LEGEND_MARKERS[key.shape]
-    return Line2D([], [], marker=marker, markeredgecolor=edge or key.colour, **made)
+    return Line2D([], [], marker=marker, markeredgecolor=edge or key.colour, **options)
 
 
-#: Shape of an entry → matplotlib's marker and the colour of its edge, None = its own.
+#: Shape of an entry → matplotlib marker and edge colour, None = the entry's own colour.
 _LEGEND_MARKERS = {"dot": ("o", "none"), "box": ("s", "none"), "cross": ("x", None), "diamond": ("D", PAPER_EDGE)}

@@ -1,6 +1,6 @@
-"""What all pages share: colours by day and in the dark, how text, tables and figures are set, and the frame around it.
+"""HTML document shared by all pages: light and dark colours, style of text, tables and figures.
 
-A page adds rules of its own behind these; it holds nothing that lies elsewhere.
+A page appends its own rules; it loads no external files.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ _STYLE_SHEET = Path(__file__).with_name("page.css")
 
 
 def build_style_sheet(own: Path | None = None) -> Markup:
-    """The style sheet of a page, with its own rules last."""
+    """Style sheet of a page, with its own rules last."""
     return Markup(
         "\n".join(
             [build_colour_variables(), *(p.read_text(encoding="utf-8") for p in (_STYLE_SHEET, own) if p is not None)]
@@ -23,7 +23,7 @@ def build_style_sheet(own: Path | None = None) -> Markup:
 
 
 def build_document(title: str, *body: object, own: Path | None = None) -> str:
-    """A page of its title and the children of its body; text is escaped unless it is markup."""
+    """Title and body elements -> HTML page; text is escaped unless it is markup."""
     metas = ({"charset": "utf-8"}, {"name": "viewport", "content": "width=device-width, initial-scale=1"})
     head = make_tag(
         "head",

@@ -1,4 +1,4 @@
-"""A completed view: the picture, what the sensor says of it, what is known of it now, and how well.
+"""Figures of a completed or aligned view: image, input depth, resulting depth, sigma / depth.
 
 Arrays may be torch tensors or numpy arrays, on any device, of one view (no batch dimension).
 """
@@ -18,86 +18,98 @@ from dhtorch.viz.plots.axis import Axis
 from dhtorch.viz.plots.canvas import TEXT_SIZE_PT, Canvas, save_figure
 from dhtorch.viz.plots.colours import INK, Stroke
 
-#: Width of a picture, between two of them, and the heights of a title and of a scale with its numbers, points.
-PICTURE_WIDTH_PT, PICTURE_GAP_PT, TITLE_HEIGHT_PT, SCALE_HEIGHT_PT = 340.0, 12.0, 20.0, 46.0
-#: Height of the title above all pictures, points.
+#: Width of an image, points.
+PICTURE_WIDTH_PT = 340.0
+#: Gap between two images, points.
+PICTURE_GAP_PT = 12.0
+#: Height of the title of an image, points.
+TITLE_HEIGHT_PT = 20.0
+#: Height of a colour scale with its numbers, points.
+SCALE_HEIGHT_PT = 46.0
+#: Height of the title above all images, points.
 HEADER_HEIGHT_PT = 22.0
-#: Shares of the depths that the scale leaves out at its ends.
-_LOW_DEPTH_QUANTILE, _HIGH_DEPTH_QUANTILE = 0.01, 0.99
-#: Scale of sigma / depth.
+#: Quantile of depth at the lower end of the scale.
+_LOW_DEPTH_QUANTILE = 0.01
+#: Quantile of depth at the upper end of the scale.
+_HIGH_DEPTH_QUANTILE = 0.99
+#: Range of the scale of sigma / depth.
 _SIGMA_REL_RANGE = (0.005, 0.2)
-#: From this ratio of its ends on, round numbers on a scale are those of decades.
+#: Ratio of the ends of a scale above which ticks are placed by decades.
 _MIN_DECADE_RATIO = 8.0
 
 
 def draw_completed(
     path: str | Path | IO[bytes],
     image: Any,  # (C, h, w) or (C, H, W) uint8, or float in [0, 1]
-    depth: Any,  # (h, w) m, 0 or NaN where nothing is known
+    depth: Any,  # (h, w) m, 0 or NaN without an answer
     sigma: Any,  # (h, w) m
     source: Any,  # (h, w) codes.Source
     *,
     title: str = "",
 ) -> None:
-    """Draw the picture, the sensor's depth, the completed one on the same scale, and its sigma / depth.
+    """Draw image, sensor depth, completed depth on the same scale, and its sigma / depth.
 
-    Depth is drawn by its logarithm, the nearest blue, the farthest red; what lies beyond the ends of a scale, of the
-    depths a hundredth on each side, has the colour of that end. Silence is left blank.
+    Log depth, near blue, far red; the nearest and farthest 1 % of the depths have the end colours. Pixels without an
+    answer are blank.
     """
     z, s, code = (as_array(x) for x in (depth, sigma, source))
-    known = np.isfinite(z) & (z > 0) & (code != Source.NONE)
-    sensed = known & (code == Source.SENSOR)
-    metres = fit_depth_axis(z[known])
-    before = f"Sensor: {_format_percent(sensed)} of the pixels", apply_log_cmap(z, sensed, metres, colours.DEPTH_CMAP)
-    after = (
-        f"Completed: {_format_percent(known)}, the rest is silent",
-        apply_log_cmap(z, known, metres, colours.DEPTH_CMAP),
+    answered = np.isfinite(z) & (z > 0) & (code != Source.NONE)
+    sensed = answered & (code == Source.SENSOR)
+    depth_axis = fit_depth_axis(z[answered])
+    sensor_panel = (
+        f"Sensor: {_format_percent(sensed)} of the pixels",
+        apply_log_cmap(z, sensed, depth_axis, colours.DEPTH_CMAP),
     )
-    _draw_four_panels(path, title, (("Picture", to_unit_rgb(image)), before, after), (z, s, known))
+    completed_panel = (
+        f"Completed: {_format_percent(answered)}, the rest no answer",
+        apply_log_cmap(z, answered, depth_axis, colours.DEPTH_CMAP),
+    )
+    _draw_four_panels(path, title, (("Picture", to_unit_rgb(image)), sensor_panel, completed_panel), (z, s, answered))
 
 
 def draw_aligned(
     path: str | Path | IO[bytes],
     image: Any,  # (C, h, w) or (C, H, W) uint8, or float in [0, 1]
-    given: Any,  # (1, h, w) or (h, w), in any unit, 0 or NaN where it has no value
-    depth: Any,  # (h, w) m, 0 or NaN where nothing is known
+    given: Any,  # (1, h, w) or (h, w), any unit, 0 or NaN without a value
+    depth: Any,  # (h, w) m, 0 or NaN without an answer
     sigma: Any,  # (h, w) m
     *,
     title: str = "",
 ) -> None:
-    """Draw the picture, a map as it was given, the anchored one, and its sigma / depth; the two maps by the logarithm
-    of their values, each over its own range."""
+    """Draw image, input map, aligned map, and its sigma / depth; both maps on log scales over their own ranges."""
     x, z, s = (as_array(q) for q in (given, depth, sigma))
     x = x.reshape(x.shape[-2:])
-    there, known = np.isfinite(x) & (x > 0), np.isfinite(z) & (z > 0)
-    before = (
-        f"Map as given: {_format_percent(there)}, own range",
-        apply_log_cmap(x, there, fit_depth_axis(x[there]), colours.DEPTH_CMAP),
+    has_value, answered = np.isfinite(x) & (x > 0), np.isfinite(z) & (z > 0)
+    input_panel = (
+        f"Input map: {_format_percent(has_value)}, own range",
+        apply_log_cmap(x, has_value, fit_depth_axis(x[has_value]), colours.DEPTH_CMAP),
     )
-    after = (
-        f"Anchored: {_format_percent(known)}, the rest is silent",
-        apply_log_cmap(z, known, fit_depth_axis(z[known]), colours.DEPTH_CMAP),
+    aligned_panel = (
+        f"Aligned: {_format_percent(answered)}, the rest no answer",
+        apply_log_cmap(z, answered, fit_depth_axis(z[answered]), colours.DEPTH_CMAP),
     )
-    _draw_four_panels(path, title, (("Picture", to_unit_rgb(image)), before, after), (z, s, known))
+    _draw_four_panels(path, title, (("Picture", to_unit_rgb(image)), input_panel, aligned_panel), (z, s, answered))
 
 
 def _draw_four_panels(
     path: str | Path | IO[bytes],
     title: str,
-    shown: Sequence[tuple[str, np.ndarray]],
-    found: tuple[np.ndarray, np.ndarray, np.ndarray],
+    panels: Sequence[tuple[str, np.ndarray]],
+    result: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
-    """Three pictures and sigma / depth of the depth, sigma and mask ``found``, with the scales of both below them
-    and the title above."""
-    z, s, known = found
-    metres, share = fit_depth_axis(z[known]), Axis(*_SIGMA_REL_RANGE, "sigma / depth, %", log=True, percent=True)
-    ratio = np.where(known, s / np.where(known, z, 1), 1)
+    """Draw three images, then sigma / depth of ``result`` (depth, sigma, mask), with both scales and the title."""
+    z, s, answered = result
+    depth_axis, sigma_axis = (
+        fit_depth_axis(z[answered]),
+        Axis(*_SIGMA_REL_RANGE, "sigma / depth, %", log=True, percent=True),
+    )
+    ratio = np.where(answered, s / np.where(answered, z, 1), 1)
     height = PICTURE_WIDTH_PT * z.shape[0] / z.shape[1]
     top = 2 * (height + TITLE_HEIGHT_PT) + SCALE_HEIGHT_PT
     canvas = Canvas(2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT * bool(title), dpi=160)
     canvas.title(title, 2 * PICTURE_WIDTH_PT + PICTURE_GAP_PT, top + HEADER_HEIGHT_PT)
     for k, (words, pixels) in enumerate(
-        (*shown, ("Sigma / depth", apply_log_cmap(ratio, known, share, colours.ERROR_CMAP)))
+        (*panels, ("Sigma / depth", apply_log_cmap(ratio, answered, sigma_axis, colours.ERROR_CMAP)))
     ):
         left, bottom = (
             (k % 2) * (PICTURE_WIDTH_PT + PICTURE_GAP_PT),
@@ -105,35 +117,35 @@ def _draw_four_panels(
         )
         canvas.title(words, PICTURE_WIDTH_PT, bottom + height + TITLE_HEIGHT_PT, left)
         canvas.picture(pixels, (left, bottom, PICTURE_WIDTH_PT, height))
-    draw_scale(canvas, metres, colours.DEPTH_CMAP, 0.0)
-    draw_scale(canvas, share, colours.ERROR_CMAP, PICTURE_WIDTH_PT + PICTURE_GAP_PT)
+    draw_scale(canvas, depth_axis, colours.DEPTH_CMAP, 0.0)
+    draw_scale(canvas, sigma_axis, colours.ERROR_CMAP, PICTURE_WIDTH_PT + PICTURE_GAP_PT)
     save_figure(canvas.figure, path)
 
 
 def fit_depth_axis(depth: np.ndarray) -> Axis:
-    """The scale of all depths."""
+    """Depths -> log axis between their 1 % and 99 % quantiles."""
     low, high = np.quantile(depth, (_LOW_DEPTH_QUANTILE, _HIGH_DEPTH_QUANTILE)).tolist() if depth.size else (0.5, 5.0)
     high = max(high, 1.25 * low)
     return Axis(low, high, "depth, m", log=True)
 
 
 def apply_log_cmap(values: np.ndarray, there: np.ndarray, axis: Axis, kind: str) -> np.ndarray:
-    """(h, w, 3) in [0, 1]: values by a colour map along a logarithmic axis, the ground where there is none."""
+    """Values (h, w) -> colours (h, w, 3) in [0, 1] on a log axis; background colour where ``there`` is False."""
     low, high = math.log(axis.low), math.log(axis.high)
     places = (np.log(np.where(there, values, axis.low).clip(1e-9)) - low) / (high - low)
-    ground = np.array(colours.parse_rgb(colours.PICTURE)) / 255
-    return np.where(there[..., None], apply_cmap(places.clip(0, 1), kind), ground)
+    background = np.array(colours.parse_rgb(colours.PICTURE)) / 255
+    return np.where(there[..., None], apply_cmap(places.clip(0, 1), kind), background)
 
 
 def apply_cmap(places: np.ndarray, kind: str) -> np.ndarray:
-    """Colours (…, 3) of places in [0, 1]."""
+    """Positions in [0, 1] -> colours (…, 3)."""
     from matplotlib import colormaps  # noqa: PLC0415
 
     return colormaps[kind](places)[..., :3]
 
 
 def draw_scale(canvas: Canvas, axis: Axis, kind: str, left: float) -> None:
-    """A colour map from end to end under a picture, with round numbers and what they mean."""
+    """Draw a colour scale with ticks and label below an image."""
     base, height = SCALE_HEIGHT_PT - 18.0, 9.0
     canvas.picture(apply_cmap(np.linspace(0, 1, 256)[None].repeat(2, 0), kind), (left, base, PICTURE_WIDTH_PT, height))
     decades = axis.log and axis.high > _MIN_DECADE_RATIO * axis.low
@@ -156,7 +168,7 @@ def _format_percent(mask: np.ndarray) -> str:
 
 
 def to_unit_rgb(image: Any) -> np.ndarray:
-    """(H, W) or (H, W, 3) in [0, 1]."""
+    """Image (C, H, W) -> (H, W) or (H, W, 3) in [0, 1]."""
     pixels = as_array(image)
     pixels = pixels / 255.0 if pixels.dtype == np.uint8 else pixels
     pixels = np.clip(pixels, 0, 1)
@@ -164,5 +176,5 @@ def to_unit_rgb(image: Any) -> np.ndarray:
 
 
 def as_array(x: Any) -> np.ndarray:
-    """A tensor of any device, or an array, as an array."""
+    """Tensor or array -> numpy array."""
     return x.detach().cpu().numpy() if hasattr(x, "detach") else np.asarray(x)

@@ -1,5 +1,4 @@
-"""How figures of a notebook are drawn: as wide as the text of a printed page, sharp on paper, in letters that are as
-large as those around them."""
+"""matplotlib settings for notebook figures: width of a printed page, print resolution, font size of the text."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""One pair of axes: say what is in it, then take it as a matplotlib figure or as SVG for a page.
+"""One pair of axes: collects marks, then renders them as a matplotlib figure or as inline SVG.
 
-Alphabet: x, y are data; u, v are places in the panel in points (1/72 inch), v up. A panel holds what was said as plain
-numbers until it is drawn. It draws its frame itself, as matplotlib's axes take ten times as long and pages have
-hundreds of panels.
+Alphabet: x, y are data; u, v are positions in the panel in points (1/72 inch), v up. A panel stores its marks as plain
+numbers until it is drawn. It draws its own frame: matplotlib's axes take ten times as long, and pages have hundreds of
+panels.
 """
 
 from __future__ import annotations
@@ -23,20 +23,22 @@ from dhtorch.viz.plots.canvas import (
 )
 from dhtorch.viz.plots.colours import FAINT, PAPER_EDGE, PAPER_FILL, Stroke
 
-#: Height of a named row, and of what lies around the rows, points.
-_ROW_HEIGHT_PT, _ROWS_MARGIN_PT = 19, 66
+#: Height of a named row, points.
+_ROW_HEIGHT_PT = 19
+#: Height of the margins around the rows, points.
+_ROWS_MARGIN_PT = 66
 
 
 class Panel:
-    """One pair of axes; draw, then :meth:`figure` or :func:`dhtorch.viz.plots.svg.render_inline_svg`."""
+    """One pair of axes; add marks, then :meth:`figure` or :func:`dhtorch.viz.plots.svg.render_inline_svg`."""
 
     def __init__(
         self,
         title: str,
         x: Axis,
-        y: Axis | None,  # None = named rows, see ``rows``
+        y: Axis | None,  # None = categorical rows, see ``rows``
         *,
-        size: CanvasPoint = (300, 216),  # points; the height of named rows follows from them
+        size: CanvasPoint = (300, 216),  # points; with rows the height follows from their number
         rows: Sequence[str] = (),
     ) -> None:
         self.title, self.x, self.y, self.rows = title, x, y, list(rows)
@@ -49,23 +51,23 @@ class Panel:
 
     @property
     def box(self) -> tuple[float, float, float, float]:
-        """Left, bottom, width and height of the inner part as shares of the panel, as matplotlib's axes want them."""
+        """Left, bottom, width and height of the plot area as fractions of the panel, as for matplotlib axes."""
         width, height = self.width - self.left - self.right, self.height - self.top - self.bottom
         return self.left / self.width, self.bottom / self.height, width / self.width, height / self.height
 
     @property
     def words(self) -> str:
-        """The panel in words, for those who do not see it."""
+        """Text alternative of the panel, for screen readers."""
         return self.title or f"{self.y.label if self.y else ', '.join(self.rows)} against {self.x.label}"
 
     def at(self, x: float, y: float) -> tuple[float, float]:
-        """Place of a point; in a panel of named rows y is the row's number, counted from the top."""
+        """Data point -> position (u, v); with rows, y is the row number from the top."""
         left, bottom, width, height = self.box
         part = 1 - (y + 0.5) / len(self.rows) if self.y is None else self.y.place(y)
         return self.width * (left + self.x.place(x) * width), self.height * (bottom + part * height)
 
     def line(self, xs: OptionalNumbers, ys: OptionalNumbers, stroke: Stroke) -> None:
-        """A line, broken where a value is missing; a value that stands alone becomes a dot."""
+        """Add a line, broken at missing values; a single value between gaps becomes a dot."""
         run: list[CanvasPoint] = []
         for x, y in [*zip(xs, ys, strict=True), (None, None)]:
             if x is not None and y is not None:
@@ -78,28 +80,28 @@ class Panel:
             run = []
 
     def dot(self, x: float, y: float, stroke: Stroke, said: str = "", width: float = 6.8) -> None:
-        """A dot with a text that shows when pointed at."""
+        """Add a dot with the tooltip ``said``."""
         self.marks.append(Mark("dot", (self.at(x, y),), stroke._replace(width=width), said))
 
     def diamond(self, x: float, y: float, said: str = "") -> None:
-        """The paper's mark."""
+        """Add a diamond, the mark of the paper's values."""
         (u, v), r = self.at(x, y), 5
         corners = ((u, v - r), (u + r, v), (u, v + r), (u - r, v))
         self.marks.append(Mark("diamond", corners, Stroke(PAPER_FILL), said, PAPER_EDGE))
 
     def bar(self, x_0: float, x_1: float, y_0: float, y_1: float, colour: str, edge: str | None = None) -> None:
-        """A filled rectangle."""
+        """Add a filled rectangle."""
         (u_0, v_0), (u_1, v_1) = self.at(x_0, y_0), self.at(x_1, y_1)
         u_1 = max(u_1, u_0 + 0.5)
         corners = ((u_0, v_0), (u_1, v_0), (u_1, v_1), (u_0, v_1))
         self.marks.append(Mark("bar", corners, Stroke(colour), edge=edge))
 
     def fill(self, xs: Sequence[float], ys: Sequence[float], colour: str) -> None:
-        """A filled polygon."""
+        """Add a filled polygon."""
         self.marks.append(Mark("bar", tuple(self.at(x, y) for x, y in zip(xs, ys, strict=True)), Stroke(colour)))
 
     def canvas(self, dpi: float = 160) -> Canvas:
-        """A canvas with the panel on it, to be drawn on further."""
+        """A canvas with the panel drawn on it, for further drawing."""
         canvas = Canvas(self.width, self.height, dpi)
         self.draw(canvas)
         return canvas

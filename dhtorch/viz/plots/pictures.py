@@ -1,4 +1,4 @@
-"""Pictures of what a pair found: arrays → PNG.
+"""Figures of a pair's samples, depth errors and risk-coverage curves: arrays → PNG.
 
 Arrays may be torch tensors or numpy arrays, on any device, of one pair (no batch dimension).
 """
@@ -19,23 +19,23 @@ from dhtorch.viz.plots.canvas import Canvas, LegendKey, prefix_title, save_figur
 from dhtorch.viz.plots.colours import FAINT, GATE_COLOURS, HOLE_COLOURS, INK, RECOVERED, SENSOR, Stroke, assign_strokes
 from dhtorch.viz.plots.panel import Panel
 
-#: Fewest answers whose mean error is drawn.
+#: Smallest number of answers whose mean error is drawn.
 MIN_CURVE_ANSWERS = 10
-#: How the points of a layer are drawn: shape, points across, and the width of a white edge.
+#: Mark of a layer → shape, diameter (points), width of its white edge (points).
 _LAYER_MARKS = {"sensor": ("dot", 2.8, 0.0), "silent": ("cross", 2.8, 0.0), "answer": ("dot", 3.8, 0.6)}
 
 
 class PointLayer(NamedTuple):
-    """Points of one kind in a picture."""
+    """Points of one kind on an image."""
 
     label: str
     uv: np.ndarray  # (P, 2) px
     colour: str
-    mark: str  # one of MARKS
+    mark: str  # key of _LAYER_MARKS
 
 
 class LayeredPicture:
-    """Layers of points over a picture; where there is none, over an empty ground."""
+    """Layers of points over an image, or over an empty background."""
 
     def __init__(
         self, title: str, hw: Sequence[float], layers: Sequence[PointLayer], image: Any = None, *, width: float
@@ -43,10 +43,10 @@ class LayeredPicture:
         self.title = self.words = title
         self.hw, self.layers, self.image = (float(hw[0]), float(hw[1])), list(layers), image
         self.width, self.inner = width, width * self.hw[0] / self.hw[1]
-        self.height = self.inner + 20  # the title stands above
+        self.height = self.inner + 20  # with the title above
 
     def figure(self, *, dpi: float = 160) -> Any:
-        """The picture as a matplotlib ``Figure`` with its title and a legend that counts the points."""
+        """matplotlib ``Figure`` with title, and a legend with the number of points."""
         canvas = Canvas(self.width, self.height, dpi)
         self.draw(canvas)
         shapes = {layer.label: _LAYER_MARKS[layer.mark][0] for layer in self.layers}
@@ -54,7 +54,7 @@ class LayeredPicture:
         return canvas.finished(keys)
 
     def draw(self, canvas: Canvas) -> None:
-        """Draw title, picture and points."""
+        """Draw title, image and points."""
         canvas.title(self.title, self.width, self.height)
         w, h = self.width, self.inner
         if self.image is None:
@@ -88,7 +88,7 @@ def draw_samples(
     *,
     title: str = "",
 ) -> None:
-    """Draw what became of every sample: a sensor return, a recovered depth, or the reason for silence."""
+    """Draw the outcome of every sample: sensor return, recovered depth, or the gate that rejected it."""
     source, gate = _to_array(source), _to_array(gate)
     layers = [
         (words(name), (source == Source.NONE) & (gate == code), GATE_COLOURS[code], "silent")
@@ -99,7 +99,7 @@ def draw_samples(
         ("sensor", source == Source.SENSOR, SENSOR, "sensor"),
         ("recovered", source == Source.RECOVERED, RECOVERED, "answer"),
     ]
-    _draw_layers(path, image, uv, layers, prefix_title("What became of the samples", title))
+    _draw_layers(path, image, uv, layers, prefix_title("Outcome of the samples", title))
 
 
 def draw_holes(
@@ -110,7 +110,7 @@ def draw_holes(
     *,
     title: str = "",
 ) -> None:
-    """Draw where the sensor is silent and why, with what could be done about it."""
+    """Draw the samples without a sensor return, by cause (codes.Hole) and remedy (codes.Route)."""
     hole = _to_array(hole)
     routes = names(Route)
     layers = [("sensor", hole == Hole.NONE, SENSOR, "sensor")]
@@ -118,7 +118,7 @@ def draw_holes(
         if code != Hole.NONE:
             label = f"{words(name)} → {words(routes[ROUTE_OF_HOLE[code]])}"
             layers.append((label, hole == code, HOLE_COLOURS[code], "answer"))
-    _draw_layers(path, image, uv, layers, prefix_title("Why there is no return", title))
+    _draw_layers(path, image, uv, layers, prefix_title("Causes of missing returns", title))
 
 
 def draw_depth(
@@ -131,12 +131,12 @@ def draw_depth(
 ) -> None:
     """Draw recovered against true depth on logarithmic axes, with the ±10 % band.
 
-    NaN is silence and left out; answers beyond the axes are drawn on their edge and counted.
+    NaN (no answer) is skipped; answers beyond the axes are drawn on their edge and counted.
     """
-    true, found = _to_array(true_depth).ravel(), _to_array(depth).ravel()
-    good = np.isfinite(true) & np.isfinite(found) & (true > 0) & (found > 0)
-    shade = None if score is None else _to_array(score).ravel()[good]
-    true, found = true[good], found[good]
+    true, recovered = _to_array(true_depth).ravel(), _to_array(depth).ravel()
+    valid = np.isfinite(true) & np.isfinite(recovered) & (true > 0) & (recovered > 0)
+    scores = None if score is None else _to_array(score).ravel()[valid]
+    true, recovered = true[valid], recovered[valid]
     low, high = (true.min() / 1.5, true.max() * 1.5) if len(true) else (1.0, 10.0)
     x, y = (Axis(float(low), float(high), f"{kind} depth, m", log=True) for kind in ("true", "recovered"))
     panel = Panel(prefix_title("Recovered against true", title), x, y, size=(380, 386))
@@ -145,33 +145,35 @@ def draw_depth(
     panel.line([low, high], [low, high], Stroke(INK, 1))
     keys = [LegendKey("± 10 %", FAINT, "box"), LegendKey("no error", INK, stroke=Stroke(INK, 1))]
     canvas = panel.canvas()
-    _draw_scatter(canvas, panel, true, found, shade)
-    for k, line in enumerate(_describe_errors(true, found, low, high) if len(true) else ()):
+    _draw_scatter(canvas, panel, true, recovered, scores)
+    for k, line in enumerate(_describe_errors(true, recovered, low, high) if len(true) else ()):
         canvas.text(line, panel.left + 10, panel.height - panel.top - 18 - 14 * k)
     save_figure(canvas.finished(keys), path)
 
 
-def _draw_scatter(canvas: Canvas, panel: Panel, true: np.ndarray, found: np.ndarray, shade: np.ndarray | None) -> None:
-    """Answers as dots, the surest on top, with a scale of the scores beside the panel."""
-    order = np.arange(len(true)) if shade is None else np.argsort(shade, kind="stable")
-    places = np.array([panel.at(x, y) for x, y in zip(true[order].tolist(), found[order].tolist(), strict=True)])
+def _draw_scatter(
+    canvas: Canvas, panel: Panel, true: np.ndarray, recovered: np.ndarray, scores: np.ndarray | None
+) -> None:
+    """Draw answers as dots, the highest scores on top, with a colour bar of the scores."""
+    order = np.arange(len(true)) if scores is None else np.argsort(scores, kind="stable")
+    places = np.array([panel.at(x, y) for x, y in zip(true[order].tolist(), recovered[order].tolist(), strict=True)])
     axes = canvas.axes()
     options = (
-        {"color": SENSOR} if shade is None else {"c": shade[order], "cmap": colours.SCORE_CMAP, "vmin": 0, "vmax": 1}
+        {"color": SENSOR} if scores is None else {"c": scores[order], "cmap": colours.SCORE_CMAP, "vmin": 0, "vmax": 1}
     )
     dots = axes.scatter(*places.reshape(-1, 2).T, s=9, alpha=0.75, linewidth=0, clip_on=False, **options)
-    if shade is not None and len(true):
-        inside = canvas.figure.add_axes((1.04, 0.12, 0.025, 0.5))
-        canvas.figure.colorbar(dots, cax=inside, label="score").outline.set_visible(False)
+    if scores is not None and len(true):
+        bar_axes = canvas.figure.add_axes((1.04, 0.12, 0.025, 0.5))
+        canvas.figure.colorbar(dots, cax=bar_axes, label="score").outline.set_visible(False)
 
 
-def _describe_errors(true: np.ndarray, found: np.ndarray, low: float, high: float) -> list[str]:
-    """The answers in numbers."""
-    error = np.abs(found / true - 1)
-    said = [format_count(len(true), "answer"), f"median error {100 * np.median(error):.1f} %"]
-    said.append(f"within 10 %: {100 * (error < 0.1).mean():.0f} %")
-    outside = int(((found < low) | (found > high)).sum())
-    return [*said, *([f"{outside} beyond the axes"] if outside else [])]
+def _describe_errors(true: np.ndarray, recovered: np.ndarray, low: float, high: float) -> list[str]:
+    """Text lines: number of answers, median error, fraction within 10 %."""
+    error = np.abs(recovered / true - 1)
+    lines = [format_count(len(true), "answer"), f"median error {100 * np.median(error):.1f} %"]
+    lines.append(f"within 10 %: {100 * (error < 0.1).mean():.0f} %")
+    outside = int(((recovered < low) | (recovered > high)).sum())
+    return [*lines, *([f"{outside} beyond the axes"] if outside else [])]
 
 
 def draw_risk_coverage(
@@ -181,25 +183,25 @@ def draw_risk_coverage(
     oracle: tuple[Any, Any] | None = None,
     title: str = "",
 ) -> None:
-    """Draw risk against coverage, as from :func:`dhtorch.metrics.risk.risk_coverage`; the best order is dashed.
+    """Draw risk against coverage, as from :func:`dhtorch.metrics.risk.risk_coverage`; the ideal order is dashed.
 
-    A mean over fewer than ten answers is not drawn.
+    Means over fewer than ten answers are not drawn.
     """
     strokes = assign_strokes(curves)
     drawn = {name: [_to_array(v)[MIN_CURVE_ANSWERS - 1 :].tolist() for v in curve] for name, curve in curves.items()}
     drawn = {name: curve for name, curve in drawn.items() if curve[0]}
     right = fit_axis([0.1, *(x for c, _ in drawn.values() for x in c)], "", low=0.0).high
     top = fit_axis([0.12, *(y for _, r in drawn.values() for y in r)], "", low=0.0).high
-    x = Axis(0.0, min(1.0, right), "answered share of the candidates, %", percent=True)
+    x = Axis(0.0, min(1.0, right), "answered fraction of the candidates, %", percent=True)
     y = Axis(0.0, min(1.0, top), "mean relative error (at most 1), %", percent=True)
-    panel = Panel(prefix_title("Error of the surest", title), x, y, size=(400, 290))
+    panel = Panel(prefix_title("Risk against coverage", title), x, y, size=(400, 290))
     for level in (0.05, 0.1):
         panel.line([x.low, x.high], [level, level], Stroke(colours.SILENT, 0.8))
     keys = [LegendKey(name, strokes[name].colour, stroke=strokes[name]) for name in drawn]
     if oracle is not None:
-        best = Stroke(INK, 1, (4, 3))
-        panel.line(_to_array(oracle[0]).tolist(), _to_array(oracle[1]).tolist(), best)
-        keys.append(LegendKey("best order", INK, stroke=best))
+        ideal = Stroke(INK, 1, (4, 3))
+        panel.line(_to_array(oracle[0]).tolist(), _to_array(oracle[1]).tolist(), ideal)
+        keys.append(LegendKey("ideal order", INK, stroke=ideal))
     for name, (coverage, risk) in drawn.items():
         panel.line(coverage, risk, strokes[name])
         panel.dot(coverage[-1], risk[-1], strokes[name], width=5)
@@ -209,7 +211,7 @@ def draw_risk_coverage(
 def _draw_layers(
     path: str | Path, image: Any, uv: Any, layers: Sequence[tuple[str, np.ndarray, str, str]], title: str
 ) -> None:
-    """Draw groups of pixels (label, mask, colour, mark) over a picture, with their counts in a legend beside it."""
+    """Draw groups of pixels (label, mask, colour, mark) over an image, with their counts in the legend."""
     uv, hw = _to_array(uv), tuple(image.shape[-2:])
     shown = [PointLayer(label, uv[mask], colour, mark) for label, mask, colour, mark in layers if mask.any()]
     save_figure(LayeredPicture(title, hw, shown, image, width=520).figure(), path)
@@ -220,7 +222,7 @@ def _to_array(x: Any) -> np.ndarray:
 
 
 def _to_pale_grey(image: Any) -> np.ndarray:
-    """Picture (H, W) in [0, 1] to draw on: colourless and of little contrast, so that what is drawn stands out."""
+    """Image -> (H, W) in [0, 1], grey and of low contrast, as a background for marks."""
     pixels = _to_array(image)
     pixels = pixels / 255.0 if pixels.dtype == np.uint8 else pixels
     return 0.45 + 0.5 * np.clip(pixels.mean(0), 0, 1)

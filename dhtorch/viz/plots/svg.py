@@ -1,7 +1,6 @@
-"""matplotlib's SVG as a page takes it in: small, the same every time, without names that could meet those of another.
+"""Panel -> inline SVG for a page: small, deterministic, without ids that could collide.
 
-Nothing in it is looked up by an id, text stays text in the page's own font, and the colours that belong to the page
-are its variables, so that a figure reads by day and in the dark.
+Text stays text in the font of the page, and the page's own colours become CSS variables, for light and dark themes.
 """
 
 from __future__ import annotations
@@ -23,23 +22,25 @@ _COORDINATES = re.compile(r'\b(d|x|y|transform)="([^"]*)"')
 
 
 def render_inline_svg(panel: Panel | LayeredPicture) -> str:
-    """A panel as an SVG element for the middle of a page."""
+    """Panel -> SVG element for a page."""
     canvas = Canvas(panel.width, panel.height, dpi=72)
     canvas.figure.patch.set_visible(False)
     panel.draw(canvas)
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph")  # a name in letters that the font lacks: the page's has them
+        warnings.filterwarnings(
+            "ignore", message="Glyph"
+        )  # glyphs missing in matplotlib's font; the page's font has them
         body = _strip_svg(_render_svg(canvas), canvas.said)
     box, label = f"0 0 {panel.width:g} {panel.height:g}", html.escape(to_plain_line(panel.words))
     return f'<svg viewBox="{box}" role="img" aria-label="{label}" style="--width: {panel.width:g}px">{body}</svg>'
 
 
 def _strip_svg(svg: str, said: Sequence[str] = ()) -> str:
-    """The inside of matplotlib's SVG without what a page does not need.
+    """matplotlib SVG -> its content without metadata, ids and redundant styles.
 
     Args:
-        svg: as ``savefig`` writes it with text as text.
-        said: what the groups named said-0, said-1, … say when pointed at.
+        svg: from ``savefig`` with text as text.
+        said: tooltips of the groups named said-0, said-1, …
     """
     body = svg[svg.index(">", svg.index("<svg")) + 1 : svg.rindex("</svg>")]
     body = re.sub(r"<metadata>.*?</metadata>|<defs>\s*<style.*?</style>\s*</defs>|<!--.*?-->", "", body, flags=re.S)
@@ -70,14 +71,14 @@ def _make_title_writer(said: Sequence[str]) -> Callable[[re.Match[str]], str]:
 
 
 def _reduce_style(style: str) -> str:
-    """Rules that say more than the page's own, in its colours."""
+    """Style attribute without rules that the page already has, with its colour variables."""
     rules = [rule.strip().replace(": ", ":") for rule in style.split(";")]
     kept = [r for r in rules if not r.startswith(("font-family", "stroke-linejoin", "text-anchor:start"))]
     return _HEX_COLOUR.sub(lambda m: to_css_colour(m[0]), ";".join(kept))
 
 
 def _round_coordinates(places: str) -> str:
-    """Numbers with one decimal; a line without length in fewer letters."""
+    """Round coordinates to one decimal, and shorten zero-length lines."""
     places = " ".join(_DECIMAL.sub(lambda m: f"{float(m[0]):.1f}".removesuffix(".0"), places).split())
     places = re.sub(r"M (\S+ \S+) L \1(?= M|$)", r"M\1h0", places)
     return re.sub(r" ?([MLz]) ?", r"\1", places).replace("-0 ", "0 ")

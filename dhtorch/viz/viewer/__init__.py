@@ -1,8 +1,8 @@
-"""What ``dhtorch view`` shows: pictures, depth, what became of every sample, tracks, cameras, recovered points, gates.
+"""Viewers of ``dhtorch view``: images, depth, outcome of every sample, tracks, cameras, recovered points, gates.
 
-``exhibit`` says what there is to see, ``again`` takes an archived result back to its parts, ``points`` a PLY file;
-``rrd`` hands an exhibit to Rerun (extra ``[view]``), ``html`` makes it one page that needs nothing but a browser. What
-is to be seen of a recording is computed by ``dhtorch.experiments.exhibits``.
+``exhibit`` defines the displayed data, ``again`` rebuilds the components of an archived result, ``points`` reads a PLY
+file; ``rrd`` sends an exhibit to Rerun (extra ``[view]``), ``html`` writes it as one self-contained page. Exhibits of
+recordings are computed by ``dhtorch.experiments.exhibits``.
 """
 
 from dhtorch.viz.viewer.exhibit import (

@@ -1,7 +1,6 @@
-"""An archived result as something to see: what its settings name, as objects.
+"""Archived result -> data, method and pairs, rebuilt from its settings.
 
-A result file may come from anywhere. Its settings name functions, and only those of this package that settings are
-meant to name are called; whatever else a file names is refused.
+Result files are untrusted: only functions on a list of this package's modules are called; any other name is rejected.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-#: Group of the settings → modules whose public functions it may name.
+#: Settings group → modules whose public functions its ``_target_`` may name.
 _ALLOWED_MODULES = {
     "data": (
         *("dhtorch.data", "dhtorch.data.readers.rh20t_set", "dhtorch.data.rig"),
@@ -41,16 +40,15 @@ _ALLOWED_MODULES = {
 
 
 def rebuild_parts(result: Mapping[str, Any], root: str | Path | None = None) -> dict[str, Any]:
-    """``data``, ``method`` and ``pairs`` of a result's settings, as objects.
+    """Result -> ``data``, ``method`` and ``pairs`` of its settings, as objects.
 
     Args:
         result: valid, as from :func:`dhtorch.runtime.results.read_result`.
-        root: where its data lie now; None = where the settings say, below DHTORCH_DATA or the present folder.
+        root: present location of its data; None = the recorded one, below DHTORCH_DATA or the working folder.
 
     Raises:
-        ValueError: the settings name a function that is none of :data:`_ALLOWED_MODULES`, or one that takes other
-            options.
-        OSError: its data are not there.
+        ValueError: the settings name a function outside :data:`_ALLOWED_MODULES`, or options that it does not accept.
+        OSError: its data are missing.
     """
     config = result["config"]
     for group in _ALLOWED_MODULES:
@@ -63,21 +61,21 @@ def rebuild_parts(result: Mapping[str, Any], root: str | Path | None = None) -> 
 
 
 def read_cutoff(result: Mapping[str, Any], scene: str) -> float:
-    """The cutoff on a scene of the result, m; infinite where nothing was held back."""
+    """The cutoff on a scene of the result, m; infinite without a hold-out."""
     rows = (row for row in result["rows"] if row["pair"] is None and row["scene"] == scene)
-    limit = next((row.get("cutoff_m") for row in rows), None)
-    return float(limit) if isinstance(limit, int | float) else math.inf
+    cutoff = next((row.get("cutoff_m") for row in rows), None)
+    return float(cutoff) if isinstance(cutoff, int | float) else math.inf
 
 
-def _resolve_root(said: Any, root: str | Path | None) -> Path | None:
-    if root is not None or said is None:
+def _resolve_root(recorded: Any, root: str | Path | None) -> Path | None:
+    if root is not None or recorded is None:
         return Path(root) if root is not None else Path(os.environ.get("DHTORCH_DATA", "."))
-    below = Path(os.environ.get("DHTORCH_DATA", ".")) / str(said)
-    return below if below.exists() else Path(str(said))
+    below = Path(os.environ.get("DHTORCH_DATA", ".")) / str(recorded)
+    return below if below.exists() else Path(str(recorded))
 
 
 def _instantiate(node: Any, group: str, where: str) -> Any:
-    """What the settings say below ``where``: functions with their options bound, or called."""
+    """Settings node at ``where`` -> functions with bound options, or their results."""
     if isinstance(node, list):
         return [_instantiate(v, group, f"{where}.{k}") for k, v in enumerate(node)]
     if not isinstance(node, Mapping):
@@ -90,7 +88,7 @@ def _instantiate(node: Any, group: str, where: str) -> Any:
     if "_target_" not in node:
         return options
     function = _load_allowed_function(node["_target_"], group, where)
-    try:  # an option that the function has not would be seen only when it is called, with another message
+    try:  # unknown options would otherwise fail later, with another message
         inspect.signature(function).bind_partial(**options)
     except TypeError as error:
         raise ValueError(f"result.config.{where}: {error}") from error
@@ -100,8 +98,8 @@ def _instantiate(node: Any, group: str, where: str) -> Any:
 def _load_allowed_function(name: Any, group: str, where: str) -> Any:
     module, _, last = str(name).rpartition(".")
     if module in _ALLOWED_MODULES[group] and not last.startswith("_"):
-        found = getattr(importlib.import_module(module), last, None)
-        if callable(found) and getattr(found, "__module__", None) == module:
-            return found
+        function = getattr(importlib.import_module(module), last, None)
+        if callable(function) and getattr(function, "__module__", None) == module:
+            return function
     expected = f"a function of {', '.join(_ALLOWED_MODULES[group])}"
     raise ValueError(f"result.config.{where}._target_: found {name!r}, expected {expected}")

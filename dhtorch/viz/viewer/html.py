@@ -1,7 +1,7 @@
-"""A scene as one HTML page that needs nothing beside itself: no installation, no server, no network.
+"""Exhibit -> one self-contained HTML page: no installation, server or network.
 
-The page draws with WebGL and two-dimensional canvases, in plain JavaScript that lies beside this file. Arrays travel as
-base64. Names come from files of others: they enter as JSON text in which no markup can end, and are shown as text.
+The page draws with WebGL and 2D canvases, in plain JavaScript stored beside this file. Arrays are embedded as base64.
+Names from files are untrusted: they are embedded as JSON text with markup characters escaped, and shown as text.
 """
 
 from __future__ import annotations
@@ -27,14 +27,16 @@ HTML_SUFFIXES = (".html", ".htm")
 _FOLDER = Path(__file__).parent
 _SCRIPTS = ("space.js", "pictures.js", "layers.js", "page.js")
 
-#: Colours that the scripts ask for by name, and their colour maps.
+#: Colours that the scripts refer to by name.
 _COLOUR_NAMES = ("SENSOR", "RECOVERED", "SWEPT", "SILENT", "PALE", "HELD", "WHITE", "BLACK")
 _CMAP_OF_QUANTITY = {"depth": colours.DEPTH_CMAP, "score": colours.SCORE_CMAP, "error": colours.ERROR_CMAP}
 
-#: Pixels travel in 16 bits: this many steps a pixel, from this far outside the picture.
-_STEPS_PER_PX, _MARGIN_PX = 8, 64
+#: Quantisation of pixel coordinates in 16 bits, steps per px.
+_STEPS_PER_PX = 8
+#: Offset of quantised pixel coordinates: positions outside the image down to this margin, px.
+_MARGIN_PX = 64
 
-#: Column of a shot's samples → type it travels as.
+#: Column of the samples → type of its encoding.
 _COLUMN_TYPES = {
     **dict.fromkeys(("xyz", "depth", "sigma", "parallax_deg", "residual_px", "error"), "f4"),
     **dict.fromkeys(("uv_0", "uv_1", "score"), "u2"),
@@ -43,10 +45,10 @@ _COLUMN_TYPES = {
 
 
 def build_viewer_page(scene: Exhibit) -> str:
-    """The scene as one page.
+    """Exhibit -> HTML page.
 
     Raises:
-        ValueError: there is nothing to show.
+        ValueError: no pair to show.
     """
     if not scene.shots:
         raise ValueError(f"view: found no pair in {scene.name}, expected at least one")
@@ -55,30 +57,30 @@ def build_viewer_page(scene: Exhibit) -> str:
         "title": escape_html(f"{scene.name} · dhtorch"),
         "style": build_style_sheet(_FOLDER / "page.css"),
         "opening": _format_opening(scene.opening) if scene.opening is not None else "",
-        # Neither "</script" nor "<!--" may stand in a script's text; in JSON strings an escape says the same.
+        # "</script" and "<!--" must not occur in a script; in JSON strings an escape is equivalent.
         "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
         "script": "\n".join(_read_asset(name) for name in _SCRIPTS),
     }
     skeleton = _read_asset("page.html").split("{{")
-    filled = [skeleton[0]]
+    pieces = [skeleton[0]]
     for piece in skeleton[1:]:
         name, rest = piece.split("}}", 1)
-        filled += [parts[name], rest]
-    return "".join(filled)
+        pieces += [parts[name], rest]
+    return "".join(pieces)
 
 
 def write_viewer_page(path: Path, scene: Exhibit) -> Path:
     """Write the page.
 
     Raises:
-        ValueError: nothing to show.
+        ValueError: no pair to show.
         OSError: the file cannot be written.
     """
     return storage.replace_file(path, build_viewer_page(scene).encode("utf-8"))
 
 
 def _format_opening(opening: PageOpening) -> Markup:
-    """Numbers, sentences and a picture, above what can be turned."""
+    """Opening -> markup: numbers, sentences and an image, above the 3D view."""
     numbers = (
         make_tag("div", make_tag("dt", what), make_tag("dd", amount)) for what, amount in opening.numbers.items()
     )
@@ -96,11 +98,11 @@ def _encode_exhibit(scene: Exhibit) -> dict[str, Any]:
     outcomes += [(name, words(name), GATE_COLOURS[code]) for code, name in names(Gate).items() if code != Gate.ANSWER]
     n = sum(len(shot.samples["depth"]) for shot in scene.shots)
     swept = sum(len(shot.swept.xyz) for shot in scene.shots)
-    said = f"{format_count(len(scene.shots), 'pair')}, {n:,} samples" if scene.views else f"{n + swept:,} points"
-    said += f", {swept} swept pixels" if scene.views and swept else ""
+    about = f"{format_count(len(scene.shots), 'pair')}, {n:,} samples" if scene.views else f"{n + swept:,} points"
+    about += f", {swept} swept pixels" if scene.views and swept else ""
     return {
         "title": scene.name,
-        "about": said,
+        "about": about,
         "facts": dict(scene.facts),
         "placed": scene.placed,
         "per_pixel": _STEPS_PER_PX,
@@ -122,19 +124,19 @@ def _encode_pair(shot: PairExhibit) -> dict[str, Any]:
     for name in ("uv_0", "uv_1"):
         steps = np.round((np.nan_to_num(columns[name]) + _MARGIN_PX) * _STEPS_PER_PX)
         columns[name] = steps.clip(0, 65535)
-    made: dict[str, Any] = {
+    encoded: dict[str, Any] = {
         "samples": {name: _encode_array(columns[name], kind) for name, kind in _COLUMN_TYPES.items()}
     }
-    made |= {"label": shot.label, "counts": shot.gates(), "facts": dict(shot.facts)}
-    made |= {
+    encoded |= {"label": shot.label, "counts": shot.gates(), "facts": dict(shot.facts)}
+    encoded |= {
         "view_0": shot.view_0,
         "view_1": shot.view_1,
         "seen": _encode_cloud(shot.seen),
         "held": _encode_cloud(shot.held),
     }
-    made["swept"] = _encode_cloud(shot.swept) | _encode_confidence(shot.swept)
+    encoded["swept"] = _encode_cloud(shot.swept) | _encode_confidence(shot.swept)
     poses = {"T_world_from_0": shot.T_world_from_0, "T_world_from_1": shot.T_world_from_1}
-    return made | {k: None if T is None else [float(x) for x in T[:3].ravel()] for k, T in poses.items()}
+    return encoded | {k: None if T is None else [float(x) for x in T[:3].ravel()] for k, T in poses.items()}
 
 
 def _encode_view(view: ExhibitView) -> dict[str, Any]:
@@ -143,7 +145,7 @@ def _encode_view(view: ExhibitView) -> dict[str, Any]:
 
 
 def _encode_cloud(cloud: PointCloud) -> dict[str, Any]:
-    """Coordinates in 16 bits between the smallest and the largest."""
+    """Cloud -> coordinates quantised to 16 bits between minimum and maximum, and colours."""
     empty = not len(cloud.xyz)
     low = np.zeros(3) if empty else cloud.xyz.min(0).astype(np.float64)
     step = np.ones(3) if empty else np.maximum((cloud.xyz.max(0) - low) / 65535, 1e-9)
@@ -165,7 +167,7 @@ def _encode_confidence(cloud: SweptPointCloud) -> dict[str, Any]:
 
 
 def _quantise_scores(score: np.ndarray) -> np.ndarray:
-    """Scores in 16 bits."""
+    """Scores [0, 1] -> 16 bits."""
     return np.round(65535 * np.nan_to_num(score).clip(0, 1))
 
 
@@ -174,8 +176,8 @@ def _encode_array(values: np.ndarray, kind: str) -> dict[str, str]:
     return {"type": kind, "base64": base64.b64encode(data).decode("ascii")}
 
 
-def _describe_code(code: int, name: str, of: Mapping[int, str]) -> dict[str, Any]:
-    return {"code": code, "name": words(name), "colour": of[code]}
+def _describe_code(code: int, name: str, colour_of: Mapping[int, str]) -> dict[str, Any]:
+    return {"code": code, "name": words(name), "colour": colour_of[code]}
 
 
 def _read_asset(name: str) -> str:

@@ -1,4 +1,4 @@
-// The data of the page, its colours, and the layers of points and lines made of it.
+// Data and colours of the page, and its layers of points and lines.
 
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const $ = (id) => document.getElementById(id);
@@ -43,7 +43,7 @@ const MODES = [["picture", "own colour"], ["source", "source"], ["hole", "class 
 const state = { now: 0, all: false, mode: "picture", threshold: 0, picked: null, playing: null };
 const show = Object.fromEntries([...document.querySelectorAll("[data-show]")].map((box) => [box.dataset.show, box.checked]));
 
-// The colour of sample k: in categories the code's, on scales the number's, silent ones pale.
+// Colour of sample k: of its code, or of its value on a scale; unanswered samples are pale.
 function sampleColour(s, k) {
   const mode = state.mode, source = s.source[k];
   if (mode === "hole") return holeOf[s.hole[k]] ? hex(holeOf[s.hole[k]].colour) : SENSOR;
@@ -54,7 +54,7 @@ function sampleColour(s, k) {
   return Number.isFinite(value) ? scales[mode].colour(value) : SILENT;
 }
 
-// The colour of a return of a depth map: the picture's, tinted where the mode tells sources apart.
+// Colour of a return of a depth map: that of the image, tinted in modes that distinguish sources.
 function returnColour(cloud, k, held) {
   const rgb = [0, 1, 2].map((c) => cloud.rgb[3 * k + c] / 255), grey = luma(rgb);
   if (state.mode === "picture") return rgb;
@@ -64,7 +64,7 @@ function returnColour(cloud, k, held) {
   return SENSOR.map((v, c) => 0.75 * v * (0.35 + 1.3 * grey) + 0.25 * rgb[c]);
 }
 
-// The colour of a swept pixel: the number's on scales, else the picture's in the tint of its source.
+// Colour of a swept pixel: of its value on a scale, else that of the image in the tint of its source.
 function sweptColour(cloud, k) {
   const rgb = [0, 1, 2].map((c) => cloud.rgb[3 * k + c] / 255), grey = luma(rgb), mode = state.mode;
   if (mode === "picture") return rgb;
@@ -91,7 +91,7 @@ function transformed(T, xyz) {
   return out;
 }
 
-// Rows of some samples of a shot, with the ends of their bars of ± sigma along the ray.
+// Rows of the given samples of a pair, with the ends of their ± sigma bars along the ray.
 function buildShot(s) {
   const T = s.T_world_from_0, o = centre(T), pick = (wanted) => [...Array(s.n).keys()].filter((k) => s.source[k] === wanted);
   const groups = { sensor: pick(1), recovered: pick(2) }, world = transformed(T, s.xyz), at = (k) => world.subarray(3 * k, 3 * k + 3);
@@ -115,7 +115,7 @@ function buildShot(s) {
   };
 }
 
-// Swept pixels: triangles between neighbours of one surface, the surer the more opaque, and points where there are none.
+// Swept pixels: triangles between neighbours on one surface, opacity by score, and points elsewhere.
 const [SURE, UNSURE, FAINTEST, JUMP] = [0.02, 0.15, 0.25, 1.08];
 function sweptLayers(s, T) {
   const cloud = s.swept, { n, depth, sigma, step_px: step } = cloud, made = { swept: space.layer({ position: transformed(T, cloud.xyz), colour: new Float32Array(3 * n), score: cloud.score }) };
@@ -141,7 +141,7 @@ function sweptLayers(s, T) {
   return made;
 }
 
-// A grid of whole metres, of ten or a tenth where the scene asks for it, under nearly all points, level with the first camera.
+// Ground grid of 1 m (0.1 m or 10 m by scene size), below nearly all points, level with the first camera.
 const ground = (() => {
   const rows = shots.flatMap((s) => [s.xyz, s.swept.xyz].flatMap((xyz) => { const out = [], step = 3 * Math.max(1, Math.ceil(xyz.length / 6000)); for (let k = 0; k + 2 < xyz.length; k += step) if (Number.isFinite(xyz[k])) out.push(place(s.T_world_from_0, xyz[k], xyz[k + 1], xyz[k + 2])); return out; }));
   if (!rows.length) return { metres: 1, layer: null };
@@ -154,7 +154,7 @@ const ground = (() => {
   return { metres, layer: space.layer({ position: Float32Array.from(lines), colour: colours(lines.length / 3, () => SILENT) }) };
 })();
 
-// Cameras as pyramids, a tenth of the typical depth high.
+// Cameras as pyramids with a height of a tenth of the typical depth.
 function frustums(s) {
   const made = [];
   for (const [T, index, colour] of [[s.T_world_from_0, s.view_0, SENSOR], [s.T_world_from_1, s.view_1, RECOVERED]]) {
@@ -221,7 +221,7 @@ function drawSpace() {
     }
     if (hasViews && show.tracks && show.recovered && n === state.now) space.lines(l.rays, { alpha: 0.1, threshold });
     if (show.frustums) for (const f of l.frustums) {
-      if (Math.hypot(...sub(f.tip, eye.position)) < 0.4 * size.depth) continue; // it would stand before everything else
+      if (Math.hypot(...sub(f.tip, eye.position)) < 0.4 * size.depth) continue; // it would cover everything else
       space.lines(f.lines);
       if (n === state.now && textures[f.index]) space.picture(f.quad, textures[f.index], 0.85);
     }
@@ -231,7 +231,7 @@ function drawSpace() {
   mark();
 }
 
-// A ring around the picked sample and its depth beside it: elements over the canvas, so that nothing in space hides them.
+// Ring around the selected sample with its depth: elements over the canvas, never hidden by 3D points.
 function mark() {
   const k = state.picked, p = k === null ? [NaN] : layers[state.now].world.subarray(3 * k, 3 * k + 3);
   const at = Number.isFinite(p[0]) ? space.onScreen(p) : null, box = space.canvas;

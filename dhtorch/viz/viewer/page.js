@@ -1,11 +1,11 @@
-// What a person does: controls, pointers and keys; and what is said in words.
+// Interaction: controls, pointers and keys; displayed text.
 
 const pictures = [0, 1].map((k) => new Picture($(`picture-${k}`), k));
 const images = DATA.views.map((view) => Object.assign(new Image(), { src: `data:image/jpeg;base64,${view.jpeg}` }));
 const textures = [];
 let waiting = false;
 
-// Everything is drawn once per frame of the screen, and only when something changed.
+// Redraw at most once per screen frame, and only after a change.
 function redraw() {
   if (waiting) return;
   waiting = true;
@@ -27,7 +27,7 @@ function drawPictures() {
   });
 }
 
-// ------------------------------------------------------------------------------------------------------- in words
+// ----------------------------------------------------------------------------------------------------------- text
 
 function facts(list, entries) {
   list.replaceChildren(...Object.entries(entries).flatMap(([key, value]) => [element("dt", {}, key), element("dd", {}, String(value))]));
@@ -40,7 +40,7 @@ function tellPair() {
   $("pair").setAttribute("aria-valuetext", $("pair-name").textContent);
   [a, b].forEach((view, k) => {
     if (!view) return;
-    $(`name-${k}`).textContent = k ? `view 1, frame ${view.number}: where the samples were found again` : `view 0, frame ${view.number}: where depth is asked for`;
+    $(`name-${k}`).textContent = k ? `source view, frame ${view.number}: tracked samples` : `reference view, frame ${view.number}: samples`;
     $(`picture-${k}`).setAttribute("aria-label", `Picture of frame ${view.number} with ${k ? "tracks" : "samples"}`);
   });
   $("gate-list").replaceChildren(...outcomes.filter((o) => shots.some((x) => x.counts[o.key])).map((o) => element("li", {}, swatch(o.colour), `${o.name} ${s.counts[o.key]}`)));
@@ -61,8 +61,8 @@ function tellCoverage() {
   }
   const left = risk.errors.filter((_, k) => risk.scores[k] >= state.threshold);
   const share = hasViews ? `: ${percent(total.kept / total.holes)} of the ${total.holes} samples without a usable return` : "";
-  const first = [total.answers ? `${total.kept.toLocaleString("en")} of ${total.answers.toLocaleString("en")} answers stay${share}.` : "", total.swept ? `${total.stay.toLocaleString("en")} of ${total.swept.toLocaleString("en")} swept points stay.` : ""].filter(Boolean).join(" ") || "Nothing beyond the sensor was recovered here.";
-  const second = left.length ? ` Of ${risk.candidates} held-back returns ${percent(left.length / risk.candidates)} are answered, median error ${percent(quantile(left, 0.5))}.` : "";
+  const first = [total.answers ? `${total.kept.toLocaleString("en")} of ${total.answers.toLocaleString("en")} answers shown${share}.` : "", total.swept ? `${total.stay.toLocaleString("en")} of ${total.swept.toLocaleString("en")} swept points shown.` : ""].filter(Boolean).join(" ") || "Nothing was recovered beyond the sensor.";
+  const second = left.length ? ` Of ${risk.candidates} held-out returns ${percent(left.length / risk.candidates)} are answered, median error ${percent(quantile(left, 0.5))}.` : "";
   $("coverage").textContent = first + second;
   $("threshold-value").textContent = state.threshold.toFixed(2);
   drawRisk($("risk"), risk, state.threshold);
@@ -72,15 +72,15 @@ function tellSample() {
   const s = shots[state.now], k = state.picked;
   $("sample-hint").toggleAttribute("hidden", k !== null);
   if (k === null) return facts($("sample-facts"), {});
-  const source = s.source[k], said = { sample: k, source: ["none", "sensor", "recovered", "swept"][source] };
-  if (source) said.depth = `${short(s.depth[k])} m ± ${short(s.sigma[k])} m (${percent(s.sigma[k] / s.depth[k])})`;
-  if (source) said[source === 1 ? "confidence" : "score"] = s.score[k].toFixed(2);
-  if (source === 0) said["silent because of"] = gateOf[s.gate[k]]?.name ?? s.gate[k];
-  if (source !== 1 && holeOf[s.hole[k]]) said["no return because of"] = holeOf[s.hole[k]].name;
-  if (Number.isFinite(s.error[k])) said["error"] = percent(s.error[k]);
-  if (Number.isFinite(s.parallax_deg[k])) said.parallax = `${short(s.parallax_deg[k])}°`;
-  if (Number.isFinite(s.residual_px[k])) said["reprojection"] = `${short(s.residual_px[k])} px`;
-  facts($("sample-facts"), said);
+  const source = s.source[k], sampleFacts = { sample: k, source: ["none", "sensor", "recovered", "swept"][source] };
+  if (source) sampleFacts.depth = `${short(s.depth[k])} m ± ${short(s.sigma[k])} m (${percent(s.sigma[k] / s.depth[k])})`;
+  if (source) sampleFacts[source === 1 ? "confidence" : "score"] = s.score[k].toFixed(2);
+  if (source === 0) sampleFacts["no answer because of"] = gateOf[s.gate[k]]?.name ?? s.gate[k];
+  if (source !== 1 && holeOf[s.hole[k]]) sampleFacts["no return because of"] = holeOf[s.hole[k]].name;
+  if (Number.isFinite(s.error[k])) sampleFacts["error"] = percent(s.error[k]);
+  if (Number.isFinite(s.parallax_deg[k])) sampleFacts.parallax = `${short(s.parallax_deg[k])}°`;
+  if (Number.isFinite(s.residual_px[k])) sampleFacts["reprojection"] = `${short(s.residual_px[k])} px`;
+  facts($("sample-facts"), sampleFacts);
 }
 
 function tellColours() {
@@ -95,7 +95,7 @@ function tellColours() {
     const list = mode === "hole" ? [[DATA.colours.sensor, "sensor"], ...DATA.holes.filter((h) => seen("hole", h.code, (x) => x !== 1)).map((h) => [h.colour, h.name])]
       : mode === "gate" ? outcomes.filter((o) => shots.some((s) => s.counts[o.key])).map((o) => [o.colour, o.name])
       : mode === "picture" ? []
-      : [[DATA.colours.sensor, "sensor"], [DATA.colours.recovered, "recovered"], ...(hasSwept ? [[DATA.colours.swept, "swept"]] : []), ...(hasViews ? [[DATA.colours.silent, "silent (on the pictures)"]] : [])];
+      : [[DATA.colours.sensor, "sensor"], [DATA.colours.recovered, "recovered"], ...(hasSwept ? [[DATA.colours.swept, "swept"]] : []), ...(hasViews ? [[DATA.colours.silent, "no answer (in the images)"]] : [])];
     rows.push(element("ul", { class: "keys" }, ...list.map(([colour, name]) => key(colour, name))));
   }
   rows.push(element("p", { class: "grid-size" }, `grid: ${ground.metres} m`));
@@ -138,16 +138,16 @@ function play() {
   $("play").setAttribute("aria-pressed", String(Boolean(state.playing)));
 }
 
-// Turns of an overview: that is taken from which all is seen from nearest by, so that it fills the canvas.
+// Candidate directions of the overview: the one with the nearest camera that shows all points is used.
 const OVER = [-0.55, -0.9, 0.55, 0.9].flatMap((yaw) => [9, 13, 17].map((pitch) => [yaw, pitch / 20]));
 
-// At most 400 of many, evenly.
+// At most 400 items, evenly spaced.
 function everyFew(many) {
   const step = Math.max(1, Math.ceil(many.length / 400));
   return many.filter((_, k) => k % step === 0);
 }
 
-// The way the anchor looks, turned; then as far back as it takes to see nearly all points and the camera.
+// View along the reference camera, rotated, from a distance at which nearly all points and the camera are visible.
 function lookFrom(name) {
   const s = shots[state.now], l = layers[state.now], T = s.T_world_from_0, o = centre(T), ahead = axis(T, 2);
   if (!l) return;

@@ -1,4 +1,4 @@
-// Colours, the two pictures with their samples, the time line of gates and the curve of risk.
+// Colours, the two images with their samples, the timeline of gates, the risk-coverage curve.
 
 const hex = (text) => [1, 3, 5].map((k) => parseInt(text.slice(k, k + 2), 16) / 255);
 const css = (c) => `rgb(${c.map((v) => Math.round(255 * Math.max(0, Math.min(1, v)))).join(" ")})`;
@@ -17,7 +17,7 @@ function quantile(values, q) {
 const short = (v) => (!Number.isFinite(v) ? "–" : Math.abs(v) >= 100 ? v.toFixed(0) : Math.abs(v) >= 1 ? v.toFixed(2) : String(Number(v.toPrecision(2))));
 const percent = (v) => (Number.isFinite(v) ? `${(100 * v).toFixed(100 * v < 9.95 ? 1 : 0)} %` : "–");
 
-// A logarithmic or linear scale from numbers to a ramp.
+// Logarithmic or linear scale from values to a colour ramp.
 class Scale {
   constructor(values, ramp, { log = true, range = null, unit = "" } = {}) {
     [this.low, this.high] = range || [quantile(values, 0.02), quantile(values, 0.98)];
@@ -37,7 +37,7 @@ class Scale {
   }
 }
 
-// One of the two pictures of a pair, with what became of its samples.
+// One of the two images of a pair, with the outcome of its samples.
 class Picture {
   constructor(canvas, which) {
     Object.assign(this, { canvas, which, image: null });
@@ -46,7 +46,7 @@ class Picture {
 
   show(view, image) { Object.assign(this, { view, image }); }
 
-  // Picture pixels → canvas pixels; integer picture pixels are pixel centres.
+  // Image pixels → canvas pixels; integer image coordinates are pixel centres.
   at(u, v) { return [(u + 0.5) * this.scale, (v + 0.5) * this.scale]; }
 
   draw(shot, { colours, visible, tracks, depth, picked }) {
@@ -108,7 +108,7 @@ class Picture {
     }
   }
 
-  // The returns that the method saw, in the colours of their depth, each as large as its share of the picture.
+  // Input returns, coloured by depth, each as large as its part of the image.
   drawDepth(shot, scale) {
     const { view, context: pen } = this, size = this.scale * Math.sqrt((view.hw[0] * view.hw[1]) / Math.max(shot.seen.n, 4000)) * 1.1;
     for (let k = 0; k < shot.seen.n; k++) {
@@ -142,7 +142,7 @@ function element(name, attributes = {}, ...children) {
 
 const swatch = (colour) => { const i = element("i"); i.style.background = colour; return i; };
 
-// Stacked columns, one for each pair: what became of its samples.
+// Stacked columns, one per pair: outcomes of its samples.
 function drawGates(svg, shots, outcomes, now, choose) {
   const wide = 100 / shots.length;
   svg.setAttribute("viewBox", "0 0 100 40");
@@ -162,7 +162,7 @@ function drawGates(svg, shots, outcomes, now, choose) {
   if (shots.length > 1) svg.append(element("rect", { class: "now", x: now * wide, y: 0, width: wide, height: 40 }));
 }
 
-// Mean error of the surest answers against the share of the candidates answered; the dot is the threshold.
+// Mean error of the answers of highest score against the answered fraction of the candidates; the dot is the threshold.
 function drawRisk(svg, { scores, errors, candidates }, threshold) {
   const order = scores.map((_, k) => k).sort((a, b) => scores[b] - scores[a]);
   svg.toggleAttribute("hidden", order.length < 10);
@@ -181,7 +181,7 @@ function drawRisk(svg, { scores, errors, candidates }, threshold) {
   svg.replaceChildren(
     line(X(0), Y(0), X(1), Y(0)), line(X(0), Y(0), X(0), Y(top)),
     element("text", { x: 2, y: 16 }, percent(top / 1.15)), element("text", { x: 2, y: 82 }, "0"),
-    element("text", { x: X(1), y: 92, "text-anchor": "end" }, "share of the candidates answered → 100 %"),
+    element("text", { x: X(1), y: 92, "text-anchor": "end" }, "answered fraction of the candidates → 100 %"),
     element("text", { x: X(0) + 6, y: 16 }, "mean error"), element("path", { d: path }),
     ...(at ? [element("circle", { cx: X(at[0]), cy: Y(at[1]), r: 4.5 })] : []));
   svg.setAttribute("aria-label", at ? `Mean error ${percent(at[1])} where ${percent(at[0])} of the candidates are answered` : "Fewer than ten answers stay");

@@ -1,7 +1,7 @@
-"""A scene as a Rerun recording: for its viewer, or for an ``.rrd`` file where there is no screen.
+"""Exhibit -> Rerun recording, shown in its viewer or written as an ``.rrd`` file.
 
-Everything stands below ``world`` in metres, on two time lines: ``pair`` counts, ``time`` is the reference view's.
-``gates`` holds the counts of every pair, ``pair`` the same in words.
+All entities are below ``world`` in metres, on two timelines: ``pair``, a counter, and ``time``, that of the reference
+view. ``gates`` holds the counts of every pair as numbers, ``pair`` as text.
 """
 
 from __future__ import annotations
@@ -17,15 +17,19 @@ from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PairExhibit, PointC
 
 RRD_SUFFIXES = (".rrd",)
 
-#: Radii of points, m: a recovered point is as large as its sigma, within these limits.
-_MIN_RADIUS_M, _MAX_RADIUS_M = 0.004, 0.15
+#: Smallest radius of a point, m; the radius of a recovered point is its sigma.
+_MIN_RADIUS_M = 0.004
+#: Largest radius of a recovered point, m.
+_MAX_RADIUS_M = 0.15
 
-#: Classes of samples with a return of the sensor, and of swept pixels; other samples have the code of their gate.
-_SENSOR_CLASS, _SWEPT_CLASS = 100, 101
+#: Class of samples with a sensor return; other samples have the code of their gate.
+_SENSOR_CLASS = 100
+#: Class of swept pixels.
+_SWEPT_CLASS = 101
 
 
 def write_rrd(path: Path, scene: Exhibit) -> Path:
-    """Write the scene as an ``.rrd`` file.
+    """Write the exhibit as an ``.rrd`` file.
 
     Raises:
         ImportError: Rerun is not installed.
@@ -42,7 +46,7 @@ def write_rrd(path: Path, scene: Exhibit) -> Path:
 
 
 def spawn_viewer(scene: Exhibit) -> None:
-    """Show the scene in a viewer of its own.
+    """Open Rerun's viewer with the exhibit.
 
     Raises:
         ImportError: Rerun is not installed.
@@ -58,22 +62,22 @@ def _import_rerun() -> Any:
     try:
         import rerun  # noqa: PLC0415
     except ImportError as error:
-        found = "Rerun is not installed: pip install 'dhtorch[view]', or html=FILE for a page that needs nothing"
-        raise ImportError(f"view: {found}") from error
+        message = "Rerun is not installed: pip install 'dhtorch[view]', or use html=FILE for a page without it"
+        raise ImportError(f"view: {message}") from error
     return rerun
 
 
 def _make_blueprint() -> Any:
     from rerun import blueprint as b  # noqa: PLC0415
 
-    space = b.Spatial3DView(origin="/world", name="points", contents=["+ /world/**", "- /world/anchor/depth/**"])
+    space = b.Spatial3DView(origin="/world", name="points", contents=["+ /world/**", "- /world/reference/depth/**"])
     words_ = b.Tabs(b.TextDocumentView(origin="/pair", name="pair"), b.TextDocumentView(origin="/about", name="about"))
     pictures = b.Vertical(
         b.Tabs(
-            b.Spatial2DView(origin="/world/anchor/picture", name="anchor"),
-            b.Spatial2DView(origin="/world/anchor/depth", name="sensor depth"),
+            b.Spatial2DView(origin="/world/reference/picture", name="reference view"),
+            b.Spatial2DView(origin="/world/reference/depth", name="sensor depth"),
         ),
-        b.Spatial2DView(origin="/world/other/picture", name="other view, tracks"),
+        b.Spatial2DView(origin="/world/source/picture", name="source view, tracks"),
         words_,
     )
     left = b.Vertical(space, b.TimeSeriesView(origin="/gates", name="gates"), row_shares=[3, 1])
@@ -90,8 +94,8 @@ def _log_exhibit(rr: Any, stream: Any, scene: Exhibit) -> None:
     stream.log("about", rr.TextDocument(about), static=True)
     if scene.path is not None:
         stream.log("world/path", rr.LineStrips3D([scene.path], colors=parse_rgb(SILENT)), static=True)
-    for name, (said, colour) in _describe_outcomes().items():
-        stream.log(f"gates/{name.lower()}", rr.SeriesLines(names=said, colors=colour), static=True)
+    for name, (label, colour) in _describe_outcomes().items():
+        stream.log(f"gates/{name.lower()}", rr.SeriesLines(names=label, colors=colour), static=True)
     swept = any(len(shot.swept.xyz) for shot in scene.shots)
     for k, shot in enumerate(scene.shots):
         stream.set_time("pair", sequence=k)
@@ -106,10 +110,10 @@ def _log_exhibit(rr: Any, stream: Any, scene: Exhibit) -> None:
 
 
 def _describe_outcomes() -> dict[str, tuple[str, tuple[int, int, int]]]:
-    """Outcome → its name and colour."""
-    found = {"SENSOR": ("sensor", SENSOR), "ANSWER": ("recovered", RECOVERED)}
-    found |= {names(Gate)[code]: (words(names(Gate)[code]), colour) for code, colour in GATE_COLOURS.items()}
-    return {name: (said, parse_rgb(colour)) for name, (said, colour) in found.items()}
+    """Outcome → printed name and colour."""
+    outcomes = {"SENSOR": ("sensor", SENSOR), "ANSWER": ("recovered", RECOVERED)}
+    outcomes |= {names(Gate)[code]: (words(names(Gate)[code]), colour) for code, colour in GATE_COLOURS.items()}
+    return {name: (label, parse_rgb(colour)) for name, (label, colour) in outcomes.items()}
 
 
 def _log_text(rr: Any, stream: Any, shot: PairExhibit) -> None:
@@ -117,7 +121,7 @@ def _log_text(rr: Any, stream: Any, shot: PairExhibit) -> None:
     for name, count in counts.items():
         stream.log(f"gates/{name.lower()}", rr.Scalars(count))
     lines = [f"pair {shot.label}", *(f"{k}: {v}" for k, v in shot.facts.items()), ""]
-    lines += [f"{counts[name]:6d}  {said}" for name, (said, _) in _describe_outcomes().items() if counts[name]]
+    lines += [f"{counts[name]:6d}  {label}" for name, (label, _) in _describe_outcomes().items() if counts[name]]
     stream.log("pair", rr.TextDocument("\n".join(lines)))
 
 
@@ -125,16 +129,16 @@ def _log_points(rr: Any, stream: Any, shot: PairExhibit) -> None:
     s, T = shot.samples, shot.T_world_from_0
     answer = s["source"] == Source.RECOVERED
     xyz, sigma = s["xyz"][answer], s["sigma"][answer]
-    kept = {name: s[name][answer] for name in ("score", "sigma", "hole")}
+    values = {name: s[name][answer] for name in ("score", "sigma", "hole")}
     radii = sigma.clip(_MIN_RADIUS_M, _MAX_RADIUS_M)
     classes = np.full(len(xyz), Gate.ANSWER, np.uint16)
     stream.log(
         "world/map/recovered",
         rr.Points3D(_transform_points(T, xyz), radii=radii, class_ids=classes),
-        rr.AnyValues(**kept),
+        rr.AnyValues(**values),
     )
-    share = (sigma / np.maximum(s["depth"][answer], 1e-9)).clip(0, 0.9)[:, None]
-    bars = np.stack((_transform_points(T, xyz * (1 - share)), _transform_points(T, xyz * (1 + share))), 1)
+    ratio = (sigma / np.maximum(s["depth"][answer], 1e-9)).clip(0, 0.9)[:, None]
+    bars = np.stack((_transform_points(T, xyz * (1 - ratio)), _transform_points(T, xyz * (1 + ratio))), 1)
     stream.log("world/map/sigma", rr.LineStrips3D(bars, colors=[*parse_rgb(RECOVERED), 120]))
     sensed = s["source"] == Source.SENSOR
     seen = shot.seen if len(shot.seen.xyz) else PointCloud(s["xyz"][sensed], s["rgb"][sensed])
@@ -153,27 +157,27 @@ def _log_swept(rr: Any, stream: Any, shot: PairExhibit) -> None:
 
 def _log_views(rr: Any, stream: Any, shot: PairExhibit, view_0: ExhibitView, view_1: ExhibitView) -> None:
     s = shot.samples
-    _log_camera(rr, stream, "anchor", shot.T_world_from_0, view_0)
+    _log_camera(rr, stream, "reference", shot.T_world_from_0, view_0)
     if shot.depth_image is not None:
         (h, w), m = shot.depth_image.depth.shape, shot.depth_image
         c = [m.c[0] + 0.5, m.c[1] + 0.5]
-        stream.log("world/anchor/depth", rr.Pinhole(focal_length=m.f, principal_point=c, width=w, height=h))
-        stream.log("world/anchor/depth", rr.DepthImage(m.depth, meter=1.0, colormap=DEPTH_CMAP))
+        stream.log("world/reference/depth", rr.Pinhole(focal_length=m.f, principal_point=c, width=w, height=h))
+        stream.log("world/reference/depth", rr.DepthImage(m.depth, meter=1.0, colormap=DEPTH_CMAP))
     groups = {"silent": Source.NONE, "sensor": Source.SENSOR, "recovered": Source.RECOVERED}
     classes = np.where(s["source"] == Source.SENSOR, _SENSOR_CLASS, s["gate"]).astype(np.uint16)
     at_0, at_1 = _to_jpeg_pixels(view_0, s["uv_0"]), _to_jpeg_pixels(view_1, s["uv_1"])
     for name, code in groups.items():
-        here = s["source"] == code
-        points = rr.Points2D(at_0[here], class_ids=classes[here], radii=1.5 if code == Source.NONE else 2.5)
-        stream.log(f"world/anchor/picture/samples/{name}", points)
+        of_source = s["source"] == code
+        points = rr.Points2D(at_0[of_source], class_ids=classes[of_source], radii=1.5 if code == Source.NONE else 2.5)
+        stream.log(f"world/reference/picture/samples/{name}", points)
     if shot.T_world_from_1 is not None:
-        _log_camera(rr, stream, "other", shot.T_world_from_1, view_1)
+        _log_camera(rr, stream, "source", shot.T_world_from_1, view_1)
     else:
-        stream.log("world/other", rr.Clear(recursive=True))
-    found = s["tracked"]
-    strips = np.stack((_to_jpeg_pixels(view_1, s["uv_0"])[found], at_1[found]), 1)
-    stream.log("world/other/picture/tracks", rr.LineStrips2D(strips, class_ids=classes[found]))
-    stream.log("world/other/picture/samples", rr.Points2D(at_1[found], class_ids=classes[found], radii=2.0))
+        stream.log("world/source", rr.Clear(recursive=True))
+    tracked = s["tracked"]
+    strips = np.stack((_to_jpeg_pixels(view_1, s["uv_0"])[tracked], at_1[tracked]), 1)
+    stream.log("world/source/picture/tracks", rr.LineStrips2D(strips, class_ids=classes[tracked]))
+    stream.log("world/source/picture/samples", rr.Points2D(at_1[tracked], class_ids=classes[tracked], radii=2.0))
 
 
 def _log_camera(rr: Any, stream: Any, name: str, T: np.ndarray, view: ExhibitView) -> None:
@@ -188,7 +192,7 @@ def _log_camera(rr: Any, stream: Any, name: str, T: np.ndarray, view: ExhibitVie
 
 
 def _to_jpeg_pixels(view: ExhibitView, uv: np.ndarray) -> np.ndarray:
-    """Pixels of the full picture in those of the JPEG, where (0, 0) is the corner of the first."""
+    """Pixels of the full image -> pixels of the JPEG, with (0, 0) at the corner of the first pixel."""
     (h, w), (H, W) = view.jpeg_hw, view.hw
     return (uv + 0.5) * np.array([w / W, h / H], uv.dtype)
 

@@ -1,4 +1,4 @@
-// Points in space: small matrices, shaders, and one object that draws layers of points, lines and pictures with WebGL.
+// 3D view: small matrices, shaders, and one object that draws layers of points, lines and images with WebGL.
 // Matrices are column-major arrays of 16; a pose is a row-major 3×4 that maps camera coordinates to the world.
 
 const POINT_VERTEX = `
@@ -25,7 +25,7 @@ void main() {
   tint = colour;
   dense = score < threshold ? -1.0 : opacity;
 }`;
-// Opacity as a share of the pixels that are drawn: no order of the triangles has to be kept.
+// Opacity by drawing a fraction of the pixels: triangles need no sorting.
 const SURFACE_FRAGMENT = `
 precision mediump float; varying vec3 tint; varying float dense;
 void main() {
@@ -78,7 +78,7 @@ function lookingFrom(eye, ahead, up) {
   return [x[0], y[0], z[0], 0, x[1], y[1], z[1], 0, x[2], y[2], z[2], 0, -dot(x, eye), -dot(y, eye), -dot(z, eye), 1];
 }
 
-// The eye goes round a target; yaw 0 and pitch 0 look along the first camera.
+// Orbit camera around a target; yaw 0 and pitch 0 look along the first camera.
 class Eye {
   constructor(T) {
     [this.right, this.down, this.ahead] = [0, 1, 2].map((k) => axis(T, k));
@@ -97,7 +97,7 @@ class Eye {
     this.pitch = Math.max(-1.55, Math.min(1.55, this.pitch + dy));
   }
 
-  // Moves the target across the picture, in shares of the picture's height.
+  // Moves the target across the view, in fractions of its height.
   shift(dx, dy) {
     const x = unit(cross(this.direction, this.down.map((v) => -v))), y = cross(x, this.direction);
     const reach = 2 * this.distance * Math.tan(this.fov / 2);
@@ -106,13 +106,13 @@ class Eye {
 
   zoom(factor) { this.distance = Math.max(1e-3, Math.min(1e5, this.distance * factor)); }
 
-  // Moves target and distance until nearly all of the points fill the picture, the last one with room around it.
+  // Moves target and distance until nearly all points fill the view, with a margin around the last one.
   fit(points, aspect, room) {
     const d = this.direction, x = unit(cross(d, this.down.map((v) => -v))), y = cross(x, d), t = Math.tan(this.fov / 2) * 0.92;
     const own = points[points.length - 1], span = (at, mine, r) => [Math.min(quantile(at, 0.01), mine - r), Math.max(quantile(at, 0.99), mine + r)];
     this.target = [0, 1, 2].map((k) => quantile(points.map((p) => p[k]), 0.5));
     this.distance = quantile(points.map((p) => Math.hypot(...sub(p, this.target))), 0.98) / t;
-    for (let turn = 0; turn < 30; turn++) { // what lies near moves more on the screen than what lies far: step by step
+    for (let turn = 0; turn < 30; turn++) { // near points move more on the screen than far ones: iterate
       const eye = this.position, seen = points.map((p) => sub(p, eye)).map((p) => [dot(p, x), dot(p, y), Math.max(dot(p, d), 0.05 * this.distance)]);
       const [ox, oy, oz] = seen[seen.length - 1], margin = room / oz;
       const [left, right] = span(seen.map(([a, , c]) => a / c), ox / oz, margin), [low, high] = span(seen.map(([, b, c]) => b / c), oy / oz, margin);
@@ -165,7 +165,7 @@ class Space {
     return made;
   }
 
-  // {position, colour, score} → buffers; without scores nothing is hidden by a threshold.
+  // {position, colour, score} → buffers; without scores no threshold applies.
   triangles(index, opacity) {
     const gl = this.gl, made = gl.createBuffer();
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, made);
@@ -262,7 +262,7 @@ class Space {
     gl.drawArrays(gl.TRIANGLES, 0, 6);
   }
 
-  // Where a point of the world lies on the canvas, in CSS pixels; null behind the eye.
+  // World point → position on the canvas, CSS pixels; null behind the camera.
   onScreen(p) {
     const m = this.matrix, w = m[3] * p[0] + m[7] * p[1] + m[11] * p[2] + m[15];
     if (w <= 0) return null;

@@ -1,7 +1,6 @@
-"""What is said of the depth of a data set, judged or anchored, as one HTML page that needs nothing beside itself:
-worst first.
+"""HTML page of validated or aligned depth maps: summary, table of all frames, figures; worst first.
 
-Names come from files of others: they are escaped. Pictures are inside the page.
+The page is self-contained. Names from files are untrusted and escaped.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from dhtorch.runtime import storage
 from dhtorch.viz.plots.document import build_document
 from dhtorch.viz.plots.markup import Markup, encode_png_uri, make_tag
 
-#: Under the numbers of a judged data set.
-_STATES_NOTE = "Green is consistent, red is wrong; of all else nothing can be known."
+#: Note on the page of a validated data set.
+_STATES_NOTE = "Green is consistent, red is wrong, all else cannot be checked."
 
 
 @dataclass(frozen=True)
@@ -35,10 +34,10 @@ def _build_page(
     frames: Sequence[ValidatedFrame],
     *,
     failed: Sequence[str] = (),
-    word: str = "judge",
+    word: str = "validate",
     note: str = _STATES_NOTE,
 ) -> str:
-    """The page: what is said of the whole, a table of all frames in the order given, and the pictures."""
+    """The page: summary lines, a table of all frames in the given order, and the figures."""
     top = [
         make_tag("h1", title),
         *(make_tag("p", text) for text in said),
@@ -78,7 +77,7 @@ def write_validation_page(path: Path, title: str, **shown: Any) -> Path:
 
 
 def format_estimate(number: Mapping[str, float | None] | None, digits: int = 3) -> str:
-    """A number with its interval, as a table shows it; – where it cannot be known."""
+    """Value with its interval -> table cell; – for an unknown value."""
     if number is None or number.get("value") is None:
         return "–"
     value, low, high = (number[name] for name in ("value", "low", "high"))

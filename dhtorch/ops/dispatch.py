@@ -1,0 +1,117 @@
+"""The dispatch: an operator is a torch function, its reference, with an optional compiled kernel of the same result.
+
+    def _scale_kernel(x, *, factor):
+        out = torch.empty_like(x)
+        torch.ops.dhtorch.scale.default(x, out, factor)
+        return out
+
+    @operator(kernel=_scale_kernel, dtypes={"x": torch.float32})
+    def scale(x, *, factor):
+        return x * factor
+
+``scale(x, factor=2.0)`` runs the kernel where the library is in use (:func:`dhtorch.ops.loader.load`, or DHTORCH_OPS=1)
+and all tensors are eligible, else the reference. The tensors of an operator are its positional parameters, its options
+are keywords. A kernel allocates the outputs and calls the C++ operator that ``TORCH_LIBRARY`` registers in ``csrc``; it
+has no condition of its own.
+
+Eligible are plain contiguous CPU tensors of the stated dtypes that are not being differentiated or transformed: no
+gradient (backward or forward), no ``torch.compile``, no ``torch.func``.
+"""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable, Collection, Mapping
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from dhtorch.ops import loader
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+#: A tensor parameter's dtypes, and whether it may have any strides.
+_Parameter = tuple[tuple[torch.dtype, ...], bool]
+
+
+def operator(
+    *,
+    kernel: Callable[..., Any],
+    dtypes: Mapping[str, torch.dtype | tuple[torch.dtype, ...]],
+    any_layout: Collection[str] = (),
+    when: Callable[..., bool] | None = None,
+) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorator: a torch function -> the same function, dispatched to ``kernel`` for eligible arguments.
+
+    Args:
+        kernel: called with the function's own arguments; returns what the function returns.
+        dtypes: dtypes that the kernel reads, for each positional parameter of the function, or each of its
+            ``*tensors``. Such a parameter is a tensor or None.
+        any_layout: parameters that need not be contiguous.
+        when: further condition on shapes and options, called with the function's own arguments.
+
+    Raises:
+        TypeError: ``dtypes`` does not name the positional parameters.
+    """
+
+    def decorate(reference: Callable[P, T]) -> Callable[P, T]:
+        signature = inspect.signature(reference)
+        names = [name for name, p in signature.parameters.items() if p.kind is p.POSITIONAL_OR_KEYWORD]
+        names = names or list(dtypes)  # *tensors
+        if names != list(dtypes) or not set(any_layout) <= set(names):
+            raise TypeError(f"{reference.__name__}: found dtypes of {', '.join(dtypes)}, expected {', '.join(names)}")
+        parameters = tuple(
+            ((found,) if isinstance(found, torch.dtype) else found, name in any_layout)
+            for name, found in dtypes.items()
+        )
+
+        @wraps(reference)
+        def dispatched(*args: P.args, **kwargs: P.kwargs) -> T:
+            if not is_in_use():
+                return reference(*args, **kwargs)
+            if len(args) < len(names):  # tensors given by keyword
+                bound = signature.bind(*args, **kwargs)
+                bound.apply_defaults()
+                args, kwargs = bound.args, bound.kwargs  # type: ignore[assignment]
+            if can_dispatch(args, parameters) and (when is None or when(*args, **kwargs)):
+                return kernel(*args, **kwargs)
+            return reference(*args, **kwargs)
+
+        return dispatched
+
+    return decorate
+
+
+def is_in_use() -> bool:
+    """Whether kernels may run at all: the library is loaded, or DHTORCH_OPS=1, and nothing traces this code.
+
+    ``torch.autograd.forward_ad`` keeps tangents within plain tensors, so that none are eligible while it is active.
+
+    Raises:
+        FileNotFoundError: DHTORCH_OPS=1, and nothing was compiled for this torch and processor.
+    """
+    if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
+        return False
+    if not loader.is_loaded():
+        if os.environ.get(loader.SWITCH, "") in ("", "0"):
+            return False
+        loader.load()
+    return True
+
+
+def can_dispatch(tensors: tuple[Any, ...], parameters: tuple[_Parameter, ...]) -> bool:
+    """Whether tensors may be handed to a kernel with such parameters: see the module's last paragraph."""
+    graph = torch.is_grad_enabled()
+    for x, (dtypes, any_layout) in zip(tensors, parameters, strict=False):
+        if x is None:
+            continue
+        if type(x) is not Tensor or x.dtype not in dtypes or not x.is_cpu or not (any_layout or x.is_contiguous()):
+            return False
+        if (graph and x.requires_grad) or x.is_neg() or torch._C._functorch.is_functorch_wrapped_tensor(x):
+            return False
+    return True

@@ -1,0 +1,24 @@
+"""What a LeRobot data set on disk holds: its files, the rows of its tables, the maps in them."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from pyarrow import parquet
+
+
+def read_files(root):
+    """{path below the folder: content} of all files."""
+    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(Path(root).rglob("*")) if p.is_file()}
+
+
+def read_rows(root):
+    """The rows of all tables of a data set, in order."""
+    tables = sorted((Path(root) / "data").rglob("*.parquet"))
+    return [row for table in tables for row in parquet.read_table(table).to_pylist()]
+
+
+def decode_map(row, key):
+    """The map (H, W) that is stored as a picture in a row."""
+    return np.array(Image.open(io.BytesIO(row[key]["bytes"])))
