@@ -1,8 +1,8 @@
-"""Records: frozen dataclasses of tensors that torch sees as trees.
+"""Records: frozen dataclasses of tensors, registered as pytrees.
 
 A record has shared leading (batch) dimensions, is never changed in place, and is an ordinary pytree: it passes
-through ``torch.func``, ``torch.compile(fullgraph=True)``, pickling and data-loader workers. A field that is absent
-is ``None``. There is no tensor subclass and there are no operators.
+through ``torch.func``, ``torch.compile(fullgraph=True)``, pickling and data-loader workers. An absent field is
+``None``. There is no tensor subclass and there are no operators.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from torch.utils import _pytree as pytree
 R = TypeVar("R", bound="Record")
 
 #: Field metadata: the dtype of this field is part of its meaning (codes, time stamps);
-#: ``.to(dtype)`` leaves it alone.
+#: ``.to(dtype)`` does not change it.
 KEEP_DTYPE = {"keep_dtype": True}
 
 
 class Record:
-    """What every record can do; made by :func:`record`, never instantiated itself."""
+    """Base class of all records, which are declared with :func:`record`; never instantiated itself."""
 
     def map(self, fn: Callable[[Tensor], Tensor]) -> Self:
         """Apply ``fn`` to every tensor, nested records included; ``None`` stays ``None``."""
@@ -50,7 +50,7 @@ class Record:
         return self.map(lambda x: x.pin_memory())
 
     def detach(self) -> Self:
-        """The same values without a graph."""
+        """A copy detached from the autograd graph."""
         return self.map(lambda x: x.detach())
 
     def replace(self, **changes: Any) -> Self:
@@ -86,9 +86,9 @@ def collate(records: Iterable[R]) -> R:
 
 
 def chunked_apply(fn: Callable[..., R], size: int, *batch: Any) -> R:
-    """``fn(*batch)`` for tensors and records of any batch, at most ``size`` of its items at a time; no ``None``.
+    """``fn(*batch)`` computed in chunks of at most ``size`` batch items of tensors and records, none of them ``None``.
 
-    ``fn`` must treat every item alike. Gradient: that of ``fn``.
+    ``fn`` must process every item independently. Gradient: that of ``fn``.
     """
     count = len(_first(batch[0]))
     if count <= size:
@@ -97,11 +97,11 @@ def chunked_apply(fn: Callable[..., R], size: int, *batch: Any) -> R:
 
 
 def _first(x: Any) -> Tensor:
-    """The first tensor of a tensor or record, without a walk through all of it."""
+    """The first tensor in a tensor or record, without traversing all fields."""
     while isinstance(x, Record):
         x = next(value for _, value in _items(x) if value is not None)
-    found: Tensor = x
-    return found
+    tensor: Tensor = x
+    return tensor
 
 
 def _items(rec: Record) -> list[tuple[str, Any]]:

@@ -1,4 +1,4 @@
-"""The faults that ``benchmarks/mutants.py`` plants: each fits today's code, and the tests that are to notice exist."""
+"""The faults that ``benchmarks/mutants.py`` plants: each fits the code once, and the tests named for it exist."""
 
 import subprocess
 import sys
@@ -30,7 +30,7 @@ def test_no_fault_is_planted_twice_and_no_table_hides_another():
     assert len(set(planted)) == len(planted), [fault for fault in planted if planted.count(fault) > 1]
     for name in ("FAULTS", "TESTS"):
         modules = [module for part in PARTS for module in getattr(part, name)]
-        assert len(set(modules)) == len(modules), "two parts speak of one module"
+        assert len(set(modules)) == len(modules), "two parts have one module"
 
 
 def test_every_module_with_a_fault_names_tests_that_exist():

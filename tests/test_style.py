@@ -1,4 +1,4 @@
-"""Habits of writing that no linter knows: one statement a line, and arguments that say what they are."""
+"""Style rules beyond the linter: one statement a line, and few positional arguments."""
 
 import ast
 from pathlib import Path
@@ -8,11 +8,11 @@ import pytest
 import dhtorch
 
 ROOT = Path(dhtorch.__file__).parent
-#: Not asked yet: parsers of files, figures, the pages of the report, and two modules beside.
+#: Not checked: parsers of files, figures, the pages of the report, and two more modules.
 ELSEWHERE = ("data/", "viz/plots", "experiments/report/", "experiments/protocol.py", "geometry/epipolar.py")
 FILES = [name for p in sorted(ROOT.rglob("*.py")) if not (name := p.relative_to(ROOT).as_posix()).startswith(ELSEWHERE)]
 
-#: Most arguments that a call passes by their place.
+#: Most positional arguments of a call.
 MOST = 6
 
 #: Functions that take any number of like things, or the fields of a format.
@@ -20,7 +20,7 @@ VARIADIC = {"first_reason", "_bits", "pack", "min", "max", "zip", "chain"}
 
 
 def shape(node):
-    """What an expression is made of, whatever names, numbers and operators are in it."""
+    """The structure of an expression without its names, numbers and operators."""
     if isinstance(node, (ast.operator, ast.unaryop, ast.cmpop, ast.boolop, ast.expr_context)):
         return ""
     if isinstance(node, ast.UnaryOp):
@@ -33,7 +33,7 @@ def shape(node):
 
 
 def packed(statement):
-    """Whether an assignment does two unlike pieces of work at once."""
+    """Whether an assignment makes two unlike calls at once."""
     if not (isinstance(statement, ast.Assign) and isinstance(statement.value, ast.Tuple)):
         return False
     values = statement.value.elts

@@ -189,7 +189,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_share_memory", "counts.share_memory_()", "counts"),
     ],
     "transforms.extend_depth": [
-        ("_sample_keys", "torch.full_like(hole, Gate.NO_TRACK)", "torch.full_like(hole, Gate.ANSWER)"),
         ("ExtendDepth.__init__", "method = get_method(method, n)", "method = get_method(method, None)"),
         ("ExtendDepth.forward", "torch.is_grad_enabled() and get_worker_info() is None", "torch.is_grad_enabled()"),
         (

@@ -1,4 +1,4 @@
-"""Calibrations that travel with the package, one JSON file each, and files of the user's own.
+"""Loading and saving of score calibrations: those shipped with the package, one JSON file each, and the user's own.
 
     calibration = dhtorch.calibration.load_calibration("map")
     score = functools.partial(rank_by_error, recalibration=calibration.probability)
@@ -16,17 +16,17 @@ from torch import Tensor
 
 from dhtorch.calibration.score_calibration import Calibration, parse_calibration
 
-#: What a file that is kept must say of its origin.
+#: Required entries of a saved calibration's ``provenance``.
 _REQUIRED_PROVENANCE = ("method", "scenes")
 
 
 def list_calibrations() -> list[str]:
-    """Names of the calibrations that travel with the package."""
+    """Names of the calibrations shipped with the package."""
     return sorted(file.stem for file in Path(__file__).parent.glob("*.json"))
 
 
 def load_calibration(name: str | Path) -> Calibration:
-    """The calibration of that name, or in that file.
+    """Load a calibration by its name or from a file.
 
     Args:
         name: one of :func:`list_calibrations`, or the path of a ``.json`` file.
@@ -44,7 +44,7 @@ def load_calibration(name: str | Path) -> Calibration:
 
 
 def load_probability(name: str | Path) -> Callable[[Tensor], Tensor]:
-    """Only the table from score to the probability of a good answer: what ``rank_by_error(recalibration=)`` takes."""
+    """The table from score to the probability of a good answer alone, for ``rank_by_error(recalibration=)``."""
     return load_calibration(name).probability
 
 
@@ -52,7 +52,7 @@ def save_calibration(calibration: Calibration, path: str | Path) -> Path:
     """Write a calibration as JSON.
 
     Raises:
-        ValueError: its provenance does not say which method and scenes it was fitted on.
+        ValueError: its provenance lacks the method or the scenes that it was fitted on.
     """
     for field in _REQUIRED_PROVENANCE:
         if not calibration.provenance.get(field):

@@ -1,7 +1,7 @@
-"""Monotone functions fitted to points: a table by isotonic regression, and the two-parameter sigmoid it has to beat.
+"""Monotone functions fitted to points: a table by isotonic regression, and a two-parameter sigmoid as its baseline.
 
-Both are callables on tensors of any shape, so a fitted one can stand in a scoring seat: they follow the dtype and
-device of their argument, have gradients, and what they say about one element does not depend on the others.
+Both are callables on tensors of any shape, usable in a scoring stage: they follow the dtype and device of their
+argument, have gradients, and are elementwise.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.pytree import Record, record
 
-#: Rise given to the two end blocks of a table, where isotonic regression is flat, so that no order is lost there.
+#: Largest rise of the two end blocks of a table, where isotonic regression is flat, so that no order is lost there.
 _MAX_END_RISE = 1e-3
 
-#: Pull of the sigmoid towards the identity beside a log loss of total weight 1: keeps separable data finite and is
-#: otherwise too small to see.
+#: Weight of the ridge term towards the identity, beside a log loss of total weight 1: keeps the sigmoid of separable
+#: data finite and is otherwise negligible.
 _RIDGE_WEIGHT = 1e-6
 
-#: A probability is kept this far from 0 and 1 before its logit is taken.
+#: Least distance of a probability from 0 and 1 before its logit is taken.
 _LOGIT_MARGIN = 1e-6
 
 
 @record
 class MonotoneTable(Record):
-    """A monotone function by its corners: straight between them, constant beyond."""
+    """A monotone function as a table of corners: linear between them, constant beyond."""
 
     x: Tensor  # (k,) strictly rising
     y: Tensor  # (k,) rising or falling
@@ -38,7 +38,7 @@ class MonotoneTable(Record):
             return values[0] + 0 * x
         right = torch.searchsorted(corners, x.detach().contiguous(), right=True).clamp(1, corners.numel() - 1)
         x0, x1, y0, y1 = corners[right - 1], corners[right], values[right - 1], values[right]
-        width = x1 - x0  # zero where a short float cannot tell two corners apart
+        width = x1 - x0  # zero if two corners are equal in the dtype of x
         share = (x - x0) / torch.where(width > 0, width, torch.ones_like(width))
         return y0 + share.clamp(0, 1) * (y1 - y0)
 
@@ -51,7 +51,7 @@ class Sigmoid(Record):
     offset: Tensor  # ()
 
     def __call__(self, p: Tensor) -> Tensor:
-        """The function at ``p`` (any shape), elementwise; arguments outside (0, 1) count as its ends."""
+        """The function at ``p`` (any shape), elementwise; arguments outside (0, 1) are clamped to its ends."""
         return pad_elementwise(torch.sigmoid, self.slope.to(p) * _logit(p) + self.offset.to(p))
 
 
@@ -64,19 +64,19 @@ def fit_isotonic(
     min_share: float = 0.0,
     ends: tuple[float, float] | None = None,
 ) -> MonotoneTable:
-    """The monotone function with the least weighted square error, made continuous.
+    """Isotonic regression of points (x, y) as a continuous table: least weighted square error.
 
-    Pool-adjacent-violators gives blocks of equal value. The table runs straight from the middle of one block to the
-    middle of the next, so that unequal arguments keep unequal values; the outermost blocks get a slope too small to
-    matter for the same reason.
+    Pool-adjacent-violators gives blocks of equal value. The table is linear from the middle of one block to the middle
+    of the next, so that unequal arguments have unequal values; for the same reason the outermost blocks get a
+    negligible slope.
 
     Args:
         x, y: points; points of equal x share one value.
         weight: of each; None = equal.
-        rising: the function rises; otherwise it falls.
-        min_share: blocks with a smaller share of the weight are joined to a neighbour: one or two lucky points at an
-            end would otherwise promise certainty.
-        ends: where the table begins and ends; None = at the smallest and largest x.
+        rising: whether the function rises or falls.
+        min_share: blocks with a smaller fraction of the weight are merged with a neighbour: one or two good points at
+            an end would otherwise give a probability of 1.
+        ends: first and last argument of the table; None = the smallest and largest x.
 
     Raises:
         ValueError: unequal lengths, or no point with weight.
@@ -125,11 +125,11 @@ def fit_platt(
     *,
     steps: int = 100,
 ) -> Sigmoid:
-    """The sigmoid of logit(p) with the least weighted log loss: the simple control beside :func:`fit_isotonic`.
+    """Platt scaling: the sigmoid of logit(p) with the least weighted log loss, a baseline for :func:`fit_isotonic`.
 
     Args:
         p: claimed probability, or a score in [0, 1].
-        good: what happened.
+        good: whether the answer was good.
         weight: of each; None = equal.
         steps: of Newton's method, halved where they overshoot.
 
@@ -189,7 +189,7 @@ def _pool_blocks(y: list[float], weight: list[float], at: list[float]) -> list[_
 
 
 def _join_light_blocks(blocks: list[_Block], least: float) -> list[_Block]:
-    """Neighbours joined until every block weighs ``least``; values still rise, being means of rising values."""
+    """Blocks merged with their neighbours until each weighs ``least``; values still rise, as means of rising values."""
     joined: list[_Block] = []
     for block in blocks:
         light = bool(joined) and joined[-1][1] < least
@@ -201,7 +201,7 @@ def _join_light_blocks(blocks: list[_Block], least: float) -> list[_Block]:
 
 
 def _make_table(x: list[float], y: list[float], low: float, high: float) -> MonotoneTable:
-    """Corners at the middles of blocks and at both ends, the end blocks tilted inwards."""
+    """Table with corners at the middles of blocks and at both ends, the end blocks sloped inwards."""
     corners = list(zip(x, y, strict=True))
     if len(x) > 1:
         left, right = low < x[0], high > x[-1]
@@ -213,7 +213,7 @@ def _make_table(x: list[float], y: list[float], low: float, high: float) -> Mono
 
 
 def _end_rise(step: float) -> float:
-    """A small part of the step to the next block, in its direction."""
+    """Rise of an end block: a quarter of the ``step`` to the next block, at most ``_MAX_END_RISE`` in size."""
     return max(-_MAX_END_RISE, min(_MAX_END_RISE, step / 4))
 
 

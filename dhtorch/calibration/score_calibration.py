@@ -1,8 +1,7 @@
-"""What scores and sigmas turned out to be worth on some scenes, so that they can be believed on others.
+"""Calibration of scores and sigmas: fitted on scenes with ground truth, applied to the estimates of others.
 
-A calibration is fitted on scenes with truth and travels as a small text: two tables of the score (probability of a
-good answer, error to expect), a sigmoid as the simple control, a correction of sigma, and thresholds chosen by the
-plug-in control, beside a note of where all that comes from.
+A calibration is stored as a small JSON text: two tables of the score (probability of a good answer, expected error), a
+sigmoid as a simple baseline, a correction of sigma, thresholds chosen by plug-in risk control, and its provenance.
 """
 
 from __future__ import annotations
@@ -29,30 +28,30 @@ _SCHEMA_VERSION = 1
 
 Answers = TypeVar("Answers", Points, DepthMap)
 
-#: Share of the fitting scenes' weight on which a step of a table must rest.
+#: Least fraction of the fitting scenes' weight in a step of a table.
 _MIN_STEP_SHARE = 0.02
 
 #: Probability that a normal variable lies within one standard deviation.
 _ONE_SIGMA_SHARE = 0.6826894921370859
 
-#: Share asked within two: less than a normal variable's 95 %, because errors have heavier tails and a few gross ones
-#: would widen every sigma. A little more than nine in ten, so that nine in ten may be promised in other rooms.
+#: Fraction required within two standard deviations: less than the 95 % of a normal variable, because errors have
+#: heavier tails and a few gross ones would widen every sigma; slightly above 90 %, to hold 90 % in other rooms.
 _TWO_SIGMA_SHARE = 0.91
 
-#: Targets, in per cent, for which thresholds are kept.
+#: Target mean errors, in per cent, for which thresholds are stored.
 _TARGET_ERRORS_PERCENT = (5, 10, 20)
 
 
-#: Floors of sigma tried, as shares of the depth.
+#: Floors of sigma tried, as fractions of the depth.
 _SIGMA_FLOORS_REL = (0.0, *(1e-4 * 10 ** (k / 10) for k in range(31)))
 
 
 @dataclass(frozen=True)
 class SigmaModel:
-    """A stated sigma made honest: scaled, and never below a share of the depth."""
+    """Correction of a stated sigma: a scale, and a floor as a fraction of the depth added in quadrature."""
 
-    scale: float  # noise that was stated too small, or shared
-    floor: float  # what no stated noise knows: lens, calibration, the place that a patch stands for
+    scale: float  # of the stated sigma; for noise stated too small, or common to all points
+    floor: float  # errors not in any stated noise: lens, calibration, the point that a patch represents
 
     def __call__(self, sigma: Tensor, depth: Tensor) -> Tensor:
         """sqrt((scale · sigma)² + (floor · depth)²), in the unit of both."""
@@ -61,17 +60,17 @@ class SigmaModel:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a score and a sigma mean, as measured on the scenes named in ``provenance``."""
+    """Calibrated meaning of a score and a sigma, fitted on the scenes named in ``provenance``."""
 
     probability: MonotoneTable  # score → P(relative error < 10 %)
     expected_error: MonotoneTable  # score → mean capped relative error
-    sigmoid: Sigmoid  # score in [0, 1] → P(relative error < 10 %), the simple control
+    sigmoid: Sigmoid  # score in [0, 1] → P(relative error < 10 %), the baseline
     sigma: SigmaModel | None  # None = no sigma was stated
-    thresholds: Mapping[int, float | None]  # per cent of mean error → threshold on the score; None = none fits
+    thresholds: Mapping[int, float | None]  # mean error in per cent → threshold on the score; None = none is feasible
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def apply(self, scene: Answers) -> Answers:
-        """The same answers, of a scene or every pixel of a map, with calibrated score and sigma."""
+        """The same answers, of a scene or of a depth map, with calibrated score and sigma."""
         score = torch.where(scene.keep, self.probability(scene.score), 0.0).to(scene.score)
         return scene.replace(score=score, sigma=self.sigma(scene.sigma, scene.depth) if self.sigma else scene.sigma)
 
@@ -107,22 +106,22 @@ def fit_calibration(
     choose: Callable[[Sequence[Points], float], control.ScoreThreshold] = control.plug_in_threshold,
     provenance: Mapping[str, Any] | None = None,
 ) -> Calibration:
-    """Learn from scenes with truth what their scores and sigmas are worth; every scene has the same weight.
+    """Fit a calibration of scores and sigmas on scenes with ground truth; every scene has the same weight.
 
     Args:
         scenes: candidates with answers, scores and, where stated, sigmas; any depth source.
-        min_share: share of the weight on which a step of a table must rest.
+        min_share: least fraction of the weight in a step of a table.
         targets: mean errors, in per cent, for which thresholds are chosen.
-        choose: the control that chooses them, such as :func:`dhtorch.metrics.control.scene_quantile_threshold`.
-        provenance: where the scenes come from, as JSON can hold it; ``n_scenes`` and ``n_answers`` are added. A file
-            that is shipped names ``method`` and ``scenes``.
+        choose: the risk control that chooses them, such as :func:`dhtorch.metrics.control.scene_quantile_threshold`.
+        provenance: origin of the scenes, as JSON values; ``n_scenes`` and ``n_answers`` are added. A saved file
+            needs ``method`` and ``scenes``.
 
     Raises:
         ValueError: no answer in any scene.
     """
     score, good, weight = pool_answers(scenes)
     if not score.numel():
-        raise ValueError("fit_calibration: found no answer in any scene, expected some")
+        raise ValueError("fit_calibration: found no answer in any scene, expected at least one")
     loss = cap_error(torch.cat([s.answered().error for s in scenes]))
     ends = (0.0, 1.0) if bool(((score >= 0) & (score <= 1)).all()) else None
     note = {**(provenance or {}), "n_scenes": sum(bool(s.keep.any()) for s in scenes), "n_answers": score.numel()}
@@ -137,14 +136,14 @@ def fit_calibration(
 
 
 def fit_sigma_model(scenes: Sequence[Points]) -> SigmaModel | None:
-    """The correction after which 68 % of the answers lie within one sigma and no fewer than nine in ten within two.
+    """Sigma correction after which 68 % of the answers lie within one sigma and at least 91 % within two.
 
-    Scenes have the same weight. For every floor the scale follows from the first share; of all these pairs the one is
-    taken under which the errors are most probable (Student's t with three degrees of freedom, which gross errors do not
-    rule). Where fewer than nine in ten then lie within two sigmas, scale and floor are widened until they do.
+    Scenes have the same weight. For every floor the scale follows from the 68 %; of all these pairs the one with the
+    largest likelihood of the errors is taken (Student's t with three degrees of freedom, robust to gross errors). If
+    fewer than 91 % then lie within two sigmas, scale and floor are widened until they do.
 
     Returns:
-        SigmaModel; None where no sigma is stated.
+        SigmaModel; None if no sigma is stated.
     """
     errors, sigmas, weights = [], [], []
     for scene in scenes:
@@ -172,7 +171,7 @@ def fit_sigma_model(scenes: Sequence[Points]) -> SigmaModel | None:
 
 
 def _quantile(x: Tensor, weight: Tensor, share: float) -> Tensor:
-    """The smallest value below or at which that share of the weight lies."""
+    """Weighted quantile: the smallest value with at least the fraction ``share`` of the weight at or below it."""
     order = x.argsort()
     below = weight[order].cumsum(0) / weight.sum()
     k = torch.searchsorted(below, torch.tensor(share, dtype=below.dtype, device=below.device))
@@ -180,11 +179,11 @@ def _quantile(x: Tensor, weight: Tensor, share: float) -> Tensor:
 
 
 def parse_calibration(text: str, where: str = "calibration") -> Calibration:
-    """Read what :meth:`Calibration.to_json` wrote.
+    """Parse a calibration from the JSON text of :meth:`Calibration.to_json`.
 
     Args:
-        text: the file's content.
-        where: its name, for the message.
+        text: content of the file.
+        where: name of the file, for messages.
 
     Raises:
         ValueError: not strict JSON, or a field is missing, unknown or out of range; the message names file and field.
@@ -193,8 +192,8 @@ def parse_calibration(text: str, where: str = "calibration") -> Calibration:
         content = storage.parse_strict_json(text)
     except ValueError as error:
         raise ValueError(f"{where}: found no strict JSON ({error}), expected a calibration") from error
-    known = ("schema", "good_error", "probability", "expected_error", "sigmoid", "sigma", "thresholds")
-    _fields(content, (*known, "provenance"), where)
+    names = ("schema", "good_error", "probability", "expected_error", "sigmoid", "sigma", "thresholds")
+    _fields(content, (*names, "provenance"), where)
     for name, value in (("schema", _SCHEMA_VERSION), ("good_error", GOOD_ERROR_REL)):
         _expect(content[name] == value, f"{where}.{name}", content[name], str(value))
     _fields(content["sigmoid"], ("slope", "offset"), f"{where}.sigmoid")
@@ -232,19 +231,21 @@ def _read_table(content: Any, where: str, *, rising: bool) -> MonotoneTable:
 def _read_sigma(content: Any, where: str) -> SigmaModel:
     _fields(content, ("scale", "floor"), where)
     for name in ("scale", "floor"):
-        _expect(_number(content[name], f"{where}.{name}") >= 0, f"{where}.{name}", content[name], "no negative number")
+        _expect(
+            _number(content[name], f"{where}.{name}") >= 0, f"{where}.{name}", content[name], "a number of at least 0"
+        )
     return SigmaModel(float(content["scale"]), float(content["floor"]))
 
 
 def _read_thresholds(content: Any, where: str) -> dict[int, float | None]:
     _expect(isinstance(content, dict), where, content, "an object")
-    found: dict[int, float | None] = {}
+    thresholds: dict[int, float | None] = {}
     for name, value in content.items():
         _expect(
             name.isdecimal() and len(name) <= 2 and int(name) > 0, f"{where}.{name}", name, "a whole number of per cent"
         )
-        found[int(name)] = None if value is None else _number(value, f"{where}.{name}")
-    return found
+        thresholds[int(name)] = None if value is None else _number(value, f"{where}.{name}")
+    return thresholds
 
 
 def _direction(rising: bool) -> str:
@@ -260,9 +261,9 @@ def _fields(content: Any, names: Sequence[str], where: str) -> None:
 
 
 def _number(value: Any, where: str) -> float:
-    plain = isinstance(value, int | float) and not isinstance(value, bool)
-    fine = plain and abs(value) <= sys.float_info.max
-    _expect(fine, where, value, "a finite number")
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    is_finite = is_number and abs(value) <= sys.float_info.max
+    _expect(is_finite, where, value, "a finite number")
     return float(value)
 
 

@@ -1,8 +1,8 @@
-"""Global integration: many views with their uncertainty → one map, as a signed distance field, points or a mesh.
+"""Integration of many depth views with their uncertainty into one map: a signed distance field, points or a mesh.
 
 :func:`fuse_views` blends depth, the sensor's, recovered or swept, into a sparse :class:`Volume`; :func:`extract_points`
-and :func:`extract_mesh` take the surface out of it. ``sweeps`` asks for depth of every pixel, ``recording`` places the
-frames of a recording and fuses what they say. The map only widens: nothing here moves a camera or closes a loop.
+and :func:`extract_mesh` extract its surface. ``sweeps`` computes dense depth maps, ``recording`` places the frames of a
+recording and fuses their depth. Nothing here refines camera poses or closes loops.
 """
 
 from dhtorch.integrate.surface import Surface, extract_mesh, extract_points

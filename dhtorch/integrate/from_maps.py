@@ -1,4 +1,4 @@
-"""One map of a recording from the maps of its frames, as they lie in files: nothing is asked of a method again."""
+"""Fusion of a recording's saved depth maps into one surface, without another run of a method."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from dhtorch.integrate.sweeps import depth_step_rel
 from dhtorch.integrate.volume import DepthView, Volume, drop_unconfirmed, fuse_views, make_volume, reserve_blocks
 from dhtorch.records import Pose
 
-#: Swept maps that must agree on a surface of which nothing else speaks; of fewer maps all.
+#: Swept maps that must agree on a surface without other depth; if there are fewer maps, all of them.
 _MIN_AGREEING_MAPS = 2
 
-#: Depth of a neighbour over a pixel's own, minus one, from which on neither is believed: a step lies between them.
+#: Largest over smallest depth in 3×3 pixels, minus one, above which a pixel is left out: it lies beside a depth step.
 _MAX_DEPTH_STEP_REL = 0.1
 
 
@@ -31,7 +31,7 @@ Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 
 class FrameMap(NamedTuple):
-    """What is known of one frame, (h, w) each."""
+    """Depth map of one frame, (h, w) each."""
 
     depth: Tensor  # m, 0 = none
     sigma: Tensor  # m
@@ -47,15 +47,15 @@ def fuse_frame_maps(
     meshed: bool,
     progress: Progress = lambda items, _text, _total: items,
 ) -> tuple[Surface, list[float]]:
-    """The surface that the maps of ``frames`` show together, and which way is up.
+    """Surface fused from the depth maps of ``frames``, and the upward direction of its world (3).
 
     Args:
-        recording: whose own trajectory places the frames; without one only the first of ``frames`` is used, and the
-            world is its camera.
-        frames: positions; those without a finite pose are left out.
-        read: the map of a frame.
-        voxel: m, of what the sensor sees; what was swept has voxels of its own where it is less sure.
-        meshed: triangles (needs scikit-image), else points.
+        recording: its trajectory places the frames; without one only the first of ``frames`` is used, and the world is
+            its camera.
+        frames: indices; those without a finite pose are left out.
+        read: frame index → its depth map.
+        voxel: m, of the grid for sensor depth; swept depth gets a coarser grid if it is less accurate.
+        meshed: extract triangles (needs scikit-image), else points.
         progress: wraps the loop over frames.
 
     Raises:
@@ -64,13 +64,13 @@ def fuse_frame_maps(
     poses = _finite_poses(recording, frames)
     if not poses:
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
-    wide = choose_coarse_voxel(voxel, _swept_sigmas([read(k) for k in list(poses)[:N_MAPS_FOR_VOXEL]]))
-    volumes = [make_volume(voxel), *([] if wide is None else [make_volume(wide)])]
+    coarse_voxel = choose_coarse_voxel(voxel, _swept_sigmas([read(k) for k in list(poses)[:N_MAPS_FOR_VOXEL]]))
+    volumes = [make_volume(voxel), *([] if coarse_voxel is None else [make_volume(coarse_voxel)])]
     volumes = _fuse_sources(recording, poses, read, volumes, progress=progress)
     surface = reduce(merge_surfaces, map(extract_points, volumes))
     placed = list(poses.values())
-    shown = surface.xyz, 2 * voxel, surface.normal
-    up = estimate_up(recording, placed, *shown) if len(surface.xyz) else mean_camera_up(placed).tolist()
+    evidence = surface.xyz, 2 * voxel, surface.normal
+    up = estimate_up(recording, placed, *evidence) if len(surface.xyz) else mean_camera_up(placed).tolist()
     return (reduce(merge_surfaces, map(extract_mesh, volumes)) if meshed and len(surface.xyz) else surface), up
 
 
@@ -82,7 +82,7 @@ def _fuse_sources(
     *,
     progress: Progress,
 ) -> list[Volume]:
-    """The volumes after all frames: what the sensor says in each of them, what was swept in the last."""
+    """The volumes after fusion of all frames: sensor depth in each of them, swept depth in the last."""
 
     def views(source: int) -> Iterator[DepthView]:
         name = "sensor" if source == Source.SENSOR else "swept"
@@ -104,8 +104,8 @@ def _fuse_sources(
 
 
 def _swept_sigmas(maps: Sequence[FrameMap]) -> Tensor:
-    """Of swept pixels."""
-    return torch.cat([found.sigma[(found.source == Source.SWEPT) & (found.depth > 0)] for found in maps])
+    """Standard deviations (P,) m of the swept pixels."""
+    return torch.cat([m.sigma[(m.source == Source.SWEPT) & (m.depth > 0)] for m in maps])
 
 
 def _finite_poses(recording: Recording, frames: Sequence[int]) -> dict[int, Pose]:
@@ -115,10 +115,12 @@ def _finite_poses(recording: Recording, frames: Sequence[int]) -> dict[int, Pose
     return {k: T for k, T in poses.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
 
 
-def _make_view(recording: Recording, k: int, found: FrameMap, source: int, T_world_from_cam: Pose) -> DepthView:
-    """The pixels of one source, but for those beside a step."""
-    depth, sigma = found.depth[None], found.sigma[None]
-    keep = (found.source[None] == source) & (depth > 0) & (sigma > 0) & (depth_step_rel(depth) <= _MAX_DEPTH_STEP_REL)
+def _make_view(recording: Recording, k: int, frame_map: FrameMap, source: int, T_world_from_cam: Pose) -> DepthView:
+    """Depth view of the pixels of one source, without those beside a depth step."""
+    depth, sigma = frame_map.depth[None], frame_map.sigma[None]
+    keep = (
+        (frame_map.source[None] == source) & (depth > 0) & (sigma > 0) & (depth_step_rel(depth) <= _MAX_DEPTH_STEP_REL)
+    )
     depth = torch.where(keep, depth, 0.0)
     score = torch.where(keep, 0.1 / (0.1 + sigma / torch.where(keep, depth, 1.0)), 0.0)
     return view_from_depth_map(recording[k], depth, sigma, score, T_world_from_cam=T_world_from_cam)

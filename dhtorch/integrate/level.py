@@ -1,4 +1,4 @@
-"""Which way is up: asked here, and nowhere else. The format's own gravity axis, else floor, walls, or the cameras."""
+"""The upward direction of a map: from the format's gravity axis, else from the floor, the walls or the cameras."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ _UP_BY_FORMAT = {
     "arkitscenes": (0.0, 0.0, 1.0),
 }
 
-#: Formats whose world is level by the way it is made, however the camera was held: a phone upright keeps its pictures
-#: lying, one above a table looks straight down.
+#: Formats whose world is aligned to gravity however the camera was held: the images of an upright phone are stored
+#: sideways, and a phone above a table looks straight down.
 _LEVEL_FORMATS = frozenset({"stray", "arkitscenes", "synthetic"})
 
-#: In the other formats a trajectory may have been moved to its first camera: a direction farther from the cameras' own
-#: upward one is not believed, cosine of the angle.
+#: In the other formats a trajectory may have been moved to its first camera: a direction whose angle to
+#: the cameras' mean upward direction has a smaller cosine is not used.
 _MIN_UP_COSINE = 0.5
 
-#: Planes that are tried, and the share of the points that the floor must hold.
+#: Number of planes tried, and the fraction of the points that the floor must contain.
 _N_FLOOR_TRIALS, _MIN_FLOOR_SHARE = 300, 0.1
 
-#: How near a floor's normal is to the direction that is guessed, cosine of 40°.
+#: Least cosine of the angle between an upward direction and its first guess: of 40°.
 _MIN_GUESS_COSINE = 0.77
 
-#: Directions that are tried on the whole sphere, about 2° apart; how far a surface may lean, rad (5°).
+#: Number of directions tried on the whole sphere, about 2° apart; standard deviation of a surface's lean, rad (5°).
 _N_DIRECTIONS, _LEAN_SIGMA_RAD = 12000, 0.087
 
-#: Score of an upward direction that walls and levels must reach: twice that of surfaces that stand anyhow.
+#: Least score of an upward direction from walls and levels: twice that of surfaces with random normals.
 _MIN_UPRIGHT_SCORE = 0.25
 
 
@@ -55,26 +55,26 @@ def estimate_up(
     else the cameras' mean upward direction; camera axes where that cancels out.
 
     Args:
-        recording: that was mapped.
+        recording: of the map.
         poses: T_world_from_cam (1) of its frames.
         xyz: (P, 3) m, points of the map.
         thickness: m, of the floor.
-        normal: (P, 3) of the map's surfaces; NaN where unknown. None = no walls are asked.
+        normal: (P, 3) of the map's surfaces; NaN where unknown. None = walls are not used.
     """
     mean = mean_camera_up(poses)
-    known = _UP_BY_FORMAT.get(recording.format)
-    if known is not None and _is_in_own_world(recording, poses):
-        axis = torch.tensor(known, dtype=torch.float64)
+    gravity_axis = _UP_BY_FORMAT.get(recording.format)
+    if gravity_axis is not None and _is_in_own_world(recording, poses):
+        axis = torch.tensor(gravity_axis, dtype=torch.float64)
         if recording.format in _LEVEL_FORMATS or float(axis @ mean) > _MIN_UP_COSINE:
             return axis.tolist()
-    found = _fit_floor_normal(xyz.double(), mean, thickness)
-    if found is None and normal is not None:
-        found = _fit_upright_direction(normal.double(), mean)
-    return (mean if found is None else found).tolist()
+    up = _fit_floor_normal(xyz.double(), mean, thickness)
+    if up is None and normal is not None:
+        up = _fit_upright_direction(normal.double(), mean)
+    return (mean if up is None else up).tolist()
 
 
 def _is_in_own_world(recording: Recording, poses: Sequence[Pose]) -> bool:
-    """Whether frames stand where the recording says, not where a chain of pairs has put them."""
+    """Whether the frames have poses of the recording's trajectory, not poses chained from pairs."""
     if recording.poses is None or not poses:
         return False
     off = (recording.poses.R - poses[0].R.to(recording.poses.R)).abs().flatten(1).amax(1)
@@ -89,32 +89,30 @@ def mean_camera_up(poses: Sequence[Pose]) -> Tensor:
 
 
 def _fit_floor_normal(xyz: Tensor, guess: Tensor, thickness: float) -> Tensor | None:
-    """Unit normal (3,) of the largest plane within 40° of ``guess``; None where none holds a tenth of the points."""
+    """Unit normal (3,) of the largest plane within 40° of ``guess``; None if none contains a tenth of the points."""
     xyz = xyz[xyz.isfinite().all(-1)]
     if len(xyz) < 100:
         return None
     draw = torch.Generator().manual_seed(0)
-    some = xyz[torch.randint(len(xyz), (min(len(xyz), 5000),), generator=draw)]
-    three = some[torch.randint(len(some), (_N_FLOOR_TRIALS, 3), generator=draw)]
-    normal = torch.linalg.cross(three[:, 1] - three[:, 0], three[:, 2] - three[:, 0])
+    subset = xyz[torch.randint(len(xyz), (min(len(xyz), 5000),), generator=draw)]
+    triples = subset[torch.randint(len(subset), (_N_FLOOR_TRIALS, 3), generator=draw)]
+    normal = torch.linalg.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     normal = torch.nn.functional.normalize(normal, dim=-1)
     normal = normal * torch.where(normal @ guess < 0, -1.0, 1.0)[:, None]
     level = normal @ guess > _MIN_GUESS_COSINE
-    off = (some @ normal.T - (three[:, 0] * normal).sum(-1)).abs()
-    count = torch.where(level, (off < thickness).sum(0), 0)
+    distance = (subset @ normal.T - (triples[:, 0] * normal).sum(-1)).abs()
+    count = torch.where(level, (distance < thickness).sum(0), 0)
     best = int(count.argmax())
-    if int(count[best]) < _MIN_FLOOR_SHARE * len(some):
+    if int(count[best]) < _MIN_FLOOR_SHARE * len(subset):
         return None
-    held = some[off[:, best] < thickness]
-    axis = torch.linalg.eigh((held - held.mean(0)).T @ (held - held.mean(0))).eigenvectors[:, 0]
+    inliers = subset[distance[:, best] < thickness]
+    axis = torch.linalg.eigh((inliers - inliers.mean(0)).T @ (inliers - inliers.mean(0))).eigenvectors[:, 0]
     axis = axis if float(axis @ guess) > 0 else -axis
-    return (
-        axis if float(axis @ guess) > _MIN_GUESS_COSINE else None
-    )  # the fit to all that it holds may have turned away
+    return axis if float(axis @ guess) > _MIN_GUESS_COSINE else None  # the fit to the inliers may have turned it away
 
 
 def _fit_upright_direction(normal: Tensor, guess: Tensor) -> Tensor | None:
-    """Unit direction (3,) within 40° of ``guess`` to which most surfaces lie level or stand upright; None = too few do.
+    """Unit direction (3,) within 40° of ``guess`` to which most surfaces are parallel or perpendicular; None = too few.
 
     Args:
         normal: (P, 3) of surfaces of one size each; those that are not finite are left out.
@@ -124,10 +122,12 @@ def _fit_upright_direction(normal: Tensor, guess: Tensor) -> Tensor | None:
     if len(normal) < 100:
         return None
     draw = torch.Generator().manual_seed(0)
-    some = torch.nn.functional.normalize(normal[torch.randint(len(normal), (min(len(normal), 5000),), generator=draw)])
+    subset = torch.nn.functional.normalize(
+        normal[torch.randint(len(normal), (min(len(normal), 5000),), generator=draw)]
+    )
     axes = _spiral_directions(_N_DIRECTIONS)
     axes = axes[axes @ guess > _MIN_GUESS_COSINE]
-    upright = torch.asin((some @ axes.T).abs().clamp(max=1))  # angle from the plane at right angles to the axis
+    upright = torch.asin((subset @ axes.T).abs().clamp(max=1))  # angle from the plane at right angles to the axis
     level = torch.pi / 2 - upright
     score = (
         torch.exp(-0.5 * (upright / _LEAN_SIGMA_RAD) ** 2) + torch.exp(-0.5 * (level / _LEAN_SIGMA_RAD) ** 2)

@@ -1,4 +1,4 @@
-"""``dhtorch integrate``: one map for every recording, its files, and a result that says how far it reaches."""
+"""The command ``dhtorch integrate``: one map per recording, its files, and a result with its coverage."""
 
 from __future__ import annotations
 
@@ -39,33 +39,33 @@ Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
 PairSelector = Callable[[Scene], Iterable[Pair]]
 
-#: Edges of voxels that are chosen from the depth, m.
+#: Least and largest edge of a voxel that is chosen from the depth, m.
 _MIN_VOXEL_M, _MAX_VOXEL_M = 0.005, 0.2
 
-#: Settings groups whose names are kept with the result.
+#: Option groups whose chosen names are stored in the result.
 _CONFIG_GROUPS = ("method", "data", "pairs")
 
 
 @dataclass(frozen=True)
 class MappedScene:
-    """The map of one recording and what it was made of."""
+    """The map of one recording, with the estimates and poses it was fused from."""
 
     recording: Recording
     answers: Sequence[PairEstimate]
     places: PlacedFrames
-    voxel: float  # m, of what the sensor sees
+    voxel: float  # m, of the grid that holds the sensor's depth
     surface: integrate.Surface
     row: Row
 
     @property
     def up(self) -> list[float]:
-        """The upward direction of the map."""
+        """Unit vector (3) upwards in the world of the map."""
         poses = list(self.places.poses.values())
         return estimate_up(self.recording, poses, self.surface.xyz, 2 * self.voxel, self.surface.normal)
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
-    """``dhtorch integrate``: a folder of files for every scene, and ``result.json`` when all are done.
+    """Run ``dhtorch integrate``: writes a folder of files per scene, and ``result.json`` after the last one.
 
     Args:
         settings: the options of ``conf/integrate.yaml``, resolved, with ``choices``.
@@ -77,7 +77,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
 
     Raises:
         ValueError, OSError, ImportError: bad options or data.
-        KeyboardInterrupt: Ctrl-C; scenes that are finished stay.
+        KeyboardInterrupt: Ctrl-C; files of finished scenes are kept.
     """
     _check_settings(settings)
     if settings["threads"] is not None:
@@ -86,23 +86,23 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     sources = scenes_of(parts["data"])
     folder = Path(settings["output"])
     began = time.perf_counter()
-    found: list[Row] = []
+    scene_rows: list[Row] = []
     rows: list[Row] = []
     written: list[Path] = []
     try:
         for source in sources:
-            made = map_scene(source, parts["method"], parts["pairs"], settings, progress=progress)
-            written += write_mapped_scene(folder / source.name, made, settings)
-            made.row["seconds"] = time.perf_counter() - began - sum(r["seconds"] for r in found)
-            found.append(made.row)
-            rows += [*_pair_rows(made), made.row]
+            mapped = map_scene(source, parts["method"], parts["pairs"], settings, progress=progress)
+            written += write_mapped_scene(folder / source.name, mapped, settings)
+            mapped.row["seconds"] = time.perf_counter() - began - sum(r["seconds"] for r in scene_rows)
+            scene_rows.append(mapped.row)
+            rows += [*_pair_rows(mapped), mapped.row]
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
-            f"{len(found)} of {format_count(len(sources), 'scene')} in {folder} are whole and stay"
+            f"{len(scene_rows)} of {format_count(len(sources), 'scene')} in {folder} are whole and stay"
         ) from None
-    result = _build_result(settings, sources, rows, found)
+    result = _build_result(settings, sources, rows, scene_rows)
     result_files.write_result(folder / "result.json", result)
-    print("\n".join(_describe_scene(row, row["cell_m"]) for row in found))
+    print("\n".join(_describe_scene(row, row["cell_m"]) for row in scene_rows))
     print("\n".join(["wrote", *(f"  {path}" for path in [folder / "result.json", *written])]))
     return 0
 
@@ -110,23 +110,23 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
 def map_scene(
     scene: Scene, method: Method, pairs: PairSelector, settings: Mapping[str, Any], *, progress: Progress
 ) -> MappedScene:
-    """Ask the method, place the frames, fuse, and count.
+    """Map of one scene: estimate its pairs, place the frames, fuse the depth and measure the coverage.
 
     Raises:
-        ValueError: as the readers, the method and the volume raise it; no frame that could be placed.
+        ValueError: as the readers, the method and the volume raise it, or if no frame could be placed.
     """
     recording, chosen = scene.recording, list(pairs(scene))
     settings = {**settings, "voxel": choose_voxel(recording) if settings["voxel"] is None else settings["voxel"]}
     sweep = DenseSweep.asked(settings["dense"])
     options = {k: settings[k] for k in ("cutoff", "seed", "device")} | {"dtype": getattr(torch, settings["dtype"])}
-    asked = recordings.estimate_pairs(
+    estimates = recordings.estimate_pairs(
         scene, method, chosen, sweep=sweep, shelf=SweepStore(Path(settings["output"])), **options
     )
-    answers = list(progress(asked, f"{recording.name}: pairs", len(chosen)))
+    answers = list(progress(estimates, f"{recording.name}: pairs", len(chosen)))
     links = _linking_pairs(answers) if settings["poses"] == "anchored" else []
-    linked = recordings.estimate_pairs(scene, method, links, **options)
-    found = [*answers, *progress(linked, f"{recording.name}: links", len(links))]
-    places = recordings.place_frames(recording, found, poses=settings["poses"])
+    link_estimates = recordings.estimate_pairs(scene, method, links, **options)
+    all_answers = [*answers, *progress(link_estimates, f"{recording.name}: links", len(links))]
+    places = recordings.place_frames(recording, all_answers, poses=settings["poses"])
     if not places.poses:
         raise ValueError(f"{recording.name}: found no frame with a finite pose, expected one at least")
     volumes, points = _fuse_sources(recording, answers, places, settings, progress)
@@ -149,7 +149,7 @@ def map_scene(
 def choose_voxel(recording: Recording, frames: Sequence[int] | None = None) -> float:
     """Edge of a voxel, m: twice the size of a depth pixel at the median return, from 5 mm to 20 cm, to two digits.
 
-    Told by three ``frames``, None = of all.
+    Measured in the first, the middle and the last of ``frames``; None = of all frames.
     """
     sizes = []
     frames = range(len(recording)) if frames is None else sorted(frames)
@@ -157,11 +157,11 @@ def choose_voxel(recording: Recording, frames: Sequence[int] | None = None) -> f
         frame: Frame = recording[k]
         depth = frame.depth[frame.depth.isfinite() & (frame.depth > 0)]
         if depth.numel():
-            own = frame.depth_camera.f if frame.depth_camera is not None else None
-            f = frame.camera.f * frame.depth.shape[-1] / frame.hw[1] if own is None else own
+            depth_f = frame.depth_camera.f if frame.depth_camera is not None else None
+            f = frame.camera.f * frame.depth.shape[-1] / frame.hw[1] if depth_f is None else depth_f
             sizes.append(float(depth.median() / f.mean()))
-    middle = 2 * sorted(sizes)[len(sizes) // 2] if sizes else 0.02
-    return float(f"{min(max(middle, _MIN_VOXEL_M), _MAX_VOXEL_M):.2g}")
+    voxel = 2 * sorted(sizes)[len(sizes) // 2] if sizes else 0.02
+    return float(f"{min(max(voxel, _MIN_VOXEL_M), _MAX_VOXEL_M):.2g}")
 
 
 def _fuse_sources(
@@ -171,21 +171,23 @@ def _fuse_sources(
     settings: Mapping[str, Any],
     progress: Progress,
 ) -> tuple[list[integrate.Volume], dict[str, integrate.Surface]]:
-    """The volumes, finest first, and what they showed after each source: of the ``sensor``, also ``sparse``, and with
-    what was swept."""
+    """The fused volumes, finest first, and the surface points after each source.
+
+    Keys of the points: ``sensor``; ``sparse``, with the recovered points; ``dense``, with the swept pixels as well.
+    """
     stages = {Source.SENSOR: "sensor", Source.RECOVERED: "sparse"}
     stages |= {Source.SWEPT: "dense"} if any(a.swept is not None for a in answers) else {}
     points: dict[str, integrate.Surface] = {}
-    wide = choose_coarse_voxel(settings["voxel"], _swept_sigmas(answers))
+    wide_voxel = choose_coarse_voxel(settings["voxel"], _swept_sigmas(answers))
 
-    def seen(volume: integrate.Volume) -> integrate.Surface:
+    def points_of(volume: integrate.Volume) -> integrate.Surface:
         return integrate.extract_points(volume, min_weight=settings["min_weight"])
 
-    def after(source: int, volumes: list[integrate.Volume]) -> None:
-        if source == Source.SENSOR or wide is None:
-            points[stages[source]] = seen(volumes[0])
+    def keep_points(source: int, volumes: list[integrate.Volume]) -> None:
+        if source == Source.SENSOR or wide_voxel is None:
+            points[stages[source]] = points_of(volumes[0])
         else:
-            points[stages[source]] = merge_surfaces(points["sensor"], seen(volumes[-1]))
+            points[stages[source]] = merge_surfaces(points["sensor"], points_of(volumes[-1]))
 
     options = {k: settings[k] for k in ("cutoff", "min_conf", "min_maps")} | {"progress": progress}
     options |= {
@@ -194,48 +196,48 @@ def _fuse_sources(
         "max_reach": MAX_REACH_TRUNCATIONS,
     }
     empty = [integrate.make_volume(settings["voxel"], truncation=settings["truncation"])]
-    empty += [] if wide is None else [integrate.make_volume(wide)]
+    empty += [] if wide_voxel is None else [integrate.make_volume(wide_voxel)]
     volumes = recordings.fuse_recording_grids(
-        recording, empty, answers, places, sources=list(stages), after=after, **options
+        recording, empty, answers, places, sources=list(stages), after=keep_points, **options
     )
     return volumes, points
 
 
 def _swept_sigmas(answers: Sequence[PairEstimate]) -> Tensor:
-    """Of what was swept, or where nothing was, of the recovered points."""
+    """Standard deviations (P,) m of the swept depth of the first maps; without maps, of the recovered points."""
     maps = [swept.read() for swept in [a.swept for a in answers if a.swept is not None][:N_MAPS_FOR_VOXEL]]
     sigmas = [sigma[depth > 0] for depth, sigma, _ in maps]
     return torch.cat(sigmas or [a.estimate.sigma[a.recovered] for a in answers] or [torch.zeros(0)])
 
 
 def _coverage_columns(points: Mapping[str, integrate.Surface], voxel: float) -> Row:
-    """Columns of the last of these surfaces, of those before it with their names, and how much wider it is."""
-    found = {name: recordings.measure_coverage(surface.xyz, voxel) for name, surface in points.items()}
-    *before, last = found
-    row: Row = found[last]
-    for name in before:
-        row |= {f"{k}_{name}": v for k, v in found[name].items()}
+    """Coverage of the last surface, of the earlier ones under their names, and the ratio of covered voxels to each."""
+    coverage = {name: recordings.measure_coverage(surface.xyz, voxel) for name, surface in points.items()}
+    *earlier, last = coverage
+    row: Row = coverage[last]
+    for name in earlier:
+        row |= {f"{k}_{name}": v for k, v in coverage[name].items()}
         n = row[f"n_voxels_{name}"]
         row[f"voxels_vs_{name}"] = row["n_voxels"] / n if n else None
     return row
 
 
 def write_mapped_scene(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list[Path]:
-    """The files of one scene; returns what was written."""
+    """Write the files of one scene into ``folder``; returns their paths."""
     surface, voxel, up = scene.surface, scene.voxel, scene.up
     rgb = surface.features[:, :3]
-    said = write_surface(folder / "map.ply", surface, f"{scene.recording.name}'s world", up)
+    comments = write_surface(folder / "map.ply", surface, f"{scene.recording.name}'s world", up)
     cloud = _collect_samples(scene)
     recovered = cloud["source"] == Source.RECOVERED
-    named = {"sigma": surface.sigma, "source": surface.source}
-    shapes = [export.Shape("surface", surface.xyz, rgb, surface.normal, surface.face, values=named)]
+    values = {"sigma": surface.sigma, "source": surface.source}
+    shapes = [export.Shape("surface", surface.xyz, rgb, surface.normal, surface.face, values=values)]
     points = cloud["xyz"][recovered], cloud["rgb"][recovered]
     shapes.append(export.Shape("recovered", *points, values={"sigma": cloud["sigma"][recovered]}))
     swept = surface.source == Source.SWEPT
     shapes.append(export.Shape("swept", surface.xyz[swept], rgb[swept], values={"sigma": surface.sigma[swept]}))
     export.write_glb(folder / "map.glb", shapes, up=up)
     columns = {k: cloud[k] for k in ("sigma", "score", "hole", "source")}
-    export.write_ply(folder / "points.ply", cloud["xyz"], cloud["rgb"], comments=said, **columns)
+    export.write_ply(folder / "points.ply", cloud["xyz"], cloud["rgb"], comments=comments, **columns)
     _write_colmap(folder / "colmap", scene)
     title = append_cutoff(scene.recording.name, scene.row["cutoff_m"])
     draw_map(folder / "map.png", surface, list(scene.places.poses.values()), up, voxel=voxel, title=title)
@@ -245,48 +247,48 @@ def write_mapped_scene(folder: Path, scene: MappedScene, settings: Mapping[str, 
 
 
 def write_surface(path: Path, surface: integrate.Surface, axes: str, up: Sequence[float]) -> list[str]:
-    """Write a surface as PLY, in the axes of what ``axes`` names; its comments, for other files of the same map."""
+    """Write a surface as PLY; returns its comments, for other files of the same map. ``axes`` names its world."""
     rgb, score = surface.features[:, :3], surface.features[:, 3]
     codes = ", ".join(f"{code} {words(name)}" for code, name in names(Source).items())
-    said = [f"metres; axes of {axes}", f"up {' '.join(f'{v:.6f}' for v in up)}", f"source: {codes}"]
-    about = {"sigma": surface.sigma, "score": score, "source": surface.source}
-    export.write_ply(path, surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=said, **about)
-    return said
+    comments = [f"metres; axes of {axes}", f"up {' '.join(f'{v:.6f}' for v in up)}", f"source: {codes}"]
+    columns = {"sigma": surface.sigma, "score": score, "source": surface.source}
+    export.write_ply(path, surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=comments, **columns)
+    return comments
 
 
 def _collect_samples(scene: MappedScene) -> dict[str, Tensor]:
-    """Every sample with depth, the sensor's or recovered, of every placed reference view, in the world."""
+    """All samples with sensor or recovered depth of the placed reference views, as points in the world with columns."""
     parts: dict[str, list[Tensor]] = {k: [] for k in ("xyz", "rgb", "sigma", "score", "hole", "source")}
     for answer in scene.answers:
         if answer.pair[0] in scene.places.poses:
-            whole = merge(answer.samples, answer.estimate)
-            there = whole.source[0] != Source.NONE
-            xyz = cameras.unproject(answer.camera, whole.uv, whole.depth)
+            merged = merge(answer.samples, answer.estimate)
+            has_depth = merged.source[0] != Source.NONE
+            xyz = cameras.unproject(answer.camera, merged.uv, merged.depth)
             world = se3.apply(scene.places.poses[answer.pair[0]], xyz.double())
-            values = {"xyz": world, "rgb": answer.rgb, "sigma": whole.sigma, "score": whole.score}
-            for name, value in {**values, "hole": answer.samples.hole, "source": whole.source}.items():
-                parts[name].append(value[0][there])
+            values = {"xyz": world, "rgb": answer.rgb, "sigma": merged.sigma, "score": merged.score}
+            for name, value in {**values, "hole": answer.samples.hole, "source": merged.source}.items():
+                parts[name].append(value[0][has_depth])
     empty = {"xyz": torch.zeros(0, 3), "rgb": torch.zeros(0, 3)}
     return {k: torch.cat(v) if v else empty.get(k, torch.zeros(0)) for k, v in parts.items()}
 
 
 def _write_colmap(folder: Path, scene: MappedScene) -> None:
-    """Views, tracks, and the points that were triangulated from them."""
+    """Write the views, tracks and triangulated points of a scene as a COLMAP text model."""
     poses = scene.places.poses
     number = {k: n for n, k in enumerate(poses)}
-    lenses: dict[int, tuple[Camera, tuple[int, int]]] = {}
+    intrinsics: dict[int, tuple[Camera, tuple[int, int]]] = {}
     for k in poses:
         frame: Frame = scene.recording[k]
-        lenses[k] = frame.camera, frame.hw
-    shots = [export.ColmapImage(f"{int(scene.recording.number[k]):06d}.png", *lenses[k], poses[k]) for k in poses]
+        intrinsics[k] = frame.camera, frame.hw
+    images = [export.ColmapImage(f"{int(scene.recording.number[k]):06d}.png", *intrinsics[k], poses[k]) for k in poses]
     pieces = [_triangulated_points(a, number, poses) for a in scene.answers if set(a.pair) <= set(poses)]
-    none = [torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2).long(), torch.zeros(0, 2, 2)]
-    xyz, rgb, error, seen_by, uv = map(torch.cat, zip(*(pieces or [none]), strict=True))
-    export.write_colmap(folder, shots, xyz, rgb=rgb, error=error, seen_by=seen_by, uv=uv)
+    empty = [torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2).long(), torch.zeros(0, 2, 2)]
+    xyz, rgb, error, seen_by, uv = map(torch.cat, zip(*(pieces or [empty]), strict=True))
+    export.write_colmap(folder, images, xyz, rgb=rgb, error=error, seen_by=seen_by, uv=uv)
 
 
 def _triangulated_points(answer: PairEstimate, number: Mapping[int, int], poses: Mapping[int, Any]) -> list[Tensor]:
-    """World points, colours, errors, views and pixels of what one pair answered."""
+    """Points in the world, colours, errors, view indices and pixels of one pair's triangulated samples."""
     keep = answer.estimate.keep[0]
     xyz = cameras.unproject(answer.camera, answer.estimate.uv, answer.estimate.depth.nan_to_num(1.0))
     world = se3.apply(poses[answer.pair[0]], xyz.double())[0]
@@ -296,9 +298,9 @@ def _triangulated_points(answer: PairEstimate, number: Mapping[int, int], poses:
 
 
 def _linking_pairs(answers: Sequence[PairEstimate]) -> list[tuple[int, int]]:
-    """Further pairs that hold the frames together."""
-    asked = [(a.pair[0], k) for a in answers for k in a.links]
-    return recordings.linking_pairs(asked, chosen=any(a.picked is not None for a in answers))
+    """Further pairs that link the frames to one another."""
+    pairs = [(a.pair[0], k) for a in answers for k in a.links]
+    return recordings.linking_pairs(pairs, chosen=any(a.picked is not None for a in answers))
 
 
 def _pair_rows(scene: MappedScene) -> list[Row]:
@@ -313,19 +315,19 @@ def _pair_rows(scene: MappedScene) -> list[Row]:
 
 
 def _describe_scene(row: Row, cell: float) -> str:
-    """One scene in words."""
+    """One line of text on a scene: frames, fragments, coverage and size of its map."""
     frames = format_count(row["n_frames"] + row["n_unplaced"], "frame")
     placed = f"{row['n_frames']} of {frames} placed by {row['truth']} poses"
     fragments = format_count(row["n_fragments"], "fragment")
     if not row["n_voxels"]:
         return f"{row['scene']}: {placed}, {fragments}; no surface"
-    wider = f", {row['voxels_vs_sensor']:.3g} times the sensor's" if row["voxels_vs_sensor"] else ""
-    wider += f" and {row['voxels_vs_sparse']:.3g} times those without a sweep" if row.get("voxels_vs_sparse") else ""
+    ratio = f", {row['voxels_vs_sensor']:.3g} times the sensor's" if row["voxels_vs_sensor"] else ""
+    ratio += f" and {row['voxels_vs_sparse']:.3g} times those without a sweep" if row.get("voxels_vs_sparse") else ""
     islands = f"{format_count(row['n_islands'], 'island')}, the largest {row['largest_island']:.0%}"
     size = f"{row['n_points']:,} points" + (f", {row['n_triangles']:,} triangles" if row["n_triangles"] else "")
     return (
         f"{row['scene']}: {placed}, {fragments};"
-        f" {format_count(row['n_voxels'], 'voxel')} of {100 * cell:g} cm{wider}, {islands};"
+        f" {format_count(row['n_voxels'], 'voxel')} of {100 * cell:g} cm{ratio}, {islands};"
         f" {size}, {row['volume_mib']:.1f} MiB, {row['seconds']:.1f} s"
     )
 
@@ -370,12 +372,12 @@ def _method_name(settings: Mapping[str, Any]) -> str:
 
 
 def should_mesh(wanted: bool | None) -> bool:
-    """Whether triangles are made: as wanted, else where scikit-image is installed."""
+    """Whether to extract a mesh: the option ``mesh``, or if it is None whether scikit-image is installed."""
     return importlib.util.find_spec("skimage") is not None if wanted is None else wanted
 
 
 def _check_settings(settings: Mapping[str, Any]) -> None:
-    """Options that would only fail after minutes."""
+    """Raise an error for options that would otherwise fail only after minutes."""
     if settings["dtype"] not in ("float32", "float64"):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
     if settings["poses"] not in recordings.POSE_SOURCES:

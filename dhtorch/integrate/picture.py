@@ -1,4 +1,4 @@
-"""A map seen from outside."""
+"""Drawing of a map seen from outside, in its own colours and coloured by source."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import Canvas, LegendKey, Stroke, colours, prefix_title, save_figure
 from dhtorch.viz.plots.colours import INK, colour_by_source
 
-#: Lengths that a scale bar may have, m.
+#: Allowed lengths of the scale bar, m.
 _SCALE_BAR_LENGTHS_M = tuple(m * 10.0**e for e in range(-3, 4) for m in (1, 2, 5))
 
 
 def draw_map(
     path: str | Path,
     surface: Surface,
-    cameras: Sequence[Pose],  # T_world_from_cam (1) of the views it is made of
+    cameras: Sequence[Pose],  # T_world_from_cam (1) of the fused views
     up: Sequence[float],  # in the world
     *,
     voxel: float,
     title: str = "",
     hw: tuple[int, int] = (600, 800),
 ) -> None:
-    """Draw a map from outside, walls that face away left out: in its own colours, and by where it comes from.
+    """Draw a map from outside, without walls that face away: in its own colours, and coloured by source.
 
-    The bar is a length at the distance of the map's middle, in front of which things look larger and behind smaller.
+    The scale bar is valid at the median depth of the map; nearer parts appear larger and farther ones smaller.
     """
     T = _viewpoint(surface, cameras, up)
     light = se3.rotate(T.R.mT, surface.normal[None].double())[0] @ torch.tensor([0.3, -0.5, -0.8]).double()
     shade = 0.35 + 0.65 * light.abs().nan_to_num(0.5).clamp(0, 1)[:, None]
     by_source = torch.from_numpy(colour_by_source(surface.source)) / 255 * shade
     xyz = se3.apply(se3.invert(T), surface.xyz[None].double())
-    away = (surface.normal.double() * (T.t - surface.xyz.double())).sum(-1) < 0
-    ahead = (xyz[..., 2] > voxel) & ~away
+    faces_away = (surface.normal.double() * (T.t - surface.xyz.double())).sum(-1) < 0
+    ahead = (xyz[..., 2] > voxel) & ~faces_away
     way = se3.apply(se3.invert(T), torch.cat([pose.t for pose in cameras])[None].double())
     lens = _fit_camera(torch.cat((xyz[ahead], way[way[..., 2] > voxel])), hw)
     uv = project(lens, xyz)
     depth = torch.where(ahead, xyz[..., 2], 0.0)
     both = torch.cat((surface.features[:, :3].double(), by_source), -1)[None]
-    seen = splat_points(lens, hw, uv, depth, torch.ones_like(depth), both, T_world_from_cam=T, radius=0.8 * voxel)
-    picture = torch.where(seen.depth[0, ..., None] > 0, seen.features[0], 1.0).clamp(0, 1).numpy()
+    view = splat_points(lens, hw, uv, depth, torch.ones_like(depth), both, T_world_from_cam=T, radius=0.8 * voxel)
+    picture = torch.where(view.depth[0, ..., None] > 0, view.features[0], 1.0).clamp(0, 1).numpy()
     dots = project(lens, way)[way[..., 2] > voxel].numpy()
     counts = {code: int((surface.source == code).sum()) for code in VOLUME_SOURCES}
     shown = {code: n for code, n in counts.items() if n or code != Source.SWEPT}
@@ -67,11 +67,11 @@ def draw_map(
 def _side_by_side(
     path: str | Path,
     pictures: Mapping[str, np.ndarray],  # title → (H, W, 3) in [0, 1]
-    way: np.ndarray,  # (V, 2) px: where the cameras were
+    way: np.ndarray,  # (V, 2) px, positions of the cameras
     counts: Mapping[int, int],  # codes.Source → points
     metre: float | None,  # px
 ) -> None:
-    """Draw pictures of one size with the cameras' way and a length on each, and a legend of the sources."""
+    """Draw pictures of one size with the camera path and a scale bar on each, and a legend of the sources."""
     width, gap = 346.0, 10.0
     H, W = next(iter(pictures.values())).shape[:2]
     scale = width / W
@@ -95,7 +95,7 @@ def _side_by_side(
 
 
 def _scale_bar(canvas: Canvas, left: float, width: float, metre: float) -> None:
-    """A round length, at most a fifth of the picture, in its lower left corner; ``metre`` in points."""
+    """Draw a bar of a round length, at most a fifth of the width, in the lower left corner; ``metre`` in points."""
     length = max((x for x in _SCALE_BAR_LENGTHS_M if x * metre <= width / 5), default=_SCALE_BAR_LENGTHS_M[0])
     start, end, tick = left + 6, left + 6 + length * metre, 2.5
     canvas.lines([((start, 6), (end, 6)), *(((x, 6 - tick), (x, 6 + tick)) for x in (start, end))], Stroke(INK, 1.2))
@@ -103,7 +103,7 @@ def _scale_bar(canvas: Canvas, left: float, width: float, metre: float) -> None:
 
 
 def _viewpoint(surface: Surface, cameras: Sequence[Pose], up: Sequence[float]) -> Pose:
-    """Outside and above, looking where the cameras look on average."""
+    """Pose T_world_from_cam (1) outside and above the map, in the mean viewing direction of the cameras."""
     above = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
     ways = [pose.R[0, :, 2].double() for pose in cameras]
     level = [way - (way @ above) * above for way in (torch.stack(ways).mean(0), *ways, torch.eye(3).double()[0])]
@@ -118,7 +118,7 @@ def _viewpoint(surface: Surface, cameras: Sequence[Pose], up: Sequence[float]) -
 
 
 def _fit_camera(xyz: Tensor, hw: tuple[int, int]) -> Camera:
-    """A camera at the origin whose picture is filled by all points but the outermost."""
+    """Camera (1) at the origin whose image ``xyz`` (P, 3) fill, without the outermost 0.5 % at each side."""
     if not len(xyz):
         return Camera(torch.full((1, 2), float(hw[1])).double(), torch.tensor([[hw[1] / 2, hw[0] / 2]]).double())
     flat = xyz[:: 1 + len(xyz) // 1_000_000, :2] / xyz[:: 1 + len(xyz) // 1_000_000, 2:]

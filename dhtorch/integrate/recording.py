@@ -1,8 +1,8 @@
-"""A recording as something to integrate: what the method says about its pairs, where its frames stand, what they add.
+"""Integration of one recording: estimates of its pairs, poses of its frames, and fusion into volumes.
 
-Frames are placed either by the recording's own trajectory (``device``) or by the poses that the method found between
-them (``anchored``): those hold frames together only where a pose could be fixed, so that the recording may fall into
-fragments. Nothing joins fragments; the one with the most frames is the map.
+Frames are placed either by the recording's own trajectory (``device``) or by the relative poses that the method
+estimated between them (``anchored``). The latter link frames only where a pose was solved, so that the recording may
+fall into fragments. Fragments are not joined; the map consists of the one with the most frames.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ _PATCH_RADIUS_VOXELS = 1.5
 
 @dataclass(frozen=True)
 class PairEstimate:
-    """What the method said about one pair, and what of the pictures a map needs."""
+    """The method's estimate for one pair, with the colours and the camera that a map needs."""
 
-    pair: tuple[int, int]  # of several views that were chosen the last
+    pair: tuple[int, int]  # reference view and source view; of several chosen source views the last
     samples: Samples
     estimate: Estimate
     tracks: Tracks  # as tracked, in the pictures' own pixels
@@ -59,27 +59,27 @@ class PairEstimate:
     rgb: Tensor  # (1, N, 3) in [0, 1] at the samples
     camera: Camera  # of the reference view
     hw: tuple[int, int]
-    picked: ViewReport | None = None  # where the method chose among several
-    others: Mapping[int, PoseFit] = field(default_factory=dict)  # the poses of all views that it chose
-    swept: StoredSweep | None = None  # pixels of the reference view's map, where one was asked for
+    picked: ViewReport | None = None  # if the method chose among several source views
+    others: Mapping[int, PoseFit] = field(default_factory=dict)  # poses of all chosen source views
+    swept: StoredSweep | None = None  # dense map of the reference view, if one was computed
 
     @property
     def links(self) -> dict[int, PoseFit]:
-        """The frames that were asked, with their poses."""
+        """Source view → its pose relative to the reference view, for all source views used."""
         return {self.pair[1]: self.fit, **self.others}
 
     @property
     def recovered(self) -> Tensor:
-        """(1, N) bool: answered where the sensor has no usable return, as in ``merge``."""
+        """(1, N) bool: samples with an estimate but without a usable return, as in ``merge``."""
         return self.estimate.keep & ~self.samples.usable
 
 
 @dataclass(frozen=True)
 class PlacedFrames:
-    """Where the frames of the map stand."""
+    """Poses of the frames of a map in its world."""
 
     poses: dict[int, Pose]  # frame → T_world_from_cam (1), float64
-    n_fragments: int  # into which the frames fall
+    n_fragments: int  # number of fragments that the frames form
     n_unplaced: int  # frames of other fragments, or without a finite pose
 
 
@@ -95,15 +95,15 @@ def estimate_pairs(
     sweep: DenseSweep | None = None,
     shelf: SweepStore | None = None,
 ) -> Iterator[PairEstimate]:
-    """The method's answer to each pair, one after the other.
+    """The method's estimates for all pairs of a scene, one after the other.
 
     Args:
         scene, pairs: see ``dhtorch.data``.
-        method: of one view or several; the others lie between the two of the pair, or are chosen among those offered.
-        cutoff: m; returns beyond it are hidden from the method. None hides nothing.
-        seed, device, dtype: of the method's run; answers come back on the CPU.
-        sweep: also make a map of every pixel of the reference views; the method runs once all the same.
-        shelf: where the maps wait; None = one of this call.
+        method: with one or several source views, which lie between the two of the pair or are chosen among candidates.
+        cutoff: m; returns beyond it are hidden from the method. None = none are.
+        seed, device, dtype: of the method's run; the estimates are returned on the CPU.
+        sweep: also computes a dense map of each reference view, in the same run of the method.
+        shelf: storage of the dense maps; None = a new one for this call.
 
     Raises:
         ValueError: as the method, the readers and the hold-out raise it.
@@ -112,58 +112,58 @@ def estimate_pairs(
     hint, recording = scene.hint, scene.recording
     shelf = SweepStore() if shelf is None else shelf
     for i, j in pairs:
-        offered = () if isinstance(j, int) else j
-        seen = spaced_frames(i, j, max(1, min(method.views, j - i))) if isinstance(j, int) else offered
-        shown = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *seen)]
-        asked = with_view_selection(method) if offered else method
+        candidates = () if isinstance(j, int) else j
+        source_views = spaced_frames(i, j, max(1, min(method.views, j - i))) if isinstance(j, int) else candidates
+        visible = [range_split(recording[k].to(dtype).to(device), cutoff) for k in (i, *source_views)]
+        pair_method = with_view_selection(method) if candidates else method
         trace: dict[str, Any] = {}
         with torch.no_grad():
-            others = stack(shown[1:]) if len(seen) > 1 else shown[-1]
-            ask_one = asked if sweep is None else partial(sweep, asked)
-            estimate = ask_one(shown[0], others, seed=seed, hint=hint, trace=trace)
+            others = stack(visible[1:]) if len(source_views) > 1 else visible[-1]
+            estimator = pair_method if sweep is None else partial(sweep, pair_method)
+            estimate = estimator(visible[0], others, seed=seed, hint=hint, trace=trace)
             samples = trace["samples"].to("cpu")
-            rgb = _sample_colours(shown[0], trace["samples"].uv)
+            rgb = _sample_colours(visible[0], trace["samples"].uv)
         tracks, fit = (trace[k].to("cpu") for k in ("tracks", "fit"))
-        camera = shown[0].camera.to("cpu")
-        choice = report_selection(i, offered, trace) if offered else None
+        camera = visible[0].camera.to("cpu")
+        selection = report_selection(i, candidates, trace) if candidates else None
         fits = [t["fit"].to("cpu") for t in trace.get("views", ())]
         yield PairEstimate(
-            pair=(i, seen[-1] if choice is None else choice.views[-1]),
+            pair=(i, source_views[-1] if selection is None else selection.views[-1]),
             samples=samples,
             estimate=estimate.to("cpu"),
             tracks=tracks,
             fit=fit,
             rgb=rgb.cpu(),
             camera=camera,
-            hw=shown[0].hw,
-            picked=choice,
-            others={} if choice is None else dict(zip(choice.views, fits or [fit], strict=True)),
+            hw=visible[0].hw,
+            picked=selection,
+            others={} if selection is None else dict(zip(selection.views, fits or [fit], strict=True)),
             swept=shelf.put(trace["dense"]) if sweep is not None else None,
         )
 
 
 def place_frames(recording: Recording, answers: Sequence[PairEstimate], *, poses: str = "device") -> PlacedFrames:
-    """Where the frames stand that the answers speak of.
+    """Poses in one world of all frames that the pairs' estimates contain.
 
     Args:
-        recording: with ``poses`` where they are asked for.
-        answers: of all pairs.
-        poses: ``device``, the recording's own trajectory; ``anchored``, chained from the pairs' own poses along the
-            fewest links, from the first frame of a fragment, which stands where the recording's trajectory has it, or
-            at the origin.
+        recording: with ``poses`` if they are to be used.
+        answers: the estimates of all pairs.
+        poses: ``device``, the recording's own trajectory; ``anchored``, the pairs' relative poses chained along the
+            fewest links from the first frame of a fragment, which has the pose of the recording's trajectory, or of
+            the origin.
 
     Raises:
-        ValueError: another word, or ``device`` for a recording without a trajectory.
+        ValueError: another value, or ``device`` for a recording without a trajectory.
     """
     if poses not in POSE_SOURCES:
         raise ValueError(f"poses: found {poses!r}, expected one of {', '.join(POSE_SOURCES)}")
     frames = sorted({k for answer in answers for k in (answer.pair[0], *answer.links)})
-    given = {} if recording.poses is None else {k: _own_pose(recording, k) for k in frames}
-    given = {k: T for k, T in given.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
+    own_poses = {} if recording.poses is None else {k: _own_pose(recording, k) for k in frames}
+    own_poses = {k: T for k, T in own_poses.items() if bool(T.R.isfinite().all() and T.t.isfinite().all())}
     if poses == "device":
         if recording.poses is None:
             raise ValueError(f"poses: {recording.name} has no trajectory of its own, expected poses=anchored")
-        return PlacedFrames(given, int(bool(given)), len(frames) - len(given))
+        return PlacedFrames(own_poses, int(bool(own_poses)), len(frames) - len(own_poses))
     links: dict[int, list[tuple[int, Pose]]] = {k: [] for k in frames}
     for answer in answers:
         i = answer.pair[0]
@@ -175,37 +175,37 @@ def place_frames(recording: Recording, answers: Sequence[PairEstimate], *, poses
     fragments: list[dict[int, Pose]] = []
     for k in frames:
         if not any(k in fragment for fragment in fragments):
-            start = given.get(k, se3.identity(1, torch.zeros(1, dtype=torch.float64)))
+            start = own_poses.get(k, se3.identity(1, torch.zeros(1, dtype=torch.float64)))
             fragments.append(_chain_poses(k, start, links))
     largest = max(fragments, key=len) if fragments else {}
     return PlacedFrames(largest, len(fragments), len(frames) - len(largest))
 
 
 def linking_pairs(pairs: Sequence[tuple[int, int]], *, chosen: bool = False) -> list[tuple[int, int]]:
-    """Further pairs, nearly as wide as the given ones, so that poses found for all of them can reach every frame.
+    """Additional pairs, nearly as wide as ``pairs``, so that the poses of all of them together link every frame.
 
-    Steps of one width alone never join neighbours; steps of two widths without a common factor do. The wider a step
-    the surer its translation, so the second is the widest that does it. Pairs that a method has ``chosen`` are of many
-    widths and on both sides: steps of their median width are then among the further ones.
+    Steps of a single width never link neighbours; steps of two widths without a common factor do. The wider a step the
+    more accurate its translation, so the second width is the largest such. Pairs that a method has ``chosen`` are of
+    many widths and on both sides: steps of their median width are then added as well.
     """
     frames = sorted({k for pair in pairs for k in pair})
-    place = {k: n for n, k in enumerate(frames)}
-    widths = sorted(abs(place[j] - place[i]) for i, j in pairs)
-    wide = widths[len(widths) // 2] if widths else 1
-    other = [w for w in range(1, wide) if math.gcd(w, wide) == 1 and w + wide - 1 <= len(frames)]
-    step = other[-1] if other else 1
-    steps = sorted({step, wide}) if chosen else [step]
+    position = {k: n for n, k in enumerate(frames)}
+    widths = sorted(abs(position[j] - position[i]) for i, j in pairs)
+    width = widths[len(widths) // 2] if widths else 1
+    coprime = [w for w in range(1, width) if math.gcd(w, width) == 1 and w + width - 1 <= len(frames)]
+    step = coprime[-1] if coprime else 1
+    steps = sorted({step, width}) if chosen else [step]
     links = [(frames[n], frames[n + step]) for step in steps for n in range(len(frames) - step)]
-    known = {*pairs, *((j, i) for i, j in pairs)}
-    return [link for link in links if link not in known]
+    listed = {*pairs, *((j, i) for i, j in pairs)}
+    return [link for link in links if link not in listed]
 
 
 def fuse_recording(
     recording: Recording, volume: Volume, answers: Sequence[PairEstimate], places: PlacedFrames, **options: Any
 ) -> Volume:
-    """The volume after all placed frames: :func:`fuse_recording_grids` of one."""
-    (built,) = fuse_recording_grids(recording, [volume], answers, places, **options)
-    return built
+    """The volume after fusion of all placed frames: :func:`fuse_recording_grids` with one volume."""
+    (fused,) = fuse_recording_grids(recording, [volume], answers, places, **options)
+    return fused
 
 
 def fuse_recording_grids(
@@ -224,29 +224,30 @@ def fuse_recording_grids(
     after: Callable[[int, list[Volume]], None] = lambda _source, _volumes: None,
     progress: Callable[[Iterable[Any], str, int], Iterable[Any]] = lambda items, _text, _total: items,
 ) -> list[Volume]:
-    """The volumes after all placed frames: first what the sensor says, frame by frame, then what was recovered, and
-    then what was swept.
+    """The volumes after fusion of all placed frames: sensor depth, then recovered points, then swept maps.
 
-    The sensor's depth enters every volume, each frame read once for all of them; the rest enters the last one alone.
+    The sensor's depth is fused into every volume, each frame read once for all of them; the other sources only into
+    the last one.
 
-    Of a swept map whole patches may be wrong together, and float where other frames see through. So room is made for
-    all maps first (:func:`dhtorch.integrate.reserve_blocks`): whatever the order, every ray that passes a place speaks
-    of it. What remains and no second map has found is left out (:func:`dhtorch.integrate.drop_unconfirmed`).
+    Whole patches of a swept map may be wrong together, and float in space that other frames see through. The blocks of
+    all maps are therefore reserved first (:func:`dhtorch.integrate.reserve_blocks`), so that whatever the order every
+    ray updates the voxels it passes. Surfaces that no second map confirms are dropped
+    (:func:`dhtorch.integrate.drop_unconfirmed`).
 
     Args:
-        recording: read once more, frame by frame.
+        recording: read again, frame by frame.
         volumes: with four feature channels: red, green, blue and score.
         answers, places: from :func:`estimate_pairs` and :func:`place_frames`.
-        sources: which of the three to fuse.
+        sources: codes.Source to fuse.
         cutoff: m; returns beyond it are hidden.
         sigma_m, sigma_rel, min_conf: the sensor's noise and least confidence, as in stage 2.
-        min_maps: swept maps that must agree on a surface of which nothing else speaks; of fewer maps all.
-        max_reach: in truncations; a depth whose twofold sigma exceeds it says nothing.
-        after: is told the volumes after each source: (codes.Source, volumes).
+        min_maps: swept maps that must agree on a surface without other depth; if there are fewer, all of them.
+        max_reach: in truncations; depth whose twofold sigma exceeds it is left out.
+        after: called after each source with (codes.Source, volumes).
         progress: wraps the loop over frames: (items, text, number of items) → items.
 
     Returns:
-        Volumes; recovered points are splats of 1.5 voxels, added where the sensor has no usable return.
+        Volumes; recovered points are discs of 1.5 voxels, added where the sensor has no usable return.
     """
     *finer, volume = volumes
     maps = [a for a in answers if a.pair[0] in places.poses and a.swept is not None and a.swept.n]
@@ -263,8 +264,8 @@ def fuse_recording_grids(
     if Source.RECOVERED in sources:
         placed = [a for a in answers if a.pair[0] in places.poses and bool(a.recovered.any())]
         for answer in progress(placed, f"{recording.name}: recovered", len(placed)):
-            one = view_from_recovered(answer, places.poses[answer.pair[0]], radius=_PATCH_RADIUS_VOXELS * volume.voxel)
-            volume = fuse_views(volume, one, source=Source.RECOVERED, max_reach=max_reach)
+            view = view_from_recovered(answer, places.poses[answer.pair[0]], radius=_PATCH_RADIUS_VOXELS * volume.voxel)
+            volume = fuse_views(volume, view, source=Source.RECOVERED, max_reach=max_reach)
         after(Source.RECOVERED, [*finer, volume])
     if Source.SWEPT in sources:
         for answer in progress(maps, f"{recording.name}: swept", len(maps)):
@@ -277,15 +278,16 @@ def fuse_recording_grids(
 
 
 def _fuse_sensor(volume: Volume, frame: Frame, T_world_from_cam: Pose, sparse: bool, noise: dict[str, Any]) -> Volume:
-    """The volume with what the sensor says in one frame."""
+    """The volume after fusion of one frame's sensor depth."""
     radius = _PATCH_RADIUS_VOXELS * volume.voxel if sparse else None
     return fuse_views(volume, view_from_sensor(frame, T_world_from_cam, radius=radius, **noise))
 
 
 def measure_coverage(xyz: Tensor, cell: float) -> dict[str, Any]:
-    """How much space points (P, 3) reach and whether it hangs together, in cells of ``cell`` metres.
+    """Number of occupied cells of ``cell`` metres of points (P, 3), and of their connected components.
 
-    ``n_voxels`` covered; ``n_islands`` of touching ones; ``largest_island``, its share; None without any.
+    Keys: ``n_voxels`` occupied; ``n_islands``, components of touching cells; ``largest_island``, the fraction of the
+    cells in the largest one, None without any.
     """
     key = sparse_grid.occupied_cells(xyz, cell)
     if not len(key):
@@ -304,10 +306,10 @@ def view_from_sensor(
     edge_rel: float = 0.1,
     radius: float | None = None,
 ) -> DepthView:
-    """The sensor's own depth of one frame (B = 1), with colours from the picture and its confidence as score.
+    """Depth view of one frame's sensor depth (B = 1), with colours of the image and the sensor confidence as score.
 
-    Returns below ``min_conf`` are left out, and those beside a depth step of more than ``edge_rel``, which belong to
-    neither side. Of sparse depth every return becomes a disc of ``radius`` metres instead.
+    Returns below ``min_conf`` are left out, and so are those beside a depth step of more than ``edge_rel``, which may
+    mix both sides. With ``radius``, for sparse depth, every return becomes a disc of so many metres instead.
     """
     depth = torch.where(frame.depth.isfinite() & (frame.depth > 0), frame.depth, 0.0)
     hw = (depth.shape[-2], depth.shape[-1])
@@ -325,14 +327,14 @@ def view_from_sensor(
         (_sample_colours(frame, uv if same else _depth_to_image_uv(frame, camera, uv)), score.view(1, -1, 1)), -1
     )
     if radius is not None:
-        some = (depth.flatten() > 0).nonzero()[:, 0]
-        values = (uv[:, some], depth.flatten(1)[:, some], sigma.flatten(1)[:, some], features[:, some])
+        index = (depth.flatten() > 0).nonzero()[:, 0]
+        values = (uv[:, index], depth.flatten(1)[:, index], sigma.flatten(1)[:, index], features[:, index])
         return splat_points(camera, hw, *values, T_world_from_cam=T_world_from_cam, radius=radius)
     return DepthView(depth, sigma, features.view(1, *hw, 4), camera, T_world_from_cam)
 
 
 def view_from_recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius: float) -> DepthView:
-    """The recovered points of a pair as patches of ``radius`` metres."""
+    """Depth view of a pair's recovered points, each a disc of ``radius`` metres."""
     estimate = answer.estimate
     depth = torch.where(answer.recovered, estimate.depth, 0.0)
     features = torch.cat((answer.rgb, estimate.score[..., None]), -1)
@@ -349,7 +351,7 @@ def view_from_recovered(answer: PairEstimate, T_world_from_cam: Pose, *, radius:
 
 
 def view_from_sweep(recording: Recording, answer: PairEstimate, places: PlacedFrames) -> DepthView:
-    """The swept pixels of a reference view's map, with colours from its picture."""
+    """Depth view of the swept pixels of a reference view's map, with colours of its image."""
     assert answer.swept is not None
     return view_from_depth_map(
         recording[answer.pair[0]], *answer.swept.read(), T_world_from_cam=places.poses[answer.pair[0]]
@@ -358,13 +360,13 @@ def view_from_sweep(recording: Recording, answer: PairEstimate, places: PlacedFr
 
 def view_from_depth_map(
     frame: Frame,
-    depth: Tensor,  # (1, h, w) m, of every pixel of a map over the frame's picture, 0 = none
+    depth: Tensor,  # (1, h, w) m, over the frame's whole image, 0 = none
     sigma: Tensor,  # (1, h, w) m
     score: Tensor,  # (1, h, w)
     *,
     T_world_from_cam: Pose,
 ) -> DepthView:
-    """A map of one frame, with colours from its picture."""
+    """Depth view of a depth map of one frame, with colours of its image."""
     hw = depth.shape[-2], depth.shape[-1]
     features = torch.cat((_sample_colours(frame, map_pixel_centres(frame, hw)[None]), score.view(1, -1, 1)), -1)
     camera = cameras.resize(frame.camera, frame.hw, hw)
@@ -377,24 +379,24 @@ def _own_pose(recording: Recording, k: int) -> Pose:
 
 
 def _chain_poses(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]]]) -> dict[int, Pose]:
-    """Poses of all frames that links join to the first one, along the fewest."""
-    found, queue = {first: start}, deque([first])
+    """Poses of all frames that links connect to the first one, each along the fewest links."""
+    poses, queue = {first: start}, deque([first])
     while queue:
         k = queue.popleft()
         for other, T_k_from_other in links[k]:
-            if other not in found:
-                found[other] = se3.compose(found[k], T_k_from_other)
+            if other not in poses:
+                poses[other] = se3.compose(poses[k], T_k_from_other)
                 queue.append(other)
-    return found
+    return poses
 
 
 def _sample_colours(frame: Frame, uv: Tensor) -> Tensor:
-    """(1, N, 3) in [0, 1] at the nearest pixels."""
+    """Colours (1, N, 3) in [0, 1] of the nearest pixels to ``uv``."""
     image = frame.image[0].expand(3, -1, -1)
     value = sample_nearest(image, uv.expand(3, -1, -1))[0].T[None]
     return value.to(uv) / 255 if image.dtype == torch.uint8 else value
 
 
 def _depth_to_image_uv(frame: Frame, camera: Camera, uv: Tensor) -> Tensor:
-    """Pixels of the picture (1, N, 2) that see what pixels of the depth map see."""
+    """Pixels (1, N, 2) of the image that correspond to pixels ``uv`` of the depth map."""
     return cameras.project(frame.camera, cameras.rays(camera, uv).nan_to_num())

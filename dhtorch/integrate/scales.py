@@ -1,8 +1,8 @@
-"""Two grids of one map: one as fine as the sensor, one as coarse as what was recovered is unsure.
+"""Two grids of one map: a fine one for sensor depth and a coarse one for the less accurate recovered depth.
 
-A grid keeps distances a few voxels from a surface. Where depth is surer than that, a finer grid would show more; where
-it is less sure, views of one surface never meet. A sensor's depth and what two views tell differ tenfold in sigma, so
-each gets voxels of its own size, and the map is both surfaces together.
+A grid stores distances up to a few voxels from a surface. For depth more accurate than that a finer grid would show
+more detail; for less accurate depth the views of one surface do not overlap. Sensor depth and triangulated depth differ
+tenfold in sigma, so each has voxels of its own size, and the map is the union of both surfaces.
 """
 
 from __future__ import annotations
@@ -13,30 +13,30 @@ from torch import Tensor
 from dhtorch.codes import Source
 from dhtorch.integrate.surface import Surface
 
-#: Voxels of the coarse grid to a median sigma of what it holds.
+#: Voxels of the coarse grid per median sigma of its depth.
 _VOXELS_PER_SIGMA = 4
-#: Truncations of a grid from which on twofold sigma says nothing there.
+#: Largest twofold sigma of depth that is fused, in truncations of the grid.
 MAX_REACH_TRUNCATIONS = 5.0
-#: Maps whose sigmas tell the size of the coarse voxels.
+#: Maps whose sigmas determine the size of the coarse voxels.
 N_MAPS_FOR_VOXEL = 5
-#: Coarse over fine voxel below which one grid holds all.
+#: Ratio of coarse to fine voxel up to which a single grid is used.
 _MIN_COARSE_RATIO = 1.5
 
 
 def choose_coarse_voxel(voxel: float, sigma: Tensor) -> float | None:
-    """Voxel, m, of the grid for depth of standard deviations ``sigma`` (P,) m; None = the sensor's ``voxel`` will do.
+    """Voxel, m, of the grid for depth of standard deviations ``sigma`` (P,) m; None = one grid of ``voxel`` suffices.
 
     Gradient: none.
     """
     usable = sigma[sigma.isfinite() & (sigma > 0)]
-    wide = float(usable.median()) / _VOXELS_PER_SIGMA if len(usable) else 0.0
-    return float(f"{wide:.2g}") if wide > _MIN_COARSE_RATIO * voxel else None
+    coarse = float(usable.median()) / _VOXELS_PER_SIGMA if len(usable) else 0.0
+    return float(f"{coarse:.2g}") if coarse > _MIN_COARSE_RATIO * voxel else None
 
 
 def merge_surfaces(fine: Surface, wide: Surface) -> Surface:
-    """The fine surface, and of the coarse one what the sensor has not made.
+    """Union of the fine surface and of the coarse surface's points that are not of the sensor.
 
-    Points or meshes, both of one kind; of a mesh those triangles stay of which all corners stay. Gradient: none.
+    Both are points or both are meshes; a triangle is kept if all its corners are. Gradient: none.
     """
     keep = wide.source != Source.SENSOR
     face = None

@@ -1,7 +1,7 @@
-"""Maps of every pixel for the frames of a recording: asked for as the settings say, and put aside in a file.
+"""Dense depth maps of a recording's reference views: their computation, and their storage in a temporary file.
 
-A map is made where its frame is asked for and needed once the frame has a place, which may be when all the others have
-been asked. Until then it lies in a file without a name, of half precision, and memory holds none of it.
+A map is computed with the estimates of its pair but used only once the frame is placed, which may be after all pairs.
+Until then it lies in an unnamed file in half precision, so that no map stays in memory.
 """
 
 from __future__ import annotations
@@ -26,43 +26,43 @@ from dhtorch.records import DepthMap, Estimate, Frame
 
 @dataclass(frozen=True, eq=False)
 class DenseSweep:
-    """How maps are made: options of ``complete`` that differ from its own, and the calibration of their sigma."""
+    """Dense completion of a reference view: its non-default options, and the calibration of its sigma."""
 
     options: Mapping[str, Any] = field(default_factory=dict)
     calibration: Calibration | None = field(default_factory=dense.default_calibration)
 
     @classmethod
     def asked(cls, given: bool | Mapping[str, Any] | None, name: str = "dense") -> DenseSweep | None:
-        """What settings ask for, see :func:`dhtorch.pipeline.dense.dense_options`."""
+        """The sweep of the option ``dense``, None if it is off; see :func:`dhtorch.pipeline.dense.dense_options`."""
         options = dense.dense_options(given, name)
         return None if options is None else cls(options)
 
     def __call__(
-        self, method: Method, reference: Frame, others: Frame, *, trace: Trace, track: Any = None, **told: Any
+        self, method: Method, reference: Frame, others: Frame, *, trace: Trace, track: Any = None, **run_options: Any
     ) -> Estimate:
-        """The sparse answers, as ``method(reference view, others)`` gives them; ``trace`` also has ``dense``, the maps.
+        """The sparse estimate of ``method(reference, others)``; the dense maps are stored in ``trace["dense"]``.
 
         Args:
             method, reference, others: as :func:`dhtorch.pipeline.dense.complete_depth` takes them.
-            trace: receives what the method tells.
-            track: another function in the method's seat 4; None = its own.
-            told: ``seed``, ``fit`` and ``hint``.
+            trace: receives the intermediate results of the method.
+            track: another function for the method's stage 4; None = its own.
+            run_options: ``seed``, ``fit`` and ``hint``.
         """
         method = method if track is None else method.replace(track=track)
-        own: dict[str, Any] = {**self.options, "calibration": self.calibration, **told}
-        trace["dense"] = dense.complete_depth(reference, others, method=method, trace=trace, **own)
+        complete_options: dict[str, Any] = {**self.options, "calibration": self.calibration, **run_options}
+        trace["dense"] = dense.complete_depth(reference, others, method=method, trace=trace, **complete_options)
         sparse: Estimate = trace["sparse"]
         return sparse
 
 
 @dataclass(frozen=True, eq=False)
 class StoredSweep:
-    """The swept pixels of one frame's map (B = 1), which lie in a file."""
+    """The swept pixels of one frame's map (B = 1), stored in a file."""
 
     file: IO[bytes]
     offset: int
     hw: tuple[int, int]
-    n: int  # pixels that were swept and are kept
+    n: int  # number of swept pixels that are kept
 
     def read(self) -> tuple[Tensor, Tensor, Tensor]:
         """Depth and sigma in m, and score, (1, h, w) each, float32; 0 in other pixels."""
@@ -74,25 +74,25 @@ class StoredSweep:
 
 
 class SweepStore:
-    """Where the maps of a recording wait until its frames are placed: a file that goes when nobody holds it.
+    """Temporary file with the dense maps of a recording, deleted when no reference to it is left.
 
-    Disk: six bytes a pixel. A kill leaves nothing behind.
+    Disk: six bytes a pixel. A killed process leaves no file behind.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
-        """Args: folder: of the file, made with the first map; None = the system's for temporary files."""
+        """Args: folder: of the file, created with the first map; None = the system's folder for temporary files."""
         self._folder = folder
         self._file: IO[bytes] | None = None
 
     def put(self, found: DepthMap, *, edge_rel: float = 0.1) -> StoredSweep:
-        """Put the swept pixels of a map (B = 1) aside, but for those beside a step of more than ``edge_rel``.
+        """Store the swept pixels of a map (B = 1), except those beside a depth step of more than ``edge_rel``.
 
-        What has no return there was fitted in a window that reaches over the step, and may belong to either side.
+        Pixels there without a return were fitted in a window that reaches over the step, and may belong to either side.
         """
         if self._file is None:
             if self._folder is not None:
                 self._folder.mkdir(parents=True, exist_ok=True)
-            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115  (it lives as long as the shelf)
+            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115  (it lives as long as the store)
         depth = torch.where(found.keep, found.depth, 0.0)
         keep = found.keep & (found.source == Source.SWEPT) & (depth_step_rel(depth) <= edge_rel)
         values = torch.cat((depth, found.sigma, found.score))
@@ -105,7 +105,7 @@ class SweepStore:
 def depth_step_rel(
     depth: Tensor,  # (B, h, w) m, 0 = none
 ) -> Tensor:
-    """Farthest over nearest depth in 3×3 pixels, minus one; what has none does not count."""
+    """Farthest over nearest depth in 3×3 pixels, minus one, (B, h, w); pixels without depth do not count."""
     far = torch.nn.functional.max_pool2d(depth[:, None], 3, 1, 1)[:, 0]
     inverse = torch.where(depth > 0, 1 / torch.where(depth > 0, depth, 1.0), 0.0)
     near = torch.nn.functional.max_pool2d(inverse[:, None], 3, 1, 1)[:, 0]

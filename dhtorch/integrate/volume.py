@@ -1,12 +1,12 @@
-"""A signed distance field in blocks: near surfaces only, growing as views are fused into it.
+"""A signed distance field in sparse blocks near surfaces, and the fusion of depth views into it.
 
 Alphabet: a *voxel* is a point of a regular grid in the world, ``voxel`` metres apart; a *block* is 8×8×8 of them, and
 only blocks that a ray has ended in (or near) exist. Each voxel holds ``distance``, how far it lies in front of the
-surface as seen along the rays that looked at it (m, negative behind, at most ``truncation``), the ``weight`` of what
-has been said, 1/m², and the weighted mean of ``features`` such as colour.
+surface along the viewing rays (m, negative behind, at most ``truncation``), the ``weight`` of its observations, 1/m²,
+and the weighted mean of ``features`` such as colour.
 
-A view speaks only where it has an answer: along the ray to a pixel with depth, from the camera to a little behind the
-surface. Elsewhere nothing changes, so that what was never looked at stays unknown.
+A view updates voxels only along the rays of pixels with depth, from the camera to a little behind the surface. All
+other voxels are unchanged, so that unobserved space remains unobserved.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from dhtorch.geometry.patches import round_half_up
 from dhtorch.pytree import Record, record
 from dhtorch.records import Camera, Pose
 
-#: Voxels along a block's side, and in it.
+#: Voxels along the side of a block, and in a block.
 BLOCK_SIDE = 8
 BLOCK_VOXELS = BLOCK_SIDE**3
-#: Blocks that are updated at a time: bounds the memory of intermediates.
+#: Blocks updated at a time; bounds the memory of intermediate results.
 _BLOCKS_PER_CHUNK = 1024
-#: Sources with a weight of their own, in the order in which a voxel keeps them.
+#: Sources of depth with separate weights, in the order of ``Volume.weight``.
 VOLUME_SOURCES = (Source.SENSOR, Source.RECOVERED, Source.SWEPT)
 
 
@@ -36,11 +36,11 @@ class Volume(Record):
     """Blocks of a signed distance field; made by :func:`make_volume`, grown by :func:`fuse_views`, never changed in
     place."""
 
-    key: Tensor  # (K,) int64, rising: numbers of the blocks, see geometry.sparse_grid
+    key: Tensor  # (K,) int64, rising: packed positions of the blocks, see geometry.sparse_grid
     distance: Tensor  # (K, 512) m, positive in front of the surface
-    weight: Tensor  # (K, 512, 3) 1/m², of depth from the sensor, recovered and swept; 0 = nothing known
-    n_swept: Tensor  # (K, 512) uint8: swept views with a surface within reach; 255 = so many or more
-    features: Tensor  # (K, 512, 1 + C) float16: how much of the weight came with features, and that times their mean
+    weight: Tensor  # (K, 512, 3) 1/m², of sensor, recovered and swept depth; 0 = unobserved
+    n_swept: Tensor  # (K, 512) uint8: number of swept views with a surface within reach; 255 = 255 or more
+    features: Tensor  # (K, 512, 1 + C) float16: fraction of the weight with features, and that times their mean
     voxel: float  # m
     truncation: float  # m
 
@@ -53,9 +53,9 @@ class Volume(Record):
 
 @record
 class DepthView(Record):
-    """Depth maps to be fused; pixels without an answer hold depth 0."""
+    """Depth maps to be fused; pixels without depth hold 0."""
 
-    depth: Tensor  # (B, h, w) m, 0 = no answer
+    depth: Tensor  # (B, h, w) m, 0 = none
     sigma: Tensor  # (B, h, w) m, standard deviation of depth
     features: Tensor  # (B, h, w, C), averaged along with the distance
     camera: Camera
@@ -69,7 +69,7 @@ def make_volume(
     channels: int = 4,
     device: torch.device | str | None = None,
 ) -> Volume:
-    """A volume in which nothing is known.
+    """An empty volume.
 
     Args:
         voxel: m from voxel to voxel.
@@ -100,24 +100,23 @@ def fuse_views(
     max_reach: float = 3.0,
     carve: bool = True,
 ) -> Volume:
-    """The volume after B views more: distances averaged by 1/sigma², overlap blended, nothing overwritten.
+    """The volume after fusion of B more views: the mean of all distances, weighted by 1/sigma².
 
-    Every voxel of a block in sight is projected into the view and reads the nearest pixel. It learns how far it lies in
-    front of the surface there, at most the truncation, or behind it, as far as the surface could well be: twice sigma,
-    but at least the truncation; what is said behind the surface fades out over the far half of that reach. Voxels in
-    front are carved free all along the ray; those without an answer at their pixel, and those further behind, are left
-    alone.
+    Every voxel of a block in sight is projected into the view and reads the nearest pixel. Its distance to the surface
+    there is clamped to the truncation. Behind the surface it is updated as far as the reach, twice sigma but at least
+    the truncation, with a weight that fades out over the far half of the reach. Voxels in front are carved free all
+    along the ray; voxels without depth at their pixel, and voxels further behind, are unchanged.
 
     Args:
-        volume: what is known so far.
+        volume: of all views fused so far.
         view: B views, fused in their order.
-        source: of their depth, Source.SENSOR, RECOVERED or SWEPT; decides which weight grows.
-        max_reach: in truncations; a depth whose twofold sigma exceeds it says nothing.
-        carve: False leaves voxels alone that lie in front of the surface by more than the reach.
+        source: of their depth, Source.SENSOR, RECOVERED or SWEPT; selects the weight that is increased.
+        max_reach: in truncations; depth whose twofold sigma exceeds it is left out.
+        carve: False = voxels in front of the surface by more than the reach are unchanged.
 
     Returns:
         Volume with the blocks that the views' surfaces pass through. Depths that are not finite, not positive or
-        without a usable sigma, views without a finite pose, and places out of the grid's reach leave no trace.
+        without a usable sigma, views without a finite pose, and points beyond the grid's range are ignored.
 
     Raises:
         ValueError: wrong shapes, or another source.
@@ -130,32 +129,32 @@ def fuse_views(
     if source not in VOLUME_SOURCES:
         raise ValueError(f"fuse_views: source is {source}, expected SENSOR, RECOVERED or SWEPT {VOLUME_SOURCES}")
     with torch.no_grad():
-        views = [_ViewIntegrator(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
-        volume = _grow(volume, [s.blocks() for s in views])
-        for sight in views:
-            sight.add_to(volume, VOLUME_SOURCES.index(source), carve)
+        integrators = [_ViewIntegrator(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
+        volume = _grow(volume, [i.blocks() for i in integrators])
+        for integrator in integrators:
+            integrator.add_to(volume, VOLUME_SOURCES.index(source), carve)
     return volume
 
 
 def reserve_blocks(volume: Volume, view: DepthView, *, max_reach: float = 3.0) -> Volume:
-    """The volume with room for the surfaces of B views, of which nothing is said yet.
+    """The volume with empty blocks for the surfaces of B views, which are not fused yet.
 
-    A voxel learns nothing from views that were fused before its block was there: rays that passed through it are
-    forgotten. Where that matters, because what comes later may be wrong, room is made for all views first.
+    A voxel is not updated by views that were fused before its block existed: rays through it are lost. Where later
+    views may be wrong, so that free space must be carved, the blocks of all views are reserved first.
 
     Arguments and errors as of :func:`fuse_views`.
     """
     _check_view(volume, view)
     with torch.no_grad():
-        sights = [_ViewIntegrator(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
-        return _grow(volume, [sight.blocks() for sight in sights])
+        integrators = [_ViewIntegrator(volume, view[b : b + 1], max_reach) for b in range(len(view.depth))]
+        return _grow(volume, [integrator.blocks() for integrator in integrators])
 
 
 def drop_unconfirmed(volume: Volume, least: int = 2) -> Volume:
-    """The volume without what swept depth alone says and fewer than ``least`` swept views agree on; asked at the end.
+    """The volume without voxels of swept depth alone that fewer than ``least`` swept views confirm; called at the end.
 
-    A view whose motion is wrong is wrong in all its pixels, and its neighbours in a patch err alike; what another view
-    found as well, with other source views, is seldom wrong in the same way.
+    A view with a wrong pose is wrong in all its pixels, and neighbouring pixels have similar errors; a surface that a
+    second reference view with other source views shows as well is seldom wrong in the same way.
 
     Raises:
         ValueError: ``least`` is not positive.
@@ -170,7 +169,7 @@ def splat_points(
     camera: Camera,  # B
     hw: tuple[int, int],
     uv: Tensor,  # (B, N, 2) px
-    depth: Tensor,  # (B, N) m; not finite or 0 = no answer
+    depth: Tensor,  # (B, N) m; not finite or 0 = none
     sigma: Tensor,  # (B, N) m
     features: Tensor,  # (B, N, C)
     *,
@@ -178,15 +177,15 @@ def splat_points(
     radius: float = 0.03,
     max_radius_px: int = 12,
 ) -> DepthView:
-    """Sparse answers as a depth map: each becomes a small disc that faces the camera.
+    """Depth view of sparse points: each becomes a small disc parallel to the image plane.
 
-    A lone ray would touch a voxel here and there; a disc of a few voxels makes a patch of surface, and claims no more
-    than its radius. Where discs overlap the nearer one covers the other, as surfaces do.
+    A single ray would update only scattered voxels; a disc of a few voxels gives a patch of surface no larger than its
+    radius. Where discs overlap the nearer one occludes the other.
 
     Args:
         camera, hw: of the image in which ``uv`` are pixels.
-        uv, depth, sigma, features: the answers.
-        T_world_from_cam: where the camera was.
+        uv, depth, sigma, features: of the points.
+        T_world_from_cam: pose of the camera.
         radius: m of a disc, at least half a pixel.
         max_radius_px: largest radius in the image, for points close to the camera.
 
@@ -206,12 +205,12 @@ def splat_points(
         step = torch.arange(-reach, reach + 1, device=uv.device)
         offset = torch.cartesian_prod(step, step)  # (O, 2)
         centre = torch.where(usable[..., None], uv, 0.0)
-        at = round_half_up(centre).long()[:, :, None] + offset  # (B, N, O, 2)
-        there = usable[..., None] & ((at - centre[:, :, None]).square().sum(-1).sqrt() <= size[..., None])
-        there |= usable[..., None] & (offset == 0).all(-1)
-        there &= (at >= 0).all(-1) & (at[..., 0] < w) & (at[..., 1] < h)
-        b, n, o = there.nonzero(as_tuple=True)
-        pixel = (b * h + at[b, n, o, 1]) * w + at[b, n, o, 0]
+        position = round_half_up(centre).long()[:, :, None] + offset  # (B, N, O, 2)
+        covered = usable[..., None] & ((position - centre[:, :, None]).square().sum(-1).sqrt() <= size[..., None])
+        covered |= usable[..., None] & (offset == 0).all(-1)
+        covered &= (position >= 0).all(-1) & (position[..., 0] < w) & (position[..., 1] < h)
+        b, n, o = covered.nonzero(as_tuple=True)
+        pixel = (b * h + position[b, n, o, 1]) * w + position[b, n, o, 0]
         owner = _nearest_owner(pixel, z[b, n], n, B * h * w)
         held = (owner >= 0).view(B, h, w)
         index = owner.clamp_min(0).view(B, h * w)
@@ -226,7 +225,7 @@ def splat_points(
 
 
 class _ViewIntegrator:
-    """One view (B = 1) of a volume."""
+    """Fusion of one view (B = 1) into a volume."""
 
     def __init__(self, volume: Volume, view: DepthView, max_reach: float) -> None:
         self.voxel, self.truncation = volume.voxel, volume.truncation
@@ -246,24 +245,24 @@ class _ViewIntegrator:
         self.extent = edge[edge.isfinite().all(-1)].abs().amax(0)[:2] if len(edge) else edge.new_zeros(2)
 
     def blocks(self) -> Tensor:
-        """Numbers of the blocks that the band around the surface passes through."""
+        """Packed positions of the blocks that the band around the surface passes through."""
         uv = torch.stack((self.pixel % self.hw[1], self.pixel // self.hw[1]), -1).to(self.camera.f)
         ray = cameras.rays(self.camera, uv[None])[0].double()
-        fine = ray.isfinite().all(-1)
-        ray, at = ray[fine], self.pixel[fine]
+        is_finite = ray.isfinite().all(-1)
+        ray, pixel = ray[is_finite], self.pixel[is_finite]
         unit = ray / ray.norm(dim=-1, keepdim=True)
-        surface, reach = ray * self.depth[at, None], self.reach[at]
+        surface, reach = ray * self.depth[pixel, None], self.reach[pixel]
         world, way = surface @ self.R.T + self.t, unit @ self.R.T
-        side, found = BLOCK_SIDE * self.voxel, []
+        side, blocks = BLOCK_SIDE * self.voxel, []
         longest = float(reach.max()) if len(reach) else 0.0
         steps = max(2, int((self.truncation + longest) / (side / 2)) + 2)
         for k in range(steps):
             along = -self.truncation + (self.truncation + reach) * k / (steps - 1)
-            found.append(sparse_grid.occupied_cells(world + along[:, None] * way, side))
-        return torch.cat(found).unique()
+            blocks.append(sparse_grid.occupied_cells(world + along[:, None] * way, side))
+        return torch.cat(blocks).unique()
 
     def add_to(self, volume: Volume, source: int, carve: bool) -> None:
-        """Update a fresh volume in place."""
+        """Update a volume in place; the caller owns the copy."""
         corner = sparse_grid.unpack_cells(volume.key).double() * BLOCK_SIDE * self.voxel
         corner = (corner - self.t) @ self.R  # in camera axes: the rotation's transpose
         local = torch.cartesian_prod(*(torch.arange(BLOCK_SIDE, device=corner.device),) * 3).double() * self.voxel
@@ -291,42 +290,42 @@ class _ViewIntegrator:
         pixel = torch.where(ahead, uv[..., 1] * self.hw[1] + uv[..., 0], 0.0).long()
         depth, reach = self.depth[pixel], self.reach[pixel]
         along = (depth - z) * xyz.norm(dim=-1) / z.clamp_min(0.01)
-        told = ahead & (depth > 0) & (along > -reach)
+        updated = ahead & (depth > 0) & (along > -reach)
         if not carve:
-            told &= along <= reach
+            updated &= along <= reach
         fade = (2 + 2 * along / reach).clamp(0, 1)
-        weight = torch.where(told, self.precision[pixel] * fade, 0.0)
+        weight = torch.where(updated, self.precision[pixel] * fade, 0.0)
         total = volume.weight[part].sum(-1) + weight
-        share = weight / torch.where(total > 0, total, 1.0)
+        fraction = weight / torch.where(total > 0, total, 1.0)
         old = volume.distance[part]
-        volume.distance[part] = old + share * (along.clamp(-self.truncation, self.truncation) - old)
-        close = torch.where(along.abs() <= self.truncation, share, 0.0)[..., None]
-        colour = volume.features[part].to(share.dtype)
+        volume.distance[part] = old + fraction * (along.clamp(-self.truncation, self.truncation) - old)
+        close = torch.where(along.abs() <= self.truncation, fraction, 0.0)[..., None]
+        colour = volume.features[part].to(fraction.dtype)
         volume.features[part] = (colour + close * (self.features[pixel] - colour)).to(volume.features.dtype)
         volume.weight[part, :, source] += weight
         if VOLUME_SOURCES[source] == Source.SWEPT:
-            volume.n_swept[part] += (told & (along <= reach) & (fade >= 0.5) & (volume.n_swept[part] < 255)).byte()
+            volume.n_swept[part] += (updated & (along <= reach) & (fade >= 0.5) & (volume.n_swept[part] < 255)).byte()
 
 
 def _grow(volume: Volume, keys: list[Tensor]) -> Volume:
-    """A copy of the volume with room for further blocks."""
+    """A copy of the volume with the blocks of ``keys`` added, empty."""
     key = torch.cat((volume.key, *keys)).unique()
     at = sparse_grid.find_cells(key, volume.key)[0]
 
-    def wider(x: Tensor) -> Tensor:
+    def zero_padded(x: Tensor) -> Tensor:
         return x.new_zeros(len(key), *x.shape[1:]).index_copy_(0, at, x)
 
     fields = ("distance", "weight", "n_swept", "features")
-    return volume.replace(key=key, **{name: wider(getattr(volume, name)) for name in fields})
+    return volume.replace(key=key, **{name: zero_padded(getattr(volume, name)) for name in fields})
 
 
 def _nearest_owner(pixel: Tensor, depth: Tensor, owner: Tensor, n_pixels: int) -> Tensor:
-    """For each pixel the owner of the nearest depth, of equals the first; -1 where there is none."""
+    """For each pixel the owner of the nearest depth, the first of equal ones; -1 where there is none."""
     best = torch.full((n_pixels,), torch.inf, dtype=depth.dtype, device=depth.device)
     best = best.scatter_reduce(0, pixel, depth, "amin")
     first = torch.full((n_pixels,), torch.iinfo(torch.int64).max, device=pixel.device)
-    won = depth == best[pixel]
-    first = first.scatter_reduce(0, pixel[won], owner[won], "amin")
+    is_nearest = depth == best[pixel]
+    first = first.scatter_reduce(0, pixel[is_nearest], owner[is_nearest], "amin")
     return torch.where(best.isfinite(), first, -1)
 
 

@@ -1,7 +1,7 @@
-"""How much a number over scenes would change with other scenes: intervals by resampling scenes, never points.
+"""Bootstrap intervals of a statistic over scenes: scenes are resampled, never points.
 
-Points of one scene share its truth, its camera and its poses; treated as independent they would promise an interval
-many times too narrow.
+Points of one scene share its truth, its camera and its poses; treated as independent they would give an interval many
+times too narrow.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-#: How scenes are joined to one number; the geometric mean is for ratios.
+#: Statistics that combine the values of scenes; the geometric mean is for ratios.
 _STATISTICS = ("median", "mean", "geometric_mean")
 
 
@@ -23,15 +23,15 @@ class Interval(NamedTuple):
     value: float | None
     low: float | None
     high: float | None
-    n: int  # scenes in which the number is defined
+    n: int  # number of scenes in which the value is defined
 
     def entry(self, unit: str = "1") -> dict[str, Any]:
-        """The interval as a result's summary holds it: ``{value, low, high, n, unit}``."""
+        """The interval as an entry of a result's summary: ``{value, low, high, n, unit}``."""
         return {**self._asdict(), "unit": unit}
 
 
 def without_interval(value: float | None, n: int, unit: str = "1") -> dict[str, Any]:
-    """A summary entry of a number without an interval, over n scenes."""
+    """Summary entry of a value over n scenes without an interval."""
     return Interval(value, None, None, n).entry(unit)
 
 
@@ -63,9 +63,9 @@ def interval_over_scenes(
     if statistic not in _STATISTICS:
         raise ValueError(f"bootstrap.statistic: found {statistic!r}, expected one of {', '.join(_STATISTICS)}")
     defined = torch.tensor([v for v in values if v is not None and math.isfinite(v)], dtype=torch.float64)
-    join = {"median": _median, "mean": _mean, "geometric_mean": _geometric_mean}[statistic]
+    reduce = {"median": _median, "mean": _mean, "geometric_mean": _geometric_mean}[statistic]
     return interval_of_statistic(
-        lambda index: join(defined[index]), defined.numel(), level=level, draws=draws, seed=seed
+        lambda index: reduce(defined[index]), defined.numel(), level=level, draws=draws, seed=seed
     )
 
 
@@ -77,16 +77,16 @@ def interval_of_statistic(
     draws: int = 2000,
     seed: int = 0,
 ) -> Interval:
-    """Any number computed from n scenes, with its percentile bootstrap interval.
+    """Value of any statistic of n scenes, with its percentile bootstrap interval.
 
     Args:
-        number: indices of scenes (draws, n), each row one choice of scenes → the number of every row (draws,), NaN
-            where it is undefined.
-        n: scenes.
+        number: the statistic: indices of scenes (draws, n), each row one resample → its value for each row (draws,),
+            NaN where undefined.
+        n: number of scenes.
         level, draws, seed: as for :func:`interval_over_scenes`.
 
     Returns:
-        Interval; draws in which the number is undefined are left out of it.
+        Interval; draws in which the statistic is undefined are left out of it.
 
     Raises:
         ValueError: a level outside (0, 1).
@@ -98,14 +98,14 @@ def interval_of_statistic(
         return Interval(None, None, None, n)
     if n == 1:
         return Interval(value, None, None, 1)
-    spread = number(resample_scenes(n, draws, seed=seed)).double()
+    resampled = number(resample_scenes(n, draws, seed=seed)).double()
     edges = torch.tensor([(1 - level) / 2, (1 + level) / 2], dtype=torch.float64)
-    low, high = torch.nanquantile(spread, edges).tolist()
+    low, high = torch.nanquantile(resampled, edges).tolist()
     return Interval(value, low, high, n)
 
 
 def resample_scenes(n: int, draws: int, *, seed: int = 0) -> Tensor:
-    """Indices (draws, n) of scenes drawn with replacement: for numbers that are no mean or median of scene values."""
+    """Indices (draws, n) of scenes drawn with replacement, for statistics other than a mean or median of values."""
     return torch.randint(n, (draws, n), generator=torch.Generator().manual_seed(seed))
 
 

@@ -1,15 +1,14 @@
-"""Where to cut the score so that the error stays below a target: three controls, two kinds of promise.
+"""Score thresholds that keep the error below a target: plug-in, scene-quantile and conformal risk control.
 
-*Plug-in* looks at the error among the answers, on the scenes it is given, and leaves room for one standard error. It
-promises nothing about another scene. *Most scenes* asks the same of nine scenes in ten, one by one, instead of their
-mean. *Conformal* promises: if the scenes, the next one included, could have come in
-any order (are exchangeable), the loss of the next scene meets the target. The loss there is per candidate, capped
-error × answered / candidates, because it must not rise when less is answered; and a promise takes scenes: with fewer
-than it needs it says how many.
+*Plug-in* bounds the mean error of the answers on the scenes given, plus one standard error; it has no guarantee for
+another scene. *Scene quantile* requires the same of nine scenes in ten, each by itself, instead of their mean.
+*Conformal* has a guarantee: if all scenes, the next one included, are exchangeable, the loss of the next scene meets
+the target. Its loss is per candidate, capped error × answered / candidates, because it must not rise when less is
+answered. The guarantee requires a minimum number of scenes, stated in ``ScoreThreshold.needed``.
 
-Both need only scores, answers and truth, so any depth source will do; ``errors.points`` joins three arrays to a scene.
-The unit is the scene: points of one scene share its truth and its poses and are no independent witnesses. Pieces of
-one room are no exchangeable scenes either: join them to one first (``dhtorch.pytree.collate``).
+All need only scores, answers and truth, so any depth source will do; ``errors.make_points`` joins arrays to a scene.
+The unit is the scene: points of one scene share its truth and its poses and are not independent. Pieces of one room
+are not exchangeable scenes: join them to one first (``dhtorch.pytree.collate``).
 """
 
 from __future__ import annotations
@@ -25,29 +24,29 @@ from torch import Tensor
 from dhtorch.metrics.errors import Points
 from dhtorch.metrics.risk import cap_error
 
-#: Scenes of which the spread of their risks is taken to be known.
+#: Fewest scenes from which the spread of their risks is estimated.
 _MIN_SCENES_FOR_SPREAD = 5
 
-#: Thresholds tried at most; where there are more distinct scores, evenly spaced ones among them.
+#: Largest number of thresholds tried; of more distinct scores, evenly spaced ones are used.
 _MAX_THRESHOLDS = 4096
 
 
 @dataclass(frozen=True)
 class ScoreThreshold:
-    """A threshold and what it did on the scenes it was chosen on."""
+    """A score threshold, with its risk and coverage on the scenes it was chosen on."""
 
     threshold: float | None  # answer where score ≥ threshold; None = answer nothing
     target: float
-    bound: float | None  # what was held against the target, at the threshold
-    risk: float  # mean over the scenes, at the threshold: of what the control calls risk
+    bound: float | None  # the value compared with the target, at the threshold
+    risk: float  # mean over the scenes of the control's risk, at the threshold
     coverage: float  # mean over the scenes of answered / candidates, at the threshold
     n: int  # scenes it was chosen on
-    needed: int | None = None  # scenes below which no threshold can meet the target; None = no such number
+    needed: int | None = None  # fewest scenes with which a threshold can meet the target; None = no such limit
     confidence: float | None = None
 
     @property
     def why(self) -> str:
-        """In words."""
+        """The result as a sentence."""
         if self.needed is not None and self.n < self.needed:
             return f"{self.n} scenes are too few: a target of {self.target:g} takes at least {self.needed}"
         if self.threshold is None:
@@ -56,16 +55,16 @@ class ScoreThreshold:
 
 
 def plug_in_threshold(scenes: Sequence[Points], target: float) -> ScoreThreshold:
-    """The largest coverage whose scene-mean risk plus one standard error over scenes meets the target.
+    """Threshold of the largest coverage at which the mean risk over scenes plus one standard error meets the target.
 
-    The risk of a scene is the mean capped error of its answers, 0 where it is silent. No guarantee is claimed.
+    The risk of a scene is the mean capped error of its answers, 0 without any. There is no guarantee.
 
     Args:
-        scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
+        scenes: candidates with scores, one entry a scene; scenes without candidates are ignored.
         target: mean capped error allowed, in (0, 1).
 
     Returns:
-        Control; with fewer than two scenes there is no standard error and no threshold.
+        ScoreThreshold; with fewer than two scenes there is no standard error and no threshold.
 
     Raises:
         ValueError: a target outside (0, 1).
@@ -86,22 +85,22 @@ def plug_in_threshold(scenes: Sequence[Points], target: float) -> ScoreThreshold
 def scene_quantile_threshold(
     scenes: Sequence[Points], target: float, *, share: float = 0.9, few: int = 0
 ) -> ScoreThreshold:
-    """The largest coverage at which so many scenes meet the target, each by itself, that the next one likely does.
+    """Threshold of the largest coverage at which the fraction ``share`` of the scenes meets the target, each by itself.
 
-    A mean over scenes may be met although half of them are above it; this asks how many are not: of n scenes
-    share · (n + 1), rounded up, so that of n + 1 exchangeable ones that share would. Where that is more than all, all
-    are asked; of so few the worst to come is read from their spread as well: mean + t · s · √(1 + 1/n), which the risk
-    of one more scene exceeds with probability 1 − share were the risks normal, meets the target too. Of fewer than
-    :data:`_MIN_SCENES_FOR_SPREAD` no spread is known, and no more is claimed than that all meet it.
+    A mean over scenes may meet the target although half of the scenes do not. Here, of n scenes share · (n + 1),
+    rounded up, must meet it, so that of n + 1 exchangeable ones the fraction ``share`` does. Where that is more than n,
+    all n must, and the bound from their spread as well: mean + t · s · √(1 + 1/n), which the risk of one more scene
+    exceeds with probability 1 − share if the risks are normal. With fewer than :data:`_MIN_SCENES_FOR_SPREAD` scenes
+    no spread is estimated, and it is only required that all meet the target.
 
     Args:
-        scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
+        scenes: candidates with scores, one entry a scene; scenes without candidates are ignored.
         target: mean capped error allowed of the answers of one scene, in (0, 1).
-        share: of the scenes that are to meet it, in (0, 1].
-        few: a scene with fewer answers above a threshold says nothing against it.
+        share: fraction of the scenes that must meet it, in (0, 1].
+        few: a scene with fewer answers above a threshold counts as meeting the target.
 
     Returns:
-        Control; its ``bound`` is the share of the scenes that meet the target.
+        ScoreThreshold; its ``bound`` is the fraction of the scenes that meet the target.
 
     Raises:
         ValueError: a target outside (0, 1), or a share outside (0, 1].
@@ -122,7 +121,7 @@ def scene_quantile_threshold(
 
 
 def conformal_threshold(scenes: Sequence[Points], target: float, *, confidence: float | None = None) -> ScoreThreshold:
-    """A threshold under which the loss of the next scene meets the target, if scenes are exchangeable.
+    """Threshold at which the loss of the next scene meets the target, if scenes are exchangeable.
 
     The loss of a scene is the sum of the capped errors of its answers over the number of its candidates: between 0
     and 1, and never larger at a higher threshold. In expectation: n / (n + 1) · (mean loss) + 1 / (n + 1) ≤ target.
@@ -130,15 +129,14 @@ def conformal_threshold(scenes: Sequence[Points], target: float, *, confidence: 
     1 − confidence, here and at every higher threshold.
 
     Args:
-        scenes: candidates with scores, one entry a scene; scenes without candidates are passed over.
+        scenes: candidates with scores, one entry a scene; scenes without candidates are ignored.
         target: loss allowed, in (0, 1).
-        confidence: None promises E(loss of the next scene) ≤ target, over the scenes here and the next one; a
-            probability in (0, 1) promises that, with it, the scenes here give a threshold whose expected loss is at
-            most the target.
+        confidence: None guarantees E(loss of the next scene) ≤ target, over the scenes here and the next one; a
+            number in (0, 1) is the probability with which the expected loss at the threshold is at most the target.
 
     Returns:
-        Control with ``needed`` = 1 / target − 1, or ln(1 − confidence) / ln(1 − target), rounded up; no threshold with
-        fewer scenes. Its ``bound`` is the left side of the inequality, or the limit of the p-value.
+        ScoreThreshold with ``needed`` = 1 / target − 1, or ln(1 − confidence) / ln(1 − target), rounded up; no
+        threshold with fewer scenes. Its ``bound`` is the left side of the inequality, or the limit of the p-value.
 
     Raises:
         ValueError: a target or confidence outside (0, 1).
@@ -153,7 +151,7 @@ def conformal_threshold(scenes: Sequence[Points], target: float, *, confidence: 
     sizes, n = _candidate_counts(scenes), len(scenes)
     risk = loss / sizes
     needed = scenes_needed(target, confidence=confidence)
-    # The loss does not rise with the threshold, so neither do its bounds: whatever lies above one that fits, fits.
+    # The loss does not rise with the threshold, nor do its bounds: every threshold above a feasible one is feasible.
     if confidence is None:
         bound = (risk.sum(0) + 1) / (n + 1)
         fits = bound <= target
@@ -166,12 +164,14 @@ def conformal_threshold(scenes: Sequence[Points], target: float, *, confidence: 
     )
 
 
-def _next_scene_bound(risk: Tensor, speaks: Tensor, share: float) -> Tensor:
-    """Risk (thresholds,) that one more scene stays below with that probability, by those (scenes, thresholds) that
-    speak, were they normal; infinite where fewer than two do."""
-    n = speaks.sum(0)
-    mean = torch.where(speaks, risk, 0.0).sum(0) / n.clamp_min(1)
-    variance = torch.where(speaks, (risk - mean).square(), 0.0).sum(0) / (n - 1).clamp_min(1)
+def _next_scene_bound(risk: Tensor, counted: Tensor, share: float) -> Tensor:
+    """Risk (thresholds,) that one more scene stays below with probability ``share``, for normal risks.
+
+    Estimated from the ``counted`` (scenes, thresholds); infinite with fewer than two.
+    """
+    n = counted.sum(0)
+    mean = torch.where(counted, risk, 0.0).sum(0) / n.clamp_min(1)
+    variance = torch.where(counted, (risk - mean).square(), 0.0).sum(0) / (n - 1).clamp_min(1)
     z = NormalDist().inv_cdf(share)
     freedom = (n - 1).clamp_min(1)
     # Student's t by its expansion around the normal quantile (Abramowitz and Stegun 1964, 26.7.5)
@@ -180,7 +180,7 @@ def _next_scene_bound(risk: Tensor, speaks: Tensor, share: float) -> Tensor:
 
 
 def scenes_needed(target: float, *, confidence: float | None = None) -> int:
-    """Fewest scenes on which :func:`conformal_threshold` can meet a target, were they all without any error.
+    """Fewest scenes with which :func:`conformal_threshold` can meet a target, if all are without error.
 
     Raises:
         ValueError: a target or confidence outside (0, 1).
@@ -193,7 +193,7 @@ def scenes_needed(target: float, *, confidence: float | None = None) -> int:
 
 
 def _hoeffding_bentkus_p_value(mean: float, n: int, target: float) -> float:
-    """Hoeffding–Bentkus: how probable a mean loss as small as ``mean`` over n scenes is where ``target`` is exceeded.
+    """Hoeffding–Bentkus p-value of "the expected loss exceeds ``target``", from the mean loss of n scenes.
 
     Losses lie in [0, 1] and are independent.
     """
@@ -213,9 +213,9 @@ def _sort_losses(scene: Points) -> tuple[Tensor, Tensor]:
 
 
 def _accepted_losses(answers: Sequence[tuple[Tensor, Tensor]], thresholds: Tensor) -> tuple[Tensor, Tensor]:
-    """Sum of the capped errors of what is accepted, and its number: (scenes, thresholds) each."""
-    none = torch.zeros(0, thresholds.numel(), dtype=torch.float64)
-    loss, count = [none], [none]
+    """Sum of the capped errors of the accepted answers, and their number: (scenes, thresholds) each."""
+    empty = torch.zeros(0, thresholds.numel(), dtype=torch.float64)
+    loss, count = [empty], [empty]
     for score, total in answers:
         below = torch.searchsorted(score, thresholds)
         loss.append((total[-1] - total[below])[None])
@@ -224,7 +224,7 @@ def _accepted_losses(answers: Sequence[tuple[Tensor, Tensor]], thresholds: Tenso
 
 
 def _candidate_thresholds(answers: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """Scores of answers, rising: every threshold that makes a difference, or evenly spaced ones among them."""
+    """Distinct scores of the answers, rising: all of them, or evenly spaced ones if they are too many."""
     scores = torch.cat([torch.zeros(0, dtype=torch.float64), *(score for score, _ in answers)]).unique()
     if scores.numel() > _MAX_THRESHOLDS:
         scores = scores[torch.linspace(0, scores.numel() - 1, _MAX_THRESHOLDS, dtype=torch.float64).round().long()]
@@ -246,14 +246,14 @@ def _lowest_feasible(
     needed: int | None = None,
     confidence: float | None = None,
 ) -> ScoreThreshold:
-    """The lowest threshold that fits, which answers most; None of none."""
+    """The lowest feasible threshold, which has the largest coverage; its ``threshold`` is None if none is feasible."""
     n = risk.shape[0]
-    none = ScoreThreshold(None, target, None, risk=0.0, coverage=0.0, n=n, needed=needed, confidence=confidence)
+    infeasible = ScoreThreshold(None, target, None, risk=0.0, coverage=0.0, n=n, needed=needed, confidence=confidence)
     if not bool(fits.any()):
-        return none
+        return infeasible
     k = int(fits.long().argmax())
     return replace(
-        none,
+        infeasible,
         threshold=float(thresholds[k]),
         bound=float(bound[k]),
         risk=float(risk[:, k].mean()),
@@ -272,7 +272,7 @@ def _check_probability(name: str, value: float) -> None:
 
 
 def _largest_mean(n: int, target: float, level: float) -> float:
-    """Largest mean loss whose p-value is at most ``level``, to rounding and never above it; −1 where none is."""
+    """Largest mean loss whose p-value is at most ``level``, up to rounding and never above; −1 if there is none."""
     if _hoeffding_bentkus_p_value(0.0, n, target) > level:
         return -1.0
     low, high = 0.0, target

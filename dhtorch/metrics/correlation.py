@@ -1,4 +1,4 @@
-"""Pearson's and Spearman's correlation of two flat lists; None where undefined."""
+"""Pearson's and Spearman's correlation coefficients of two flat lists; None where undefined."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Curves of a scene, small enough for a result file: what figures are drawn from."""
+"""Risk–coverage, distance and reliability curves of a scene, sampled for the figures and small in a result file."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import torch
 from dhtorch.metrics import reliability, risk
 from dhtorch.metrics.errors import Points
 
-#: Points of a risk–coverage curve and bins of the other two.
+#: Number of points of a risk–coverage curve, and of bins of the other two curves.
 _N_CURVE_POINTS, _N_BINS = 20, 10
 
 
 def sample_curves(pooled: Points) -> dict[str, Any]:
-    """Risk–coverage, error against distance and reliability of one scene, as lists of equal length.
+    """Risk–coverage, error-over-distance and reliability curves of one scene, as lists of equal length.
 
     Returns:
-        ``risk_coverage``: ``coverage`` (share of the candidates), ``risk`` (mean capped error of the surest answers so
-        far), ``oracle`` (the same by rising error), ``score`` (threshold) and ``median_rel`` at twentieths of the
-        answers. ``distance``: tenths of the candidates by true depth: ``depth`` (m, median), ``coverage``,
-        ``median_rel`` (None where silent). ``reliability``: ``claimed``, ``realised`` and ``weight`` in ten bins of
-        equal width (None where empty). Empty lists without answers or candidates.
+        ``risk_coverage``: ``coverage`` (fraction of the candidates), ``risk`` (mean capped error of the answers with
+        the highest scores), ``oracle`` (the same by rising error), ``score`` (threshold) and ``median_rel`` at
+        twentieths of the answers. ``distance``: tenths of the candidates by true depth: ``depth`` (m, median),
+        ``coverage``, ``median_rel`` (None without answers). ``reliability``: ``claimed``, ``realised`` and ``weight``
+        in ten bins of equal width (None where empty). Empty lists without answers or candidates.
     """
     answered = pooled.answered()
     n = answered.keep.numel()
@@ -49,14 +49,14 @@ def sample_curves(pooled: Points) -> dict[str, Any]:
 
 def _by_distance(pooled: Points) -> dict[str, list[float | None]]:
     bins = torch.tensor_split(pooled.true_depth.argsort(stable=True), min(_N_BINS, pooled.true_depth.numel()) or 1)
-    found: dict[str, list[float | None]] = {"depth": [], "coverage": [], "median_rel": []}
+    curves: dict[str, list[float | None]] = {"depth": [], "coverage": [], "median_rel": []}
     for index in bins if pooled.true_depth.numel() else ():
-        here: Points = pooled[index]
-        error = here.answered().error
-        found["depth"].append(float(here.true_depth.quantile(0.5)))
-        found["coverage"].append(float(here.keep.double().mean()))
-        found["median_rel"].append(float(error.quantile(0.5)) if error.numel() else None)
-    return {name: _round_digits(values) for name, values in found.items()}
+        points: Points = pooled[index]
+        error = points.answered().error
+        curves["depth"].append(float(points.true_depth.quantile(0.5)))
+        curves["coverage"].append(float(points.keep.double().mean()))
+        curves["median_rel"].append(float(error.quantile(0.5)) if error.numel() else None)
+    return {name: _round_digits(values) for name, values in curves.items()}
 
 
 def _reliability(pooled: Points) -> dict[str, list[float | None]]:
@@ -65,5 +65,5 @@ def _reliability(pooled: Points) -> dict[str, list[float | None]]:
 
 
 def _round_digits(values: list[float | None]) -> list[float | None]:
-    """Five significant digits: a figure shows no more, and a result file holds many curves. NaN becomes None."""
+    """Five significant digits: enough for a figure, short in a result file. NaN becomes None."""
     return [None if v is None or math.isnan(v) else float(f"{v:.5g}") for v in values]

@@ -1,4 +1,4 @@
-"""How well a number tells what is wrong from what is right."""
+"""Detection metrics: how well a score separates wrong from right."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dhtorch.geometry.checks import check
 
 
 def auroc(
-    score: Tensor,  # (N,) the more, the likelier wrong
+    score: Tensor,  # (N,) larger = more likely wrong
     wrong: Tensor,  # (N,) bool
 ) -> float | None:
-    """Area under the receiver operating characteristic: how often a wrong one scores above a right one, ties by half.
+    """Area under the ROC curve: the probability that a wrong one scores above a right one, ties counting half.
 
-    None where all are alike. Gradient: none.
+    None if all are wrong or all are right. Gradient: none.
 
     Raises:
         ValueError: wrong shapes.
@@ -24,6 +24,6 @@ def auroc(
     n, m = (int(kind.sum()) for kind in (wrong, ~wrong))
     if not n or not m:
         return None
-    _, place, count = score.detach().double().unique(return_inverse=True, return_counts=True)
-    rank = (count.cumsum(0).double() - 0.5 * (count - 1).double())[place]  # ties share their mean rank
+    _, group, count = score.detach().double().unique(return_inverse=True, return_counts=True)
+    rank = (count.cumsum(0).double() - 0.5 * (count - 1).double())[group]  # ties share their mean rank
     return float((rank[wrong].sum() - n * (n + 1) / 2) / (n * m))

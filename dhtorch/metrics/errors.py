@@ -1,8 +1,8 @@
-"""How far answers are from truth: per pair, per scene, over scenes.
+"""Depth errors of estimates against the truth: per pair, per scene and over scenes.
 
-The unit of evaluation is :class:`Points`: the candidates of a pair or scene, silent ones included, in one flat list.
-Points are pooled inside a scene; scenes are joined by the median of their numbers and never by pooling. Whatever has
-no value (no answer, no candidate, no variance) is None, which a result file writes as null.
+The unit of evaluation is :class:`Points`: the candidates of a pair or scene, unanswered ones included, as a flat list.
+Points are pooled within a scene; scenes are combined by the median of their values and never by pooling. Undefined
+values (no answer, no candidate, no variance) are None, written to a result file as null.
 """
 
 from __future__ import annotations
@@ -20,34 +20,34 @@ from dhtorch.metrics.holdout import Truth
 from dhtorch.pytree import Record, record
 from dhtorch.records import Estimate
 
-#: Metric name → None where undefined.
+#: Metric name → value, None where undefined.
 MetricValues = dict[str, float | None]
 
-#: What names a row of a result rather than measuring it.
+#: Keys that identify a row of a result; they are not metrics.
 _ROW_KEYS = ("scene", "pair", "method")
 
-#: An answer whose relative error is larger counts as silently wrong.
+#: Relative error above which an answer is a gross error.
 GROSS_ERROR_REL = 0.2
 
 
 @record
 class Points(Record):
-    """Candidates: what was said about each and what is true. Floating fields are float64."""
+    """Candidates with their estimated and true depth. Floating fields are float64."""
 
     true_depth: Tensor  # (P,) m
-    depth: Tensor  # (P,) m; NaN where silent
-    score: Tensor  # (P,) larger is surer; the values need no meaning beyond their order
+    depth: Tensor  # (P,) m; NaN where unanswered
+    score: Tensor  # (P,) larger is more certain; only the order of the values matters
     keep: Tensor  # (P,) bool, answered
-    sigma: Tensor  # (P,) m; NaN where silent or not stated
-    residual_px: Tensor  # (P,) px; NaN where silent or not stated
+    sigma: Tensor  # (P,) m; NaN where unanswered or not stated
+    residual_px: Tensor  # (P,) px; NaN where unanswered or not stated
 
     @property
     def error(self) -> Tensor:
-        """(P,) relative error |z − z*| / z*; NaN where silent."""
+        """(P,) relative error |z − z*| / z*; NaN where unanswered."""
         return (self.depth - self.true_depth).abs() / self.true_depth
 
     def answered(self) -> Points:
-        """The points that were answered."""
+        """The answered points."""
         return self[self.keep]
 
 
@@ -61,39 +61,39 @@ def make_points(
     keep: Tensor | None = None,  # (*) bool
     candidate: Tensor | None = None,  # (*) bool
 ) -> Points:
-    """The candidates among equally shaped arrays of any depth source, as one flat list.
+    """Points of one pair or scene from equally shaped arrays of any depth source: its candidates as one flat list.
 
     Args:
-        depth: answers; a non-finite or non-positive one is silence.
-        true_depth: what they are held against; a non-finite or non-positive one is no candidate.
-        score: how sure the source is; None = equally sure everywhere.
-        sigma: claimed standard deviation of depth; None = none claimed.
-        residual_px: reprojection residual; None = none known.
-        keep: answered; None = wherever there is a depth.
-        candidate: what counts; None = wherever there is truth.
+        depth: estimates; non-finite or non-positive ones are unanswered.
+        true_depth: ground truth; where it is not finite or not positive there is no candidate.
+        score: confidence of the source; None = equal everywhere.
+        sigma: stated standard deviation of depth; None = none stated.
+        residual_px: reprojection residual; None = none stated.
+        keep: answered; None = wherever depth is valid.
+        candidate: evaluated; None = wherever the truth is valid.
 
     Raises:
         ValueError: unequal shapes.
     """
-    given = {"depth": depth, "score": score, "sigma": sigma, "residual_px": residual_px, "keep": keep}
-    for name, value in {**given, "candidate": candidate}.items():
+    arrays = {"depth": depth, "score": score, "sigma": sigma, "residual_px": residual_px, "keep": keep}
+    for name, value in {**arrays, "candidate": candidate}.items():
         if value is not None and value.shape != true_depth.shape:
-            found, expected = tuple(value.shape), tuple(true_depth.shape)
-            raise ValueError(f"make_points: {name} has shape {found}, expected {expected}, the shape of true_depth")
+            shape, expected = tuple(value.shape), tuple(true_depth.shape)
+            raise ValueError(f"make_points: {name} has shape {shape}, expected {expected}, the shape of true_depth")
     counts = true_depth.isfinite() & (true_depth > 0)
     counts = counts if candidate is None else counts & candidate.bool()
-    said = depth.isfinite() & (depth > 0)
-    said = said if keep is None else said & keep.bool()
+    is_answered = depth.isfinite() & (depth > 0)
+    is_answered = is_answered if keep is None else is_answered & keep.bool()
 
-    def flat(value: Tensor | None, silent: float) -> Tensor:
-        full = true_depth.new_full((), silent).double()
-        return torch.where(said, full if value is None else value.detach().double(), silent)[counts]
+    def flat(value: Tensor | None, fill: float) -> Tensor:
+        full = true_depth.new_full((), fill).double()
+        return torch.where(is_answered, full if value is None else value.detach().double(), fill)[counts]
 
     return Points(
         true_depth=true_depth.detach().double()[counts],
         depth=flat(depth, torch.nan),
         score=flat(torch.ones_like(true_depth) if score is None else score.nan_to_num(nan=0.0), 0.0),
-        keep=said[counts],
+        keep=is_answered[counts],
         sigma=flat(sigma, torch.nan),
         residual_px=flat(residual_px, torch.nan),
     )
@@ -103,7 +103,7 @@ def points_from_estimate(
     estimate: Estimate,
     truth: Truth,
 ) -> Points:
-    """The candidates of a batch of pairs as one flat list, pair after pair; index both by ``[b : b + 1]`` for one pair.
+    """Points of a batch of pairs, pair after pair in one list; index both arguments by ``[b : b + 1]`` for one pair.
 
     Raises:
         ValueError: wrong shapes.
@@ -121,18 +121,18 @@ def points_from_estimate(
 
 
 def measure_errors(pooled: Points) -> MetricValues:
-    """Coverage and error of the answers of a pair or scene.
+    """Coverage and errors of the answers of a pair or scene.
 
     Returns:
-        ``n_candidates``, ``n_kept``; ``coverage``, answered share of the candidates; and over the answered ones
-        ``median_rel`` and ``p90_rel`` of the relative error, ``wrong_share`` (error > 20 %), ``corr`` (Pearson, of
-        recovered and true depth), median ``residual_px``, ``within_sigma`` and ``within_2sigma`` (share whose error is
-        at most one and two claimed standard deviations). None where undefined.
+        ``n_candidates``, ``n_kept``; ``coverage``, answered fraction of the candidates; and over the answered ones
+        ``median_rel`` and ``p90_rel`` of the relative error, ``wrong_share`` (fraction with an error > 20 %), ``corr``
+        (Pearson, of recovered and true depth), median ``residual_px``, ``within_sigma`` and ``within_2sigma`` (fraction
+        whose error is at most one and two stated standard deviations). None where undefined.
     """
     n = pooled.keep.numel()
     answered = pooled.answered()
     error, sigma = answered.error, answered.sigma
-    off = (answered.depth - answered.true_depth).abs()
+    error_m = (answered.depth - answered.true_depth).abs()
     stated = sigma.isfinite()
     return {
         "n_candidates": n,
@@ -143,25 +143,25 @@ def measure_errors(pooled: Points) -> MetricValues:
         "wrong_share": _share(error > GROSS_ERROR_REL),
         "corr": pearson(answered.depth, answered.true_depth),
         "residual_px": _quantile(answered.residual_px[answered.residual_px.isfinite()], 0.5),
-        "within_sigma": _share((off <= sigma)[stated]),
-        "within_2sigma": _share((off <= 2 * sigma)[stated]),
+        "within_sigma": _share((error_m <= sigma)[stated]),
+        "within_2sigma": _share((error_m <= 2 * sigma)[stated]),
     }
 
 
 def summarise_scenes(
     scenes: Iterable[Mapping[str, Any]], *, statistic: str = "median", draws: int = 2000, seed: int = 0
 ) -> dict[str, dict[str, Any]]:
-    """Scenes joined to one number per metric: the ``summary`` of a result.
+    """Metrics combined over scenes, with intervals: the ``summary`` of a result.
 
     Args:
-        scenes: the numbers of each scene (one row each); groups such as ``ms: {track: …}`` become ``ms.track``, and
-            what is no number (names, lists, truth values) is passed over.
+        scenes: the metrics of each scene (one row each); groups such as ``ms: {track: …}`` become ``ms.track``, and
+            values that are not numbers (names, lists, booleans) are ignored.
         statistic: ``median`` or ``mean`` over scenes. Counts (``n_…``) are added up and have no interval.
         draws, seed: of the bootstrap over scenes.
 
     Returns:
-        Metric → ``{value, low, high, n, unit}``: a 95 % interval, n = scenes in which it is defined; value None where
-        it is in none.
+        Metric → ``{value, low, high, n, unit}``: a 95 % interval, n = scenes in which it is defined; value None if
+        in none.
     """
     flat = [_flatten(scene) for scene in scenes]
     summary: dict[str, dict[str, Any]] = {}
@@ -169,10 +169,10 @@ def summarise_scenes(
         values = [scene.get(name) for scene in flat]
         if name.startswith("n_"):
             defined = [v for v in values if v is not None]
-            found = bootstrap.Interval(sum(defined) if defined else None, None, None, len(defined))
+            interval = bootstrap.Interval(sum(defined) if defined else None, None, None, len(defined))
         else:
-            found = bootstrap.interval_over_scenes(values, statistic=statistic, draws=draws, seed=seed)
-        summary[name] = found.entry(metric_unit(name))
+            interval = bootstrap.interval_over_scenes(values, statistic=statistic, draws=draws, seed=seed)
+        summary[name] = interval.entry(metric_unit(name))
     return summary
 
 
@@ -201,15 +201,15 @@ def _flatten(row: Mapping[str, Any], prefix: str = "") -> dict[str, float | None
 
 
 def _quantile(x: Tensor, q: float) -> float | None:
-    """Quantile with linear interpolation, of any number of values (``torch.quantile`` stops at 2²⁴)."""
+    """Quantile with linear interpolation, of any number of values (``torch.quantile`` is limited to 2²⁴)."""
     if not x.numel():
         return None
-    place = q * (x.numel() - 1)
-    low = int(place)
+    position = q * (x.numel() - 1)
+    low = int(position)
     ordered = x.sort().values
     a = float(ordered[low])
     b = float(ordered[min(low + 1, x.numel() - 1)])
-    return a + (place - low) * (b - a)
+    return a + (position - low) * (b - a)
 
 
 def _share(mask: Tensor) -> float | None:

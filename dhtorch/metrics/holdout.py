@@ -1,8 +1,8 @@
-"""The range split: far returns are kept from the method, and those that can be trusted are what it is held against.
+"""Hold-out splits: far returns are hidden from the method, and the reliable ones among them are the ground truth.
 
-Most of what looks like error at a depth edge is wrong truth: a patch locks onto the foreground side, and a depth map
-that is not registered to the pixel shows the background. So a held-back return counts only where the map around it is
-smooth, and every return that is turned away is counted under the rule that did it.
+Most apparent error at a depth edge is wrong truth: a patch locks onto the foreground side, and a depth map that is not
+registered to the pixel shows the background. A held-back return therefore counts only where the map around it is
+smooth, and every rejected return is counted under the rule that rejected it.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from dhtorch.geometry.patches import extract_patches, round_half_up, sample_near
 from dhtorch.pytree import Record, record
 from dhtorch.records import Frame, Samples
 
-#: How much of the truth test is asked, from nothing to everything.
+#: Levels of the truth test, from none to all of it.
 _TRUTH_TESTS = ("raw", "5x5", "full")
 
-#: Side of the close window of a dense map, px; sparse returns: side of the close and of the wide one.
+#: Side of the close window of a dense map, px; of the close and of the wide window of a sparse map, px.
 _CLOSE_WINDOW_PX, SPARSE_CLOSE_WINDOW_PX, _SPARSE_WIDE_WINDOW_PX = 5, 7, 15
 
 #: Spread (max / min − 1) of the returns from which the close and the wide window fail.
@@ -30,44 +30,44 @@ _MAX_CLOSE_SPREAD, _MAX_WIDE_SPREAD = 0.05, 0.15
 
 
 class TruthCode:
-    """Codes of ``Truth.code``: why a sample is not held against a held-back return; the first reason wins."""
+    """Codes of ``Truth.code``: why a sample is not compared with a held-back return; the first reason applies."""
 
-    CANDIDATE = 0  #: counts
-    NO_RETURN = 1  #: nothing to hold it against
+    CANDIDATE = 0  #: evaluated
+    NO_RETURN = 1  #: no return to compare with
     NEAR = 2  #: the return was not held back
     CLOSE = 3  #: a step, or a dense map's missing pixel, right beside it
     WIDE = 4  #: a step within the reach of a track's patch
-    EXCLUDED = 5  #: turned away by the caller (a mirror, a window)
+    EXCLUDED = 5  #: excluded by the caller (a mirror, a window)
     TEXTURE = 6  #: not trackable by any method
 
 
 @record
 class Truth(Record):
-    """What each sample is held against, or why it is not."""
+    """True depth of each sample, or the reason why the sample is not evaluated."""
 
     depth: Tensor  # (B, N) m; 0 = no return
-    code: Tensor  # (B, N) int32, Rule
+    code: Tensor  # (B, N) int32, TruthCode
 
     @property
     def ok(self) -> Tensor:
-        """(B, N) bool: the sample counts."""
+        """(B, N) bool: the sample is a candidate."""
         return self.code == TruthCode.CANDIDATE
 
     def dropped(self) -> dict[str, int]:
-        """Held-back returns that do not count, by rule: the metric ``n_dropped``."""
+        """Number of held-back returns rejected by each rule: the metric ``n_dropped``."""
         rules = {code: name for code, name in names(TruthCode).items() if code > TruthCode.NEAR}
         return {name.lower(): int((self.code == code).sum()) for code, name in rules.items()}
 
 
 def range_split(frame: Frame, cutoff: float | None) -> Frame:
-    """The frame without its returns beyond ``cutoff`` (m, z-depth): what the method may see.
+    """The frame without its returns beyond ``cutoff`` (m, z-depth): the input of the method.
 
-    The truth is the depth of the frame that went in. None or infinity takes nothing away.
+    The truth is the depth of the original frame. None or infinity removes nothing.
 
     Raises:
         ValueError: the cutoff is not a positive number.
 
-    Gradient: to the depth that stays.
+    Gradient: to the depth that remains.
     """
     if cutoff is None:
         return frame
@@ -85,13 +85,13 @@ def split_half(
 ) -> tuple[Tensor, Tensor]:
     """Sets A and B, (B, N) bool each: the trackable samples with a usable return, split at random.
 
-    A may fix the pose, B is what answers are held against; no sample is in both. The split depends on the seed and
-    the sample's place alone: not on batch mates, device or method.
+    A is for the pose, B for the comparison with the estimates; no sample is in both. The split depends only on the seed
+    and the sample's index: not on batch mates, device or method.
 
     Args:
         samples: of whole frames, classified.
         seed: of the split.
-        share: of the samples that A receives, in expectation.
+        share: expected fraction of the samples in A.
         min_trackability: samples below it are in neither set.
 
     Raises:
@@ -109,12 +109,12 @@ def split_half(
 
 
 def hide_returns(samples: Samples, hidden: Tensor) -> Samples:
-    """The samples as if the sensor had been silent at the ``hidden`` (B, N) ones: no stage can see those returns.
+    """The samples without the returns of the ``hidden`` (B, N) ones, as if the sensor had none there.
 
     Raises:
         ValueError: wrong shapes.
 
-    Gradient: to the returns that stay.
+    Gradient: to the returns that remain.
     """
     check("hide_returns", xyz=(samples.xyz, "B N 3"), hidden=(hidden, "B N"))
     zero = torch.zeros_like(samples.depth)
@@ -134,18 +134,18 @@ def sample_truth(
     truth: str = "full",
     window: int = 25,
 ) -> Truth:
-    """The return at every sample, and whether the depth around it is smooth enough to be held against an answer.
+    """The return at every sample as true depth, and whether the depth around it is smooth enough to be reliable.
 
     Dense map: the return of the nearest pixel; the 5×5 pixels around it must all have one and spread by less than
-    5 % (CLOSE), and those that have one in the wide window by less than 15 % (WIDE). Where the frame says that its map
-    is sparse (projected LiDAR): the nearest return within 7×7 pixels, spread there less than 5 %, within 15×15 less
+    5 % (CLOSE), and those that have one in the wide window by less than 15 % (WIDE). Where the map is marked as sparse
+    (projected LiDAR): the nearest return within 7×7 pixels, spread there less than 5 %, within 15×15 less
     than 15 %.
 
     Args:
         frame: the views with their full depth, before the hold-out. For truth from elsewhere replace ``depth`` (and
             ``depth_camera``, where the map has intrinsics of its own).
         uv: sample pixels.
-        truth: ``full`` asks both tests, ``5x5`` the close one only, ``raw`` none.
+        truth: ``full`` applies both tests, ``5x5`` only the close one, ``raw`` none.
         window: side of a dense map's wide window, px of the image: the LK window and two pixels around it.
 
     Returns:
@@ -154,7 +154,7 @@ def sample_truth(
         edge of the map lacks returns there. Non-finite and non-positive depth counts as no return.
 
     Raises:
-        ValueError: wrong shapes, or another word for ``truth``.
+        ValueError: wrong shapes, or another value of ``truth``.
 
     Gradient: ``depth`` to the depth map; the choice of the pixel and codes carry none.
     Cost: reads window² depth pixels per sample, whatever the image size.
@@ -173,12 +173,12 @@ def sample_truth(
 
 
 def _test_truth(depth: Tensor, place: Tensor, truth: str, scale: float, window: int | None) -> tuple[Tensor, Tensor]:
-    """The return (B, N) of each place in maps (B, h, w), and its code; ``window`` None: the maps are sparse."""
+    """The return (B, N) and its code at pixels ``place`` of maps (B, h, w); ``window`` None: the maps are sparse."""
     close, u, v = _window_returns(
         depth, place, _window_side(SPARSE_CLOSE_WINDOW_PX if window is None else _CLOSE_WINDOW_PX, scale)
     )
-    found = _nearest_return(close, u, v, place) if window is None else _nearest_pixel(depth, place)
-    fails_close, fails_wide = torch.zeros_like(found, dtype=torch.bool), torch.zeros_like(found, dtype=torch.bool)
+    returned = _nearest_return(close, u, v, place) if window is None else _nearest_pixel(depth, place)
+    fails_close, fails_wide = torch.zeros_like(returned, dtype=torch.bool), torch.zeros_like(returned, dtype=torch.bool)
     if truth != "raw":
         fails_close = _is_spread(close, _MAX_CLOSE_SPREAD)
         if window is not None:
@@ -188,8 +188,10 @@ def _test_truth(depth: Tensor, place: Tensor, truth: str, scale: float, window: 
             depth, place, _window_side(_SPARSE_WIDE_WINDOW_PX if window is None else window, scale)
         )
         fails_wide = _is_spread(wide, _MAX_WIDE_SPREAD)
-    code = first_reason((found <= 0, TruthCode.NO_RETURN), (fails_close, TruthCode.CLOSE), (fails_wide, TruthCode.WIDE))
-    return found, code
+    code = first_reason(
+        (returned <= 0, TruthCode.NO_RETURN), (fails_close, TruthCode.CLOSE), (fails_wide, TruthCode.WIDE)
+    )
+    return returned, code
 
 
 def select_candidates(
@@ -200,19 +202,19 @@ def select_candidates(
     excluded: Tensor | None = None,  # (B, N) bool
     min_texture: float = 0.2,
 ) -> Truth:
-    """The samples that every method is counted on: a held-back return that can be trusted, and texture.
+    """The samples on which every method is evaluated: those with a reliable held-back return and texture.
 
-    Known before any method runs, so a pair whose pose fails keeps its candidates.
+    Independent of the method, so a pair whose pose fails keeps its candidates.
 
     Args:
         samples: of the frame, with trackability.
         truth: from :func:`sample_truth`, at the same samples.
         cutoff: m; a return beyond it was held back. None: none was, and nothing is a candidate.
-        excluded: samples to be counted apart, under EXCLUDED.
-        min_texture: trackability asked, as a share of the median over the frame's samples.
+        excluded: samples to be counted separately, under EXCLUDED.
+        min_texture: least trackability, as a fraction of the median over the frame's samples.
 
     Returns:
-        Truth whose code is CANDIDATE, or why not.
+        Truth whose code is CANDIDATE or the reason.
 
     Raises:
         ValueError: wrong shapes.
@@ -221,14 +223,14 @@ def select_candidates(
         "candidates", trackability=(samples.trackability, "B N"), depth=(truth.depth, "B N"), excluded=(excluded, "B N")
     )
     near = truth.depth <= (math.inf if cutoff is None else cutoff)
-    plain = samples.trackability < min_texture * _median(samples.trackability)
+    textureless = samples.trackability < min_texture * _median(samples.trackability)
     code = first_reason(
         (truth.code == TruthCode.NO_RETURN, TruthCode.NO_RETURN),
         (near, TruthCode.NEAR),
         (truth.code == TruthCode.CLOSE, TruthCode.CLOSE),
         (truth.code == TruthCode.WIDE, TruthCode.WIDE),
         (torch.zeros_like(near) if excluded is None else excluded, TruthCode.EXCLUDED),
-        (plain, TruthCode.TEXTURE),
+        (textureless, TruthCode.TEXTURE),
     )
     return truth.replace(code=code)
 
@@ -243,24 +245,24 @@ def select_real_holes(
     agreement: float = 0.1,
     min_texture: float = 0.2,
 ) -> Truth:
-    """The sensor's own holes whose depth another instrument knows for sure: the cohort of real holes.
+    """The sensor's real holes at which an independent instrument has reliable depth.
 
-    A sample is one where the sensor map has no return at the nearest pixel, the independent truth is there and passed
-    its test, and the sensor's returns right around the hole agree with that truth, so that the two are registered and
+    A sample is a candidate if the sensor map has no return at the nearest pixel, the independent truth exists and
+    passed its test, and the sensor's returns around the hole agree with that truth, so that the two are registered and
     the hole is not the shadow of a nearer edge.
 
     Args:
         frame: the views with the sensor's full depth.
         samples: of these frames.
         truth: the independent depth at the samples, from :func:`sample_truth`.
-        window: side of the window in the sensor map that is asked for neighbours, px of that map.
+        window: side of the window of neighbours in the sensor map, px of that map.
         min_returns: fewest returns in it.
         agreement: relative difference allowed between their median and the truth.
-        min_texture: trackability asked, as a share of the median over the frame's samples.
+        min_texture: least trackability, as a fraction of the median over the frame's samples.
 
     Returns:
-        Truth whose code is CANDIDATE, or why not: NO_RETURN (no independent depth), NEAR (the sensor answered there),
-        CLOSE, WIDE, EXCLUDED (neighbours missing or contradicting), TEXTURE.
+        Truth whose code is CANDIDATE or the reason: NO_RETURN (no independent depth), NEAR (the sensor has a return
+        there), CLOSE, WIDE, EXCLUDED (neighbours missing or contradicting), TEXTURE.
 
     Raises:
         ValueError: wrong shapes.
@@ -271,20 +273,20 @@ def select_real_holes(
         "select_real_holes", depth=(frame.depth, "B h w"), uv=(samples.uv, "B N 2"), truth=(truth.depth, "B N")
     )
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (sizes["h"], sizes["w"]), samples.uv)
-    answered = _nearest_pixel(frame.depth, place) > 0
+    has_return = _nearest_pixel(frame.depth, place) > 0
     around = _window_returns(frame.depth, place, window)[0].flatten(-2)
     count = (around > 0).sum(-1)
     ordered = torch.where(around > 0, around, torch.full_like(around, torch.inf)).sort(-1).values
-    middle = ordered.gather(-1, ((count - 1).clamp_min(0) // 2)[..., None])[..., 0]
-    agrees = (count >= min_returns) & ((middle - truth.depth).abs() <= agreement * truth.depth)
-    plain = samples.trackability < min_texture * _median(samples.trackability)
+    median = ordered.gather(-1, ((count - 1).clamp_min(0) // 2)[..., None])[..., 0]
+    agrees = (count >= min_returns) & ((median - truth.depth).abs() <= agreement * truth.depth)
+    textureless = samples.trackability < min_texture * _median(samples.trackability)
     code = first_reason(
         (truth.code == TruthCode.NO_RETURN, TruthCode.NO_RETURN),
-        (answered, TruthCode.NEAR),
+        (has_return, TruthCode.NEAR),
         (truth.code == TruthCode.CLOSE, TruthCode.CLOSE),
         (truth.code == TruthCode.WIDE, TruthCode.WIDE),
         (~agrees, TruthCode.EXCLUDED),
-        (plain, TruthCode.TEXTURE),
+        (textureless, TruthCode.TEXTURE),
     )
     return truth.replace(code=code)
 
@@ -298,20 +300,20 @@ def _window_returns(depth: Tensor, place: Tensor, size: int) -> tuple[Tensor, Te
     """Returns (B, N, size, size) around depth pixels ``place`` (B, N, 2), 0 = none, and the u and v (B, N, size) of
     the window's columns and rows.
 
-    Pixels that do not exist are no returns.
+    Pixels outside the map have no return.
     """
     h, w = depth.shape[-2:]
     size = min(size, h, w)
     centre = round_half_up(place.nan_to_num(-1e6)).clamp(-1e6, 1e6)
     corner = centre.long() - size // 2
-    value = extract_patches(depth[:, None], corner, size)[:, :, 0]  # moved inside at the edge of the map
+    value = extract_patches(depth[:, None], corner, size)[:, :, 0]  # clamped to the map at its edge
     steps = torch.arange(size, device=depth.device)
     u = corner[..., 0, None].clamp(0, w - size) + steps
     v = corner[..., 1, None].clamp(0, h - size) + steps
-    wanted_u = (u - centre[..., 0, None]).abs() <= size // 2
-    wanted_v = (v - centre[..., 1, None]).abs() <= size // 2
-    wanted = wanted_u[..., None, :] & wanted_v[..., :, None] & value.isfinite() & (value > 0)
-    return torch.where(wanted, value, torch.zeros_like(value)), u, v
+    valid_u = (u - centre[..., 0, None]).abs() <= size // 2
+    valid_v = (v - centre[..., 1, None]).abs() <= size // 2
+    valid = valid_u[..., None, :] & valid_v[..., :, None] & value.isfinite() & (value > 0)
+    return torch.where(valid, value, torch.zeros_like(value)), u, v
 
 
 def _nearest_pixel(depth: Tensor, place: Tensor) -> Tensor:
@@ -320,7 +322,7 @@ def _nearest_pixel(depth: Tensor, place: Tensor) -> Tensor:
 
 
 def _nearest_return(window: Tensor, u: Tensor, v: Tensor, place: Tensor) -> Tensor:
-    """The return (B, N) of a window that lies nearest to ``place``, 0 where there is none."""
+    """The return (B, N) of a window nearest to ``place``, 0 where there is none."""
     du, dv = u - place[..., 0, None].detach(), v - place[..., 1, None].detach()
     distance = ((du * du)[..., None, :] + (dv * dv)[..., :, None]).flatten(-2)
     returns = window.flatten(-2)
@@ -329,7 +331,7 @@ def _nearest_return(window: Tensor, u: Tensor, v: Tensor, place: Tensor) -> Tens
 
 
 def _is_spread(window: Tensor, limit: float) -> Tensor:
-    """Whether the returns of a window (B, N, s, s) spread by ``limit`` or more; no return does not."""
+    """Whether the returns of a window (B, N, s, s) spread by ``limit`` or more; False without returns."""
     high = window.amax((-2, -1))
     low = torch.where(window > 0, window, torch.full_like(window, torch.inf)).amin((-2, -1))
     return (high > 0) & (high >= low * (1 + limit))

@@ -1,6 +1,6 @@
-"""Whether a score means what it says: claimed against realised probability of a good answer.
+"""Reliability of a score as a probability: claimed against realised fraction of good answers.
 
-An answer is *good* where its relative error is below 10 %. Every scene weighs the same, however many answers it has.
+An answer is *good* if its relative error is below 10 %. Every scene has the same weight, however many answers it has.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class ReliabilityDiagram(Record):
     """A reliability diagram, bin by bin; an empty bin has weight 0 and NaN for the rest."""
 
     claimed: Tensor  # (bins,) mean claimed probability
-    realised: Tensor  # (bins,) share that turned out good
-    weight: Tensor  # (bins,) share of the total weight
+    realised: Tensor  # (bins,) fraction of good answers
+    weight: Tensor  # (bins,) fraction of the total weight
 
     @property
     def ece(self) -> float | None:
@@ -43,13 +43,13 @@ def reliability_diagram(
     bins: int = 10,
     equal_mass: bool = False,
 ) -> ReliabilityDiagram:
-    """Claimed probabilities against what happened, in bins.
+    """Reliability diagram: mean claimed probability and realised fraction of good answers, in bins.
 
     Args:
         claimed: probability of a good answer; values outside [0, 1] are clipped.
-        good: whether it was.
+        good: whether the answer was good.
         weight: of each answer; None = equal.
-        bins: how many.
+        bins: number of bins.
         equal_mass: bins of equal weight instead of equal width; equal claims always share a bin.
 
     Raises:
@@ -62,8 +62,8 @@ def reliability_diagram(
         raise ValueError(f"reliability: found bins={bins}, expected at least 1")
     claimed = claimed.double().clamp(0, 1)
     weight = torch.ones_like(claimed) if weight is None else weight.double()
-    place = _mass_below(claimed, weight) if equal_mass else claimed
-    index = (place * bins).long().clamp(max=bins - 1)
+    position = _mass_below(claimed, weight) if equal_mass else claimed
+    index = (position * bins).long().clamp(max=bins - 1)
 
     def total(x: Tensor) -> Tensor:
         return torch.zeros(bins, dtype=torch.float64, device=claimed.device).index_add(0, index, x)
@@ -77,33 +77,33 @@ def reliability_diagram(
 
 
 def excess_ece(scene: Points, *, bins: int = 10, draws: int = 200, seed: int = 0) -> float | None:
-    """How much further off the claims of one scene are than chance alone would have them; None without answers.
+    """Expected calibration error of one scene in excess of that by chance; None without answers.
 
-    The calibration error over ``bins`` of equal mass less what it would be on average if every answer were good with
-    exactly the probability that it claims (``draws`` draws), and never below 0: few answers scatter.
+    The calibration error over ``bins`` of equal mass, minus its mean over ``draws`` draws in which every answer is good
+    with exactly its claimed probability, and at least 0: the error of few answers scatters.
 
     Args:
         scene: candidates whose score is a probability of a good answer.
     """
-    said = scene.answered()
-    if not len(said.score):
+    answered = scene.answered()
+    if not len(answered.score):
         return None
-    claimed = said.score.double().clamp(0, 1)
-    found = reliability_diagram(claimed, said.error < GOOD_ERROR_REL, bins=bins, equal_mass=True).ece
+    claimed = answered.score.double().clamp(0, 1)
+    ece = reliability_diagram(claimed, answered.error < GOOD_ERROR_REL, bins=bins, equal_mass=True).ece
     g = torch.Generator().manual_seed(seed)
     expected = 0.0
     for _ in range(draws):
         good = torch.rand(len(claimed), generator=g, dtype=torch.float64) < claimed
         expected += (reliability_diagram(claimed, good, bins=bins, equal_mass=True).ece or 0.0) / draws
-    return max(0.0, (found or 0.0) - expected)
+    return max(0.0, (ece or 0.0) - expected)
 
 
 def pool_answers(scenes: Sequence[Points]) -> tuple[Tensor, Tensor, Tensor]:
-    """Claimed probability, goodness and weight (n,) of the answers of several scenes, each scene of total weight 1."""
+    """Claimed probability, good and weight (n,) of the answers of several scenes, each scene of total weight 1."""
     answers = [scene.answered() for scene in scenes]
     if not answers:
-        none = torch.zeros(0, dtype=torch.float64)
-        return none, none.bool(), none
+        empty = torch.zeros(0, dtype=torch.float64)
+        return empty, empty.bool(), empty
     return (
         torch.cat([a.score for a in answers]),
         torch.cat([a.error < GOOD_ERROR_REL for a in answers]),
@@ -121,7 +121,7 @@ def measure_reliability(scenes: Sequence[Points], *, bins: int = 10) -> MetricVa
 
 
 def ece_interval(scenes: Sequence[Points], *, bins: int = 10, draws: int = 2000, seed: int = 0) -> bootstrap.Interval:
-    """``ece`` (bins of equal width) with its interval over scenes; scenes without answers are passed over."""
+    """``ece`` (bins of equal width) with its interval over scenes; scenes without answers are ignored."""
     tables = [reliability_diagram(*pool_answers([s]), bins=bins) for s in scenes if bool(s.keep.any())]
     if not tables:
         return bootstrap.Interval(None, None, None, 0)
@@ -136,22 +136,22 @@ def ece_interval(scenes: Sequence[Points], *, bins: int = 10, draws: int = 2000,
 def leave_one_room_out(
     scenes: Mapping[str, Points], rooms: Mapping[str, str] | None = None
 ) -> Iterator[tuple[dict[str, Points], dict[str, Points]]]:
-    """Folds (scenes of the other rooms, scenes of this room), each by name: learn on the first, judge the second.
+    """Folds (scenes of the other rooms, scenes of this room), each by name: fit on the first, test on the second.
 
-    Pieces of one room share walls, light and camera, so one of them must not teach the judgement of another.
+    Pieces of one room share walls, light and camera, so a fit on one of them must not be tested on another.
 
     Args:
         scenes: by name.
-        rooms: scene → room; a scene that is not named is a room of its own.
+        rooms: scene → room; a scene without an entry is a room of its own.
     """
     room = {name: (rooms or {}).get(name, name) for name in scenes}
-    for held in dict.fromkeys(room.values()):
-        others = {name: s for name, s in scenes.items() if room[name] != held}
-        yield others, {name: s for name, s in scenes.items() if room[name] == held}
+    for left_out in dict.fromkeys(room.values()):
+        others = {name: s for name, s in scenes.items() if room[name] != left_out}
+        yield others, {name: s for name, s in scenes.items() if room[name] == left_out}
 
 
 def _mass_below(x: Tensor, weight: Tensor) -> Tensor:
-    """Share of the weight below each value, half of its own (and its equals') included: its place on [0, 1]."""
+    """Fraction (n,) of the weight below each value, plus half the weight of its equals: its position in [0, 1]."""
     order = x.argsort(stable=True)
     _, group, size = x[order].unique_consecutive(return_inverse=True, return_counts=True)
     mass = torch.zeros(size.numel(), dtype=x.dtype, device=x.device).index_add(0, group, weight[order])

@@ -1,8 +1,8 @@
-"""What a score is worth: error among the surest answers, as more and more of them are accepted.
+"""Risk–coverage evaluation of a score: error of the accepted answers as more of them are accepted.
 
 Answers are taken in the order of falling score; the *risk* at k is the mean loss of the first k, where the loss is the
-relative error, at most 1. Answers of equal score cannot be told apart, so each counts as the mean of its group: the
-curve is then the expectation over all orders of the tied ones and does not depend on how they happen to be listed.
+relative error, at most 1. Answers of equal score are indistinguishable, so each counts as the mean of its group: the
+curve is then the expectation over all orders of the tied answers and does not depend on their order in the list.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from torch import Tensor
 from dhtorch.geometry.checks import check
 from dhtorch.metrics.errors import MetricValues, Points
 
-#: Fewest answers that a coverage at some risk may rest on.
+#: Fewest accepted answers of a coverage at a risk.
 _MIN_POINTS = 10
 
-#: Coverages, as tenths of the answers, between which the curve is asked whether it rises.
+#: Number of equal steps of coverage between which the curve is tested for monotonicity.
 _N_MONOTONICITY_STEPS = 10
 
 
@@ -26,7 +26,7 @@ def risk_curve(
 ) -> Tensor:
     """Risk (n,) of the surest 1, 2, … n answers: running mean of the loss by falling score, ties by their mean.
 
-    Any numbers that order the answers will do as a score; infinities are allowed. Works in float64.
+    Any numbers that order the answers are a score; infinities are allowed. Computed in float64.
 
     Raises:
         ValueError: unequal lengths.
@@ -35,7 +35,7 @@ def risk_curve(
 
 
 def risk_coverage(pooled: Points, *, oracle: bool = False) -> tuple[Tensor, Tensor]:
-    """Coverage (share of the candidates) and risk (n,) as the answers are accepted by falling score.
+    """Coverage (fraction of the candidates) and risk (n,) as the answers are accepted by falling score.
 
     Args:
         pooled: candidates of a pair or scene.
@@ -47,18 +47,18 @@ def risk_coverage(pooled: Points, *, oracle: bool = False) -> tuple[Tensor, Tens
 
 
 def measure_risk(pooled: Points, *, min_points: int = _MIN_POINTS) -> MetricValues:
-    """How well the score of a pair or scene orders its answers by error.
+    """Risk metrics of a pair or scene: how well its score orders the answers by error.
 
     Returns:
-        ``aurc``: mean of the risk over the answered candidates. ``aurc_excess``: what remains after subtracting the
-        best possible order's. ``aurc_full``: over all candidates, silent ones last with loss 1. ``augrc``: mean over
+        ``aurc``: mean of the risk over the answered candidates. ``aurc_excess``: the same minus that of the
+        best possible order. ``aurc_full``: over all candidates, unanswered ones last with loss 1. ``augrc``: mean over
         the answered candidates of their running *sum* of loss over their number (an early error is not counted over
-        and over). ``coverage_at_5``, ``_10``, ``_20``: largest share of the candidates, at least ``min_points``, that a
-        threshold on the score can accept at a risk of at most 5, 10, 20 %; 0 where none can. ``monotonicity``: share
-        of the nine steps between the tenths of the answers over which the risk does not fall. ``largest_fall``: the
-        most that the risk falls from one of these tenths to a later one, 0 for a curve that never does. None where
-        undefined (no candidate; for all but ``aurc_full`` and the coverages also no answer; for the last two fewer
-        than ten).
+        and over). ``coverage_at_5``, ``_10``, ``_20``: largest fraction of the candidates, at least ``min_points``,
+        that a threshold on the score can accept at a risk of at most 5, 10, 20 %; 0 if there is none.
+        ``monotonicity``: fraction of the nine steps between the tenths of the answers over which the risk does not
+        fall. ``largest_fall``: the most that the risk falls from one of these tenths to a later one, 0 for a curve that
+        never falls. None where undefined (no candidate; for all but ``aurc_full`` and the coverages also no answer; for
+        the last two fewer than ten).
 
     Source: J. Traub et al., "Overcoming common flaws in the evaluation of selective classification systems", 2024
     (AUGRC); Y. Geifman, G. Uziel, R. El-Yaniv, "Bias-reduced uncertainty estimation", 2019 (excess AURC); A. Shah et
@@ -69,7 +69,7 @@ def measure_risk(pooled: Points, *, min_points: int = _MIN_POINTS) -> MetricValu
     answered = pooled.answered()
     loss, score = cap_error(answered.error), answered.score
     risk = risk_curve(loss, score)
-    some = bool(risk.numel())
+    has_answers = bool(risk.numel())
     last = torch.where(pooled.keep, pooled.score, -torch.inf)
     full = risk_curve(torch.where(pooled.keep, cap_error(pooled.error), 1.0), last)
     numbers: MetricValues = {
@@ -81,17 +81,17 @@ def measure_risk(pooled: Points, *, min_points: int = _MIN_POINTS) -> MetricValu
     cuts = _ends_of_ties(score)
     for percent in (5, 10, 20):
         fits = cuts & (risk <= percent / 100) & (_running_count(loss) >= min_points)
-        most = int(torch.where(fits, _running_count(loss), 0).max()) if some else 0
+        most = int(torch.where(fits, _running_count(loss), 0).max()) if has_answers else 0
         numbers[f"coverage_at_{percent}"] = most / n if n else None
     numbers["monotonicity"], numbers["largest_fall"] = _monotonicity(risk)
     return numbers
 
 
 def ause(pooled: Points) -> float | None:
-    """Area between the sparsification curve of the score and that of the errors themselves, over random's.
+    """Area between the sparsification curves of the score and of the true errors, over that of a random order.
 
-    The curve is the mean capped error of what is left when the worst-scored 0, 1, … 95 % of the answers are removed;
-    a random order leaves the mean. 0 is a perfect order, 1 no better than chance; None where undefined.
+    The curve is the mean capped error of the remaining answers when the worst-scored 0, 1, … 95 % are removed; with a
+    random order it is constant. 0 is a perfect order, 1 no better than chance; None where undefined.
 
     Source: E. Ilg et al., "Uncertainty estimates and multi-hypotheses networks for optical flow", 2018.
     """
@@ -107,16 +107,16 @@ def ause(pooled: Points) -> float | None:
 
 
 def realised_risk(pooled: Points, threshold: float | None) -> float | None:
-    """Mean capped error of the answers that score at least ``threshold`` (None answers nothing); None where silent."""
+    """Mean capped error of the answers that score at least ``threshold`` (None = no answers); None without any."""
     accepted = pooled.keep & (pooled.score >= (torch.inf if threshold is None else threshold))
     return _mean(cap_error(pooled.error[accepted]))
 
 
 def keep_surest(pooled: Points, n: int) -> Points:
-    """The same candidates with only the ``n`` surest answers kept: two methods cut so answer equally much.
+    """The same candidates with only the ``n`` highest-scoring answers kept, to compare methods at equal coverage.
 
-    Where the cut falls among answers of equal score, which cannot be told apart, those that stay are spread evenly
-    over the group's errors: their median and mean are the group's, whatever the order of the list.
+    Where the cut falls among answers of equal score, the kept ones are spread evenly over the group's errors: their
+    median and mean are those of the group, whatever the order of the list.
     """
     answered = pooled.keep.nonzero()[:, 0]
     if n >= answered.numel():
@@ -140,7 +140,7 @@ def keep_surest(pooled: Points, n: int) -> Points:
 
 
 def cap_error(error: Tensor) -> Tensor:
-    """Loss of a relative error: the error itself, at most 1; 1 where it is not a number."""
+    """Loss of a relative error: the error itself, at most 1; 1 where it is NaN."""
     return error.nan_to_num(nan=1.0).clamp(max=1.0)
 
 
@@ -158,7 +158,7 @@ def _running_count(loss: Tensor) -> Tensor:
 
 
 def _ends_of_ties(score: Tensor) -> Tensor:
-    """(n,) bool, by falling score: a threshold can cut here, because the next answer has a smaller score."""
+    """(n,) bool, by falling score: a threshold can lie after this answer, because the next score is smaller."""
     ordered = score.sort(descending=True).values
     return torch.cat((ordered[1:] < ordered[:-1], ordered.new_ones(min(1, ordered.numel()), dtype=torch.bool)))
 

@@ -1,4 +1,4 @@
-"""The built-in world: rooms whose every point is known, a phone and a robot in them, and what goes wrong."""
+"""Synthetic data with exact ground truth: a furnished room, phone and robot recordings, depth faults and stresses."""
 
 from dhtorch.synthetic.recording import SyntheticRoom, open_room
 

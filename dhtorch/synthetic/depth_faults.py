@@ -1,8 +1,8 @@
-"""A depth map gone wrong in a known way: what networks, sensors and hands full of files do to depth.
+"""Simulated depth faults: errors of networks, sensors and data files applied to true depth maps.
 
-Every fault takes a true map (B, h, w) in m, 0 where there is none, and gives a map of the same size with as many zeros
-or fewer. Random ones draw from a seed on the CPU, the same for every map of a batch, so that a map's fault does not
-depend on its batch mates.
+Every fault maps a true depth map (B, h, w) in m, 0 = none, to a map of the same size with as many zeros or fewer.
+Random faults draw from a seed on the CPU, the same for every map of a batch, so that a map's fault does not depend on
+its batch mates.
 """
 
 from __future__ import annotations
@@ -18,61 +18,61 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.filters import gaussian_blur
 from dhtorch.geometry.patches import rescale_field_of_view
 
-#: Scales of a map that is otherwise right, and the shift of one, m.
+#: Scale factors of the scale faults, and the shift of the shift fault, m.
 _SCALE_FACTORS, _SHIFT_M = (0.8, 1.25), 0.15
 
-#: Tilt: share of the depth from one side of the picture to the other.
+#: Tilt: relative change of depth from one side of the image to the other.
 _TILT_SHARE = 0.10
 
-#: Standard deviations of low-frequency warps, of log depth, and how many waves they have across the picture at most.
+#: Standard deviations of low-frequency warps, of log depth, and their largest number of waves across the image.
 _WARP_SIGMAS, _MAX_WARP_WAVES = (0.013, 0.05), 2.5
 
-#: Standard deviation of the blur that mixes both sides of an edge, as a share of the width.
+#: Standard deviation of the blur that mixes both sides of an edge, as a fraction of the width.
 _BLUR_SIGMA_REL = 0.012
 
-#: Local jumps: so many objects moved away by this factor (0.6 m → 1.8 m), each of pixels within a share of the width
-#: whose depth differs little from that of the middle.
+#: Local jumps: number of objects, the factor on their depth (0.6 m → 1.8 m), the radius of an object as a fraction of
+#: the width, and the largest difference of its log depth from that of its centre.
 _N_JUMPS, _JUMP_FACTOR, _JUMP_RADIUS_REL, _JUMP_MAX_LOG_STEP = 3, 3.0, 0.12, 0.08
 
-#: Inventions: so many discs of this radius (share of the width) are cut out and filled smoothly, off by this at most.
+#: Invented depth: number of discs filled smoothly, their radius as a fraction of the width, and the largest error.
 _N_DISCS, _DISC_RADIUS_REL, _MAX_INVENTED_REL = 4, 0.10, 0.25
 
-#: Structured light: disparities of f · baseline / z px come in eighths.
+#: Structured light: f · baseline of the disparity f · baseline / z, px · m, and the step of the disparity, px.
 _FOCAL_BASELINE_PX_M, _DISPARITY_STEP_PX = 580 * 0.075, 0.125
 
-#: A unit of another data set (5000 a metre read as 1000), and a focal length that is too long by this factor.
+#: Factor of a wrong unit (5000 per metre read as 1000 per metre), and factor of a focal length that is too long.
 _UNIT_FACTOR, _FOCAL_FACTOR = 5.0, 1.1
 
-#: A map that was rolled sideways by this share of its width.
+#: Sideways shift of a rolled map, as a fraction of its width.
 _ROLL_SHARE = 0.1
 
-#: A map that is cut where so many of its pixels are nearer.
+#: Quantile of depth at which a map is clipped.
 _CLIP_SHARE = 0.6
 
-#: From which relative change on a pixel of a faulty map counts as wrong.
+#: Relative change of depth above which a pixel of a faulty map counts as wrong.
 _MIN_WRONG_REL = 0.02
 
 DepthFault = Callable[[Tensor, Generator], Tensor]
 
 
 def scale_depth(depth: Tensor, factor: float) -> Tensor:
-    """The map in another metre."""
+    """The map with all depths multiplied by ``factor``."""
     return depth * factor
 
 
 def shift_depth(depth: Tensor, shift: float) -> Tensor:
-    """All depths ``shift`` m more, at least a hundredth of what they were."""
+    """The map with ``shift`` m added to all depths, which remain at least a hundredth of the original."""
     return torch.where(depth > 0, (depth + shift).clamp_min(0).maximum(0.01 * depth), 0.0)
 
 
 def tilt_depth(depth: Tensor, share: float, angle: float) -> Tensor:
-    """Depths that grow by ``share`` from one side of the picture to the other, in the direction ``angle`` (rad)."""
+    """The map with depths that grow by the fraction ``share`` across the image, in the direction ``angle`` (rad)."""
     x, y = _pixel_grid(depth)
     return depth * (1 + 0.5 * share * (math.cos(angle) * x + math.sin(angle) * y))
 
 
 def warp_depth(depth: Tensor, sigma: float, generator: Generator) -> Tensor:
-    """A smooth error: log depth plus a few waves of standard deviation ``sigma``, of mean zero over the picture."""
+    """The map with smooth errors: waves of mean zero and standard deviation ``sigma`` added to its log depth."""
     x, y = _pixel_grid(depth)
     field = torch.zeros_like(x + y)
     for _ in range(6):
@@ -84,40 +84,39 @@ def warp_depth(depth: Tensor, sigma: float, generator: Generator) -> Tensor:
 
 
 def blur_depth(depth: Tensor, share: float = _BLUR_SIGMA_REL) -> Tensor:
-    """Edges that mix foreground and background: the Gaussian mean of what is known around each pixel."""
+    """The map with edges that mix foreground and background: Gaussian mean of the valid depths around each pixel."""
     sigma_px = max(0.5, share * depth.shape[-1])
-    known = (depth > 0).to(depth)
-    mean = gaussian_blur(depth[:, None], sigma_px) / gaussian_blur(known[:, None], sigma_px).clamp_min(1e-6)
+    valid = (depth > 0).to(depth)
+    mean = gaussian_blur(depth[:, None], sigma_px) / gaussian_blur(valid[:, None], sigma_px).clamp_min(1e-6)
     return torch.where(depth > 0, mean[:, 0], 0.0)
 
 
 def move_objects(depth: Tensor, generator: Generator, *, n: int = _N_JUMPS, factor: float = _JUMP_FACTOR) -> Tensor:
-    """Objects that stand elsewhere: pixels around ``n`` places that lie as deep as the place does, ``factor`` times as
-    deep."""
-    found = depth
+    """The map with ``n`` displaced objects: the pixels around a random pixel, at about its depth, times ``factor``."""
+    faulty = depth
     for u, v in _draw_pixels(depth, generator, n):
         middle = _depth_at(depth, u, v)
         level = (depth / middle.clamp_min(1e-6)).clamp_min(1e-6).log().abs() < _JUMP_MAX_LOG_STEP
         inside = _is_within(depth, u, v, _JUMP_RADIUS_REL) & level & (depth > 0) & (middle > 0)
-        found = torch.where(inside, factor * depth, found)
-    return found
+        faulty = torch.where(inside, factor * depth, faulty)
+    return faulty
 
 
 def fill_discs(depth: Tensor, generator: Generator) -> Tensor:
-    """Holes filled with something smooth: discs in which the map is the blurred surroundings times a smooth factor."""
+    """The map with smoothly invented discs: the blurred surroundings times a smooth factor."""
     wide = blur_depth(depth, _DISC_RADIUS_REL)
-    found = depth
+    faulty = depth
     for u, v in _draw_pixels(depth, generator, _N_DISCS):
         off = _MAX_INVENTED_REL * (2 * float(torch.rand((), generator=generator)) - 1)
         x, y = _pixel_grid(depth)
         r = _pixel_distance(depth, u, v) / _DISC_RADIUS_REL
-        lie = wide * (1 + off * (1 - r.square()).clamp_min(0) + 0.05 * off * (x + y))
-        found = torch.where((r < 1) & (depth > 0), lie, found)
-    return found
+        invented = wide * (1 + off * (1 - r.square()).clamp_min(0) + 0.05 * off * (x + y))
+        faulty = torch.where((r < 1) & (depth > 0), invented, faulty)
+    return faulty
 
 
 def quantise_disparity(depth: Tensor) -> Tensor:
-    """Depth of structured light, which comes in steps that grow as its square; none beyond what one step can tell."""
+    """The map with quantised disparity, as of structured light; no depth below half a disparity step."""
     steps = (_FOCAL_BASELINE_PX_M / depth.clamp_min(1e-6) / _DISPARITY_STEP_PX).round()
     return torch.where(
         (depth > 0) & (steps >= 1), _FOCAL_BASELINE_PX_M / (steps.clamp_min(1) * _DISPARITY_STEP_PX), 0.0
@@ -125,28 +124,28 @@ def quantise_disparity(depth: Tensor) -> Tensor:
 
 
 def mirror_depth(depth: Tensor) -> Tensor:
-    """Left for right."""
+    """The map mirrored left to right."""
     return depth.flip(-1)
 
 
 def roll_depth(depth: Tensor, share: float = _ROLL_SHARE) -> Tensor:
-    """Columns moved to the right by a share of the width, those beyond the edge to the left."""
+    """The map rolled to the right by the fraction ``share`` of its width."""
     return depth.roll(round(share * depth.shape[-1]), -1)
 
 
 def clip_far_depth(depth: Tensor, nearer: float = _CLIP_SHARE) -> Tensor:
-    """What is farther than a share of the pixels stands where that share ends, as where numbers of few bits run out."""
-    known = torch.where(depth > 0, depth, torch.inf).flatten(1).sort(-1).values
+    """The map clipped at the quantile ``nearer`` of its depths, as by a file format with too few bits."""
+    valid = torch.where(depth > 0, depth, torch.inf).flatten(1).sort(-1).values
     last = (nearer * ((depth > 0).flatten(1).sum(-1) - 1).clamp_min(0)).long()
-    return depth.minimum(known.gather(1, last[:, None])[..., None])
+    return depth.minimum(valid.gather(1, last[:, None])[..., None])
 
 
 def _deterministic(fault: Callable[[Tensor], Tensor]) -> DepthFault:
-    """A fault without anything drawn."""
+    """A deterministic fault as a :data:`DepthFault`, which ignores the generator."""
     return lambda depth, _generator: fault(depth)
 
 
-#: What a network's map does wrong: shape and metre, alone and together.
+#: Faults of network predictions: of shape and scale, alone and combined.
 NETWORK_FAULTS: dict[str, DepthFault] = {
     "scale_short": _deterministic(partial(scale_depth, factor=_SCALE_FACTORS[0])),
     "scale_long": _deterministic(partial(scale_depth, factor=_SCALE_FACTORS[1])),
@@ -161,7 +160,7 @@ NETWORK_FAULTS: dict[str, DepthFault] = {
     "quantised": _deterministic(quantise_disparity),
 }
 
-#: What sensors and data sets do wrong with maps that are right by themselves.
+#: Faults of sensors and data sets applied to correct maps.
 FILE_FAULTS: dict[str, DepthFault] = {
     "unit": _deterministic(partial(scale_depth, factor=_UNIT_FACTOR)),
     "mirrored": _deterministic(mirror_depth),
@@ -170,10 +169,10 @@ FILE_FAULTS: dict[str, DepthFault] = {
 }
 DEPTH_FAULTS = NETWORK_FAULTS | FILE_FAULTS
 
-#: What a format does to maps that are right by themselves, of which only a bound is left.
+#: Faults of file formats that leave only a lower bound of the depth.
 FORMAT_FAULTS: dict[str, DepthFault] = {"cut": _deterministic(clip_far_depth)}
 
-#: A fault that is another frame's map: it is no function of this one.
+#: The fault of using the map of another frame.
 WRONG_TIME = "time"
 
 
@@ -184,30 +183,30 @@ def apply_fault(
     seed: int = 0,
     other: Tensor | None = None,  # (B, h, w) m, of another time
 ) -> tuple[Tensor, Tensor]:
-    """A map with a fault, and which of its pixels are wrong by more than ``_MIN_WRONG_REL``, (B, h, w) each.
+    """The map with a fault, and a mask of pixels wrong by more than ``_MIN_WRONG_REL``, (B, h, w) each.
 
     Args:
         name: of :data:`DEPTH_FAULTS` or :data:`FORMAT_FAULTS`, or ``time``.
         depth: the true map.
-        seed: of what is drawn.
-        other: what ``time`` gives instead.
+        seed: of the random draws.
+        other: the map that ``time`` returns.
 
     Raises:
         ValueError: an unknown fault, no map of another time, or wrong shapes.
 
-    Gradient: to ``depth`` where the fault is a function of values, not through places.
+    Gradient: to ``depth`` where the fault is a function of values, not of pixel positions.
     """
     check("apply_fault", depth=(depth, "B h w"), other=(other, "B h w"))
     if name == WRONG_TIME:
         if other is None:
             raise ValueError("apply_fault: found no map of another time, expected other=")
-        found = other
-    elif name in (known := DEPTH_FAULTS | FORMAT_FAULTS):
-        found = known[name](depth, Generator().manual_seed(seed))
+        faulty = other
+    elif name in (faults := DEPTH_FAULTS | FORMAT_FAULTS):
+        faulty = faults[name](depth, Generator().manual_seed(seed))
     else:
-        raise ValueError(f"apply_fault: found {name!r}, expected one of {', '.join((*known, WRONG_TIME))}")
-    wrong = (found > 0) & (depth > 0) & ((found - depth).abs() > _MIN_WRONG_REL * depth)
-    return found, wrong
+        raise ValueError(f"apply_fault: found {name!r}, expected one of {', '.join((*faults, WRONG_TIME))}")
+    wrong = (faulty > 0) & (depth > 0) & ((faulty - depth).abs() > _MIN_WRONG_REL * depth)
+    return faulty, wrong
 
 
 def _pixel_grid(depth: Tensor) -> tuple[Tensor, Tensor]:
@@ -218,14 +217,14 @@ def _pixel_grid(depth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _draw_pixels(depth: Tensor, generator: Generator, n: int) -> list[tuple[int, int]]:
-    """Columns and rows of ``n`` places away from the border."""
+    """Columns and rows of ``n`` random pixels away from the border."""
     h, w = depth.shape[-2:]
     share = 0.1 + 0.8 * torch.rand(n, 2, generator=generator, dtype=torch.float64)
     return [(int(x * w), int(y * h)) for x, y in share.tolist()]
 
 
 def _pixel_distance(depth: Tensor, u: int, v: int) -> Tensor:
-    """Of every pixel (h, w) from a place, in widths of the map."""
+    """Distance (h, w) of every pixel from the pixel (u, v), in widths of the map."""
     h, w = depth.shape[-2:]
     rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) for n in (h, w))
     return ((columns[None] - u).square() + (rows[:, None] - v).square()).sqrt() / w
@@ -236,5 +235,5 @@ def _is_within(depth: Tensor, u: int, v: int, radius: float) -> Tensor:
 
 
 def _depth_at(depth: Tensor, u: int, v: int) -> Tensor:
-    """Depth (B, 1, 1) at a place."""
+    """Depth (B, 1, 1) at the pixel (u, v)."""
     return depth[:, v, u][:, None, None]

@@ -1,8 +1,8 @@
-"""Bodies that move in the built-in room, and how they move: with the viewer, in his hand, or on a turntable.
+"""Moving bodies in the built-in room and their motions: with the viewer, in a hand, or on a turntable.
 
-A body stands *at home*, before the viewer of a path that does not move, and is lit there; a motion says where it has
-gone from home. It is painted with what the room is painted with, is the same for every seed but for that paint, and
-casts no shadow: the room looks the same with it and without.
+A body has a *home* pose in front of the viewer of the static path, where its light is computed; a motion is its
+displacement from home. It uses the textures of the room, is otherwise the same for every seed, and casts no shadow: the
+rest of the room looks the same with and without it.
 
 Alphabet: ``T_world_from_home`` (n) a motion of the world, one a frame; axes of the world as the room's, lengths in m.
 """
@@ -22,13 +22,13 @@ from dhtorch.synthetic.raycast import SURFACE_MOVING, Material, Solid, Triple
 from dhtorch.synthetic.room import furnished_room, make_box
 from dhtorch.synthetic.shading import ShadedRoom
 
-#: Where the viewer stands who has a body before him, and the direction that he looks in: degrees to the right.
+#: Pose of the viewer with a body in front of it, and its viewing direction, degrees to the right.
 _VIEWER_POSE, _YAW = hand_held_path("static", 1, step_m=0.0, rate_hz=1.0, seed=0), 12.0
 
-#: Middle of what is held, in the viewer's axes (x right, y down, z forward).
+#: Centre of the held body, in the viewer's axes (x right, y down, z forward).
 _HELD_CENTRE: Triple = (0.02, 0.05, 0.52)
 
-#: Middle of the turntable, in the viewer's axes, and degrees a frame.
+#: Centre of the turntable, in the viewer's axes, and its rotation, degrees per frame.
 _TURNTABLE_CENTRE: Triple = (0.0, 0.02, 1.07)
 _TURN_DEG_PER_FRAME = 2.0
 
@@ -36,14 +36,14 @@ _TURN_DEG_PER_FRAME = 2.0
 def _body_box(
     at: Triple, size: Triple, picture: str, *, tile: float | None = None, yaw: float = 0, pitch: float = 0
 ) -> Solid:
-    """A box whose middle is ``at`` in the viewer's axes, turned against him; ``size`` is (across, up, deep)."""
+    """A box with its centre ``at`` and its rotation in the viewer's axes; ``size`` is (across, up, deep)."""
     x, y, z = se3.apply(_VIEWER_POSE, torch.tensor([[at]], dtype=torch.float64))[0, 0].tolist()
     surface = Material(picture, tile=tile, kind=SURFACE_MOVING)
     return make_box(x, -y - size[1] / 2, z, size, surface, yaw=_YAW + yaw, pitch=pitch, shadow=False)
 
 
 def _parcel_stack() -> list[Solid]:
-    """A stack of parcels, 0.8 to 1.2 m before the viewer."""
+    """A stack of parcels, 0.8 to 1.2 m in front of the viewer."""
     return [
         _body_box((0.05, 0.05, 1.11), (0.42, 0.32, 0.22), "poster:0", yaw=24),
         _body_box((-0.19, 0.10, 0.97), (0.21, 0.23, 0.18), "print", tile=0.5, yaw=-18),
@@ -54,7 +54,7 @@ def _parcel_stack() -> list[Solid]:
 
 
 def _held_parcel() -> list[Solid]:
-    """A parcel and the fingers that hold it, 0.4 to 0.6 m before the viewer."""
+    """A parcel and the fingers that hold it, 0.4 to 0.6 m in front of the viewer."""
     x, y, z = _HELD_CENTRE
     parcel = _body_box(_HELD_CENTRE, (0.26, 0.19, 0.10), "poster:3", yaw=22, pitch=-16)
     label = _body_box((x - 0.02, y - 0.11, z + 0.01), (0.13, 0.07, 0.08), "poster:1", yaw=-14)
@@ -71,32 +71,33 @@ MOVING_BODIES = {"parcels": _parcel_stack, "held": _held_parcel}
 
 @lru_cache(maxsize=2)
 def room_with_body(seed: int, guest: str) -> ShadedRoom:
-    """The furnished room of a seed with one of :data:`MOVING_BODIES` at home; the same object for the same
-    arguments."""
+    """The furnished room of a seed with one of :data:`MOVING_BODIES` at home; cached for the last two."""
     return furnished_room(seed).joined_by(MOVING_BODIES[guest]())
 
 
 def move_with_viewer(T_world_from_cam: Pose, *, share: float = 1.0) -> Pose:
-    """``T_world_from_home`` (n) of what goes ``share`` of the viewer's way, in his direction, and does not turn."""
+    """``T_world_from_home`` (n) of a body that translates by ``share`` times the viewer's translation."""
     moved = T_world_from_cam.t - _VIEWER_POSE.t
     return Pose(se3.identity(len(moved), moved).R, share * moved)
 
 
 def move_in_hand(T_world_from_cam: Pose) -> Pose:
-    """``T_world_from_home`` (n) of what goes and turns with the viewer, and is moved a little in his hand."""
-    own = []
+    """``T_world_from_home`` (n) of a body that moves rigidly with the viewer, with small motions of the hand added."""
+    hand_motions = []
     for i in range(T_world_from_cam.t.shape[0]):
         turn = rotation_from_angles(
             3.0 * math.sin(0.41 * i), 2.0 * math.sin(0.29 * i + 1.0), 2.0 * math.sin(0.33 * i + 2.0)
         )
         shift = [0.012 * math.sin(0.37 * i), 0.010 * math.sin(0.31 * i + 2.0), 0.010 * math.sin(0.43 * i + 4.0)]
-        own.append(_rotate_about(_HELD_CENTRE, turn, shift))
+        hand_motions.append(_rotate_about(_HELD_CENTRE, turn, shift))
     home_from_viewer = se3.invert(_VIEWER_POSE)
-    return se3.compose(se3.compose(T_world_from_cam, _stack_poses(own)), _repeat_pose(home_from_viewer, len(own)))
+    return se3.compose(
+        se3.compose(T_world_from_cam, _stack_poses(hand_motions)), _repeat_pose(home_from_viewer, len(hand_motions))
+    )
 
 
 def turn_on_turntable(T_world_from_cam: Pose) -> Pose:
-    """``T_world_from_home`` (n) of what turns :data:`_TURN_DEG_PER_FRAME` a frame about the upright axis of the
+    """``T_world_from_home`` (n) of a body that turns by :data:`_TURN_DEG_PER_FRAME` about the vertical axis of the
     turntable."""
     axis = se3.apply(_VIEWER_POSE, torch.tensor([[_TURNTABLE_CENTRE]], dtype=torch.float64))[0, 0].tolist()
     n = T_world_from_cam.t.shape[0]
@@ -109,7 +110,7 @@ def turn_on_turntable(T_world_from_cam: Pose) -> Pose:
 
 
 def _rotate_about(centre: tuple[float, ...], turn: list[list[float]], shift: list[float]) -> Pose:
-    """Turned about ``centre``, then shifted (1)."""
+    """Motion (1): rotation ``turn`` about ``centre``, then translation ``shift``."""
     R, c = torch.tensor([turn], dtype=torch.float64), torch.tensor([centre], dtype=torch.float64)
     return Pose(R, c - se3.rotate(R, c[:, None])[:, 0] + torch.tensor([shift], dtype=torch.float64))
 

@@ -1,8 +1,8 @@
-"""Where the viewer of the built-in room stands and looks, frame by frame.
+"""Camera paths in the built-in room: pose of the viewer in every frame.
 
-A path is a smooth closed form of the way gone (m) and the time (s): frame ``i`` is the same however many follow, and a
-long recording stays in the room by going to and fro. Sines are taken with Python's ``math``, one by one, so that poses
-do not depend on vector widths.
+A path is a smooth closed form of the length travelled (m) and the time (s): frame ``i`` does not depend on the number
+of frames, and a long recording stays in the room by oscillating. Sines are taken with Python's ``math``, one by one, so
+that poses do not depend on vector widths.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from dhtorch.geometry.se3 import Pose
 _Position = tuple[float, float, float]  # x, height, z; m
 _Angles = tuple[float, float, float]  # yaw (positive: right), pitch (positive: up), roll; degrees
 
-_START_POSITION, _YAW, _PITCH = (-0.45, 1.3, 0.2), 12.0, -9.0  # where the viewer stands and looks
-_ORBIT_CENTRE = (-0.1, 0.9, 2.0)  # what an orbit goes around
+_START_POSITION, _YAW, _PITCH = (-0.45, 1.3, 0.2), 12.0, -9.0  # initial position and viewing direction of the viewer
+_ORBIT_CENTRE = (-0.1, 0.9, 2.0)  # centre of an orbit
 
 
 def hand_held_path(
@@ -27,7 +27,7 @@ def hand_held_path(
 ) -> Pose:
     """``T_world_from_cam`` (n_frames), float64, of one of :data:`CAMERA_PATHS`.
 
-    ``pan``: degrees by which the first frame looks farther to the right than the path says, and every next one more.
+    ``pan``: degrees of yaw to the right added to the first frame, and added from frame to frame.
     """
     stations = [CAMERA_PATHS[path](_Hand(seed), step_m * i, i / rate_hz) for i in range(n_frames)]
     turns = [(yaw + pan[0] + pan[1] * i, *more) for i, (_, (yaw, *more)) in enumerate(stations)]
@@ -38,7 +38,7 @@ def hand_held_path(
 
 
 class _Hand:
-    """Seeded phases of the small movements that no hand can hold back."""
+    """Seeded phases of the small unintended motions of a hand-held camera."""
 
     def __init__(self, seed: int):
         draw = Random(f"hand {seed}")
@@ -46,7 +46,7 @@ class _Hand:
         self.start = draw.uniform(-0.6, -0.3)
 
     def sway(self, k: int, phase: float) -> float:
-        """Smooth wander in [-1, 1]: two sines whose periods do not fit each other."""
+        """Smooth oscillation in [-1, 1]: two sines of incommensurate periods."""
         a, b = self._phases[2 * k], self._phases[2 * k + 1]
         return 0.65 * math.sin(phase + a) + 0.35 * math.sin(1.83 * phase + b)
 
@@ -54,9 +54,9 @@ class _Hand:
 def _walk(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
     side = 0.55 * math.sin(way / 0.55 + hand.start)
     x, height, z = _START_POSITION
-    place = (x + side, height + 0.03 * hand.sway(0, way / 0.25), z + 0.08 * hand.sway(1, way / 0.4))
+    position = (x + side, height + 0.03 * hand.sway(0, way / 0.25), z + 0.08 * hand.sway(1, way / 0.4))
     tremor = [hand.sway(2 + k, 2 * math.pi * 0.9 * time) for k in range(3)]
-    return place, (_YAW - 11 * side + 0.6 * tremor[0], _PITCH + 0.6 * tremor[1], 0.8 * tremor[2])
+    return position, (_YAW - 11 * side + 0.6 * tremor[0], _PITCH + 0.6 * tremor[1], 0.8 * tremor[2])
 
 
 def _lateral(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
@@ -75,8 +75,8 @@ def _orbit(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
     radius = 1.75
     a = 0.5 * math.sin(way / (0.5 * radius) + hand.start)
     drop = math.degrees(math.atan2(_START_POSITION[1] - _ORBIT_CENTRE[1], radius))
-    place = (_ORBIT_CENTRE[0] - radius * math.sin(a), _START_POSITION[1], _ORBIT_CENTRE[2] - radius * math.cos(a))
-    return place, (math.degrees(a), -0.6 * drop, 0.0)
+    position = (_ORBIT_CENTRE[0] - radius * math.sin(a), _START_POSITION[1], _ORBIT_CENTRE[2] - radius * math.cos(a))
+    return position, (math.degrees(a), -0.6 * drop, 0.0)
 
 
 def _turn(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
@@ -88,7 +88,7 @@ def _static(hand: _Hand, way: float, time: float) -> tuple[_Position, _Angles]:
     return _START_POSITION, (_YAW, _PITCH, 0.0)
 
 
-#: Kinds of path: place and angles after a way (m) and a time (s).
+#: Paths by name: position and angles after a length (m) and a time (s).
 CAMERA_PATHS: dict[str, Callable[[_Hand, float, float], tuple[_Position, _Angles]]] = {
     "walk": _walk,
     "lateral": _lateral,

@@ -1,11 +1,11 @@
-"""Ray casting of boxes and balls: what a ray meets first, where on it, and what stands in the light.
+"""Ray casting of boxes and balls: nearest intersections, surface coordinates, normals and shadow casters.
 
 Alphabet: ``o`` origin and ``d`` direction of rays, as triples of tensors or numbers that broadcast; ``t`` distance in
 units of ``d`` (for a camera ray, whose z is 1, the z-depth); solid ``i``; face ``6 i + 2 axis + (outward normal
 positive)``. Solid 0 is the room, seen from inside.
 
-Only correctly rounded arithmetic and fixed summation orders are used (here and wherever pictures are made): results do
-not depend on the number of threads.
+Only correctly rounded arithmetic and fixed summation orders are used, here and in all rendering: results do not depend
+on the number of threads.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ SURFACE_ORDINARY, SURFACE_MIRROR, SURFACE_WINDOW, SURFACE_DARK, SURFACE_MOVING =
     2,
     3,
     4,
-)  #: kinds of surface; MOVING: of a body that moves
-_NO_HIT_M = 1e9  #: distance of what is not met
+)  #: kinds of surface; MOVING: of a moving body
+_NO_HIT_M = 1e9  #: distance of rays without a hit
 
 _RAYS_PER_CHUNK = 1 << 8  # rays cast at all solids at a time: few enough to stay in the cache
 
 
 @dataclass(frozen=True)
 class Material:
-    """How a face looks and what it does to a sensor."""
+    """Appearance of a face, and its kind for the sensor model."""
 
     picture: str  #: name of a texture
     tint: Triple = (1.0, 1.0, 1.0)
     tile: float | None = None  #: m per repetition; None stretches one copy over the face
     kind: int = SURFACE_ORDINARY
-    reflect: float = 0.0  #: share of the colour that comes from the mirrored ray
-    glow: float = 0.0  #: light of its own, in units of the picture
+    reflect: float = 0.0  #: fraction of the colour from the mirrored ray
+    glow: float = 0.0  #: emitted light, in units of the picture
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Solid:
 
 
 class Solids:
-    """Many solids that rays can meet."""
+    """Solids for ray casting, batched."""
 
     def __init__(self, solids: Sequence[Solid]):
         self.each = tuple(solids)
@@ -107,21 +107,21 @@ class Solids:
         return torch.cat([t for t, _ in strips]), torch.cat([index for _, index in strips])
 
     def _cast(self, o: list[Tensor], d: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """All solids against all rays at once; of solids that are met at the same place, the first."""
+        """All solids against all rays at once; of solids hit at the same distance, the first."""
         centre, half = self.centre[..., None].unbind(1), self.half[..., None].unbind(1)
         o, d = _to_local(centre, [c.unbind(1) for c in self.R[..., None].unbind(2)], o, d)
         spans = zip(_ball_span(self._square[:, None], o, d), _box_span(half, o, d), strict=True)
-        enter, leave, met = (torch.where(self.ball[:, None], one, other) for one, other in spans)
-        at = torch.cat((leave[:1], enter[1:]))  # the room is met on leaving it
-        at = torch.where(met & (at >= 0), at, _NO_HIT_M)
+        enter, leave, hit = (torch.where(self.ball[:, None], of_ball, of_box) for of_ball, of_box in spans)
+        at = torch.cat((leave[:1], enter[1:]))  # the room is hit on leaving it
+        at = torch.where(hit & (at >= 0), at, _NO_HIT_M)
         t = at.amin(0).clamp(max=_NO_HIT_M)
         first = torch.where(at == t, torch.arange(len(at))[:, None], len(at)).amin(0)
         return t, torch.where(t < _NO_HIT_M, first, 0)
 
     def locate(self, index: Tensor, p: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-        """Face (P,) of points on solids, and their place (P,), (P,) across and down it in [-1, 1].
+        """Face (P,) of points on solids, and their coordinates (P,), (P,) across and down the face in [-1, 1].
 
-        A ball is mapped like the cube around it: its points are pushed out onto the cube.
+        A ball is mapped like the cube around it: its points are projected onto the cube.
         """
         centre, half, R = self.centre[index], self.half[index], self.R[index]
         rel = [p[k] - centre[:, k] for k in range(3)]
@@ -148,7 +148,7 @@ class Solids:
         return [centre[:, k] + dot_product(R[:, k].unbind(-1), local) for k in range(3)]
 
     def normal(self, face: Tensor, p: Sequence[Tensor]) -> list[Tensor]:
-        """Unit normal towards the open room, three components (P,)."""
+        """Unit normal towards the free space of the room, three components (P,)."""
         index, axis, sign = face // 6, (face % 6) // 2, (face % 2) * 2.0 - 1
         sign = torch.where(index == 0, -sign, sign)
         flat = self.R[index, :, axis] * sign[:, None]
@@ -158,22 +158,22 @@ class Solids:
     def blockers(
         self, p: Sequence[Tensor], reach: float, way: Sequence[Tensor] | None = None
     ) -> list[tuple[Solid, Tensor]]:
-        """Solids that cast shadows, each with the points (indices) it could shade.
+        """Shadow-casting solids, each with the indices of the points that it could shade.
 
-        Those are the points p (P,) with a part of the solid nearer than ``reach`` (m): to the point itself, or to the
-        straight ``way`` (P,) from it.
+        These are the points p (P,) with a part of the solid nearer than ``reach`` (m) to the point itself, or to the
+        straight segment ``way`` (P,) from it.
         """
-        found = []
+        blockers = []
         for solid in self.each[1:]:
             if solid.shadow:
                 rel = [solid.centre[k] - p[k] for k in range(3)]
                 if way is not None:
                     along = (dot_product(rel, way) / dot_product(way, way)).clamp(0, 1)
                     rel = [rel[k] - along * way[k] for k in range(3)]
-                at = (dot_product(rel, rel) < (reach + math.hypot(*solid.half)) ** 2).nonzero()[:, 0]
-                if at.numel():
-                    found.append((solid, at))
-        return found
+                index = (dot_product(rel, rel) < (reach + math.hypot(*solid.half)) ** 2).nonzero()[:, 0]
+                if index.numel():
+                    blockers.append((solid, index))
+        return blockers
 
     def open_distance(self, solid: Solid, o: Sequence[Tensor], d: Sequence[Tensor]) -> Tensor:
         """Distance (…) that rays travel before they enter ``solid``, at most 1; 0 for rays that start inside."""
@@ -197,7 +197,7 @@ def world_rays(camera: Camera, T_world_from_cam: Pose, hw: tuple[int, int]) -> t
 
 
 def _span(solid: Solid, o: _Vector, d: _Vector) -> tuple[Tensor, Tensor, Tensor]:
-    """Distances at which rays in the solid's own axes enter and leave it, and whether they meet it at all."""
+    """Distances at which rays in the solid's own axes enter and leave it, and whether they hit it."""
     return _ball_span(solid.half[0] ** 2, o, d) if solid.ball else _box_span(solid.half, o, d)
 
 
@@ -220,10 +220,10 @@ def _box_span(half: _Vector, o: _Vector, d: _Vector) -> tuple[Tensor, Tensor, Te
     return enter, leave, leave > enter
 
 
-def _update_nearest(t: Tensor, index: Tensor, i: int, enter: Tensor, leave: Tensor, met: Tensor) -> None:
-    """Write solid ``i`` into ``t`` and ``index`` where it is met first; the room is met on leaving it."""
+def _update_nearest(t: Tensor, index: Tensor, i: int, enter: Tensor, leave: Tensor, hit: Tensor) -> None:
+    """Write solid ``i`` into ``t`` and ``index`` where it is the nearest hit; the room is hit on leaving it."""
     at = leave if i == 0 else enter
-    first = met & (at < t) & (at >= 0)
+    first = hit & (at < t) & (at >= 0)
     t.copy_(torch.where(first, at, t))
     index.masked_fill_(first, i)
 
@@ -242,7 +242,7 @@ def _image_plane(camera: Camera, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 
 def _solid_rectangles(solids: Solids, R: Tensor, o: Tensor, x: Tensor, y: Tensor) -> list[tuple[slice, slice]]:
-    """Of each solid, rows and columns whose rays can meet it; all of them if it reaches behind the camera."""
+    """For each solid the rows and columns whose rays can hit it; all of them if it extends behind the camera."""
     signs = torch.tensor([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=torch.float64)
     half, turn, centre = solids.half.double(), solids.R.double(), solids.centre.double()
     cam = ((signs * half[:, None]) @ turn.mT + centre[:, None] - o) @ R  # (solids, 8 corners, 3)
@@ -250,7 +250,7 @@ def _solid_rectangles(solids: Solids, R: Tensor, o: Tensor, x: Tensor, y: Tensor
     xy = cam[..., :2] / z[..., None]
     low, high = (xy.amin(1) - 1e-4).float(), (xy.amax(1) + 1e-4).float()
     bounds = [torch.searchsorted(axis, edge[:, k].contiguous()) for k, axis in ((1, y), (0, x)) for edge in (low, high)]
-    found = [(slice(a, b), slice(c, e)) for a, b, c, e in torch.stack(bounds, 1).tolist()]
+    rectangles = [(slice(a, b), slice(c, e)) for a, b, c, e in torch.stack(bounds, 1).tolist()]
     for i in (z.amin(1) < 0.02).nonzero()[:, 0].tolist():
-        found[i] = (slice(0, 0), slice(0, 0)) if float(z[i].amax()) <= 0 else (slice(None), slice(None))
-    return found
+        rectangles[i] = (slice(0, 0), slice(0, 0)) if float(z[i].amax()) <= 0 else (slice(None), slice(None))
+    return rectangles

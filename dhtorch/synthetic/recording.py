@@ -1,8 +1,8 @@
-"""The built-in recording: a hand-held phone with a LiDAR in a furnished room, all truth known.
+"""The built-in recording: a hand-held phone with a LiDAR in a furnished room, with exact ground truth.
 
-The picture is ray cast (:mod:`dhtorch.synthetic.room`), so depth, poses and intrinsics are exact; what the sensor
-reports is a model of a phone's LiDAR on top. Every frame is a function of the options and its number alone: not of the
-other frames, the order of access, the process or the number of threads.
+Images are ray cast (:mod:`dhtorch.synthetic.room`), so depth, poses and intrinsics are exact; the sensor depth is a
+model of a phone's LiDAR. Every frame is a function of the options and its index alone: not of the other frames, the
+order of access, the process or the number of threads.
 """
 
 from __future__ import annotations
@@ -28,35 +28,35 @@ from dhtorch.synthetic.raycast import SURFACE_DARK, SURFACE_MIRROR, SURFACE_ORDI
 from dhtorch.synthetic.room import furnished_room
 from dhtorch.synthetic.shading import ShadedRoom
 
-#: Values of ``truth(i)["surface"]`` where nothing moves.
+#: Values of ``truth(i)["surface"]`` without moving bodies.
 SURFACE_NAMES = {SURFACE_ORDINARY: "ordinary", SURFACE_MIRROR: "mirror", SURFACE_WINDOW: "window", SURFACE_DARK: "dark"}
 
 
 class SyntheticRoom(TruthRecording):
-    """The built-in room: a recording whose frames are rendered when they are asked for.
+    """The built-in room: a recording whose frames are rendered on access.
 
     Args:
         seed: of the paint and small placements, the path and the sensor noise.
         n_frames: number of frames.
         hw: (height, width) of the image in pixels.
         path: one of :data:`CAMERA_PATHS`. ``walk`` is a hand-held sweep; ``rotation`` does not translate, ``static``
-            not move.
-        step_m: way along the path from frame to frame (for ``rotation``: the same pace, as an angle).
+            does not move.
+        step_m: length of the path from frame to frame (for ``rotation``: the same pace, as an angle).
         rate_hz: frame rate.
         lidar: ``phone`` = the model of :func:`simulate_phone_lidar`; ``exact`` = true depth at every image pixel; None
             = no sensor, depth is 0 everywhere.
         depth_hw: (height, width) of the phone's depth map, and of the empty one.
         range_limit: of the phone's LiDAR, m along the ray.
-        depth_noise: factor on the LiDAR's noise; 0 keeps its drop-outs and limits.
+        depth_noise: factor on the LiDAR's noise; with 0 its drop-outs and limits remain.
         image_noise: standard deviation of the pixel noise, grey levels of 255.
         supersample: rays per pixel and axis.
-        trajectory_axes: ``cv`` or ``gl``, the axes in which the device is said to write its trajectory (``pose_axes``;
-            frames carry OpenCV axes in any case).
-        trajectory_offset_deg: constant angle by which the device's axes are turned against the camera's; the
-            trajectory that frames carry is then wrong by it, ``true_poses`` is not.
+        trajectory_axes: ``cv`` or ``gl``, the axes stated for the device's trajectory (``pose_axes``; frames have
+            OpenCV axes in any case).
+        trajectory_offset_deg: constant angle between the device's axes and the camera's; the frames' trajectory is
+            then wrong by it, ``true_poses`` is not.
         name: of the recording.
-        true_poses: (n_frames) T_world_from_cam, float64, in the place of the path's.
-        times: (n_frames) s, float64, in the place of the frame rate's.
+        true_poses: (n_frames) T_world_from_cam, float64, instead of the path's.
+        times: (n_frames) s, float64, instead of the frame rate's.
 
     Raises:
         ValueError: an unknown path or LiDAR, or a size, count or limit that is not positive.
@@ -116,24 +116,24 @@ class SyntheticRoom(TruthRecording):
         self.camera = phone_camera(self.hw)
         self._frames: dict[int, Frame] = {}
 
-    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]  # one frame at a time: slices would render
+    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]  # single frames only: a slice would render them all
         i = self._position(index)
         if i not in self._frames:
             self._frames[i] = self._render(i)
         return self._frames[i]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_frames": {}}  # a worker renders what it needs
+        return {**self.__dict__, "_frames": {}}  # not pickled: a worker renders its own frames
 
     def __repr__(self) -> str:
         frames = format_count(len(self), "frame")
         return f"SyntheticRoom(seed={self.seed}, path={self.path!r}, lidar={self.lidar!r}, {frames})"
 
     def truth(self, index: int) -> dict[str, Tensor]:
-        """What is really there at the centre of every image pixel of frame ``index``.
+        """True depth and surface kind at the centre of every image pixel of frame ``index``.
 
-        A mirror or a window pane counts with the depth of its own surface. What is seen *in* it lies elsewhere, and
-        triangulation finds it there: evaluate such pixels apart, by ``surface``.
+        A mirror or a window pane has the depth of its own surface. What is visible *in* it lies elsewhere, where it is
+        triangulated: evaluate such pixels separately, by ``surface``.
 
         Returns:
             ``depth`` (1, H, W) m float32 and ``surface`` (1, H, W) uint8, a key of :data:`SURFACE_NAMES`.
@@ -142,7 +142,7 @@ class SyntheticRoom(TruthRecording):
         return self._true_view(i, self.camera, self.true_poses[i : i + 1], self.hw)
 
     def world(self, index: int) -> ShadedRoom:
-        """What stands where at frame ``index``."""
+        """The room at frame ``index``."""
         return furnished_room(self.seed)
 
     def _true_view(self, i: int, camera: Camera, pose: Pose, hw: tuple[int, int]) -> dict[str, Tensor]:
@@ -194,21 +194,21 @@ def open_room(*, near: float = 2.0, gap: int = 6, **options: Any) -> Scene:
 
     Args:
         near: m, cutoff for a range split.
-        gap: frame step; 6 with the default step is a way of 12 cm.
+        gap: frame step; 6 with the default step is a distance of 12 cm.
         options: of :class:`SyntheticRoom`.
 
     Raises:
-        ValueError: near or gap is not positive, or an option that there is not; else as :class:`SyntheticRoom`.
+        ValueError: near or gap is not positive, or an unknown option; else as :class:`SyntheticRoom`.
     """
-    known = inspect.signature(SyntheticRoom).parameters
+    parameters = inspect.signature(SyntheticRoom).parameters
     for option in options:
-        if option not in known:
-            raise ValueError(f"synthetic room: found option {option!r}, expected one of {', '.join(known)}")
+        if option not in parameters:
+            raise ValueError(f"synthetic room: found option {option!r}, expected one of {', '.join(parameters)}")
     return room_to_scene(SyntheticRoom(**options), near, gap)
 
 
 def room_to_scene(room: SyntheticRoom, near: float, gap: int) -> Scene:
-    """A room with the notes of a benchmark; a path without baseline has a role.
+    """A room as a scene with its cutoff and frame step; a path without baseline has the role ``rotation``.
 
     Raises:
         ValueError: near or gap is not positive.
@@ -231,9 +231,9 @@ def open_rooms(
     near: float = 2.0,
     gap: int = 6,
 ) -> list[Scene]:
-    """The room along several paths, or built of several seeds, one scene each; options as :func:`open_room`.
+    """The room along several paths and of several seeds, one scene each; options as :func:`open_room`.
 
-    A recording is named after its path and, where there are several, its seed.
+    A recording is named after its path and, with several seeds, its seed.
     """
     options: dict[str, Any] = {"n_frames": n_frames, "hw": hw, "lidar": lidar, "near": near, "gap": gap}
     options |= {"depth_noise": depth_noise, "image_noise": image_noise}
@@ -255,13 +255,13 @@ def simulate_phone_lidar(
     range_limit: float = 5.0,
     noise_factor: float = 1.0,
 ) -> tuple[Tensor, Tensor]:
-    """What a phone's LiDAR reports from one place (B = 1): depth (1, h, w) m, 0 = no return, and confidence 0–2.
+    """Simulated depth of a phone's LiDAR (B = 1): depth (1, h, w) m, 0 = no return, and confidence 0–2.
 
-    The light that returns falls with reflectance, slant and squared range. Where it is weak the noise grows, the
-    confidence falls and returns go missing. They also go missing on mirrors (what is left lies *behind* the mirror, at
-    low confidence), window panes, grazing surfaces, at depth edges (what is left there mixes both sides) and towards
-    ``range_limit``, beyond which there are none. Gaps come in patches, and noise is shared by neighbours, as a device
-    that fills in between sparse beams has it. Numbers are chosen to be plausible, not fitted to a device.
+    The returned light falls with reflectance, slant and squared range. Where it is weak the noise is larger, the
+    confidence lower and returns are missing. They are also missing on mirrors (remaining ones lie *behind* the mirror,
+    at low confidence), window panes, grazing surfaces, at depth edges (remaining ones mix both sides) and towards
+    ``range_limit``, beyond which there are none. Gaps come in patches, and noise is correlated between neighbours, as
+    in a device that interpolates between sparse beams. Parameters are plausible, not fitted to a device.
 
     Returns:
         depth float32 and confidence uint8 (2 high, 1 medium, 0 low or no return), both (1, h, w).
@@ -273,24 +273,24 @@ def simulate_phone_lidar(
     cosine, kind = scene.cosine(d, face, p), scene.kind[face]
     per_depth = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt()
     edge, mixed = _depth_edges(depth.view(hw))
-    seen = torch.where(edge, mixed, depth)
+    measured = torch.where(edge, mixed, depth)
     at = (kind == SURFACE_MIRROR).nonzero()[:, 0]
     _, _, more, _ = scene.mirrored([c[at] for c in o], [c[at] for c in d], depth[at], face[at])
-    seen = seen.index_copy(0, at, depth[at] + more)
-    distance = seen * per_depth
+    measured = measured.index_copy(0, at, depth[at] + more)
+    distance = measured * per_depth
     returned = scene.albedo[face] * scene.albedo[face] * cosine / (distance * distance)
 
     far = ((distance / range_limit - 0.85) / 0.15).clamp(0, 1)
-    lost = 0.6 * far
-    for why in (
+    p_lost = 0.6 * far
+    for probability in (
         torch.where(edge, 0.5, 0.0),
         torch.where(kind == SURFACE_MIRROR, 0.85, 0.0),
         torch.where(kind == SURFACE_WINDOW, 0.9, 0.0),
         0.9 * ((0.25 - cosine) / 0.25).clamp(0, 1),
         0.9 * (1 - returned / 0.001).clamp(0, 1),
     ):
-        lost = 1 - (1 - lost) * (1 - why)
-    answered = (_patchy_uniform(hw, generator) >= lost) & (distance <= range_limit)
+        p_lost = 1 - (1 - p_lost) * (1 - probability)
+    answered = (_patchy_uniform(hw, generator) >= p_lost) & (distance <= range_limit)
 
     sigma = (0.002 + 0.0025 * distance * distance) * (0.025 / returned.clamp(min=1e-6)).sqrt().clamp(1, 2.5)
     error = noise_factor * sigma * _shared_normal(hw, generator)
@@ -303,7 +303,7 @@ def simulate_phone_lidar(
 
 
 def _rotate_device_axes(poses: Pose, degrees: float) -> Pose:
-    """The poses a device would report whose axes are turned by a constant angle against those of its camera."""
+    """Poses reported by a device whose axes are rotated by a constant angle against those of its camera."""
     turn = se3.exp(poses.t.new_tensor([[math.radians(degrees) / 3**0.5] * 3 + [0.0] * 3]))
     return Pose(poses.R @ turn.R, poses.t)
 
@@ -311,8 +311,8 @@ def _rotate_device_axes(poses: Pose, degrees: float) -> Pose:
 def _photograph(
     scene: ShadedRoom, camera: Camera, pose: Pose, hw: tuple[int, int], *, supersample: int, exposure: float = 1.0
 ) -> Tensor:
-    """(1, 3, H, W) display values in [0, 1], ``exposure`` times as bright and clipped: the mean over ``supersample``²
-    rays in each pixel."""
+    """Rendered image (1, 3, H, W), display values in [0, 1], times ``exposure`` and clipped: the mean of
+    ``supersample``² rays in each pixel."""
     s = supersample
     fine = (hw[0] * s, hw[1] * s)
     dense = resize(camera, hw, fine)
@@ -328,9 +328,9 @@ def _photograph(
 
 
 def _depth_edges(depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Where the depth map (h, w) jumps, and there the mean with the farther neighbour; both flat (h·w,).
+    """Mask of depth edges of a map (h, w), and the mean with the farther neighbour; both flat (h·w,).
 
-    A plane has linear inverse depth, however slanted: its second difference tells jumps from slopes.
+    A plane has linear inverse depth, however slanted: the second difference distinguishes jumps from slopes.
     """
     inverse = torch.nn.functional.pad(1 / depth[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     middle = inverse[1:-1, 1:-1]
@@ -341,7 +341,7 @@ def _depth_edges(depth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _patchy_uniform(hw: tuple[int, int], generator: Generator) -> Tensor:
-    """Uniform numbers (h·w,) of which most are shared by 4×4 pixels, so that gaps have a size."""
+    """Uniform numbers (h·w,), most of them equal within blocks of 4×4 pixels, so that gaps come in patches."""
     coarse = torch.rand((hw[0] + 3) // 4, (hw[1] + 3) // 4, generator=generator)
     coarse = coarse.repeat_interleave(4, 0)[: hw[0]].repeat_interleave(4, 1)[:, : hw[1]]
     own = torch.rand(hw, generator=generator)
@@ -349,7 +349,7 @@ def _patchy_uniform(hw: tuple[int, int], generator: Generator) -> Tensor:
 
 
 def _shared_normal(hw: tuple[int, int], generator: Generator) -> Tensor:
-    """Standard normal numbers (h·w,), 64 % of whose variance is shared over about 6 pixels."""
+    """Standard normal numbers (h·w,), 64 % of whose variance is correlated over about 6 pixels."""
     smooth = torch.randn(-(-hw[0] // 6) + 1, -(-hw[1] // 6) + 1, generator=generator)
     for dim in (0, 1):
         at = torch.arange(hw[dim])
@@ -360,7 +360,7 @@ def _shared_normal(hw: tuple[int, int], generator: Generator) -> Tensor:
 
 
 def phone_camera(hw: tuple[int, int]) -> Camera:
-    """525 px at 640 columns, principal point a little off the middle, as real ones are."""
+    """Camera (1) with f = 525 px at 640 columns and a principal point slightly off the centre."""
     s = hw[1] / 640
     c = [hw[1] / 2 + 2.3 * s - 0.5, hw[0] / 2 - 1.4 * s - 0.5]
     return Camera(torch.tensor([[525.0 * s, 525.0 * s]]), torch.tensor([c]))

@@ -1,10 +1,10 @@
-"""A small robot data set in RH20T's format: an arm with a camera on its hand at work in the built-in room.
+"""A small synthetic robot data set in RH20T's format: an arm with an in-hand camera in the built-in room.
 
-A task is a thing in the room and a motion towards it; the scenes of a task differ in start, pace, direction and in the
-room's paint. How far the hand still has to go is how far the thing is beyond the distance it stops at: the motions can
-be told from depth, and a set made for a test of reading and probing says nothing about robots in general.
+A task is an object in the room and a motion towards it; the scenes of a task differ in start, pace, direction and in
+the room's paint. The remaining way of the hand is the distance of the object beyond the stopping distance, so the
+motions can be predicted from depth. The set is for tests of reading and probing; it does not represent real robots.
 
-Alphabet: ``d`` (m) way from the camera to the thing; axes of the world as the room's: x right, y down, z forward.
+Alphabet: ``d`` (m) distance from the camera to the object; axes of the world as the room's: x right, y down, z forward.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from dhtorch.records import Pose
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.testing.rh20t import write_rh20t
 
-#: What the hand goes to: x, height, z, m, and the direction it comes from, degrees: yaw (positive: looks right), pitch.
+#: Targets of the hand: x, height, z, m, and viewing direction, degrees: yaw (positive: looks right), pitch.
 _TARGETS = (
     (-0.76, 1.02, 1.95, 0, -12),
     (-0.30, 1.02, 1.98, 8, -6),
@@ -41,7 +41,7 @@ _TARGETS = (
     (-1.90, 0.75, 4.15, -12, -6),
 )
 
-#: What the hand does there.
+#: Motions of the hand at the target.
 _MOTIONS = ("reach", "pick", "slide", "screw")
 
 #: Frames a second, as RH20T's cameras.
@@ -61,24 +61,24 @@ def open_robot(
     hw: tuple[int, int] = (144, 256),
     seed: int = 2,
 ) -> Recordings:
-    """The set, written where it is not there yet, and opened as any other of its format.
+    """Open the synthetic robot set as any other RH20T set; it is written first if it does not exist.
 
     Args:
-        root: folder to write to and to read from; what lies there is taken as it is. None = a temporary folder that
-            lasts as long as the process.
+        root: folder to write to and to read from; existing files are used unchanged. None = a temporary folder that
+            is deleted at the end of the process.
         tasks, scenes: number of tasks, and of scenes of each.
         n_frames: frames of a scene, 0.1 s apart.
-        hw: (height, width) of the pictures, of the shape of 720×1280; depth has half the size.
-        seed: of everything.
+        hw: (height, width) of the images, with the aspect ratio of 720×1280; depth has half the size.
+        seed: of rooms, motions and noise.
 
     Raises:
-        ValueError: a count below 1, or another shape.
-        FormatError: ``root`` holds something else.
+        ValueError: a count below 1, or another aspect ratio.
+        FormatError: ``root`` holds other files.
     """
     if min(tasks, scenes, n_frames) < 1 or hw[0] * 16 != hw[1] * 9 or hw[0] % 4:
         raise ValueError(
             f"synthetic robot: tasks {tasks}, scenes {scenes}, n_frames {n_frames}, hw {tuple(hw)}; expected counts of"
-            " at least 1 and a picture of the shape of 720x1280 with a height of a multiple of 4"
+            " at least 1 and an image with the aspect ratio of 720x1280 and a height that is a multiple of 4"
         )
     if root is None:
         _TEMPORARY_FOLDERS.append(tempfile.TemporaryDirectory(prefix="dhtorch_robot_"))
@@ -128,7 +128,7 @@ def write_robot(root: Path, *, tasks: int, scenes: int, n_frames: int, hw: tuple
 
 @dataclass(frozen=True)
 class _Episode:
-    """One scene of a task: where the hand is at a time (s) since the start."""
+    """One scene of a task: the pose of the hand as a function of time (s) since the start."""
 
     motion: str
     thing: tuple[float, float, float]  # world, m
@@ -140,19 +140,19 @@ class _Episode:
     near: float  # m, d at the end
     side: float  # m, of a slide
     roll: float  # degrees, of a screw
-    offset: tuple[float, float]  # m, how far beside the thing the camera looks
+    offset: tuple[float, float]  # m, how far beside the object the camera looks
 
     @staticmethod
     def of(task: int, scene: int, seed: int) -> _Episode:
-        """A task fixes the thing and the motion; a scene the rest."""
+        """The episode of a task, which determines object and motion, and a scene, which determines the rest."""
         x, height, z, yaw, pitch = _TARGETS[task % len(_TARGETS)]
-        own = Random(f"robot {seed} {task}")
+        draw_task = Random(f"robot {seed} {task}")
         draw = Random(f"robot {seed} {task} {scene}")
         return _Episode(
             motion=_MOTIONS[(task + task // len(_TARGETS)) % len(_MOTIONS)],
             thing=(x, -height, z),
-            yaw=yaw + own.uniform(-4, 4) + draw.uniform(-5, 5),
-            pitch=pitch + own.uniform(-3, 3) + draw.uniform(-3, 3),
+            yaw=yaw + draw_task.uniform(-4, 4) + draw.uniform(-5, 5),
+            pitch=pitch + draw_task.uniform(-3, 3) + draw.uniform(-3, 3),
             start=draw.uniform(0.0, 0.5),
             length=draw.uniform(1.0, 1.5),
             far=draw.uniform(0.50, 0.80),
@@ -163,7 +163,7 @@ class _Episode:
         )
 
     def camera(self, time: float) -> np.ndarray:
-        """Camera to world (4, 4)."""
+        """Pose of the camera at ``time``: camera to world (4, 4)."""
         done = _smooth_ramp((time - self.start) / self.length)
         d, side, roll = self.near, 0.0, 0.0
         if self.motion == "slide":
@@ -184,7 +184,7 @@ class _Episode:
         return T
 
     def base(self) -> np.ndarray:
-        """Base of the arm to world (4, 4): in front of the thing and below it, z up; one for all scenes of a task."""
+        """Base of the arm to world (4, 4): in front of and below the object, z up; equal for all scenes of a task."""
         x, y, z = self.thing
         T = np.eye(4)
         T[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # base x = world z, base z = up
@@ -192,15 +192,15 @@ class _Episode:
         return T
 
     def width(self, time: float) -> float:
-        """Opening of the gripper, mm: it closes where the hand arrives."""
+        """Opening of the gripper at ``time``, mm: it closes when the hand arrives."""
         arrives = self.start + self.length * (0.5 if self.motion == "pick" else 1.0)
         return _OPEN_MM + (_CLOSED_MM - _OPEN_MM) * _smooth_ramp((time - arrives) / 0.3)
 
 
 def _solve_joints(T_base_from_tcp: np.ndarray) -> np.ndarray:
-    """Seven angles (7,) for a tcp pose (4, 4), rad: two links of 0.6 m in a turning plane, and three at the wrist.
+    """Seven joint angles (7,) of a tcp pose (4, 4), rad: two links of 0.6 m in a turning plane, three at the wrist.
 
-    No real arm's: enough for a stream that moves as smoothly as the hand and belongs to it.
+    Not a real arm's kinematics: it only has to be a smooth function of the hand's pose.
     """
     x, y, z = T_base_from_tcp[:3, 3]
     reach = math.hypot(x, y)
@@ -217,7 +217,7 @@ def _solve_joints(T_base_from_tcp: np.ndarray) -> np.ndarray:
 
 
 def _smooth_ramp(share: float) -> float:
-    """From 0 to 1 with neither speed nor acceleration at the ends."""
+    """Ramp from 0 to 1 as ``share`` goes from 0 to 1, with zero speed and acceleration at the ends."""
     s = min(max(share, 0.0), 1.0)
     return s * s * s * (10 + s * (6 * s - 15))
 

@@ -1,13 +1,13 @@
-"""The furniture of the built-in room.
+"""The built-in furnished room: its solids, materials and lights.
 
 World axes as a camera's: x right, y down, z forward, the floor at y = 0. Helpers take heights above the floor. A viewer
-stands at about (-0.45, 1.3 m up, 0.2) and looks along z. Within 2 m of him a low shelf of drawers and books divides the
+stands at about (-0.45, 1.3 m up, 0.2) and looks along z. Within 2 m of it a low shelf of drawers and books divides the
 room, with a plant, a globe, a picture and a laptop on it; beyond it an armchair, a sofa under the window on the right,
 and along the brick wall a bookcase, a sideboard with a screen, a picture and a mirror. The other walls are blank or
 papered. The seed decides paint, tint and small placements.
 
-What faces the viewer is painted with detail at several scales: window-based trackers are exact there. Slanted and plain
-boards are white. That near surfaces can be tracked well is a property of this room, not of rooms.
+Surfaces that face the viewer have texture at several scales, where window-based trackers are accurate. Slanted and
+plain boards are white. That near surfaces are easy to track is a property of this room, not of rooms in general.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _BOOK_COLOURS: tuple[Triple, ...] = (
 
 @lru_cache(maxsize=2)
 def furnished_room(seed: int = 2) -> ShadedRoom:
-    """The room with its light; the same object for the same seed (two are kept)."""
+    """The furnished room of a seed, shaded; cached for the last two seeds."""
     draw = Random(seed)
     solids = [_shell(draw)]
     for part in (_divider, _on_the_divider, _seats, _back_wall, _side_walls):
@@ -98,7 +98,7 @@ def make_ball(x: float, height: float, z: float, radius: float, surface: Materia
 
 
 def _tint(draw: Random) -> Triple:
-    """A book cloth: a warm, cool or grey colour, never a pure one."""
+    """Random tint of a book cover: a muted warm, cool or grey colour."""
     base = draw.choice(_BOOK_COLOURS)
     tone = draw.uniform(0.75, 1.2)
     return (base[0] * tone, base[1] * tone, base[2] * tone)
@@ -133,7 +133,7 @@ def _legs(x: float, z: float, size: Triple, thick: float, surface: Material, yaw
 
 
 def _divider(draw: Random) -> list[Solid]:
-    """A low open shelf across the view, five bays of drawers, boxes and books, and the lamp behind it."""
+    """A low open shelf across the view, with five bays of drawers, boxes and books, and the lamp behind it."""
     x0, z, pitch, top = -1.25, 1.95, 0.42, 0.86
     wide = 5 * pitch
     parts = [make_box(x0 + wide / 2, h, z, (wide + 0.03, 0.03, 0.36), _WHITE_PAINT) for h in (0.03, 0.43, top - 0.03)]
@@ -188,7 +188,7 @@ def _laptop(x: float, height: float, z: float) -> list[Solid]:
 
 
 def _plant(x: float, height: float, z: float, size: float) -> list[Solid]:
-    """A pot with a bush of four balls."""
+    """A plant: a pot with a bush of four balls."""
     leaf = Material("leaves", tile=0.25)
     pot = Material("speckle")
     bush = ((0, 0, 0.10), (-0.06, -0.03, 0.07), (0.05, 0.04, 0.075), (0.02, -0.06, 0.06))
@@ -272,7 +272,7 @@ def _back_wall(draw: Random) -> list[Solid]:
 
 
 def _books(draw: Random, left: float, right: float, height: float, z: float, *, shortest: float = 0.64) -> list[Solid]:
-    """Upright books, at most 33 cm tall, from left to right until the board is full; all end 13 cm behind ``z``."""
+    """Upright books, at most 33 cm tall, from left to right until the board is full; backs 13 cm behind ``z``."""
     books: list[Solid] = []
     x = left
     stop = right - draw.uniform(0.0, 0.12)

@@ -1,8 +1,8 @@
-"""What surfaces look like: painted, lit once, mirrored once.
+"""Shading of the room: textures, precomputed light and one mirror reflection.
 
-Light is computed when a :class:`ShadedRoom` is made, on a grid of nodes over each face: area lights with soft shadows,
-and an ambient part that corners and crevices lose. It does not depend on the viewer, so a surface point has the same
-colour in every frame (the mirror and the gloss of the screen excepted, which is what they are for).
+Light is computed when a :class:`ShadedRoom` is constructed, on a grid of nodes over each face: area lights with soft
+shadows, and ambient light with occlusion. It does not depend on the viewer, so a surface point has the same colour in
+every frame (except for the mirror and the gloss of the screen).
 
 Colours are display values, roughly square roots of light: multiplying them multiplies light and reflectance.
 Alphabet: as in :mod:`dhtorch.synthetic.raycast`; L nodes, P rays.
@@ -28,7 +28,7 @@ _RAYS_PER_CHUNK = 1 << 16  # rays shaded at a time: enough to amortise a call, f
 
 @dataclass(frozen=True)
 class Light:
-    """A rectangle ``centre ± u ± v`` that shines along ``normal``; with a zero normal, to all sides."""
+    """A rectangular area light ``centre ± u ± v`` along ``normal``; with a zero normal, in all directions."""
 
     centre: Triple
     u: Triple
@@ -39,7 +39,7 @@ class Light:
 
 
 class ShadedRoom:
-    """Solids, pictures and light, ready to be looked at."""
+    """Solids with textures and precomputed light, for rendering."""
 
     def __init__(self, solids: Sequence[Solid], lights: Sequence[Light], *, ambient: float, seed: int):
         self._lights, self._ambient = tuple(lights), ambient
@@ -48,24 +48,24 @@ class ShadedRoom:
         self._furnish(solids, None)
 
     def _furnish(self, solids: Sequence[Solid], lit: _Lightmap | None) -> None:
-        """Put up the solids; the first ones keep the light ``lit``."""
+        """Set the solids and compute their light; the first ones keep the light ``lit``."""
         surfaces = _face_materials(solids)
         self.solids = Solids(solids)
-        self.kind = torch.tensor([s.kind for s in surfaces])  # (faces,), also the next ones
+        self.kind = torch.tensor([s.kind for s in surfaces])  # (faces,), as are the next ones
         self._picture = torch.tensor([self._names.index(s.picture) for s in surfaces])
         self._reflect = torch.tensor([s.reflect for s in surfaces])
         self._glow = torch.tensor([s.glow for s in surfaces])
         self._tint = torch.tensor([s.tint for s in surfaces])
         self._scale = _texture_scale(solids, surfaces)
-        #: Mean grey of each face (faces,), display values: the surface's brightness to a sensor with its own light.
+        #: Mean grey of each face (faces,), display values: its brightness to an active sensor.
         self.albedo = (self._pictures.mean[self._picture] * self._tint * torch.tensor(LUMA_WEIGHTS)).sum(-1)
         self.light = _Lightmap(self.solids, self._lights, self._ambient, lit)
 
     def joined_by(self, guests: Sequence[Solid]) -> ShadedRoom:
-        """The room and guests in it, who are lit where they stand; what was there before looks as it did.
+        """The room with further solids, lit where they stand; the light of the room itself is unchanged.
 
         Raises:
-            ValueError: a guest is painted with what nothing in the room is painted with, or would cast a shadow.
+            ValueError: a guest has a picture that nothing in the room has, or casts a shadow.
         """
         for guest in guests:
             if guest.shadow:
@@ -73,24 +73,23 @@ class ShadedRoom:
         for surface in _face_materials(guests):
             if surface.picture not in self._names:
                 raise ValueError(f"shaded room: picture is {surface.picture!r}, expected one of {self._names}")
-        whole = copy.copy(self)
-        whole._furnish([*self.solids.each, *guests], self.light)
-        return whole
+        room = copy.copy(self)
+        room._furnish([*self.solids.each, *guests], self.light)
+        return room
 
     def moved(self, motion: Pose) -> ShadedRoom:
-        """The room with its solids of kind ``SURFACE_MOVING`` gone by a rigid motion (1) of the world, in the light
-        they had.
+        """The room with its ``SURFACE_MOVING`` solids after a rigid motion (1) of the world, in unchanged light.
 
-        A surface point keeps its colour wherever it goes, so that it can be tracked like any other.
+        A surface point keeps its colour, so that it can be tracked like any other.
         """
-        there = copy.copy(self)
-        there.solids = Solids([s.moved(motion) if s.surface.kind == SURFACE_MOVING else s for s in self.solids.each])
-        return there
+        room = copy.copy(self)
+        room.solids = Solids([s.moved(motion) if s.surface.kind == SURFACE_MOVING else s for s in self.solids.each])
+        return room
 
     def shade(
         self, o: Sequence[Tensor], d: Sequence[Tensor], t: Tensor, index: Tensor, spread: float
     ) -> tuple[Tensor, Tensor]:
-        """Colours (P, 3), not clipped, and faces (P,) of rays that meet solid ``index`` (P,) at ``t`` (P,).
+        """Colours (P, 3), not clipped, and faces (P,) of rays that hit solid ``index`` (P,) at ``t`` (P,).
 
         ``spread``: width of a ray per unit of ``t``; pictures are filtered to it.
         """
@@ -100,7 +99,7 @@ class ShadedRoom:
         return self._mirror(colour, face, o, d, t, spread), face
 
     def cosine(self, d: Sequence[Tensor], face: Tensor, p: Sequence[Tensor]) -> Tensor:
-        """Cosine (P,) of the angle between a ray and the normal of the face it meets at ``p``, in [0, 1]."""
+        """Cosine (P,) of the angle between a ray and the normal of the face it hits at ``p``, in [0, 1]."""
         along = dot_product(d, self.solids.normal(face, p)).abs()
         return (along / dot_product(d, d).sqrt()).clamp(0, 1)
 
@@ -129,18 +128,18 @@ class ShadedRoom:
     def _mirror(
         self, colour: Tensor, face: Tensor, o: Sequence[Tensor], d: Sequence[Tensor], t: Tensor, spread: float
     ) -> Tensor:
-        """Mix in what the mirrored rays see; a mirror in a mirror shows its own colour."""
-        at = (self._reflect[face] > 0).nonzero()[:, 0]
-        if not at.numel():
+        """Blend the colour (P, 3) with that of the mirrored rays; a mirror in a mirror shows its own colour."""
+        index = (self._reflect[face] > 0).nonzero()[:, 0]
+        if not index.numel():
             return colour
-        rays = self.mirrored([c[at] for c in o], [c[at] for c in d], t[at], face[at])
-        seen, _ = self._paint(*rays, spread * 2)  # about the width at the whole distance travelled
-        share = self._reflect[face[at], None]
-        return colour.index_copy(0, at, colour[at] * (1 - share) + seen * share)
+        rays = self.mirrored([c[index] for c in o], [c[index] for c in d], t[index], face[index])
+        reflected, _ = self._paint(*rays, spread * 2)  # about the width at the whole distance travelled
+        weight = self._reflect[face[index], None]
+        return colour.index_copy(0, index, colour[index] * (1 - weight) + reflected * weight)
 
 
 class _Pictures:
-    """Tiling pictures with a pyramid of halved sizes each, all texels in one table."""
+    """Tileable pictures with a mipmap pyramid each, all texels in one table."""
 
     def __init__(self, pictures: Tensor):
         levels, parts, start = [], [], 0
@@ -179,7 +178,7 @@ class _Pictures:
 
 
 class _Lightmap:
-    """Light on a grid of nodes over each face, bilinear between; that of the first faces may be known already."""
+    """Light on a grid of nodes over each face, interpolated bilinearly; that of the first faces may be given."""
 
     def __init__(
         self,
@@ -198,11 +197,11 @@ class _Lightmap:
         count = self.n[:, 0] * self.n[:, 1]
         self.start = count.cumsum(0) - count
         face = torch.arange(len(count)).repeat_interleave(count)
-        place = torch.arange(len(face)) - self.start[face]
+        node = torch.arange(len(face)) - self.start[face]
         if known is not None:
-            face, place = face[len(known.values) :], place[len(known.values) :]
+            face, node = face[len(known.values) :], node[len(known.values) :]
         n = self.n[face]
-        across, down = (place % n[:, 0]) / (n[:, 0] - 1) * 2 - 1, (place // n[:, 0]) / (n[:, 1] - 1) * 2 - 1
+        across, down = (node % n[:, 0]) / (n[:, 0] - 1) * 2 - 1, (node // n[:, 0]) / (n[:, 1] - 1) * 2 - 1
         p = solids.points(face, across * 0.995, down * 0.995)
         normal = solids.normal(face, p)
         p = [p[k] + 0.003 * normal[k] for k in range(3)]
@@ -213,7 +212,7 @@ class _Lightmap:
         self.values: Tensor = values if known is None else torch.cat((known.values, values))  # (L, 3)
 
     def sample(self, face: Tensor, across: Tensor, down: Tensor) -> Tensor:
-        """(P, 3) at places in [-1, 1] of faces."""
+        """Light (P, 3) at coordinates in [-1, 1] of faces."""
         n = self.n[face]
         columns, last = n[:, 0], n - 1
         x = (across.clamp(-1, 1) + 1) * 0.5 * last[:, 0]
@@ -228,24 +227,24 @@ class _Lightmap:
 
 
 def _direct_light(solids: Solids, light: Light, p: list[Tensor], normal: list[Tensor]) -> Tensor:
-    """Power (L, 3) that reaches points from a light past everything that casts a shadow."""
+    """Power (L, 3) that points receive from a light, with soft shadows."""
     rows, columns = light.samples
-    places = [((2 * i + 1) / columns - 1, (2 * k + 1) / rows - 1) for k in range(rows) for i in range(columns)]
-    target = [torch.tensor([[light.centre[j] + a * light.u[j] + b * light.v[j]] for a, b in places]) for j in range(3)]
+    offsets = [((2 * i + 1) / columns - 1, (2 * k + 1) / rows - 1) for k in range(rows) for i in range(columns)]
+    target = [torch.tensor([[light.centre[j] + a * light.u[j] + b * light.v[j]] for a, b in offsets]) for j in range(3)]
     d = [target[k] - p[k] for k in range(3)]  # (samples, L)
     square = dot_product(d, d).clamp(min=0.04)
     shine = -dot_product(d, light.normal) if any(light.normal) else square.sqrt()
     gain = dot_product(d, normal).clamp(min=0) * shine.clamp(min=0) / (square * square)
-    lit = gain.any(0).nonzero()[:, 0]  # what faces away from all of the light is dark whatever stands between
-    gain[:, lit] *= _is_unshaded(solids, light, [c[lit] for c in p], [c[:, lit] for c in d])
+    facing = gain.any(0).nonzero()[:, 0]  # points that face away from the whole light need no shadow test
+    gain[:, facing] *= _is_unshaded(solids, light, [c[facing] for c in p], [c[:, facing] for c in d])
     total = torch.zeros_like(gain[0])
-    for k in range(len(places)):  # a sum in written order
+    for k in range(len(offsets)):  # summed in a fixed order
         total = total + gain[k]
-    return (total / len(places))[:, None] * torch.tensor(light.colour)
+    return (total / len(offsets))[:, None] * torch.tensor(light.colour)
 
 
 def _is_unshaded(solids: Solids, light: Light, p: list[Tensor], d: list[Tensor]) -> Tensor:
-    """1 where nothing stands on the ways ``d`` (samples, P) from points ``p`` (P,) to places of a light, else 0."""
+    """1 where the segments ``d`` (samples, P) from points ``p`` (P,) to samples of a light are free, else 0."""
     clear = torch.ones_like(d[0])
     half = math.hypot(*(abs(light.u[k]) + abs(light.v[k]) for k in range(3)))
     for solid, at in solids.blockers(p, half + 1e-3, [light.centre[k] - p[k] for k in range(3)]):
@@ -255,12 +254,12 @@ def _is_unshaded(solids: Solids, light: Light, p: list[Tensor], d: list[Tensor])
 
 
 def _ambient_light(solids: Solids, p: list[Tensor], normal: list[Tensor], *, reach: float = 1.1) -> Tensor:
-    """Share (L, 3) of light from all around that what stands within ``reach`` (m) lets through."""
+    """Fraction (L, 3) of the ambient light that is not occluded by solids within ``reach`` (m)."""
     sphere = _sphere_directions()
     d = [torch.tensor([[c[k]] for c in sphere]) for k in range(3)]
     side = torch.where(
         dot_product(d, normal) < 0, -reach, reach
-    )  # the same directions for all, turned to the open side
+    )  # the same directions for all points, flipped to the side of the normal
     d = [c * side for c in d]  # (directions, L)
     clear = solids.open_distance(solids.each[0], p, d)
     for solid, at in solids.blockers(p, reach):
@@ -275,7 +274,7 @@ def _ambient_light(solids: Solids, p: list[Tensor], normal: list[Tensor], *, rea
 
 
 def _sphere_directions(n: int = 14) -> list[Triple]:
-    """Directions spread over the sphere: a spiral in equal height steps, turned by the golden angle each."""
+    """Directions (n) spread over the sphere: a spiral in equal height steps, rotated by the golden angle each."""
     c, s = -0.7373688780783197, 0.6754902942615238  # cosine and sine of the golden angle
     x, y = 1.0, 0.0
     directions = []
@@ -288,12 +287,12 @@ def _sphere_directions(n: int = 14) -> list[Triple]:
 
 
 def _face_materials(solids: Sequence[Solid]) -> list[Material]:
-    """Of every face, six a solid."""
+    """Material of every face, six per solid."""
     return [s.faces.get(f, s.surface) for s in solids for f in range(6)]
 
 
 def _texture_scale(solids: Sequence[Solid], surfaces: Sequence[Material]) -> Tensor:
-    """(faces, 3): texels per half width across and down, signed so that print reads the right way round; per m."""
+    """(faces, 3): texels per half width across and down, signed so that print is not mirrored; texels per m."""
     rows = []
     for f, surface in enumerate(surfaces):
         solid, axis, positive = solids[f // 6], (f % 6) // 2, f % 2
@@ -308,5 +307,5 @@ def _texture_scale(solids: Sequence[Solid], surfaces: Sequence[Material]) -> Ten
 
 
 def _log2(x: Tensor) -> Tensor:
-    """log2 to within 0.09, straight between powers of two: read off the exponent bits of a float32."""
+    """log2 to within 0.09, linear between powers of two: from the exponent bits of a float32."""
     return x.clamp(min=1e-6).view(torch.int32).float() * 2.0**-23 - 127

@@ -1,8 +1,8 @@
-"""The built-in room under stress: one recording for each thing that goes wrong with a capture, all truth known.
+"""Stress recordings of the built-in room: one per difficulty of a capture, with exact ground truth.
 
-Paths that give little to triangulate with, near returns that hardly fix a pose, a worse sensor, a rolling shutter,
-places that are shown elsewhere, tracks that end elsewhere, things near by that move, motion that is large, exposures
-that jump or smear. Recordings bear the name ``stress_<name>``.
+Difficulties: paths with little parallax, near returns that hardly constrain a pose, a noisier sensor, a rolling
+shutter, displaced image tiles, wrong tracks, moving bodies near by, large motion, exposure jumps and motion blur.
+Recordings are named ``stress_<name>``.
 """
 
 from __future__ import annotations
@@ -27,44 +27,44 @@ from dhtorch.synthetic.raycast import SURFACE_MOVING, world_rays
 from dhtorch.synthetic.recording import SURFACE_NAMES, SyntheticRoom, room_to_scene
 from dhtorch.synthetic.shading import ShadedRoom
 
-#: Near returns that are left in ``few_near``.
+#: Number of near returns kept in ``few_near``.
 _N_FEW_NEAR = 20
 
 #: Standard deviation of the additional relative depth error in ``depth_noise``; per pixel, on top of the phone's.
 _DEPTH_NOISE_REL = 0.025
 
-#: Rolling shutter: seconds from the first row to the last, in so many bands of rows that share a pose.
+#: Rolling shutter: seconds from the first row to the last, and number of bands of rows with the same pose.
 _READOUT_S, _N_ROW_BANDS = 0.02, 30
 
-#: Share of the picture (``moved``) or of the tracks (``mistracks``) that is shown or found elsewhere, by between so
-#: many pixels at 640 columns; the picture in squares of ``_TILE_PX`` px.
+#: Displaced fraction of the image (``moved``) or of the tracks (``mistracks``), side of the image tiles, and range of
+#: the displacement, px at 640 columns.
 _MOVED_SHARE, _TILE_PX, _MOVED_RANGE_PX = 0.3, 80, (6.0, 24.0)
 
-#: ``fast``: degrees by which the first frame looks farther to the right than the path, and each next one more.
+#: ``fast``: degrees of yaw to the right added to the first frame of the path, and added from frame to frame.
 _PAN_DEG = (-6.0, 1.2)
 
-#: ``exposure_jump``: grey values are two to a power between these times as bright or dark, then clipped.
+#: ``exposure_jump``: range of the exposure change in stops, brighter or darker; grey values are then clipped.
 _EXPOSURE_STOPS = (0.5, 1.0)
 
-#: ``motion_blur``: the camera turns while it exposes, in each frame another way, by so many px at 640 columns.
+#: ``motion_blur``: range of the blur length, px at 640 columns; its direction differs from frame to frame.
 _SMEAR_RANGE_PX = (5.0, 15.0)
 
-#: Where samples will be taken: ``(hw, n) -> uv (n, 2)``.
+#: Positions of samples: ``(hw, n) -> uv (n, 2)``.
 _SamplePattern = Callable[[tuple[int, int], int], Tensor]
 
 
 class StressRoom(SyntheticRoom):
-    """The built-in room with one thing wrong.
+    """The built-in room with one of the stresses.
 
-    Where a body moves, what is seen of it has the surface ``moving`` and is counted apart.
+    If a body moves, its visible surface has the kind ``moving`` and is evaluated separately.
 
     Args:
         stress: one of :data:`STRESSES`.
-        places: for ``few_near``, where a method will look, with ``n_places``: returns are kept there. None = anywhere.
-        n_places: number of places.
-        near: m; returns up to here are what a stress of the sensor is about.
-        gap: the first so many frames are reference views, which ``moved`` leaves alone.
-        options: of :class:`SyntheticRoom`; those that make the stress are set by it.
+        places: for ``few_near``: sample positions of the method, at which returns are kept. None = anywhere.
+        n_places: number of sample positions.
+        near: m; the stresses of the sensor concern returns up to this depth.
+        gap: number of first frames, the reference views, that ``moved`` does not change.
+        options: of :class:`SyntheticRoom`; the options of the stress override them.
 
     Raises:
         ValueError: an unknown stress; else as :class:`SyntheticRoom`.
@@ -95,14 +95,14 @@ class StressRoom(SyntheticRoom):
         super().__init__(**options)
         self.stress, self.places, self.n_places = stress, places, n_places
         moving = STRESSES[stress].moving
-        #: T_world_from_home (n_frames) of the body that moves, if one does: see :mod:`dhtorch.synthetic.guests`.
+        #: T_world_from_home (n_frames) of the moving body, None without one: see :mod:`dhtorch.synthetic.guests`.
         self.body_poses = None if moving is None else moving.motion(self.true_poses)
         self.near, self.gap = near, gap
         if self.bands:
             self.camera = self.camera.replace(readout=torch.tensor([_READOUT_S]))
 
     def truth(self, index: int) -> dict[str, Tensor]:
-        """As :meth:`SyntheticRoom.truth`; under a rolling shutter each row in its own camera."""
+        """As :meth:`SyntheticRoom.truth`; under a rolling shutter with the pose of each row."""
         i = self._position(index)
         if not self.bands:
             return super().truth(i)
@@ -110,14 +110,14 @@ class StressRoom(SyntheticRoom):
         return {k: torch.cat([part[k] for part in parts], 1) for k in parts[0]}
 
     def world(self, index: int) -> ShadedRoom:
-        """As :meth:`SyntheticRoom.world`; a body that moves is where it has gone."""
+        """As :meth:`SyntheticRoom.world`, with the moving body at its position in frame ``index``."""
         i, moving = self._position(index), STRESSES[self.stress].moving
         if moving is None or self.body_poses is None:
             return super().world(i)
         return room_with_body(self.seed, moving.guest).moved(self.body_poses[i : i + 1])
 
     def gain(self, index: int) -> float:
-        """Factor on the grey values of frame ``index`` before they are clipped; 1 but for ``exposure_jump``."""
+        """Factor on the grey values of frame ``index`` before clipping; 1 except for ``exposure_jump``."""
         if self.stress != "exposure_jump":
             return 1.0
         i = self._position(index)
@@ -125,11 +125,11 @@ class StressRoom(SyntheticRoom):
             _EXPOSURE_STOPS[0]
             + (_EXPOSURE_STOPS[1] - _EXPOSURE_STOPS[0]) * torch.rand(1, generator=self._generator(i, "gain")).item()
         )
-        brighter = (i + i // self.gap) % 2 == 0  # from frame to frame and over a gap it goes up or down
+        brighter = (i + i // self.gap) % 2 == 0  # changes from frame to frame and over a gap
         return math.pow(2.0, stops if brighter else -stops)
 
     def smear(self, index: int) -> tuple[float, float]:
-        """Right and down, px: from where to where a far point goes while frame ``index`` is exposed; 0 but for
+        """Motion of a far point to the right and down during the exposure of frame ``index``, px; 0 except for
         ``motion_blur``."""
         if self.stress != "motion_blur":
             return 0.0, 0.0
@@ -138,7 +138,7 @@ class StressRoom(SyntheticRoom):
         return length * math.cos(2 * math.pi * angle), length * math.sin(2 * math.pi * angle)
 
     def spoil_track(self, track: Callable[..., Tracks]) -> Callable[..., Tracks]:
-        """A method's tracker as it works in this room: under ``mistracks`` many of its tracks end elsewhere."""
+        """The tracker ``track`` as it works in this room: under ``mistracks`` with many wrong tracks."""
         if self.stress != "mistracks":
             return track
         return partial(_displace_tracks, track)
@@ -151,15 +151,13 @@ class StressRoom(SyntheticRoom):
         return torch.cat([self._photograph(i, camera, pose, hw) for camera, pose, hw in self._rows(i)], 2)
 
     def _smeared(self, i: int) -> Tensor:
-        """The mean of pictures at most a pixel apart, on both sides of the frame's own pose."""
+        """Motion-blurred image: mean of renderings at most a pixel apart, on both sides of the frame's pose."""
         right, down = self.smear(i)
         n = math.ceil(math.hypot(right, down)) + 1
         pose, f = self.true_poses[i : i + 1], float(self.camera.f[0, 0])
         total = torch.zeros(1, 3, *self.hw)
         for k in range(n):
-            at = (
-                k / (n - 1) - 0.5
-            ) / f  # a camera that looks farther to the left and up shifts the picture right, down
+            at = (k / (n - 1) - 0.5) / f  # turning the camera left and up shifts the image right and down
             turn = torch.tensor(
                 [rotation_from_angles(-math.degrees(right * at), math.degrees(down * at), 0.0)], dtype=torch.float64
             )
@@ -179,14 +177,14 @@ class StressRoom(SyntheticRoom):
                 yield self.camera.replace(c=self.camera.c - shift), pose, (bottom - top, self.hw[1])
 
 
-#: Options of :class:`SyntheticRoom` that decide its way.
+#: Options of :class:`SyntheticRoom` that determine its path.
 _PATH_OPTIONS = ("path", "n_frames", "step_m", "rate_hz", "seed")
 
 
 def _rolling_shutter_poses(
     path: str = "walk", n_frames: int = 12, step_m: float = 0.02, rate_hz: float = 30.0, seed: int = 2
 ) -> tuple[list[Pose], Pose]:
-    """Poses of the bands of every frame, and of the frames: a frame's own pose is that of its middle band."""
+    """Poses of the row bands of every frame, and poses of the frames, which are those of their middle bands."""
     per_frame = round(_N_ROW_BANDS / (_READOUT_S * rate_hz))
     n = n_frames * per_frame + _N_ROW_BANDS
     every = hand_held_path(path, n, step_m=step_m / per_frame, rate_hz=rate_hz * per_frame, seed=seed)
@@ -198,7 +196,7 @@ def _rolling_shutter_poses(
 def _panning_poses(
     path: str = "lateral", n_frames: int = 12, step_m: float = 0.02, rate_hz: float = 30.0, seed: int = 2
 ) -> Pose:
-    """Poses of a camera that turns to the side it goes to."""
+    """Poses (n_frames) of a lateral path with the pan :data:`_PAN_DEG`."""
     return hand_held_path(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed, pan=_PAN_DEG)
 
 
@@ -215,7 +213,7 @@ def open_stress(
 ) -> list[Scene]:
     """The room under each of :data:`STRESSES` (None = all), one scene each; options as :class:`StressRoom`.
 
-    A scene in which a body moves has the role ``moving``, and a cutoff of at most what its stress says.
+    A scene with a moving body has the role ``moving`` and a cutoff of at most that of the body.
     """
     options: dict[str, Any] = {"seed": seed, "n_frames": n_frames, "hw": hw, "near": near, "gap": gap}
     names = STRESSES if stresses is None else stresses
@@ -235,30 +233,30 @@ def _keep_all(room: StressRoom, i: int, frame: Frame) -> Frame:
 
 
 def _keep_one_plane(room: StressRoom, i: int, frame: Frame) -> Frame:
-    """Near returns off the plane that most of them lie on are gone, and so are those off their surface."""
+    """The frame without near returns off the plane that most of them lie on, and without those off their surface."""
     assert frame.depth_camera is not None
     scene, pose, hw = room.world(i), room.true_poses[i : i + 1], room.depth_hw
     depth, solid = scene.solids.view(frame.depth_camera, pose, hw)
     o, d = world_rays(frame.depth_camera, pose, hw)
     face, _, _ = scene.solids.locate(solid, [o[k] + d[k] * depth for k in range(3)])
-    said = frame.depth.flatten()
-    near = (said > 0) & (said <= room.near)
-    sound = near & ((said / depth - 1).abs() < 0.05) & ~scene.solids.ball[solid]
-    plane = torch.bincount(face[sound], minlength=1).argmax()
-    return _remove_returns(frame, near & ~(sound & (face == plane)))
+    returns = frame.depth.flatten()
+    near = (returns > 0) & (returns <= room.near)
+    accurate = near & ((returns / depth - 1).abs() < 0.05) & ~scene.solids.ball[solid]
+    plane = torch.bincount(face[accurate], minlength=1).argmax()
+    return _remove_returns(frame, near & ~(accurate & (face == plane)))
 
 
 def _keep_few_returns(room: StressRoom, i: int, frame: Frame) -> Frame:
-    """Of the near returns that a method would read, :data:`_N_FEW_NEAR` are left."""
-    said = frame.depth.flatten()
-    near = (said > 0) & (said <= room.near)
+    """The frame with only :data:`_N_FEW_NEAR` of the near returns that a method would read."""
+    returns = frame.depth.flatten()
+    near = (returns > 0) & (returns <= room.near)
     usable = near if frame.conf is None else near & (frame.conf.flatten() > 0)
     if room.places is not None:
         uv = room.places(room.hw, room.n_places)[None].to(frame.depth)
-        at = round_half_up(depth_pixels(frame.camera, room.hw, frame.depth_camera, room.depth_hw, uv))[0].long()
+        pixel = round_half_up(depth_pixels(frame.camera, room.hw, frame.depth_camera, room.depth_hw, uv))[0].long()
         h, w = room.depth_hw
-        at = at[((at >= 0) & (at < torch.tensor([w, h]))).all(-1)]
-        read = torch.zeros_like(near).index_fill(0, at[:, 1] * w + at[:, 0], True)
+        pixel = pixel[((pixel >= 0) & (pixel < torch.tensor([w, h]))).all(-1)]
+        read = torch.zeros_like(near).index_fill(0, pixel[:, 1] * w + pixel[:, 0], True)
         usable = usable & read
     chosen = usable.nonzero()[:, 0]
     chosen = chosen[torch.randperm(len(chosen), generator=room._generator(i, "few"))[:_N_FEW_NEAR]]
@@ -271,9 +269,9 @@ def _add_depth_noise(room: StressRoom, i: int, frame: Frame) -> Frame:
 
 
 def _displace_tiles(room: StressRoom, i: int, frame: Frame) -> Frame:
-    """Squares of the later views show what lies beside them, so that tracks end in the wrong place, and fit there.
+    """The frame with displaced tiles of the image, so that tracks end in the wrong place with a good photometric fit.
 
-    The first ``gap`` frames are left alone: reference views show what is there.
+    The first ``gap`` frames, the reference views, are unchanged.
     """
     if i < room.gap:
         return frame
@@ -284,9 +282,11 @@ def _displace_tiles(room: StressRoom, i: int, frame: Frame) -> Frame:
     square = (v // tile) * columns + u // tile
     moved = torch.randperm(rows * columns, generator=g)[: round(_MOVED_SHARE * rows * columns)]
     low, high = (px * W / 640 for px in _MOVED_RANGE_PX)
-    way = torch.randn(rows * columns, 2, generator=g)
-    way = way / way.norm(dim=-1, keepdim=True) * (low + (high - low) * torch.rand(rows * columns, 1, generator=g))
-    shift = torch.zeros_like(way).index_copy(0, moved, way[moved]).round().long()
+    offset = torch.randn(rows * columns, 2, generator=g)
+    offset = (
+        offset / offset.norm(dim=-1, keepdim=True) * (low + (high - low) * torch.rand(rows * columns, 1, generator=g))
+    )
+    shift = torch.zeros_like(offset).index_copy(0, moved, offset[moved]).round().long()
     row, column = (v + shift[square, 1]).clamp(0, H - 1), (u + shift[square, 0]).clamp(0, W - 1)
     return frame.replace(image=frame.image[..., row, column])
 
@@ -294,9 +294,9 @@ def _displace_tiles(room: StressRoom, i: int, frame: Frame) -> Frame:
 def _displace_tracks(
     track: Callable[..., Tracks], image_0: Tensor, image_1: Tensor, uv_0: Tensor, **options: Any
 ) -> Tracks:
-    """Tracks of which :data:`_MOVED_SHARE` end elsewhere, while all that they say of themselves stays as it was.
+    """Tracks of which the fraction :data:`_MOVED_SHARE` is displaced, with their quality measures unchanged.
 
-    Which ones and where to depends on the second image alone, so every method that looks at it errs alike.
+    The displacements depend on the second image alone, so they are the same for every method.
     """
     tracks = track(image_0, image_1, uv_0, **options)
     low, high = (px * image_1.shape[-1] / 640 for px in _MOVED_RANGE_PX)
@@ -305,34 +305,34 @@ def _displace_tracks(
         grey_levels = image if image.dtype == torch.uint8 else (255 * image).round()
         g = torch.Generator().manual_seed(int(grey_levels.long().sum()))
         wrong, length, angle = torch.rand(3, uv_0.shape[1], 1, generator=g)
-        way = torch.cat((torch.cos(2 * torch.pi * angle), torch.sin(2 * torch.pi * angle)), -1)
-        shifts.append(torch.where(wrong < _MOVED_SHARE, way * (low + (high - low) * length), 0.0))
+        direction = torch.cat((torch.cos(2 * torch.pi * angle), torch.sin(2 * torch.pi * angle)), -1)
+        shifts.append(torch.where(wrong < _MOVED_SHARE, direction * (low + (high - low) * length), 0.0))
     return tracks.replace(uv_1=tracks.uv_1 + torch.stack(shifts).to(tracks.uv_1))
 
 
 def _remove_returns(frame: Frame, gone: Tensor) -> Frame:
-    """The frame without the returns under the flat mask."""
+    """The frame without the returns in the flat mask ``gone``."""
     depth = torch.where(gone.view(frame.depth.shape), torch.zeros_like(frame.depth), frame.depth)
     return frame.replace(depth=depth)
 
 
 class MovingBody(NamedTuple):
-    """A body that moves."""
+    """A moving body of a stress."""
 
-    guest: str  # which of the room's guests
+    guest: str  # name in guests.MOVING_BODIES
     motion: Callable[[Pose], Pose]  # T_world_from_cam (n) → T_world_from_home (n)
-    near: float  # m, a cutoff below which the story holds: what is near belongs to the body, or half of it
+    near: float  # m, cutoff at which all or half of the near returns are of the body
 
 
 class Stress(NamedTuple):
-    """Options of the room, what is done to its frames, and what moves in it."""
+    """A stress: options of the room, a change of its frames, and a moving body."""
 
     options: dict[str, Any]
     spoil: Callable[[StressRoom, int, Frame], Frame] = _keep_all
     moving: MovingBody | None = None
 
 
-#: What may go wrong; the hand-held walk where no path is said.
+#: The stresses by name.
 STRESSES: dict[str, Stress] = {
     "lateral": Stress({"path": "lateral"}),
     "forward": Stress({"path": "forward"}),

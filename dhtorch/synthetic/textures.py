@@ -1,11 +1,11 @@
-"""Procedural, tileable surface pictures for the built-in room.
+"""Procedural, tileable textures of the built-in room.
 
 A picture is a (SIZE, SIZE, 3) tensor of display values (about the square root of reflectance) in [0, 1]. A painter
-takes the scene's generator alone, so a seed fixes all pictures. Detail comes at several scales: large shapes for coarse
-pyramid levels, grain of a few texels for the finest.
+depends on the room's generator alone, so a seed determines all pictures. Detail has several scales: large shapes for
+coarse pyramid levels, grain of a few texels for the finest.
 
 Alphabet: ``u`` right and ``v`` down, in [0, 1) over the tile. Only correctly rounded arithmetic is used (no sine, no
-logarithm): its result cannot depend on how many threads share the work.
+logarithm): the result does not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _periodic_noise(generator: Generator, hw: tuple[int, int], cells: tuple[int,
 
 
 def _fractal_noise(g: Generator, cells: int, octaves: int, stretch: int = 1) -> Tensor:
-    """Sum of noises of falling size in [0, 1]; ``stretch`` makes it that much finer across than down."""
+    """Sum of noise octaves (SIZE, SIZE) in [0, 1]; ``stretch`` times finer across than down."""
     total, weight = torch.zeros(TEXTURE_SIZE_PX, TEXTURE_SIZE_PX), 0.0
     for k in range(octaves):
         down, across = (min(n << k, TEXTURE_SIZE_PX // 2) for n in (cells, cells * stretch))
@@ -67,7 +67,7 @@ def _texture_uv() -> tuple[Tensor, Tensor]:
 
 
 def _smooth_step(x: Tensor, width: float) -> Tensor:
-    """0 below -width, 1 above width, smooth between: an edge that sampling can follow."""
+    """0 below -width, 1 above width, smooth between: an edge without aliasing."""
     x = (x / (2 * width) + 0.5).clamp(0, 1)
     return x * x * (3 - 2 * x)
 
@@ -84,13 +84,13 @@ def _blend(a: _Colour | Tensor, b: _Colour | Tensor, weight: Tensor) -> Tensor:
 
 
 def _draw_pigment(g: Generator) -> Tensor:
-    """One of a few paints that go together, slightly lighter or darker."""
+    """Random colour of the palette, slightly lighter or darker."""
     which, tone = torch.rand(2, generator=g).tolist()
     return torch.tensor(_PALETTE[int(which * len(_PALETTE))]) * (0.85 + 0.3 * tone)
 
 
 def _cell_noise(g: Generator, row: Tensor, column: Tensor, n: tuple[int, int]) -> Tensor:
-    """One random number per (row, column) cell, spread over the picture."""
+    """A random number per (row, column) cell, for every texel."""
     table = torch.rand(n, generator=g)
     return table[row.long() % n[0], column.long() % n[1]]
 
@@ -183,7 +183,7 @@ def _poster(g: Generator) -> Tensor:
         cx, cy, rx, ry, slant = torch.rand(5, generator=g).tolist()
         size = 0.30 / (1 + 0.22 * k)
         rx, ry, slant = size * (0.4 + rx), size * (0.4 + ry), slant - 0.5
-        # Paint only where the shape can be.
+        # Paint only the bounding box of the shape.
         part = tuple(
             slice(max(0, int((c - 0.8 * size * 2) * TEXTURE_SIZE_PX)), int((c + 0.8 * size * 2) * TEXTURE_SIZE_PX))
             for c in (cy, cx)
@@ -201,7 +201,7 @@ def _poster(g: Generator) -> Tensor:
 
 
 def _landscape(g: Generator) -> Tensor:
-    """Sky, hills, a few houses and trees: what is outside the window."""
+    """Sky, hills, a few houses and trees: the view out of the window."""
     u, v = _texture_uv()
     cloud = _smooth_step(_fractal_noise(g, 4, 5) - 0.55, 0.12)
     picture = _blend(_blend((0.62, 0.80, 1.0), (0.93, 0.97, 1.0), v), (1.0, 1.0, 1.0), cloud * 0.8)
@@ -285,7 +285,7 @@ def _speckle(g: Generator) -> Tensor:
 
 
 def _print(g: Generator) -> Tensor:
-    """Printed cloth: patches of paint on cream, large and small, nowhere the same."""
+    """Printed cloth: random patches of paint on cream, at several scales."""
     cloth = _blend((0.86, 0.82, 0.72), (0.76, 0.72, 0.62), _fractal_noise(g, 5, 3))
     for cells, share in ((6, 0.60), (6, 0.62), (10, 0.64), (16, 0.66), (28, 0.68)):
         patch = _smooth_step(

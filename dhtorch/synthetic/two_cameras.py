@@ -1,4 +1,4 @@
-"""A robot with two cameras in the built-in room: a rig whose relative pose and all depth are known."""
+"""A two-camera rig in the built-in room, with exact relative pose and depth."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def open_two_cameras(
     supersample: int = 2,
     near: float | None = 2.0,
 ) -> list[Scene]:
-    """One scene: the frames of ``left`` and ``right``, which move together.
+    """Open the two-camera rig as one scene with the frames of ``left`` and ``right``, which move together.
 
     Args:
         seed, n_frames, hw, depth_hw, range_limit, step_m, supersample: as :class:`SyntheticRoom`.
         baseline: m, from the left camera to the right one.
-        toe_in_deg: by which the right camera looks to the left.
-        zoom: its focal length over the left one's.
+        toe_in_deg: yaw of the right camera to the left.
+        zoom: focal length of the right camera over that of the left.
         near: the cutoff to use for a range split.
 
     Raises:
-        ValueError: a baseline or zoom that is not positive, or an option that :class:`SyntheticRoom` does not take.
+        ValueError: a baseline or zoom that is not positive, or an option that :class:`SyntheticRoom` rejects.
     """
     if not (baseline > 0 and zoom > 0):
         raise ValueError(f"two cameras: baseline is {baseline} and zoom {zoom}, expected positive numbers")

@@ -1,4 +1,4 @@
-"""The built-in room from many places and in many directions: independent views, one frame each."""
+"""Independent views of the built-in room from random positions and directions, one frame each."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from dhtorch.records import Pose
 from dhtorch.synthetic.recording import SyntheticRoom, phone_camera
 from dhtorch.synthetic.room import ROOM_BACK_M, ROOM_FRONT_M, ROOM_LEFT_M, ROOM_RIGHT_M, furnished_room
 
-#: Views of one furnished room before the next one is painted.
+#: Number of views per room seed.
 _VIEWS_PER_ROOM = 5
 
-#: A view is drawn anew while more than a hundredth of it is nearer than this, m.
+#: A view with more than a hundredth of its pixels nearer than this is redrawn, m.
 _MIN_DEPTH_M = 0.4
 
 
@@ -27,19 +27,19 @@ def open_viewpoints(
     image_noise: float = 0.0,
     supersample: int = 2,
 ) -> list[SyntheticRoom]:
-    """``n`` views of the room, a recording of one frame each, with exact depth.
+    """``n`` random views of the room with exact depth, a recording of one frame each.
 
-    The viewer stands anywhere, at a height of 0.9 to 1.7 m, and looks anywhere, mostly a little down; every
-    :data:`_VIEWS_PER_ROOM` views the room is painted anew. View ``k`` is the same however many follow.
+    The viewer stands anywhere, at a height of 0.9 to 1.7 m, and looks in any direction, mostly slightly down; the seed
+    of the room changes every :data:`_VIEWS_PER_ROOM` views. View ``k`` does not depend on ``n``.
 
     Args:
         n: number of views.
         seed: of rooms and viewers.
-        hw, image_noise, supersample: as :class:`SyntheticRoom`. Without noise by default: a camera model on top of the
-            picture adds its own.
+        hw, image_noise, supersample: as :class:`SyntheticRoom`. Without noise by default: a camera model applied
+            to the image adds its own.
 
     Raises:
-        ValueError: no view, or an option that :class:`SyntheticRoom` does not take.
+        ValueError: ``n`` below 1, or an option that :class:`SyntheticRoom` rejects.
     """
     if n < 1:
         raise ValueError(f"viewpoints: n is {n}, expected at least 1")
@@ -61,7 +61,7 @@ def open_viewpoints(
 
 
 def _draw_pose(room: int, camera: Camera, hw: tuple[int, int], draw: Random) -> Pose:
-    """A place with some air around it, and a direction: ``T_world_from_cam`` (1), float64."""
+    """A random pose away from near surfaces: ``T_world_from_cam`` (1), float64."""
     solids = furnished_room(room).solids
     small = (24, 32)
     camera = resize(camera, hw, small)

@@ -268,7 +268,7 @@ def broken(path, value):
         (("probability", "score", 1), "0.1", r"mine\.json\.probability\.score\.1: found 0\.1, expected a finite"),
         (("expected_error", "score"), [], r"mine\.json\.expected_error\.score: found \[\], expected a list"),
         (("sigmoid", "slope"), True, r"mine\.json\.sigmoid\.slope: found true"),
-        (("sigma", "floor"), -1, r"mine\.json\.sigma\.floor: found -1, expected no negative"),
+        (("sigma", "floor"), -1, r"mine\.json\.sigma\.floor: found -1, expected a number of at least 0"),
         (("sigma", "scale"), 10**400, r"mine\.json\.sigma\.scale: found 1000"),
         (("probability", "score", 1), 0.0, r"mine\.json\.probability\.score: found \[0\.0, 0\.0, .*expected rising"),
         (("thresholds", "100"), 0.5, r"mine\.json\.thresholds\.100: found 100, expected a whole number"),

@@ -1,4 +1,4 @@
-"""``dhtorch reference``: maps in other units written in metres, frames that are whole stay, limits decide the exit code."""
+"""``dhtorch align``: maps in other units written in metres, frames that are whole stay, limits decide the exit code."""
 
 import json
 
@@ -30,13 +30,13 @@ def maps(tmp_path_factory, room):
 
 def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     out = tmp_path / "out"
-    asked = ["anchor", *ROOM, *LITTLE, f"depth={maps}", f"out={out}", "kind=inverse", 'fail_on="silent>0.9"']
+    asked = ["align", *ROOM, *LITTLE, f"depth={maps}", f"out={out}", "kind=inverse", 'fail_on="silent>0.9"']
     assert run.main(asked) == run.EXIT_DONE
     assert "2 maps" in capsys.readouterr().out
     found = json.loads((out / "align.json").read_text())
     assert [row["frame"] for row in found["frames"]] == [0, 3]
-    assert found["whole"]["held"]["unanchored"] == 0
-    for row in (frame["anchored"] for frame in found["frames"]):
+    assert found["whole"]["held"]["unaligned"] == 0
+    for row in (frame["aligned"] for frame in found["frames"]):
         assert 0 <= row["probability"] <= row["likeliest_probability"] <= 1
         assert (row["probability"] == row["likeliest_probability"]) == (row["model"] == row["likeliest"])
     again = data.open(out)
@@ -60,7 +60,7 @@ def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
     for k in range(len(room)):
         np.save(tmp_path / f"{k:04d}.npy", 1.5 * room.truth(k)["depth"][0].numpy())
     words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "most=1", 'fail_on="scale>0.2,silent>0.99"']
-    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.EXIT_SOME_FAILED
+    assert run.main(["align", *ROOM, *LITTLE, *words]) == run.EXIT_SOME_FAILED
     assert "exceeded: scale is 0.33" in capsys.readouterr().out
     assert "Exceeded" in (tmp_path / "out" / "align.html").read_text()
 
@@ -70,8 +70,8 @@ def test_a_hole_in_a_file_is_no_value_of_any_kind_and_a_sensor_beside_itself_is_
         depth = room[k].depth[0].numpy()
         np.save(tmp_path / f"{k:04d}.npy", np.where(np.arange(128) < 20, 0, depth))
     words = [f"depth={tmp_path}", "most=1", "kind=affine"]
-    assert run.main(["anchor", *ROOM, *LITTLE[:1], *words, f"out={tmp_path / 'out'}"]) == run.EXIT_DONE
-    assert "of one sensor" in capsys.readouterr().out
+    assert run.main(["align", *ROOM, *LITTLE[:1], *words, f"out={tmp_path / 'out'}"]) == run.EXIT_DONE
+    assert "from one sensor" in capsys.readouterr().out
     depth = data.open(tmp_path / "out")[0].depth
     assert (depth[..., :20] == 0).all()
     assert (depth[..., 20:] > 0).double().mean() > 0.5
@@ -89,7 +89,7 @@ def test_a_hole_in_a_file_is_no_value_of_any_kind_and_a_sensor_beside_itself_is_
 )
 def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, maps, capsys):
     words = [f"depth={maps}", f"out={tmp_path / 'out'}", word]
-    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.EXIT_FAILED
+    assert run.main(["align", *ROOM, *LITTLE, *words]) == run.EXIT_FAILED
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert said in lines[0]
@@ -97,7 +97,7 @@ def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, maps, capsys):
 
 def test_limits_of_a_metre_need_a_metre(tmp_path, maps, capsys):
     words = [f"depth={maps}", f"out={tmp_path / 'out'}", "kind=inverse", "fail_on='scale>0.1'"]
-    assert run.main(["anchor", *ROOM, *LITTLE, *words]) == run.EXIT_FAILED
+    assert run.main(["align", *ROOM, *LITTLE, *words]) == run.EXIT_FAILED
     assert "expected kind=metric" in capsys.readouterr().err
 
 

@@ -178,7 +178,7 @@ def test_figure_and_points_are_of_the_first_frame(room, numbered):
 
 def test_a_tum_sequence_stays_one_with_its_own_step_and_stamps(captures, tmp_path):
     out = said(captures / "stamped", tmp_path / "maps", every=2)
-    assert "2 frames of 160x120" in out and "0.2 mm reach 13.1 m" in out
+    assert "2 frames of 160x120" in out and "0.2 mm, up to 13.1 m" in out
     there, back = data.open(captures / "stamped"), data.open(tmp_path / "maps")
     assert back.format == "tum" and torch.equal(back.times, there.times[::2])
     assert torch.equal(back[1].image, there[2].image) and torch.allclose(back.poses.t, there.poses.t[::2], atol=1e-9)
@@ -217,14 +217,14 @@ def test_steps_never_clip_and_never_wrap():
     assert steps.sigma[0].tolist() == [0, 1, 50, 50, 0, 0, 0, 0, 0, 0], "no sigma is 0"
     assert steps.source[0].tolist() == [0, 3, 3, 3, 0, 0, 0, 0, 0, 0]
     assert steps.unfit[0].tolist() == [True, False, False, False, True, True, True, False, True, True]
-    with pytest.raises(ValueError, match=r"\(1, 10\), \(1, 10\), \(10,\), expected three alike"):
+    with pytest.raises(ValueError, match=r"\(1, 10\), \(1, 10\), \(10,\), expected equal shapes"):
         export.quantise_depth(depth, sigma, source[0], 0.001)
 
 
 def test_what_does_not_fit_is_silent_counted_and_said(captures, tmp_path):
     out = said(captures / "numbered", tmp_path / "maps", most=1, unit=0.00005)
     row = storage.parse_strict_json((tmp_path / "maps" / "meta" / "000000.json").read_text())
-    assert row["silent"]["unfit"] > 0.01 and "do not fit" in out and "reach 3.3 m" in out
+    assert row["silent"]["unfit"] > 0.01 and "are beyond it" in out and "up to 3.3 m" in out
     back = data.open(tmp_path / "maps")[0].depth
     assert float(back.max()) <= 3.2768 and (back > NEAR).any()
     assert row["pixels"]["none"] / back.numel() == pytest.approx(sum(row["silent"].values()))
@@ -279,7 +279,9 @@ def test_ctrl_c_leaves_whole_frames_and_a_recording_of_them(captures, tmp_path):
         raise KeyboardInterrupt
 
     (tmp_path / ".complete.json.abc.tmp").write_bytes(b"half")  # killed while the first file was written
-    with pytest.raises(KeyboardInterrupt, match=r"1 of 4 frames in .* are whole and stay; the same command does the"):
+    with pytest.raises(
+        KeyboardInterrupt, match=r"1 of 4 frames in .* are complete and kept; run the same command again"
+    ):
         said(captures / "numbered", tmp_path, stopped)
     assert len(data.open(tmp_path)) == 1
     before = stamps(tmp_path)
@@ -304,7 +306,7 @@ def test_a_stopped_process_loses_the_frame_that_was_being_made(captures, tmp_pat
     assert 1 <= len(there) < 4
     if stop == signal.SIGINT:
         assert process.returncode == 130 and len(err.strip().splitlines()) == 1, err
-        assert f"{len(there)} of 4 frames" in err and "the same command does the rest" in err
+        assert f"{len(there)} of 4 frames" in err and "run the same command again for the rest" in err
         assert len(data.open(out)) == len(there), "a recording even so"
     before = stamps(out)
     assert run.main(words) == 0
@@ -338,7 +340,7 @@ def test_other_settings_data_or_files_are_refused(captures, numbered, tmp_path):
         ({"every": -1}, "every: found -1"),
         ({"format": "zip"}, "format: found 'zip', expected one of auto, frames, tum, stray, png"),
         ({"format": "tum"}, "format=tum: numbered has no time stamps"),
-        ({"format": "stray"}, "numbered is frames_dir, no Stray"),
+        ({"format": "stray"}, "numbered is a frames_dir recording, not a Stray"),
         ({"unit": 0}, "unit: found 0"),
         ({"unit": 1}, "unit: found 1"),
         ({"cutoff": -2}, "cutoff: found -2"),
@@ -382,7 +384,7 @@ def test_a_broken_frame_ends_it_and_the_others_stay(captures, tmp_path):
 def test_a_frame_alone_gets_the_sensor_and_maps_without_poses_are_maps_alone(room, tmp_path):
     one = Recording("one", "made", room.load, room.number[:1])
     out = said([one], tmp_path)
-    assert "1 frame of 160x120" in out and "maps alone" in out
+    assert "1 frame of 160x120" in out and "maps only" in out
     source = pixels(tmp_path / "source" / "000000.png")
     depth = room[0].depth[0].numpy()
     assert np.array_equal(source == Source.SENSOR, (depth > 0) & (depth <= NEAR)) and set(np.unique(source)) == {0, 1}

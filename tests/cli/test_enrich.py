@@ -163,10 +163,10 @@ def test_other_options_and_other_folders_are_refused(robot, enriched, tmp_path, 
     assert main(["enrich", str(robot), str(enriched), *ASKED, "step=0"]) == 2
     assert "step 0.0009765625 there, 0 here" in capsys.readouterr().err
     assert main(["enrich", str(robot), str(robot / "new"), *ASKED]) == 2
-    assert "only read" in capsys.readouterr().err and not (robot / "new").exists()
+    assert "never written to" in capsys.readouterr().err and not (robot / "new").exists()
     (tmp_path / "note.txt").write_text("mine")
     assert main(["enrich", str(robot), str(tmp_path), *ASKED]) == 2
-    assert "something else" in capsys.readouterr().err and [p.name for p in tmp_path.iterdir()] == ["note.txt"]
+    assert "with other files" in capsys.readouterr().err and [p.name for p in tmp_path.iterdir()] == ["note.txt"]
 
 
 def test_an_older_set_becomes_one_of_today_and_its_numbers_stay_beside(shots, tmp_path):
@@ -216,7 +216,7 @@ def test_a_recording_becomes_a_set_and_a_nerfstudio_folder(tmp_path, capsys):
     pose = np.array(found[1]["observation.camera.T_world_from_cam"]).reshape(4, 4)
     assert np.allclose(np.array(about["frames"][1]["transform_matrix"]) @ np.diag([1, -1, -1, 1]), pose)
     assert main(["enrich", "out=" + str(tmp_path / "x"), "data=synthetic", "format=same", *ASKED]) == 2
-    assert "no writer" in capsys.readouterr().err
+    assert "cannot write" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("kind", ["stray", "record3d", "frames_dir", "rlds"])
@@ -232,7 +232,7 @@ def test_a_format_that_nothing_writes_is_refused_in_a_line(kind, shots, tmp_path
     assert main(["enrich", str(source), str(out), *ASKED, "format=same"]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and not out.exists()
-    assert said.startswith(f"dhtorch: format=same: found {kind}, which has no writer here; expected lerobot, ")
+    assert said.startswith(f"dhtorch: format=same: found {kind}, which dhtorch cannot write; expected lerobot, ")
 
 
 def test_every_format_that_is_read_was_written_in_every_format_or_refused():

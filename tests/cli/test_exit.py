@@ -77,10 +77,10 @@ def test_an_ignored_signal_stays_ignored() -> None:
 
 _PARENT = """
 import multiprocessing, sys, time
-from dhtorch.runtime.parent_watch import follow_parent
+from dhtorch.runtime.parent_watch import exit_with_parent
 def work():
-    follow_parent()
-    follow_parent()
+    exit_with_parent()
+    exit_with_parent()
     print(multiprocessing.current_process().pid, flush=True)
     time.sleep(60)
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def test_options_of_the_reader_that_is_recognised_are_options(command, monkeypat
     monkeypatch.setattr(importlib.import_module(module), "run", run)
     code, _, err = command(*typed, "data.register=false")
     assert code != 0 and "seen" in err and asked == [(False, True)]
-    if module.endswith("recover"):  # opens the capture itself
+    if module.endswith("process_capture"):  # opens the capture itself
         monkeypatch.undo()
         monkeypatch.chdir(tmp_path)
     code, _, err = command(*typed, "data.camera=front")

@@ -227,17 +227,21 @@ def stopping(function, after):
 def test_ctrl_c_leaves_the_sheets_that_are_written(command, frames, monkeypatch):
     monkeypatch.setattr(capture, "write_contact_sheet", stopping(capture.write_contact_sheet, 1))
     code, out, err = command("inspect", str(frames), "--out", "sheets")
-    assert code == 130 and "1 contact sheet in sheets stay" in err and len(err.strip().splitlines()) == 1
+    assert code == 130 and "1 contact sheet in sheets kept" in err and len(err.strip().splitlines()) == 1
     assert [p.name for p in Path("sheets").iterdir()] == [re.search(r"sheets/(\S+png)", out)[1]]
 
 
 @pytest.mark.parametrize(
-    ("words", "module"), [(["report", "job", "--html", "out.html"], page), (["view", "job", "html=out.html"], html)]
+    ("words", "module", "name"),
+    [
+        (["report", "job", "--html", "out.html"], page, "render_report"),
+        (["view", "job", "html=out.html"], html, "build_viewer_page"),
+    ],
 )
-def test_ctrl_c_keeps_the_old_page(command, monkeypatch, said, words, module):
+def test_ctrl_c_keeps_the_old_page(command, monkeypatch, said, words, module, name):
     Path("job").symlink_to(said[0] / "job")
     Path("out.html").write_text("the old one", encoding="utf-8")
-    monkeypatch.setattr(module, "page", stopping(module.page, 0))
+    monkeypatch.setattr(module, name, stopping(getattr(module, name), 0))
     code, _, err = command(*words)
     assert code == 130 and "interrupted" in err and "Traceback" not in err
     assert Path("out.html").read_text(encoding="utf-8") == "the old one" and len(list(Path().glob("*out*"))) == 1

@@ -50,9 +50,9 @@ def test_the_page_begins_with_the_numbers_and_the_picture(made):
     rows = [json.loads(p.read_text()) for p in (made / "meta").iterdir()]
     pixels = sum(row["pixels"]["swept"] for row in rows) / len(rows)
     opening = page[page.index('<section id="opening"') : page.index("<main>")]
-    assert f"<dd>{pixels:,.0f}</dd>" in opening and "Median stated error" in opening
+    assert f"<dd>{pixels:,.0f}</dd>" in opening and "Median sigma / depth" in opening
     assert base64.b64encode((made / "overview.png").read_bytes()).decode() in opening
-    assert "Recovered " in opening and "Silent, most often: " in opening and "no_track" not in opening
+    assert "Recovered " in opening and "Most frequent reasons for no answer: " in opening and "no_track" not in opening
     assert "kitchen, frame" in opening and ", with frame" in opening, "whose picture, and of which views"
 
 
@@ -60,16 +60,16 @@ def test_it_says_what_it_is_what_was_recovered_and_what_to_do_next(capture, made
     before = {p: p.stat().st_mtime_ns for p in (made / "meta").iterdir()}
     assert main(["recover", str(capture), f"out={made}", *SMALL]) == 0
     what, found, then, wrote = capsys.readouterr().out.strip().splitlines()
-    assert what.startswith("kitchen: a frames_dir capture, 3 frames of 160x120; the sensor answers")
-    assert found.startswith("Recovered ") and " pixels a frame that the sensor lacks, from " in found
+    assert what.startswith("kitchen: a frames_dir capture, 3 frames of 160x120; the sensor has depth at")
+    assert found.startswith("Recovered ") and " pixels per frame without sensor depth, from " in found
     assert then.startswith("Next: ") and str(made) in wrote
-    assert {p: p.stat().st_mtime_ns for p in (made / "meta").iterdir()} == before, "whole frames stay"
+    assert {p: p.stat().st_mtime_ns for p in (made / "meta").iterdir()} == before, "complete frames are kept"
 
 
 def test_the_beginning_is_made_where_time_is_short_and_said_again_it_goes_on(capture, tmp_path, capsys):
     words = [str(capture), f"out={tmp_path / 'x'}", *SMALL]
     assert main([*words, "minutes=1e-6"]) == 0
-    assert "does more of the 2 frames left" in capsys.readouterr().out
+    assert "for the 2 frames left" in capsys.readouterr().out
     assert [p.stem for p in (tmp_path / "x/meta").iterdir()] == ["000001"], "the middle comes first"
     assert main([*words, "minutes=1e-6"]) == 0
     assert main([*words, "minutes=null"]) == 0
@@ -100,7 +100,7 @@ def test_one_capture_that_cannot_be_opened_does_not_stop_the_others(capture, tmp
     shutil.copytree(capture, tmp_path / "both" / "kitchen")
     assert main([str(tmp_path / "both"), f"out={tmp_path / 'out'}", "minutes=0.01", *SMALL]) == 0
     said = capsys.readouterr().out
-    assert "kitchen" in said and "alone: depth only" in said and (tmp_path / "out/overview.png").is_file()
+    assert "kitchen" in said and "alone: depth without images" in said and (tmp_path / "out/overview.png").is_file()
 
 
 def test_what_cannot_work_is_one_sentence(capture, tmp_path, capsys):
@@ -112,12 +112,12 @@ def test_what_cannot_work_is_one_sentence(capture, tmp_path, capsys):
     assert "one frame" in refusal([single], capsys)
     (tmp_path / "empty").mkdir()
     assert "found an empty folder" in refusal([tmp_path / "empty"], capsys)
-    assert "lies in the capture" in refusal([capture, f"out={capture}/out"], capsys)
+    assert "is inside the capture" in refusal([capture, f"out={capture}/out"], capsys)
     assert refusal([capture, "minutes=-1"], capsys).startswith("dhtorch: minutes: found -1, expected")
     alone = tmp_path / "alone"
     room = SyntheticRoom(hw=(48, 64), n_frames=3)
     writers.write_stray(alone, list(room), video=False)
-    assert "depth only" in refusal([alone], capsys)
+    assert "depth without images" in refusal([alone], capsys)
 
 
 @pytest.mark.parametrize("n", [1, 2, 7, 40])

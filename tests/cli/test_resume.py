@@ -191,7 +191,7 @@ def test_a_broken_launcher_says_how_to_go_on(command, monkeypatch):
     monkeypatch.setattr("hydra._internal.hydra.Hydra.multirun", die)
     code, out, err = command("-m", *TINY, "seed=0,1")
     assert code == 1 and out == "" and "a worker process was killed" in err
-    assert "What is finished stays. To do the rest:\n  dhtorch " in err
+    assert "Finished jobs are kept. To run the rest:\n  dhtorch " in err
     words = shlex.split(err.strip().splitlines()[-1])
     assert {"-m", "resume=true", "seed=0,1", *TINY} <= set(words) and any(w.startswith("output=") for w in words)
 

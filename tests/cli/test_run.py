@@ -165,7 +165,7 @@ def test_pairs_by_time_and_by_baseline(command, tmp_path, pairs):
 
 def test_dropped_pairs_are_said(command):
     code, out, _ = command(*TINY, "figures=false", "method.n=64")
-    assert code == 0 and "1 pair dropped" in out and "fewer than 20 candidates" in out
+    assert code == 0 and "1 pair skipped" in out and "fewer than 20 candidate samples" in out
 
 
 def test_a_traceback_is_shown_when_asked_for(command):

@@ -48,14 +48,14 @@ def maps(tmp_path, room):
     return tmp_path
 
 
-def judged(out, *words, capsys=None):
-    code = run.main(["judge", *ROOM, *LITTLE, f"output={out}", *words])
+def validated(out, *words, capsys=None):
+    code = run.main(["validate", *ROOM, *LITTLE, f"output={out}", *words])
     return code, json.loads((out / "validate.json").read_text())
 
 
 def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
     out = tmp_path / "out"
-    code, found = judged(out, f"depth={maps}", "depth_unit=mm", 'fail_on="scale>0.5,unknown>1"')
+    code, found = validated(out, f"depth={maps}", "depth_unit=mm", 'fail_on="scale>0.5,unknown>1"')
     assert code == run.EXIT_SOME_FAILED, "metres read as millimetres"
     assert len(found["exceeded"]) == 1
     assert found["whole"]["held"]["scale"] == pytest.approx(0.999, abs=0.002)
@@ -63,7 +63,7 @@ def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
     page = (out / "validate.html").read_text()
     assert page.count("data:image/png;base64,") == 2
     assert "Exceeded: scale" in page
-    code, found = judged(out, f"depth={maps}", 'fail_on="scale>0.5"', "pictures=0", "views=false")
+    code, found = validated(out, f"depth={maps}", 'fail_on="scale>0.5"', "pictures=0", "views=false")
     assert code == run.EXIT_DONE
     assert found["exceeded"] == []
     assert "data:image" not in (out / "validate.html").read_text()
@@ -74,10 +74,10 @@ def test_a_guessed_camera_is_told_on_the_page_and_one_frame_is_one(tmp_path, roo
     writers.write_counted_frames(capture, [room[0], room[3]])
     (capture / "K.txt").unlink()
     words = ["data=frames_dir", f"data.root={capture}", "data.fov=60", *LITTLE, "most=1", f"output={tmp_path / 'out'}"]
-    assert run.main(["judge", *words]) == run.EXIT_DONE
+    assert run.main(["validate", *words]) == run.EXIT_DONE
     page = (tmp_path / "out/validate.html").read_text()
     assert "<p>Its intrinsics are a guess from a field of view of 60°" in page
-    assert "capture: 1 frame: " in page and "known, of the depth" in page
+    assert "capture: 1 frame: " in page and "checked, of depth" in page
     assert "60°" in json.loads((tmp_path / "out/validate.json").read_text())["intrinsics_guessed"]
 
 
@@ -93,7 +93,7 @@ def test_a_guessed_camera_is_told_on_the_page_and_one_frame_is_one(tmp_path, roo
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(word, said, tmp_path, capsys):
-    assert run.main(["judge", *ROOM, *LITTLE, f"output={tmp_path}", word]) == run.EXIT_FAILED
+    assert run.main(["validate", *ROOM, *LITTLE, f"output={tmp_path}", word]) == run.EXIT_FAILED
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert said in lines[0]
@@ -103,12 +103,12 @@ def test_a_single_frame_exceeds_a_limit_by_its_bound_alone(tmp_path, maps):
     for file in maps.glob("*.npy"):
         np.save(file, 1.1 * np.load(file))
     out = tmp_path / "out"
-    code, found = judged(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.05,wrong>0.9"')
+    code, found = validated(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.05,wrong>0.9"')
     scale = found["frames"][0]["scale"]
     assert code == run.EXIT_SOME_FAILED
     assert found["whole"]["held"]["scale"] == pytest.approx(scale["low"] - 1)
     assert scale["low"] - 1 < 0.099 < scale["value"] - 1 + 0.01
-    code, _ = judged(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.097"')
+    code, _ = validated(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.097"')
     assert code == run.EXIT_DONE, "the value is more, its interval is not"
     assert found["intrinsics_guessed"] is None
 
@@ -139,7 +139,7 @@ def test_bounds_of_a_recording():
 def test_maps_that_are_cut_are_told(tmp_path, maps, room):
     for file in maps.glob("*.npy"):
         np.save(file, np.minimum(np.load(file), np.float32(2.55)))
-    code, found = judged(tmp_path / "out", f"depth={maps}", "window=6", "every=2", "most=3", "method.n=512")
+    code, found = validated(tmp_path / "out", f"depth={maps}", "window=6", "every=2", "most=3", "method.n=512")
     assert code == run.EXIT_DONE
     assert [row["clip_depth"] for row in found["frames"]] == pytest.approx([2.55] * 3)
     assert [(row["cause"], row["kind"]) for row in found["windows"]] == [("cut at 2.55 m", "cut")]
@@ -147,7 +147,7 @@ def test_maps_that_are_cut_are_told(tmp_path, maps, room):
         found["whole"]["clip_depth"] == pytest.approx(2.55) and "2.55" in (tmp_path / "out/validate.html").read_text()
     )
     unnamed = _format_summary("room", found["whole"] | {"causes": {}})
-    assert unnamed[-1] == "  cut at 2.55 m: what is farther is said to lie there"
+    assert unnamed[-1] == "  cut at 2.55 m: larger depths are set to this value"
     assert not any("farther" in line for line in _format_summary("room", found["whole"])), "said once"
     assert _find_shared_clip_depth([{"clip_depth": 2.55}, {"clip_depth": None}]) is None, "not most of them"
     assert _find_shared_clip_depth([{"clip_depth": 2.55}, {"clip_depth": 3.0}]) is None, "not at one depth"
@@ -159,7 +159,7 @@ def test_a_guessed_field_of_view_is_told(tmp_path, room):
             (tmp_path / "capture" / name).mkdir(parents=True, exist_ok=True)
             array = picture.permute(1, 2, 0).numpy() if name == "rgb" else picture.numpy()
             (tmp_path / "capture" / name / f"{k}.png").write_bytes(encode_png(np.ascontiguousarray(array)))
-    words = ["judge", str(tmp_path / "capture"), "data.fov=60", "method.n=256", "size=96", "window=0", "most=1"]
+    words = ["validate", str(tmp_path / "capture"), "data.fov=60", "method.n=256", "size=96", "window=0", "most=1"]
     with pytest.warns(UserWarning, match="intrinsics are a guess"):
         assert run.main([*words, f"output={tmp_path}"]) == run.EXIT_DONE
     told = json.loads((tmp_path / "validate.json").read_text())["intrinsics_guessed"]
@@ -247,9 +247,11 @@ def test_files_are_matched_by_number_else_in_order_and_never_by_halves(tmp_path,
 
 def test_a_map_is_laid_over_the_whole_picture(tmp_path, room):
     h, w = room[0].hw
-    with pytest.raises(FormatError, match=rf"a map of {h}x{w}, expected one over the field of view of its image, {w}x{h}"):
+    with pytest.raises(
+        FormatError, match=rf"a map of {h}x{w}, expected one over the field of view of its image, {w}x{h}"
+    ):
         open_depth_maps(folder_of(tmp_path / "upright", ["0"], (w, h)), room)[0]
-    with pytest.warns(UserWarning, match="maps of 64x64 are taken to be stretched"):
+    with pytest.warns(UserWarning, match="maps of 64x64 are stretched"):
         assert open_depth_maps(folder_of(tmp_path / "square", ["0"], (64, 64)), room)[0].shape == (1, 64, 64)
 
 
@@ -309,9 +311,23 @@ def test_options_of_the_transform_that_cannot_be():
 
 def test_a_study_counts_what_was_planted():
     rows = [
-        {"scene": "a", "pair": None, "method": "judge", "role": None, "judge.scale_found": 1.0, "judge.known": 0.5},
-        {"scene": "b", "pair": None, "method": "judge", "role": None, "judge.scale_found": 0.5, "judge.known": None},
-        {"scene": "c", "pair": None, "method": "judge", "role": "rotation", "judge.scale_found": 0.0},
+        {
+            "scene": "a",
+            "pair": None,
+            "method": "validate",
+            "role": None,
+            "validate.scale_found": 1.0,
+            "validate.known": 0.5,
+        },
+        {
+            "scene": "b",
+            "pair": None,
+            "method": "validate",
+            "role": None,
+            "validate.scale_found": 0.5,
+            "validate.known": None,
+        },
+        {"scene": "c", "pair": None, "method": "validate", "role": "rotation", "validate.scale_found": 0.0},
     ]
 
     def window(fault, kind, named, moved):
@@ -321,18 +337,18 @@ def test_a_study_counts_what_was_planted():
     rows += [window("unit_mm", "unit", "unit", 50.0), window("unit_m", "unit", None, 50.0)]
     rows += [window("mirrored", "mirrored", "mirrored", 9.0), window("mirrored", "mirrored", None, 1.0)]
     rows += [window("none", None, None, 0.0), window("none", None, "rolled", 0.0)]
-    found = validate_study.summarise_validation([*rows, {**rows[0], "judge.called_right_wrong": 0.02}])
-    assert found["judge.called_right_wrong_worst"]["value"] == 0.02
+    found = validate_study.summarise_validation([*rows, {**rows[0], "validate.called_right_wrong": 0.02}])
+    assert found["validate.called_right_wrong_worst"]["value"] == 0.02
     found = validate_study.summarise_validation(rows)
-    assert found["judge.scale_found"]["value"] == 0.75
-    assert found["judge.known"]["value"] == 0.5
-    assert found["judge.named.unit"]["value"] == 0.5
-    assert found["judge.named.mirrored"]["value"] == 1.0, "what moves less than two pixels does not count"
-    assert found["judge.named_worst"]["value"] == 0.5
-    assert found["judge.misnamed"]["value"] == 0.5
+    assert found["validate.scale_found"]["value"] == 0.75
+    assert found["validate.known"]["value"] == 0.5
+    assert found["validate.named.unit"]["value"] == 0.5
+    assert found["validate.named.mirrored"]["value"] == 1.0, "what moves less than two pixels does not count"
+    assert found["validate.named_worst"]["value"] == 0.5
+    assert found["validate.misnamed"]["value"] == 0.5
     holds, why = validate_study.verdict(found)
     assert holds is False
-    assert "judge.scale_found 0.750" in why
+    assert "validate.scale_found 0.750" in why
     assert "not measured: " in why
 
 
@@ -349,6 +365,6 @@ def test_the_study_runs_on_a_room(room):
     options = {"reference_views": 1, "windows": 0, "rooms": [], "size": 96}
     found = validate_study.run([room], {"auto": AUTO.replace(n=512)}, None, Settings(cutoff=2.0), **options)
     told = {"called_right_wrong", "called_right_wrong_worst", "called_right_wrong_cut"}
-    assert {f"{who}.{name}" for who in ("judge", "quick", "photometric") for name in told} <= set(found.summary)
-    assert found.summary["judge.scale_found_quick_far"]["n"] <= 1
+    assert {f"{who}.{name}" for who in ("validate", "quick", "photometric") for name in told} <= set(found.summary)
+    assert found.summary["validate.scale_found_quick_far"]["n"] <= 1
     assert found.verdict in ("supported", "refuted", "undecided")

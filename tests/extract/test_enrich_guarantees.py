@@ -339,7 +339,7 @@ def test_the_record_of_an_episode_is_read_once(tmp_path, monkeypatch):
     assert len(opened) <= 2 + columns, "one a column and group at most, not one a step"
 
 
-class Told(NamedTuple):
+class FixedEstimate(NamedTuple):
     """Steps of an episode from given values, as dhtorch.data.readers.rlds_steps.EpisodeSteps has them."""
 
     features: dict[str, StepFeature]
@@ -366,7 +366,7 @@ def test_steps_tell_their_time_their_task_and_how_pictures_are_encoded():
         "observation/image_0": [jpeg, png] * 6,
     }
     tasks = ["place", "reach"]  # of an episode before
-    tables = list(RldsSource([], [0], 5.0, held={0: Told(features, each)}).batches(0, tasks))
+    tables = list(RldsSource([], [0], 5.0, held={0: FixedEstimate(features, each)}).batches(0, tasks))
     found = [row for table in tables for row in table.to_pylist()]
     assert [table.num_rows for table in tables] == [8, 4]
     assert [row["timestamp"] for row in found] == pytest.approx([k / 5 for k in range(12)])

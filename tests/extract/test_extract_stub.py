@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from support.stub_recordings import Load, recording
-from support.stub_samples import N, Stub, Told
+from support.stub_samples import FixedEstimate, N, Stub
 
 pytest.importorskip("pyarrow")
 
@@ -31,7 +31,11 @@ def made(tmp_path, capsys):
 
         asked = {"shard_rows": 4, "tokens_hw": (28, 42), "gap": None, **(options or {})}
         plain = {"data": {"name": "made"}, "method": {"n": 6}, "seed": 0, "workers": 0, "out": str(tmp_path / out)}
-        parts = {"data": recordings, "method": Stub(answer=Told(), n=N), "extract": extract.ExtractOptions(**asked)}
+        parts = {
+            "data": recordings,
+            "method": Stub(answer=FixedEstimate(), n=N),
+            "extract": extract.ExtractOptions(**asked),
+        }
         code = extract.run({**plain, "choices": {"data": "made"}, **settings}, parts, progress=progress)
         return SimpleNamespace(code=code, said=capsys.readouterr().out, shown=shown, folder=tmp_path / out)
 

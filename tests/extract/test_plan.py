@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from support.stub_recordings import Load, P, frame, recording, rows
-from support.stub_samples import H, K, N, Stub, Told, W, added, tiny
+from support.stub_samples import FixedEstimate, H, K, N, Stub, W, added, tiny
 
 from dhtorch import extract
 from dhtorch.extract import columns, plan
@@ -24,7 +24,7 @@ class Seen:
 
     def __call__(self, reference, other, *, n=N, seed=0, trace=None):
         Seen.calls.append((reference, other, seed))
-        return Told()(reference, other, n=n, seed=seed, trace=trace)
+        return FixedEstimate()(reference, other, n=n, seed=seed, trace=trace)
 
 
 @pytest.fixture(autouse=True)
@@ -122,7 +122,7 @@ def test_a_row_says_where_it_belongs():
 
 def test_features_are_those_of_the_transform_in_the_types_of_the_columns():
     one = recording(load=Load(confidence=True))
-    made = rows([one], 1, Told(), seed=4)
+    made = rows([one], 1, FixedEstimate(), seed=4)
     answer = made[2]
     before, now = frame(1, confidence=True), frame(2, confidence=True)
     given = {"image": now.image[0], "before": before.image[0], "depth": now.depth[0], "conf": now.conf[0]}

@@ -16,7 +16,7 @@ glibc = pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C 
 
 ASKED = """
 import resource, sys, torch
-from dhtorch.runtime.allocator import keep_freed
+from dhtorch.runtime.allocator import disable_malloc_trim
 from dhtorch.transforms import one_thread
 
 def faults(mebibytes):
@@ -25,7 +25,7 @@ def faults(mebibytes):
     del blocks
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
-asked = {"nothing": lambda: None, "keep": keep_freed, "worker": one_thread}[sys.argv[1]]()
+asked = {"nothing": lambda: None, "keep": disable_malloc_trim, "worker": one_thread}[sys.argv[1]]()
 for size in (1, 8, 64):
     faults(size)
 print(asked, *(faults(size) for size in (1, 8, 64)))

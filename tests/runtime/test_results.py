@@ -365,7 +365,9 @@ def test_only_experiments_have_a_question(experiment):
     else:
         assert result(experiment=experiment)["verdict"] is None
         for name, text in asked.items():
-            with pytest.raises(ValueError, match=rf"^result\.{name}: found '{text}', expected null for this experiment"):
+            with pytest.raises(
+                ValueError, match=rf"^result\.{name}: found '{text}', expected null for this experiment"
+            ):
                 result(experiment=experiment, **{name: text})
 
 

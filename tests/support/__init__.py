@@ -1,1 +1,1 @@
-"""Scenes, samples, stubs and reference implementations that several tests use."""
+"""Scenes, samples, captures, stubs and reference implementations that several test modules use."""

@@ -1,4 +1,4 @@
-"""Small worlds of textured boards seen by two cameras, with exact depth: what a dense map must get right, or leave."""
+"""Scenes of textured boards seen by two cameras, with exact depth, for tests of dense maps."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ class Board:
     seed: int = 0
 
     def colour(self, x, y):
-        """Grey value in [0, 1] of its points."""
+        """Grey values in [0, 1] at points (x, y) of the board."""
         if self.plain:
             return torch.full_like(x, 0.5)
         if self.stripes:
@@ -45,7 +45,7 @@ def _paint(seed):
 
 
 def look(boards, t, *, hw=(120, 160), f=140.0, angle=(0.0, 0.0, 0.0)):
-    """The frame of a camera at ``t`` (m, world), turned by ``angle`` (rad), with exact depth; and which board is seen."""
+    """(frame with exact depth of a camera at ``t`` (m) turned by ``angle`` (rad), index of the board in each pixel)."""
     h, w = hw
     camera = Camera(torch.tensor([[f, f]]), torch.tensor([[w / 2 - 0.5, h / 2 - 0.5]]))
     T = se3.exp(torch.tensor([[*angle, 0.0, 0.0, 0.0]]))

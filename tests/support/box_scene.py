@@ -1,4 +1,4 @@
-"""A box seen from inside: a scene whose every pixel is known to the last digit, for the tests of the readers."""
+"""Frames of a box seen from inside, with exact depth and pose, for the tests of the readers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CAMERA = Camera(torch.tensor([[61.5, 58.25]]), torch.tensor([[33.5, 21.75]]))  #
 def render(
     camera: Camera, T: Pose, hw: tuple[int, int], time: float = 0.0, depth_camera: Camera | None = None
 ) -> Frame:
-    """What a camera at ``T`` inside the box sees; depth exact to float32."""
+    """The frame of a camera at ``T`` inside the box; depth is exact to float32."""
     xyz, _ = hit(camera, T, hw)
     tone = [torch.sin(3 * xyz[..., 0] + 1), torch.sin(4 * xyz[..., 1] - xyz[..., 0]), torch.sin(5 * xyz[..., 2])]
     image = ((torch.stack(tone) * 0.5 + 0.5) * 255).round().to(torch.uint8)
@@ -30,6 +30,7 @@ def render(
 
 
 def hit(camera: Camera, T: Pose, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """(world points (H, W, 3), depth (H, W)) where the rays of all pixels meet the box, float64."""
     v, u = torch.meshgrid(torch.arange(hw[0]), torch.arange(hw[1]), indexing="ij")
     uv = torch.stack((u, v), -1).reshape(1, -1, 2).double()
     ray = se3.rotate(T.R, cameras.rays(camera.to(torch.float64), uv))[0]
@@ -38,7 +39,7 @@ def hit(camera: Camera, T: Pose, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
 
 
 def pose(i: float, offset: float = 0.0) -> Pose:
-    """A path with every rotation axis in it."""
+    """Pose ``i`` of a path that rotates about all three axes."""
     xi = torch.tensor(
         [[0.25 - 0.03 * i + offset, 0.7 + 0.05 * i, -0.4 + 0.04 * i, 0.3 * math.sin(i), 0.1 * i, -0.2 + 0.08 * i]]
     )
@@ -46,6 +47,7 @@ def pose(i: float, offset: float = 0.0) -> Pose:
 
 
 def walk(n: int = 4, camera: Camera = CAMERA, hw: tuple[int, int] = HW, **options: Camera) -> list[Frame]:
+    """The first ``n`` frames of that path at 30 Hz."""
     return [render(camera, pose(i), hw, 100 + i / 30, **options) for i in range(n)]
 
 
@@ -55,6 +57,7 @@ def off_wall(xyz: Tensor) -> Tensor:
 
 
 def world_points(frame: Frame) -> Tensor:
+    """World points (1, P, 3) of all returns of a frame."""
     v, u = torch.nonzero(frame.depth[0] > 0, as_tuple=True)
     uv = torch.stack((u, v), -1).double()[None]
     camera = (frame.depth_camera or frame.camera).to(torch.float64)
@@ -62,12 +65,12 @@ def world_points(frame: Frame) -> Tensor:
 
 
 def own_camera(frame: Frame) -> Frame:
-    """The same with the depth map's camera spelt out."""
+    """The frame with the camera of its depth map stated."""
     return frame.replace(depth_camera=cameras.resize(frame.camera, frame.hw, tuple(frame.depth.shape[-2:])))
 
 
 def turned_over(frame: Frame) -> Frame:
-    """The frame with the axes of its camera mistaken (GL for ours), so that a check shows that it can tell."""
+    """The frame with wrong camera axes (OpenGL for OpenCV), which a check of poses must detect."""
     over = torch.diag(torch.tensor([1.0, -1.0, -1.0])).to(frame.T_world_from_cam.R)
     return frame.replace(T_world_from_cam=Pose(frame.T_world_from_cam.R @ over, frame.T_world_from_cam.t))
 
@@ -92,7 +95,7 @@ def disagreement(a: Frame, b: Frame, near: float = math.inf, reach: int = 0) -> 
 
 
 def check_same(got: Recording, frames: list[Frame], step: float) -> None:
-    """K, pose and time as written, depth to half a quantisation step, every point back on its wall."""
+    """Asserts that a recording holds these frames: cameras, poses and pictures equal, depth to half a ``step`` (m)."""
     for i, want in enumerate(frames):
         frame = got[i]
         assert frame.image.dtype == torch.uint8 and frame.depth.dtype == torch.float32

@@ -1,7 +1,7 @@
-"""Damage: functions from one capture to another, as a bad disk, a broken download or somebody hostile would make it.
+"""Random damage of captures: changed bytes, text, archive members and files, as from a bad disk, download or attacker.
 
-A capture is held as ``{relative path: bytes}``. Every choice is drawn from the generator that is given, so a mutant is
-known by its seed, and Hypothesis may choose instead.
+A capture is ``{relative path: bytes}``. Every choice is drawn from the given generator: a seed repeats a mutant, and
+Hypothesis can make the choices instead.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Capture = dict[str, bytes | None]  # None = a folder stands where the file was
 
 
 def mutate(good: Capture, draw: random.Random) -> tuple[str, Capture]:
-    """(what was done, the damaged capture): one file changed, now and then two, or files moved about."""
+    """(description, damaged capture): mostly one file changed, sometimes two, or files removed or exchanged."""
     want = dict(good)
     told = []
     for _ in range(1 if draw.random() < 0.85 else 2):
@@ -40,7 +40,7 @@ def mutate(good: Capture, draw: random.Random) -> tuple[str, Capture]:
 
 
 def _victim(capture: Capture, draw: random.Random) -> str:
-    """Kinds of file are equally likely, so that one table among a hundred pictures gets its share."""
+    """Name of a random file; kinds of file are equally likely, however many files of each there are."""
     kinds: dict[str, list[str]] = {}
     for name, content in sorted(capture.items()):
         if content is not None:
@@ -89,7 +89,7 @@ def _is_text(content: bytes) -> bool:
 
 
 def _at(content: bytes, draw: random.Random) -> int:
-    """Headers are hit as often as all the rest."""
+    """A random position; the first 128 bytes are as likely as all others together."""
     return draw.randrange(min(128, len(content)) if draw.random() < 0.5 else len(content))
 
 
@@ -160,7 +160,7 @@ _WORDS = [
 
 
 def _spans(text: str, draw: random.Random) -> tuple[int, int]:
-    """A word: what stands between separators."""
+    """(start, end) of a random word between separators."""
     at = draw.randrange(len(text)) if text else 0
     low, high = at, at
     while low > 0 and text[low - 1] not in " \t\r\n,;=[]{}()\"'":
@@ -171,7 +171,7 @@ def _spans(text: str, draw: random.Random) -> tuple[int, int]:
 
 
 def _word(content: bytes, name: str, draw: random.Random) -> bytes:
-    """A word replaced by something hostile; a file's name now and then by the way to the intact copy beside."""
+    """A word replaced by a hostile one; a file name sometimes by the path of the intact copy."""
     text = content.decode(errors="replace")
     low, high = _spans(text, draw)
     word = text[low:high]
@@ -180,7 +180,7 @@ def _word(content: bytes, name: str, draw: random.Random) -> bytes:
 
 
 def _lines(content: bytes, name: str, draw: random.Random) -> bytes:
-    """A line gone, twice, at another place, or cut: missing frames and time stamps out of order."""
+    """A line removed, repeated, moved or cut: missing frames and time stamps out of order."""
     lines = content.split(b"\n")
     i, j = draw.randrange(len(lines)), draw.randrange(len(lines))
     way = draw.randrange(5)
@@ -244,7 +244,7 @@ def _json(content: bytes, name: str, draw: random.Random) -> bytes:
 
 
 def _png(content: bytes, name: str, draw: random.Random) -> bytes:
-    """A chunk damaged and its check sum made good again, so that the decoder gets to see it."""
+    """A chunk damaged and its check sum corrected, so that the decoder reads it."""
     chunks, at = [], 8
     while at + 12 <= len(content):
         size = int.from_bytes(content[at : at + 4], "big")
@@ -267,7 +267,7 @@ def _png(content: bytes, name: str, draw: random.Random) -> bytes:
 
 
 def _zip(content: bytes, name: str, draw: random.Random) -> bytes:
-    """A member damaged inside a sound archive, gone, twice, named out of the archive, or a bomb."""
+    """A member of a valid archive damaged, removed, repeated, named outside the archive, or a decompression bomb."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members: Capture = {info.filename: archive.read(info) for info in archive.infolist() if not info.is_dir()}
@@ -285,7 +285,7 @@ def _zip(content: bytes, name: str, draw: random.Random) -> bytes:
 
 
 def _tar(content: bytes, name: str, draw: random.Random) -> bytes:
-    """The same for a tar; also members that are links and devices."""
+    """The same damage in a tar archive; also members that are links and devices."""
     try:
         with tarfile.open(fileobj=io.BytesIO(content)) as archive:
             members: Capture = {m.name: archive.extractfile(m).read() for m in archive.getmembers() if m.isfile()}  # type: ignore[union-attr]
@@ -311,7 +311,7 @@ def _tar(content: bytes, name: str, draw: random.Random) -> bytes:
 
 
 def _member(members: Capture, draw: random.Random) -> str | None:
-    """Damage the members in place; the name of one to be blown up, if any."""
+    """Damages the members in place; returns the name of one to become a bomb, or None."""
     name = _victim(members, draw)
     way = draw.random()
     if way < 0.75:

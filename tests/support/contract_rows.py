@@ -1,7 +1,7 @@
-"""The contract that every public function of geometry, stages and metrics signs, as one table's vocabulary.
+"""Rows of the contract table of public functions in geometry, stages and metrics, and helpers on trees of tensors.
 
-A :class:`Row` says how to make a function's inputs and which promises hold; ``test_contract.py`` holds the rows and
-turns each promise into a test. Leaves are the tensors of records, tuples and dicts, in order.
+A :class:`Row` makes the inputs of a function and lists the promises that hold; ``test_contract.py`` has the rows and a
+test for every promise. Leaves are the tensors of records, tuples and dicts, in order.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree as pytree
 
-#: Operations between numbers: what they make of a mask has to be guessed, where, & and | say it.
+#: Operations between numbers, which are unclear with a mask; ``where``, ``&`` and ``|`` are clear.
 NUMBERS = {
     *("add", "sub", "mul", "div", "pow", "add_", "sub_", "mul_", "div_", "multiply", "true_divide", "rsub"),
     *("__radd__", "__rsub__", "__rmul__", "__rpow__", "__rtruediv__", "matmul", "bmm", "prod"),
@@ -77,7 +77,7 @@ class NoMasksAsNumbers(TorchFunctionMode):
     """Refuses arithmetic with a mask, of a tensor or of Python."""
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
-        """Ask before the call."""
+        """Checks the arguments before the call."""
         masks = [x for x in args if isinstance(x, bool) or (isinstance(x, torch.Tensor) and x.dtype == torch.bool)]
         name = getattr(func, "__name__", "")
         assert not (masks and name in NUMBERS), f"{name} of a mask: choose with torch.where, join with & and |"

@@ -1,12 +1,11 @@
-"""Hostile input: damage a written capture in every way we can think of and read it in a child that may die.
+"""Damages a written capture in many ways and reads every mutant in a child process, with limits and without writing.
 
 ``attack(write, read, tmp_path)`` lets ``write`` make one intact sample, then makes seeded mutants of it. Each one is
 read in a forked child of this (warmed-up) process, under a limit of time and of memory, with no right to write. The
 outcome of a mutant is ``"frames"`` (it read as valid data), ``"FormatError"`` (one line that names file and field) or a
 failure: another exception, a crash, a hang, too much work or memory, a file touched outside the capture, code executed.
 
-What is done to a sample stands in ``mutations``; a mutant is known by its seed alone: ``attack(..., only=17)`` repeats
-mutant 17.
+The damage is that of ``byte_damage``; the number of a mutant determines it: ``attack(..., only=17)`` repeats mutant 17.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ FINE = ("frames", "FormatError")
 
 
 class Outcome(NamedTuple):
-    """What became of one mutant."""
+    """The outcome of reading one mutant."""
 
     kind: str  # "frames", "FormatError", or the kind of failure
     detail: str
@@ -53,7 +52,7 @@ class Outcome(NamedTuple):
 
 
 def read_all(path: Path) -> None:
-    """Open everything at ``path``, decode every frame, truth and stack, hold them against what they promise."""
+    """Opens everything at ``path``, decodes every frame, truth and stack, and checks them."""
     for found in _opened(path):
         truth = getattr(found, "truth", None)
         for i, each in enumerate(found):
@@ -140,7 +139,7 @@ def attack(
 def sample(
     write: Callable[[Path], Path | None], read: Callable[[Path], Any], tmp_path: Path
 ) -> Iterator[tuple[Capture, Callable[[Capture], Outcome]]]:
-    """Write an intact sample; gives it with a function that lays another capture in its place and reads that.
+    """Writes an intact sample; yields it and a function that replaces it by another capture and reads that.
 
     Arguments as of :func:`attack`; for tests that draw their mutants otherwise, such as Hypothesis.
     """

@@ -1,6 +1,6 @@
-"""Near and far tracks written out for the tests: one track at a time, one inverse depth each, matrices inverted whole.
+"""Reference implementation of the reprojection problem of near and far tracks: loops over tracks, dense matrices.
 
-Alphabet: that of ``dhtorch.geometry.reprojection_problem``; ``J`` (2, 9) the derivative of a track's pixel to (rotation,
+Symbols are those of ``dhtorch.geometry.reprojection_problem``; ``J`` (2, 9) the derivative of a track's pixel to (rotation,
 translation, turn), ``s`` (2,) to its inverse depth, ``r`` (2,) px, ``W`` the inverse of its noise's covariance, ``v``
 the variance of the inverse depth. Everything is numpy, float64, of one pair.
 """
@@ -120,7 +120,7 @@ def reduced(found: list[Track], weights: list[float]) -> tuple[np.ndarray, np.nd
 
 
 def problem_of(args: tuple, isotropic: float) -> PoseDepthProblem:
-    """The problem that ``map_pose`` is asked: arguments of the seat → planes, one track at a time."""
+    """Arguments of ``map_pose`` -> its pose problem, one track at a time."""
     samples, seen, camera_0, camera_1, _ = args
     B, N = seen.valid.shape
     out = {k: torch.zeros(B, *s, N, dtype=D) for k, s in (("ray", (3,)), ("uv", (2,)), ("shape", (3,)))}

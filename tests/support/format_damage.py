@@ -1,7 +1,7 @@
-"""Damage that a check sum does not find: a file is taken apart, one thing in it changed, and put together again.
+"""Random damage with valid check sums: a file is decoded, one field of it changed, and encoded again.
 
-``mutations`` changes bytes; here a format's own library, or knowledge of its fields, writes the damaged file, so that
-readers get past the door. Every choice is drawn from the generator that is given.
+``byte_damage`` changes bytes; here the library of a format, or knowledge of its fields, writes the damaged file, and
+readers decode it. Every choice is drawn from the given generator.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import numpy as np
 
 from support import byte_damage as mutations
 
-#: Numbers that a count, a size or a place may be made.
+#: Numbers to replace a count, a size or an offset.
 ODD = (0, 1, 2, 7, 255, 256, 65_535, 65_536, 10**6, 50_000_000, 2**31 - 1, 2**31, 2**32 - 1)
 
 _BOXES = (b"stsz", b"stts", b"ctts", b"stsc", b"stco", b"stss", b"elst", b"tkhd", b"mdhd", b"avc1", b"hdlr", b"trak")
 
 
 def recode(good: mutations.Capture, draw: random.Random) -> tuple[str, mutations.Capture]:
-    """(what was done, the damaged capture); bytes are damaged where nothing is known of a file's format."""
+    """(description, damaged capture); files of an unknown format get damaged bytes."""
     want = dict(good)
     name = mutations._victim(want, draw)
     content = want[name]
@@ -143,7 +143,7 @@ def _jpeg(content: bytes, draw: random.Random) -> bytes:
     return content[:at] + content[at:-2] * draw.choice((2, 50, 1500)) + content[-2:]
 
 
-#: Whether a file is of a format, and how it is put together again.
+#: (whether a file is of a format, how to damage it).
 _WAYS: tuple[tuple[Callable[[bytes], bool], Callable[[bytes, random.Random], bytes]], ...] = (
     (lambda c: c[4:8] == b"ftyp", _mp4),
     (lambda c: c[:4] in (b"II*\0", b"MM\0*"), _tiff),

@@ -1,8 +1,8 @@
-"""``dhtorch enrich`` struck at a chosen moment, again and again, by one process that loads everything once.
+"""Kills ``dhtorch enrich`` at chosen moments and finishes each run, in forks of one process that is loaded once.
 
     python tests/support/kill_enrich.py SRC FOLDER MOMENTS -- OPTION…
 
-First undisturbed into FOLDER/whole, counting what it asks of the file system (files opened to be written, renamed,
+First it runs undisturbed into FOLDER/whole and counts the calls of the file system (files opened for writing, renamed,
 removed, folders made): these are the moments. Then, for each of MOMENTS of them evenly spread (0 = all), a child is
 killed with SIGKILL right before it into FOLDER/<moment>, and another one finishes there. Last, a disk is full: no file
 may grow beyond 2 kB, and then one may. Prints a line of JSON.
@@ -44,7 +44,7 @@ def counted(folder: Path, at: Callable[[int], None]) -> None:
 
 
 def child(work: Callable[[], int]) -> tuple[int, str]:
-    """Exit status (negative: signal) and what was said on the error channel, of work in a process of its own."""
+    """(exit status, stderr) of work in a process of its own; a negative status is a signal."""
     read, write = os.pipe()
     pid = os.fork()
     if pid == 0:

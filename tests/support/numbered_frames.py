@@ -1,4 +1,4 @@
-"""Scenes whose pictures show their own number, and methods whose answers depend on the step from the reference view alone."""
+"""Scenes with the frame number as grey value, and a method whose answers depend on the frame step alone."""
 
 import torch
 
@@ -11,7 +11,7 @@ from dhtorch.pipeline.method import Method
 from dhtorch.records import Estimate, Pose, Tracks
 from dhtorch.stages.sample import regular_grid
 
-#: Step from the reference view → share of the samples that is answered, rightly.
+#: Step from the reference view -> share of the samples with a (correct) answer.
 SHARES = {1: 0.2, 2: 0.5, -2: 0.1, 5: 0.3, -5: 0.4}
 NEAR, FAR = 1.0, 3.0
 
@@ -61,7 +61,7 @@ MAP = Method(
 
 
 def choosing(*steps):
-    """A method that takes the frames so many steps on, in this order."""
+    """A choice of views that takes the frames at these steps, in this order."""
 
     def choose(reference, others, views, *, fit=None):
         found = (others.image.double() - reference.image.double()).mean((2, 3, 4))

@@ -1,4 +1,4 @@
-"""What runs of the paper's experiments need: a method from its configuration, a room of two pairs, outcomes of given rows."""
+"""For the paper's experiments: a configured method, a room of two pairs, outcomes of given rows."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Random pose problems with near and far tracks, and their true solutions: inputs of ``map_pose`` and of the solver below it."""
+"""Random pose problems with near and far tracks and their true solutions, for ``map_pose`` and its solver."""
 
 import math
 
@@ -18,7 +18,7 @@ DRAWS = torch.rand(1, 64, 3, generator=torch.Generator().manual_seed(7), dtype=D
 def map_pose_inputs(
     batch, near=60, far=140, *, noise=0.3, depth=0.01, turn=0.0, baseline=0.1, planar=False, rotation=0.05, seed=0
 ):
-    """Pairs of views with near and far tracks: (arguments of ``map_pose``, true T_1_from_0, true shutter rate, true depths).
+    """(arguments of ``map_pose``, true T_1_from_0, true shutter rate, true depths) of random pairs of views.
 
     ``noise`` px is anisotropic; ``depth`` is the relative noise of the sensor's returns, ``turn`` the deviation of the
     shutter rate; ``planar`` puts the near points on a plane.
@@ -61,7 +61,7 @@ FAR, BEYOND, EPIPOLE, NEARLY, BEHIND, UNUSED = (8, 9, 10), 11, 12, 13, 14, 15
 
 
 def pose_depth_problem(off=0.5, turn=0.02, seed=0):
-    """Two problems of N tracks and their true unknowns: near tracks 0 to 7, far ones after them, ``off`` px of noise each."""
+    """(two problems of N tracks, their true unknowns): tracks 0 to 7 are near, the others far; noise of ``off`` px."""
     g = torch.Generator().manual_seed(seed)
     rand = lambda *s: torch.rand(*s, generator=g, dtype=D)  # noqa: E731
     randn = lambda *s: torch.randn(*s, generator=g, dtype=D)  # noqa: E731

@@ -1,4 +1,4 @@
-"""The command in a process of its own, and signals to it at a chosen moment."""
+"""Starts the command in a process of its own, and sends it a signal at a chosen moment."""
 
 import os
 import signal
@@ -8,14 +8,14 @@ import time
 
 
 def start(folder, *args):
-    """``dhtorch`` with these arguments in a process group of its own, as a shell starts it; it speaks to files."""
+    """Starts ``dhtorch`` with these arguments in its own process group, as a shell does, with output to files."""
     with (folder / "out").open("w") as out, (folder / "err").open("w") as err:
         command = [sys.executable, "-m", "dhtorch", *args]
         return subprocess.Popen(command, cwd=folder, stdout=out, stderr=err, start_new_session=True)
 
 
 def stop(process, finished, n, how):
-    """Send a signal to the whole group as soon as ``n`` files are ``finished()``; returns the exit code."""
+    """Sends a signal to the whole group as soon as ``n`` files are ``finished()``; returns the exit code."""
     try:
         end = time.monotonic() + 150  # on a busy machine a start alone takes long
         while len(finished()) < n and process.poll() is None and time.monotonic() < end:

@@ -1,4 +1,4 @@
-"""Answers drawn at random, with what is true of them."""
+"""Random evaluated points: depths with errors, truth, sigma and scores."""
 
 import numpy as np
 import torch
@@ -7,7 +7,7 @@ from dhtorch.metrics import errors
 
 
 def random_points(n, seed=0, ties=False, silent=0.3):
-    """n answers 30 % off, of which a share is silent; scores of six values where there are ``ties``."""
+    """``n`` points with depth errors of 30 %, a share of them without an answer; ``ties``: only six different scores."""
     g = np.random.default_rng(seed)
     true = g.uniform(2, 6, n)
     depth = true * np.exp(g.normal(0, 0.3, n))

@@ -41,7 +41,7 @@ def r3d_archive(tmp_path: Path, frames: list[Frame] | None = None, **options: An
 
 
 def rgbd_video(tmp_path: Path, n: int = 3, **options: Any) -> tuple[Path, list[Frame]]:
-    """(an RGBD video written in this folder, its frames): depth of 0.2 to 2.7 m, away from the ends of the colour range."""
+    """(an RGBD video written in this folder, its frames); depth of 0.2 to 2.7 m avoids the ends of the colour range."""
     hw = (96, 128)
     camera = cameras.resize(camera_of(0), HW, hw)
     frames = [render(camera, pose(i), hw, i / 30) for i in range(n)]

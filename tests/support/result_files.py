@@ -1,4 +1,4 @@
-"""Result files as every experiment writes them, with made-up numbers: what the report is tested on."""
+"""Result files of every experiment with random numbers, for tests of the report."""
 
 import random
 

@@ -1,4 +1,4 @@
-"""How far points lie from the surfaces of the built-in room, in closed form."""
+"""Exact distance of points from the surfaces of the synthetic room."""
 
 import torch
 
@@ -6,7 +6,7 @@ from dhtorch.synthetic.room import furnished_room
 
 
 def room_distance(xyz):
-    """Distance (P,) of points from the nearest surface of the built-in room, exact."""
+    """World points (P, 3) -> distance (P,) m from the nearest surface of the room, in closed form."""
     solids = furnished_room(2).solids
     best = torch.full((len(xyz),), torch.inf, dtype=torch.float64)
     for k in range(len(solids.each)):

@@ -1,4 +1,4 @@
-"""Built-in rooms that several tests look at: each is rendered once in a process. Nobody changes them."""
+"""Synthetic rooms that tests share, each rendered once in a process and never changed."""
 
 from functools import cache
 
@@ -9,19 +9,19 @@ from dhtorch.synthetic.recording import SyntheticRoom, room_to_scene
 
 @cache
 def room(**options) -> SyntheticRoom:
-    """A room of these options; without antialiasing, which costs four times as much, where they do not ask for it."""
+    """The synthetic room with these options; without antialiasing (four times slower) unless ``supersample`` is given."""
     return SyntheticRoom(**{"supersample": 1, **options})
 
 
 def noted(recording, near=2.0, gap=6) -> Scene:
-    """A recording with the notes of a benchmark; a scene keeps its own."""
+    """The recording as a scene with a near limit (m) and a frame gap; a scene is returned as it is."""
     if isinstance(recording, SyntheticRoom):
         return room_to_scene(recording, near, gap)
     return recording if isinstance(recording, Scene) else Scene(recording, near=near, gap=gap)
 
 
 class Changed(SyntheticRoom):
-    """A room of which the frames or some fields are others."""
+    """A room with its frames changed by a function and some fields replaced."""
 
     def __init__(self, room, change=lambda frame: frame, **fields):
         self.__dict__.update(room.__dict__, **fields)
@@ -32,5 +32,5 @@ class Changed(SyntheticRoom):
 
 
 def untold(room) -> Recording:
-    """A room that does not know what is really there."""
+    """The recording of a room without its truth."""
     return Recording(name=room.name, format="made", load=room.__getitem__, number=room.number, poses=room.poses)

@@ -1,4 +1,4 @@
-"""A small data set of the synthetic room, as sample dicts: module level, so that spawned workers can import it."""
+"""A small data set of the synthetic room as sample dicts; at module level, so that spawned workers can import it."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Frames of a walk inside the box as Stray Scanner stores them: 60 Hz, a small depth map, confidence, a camera per frame."""
+"""Frames of a walk inside the box as in Stray Scanner captures: 60 Hz, small depth maps, a camera per frame."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def camera_of(i: int) -> Camera:
 
 
 def walk(n: int = 4, place: Callable[[int], Pose] = pose) -> list[Frame]:
-    """``n`` frames with a smaller depth map, confidence and poses; times (s) of a phone that was started three days ago."""
+    """``n`` frames with a smaller depth map, confidence and poses; times count from a phone's start three days ago."""
     frames = []
     for i in range(n):
         camera = camera_of(i)

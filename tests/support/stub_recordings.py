@@ -1,4 +1,4 @@
-"""Recordings of a few pixels with random pictures and depth, frames that cannot be decoded, and the rows extracted from them."""
+"""Recordings of a few pixels with random pictures and depth, some of them damaged, and the rows of their extraction."""
 
 import torch
 
@@ -6,7 +6,7 @@ from dhtorch.data import Recording, Scene
 from dhtorch.extract import columns, plan
 from dhtorch.extract.dataset import RowDataset
 from dhtorch.records import Camera, Frame
-from support.stub_samples import H, K, N, Stub, Told, W
+from support.stub_samples import FixedEstimate, H, K, N, Stub, W
 
 #: Patches of a picture, as tokens.
 P = 6
@@ -50,7 +50,7 @@ def recording(n=4, numbers=None, name="one", load=None, gap=None, levels=None, *
 
 def rows(recordings, gap, method=None, wanted=None, **options):
     """The rows that an extraction of these recordings has, with the features of a stub method."""
-    method = Stub(answer=method or Told(), n=N)
+    method = Stub(answer=method or FixedEstimate(), n=N)
     found = columns.feature_columns(N, P)
     made = plan.make_plan(recordings, gap, 1)
     return RowDataset(recordings, made, wanted or found, method=method, gap=gap, tokens_hw=(H, W), **options)

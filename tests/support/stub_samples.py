@@ -1,4 +1,4 @@
-"""Samples of a few pixels, and a method that answers what it was told: what surrounds a method can be tried alone."""
+"""Samples of a few pixels, and a stub method with a fixed estimate: for tests of the code around a method."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ K = [40.0, 42.0, 20.0, 14.0]
 
 
 def sample(seed=0, **changes):
-    """An uint8 picture, a depth map in whole millimetres, a picture before it."""
+    """A sample dict: a random uint8 picture, a depth map in whole millimetres, the picture before it, intrinsics."""
     rng = np.random.default_rng(seed)
     image, before = rng.integers(0, 256, (2, H, W, 3), dtype=np.uint8)
     depth = rng.integers(500, 2000, (H, W)).astype(np.uint16)
@@ -24,24 +24,24 @@ def sample(seed=0, **changes):
 
 
 def pose(batch, seed=0):
-    """A turn about y and a step, other ones for each."""
+    """Poses with a rotation about y and a step, different for each member of the batch."""
     a = 0.1 * (1 + seed + torch.arange(batch))
     zero, one = torch.zeros(batch), torch.ones(batch)
     R = torch.stack((a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos()), -1).view(-1, 3, 3)
     return Pose(R, torch.stack((a, 2 * a, 3 * a), -1))
 
 
-class Told:
-    """Two samples that the sensor sees, two that are recovered, one that both say, one that nobody does.
+class FixedEstimate:
+    """Estimate of six samples: two known to the sensor, two triangulated, one with both, one with neither.
 
-    ``codes`` are those of the pose; ``asked`` holds what the last call was given.
+    ``codes`` are the pose codes of the batch; ``asked`` holds the arguments of the last call.
     """
 
     def __init__(self, codes=None):
         self.codes, self.asked, self.calls = codes, {}, 0
 
     def __call__(self, reference, other, *, n=N, seed=0, trace=None):
-        self.asked, self.calls = {"anchor": reference, "other": other, "n": n, "seed": seed}, self.calls + 1
+        self.asked, self.calls = {"reference": reference, "other": other, "n": n, "seed": seed}, self.calls + 1
         g = torch.Generator().manual_seed(7)
         B = reference.image.shape[0]
         uv = torch.rand(1, n, 2, generator=g).expand(B, n, 2) * torch.tensor([W - 1.0, H - 1.0])
@@ -71,7 +71,7 @@ class Told:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stub(Method):
-    """A method in which another function answers; its front end is the paper's."""
+    """A method whose estimate is that of the function ``answer``; its front end is the paper's."""
 
     answer: Callable[..., Estimate] = None
 
@@ -80,11 +80,11 @@ class Stub(Method):
 
 
 def tiny(method=None, **options):
-    """The transform of such samples."""
-    method = method if isinstance(method, Method) else Stub(answer=method or Told(), n=N)
+    """The ``ExtendDepth`` transform of such samples with the stub method."""
+    method = method if isinstance(method, Method) else Stub(answer=method or FixedEstimate(), n=N)
     return ExtendDepth(**{"depth_unit": "mm", "other_image": "before", "method": method, **options})
 
 
 def added(out, prefix="dhtorch."):
-    """What was added, without its prefix."""
+    """{name: tensor} of the keys that a transform added, without their prefix."""
     return {k.removeprefix(prefix): v for k, v in out.items() if k.startswith(prefix)}

@@ -1,4 +1,4 @@
-"""The box of ``box.py`` with paint on its walls that can be tracked: views that cost nothing to draw."""
+"""Frames of the box of ``box_scene.py`` with a texture that can be tracked; fast to render."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from support import box_scene as box
 HW = (96, 128)
 CAMERA = Camera(torch.tensor([[88.0, 86.0]]), torch.tensor([[64.5, 46.0]]))
 
-#: Nearer than this a sensor answers, m.
+#: Range of the sensor, m.
 NEAR = 3.0
 
 
 def at(i: float, step_m: float = 0.04) -> Pose:
-    """A walk to the right, looking at the far wall."""
+    """Pose ``i`` of a walk to the right that faces the far wall."""
     xi = torch.tensor([[0.05 + 0.01 * i, 0.6 - 0.012 * i, 0.02 * i, 0.2 + step_m * i, 0.3 + 0.1 * step_m * i, -1.6]])
     return se3.exp(xi.double())
 
 
 def view(T: Pose, hw: tuple[int, int] = HW, camera: Camera = CAMERA) -> Frame:
-    """What a camera in the box sees, with exact depth."""
+    """The frame of a camera at ``T`` in the box, with exact depth."""
     xyz, depth = box.hit(camera, T, hw)
     g = torch.Generator().manual_seed(0)
     wave = torch.randn(3, 24, generator=g, dtype=torch.float64)
@@ -33,5 +33,5 @@ def view(T: Pose, hw: tuple[int, int] = HW, camera: Camera = CAMERA) -> Frame:
 
 
 def near(frame: Frame, limit: float = NEAR) -> Frame:
-    """The same with near returns only."""
+    """The frame with near returns only."""
     return frame.replace(depth=torch.where(frame.depth <= limit, frame.depth, torch.zeros_like(frame.depth)))

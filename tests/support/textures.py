@@ -1,4 +1,4 @@
-"""Textures that are moved by exactly so much, and levels of pictures as OpenCV makes, filters and pads them.
+"""Textures with an exact motion, and pyramid levels made, filtered and padded by OpenCV.
 
 The searches are checked against ``support/reference.py``; that, and the pyramid, against these levels.
 """
@@ -12,7 +12,7 @@ REACH = 8
 
 
 def waves(B, H, W, shift=(0.0, 0.0), seed=0, shortest=7.0, linear=((1.0, 0.0), (0.0, 1.0))):
-    """Texture (B, 1, H, W) float64 in about [0, 1], turned, scaled about the middle and moved by exactly that."""
+    """Texture (B, 1, H, W) float64 in about [0, 1], mapped by ``linear`` about the middle and moved by ``shift`` px."""
     draw = np.random.default_rng(seed)
     length = shortest * (60 / shortest) ** draw.random((B, 25, 1, 1))
     turn, phase = 2 * np.pi * draw.random((2, B, 25, 1, 1))
@@ -26,7 +26,7 @@ def waves(B, H, W, shift=(0.0, 0.0), seed=0, shortest=7.0, linear=((1.0, 0.0), (
 
 
 def places(B, N, H, W, margin, seed=1):
-    """Random places (B, N, 2) float64."""
+    """Random pixels (B, N, 2) float64, at least ``margin`` px inside the border."""
     draw = np.random.default_rng(seed)
     return torch.from_numpy(margin + draw.random((B, N, 2)) * (np.array([W - 1, H - 1]) - 2 * margin))
 

@@ -11,7 +11,7 @@ def rand(*shape, seed, low=0.0, high=1.0):
 
 
 def random_estimates(V=4, B=2, N=30, seed=0, silent=0.3, spread=1.0):
-    """Estimates (V, B, N) that scatter about a true depth by a few of their sigmas; a share ``silent`` has no answer."""
+    """Estimates (V, B, N) within a few sigmas of a true depth; a share ``silent`` has no answer."""
     z = rand(B, N, seed=seed, low=2, high=8)
     relative = rand(V, B, N, seed=seed + 1, low=0.01, high=0.08)
     noise = spread * 4 * (rand(V, B, N, seed=seed + 2) - 0.5)

@@ -1,4 +1,4 @@
-"""ExtendDepth around a method that answers what it was told: what is asked of it and what is made of its answer."""
+"""ExtendDepth with a stub method: the arguments that it passes, and the features that it makes of an estimate."""
 
 import copy
 import warnings
@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from support.stub_samples import H, K, N, Stub, Told, W, added, pose, sample, tiny
+from support.stub_samples import FixedEstimate, H, K, N, Stub, W, added, pose, sample, tiny
 from torch.utils.data import default_collate
 
 import dhtorch
@@ -28,7 +28,7 @@ def batch(n=3, **changes):
 
 
 def test_every_answer_has_its_place():
-    given, method = sample(), Told()
+    given, method = sample(), FixedEstimate()
     out = tiny(method)(given)
     mine = added(out)
     assert list(mine) == [
@@ -36,7 +36,7 @@ def test_every_answer_has_its_place():
         *("T_1_from_0", "pose_cov", "pose_ok", "pose_code", "tokens", "tokens_valid", "problem"),
     ]
     trace = {}
-    estimate = method(method.asked["anchor"], None, trace=trace)
+    estimate = method(method.asked["reference"], None, trace=trace)
     samples = trace["samples"]
     assert mine["source"].tolist() == [1, 1, 2, 2, 1, 0] and mine["valid"].tolist() == [True] * 5 + [False]
     base = samples.trackability[0].tolist()
@@ -71,7 +71,7 @@ def test_points_lie_on_bent_rays_where_the_lens_bends_them():
 def test_the_pose_is_a_matrix_where_there_is_one():
     found = pose(1)
     for code, ok in ((0, True), (4, True), (1, False), (2, False), (3, False)):
-        mine = added(tiny(Told([code]))(sample()))
+        mine = added(tiny(FixedEstimate([code]))(sample()))
         assert mine["pose_code"] == code and mine["pose_ok"] == ok
         if ok:
             wanted = torch.eye(4)
@@ -88,10 +88,10 @@ def test_tokens_are_those_of_the_merged_map():
         {"patch": 7, "tokens_hw": (14, 28)},
         {"patch": 5, "tokens_hw": (30, 20), "fit": "pad"},
     ):
-        method = Told()
+        method = FixedEstimate()
         mine = added(tiny(method, **options)(sample()))
         trace = {}
-        estimate = method(method.asked["anchor"], None, trace=trace)
+        estimate = method(method.asked["reference"], None, trace=trace)
         found = dhtorch.merge(trace["samples"], estimate)
         tokens, known = patch_tokens(found, trace["samples"].hole, (H, W), **options)
         assert torch.equal(mine["tokens"], tokens[0]) and torch.equal(mine["tokens_valid"], known[0]) and known.any()
@@ -110,19 +110,19 @@ def test_the_sample_is_not_changed_and_keys_bear_the_prefix():
 
 
 def test_the_method_is_given_both_views_number_and_seed():
-    method = Told()
+    method = FixedEstimate()
     tiny(method, n=12, seed=5)(sample())
     assert method.asked["n"] == 12 and method.asked["seed"] == 5
     given = sample()
-    for view, key in (("anchor", "image"), ("other", "before")):
+    for view, key in (("reference", "image"), ("other", "before")):
         assert np.array_equal(method.asked[view].image[0].permute(1, 2, 0), given[key])
-    assert np.allclose(method.asked["anchor"].depth[0], given["depth"] / 1000)
+    assert np.allclose(method.asked["reference"].depth[0], given["depth"] / 1000)
     assert not method.asked["other"].depth.any()
 
 
 def test_the_number_of_samples_is_that_of_the_method():
     for options, n in (({}, 9), ({"n": 4}, 4)):
-        transform = tiny(Stub(answer=Told(), n=9), **options)
+        transform = tiny(Stub(answer=FixedEstimate(), n=9), **options)
         assert transform.method.n == n and added(transform(sample()))["depth"].shape == (n,)
     assert ExtendDepth(depth_unit="m").method.n == 2048, "dhtorch.extend's own"
 
@@ -140,7 +140,7 @@ def test_the_tracker_is_told_what_is_known_of_the_motion():
 
 
 def test_seeds_of_samples_are_told_apart_by_their_index():
-    method = Told()
+    method = FixedEstimate()
     for index in (4, np.int64(4), torch.tensor([4]), np.array([[4]], np.int32)):
         tiny(method, seed=3, index_key="index")(sample(index=index))
         assert torch.equal(method.asked["seed"], torch.tensor([7]))
@@ -167,7 +167,7 @@ def test_a_method_is_a_name_or_a_record():
         ExtendDepth(depth_unit="m", method="mapp")
 
 
-def test_networks_in_the_seats_of_a_method_are_parts_of_the_module():
+def test_networks_in_the_stages_of_a_method_are_submodules():
     class Net(torch.nn.Module):
         def __init__(self, size):
             super().__init__()
@@ -191,7 +191,7 @@ def front_end(given, n):
 def test_without_a_second_view_the_front_end_runs_alone(alone):
     given = sample(before_is_pad=np.array([True]), image=sample()["image"] // 2)
     given["depth"][:, :20] = 0
-    method = Told()
+    method = FixedEstimate()
     extender = tiny(method, n=40, **alone)
     mine, samples = added(extender(given)), front_end(given, 40)
     assert method.calls == 0 and mine["problem"] == SampleProblem.NO_SECOND_VIEW
@@ -210,7 +210,7 @@ def test_without_a_second_view_the_front_end_runs_alone(alone):
     assert extender.report() == {**QUIET, "no_second_view": 1}
 
 
-def test_the_front_end_has_the_seats_of_the_method():
+def test_the_front_end_has_the_stages_of_the_method():
     calls = []
 
     def few(hw, n, *, device, dtype):
@@ -234,7 +234,7 @@ def test_the_front_end_has_the_seats_of_the_method():
 
 def test_rows_of_a_batch_without_a_view_are_silent_beside_the_others():
     given = {**batch(3), "before_is_pad": torch.tensor([[False], [True], [False]])}
-    method = Told([0, 0, 2])
+    method = FixedEstimate([0, 0, 2])
     mine = added(tiny(method, batched=True)(given))
     assert mine["problem"].tolist() == [0, SampleProblem.NO_SECOND_VIEW, 0]
     assert mine["gate"][0].tolist() == mine["gate"][2].tolist() == [6, 6, 0, 0, 0, 6]
@@ -242,7 +242,7 @@ def test_rows_of_a_batch_without_a_view_are_silent_beside_the_others():
     assert mine["pose_ok"].tolist() == [True, False, False] and mine["pose_code"].tolist() == [0, 0, 2]
     assert not mine["T_1_from_0"][1:].any() and not mine["pose_cov"][1:].any()
     given = {**batch(2), "before_is_pad": torch.tensor([[False], [True]])}
-    assert added(tiny(Told([4, 4]), batched=True)(given))["pose_code"].tolist() == [4, 0]
+    assert added(tiny(FixedEstimate([4, 4]), batched=True)(given))["pose_code"].tolist() == [4, 0]
 
 
 @pytest.mark.parametrize("padded", [True, False])
@@ -253,7 +253,9 @@ def test_a_padded_view_of_a_nested_sample_is_no_view(padded, batched):
     pictures = {"front": given.pop("image"), "before": given.pop("before")}
     pictures["before_is_pad"] = torch.tensor([[False], [padded]]) if batched else torch.tensor([padded])
     mine = added(
-        tiny(Told([0, 0] if batched else [0]), batched=batched, **where)({**given, "observation": {"images": pictures}})
+        tiny(FixedEstimate([0, 0] if batched else [0]), batched=batched, **where)(
+            {**given, "observation": {"images": pictures}}
+        )
     )
     alone = SampleProblem.NO_SECOND_VIEW if padded else SampleProblem.NONE
     assert mine["problem"].flatten().tolist() == ([SampleProblem.NONE, alone] if batched else [alone])
@@ -409,7 +411,7 @@ def test_options_that_cannot_be_are_refused():
 
 def test_gradients_pass_where_they_are_asked_for():
     def method(a, b, *, n=N, seed=0, trace=None):
-        estimate = Told()(a, b, n=n, trace=trace)
+        estimate = FixedEstimate()(a, b, n=n, trace=trace)
         scaled = estimate.depth.nan_to_num() * a.image.mean() * b.image.mean()
         return estimate.replace(depth=torch.where(estimate.keep, scaled, torch.nan))
 

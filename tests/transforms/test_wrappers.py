@@ -1,4 +1,4 @@
-"""Adapters around data sets of a few pixels: which item is the other view, what is left out, what a loader gets."""
+"""Wrappers of data sets: which item is the source view, skipped samples, and batches of a loader."""
 
 import os
 import pickle
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from support.stub_samples import K, Told, added, sample, tiny
+from support.stub_samples import FixedEstimate, K, added, sample, tiny
 from torch.utils.data import DataLoader
 
 from dhtorch.transforms import (
@@ -48,7 +48,7 @@ class Items(torch.utils.data.Dataset):
 
 
 def looking_back(gap=2, items=None, **options):
-    method = Told()
+    method = FixedEstimate()
     keys = {k: options.pop(k) for k in ("episode_key",) if k in options}
     return ExtendedDataset(items or Items(), tiny(method, **options), gap=gap, **keys), method
 
@@ -66,7 +66,7 @@ def test_the_other_view_is_so_many_items_back_in_the_same_episode():
             assert out["index"] == i and "before" not in out and "before_is_pad" not in out
             if i in pairs:
                 assert np.array_equal(method.asked["other"].image[0].permute(1, 2, 0), sample(pairs[i])["image"])
-                assert np.array_equal(method.asked["anchor"].image[0].permute(1, 2, 0), sample(i)["image"])
+                assert np.array_equal(method.asked["reference"].image[0].permute(1, 2, 0), sample(i)["image"])
             else:
                 assert out["dhtorch.problem"] == SampleProblem.NO_SECOND_VIEW and not method.asked
 
@@ -264,7 +264,7 @@ def test_a_worker_answers_without_a_graph():
             self.gain = torch.nn.Parameter(torch.tensor(2.0))
 
         def forward(self, a, b, *, n=6, seed=0, trace=None):
-            estimate = Told()(a, b, n=n, trace=trace)
+            estimate = FixedEstimate()(a, b, n=n, trace=trace)
             return estimate.replace(depth=estimate.depth * self.gain)
 
     dataset = ExtendedDataset([sample(k) for k in range(2)], tiny(Gain(), n=6))

@@ -257,7 +257,7 @@ def test_known_is_a_share_of_the_depth_in_the_figure_of_a_verdict(monkeypatch):
     monkeypatch.setattr(drawing.Canvas, "title", lambda self, text, *_: said.append(text))
     depth, state = np.array([[1.0, 1.0], [1.0, 0.0]]), np.array([[State.CONSISTENT, State.WRONG], [0, 0]])
     drawing.draw_validation(io.BytesIO(), np.zeros((1, 2, 2)), depth, state, np.zeros((2, 2)), title="room, frame 3")
-    assert "room, frame 3" in said and "Known: 67 % of the depth, of which 50.0 % are wrong" in said
+    assert "room, frame 3" in said and "Checked: 67 % of the depth, of which 50.0 % are wrong" in said
 
 
 def test_figures_of_all_notebooks_have_the_same_sizes():
@@ -267,6 +267,6 @@ def test_figures_of_all_notebooks_have_the_same_sizes():
     )
     for file in (REPO / "notebooks").glob("*.ipynb"):
         code = "".join("".join(c["source"]) for c in json.loads(file.read_text())["cells"] if c["cell_type"] == "code")
-        assert "rcParams |= notebook.SETTINGS" in code, file.name
+        assert "rcParams |= notebook.NOTEBOOK_RC_PARAMS" in code, file.name
         widths = re.findall(r"figsize=\(([^,]*),", code)
-        assert widths and all("notebook.WIDTH" in width for width in widths), f"{file.name}: {widths}"
+        assert widths and all("notebook.FIGURE_WIDTH_IN" in width for width in widths), f"{file.name}: {widths}"

@@ -31,7 +31,6 @@ from dhtorch.data.pairs import by_choice, by_gap
 from dhtorch.experiments.exhibits import MAX_CLOUD_POINTS, MAX_SWEPT_POINTS, make_exhibit
 from dhtorch.experiments.protocol import Settings
 from dhtorch.integrate.sweeps import DenseSweep
-from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import METHODS
 from dhtorch.runtime import code_dependencies
 from dhtorch.runtime import results as result_files
@@ -315,7 +314,7 @@ def test_a_browser_counts_and_obeys(scene, tmp_path):
         s = scene.shots[k].samples
         answers = s["source"] == Source.RECOVERED
         kept = answers & (s["score"] >= least)
-        assert said.startswith(f"{kept.sum()} of {answers.sum()} answers stay")
+        assert said.startswith(f"{kept.sum()} of {answers.sum()} answers shown")
         right = np.isfinite(s["error"]) & (s["score"] >= least)
         assert f"Of {s['candidate'].sum()} held-back returns" in said and right.any()
     assert "recovered" in sample and "parallax" in sample and changed == "true"
@@ -349,7 +348,13 @@ def column(reader, entity, component):
 def test_a_recording_holds_everything(recorded):
     paths = set(recorded.store().schema().entity_paths())
     assert {f"/gates/{name.lower()}" for name in ("SENSOR", *names(Gate).values())} <= paths
-    for name in ("path", "anchor/picture", "anchor/depth", "anchor/picture/samples/silent", "other/picture/tracks"):
+    for name in (
+        "path",
+        "reference/picture",
+        "reference/depth",
+        "reference/picture/samples/silent",
+        "source/picture/tracks",
+    ):
         assert f"/world/{name}" in paths, name
     assert {"/pair", "/about", "/world/map/sensor", "/world/map/held_back", "/world/map/sigma"} <= paths
     assert "/world/map/swept" in paths
@@ -400,7 +405,7 @@ def test_a_recording_of_ones_own(command, tmp_path):
     code, _, err = command("view", *TINY, "most=1", "holdout=none", "html=own.html")
     assert (code, err) == (0, ""), err
     data = data_of((tmp_path / "own.html").read_text())
-    assert len(data["shots"]) == 1 and data["facts"]["sensor"] == "all returns were used"
+    assert len(data["shots"]) == 1 and data["facts"]["sensor"] == "all returns used"
     assert not unpacked(data["shots"][0]["held"]["xyz"]).size
 
 
@@ -486,7 +491,7 @@ def test_every_setting_that_ships_can_be_shown_again(job, group, folder):
         result["config"][group] = {"_target_": name, "_partial_": True}
         module, _, last = name.rpartition(".")
         found, expected = again.rebuild_parts(result)[group], getattr(importlib.import_module(module), last)
-        assert isinstance(found, Method) if expected is Method else found.func is expected
+        assert found.func is expected
 
 
 def test_null_stands_for_what_strict_json_cannot_hold(job):
@@ -547,4 +552,4 @@ def test_broken_points_are_refused(tmp_path, content):
 
 
 def test_the_viewer_says_what_it_offers():
-    assert {"Exhibit", "Shot", "Picture"} <= set(viewer.__all__)
+    assert {"Exhibit", "ExhibitView", "PairExhibit"} <= set(viewer.__all__)
