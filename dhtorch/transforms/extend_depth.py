@@ -161,7 +161,17 @@ class ExtendDepth(torch.nn.Module):
         tokens = patch_tokens(*pooled, frame.hw, patch=self.patch, tokens_hw=self.tokens_hw, fit=self.fit)
         xyz = samples.xyz if estimate is None else cam.unproject(frame.camera, merged.uv, merged.depth)
         problem = torch.tensor(_problem_codes(read, flagged), dtype=torch.int32, device=xyz.device)
-        found = schema.SampleResults(samples, merged, xyz, estimate, fits, paired, tokens, dense, problem)
+        found = schema.SampleResults(
+            samples=samples,
+            merged=merged,
+            xyz=xyz,
+            estimate=estimate,
+            fits=fits,
+            paired=paired,
+            tokens=tokens,
+            dense=dense,
+            problem=problem,
+        )
         added = schema.compute_columns(found, self._column_options())
         if self.views.pose is not None:
             label = poses.pose_label(self.views.pose)
