@@ -1,14 +1,13 @@
-"""Time of a verdict on a frame, beside a fixed-threshold photometric check of the same frame.
+"""Time of the validation of a frame, beside a fixed-threshold photometric check of the same frame.
 
     python benchmarks/validate.py --json benchmarks/results/validate_speed.json --clock cpu --repeats 9
 
-``validate_sparse``: :func:`dhtorch.validate_depth` of a map of 640×480 with one other view, by sparse evidence
-    (``views=False``) of
-:data:`dhtorch.validation.validate.QUICK_METHOD`, from the frames to the verdict; ``validate_sparse_512`` the same by 512
-samples of ``map``, and ``validate_views`` asks the pictures of the view as well. Rows of mode ``compiled`` use the compiled
-code of ``python -m dhtorch.ops``. All take turns in one process, a second or more of frames in a row each, as a
-data set is judged. The peer needs a motion like ours and gets one by the same method. Frames of TUM fr1/desk where
-DHTORCH_DATA is set, else of the built-in room; frames a second are 1000 / ms.
+``validate_sparse``: :func:`dhtorch.validate_depth` of a map of 640×480 with one source view, by sparse evidence
+(``views=False``) of :data:`dhtorch.validation.validate.QUICK_METHOD`, from the frames to the record;
+``validate_sparse_512``: the same with 512 samples of ``map``; ``validate_views``: with photometric evidence as well. Rows
+of mode ``compiled`` use the operators that ``python -m dhtorch.ops`` compiles. All take turns in one process, a second or
+more of frames in a row each, as a data set is validated. The peer needs a relative pose and gets one by the same method.
+Frames of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room; frames a second are 1000 / ms.
 """
 
 from __future__ import annotations
@@ -43,13 +42,13 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
     def ours(method: Method, views: bool) -> None:
         validate_depth(reference.depth, near, other, method=method, views=views)
 
-    asked = {"validate_sparse": (QUICK_METHOD, False), "validate_sparse_512": (METHOD, False), "validate_views": (METHOD, True)}
+    asked = {"sparse": (QUICK_METHOD, False), "sparse_512": (METHOD, False), "views": (METHOD, True)}
     modes = {"eager": ours, "compiled": harness.with_compiled_operators()(ours)}
     sides = [(name, mode) for mode in modes for name in asked]
     calls = [*(partial(modes[mode], *asked[name]) for name, mode in sides), check]
     *found, peer = harness.in_turn(calls, repeats=options.repeats, clock=options.clock, least_ms=1000.0)
     return [
-        harness.row(name, times, "photometric", peer, n=asked[name][0].n, mode=mode)
+        harness.row(f"validate_{name}", times, "photometric", peer, n=asked[name][0].n, mode=mode)
         for (name, mode), times in zip(sides, found, strict=True)
     ]
 

@@ -1,8 +1,8 @@
 """Readers: capture files -> recordings of frames; all file decoding and conversion of units and axes is done here.
 
 ``open(path)`` recognises a capture by its content and returns its :class:`Recording`, a lazy sequence of frames. A
-format is one module with ``recognise(root)`` and ``read(root, *, options)``, one import and one line in the table below. Focal
-stacks have one view and no depth of their own: they are read by ``dhtorch.experiments.focal``.
+format is one module with ``recognise(root)`` and ``read(root, *, options)``, one import and one line in the table
+below. Focal stacks have one view and no depth of their own: they are read by ``dhtorch.experiments.focal``.
 """
 
 from __future__ import annotations

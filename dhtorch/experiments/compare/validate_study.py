@@ -137,20 +137,21 @@ def run(
 ) -> Outcome:
     """Detection rates of faults planted in true maps, from near returns and source views.
 
-    Rows: one per reference view (``pair`` [i, i], method ``validate``), one per window and fault (``pair`` [first, last],
-    method ``causes``), one per scene. In the summary, ratios of reference views are means over scenes with intervals
-    over scenes:
+    Rows: one per reference view (``pair`` [i, i], method ``validate``), one per window and fault (``pair`` [first,
+    last], method ``causes``), one per scene. In the summary, ratios of reference views are means over scenes with
+    intervals over scenes:
 
-    * ``validate.scale_found`` and ``validate.false_alarm`` (all evidence); suffix ``_5`` for a scale wrong by a twentieth,
-      ``_far`` for triangulated points alone;
+    * ``validate.scale_found`` and ``validate.false_alarm`` (all evidence); suffix ``_5`` for a scale wrong by a
+      twentieth, ``_far`` for triangulated points alone;
     * ``validate.jump_auroc`` of pixels without a near return, ``_all`` of all pixels;
-    * ``validate.called_right_wrong``, ``_worst`` of the worst scene, ``_cut`` of clipped maps alone; ``validate.known``;
+    * ``validate.called_right_wrong``, ``_worst`` of the worst scene, ``_cut`` of clipped maps alone;
+      ``validate.known``;
     * ``photometric.<key>`` of the photometric baseline; ``quick.<key>`` of
       :data:`dhtorch.validation.validate.QUICK_METHOD` without the images of other views, whose scale from
       triangulated points alone is ``_quick_far``.
 
-    Ratios of windows: ``validate.named.<kind>``, their minimum ``validate.named_worst``, and ``validate.misnamed`` where no
-    fault was planted. Nothing is fitted to the scenes.
+    Ratios of windows: ``validate.named.<kind>``, their minimum ``validate.named_worst``, and ``validate.misnamed``
+    where no fault was planted. Nothing is fitted to the scenes.
 
     Args:
         scenes, chosen, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
@@ -331,12 +332,14 @@ def _baseline_columns(selected: dense.SelectedViews) -> Row:
 def _scene_row(scene: Scene, rows: Sequence[Row]) -> Row:
     """Rows of a scene's reference views → the scene's row of ratios."""
     with_baseline = [row for row in rows if row["baseline"]]
-    out: Row = {"scene": scene.name, "pair": None, "method": "validate", "role": scene.role, "n_wide": len(with_baseline)}
+    out: Row = {"scene": scene.name, "pair": None, "method": "validate", "role": scene.role}
+    out["n_wide"] = len(with_baseline)
     for column, suffix in _SCALE_COLUMN_SUFFIXES.items():
         for percent, ending in (("10", ""), ("5", "_5")):
             alarms = [row[f"{column}.{percent}_{side}"] for row in with_baseline for side in ("long", "short")]
             out[f"validate.scale_found{ending}{suffix}"] = mean_or_none([float(bool(x)) for x in alarms])
-        out[f"validate.false_alarm{suffix}"] = mean_or_none([float(bool(row[f"{column}.none"])) for row in with_baseline])
+        false_alarms = [float(bool(row[f"{column}.none"])) for row in with_baseline]
+        out[f"validate.false_alarm{suffix}"] = mean_or_none(false_alarms)
     for name, prefix in _PREDICTOR_PREFIXES.items():
         for key, column in (("jump_auroc", "auroc"), ("jump_auroc_all", "auroc_all")):
             out[f"{name}.{key}"] = mean_or_none(

@@ -3,8 +3,8 @@
 Samples are pairs of frames, a third of the scene's usable gap apart; the target is how the camera moved between them,
 rotation vector and translation from the recording's own trajectory. The input of the probe is the features of the
 first frame and their change to the second; depth tokens of either frame have the other one as second view. A sequence
-is cut into consecutive blocks that share no frame, and whole blocks are held out: every block is evaluated once. There is
-no context, so the arm ``context`` predicts the mean motion. ``two_view_pose`` is no probe but the method's own relative
+is cut into consecutive blocks that share no frame, and whole blocks are held out: every block is evaluated once. There
+is no context, so the arm ``context`` predicts the mean motion. ``two_view_pose`` is no probe but the method's own relative
 pose, no motion if it has none: the estimate of the geometry itself.
 
 Expectation (written before the run): yes; on every scene the error with depth features is smaller than DINOv2's (the
