@@ -123,7 +123,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "metrics.curves": [
         ("sample_curves", "(k + 1) / _N_CURVE_POINTS", "k / _N_CURVE_POINTS"),
         ("sample_curves", "descending=True, stable=True", "stable=True"),
-        ("sample_curves", "oracle[at - 1]", "mean[at - 1]"),
+        ("sample_curves", "oracle[rank - 1]", "mean[rank - 1]"),
         ("sample_curves", "ranked[:k].quantile(0.5)", "ranked[:k].mean()"),
         ("_by_distance", "pooled.true_depth.argsort(stable=True)", "pooled.depth.argsort(stable=True)"),
         ("_by_distance", "min(_N_BINS, pooled.true_depth.numel())", "_N_BINS"),
@@ -282,7 +282,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("measure_risk", "_count(loss) >= min_points", "_count(loss) > min_points"),
         ("measure_risk", "risk <= percent / 100", "risk < percent / 100"),
         ("measure_risk", "cuts & (risk", "(risk"),
-        ("measure_risk", "most / n if n else None", "most / max(loss.numel(), 1) if n else None"),
+        ("measure_risk", "n_accepted / n if n else None", "n_accepted / max(loss.numel(), 1) if n else None"),
         ("measure_risk", "_running_sum(loss, score) / max(loss.numel(), 1)", "_running_sum(loss, score) / max(n, 1)"),
         ("realised_risk", "pooled.score >=", "pooled.score >"),
         ("realised_risk", "pooled.keep & (", "("),

@@ -90,16 +90,16 @@ def fit_isotonic(
     x, y, weight = (v[weight > 0] for v in (x, y, weight))
     if not x.numel():
         raise ValueError("fit_isotonic: found no point with weight, expected at least one")
-    at, group = x.unique(return_inverse=True)
-    mass = torch.zeros_like(at).index_add(0, group, weight)
-    mean = torch.zeros_like(at).index_add(0, group, weight * y) / mass
+    argument, group = x.unique(return_inverse=True)
+    mass = torch.zeros_like(argument).index_add(0, group, weight)
+    mean = torch.zeros_like(argument).index_add(0, group, weight * y) / mass
     sign = 1.0 if rising else -1.0
     blocks = _join_light_blocks(
-        _pool_blocks((sign * mean).tolist(), mass.tolist(), at.tolist()), min_share * float(mass.sum())
+        _pool_blocks((sign * mean).tolist(), mass.tolist(), argument.tolist()), min_share * float(mass.sum())
     )
     middle = [block[2] for block in blocks]
     value = [sign * block[0] for block in blocks]
-    low, high = (float(at[0]), float(at[-1])) if ends is None else ends
+    low, high = (float(argument[0]), float(argument[-1])) if ends is None else ends
     return _make_table(middle, value, min(low, middle[0]), max(high, middle[-1]))
 
 
@@ -177,11 +177,11 @@ def _merge_blocks(a: _Block, b: _Block) -> _Block:
     return (a[0] * a[1] + b[0] * b[1]) / mass, mass, (a[2] * a[1] + b[2] * b[1]) / mass, a[3] + b[3]
 
 
-def _pool_blocks(y: list[float], weight: list[float], at: list[float]) -> list[_Block]:
+def _pool_blocks(y: list[float], weight: list[float], arguments: list[float]) -> list[_Block]:
     """Pool-adjacent-violators in one pass: a stack of blocks whose values rise strictly."""
     stack: list[_Block] = []
-    for value, mass, place in zip(y, weight, at, strict=True):
-        block = (value, mass, place, 1)
+    for value, mass, argument in zip(y, weight, arguments, strict=True):
+        block = (value, mass, argument, 1)
         while stack and stack[-1][0] >= block[0]:
             block = _merge_blocks(stack.pop(), block)
         stack.append(block)
@@ -208,8 +208,8 @@ def _make_table(x: list[float], y: list[float], low: float, high: float) -> Mono
         corners[0] = (x[0], y[0] + left * _end_rise(y[1] - y[0]))
         corners[-1] = (x[-1], y[-1] - right * _end_rise(y[-1] - y[-2]))
         corners = [(low, y[0])] * left + corners + [(high, y[-1])] * right
-    at, value = zip(*corners, strict=True)
-    return MonotoneTable(torch.tensor(at, dtype=torch.float64), torch.tensor(value, dtype=torch.float64))
+    argument, value = zip(*corners, strict=True)
+    return MonotoneTable(torch.tensor(argument, dtype=torch.float64), torch.tensor(value, dtype=torch.float64))
 
 
 def _end_rise(step: float) -> float:

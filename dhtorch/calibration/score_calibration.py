@@ -156,7 +156,7 @@ def fit_sigma_model(scenes: Sequence[Points]) -> SigmaModel | None:
     if not sum(e.numel() for e in errors):
         return None
     error, sigma, weight = torch.cat(errors), torch.cat(sigmas), torch.cat(weights)
-    best, least = SigmaModel(1.0, 0.0), math.inf
+    best, lowest_cost = SigmaModel(1.0, 0.0), math.inf
     for floor in _SIGMA_FLOORS_REL:
         scale = (
             _quantile((error.square() - floor * floor) / sigma.square(), weight, _ONE_SIGMA_SHARE).clamp_min(0).sqrt()
@@ -164,7 +164,7 @@ def fit_sigma_model(scenes: Sequence[Points]) -> SigmaModel | None:
         model = SigmaModel(float(scale), floor)
         spread = model(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
         cost = float((weight * (2 * torch.log1p((error / spread).square() / 3) + spread.log())).sum())
-        best, least = (model, cost) if cost < least else (best, least)
+        best, lowest_cost = (model, cost) if cost < lowest_cost else (best, lowest_cost)
     spread = best(sigma, torch.ones_like(sigma)).clamp_min(torch.finfo(sigma.dtype).tiny)
     wider = max(1.0, float(_quantile(error / spread, weight, _TWO_SIGMA_SHARE)) / 2)
     return SigmaModel(best.scale * wider, best.floor * wider)
@@ -267,7 +267,7 @@ def _number(value: Any, where: str) -> float:
     return float(value)
 
 
-def _expect(condition: bool, where: str, found: Any, expected: str) -> None:
+def _expect(condition: bool, where: str, actual: Any, expected: str) -> None:
     if not condition:
-        shown = found if isinstance(found, str) else storage.dump_strict_json(found)
-        raise ValueError(f"{where}: found {shown if len(shown) <= 60 else shown[:57] + '...'}, expected {expected}")
+        text = actual if isinstance(actual, str) else storage.dump_strict_json(actual)
+        raise ValueError(f"{where}: found {text if len(text) <= 60 else text[:57] + '...'}, expected {expected}")

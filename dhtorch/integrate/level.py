@@ -102,10 +102,10 @@ def _fit_floor_normal(xyz: Tensor, guess: Tensor, thickness: float) -> Tensor | 
     level = normal @ guess > _MIN_GUESS_COSINE
     distance = (subset @ normal.T - (triples[:, 0] * normal).sum(-1)).abs()
     count = torch.where(level, (distance < thickness).sum(0), 0)
-    best = int(count.argmax())
-    if int(count[best]) < _MIN_FLOOR_SHARE * len(subset):
+    largest = int(count.argmax())
+    if int(count[largest]) < _MIN_FLOOR_SHARE * len(subset):
         return None
-    inliers = subset[distance[:, best] < thickness]
+    inliers = subset[distance[:, largest] < thickness]
     axis = torch.linalg.eigh((inliers - inliers.mean(0)).T @ (inliers - inliers.mean(0))).eigenvectors[:, 0]
     axis = axis if float(axis @ guess) > 0 else -axis
     return axis if float(axis @ guess) > _MIN_GUESS_COSINE else None  # the fit to the inliers may have turned it away

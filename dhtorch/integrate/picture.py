@@ -44,30 +44,32 @@ def draw_map(
     xyz = se3.apply(se3.invert(T), surface.xyz[None].double())
     faces_away = (surface.normal.double() * (T.t - surface.xyz.double())).sum(-1) < 0
     ahead = (xyz[..., 2] > voxel) & ~faces_away
-    way = se3.apply(se3.invert(T), torch.cat([pose.t for pose in cameras])[None].double())
-    lens = _fit_camera(torch.cat((xyz[ahead], way[way[..., 2] > voxel])), hw)
-    uv = project(lens, xyz)
+    camera_path = se3.apply(se3.invert(T), torch.cat([pose.t for pose in cameras])[None].double())
+    camera = _fit_camera(torch.cat((xyz[ahead], camera_path[camera_path[..., 2] > voxel])), hw)
+    uv = project(camera, xyz)
     depth = torch.where(ahead, xyz[..., 2], 0.0)
-    both = torch.cat((surface.features[:, :3].double(), by_source), -1)[None]
-    view = splat_points(lens, hw, uv, depth, torch.ones_like(depth), both, T_world_from_cam=T, radius=0.8 * voxel)
+    colours_of_both = torch.cat((surface.features[:, :3].double(), by_source), -1)[None]
+    view = splat_points(
+        camera, hw, uv, depth, torch.ones_like(depth), colours_of_both, T_world_from_cam=T, radius=0.8 * voxel
+    )
     picture = torch.where(view.depth[0, ..., None] > 0, view.features[0], 1.0).clamp(0, 1).numpy()
-    dots = project(lens, way)[way[..., 2] > voxel].numpy()
+    dots = project(camera, camera_path)[camera_path[..., 2] > voxel].numpy()
     counts = {code: int((surface.source == code).sum()) for code in VOLUME_SOURCES}
-    shown = {code: n for code, n in counts.items() if n or code != Source.SWEPT}
-    *first, last = (words(names(Source)[code]) for code in shown)
+    shown_counts = {code: n for code, n in counts.items() if n or code != Source.SWEPT}
+    *first, last = (words(names(Source)[code]) for code in shown_counts)
     sources = f"{', '.join(first)} and {last}".capitalize()
     pictures = {
         prefix_title(f"Map of {format_count(len(cameras), 'view')}", title): picture[..., :3],
         sources: picture[..., 3:],
     }
-    metre = float(lens.f[0, 0] / depth[depth > 0].median()) if bool((depth > 0).any()) else None
-    _side_by_side(path, pictures, dots, shown, metre)
+    metre = float(camera.f[0, 0] / depth[depth > 0].median()) if bool((depth > 0).any()) else None
+    _side_by_side(path, pictures, dots, shown_counts, metre)
 
 
 def _side_by_side(
     path: str | Path,
     pictures: Mapping[str, np.ndarray],  # title → (H, W, 3) in [0, 1]
-    way: np.ndarray,  # (V, 2) px, positions of the cameras
+    camera_path: np.ndarray,  # (V, 2) px, positions of the cameras
     counts: Mapping[int, int],  # codes.Source → points
     metre: float | None,  # px
 ) -> None:
@@ -81,7 +83,7 @@ def _side_by_side(
         left = k * (width + gap)
         canvas.title(title, width, height + 20, left)
         canvas.picture(pixels, (left, 0, width, height))
-        places = [(left + (u + 0.5) * scale, height - (v + 0.5) * scale) for u, v in way.tolist()]
+        places = [(left + (u + 0.5) * scale, height - (v + 0.5) * scale) for u, v in camera_path.tolist()]
         inside = [(u, v) for u, v in places if left <= u <= left + width and 0 <= v <= height]
         canvas.lines([inside] if inside else [], Stroke(INK, 0.8))
         canvas.dots(inside, Stroke(INK, 1.5))
@@ -105,9 +107,12 @@ def _scale_bar(canvas: Canvas, left: float, width: float, metre: float) -> None:
 def _viewpoint(surface: Surface, cameras: Sequence[Pose], up: Sequence[float]) -> Pose:
     """Pose T_world_from_cam (1) outside and above the map, in the mean viewing direction of the cameras."""
     above = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
-    ways = [pose.R[0, :, 2].double() for pose in cameras]
-    level = [way - (way @ above) * above for way in (torch.stack(ways).mean(0), *ways, torch.eye(3).double()[0])]
-    ahead = next(way / way.norm() for way in level if float(way.norm()) > 0.1)
+    directions = [pose.R[0, :, 2].double() for pose in cameras]
+    level = [
+        direction - (direction @ above) * above
+        for direction in (torch.stack(directions).mean(0), *directions, torch.eye(3).double()[0])
+    ]
+    ahead = next(direction / direction.norm() for direction in level if float(direction.norm()) > 0.1)
     xyz = surface.xyz[:: 1 + len(surface.xyz) // 1_000_000].double()
     middle = xyz.median(0).values if len(xyz) else cameras[0].t[0].double() + ahead
     far = float((xyz - middle).norm(dim=-1).quantile(0.9)) if len(xyz) else 1.0

@@ -383,10 +383,10 @@ def _chain_poses(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]
     poses, queue = {first: start}, deque([first])
     while queue:
         k = queue.popleft()
-        for other, T_k_from_other in links[k]:
-            if other not in poses:
-                poses[other] = se3.compose(poses[k], T_k_from_other)
-                queue.append(other)
+        for neighbour, T_k_from_neighbour in links[k]:
+            if neighbour not in poses:
+                poses[neighbour] = se3.compose(poses[k], T_k_from_neighbour)
+                queue.append(neighbour)
     return poses
 
 

@@ -41,9 +41,9 @@ def merge_surfaces(fine: Surface, wide: Surface) -> Surface:
     keep = wide.source != Source.SENSOR
     face = None
     if fine.face is not None and wide.face is not None:
-        whole = wide.face[keep[wide.face].all(-1)]
-        keep = torch.zeros_like(keep).index_fill(0, whole.flatten().unique(), True)
-        face = torch.cat((fine.face, (keep.cumsum(0) - 1)[whole] + len(fine.xyz)))
+        kept_faces = wide.face[keep[wide.face].all(-1)]
+        keep = torch.zeros_like(keep).index_fill(0, kept_faces.flatten().unique(), True)
+        face = torch.cat((fine.face, (keep.cumsum(0) - 1)[kept_faces] + len(fine.xyz)))
     return Surface(
         xyz=torch.cat((fine.xyz, wide.xyz[keep])),
         normal=torch.cat((fine.normal, wide.normal[keep])),

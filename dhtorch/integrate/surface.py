@@ -149,9 +149,9 @@ def _distance_gradient(volume: Volume, ijk: Tensor) -> Tensor:
     derivatives = []
     for step in torch.eye(3, dtype=torch.int64, device=ijk.device):
         ahead, behind = (_distance(volume, ijk + sign * step) for sign in (1, -1))
-        both = ahead.isfinite() & behind.isfinite()
+        is_central = ahead.isfinite() & behind.isfinite()
         one_sided = (ahead - here).nan_to_num(0.0) + (here - behind).nan_to_num(0.0)
-        derivatives.append(torch.where(both, (ahead - behind) / 2, one_sided))
+        derivatives.append(torch.where(is_central, (ahead - behind) / 2, one_sided))
     return torch.stack(derivatives, -1)
 
 

@@ -212,13 +212,13 @@ def splat_points(
         b, n, o = covered.nonzero(as_tuple=True)
         pixel = (b * h + position[b, n, o, 1]) * w + position[b, n, o, 0]
         owner = _nearest_owner(pixel, z[b, n], n, B * h * w)
-        held = (owner >= 0).view(B, h, w)
+        has_owner = (owner >= 0).view(B, h, w)
         index = owner.clamp_min(0).view(B, h * w)
 
         def spread(values: Tensor) -> Tensor:
             flat = values.gather(1, index[..., None].expand(-1, -1, values.shape[-1])) if values.shape[1] else None
             full = torch.zeros(B, h * w, values.shape[-1]).to(values) if flat is None else flat
-            return torch.where(held[..., None], full.view(B, h, w, -1), 0.0)
+            return torch.where(has_owner[..., None], full.view(B, h, w, -1), 0.0)
 
         maps = spread(torch.cat((z[..., None], sigma.nan_to_num()[..., None], features), -1))
     return DepthView(maps[..., 0], maps[..., 1], maps[..., 2 : 2 + C], camera, T_world_from_cam)
@@ -252,13 +252,13 @@ class _ViewIntegrator:
         ray, pixel = ray[is_finite], self.pixel[is_finite]
         unit = ray / ray.norm(dim=-1, keepdim=True)
         surface, reach = ray * self.depth[pixel, None], self.reach[pixel]
-        world, way = surface @ self.R.T + self.t, unit @ self.R.T
+        world, direction = surface @ self.R.T + self.t, unit @ self.R.T
         side, blocks = BLOCK_SIDE * self.voxel, []
         longest = float(reach.max()) if len(reach) else 0.0
         steps = max(2, int((self.truncation + longest) / (side / 2)) + 2)
         for k in range(steps):
             along = -self.truncation + (self.truncation + reach) * k / (steps - 1)
-            blocks.append(sparse_grid.occupied_cells(world + along[:, None] * way, side))
+            blocks.append(sparse_grid.occupied_cells(world + along[:, None] * direction, side))
         return torch.cat(blocks).unique()
 
     def add_to(self, volume: Volume, source: int, carve: bool) -> None:
@@ -278,8 +278,8 @@ class _ViewIntegrator:
         z = centre[:, 2]
         farthest = float((self.depth + self.reach)[self.pixel].max()) if len(self.pixel) else 0.0
         extent = self.extent.double()
-        wide = centre[:, :2].abs() <= extent * z[:, None] + radius * (1 + extent.square()).sqrt()
-        return ((z > -radius) & (z < farthest + radius) & wide.all(-1)).nonzero()[:, 0]
+        in_field = centre[:, :2].abs() <= extent * z[:, None] + radius * (1 + extent.square()).sqrt()
+        return ((z > -radius) & (z < farthest + radius) & in_field.all(-1)).nonzero()[:, 0]
 
     def _update(self, volume: Volume, part: Tensor, xyz: Tensor, source: int, carve: bool) -> None:
         z = xyz[..., 2]
@@ -310,10 +310,10 @@ class _ViewIntegrator:
 def _grow(volume: Volume, keys: list[Tensor]) -> Volume:
     """A copy of the volume with the blocks of ``keys`` added, empty."""
     key = torch.cat((volume.key, *keys)).unique()
-    at = sparse_grid.find_cells(key, volume.key)[0]
+    index = sparse_grid.find_cells(key, volume.key)[0]
 
     def zero_padded(x: Tensor) -> Tensor:
-        return x.new_zeros(len(key), *x.shape[1:]).index_copy_(0, at, x)
+        return x.new_zeros(len(key), *x.shape[1:]).index_copy_(0, index, x)
 
     fields = ("distance", "weight", "n_swept", "features")
     return volume.replace(key=key, **{name: zero_padded(getattr(volume, name)) for name in fields})
@@ -321,12 +321,12 @@ def _grow(volume: Volume, keys: list[Tensor]) -> Volume:
 
 def _nearest_owner(pixel: Tensor, depth: Tensor, owner: Tensor, n_pixels: int) -> Tensor:
     """For each pixel the owner of the nearest depth, the first of equal ones; -1 where there is none."""
-    best = torch.full((n_pixels,), torch.inf, dtype=depth.dtype, device=depth.device)
-    best = best.scatter_reduce(0, pixel, depth, "amin")
+    nearest = torch.full((n_pixels,), torch.inf, dtype=depth.dtype, device=depth.device)
+    nearest = nearest.scatter_reduce(0, pixel, depth, "amin")
     first = torch.full((n_pixels,), torch.iinfo(torch.int64).max, device=pixel.device)
-    is_nearest = depth == best[pixel]
+    is_nearest = depth == nearest[pixel]
     first = first.scatter_reduce(0, pixel[is_nearest], owner[is_nearest], "amin")
-    return torch.where(best.isfinite(), first, -1)
+    return torch.where(nearest.isfinite(), first, -1)
 
 
 def _border_pixels(h: int, w: int) -> Tensor:

@@ -27,7 +27,7 @@ def sample_curves(pooled: Points) -> dict[str, Any]:
     answered = pooled.answered()
     n = answered.keep.numel()
     order = answered.score.argsort(descending=True, stable=True)
-    at = torch.tensor(
+    rank = torch.tensor(
         sorted({max(1, round(n * (k + 1) / _N_CURVE_POINTS)) for k in range(_N_CURVE_POINTS)}) if n else [],
         dtype=torch.long,
     )
@@ -36,11 +36,11 @@ def sample_curves(pooled: Points) -> dict[str, Any]:
     ranked = answered.error[order]
     return {
         "risk_coverage": {
-            "coverage": _round_digits(coverage[at - 1].tolist()),
-            "risk": _round_digits(mean[at - 1].tolist()),
-            "oracle": _round_digits(oracle[at - 1].tolist()),
-            "score": _round_digits(answered.score[order][at - 1].tolist()),
-            "median_rel": _round_digits([float(ranked[:k].quantile(0.5)) for k in at.tolist()]),
+            "coverage": _round_digits(coverage[rank - 1].tolist()),
+            "risk": _round_digits(mean[rank - 1].tolist()),
+            "oracle": _round_digits(oracle[rank - 1].tolist()),
+            "score": _round_digits(answered.score[order][rank - 1].tolist()),
+            "median_rel": _round_digits([float(ranked[:k].quantile(0.5)) for k in rank.tolist()]),
         },
         "distance": _by_distance(pooled),
         "reliability": _reliability(pooled),

@@ -17,7 +17,7 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.patches import extract_patches, round_half_up, sample_nearest
 from dhtorch.pytree import Record, record
-from dhtorch.records import Frame, Samples
+from dhtorch.records import MIN_TRACKABILITY, Frame, Samples
 
 #: Levels of the truth test, from none to all of it.
 _TRUTH_TESTS = ("raw", "5x5", "full")
@@ -81,7 +81,7 @@ def split_half(
     seed: int,
     *,
     share: float = 0.5,
-    min_trackability: float = 1e-5,
+    min_trackability: float = MIN_TRACKABILITY,
 ) -> tuple[Tensor, Tensor]:
     """Sets A and B, (B, N) bool each: the trackable samples with a usable return, split at random.
 
@@ -163,11 +163,11 @@ def sample_truth(
     if truth not in _TRUTH_TESTS:
         raise ValueError(f"holdout.truth: found {truth!r}, expected one of {', '.join(_TRUTH_TESTS)}")
     scale = sizes["w"] / sizes["W"]
-    place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (sizes["h"], sizes["w"]), uv)
-    dense = _test_truth(frame.depth, place, truth, scale, window)
+    pixel = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (sizes["h"], sizes["w"]), uv)
+    dense = _test_truth(frame.depth, pixel, truth, scale, window)
     if frame.sparse is None:
         return Truth(*dense)
-    sparse = _test_truth(frame.depth, place, truth, scale, None)
+    sparse = _test_truth(frame.depth, pixel, truth, scale, None)
     depth, code = (torch.where(frame.sparse[:, None], a, b) for a, b in zip(sparse, dense, strict=True))
     return Truth(depth, code)
 

@@ -81,8 +81,8 @@ def measure_risk(pooled: Points, *, min_points: int = _MIN_POINTS) -> MetricValu
     cuts = _ends_of_ties(score)
     for percent in (5, 10, 20):
         fits = cuts & (risk <= percent / 100) & (_running_count(loss) >= min_points)
-        most = int(torch.where(fits, _running_count(loss), 0).max()) if has_answers else 0
-        numbers[f"coverage_at_{percent}"] = most / n if n else None
+        n_accepted = int(torch.where(fits, _running_count(loss), 0).max()) if has_answers else 0
+        numbers[f"coverage_at_{percent}"] = n_accepted / n if n else None
     numbers["monotonicity"], numbers["largest_fall"] = _monotonicity(risk)
     return numbers
 
@@ -100,10 +100,10 @@ def ause(pooled: Points) -> float | None:
     n = answered.keep.numel()
     if not n:
         return None
-    left = torch.tensor([max(round(n * (100 - k) / 100), 1) - 1 for k in range(96)], device=loss.device)
-    best = risk_curve(loss, -loss)[left].mean()
+    rank = torch.tensor([max(round(n * (100 - k) / 100), 1) - 1 for k in range(96)], device=loss.device)
+    best = risk_curve(loss, -loss)[rank].mean()
     chance = loss.mean() - best
-    return float((risk_curve(loss, answered.score)[left].mean() - best) / chance) if float(chance) > 0 else None
+    return float((risk_curve(loss, answered.score)[rank].mean() - best) / chance) if float(chance) > 0 else None
 
 
 def realised_risk(pooled: Points, threshold: float | None) -> float | None:
@@ -128,8 +128,8 @@ def keep_surest(pooled: Points, n: int) -> Points:
         keep[answered[score > limit]] = True
         tied = answered[score == limit]
         tied = tied[pooled.error[tied].argsort(stable=True)]
-        few = n - int(keep.sum())
-        keep[tied[(torch.arange(few, device=tied.device) * 2 + 1) * tied.numel() // (2 * few)]] = True
+        n_tied = n - int(keep.sum())
+        keep[tied[(torch.arange(n_tied, device=tied.device) * 2 + 1) * tied.numel() // (2 * n_tied)]] = True
     return pooled.replace(
         keep=keep,
         depth=torch.where(keep, pooled.depth, torch.nan),
@@ -167,10 +167,10 @@ def _monotonicity(risk: Tensor) -> tuple[float | None, float | None]:
     n = risk.numel()
     if n < _N_MONOTONICITY_STEPS:
         return None, None
-    at = torch.tensor(
+    rank = torch.tensor(
         [n * k // _N_MONOTONICITY_STEPS - 1 for k in range(1, _N_MONOTONICITY_STEPS + 1)], device=risk.device
     )
-    tenths = risk[at]
+    tenths = risk[rank]
     fall = (tenths.cummax(0).values - tenths).max()
     return float((tenths.diff() >= -1e-12).double().mean()), float(fall)
 

@@ -104,13 +104,13 @@ def move_objects(depth: Tensor, generator: Generator, *, n: int = _N_JUMPS, fact
 
 def fill_discs(depth: Tensor, generator: Generator) -> Tensor:
     """The map with smoothly invented discs: the blurred surroundings times a smooth factor."""
-    wide = blur_depth(depth, _DISC_RADIUS_REL)
+    blurred = blur_depth(depth, _DISC_RADIUS_REL)
     faulty = depth
     for u, v in _draw_pixels(depth, generator, _N_DISCS):
         off = _MAX_INVENTED_REL * (2 * float(torch.rand((), generator=generator)) - 1)
         x, y = _pixel_grid(depth)
         r = _pixel_distance(depth, u, v) / _DISC_RADIUS_REL
-        invented = wide * (1 + off * (1 - r.square()).clamp_min(0) + 0.05 * off * (x + y))
+        invented = blurred * (1 + off * (1 - r.square()).clamp_min(0) + 0.05 * off * (x + y))
         faulty = torch.where((r < 1) & (depth > 0), invented, faulty)
     return faulty
 

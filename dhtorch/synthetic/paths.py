@@ -30,7 +30,7 @@ def hand_held_path(
     ``pan``: degrees of yaw to the right added to the first frame, and added from frame to frame.
     """
     stations = [CAMERA_PATHS[path](_Hand(seed), step_m * i, i / rate_hz) for i in range(n_frames)]
-    turns = [(yaw + pan[0] + pan[1] * i, *more) for i, (_, (yaw, *more)) in enumerate(stations)]
+    turns = [(yaw + pan[0] + pan[1] * i, *pitch_roll) for i, (_, (yaw, *pitch_roll)) in enumerate(stations)]
     return Pose(
         torch.tensor([rotation_from_angles(*angles) for angles in turns], dtype=torch.float64),
         torch.tensor([(x, -height, z) for (x, height, z), _ in stations], dtype=torch.float64),

@@ -112,10 +112,10 @@ class Solids:
         o, d = _to_local(centre, [c.unbind(1) for c in self.R[..., None].unbind(2)], o, d)
         spans = zip(_ball_span(self._square[:, None], o, d), _box_span(half, o, d), strict=True)
         enter, leave, hit = (torch.where(self.ball[:, None], of_ball, of_box) for of_ball, of_box in spans)
-        at = torch.cat((leave[:1], enter[1:]))  # the room is hit on leaving it
-        at = torch.where(hit & (at >= 0), at, _NO_HIT_M)
-        t = at.amin(0).clamp(max=_NO_HIT_M)
-        first = torch.where(at == t, torch.arange(len(at))[:, None], len(at)).amin(0)
+        distance = torch.cat((leave[:1], enter[1:]))  # the room is hit on leaving it
+        distance = torch.where(hit & (distance >= 0), distance, _NO_HIT_M)
+        t = distance.amin(0).clamp(max=_NO_HIT_M)
+        first = torch.where(distance == t, torch.arange(len(distance))[:, None], len(distance)).amin(0)
         return t, torch.where(t < _NO_HIT_M, first, 0)
 
     def locate(self, index: Tensor, p: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
@@ -222,9 +222,9 @@ def _box_span(half: _Vector, o: _Vector, d: _Vector) -> tuple[Tensor, Tensor, Te
 
 def _update_nearest(t: Tensor, index: Tensor, i: int, enter: Tensor, leave: Tensor, hit: Tensor) -> None:
     """Write solid ``i`` into ``t`` and ``index`` where it is the nearest hit; the room is hit on leaving it."""
-    at = leave if i == 0 else enter
-    first = hit & (at < t) & (at >= 0)
-    t.copy_(torch.where(first, at, t))
+    distance = leave if i == 0 else enter
+    first = hit & (distance < t) & (distance >= 0)
+    t.copy_(torch.where(first, distance, t))
     index.masked_fill_(first, i)
 
 

@@ -274,9 +274,11 @@ def simulate_phone_lidar(
     per_depth = (d[0] * d[0] + d[1] * d[1] + d[2] * d[2]).sqrt()
     edge, mixed = _depth_edges(depth.view(hw))
     measured = torch.where(edge, mixed, depth)
-    at = (kind == SURFACE_MIRROR).nonzero()[:, 0]
-    _, _, more, _ = scene.mirrored([c[at] for c in o], [c[at] for c in d], depth[at], face[at])
-    measured = measured.index_copy(0, at, depth[at] + more)
+    at_mirror = (kind == SURFACE_MIRROR).nonzero()[:, 0]
+    _, _, reflected, _ = scene.mirrored(
+        [c[at_mirror] for c in o], [c[at_mirror] for c in d], depth[at_mirror], face[at_mirror]
+    )
+    measured = measured.index_copy(0, at_mirror, depth[at_mirror] + reflected)
     distance = measured * per_depth
     returned = scene.albedo[face] * scene.albedo[face] * cosine / (distance * distance)
 
@@ -314,10 +316,10 @@ def _photograph(
     """Rendered image (1, 3, H, W), display values in [0, 1], times ``exposure`` and clipped: the mean of
     ``supersample``² rays in each pixel."""
     s = supersample
-    fine = (hw[0] * s, hw[1] * s)
-    dense = resize(camera, hw, fine)
-    depth, solid = scene.solids.view(dense, pose, fine)
-    o, d = world_rays(dense, pose, fine)
+    fine_hw = (hw[0] * s, hw[1] * s)
+    dense = resize(camera, hw, fine_hw)
+    depth, solid = scene.solids.view(dense, pose, fine_hw)
+    o, d = world_rays(dense, pose, fine_hw)
     colour, _ = scene.shade(o, d, depth, solid, 1 / float(dense.f.min()))
     colour = (colour * exposure).clamp(0, 1).view(hw[0], s, hw[1], s, 3)
     total = torch.zeros(*hw, 3)
@@ -344,16 +346,16 @@ def _patchy_uniform(hw: tuple[int, int], generator: Generator) -> Tensor:
     """Uniform numbers (h·w,), most of them equal within blocks of 4×4 pixels, so that gaps come in patches."""
     coarse = torch.rand((hw[0] + 3) // 4, (hw[1] + 3) // 4, generator=generator)
     coarse = coarse.repeat_interleave(4, 0)[: hw[0]].repeat_interleave(4, 1)[:, : hw[1]]
-    own = torch.rand(hw, generator=generator)
-    return torch.where(torch.rand(hw, generator=generator) < 0.3, own, coarse).flatten()
+    per_pixel = torch.rand(hw, generator=generator)
+    return torch.where(torch.rand(hw, generator=generator) < 0.3, per_pixel, coarse).flatten()
 
 
 def _shared_normal(hw: tuple[int, int], generator: Generator) -> Tensor:
     """Standard normal numbers (h·w,), 64 % of whose variance is correlated over about 6 pixels."""
     smooth = torch.randn(-(-hw[0] // 6) + 1, -(-hw[1] // 6) + 1, generator=generator)
     for dim in (0, 1):
-        at = torch.arange(hw[dim])
-        low, w = at // 6, ((at % 6) / 6).unsqueeze(1 - dim)
+        pixel = torch.arange(hw[dim])
+        low, w = pixel // 6, ((pixel % 6) / 6).unsqueeze(1 - dim)
         mixed = smooth.index_select(dim, low) * (1 - w) + smooth.index_select(dim, low + 1) * w
         smooth = mixed / ((1 - w) * (1 - w) + w * w).sqrt()  # keeps the variance at 1
     return (0.8 * smooth + 0.6 * torch.randn(hw, generator=generator)).flatten()

@@ -135,10 +135,10 @@ def _legs(x: float, z: float, size: Triple, thick: float, surface: Material, yaw
 def _divider(draw: Random) -> list[Solid]:
     """A low open shelf across the view, with five bays of drawers, boxes and books, and the lamp behind it."""
     x0, z, pitch, top = -1.25, 1.95, 0.42, 0.86
-    wide = 5 * pitch
-    parts = [make_box(x0 + wide / 2, h, z, (wide + 0.03, 0.03, 0.36), _WHITE_PAINT) for h in (0.03, 0.43, top - 0.03)]
+    width = 5 * pitch
+    parts = [make_box(x0 + width / 2, h, z, (width + 0.03, 0.03, 0.36), _WHITE_PAINT) for h in (0.03, 0.43, top - 0.03)]
     parts += [make_box(x0 + k * pitch, 0.03, z, (0.03, top - 0.06, 0.36), _WHITE_PAINT) for k in range(6)]
-    parts.append(make_box(x0 + wide / 2, 0.03, z + 0.175, (wide, top - 0.06, 0.01), _WHITE_PAINT))
+    parts.append(make_box(x0 + width / 2, 0.03, z + 0.175, (width, top - 0.06, 0.01), _WHITE_PAINT))
     fronts = ["print", "poster:0", "books", "wallpaper", "poster:2"]
     draw.shuffle(fronts)
     for row in (0.06, 0.46):
@@ -277,16 +277,23 @@ def _books(draw: Random, left: float, right: float, height: float, z: float, *, 
     x = left
     stop = right - draw.uniform(0.0, 0.12)
     while True:
-        wide = draw.uniform(0.025, 0.06)
-        tall = draw.uniform(0.33 * shortest, 0.33)
-        deep = draw.uniform(0.16, 0.24)
-        if x + wide > stop:
+        width = draw.uniform(0.025, 0.06)
+        book_height = draw.uniform(0.33 * shortest, 0.33)
+        depth = draw.uniform(0.16, 0.24)
+        if x + width > stop:
             return books
         surface = Material("spine", _tint(draw))
         books.append(
-            make_box(x + wide / 2, height, z + 0.13 - deep / 2, (wide - 0.003, tall, deep), surface, shadow=False)
+            make_box(
+                x + width / 2,
+                height,
+                z + 0.13 - depth / 2,
+                (width - 0.003, book_height, depth),
+                surface,
+                shadow=False,
+            )
         )
-        x += wide
+        x += width
 
 
 def _side_walls(draw: Random) -> list[Solid]:

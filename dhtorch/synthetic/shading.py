@@ -185,7 +185,7 @@ class _Lightmap:
         solids: Solids,
         lights: Sequence[Light],
         ambient: float,
-        known: _Lightmap | None = None,
+        existing: _Lightmap | None = None,
         *,
         spacing: float = 0.1,
     ):
@@ -198,8 +198,8 @@ class _Lightmap:
         self.start = count.cumsum(0) - count
         face = torch.arange(len(count)).repeat_interleave(count)
         node = torch.arange(len(face)) - self.start[face]
-        if known is not None:
-            face, node = face[len(known.values) :], node[len(known.values) :]
+        if existing is not None:
+            face, node = face[len(existing.values) :], node[len(existing.values) :]
         n = self.n[face]
         across, down = (node % n[:, 0]) / (n[:, 0] - 1) * 2 - 1, (node // n[:, 0]) / (n[:, 1] - 1) * 2 - 1
         p = solids.points(face, across * 0.995, down * 0.995)
@@ -209,7 +209,7 @@ class _Lightmap:
         for light in lights:
             power = power + _direct_light(solids, light, p, normal)
         values = power.sqrt()
-        self.values: Tensor = values if known is None else torch.cat((known.values, values))  # (L, 3)
+        self.values: Tensor = values if existing is None else torch.cat((existing.values, values))  # (L, 3)
 
     def sample(self, face: Tensor, across: Tensor, down: Tensor) -> Tensor:
         """Light (P, 3) at coordinates in [-1, 1] of faces."""
@@ -247,9 +247,9 @@ def _is_unshaded(solids: Solids, light: Light, p: list[Tensor], d: list[Tensor])
     """1 where the segments ``d`` (samples, P) from points ``p`` (P,) to samples of a light are free, else 0."""
     clear = torch.ones_like(d[0])
     half = math.hypot(*(abs(light.u[k]) + abs(light.v[k]) for k in range(3)))
-    for solid, at in solids.blockers(p, half + 1e-3, [light.centre[k] - p[k] for k in range(3)]):
-        far = solids.open_distance(solid, [c[at] for c in p], [c[:, at] for c in d])
-        clear[:, at] = torch.where(far > 0.98, clear[:, at], 0.0)
+    for solid, index in solids.blockers(p, half + 1e-3, [light.centre[k] - p[k] for k in range(3)]):
+        far = solids.open_distance(solid, [c[index] for c in p], [c[:, index] for c in d])
+        clear[:, index] = torch.where(far > 0.98, clear[:, index], 0.0)
     return clear
 
 
@@ -262,15 +262,15 @@ def _ambient_light(solids: Solids, p: list[Tensor], normal: list[Tensor], *, rea
     )  # the same directions for all points, flipped to the side of the normal
     d = [c * side for c in d]  # (directions, L)
     clear = solids.open_distance(solids.each[0], p, d)
-    for solid, at in solids.blockers(p, reach):
-        far = solids.open_distance(solid, [c[at] for c in p], [c[:, at] for c in d])
-        clear[:, at] = torch.minimum(clear[:, at], far)
+    for solid, index in solids.blockers(p, reach):
+        far = solids.open_distance(solid, [c[index] for c in p], [c[:, index] for c in d])
+        clear[:, index] = torch.minimum(clear[:, index], far)
     weight = 0.35 + dot_product(d, normal) / reach
-    total, most = torch.zeros_like(p[0]), torch.zeros_like(p[0])
+    total, total_weight = torch.zeros_like(p[0]), torch.zeros_like(p[0])
     for k in range(len(sphere)):
-        total, most = total + clear[k] * weight[k], most + weight[k]
+        total, total_weight = total + clear[k] * weight[k], total_weight + weight[k]
     from_above = 0.8 - 0.2 * normal[1]
-    return (from_above * total / most)[:, None] * torch.tensor([0.96, 0.98, 1.04])
+    return (from_above * total / total_weight)[:, None] * torch.tensor([0.96, 0.98, 1.04])
 
 
 def _sphere_directions(n: int = 14) -> list[Triple]:

@@ -87,11 +87,11 @@ class StressRoom(SyntheticRoom):
             raise ValueError(f"stress room: stress is {stress!r}, expected one of {', '.join(STRESSES)}")
         options = {"name": f"stress_{stress}", **options, **STRESSES[stress].options}
         self.bands: list[Pose] = []
-        way = {k: options[k] for k in _PATH_OPTIONS if k in options}
+        path_options = {k: options[k] for k in _PATH_OPTIONS if k in options}
         if stress == "rolling_shutter":
-            self.bands, options["true_poses"] = _rolling_shutter_poses(**way)
+            self.bands, options["true_poses"] = _rolling_shutter_poses(**path_options)
         if stress == "fast":
-            options["true_poses"] = _panning_poses(**way)
+            options["true_poses"] = _panning_poses(**path_options)
         super().__init__(**options)
         self.stress, self.places, self.n_places = stress, places, n_places
         moving = STRESSES[stress].moving
@@ -157,9 +157,10 @@ class StressRoom(SyntheticRoom):
         pose, f = self.true_poses[i : i + 1], float(self.camera.f[0, 0])
         total = torch.zeros(1, 3, *self.hw)
         for k in range(n):
-            at = (k / (n - 1) - 0.5) / f  # turning the camera left and up shifts the image right and down
+            offset = (k / (n - 1) - 0.5) / f  # turning the camera left and up shifts the image right and down
             turn = torch.tensor(
-                [rotation_from_angles(-math.degrees(right * at), math.degrees(down * at), 0.0)], dtype=torch.float64
+                [rotation_from_angles(-math.degrees(right * offset), math.degrees(down * offset), 0.0)],
+                dtype=torch.float64,
             )
             total = total + self._photograph(i, self.camera, Pose(pose.R @ turn, pose.t), self.hw)
         return total / n

@@ -42,10 +42,10 @@ def _periodic_noise(generator: Generator, hw: tuple[int, int], cells: tuple[int,
     """Periodic smooth random field (h, w) in [0, 1] with ``cells`` independent values down and across."""
     grid = torch.rand(cells, generator=generator)
     for dim in (0, 1):
-        at = torch.arange(hw[dim]) * (cells[dim] / hw[dim])
-        low = at.floor()
+        position = torch.arange(hw[dim]) * (cells[dim] / hw[dim])
+        low = position.floor()
         index = low.long()
-        w = at - low
+        w = position - low
         w = (w * w * (3 - 2 * w)).unsqueeze(1 - dim)
         grid = grid.index_select(dim, index) * (1 - w) + grid.index_select(dim, (index + 1) % cells[dim]) * w
     return grid
@@ -62,8 +62,8 @@ def _fractal_noise(g: Generator, cells: int, octaves: int, stretch: int = 1) -> 
 
 
 def _texture_uv() -> tuple[Tensor, Tensor]:
-    at = (torch.arange(TEXTURE_SIZE_PX) + 0.5) / TEXTURE_SIZE_PX
-    return at.expand(TEXTURE_SIZE_PX, TEXTURE_SIZE_PX), at[:, None].expand(TEXTURE_SIZE_PX, TEXTURE_SIZE_PX)
+    position = (torch.arange(TEXTURE_SIZE_PX) + 0.5) / TEXTURE_SIZE_PX
+    return position.expand(TEXTURE_SIZE_PX, TEXTURE_SIZE_PX), position[:, None].expand(TEXTURE_SIZE_PX, TEXTURE_SIZE_PX)
 
 
 def _smooth_step(x: Tensor, width: float) -> Tensor:
@@ -85,8 +85,8 @@ def _blend(a: _Colour | Tensor, b: _Colour | Tensor, weight: Tensor) -> Tensor:
 
 def _draw_pigment(g: Generator) -> Tensor:
     """Random colour of the palette, slightly lighter or darker."""
-    which, tone = torch.rand(2, generator=g).tolist()
-    return torch.tensor(_PALETTE[int(which * len(_PALETTE))]) * (0.85 + 0.3 * tone)
+    choice, tone = torch.rand(2, generator=g).tolist()
+    return torch.tensor(_PALETTE[int(choice * len(_PALETTE))]) * (0.85 + 0.3 * tone)
 
 
 def _cell_noise(g: Generator, row: Tensor, column: Tensor, n: tuple[int, int]) -> Tensor:
@@ -184,14 +184,14 @@ def _poster(g: Generator) -> Tensor:
         size = 0.30 / (1 + 0.22 * k)
         rx, ry, slant = size * (0.4 + rx), size * (0.4 + ry), slant - 0.5
         # Paint only the bounding box of the shape.
-        part = tuple(
+        box = tuple(
             slice(max(0, int((c - 0.8 * size * 2) * TEXTURE_SIZE_PX)), int((c + 0.8 * size * 2) * TEXTURE_SIZE_PX))
             for c in (cy, cx)
         )
-        du, dv = u[part] - cx, v[part] - cy
+        du, dv = u[box] - cx, v[box] - cy
         x, y = (du + slant * dv) / rx, (dv - slant * du) / ry
         edge = (x * x + y * y).sqrt() if k % 2 else torch.maximum(x.abs(), y.abs())
-        picture[part] = _blend(picture[part], _draw_pigment(g), 0.92 * _smooth_step(1 - edge, 0.004 / min(rx, ry)))
+        picture[box] = _blend(picture[box], _draw_pigment(g), 0.92 * _smooth_step(1 - edge, 0.004 / min(rx, ry)))
     picture = picture * (0.55 + 0.85 * _fractal_noise(g, 12, 4))[..., None]
     return _blend(
         (0.93, 0.92, 0.88),

@@ -75,8 +75,8 @@ def _render_scene(light: Tensor, inverse: Tensor, gain: Tensor, focus: Tensor, s
     """One scene (C, H, W) at S distances in focus (S,), all in dioptres: (S, C, H, W)."""
     low, high = float(inverse.min()), float(inverse.max())
     count = min(max(math.ceil((high - low) * float(gain.max()) / step_px), 1) + 1, _MAX_LAYERS)
-    place = torch.linspace(high, low, count, dtype=inverse.dtype)  # near first
-    widest = float((gain[:, None] * (focus[:, None] - place)).abs().max())
+    layer_inverse = torch.linspace(high, low, count, dtype=inverse.dtype)  # near first
+    widest = float((gain[:, None] * (focus[:, None] - layer_inverse)).abs().max())
     margin = math.ceil(widest / 2) + 2
     size = (light.shape[-2] + 2 * margin, light.shape[-1] + 2 * margin)
     position = (high - inverse) / max(high - low, 1e-12) * (count - 1)
@@ -90,7 +90,7 @@ def _render_scene(light: Tensor, inverse: Tensor, gain: Tensor, focus: Tensor, s
             continue
         spectrum = torch.fft.rfft2(pad((solid * weight)[None], (margin,) * 4, mode="replicate"))
         spread = torch.stack(
-            [_disc_transfer(radius, abs(float(g * (f - place[k])))) for g, f in zip(gain, focus, strict=True)]
+            [_disc_transfer(radius, abs(float(g * (f - layer_inverse[k])))) for g, f in zip(gain, focus, strict=True)]
         )
         blurred = torch.fft.irfft2(spectrum * spread[:, None], s=size)
         alpha = blurred[:, -1:].clamp(0, 1)
