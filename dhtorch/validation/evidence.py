@@ -27,6 +27,7 @@ from dhtorch.geometry.camera import resize_pixels
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.patches import containing_pixels, nearest_pixel_index, sample_nearest
 from dhtorch.pipeline import surface
+from dhtorch.pipeline.dense_options import DenseOptions
 from dhtorch.records import Estimate, Samples
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOptions
 
@@ -254,7 +255,7 @@ def _view_evidence(
         & ~plane_sweep.occlusion_mask(plane_sweep.epipolar_warp(base, view), q, plane_step)
         & base.known.unflatten(-1, base.hw)
     )
-    own_var = (window.noise + surface.GREY_NOISE**2) / (options.independent_evidence_pixels * window.contrast)
+    own_var = (window.noise + DenseOptions.grey_noise**2) / (options.independent_evidence_pixels * window.contrast)
     shared_var = surface.pose_variance(base, view, fit, q, window.motion)
     sigma = ((own_var + shared_var) / q.square().clamp_min(1e-12) + tolerance**2).sqrt()
     step = torch.where(q > 0, window.step / q.clamp_min(1e-9), 0.0)  # of log(1 / d)

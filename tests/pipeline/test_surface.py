@@ -11,6 +11,7 @@ from dhtorch.geometry import plane_sweep, se3
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense, surface
+from dhtorch.pipeline.dense_options import DenseOptions
 from dhtorch.pytree import collate, stack
 
 NEAR, N = 2.0, 512
@@ -118,7 +119,7 @@ def test_a_few_returns_refute_no_motion(scene):
     assert not bool((refuted.source == Source.SWEPT).any()) and bool((silent == Gate.CONTRADICTED).any())
     few = torch.zeros_like(reference.depth)
     few[:, 10:14, :30] = reference.depth[:, 10:14, :30]
-    assert 20 < int((few > 0).sum()) < dense.MIN_OVERLAP_PIXELS
+    assert 20 < int((few > 0).sum()) < DenseOptions.min_overlap_pixels
     assert bool((mapped((reference.replace(depth=few), wrong)).source == Source.SWEPT).any())
 
 
@@ -202,10 +203,10 @@ def test_one_view_in_which_a_pixel_fits_is_enough(scene, monkeypatch):
     assert int((found.source == Source.SWEPT).sum()) > 0.6 * int((plain.source == Source.SWEPT).sum()) > 100
 
 
-def test_pixels_of_a_window_err_together(scene, monkeypatch):
+def test_pixels_of_a_window_err_together(scene):
     plain = mapped(scene)
-    monkeypatch.setattr(surface, "INDEPENDENT_WINDOW_PIXELS", 4 * surface.INDEPENDENT_WINDOW_PIXELS)
-    found = mapped(scene)
+    independent = DenseOptions(independent_window_pixels=4 * DenseOptions.independent_window_pixels)
+    found = mapped(scene, options=independent)
     both = (plain.source == Source.SWEPT) & (found.source == Source.SWEPT)
     assert both.sum() > 50 and float((found.sigma / plain.sigma)[both].median()) < 0.9
 
@@ -221,7 +222,7 @@ def test_a_fit_moves_a_pixel_no_further_than_a_few_planes(scene, monkeypatch):
         found = surface.refine_surface(base, source_view, start, q, 2)
     assert (
         float((found.q - start.q).abs().max()) * 23
-        < surface.MAX_TOTAL_PLANES + surface.MAX_STEP_PLANES + surface.SURFACE_PLANES
+        < DenseOptions.max_total_planes + DenseOptions.max_step_planes + DenseOptions.surface_planes
     )
 
 
@@ -241,7 +242,7 @@ def test_a_view_that_goes_astray_asks_for_no_more_than_a_plane(views, planes, sc
     changed(monkeypatch, astray)
     with torch.no_grad():
         found = surface.refine_surface(base, source_views, start, q, 1)
-    assert float((found.q - start.q).median()) * 23 == pytest.approx(planes * surface.MAX_STEP_PLANES, rel=1e-3)
+    assert float((found.q - start.q).median()) * 23 == pytest.approx(planes * DenseOptions.max_step_planes, rel=1e-3)
 
 
 def test_what_a_motion_does_not_know_of_a_depth_is_its_derivative_along_the_line(scene):
