@@ -84,7 +84,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("Method.__call__", "fit=fit, hint=hint, trace=trace)", "hint=hint, trace=trace)"),
     ],
     "pipeline.spec": [
-        ("MethodSpec", "min_trackability: float = 1e-5", "min_trackability: float = 1e-6"),
+        ("MethodSpec", "min_trackability: float = MIN_TRACKABILITY", "min_trackability: float = 1e-6"),
         ("MethodSpec", "hypotheses: int = 200", "hypotheses: int = 100"),
         ("MethodSpec", "n: int = 2048", "n: int = 1024"),
         ("MethodSpec.replace", "partial(getattr(self, k), **v)", "partial(getattr(MethodSpec, k), **v)"),

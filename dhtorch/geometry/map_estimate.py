@@ -6,6 +6,7 @@ Alphabet: that of :mod:`dhtorch.geometry.reprojection_problem`; ``noise`` (B, N)
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -59,17 +60,46 @@ NEAREST_FRACTIONS, MIN_FRACTION_TRACKS = (0.25, 0.5), 20
 COST_SLACK = 1.0
 
 
-class FitOptions(NamedTuple):
-    """What the solution of one problem may be told; see ``stages.pose.map_pose``."""
+@dataclass(frozen=True)
+class FitOptions:
+    """Options of one pose estimate and the only place of their defaults; see ``stages.pose.map_pose``."""
 
+    #: Weight of a far track's robust cost, in [0, 1] and without unit; a near track's is 1. Not an inverse variance,
+    #: because neighbouring tracks share their errors.
+    #: Source: chosen on shared_scenes and the built-in rooms, docs/methods.md.
     far_weight: float = 0.1
+
+    #: Limits the relative rise of the near tracks' cost when far tracks are included, a fraction without unit.
+    #: Source: chosen on shared_scenes and the built-in rooms, docs/methods.md.
     max_rise: float = 0.1
+
+    #: Limits the shutter rate: standard deviation of its prior around zero, rad per unit of height of a ray with z = 1;
+    #: 0 is a global shutter.
+    #: Source: chosen on shared_scenes and the built-in rooms, docs/methods.md.
     shutter_sigma: float = 0.01
+
+    #: Fraction of the cost, without unit, that a shutter rate must take away to be accepted.
+    #: Source: chosen on shared_scenes and the built-in rooms, docs/methods.md.
     shutter_gain: float = 0.02
+
+    #: Fraction of the cost of the best pure rotation, without unit, that a translation must take away to be accepted.
+    #: Source: chosen on shared_scenes and the built-in rooms, docs/methods.md.
     translation_gain: float = 0.55
+
+    #: Robust kernel of a whitened residual: None, ``"huber"``, ``"cauchy"`` or ``"geman_mcclure"``.
+    #: Source: chosen on shared_scenes and the built-in rooms, docs/methods.md.
     kernel: str | None = "geman_mcclure"
+
+    #: Limits the influence of a residual: where the kernel bends, in standard deviations.
+    #: Source: chosen on shared_scenes and the built-in rooms, docs/methods.md.
     bend: float = 2.0
+
+    #: Limits the Levenberg–Marquardt steps of the estimate from near tracks, a count.
+    #: Source: origin not recorded.
     near_steps: int = 4
+
+    #: Limits the Levenberg–Marquardt steps of each estimate from all tracks, a count.
+    #: Source: origin not recorded.
     steps: int = 6
 
 

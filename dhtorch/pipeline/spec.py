@@ -18,7 +18,16 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from dhtorch.records import Estimate, Frame, PoseFit, PosePrior, Samples, Tracks, ViewSelection
+from dhtorch.records import (
+    MIN_TRACKABILITY,
+    Estimate,
+    Frame,
+    PoseFit,
+    PosePrior,
+    Samples,
+    Tracks,
+    ViewSelection,
+)
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.holes import classify
@@ -59,7 +68,7 @@ class MethodSpec:
 
     n: int = 2048  # samples per reference view
     hypotheses: int = 200  # minimal samples drawn by the pose search
-    min_trackability: float = 1e-5  # samples below it are not used (gate NO_TEXTURE)
+    min_trackability: float = MIN_TRACKABILITY  # samples below it are not used (gate NO_TEXTURE)
     views: int = 1  # other views that are used, of more the best are chosen
     chain: bool = True  # begin the search in each view where its predecessor was found, further on at the same pace
 

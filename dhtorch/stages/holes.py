@@ -23,7 +23,7 @@ from dhtorch.geometry.patches import (
     window_arguments,
 )
 from dhtorch.ops.dispatch import operator
-from dhtorch.records import Frame, Samples
+from dhtorch.records import MIN_TRACKABILITY, Frame, Samples
 
 
 def classify(
@@ -31,7 +31,7 @@ def classify(
     samples: Samples,
     *,
     block: int = 7,
-    min_trackability: float = 1e-5,
+    min_trackability: float = MIN_TRACKABILITY,
 ) -> Samples:
     """Measure the texture at every sample and name the class of every hole.
 

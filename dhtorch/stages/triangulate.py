@@ -18,7 +18,7 @@ from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
 
 #: Least trackability that a grey difference is divided by.
-MIN_TRACKABILITY = 1e-8
+MIN_MISMATCH_TRACKABILITY = 1e-8
 
 
 def two_view(
@@ -118,7 +118,7 @@ def two_view(
         uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, shutter_rate).transpose(1, 2)
     geometry = solver(uv_0, uv_1, camera_0, camera_1, _stand_in(fit))
     parallax_deg = geometry.parallax * (180 / math.pi)
-    mismatch = grey / texture.clamp_min(MIN_TRACKABILITY).sqrt()
+    mismatch = grey / texture.clamp_min(MIN_MISMATCH_TRACKABILITY).sqrt()
     cov = _fitted(cov, tracked, fit, isotropic) if fitted_noise else cov
     own, shared = _variance(geometry, cov, fit, y)
     own, shared = own * sigma_scale**2, shared * sigma_scale**2

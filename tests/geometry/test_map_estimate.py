@@ -1,5 +1,7 @@
 """Most probable pose: noise, choice of tracks and covariance, against ``support/dense_reprojection.py`` and scipy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -169,14 +171,14 @@ def contradiction():
 def test_far_tracks_are_believed_up_to_the_rise_of_the_near_cost_that_is_allowed():
     tracks, at = contradiction()
     o = FitOptions(far_weight=0.5, shutter_sigma=0.0, **LONG)
-    near, both = (estimate_map_pose(tracks, at.T, o._replace(max_rise=x)) for x in (-9.0, 1e9))
+    near, both = (estimate_map_pose(tracks, at.T, replace(o, max_rise=x)) for x in (-9.0, 1e9))
     assert float(near.far_weight) == 0 and float(both.far_weight) == 0.5
     noise = estimate_noise_variance(tracks, both.at)
     before, after = (costs(tracks, x.at, noise, o, 0.5, only_near=True) for x in (near, both))
     rise = (after - 1.0) / before - 1
     assert 0.1 < rise < 3, "a case that depends on the option, and on one unit of slack"
     for share, believed in ((0.97, False), (1.03, True)):
-        found = estimate_map_pose(tracks, at.T, o._replace(max_rise=share * rise))
+        found = estimate_map_pose(tracks, at.T, replace(o, max_rise=share * rise))
         wanted = both if believed else near
         assert float(found.far_weight) == float(wanted.far_weight)
         torch.testing.assert_close(found.at.T.t, wanted.at.T.t, rtol=0, atol=1e-12)
@@ -185,7 +187,7 @@ def test_far_tracks_are_believed_up_to_the_rise_of_the_near_cost_that_is_allowed
 def test_a_turn_is_believed_from_the_share_of_the_cost_that_is_asked():
     tracks, at = problem(1, 30, 40, noise=0.3, depth=0.003, turn=0.002, seed=6)
     o = FitOptions(far_weight=0.5, max_rise=1e9, shutter_sigma=0.003, translation_gain=-1e9, **LONG)
-    rigid, turned = (estimate_map_pose(tracks, at.T, o._replace(shutter_gain=x)) for x in (1e9, -1e9))
+    rigid, turned = (estimate_map_pose(tracks, at.T, replace(o, shutter_gain=x)) for x in (1e9, -1e9))
     assert float(rigid.shutter_precision) > 1e12 and rigid.at.shutter_rate.abs().max() < 1e-9
     assert float(turned.shutter_precision) == pytest.approx(0.003**-2) and turned.at.shutter_rate.abs().max() > 1e-4
     noise = estimate_noise_variance(tracks, rigid.at)
@@ -194,7 +196,7 @@ def test_a_turn_is_believed_from_the_share_of_the_cost_that_is_asked():
     gain = (before - after - 1.0) / before
     assert 0.05 < gain < 0.9
     for share, believed in ((0.97, True), (1.03, False)):
-        found = estimate_map_pose(tracks, at.T, o._replace(shutter_gain=share * gain))
+        found = estimate_map_pose(tracks, at.T, replace(o, shutter_gain=share * gain))
         torch.testing.assert_close(
             found.at.shutter_rate, (turned if believed else rigid).at.shutter_rate, rtol=0, atol=1e-9
         )
@@ -228,7 +230,7 @@ def test_a_translation_is_believed_from_the_share_that_no_rotation_takes_away():
     gain = (found.fun - costs(tracks, solution.at, noise, o, 0.5) - 1.0) / found.fun
     assert 0.05 < gain < 0.9
     for share, believed in ((0.98, True), (1.02, False)):
-        again = estimate_map_pose(tracks, at.T, o._replace(translation_gain=share * gain))
+        again = estimate_map_pose(tracks, at.T, replace(o, translation_gain=share * gain))
         assert bool(again.translates) is believed
 
 

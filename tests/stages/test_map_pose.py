@@ -1,5 +1,6 @@
 """``map_pose``: accuracy with far tracks, covariance, which tracks and shutter rates are accepted, gradients."""
 
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -111,14 +112,14 @@ def test_the_answer_is_the_optimum_of_the_problem_that_its_options_describe(isot
     """And not the optimum of the default's, so every option reaches the problem."""
     args, *_ = map_pose_inputs(1, 20, 40, depth=0.01 if "bend" in options else 0.03, turn=0.002, seed=2)
     base = map_estimate.FitOptions(max_rise=10.0, near_steps=8, steps=16, shutter_sigma=0.0, translation_gain=-9.0)
-    o = base._replace(**options)
-    fit = map_pose(*args, isotropic=isotropic, **o._asdict())
+    o = replace(base, **options)
+    fit = map_pose(*args, isotropic=isotropic, **asdict(o))
     assert fit.code.tolist() == [PoseCode.OK] and (fit.shutter.shutter_rate.abs().amax() > 1e-5) == (
         o.shutter_sigma > 0
     )
     assert newton_step(args, fit, o, isotropic) < 0.1
     if options or isotropic != 0.1:
-        plain = map_pose(*args, **base._asdict())
+        plain = map_pose(*args, **asdict(base))
         assert newton_step(args, plain, o, isotropic) > 0.2 or o.shutter_sigma > 0
 
 
@@ -128,9 +129,9 @@ def test_the_near_cost_may_rise_by_the_share_that_is_allowed():
     shift = torch.tensor([3.3, 2.1], dtype=D) * (torch.arange(72) >= 12)[:, None]
     args = put(args, uv_1=args[1].uv_1 + shift)
     o = map_estimate.FitOptions(far_weight=0.5, shutter_sigma=0.0, translation_gain=-9.0, near_steps=12, steps=12)
-    ask = lambda rise: map_pose(*args, **o._replace(max_rise=rise)._asdict())  # noqa: E731
+    ask = lambda rise: map_pose(*args, **asdict(replace(o, max_rise=rise)))  # noqa: E731
     problem, start = dense.problem_of(args, 0.1), pnp_ransac(*args).T_1_from_0
-    places = [map_estimate.estimate_map_pose(problem, start, o._replace(max_rise=x)).at for x in (-9.0, 1e9)]
+    places = [map_estimate.estimate_map_pose(problem, start, replace(o, max_rise=x)).at for x in (-9.0, 1e9)]
     noise = map_estimate.estimate_noise_variance(problem, places[1])
     before, after = (
         dense.cost([x for x in dense.tracks(problem, at, noise) if x.near], 0.0, o.kernel, o.bend) for at in places
@@ -380,7 +381,7 @@ def test_gradients_stay_finite_whatever_the_input():
 
 
 def test_options_have_one_default():
-    options, conf = map_estimate.FitOptions()._asdict(), Path(__file__).parents[2] / "conf" / "method"
+    options, conf = asdict(map_estimate.FitOptions()), Path(__file__).parents[2] / "conf" / "method"
     written = yaml.safe_load((conf / "map.yaml").read_text())["pose"]
     defaults = {k: v for k, v in map_pose.__kwdefaults__.items() if k != "start"}
     assert defaults == options | {k: defaults[k] for k in ("isotropic", "threshold_px")}
