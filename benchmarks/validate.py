@@ -4,9 +4,9 @@
 
 ``validate_sparse``: :func:`dhtorch.validate_depth` of a map of 640×480 with one source view, by sparse evidence
 (``views=False``) of :data:`dhtorch.validation.validate.QUICK_METHOD`, from the frames to the record;
-``validate_sparse_512``: the same with 512 samples of ``map``; ``validate_views``: with photometric evidence as well. Rows
-of mode ``compiled`` use the operators that ``python -m dhtorch.ops`` compiles. All take turns in one process, a second or
-more of frames in a row each, as a data set is validated. The peer needs a relative pose and gets one by the same method.
+``validate_sparse_512``: the same with 512 samples of ``map``; ``validate_views``: with photometric evidence too. Rows
+of mode ``compiled`` use the operators that ``python -m dhtorch.ops`` compiles. All take turns in one process, a second
+or more of frames in a row each, as a data set is validated. The peer needs a relative pose and gets one by the same method.
 Frames of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room; frames a second are 1000 / ms.
 """
 
