@@ -1,15 +1,14 @@
-"""One least-squares problem from two kinds of tracks: near ones, whose depth a sensor knows, and far ones, without.
+"""Least-squares problem of a pair's pose: near tracks with sensor depth and far tracks without → normal equations.
 
 Alphabet: view 0 is the reference view; ``x`` its viewing ray with z = 1 and ``q`` the inverse depth along it (1/m), so
-    that the
-point seen from camera 1 is R x + q t, up to scale, and q = 0 is a point at infinity. ``r`` = projected − measured (px),
-``S`` its covariance, ``s`` = d r / d q. Every track has its own q, which is eliminated from the problem (a Schur
-complement that is one number): with a sensor that states variance v of q, r has the covariance S + v s sᵀ; a far track
-has v = ∞ and keeps only the part of r across its epipolar line. So both kinds end as two rows per track, whitened.
+that the point in camera 1 is R x + q t, up to scale, and q = 0 is a point at infinity. ``r`` = projected − measured
+(px), ``S`` its covariance, ``s`` = d r / d q. Every track has its own q, which is eliminated from the problem (a Schur
+complement of one number): with a sensor variance v of q, r has the covariance S + v s sᵀ; a far track has v = ∞ and
+keeps only the part of r across its epipolar line. Both kinds become two whitened rows per track.
 
-Unknowns of a pair: the pose T (left perturbation) and the *turn* b (rad): a camera that reads row by row while it moves
-sees each row from a place of its own, which for short exposures is mainly a rotation y · b more, y being the height of
-x in the reference view. A turn of zero is a global shutter.
+Unknowns of a pair: the pose T (left perturbation) and the *shutter rate* b (rad per unit of height): a camera that
+reads row by row while it moves takes each row from another pose, which for short exposures is mainly an additional
+rotation y · b, y being the height of x in the reference view. A shutter rate of zero is a global shutter.
 
 Source: bundle adjustment with one free camera (B. Triggs et al., "Bundle adjustment: a modern synthesis", 2000);
 tracks with and without depth in one problem: J. Zhang, M. Kaess, S. Singh, "Real-time depth enhanced monocular
@@ -40,16 +39,18 @@ from dhtorch.geometry.se3 import Pose, hat
 from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import Record, record
 
-#: A far track is not closer to the reference view than the nearest point of the sensor by more than this factor.
+#: Limits how much closer than the nearest near return a far track may be: factor on inverse depth, without unit.
+#: Source: origin not recorded.
 NEAREST_DEPTH_DIVISOR = 2.0
 
-#: Squared residual (in units of its variance) of a point behind a camera: far beyond every kernel.
+#: Squared residual of a point behind a camera, in variances: far beyond the bend of every robust kernel.
+#: Source: origin not recorded.
 BEHIND_CAMERA_RESIDUAL = 1e4
 
 
 @record
 class PoseDepthProblem(Record):
-    """Tracks of B pairs as planes, N a multiple of ``SUM_LANES``; unused ones at any finite place."""
+    """Tracks of B pairs as planes, N a multiple of ``SUM_LANES``; unused tracks hold any finite values."""
 
     f: Tensor  # (B, 2) px, camera 1
     c: Tensor  # (B, 2) px, camera 1
@@ -63,14 +64,14 @@ class PoseDepthProblem(Record):
 
 
 class Unknowns(NamedTuple):
-    """What is solved for."""
+    """The unknowns of a pair: pose and shutter rate."""
 
     T: Pose
-    shutter_rate: Tensor | None  # (B, 3) rad per unit of y; None: none, and none is looked for
+    shutter_rate: Tensor | None  # (B, 3) rad per unit of y; None: not estimated
 
 
 def retract_unknowns(at: Unknowns, xi: Tensor) -> Unknowns:
-    """The unknowns displaced by xi (B, 9): a tangent vector of the pose, then the turn; (B, 6) where there is none.
+    """The unknowns displaced by xi (B, 9): tangent vector of the pose, shutter rate; (B, 6) without a shutter rate.
 
     Gradient: to both. Raises ValueError for wrong shapes.
     """
@@ -83,7 +84,7 @@ def retract_unknowns(at: Unknowns, xi: Tensor) -> Unknowns:
 def unknowns_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
     """The unknowns after one Gauss–Newton step, H (B, 9, 9) and g (B, 9), and ``ok`` (B,); unmoved where H is singular.
 
-    Without a turn H is (B, 6, 6) and g (B, 6).
+    Without a shutter rate H is (B, 6, 6) and g (B, 6).
 
     Gradient: to all three. Raises ValueError for wrong shapes.
     """
@@ -93,8 +94,9 @@ def unknowns_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]
 
 
 def trial_unknowns_step(at: Unknowns, H: Tensor, g: Tensor) -> tuple[Unknowns, Tensor]:
-    """:func:`unknowns_step` in a few operations, for proposals that are judged afterwards: see
-    ``least_squares.trial_step``.
+    """:func:`unknowns_step` in fewer operations, for proposals whose cost is compared afterwards.
+
+    See ``least_squares.trial_pose_step``.
 
     Gradient: none. Raises ValueError for wrong shapes.
     """
@@ -111,7 +113,7 @@ def undo_rolling_shutter(
     y: Tensor,  # (B, N) height of the reference view's ray
     shutter_rate: Tensor,  # (B, 3) rad per unit of y
 ) -> Tensor:
-    """Pixels as a camera without rolling shutter would have seen them: each ray is turned back by y · turn.
+    """Pixels (B, 2, N) with the rolling shutter undone: each ray is rotated back by y · shutter rate.
 
     Gradient: to all. Raises ValueError for wrong shapes.
     """
@@ -124,29 +126,29 @@ def undo_rolling_shutter(
         shutter_rate=(shutter_rate, "B 3"),
     )
     f, c = f[..., None], c[..., None]
-    return _straight((uv - c) / f, y, shutter_rate) * f + c
+    return _straighten((uv - c) / f, y, shutter_rate) * f + c
 
 
-def _straight(seen: Tensor, y: Tensor, shutter_rate: Tensor) -> Tensor:
-    """:func:`undo_rolling_shutter` at z = 1: where (u, v, 1) - y · turn x (u, v, 1) passes it."""
+def _straighten(seen: Tensor, y: Tensor, shutter_rate: Tensor) -> Tensor:
+    """:func:`undo_rolling_shutter` at z = 1: (u, v, 1) − y · shutter rate × (u, v, 1), divided by its z."""
     ray = torch.cat((seen, torch.ones_like(seen[:, :1])), 1)
     ray = ray - y[:, None] * rotate_planes(hat(shutter_rate), ray)
     z = ray[:, 2:]
-    return ray[:, :2] / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter: stays finite
+    return ray[:, :2] / torch.where(z.abs() < 0.1, 0.1, z)  # beyond any shutter rate: stays finite
 
 
 class TrackConstants(NamedTuple):
-    """What a problem's tracks are at z = 1, wherever the pose is."""
+    """Quantities of a problem's tracks at z = 1 that do not depend on the pose."""
 
     seen: Tensor  # (B, 2, N) measured in camera 1
     shape: Tensor  # (B, 3, N) the noise's covariance there, up to scale: xx, xy, yy
     height: Tensor  # (B, N) of the ray in camera 0
     nearest: Tensor  # (B, 1) 1/m, largest q of the near tracks
-    variance: Tensor  # (B, N) 1/m², of the sensor's q; 0 for tracks that have none
+    variance: Tensor  # (B, N) 1/m², of the sensor's q; 0 for tracks without one
 
 
 def track_constants(problem: PoseDepthProblem) -> TrackConstants:
-    """To be worked out once for several linearisations. Gradient: as :func:`linearise_tracks`."""
+    """Constants of a problem's tracks, shared by several linearisations. Gradient: as :func:`linearise_tracks`."""
     f0, f1 = problem.f[:, :1], problem.f[:, 1:]
     return TrackConstants(
         seen=(problem.uv - problem.c[..., None]) / problem.f[..., None],
@@ -158,42 +160,42 @@ def track_constants(problem: PoseDepthProblem) -> TrackConstants:
 
 
 class LinearisedTracks(NamedTuple):
-    """The tracks of a problem, linearised at z = 1: two equations each, before their inverse depth is eliminated."""
+    """The tracks of a problem linearised at z = 1: two equations each, inverse depths not yet eliminated."""
 
     u: Tensor  # (B, 7, N), along u: six columns of the pose, then the residual; or (B, 1, N), the residual alone
     v: Tensor  # (B, 7, N) or (B, 1, N), along v
     slope: Tensor  # (B, 2, N) m, d r / d q
-    free: Tensor  # (B, N) bool, neither the sensor nor infinity holds q: its variance before this track is infinite
-    front: Tensor  # (B, N) bool, in front of camera 1 and not at the epipole; others are finite and have no meaning
+    free: Tensor  # (B, N) bool, q is fixed neither by the sensor nor at infinity: its prior variance is infinite
+    front: Tensor  # (B, N) bool, in front of camera 1 and not at the epipole; others are finite and meaningless
     fixed: TrackConstants
 
 
 def linearise_tracks(
     problem: PoseDepthProblem, at: Unknowns, *, columns: bool = True, known: TrackConstants | None = None
 ) -> LinearisedTracks:
-    """Residuals and their Jacobian at the sensor's inverse depths, and at the most probable ones of far tracks.
+    """Residuals and Jacobian of a problem at the sensor's inverse depths, and at the most probable ones of far tracks.
 
     Without ``columns`` the residuals alone, the same bits: enough for :func:`squared_residuals`. ``known`` is
-    :func:`track_constants` of the problem, where it was worked out before.
+    :func:`track_constants` of the problem where already computed.
 
-    Gradient: to measurements, cameras, rays and the sensor's q; the far tracks' q is held at its optimum, where it has
+    Gradient: to measurements, cameras, rays and the sensor's q; the far tracks' q is fixed at its optimum, where it has
     no first-order effect. Raises ValueError for wrong shapes.
     """
     check(
         "linearise_tracks", ray=(problem.ray, "B 3 N"), uv=(problem.uv, "B 2 N"), shutter_rate=(at.shutter_rate, "B 3")
     )
     known = track_constants(problem) if known is None else known
-    seen = known.seen if at.shutter_rate is None else _straight(known.seen, known.height, at.shutter_rate)
+    seen = known.seen if at.shutter_rate is None else _straighten(known.seen, known.height, at.shutter_rate)
     t = at.T.t[..., None]
-    # Where the ray and the plane of the epipolar line go, in one product.
+    # The ray in camera 1 and its epipolar line, in one product.
     a, line = rotate_planes(torch.cat((at.T.R, torch.linalg.cross(t, at.T.R, dim=1)), 1), problem.ray).chunk(2, 1)
     with torch.no_grad():
         best = _inverse_depth(a, t, line, seen, known.shape)
-        # A point cannot lie beyond infinity: there q is known, and nothing is eliminated.
+        # A point cannot lie beyond infinity: q is then fixed at 0 and not eliminated.
         free = ~(problem.near | (best < 0))
     q = torch.where(problem.near, problem.inverse, best.clamp_min(0))
     Y = a + q[:, None] * t
-    # At the epipole a track fits any pose if only its point is near enough, and then holds it as if it were a vice.
+    # At the epipole a track fits any pose if its point is near enough, and then constrains it far too strongly.
     front = (Y[:, 2] > MIN_DEPTH) & (problem.near | (q < NEAREST_DEPTH_DIVISOR * known.nearest))
     w = Y[:, 2].masked_fill(~front, 1.0).reciprocal()
     plane = Y[:, :2] * w[:, None]
@@ -218,21 +220,21 @@ def whitened_residuals(
     *,
     shutter_rate: bool = True,
 ) -> Tensor:
-    """Whitened rows (B, 10, 2, N), inverse depths eliminated: six columns of the pose, three of the turn, the residual.
+    """Whitened rows (B, 10, 2, N) without inverse depths: six columns of the pose, three of the shutter, the residual.
 
     Args:
         problem, linear: tracks and :func:`linearise_tracks` of them.
         noise: scale of the tracks' ``shape``.
-        turn: whether it has columns; (B, 7, 2, N) without.
+        shutter_rate: whether the shutter rate has columns; (B, 7, 2, N) without.
 
     Gradient: to ``linear`` and noise. Raises ValueError for wrong shapes.
     """
     check("whitened_residuals", u=(linear.u, "B 7 N"), noise=(noise, "B N"))
-    return _rows(linear, _sphere(linear.fixed, noise), shutter_rate)
+    return _whitened_rows(linear, _noise_factors(linear.fixed, noise), shutter_rate)
 
 
-def _rows(linear: LinearisedTracks, sphere: tuple[Tensor, Tensor, Tensor], shutter_rate: bool) -> Tensor:
-    m0, m1 = (m[:, None] for m in _whitener(linear, sphere))
+def _whitened_rows(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor], shutter_rate: bool) -> Tensor:
+    m0, m1 = (m[:, None] for m in _whitener(linear, factors))
     rows = m0 * linear.u[:, :, None] + m1 * linear.v[:, :, None]
     if not shutter_rate:
         return rows
@@ -244,37 +246,35 @@ def squared_residuals(
     linear: LinearisedTracks,
     noise: Tensor,  # (B, N) px²
 ) -> Tensor:
-    """Squared length (B, N) of the whitened residuals; :data:`BEHIND_CAMERA_RESIDUAL` for points not in front of camera
-    1.
+    """Squared length (B, N) of the whitened residuals; :data:`BEHIND_CAMERA_RESIDUAL` for points behind camera 1.
 
     Gradient: as :func:`whitened_residuals`. Raises ValueError for wrong shapes.
     """
     check("squared_residuals", u=(linear.u, "B n N"), noise=(noise, "B N"))
-    return _lengths(linear, _sphere(linear.fixed, noise))
+    return _squared_lengths(linear, _noise_factors(linear.fixed, noise))
 
 
 def squared_residuals_at(problem: PoseDepthProblem, at: Unknowns) -> Callable[[Tensor], tuple[Tensor, Tensor]]:
-    """:func:`squared_residuals` at one place as a function of the noise (B, N) px², and which tracks are in front (B,
-    N).
+    """:func:`squared_residuals` at fixed unknowns as a function of noise (B, N) px², with the tracks in front (B, N).
 
     Gradient: as :func:`whitened_residuals`.
     """
     known = track_constants(problem)
 
-    kept: LinearisedTracks | None = None
+    linearised: LinearisedTracks | None = None
 
     def linear() -> LinearisedTracks:
-        nonlocal kept
-        kept = linearise_tracks(problem, at, columns=False, known=known) if kept is None else kept
-        return kept
+        nonlocal linearised
+        linearised = linearise_tracks(problem, at, columns=False, known=known) if linearised is None else linearised
+        return linearised
 
-    def found(noise: Tensor) -> tuple[Tensor, Tensor]:
-        return _squares(*_track_tensors(problem, known, _sphere(known, noise), at), linear=linear)
+    def evaluate(noise: Tensor) -> tuple[Tensor, Tensor]:
+        return _squares(*_track_tensors(problem, known, _noise_factors(known, noise), at), linear=linear)
 
-    return found
+    return evaluate
 
 
-#: Dtypes of what the kernels read, in the order of :func:`_track_tensors`.
+#: Dtypes of the kernels' inputs, in the order of :func:`_track_tensors`.
 _TRACK_DTYPES = {
     name: torch.bool if name == "near" else torch.float32
     for name in (
@@ -287,42 +287,41 @@ _TRACK_DTYPES = {
 
 
 def _track_tensors(
-    problem: PoseDepthProblem, known: TrackConstants, sphere: tuple[Tensor, Tensor, Tensor], at: Unknowns
+    problem: PoseDepthProblem, known: TrackConstants, factors: tuple[Tensor, Tensor, Tensor], at: Unknowns
 ) -> tuple[Tensor | None, ...]:
-    """Tracks and unknowns, as the operators on them take them."""
-    return problem.ray, problem.inverse, problem.near, *known, *sphere, at.T.R, at.T.t, at.shutter_rate
+    """Tracks and unknowns as the argument tuple of the operators below."""
+    return problem.ray, problem.inverse, problem.near, *known, *factors, at.T.R, at.T.t, at.shutter_rate
 
 
 def _kernel_arguments(*tensors: Any) -> tuple[Tensor, ...]:
-    """The same for a C++ operator: unknowns contiguous, a turn of shape (0, 3) where there is none."""
+    """The same tuple for a C++ operator: unknowns contiguous, shutter rate of shape (0, 3) where there is none."""
     *tracks, R, t, shutter_rate = tensors
-    turn = t.new_empty(0, 3) if shutter_rate is None else shutter_rate.contiguous()
-    return *tracks, R.contiguous(), t.contiguous(), turn
+    rate = t.new_empty(0, 3) if shutter_rate is None else shutter_rate.contiguous()
+    return *tracks, R.contiguous(), t.contiguous(), rate
 
 
 def _has_whole_lanes(ray: Tensor, *_: Tensor | None, **__: Any) -> bool:
-    """Whether there are as many tracks as a kernel's vectors divide."""
+    """Whether the number of tracks is a multiple of the kernel's vector width."""
     return ray.shape[-1] % SUM_LANES == 0
 
 
 def _squares_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks]) -> tuple[Tensor, Tensor]:
-    given = _kernel_arguments(*tensors)
-    square, front = torch.empty_like(given[1]), torch.empty_like(given[2])
+    kernel_args = _kernel_arguments(*tensors)
+    square, front = torch.empty_like(kernel_args[1]), torch.empty_like(kernel_args[2])
     limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
-    torch.ops.dhtorch.squared_residuals.default(*given, square, front, *limits)
+    torch.ops.dhtorch.squared_residuals.default(*kernel_args, square, front, *limits)
     return square, front
 
 
 @operator(kernel=_squares_kernel, dtypes=_TRACK_DTYPES, any_layout=("R", "t", "shutter_rate"), when=_has_whole_lanes)
 def _squares(*tensors: Any, linear: Callable[[], LinearisedTracks]) -> tuple[Tensor, Tensor]:
-    """Squared whitened residuals (B, N) of :func:`_track_tensors`, which are ``linear`` there, and which tracks are in
-    front."""
+    """Squared whitened residuals (B, N) of :func:`_track_tensors` linearised as ``linear``, and tracks in front."""
     tracks, (a, b, d) = linear(), tensors[8:11]
-    return _lengths(tracks, (a, b, d)), tracks.front
+    return _squared_lengths(tracks, (a, b, d)), tracks.front
 
 
-def _lengths(linear: LinearisedTracks, sphere: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-    m0, m1 = _whitener(linear, sphere)
+def _squared_lengths(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    m0, m1 = _whitener(linear, factors)
     return _square(linear, m0 * linear.u[:, -1:] + m1 * linear.v[:, -1:])
 
 
@@ -336,13 +335,13 @@ def pose_normal_equations(
     kernel: str | None,
     bend: float,
 ) -> NormalEquations:
-    """Cost and normal equations (n = 9) of near tracks with weight 1, far tracks with ``far_weight``, turns near zero.
+    """Cost and normal equations (n = 9): near tracks weigh 1, far tracks ``far_weight``, shutter rate prior at zero.
 
     Args:
-        problem, at, noise: as in :func:`linearise_tracks` and :func:`whitened_residuals`. Without a turn n = 6.
-        far_weight: of a far track's robust cost; 0 leaves them out.
-        shutter_precision: of the turn around zero; a huge one holds it there.
-        kernel, bend: robust kernel of a whitened residual and where it bends, see ``least_squares.robust``.
+        problem, at, noise: as in :func:`linearise_tracks` and :func:`whitened_residuals`. Without a shutter rate n = 6.
+        far_weight: of a far track's robust cost; 0 leaves far tracks out.
+        shutter_precision: of the shutter rate's prior at zero; a huge one fixes it there.
+        kernel, bend: robust kernel of a whitened residual and where it bends, see ``least_squares.robust_loss``.
 
     Gradient: as :func:`whitened_residuals`. Raises ValueError for wrong shapes or an unknown kernel.
     """
@@ -358,24 +357,25 @@ def pose_normal_equations_at(
     kernel: str | None,
     bend: float,
 ) -> tuple[Callable[[Unknowns], NormalEquations], Callable[[Unknowns], Tensor]]:
-    """:func:`pose_normal_equations` as a function of the unknowns, and its cost (B,) alone, the same bits; for several
-    places.
+    """:func:`pose_normal_equations` as a function of the unknowns, and its cost (B,) alone with the same bits.
 
     Gradient: as :func:`whitened_residuals`.
     """
     known = track_constants(problem)
-    sphere = _sphere(known, noise)
+    factors = _noise_factors(known, noise)
     share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
 
-    def total(cost: Tensor, shutter_rate: Tensor | None) -> Tensor:
+    def total_cost(cost: Tensor, shutter_rate: Tensor | None) -> Tensor:
         return cost if shutter_rate is None else cost + shutter_precision * (shutter_rate * shutter_rate).sum(-1)
 
     def with_prior(cost: Tensor, H: Tensor, g: Tensor, shutter_rate: Tensor | None) -> NormalEquations:
         if shutter_rate is None:
             return NormalEquations(cost, H, g)
         precision = shutter_prior(shutter_precision.to(g.dtype))
-        towards = torch.cat((torch.zeros_like(g[:, :6]), shutter_rate), -1)
-        return NormalEquations(total(cost, shutter_rate), H + torch.diag_embed(precision), g + precision * towards)
+        deviation = torch.cat((torch.zeros_like(g[:, :6]), shutter_rate), -1)
+        return NormalEquations(
+            total_cost(cost, shutter_rate), H + torch.diag_embed(precision), g + precision * deviation
+        )
 
     robust = kernel, bend
 
@@ -383,15 +383,15 @@ def pose_normal_equations_at(
         def linear() -> LinearisedTracks:
             return linearise_tracks(problem, at, known=known)
 
-        tensors = _track_tensors(problem, known, sphere, at)
+        tensors = _track_tensors(problem, known, factors, at)
         return with_prior(*_equations(*tensors, share, linear=linear, robust=robust), at.shutter_rate)
 
     def cost(at: Unknowns) -> Tensor:
         def linear() -> LinearisedTracks:
             return linearise_tracks(problem, at, columns=False, known=known)
 
-        tensors = _track_tensors(problem, known, sphere, at)
-        return total(_robust_cost(*tensors, share, linear=linear, robust=robust), at.shutter_rate)
+        tensors = _track_tensors(problem, known, factors, at)
+        return total_cost(_robust_cost(*tensors, share, linear=linear, robust=robust), at.shutter_rate)
 
     return normal, cost
 
@@ -401,19 +401,19 @@ _Robust = tuple[str | None, float]
 
 
 def _is_geman_mcclure(ray: Tensor, *_: Tensor | None, linear: Callable[[], LinearisedTracks], robust: _Robust) -> bool:
-    """Whether the compiled kernels have the robust kernel, and as many tracks as their vectors divide."""
+    """Whether the compiled kernels implement the robust kernel and divide the number of tracks."""
     return robust[0] == "geman_mcclure" and _has_whole_lanes(ray)
 
 
 def _sum_tracks(*tensors: Any, bend: float, with_equations: bool) -> NormalEquations:
     *tracks, share = tensors
-    given = _kernel_arguments(*tracks)
+    kernel_args = _kernel_arguments(*tracks)
     B = len(share) if with_equations else 0
-    n = 9 if len(given[-1]) else 6
-    found = NormalEquations(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
+    n = 9 if len(kernel_args[-1]) else 6
+    equations = NormalEquations(share.new_empty(len(share)), share.new_empty(B, n, n), share.new_empty(B, n))
     limits = NEAREST_DEPTH_DIVISOR, BEHIND_CAMERA_RESIDUAL, MIN_DEPTH
-    torch.ops.dhtorch.pose_normal_equations.default(*given, share, *found, bend, *limits)
-    return found
+    torch.ops.dhtorch.pose_normal_equations.default(*kernel_args, share, *equations, bend, *limits)
+    return equations
 
 
 def _equations_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> NormalEquations:
@@ -427,9 +427,9 @@ def _equations_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks], rob
     when=_is_geman_mcclure,
 )
 def _equations(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> NormalEquations:
-    """Cost, H and g of :func:`_track_tensors` and the share (B, N) of each in the cost, before any prior."""
+    """Cost, H and g of :func:`_track_tensors` with the weight ``share`` (B, N) of each track, before any prior."""
     tracks, (a, b, d), shutter_rate, share = linear(), tensors[8:11], tensors[-2], tensors[-1]
-    rows = _rows(tracks, (a, b, d), shutter_rate is not None)
+    rows = _whitened_rows(tracks, (a, b, d), shutter_rate is not None)
     rho, weight = robust_loss(_square(tracks, rows[:, -1]), *robust)
     H, g = normal_equations(rows, torch.where(tracks.front, weight * share, 0.0), block=SUM_LANES)
     return NormalEquations((rho * share).sum(-1), H, g)
@@ -447,7 +447,7 @@ def _robust_cost_kernel(*tensors: Any, linear: Callable[[], LinearisedTracks], r
 )
 def _robust_cost(*tensors: Any, linear: Callable[[], LinearisedTracks], robust: _Robust) -> Tensor:
     """The cost (B,) of :func:`_equations` alone."""
-    square = _lengths(linear(), tensors[8:11])
+    square = _squared_lengths(linear(), tensors[8:11])
     return (robust_loss(square, *robust)[0] * tensors[-1]).sum(-1)
 
 
@@ -457,16 +457,16 @@ def _square(linear: LinearisedTracks, r: Tensor) -> Tensor:
 
 
 def shutter_prior(shutter_precision: Tensor) -> Tensor:
-    """Information (B, 9) that is there before any track: none on the pose."""
+    """Diagonal (B, 9) of the prior's information matrix: zero for the pose, the precision for the shutter rate."""
     zero = torch.zeros_like(shutter_precision)
     return torch.stack((*[zero] * 6, *[shutter_precision] * 3), -1)
 
 
 def _inverse_depth(a: Tensor, t: Tensor, line: Tensor, seen: Tensor, shape: Tensor) -> Tensor:
-    """Maximum-likelihood q (B, N) of a track without depth: its pixel, moved onto the epipolar line along the noise.
+    """Maximum-likelihood q (B, N) of a track without depth: its pixel is moved onto the epipolar line along the noise.
 
-    ``a`` (B, 3, N) is the reference view's ray turned into camera 1, ``line`` = t × a. Negative where the rays part; 0
-    without baseline.
+    ``a`` (B, 3, N) is the reference view's ray rotated into camera 1, ``line`` = t × a. Negative where the rays
+    diverge; 0 without baseline.
     """
     n, last = line[:, :2], line[:, 2]
     m = shape[:, :2] * n[:, :1] + shape[:, 1:] * n[:, 1:]
@@ -476,34 +476,34 @@ def _inverse_depth(a: Tensor, t: Tensor, line: Tensor, seen: Tensor, shape: Tens
     return -(p * d).sum(1) / (d * d).sum(1).clamp_min(1e-24)
 
 
-def _sphere(known: TrackConstants, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """a, b, d (B, N) of L⁻¹ = [[a, 0], [−b d, d]], which makes the noise S = L Lᵀ of a track round."""
+def _noise_factors(known: TrackConstants, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """a, b, d (B, N) of L⁻¹ = [[a, 0], [−b d, d]], which whitens the noise S = L Lᵀ of a track."""
     xx, xy, yy = (known.shape * noise[:, None]).unbind(1)
     b = xy / xx
     return xx.rsqrt(), b, (yy - b * xy).rsqrt()
 
 
-def _whitener(linear: LinearisedTracks, sphere: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+def _whitener(linear: LinearisedTracks, factors: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """The columns (B, 2, N) of a matrix M with MᵀM = (S + variance s sᵀ)⁻¹, singular where the variance is infinite.
 
-    With S = L Lᵀ the whitened slope e = L⁻¹ s is a vector of the plane. Only the residual along it depends on q: of its
-    weight, 1 / (1 + |e|² variance) is left. M turns e to the first axis and scales that.
+    With S = L Lᵀ the whitened slope e = L⁻¹ s is a vector of the plane. Only the residual along it depends on q: its
+    weight is multiplied by 1 / (1 + |e|² variance). M rotates e to the first axis and scales that axis.
     """
-    a, b, d = sphere
+    a, b, d = factors
     s0, s1 = linear.slope.unbind(1)
     e0, e1 = a * s0, d * (s1 - b * s0)
     square = e0 * e0 + e1 * e1
-    flat, free = square < 1e-12, linear.free
-    if any_possible(flat):  # there the pixel does not depend on q, and any axis will do
-        unit = square.masked_fill(flat, 1.0).rsqrt()
-        e0, e1 = (e0 * unit).masked_fill(flat, 1.0), (e1 * unit).masked_fill(flat, 0.0)
-        free = free & ~flat
+    no_slope, free = square < 1e-12, linear.free
+    if any_possible(no_slope):  # there the pixel does not depend on q, and any axis serves
+        unit = square.masked_fill(no_slope, 1.0).rsqrt()
+        e0, e1 = (e0 * unit).masked_fill(no_slope, 1.0), (e1 * unit).masked_fill(no_slope, 0.0)
+        free = free & ~no_slope
     else:
         unit = square.rsqrt()
         e0, e1 = e0 * unit, e1 * unit
-    left = (1 + square * linear.fixed.variance).rsqrt().masked_fill(free, 0.0)
-    left0, left1, bd = left * e0, left * e1, b * d
+    scale = (1 + square * linear.fixed.variance).rsqrt().masked_fill(free, 0.0)
+    scale0, scale1, bd = scale * e0, scale * e1, b * d
     return (
-        torch.stack((left0 * a - left1 * bd, -e1 * a - e0 * bd), 1),
-        torch.stack((left1 * d, e0 * d), 1),
+        torch.stack((scale0 * a - scale1 * bd, -e1 * a - e0 * bd), 1),
+        torch.stack((scale1 * d, e0 * d), 1),
     )
