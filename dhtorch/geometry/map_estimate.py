@@ -1,4 +1,4 @@
-"""The most probable pose of near and far tracks, and how well it is known: steps, noise, choices, covariance.
+"""Most probable pose of near and far tracks with its covariance: noise scale, accepted parameters, sandwich estimate.
 
 Alphabet: that of :mod:`dhtorch.geometry.reprojection_problem`; ``noise`` (B, N) px² is the scale of each track's noise;
 ``psi`` = w r a residual after its robust weight w, in standard deviations.
@@ -38,25 +38,44 @@ from dhtorch.geometry.reprojection_problem import (
 )
 from dhtorch.geometry.se3 import Pose
 
-#: Standard deviations of a residual coordinate, px, that are believed.
-MIN_NOISE_PX, MAX_NOISE_PX = 0.1, 5.0
+#: Least estimated standard deviation of a residual coordinate, px.
+#: Source: origin not recorded.
+MIN_NOISE_PX = 0.1
 
-#: Medians of |r| / sigma for normal noise: of a vector of two coordinates, and of one coordinate.
-MEDIAN_2D, MEDIAN_1D = 1.17741, 0.67449
+#: Largest estimated standard deviation of a residual coordinate, px.
+#: Source: origin not recorded.
+MAX_NOISE_PX = 5.0
 
-#: Precision (1/rad²) of a turn that is held at zero.
+#: Median of |r| / sigma for normal noise in two coordinates, without unit.
+#: Source: derived, sqrt(2 ln 2), the median of a Rayleigh distribution.
+MEDIAN_2D = 1.17741
+
+#: Median of |r| / sigma for normal noise in one coordinate, without unit.
+#: Source: derived, the upper quartile of the standard normal distribution.
+MEDIAN_1D = 0.67449
+
+#: Precision (1/rad²) of the prior that fixes a shutter rate at zero.
+#: Source: origin not recorded.
 GLOBAL_SHUTTER_PRECISION = 1e18
 
-#: Parameters that a pose takes from its residuals.
+#: Degrees of freedom that a pose takes from its residuals, a count.
+#: Source: derived, 3 of rotation + 3 of translation.
 N_POSE_PARAMETERS = 6
 
-#: Least believed ratio of mean psi′ to mean w: residuals all beyond the bend would make it negative.
+#: Least ratio of mean psi′ to mean w, without unit: residuals all beyond the bend would make it negative.
+#: Source: origin not recorded.
 MIN_PSI_SLOPE = 0.1
 
-#: Nearest parts of the near tracks that alone may show a translation, and how many tracks make such a part.
-NEAREST_FRACTIONS, MIN_FRACTION_TRACKS = (0.25, 0.5), 20
+#: Fractions of the near tracks, nearest first, that alone may show a translation, without unit.
+#: Source: origin not recorded.
+NEAREST_FRACTIONS = (0.25, 0.5)
 
-#: Cost (in units of its variance) that may be gained or lost without being asked why.
+#: Least number of tracks in such a fraction.
+#: Source: origin not recorded.
+MIN_FRACTION_TRACKS = 20
+
+#: Limits cost differences that count as none, in variances of a residual.
+#: Source: origin not recorded.
 COST_SLACK = 1.0
 
 
@@ -104,79 +123,78 @@ class FitOptions:
 
 
 class MapSolution(NamedTuple):
-    """The unknowns at the optimum, and the weights under which it is one."""
+    """The unknowns at the optimum, and the noise and weights of the cost that they minimise."""
 
-    at: Unknowns  # with a turn, zero where none was believed
+    at: Unknowns  # with a shutter rate, zero where none was accepted
     noise: Tensor  # (B, N) px²
-    far_weight: Tensor  # (B,) 0 where far tracks were not believed
+    far_weight: Tensor  # (B,) 0 where far tracks were not accepted
     shutter_precision: Tensor  # (B,) 1/rad²
     translates: Tensor  # (B,) bool, a pure rotation does not explain the tracks
 
 
 @torch.no_grad()
 def estimate_map_pose(problem: PoseDepthProblem, start: Pose, o: FitOptions) -> MapSolution:
-    """Solve for the near tracks, then for all, then for all with a turn; go on only where that is borne out.
+    """Most probable unknowns of a problem from a start pose: near tracks first, then all, then all with a shutter rate.
 
-    *Far tracks* are believed unless the near tracks' robust cost rises by more than ``max_rise`` with them. A *turn* is
-    believed where it takes away more than ``shutter_gain`` of the whole cost, a *translation* where it takes away more
-    than ``translation_gain`` of the cost of the best pure rotation. More parameters always fit better; by how much they
-    do without need is a matter of systematic errors, which no number of tracks averages out: hence shares. Returns from
-    far away move little and lose little: their number dilutes the share. So a translation is also believed where the
-    nearest part of the near tracks shows it, the others counting as if they had no return.
+    *Far tracks* are accepted unless they raise the near tracks' robust cost by more than ``max_rise``. A *shutter rate*
+    is accepted where it lowers the whole cost by more than the fraction ``shutter_gain``, a *translation* where it
+    lowers the cost of the best pure rotation by more than ``translation_gain``. More parameters always fit better; how
+    much better without need depends on systematic errors, which no number of tracks averages out: hence fractions.
+    Distant returns move little and gain little: their number dilutes the fraction. So a translation is also accepted
+    where the nearest fraction of the near tracks shows it, the others weighing as if they had no return.
 
     Raises:
         ValueError: wrong shapes, an unknown kernel.
 
-    Cost: ``near_steps`` + 3.5 ``steps`` evaluations of the tracks that are used. Their number apart, nothing depends on
-    values.
+    Cost: ``near_steps`` + 3.5 ``steps`` evaluations of the used tracks. Only their number depends on values.
     """
-    whole, (problem, close) = problem, _used_first(problem)
+    full_problem, (problem, near_problem) = problem, _compact_problems(problem)
     at = Unknowns(start, None)
-    straight = torch.zeros_like(start.t)
-    none, far, rigid = (torch.full_like(start.t[:, 0], x) for x in (0.0, o.far_weight, GLOBAL_SHUTTER_PRECISION))
+    zero_rate = torch.zeros_like(start.t)
+    no_far, far, rigid = (torch.full_like(start.t[:, 0], x) for x in (0.0, o.far_weight, GLOBAL_SHUTTER_PRECISION))
 
     def solve(
         at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, steps: int, problem: PoseDepthProblem = problem
     ) -> tuple[Unknowns, Tensor]:
-        evaluate, judge = pose_normal_equations_at(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
-        return minimise(evaluate, at, steps, cost=judge, step=trial_unknowns_step)
+        evaluate, cost = pose_normal_equations_at(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
+        return minimise(evaluate, at, steps, cost=cost, step=trial_unknowns_step)
 
     half = o.near_steps // 2
-    near, _ = solve(at, estimate_noise_variance(close, at), none, rigid, half, close)
-    near, _ = solve(near, estimate_noise_variance(close, near), none, rigid, o.near_steps - half, close)
+    near, _ = solve(at, estimate_noise_variance(near_problem, at), no_far, rigid, half, near_problem)
+    near, _ = solve(near, estimate_noise_variance(near_problem, near), no_far, rigid, o.near_steps - half, near_problem)
     both, _ = solve(near, estimate_noise_variance(problem, near), far, rigid, o.steps)
     noise, precision = estimate_noise_variance(problem, both), rigid
     if o.shutter_sigma > 0:
-        both, least = solve(both, noise, far, rigid, o.steps // 2)
-        both = both._replace(shutter_rate=straight)
-        loose = torch.full_like(rigid, o.shutter_sigma**-2)
-        turned, lower = solve(both, noise, far, loose, o.steps)
-        worth = least - lower > o.shutter_gain * least + COST_SLACK
-        both, precision = select_batch(worth, turned, both), torch.where(worth, loose, rigid)
-    near = near._replace(shutter_rate=straight)
-    both = both if o.shutter_sigma > 0 else both._replace(shutter_rate=straight)
-    scales = noise[:, : close.near.shape[1]]
-    cost_near, cost_both = (_near_cost(close, x, scales, o) for x in (near, both))
-    believed = cost_both <= cost_near * (1 + o.max_rise) + COST_SLACK
-    at, precision = select_batch(believed, both, near), torch.where(believed, precision, rigid)
-    far = torch.where(believed, far, none)
+        both, rigid_cost = solve(both, noise, far, rigid, o.steps // 2)
+        both = both._replace(shutter_rate=zero_rate)
+        prior = torch.full_like(rigid, o.shutter_sigma**-2)
+        rolling, shutter_cost = solve(both, noise, far, prior, o.steps)
+        has_shutter = rigid_cost - shutter_cost > o.shutter_gain * rigid_cost + COST_SLACK
+        both, precision = select_batch(has_shutter, rolling, both), torch.where(has_shutter, prior, rigid)
+    near = near._replace(shutter_rate=zero_rate)
+    both = both if o.shutter_sigma > 0 else both._replace(shutter_rate=zero_rate)
+    near_noise = noise[:, : near_problem.near.shape[1]]
+    cost_near, cost_both = (_near_cost(near_problem, x, near_noise, o) for x in (near, both))
+    accept_far = cost_both <= cost_near * (1 + o.max_rise) + COST_SLACK
+    at, precision = select_batch(accept_far, both, near), torch.where(accept_far, precision, rigid)
+    far = torch.where(accept_far, far, no_far)
     noise = estimate_noise_variance(problem, at)
     translates = _translates(problem, at, noise, far, precision, o)
     of_near, of_far = (torch.where(kind, noise, 0.0).amax(-1, keepdim=True) for kind in (~problem.far, problem.far))
-    noise = torch.where(whole.far, of_far, of_near.clamp_min(MIN_NOISE_PX**2))
+    noise = torch.where(full_problem.far, of_far, of_near.clamp_min(MIN_NOISE_PX**2))
     return MapSolution(at, noise, far, precision, translates)
 
 
-def _used_first(problem: PoseDepthProblem) -> tuple[PoseDepthProblem, PoseDepthProblem]:
-    """The used tracks and the near tracks, each problem as wide as its fullest pair needs; near tracks come first."""
+def _compact_problems(problem: PoseDepthProblem) -> tuple[PoseDepthProblem, PoseDepthProblem]:
+    """Problems of the used tracks and of the near tracks, as wide as the pair with most tracks; near tracks first."""
     if is_static(problem.near):
         return problem, problem
     used = problem.near | problem.far
     order = (used.to(torch.uint8) + problem.near.to(torch.uint8)).argsort(dim=1, descending=True, stable=True)
 
-    def some(wanted: Tensor) -> PoseDepthProblem:
-        most = int(wanted.sum(1).max())
-        index = order[:, : round_up(most, SUM_LANES)]
+    def compact(kept: Tensor) -> PoseDepthProblem:
+        width = int(kept.sum(1).max())
+        index = order[:, : round_up(width, SUM_LANES)]
 
         def pick(x: Tensor) -> Tensor:
             return x.gather(-1, index.view(len(x), *[1] * (x.ndim - 2), -1).expand(*x.shape[:-1], -1))
@@ -184,50 +202,49 @@ def _used_first(problem: PoseDepthProblem) -> tuple[PoseDepthProblem, PoseDepthP
         planes = {k: pick(getattr(problem, k)) for k in ("ray", "uv", "inverse", "variance", "shape", "near", "far")}
         return problem.replace(**planes)
 
-    return some(used), some(problem.near)
+    return compact(used), compact(problem.near)
 
 
 def _translates(
     problem: PoseDepthProblem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: FitOptions
 ) -> Tensor:
     """Whether (B,) the cost is far below that of the best rotation without translation, under the same noise."""
+    free = noise.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # the least t would be a baseline for a far track
 
-    free = noise.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # a trace of t would be a baseline to a far track
-
-    normal, judge = pose_normal_equations_at(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
+    normal, cost_at = pose_normal_equations_at(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
 
     def evaluate(at: Unknowns) -> NormalEquations:
-        there, H, g = normal(at)
-        return NormalEquations(there, H * free * free[:, None] + torch.diag(1 - free), g * free)
+        cost, H, g = normal(at)
+        return NormalEquations(cost, H * free * free[:, None] + torch.diag(1 - free), g * free)
 
-    still = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.shutter_rate)
-    turned, rotation = minimise(evaluate, still, o.steps, cost=judge, step=trial_unknowns_step)
-    shown = rotation - judge(at) > o.translation_gain * rotation + COST_SLACK
-    if all_known(shown):
-        return shown
-    costs = [_costs(problem, x, noise, o) for x in (turned, at)]
-    for part in NEAREST_FRACTIONS:
-        nearest = _nearest(problem, part)
-        share = torch.where(nearest, 1.0, torch.where(problem.near | problem.far, far[:, None], 0.0))
-        without, found = ((each * share).sum(-1) for each in costs)
-        better = without - found > o.translation_gain * without + COST_SLACK
-        shown = shown | (better & (nearest.sum(-1) >= MIN_FRACTION_TRACKS))
-    return shown
+    rotation_start = Unknowns(Pose(at.T.R, torch.zeros_like(at.T.t)), at.shutter_rate)
+    rotation_only, rotation_cost = minimise(evaluate, rotation_start, o.steps, cost=cost_at, step=trial_unknowns_step)
+    translates = rotation_cost - cost_at(at) > o.translation_gain * rotation_cost + COST_SLACK
+    if all_known(translates):
+        return translates
+    costs = [_costs(problem, x, noise, o) for x in (rotation_only, at)]
+    for fraction in NEAREST_FRACTIONS:
+        in_nearest = _nearest_tracks(problem, fraction)
+        weight = torch.where(in_nearest, 1.0, torch.where(problem.near | problem.far, far[:, None], 0.0))
+        without_translation, with_translation = ((track_costs * weight).sum(-1) for track_costs in costs)
+        improves = without_translation - with_translation > o.translation_gain * without_translation + COST_SLACK
+        translates = translates | (improves & (in_nearest.sum(-1) >= MIN_FRACTION_TRACKS))
+    return translates
 
 
-def _nearest(problem: PoseDepthProblem, part: float) -> Tensor:
-    """The near tracks (B, N) of the shortest depth, ``part`` of all, and those just as deep."""
+def _nearest_tracks(problem: PoseDepthProblem, fraction: float) -> Tensor:
+    """The near tracks (B, N) of the least depth, ``fraction`` of all, and those of equal depth."""
     inverse = torch.where(problem.near, problem.inverse, 0.0)
-    last = (problem.near.sum(-1, keepdim=True) * part).ceil().long().sub(1).clamp_min(0)
+    last = (problem.near.sum(-1, keepdim=True) * fraction).ceil().long().sub(1).clamp_min(0)
     return problem.near & (inverse >= inverse.sort(-1, descending=True).values.gather(-1, last))
 
 
 @torch.no_grad()
 def estimate_noise_variance(problem: PoseDepthProblem, at: Unknowns, rounds: int = 3) -> Tensor:
-    """Variance (B, N) px² of a residual coordinate, estimated from medians; one for the near, one for the far tracks.
+    """Variance (B, N) px² of a residual coordinate from medians; one for the near, one for the far tracks of a pair.
 
-    Medians know nothing of the scale that the sensor's noise adds to a near residual; so the estimate is repeated with
-    what the last one found.
+    Medians do not contain the scale that the sensor's noise adds to a near residual; so the estimate is repeated with
+    the previous one.
     """
     noise = torch.ones_like(problem.inverse)
     square_of = squared_residuals_at(problem, at)
@@ -244,13 +261,13 @@ def estimate_noise_variance(problem: PoseDepthProblem, at: Unknowns, rounds: int
 
 @torch.no_grad()
 def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOptions) -> tuple[Tensor, Tensor]:
-    """Covariance (B, 9, 9) of (rotation, translation, turn), and ``ok`` (B,); zero where not ok.
+    """Covariance (B, 9, 9) of (rotation, translation, shutter rate), and ``ok`` (B,); zero where not ok.
 
     Neither the far weight nor a robust weight is an inverse variance, so this is the sandwich A⁻¹ M A⁻¹ of an
-    M-estimator: A = Σ ω ψ′ Jᵀ S⁻¹ J is how steeply the equations rise, M = Σ ω² ψ² Jᵀ S⁻¹ J how much they scatter, with
-    the inverse depths eliminated from both. ψ′ and ψ² are taken as means over each kind of track, so residuals that
-    are heavier in their tails than assumed widen the answer. A turn that was not believed is not known to be none:
-    wherever one may be, it is as free here as its prior says.
+    M-estimator: A = Σ ω ψ′ Jᵀ S⁻¹ J is the slope of the equations, M = Σ ω² ψ² Jᵀ S⁻¹ J their scatter, with the inverse
+    depths eliminated from both. ψ′ and ψ² are taken as means over each kind of track, so residuals with heavier tails
+    than assumed enlarge the covariance. A shutter rate that was not accepted is still unknown: it has its prior's
+    freedom here.
 
     Source: P. Huber, "Robust Statistics", 1981, section 7.6.
     """
@@ -267,16 +284,16 @@ def pose_covariance(problem: PoseDepthProblem, solution: MapSolution, o: FitOpti
     rows = whitened_residuals(problem, linear, solution.noise).double()
     A, _ = normal_equations(rows, bread.double(), block=SUM_LANES)
     M, _ = normal_equations(rows, meat.double(), block=SUM_LANES)
-    free = o.shutter_sigma**-2 if o.shutter_sigma > 0 else GLOBAL_SHUTTER_PRECISION
-    known = torch.diag_embed(shutter_prior(torch.full_like(solution.shutter_precision, free).double()))
-    A, M = A + known, M + known
+    precision = o.shutter_sigma**-2 if o.shutter_sigma > 0 else GLOBAL_SHUTTER_PRECISION
+    prior = torch.diag_embed(shutter_prior(torch.full_like(solution.shutter_precision, precision).double()))
+    A, M = A + prior, M + prior
     inverse, ok = solve_spd(A, torch.eye(9, dtype=A.dtype, device=A.device).expand_as(A))
     whole = small_matmul(small_matmul(inverse, M), inverse)
     return 0.5 * (whole + whole.transpose(1, 2)), ok
 
 
 def _costs(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOptions) -> Tensor:
-    """Robust cost (B, N) of every track, of weight 1."""
+    """Robust cost (B, N) of every track with weight 1."""
     square, _ = squared_residuals_at(problem, at)(noise)
     return robust_loss(square, o.kernel, o.bend)[0]
 
@@ -289,8 +306,8 @@ def _near_cost(problem: PoseDepthProblem, at: Unknowns, noise: Tensor, o: FitOpt
 def _rise_and_scatter(square: Tensor, weight: Tensor, used: Tensor, size: int, o: FitOptions) -> tuple[Tensor, Tensor]:
     """mean psi′ / mean w and mean psi² / mean w² (B,) of the used tracks, whose residuals have ``size`` coordinates.
 
-    Both are corrected for the freedom that the pose takes from few residuals, the scatter once for itself and once for
-    the scale of the noise, which comes from the same residuals.
+    Both are corrected for the degrees of freedom that the pose takes from few residuals, the scatter once for itself
+    and once for the noise scale, which is estimated from the same residuals.
     """
     steeper = robust_weight_slope(square, o.kernel, o.bend) * square * (2 / size) + weight
 
