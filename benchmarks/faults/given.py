@@ -56,7 +56,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "conventions.motion_from_axes(_read_pose(leaves, name, T[1], place, unit, checks), M)",
             "_read_pose(leaves, name, T[1], place, unit, checks)",
         ),
-        ("match_refuted_poses", "here & (matched == 0)", "here"),
+        ("match_refuted_poses", "refuted & (matched == 0)", "refuted"),
         ("_read_pose", "x[:, :3, 3] * unit", "x[:, :3, 3]"),
         ("_read_pose", "det < 0", "det < -2"),
         ("_read_pose", "~(last < 1e-6)", "(last > 2)"),

@@ -173,10 +173,10 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "transforms.validate_depth": [
         ("ValidateDepth.__init__", "not map_unit > 0", "not map_unit"),
-        ("ValidateDepth.forward", "stack([verdict, seen])", "stack([seen, seen])"),
-        ("ValidateDepth._map", "planes[:, 0] * self.map_unit", "planes[:, 0]"),
-        ("_validation_keys", "& there", ""),
+        ("ValidateDepth.forward", "stack([validation, with_source])", "stack([with_source, with_source])"),
+        ("ValidateDepth._read_map", "planes[:, 0] * self.map_unit", "planes[:, 0]"),
+        ("_validation_keys", "& has_depth", ""),
         ("_validation_keys", "value.isfinite().all(-1)", "value.isfinite().any(-1)"),
-        ("_validation_keys", "verdict.clip_depth.isfinite()", "verdict.clip_depth > 0"),
+        ("_validation_keys", "clip_depth.isfinite()", "clip_depth > 0"),
     ],
 }

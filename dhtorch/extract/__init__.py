@@ -1,10 +1,10 @@
-"""Features of a whole data set, written once: ``dhtorch extract`` and what reads it back.
+"""Features of a whole data set, computed once and stored: ``dhtorch extract`` and its reader.
 
 dhtorch extract data=lerobot data.root=PATH data.gap=5 out=features workers=8
 
-Every recording is an episode, every frame a row: ``plan`` numbers the rows, ``rows`` makes one (with
-:class:`dhtorch.transforms.ExtendDepth`), ``engines`` say where, ``columns`` and ``shards`` write Parquet files, and
-``features`` reads them for a data loader.
+Every recording is an episode, every frame a row: ``plan`` numbers the rows, ``dataset`` computes one (with
+:class:`dhtorch.transforms.ExtendDepth`), ``engines`` run it on workers or a cluster, ``columns`` and ``shards`` write
+Parquet files, and ``features`` reads them for a data loader.
 """
 
 from __future__ import annotations
@@ -32,51 +32,51 @@ from dhtorch.transforms.tokens import FIT_MODES
 
 __all__ = ["ExtractOptions", "FeatureTable", "JoinedDataset", "run"]
 
-#: Of the files: raised when a reader of older ones would be wrong.
+#: Version of the file format, increased by every change that an older reader would misread.
 _FORMAT_VERSION = 1
 
-#: ExtractOptions that change where and how fast rows are made, and no row.
+#: ExtractOptions that change where and how fast rows are computed, but not the rows.
 _OPTIONS_NOT_IN_KEY = ("engine", "address")
 
-#: Frames that cannot be read, named in the report.
+#: Maximum number of unreadable frames that the summary names.
 _MAX_COMPLAINTS_SHOWN = 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExtractOptions:
-    """What to extract, where it is made, and how it is stored.
+    """Options of ``dhtorch extract``: what to extract, where to compute it, how to store it.
 
     Raises:
-        ValueError: an option that cannot be.
+        ValueError: an invalid option.
     """
 
     engine: str = "local"  # local: this machine; ray: a cluster, through Ray Data
-    address: str | None = None  # of the Ray cluster; None = one that is started here
-    gap: int | str | None = plan.AUTO_GAP  # auto = chosen among earlier frames; else frames back, 0 = front end alone
+    address: str | None = None  # of the Ray cluster; None = start one on this machine
+    gap: int | str | None = plan.AUTO_GAP  # auto = view selection among earlier frames; 0 = front end only
     patch: int = 14  # px
-    tokens_hw: Sequence[int] = (224, 224)  # size of the network's picture: with it all rows have one shape
-    fit: str = "stretch"  # how the picture is brought to that size
-    dense: bool | Mapping[str, Any] = False  # maps of every pixel: True, or options as ExtendDepth takes them
-    on_error: str = "raise"  # a frame that cannot be read: raise, skip, or flag = zeros and a problem
-    columns: Sequence[str] | None = None  # to write; None = all
+    tokens_hw: Sequence[int] = (224, 224)  # size of the network's input: gives all rows one shape
+    fit: str = "stretch"  # how the image is resized to that size
+    dense: bool | Mapping[str, Any] = False  # dense maps: True, or options as of ExtendDepth
+    on_error: str = "raise"  # an unreadable frame: raise, skip, or flag = zeros and a problem code
+    columns: Sequence[str] | None = None  # columns to write; None = all
     half: bool = False  # depths, scores, maps and tokens as float16
-    shard_rows: int = 512  # of one file: what a kill loses at most
+    shard_rows: int = 512  # rows per file: the most that an interruption loses
 
     def __post_init__(self) -> None:
-        for name, known in {"engine": engines.ENGINES, "on_error": ON_ERROR_CHOICES, "fit": FIT_MODES}.items():
-            if getattr(self, name) not in known:
-                raise ValueError(f"extract.{name}: found {getattr(self, name)!r}, expected one of {', '.join(known)}")
+        for name, choices in {"engine": engines.ENGINES, "on_error": ON_ERROR_CHOICES, "fit": FIT_MODES}.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(f"extract.{name}: found {getattr(self, name)!r}, expected one of {', '.join(choices)}")
         for name, low in {"gap": 0, "patch": 1, "shard_rows": 1}.items():
             value = getattr(self, name)
             if not (isinstance(value, int) and value >= low) and not (name == "gap" and value in (None, plan.AUTO_GAP)):
                 raise ValueError(f"extract.{name}: found {value!r}, expected a whole number of at least {low}")
-        DenseMaps.asked(self.dense, "extract.dense")
+        DenseMaps.from_options(self.dense, "extract.dense")
         if not (isinstance(self.tokens_hw, Sequence) and len(self.tokens_hw) == 2):
             raise ValueError(f"extract.tokens_hw: found {self.tokens_hw!r}, expected height and width")
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Callable[..., Iterable[Any]]) -> int:
-    """``dhtorch extract``: write the shards of ``out`` that are not there yet.
+    """``dhtorch extract``: scenes, method and options -> missing shards in ``out``; returns the exit code.
 
     Args:
         settings: ``out``, ``workers``, ``seed``, ``choices`` and the groups' options, as plain values.
@@ -86,60 +86,63 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
     Raises:
         ValueError, OSError, ImportError: bad options or data, a folder that cannot be written or belongs to another
             extraction, a library that is missing.
-        KeyboardInterrupt: Ctrl-C; what is finished stays.
+        KeyboardInterrupt: Ctrl-C; finished shards stay.
     """
     options: ExtractOptions = parts["extract"]
     import_optional("pyarrow.parquet", extra="scale")
     if not isinstance(settings["workers"], int) or settings["workers"] < 0:
         raise ValueError(f"workers: found {settings['workers']!r}, expected a whole number of at least 0")
     scenes = scenes_of(parts["data"])
-    whole = plan.make_plan(scenes, options.gap, parts["method"].views)
-    rows = _make_rows(scenes, whole, parts["method"], settings["seed"], options)
+    extraction_plan = plan.make_plan(scenes, options.gap, parts["method"].views)
+    rows = _make_rows(scenes, extraction_plan, parts["method"], settings["seed"], options)
     folder = _make_folder(settings["out"])
     with file_lock.acquire_file_lock(folder / ".lock", f"out: {folder}"):
-        shards.remove_unfinished(folder)  # what a killed run left there
-        return _write_shards(settings, options, whole, rows, folder, progress)
+        shards.remove_unfinished(folder)  # left by an interrupted run
+        return _write_shards(settings, options, extraction_plan, rows, folder, progress)
 
 
 def _write_shards(
     settings: Mapping[str, Any],
     options: ExtractOptions,
-    whole: plan.ExtractionPlan,
+    extraction_plan: plan.ExtractionPlan,
     rows: RowDataset,
     folder: Path,
     progress: Callable[..., Iterable[Any]],
 ) -> int:
-    """The shards that are not there yet; the exit code."""
-    shared = _shared_metadata(settings, options, whole, rows)
-    every = whole.shards(options.shard_rows)
+    """Compute and write the missing shards; returns the exit code."""
+    shared = _shared_metadata(settings, options, extraction_plan, rows)
+    all_shards = extraction_plan.shards(options.shard_rows)
     done = shards.find_finished_shards(folder, shared)
     counts = dict(done)
-    todo = [shard for shard in every if shard.name not in done]
+    todo = [shard for shard in all_shards if shard.name not in done]
     positions = [position for shard in todo for position in shard.rows]
     complaints: list[str] = []
     engine = engines.run_engine(options.engine, rows, positions, workers=settings["workers"], address=options.address)
     try:
-        with closing(progress(engine, format_count(len(whole), "frame"), len(positions))) as answers:  # type: ignore[type-var]
+        with closing(progress(engine, format_count(len(extraction_plan), "frame"), len(positions))) as answers:  # type: ignore[type-var]
             for shard in todo:
                 kept = engines.filter_rows(islice(answers, len(shard.rows)), options.on_error, rows, complaints)
                 counts[shard.name] = shards.write_shard(folder, shard, kept, rows.wanted, shared)
     except KeyboardInterrupt:
-        whole_ones = f"{len(counts)} of {format_count(len(every), 'shard')} in {folder} are whole and stay"
-        raise KeyboardInterrupt(f"{whole_ones}; the same command does the rest") from None
+        finished = f"{len(counts)} of {format_count(len(all_shards), 'shard')} in {folder} are complete and stay"
+        raise KeyboardInterrupt(f"{finished}; run the same command again for the rest") from None
     _print_summary(folder, counts, len(done), complaints)
     return 0
 
 
 def _make_rows(
-    scenes: Sequence[Scene], whole: plan.ExtractionPlan, method: Method, seed: int, options: ExtractOptions
+    scenes: Sequence[Scene], extraction_plan: plan.ExtractionPlan, method: Method, seed: int, options: ExtractOptions
 ) -> RowDataset:
+    """Scenes, plan and options -> data set of rows with the selected columns."""
     hw = (int(options.tokens_hw[0]), int(options.tokens_hw[1]))
-    rows, across = token_grid(hw, patch=options.patch, tokens_hw=hw)
-    every = columns.feature_columns(method.n, rows * across, half=options.half, map_hw=_map_hw(scenes, options))
+    token_rows, token_columns = token_grid(hw, patch=options.patch, tokens_hw=hw)
+    all_columns = columns.feature_columns(
+        method.n, token_rows * token_columns, half=options.half, map_hw=_map_hw(scenes, options)
+    )
     return RowDataset(
         scenes,
-        whole,
-        columns.select_columns(every, options.columns),
+        extraction_plan,
+        columns.select_columns(all_columns, options.columns),
         method=method,
         gap=options.gap,
         seed=seed,
@@ -151,64 +154,69 @@ def _make_rows(
 
 
 def _map_hw(scenes: Sequence[Scene], options: ExtractOptions) -> tuple[int, int] | None:
-    """Size of the maps, where there is a column of one: all pictures must then have one shape."""
-    asked = DenseMaps.asked(options.dense, "extract.dense")
+    """Height and width of the maps; None if no column holds one. Maps require images of one size."""
+    maps = DenseMaps.from_options(options.dense, "extract.dense")
     dense = {spec.key for spec in schema.COLUMNS if spec.option == "dense"}
-    named = options.columns is None or not dense.isdisjoint(options.columns)
-    return common_map_hw(scenes, asked) if asked is not None and named else None
+    has_map_column = options.columns is None or not dense.isdisjoint(options.columns)
+    return common_map_hw(scenes, maps) if maps is not None and has_map_column else None
 
 
 def _shared_metadata(
-    settings: Mapping[str, Any], options: ExtractOptions, whole: plan.ExtractionPlan, rows: RowDataset
+    settings: Mapping[str, Any], options: ExtractOptions, extraction_plan: plan.ExtractionPlan, rows: RowDataset
 ) -> dict[str, Any]:
-    """Metadata of all shards: what the columns mean and where they come from."""
-    asked = {k: v for k, v in asdict(options).items() if k not in _OPTIONS_NOT_IN_KEY}
-    config = {**{k: settings[k] for k in ("data", "method", "seed")}, "extract": asked}
-    files = {**result_files.list_files_below(whole.roots), **result_files.list_files_named(config)}
+    """Metadata shared by all shards: meaning of the columns, settings, data, versions and key."""
+    key_options = {k: v for k, v in asdict(options).items() if k not in _OPTIONS_NOT_IN_KEY}
+    config = {**{k: settings[k] for k in ("data", "method", "seed")}, "extract": key_options}
+    files = {**result_files.list_files_below(extraction_plan.roots), **result_files.list_files_named(config)}
     name, digest = settings["choices"]["data"], result_files.compute_data_digest(files)
-    made = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
-    found: dict[str, Any] = storage.to_strict_json(
+    run_metadata = result_files.collect_run_metadata(device="cpu", dtype="float32", threads=1, seed=settings["seed"])
+    metadata: dict[str, Any] = storage.to_strict_json(
         {
             "format": _FORMAT_VERSION,
-            "version": made["versions"]["dhtorch"],
-            "git": made["git"],
-            "versions": made["versions"],
+            "version": run_metadata["versions"]["dhtorch"],
+            "git": run_metadata["git"],
+            "versions": run_metadata["versions"],
             "key": result_files.compute_result_key(
                 {**config, "name": name, "format": _FORMAT_VERSION}, digest, roots=[RowDataset.__module__]
             ),
             "config": result_files.make_portable(config),
-            "data": {"name": name, "digest": digest, "recordings": len(whole.episodes), "frames": len(whole)},
+            "data": {
+                "name": name,
+                "digest": digest,
+                "recordings": len(extraction_plan.episodes),
+                "frames": len(extraction_plan),
+            },
             "columns": {k: c._asdict() for k, c in rows.wanted.items()},
             "codes": columns.code_tables(),
             "channels": TOKEN_CHANNELS,
             "grid": token_grid(rows.options["tokens_hw"], patch=options.patch),
         }
     )
-    return found
+    return metadata
 
 
 def _make_folder(out: str) -> Path:
-    """The folder of the shards, made where it is missing."""
+    """Option ``out`` -> folder of the shards, created if missing."""
     folder = Path(str(out)).expanduser()
     if folder.exists() and not folder.is_dir():
-        raise NotADirectoryError(f"out: {folder} is a file, expected a folder, or a place for one")
+        raise NotADirectoryError(f"out: {folder} is a file, expected a folder or a new path")
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
 def _print_summary(folder: Path, counts: Mapping[str, Counter[str]], n_before: int, complaints: Sequence[str]) -> None:
-    """What is there now, and what was wrong with frames."""
+    """Print the number of shards and rows, their size, and the problems of frames."""
     total = sum(counts.values(), Counter())
     skipped = total.pop("skipped", 0)
     size = sum(file.stat().st_size for file in shards.shard_files(folder))
     before = f" ({n_before} left untouched)" if n_before else ""
     rows = format_count(total.total(), "row")
     print(f"{folder}: {format_count(len(counts), 'shard')}{before}, {rows}, {size / 1e6:.1f} MB")
-    said = [
+    problems = [
         f"{n} {name.replace('_', ' ')}" for name, n in (*total.items(), ("skipped", skipped)) if n and name != "none"
     ]
-    if said:
-        print(f"frames with a problem: {', '.join(said)}")
+    if problems:
+        print(f"frames with a problem: {', '.join(problems)}")
     for complaint in complaints[:_MAX_COMPLAINTS_SHOWN]:
         print(f"  {complaint}")
     if len(complaints) > _MAX_COMPLAINTS_SHOWN:

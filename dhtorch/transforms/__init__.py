@@ -1,4 +1,4 @@
-"""dhtorch inside a data loader: :class:`ExtendDepth` takes a sample dict and returns it with what the depth tells.
+"""dhtorch inside a data loader: :class:`ExtendDepth` maps a sample dict to the same dict plus far depth.
 
 transform = ExtendDepth(image="observation.images.wrist", depth="observation.depth.wrist", depth_unit="mm")
 dataset = ExtendedDataset(dataset, transform)

@@ -1,10 +1,10 @@
-"""The transform in other people's pipelines: each adapter fits a hook that exists there, and imports nothing of theirs.
+"""Adapters of the transform to the hooks of LeRobot, openpi, OpenVLA and torchvision, without importing them.
 
-LeRobot hands samples out one by one, map-style or as a stream: :class:`ExtendedDataset`, :class:`ExtendedStream` wrap
-the data set (its own ``image_transforms`` sees one picture and no depth). openpi calls ``dict → dict`` with numpy
-leaves: :class:`NumpyTransform`. OpenVLA calls ``batch_transform`` on an RLDS frame and then a collator that knows its
-keys: :class:`RldsBatchTransform`, :class:`AddedCollate`. In ``torchvision.transforms.v2.Compose`` the transform itself
-stands as it is, before anything that crops: a crop would not move the intrinsics.
+LeRobot returns samples one by one, map-style or as a stream: :class:`ExtendedDataset`, :class:`ExtendedStream` wrap
+the data set (its own ``image_transforms`` gets one image and no depth). openpi calls ``dict → dict`` with numpy
+leaves: :class:`NumpyTransform`. OpenVLA calls ``batch_transform`` on an RLDS frame and then a collator for its own
+keys: :class:`RldsBatchTransform`, :class:`AddedCollate`. In ``torchvision.transforms.v2.Compose`` the transform is used
+directly, before any crop: a crop would not adapt the intrinsics.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from dhtorch.transforms.collate import collate_shared, pack_shared
 from dhtorch.transforms.extend_depth import ExtendDepth
 from dhtorch.transforms.sample_access import SampleError, drop_keys, get_value, has_key, to_tensor
 
-#: Neighbours asked for the shapes of a sample that could not be loaded.
+#: Maximum distance of the neighbour whose shapes replace those of an item that cannot be loaded.
 _MAX_NEIGHBOURS_TRIED = 16
 
 
 class _DatasetWrapper:
-    """What a wrapper does not know itself, its data set does."""
+    """Base of wrappers: attributes that the wrapper lacks are those of the data set."""
 
     dataset: Any
 
@@ -38,23 +38,23 @@ class _DatasetWrapper:
 
 
 class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
-    """A map-style data set whose items went through the transform; everything else is the data set's own.
+    """Map-style data set -> the same data set with the transform applied to its items; other attributes are delegated.
 
-    With ``gap`` the other view is the item so many places before, of the same episode; it is put under the
-    transform's ``other_image`` while the transform runs. Where an episode has no such item the front end runs alone.
+    With ``gap`` the source view is the item ``gap`` places earlier in the same episode; it is added under the
+    transform's ``other_image`` while the transform runs. Without such an item only the front end runs.
 
-    A corrupt item, whose loading raises, is treated as the transform's ``on_error`` says: with ``flag`` it is replaced
-    by zeros in the shapes of a neighbour, and its ``problem`` is UNREADABLE.
+    A corrupt item, whose loading raises, is treated by the transform's ``on_error``: with ``flag`` it is replaced by
+    zeros in the shapes of a neighbour, and its ``problem`` is UNREADABLE.
 
     Args:
         dataset: ``dataset[i]`` is a dict.
         transform: for single samples; with ``by_batch`` for batches.
-        gap: places from the other view to the reference view; None = the sample itself holds both.
-        episode_key: key of a number that items of one episode share; None = there is one episode.
-        by_batch: items stay as they are, and :meth:`collate`, then needed as the loader's ``collate_fn``, extends the
-            whole batch in the worker: the same bits in less time.
-        consumed: keys among those that the transform reads, of which nobody has a use afterwards (the depth, the other
-            view): items and batches come without them, so that no worker copies them into shared memory.
+        gap: items from the source view to the reference view; None = the sample itself holds both.
+        episode_key: key of the episode number; None = there is one episode.
+        by_batch: items stay unchanged, and :meth:`collate`, then required as the loader's ``collate_fn``, transforms
+            the whole batch in the worker: the same bits in less time.
+        consumed: keys read by the transform that are not needed afterwards (the depth, the source view): they are
+            dropped from items and batches, so that no worker copies them into shared memory.
 
     Raises:
         ValueError: a gap without ``other_image``; a transform for batches without ``by_batch``, or with it one for
@@ -85,12 +85,12 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
         self.by_batch, self.consumed = by_batch, tuple(consumed)
         self.dataset, self.transform, self.gap, self.episode_key = dataset, transform, gap, episode_key
         views = transform.views
-        self._lent: tuple[str, ...] = (
+        self._gap_keys: tuple[str, ...] = (
             f"{views.other_image}",
             f"{views.other_image}_is_pad",
-        )  # what a gap puts in, for the transform
+        )  # keys added by a gap while the transform runs
         if views.pose is not None and views.other_pose is not None:
-            self._lent += (views.other_pose,)
+            self._gap_keys += (views.other_pose,)
 
     def __len__(self) -> int:
         return len(self.dataset)
@@ -98,72 +98,79 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
     def __getitem__(self, index: int) -> dict[str, Any] | None:
         i = range(len(self))[index]
         try:
-            sample = self._loaded(i)
+            sample = self._load(i)
             if self.by_batch:
                 return sample
-        except Exception as error:  # whatever a decoder raises; lack of memory is no property of a sample
+        except Exception as error:  # any error of a decoder; lack of memory is no property of a sample
             if self.transform.on_error == "raise" or isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
-            zeros = {} if self.transform.on_error == "skip" else self._zeros_like_neighbour(i, error)
-            out = self.transform.left_out(zeros, SampleError(f"item {i} cannot be loaded: {error}"))
-            return self._returned(out)
-        return self._returned(self.transform(sample))
+            blank = {} if self.transform.on_error == "skip" else self._zeros_like_neighbour(i, error)
+            out = self.transform.left_out(blank, SampleError(f"item {i} cannot be loaded: {error}"))
+            return self._drop_internal(out)
+        return self._drop_internal(self.transform(sample))
 
     def collate(self, samples: Sequence[Any]) -> dict[str, Any]:
-        """One batch, collated as torch does, with ``by_batch`` then extended as a whole; skipped samples are left out,
-        as :func:`collate_kept` does. From a worker what was added comes as views of one piece of shared memory."""
+        """Samples -> batch by torch's default collate, with ``by_batch`` then transformed as a whole.
+
+        Skipped samples are left out as by :func:`collate_kept`. In a worker the added tensors are views of one block
+        of shared memory.
+        """
         if not self.by_batch:
             skips = self.transform.on_error == "skip"
             return (collate_kept if skips else collate_shared)(samples, self.transform.prefix)
-        return pack_shared(self._extended(samples), self.transform.prefix)
+        return pack_shared(self._transform_batch(samples), self.transform.prefix)
 
-    def _extended(self, samples: Sequence[Any]) -> dict[str, Any]:
-        """A whole batch of samples that the transform has not seen."""
-        # In a worker torch collates into memory that it shares: page by page a new one, several times as slow.
-        gone = {key: _collect_key(samples, key) for key in self.consumed if has_key(samples[0], key)}
+    def _transform_batch(self, samples: Sequence[Any]) -> dict[str, Any]:
+        """Samples not yet transformed -> transformed batch."""
+        # In a worker torch collates into new shared memory, which is several times slower: consumed keys avoid that.
+        consumed = {key: _collect_key(samples, key) for key in self.consumed if has_key(samples[0], key)}
         views = self.transform.views
-        own = {key: torch.stack(found) for key, found in gone.items() if key != views.depth}
-        if views.depth in gone:
-            own[views.in_metres] = views.metres(gone[views.depth])
-        batch = default_collate([drop_keys(sample, gone) for sample in samples] if gone else list(samples))
-        return self._returned(self.transform({**batch, **own} if own else batch)) or {}
+        stacked = {key: torch.stack(values) for key, values in consumed.items() if key != views.depth}
+        if views.depth in consumed:
+            stacked[views.metric_depth_key] = views.metres(consumed[views.depth])
+        batch = default_collate([drop_keys(sample, consumed) for sample in samples] if consumed else list(samples))
+        return self._drop_internal(self.transform({**batch, **stacked} if stacked else batch)) or {}
 
-    def _returned(self, out: dict[str, Any] | None) -> dict[str, Any] | None:
-        """Without what a gap lent, and what was consumed."""
-        gone = (*self.consumed, self.transform.views.in_metres) if self.consumed else ()
-        gone = gone if self.gap is None else (*gone, *self._lent)
-        return drop_keys(out, gone) if out is not None and gone else out
+    def _drop_internal(self, out: dict[str, Any] | None) -> dict[str, Any] | None:
+        """Drop the keys that a gap added, and the consumed keys."""
+        dropped = (*self.consumed, self.transform.views.metric_depth_key) if self.consumed else ()
+        dropped = dropped if self.gap is None else (*dropped, *self._gap_keys)
+        return drop_keys(out, dropped) if out is not None and dropped else out
 
-    def _loaded(self, i: int) -> dict[str, Any]:
-        """The item, with the other view where it comes from another item."""
+    def _load(self, i: int) -> dict[str, Any]:
+        """Item ``i``, with ``gap`` plus the source view from an earlier item."""
         sample = self.dataset[i]
         if self.gap is None:
             return sample
         earlier = self.dataset[i - self.gap] if i >= self.gap else sample
         same = i >= self.gap and self._episode(earlier) == self._episode(sample)
         views, source = self.transform.views, earlier if same else sample
-        found = [get_value(source, views.image), torch.tensor([not same])]
-        if len(self._lent) > len(found):
-            found.append(get_value(source, str(views.pose)))
-        return {**sample, **dict(zip(self._lent, found, strict=True))}
+        values = [get_value(source, views.image), torch.tensor([not same])]
+        if len(self._gap_keys) > len(values):
+            values.append(get_value(source, str(views.pose)))
+        return {**sample, **dict(zip(self._gap_keys, values, strict=True))}
 
     def _episode(self, sample: Mapping[str, Any]) -> int:
         return 0 if self.episode_key is None else int(get_value(sample, self.episode_key))
 
     def _zeros_like_neighbour(self, i: int, error: Exception) -> dict[str, Any]:
-        """Zeros in the shapes of the nearest item that can be loaded."""
+        """Zeros in the shapes of the nearest item that can be loaded.
+
+        Raises:
+            SampleError: no neighbour within the maximum distance can be loaded.
+        """
         for k in (i + sign * step for step in range(1, _MAX_NEIGHBOURS_TRIED) for sign in (1, -1)):
             if not 0 <= k < len(self):
                 continue
             try:
                 return {key: _zeros_like(value) for key, value in self.dataset[k].items()}
             except Exception:
-                continue  # as corrupt as the first
+                continue  # corrupt as well
         raise SampleError(f"neither item {i} nor its neighbours can be loaded: {error}") from error
 
 
 class ExtendedStream(_DatasetWrapper, IterableDataset[Any]):
-    """An iterable data set whose samples went through the transform; skipped ones are left out of the stream."""
+    """Iterable data set -> transformed samples; skipped ones are left out of the stream."""
 
     def __init__(self, dataset: Iterable[Any], transform: Callable[[Any], dict[str, Any] | None]) -> None:
         self.dataset, self.transform = dataset, transform
@@ -176,13 +183,13 @@ class ExtendedStream(_DatasetWrapper, IterableDataset[Any]):
 
 
 class NumpyTransform:
-    """openpi's ``DataTransformFn``: the same dict → dict, what is added as numpy arrays."""
+    """openpi's ``DataTransformFn``: dict → dict, with the added values as numpy arrays."""
 
     def __init__(self, transform: ExtendDepth) -> None:
         self.transform = transform
 
     def __call__(self, data: Mapping[str, Any]) -> dict[str, Any]:
-        """The dict with our keys. Raises SampleError where the transform would skip: openpi knows no None."""
+        """Sample -> copy with the added keys. Raises SampleError instead of skipping: openpi does not accept None."""
         out = self.transform(data)
         if out is None:
             raise SampleError("a sample cannot be skipped here: use on_error='flag'")
@@ -190,37 +197,37 @@ class NumpyTransform:
 
 
 class RldsBatchTransform:
-    """OpenVLA's ``batch_transform``: the given one, and what ours adds to the same frame."""
+    """OpenVLA's ``batch_transform`` plus the keys that the transform adds to the same frame."""
 
     def __init__(self, batch_transform: Callable[[Any], Mapping[str, Any]], transform: ExtendDepth) -> None:
         self.batch_transform, self.transform = batch_transform, transform
 
     def __call__(self, rlds_batch: Mapping[str, Any]) -> dict[str, Any]:
-        """The given transform's dict with our keys."""
+        """RLDS frame -> dict of the wrapped ``batch_transform`` plus the added keys."""
         out = self.transform(rlds_batch)
         if out is None:
             raise SampleError("a sample cannot be skipped here: use on_error='flag'")
-        mine = {k: v for k, v in out.items() if k.startswith(self.transform.prefix)}
-        return {**self.batch_transform(rlds_batch), **mine}
+        added = {k: v for k, v in out.items() if k.startswith(self.transform.prefix)}
+        return {**self.batch_transform(rlds_batch), **added}
 
 
 class AddedCollate:
-    """A collator that knows its own keys only, and the stacked keys that the transform added."""
+    """A collator for fixed keys, extended by the stacked keys that the transform added."""
 
     def __init__(self, collate: Callable[[Sequence[Any]], Mapping[str, Any]], prefix: str = "dhtorch.") -> None:
         self.collate, self.prefix = collate, prefix
 
     def __call__(self, instances: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        """One batch."""
-        mine = [{k: v for k, v in one.items() if k.startswith(self.prefix)} for one in instances]
-        return {**self.collate(instances), **collate_shared(mine, self.prefix)}
+        """Samples -> batch."""
+        added = [{k: v for k, v in sample.items() if k.startswith(self.prefix)} for sample in instances]
+        return {**self.collate(instances), **collate_shared(added, self.prefix)}
 
 
 def collate_kept(samples: Sequence[dict[str, Any] | None], prefix: str = "dhtorch.") -> dict[str, Any]:
-    """torch's default collate without the samples that were skipped; ``dhtorch.skipped`` tells how many.
+    """Samples, None if skipped -> batch by torch's default collate; ``dhtorch.skipped`` counts the skipped ones.
 
-    A batch of which every sample was skipped holds nothing but that number. From a worker what begins with ``prefix``
-    comes as views of one piece of shared memory.
+    A batch whose samples were all skipped holds only that number. In a worker the tensors under keys with ``prefix``
+    are views of one block of shared memory.
     """
     kept = [sample for sample in samples if sample is not None]
     skipped = torch.tensor(len(samples) - len(kept))
@@ -228,25 +235,25 @@ def collate_kept(samples: Sequence[dict[str, Any] | None], prefix: str = "dhtorc
 
 
 def one_thread(worker: int = 0) -> None:
-    """One thread for torch and OpenCV: the ``worker_init_fn`` of a data loader. Workers are the parallelism there.
+    """Set one thread for torch and OpenCV: the ``worker_init_fn`` of a data loader, whose workers run in parallel.
 
-    A worker also keeps what it frees, where that can be asked for
-    (:func:`dhtorch.runtime.allocator.disable_malloc_trim`): its next batch asks for the same memory.
+    Where supported, a worker also keeps freed memory (:func:`dhtorch.runtime.allocator.disable_malloc_trim`), because
+    its next batch needs as much.
     """
     torch.set_num_threads(1)
     disable_malloc_trim()
     opencv = sys.modules.get("cv2")
     if opencv is not None:
-        opencv.setNumThreads(0)  # 1 would wait for the threads of the pool, which a forked worker does not have
+        opencv.setNumThreads(0)  # 1 would wait for the threads of the pool, which do not exist in a forked worker
 
 
 def _collect_key(samples: Sequence[Any], key: str) -> list[torch.Tensor]:
-    """What lies under a key of each sample."""
+    """Values of a key in all samples, as tensors."""
     return [to_tensor(get_value(sample, key), key, signed=False) for sample in samples]
 
 
 def _zeros_like(value: Any) -> Any:
-    """Nothing, in the shape and type of a value."""
+    """Value -> zeros of the same structure, shape and type."""
     if isinstance(value, Mapping):
         return {k: _zeros_like(v) for k, v in value.items()}
     if isinstance(value, str | bytes):

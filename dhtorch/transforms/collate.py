@@ -1,8 +1,8 @@
-"""What the transform adds to a batch leaves a worker in one piece of shared memory.
+"""Collate samples so that the tensors added to a batch leave a worker in one block of shared memory.
 
-Each tensor that a worker returns is otherwise a piece of its own, which the system has to make and for which the main
-process has to ask the worker, while that is at its next batch: seventeen times a batch, however little they hold. The
-keys are views of the piece: whoever keeps one of them keeps all.
+Otherwise each tensor that a worker returns is a shared-memory file of its own, whose handle the main process requests
+from the worker while that computes its next batch: seventeen times a batch, whatever their size. The keys are views of
+the block: keeping one of them keeps all.
 """
 
 from __future__ import annotations
@@ -16,45 +16,45 @@ import torch
 from torch import Tensor
 from torch.utils.data import default_collate, get_worker_info
 
-#: Bytes at whose multiples tensors begin, as vectors and caches like them.
+#: Alignment of the tensors in the block, bytes: vector registers and cache lines.
 _ALIGNMENT_BYTES = 64
 
 
 def collate_shared(samples: Sequence[Mapping[str, Any]], prefix: str) -> dict[str, Any]:
-    """torch's default collate; in a worker tensors under keys that begin with ``prefix`` (B, …) lie in one piece.
+    """Samples -> batch by torch's default collate; in a worker tensors under keys with ``prefix`` share one block.
 
-    Raises RuntimeError where the shapes of samples differ, KeyError where a sample lacks a key, as that does.
+    Raises RuntimeError if the shapes of samples differ, KeyError if a sample lacks a key, as the default collate does.
     """
-    mine = _shareable_tensors(samples[0], prefix)
-    if not mine:
+    shareable = _shareable_tensors(samples[0], prefix)
+    if not shareable:
         return default_collate(list(samples))
-    batch = default_collate([{k: v for k, v in sample.items() if k not in mine} for sample in samples])
-    for key, place in _allocate_shared(mine, len(samples)).items():
+    batch = default_collate([{k: v for k, v in sample.items() if k not in shareable} for sample in samples])
+    for key, place in _allocate_shared(shareable, len(samples)).items():
         batch[key] = torch.stack([sample[key] for sample in samples], out=place)
     return batch
 
 
 def pack_shared(batch: dict[str, Any], prefix: str) -> dict[str, Any]:
-    """A batch whose tensors under keys that begin with ``prefix`` lie in one piece, in a worker; elsewhere itself."""
-    mine = _shareable_tensors(batch, prefix)
-    if not mine:
+    """Batch -> batch whose tensors under keys with ``prefix`` share one block in a worker; elsewhere unchanged."""
+    shareable = _shareable_tensors(batch, prefix)
+    if not shareable:
         return batch
-    return {**batch, **{key: place.copy_(mine[key]) for key, place in _allocate_shared(mine).items()}}
+    return {**batch, **{key: place.copy_(shareable[key]) for key, place in _allocate_shared(shareable).items()}}
 
 
-def _shareable_tensors(found: Mapping[str, Any], prefix: str) -> dict[str, Tensor]:
-    """Tensors that leave a worker and can share their memory; none outside a worker."""
+def _shareable_tensors(batch: Mapping[str, Any], prefix: str) -> dict[str, Tensor]:
+    """Dense CPU tensors under keys with ``prefix``, in a worker; none outside a worker."""
     if get_worker_info() is None:
         return {}
-    own = {key: x for key, x in found.items() if key.startswith(prefix) and type(x) is Tensor}
-    return {key: x for key, x in own.items() if x.is_cpu and x.layout == torch.strided}
+    tensors = {key: x for key, x in batch.items() if key.startswith(prefix) and type(x) is Tensor}
+    return {key: x for key, x in tensors.items() if x.is_cpu and x.layout == torch.strided}
 
 
 def _allocate_shared(like: Mapping[str, Tensor], *front: int) -> dict[str, Tensor]:
-    """Empty tensors of the shapes (``front``, …) and types of others, one after the other in one shared piece."""
+    """Tensors -> empty tensors of shape (``front``, …) and the same dtypes, consecutive in one shared block."""
     shapes = {key: (*front, *x.shape) for key, x in like.items()}
     sizes = [math.prod(shapes[key]) * x.element_size() for key, x in like.items()]
-    begins = list(accumulate((size + -size % _ALIGNMENT_BYTES for size in sizes), initial=0))
-    piece = torch.empty(begins[-1], dtype=torch.uint8).share_memory_()
-    rows = zip(like.items(), begins[:-1], sizes, strict=True)
-    return {key: piece[at : at + size].view(x.dtype).view(shapes[key]) for (key, x), at, size in rows}
+    starts = list(accumulate((size + -size % _ALIGNMENT_BYTES for size in sizes), initial=0))
+    block = torch.empty(starts[-1], dtype=torch.uint8).share_memory_()
+    rows = zip(like.items(), starts[:-1], sizes, strict=True)
+    return {key: block[at : at + size].view(x.dtype).view(shapes[key]) for (key, x), at, size in rows}

@@ -1,5 +1,4 @@
-"""Maps of samples: a depth for every pixel of the reference view, as :func:`dhtorch.pipeline.dense.complete_depth`
-finds it."""
+"""Dense depth maps of samples, computed by :func:`dhtorch.pipeline.dense.complete_depth`."""
 
 from __future__ import annotations
 
@@ -20,49 +19,49 @@ from dhtorch.transforms.sample_spec import SampleViews
 
 @dataclass(frozen=True, eq=False)
 class DenseMaps:
-    """How maps are made: all options, and the calibration that travels with the package."""
+    """Options of the dense maps of samples, and the calibration of their sigma and score (the package's default)."""
 
     options: Mapping[str, Any]
     calibration: Calibration | None = field(default_factory=dense.default_calibration)
 
     @classmethod
-    def asked(cls, given: bool | Mapping[str, Any], name: str = "dense") -> DenseMaps | None:
-        """What ``dense=`` asks for, see :func:`dhtorch.pipeline.dense.dense_options`."""
-        options = dense.dense_options(given, name)
+    def from_options(cls, setting: bool | Mapping[str, Any], name: str = "dense") -> DenseMaps | None:
+        """Option ``dense`` -> maps, None if it is off; see :func:`dhtorch.pipeline.dense.dense_options`."""
+        options = dense.dense_options(setting, name)
         return None if options is None else cls(options)
 
     def hw(self, hw: tuple[int, int]) -> tuple[int, int]:
-        """Height and width of the map of a picture."""
+        """Image height and width -> height and width of its map."""
         return dense.map_hw(hw, self.options["size"])
 
-    def swept(self, read: SampleViews, method: Method, **asked: Any) -> DepthMap:
-        """The maps of samples of which some have a second view; the others get those of :meth:`sensed`.
+    def complete(self, read: SampleViews, method: Method, **method_args: Any) -> DepthMap:
+        """Views of B samples -> maps (B, h, w): completed where a source view exists, else :meth:`sensor_depth`.
 
         Args:
             read: the views.
             method: the sparse method.
-            asked: ``seed``, ``fit``, ``hint`` and ``trace``, as ``complete`` takes them.
+            method_args: ``seed``, ``fit``, ``hint`` and ``trace`` of ``complete_depth``.
         """
         assert read.other is not None
-        options = {**self.options, "method": method, "calibration": self.calibration, **asked}
-        found = dense.complete_depth(read.reference, read.other, **options)
+        options = {**self.options, "method": method, "calibration": self.calibration, **method_args}
+        completed = dense.complete_depth(read.reference, read.other, **options)
         if bool(read.paired.all()):
-            return found
+            return completed
         rows = torch.arange(len(read.paired), device=read.paired.device)
-        return pytree.stack([self.sensed(read.reference, method), found])[read.paired.long(), rows]
+        return pytree.stack([self.sensor_depth(read.reference, method), completed])[read.paired.long(), rows]
 
-    def sensed(self, reference: Frame, method: Method) -> DepthMap:
-        """The maps of samples without a second view: the sensor where it answers, else silence."""
+    def sensor_depth(self, reference: Frame, method: Method) -> DepthMap:
+        """Reference view -> maps (B, h, w) of the sensor's depth, other pixels unanswered."""
         return dense.sensor_depth_map(reference, method=method, size=self.options["size"])
 
 
 def zero_unanswered(found: DepthMap, values: Tensor) -> Tensor:
-    """Values (B, h, w) of a map, 0 where there is no depth. Gradient: to the values."""
+    """Values (B, h, w) of a map -> the same with 0 where it has no depth. Gradient: to the values."""
     return torch.where(found.keep, values, 0.0)
 
 
 def map_to_samples(found: DepthMap, frame: Frame, method: Method) -> tuple[MergedDepth, Tensor]:
-    """Every pixel of a map as a sample (B, h · w), and the class of its hole as the method's seats 2 and 3 name it.
+    """Depth map -> samples (B, h · w), one per pixel, and their hole classes from stages 2 and 3 of the method.
 
     Gradient: to depth and sigma.
     """

@@ -1,4 +1,4 @@
-"""Poses in samples: which key, which way round, which axes and unit; and what is said of one that is refuted.
+"""Poses in samples → pose priors: key, direction, axes and unit; warnings for poses that near returns refute.
 
 Alphabet: B samples, T frames of a sample along time.
 """
@@ -21,39 +21,39 @@ from dhtorch.records import Pose, PoseFit, PosePrior
 from dhtorch.stages import pose_prior
 from dhtorch.transforms.sample_access import SampleError, SampleReader
 
-#: What a pose in a sample maps.
+#: Accepted ``pose_kind``: the mapping that a pose in a sample represents.
 POSE_KINDS = ("world_from_cam", "1_from_0")
 
-#: A motion itself: 3x4 or 4x4 numbers.
+#: A constant relative pose: 3x4 or 4x4 numbers.
 PoseMatrix = Sequence[Sequence[float]]
 
-#: How far a stored rotation may be from one.
+#: Maximum deviation of R·Rᵀ of a stored rotation from the identity.
 _MAX_ROTATION_ERROR = 0.01
 
 
 def pose_label(pose: str | PoseMatrix) -> str:
-    """What messages call it."""
+    """Name of a pose in messages."""
     return pose if isinstance(pose, str) else "pose"
 
 
 def check_constant_pose(pose: PoseMatrix, kind: str) -> None:
-    """A motion that is the same for all samples.
+    """Check a relative pose that is the same for all samples.
 
     Raises:
-        ValueError: no 3x4 or 4x4 finite numbers, or poses in a world.
+        ValueError: no 3x4 or 4x4 finite numbers, or ``kind`` is not ``1_from_0``.
     """
     try:
         shape = np.asarray(pose, dtype=np.float64).shape
-        fine = shape in ((3, 4), (4, 4)) and bool(np.isfinite(np.asarray(pose, dtype=np.float64)).all())
+        is_valid = shape in ((3, 4), (4, 4)) and bool(np.isfinite(np.asarray(pose, dtype=np.float64)).all())
     except (TypeError, ValueError):
-        fine = False
-    if not fine or kind != "1_from_0":
-        found = f"pose_kind {kind}" if fine else repr(pose)[:60]
+        is_valid = False
+    if not is_valid or kind != "1_from_0":
+        found = f"pose_kind {kind}" if is_valid else repr(pose)[:60]
         raise ValueError(f"pose: found {found}, expected a key, or with pose_kind='1_from_0' 3x4 or 4x4 finite numbers")
 
 
 def parse_pose_sigmas(cov: str | Sequence[float] | None, name: str = "pose_cov") -> tuple[float, float] | None:
-    """The standard deviations (rad, m) of a relative pose that are stated as two numbers; ``name`` of the option.
+    """Option ``pose_cov`` -> standard deviations (rad, m) of a relative pose, None if it is unset or a key.
 
     Raises:
         ValueError: not two numbers of at least 0.
@@ -78,14 +78,14 @@ def read_pose_priors(
     unit: float,
     refine: bool,
 ) -> PosePrior:
-    """The motions (V, B) from the reference view to the other views, as samples state them.
+    """Poses in samples -> priors (V, B) of the motions from the reference view to the V source views.
 
     Args:
         leaves: the samples.
-        at: the reference view's place along time, and those of the V other views.
-        T: frames along time of the reference view's images and of the others'.
-        checks: gets what contradicts that these are poses: mask, value and text.
-        keys: of the pose, or the matrix of all; and of the other views' where it is another.
+        at: index of the reference view along time, and those of the V source views.
+        T: frames along time of the reference view's images and of the source views'.
+        checks: failed checks of the poses are appended: mask, value and message.
+        keys: key of the pose, or a constant matrix; and key of the source views' pose if it is another.
         cov, kind, axes, unit, refine: see :class:`dhtorch.transforms.SampleSpec`.
 
     Raises:
@@ -95,72 +95,72 @@ def read_pose_priors(
     """
     M, name = conventions.STATED_AXES[axes], keys[0]
     options: dict[str, Any] = {"sigma": parse_pose_sigmas(cov), "refine": refine}
-    found = []
+    priors = []
     for place in at[1]:
         if kind == "1_from_0":
             T_1_from_0 = conventions.motion_from_axes(_read_pose(leaves, name, T[1], place, unit, checks), M)
-            known = None if not isinstance(cov, str) else _read_covariance(leaves, cov, T[1], place)
-            found.append(pose_prior.make_prior(T_1_from_0, cov=known, **options))
+            pose_cov = None if not isinstance(cov, str) else _read_covariance(leaves, cov, T[1], place)
+            priors.append(pose_prior.make_prior(T_1_from_0, cov=pose_cov, **options))
             continue
         world_0 = conventions.pose_from_axes(_read_pose(leaves, name, T[0], at[0], unit, checks), M)
         world_1 = conventions.pose_from_axes(_read_pose(leaves, keys[1] or name, T[1], place, unit, checks), M)
-        known = None
+        pose_cov = None
         if isinstance(cov, str):
-            both = _read_covariance(leaves, cov, T[0], at[0]), _read_covariance(leaves, cov, T[1], place)
-            known = conventions.relative_covariance(world_1, *both)
-        found.append(pose_prior.relative_prior(world_0, world_1, cov=known, **options))
-    return stack(found).to(leaves.dtype)
+            covs = _read_covariance(leaves, cov, T[0], at[0]), _read_covariance(leaves, cov, T[1], place)
+            pose_cov = conventions.relative_covariance(world_1, *covs)
+        priors.append(pose_prior.relative_prior(world_0, world_1, cov=pose_cov, **options))
+    return stack(priors).to(leaves.dtype)
 
 
 def match_refuted_poses(fits: Sequence[PoseFit], paired: Tensor) -> Tensor:
-    """(B,) int32: which of CONVENTIONS a given pose would fit that the near returns refute; 0 = none.
+    """Pose fits -> (B,) int32 index into CONVENTIONS that a refuted pose prior would match; 0 = none.
 
     Args:
-        fits: of the source views; the first that is refuted and fits a convention counts.
-        paired: (B,) whether a sample has another view.
+        fits: of the source views; the first that is refuted and matches a convention counts.
+        paired: (B,) whether a sample has a source view.
     """
     matched = torch.zeros_like(paired, dtype=torch.int32)
     for fit in fits:
         if fit.matched_convention is not None:
-            here = paired & (fit.code == PoseCode.REFUTED)
-            matched = torch.where(here & (matched == 0), fit.matched_convention.to(matched.dtype), matched)
+            refuted = paired & (fit.code == PoseCode.REFUTED)
+            matched = torch.where(refuted & (matched == 0), fit.matched_convention.to(matched.dtype), matched)
     return matched
 
 
 def warn_refuted_poses(fits: Sequence[PoseFit], paired: Tensor, matched: Tensor, name: str) -> None:
-    """Warn where a given pose is refuted, with the conventions that it would fit.
+    """Warn of refuted pose priors, with the conventions that they would match.
 
     Args:
         fits: of the source views.
-        paired: (B,) whether a sample has another view.
-        matched: (B,) of :func:`match_refuted_poses`.
-        name: of the pose.
+        paired: (B,) whether a sample has a source view.
+        matched: (B,) from :func:`match_refuted_poses`.
+        name: of the pose in the message.
     """
     refuted = torch.zeros_like(paired)
     for fit in fits:
         refuted = refuted | (paired & (fit.code == PoseCode.REFUTED))
     if bool(refuted.any()):
-        seen = [conventions.CONVENTIONS[i] for i in sorted(set(matched[refuted].tolist())) if i]
-        like = f"; looks like {' or '.join(seen)}" if seen else ""
-        warnings.warn(f"{name}: the near returns contradict the pose{like}", stacklevel=4)
+        conventions_seen = [conventions.CONVENTIONS[i] for i in sorted(set(matched[refuted].tolist())) if i]
+        guess = f"; looks like {' or '.join(conventions_seen)}" if conventions_seen else ""
+        warnings.warn(f"{name}: the near returns contradict the pose{guess}", stacklevel=4)
 
 
 def _read_matrix(
     leaves: SampleReader, key: str | PoseMatrix, T: int, at: int, tail: tuple[tuple[int, ...], int]
 ) -> Tensor:
-    """(B, rows, columns) in float64 of one matrix per sample, or one per frame; or of one for all."""
+    """Matrix per sample, per frame, or constant -> (B, rows, columns) float64; ``tail``: accepted rows, and columns."""
     if not isinstance(key, str):
         assert leaves.like is not None
-        one = torch.as_tensor(np.asarray(key), dtype=torch.float64, device=leaves.like.device)
-        return one.expand(leaves.like.shape[0], *one.shape)
+        matrix = torch.as_tensor(np.asarray(key), dtype=torch.float64, device=leaves.like.device)
+        return matrix.expand(leaves.like.shape[0], *matrix.shape)
     x = leaves.get(key)
     rows, columns = tail
     shape = tuple(x.shape[1:])
     if x.ndim == 4 and x.shape[1] in (1, T):
         x = x[:, at if x.shape[1] > 1 else 0]
     if x.ndim != 3 or x.shape[1] not in rows or x.shape[2] != columns:
-        wanted = " or ".join(f"{r}x{columns}" for r in rows)
-        raise SampleError(f"{key}: found shape {shape}, expected {wanted}, with or without {T} in front")
+        expected = " or ".join(f"{r}x{columns}" for r in rows)
+        raise SampleError(f"{key}: found shape {shape}, expected {expected}, with or without {T} in front")
     return x.double()
 
 
@@ -173,17 +173,17 @@ def _read_pose(leaves: SampleReader, source: str | PoseMatrix, T: int, at: int, 
     x = _read_matrix(leaves, source, T, at, ((3, 4), 4))
     R = x[:, :3, :3]
     with torch.no_grad():
-        known = x.isfinite().flatten(1).all(1)  # a pose that is not known is no mistake: its pair is not answered
+        is_known = x.isfinite().flatten(1).all(1)  # an unknown pose is no error: its pair stays unanswered
         eye = torch.eye(3, dtype=R.dtype, device=R.device)
-        safe = torch.where(known[:, None, None], R, eye)
+        safe = torch.where(is_known[:, None, None], R, eye)
         det = (torch.linalg.cross(safe[:, 0], safe[:, 1]) * safe[:, 2]).sum(-1)
-        off = (safe @ safe.mT - eye).abs().flatten(1).amax(1)
+        error = (safe @ safe.mT - eye).abs().flatten(1).amax(1)
         checks.append((det < 0, det, f"{key}: the determinant is {{:.4g}}, a reflection: are the axes left-handed?"))
         checks.append(
-            (off > _MAX_ROTATION_ERROR, det, f"{key}: found no rotation (determinant {{:.4g}}), expected one in 3x3")
+            (error > _MAX_ROTATION_ERROR, det, f"{key}: found no rotation (determinant {{:.4g}}), expected one in 3x3")
         )
         if x.shape[1] == 4:
             last = (x[:, 3] - torch.tensor([0.0, 0, 0, 1]).to(x)).abs().amax(-1)
             text = f"{key}: the last row is off 0 0 0 1 by {{:.4g}}; is the matrix transposed?"
-            checks.append((known & ~(last < 1e-6), last, text))
+            checks.append((is_known & ~(last < 1e-6), last, text))
     return Pose(se3.orthonormal(R), x[:, :3, 3] * unit)

@@ -1,4 +1,4 @@
-"""The tensors behind the keys of a sample, all with the same number of dimensions whatever their layout was.
+"""Keys of a sample dict -> tensors with a fixed number of dimensions, whatever the layout of the sample.
 
 Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w depth map.
 """
@@ -16,23 +16,23 @@ from dhtorch.geometry.checks import is_transformed
 from dhtorch.geometry.least_squares import has_graph
 from dhtorch.records import Camera
 
-#: Where the numbers are: a key of the sample, or the numbers themselves, the same for every sample.
+#: Source of numbers: a key of the sample, or the numbers themselves, the same for every sample.
 KeyOrNumbers = str | Sequence[float]
 
 
-#: torch knows little of unsigned words.
+#: Unsigned dtypes for which torch has few operations -> the signed dtype they are converted to.
 _SIGNED_DTYPES = {torch.uint16: torch.int32, torch.uint32: torch.int64}
 
 
 class SampleError(ValueError):
-    """A sample cannot be read as stated; the message names the key, what was found and what was expected."""
+    """A sample does not match its specification; the message names the key, what was found and what was expected."""
 
 
 def get_value(sample: Mapping[str, Any], key: str) -> Any:
-    """The value under a key, or piece by piece in nested dicts.
+    """Sample and key -> value; a dotted key is also looked up part by part in nested dicts.
 
     Raises:
-        SampleError: there is none.
+        SampleError: the key is missing.
     """
     value = _look_up(sample, key)
     if value is _MISSING:
@@ -41,12 +41,12 @@ def get_value(sample: Mapping[str, Any], key: str) -> Any:
 
 
 def has_key(sample: Mapping[str, Any], key: str) -> bool:
-    """Whether there is a value under a key, as :func:`get_value` looks for it."""
+    """Whether a sample has a key, by the lookup of :func:`get_value`."""
     return _look_up(sample, key) is not _MISSING
 
 
 def drop_keys(sample: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
-    """A copy of a sample without what :func:`get_value` finds under some keys; nested dicts that lose it are copied."""
+    """Copy of a sample without some keys, which :func:`get_value` would find; changed nested dicts are copied too."""
     out = dict(sample)
     for key in keys:
         head, _, rest = key.replace("/", ".").partition(".")
@@ -57,7 +57,7 @@ def drop_keys(sample: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
     return out
 
 
-#: What is found under a key that is not there.
+#: Sentinel for a missing key.
 _MISSING = object()
 
 
@@ -73,10 +73,10 @@ def _look_up(sample: Mapping[str, Any], key: str) -> Any:
 
 
 def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
-    """A plain tensor of an array, a picture, numbers or a tensor of any class; unsigned words made ``signed``.
+    """Array, image, numbers or tensor of any class -> plain tensor; ``signed`` converts uint16 and uint32 to signed.
 
     Raises:
-        SampleError: it holds no numbers.
+        SampleError: the value holds no numbers.
     """
     if isinstance(value, Tensor):
         x = value.as_subclass(Tensor)
@@ -91,7 +91,7 @@ def to_tensor(value: Any, key: str, *, signed: bool = True) -> Tensor:
 
 
 def numbers_fingerprint(value: Any) -> Hashable | None:
-    """What tells numbers from others; None of what numpy does not know, or a graph or another device has."""
+    """Numbers -> hashable fingerprint of bytes, dtype and shape; None for non-numpy types, graphs, other devices."""
     if isinstance(value, Tensor) and value.dtype in (torch.float32, torch.float64) and not is_transformed():
         value = value.numpy() if value.is_cpu and not has_graph(value) else value
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "buif":
@@ -99,15 +99,15 @@ def numbers_fingerprint(value: Any) -> Hashable | None:
     return value.tobytes(), value.dtype.str, value.shape
 
 
-#: Keys of numbers that samples have one of, and collated batches one for each sample.
+#: Keys of integers: one in a sample, one per sample in a collated batch.
 _INDEX_KEYS = ("episode_index", "index", "frame_index")
 
 
 def check_sample(sample: Any, image: str, intrinsics: KeyOrNumbers, batched: bool | None) -> None:
-    """Refuse what is no sample; where ``batched`` is None also a batch, whose samples would be read as frames in time.
+    """Reject what is no sample; if ``batched`` is None also a batch, whose samples would be read as frames along time.
 
     Raises:
-        SampleError: it is no dict, or a field shows several samples; the message says what to do instead.
+        SampleError: it is no dict, or a field has one value per image; the message names the remedy.
     """
     if not isinstance(sample, Mapping):
         size = f" of shape {tuple(sample.shape)}" if hasattr(sample, "shape") else ""
@@ -120,19 +120,19 @@ def check_sample(sample: Any, image: str, intrinsics: KeyOrNumbers, batched: boo
     try:
         images = get_value(sample, image)
     except SampleError:
-        return  # said where it is read
+        return  # reported when the key is read
     n = len(images) if getattr(images, "ndim", 0) == 4 else 1
     flag = f"{image}_is_pad"
     if has_key(sample, flag) and tuple(getattr(get_value(sample, flag), "shape", ())) == (n,):
         return  # LeRobot's delta_timestamps: time
-    keys: tuple[Any, ...] = () if n < 2 else (intrinsics, *_INDEX_KEYS, *sample)
-    for key in keys:
+    candidates: tuple[Any, ...] = () if n < 2 else (intrinsics, *_INDEX_KEYS, *sample)
+    for key in candidates:
         value = sample.get(key) if isinstance(key, str) else None
         shape = tuple(getattr(value, "shape", ()))
-        texts = isinstance(value, list | tuple) and len(value) == n and all(isinstance(text, str) for text in value)
-        several = shape == (n,) and key in _INDEX_KEYS
-        if texts or several or (key == intrinsics and shape == (n, 3, 3)):
-            found = f"{n} texts" if texts else f"shape {shape}"
+        is_texts = isinstance(value, list | tuple) and len(value) == n and all(isinstance(text, str) for text in value)
+        is_index = shape == (n,) and key in _INDEX_KEYS
+        if is_texts or is_index or (key == intrinsics and shape == (n, 3, 3)):
+            found = f"{n} texts" if is_texts else f"shape {shape}"
             raise SampleError(
                 f"{key}: found {found} beside {n} pictures, expected one sample; batched=True reads {n} samples, "
                 f"batched=False one sample of {n} frames"
@@ -140,14 +140,14 @@ def check_sample(sample: Any, image: str, intrinsics: KeyOrNumbers, batched: boo
 
 
 class SampleReader:
-    """The tensors of a sample, all with B in front."""
+    """Reads the tensors of a sample or a batch, all with B in front."""
 
     def __init__(self, sample: Mapping[str, Any], batched: bool, dtype: torch.dtype) -> None:
         self.sample, self.batched, self.dtype = sample, batched, dtype
-        self.like: Tensor | None = None  # the reference view's images: everything follows their device and number
+        self.like: Tensor | None = None  # first tensor read (reference images): sets device and batch size
 
     def get(self, key: str, *, signed: bool = True) -> Tensor:
-        """(B, …) on the device of the first one asked for."""
+        """Key -> tensor (B, …) on the device of the first tensor read."""
         x = to_tensor(get_value(self.sample, key), key, signed=signed)
         x = x if self.batched else x[None]
         if self.like is None:
@@ -157,7 +157,7 @@ class SampleReader:
         return x.to(self.like.device)
 
     def images(self, key: str, layout: str | None) -> Tensor:
-        """(B, T, C, H, W), uint8 or floating."""
+        """Key of images -> (B, T, C, H, W), uint8 or floating."""
         x = self.get(key)
         if x.ndim not in (4, 5):
             shape = tuple(x.shape[1:])
@@ -176,7 +176,7 @@ class SampleReader:
         return x if x.dtype == torch.uint8 else x.to(self.dtype)
 
     def planes(self, key: str, T: int, *, signed: bool = True) -> Tensor:
-        """(B, T or 1, h, w), floating if it was, else whole."""
+        """Key of depth or confidence maps -> (B, T or 1, h, w); floats as ``dtype``, integers unchanged."""
         x = self.get(key, signed=signed)
         shape = tuple(x.shape[1:])
         if x.ndim == 3:
@@ -191,7 +191,7 @@ class SampleReader:
         return x.to(self.dtype) if x.is_floating_point() else x
 
     def numbers(self, numbers: KeyOrNumbers | None, T: int, at: int) -> Tensor | None:
-        """(B, k) of numbers given once, per sample, or per sample and frame."""
+        """Numbers for all samples, per sample, or per sample and frame -> (B, k)."""
         if numbers is None or self.like is None:
             return None
         name = numbers if isinstance(numbers, str) else "numbers"
@@ -209,18 +209,22 @@ class SampleReader:
             )
         return x.to(self.dtype)
 
-    def stated(self, numbers: KeyOrNumbers) -> Hashable | None:
-        """What tells numbers from others, so that the same ones need not be read again; None where a graph, a device or
-        a type that numpy does not know has them, and in inference mode, whose tensors are of no use outside it."""
+    def fingerprint(self, numbers: KeyOrNumbers) -> Hashable | None:
+        """Numbers -> cache key of the tensors read from them; None if they cannot be cached.
+
+        These are numbers with a graph, on another device or of a type unknown to numpy, and all in inference mode,
+        whose tensors cannot be used outside it.
+        """
         if torch.is_inference_mode_enabled():
             return None
-        own = numbers_fingerprint(get_value(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers))
-        if own is None or self.like is None:
+        value = get_value(self.sample, numbers) if isinstance(numbers, str) else np.asarray(numbers)
+        digest = numbers_fingerprint(value)
+        if digest is None or self.like is None:
             return None
-        return own, self.dtype, self.like.device, self.batched, len(self.like)
+        return digest, self.dtype, self.like.device, self.batched, len(self.like)
 
     def camera(self, numbers: KeyOrNumbers, T: int, at: int, distortion: Tensor | None) -> Camera:
-        """Camera of the frame at a place along time."""
+        """Intrinsics -> camera (B,) of the frame with index ``at`` along time."""
         x = self.numbers(numbers, T, at)
         assert x is not None
         if x.shape[1] == 4:
@@ -231,7 +235,7 @@ class SampleReader:
         return Camera(x[:, 0:5:4].contiguous(), x[:, 2:6:3].contiguous(), distortion)
 
     def pad(self, key: str, T: int) -> Tensor:
-        """(B, T) whether a frame only pads the start or end of an episode: LeRobot's ``<key>_is_pad``."""
+        """Image key -> (B, T) bool, True for frames that pad an episode: LeRobot's ``<key>_is_pad``."""
         assert self.like is not None
         name = f"{key}_is_pad"
         if not has_key(self.sample, name):
@@ -243,8 +247,8 @@ class SampleReader:
 
 
 def _list_keys(sample: Mapping[str, Any], prefix: str = "") -> list[str]:
-    found: list[str] = []
+    keys: list[str] = []
     for key, value in sample.items():
         nested = isinstance(value, Mapping)
-        found += _list_keys(value, f"{prefix}{key}.") if nested else [f"{prefix}{key}"]
-    return sorted(found)
+        keys += _list_keys(value, f"{prefix}{key}.") if nested else [f"{prefix}{key}"]
+    return sorted(keys)

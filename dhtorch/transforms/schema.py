@@ -1,7 +1,7 @@
 """The columns that :class:`dhtorch.transforms.ExtendDepth` adds to a sample, in one table.
 
-A column is one row of :data:`COLUMNS` and the function that it names. The keys of a sample, the zeros of a sample that
-cannot be read, the Parquet columns of ``dhtorch extract``, the features of ``dhtorch enrich`` and the table of keys in
+A column is one row of :data:`COLUMNS` with its function. The keys of a sample, the blank values of an unreadable
+sample, the Parquet columns of ``dhtorch extract``, the features of ``dhtorch enrich`` and the table of keys in
 the documentation are derived from it.
 
 Alphabet: B samples; of each N points, P patches of its token grid, H × W pixels of its dense map.
@@ -26,14 +26,14 @@ from dhtorch.transforms.tokens import TOKEN_CHANNELS
 
 @dataclass(frozen=True, eq=False)
 class SampleResults:
-    """What the method found in B samples: the input of every column's function."""
+    """Results of the method for B samples: the input of every column's function."""
 
     samples: Samples  # the front end, in the reference view
     merged: MergedDepth  # sensor and recovered depth
-    xyz: Tensor  # (B, N, 3) m in camera 0, of the merged depth; any value where there is none
-    estimate: Estimate | None  # None = no sample has a second view
-    fits: Sequence[PoseFit]  # of the source views, the one that stands for all last; empty without a second view
-    paired: Tensor  # (B,) bool: the sample has a second view
+    xyz: Tensor  # (B, N, 3) m in camera 0, of the merged depth; any value without a depth
+    estimate: Estimate | None  # None = no sample has a source view
+    fits: Sequence[PoseFit]  # of the source views, the overall one last; empty without a source view
+    paired: Tensor  # (B,) bool: the sample has a source view
     tokens: tuple[Tensor, Tensor]  # (B, P, channels) and (B, P) bool, of patch_tokens
     dense: DepthMap | None  # None = dense maps were not requested
     problem: Tensor  # (B,) int32, codes.SampleProblem
@@ -42,129 +42,129 @@ class SampleResults:
 class ColumnSpec(NamedTuple):
     """One column."""
 
-    key: str  # behind the prefix
+    key: str  # without the prefix
     shape: tuple[str | int, ...]  # of one sample: letters of the alphabet, or numbers
-    dtype: str  # bool, int32, or float32, which stands for the floating type of the sample's camera
+    dtype: str  # bool, int32, or float32 = the floating dtype of the sample's camera
     unit: str
     meaning: str
     compute: Callable[[SampleResults], Tensor]  # results of B samples -> (B, *shape)
     codes: type | None = None  # code table of its values
-    option: str | None = None  # of ExtendDepth without which the column is left out; None = always there
+    option: str | None = None  # of ExtendDepth that adds the column; None = always present
     half: bool = False  # float16 is exact enough to store it
     enrich: str | None = None  # file type of a map, or "numbers", in an enriched data set; None = not in it
-    unreadable: int = 0  # value in a sample that cannot be read
+    unreadable: int = 0  # value in an unreadable sample
 
 
 # ------------------------------------------------------------------------------------------------ one function each
 
 
-def _uv(found: SampleResults) -> Tensor:
-    return found.merged.uv
+def _uv(results: SampleResults) -> Tensor:
+    return results.merged.uv
 
 
-def _xyz(found: SampleResults) -> Tensor:
-    return torch.where(_valid(found)[..., None], found.xyz, 0.0)
+def _xyz(results: SampleResults) -> Tensor:
+    return torch.where(_valid(results)[..., None], results.xyz, 0.0)
 
 
-def _depth(found: SampleResults) -> Tensor:
-    return found.merged.depth
+def _depth(results: SampleResults) -> Tensor:
+    return results.merged.depth
 
 
-def _sigma(found: SampleResults) -> Tensor:
-    return found.merged.sigma
+def _sigma(results: SampleResults) -> Tensor:
+    return results.merged.sigma
 
 
-def _score(found: SampleResults) -> Tensor:
-    return found.merged.score
+def _score(results: SampleResults) -> Tensor:
+    return results.merged.score
 
 
-def _valid(found: SampleResults) -> Tensor:
-    return found.merged.source != Source.NONE
+def _valid(results: SampleResults) -> Tensor:
+    return results.merged.source != Source.NONE
 
 
-def _source(found: SampleResults) -> Tensor:
-    return found.merged.source
+def _source(results: SampleResults) -> Tensor:
+    return results.merged.source
 
 
-def _flag(found: SampleResults) -> Tensor:
-    return found.samples.flag
+def _flag(results: SampleResults) -> Tensor:
+    return results.samples.flag
 
 
-def _hole(found: SampleResults) -> Tensor:
-    return found.samples.hole
+def _hole(results: SampleResults) -> Tensor:
+    return results.samples.hole
 
 
-def _gate(found: SampleResults) -> Tensor:
-    if found.estimate is None:
-        return torch.full_like(found.samples.hole, Gate.NO_TRACK)
-    return found.estimate.gate
+def _gate(results: SampleResults) -> Tensor:
+    if results.estimate is None:
+        return torch.full_like(results.samples.hole, Gate.NO_TRACK)
+    return results.estimate.gate
 
 
-def _T_1_from_0(found: SampleResults) -> Tensor:
-    if not found.fits:
-        return found.merged.depth.new_zeros(len(found.paired), 4, 4)
-    T = found.fits[-1].T_1_from_0
+def _T_1_from_0(results: SampleResults) -> Tensor:
+    if not results.fits:
+        return results.merged.depth.new_zeros(len(results.paired), 4, 4)
+    T = results.fits[-1].T_1_from_0
     top = torch.cat((T.R, T.t[..., None]), -1)
     last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=top.dtype, device=top.device).expand(len(top), 1, 4)
-    return torch.where(_pose_ok(found)[:, None, None], torch.cat((top, last), 1), 0.0)
+    return torch.where(_pose_ok(results)[:, None, None], torch.cat((top, last), 1), 0.0)
 
 
-def _pose_cov(found: SampleResults) -> Tensor:
-    if not found.fits:
-        return found.merged.depth.new_zeros(len(found.paired), 6, 6)
-    return torch.where(_pose_ok(found)[:, None, None], found.fits[-1].cov, 0.0)
+def _pose_cov(results: SampleResults) -> Tensor:
+    if not results.fits:
+        return results.merged.depth.new_zeros(len(results.paired), 6, 6)
+    return torch.where(_pose_ok(results)[:, None, None], results.fits[-1].cov, 0.0)
 
 
-def _pose_ok(found: SampleResults) -> Tensor:
-    return found.fits[-1].ok & found.paired if found.fits else torch.zeros_like(found.paired)
+def _pose_ok(results: SampleResults) -> Tensor:
+    return results.fits[-1].ok & results.paired if results.fits else torch.zeros_like(results.paired)
 
 
-def _pose_code(found: SampleResults) -> Tensor:
-    if not found.fits:
-        return torch.zeros_like(found.paired, dtype=torch.int32)
-    code = found.fits[-1].code
-    return torch.where(found.paired, code, torch.zeros_like(code))
+def _pose_code(results: SampleResults) -> Tensor:
+    if not results.fits:
+        return torch.zeros_like(results.paired, dtype=torch.int32)
+    code = results.fits[-1].code
+    return torch.where(results.paired, code, torch.zeros_like(code))
 
 
-def _tokens(found: SampleResults) -> Tensor:
-    return found.tokens[0]
+def _tokens(results: SampleResults) -> Tensor:
+    return results.tokens[0]
 
 
-def _tokens_valid(found: SampleResults) -> Tensor:
-    return found.tokens[1]
+def _tokens_valid(results: SampleResults) -> Tensor:
+    return results.tokens[1]
 
 
-def _pose_convention(found: SampleResults) -> Tensor:
-    return match_refuted_poses(found.fits, found.paired)
+def _pose_convention(results: SampleResults) -> Tensor:
+    return match_refuted_poses(results.fits, results.paired)
 
 
-def _depth_map(found: SampleResults) -> Tensor:
-    return zero_unanswered(_dense(found), _dense(found).depth)
+def _depth_map(results: SampleResults) -> Tensor:
+    return zero_unanswered(_dense(results), _dense(results).depth)
 
 
-def _sigma_map(found: SampleResults) -> Tensor:
-    return zero_unanswered(_dense(found), _dense(found).sigma)
+def _sigma_map(results: SampleResults) -> Tensor:
+    return zero_unanswered(_dense(results), _dense(results).sigma)
 
 
-def _score_map(found: SampleResults) -> Tensor:
-    return _dense(found).score
+def _score_map(results: SampleResults) -> Tensor:
+    return _dense(results).score
 
 
-def _source_map(found: SampleResults) -> Tensor:
-    return _dense(found).source
+def _source_map(results: SampleResults) -> Tensor:
+    return _dense(results).source
 
 
-def _gate_map(found: SampleResults) -> Tensor:
-    return _dense(found).gate
+def _gate_map(results: SampleResults) -> Tensor:
+    return _dense(results).gate
 
 
-def _problem(found: SampleResults) -> Tensor:
-    return found.problem
+def _problem(results: SampleResults) -> Tensor:
+    return results.problem
 
 
-def _dense(found: SampleResults) -> DepthMap:
-    assert found.dense is not None  # columns of the option "dense" alone ask for it
-    return found.dense
+def _dense(results: SampleResults) -> DepthMap:
+    assert results.dense is not None  # only columns of the option "dense" use it
+    return results.dense
 
 
 # ------------------------------------------------------------------------------------------------------- the table
@@ -290,23 +290,23 @@ COLUMNS: tuple[ColumnSpec, ...] = (
 
 
 def select_columns(options: Collection[str]) -> list[ColumnSpec]:
-    """The columns that are there with some options of ExtendDepth (``pose``, ``dense``), in order."""
+    """Active options of ExtendDepth (``pose``, ``dense``) -> columns, in order."""
     return [column for column in COLUMNS if column.option is None or column.option in options]
 
 
 def compute_columns(found: SampleResults, options: Collection[str]) -> dict[str, Tensor]:
-    """Key → (B, …) of what was found. Gradient: as the records' fields."""
+    """Results and options -> key → values (B, …). Gradient: as the records' fields."""
     return {column.key: column.compute(found) for column in select_columns(options)}
 
 
 def fill_unreadable(added: Mapping[str, Tensor], bad: Tensor) -> dict[str, Tensor]:
-    """Columns (B, …) in which the samples of the mask ``bad`` (B,) are those that cannot be read. Gradient: kept."""
+    """Columns (B, …) and mask ``bad`` (B,) -> columns with the values of unreadable samples there. Gradient: kept."""
     value = {column.key: column.unreadable for column in COLUMNS}
     return {key: x.masked_fill(bad.view(-1, *[1] * (x.ndim - 1)), value[key]) for key, x in added.items()}
 
 
 def blank_columns(sizes: Mapping[str, int], options: Collection[str]) -> dict[str, Tensor]:
-    """Key → (1, …) of a sample that cannot be read; ``sizes``: letter of the alphabet → number."""
+    """Sizes and options -> key → values (1, …) of an unreadable sample; ``sizes``: letter of the alphabet → number."""
     return {
         c.key: torch.full((1, *resolve_shape(c.shape, sizes)), c.unreadable, dtype=getattr(torch, c.dtype))
         for c in select_columns(options)
@@ -314,5 +314,5 @@ def blank_columns(sizes: Mapping[str, int], options: Collection[str]) -> dict[st
 
 
 def resolve_shape(shape: Sequence[str | int], sizes: Mapping[str, int]) -> tuple[int, ...]:
-    """A shape in numbers; ``sizes``: letter of the alphabet → number."""
+    """Shape with letters -> shape in numbers; ``sizes``: letter of the alphabet → number."""
     return tuple(sizes[size] if isinstance(size, str) else size for size in shape)

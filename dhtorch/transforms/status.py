@@ -1,4 +1,4 @@
-"""What was wrong with samples, and how often: a code per sample, and counts that data-loader workers share."""
+"""Problem codes of samples, and their counts in memory shared by data-loader workers."""
 
 from __future__ import annotations
 
@@ -13,41 +13,41 @@ from dhtorch.codes import names
 
 
 class SampleProblem:
-    """Codes of ``problem``, the worst one of a sample."""
+    """Codes of ``problem``: the worst problem of a sample."""
 
     NONE: Final = 0
-    NO_SECOND_VIEW: Final = 1  #: front end only: one frame, or the other one only pads the episode
-    NO_DEPTH: Final = 2  #: the sensor gave no return at all
-    UNREADABLE: Final = 3  #: left out; every number of ours is 0
+    NO_SECOND_VIEW: Final = 1  #: front end only: one frame, or the source view only pads the episode
+    NO_DEPTH: Final = 2  #: the sensor has no return at all
+    UNREADABLE: Final = 3  #: left out; all added numbers are 0
 
 
-#: Workers that are counted apart; more share a row, and may then lose counts.
+#: Rows of the table of counts; more workers than rows share a row, and may then lose counts.
 _MAX_COUNT_ROWS = 128
 
 
 class ProblemCounts:
-    """Counts by problem, in memory that forked and spawned workers share, each writing to a row of its own."""
+    """Counts by problem in memory shared with forked and spawned workers, each of which writes its own row."""
 
     def __init__(self) -> None:
         self.counts = _share_memory(torch.zeros(_MAX_COUNT_ROWS, len(names(SampleProblem)), dtype=torch.int64))
 
     def add(self, problem: Tensor) -> None:
-        """Count the codes of some samples."""
+        """Count problem codes (B,) of samples."""
         worker = get_worker_info()
         row = 0 if worker is None else 1 + worker.id % (_MAX_COUNT_ROWS - 1)
-        counts = self.counts[row].numpy()  # of which torch would make several operations for each sample
+        counts = self.counts[row].numpy()  # numpy: several torch operations per sample cost more
         for code in problem.tolist():
             counts[code] += 1
 
     def report(self) -> dict[str, int]:
-        """Number of samples by problem, all workers together."""
+        """Number of samples by problem, summed over all workers."""
         total = self.counts.sum(0).tolist()
         return {name.lower(): total[code] for code, name in names(SampleProblem).items()}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ProblemCounts:
-        twin = copy.copy(self)
-        twin.counts = _share_memory(self.counts.clone())
-        return twin
+        clone = copy.copy(self)
+        clone.counts = _share_memory(self.counts.clone())
+        return clone
 
 
 def _share_memory(counts: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
-"""Sparse depth pooled to the patch grid of a vision transformer: one depth token beside each of its patch tokens.
+"""Sparse depth pooled to the patch grid of a vision transformer: one depth token per patch token.
 
-Alphabet: B pictures, N samples, P = rows × columns of patches, row by row, as ViT and DINOv2 order theirs.
+Alphabet: B images, N samples, P = rows × columns of patches, row by row, as in ViT and DINOv2.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from dhtorch.geometry.checks import check
 from dhtorch.ops.dispatch import operator
 from dhtorch.records import MergedDepth
 
-#: What the numbers of a token are: 1/m, 1/m, then shares of the patch's samples in [0, 1].
+#: Channels of a token: 1/m, 1/m, then fractions of the patch's samples in [0, 1].
 TOKEN_CHANNELS = ("inverse_depth", "sigma", "answered", *(f"hole_{name.lower()}" for name in names(Hole).values()))
 
-#: How many classes of holes there are; their codes count from 0.
+#: Number of hole classes; their codes count from 0.
 _N_HOLE_CLASSES = len(names(Hole))
 
-#: How a picture is brought to the network's size: stretched, shrunk whole with bars, or cut to fill.
+#: How an image is resized to the network's input: stretched, letterboxed, or cropped to fill.
 FIT_MODES = ("stretch", "pad", "crop")
 
 
 def token_grid(hw: tuple[int, int], *, patch: int = 14, tokens_hw: tuple[int, int] | None = None) -> tuple[int, int]:
-    """Rows and columns of the patches of a picture of size ``hw``, seen by the network at ``tokens_hw``.
+    """Image size ``hw`` and network input size ``tokens_hw`` (None = ``hw``) -> rows and columns of patches.
 
     Raises:
-        ValueError: the picture is smaller than a patch.
+        ValueError: the image is smaller than a patch.
     """
     height, width = hw if tokens_hw is None else tokens_hw
     if patch < 1 or min(height, width) < patch:
-        raise ValueError(f"tokens: found a picture of {height}x{width}, expected at least one patch of {patch} px")
+        raise ValueError(f"tokens: found an image of {height}x{width}, expected at least one patch of {patch} px")
     return height // patch, width // patch
 
 
@@ -44,27 +44,27 @@ def patch_tokens(
     tokens_hw: tuple[int, int] | None = None,
     fit: str = "stretch",
 ) -> tuple[Tensor, Tensor]:
-    """What is known of the depth inside each patch: tokens (B, P, 10) and whether any sample there has one (B, P).
+    """Samples with depth and hole class -> tokens (B, P, 10) and whether a patch has any depth (B, P) bool.
 
-    Inverse depth, because it is bounded and errors of triangulation are even in it. ``inverse_depth`` and ``sigma``
-    are the mean and standard deviation of the inverse depth of a point of the patch drawn at random: the noise of the
-    samples and their spread. ``answered`` is the share of samples with a depth; a share for each class of hole says why
-    the others have none, ``hole_none`` being the share with a usable return. They sum to 1, or to 0 where the patch
-    has no sample.
+    Tokens hold inverse depth, because it is bounded and triangulation errors are uniform in it. ``inverse_depth`` and
+    ``sigma`` are the mean and standard deviation of the inverse depth of a random point of the patch: noise of the
+    samples plus their spread. ``answered`` is the fraction of samples with a depth. The fractions of the hole classes
+    give the reasons for missing returns, ``hole_none`` being the fraction with a usable return; they sum to 1, or to 0
+    in a patch without samples.
 
     Args:
         found: sensor and recovered depths, from :func:`dhtorch.pipeline.pair.merge`.
         hole: class of each sample.
-        hw: size of the picture that ``found.uv`` are pixels of.
-        patch: side of a patch, px of the network's picture.
-        tokens_hw: size of the network's picture; None = ``hw``. What is left of a size that is no multiple of the
+        hw: size of the image that ``found.uv`` are pixels of.
+        patch: side of a patch, px of the network's input.
+        tokens_hw: size of the network's input; None = ``hw``. The remainder of a size that is no multiple of the
             patch, on the right and below, is dropped, as the network's convolution drops it.
-        fit: how the picture is brought to that size, one of :data:`FIT_MODES`.
+        fit: how the image is resized to that size, one of :data:`FIT_MODES`.
 
     Raises:
         ValueError: wrong shapes, an unknown fit, or no patch.
 
-    Gradient: to depth and sigma; where a sample lies and whether it has an answer carry none.
+    Gradient: to depth and sigma; none through the patch of a sample and whether it has a depth.
     """
     check("patch_tokens", uv=(found.uv, "B N 2"), depth=(found.depth, "B N"), hole=(hole, "B N"))
     check("patch_tokens", depth=(found.depth, "B N"), sigma=(found.sigma, "B N"), source=(found.source, "B N"))
@@ -94,10 +94,10 @@ def _pool_tokens_kernel(
     margin: list[float],
 ) -> tuple[Tensor, Tensor]:
     tokens = depth.new_empty(len(depth), grid[1] * grid[2], len(TOKEN_CHANNELS))
-    known = torch.empty_like(tokens[..., 0], dtype=torch.bool)
+    valid = torch.empty_like(tokens[..., 0], dtype=torch.bool)
     samples = uv.contiguous(), depth, sigma, source, hole
-    torch.ops.dhtorch.patch_tokens.default(*samples, tokens, known, *grid, *scale, *margin)
-    return tokens, known
+    torch.ops.dhtorch.patch_tokens.default(*samples, tokens, valid, *grid, *scale, *margin)
+    return tokens, valid
 
 
 @operator(
@@ -126,7 +126,7 @@ def _pool_tokens(
     patch, rows, columns = grid
     cell = _patch_index(uv, scale, margin, patch=patch, rows=rows, columns=columns)
 
-    def total(x: Tensor) -> Tensor:  # (B, N, k) → (B, P + 1, k), the last of what lies in no patch
+    def total(x: Tensor) -> Tensor:  # (B, N, k) → (B, P + 1, k), the last for samples outside all patches
         zero = torch.zeros(x.shape[0], rows * columns + 1, x.shape[2], dtype=torch.float64, device=x.device)
         return zero.scatter_add(1, cell[..., None].expand_as(x), x)
 
@@ -137,18 +137,18 @@ def _pool_tokens(
     sums = total(
         torch.cat((torch.ones_like(inverse)[..., None], inverse[..., None], answered[..., None], is_class), -1)
     )
-    per, per_answered = sums[..., ::2][..., :2].clamp_min(1).reciprocal().split(1, -1)
+    per_sample, per_answered = sums[..., ::2][..., :2].clamp_min(1).reciprocal().split(1, -1)
     mean = sums[..., 1:2] * per_answered
-    off = torch.where(answered, inverse - mean[..., 0].gather(1, cell), 0.0)
-    variance = total((noise * noise + off * off)[..., None]) * per_answered
+    residual = torch.where(answered, inverse - mean[..., 0].gather(1, cell), 0.0)
+    variance = total((noise * noise + residual * residual)[..., None]) * per_answered
     positive = variance > 0
     spread = torch.where(positive, torch.where(positive, variance, 1.0).sqrt(), 0.0)
-    tokens = torch.cat((mean, spread, sums[..., 2:] * per), -1)[:, :-1]
+    tokens = torch.cat((mean, spread, sums[..., 2:] * per_sample), -1)[:, :-1]
     return tokens.to(depth.dtype), sums[:, :-1, 2] > 0
 
 
 def _placement(hw: tuple[int, int], tokens_hw: tuple[int, int], fit: str) -> tuple[list[float], list[float]]:
-    """Scale and margin along x and y by which (uv + ½) lies in the network's picture."""
+    """Image and input size -> scale and margin along x and y that map (uv + ½) into the network's input."""
     if fit not in FIT_MODES:
         raise ValueError(f"tokens: fit is {fit!r}, expected one of {', '.join(FIT_MODES)}")
     scale = [tokens_hw[1] / hw[1], tokens_hw[0] / hw[0]]
@@ -159,11 +159,11 @@ def _placement(hw: tuple[int, int], tokens_hw: tuple[int, int], fit: str) -> tup
 
 
 def _patch_index(uv: Tensor, scale: list[float], margin: list[float], *, patch: int, rows: int, columns: int) -> Tensor:
-    """(B, N) index of the patch each sample lies in; rows · columns where it lies in none."""
-    place = uv.detach().double() + 0.5
-    place = place * (scale[0] if scale[0] == scale[1] else place.new_tensor(scale))
+    """Pixels (B, N, 2) -> index (B, N) of the patch that contains each; rows · columns if none does."""
+    position = uv.detach().double() + 0.5
+    position = position * (scale[0] if scale[0] == scale[1] else position.new_tensor(scale))
     if any(margin):
-        place = place + place.new_tensor(margin)
-    column, row = (place / patch).floor().unbind(-1)
+        position = position + position.new_tensor(margin)
+    column, row = (position / patch).floor().unbind(-1)
     inside = (column.clamp(0, columns - 1) == column) & (row.clamp(0, rows - 1) == row)
     return torch.where(inside, torch.add(column, row, alpha=columns), rows * columns).long()

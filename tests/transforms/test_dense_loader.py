@@ -176,10 +176,10 @@ def test_options_that_cannot_be_raise_when_it_is_made(wrong, said):
 
 
 def test_true_is_what_complete_does_by_itself():
-    standard = DenseMaps.asked(True)
-    assert standard.options == DenseMaps.asked({}).options and DenseMaps.asked(False) is None
+    standard = DenseMaps.from_options(True)
+    assert standard.options == DenseMaps.from_options({}).options and DenseMaps.from_options(False) is None
     assert {k: dense.complete_depth.__kwdefaults__[k] for k in standard.options} == standard.options
-    changed = DenseMaps.asked({"size": 224, "max_sigma_rel": 1}).options
+    changed = DenseMaps.from_options({"size": 224, "max_sigma_rel": 1}).options
     assert changed == {**standard.options, "size": 224, "max_sigma_rel": 1}
 
 
@@ -201,7 +201,7 @@ def test_a_worker_says_the_same_also_where_an_item_is_corrupt(items):
 
 
 def test_a_corrupt_sample_without_a_picture_cannot_be_flagged(sample):
-    with pytest.raises(SampleError, match="no image tells the size of its maps"):
+    with pytest.raises(SampleError, match="no image gives the size of its maps"):
         transform(on_error="flag", tokens_hw=(56, 56))({"depth": sample["depth"]})
 
 
@@ -286,12 +286,12 @@ class OtherSize(Load):
 
 def test_recordings_of_another_shape_are_refused_before_the_work(tmp_path):
     small, wide = recording(2, load=Load(bad={0})), recording(2, name="two", load=OtherSize(0))
-    assert common_map_hw([small, recording(3)], DenseMaps.asked({"size": 21})) == (14, 21)
+    assert common_map_hw([small, recording(3)], DenseMaps.from_options({"size": 21})) == (14, 21)
     said = "extract.dense: two has pictures of 28x84 and maps of 11x32, expected maps of 21x32 as of one; extract them"
     with pytest.raises(ValueError, match=said):
-        common_map_hw([small, wide], DenseMaps.asked({"size": 32}))
+        common_map_hw([small, wide], DenseMaps.from_options({"size": 32}))
     with pytest.raises(ValueError, match="found no frame that can be read"):
-        common_map_hw([recording(2, load=Load(bad={0, 1}))], DenseMaps.asked(True))
+        common_map_hw([recording(2, load=Load(bad={0, 1}))], DenseMaps.from_options(True))
 
 
 def test_a_frame_of_another_shape_is_one_that_cannot_be_read():

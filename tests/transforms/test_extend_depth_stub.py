@@ -361,7 +361,7 @@ def test_a_bad_sample_raises_unless_told_otherwise():
 def test_tokens_of_a_picture_that_is_missing_take_the_size_last_seen():
     lost = {k: v for k, v in sample().items() if k != "image"}
     extender = tiny(on_error="flag", patch=7)
-    with pytest.raises(SampleError, match=r"image: found no such key.*no image tells the size.*give tokens_hw"):
+    with pytest.raises(SampleError, match=r"image: found no such key.*no image gives the size.*give tokens_hw"):
         extender(lost)
     extender(sample())
     with pytest.warns(UserWarning, match="image: found no such key"):
@@ -396,7 +396,7 @@ def test_options_that_cannot_be_are_refused():
         ({"on_error": "ignore"}, "on_error is 'ignore', expected one of raise, skip, flag"),
         ({"batched": True, "on_error": "skip"}, "on_error is 'skip', expected one of raise, flag"),
         ({"fit": "squash"}, "fit is 'squash', expected one of stretch, pad, crop"),
-        ({"tokens_hw": (10, 224)}, "found a picture of 10x224, expected at least one patch of 14 px"),
+        ({"tokens_hw": (10, 224)}, "found an image of 10x224, expected at least one patch of 14 px"),
         ({"patch": 0}, "at least one patch of 0 px"),
     ]:
         with pytest.raises(ValueError, match=message):

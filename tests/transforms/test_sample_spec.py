@@ -424,17 +424,17 @@ def test_the_same_numbers_are_read_once_and_others_never_taken_for_them():
         views.read(sample(intrinsics=flat.reshape(2, 1, 2)))
     leaves = SampleReader(sample(intrinsics=np.array(K, object)), batched=False, dtype=torch.float32)
     leaves.images("image", None)
-    assert leaves.stated("intrinsics") is None, "bytes of objects are addresses"
-    assert leaves.stated((20.0, 22.0, 3.6, 2.4)) is not None
+    assert leaves.fingerprint("intrinsics") is None, "bytes of objects are addresses"
+    assert leaves.fingerprint((20.0, 22.0, 3.6, 2.4)) is not None
 
 
 @pytest.mark.parametrize("place", [(0, 1), (33, 47), (63, 95)])
 def test_one_return_that_no_probe_meets_is_a_return(place):
     depth = np.zeros((64, 96), np.float32)
     given = sample(image=picture(shape=(64, 96, 3)), depth=depth, intrinsics=[50, 50, 47.5, 31.5])
-    assert not read(given).sensed
+    assert not read(given).has_returns
     depth[place] = 1.5
-    assert read(given).sensed
+    assert read(given).has_returns
 
 
 def test_intrinsics_of_another_size_are_scaled_about_the_corner():

@@ -175,7 +175,7 @@ def test_tokens_refuse_what_cannot_be():
     found = MergedDepth(*(torch.zeros(1, 0, 2), *torch.zeros(3, 1, 0), torch.zeros(1, 0, dtype=torch.int32)))
     tokens, known = patch_tokens(found, torch.zeros(1, 0), (28, 28))
     assert tokens.shape == (1, 4, 10) and not known.any() and (tokens == 0).all()
-    with pytest.raises(ValueError, match="found a picture of 10x28, expected at least one patch of 14 px"):
+    with pytest.raises(ValueError, match="found an image of 10x28, expected at least one patch of 14 px"):
         patch_tokens(found, torch.zeros(1, 0), (10, 28))
     with pytest.raises(ValueError, match="fit is 'squash', expected one of stretch, pad, crop"):
         patch_tokens(found, torch.zeros(1, 0), (28, 28), fit="squash")
@@ -188,7 +188,7 @@ def test_a_grid_counts_whole_patches():
     assert token_grid((28, 43)) == (2, 3) and token_grid((480, 640), patch=16, tokens_hw=(31, 64)) == (1, 4)
     assert token_grid((14, 14)) == (1, 1) and token_grid((3, 3), patch=3, tokens_hw=(5, 3)) == (1, 1)
     for hw, patch in (((13, 40), 14), ((40, 13), 14), ((40, 40), 0), ((40, 40), -1)):
-        with pytest.raises(ValueError, match=f"found a picture of {hw[0]}x{hw[1]}, expected .* patch of {patch} px"):
+        with pytest.raises(ValueError, match=f"found an image of {hw[0]}x{hw[1]}, expected .* patch of {patch} px"):
             token_grid(hw, patch=patch)
-    with pytest.raises(ValueError, match="found a picture of 9x50"):
+    with pytest.raises(ValueError, match="found an image of 9x50"):
         token_grid((400, 400), tokens_hw=(9, 50))
