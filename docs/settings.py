@@ -3,7 +3,7 @@
     python docs/settings.py            write them (``make conf``)
     python docs/settings.py --check    say which differ, and change nothing
 
-What Hydra composes is then complete: every seat's function with every option and its value, so that any of them can be
+What Hydra composes is then complete: every stage's function with every option and its value, so that any of them can be
 changed from the command line, and a misspelt one is refused by the settings alone. Comments are the first words that a
 function's docstring has for the option.
 """

@@ -1,4 +1,4 @@
-"""The line of seats, and several views."""
+"""The pair pipeline, and several views."""
 
 TESTS: dict[str, list[str]] = {
     "pipeline.pair": ["tests/pipeline/test_merge.py", "tests/pipeline/test_pair.py", "tests/pipeline/test_method.py"],
@@ -58,9 +58,9 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("merge", "choose(samples.confidence, estimate.score)", "choose(samples.confidence, samples.confidence)"),
         (
             "merge",
-            "recovered = estimate.keep & ~sensed",
-            "recovered = estimate.keep",
-            "what the sensor says is taken first in any case",
+            "is_recovered = estimate.keep & ~is_sensed",
+            "is_recovered = estimate.keep",
+            "the sensor takes precedence in any case",
         ),
         ("upcast_intrinsics", "camera.f.dtype.itemsize >= 4", "camera.f.dtype.itemsize >= 2"),
         ("upcast_intrinsics", "depth_camera=single(frame.depth_camera)", "depth_camera=frame.depth_camera"),
@@ -72,9 +72,13 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("undistort_tracks", "cam.undistort_jacobian(camera_1,", "cam.undistort_jacobian(camera_0,"),
         ("undistort_tracks", "cam.undistort(camera_1, torch.where", "cam.undistort(camera_0, torch.where"),
         ("undistort_tracks", "tracks.cov, 0)), J.mT)", "tracks.cov, 0)), J)"),
-        ("undistort_tracks", "valid=tracks.valid & fine", "valid=tracks.valid"),
+        ("undistort_tracks", "valid=tracks.valid & in_model", "valid=tracks.valid"),
         ("uniform_draws", "torch.tensor([seed])", "torch.tensor([0])"),
-        ("_drawn", "manual_seed(int(s)) for s in seed.tolist()", "manual_seed(k) for k, s in enumerate(seed.tolist())"),
+        (
+            "_draw_rows",
+            "manual_seed(int(s)) for s in seed.tolist()",
+            "manual_seed(k) for k, s in enumerate(seed.tolist())",
+        ),
         ("StageTimer.__call__", "self.ms.get(name, 0.0) + 1e3", "1e3"),
     ],
     "pipeline.method": [
@@ -94,7 +98,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "self.classify(frame, self.backproject(frame, uv))",
             "self.backproject(frame, uv)",
         ),
-        ("iter_components", "*seat.args, ", ""),
+        ("iter_components", "*stage.args, ", ""),
     ],
     "pipeline.presets": [
         ("MAP_PYRAMID_LEVELS", "5", "4"),
@@ -108,16 +112,24 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("WINDOW", "views=5", "views=4"),
     ],
     "pipeline.view_selection": [
-        ("select_views_by_preview", "estimate.sigma / k", "estimate.sigma * k"),
+        ("select_views_by_preview", "estimate.sigma / scale", "estimate.sigma * scale"),
         ("select_views_by_preview", "x.expand(V, *x.shape).flatten(0, 1)", "x.repeat_interleave(V, 0)"),
-        ("downscale_frame", "frame.camera.f / picture.scale", "frame.camera.f"),
-        ("downscale_frame", "(frame.camera.c - picture.first) / picture.scale", "frame.camera.c / picture.scale"),
+        ("downscale_frame", "frame.camera.f / small.scale", "frame.camera.f"),
+        ("downscale_frame", "(frame.camera.c - small.first) / small.scale", "frame.camera.c / small.scale"),
         ("downscale_frame", "depth_camera=depth_camera", "depth_camera=frame.depth_camera"),
         ("rank_views", "good_sigma_rel * estimates.depth", "good_sigma_rel"),
         ("rank_views", ".square().flip(0)", ".square()"),
-        ("rank_views", "known = known + torch.where(best[..., None], information, 0.0).sum(0)", "known = known"),
-        ("rank_views", "pad_elementwise(torch.log1p, known + information)", "(known + information)"),
-        ("rank_views", "gain - pad_elementwise(torch.log1p, known).sum(-1)", "gain"),
+        (
+            "rank_views",
+            "selected_information = selected_information + torch.where(best[..., None], information, 0.0).sum(0)",
+            "selected_information = selected_information",
+        ),
+        (
+            "rank_views",
+            "pad_elementwise(torch.log1p, selected_information + information)",
+            "(selected_information + information)",
+        ),
+        ("rank_views", "gain - pad_elementwise(torch.log1p, selected_information).sum(-1)", "gain"),
         ("rank_views", "added.flip(0).gather(0, index)", "added.gather(0, index)"),
     ],
     "pipeline.stream": [
@@ -196,14 +208,14 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("report_selection", "choice.no_answer[:, b].sum()", "(~choice.no_answer[:, b]).sum()"),
     ],
     "pipeline.multiview": [
-        ("_select_views", "thin = samples[:, :: max(1, method.n // N_PREVIEW_SAMPLES)]", "thin = samples"),
+        ("_select_views", "preview = samples[:, :: max(1, method.n // N_PREVIEW_SAMPLES)]", "preview = samples"),
         ("estimate_multiview", "len(others.image) > method.views", "len(others.image) >= method.views"),
-        ("estimate_multiview", "None if fit is None else fit[pick]", "fit"),
+        ("estimate_multiview", "None if fit is None else fit[rows]", "fit"),
         ("estimate_multiview", 'last["tracks_ideal"], last["fit"])', 'traces[0]["tracks_ideal"], traces[0]["fit"])'),
         ("_estimate_views", "(k + 1) / k", "k / (k + 1)"),
-        ("_estimate_views", "_extrapolate_tracks(seen[-1], (k + 1) / k)", "_extrapolate_tracks(seen[0], k + 1)"),
+        ("_estimate_views", "_extrapolate_tracks(tracks[-1], (k + 1) / k)", "_extrapolate_tracks(tracks[0], k + 1)"),
         ("_estimate_views", "None if fit is None else fit.map", "None if True else fit.map"),
-        ("_estimate_views", "if method.chain and seen", "if seen"),
+        ("_estimate_views", "if method.chain and tracks", "if tracks"),
         ("_estimate_views", "seed.repeat(V)", "seed.repeat_interleave(V)"),
         ("_repeat_views", "x.expand(V, *x.shape).flatten(0, 1)", "x.repeat_interleave(V, 0)"),
         ("estimate_multiview", "pyramid=PyramidCache(reference.image)", "pyramid=None"),

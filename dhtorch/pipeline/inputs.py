@@ -1,4 +1,4 @@
-"""What frames that are asked together must share: a device, a precision, and that there is something to see."""
+"""Validation of the views of a method: one device, one precision, no empty frames."""
 
 from __future__ import annotations
 
@@ -10,49 +10,53 @@ from torch import Tensor
 from dhtorch import pytree
 from dhtorch.records import Camera, Frame
 
-#: What a method reads of its reference view and of the other views: times and poses of the data set are not for it.
+#: Fields that a method reads of its reference view; timestamps and poses of a data set are not among them.
 REFERENCE_FIELDS = "image", "depth", "conf", "sparse", "camera", "depth_camera"
+
+#: Fields that a method reads of its other views.
 SOURCE_FIELDS = "image", "camera"
 
 
 def validate_views(reference: Frame, others: Frame | Sequence[Frame]) -> tuple[Frame, Frame]:
     """The reference view and its other views, stacked to V × B where there are several, in one precision.
 
-    Frames of several data sets come in several precisions: cameras become the widest of them, and pictures that differ
-    become floating in the widest of theirs (uint8 counts as float32). Equal ones stay as they are, byte for byte.
+    Frames of different data sets have different precisions: cameras get the widest dtype among them, and images of
+    different dtypes become floating in the widest of these (uint8 counts as float32). Equal dtypes are unchanged.
 
     Raises:
-        TypeError: something that is no frame.
+        TypeError: an argument that is not a Frame.
         ValueError: no other view, a frame without a view or a pixel, or tensors on different devices.
 
-    Gradient: to pictures and intrinsics, through the change of precision.
+    Gradient: to images and intrinsics, through the change of precision.
     """
-    single = isinstance(others, Frame)
-    given = [others] if isinstance(others, Frame) else list(others or ())
-    if not given:
+    is_single = isinstance(others, Frame)
+    views = [others] if isinstance(others, Frame) else list(others or ())
+    if not views:
         raise ValueError("method: found no other view, expected at least one")
-    frames = [reference, *given]
-    names = ["reference", *("other" if single else f"others[{k}]" for k in range(len(given)))]
+    frames = [reference, *views]
+    names = ["reference", *("other" if is_single else f"others[{k}]" for k in range(len(views)))]
     for name, frame in zip(names, frames, strict=True):
         if not isinstance(frame, Frame):
             raise TypeError(f"method: {name} is a {type(frame).__name__}, expected a dhtorch.Frame")
-        _check(name, frame, SOURCE_FIELDS if name != "reference" else REFERENCE_FIELDS, reference.image.device)
-    reference, *given = _one_precision(frames)
-    return reference, given[0] if single else pytree.stack(given)
+        _check_frame(name, frame, SOURCE_FIELDS if name != "reference" else REFERENCE_FIELDS, reference.image.device)
+    reference, *views = _common_precision(frames)
+    return reference, views[0] if is_single else pytree.stack(views)
 
 
-def _check(name: str, frame: Frame, fields: tuple[str, ...], device: torch.device) -> None:
-    for field, x in _tensors(frame, fields):
+def _check_frame(name: str, frame: Frame, fields: tuple[str, ...], device: torch.device) -> None:
+    """Raise ValueError for an empty tensor of the frame, or one on another device."""
+    for field, x in _iter_tensors(frame, fields):
         if 0 in x.shape:
-            lacks = "pixel" if 0 in x.shape[-2:] else "view"
-            raise ValueError(f"method: {name}.{field} has shape {tuple(x.shape)}, expected at least one {lacks}")
+            missing = "pixel" if 0 in x.shape[-2:] else "view"
+            raise ValueError(f"method: {name}.{field} has shape {tuple(x.shape)}, expected at least one {missing}")
         if x.device != device:
             raise ValueError(
                 f"method: {name}.{field} is on {x.device}, reference.image on {device}, expected one device"
             )
 
 
-def _tensors(frame: Frame, fields: tuple[str, ...]) -> Iterator[tuple[str, Tensor]]:
+def _iter_tensors(frame: Frame, fields: tuple[str, ...]) -> Iterator[tuple[str, Tensor]]:
+    """Names and tensors of the fields; of a camera its focal lengths."""
     for field in fields:
         value = getattr(frame, field)
         if isinstance(value, Tensor):
@@ -61,24 +65,26 @@ def _tensors(frame: Frame, fields: tuple[str, ...]) -> Iterator[tuple[str, Tenso
             yield f"{field}.f", value.f
 
 
-def _one_precision(frames: list[Frame]) -> list[Frame]:
-    pictures, cameras = {f.image.dtype for f in frames}, {f.camera.f.dtype for f in frames}
-    if len(cameras) > 1:
-        wide = _widest(cameras)
-        frames = [f.replace(camera=f.camera.to(wide)) for f in frames]
-    if len(pictures) > 1:
-        wide = _widest(pictures)
-        frames = [f.replace(image=_floating(f.image, wide)) for f in frames]
+def _common_precision(frames: list[Frame]) -> list[Frame]:
+    """The frames with cameras of one dtype and images of one dtype."""
+    image_dtypes, camera_dtypes = {f.image.dtype for f in frames}, {f.camera.f.dtype for f in frames}
+    if len(camera_dtypes) > 1:
+        dtype = _widest_dtype(camera_dtypes)
+        frames = [f.replace(camera=f.camera.to(dtype)) for f in frames]
+    if len(image_dtypes) > 1:
+        dtype = _widest_dtype(image_dtypes)
+        frames = [f.replace(image=_to_floating(f.image, dtype)) for f in frames]
     return frames
 
 
-def _widest(dtypes: set[torch.dtype]) -> torch.dtype:
-    """The floating type that holds all of them."""
-    wide = torch.float32 if torch.uint8 in dtypes else torch.float16
+def _widest_dtype(dtypes: set[torch.dtype]) -> torch.dtype:
+    """The floating dtype that represents all of them."""
+    widest = torch.float32 if torch.uint8 in dtypes else torch.float16
     for dtype in dtypes - {torch.uint8}:
-        wide = torch.promote_types(wide, dtype)
-    return wide
+        widest = torch.promote_types(widest, dtype)
+    return widest
 
 
-def _floating(image: Tensor, dtype: torch.dtype) -> Tensor:
+def _to_floating(image: Tensor, dtype: torch.dtype) -> Tensor:
+    """The image in a floating dtype; uint8 is scaled to [0, 1]."""
     return image.to(dtype) / 255 if image.dtype == torch.uint8 else image.to(dtype)

@@ -37,33 +37,33 @@ class Method(MethodSpec):
         trace: Trace | None = None,
         **changes: Any,
     ) -> Estimate:
-        """Depth along the samples of ``reference``, by the parallax to one other view or several.
+        """Depth at the samples of ``reference``, triangulated from one other view or several.
 
         Args:
             reference: B views.
             others: B other views; or several of each reference view, V × B in one record or a sequence of V, in the
-                order in which the camera took them. Their depth is not read. Cameras may differ.
-            seed: an int gives every pair the same draws; a (B,) int64 tensor gives each pair its own. All views of an
+                order of capture. Their depth is not read. Cameras may differ.
+            seed: an int gives every pair the same draws; a (B,) int64 tensor gives each pair its own. All views of a
                 reference view have the same.
-            fit: a pose that is believed, (B,) or (V, B): seat 5 is then skipped; or a :class:`PosePrior` from
-                elsewhere, which near returns may refute (:func:`dhtorch.stages.pose_prior.check_pose_prior`). None = as
-                ``given`` says.
-            hint: what is known of the motion, for the tracker.
+            fit: a pose that is used as it is, (B,) or (V, B): stage 5 is then skipped; or a :class:`PosePrior`, which
+                near returns may refute (:func:`dhtorch.stages.pose_prior.check_pose_prior`). None = the prior of
+                ``pose_prior``, if there is one.
+            hint: prior knowledge of the motion, for the tracker.
             trace: a dict that receives ``samples``, ``tracks`` (as tracked), ``tracks_ideal`` (undistorted), ``fit``,
-                ``estimate`` and ``ms`` (milliseconds by stage). Of several views those of the last, with ``ms`` summed
-                and ``views``, the traces of all.
-            **changes: seats and options for this call alone, as :meth:`replace` takes them.
+                ``estimate`` and ``ms`` (milliseconds by stage). With several views those of the last, ``ms`` summed
+                over all, and ``views``, the traces of all.
+            **changes: stages and options for this call alone, as :meth:`replace` takes them.
 
         Returns:
-            Estimate for the B × n samples, silent ones with their reason; in the dtype of the intrinsics, float32
-            where these are half precision. Images and depth may be of any floating dtype, each frame's
-            of its own (:func:`dhtorch.pipeline.inputs.validate_views`).
+            Estimate for the B × n samples, unanswered ones with their reason; in the dtype of the intrinsics, float32
+            where these are half precision. Images and depth may be of any floating dtype, different for each frame
+            (:func:`dhtorch.pipeline.inputs.validate_views`).
 
         Raises:
-            ValueError: wrong shapes, different batch sizes or devices, nothing to see, no other view.
-            TypeError: no such seat or option, or no frame.
+            ValueError: wrong shapes, different batch sizes or devices, an empty frame, no other view.
+            TypeError: no such stage or option, or an argument that is not a Frame.
 
-        Memory: grows with the answers; pyramids are held of eight pairs at most, unless a graph keeps them.
+        Memory: linear in samples and views; pyramids of eight pairs at most exist at once, unless a graph keeps them.
         Gradient: recovered depth to all images, to the near depth and to intrinsics; choices (flags, inliers, gates)
         carry none.
         Cost: linear in views; the reference view's pyramid is built once.
@@ -73,5 +73,5 @@ class Method(MethodSpec):
         reference, others = validate_views(reference, others)
         if fit is None and method.pose_prior is not None:
             fit = method.pose_prior(reference, others)
-        ask = estimate_pair if others.image.dim() == 4 else estimate_multiview
-        return ask(method, reference, others, seed=seed, fit=fit, hint=hint, trace=trace)
+        estimate = estimate_pair if others.image.dim() == 4 else estimate_multiview
+        return estimate(method, reference, others, seed=seed, fit=fit, hint=hint, trace=trace)

@@ -1,4 +1,4 @@
-"""The line that joins the seats of a method: two RGB-D views in, far depth with abstention out; and their map."""
+"""Pair pipeline: the stages of a method in sequence, two RGB-D views -> far depth with abstention; and merged depth."""
 
 from __future__ import annotations
 
@@ -31,17 +31,26 @@ from dhtorch.records import (
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.pose_prior import check_pose_prior, reject_poses
 
-#: Pairs tracked at once: more are no faster, and their pyramids cost memory.
+#: Most pairs tracked at once: more are no faster, and their pyramids cost memory. Source: origin not recorded.
 TRACK_CHUNK_PAIRS = 8
 
-#: The camera stood still where more than this share of at least so many tracks moved by fewer pixels. What moves in
-#: front of it is not the background, and without near returns nothing else can tell.
-STATIC_RATIO, MIN_STATIC_TRACKS, STATIC_FLOW_PX = 0.7, 16, 0.25
+#: Fraction of the tracks with less motion than ``STATIC_FLOW_PX`` above which the camera stood still. Objects that move
+#: in front of it are not the background, which only near returns could distinguish otherwise.
+#: Source: origin not recorded.
+STATIC_RATIO = 0.7
 
-#: Residual of near returns that a pose may leave from which a search only starts, of a ray with z = 1.
+#: Fewest tracks from which a camera that stood still is detected. Source: origin not recorded.
+MIN_STATIC_TRACKS = 16
+
+#: Motion below which a track counts as static, px. Source: origin not recorded.
+STATIC_FLOW_PX = 0.25
+
+#: Largest residual of near returns under a pose that is only a start, for a ray with z = 1.
+#: Source: origin not recorded.
 MAX_START_RESIDUAL = 0.04
 
-#: Near returns that must lie where a search ends, if they have no pose of their own: fewer fit almost anywhere.
+#: Fewest near inliers of a pose refined from a start, if near returns have no pose of their own: fewer fit almost any
+#: pose. Source: origin not recorded.
 MIN_NEAR_INLIERS = 8
 
 
@@ -55,9 +64,9 @@ def estimate_pair(
     hint: TrackHint = NO_HINT,
     trace: Trace | None = None,
 ) -> Estimate:
-    """The method's answer for B reference views with one other view each; what ``method(frame_0, frame_1)`` calls.
+    """Estimate (B, n) of a method for B reference views with one other view each, for ``method(frame_0, frame_1)``.
 
-    Arguments, answer and errors are those of :class:`dhtorch.pipeline.method.Method`.
+    Arguments, result and errors are those of :class:`dhtorch.pipeline.method.Method`.
     """
     check("extend", image_0=(frame_0.image, "B C H W"), f_0=(frame_0.camera.f, "B 2"), t=(frame_1.camera.f, "B 2"))
     check("extend", image_0=(frame_0.image, "B C H W"), image_1=(frame_1.image, "B c h w"))
@@ -79,12 +88,12 @@ def estimate_pair(
 
 
 def track_in_chunks(method: MethodSpec, image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
-    """Seat 4, so many pairs at a time that memory stays bounded."""
+    """Stage 4, the tracks (B, N) from ``image_0`` into ``image_1``, in chunks of pairs to bound memory."""
 
-    def some(image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
+    def track_chunk(image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
         return method.track(image_0, image_1, uv, hint=hint)
 
-    return chunked_apply(some, TRACK_CHUNK_PAIRS, image_0, image_1, uv, hint)
+    return chunked_apply(track_chunk, TRACK_CHUNK_PAIRS, image_0, image_1, uv, hint)
 
 
 def solve_pose_and_triangulate(
@@ -98,10 +107,10 @@ def solve_pose_and_triangulate(
     fit: PoseFit | PosePrior | None,
     clock: StageTimer,
 ) -> tuple[Estimate, Tracks, PoseFit]:
-    """Seats 5 and 6: what tracks say under the pose that they give, or under a known one.
+    """Stages 5 and 6: triangulate tracks under the pose estimated from them, or under a given one.
 
     Returns:
-        The estimate, the tracks in ideal pixels with those that have no texture no longer valid, and the pose.
+        The estimate, the tracks in ideal pixels, those without texture invalid, and the pose.
     """
     textured = samples.trackability >= method.min_trackability
     usable = tracks.replace(valid=tracks.valid & textured)
@@ -109,8 +118,8 @@ def solve_pose_and_triangulate(
     camera_0, camera_1 = cam.ideal(camera_0), cam.ideal(camera_1)
     if not isinstance(fit, PoseFit):
         draws = uniform_draws(seed, camera_0.f.shape[0], method.hypotheses).to(camera_0.f)
-        found = method.pose(samples, usable, camera_0, camera_1, draws)
-        fit = found if fit is None else _apply_prior(fit, found, samples, usable, camera_0, camera_1)
+        solved = method.pose(samples, usable, camera_0, camera_1, draws)
+        fit = solved if fit is None else _apply_prior(fit, solved, samples, usable, camera_0, camera_1)
         fit = fit.replace(code=torch.where(_is_static(fit, usable), PoseCode.NO_BASELINE, fit.code).to(fit.code.dtype))
     clock("pose", fit)
     estimate = clock("triangulate", method.triangulate(samples, usable, fit, camera_0, camera_1))
@@ -120,51 +129,51 @@ def solve_pose_and_triangulate(
 
 
 def _is_static(fit: PoseFit, tracks: Tracks) -> Tensor:
-    """Whether (B,) a pose is missing and most of the picture stayed where it was: the camera stood still."""
+    """Whether (B,) the camera stood still: no pose, and most tracks without motion."""
     with torch.no_grad():
-        way = (tracks.uv_1 - tracks.uv_0).square().sum(-1)
-        stayed = (tracks.valid & (way < STATIC_FLOW_PX**2)).sum(-1)
-        seen = tracks.valid.sum(-1)
-        lost = (fit.code == PoseCode.TOO_FEW) | (fit.code == PoseCode.DEGENERATE)
-        return lost & (seen >= MIN_STATIC_TRACKS) & (stayed > STATIC_RATIO * seen)
+        square_flow = (tracks.uv_1 - tracks.uv_0).square().sum(-1)
+        n_static = (tracks.valid & (square_flow < STATIC_FLOW_PX**2)).sum(-1)
+        n_tracks = tracks.valid.sum(-1)
+        no_pose = (fit.code == PoseCode.TOO_FEW) | (fit.code == PoseCode.DEGENERATE)
+        return no_pose & (n_tracks >= MIN_STATIC_TRACKS) & (n_static > STATIC_RATIO * n_tracks)
 
 
 def _apply_prior(
-    given: PosePrior, found: PoseFit, samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera
+    prior: PosePrior, solved: PoseFit, samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera
 ) -> PoseFit:
-    """A pose from elsewhere as the near returns leave it: held against them, or the start of the most probable one."""
-    if not isinstance(given, InitialPose):
-        return check_pose_prior(given, samples, tracks, camera_0, camera_1, found)
-    held = check_pose_prior(
-        given.replace(cov=None), samples, tracks, camera_0, camera_1, found, max_residual=MAX_START_RESIDUAL
+    """The pose of a prior after the test by near returns; of an InitialPose, the most probable pose from that start."""
+    if not isinstance(prior, InitialPose):
+        return check_pose_prior(prior, samples, tracks, camera_0, camera_1, solved)
+    start = check_pose_prior(
+        prior.replace(cov=None), samples, tracks, camera_0, camera_1, solved, max_residual=MAX_START_RESIDUAL
     )
-    unused = samples.uv.new_zeros(len(samples.uv), 1, 3)
-    refined = map_pose(samples, tracks, camera_0, camera_1, unused, start=lambda *_: held).replace(
-        matched_convention=held.matched_convention
+    no_draws = samples.uv.new_zeros(len(samples.uv), 1, 3)
+    refined = map_pose(samples, tracks, camera_0, camera_1, no_draws, start=lambda *_: start).replace(
+        matched_convention=start.matched_convention
     )
-    # From far off a search may end where near returns do not: they are asked again, now as of any pose.
+    # A search from a distant start may end at a pose that near returns contradict: it is tested like any other prior.
     end = PosePrior(refined.T_1_from_0)
-    ended = check_pose_prior(end, samples, tracks, camera_0, camera_1, found, min_confirmed=MIN_NEAR_INLIERS)
-    return reject_poses(refined, ended)
+    checked = check_pose_prior(end, samples, tracks, camera_0, camera_1, solved, min_confirmed=MIN_NEAR_INLIERS)
+    return reject_poses(refined, checked)
 
 
 def merge(samples: Samples, estimate: Estimate | None) -> MergedDepth:
-    """The user's map: the sensor where it has a usable return, a recovered depth where it has none, else a hole.
+    """Merged depth at the samples: the sensor's return where it is usable, else the recovered depth, else a hole.
 
-    Without an estimate the sensor's returns alone.
+    Without an estimate, the sensor's returns alone.
 
     Gradient: to both sources.
     """
     if estimate is None:
         return MergedDepth(samples.uv, *_sensor_values(samples.depth, samples.sigma, samples.confidence, samples.xyz))
-    sensed = samples.usable
-    recovered = estimate.keep & ~sensed
+    is_sensed = samples.usable
+    is_recovered = estimate.keep & ~is_sensed
     zero = torch.zeros_like(samples.depth)
 
     def choose(sensor: Tensor, answer: Tensor) -> Tensor:
-        return torch.where(sensed, sensor, torch.where(recovered, answer.nan_to_num(), zero))
+        return torch.where(is_sensed, sensor, torch.where(is_recovered, answer.nan_to_num(), zero))
 
-    source = torch.where(sensed, Source.SENSOR, torch.where(recovered, Source.RECOVERED, Source.NONE))
+    source = torch.where(is_sensed, Source.SENSOR, torch.where(is_recovered, Source.RECOVERED, Source.NONE))
     return MergedDepth(
         uv=samples.uv,
         depth=choose(samples.depth, estimate.depth),
@@ -192,13 +201,13 @@ def _sensor_values(
     depth: Tensor, sigma: Tensor, confidence: Tensor, xyz: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Depth, sigma, score and source (B, N) of samples with a point (B, N, 3), 0 for the others."""
-    sensed = all_finite(xyz, -1)
-    depth, sigma, score = (torch.where(sensed, x, 0.0) for x in (depth, sigma, confidence))
-    return depth, sigma, score, sensed.int() * Source.SENSOR
+    is_sensed = all_finite(xyz, -1)
+    depth, sigma, score = (torch.where(is_sensed, x, 0.0) for x in (depth, sigma, confidence))
+    return depth, sigma, score, is_sensed.int() * Source.SENSOR
 
 
 def upcast_intrinsics(frame: Frame) -> Frame:
-    """The frame with intrinsics of at least single precision: half a pixel is lost on the eleven bits of a half.
+    """The frame with intrinsics of at least single precision: the 11 bits of half precision err by up to half a pixel.
 
     Gradient: to the intrinsics.
     """
@@ -212,35 +221,35 @@ def upcast_intrinsics(frame: Frame) -> Frame:
 
 
 def undistort_tracks(tracks: Tracks, camera_0: Camera, camera_1: Camera) -> Tracks:
-    """Tracks in ideal pixels, covariances carried along; a pixel outside the lens model is no longer valid.
+    """Tracks in ideal pixels with propagated covariances; pixels outside the lens model become invalid.
 
     Gradient: to pixels, intrinsics and distortion.
     """
     if camera_0.distortion is None and camera_1.distortion is None:
         return tracks
-    given = tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
+    is_finite = tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
     centre_0, centre_1 = (c.c.detach()[:, None] for c in (camera_0, camera_1))
-    uv_0 = cam.undistort(camera_0, torch.where(given[..., None], tracks.uv_0, centre_0))
-    uv_1 = cam.undistort(camera_1, torch.where(given[..., None], tracks.uv_1, centre_1))
-    fine = given & uv_0.isfinite().all(-1) & uv_1.isfinite().all(-1)
-    uv_0 = torch.where(fine[..., None], uv_0, tracks.uv_0)
-    uv_1 = torch.where(fine[..., None], uv_1, tracks.uv_1)
-    J = cam.undistort_jacobian(camera_1, torch.where(fine[..., None], uv_1, centre_1))
-    known = tracks.cov.isfinite()
-    turned = small_matmul(small_matmul(J, torch.where(known, tracks.cov, 0)), J.mT)
-    cov = torch.where(known, turned, tracks.cov)
-    return tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov, valid=tracks.valid & fine)
+    uv_0 = cam.undistort(camera_0, torch.where(is_finite[..., None], tracks.uv_0, centre_0))
+    uv_1 = cam.undistort(camera_1, torch.where(is_finite[..., None], tracks.uv_1, centre_1))
+    in_model = is_finite & uv_0.isfinite().all(-1) & uv_1.isfinite().all(-1)
+    uv_0 = torch.where(in_model[..., None], uv_0, tracks.uv_0)
+    uv_1 = torch.where(in_model[..., None], uv_1, tracks.uv_1)
+    J = cam.undistort_jacobian(camera_1, torch.where(in_model[..., None], uv_1, centre_1))
+    has_cov = tracks.cov.isfinite()
+    ideal_cov = small_matmul(small_matmul(J, torch.where(has_cov, tracks.cov, 0)), J.mT)
+    cov = torch.where(has_cov, ideal_cov, tracks.cov)
+    return tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov, valid=tracks.valid & in_model)
 
 
 def uniform_draws(seed: int | Tensor, batch: int, hypotheses: int) -> Tensor:
     """Random numbers for the pose search: (batch, hypotheses, 3) uniform in [0, 1), float64, on the CPU.
 
-    They depend on the seed of each pair alone: not on its batch mates, its place, the worker or the device.
+    They depend only on the seed of each pair: not on other pairs of the batch, their order, the worker or the device.
 
     Raises:
         ValueError: ``seed`` is a tensor of another shape than (batch,).
     """
-    draws = _draws_op if is_transformed() else _drawn
+    draws = _draws_op if is_transformed() else _draw_rows
     if isinstance(seed, int):
         return draws(torch.tensor([seed]), hypotheses).expand(batch, -1, -1)
     if seed.shape != (batch,):
@@ -248,15 +257,16 @@ def uniform_draws(seed: int | Tensor, batch: int, hypotheses: int) -> Tensor:
     return draws(seed.cpu(), hypotheses)
 
 
-def _drawn(seed: Tensor, hypotheses: int) -> Tensor:
-    made = [torch.Generator().manual_seed(int(s)) for s in seed.tolist()]
-    rows = [torch.rand(hypotheses, 3, generator=g, dtype=torch.float64) for g in made]
+def _draw_rows(seed: Tensor, hypotheses: int) -> Tensor:
+    """Uniform numbers (batch, hypotheses, 3) from the seeds (batch,)."""
+    generators = [torch.Generator().manual_seed(int(s)) for s in seed.tolist()]
+    rows = [torch.rand(hypotheses, 3, generator=g, dtype=torch.float64) for g in generators]
     return torch.stack(rows) if rows else torch.zeros(0, hypotheses, 3, dtype=torch.float64)
 
 
-# One operation to torch.compile and vmap: neither can look into a generator, nor needs to, for nothing here is random.
-# Others are spared it: its first call imports the compiler.
-_draws_op = torch.library.custom_op("dhtorch::uniform_draws", _drawn, mutates_args=())
+# One operation for torch.compile and vmap, which cannot trace a generator; the result is a function of the seed alone.
+# It is used only under transforms, since its first call imports the compiler.
+_draws_op = torch.library.custom_op("dhtorch::uniform_draws", _draw_rows, mutates_args=())
 
 
 @_draws_op.register_fake
@@ -265,14 +275,14 @@ def _(seed: Tensor, hypotheses: int) -> Tensor:
 
 
 class StageTimer:
-    """Writes the milliseconds of each stage into a trace; does nothing without one."""
+    """Adds the milliseconds of each stage to a trace; does nothing without a trace."""
 
     def __init__(self, trace: Trace | None) -> None:
         self.ms = None if trace is None else trace.setdefault("ms", {})
         self.last = time.perf_counter() if trace is not None else 0.0
 
     def __call__(self, name: str, value: Any) -> Any:
-        """The value, with the time since the last one put down to that name."""
+        """The value unchanged; the time since the last call is added to stage ``name``."""
         if self.ms is not None:
             now = time.perf_counter()
             self.ms[name] = self.ms.get(name, 0.0) + 1e3 * (now - self.last)

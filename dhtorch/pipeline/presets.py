@@ -1,4 +1,4 @@
-"""Methods by name: the paper's, and pose and abstention by what the errors must be."""
+"""Methods by name: that of the paper, and those with a most probable pose and abstention by the stated error."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from dhtorch.stages.score import confidence_from_error, confidence_from_sigma
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.triangulate import two_view
 
-#: The paper's method and parameters; P3P instead of EPnP as the minimal solver is the one stated difference.
+#: The paper's method and parameters; the one difference is P3P instead of EPnP as the minimal solver.
 PAPER = Method()
 
 #: The paper's method as a function of two frames.
 extend = PAPER
 
-#: Pyramid levels of ``MAP``: one more than the paper, motions are larger than 30 px.
+#: Pyramid levels of ``MAP``, for motions larger than 30 px. Source: derived, the paper's 4 levels + 1.
 MAP_PYRAMID_LEVELS = 5
 
-#: Pose from near and far tracks together, a sigma in metres for every answer, and silence where that is too large.
-#: Tracks are registered once more with an affine window; the pose starts from the paper's. Its constants were chosen on
-#: ``data=shared_scenes`` and on the built-in rooms: figures on these are not figures on scenes that it has not seen.
+#: Pose from near and far tracks together, a sigma in metres for every estimate, and no answer where sigma is too large.
+#: Tracks are registered once more with an affine window; the pose search starts at the paper's. Its constants were
+#: chosen on ``data=shared_scenes`` and on the built-in rooms: results on these are not results on unseen scenes.
 MAP = PAPER.replace(
     track=partial(lucas_kanade_affine, levels=MAP_PYRAMID_LEVELS),
     pose=map_pose,
     triangulate=partial(
         two_view,
-        min_parallax_deg=None,  # sigma says it
+        min_parallax_deg=None,  # max_sigma_rel limits it
         max_sigma_rel=0.2,
         min_t_snr=30.0,
         max_mismatch_px=10.0,
@@ -43,12 +43,12 @@ MAP = PAPER.replace(
     score=confidence_from_error,
 )
 
-#: ``MAP`` for several views of one anchor: each view a pair, their inverse depths fused where they agree.
+#: ``MAP`` for several source views of one reference view: each view a pair, consistent inverse depths are fused.
 WINDOW = MAP.replace(views=5)
 
-#: Several views chosen among those around the reference view; the search begins where the whole picture went, whatever
-#: the exposures; an answer needs views that agree or one that is sure by itself, and near returns that what lies far
-#: does not contradict. A view may be unsure: what counts is how sure they are together.
+#: Source views are selected among those around the reference view; tracks start at the coarse flow of the whole image,
+#: whatever the exposures. An answer needs consistent views or one with a small sigma, and near returns that far points
+#: do not contradict. Single views may be uncertain: the sigma of the fused estimate counts.
 AUTO = MAP.replace(
     track=partial(
         lucas_kanade_affine, levels=MAP_PYRAMID_LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="bias")
@@ -61,16 +61,17 @@ AUTO = MAP.replace(
     chain=False,
 )
 
+#: Methods by name.
 METHODS = {"paper": PAPER, "map": MAP, "window": WINDOW, "auto": AUTO}
 
 
 def get_method(method: str | Method, n: int | None = None) -> Method:
-    """A method by its name or as it is, with ``n`` samples where that is said.
+    """The method of a name in :data:`METHODS`, or the given method; with ``n`` samples if ``n`` is not None.
 
     Raises:
-        ValueError: a name of :data:`METHODS` is unknown, or something else.
+        ValueError: an unknown name, or another type.
     """
     if method not in METHODS if isinstance(method, str) else not isinstance(method, Method):
         raise ValueError(f"method is {method!r}, expected one of {sorted(METHODS)} or a Method")
-    found = METHODS[method] if isinstance(method, str) else method
-    return found if n is None else found.replace(n=n)
+    resolved = METHODS[method] if isinstance(method, str) else method
+    return resolved if n is None else resolved.replace(n=n)

@@ -1,6 +1,6 @@
-"""The pose of one camera of a rig relative to another: measured once, over many instants, and then given.
+"""Relative pose of two cameras of a rig: estimated once from many instants, then used as a prior.
 
-At every instant near returns fix that pose with a covariance; a rig that is rigid has one pose for all.
+At every instant near returns fix that pose with a covariance; a rigid rig has one pose at all instants.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ def estimate_rig_pose(
     trace: Trace | None = None,
     **options: Any,
 ) -> AveragePose:
-    """The pose of the other camera relative to the reference views', ``T`` (1) with its covariance, from B instants.
+    """The pose ``T`` (1) of the other camera relative to the reference camera, with its covariance, from B instants.
 
-    Instants that look at one place share most of their errors: those of the sensor there, of tracks on its edges. So
-    their mean is called no surer than one of them is; only other ``places`` make it surer.
+    Instants that show one place share most of their errors: those of the sensor there and of tracks on its edges. So
+    the covariance of their mean is that of a single instant; only further ``places`` reduce it.
 
     Args:
-        reference views, others: views of the two cameras; both may move, together.
-        method: whose seats 1 to 5 are asked. Where the cameras see the scene very differently a learned tracker helps.
+        references, others: views of the two cameras; both may move, together.
+        method: its stages 1 to 5 are used. Where the cameras see the scene very differently a learned tracker helps.
         seed, hint, trace: as :class:`Method` takes them.
-        places: that the instants look at, in about equal shares.
+        places: number of places that the instants show, in about equal parts.
         options: of :func:`dhtorch.geometry.pose_averaging.average_poses`.
 
     Returns:
         The mean of B = 1 rig over V instants. Not ``ok`` where the instants contradict each other: the rig is not
-        rigid, or most poses are wrong. ``agree`` tells which instants hold the mean.
+        rigid, or most poses are wrong. ``agree`` marks the instants whose poses are consistent with the mean.
 
     Raises:
         ValueError: wrong shapes, or places below 1.
@@ -57,20 +57,20 @@ def estimate_rig_pose(
     fit = trace["fit"]
     T = fit.T_1_from_0.map(lambda x: x[None])
     mean = average_poses(T, fit.cov[None], fit.ok[None], **options)
-    shared = (mean.agree.sum(-1) / places).clamp_min(1)
-    return mean._replace(cov=mean.cov * shared[:, None, None].to(mean.cov))
+    per_place = (mean.agree.sum(-1) / places).clamp_min(1)
+    return mean._replace(cov=mean.cov * per_place[:, None, None].to(mean.cov))
 
 
 @dataclass(frozen=True, eq=False)
 class ConstantPose:
-    """What stands in a method's ``pose_prior`` where all pairs are of the same two cameras of a rig:
-    ``pose_prior=ConstantPose(…)``."""
+    """A ``pose_prior`` stage with one pose for all pairs, those of two cameras of a rig:
+    ``method.replace(pose_prior=ConstantPose(…))``."""
 
     T_1_from_0: Pose  # (1)
-    cov: Tensor | None = None  # (1, 6, 6); None = not stated
+    cov: Tensor | None = None  # (1, 6, 6); None = unknown
 
     def __call__(self, reference: Frame, others: Frame) -> PosePrior:
-        """The pose for B reference views, and for V × B other views."""
-        lead = others.camera.f.shape[:-1]
-        made = make_prior(self.T_1_from_0, cov=self.cov).to(reference.camera.f.dtype)
-        return made.map(lambda x: x[0].to(reference.camera.f.device).expand(*lead, *x.shape[1:]))
+        """The prior of B reference views with B or V × B other views: (B,) or (V, B)."""
+        batch_shape = others.camera.f.shape[:-1]
+        prior = make_prior(self.T_1_from_0, cov=self.cov).to(reference.camera.f.dtype)
+        return prior.map(lambda x: x[0].to(reference.camera.f.device).expand(*batch_shape, *x.shape[1:]))

@@ -1,7 +1,7 @@
-"""Frame after frame: the newest is answered from those before it, with a bounded memory.
+"""Streaming estimation: depth of the newest frame of a sequence from past frames, with bounded memory.
 
-push(frame) ─ remember ─┬─ a cut? forget what came before
-                        └─ past frames at a few steps ─ choose ─ the method ─ Estimate of the newest
+push(frame) ─┬─ scene cut: past frames are dropped
+             └─ past frames at a few steps ─ selection ─ method ─ Estimate of the newest
 """
 
 from __future__ import annotations
@@ -21,28 +21,29 @@ from dhtorch.pipeline.presets import AUTO
 from dhtorch.pipeline.spec import Trace
 from dhtorch.records import NO_HINT, Estimate, Frame, TrackHint
 
-#: Mean support of the coarse motion below which two frames in a row show different things. Real frames in a row reach
-#: 0.65 and more, pictures of different rooms 0.07 to 0.33 (``data=shared_scenes``); built-in rooms of different seeds,
-#: which share their layout, 0.37 to 0.43: no cut is seen between those.
+#: Mean support of the coarse flow below which two consecutive frames show different scenes. Consecutive real frames
+#: reach 0.65 and more, images of different rooms 0.07 to 0.33 (``data=shared_scenes``); built-in rooms of different
+#: seeds, which share their layout, 0.37 to 0.43: a cut between those is not detected.
+#: Source: derived, between 0.07 to 0.33 and 0.65 on data=shared_scenes.
 MIN_CUT_SUPPORT = 0.3
 
-#: Standard deviation of grey values below which a picture is too flat to tell a cut by.
+#: Standard deviation of grey values below which an image is too flat to detect a cut. Source: origin not recorded.
 FLAT_IMAGE_SIGMA = 0.02
 
 
 class Stream:
-    """A method asked for the newest frame of a sequence, from past frames only.
+    """A method applied to the newest frame of a sequence, with past frames as source views.
 
-    What it answers depends on the frames that were pushed since the last cut or :meth:`reset`, and on nothing else: not
-    on how they came, nor on the process that held the stream (it pickles, with its memory).
+    An estimate depends only on the frames pushed since the last cut or :meth:`reset`: not on their timing, nor on the
+    process that has the stream (it can be pickled, past frames included).
 
     Args:
-        method: of one other view or several; it chooses among past frames (``method.select_views``, else by samples).
+        method: of one other view or several; it selects among past frames (``method.select_views``, else by samples).
         steps: how many frames back the other views may lie.
         seed: of the pose search, the same for every frame.
-        hint: what is known of the motion.
+        hint: prior knowledge of the motion, for the tracker.
 
-    Memory: the last ``max(steps)`` frames as they were pushed; :attr:`nbytes` says how much that is now.
+    Memory: the last ``max(steps)`` frames as they were pushed; :attr:`nbytes` is their present size.
     """
 
     def __init__(
@@ -58,28 +59,28 @@ class Stream:
         self.method, self.steps, self.seed, self.hint = method, tuple(sorted(set(steps))), seed, hint
         self.past: deque[Frame] = deque(maxlen=self.steps[-1])
         self.pushed = 0  # frames since the stream was made
-        self.cuts: list[int] = []  # numbers of the frames with which something new began, the first apart
+        self.cuts: list[int] = []  # numbers of the frames after a cut; the first frame is not among them
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the remembered frames."""
+        """Bytes of the past frames."""
         return sum(x.nbytes for x in pytree.tree_leaves(list(self.past)))
 
     def reset(self) -> None:
-        """Forget all past frames: what comes next is seen for the first time."""
+        """Drop all past frames: the next frame has no source view."""
         self.past.clear()
 
     def push(self, frame: Frame, *, trace: Trace | None = None) -> Estimate:
-        """Depth along the samples of ``frame`` (B = 1), by the parallax to past frames.
+        """Depth at the samples of ``frame`` (B = 1), triangulated from past frames.
 
-        The first frame, and the first after a cut, has no other view and is silent (gate NO_BASELINE). A cut is a
-        picture in which hardly a part of the one before is found again (:func:`is_scene_cut`); the past is then
-        forgotten and the frame's number noted in :attr:`cuts`.
+        The first frame, and the first after a cut, has no source view and is unanswered (gate NO_BASELINE). A cut is
+        an image with hardly any correspondence to the one before (:func:`is_scene_cut`); past frames are then dropped
+        and the frame's number is appended to :attr:`cuts`.
 
         Args:
             frame: one view, on the device of those before it.
-            trace: as :class:`dhtorch.pipeline.method.Method`; ``back`` (views, 1) says how many frames back the views
-                asked lie.
+            trace: as :class:`dhtorch.pipeline.method.Method`; ``back`` (views, 1) is the number of frames from each
+                selected view to ``frame``.
 
         Raises:
             ValueError: more than one view in the frame; else as the method.
@@ -94,10 +95,10 @@ class Stream:
                 self.cuts.append(self.pushed)
                 self.reset()
             steps = [s for s in self.steps if s <= len(self.past)]
-            others = [self.past[-s] for s in reversed(steps)]  # in the order in which the camera took them
+            others = [self.past[-s] for s in reversed(steps)]  # in the order of capture
             if others:
-                told = others if len(others) > 1 else others[0]
-                estimate = self.method(frame, told, seed=self.seed, hint=self.hint, trace=trace)
+                views = others if len(others) > 1 else others[0]
+                estimate = self.method(frame, views, seed=self.seed, hint=self.hint, trace=trace)
                 if trace is not None and "choice" in trace:
                     index = trace["choice"].index
                     trace["back"] = torch.tensor(list(reversed(steps)), device=index.device)[index]
@@ -109,12 +110,13 @@ class Stream:
 
 
 def is_scene_cut(before: Frame, after: Frame) -> bool:
-    """Whether hardly a part of one picture is found again in the next; flat pictures tell nothing and are no cut."""
+    """Whether two frames have hardly any correspondence, by the support of their coarse flow; False for flat images."""
     if min(float(_contrast(frame.image)) for frame in (before, after)) < FLAT_IMAGE_SIGMA:
         return False
     return float(coarse_flow(before.image, after.image).support.mean()) < MIN_CUT_SUPPORT
 
 
 def _contrast(image: Tensor) -> Tensor:
+    """Standard deviation of every fourth pixel of an image, uint8 scaled to [0, 1]."""
     grey = image[..., ::4, ::4].float()
     return (grey / 255 if image.dtype == torch.uint8 else grey).std()

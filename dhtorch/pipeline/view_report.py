@@ -1,4 +1,4 @@
-"""A method that is offered the frames around a reference view: how it is asked, which it chose, and why these."""
+"""Report of view selection: the source views that a method selected for a reference view, and their gain."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ViewReport:
-    """The frames of one reference view that were asked, as positions in the recording, and what spoke for them."""
+    """The source views of one reference view, as positions in the recording, and the gain of each."""
 
     reference: int
-    views: tuple[int, ...]  # rising; tracks and pose in a trace are those of the last
+    views: tuple[int, ...]  # ascending; tracks and pose in a trace are those of the last
     n_offered: int
-    gain: tuple[float, ...] | None = None  # what each added to those chosen before it; None = nobody said
-    n_no_answer: int = 0  # offered frames that answered nothing: no pose or no baseline
+    gain: tuple[float, ...] | None = None  # of each over those selected before it; None = not computed
+    n_no_answer: int = 0  # candidates without any answer: no pose or no baseline
 
     def row(self) -> dict[str, Any]:
         """Columns of a result's row."""
         gain = None if self.gain is None else [float(f"{w:.4g}") for w in self.gain]
-        why = {"n_offered": self.n_offered, "gain": gain, "n_no_answer": self.n_no_answer}
-        return {"views": list(self.views), "why": why}
+        columns = {"n_offered": self.n_offered, "gain": gain, "n_no_answer": self.n_no_answer}
+        return {"views": list(self.views), "why": columns}
 
     def __str__(self) -> str:
-        names = ", ".join(map(str, self.views))
-        said = f"frame {self.reference}: view{'s' * (len(self.views) > 1)} {names}"
+        views = ", ".join(map(str, self.views))
+        line = f"frame {self.reference}: view{'s' * (len(self.views) > 1)} {views}"
         if len(self.views) == self.n_offered:
-            return f"{said}, all that were offered"
-        said += f", chosen of {self.n_offered}"
+            return f"{line}, all that were offered"
+        line += f", chosen of {self.n_offered}"
         if self.gain is None:
-            return said
+            return line
         gain = f"gain {', '.join(f'{w:.3g}' for w in self.gain)}"
         no_answer = f"; {self.n_no_answer} had no baseline or no pose" if self.n_no_answer else ""
-        return f"{said} ({gain}{no_answer})"
+        return f"{line} ({gain}{no_answer})"
 
 
 def with_view_selection(method: Method) -> Method:
-    """The method as it is asked with more frames than it looks at.
+    """The method with a ``select_views`` stage, for more candidate views than it uses.
 
-    One that does not choose for itself (``paper``, ``map``, ``window``) chooses by probes; and as the chosen views lie
-    on both sides of the reference view, none says where the search in the next begins.
+    A method without one (``paper``, ``map``, ``window``) selects by previews, and without ``chain``: selected views lie
+    on both sides of the reference view, so that tracks are not extrapolated from one to the next.
     """
     return (
         method if method.select_views is not None else method.replace(select_views=select_views_by_preview, chain=False)
@@ -54,22 +54,22 @@ def with_view_selection(method: Method) -> Method:
 
 
 def report_selection(reference: int, offered: Sequence[int], trace: Mapping[str, Any], b: int = 0) -> ViewReport:
-    """What became of the frames offered for one reference view; said in the log at level DEBUG.
+    """The view selection of one reference view, from the trace of the method's call; logged at level DEBUG.
 
     Args:
         reference: its position in the recording.
-        offered: positions of the frames that the method was given, in that order.
-        trace: of the call; a single frame is asked as a pair, and chosen without a choice.
-        b: place of the reference view in the batch.
+        offered: positions of the candidate frames, in the order in which the method got them.
+        trace: of the call; it has no ``choice`` for a single candidate, which is a pair.
+        b: index of the reference view in the batch.
     """
     choice = trace.get("choice")
     if choice is None:
-        found = ViewReport(reference, tuple(offered), len(offered))
+        report = ViewReport(reference, tuple(offered), len(offered))
     else:
         views = tuple(offered[k] for k in choice.index[:, b].tolist())
         gain = None if choice.gain is None else tuple(choice.gain[:, b].tolist())
-        found = ViewReport(
+        report = ViewReport(
             reference, views, len(offered), gain, 0 if choice.no_answer is None else int(choice.no_answer[:, b].sum())
         )
-    _LOG.debug("%s", found)
-    return found
+    _LOG.debug("%s", report)
+    return report

@@ -1,4 +1,4 @@
-"""A method is a record: any function with the seat's signature may sit in a seat, wherever a method is asked."""
+"""A method is a record: any function with a stage's signature can be that stage, wherever a method is used."""
 
 import pickle
 from dataclasses import fields
@@ -34,7 +34,7 @@ N = 512
 
 
 def sample(hw, n, *, device=None, dtype=torch.float32):
-    """Seat 1, and so on: plain functions with nothing but what the seat is called with."""
+    """Stage 1, and so on: plain functions with nothing but what the stage is called with."""
     return spiral(hw, n, device=device, dtype=dtype)
 
 
@@ -156,7 +156,7 @@ def test_replace_changes_a_seat_or_its_options_and_nothing_else():
     kept = [f.name for f in fields(Method) if f.name not in ("n", "track", "score")]
     assert all(getattr(changed, k) is getattr(MAP, k) for k in kept) and MAP.track.keywords == {"levels": 5}
     for wrong in ({"trak": len}, {"seed": 1}):
-        with pytest.raises(TypeError, match=f"found {next(iter(wrong))}, expected seats and options among sample, "):
+        with pytest.raises(TypeError, match=f"found {next(iter(wrong))}, expected stages and options among sample, "):
             PAPER.replace(**wrong)
 
 
@@ -166,8 +166,8 @@ def test_options_are_the_papers_unless_they_are_changed():
 
 
 def test_options_are_those_of_what_sits_there_now():
-    seat = PAPER.replace(track=track).replace(track={"hint": TrackHint()}).track
-    assert seat.func is track and PAPER.replace(score={"min_score": 0.5}).score.func is confidence
+    stage = PAPER.replace(track=track).replace(track={"hint": TrackHint()}).track
+    assert stage.func is track and PAPER.replace(score={"min_score": 0.5}).score.func is confidence
 
 
 def test_a_pose_from_elsewhere_takes_the_place_of_seat_5(room):
