@@ -1,9 +1,10 @@
-"""dhtorch: a short-range depth sensor as a metric ruler.
+"""dhtorch: metric depth beyond the range of a short-range depth sensor, from several views.
 
-Near returns fix the metric relative pose of two views; what can be tracked beyond the sensor's reach is triangulated
-under that pose; weak geometry stays a hole that says why. ``extend`` is the paper's method, ``merge`` the map it gives.
+Near returns fix the metric relative pose of two views; pixels tracked beyond the sensor's range are triangulated under
+that pose; where the geometry is weak, a hole with a reason remains. ``extend`` is the paper's method, ``merge``
+combines its estimate with the sensor's returns.
 
-Names are imported when they are first asked for: ``dhtorch --help`` answers before torch is loaded.
+Names are imported on first access: ``dhtorch --help`` runs without loading torch.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ __all__ = [
     "validate_depth",
 ]
 
-#: Public name → the module that defines it, where it is not ``records``.
+#: Public name → module that defines it, if that is not ``records``.
 _HOMES = dict.fromkeys(("AUTO", "MAP", "PAPER", "WINDOW", "extend"), "pipeline.presets")
 _HOMES |= {
     "ExtendDepth": "transforms",

@@ -1,11 +1,10 @@
-"""The three code tables: what is wrong with a sample, why a return is missing, why an answer is withheld.
+"""Code tables: flags of a sample, reasons for a missing return, reasons for a withheld answer, sources and states.
 
 Codes are plain integers (an ``IntEnum`` member compared with a tensor inside ``torch.compile(fullgraph=True)`` becomes
-a Python bool). The numbers are fixed once published; the names in the tables are what results and figures print.
+a Python bool). Published numbers are fixed; the names in the tables are those in results and figures.
 
-A code is one entry: ``NAME: Final = code(number, definition, …)``. Everything that shows codes reads the entries, so
-that a new code has a text wherever codes are described and, until ``viz.plots.colours`` gives it one of its own, a
-common colour.
+A code is one entry: ``NAME: Final = code(number, definition, …)``. Descriptions and figures read the entries, so that a
+new code has a text everywhere and, until ``viz.plots.colours`` defines one for it, a default colour.
 """
 
 from __future__ import annotations
@@ -19,26 +18,26 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class CodeEntry:
-    """What is written about one code."""
+    """Number and texts of one code."""
 
     number: int
     definition: str  # the condition that sets it
-    meaning: str  # the same as a short clause for people; the definition where none is given
-    advice: str = ""  # what would help at the next recording; empty = nothing
-    retry: str = ""  # which options of a job to try; empty = none
+    meaning: str  # the same as a short clause for messages; default: the definition
+    advice: str = ""  # what to change in the next recording; empty = nothing
+    retry: str = ""  # options of a job to try; empty = none
 
 
-_pending: list[CodeEntry] = []  # entries of the table whose class body is being executed
+_pending: list[CodeEntry] = []  # entries of the class body in execution
 
 
 def code(number: int, definition: str, *, meaning: str = "", advice: str = "", retry: str = "") -> int:
-    """An entry of the code table in whose class body it stands: its number, see :class:`CodeEntry`."""
+    """The number of a code; adds its :class:`CodeEntry` to the table whose class body calls this."""
     _pending.append(CodeEntry(number, definition, meaning or definition, advice, retry))
     return number
 
 
 class CodeTable:
-    """Base of the code tables: class attributes are plain integers, ``entries`` is what is written about them."""
+    """Base of the code tables: class attributes are plain integers, ``entries`` maps them to their entries."""
 
     entries: ClassVar[dict[int, CodeEntry]]
 
@@ -48,7 +47,7 @@ class CodeTable:
 
 
 class Flag(CodeTable):
-    """Bits of ``Samples.flag``: several may hold at once. The first five are the paper's."""
+    """Bits of ``Samples.flag``: several may be set at once. The first five are the paper's."""
 
     NO_DEPTH: Final = code(1, "the sensor gave no return at this pixel")
     LOW_CONF: Final = code(2, "the sensor's own confidence is below the accepted level")
@@ -64,9 +63,9 @@ class Flag(CodeTable):
 
 
 class Hole(CodeTable):
-    """Classes of ``Samples.hole``: why a sample has no usable return, and so what could be done about it."""
+    """Classes of ``Samples.hole``: the reason why a sample has no usable return."""
 
-    NONE: Final = code(0, "not a hole: the sensor answered")
+    NONE: Final = code(0, "not a hole: there is a usable return")
     TRACKABLE_NO_LIDAR: Final = code(1, "normal brightness, enough texture, no usable depth: the key class")
     LOW_TEXTURE: Final = code(2, "normal brightness, but nothing to track")
     TOO_BRIGHT: Final = code(3, "clipped at white")
@@ -76,7 +75,7 @@ class Hole(CodeTable):
 
 
 class Route(CodeTable):
-    """A hint to the user of the map: what could fill this hole (one per :class:`Hole` class)."""
+    """Suggestion how to fill a hole (one per :class:`Hole` class)."""
 
     NOTHING: Final = code(0, "")
     TRIANGULATE: Final = code(1, "")
@@ -86,7 +85,7 @@ class Route(CodeTable):
 
 
 class Gate(CodeTable):
-    """Codes of ``Estimate.gate``, in the order asked; the first reason for silence wins."""
+    """Codes of ``Estimate.gate``, in order of precedence: the first reason that holds is the code."""
 
     ANSWER: Final = code(0, "answered")
     NO_TRACK: Final = code(
@@ -124,7 +123,7 @@ class Gate(CodeTable):
         7, "the rays miss each other by too many pixels", meaning="the views do not meet in one point"
     )
     INCONSISTENT: Final = code(
-        8, "another view, or the patch itself, contradicts the answer", meaning="the views do not agree"
+        8, "another view, or the patch itself, contradicts the depth", meaning="the views do not agree"
     )
     UNCERTAIN: Final = code(
         9,
@@ -135,14 +134,14 @@ class Gate(CodeTable):
     LOW_SCORE: Final = code(10, "score below the threshold", meaning="answers that are not sure enough")
     CONTRADICTED: Final = code(
         11,
-        "what lies far contradicts the near returns: these move on their own",
+        "far tracks contradict the near returns: these lie on moving objects",
         meaning="what the sensor sees moves, or contradicts the pictures",
         advice="a still scene would help",
         retry="try frames in which nothing else moves",
     )
     POSE_REFUTED: Final = code(
         12,
-        "a pose was given, and the near returns contradict it",
+        "the near returns contradict the given pose",
         meaning="the poses given contradict the near returns",
         advice="see their axes, direction and unit",
     )
@@ -156,30 +155,30 @@ class PoseCode(CodeTable):
     DEGENERATE: Final = code(2, "the points do not determine a pose (collinear, coincident)")
     NO_BASELINE: Final = code(3, "the camera did not translate significantly, or stood still")
     KEPT_PNP: Final = code(4, "refinement did not improve the fit; the PnP pose was kept")
-    REFUTED: Final = code(5, "a pose was given, and the near returns contradict it")
+    REFUTED: Final = code(5, "the near returns contradict the given pose")
 
 
 class Source(CodeTable):
-    """Where a value of a merged map comes from."""
+    """Origin of a value of a merged map."""
 
     NONE: Final = code(0, "")
     SENSOR: Final = code(1, "")
     RECOVERED: Final = code(2, "a tracked sample, triangulated")
-    SWEPT: Final = code(3, "a pixel of a dense map, found on its epipolar line")
-    ALIGNED: Final = code(4, "a pixel of somebody else's map, tied to returns and answers")
+    SWEPT: Final = code(3, "a pixel of a dense map, matched along its epipolar line")
+    ALIGNED: Final = code(4, "a pixel of an external depth map, aligned to returns and recovered depths")
 
 
 class State(CodeTable):
-    """What is said of a pixel of a judged depth map."""
+    """Codes of the pixels of a validated depth map."""
 
-    CANNOT_KNOW: Final = code(0, "nothing that was seen could tell: no baseline, no texture, hidden, or no depth")
-    CONSISTENT: Final = code(1, "what would have told an error of a fifth speaks for it")
-    WRONG: Final = code(2, "something speaks against it, and nothing for it")
+    CANNOT_KNOW: Final = code(0, "no evidence: no baseline, no texture, occluded, or no depth")
+    CONSISTENT: Final = code(1, "supported by evidence that would detect an error of 20 %")
+    WRONG: Final = code(2, "contradicted by evidence, and supported by none")
 
 
 def describe(table: type[CodeTable], name: str) -> CodeEntry | None:
     """The entry of a code by its name in any case; None where the table has no such code."""
-    numbers = {known: number for number, known in names(table).items()}
+    numbers = {code_name: number for number, code_name in names(table).items()}
     return table.entries.get(numbers.get(name.upper(), -1))
 
 
@@ -190,11 +189,11 @@ def names(table: type) -> dict[int, str]:
 
 
 def words(name: str) -> str:
-    """A code's name as people read it: TRACKABLE_NO_LIDAR → trackable, no LiDAR."""
+    """A code's name as text: TRACKABLE_NO_LIDAR → trackable, no LiDAR."""
     return name.lower().replace("_no_lidar", ", no LiDAR").replace("_", " ")
 
 
-#: What to try for each class of hole; nothing for one that is not listed.
+#: Route of each class of hole; NOTHING for one that is not listed.
 ROUTE_OF_HOLE: Final[dict[int, int]] = dict.fromkeys(names(Hole), Route.NOTHING) | {
     Hole.TRACKABLE_NO_LIDAR: Route.TRIANGULATE,
     Hole.LOW_TEXTURE: Route.GET_CLOSER,
@@ -205,11 +204,11 @@ ROUTE_OF_HOLE: Final[dict[int, int]] = dict.fromkeys(names(Hole), Route.NOTHING)
 
 
 def first_reason(*reasons: tuple[Tensor, int], otherwise: int = 0) -> Tensor:
-    """Codes int32 of the first mask that holds, asked in the order given; ``otherwise`` where none does.
+    """Codes int32 of the first mask that is True, in the order of ``reasons``; ``otherwise`` where none is.
 
     Args:
         reasons: (mask, code) pairs; masks are equally shaped bool tensors.
-        otherwise: code where no mask holds.
+        otherwise: code where no mask is True.
     """
     code = torch.full_like(reasons[0][0], otherwise, dtype=torch.int32)
     for mask, reason in reversed(reasons):
