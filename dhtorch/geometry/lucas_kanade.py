@@ -1,18 +1,18 @@
-"""Pyramidal Lucas-Kanade between two pyramids: the search, without a graph.
+"""Pyramidal Lucas-Kanade: points of a source pyramid -> their displacements to a target pyramid, without gradients.
 
 Alphabet: ``x`` a point of the first image (the source) and ``d`` its displacement to the second (the target), (2, M) px
 of the level at hand, the M points of all pairs in one row; ``batch`` (M,) the pair a point belongs to; T the window at
 x, J the target, g = (dT/dx, dT/dy), A = sum g gᵀ; ``moments`` (5 or 6, M): sum g T, A_xx, A_xy, A_yy and, where the
 gain is estimated, sum T².
 
-Why it is fast. A Gauss-Newton step solves A step = sum g (J(d) - T). J between pixels is a weighted mean of J at
+Cost. A Gauss-Newton step solves A step = sum g (J(d) - T). J between pixels is a weighted mean of J at
 pixels, and the sum over the window is linear in J; so sum g J(d) is the same weighted mean of a few numbers
 C[o] = sum_p g(p) J(p + o), o an offset in whole pixels. This *map* C is computed once for a small square of offsets, by
 a depthwise convolution whose channels are the points. After that a step touches eight numbers per point, and no pixel.
 Coarse levels only provide a start: there the points of a small *cell* of the image share one search.
 
-The same without maps, one point at a time: ``search`` of ``tests/support/reference.py``. One level of the search has a
-compiled kernel.
+The same search without maps, one point at a time: ``search`` of ``tests/support/reference.py``. One level of the search
+has a compiled kernel.
 """
 
 from __future__ import annotations
@@ -32,33 +32,46 @@ from dhtorch.geometry.patches import QUANTISATION_VARIANCE
 from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, OUTSIDE_MARGIN_PX, Pyramid
 from dhtorch.ops.dispatch import operator
 
-#: Width of a cell, px of its level, and the finest level with cells. Coarse levels only say where the next one starts:
-#: there the points of a cell share one search. Cells are nested, so that they share its start as well.
-CELL_PX, CELL_LEVEL = 4, 2
+#: Width of a cell, px of its level: on coarse levels, which only provide the start of the next one, the points of a
+#: cell share one search. Cells are nested, so that they share its start as well. Source: origin not recorded.
+CELL_PX = 4
 
-#: On the finest level the sixth step on a map leaps to where the steps seem to lead; ratios of successive steps beyond
-#: these limits are not believed.
-AITKEN_STEP, AITKEN_RATIO_RANGE = 6, (-0.9, 0.9)
+#: Finest level with cells, 0 = full resolution. Source: origin not recorded.
+CELL_LEVEL = 2
 
-#: On coarse levels a step has converged at so many times ``epsilon_px``.
+#: Number of the step on a map, from 1, that is extrapolated to the limit of the steps (Aitken); finest level only.
+#: Source: origin not recorded.
+AITKEN_STEP = 6
+
+#: Limits of the ratio of successive steps in that extrapolation. Source: origin not recorded.
+AITKEN_RATIO_RANGE = (-0.9, 0.9)
+
+#: Factor on ``epsilon_px``, the step length at which a point has converged, on coarse levels.
+#: Source: origin not recorded.
 COARSE_EPSILON_FACTOR = 4.0
 
-#: Gauss-Newton steps on one map.
+#: Largest number of Gauss-Newton steps on one map. Source: origin not recorded.
 STEPS_PER_MAP = 8
 
-#: Radii of a point's successive maps at the top, where nothing is known yet and few cells are to be searched, between,
-#: and on the finest level. A map of radius r covers the offsets from -r to r + 1.
-TOP_RADII, MIDDLE_RADII, FINEST_RADII = (2, 2, 2, 2), (1, 2, 2), (1, 2, 2, 2)
+#: Radii of a point's successive maps on the top level, where the displacement is unknown and few cells are searched,
+#: px. A map of radius r covers the offsets from -r to r + 1. Source: origin not recorded.
+TOP_RADII = (2, 2, 2, 2)
 
-#: A ratio of contrasts beyond these limits is not believed.
+#: Radii of the maps on the levels between, px. Source: origin not recorded.
+MIDDLE_RADII = (1, 2, 2)
+
+#: Radii of the maps on the finest level, px. Source: origin not recorded.
+FINEST_RADII = (1, 2, 2, 2)
+
+#: Limits of the gain between two windows, a ratio of contrasts. Source: origin not recorded.
 CONTRAST_RATIO_RANGE = (0.2, 5.0)
 
-#: What may be taken out of the difference of two windows.
+#: What the comparison of two windows leaves free.
 NORMALISATIONS = ("none", "bias", "gain_bias")
 
 
 class SearchOptions(NamedTuple):
-    """How to search; see :func:`dhtorch.stages.track.lucas_kanade`."""
+    """Options of the search; see :func:`dhtorch.stages.track.lucas_kanade`."""
 
     window: int
     iterations: int
@@ -68,7 +81,7 @@ class SearchOptions(NamedTuple):
 
 
 class _Pair(NamedTuple):
-    """One level of two pyramids, how to search on it, and where points may be."""
+    """One level of two pyramids, the options of its search, and the bounds of its points."""
 
     source: Pyramid
     target: Pyramid
@@ -79,7 +92,7 @@ class _Pair(NamedTuple):
 
 
 class _Templates(NamedTuple):
-    """What is known of the windows of image 0, whatever image 1 shows."""
+    """The windows of image 0, which do not depend on image 1."""
 
     x: Tensor  # (2, M) px of the level
     batch: Tensor  # (M,)
@@ -88,11 +101,11 @@ class _Templates(NamedTuple):
 
 
 class _State(NamedTuple):
-    """How far the points are."""
+    """State of the search for every point."""
 
     d: Tensor  # (2, M) px of the level
-    live: Tensor  # (M,) wants to move
-    held: Tensor  # (M,) is still on its map
+    active: Tensor  # (M,) the search goes on
+    on_map: Tensor  # (M,) the point lies within its map
 
 
 def search_displacements(
@@ -103,61 +116,61 @@ def search_displacements(
     d: Tensor,  # (2, M) px, the start
     batch: Tensor,  # (M,)
     *,
-    known: Tensor,  # (M,) bool, the others are not searched for
+    known: Tensor,  # (M,) bool, other points are not searched for
     begun: Tensor,  # (M,) bool
     near_levels: int,
     alike: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Coarse to fine from ``d``. ``alike``: all ``d`` are equal, so that the points of a cell may share a search.
-    ``begun``: points whose ``d`` is as near as the finest ``near_levels`` levels reach; they skip the coarser ones.
+    """Points x and start d -> displacements (2, M), whether they are valid (M,), and A (3, M) of the finest level.
 
-    Returns the displacement (2, M), whether it was found (M,), and A (3, M) of the finest level.
+    Coarse to fine. ``alike``: all ``d`` are equal, so that the points of a cell may share a search. ``begun``: points
+    whose ``d`` is within the range of the finest ``near_levels`` levels; they skip the coarser ones.
     """
     x, d = x.contiguous(), d.contiguous()
     top = min(len(source.levels), len(target.levels)) - 1
-    rough = o._replace(epsilon_px=o.epsilon_px * COARSE_EPSILON_FACTOR)
+    coarse_options = o._replace(epsilon_px=o.epsilon_px * COARSE_EPSILON_FACTOR)
 
     def start(level: int, x: Tensor, d: Tensor, batch: Tensor, begun: Tensor | None = None) -> Tensor:
-        """Where the search on ``level`` starts: the displacement found on the level above."""
+        """Start of the search on ``level``: the displacement of the level above."""
         if level == top:
             return d * 0.5**top
         if begun is not None and level + 1 >= near_levels:
             return masked_apply(~begun, lambda *cold: (start(level, *cold),), (d * 0.5**level,), (x, d, batch))[0]
         if alike and level + 1 >= CELL_LEVEL:
-            return _by_cell(source, level + 1, partial(coarse, level + 1, begun=None), x, d, batch) * 2
+            return _search_by_cell(source, level + 1, partial(coarse, level + 1, begun=None), x, d, batch) * 2
         return coarse(level + 1, x, d, batch, begun) * 2
 
     def coarse(level: int, x: Tensor, d: Tensor, batch: Tensor, begun: Tensor | None) -> Tensor:
-        pair = _Pair(source, target, rough, level, *target.bounds(level))
+        pair = _Pair(source, target, coarse_options, level, *target.bounds(level))
         radii = TOP_RADII if level == top or level + 1 == near_levels else MIDDLE_RADII
-        pixel = source.corner(level, x * 0.5**level + 0.5)  # read between pixels only where it decides the answer
-        every = torch.ones_like(batch, dtype=torch.bool)
-        return _search_level(pair, radii, pixel, start(level, x, d, batch, begun), batch, every)[0]
+        pixel = source.corner(level, x * 0.5**level + 0.5)  # interpolated on the finest level only
+        all_known = torch.ones_like(batch, dtype=torch.bool)
+        return _search_level(pair, radii, pixel, start(level, x, d, batch, begun), batch, all_known)[0]
 
     pair = _Pair(source, target, o, 0, *target.bounds(0))
-    d, held, textured, A = _search_level(
+    d, on_map, textured, A = _search_level(
         pair, FINEST_RADII if top else TOP_RADII, x, start(0, x, d, batch, begun), batch, known
     )
-    return d, known & textured & held & is_between(x + d, pair.low, pair.high), A
+    return d, known & textured & on_map & is_between(x + d, pair.low, pair.high), A
 
 
 def lucas_kanade_step(
     source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, x_1: Tensor, batch: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """One Gauss-Newton step (2, M), to be subtracted from ``x_1``, read from pixels of the finest level and carrying a
-    graph; and who is textured (M,)."""
-    G = _project(source.windows(0, x, batch, o.window), o.normalise)
+    """One differentiable Gauss-Newton step (2, M) on the finest level, to be subtracted from ``x_1``; and whether each
+    window is textured (M,)."""
+    G = _remove_gain_bias(source.windows(0, x, batch, o.window), o.normalise)
     J = target.windows(0, x_1, batch, o.window, (GREY_PLANE,))
     moments = _moments(G, o.normalise)
     A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
-    found = _steps((_kernels(G, o.normalise) * J).sum(-1), moments, A_inv)
-    return found if o.normalise != "gain_bias" else found[:2] / found[2].clamp(*CONTRAST_RATIO_RANGE), textured
+    steps = _steps((_kernels(G, o.normalise) * J).sum(-1), moments, A_inv)
+    return steps if o.normalise != "gain_bias" else steps[:2] / steps[2].clamp(*CONTRAST_RATIO_RANGE), textured
 
 
 def squared_differences(
     source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, d: Tensor, batch: Tensor
 ) -> Tensor:
-    """Squared grey differences between the windows at ``x`` and ``x + d`` after normalisation, summed: (M,)."""
+    """Sum (M,) of squared grey differences between the windows at ``x`` and ``x + d``, after normalisation."""
     sums = []
     for p, q, b in zip(*(y.split(MAX_CHUNK_POINTS, -1) for y in (x, x + d, batch)), strict=True):
         T = source.windows(0, p, b, o.window, (GREY_PLANE,))[0]
@@ -172,7 +185,10 @@ def squared_differences(
 
 
 def window_covariance(A: Tensor, variance: Tensor) -> Tensor:
-    """s² A⁻¹ (2, 2, M). The small eigenvalue of A is raised to 1e-5 of the large one, which float32 can represent."""
+    """Normal matrices A and variances s² -> covariances s² A⁻¹ (2, 2, M).
+
+    The small eigenvalue of A is raised to 1e-5 of the large one, which float32 can represent.
+    """
     a, b, c = torch.where(A.isfinite(), A, torch.zeros_like(A)).double()
     small, _ = eigenvalues_2x2(a, b, c)
     lift = (1e-5 * (a + c - small).clamp_min(1e-4) - small).clamp_min(0)
@@ -182,61 +198,61 @@ def window_covariance(A: Tensor, variance: Tensor) -> Tensor:
 
 
 def masked_apply(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: tuple[Any, ...]):
-    """``values`` (each (..., M)), replaced where ``wanted`` (M,) by what ``fn(*columns)`` returns.
+    """``values`` (each (..., M)), replaced where ``wanted`` (M,) by the results of ``fn(*columns)``.
 
-    ``columns`` are tensors (..., M) or trees of them. Where shapes may depend on values, ``fn`` sees only the wanted
-    points, filled up by copies of the first.
+    ``columns`` are tensors (..., M) or trees of them. Where shapes may depend on values, ``fn`` gets only the wanted
+    points, padded with copies of the first.
     """
     if is_static(wanted):
         return tuple(torch.where(wanted, new, old) for new, old in zip(fn(*columns), values, strict=True))
-    some = wanted.nonzero()[:, 0]
-    if not len(some):
+    index = wanted.nonzero()[:, 0]
+    if not len(index):
         return values
-    some = _whole_lanes(some)
-    new = fn(*(_picked(column, some) for column in columns))
-    return tuple(old.index_copy(-1, some, n) for old, n in zip(values, new, strict=True))
+    index = _pad_to_lanes(index)
+    new = fn(*(_select_points(column, index) for column in columns))
+    return tuple(old.index_copy(-1, index, n) for old, n in zip(values, new, strict=True))
 
 
-def _picked(column: Any, some: Tensor) -> Any:
-    """Points of a tensor (..., M), or of each in a named tuple of them."""
+def _select_points(column: Any, index: Tensor) -> Any:
+    """The points ``index`` of a tensor (..., M), or of each tensor in a named tuple."""
     if isinstance(column, Tensor):
-        return column.index_select(-1, some)
-    return type(column)(*(_picked(part, some) for part in column))
+        return column.index_select(-1, index)
+    return type(column)(*(_select_points(part, index) for part in column))
 
 
-def _whole_lanes(index: Tensor) -> Tensor:
-    """An index (M,) filled up to whole ``ELEMENTWISE_LANES`` by copies of its first."""
+def _pad_to_lanes(index: Tensor) -> Tensor:
+    """An index (M,) padded to whole ``ELEMENTWISE_LANES`` with copies of its first element."""
     return torch.cat([index, index[:1].expand(-len(index) % ELEMENTWISE_LANES)])
 
 
-def _by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
-    """``fn(x, d, batch)`` (2, M) in the middle of the cell that each ``x`` (2, M) lies in; all ``d`` are equal.
+def _search_by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
+    """``fn(x, d, batch)`` (2, M) at the centre of the cell of each point ``x`` (2, M); all ``d`` are equal.
 
     Where shapes may depend on values it is computed once per cell.
     """
     size = CELL_PX * 2**level
     H, W = pyramid.hw()
     columns, rows = -(-W // size), -(-H // size)
-    lowest, highest = pyramid.bounds()
+    low, high = pyramid.bounds()
 
     def search(cell: Tensor) -> Tensor:
-        place = torch.stack([cell % columns, cell // columns % rows]).to(x)
-        place = torch.minimum((place + 0.5) * size, highest - 0.5)
-        return fn(place, d[:, :1].expand_as(place).contiguous(), cell // (rows * columns))
+        centre = torch.stack([cell % columns, cell // columns % rows]).to(x)
+        centre = torch.minimum((centre + 0.5) * size, high - 0.5)
+        return fn(centre, d[:, :1].expand_as(centre).contiguous(), cell // (rows * columns))
 
-    column, row = ((x - lowest) / size).long().clamp_min(0)
-    own = (batch * rows + row.clamp_max(rows - 1)) * columns + column.clamp_max(columns - 1)
+    column, row = ((x - low) / size).long().clamp_min(0)
+    cell_of_point = (batch * rows + row.clamp_max(rows - 1)) * columns + column.clamp_max(columns - 1)
     if is_static(x):
-        return search(own)
-    wanted = own.new_zeros(len(pyramid.levels[0]) * rows * columns).index_fill_(0, own, 1)
-    cells = _whole_lanes(wanted.nonzero()[:, 0])
-    return search(cells).index_select(-1, (wanted.cumsum(0) - 1)[own])
+        return search(cell_of_point)
+    occupied = cell_of_point.new_zeros(len(pyramid.levels[0]) * rows * columns).index_fill_(0, cell_of_point, 1)
+    cells = _pad_to_lanes(occupied.nonzero()[:, 0])
+    return search(cells).index_select(-1, (occupied.cumsum(0) - 1)[cell_of_point])
 
 
 def _search_level(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
-    """One level: all points on a first map, then those that need it on further ones.
+    """Search on one level -> displacement (2, M); whether each point lies within its last map and is textured (M,); A.
 
-    Returns the displacement; who stayed on the last map, and whose window is textured (both (M,)); and A (3, M).
+    All points are searched on a first map, those that have not converged on further ones. A is (3, M).
     """
     levels = pair.source.levels[pair.level], pair.target.levels[pair.level]
     return _lk_level(*levels, x, d, batch, known, pair=pair, radii=radii)
@@ -254,8 +270,8 @@ def _lk_level_kernel(
     radii: tuple[int, ...],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     o = pair.o
-    found, A = d.new_empty(2, d.shape[-1]), d.new_empty(3, d.shape[-1])
-    held, textured = torch.empty_like(known), torch.empty_like(known)
+    displacement, A = d.new_empty(2, d.shape[-1]), d.new_empty(3, d.shape[-1])
+    on_map, textured = torch.empty_like(known), torch.empty_like(known)
     torch.ops.dhtorch.lk_level.default(
         source=source,
         target=target,
@@ -265,9 +281,9 @@ def _lk_level_kernel(
         known=known,
         limits=torch.cat([pair.low, pair.high], 1).T.contiguous(),
         radii=torch.tensor(radii),
-        found=found,
+        found=displacement,
         A=A,
-        held=held,
+        held=on_map,
         textured=textured,
         window=o.window,
         iterations=o.iterations,
@@ -285,7 +301,7 @@ def _lk_level_kernel(
         min_ratio=AITKEN_RATIO_RANGE[0],
         max_ratio=AITKEN_RATIO_RANGE[1],
     )
-    return found, held, textured, A
+    return displacement, on_map, textured, A
 
 
 @operator(
@@ -303,27 +319,27 @@ def _lk_level(
     pair: _Pair,
     radii: tuple[int, ...],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """:func:`_search_level` on the level of ``pair`` that ``source`` and ``target`` are."""
+    """:func:`_search_level` on the level tensors ``source`` and ``target`` of ``pair``."""
     o = pair.o
     corner = pair.target.corner(pair.level, x + d) - radii[0]
-    C, moments = _map(pair, radii[0], x, corner, batch)
+    C, moments = _correlation_map(pair, radii[0], x, corner, batch)
     A_inv, textured = _inverse(moments[2:5], o.min_eigenvalue * o.window**2)
     windows = _Templates(x, batch, moments, A_inv)
-    live = known & textured & is_between(x + d, pair.low, pair.high)
+    active = known & textured & is_between(x + d, pair.low, pair.high)
     first, *further = (min(STEPS_PER_MAP, o.iterations - k * STEPS_PER_MAP) for k in range(len(radii)))
-    state = _on_map(pair, first, _steps(C, moments, A_inv), corner, x, _State(d, live, live))
+    state = _on_map(pair, first, _steps(C, moments, A_inv), corner, x, _State(d, active, active))
     for radius, steps in zip(radii[1:], further, strict=True):
         if steps > 0:
-            again = partial(_on_new_map, pair, radius, steps)
-            state = _State(*masked_apply(state.live, again, state, (windows, state)))
-    return state.d, state.held, textured, moments[2:5]
+            search_again = partial(_recentre_map, pair, radius, steps)
+            state = _State(*masked_apply(state.active, search_again, state, (windows, state)))
+    return state.d, state.on_map, textured, moments[2:5]
 
 
-def _on_new_map(pair: _Pair, radius: int, steps: int, windows: _Templates, state: _State) -> _State:
-    """:func:`_on_map` with a map around where the points are, of windows whose moments are known."""
+def _recentre_map(pair: _Pair, radius: int, steps: int, windows: _Templates, state: _State) -> _State:
+    """:func:`_on_map` with a new map around the points' current positions; the windows' moments are reused."""
     x, batch, moments, A_inv = windows
     corner = pair.target.corner(pair.level, x + state.d) - radius
-    C, _ = _map(pair, radius, x, corner, batch, moments)
+    C, _ = _correlation_map(pair, radius, x, corner, batch, moments)
     return _on_map(pair, steps, _steps(C, moments, A_inv), corner, x, state)
 
 
@@ -331,14 +347,13 @@ def _on_map(
     pair: _Pair,
     steps: int,
     field: Tensor,  # (2 or 3, n, n, M) see _steps
-    corner: Tensor,  # (2, M) the target's pixel where the map begins
+    corner: Tensor,  # (2, M) first pixel of the map in the target
     x: Tensor,  # (2, M)
     state: _State,
 ) -> _State:
-    """Where the living are after ``steps`` Gauss-Newton steps on one map, who of them wants to go on from there on
-    another, and who is still on this one.
+    """The state after ``steps`` Gauss-Newton steps of the active points on one map.
 
-    Beyond a map's border its field fades to zero, so that a point that leaves is held near it.
+    Beyond a map's border its field fades to zero, so that a point that leaves stays near it.
     """
     o, start = pair.o, x + state.d - corner
     p = start
@@ -346,29 +361,29 @@ def _on_map(
     step = torch.zeros_like(p)
     for k in range(1, steps + 1):
         hat = torch.rsub((p[:, None] - node).abs_(), 1).clamp_min_(0)  # (2, n, M) bilinear weights, 1 - |p - node|
-        last, step = step, ((field * hat[0]).sum(2) * hat[1]).sum(1)
+        previous, step = step, ((field * hat[0]).sum(2) * hat[1]).sum(1)
         if len(field) == 3:
             step = step[:2] / step[2].clamp(*CONTRAST_RATIO_RANGE)
         if k == AITKEN_STEP and k < steps and pair.level == 0:
-            step = _leap(last, step, o.epsilon_px)
+            step = _aitken_step(previous, step, o.epsilon_px)
         p = p - step
-    p = torch.where(state.live & all_finite(p, 0), p, start)
-    held = (p == p.clamp(0, field.shape[1] - 1.0)).all(0)
-    restless = ~held | ((step * step).sum(0) > o.epsilon_px**2)
-    live = state.live & restless & is_between(p, pair.low - corner, pair.high - corner)
-    return _State(p + corner - x, live, held)
+    p = torch.where(state.active & all_finite(p, 0), p, start)
+    within = (p == p.clamp(0, field.shape[1] - 1.0)).all(0)
+    unconverged = ~within | ((step * step).sum(0) > o.epsilon_px**2)
+    active = state.active & unconverged & is_between(p, pair.low - corner, pair.high - corner)
+    return _State(p + corner - x, active, within)
 
 
-def _leap(last: Tensor, step: Tensor, epsilon_px: float) -> Tensor:
-    """The sum of all steps to come, as shrinking by one ratio as from the ``last`` to this ``step`` (Aitken)."""
-    ratio = (step * last).sum(0) / (last * last).sum(0).clamp_min(epsilon_px**2)
+def _aitken_step(previous: Tensor, step: Tensor, epsilon_px: float) -> Tensor:
+    """Limit of the steps, which shrink geometrically by the ratio of ``step`` to the ``previous`` one (Aitken)."""
+    ratio = (step * previous).sum(0) / (previous * previous).sum(0).clamp_min(epsilon_px**2)
     return torch.where((step * step).sum(0) > epsilon_px**2, step / (1 - ratio.clamp(*AITKEN_RATIO_RANGE)), step)
 
 
 def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:
-    """Gauss-Newton steps (2, ..., M) from correlations (K, ..., M), as linear in them as a map is between its nodes.
+    """Correlations (K, ..., M) -> Gauss-Newton steps (2, ..., M), which are linear in them.
 
-    With K = 3 the steps are those for equal contrast, and a third plane is the gain they are to be divided by.
+    With K = 3 the steps are those for equal contrast, and a third plane is the gain to divide them by.
     """
     shape = (2, *(1,) * (C.ndim - 2), C.shape[-1])
     change = C[:2] - moments[:2].view(shape)
@@ -376,8 +391,8 @@ def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:
     return steps if len(C) == 2 else torch.cat([steps, _gain(C[2:], moments[5])])
 
 
-def _map(pair: _Pair, radius: int, x: Tensor, corner: Tensor, batch: Tensor, moments: Tensor | None = None):
-    """Map (K, n, n, M) of the windows at ``x`` (2, M) that begins at the target's pixels ``corner``; the moments."""
+def _correlation_map(pair: _Pair, radius: int, x: Tensor, corner: Tensor, batch: Tensor, moments: Tensor | None = None):
+    """Windows at ``x`` (2, M) -> map (K, n, n, M) that begins at the target's pixels ``corner``, and their moments."""
     o, w = pair.o, pair.o.window
     side = w + 2 * radius + 1
     planes = (
@@ -389,7 +404,7 @@ def _map(pair: _Pair, radius: int, x: Tensor, corner: Tensor, batch: Tensor, mom
     first_1, _ = pair.target.locate(pair.level, corner + radius, batch, w // 2 + radius, (GREY_PLANE,))
     maps, sums = [], []
     for i, j, f in zip(*(y.split(MAX_CHUNK_POINTS, -1) for y in (first_0, first_1, fraction)), strict=True):
-        G = _project(pair.source.read(pair.level, i, w, None if pair.level else f), o.normalise)
+        G = _remove_gain_bias(pair.source.read(pair.level, i, w, None if pair.level else f), o.normalise)
         if moments is None:
             sums.append(_moments(G, o.normalise))
         kernel = _kernels(G, o.normalise).reshape(-1, 1, w, w)
@@ -399,8 +414,8 @@ def _map(pair: _Pair, radius: int, x: Tensor, corner: Tensor, batch: Tensor, mom
     return C, torch.cat(sums, -1) if moments is None else moments
 
 
-def _project(G: Tensor, normalise: str) -> Tensor:
-    """Windows (3, M, w²) of g_x, g_y and T with what the normalisation leaves free (bias, gain) taken out of them."""
+def _remove_gain_bias(G: Tensor, normalise: str) -> Tensor:
+    """Windows (3, M, w²) of g_x, g_y and T, made orthogonal to what ``normalise`` leaves free (bias, gain)."""
     if normalise == "none":
         return G
     G = G - G.mean(-1, keepdim=True)
@@ -408,12 +423,12 @@ def _project(G: Tensor, normalise: str) -> Tensor:
         return G
     g, T = G[:2], G[2:]
     energy = (T * T).sum(-1, keepdim=True)
-    share = (g * T).sum(-1, keepdim=True) / torch.where(energy > 0, energy, torch.ones_like(energy))
-    return torch.cat([g - share * T, T])
+    slope = (g * T).sum(-1, keepdim=True) / torch.where(energy > 0, energy, torch.ones_like(energy))
+    return torch.cat([g - slope * T, T])
 
 
 def _kernels(G: Tensor, normalise: str) -> Tensor:
-    """What a step needs correlated with J, (K, M, w²): g, and T where the gain is estimated."""
+    """The kernels (K, M, w²) that are correlated with J: g, and T where the gain is estimated."""
     return G if normalise == "gain_bias" else G[:2]
 
 
@@ -424,20 +439,20 @@ def _moments(G: Tensor, normalise: str) -> Tensor:
 
 
 def _gain(correlation: Tensor, energy: Tensor) -> Tensor:
-    """Contrast of J in units of T's."""
+    """Correlation of T with J and energy of T -> gain, the contrast of J over that of T; 1 where T is flat."""
     ratio = correlation / torch.where(energy > 0, energy, torch.ones_like(energy))
     return torch.where(energy > 0, ratio, torch.ones_like(ratio))
 
 
 def _inverse(A: Tensor, min_eigenvalue: float) -> tuple[Tensor, Tensor]:
-    """Inverse (2, 2, M) of A (3, M), zero where its small eigenvalue is not above the limit; and where it is (M,)."""
+    """A (3, M) -> inverse (2, 2, M), zero where the small eigenvalue is not above the limit; and whether it is (M,)."""
     a, b, c = A.double()
     textured = eigenvalues_2x2(a, b, c)[0] > min_eigenvalue
     det = torch.where(textured, determinant_2x2(a, b, b, c), torch.ones_like(a))
-    found = torch.stack(adjugate_2x2(a, b, b, c)) / det
-    return torch.where(textured, found, torch.zeros_like(found)).to(A.dtype).unflatten(0, (2, 2)), textured
+    inverse = torch.stack(adjugate_2x2(a, b, b, c)) / det
+    return torch.where(textured, inverse, torch.zeros_like(inverse)).to(A.dtype).unflatten(0, (2, 2)), textured
 
 
 def is_between(x: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """Whether points (2, M) lie between bounds; NaN does not."""
+    """Whether points (2, M) lie between bounds, (M,); false for NaN."""
     return ((x >= low) & (x <= high)).all(0)
