@@ -1,6 +1,6 @@
-"""Stage 2, what the sensor says there: depth at the samples → metric points, confidence and flags.
+"""Stage 2: depth maps and sample pixels → metric points, sigma, confidence and flags.
 
-Fail loud, fail localised: a sample without a usable return is NaN and flagged, never filled from its neighbours.
+A sample without a usable return is NaN and flagged, never filled from its neighbours.
 """
 
 from __future__ import annotations
@@ -32,15 +32,21 @@ from dhtorch.geometry.windows import row_bands, window_extreme, window_sum
 from dhtorch.ops.dispatch import operator
 from dhtorch.records import Camera, Frame, Samples
 
-#: Search radius in a sparse depth map, px: the truth test reads sparse returns in 7×7 windows, so do the samples.
+#: Limits the search for a return in a sparse depth map: Chebyshev radius in depth pixels.
+#: Source: derived, (7 − 1) / 2 of the 7×7 windows in which ``metrics.holdout`` reads sparse returns.
 SPARSE_SEARCH_PX = 3
 
-#: Side of the neighbourhood that appearance and depth edges are judged on, px.
+#: Side of the neighbourhood for appearance flags and depth edges, px.
+#: Source: origin not recorded.
 NEIGHBOURHOOD_PX = 5
 
-#: A highlight is colourless: its channels differ by no more than this share of the largest; and it is brighter than the
-#: mean of its neighbourhood by this much of the range of grey values.
-MAX_HIGHLIGHT_COLOUR_REL, MIN_HIGHLIGHT_CONTRAST = 0.15, 0.1
+#: Limits the colour of a highlight: difference of its channels as a fraction of the largest, without unit.
+#: Source: origin not recorded.
+MAX_HIGHLIGHT_COLOUR_REL = 0.15
+
+#: Least excess of a highlight over the mean of its neighbourhood, as a fraction of the range of grey values.
+#: Source: origin not recorded.
+MIN_HIGHLIGHT_CONTRAST = 0.1
 
 
 def backproject(
@@ -57,7 +63,7 @@ def backproject(
     saturated: float = 0.99,
     highlight: float = 0.85,
 ) -> Samples:
-    """Read the depth at sample pixels and lift it to camera-frame points.
+    """Samples of a frame at pixels uv: depth, sigma, camera-frame points, confidence and flags.
 
     The nearest depth pixel is read, so values are never mixed across an edge. In a sparse map (projected LiDAR) a
     sample takes the nearest return within ``search_px`` depth pixels instead.
@@ -73,11 +79,11 @@ def backproject(
         edge_rel: max / min − 1 of the returns in the 5×5 neighbourhood (or as far as is searched, where that is
             farther) above which DEPTH_EDGE is set.
         dark, saturated: mean grey of the neighbourhood below / above which UNDEREXPOSED / SATURATED is set.
-        highlight: a colourless pixel above it that outshines its neighbourhood is SPECULAR.
+        highlight: a colourless pixel above it that is brighter than its neighbourhood is SPECULAR.
 
     Returns:
         Samples with ``trackability`` 0 and ``hole`` NONE: the next stage fills them. ``confidence`` is the sensor's
-        level scaled to [0, 1] (1 where it reports none), halved for each of DEPTH_EDGE, SPECULAR and SATURATED, and
+        level scaled to [0, 1] (1 without a confidence map), halved for each of DEPTH_EDGE, SPECULAR and SATURATED, and
         0 where there is no usable return.
 
     Flags: NO_DEPTH, LOW_CONF, SPECULAR, SATURATED, UNDEREXPOSED, DEPTH_EDGE, BEYOND_NEAR, BORDER. Non-finite and
@@ -111,8 +117,8 @@ def backproject(
         frame.depth,
         frame.conf,
         uv,
-        *_lens(camera),
-        *((None, None, None) if own is None else _lens(own)),
+        *_intrinsics(camera),
+        *((None, None, None) if own is None else _intrinsics(own)),
         frame=frame,
         search_px=search_px,
         limits=limits,
@@ -120,7 +126,7 @@ def backproject(
 
 
 class ReturnLimits(NamedTuple):
-    """What is taken for a return, and what is said of it: options of :func:`backproject`."""
+    """Thresholds of returns and flags: options of :func:`backproject`."""
 
     near_limit: float | None
     min_conf: int
@@ -132,12 +138,12 @@ class ReturnLimits(NamedTuple):
     highlight: float
 
 
-def _lens(camera: Camera) -> tuple[Tensor, Tensor, Tensor | None]:
+def _intrinsics(camera: Camera) -> tuple[Tensor, Tensor, Tensor | None]:
     return camera.f, camera.c, camera.distortion
 
 
 def _is_dense_read(*_: Tensor | None, frame: Frame, search_px: int | None, limits: ReturnLimits) -> bool:
-    """Whether samples read the nearest pixel of a dense map, with a limit of confidence that a byte can hold."""
+    """Whether samples read the nearest pixel of a dense map, with a confidence threshold that fits a byte."""
     return not search_px and frame.sparse is None and 0 <= limits.min_conf <= 255
 
 
@@ -147,9 +153,9 @@ def _read_samples_kernel(
     frame, limits = options["frame"], options["limits"]
     pixel, at, ray = _project_samples(frame, uv)
     picture, steps = flatten_images(image)
-    outputs = found, sigma, confidence = tuple(ray.new_empty(ray.shape[:2]) for _ in range(3))
+    outputs = z, sigma, confidence = tuple(ray.new_empty(ray.shape[:2]) for _ in range(3))
     xyz = torch.empty_like(ray)
-    flag = torch.empty_like(found, dtype=torch.int32)
+    flag = torch.empty_like(z, dtype=torch.int32)
     hw, map_hw, n = frame.hw, (depth.shape[-2], depth.shape[-1]), uv.shape[1]
     size, reach = min(NEIGHBOURHOOD_PX, *hw), min(NEIGHBOURHOOD_PX, *map_hw)
     levels = depth.new_empty(0, dtype=torch.uint8) if conf is None else conf
@@ -169,12 +175,12 @@ def _read_samples_kernel(
         whole_map=whole_is_faster(map_hw, n, reach),
         whole_picture=whole_is_faster(hw, n, size),
     )
-    none = {"trackability": torch.zeros_like(found), "hole": torch.zeros_like(flag)}
-    return Samples(uv=uv, depth=found, sigma=sigma, xyz=xyz, confidence=confidence, flag=flag, **none)
+    unfilled = {"trackability": torch.zeros_like(z), "hole": torch.zeros_like(flag)}
+    return Samples(uv=uv, depth=z, sigma=sigma, xyz=xyz, confidence=confidence, flag=flag, **unfilled)
 
 
 def _project_samples(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels of picture and map (B, N, 2) int32, and rays (B, N, 3), of samples (B, N, 2), for the kernel."""
+    """Pixels of image and depth map (B, N, 2) int32 and rays (B, N, 3) of samples (B, N, 2), for the kernel."""
     camera, own = frame.camera, frame.depth_camera
     (h, w), (H, W) = frame.depth.shape[-2:], frame.hw
     if camera.distortion is None and (own is None or own.distortion is None):
@@ -207,22 +213,22 @@ def _project_samples(frame: Frame, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     when=_is_dense_read,
 )
 def _read_samples(*tensors: Any, frame: Frame, search_px: int | None, limits: ReturnLimits) -> Samples:
-    """:func:`backproject` of a frame; ``tensors`` are those of it that the kernel reads, and uv (B, N, 2)."""
+    """:func:`backproject` of a frame; ``tensors`` are the frame's tensors that the kernel reads, and uv (B, N, 2)."""
     uv = tensors[3]
     pixel = containing_pixels(uv)
     depth, level, edge = _read_depth(frame, uv, pixel, search_px or 0, limits.edge_rel)
     if search_px is None and frame.sparse is not None:
-        found = zip(_read_depth(frame, uv, pixel, SPARSE_SEARCH_PX, limits.edge_rel), (depth, level, edge), strict=True)
-        depth, level, edge = (torch.where(frame.sparse[:, None], a, b) for a, b in found)
-    border, dim, white, shine = _appearance(frame.image, pixel, limits)
-    returned = depth > 0
-    beyond = torch.zeros_like(returned) if limits.near_limit is None else depth > limits.near_limit
-    unsure = returned & (level < limits.min_conf)
-    xyz = cam.unproject(frame.camera, uv.nan_to_num(0.0, 0.0, 0.0), depth)  # no gradient to what is no number
-    usable = returned & ~(unsure | beyond)
+        pairs = zip(_read_depth(frame, uv, pixel, SPARSE_SEARCH_PX, limits.edge_rel), (depth, level, edge), strict=True)
+        depth, level, edge = (torch.where(frame.sparse[:, None], a, b) for a, b in pairs)
+    border, dark, saturated, specular = _appearance(frame.image, pixel, limits)
+    has_return = depth > 0
+    beyond = torch.zeros_like(has_return) if limits.near_limit is None else depth > limits.near_limit
+    low_conf = has_return & (level < limits.min_conf)
+    xyz = cam.unproject(frame.camera, uv.nan_to_num(0.0, 0.0, 0.0), depth)  # no gradient to NaN
+    usable = has_return & ~(low_conf | beyond)
     usable = usable & all_finite(xyz, -1)  # a pixel outside the lens model has no ray
     confidence = (level.to(depth.dtype) / 2).clamp(0, 1)
-    for doubt in (edge, shine, white):
+    for doubt in (edge, specular, saturated):
         confidence = torch.where(doubt, confidence / 2, confidence)
     noise = limits.sigma_rel * depth
     return Samples(
@@ -232,14 +238,14 @@ def _read_samples(*tensors: Any, frame: Frame, search_px: int | None, limits: Re
         xyz=torch.where(usable[..., None], xyz, torch.nan),
         confidence=torch.where(usable, confidence, 0.0),
         flag=_bits(
-            (~returned, Flag.NO_DEPTH),
-            (unsure, Flag.LOW_CONF),
+            (~has_return, Flag.NO_DEPTH),
+            (low_conf, Flag.LOW_CONF),
             (beyond, Flag.BEYOND_NEAR),
             (edge, Flag.DEPTH_EDGE),
             (border, Flag.BORDER),
-            (dim, Flag.UNDEREXPOSED),
-            (white, Flag.SATURATED),
-            (shine, Flag.SPECULAR),
+            (dark, Flag.UNDEREXPOSED),
+            (saturated, Flag.SATURATED),
+            (specular, Flag.SPECULAR),
         ),
         trackability=torch.zeros_like(depth),
         hole=torch.full_like(depth, Hole.NONE, dtype=torch.int32),
@@ -251,7 +257,7 @@ def _read_depth(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Depth (B, N), 0 = none; sensor confidence level (B, N); whether returns around it differ (B, N).
 
-    ``pixel`` is the image's pixel at ``uv``, and the map's as well where both are of one size.
+    ``pixel`` is the image's pixel at ``uv``, and the depth map's where both have the same size.
     """
     h, w = frame.depth.shape[-2:]
     place = cam.depth_pixels(frame.camera, frame.hw, frame.depth_camera, (h, w), uv)
@@ -265,7 +271,7 @@ def _read_depth(
         pixel = containing_pixels(_nearest_return(frame.depth, place, size, search_px))
     index, inside = nearest_pixel_index((h, w), pixel)
     value = frame.depth.flatten(1).gather(1, index)
-    value = value.to(torch.promote_types(value.dtype, uv.dtype))  # half precision stores, and computes nothing
+    value = value.to(torch.promote_types(value.dtype, uv.dtype))  # half precision is for storage only
     value = torch.where(inside, value.nan_to_num(0.0, 0.0, 0.0).relu(), 0.0)
     edge = (value > 0) & (high > low * (1 + edge_rel))
     level = torch.full_like(value, 2) if frame.conf is None else frame.conf.flatten(1).gather(1, index)
@@ -274,9 +280,9 @@ def _read_depth(
 
 def _window_extremes_kernel(depth: Tensor, pixel: Tensor, *, size: int) -> tuple[Tensor, Tensor]:
     *windows, shape = window_arguments(depth, pixel, size)
-    found = depth.new_empty(2, *pixel.shape[:2])
-    torch.ops.dhtorch.window_extremes.default(*windows, found, *shape)
-    low, high = found.unbind(0)
+    extremes = depth.new_empty(2, *pixel.shape[:2])
+    torch.ops.dhtorch.window_extremes.default(*windows, extremes, *shape)
+    low, high = extremes.unbind(0)
     return low, high
 
 
@@ -300,18 +306,18 @@ def _extremes(window: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _whole_extremes(depth: Tensor, size: int) -> tuple[Tensor, Tensor]:
-    """What :func:`_extremes` finds around every pixel (B, h, w) of a map."""
+    """:func:`_extremes` around every pixel (B, h, w) of a depth map."""
     low, high = [], []
-    for inside, around in _around(depth, size // 2):
-        some = depth[:, around].detach().nan_to_num(0, 0, 0)
-        none = torch.nn.functional.threshold(some, 0.0, torch.inf)
+    for inside, around in _bands_with_margin(depth, size // 2):
+        band = depth[:, around].detach().nan_to_num(0, 0, 0)
+        none = torch.nn.functional.threshold(band, 0.0, torch.inf)
         low.append(window_extreme(none, size // 2, torch.minimum)[:, inside])
-        high.append(window_extreme(some, size // 2, torch.maximum)[:, inside])
+        high.append(window_extreme(band, size // 2, torch.maximum)[:, inside])
     return torch.cat(low, 1), torch.cat(high, 1)
 
 
-def _around(image: Tensor, radius: int) -> Iterator[tuple[slice, slice]]:
-    """Some rows of a picture after the other: where they are among those read for them, and which these are."""
+def _bands_with_margin(image: Tensor, radius: int) -> Iterator[tuple[slice, slice]]:
+    """Row bands of an image: the band's rows within the rows read for it, and the rows read (margin ``radius``)."""
     for part in row_bands(image, image.shape[-2:]):
         top = max(part.start - radius, 0)
         yield slice(part.start - top, part.stop - top), slice(top, part.stop + radius)
@@ -332,12 +338,12 @@ def _nearest_return(depth: Tensor, place: Tensor, size: int, search_px: int) -> 
     reachable = near & (window > 0) & (window < torch.inf)
     distance = (du * du + dv * dv).flatten(-2)
     pick = torch.where(reachable, distance, distance.new_full((), 1 << 30)).argmin(-1, keepdim=True)
-    found = first + torch.cat((pick % size, torch.div(pick, size, rounding_mode="floor")), -1)
-    return torch.where(reachable.gather(-1, pick), found.to(place.dtype), place)
+    nearest = first + torch.cat((pick % size, torch.div(pick, size, rounding_mode="floor")), -1)
+    return torch.where(reachable.gather(-1, pick), nearest.to(place.dtype), place)
 
 
 def _appearance(image: Tensor, pixel: Tensor, limits: ReturnLimits) -> tuple[Tensor, ...]:
-    """What the picture alone decides, (B, N) each: at the border, too dark, clipped at white, a highlight."""
+    """Flags (B, N) from the image alone: border, underexposed, saturated, highlight."""
     hw = (image.shape[-2], image.shape[-1])
     size = min(NEIGHBOURHOOD_PX, *hw)
     white = 1 if image.is_floating_point() else 255
@@ -345,12 +351,12 @@ def _appearance(image: Tensor, pixel: Tensor, limits: ReturnLimits) -> tuple[Ten
     def doubts_of(mean: Tensor, centre: Tensor, top: Tensor, bottom: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         colourless = top - bottom <= MAX_HIGHLIGHT_COLOUR_REL * top
         bright = (centre >= limits.highlight * white) & (centre - mean >= MIN_HIGHLIGHT_CONTRAST * white)
-        shine = colourless & bright
-        return mean <= limits.dark * white, mean >= limits.saturated * white, shine
+        specular = colourless & bright
+        return mean <= limits.dark * white, mean >= limits.saturated * white, specular
 
     if whole_is_faster(hw, pixel.shape[1], size) and image.dtype == torch.uint8:
-        found = zip(*(doubts_of(*seen) for seen in _whole_brightness(image, size)), strict=True)
-        doubts = tuple(gather_reduced(torch.cat(rows, 1), pixel, size) for rows in found)
+        bands = zip(*(doubts_of(*brightness) for brightness in _whole_brightness(image, size)), strict=True)
+        doubts = tuple(gather_reduced(torch.cat(rows, 1), pixel, size) for rows in bands)
     else:
         doubts = doubts_of(*_window_brightness(image.detach(), pixel, size=size))
     return ~is_patch_inside(pixel, hw, size), *doubts
@@ -358,9 +364,9 @@ def _appearance(image: Tensor, pixel: Tensor, limits: ReturnLimits) -> tuple[Ten
 
 def _window_brightness_kernel(image: Tensor, pixel: Tensor, *, size: int) -> tuple[Tensor, ...]:
     *windows, shape = window_arguments(image, pixel, size)
-    found = image.new_empty(4, *pixel.shape[:2], dtype=torch.float32)
-    torch.ops.dhtorch.window_brightness.default(*windows, found, *shape)
-    return found.unbind(0)
+    brightness = image.new_empty(4, *pixel.shape[:2], dtype=torch.float32)
+    torch.ops.dhtorch.window_brightness.default(*windows, brightness, *shape)
+    return brightness.unbind(0)
 
 
 @operator(
@@ -370,12 +376,12 @@ def _window_brightness_kernel(image: Tensor, pixel: Tensor, *, size: int) -> tup
     when=fits_window_kernel,
 )
 def _window_brightness(image: Tensor, pixel: Tensor, *, size: int) -> tuple[Tensor, ...]:
-    """What :func:`_brightness` is around pixels (B, N, 2) of images (B, C, H, W), four tensors (B, N)."""
+    """:func:`_brightness` around pixels (B, N, 2) of images (B, C, H, W), four tensors (B, N)."""
     return reduce_patches(image, pixel, size, _brightness)
 
 
 def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Mean grey, and of the pixel in the middle grey, largest and smallest channel; of (C, size, size, P)."""
+    """Mean grey of windows (C, size, size, P); grey, largest and smallest channel of their middle pixel; (P,) each."""
     patch = patch if patch.is_floating_point() else patch.float()
     middle = patch[:, patch.shape[1] // 2, patch.shape[2] // 2]
     mean, centre = luma(torch.stack((patch.flatten(1, 2).mean(1), middle), 1), 0)[0]
@@ -383,28 +389,30 @@ def _brightness(patch: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 def _whole_brightness(image: Tensor, size: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-    """What :func:`_brightness` finds around every pixel (B, H, W) of pictures of bytes, whose sums are exact in
-    whatever order they are taken; some rows after the other, which need no fresh memory."""
-    for inside, around in _around(image, size // 2):
-        some = image[..., around, :]
-        total = window_sum(some.to(torch.int16).flatten(0, 1), size // 2)[:, inside].unflatten(0, image.shape[:2])
-        planes = some[..., inside, :].contiguous()
+    """:func:`_brightness` around every pixel (B, H, W) of uint8 images, one row band after the other.
+
+    Sums of bytes are exact in any order; a band needs no fresh memory.
+    """
+    for inside, around in _bands_with_margin(image, size // 2):
+        band = image[..., around, :]
+        total = window_sum(band.to(torch.int16).flatten(0, 1), size // 2)[:, inside].unflatten(0, image.shape[:2])
+        planes = band[..., inside, :].contiguous()
         mean, centre = (luma(x, 1)[:, 0] for x in (total.float() / size**2, planes.float()))
         yield mean, centre, planes.amax(1).float(), planes.amin(1).float()
 
 
 def _bits(*masks: tuple[Tensor, int]) -> Tensor:
-    """One int32 bit set of (mask, bit) pairs; of eight bits at most, which a byte holds."""
-    if torch.compiler.is_compiling():  # which makes one loop of all
+    """Bit set (…) int32 of (mask, bit) pairs with bits below 256."""
+    if torch.compiler.is_compiling():  # which fuses them into one loop
         return sum(
             (torch.where(mask, bit, 0) for mask, bit in masks[1:]), torch.where(masks[0][0], masks[0][1], 0)
         ).int()
-    held = torch.stack([mask for mask, _ in masks])
-    bits = (_bytes.__wrapped__ if is_transformed() else _bytes)(tuple(bit for _, bit in masks), device=held.device)
-    return torch.where(held, bits, 0).sum(0, dtype=torch.int32)
+    stacked = torch.stack([mask for mask, _ in masks])
+    bits = (_bytes.__wrapped__ if is_transformed() else _bytes)(tuple(bit for _, bit in masks), device=stacked.device)
+    return torch.where(stacked, bits, 0).sum(0, dtype=torch.int32)
 
 
 @lru_cache(maxsize=32)
 def _bytes(values: tuple[int, ...], *, device: torch.device) -> Tensor:
-    """Numbers below 256, (K, 1, 1); the same few are asked for again and again."""
+    """Numbers below 256 as a tensor (K, 1, 1); cached, because few distinct values occur."""
     return torch.tensor(values, dtype=torch.uint8, device=device)[:, None, None]

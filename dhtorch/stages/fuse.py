@@ -1,4 +1,4 @@
-"""The seat beside the line: what several views of one reference view say about its samples, joined into one answer."""
+"""Fusion of source views: estimates (V, B, N) of one reference view's samples → one estimate (B, N)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from dhtorch.codes import Gate, first_reason
 from dhtorch.geometry.checks import check
 from dhtorch.records import Estimate
 
-#: Least share of a variance that is put down to the point's own track, whatever the pose's part.
+#: Limits the own part of a variance from below: a fraction of the whole, without unit, whatever the pose's part.
+#: Source: origin not recorded.
 MIN_FUSED_OWN_RATIO = 1e-3
 
 
@@ -24,32 +25,30 @@ def inverse_variance(
     max_sigma_rel: float | None = 0.1,
     max_static_ratio: float = 0.5,
 ) -> Estimate:
-    """Join the answers of several views of the same samples; where they contradict each other, say nothing.
+    """Inverse-variance mean of several views' estimates (V, B, N) -> (B, N); unanswered where the views contradict.
 
-    Errors of triangulation are even in inverse depth, not in depth, so inverse depths are averaged, each by its own
-    inverse variance. What the views disagree by is asked twice: more than ``max_chi2`` variances per degree of freedom
-    silences the point, and a smaller excess over one widens its sigma.
+    Errors of triangulation are symmetric in inverse depth, not in depth, so inverse depths are averaged, each with its
+    own inverse variance. The disagreement of the views is used twice: more than ``max_chi2`` variances per degree of
+    freedom leave the point unanswered, and a smaller excess over one increases its sigma.
 
     Args:
         min_views: fewer answering views (or all, where there are not so many) make no answer.
         max_chi2: sum of squared differences from the mean, in variances, per view beyond the first.
         correlation: of the views' own errors, which share the reference view's window. At 1 sigma is the weighted mean
-            of the views', at 0 it shrinks with the root of their number. The poses' parts are always taken to be common
-            to the
-            views: all poses rest on the same near returns.
-        max_sigma_rel: sigma / depth of the fused answer above which it is withheld; None asks nothing. Views may answer
-            far less surely than that.
-        max_static_ratio: share of the views without a baseline above which none is believed: the few that found one
-            where the camera hardly moved have most likely taken something else for it.
+            of the views', at 0 it decreases with the root of their number. The poses' parts are always taken as common
+            to the views: all poses are estimated from the same near returns.
+        max_sigma_rel: sigma / depth of the fused answer above which it is withheld; None = no limit. Views may answer
+            with a far larger sigma.
+        max_static_ratio: fraction of the views without a baseline above which no view is used: the few baselines found
+            where the camera hardly moved are most likely wrong.
 
     Returns:
         Estimate (B, N); a single view's as it is. ``n_views`` counts the reference view; ``parallax_deg`` is the
         largest of all views, ``residual_px`` the weighted rms of those that answered (of none: the last view's);
         ``score`` is 1 where answered.
 
-    Gates: NO_BASELINE for all points of a reference view whose views mostly have none; with too few views, the reason
-        of the
-    last view that is silent; INCONSISTENT, UNCERTAIN.
+    Gates: NO_BASELINE for all points of a reference view whose views mostly have none; with too few views, the gate of
+    the last unanswered view; INCONSISTENT, UNCERTAIN.
 
     Raises:
         ValueError: wrong shapes, or no view.
@@ -62,10 +61,10 @@ def inverse_variance(
         raise ValueError("inverse_variance: expected at least one view")
     if V == 1:
         return estimates[0]
-    said = _is_answered(estimates)
-    inverse, own, shared = _inverse_depth(estimates, said)
-    n = said.sum(0)
-    weight, mean, chi2 = _mean(inverse, own * own + shared * shared, said)
+    answered = _is_answered(estimates)
+    inverse, own, shared = _inverse_depth(estimates, answered)
+    n = answered.sum(0)
+    weight, mean, chi2 = _mean(inverse, own * own + shared * shared, answered)
     widening = chi2.clamp_min(1)
     own_2 = correlation * (weight * own).sum(0).square() + (1 - correlation) * (weight * own).square().sum(0)
     shared_2 = (weight * shared).sum(0).square() * widening
@@ -73,11 +72,11 @@ def inverse_variance(
     sigma = depth * depth * (own_2 * widening + shared_2).sqrt()
     unsure = torch.zeros_like(n, dtype=torch.bool) if max_sigma_rel is None else sigma > max_sigma_rel * depth
     gate = first_reason((~(chi2 <= max_chi2), Gate.INCONSISTENT), (unsure, Gate.UNCERTAIN))
-    gate = torch.where(n < min(max(min_views, 1), V), _last_reason(estimates.gate, said), gate)
-    return _joint(
+    gate = torch.where(n < min(max(min_views, 1), V), _last_reason(estimates.gate, answered), gate)
+    return _joint_estimate(
         estimates,
         _static_gate(estimates, gate, max_static_ratio),
-        said,
+        answered,
         weight,
         depth=depth,
         sigma=sigma,
@@ -96,67 +95,72 @@ def fuse_consistent(
     max_sigma_rel: float | None = 0.2,
     max_static_ratio: float = 0.5,
 ) -> Estimate:
-    """Join the views that agree about a sample; one view alone answers where it is sure by itself.
+    """Mean of the largest set of agreeing views' estimates (V, B, N) -> (B, N); a single precise view may answer alone.
 
-    Every view is asked how much the others agree with it, each as sure as its (depth / sigma)²; the one with most
-    agreement and those that agree with it answer together, and the others speak against the answer. A view that is
-    silent speaks neither for it nor against it, so another view never costs an answer that it does not contradict.
+    Every view is scored by the weights (depth / sigma)² of the views that agree with it; the view with the highest
+    score and those that agree with it form the answer, and the others count against it. An unanswered view counts
+    neither for nor against it, so another view never removes an answer that it does not contradict.
 
     Args:
         max_chi2: squared difference of two views' inverse depths, over the sum of their variances, up to which they
             agree.
-        max_conflict_ratio: (depth / sigma)² of the views that disagree, as a share of that of the views that agree,
-            above which the point is silenced.
+        max_conflict_ratio: (depth / sigma)² of the views that disagree, as a fraction of that of the views that agree,
+            above which the point is unanswered.
         sure_rel: sigma / depth up to which one view answers without another that agrees.
-        sure_rel_each: sigma / depth up to which several answer, for each that agrees: what is unsure needs many.
-        max_sigma_rel: sigma / depth of the joint answer above which it is withheld; None asks nothing.
-        max_static_ratio: share of the views without a baseline above which none is believed.
+        sure_rel_each: sigma / depth up to which several answer, per agreeing view: a larger sigma needs more views.
+        max_sigma_rel: sigma / depth of the joint answer above which it is withheld; None = no limit.
+        max_static_ratio: fraction of the views without a baseline above which no view is used.
 
     Returns:
         Estimate (B, N); a single view's as it is. The joint inverse depth is the mean of those that agree, by inverse
         variance. Sigma is the weighted mean of theirs and never less: the views share the reference view's window and
-        the near returns, so what they have in common is not averaged out; where they differ by more than they say it
-        grows with the root of that ratio. ``n_views`` counts the reference view and those that agree; ``parallax_deg``
-        is their largest, ``residual_px`` their weighted rms; ``score`` is 1 where answered.
+        the near returns, so what they have in common is not averaged out; where they differ by more than their
+        sigmas it grows with the root of that ratio. ``n_views`` counts the reference view and those that agree;
+        ``parallax_deg`` is their largest, ``residual_px`` their weighted rms; ``score`` is 1 where answered.
 
-    Gates: NO_BASELINE for all points of a reference view whose views mostly have none; where no view answers, the
-        reason of
-    the last; INCONSISTENT (other views disagree), UNCERTAIN (a sigma too large for so many views);
-    CONTRADICTED for all answers where it silences more views than answer.
+    Gates: NO_BASELINE for all points of a reference view whose views mostly have none; where no view answers, the gate
+    of the last; INCONSISTENT (other views disagree), UNCERTAIN (a sigma too large for so many views); CONTRADICTED for
+    all answers where more views are CONTRADICTED than answer.
 
     Raises:
         ValueError: wrong shapes, or no view.
 
     Gradient: depth and sigma to those of the views; which of them agree, and gates, carry none.
-    Cost: linear in views but for comparing them with each other, a few operations on (V, V, B, N).
+    Cost: linear in views except their comparison, a few operations on (V, V, B, N).
     """
     V = check("fuse_consistent", gate=(estimates.gate, "V B N"), depth=(estimates.depth, "V B N"))["V"]
     if V < 1:
         raise ValueError("fuse_consistent: expected at least one view")
     if V == 1:
         return estimates[0]
-    said = _is_answered(estimates)
-    inverse, own, shared = _inverse_depth(estimates, said)
+    answered = _is_answered(estimates)
+    inverse, own, shared = _inverse_depth(estimates, answered)
     variance = own.square() + shared.square()
-    sureness = torch.where(said, inverse.square() / variance, torch.zeros_like(variance)).detach()  # (depth / sigma)²
-    joined = _largest_agreement(inverse.detach(), variance.detach(), sureness, said, max_chi2)
-    n = joined.sum(0)
-    against = torch.where(joined, 0.0, sureness).sum(0) > max_conflict_ratio * torch.where(joined, sureness, 0.0).sum(0)
-    weight, mean, chi2 = _mean(inverse, variance, joined)
+    sureness = torch.where(
+        answered, inverse.square() / variance, torch.zeros_like(variance)
+    ).detach()  # (depth / sigma)²
+    agreeing = _largest_agreement(inverse.detach(), variance.detach(), sureness, answered, max_chi2)
+    n_agreeing = agreeing.sum(0)
+    contradicted = torch.where(agreeing, 0.0, sureness).sum(0) > max_conflict_ratio * torch.where(
+        agreeing, sureness, 0.0
+    ).sum(0)
+    weight, mean, chi2 = _mean(inverse, variance, agreeing)
     own_2, shared_2 = ((weight * part).sum(0).square() * chi2.clamp_min(1) for part in (own, shared))
     depth = 1 / mean
     sigma = depth * depth * _root(own_2 + shared_2)
-    limit = torch.where(n < 2, sure_rel, sure_rel_each * n).clamp(
+    max_rel = torch.where(n_agreeing < 2, sure_rel, sure_rel_each * n_agreeing).clamp(
         max=math.inf if max_sigma_rel is None else max_sigma_rel
     )
-    gate = first_reason((against, Gate.INCONSISTENT), (sigma > limit * depth, Gate.UNCERTAIN))
-    gate = torch.where(n < 1, _last_reason(estimates.gate, said), gate)
+    gate = first_reason((contradicted, Gate.INCONSISTENT), (sigma > max_rel * depth, Gate.UNCERTAIN))
+    gate = torch.where(n_agreeing < 1, _last_reason(estimates.gate, answered), gate)
     gate = _contradicted_gate(estimates, gate)
-    parallax = torch.where(joined | (n < 1), estimates.parallax_deg, torch.zeros_like(estimates.parallax_deg))
-    return _joint(
+    parallax = torch.where(
+        agreeing | (n_agreeing < 1), estimates.parallax_deg, torch.zeros_like(estimates.parallax_deg)
+    )
+    return _joint_estimate(
         estimates,
         _static_gate(estimates, gate, max_static_ratio),
-        joined,
+        agreeing,
         weight,
         depth=depth,
         sigma=sigma,
@@ -165,50 +169,53 @@ def fuse_consistent(
     )
 
 
-def _largest_agreement(inverse: Tensor, variance: Tensor, sureness: Tensor, said: Tensor, max_chi2: float) -> Tensor:
-    """Which views (V, B, N) stand together: those that agree with the view that has most agreement, it included."""
-    apart = (inverse[:, None] - inverse).square() / (variance[:, None] + variance)
-    agreeing = said[:, None] & said & (apart <= max_chi2)
-    support = torch.where(agreeing, sureness, torch.zeros_like(sureness)).sum(1)
-    first = support.argmax(0)  # the first of equals
-    return agreeing.gather(0, first[None, None].expand(1, *agreeing.shape[1:]))[0]
+def _largest_agreement(
+    inverse: Tensor, variance: Tensor, sureness: Tensor, answered: Tensor, max_chi2: float
+) -> Tensor:
+    """Views (V, B, N) that agree with the view of highest score, itself included."""
+    chi2 = (inverse[:, None] - inverse).square() / (variance[:, None] + variance)
+    agree = answered[:, None] & answered & (chi2 <= max_chi2)
+    support = torch.where(agree, sureness, torch.zeros_like(sureness)).sum(1)
+    best = support.argmax(0)  # the first of equals
+    return agree.gather(0, best[None, None].expand(1, *agree.shape[1:]))[0]
 
 
 def _is_answered(estimates: Estimate) -> Tensor:
-    """(V, B, N) bool: an answer that can be weighed."""
+    """(V, B, N) bool: answered, with a finite positive sigma."""
     return estimates.keep & (estimates.depth > 0) & (estimates.sigma > 0) & estimates.sigma.isfinite()
 
 
-def _mean(inverse: Tensor, variance: Tensor, among: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Of the views ``among`` (V, B, N) that count: their weights, their mean by inverse variance (of none: 1), and what
-    they differ by, in variances per view beyond the first."""
-    weight = torch.where(among, 1 / variance, torch.zeros_like(variance))
-    total, n = weight.sum(0), among.sum(0)
+def _mean(inverse: Tensor, variance: Tensor, used: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights, inverse-variance mean (of no view: 1) and chi² per view beyond the first of the ``used`` (V, B, N)."""
+    weight = torch.where(used, 1 / variance, torch.zeros_like(variance))
+    total, n = weight.sum(0), used.sum(0)
     weight = weight / torch.where(n > 0, total, torch.ones_like(total))
     mean = torch.where(n > 0, (weight * inverse).sum(0), torch.ones_like(total))
-    chi2 = torch.where(among, (inverse - mean).square() / variance, torch.zeros_like(variance)).sum(0)
+    chi2 = torch.where(used, (inverse - mean).square() / variance, torch.zeros_like(variance)).sum(0)
     return weight, mean, chi2 / (n - 1).clamp_min(1)
 
 
 def _static_gate(estimates: Estimate, gate: Tensor, max_static_ratio: float) -> Tensor:
     """The gates (B, N); NO_BASELINE for all points of a reference view whose views mostly have none."""
-    still = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_static_ratio * len(estimates.gate)
-    return torch.where(still[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
+    static = (estimates.gate == Gate.NO_BASELINE).any(-1).sum(0) > max_static_ratio * len(estimates.gate)
+    return torch.where(static[:, None], Gate.NO_BASELINE, gate).to(torch.int32)
 
 
 def _contradicted_gate(estimates: Estimate, gate: Tensor) -> Tensor:
-    """The gates (B, N); CONTRADICTED for what a reference view answers of whose views more are contradicted than
-    answer: what moves on its own is near in all of them."""
-    against = (estimates.gate == Gate.CONTRADICTED).any(-1).sum(0)
+    """The gates (B, N); CONTRADICTED for all answers of a reference view with more CONTRADICTED than answering views.
+
+    An independently moving foreground is near in all of them.
+    """
+    contradicted = (estimates.gate == Gate.CONTRADICTED).any(-1).sum(0)
     answering = (estimates.gate == Gate.ANSWER).any(-1).sum(0)
-    moving = against > answering
-    return torch.where(moving[:, None] & (gate == Gate.ANSWER), Gate.CONTRADICTED, gate)
+    is_moving = contradicted > answering
+    return torch.where(is_moving[:, None] & (gate == Gate.ANSWER), Gate.CONTRADICTED, gate)
 
 
-def _joint(
+def _joint_estimate(
     estimates: Estimate,
     gate: Tensor,  # (B, N)
-    among: Tensor,  # (V, B, N) bool, the views that count
+    used: Tensor,  # (V, B, N) bool, the views of the mean
     weight: Tensor,  # (V, B, N)
     *,
     depth: Tensor,  # (B, N) m
@@ -216,11 +223,11 @@ def _joint(
     sigma_shared: Tensor,
     parallax_deg: Tensor,
 ) -> Estimate:
-    """The answer that the gates let through; its residual is the weighted rms of the views, of none the last view's."""
+    """The joint estimate under the gates; its residual is the weighted rms of the views, of no view the last one's."""
     dtype = estimates.depth.dtype
     keep = gate == Gate.ANSWER
-    n = among.sum(0)
-    residual_px = torch.where(among, estimates.residual_px, torch.zeros_like(estimates.residual_px))
+    n = used.sum(0)
+    residual_px = torch.where(used, estimates.residual_px, torch.zeros_like(estimates.residual_px))
     residual_px = _root((weight * residual_px.square()).sum(0)).to(dtype)
 
     def answer(x: Tensor) -> Tensor:
@@ -239,20 +246,20 @@ def _joint(
     )
 
 
-def _inverse_depth(estimates: Estimate, said: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Inverse depth and the own and shared parts of its standard deviation, float64; 1 where nothing was said."""
+def _inverse_depth(estimates: Estimate, answered: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Inverse depth and the own and shared parts of its standard deviation, float64; 1 where unanswered."""
     one = torch.ones_like(estimates.depth)
-    inverse = 1 / torch.where(said, estimates.depth, one).double()
-    whole = torch.where(said, estimates.sigma, one).double() * inverse * inverse
-    shared = torch.where(said, estimates.sigma_shared, 0 * one).double() * inverse * inverse
-    own = (whole.square() - shared.square()).clamp_min(MIN_FUSED_OWN_RATIO * whole.square()).sqrt()
+    inverse = 1 / torch.where(answered, estimates.depth, one).double()
+    total = torch.where(answered, estimates.sigma, one).double() * inverse * inverse
+    shared = torch.where(answered, estimates.sigma_shared, 0 * one).double() * inverse * inverse
+    own = (total.square() - shared.square()).clamp_min(MIN_FUSED_OWN_RATIO * total.square()).sqrt()
     return inverse, own, shared
 
 
-def _last_reason(gate: Tensor, said: Tensor) -> Tensor:
-    """Gate (B, N) of the last of the views (V, B, N) that did not answer."""
+def _last_reason(gate: Tensor, is_answered: Tensor) -> Tensor:
+    """Gate (B, N) of the last unanswered view of (V, B, N)."""
     reason = torch.full_like(gate[0], Gate.INCONSISTENT)
-    for code, answered in zip(gate, said, strict=True):
+    for code, answered in zip(gate, is_answered, strict=True):
         reason = torch.where(answered | (code == Gate.ANSWER), reason, code)
     return reason
 

@@ -1,8 +1,8 @@
-"""Stage 3, why a return is missing: the hole taxonomy.
+"""Stage 3: samples → samples with trackability and a hole class, the cause of a missing return.
 
-A sample without a usable return falls into exactly one class (``codes.Hole``), and each class names what could be done
-about it (``codes.ROUTE_OF_HOLE``). The key class, TRACKABLE_NO_LIDAR, is a candidate for triangulation; it says nothing
-about why the sensor was silent.
+A sample without a usable return has exactly one class (``codes.Hole``), and each class has a suggested route
+(``codes.ROUTE_OF_HOLE``). The main class, TRACKABLE_NO_LIDAR, is a candidate for triangulation; it implies no cause of
+the missing return.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ def classify(
     block: int = 7,
     min_trackability: float = MIN_TRACKABILITY,
 ) -> Samples:
-    """Measure the texture at every sample and name the class of every hole.
+    """Samples with their trackability and, where they have no usable return, their hole class.
 
-    Asked in this order, the first that holds wins: AT_BORDER, TOO_DARK, TOO_BRIGHT, HIGHLIGHT, LOW_TEXTURE; what is
-    left is TRACKABLE_NO_LIDAR. A sample with a usable return is no hole.
+    The first class that applies, in this order: AT_BORDER, TOO_DARK, TOO_BRIGHT, HIGHLIGHT, LOW_TEXTURE, else
+    TRACKABLE_NO_LIDAR. A sample with a usable return is no hole.
 
     Args:
         frame: the B views the samples were taken from.
@@ -73,13 +73,13 @@ def _classify_holes_kernel(xyz: Tensor, flag: Tensor, trackability: Tensor, *, m
 def _classify_holes(xyz: Tensor, flag: Tensor, trackability: Tensor, *, min_trackability: float) -> Tensor:
     """Hole class (B, N) int32 of points (B, N, 3), flags (B, N) and trackability (B, N)."""
     hole = (_class_of_flag.__wrapped__ if is_transformed() else _class_of_flag)(flag.device)[flag]
-    flat = (trackability.detach() < min_trackability) & (hole == Hole.TRACKABLE_NO_LIDAR)
-    return hole.masked_fill_(flat, Hole.LOW_TEXTURE).masked_fill_(all_finite(xyz, -1), Hole.NONE)
+    textureless = (trackability.detach() < min_trackability) & (hole == Hole.TRACKABLE_NO_LIDAR)
+    return hole.masked_fill_(textureless, Hole.LOW_TEXTURE).masked_fill_(all_finite(xyz, -1), Hole.NONE)
 
 
 @lru_cache(maxsize=8)
 def _class_of_flag(device: torch.device) -> Tensor:
-    """The class that each flag decides, whatever the texture, (256,): one look-up instead of four masks of samples."""
+    """Hole class (256,) of every flag value, ignoring texture: one table look-up instead of four masks of samples."""
     flag = torch.arange(256, dtype=torch.int32, device=device)
     return first_reason(
         ((flag & Flag.BORDER).bool(), Hole.AT_BORDER),
@@ -110,10 +110,10 @@ def min_eigenvalue(
 
 def _window_texture_kernel(image: Tensor, pixel: Tensor, *, size: int) -> Tensor:
     *windows, shape = window_arguments(image, pixel, size)
-    found = image.new_empty(pixel.shape[:2], dtype=torch.float32)
+    eigenvalue = image.new_empty(pixel.shape[:2], dtype=torch.float32)
     interleaved = shape[3] == 3
-    torch.ops.dhtorch.window_texture.default(*windows, found, *shape, interleaved and product_is_exact(image))
-    return found
+    torch.ops.dhtorch.window_texture.default(*windows, eigenvalue, *shape, interleaved and product_is_exact(image))
+    return eigenvalue
 
 
 @operator(
@@ -123,14 +123,16 @@ def _window_texture_kernel(image: Tensor, pixel: Tensor, *, size: int) -> Tensor
     when=fits_window_kernel,
 )
 def _window_texture(image: Tensor, pixel: Tensor, *, size: int) -> Tensor:
-    """What :func:`min_eigenvalue` is around pixels (B, N, 2) of images (B, C, H, W), in windows of ``size`` px."""
-    (found,) = reduce_patches(image, pixel, size, _texture, grey=True)
-    return found
+    """:func:`min_eigenvalue` around pixels (B, N, 2) of images (B, C, H, W), in windows of ``size`` px."""
+    (eigenvalue,) = reduce_patches(image, pixel, size, _texture, grey=True)
+    return eigenvalue
 
 
 def _texture(grey: Tensor) -> tuple[Tensor]:
-    """Smaller eigenvalue (P,) of the mean of ((gx², gx gy), (gx gy, gy²)), by the Sobel filters over all but the
-    outermost pixels (size, size, P)."""
+    """Smaller eigenvalue (P,) of the mean of ((gx², gx gy), (gx gy, gy²)) over windows (size, size, P).
+
+    Sobel gradients of all but the outermost pixels.
+    """
     gx, gy = _sobel(grey)
     smaller, _ = eigenvalues_2x2((gx * gx).sum((0, 1)), (gx * gy).sum((0, 1)), (gy * gy).sum((0, 1)))
     return (smaller / (16 * len(gx) * len(gx)),)
@@ -144,6 +146,6 @@ def _sobel(grey: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def suggest_route(hole: Tensor) -> Tensor:
-    """What to try for each hole: ``codes.Hole`` (…) → ``codes.Route`` (…), for the user of the map."""
+    """Suggested route of each hole: ``codes.Hole`` (…) → ``codes.Route`` (…), for the user of the map."""
     table = torch.tensor([ROUTE_OF_HOLE[k] for k in sorted(ROUTE_OF_HOLE)], dtype=hole.dtype, device=hole.device)
     return table[hole.long()]

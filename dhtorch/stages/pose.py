@@ -1,4 +1,4 @@
-"""Stage 5, near returns and their tracks → the metric relative pose of the pair, with a covariance, or none."""
+"""Stage 5: near returns and tracks → metric relative pose of the pair with a covariance, or a code without pose."""
 
 from __future__ import annotations
 
@@ -39,16 +39,20 @@ from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import chunked_apply
 from dhtorch.records import Camera, Pose, PoseFit, Samples, Shutter, Tracks
 
-#: Pairs solved together: few enough for their temporaries to stay in cache.
+#: Limits the pairs that :func:`pnp_ransac` solves together, a count: few enough for their temporaries to stay in cache.
+#: Source: origin not recorded.
 PNP_CHUNK_PAIRS = 16
 
-#: Pairs whose near and far tracks are solved together: a track has ten columns there.
+#: Limits the pairs that :func:`map_pose` solves together, a count; each track has ten columns.
+#: Source: origin not recorded.
 MAP_CHUNK_PAIRS = 16
 
-#: Points the search looks at; a pair with more is thinned evenly. The last steps see all points.
+#: Limits the points of a pair in the search, a count; more are thinned evenly. The last steps use all points.
+#: Source: origin not recorded.
 MAX_SEARCH_POINTS = 256
 
-#: Noise below this is not believed (px): residuals of exact data are rounding.
+#: Least standard deviation of the noise, px: residuals of exact data are rounding.
+#: Source: origin not recorded.
 MIN_NOISE_SIGMA_PX = 1e-6
 
 
@@ -66,17 +70,16 @@ def pnp_ransac(
     kernel: str | None = None,
     kernel_px: float = 1.0,
 ) -> PoseFit:
-    """The metric pose of camera 1 relative to camera 0 from samples with a sensor return, or the reason why not.
+    """Metric pose of camera 1 relative to camera 0 from tracked samples with a return, or a code where there is none.
 
-    Each draw picks three near points, whose four possible poses are scored on the others by truncated squared errors.
-    The best two are refined by damped Gauss–Newton steps on the truncated cost (the set of inliers is
-    recomputed at each step), the better one again on all points, and a last undamped step from that detached optimum
-    carries the gradient.
+    Each draw selects three near points, whose four possible poses are scored on the others by truncated squared errors.
+    The best two are refined by damped Gauss–Newton steps on the truncated cost (the inliers are recomputed at each
+    step), the better one again on all points, and a last undamped step from that detached optimum carries the gradient.
 
     Args:
         samples: near points are those with finite ``xyz`` (B, N, 3), m in camera 0; the others are ignored here.
         tracks: ``uv_1`` (B, N, 2) in ideal pixels of camera 1; only ``valid`` (B, N) ones are used.
-        camera_0: not needed, ``xyz`` is metric; here because seats share their arguments.
+        camera_0: not used, ``xyz`` is metric; part of the stage's signature.
         camera_1: intrinsics of view 1, ideal: focal lengths and principal point, (B, 2) px each.
         draws: (B, H, 3), the randomness: H hypotheses per pair.
         threshold_px: largest reprojection error of an inlier.
@@ -89,10 +92,10 @@ def pnp_ransac(
     Returns:
         PoseFit: ``T_1_from_0`` with R (B, 3, 3) and t (B, 3) m, which carry points from camera 0 to camera 1;
         ``inlier`` (B, N); ``code`` (B,); ``cov`` (B, 6, 6) = sigma_px² (Jᵀ W J)⁻¹ of (rotation rad, translation m),
-        with sigma_px from the inliers' residuals (2 n − 6 degrees of freedom) and first-order, so it knows nothing of
-        errors in ``xyz``. Where there is no pose, R, t, cov, rms_px, sigma_px and t_snr are NaN, no point is an inlier
-        and ``n_inlier`` is what was counted. Codes: TOO_FEW near points or inliers; DEGENERATE: the points lie on a
-        line or leave the pose undetermined. Points in one plane are fine.
+        with sigma_px from the inliers' residuals (2 n − 6 degrees of freedom) and first-order; it does not contain
+        errors of ``xyz``. Where there is no pose, R, t, cov, rms_px, sigma_px and t_snr are NaN, no point is an inlier
+        and ``n_inlier`` is the count before that. Codes: TOO_FEW near points or inliers; DEGENERATE: the points lie on
+        a line or leave the pose undetermined. Points in one plane are fine.
 
     Raises:
         ValueError: wrong shapes, no hypothesis, an unknown kernel.
@@ -118,7 +121,7 @@ def pnp_ransac(
         >>> zero, code = torch.zeros(2, 50), torch.zeros(2, 50, dtype=torch.int32)
         >>> unread = {"confidence": zero, "flag": code, "trackability": zero, "hole": code}
         >>> samples = Samples(uv_0, depth, sigma=0.01 * depth, xyz=xyz, **unread)
-        >>> valid = torch.stack((zero[0] == 0, zero[1] == 1))  # nothing was found again in the second pair
+        >>> valid = torch.stack((zero[0] == 0, zero[1] == 1))  # no valid track in the second pair
         >>> cov = torch.eye(2).expand(2, 50, 2, 2)
         >>> tracks = Tracks(uv_0, uv_1, error=zero, photometric=zero, cov=cov, valid=valid)
         >>> fit = pnp_ransac(samples, tracks, camera, camera, torch.rand(2, 100, 3, generator=draw))
@@ -163,14 +166,14 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
     N, f, c = xyz.shape[1], camera.f, camera.c
     points, usable = _planes(xyz, uv, valid)
     with torch.no_grad():
-        start, found = _robust_pose(points, usable, f, c, draws, options=options)
-    start = start.detach()  # forward mode looks through no_grad, into a search that may stand beside a singular triple
+        start, has_start = _robust_pose(points, usable, f, c, draws, options=options)
+    start = start.detach()  # forward mode passes through no_grad, into a search that may meet a singular triple
     # The last step, in float64 and with the graph on.
     f, c = f.double(), c.double()
     xyz, uv = points.double().split((3, 2), 1)
     rows, depth = linearise(start, f, c, xyz, uv)
     square = (rows[:, 6] * rows[:, 6]).sum(1)
-    inlier = usable & found[:, None] & (depth > MIN_DEPTH) & (square < options.threshold_px**2)
+    inlier = usable & has_start[:, None] & (depth > MIN_DEPTH) & (square < options.threshold_px**2)
     H, g = _inlier_normal_equations(options, rows, inlier)
     eye = torch.eye(6, dtype=H.dtype, device=H.device).expand_as(H)
     x, solved = solve_spd(H.detach(), torch.cat((-g.detach()[..., None], eye), -1))
@@ -185,11 +188,11 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
     with torch.no_grad():
         n_inlier = inlier.sum(-1)
         enough = n_inlier >= options.min_inlier
-        line = ransac.is_collinear(xyz, torch.where(enough[:, None], inlier, usable))
+        collinear = ransac.is_collinear(xyz, torch.where(enough[:, None], inlier, usable))
         finite = (T.R.sum((1, 2)) + T.t.sum(1)).isfinite()
         code = first_reason(
             (usable.sum(-1) < options.min_inlier, PoseCode.TOO_FEW),
-            (line, PoseCode.DEGENERATE),
+            (collinear, PoseCode.DEGENERATE),
             (~enough, PoseCode.TOO_FEW),
             (~(solved & finite), PoseCode.DEGENERATE),
             otherwise=PoseCode.OK,
@@ -202,14 +205,14 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
         cov = (inverse + inverse.transpose(1, 2)) * (0.5 * sigma_px * sigma_px)[:, None, None]
         # With H = L Lᵀ, the lower end of L is the factor of the translation's information, the rotation eliminated.
         lower = torch.linalg.cholesky_ex(H.detach()).L[:, 3:, 3:]
-        root = (lower * T.t[..., None]).sum(1)
-        t_snr = (root * root).sum(-1).sqrt() / sigma_px
+        whitened = (lower * T.t[..., None]).sum(1)
+        t_snr = (whitened * whitened).sum(-1).sqrt() / sigma_px
 
-    every = all_known(ok)  # then nothing need be hidden
+    all_ok = all_known(ok)  # then no masking is needed
 
     def answer(x: Tensor) -> Tensor:
         x = x.to(nan.dtype)
-        return x if every else torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, nan)
+        return x if all_ok else torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, nan)
 
     return PoseFit(
         T_1_from_0=Pose(answer(T.R), answer(T.t)),
@@ -224,7 +227,7 @@ def _fit(options: _Options, xyz: Tensor, uv: Tensor, valid: Tensor, camera: Came
 
 
 def _inlier_normal_equations(o: _Options, rows: Tensor, inlier: Tensor) -> tuple[Tensor, Tensor]:
-    """The normal equations of inliers, by the robust kernel."""
+    """Normal equations of the inliers, weighted by the robust kernel."""
     _, weight = robust_loss((rows[:, 6] * rows[:, 6]).sum(1), o.kernel, o.kernel_px)
     return normal_equations(rows, torch.where(inlier, weight, 0.0))
 
@@ -235,12 +238,12 @@ def _planes(xyz: Tensor, uv: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     usable = valid & all_finite(points, 1)
     points = torch.where(usable[:, None], points, torch.zeros_like(points))
     N = usable.shape[1]
-    more = (0, round_up(N, PRODUCT_LANES) - N)
-    return torch.nn.functional.pad(points, more), torch.nn.functional.pad(usable, more)
+    padding = (0, round_up(N, PRODUCT_LANES) - N)
+    return torch.nn.functional.pad(points, padding), torch.nn.functional.pad(usable, padding)
 
 
 def _is_truncated_only(*_: Tensor, options: _Options) -> bool:
-    """Whether costs are squares, truncated and not bent by a robust kernel."""
+    """Whether costs are truncated squares without a robust kernel."""
     return options.kernel is None
 
 
@@ -249,7 +252,7 @@ def _robust_pose_kernel(
 ) -> tuple[Pose, Tensor]:
     B = len(points)
     R, t = (points.new_empty(B, *size, dtype=torch.float64) for size in ((3, 3), (3,)))
-    found = torch.empty_like(usable[:, 0])
+    valid = torch.empty_like(usable[:, 0])
     torch.ops.dhtorch.robust_pose.default(
         points=points,
         usable=usable,
@@ -258,7 +261,7 @@ def _robust_pose_kernel(
         draws=draws.contiguous(),
         R=R,
         t=t,
-        found=found,
+        found=valid,
         threshold_px=options.threshold_px,
         local_optimisation=options.local_optimisation,
         polish_steps=options.polish_steps,
@@ -271,7 +274,7 @@ def _robust_pose_kernel(
         min_height=p3p.MIN_HEIGHT_RATIO,
         max_cosine=p3p.MAX_RAY_COSINE,
     )
-    return Pose(R, t), found
+    return Pose(R, t), valid
 
 
 @operator(
@@ -283,11 +286,11 @@ def _robust_pose_kernel(
 def _robust_pose(
     points: Tensor, usable: Tensor, f: Tensor, c: Tensor, draws: Tensor, *, options: _Options
 ) -> tuple[Pose, Tensor]:
-    """Search, refine the best two, polish the better: a float64 pose (exactly a rotation) and whether there is one."""
+    """Search, refine the best two, polish the better: float64 pose (R orthonormal) and whether (B,) there is one."""
     index, count = ransac.usable_first(usable, min(MAX_SEARCH_POINTS, usable.shape[1]))
     near = points.gather(2, index[:, None].expand(-1, 5, -1))
     poses, cost = ransac.search_hypotheses(near, count, f, c, draws, threshold_px=options.threshold_px)
-    found, keep = cost[:, 0].isfinite(), cost.shape[1]
+    valid, keep = cost[:, 0].isfinite(), cost.shape[1]
     used = torch.arange(index.shape[1], device=index.device) < count[:, None]
     near, used, fk, ck = (x.repeat_interleave(keep, 0) for x in (near, used, f, c))
     normal, cost_of = _truncated(near, used, fk, ck, threshold_px=options.threshold_px)
@@ -298,7 +301,7 @@ def _robust_pose(
         points, usable, f, c, threshold_px=options.threshold_px, kernel=options.kernel, kernel_px=options.kernel_px
     )
     T, _ = minimise(normal, flat[best], options.polish_steps, cost=cost_of, step=trial_pose_step)
-    return Pose(se3.orthonormal(T.R.double()), T.t.double()), found
+    return Pose(se3.orthonormal(T.R.double()), T.t.double()), valid
 
 
 def _truncated(
@@ -311,8 +314,10 @@ def _truncated(
     kernel: str | None = None,
     kernel_px: float = 1.0,
 ) -> tuple[Callable[[Pose], NormalEquations], Callable[[Pose], Tensor]]:
-    """The cost that search and refinement share, Σ rho(min(r², threshold²)), points behind the camera in full: with its
-    normal equations, and alone."""
+    """The cost Σ rho(min(r², threshold²)) of search and refinement as functions: with normal equations, and alone.
+
+    Points behind the camera cost threshold².
+    """
     limits = torch.where(usable, threshold_px * threshold_px, 0.0).to(points.dtype)
     xyz, uv = points[:, :3], points[:, 3:]
 
@@ -353,15 +358,14 @@ def map_pose(
     steps: int = FitOptions.steps,
     threshold_px: float = 3.0,
 ) -> PoseFit:
-    """The most probable pose under all tracks: near ones hold the scale, far ones, without depth, the rotation.
+    """Most probable pose of all tracks: near tracks determine the scale, far tracks, without depth, the rotation.
 
-    One least-squares problem per pair (:mod:`dhtorch.geometry.reprojection_problem`). A near residual is weighed by the
-    noise of its track and of its depth; a far track has an inverse depth of its own, which is eliminated. First the
-    near tracks alone are solved from the pose of ``start``, then all of them. The second answer is kept unless it fits
-    the near
-    tracks clearly worse: far tracks are many, and what is not a rigid scene seen by two pinhole cameras speaks through
-    them first. The scale of the noise is estimated from the residuals, near and far apart. Where it explains much of
-    the residuals, rows of the image get a rotation each, as a rolling shutter gives them.
+    One least-squares problem per pair (:mod:`dhtorch.geometry.reprojection_problem`). A near residual is weighted by
+    the noise of its track and of its depth; a far track has its own inverse depth, which is eliminated. First the near
+    tracks alone are solved from the pose of ``start``, then all of them. The second pose is kept unless it fits the
+    near tracks clearly worse: far tracks are many, and deviations from a rigid scene seen by two pinhole cameras show
+    in them first. The noise scale is estimated from the residuals, near and far separately. Where it explains much of
+    the residuals, each image row gets its own rotation, as under a rolling shutter.
 
     Args:
         samples: near points are those with finite ``xyz`` (B, N, 3), m in camera 0, and their noise ``sigma`` (B, N) m.
@@ -369,29 +373,29 @@ def map_pose(
             (B, N) ones are used.
         camera_0, camera_1: intrinsics, ideal; they may differ.
         draws: (B, H, 3), the randomness of ``start``.
-        start: another function of this seat.
+        start: another function of this stage.
         far_weight: weight of a far track's cost: not its inverse variance, because neighbours share their errors.
-        max_rise: share by which the near cost may rise over that of the near tracks alone.
-        isotropic: share of a track's noise that does not depend on its patch, see ``covariance.noise_shape``.
-        shutter_sigma: one standard deviation of how far rows may turn against each other, rad per unit of height (of a
-            ray with z = 1); 0 for a global shutter.
-        shutter_gain: share of the cost that such a turn must take away to be believed.
-        translation_gain: share of the cost of the best pure rotation that the translation must take away.
+        max_rise: fraction by which the near cost may rise over that of the near tracks alone.
+        isotropic: fraction of a track's noise that does not depend on its patch, see ``covariance.noise_shape``.
+        shutter_sigma: standard deviation of the shutter rate's prior, rad per unit of height (of a ray with z = 1);
+            0 for a global shutter.
+        shutter_gain: fraction of the cost that a shutter rate must take away to be accepted.
+        translation_gain: fraction of the cost of the best pure rotation that the translation must take away.
         kernel, bend: robust kernel and the residual, in standard deviations, at which it bends.
         near_steps, steps: Levenberg–Marquardt steps of the two solutions.
         threshold_px: largest reprojection error of a near track that is reported as an inlier.
 
     Returns:
         PoseFit with ``shutter``, shapes as of :func:`pnp_ransac`. ``cov`` is the sandwich of an M-estimator with
-        inverse depths and turn eliminated, in which residuals with heavy tails widen the answer; ``sigma_px`` is the
-        scale of the noise of the far tracks, to be multiplied with their shape. Codes: those of ``start`` where it
-        found no pose; DEGENERATE: the near tracks leave the pose undetermined; NO_BASELINE: a pure rotation explains
-        the tracks nearly as well; KEPT_PNP: far tracks contradict the near ones, which alone are answered.
+        inverse depths and shutter rate eliminated, which residuals with heavy tails enlarge; ``sigma_px`` is the noise
+        scale of the far tracks, a factor on their shape. Codes: those of ``start`` where it has no pose; DEGENERATE:
+        the near tracks leave the pose undetermined; NO_BASELINE: a pure rotation explains the tracks nearly as well;
+        KEPT_PNP: far tracks contradict the near ones, and the pose is that of the near tracks alone.
 
     Raises:
         ValueError: wrong shapes, an unknown kernel; else as ``start``.
 
-    Gradient: R, t and turn to near ``xyz``, ``uv_0``, ``uv_1`` and both cameras, through one last step from the
+    Gradient: R, t and shutter rate to near ``xyz``, ``uv_0``, ``uv_1`` and both cameras, through one last step from the
     detached optimum: exact to first order. Noise and its scale, cov and codes are detached.
     Cost: linear in B and N. Float64 in the last step and the covariance, the inputs' dtype elsewhere.
     Source: see :mod:`dhtorch.geometry.reprojection_problem`.
@@ -442,39 +446,39 @@ def map_pose(
 def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: PoseDepthProblem, tracks: Tracks) -> PoseFit:
     N = tracks.uv_1.shape[1]
     eye = se3.identity(len(first.code), problem.f)
-    found = estimate_map_pose(problem.detach(), select_batch(first.ok, first.T_1_from_0.detach(), eye), o)
+    solution = estimate_map_pose(problem.detach(), select_batch(first.ok, first.T_1_from_0.detach(), eye), o)
     # The last step, in float64 and with the graph on.
     problem = problem.to(torch.float64)
-    found = pytree.tree_map(lambda x: x.double() if x.is_floating_point() else x, found)
-    found = found._replace(at=found.at._replace(T=Pose(se3.orthonormal(found.at.T.R), found.at.T.t)))
+    solution = pytree.tree_map(lambda x: x.double() if x.is_floating_point() else x, solution)
+    solution = solution._replace(at=solution.at._replace(T=Pose(se3.orthonormal(solution.at.T.R), solution.at.T.t)))
     normal = partial(
         reprojection_problem.pose_normal_equations,
-        noise=found.noise,
-        far_weight=found.far_weight,
-        shutter_precision=found.shutter_precision,
+        noise=solution.noise,
+        far_weight=solution.far_weight,
+        shutter_precision=solution.shutter_precision,
         kernel=o.kernel,
         bend=o.bend,
     )
-    _, H, g = normal(problem, found.at)
-    at, solved = reprojection_problem.unknowns_step(found.at, H.detach(), g.detach())
+    _, H, g = normal(problem, solution.at)
+    at, solved = reprojection_problem.unknowns_step(solution.at, H.detach(), g.detach())
     fixed = problem.detach()
     if has_graph(g):
         at = reprojection_problem.retract_unknowns(
-            at, implicit_step(lambda xi: normal(fixed, reprojection_problem.retract_unknowns(found.at, xi)).g, g)
+            at, implicit_step(lambda xi: normal(fixed, reprojection_problem.retract_unknowns(solution.at, xi)).g, g)
         )
     with torch.no_grad():
-        cov, known = pose_covariance(problem, found, o)
+        cov, cov_ok = pose_covariance(problem, solution, o)
         finite = at.T.R.isfinite().flatten(1).all(1) & at.T.t.isfinite().all(1)
-        code = torch.where(found.far_weight < o.far_weight, PoseCode.KEPT_PNP, PoseCode.OK)
-        code = torch.where(found.translates, code, PoseCode.NO_BASELINE)
-        code = torch.where(solved & known & finite, code, PoseCode.DEGENERATE)
+        code = torch.where(solution.far_weight < o.far_weight, PoseCode.KEPT_PNP, PoseCode.OK)
+        code = torch.where(solution.translates, code, PoseCode.NO_BASELINE)
+        code = torch.where(solved & cov_ok & finite, code, PoseCode.DEGENERATE)
         code = torch.where(first.ok, code, first.code).to(torch.int32)
         ok = (code == PoseCode.OK) | (code == PoseCode.KEPT_PNP)
         inlier, rms_px = _reprojection(problem, at, threshold_px)
-        far_noise = torch.where(problem.far, found.noise, 0.0).amax(-1)
-        variance = torch.where(problem.far.any(-1), far_noise, found.noise.amax(-1))
+        far_noise = torch.where(problem.far, solution.noise, 0.0).amax(-1)
+        variance = torch.where(problem.far.any(-1), far_noise, solution.noise.amax(-1))
         t_snr = covariance.mahalanobis(at.T.t, cov[:, 3:6, 3:6])
-    assert at.shutter_rate is not None  # most_probable answers one, of zeros where it believes none
+    assert at.shutter_rate is not None  # estimate_map_pose returns one, zero where not accepted
 
     def answer(x: Tensor) -> Tensor:
         return torch.where(ok.view(-1, *[1] * (x.ndim - 1)), x, torch.nan).to(tracks.uv_1.dtype)
@@ -495,7 +499,7 @@ def _fit_all(o: FitOptions, threshold_px: float, first: PoseFit, problem: PoseDe
 def _pose_depth_problem(
     samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera, isotropic: float
 ) -> PoseDepthProblem:
-    """The tracks as planes, N' > 0 a multiple of ``SUM_LANES``; unused ones at a safe place."""
+    """Tracks of a pair as planes, N' > 0 a multiple of ``SUM_LANES``; unused ones hold safe finite values."""
     usable = tracks.valid & all_finite(tracks.uv_1, -1) & all_finite(tracks.uv_0, -1)
     xyz, sigma = samples.xyz, samples.sigma.detach()
     near = usable & samples.usable & (xyz[..., 2] > 0) & (sigma > 0) & sigma.isfinite()
@@ -532,7 +536,7 @@ def _pose_depth_problem(
 def _reprojection(
     problem: PoseDepthProblem, at: reprojection_problem.Unknowns, threshold_px: float
 ) -> tuple[Tensor, Tensor]:
-    """Near tracks (B, N) whose point, at the sensor's depth, falls close to where they were seen; rms px of these."""
+    """Near tracks (B, N) whose sensor point projects within ``threshold_px`` of the measured one; their rms px (B,)."""
     uv = problem.uv
     if at.shutter_rate is not None:
         uv = reprojection_problem.undo_rolling_shutter(uv, problem.f, problem.c, problem.ray[:, 1], at.shutter_rate)

@@ -1,4 +1,4 @@
-"""Stage 1, where to look: a dual phase-shifted foveated spiral, and two plain alternatives in the same seat.
+"""Stage 1: image size → sample pixels: a dual phase-shifted foveated spiral, a Vogel spiral or a regular grid.
 
 Every sampler returns exactly ``n`` pixels inside the image, in a fixed order, without reading the image.
 """
@@ -12,6 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+#: Step of the angle of a Vogel spiral, rad.
+#: Source: derived, π (3 − √5), the golden section of a full turn.
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
@@ -27,7 +29,7 @@ def spiral(
     device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Two spiral arms, half a turn apart, densest at the gaze centre.
+    """Sample pixels (n, 2) on two spiral arms half a turn apart, densest at the gaze centre.
 
     Point k of an arm sits at the fraction s = (k + ½) / (n / 2) of the arm. Its angle grows with √s and its radius
     runs from ``inner_px`` to the image border along that direction with s ^ ``foveation``, so the arms wind to the
@@ -55,17 +57,19 @@ def spiral(
     if foveation <= 0:
         raise ValueError(f"spiral: foveation is {foveation}, expected > 0")
     centre = None if gaze is None else (gaze[0], gaze[1])
-    uv = _kept((hw[0], hw[1]), n, turns=turns, foveation=foveation, gaze=centre, inner_px=inner_px, margin_px=margin_px)
+    uv = _constant_arms(
+        (hw[0], hw[1]), n, turns=turns, foveation=foveation, gaze=centre, inner_px=inner_px, margin_px=margin_px
+    )
     return uv.to(device=device, dtype=dtype, copy=True)
 
 
-def _kept(*args: Any, **options: Any) -> Tensor:
-    """:func:`_arms`, which torch.compile takes as it is and does not look into."""
+def _constant_arms(*args: Any, **options: Any) -> Tensor:
+    """:func:`_arms`, a constant for torch.compile, which does not trace into it."""
     return _arms(*args, **options)
 
 
-# All that torch.compiler.assume_constant_result does after it has imported the compiler, for which nobody asked yet.
-_kept._dynamo_marked_constant = True  # type: ignore[attr-defined]
+# The whole effect of torch.compiler.assume_constant_result, which would import the compiler.
+_constant_arms._dynamo_marked_constant = True  # type: ignore[attr-defined]
 
 
 @lru_cache(maxsize=16)
@@ -79,7 +83,7 @@ def _arms(
     inner_px: float,
     margin_px: float,
 ) -> Tensor:
-    """:func:`spiral` in float64; the same few patterns are asked for again and again."""
+    """:func:`spiral` in float64; cached, because few distinct patterns occur."""
     box = _frame(hw, n, gaze, margin_px)
     k = torch.arange(n, dtype=torch.float64)
     arm, s = k % 2, (torch.div(k, 2, rounding_mode="floor") + 0.5) / max(math.ceil(n / 2), 1)
@@ -97,7 +101,7 @@ def vogel_spiral(
     device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """Phyllotaxis: golden-angle steps, radius with √k, so the density is uniform (for a central gaze).
+    """Sample pixels (n, 2) of a Vogel spiral: golden-angle steps, radius with √k, uniform density for a central gaze.
 
     Args and errors as :func:`spiral`. Returns uv (n, 2) px.
     Source: H. Vogel, "A better way to construct the sunflower head", 1979.
@@ -116,7 +120,7 @@ def regular_grid(
     device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> Tensor:
-    """A regular grid of exactly ``n`` pixels in rows; rows differ by at most one point.
+    """Sample pixels (n, 2) of a regular grid in rows whose lengths differ by at most one point.
 
     Args and errors as :func:`spiral`. Returns uv (n, 2) px.
     """
@@ -153,7 +157,7 @@ def _frame(
 
 
 def _polar(box: tuple[Tensor, Tensor, Tensor], angle: Tensor, radius: Tensor, inner_px: float) -> Tensor:
-    """Direction ``angle`` and ``radius`` in [0, 1], 1 being the image border in that direction → uv (n, 2)."""
+    """Pixels (n, 2) of polar coordinates: ``angle`` and ``radius`` in [0, 1], 1 being the image border there."""
     centre, low, high = box
     direction = torch.stack((angle.cos(), angle.sin()), -1)
     room = torch.where(direction > 0, high - centre, centre - low)

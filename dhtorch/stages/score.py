@@ -1,7 +1,7 @@
-"""Stage 7, how sure: the selective score and its threshold, which is the last gate.
+"""Stage 7: estimates → estimates with a selective score in [0, 1] and its threshold, which is the last gate.
 
-Two scores made by hand and one that learns. Alphabet of the latter: ``x`` (…, 8) evidence of an answer in logarithms,
-``e`` the relative error to expect of it.
+Three closed-form scores and a learned one. Alphabet of the latter: ``x`` (…, 8) evidence of an answer in logarithms,
+``e`` its expected relative error.
 """
 
 from __future__ import annotations
@@ -19,29 +19,42 @@ from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.records import Estimate, PoseFit, Samples, Tracks
 from dhtorch.runtime import storage
 
-#: The pose's part of a variance is subtracted from the whole; no own part is believed to be a smaller share of it.
+#: Limits the own part of a variance, the whole less the pose's part, from below: a fraction of the whole without unit.
+#: Source: origin not recorded.
 MIN_SCORED_OWN_RATIO = 1e-6
 
-#: Relative errors and ratios beyond these limits are not told apart: their squares stay in the range of float32.
-MIN_RATIO, MAX_RATIO = 1e-6, 1e6
+#: Limits relative errors and ratios from below, without unit: their squares stay in the range of float32.
+#: Source: origin not recorded.
+MIN_RATIO = 1e-6
 
-#: What a learned score looks at, each as a logarithm, with the limits beyond which values are not told apart.
+#: Limits relative errors and ratios from above, without unit: their squares stay in the range of float32.
+#: Source: origin not recorded.
+MAX_RATIO = 1e6
+
+#: Features of a learned score, each as a logarithm, and the limits to which their values are clamped, in their unit.
+#: Source: origin not recorded.
 SCORE_FEATURES: dict[str, tuple[float, float]] = {
-    "expected_error": (1e-5, 1e2),  # e of rank_by_error
+    "expected_error": (1e-5, 1e2),  # e of confidence_from_error
     "shared_error": (1e-5, 1e2),  # the pose's part of sigma / depth
     "parallax_deg": (1e-3, 1e2),
     "residual_px": (1e-2, 1e2),
     "round_trip_px": (1e-3, 1e2),
     "photometric": (1e-4, 1.0),
     "trackability": (1e-7, 1.0),
-    "reach": (1e-2, 1e2),  # depth over the mean depth of the returns that hold the pose
+    "reach": (1e-2, 1e2),  # depth over the mean depth of the inlier returns of the pose
 }
 
-#: The largest factor, as a logarithm, by which a learned score changes the error to expect.
+#: Limits the logarithm of the factor by which a learned score changes the expected error, without unit.
+#: Source: origin not recorded.
 MAX_LOG_FACTOR = 4.0
 
-#: Residual and round trip, px, that count as much as a track's own noise.
-SCORE_RESIDUAL_PX, SCORE_ROUND_TRIP_PX = 0.5, 0.4
+#: Reprojection residual that contributes as much as a track's own noise, px.
+#: Source: origin not recorded.
+SCORE_RESIDUAL_PX = 0.5
+
+#: Round trip that contributes as much as a track's own noise, px.
+#: Source: origin not recorded.
+SCORE_ROUND_TRIP_PX = 0.4
 
 
 def confidence(
@@ -54,21 +67,21 @@ def confidence(
     residual_scale_px: float = 3.0,
     min_score: float = 0.0,
 ) -> Estimate:
-    """Score every answer by its parallax and residual: p / (p + p½) · max(0, 1 − r / r₀).
+    """Score of every answer from parallax p and residual r: p / (p + p½) · max(0, 1 − r / r₀).
 
     The paper describes a continuous score that rises with parallax and falls with the reprojection residual but
-    prints no formula; this one, with both constants as options, is ours. The score orders answers by risk; it is not
-    a probability.
+    gives no formula; this one, with both constants as options, is not the paper's. The score orders answers by risk;
+    it is not a probability.
 
     Args:
-        estimate: from seat 6.
-        samples, tracks, fit: part of the seat's signature; this score does not read them.
+        estimate: from stage 6.
+        samples, tracks, fit: part of the stage's signature, not used.
         half_parallax_deg: parallax p½ at which the first factor is one half.
         residual_scale_px: residual r₀ at which the second factor reaches zero.
-        min_score: answers below it are silenced with LOW_SCORE.
+        min_score: answers below it become unanswered with LOW_SCORE.
 
     Returns:
-        Estimate with ``score`` in [0, 1], 0 where silent.
+        Estimate with ``score`` in [0, 1], 0 where unanswered.
 
     Raises:
         ValueError: wrong shapes.
@@ -81,7 +94,7 @@ def confidence(
     stated = estimate.keep & parallax.isfinite() & residual.isfinite()
     parallax, residual = (torch.where(stated, x, torch.zeros_like(x)) for x in (parallax, residual))
     score = parallax / (parallax + half_parallax_deg) * (1 - residual / residual_scale_px).clamp_min(0)
-    return _silence(estimate, score, min_score)
+    return _apply_min_score(estimate, score, min_score)
 
 
 def confidence_from_error(
@@ -97,31 +110,31 @@ def confidence_from_error(
     recalibration: Callable[[Tensor], Tensor] | None = None,
     min_score: float = 0.0,
 ) -> Estimate:
-    """Score every answer by the relative error to expect of it: h / (h + e).
+    """Score of every answer from its expected relative error e: h / (h + e).
 
     e = (own part of sigma) / depth · sqrt(1 + (r / s)² + …): how far the depth moves with the noise of its own track,
     more where the track disagrees with the pose. The part of sigma that all points of the pair share belongs in the
-    sigma that is reported; it says how good the pair is, not which of its points are better, and stays out.
+    reported sigma; it does not distinguish the points of a pair, and is left out.
 
     Args:
-        estimate: from seat 6, with ``sigma``, ``sigma_shared`` and ``residual_px``.
-        samples, fit: part of the seat's signature; this score does not read them.
-        tracks: with ``photometric`` and ``error``, where a scale asks for them.
-        residual_scale_px: reprojection residual s that counts as much as the track's own noise.
-        photometric_scale: grey difference of the patches that does, in grey values from 0 to 1; None = not asked.
-        round_trip_scale_px: round trip that does; None = not asked.
+        estimate: from stage 6, with ``sigma``, ``sigma_shared`` and ``residual_px``.
+        samples, fit: part of the stage's signature, not used.
+        tracks: with ``photometric`` and ``error``, where their scale is not None.
+        residual_scale_px: reprojection residual s that contributes as much as the track's own noise.
+        photometric_scale: grey difference of the patches that does, in grey values from 0 to 1; None = not used.
+        round_trip_scale_px: round trip that does; None = not used.
         half_error: expected error h at which the score is one half.
         recalibration: elementwise, score → probability that the error is below 10 %, such as the table of a
-            calibration (``dhtorch.calibration``); None leaves the score as it is. A rising one changes no order.
-        min_score: answers below it (after recalibration) are silenced with LOW_SCORE.
+            calibration (``dhtorch.calibration``); None = unchanged score. An increasing one keeps the order.
+        min_score: answers below it (after recalibration) become unanswered with LOW_SCORE.
 
     Returns:
-        Estimate with ``score`` in [0, 1], 0 where silent or where no error can be stated.
+        Estimate with ``score`` in [0, 1], 0 where unanswered or without an expected error.
 
     Raises:
         ValueError: wrong shapes.
 
-    Gradient: to sigma, depth, residual and what else is asked; the threshold carries none.
+    Gradient: to sigma, depth, residual and the other terms used; the threshold carries none.
     """
     check("confidence_from_error", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
     terms = [(estimate.residual_px, residual_scale_px)]
@@ -134,7 +147,7 @@ def confidence_from_error(
     score = torch.where(stated, half_error / (half_error + expected), zero)
     if recalibration is not None:
         score = torch.where(stated, recalibration(score), zero)
-    return _silence(estimate, score, min_score)
+    return _apply_min_score(estimate, score, min_score)
 
 
 def confidence_from_sigma(
@@ -147,18 +160,18 @@ def confidence_from_sigma(
     recalibration: Callable[[Tensor], Tensor] | None = None,
     min_score: float = 0.0,
 ) -> Estimate:
-    """Score every answer of several views by its sigma and by how many of them agree: h / (h + e).
+    """Score of every answer of several views from its sigma and the number of agreeing views: h / (h + e).
 
-    e = sigma / depth / √views: views that agree share too much for sigma to shrink with their number, but an answer
-    that is wrong by far more than its sigma is seldom found twice.
+    e = sigma / depth / √views: agreeing views have too much in common for sigma to shrink with their number, but an
+    answer that is wrong by far more than its sigma is seldom repeated by another view.
 
     Args:
-        estimate: from ``fuse``, or from seat 6 (one view).
-        samples, tracks, fit: part of the seat's signature; this score does not read them.
+        estimate: from ``fuse``, or from stage 6 (one view).
+        samples, tracks, fit: part of the stage's signature, not used.
         half_error, recalibration, min_score: as in :func:`confidence_from_error`.
 
     Returns:
-        Estimate with ``score`` in [0, 1], 0 where silent or where no error can be stated.
+        Estimate with ``score`` in [0, 1], 0 where unanswered or without an expected error.
 
     Raises:
         ValueError: wrong shapes.
@@ -174,11 +187,11 @@ def confidence_from_sigma(
     score = torch.where(stated, half_error / (half_error + expected), zero)
     if recalibration is not None:
         score = torch.where(stated, recalibration(score), zero)
-    return _silence(estimate, score, min_score)
+    return _apply_min_score(estimate, score, min_score)
 
 
 def score_features(estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit) -> tuple[Tensor, Tensor]:
-    """What speaks for and against every answer: logarithms (B, N, 8) in the order of :data:`SCORE_FEATURES`.
+    """Features of every answer for a learned score: logarithms (B, N, 8) in the order of :data:`SCORE_FEATURES`.
 
     Returns:
         The logarithms, 0 where there is no answer with a sigma, and a mask (B, N) of where there is.
@@ -191,36 +204,38 @@ def score_features(estimate: Estimate, samples: Samples, tracks: Tracks, fit: Po
     check("score_features", gate=(estimate.gate, "B N"), uv=(samples.uv, "B N 2"), valid=(tracks.valid, "B N"))
     terms = [(estimate.residual_px, SCORE_RESIDUAL_PX), (tracks.error, SCORE_ROUND_TRIP_PX)]
     expected, stated = _expected_error(estimate, terms)
-    others = (estimate.parallax_deg, estimate.residual_px, tracks.error, tracks.photometric, samples.trackability)
-    for x in others:
+    evidence = (estimate.parallax_deg, estimate.residual_px, tracks.error, tracks.photometric, samples.trackability)
+    for x in evidence:
         stated = stated & x.isfinite()
     one, zero = torch.ones_like(expected), torch.zeros_like(expected)
     depth = torch.where(stated, estimate.depth, one)
     inlier = fit.inlier & (samples.depth > 0)
-    near = torch.where(inlier, samples.depth, zero).sum(-1, keepdim=True) / inlier.sum(-1, keepdim=True).clamp_min(1)
-    reach = depth / torch.where(near > 0, near, torch.ones_like(near))
+    mean_near_depth = torch.where(inlier, samples.depth, zero).sum(-1, keepdim=True) / inlier.sum(
+        -1, keepdim=True
+    ).clamp_min(1)
+    reach = depth / torch.where(mean_near_depth > 0, mean_near_depth, torch.ones_like(mean_near_depth))
     shared = torch.where(stated, estimate.sigma_shared, zero) / depth
-    columns = (expected, shared, *(torch.where(stated, x, one) for x in others), reach)
-    logs = [
+    columns = (expected, shared, *(torch.where(stated, x, one) for x in evidence), reach)
+    logarithms = [
         pad_elementwise(torch.log, x.clamp(*limits)) for x, limits in zip(columns, SCORE_FEATURES.values(), strict=True)
     ]
-    return torch.stack([torch.where(stated, x, zero) for x in logs], -1), stated
+    return torch.stack([torch.where(stated, x, zero) for x in logarithms], -1), stated
 
 
 class LearnedScore(nn.Module):
-    """A seat-7 function with weights: h / (h + e), e the relative error that the evidence lets expect.
+    """Stage 7 with trained weights: estimate, samples, tracks, fit -> estimate with the score h / (h + e).
 
-    e = exp(g(x)) times the error that :func:`confidence_from_error` expects, g a network with one hidden layer.
+    e = exp(g(x)) times the expected error of :func:`confidence_from_error`, g a network with one hidden layer.
     Untrained, g is 0 and the score that of ``confidence_from_error``. Train it on answers with truth by
-    :func:`expected_error_loss`; it travels as JSON or, through ``state_dict``, as any module does.
+    :func:`expected_error_loss`; it is stored as JSON or through ``state_dict``.
 
     Args:
         hidden: width of the hidden layer.
         half_error: e at which the score is one half.
-        min_score: answers below it are silenced with LOW_SCORE.
+        min_score: answers below it become unanswered with LOW_SCORE.
         seed: of the first layer's weights.
 
-    Gradient: to the weights, and to what :func:`score_features` passes on; the threshold carries none.
+    Gradient: to the weights, and through :func:`score_features`; the threshold carries none.
     """
 
     mean: Tensor
@@ -229,42 +244,42 @@ class LearnedScore(nn.Module):
     def __init__(self, hidden: int = 16, *, half_error: float = 0.1, min_score: float = 0.0, seed: int = 0) -> None:
         super().__init__()
         n = len(SCORE_FEATURES)
-        start = torch.rand(hidden, n + 1, generator=torch.Generator().manual_seed(seed)) * 2 - 1
+        weights = torch.rand(hidden, n + 1, generator=torch.Generator().manual_seed(seed)) * 2 - 1
         self.register_buffer("mean", torch.zeros(n))  # of the evidence it is trained on
         self.register_buffer("spread", torch.ones(n))
-        self.first = nn.Parameter(start[:, :n] / n**0.5)  # (hidden, 8)
-        self.first_bias = nn.Parameter(start[:, n] / n**0.5)
+        self.first = nn.Parameter(weights[:, :n] / n**0.5)  # (hidden, 8)
+        self.first_bias = nn.Parameter(weights[:, n] / n**0.5)
         self.last = nn.Parameter(torch.zeros(hidden))
         self.last_bias = nn.Parameter(torch.zeros(()))
         self.half_error, self.min_score = half_error, min_score
         self.provenance: dict[str, Any] = {}
 
     def forward(self, estimate: Estimate, samples: Samples, tracks: Tracks, fit: PoseFit) -> Estimate:
-        """The estimate with its score; 0 where silent or where no error can be stated."""
+        """The estimate with its score; 0 where unanswered or without an expected error."""
         x, stated = score_features(estimate, samples, tracks, fit)
         e = pad_elementwise(torch.exp, self.log_error(x))
         zero = torch.zeros_like(e)
         score = torch.where(stated, self.half_error / (self.half_error + e), zero)
-        return _silence(estimate, score, self.min_score)
+        return _apply_min_score(estimate, score, self.min_score)
 
     def log_error(
         self,
         x: Tensor,  # (…, 8) evidence
     ) -> Tensor:
-        """Logarithm (…) of the relative error to expect. Sums are written out: an answer never depends on its mates."""
+        """Logarithm (…) of the expected relative error. Sums are written out: no answer depends on its batch."""
         z = (x - self.mean.to(x)) / self.spread.to(x)
         first = self.first.to(x)
         hidden = self.first_bias.to(x).expand(*x.shape[:-1], -1)
         for k in range(x.shape[-1]):
             hidden = hidden + z[..., k, None] * first[:, k]
         hidden = hidden / (1 + hidden.abs())
-        more = self.last_bias.to(x).expand(x.shape[:-1])
+        correction = self.last_bias.to(x).expand(x.shape[:-1])
         for k, weight in enumerate(self.last.to(x).unbind()):
-            more = more + weight * hidden[..., k]
-        return x[..., 0] + MAX_LOG_FACTOR * more / (MAX_LOG_FACTOR + more.abs())
+            correction = correction + weight * hidden[..., k]
+        return x[..., 0] + MAX_LOG_FACTOR * correction / (MAX_LOG_FACTOR + correction.abs())
 
     def to_json(self) -> str:
-        """Everything as strict JSON: weights, options and where they come from. Nothing in it can be executed."""
+        """Weights, options and provenance as strict JSON. It contains nothing executable."""
         weights = {k: v.tolist() for k, v in self.state_dict().items()}
         options = {"half_error": self.half_error, "min_score": self.min_score}
         content = {"evidence": [*SCORE_FEATURES], **options, "weights": weights, "provenance": self.provenance}
@@ -272,7 +287,7 @@ class LearnedScore(nn.Module):
 
     @classmethod
     def from_json(cls, text: str, where: str = "learned score") -> Self:
-        """What :meth:`to_json` wrote.
+        """The scorer that :meth:`to_json` wrote.
 
         Raises:
             ValueError: not strict JSON, other evidence, or weights of another shape; the message names ``where``.
@@ -283,15 +298,15 @@ class LearnedScore(nn.Module):
                 raise ValueError(f"evidence is {content['evidence']}")
             weights = {k: torch.tensor(v, dtype=torch.float32) for k, v in content["weights"].items()}
             half_error, min_score = float(content["half_error"]), float(content["min_score"])
-            found = cls(len(weights["last"]), half_error=half_error, min_score=min_score)
-            found.load_state_dict(weights)
-            found.provenance = dict(content["provenance"])
+            scorer = cls(len(weights["last"]), half_error=half_error, min_score=min_score)
+            scorer.load_state_dict(weights)
+            scorer.provenance = dict(content["provenance"])
         except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
-            why = " ".join(str(error).split())
+            reason = " ".join(str(error).split())
             raise ValueError(
-                f"{where}: found {why}, expected a learned score on {', '.join(SCORE_FEATURES)}"
+                f"{where}: found {reason}, expected a learned score on {', '.join(SCORE_FEATURES)}"
             ) from error
-        return found
+        return scorer
 
     def save(self, path: str | Path) -> Path:
         """Write :meth:`to_json` to a file."""
@@ -311,10 +326,10 @@ def expected_error_loss(
     error: Tensor,  # (n,) relative error that turned out
     weight: Tensor,  # (n,) adds up to 1
 ) -> Tensor:
-    """How badly errors were foreseen: Σ w (ln e + min(error, 1) / e), least where e is the mean error of such answers.
+    """Loss of expected errors e: Σ w (ln e + min(error, 1) / e), least where e is the mean error of such answers.
 
-    The negative log-likelihood of an exponential distribution. It asks for the mean, as the risk of selected answers
-    is one, and weighs factors: a foreseen 1 % for 2 % is as wrong as 10 % for 20 %.
+    The negative log-likelihood of an exponential distribution. Its optimum is the mean, as the risk of selected answers
+    is one, and it compares ratios: 1 % expected for 2 % is as wrong as 10 % for 20 %.
 
     Gradient: to ``log_error``. Raises ValueError for wrong shapes.
     """
@@ -323,7 +338,7 @@ def expected_error_loss(
 
 
 def _expected_error(estimate: Estimate, terms: list[tuple[Tensor, float]]) -> tuple[Tensor, Tensor]:
-    """Relative error (B, N) to expect, from the own part of sigma and (term, scale) pairs, and where it can be said."""
+    """Expected relative error (B, N) from the own part of sigma and (term, scale) pairs, and where it is defined."""
     whole, shared, depth = estimate.sigma, estimate.sigma_shared, estimate.depth
     stated = estimate.keep & (depth > 0) & whole.isfinite() & shared.isfinite()
     for x, _ in terms:
@@ -342,8 +357,8 @@ def _expected_error(estimate: Estimate, terms: list[tuple[Tensor, float]]) -> tu
     return (own * spread).sqrt(), stated
 
 
-def _silence(estimate: Estimate, score: Tensor, min_score: float) -> Estimate:
-    """The estimate with its score; answers that score below ``min_score`` become silent."""
+def _apply_min_score(estimate: Estimate, score: Tensor, min_score: float) -> Estimate:
+    """The estimate with its score; answers below ``min_score`` become unanswered with LOW_SCORE."""
     low = estimate.keep & (score < min_score)
     gate = torch.where(low, torch.full_like(estimate.gate, Gate.LOW_SCORE), estimate.gate)
     keep = gate == Gate.ANSWER

@@ -1,4 +1,4 @@
-"""Stage 6, two views → depth with a sigma, and the gates that turn weak geometry into an explicit hole."""
+"""Stage 6: two views' tracks and pose → depth with a sigma, or a gate code where the geometry is weak."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from dhtorch.geometry.free_space import free_space_violations
 from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
 
-#: Least trackability that a grey difference is divided by.
+#: Limits the trackability (grey values in [0, 1]) that a grey difference is divided by from below: no division by 0.
+#: Source: origin not recorded.
 MIN_MISMATCH_TRACKABILITY = 1e-8
 
 
@@ -44,57 +45,57 @@ def two_view(
     sensor_share: float = 0.0,
     solver: Callable[..., epipolar.TwoView] = epipolar.triangulate,
 ) -> Estimate:
-    """Triangulate every track under the anchored pose and abstain where the geometry is weak.
+    """Triangulate every track under the metric pose -> depth with a sigma, or a gate where the geometry is weak.
 
-    The variance of a depth z, to first order, with s = ∂uv_1/∂z (px/m) and g = s / (sᵀ s) what a pixel is worth::
+    The variance of a depth z, to first order, with s = ∂uv_1/∂z (px/m) and g = s / (sᵀ s) the depth per pixel::
 
-        sigma² = c² · gᵀ Σ_track g · (1 + Σ_k (sign_k / scale_k)²)    the point's own: its track, and signs against it
+        sigma² = c² · gᵀ Σ_track g · (1 + Σ_k (term_k / scale_k)²)    the point's own: its track and its error terms
                + c² · gᵀ J Σ_pose Jᵀ g                                shared through the pose, J = ∂uv_1/∂pose
                + (h · n · z)²                                         shared through the sensor: a wrong scale
 
     c is ``sigma_scale``; Σ_track the track's covariance, or its shape with the size of the pose's residuals
-    (``fitted_noise``); the signs are the mismatch of the patches, the reprojection residual and the round trip, each
-    over its scale (``mismatch_px``, ``residual_px``, ``round_trip_px``; None leaves it out); Σ_pose has a shutter's
-    turn beside the motion where one was found; h is ``sensor_share`` and n the median relative noise of the near
-    returns that hold the pose. ``sigma_shared``² is the last two lines.
+    (``fitted_noise``); the terms are the mismatch of the patches, the reprojection residual and the round trip, each
+    over its scale (``mismatch_px``, ``residual_px``, ``round_trip_px``; None leaves it out); Σ_pose includes the
+    shutter rate where the fit has one; h is ``sensor_share`` and n the median relative noise of the near returns among
+    the pose's inliers. ``sigma_shared``² is the last two lines.
 
     Args:
         samples: N samples of view 0 (their own depth is not used here).
-        tracks: where they were found, in ideal pixels.
+        tracks: their pixels in both views, ideal.
         fit: metric relative pose.
         camera_0, camera_1: intrinsics of the two views, ideal; they may differ.
-        min_parallax_deg: rays closer to parallel than this are not answered; None asks nothing.
-        max_residual_px: reprojection error above which a point is not answered; None asks nothing. Triangulation is
+        min_parallax_deg: rays closer to parallel than this are not answered; None = no limit.
+        max_residual_px: reprojection error above which a point is not answered; None = no limit. Triangulation is
             one-sided, so the residual in view 0 is zero and the one in view 1 is the larger of the two.
-        max_sigma_rel: sigma / depth above which a point is not answered; None asks nothing.
+        max_sigma_rel: sigma / depth above which a point is not answered; None = no limit.
         min_t_snr: length of the translation, in its own standard deviations, below which no point of the pair is
-            answered; None asks nothing.
-        max_mismatch_px: grey difference of a track's patches above which it may have slid to another place of its
-            epipolar line, and is not answered; as the shift that would make it, the rms over the root of the
-            sample's trackability. None asks nothing.
-        max_far_noise: spread of the far tracks' residuals, of a ray with z = 1, above which the near returns are taken
-            to move on their own and no point of the pair is answered; None asks nothing.
-        max_in_reach: share of the answers that may lie where the sensor would have seen them
-            (:func:`dhtorch.geometry.free_space.free_space_violations`); with more, none is given. None asks nothing.
+            answered; None = no limit.
+        max_mismatch_px: grey difference of a track's patches above which it may have slid along its epipolar line, and
+            is not answered; as the equivalent shift, the rms over the root of the sample's trackability. None = no
+            limit.
+        max_far_noise: standard deviation of the far tracks' residuals, of a ray with z = 1, above which the near
+            returns are taken as independently moving and no point of the pair is answered; None = no limit.
+        max_in_reach: fraction of the answers that may lie where the sensor would have measured them
+            (:func:`dhtorch.geometry.free_space.free_space_violations`); above it no point is answered. None = no limit.
         fitted_noise: take the scale of the tracks' noise from the pose's residuals (``fit.sigma_px``), and from the
             tracks' covariances only its shape; else the covariances as they are.
-        isotropic: share of that shape which does not depend on the patch, see ``covariance.noise_shape``.
-        mismatch_px: such a shift that widens a track's noise as much as what is fitted; None: none does.
-        residual_px, round_trip_px: a reprojection residual and a round trip that do: a track that contradicts the pose,
-            or itself, is worse than others of its patch; None: none does.
-        sigma_scale: factor on what the tracks and the pose give to sigma, as a calibration found it.
-        sensor_share: share of the sensor's relative noise that all its returns have in common (a wrong scale): it
-            passes whole to every recovered depth, however many near points there are.
-        solver: ``(uv_0, uv_1, camera_0, camera_1, T_1_from_0) -> TwoView``, how two rays become a depth.
+        isotropic: fraction of that shape which does not depend on the patch, see ``covariance.noise_shape``.
+        mismatch_px: mismatch whose term equals the track's own noise; None leaves the term out.
+        residual_px, round_trip_px: reprojection residual and round trip whose term does: a track that contradicts the
+            pose, or itself, is worse than others with its patch; None leaves the term out.
+        sigma_scale: factor on the tracks' and the pose's parts of sigma, from a calibration.
+        sensor_share: fraction of the sensor's relative noise that all its returns have in common (a wrong scale): it
+            enters every recovered depth in full, however many near points there are.
+        solver: ``(uv_0, uv_1, camera_0, camera_1, T_1_from_0) -> TwoView``, the triangulation.
 
     Returns:
         Estimate with score 1 where answered (the next stage ranks). ``sigma`` combines the track's covariance and
         the pose's (with it the sensor's noise, which the pose has from the near points); ``sigma_shared`` is the pose's
         part, common to the pair's points.
 
-    Gates, first reason wins: NO_TRACK, NO_BASELINE, POSE_REFUTED, NO_POSE, BEHIND, PARALLAX, RESIDUAL, INCONSISTENT,
-    UNCERTAIN; in the place of an answer CONTRADICTED.
-    A rolling shutter that the pose found (``fit.shutter``) is undone in ``uv_1`` and counts in sigma.
+    Gates, the first that applies: NO_TRACK, NO_BASELINE, POSE_REFUTED, NO_POSE, BEHIND, PARALLAX, RESIDUAL,
+    INCONSISTENT, UNCERTAIN; CONTRADICTED in place of an answer.
+    The rolling shutter of the fit (``fit.shutter``) is undone in ``uv_1`` and included in sigma.
 
     Raises:
         ValueError: wrong shapes.
@@ -104,11 +105,11 @@ def two_view(
     Source: paper, "Gated two-view triangulation and abstention".
     """
     check("two_view", uv_0=(tracks.uv_0, "B N 2"), uv=(samples.uv, "B N 2"), R=(fit.T_1_from_0.R, "B 3 3"))
-    posed, still = fit.ok[:, None], fit.code == PoseCode.NO_BASELINE
+    posed, static = fit.ok[:, None], fit.code == PoseCode.NO_BASELINE
     tracked = tracks.valid & all_finite(tracks.uv_0, -1) & all_finite(tracks.uv_1, -1)
-    uv_0, uv_1 = _silence(tracks.uv_0, tracked), _silence(tracks.uv_1, tracked)
-    cov = _silence(tracks.cov.flatten(-2), tracked).unflatten(-1, (2, 2))
-    grey, round_trip, texture = (
+    uv_0, uv_1 = _zero_invalid(tracks.uv_0, tracked), _zero_invalid(tracks.uv_1, tracked)
+    cov = _zero_invalid(tracks.cov.flatten(-2), tracked).unflatten(-1, (2, 2))
+    grey_rms, round_trip, texture = (
         torch.where(tracked, x, 0) for x in (tracks.photometric, tracks.error, samples.trackability)
     )
     y = None
@@ -116,20 +117,22 @@ def two_view(
         y = cam.rays(cam.ideal(camera_0), uv_0)[..., 1]
         shutter_rate = torch.where(posed, fit.shutter.shutter_rate, torch.zeros_like(fit.shutter.shutter_rate))
         uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, y, shutter_rate).transpose(1, 2)
-    geometry = solver(uv_0, uv_1, camera_0, camera_1, _stand_in(fit))
+    geometry = solver(uv_0, uv_1, camera_0, camera_1, _safe_pose(fit))
     parallax_deg = geometry.parallax * (180 / math.pi)
-    mismatch = grey / texture.clamp_min(MIN_MISMATCH_TRACKABILITY).sqrt()
-    cov = _fitted(cov, tracked, fit, isotropic) if fitted_noise else cov
+    mismatch = grey_rms / texture.clamp_min(MIN_MISMATCH_TRACKABILITY).sqrt()
+    cov = _rescaled_covariance(cov, tracked, fit, isotropic) if fitted_noise else cov
     own, shared = _variance(geometry, cov, fit, y)
     own, shared = own * sigma_scale**2, shared * sigma_scale**2
-    own = own * _doubt((mismatch, mismatch_px), (geometry.residual_px, residual_px), (round_trip, round_trip_px))
+    own = own * _variance_factor(
+        (mismatch, mismatch_px), (geometry.residual_px, residual_px), (round_trip, round_trip_px)
+    )
     if sensor_share > 0:
         shared = shared + (sensor_share * _relative_noise(samples, fit) * geometry.depth) ** 2
     behind = ~((geometry.depth > 0) & (geometry.depth_1 > 0))
     limit = None if max_sigma_rel is None else (max_sigma_rel * geometry.depth) ** 2
     gate = first_reason(
         (~tracked, Gate.NO_TRACK),
-        (still[:, None].expand_as(tracked), Gate.NO_BASELINE),
+        (static[:, None].expand_as(tracked), Gate.NO_BASELINE),
         ((fit.code == PoseCode.REFUTED)[:, None].expand_as(tracked), Gate.POSE_REFUTED),
         (~posed, Gate.NO_POSE),
         (_below(fit.t_snr[:, None].expand_as(tracked), min_t_snr), Gate.NO_BASELINE),
@@ -140,21 +143,21 @@ def two_view(
         (_above(own + shared, limit), Gate.UNCERTAIN),
     )
     sigma = _root(own + shared, gate == Gate.ANSWER)
-    moving = torch.zeros_like(fit.ok)
+    contradicted = torch.zeros_like(fit.ok)
     if max_far_noise is not None:
-        moving = moving | (fit.sigma_px > max_far_noise * camera_1.f.detach().amin(-1))
+        contradicted = contradicted | (fit.sigma_px > max_far_noise * camera_1.f.detach().amin(-1))
     if max_in_reach is not None:
-        seen = torch.where(samples.usable, samples.depth, torch.zeros_like(samples.depth))
-        asked = (gate == Gate.ANSWER) & (samples.hole == Hole.TRACKABLE_NO_LIDAR)
-        share = free_space_violations(samples.uv, seen, fit.inlier, asked, geometry.depth, sigma)
-        moving = moving | (share > max_in_reach)
-    gate = torch.where((gate == Gate.ANSWER) & moving[:, None], Gate.CONTRADICTED, gate)
+        sensor_depth = torch.where(samples.usable, samples.depth, torch.zeros_like(samples.depth))
+        candidates = (gate == Gate.ANSWER) & (samples.hole == Hole.TRACKABLE_NO_LIDAR)
+        violations = free_space_violations(samples.uv, sensor_depth, fit.inlier, candidates, geometry.depth, sigma)
+        contradicted = contradicted | (violations > max_in_reach)
+    gate = torch.where((gate == Gate.ANSWER) & contradicted[:, None], Gate.CONTRADICTED, gate)
     keep, measured = gate == Gate.ANSWER, tracked & posed
     return Estimate(
         uv=samples.uv,
-        depth=_where_or_nan(keep, geometry.depth),
-        sigma=_where_or_nan(keep, sigma),
-        sigma_shared=_where_or_nan(keep, _root(shared, keep)),
+        depth=_keep_or_nan(keep, geometry.depth),
+        sigma=_keep_or_nan(keep, sigma),
+        sigma_shared=_keep_or_nan(keep, _root(shared, keep)),
         parallax_deg=torch.where(measured, parallax_deg, torch.zeros_like(parallax_deg)),
         residual_px=torch.where(measured, geometry.residual_px, torch.zeros_like(geometry.residual_px)),
         n_views=torch.where(measured, 2, 1).to(torch.int32),
@@ -164,7 +167,7 @@ def two_view(
 
 
 def _variance(geometry: epipolar.TwoView, cov: Tensor, fit: PoseFit, y: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Own and shared variance of depth; with a shutter its turn is three more columns of the pose."""
+    """Own and shared variance of depth; a shutter rate adds three columns to the pose's."""
     if fit.shutter is None or y is None:
         return epipolar.depth_variance(geometry, cov, fit.cov.nan_to_num())
     J = torch.cat((geometry.J_pose, geometry.J_pose[..., :3] * y[..., None, None]), -1)
@@ -172,24 +175,24 @@ def _variance(geometry: epipolar.TwoView, cov: Tensor, fit: PoseFit, y: Tensor |
 
 
 def _relative_noise(samples: Samples, fit: PoseFit) -> Tensor:
-    """Median sigma / depth (B, 1) of the near points that hold the pose; 0 where there are none."""
+    """Median sigma / depth (B, 1) of the near inliers of the pose; 0 where there are none."""
     used = fit.inlier & (samples.depth > 0)
     relative = samples.sigma / torch.where(used, samples.depth, torch.ones_like(samples.depth))
     return torch.where(used.any(-1, keepdim=True), masked_median(relative, used), 0.0)
 
 
-def _fitted(cov: Tensor, tracked: Tensor, fit: PoseFit, isotropic: float) -> Tensor:
-    """Covariances of the tracks with the shape they state and the scale that the pose's residuals have."""
+def _rescaled_covariance(cov: Tensor, tracked: Tensor, fit: PoseFit, isotropic: float) -> Tensor:
+    """Covariances with the shape of the tracks' covariances and the scale of the pose's residuals."""
     scale = torch.where(fit.ok[:, None], fit.sigma_px[:, None], 1.0).to(cov.dtype)
     return noise_shape(cov, tracked, isotropic) * (scale * scale)[..., None, None]
 
 
-def _doubt(*signs: tuple[Tensor, float | None]) -> Tensor | float:
-    """Factor on a track's variance from signs that it is worse than its patch says: 1 + Σ (sign / scale)²."""
+def _variance_factor(*terms: tuple[Tensor, float | None]) -> Tensor | float:
+    """Factor on a track's variance from error terms and their scales: 1 + Σ (term / scale)²."""
     factor: Tensor | float = 1.0
-    for sign, scale in signs:
+    for term, scale in terms:
         if scale is not None:
-            factor = factor + (sign / scale) ** 2
+            factor = factor + (term / scale) ** 2
     return factor
 
 
@@ -202,23 +205,23 @@ def _below(x: Tensor, limit: float | None) -> Tensor:
     return torch.zeros_like(x, dtype=torch.bool) if limit is None else ~(x >= limit)
 
 
-def _stand_in(fit: PoseFit) -> epipolar.Pose:
-    """The fitted pose, with a harmless one where there is none, so that arithmetic and gradients stay finite."""
+def _safe_pose(fit: PoseFit) -> epipolar.Pose:
+    """The fitted pose, or a fixed valid one where there is none, so that arithmetic and gradients stay finite."""
     ok = fit.ok
     R, t = fit.T_1_from_0.R, fit.T_1_from_0.t
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
     return epipolar.Pose(torch.where(ok[:, None, None], R, eye), torch.where(ok[:, None], t, eye[0]))
 
 
-def _silence(uv: Tensor, valid: Tensor) -> Tensor:
+def _zero_invalid(uv: Tensor, valid: Tensor) -> Tensor:
     return torch.where(valid[..., None], uv, torch.zeros_like(uv))
 
 
-def _where_or_nan(keep: Tensor, x: Tensor) -> Tensor:
+def _keep_or_nan(keep: Tensor, x: Tensor) -> Tensor:
     return torch.where(keep, x, torch.full_like(x, torch.nan))
 
 
 def _root(x: Tensor, keep: Tensor) -> Tensor:
     """Square root whose gradient stays finite where the value is not used or zero."""
-    fine = keep & (x > 0)
-    return torch.where(fine, torch.where(fine, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x))
+    positive = keep & (x > 0)
+    return torch.where(positive, torch.where(positive, x, torch.ones_like(x)).sqrt(), torch.zeros_like(x))
