@@ -4,8 +4,8 @@
 
 The plain loader decodes a JPEG and a 16-bit PNG with the depth, resizes both where asked for, and resizes the picture
 to 224×224 for a network; only that leaves the worker. ``single`` is one view per sample, of which the transform's
-front end alone is asked; ``pair`` is two views, and beside the transform stands the same with OpenCV in its seats. Rows
-of mode ``native`` use the compiled code of ``python -m dhtorch.ops``. Rows
+front end alone is asked; ``pair`` is two views, and beside the transform stands the same with OpenCV in its stages.
+Rows of mode ``compiled`` use the compiled code of ``python -m dhtorch.ops``. Rows
 with ``by_batch`` collate in the worker first and extend the whole batch at once (``batched=True``): the same answers.
 Bars are about rows without workers (``workers0``).
 ``ours_ms`` and ``peer_ms`` are milliseconds per sample in the steady state, workers included. In ``scaling`` rows
@@ -140,7 +140,7 @@ class Bench:
         self.transforms["plain_loader"] = None
         self.transforms |= {side: self.transforms[COMPILED_SIDES[side]] for side in COMPILED_SIDES}
         if mode == "pair":
-            self.transforms["opencv_seats"] = self.transform(method=OPENCV)
+            self.transforms["opencv_stages"] = self.transform(method=OPENCV)
         self.times: dict[tuple[str, int], list[float]] = {}
 
     def transform(self, **options: Any) -> ExtendDepth:
@@ -176,7 +176,7 @@ class Bench:
 
     def rows(self, workers: int) -> list[dict[str, Any]]:
         """Against the plain loader and against OpenCV; the bars stand on the larger pictures."""
-        barred = {"single": "plain_loader", "pair": "opencv_seats"}[self.mode]
+        barred = {"single": "plain_loader", "pair": "opencv_stages"}[self.mode]
         name = f"loader_{self.mode}_{self.size}_workers{workers}"
         return [
             harness.row(

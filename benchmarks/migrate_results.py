@@ -177,26 +177,32 @@ def migrate(path: Path) -> None:
         if new != content:
             result_files.write_result(path, new)
     elif isinstance(content, list) and any(_is_earlier(row) for row in content):
-        rows = [{**row, **_present_row(row)} for row in content]
+        rows = [_present_row(row) for row in content]
         replace_file(path, (json.dumps(rows, indent=1, ensure_ascii=False) + "\n").encode())
 
 
 def _is_earlier(row: Mapping[str, Any]) -> bool:
     """Whether the names of a benchmark row are an earlier version's."""
     torch_alone = str(row.get("name")).startswith(("triangulate", "start"))  # rows that have no compiled operators
-    return row.get("mode") == "native" or row.get("name") in ROW_NAMES or (torch_alone and row["mode"] == "compiled")
+    other_mode = row.get("mode") == "native" or (torch_alone and row["mode"] == "compiled")
+    return other_mode or row.get("name") in ROW_NAMES or not COLUMNS.keys().isdisjoint(row)
 
 
 def _present_row(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Name and mode of a benchmark row, where they have other names now."""
-    table = {"name": ROW_NAMES, "mode": MODES}
-    return {key: names[row[key]] for key, names in table.items() if row.get(key) in names}
+    """A benchmark row with the present names of its columns, of itself, its mode and its peer."""
+    tables = {"name": ROW_NAMES, "mode": MODES, "peer": PEERS}
+    values = {key: tables[key].get(value, value) if key in tables else value for key, value in row.items()}
+    return {COLUMNS.get(key, key): value for key, value in values.items()}
 
 
 #: Name of a benchmark row in an earlier version → its present name.
 ROW_NAMES = {"anchor_auto": "auto_reference_view", "auto_anchor": "auto_reference_view"} | {
     f"judge_{way}": f"validate_{way}" for way in ("sparse", "sparse_512", "views")
 }
+
+#: Peer and columns of a benchmark row in an earlier version → their present names.
+PEERS = {"opencv_seats": "opencv_stages"}
+COLUMNS = {"seat": "tracker"}
 
 #: Mode of a benchmark row in an earlier version → its present name.
 MODES = {"native": "compiled", "compiled": "torch.compile"}

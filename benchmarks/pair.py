@@ -1,4 +1,4 @@
-"""Time per pair, whole and by stage: ``paper`` and ``map`` against the seats of ``paper`` filled by OpenCV.
+"""Time per pair, whole and by stage: ``paper`` and ``map`` against the stages of ``paper`` filled by OpenCV.
 
     python benchmarks/pair.py --json benchmarks/results/pair.json
 

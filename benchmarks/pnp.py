@@ -3,12 +3,12 @@
     python benchmarks/pnp.py --json benchmarks/results/pnp.json
 
 Random scenes: points 0.5 to 2.5 m away seen by a 640x480 camera, pixels with 0.5 px of noise, a share of them replaced
-by any other pixel. Ours is seat 5 of ``paper`` with 64 hypotheses, enough for half the points being wrong. Peers, pair
+by any other pixel. Ours is stage 5 of ``paper`` with 64 hypotheses, enough for half the points being wrong. Peers, pair
 after pair: ``cv2.solvePnPRansac`` with AP3P and with USAC MAGSAC, both followed by ``cv2.solvePnPRefineLM`` on the
 inliers; PoseLib with at least 100 iterations (its default of 1000 would be no fair peer); pycolmap where it is
-installed. Mode ``compiled`` is ``torch.compile`` of the seat with calls from kernel to kernel in C++ as well
-(``options={"cpp_wrapper": True}``), which takes longer to compile once, mode ``native`` the seat with the compiled code
-of ``python -m dhtorch.ops``. Ours runs under ``torch.inference_mode``, as one would run it where nothing is to
+installed. Mode ``torch.compile`` is ``torch.compile`` of the stage with calls from kernel to kernel in C++ as well
+(``options={"cpp_wrapper": True}``), which takes longer to compile once, mode ``compiled`` the stage with the compiled
+code of ``python -m dhtorch.ops``. Ours runs under ``torch.inference_mode``, as one would run it where nothing is to
 be learned.
 
 Errors: median rotation error in degrees over a hundred pairs; that of the translation is printed above the table.
@@ -134,8 +134,8 @@ def measure(batch: int, n: int, outliers: float, options: Any, compile_too: bool
     """Rows of one size: eager, native and compiled against every peer."""
     draws = uniform_draws(torch.arange(batch), batch, HYPOTHESES)
     samples, tracks, camera, _ = scene(batch, n, outliers, seed=1)
-    seat = partial(pnp_ransac, samples, tracks, camera, camera, draws)
-    calls: dict[str, Callable[[], Any]] = {"eager": seat, "compiled": harness.with_compiled_operators()(seat)}
+    stage = partial(pnp_ransac, samples, tracks, camera, camera, draws)
+    calls: dict[str, Callable[[], Any]] = {"eager": stage, "compiled": harness.with_compiled_operators()(stage)}
     seconds = 0.0
     if compile_too:
         torch.compiler.reset()

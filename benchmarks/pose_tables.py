@@ -79,7 +79,7 @@ def rigs(kind: str) -> list[dict[str, Any]]:
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for row in found:
         if row["rig"].startswith("robot"):
-            groups.setdefault(tuple(row.get(k, "") for k in ("seat", "pose", "pairs")), []).append(row)
+            groups.setdefault(tuple(row.get(k, "") for k in ("tracker", "pose", "pairs")), []).append(row)
     for of in groups.values():
         joined = {
             key: median([row.get(key) for row in of]) for key, value in of[0].items() if not isinstance(value, str)
@@ -99,7 +99,7 @@ def rig_poses() -> str:
     rows = []
     for row in rigs("pose"):
         several = row.get("all", [row])
-        head = [row["rig"], row["seat"], f"{row['n_ok']:g} of {row['n_instants']:g}"]
+        head = [row["rig"], row["tracker"], f"{row['n_ok']:g} of {row['n_instants']:g}"]
         if row.get("baseline_m") is None:
             reached = ", ".join(code.lower().replace("_", " ") for code in row["codes"])
             rows.append([*head, f"– / {1e3 * row['calibrated_m']:.1f}", "", "", f"none: {reached}"])
@@ -109,7 +109,7 @@ def rig_poses() -> str:
         worst = "" if len(several) == 1 else f" (largest {max(r['deviation'] for r in several):.1f})"
         baseline = f"{1e3 * row['baseline_m']:.1f} / {1e3 * row['calibrated_m']:.1f}"
         rows.append([*head, baseline, off, stated, f"{row['deviation']:.1f}{worst}"])
-    head = ["rig", "seat 4", "instants with a pose", "baseline, mm: found / calibrated"]
+    head = ["rig", "stage 4", "instants with a pose", "baseline, mm: found / calibrated"]
     return table([*head, "off", "stated sigma", "off in sigmas (2.3 expected, 4.7 once in a thousand)"], rows)
 
 
@@ -118,10 +118,10 @@ def rig_answers() -> str:
     rows = []
     for row in rigs("answers"):
         n = row["n_candidates"]
-        cells = [row["rig"], row["seat"], row["pairs"], row["pose"], f"{n:g}", percent(row["coverage"])]
+        cells = [row["rig"], row["tracker"], row["pairs"], row["pose"], f"{n:g}", percent(row["coverage"])]
         cells += [percent(row["median_rel"]), percent(row["p90_rel"])]
         rows.append([*cells, f"{percent(row['within_sigma'])}, {percent(row['within_2sigma'])}"])
-    head = ["rig", "seat 4", "pairs in", "pose from", "held back", "answered", "median error", "p90"]
+    head = ["rig", "stage 4", "pairs in", "pose from", "held back", "answered", "median error", "p90"]
     return table([*head, "within 1, 2 sigma"], rows)
 
 

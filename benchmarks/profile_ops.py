@@ -1,7 +1,7 @@
 """The ten most expensive operations of a method or a stage, and how many there are.
 
     python benchmarks/profile_ops.py                         method=paper, whole pair
-    python benchmarks/profile_ops.py map --stage pose        one seat of a method
+    python benchmarks/profile_ops.py map --stage pose        one stage of a method
     python benchmarks/profile_ops.py paper --batch 8 --n 2048 --top 20
 
 Stages: sample, backproject, classify, track, pose, triangulate, score. One pair of TUM fr1/desk where DHTORCH_DATA is
@@ -27,13 +27,13 @@ STAGES = ("sample", "backproject", "classify", "track", "pose", "triangulate", "
 
 
 def seat_call(method: Method, stage: str, frames: tuple[Any, Any], n: int) -> Callable[[], Any]:
-    """One seat of a method with the arguments that the method gives it."""
+    """One stage of a method with the arguments that the method gives it."""
     seen: dict[str, Callable[[], Any]] = {}
-    seat = getattr(method, stage)
+    stage = getattr(method, stage)
 
     def watched(*args: Any, **kwargs: Any) -> Any:
-        seen[stage] = partial(seat, *args, **kwargs)
-        return seat(*args, **kwargs)
+        seen[stage] = partial(stage, *args, **kwargs)
+        return stage(*args, **kwargs)
 
     method.replace(n=n, **{stage: watched})(*frames)
     return seen[stage]
@@ -62,7 +62,7 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("method", nargs="?", choices=[*METHODS], default="paper")
-    parser.add_argument("--stage", choices=STAGES, help="one seat instead of the whole pair")
+    parser.add_argument("--stage", choices=STAGES, help="one stage instead of the whole pair")
     parser.add_argument("--batch", type=int, default=1)
     parser.add_argument("--n", type=int, default=2048)
     parser.add_argument("--top", type=int, default=10)

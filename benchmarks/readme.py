@@ -145,7 +145,7 @@ def beside_chosen() -> str:
         ["samples without a return that are answered where the camera only turns", percent(turned), "≤ 0.5 %"],
         ["answered and wrong by a fifth where what is near moves, worst room", percent(wrong), "≤ 1 %"],
         ["time of a whole reference view, ratio to `window`", number(timed["auto_reference_view"]), "≤ 1.0"],
-        ["time of `Stream.push`, ratio to OpenCV's seats on the same views", number(timed["stream_push"]), "≤ 1.2"],
+        ["time of `Stream.push`, ratio to OpenCV's stages on the same views", number(timed["stream_push"]), "≤ 1.2"],
     ]
     return table(["number", "`auto`", "bar"], rows)
 
@@ -273,9 +273,7 @@ def loader_times() -> str:
         return " and ".join(f"{a['ours_ms']:.2g} ms with {x} ({b['ours_ms']:.2g} by batch)" for a, b, x in times)
 
     plain, _ = taken("single", "eager")
-    after = f"; after `python -m dhtorch.ops`, which compiles inner loops, {said('compiled')}" * bool(
-        said("compiled")
-    )
+    after = f"; after `python -m dhtorch.ops`, which compiles inner loops, {said('compiled')}" * bool(said("compiled"))
     return (
         f"A sample of 640×480 takes {said('eager')}{after}; {plain['peer_ms']:.2g} ms of it is decoding\n"
         f"(`python benchmarks/loader.py`; one thread, {plain['processor']})."

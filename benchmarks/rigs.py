@@ -46,7 +46,7 @@ ROBOT = {"n_frames": 12, "hw": (240, 320), "depth_hw": (96, 128), "supersample":
 CALIBRATED = (0.0005, 0.001)
 
 #: Who finds the same place in the other camera.
-SEATS: dict[str, Method] = {"map": MAP, "xfeat": xfeat.XFEAT}
+TRACKERS: dict[str, Method] = {"map": MAP, "xfeat": xfeat.XFEAT}
 
 
 @dataclass(frozen=True)
@@ -90,17 +90,23 @@ def of_rig(scene: Scene, name: str | None = None) -> Iterator[Pairing]:
         yield Pairing(f"{name or rig.name} {rig.cameras[a]}–{rig.cameras[b]}", scene, one, two, calibration)
 
 
-def measured(pairing: Pairing, seat: str) -> tuple[dict[str, Any], Pose | None, Tensor | None]:
+def measured(pairing: Pairing, tracker: str) -> tuple[dict[str, Any], Pose | None, Tensor | None]:
     """A row ``pose``, and the pose with its covariance where there is one."""
     _, reference, others = pairing.frames()
     trace: dict[str, Any] = {}
-    mean = estimate_rig_pose(reference, others, method=SEATS[seat], hint=pairing.rig.hint, trace=trace)
+    mean = estimate_rig_pose(reference, others, method=TRACKERS[tracker], hint=pairing.rig.hint, trace=trace)
     fit = trace["fit"]
     several = len(fit.code) > 1
     T, cov, scale = (mean.T, mean.cov, float(mean.scale[0])) if several else (fit.T_1_from_0, fit.cov, 1.0)
     agree, ok = int(mean.agree.sum()), bool(mean.ok[0] if several else fit.ok[0])
     codes = names(PoseCode)
-    row = {"kind": "pose", "rig": pairing.name, "seat": seat, "n_instants": len(fit.code), "n_ok": int(fit.ok.sum())}
+    row = {
+        "kind": "pose",
+        "rig": pairing.name,
+        "tracker": tracker,
+        "n_instants": len(fit.code),
+        "n_ok": int(fit.ok.sum()),
+    }
     row |= {"codes": sorted({codes[int(c)] for c in fit.code}), "n_agree": agree, "ok": ok}
     row |= {"calibrated_m": float(pairing.calibration.t.norm()), "turn_deg": turned(pairing.calibration.R)}
     return (row | off(T, cov, pairing.calibration) | {"scale": scale}, T, cov) if ok else (row, None, None)
@@ -127,10 +133,10 @@ def held_against(estimate: Any, samples: Any, whole: Frame, near: float | None) 
     return errors.points_from_estimate(estimate, truth)
 
 
-def answers(pairing: Pairing, pose: Pose | None, cov: Tensor | None, seat: str) -> Iterator[dict[str, Any]]:
+def answers(pairing: Pairing, pose: Pose | None, cov: Tensor | None, tracker: str) -> Iterator[dict[str, Any]]:
     """Rows ``answers`` of pairs at one instant, by where the pose comes from."""
     whole, reference, others = pairing.frames()
-    method = SEATS[seat]
+    method = TRACKERS[tracker]
     sources: dict[str, Any] = {"near returns": None, "calibration": calibrated(pairing)}
     if pose is not None and len(pairing.references) > 1:
         sources["measured once"] = ConstantPose(pose, cov)
@@ -138,7 +144,7 @@ def answers(pairing: Pairing, pose: Pose | None, cov: Tensor | None, seat: str) 
         trace: dict[str, Any] = {}
         estimate = method.replace(pose_prior=rigid)(reference, others, hint=pairing.rig.hint, trace=trace)
         found = held_against(estimate, trace["samples"], whole, pairing.rig.near)
-        yield row(pairing, source, seat, "space", len(pairing.references), int(trace["fit"].ok.sum()), [found])
+        yield row(pairing, source, tracker, "space", len(pairing.references), int(trace["fit"].ok.sum()), [found])
 
 
 def calibrated(pairing: Pairing) -> ConstantPose:
@@ -167,12 +173,12 @@ def mixed(scene: Scene, name: str) -> dict[str, Any]:
 
 
 def row(
-    pairing: Pairing, source: str, seat: str, where: str, n: int, n_ok: int, found: list[errors.Points]
+    pairing: Pairing, source: str, tracker: str, where: str, n: int, n_ok: int, found: list[errors.Points]
 ) -> dict[str, Any]:
     """A row ``answers``."""
     parts = errors.measure_errors(collate_points(found))
     kept = ("n_candidates", "coverage", "median_rel", "p90_rel", "within_sigma", "within_2sigma")
-    head = {"kind": "answers", "rig": pairing.name, "pose": source, "seat": seat, "pairs": where, "n_pairs": n}
+    head = {"kind": "answers", "rig": pairing.name, "pose": source, "tracker": tracker, "pairs": where, "n_pairs": n}
     return head | {"n_ok": n_ok} | {k: parts[k] for k in kept}
 
 
@@ -181,9 +187,9 @@ def collate_points(found: list[errors.Points]) -> errors.Points:
     return errors.Points(*(torch.cat([getattr(p, f) for p in found]) for f in errors.Points.__dataclass_fields__))
 
 
-def seats() -> list[str]:
+def trackers() -> list[str]:
     """Those that can be asked here."""
-    return [name for name, method in SEATS.items() if xfeat.method_missing_reason(method) is None]
+    return [name for name, method in TRACKERS.items() if xfeat.method_missing_reason(method) is None]
 
 
 def main() -> int:
@@ -195,9 +201,9 @@ def main() -> int:
     found: list[Mapping[str, Any]] = []
     seen: set[int] = set()
     for pairing in pairings():
-        for seat in seats():
-            said, T, cov = measured(pairing, seat)
-            found += [said, *answers(pairing, T, cov, seat)]
+        for tracker in trackers():
+            said, T, cov = measured(pairing, tracker)
+            found += [said, *answers(pairing, T, cov, tracker)]
         if isinstance(pairing.rig.recording, Rig) and id(pairing.rig.recording) not in seen:
             seen.add(id(pairing.rig.recording))
             found.append(mixed(pairing.rig, pairing.name.rpartition(" ")[0]))

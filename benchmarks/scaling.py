@@ -2,7 +2,7 @@
 
     python benchmarks/scaling.py --json benchmarks/results/scaling.json
 
-Each series doubles one size, the others stay; hypotheses are those of seat 5 alone, 16 pairs at once. Growth exponents
+Each series doubles one size, the others stay; hypotheses are those of stage 5 alone, 16 pairs at once. Growth exponents
 are slopes of a line through (log size, log time or log memory): 1 is proportional, 0 constant. Sizes of pictures are in
 pixels. Peak memory is what a process of its own needs above its inputs, after one small call of each method has loaded
 the libraries. The last rows are the largest batch that is promised to fit: 32 pairs with 4096 samples.
@@ -67,8 +67,8 @@ def series(full: bool) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
         pairs = [partial(METHODS[method], repeated(reference, 1 << k), repeated(other, 1 << k)) for k in doublings]
         found[f"{method}.pairs"] = [(1 << k, partial(p, n=512)) for k, p in zip(doublings, pairs, strict=True)]
     samples, tracks, camera, _ = pnp.scene(16, 500, 0.3, seed=1)
-    seat = partial(pnp_ransac, samples, tracks, camera, camera)
-    found["pose.hypotheses"] = [(128 << k, partial(seat, uniform_draws(0, 16, 128 << k))) for k in doublings]
+    stage = partial(pnp_ransac, samples, tracks, camera, camera)
+    found["pose.hypotheses"] = [(128 << k, partial(stage, uniform_draws(0, 16, 128 << k))) for k in doublings]
     sizes = [(120, 160), (240, 160), (240, 320), (480, 320), (480, 640)][-len(doublings) :]
     shown = [(hw, partial(METHODS["paper"], resized(reference, hw), resized(other, hw), n=512)) for hw in sizes]
     found["paper.pixels"] = [(hw[0] * hw[1], call) for hw, call in shown]

@@ -5,7 +5,7 @@
 Each side is a process of its own, ``python -c``, and both take turns; times are those of the whole process, user and
 system together with ``--clock cpu``. ``start_import`` loads the package, whose names are imported when they are asked
 for; ``start_extend`` also the method, and ``start_names`` everything that ``from dhtorch import *`` gives.
-``start_compiled`` is a worker's first pose by the compiled seat (500 points): with what another process compiled,
+``start_compiled`` is a worker's first pose by the compiled stage (500 points): with what another process compiled,
 kept (``torch.compiler.save_cache_artifacts``) and the worker loaded, beside a worker that compiles for itself.
 """
 

@@ -6,8 +6,8 @@
 (``views=False``) of :data:`dhtorch.validation.validate.QUICK_METHOD`, from the frames to the record;
 ``validate_sparse_512``: the same with 512 samples of ``map``; ``validate_views``: with photometric evidence too. Rows
 of mode ``compiled`` use the operators that ``python -m dhtorch.ops`` compiles. All take turns in one process, a second
-or more of frames in a row each, as a data set is validated. The peer needs a relative pose and gets one by the same method.
-Frames of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room; frames a second are 1000 / ms.
+or more of frames in a row each, as a data set is validated. The peer needs a relative pose and gets one by the same
+method. Frames of TUM fr1/desk where DHTORCH_DATA is set, else of the built-in room; frames a second are 1000 / ms.
 """
 
 from __future__ import annotations

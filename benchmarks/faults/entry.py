@@ -303,8 +303,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_make_rows", "fit=options.fit,", ""),
         (
             "_shared_metadata",
-            "{**result_files.list_files_below(whole.roots), **result_files.list_files_named(config)}",
-            "result_files.list_files_below(whole.roots)",
+            "{**result_files.list_files_below(extraction_plan.roots), **result_files.list_files_named(config)}",
+            "result_files.list_files_below(extraction_plan.roots)",
         ),
         ("run", "shards.remove_unfinished(folder)", "pass"),
         ("_print_summary", 'if n and name != "none"', 'if name != "none"'),
@@ -336,7 +336,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("filter_rows", 'features is None and on_error == "raise"', "False"),
     ],
     "extract.features": [
-        ("FeatureTable.__init__", 'len(self.files) != own["of"]', 'len(self.files) > own["of"]'),
+        ("FeatureTable.__init__", 'len(self.files) != shard_metadata["of"]', 'len(self.files) > shard_metadata["of"]'),
         ("FeatureTable.__init__", "if name not in KEY_COLUMNS]", "]"),
         ("FeatureTable.__getitem__", '"right"', '"left"'),
         ("FeatureTable.__getitem__", "i - int(self._starts[k])", "i"),
@@ -355,7 +355,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("view_offsets", "scene.gap if gap is None else gap", "scene.gap or gap"),
         ("view_offsets", "spaced_frames(0, gap, views) if gap else []", "spaced_frames(0, gap, 1) if gap else []"),
         ("make_plan", "k if number is None else number", "k"),
-        ("make_plan", "places = sorted(found)", "places = list(found)"),
+        ("make_plan", "keys = sorted(recordings)", "keys = list(recordings)"),
     ],
     "extract.dataset": [
         ("_READER_OPTIONS", '"max_depth": np.inf', '"max_depth": 100.0'),
@@ -385,7 +385,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("write_shard", 'unfinished = folder / f".{shard.name}{_UNFINISHED}"', "unfinished = folder / shard.name"),
         ("write_shard", 'compression="zstd"', 'compression="snappy"'),
         ("remove_unfinished", 'f".{_PATTERN}{_UNFINISHED}"', 'f"*{_UNFINISHED}"'),
-        ("find_finished_shards", 'other["key"] != shared["key"]', 'other["config"] != shared["config"]'),
+        ("find_finished_shards", 'metadata["key"] != shared["key"]', 'metadata["config"] != shared["config"]'),
         ("find_finished_shards", "except FormatError:\n            continue", "except OSError:\n            continue"),
     ],
 }

@@ -398,7 +398,8 @@ class _SceneCollector:
         # some synthetic recordings distort tracks
         distort = getattr(self.scene.recording, "spoil_track", lambda track: track)
         seed = self.settings.seed if variant.seed is None else variant.seed
-        options: dict[str, Any] = {"seed": seed, "hint": self.scene.hint, "track": distort(shared.seat(method.track))}
+        track = distort(shared.shared_tracker(method.track))
+        options: dict[str, Any] = {"seed": seed, "hint": self.scene.hint, "track": track}
         if variant.fit is not None:
             options["fit"] = variant.fit(batch, method.n)
         options |= variant.given(batch)

@@ -26,7 +26,7 @@ class SharedTracks:
         self._cached: list[tuple[Any, tuple[Tensor, ...], Tracks, float]] = []
         self._uncharged_ms = 0.0
 
-    def seat(self, track: TrackStage) -> TrackStage:
+    def shared_tracker(self, track: TrackStage) -> TrackStage:
         """Cached track stage of one variant."""
         self._uncharged_ms = 0.0
         return partial(self._track, track)

@@ -18,10 +18,10 @@ from torch.utils import _pytree as torch_pytree
 from dhtorch.geometry.checks import is_transformed
 from dhtorch.pytree import Record
 
-R = TypeVar("R")
+_Result = TypeVar("_Result")
 
 
-def run_without_grad(fn: Callable[..., R], *args: Any, **options: Any) -> R:
+def run_without_grad(fn: Callable[..., _Result], *args: Any, **options: Any) -> _Result:
     """``fn(*args, **options)``, in inference mode where no tensor among the arguments asks for a graph.
 
     Tensors that ``fn`` reads elsewhere must not ask for one; it may keep none that it makes.

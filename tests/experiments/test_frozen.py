@@ -17,9 +17,9 @@ from dhtorch.synthetic import SyntheticRoom
 AT_RUN_TIME = {"hint", "device", "dtype", "linear"}
 
 
-def left_open(seat, path):
+def left_open(stage, path):
     """Options of a function, and of the functions among them, that would follow a default."""
-    function, given = (seat.func, seat.keywords) if isinstance(seat, partial) else (seat, {})
+    function, given = (stage.func, stage.keywords) if isinstance(stage, partial) else (stage, {})
     for name, parameter in inspect.signature(function).parameters.items():
         if parameter.kind is not parameter.KEYWORD_ONLY or name in AT_RUN_TIME:
             continue
@@ -31,9 +31,9 @@ def left_open(seat, path):
 
 @pytest.mark.parametrize("method", [MAP_1, WINDOW_1])
 def test_every_option_is_written_out(method):
-    seats = {f.name: getattr(method, f.name) for f in fields(Method) if callable(getattr(method, f.name))}
-    assert len(seats) >= 8
-    assert not [name for seat, f in seats.items() for name in left_open(f, seat)]
+    stages = {f.name: getattr(method, f.name) for f in fields(Method) if callable(getattr(method, f.name))}
+    assert len(stages) >= 8
+    assert not [name for stage, f in stages.items() for name in left_open(f, stage)]
 
 
 def test_an_option_that_follows_a_default_would_be_seen():

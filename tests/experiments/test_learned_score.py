@@ -1,4 +1,4 @@
-"""Seat 7 with weights learns which answers err, and is judged on rooms it has not seen; the seat alone: test_score.py."""
+"""Stage 7 with weights learns which answers err, and is judged on rooms it has not seen; the stage alone: test_score.py."""
 
 import pytest
 import torch

@@ -29,15 +29,15 @@ def methods(every):
     return {m: every[m] for m in ("paper", "map", "window")}
 
 
-def flat(seat):
+def flat(stage):
     """A partial of a partial as one."""
-    while isinstance(seat, partial) and isinstance(seat.func, partial):
-        seat = partial(seat.func.func, **seat.func.keywords | seat.keywords)
-    return seat
+    while isinstance(stage, partial) and isinstance(stage.func, partial):
+        stage = partial(stage.func.func, **stage.func.keywords | stage.keywords)
+    return stage
 
 
 def differences(a, b, path=""):
-    """Dotted names of what two methods, or two seats, do differently."""
+    """Dotted names of what two methods, or two stages, do differently."""
     if isinstance(a, Method):
         return [d for f in fields(a) for d in differences(getattr(a, f.name), getattr(b, f.name), f.name)]
     a, b = flat(a), flat(b)
@@ -71,8 +71,8 @@ def test_gates_and_sigma_are_told_apart(methods):
     variants = part_ablation.build_map_ablations(*methods.values())
     gates, sigma = (set(differences(methods["map"], variants[f"- {part}"])) for part in ("gates", "sigma"))
     assert not gates & sigma and {d.rpartition(".")[2] for d in gates} <= set(part_ablation.PAPER_GATE_OPTIONS)
-    seats = [methods[m].triangulate for m in ("map", "paper")]
-    assert gates | sigma == {f"triangulate.{d}" for d in differences(*seats)}
+    stages = [methods[m].triangulate for m in ("map", "paper")]
+    assert gates | sigma == {f"triangulate.{d}" for d in differences(*stages)}
     assert flat(variants["- gates"].triangulate).keywords["min_parallax_deg"] == 0.3
     assert flat(variants["- sigma"].triangulate).keywords["sigma_scale"] == 1.0
     paper = methods["paper"].triangulate.keywords
@@ -101,9 +101,9 @@ def test_a_part_of_auto_is_put_in_alone_and_left_out(every, part):
     alone, left_out = variants[f"+ {part}"], variants[f"- {part}"]
     assert set(differences(window, alone)) == PARTS_OF_AUTO[part]
     assert set(differences(auto, left_out)) == PARTS_OF_AUTO[part] - {"chain"}, "where it is chosen nothing is chained"
-    seats = {name.partition(".")[0] for name in PARTS_OF_AUTO[part]} - {"track"}
-    assert not [d for d in differences(auto, alone) if d in seats], "what is put in is the whole's"
-    assert not [d for d in differences(window, left_out) if d in seats - {"chain"}], "what is left out is as before"
+    stages = {name.partition(".")[0] for name in PARTS_OF_AUTO[part]} - {"track"}
+    assert not [d for d in differences(auto, alone) if d in stages], "what is put in is the whole's"
+    assert not [d for d in differences(window, left_out) if d in stages - {"chain"}], "what is left out is as before"
 
 
 def test_every_difference_of_auto_belongs_to_one_part(every):

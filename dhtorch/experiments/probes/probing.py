@@ -284,7 +284,7 @@ def _choose_penalties(
 # ---------------------------------------------------------------------------------------------------------- results
 
 
-def record_probes(outcome: Outcome, judged: ProbeErrors, scene: str | None = None) -> None:
+def record_probes(outcome: Outcome, probe_errors: ProbeErrors, scene: str | None = None) -> None:
     """Append result rows: one per arm and group or, with ``scene``, one per arm over all groups.
 
     Fields: ``mse`` in units of the targets' variance; ``n_samples``; ``vs_context``, ``vs_dinov2`` and, if XFeat was
@@ -292,39 +292,39 @@ def record_probes(outcome: Outcome, judged: ProbeErrors, scene: str | None = Non
     move. A row of a whole scene also has 95 % intervals over its groups, ``vs_dinov2_low`` and ``vs_dinov2_high``, and
     those of XFeat.
     """
-    for arm in judged.arms:
+    for arm in probe_errors.arms:
         common: Row = {"pair": None, "method": arm, "truth": PROBE_TRUTH, "role": None}
         if scene is not None:
-            numbers = {cohort: _overall_numbers(judged, arm, cohort) for cohort in (ALL_COHORT, MOVING_COHORT)}
+            numbers = {cohort: _overall_numbers(probe_errors, arm, cohort) for cohort in (ALL_COHORT, MOVING_COHORT)}
             outcome.rows.append(
                 {"scene": scene, **common, **numbers[ALL_COHORT], MOVING_COHORT: numbers[MOVING_COHORT]}
             )
             continue
-        for k, group in enumerate(judged.groups):
-            numbers = {cohort: _group_numbers(judged, arm, cohort, k) for cohort in (ALL_COHORT, MOVING_COHORT)}
+        for k, group in enumerate(probe_errors.groups):
+            numbers = {cohort: _group_numbers(probe_errors, arm, cohort, k) for cohort in (ALL_COHORT, MOVING_COHORT)}
             outcome.rows.append(
                 {"scene": group, **common, **numbers[ALL_COHORT], MOVING_COHORT: numbers[MOVING_COHORT]}
             )
 
 
-def summarise_probes(judged: ProbeErrors) -> dict[str, Any]:
+def summarise_probes(probe_errors: ProbeErrors) -> dict[str, Any]:
     """Summary entries ``<arm>.<metric>`` and ``<arm>.moving.<metric>`` over all groups, with bootstrap intervals.
 
     Groups are resampled. Metrics: ``mse``; ``vs_context`` and ``vs_dinov2`` with paired 95 % intervals;
     ``vs_dinov2_90``, the 90 % interval of the equivalence test.
     """
     summary: dict[str, Any] = {}
-    for arm in judged.arms:
+    for arm in probe_errors.arms:
         for cohort, prefix in ((ALL_COHORT, f"{arm}."), (MOVING_COHORT, f"{arm}.{MOVING_COHORT}.")):
-            equivalence = judged.ratio(arm, REFERENCE_BLOCK, cohort, level=probe.EQUIVALENCE_LEVEL)
+            equivalence = probe_errors.ratio(arm, REFERENCE_BLOCK, cohort, level=probe.EQUIVALENCE_LEVEL)
             intervals = {
-                "mse": judged.mean(arm, cohort),
-                "vs_context": judged.ratio(arm, CONTEXT_BLOCK, cohort),
-                "vs_dinov2": judged.ratio(arm, REFERENCE_BLOCK, cohort),
+                "mse": probe_errors.mean(arm, cohort),
+                "vs_context": probe_errors.ratio(arm, CONTEXT_BLOCK, cohort),
+                "vs_dinov2": probe_errors.ratio(arm, REFERENCE_BLOCK, cohort),
                 "vs_dinov2_90": equivalence,
             }
-            if (XFEAT_BLOCK, cohort) in judged.squares:
-                intervals["vs_xfeat"] = judged.ratio(arm, XFEAT_BLOCK, cohort)
+            if (XFEAT_BLOCK, cohort) in probe_errors.squares:
+                intervals["vs_xfeat"] = probe_errors.ratio(arm, XFEAT_BLOCK, cohort)
             summary |= {prefix + name: interval.entry() for name, interval in intervals.items()}
     return summary
 

@@ -143,11 +143,11 @@ def run(
         if not shards.n:
             raise ValueError(f"rh20t_probe: found no sample, expected scenes longer than {history + horizon} s")
         arms = {k: blocks for k, blocks in PROBE_ARMS.items() if set(blocks) <= set(shards.widths)}
-        judged = probing.evaluate_probes(shards, arms, n_folds=n_folds, penalties=penalties, seed=settings.seed)
+        probe_errors = probing.evaluate_probes(shards, arms, n_folds=n_folds, penalties=penalties, seed=settings.seed)
         outcome.n_pairs = shards.n
-    probing.record_probes(outcome, judged)
-    outcome.summary = probing.summarise_probes(judged)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(judged, real, margin))
+    probing.record_probes(outcome, probe_errors)
+    outcome.summary = probing.summarise_probes(probe_errors)
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(probe_errors, real, margin))
 
 
 def select_robot_samples(
@@ -198,22 +198,23 @@ def select_robot_samples(
     return index.tolist(), before[index].tolist(), context.round(decimals=_CONTEXT_DECIMALS), target
 
 
-def verdict(judged: ProbeErrors, real: bool, margin: float) -> tuple[bool | None, str]:
+def verdict(probe_errors: ProbeErrors, real: bool, margin: float) -> tuple[bool | None, str]:
     """Verdict and text: equivalence over all samples and over those that move; None with random DINOv2 weights."""
-    n = len(judged.groups)
-    error = judged.mean(_OURS, ALL_COHORT).value or 0.0
-    context_ratio = judged.ratio(_OURS, CONTEXT_BLOCK, ALL_COHORT)
+    n = len(probe_errors.groups)
+    error = probe_errors.mean(_OURS, ALL_COHORT).value or 0.0
+    context_ratio = probe_errors.ratio(_OURS, CONTEXT_BLOCK, ALL_COHORT)
     ratio = _format_interval(context_ratio)
     text = f"error {error:.3f} of the targets' variance, {ratio} times that of the context alone ({n} tasks)"
-    if (XFEAT_BLOCK, ALL_COHORT) in judged.squares:
-        xfeat_ratios = {cohort: judged.ratio(_OURS, XFEAT_BLOCK, cohort) for cohort in (ALL_COHORT, MOVING_COHORT)}
+    if (XFEAT_BLOCK, ALL_COHORT) in probe_errors.squares:
+        cohorts = (ALL_COHORT, MOVING_COHORT)
+        xfeat_ratios = {cohort: probe_errors.ratio(_OURS, XFEAT_BLOCK, cohort) for cohort in cohorts}
         text += probing.compare_with_xfeat(
             {cohort: (interval.value, interval.low, interval.high) for cohort, interval in xfeat_ratios.items()}
         )
-    if (REFERENCE_BLOCK, ALL_COHORT) not in judged.squares:
+    if (REFERENCE_BLOCK, ALL_COHORT) not in probe_errors.squares:
         return None, f"DINOv2 was left out; with depth features: {text}"
     reference_ratios = {
-        cohort: judged.ratio(_OURS, REFERENCE_BLOCK, cohort, level=probe.EQUIVALENCE_LEVEL)
+        cohort: probe_errors.ratio(_OURS, REFERENCE_BLOCK, cohort, level=probe.EQUIVALENCE_LEVEL)
         for cohort in (ALL_COHORT, MOVING_COHORT)
     }
     ratios = ", ".join(f"{cohort} {_format_interval(interval)}" for cohort, interval in reference_ratios.items())

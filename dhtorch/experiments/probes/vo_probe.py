@@ -4,8 +4,8 @@ Samples are pairs of frames, a third of the scene's usable gap apart; the target
 rotation vector and translation from the recording's own trajectory. The input of the probe is the features of the
 first frame and their change to the second; depth tokens of either frame have the other one as second view. A sequence
 is cut into consecutive blocks that share no frame, and whole blocks are held out: every block is evaluated once. There
-is no context, so the arm ``context`` predicts the mean motion. ``two_view_pose`` is no probe but the method's own relative
-pose, no motion if it has none: the estimate of the geometry itself.
+is no context, so the arm ``context`` predicts the mean motion. ``two_view_pose`` is no probe but the method's own
+relative pose, no motion if it has none: the estimate of the geometry itself.
 
 Expectation (written before the run): yes; on every scene the error with depth features is smaller than DINOv2's (the
 paper: 1.32 against 1.63, ratio 0.81, one scene, geometry-favoured as it says itself).
@@ -124,8 +124,8 @@ def run(
                     shards.add(_make_shard(f"{scene.name} {k}", features, scene.recording, block, moving))
             arms = {k: names for k, names in PROBE_ARMS.items() if set(names) <= set(shards.widths)}
             options = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
-            judged = probing.evaluate_probes(shards, arms, told={_POSE_ARM: _OWN_POSE_BLOCK}, **options)
-        probing.record_probes(outcome, judged, room)
+            probe_errors = probing.evaluate_probes(shards, arms, told={_POSE_ARM: _OWN_POSE_BLOCK}, **options)
+        probing.record_probes(outcome, probe_errors, room)
         outcome.n_pairs += n_pairs
     outcome.summary = probing.summarise_over_scenes(outcome, arm_names)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, real))

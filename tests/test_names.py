@@ -1,0 +1,67 @@
+"""Names: a public top-level name has one meaning, and words of the former private language do not come back."""
+
+import ast
+import re
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+
+import dhtorch
+
+ROOT = Path(dhtorch.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+
+#: Names of an interface that several modules implement: readers, experiments, commands, types of rows, cameras and
+#: poses as matrices.
+INTERFACES = {
+    *("main", "run", "read", "recognise", "verdict", "QUESTION", "EXPECTATION", "VARIANTS", "Row", "Progress"),
+    *("from_matrix", "to_matrix"),
+}
+
+#: Words that name a concept otherwise now, as identifiers: word → the term.
+REPLACED = {
+    "anchor": "reference (view)",
+    "anchors": "references, reference_views",
+    "partner": "source_view",
+    "partners": "source_views",
+    "judge": "validate",
+    "judged": "validated",
+    "seat": "stage",
+    "worth": "gain",
+}
+
+
+def top_level_names(tree):
+    """Public names that a module defines itself; those that it imports are none."""
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield from (
+                x.id for t in targets for x in ast.walk(t) if isinstance(x, ast.Name) and isinstance(x.ctx, ast.Store)
+            )
+
+
+def test_no_public_name_has_two_meanings():
+    homes = defaultdict(set)
+    for path in FILES:
+        for name in top_level_names(ast.parse(path.read_text(encoding="utf-8"))):
+            if not name.startswith("_"):
+                homes[name].add(str(path.relative_to(ROOT)))
+    several = {name: sorted(at) for name, at in homes.items() if len(at) > 1 and name not in INTERFACES}
+    assert not several
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_no_identifier_is_a_replaced_word(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    names = {n.id for n in ast.walk(tree) if isinstance(n, ast.Name)} | {
+        n.arg for n in ast.walk(tree) if isinstance(n, ast.arg)
+    }
+    names |= {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    names |= {n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef | ast.ClassDef)}
+    names |= {n.arg for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg}
+    found = {name: REPLACED[part] for name in names for part in re.split(r"_+", name.lower()) if part in REPLACED}
+    assert not found, f"{path.relative_to(ROOT)}: {found}"
