@@ -1,6 +1,6 @@
 """The public surface: what users may rely on, held with signatures in ``api_surface.json``.
 
-    python tests/test_api_surface.py      write the file anew, after a change that is meant
+python tests/test_api_surface.py      write the file anew, after a change that is meant
 """
 
 import dataclasses
@@ -32,8 +32,12 @@ def signature(value):
     if inspect.ismodule(value):
         return {name: signature(getattr(value, name)) for name in public_names(value)}
     if inspect.isclass(value):
-        members = {n: m for n, m in vars(value).items() if not n.startswith("_") and (callable(m) or isinstance(m, property))}
-        shown = {n: "property" if isinstance(m, property) else parameters(getattr(value, n)) for n, m in members.items()}
+        members = {
+            n: m for n, m in vars(value).items() if not n.startswith("_") and (callable(m) or isinstance(m, property))
+        }
+        shown = {
+            n: "property" if isinstance(m, property) else parameters(getattr(value, n)) for n, m in members.items()
+        }
         fields = [f.name for f in dataclasses.fields(value)] if dataclasses.is_dataclass(value) else []
         return {"fields": fields, "members": shown} if fields else {"call": parameters(value), "members": shown}
     return parameters(value) if callable(value) else type(value).__name__
@@ -75,9 +79,13 @@ def test_the_public_surface_is_the_one_that_is_written_down(package):
     changes = [f"{name} is gone" for name in wanted.keys() - found.keys()]
     changes += [f"{name} is new" for name in found.keys() - wanted.keys()]
     changes += [
-        f"{name} was {wanted[name]}, is {found[name]}" for name in wanted.keys() & found.keys() if wanted[name] != found[name]
+        f"{name} was {wanted[name]}, is {found[name]}"
+        for name in wanted.keys() & found.keys()
+        if wanted[name] != found[name]
     ]
-    assert not changes, f"{package}: {sorted(changes)}; meant? python tests/test_api_surface.py, and say so in CHANGELOG.md"
+    assert not changes, (
+        f"{package}: {sorted(changes)}; meant? python tests/test_api_surface.py, and say so in CHANGELOG.md"
+    )
 
 
 @pytest.mark.parametrize("package", PACKAGES)

@@ -152,19 +152,19 @@ def test_the_settings_folder_travels_with_the_package():
     assert (CONF / "run.yaml").is_file() and Path(CONF).is_absolute()
 
 
-def effective(seat):
-    """(function, every option with its value) of a seat, partials inside it included."""
-    if isinstance(seat, Method):
-        held = {f.name: getattr(seat, f.name) for f in dataclasses.fields(seat)}
+def effective(stage):
+    """(function, every option with its value) of a stage, partials inside it included."""
+    if isinstance(stage, Method):
+        held = {f.name: getattr(stage, f.name) for f in dataclasses.fields(stage)}
         return Method, {k: effective(v) if callable(v) else v for k, v in held.items()}
-    fn, given = (seat.func, seat.keywords) if isinstance(seat, functools.partial) else (seat, {})
+    fn, given = (stage.func, stage.keywords) if isinstance(stage, functools.partial) else (stage, {})
     known = {k: p.default for k, p in options(fn).items() if p.default is not p.empty and k not in AT_RUN_TIME}
     known |= {k: v for k, v in given.items() if k not in AT_RUN_TIME}
     return fn, {k: effective(v) if callable(v) else v for k, v in known.items()}
 
 
 def agree(a, b, where):
-    """Two seats are the same function with the same options."""
+    """Two stages are the same function with the same options."""
     assert a[0] is b[0] and a[1].keys() == b[1].keys(), where
     for key, value in a[1].items():
         if isinstance(value, tuple) and callable(value[0]):

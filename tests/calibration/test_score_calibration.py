@@ -1,4 +1,4 @@
-"""What scores and sigmas turned out to be worth, learnt, kept as text, and used in the scoring seat."""
+"""What scores and sigmas turned out to be worth, learnt, kept as text, and used in the scoring stage."""
 
 import dataclasses
 import functools
@@ -322,11 +322,11 @@ def test_what_travels_with_the_package_is_valid(name):
     assert found.provenance["method"] and found.provenance["scenes"] and found.to_json()
 
 
-# ---------------------------------------------------------------------------------------------------- the seat
+# ---------------------------------------------------------------------------------------------------- the stage
 
 
 def answers(sigma, shared=0.0, depth=2.0, residual=0.0, gate=None, error=0.0, photometric=0.0):
-    """An estimate (1, N) and what else the seat takes."""
+    """An estimate (1, N) and what else the stage takes."""
     sigma = torch.as_tensor(sigma, dtype=torch.float64)[None]
     like = torch.ones_like(sigma)
     gate = torch.zeros_like(sigma).int() if gate is None else torch.tensor([gate], dtype=torch.int32)
@@ -407,9 +407,9 @@ def test_a_recalibrated_score_is_the_tables_probability():
 
 
 @pytest.mark.parametrize("kind", ["table", "sigmoid"])
-def test_a_recalibrated_seat_captures_maps_differentiates_and_keeps_to_itself(kind):
+def test_a_recalibrated_stage_captures_maps_differentiates_and_keeps_to_itself(kind):
     learnt = fitted()
-    seat = functools.partial(
+    stage = functools.partial(
         score.confidence_from_error, recalibration=learnt.probability if kind == "table" else learnt.sigmoid
     )
     _, *rest = answers([0.1] * 37)
@@ -418,7 +418,7 @@ def test_a_recalibrated_seat_captures_maps_differentiates_and_keeps_to_itself(ki
 
     def out(s, estimate=estimate):
         records = [r.map(lambda x: x[:1].expand(s.shape[0], *x.shape[1:])) for r in (estimate, *rest[:2])]
-        return seat(records[0].replace(sigma=s), *records[1:], rest[2]).score
+        return stage(records[0].replace(sigma=s), *records[1:], rest[2]).score
 
     together = out(sigma.float())
     for b in range(5):

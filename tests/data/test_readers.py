@@ -283,7 +283,8 @@ def test_damaged_pictures(named: Path) -> None:
     good_colour, good_depth = colour.read_bytes(), depth.read_bytes()
     colour.write_bytes(good_colour[: len(good_colour) // 2])
     fails(
-        r"frame-000001.color.png: data: found a truncated or damaged png file of \d+ bytes, expected a whole file", named
+        r"frame-000001.color.png: data: found a truncated or damaged png file of \d+ bytes, expected a whole file",
+        named,
     )
     colour.write_bytes(good_colour[:60] + bytes([good_colour[60] ^ 1]) + good_colour[61:])
     fails(r"color.png: data: found a truncated or damaged", named)

@@ -1,4 +1,4 @@
-"""The line of seats with seats that only look: what is handed to whom, who is silenced, and what the map is made of."""
+"""The line of stages with stages that only look: what is handed to whom, who is silenced, and what the map is made of."""
 
 import itertools
 import time
@@ -106,7 +106,7 @@ def test_the_map_without_an_estimate_is_that_of_a_silent_one():
 
 
 class Seats:
-    """Seven seats that answer made-up things and remember what they were given."""
+    """Seven stages that answer made-up things and remember what they were given."""
 
     def __init__(self, n=12, batch=2, gate=None):
         self.seen, self.n = {}, n
@@ -120,7 +120,7 @@ class Seats:
         self.seats = {name: self.seat(name, answer) for name, answer in answers.items()}
         self.seats["score"] = self.seat("score", None)
 
-    def seat(self, name, answer):
+    def stage(self, name, answer):
         def look(*args, **options):
             self.seen[name] = args, options
             return args[0] if answer is None else answer
@@ -128,80 +128,80 @@ class Seats:
         return look
 
 
-def test_every_seat_gets_what_those_before_it_found():
-    seats, trace = Seats(), {}
+def test_every_stage_gets_what_those_before_it_found():
+    stages, trace = Seats(), {}
     lens = torch.tensor([[0.1, -0.05, 0.001, 0.002]])
     frame_0, frame_1 = frame(lens=lens), frame(seed=5, lens=-lens)
     frame_1 = frame_1.replace(camera=frame_1.camera.replace(f=1.1 * frame_1.camera.f))
-    estimate = extend(frame_0, frame_1, **seats.seats, n=12, hypotheses=7, seed=3, min_trackability=0.3, trace=trace)
-    (hw, n), options = seats.seen["sample"]
+    estimate = extend(frame_0, frame_1, **stages.seats, n=12, hypotheses=7, seed=3, min_trackability=0.3, trace=trace)
+    (hw, n), options = stages.seen["sample"]
     assert (hw, n) == (HW, 12) and options == {"device": torch.device("cpu"), "dtype": torch.float64}
-    assert seats.seen["backproject"][0][0].depth is frame_0.depth and seats.seen["backproject"][0][1] is seats.uv
-    assert seats.seen["classify"][0][0].depth is frame_0.depth and seats.seen["classify"][0][1] is seats.samples
-    images = seats.seen["track"][0]
-    assert images[0] is frame_0.image and images[1] is frame_1.image and torch.equal(images[2], seats.samples.uv)
-    classified, usable, camera_0, camera_1, draws = seats.seen["pose"][0]
+    assert stages.seen["backproject"][0][0].depth is frame_0.depth and stages.seen["backproject"][0][1] is stages.uv
+    assert stages.seen["classify"][0][0].depth is frame_0.depth and stages.seen["classify"][0][1] is stages.samples
+    images = stages.seen["track"][0]
+    assert images[0] is frame_0.image and images[1] is frame_1.image and torch.equal(images[2], stages.samples.uv)
+    classified, usable, camera_0, camera_1, draws = stages.seen["pose"][0]
     assert (classified.flag == 4).all(), "what classify made of the samples"
-    expected = undistort_tracks(seats.tracks, frame_0.camera, frame_1.camera)
+    expected = undistort_tracks(stages.tracks, frame_0.camera, frame_1.camera)
     for name in ("uv_0", "uv_1", "cov"):
         assert torch.equal(getattr(usable, name), getattr(expected, name)), name
-    assert torch.equal(usable.valid, seats.tracks.valid & (seats.samples.trackability >= 0.3))
+    assert torch.equal(usable.valid, stages.tracks.valid & (stages.samples.trackability >= 0.3))
     for camera, of in ((camera_0, frame_0), (camera_1, frame_1)):
         assert torch.equal(camera.f, of.camera.f) and camera.distortion is None
     assert torch.equal(draws, uniform_draws(3, 2, 7)) and draws.dtype == torch.float64
-    args = seats.seen["triangulate"][0]
+    args = stages.seen["triangulate"][0]
     fit = args[2]
-    assert args[0] is classified and args[1] is usable and fit.T_1_from_0 is seats.fit.T_1_from_0
-    assert torch.equal(fit.code, seats.fit.code)
+    assert args[0] is classified and args[1] is usable and fit.T_1_from_0 is stages.fit.T_1_from_0
+    assert torch.equal(fit.code, stages.fit.code)
     assert args[3] is camera_0 and args[4] is camera_1
-    assert seats.seen["score"][0][1:] == (classified, usable, fit)
-    assert trace["tracks"] is seats.tracks and trace["tracks_ideal"] is usable and trace["fit"] is fit
+    assert stages.seen["score"][0][1:] == (classified, usable, fit)
+    assert trace["tracks"] is stages.tracks and trace["tracks_ideal"] is usable and trace["fit"] is fit
     assert trace["samples"] is classified and trace["estimate"] is estimate
 
 
-def test_a_given_pose_is_taken_and_seat_five_not_asked():
-    seats, other = Seats(), known_pose_fit(se3.exp(rand(2, 6, seed=90)), 12)
-    extend(frame(), frame(), **seats.seats, n=12, fit=other)
-    assert "pose" not in seats.seen and seats.seen["triangulate"][0][2] is other
+def test_a_given_pose_is_taken_and_stage_five_not_asked():
+    stages, other = Seats(), known_pose_fit(se3.exp(rand(2, 6, seed=90)), 12)
+    extend(frame(), frame(), **stages.seats, n=12, fit=other)
+    assert "pose" not in stages.seen and stages.seen["triangulate"][0][2] is other
 
 
 def test_the_draws_have_the_numbers_of_the_intrinsics_and_number_two_hundred():
-    seats = Seats()
-    extend(frame(dtype=torch.float32), frame(dtype=torch.float32), **seats.seats)
-    draws = seats.seen["pose"][0][4]
+    stages = Seats()
+    extend(frame(dtype=torch.float32), frame(dtype=torch.float32), **stages.seats)
+    draws = stages.seen["pose"][0][4]
     assert draws.dtype == torch.float32 and torch.equal(draws, uniform_draws(0, 2, 200).float())
-    assert seats.seen["sample"][0][1] == 2048
+    assert stages.seen["sample"][0][1] == 2048
 
 
 def test_pairs_are_tracked_eight_at_a_time():
-    seats, sizes = Seats(batch=11), []
+    stages, sizes = Seats(batch=11), []
 
     def track(image_0, image_1, uv, *, hint):
         sizes.append(len(image_0))
         assert len(image_0) == len(image_1) == len(uv)
         return tracks_of(uv)
 
-    extend(frame(11), frame(11), **seats.seats | {"track": track})
+    extend(frame(11), frame(11), **stages.seats | {"track": track})
     assert sizes == [8, 3]
 
 
 def test_a_lost_sample_without_texture_says_so():
     """NO_TEXTURE takes the place of NO_TRACK where a track was found and only the texture is too weak."""
     gate = torch.tensor([[Gate.NO_TRACK] * 4 + [Gate.NO_POSE, Gate.ANSWER, Gate.NO_TRACK]], dtype=torch.int32)
-    seats = Seats(n=7, batch=1, gate=gate)
+    stages = Seats(n=7, batch=1, gate=gate)
     valid = torch.tensor([[True, True, False, False, True, True, True]])
     texture = torch.tensor([[0.1, 0.3, 0.1, 0.3, 0.1, 0.1, 0.2]]).double()
-    seats.seats["track"] = seats.seat("track", seats.tracks.replace(valid=valid))
-    seats.seats["classify"] = seats.seat("classify", seats.samples.replace(trackability=texture))
-    found = extend(frame(1), frame(1), **seats.seats, min_trackability=0.2).gate[0]
+    stages.seats["track"] = stages.seat("track", stages.tracks.replace(valid=valid))
+    stages.seats["classify"] = stages.seat("classify", stages.samples.replace(trackability=texture))
+    found = extend(frame(1), frame(1), **stages.seats, min_trackability=0.2).gate[0]
     lost = Gate.NO_TRACK
     assert found.tolist() == [Gate.NO_TEXTURE, lost, lost, lost, Gate.NO_POSE, Gate.ANSWER, lost]
-    usable = seats.seen["pose"][0][1].valid[0]
+    usable = stages.seen["pose"][0][1].valid[0]
     assert usable.tolist() == [False, True, False, False, False, False, True], "texture at the limit is enough"
-    faint = seats.samples.replace(trackability=texture.clamp(max=1e-5) * torch.tensor([1, 0.99, 1, 1, 1, 1, 1.0]))
-    seats.seats["classify"] = seats.seat("classify", faint)
-    extend(frame(1), frame(1), **seats.seats)
-    assert seats.seen["pose"][0][1].valid[0].tolist() == [True, False, False, False, True, True, True], "1e-5"
+    faint = stages.samples.replace(trackability=texture.clamp(max=1e-5) * torch.tensor([1, 0.99, 1, 1, 1, 1, 1.0]))
+    stages.seats["classify"] = stages.seat("classify", faint)
+    extend(frame(1), frame(1), **stages.seats)
+    assert stages.seen["pose"][0][1].valid[0].tolist() == [True, False, False, False, True, True, True], "1e-5"
 
 
 def test_the_trace_says_how_many_milliseconds_each_stage_took(monkeypatch):
@@ -227,10 +227,10 @@ def test_intrinsics_of_half_precision_are_computed_with_as_single_ones():
     for dtype in (torch.float32, torch.float64):
         plain = frame(1, dtype=dtype)
         assert upcast_intrinsics(plain).camera is plain.camera and upcast_intrinsics(plain).depth_camera is None
-    seats = Seats(batch=1)
-    extend(half, half, **seats.seats)
-    assert seats.seen["sample"][1]["dtype"] == torch.float32
-    assert seats.seen["triangulate"][0][4].f.dtype == torch.float32
+    stages = Seats(batch=1)
+    extend(half, half, **stages.seats)
+    assert stages.seen["sample"][1]["dtype"] == torch.float32
+    assert stages.seen["triangulate"][0][4].f.dtype == torch.float32
 
 
 def test_views_of_another_shape_or_number_are_refused():
@@ -260,9 +260,9 @@ def test_the_draws_of_a_pair_hang_on_its_seed_alone():
 
 
 def test_the_seed_of_a_pair_reaches_the_pose():
-    seats = Seats()
-    extend(frame(), frame(), **seats.seats, hypotheses=5, seed=torch.tensor([7, 8]))
-    assert torch.equal(seats.seen["pose"][0][4], uniform_draws(torch.tensor([7, 8]), 2, 5))
+    stages = Seats()
+    extend(frame(), frame(), **stages.seats, hypotheses=5, seed=torch.tensor([7, 8]))
+    assert torch.equal(stages.seen["pose"][0][4], uniform_draws(torch.tensor([7, 8]), 2, 5))
 
 
 # ---------------------------------------------------------------------------------------------------- lenses
@@ -332,7 +332,7 @@ def test_a_pixel_outside_of_a_lens_model_or_no_number_is_no_longer_valid():
 
 
 def told(n=40, noise_px=0.4):
-    """Frames through a long lens, and a track and a pose seat that know everything: points 2 to 60 m away, with noise."""
+    """Frames through a long lens, and a track and a pose stage that know everything: points 2 to 60 m away, with noise."""
     frame_0, frame_1 = frame(1), frame(1, seed=7)
     rng = np.random.default_rng(0)
     uv = torch.tensor(rng.uniform([2, 2], [27, 17], (1, n, 2)))
@@ -374,7 +374,7 @@ WRITTEN_OUT = {
 }
 
 
-def test_every_option_of_the_method_reaches_its_seat():
+def test_every_option_of_the_method_reaches_its_stage():
     """The same as the line with all options written out; leaving any of the method's own out changes the answer."""
     frames, given, fit = told()
 
@@ -395,7 +395,7 @@ def test_every_option_of_the_method_reaches_its_seat():
         assert bool(METHODS["map"](*frames, **given).keep.any()) == (weak > 30)
 
 
-def test_the_method_has_the_seats_that_its_configuration_names():
+def test_the_method_has_the_stages_that_its_configuration_names():
     with initialize_config_dir(str(config_dir()), version_base="1.3"):
         configured = instantiate(compose("run", ["method=map"]).method, _convert_="all")
     method = METHODS["map"]

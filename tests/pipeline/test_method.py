@@ -66,9 +66,9 @@ def fuse(estimates):
     return inverse_variance(estimates)
 
 
-SEATS = {"sample": sample, "backproject": look, "classify": sort, "track": track, "pose": pose}
-SEATS |= {"triangulate": triangulate, "score": score, "fuse": fuse}
-PLAIN, USUAL = PAPER.replace(**SEATS, n=N), PAPER.replace(n=N)
+STAGES = {"sample": sample, "backproject": look, "classify": sort, "track": track, "pose": pose}
+STAGES |= {"triangulate": triangulate, "score": score, "fuse": fuse}
+PLAIN, USUAL = PAPER.replace(**STAGES, n=N), PAPER.replace(n=N)
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def alike(a, b):
     )
 
 
-def test_a_plain_function_in_every_seat_answers_as_the_stage_itself(room):
+def test_a_plain_function_in_every_stage_answers_as_the_stage_itself(room):
     assert alike(PLAIN(room[0], room[3]), USUAL(room[0], room[3]))
     others = pytree.stack([room[k] for k in (1, 2, 3)])
     assert alike(PLAIN(room[0], others, views=3), USUAL(room[0], others, views=3))
@@ -150,7 +150,7 @@ def test_a_method_is_a_frozen_record_that_travels():
     assert again.track.keywords == MAP.track.keywords and again.pose is MAP.pose
 
 
-def test_replace_changes_a_seat_or_its_options_and_nothing_else():
+def test_replace_changes_a_stage_or_its_options_and_nothing_else():
     changed = MAP.replace(n=64, track={"levels": 6}, score=len)
     assert (changed.n, changed.score) == (64, len) and changed.track.keywords == {"levels": 6}
     kept = [f.name for f in fields(Method) if f.name not in ("n", "track", "score")]
@@ -170,7 +170,7 @@ def test_options_are_those_of_what_sits_there_now():
     assert stage.func is track and PAPER.replace(score={"min_score": 0.5}).score.func is confidence
 
 
-def test_a_pose_from_elsewhere_takes_the_place_of_seat_5(room):
+def test_a_pose_from_elsewhere_takes_the_place_of_stage_5(room):
     trace = {}
     found = USUAL(room[0], room[3], trace=trace)
 

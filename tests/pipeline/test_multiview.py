@@ -259,7 +259,7 @@ def test_several_views_come_as_one_record_or_as_a_sequence(room):
 def test_gradients_reach_images_and_depth(room):
     reference, others = room
     image, depth = (x[:1].clone().requires_grad_() for x in (reference.image / 255, reference.depth))
-    seat = partial(SURE, max_chi2=1e9)
-    window = extend_window(reference[:1].replace(image=image, depth=depth), others[:, :1], fuse=seat, **PAIR)
+    stage = partial(SURE, max_chi2=1e9)
+    window = extend_window(reference[:1].replace(image=image, depth=depth), others[:, :1], fuse=stage, **PAIR)
     grads = torch.autograd.grad(window.depth[window.keep].sum(), (image, depth))
     assert all(g.isfinite().all() and g.abs().sum() > 0 for g in grads)

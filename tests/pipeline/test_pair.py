@@ -178,7 +178,7 @@ def test_a_pure_rotation_is_not_answered():
 # ---------------------------------------------------------------------------------------------------- pose, cameras
 
 
-def test_a_given_pose_replaces_seat_five(views):
+def test_a_given_pose_replaces_stage_five(views):
     (frame_0, frame_1), *_ = views[0]
     n = 512
     fit = device_pose_fit(frame_0, frame_1, n)
@@ -234,7 +234,7 @@ def test_scaling_the_near_depth_scales_the_answer(views):
     assert both.sum() > 450 and torch.allclose(ratio, torch.full_like(ratio, 1.1), rtol=1e-5)
 
 
-def test_opencv_fills_the_same_seats(views):
+def test_opencv_fills_the_same_stages(views):
     (frame_0, frame_1), *_ = views[0]
     ours, theirs = extend(frame_0, frame_1, n=1024), OPENCV(frame_0, frame_1, n=1024)
     both = ours.keep & theirs.keep

@@ -90,7 +90,7 @@ def test_what_chooses_for_itself_is_asked_as_it_is():
         assert not with_view_selection(method).chain, "views lie on both sides: none says where the next search begins"
 
 
-def test_a_seat_may_give_indices_alone(room):
+def test_a_stage_may_give_indices_alone(room):
     last = SMALL["map"].replace(
         select_views=lambda _anchor, others, views, *, fit: torch.full((views, 1), len(others.image) - 1)
     )

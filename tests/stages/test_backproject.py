@@ -1,4 +1,4 @@
-"""Seat 2 against a loop over samples that says the same in numpy: depth, points, flags, confidence, every option."""
+"""Stage 2 against a loop over samples that says the same in numpy: depth, points, flags, confidence, every option."""
 
 import math
 

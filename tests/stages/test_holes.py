@@ -1,4 +1,4 @@
-"""Seat 3: the order of its classes, its limits, texture by a plain formula and by OpenCV, what to try for each hole."""
+"""Stage 3: the order of its classes, its limits, texture by a plain formula and by OpenCV, what to try for each hole."""
 
 import cv2
 import numpy as np

@@ -268,7 +268,7 @@ class Seats:
         one = torch.ones(2, self.n)
         return Samples(self.uv, one, one, one[..., None].expand(2, self.n, 3), one, one.int(), one, one.int())
 
-    def seats(self):
+    def stages(self):
         """Seats and options of a method."""
 
         def track(image_0, image_1, uv, *, hint):
@@ -306,46 +306,46 @@ class Seats:
 
 
 def test_the_reference_is_sampled_once_and_every_view_is_a_pair_with_it():
-    seats, trace = Seats(), {}
-    found = extend_window(seats.reference, seats.others, **seats.seats(), seed=4, trace=trace)
-    names = [call[0] for call in seats.calls]
+    stages, trace = Seats(), {}
+    found = extend_window(stages.reference, stages.others, **stages.seats(), seed=4, trace=trace)
+    names = [call[0] for call in stages.calls]
     assert names == ["sample", "backproject", "classify", "score"]
-    assert seats.calls[0][1:] == (HW, 8, {"device": torch.device("cpu"), "dtype": torch.float32})
-    assert seats.calls[1][1].image is seats.reference.image and seats.calls[2][1].image is seats.reference.image
-    assert [k for k, *_ in seats.asked["track"]] == [0, 1, 2]
-    ((samples, tracks, draws),) = seats.asked["pose"]
+    assert stages.calls[0][1:] == (HW, 8, {"device": torch.device("cpu"), "dtype": torch.float32})
+    assert stages.calls[1][1].image is stages.reference.image and stages.calls[2][1].image is stages.reference.image
+    assert [k for k, *_ in stages.asked["track"]] == [0, 1, 2]
+    ((samples, tracks, draws),) = stages.asked["pose"]
     assert (samples.hole == 3).all(), "what classify made of the samples"
-    assert torch.equal(tracks.uv_1, torch.cat([seats.tracks(k, seats.uv).uv_1 for k in range(3)]))
+    assert torch.equal(tracks.uv_1, torch.cat([stages.tracks(k, stages.uv).uv_1 for k in range(3)]))
     assert torch.equal(draws, uniform_draws(4, 2, 5).float().repeat(3, 1, 1)), "the same draws for all views"
-    ((samples, fit),) = seats.asked["triangulate"]
-    assert torch.equal(fit.T_1_from_0.t, collate(seats.fits).T_1_from_0.t)
-    fused = inverse_variance(seats.answers)
-    _, estimate, samples, tracks, fit = seats.calls[3]
+    ((samples, fit),) = stages.asked["triangulate"]
+    assert torch.equal(fit.T_1_from_0.t, collate(stages.fits).T_1_from_0.t)
+    fused = inverse_variance(stages.answers)
+    _, estimate, samples, tracks, fit = stages.calls[3]
     for name in (*FIELDS, "gate"):
         assert torch.equal(getattr(estimate, name).nan_to_num(), getattr(fused, name).nan_to_num()), name
-    assert (samples.hole == 3).all() and torch.equal(fit.T_1_from_0.t, seats.fits[2].T_1_from_0.t)
-    assert torch.equal(tracks.uv_1, seats.tracks(2, seats.uv).uv_1)
+    assert (samples.hole == 3).all() and torch.equal(fit.T_1_from_0.t, stages.fits[2].T_1_from_0.t)
+    assert torch.equal(tracks.uv_1, stages.tracks(2, stages.uv).uv_1)
     assert torch.equal(found.score, 0.5 * fused.score)
     assert trace["estimate"] is found and trace["fit"] is fit and len(trace["views"]) == 3
-    for t, expected in zip(trace["views"], seats.fits, strict=True):
+    for t, expected in zip(trace["views"], stages.fits, strict=True):
         assert torch.equal(t["fit"].T_1_from_0.t, expected.T_1_from_0.t)
 
 
 def test_every_reference_has_its_own_draws_in_all_its_views():
-    seats = Seats()
-    extend_window(seats.reference, seats.others, **seats.seats(), seed=torch.tensor([4, 9]))
-    ((_, _, draws),) = seats.asked["pose"]
+    stages = Seats()
+    extend_window(stages.reference, stages.others, **stages.seats(), seed=torch.tensor([4, 9]))
+    ((_, _, draws),) = stages.asked["pose"]
     assert torch.equal(draws, uniform_draws(torch.tensor([4, 9] * 3), 6, 5).float())
     assert not torch.equal(draws[0], draws[1])
 
 
 def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pace():
-    seats = Seats(V=4)
-    extend_window(seats.reference, seats.others, **seats.seats())
-    starts = [hint.start for *_, hint in seats.asked["track"]]
+    stages = Seats(V=4)
+    extend_window(stages.reference, stages.others, **stages.seats())
+    starts = [hint.start for *_, hint in stages.asked["track"]]
     assert starts[0] is None
     for k in (1, 2, 3):
-        last = seats.tracks(k - 1, seats.uv)
+        last = stages.tracks(k - 1, stages.uv)
         for b, i in itertools.product(range(2), range(8)):
             ahead = last.uv_0[b, i] + (last.uv_1[b, i] - last.uv_0[b, i]) * (k + 1) / k
             expected = ahead if last.valid[b, i] else last.uv_0[b, i]
@@ -357,11 +357,11 @@ def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pa
 
 
 def test_the_pyramid_of_the_reference_is_built_once_for_all_views():
-    seats = Seats()
-    extend_window(seats.reference, seats.others, **seats.seats(), hint=TrackHint(levels=3))
-    first, *others = (hint for *_, hint in seats.asked["track"])
+    stages = Seats()
+    extend_window(stages.reference, stages.others, **stages.seats(), hint=TrackHint(levels=3))
+    first, *others = (hint for *_, hint in stages.asked["track"])
     assert all(hint.pyramid is first.pyramid and hint.levels == 3 for hint in others)
-    made, expected = first.pyramid(2, 7), build_pyramid(seats.reference.image, 2, 7)
+    made, expected = first.pyramid(2, 7), build_pyramid(stages.reference.image, 2, 7)
     assert first.pyramid(2, 7) is made and first.pyramid(1, 7) is not made
     leaves = [torch.utils._pytree.tree_leaves(x) for x in (made, expected)]
     assert len(leaves[0]) == len(leaves[1]) > 2
@@ -391,43 +391,43 @@ def test_a_chain_changes_the_start_and_not_what_is_searched_for(track):
 def test_of_more_views_the_key_views_are_estimated_again_with_their_own_poses():
     """They are chosen by few of the samples: each reference view has its own choice."""
     n = 512
-    seats = Seats(V=5, n=n)
-    fits = stack(seats.fits)
-    known = rank_views(seats.answers[:, :, ::2], 2).index
+    stages = Seats(V=5, n=n)
+    fits = stack(stages.fits)
+    known = rank_views(stages.answers[:, :, ::2], 2).index
     assert not torch.equal(known[:, 0], known[:, 1]), "the two reference views choose otherwise"
-    options = seats.seats() | {"track": lambda image_0, image_1, uv, hint: seats.tracks(0, uv)}
+    options = stages.seats() | {"track": lambda image_0, image_1, uv, hint: stages.tracks(0, uv)}
     asked = []
 
     def triangulate(samples, tracks, fit, camera_0, camera_1):
         asked.append((samples.uv, fit))
         probes = samples.uv.shape[1] == n // 2
-        return (seats.answers[:, :, ::2] if probes else seats.answers[:2]).map(lambda x: x.flatten(0, 1))
+        return (stages.answers[:, :, ::2] if probes else stages.answers[:2]).map(lambda x: x.flatten(0, 1))
 
     trace = {}
     options |= {"triangulate": triangulate, "views": 2, "fit": fits, "trace": trace}
-    extend_window(seats.reference, seats.others, **options)
+    extend_window(stages.reference, stages.others, **options)
     (probes, first), (uv, second) = asked
     assert probes.shape == (10, n // 2, 2) and uv.shape == (4, n, 2), "256 samples, every second"
-    assert torch.equal(probes[:2], seats.uv[:, ::2]) and len(trace["views"]) == 2
+    assert torch.equal(probes[:2], stages.uv[:, ::2]) and len(trace["views"]) == 2
     assert torch.equal(first.T_1_from_0.t, fits.T_1_from_0.t.flatten(0, 1))
     for k in range(2):
         for b in range(2):
             assert torch.equal(second.T_1_from_0.t[2 * k + b], fits[int(known[k, b])].T_1_from_0.t[b])
-    assert "pose" not in [c[0] for c in seats.calls] and not seats.asked["pose"]
+    assert "pose" not in [c[0] for c in stages.calls] and not stages.asked["pose"]
 
 
 def test_five_views_are_used_by_default_and_no_more_than_that_are_not_chosen_among():
     for V, options, asked in ((5, {}, 5), (6, {}, 11), (3, {"views": 3}, 3), (3, {"views": 2}, 5)):
-        seats = Seats(V=V)
+        stages = Seats(V=V)
         count = []
-        given = seats.seats() | {
+        given = stages.seats() | {
             "track": lambda image_0, image_1, uv, hint, count=count: count.append(1) or Seats().tracks(0, uv)
         }
-        given["pose"] = lambda samples, *_, seats=seats: collate(seats.fits[: len(samples.uv) // 2])
-        given["triangulate"] = lambda samples, *_, seats=seats: seats.answers.map(
+        given["pose"] = lambda samples, *_, stages=stages: collate(stages.fits[: len(samples.uv) // 2])
+        given["triangulate"] = lambda samples, *_, stages=stages: stages.answers.map(
             lambda x: x.flatten(0, 1)[: len(samples.uv), : samples.uv.shape[1]]
         )
-        extend_window(seats.reference, seats.others, **given, **options)
+        extend_window(stages.reference, stages.others, **given, **options)
         assert len(count) == asked, (V, options)
 
 
@@ -438,31 +438,31 @@ def test_the_trace_sums_the_milliseconds_over_the_views(monkeypatch):
     expected = {name: 1e3 * s for name, s in seconds.items()}
     times = itertools.accumulate(itertools.count(1))
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(times)))
-    seats, trace = Seats(), {}
-    extend_window(seats.reference, seats.others, **seats.seats(), trace=trace)
+    stages, trace = Seats(), {}
+    extend_window(stages.reference, stages.others, **stages.seats(), trace=trace)
     assert trace["ms"] == expected
 
 
 def test_what_a_window_asks_by_default():
     """A texture of 1e-5, 200 hypotheses, the draws of seed 0."""
-    seats = Seats()
-    given = {k: v for k, v in seats.seats().items() if k != "hypotheses"}
-    texture = torch.where(torch.arange(seats.n) % 2 == 0, 1.01e-5, 0.99e-5).expand(2, -1)
+    stages = Seats()
+    given = {k: v for k, v in stages.seats().items() if k != "hypotheses"}
+    texture = torch.where(torch.arange(stages.n) % 2 == 0, 1.01e-5, 0.99e-5).expand(2, -1)
     given["classify"] = lambda _, samples: samples.replace(trackability=texture)
-    extend_window(seats.reference, seats.others, **given)
-    ((_, tracks, draws),) = seats.asked["pose"]
+    extend_window(stages.reference, stages.others, **given)
+    ((_, tracks, draws),) = stages.asked["pose"]
     for k in range(3):
         of_view = slice(2 * k, 2 * k + 2)
-        assert torch.equal(tracks.valid[of_view], seats.tracks(k, seats.uv).valid & (texture > 1e-5))
+        assert torch.equal(tracks.valid[of_view], stages.tracks(k, stages.uv).valid & (texture > 1e-5))
         assert torch.equal(draws[of_view], uniform_draws(0, 2, 200).float())
 
 
 def test_the_texture_of_a_sample_is_measured_in_every_view():
-    seats = Seats()
-    gate = torch.full_like(seats.answers.gate, Gate.NO_TRACK)
-    seats.answers = seats.answers.replace(gate=gate)
+    stages = Seats()
+    gate = torch.full_like(stages.answers.gate, Gate.NO_TRACK)
+    stages.answers = stages.answers.replace(gate=gate)
     for limit, reason in ((1.0, Gate.NO_TRACK), (1.01, Gate.NO_TEXTURE)):
-        seats.asked["track"].clear()
-        found = extend_window(seats.reference, seats.others, **seats.seats(), min_trackability=limit)
-        last = seats.tracks(2, seats.uv).valid
+        stages.asked["track"].clear()
+        found = extend_window(stages.reference, stages.others, **stages.seats(), min_trackability=limit)
+        last = stages.tracks(2, stages.uv).valid
         assert (found.gate[last] == reason).all() and (found.gate[~last] == Gate.NO_TRACK).all()

@@ -1,4 +1,4 @@
-"""Seat 5: the metric pose from near points, against truth, OpenCV and PoseLib, and what it refuses."""
+"""Stage 5: the metric pose from near points, against truth, OpenCV and PoseLib, and what it refuses."""
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from dhtorch.stages.pose import MAX_SEARCH_POINTS, pnp_ransac
 
 
 def pairs(batch, n, *, noise=0.0, outliers=0.0, planar=False, seed=0, dtype=torch.float64):
-    """Near points seen by two different cameras; arguments of the seat, and the true pose."""
+    """Near points seen by two different cameras; arguments of the stage, and the true pose."""
     g = torch.Generator().manual_seed(seed)
 
     def rand(*shape):

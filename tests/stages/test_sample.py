@@ -1,4 +1,4 @@
-"""Seat 1 against its formulas, point by point in plain Python, and what it refuses."""
+"""Stage 1 against its formulas, point by point in plain Python, and what it refuses."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Seat 7 alone: both scores made by hand and the learned one against plain numpy, on made-up answers."""
+"""Stage 7 alone: both scores made by hand and the learned one against plain numpy, on made-up answers."""
 
 import json
 import math
@@ -141,20 +141,20 @@ def test_the_score_is_half_where_the_expected_error_is_the_half_error(options):
 
 
 def test_a_recalibration_changes_scores_of_answers_alone_and_comes_before_the_threshold():
-    seat = answers()
-    keep = seat[0].keep
-    plain = confidence_from_error(*seat)
-    found = confidence_from_error(*seat, recalibration=lambda s: 1 - s / 2)
+    stage = answers()
+    keep = stage[0].keep
+    plain = confidence_from_error(*stage)
+    found = confidence_from_error(*stage, recalibration=lambda s: 1 - s / 2)
     torch.testing.assert_close(found.score, torch.where(keep, 1 - plain.score / 2, 0.0))
     limit = float((1 - plain.score / 2)[keep].median())
-    strict = confidence_from_error(*seat, recalibration=lambda s: 1 - s / 2, min_score=limit)
+    strict = confidence_from_error(*stage, recalibration=lambda s: 1 - s / 2, min_score=limit)
     assert torch.equal(strict.gate == Gate.LOW_SCORE, keep & (found.score < limit))
 
 
 @pytest.mark.parametrize("seat", [confidence, confidence_from_error, "learned"])
-def test_below_the_threshold_and_not_at_it_an_answer_becomes_silent(seat):
+def test_below_the_threshold_and_not_at_it_an_answer_becomes_silent(stage):
     parts = answers()
-    ask = (lambda *p, min_score=0.0: LearnedScore(min_score=min_score)(*p)) if seat == "learned" else seat
+    ask = (lambda *p, min_score=0.0: LearnedScore(min_score=min_score)(*p)) if stage == "learned" else stage
     plain = ask(*parts)
     limit = sorted(plain.score[plain.keep].tolist())[7]
     strict = ask(*parts, min_score=limit)
@@ -261,8 +261,8 @@ def test_evidence_is_not_told_apart_beyond_its_limits():
         extreme = estimate.replace(sigma=4 * x, sigma_shared=2 * x, parallax_deg=x, residual_px=x)
         extreme = extreme.replace(depth=x if end else estimate.depth, sigma=(4 * x * x if end else 4 * x))
         extreme = extreme.replace(sigma_shared=2 * x * x if end else 2 * x)
-        seat = samples.replace(trackability=x), tracks.replace(error=x, photometric=x), fit
-        found, stated = score_features(extreme, *seat)
+        stage = samples.replace(trackability=x), tracks.replace(error=x, photometric=x), fit
+        found, stated = score_features(extreme, *stage)
         rows = found[stated].exp()
         for k, name in enumerate(SCORE_FEATURES):
             if name != "reach" or end:
@@ -285,8 +285,8 @@ def test_evidence_is_nothing_where_any_of_it_is_no_number():
         x = getattr(record, name).clone()
         x[0, 3] = torch.nan
         changed = {id(record): record.replace(**{name: x})}
-        seat = [changed.get(id(r), r) for r in (estimate, samples, tracks, fit)]
-        found, stated = score_features(*seat)
+        stage = [changed.get(id(r), r) for r in (estimate, samples, tracks, fit)]
+        found, stated = score_features(*stage)
         assert not stated[0, 3] and int(stated.sum()) == int(estimate.keep.sum()) - 1, name
         assert found.isfinite().all() and (found[0, 3] == 0).all()
 
@@ -314,19 +314,19 @@ def plain_forward(scorer, x):
 
 
 def test_the_learned_score_is_its_network_written_out():
-    seat, scorer = answers(), trained(half_error=0.07)
-    x, stated = score_features(*seat)
+    stage, scorer = answers(), trained(half_error=0.07)
+    x, stated = score_features(*stage)
     expected = plain_forward(scorer, x.numpy())
     np.testing.assert_allclose(scorer.log_error(x).detach().numpy(), expected, rtol=1e-9)
-    same(scorer(*seat).score.detach(), 0.07 / (0.07 + np.exp(expected)), stated.numpy())
+    same(scorer(*stage).score.detach(), 0.07 / (0.07 + np.exp(expected)), stated.numpy())
     single = scorer.log_error(x.float())
     assert single.dtype == torch.float32, "in the numbers of the evidence"
     np.testing.assert_allclose(single.detach().numpy(), expected, rtol=1e-4, atol=1e-4)
 
 
 def test_untrained_it_is_the_score_made_by_hand():
-    seat = answers()
-    scored, by_hand = LearnedScore()(*seat), confidence_from_error(*seat)
+    stage = answers()
+    scored, by_hand = LearnedScore()(*stage), confidence_from_error(*stage)
     torch.testing.assert_close(scored.score.detach(), by_hand.score, rtol=1e-9, atol=0)
     assert torch.equal(scored.gate, by_hand.gate) and torch.equal(scored.depth.isnan(), by_hand.depth.isnan())
 
@@ -347,18 +347,18 @@ def test_the_correction_is_bounded_and_gradients_reach_every_weight():
     more = (wild.log_error(x) - x[..., 0]).detach()[stated].abs()
     assert more.max() <= MAX_LOG_FACTOR == 4 and more.min() > 3.9
     scorer = trained()
-    seat = answers()
-    depth = seat[0].depth.clone().requires_grad_()
-    scorer(seat[0].replace(depth=depth), *seat[1:]).score.sum().backward()
+    stage = answers()
+    depth = stage[0].depth.clone().requires_grad_()
+    scorer(stage[0].replace(depth=depth), *stage[1:]).score.sum().backward()
     for name, weight in scorer.named_parameters():
         assert weight.grad.isfinite().all() and weight.grad.abs().max() > 0, name
-    assert depth.grad.isfinite().all() and depth.grad[seat[0].keep].abs().min() > 0
+    assert depth.grad.isfinite().all() and depth.grad[stage[0].keep].abs().min() > 0
 
 
 def test_a_row_does_not_depend_on_its_mates():
     scorer = trained().float()
-    seat = [r.to(torch.float32) for r in answers()]
-    turned = [[r.map(lambda x, k=k: x.roll(k, 1) if x.dim() > 1 else x) for r in seat] for k in (0, 3, 7)]
+    stage = [r.to(torch.float32) for r in answers()]
+    turned = [[r.map(lambda x, k=k: x.roll(k, 1) if x.dim() > 1 else x) for r in stage] for k in (0, 3, 7)]
     together = scorer(*(collate(group) for group in zip(*turned, strict=True)))
     for b, one in enumerate(turned):
         assert torch.equal(together.score[B * b : B * b + B], scorer(*one).score)

@@ -1,4 +1,4 @@
-"""Seat 6 on a scene: closed-form two-view depth, its uncertainty, the gates; option by option: test_two_view.py."""
+"""Stage 6 on a scene: closed-form two-view depth, its uncertainty, the gates; option by option: test_two_view.py."""
 
 import math
 
@@ -44,8 +44,8 @@ def scene(n=200, batch=2, dtype=torch.float64, seed=0, noise_px=0.0, t=(0.2, -0.
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_exact_input_gives_exact_depth(dtype):
-    *seat, depth = scene(dtype=dtype)
-    estimate = two_view(*seat)
+    *stage, depth = scene(dtype=dtype)
+    estimate = two_view(*stage)
     assert (estimate.gate == Gate.ANSWER).all()
     assert torch.allclose(estimate.depth, depth, rtol=1e-9 if dtype == torch.float64 else 2e-3)
     assert estimate.residual_px.max() < (1e-9 if dtype == torch.float64 else 1e-2)

@@ -1,4 +1,4 @@
-"""Seat 6 alone, on made-up geometry: every gate at its limit, every option, and sigma recomputed term by term."""
+"""Stage 6 alone, on made-up geometry: every gate at its limit, every option, and sigma recomputed term by term."""
 
 import math
 
@@ -33,7 +33,7 @@ CAMERA_0, CAMERA_1 = camera((500.0, 540.0), (320.0, 240.0)), camera((420.0, 390.
 MOTION = torch.tensor([[0.06, -0.09, 0.04, 0.25, -0.08, 0.05]]).double().repeat(B, 1)
 
 
-def seat(seed=0, noise_px=0.6):
+def stage(seed=0, noise_px=0.6):
     """(samples, tracks, fit) of points with everything that an option may read, and their depth; pairs differ."""
     uv_0 = rand(B, N, 2, seed=seed) * torch.tensor([600.0, 440.0]) + 20
     depth = 2 + 3 * rand(B, N, seed=seed + 1)
@@ -150,7 +150,7 @@ def plain_sigmas(
     ],
 )
 def test_sigma_is_the_sum_of_its_terms(options):
-    samples, tracks, fit, _ = seat()
+    samples, tracks, fit, _ = stage()
     estimate = ask(samples, tracks, fit, **options)
     whole, shared = plain_sigmas(samples, tracks, fit, **options)
     assert estimate.keep.all()
@@ -160,7 +160,7 @@ def test_sigma_is_the_sum_of_its_terms(options):
 
 def test_the_noise_of_the_sensor_is_that_of_the_returns_that_hold_the_pose():
     """An even number has the lower of the middle two; one without a return and a pair without inliers add nothing."""
-    samples, tracks, fit, _ = seat()
+    samples, tracks, fit, _ = stage()
     plain = ask(samples, tracks, fit)
     inlier = torch.zeros(B, N, dtype=torch.bool)
     inlier[0, :4], inlier[1, :3] = True, True
@@ -180,7 +180,7 @@ def test_the_noise_of_the_sensor_is_that_of_the_returns_that_hold_the_pose():
 
 def test_a_rolling_shutter_counts_with_all_correlations_of_rotation_translation_and_turn():
     """Against the gradient of depth by autograd, for exact points and a shutter whose turn is found to be zero."""
-    samples, tracks, fit, depth = seat(noise_px=0.0)
+    samples, tracks, fit, depth = stage(noise_px=0.0)
     cov = 1e-5 * spd(B, 9, seed=20)
     none = torch.zeros(B, 3, dtype=torch.float64)
     rolling = fit.replace(shutter=Shutter(none, cov))
@@ -207,7 +207,7 @@ def test_a_rolling_shutter_counts_with_all_correlations_of_rotation_translation_
 
 def test_a_rolling_shutter_is_undone_before_the_rays_meet():
     """Each row of view 1 is turned by y · turn more; the pair whose pose is not ok is not touched by its turn."""
-    samples, tracks, fit, depth = seat(noise_px=0.0)
+    samples, tracks, fit, depth = stage(noise_px=0.0)
     turn = torch.tensor([[0.016, -0.008, 0.012], [-0.012, 0.004, 0.008], [torch.nan] * 3]).double()
     code = torch.tensor([PoseCode.OK, PoseCode.OK, PoseCode.TOO_FEW], dtype=torch.int32)
     y = (tracks.uv_0[..., 1] - CAMERA_0.c[:, 1:]) / CAMERA_0.f[:, 1:]
@@ -244,7 +244,7 @@ def told(**values):
 
 def flat(n, batch=1, cov=1.0):
     """(samples, tracks, fit) of n points that pass every gate, with variance 0.01 m² of cov 1."""
-    samples, tracks, fit, _ = seat()
+    samples, tracks, fit, _ = stage()
     grow = lambda r: r.map(lambda x: x[:1, :1].expand(batch, n, *x.shape[2:]).clone())  # noqa: E731
     samples, tracks = grow(samples), grow(tracks)
     tracks = tracks.replace(cov=cov * torch.eye(2).double().expand(batch, n, 2, 2), photometric=0 * tracks.error)
@@ -389,7 +389,7 @@ def test_a_place_that_is_no_number_is_no_track_in_whatever_coordinate():
 
 
 def test_what_is_silent_by_a_gate_still_says_how_it_was_seen():
-    samples, tracks, fit, _ = seat()
+    samples, tracks, fit, _ = stage()
     code = torch.tensor([PoseCode.OK, PoseCode.DEGENERATE, PoseCode.KEPT_PNP], dtype=torch.int32)
     nan = fit.T_1_from_0.map(
         lambda x: torch.where((code == PoseCode.DEGENERATE).view(-1, *[1] * (x.dim() - 1)), torch.nan, x)
@@ -408,7 +408,7 @@ def test_what_is_silent_by_a_gate_still_says_how_it_was_seen():
 
 
 def test_gradients_of_a_sigma_of_zero_are_finite():
-    samples, tracks, fit, _ = seat()
+    samples, tracks, fit, _ = stage()
     cov = (0 * tracks.cov).requires_grad_()
     estimate = ask(samples, tracks.replace(cov=cov), fit.replace(cov=0 * fit.cov))
     assert (estimate.sigma == 0).all() and (estimate.sigma_shared == 0).all()
@@ -417,7 +417,7 @@ def test_gradients_of_a_sigma_of_zero_are_finite():
 
 
 def test_points_without_a_track_do_not_set_the_scale_of_the_noise():
-    samples, tracks, fit, _ = seat()
+    samples, tracks, fit, _ = stage()
     valid = torch.arange(N) < N - 4
     cov = torch.where(valid[:, None, None], tracks.cov, 1e6 * tracks.cov)
     some = ask(samples, tracks.replace(cov=cov, valid=valid.expand(B, N)), fit, fitted_noise=True)
