@@ -273,9 +273,7 @@ def loader_times() -> str:
         return " and ".join(f"{a['ours_ms']:.2g} ms with {x} ({b['ours_ms']:.2g} by batch)" for a, b, x in times)
 
     plain, _ = taken("single", "eager")
-    after = f"; after `python -m dhtorch.ops`, which compiles inner loops, {said('native')}" * bool(
-        said("compiled")
-    )
+    after = f"; after `python -m dhtorch.ops`, which compiles inner loops, {said('native')}" * bool(said("compiled"))
     return (
         f"A sample of 640×480 takes {said('eager')}{after}; {plain['peer_ms']:.2g} ms of it is decoding\n"
         f"(`python benchmarks/loader.py`; one thread, {plain['processor']})."
