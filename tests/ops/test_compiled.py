@@ -784,7 +784,7 @@ def every_track(turning):
     noise = NOISE.repeat(1, 16)
     return (
         problem.to(torch.float32),
-        at._replace(T=at.T.to(torch.float32), turn=at.shutter_rate.float() if turning else None),
+        at._replace(T=at.T.to(torch.float32), shutter_rate=at.shutter_rate.float() if turning else None),
         noise.float(),
     )
 
@@ -810,7 +810,9 @@ def test_equations_of_tracks_agree_up_to_rounding(loaded, monkeypatch, turning):
     wide = [x.to(torch.float64) for x in told]
     ask(
         told=wide,
-        at=at._replace(T=at.T.to(torch.float64), turn=None if at.shutter_rate is None else at.shutter_rate.double()),
+        at=at._replace(
+            T=at.T.to(torch.float64), shutter_rate=None if at.shutter_rate is None else at.shutter_rate.double()
+        ),
     )
     leaf = at.T.t.clone().requires_grad_()
     assert ask(at=at._replace(T=at.T.replace(t=leaf)))[0].requires_grad
