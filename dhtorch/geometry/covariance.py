@@ -1,4 +1,4 @@
-"""From normal equations to what they say about the estimate.
+"""Covariances: normal equations → covariance of an estimate, its Mahalanobis length, shape of tracks' noise.
 
 Alphabet: ``H`` = Σ w Jᵀ J in px² per tangent unit², ``xi`` = (rotation rad, translation m), left perturbation.
 """
@@ -50,10 +50,10 @@ def noise_shape(
 ) -> Tensor:
     """Shape of the noise of tracks without its scale: covariances over the median of their mean variance (B, N, 2, 2).
 
-    A tracker's covariance says along which direction a patch is held and where better than elsewhere; how large its
-    errors really are is another question (a patch that sees two depths, a lens that is not quite the model's), asked
-    of residuals. ``isotropic`` of the shape is replaced by the unit matrix, so that no track and no direction counts as
-    free of such errors.
+    A tracker's covariance gives the direction and the relative size of a patch's errors; their absolute size has other
+    causes as well (a patch with two depths, a lens that deviates from its model) and is estimated from residuals. The
+    fraction ``isotropic`` of the shape is replaced by the unit matrix, so that no track and no direction counts as free
+    of such errors.
 
     Returns:
         The unit matrix where a track is not used or its covariance is not positive and finite.
@@ -62,12 +62,12 @@ def noise_shape(
     """
     check("noise_shape", cov=(cov, "B N 2 2"), used=(used, "B N"))
     xx, xy, yy = upper_triangle(cov)
-    good = used & (xx > 0) & (yy > 0) & (xx * yy > xy * xy) & (xx + yy < torch.inf)
-    size = torch.where(good, 0.5 * (xx + yy), torch.ones_like(xx))
-    scale = masked_median(size, good)[..., None, None]
+    valid = used & (xx > 0) & (yy > 0) & (xx * yy > xy * xy) & (xx + yy < torch.inf)
+    size = torch.where(valid, 0.5 * (xx + yy), torch.ones_like(xx))
+    scale = masked_median(size, valid)[..., None, None]
     eye = torch.eye(2, dtype=cov.dtype, device=cov.device)
     shape = (1 - isotropic) * cov / scale + isotropic * eye
-    return torch.where(good[..., None, None], shape, eye)
+    return torch.where(valid[..., None, None], shape, eye)
 
 
 def masked_median(

@@ -1,4 +1,4 @@
-"""Perspective from three points: every camera pose that sees three known points along three known rays.
+"""Perspective from three points: three rays and three points → up to four camera poses.
 
 Alphabet: point i of a triple has world coordinates ``X_i``, unit ray ``j_i`` and range ``d_i``; ``Y_i = d_i j_i``
 is the point in the camera. Pair k joins point k and the next one in the circle 0 → 1 → 2 → 0: ``m_k`` is the cosine
@@ -16,10 +16,12 @@ from torch.linalg import cross
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.linalg import cofactor_planes
 
-#: Triples flatter than this (height over longest side) count as collinear.
+#: Limits the flatness of a triple: height over longest side below which it is collinear, without unit.
+#: Source: origin not recorded.
 MIN_HEIGHT_RATIO = 1e-3
 
-#: Cosine of the smallest angle between two rays, a microradian.
+#: Limits the cosine of the angle between two rays, which is at least about a microradian.
+#: Source: origin not recorded.
 MAX_RAY_COSINE = 1 - 1e-12
 
 
@@ -27,13 +29,13 @@ def p3p(
     rays: Tensor,  # (*, 3, 3) point, coordinate: viewing rays of any length
     xyz: Tensor,  # (*, 3, 3) point, coordinate: the points, m
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """All poses under which three points lie on three rays.
+    """All poses under which three points lie on three rays: R (*, 4, 3, 3), t (*, 4, 3) and valid (*, 4).
 
     The law of cosines gives one quadric cone in the ranges (d_0, d_1, d_2) per pair of points; eliminating the scale
     leaves two cones. Some member of their pencil splits into two planes, found from one real root of a cubic; each
     plane meets another cone in two lines, hence four solutions, all from homogeneous quadratics that stay regular for
-    symmetric triangles. A Newton step on the law of cosines restores digits lost on the way. Planar scenes are
-    nothing special to three points.
+    symmetric triangles. A Newton step on the law of cosines restores lost digits. Planar scenes are no special
+    case for three points.
 
     Args:
         rays: (*, 3, 3) viewing rays in the camera, of any length; the second last axis counts the points.
@@ -56,9 +58,9 @@ def p3p(
         >>> import torch
         >>> from dhtorch.geometry.p3p import p3p
         >>> xyz = torch.tensor([[[0.0, 0.0, 2.0], [1.0, 0.2, 3.0], [-0.3, 1.0, 2.5]]])  # (B, point, coordinate) m
-        >>> seen = xyz + torch.tensor([0.1, 0.0, -0.2])  # from a camera that stands elsewhere
+        >>> seen = xyz + torch.tensor([0.1, 0.0, -0.2])  # from a displaced camera
         >>> R, t, valid = p3p(seen / seen[..., 2:], xyz)
-        >>> R.shape, t.shape, valid.shape  # four solutions each, some of which there are not
+        >>> R.shape, t.shape, valid.shape  # four solutions each, not all valid
         (torch.Size([1, 4, 3, 3]), torch.Size([1, 4, 3]), torch.Size([1, 4]))
         >>> right = valid & ((t - torch.tensor([0.1, 0.0, -0.2])).norm(dim=-1) < 1e-4)
         >>> int(right.sum()), bool(torch.allclose(R[right], torch.eye(3), atol=1e-4))
@@ -89,11 +91,11 @@ def p3p_of_planes(
         longest = a.amax(0)
         a = a / longest
         total = a.sum(0)
-        flat = total * total - 2 * (a * a).sum(0)  # (4 × area)², by Heron's formula
-        sound = (flat > 4 * MIN_HEIGHT_RATIO**2) & (m.amax(0) < MAX_RAY_COSINE) & (longest < torch.inf)
+        squared_area = total * total - 2 * (a * a).sum(0)  # (4 × area)², by Heron's formula
+        regular = (squared_area > 4 * MIN_HEIGHT_RATIO**2) & (m.amax(0) < MAX_RAY_COSINE) & (longest < torch.inf)
         d, step = _polish(_ranges(m, a), m, a)
-        # Newton's method squares the error: a short step has arrived.
-        valid = sound & (step < 1e-3) & (d.amin(0) > 1e-9)
+        # Newton's method squares the error: a short step means convergence.
+        valid = regular & (step < 1e-3) & (d.amin(0) > 1e-9)
         Y = (d * longest.sqrt())[:, None] * j[:, :, None]  # (point, coordinate, root, *)
         R, t = _align(torch.cat((Y, X[:, :, None]), 2).to(xyz.dtype))
         eye = torch.eye(3, dtype=R.dtype, device=R.device).view(3, 3, *[1] * valid.ndim)
@@ -108,8 +110,8 @@ def _ranges(m: Tensor, a: Tensor) -> Tensor:
     split, other = gamma * first + second, first - gamma * second  # det(split) = 0
     # Planes g and h: split = g hᵀ + h gᵀ, and its cofactors are −p pᵀ with p = g × h, where the planes meet.
     minors = cofactor_planes(split)
-    least, index = minors.diagonal(dim1=0, dim2=1).min(-1)
-    p = _row(minors, index) * (-least).clamp_min(1e-300).rsqrt()
+    smallest, index = minors.diagonal(dim1=0, dim2=1).min(-1)
+    p = _row(minors, index) * (-smallest).clamp_min(1e-300).rsqrt()
     eye = torch.eye(3, dtype=p.dtype, device=p.device).view(3, 3, *[1] * (p.ndim - 1))
     product = split + cross(p[:, None], eye, dim=0)  # = 2 h gᵀ
     product = torch.stack((product, product.transpose(0, 1)), 2)  # (row, column, plane, *)
@@ -138,10 +140,10 @@ def _row(A: Tensor, index: Tensor) -> Tensor:
 
 
 def _outer_root(cones: Tensor) -> Tensor:
-    """γ with det(γ first + second) = 0: the real root that lies farthest from the other two, the best conditioned.
+    """γ with det(γ first + second) = 0: the real root farthest from the other two, which is the best conditioned.
 
-    A vanishing leading coefficient sends that root to infinity; it is held at about 1e12 times the others' scale.
-    It is made of functions that torch rounds alike wherever an element stands; sinh and pow are not among them.
+    A vanishing leading coefficient sends that root to infinity; it is limited to about 1e12 times the others' scale.
+    It uses only functions that torch rounds alike at every position of a tensor; sinh and pow are not among them.
     """
     k = (
         (cofactor_planes(cones)[:, :, :, None] * cones[:, :, None]).sum(0).sum(0).flatten(0, 1)
@@ -163,7 +165,7 @@ def _outer_root(cones: Tensor) -> Tensor:
 def _null_directions(A: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """The vectors x = α u + β v with xᵀ A x = 0: A (3, 3, *), u (3, *) and v (3, 2, *) → (3, 4, *), of any length.
 
-    A negative discriminant counts as zero; whether the solution exists shows when it is put back into the equations.
+    A negative discriminant counts as zero; whether the solution exists is checked by substitution into the equations.
     """
     Au, u = (A * u).sum(1), u[:, None]
     uu = (Au[:, None] * u).sum(0)

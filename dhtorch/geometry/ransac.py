@@ -1,4 +1,4 @@
-"""Random sample consensus over camera poses, all hypotheses of all pairs at once, with fixed sizes.
+"""Random sample consensus over camera poses: points and draws → best poses, all pairs at once, with fixed sizes.
 
 Alphabet: B pairs, H drawn triples, K candidate poses, M points in M *slots*: the usable points of a pair come first, in
 order, ``count`` (B,) of them. Points are planes (B, 3, M) and (B, 2, M). Nothing here carries a gradient.
@@ -15,18 +15,30 @@ from dhtorch.geometry.least_squares import MIN_DEPTH
 from dhtorch.geometry.p3p import p3p_of_planes
 from dhtorch.geometry.se3 import Pose
 
-#: A point set counts as a line when its spread across is below this share of its spread along.
+#: Limits the flatness of a point set: spread across over spread along below which it is a line, without unit.
+#: Source: origin not recorded.
 MIN_SPREAD_RATIO = 1e-3
 
-#: Points this many times as far as the median one are directions, not places: a renderer's sky at 1e10 m, with the
-#: points of a room, would look like a line.
+#: Limits the distance of a point, in multiples of the median distance: farther points are directions. With a renderer's
+#: sky at 1e10 m the points of a room would look like a line.
+#: Source: origin not recorded.
 MAX_DISTANCE_RATIO = 100.0
 
-#: Residuals of hypotheses that are looked at together: three planes of them stay in cache.
+#: Limits the residuals of hypotheses computed together, a count: three planes of them stay in cache.
+#: Source: origin not recorded.
 MAX_CHUNK_RESIDUALS = 1 << 15
 
-#: Points that all hypotheses are scored on first; hypotheses that are then scored on all points; those that are kept.
-PREVIEW_POINTS, SHORTLISTED_POSES, KEPT_POSES = 32, 32, 2
+#: Limits the points that all hypotheses are scored on first, a count.
+#: Source: origin not recorded.
+PREVIEW_POINTS = 32
+
+#: Limits the hypotheses that are then scored on all points, a count.
+#: Source: origin not recorded.
+SHORTLISTED_POSES = 32
+
+#: Limits the best hypotheses that are returned, a count.
+#: Source: origin not recorded.
+KEPT_POSES = 2
 
 
 def usable_first(
@@ -43,14 +55,14 @@ def usable_first(
     N = check("usable_first", usable=(usable, "B N"))["N"]
     if N == 0:
         raise ValueError("usable_first: usable has no points, expected N > 0")
-    found = usable.cumsum(-1)
-    number = found[:, -1]
-    index = torch.searchsorted(found, evenly_spaced_slots(number, size) + 1)
-    return index.clamp(max=N - 1), number.clamp(max=size)
+    rank = usable.cumsum(-1)
+    n_usable = rank[:, -1]
+    index = torch.searchsorted(rank, evenly_spaced_slots(n_usable, size) + 1)
+    return index.clamp(max=N - 1), n_usable.clamp(max=size)
 
 
 def evenly_spaced_slots(count: Tensor, size: int) -> Tensor:
-    """(B, size) slots below ``count`` (B,): 0, 1, 2, … while they last; evenly thinned where there are more."""
+    """Slots (B, size) below ``count`` (B,): 0, 1, 2, … up to the count; evenly thinned where there are more."""
     slot, count = torch.arange(size, device=count.device), count[:, None]
     return torch.minimum(slot * count.clamp_min(size) // size, (count - 1).clamp_min(0))
 
@@ -59,7 +71,7 @@ def distinct_triples(
     draws: Tensor,  # (B, H, 3) uniform in [0, 1)
     count: Tensor,  # (B,) int64
 ) -> Tensor:
-    """Three different slots below ``count`` per draw, uniformly: (B, H, 3) int64.
+    """Three different slots below ``count`` per draw, uniformly distributed: (B, H, 3) int64.
 
     The second draw chooses among the slots left by the first, the third among those left by both. With fewer than
     three slots the triples cannot be distinct (and stay in range).
@@ -85,8 +97,8 @@ def msac_cost(
 ) -> Tensor:
     """Truncated squared reprojection errors, summed over points: (B, K) px².
 
-    Points behind the camera count in full, save one exactly on its axis: refinement, not this ranking, decides on
-    inliers.
+    Points behind the camera cost their limit, except one exactly on its axis: inliers are determined by the refinement,
+    not by this ranking.
 
     Source: P. Torr, A. Zisserman, "MLESAC" (CVIU 2000), the truncated score.
     """
@@ -106,7 +118,7 @@ def msac_cost(
 
 @torch.no_grad()
 def search_hypotheses(
-    points: Tensor,  # (B, 5, M): x, y, z (m) and where they were seen, u, v (px)
+    points: Tensor,  # (B, 5, M): x, y, z (m) and their measured pixel u, v (px)
     count: Tensor,  # (B,) usable slots
     f: Tensor,  # (B, 2) px
     c: Tensor,  # (B, 2) px
@@ -143,13 +155,13 @@ def search_hypotheses(
     points = torch.cat((uv, xyz, one), 1)
     used = torch.arange(M, device=count.device) < count[:, None]
     limits = torch.where(used, threshold_px**2, 0.0).to(points.dtype)
-    some = min(preview, M)
-    seen = _take(points, evenly_spaced_slots(count, some)[:, None])
-    cost = msac_cost(lenses.flatten(2), seen, limits[:, :some])
+    n_preview = min(preview, M)
+    preview_points = _take(points, evenly_spaced_slots(count, n_preview)[:, None])
+    cost = msac_cost(lenses.flatten(2), preview_points, limits[:, :n_preview])
     cost = cost.masked_fill(~valid.transpose(0, 1).flatten(1), torch.inf)
     cost, index = cost.topk(min(max(shortlist, keep), K), largest=False)
     full = msac_cost(_take(lenses, index[:, None, None]).flatten(2), points, limits)
-    # The preview is part of the whole, so the greater cost is the whole one, save that infinity stays.
+    # The preview is part of all points, so the larger cost is that of all points, or infinity.
     cost, best = torch.maximum(cost, full).topk(keep, largest=False)
     poses = _take(poses, index.gather(1, best)[:, None, None]).permute(0, 3, 2, 1)
     return Pose(poses[..., :3], poses[..., 3]), cost
@@ -159,10 +171,10 @@ def is_collinear(
     xyz: Tensor,  # (B, 3, M) m
     used: Tensor,  # (B, M) bool
 ) -> Tensor:
-    """(B,) bool: the used points lie on one line (or in one point), and so leave a rotation undetermined.
+    """Whether (B,) the used points lie on one line (or in one point), which leaves a rotation undetermined.
 
     The second largest eigenvalue of their scatter is compared with the largest through the matrix's invariants. Points
-    more than ``MAX_DISTANCE_RATIO`` times as far from the origin as the median one are not looked at.
+    more than ``MAX_DISTANCE_RATIO`` times as far from the origin as the median one are left out.
 
     Raises:
         ValueError: wrong shapes.

@@ -1,7 +1,7 @@
-"""Stage 4: the samples found again in the other image, by pyramidal Lucas-Kanade, forward and back.
+"""Stage 4: two images and sample pixels → tracks with covariance, by pyramidal Lucas-Kanade, forward and back.
 
-The search stands in :mod:`dhtorch.geometry.lucas_kanade`, whose alphabet is used here: the points of all pairs in one
-row, ``x`` (2, M) in image 0 and ``d`` their displacement to image 1.
+The search is in :mod:`dhtorch.geometry.lucas_kanade`, whose alphabet is used here: the points of all pairs in one row,
+``x`` (2, M) in image 0 and ``d`` their displacement to image 1.
 """
 
 from __future__ import annotations
@@ -30,12 +30,14 @@ from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.pyramid import Pyramid, PyramidCache, build_pyramid
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
-#: A search from a coarse flow begins on the first level (the second at least) whose windows are so many times as wide
-#: as the flow's cells are apart there: four small pixels, of which a cell is about five.
+#: Limits the start level of a search from a coarse flow: the first level (at least the second) whose windows are this
+#: many times as wide as the spacing of the flow's cells there, without unit.
+#: Source: derived, 4 / 5: four small pixels over the about five of a cell.
 START_LEVEL_MARGIN = 0.8
 
-#: Smallest eigenvalue of A per pixel of the window below which it is not tracked: 1e-4 of cv2, which sums gradients
-#: of 8-bit images scaled by 2^-5.
+#: Least eigenvalue of A per pixel of a window that is tracked, squared grey values in [0, 1] per px²; cv2 sums
+#: gradients of 8-bit images scaled by 2^-5.
+#: Source: OpenCV calcOpticalFlowPyrLK default minEigThreshold 1e-4, derived, times 2^10 / 255².
 MIN_TRACK_EIGENVALUE = 1e-4 * 2**10 / 255**2
 
 
@@ -54,37 +56,38 @@ def lucas_kanade(
     min_eigenvalue: float = MIN_TRACK_EIGENVALUE,
     start: Callable[..., CoarseFlow] | None = None,
 ) -> Tracks:
-    """Track points from image 0 to image 1 and back; a track that does not return to its start is not valid.
+    """Tracks of points uv_0 from image 0 to image 1 and back; a track that does not return to its start is not valid.
 
     From coarse to fine, every window takes Gauss-Newton steps towards the smallest squared grey difference to its
-    template. The way back starts from the point found as if nothing were known of the way there (with a start that was
-    hinted: from the opposite displacement), so that it is a test. A window that still runs away at the end of the way
-    there is lost and not tested.
+    template. The backward search starts from the forward result without using the forward displacement (with a hinted
+    start: from the opposite displacement), so that it is an independent test. A window that still diverges at the end
+    of the forward search is lost and not tested.
 
     Args:
         image_0, image_1: (B, C, H, W) with C 1 or 3, float in [0, 1] or uint8; the two may differ in size.
         uv_0: (B, N, 2) px, x to the right and y down, 0 the middle of the first pixel.
-        hint: where to start in image 1, pyramids of image 0 made once for many views, and ``levels`` for this scene.
+        hint: start in image 1, pyramid of image 0 shared by many views, and ``levels`` for this scene.
         window: width in pixels, odd.
         levels: pyramid levels, full resolution included; fewer where a level would be no larger than the window.
-        iterations: most Gauss-Newton steps per level. A point that is not at rest after eight goes on only as far as
-            three maps reach (``dhtorch.geometry.lucas_kanade``).
+        iterations: most Gauss-Newton steps per level. A point that has not converged after eight continues only as far
+            as three maps reach (``dhtorch.geometry.lucas_kanade``).
         epsilon_px: a shorter step has converged; on coarse levels, which only provide a start, four times that.
         normalise: ``none``; ``bias`` removes the means of both windows; ``gain_bias`` also their ratio of contrast.
         min_eigenvalue: of A / window² (grey values in [0, 1]); a window with less has too little texture.
-        start: ``(image_0, image_1, *, linear) -> Flow``, such as :func:`dhtorch.geometry.coarse_flow.coarse_flow`:
-            asked for the coarse motion of the whole picture, there and back, where the hint has none. Turn, zoom and
-            gain of a pair are undone in image 1 before it is searched. None = the search starts at ``uv_0``.
+        start: ``(image_0, image_1, *, linear) -> CoarseFlow``, such as
+            :func:`dhtorch.geometry.coarse_flow.coarse_flow`: the coarse motion of the whole image, forward and
+            backward, where the hint has none. Rotation, zoom and gain of a pair are undone in image 1 before the
+            search. None = the search starts at ``uv_0``.
 
     Returns:
-        Tracks in the dtype of ``uv_0``: ``uv_1`` (B, N, 2) px; ``error`` (B, N) px, the round trip (the way there where
-        it led nowhere); ``cov`` (B, N, 2, 2) px²; ``valid`` (B, N). ``photometric`` (B, N) is the rms grey difference
-        of the windows, in grey values of image 0, after normalisation; ``cov`` is s² A⁻¹ with s² the residual variance,
-        not below that of 8-bit rounding, and the small eigenvalue of A kept from vanishing: always finite, large
-        without texture. It understates white noise, which reading between pixels smooths out of the residual.
-        ``valid``: inside image 1 on the finest level from start to end, not running away at either end, textured, round
-        trip below its limit. Not valid: ``uv_1`` is the last position; for a ``uv_0`` outside the image the start of
-        the search, with 0 for what is not finite.
+        Tracks in the dtype of ``uv_0``: ``uv_1`` (B, N, 2) px; ``error`` (B, N) px, the round trip (the forward
+        displacement where the forward search is lost); ``cov`` (B, N, 2, 2) px²; ``valid`` (B, N). ``photometric`` (B,
+        N) is the rms grey difference of the windows, in grey values of image 0, after normalisation; ``cov`` is s² A⁻¹
+        with s² the residual variance, not below that of 8-bit rounding, and the small eigenvalue of A kept from
+        vanishing: always finite, large without texture. It understates white noise, which interpolation smooths out of
+        the residual. ``valid``: inside image 1 on the finest level from start to end, not diverging in either
+        direction, textured, round trip below its limit. Not valid: ``uv_1`` is the last position; for a ``uv_0``
+        outside the image the start of the search, with 0 for what is not finite.
 
     Raises:
         ValueError: wrong shapes or options, an image no larger than the window, pyramids of another image.
@@ -108,7 +111,7 @@ def lucas_kanade(
         >>> (tracks.uv_1 - uv_0).round(decimals=1)[0, :2]
         tensor([[ 1.5000, -1.5000],
                 [ 1.5000, -1.5000]])
-        >>> tracks.valid  # the third has left the image
+        >>> tracks.valid  # the third is outside image 1
         tensor([[ True,  True, False]])
     """
     check("lucas_kanade", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), start=(hint.start, "B N 2"))
@@ -117,18 +120,18 @@ def lucas_kanade(
     o = lk.SearchOptions(window, iterations, epsilon_px, min_eigenvalue, normalise)
     levels = levels if hint.levels is None else hint.levels
     with torch.no_grad():
-        source = _source(hint, image_0, levels, window)
+        source = _source_pyramid(hint, image_0, levels, window)
         flows = resolve_coarse_flow(image_0, image_1, hint, start)
         view = None if flows is None else _DerotatedImage(image_1, flows)
         target = build_pyramid(image_1 if view is None else view.image, levels, window)
         tracks = run_without_grad(
-            _there_and_back,
+            _track_both_ways,
             source,
             target,
             uv_0.detach(),
             o,
             init=hint.start if view is None else view.begin(uv_0.detach(), hint.start),
-            homewards=None if view is None else view.back,
+            back_start_of=None if view is None else view.back,
             near_levels=levels if flows is None else _levels_for_flow(flows[0], source.hw(), window),
             limit_px=max_round_trip_px,
         )
@@ -137,7 +140,9 @@ def lucas_kanade(
         uv_1 = refine_tracks(
             image_0, image_1, uv_0, tracks.uv_1, window=window, normalise=normalise, min_eigenvalue=min_eigenvalue
         )
-        if view is not None:  # a step through image 1 as it is says nothing of a window that is changed there
+        if (
+            view is not None
+        ):  # a step on the unchanged image 1 has another value where image 1 was changed for the search
             uv_1 = torch.where(view.changed[:, None, None], tracks.uv_1 + (uv_1 - uv_1.detach()), uv_1)
         return tracks.replace(uv_0=uv_0, uv_1=torch.where(tracks.valid[..., None], uv_1, tracks.uv_1))
     return tracks
@@ -153,7 +158,7 @@ def refine_tracks(
     normalise: str = "none",
     min_eigenvalue: float = MIN_TRACK_EIGENVALUE,
 ) -> Tensor:
-    """One differentiable Gauss-Newton step from ``uv_1``: the position (B, N, 2) as a function of the images.
+    """One differentiable Gauss-Newton step from ``uv_1``: positions (B, N, 2) as a function of the images.
 
     Where the search has converged the step is zero but its derivative is not: it is that of the converged position (by
     the implicit function theorem, with the Gauss-Newton Hessian). Points that are not finite, outside an image or
@@ -177,62 +182,64 @@ def refine_tracks(
     batch = torch.arange(B, device=x.device).repeat_interleave(N)
     o = lk.SearchOptions(window, 1, 0.0, min_eigenvalue, normalise)
     step, textured = lk.lucas_kanade_step(source, target, o, x, x_1, batch)
-    found = start - torch.where(usable & textured, step, torch.zeros_like(step))
-    return found.reshape(2, B, N).permute(1, 2, 0).to(uv_0.dtype)
+    refined = start - torch.where(usable & textured, step, torch.zeros_like(step))
+    return refined.reshape(2, B, N).permute(1, 2, 0).to(uv_0.dtype)
 
 
 def resolve_coarse_flow(
     image_0: Tensor, image_1: Tensor, hint: TrackHint, start: Callable[..., CoarseFlow] | None
 ) -> tuple[CoarseFlow, CoarseFlow] | None:
-    """The coarse motion of the pictures there and back: the hint's, else what ``start`` says, else none."""
+    """Coarse motion of the images, forward and backward: the hint's, else the result of ``start``, else None."""
     if hint.flows is not None or start is None:
         return hint.flows
-    there = start(image_0, image_1)
-    return there, start(image_1, image_0, linear=invert_similarity(there.linear))
+    forward = start(image_0, image_1)
+    return forward, start(image_1, image_0, linear=invert_similarity(forward.linear))
 
 
 class _DerotatedImage:
-    """Image 1 with the turn, zoom and gain of its pair undone, and the ways between the two."""
+    """Image 1 with rotation, zoom and gain of its pair undone, and the maps between the two."""
 
     def __init__(self, image: Tensor, flows: tuple[CoarseFlow, CoarseFlow]) -> None:
         self.hw = image.shape[-2], image.shape[-1]
         self.flows, self.linear = flows, flows[0].linear
-        self.turned = is_not_identity(self.linear)
-        self.changed = self.turned | (flows[0].gain != 1)
-        # Under a compiler, which sees no values, everything is undone, if it be nothing.
+        self.rotated = is_not_identity(self.linear)
+        self.changed = self.rotated | (flows[0].gain != 1)
+        # Under torch.compile, without values, the transform is always undone, even where it is the identity.
         undo = any_possible(self.changed)
         self.image = undo_similarity(image, self.linear, flows[0].gain) if undo else image
 
-    def begin(self, uv_0: Tensor, known: Tensor | None) -> Tensor:
-        """Where to look in the upright picture for pixels (B, N, 2) of image 0; ``known`` in image 1 goes before."""
-        uv_1 = self.flows[0].at(uv_0) if known is None else known
+    def begin(self, uv_0: Tensor, start: Tensor | None) -> Tensor:
+        """Start in the derotated image of pixels (B, N, 2) of image 0; ``start`` in image 1 takes precedence."""
+        uv_1 = self.flows[0].at(uv_0) if start is None else start
         return apply_similarity(invert_similarity(self.linear), uv_1, self.hw)
 
     def back(self, uv: Tensor) -> Tensor:
-        """Where to look in image 0 for pixels (B, N, 2) of the upright picture."""
+        """Start in image 0 of pixels (B, N, 2) of the derotated image."""
         return self.flows[1].at(apply_similarity(self.linear, uv, self.hw))
 
     def to_image(self, tracks: Tracks) -> Tracks:
-        """Tracks to the upright picture as tracks to image 1."""
+        """Tracks into the derotated image as tracks into image 1."""
         A = self.linear.to(tracks.cov)[:, None]
         uv_1 = apply_similarity(self.linear, tracks.uv_1, self.hw)
         inside = ((uv_1 >= -0.5) & (uv_1 <= uv_1.new_tensor([self.hw[1] - 0.5, self.hw[0] - 0.5]))).all(-1)
-        cov = torch.where(self.turned[:, None, None, None], small_matmul(small_matmul(A, tracks.cov), A.mT), tracks.cov)
-        return tracks.replace(uv_1=uv_1, cov=cov, valid=tracks.valid & (inside | ~self.turned[:, None]))
+        cov = torch.where(
+            self.rotated[:, None, None, None], small_matmul(small_matmul(A, tracks.cov), A.mT), tracks.cov
+        )
+        return tracks.replace(uv_1=uv_1, cov=cov, valid=tracks.valid & (inside | ~self.rotated[:, None]))
 
 
-def _there_and_back(
+def _track_both_ways(
     source: Pyramid,
     target: Pyramid,
     uv_0: Tensor,
     o: lk.SearchOptions,
     *,
     init: Tensor | None,
-    homewards: Callable[[Tensor], Tensor] | None,
+    back_start_of: Callable[[Tensor], Tensor] | None,
     near_levels: int,
     limit_px: float,
 ) -> Tracks:
-    """Tracks of all points, laid out in one row (2, M), filled up to whole ``LANES`` by points outside the image."""
+    """Tracks of all points, forward and back, in one row (2, M) padded to whole ``LANES`` by points outside."""
     B, N, _ = uv_0.shape
     fill = round_up(B * N) - B * N
 
@@ -245,41 +252,42 @@ def _there_and_back(
 
     x = row(uv_0)
     d = torch.zeros_like(x) if init is None else row(init) - x
-    given = d.isfinite().all(0)
-    d = torch.where(given, d, torch.zeros_like(d))
-    known = lk.is_between(x, *source.bounds(0))
-    elsewhere = _finite(x) + d
-    x = torch.where(known, x, torch.zeros_like(x))
+    has_start = d.isfinite().all(0)
+    d = torch.where(has_start, d, torch.zeros_like(d))
+    inside = lk.is_between(x, *source.bounds(0))
+    unsearched = _finite(x) + d
+    x = torch.where(inside, x, torch.zeros_like(x))
     batch = F.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
 
     search = partial(lk.search_displacements, o=o, alike=init is None, near_levels=near_levels)
 
-    def back(x: Tensor, d: Tensor, batch: Tensor, known: Tensor, begun: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return search(target, source, x=x, d=d, batch=batch, known=known, begun=begun)
+    def back(x: Tensor, d: Tensor, batch: Tensor, inside: Tensor, begun: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return search(target, source, x=x, d=d, batch=batch, known=inside, begun=begun)
 
-    forward, found, A = search(source, target, x=x, d=d, batch=batch, known=known, begun=given)
-    begin = -d
-    if homewards is not None:
-        begin = row(homewards(grid(x + forward))) - (x + forward)
-        given = begin.isfinite().all(0)
-        begin = torch.where(given, begin, torch.zeros_like(begin))
-    nothing = torch.zeros_like(d), torch.zeros_like(found), torch.zeros_like(A)
-    backward, returned, _ = lk.masked_apply(found, back, nothing, (x + forward, begin, batch, found, given))
+    forward, forward_ok, A = search(source, target, x=x, d=d, batch=batch, known=inside, begun=has_start)
+    back_start = -d
+    if back_start_of is not None:
+        back_start = row(back_start_of(grid(x + forward))) - (x + forward)
+        has_start = back_start.isfinite().all(0)
+        back_start = torch.where(has_start, back_start, torch.zeros_like(back_start))
+    fill_values = torch.zeros_like(d), torch.zeros_like(forward_ok), torch.zeros_like(A)
+    backward, backward_ok, _ = lk.masked_apply(
+        forward_ok, back, fill_values, (x + forward, back_start, batch, forward_ok, has_start)
+    )
     error = (forward + backward).square().sum(0).sqrt()
     squares = lk.squared_differences(source, target, o, x, forward, batch)
     return Tracks(
         uv_0=uv_0,
-        uv_1=grid(torch.where(known, x + forward, elsewhere)),
+        uv_1=grid(torch.where(inside, x + forward, unsearched)),
         error=grid(error),
         photometric=grid((squares / o.window**2).sqrt()),
         cov=grid(lk.window_covariance(A, squares / (o.window**2 - 2))),
-        valid=grid(found & returned & (error < limit_px)),
+        valid=grid(forward_ok & backward_ok & (error < limit_px)),
     )
 
 
 def _levels_for_flow(flow: CoarseFlow, hw: tuple[int, int], window: int) -> int:
-    """How many levels a search needs that starts where a coarse flow says: until a window reaches as far as that may
-    be wrong."""
+    """Pyramid levels of a search that starts from a coarse flow: until a window covers the error of the flow."""
     cell_px = max(n / cells for n, cells in zip(hw, flow.support.shape[1:], strict=True))
     return max(2, 1 + math.ceil(math.log2(START_LEVEL_MARGIN * cell_px / window)))
 
@@ -295,8 +303,8 @@ def _check_options(iterations: int, normalise: str) -> None:
         raise ValueError(f"lucas_kanade: iterations is {iterations}, expected at least 1")
 
 
-def _source(hint: TrackHint, image: Tensor, levels: int, window: int) -> Pyramid:
-    """The pyramid of image 0: the caller's, where it has one."""
+def _source_pyramid(hint: TrackHint, image: Tensor, levels: int, window: int) -> Pyramid:
+    """The pyramid of image 0: the hint's, or a new one."""
     if hint.pyramid is None:
         return build_pyramid(image, levels, window)
     found, expected = (tuple(x.shape) for x in (hint.pyramid.image, image))
@@ -319,22 +327,22 @@ def lucas_kanade_affine(
     max_shift_px: float = 2.0,
     start: Callable[..., CoarseFlow] | None = None,
 ) -> Tracks:
-    """Track as ``track`` does, then register every window once more, free to shear and to change its brightness.
+    """Tracks of ``track`` with every window registered once more by an affine warp with gain and bias.
 
     Args:
-        hint: as in :func:`lucas_kanade`; handed on to ``track``.
-        track: the search that finds the windows, any tracker; it is told the ``levels`` and shares the pyramid.
+        hint: as in :func:`lucas_kanade`; passed on to ``track``.
+        track: the search, any tracker; its hint holds ``levels`` and the shared pyramid.
         window: of the registration; the search has its own.
-        levels: of the search, where it follows hints.
+        levels: of the search, where it uses hints.
         iterations, epsilon_px, max_shift_px: of the registration, see
             :func:`dhtorch.geometry.affine_alignment.register_affine`.
-        start: as in :func:`lucas_kanade`; ``track`` finds its answer in the hint, and the registration begins with its
-            turn and zoom.
+        start: as in :func:`lucas_kanade`; ``track`` has its result in the hint, and the registration starts with its
+            rotation and zoom.
 
     Returns:
-        Tracks of ``track`` with new ``uv_1``, ``cov`` (right for white noise, see ``register``) and ``photometric``, a
-        residual with gain and bias taken out. A registration that is rejected leaves the position and
-        raises ``error`` to how far it went, at most ``max_shift_px``; ``photometric`` and ``cov`` are then those of the
+        Tracks of ``track`` with new ``uv_1``, ``cov`` (right for white noise, see ``register_affine``) and
+        ``photometric``, a residual with gain and bias taken out. A registration that is rejected leaves the position
+        and raises ``error`` to its shift, at most ``max_shift_px``; ``photometric`` and ``cov`` are then those of the
         unregistered window. ``valid`` is untouched.
 
     Raises:
@@ -346,13 +354,13 @@ def lucas_kanade_affine(
     check("lucas_kanade_affine", image_0=(image_0, "B C H W"), uv_0=(uv_0, "B N 2"), start=(hint.start, "B N 2"))
     check("lucas_kanade_affine", image_1=(image_1, "B C H W"), uv_0=(uv_0, "B N 2"))
     with torch.no_grad():
-        known = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
+        pyramid = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
         levels = levels if hint.levels is None else hint.levels
-        source = _source(hint.replace(pyramid=known), image_0, levels, window)
+        source = _source_pyramid(hint.replace(pyramid=pyramid), image_0, levels, window)
         flows = resolve_coarse_flow(image_0, image_1, hint, start)
-        tracks = track(image_0, image_1, uv_0, hint=TrackHint(hint.start, known, levels, flows))
+        tracks = track(image_0, image_1, uv_0, hint=TrackHint(hint.start, pyramid, levels, flows))
         target = build_pyramid(image_1, 2, window, gradients=False)
-        found = affine_alignment.register_affine(
+        registration = affine_alignment.register_affine(
             source,
             target,
             uv_0,
@@ -364,19 +372,23 @@ def lucas_kanade_affine(
             epsilon_px=epsilon_px,
             max_shift_px=max_shift_px,
         )
-        moved, rejected = tracks.valid & found.ok, tracks.valid & ~found.ok
-        uv_1 = torch.where(moved[..., None], found.uv_1, tracks.uv_1)
-        error = torch.maximum(tracks.error, found.shift_px.clamp(max=max_shift_px))
+        registered, rejected = tracks.valid & registration.ok, tracks.valid & ~registration.ok
+        uv_1 = torch.where(registered[..., None], registration.uv_1, tracks.uv_1)
+        error = torch.maximum(tracks.error, registration.shift_px.clamp(max=max_shift_px))
         tracks = tracks.replace(
             uv_0=uv_0,
             uv_1=uv_1,
             error=torch.where(rejected, error, tracks.error),
-            photometric=torch.where(tracks.valid, found.rms, tracks.photometric),
-            cov=torch.where(tracks.valid[..., None, None], found.cov, tracks.cov),
+            photometric=torch.where(tracks.valid, registration.rms, tracks.photometric),
+            cov=torch.where(tracks.valid[..., None, None], registration.cov, tracks.cov),
         )
     if torch.is_grad_enabled() and (image_0.requires_grad or image_1.requires_grad or uv_0.requires_grad):
         source, target = build_pyramid(image_0, 1, window), build_pyramid(image_1, 1, window)
-        again = affine_alignment.registration_step(source, target, uv_0, tracks.uv_1, found.linear, window=window)
-        # The value is the search's, bit for bit; the step lends its derivative.
-        return tracks.replace(uv_1=torch.where(tracks.valid[..., None], uv_1 + (again - again.detach()), uv_1))
+        differentiable = affine_alignment.registration_step(
+            source, target, uv_0, tracks.uv_1, registration.linear, window=window
+        )
+        # The value is that of the search, bit for bit; the derivative that of the step.
+        return tracks.replace(
+            uv_1=torch.where(tracks.valid[..., None], uv_1 + (differentiable - differentiable.detach()), uv_1)
+        )
     return tracks
