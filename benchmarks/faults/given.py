@@ -48,8 +48,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "geometry.inference_mode": [
         ("run_without_grad", "forward_ad._current_level >= 0 or ", ""),
-        ("_asked", "x.requires_grad", "False"),
-        ("_usual", "x.clone() if", "x if"),
+        ("_requires_graph", "x.requires_grad", "False"),
+        ("_leave_inference_mode", "x.clone() if", "x if"),
     ],
     "transforms.poses": [
         ("check_constant_pose", 'or kind != "1_from_0"', ""),

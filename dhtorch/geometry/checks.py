@@ -1,6 +1,6 @@
-"""Shape contracts: named axes, bound across the arguments of one call.
+"""Shape checks: tensors and axis patterns -> sizes of the named axes; and tests of masks and finiteness.
 
-*Shapes raise, values flag*: a wrong shape is the caller's mistake and raises here, with the argument's name.
+*Shapes raise, values flag*: a wrong shape is an error of the caller and raises here, with the argument's name.
 """
 
 from __future__ import annotations
@@ -8,15 +8,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-#: Calls that are remembered before all are forgotten.
+#: Largest number of cached checks; the cache is then cleared. Source: origin not recorded.
 MAX_CACHED_CHECKS = 4096
 
-#: Patterns and shapes that were right, and their sizes: a fit asks the same at every step.
-_right: dict[tuple[tuple[str, torch.Size | None], ...], dict[str, int]] = {}
+#: Patterns and shapes that passed -> sizes: an iterative fit repeats the same checks at every step.
+_cache: dict[tuple[tuple[str, torch.Size | None], ...], dict[str, int]] = {}
 
 
 def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
-    """Check tensors against axis patterns such as ``"B N 2"``; equal letters must have equal sizes.
+    """Tensors and axis patterns such as ``"B N 2"`` -> sizes of the axes; equal letters must have equal sizes.
 
     Args:
         where: name of the calling function, for the message.
@@ -30,21 +30,21 @@ def check(where: str, **args: tuple[Tensor | None, str]) -> dict[str, int]:
         ValueError: the number of axes, a fixed size or a shared axis differs from the pattern.
     """
     if torch.compiler.is_compiling():
-        return _bound(where, args)
-    seen = tuple([(pattern, None if x is None else x.shape) for x, pattern in args.values()])
+        return _bind_axes(where, args)
+    key = tuple([(pattern, None if x is None else x.shape) for x, pattern in args.values()])
     try:
-        sizes = _right.get(seen)
-    except TypeError:  # a size that is only a symbol yet cannot be looked up
-        return _bound(where, args)
+        sizes = _cache.get(key)
+    except TypeError:  # a symbolic size is not hashable
+        return _bind_axes(where, args)
     if sizes is None:
-        sizes = _bound(where, args)
-        if len(_right) >= MAX_CACHED_CHECKS:
-            _right.clear()
-        _right[seen] = sizes
+        sizes = _bind_axes(where, args)
+        if len(_cache) >= MAX_CACHED_CHECKS:
+            _cache.clear()
+        _cache[key] = sizes
     return dict(sizes)
 
 
-def _bound(where: str, args: dict[str, tuple[Tensor | None, str]]) -> dict[str, int]:
+def _bind_axes(where: str, args: dict[str, tuple[Tensor | None, str]]) -> dict[str, int]:
     sizes: dict[str, int] = {}
     for name, (x, pattern) in args.items():
         if x is None:
@@ -71,20 +71,20 @@ def is_static(x: Tensor) -> bool:
 
 
 def all_known(mask: Tensor) -> bool:
-    """Whether a mask holds everywhere, where values may be looked at: then nothing need be chosen."""
+    """Whether a mask is true everywhere; false where shapes are static and values must not be read."""
     return not is_static(mask) and bool(mask.all())
 
 
 def any_possible(mask: Tensor) -> bool:
-    """Whether a mask holds anywhere; it may where values are not known yet."""
+    """Whether a mask is true anywhere; true where shapes are static and values must not be read."""
     return is_static(mask) or bool(mask.any())
 
 
 def all_finite(x: Tensor, dim: int) -> Tensor:
-    """Whether no number along ``dim`` is infinite or NaN; ``x.isfinite().all(dim)`` in less time. Gradient: none."""
+    """Whether all values along ``dim`` are finite; faster than ``x.isfinite().all(dim)``. Gradient: none."""
     return x.detach().abs().amax(dim) < torch.inf
 
 
 def is_transformed() -> bool:
-    """Whether this runs inside ``torch.compile`` or a transform of ``torch.func``, whatever it is given."""
+    """Whether this runs inside ``torch.compile`` or a transform of ``torch.func``, for any arguments."""
     return torch.compiler.is_compiling() or torch._C._functorch.maybe_current_level() is not None

@@ -1,18 +1,17 @@
-"""What makes answers equal bit for bit: alone or in a batch, in any order, in whatever worker.
+"""Batch-independent rounding: padding with which results are bit-equal alone, in a batch, in any order and worker.
 
-On the CPU, torch works with vector instructions and hands what is left over at the end of a row to scalar ones, which
-may round differently; a matrix product takes another way through its sums when its sizes change; and a sum is split by
-its length. An element's answer would then depend on how many others travel with it. Three habits keep that away, and
-whoever works on rows of points follows them:
+On the CPU, torch uses vector instructions and scalar ones for the remainder of a row, which may round differently; a
+matrix product changes its order of summation with its sizes; and a sum is split by its length. The result of an element
+would then depend on the number of the others. Three rules prevent that, for all code on rows of points:
 
-- rows are filled up to whole :data:`ELEMENTWISE_LANES` (:func:`round_up`), with points whose answers nobody reads;
+- rows are padded to whole :data:`ELEMENTWISE_LANES` (:func:`round_up`), with points whose results are discarded;
 - matrix products and sums over points run over whole :data:`PRODUCT_LANES` and :data:`SUM_LANES`; products of 2×2 and
   3×3 matrices are written out as sums;
 - sin, atan2, pow, … go through :func:`pad_elementwise`.
 
-Additions, products, quotients and square roots are exact to rounding everywhere and need no such care. How many points
-are worked on at once (:data:`MAX_CHUNK_POINTS`) is a matter of speed: it is a multiple of all of them, and changes no
-bit.
+Additions, products, quotients and square roots are correctly rounded everywhere and need no padding. The number of
+points that are processed at once (:data:`MAX_CHUNK_POINTS`) affects speed only: it is a multiple of all lane counts and
+changes no bit.
 """
 
 from __future__ import annotations
@@ -22,21 +21,25 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-#: Rows of so many points leave no tail to a vector loop (two AVX-512 registers of float32 hold 32 values).
+#: Multiple of row lengths, in elements, without a scalar tail in vector loops (two AVX-512 registers of float32 hold 32
+#: values). Source: origin not recorded.
 ELEMENTWISE_LANES = 64
 
-#: Matrix products over points round alike in any company when the number of points is a multiple of this.
+#: Multiple of the number of points of a matrix product for which its rounding does not depend on that number.
+#: Source: origin not recorded.
 PRODUCT_LANES = 16
 
-#: Sums over whole blocks of so many points round alike in any company, however many empty ones follow.
+#: Block length of sums over points, in points, for which their rounding does not depend on the zeros appended.
+#: Source: origin not recorded.
 SUM_LANES = 256
 
-#: Points whose windows are read at once: few enough for these to stay in the cache.
+#: Number of points whose windows are read at once: few enough for these to stay in the cache.
+#: Source: derived, fits the L2/L3 cache.
 MAX_CHUNK_POINTS = 256
 
 
 def round_up(count: int, lanes: int = ELEMENTWISE_LANES) -> int:
-    """``count`` rounded up to whole lanes, at least one."""
+    """Count -> the next multiple of ``lanes``, at least ``lanes``."""
     return max(count + -count % lanes, lanes)
 
 

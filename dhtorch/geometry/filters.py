@@ -1,6 +1,6 @@
-"""Whole pictures: grey, and filtered; every pixel is rounded alike, whatever the batch.
+"""Filters of whole pictures: grey values, Gaussian and box blur, separable correlation; rounding independent of batch.
 
-kornia's where kornia is as fast; filters of few taps are sums of shifted copies, which take a third of a convolution.
+kornia's where kornia is as fast; filters of few taps are sums of shifted copies, a third of the time of a convolution.
 
 Alphabet: ``x`` (B, C, H, W); ``taps`` weights along one axis, odd in number. Beyond the border its pixels repeat.
 """
@@ -18,10 +18,11 @@ from dhtorch.geometry.checks import check
 
 
 def grayscale(image: Tensor) -> Tensor:
-    """Grey values (B, 1, H, W) in [0, 1] of pictures (B, C, H, W), C 1 or 3, float in [0, 1] or uint8; BT.601.
+    """Pictures (B, C, H, W) -> grey values (B, 1, H, W) in [0, 1]; BT.601.
 
-    kornia's: bit for bit those of :func:`dhtorch.geometry.patches.luma` in float32 and float64, which is twice as fast
-    on patches and reads channels along any axis. Bytes become float32, divided first.
+    C is 1 or 3, the pictures are float in [0, 1] or uint8. By kornia: bit for bit the values of
+    :func:`dhtorch.geometry.patches.luma` in float32 and float64, which is twice as fast on patches and reads channels
+    along any axis. Bytes become float32, divided first.
 
     Gradient: to the picture.
     """
@@ -32,9 +33,9 @@ def grayscale(image: Tensor) -> Tensor:
 
 
 def correlate_separable(x: Tensor, down: Sequence[float], across: Sequence[float]) -> Tensor:
-    """Correlation of (B, C, H, W) with ``down`` along the rows' axis and ``across`` along the columns'.
+    """Pictures (B, C, H, W) -> correlation with the taps ``down`` along the height and ``across`` along the width.
 
-    kornia's ``filter2d_separable`` takes three times as long at the least for up to 17 taps.
+    kornia's ``filter2d_separable`` takes at least three times as long for up to 17 taps.
 
     Raises:
         ValueError: wrong shape, or an even number of taps.
@@ -43,32 +44,32 @@ def correlate_separable(x: Tensor, down: Sequence[float], across: Sequence[float
     """
     sizes = check("correlate_separable", x=(x, "B C H W"))
     if len(down) % 2 == 0 or len(across) % 2 == 0:
-        raise ValueError(f"correlate_separable: {len(down)} and {len(across)} taps, expected odd numbers")
+        raise ValueError(f"correlate_separable: found {len(down)} and {len(across)} taps, expected odd numbers")
     i, k = len(down) // 2, len(across) // 2
     padded = F.pad(x, (k, k, i, i), mode="replicate")
-    rows = _sum([padded[..., t : t + sizes["H"], :] for t in range(len(down))], down)
-    return _sum([rows[..., t : t + sizes["W"]] for t in range(len(across))], across)
+    rows = _weighted_sum([padded[..., t : t + sizes["H"], :] for t in range(len(down))], down)
+    return _weighted_sum([rows[..., t : t + sizes["W"]] for t in range(len(across))], across)
 
 
 def gaussian_taps(sigma_px: float, derivative: bool = False) -> list[float]:
-    """Weights of a sampled Gaussian of sum 1, or of its derivative, which answers 1 to a slope of 1; sigma 0 is [1]."""
+    """Sigma -> taps of a sampled Gaussian of sum 1, or of its derivative, of response 1 to slope 1; sigma 0 is [1]."""
     if not sigma_px >= 0 or (derivative and sigma_px == 0):
         raise ValueError(f"gaussian_taps: sigma_px is {sigma_px}, expected a positive number")
-    reach = math.ceil(4 * sigma_px)
-    place = range(-reach, reach + 1)
-    weight = [math.exp(-0.5 * (p / sigma_px) ** 2) for p in place] if reach else [1.0]
+    radius = math.ceil(4 * sigma_px)
+    offsets = range(-radius, radius + 1)
+    weight = [math.exp(-0.5 * (p / sigma_px) ** 2) for p in offsets] if radius else [1.0]
     if not derivative:
         total = sum(weight)
         return [w / total for w in weight]
-    slope = [p * w for p, w in zip(place, weight, strict=True)]
-    answer = sum([p * v for p, v in zip(place, slope, strict=True)])
-    return [v / answer for v in slope]
+    slope = [p * w for p, w in zip(offsets, weight, strict=True)]
+    gain = sum([p * v for p, v in zip(offsets, slope, strict=True)])
+    return [v / gain for v in slope]
 
 
 def gaussian_blur(x: Tensor, sigma_px: float, *, reach_px: int | None = None) -> Tensor:
-    """Pictures (B, C, H, W) blurred by a Gaussian, by kornia; sigma 0 leaves them. It reaches four deviations.
+    """Pictures (B, C, H, W) -> blurred by a Gaussian up to four sigma, by kornia; unchanged for sigma 0.
 
-    Picture by picture, because kornia goes another way, which rounds otherwise, when there are more pixels in all.
+    Picture by picture, because for more pixels kornia uses an implementation that rounds differently.
 
     Raises:
         ValueError: wrong shape, or a negative sigma.
@@ -81,12 +82,12 @@ def gaussian_blur(x: Tensor, sigma_px: float, *, reach_px: int | None = None) ->
     size = len(gaussian_taps(sigma_px)) if reach_px is None else 2 * reach_px + 1
     if size == 1 or len(x) == 0:
         return x
-    blurred = [gaussian_blur2d(one, size, (sigma_px, sigma_px), border_type="replicate") for one in x.split(1)]
+    blurred = [gaussian_blur2d(picture, size, (sigma_px, sigma_px), border_type="replicate") for picture in x.split(1)]
     return torch.cat(blurred)
 
 
 def box_mean(x: Tensor, radius: int) -> Tensor:
-    """Mean over squares of ``2 radius + 1`` pixels, (B, C, H, W). Gradient: to ``x``.
+    """Pictures (B, C, H, W) -> means over squares of ``2 radius + 1`` pixels. Gradient: to ``x``.
 
     kornia's ``box_blur`` takes four times as long for a radius of 1.
     """
@@ -94,7 +95,7 @@ def box_mean(x: Tensor, radius: int) -> Tensor:
     return correlate_separable(x, [1 / side] * side, [1 / side] * side)
 
 
-def _sum(parts: Sequence[Tensor], taps: Sequence[float]) -> Tensor:
+def _weighted_sum(parts: Sequence[Tensor], taps: Sequence[float]) -> Tensor:
     total = parts[0] * taps[0]
     for part, weight in zip(parts[1:], taps[1:], strict=True):
         total = total + part * weight

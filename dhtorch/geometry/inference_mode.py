@@ -1,8 +1,8 @@
-"""What asks for no graph is worked out without the book-keeping for one, which every small operation pays for.
+"""Run a function in inference mode where no gradient is required -> its result as ordinary tensors, bit for bit.
 
 ``torch.no_grad`` still counts versions and walks the dispatcher's autograd layer at every operation;
-``torch.inference_mode`` does neither, but its tensors may enter no graph ever after. So they stay inside, and what
-comes out is copied. No bit of an answer depends on it.
+``torch.inference_mode`` does neither, but its tensors can enter no graph afterwards. So they stay inside, and the
+results are copied. No bit of a result depends on it.
 """
 
 from __future__ import annotations
@@ -22,29 +22,33 @@ _Result = TypeVar("_Result")
 
 
 def run_without_grad(fn: Callable[..., _Result], *args: Any, **options: Any) -> _Result:
-    """``fn(*args, **options)``, in inference mode where no tensor among the arguments asks for a graph.
+    """``fn(*args, **options)``, in inference mode where no tensor among the arguments requires a gradient.
 
-    Tensors that ``fn`` reads elsewhere must not ask for one; it may keep none that it makes.
+    Other tensors that ``fn`` reads must not require one, and ``fn`` must not store tensors that it creates.
 
     Gradient: that of ``fn``.
     """
-    if is_transformed() or torch.is_inference_mode_enabled():  # a compiler looks no further than the first
+    if is_transformed() or torch.is_inference_mode_enabled():  # under a compiler only the first condition is evaluated
         return fn(*args, **options)
-    if forward_ad._current_level >= 0 or _asked(args, options):
+    if forward_ad._current_level >= 0 or _requires_graph(args, options):
         return fn(*args, **options)
     with torch.inference_mode():
-        found = fn(*args, **options)
-    # A record knows its own fields: a walk through it as a tree takes several times as long.
-    return found.map(_usual) if isinstance(found, Record) else torch_pytree.tree_map(_usual, found)
+        result = fn(*args, **options)
+    # A record maps over its own fields: a generic tree map takes several times as long.
+    return (
+        result.map(_leave_inference_mode)
+        if isinstance(result, Record)
+        else torch_pytree.tree_map(_leave_inference_mode, result)
+    )
 
 
-def _asked(*trees: Any) -> bool:
-    """Whether a graph is wanted of what these tensors become."""
+def _requires_graph(*trees: Any) -> bool:
+    """Whether the results of these tensors need a graph."""
     if not torch.is_grad_enabled():
         return False
     return any(isinstance(x, Tensor) and x.requires_grad for x in torch_pytree.tree_leaves(trees))
 
 
-def _usual(x: Any) -> Any:
-    """A tensor that may enter a graph."""
+def _leave_inference_mode(x: Any) -> Any:
+    """The value, with an inference tensor copied to one that can enter a graph."""
     return x.clone() if isinstance(x, Tensor) and x.is_inference() else x

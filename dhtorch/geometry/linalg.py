@@ -1,11 +1,11 @@
-"""2×2 and 3×3 matrices in closed form: what is written out is written out here, once.
+"""Closed forms of 2×2 and 3×3 matrices: determinants, inverses, eigenvalues and products with batch-independent sums.
 
 Alphabet: a 2×2 matrix is its *entries* ((a, b), (c, d)), four tensors of one shape, so that each operation is
-contiguous over points and the caller may keep them as he likes; a symmetric one is ((a, b), (b, c)). *Matrices* are
+contiguous over points and the caller chooses their memory layout; a symmetric one is ((a, b), (b, c)). *Matrices* are
 (…, m, n), *planes* (m, n, …), components first and points last.
 
-Products are sums of products, not matrix products: their rounding does not depend on how many matrices there are
-(:mod:`dhtorch.geometry.determinism`). The order of every sum is part of the answer.
+Products are sums of products, not calls of ``matmul``: their rounding does not depend on the number of matrices
+(:mod:`dhtorch.geometry.determinism`). The order of every sum is part of the definition.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from torch import Tensor
 
 
 def determinant_2x2(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> Tensor:
-    """a d − b c. Gradient: to all."""
+    """Entries -> determinant a d − b c. Gradient: to all."""
     return a * d - b * c
 
 
 def adjugate_2x2(a: Tensor, b: Tensor, c: Tensor, d: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Entries ((d, −b), (−c, a)): the inverse times the determinant. Gradient: to all."""
+    """Entries -> entries ((d, −b), (−c, a)) of the adjugate: the inverse times the determinant. Gradient: to all."""
     return d, -b, -c, a
 
 
 def inverse_2x2(a: Tensor, b: Tensor, c: Tensor, d: Tensor, *, least: float) -> Tensor:
-    """Entries (4, …) of the inverse; a determinant not larger than ``least`` in size, or no number, counts as that.
+    """Entries -> entries (4, …) of the inverse; a determinant of magnitude ≤ ``least``, or NaN, counts as ``least``.
 
     Gradient: to all; finite where the determinant counts as ``least``.
     """
@@ -35,34 +35,34 @@ def inverse_2x2(a: Tensor, b: Tensor, c: Tensor, d: Tensor, *, least: float) -> 
 
 
 def eigenvalues_2x2(a: Tensor, b: Tensor, c: Tensor) -> tuple[Tensor, Tensor]:
-    """The smaller and the larger eigenvalue of ((a, b), (b, c)).
+    """Entries of ((a, b), (b, c)) -> the smaller and the larger eigenvalue.
 
     Gradient: to all; where both are equal that of their mean.
     """
     half, middle = (a - c) / 2, (a + c) / 2
     square = half * half + b * b
-    apart = square > 0
-    split = torch.where(apart, torch.where(apart, square, torch.ones_like(square)).sqrt(), square)
+    is_distinct = square > 0
+    split = torch.where(is_distinct, torch.where(is_distinct, square, torch.ones_like(square)).sqrt(), square)
     return middle - split, middle + split
 
 
 def quadratic_form(x: Tensor, y: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """(x, y) ((a, b), (b, c)) (x, y)ᵀ. Gradient: to all."""
+    """Vector and symmetric matrix -> (x, y) ((a, b), (b, c)) (x, y)ᵀ. Gradient: to all."""
     return x * x * a + 2 * x * y * b + y * y * c
 
 
 def upper_triangle(S: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Entries a, b, c of symmetric matrices (…, 2, 2), whose lower left is not read. Gradient: to ``S``."""
+    """Symmetric matrices (…, 2, 2) -> entries a, b, c; the lower left is not read. Gradient: to ``S``."""
     return S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
 
 
 def small_matmul(A: Tensor, B: Tensor) -> Tensor:
-    """Matrices (…, m, k) times (…, k, n). Gradient: to both."""
+    """Matrices (…, m, k) and (…, k, n) -> products (…, m, n). Gradient: to both."""
     return (A[..., :, :, None] * B[..., None, :, :]).sum(-2)
 
 
 def matmul_planes(A: Tensor, B: Tensor) -> Tensor:
-    """Planes (m, k, …) times (k, n, …). Gradient: to both."""
+    """Planes (m, k, …) and (k, n, …) -> products (m, n, …). Gradient: to both."""
     return (A[:, :, None] * B[None]).sum(1)
 
 
@@ -70,7 +70,9 @@ def rotate_planes(
     R: Tensor,  # (B, m, 3)
     x: Tensor,  # (B, 3, N)
 ) -> Tensor:
-    """R x of vectors in planes (B, m, N); :func:`dhtorch.geometry.se3.rotate` is the same of points (B, N, 3).
+    """Matrices (B, m, 3) and vectors in planes (B, 3, N) -> R x (B, m, N).
+
+    :func:`dhtorch.geometry.se3.rotate` is the same for points (B, N, 3).
 
     Gradient: to both.
     """
@@ -80,7 +82,7 @@ def rotate_planes(
 
 
 def cofactor_planes(A: Tensor) -> Tensor:
-    """Cofactor matrices of planes (3, 3, …): row i is the cross product of the two rows that follow it in the circle.
+    """Planes (3, 3, …) -> cofactor matrices: row i is the cross product of the two rows that follow it cyclically.
 
     Gradient: to ``A``.
     """

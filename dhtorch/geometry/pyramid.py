@@ -1,7 +1,7 @@
-"""Image pyramids ready for window searches: padded levels, with their gradients beside them.
+"""Image pyramids: images -> padded grey levels with gradients, for window searches.
 
-Alphabet: ``image`` (B, C, H, W); ``level`` (B, P, H_l + 2 pad, W_l + 2 pad), whose planes are the grey value and, where
-windows are to be searched for and not only searched in, its gradients along x and y. Pixel i of a level lies at pixel
+Alphabet: ``image`` (B, C, H, W); ``level`` (B, P, H_l + 2 pad, W_l + 2 pad), whose planes are the grey value and, for
+the source of a search, its gradients along x and y. Pixel i of a level lies at pixel
 2 i of the level below it.
 """
 
@@ -20,19 +20,26 @@ from dhtorch.geometry.patches import extract_windows
 from dhtorch.geometry.windows import row_bands
 from dhtorch.ops.dispatch import operator
 
-#: Padding beyond half a window: how far from a pixel of the image (or of ``OUTSIDE_MARGIN_PX`` around it) a search may
-#: look.
+#: Padding of a level beyond half a window, px: the largest distance of a search from a pixel of the image or of the
+#: ``OUTSIDE_MARGIN_PX`` around it. Source: origin not recorded.
 SEARCH_PADDING_PX = 8
 
-#: How far outside the image the middle of a window may lie, px of the level.
+#: Largest distance of the centre of a window from the image, px of the level. Source: origin not recorded.
 OUTSIDE_MARGIN_PX = 4
 
-#: Planes of a level.
-GREY_PLANE, GRAD_X_PLANE, GRAD_Y_PLANE = 0, 1, 2
+#: Index of a level's plane of grey values. Source: derived, the order in ``build_pyramid``.
+GREY_PLANE = 0
+
+#: Index of a level's plane of gradients along x. Source: derived, the order in ``build_pyramid``.
+GRAD_X_PLANE = 1
+
+#: Index of a level's plane of gradients along y. Source: derived, the order in ``build_pyramid``.
+GRAD_Y_PLANE = 2
 
 
 class Pyramid(NamedTuple):
-    """Padded levels of a batch of images, finest first. A plain pytree: it may be kept, moved and compiled."""
+    """Padded levels of a batch of images, finest first. A plain pytree: it may be stored, moved to a device and
+    compiled."""
 
     levels: tuple[Tensor, ...]  # each (B, 3 or 1, H_l + 2 pad, W_l + 2 pad)
     pad: int
@@ -43,36 +50,38 @@ class Pyramid(NamedTuple):
         return rows - 2 * self.pad, width - 2 * self.pad
 
     def bounds(self, level: int = 0) -> tuple[Tensor, Tensor]:
-        """Lowest and highest position (2, 1) of a point on a level: its pixels' area, and coarsely the margin as well.
+        """Lowest and highest position (2, 1) of a point on a level: the area of its pixels, on coarse levels with
+        margin.
 
-        A coarse step that overshoots the border may come back; on the finest level it is lost.
+        A point that overshoots the border on a coarse level may return; on the finest level it is lost.
         """
         H, W = self.hw()
         high = self.levels[0].new_tensor([[W - 0.5], [H - 0.5]])
-        slack = OUTSIDE_MARGIN_PX if level else 0
-        return torch.full_like(high, -0.5) * 0.5**level - slack, high * 0.5**level + slack
+        margin = OUTSIDE_MARGIN_PX if level else 0
+        return torch.full_like(high, -0.5) * 0.5**level - margin, high * 0.5**level + margin
 
     def corner(self, level: int, x: Tensor) -> Tensor:
-        """The pixel (2, M) left of and above ``x`` (2, M), on a level or in the margin around it."""
-        return torch.clamp(x.detach().floor(), *_margins(self.hw(level), device=x.device, dtype=x.dtype))
+        """Points ``x`` (2, M) -> the pixels (2, M) left of and above them, on a level or in the margin around it."""
+        return torch.clamp(x.detach().floor(), *_corner_limits(self.hw(level), device=x.device, dtype=x.dtype))
 
     def locate(self, level: int, x: Tensor, batch: Tensor, before: int, planes: tuple[int, ...]):
-        """Where windows begin that reach ``before`` pixels left of and above floor(x), and the fraction of x.
+        """First pixels of windows that extend ``before`` pixels left of and above floor(x), and the fractions of x.
 
         ``x`` (2, M) px of the level, ``batch`` (M,); returns flat indices (P, M), one row per plane, and (2, M).
         """
         count, rows, width = self.levels[level].shape[1:]
-        whole = self.corner(level, x)
-        u, v = whole.long()
-        first = _first(planes, rows * width, (self.pad - before) * (width + 1), device=x.device)
-        return torch.add(first, batch, alpha=count * rows * width) + torch.add(u, v, alpha=width), x - whole
+        corner = self.corner(level, x)
+        u, v = corner.long()
+        first = _plane_offsets(planes, rows * width, (self.pad - before) * (width + 1), device=x.device)
+        return torch.add(first, batch, alpha=count * rows * width) + torch.add(u, v, alpha=width), x - corner
 
     def read(self, level: int, first: Tensor, size: int, fraction: Tensor | None = None) -> Tensor:
-        """Windows (P, M, size²) that begin at ``first`` (P, M), or (bilinear) ``fraction`` (2, M) right and below."""
+        """Windows (P, M, size²) from pixel ``first`` (P, M) on, or bilinear, ``fraction`` (2, M) to the right and
+        below."""
         if fraction is None:
             return extract_windows(self.levels[level], first, size).flatten(-2)
-        # Between columns by shifting the window as one long row, which runs at full speed; what the shift carries over
-        # a row's end lands in the last column, which is left out.
+        # Interpolation between columns shifts the window as one long row, which is fast; values that the shift moves
+        # across a row's end are in the last column, which is dropped.
         side = size + 1
         w = extract_windows(self.levels[level], first, side).flatten(-2)
         w = torch.lerp(w[..., :-1], w[..., 1:], fraction[0][:, None]).unfold(-1, size, side)
@@ -81,52 +90,50 @@ class Pyramid(NamedTuple):
     def windows(
         self, level: int, x: Tensor, batch: Tensor, size: int, planes=(GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE)
     ) -> Tensor:
-        """Windows (P, M, size²) around ``x`` (2, M), between pixels."""
+        """Windows (P, M, size²) around ``x`` (2, M), interpolated between pixels."""
         first, fraction = self.locate(level, x, batch, size // 2, planes)
         return self.read(level, first, size, fraction)
 
 
 @lru_cache(maxsize=64)
-def _margins(hw: tuple[int, int], *, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """First and last pixel (2, 1) of an image and the margin around it."""
+def _corner_limits(hw: tuple[int, int], *, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """First and last pixel (2, 1) of an image with the margin around it."""
     H, W = hw
     last = torch.tensor([[W - 1 + OUTSIDE_MARGIN_PX], [H - 1 + OUTSIDE_MARGIN_PX]], device=device, dtype=dtype)
     return torch.full_like(last, -OUTSIDE_MARGIN_PX), last
 
 
 @lru_cache(maxsize=256)
-def _first(planes: tuple[int, ...], size: int, shift: int, *, device: torch.device) -> Tensor:
-    """Flat indices (P, 1) of pixel ``shift`` of some planes of ``size`` pixels."""
+def _plane_offsets(planes: tuple[int, ...], size: int, shift: int, *, device: torch.device) -> Tensor:
+    """Flat indices (P, 1) of pixel ``shift`` of the ``planes``, of ``size`` pixels each."""
     return torch.tensor(planes, device=device)[:, None] * size + shift
 
 
 class PyramidCache:
-    """The pyramids of a batch of images, each built when it is first asked for: of a reference view tracked into many
-    views.
+    """Pyramids of a batch of images, each built at first use: for a reference view that is tracked into many views.
 
-    Carries no graph. ``pyramids[i:j]`` are those of some of the images.
+    Carries no graph. ``pyramids[i:j]`` are those of images i to j - 1.
     """
 
     def __init__(self, image: Tensor) -> None:
-        self.image = image  # (B, C, H, W), as build_pyramid takes it
-        self._built: dict[tuple[int, int], Pyramid] = {}
+        self.image = image  # (B, C, H, W), see build_pyramid
+        self._pyramids: dict[tuple[int, int], Pyramid] = {}
         self._parts: dict[tuple[int, int], PyramidCache] = {}
-        self._more: dict[Hashable, Any] = {}
+        self._cached: dict[Hashable, Any] = {}
 
     def __call__(self, levels: int, window: int) -> Pyramid:
-        """``build_pyramid(image, levels, window)``, made once."""
-        if (levels, window) not in self._built:
+        """``build_pyramid(image, levels, window)``, built once."""
+        if (levels, window) not in self._pyramids:
             with torch.no_grad():
-                self._built[levels, window] = build_pyramid(self.image, levels, window)
-        return self._built[levels, window]
+                self._pyramids[levels, window] = build_pyramid(self.image, levels, window)
+        return self._pyramids[levels, window]
 
     def once(self, key: Hashable, make: Callable[[Tensor], Any]) -> Any:
-        """``make(image)``, made once for all who name it by ``key``: what else a tracker knows of its reference
-        view."""
-        if key not in self._more:
+        """``make(image)``, computed once per ``key``: for other data that a tracker derives from its reference view."""
+        if key not in self._cached:
             with torch.no_grad():
-                self._more[key] = make(self.image)
-        return self._more[key]
+                self._cached[key] = make(self.image)
+        return self._cached[key]
 
     def __getitem__(self, part: slice) -> PyramidCache:
         start, stop, _ = part.indices(len(self.image))
@@ -142,15 +149,15 @@ def build_pyramid(
     *,
     gradients: bool = True,
 ) -> Pyramid:
-    """Grey pyramid with gradients, padded for searches with windows of ``window`` pixels.
+    """Images -> grey pyramid with gradients, padded for searches with windows of ``window`` pixels.
 
-    Each level is the one below, smoothed by the binomial filter (1 4 6 4 1) / 16 and taken at even pixels; gradients
+    Each level is the one below, smoothed by the binomial filter (1 4 6 4 1) / 16 and sampled at even pixels; gradients
     are Scharr's, per pixel. Outside the image the grey value is mirrored about the border pixel and the gradient is
-    zero (a mirrored gradient would hold a window back at the border). As in ``cv2.buildOpticalFlowPyramid``
-    (``tests/docs/test_statements.py``), a level that would be no larger than the window is not made.
+    zero (a mirrored gradient would keep a window inside the border). As in ``cv2.buildOpticalFlowPyramid``
+    (``tests/docs/test_statements.py``), a level that would be no larger than the window is left out.
 
     Args:
-        gradients: without them the pyramid takes a third of the memory; windows can be searched in it, not for it.
+        gradients: without them the pyramid takes a third of the memory and can only be the target of a search.
 
     Returns:
         1 to ``levels`` levels (full resolution included) in the image's dtype, float32 for narrower ones.
@@ -191,17 +198,17 @@ def _fill_level(below: Tensor, level: Tensor, *, pad: int, finest: bool) -> None
     grey = level[:, GREY_PLANE : GREY_PLANE + 1]
     inside = grey[..., pad:-pad, pad:-pad]
     for part in row_bands(below, inside.shape[-2:]):
-        inside[..., part, :] = filters.grayscale(below[..., part, :]) if finest else _half(below, pad, part)
-    _mirror(grey, pad)
+        inside[..., part, :] = filters.grayscale(below[..., part, :]) if finest else _downscale(below, pad, part)
+    _mirror_padding(grey, pad)
     if level.shape[1] > 1:
         _add_gradients(level, pad, below)
 
 
-def _half(level: Tensor, pad: int, part: slice) -> Tensor:
-    """Rows ``part`` of the half-size image of a padded one, as ``cv2.pyrDown`` (``tests/geometry/test_pyramid.py``).
+def _downscale(level: Tensor, pad: int, part: slice) -> Tensor:
+    """Padded level -> rows ``part`` of its half-size image, as ``cv2.pyrDown`` (``tests/geometry/test_pyramid.py``).
 
-    kornia's ``pyrdown`` samples at other places, and takes four to ten times as long. Rows first, because their slices
-    are contiguous; then even and odd columns are taken apart once.
+    kornia's ``pyrdown`` samples at other positions and takes four to ten times as long. Rows first, because their
+    slices are contiguous; then even and odd columns are separated once.
     """
     w = (level.shape[-1] - 2 * pad + 1) // 2
     top, bottom = (pad + 2 * row for row in (part.start, part.stop))
@@ -209,17 +216,17 @@ def _half(level: Tensor, pad: int, part: slice) -> Tensor:
         level[:, GREY_PLANE : GREY_PLANE + 1, top + k : bottom + k : 2, pad - 2 : pad + 2 * w + 1]
         for k in (-2, -1, 0, 1, 2)
     ]
-    smooth = _binomial(*rows)
+    smooth = _binomial_5(*rows)
     even = smooth[..., ::2].contiguous()
     odd = smooth[..., 1::2].contiguous()
-    return _binomial(even[..., :w], odd[..., :w], even[..., 1 : w + 1], odd[..., 1:], even[..., 2:])
+    return _binomial_5(even[..., :w], odd[..., :w], even[..., 1 : w + 1], odd[..., 1:], even[..., 2:])
 
 
-def _binomial(a: Tensor, b: Tensor, c: Tensor, d: Tensor, e: Tensor) -> Tensor:
+def _binomial_5(a: Tensor, b: Tensor, c: Tensor, d: Tensor, e: Tensor) -> Tensor:
     return torch.add(torch.add(a + e, b + d, alpha=4), c, alpha=6) * (1 / 16)
 
 
-def _mirror(grey: Tensor, pad: int) -> None:
+def _mirror_padding(grey: Tensor, pad: int) -> None:
     """Fill the padding of (B, 1, rows, width) with the image mirrored about its border pixels."""
     middle = grey[..., pad:-pad, :]
     middle[..., :pad] = middle[..., pad + 1 : 2 * pad + 1].flip(-1)
@@ -229,7 +236,7 @@ def _mirror(grey: Tensor, pad: int) -> None:
 
 
 def _add_gradients(level: Tensor, pad: int, below: Tensor) -> None:
-    """Fill the planes beside the grey one: Scharr's filter (3 10 3) x (-1 0 1) / 32, kornia has none; 0 outside."""
+    """Fill the gradient planes: Scharr's filter (3 10 3) x (-1 0 1) / 32, which kornia lacks; 0 outside the image."""
     planes, grey = level[:, GRAD_X_PLANE:], level[:, GREY_PLANE : GREY_PLANE + 1]
     for border in (planes[..., :pad, :], planes[..., -pad:, :], planes[..., :pad], planes[..., -pad:]):
         border.zero_()

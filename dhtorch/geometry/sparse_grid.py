@@ -1,8 +1,8 @@
-"""Cells of a regular grid, of which only some are there: as sorted numbers instead of a table of space.
+"""Sparse regular grid: points -> sorted cell keys, with look-up, neighbours and connected components of cells.
 
-Alphabet: ``ijk`` (…, 3) int64, a cell's place in steps of the grid; ``key`` its number, 21 bits for each axis, so that
-numbers sort as places do. A list of numbers in rising order is looked up by bisection: no table, no collision, and the
-same order whichever order the points came in.
+Alphabet: ``ijk`` (…, 3) int64, a cell's position in steps of the grid; ``key`` its number, 21 bits for each axis, so
+that keys sort as positions do. A sorted list of keys is searched by bisection: no dense table, no collision, and a
+result that does not depend on the order of the points.
 """
 
 from __future__ import annotations
@@ -12,15 +12,18 @@ from torch import Tensor
 
 from dhtorch.geometry.checks import check
 
+#: Bits of a key per axis. Source: derived, ⌊63 / 3⌋: three axes fit a non-negative int64.
 CELL_BITS = 21
-#: Places from -REACH to REACH - 1 have a number.
+
+#: Positions from -CELL_RANGE to CELL_RANGE - 1 along an axis, in cells, have a key. Source: derived, 2^(CELL_BITS - 1).
 CELL_RANGE = 1 << (CELL_BITS - 1)
-#: Number of a place that is out of reach.
+
+#: Key of a position out of range. Source: derived, valid keys are non-negative.
 OUT_OF_RANGE = -1
 
 
 def pack_cells(ijk: Tensor) -> Tensor:
-    """Numbers (…,) of cells (…, 3) int64; NOWHERE for a place out of reach. Gradient: none."""
+    """Cells (…, 3) int64 -> keys (…,); :data:`OUT_OF_RANGE` for positions out of range. Gradient: none."""
     check("pack_cells", ijk=(ijk, "* 3"))
     shifted = ijk + CELL_RANGE
     inside = ((shifted >= 0) & (shifted < 2 * CELL_RANGE)).all(-1)
@@ -29,7 +32,7 @@ def pack_cells(ijk: Tensor) -> Tensor:
 
 
 def unpack_cells(key: Tensor) -> Tensor:
-    """Cells (…, 3) int64 of numbers (…,), the inverse of :func:`pack_cells`. Gradient: none."""
+    """Keys (…,) -> cells (…, 3) int64, the inverse of :func:`pack_cells`. Gradient: none."""
     mask = 2 * CELL_RANGE - 1
     return torch.stack((key >> 2 * CELL_BITS, (key >> CELL_BITS) & mask, key & mask), -1) - CELL_RANGE
 
@@ -38,7 +41,7 @@ def find_cells(
     keys: Tensor,  # (K,) int64, rising
     wanted: Tensor,  # (…,) int64
 ) -> tuple[Tensor, Tensor]:
-    """Where numbers stand in a list: positions (…,), 0 where they are not in it, and whether they are.
+    """Sorted keys and wanted keys -> positions (…,) in the list, 0 for keys that are absent, and whether present.
 
     Raises:
         ValueError: wrong shapes.
@@ -46,16 +49,16 @@ def find_cells(
     K = check("find_cells", keys=(keys, "K"))["K"]
     if not K:
         return torch.zeros_like(wanted), torch.zeros_like(wanted, dtype=torch.bool)
-    at = torch.searchsorted(keys, wanted).clamp_max(K - 1)
-    found = keys[at] == wanted
-    return torch.where(found, at, 0), found
+    position = torch.searchsorted(keys, wanted).clamp_max(K - 1)
+    is_present = keys[position] == wanted
+    return torch.where(is_present, position, 0), is_present
 
 
 def occupied_cells(
     xyz: Tensor,  # (…, 3) m
     side: float,
 ) -> Tensor:
-    """Numbers (V,), rising, of the cells of ``side`` metres that points fall into; non-finite points are nowhere.
+    """Points -> keys (V,), rising, of the cells of ``side`` metres that contain them; non-finite points are left out.
 
     Raises:
         ValueError: wrong shapes, or a side that is not positive.
@@ -64,28 +67,28 @@ def occupied_cells(
     if not side > 0:
         raise ValueError(f"occupied_cells: side is {side}, expected a positive length")
     scaled = xyz.reshape(-1, 3).double() / side
-    there = (scaled.abs() < CELL_RANGE).all(-1)  # false for NaN
-    return pack_cells(scaled[there].floor().long()).unique()
+    in_range = (scaled.abs() < CELL_RANGE).all(-1)  # false for NaN
+    return pack_cells(scaled[in_range].floor().long()).unique()
 
 
 def touches_cells(
     keys: Tensor,  # (K,) int64, rising
     others: Tensor,  # (V,) int64, rising
 ) -> Tensor:
-    """Whether (K,) bool each cell is one of the others, or touches one, be it by a corner.
+    """Keys -> whether each cell, (K,) bool, is one of ``others`` or touches one by a face, edge or corner.
 
     Raises:
         ValueError: wrong shapes.
     """
     check("touches_cells", keys=(keys, "K"), others=(others, "V"))
-    around = pack_cells(unpack_cells(keys)[:, None] + _steps(keys))
+    around = pack_cells(unpack_cells(keys)[:, None] + _neighbour_steps(keys))
     return find_cells(others, around)[1].any(-1)
 
 
 def connected_components(keys: Tensor) -> Tensor:
-    """Which cells (K,), numbers in rising order, hang together by faces, edges or corners: labels (K,) int64 from 0.
+    """Sorted keys (K,) -> labels (K,) int64 from 0 of the components connected by faces, edges or corners.
 
-    Two cells have the same label when a chain of touching cells joins them; labels rise with their first cell.
+    Two cells have the same label when a chain of touching cells connects them; labels rise with their first cell.
 
     Raises:
         ValueError: wrong shapes.
@@ -93,21 +96,21 @@ def connected_components(keys: Tensor) -> Tensor:
     Cost: the logarithm of the longest chain, times 13 look-ups of all cells.
     """
     check("connected_components", keys=(keys, "K"))
-    at, found = find_cells(
-        keys, pack_cells(unpack_cells(keys)[:, None] + _steps(keys)[14:])
+    position, is_present = find_cells(
+        keys, pack_cells(unpack_cells(keys)[:, None] + _neighbour_steps(keys)[14:])
     )  # each pair of neighbours once
-    a, b = torch.arange(len(keys), device=keys.device)[:, None].expand_as(at)[found], at[found]
+    a, b = torch.arange(len(keys), device=keys.device)[:, None].expand_as(position)[is_present], position[is_present]
     label = torch.arange(len(keys), device=keys.device)
     while True:
-        one, other = label[a], label[b]
-        new = label.scatter_reduce(0, torch.maximum(one, other), torch.minimum(one, other), "amin")
-        while bool((new[new] != new).any()):
-            new = new[new]
-        if torch.equal(new, label):
+        label_a, label_b = label[a], label[b]
+        merged = label.scatter_reduce(0, torch.maximum(label_a, label_b), torch.minimum(label_a, label_b), "amin")
+        while bool((merged[merged] != merged).any()):
+            merged = merged[merged]
+        if torch.equal(merged, label):
             return label.unique(return_inverse=True)[1]
-        label = new
+        label = merged
 
 
-def _steps(like: Tensor) -> Tensor:
-    """The 27 steps (27, 3) to a cell itself (at 13) and its neighbours, opposite ones mirrored about the middle."""
+def _neighbour_steps(like: Tensor) -> Tensor:
+    """Steps (27, 3) to a cell itself (index 13) and its neighbours; opposite steps mirror about the middle index."""
     return torch.cartesian_prod(*(torch.arange(-1, 2, device=like.device),) * 3)

@@ -1,4 +1,4 @@
-"""What lies around every pixel of a map: sums, extremes and means of windows, read from the whole map at once.
+"""Window filters: maps (B, h, w) -> sums, extremes, ranges and edge-preserving means of the window of every pixel.
 
 Alphabet: maps (B, h, w); a window of *radius* r has (2 r + 1)² pixels. Beyond the border its pixels repeat.
 """
@@ -12,13 +12,14 @@ from torch import Tensor
 
 from dhtorch.ops.dispatch import operator
 
-#: Pixels that are worked on at once: few enough to stay in the cache, and to need no fresh memory.
+#: Largest number of pixels that are processed at once: few enough to stay in the cache and to need no fresh memory.
+#: Source: derived, fits the L2/L3 cache.
 MAX_BAND_PIXELS = 1 << 17
 
 
 def row_bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
-    """Rows of maps of size ``hw``, made from pictures (B, ...), to be worked on at once; all of them where a graph or a
-    compiler would have to carry each."""
+    """Picture (B, ...) and map size -> slices of rows to process at once; a single one under a gradient or a compiler,
+    where each would add to the graph."""
     h, w = hw
     whole = torch.compiler.is_compiling() or (image.requires_grad and torch.is_grad_enabled())
     rows = h if whole else max(MAX_BAND_PIXELS // max(len(image) * w, 1), 1)
@@ -26,37 +27,38 @@ def row_bands(image: Tensor, hw: tuple[int, ...]) -> list[slice]:
 
 
 def window_sum(x: Tensor, radius: int) -> Tensor:
-    """Sum (B, h, w) of the (2 radius + 1)² pixels around each, the border's repeated outside. Gradient: to x."""
+    """Map (B, h, w) -> sums of the (2 radius + 1)² pixels around each, the border repeated outside. Gradient: to x."""
     for dim in (1, 2):
         n, side = x.shape[dim], 2 * radius + 1
         first, last = (x.narrow(dim, k, 1) for k in (0, n - 1))
-        part = torch.cat([first] * radius + [x] + [last] * radius, dim)  # sums of 1, 2, 4, … neighbours
-        x, width, begin = part.narrow(dim, 0, n), 1, 1
+        partial = torch.cat([first] * radius + [x] + [last] * radius, dim)  # sums of 1, 2, 4, … neighbours
+        x, width, start = partial.narrow(dim, 0, n), 1, 1
         while 2 * width <= side:
-            length = part.shape[dim] - width
-            part = part.narrow(dim, 0, length) + part.narrow(dim, width, length)
+            length = partial.shape[dim] - width
+            partial = partial.narrow(dim, 0, length) + partial.narrow(dim, width, length)
             width *= 2
             if side & width:
-                x = x + part.narrow(dim, begin, n)
-                begin += width
+                x = x + partial.narrow(dim, start, n)
+                start += width
     return x
 
 
 def window_extreme(x: Tensor, radius: int, pick: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """What ``pick`` chooses of two, torch.maximum or torch.minimum, in the window around each pixel (B, h, w): of two
-    windows half as wide, and so on. Gradient: to x."""
+    """Map (B, h, w) -> extreme of the window around each pixel; ``pick`` is torch.maximum or torch.minimum.
+
+    Computed from two windows half as wide, recursively. Gradient: to x."""
     for dim in (1, 2):
         first, last = (x.narrow(dim, k, 1) for k in (0, x.shape[dim] - 1))
         x, width = torch.cat([first] * radius + [x] + [last] * radius, dim), 1
         while width < 2 * radius + 1:
-            more = min(width, 2 * radius + 1 - width)
-            length = x.shape[dim] - more
-            x, width = pick(x.narrow(dim, 0, length), x.narrow(dim, more, length)), width + more
+            shift = min(width, 2 * radius + 1 - width)
+            length = x.shape[dim] - shift
+            x, width = pick(x.narrow(dim, 0, length), x.narrow(dim, shift, length)), width + shift
     return x
 
 
 def window_range(q: Tensor, radius: int) -> Tensor:
-    """Largest minus smallest value (B, h, w) of a map in the window around each pixel. Gradient: none."""
+    """Map (B, h, w) -> largest minus smallest value in the window around each pixel. Gradient: none."""
     q = q.detach()
     return window_extreme(q, radius, torch.maximum) - window_extreme(q, radius, torch.minimum)
 
@@ -69,24 +71,24 @@ def _smooth_kernel(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
 
 @operator(kernel=_smooth_kernel, dtypes={"q": torch.float32, "tolerance": torch.float32})
 def smooth_within_tolerance(q: Tensor, tolerance: Tensor, *, radius: int = 4) -> Tensor:
-    """Inverse depths (B, h, w), each the mean of those along its column, then along its row, up to ``radius`` away that
-    differ from it by no more than ``tolerance`` (B,) 1/m: planes stay what they are, and so do edges.
+    """Inverse depths q (B, h, w) -> smoothed along columns, then rows, over values within ``tolerance`` (B,) 1/m.
 
-    A window cannot see how its pixels scatter about their mean, so what is fitted by windows must be smooth within
-    them. Gradient: to q.
+    Each value becomes the mean of those up to ``radius`` away that differ by no more than the tolerance: planes and
+    edges are preserved. A fit of windows is blind to the scatter of inverse depth within a window, so the map must be
+    smooth there. Gradient: to q.
     """
-    near = tolerance[:, None, None]
+    limit = tolerance[:, None, None]
     for dim in (1, 2):
         n = q.shape[dim]
         reach = min(radius, n - 1)
-        none = torch.full_like(q.narrow(dim, 0, reach), torch.inf)
-        wide = torch.cat([none, q, none], dim)
+        border = torch.full_like(q.narrow(dim, 0, reach), torch.inf)
+        padded = torch.cat([border, q, border], dim)
         total, count = q, torch.zeros_like(q, dtype=torch.int16)
         for k in range(1, reach + 1):
-            # a plane is kept where both sides are read: k before with k after
-            before, after = (wide.narrow(dim, reach + step, n) for step in (-k, k))
-            fine = torch.maximum((before - q).abs(), (after - q).abs()) <= near
-            total = total + torch.where(fine, before + after, 0.0)
-            count = count + fine.to(count.dtype)
+            # planes are preserved because both sides are used together: k before and k after
+            before, after = (padded.narrow(dim, reach + step, n) for step in (-k, k))
+            is_close = torch.maximum((before - q).abs(), (after - q).abs()) <= limit
+            total = total + torch.where(is_close, before + after, 0.0)
+            count = count + is_close.to(count.dtype)
         q = total / (1 + 2 * count).to(q)
     return q
