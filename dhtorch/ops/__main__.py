@@ -1,6 +1,6 @@
 """``python -m dhtorch.ops``: compile the operators and print the path of the library.
 
-Exit code 2 where that is not possible.
+Exit code 2 if that is not possible.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from dhtorch.ops import loader
 
 
 def main() -> int:
-    """The exit code."""
-    options = sys.argv[1:]
-    if {"-h", "--help"} & set(options):
+    """Command-line arguments -> exit code."""
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
         print(loader.__doc__)
         return 0
-    if options:
-        print(f"found {options[0]!r}, expected no options: {loader.COMMAND}")
+    if arguments:
+        print(f"{loader.COMMAND}: found {arguments[0]!r}, expected no arguments")
         return 2
     try:
         print(loader.build())

@@ -1,21 +1,23 @@
-"""Constants that both the torch functions and the C++ kernels need when they are compiled.
+"""Compile-time constants that the torch functions share with the C++ kernels.
 
-Written with the codes of :mod:`dhtorch.codes` into a header by :func:`dhtorch.ops.loader.constants_header`. Every other
-constant of a kernel is one of its arguments.
+:func:`dhtorch.ops.loader.constants_header` writes them, with the codes of :mod:`dhtorch.codes`, into a header. Every
+other constant of a kernel is an argument.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
-#: ITU-R BT.601 luma weights of red, green and blue, in thousandths: those of ``cv2.cvtColor``.
+#: Luma weights of red, green and blue, thousandths: those of ``cv2.cvtColor``. Source: ITU-R BT.601.
 LUMA_THOUSANDTHS: Final = (299, 587, 114)
 
-#: Half width of the windows that a swept surface is fitted in, px: 9×9 pixels.
+#: Radius of the windows of a swept surface's refinement, px: 9×9 pixels. Source: origin not recorded.
 FIT_RADIUS_PX: Final = 4
 
-#: Widest window around a sample that the kernels read, px.
+#: Largest width of a window around a sample that the kernels support, px. Source: origin not recorded.
 MAX_KERNEL_WINDOW_PX: Final = 16
 
-#: Largest radius of a correlation map in the search for points, in pixels.
+#: Largest radius of a correlation map in the Lucas-Kanade search, px.
+#: Source: derived, the largest of ``TOP_RADII``, ``MIDDLE_RADII`` and ``FINEST_RADII`` of
+#: :mod:`dhtorch.geometry.lucas_kanade`.
 MAX_MAP_RADIUS_PX: Final = 2

@@ -1,4 +1,4 @@
-"""The dispatch: an operator is a torch function, its reference, with an optional compiled kernel of the same result.
+"""Dispatch of operators: a torch function, the reference, and an optional compiled kernel of the same result.
 
     def _scale_kernel(x, *, factor):
         out = torch.empty_like(x)
@@ -9,9 +9,9 @@
     def scale(x, *, factor):
         return x * factor
 
-``scale(x, factor=2.0)`` runs the kernel where the library is in use (:func:`dhtorch.ops.loader.load`, or DHTORCH_OPS=1)
+``scale(x, factor=2.0)`` runs the kernel if the library is in use (:func:`dhtorch.ops.loader.load`, or DHTORCH_OPS=1)
 and all tensors are eligible, else the reference. The tensors of an operator are its positional parameters, its options
-are keywords. A kernel allocates the outputs and calls the C++ operator that ``TORCH_LIBRARY`` registers in ``csrc``; it
+keywords. A kernel allocates the outputs and calls the C++ operator that ``TORCH_LIBRARY`` registers in ``csrc``; it
 has no condition of its own.
 
 Eligible are plain contiguous CPU tensors of the stated dtypes that are not being differentiated or transformed: no
@@ -66,15 +66,15 @@ def operator(
         if names != list(dtypes) or not set(any_layout) <= set(names):
             raise TypeError(f"{reference.__name__}: found dtypes of {', '.join(dtypes)}, expected {', '.join(names)}")
         parameters = tuple(
-            ((found,) if isinstance(found, torch.dtype) else found, name in any_layout)
-            for name, found in dtypes.items()
+            ((allowed,) if isinstance(allowed, torch.dtype) else allowed, name in any_layout)
+            for name, allowed in dtypes.items()
         )
 
         @wraps(reference)
         def dispatched(*args: P.args, **kwargs: P.kwargs) -> T:
             if not is_in_use():
                 return reference(*args, **kwargs)
-            if len(args) < len(names):  # tensors given by keyword
+            if len(args) < len(names):  # tensors passed by keyword
                 bound = signature.bind(*args, **kwargs)
                 bound.apply_defaults()
                 args, kwargs = bound.args, bound.kwargs  # type: ignore[assignment]
@@ -88,12 +88,12 @@ def operator(
 
 
 def is_in_use() -> bool:
-    """Whether kernels may run at all: the library is loaded, or DHTORCH_OPS=1, and nothing traces this code.
+    """Whether kernels may run: the library is loaded or DHTORCH_OPS=1, and no compiler traces this code.
 
-    ``torch.autograd.forward_ad`` keeps tangents within plain tensors, so that none are eligible while it is active.
+    ``torch.autograd.forward_ad`` keeps tangents within plain tensors, so none are eligible while it is active.
 
     Raises:
-        FileNotFoundError: DHTORCH_OPS=1, and nothing was compiled for this torch and processor.
+        FileNotFoundError: DHTORCH_OPS=1, and no library was compiled for this torch and processor.
     """
     if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
         return False
@@ -105,13 +105,13 @@ def is_in_use() -> bool:
 
 
 def can_dispatch(tensors: tuple[Any, ...], parameters: tuple[_Parameter, ...]) -> bool:
-    """Whether tensors may be handed to a kernel with such parameters: see the module's last paragraph."""
-    graph = torch.is_grad_enabled()
+    """Whether tensors are eligible for a kernel with such parameters; see the module's last paragraph."""
+    grad_enabled = torch.is_grad_enabled()
     for x, (dtypes, any_layout) in zip(tensors, parameters, strict=False):
         if x is None:
             continue
         if type(x) is not Tensor or x.dtype not in dtypes or not x.is_cpu or not (any_layout or x.is_contiguous()):
             return False
-        if (graph and x.requires_grad) or x.is_neg() or torch._C._functorch.is_functorch_wrapped_tensor(x):
+        if (grad_enabled and x.requires_grad) or x.is_neg() or torch._C._functorch.is_functorch_wrapped_tensor(x):
             return False
     return True

@@ -1,4 +1,4 @@
-"""Compile and load the C++ kernels of ``csrc``. They are optional: every operator has a torch reference.
+"""Compilation and loading of the C++ kernels of ``csrc``, which are optional: every operator has a torch reference.
 
     python -m dhtorch.ops          compile them into the user's cache, with the system's C++ compiler
     DHTORCH_OPS=1 python …         use them, in loader workers as well; or dhtorch.ops.loader.load() in a program
@@ -7,16 +7,16 @@ Which functions have a kernel, and for which tensors it runs: :mod:`dhtorch.ops.
 reference, which the tests check (``tests/ops/test_compiled.py``):
 
 - bit for bit: pixels of samples, flags and classes of holes, depth in metres, tokens, the sensor's map, census costs,
-  the surface through them;
-- up to one rounding of a value: pyramids, sigma, what is read in windows around samples, where textures carry the
+  their best surface;
+- up to one rounding of a value: pyramids, sigma, statistics of windows around samples, where textures carry the
   rounding of their sums;
 - up to the rounding of sums over a window, of the search for points and the registration of windows: half of the
-  places are equal or within 1e-4 px, 99 of 100 within a tenth of their sigma, at most one validity in 200 differs;
-- poses: 99 of 100 within a hundredth of their sigma; fitted surfaces: 99 of 100 depths within a tenth of theirs, at
-  most one gate in 200 differs.
+  positions are equal or within 1e-4 px, 99 of 100 within a tenth of their sigma, at most one validity in 200 differs;
+- poses: 99 of 100 within a hundredth of their sigma; fitted surfaces: 99 of 100 depths within a tenth of their sigma,
+  at most one gate in 200 differs.
 
 Nothing is compiled or downloaded without the command above. The library's name is a hash of its sources, torch's
-version, the compiler flags and the processor, whose widest vector instructions it uses.
+version, the compiler flags and the processor, the widest vector instructions of which it uses.
 """
 
 from __future__ import annotations
@@ -43,23 +43,25 @@ COMMAND = "python -m dhtorch.ops"
 #: Environment variable: 1 loads the library on first use.
 SWITCH = "DHTORCH_OPS"
 
-#: Lowest torch version whose headers have what the sources use: torch's stable ABI with ``TORCH_BOX``.
+#: Lowest torch version whose headers have the stable ABI with ``TORCH_BOX``, which the sources use.
 MIN_TORCH_VERSION = (2, 10)
 
+#: Folder of the C++ sources.
 FOLDER = Path(__file__).with_name("csrc")
 
+#: C++ sources of the library.
 SOURCES = tuple(
     FOLDER / f"{part}.cpp"
     for part in ("sweep", "search", "affine", "pyramid", "fit", "windows", "tokens", "pose", "tracks")
 )
 
-#: What the sources share.
+#: Header that all sources include.
 HEADER = FOLDER / "vectors.h"
 
-#: The header that is generated, as the sources include it.
+#: Name of the generated header, as in the sources' ``#include``.
 CONSTANTS_HEADER = "constants.h"
 
-#: Code tables whose values are in that header, as ``<table>_<name>``.
+#: Code tables whose values are in the generated header, as ``<table>_<name>``.
 _CODE_TABLES = (codes.Flag, codes.Hole, codes.Source)
 
 #: No FMA contraction: torch rounds the product and the sum. ``-fno-math-errno -fno-trapping-math`` let square roots and
@@ -73,15 +75,15 @@ _loaded: list[Path] = []
 
 
 def cache() -> Path:
-    """The folder of compiled libraries: DHTORCH_CACHE, else ``dhtorch`` in the user's cache."""
-    own = os.environ.get("DHTORCH_CACHE")
-    if own:
-        return Path(own)
+    """Folder of compiled libraries: DHTORCH_CACHE, else ``dhtorch`` in the user's cache folder."""
+    folder = os.environ.get("DHTORCH_CACHE")
+    if folder:
+        return Path(folder)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dhtorch"
 
 
 def library() -> Path:
-    """Path of the library for these sources, this torch and this processor, whether or not it exists."""
+    """Path of the library for these sources, this torch version and this processor, whether or not it exists."""
     flags = (*FLAGS, *_vector_flags())
     sources = (source.read_text(encoding="utf-8") for source in (HEADER, *SOURCES))
     key = "\n".join((*sources, constants_header(), torch.__version__, describe_processor(), platform.machine(), *flags))
@@ -89,7 +91,7 @@ def library() -> Path:
 
 
 def constants_header() -> str:
-    """C++ definitions of the code tables and of :mod:`dhtorch.ops.constants`."""
+    """C++ header with the values of the code tables and of :mod:`dhtorch.ops.constants`."""
     lines = ["// Generated from dhtorch/codes.py and dhtorch/ops/constants.py.", "#pragma once", "#include <cstdint>"]
     lines.append("namespace {")
     for table in _CODE_TABLES:
@@ -105,39 +107,41 @@ def constants_header() -> str:
 
 
 def build() -> Path:
-    """Compile the library, unless it exists; returns its path.
+    """Compile the library unless it exists -> its path.
 
     Raises:
-        OSError: torch older than :data:`MIN_TORCH_VERSION`; no compiler (CXX, else c++, g++ or clang++); one that
-            fails, with its message; no permission to write.
+        OSError: torch older than :data:`MIN_TORCH_VERSION`; no compiler (CXX, else c++, g++ or clang++);
+            compilation failed, with the compiler's message; no permission to write.
     """
     _check_torch_version()
     path = library()
     if path.is_file():
         return path
-    compiler = _compiler()
-    home = Path(torch.__file__).parent
+    compiler = _compiler_command()
+    torch_folder = Path(torch.__file__).parent
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        unfinished = Path(folder) / path.name
+        temporary = Path(folder) / path.name
         (Path(folder) / CONSTANTS_HEADER).write_text(constants_header(), encoding="utf-8")
-        command = [*compiler, *FLAGS, *_vector_flags(), f"-I{folder}", f"-I{home / 'include'}"]
-        command += [*map(str, SOURCES), "-o", str(unfinished)]
+        command = [*compiler, *FLAGS, *_vector_flags(), f"-I{folder}", f"-I{torch_folder / 'include'}"]
+        command += [*map(str, SOURCES), "-o", str(temporary)]
         command += (
-            ["-undefined", "dynamic_lookup"] if sys.platform == "darwin" else [f"-L{home / 'lib'}", "-ltorch_cpu"]
+            ["-undefined", "dynamic_lookup"]
+            if sys.platform == "darwin"
+            else [f"-L{torch_folder / 'lib'}", "-ltorch_cpu"]
         )
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode:
-            raise OSError(f"{shlex.join(command)}: exit code {done.returncode}\n{done.stderr.strip()}")
-        unfinished.replace(path)
+        process = subprocess.run(command, capture_output=True, text=True, check=False)
+        if process.returncode:
+            raise OSError(f"{shlex.join(command)}: exit code {process.returncode}\n{process.stderr.strip()}")
+        temporary.replace(path)
     return path
 
 
 def load() -> None:
-    """Load the compiled library: operators use it from now on in this process.
+    """Load the compiled library, which operators of this process then use.
 
     Raises:
-        FileNotFoundError: nothing was compiled for these sources, this torch and this processor.
+        FileNotFoundError: no library was compiled for these sources, this torch and this processor.
         OSError: torch older than :data:`MIN_TORCH_VERSION`.
     """
     if _loaded:
@@ -145,7 +149,7 @@ def load() -> None:
     _check_torch_version()
     path = library()
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: not compiled for this torch and processor; {COMMAND} does it")
+        raise FileNotFoundError(f"{path}: no library for this torch and processor; compile it with {COMMAND}")
     torch.ops.load_library(str(path))
     _loaded.append(path)
 
@@ -163,16 +167,16 @@ def _check_torch_version() -> None:
 
 
 def _vector_flags() -> tuple[str, ...]:
-    """The flag for this processor's vector instructions, or those torch is restricted to; none but on x86-64."""
+    """Compiler flag of the vector instructions of this processor, or of those torch is restricted to; x86-64 only."""
     if platform.machine().lower() not in ("x86_64", "amd64"):
         return ()
-    held = os.environ.get("ATEN_CPU_CAPABILITY", "").lower()
-    return (f"-march={_LEVELS.get(held, 'native')}",)
+    capability = os.environ.get("ATEN_CPU_CAPABILITY", "").lower()
+    return (f"-march={_LEVELS.get(capability, 'native')}",)
 
 
-def _compiler() -> list[str]:
-    own = shlex.split(os.environ.get("CXX", ""))
-    found = own or [name for name in ("c++", "g++", "clang++") if shutil.which(name)][:1]
-    if not found or shutil.which(found[0]) is None:
-        raise OSError(f"{' '.join(own) or 'c++, g++, clang++'}: no such C++ compiler; CXX names another")
-    return found
+def _compiler_command() -> list[str]:
+    requested = shlex.split(os.environ.get("CXX", ""))
+    command = requested or [name for name in ("c++", "g++", "clang++") if shutil.which(name)][:1]
+    if not command or shutil.which(command[0]) is None:
+        raise OSError(f"{' '.join(requested) or 'c++, g++, clang++'}: no such C++ compiler; set CXX to another")
+    return command

@@ -953,7 +953,7 @@ def test_the_environment_asks_for_it(cache, monkeypatch):
 def test_nothing_is_compiled_silently(tmp_path, monkeypatch):
     monkeypatch.setenv("DHTORCH_CACHE", str(tmp_path / "none"))
     monkeypatch.setenv("DHTORCH_OPS", "1")
-    with pytest.raises(FileNotFoundError, match=f"not compiled .*; {loader.COMMAND} does it"):
+    with pytest.raises(FileNotFoundError, match=f"no library for .*; compile it with {loader.COMMAND}"):
         plane_sweep.aggregate_best_plane(volume(1, 2, 2, 3, most=31), torch.tensor(1))
     assert not (tmp_path / "none").exists()
 

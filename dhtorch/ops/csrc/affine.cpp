@@ -320,8 +320,8 @@ Warp gauss_newton(Window& window, const Patch& patch, const float (*inverse)[8],
 }
 
 // source (B, 3, ., .), target (B, 1 or 3, ., .), q (2, M) integer pixels, place (3, M) and begin (3, 2, M), px of the
-// target, float32; batch (M) int64. Outputs, the fields of _State in affine_alignment.py: warp (3, 2, M), fit and first
-// (3, M), inverse (2, 8, M) float32, textured (M) bool.
+// target, float32; batch (M) int64. Outputs, the fields of _State in affine_alignment.py: warp (3, 2, M), fit (quality
+// there) and first (start_quality) (3, M), inverse (2, 8, M) float32, textured (M) bool.
 void register_affine(Tensor source, Tensor target, Tensor q, Tensor place, Tensor begin, Tensor batch, Tensor warp,
                      Tensor textured, Tensor fit, Tensor first, Tensor inverse, int64_t window, int64_t steps,
                      int64_t source_pad, int64_t target_pad, double epsilon, int64_t search_padding, int64_t margin,
