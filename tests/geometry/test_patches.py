@@ -211,7 +211,7 @@ def test_patches_larger_than_the_image_are_refused():
         if fine:
             patches.reduce_patches(pictures(), pixels(), size, corner_and_sum)
         else:
-            with pytest.raises(ValueError, match=r"lookup.summarise: image of 9x13 pixels is smaller than .* 10x10"):
+            with pytest.raises(ValueError, match=r"reduce_patches: image of 9x13 pixels is smaller than .* 10x10"):
                 patches.reduce_patches(pictures(), pixels(), size, corner_and_sum)
 
 
