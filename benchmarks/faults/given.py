@@ -32,7 +32,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "geometry.pose_conventions": [
         ("TRANSLATION_UNITS", '"millimetres": 1e-3', '"millimetres": 1e3'),
-        ("pose_hypotheses", "other_way if way else T", "T"),
+        ("pose_hypotheses", "other_way if direction else T", "T"),
         ("motion_from_axes", "M.T @ T.R @ M", "M @ T.R @ M.T"),
         ("motion_from_axes", "(M.T @ T.t[..., None])", "(M @ T.t[..., None])"),
         ("relative_covariance", "cov_0 + cov_1", "cov_1"),
@@ -43,7 +43,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("average_poses", "& (n >= min_agree * valid.sum(-1))", ""),
         ("average_poses", "n >= at_least", "n >= 1"),
         ("average_poses", "& (square < (max_deviation * bend) ** 2)", ""),
-        ("_start", "argmin(0)", "argmax(0)", "from an outlier, too, the reweighed steps reach the mean of the others"),
+        (
+            "_start_pose",
+            "argmin(0)",
+            "argmax(0)",
+            "from an outlier, too, the reweighed steps reach the mean of the others",
+        ),
         ("_scale", ".clamp_min(1.0)", ""),
     ],
     "geometry.inference_mode": [

@@ -1,9 +1,9 @@
-"""Pinhole camera with OpenCV's lens distortion, one value type and its functions.
+"""Pinhole camera with OpenCV's lens distortion: intrinsics, projection, rays, (un)distortion.
 
 Alphabet: ``uv`` (…, 2) pixels, ``xyz`` (…, 3) metres in camera axes (x right, y down, z forward), ``xy`` (…, 2) ideal
 image-plane coordinates (z = 1), ``f``, ``c`` focal lengths and principal point in pixels.
 
-Pixel convention, once for the whole project: *integer coordinates are pixel centres*; the top-left pixel's centre is
+Pixel convention of the whole project: *integer coordinates are pixel centres*; the top-left pixel's centre is
 (0, 0) and the image spans [-0.5, W - 0.5] × [-0.5, H - 0.5].
 """
 
@@ -23,7 +23,8 @@ from dhtorch.pytree import Record, record
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-#: How many coefficients a distortion may have: k1 k2 p1 p2 [k3 [k4 k5 k6]].
+#: Numbers of coefficients that a distortion may have: k1 k2 p1 p2 [k3 [k4 k5 k6]].
+#: Source: OpenCV calibrateCamera, distortion models without thin prism and tilt.
 COEFFICIENTS = (4, 5, 8)
 
 
@@ -38,17 +39,17 @@ class Camera(Record):
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera, distortion: Tensor | None = None) -> Camera:
-        """The intrinsics of a ``kornia.geometry.camera.PinholeCamera``; where it stands is ``Pose.from_kornia``'s.
+        """The intrinsics of a ``kornia.geometry.camera.PinholeCamera``; its pose is ``Pose.from_kornia``.
 
-        Its matrix is used as it is: kornia, too, leaves it to the caller where a pixel's centre lies, and here that is
-        at whole numbers. Skew is not carried. kornia keeps a lens apart from its cameras: ``distortion`` (B, k).
+        Its matrix is used unchanged: kornia leaves the position of pixel centres to the caller; here they are at whole
+        numbers. Skew is dropped. kornia stores distortion apart from its cameras: ``distortion`` (B, k).
 
         Gradient: to the intrinsics.
         """
         return from_matrix(camera.intrinsics[:, :3, :3], distortion)
 
     def to_kornia(self, hw: tuple[int, int], T_cam_from_world: Pose | None = None) -> PinholeCamera:
-        """As a ``kornia.geometry.camera.PinholeCamera`` of pictures of size ``hw``; the lens stays behind.
+        """As a ``kornia.geometry.camera.PinholeCamera`` of images of size ``hw``; distortion is dropped.
 
         Its extrinsics map points of the world into the camera; None = the world is the camera's frame.
 
@@ -63,20 +64,20 @@ class Camera(Record):
 
 
 def from_matrix(K: Tensor, distortion: Tensor | None = None, readout: Tensor | None = None) -> Camera:
-    """Camera of a (B, 3, 3) intrinsic matrix without skew."""
+    """Camera of an intrinsic matrix (B, 3, 3) without skew."""
     check("camera.from_matrix", K=(K, "B 3 3"), distortion=(distortion, "B k"))
     return Camera(K.diagonal(dim1=1, dim2=2)[:, :2].contiguous(), K[:, :2, 2], distortion, readout)
 
 
 def to_matrix(camera: Camera) -> Tensor:
-    """(B, 3, 3) intrinsic matrix."""
+    """Intrinsic matrix (B, 3, 3) of a camera."""
     zero, one = torch.zeros_like(camera.f[:, 0]), torch.ones_like(camera.f[:, 0])
     rows = (camera.f[:, 0], zero, camera.c[:, 0], zero, camera.f[:, 1], camera.c[:, 1], zero, zero, one)
     return torch.stack(rows, -1).reshape(-1, 3, 3)
 
 
 def ideal(camera: Camera) -> Camera:
-    """The same camera without its distortion: what undistorted pixels belong to."""
+    """The same camera without its distortion: the camera of undistorted pixels."""
     return camera.replace(distortion=None)
 
 
@@ -90,7 +91,7 @@ def resize(camera: Camera, hw: tuple[int, int], new_hw: tuple[int, int]) -> Came
 
 
 def resize_pixels(uv: Tensor, hw: tuple[int, int], new_hw: tuple[int, int]) -> Tensor:
-    """Where pixels (…, 2) of an image lie in the image resampled from ``hw`` to ``new_hw``. Gradient: to uv."""
+    """Pixels (…, 2) of an image in the image resampled from ``hw`` to ``new_hw``. Gradient: to uv."""
     s = torch.as_tensor([new_hw[1] / hw[1], new_hw[0] / hw[0]]).to(uv)
     return (uv + 0.5) * s - 0.5
 
@@ -99,9 +100,9 @@ def project(
     camera: Camera,
     xyz: Tensor,  # (B, N, 3) m
 ) -> Tensor:
-    """Pixels (B, N, 2) of points; the sign of z is the caller's affair, |z| is kept away from zero.
+    """Pixels (B, N, 2) of points; the sign of z is left to the caller, |z| is kept away from zero.
 
-    kornia's ``project_points`` takes half as long again, since it asks for a matrix; the lens is kornia's.
+    kornia's ``project_points`` takes half as long again, since it takes a matrix; the distortion is kornia's.
 
     Gradient: to points, intrinsics and distortion. Checked against ``cv2.projectPoints`` and
     ``kornia.geometry.camera.PinholeCamera`` (``tests/geometry/test_camera.py``).
@@ -109,7 +110,7 @@ def project(
     check("camera.project", f=(camera.f, "B 2"), xyz=(xyz, "B N 3"))
     z = xyz[..., 2:]
     z = torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)
-    return _seen(camera, xyz[..., :2] / z)
+    return _to_pixels(camera, xyz[..., :2] / z)
 
 
 def unproject(
@@ -119,7 +120,7 @@ def unproject(
 ) -> Tensor:
     """Points (B, N, 3) at z-depth ``depth`` seen at (distorted) pixels ``uv``.
 
-    kornia's ``unproject_points`` gives the same bits and takes a third longer, since it asks for a matrix.
+    kornia's ``unproject_points`` gives the same bits and takes a third longer, since it takes a matrix.
     """
     check("camera.unproject", f=(camera.f, "B 2"), uv=(uv, "B N 2"), depth=(depth, "B N"))
     z = depth[..., None]
@@ -137,19 +138,19 @@ def rays(camera: Camera, uv: Tensor) -> Tensor:
 
 
 def distort(camera: Camera, uv: Tensor) -> Tensor:
-    """Ideal pixels (B, N, 2) → pixels of the distorted image, by kornia. The inverse of :func:`undistort`."""
+    """Pixels of the distorted image at ideal pixels (B, N, 2), by kornia. The inverse of :func:`undistort`."""
     check("camera.distort", f=(camera.f, "B 2"), uv=(uv, "B N 2"))
     if camera.distortion is None:
         return uv
-    return _seen(camera, _normalised(camera, uv))
+    return _to_pixels(camera, _normalised(camera, uv))
 
 
 def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
-    """Pixels of the distorted image → ideal pixels, (B, N, 2).
+    """Ideal pixels (B, N, 2) of pixels of the distorted image.
 
     Newton's method on the distortion model, from the pixel itself. A pixel for which it does not converge (outside
     the model's invertible field) becomes NaN. kornia's ``undistort_points`` is ten times as fast, but takes fixed-point
-    steps: behind a wide lens most pixels have not arrived after its five, many not after forty, and none says so.
+    steps: with a wide lens most pixels have not converged after its five, many not after forty, without any sign of it.
 
     Gradient: one Newton step from the detached solution, which is the implicit derivative, to ``uv``, intrinsics and
     distortion. Checked against ``cv2.undistortPoints`` and ``kornia.geometry.calibration.undistort_points``
@@ -160,14 +161,14 @@ def undistort(camera: Camera, uv: Tensor, *, iterations: int = 12) -> Tensor:
         return uv
     target = _planes(_normalised(camera, uv))
     with torch.no_grad():
-        xy = _solved(camera.distortion, target.detach(), iterations)
-        miss = (_distort(camera.distortion, xy)[0] - target).abs().amax(0)
-        # A pixel counts as solved when it returns to itself within a hundredth of a pixel, at any focal length.
-        solved = miss * camera.f.amax(-1)[:, None] < 0.01
-        start = torch.where(solved, xy, 0.0)
-    xy = start + _newton_step(camera.distortion, start, torch.where(solved, target, 0.0))
+        xy = _solve_undistortion(camera.distortion, target.detach(), iterations)
+        residual = (_distort(camera.distortion, xy)[0] - target).abs().amax(0)
+        # A pixel has converged when it returns to itself within a hundredth of a pixel, at any focal length.
+        converged = residual * camera.f.amax(-1)[:, None] < 0.01
+        detached = torch.where(converged, xy, 0.0)
+    xy = detached + _newton_step(camera.distortion, detached, torch.where(converged, target, 0.0))
     uv = xy.movedim(0, -1) * camera.f[:, None] + camera.c[:, None]
-    return torch.where(solved[..., None], uv, torch.nan)
+    return torch.where(converged[..., None], uv, torch.nan)
 
 
 def depth_pixels(
@@ -177,48 +178,48 @@ def depth_pixels(
     depth_hw: tuple[int, int],
     uv: Tensor,  # (B, N, 2) px of the image
 ) -> Tensor:
-    """Where image pixels lie in a depth map taken from the same place: (B, N, 2) depth pixels.
+    """Depth-map pixels (B, N, 2) of image pixels, for a map taken from the same pose.
 
-    With a camera of its own the map is reached along the viewing ray; without one it covers the same field as the
-    image of size ``hw`` and the exact scaling rule of :func:`resize` applies.
+    With ``depth_camera`` the pixel follows from the viewing ray; without one the map covers the same field as the image
+    of size ``hw`` and the exact scaling rule of :func:`resize` applies.
     """
     if depth_camera is not None:
-        return _seen(depth_camera, _normalised(camera, undistort(camera, uv)))
+        return _to_pixels(depth_camera, _normalised(camera, undistort(camera, uv)))
     if depth_hw == hw:
         return uv
     return resize_pixels(uv, hw, depth_hw)
 
 
 def undistort_jacobian(camera: Camera, uv_ideal: Tensor) -> Tensor:
-    """d(ideal pixel) / d(distorted pixel), (B, N, 2, 2), at ideal pixels (B, N, 2): carries covariances along."""
+    """d(ideal pixel) / d(distorted pixel), (B, N, 2, 2), at ideal pixels (B, N, 2), to transport covariances."""
     check("camera.undistort_jacobian", f=(camera.f, "B 2"), uv_ideal=(uv_ideal, "B N 2"))
     if camera.distortion is None:
         eye = torch.eye(2, dtype=uv_ideal.dtype, device=uv_ideal.device)
         return eye.expand(*uv_ideal.shape, 2)
     a, b, c = _distort(camera.distortion, _planes(_normalised(camera, uv_ideal)))[1]
     f = camera.f[:, None]
-    turned = inverse_2x2(a, b, b, c, least=1e-12).movedim(0, -1).unflatten(-1, (2, 2))
-    return f[..., :, None] * turned / f[..., None, :]
+    inverse = inverse_2x2(a, b, b, c, least=1e-12).movedim(0, -1).unflatten(-1, (2, 2))
+    return f[..., :, None] * inverse / f[..., None, :]
 
 
 def _normalised(camera: Camera, uv: Tensor) -> Tensor:
     return (uv - camera.c[:, None]) / camera.f[:, None]
 
 
-def _seen(camera: Camera, xy: Tensor) -> Tensor:
+def _to_pixels(camera: Camera, xy: Tensor) -> Tensor:
     """Pixels of the distorted image at ideal image-plane coordinates."""
     if camera.distortion is not None:
-        xy = _bent(camera.distortion, xy)
+        xy = _distort_kornia(camera.distortion, xy)
     return xy * camera.f[:, None] + camera.c[:, None]
 
 
-def _bent(distortion: Tensor, xy: Tensor) -> Tensor:
+def _distort_kornia(distortion: Tensor, xy: Tensor) -> Tensor:
     """Distorted image-plane coordinates (B, N, 2) of ideal ones, by kornia."""
     from kornia.geometry.calibration import distort_points  # noqa: PLC0415
 
-    _check_count(distortion)
-    one = torch.eye(3, dtype=xy.dtype, device=xy.device)
-    return distort_points(xy, one, distortion)
+    _check_coefficient_count(distortion)
+    identity = torch.eye(3, dtype=xy.dtype, device=xy.device)
+    return distort_points(xy, identity, distortion)
 
 
 def _planes(xy: Tensor) -> Tensor:
@@ -226,11 +227,11 @@ def _planes(xy: Tensor) -> Tensor:
     return xy.movedim(-1, 0).contiguous()
 
 
-def _solved(distortion: Tensor, target: Tensor, iterations: int) -> Tensor:
-    """Newton's method for the ideal planes (2, B, N) that are bent to ``target``.
+def _solve_undistortion(distortion: Tensor, target: Tensor, iterations: int) -> Tensor:
+    """Ideal planes (2, B, N) whose distortion is ``target``, by Newton's method.
 
-    A point stops after a step whose square is lost in rounding, as the error that is left then is: so that its answer
-    does not depend on how long others of its batch take.
+    A point stops after a step whose square is below rounding, as the remaining error is then: so that its result does
+    not depend on the iterations of others in its batch.
     """
     xy, moving = target, torch.ones_like(target[0], dtype=torch.bool)
     for _ in range(iterations):
@@ -243,26 +244,29 @@ def _solved(distortion: Tensor, target: Tensor, iterations: int) -> Tensor:
 
 
 def _newton_step(distortion: Tensor, xy: Tensor, target: Tensor) -> Tensor:
-    """What is to be added to the planes ``xy`` (2, B, N)."""
+    """Newton step (2, B, N) to be added to the planes ``xy``."""
     value, (a, b, c) = _distort(distortion, xy)
-    left = target - value
+    residual = target - value
     a, b, _, c = inverse_2x2(*(x.detach() for x in (a, b, b, c)), least=1e-12)
-    return torch.stack((a * left[0] + b * left[1], b * left[0] + c * left[1]))
+    return torch.stack((a * residual[0] + b * residual[1], b * residual[0] + c * residual[1]))
 
 
 def _distort(distortion: Tensor, xy: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
-    """Brown's rational model: where ideal points x (2, B, N) are seen, s x + r² q with q = (p₂, p₁) and
-    s = radial(r²) + 2 q·x; and the entries a, b, c (B, N) of its Jacobian s I + 2 (radial' x xᵀ + x qᵀ + q xᵀ)."""
-    count = _check_count(distortion)
+    """Brown's rational model: distorted planes (2, B, N) of ideal planes x, and the entries of its Jacobian (B, N).
+
+    The value is s x + r² q with q = (p₂, p₁) and s = radial(r²) + 2 q·x; a, b, c are the entries of the Jacobian
+    s I + 2 (radial' x xᵀ + x qᵀ + q xᵀ).
+    """
+    count = _check_coefficient_count(distortion)
     k1, k2, p1, p2, k3, k4, k5, k6 = torch.nn.functional.pad(distortion, (0, 8 - count))[:, None].unbind(-1)
     x, y = xy
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     slope = k1 + r2 * (2 * k2 + r2 * (3 * k3))  # d radial / d r²
     if count > 5:
-        bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        radial = radial / bottom
-        slope = (slope - radial * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) / bottom
+        denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = radial / denominator
+        slope = (slope - radial * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) / denominator
     s = radial + 2 * (p1 * y + p2 * x)
     value = torch.stack((x * s + p2 * r2, y * s + p1 * r2))
     along = slope * x
@@ -270,7 +274,7 @@ def _distort(distortion: Tensor, xy: Tensor) -> tuple[Tensor, tuple[Tensor, Tens
     return value, (a, 2 * (y * (along + p2) + x * p1), c)
 
 
-def _check_count(distortion: Tensor) -> int:
+def _check_coefficient_count(distortion: Tensor) -> int:
     count = distortion.shape[-1]
     if count not in COEFFICIENTS:  # more would be OpenCV's thin prism and tilted sensor
         raise ValueError(f"camera: distortion has {count} coefficients, expected one of {COEFFICIENTS}")

@@ -1,10 +1,9 @@
-"""Two-view geometry of one point: closed-form depth, and how errors reach it.
+"""Two-view geometry of one point: pixels, cameras and pose → closed-form depth and its variance.
 
 Alphabet: view 0 is the reference view and its pixel ``uv_0`` is exact; ``x`` = viewing ray of view 0 with z = 1; the
-    point is
-X = depth · x in camera 0 and Y = R X + t in camera 1; ``uv_1`` is its measured pixel. Everything is ideal pinhole; the
-two cameras may differ. Coordinates travel as separate (B, N) planes: each operation is contiguous, and rounding cannot
-depend on the batch.
+point is X = depth · x in camera 0 and Y = R X + t in camera 1; ``uv_1`` is its measured pixel. Everything is ideal
+pinhole; the two cameras may differ. Coordinates are separate (B, N) planes: each operation is contiguous, and rounding
+cannot depend on the batch.
 """
 
 from __future__ import annotations
@@ -22,12 +21,14 @@ from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.geometry.linalg import quadratic_form, upper_triangle
 from dhtorch.geometry.se3 import Pose
 
-#: Points of all pairs that :func:`triangulate_depth` works on at once: torch does not split so few over threads.
+#: Limits the points of all pairs that :func:`triangulate_depth` processes at once, a count: torch does not split so few
+#: over threads.
+#: Source: origin not recorded.
 MAX_CHUNK_TRIANGULATED = 1 << 15
 
 
 class TwoView(NamedTuple):
-    """What :func:`triangulate` finds for B × N points; finite everywhere, meaningful where both depths are positive."""
+    """Triangulation of B × N points: finite everywhere, meaningful where both depths are positive."""
 
     depth: Tensor  # (B, N) m, z in camera 0
     depth_1: Tensor  # (B, N) m, z in camera 1
@@ -44,14 +45,14 @@ def triangulate(
     camera_1: Camera,
     T_1_from_0: Pose,
 ) -> TwoView:
-    """One-sided optimal triangulation: the reference view's pixel is exact, the other is moved onto its epipolar line.
+    """One-sided optimal triangulation of pixels: uv_0 is exact, uv_1 is moved onto its epipolar line.
 
-    ``uv_1`` drops perpendicularly (in pixels) onto the epipolar line of ``uv_0``, which is the maximum-likelihood
+    ``uv_1`` moves perpendicularly (in pixels) onto the epipolar line of ``uv_0``, which is the maximum-likelihood
     correction for isotropic noise in view 1; the two rays then meet, and depth is a quotient of lengths along the line.
 
     Returns:
-        :class:`TwoView`. Without a baseline, or where the rays are exactly parallel, depth is 0 and the rest, though
-        finite, means nothing.
+        :class:`TwoView`. Without a baseline, or where the rays are exactly parallel, depth is 0 and the rest finite
+        but meaningless.
 
     kornia's ``triangulate_points`` lets both pixels move, and takes twenty times as long at best;
     ``sampson_epipolar_distance`` would be that distance for two noisy pixels.
@@ -62,9 +63,9 @@ def triangulate(
     Source: R. Hartley, A. Zisserman, "Multiple View Geometry", section 12.3, with one noise-free view.
     """
     check("triangulate", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2"))
-    direction = _directions(uv_0, camera_0, T_1_from_0)
-    depth = _meet(direction, uv_1, camera_1, T_1_from_0)
-    return _describe(depth, torch.stack(direction, -1), uv_1, camera_1, T_1_from_0)
+    direction = _rotated_rays(uv_0, camera_0, T_1_from_0)
+    depth = _triangulated_depth(direction, uv_1, camera_1, T_1_from_0)
+    return _two_view(depth, torch.stack(direction, -1), uv_1, camera_1, T_1_from_0)
 
 
 def triangulate_depth(
@@ -74,9 +75,9 @@ def triangulate_depth(
     camera_1: Camera,
     T_1_from_0: Pose,
 ) -> Tensor:
-    """Depth (B, N) of :func:`triangulate` and nothing else, for many points: m, z in camera 0.
+    """Depth (B, N) of :func:`triangulate` alone, for many points: m, z in camera 0.
 
-    Works through the points in pieces that stay in cache.
+    Processes the points in chunks that stay in cache.
 
     Raises:
         ValueError: wrong shapes.
@@ -87,15 +88,15 @@ def triangulate_depth(
         "triangulate_depth", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2")
     )
     step = max(MAX_CHUNK_TRIANGULATED // max(uv_0.shape[0], 1), 1)
-    pieces = (
+    chunks = (
         [(uv_0, uv_1)] if torch.compiler.is_compiling() else zip(uv_0.split(step, 1), uv_1.split(step, 1), strict=True)
     )
-    found = [_meet(_directions(a, camera_0, T_1_from_0), b, camera_1, T_1_from_0) for a, b in pieces]
-    return torch.cat(found, 1)
+    depths = [_triangulated_depth(_rotated_rays(a, camera_0, T_1_from_0), b, camera_1, T_1_from_0) for a, b in chunks]
+    return torch.cat(depths, 1)
 
 
-def _directions(uv_0: Tensor, camera_0: Camera, T_1_from_0: Pose) -> tuple[Tensor, Tensor, Tensor]:
-    """The reference view's rays turned into camera 1, R x, as three planes (B, N)."""
+def _rotated_rays(uv_0: Tensor, camera_0: Camera, T_1_from_0: Pose) -> tuple[Tensor, Tensor, Tensor]:
+    """The reference view's rays rotated into camera 1, R x, as three planes (B, N)."""
     (u, v), (cx, cy) = uv_0.unbind(-1), camera_0.c.split(1, 1)
     x, y = u - cx, v - cy
     R = torch.cat((T_1_from_0.R[..., :2] / camera_0.f[:, None], T_1_from_0.R[..., 2:]), -1)[..., None]
@@ -103,14 +104,16 @@ def _directions(uv_0: Tensor, camera_0: Camera, T_1_from_0: Pose) -> tuple[Tenso
     return a0, a1, a2
 
 
-def _meet(direction: tuple[Tensor, Tensor, Tensor], uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose) -> Tensor:
-    """Depth (B, N) where the reference view's rays meet those of ``uv_1`` moved onto the epipolar lines."""
+def _triangulated_depth(
+    direction: tuple[Tensor, Tensor, Tensor], uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose
+) -> Tensor:
+    """Depth (B, N) where the reference view's rays meet the rays of ``uv_1`` moved onto the epipolar lines."""
     (a0, a1, a2), (t0, t1, t2) = direction, T_1_from_0.t.split(1, 1)
     u, v = uv_1.unbind(-1)
     (fx, fy), (cx, cy) = camera_1.f.split(1, 1), camera_1.c.split(1, 1)
     y0, y1 = (u - cx) / fx, (v - cy) / fy
     # (a − a₃ y) depth = t₃ y − t on the first two rows, for y on the epipolar line. Its direction is g = t₃ a − a₃ t;
-    # along it a point does not move when it drops onto the line perpendicularly in pixels.
+    # along it the perpendicular projection in pixels does not move a point.
     stretch = fy / fx
     g0, g1 = t2 * a0 - t0 * a2, (t2 * a1 - t1 * a2) * (stretch * stretch)
     near = g0 * (t2 * y0 - t0) + g1 * (t2 * y1 - t1)
@@ -126,23 +129,23 @@ def describe_triangulation(
     camera_1: Camera,
     T_1_from_0: Pose,
 ) -> TwoView:
-    """The same quantities for points found by another triangulation; the residual is the larger of the two views."""
+    """:class:`TwoView` of points from another triangulation; the residual is the larger of the two views."""
     check("describe_triangulation", xyz_0=(xyz_0, "B N 3"), uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"))
     z = xyz_0[..., 2]
     x = xyz_0 / torch.where(z.abs() < 1e-9, torch.full_like(z, 1e-9), z)[..., None]
-    found = _describe(z, se3.rotate(T_1_from_0.R, x), uv_1, camera_1, T_1_from_0)
-    miss_0 = _length(uv_0 - cam.project(cam.ideal(camera_0), xyz_0))
-    return found._replace(residual_px=torch.maximum(found.residual_px, miss_0))
+    geometry = _two_view(z, se3.rotate(T_1_from_0.R, x), uv_1, camera_1, T_1_from_0)
+    residual_0 = _length(uv_0 - cam.project(cam.ideal(camera_0), xyz_0))
+    return geometry._replace(residual_px=torch.maximum(geometry.residual_px, residual_0))
 
 
-def _describe(depth: Tensor, direction: Tensor, uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose) -> TwoView:
-    """``direction`` (B, N, 3) = R x, the reference view's ray turned into camera 1."""
+def _two_view(depth: Tensor, direction: Tensor, uv_1: Tensor, camera_1: Camera, T_1_from_0: Pose) -> TwoView:
+    """:class:`TwoView` at ``depth``; ``direction`` (B, N, 3) = R x, the reference view's ray rotated into camera 1."""
     t = T_1_from_0.t[:, None]
     Y = depth[..., None] * direction + t
-    miss = uv_1 - cam.project(cam.ideal(camera_1), Y)
+    residual = uv_1 - cam.project(cam.ideal(camera_1), Y)
     J_point, J_pose = point_jacobians(camera_1, Y)
     slope = (J_point * direction[..., None, :]).unbind(-1)
-    return TwoView(depth, Y[..., 2], _angle(Y, t), _length(miss), slope[0] + slope[1] + slope[2], J_pose)
+    return TwoView(depth, Y[..., 2], _angle(Y, t), _length(residual), slope[0] + slope[1] + slope[2], J_pose)
 
 
 def point_jacobians(
@@ -170,21 +173,21 @@ def depth_variance(
     cov_uv_1: Tensor,  # (B, N, 2, 2) px²
     cov_pose: Tensor,  # (B, k, k), k columns of J_pose
 ) -> tuple[Tensor, Tensor]:
-    """First-order variance of depth (B, N) m²: the point's own part (its track) and the part shared through the pose.
+    """First-order variance of depth (B, N) m²: the point's own part (its track), and the part shared through the pose.
 
     Along the epipolar direction d the depth obeys |slope| · dz = d · (δuv_1 − J_pose δξ), hence both parts.
 
     Gradient: to covariances and geometry. Infinite where depth does not move the pixel.
     """
     slope = geometry.slope
-    steep = (slope * slope).sum(-1)
-    defined = steep > 1e-18
-    gain = slope / torch.where(defined, steep, torch.ones_like(steep))[..., None]  # d(depth) / d(uv_1), m/px
+    slope2 = (slope * slope).sum(-1)
+    defined = slope2 > 1e-18
+    gain = slope / torch.where(defined, slope2, torch.ones_like(slope2))[..., None]  # d(depth) / d(uv_1), m/px
     g0, g1 = gain.unbind(-1)
     own = quadratic_form(g0, g1, *upper_triangle(cov_uv_1))
     row = g0[..., None] * geometry.J_pose[..., 0, :] + g1[..., None] * geometry.J_pose[..., 1, :]  # (B, N, k)
-    carried = sum(row[..., k, None] * cov_pose[:, None, k] for k in range(cov_pose.shape[-1]))
-    shared = (carried * row).sum(-1)
+    cov_rows = sum(row[..., k, None] * cov_pose[:, None, k] for k in range(cov_pose.shape[-1]))
+    shared = (cov_rows * row).sum(-1)
     infinite = torch.full_like(own, torch.inf)
     return torch.where(defined, own, infinite), torch.where(defined, shared.clamp_min(0), infinite)
 

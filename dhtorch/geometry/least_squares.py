@@ -1,4 +1,4 @@
-"""Pieces of nonlinear least squares over rigid motions: residuals with Jacobians, robust weights, safe solves, steps.
+"""Nonlinear least squares over rigid motions: residuals with Jacobians, robust weights, solvers and damped steps.
 
 Alphabet: ``x`` points of frame a and ``Y = R x + t`` in the camera; ``r`` residual = projected − measured, px; ``xi``
 the left perturbation ``T ← exp(xi) T`` = (rotation rad, translation m); ``H xi = −g`` the normal equations with
@@ -22,17 +22,20 @@ from dhtorch.geometry.checks import all_known, check
 from dhtorch.geometry.linalg import small_matmul
 from dhtorch.geometry.se3 import Pose
 
-#: Points nearer to the camera plane than this (m), or behind it, are not in front.
+#: Limits the depth of a point in front of a camera from below, m.
+#: Source: origin not recorded.
 MIN_DEPTH = 1e-6
 
-#: A matrix whose scaled Cholesky factor has a smaller pivot than this is called singular.
+#: Limits the pivots of a Cholesky factor with unit diagonal from below, without unit: singular where smaller.
+#: Source: origin not recorded.
 MIN_PIVOT = 1e-6
 
-
-#: First factor of the diagonal in :func:`minimise`.
+#: Initial damping of :func:`minimise`, a factor on the diagonal without unit.
+#: Source: origin not recorded.
 INITIAL_DAMPING = 1e-4
 
-#: Displacement, rad or m, by which the derivative of equations in float64 is found.
+#: Step of the finite differences in :func:`implicit_step`, rad or m, in float64.
+#: Source: origin not recorded.
 DERIVATIVE_STEP = 1e-7
 
 #: A pose, or another tree of unknowns with a leading batch dimension.
@@ -40,7 +43,7 @@ S = TypeVar("S")
 
 
 class NormalEquations(NamedTuple):
-    """A cost and its normal equations at one place per batch element."""
+    """A cost and its normal equations at one set of unknowns per batch element."""
 
     cost: Tensor  # (B,)
     H: Tensor  # (B, n, n); n = 6 for a pose
@@ -67,7 +70,7 @@ def linearise(
     (``tests/geometry/test_least_squares.py``).
     """
     check("linearise", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
-    plane, w, z = _seen(T, xyz)
+    plane, w, z = _project_to_plane(T, xyz)
     f = f[..., None]
     minus, square = -plane, plane * plane
     (a, b) = plane.unbind(1)
@@ -77,7 +80,7 @@ def linearise(
     ra, rb = (plane - (uv - c[..., None]) / f).unbind(1)
     w = w[:, 0]
     zero = torch.zeros_like(a)
-    columns = (na * b, -1 - bb, 1 + aa, a * b, nb, a, w, zero, zero, w, aw, bw, ra, rb)  # u and v in turn
+    columns = (na * b, -1 - bb, 1 + aa, a * b, nb, a, w, zero, zero, w, aw, bw, ra, rb)  # u and v alternate
     return torch.stack(columns, 1).unflatten(1, (7, 2)) * f[:, None], z
 
 
@@ -93,13 +96,13 @@ def reprojection_residuals(
     Gradient: to pose, f, c, xyz and uv. Raises ValueError for wrong shapes.
     """
     check("reprojection_residuals", R=(T.R, "B 3 3"), f=(f, "B 2"), c=(c, "B 2"), xyz=(xyz, "B 3 N"), uv=(uv, "B 2 N"))
-    plane, _, z = _seen(T, xyz)
+    plane, _, z = _project_to_plane(T, xyz)
     f = f[..., None]
     return (plane - (uv - c[..., None]) / f) * f, z
 
 
-def _seen(T: Pose, xyz: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Where points are seen at z = 1 (B, 2, N), one over their depth (B, 1, N), safe for points behind, and z."""
+def _project_to_plane(T: Pose, xyz: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Projections at z = 1 (B, 2, N), inverse depths (B, 1, N), finite for points behind, and depths z (B, N)."""
     Y = torch.baddbmm(T.t[..., None], T.R, xyz)
     z = Y[:, 2:]
     w = z.clamp_min(MIN_DEPTH).reciprocal()
@@ -112,7 +115,7 @@ def robust_loss(square: Tensor, kernel: str | None, scale: float) -> tuple[Tenso
     Args:
         square: squared residuals of any shape, ≥ 0.
         kernel: None (plain squares), ``"huber"``, ``"cauchy"`` or ``"geman_mcclure"``.
-        scale: the residual at which the kernel starts to bend, in the residual's unit.
+        scale: the residual at which the kernel bends, in the residual's unit.
 
     Returns:
         ``rho`` with rho ≈ square for small residuals, and ``weight`` = d rho / d square, 1 at zero.
@@ -139,7 +142,7 @@ def robust_loss(square: Tensor, kernel: str | None, scale: float) -> tuple[Tenso
 
 
 def robust_weight_slope(square: Tensor, kernel: str | None, scale: float) -> Tensor:
-    """d weight / d square of :func:`robust_loss`: how fast a kernel lets go; ≤ 0.
+    """Derivative d weight / d square of :func:`robust_loss`, ≤ 0.
 
     Raises:
         ValueError: an unknown kernel.
@@ -168,22 +171,22 @@ def normal_equations(
 
     Args:
         rows, weight: of the points.
-        block: points that are summed at a time; all by default. How a matrix product rounds depends on how long it is,
-            on some processors: where N is a multiple of ``block``, empty points behind the last change no bit.
+        block: points summed at a time; all by default. On some processors the rounding of a matrix product depends on
+            its length: where N is a multiple of ``block``, empty points behind the last change no bit.
 
     Gradient: to rows and weights. Raises ValueError for wrong shapes.
     """
     N = check("normal_equations", rows=(rows, "B n 2 N"), weight=(weight, "B N"))["N"]
     weighted = rows[:, :-1] * weight[:, None, None]
-    (first, last), *more = zip(*(_in_blocks(x, block or N) for x in (weighted, rows)), strict=True)
+    (first, last), *blocks = zip(*(_in_blocks(x, block or N) for x in (weighted, rows)), strict=True)
     sums = torch.bmm(first, last.transpose(1, 2))  # Σ w J (J, r)ᵀ (B, n, n + 1)
-    for left, right in more:
+    for left, right in blocks:
         sums = torch.baddbmm(sums, left, right.transpose(1, 2))
     return sums[..., :-1], sums[..., -1]
 
 
 def _in_blocks(x: Tensor, block: int) -> tuple[Tensor, ...]:
-    """Rows (B, n, 2, N) as matrices (B, n, 2 · block) of some points each, zeros behind the last."""
+    """Rows (B, n, 2, N) as matrices (B, n, 2 · block) of ``block`` points each, zeros behind the last."""
     N = x.shape[-1]
     if block >= N:
         return (x.flatten(2),)
@@ -211,36 +214,36 @@ def solve_spd(
     n = check("solve_spd", H=(H, "B n n"), b=(b, "B n k"))["n"]
     A, rhs = H.double(), b.double()
     if n % 2:
-        # LAPACK rounds by how a matrix lies in memory: filled up to a multiple of 4, all of a batch lie alike.
-        more = -n % 4
-        A, rhs = F.pad(A, (0, more, 0, more)), F.pad(rhs, (0, 0, 0, more))
-        A = A + torch.diag(F.pad(A.new_zeros(n), (0, more), value=1.0))
+        # The rounding of LAPACK depends on memory alignment: padded to a multiple of 4, a batch is aligned alike.
+        padding = -n % 4
+        A, rhs = F.pad(A, (0, padding, 0, padding)), F.pad(rhs, (0, 0, 0, padding))
+        A = A + torch.diag(F.pad(A.new_zeros(n), (0, padding), value=1.0))
     eye = torch.eye(A.shape[-1], dtype=A.dtype, device=A.device)
     diagonal = A.detach().diagonal(dim1=-2, dim2=-1)
     s = diagonal.masked_fill(~(diagonal > 0), 1.0).rsqrt()[..., None]
     A, rhs = A * (s * s.transpose(1, 2)), rhs * s
     with torch.no_grad():
         L, info = torch.linalg.cholesky_ex(A)
-        pivot = L.diagonal(dim1=-2, dim2=-1).amin(-1)  # NaN for a NaN matrix, and so not above the limit
+        pivot = L.diagonal(dim1=-2, dim2=-1).amin(-1)  # NaN for a NaN matrix, hence not above the limit
         ok = (info == 0) & (pivot > MIN_PIVOT) & (rhs * 0 == 0).flatten(1).all(1)
-        bad = ~ok[:, None, None]
+        singular = ~ok[:, None, None]
     if not all_known(ok):
-        L, A = torch.where(bad, eye, L), torch.where(bad, eye, A)
-        rhs = rhs.masked_fill(bad, 0.0)
+        L, A = torch.where(singular, eye, L), torch.where(singular, eye, A)
+        rhs = rhs.masked_fill(singular, 0.0)
     start = torch.cholesky_solve(rhs.detach(), L)
     x = start + torch.cholesky_solve(rhs - small_matmul(A, start), L)
     return (x * s)[:, :n].to(b.dtype), ok
 
 
 def implicit_step(equations: Callable[[Tensor], Tensor], g: Tensor) -> Tensor:
-    """The zero displacement (B, n) of an optimum, with the gradient of where the optimum lies.
+    """Zero displacement (B, n) of an optimum that carries the gradient of the optimum's position.
 
     The implicit function theorem with the whole derivative of the equations: what Gauss–Newton leaves out (residuals
-    times their curvature, weights that change) is a fifth of the derivative of a pose from real tracks.
+    times their curvature, changing weights) is a fifth of the derivative of a pose from real tracks.
 
     Args:
         equations: g (B, n) after a displacement (B, n) of the unknowns; called without a graph.
-        g: what they are at the optimum, (B, n), with the graph of all that they depend on.
+        g: their value (B, n) at the optimum, with the graph of all its inputs.
 
     Gradient: to what g depends on, first order; zero where the equations are singular or g has no graph.
     Raises ValueError for wrong shapes.
@@ -252,13 +255,13 @@ def implicit_step(equations: Callable[[Tensor], Tensor], g: Tensor) -> Tensor:
         steps = DERIVATIVE_STEP * torch.eye(n, dtype=g.dtype, device=g.device)[:, None].expand(n, *g.shape)
         slope = (torch.stack([equations(step) for step in steps], -1) - g.detach()[..., None]) / DERIVATIVE_STEP
         inverse, info = torch.linalg.inv_ex(slope)
-        known = (info == 0) & inverse.isfinite().flatten(1).all(1)
-        inverse = torch.where(known[:, None, None], inverse, 0.0)
+        regular = (info == 0) & inverse.isfinite().flatten(1).all(1)
+        inverse = torch.where(regular[:, None, None], inverse, 0.0)
     return -(inverse * (g - g.detach())[:, None]).sum(-1)
 
 
 def has_graph(x: Tensor) -> bool:
-    """Whether a derivative is asked of what becomes of ``x``, backward or forward. Gradient: none."""
+    """Whether ``x`` takes part in backward or forward differentiation. Gradient: none."""
     return x.requires_grad or unpack_dual(x).tangent is not None
 
 
@@ -266,7 +269,7 @@ def gauss_newton_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
     """The pose after one Gauss–Newton step on its normal equations, and ``ok`` (B,); unchanged where H is singular.
 
     From a detached optimum this step is the implicit derivative of the optimum up to terms of the size of the
-    residuals, which :func:`implicit_step` has as well. The step moves the pose by Cayley's map, a rotation that agrees
+    residuals, which :func:`implicit_step` includes. The step moves the pose by Cayley's map, a rotation that agrees
     with exp to second order and needs no transcendental function.
 
     Gradient: to T, H and g. Raises ValueError for wrong shapes.
@@ -294,10 +297,10 @@ def move_pose(
 
 
 def trial_pose_step(T: Pose, H: Tensor, g: Tensor) -> tuple[Pose, Tensor]:
-    """:func:`gauss_newton_step` in a few operations, for proposals that are judged afterwards by their cost.
+    """:func:`gauss_newton_step` in fewer operations, for proposals whose cost is compared afterwards.
 
-    The system is solved in float64 by elimination and not refined. Where it has no solution, or one that is no number,
-    the pose is no number either, and no cost of it is below another.
+    The system is solved in float64 by elimination and not refined. Where it has no solution, or NaN, the pose is NaN,
+    and its cost is below no other.
 
     Gradient: none. Raises ValueError for wrong shapes.
     """
@@ -319,17 +322,17 @@ def minimise(
     """Levenberg–Marquardt with a fixed number of steps; each batch element accepts or rejects its own.
 
     Args:
-        evaluate: cost and normal equations at a pose; its mask or weights may be recomputed there.
+        evaluate: cost and normal equations at a pose; masks and weights may be recomputed there.
         T: start; a pose, or another record of unknowns that ``step`` can move.
-        steps: how many proposals.
-        cost: the cost (B,) of ``evaluate`` alone: the last proposal is only judged, no step follows.
+        steps: number of proposals.
+        cost: the cost (B,) of ``evaluate`` alone, for the last proposal, after which no step follows.
         damping: initial factor of the diagonal; ×0.1 after an accepted step, ×10 after a rejected one.
         step: ``(T, H, g) -> (T, ok)``, the Gauss–Newton step.
 
     Returns:
-        The best pose seen and its cost (B,); the cost never rises above the start's.
+        The best pose evaluated and its cost (B,); the cost never rises above the start's.
 
-    Gradient: none is meant to flow here; take :func:`gauss_newton_step` from the detached result.
+    Gradient: not intended; take :func:`gauss_newton_step` from the detached result.
     """
     best = evaluate(T)
     eye = torch.eye(best.H.shape[-1], dtype=best.H.dtype, device=best.H.device)
@@ -337,20 +340,20 @@ def minimise(
     for k in range(steps):
         proposal, ok = step(T, best.H * (1 + factor[:, None, None] * eye), best.g)
         if k == steps - 1:
-            found = evaluate(proposal).cost if cost is None else cost(proposal)
-            better = ok & (found < best.cost)
-            if all_known(better):
-                return proposal, found
-            return select_batch(better, proposal, T), torch.where(better, found, best.cost)
-        there = evaluate(proposal)
-        better = ok & (there.cost < best.cost)
-        if all_known(better):
-            T, best = proposal, there
+            last_cost = evaluate(proposal).cost if cost is None else cost(proposal)
+            accepted = ok & (last_cost < best.cost)
+            if all_known(accepted):
+                return proposal, last_cost
+            return select_batch(accepted, proposal, T), torch.where(accepted, last_cost, best.cost)
+        trial = evaluate(proposal)
+        accepted = ok & (trial.cost < best.cost)
+        if all_known(accepted):
+            T, best = proposal, trial
             factor = factor * 0.1
             continue
-        T = select_batch(better, proposal, T)
-        best = NormalEquations(*(_where(better, a, b) for a, b in zip(there, best, strict=True)))
-        factor = torch.where(better, factor * 0.1, factor * 10)
+        T = select_batch(accepted, proposal, T)
+        best = NormalEquations(*(_where(accepted, a, b) for a, b in zip(trial, best, strict=True)))
+        factor = torch.where(accepted, factor * 0.1, factor * 10)
     return T, best.cost
 
 
@@ -359,11 +362,11 @@ def select_batch(mask: Tensor, new: S, old: S) -> S:
 
     Gradient: to the chosen ones.
     """
-    return pytree.tree_map(partial(_either, mask), new, old, is_leaf=_is_pose)
+    return pytree.tree_map(partial(_select_leaf, mask), new, old, is_leaf=_is_pose)
 
 
-def _either(mask: Tensor, new: Any, old: Any) -> Any:
-    if _is_pose(new):  # not one walk deeper: every step of every fit comes here
+def _select_leaf(mask: Tensor, new: Any, old: Any) -> Any:
+    if _is_pose(new):  # a leaf of the tree: avoids another traversal in every step
         return Pose(_where(mask, new.R, old.R), _where(mask, new.t, old.t))
     return None if new is None else _where(mask, new, old)
 

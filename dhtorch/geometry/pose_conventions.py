@@ -1,7 +1,7 @@
-"""In which other way a pose may have been meant: other axes, the inverse, another unit.
+"""Conventions of camera poses: a relative pose → its readings under other axes, as the inverse, in other units.
 
-Alphabet: ``M`` takes our camera axes (x right, y down, z forward) to somebody's, so that a relative motion ``T``
-written in theirs is Mᵀ T M in ours. Whoever only reads two such motions cannot tell them apart; near returns can.
+Alphabet: ``M`` takes our camera axes (x right, y down, z forward) to those of another convention, so that a relative
+motion ``T`` in the other axes is Mᵀ T M in ours. The numbers alone do not determine the convention; near returns do.
 """
 
 from __future__ import annotations
@@ -26,27 +26,30 @@ CAMERA_AXES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "axes of a picture turned by three quarters": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
 }
 
-#: Ways round, and metres per unit.
+#: Directions of a pose: as stated, or its inverse.
 POSE_DIRECTIONS = ("", "the inverse")
+
+#: Metres per unit of a translation.
+#: Source: derived, SI prefixes.
 TRANSLATION_UNITS = {"": 1.0, "millimetres": 1e-3, "centimetres": 1e-2}
 
-_ALL = sorted(
+_COMBINATIONS = sorted(
     itertools.product(CAMERA_AXES, POSE_DIRECTIONS, TRANSLATION_UNITS),
     key=lambda parts: sum(bool(part) for part in parts),
 )
 
-#: What a reading is called, the simplest first; the first is the pose as it was stated.
-CONVENTIONS = tuple(", ".join(part for part in parts if part) for parts in _ALL)
+#: Names of the readings, the simplest first; the first is the pose as stated.
+CONVENTIONS = tuple(", ".join(part for part in parts if part) for parts in _COMBINATIONS)
 
 #: Names of the camera axes that can be stated, and their M.
 STATED_AXES = {"cv": CAMERA_AXES[""], "gl": CAMERA_AXES["OpenGL axes (x right, y up, z backward)"]}
 
 
 def pose_hypotheses(
-    T: Pose,  # (B,), as it was stated
-    other_way: Pose,  # (B,), with every pose it comes from taken for its inverse
+    T: Pose,  # (B,), as stated
+    other_way: Pose,  # (B,), with every pose that it is computed from inverted
 ) -> Pose:
-    """The motions (B, K) that the numbers mean in each of the K :data:`CONVENTIONS`.
+    """Motions (B, K) of the stated numbers under each of the K :data:`CONVENTIONS`.
 
     Raises:
         ValueError: wrong shapes.
@@ -56,22 +59,22 @@ def pose_hypotheses(
     check(
         "pose_hypotheses", R=(T.R, "B 3 3"), t=(T.t, "B 3"), R_back=(other_way.R, "B 3 3"), t_back=(other_way.t, "B 3")
     )
-    found = []
-    for axes, way, unit in _ALL:
-        motion = motion_from_axes(other_way if way else T, CAMERA_AXES[axes])
-        found.append(Pose(motion.R, motion.t * TRANSLATION_UNITS[unit]))
-    return Pose(torch.stack([m.R for m in found], 1), torch.stack([m.t for m in found], 1))
+    hypotheses = []
+    for axes, direction, unit in _COMBINATIONS:
+        motion = motion_from_axes(other_way if direction else T, CAMERA_AXES[axes])
+        hypotheses.append(Pose(motion.R, motion.t * TRANSLATION_UNITS[unit]))
+    return Pose(torch.stack([m.R for m in hypotheses], 1), torch.stack([m.t for m in hypotheses], 1))
 
 
 def motion_from_axes(T: Pose, axes: tuple[tuple[int, int, int], ...]) -> Pose:
-    """A motion (B,) between cameras with these axes as one between cameras with ours. Gradient: to the motion."""
-    M = _matrix(axes, T.R)
+    """A motion (B,) between cameras with ``axes``, converted to our camera axes. Gradient: to the motion."""
+    M = _axes_matrix(axes, T.R)
     return Pose(M.T @ T.R @ M, (M.T @ T.t[..., None])[..., 0])
 
 
 def pose_from_axes(T_world_from_cam: Pose, axes: tuple[tuple[int, int, int], ...]) -> Pose:
-    """The pose (B,) of a camera with these axes as that of one with ours. Gradient: to the pose."""
-    return T_world_from_cam.replace(R=T_world_from_cam.R @ _matrix(axes, T_world_from_cam.R))
+    """The pose (B,) of a camera with ``axes``, converted to our camera axes. Gradient: to the pose."""
+    return T_world_from_cam.replace(R=T_world_from_cam.R @ _axes_matrix(axes, T_world_from_cam.R))
 
 
 def relative_covariance(
@@ -88,5 +91,5 @@ def relative_covariance(
     return A @ (cov_0 + cov_1) @ A.mT
 
 
-def _matrix(axes: tuple[tuple[int, int, int], ...], like: Tensor) -> Tensor:
+def _axes_matrix(axes: tuple[tuple[int, int, int], ...], like: Tensor) -> Tensor:
     return torch.tensor(axes, dtype=like.dtype, device=like.device)

@@ -1,7 +1,7 @@
-"""Rigid motions.
+"""Rigid motions SE(3): poses, composition, exponential map, logarithm, adjoint.
 
-Alphabet: ``T_b_from_a`` maps points of frame a into frame b, ``x_b = R x_a + t``; equal names touch when chained:
-``compose(T_c_from_b, T_b_from_a)``. Tangent ``xi = (rotation rad, translation m)``; perturbation on the left,
+Alphabet: ``T_b_from_a`` maps points of frame a into frame b, ``x_b = R x_a + t``; adjacent frame names match when
+chained: ``compose(T_c_from_b, T_b_from_a)``. Tangent ``xi = (rotation rad, translation m)``; perturbation on the left,
 ``T ← exp(xi) · T``. kornia's ``Se3`` puts translation first; the order is changed in :func:`exp` alone.
 """
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @record
 class Pose(Record):
-    """A batch of rigid motions."""
+    """A batch of B rigid motions."""
 
     R: Tensor  # (B, 3, 3)
     t: Tensor  # (B, 3) m
@@ -38,7 +38,7 @@ class Pose(Record):
         return cls(motion.so3.matrix(), motion.t) if extrinsics is None else from_matrix(extrinsics)
 
     def to_kornia(self) -> Se3:
-        """As a ``kornia.geometry.liegroup.Se3``. Beware of tangents: kornia's begin with the translation, ours end so.
+        """As a ``kornia.geometry.liegroup.Se3``, whose tangents have the translation first, here it is last.
 
         Gradient: to the motion.
         """
@@ -48,25 +48,25 @@ class Pose(Record):
 
 
 def identity(batch: int, like: Tensor) -> Pose:
-    """``batch`` identities with the device and dtype of ``like``."""
+    """Identity poses (``batch``,) with the device and dtype of ``like``."""
     eye = torch.eye(3, dtype=like.dtype, device=like.device)
     return Pose(eye.expand(batch, 3, 3), torch.zeros(batch, 3, dtype=like.dtype, device=like.device))
 
 
 def from_matrix(T: Tensor) -> Pose:
-    """(B, 4, 4) or (B, 3, 4) → Pose."""
+    """Pose of matrices (B, 4, 4) or (B, 3, 4)."""
     return Pose(T[..., :3, :3], T[..., :3, 3])
 
 
 def to_matrix(T: Pose) -> Tensor:
-    """(B, 4, 4), by kornia."""
+    """Matrices (B, 4, 4) of a pose, by kornia."""
     from kornia.geometry.conversions import Rt_to_matrix4x4  # noqa: PLC0415
 
     return Rt_to_matrix4x4(T.R, T.t[..., None])
 
 
 def apply(T: Pose, xyz: Tensor) -> Tensor:
-    """Points (B, N, 3) of the source frame → the target frame.
+    """Points (B, N, 3) of the source frame in the target frame.
 
     kornia's ``transform_points`` takes twice as long, and multiplies matrices.
     """
@@ -75,33 +75,33 @@ def apply(T: Pose, xyz: Tensor) -> Tensor:
 
 
 def rotate(R: Tensor, xyz: Tensor) -> Tensor:
-    """(B, 3, 3) times each of (B, N, 3).
+    """Rotated points (B, N, 3): R (B, 3, 3) times each point.
 
-    Written out instead of a matrix product: the rounding then cannot depend on the batch size.
+    Written out instead of a matrix product, so that rounding cannot depend on the batch size.
     """
     x, y, z = xyz[..., 0:1], xyz[..., 1:2], xyz[..., 2:3]
     return x * R[:, None, :, 0] + y * R[:, None, :, 1] + z * R[:, None, :, 2]
 
 
 def compose(T_c_from_b: Pose, T_b_from_a: Pose) -> Pose:
-    """``T_c_from_a``. kornia's ``compose_transformations``, of 4×4 matrices, takes five times as long."""
+    """Composition ``T_c_from_a``. kornia's ``compose_transformations``, of 4×4 matrices, takes five times as long."""
     t = (T_c_from_b.R @ T_b_from_a.t[..., None])[..., 0] + T_c_from_b.t
     return Pose(T_c_from_b.R @ T_b_from_a.R, t)
 
 
 def invert(T_b_from_a: Pose) -> Pose:
-    """``T_a_from_b``. kornia's ``inverse_transformation``, of 4×4 matrices, takes three times as long."""
+    """Inverse ``T_a_from_b``. kornia's ``inverse_transformation``, of 4×4 matrices, takes three times as long."""
     R = T_b_from_a.R.transpose(-1, -2)
     return Pose(R, -(R @ T_b_from_a.t[..., None])[..., 0])
 
 
 def relative(T_world_from_a: Pose, T_world_from_b: Pose) -> Pose:
-    """``T_b_from_a`` of two poses in one world."""
+    """Relative pose ``T_b_from_a`` of two poses in one world."""
     return compose(invert(T_world_from_b), T_world_from_a)
 
 
 def orthonormal(R: Tensor) -> Tensor:
-    """The rotation (B, 3, 3) nearest along Gram-Schmidt to one that has drifted by rounding. Gradient: to R."""
+    """Rotations (B, 3, 3) of nearly orthonormal matrices R, by Gram-Schmidt: removes rounding drift. Gradient: to R."""
     x = R[:, 0] / (R[:, 0] * R[:, 0]).sum(-1, keepdim=True).sqrt()
     z = torch.linalg.cross(x, R[:, 1])
     z = z / (z * z).sum(-1, keepdim=True).sqrt()
@@ -109,7 +109,7 @@ def orthonormal(R: Tensor) -> Tensor:
 
 
 def hat(v: Tensor) -> Tensor:
-    """Cross-product matrix: (…, 3) → (…, 3, 3), ``hat(v) @ w = v × w``.
+    """Cross-product matrix (…, 3, 3) of vectors (…, 3): ``hat(v) @ w = v × w``.
 
     kornia's ``So3.hat`` gives the same bits and takes half as long again, in every step of a refinement.
     """
@@ -118,11 +118,11 @@ def hat(v: Tensor) -> Tensor:
 
 
 def exp(xi: Tensor) -> Pose:
-    """Exponential map: (B, 6) rotation vector (rad) then translation part (m) → Pose.
+    """Exponential map: Pose of tangents (B, 6), rotation vector (rad) then translation part (m).
 
     Closed form with series below 0.1 rad, so that value and gradient are exact at zero as well. Equal to
     ``kornia.geometry.liegroup.Se3.exp`` of the reordered vector (``tests/geometry/test_se3.py``); written out because
-    it sits in the inner loop of every refinement, where kornia's takes more than twice as long.
+    it is in the inner loop of every refinement, where kornia's takes more than twice as long.
     """
     check("se3.exp", xi=(xi, "B 6"))
     omega, upsilon = xi[..., :3], xi[..., 3:]
@@ -148,13 +148,13 @@ def exp(xi: Tensor) -> Pose:
 
 
 def log(T: Pose) -> Tensor:
-    """Logarithm (B, 6), rotation vector (rad) then translation part (m): ``exp(log(T))`` is T, for turns below π.
+    """Logarithm (B, 6), rotation vector (rad) then translation part (m): ``exp(log(T))`` is T, for rotations below π.
 
-    Gradient: to the pose, exact at no rotation as well. Towards half a turn the axis is lost to rounding.
+    Gradient: to the pose, exact at zero rotation as well. Near π the axis is lost to rounding.
     """
     check("se3.log", R=(T.R, "B 3 3"), t=(T.t, "B 3"))
     R = T.R
-    axis = 0.5 * _turn_axis(R)
+    axis = 0.5 * _rotation_axis(R)
     sin2 = (axis * axis).sum(-1, keepdim=True)
     cos = 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1)
     small = (sin2 < 1e-4) & (cos > 0)
@@ -167,13 +167,13 @@ def log(T: Pose) -> Tensor:
     whole = (1 - half * cotangent)[..., None] / torch.where(small[..., None], torch.ones_like(theta2), theta2)
     square = torch.where(small[..., None], (1 + theta2 / 60 * (1 + theta2 / 42)) / 12, whole)
     W = hat(omega)
-    once = (W @ T.t[..., None])[..., 0]
-    twice = (W @ once[..., None])[..., 0]
-    return torch.cat((omega, T.t - 0.5 * once + square[..., 0] * twice), -1)
+    W_t = (W @ T.t[..., None])[..., 0]
+    W2_t = (W @ W_t[..., None])[..., 0]
+    return torch.cat((omega, T.t - 0.5 * W_t + square[..., 0] * W2_t), -1)
 
 
 def adjoint(T: Pose) -> Tensor:
-    """(B, 6, 6) that carries tangents through a motion: ``T · exp(xi) = exp(adjoint(T) @ xi) · T``.
+    """Adjoint (B, 6, 6), which transports tangents through a motion: ``T · exp(xi) = exp(adjoint(T) @ xi) · T``.
 
     Gradient: to the pose.
     """
@@ -183,7 +183,7 @@ def adjoint(T: Pose) -> Tensor:
 
 
 def retract(T: Pose, xi: Tensor) -> Pose:
-    """``exp(xi) · T`` for (B, 6)."""
+    """Retraction ``exp(xi) · T`` for tangents (B, 6)."""
     return compose(exp(xi), T)
 
 
@@ -192,16 +192,16 @@ def rotation_angle(R: Tensor) -> Tensor:
 
     The length of kornia's ``rotation_matrix_to_axis_angle`` takes seven times as long and depends on the batch's size.
     """
-    axis = _turn_axis(R)
+    axis = _rotation_axis(R)
     trace = R.diagonal(dim1=-2, dim2=-1).sum(-1)
     return pad_elementwise(torch.atan2, axis.norm(dim=-1), trace - 1)
 
 
 def turn_between(up: Sequence[float], to: Sequence[float] = (0.0, -1.0, 0.0)) -> Tensor:
-    """The smallest rotation (3, 3) that takes ``up`` to ``to``; half a turn goes about x.
+    """The smallest rotation (3, 3) that takes ``up`` to ``to``; a rotation by π is about x.
 
     Raises:
-        ValueError: a direction of no length.
+        ValueError: a direction of zero length.
     """
     a, b = (torch.tensor(list(v), dtype=torch.float64) for v in (up, to))
     if not (float(a.norm()) > 0 and float(b.norm()) > 0):
@@ -216,6 +216,6 @@ def turn_between(up: Sequence[float], to: Sequence[float] = (0.0, -1.0, 0.0)) ->
     return torch.eye(3, dtype=torch.float64) + K + K @ K / (1 + a @ b)
 
 
-def _turn_axis(R: Tensor) -> Tensor:
+def _rotation_axis(R: Tensor) -> Tensor:
     """The axis of rotations (…, 3, 3) times twice the sine of their angle."""
     return torch.stack((R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]), -1)
