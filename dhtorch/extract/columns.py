@@ -1,4 +1,4 @@
-"""What a row of features is: names, shapes, units, and how arrays become columns of an Arrow table.
+"""Columns of a row of features: names, shapes, units, and their conversion to an Arrow table.
 
 Alphabet: N samples of a frame, P patches of its token grid.
 """
@@ -17,33 +17,33 @@ from dhtorch.transforms import SampleProblem, schema
 
 Row = dict[str, Any]  # column → number, text or array
 
-#: Where a row belongs: these columns come first, and every shard has them.
+#: Columns that identify a row: they come first, and every shard has them.
 KEY_COLUMNS = ("episode_index", "frame_index", "timestamp", "recording")
 
-#: Kinds that are no numbers → bytes of one, roughly.
+#: Kinds other than numbers → estimated bytes of a value.
 _GUESSED_BYTES = {"str": 1, "bytes": 1 << 18}
 
 
 class Column(NamedTuple):
     """One column of a table."""
 
-    kind: str  # numpy's name of the type of a number, "str", or "bytes" = a file
+    kind: str  # numpy dtype of a number, "str", or "bytes" = a file
     shape: tuple[int, ...]  # of one row
     unit: str
     about: str
 
     @property
     def n_bytes(self) -> int:
-        """In memory, of one row, files and texts by a guess."""
+        """Bytes in memory of one row; files and texts are estimated."""
         return _GUESSED_BYTES.get(self.kind) or np.dtype(self.kind).itemsize * math.prod(self.shape)
 
 
 def feature_columns(
     n: int, patches: int, *, half: bool = False, map_hw: tuple[int, int] | None = None
 ) -> dict[str, Column]:
-    """All columns of rows with ``n`` samples, ``patches`` tokens and maps of that size (None = no maps), in order."""
+    """Numbers of samples and tokens, map size (None = no maps) -> all columns of a row, in order."""
     sizes = {"N": n, "P": patches, **({} if map_hw is None else dict(zip("HW", map_hw, strict=True)))}
-    added = schema.select_columns(() if map_hw is None else ("dense",))
+    added = schema.columns_of_options(() if map_hw is None else ("dense",))
     return {
         "episode_index": Column("int64", (), "1", "number of the episode in its data set, else of the recording"),
         "frame_index": Column("int64", (), "1", "number of the frame in its capture"),
@@ -54,16 +54,16 @@ def feature_columns(
 
 
 def stored_column(spec: schema.ColumnSpec, sizes: Mapping[str, int], *, half: bool = False) -> Column:
-    """A column of the transform as files hold it: codes as bytes, with ``half`` what allows it as float16."""
+    """Column of the transform -> stored column: codes as uint8, with ``half`` suitable floats as float16."""
     kind = "uint8" if spec.codes is not None else "float16" if half and spec.half else spec.dtype
     return Column(kind, schema.resolve_shape(spec.shape, sizes), spec.unit, spec.meaning)
 
 
 def select_columns(found: Mapping[str, Column], wanted: Sequence[str] | None) -> dict[str, Column]:
-    """The place of a row, the wanted columns (None = all) and ``problem``.
+    """All columns and wanted names (None = all) -> key columns, wanted columns and ``problem``.
 
     Raises:
-        ValueError: no such column.
+        ValueError: an unknown column.
     """
     for name in wanted or ():
         if name not in found:
@@ -73,7 +73,7 @@ def select_columns(found: Mapping[str, Column], wanted: Sequence[str] | None) ->
 
 
 def blank_features(wanted: Mapping[str, Column]) -> Row:
-    """The features of a frame that cannot be read: zeros, and a ``problem`` that says so."""
+    """Columns -> features of an unreadable frame: zeros, and ``problem`` UNREADABLE."""
     empty: dict[str, Any] = {"str": "", "bytes": b""}
     zeros = {k: empty[c.kind] if c.kind in empty else np.zeros(c.shape, c.kind) for k, c in wanted.items()}
     zeros = {k: value for k, value in zeros.items() if k not in KEY_COLUMNS}
@@ -81,12 +81,12 @@ def blank_features(wanted: Mapping[str, Column]) -> Row:
 
 
 def code_tables() -> dict[str, dict[int, str]]:
-    """Column → what its codes mean, for the metadata of a file."""
+    """Column → code → name, for the metadata of a file."""
     return {spec.key: names(spec.codes) for spec in schema.COLUMNS if spec.codes is not None}
 
 
 def arrow_schema(wanted: Mapping[str, Column], metadata: Mapping[str, str]) -> Any:
-    """Arrow schema: lists of fixed size, unit and meaning with every field."""
+    """Columns and metadata -> Arrow schema: fixed-size lists, unit and meaning in every field."""
     pyarrow = import_optional("pyarrow", extra="scale")
     fields = [
         pyarrow.field(name, _arrow_type(pyarrow, c), nullable=False, metadata={"unit": c.unit, "about": c.about})
@@ -96,7 +96,7 @@ def arrow_schema(wanted: Mapping[str, Column], metadata: Mapping[str, str]) -> A
 
 
 def arrow_table(rows: Iterable[Row], wanted: Mapping[str, Column], layout: Any) -> Any:
-    """Arrow table of some rows, at least one, in the layout that :func:`arrow_schema` made."""
+    """Rows (at least one) -> Arrow table with the schema of :func:`arrow_schema`."""
     pyarrow = import_optional("pyarrow", extra="scale")
     rows = list(rows)
     arrays = []
@@ -113,8 +113,8 @@ def arrow_table(rows: Iterable[Row], wanted: Mapping[str, Column], layout: Any) 
 
 
 def _arrow_type(pyarrow: Any, column: Column) -> Any:
-    named = {"str": pyarrow.string(), "bytes": pyarrow.binary()}
-    kind = named.get(column.kind) or pyarrow.from_numpy_dtype(np.dtype(column.kind))
+    other_kinds = {"str": pyarrow.string(), "bytes": pyarrow.binary()}
+    kind = other_kinds.get(column.kind) or pyarrow.from_numpy_dtype(np.dtype(column.kind))
     for size in reversed(column.shape):
         kind = pyarrow.list_(kind, size)
     return kind

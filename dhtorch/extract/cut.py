@@ -1,4 +1,4 @@
-"""Part of a data set: the first frames of each recording, or some of the recordings; opened when they are asked for."""
+"""Subsets of a data set, opened lazily: the first frames of each recording, or selected recordings."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dhtorch.data.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class TruncatedScenes(LazySequence[Scene]):
-    """Scenes with so many frames each at most."""
+    """Scenes of at most ``frames`` frames each."""
 
     scenes: Sequence[Scene]
     frames: int
@@ -20,14 +20,14 @@ class TruncatedScenes(LazySequence[Scene]):
         return len(self.scenes)
 
     def made(self, place: int) -> Scene:
-        """The scene there, cut."""
+        """Truncated scene at an index."""
         scene = self.scenes[place]
         return replace(scene, recording=truncate_recording(scene.recording, self.frames))
 
 
 @dataclass(frozen=True, eq=False)
 class SelectedRecordings(LazySequence[Recording]):
-    """The recordings of some scenes."""
+    """Recordings of the scenes at some indices."""
 
     scenes: Sequence[Scene]
     places: tuple[int, ...]
@@ -36,17 +36,17 @@ class SelectedRecordings(LazySequence[Recording]):
         return len(self.places)
 
     def made(self, place: int) -> Recording:
-        """The recording of the scene there."""
+        """Recording at an index."""
         return self.scenes[self.places[place]].recording
 
 
 def truncate_scenes(scenes: Sequence[Scene], frames: int | None) -> Sequence[Scene]:
-    """The scenes with their first frames alone; None = all."""
+    """Scenes -> scenes of their first frames; None = all frames."""
     return scenes if frames is None else TruncatedScenes(scenes, frames)
 
 
 def truncate_recording(recording: Recording, frames: int) -> Recording:
-    """The first frames of a recording."""
+    """Recording -> recording of its first frames."""
     times, poses = recording.times, recording.poses
     return replace(
         recording,

@@ -1,4 +1,4 @@
-"""A frame of a recording → its row: the frame and an earlier one become a sample, the transform answers."""
+"""Frame of a recording → row of features: the frame and other frames form a sample for the transform."""
 
 from __future__ import annotations
 
@@ -23,39 +23,39 @@ from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.records import Camera, Frame
 from dhtorch.transforms import DenseMaps, ExtendDepth, SampleError
 
-#: Readers give metres, and the camera of these very pixels: there is no unit that could be wrong.
+#: Readers return metres and the camera of the same pixels: the checks of unit and intrinsics are switched off.
 _READER_OPTIONS = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
 
 
-#: Bytes of frames that are held because others will ask for them.
+#: Maximum bytes of cached frames, which are read again as source views of later frames.
 _FRAME_CACHE_BYTES = 1 << 26
 
 
 class ExtractedRow(NamedTuple):
-    """What came of one row of the plan."""
+    """Result of one row of the plan."""
 
-    place: Row  # the columns that say where it belongs
+    place: Row  # the key columns
     features: Row | None  # the other columns; None = the frame cannot be read
-    complaint: str = ""  # why
+    complaint: str = ""  # the reason
 
 
 class RowDataset(Dataset[ExtractedRow]):
-    """Position in the plan → answer. Depends on nothing but the position: not on the worker, its engine or the order.
+    """Position in the plan → row. Depends on the position only: not on the worker, the engine or the order.
 
-    The sample is what a robot's data loader with ``delta_timestamps`` makes: earlier pictures, then the frame itself.
-    Earlier ones are those among which the method chooses, or that of ``gap`` frames earlier (for a method of many views
-    several, spread over the way). Where there is no such frame, or it cannot be read, a copy of the frame pads, and the
-    front end runs alone; among several to choose from it is left out.
+    The sample is that of a robot data loader with ``delta_timestamps``: source images, then the frame itself. Source
+    views are the candidates of view selection, or the frame ``gap`` frames earlier (for a multi-view method several,
+    evenly spaced over the gap). If such a frame is missing or cannot be read, a copy of the frame pads, and only the
+    front end runs; an unreadable candidate of view selection is left out.
 
     Args:
         scenes: of the data set.
         plan: from :func:`dhtorch.extract.plan.make_plan`.
         wanted: columns of the rows.
-        method: of one other view or several.
-        gap: ``auto`` = the method chooses among earlier frames; a number of frames back to the other view, 0 = none;
+        method: for one source view or several.
+        gap: ``auto`` = view selection among earlier frames; number of frames back to the source view, 0 = none;
             None = the scene's own.
-        past: among earlier frames alone; else also among later ones of the same recording.
-        beside: also among the frames of the episode's other cameras at the same instant; with a ``gap`` of auto.
+        past: candidates are earlier frames only; else also later ones of the same recording.
+        beside: candidates are also the frames of the episode's other cameras at the same instant; with ``gap`` auto.
         options: of :class:`dhtorch.transforms.ExtendDepth`.
     """
 
@@ -91,26 +91,26 @@ class RowDataset(Dataset[ExtractedRow]):
         try:
             with torch.no_grad():
                 return ExtractedRow(place, self.features(opened, i))
-        except Exception as error:  # whatever a decoder raises; lack of memory is no property of a frame
+        except Exception as error:  # any error of a decoder; lack of memory is no property of a frame
             if isinstance(error, MemoryError | torch.OutOfMemoryError):
                 raise
-            text = f"{recording.name}, frame {place['frame_index']}: {error}"
-            return ExtractedRow(place, None, " ".join(text.split()))
+            message = f"{recording.name}, frame {place['frame_index']}: {error}"
+            return ExtractedRow(place, None, " ".join(message.split()))
 
     def features(self, opened: OpenRecording, i: int) -> Row:
-        """The columns of frame ``i`` of an opened recording, beside those of its place."""
+        """Frame ``i`` of an opened recording -> its columns other than the key columns."""
         reference = opened.frame(i)
         added = opened.answer(reference, opened.others(i))
         _check_shapes(added, self.wanted)
-        keep = {k: c for k, c in self.wanted.items() if k not in KEY_COLUMNS}
-        return {k: added[k].numpy().astype(c.kind) for k, c in keep.items()}
+        columns = {k: c for k, c in self.wanted.items() if k not in KEY_COLUMNS}
+        return {k: added[k].numpy().astype(c.kind) for k, c in columns.items()}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": None}
 
 
 class OpenRecording:
-    """One recording, and the transforms that fit its frames."""
+    """One recording with a cache of frames, and the transforms for its kinds of samples."""
 
     def __init__(
         self,
@@ -131,48 +131,50 @@ class OpenRecording:
         self.beside = [(other, match_instants(self.recording, other)) for other in beside]
 
     def frame(self, i: int) -> Frame:
-        """Frame ``i``, which is likely to be asked for again as another view of those behind it."""
+        """Frame ``i``; it is cached, because later frames use it as a source view."""
         self.held[i] = frame = self.recording[i]
         self._forget()
         return frame
 
     def answer(self, reference: Frame, others: Sequence[Frame | None]) -> dict[str, Tensor]:
-        """What the transform adds to the sample of a frame and its other views."""
+        """Reference frame and source frames -> columns that the transform adds to their sample, without prefix."""
         sample = _make_sample(reference, others)
         optional = tuple(key for key in ("confidence", "distortion", "depth_intrinsics") if key in sample)
-        kind = (len(sample["image"]), *optional)
-        if kind not in self.transforms:
-            self.transforms[kind] = self._transform(len(sample["image"]) - 1, optional)
-        transform = self.transforms[kind]
-        out = transform(sample)
-        assert out is not None  # on_error is raise
-        return {k.removeprefix(transform.prefix): v for k, v in out.items() if k.startswith(transform.prefix)}
+        sample_kind = (len(sample["image"]), *optional)
+        if sample_kind not in self.transforms:
+            self.transforms[sample_kind] = self._transform(len(sample["image"]) - 1, optional)
+        transform = self.transforms[sample_kind]
+        extended = transform(sample)
+        assert extended is not None  # on_error is raise
+        return {k.removeprefix(transform.prefix): v for k, v in extended.items() if k.startswith(transform.prefix)}
 
     def others(self, i: int) -> list[Frame | None]:
-        """The other views of frame ``i``; None = one that is not there, or cannot be read."""
+        """Source frames of frame ``i``; None = missing or unreadable."""
         if self.offers is None:
             number = int(self.recording.number[i])
-            return [self._frame(self.position.get(number - step)) for step in self.steps]
-        found: list[Frame | None] = [f for k in self.offers.get(i, ()) if (f := self._frame(k)) is not None]
-        for other, places in self.beside:
-            frame = None if places[i] < 0 else try_read_frame(other, places[i])
-            found += [] if frame is None else [frame]
-        return found or [None]
+            return [self._cached_frame(self.position.get(number - step)) for step in self.steps]
+        frames: list[Frame | None] = [f for k in self.offers.get(i, ()) if (f := self._cached_frame(k)) is not None]
+        for recording, indices in self.beside:
+            frame = None if indices[i] < 0 else try_read_frame(recording, indices[i])
+            frames += [] if frame is None else [frame]
+        return frames or [None]
 
-    def _frame(self, at: int | None) -> Frame | None:
+    def _cached_frame(self, at: int | None) -> Frame | None:
+        """Frame ``at`` from the cache; None = no index, or unreadable."""
         if at is not None and at not in self.held:
             self.held[at] = try_read_frame(self.recording, at)
             self._forget()
         return None if at is None else self.held[at]
 
     def _forget(self) -> None:
-        """Drop what was read first: decoding a video backwards starts at a key frame every time."""
-        known = [frame for frame in self.held.values() if frame is not None]
-        size = max((frame.image.nbytes + frame.depth.nbytes for frame in known), default=1)
+        """Drop the oldest frames beyond the cache size. (Uncached, decoding backwards restarts at a key frame.)"""
+        frames = [frame for frame in self.held.values() if frame is not None]
+        size = max((frame.image.nbytes + frame.depth.nbytes for frame in frames), default=1)
         while len(self.held) > max(2, _FRAME_CACHE_BYTES // size):
             self.held.popitem(last=False)
 
     def _transform(self, views: int, optional: tuple[str, ...]) -> ExtendDepth:
+        """Number of source views and optional keys of a sample -> its transform."""
         options: dict[str, Any] = {**_READER_OPTIONS, **self.options, **{key: key for key in optional}}
         options |= {"sparse": self.recording.sparse, "hint": self.scene.hint}
         other_at = list(range(views)) if views > 1 else 0
@@ -180,7 +182,7 @@ class OpenRecording:
 
 
 def common_map_hw(scenes: Sequence[Scene], maps: DenseMaps) -> tuple[int, int]:
-    """Height and width of all maps of a data set, by the first frame of each recording that can be read.
+    """Scenes -> height and width of all their maps, from the first readable frame of each recording.
 
     Raises:
         ValueError: recordings whose maps have different sizes, or no frame that can be read.
@@ -190,7 +192,7 @@ def common_map_hw(scenes: Sequence[Scene], maps: DenseMaps) -> tuple[int, int]:
         frames = (try_read_frame(recording, i) for i in range(len(recording)))
         frame = next((frame for frame in frames if frame is not None), None)
         if frame is None:
-            continue  # said row by row
+            continue  # reported row by row
         hw = maps.hw(frame.hw)
         if first is not None and hw != first[1]:
             found = f"{recording.name} has pictures of {_format_hw(frame.hw)} and maps of {_format_hw(hw)}"
@@ -199,12 +201,12 @@ def common_map_hw(scenes: Sequence[Scene], maps: DenseMaps) -> tuple[int, int]:
             )
         first = first or (recording.name, hw)
     if first is None:
-        raise ValueError("extract.dense: found no frame that can be read, expected one that tells the size of maps")
+        raise ValueError("extract.dense: found no frame that can be read, expected one to set the size of the maps")
     return first[1]
 
 
 def try_read_frame(recording: Recording, at: int) -> Frame | None:
-    """A frame, None where it cannot be read: said where that frame is the reference view."""
+    """Frame ``at``, None if it cannot be read; the error is reported where that frame is the reference view."""
     try:
         return recording[at]
     except MemoryError:
@@ -214,7 +216,7 @@ def try_read_frame(recording: Recording, at: int) -> Frame | None:
 
 
 def _check_shapes(added: Mapping[str, Tensor], wanted: Mapping[str, Column]) -> None:
-    """Raises SampleError for a map of another size than its column, the only thing that a picture's size decides."""
+    """Raises SampleError for a map of another size than its column: only maps depend on the image size."""
     for name, column in wanted.items():
         if name in added and tuple(added[name].shape) != column.shape:
             found, expected = (_format_hw(shape) for shape in (added[name].shape, column.shape))
@@ -226,7 +228,7 @@ def _format_hw(hw: Sequence[int]) -> str:
 
 
 def _make_sample(reference: Frame, others: Sequence[Frame | None]) -> dict[str, Any]:
-    """Frames along time, the reference view last, as the transform reads them."""
+    """Reference frame and source frames -> sample dict, frames along time, the reference view last."""
     frames = [*(reference if other is None else other for other in others), reference]
     cameras = [frame.camera for frame in frames]
     sample = {
@@ -250,6 +252,6 @@ def _make_sample(reference: Frame, others: Sequence[Frame | None]) -> dict[str, 
 
 
 def _pad_distortion(camera: Camera, like: Tensor, size: int) -> Tensor:
-    """Numbers of the lens, zeros where there is none or another has more."""
-    lens = like.new_zeros(1, 0) if camera.distortion is None else camera.distortion
-    return torch.nn.functional.pad(lens, (0, size - lens.shape[-1]))
+    """Distortion coefficients (1, size) of a camera, padded with zeros."""
+    coefficients = like.new_zeros(1, 0) if camera.distortion is None else camera.distortion
+    return torch.nn.functional.pad(coefficients, (0, size - coefficients.shape[-1]))

@@ -1,7 +1,7 @@
-"""Where rows are made: data-loader workers of this machine, or the tasks of a Ray cluster. The rows are the same.
+"""Engines that compute rows: data-loader workers of this machine, or tasks of a Ray cluster, with the same result.
 
-An engine yields the answers of some positions in their order. Each is made by one call of one sample on one thread,
-and no worker raises: what is wrong with a frame travels in its answer.
+An engine yields the rows of some positions in their order. Each is computed by one call for one sample on one thread,
+and no worker raises: the error of a frame is part of its row.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from dhtorch.extract.dataset import ExtractedRow, RowDataset
 from dhtorch.runtime.parent_watch import exit_with_parent
 from dhtorch.transforms import SampleError, one_thread
 
-#: Rows of one Ray task: what is done again where a node is lost.
+#: Rows of one Ray task: the unit that is repeated if a node is lost.
 _RAY_TASK_ROWS = 16
 
-#: Bytes of shared memory of a Ray that is started on this machine.
+#: Shared memory of a Ray instance started on this machine, bytes.
 _RAY_STORE_BYTES = 300_000_000
 
-#: Time that a cluster is given to answer, s.
+#: Timeout of the connection to a cluster, s.
 _CONNECT_TIMEOUT_S = 10
 
 
-#: Names of the places.
+#: Names of the engines.
 ENGINES = ("local", "ray")
 
 
 def run_engine(
     engine: str, rows: RowDataset, positions: Sequence[int], *, workers: int, address: str | None = None
 ) -> Iterator[ExtractedRow]:
-    """The answers of the engine of that name."""
+    """Engine name, rows and positions -> computed rows, in the order of the positions."""
     return run_ray(rows, positions, address) if engine == "ray" else run_local(rows, positions, workers)
 
 
@@ -49,14 +49,14 @@ def filter_rows(
     complaints: list[str],
     otherwise: str = "extract.on_error=skip or flag",
 ) -> Iterator[columns.Row]:
-    """Rows to write: what becomes of a frame that cannot be read is decided here, for every engine alike.
+    """Computed rows -> rows to write; applies ``on_error`` to unreadable frames, for all engines alike.
 
     Raises:
-        SampleError: one that cannot be read, where ``on_error`` is raise; ``otherwise`` is what to set.
+        SampleError: an unreadable frame if ``on_error`` is raise; ``otherwise`` names the option in the message.
     """
     for place, features, complaint in answers:
         if features is None and on_error == "raise":
-            raise SampleError(f"{complaint} (with {otherwise} the rest goes on)")
+            raise SampleError(f"{complaint} (set {otherwise} to continue with the other frames)")
         if features is None:
             complaints.append(complaint)
         if features is not None or on_error == "flag":
@@ -64,7 +64,7 @@ def filter_rows(
 
 
 def run_local(rows: RowDataset, positions: Sequence[int], workers: int) -> Iterator[ExtractedRow]:
-    """In this process, or in so many data-loader workers.
+    """Compute rows in this process (``workers`` 0), or in data-loader workers.
 
     Raises:
         ChildProcessError: a worker was killed.
@@ -84,35 +84,35 @@ def run_local(rows: RowDataset, positions: Sequence[int], workers: int) -> Itera
     except RuntimeError as error:
         if "DataLoader worker" not in str(error):
             raise
-        raise ChildProcessError(f"{error}; is there memory for {workers} workers?") from error
+        raise ChildProcessError(f"{error}; is there enough memory for {workers} workers?") from error
 
 
 def run_ray(rows: RowDataset, positions: Sequence[int], address: str | None) -> Iterator[ExtractedRow]:
-    """In the tasks of a Ray cluster, through Ray Data; lost nodes are made up for.
+    """Compute rows in tasks of a Ray cluster, through Ray Data, which repeats the tasks of lost nodes.
 
     Args:
-        rows: what the tasks are sent; data files must lie at the same place on every node.
+        rows: sent to the tasks; data files must have the same path on every node.
         positions: in the plan.
-        address: of the cluster; None = one that is started on this machine and ends with the last row.
+        address: of the cluster; None = start one on this machine, which ends with the last row.
 
     Raises:
         ConnectionError: no cluster at the address.
     """
     ray, data = import_optional("ray", extra="scale"), import_optional("ray.data", extra="scale")
     _check_reachable(address)
-    own = {} if address else {"include_dashboard": False, "object_store_memory": _RAY_STORE_BYTES}
+    init_args = {} if address else {"include_dashboard": False, "object_store_memory": _RAY_STORE_BYTES}
     logging.getLogger("ray.data").setLevel(logging.ERROR)
     try:
-        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
-    except Exception as error:  # Ray has no class of its own for a node that does not come up
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **init_args)
+    except Exception as error:  # Ray has no specific class for a node that does not start
         raise ConnectionError(f"engine=ray: {error}") from error
     try:
         context = data.DataContext.get_current()
         context.execution_options.preserve_order = True
         context.enable_progress_bars = False
         shared = ray.put(rows)
-        cuts = range(_RAY_TASK_ROWS, len(positions), _RAY_TASK_ROWS)
-        blocks = np.split(np.asarray(positions, np.int64), cuts)
+        splits = range(_RAY_TASK_ROWS, len(positions), _RAY_TASK_ROWS)
+        blocks = np.split(np.asarray(positions, np.int64), splits)
 
         def task(batch: dict[str, Any]) -> dict[str, Any]:
             return {
@@ -127,14 +127,14 @@ def run_ray(rows: RowDataset, positions: Sequence[int], address: str | None) -> 
 
 
 def _check_reachable(address: str | None) -> None:
-    """Ask whether anything answers: Ray itself goes on trying for minutes."""
+    """Raises ConnectionError if no server accepts connections at the address; Ray itself retries for minutes."""
     host, _, port = str(address).removeprefix("ray://").rpartition(":")
     if not port.isdigit():
         return
     try:
         socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
     except OSError as error:
-        raise ConnectionError(f"address: nothing answers at {address} ({error}), expected a cluster") from None
+        raise ConnectionError(f"address: no connection to {address} ({error}), expected a Ray cluster") from None
 
 
 def _init_worker(number: int) -> None:

@@ -1,4 +1,4 @@
-"""A frame of a recording → what a data set is enriched with: its maps as files, its camera, and counts of them."""
+"""Frame of a recording → row of an enriched data set: encoded maps, camera, and counts."""
 
 from __future__ import annotations
 
@@ -24,23 +24,28 @@ from dhtorch.pipeline import dense
 from dhtorch.records import Frame
 from dhtorch.transforms import SampleError, schema
 
-#: Map -> its steps in one of depth, where they are finer.
+#: Map -> number of its quantisation steps per step of depth; 1 if missing.
 MAP_STEPS: Final = {"sigma": 8}
 
-#: File type of a map -> numpy's type of its pixels.
+#: File type of a map -> numpy dtype of its pixels.
 _MAP_DTYPES: Final = {"tiff": np.float32, "png": np.uint8}
 
-#: Columns of the transform that an enriched data set holds: a file for each picture, by name of the map, and numbers.
+#: Maps of the transform that an enriched data set stores, one file per image, by name.
 MAP_FILES: Final = {c.key.removesuffix("_map"): c for c in schema.COLUMNS if c.enrich in ("tiff", "png")}
+
+#: Columns of numbers of the transform that an enriched data set stores.
 NUMBER_COLUMNS: Final = {c.key: c for c in schema.COLUMNS if c.enrich == "numbers"}
 
-#: Columns of the counts: pixels by source, and silent ones by reason.
-_N_SOURCES, NO_OTHER_VIEW = max(names(Source)) + 1, max(names(Gate)) + 1
+#: Length of the counts of pixels by source.
+_N_SOURCES = max(names(Source)) + 1
 
-#: Why a pixel is silent: gates, and that there was no other view, as before the first frame of an episode.
+#: Reason for pixels without an answer beyond the gates: no source view, as for the first frame of an episode.
+NO_OTHER_VIEW = max(names(Gate)) + 1
+
+#: Reasons for unanswered pixels, by code: gates, and no source view.
 NO_ANSWER_REASONS = {**names(Gate), NO_OTHER_VIEW: "NO_OTHER_VIEW"}
 
-#: Numbers of :class:`dhtorch.export.lerobot.FeatureMoments`, over depth, sigma, and the colours of the picture.
+#: Shape of the stored :class:`dhtorch.export.lerobot.FeatureMoments`: numbers × (depth, sigma, red, green, blue).
 _MOMENTS_SHAPE = (5, 5)
 
 
@@ -48,42 +53,42 @@ _MOMENTS_SHAPE = (5, 5)
 class DatasetCamera:
     """One camera of a data set."""
 
-    key: str  # of its pictures, as a LeRobot feature
-    hw: tuple[int, int]  # of the picture
+    key: str  # LeRobot feature of its images
+    hw: tuple[int, int]  # of the image
     map_hw: tuple[int, int]
     posed: bool
     lens: tuple[float, ...] = ()
 
     @property
     def name(self) -> str:
-        """Of the camera alone."""
+        """Name of the camera, without the prefixes of the feature."""
         return self.key.removeprefix("observation.").removeprefix("images.")
 
     @classmethod
     def of(cls, scene: Scene, size: int) -> DatasetCamera:
-        """The camera of a recording, by the first of its frames that can be read.
+        """Recording and maximum map size -> its camera, from the first readable frame.
 
         Raises:
-            ValueError: there is none, or frames have no pictures.
+            ValueError: no readable frame, or frames without images.
         """
         recording = scene.recording
         frames = (try_read_frame(recording, i) for i in range(len(recording)))
         frame = next((frame for frame in frames if frame is not None), None)
         if frame is None or 0 in frame.hw:
-            recording[0]  # says what is wrong with it
-            raise ValueError(f"{recording.name}: found no frame with a picture, expected one")
+            recording[0]  # raises the error of the reader
+            raise ValueError(f"{recording.name}: found no frame with an image, expected one")
         map_hw = dense.map_hw(frame.hw, size)
         return cls(camera_key(recording), frame.hw, map_hw, recording.poses is not None, get_distortion(frame))
 
 
 def get_distortion(frame: Frame) -> tuple[float, ...]:
-    """Distortion of the picture, OpenCV's order; none is empty."""
-    lens = frame.camera.distortion
-    return () if lens is None else tuple(lens[0].tolist())
+    """Frame -> distortion coefficients in OpenCV's order; empty without distortion."""
+    distortion = frame.camera.distortion
+    return () if distortion is None else tuple(distortion[0].tolist())
 
 
 def camera_key(recording: Recording) -> str:
-    """The LeRobot feature of a recording's pictures."""
+    """Recording -> LeRobot feature of its images."""
     name = recording.camera_name
     if name is None or recording.format == "lerobot":
         return name or "observation.images.camera"
@@ -91,12 +96,12 @@ def camera_key(recording: Recording) -> str:
 
 
 def camera_feature(name: str) -> str:
-    """The LeRobot feature of pictures that another format calls ``name``."""
+    """Name of images in another format -> LeRobot feature."""
     return "observation.images." + name.removeprefix("observation/").removeprefix("images/").replace("/", "_")
 
 
 def map_columns(pictures: bool, n: int = 0) -> dict[str, Column]:
-    """What is kept of a frame, of ``n`` samples, until its episode is whole."""
+    """Columns of the intermediate shards; ``pictures``: with the encoded image; ``n``: samples of a frame."""
     f, whole = "float64", "int64"
     files = {name: f"{c.meaning}, {c.unit}, as {str(c.enrich).upper()}" for name, c in MAP_FILES.items()}
     place = {
@@ -114,7 +119,7 @@ def map_columns(pictures: bool, n: int = 0) -> dict[str, Column]:
         "K": Column(f, (9,), "px", "of the picture"),
         "pose": Column(f, (16,), "1, m", "T_world_from_cam by rows; NaN = none"),
         "pixels": Column(whole, (_N_SOURCES,), "1", "by source"),
-        "silent": Column(whole, (len(NO_ANSWER_REASONS),), "1", "silent ones by SILENCE"),
+        "silent": Column(whole, (len(NO_ANSWER_REASONS),), "1", "unanswered ones by NO_ANSWER_REASONS"),
         "refuted": Column(whole, (), "code", "0 = no pose is, else 1 + which of CONVENTIONS it looks like"),
         "moments": Column(f, _MOMENTS_SHAPE, "m, 1", "of depth, sigma, red, green, blue"),
         "problem": Column("uint8", (), "code", "what was wrong with the frame"),
@@ -122,17 +127,17 @@ def map_columns(pictures: bool, n: int = 0) -> dict[str, Column]:
 
 
 def number_column(spec: schema.ColumnSpec, n: int) -> Column:
-    """A column of numbers as shards and data sets hold it; its shape is fixed by ``n`` samples, not by the picture."""
+    """Column of numbers of the transform -> stored column; its shape depends on ``n`` samples, not on the image."""
     return stored_column(spec, {"N": n})
 
 
 class MapRowDataset(RowDataset):
-    """Position in the plan → the maps of that frame; see :class:`dhtorch.extract.dataset.RowDataset`.
+    """Position in the plan → row with the maps of that frame; see :class:`dhtorch.extract.dataset.RowDataset`.
 
     Args:
-        step: m, of which depths are whole numbers, and sigma of an eighth; 0 = as found. A power of two: float32 holds
-            every step of it and packs well.
-        views: LeRobot feature of a camera → what it must be like.
+        step: m, quantisation step of depth; that of sigma is an eighth; 0 = unquantised. A power of two, because
+            float32 represents its multiples exactly and they compress well.
+        views: LeRobot feature of a camera → expected camera.
         more: of :class:`RowDataset`.
     """
 
@@ -141,46 +146,47 @@ class MapRowDataset(RowDataset):
         self.step, self.views = step, dict(views)
 
     def features(self, opened: OpenRecording, i: int) -> Row:
-        """What is kept of frame ``i``."""
+        """Frame ``i`` of an opened recording -> its columns other than the key columns."""
         recording = opened.recording
         reference = opened.frame(i)
         view = self.views[camera_key(recording)]
         if reference.hw != view.hw:
             raise SampleError(
-                f"picture of {_format_hw(reference.hw)}, expected {_format_hw(view.hw)} as of the first frame"
+                f"image: found {_format_hw(reference.hw)}, expected {_format_hw(view.hw)} as of the first frame"
             )
         if get_distortion(reference) != view.lens:
             expected = list(view.lens) or "none"
             raise SampleError(
-                f"lens {list(get_distortion(reference)) or 'none'}, expected {expected} as of the first frame"
+                f"distortion: found {list(get_distortion(reference)) or 'none'}, expected {expected} as of the first "
+                "frame"
             )
         others = opened.others(i)
         added = opened.answer(reference, others)
         maps = _extract_maps(added, view)
         source, gate = maps["source"], maps.pop("gate")
-        why = gate if any(other is not None for other in others) else np.full_like(gate, NO_OTHER_VIEW)
+        reason = gate if any(other is not None for other in others) else np.full_like(gate, NO_OTHER_VIEW)
         for name in maps:
             if MAP_FILES[name].enrich == "tiff":
                 maps[name] = _quantise(maps[name], self.step / MAP_STEPS.get(name, 1))
         image = to_rgb_uint8(reference)
         poses = recording.poses
         pose = np.full(16, np.nan) if poses is None else se3.to_matrix(poses[i : i + 1])[0].double().flatten().numpy()
-        found = {
+        columns = {
             **{name: _encode_map(field, name) for name, field in maps.items()},
             **{key: added[key].numpy().astype(self.wanted[key].kind) for key in NUMBER_COLUMNS},
             "K": cam.to_matrix(reference.camera)[0].double().flatten().numpy(),
             "pose": pose,
             "pixels": np.bincount(source.ravel(), minlength=_N_SOURCES),
-            "silent": np.bincount(why[source == Source.NONE], minlength=len(NO_ANSWER_REASONS)),
+            "silent": np.bincount(reason[source == Source.NONE], minlength=len(NO_ANSWER_REASONS)),
             "refuted": _refuted_code(added),
             "moments": _compute_moments(maps["depth"], maps["sigma"], image),
             "problem": added["problem"].numpy(),
         }
-        return found if "picture" not in self.wanted else {**found, "picture": encode_png(image)}
+        return columns if "picture" not in self.wanted else {**columns, "picture": encode_png(image)}
 
 
 def to_rgb_uint8(frame: Frame) -> np.ndarray:
-    """The picture (h, w, 3) uint8; grey in all three."""
+    """Frame -> image (h, w, 3) uint8; grey is repeated."""
     image = frame.image[0].cpu()
     if image.is_floating_point():
         image = (image.clamp(0, 1) * 255).round().to(torch.uint8)
@@ -188,7 +194,7 @@ def to_rgb_uint8(frame: Frame) -> np.ndarray:
 
 
 def blank_maps(view: DatasetCamera) -> dict[str, bytes]:
-    """The maps of a frame that could not be read: no depth anywhere."""
+    """Maps of an unreadable frame as files: no depth anywhere."""
     return {name: _encode_map(np.zeros(view.map_hw, _MAP_DTYPES[str(c.enrich)]), name) for name, c in MAP_FILES.items()}
 
 
@@ -197,42 +203,44 @@ def _encode_map(field: np.ndarray, name: str) -> bytes:
 
 
 def _extract_maps(added: Mapping[str, Tensor], view: DatasetCamera) -> dict[str, np.ndarray]:
-    """The maps that become files, and the gates (h, w); of samples alone where they stand, elsewhere zeros."""
+    """Columns of the transform -> maps (h, w) by name, and ``gate``; without dense maps only sampled pixels are set."""
     kinds: dict[str, Any] = {name: _MAP_DTYPES[str(c.enrich)] for name, c in MAP_FILES.items()} | {"gate": np.int64}
     if "depth_map" in added:
         return {name: added[f"{name}_map"].numpy().astype(kind) for name, kind in kinds.items()}
     h, w = view.map_hw
     scale = np.array([w / view.hw[1], h / view.hw[0]])
-    at = np.rint((added["uv"].double().numpy() + 0.5) * scale - 0.5).astype(np.int64).clip(0, (w - 1, h - 1))
-    found = {}
+    pixel = np.rint((added["uv"].double().numpy() + 0.5) * scale - 0.5).astype(np.int64).clip(0, (w - 1, h - 1))
+    maps = {}
     for name, kind in kinds.items():
-        found[name] = np.zeros((h, w), kind)
+        maps[name] = np.zeros((h, w), kind)
         if name in added:
-            found[name][at[:, 1], at[:, 0]] = added[name].numpy()
-    return found
+            maps[name][pixel[:, 1], pixel[:, 0]] = added[name].numpy()
+    return maps
 
 
 def _refuted_code(added: Mapping[str, Tensor]) -> np.ndarray:
-    """Whether the near returns refute a pose that was given, and what it looks like, as the column has it."""
-    looks = int(added.get("pose_convention", torch.zeros(())))
+    """Columns of the transform -> 0, or 1 + index of the matched convention if near returns refute the pose prior."""
+    convention = int(added.get("pose_convention", torch.zeros(())))
     refuted = (
-        looks > 0 or int(added["pose_code"]) == PoseCode.REFUTED or bool((added["gate"] == Gate.POSE_REFUTED).any())
+        convention > 0
+        or int(added["pose_code"]) == PoseCode.REFUTED
+        or bool((added["gate"] == Gate.POSE_REFUTED).any())
     )
-    return np.asarray(1 + looks if refuted else 0)
+    return np.asarray(1 + convention if refuted else 0)
 
 
 def _quantise(x: np.ndarray, step: float) -> np.ndarray:
-    """At the nearest step, one at least where there is anything."""
+    """Values -> nearest multiples of ``step``, at least one step where positive; 0 = unquantised."""
     if not step:
         return x.astype(np.float32)
     return np.where(x > 0, np.rint(x.astype(np.float64) / step).clip(1) * step, 0).astype(np.float32)
 
 
 def _compute_moments(depth: np.ndarray, sigma: np.ndarray, image: np.ndarray) -> np.ndarray:
-    known = depth.reshape(-1, 1) > 0
-    each = [FeatureMoments.of(x.reshape(-1, 1), known) for x in (depth, sigma)]
-    each.append(FeatureMoments.of(image.reshape(-1, 3) / 255))
-    return np.concatenate([np.stack(moments) for moments in each], 1)
+    valid = depth.reshape(-1, 1) > 0
+    all_moments = [FeatureMoments.of(x.reshape(-1, 1), valid) for x in (depth, sigma)]
+    all_moments.append(FeatureMoments.of(image.reshape(-1, 3) / 255))
+    return np.concatenate([np.stack(moments) for moments in all_moments], 1)
 
 
 def _format_hw(hw: Sequence[int]) -> str:

@@ -1,4 +1,4 @@
-"""Reading extracted features back: by row, by episode and frame, or joined to the data set they belong to."""
+"""Reader of extracted features: by row, by episode and frame, or joined to their data set."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from dhtorch.extract.columns import KEY_COLUMNS
 from dhtorch.extract.shards import read_shard_metadata, shard_files
 from dhtorch.transforms.sample_access import get_value
 
-#: Row groups that a process keeps in memory.
+#: Maximum number of row groups cached in a process.
 _MAX_CACHED_GROUPS = 4
 
 
 class FeatureTable(Sequence[dict[str, Tensor]]):
-    """The rows of an extraction, sorted by episode and frame; read when asked for.
+    """The rows of an extraction, sorted by episode and frame; read lazily.
 
     A row is a dict with the keys and shapes that :class:`dhtorch.transforms.ExtendDepth` adds to a sample, so a model
-    need not know whether its features were made before or in the loader. Halves become floats again.
+    gets the same input from stored features and from the loader. float16 is converted to float32.
 
     Args:
-        folder: that ``dhtorch extract`` wrote.
-        columns: what to read; None = all. Fewer are faster.
+        folder: output of ``dhtorch extract``.
+        columns: to read; None = all. Fewer are faster.
         prefix: of the keys.
 
     Attributes:
@@ -39,23 +39,23 @@ class FeatureTable(Sequence[dict[str, Tensor]]):
         place: column → (rows,) array: ``episode_index``, ``frame_index``, ``timestamp``.
 
     Raises:
-        FormatError: no extraction there, an unfinished one, or an unknown column.
+        FormatError: no extraction in the folder, an unfinished one, or an unknown column.
         ImportError: pyarrow is missing.
     """
 
     def __init__(self, folder: str | Path, columns: Sequence[str] | None = None, *, prefix: str = "dhtorch.") -> None:
         self.files = shard_files(Path(folder))
         if not self.files:
-            raise FormatError(folder, "shards", "none", "a folder that dhtorch extract wrote")
-        self.about, own = read_shard_metadata(self.files[0])
-        if len(self.files) != own["of"]:
-            expected = f"{own['of']}: the same dhtorch extract once more makes those that are missing"
+            raise FormatError(folder, "shards", "none", "a folder written by dhtorch extract")
+        self.about, shard_metadata = read_shard_metadata(self.files[0])
+        if len(self.files) != shard_metadata["of"]:
+            expected = f"{shard_metadata['of']}: run the same dhtorch extract again for the missing ones"
             raise FormatError(folder, "shards", len(self.files), expected)
-        known = [name for name in self.about["columns"] if name not in KEY_COLUMNS]
+        available = [name for name in self.about["columns"] if name not in KEY_COLUMNS]
         for name in columns or ():
-            if name not in known:
-                raise FormatError(folder, "columns", name, f"some of {', '.join(known)}")
-        self.columns, self.prefix = tuple(known if columns is None else columns), prefix
+            if name not in available:
+                raise FormatError(folder, "columns", name, f"some of {', '.join(available)}")
+        self.columns, self.prefix = tuple(available if columns is None else columns), prefix
         places = [read_columns(file, KEY_COLUMNS[:3]) for file in self.files]
         self.place = {name: np.concatenate([np.asarray(part[name]) for part in places]) for name in KEY_COLUMNS[:3]}
         self._starts = np.cumsum([0, *(len(part["episode_index"]) for part in places)])
@@ -72,10 +72,10 @@ class FeatureTable(Sequence[dict[str, Tensor]]):
         return {self.prefix + name: _tensor(values[name][at]) for name in self.columns}
 
     def at(self, episode: int, frame: int) -> dict[str, Tensor]:
-        """The row of one frame.
+        """Numbers of episode and frame -> row.
 
         Raises:
-            KeyError: there is none: the frame was skipped, or belongs to another data set.
+            KeyError: no such row: the frame was skipped, or belongs to another data set.
         """
         try:
             return self[self._row[episode, frame]]
@@ -84,12 +84,12 @@ class FeatureTable(Sequence[dict[str, Tensor]]):
 
 
 class JoinedDataset(Dataset[Any]):
-    """A map-style data set whose items carry their extracted features, found by episode and frame.
+    """Map-style data set and extracted features -> items with their features, matched by episode and frame.
 
     Args:
-        dataset: ``dataset[i]`` is a dict with the numbers of its episode and frame, as LeRobot's are.
+        dataset: ``dataset[i]`` is a dict with the numbers of its episode and frame, as in LeRobot.
         features: of the same frames.
-        episode_key, frame_key: of those numbers.
+        episode_key, frame_key: keys of those numbers.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class JoinedDataset(Dataset[Any]):
 
 
 def _row_of(file: Path, row: int, columns: tuple[str, ...]) -> tuple[int, dict[str, Any]]:
-    """(place in its row group, the group) of a row."""
+    """File and row -> (index in its row group, columns of the group)."""
     changed = modification_time_ns(file)
     starts = _starts(file, changed)
     group = int(np.searchsorted(starts, row, "right")) - 1
@@ -129,6 +129,6 @@ def _group(file: Path, _changed: int, rows: tuple[int, int], columns: tuple[str,
 
 
 def _tensor(value: Any) -> Tensor:
-    """A copy of its own, in the types that the transform uses."""
+    """Stored value -> tensor copy in the dtypes of the transform: bool, float32 or int32."""
     x = torch.from_numpy(np.array(value))
     return x if x.dtype == torch.bool else x.float() if x.is_floating_point() else x.int()

@@ -1,4 +1,4 @@
-"""The rows of an episode's shards as they are asked for: of one camera frame by frame, of several by their instants."""
+"""Rows of an episode read lazily from its shards: of one camera by frame, of several cameras by instant."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dhtorch.extract.origin import TABLE_GROUP_ROWS
 
 
 def iter_rows(parts: Sequence[Path]) -> Iterator[Row]:
-    """The rows of some shards in their order, held one group at a time."""
+    """Shards -> their rows in order, one group in memory at a time."""
     parquet = import_optional("pyarrow.parquet", extra="scale")
     for path in parts:
         with parquet.ParquetFile(path) as file:
@@ -20,14 +20,14 @@ def iter_rows(parts: Sequence[Path]) -> Iterator[Row]:
 
 
 class PeekableRows:
-    """Rows of which the first is looked at before it is taken."""
+    """Iterator over rows with access to the next row before it is taken."""
 
     def __init__(self, rows: Iterator[Row]) -> None:
         self.rows = rows
         self.row = next(rows, None)
 
     def take(self, frame: int) -> Row | None:
-        """The next row if it is that of the frame."""
+        """Frame number -> the next row if it belongs to that frame, else None."""
         row = self.row
         if row is None or row["frame_index"] != frame:
             return None
@@ -35,12 +35,12 @@ class PeekableRows:
         return row
 
     def drop(self) -> None:
-        """Pass over the next row."""
+        """Skip the next row."""
         self.row = next(self.rows, None)
 
 
 def iter_instants(made: Mapping[str, PeekableRows]) -> Iterator[dict[str, Row]]:
-    """The rows of one instant of all cameras; those without their instant are passed over."""
+    """Rows by camera -> rows of each instant that all cameras have; other rows are skipped."""
     while all(rows.row is not None for rows in made.values()):
         latest = max(rows.row["frame_index"] for rows in made.values() if rows.row is not None)
         for rows in made.values():
@@ -51,7 +51,7 @@ def iter_instants(made: Mapping[str, PeekableRows]) -> Iterator[dict[str, Row]]:
 
 
 def iter_groups(rows: Iterable[dict[str, Row]]) -> Iterator[list[dict[str, Row]]]:
-    """So many that are held together."""
+    """Instants -> lists of up to ``TABLE_GROUP_ROWS`` of them."""
     group: list[dict[str, Row]] = []
     for row in rows:
         group.append(row)

@@ -1,4 +1,4 @@
-"""An enriched data set as nerfstudio folders, one for each recording: pictures, depth, confidence and their poses."""
+"""Writer of an enriched data set as nerfstudio folders, one per recording: images, depth, confidence and poses."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from dhtorch.runtime import storage
 
 
 class NerfstudioTarget:
-    """A nerfstudio folder for each recording.
+    """One nerfstudio folder per recording.
 
     Args:
-        root: of the folders; the folder itself where there is one recording.
+        root: of the folders; the folder itself if there is one recording.
         views: cameras, see :class:`dhtorch.extract.enriched.DatasetCamera`.
         folders: of the recordings, by episode and then by camera.
         key: of the settings and data.
@@ -34,20 +34,20 @@ class NerfstudioTarget:
         return self.root / self.folders[k][camera] / "transforms.json"
 
     def own(self, k: int) -> Row | None:
-        """As :meth:`Target.own`."""
+        """As :meth:`DatasetTarget.own`."""
         try:
-            found = [
+            summaries = [
                 storage.parse_strict_json(self._file(k, key).read_text(encoding="utf-8"))["dhtorch"]
                 for key in self.views
             ]
         except (OSError, ValueError, KeyError):
             return None
-        if any(each["key"] != self.key for each in found):
+        if any(summary["key"] != self.key for summary in summaries):
             return None
-        return {**found[0], "cameras": {name: x for each in found for name, x in each["cameras"].items()}}
+        return {**summaries[0], "cameras": {name: x for summary in summaries for name, x in summary["cameras"].items()}}
 
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
-        """As :meth:`Target.assemble`."""
+        """As :meth:`DatasetTarget.assemble`."""
         for key, view in self.views.items():
             tally, shots = MapCounts(), []
             folder = self._file(k, key).parent
@@ -58,22 +58,22 @@ class NerfstudioTarget:
             if not shots:
                 raise ValueError(f"{folder.name}: found no frame with a pose, expected poses (format=nerfstudio)")
             cameras = {view.name: tally.summary()}
-            own = storage.to_strict_json({"key": self.key, "number": k, "length": len(shots), "cameras": cameras})
-            storage.write_json(self._file(k, key), nerfstudio.make_transforms(shots, dhtorch=own))
-        found = self.own(k)
-        assert found is not None  # just written
-        return found
+            summary = storage.to_strict_json({"key": self.key, "number": k, "length": len(shots), "cameras": cameras})
+            storage.write_json(self._file(k, key), nerfstudio.make_transforms(shots, dhtorch=summary))
+        written = self.own(k)
+        assert written is not None  # just written
+        return written
 
     def finish(self, owns: Sequence[Row]) -> None:
-        """As :meth:`Target.finish`: nothing is shared."""
+        """As :meth:`DatasetTarget.finish`: nothing to write, the folders are independent."""
 
 
 def _write_shot(folder: Path, row: Row, view: DatasetCamera) -> Row:
     stem = f"frame_{row['frame_index']:06d}"
     depth, sigma = (decode_tiff(row[kind], folder / stem, view.map_hw) for kind in ("depth", "sigma"))
     steps = nerfstudio.quantise_nerfstudio_depth(depth)
-    sure = nerfstudio.encode_confidence(np.where(steps > 0, depth, 0), sigma)
-    pictures = {"images": row["picture"], "depth": encode_png(steps), "confidence": encode_png(sure)}
+    confidence = nerfstudio.encode_confidence(np.where(steps > 0, depth, 0), sigma)
+    pictures = {"images": row["picture"], "depth": encode_png(steps), "confidence": encode_png(confidence)}
     for name, content in pictures.items():
         storage.replace_file(folder / name / f"{stem}.png", content)
     K, pose = np.reshape(row["K"], (3, 3)), np.reshape(row["pose"], (4, 4))

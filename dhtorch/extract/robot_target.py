@@ -1,4 +1,4 @@
-"""An enriched data set as LeRobot's tables: an episode is one file, which is joined from its shards and its origin."""
+"""Writer of an enriched data set as LeRobot tables: one file per episode, joined from its shards and its source."""
 
 from __future__ import annotations
 
@@ -28,31 +28,32 @@ from dhtorch.extract.origin import DatasetSource, LeRobotSource
 from dhtorch.extract.targets import MapCounts, Row
 from dhtorch.runtime import storage
 
-#: Metadata of an episode: what its rows amount to.
+#: Key of the metadata with the summary of an episode.
 _EPISODE_METADATA_KEY = b"dhtorch.episode"
 
+#: Task text of recordings without one.
 _DEFAULT_TASK = "look around"
 
 
 class LeRobotTarget:
-    """LeRobot tables.
+    """Writer of LeRobot tables.
 
     Args:
-        root: of the new set.
+        root: of the new data set.
         version: 3, or 2 for v2.1.
         views: its cameras.
-        origin: the data set it comes from; None = recordings, whose pictures are in the shards.
-        numbers: of the episodes at their source.
-        step: m, of the depth maps.
+        origin: source data set; None = recordings, whose images are in the shards.
+        numbers: episode numbers in the source.
+        step: m, quantisation step of the depth maps.
         fps: of a recording.
         task: of a recording.
-        key: of the settings and data, which every table notes.
-        n: samples of a frame, where columns of them are in the set.
-        cut: some rows of the origin are left out, so that others have another index.
+        key: of the settings and data, stored in every table.
+        n: samples of a frame, if the data set has columns of them.
+        cut: some rows of the source are left out, so that the index of others changes.
 
     Raises:
-        ValueError: columns that the source has already, names that are no file's, or videos that this version would
-            have to cut.
+        ValueError: columns that the source already has, names that are invalid in file names, or videos that this
+            version would have to cut.
     """
 
     def __init__(
@@ -86,38 +87,38 @@ class LeRobotTarget:
     # -------------------------------------------------------------------------------------------------- the columns
 
     def _keys(self, view: DatasetCamera) -> dict[str, str]:
-        """What is added for a camera: kind → column."""
+        """Camera -> added columns: kind → column name."""
         depth = f"{view.key}_depth"
         depth = f"{depth}_enriched" if depth in self.given else depth
-        found = {
+        columns = {
             name: f"{view.key}_dhtorch_{name}" if c.enrich == "png" else depth if name == "depth" else f"{depth}_{name}"
             for name, c in MAP_FILES.items()
         }
-        found |= {key: f"observation.{view.name}.dhtorch_{key}" for key in NUMBER_COLUMNS}
-        found["K"] = f"observation.{view.name}.intrinsics"
+        columns |= {key: f"observation.{view.name}.dhtorch_{key}" for key in NUMBER_COLUMNS}
+        columns["K"] = f"observation.{view.name}.intrinsics"
         if view.posed:
-            found["pose"] = f"observation.{view.name}.T_world_from_cam"
-        for kind, key in list(found.items()):
+            columns["pose"] = f"observation.{view.name}.T_world_from_cam"
+        for kind, key in list(columns.items()):
             if key in self.given and kind in ("K", "pose"):
-                del found[kind]  # the source has it, value for value
+                del columns[kind]  # the source has the same values
             elif key in self.given:
                 raise ValueError(f"data: found a column {key} in the source, expected a set that is not enriched yet")
-        return found
+        return columns
 
     def added(self) -> dict[str, FeatureSpec]:
-        """The features beside those of the source."""
-        found: dict[str, FeatureSpec] = {}
+        """LeRobot features of the added columns."""
+        features: dict[str, FeatureSpec] = {}
         for key, view in self.views.items():
-            of: dict[str, FeatureSpec] = {
+            by_kind: dict[str, FeatureSpec] = {
                 **{name: self._map_feature(name, view) for name in MAP_FILES},
                 **{key: _number_feature(number_column(c, self.n)) for key, c in NUMBER_COLUMNS.items()},
                 "K": lerobot.number_feature("float64", 9),
                 "pose": lerobot.number_feature("float64", 16),
             }
             if self.origin is None:
-                found[key] = lerobot.image_feature(view.hw)
-            found |= {column: of[kind] for kind, column in self.keys[key].items()}
-        return found
+                features[key] = lerobot.image_feature(view.hw)
+            features |= {column: by_kind[kind] for kind, column in self.keys[key].items()}
+        return features
 
     def _map_feature(self, name: str, view: DatasetCamera) -> FeatureSpec:
         spec = MAP_FILES[name]
@@ -127,67 +128,67 @@ class LeRobotTarget:
         return lerobot.image_feature(view.map_hw, 1, codes={str(k): name.lower() for k, name in table.items()})
 
     def features(self, columns: Iterable[str]) -> dict[str, FeatureSpec]:
-        """Of all columns of the tables, and the videos."""
-        found = dict(self.given)
+        """LeRobot features of all columns of the tables, and of the videos."""
+        features = dict(self.given)
         for name in columns:
-            if name not in found and name not in self.added():
-                whole = name.removeprefix("source.") != "timestamp" and name != "observation.time"
-                found[name] = lerobot.number_feature("int64" if whole else "float64")
+            if name not in features and name not in self.added():
+                is_integer = name.removeprefix("source.") != "timestamp" and name != "observation.time"
+                features[name] = lerobot.number_feature("int64" if is_integer else "float64")
         if "timestamp" not in self.given:
-            found["timestamp"] = lerobot.number_feature("float32")
-        return found | self.added()
+            features["timestamp"] = lerobot.number_feature("float32")
+        return features | self.added()
 
     # ------------------------------------------------------------------------------------------------- one episode
 
     def file(self, k: int) -> Path:
-        """The table of the ``k``-th episode."""
+        """Path of the table of the ``k``-th episode."""
         return self.root / lerobot.episode_table_path(self.version, k)
 
     def own(self, k: int) -> Row | None:
-        """As :meth:`Target.own`."""
+        """As :meth:`DatasetTarget.own`."""
         parquet = import_optional("pyarrow.parquet", extra="scale")
         try:
             metadata = parquet.read_metadata(self.file(k)).metadata or {}
-            found: Row = storage.parse_strict_json(metadata[_EPISODE_METADATA_KEY].decode())
+            summary: Row = storage.parse_strict_json(metadata[_EPISODE_METADATA_KEY].decode())
         except (OSError, ValueError, KeyError):
             return None
-        return found if found["key"] == self.key else None
+        return summary if summary["key"] == self.key else None
 
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
-        """As :meth:`Target.assemble`."""
+        """As :meth:`DatasetTarget.assemble`."""
         parquet = import_optional("pyarrow.parquet", extra="scale")
         start = sum(each["length"] for each in before)
         tallies = {key: MapCounts() for key in self.views}
         moments: dict[str, FeatureMoments] = {}
-        seen: dict[int, None] = {}
+        task_indices: dict[int, None] = {}
         tasks = self._tasks(before)
-        clean = self.file(k)
-        clean.parent.mkdir(parents=True, exist_ok=True)
+        path = self.file(k)
+        path.parent.mkdir(parents=True, exist_ok=True)
         length, writer = 0, None
-        with storage.write_atomically(clean, clean.with_name(f".{clean.name}.tmp")) as sink, ExitStack() as closing:
-            for table in self._joined(k, start, parts, tallies, tasks):
+        with storage.write_atomically(path, path.with_name(f".{path.name}.tmp")) as sink, ExitStack() as closing:
+            for table in self._join_rows(k, start, parts, tallies, tasks):
                 if writer is None:
                     layout = lerobot.make_arrow_schema(self.features(table.column_names), _column_types(table), {})
                     writer = closing.enter_context(parquet.ParquetWriter(sink, layout, compression="zstd"))
                 writer.write_table(table.select(layout.names).cast(layout))
                 length += table.num_rows
-                seen |= dict.fromkeys(table.column("task_index").to_pylist())
+                task_indices |= dict.fromkeys(table.column("task_index").to_pylist())
                 _add_moments(moments, table)
             if writer is None:
                 raise ValueError(f"episode {self.numbers[k]}: found no frame that can be read, expected one")
-            said = [tasks[i] for i in seen if i is not None and 0 <= i < len(tasks)]
-            own = self._summary(k, start, length, said, moments, tallies)
-            writer.add_key_value_metadata({_EPISODE_METADATA_KEY: storage.dump_strict_json(own)})
+            task_texts = [tasks[i] for i in task_indices if i is not None and 0 <= i < len(tasks)]
+            summary = self._summary(k, start, length, task_texts, moments, tallies)
+            writer.add_key_value_metadata({_EPISODE_METADATA_KEY: storage.dump_strict_json(summary)})
             self._copy_videos(k, length)
-        return own
+        return summary
 
     def _tasks(self, owns: Sequence[Row]) -> list[str]:
-        """Texts by ``task_index``, where they are numbered as they come those of the episodes ``owns``."""
+        """Task texts by ``task_index``: of the source, else in order of appearance in the summaries ``owns``."""
         if self.tasks is not None:
             return list(self.tasks)
-        return list(dict.fromkeys(task for own in owns for task in own["tasks"]))
+        return list(dict.fromkeys(task for summary in owns for task in summary["tasks"]))
 
-    def _joined(
+    def _join_rows(
         self,
         k: int,
         start: int,
@@ -195,54 +196,54 @@ class LeRobotTarget:
         tallies: Mapping[str, MapCounts],
         tasks: list[str],
     ) -> Iterator[Any]:
-        """The rows of an episode with what is added, as Arrow tables of few rows."""
-        made = {key: PeekableRows(iter_rows(files)) for key, files in parts.items()}
+        """Rows of an episode with the added columns, as Arrow tables of few rows."""
+        rows_by_camera = {key: PeekableRows(iter_rows(files)) for key, files in parts.items()}
         if self.origin is None:
-            yield from self._plain(k, start, made, tallies)
+            yield from self._recording_rows(k, start, rows_by_camera, tallies)
             return
         done = 0
         for part in self.origin.batches(k, tasks):
             table, n = part, part.num_rows
             numbers = part.column("frame_index").to_pylist()
-            for key, rows in made.items():
-                found = [rows.take(i) for i in numbers]
-                for row in found:
+            for key, rows in rows_by_camera.items():
+                camera_rows = [rows.take(i) for i in numbers]
+                for row in camera_rows:
                     tallies[key].add(row)
-                for column, values in self._cells(key, found, done).items():
+                for column, values in self._cells(key, camera_rows, done).items():
                     table = table.append_column(column, values)
-            yield self._renumbered(table, k, start + done)
+            yield self._renumber(table, k, start + done)
             done += n
 
-    def _plain(
-        self, k: int, start: int, made: Mapping[str, PeekableRows], tallies: Mapping[str, MapCounts]
+    def _recording_rows(
+        self, k: int, start: int, rows_by_camera: Mapping[str, PeekableRows], tallies: Mapping[str, MapCounts]
     ) -> Iterator[Any]:
-        """The rows of recordings, without instants of which a frame could not be read."""
+        """Rows of an episode from recordings, without instants that have an unreadable frame."""
         pyarrow = import_optional("pyarrow", extra="scale")
         done = 0
-        for group in iter_groups(iter_instants(made)):
+        for group in iter_groups(iter_instants(rows_by_camera)):
             for shots in group:
                 for key, row in shots.items():
                     tallies[key].add(row)
             kept = [shots for shots in group if all(row["picture"] for row in shots.values())]
             if not kept:
                 continue
-            at = done + np.arange(len(kept))
+            index = done + np.arange(len(kept))
             first = [next(iter(shots.values())) for shots in kept]
             table = pyarrow.table(
                 {
-                    "timestamp": (at / self.fps).astype(np.float32),
-                    "frame_index": at,
+                    "timestamp": (index / self.fps).astype(np.float32),
+                    "frame_index": index,
                     "episode_index": np.full(len(kept), k),
-                    "index": start + at,
+                    "index": start + index,
                     "task_index": np.zeros(len(kept), np.int64),
                     "observation.frame_number": [row["frame_index"] for row in first],
                     "observation.time": np.array([row["timestamp"] for row in first], np.float64),
                 }
             )
-            for key in made:
+            for key in rows_by_camera:
                 rows = [shots[key] for shots in kept]
                 pictures = [
-                    {"bytes": row["picture"], "path": f"frame-{i:06d}.png"} for row, i in zip(rows, at, strict=True)
+                    {"bytes": row["picture"], "path": f"frame-{i:06d}.png"} for row, i in zip(rows, index, strict=True)
                 ]
                 cells = {key: pyarrow.array(pictures), **self._cells(key, rows, done)}
                 for column, values in cells.items():
@@ -250,41 +251,41 @@ class LeRobotTarget:
             yield table
             done += len(kept)
 
-    def _cells(self, key: str, found: Sequence[Row | None], done: int) -> dict[str, Any]:
-        """Column → cells of some rows of a camera; None = a frame that could not be read."""
+    def _cells(self, key: str, camera_rows: Sequence[Row | None], done: int) -> dict[str, Any]:
+        """Camera and rows (None = unreadable) -> column → Arrow array of cells."""
         pyarrow = import_optional("pyarrow", extra="scale")
-        nothing, cells = blank_maps(self.views[key]), {}
+        blanks, cells = blank_maps(self.views[key]), {}
         values: list[Any]
         for kind, column in self.keys[key].items():
-            if kind in nothing:
-                end = MAP_FILES[kind].enrich
-                files = [row[kind] if row is not None and row["depth"] else nothing[kind] for row in found]
-                values = [{"bytes": file, "path": f"frame-{done + i:06d}.{end}"} for i, file in enumerate(files)]
+            if kind in blanks:
+                suffix = MAP_FILES[kind].enrich
+                files = [row[kind] if row is not None and row["depth"] else blanks[kind] for row in camera_rows]
+                values = [{"bytes": file, "path": f"frame-{done + i:06d}.{suffix}"} for i, file in enumerate(files)]
             elif kind in NUMBER_COLUMNS:
                 stored = number_column(NUMBER_COLUMNS[kind], self.n)
                 blank = np.zeros(stored.shape, stored.kind)
-                rows = [row[kind] if row is not None and row["depth"] else blank for row in found]
+                rows = [row[kind] if row is not None and row["depth"] else blank for row in camera_rows]
                 values = [_flat_number(row) for row in rows]
             else:
                 n = 9 if kind == "K" else 16
-                values = [row[kind] if row is not None and row["depth"] else [float("nan")] * n for row in found]
+                values = [row[kind] if row is not None and row["depth"] else [float("nan")] * n for row in camera_rows]
             cells[column] = pyarrow.array(values)
         return cells
 
-    def _renumbered(self, table: Any, k: int, start: int) -> Any:
-        """Episodes from 0 and rows one after another, as loaders count."""
+    def _renumber(self, table: Any, k: int, start: int) -> Any:
+        """Number episodes from 0 and rows consecutively; changed numbers of the source are kept under ``source.``."""
         pyarrow = import_optional("pyarrow", extra="scale")
         n = table.num_rows
-        news = {"episode_index": np.full(n, k), "index": start + np.arange(n)}
-        for name, values in news.items():
-            mine = pyarrow.array(values.astype(np.int64))
+        numbers = {"episode_index": np.full(n, k), "index": start + np.arange(n)}
+        for name, values in numbers.items():
+            array = pyarrow.array(values.astype(np.int64))
             if name not in table.column_names:
-                table = table.append_column(name, mine)
+                table = table.append_column(name, array)
             elif self.renumbered or self.version == 3:
-                place = table.column_names.index(name)
+                position = table.column_names.index(name)
                 if self.renumbered:
                     table = table.append_column(f"source.{name}", table.column(name))
-                table = table.set_column(place, name, mine)
+                table = table.set_column(position, name, array)
         return table
 
     def _summary(
@@ -296,42 +297,44 @@ class LeRobotTarget:
         moments: dict[str, FeatureMoments],
         tallies: Mapping[str, MapCounts],
     ) -> Row:
+        """Summary of a complete episode."""
         for key, tally in tallies.items():
             maps = tally.of_maps()
             if maps is not None:
                 moments |= {self.keys[key]["depth"]: maps[0], self.keys[key]["sigma"]: maps[1], key: maps[2]}
-        said = None if self.origin is None else self.origin.words(k)
-        found: Row = storage.to_strict_json(
+        episode_tasks = None if self.origin is None else self.origin.words(k)
+        summary: Row = storage.to_strict_json(
             {
                 "key": self.key,
                 "number": self.numbers[k],
                 "start": start,
                 "length": length,
-                "tasks": list(tasks) if said is None else said,
+                "tasks": list(tasks) if episode_tasks is None else episode_tasks,
                 "about": {} if self.origin is None else self.origin.about(k),
                 "cameras": {self.views[key].name: tally.summary() for key, tally in tallies.items()},
             }
         )
-        return found | {"moments": {name: each.pack() for name, each in moments.items()}}
+        return summary | {"moments": {name: each.pack() for name, each in moments.items()}}
 
     def _copy_videos(self, k: int, length: int) -> None:
-        """Byte for byte."""
+        """Copy the videos of an episode unchanged."""
         for key, (file, clip) in self._clips(k, length).items():
             storage.copy_file(file, self.root / lerobot.episode_video_path(self.version, key, clip, k))
 
     def _clips(self, k: int, length: int) -> dict[str, tuple[Path, lerobot.VideoSegment]]:
+        """Video key → source file and its segment in the new data set."""
         if self.origin is None:
             return {}
-        found = self.origin.clips(k, length)
+        clips = self.origin.clips(k, length)
         if self.origin.version == 3:
-            return found
+            return clips
         chunk, file = divmod(k, lerobot.FILES_PER_CHUNK)
-        return {key: (path, clip._replace(chunk=chunk, file=file)) for key, (path, clip) in found.items()}
+        return {key: (path, clip._replace(chunk=chunk, file=file)) for key, (path, clip) in clips.items()}
 
     # ---------------------------------------------------------------------------------------------------- the whole
 
     def finish(self, owns: Sequence[Row]) -> None:
-        """As :meth:`Target.finish`."""
+        """As :meth:`DatasetTarget.finish`."""
         parquet = import_optional("pyarrow.parquet", extra="scale")
         features = self.features(parquet.read_schema(self.file(0)).names)
         self._write_lenses()
@@ -342,13 +345,13 @@ class LeRobotTarget:
         episodes = [
             lerobot.EpisodeSpec(
                 number=k,
-                length=own["length"],
-                start=own["start"],
-                tasks=own["tasks"],
-                videos={key: clip for key, (_, clip) in self._clips(k, own["length"]).items()},
-                stats=self._stats([own], features) if self.version == 2 else {},
+                length=summary["length"],
+                start=summary["start"],
+                tasks=summary["tasks"],
+                videos={key: clip for key, (_, clip) in self._clips(k, summary["length"]).items()},
+                stats=self._stats([summary], features) if self.version == 2 else {},
             )
-            for k, own in enumerate(owns)
+            for k, summary in enumerate(owns)
         ]
         about = lerobot.make_info(
             self.version,
@@ -358,24 +361,28 @@ class LeRobotTarget:
             n_tasks=len(tasks),
             robot="unknown" if self.origin is None else self.origin.robot,
         )
-        about["splits"] = self._splits(owns) or about["splits"]  # beside the origin's, "train: all" would be wrong
+        about["splits"] = (
+            self._splits(owns) or about["splits"]
+        )  # with splits of the source, "train: all" would be wrong
         lerobot.write_lerobot_meta(self.root, self.version, about, episodes, tasks, self._stats(owns, features))
 
     def _stats(self, owns: Sequence[Row], features: Mapping[str, FeatureSpec]) -> dict[str, Any]:
-        """Of every column of numbers, and of the pictures and maps that were looked at.
+        """Summaries and features -> statistics of columns of numbers, images and maps.
 
-        A LeRobot that reads v2.1 refuses a set unless whatever has "image" in its name has statistics of three
-        channels: a map's stand there three times, and numbers of such a name have none.
+        LeRobot for v2.1 rejects a data set unless every feature with "image" in its name has statistics of three
+        channels: those of a map are repeated three times, those of numbers with such a name are left out.
         """
-        frames = sum(own["length"] for own in owns)
-        found = {}
+        frames = sum(summary["length"] for summary in owns)
+        stats = {}
         for name, feature in features.items():
-            each = [FeatureMoments.parse(own["moments"][name]) for own in owns if name in own["moments"]]
-            if not each:
+            all_moments = [
+                FeatureMoments.parse(summary["moments"][name]) for summary in owns if name in summary["moments"]
+            ]
+            if not all_moments:
                 continue
-            total = each[0]
-            for more in each[1:]:
-                total = total + more
+            total = all_moments[0]
+            for moments in all_moments[1:]:
+                total = total + moments
             visual = feature["dtype"] in ("image", "video")
             entry = total.stats(frames, (len(total.n), 1, 1) if visual else (len(total.n),))
             if self.version == 2 and "image" in name and entry is not None:
@@ -383,42 +390,43 @@ class LeRobotTarget:
                     continue
                 entry = {k: v * (3 // len(v)) if k != "count" else v for k, v in entry.items()}
             if entry is not None:
-                found[name] = entry
-        return found
+                stats[name] = entry
+        return stats
 
     def _splits(self, owns: Sequence[Row]) -> dict[str, str]:
-        """The origin's splits in this set's numbers, where the episodes of each follow one another."""
-        found: dict[str, str] = {}
+        """Splits of the source in the new episode numbers, if the episodes of a split are consecutive."""
+        consecutive: dict[str, str] = {}
         splits: dict[str, list[int]] = {} if self.origin is None else dict(self.origin.splits)
-        for own in owns:
-            if "split" in own["about"]:
-                splits.setdefault(own["about"]["split"], []).append(own["number"])
+        for summary in owns:
+            if "split" in summary["about"]:
+                splits.setdefault(summary["about"]["split"], []).append(summary["number"])
         for name, numbers in splits.items():
-            places = [k for k, number in enumerate(self.numbers) if number in set(numbers)]
-            if places and places == list(range(places[0], places[-1] + 1)):
-                found[name] = f"{places[0]}:{places[-1] + 1}"
-        return found
+            indices = [k for k, number in enumerate(self.numbers) if number in set(numbers)]
+            if indices and indices == list(range(indices[0], indices[-1] + 1)):
+                consecutive[name] = f"{indices[0]}:{indices[-1] + 1}"
+        return consecutive
 
     def _write_about(self, owns: Sequence[Row]) -> None:
-        """What an origin says of its episodes and the format has no place for."""
-        if any(own["about"] for own in owns):
-            rows = [{"episode_index": k, **own["about"]} for k, own in enumerate(owns)]
+        """Write the metadata of source episodes that the format cannot hold."""
+        if any(summary["about"] for summary in owns):
+            rows = [{"episode_index": k, **summary["about"]} for k, summary in enumerate(owns)]
             text = "".join(storage.dump_strict_json(row) + "\n" for row in rows)
             storage.replace_file(self.root / "meta" / "source_episodes.jsonl", text.encode())
 
     def _write_lenses(self) -> None:
-        """Lenses, which no feature of the format holds, in the side-car that the reader knows."""
-        lenses = {view.key: {"dist": list(view.lens)} for view in self.views.values() if view.lens}
-        if lenses:
-            storage.write_json(self.root / "meta" / "intrinsics.json", lenses)
+        """Write distortion coefficients, which the format cannot hold, to the side-car file ``intrinsics.json``."""
+        distortions = {view.key: {"dist": list(view.lens)} for view in self.views.values() if view.lens}
+        if distortions:
+            storage.write_json(self.root / "meta" / "intrinsics.json", distortions)
 
 
 def _number_feature(column: Column) -> FeatureSpec:
+    """Column of numbers -> LeRobot feature."""
     return lerobot.number_feature(column.kind, math.prod(column.shape))
 
 
 def _flat_number(value: Any) -> Any:
-    """A number, or a list of several, as a table of the format holds it."""
+    """Array -> number, or flat list if it has several, as a LeRobot table stores it."""
     flat = np.asarray(value).reshape(-1).tolist()
     return flat[0] if len(flat) == 1 else flat
 
@@ -428,7 +436,7 @@ def _column_types(table: Any) -> dict[str, Any]:
 
 
 def _add_moments(moments: dict[str, FeatureMoments], table: Any) -> None:
-    """Of the columns of numbers."""
+    """Add the moments of the numeric columns of a table to ``moments``."""
     for name in table.column_names:
         cells = table.column(name).to_pylist() if "struct" not in str(table.schema.field(name).type) else []
         try:
@@ -441,6 +449,7 @@ def _add_moments(moments: dict[str, FeatureMoments], table: Any) -> None:
 
 
 def _refuse_shared_videos(origin: LeRobotSource) -> None:
+    """Raises ValueError if a video file holds several episodes, which v2.1 does not allow."""
     for key in (k for k, f in origin.features.items() if f["dtype"] == "video"):
         starts = origin.episodes.columns[f"videos/{key}/from_timestamp"]
         files = {origin.episodes[i].videos[key][0] for i in range(len(origin.episodes))}

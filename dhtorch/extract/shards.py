@@ -1,8 +1,8 @@
-"""Files of rows: written whole or not at all, and recognised when they need not be written again.
+"""Parquet files of rows: written atomically, with metadata that identify finished ones.
 
-Every shard tells where it comes from. The metadata under ``dhtorch`` are the same in all shards of an extraction: the
-meaning of columns and codes, version, settings, key, and a digest of the data. Those under ``dhtorch.shard`` are its
-own: its number, and how many of its frames had which problem. No time is noted: the same question gives the same bytes.
+The metadata under ``dhtorch`` are the same in all shards of an extraction: meaning of columns and codes, version,
+settings, key, and a digest of the data. Those under ``dhtorch.shard`` belong to one shard: its number, and its counts
+of frames by problem. No time is stored, so that the same settings and data give the same bytes.
 """
 
 from __future__ import annotations
@@ -19,12 +19,17 @@ from dhtorch.extract.plan import ShardSpec
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 
-#: Key of the metadata that all shards share, and of those of one shard.
-_SHARED_METADATA_KEY, _SHARD_METADATA_KEY = b"dhtorch", b"dhtorch.shard"
+#: Key of the metadata that all shards share.
+_SHARED_METADATA_KEY = b"dhtorch"
 
-#: Rows that are held and decoded together: few, because a shuffled loader asks for one, and so many bytes of them at
-#: most, because maps are large.
-_MAX_GROUP_ROWS, _MAX_GROUP_BYTES = 16, 1 << 24
+#: Key of the metadata of one shard.
+_SHARD_METADATA_KEY = b"dhtorch.shard"
+
+#: Maximum rows of a row group, which is decoded as a whole: few, because a shuffled loader reads one row at a time.
+_MAX_GROUP_ROWS = 16
+
+#: Maximum bytes of a row group: maps are large.
+_MAX_GROUP_BYTES = 1 << 24
 
 _PATTERN = "shard-*.parquet"
 _UNFINISHED = ".tmp"
@@ -33,17 +38,17 @@ _UNFINISHED = ".tmp"
 def write_shard(
     folder: Path, shard: ShardSpec, rows: Iterable[Row], wanted: Mapping[str, Column], shared: Mapping[str, Any]
 ) -> Counter[str]:
-    """Write one shard, rows as they come; the file appears when it is whole.
+    """Write the rows of one shard as they arrive; the file appears when it is complete.
 
     Args:
-        folder: exists.
-        shard: which one.
-        rows: of this shard, fewer where frames were skipped.
+        folder: of the shards, exists.
+        shard: to write.
+        rows: of this shard, fewer if frames were skipped.
         wanted: columns.
         shared: metadata of the extraction.
 
     Returns:
-        Number of rows by problem, and ``skipped``.
+        Number of rows by problem, and of the skipped ones as ``skipped``.
     """
     parquet = import_optional("pyarrow.parquet", extra="scale")
     layout = arrow_schema(wanted, {_SHARED_METADATA_KEY.decode(): storage.dump_strict_json(shared)})
@@ -58,51 +63,53 @@ def write_shard(
             counts.update(problems[str(int(row["problem"]))].lower() for row in group)
             writer.write_table(arrow_table(group, wanted, layout))
         counts["skipped"] = len(shard.rows) - counts.total()
-        own = {"number": shard.number, "of": shard.of, "counts": dict(sorted(counts.items()))}
-        writer.add_key_value_metadata({_SHARD_METADATA_KEY: storage.dump_strict_json(own)})
+        shard_metadata = {"number": shard.number, "of": shard.of, "counts": dict(sorted(counts.items()))}
+        writer.add_key_value_metadata({_SHARD_METADATA_KEY: storage.dump_strict_json(shard_metadata)})
     return counts
 
 
 def _rows_per_group(wanted: Mapping[str, Column]) -> int:
-    """Rows of such columns that are held together, one at least."""
+    """Columns -> rows of a row group, at least one."""
     return max(1, min(_MAX_GROUP_ROWS, _MAX_GROUP_BYTES // sum(column.n_bytes for column in wanted.values())))
 
 
 def shard_files(folder: Path) -> list[Path]:
-    """The shards in a folder, in the order of their rows."""
+    """Folder -> its shards, in the order of their rows."""
     return sorted(folder.glob(_PATTERN))
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what a writer left that was killed. Nobody may be writing there meanwhile."""
-    for left in folder.glob(f".{_PATTERN}{_UNFINISHED}"):
-        left.unlink(missing_ok=True)
+    """Remove the unfinished files of an interrupted writer. No other process may be writing in the folder."""
+    for file in folder.glob(f".{_PATTERN}{_UNFINISHED}"):
+        file.unlink(missing_ok=True)
 
 
 def find_finished_shards(folder: Path, shared: Mapping[str, Any]) -> dict[str, Counter[str]]:
-    """Shards in a folder that are whole: name → number of rows by problem.
+    """Folder and metadata of the extraction -> complete shards: name → number of rows by problem.
 
     Raises:
-        FileExistsError: a shard of another extraction; the message says what differs.
+        FileExistsError: a shard of another extraction; the message lists what differs.
     """
-    found = {}
+    finished = {}
     for path in shard_files(folder):
         try:
-            other, own = read_shard_metadata(path)
+            metadata, shard_metadata = read_shard_metadata(path)
         except FormatError:
-            continue  # torn: it is written again
-        if other["key"] != shared["key"]:
-            found_there = f"a shard of another extraction ({result_files.describe_difference(other, shared)})"
-            raise FileExistsError(f"{path}: found {found_there}, expected one of this, or another folder for out")
-        found[path.name] = Counter(own["counts"])
-    return found
+            continue  # damaged: it is written again
+        if metadata["key"] != shared["key"]:
+            mismatch = f"a shard of another extraction ({result_files.describe_difference(metadata, shared)})"
+            raise FileExistsError(
+                f"{path}: found {mismatch}, expected one of this extraction, or another folder for out"
+            )
+        finished[path.name] = Counter(shard_metadata["counts"])
+    return finished
 
 
 def read_shard_metadata(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The metadata of a shard: what all share, and its own.
+    """Shard -> metadata shared by all shards, metadata of this shard.
 
     Raises:
-        FormatError: no shard of ours, or a torn one.
+        FormatError: no shard of dhtorch extract, or a damaged one.
     """
     parquet = import_optional("pyarrow.parquet", extra="scale")
     try:

@@ -1,7 +1,7 @@
-"""What an enriched data set is written as: a format; an episode is whole or not there, and says what it amounts to.
+"""Interface of the formats of an enriched data set: episodes are written atomically, each with a summary.
 
-The maps of an episode wait in shards until all are made; then its rows are joined with them, few at a time, into one
-file, whose metadata say what all rows together amount to. Who is killed begins that episode's file anew.
+The maps of an episode are stored in shards until all are computed; then they are joined with its rows, few at a time,
+into one file, whose metadata hold the summary of all rows. After an interruption the file of that episode is rewritten.
 """
 
 from __future__ import annotations
@@ -18,28 +18,28 @@ from dhtorch.geometry.pose_conventions import CONVENTIONS
 
 Row = dict[str, Any]
 
-#: Parts of an episode, along time, whose shares are noted.
+#: Maximum number of time bins of an episode in its summary.
 _N_TIME_BINS = 24
 
-#: What refuted poses look like that fit in no reading of them.
+#: Name in the summary for refuted poses that match no convention.
 UNKNOWN_CONVENTION = "unknown"
 
 
 class DatasetTarget(Protocol):
-    """How a format is written."""
+    """Writer of one format."""
 
     def own(self, k: int) -> Row | None:
-        """What the ``k``-th episode amounts to; None = it is not whole yet."""
+        """Summary of the ``k``-th episode; None = it is not complete yet."""
 
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
-        """Write the ``k``-th episode from the shards of its cameras; ``before``: what those before it amount to."""
+        """Write the ``k``-th episode from the shards of its cameras; ``before``: summaries of the earlier episodes."""
 
     def finish(self, owns: Sequence[Row]) -> None:
-        """Write what describes all episodes."""
+        """Write the metadata of the data set; ``owns``: summaries of all episodes."""
 
 
 class MapCounts:
-    """Counts over the frames of one camera in one episode."""
+    """Counts and moments over the frames of one camera in one episode."""
 
     def __init__(self) -> None:
         self.pixels: list[np.ndarray] = []
@@ -49,7 +49,7 @@ class MapCounts:
         self.unread = 0
 
     def add(self, row: Mapping[str, Any] | None) -> None:
-        """Count a frame; None = it could not be read."""
+        """Add the row of a frame; None = it could not be read."""
         if row is None or not row["depth"]:
             self.unread += 1
             return
@@ -61,20 +61,20 @@ class MapCounts:
         self.moments = moments if self.moments is None else self.moments + moments
 
     def summary(self) -> Row:
-        """Pixels by source and by reason, in all and along time; frames with refuted poses, by what these look like."""
+        """Pixels by source and by reason, in total and along time; refuted poses by the convention that they match."""
         if not self.pixels:
-            nothing: Row = {key: [] for key in ("pixels", "silent", "over_time", "silent_over_time")}
-            return {**nothing, "unread": self.unread, "frames": 0, "refuted": {}}
+            no_pixels: Row = {key: [] for key in ("pixels", "silent", "over_time", "silent_over_time")}
+            return {**no_pixels, "unread": self.unread, "frames": 0, "refuted": {}}
         pixels, silent = np.stack(self.pixels), np.stack(self.silent)
         parts = np.array_split(np.arange(len(pixels)), min(_N_TIME_BINS, len(pixels)))
-        along, why = ([x[at].sum(0) / max(1, pixels[at].sum()) for at in parts] for x in (pixels, silent))
-        found = {"over_time": along, "silent_over_time": why, "unread": self.unread}
-        found |= {"frames": len(pixels), "refuted": dict(sorted(self.refuted.items()))}
-        return {"pixels": pixels.sum(0), "silent": silent.sum(0), **found}
+        along, reasons = ([x[at].sum(0) / max(1, pixels[at].sum()) for at in parts] for x in (pixels, silent))
+        more = {"over_time": along, "silent_over_time": reasons, "unread": self.unread}
+        more |= {"frames": len(pixels), "refuted": dict(sorted(self.refuted.items()))}
+        return {"pixels": pixels.sum(0), "silent": silent.sum(0), **more}
 
     def of_maps(self) -> tuple[FeatureMoments, FeatureMoments, FeatureMoments] | None:
-        """Of depth, sigma and the picture; None where no frame could be read."""
+        """Moments of depth, sigma and the image; None if no frame could be read."""
         if self.moments is None:
             return None
-        cut = [FeatureMoments(*(x[span] for x in self.moments)) for span in (slice(0, 1), slice(1, 2), slice(2, 5))]
-        return cut[0], cut[1], cut[2]
+        parts = [FeatureMoments(*(x[span] for x in self.moments)) for span in (slice(0, 1), slice(1, 2), slice(2, 5))]
+        return parts[0], parts[1], parts[2]

@@ -113,7 +113,7 @@ def check_sample(sample: Any, image: str, intrinsics: KeyOrNumbers, batched: boo
         size = f" of shape {tuple(sample.shape)}" if hasattr(sample, "shape") else ""
         raise SampleError(
             f"sample: found {type(sample).__name__}{size}, expected a dict with pictures and depth; image_transforms "
-            "hands over single pictures: wrap the data set instead, ExtendedDataset(dataset, transform)"
+            "passes single images only: wrap the data set instead, ExtendedDataset(dataset, transform)"
         )
     if batched is not None:
         return

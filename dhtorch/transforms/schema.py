@@ -289,14 +289,14 @@ COLUMNS: tuple[ColumnSpec, ...] = (
 )
 
 
-def select_columns(options: Collection[str]) -> list[ColumnSpec]:
+def columns_of_options(options: Collection[str]) -> list[ColumnSpec]:
     """Active options of ExtendDepth (``pose``, ``dense``) -> columns, in order."""
     return [column for column in COLUMNS if column.option is None or column.option in options]
 
 
 def compute_columns(found: SampleResults, options: Collection[str]) -> dict[str, Tensor]:
     """Results and options -> key → values (B, …). Gradient: as the records' fields."""
-    return {column.key: column.compute(found) for column in select_columns(options)}
+    return {column.key: column.compute(found) for column in columns_of_options(options)}
 
 
 def fill_unreadable(added: Mapping[str, Tensor], bad: Tensor) -> dict[str, Tensor]:
@@ -309,7 +309,7 @@ def blank_columns(sizes: Mapping[str, int], options: Collection[str]) -> dict[st
     """Sizes and options -> key → values (1, …) of an unreadable sample; ``sizes``: letter of the alphabet → number."""
     return {
         c.key: torch.full((1, *resolve_shape(c.shape, sizes)), c.unreadable, dtype=getattr(torch, c.dtype))
-        for c in select_columns(options)
+        for c in columns_of_options(options)
     }
 
 

@@ -396,7 +396,7 @@ def test_an_episode_of_which_nothing_can_be_read_is_said(tmp_path, capsys):
     writers.write_lerobot(source, [shots(2), shots(2, 2)], depth="tiff", version=2)
     gone = source / "videos" / "chunk-000" / FRONT / "episode_000001.mp4"
     gone.unlink()
-    for more, helps in (((), "on_error=flag the rest"), (("on_error=flag",), "the video of episode 1")):
+    for more, helps in (((), "on_error=flag to continue"), (("on_error=flag",), "the video of episode 1")):
         assert main(["enrich", str(source), str(tmp_path / "set"), *ASKED, *more]) == 2
         said = capsys.readouterr().err
         assert gone.name in said and helps in said and said.count("\n") == 1, said
@@ -454,7 +454,7 @@ def test_a_frame_of_another_size_or_lens_than_the_first_is_said():
     options = {"method": PAPER.replace(n=64), "gap": 1, "step": 0.0, "views": {view.key: view}, "dense": False}
     made = MapRowDataset([scene], plan.make_plan([scene], 1, 1), map_columns(pictures=False), **options)
     said = [made[i].complaint for i in range(4)]
-    assert "picture of 40x64, expected 48x64 as of the first frame" in said[1]
+    assert "image: found 40x64, expected 48x64 as of the first frame" in said[1]
     assert "expected none as of the first frame" in said[2]
     assert said[0] == said[3] == ""
 

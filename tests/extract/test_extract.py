@@ -217,7 +217,9 @@ def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(robot, command, monkey
     monkeypatch.setattr(shards, "write_shard", interrupted)
     code, out, err = command(*asked(robot))
     assert code == 130 and "Traceback" not in err and out == ""
-    assert "interrupted: 1 of 3 shards in features are whole and stay; the same command does the rest" in err
+    assert (
+        "interrupted: 1 of 3 shards in features are complete and stay; run the same command again for the rest" in err
+    )
     before = seen(files("features"))
     assert len(before) == 1
     with pytest.raises(data.FormatError, match="found 1, expected 3: the same dhtorch extract once more"):
@@ -232,7 +234,7 @@ def test_ctrl_c_from_a_terminal_ends_the_workers_quietly(tmp_path, many):
     code = stop(process, partial(files, tmp_path / "features"), 2, signal.SIGINT)
     err = (tmp_path / "err").read_text()
     assert code == 130 and "Traceback" not in err and len(err.strip().splitlines()) == 1, err
-    assert "whole and stay" in err
+    assert "complete and stay" in err
 
 
 @pytest.fixture
@@ -304,7 +306,7 @@ def test_bad_input_gets_one_clear_line(command, args, words):
 
 def test_a_recording_without_a_gap_asks_for_one(robot, command):
     code, _, err = command("data=lerobot", f"data.root={robot}", "extract.gap=null", "out=x", *PAPER)
-    assert code == 2 and "extract.gap" in err and "0 = front end alone" in err
+    assert code == 2 and "extract.gap" in err and "0 = front end only" in err
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

@@ -174,7 +174,7 @@ BAD = {"load": Load(bad={1, 2}), "numbers": [10, 11, 12, 13, 14]}
 
 
 def test_a_bad_frame_ends_the_run_unless_told_otherwise(made):
-    expected = r"^one, frame 11: position 1 is damaged \(with extract.on_error=skip or flag the rest goes on\)$"
+    expected = r"^one, frame 11: position 1 is damaged \(set extract.on_error=skip or flag to continue with the other frames\)$"
     with pytest.raises(SampleError, match=expected):
         made([recording(**BAD)], options={"gap": 1, "shard_rows": 1})
 
@@ -209,19 +209,21 @@ def test_an_interrupted_run_says_what_stays(made, monkeypatch):
         return real(*args)
 
     monkeypatch.setattr(shards, "write_shard", interrupted)
-    with pytest.raises(KeyboardInterrupt, match=r"^1 of 2 shards in .*out are whole and stay; the same command does"):
+    with pytest.raises(
+        KeyboardInterrupt, match=r"^1 of 2 shards in .*out are complete and stay; run the same command again"
+    ):
         made()
     assert "1 left untouched" in made().said
 
 
 def test_the_folder_and_the_workers_are_checked_first(made, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(NotADirectoryError, match=r"out: .*file is a file, expected a folder, or a place for one"):
+    with pytest.raises(NotADirectoryError, match=r"out: .*file is a file, expected a folder or a new path"):
         made(out="file")
     for workers in (-1, 1.5, None):
         with pytest.raises(ValueError, match=f"workers: found {workers}, expected a whole number of at least 0"):
             made(workers=workers)
-    with pytest.raises(ValueError, match="found a picture of 7x7, expected at least one patch of 14"):
+    with pytest.raises(ValueError, match="found an image of 7x7, expected at least one patch of 14"):
         made(options={"tokens_hw": (7, 7)})
     assert not (tmp_path / "out").exists()
     assert made(out="deep/er").code == 0 and (tmp_path / "deep" / "er" / "shard-00000.parquet").exists()

@@ -84,7 +84,7 @@ def test_steps_go_back_by_the_gap_evenly_for_many_views():
     assert plan.view_offsets(own, 3, 1) == [3] and plan.view_offsets(own, None, 1) == [7]
     assert plan.view_offsets(own, 0, 1) == plan.view_offsets(none, 0, 3) == []
     assert plan.view_offsets(own, 6, 3) == [2, 4, 6] and plan.view_offsets(own, None, 2) == [4, 7]
-    with pytest.raises(ValueError, match=r"extract\.gap: r knows no gap of its own, expected a number.*0 = front end"):
+    with pytest.raises(ValueError, match=r"extract\.gap: r has no gap of its own, expected a number.*0 = front end"):
         plan.view_offsets(none, None, 1)
     with pytest.raises(ValueError, match="views: found 4"):
         plan.make_plan([recording(gap=3)], None, 4)

@@ -287,7 +287,7 @@ def test_finished_shards_are_whole_and_of_this_extraction(tmp_path):
 def test_the_first_difference_between_two_extractions_is_said(tmp_path, change, said):
     folder = written(tmp_path / "out", [[row(0)]])
     ours = {**SHARED, **change, "key": "x" * 64}
-    expected = rf"shard-00000.parquet: found a shard of another extraction \({said}\), expected one of this, or another"
+    expected = rf"shard-00000.parquet: found a shard of another extraction \({said}\), expected one of this extraction, or another"
     with pytest.raises(FileExistsError, match=expected):
         shards.find_finished_shards(folder, ours)
     assert shards.find_finished_shards(folder, {**SHARED, **change}), "the key alone decides"
@@ -343,11 +343,11 @@ def test_a_rewritten_file_is_read_again(tmp_path):
 
 
 def test_a_folder_without_a_whole_extraction_is_refused(tmp_path):
-    with pytest.raises(FormatError, match="shards: found none, expected a folder that dhtorch extract wrote"):
+    with pytest.raises(FormatError, match="shards: found none, expected a folder written by dhtorch extract"):
         FeatureTable(tmp_path)
     folder = written(tmp_path / "out", [[row(0)], [row(1)]], of=3)
     with pytest.raises(
-        FormatError, match="shards: found 2, expected 3: the same dhtorch extract once more makes those"
+        FormatError, match="shards: found 2, expected 3: run the same dhtorch extract again for the missing"
     ):
         FeatureTable(folder)
     whole = written(tmp_path / "whole", [[row(0)]])
@@ -497,7 +497,9 @@ def test_a_cluster_that_does_not_answer_is_said(ray, monkeypatch):
         raise ConnectionRefusedError("refused")
 
     monkeypatch.setattr(engines.socket, "create_connection", refused)
-    with pytest.raises(ConnectionError, match=r"address: nothing answers at ray://head:1 \(refused\), expected a clu"):
+    with pytest.raises(
+        ConnectionError, match=r"address: no connection to ray://head:1 \(refused\), expected a Ray clu"
+    ):
         list(engines.run_ray(Counted(), [1], "ray://head:1"))
     assert not ray.log
     monkeypatch.setattr(ray, "init", lambda **_: (_ for _ in ()).throw(ValueError("no node")))
