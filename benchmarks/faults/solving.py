@@ -104,7 +104,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_inverse_depth", "seen = seen - lift", "seen = seen + lift"),
         ("_inverse_depth", "m = shape[:, :2] * n[:, :1] + shape[:, 1:] * n[:, 1:]", "m = n"),
         ("_inverse_depth", "return -(p * d)", "return (p * d)"),
-        ("_noise_factors", "known.shape * noise[:, None]", "known.shape * noise[:, None].sqrt()"),
+        ("_noise_factors", "constants.shape * noise[:, None]", "constants.shape * noise[:, None].sqrt()"),
         ("_noise_factors", "(yy - b * xy).rsqrt()", "yy.rsqrt()"),
         ("_whitener", "square < 1e-12", "square < 1e-1"),
         ("_whitener", "(1 + square * linear", "(square * linear"),

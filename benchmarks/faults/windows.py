@@ -457,7 +457,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_DerotatedImage.to_image", "tracks.valid & (inside | ~self.rotated[:, None])", "tracks.valid"),
         ("_DerotatedImage.begin", "invert_similarity(self.linear)", "self.linear"),
         ("_check_options", "iterations < 1", "iterations < 0"),
-        ("_source_pyramid", "found != expected", "False"),
+        ("_source_pyramid", "shape != image_shape", "False"),
         (
             "lucas_kanade_affine",
             "wanted=tracks.valid",

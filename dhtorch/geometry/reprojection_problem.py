@@ -259,17 +259,17 @@ def squared_residuals_at(problem: PoseDepthProblem, at: Unknowns) -> Callable[[T
 
     Gradient: as :func:`whitened_residuals`.
     """
-    known = track_constants(problem)
+    constants = track_constants(problem)
 
     linearised: LinearisedTracks | None = None
 
     def linear() -> LinearisedTracks:
         nonlocal linearised
-        linearised = linearise_tracks(problem, at, columns=False, known=known) if linearised is None else linearised
+        linearised = linearise_tracks(problem, at, columns=False, known=constants) if linearised is None else linearised
         return linearised
 
     def evaluate(noise: Tensor) -> tuple[Tensor, Tensor]:
-        return _squares(*_track_tensors(problem, known, _noise_factors(known, noise), at), linear=linear)
+        return _squares(*_track_tensors(problem, constants, _noise_factors(constants, noise), at), linear=linear)
 
     return evaluate
 
@@ -287,10 +287,10 @@ _TRACK_DTYPES = {
 
 
 def _track_tensors(
-    problem: PoseDepthProblem, known: TrackConstants, factors: tuple[Tensor, Tensor, Tensor], at: Unknowns
+    problem: PoseDepthProblem, constants: TrackConstants, factors: tuple[Tensor, Tensor, Tensor], at: Unknowns
 ) -> tuple[Tensor | None, ...]:
     """Tracks and unknowns as the argument tuple of the operators below."""
-    return problem.ray, problem.inverse, problem.near, *known, *factors, at.T.R, at.T.t, at.shutter_rate
+    return problem.ray, problem.inverse, problem.near, *constants, *factors, at.T.R, at.T.t, at.shutter_rate
 
 
 def _kernel_arguments(*tensors: Any) -> tuple[Tensor, ...]:
@@ -361,8 +361,8 @@ def pose_normal_equations_at(
 
     Gradient: as :func:`whitened_residuals`.
     """
-    known = track_constants(problem)
-    factors = _noise_factors(known, noise)
+    constants = track_constants(problem)
+    factors = _noise_factors(constants, noise)
     share = torch.where(problem.near, 1.0, torch.where(problem.far, far_weight[:, None], 0.0))
 
     def total_cost(cost: Tensor, shutter_rate: Tensor | None) -> Tensor:
@@ -381,16 +381,16 @@ def pose_normal_equations_at(
 
     def normal(at: Unknowns) -> NormalEquations:
         def linear() -> LinearisedTracks:
-            return linearise_tracks(problem, at, known=known)
+            return linearise_tracks(problem, at, known=constants)
 
-        tensors = _track_tensors(problem, known, factors, at)
+        tensors = _track_tensors(problem, constants, factors, at)
         return with_prior(*_equations(*tensors, share, linear=linear, robust=robust), at.shutter_rate)
 
     def cost(at: Unknowns) -> Tensor:
         def linear() -> LinearisedTracks:
-            return linearise_tracks(problem, at, columns=False, known=known)
+            return linearise_tracks(problem, at, columns=False, known=constants)
 
-        tensors = _track_tensors(problem, known, factors, at)
+        tensors = _track_tensors(problem, constants, factors, at)
         return total_cost(_robust_cost(*tensors, share, linear=linear, robust=robust), at.shutter_rate)
 
     return normal, cost
@@ -476,9 +476,9 @@ def _inverse_depth(a: Tensor, t: Tensor, line: Tensor, seen: Tensor, shape: Tens
     return -(p * d).sum(1) / (d * d).sum(1).clamp_min(1e-24)
 
 
-def _noise_factors(known: TrackConstants, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _noise_factors(constants: TrackConstants, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """a, b, d (B, N) of L⁻¹ = [[a, 0], [−b d, d]], which whitens the noise S = L Lᵀ of a track."""
-    xx, xy, yy = (known.shape * noise[:, None]).unbind(1)
+    xx, xy, yy = (constants.shape * noise[:, None]).unbind(1)
     b = xy / xx
     return xx.rsqrt(), b, (yy - b * xy).rsqrt()
 

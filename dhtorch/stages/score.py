@@ -323,7 +323,7 @@ class LearnedScore(nn.Module):
 
 def expected_error_loss(
     log_error: Tensor,  # (n,) of the scorer
-    error: Tensor,  # (n,) relative error that turned out
+    error: Tensor,  # (n,) actual relative error
     weight: Tensor,  # (n,) adds up to 1
 ) -> Tensor:
     """Loss of expected errors e: Σ w (ln e + min(error, 1) / e), least where e is the mean error of such answers.

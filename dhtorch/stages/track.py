@@ -74,10 +74,10 @@ def lucas_kanade(
         epsilon_px: a shorter step has converged; on coarse levels, which only provide a start, four times that.
         normalise: ``none``; ``bias`` removes the means of both windows; ``gain_bias`` also their ratio of contrast.
         min_eigenvalue: of A / window² (grey values in [0, 1]); a window with less has too little texture.
-        start: ``(image_0, image_1, *, linear) -> CoarseFlow``, such as
-            :func:`dhtorch.geometry.coarse_flow.coarse_flow`: the coarse motion of the whole image, forward and
-            backward, where the hint has none. Rotation, zoom and gain of a pair are undone in image 1 before the
-            search. None = the search starts at ``uv_0``.
+        start: coarse motion of the whole image, forward and backward, where the hint has none; a function
+            ``(image_0, image_1, *, linear) -> CoarseFlow`` such as
+            :func:`dhtorch.geometry.coarse_flow.coarse_flow`. Rotation, zoom and gain of a pair are undone in image 1
+            before the search. None = the search starts at ``uv_0``.
 
     Returns:
         Tracks in the dtype of ``uv_0``: ``uv_1`` (B, N, 2) px; ``error`` (B, N) px, the round trip (the forward
@@ -307,9 +307,9 @@ def _source_pyramid(hint: TrackHint, image: Tensor, levels: int, window: int) ->
     """The pyramid of image 0: the hint's, or a new one."""
     if hint.pyramid is None:
         return build_pyramid(image, levels, window)
-    found, expected = (tuple(x.shape) for x in (hint.pyramid.image, image))
-    if found != expected:
-        raise ValueError(f"lucas_kanade: hint.pyramid is of an image of shape {found}, expected {expected}")
+    shape, image_shape = (tuple(x.shape) for x in (hint.pyramid.image, image))
+    if shape != image_shape:
+        raise ValueError(f"lucas_kanade: hint.pyramid is of an image of shape {shape}, expected {image_shape}")
     return hint.pyramid(levels, window)
 
 
