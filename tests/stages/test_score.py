@@ -151,7 +151,7 @@ def test_a_recalibration_changes_scores_of_answers_alone_and_comes_before_the_th
     assert torch.equal(strict.gate == Gate.LOW_SCORE, keep & (found.score < limit))
 
 
-@pytest.mark.parametrize("seat", [confidence, confidence_from_error, "learned"])
+@pytest.mark.parametrize("stage", [confidence, confidence_from_error, "learned"])
 def test_below_the_threshold_and_not_at_it_an_answer_becomes_silent(stage):
     parts = answers()
     ask = (lambda *p, min_score=0.0: LearnedScore(min_score=min_score)(*p)) if stage == "learned" else stage
