@@ -245,8 +245,8 @@ def frame(batch=2, seed=0):
     return Frame(rand(batch, 1, *HW, seed=seed).float(), 1 + rand(batch, *HW, seed=seed).float(), camera)
 
 
-class Seats:
-    """Seats that remember what they were given; view k of the window is known by its picture."""
+class RecordingStages:
+    """Stages that record their arguments; view k of the window is identified by its image."""
 
     def __init__(self, V=3, n=8):
         self.reference, self.others = frame(), stack([frame(seed=10 + k) for k in range(V)])
@@ -269,7 +269,7 @@ class Seats:
         return Samples(self.uv, one, one, one[..., None].expand(2, self.n, 3), one, one.int(), one, one.int())
 
     def stages(self):
-        """Seats and options of a method."""
+        """Stages and options of a method."""
 
         def track(image_0, image_1, uv, *, hint):
             k = self.number(image_1)
@@ -306,8 +306,8 @@ class Seats:
 
 
 def test_the_reference_is_sampled_once_and_every_view_is_a_pair_with_it():
-    stages, trace = Seats(), {}
-    found = extend_window(stages.reference, stages.others, **stages.seats(), seed=4, trace=trace)
+    stages, trace = RecordingStages(), {}
+    found = extend_window(stages.reference, stages.others, **stages.stages(), seed=4, trace=trace)
     names = [call[0] for call in stages.calls]
     assert names == ["sample", "backproject", "classify", "score"]
     assert stages.calls[0][1:] == (HW, 8, {"device": torch.device("cpu"), "dtype": torch.float32})
@@ -332,16 +332,16 @@ def test_the_reference_is_sampled_once_and_every_view_is_a_pair_with_it():
 
 
 def test_every_reference_has_its_own_draws_in_all_its_views():
-    stages = Seats()
-    extend_window(stages.reference, stages.others, **stages.seats(), seed=torch.tensor([4, 9]))
+    stages = RecordingStages()
+    extend_window(stages.reference, stages.others, **stages.stages(), seed=torch.tensor([4, 9]))
     ((_, _, draws),) = stages.asked["pose"]
     assert torch.equal(draws, uniform_draws(torch.tensor([4, 9] * 3), 6, 5).float())
     assert not torch.equal(draws[0], draws[1])
 
 
 def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pace():
-    stages = Seats(V=4)
-    extend_window(stages.reference, stages.others, **stages.seats())
+    stages = RecordingStages(V=4)
+    extend_window(stages.reference, stages.others, **stages.stages())
     starts = [hint.start for *_, hint in stages.asked["track"]]
     assert starts[0] is None
     for k in (1, 2, 3):
@@ -351,14 +351,14 @@ def test_a_search_begins_where_the_last_view_was_found_further_on_at_the_same_pa
             expected = ahead if last.valid[b, i] else last.uv_0[b, i]
             torch.testing.assert_close(starts[k][b, i], expected)
     assert not last.valid.all() and last.valid.any()
-    alone = Seats(V=4)
-    extend_window(alone.reference, alone.others, **alone.seats(), chain=False)
+    alone = RecordingStages(V=4)
+    extend_window(alone.reference, alone.others, **alone.stages(), chain=False)
     assert all(hint.start is None for *_, hint in alone.asked["track"])
 
 
 def test_the_pyramid_of_the_reference_is_built_once_for_all_views():
-    stages = Seats()
-    extend_window(stages.reference, stages.others, **stages.seats(), hint=TrackHint(levels=3))
+    stages = RecordingStages()
+    extend_window(stages.reference, stages.others, **stages.stages(), hint=TrackHint(levels=3))
     first, *others = (hint for *_, hint in stages.asked["track"])
     assert all(hint.pyramid is first.pyramid and hint.levels == 3 for hint in others)
     made, expected = first.pyramid(2, 7), build_pyramid(stages.reference.image, 2, 7)
@@ -391,11 +391,11 @@ def test_a_chain_changes_the_start_and_not_what_is_searched_for(track):
 def test_of_more_views_the_key_views_are_estimated_again_with_their_own_poses():
     """They are chosen by few of the samples: each reference view has its own choice."""
     n = 512
-    stages = Seats(V=5, n=n)
+    stages = RecordingStages(V=5, n=n)
     fits = stack(stages.fits)
     known = rank_views(stages.answers[:, :, ::2], 2).index
     assert not torch.equal(known[:, 0], known[:, 1]), "the two reference views choose otherwise"
-    options = stages.seats() | {"track": lambda image_0, image_1, uv, hint: stages.tracks(0, uv)}
+    options = stages.stages() | {"track": lambda image_0, image_1, uv, hint: stages.tracks(0, uv)}
     asked = []
 
     def triangulate(samples, tracks, fit, camera_0, camera_1):
@@ -418,10 +418,10 @@ def test_of_more_views_the_key_views_are_estimated_again_with_their_own_poses():
 
 def test_five_views_are_used_by_default_and_no_more_than_that_are_not_chosen_among():
     for V, options, asked in ((5, {}, 5), (6, {}, 11), (3, {"views": 3}, 3), (3, {"views": 2}, 5)):
-        stages = Seats(V=V)
+        stages = RecordingStages(V=V)
         count = []
-        given = stages.seats() | {
-            "track": lambda image_0, image_1, uv, hint, count=count: count.append(1) or Seats().tracks(0, uv)
+        given = stages.stages() | {
+            "track": lambda image_0, image_1, uv, hint, count=count: count.append(1) or RecordingStages().tracks(0, uv)
         }
         given["pose"] = lambda samples, *_, stages=stages: collate(stages.fits[: len(samples.uv) // 2])
         given["triangulate"] = lambda samples, *_, stages=stages: stages.answers.map(
@@ -438,15 +438,15 @@ def test_the_trace_sums_the_milliseconds_over_the_views(monkeypatch):
     expected = {name: 1e3 * s for name, s in seconds.items()}
     times = itertools.accumulate(itertools.count(1))
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(times)))
-    stages, trace = Seats(), {}
-    extend_window(stages.reference, stages.others, **stages.seats(), trace=trace)
+    stages, trace = RecordingStages(), {}
+    extend_window(stages.reference, stages.others, **stages.stages(), trace=trace)
     assert trace["ms"] == expected
 
 
 def test_what_a_window_asks_by_default():
     """A texture of 1e-5, 200 hypotheses, the draws of seed 0."""
-    stages = Seats()
-    given = {k: v for k, v in stages.seats().items() if k != "hypotheses"}
+    stages = RecordingStages()
+    given = {k: v for k, v in stages.stages().items() if k != "hypotheses"}
     texture = torch.where(torch.arange(stages.n) % 2 == 0, 1.01e-5, 0.99e-5).expand(2, -1)
     given["classify"] = lambda _, samples: samples.replace(trackability=texture)
     extend_window(stages.reference, stages.others, **given)
@@ -458,11 +458,11 @@ def test_what_a_window_asks_by_default():
 
 
 def test_the_texture_of_a_sample_is_measured_in_every_view():
-    stages = Seats()
+    stages = RecordingStages()
     gate = torch.full_like(stages.answers.gate, Gate.NO_TRACK)
     stages.answers = stages.answers.replace(gate=gate)
     for limit, reason in ((1.0, Gate.NO_TRACK), (1.01, Gate.NO_TEXTURE)):
         stages.asked["track"].clear()
-        found = extend_window(stages.reference, stages.others, **stages.seats(), min_trackability=limit)
+        found = extend_window(stages.reference, stages.others, **stages.stages(), min_trackability=limit)
         last = stages.tracks(2, stages.uv).valid
         assert (found.gate[last] == reason).all() and (found.gate[~last] == Gate.NO_TRACK).all()
