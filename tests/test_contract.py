@@ -130,7 +130,7 @@ def two_views(batch, n, dtype):
 
 
 def posed(batch, n, dtype):
-    """Seat 5: exact tracks, so that the pose does not depend on which points were drawn; 17 of them count."""
+    """Stage 5: exact tracks, so that the pose does not depend on which points were drawn; 17 of them count."""
     samples, tracks, _, camera_0, camera_1 = tracked(batch, n, dtype, noise=0.0)
     tracks = tracks.replace(valid=tracks.valid & (torch.arange(n) < 17))
     return samples, tracks, camera_0, camera_1, uniform(1, 64, 3, dtype=torch.float64).expand(batch, 64, 3)
@@ -495,14 +495,29 @@ ELSEWHERE = {
     ),
     *(f"support.reference.{name}" for name in ("register", "register_step", "composed", "believed", "nearest_inside")),
     *(f"dhtorch.geometry.sparse_grid.{name}" for name in ("occupied_cells", "connected_components")),
-    *(f"dhtorch.integrate.volume.{name}" for name in ("make_volume", "fuse_views", "reserve_blocks", "drop_unconfirmed", "splat_points")),
+    *(
+        f"dhtorch.integrate.volume.{name}"
+        for name in ("make_volume", "fuse_views", "reserve_blocks", "drop_unconfirmed", "splat_points")
+    ),
     "dhtorch.integrate.sweeps.depth_step_rel",
     *(f"dhtorch.integrate.surface.{name}" for name in ("extract_points", "extract_mesh")),
     "dhtorch.integrate.picture.draw_map",
     "dhtorch.integrate.from_maps.fuse_frame_maps",
     *(f"dhtorch.integrate.scales.{name}" for name in ("choose_coarse_voxel", "merge_surfaces")),
-    *(f"dhtorch.integrate.mapping.{name}" for name in ("map_scene", "run", "choose_voxel", "should_mesh", "write_mapped_scene", "write_surface")),
-    *(f"dhtorch.integrate.level.{name}" for name in ("estimate_up", "mean_camera_up", "_fit_floor_normal", "_fit_upright_direction", "_spiral_directions")),
+    *(
+        f"dhtorch.integrate.mapping.{name}"
+        for name in ("map_scene", "run", "choose_voxel", "should_mesh", "write_mapped_scene", "write_surface")
+    ),
+    *(
+        f"dhtorch.integrate.level.{name}"
+        for name in (
+            "estimate_up",
+            "mean_camera_up",
+            "_fit_floor_normal",
+            "_fit_upright_direction",
+            "_spiral_directions",
+        )
+    ),
     "dhtorch.geometry.se3.turn_between",
     *(
         f"dhtorch.integrate.recording.{name}"
@@ -523,42 +538,90 @@ ELSEWHERE = {
     "dhtorch.pipeline.multiview.estimate_multiview",
     *(
         f"dhtorch.pipeline.pair.{name}"
-        for name in ("estimate_pair", "track_in_chunks", "solve_pose_and_triangulate", "merge", "upcast_intrinsics", "undistort_tracks", "uniform_draws")
+        for name in (
+            "estimate_pair",
+            "track_in_chunks",
+            "solve_pose_and_triangulate",
+            "merge",
+            "upcast_intrinsics",
+            "undistort_tracks",
+            "uniform_draws",
+        )
     ),
     *(f"dhtorch.pipeline.method.{name}" for name in ("parts", "networks", "options")),
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.fuse_consistent",
     "dhtorch.geometry.free_space.free_space_violations",
-    *(f"dhtorch.pipeline.view_selection.{name}" for name in ("select_views_by_preview", "downscale_frame", "rank_views")),
+    *(
+        f"dhtorch.pipeline.view_selection.{name}"
+        for name in ("select_views_by_preview", "downscale_frame", "rank_views")
+    ),
     *(f"dhtorch.geometry.coarse_flow.{name}" for name in ("downscale", "is_not_identity", "invert_similarity")),
     "dhtorch.stages.track.resolve_coarse_flow",
     "dhtorch.geometry.patches.whole_is_faster",
-    *(f"dhtorch.geometry.plane_sweep.{name}" for name in ("add_census_costs", "rectify_view", "census_cost", "second_best_margin")),
+    *(
+        f"dhtorch.geometry.plane_sweep.{name}"
+        for name in ("add_census_costs", "rectify_view", "census_cost", "second_best_margin")
+    ),
     *(
         f"dhtorch.pipeline.dense.{name}"
-        for name in ("complete_depth", "map_hw", "dense_options", "map_pixel_centres", "downscale_grey", "sensor_depth_map", "default_calibration")
+        for name in (
+            "complete_depth",
+            "map_hw",
+            "dense_options",
+            "map_pixel_centres",
+            "downscale_grey",
+            "sensor_depth_map",
+            "default_calibration",
+        )
     ),
     *(f"dhtorch.pipeline.dense.{name}" for name in ("sweep_depth", "selected_views", "top_views")),
     "dhtorch.pipeline.dense.source_view_of",
     *(f"dhtorch.pipeline.surface.{name}" for name in ("sweep_planes", "refine_surface", "pose_variance")),
-    *(f"dhtorch.validation.validate.{name}" for name in ("validate_depth", "validate_against", "combine_evidence", "clipped_depth", "share_interval")),
+    *(
+        f"dhtorch.validation.validate.{name}"
+        for name in ("validate_depth", "validate_against", "combine_evidence", "clipped_depth", "share_interval")
+    ),
     *(
         f"dhtorch.validation.evidence.{name}"
-        for name in ("validation_references", "resolution_sigma", "is_coarser", "pixel_centres", "inflate_sigma", "no_evidence")
+        for name in (
+            "validation_references",
+            "resolution_sigma",
+            "is_coarser",
+            "pixel_centres",
+            "inflate_sigma",
+            "no_evidence",
+        )
     ),
     *(
         f"dhtorch.validation.evidence.{name}"
         for name in ("sparse_evidence", "photometric_evidence", "consistency_evidence", "nearest_surface")
     ),
-    *(f"dhtorch.validation.faults.{name}" for name in ("rot90_map", "diagnose", "select_cause", "track_window", "ray_lengths")),
+    *(
+        f"dhtorch.validation.faults.{name}"
+        for name in ("rot90_map", "diagnose", "select_cause", "track_window", "ray_lengths")
+    ),
     "dhtorch.metrics.detection.auroc",
     "dhtorch.alignment.align.align_depth",
-    *(f"dhtorch.alignment.references.{name}" for name in ("collect_references", "sample_at_references", "local_spread")),
+    *(
+        f"dhtorch.alignment.references.{name}"
+        for name in ("collect_references", "sample_at_references", "local_spread")
+    ),
     *(
         f"dhtorch.alignment.error_model.{name}"
-        for name in ("make_basis", "evaluate_fields", "evaluate_curves", "predict_log_depth", "predict_references", "fit_models")
+        for name in (
+            "make_basis",
+            "evaluate_fields",
+            "evaluate_curves",
+            "predict_log_depth",
+            "predict_references",
+            "fit_models",
+        )
     ),
-    *(f"dhtorch.alignment.error_model.{name}" for name in ("placement_variance", "estimate_freedom", "motion_error_basis", "interpolation_variance")),
+    *(
+        f"dhtorch.alignment.error_model.{name}"
+        for name in ("placement_variance", "estimate_freedom", "motion_error_basis", "interpolation_variance")
+    ),
     "dhtorch.alignment.residual_noise.residual_variance",
     "dhtorch.geometry.determinism.round_up",
     "dhtorch.geometry.least_squares.minimise",
@@ -568,7 +631,10 @@ ELSEWHERE = {
         for n in ("search", "step", "squares", "window_covariance", "for_some", "within")
     ),
     *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search_hypotheses")),
-    *(f"dhtorch.metrics.errors.{name}" for name in ("make_points", "points_from_estimate", "measure_errors", "summarise_scenes", "metric_unit")),
+    *(
+        f"dhtorch.metrics.errors.{name}"
+        for name in ("make_points", "points_from_estimate", "measure_errors", "summarise_scenes", "metric_unit")
+    ),
     *(
         f"dhtorch.metrics.risk.{name}"
         for name in ("ause", "cap_error", "risk_curve", "measure_risk", "realised_risk", "risk_coverage", "keep_surest")
@@ -577,20 +643,42 @@ ELSEWHERE = {
         f"dhtorch.metrics.reliability.{n}"
         for n in ("diagram", "excess_ece", "pool", "measure", "ece_interval", "leave_one_room_out")
     ),
-    *(f"dhtorch.calibration.score_calibration.{name}" for name in ("fit_calibration", "fit_sigma_model", "parse_calibration")),
+    *(
+        f"dhtorch.calibration.score_calibration.{name}"
+        for name in ("fit_calibration", "fit_sigma_model", "parse_calibration")
+    ),
     *(f"dhtorch.calibration.monotone.{name}" for name in ("fit_isotonic", "_pool_adjacent_violators", "fit_platt")),
     *(
         f"dhtorch.metrics.control.{name}"
-        for name in ("plug_in_threshold", "scene_quantile_threshold", "conformal_threshold", "scenes_needed", "_hoeffding_bentkus_p_value")
+        for name in (
+            "plug_in_threshold",
+            "scene_quantile_threshold",
+            "conformal_threshold",
+            "scenes_needed",
+            "_hoeffding_bentkus_p_value",
+        )
     ),
     *(
         f"dhtorch.experiments.compare_methods.{name}"
-        for name in ("multiview_ratios", "complete_scenes", "cut_to_equal_coverage", "method_ratios", "evaluate_promises", "ratio_over_seeds")
+        for name in (
+            "multiview_ratios",
+            "complete_scenes",
+            "cut_to_equal_coverage",
+            "method_ratios",
+            "evaluate_promises",
+            "ratio_over_seeds",
+        )
     ),
     "dhtorch.metrics.curves.sample_curves",
     *(f"dhtorch.metrics.correlation.{name}" for name in ("pearson", "spearman", "_ranks")),
-    *(f"dhtorch.metrics.bootstrap.{name}" for name in ("interval_over_scenes", "interval_of_statistic", "resample_scenes", "without_interval")),
-    *(f"dhtorch.experiments.probes.ridge.{name}" for name in ("select_features", "make_folds", "mean_squared_error", "error_ratio", "is_equivalent")),
+    *(
+        f"dhtorch.metrics.bootstrap.{name}"
+        for name in ("interval_over_scenes", "interval_of_statistic", "resample_scenes", "without_interval")
+    ),
+    *(
+        f"dhtorch.experiments.probes.ridge.{name}"
+        for name in ("select_features", "make_folds", "mean_squared_error", "error_ratio", "is_equivalent")
+    ),
 }
 
 

@@ -265,7 +265,7 @@ def test_depths_that_compiled_code_does_not_take_are_torchs(loaded, monkeypatch)
     assert SampleSpec(depth_unit=0.002).metres([whole.to(torch.int16)])[0, 0, 59, 99] == 5999 * 0.002
     with pytest.raises(SampleError, match="is the unit mm"):
         SampleSpec(depth_unit="m").metres([whole.to(torch.int16)])
-    SampleSpec(depth_unit="m")._probed(whole.double())
+    SampleSpec(depth_unit="m")._check_depth(whole.double())
     assert not calls
 
 
@@ -278,7 +278,7 @@ def test_the_unit_found_from_depths_is_that_of_torch(loaded, monkeypatch):
     depth[5, :, ::3] = torch.nan
     calls = counted(monkeypatch, "count_returns")
     for some in ([0, 5], [0, 1], [2], [3], [4], [5], [0, 3, 4]):
-        ours, torchs = both_ways(lambda some=some: views._probed(depth[some]), monkeypatch)
+        ours, torchs = both_ways(lambda some=some: views._check_depth(depth[some]), monkeypatch)
         assert torch.equal(ours[0], torchs[0]) and ours[0].dtype == torchs[0].dtype
         assert ours[0].tolist() == [k != 1 for k in some]
         bad = [

@@ -173,8 +173,8 @@ def test_networks_in_the_stages_of_a_method_are_submodules():
             super().__init__()
             self.weight = torch.nn.Parameter(torch.zeros(size))
 
-    seats = {"score": Net(2), "track": partial(print, Net(1), net=partial(print, net=Net(3))), "pose": print}
-    sizes = sorted(p.numel() for p in tiny(dhtorch.PAPER.replace(**seats)).parameters())
+    stages = {"score": Net(2), "track": partial(print, Net(1), net=partial(print, net=Net(3))), "pose": print}
+    sizes = sorted(p.numel() for p in tiny(dhtorch.PAPER.replace(**stages)).parameters())
     assert sizes == [1, 2, 3] and not list(tiny(dhtorch.PAPER).parameters())
 
 
