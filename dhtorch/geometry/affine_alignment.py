@@ -217,7 +217,9 @@ def registration_step(
     return xy.T.reshape(B, N, 2).to(uv_0.dtype)
 
 
-def _flatten_points(source: Pyramid, target: Pyramid, uv_0: Tensor, uv_1: Tensor):
+def _flatten_points(
+    source: Pyramid, target: Pyramid, uv_0: Tensor, uv_1: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points of all pairs in one row: positions in both images (2, M), their pair (M,), and whether both are usable."""
     B, N, _ = uv_0.shape
     xy_0, xy_1 = (uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, B * N) for uv in (uv_0, uv_1.detach()))

@@ -260,7 +260,7 @@ def _grey(image: Tensor) -> Tensor:
 
 def _best_similarity(
     image_0: Tensor, image_1: Tensor, reach: float, rotations_deg: tuple[float, ...], zooms: tuple[float, ...]
-):
+) -> Tensor:
     """Two images -> similarity (B, 2, 2) of the candidates with the highest mean correlation."""
     a, b = (_quantised(downscale(image, ROTATION_SIDE_PX)) for image in (image_0, image_1))
     angle = torch.tensor([math.radians(t) for z in zooms for t in rotations_deg], device=a.device)

@@ -17,7 +17,7 @@ has a compiled kernel.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -197,7 +197,9 @@ def window_covariance(A: Tensor, variance: Tensor) -> Tensor:
     return (torch.stack(adjugate_2x2(a, b, b, c)) * scale).to(A.dtype).unflatten(0, (2, 2))
 
 
-def masked_apply(wanted: Tensor, fn: Callable, values: tuple[Tensor, ...], columns: tuple[Any, ...]):
+def masked_apply(
+    wanted: Tensor, fn: Callable[..., Sequence[Tensor]], values: tuple[Tensor, ...], columns: tuple[Any, ...]
+) -> Sequence[Tensor]:
     """``values`` (each (..., M)), replaced where ``wanted`` (M,) by the results of ``fn(*columns)``.
 
     ``columns`` are tensors (..., M) or trees of them. Where shapes may depend on values, ``fn`` gets only the wanted
@@ -225,7 +227,9 @@ def _pad_to_lanes(index: Tensor) -> Tensor:
     return torch.cat([index, index[:1].expand(-len(index) % ELEMENTWISE_LANES)])
 
 
-def _search_by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Tensor, batch: Tensor) -> Tensor:
+def _search_by_cell(
+    pyramid: Pyramid, level: int, fn: Callable[..., Tensor], x: Tensor, d: Tensor, batch: Tensor
+) -> Tensor:
     """``fn(x, d, batch)`` (2, M) at the centre of the cell of each point ``x`` (2, M); all ``d`` are equal.
 
     Where shapes may depend on values it is computed once per cell.
@@ -249,7 +253,9 @@ def _search_by_cell(pyramid: Pyramid, level: int, fn: Callable, x: Tensor, d: Te
     return search(cells).index_select(-1, (occupied.cumsum(0) - 1)[cell_of_point])
 
 
-def _search_level(pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor):
+def _search_level(
+    pair: _Pair, radii: tuple[int, ...], x: Tensor, d: Tensor, batch: Tensor, known: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Search on one level -> displacement (2, M); whether each point lies within its last map and is textured (M,); A.
 
     All points are searched on a first map, those that have not converged on further ones. A is (3, M).
@@ -391,7 +397,9 @@ def _steps(C: Tensor, moments: Tensor, A_inv: Tensor) -> Tensor:
     return steps if len(C) == 2 else torch.cat([steps, _gain(C[2:], moments[5])])
 
 
-def _correlation_map(pair: _Pair, radius: int, x: Tensor, corner: Tensor, batch: Tensor, moments: Tensor | None = None):
+def _correlation_map(
+    pair: _Pair, radius: int, x: Tensor, corner: Tensor, batch: Tensor, moments: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Windows at ``x`` (2, M) -> map (K, n, n, M) that begins at the target's pixels ``corner``, and their moments."""
     o, w = pair.o, pair.o.window
     side = w + 2 * radius + 1

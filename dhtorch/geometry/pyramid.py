@@ -64,7 +64,9 @@ class Pyramid(NamedTuple):
         """Points ``x`` (2, M) -> the pixels (2, M) left of and above them, on a level or in the margin around it."""
         return torch.clamp(x.detach().floor(), *_corner_limits(self.hw(level), device=x.device, dtype=x.dtype))
 
-    def locate(self, level: int, x: Tensor, batch: Tensor, before: int, planes: tuple[int, ...]):
+    def locate(
+        self, level: int, x: Tensor, batch: Tensor, before: int, planes: tuple[int, ...]
+    ) -> tuple[Tensor, Tensor]:
         """First pixels of windows that extend ``before`` pixels left of and above floor(x), and the fractions of x.
 
         ``x`` (2, M) px of the level, ``batch`` (M,); returns flat indices (P, M), one row per plane, and (2, M).
@@ -88,7 +90,12 @@ class Pyramid(NamedTuple):
         return torch.lerp(w[..., :-1, :], w[..., 1:, :], fraction[1][:, None, None]).flatten(-2)
 
     def windows(
-        self, level: int, x: Tensor, batch: Tensor, size: int, planes=(GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE)
+        self,
+        level: int,
+        x: Tensor,
+        batch: Tensor,
+        size: int,
+        planes: tuple[int, ...] = (GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE),
     ) -> Tensor:
         """Windows (P, M, size²) around ``x`` (2, M), interpolated between pixels."""
         first, fraction = self.locate(level, x, batch, size // 2, planes)

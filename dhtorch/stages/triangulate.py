@@ -15,6 +15,7 @@ from dhtorch.geometry.checks import all_finite, check
 from dhtorch.geometry.covariance import masked_median, noise_shape
 from dhtorch.geometry.free_space import free_space_violations
 from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
+from dhtorch.geometry.se3 import Pose
 from dhtorch.records import Camera, Estimate, PoseFit, Samples, Tracks
 
 #: Limits the trackability (grey values in [0, 1]) that a grey difference is divided by from below: no division by 0.
@@ -205,12 +206,12 @@ def _below(x: Tensor, limit: float | None) -> Tensor:
     return torch.zeros_like(x, dtype=torch.bool) if limit is None else ~(x >= limit)
 
 
-def _safe_pose(fit: PoseFit) -> epipolar.Pose:
+def _safe_pose(fit: PoseFit) -> Pose:
     """The fitted pose, or a fixed valid one where there is none, so that arithmetic and gradients stay finite."""
     ok = fit.ok
     R, t = fit.T_1_from_0.R, fit.T_1_from_0.t
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
-    return epipolar.Pose(torch.where(ok[:, None, None], R, eye), torch.where(ok[:, None], t, eye[0]))
+    return Pose(torch.where(ok[:, None, None], R, eye), torch.where(ok[:, None], t, eye[0]))
 
 
 def _zero_invalid(uv: Tensor, valid: Tensor) -> Tensor:
