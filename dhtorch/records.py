@@ -152,7 +152,7 @@ class PoseFit(Record):
 class PosePrior(Record):
     """A relative pose from elsewhere (kinematics, SLAM, a device's own tracker, a calibration), for ``fit=``.
 
-    It is tested against the near returns (:func:`dhtorch.stages.pose_prior.check_pose_prior`); a pose that they
+    Near returns may refute it (:func:`dhtorch.stages.pose_prior.check_pose_prior`); a pose that they
     contradict is not used.
     """
 

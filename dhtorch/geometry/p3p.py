@@ -165,7 +165,7 @@ def _outer_root(cones: Tensor) -> Tensor:
 def _null_directions(A: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """The vectors x = α u + β v with xᵀ A x = 0: A (3, 3, *), u (3, *) and v (3, 2, *) → (3, 4, *), of any length.
 
-    A negative discriminant counts as zero; whether the solution exists is checked by substitution into the equations.
+    A negative discriminant counts as zero; whether the solution exists follows from substitution into the equations.
     """
     Au, u = (A * u).sum(1), u[:, None]
     uu = (Au[:, None] * u).sum(0)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from typing import Final
 
-#: Luma weights of red, green and blue, thousandths: those of ``cv2.cvtColor``. Source: ITU-R BT.601.
+#: Luma weights of red, green and blue, thousandths: those of ``cv2.cvtColor`` (``tests/geometry/test_patches.py``).
+#: Source: ITU-R BT.601.
 LUMA_THOUSANDTHS: Final = (299, 587, 114)
 
 #: Radius of the windows of a swept surface's refinement, px: 9×9 pixels. Source: origin not recorded.

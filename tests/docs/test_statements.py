@@ -76,7 +76,8 @@ def read_with(path: Path) -> list[ast.Module]:
     """A file of tests and the helpers beside it that it imports."""
     imports = (node for node in ast.walk(parsed(path)) if isinstance(node, ast.ImportFrom))
     names = {n.module for n in imports if (n.module or "").startswith("support.")}
-    helpers = (REPO / "tests" / f"{name.replace('.', '/')}.py" for name in sorted(names))
+    tests = next(folder for folder in path.parents if folder.name == "tests")
+    helpers = (tests / f"{name.replace('.', '/')}.py" for name in sorted(names))
     return [parsed(path), *(parsed(helper) for helper in helpers if helper.is_file())]
 
 
@@ -194,8 +195,9 @@ def test_a_sentence_is_held_to_what_it_says(tmp_path, sentence, fault):
 
 def test_what_a_helper_of_the_test_uses_counts(tmp_path):
     (tmp_path / "tests").mkdir()
-    (tmp_path / "tests" / "test_a.py").write_text("from helper import slow\n")
-    (tmp_path / "tests" / "helper.py").write_text(TESTED)
+    (tmp_path / "tests" / "support").mkdir()
+    (tmp_path / "tests" / "test_a.py").write_text("from support.helper import slow\n")
+    (tmp_path / "tests" / "support" / "helper.py").write_text(TESTED)
     sentence = "Checked against ``cv2.undistort`` (``tests/test_a.py``)."
     assert not wrong_with(sentence, "mine", tmp_path)
     (tmp_path / "tests" / "test_c.py").write_text("import other\n")
