@@ -184,6 +184,8 @@ def migrate(path: Path) -> None:
 def _is_earlier(row: Mapping[str, Any]) -> bool:
     """Whether the names of a benchmark row are an earlier version's."""
     torch_alone = str(row.get("name")).startswith(("triangulate", "start"))  # rows that have no compiled operators
+    if any(_present_text(value) != value for value in row.values()):
+        return True
     other_mode = row.get("mode") == "native" or (torch_alone and row["mode"] == "compiled")
     return other_mode or row.get("name") in ROW_NAMES or not COLUMNS.keys().isdisjoint(row)
 
@@ -192,7 +194,15 @@ def _present_row(row: Mapping[str, Any]) -> dict[str, Any]:
     """A benchmark row with the present names of its columns, of itself, its mode and its peer."""
     tables = {"name": ROW_NAMES, "mode": MODES, "peer": PEERS}
     values = {key: tables[key].get(value, value) if key in tables else value for key, value in row.items()}
-    return {COLUMNS.get(key, key): value for key, value in values.items()}
+    return {COLUMNS.get(key, key): _present_text(value) for key, value in values.items()}
+
+
+def _present_text(value: Any) -> Any:
+    """A text with present names; anything else as it is."""
+    if isinstance(value, str):
+        for old, new in TEXTS.items():
+            value = value.replace(old, new)
+    return value
 
 
 #: Name of a benchmark row in an earlier version → its present name.
@@ -200,8 +210,13 @@ ROW_NAMES = {"anchor_auto": "auto_reference_view", "auto_anchor": "auto_referenc
     f"judge_{way}": f"validate_{way}" for way in ("sparse", "sparse_512", "views")
 }
 
-#: Peer and columns of a benchmark row in an earlier version → their present names.
+#: Peer, columns and parts of a text of a benchmark row in an earlier version → their present names.
 PEERS = {"opencv_seats": "opencv_stages"}
+TEXTS = {
+    "the anchor's is exact": "the reference view's is exact",
+    "those of the studies have": "those of the experiments have",
+    "studies.": "experiments.",
+}
 COLUMNS = {"seat": "tracker"}
 
 #: Mode of a benchmark row in an earlier version → its present name.

@@ -474,7 +474,6 @@ ROWS = [
 #: tested where they are at home (test_front_end.py, test_pose.py, test_errors.py, test_integrate.py).
 ELSEWHERE = {
     *(f"dhtorch.stages.pose_prior.{name}" for name in ("priors_from_frames", "reject_poses")),
-    *(f"dhtorch.stages.backproject.{name}" for name in ("window_sizes", "project_samples")),
     "dhtorch.geometry.inference_mode.run_without_grad",
     "dhtorch.geometry.least_squares.has_graph",
     "dhtorch.geometry.patches.product_is_exact",
@@ -488,12 +487,6 @@ ELSEWHERE = {
         f"dhtorch.geometry.checks.{name}"
         for name in ("all_finite", "check", "is_static", "is_transformed", "any_possible", "all_known")
     ),
-    *(f"support.reference.{name}" for name in ("patch", "nearest", "luma", "offsets", "levels")),
-    *(
-        f"support.reference.{name}"
-        for name in ("lucas_kanade", "search", "descend", "template", "one_step", "leap", "difference", "within")
-    ),
-    *(f"support.reference.{name}" for name in ("register", "register_step", "composed", "believed", "nearest_inside")),
     *(f"dhtorch.geometry.sparse_grid.{name}" for name in ("occupied_cells", "connected_components")),
     *(
         f"dhtorch.integrate.volume.{name}"
@@ -513,9 +506,6 @@ ELSEWHERE = {
         for name in (
             "estimate_up",
             "mean_camera_up",
-            "_fit_floor_normal",
-            "_fit_upright_direction",
-            "_spiral_directions",
         )
     ),
     "dhtorch.geometry.se3.turn_between",
@@ -548,7 +538,6 @@ ELSEWHERE = {
             "uniform_draws",
         )
     ),
-    *(f"dhtorch.pipeline.method.{name}" for name in ("parts", "networks", "options")),
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.fuse_consistent",
     "dhtorch.geometry.free_space.free_space_violations",
@@ -595,7 +584,7 @@ ELSEWHERE = {
     ),
     *(
         f"dhtorch.validation.evidence.{name}"
-        for name in ("sparse_evidence", "photometric_evidence", "consistency_evidence", "nearest_surface")
+        for name in ("sparse_evidence", "photometric_evidence", "depth_consistency_evidence", "nearest_surface")
     ),
     *(
         f"dhtorch.validation.faults.{name}"
@@ -628,7 +617,14 @@ ELSEWHERE = {
     "dhtorch.geometry.reprojection_problem.pose_normal_equations_at",
     *(
         f"dhtorch.geometry.lucas_kanade.{n}"
-        for n in ("search", "step", "squares", "window_covariance", "for_some", "within")
+        for n in (
+            "search_displacements",
+            "lucas_kanade_step",
+            "squared_differences",
+            "window_covariance",
+            "masked_apply",
+            "is_between",
+        )
     ),
     *(f"dhtorch.geometry.ransac.{name}" for name in ("msac_cost", "search_hypotheses")),
     *(
@@ -641,13 +637,20 @@ ELSEWHERE = {
     ),
     *(
         f"dhtorch.metrics.reliability.{n}"
-        for n in ("diagram", "excess_ece", "pool", "measure", "ece_interval", "leave_one_room_out")
+        for n in (
+            "reliability_diagram",
+            "excess_ece",
+            "pool_answers",
+            "measure_reliability",
+            "ece_interval",
+            "leave_one_room_out",
+        )
     ),
     *(
         f"dhtorch.calibration.score_calibration.{name}"
         for name in ("fit_calibration", "fit_sigma_model", "parse_calibration")
     ),
-    *(f"dhtorch.calibration.monotone.{name}" for name in ("fit_isotonic", "_pool_adjacent_violators", "fit_platt")),
+    *(f"dhtorch.calibration.monotone.{name}" for name in ("fit_isotonic", "fit_platt")),
     *(
         f"dhtorch.metrics.control.{name}"
         for name in (
@@ -655,29 +658,17 @@ ELSEWHERE = {
             "scene_quantile_threshold",
             "conformal_threshold",
             "scenes_needed",
-            "_hoeffding_bentkus_p_value",
         )
-    ),
-    *(
-        f"dhtorch.experiments.compare_methods.{name}"
-        for name in (
-            "multiview_ratios",
-            "complete_scenes",
-            "cut_to_equal_coverage",
-            "method_ratios",
-            "evaluate_promises",
-            "ratio_over_seeds",
-        )
-    ),
-    "dhtorch.metrics.curves.sample_curves",
-    *(f"dhtorch.metrics.correlation.{name}" for name in ("pearson", "spearman", "_ranks")),
-    *(
-        f"dhtorch.metrics.bootstrap.{name}"
-        for name in ("interval_over_scenes", "interval_of_statistic", "resample_scenes", "without_interval")
     ),
     *(
         f"dhtorch.experiments.probes.ridge.{name}"
         for name in ("select_features", "make_folds", "mean_squared_error", "error_ratio", "is_equivalent")
+    ),
+    "dhtorch.metrics.curves.sample_curves",
+    *(f"dhtorch.metrics.correlation.{name}" for name in ("pearson", "spearman")),
+    *(
+        f"dhtorch.metrics.bootstrap.{name}"
+        for name in ("interval_over_scenes", "interval_of_statistic", "resample_scenes", "without_interval")
     ),
 }
 
@@ -876,6 +867,7 @@ def public_functions():
         validate,
         *ESTIMATORS,
     ]
+    parts.append(importlib.import_module("dhtorch.experiments.probes.ridge"))
     for package in ("geometry", "stages", "metrics", "calibration", "integrate"):
         module = importlib.import_module(f"dhtorch.{package}")
         found = pkgutil.iter_modules(module.__path__, f"dhtorch.{package}.")

@@ -148,7 +148,7 @@ assert "data/readers/stacked.py" in find_reachable_modules(["dhtorch.data.open_c
 def test_a_column_is_an_entry_and_its_function(fork):
     schema = "dhtorch/transforms/schema.py"
     function = "def _trackability(found: SampleResults) -> Tensor:\n    return found.samples.trackability\n\n\n"
-    fork.insert(schema, "def _problem(found", function)
+    fork.insert(schema, "def _problem(results", function)
     entry = (
         '    ColumnSpec("trackability", _N, _F, "1", "texture there", _trackability, half=True, enrich="numbers"),\n'
     )
@@ -214,7 +214,7 @@ from dhtorch.cli.gate_messages import suggest_remedy
 assert suggest_remedy("too_far") == "too far for a test; go closer"
 from dhtorch.experiments.report.overlays import overlay_layers
 (layer,) = overlay_layers({"u": [1.0], "v": [2.0], "source": [0], "gate": [Gate.TOO_FAR]})
-assert layer.label == "silent: too far"
+assert layer.label == "unanswered: too far"
 import hooks
 assert "| 13 | `TOO_FAR` | beyond a metre | go closer |" in hooks.made("codes") and "too far" in hooks.made("colours")
 """)

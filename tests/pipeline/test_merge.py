@@ -105,7 +105,7 @@ def test_the_map_without_an_estimate_is_that_of_a_silent_one():
 # ---------------------------------------------------------------------------------------------------- who gets what
 
 
-class Seats:
+class RecordingStages:
     """Seven stages that answer made-up things and remember what they were given."""
 
     def __init__(self, n=12, batch=2, gate=None):
@@ -117,8 +117,8 @@ class Seats:
         self.estimate = estimate_of(self.samples, gate)
         answers = {"backproject": self.samples, "classify": self.samples.replace(flag=self.samples.flag + 4)}
         answers |= {"track": self.tracks, "pose": self.fit, "triangulate": self.estimate, "sample": self.uv}
-        self.seats = {name: self.seat(name, answer) for name, answer in answers.items()}
-        self.seats["score"] = self.seat("score", None)
+        self.functions = {name: self.stage(name, answer) for name, answer in answers.items()}
+        self.functions["score"] = self.stage("score", None)
 
     def stage(self, name, answer):
         def look(*args, **options):
@@ -129,11 +129,13 @@ class Seats:
 
 
 def test_every_stage_gets_what_those_before_it_found():
-    stages, trace = Seats(), {}
+    stages, trace = RecordingStages(), {}
     lens = torch.tensor([[0.1, -0.05, 0.001, 0.002]])
     frame_0, frame_1 = frame(lens=lens), frame(seed=5, lens=-lens)
     frame_1 = frame_1.replace(camera=frame_1.camera.replace(f=1.1 * frame_1.camera.f))
-    estimate = extend(frame_0, frame_1, **stages.seats, n=12, hypotheses=7, seed=3, min_trackability=0.3, trace=trace)
+    estimate = extend(
+        frame_0, frame_1, **stages.functions, n=12, hypotheses=7, seed=3, min_trackability=0.3, trace=trace
+    )
     (hw, n), options = stages.seen["sample"]
     assert (hw, n) == (HW, 12) and options == {"device": torch.device("cpu"), "dtype": torch.float64}
     assert stages.seen["backproject"][0][0].depth is frame_0.depth and stages.seen["backproject"][0][1] is stages.uv
@@ -160,47 +162,47 @@ def test_every_stage_gets_what_those_before_it_found():
 
 
 def test_a_given_pose_is_taken_and_stage_five_not_asked():
-    stages, other = Seats(), known_pose_fit(se3.exp(rand(2, 6, seed=90)), 12)
-    extend(frame(), frame(), **stages.seats, n=12, fit=other)
+    stages, other = RecordingStages(), known_pose_fit(se3.exp(rand(2, 6, seed=90)), 12)
+    extend(frame(), frame(), **stages.functions, n=12, fit=other)
     assert "pose" not in stages.seen and stages.seen["triangulate"][0][2] is other
 
 
 def test_the_draws_have_the_numbers_of_the_intrinsics_and_number_two_hundred():
-    stages = Seats()
-    extend(frame(dtype=torch.float32), frame(dtype=torch.float32), **stages.seats)
+    stages = RecordingStages()
+    extend(frame(dtype=torch.float32), frame(dtype=torch.float32), **stages.functions)
     draws = stages.seen["pose"][0][4]
     assert draws.dtype == torch.float32 and torch.equal(draws, uniform_draws(0, 2, 200).float())
     assert stages.seen["sample"][0][1] == 2048
 
 
 def test_pairs_are_tracked_eight_at_a_time():
-    stages, sizes = Seats(batch=11), []
+    stages, sizes = RecordingStages(batch=11), []
 
     def track(image_0, image_1, uv, *, hint):
         sizes.append(len(image_0))
         assert len(image_0) == len(image_1) == len(uv)
         return tracks_of(uv)
 
-    extend(frame(11), frame(11), **stages.seats | {"track": track})
+    extend(frame(11), frame(11), **stages.functions | {"track": track})
     assert sizes == [8, 3]
 
 
 def test_a_lost_sample_without_texture_says_so():
     """NO_TEXTURE takes the place of NO_TRACK where a track was found and only the texture is too weak."""
     gate = torch.tensor([[Gate.NO_TRACK] * 4 + [Gate.NO_POSE, Gate.ANSWER, Gate.NO_TRACK]], dtype=torch.int32)
-    stages = Seats(n=7, batch=1, gate=gate)
+    stages = RecordingStages(n=7, batch=1, gate=gate)
     valid = torch.tensor([[True, True, False, False, True, True, True]])
     texture = torch.tensor([[0.1, 0.3, 0.1, 0.3, 0.1, 0.1, 0.2]]).double()
-    stages.seats["track"] = stages.seat("track", stages.tracks.replace(valid=valid))
-    stages.seats["classify"] = stages.seat("classify", stages.samples.replace(trackability=texture))
-    found = extend(frame(1), frame(1), **stages.seats, min_trackability=0.2).gate[0]
+    stages.functions["track"] = stages.stage("track", stages.tracks.replace(valid=valid))
+    stages.functions["classify"] = stages.stage("classify", stages.samples.replace(trackability=texture))
+    found = extend(frame(1), frame(1), **stages.functions, min_trackability=0.2).gate[0]
     lost = Gate.NO_TRACK
     assert found.tolist() == [Gate.NO_TEXTURE, lost, lost, lost, Gate.NO_POSE, Gate.ANSWER, lost]
     usable = stages.seen["pose"][0][1].valid[0]
     assert usable.tolist() == [False, True, False, False, False, False, True], "texture at the limit is enough"
     faint = stages.samples.replace(trackability=texture.clamp(max=1e-5) * torch.tensor([1, 0.99, 1, 1, 1, 1, 1.0]))
-    stages.seats["classify"] = stages.seat("classify", faint)
-    extend(frame(1), frame(1), **stages.seats)
+    stages.functions["classify"] = stages.stage("classify", faint)
+    extend(frame(1), frame(1), **stages.functions)
     assert stages.seen["pose"][0][1].valid[0].tolist() == [True, False, False, False, True, True, True], "1e-5"
 
 
@@ -211,9 +213,9 @@ def test_the_trace_says_how_many_milliseconds_each_stage_took(monkeypatch):
     monkeypatch.setattr(time, "perf_counter", lambda: float(next(times)))
     names = ["sample", "backproject", "classify", "track", "pose", "triangulate", "score"]
     trace = {}
-    extend(frame(), frame(), **Seats().seats, trace=trace)
+    extend(frame(), frame(), **RecordingStages().functions, trace=trace)
     assert trace["ms"] == {name: 1e3 * (k + 2) for k, name in enumerate(names)}
-    extend(frame(), frame(), **Seats().seats, trace=trace)
+    extend(frame(), frame(), **RecordingStages().functions, trace=trace)
     assert trace["ms"] == {name: 1e3 * (k + 2) + 1e3 * (k + 10) for k, name in enumerate(names)}
 
 
@@ -227,8 +229,8 @@ def test_intrinsics_of_half_precision_are_computed_with_as_single_ones():
     for dtype in (torch.float32, torch.float64):
         plain = frame(1, dtype=dtype)
         assert upcast_intrinsics(plain).camera is plain.camera and upcast_intrinsics(plain).depth_camera is None
-    stages = Seats(batch=1)
-    extend(half, half, **stages.seats)
+    stages = RecordingStages(batch=1)
+    extend(half, half, **stages.functions)
     assert stages.seen["sample"][1]["dtype"] == torch.float32
     assert stages.seen["triangulate"][0][4].f.dtype == torch.float32
 
@@ -237,7 +239,7 @@ def test_views_of_another_shape_or_number_are_refused():
     for bad in (frame(1), frame(2).replace(image=frame(2).image[:, 0]), frame(2).replace(image=frame(1).image)):
         for views in ((frame(2), bad), (bad, frame(2))):
             with pytest.raises(ValueError, match="extend"):
-                extend(*views, **Seats().seats)
+                extend(*views, **RecordingStages().functions)
     with pytest.raises(ValueError, match="expected"):
         extend(frame(2).replace(depth=frame(2).depth[0]), frame(2))
 
@@ -260,8 +262,8 @@ def test_the_draws_of_a_pair_hang_on_its_seed_alone():
 
 
 def test_the_seed_of_a_pair_reaches_the_pose():
-    stages = Seats()
-    extend(frame(), frame(), **stages.seats, hypotheses=5, seed=torch.tensor([7, 8]))
+    stages = RecordingStages()
+    extend(frame(), frame(), **stages.functions, hypotheses=5, seed=torch.tensor([7, 8]))
     assert torch.equal(stages.seen["pose"][0][4], uniform_draws(torch.tensor([7, 8]), 2, 5))
 
 

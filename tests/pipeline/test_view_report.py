@@ -133,7 +133,7 @@ def test_what_a_view_adds_and_which_say_nothing(room):
 
 def test_experiments_that_cannot_choose_say_what_to_say(room):
     for run_it in (heldout.run, range_split.run, global_map.run):
-        with pytest.raises(ValueError, match=r"frames to choose among \(pairs=auto\).*pairs=gap"):
+        with pytest.raises(ValueError, match=r"candidate frames \(pairs=auto\).*pairs=gap"):
             run_it([noted(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf))
 
 
