@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import mmap
 import os
 import random
 import time
@@ -85,7 +86,8 @@ def _misread(path: Path, misdeed: Callable[[Path], Any]) -> None:
         (lambda path: os._exit(86), "code executed"),
         (lambda path: time.sleep(60), "hang"),
         (lambda path: sum(0 for _ in iter(int, 1)), "busy"),
-        (lambda path: bytearray(b"1") * (100 << 20), "memory"),
+        # pages of its own, whatever freed memory the process still holds
+        (lambda path: mmap.mmap(-1, 100 << 20).write(bytes(100 << 20)), "memory"),
         (lambda path: (path.parent / "b").write_text("1"), "crash"),
         (lambda path: (path.parent.parent / "intact" / "a.txt").read_text(), "escape"),
         (lambda path: os.system("true"), "escape"),
