@@ -261,7 +261,7 @@ TIMED = (
 
 def loader_times() -> str:
     """What the transform costs in a loader, in one sentence."""
-    rows = {(r["name"], r["mode"]): r for r in speed_tables.timings("loader") if r["threads"] == 1}
+    rows = {(r["name"], r["mode"]): r for r in speed_tables.timings("loader_workers0") if r["threads"] == 1}
 
     def taken(views: str, mode: str) -> list[dict[str, Any]]:
         names = (f"loader_{views}_640x480_workers0{kind}" for kind in ("", "_by_batch"))
@@ -276,7 +276,7 @@ def loader_times() -> str:
     after = f"; after `python -m dhtorch.ops`, which compiles inner loops, {said('compiled')}" * bool(said("compiled"))
     return (
         f"A sample of 640×480 takes {said('eager')}{after}; {plain['peer_ms']:.2g} ms of it is decoding\n"
-        f"(`python benchmarks/loader.py`; one thread, {plain['processor']})."
+        f"(`python benchmarks/loader.py --workers 0`; one thread, {plain['processor']})."
     )
 
 

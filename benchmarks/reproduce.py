@@ -84,6 +84,7 @@ EXPERIMENTS = {
 
 #: Result of a script of this folder → its arguments.
 SCRIPTS = dict.fromkeys(("frontend", "lk", "pnp", "triangulate", "pair", "loader", "scaling", "readers"), "")
+SCRIPTS["loader_workers0"] = "--workers 0"
 SCRIPTS |= {
     "stream": "--clock cpu --repeats 5",
     "dense_speed": "--clock cpu --repeats 5",
@@ -113,7 +114,13 @@ AGAIN = {"avx2": ("frontend", "lk", "pnp", "pair", "loader", "dense_speed"), "ke
 SCRIPTS |= {f"{name}_{how}": f"--{how} {SCRIPTS[name]}".strip() for how, names in AGAIN.items() for name in names}
 
 #: Scripts of another name than their result: ``kornia.py`` would be imported instead of the library.
-NAMED = {"kornia": "beside_kornia", "dense_speed": "dense", "clients": "clients/all", "validate_speed": "validate"}
+NAMED = {
+    "kornia": "beside_kornia",
+    "loader_workers0": "loader",
+    "dense_speed": "dense",
+    "clients": "clients/all",
+    "validate_speed": "validate",
+}
 NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items() for name in names}
 
 #: Options that change no number, and which a file may hold otherwise.
