@@ -32,6 +32,7 @@ from dhtorch.records import DepthValidation, Frame
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.validation import faults
+from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
 from dhtorch.validation.validate import share_interval, validate_depth
 from dhtorch.viz.plots import append_cutoff, draw_validation, format_frame
 from dhtorch.viz.viewer import validation as pages
@@ -304,7 +305,8 @@ def _summarise_recording(found: RecordingValidation) -> Row:
     for name in ("scale", "scale_vs_trajectory", "shift", "tilt"):
         values = [row[name]["value"] for row in rows if row[name] is not None]
         medians[name] = statistics.median(values) if values else None
-    diagnosable = [row for row in found.windows if row["pairs"] >= faults.MIN_WINDOW_PAIRS or row["cause"] is not None]
+    least = DEFAULT_VALIDATION_OPTIONS.min_window_pairs
+    diagnosable = [row for row in found.windows if row["pairs"] >= least or row["cause"] is not None]
     causes = Counter(row["cause"] for row in diagnosable if row["cause"] is not None)
     limited = {
         "wrong": _wrong_lower_bound(rows),

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -79,10 +79,6 @@ UNIT_FACTORS = {
     "1/256 m read as mm": 1000 / 256,
     "mm read as 1/256 m": 256 / 1000,
 }
-
-
-#: Fewest pairs (or frames) of a diagnosis with the default options.
-MIN_WINDOW_PAIRS: Final = DEFAULT_VALIDATION_OPTIONS.min_window_pairs
 
 
 @dataclass(frozen=True)
