@@ -7,6 +7,17 @@ They share no code with the decoders: PNG bytes, for example, are assembled here
 
 from dhtorch.testing.arkitscenes import write_arkitscenes
 from dhtorch.testing.ca1m import write_ca1m
+from dhtorch.testing.captures import CAPTURE_WRITERS, CaptureWriter
+from dhtorch.testing.image_folders import (
+    write_bop,
+    write_icl_nuim,
+    write_open3d,
+    write_replica,
+    write_ros_tum,
+    write_scannet,
+    write_sens_folder,
+    write_sun3d,
+)
 from dhtorch.testing.layouts import (
     write_calib_pair,
     write_counted_frames,
@@ -22,19 +33,29 @@ from dhtorch.testing.rlds import write_rlds
 from dhtorch.testing.stray import write_stray
 
 __all__ = [
+    "CAPTURE_WRITERS",
+    "CaptureWriter",
     "write_arkitscenes",
+    "write_bop",
     "write_ca1m",
     "write_calib_pair",
     "write_counted_frames",
     "write_driving",
+    "write_icl_nuim",
     "write_lerobot",
     "write_named_frames",
     "write_npz_pair",
+    "write_open3d",
     "write_r3d",
     "write_record3d_exr",
     "write_record3d_mp4",
+    "write_replica",
     "write_rh20t",
     "write_rlds",
+    "write_ros_tum",
+    "write_scannet",
+    "write_sens_folder",
     "write_stray",
+    "write_sun3d",
     "write_tum",
 ]

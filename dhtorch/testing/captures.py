@@ -1,0 +1,96 @@
+"""Table of test writers with one signature: the same frames as a small capture of every layout."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from dhtorch.records import Frame
+from dhtorch.testing import image_folders, layouts
+from dhtorch.testing.arkitscenes import write_arkitscenes
+from dhtorch.testing.ca1m import write_ca1m
+from dhtorch.testing.lerobot import write_lerobot
+from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
+from dhtorch.testing.rlds import write_rlds
+from dhtorch.testing.stray import write_stray
+
+
+@dataclass(frozen=True)
+class CaptureWriter:
+    """Frames with image, depth, camera, time and pose → files of one layout."""
+
+    write: Callable[[Path, Sequence[Frame]], object]
+    format: str  # name of the reader
+    step_m: float | None = None  # metres of one depth code; None = the layout stores metres, or rounds to no fixed step
+    path: str = "."  # what to open, relative to the folder
+    has_poses: bool = True
+    is_exact: bool = True  # images and depth come back bit for bit, apart from the step of depth
+    states_unit: bool = True  # whether the layout states the unit of its depth
+    wants_even_sides: bool = False  # the images are stored as a film
+    options: Mapping[str, object] = field(default_factory=dict)  # of the reader, so that images come back as written
+
+    def __call__(self, root: Path, frames: Sequence[Frame]) -> Path:
+        """Write the capture below the folder ``root`` → the path to open."""
+        self.write(root, frames)
+        return root / self.path
+
+
+#: Layout → its writer. Frames have B = 1, image and depth of one size unless the reader accepts others.
+CAPTURE_WRITERS: Final[dict[str, CaptureWriter]] = {
+    "named_frames": CaptureWriter(layouts.write_named_frames, "frames_dir", 1 / 1000, states_unit=False),
+    "counted_frames": CaptureWriter(layouts.write_counted_frames, "frames_dir", 1 / 1000, states_unit=False),
+    "tum": CaptureWriter(layouts.write_tum, "tum", 1 / 5000, states_unit=False),
+    "ros_tum": CaptureWriter(
+        lambda root, frames: image_folders.write_ros_tum(root, frames, units_per_metre=5000),
+        "tum",
+        1 / 5000,
+        states_unit=False,
+    ),
+    "icl_nuim": CaptureWriter(image_folders.write_icl_nuim, "tum", 1 / 5000),
+    "bop": CaptureWriter(image_folders.write_bop, "bop", 1 / 10000),
+    "replica": CaptureWriter(image_folders.write_replica, "replica", 1 / 6553.5, is_exact=False),
+    "scannet": CaptureWriter(image_folders.write_scannet, "scannet", 1 / 1000, is_exact=False),
+    "sens_folder": CaptureWriter(image_folders.write_sens_folder, "sens_folder", 1 / 1000, is_exact=False),
+    "open3d": CaptureWriter(image_folders.write_open3d, "open3d", 1 / 1000, states_unit=False),
+    "sun3d": CaptureWriter(image_folders.write_sun3d, "sun3d", 1 / 1000),
+    "stray": CaptureWriter(write_stray, "stray", 1 / 1000, is_exact=False, wants_even_sides=True),
+    "r3d": CaptureWriter(
+        lambda root, frames: write_r3d(root / "capture.r3d", frames), "record3d", path="capture.r3d", is_exact=False
+    ),
+    "record3d_exr": CaptureWriter(write_record3d_exr, "record3d", is_exact=False),
+    "record3d_mp4": CaptureWriter(
+        lambda root, frames: write_record3d_mp4(root / "capture.mp4", frames),
+        "record3d",
+        path="capture.mp4",
+        has_poses=False,
+        is_exact=False,
+        wants_even_sides=True,
+    ),
+    "arkitscenes": CaptureWriter(
+        lambda root, frames: write_arkitscenes(
+            root / "41048190", {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames
+        ),
+        "arkitscenes",
+        1 / 1000,
+        path="41048190",
+        options={"upright": False},
+    ),
+    "ca1m": CaptureWriter(
+        lambda root, frames: write_ca1m(root / "ca1m-val-1.tar", frames, frames),
+        "ca1m",
+        1 / 1000,
+        path="ca1m-val-1.tar",
+    ),
+    "lerobot": CaptureWriter(
+        lambda root, frames: write_lerobot(root, [frames], image="image", depth="tiff"), "lerobot"
+    ),
+    "lerobot_png": CaptureWriter(
+        lambda root, frames: write_lerobot(root, [frames], image="image", depth="png"), "lerobot", 1 / 1000
+    ),
+    "lerobot_video": CaptureWriter(
+        lambda root, frames: write_lerobot(root, [frames]), "lerobot", is_exact=False, wants_even_sides=True
+    ),
+    "rlds": CaptureWriter(lambda root, frames: write_rlds(root / "1.0.0", [frames]), "rlds", 1 / 1000, path="1.0.0"),
+}
