@@ -19,6 +19,7 @@ from support.robot_episodes import two_episodes
 pytest.importorskip("av")
 pytest.importorskip("pyarrow")
 
+import av
 import pyarrow
 from pyarrow import parquet
 
@@ -29,9 +30,11 @@ from dhtorch.data.codecs.video import close_videos
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers import lerobot_depth, lerobot_rows
 from dhtorch.data.readers.lerobot_meta import LeRobotFeature
+from dhtorch.data.units import DepthUnit
 from dhtorch.records import Camera, Frame
 from dhtorch.testing.lerobot import quantise_lerobot_depth, write_lerobot
 from dhtorch.testing.lossless import write_lossless
+from dhtorch.testing.parts import encode_depth_codes
 
 KEY = "observation.images.front"
 STEP = {"video": 3e-3, "tiff": 1e-6, "png": 1e-3, "array": 1e-3}  # m, up to 5 m (codes: 2.8 mm there)
@@ -205,8 +208,55 @@ def test_depth_unit_of_pictures(tmp_path: Path) -> None:
     for unit in ("ft", 1000, ["m"], {"m": 1}):
         change = {"depth_unit": unit}
         edit(tmp_path, lambda info, change=change: info["features"][f"{KEY}_depth"]["info"].update(change))
-        with pytest.raises(FormatError, match=r"depth_unit: found .*, expected m or mm"):
+        with pytest.raises(FormatError, match=r"depth_unit: found .*, expected one of m, cm, mm, inch"):
             data.open(tmp_path, episode=0)[0]
+
+
+@pytest.mark.parametrize("depth", ["video", "png"])
+def test_depth_without_a_flag_is_recognised_by_its_pixels(depth: str, tmp_path: Path) -> None:
+    write_lerobot(tmp_path, two_episodes(), depth=depth)
+    flagged = data.open(tmp_path, episode=0)
+    edit(tmp_path, lambda info: info["features"][f"{KEY}_depth"]["info"].pop("is_depth_map"))
+    unflagged = data.open(tmp_path, episode=0)
+    assert torch.equal(unflagged[1].depth, flagged[1].depth) and unflagged[1].depth.any()
+    kind = {"video": "gray12le", "png": "uint16"}[depth]
+    remark = f"{KEY}_depth looks like depth: one channel, {kind}, without is_depth_map; data.depth={KEY}_depth sets it"
+    assert unflagged.report == (remark,) and flagged.report == ()
+    assert data.open(tmp_path, episode=0, depth=f"{KEY}_depth").report == ()
+    assert unflagged.depth_unit == flagged.depth_unit == (None if depth == "video" else DepthUnit(1e-3))
+
+
+def test_a_grey_camera_of_8_bits_is_no_depth(tmp_path: Path) -> None:
+    """One channel alone does not make depth: infrared cameras have it, too."""
+    write_lerobot(tmp_path, two_episodes(), depth="video", depth_pixels="yuv420p12le")
+    edit(tmp_path, lambda info: info["features"][f"{KEY}_depth"].update(info={"video.pix_fmt": "gray"}))
+    assert {r.camera_name for r in data.open_all(tmp_path, episode=0, fov=60.0)} == {KEY, f"{KEY}_depth"}
+
+
+def test_a_depth_video_of_16_bits_holds_steps_of_an_assumed_millimetre(tmp_path: Path) -> None:
+    episodes = two_episodes()
+    write_lerobot(tmp_path, episodes, depth=None)
+    pictures = [encode_depth_codes(frame.depth, 1000) for episode in episodes for frame in episode]
+    key, (video,) = f"{KEY}_raw", (tmp_path / "videos").rglob("*.mp4")
+    file = Path(str(video).replace(KEY, key))
+    file.parent.mkdir(parents=True)
+    with av.open(str(file), "w", format="matroska") as container:
+        stream = container.add_stream("ffv1", rate=30)
+        stream.pix_fmt, (stream.height, stream.width) = "gray16le", pictures[0].shape
+        for picture in pictures:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray16le")))
+        container.mux(stream.encode())
+    feature = {"dtype": "video", "shape": [*episodes[0][0].depth.shape[1:], 1], "names": None, "info": {}}
+    edit(tmp_path, lambda info: info["features"].update({key: feature}))
+    (table,) = (tmp_path / "meta" / "episodes").rglob("*.parquet")
+    rows = parquet.read_table(table)
+    for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp"):
+        rows = rows.append_column(f"videos/{key}/{name}", rows.column(f"videos/{KEY}/{name}"))
+    parquet.write_table(rows, table)
+    recording = data.open(tmp_path, episode=1)
+    assert recording.depth_unit == DepthUnit(1e-3) and "gray16le" in recording.report[0]
+    torch.testing.assert_close(recording[0].depth, episodes[1][0].depth, atol=6e-4, rtol=0)
+    torch.testing.assert_close(data.open(tmp_path, episode=1, depth_unit="cm")[0].depth, 10 * recording[0].depth)
 
 
 def edit(root: Path, change: Callable[[dict[str, Any]], object]) -> None:

@@ -35,10 +35,10 @@ FILE = "tiny_robot-train.tfrecord-00000-of-00001"
 
 
 @pytest.mark.parametrize("depth", ["png", "array", None])
-@pytest.mark.parametrize("said", [True, False])
-def test_what_is_written_is_read(depth: str | None, said: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("has_size", [True, False])
+def test_what_is_written_is_read(depth: str | None, has_size: bool, tmp_path: Path) -> None:
     want = three_episodes()
-    write_rlds(tmp_path, want, depth=depth, shards=2, said=said)  # type: ignore[arg-type]
+    write_rlds(tmp_path, want, depth=depth, shards=2, has_size=has_size)  # type: ignore[arg-type]
     found = data.open_all(tmp_path, rate_hz=30)
     assert data.recognise(tmp_path)[0] == "rlds" and len(found) == 3
     assert found.names[1] == "tiny_robot/train_000001/image_0"  # type: ignore[attr-defined]
@@ -75,7 +75,6 @@ def test_options(tmp_path: Path) -> None:
         ({"camera": "observation/image_9"}, "expected one of observation/image_0"),
         ({"depth": "observation/depth_9"}, "option depth"),
         ({"intrinsics": "K"}, "option intrinsics"),
-        ({"depth_unit": "inch"}, "expected m or mm"),
         ({"rate_hz": 0}, "option rate_hz"),
         ({"fov": 90.0, "K": [1, 1, 1, 1]}, "found data.K and data.fov, expected one of them"),
         ({"intrinsics": "action"}, "found 7 numbers a step, expected 4 or 9"),

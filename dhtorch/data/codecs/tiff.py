@@ -66,7 +66,12 @@ def read_tiff_header(file: Path) -> TiffHeader:
     Raises:
         FormatError: missing, truncated or unknown file.
     """
-    tags = _read_first_directory(read_bytes(file), file)
+    return decode_tiff_header(read_bytes(file), file)
+
+
+def decode_tiff_header(data: bytes, file: Path) -> TiffHeader:
+    """As :func:`read_tiff_header`, of bytes in memory; ``file`` names them in errors."""
+    tags = _read_first_directory(data, file)
     return TiffHeader(
         (_single_tag_value(tags, 257, None, file), _single_tag_value(tags, 256, None, file)),
         _single_tag_value(tags, 277, 1, file),

@@ -12,7 +12,7 @@ videos have no code for *no return*, see :mod:`dhtorch.data.readers.lerobot_dept
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,13 @@ from dhtorch.data.codecs.parquet import read_cell
 from dhtorch.data.codecs.video import read_video_frame, read_video_times
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.lerobot_depth import decode_depth_picture, dequantise_depth, find_depth_feature
+from dhtorch.data.readers.lerobot_depth import (
+    decode_depth_picture,
+    dequantise_depth,
+    find_depth_feature,
+    find_depth_unit,
+    flag_unmarked_depth,
+)
 from dhtorch.data.readers.lerobot_meta import (
     LeRobotEpisode,
     LeRobotEpisodes,
@@ -33,14 +39,11 @@ from dhtorch.data.readers.lerobot_meta import (
     LeRobotMeta,
     read_lerobot_episodes,
     read_lerobot_meta,
-    resolve_inside,
     select_colour_keys,
 )
-from dhtorch.data.readers.lerobot_rows import read_row_table, select_episode_rows
+from dhtorch.data.readers.lerobot_rows import read_encoded_image, read_row_table, select_episode_rows
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.records import Camera, Frame
-
-_UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
 
 
 def recognise(root: Path) -> str | None:
@@ -63,7 +66,6 @@ def read(
     distortion: Sequence[float] | None = None,
     intrinsics: intrinsics_options.IntrinsicsOption | None = None,
     pose: str | None = None,
-    depth_unit: str | None = None,
     depth_range: Sequence[float] | None = None,
     tolerance: float = 1e-4,
 ) -> Recordings:
@@ -85,8 +87,6 @@ def read(
         pose: key of a feature with the camera-to-world pose: 16 numbers (4×4 by rows) or 7 (x y z qx qy qz qw). None =
             ``<camera>.pose``, ``observation.camera.<name>.pose`` or ``observation.<name>.T_world_from_cam`` where there
             is one, else no poses.
-        depth_unit: ``"m"`` or ``"mm"`` of depth stored as images or arrays. None = ``depth_unit`` of the feature's
-            info, else mm for integers and m for floats, as in LeRobot.
         depth_range: m, nearest and farthest return to keep; for lossy depth videos, whose zeros are blurred with
             their surroundings. None = all.
         tolerance: s, largest distance of a video frame from its row's time.
@@ -101,14 +101,14 @@ def read(
     """
     root = Path(root)
     meta = read_lerobot_meta(root)
-    if depth_unit not in (None, *_UNITS_PER_METRE):
-        raise FormatError(root, "option depth_unit", depth_unit, "m or mm")
     span = (
         (0.0, np.inf) if depth_range is None else tuple(files.to_array(depth_range, (2,), root, "option depth_range"))
     )
-    keys = select_colour_keys(meta, camera)
     wanted = None if episode is None else [episode] if isinstance(episode, int) else [int(e) for e in episode]
     episodes = read_lerobot_episodes(meta, wanted)
+    meta, remarks = flag_unmarked_depth(meta, episodes[0], depth)
+    episodes = replace(episodes, meta=meta)
+    keys = select_colour_keys(meta, camera)
     keys = keys if camera is not None else _recorded_cameras(keys, episodes)
     rigs = [
         _CameraSpec(
@@ -119,7 +119,7 @@ def read(
             K_depth,
             distortion,
             pose,
-            depth_unit,
+            remarks,
             span,
             tolerance,
         )
@@ -162,7 +162,7 @@ class _Load:
     videos: dict[str, tuple[Path, float]]
     cameras: Camera  # (n), or (1) for all
     depth_camera: Camera | None
-    unit: str | None
+    step_m: float | None  # metres of one step of the stored depth; None = codes of LeRobot's depth videos
     span: tuple[float, float]
     tolerance: float
 
@@ -179,18 +179,17 @@ class _Load:
 
     def _depth(self, i: int, feature: LeRobotFeature) -> Tensor:
         if feature.dtype == "video":
-            return self._within(dequantise_depth(feature, self._video(i, feature, "luma"), self.videos[feature.key][0]))
-        if feature.dtype == "image":
+            values = self._video(i, feature, "luma")
+            if self.step_m is None:
+                return self._within(dequantise_depth(feature, values, self.videos[feature.key][0]))
+        elif feature.dtype == "image":
             data, file = self._bytes(i, feature.key)
             values = decode_depth_picture(data, file, feature.hw)
         else:
-            values, file = np.asarray(read_cell(self.data, feature.key, int(self.rows[i]))), self.data
+            values = np.asarray(read_cell(self.data, feature.key, int(self.rows[i])))
             if values.size != feature.hw[0] * feature.hw[1] or values.dtype.kind not in "fiu":
-                raise FormatError(file, feature.key, f"shape {values.shape}", f"{feature.hw} numbers")
-        unit = self.unit or feature.info.get("depth_unit") or ("m" if values.dtype.kind == "f" else "mm")
-        if not isinstance(unit, str) or unit not in _UNITS_PER_METRE:
-            raise FormatError(self.data, f"{feature.key} depth_unit", unit, "m or mm")
-        return self._within(values.reshape(feature.hw).astype(np.float64) / _UNITS_PER_METRE[unit])
+                raise FormatError(self.data, feature.key, f"shape {values.shape}", f"{feature.hw} numbers")
+        return self._within(values.reshape(feature.hw).astype(np.float64) * (self.step_m or 1.0))
 
     def _within(self, depth: np.ndarray) -> Tensor:
         low, high = self.span
@@ -209,17 +208,7 @@ class _Load:
         return read_video_frame(file, nearest, feature.hw, pixels=pixels)
 
     def _bytes(self, i: int, key: str) -> tuple[bytes, Path]:
-        """Encoded image and its file: bytes in the table, or the file named in the table."""
-        cell = read_cell(self.data, key, int(self.rows[i]))
-        if not isinstance(cell, dict):
-            raise FormatError(self.data, key, type(cell).__name__, "an image: bytes and path")
-        data, path = cell.get("bytes"), cell.get("path")
-        if isinstance(data, bytes) and data:
-            return data, self.data
-        if not isinstance(path, str):
-            raise FormatError(self.data, key, "neither bytes nor path", "an image")
-        file = resolve_inside(self.root, path, self.data, key)
-        return files.read_bytes(file), file
+        return read_encoded_image(self.data, self.root, key, int(self.rows[i]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +222,7 @@ class _CameraSpec:
     K_depth: Sequence[float] | None
     distortion: Sequence[float] | None
     pose: str | None
-    unit: str | None
+    remarks: tuple[str, ...]  # about the data set, for the reports
     span: tuple[float, float]
     tolerance: float
 
@@ -270,7 +259,9 @@ class _CameraSpec:
         meta, image = self.meta, self.image
         rows, numbers, times, report = select_episode_rows(meta, episode, table)
         report += self.stated.report
+        report += self.remarks
         depth = find_depth_feature(meta, self.key, self.depth_key)
+        unit = None if depth is None else find_depth_unit(meta, depth, episode, int(rows[0]))
         if depth is None:
             report.append(f"{self.key}: no depth feature: depth is empty")
         cameras, depth_camera = self._cameras(table, rows, depth)
@@ -287,7 +278,7 @@ class _CameraSpec:
             videos={f.key: episode.videos[f.key] for f in (image, depth) if f is not None and f.dtype == "video"},
             cameras=cameras,
             depth_camera=depth_camera,
-            unit=self.unit,
+            step_m=None if unit is None else unit.metres,
             span=self.span,
             tolerance=self.tolerance,
         )
@@ -303,6 +294,7 @@ class _CameraSpec:
             report=tuple(report),
             episode=episode.number,
             camera_name=self.key,
+            depth_unit=unit,
         )
 
     def _cameras(

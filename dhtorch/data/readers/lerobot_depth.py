@@ -2,32 +2,117 @@
 
 A depth video holds 12-bit codes, by default logarithmic, that span ``depth_min`` to ``depth_max``. The encoder clips
 *no return* to the nearest distance and everything too far to the farthest; the two codes at either end are therefore
-read as no return.
+read as no return. A video of more bits without a stated range holds steps of a unit, as images and arrays do.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from dhtorch.data.codecs.tiff import decode_tiff
+from dhtorch.data.codecs.tiff import decode_tiff, decode_tiff_header
+from dhtorch.data.codecs.video import read_video_header
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.lerobot_meta import LeRobotFeature, LeRobotMeta, select_colour_keys
+from dhtorch.data.readers.lerobot_meta import LeRobotEpisode, LeRobotFeature, LeRobotMeta, select_colour_keys
+from dhtorch.data.readers.lerobot_rows import read_encoded_image
+from dhtorch.data.units import UNIT_METRES, DepthUnit
 
-_N_DEPTH_CODES = 4096
+_CODE_BITS = 12  # of LeRobot's depth videos
+_N_DEPTH_CODES = 2**_CODE_BITS
 _DEFAULT_DEPTH_RANGE = {"depth_min": 0.01, "depth_max": 10.0, "shift": 3.5}  # m
 
 
-def find_depth_feature(meta: LeRobotMeta, camera: str, asked: str | None) -> LeRobotFeature | None:
-    """The depth feature of a camera: the one ``asked`` for, named like the camera, or the only one; else None."""
+class _PixelType(NamedTuple):
+    """Type of the stored pixels of a feature."""
+
+    name: str  # such as gray12le, uint16, float32
+    bits: int  # per channel
+    channels: int
+
+
+def flag_unmarked_depth(
+    meta: LeRobotMeta, episode: LeRobotEpisode, requested: str | None
+) -> tuple[LeRobotMeta, tuple[str, ...]]:
+    """Flag features that are depth by their pixels: one channel of more than 8 bits, without ``is_depth_map``.
+
+    Returns:
+        The metadata with these features flagged, and a remark on each that is not ``requested``.
+
+    Raises:
+        FormatError: a damaged video or image of the episode.
+    """
+    features, remarks = dict(meta.features), list[str]()
+    for key, feature in meta.features.items():
+        if feature.dtype not in ("video", "image") or feature.is_depth or feature.channels != 1:
+            continue
+        if key in episode.videos and not episode.videos[key][0].is_file():
+            continue
+        pixels = _read_pixel_type(meta, feature, episode, 0)
+        if pixels.channels != 1 or pixels.bits <= 8:
+            continue
+        features[key] = replace(feature, info={**feature.info, "is_depth_map": True})
+        if key != requested:
+            found = f"{key} looks like depth: one channel, {pixels.name}, without is_depth_map"
+            remarks.append(f"{found}; data.depth={key} sets it")
+    return replace(meta, features=features), tuple(remarks)
+
+
+def find_depth_unit(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobotEpisode, row: int) -> DepthUnit | None:
+    """Unit of the stored depth; None = a video of LeRobot's codes, whose range defines metres.
+
+    ``depth_unit`` of the feature's info, else m for floats and mm for integers, as in LeRobot. ``row`` of the table
+    holds an image of the episode.
+
+    Raises:
+        FormatError: an unknown unit, or a damaged image or video.
+    """
+    if feature.dtype == "video":
+        if _has_stated_range(feature) or _read_pixel_type(meta, feature, episode, row).bits <= _CODE_BITS:
+            return None
+        return DepthUnit(UNIT_METRES["mm"])
+    stated = feature.info.get("depth_unit")
+    if stated is None:
+        is_float = _read_pixel_type(meta, feature, episode, row).name.startswith("float")
+        return DepthUnit(UNIT_METRES["m" if is_float else "mm"])
+    if not isinstance(stated, str) or stated not in UNIT_METRES:
+        expected = f"one of {', '.join(UNIT_METRES)}"
+        raise FormatError(meta.root / "meta" / "info.json", f"{feature.key} depth_unit", stated, expected)
+    return DepthUnit(UNIT_METRES[stated], f"meta/info.json: {feature.key} depth_unit")
+
+
+def _has_stated_range(feature: LeRobotFeature) -> bool:
+    return any(f"{prefix}{name}" in feature.info for name in _DEFAULT_DEPTH_RANGE for prefix in ("", "video."))
+
+
+def _read_pixel_type(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobotEpisode, row: int) -> _PixelType:
+    """Type of a feature's pixels: from its info or the header of its video or of the image in ``row``."""
+    if feature.dtype == "video":
+        stated = feature.info.get("video.pix_fmt", feature.info.get("pix_fmt"))
+        name = stated if isinstance(stated, str) else read_video_header(episode.videos[feature.key][0]).pixels
+        bits = re.search(r"(\d+)[lb]e$", name)
+        return _PixelType(name, int(bits[1]) if bits else 8, 1 if name.startswith("gray") else feature.channels)
+    if feature.dtype != "image":
+        return _PixelType(feature.dtype, 8 * np.dtype(feature.dtype).itemsize, 1)
+    data, file = read_encoded_image(episode.data, meta.root, feature.key, row)
+    if data[:2] in (b"II", b"MM"):
+        tiff = decode_tiff_header(data, file)
+        return _PixelType(str(tiff.dtype), 8 * tiff.dtype.itemsize, tiff.samples)
+    header = files.decode_image_header(data, file)
+    return _PixelType(f"uint{header.bits}", header.bits, header.channels)
+
+
+def find_depth_feature(meta: LeRobotMeta, camera: str, requested: str | None) -> LeRobotFeature | None:
+    """The depth feature of a camera: the one ``requested`` for, named like the camera, or the only one; else None."""
     depths = {key: f for key, f in meta.features.items() if f.is_depth and len(f.shape) >= 2}
-    if asked is not None:
-        if asked not in meta.features or len(meta.features[asked].shape) < 2:
-            raise FormatError(meta.root, "option depth", asked, f"one of {', '.join(depths) or 'none'}")
-        return meta.features[asked]
+    if requested is not None:
+        if requested not in meta.features or len(meta.features[requested].shape) < 2:
+            raise FormatError(meta.root, "option depth", requested, f"one of {', '.join(depths) or 'none'}")
+        return meta.features[requested]
     matching = [f for key, f in depths.items() if _distinctive_words(key) == _distinctive_words(camera)]
     if len(matching) == 1:
         return matching[0]

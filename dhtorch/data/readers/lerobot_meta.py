@@ -41,6 +41,12 @@ class LeRobotFeature:
         return h_w[0], h_w[1]
 
     @property
+    def channels(self) -> int:
+        """Number of channels of an image feature, first or last."""
+        h, w = self.hw
+        return math.prod(self.shape) // max(h * w, 1)
+
+    @property
     def is_depth(self) -> bool:
         """Whether the feature is depth: by its flag (current or older name), a plain array by its key."""
         marked = self.info.get("is_depth_map") is True or self.info.get("video.is_depth_map") is True
@@ -196,7 +202,7 @@ def _read_columns_v2(meta: LeRobotMeta) -> dict[str, np.ndarray]:
     return {"episode_index": numbers[:, 0], "length": numbers[:, 1]}
 
 
-def select_colour_keys(meta: LeRobotMeta, asked: str | Sequence[str] | None = None) -> list[str]:
+def select_colour_keys(meta: LeRobotMeta, requested: str | Sequence[str] | None = None) -> list[str]:
     """The requested keys of colour features, checked; None = all.
 
     Raises:
@@ -206,7 +212,7 @@ def select_colour_keys(meta: LeRobotMeta, asked: str | Sequence[str] | None = No
     colour = [
         key for key in pictures if "codes" not in meta.features[key].info
     ]  # without maps of codes, which we write
-    keys = colour if asked is None else [asked] if isinstance(asked, str) else list(asked)
+    keys = colour if requested is None else [requested] if isinstance(requested, str) else list(requested)
     unknown = [key for key in keys if key not in colour]
     if unknown or not keys:
         raise FormatError(

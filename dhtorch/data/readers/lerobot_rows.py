@@ -1,4 +1,4 @@
-"""Rows of LeRobot tables: the rows of an episode with their frame numbers and times."""
+"""Rows of LeRobot tables: the rows of an episode with their frame numbers and times, and encoded images in them."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.data.codecs.parquet import read_columns
+from dhtorch.data.codecs.parquet import read_cell, read_columns
+from dhtorch.data.io import decode as files
 from dhtorch.data.io import safe_open as doors
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.lerobot_meta import LeRobotEpisode, LeRobotMeta
+from dhtorch.data.readers.lerobot_meta import LeRobotEpisode, LeRobotMeta, resolve_inside
 from dhtorch.runtime.console import format_count
 
 #: Largest difference in s between a float32 time stamp and the exact grid (frame number / fps) it was rounded from.
@@ -75,6 +76,24 @@ def select_episode_rows(
         report.append(f"episode {episode.number}: times begin at {stamp[0]:.4g} s: images taken by the order of rows")
         stamp = grid
     return rows, number.astype(np.int64), np.where(np.abs(grid - stamp) < _MAX_GRID_ERROR_S, grid, stamp), report
+
+
+def read_encoded_image(table: Path, root: Path, key: str, row: int) -> tuple[bytes, Path]:
+    """Encoded image of a row and its file: bytes in the table, or the file that the table names.
+
+    Raises:
+        FormatError: no image in that cell, or a missing file.
+    """
+    cell = read_cell(table, key, row)
+    if not isinstance(cell, dict):
+        raise FormatError(table, key, type(cell).__name__, "an image: bytes and path")
+    data, path = cell.get("bytes"), cell.get("path")
+    if isinstance(data, bytes) and data:
+        return data, table
+    if not isinstance(path, str):
+        raise FormatError(table, key, "neither bytes nor path", "an image")
+    file = resolve_inside(root, path, table, key)
+    return files.read_bytes(file), file
 
 
 def _is_increasing(values: np.ndarray, valid: np.ndarray) -> np.ndarray:

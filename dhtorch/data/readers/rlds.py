@@ -5,7 +5,8 @@ values of all steps in order: ``steps/observation/image_0`` one encoded image a 
 numbers a step. Opening a set reads only the lengths of its records; reading a frame reads only that frame's images.
 
 The format has no place for intrinsics, poses, time stamps and the unit of depth: they come from options, or from
-features where a set has them. Stationary cameras give no depth (NO_BASELINE).
+features where a set has them; without them 16-bit depth images are in mm and arrays in m, an assumption. Stationary
+cameras give no depth (NO_BASELINE).
 """
 
 from __future__ import annotations
@@ -26,12 +27,14 @@ from dhtorch.data.codecs import tfrecord
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings, consecutive_frame_numbers
+from dhtorch.data.units import DepthUnit
 from dhtorch.records import Camera, Frame, Pose
 
 _MAX_EPISODE_STEPS = 100_000  # steps of an episode
 
 _SHARD_PATTERN = re.compile(r"^(?P<set>.+)-(?P<split>[^-]+)\.tfrecord-(?P<shard>\d{5})-of-(?P<of>\d{5})$")
-_UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
+#: Convention of the unit of depth by the kind of its feature: 16-bit images in mm, arrays of floats in m.
+_ASSUMED_DEPTH_UNITS = {"image": DepthUnit(1e-3), "tensor": DepthUnit(1.0)}
 _STEPS_FEATURE = "steps"
 
 
@@ -56,7 +59,6 @@ def read(
     distortion: Sequence[float] | None = None,
     intrinsics: intrinsics_options.IntrinsicsOption | None = None,
     pose: str | None = None,
-    depth_unit: str | None = None,
     rate_hz: float | None = None,
 ) -> Recordings:
     """Open a folder with ``features.json`` and the TFRecord files beside it.
@@ -76,7 +78,6 @@ def read(
             None = ``<camera>_intrinsics`` where there is one.
         pose: feature with the camera-to-world pose of every step: 16 numbers (4×4 by rows) or 7 (x y z qx qy qz qw).
             None = ``<camera>_T_world_from_cam`` where there is one, else no poses.
-        depth_unit: ``"m"`` or ``"mm"``. None = mm for integers and m for floats.
         rate_hz: steps per second; without it there are no times.
 
     Returns:
@@ -87,8 +88,6 @@ def read(
             damaged record, or values that are no camera or pose.
     """
     root = Path(root)
-    if depth_unit not in (None, *_UNITS_PER_METRE):
-        raise FormatError(root, "option depth_unit", depth_unit, "m or mm")
     rate = None if rate_hz is None else files.to_positive(rate_hz, root, "option rate_hz")
     features = _read_step_features(root)
     keys = _select_colour(root, features, camera)
@@ -107,7 +106,6 @@ def read(
             distortion=distortion,
             intrinsics=_find_companion(root, features, key, stated.feature, "intrinsics"),
             pose=_find_companion(root, features, key, pose, "pose", "T_world_from_cam"),
-            unit=depth_unit,
             rate_hz=rate,
         )
         rigs.append(rig)
@@ -293,7 +291,6 @@ class LoadStep:
     depth: StepFeature | None
     cameras: Camera  # (n), or (1) for all
     depth_camera: Camera | None
-    unit: str | None
     place: RecordLocation
     features: dict[str, StepFeature]  # of a step
 
@@ -307,10 +304,9 @@ class LoadStep:
     def _depth(self, i: int, feature: StepFeature) -> Tensor:
         data = tfrecord.read_span(self.file, self.depths[i])
         if feature.kind == "image":
-            units = _UNITS_PER_METRE[self.unit or "mm"]
-            return torch.from_numpy(files.decode_depth_png(data, self.file, units))
-        values = np.frombuffer(data, "<f4").astype(np.float64)
-        depth = values.reshape(feature.shape[:2]) / _UNITS_PER_METRE[self.unit or "m"]
+            units_per_metre = 1 / _ASSUMED_DEPTH_UNITS["image"].metres
+            return torch.from_numpy(files.decode_depth_png(data, self.file, units_per_metre))
+        depth = np.frombuffer(data, "<f4").astype(np.float64).reshape(feature.shape[:2])
         keep = np.isfinite(depth) & (depth > 0) & (depth < 1e6)
         return torch.from_numpy(np.where(keep, depth, 0).astype(np.float32))
 
@@ -329,7 +325,6 @@ class _CameraSpec:
     distortion: Sequence[float] | None
     intrinsics: str | None
     pose: str | None
-    unit: str | None
     rate_hz: float | None
 
     def recording(self, name: str, episode: RecordLocation, example: dict[str, tfrecord.ExampleFeature]) -> Recording:
@@ -349,7 +344,6 @@ class _CameraSpec:
             depth=None if self.depth is None else self.features[self.depth],
             cameras=cameras,
             depth_camera=depth_camera,
-            unit=self.unit,
             place=episode,
             features=self.features,
         )
@@ -365,6 +359,7 @@ class _CameraSpec:
             report=self.stated.report + (() if self.depth else (f"{self.image}: no depth feature: depth is empty",)),
             episode=episode.place,
             camera_name=self.image,
+            depth_unit=_ASSUMED_DEPTH_UNITS.get(self.features[self.depth].kind) if self.depth else None,
         )
 
     def _pictures(
