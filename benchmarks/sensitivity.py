@@ -10,6 +10,8 @@ beyond the scene's cutoff are hidden, which are then the truth; ``align`` aligns
 as a depth network distorts it; ``validate`` validates the same map scaled by 1.1, coverage being the fraction of pixels
 with a state and the error the fraction of these called consistent.
 
+Rows that the JSON file already has are kept, so that an interrupted run continues.
+
 A constant whose change moves neither number by more than ``--epsilon`` is marked: a candidate for removal.
 """
 
@@ -149,9 +151,9 @@ def align(case: Case, options: AlignmentOptions) -> tuple[float, float]:
 
 def validate(case: Case, options: ValidationOptions) -> tuple[float, float]:
     """Fraction of the pixels with a state, and of these called consistent, of a map that is a tenth too long."""
-    found = dhtorch.validate_depth(1.1 * case.whole.depth, case.near, case.others, hint=case.hint, options=options)
-    has_state = found.state != State.CANNOT_KNOW
-    consistent = found.state == State.CONSISTENT
+    validation = dhtorch.validate_depth(1.1 * case.whole.depth, case.near, case.others, hint=case.hint, options=options)
+    has_state = validation.state != State.CANNOT_KNOW
+    consistent = validation.state == State.CONSISTENT
     return float(has_state.double().mean()), float(consistent.sum() / has_state.sum().clamp_min(1))
 
 
@@ -205,10 +207,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    of, rows, as_is = list(cases()), [], {}
+    of, as_is = list(cases()), {}
+    rows = json.loads(options.json.read_text()) if options.json and options.json.is_file() else []
+    measured = {row["name"] for row in rows}
     print(f"{'constant':44} {'value':>9}  {'coverage':>20}  {'median error':>24}")
     for constant in constants():
-        if options.only not in constant.name:
+        if options.only not in constant.name or constant.name in measured:
             continue
         kind = constant.name.split(".")[0]
         kind = kind if kind in {r.__name__ for r in RECORDS.values()} else "sparse"
@@ -218,7 +222,7 @@ def main() -> None:
         for factor, key in ((0.5, "half"), (2.0, "twice")):
             try:
                 row[key] = medians(constant, factor * constant.value, of)
-            except ValueError as error:  # out of the option's range
+            except (ValueError, RuntimeError) as error:  # out of the option's range
                 row[key] = {"error": str(error)}
         changes = [abs(row[k][n] - row["as_is"][n]) for k in ("half", "twice") if "coverage" in row[k] for n in NUMBERS]
         row["candidate_for_removal"] = bool(changes) and max(changes) <= options.epsilon

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from dhtorch.data import intrinsics as intrinsics_options
+from dhtorch.data.corrections import Corrections
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.io.safe_open import restrict_links
 from dhtorch.data.readers import (
@@ -119,8 +120,10 @@ def open_all(
         root: a folder (or file) of one of the formats in ``FORMATS``.
         format: a name of ``FORMATS``, or ``"auto"`` to recognise it by its content.
         follow_links: whether symbolic links inside the capture may point outside it.
-        options: keyword options of the reader, see ``dhtorch.data.<format>.read``. For formats without a stored K
-            they include ``intrinsics``, ``K`` and ``fov``, see :mod:`dhtorch.data.intrinsics`.
+        options: ``depth_unit``, ``pose_convention``, ``depth_lag`` and ``depth_turn`` of
+            :class:`dhtorch.data.corrections.Corrections`, and keyword options of the reader, see
+            ``dhtorch.data.<format>.read``. For formats without a stored K they include ``intrinsics``, ``K`` and
+            ``fov``, see :mod:`dhtorch.data.intrinsics`.
 
     Returns:
         One recording for each camera (and episode), at least one; formats with up to tens of thousands of recordings
@@ -138,6 +141,8 @@ def open_all(
         raise FormatError(root, "format", format, f"auto, {', '.join(FORMATS)}")
     elif not root.exists():
         raise FormatError(root, "path", "no such file or folder", f"a {format} capture")
+    corrections = Corrections.from_options(options)
+    options = {name: value for name, value in options.items() if name not in Corrections.names()}
     read = FORMATS[format].read
     reader_options = list(inspect.signature(read).parameters)[1:]
     options = {name: value for name, value in options.items() if (name, value) not in _UNSET_INTRINSICS}
@@ -150,8 +155,8 @@ def open_all(
     with restrict_links(bounds):
         recordings = read(root, **options)
     if isinstance(recordings, Recordings):
-        return replace(recordings, make=_RestrictedOpener(recordings.make, bounds))
-    return [replace(recording, bounds=bounds) for recording in recordings]
+        return replace(recordings, make=_RestrictedOpener(recordings.make, bounds, corrections))
+    return [corrections.apply(replace(recording, bounds=bounds)) for recording in recordings]
 
 
 @dataclass(frozen=True)
@@ -160,10 +165,11 @@ class _RestrictedOpener:
 
     make: Callable[[int], Recording]
     bounds: Path | None
+    corrections: Corrections
 
     def __call__(self, i: int) -> Recording:
         with restrict_links(self.bounds):
-            return replace(self.make(i), bounds=self.bounds)
+            return self.corrections.apply(replace(self.make(i), bounds=self.bounds))
 
 
 def open_capture(

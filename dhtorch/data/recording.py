@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.data.io.safe_open import restrict_links
+from dhtorch.data.units import DepthUnit
 from dhtorch.records import Frame, Pose
 from dhtorch.runtime.console import format_count
 
@@ -29,8 +30,8 @@ class Recording(Sequence[Frame]):
     A reader must set ``name``, ``format``, ``load``, which decodes image, depth and cameras of position ``i``, and
     ``number``, the place of every frame in the capture: skipped frames leave a gap in the numbers, so that pairs do not
     shift. It may set ``root``, ``times``, ``poses`` with their ``pose_axes``, ``rate_hz``, ``sparse``, ``episode``,
-    ``camera_name`` and ``report``, where the capture contains them; the recording adds time, pose and ``sparse`` to its
-    frames. Notes of a benchmark are not part of a recording: see :class:`dhtorch.data.scene.Scene`.
+    ``camera_name``, ``depth_unit`` and ``report``, where the capture contains them; the recording adds time, pose and
+    ``sparse`` to its frames. Notes of a benchmark are not part of a recording: see :class:`dhtorch.data.scene.Scene`.
 
     Raises:
         ValueError: no frame, or fields of unequal length.
@@ -49,6 +50,7 @@ class Recording(Sequence[Frame]):
     episode: int | None = None  # its number in the data set, where episodes have one
     report: tuple[str, ...] = ()  # what was left out or guessed, and why
     camera_name: str | None = None  # the data set's name of the camera, where an episode has several
+    depth_unit: DepthUnit | None = None  # of the stored depth; None = the format defines metres
     bounds: Path | None = None  # symbolic links must not point outside it; None = no restriction
 
     def __post_init__(self) -> None:
@@ -130,7 +132,7 @@ class MeasuredRecording(TruthRecording):
 class LazySequence(Sequence[_Item]):
     """A sequence whose items are created on access; subclasses define ``__len__`` and :meth:`made`."""
 
-    def made(self, place: int) -> _Item:
+    def load_item(self, place: int) -> _Item:
         """Create the item at ``place``, counted from 0."""
         raise NotImplementedError
 
@@ -141,8 +143,8 @@ class LazySequence(Sequence[_Item]):
     def __getitem__(self, index: int | slice) -> _Item | list[_Item]:
         places = range(len(self))
         if isinstance(index, slice):
-            return [self.made(place) for place in places[index]]
-        return self.made(places[index])
+            return [self.load_item(place) for place in places[index]]
+        return self.load_item(places[index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +162,7 @@ class Recordings(LazySequence[Recording]):
     def __len__(self) -> int:
         return len(self.names)
 
-    def made(self, place: int) -> Recording:
+    def load_item(self, place: int) -> Recording:
         """Open the recording at ``place``."""
         return self.make(place)
 

@@ -104,7 +104,13 @@ def run_command(case: Path, arguments: str, out: Path) -> tuple[str, int]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(package), os.environ.get("PYTHONPATH", "")))}
     try:
         done = subprocess.run(
-            [*start, *words], cwd=case, env=environment, capture_output=True, text=True, timeout=_MAX_SECONDS
+            [*start, *words],
+            check=False,
+            cwd=case,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=_MAX_SECONDS,
         )
     except subprocess.TimeoutExpired:
         return f"no end after {_MAX_SECONDS} s", -1

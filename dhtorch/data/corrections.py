@@ -1,0 +1,134 @@
+"""Corrections of what a reader assumes, as options of every format: unit, lag and turn of depth, pose convention.
+
+Files may mean something else than their layout suggests, which a capture check detects; each correction is the option
+that its warning names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from dhtorch.data.pose_convention import parse_pose_convention
+from dhtorch.data.recording import Recording
+from dhtorch.data.units import DepthUnit, parse_unit
+from dhtorch.records import Frame
+
+#: How stored depth (…, h, w) must be turned to lie over its picture, counter-clockwise in degrees, or flipped.
+DEPTH_TURNS: Final[dict[str, Callable[[Tensor], Tensor]]] = {
+    "90": lambda depth: torch.rot90(depth, 1, (-2, -1)),
+    "180": lambda depth: torch.rot90(depth, 2, (-2, -1)),
+    "270": lambda depth: torch.rot90(depth, 3, (-2, -1)),
+    "left_right": lambda depth: depth.flip(-1),
+    "upside_down": lambda depth: depth.flip(-2),
+}
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Options of every format; None = as the reader reads it."""
+
+    depth_unit: str | float | None = None  # m, cm, mm, inch, 1/5000, or metres of one step
+    pose_convention: str | None = None  # see parse_pose_convention
+    depth_lag: int | None = None  # frames by which depth comes late; negative: early
+    depth_turn: str | int | None = None  # a key of DEPTH_TURNS: how the stored depth is to be turned, counter-clockwise
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """Names of the options."""
+        return [each.name for each in fields(cls)]
+
+    @classmethod
+    def from_options(cls, options: Mapping[str, object]) -> Corrections:
+        """The corrections among the options of a capture."""
+        return cls(**{name: options[name] for name in cls.names() if name in options})  # type: ignore[arg-type]
+
+    def __post_init__(self) -> None:
+        if self.depth_unit is not None:
+            parse_unit(self.depth_unit)
+        if self.pose_convention is not None:
+            parse_pose_convention(self.pose_convention)
+        if self.depth_turn is not None and str(self.depth_turn) not in DEPTH_TURNS:
+            raise ValueError(f"depth_turn: found {self.depth_turn!r}, expected {', '.join(DEPTH_TURNS)}")
+        lag = self.depth_lag
+        if lag is not None and (not isinstance(lag, int) or isinstance(lag, bool)):
+            raise ValueError(f"depth_lag: found {lag!r}, expected a whole number of frames")
+
+    def apply(self, recording: Recording) -> Recording:
+        """The recording with these corrections.
+
+        Raises:
+            ValueError: a lag that leaves no frame.
+        """
+        if self.depth_turn is not None:
+            recording = replace(recording, load=_TurnedDepth(recording.load, str(self.depth_turn)))
+        if self.depth_unit is not None:
+            metres = parse_unit(self.depth_unit)
+            read_as = 1.0 if recording.depth_unit is None else recording.depth_unit.metres
+            load = _ScaledDepth(recording.load, metres / read_as) if metres != read_as else recording.load
+            recording = replace(recording, load=load, depth_unit=DepthUnit(metres, "option depth_unit"))
+        if self.depth_lag:
+            recording = _shift_depth(recording, self.depth_lag)
+        if self.pose_convention is not None and recording.poses is not None:
+            convention = parse_pose_convention(self.pose_convention)
+            recording = replace(recording, poses=convention.apply(recording.poses))
+        return recording
+
+
+@dataclass(frozen=True)
+class _ScaledDepth:
+    """Position → frame with its depth times a factor."""
+
+    load: Callable[[int], Frame]
+    factor: float
+
+    def __call__(self, i: int) -> Frame:
+        frame = self.load(i)
+        return frame.replace(depth=frame.depth * self.factor)
+
+
+@dataclass(frozen=True)
+class _TurnedDepth:
+    """Position → frame with its depth map (and confidence) turned; a turn by 90° keeps the stored size if it is square,
+    else the map's height and width are exchanged."""
+
+    load: Callable[[int], Frame]
+    turn: str
+
+    def __call__(self, i: int) -> Frame:
+        frame, turn = self.load(i), DEPTH_TURNS[self.turn]
+        conf = None if frame.conf is None else turn(frame.conf)
+        return frame.replace(depth=turn(frame.depth), conf=conf)
+
+
+@dataclass(frozen=True)
+class _LaggedDepth:
+    """Position → frame with the depth of another position: that of ``lag`` frames later."""
+
+    load: Callable[[int], Frame]
+    lag: int
+    first: int
+
+    def __call__(self, i: int) -> Frame:
+        frame, later = self.load(i + self.first), self.load(i + self.first + self.lag)
+        return frame.replace(depth=later.depth, conf=later.conf, depth_camera=later.depth_camera)
+
+
+def _shift_depth(recording: Recording, lag: int) -> Recording:
+    """The recording with depth moved by a lag; frames without depth of their own are left out."""
+    n, first = len(recording) - abs(lag), max(-lag, 0)
+    if n < 1:
+        raise ValueError(f"depth_lag: found {lag} for {len(recording)} frames, expected less")
+    kept = slice(first, first + n)
+    return replace(
+        recording,
+        load=_LaggedDepth(recording.load, lag, first),
+        number=recording.number[kept],
+        times=None if recording.times is None else recording.times[kept],
+        poses=None if recording.poses is None else recording.poses[kept],
+        report=(*recording.report, f"depth is that of {abs(lag)} frames {'later' if lag > 0 else 'earlier'}"),
+    )
