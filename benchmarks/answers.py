@@ -25,17 +25,17 @@ PAIRS = 5
 def main() -> None:
     """Write scene, method and pair → depth and gate."""
     torch.set_num_threads(1)
-    found = {}
+    dumped = {}
     for name, near, gap in SCENES:
         recording = data.open(Path(os.environ["DHTORCH_DATA"]) / name)
         pairs = by_gap(recording, gap)
         for i, j in pairs[:: max(len(pairs) // PAIRS, 1)][:PAIRS]:
             reference, other = (holdout.range_split(recording[k], near) for k in (i, j))
-            for method, ask in (("paper", PAPER), ("map", MAP)):
+            for method, run in (("paper", PAPER), ("map", MAP)):
                 with torch.no_grad():
-                    estimate = ask(reference, other)
-                found[name, method, i] = {"depth": estimate.depth[0], "gate": estimate.gate[0]}
-    torch.save(found, sys.argv[1])
+                    estimate = run(reference, other)
+                dumped[name, method, i] = {"depth": estimate.depth[0], "gate": estimate.gate[0]}
+    torch.save(dumped, sys.argv[1])
 
 
 if __name__ == "__main__":

@@ -102,8 +102,8 @@ def gradient(fn: Callable[..., Any], args: tuple[Any, ...]) -> bool:
     """Whether there is a gradient, and all of it finite."""
     args = pytree.tree_map(lambda x: x.clone().requires_grad_(), args)
     with contextlib.suppress(Exception):
-        found = fn(*args)
-        torch.where(found.isfinite(), found, 0.0).sum().backward()
+        result = fn(*args)
+        torch.where(result.isfinite(), result, 0.0).sum().backward()
         grads = [x.grad for x in _tensors(args) if x.grad is not None]
         return bool(grads) and all(bool(g.isfinite().all()) for g in grads)
     return False
@@ -116,19 +116,19 @@ def _tensors(args: Any) -> Iterator[Tensor]:
 def answers(before: Path) -> list[dict[str, Any]]:
     """What the methods say of real pairs, here and in the checkout ``before``: a row for each scene and method."""
     with tempfile.TemporaryDirectory() as folder:
-        found = []
+        dumps = []
         for side, root in (("before", before), ("now", HERE.parent)):
             path = Path(folder) / f"{side}.pt"
             environment = {**os.environ, "PYTHONPATH": str(root)}
             subprocess.run(
                 [sys.executable, str(HERE / "answers.py"), str(path)], env=environment, cwd=folder, check=True
             )
-            found.append(torch.load(path))
+            dumps.append(torch.load(path))
     commit = subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=before, text=True).strip()
     rows = []
-    for key in dict.fromkeys((scene, method) for scene, method, _ in found[0]):
-        pairs = [k for k in found[0] if k[:2] == key]
-        a, b = ({name: torch.cat([side[k][name] for k in pairs]) for name in ("depth", "gate")} for side in found)
+    for key in dict.fromkeys((scene, method) for scene, method, _ in dumps[0]):
+        pairs = [k for k in dumps[0] if k[:2] == key]
+        a, b = ({name: torch.cat([side[k][name] for k in pairs]) for name in ("depth", "gate")} for side in dumps)
         both = (a["gate"] == 0) & (b["gate"] == 0)
         moved = ((a["depth"] - b["depth"]).abs() / a["depth"])[both]
         numbers = {"answered": int((a["gate"] == 0).sum()), "flipped": float((a["gate"] != b["gate"]).double().mean())}
@@ -147,8 +147,8 @@ def main() -> None:
     harness.set_threads(1)
     rows = run(options.repeats, options.only, options.clock)
     for r in rows:
-        held = " ".join(f"{k}={r[k]}" for k in r if k.endswith(("steady", "captures", "gradient", "hard")))
-        print(f"{r['name']:46} {r['kornia']:52} {r['ratio']:7.3f} {r['largest']:9.2e} {r['median_rel']:9.2e} {held}")
+        counts = " ".join(f"{k}={r[k]}" for k in r if k.endswith(("steady", "captures", "gradient", "hard")))
+        print(f"{r['name']:46} {r['kornia']:52} {r['ratio']:7.3f} {r['largest']:9.2e} {r['median_rel']:9.2e} {counts}")
     if options.before is not None:
         rows += answers(options.before)
         print(*rows[len(rows) - 8 :], sep="\n")

@@ -33,28 +33,28 @@ SHOWN, WIDTH = ("dgp_drive6cam", "holo_a", "tum_fr1_desk9"), 640
 ASIDE = ("Wrote ", "Next: ")
 
 
-def row(path: Path, folder: Path, asked: Sequence[str] = SHORT) -> dict[str, Any]:
-    """What the command makes of one capture, with the options ``asked``."""
+def row(path: Path, folder: Path, options: Sequence[str] = SHORT) -> dict[str, Any]:
+    """What the command makes of one capture, with the options ``options``."""
     out, began, first = folder / path.name, time.perf_counter(), None
-    words = [sys.executable, "-m", "dhtorch", str(path), f"out={out}", *asked]
+    words = [sys.executable, "-m", "dhtorch", str(path), f"out={out}", *options]
     with subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         while process.poll() is None:
             if first is None and (any(out.glob("overview.png")) or any(out.glob("*/overview.png"))):
                 first = time.perf_counter() - began
             time.sleep(0.2)
-        said, wrong = process.communicate()
-    lines = [line for line in said.splitlines() if not line.startswith(ASIDE)]
-    found: dict[str, Any] = {"name": path.name, "seconds": time.perf_counter() - began, "first_s": first}
-    found |= {"rc": process.returncode}
+        stdout, wrong = process.communicate()
+    lines = [line for line in stdout.splitlines() if not line.startswith(ASIDE)]
+    record: dict[str, Any] = {"name": path.name, "seconds": time.perf_counter() - began, "first_s": first}
+    record |= {"rc": process.returncode}
     if process.returncode == 0:
-        return found | {"said": " ".join(lines)}
-    return found | {"why": wrong.strip().removeprefix("dhtorch: ").replace(f"{path.parent}{os.sep}", "")}
+        return record | {"printed": " ".join(lines)}
+    return record | {"why": wrong.strip().removeprefix("dhtorch: ").replace(f"{path.parent}{os.sep}", "")}
 
 
 def picture(folder: Path, file: Path) -> None:
     """Keep a smaller copy of the first overview below ``folder``, if there is one."""
-    for made in sorted(folder.rglob("overview.png"))[:1]:
-        whole = cv2.imread(str(made))
+    for picture in sorted(folder.rglob("overview.png"))[:1]:
+        whole = cv2.imread(str(picture))
         size = (WIDTH, round(whole.shape[0] * WIDTH / whole.shape[1]))
         file.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(file), cv2.resize(whole, size, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_JPEG_QUALITY, 85])

@@ -51,7 +51,7 @@ class Batch:
         parts = (self.reference[s], self.other[s], self.uv[s], self.truth[s])
         return Batch(self.numbers[s], self.kinds[s], *parts)
 
-    def ask(self, method: str) -> tuple[Estimate, Trace]:
+    def estimate(self, method: str) -> tuple[Estimate, Trace]:
         """What a method says, and how it came to it."""
         trace: Trace = {}
         seed = torch.tensor(self.numbers)
@@ -74,9 +74,9 @@ def batches(n: int, *, seed: int = 0, size: int = BATCH) -> Iterator[Batch]:
     yield from (join(rest) for rest in waiting.values() if rest)
 
 
-def join(made: list[tuple[int, str, Pair]]) -> Batch:
+def join(items: list[tuple[int, str, Pair]]) -> Batch:
     """A batch of numbers, kinds and pairs."""
-    numbers, kinds, pairs = zip(*made, strict=True)
+    numbers, kinds, pairs = zip(*items, strict=True)
     references, others = zip(*(pair.frames() for pair in pairs), strict=True)
     uv, truth = torch.stack([pair.uv for pair in pairs]), torch.stack([pair.truth for pair in pairs])
     return Batch([*numbers], [*kinds], pytree.collate(references), pytree.collate(others), uv, truth)
@@ -87,13 +87,13 @@ def broken(estimate: Estimate, trace: Trace) -> dict[str, Tensor]:
     e, fit, tracks, keep = estimate, trace["fit"], trace["tracks"], estimate.keep
     merged = merge(trace["samples"], e)
     positive = (e.depth > 0) & (e.sigma > 0) & e.depth.isfinite() & e.sigma.isfinite()
-    silent = e.depth.isnan() & e.sigma.isnan() & e.sigma_shared.isnan() & (e.score == 0)
+    is_empty = e.depth.isnan() & e.sigma.isnan() & e.sigma_shared.isnan() & (e.score == 0)
     shared = (e.sigma_shared >= 0) & (e.sigma_shared <= e.sigma * (1 + 1e-4))
     tracked = tracks.valid & ~(tracks.uv_1.isfinite().all(-1) & tracks.cov.isfinite().flatten(2).all(-1))
     points: dict[str, Tensor] = {
         "an answer is a depth with a sigma": keep & ~positive,
         "the shared part is no more than sigma": keep & ~shared,
-        "silence is NaN with score 0": ~keep & ~silent,
+        "silence is NaN with score 0": ~keep & ~is_empty,
         "score in [0, 1]": ~((e.score >= 0) & (e.score <= 1)),
         "a gate of the table": ~torch.isin(e.gate, torch.tensor([*names(Gate)], dtype=e.gate.dtype)),
         "parallax and residual are numbers": ~((e.parallax_deg >= 0) & (e.residual_px >= 0))
@@ -164,7 +164,7 @@ class Tally:
 def answer(batch: Batch, method: str, tallies: dict[str, Tally]) -> None:
     """Ask one method about a batch; where that raises, about its pairs one by one."""
     try:
-        estimate, trace = batch.ask(method)
+        estimate, trace = batch.estimate(method)
     except Exception as error:
         if len(batch.kinds) > 1:
             for b in range(len(batch.kinds)):
@@ -184,9 +184,9 @@ def answer(batch: Batch, method: str, tallies: dict[str, Tally]) -> None:
         off = (estimate.depth[b] - true[b])[keep].abs().double()
         tally.errors.append((off / true[b][keep]).float())
         tally.sigmas.append((off / estimate.sigma[b][keep]).float())
-        found = [promise for promise, where in faults.items() if where[b]]
-        tally.promises.update(found)
-        tally.examples += [batch.numbers[b]] if found else []
+        broken_promises = [promise for promise, where in faults.items() if where[b]]
+        tally.promises.update(broken_promises)
+        tally.examples += [batch.numbers[b]] if broken_promises else []
 
 
 def run(n: int, *, seed: int = 0, methods: tuple[str, ...] = ("map", "paper")) -> list[dict[str, Any]]:
@@ -223,7 +223,7 @@ def explain(number: int, seed: int) -> None:
     kind, pair = make(number, seed=seed)
     batch = join([(number, kind, pair)])
     for method in ("map", "paper"):
-        estimate, trace = batch.ask(method)
+        estimate, trace = batch.estimate(method)
         gates = Counter(names(Gate)[g] for g in estimate.gate.flatten().tolist())
         code = names(PoseCode)[int(trace["fit"].code)]
         print(kind, method, code, dict(gates), [k for k, v in broken(estimate, trace).items() if v.any()])
@@ -235,11 +235,11 @@ def show(rows: list[dict[str, Any]]) -> None:
     print(f"{'median':>7} {'p90':>7} {'>10 %':>6} {'<3σ':>6}")
     for r in rows:
         shares = [r["median_rel"], r["p90_rel"], r["wrong_share"], r["within_3sigma"]]
-        said = " ".join(f"{v:7.3g}" if v is not None else "      -" for v in shares)
+        shares_text = " ".join(f"{v:7.3g}" if v is not None else "      -" for v in shares)
         print(
             f"{r['name']:28} {r['method']:6} {r['n_pairs']:5d} {r['exceptions']:5d} {r['broken_promises']:5d} ", end=""
         )
-        print(f"{r['posed']:6.2f} {r['answered']:7.3f} {said}", r["faults"] or "")
+        print(f"{r['posed']:6.2f} {r['answered']:7.3f} {shares_text}", r["faults"] or "")
     for method in dict.fromkeys(r["method"] for r in rows):
         of = [r for r in rows if r["method"] == method]
         print(

@@ -36,14 +36,14 @@ def measure(hw: tuple[int, int], threads: int, options: Any) -> list[dict[str, A
     trace: dict[str, Any] = {}
     with torch.no_grad():
         joined = MAP(reference, other, trace=trace)
-    asked = dense.selected_views(joined, other, trace)
+    selected = dense.selected_views(joined, other, trace)
     bytes_0, bytes_1 = (_bytes(frame) for frame in (reference, other))
     size = dense.map_hw(hw, 640)
     cameras = [dense.downscale_grey(frame, 640)[1] for frame in (reference, other)]
 
     def ours() -> None:
         with torch.no_grad():
-            dense.sweep_depth(reference, asked, method=MAP, source_views=1)
+            dense.sweep_depth(reference, selected, method=MAP, source_views=1)
 
     def peer() -> None:
         small = [

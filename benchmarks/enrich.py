@@ -83,31 +83,31 @@ def run(words: Sequence[str]) -> tuple[subprocess.CompletedProcess[str], float]:
     return done, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def row(name: str, path: Path, told: Sequence[str], target: str, folder: Path) -> dict[str, Any]:
+def row(name: str, path: Path, arguments: Sequence[str], target: str, folder: Path) -> dict[str, Any]:
     """One source in one format."""
     out = folder / f"{name.replace('/', '_')}_{TARGETS[target]}"
-    options = dict(word.removeprefix("data.").split("=", 1) for word in told if word.startswith("data."))
+    options = dict(word.removeprefix("data.").split("=", 1) for word in arguments if word.startswith("data."))
     source = data.open_all(path, **{k: json.loads(v) if v[0] in "[0123456789" else v for k, v in options.items()})
-    found: dict[str, Any] = {"source": source[0].format, "data": name, "target": target}
-    found |= {"options": " ".join([*told, *SHORT]), "made": "written" if folder in path.parents else "real"}
-    words = ["enrich", str(path), str(out), *told, *SHORT, f"format={TARGETS[target]}"]
+    record: dict[str, Any] = {"source": source[0].format, "data": name, "target": target}
+    record |= {"options": " ".join([*arguments, *SHORT]), "origin": "written" if folder in path.parents else "real"}
+    words = ["enrich", str(path), str(out), *arguments, *SHORT, f"format={TARGETS[target]}"]
     before = digest(path)
     done, seconds = run(words)
     if done.returncode:
-        said = [line for line in done.stderr.splitlines() if not line.startswith("dhtorch: warning: ")]
-        if len(said) != 1 or out.exists():
-            raise ValueError(f"{name} as {target}: found {said} and {out.exists()=}, expected one line and no folder")
-        return found | {"refused": said[0].removeprefix("dhtorch: ").replace(f"{path.parent}{os.sep}", "")}
+        errors = [line for line in done.stderr.splitlines() if not line.startswith("dhtorch: warning: ")]
+        if len(errors) != 1 or out.exists():
+            raise ValueError(f"{name} as {target}: found {errors} and {out.exists()=}, expected one line and no folder")
+        return record | {"refused": errors[0].removeprefix("dhtorch: ").replace(f"{path.parent}{os.sep}", "")}
     again, idle = run(words)
     frames = sum(min(FRAMES, len(each)) for each in source)
     sizes = [p.stat().st_size for p in out.rglob("*") if p.is_file() and p.suffix != ".mp4" and p.parent.name != "meta"]
     rate = json.loads((out / "meta" / "info.json").read_text())["fps"] if target != "nerfstudio" else None
-    return found | {
+    return record | {
         "frames": frames,
         "s_per_frame": max(0.0, seconds - idle) / frames,
         "mb_per_minute": None if rate is None else sum(sizes) / 1e6 / frames * rate * 60 * cameras(source),
         "mb_per_frame": sum(sizes) / 1e6 / frames,
-        "said": [line.strip() for line in done.stdout.splitlines()[1:]],
+        "printed": [line.strip() for line in done.stdout.splitlines()[1:]],
         "done_again": again.returncode == 0 and "left untouched" in again.stdout,
         "source_untouched": digest(path) == before,
         "compared": (nerfstudio if target == "nerfstudio" else robot)(path, source, out),
@@ -237,16 +237,16 @@ def main() -> int:
     home, rows = Path(os.environ["DHTORCH_DATA"]), []
     with tempfile.TemporaryDirectory(prefix="dhtorch-enrich-") as place:
         folder = Path(place)
-        sources = {name: (home / name, told) for name, told in REAL.items() if (home / name).exists()}
+        sources = {name: (home / name, arguments) for name, arguments in REAL.items() if (home / name).exists()}
         sources |= {name: (path, ()) for name, path in written(folder / "written").items()}
         for target in TARGETS:
-            for name, (path, told) in sources.items():
+            for name, (path, arguments) in sources.items():
                 if options.only is not None and options.only not in name:
                     continue
-                found = row(name, path, told, target, folder)
-                found |= {"processor": result_files.describe_processor(), "cores": os.cpu_count()}
-                rows.append(found)
-                print(found, flush=True)
+                record = row(name, path, arguments, target, folder)
+                record |= {"processor": result_files.describe_processor(), "cores": os.cpu_count()}
+                rows.append(record)
+                print(record, flush=True)
                 options.json.write_text(storage.dump_strict_json(storage.to_strict_json(rows), indent=1) + "\n")
     return 0
 

@@ -62,9 +62,9 @@ def _dense(method: protocol.Method, chosen: list[Any]) -> dict[str, list[Points]
     return _by_scene({k: p for k, p in study.points.items() if k[1:] == wanted and p.keep.numel()})
 
 
-def _by_scene(found: dict[tuple[str, str, str], Points]) -> dict[str, list[Points]]:
+def _by_scene(points_by_key: dict[tuple[str, str, str], Points]) -> dict[str, list[Points]]:
     scenes: dict[str, list[Points]] = {}
-    for (scene, _, _), points in found.items():
+    for (scene, _, _), points in points_by_key.items():
         scenes.setdefault(scene, []).append(points)
     return scenes
 
@@ -81,9 +81,9 @@ def main() -> int:
     if options.dense:
         options.method, options.seeds = "auto", 1
     method, chosen = settings(options.method)
-    found = _dense(method, chosen) if options.dense else _sparse(method, chosen, options.seeds)
+    points_by_scene = _dense(method, chosen) if options.dense else _sparse(method, chosen, options.seeds)
     scenes = [scene.name for scene in chosen if scene.role is None]
-    pooled = {s: pytree.collate(found[s]) for s in scenes if found.get(s)}
+    pooled = {s: pytree.collate(points_by_scene[s]) for s in scenes if points_by_scene.get(s)}
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=HERE, capture_output=True, text=True, check=False
     ).stdout.strip()

@@ -127,12 +127,12 @@ def compiled(call: Callable[..., Samples], *args: Any) -> tuple[Callable[[], Sam
     return fast, time.perf_counter() - start
 
 
-def agreement(found: Samples, peer: list[dict[str, Any]]) -> str:
+def agreement(samples: Samples, peer: list[dict[str, Any]]) -> str:
     """In words, how far both sides say the same."""
     hole, flag = (torch.from_numpy(np.stack([p[k] for p in peer])) for k in ("hole", "flag"))
     xyz = torch.from_numpy(np.stack([p["xyz"] for p in peer]))
-    same = [(found.hole == hole).double().mean().item(), (found.flag == flag).double().mean().item()]
-    apart = (found.xyz - xyz).abs().nan_to_num().max().item()
+    same = [(samples.hole == hole).double().mean().item(), (samples.flag == flag).double().mean().item()]
+    apart = (samples.xyz - xyz).abs().nan_to_num().max().item()
     return f"same class {same[0]:.4f}, same flags {same[1]:.4f}, xyz within {apart:.1g} m"
 
 
@@ -191,14 +191,14 @@ def against_dinov2(options: Any) -> list[dict[str, Any]]:
 
 def growth(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the time at 1440x1920 beside the own time at 224x224."""
-    found = []
+    rows = []
     for mode in ("eager", "compiled", "torch.compile"):
         small, large = ([r for r in rows if r["name"] == f"frontend_{s}" and r["mode"] == mode] for s in SIZES)
         if small and large:
             a, b = large[0]["ours_ms"], small[0]["ours_ms"]
             more = {"ours_ms": a, "peer": "own_224", "peer_ms": b, "ratio": a / b, "peer_error": None, "bar": False}
-            found.append({**large[0], **more})
-    return found
+            rows.append({**large[0], **more})
+    return rows
 
 
 def main() -> None:

@@ -48,16 +48,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     names = [options.only] if options.only else list(SAMPLES)
     numbers = [options.case] if options.case is not None else range(MANY if options.full else SOME)
     end = time.monotonic() + (MINUTES * 60 if not options.full else float("inf"))
-    found = {}
+    outcomes = {}
     for k, name in enumerate(names):  # each its share of what is left, so that a slow one starves no other
         now = time.monotonic()
-        found[name] = attack(name, numbers, options.seed, now + (end - now) / (len(names) - k))
-    failures = [failure for each in found.values() for failure in each["failures"]]
-    total = sum(each["cases"] for each in found.values())
+        outcomes[name] = attack(name, numbers, options.seed, now + (end - now) / (len(names) - k))
+    failures = [failure for each in outcomes.values() for failure in each["failures"]]
+    total = sum(each["cases"] for each in outcomes.values())
     print(f"{total} cases, {len(failures)} failures")
     if options.json:
         law = {"name": "all", "cases": total, "failures": len(failures), "cpu_s": SECONDS, "bytes": MAX_MEMORY_BYTES}
-        storage.write_json(options.json, [law | {"seed": options.seed}, *({"name": k} | v for k, v in found.items())])
+        storage.write_json(
+            options.json, [law | {"seed": options.seed}, *({"name": k} | v for k, v in outcomes.items())]
+        )
     return int(bool(failures))
 
 

@@ -57,7 +57,7 @@ MISSING = {
 }
 
 #: Methods, pairs a capture, and frames by which poses are late.
-ASKED = ("paper", "map")
+MEASURED_METHODS = ("paper", "map")
 PAIRS = 8
 LATE = range(1, 6)
 
@@ -74,7 +74,7 @@ OF_WRONG = ("as it is", "refined")
 
 
 @dataclass(frozen=True)
-class Asked:
+class TrackedPairs:
     """Pairs of a scene, tracked, and the answers that were held back."""
 
     scene: Scene
@@ -83,14 +83,14 @@ class Asked:
     others: Frame
     truth: holdout.Truth
     method: Method  # its tracks and near returns' pose are known
-    found: PoseFit
+    fit: PoseFit
 
     def points(self, fit: PosePrior | None, at: Tensor) -> tuple[errors.Points, PoseFit]:
         """What is answered in the pairs ``at``, under a pose or the near returns' own."""
         trace: dict[str, Any] = {}
         method = self.method.replace(
             track=lambda *_, hint: self.method.track(*_, hint=hint)[at],
-            pose=lambda *_: self.found[at],
+            pose=lambda *_: self.fit[at],
         )
         estimate = method(self.reference[at], self.others[at], fit=fit, trace=trace)
         return errors.points_from_estimate(estimate, self.truth[at]), trace["fit"]
@@ -104,7 +104,7 @@ def pairs_of(recording: Recording, gap: int) -> list[tuple[int, int]]:
     return [(i, i + gap) for i in (first + k * (last - 1 - first) // max(count - 1, 1) for k in range(count))]
 
 
-def tracked(scene: Scene, method: Method) -> Asked:
+def tracked(scene: Scene, method: Method) -> TrackedPairs:
     """The pairs of a scene under the near returns' own pose."""
     assert scene.gap is not None
     pairs = pairs_of(scene.recording, scene.gap)
@@ -114,7 +114,7 @@ def tracked(scene: Scene, method: Method) -> Asked:
     method(reference, others, hint=scene.hint, trace=trace)
     truth = holdout.select_candidates(trace["samples"], holdout.sample_truth(whole, trace["samples"].uv), scene.near)
     known = method.replace(track=lambda *_, hint: trace["tracks"])
-    return Asked(scene, pairs, reference, others, truth, known, trace["fit"])
+    return TrackedPairs(scene, pairs, reference, others, truth, known, trace["fit"])
 
 
 def stated(world: Pose) -> Iterator[tuple[str, Pose, list[int] | None]]:
@@ -130,22 +130,22 @@ def stated(world: Pose) -> Iterator[tuple[str, Pose, list[int] | None]]:
     yield "backwards", world, [n - 1 - k for k in range(n)]
 
 
-def motions(asked: Asked, world: Pose, source: list[int] | None, **use: Any) -> tuple[PosePrior | None, Tensor]:
+def motions(case: TrackedPairs, world: Pose, source: list[int] | None, **use: Any) -> tuple[PosePrior | None, Tensor]:
     """The motions of those pairs whose poses are there and not right by chance, and which pairs these are."""
     place = list(range(len(world.t))) if source is None else source
-    there = [b for b, (i, j) in enumerate(asked.pairs) if min(place[i], place[j]) >= 0]
+    there = [b for b, (i, j) in enumerate(case.pairs) if min(place[i], place[j]) >= 0]
     if source is not None:
-        there = [b for b in there if (place[asked.pairs[b][0]], place[asked.pairs[b][1]]) != asked.pairs[b]]
+        there = [b for b in there if (place[case.pairs[b][0]], place[case.pairs[b][1]]) != case.pairs[b]]
     if not there:
         return None, torch.tensor(there)
-    ends = ([place[asked.pairs[b][side]] for b in there] for side in (0, 1))
+    ends = ([place[case.pairs[b][side]] for b in there] for side in (0, 1))
     T_0, T_1 = (world.map(lambda x, k=k: x[k]) for k in ends)
-    return pose_prior.relative_prior(T_0, T_1, **use).to(asked.reference.camera.f.dtype), torch.tensor(there)
+    return pose_prior.relative_prior(T_0, T_1, **use).to(case.reference.camera.f.dtype), torch.tensor(there)
 
 
-def off(asked: Asked, motion: PosePrior, world: Pose, at: Tensor) -> dict[str, float]:
+def off(case: TrackedPairs, motion: PosePrior, world: Pose, at: Tensor) -> dict[str, float]:
     """By how much a motion differs from that of the capture's own poses, medians over pairs."""
-    i, j = (torch.tensor(side)[at] for side in zip(*asked.pairs, strict=True))
+    i, j = (torch.tensor(side)[at] for side in zip(*case.pairs, strict=True))
     right = se3.relative(world.map(lambda x: x[i]), world.map(lambda x: x[j]))
     xi = se3.log(se3.compose(motion.T_1_from_0.to(torch.float64), se3.invert(right)))
     return {
@@ -168,34 +168,36 @@ def numbers(points: errors.Points, fit: PoseFit) -> dict[str, Any]:
         "n_refuted": int(refuted.sum()),
         "looks": dict(looks),
         "sigma_rel": None if not points.keep.any() else float((points.sigma / points.depth)[points.keep].median()),
-        **said(points),
+        **error_row(points),
     }
 
 
-def said(points: errors.Points) -> dict[str, Any]:
+def error_row(points: errors.Points) -> dict[str, Any]:
     """How far answers are from what was held back."""
-    found = errors.measure_errors(points)
-    return {k: found[k] for k in ("n_candidates", "coverage", "median_rel", "p90_rel", "within_sigma", "within_2sigma")}
+    measured = errors.measure_errors(points)
+    return {
+        k: measured[k] for k in ("n_candidates", "coverage", "median_rel", "p90_rel", "within_sigma", "within_2sigma")
+    }
 
 
 def rows(scene: Scene, name: str) -> Iterator[dict[str, Any]]:
     """All rows of one scene under one method."""
-    asked, world = tracked(scene, METHODS[name]), scene.recording.poses
+    case, world = tracked(scene, METHODS[name]), scene.recording.poses
     assert world is not None
     head = {"scene": scene.name, "room": scene.place, "role": scene.role, "cutoff_m": scene.near, "method": name}
-    everything = torch.arange(len(asked.pairs))
-    yield head | {"pose": "none", "use": "near returns"} | numbers(*asked.points(None, everything))
+    everything = torch.arange(len(case.pairs))
+    yield head | {"pose": "none", "use": "near returns"} | numbers(*case.points(None, everything))
     for pose, poses, source in stated(world):
         true = pose == "right" or pose.startswith("late")
         for use, options in USES.items():
             if not (true or use in OF_WRONG) or (use == "exact" and pose != "right"):
                 continue
-            motion, at = motions(asked, poses, source, **options)
+            motion, at = motions(case, poses, source, **options)
             if motion is None:
                 continue
-            away = off(asked, motion, world, at) if true else {}
-            row = numbers(*asked.points(motion, at))
-            yield head | {"pose": pose, "use": use} | away | row | {"near": said(asked.points(None, at)[0])}
+            away = off(case, motion, world, at) if true else {}
+            row = numbers(*case.points(motion, at))
+            yield head | {"pose": pose, "use": use} | away | row | {"near": error_row(case.points(None, at)[0])}
 
 
 def scenes() -> Iterator[Scene]:
@@ -212,13 +214,13 @@ def main() -> int:
     parser.add_argument("--only", help="one scene")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    found: list[Mapping[str, Any]] = [{"scene": name, "why": why} for name, why in MISSING.items()]
+    records: list[Mapping[str, Any]] = [{"scene": name, "why": why} for name, why in MISSING.items()]
     for scene in scenes():
         if options.only in (None, scene.name):
-            for method in ASKED:
-                found += rows(scene, method)
+            for method in MEASURED_METHODS:
+                records += rows(scene, method)
             print(scene.name, flush=True)
-    storage.write_json(options.json, storage.to_strict_json([*found]))
+    storage.write_json(options.json, storage.to_strict_json([*records]))
     return 0
 
 

@@ -45,23 +45,23 @@ def calls(batch: int, device: str, one: tuple[str, Frame, Frame, Frame, float]) 
     uv_0, uv_1, view, T, _ = triangulate.scene(N)
     seen = [x.repeat(batch, 1, 1).to(device) for x in (uv_0, uv_1)]
     view, T = pytree.collate([view] * batch).to(device), pytree.collate([T] * batch).to(device)
-    found: dict[str, Call] = {
+    calls: dict[str, Call] = {
         "frontend": partial(front_end, near, N),
         "pnp_n500": partial(pnp_ransac, samples, tracks, camera, camera, draws),
         "triangulate": partial(epipolar.triangulate_depth, seen[0], seen[1], view, view, T),
     }
-    return found | {f"pair_{name}": partial(method, near, other, n=N) for name, method in METHODS.items()}
+    return calls | {f"pair_{name}": partial(method, near, other, n=N) for name, method in METHODS.items()}
 
 
 def error(method: str, device: str, one: tuple[str, Frame, Frame, Frame, float]) -> float | None:
     """Median relative depth error of the pair on a device; answers come home to be judged."""
 
-    def asked(near: Frame, other: Frame, *, trace: dict[str, Any]) -> Any:
-        found = METHODS[method](near.to(device), other.to(device), n=N, trace=trace)
+    def run_pair(near: Frame, other: Frame, *, trace: dict[str, Any]) -> Any:
+        result = METHODS[method](near.to(device), other.to(device), n=N, trace=trace)
         trace["samples"] = trace["samples"].to("cpu")
-        return found.to("cpu")
+        return result.to("cpu")
 
-    return pairs.median_error(asked, one)
+    return pairs.median_error(run_pair, one)
 
 
 def measure(device: str, options: Any) -> list[dict[str, Any]]:

@@ -83,8 +83,8 @@ def mode(n: Tensor, area: Tensor, guess: Tensor, within_deg: float) -> tuple[Ten
         mass += ((some @ axes.T > kernel) * weight[:, None]).sum(0)
     axis = axes[int(mass.argmax())]
     for _ in range(10):
-        held = n @ axis > kernel
-        axis = torch.nn.functional.normalize((n[held] * area[held, None]).sum(0), dim=0)
+        inlier = n @ axis > kernel
+        axis = torch.nn.functional.normalize((n[inlier] * area[inlier, None]).sum(0), dim=0)
     return axis, float(area[n @ axis > kernel].sum() / area.sum())
 
 
@@ -130,15 +130,15 @@ def written(path: Path, folder: Path) -> dict[str, dict[str, Any]]:
     """Recording → the upward direction in its PLY and how far the GLB's turn takes it from +y; of ``dhtorch PATH``."""
     words = [sys.executable, "-m", "dhtorch", str(path), f"out={folder}", *QUICK]
     subprocess.run(words, cwd=folder.parent, check=False, capture_output=True)
-    found = {}
+    directions = {}
     for ply in sorted(folder.rglob("map.ply")):
         head = ply.read_bytes().partition(b"end_header\n")[0].decode("ascii")
-        said = re.search(r"^comment up (\S+) (\S+) (\S+)$", head, re.MULTILINE)
-        up = [float(x) for x in said.groups()] if said else None
+        match = re.search(r"^comment up (\S+) (\S+) (\S+)$", head, re.MULTILINE)
+        up = [float(x) for x in match.groups()] if match else None
         inside = ply.parent.relative_to(folder).as_posix()
         turned = None if up is None else angle(in_glb(ply.with_name("map.glb"), up), (0.0, 1.0, 0.0))
-        found["" if inside == "." else inside] = {"written": up, "glb_from_y_deg": turned}
-    return found
+        directions["" if inside == "." else inside] = {"written": up, "glb_from_y_deg": turned}
+    return directions
 
 
 def in_glb(path: Path, up: Sequence[float]) -> Tensor:
@@ -181,13 +181,13 @@ def main() -> int:
     parser.add_argument("--only", help="one capture")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    found: list[dict[str, Any]] = []
+    records: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as folder:
         for path in sorted(p for p in data.scenes_root(None).iterdir() if p.is_dir()):
             if options.only in (None, path.name):
-                found += rows(path, Path(folder))
-                print(found[-1], flush=True)
-    storage.write_json(options.json, storage.to_strict_json(found))
+                records += rows(path, Path(folder))
+                print(records[-1], flush=True)
+    storage.write_json(options.json, storage.to_strict_json(records))
     return 0
 
 

@@ -142,7 +142,7 @@ def set_threads(threads: int) -> None:
     cv2.setNumThreads(threads)
 
 
-class _Held(argparse.Action):
+class _LimitInstructions(argparse.Action):
     """Begin the script again in a process whose libraries use no wider vectors than those of AVX2."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
@@ -165,7 +165,9 @@ def arguments(description: str) -> argparse.ArgumentParser:
     parser.add_argument("--full", action="store_true", help="the whole grid instead of the default few minutes")
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--clock", choices=[*CLOCKS], default="wall", help="cpu: on a machine that others use too")
-    parser.add_argument("--avx2", action=_Held, nargs=0, help="torch, oneDNN, MKL and OpenCV without AVX-512")
+    parser.add_argument(
+        "--avx2", action=_LimitInstructions, nargs=0, help="torch, oneDNN, MKL and OpenCV without AVX-512"
+    )
     parser.add_argument("--kept", action=_Kept, nargs=0, help="what is freed stays with the process")
     parser.add_argument("--device", default="cpu", help="cpu, or cuda where the script knows how")
     return parser

@@ -15,15 +15,15 @@ RESULTS = Path(__file__).resolve().parent / "results"
 
 def rows() -> list[dict[str, Any]]:
     """Rows of the result file."""
-    found: list[dict[str, Any]] = json.loads((RESULTS / "kornia.json").read_text())
-    return found
+    loaded: list[dict[str, Any]] = json.loads((RESULTS / "kornia.json").read_text())
+    return loaded
 
 
 def functions() -> str:
     """One row for every pair of functions, those that are kornia's first."""
     shown = []
-    asked = [r for r in rows() if r["name"] != "answers"]
-    for r in sorted(asked, key=lambda r: r["used"] != "kornia"):
+    compared = [r for r in rows() if r["name"] != "answers"]
+    for r in sorted(compared, key=lambda r: r["used"] != "kornia"):
         size = r["note"] or (f"B = {r['batch']}" if r["n"] == 1 else f"B = {r['batch']}, N = {r['n']}")
         cells = [
             f"`{r['name'].split(' ')[0]}`{r['name'][len(r['name'].split(' ')[0]) :]}",
@@ -32,8 +32,8 @@ def functions() -> str:
         ]
         cells += [size, f"{1e3 * r['ours_ms']:.0f}", ratio(r["ratio"]), f"{r['largest']:.1g}", f"{r['median_rel']:.1g}"]
         shown.append([*cells, lacks(r), r["why"]])
-    head = ["ours", "kornia's", "used", "asked", "ours, µs", "ratio", "largest", "median", "kornia's lacks", "why"]
-    return f"{text.table_to_markdown(ReportTable('', head, shown, n_label=3))}\n\n{measured(asked)}"
+    head = ["ours", "kornia's", "used", "size", "ours, µs", "ratio", "largest", "median", "kornia's lacks", "why"]
+    return f"{text.table_to_markdown(ReportTable('', head, shown, n_label=3))}\n\n{measured(compared)}"
 
 
 def lacks(r: dict[str, Any]) -> str:
@@ -43,9 +43,9 @@ def lacks(r: dict[str, Any]) -> str:
     return ", ".join(missing) or "–"
 
 
-def measured(asked: list[dict[str, Any]]) -> str:
+def measured(compared: list[dict[str, Any]]) -> str:
     """Where the file was made."""
-    first = asked[0]
+    first = compared[0]
     versions = ", ".join(f"{name} {value}" for name, value in first["versions"].items())
     threads = "one thread" if first["threads"] == 1 else f"{first['threads']} threads"
     clock = {"wall": "", "cpu": "; time given to the process, on a machine that did other things too"}[first["clock"]]
@@ -54,9 +54,9 @@ def measured(asked: list[dict[str, Any]]) -> str:
 
 def answers() -> str:
     """What both methods said of real pairs before and after."""
-    found = [r for r in rows() if r["name"] == "answers"]
+    answers = [r for r in rows() if r["name"] == "answers"]
     shown = []
-    for r in found:
+    for r in answers:
         cells = [f"{r['scene']}, `{r['method']}`", str(r["pairs"]), str(r["answered"])]
         shown.append([*cells, f"{r['median_rel']:.1g}", f"{r['largest_rel']:.1g}", f"{100 * r['flipped']:.2g} %"])
     head = ["scene, method", "pairs", "answers", "median difference of depth", "largest", "gates flipped"]

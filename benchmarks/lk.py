@@ -49,12 +49,12 @@ LEVELS = 4
 def pairs(count: int) -> tuple[Tensor, Tensor]:
     """Grey images 0 and 1 (count, 1, H, W) uint8, taken from the scenes in turn."""
     root = os.environ.get("DHTORCH_DATA")
-    asked = [(data.open(Path(root) / name), gap) for name, gap in SCENES.items()] if root else [(SyntheticRoom(), 6)]
-    chosen = [(recording, by_gap(recording, gap)) for recording, gap in asked]
+    captures = [(data.open(Path(root) / name), gap) for name, gap in SCENES.items()] if root else [(SyntheticRoom(), 6)]
+    chosen = [(recording, by_gap(recording, gap)) for recording, gap in captures]
     views: list[list[Tensor]] = [[], []]
     for k in range(count):
-        recording, found = chosen[k % len(chosen)]
-        pair = found[k // len(chosen) % len(found)]
+        recording, pairs = chosen[k % len(chosen)]
+        pair = pairs[k // len(chosen) % len(pairs)]
         for side, i in zip(views, pair, strict=True):
             grey = luma(recording[i].image, -3) * 255
             side.append(grey.round().to(torch.uint8).reshape(1, *grey.shape[-2:]))
@@ -73,8 +73,8 @@ def forward(image_0: Tensor, image_1: Tensor, uv: Tensor, window: int, pyramid_0
         batch = torch.arange(B).repeat_interleave(N)
         known = lk.is_between(x, *source.bounds())
         every = {"known": known, "begun": known, "near_levels": len(source.levels), "alike": True}
-        d, found, _ = lk.search_displacements(source, target, o, x, torch.zeros_like(x), batch, **every)
-    return (x + d).reshape(2, B, N).permute(1, 2, 0), found.reshape(B, N)
+        d, valid, _ = lk.search_displacements(source, target, o, x, torch.zeros_like(x), batch, **every)
+    return (x + d).reshape(2, B, N).permute(1, 2, 0), valid.reshape(B, N)
 
 
 @cache
@@ -121,13 +121,13 @@ def accuracy(images: Tensor, uv: Tensor, window: int) -> list[tuple[float, float
     moved, truth = warped(images, uv)
     high = torch.tensor([images.shape[-1] - 1, images.shape[-2] - 1])
     inside = ((truth >= 0) & (truth <= high)).all(-1)
-    found = []
+    results = []
     for method in (forward, forward_opencv):
         uv_1, ok = method(images, moved, uv, window)
         distance = (uv_1 - truth).norm(dim=-1)
         missed = ~ok.bool() | (distance > 1)
-        found.append((missed[inside].double().mean().item(), distance[inside].median().item()))
-    return found
+        results.append((missed[inside].double().mean().item(), distance[inside].median().item()))
+    return results
 
 
 def measure(n: int, batch: int, window: int, repeats: int) -> list[dict[str, Any]]:

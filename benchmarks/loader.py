@@ -133,7 +133,7 @@ class Bench:
     """One image size and one kind of sample: the loaders that are compared, and their rows."""
 
     def __init__(self, size: str, mode: str, n: int, repeats: int, clock: str) -> None:
-        self.found, self.size, self.mode, self.n = encoded(), size, mode, n
+        self.encoded, self.size, self.mode, self.n = encoded(), size, mode, n
         self.repeats, self.clock = max(repeats // ROUNDS, 1), clock
         self.keys = ("image",) if mode == "single" else ("image", "other")
         self.transforms = {"transform": self.transform(), "by_batch": self.transform(batched=True)}
@@ -147,13 +147,13 @@ class Bench:
         """For the samples of this loader."""
         other = {"other_image": "other"} if self.mode == "pair" else {}
         return ExtendDepth(
-            depth_unit="mm", intrinsics_hw=self.found[1], tokens_hw=(SIDE, SIDE), n=self.n, **other, **options
+            depth_unit="mm", intrinsics_hw=self.encoded[1], tokens_hw=(SIDE, SIDE), n=self.n, **other, **options
         )
 
     def encoded(self, workers: int, *, light: bool = False) -> Encoded:
         """Long enough for one turn."""
         length = BATCH * (STRETCH * (self.repeats + 1) + 2 * workers)
-        return Encoded(self.found[2], SIZES[self.size], self.keys, length, light)
+        return Encoded(self.encoded[2], SIZES[self.size], self.keys, length, light)
 
     def dataset(self, transform: ExtendDepth | None, workers: int) -> Encoded | ExtendedDataset:
         """What leaves the worker are small pictures and, with a transform, what it tells."""
@@ -167,12 +167,12 @@ class Bench:
         for _, name, workers in product(range(ROUNDS), self.transforms, counts):
             dataset = self.dataset(self.transforms[name], workers)
             with harness.with_compiled_operators() if name in COMPILED_SIDES else nullcontext():
-                found = list(per_sample(dataset, workers, self.repeats, self.clock))
-            self.times.setdefault((name, workers), []).extend(found)
+                durations = list(per_sample(dataset, workers, self.repeats, self.clock))
+            self.times.setdefault((name, workers), []).extend(durations)
         for workers in counts:
             rates = {name: 1e3 / median(self.times[name, workers]) for name in self.transforms}
-            said = ", ".join(f"{name} {rate:.1f}" for name, rate in rates.items())
-            print(f"{self.mode} {self.size}, {workers} workers: samples/s {said}", flush=True)
+            rates_text = ", ".join(f"{name} {rate:.1f}" for name, rate in rates.items())
+            print(f"{self.mode} {self.size}, {workers} workers: samples/s {rates_text}", flush=True)
 
     def rows(self, workers: int) -> list[dict[str, Any]]:
         """Against the plain loader and against OpenCV; the bars stand on the larger pictures."""
@@ -226,10 +226,10 @@ def steps(benches: Sequence[Bench], repeats: int, clock: str) -> Iterator[dict[s
             calls = [partial(transform, sample), partial(network, pixel_values=picture)]
             with torch.no_grad():
                 ours, theirs = harness.in_turn(calls, repeats=repeats, warm_up=1, clock=clock)
-            found = harness.row(f"step_{bench.mode}_{bench.size}", ours, peer, theirs, n=bench.n)
-            share = found["ours_ms"] / (found["ours_ms"] + found["peer_ms"])
+            record = harness.row(f"step_{bench.mode}_{bench.size}", ours, peer, theirs, n=bench.n)
+            share = record["ours_ms"] / (record["ours_ms"] + record["peer_ms"])
             print(f"{bench.mode} {bench.size}: {100 * share:.2f} % of the transform and a {peer} forward", flush=True)
-            yield found
+            yield record
 
 
 def main() -> None:
@@ -241,7 +241,7 @@ def main() -> None:
     counts = options.workers or ([0, 1, 2, 4] if options.full else [0, 1, 2])
     modes = [(size, mode) for size in SIZES for mode in ("single", "pair")]
     benches = [Bench(*each, options.samples, options.repeats, options.clock) for each in modes]
-    print(f"pairs of {benches[0].found[0]}")
+    print(f"pairs of {benches[0].encoded[0]}")
     rows = []
     for bench in benches:
         bench.measure(counts)

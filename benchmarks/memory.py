@@ -45,14 +45,14 @@ def measure(frames: int) -> dict[str, Any]:
 
     room = SyntheticRoom(n_frames=frames, hw=HW, depth_hw=HW)
     settings = {"steps": (1, 2, 3, 5, 8), "seed": 0, "most": None, "dtype": "float32", "device": "cpu", "cutoff": 2.0}
-    told = stream_scene(Scene(room, near=2.0), MAP.replace(n=SAMPLES), settings, progress=watched)
+    summary = stream_scene(Scene(room, near=2.0), MAP.replace(n=SAMPLES), settings, progress=watched)
     return {
         "name": "stream_recording",
-        "frames": told["n_frames"],
+        "frames": summary["n_frames"],
         "first": FIRST,
         "first_mib": peaks[0],
         "above_mib": peak_mib() - peaks[0],
-        "held_mib": told["mib"],
+        "state_mib": summary["mib"],
         **harness.place(),
     }
 

@@ -99,6 +99,11 @@ KEYS = {
     "one_partner": "one_source_view",
     "worth": "gain",
     "n_mute": "n_no_answer",
+    "n_pairs_told": "n_diagnosed_pairs",
+    **{
+        f"validate.scale_found{suffix}": f"validate.scale_detected{suffix}"
+        for suffix in ("", "_5", "_far", "_5_far", "_quick_far", "_5_quick_far")
+    },
 }
 
 _FUSE = {"_target_": "dhtorch.stages.fuse.inverse_variance", "_partial_": True, "min_views": 2, "max_chi2": 9.0}
@@ -198,10 +203,14 @@ def _present_row(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _present_text(value: Any) -> Any:
-    """A text with present names; anything else as it is."""
+    """A text with present names, also within lists and mappings; anything else as it is."""
     if isinstance(value, str):
         for old, new in TEXTS.items():
             value = value.replace(old, new)
+    if isinstance(value, list):
+        return [_present_text(item) for item in value]
+    if isinstance(value, Mapping):
+        return {COLUMNS.get(key, key): _present_text(item) for key, item in value.items()}
     return value
 
 
@@ -216,8 +225,11 @@ TEXTS = {
     "the anchor's is exact": "the reference view's is exact",
     "those of the studies have": "those of the experiments have",
     "studies.": "experiments.",
+    ", silent ": ", no answer ",
 }
-COLUMNS = {"seat": "tracker"}
+COLUMNS = {"seat": "tracker", "said": "printed", "made": "origin", "held": "limited", "told": "coverage"} | {
+    "held_mib": "state_mib"
+}
 
 #: Mode of a benchmark row in an earlier version → its present name.
 MODES = {"native": "compiled", "compiled": "torch.compile"}

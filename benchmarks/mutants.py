@@ -97,13 +97,13 @@ LEFT = (
 
 def modules(root: Path = ROOT) -> dict[str, Path]:
     """Modules of the places by dotted name below the package."""
-    found = {}
+    files = {}
     for place in PLACES:
         base = root / "dhtorch" / place
         for path in [base.with_suffix(".py")] if base.with_suffix(".py").exists() else sorted(base.rglob("*.py")):
             parts = path.relative_to(root / "dhtorch").with_suffix("").parts
-            found[".".join(p for p in parts if p != "__init__")] = path
-    return found
+            files[".".join(p for p in parts if p != "__init__")] = path
+    return files
 
 
 def module_of(name: str, known: Iterable[str]) -> str:
@@ -118,11 +118,11 @@ def module_of(name: str, known: Iterable[str]) -> str:
 def within(places: Sequence[str], known: Iterable[str]) -> list[str]:
     """The known modules that are, or lie in, some places by dotted name."""
     known = list(known)
-    found = {place: [m for m in known if f"{m}.".startswith(f"{place}.")] for place in places}
-    for place, modules_there in found.items():
+    by_place = {place: [m for m in known if f"{m}.".startswith(f"{place}.")] for place in places}
+    for place, modules_there in by_place.items():
         if not modules_there:
             raise ValueError(f"mutants: {place!r} names no module, expected one or a folder of {', '.join(PLACES)}")
-    return [m for m in known if any(m in there for there in found.values())]
+    return [m for m in known if any(m in there for there in by_place.values())]
 
 
 def span(source: str, function: str) -> tuple[int, int]:
@@ -327,8 +327,8 @@ class Tried(NamedTuple):
 
 def trial(tree: Path, module: str, tests: Sequence[str], limit_s: float, order: Mapping[str, float]) -> Tried:
     """Run the module's tests over the tree in a fork."""
-    said, times = tree / FAILURE, tree / TIMES
-    for path in (said, times):
+    failure, times = tree / FAILURE, tree / TIMES
+    for path in (failure, times):
         path.unlink(missing_ok=True)
     start = time.perf_counter()
     child = os.fork()
@@ -345,11 +345,14 @@ def trial(tree: Path, module: str, tests: Sequence[str], limit_s: float, order: 
         os.waitpid(child, 0)
         return Tried(True, f"did not end in {limit_s:.0f} s")
     code = os.waitstatus_to_exitcode(status)
-    if code not in (0, 1, NONE) and not said.exists():
+    if code not in (0, 1, NONE) and not failure.exists():
         raise RuntimeError(
             f"mutants: the tests of {module} could not be run (exit code {code}): {(tree / 'log').read_text()[-2000:]}"
         )
-    why, seconds = said.read_text() if said.exists() else "", json.loads(times.read_text()) if times.exists() else {}
+    why, seconds = (
+        failure.read_text() if failure.exists() else "",
+        json.loads(times.read_text()) if times.exists() else {},
+    )
     return Tried(code not in (0, NONE), why, seconds)
 
 
@@ -389,15 +392,15 @@ class Bench:
         source = path.read_text()
         tests = [t for t in tests if (self.tree / t.split("::")[0]).exists()]
         table = [t for t in tests if t.endswith("test_contract.py")]  # long to collect, and seldom needed
-        found = Tried(False)
+        outcome = Tried(False)
         try:
             if fault is not None:
                 self._write(path, planted(source, fault))
             for some in ([t for t in tests if t not in table], table):
-                if some and not found.failed:
+                if some and not outcome.failed:
                     more = trial(self.tree, module, some, limit_s, order)
-                    found = more._replace(seconds={**found.seconds, **more.seconds})
-            return found
+                    outcome = more._replace(seconds={**outcome.seconds, **more.seconds})
+            return outcome
         finally:
             self._write(path, source)
 
@@ -426,10 +429,10 @@ def run(
             bench = free.pop()
             module, fault = named[k]
             try:
-                found = bench.run(fault, module, tests_of[module], 60 + 4 * whole[module], clean[module])
+                outcome = bench.run(fault, module, tests_of[module], 60 + 4 * whole[module], clean[module])
             finally:
                 free.append(bench)
-            row = row_of(module, fault, found)
+            row = row_of(module, fault, outcome)
             if not quiet or row["verdict"] in ("missed", "noticed"):
                 place = f"{module}.{fault.function}"
                 print(f"{row['verdict']:10} {place}: {fault.old!r} -> {fault.new!r}  {row.get('by', '')}", flush=True)
@@ -449,10 +452,10 @@ def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str
             raise ValueError(f"mutants: no tests are named for {module}, add them to benchmarks/faults/")
         bench = free.pop()
         try:
-            found = bench.run(None, module, tests_of[module], 600, {})
-            if found.failed:
-                raise RuntimeError(f"mutants: the tests of {module} fail without a fault: {found.why}")
-            return found.seconds
+            outcome = bench.run(None, module, tests_of[module], 600, {})
+            if outcome.failed:
+                raise RuntimeError(f"mutants: the tests of {module} fail without a fault: {outcome.why}")
+            return outcome.seconds
         finally:
             free.append(bench)
 
@@ -460,12 +463,12 @@ def _clean(benches: list[Bench], wanted: list[str], tests_of: dict[str, list[str
         return dict(zip(wanted, pool.map(one, wanted), strict=True))
 
 
-def row_of(module: str, fault: Fault, found: Tried) -> dict[str, Any]:
+def row_of(module: str, fault: Fault, outcome: Tried) -> dict[str, Any]:
     """What became of one fault. ``noticed``: said to change no answer, and yet a test failed."""
     right, wrong = ("noticed", "equivalent") if fault.equivalent else ("caught", "missed")
     row = {"module": module, "function": fault.function, "old": fault.old, "new": fault.new}
-    told = {"reason": fault.equivalent} if fault.equivalent else {"by": found.why.partition("\n")[0]}
-    return row | {"verdict": right if found.failed else wrong} | told
+    details = {"reason": fault.equivalent} if fault.equivalent else {"by": outcome.why.partition("\n")[0]}
+    return row | {"verdict": right if outcome.failed else wrong} | details
 
 
 def by_module(rows: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]:
@@ -479,9 +482,9 @@ def by_module(rows: Sequence[dict[str, Any]]) -> list[tuple[str, int, int, int]]
 
 def summary(rows: Sequence[dict[str, Any]]) -> str:
     """Caught of those that change an answer, by module."""
-    found = by_module(rows)
-    lines = [f"{name:28} {caught:6} {of:3} {same or '':>6}" for name, caught, of, same in found]
-    _, caught, of, _ = found[-1]
+    counts = by_module(rows)
+    lines = [f"{name:28} {caught:6} {of:3} {same or '':>6}" for name, caught, of, same in counts]
+    _, caught, of, _ = counts[-1]
     share = f" = {caught / of:.1%}" if of else ""
     return "\n".join([f"{'module':28} caught  of  equivalent", *lines]) + share
 

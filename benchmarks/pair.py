@@ -103,21 +103,21 @@ def measure(batch: int, threads: int, options: Any, n: int = 2048) -> list[dict[
             methods[side](pair[1], pair[2], n=n, trace=trace)
         traces[side].append(trace["ms"])
 
-    def said(side: tuple[str, str]) -> errors.Points:
+    def points_of(side: tuple[str, str]) -> errors.Points:
         with MODES[side[1]]():
             return answers(methods[side], pair)
 
     sides = harness.in_turn([partial(call, side) for side in methods], repeats=options.repeats, clock=options.clock)
-    times = {side: [t / batch for t in found] for side, found in zip(methods, sides, strict=True)}
-    points = {side: said(side) for side in methods}
-    found = {side: errors.measure_errors(points[side])["median_rel"] for side in methods}
+    times = {side: [t / batch for t in durations] for side, durations in zip(methods, sides, strict=True)}
+    points = {side: points_of(side) for side in methods}
+    median_rel = {side: errors.measure_errors(points[side])["median_rel"] for side in methods}
     good = {side: int((points[side].answered().error <= GOOD).sum()) / batch for side in methods}
     rows = []
     for side in methods:
         if side == peer:
             continue
         name, common = f"pair_{side[0]}_b{batch}", {"n": n, "batch": batch, "mode": side[1]}
-        errors_of = {"ours_error": found[side], "peer_error": found[peer]}
+        errors_of = {"ours_error": median_rel[side], "peer_error": median_rel[peer]}
         rows.append(harness.row(name, times[side], "opencv", times[peer], **common, **errors_of, bar=True))
         if good[side] and good[peer]:
             a, b = ([t / good[k] for t in times[k]] for k in (side, peer))
@@ -154,16 +154,16 @@ def measure_every_pixel(threads: int, options: Any, n: int = 2048) -> list[dict[
     ]
 
 
-def pixel_errors(found: DepthMap, pair: tuple[str, Frame, Frame, Frame, float]) -> torch.Tensor:
+def pixel_errors(depth_map: DepthMap, pair: tuple[str, Frame, Frame, Frame, float]) -> torch.Tensor:
     """Relative errors of the swept pixels in every so many rows and columns that have truth beyond the cutoff."""
     _, near, _, reference, cutoff = pair
-    chosen = torch.zeros_like(found.keep)
+    chosen = torch.zeros_like(depth_map.keep)
     chosen[:, ::EVERY, ::EVERY] = True
-    chosen &= found.source == Source.SWEPT
-    _, h, w = found.depth.shape
+    chosen &= depth_map.source == Source.SWEPT
+    _, h, w = depth_map.depth.shape
     truth = holdout.sample_truth(reference, dense.map_pixel_centres(near, (h, w))[chosen.flatten()][None])
     counts = truth.ok & (truth.depth > cutoff)
-    return (found.depth[chosen][None] / truth.depth - 1).abs()[counts]
+    return (depth_map.depth[chosen][None] / truth.depth - 1).abs()[counts]
 
 
 def measure_anchor(threads: int, options: Any, n: int = 2048) -> list[dict[str, Any]]:
@@ -175,14 +175,14 @@ def measure_anchor(threads: int, options: Any, n: int = 2048) -> list[dict[str, 
         holdout.range_split(recording[k], near) for k in (middle, *(i for i in range(len(recording)) if i != middle))
     )
     truth_of = recording[middle]
-    found = {}
+    median_rel = {}
 
     def call(name: str, method: Any, mode: str = "eager") -> None:
         trace: dict[str, Any] = {}
         with torch.no_grad(), MODES[mode]():
             estimate = method(reference, others, n=n, trace=trace)
         truth = holdout.select_candidates(trace["samples"], holdout.sample_truth(truth_of, estimate.uv), near)
-        found[name] = errors.measure_errors(errors.points_from_estimate(estimate, truth))["median_rel"]
+        median_rel[name] = errors.measure_errors(errors.points_from_estimate(estimate, truth))["median_rel"]
 
     sides = [partial(call, mode, with_view_selection(AUTO), mode) for mode in MODES]
     sides.append(partial(call, "window_1", with_view_selection(WINDOW_1)))
@@ -190,7 +190,7 @@ def measure_anchor(threads: int, options: Any, n: int = 2048) -> list[dict[str, 
     rows = []
     for mode, times in zip(MODES, ours, strict=True):
         more: dict[str, Any] = {"n": n, "mode": mode, "bar": True}
-        more |= {"ours_error": found[mode], "peer_error": found["window_1"]}
+        more |= {"ours_error": median_rel[mode], "peer_error": median_rel["window_1"]}
         rows.append(harness.row("auto_reference_view", times, "window_1", peer, **more))
     return rows
 

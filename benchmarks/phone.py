@@ -36,16 +36,16 @@ def main() -> int:
             n_frames=options.frames, hw=HW, depth_hw=(256, 192), step_m=STEP_M, range_limit=RANGE_M, supersample=1
         )
         write_stray(capture, room, codec="libx265")
-        found = row(capture, Path(folder), ())
-    found |= {
+        record = row(capture, Path(folder), ())
+    record |= {
         "frames": options.frames,
         "hw": list(HW),
         "processor": result_files.describe_processor(),
         "cores": os.cpu_count(),
     }
-    print(found)
-    storage.write_json(options.json, [found])
-    return found["rc"]
+    print(record)
+    storage.write_json(options.json, [record])
+    return record["rc"]
 
 
 if __name__ == "__main__":

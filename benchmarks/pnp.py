@@ -103,8 +103,8 @@ def colmap(xyz: np.ndarray, uv: np.ndarray) -> PeerPose:
     camera = pycolmap.Camera(model="PINHOLE", width=HW[1], height=HW[0], params=[FOCAL, FOCAL, HW[1] / 2, HW[0] / 2])
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error, options.ransac.min_num_trials, options.ransac.confidence = THRESHOLD_PX, 100, 0.999
-    found: Any = pycolmap.estimate_and_refine_absolute_pose(uv, xyz, camera, options)
-    matrix = np.asarray(found["cam_from_world"].matrix())
+    result: Any = pycolmap.estimate_and_refine_absolute_pose(uv, xyz, camera, options)
+    matrix = np.asarray(result["cam_from_world"].matrix())
     return matrix[:, :3], matrix[:, 3]
 
 
@@ -123,10 +123,10 @@ def each(peer: Callable[..., PeerPose], pairs: list[tuple[np.ndarray, np.ndarray
     return Pose(torch.from_numpy(np.stack(R)), torch.from_numpy(np.stack(t)))
 
 
-def errors(found: Pose, truth: Pose) -> Iterator[tuple[float, float]]:
+def errors(pose: Pose, truth: Pose) -> Iterator[tuple[float, float]]:
     """Rotation (degrees) and translation (mm) error of each pair."""
-    turn = se3.rotation_angle(found.R.double() @ truth.R.mT)
-    shift = (found.t.double() - truth.t).norm(dim=-1)
+    turn = se3.rotation_angle(pose.R.double() @ truth.R.mT)
+    shift = (pose.t.double() - truth.t).norm(dim=-1)
     yield from zip((turn * 180 / np.pi).tolist(), (shift * 1e3).tolist(), strict=True)
 
 
@@ -146,14 +146,14 @@ def measure(batch: int, n: int, outliers: float, options: Any, compile_too: bool
         seconds = time.perf_counter() - start
     pairs = arrays(samples, tracks)
     calls |= {name: partial(each, peer, pairs) for name, peer in PEERS.items()}
-    found = harness.in_turn([*calls.values()], repeats=options.repeats, clock=options.clock, warm_up=2)
-    times = {name: [t / batch for t in side] for name, side in zip(calls, found, strict=True)}
+    durations = harness.in_turn([*calls.values()], repeats=options.repeats, clock=options.clock, warm_up=2)
+    times = {name: [t / batch for t in side] for name, side in zip(calls, durations, strict=True)}
     wrong: dict[str, list[tuple[float, float]]] = {name: [] for name in ("eager", "compiled", *PEERS)}
     for seed in range(-(-96 // batch)):
         samples, tracks, camera, T = scene(batch, n, outliers, seed=100 + seed)
-        ask = partial(pnp_ransac, samples, tracks, camera, camera, draws)
-        wrong["eager"] += errors(ask().T_1_from_0, T)
-        wrong["compiled"] += errors(harness.with_compiled_operators()(ask)().T_1_from_0, T)
+        solve = partial(pnp_ransac, samples, tracks, camera, camera, draws)
+        wrong["eager"] += errors(solve().T_1_from_0, T)
+        wrong["compiled"] += errors(harness.with_compiled_operators()(solve)().T_1_from_0, T)
         for name, peer in PEERS.items():
             wrong[name] += errors(each(peer, arrays(samples, tracks)), T)
     middle = {name: np.nanmedian(np.array(w), 0) for name, w in wrong.items()}

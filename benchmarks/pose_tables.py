@@ -21,9 +21,9 @@ USED = {"as it is": "as it is", "stated": "0.005 rad, 0.01 m stated", "refined":
 def given_poses(method: str) -> str:
     """What is answered under right poses of every capture, by what is made of them, beside near returns alone."""
     rows = []
-    for scene, found in by_capture(method).items():
-        right = {row["use"]: row for row in found if row["pose"] in ("right", "none")}
-        name = f"`{scene}`" + (" (turns only)" if found[0]["role"] == "rotation" else "")
+    for scene, runs in by_capture(method).items():
+        right = {row["use"]: row for row in runs if row["pose"] in ("right", "none")}
+        name = f"`{scene}`" + (" (turns only)" if runs[0]["role"] == "rotation" else "")
         uses = [right["near returns"], *(right[use] for use in USED)]
         cells = [" / ".join(percent(row[key]) for row in uses) for key in ("coverage", "median_rel")]
         honest = [f"{percent(row['within_sigma'])}, {percent(row['within_2sigma'])}" for row in uses[:2] + uses[3:]]
@@ -35,14 +35,14 @@ def given_poses(method: str) -> str:
 
 def misread_poses(method: str) -> str:
     """What becomes of late and misread poses, over all captures that do not only turn."""
-    found = [row for rows in by_capture(method).values() for row in rows if row["role"] is None]
+    runs = [row for rows in by_capture(method).values() for row in rows if row["role"] is None]
     rows = []
-    for pose in dict.fromkeys(row["pose"] for row in found if row["pose"] != "none"):
+    for pose in dict.fromkeys(row["pose"] for row in runs if row["pose"] != "none"):
         cells = []
         for use in ("as it is", "refined"):
-            of = [row for row in found if (row["pose"], row["use"]) == (pose, use)]
+            of = [row for row in runs if (row["pose"], row["use"]) == (pose, use)]
             n, ok, refuted = (sum(row[key] for row in of) for key in ("n_pairs", "n_ok", "n_refuted"))
-            looks = sum(n for row in of for said, n in row["looks"].items() if said and pose.lower() in said.lower())
+            looks = sum(n for row in of for label, n in row["looks"].items() if label and pose.lower() in label.lower())
             cells += [f"{ok} / {refuted} / {n - ok - refuted} of {n}"]
             cells += [*([str(looks or "")] if use == "as it is" else []), answered_numbers(of)]
         rows.append([pose, *cells])
@@ -65,19 +65,19 @@ def answered_numbers(rows: list[dict[str, Any]]) -> str:
 
 def by_capture(method: str) -> dict[str, list[dict[str, Any]]]:
     """Capture → its rows of one method."""
-    found: dict[str, list[dict[str, Any]]] = {}
+    by_scene: dict[str, list[dict[str, Any]]] = {}
     for row in json.loads((RESULTS / "given_poses.json").read_text()):
         if row.get("method") == method:
-            found.setdefault(row["scene"], []).append(row)
-    return found
+            by_scene.setdefault(row["scene"], []).append(row)
+    return by_scene
 
 
 def rigs(kind: str) -> list[dict[str, Any]]:
     """Rows of one kind, those of all robots as one of medians."""
-    found = [row for row in json.loads((RESULTS / "rigs.json").read_text()) if row["kind"] == kind]
-    rows = [row for row in found if not row["rig"].startswith("robot")]
+    records = [row for row in json.loads((RESULTS / "rigs.json").read_text()) if row["kind"] == kind]
+    rows = [row for row in records if not row["rig"].startswith("robot")]
     groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-    for row in found:
+    for row in records:
         if row["rig"].startswith("robot"):
             groups.setdefault(tuple(row.get(k, "") for k in ("tracker", "pose", "pairs")), []).append(row)
     for of in groups.values():
@@ -133,10 +133,10 @@ def upwards() -> str:
         if "format" not in row:
             rows.append([f"`{row['capture']}`", "", "", "", "", "", f"not opened: {why.partition(': ')[2]}"])
             continue
-        said = "–" if stated is None else "xyz"[max(range(3), key=lambda k: abs(stated[k]))]
+        axis = "–" if stated is None else "xyz"[max(range(3), key=lambda k: abs(stated[k]))]
         sign = "" if stated is None else "−" if sum(stated) < 0 else "+"
         plane = f"{percent(row['share'])} of the area" if "plane" in row else "–"
-        cells = [f"`{row['capture']}`", row["format"], sign + said, plane]
+        cells = [f"`{row['capture']}`", row["format"], sign + axis, plane]
         cells += [degrees(row.get(key)) for key in ("stated_from_plane_deg", "written_from_plane_deg")]
         if "largest_from_stated_deg" in row and "plane" not in row:
             why = f"{why}; the largest one is {degrees(row['largest_from_stated_deg'])} from the stated axis"

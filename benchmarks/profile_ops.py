@@ -44,11 +44,11 @@ def table(call: Callable[[], Any], repeats: int, top: int, device: str) -> str:
     for _ in range(3):
         call()
     kinds = [ProfilerActivity.CPU] + ([ProfilerActivity.CUDA] if device != "cpu" else [])
-    with profile(activities=kinds) as found:
+    with profile(activities=kinds) as profiler:
         for _ in range(repeats):
             call()
     key = "self_cpu_time_total" if device == "cpu" else "self_device_time_total"
-    events = sorted(found.key_averages(), key=lambda e: -getattr(e, key))
+    events = sorted(profiler.key_averages(), key=lambda e: -getattr(e, key))
     whole = sum(getattr(e, key) for e in events)
     lines = [f"{'operation':36} {'us per call':>12} {'share':>7} {'count':>7}"]
     for e in events[:top]:

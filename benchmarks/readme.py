@@ -47,11 +47,11 @@ COMPARED = ("map", "window", "auto")
 
 def scenes(name: str, truth: str) -> dict[str, dict[str, dict[str, Any]]]:
     """Scene → method → row of a result file, for one truth test."""
-    found: dict[str, dict[str, dict[str, Any]]] = {}
+    by_scene: dict[str, dict[str, dict[str, Any]]] = {}
     for row in json.loads((RESULTS / f"{name}.json").read_text())["rows"]:
         if row["pair"] is None and row["truth"] == truth:
-            found.setdefault(row["scene"], {})[row["method"]] = row
-    return found
+            by_scene.setdefault(row["scene"], {})[row["method"]] = row
+    return by_scene
 
 
 def kept(row: dict[str, Any]) -> float:
@@ -65,12 +65,12 @@ def room() -> str:
     for name, words in (("room_exact", "exact depth, no noise"), ("room_phone", "LiDAR model")):
         rooms = scenes(name, "full")
         for method in ("paper", "opencv"):
-            found = {scene: methods[method] for scene, methods in rooms.items()}
+            by_scene = {scene: methods[method] for scene, methods in rooms.items()}
             numbers = []
             for key in ("coverage", "median_rel", "p90_rel", "wrong_share"):
-                of = [r[key] for r in found.values()]
-                numbers.append(f"{percent(found[DEFAULT_ROOM][key])} ({100 * min(of):.1f} to {100 * max(of):.1f})")
-            rows.append([f"{words}, `{method}`", str(found[DEFAULT_ROOM]["n_candidates"]), *numbers])
+                of = [r[key] for r in by_scene.values()]
+                numbers.append(f"{percent(by_scene[DEFAULT_ROOM][key])} ({100 * min(of):.1f} to {100 * max(of):.1f})")
+            rows.append([f"{words}, `{method}`", str(by_scene[DEFAULT_ROOM]["n_candidates"]), *numbers])
     return table(["sensor, method", "candidates", "coverage", "median error", "p90", "> 20 % off"], rows)
 
 
@@ -160,8 +160,8 @@ def every_pixel(*results: str) -> str:
     timed = [r for r in json.loads((RESULTS / "dense_speed.json").read_text()) if r["threads"] == 1]
     rows = []
     for name, (words, bar) in PIXELS.items():
-        found = [s.get(name, {}).get("value") for s in summaries]
-        rows.append([words, *("" if value is None else f"{value:.3f}" for value in found), bar])
+        values = [s.get(name, {}).get("value") for s in summaries]
+        rows.append([words, *("" if value is None else f"{value:.3f}" for value in values), bar])
     for row in timed:
         size = row["name"].removeprefix("sweep_").replace("x", "×")
         how = "" if row["mode"] == "eager" else ", compiled code"
@@ -173,11 +173,11 @@ def pixels_by_scene(comparison: str) -> str:
     """What the dense map of every scene answers, how well, and how its peers do under the same motion."""
     rows = []
     for scene, methods in scenes(comparison, "full").items():
-        found = methods["dense"]
-        if found["role"] or not found.get("n_candidates"):
+        record = methods["dense"]
+        if record["role"] or not record.get("n_candidates"):
             continue
-        own = found["dense"]
-        cells = [scene, percent(found["coverage"]), percent(found["median_rel"]), percent(found["wrong_share"])]
+        own = record["dense"]
+        cells = [scene, percent(record["coverage"]), percent(record["median_rel"]), percent(record["wrong_share"])]
         cells += [number(own.get("ause_ratio")), number(own.get("error_ratio_to_sparse"))]
         peers = (own.get(f"error_ratio_to_{peer}") for peer in ("sgbm", "dis_flow", "bilateral"))
         rows.append([*cells, " / ".join("–" if ratio is None else number(ratio) for ratio in peers)])
@@ -267,15 +267,17 @@ def loader_times() -> str:
         names = (f"loader_{views}_640x480_workers0{kind}" for kind in ("", "_by_batch"))
         return [rows[name, mode] for name in names if (name, mode) in rows]
 
-    def said(mode: str) -> str:
+    def ratio_of(mode: str) -> str:
         both = (("single", "one view"), ("pair", "two views"))
         times = [(*taken(views, mode), words) for views, words in both if taken(views, mode)]
         return " and ".join(f"{a['ours_ms']:.2g} ms with {x} ({b['ours_ms']:.2g} by batch)" for a, b, x in times)
 
     plain, _ = taken("single", "eager")
-    after = f"; after `python -m dhtorch.ops`, which compiles inner loops, {said('compiled')}" * bool(said("compiled"))
+    after = f"; after `python -m dhtorch.ops`, which compiles inner loops, {ratio_of('compiled')}" * bool(
+        ratio_of("compiled")
+    )
     return (
-        f"A sample of 640×480 takes {said('eager')}{after}; {plain['peer_ms']:.2g} ms of it is decoding\n"
+        f"A sample of 640×480 takes {ratio_of('eager')}{after}; {plain['peer_ms']:.2g} ms of it is decoding\n"
         f"(`python benchmarks/loader.py --workers 0`; one thread, {plain['processor']})."
     )
 
@@ -309,16 +311,16 @@ HEAD |= {"coverage_at_5": "answered at 5 % mean error", "ms": "ms"}
 def captures() -> str:
     """Every capture that was given to ``dhtorch PATH``: what came of it, and how long it took; last the phone's."""
     rows, files = [], (RESULTS / f"{name}.json" for name in ("captures", "phone"))
-    for found in [each for file in files for each in json.loads(file.read_text())]:
-        first = "" if found["first_s"] is None else f"{found['first_s']:.0f}"
-        said = (found.get("said") or found.get("why") or "").removeprefix(f"{found['name']}: ")
-        rows.append([said, f"`{found['name']}`", first, f"{found['seconds']:.0f}"])
+    for record in [each for file in files for each in json.loads(file.read_text())]:
+        first = "" if record["first_s"] is None else f"{record['first_s']:.0f}"
+        printed = (record.get("printed") or record.get("why") or "").removeprefix(f"{record['name']}: ")
+        rows.append([printed, f"`{record['name']}`", first, f"{record['seconds']:.0f}"])
     grid = text.table_to_markdown(ReportTable("", ["what came out", "capture", "first picture, s", "all, s"], rows))
     shown = "".join(
         f"\n\n![{file.stem}: picture, sensor, completed](../assets/captures/{file.name})\n\n`{file.stem}`"
         for file in sorted((HERE.parent / "docs/assets/captures").glob("*.jpg"))
     )
-    return f"{grid}\n\n{found['processor']}, {found['cores']} cores, beside other work.{shown}"
+    return f"{grid}\n\n{record['processor']}, {record['cores']} cores, beside other work.{shown}"
 
 
 def enriched() -> str:
@@ -328,18 +330,18 @@ def enriched() -> str:
         return "Not measured yet: `benchmarks/results/enrich.json` is not there."
     others = [each for each in json.loads((RESULTS / "clients.json").read_text()) if each["opened"]]
     rows = []
-    for found in sorted(json.loads(file.read_text()), key=lambda found: (found["source"], found["data"])):
-        name = f"`{found['data']}`" if found["made"] == "real" else "written"
-        if "refused" in found:
-            why = found["refused"].rpartition("dhtorch: ")[2]  # what stands before it are warnings
-            rows.append([why, found["source"], name, found["target"], "refused", "", "", ""])
+    for record in sorted(json.loads(file.read_text()), key=lambda record: (record["source"], record["data"])):
+        name = f"`{record['data']}`" if record["origin"] == "real" else "written"
+        if "refused" in record:
+            why = record["refused"].rpartition("dhtorch: ")[2]  # what stands before it are warnings
+            rows.append([why, record["source"], name, record["target"], "refused", "", "", ""])
             continue
-        weight = "" if found["mb_per_minute"] is None else f"{found['mb_per_minute']:.1f}"
-        same = f"{found['compared']:,} values" if found["source_untouched"] and found["done_again"] else "no"
-        opened = [each for each in others if (each["data"], each["target"]) == (found["data"], found["target"])]
+        weight = "" if record["mb_per_minute"] is None else f"{record['mb_per_minute']:.1f}"
+        same = f"{record['compared']:,} values" if record["source_untouched"] and record["done_again"] else "no"
+        opened = [each for each in others if (each["data"], each["target"]) == (record["data"], record["target"])]
         loaders = list(dict.fromkeys(f"{each['loader']}{', a training step' * bool(each['step'])}" for each in opened))
-        row = [same, f"{found['s_per_frame']:.2f}", weight, "; ".join(loaders)]
-        rows.append(["; ".join(found["said"]), found["source"], name, found["target"], *row])
+        row = [same, f"{record['s_per_frame']:.2f}", weight, "; ".join(loaders)]
+        rows.append(["; ".join(record["printed"]), record["source"], name, record["target"], *row])
     head = [
         "what came out",
         "source",
@@ -357,12 +359,12 @@ def enriched() -> str:
 
 
 #: What validation is to find, in words, and its bars.
-FOUND = {
-    "scale_found": ("metre off by a tenth: found, reference views with a baseline", "≥ 0.95"),
-    "scale_found_5": ("metre off by a twentieth: found", "≥ 0.90"),
+SCALE_ROWS = {
+    "scale_detected": ("metre off by a tenth: found, reference views with a baseline", "≥ 0.95"),
+    "scale_detected_5": ("metre off by a twentieth: found", "≥ 0.90"),
     "false_alarm": ("sound maps whose metre is called wrong", "≤ 0.02"),
-    "scale_found_far": ("a tenth, by triangulated points alone", ""),
-    "scale_found_5_far": ("a twentieth, by triangulated points alone", ""),
+    "scale_detected_far": ("a tenth, by triangulated points alone", ""),
+    "scale_detected_5_far": ("a twentieth, by triangulated points alone", ""),
     "false_alarm_far": ("false alarms of triangulated points alone", ""),
     "jump_auroc": (
         "surfaces moved to three times their depth, where no return is shown: area under the curve",
@@ -391,10 +393,10 @@ VALIDATIONS = (
 
 def validated() -> str:
     """What validation finds, beside a fixed-threshold photometric check and the bars."""
-    found = {name: json.loads((RESULTS / f"{name}.json").read_text()) for name, _, _ in VALIDATIONS}
-    summary = {name: result["summary"] for name, result in found.items()}
+    results = {name: json.loads((RESULTS / f"{name}.json").read_text()) for name, _, _ in VALIDATIONS}
+    summary = {name: result["summary"] for name, result in results.items()}
     rows = []
-    for name, (words, bar) in FOUND.items():
+    for name, (words, bar) in SCALE_ROWS.items():
         values = []
         for result, who, _ in VALIDATIONS:
             key = (
@@ -404,7 +406,9 @@ def validated() -> str:
             )
             values.append(summary[result].get(key, {}).get("value"))
         rows.append([words, *("" if value is None else f"{value:.3f}" for value in values), bar])
-    shares = [named_registration(found[result]["rows"]) if who == "validate" else "" for result, who, _ in VALIDATIONS]
+    shares = [
+        named_registration(results[result]["rows"]) if who == "validate" else "" for result, who, _ in VALIDATIONS
+    ]
     rows.append(["depth that is not registered: named, all windows", *shares, ""])
     return table(["number", *(head for _, _, head in VALIDATIONS), "bar"], rows)
 
@@ -419,11 +423,13 @@ def validated_real() -> str:
     """What is said of real sensors' own depth."""
     rows = []
     for row in json.loads((RESULTS / "validate_real.json").read_text()):
-        whole, held = row["whole"], row["whole"]["held"]
-        wrong = "nothing is known" if whole["wrong"] is None else f"{whole['wrong']:.1%}, at least {held['wrong']:.1%}"
+        whole, limited = row["whole"], row["whole"]["limited"]
+        wrong = (
+            "nothing is known" if whole["wrong"] is None else f"{whole['wrong']:.1%}, at least {limited['wrong']:.1%}"
+        )
         causes = "; ".join(f"{cause} ({n} of {whole['windows']})" for cause, n in whole["causes"].items())
         options = f" {' '.join(row['options'])}" if row["options"] else ""
-        cells = [f"`{row['name']}{options}`", str(whole["frames"]), wrong, f"{held['unknown']:.1%}"]
+        cells = [f"`{row['name']}{options}`", str(whole["frames"]), wrong, f"{limited['unknown']:.1%}"]
         rows.append([*cells, causes or ("no window" if not whole["windows"] else "none")])
     return table(["capture", "frames", "wrong, of what is known", "cannot be known", "likely cause (windows)"], rows)
 
@@ -440,30 +446,30 @@ ALIGNED = {
 
 def aligned(*results: str) -> str:
     """What alignment reaches, of several results, beside its bars."""
-    found = [json.loads((RESULTS / f"{name}.json").read_text()) for name in results]
+    results = [json.loads((RESULTS / f"{name}.json").read_text()) for name in results]
     rows = [
-        [words, *(f"{result['summary'][f'align.{name}']['value']:.3f}" for result in found), bar]
+        [words, *(f"{result['summary'][f'align.{name}']['value']:.3f}" for result in results), bar]
         for name, (words, bar) in ALIGNED.items()
     ]
-    seeds = [result["config"]["data"].get("seed") for result in found]
+    seeds = [result["config"]["data"].get("seed") for result in results]
     names = [
         f"`{result['data']['name']}`" + (f", seeds {seed[0]} to {seed[-1]}" if seed else "")
-        for result, seed in zip(found, seeds, strict=True)
+        for result, seed in zip(results, seeds, strict=True)
     ]
     return table(["number", *names, "bar"], rows)
 
 
 def questions() -> str:
     """Every archived answer, in alphabetical order."""
-    found = {path.stem: json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))}
-    return verdicts([name for name, result in found.items() if isinstance(result, dict) and result.get("verdict")])
+    results = {path.stem: json.loads(path.read_text()) for path in sorted(RESULTS.glob("*.json"))}
+    return verdicts([name for name, result in results.items() if isinstance(result, dict) and result.get("verdict")])
 
 
 def caught() -> str:
     """Planted faults that a test of their module caught, of those that change an answer."""
-    found = mutants.by_module(json.loads((RESULTS / "mutants.json").read_text()))
+    counts = mutants.by_module(json.loads((RESULTS / "mutants.json").read_text()))
     cells = [
-        [name if name == mutants.ALL else f"`{name}`", f"{n} of {of}", f"{same or ''}"] for name, n, of, same in found
+        [name if name == mutants.ALL else f"`{name}`", f"{n} of {of}", f"{same or ''}"] for name, n, of, same in counts
     ]
     return table(["faults planted in", "caught", "change no answer"], cells)
 
@@ -566,22 +572,22 @@ PIXELS = {
 BOUND = dict.fromkeys(NUMBER, "≤") | {"coverage_at_5": "≥", "within_2sigma": "≥", "within_sigma": "±0.07 of"}
 
 #: Results whose verdicts are shown, beside those with a table.
-ASKED = (
+SUPPORTED = (
     *("hole_census", "device_pose", "motion", "ablation", "latency"),
     *("room_range_split", "room_gate_ablation", "room_device_pose", "room_real_holes", "paths_motion"),
 )
 PIPELINES = ("rh20t_probe", "vo_probe", "learned_score")
 NEGATIVE = ("helix_correlation", "defocus", "focus_stack", "defocus_fusion", "icp", "hole_attention")
-TABLES |= {"verdicts": partial(verdicts, ASKED), "negative": partial(verdicts, NEGATIVE)}
+TABLES |= {"verdicts": partial(verdicts, SUPPORTED), "negative": partial(verdicts, NEGATIVE)}
 TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, ("global_map",))}
 
 
 def in_layout(name: str) -> str:
     """The tables of ``results/<name>.json`` in the paper's layout, the paper's figures beside ours."""
-    found = layouts.layout_tables(result_files.read_result(RESULTS / f"{name}.json"))
-    if not found:
+    tables = layouts.layout_tables(result_files.read_result(RESULTS / f"{name}.json"))
+    if not tables:
         raise ValueError(f"{RESULTS / name}.json: found an experiment without tables of its own, expected a known one")
-    return text.tables_to_markdown(found).rstrip()
+    return text.tables_to_markdown(tables).rstrip()
 
 
 def maker(name: str) -> Callable[[], str]:
@@ -598,7 +604,7 @@ def maker(name: str) -> Callable[[], str]:
         sys.path.append(str(HERE.parent / "docs"))
         import hooks
 
-        return partial(hooks.made, name.removeprefix("make: "))
+        return partial(hooks.generate, name.removeprefix("make: "))
     if name not in TABLES:
         raise ValueError(f"marker <!-- {name} -->: expected one of {', '.join(TABLES)}")
     return TABLES[name]

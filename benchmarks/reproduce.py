@@ -149,14 +149,14 @@ def settings(name: str) -> dict[str, Any]:
     return storage.to_strict_json(result_files.make_portable(OmegaConf.to_container(cfg, resolve=True)))  # type: ignore[arg-type]
 
 
-def differences(found: Any, expected: Any, where: str = "") -> list[str]:
+def differences(actual: Any, expected: Any, where: str = "") -> list[str]:
     """Options that two settings do not share, as ``name: found, expected``."""
-    if isinstance(found, Mapping) and isinstance(expected, Mapping):
-        names = sorted({*found, *expected} - ASIDE)
-        return [d for k in names for d in differences(found.get(k), expected.get(k), f"{where}.{k}".strip("."))]
-    if isinstance(found, float) and isinstance(expected, float) and math.isclose(found, expected, rel_tol=1e-12):
+    if isinstance(actual, Mapping) and isinstance(expected, Mapping):
+        names = sorted({*actual, *expected} - ASIDE)
+        return [d for k in names for d in differences(actual.get(k), expected.get(k), f"{where}.{k}".strip("."))]
+    if isinstance(actual, float) and isinstance(expected, float) and math.isclose(actual, expected, rel_tol=1e-12):
         return []  # a number that is written with fewer digits
-    return [] if found == expected else [f"{where}: found {found!r}, expected {expected!r}"]
+    return [] if actual == expected else [f"{where}: found {actual!r}, expected {expected!r}"]
 
 
 def check(name: str) -> list[str]:

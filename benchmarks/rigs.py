@@ -116,10 +116,10 @@ def off(T: Pose, cov: Tensor, calibration: Pose) -> dict[str, Any]:
     """How far a pose is from the calibration: as numbers, in its own standard deviations, and each of the six."""
     xi = se3.log(se3.compose(T.to(torch.float64), se3.invert(calibration)))
     z = xi[0] / cov[0].double().diagonal().sqrt()
-    found = {"baseline_m": float(T.t.norm()), "off_deg": math.degrees(float(xi[0, :3].norm()))}
-    found |= {"off_m": float(xi[0, 3:].norm()), "sigma_m": float(cov[0, 3:, 3:].diagonal().sum().sqrt())}
-    found["sigma_deg"] = math.degrees(float(cov[0, :3, :3].diagonal().sum().sqrt()))
-    return found | {"deviation": float(covariance.mahalanobis(xi, cov.double())[0]), "z": z.tolist()}
+    record = {"baseline_m": float(T.t.norm()), "off_deg": math.degrees(float(xi[0, :3].norm()))}
+    record |= {"off_m": float(xi[0, 3:].norm()), "sigma_m": float(cov[0, 3:, 3:].diagonal().sum().sqrt())}
+    record["sigma_deg"] = math.degrees(float(cov[0, :3, :3].diagonal().sum().sqrt()))
+    return record | {"deviation": float(covariance.mahalanobis(xi, cov.double())[0]), "z": z.tolist()}
 
 
 def turned(R: Tensor) -> float:
@@ -127,7 +127,7 @@ def turned(R: Tensor) -> float:
     return math.degrees(float(se3.rotation_angle(R)[0]))
 
 
-def held_against(estimate: Any, samples: Any, whole: Frame, near: float | None) -> errors.Points:
+def evaluate(estimate: Any, samples: Any, whole: Frame, near: float | None) -> errors.Points:
     """The answers whose returns were held back."""
     truth = holdout.select_candidates(samples, holdout.sample_truth(whole, samples.uv), near)
     return errors.points_from_estimate(estimate, truth)
@@ -143,8 +143,8 @@ def answers(pairing: Pairing, pose: Pose | None, cov: Tensor | None, tracker: st
     for source, rigid in sources.items():
         trace: dict[str, Any] = {}
         estimate = method.replace(pose_prior=rigid)(reference, others, hint=pairing.rig.hint, trace=trace)
-        found = held_against(estimate, trace["samples"], whole, pairing.rig.near)
-        yield row(pairing, source, tracker, "space", len(pairing.references), int(trace["fit"].ok.sum()), [found])
+        points = evaluate(estimate, trace["samples"], whole, pairing.rig.near)
+        yield row(pairing, source, tracker, "space", len(pairing.references), int(trace["fit"].ok.sum()), [points])
 
 
 def calibrated(pairing: Pairing) -> ConstantPose:
@@ -157,7 +157,7 @@ def mixed(scene: Scene, name: str) -> dict[str, Any]:
     """A row ``answers`` of pairs in space and in time: of one instant before or after, in any camera, AUTO chooses."""
     rig = scene.recording
     assert isinstance(rig, Rig)
-    found, n_ok = [], 0
+    points_by_pair, n_ok = [], 0
     pairs = by_cameras(rig, instants=[0, 1], reference=rig.cameras[0], stride=2)
     for i, offered in pairs:
         whole = rig[i]
@@ -166,25 +166,27 @@ def mixed(scene: Scene, name: str) -> dict[str, Any]:
         trace: dict[str, Any] = {}
         estimate = AUTO(holdout.range_split(whole, scene.near), views, hint=scene.hint, trace=trace)
         samples = trace["samples"]
-        found.append(held_against(estimate, samples, whole, scene.near))
+        points_by_pair.append(evaluate(estimate, samples, whole, scene.near))
         n_ok += bool(estimate.keep.any())
     pairing = Pairing(name, scene, (), (), se3.identity(1, torch.zeros(1)))
-    return row(pairing, "near returns", "auto", "space and time", len(pairs), n_ok, found)
+    return row(pairing, "near returns", "auto", "space and time", len(pairs), n_ok, points_by_pair)
 
 
 def row(
-    pairing: Pairing, source: str, tracker: str, where: str, n: int, n_ok: int, found: list[errors.Points]
+    pairing: Pairing, source: str, tracker: str, where: str, n: int, n_ok: int, points_by_pair: list[errors.Points]
 ) -> dict[str, Any]:
     """A row ``answers``."""
-    parts = errors.measure_errors(collate_points(found))
+    parts = errors.measure_errors(collate_points(points_by_pair))
     kept = ("n_candidates", "coverage", "median_rel", "p90_rel", "within_sigma", "within_2sigma")
     head = {"kind": "answers", "rig": pairing.name, "pose": source, "tracker": tracker, "pairs": where, "n_pairs": n}
     return head | {"n_ok": n_ok} | {k: parts[k] for k in kept}
 
 
-def collate_points(found: list[errors.Points]) -> errors.Points:
+def collate_points(points_by_pair: list[errors.Points]) -> errors.Points:
     """Candidates of several pairs as one list."""
-    return errors.Points(*(torch.cat([getattr(p, f) for p in found]) for f in errors.Points.__dataclass_fields__))
+    return errors.Points(
+        *(torch.cat([getattr(p, f) for p in points_by_pair]) for f in errors.Points.__dataclass_fields__)
+    )
 
 
 def trackers() -> list[str]:
@@ -198,17 +200,17 @@ def main() -> int:
     parser.add_argument("--json", type=Path, required=True)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    found: list[Mapping[str, Any]] = []
+    records: list[Mapping[str, Any]] = []
     seen: set[int] = set()
     for pairing in pairings():
         for tracker in trackers():
-            said, T, cov = measured(pairing, tracker)
-            found += [said, *answers(pairing, T, cov, tracker)]
+            measurement, T, cov = measured(pairing, tracker)
+            records += [measurement, *answers(pairing, T, cov, tracker)]
         if isinstance(pairing.rig.recording, Rig) and id(pairing.rig.recording) not in seen:
             seen.add(id(pairing.rig.recording))
-            found.append(mixed(pairing.rig, pairing.name.rpartition(" ")[0]))
+            records.append(mixed(pairing.rig, pairing.name.rpartition(" ")[0]))
         print(pairing.name, flush=True)
-    storage.write_json(options.json, storage.to_strict_json(found))
+    storage.write_json(options.json, storage.to_strict_json(records))
     return 0
 
 

@@ -291,7 +291,7 @@ def scenes() -> list[Any]:
 
 def scene_cases(names: Sequence[str] | None, wanted: int) -> list[Case]:
     """Anchors of the shared scenes of these names, or of all."""
-    found = []
+    selected = []
     for scene in scenes():
         # Notes of a scene by position: recording, near limit, gap, levels.
         recording, near, gap, levels = (getattr(scene, field.name) for field in dataclasses.fields(scene)[:4])
@@ -299,8 +299,8 @@ def scene_cases(names: Sequence[str] | None, wanted: int) -> list[Case]:
             continue
         last = len(recording) - 1 - gap
         anchors = {last // 2} if wanted == 1 else {last // 3, last - last // 3}
-        found += [Case(f"{recording.name}[{k}]", recording, k, gap, near, levels) for k in sorted(anchors)]
-    return found
+        selected += [Case(f"{recording.name}[{k}]", recording, k, gap, near, levels) for k in sorted(anchors)]
+    return selected
 
 
 def sample() -> dict[str, Any]:
@@ -342,15 +342,15 @@ def items(quick: bool, data: bool) -> list[Item]:
     if data:
         cases += scene_cases(QUICK_SCENES if quick else None, 1 if quick else 2)
         on_maps += scene_cases(MAP_SCENES[:1] if quick else MAP_SCENES, 1)
-    found = [item for case in cases for item in method_items(case)]
-    found += [item for case in on_maps for item in map_items(case, quick)]
-    return found + room_items(small) + transform_items() + command_items(quick)
+    items = [item for case in cases for item in method_items(case)]
+    items += [item for case in on_maps for item in map_items(case, quick)]
+    return items + room_items(small) + transform_items() + command_items(quick)
 
 
 def method_items(case: Case) -> list[Item]:
     """The frames of a case, and every method on them."""
-    found: list[Item] = [(f"{case.name} frames", lambda: {"view": case.recording[case.anchor], "other": case.other})]
-    return found + [(f"{case.name} {name}", partial(run_method, case, name)) for name in METHODS]
+    items: list[Item] = [(f"{case.name} frames", lambda: {"view": case.recording[case.anchor], "other": case.other})]
+    return items + [(f"{case.name} {name}", partial(run_method, case, name)) for name in METHODS]
 
 
 def run_method(case: Case, name: str) -> Any:
@@ -365,21 +365,21 @@ def map_items(case: Case, quick: bool) -> list[Item]:
     """Completion, alignment and validation of depth maps."""
     size = 192 if quick else 320
     name, steps = case.name, {"size": size, "planes": 48}
-    found: list[Item] = [
+    items: list[Item] = [
         (f"{name} complete, pair", lambda: completed(case, "map", case.other, **steps)),
         (f"{name} complete, views", lambda: completed(case, "auto", case.between, **steps)),
         (f"{name} complete, sensor alone", lambda: call(resolve("sensor_depth_map"), case.view, size=size)),
     ]
     kinds = range(5) if case.name == "room" or (case.name.startswith(MAP_SCENES[0]) and not quick) else range(1)
-    found += [(f"{name} align, kind {k + 1}", partial(aligned, case, k)) for k in kinds]
+    items += [(f"{name} align, kind {k + 1}", partial(aligned, case, k)) for k in kinds]
     wrong = {"depth": 1.1 * case.depth, "size": size}
-    found += [
+    items += [
         (f"{name} validate, map", lambda: validated(case, case.between, **wrong)),
         (f"{name} validate, sensor", lambda: validated(case, case.between, depth=None, size=size)),
         (f"{name} validate, no other view", lambda: validated(case, None, **wrong)),
         (f"{name} validate, quick", lambda: validated(case, case.other, quick=True, views=False, **wrong)),
     ]
-    return found
+    return items
 
 
 def completed(case: Case, name: str, others: Any, **options: Any) -> Any:
@@ -412,13 +412,13 @@ def validated(case: Case, others: Any, *, depth: Tensor | None, quick: bool = Fa
 
 def room_items(case: Case) -> list[Item]:
     """Other ways to call a method: from settings, in a batch, with a pose from elsewhere, with a graph."""
-    found: list[Item] = []
+    items: list[Item] = []
     for name in ("paper", "map", "window", "auto"):
         others = case.other if name in ("paper", "map") else case.between
-        found.append((f"room {name} from settings", partial(from_settings, case, name, others)))
-    found += [(f"room {name}, batch of 2", partial(batch_of_two, case, name)) for name in ("paper", "map")]
-    found += [(f"room map, {key}", partial(with_pose, case, key)) for key in ("pose_prior", "initial_pose")]
-    return [*found, ("room map, gradient", partial(gradient, case))]
+        items.append((f"room {name} from settings", partial(from_settings, case, name, others)))
+    items += [(f"room {name}, batch of 2", partial(batch_of_two, case, name)) for name in ("paper", "map")]
+    items += [(f"room map, {key}", partial(with_pose, case, key)) for key in ("pose_prior", "initial_pose")]
+    return [*items, ("room map, gradient", partial(gradient, case))]
 
 
 def from_settings(case: Case, name: str, others: Any) -> Any:
@@ -467,11 +467,11 @@ def transform_items() -> list[Item]:
         "two views, dense": {"method": "map", "other_image": "before", "dense": small},
         "three views": several,
     }
-    found: list[Item] = [(f"ExtendDepth, {name}", partial(extended, **o)) for name, o in options.items()]
-    found.append(("ExtendDepth, batch", lambda: extended(batched=True)))
+    items: list[Item] = [(f"ExtendDepth, {name}", partial(extended, **o)) for name, o in options.items()]
+    items.append(("ExtendDepth, batch", lambda: extended(batched=True)))
     for name, o in {"sensor": {}, "map": {"map": "map"}, "two views": {"map": "map", "other_image": "before"}}.items():
-        found.append((f"ValidateDepth, {name}", partial(checked, **o)))
-    return found
+        items.append((f"ValidateDepth, {name}", partial(checked, **o)))
+    return items
 
 
 def extended(**options: Any) -> Any:
@@ -492,17 +492,17 @@ def two_of(sample: Mapping[str, Any]) -> dict[str, Any]:
     return {key: torch.from_numpy(np.stack([value, value])) for key, value in sample.items()}
 
 
-def _added(transform: Callable[[Any], Any], given: Mapping[str, Any]) -> dict[str, Any]:
+def _added(transform: Callable[[Any], Any], sample: Mapping[str, Any]) -> dict[str, Any]:
     """The keys that a transform adds."""
-    return {key: value for key, value in transform(given).items() if key not in given}
+    return {key: value for key, value in transform(sample).items() if key not in sample}
 
 
 def command_items(quick: bool) -> list[Item]:
     """Files that the command writes."""
-    found: list[Item] = [("extract, map", lambda: shard("method=map"))]
+    items: list[Item] = [("extract, map", lambda: shard("method=map"))]
     if not quick:
-        found.append(("extract, auto, dense", lambda: shard("method=auto", "extract.dense={size: 96}")))
-    return found
+        items.append(("extract, auto, dense", lambda: shard("method=auto", "extract.dense={size: 96}")))
+    return items
 
 
 def shard(*words: str) -> dict[str, Any]:
@@ -511,10 +511,10 @@ def shard(*words: str) -> dict[str, Any]:
 
     with tempfile.TemporaryDirectory() as folder:
         shown = ["data=synthetic", "data.n_frames=4", "data.hw=[120,160]", "data.depth_hw=[48,64]", "method.n=256"]
-        asked = [sys.executable, "-m", "dhtorch", "extract", *shown, *words, f"out={folder}"]
-        done = subprocess.run(asked, capture_output=True, text=True, check=False)
+        command = [sys.executable, "-m", "dhtorch", "extract", *shown, *words, f"out={folder}"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
-            raise RuntimeError(f"{shlex.join(asked)}: exit code {done.returncode}, {done.stderr.strip()[-500:]}")
+            raise RuntimeError(f"{shlex.join(command)}: exit code {done.returncode}, {done.stderr.strip()[-500:]}")
         tables = [parquet.read_table(file) for file in sorted(Path(folder).glob("*.parquet"))]
     return {name: [_column(table[name]) for table in tables] for name in tables[0].column_names}
 
@@ -581,30 +581,30 @@ def dump(path: Path, quick: bool, threads: int, only: str, data: bool) -> None:
         raise RuntimeError(f"found {dhtorch.__file__}, expected a file below {Path.cwd()}")
     torch.set_num_threads(threads)
     cv2.setNumThreads(threads)
-    found: dict[str, Any] = {}
+    rows: dict[str, Any] = {}
     values: dict[str, np.ndarray] = {}
     with torch.no_grad():
         for name, compute in items(quick, data):
             if only in name:
                 began = time.perf_counter()
-                found[name] = measured(compute, values)
+                rows[name] = measured(compute, values)
                 print(f"  {name}: {time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True)
     loaded = any("dhtorch" in Path(file).name for file in torch.ops.loaded_libraries)
     np.savez(path.with_suffix(".npz"), **values)  # type: ignore[arg-type]
-    path.write_text(json.dumps({"loaded": loaded, "items": found}), encoding="utf-8")
+    path.write_text(json.dumps({"loaded": loaded, "items": rows}), encoding="utf-8")
 
 
 def measured(compute: Callable[[], Any], values: dict[str, np.ndarray]) -> list[Leaf] | str:
     """The reduced tensors of an item, their values added by digest; the error where there is one."""
-    found = []
+    leaves = []
     try:
         for label, tensor in leaves(compute()):
             leaf, kept = reduced(label, tensor)
             values.setdefault(leaf.digest, kept)
-            found.append(leaf)
+            leaves.append(leaf)
     except Exception as error:
         return f"{type(error).__name__}: {error}"
-    return found if found else "no tensor"
+    return leaves if leaves else "no tensor"
 
 
 # ---------------------------------------------------------------------------------------------------- both checkouts
@@ -620,9 +620,9 @@ class Dump(NamedTuple):
     @classmethod
     def read(cls, path: Path) -> Dump:
         """The contents of the files that :func:`dump` wrote."""
-        found = json.loads(path.read_text(encoding="utf-8"))
-        rows = {name: x if isinstance(x, str) else [Leaf(*leaf) for leaf in x] for name, x in found["items"].items()}
-        return cls(found["loaded"], rows, np.load(path.with_suffix(".npz")))
+        content = json.loads(path.read_text(encoding="utf-8"))
+        rows = {name: x if isinstance(x, str) else [Leaf(*leaf) for leaf in x] for name, x in content["items"].items()}
+        return cls(content["loaded"], rows, np.load(path.with_suffix(".npz")))
 
 
 def environment(checkout: Path, mode: str, threads: int) -> dict[str, str]:
@@ -663,9 +663,9 @@ def run(checkout: Path, mode: str, path: Path, options: argparse.Namespace) -> N
     """
     words = [sys.executable, "-P", str(Path(__file__).resolve()), ".", ".", "--dump", str(path)]
     words += ["--threads", str(options.threads), "--only", options.only, *["--quick"] * options.quick]
-    told = None if options.verbose else subprocess.PIPE
+    stderr = None if options.verbose else subprocess.PIPE
     env = environment(checkout, mode, options.threads)
-    done = subprocess.run(words, cwd=checkout, env=env, stderr=told, text=True, check=False)
+    done = subprocess.run(words, cwd=checkout, env=env, stderr=stderr, text=True, check=False)
     if done.returncode:
         raise RuntimeError(f"{checkout}, {mode}: exit code {done.returncode}\n{(done.stderr or '').strip()[-2000:]}")
 
@@ -682,14 +682,14 @@ def state(checkout: Path) -> str:
             return commit.stdout.strip()
     files = sorted(path for part in ("dhtorch", "conf") for path in (checkout / part).rglob("*") if path.is_file())
     stats = [(str(path), path.stat()) for path in files if "__pycache__" not in path.parts]
-    return "\n".join(f"{path} {found.st_size} {found.st_mtime_ns}" for path, found in stats)
+    return "\n".join(f"{path} {stat.st_size} {stat.st_mtime_ns}" for path, stat in stats)
 
 
 def cache_key(checkout: Path, mode: str, options: argparse.Namespace) -> str:
     """The name of a cached result: it depends on the code, this script, the machine, and what is asked."""
     machine = (torch.__version__, platform.platform(), torch.backends.cpu.get_cpu_capability())
-    asked = (mode, options.quick, options.threads, options.only, os.environ.get("DHTORCH_DATA"))
-    parts = (state(checkout), Path(__file__).read_text(encoding="utf-8"), *machine, *asked)
+    request = (mode, options.quick, options.threads, options.only, os.environ.get("DHTORCH_DATA"))
+    parts = (state(checkout), Path(__file__).read_text(encoding="utf-8"), *machine, *request)
     return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:24]
 
 
@@ -702,10 +702,10 @@ def obtained(task: tuple[str, str], folder: Path, temporary: Path, options: argp
     began, known = time.perf_counter(), path.is_file()
     if not known:
         run(checkout, mode, path, options)
-    found = Dump.read(path)
+    dump = Dump.read(path)
     took = "from the cache" if known else f"{time.perf_counter() - began:.0f} s"
-    print(f"{role} {mode}: {len(found.items)} items, {took}", file=sys.stderr, flush=True)
-    return found
+    print(f"{role} {mode}: {len(dump.items)} items, {took}", file=sys.stderr, flush=True)
+    return dump
 
 
 # --------------------------------------------------------------------------------------------------------- comparison
@@ -751,9 +751,9 @@ def outcome(name: str, old: Dump, new: Dump) -> tuple[int, str]:
         return 0, "; ".join(f"{role}: {x}" for role, x in wrong.items())
     pairs, complaints = matched(a, b)
     differing = [(x, y) for x, y in pairs if x.digest != y.digest]
-    told = [difference(x, y, old, new) for x, y in differing[:NAMED]] + complaints[:NAMED]
-    more = len(differing) + len(complaints) - len(told)
-    return len(b), ", ".join(told) + (f" and {more} more" if more else "")
+    shown = [difference(x, y, old, new) for x, y in differing[:NAMED]] + complaints[:NAMED]
+    more = len(differing) + len(complaints) - len(shown)
+    return len(b), ", ".join(shown) + (f" and {more} more" if more else "")
 
 
 def compare(mode: str, old: Dump, new: Dump) -> tuple[int, int]:

@@ -60,22 +60,22 @@ def series(full: bool) -> dict[str, list[tuple[int, Callable[[], Any]]]]:
     """Calls by name of what grows, each with its size."""
     reference, other = views(1)
     doublings = range(5 if full else 4)
-    found: dict[str, list[tuple[int, Callable[[], Any]]]] = {}
+    calls: dict[str, list[tuple[int, Callable[[], Any]]]] = {}
     for method in ("paper", "map"):
         pair = partial(METHODS[method], reference, other)
-        found[f"{method}.samples"] = [(512 << k, partial(pair, n=512 << k)) for k in doublings]
+        calls[f"{method}.samples"] = [(512 << k, partial(pair, n=512 << k)) for k in doublings]
         pairs = [partial(METHODS[method], repeated(reference, 1 << k), repeated(other, 1 << k)) for k in doublings]
-        found[f"{method}.pairs"] = [(1 << k, partial(p, n=512)) for k, p in zip(doublings, pairs, strict=True)]
+        calls[f"{method}.pairs"] = [(1 << k, partial(p, n=512)) for k, p in zip(doublings, pairs, strict=True)]
     samples, tracks, camera, _ = pnp.scene(16, 500, 0.3, seed=1)
     stage = partial(pnp_ransac, samples, tracks, camera, camera)
-    found["pose.hypotheses"] = [(128 << k, partial(stage, uniform_draws(0, 16, 128 << k))) for k in doublings]
+    calls["pose.hypotheses"] = [(128 << k, partial(stage, uniform_draws(0, 16, 128 << k))) for k in doublings]
     sizes = [(120, 160), (240, 160), (240, 320), (480, 320), (480, 640)][-len(doublings) :]
     shown = [(hw, partial(METHODS["paper"], resized(reference, hw), resized(other, hw), n=512)) for hw in sizes]
-    found["paper.pixels"] = [(hw[0] * hw[1], call) for hw, call in shown]
+    calls["paper.pixels"] = [(hw[0] * hw[1], call) for hw, call in shown]
     counts = [1 << k for k in doublings]
     windows = [partial(PAPER.replace(views=v), reference, pytree.stack(views(v)[1:]), n=512) for v in counts]
-    found["window.views"] = [*zip(counts, windows, strict=True)]
-    return found
+    calls["window.views"] = [*zip(counts, windows, strict=True)]
+    return calls
 
 
 def small_calls() -> None:
@@ -103,10 +103,10 @@ def measure(name: str, calls: list[tuple[int, Callable[[], Any]]], options: Any)
     memory = [peak_mib(calls[k][1], small_calls) or math.nan for k in (0, -1)]
     middles = [statistics.median(t) for t in times]
     grows = [exponent(sizes, middles), exponent([sizes[0], sizes[-1]], memory)]
-    said = ", ".join(f"{size}: {ms:.1f} ms" for size, ms in zip(sizes, middles, strict=True))
+    times_text = ", ".join(f"{size}: {ms:.1f} ms" for size, ms in zip(sizes, middles, strict=True))
     verdict = "" if max(grows) <= MOST else f"   above {MOST}!"
     print(f"{name:18} time ^ {grows[0]:.2f}, memory ^ {grows[1]:.2f}{verdict}", flush=True)
-    print(f"{'':18} {said}; {memory[0]:.0f} to {memory[1]:.0f} MiB", flush=True)
+    print(f"{'':18} {times_text}; {memory[0]:.0f} to {memory[1]:.0f} MiB", flush=True)
     rows = []
     for k in range(1, len(sizes)):
         last = k == len(sizes) - 1

@@ -94,14 +94,14 @@ def on(file: str, shown: str) -> str:
 def code(rows: list[dict[str, Any]]) -> str:
     """In words, which commit's code was measured."""
     commits = {r.get("git") for r in rows}
-    said = [f"code of {commit}" for commit in sorted(commit for commit in commits if commit)]
-    return "; " + " and ".join(said + ["code of an earlier commit, not noted"] * (None in commits))
+    versions = [f"code of {commit}" for commit in sorted(commit for commit in commits if commit)]
+    return "; " + " and ".join(versions + ["code of an earlier commit, not noted"] * (None in commits))
 
 
 def _barred(file: str, name: str, mode: str) -> dict[str, Any] | None:
     """The row of one thread that a bar is about; of several peers the one that it names."""
-    found = [r for r in timings(file) if (r["name"], r["mode"], r["threads"]) == (name, mode, 1)]
-    return next((r for r in found if r["bar"]), found[0] if found else None)
+    matching = [r for r in timings(file) if (r["name"], r["mode"], r["threads"]) == (name, mode, 1)]
+    return next((r for r in matching if r["bar"]), matching[0] if matching else None)
 
 
 def bars() -> str:

@@ -22,7 +22,7 @@ from typing import Any
 import harness
 
 #: What is run, by row, and what it is compared with.
-ASKED = {
+START_MODES = {
     "start_import": "import dhtorch",
     "start_extend": "from dhtorch import extend",
     "start_names": "from dhtorch import *",
@@ -61,7 +61,7 @@ def took(code: str, clock: str, **environment: str) -> float:
 
 def measure(options: Any) -> list[dict[str, Any]]:
     """A row for each thing asked, all of them in turn after one round that fills the caches of files."""
-    codes = {**ASKED, "": PEER}
+    codes = {**START_MODES, "": PEER}
     for code in codes.values():
         took(code, options.clock)
     times: dict[str, list[float]] = {name: [] for name in codes}

@@ -78,19 +78,19 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
         if k >= 0:
             stream.past.append(view(k))
     trace: dict[str, Any] = {}
-    held = list(stream.past)
+    past = list(stream.past)
 
     def push() -> None:
         stream.past.clear()
-        stream.past.extend(held)
+        stream.past.extend(past)
         stream.push(view(i), trace=trace)
 
     push()
-    asked = [view(i - s) for s in trace["back"][:, 0].tolist()]
+    source_frames = [view(i - s) for s in trace["back"][:, 0].tolist()]
 
     def peer() -> None:
         with torch.no_grad():
-            for other in asked:
+            for other in source_frames:
                 PEER(view(i), other, n=1024)
 
     ours, theirs = harness.in_turn([push, peer], repeats=options.repeats, clock=options.clock)

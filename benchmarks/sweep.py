@@ -26,10 +26,10 @@ COLUMNS = ("coverage", "median_rel", "p90_rel", "coverage_at_5")
 def row(folder: Path) -> dict[str, Any]:
     """The numbers of one job."""
     result = result_files.read_result(folder)
-    (found,) = (r for r in result["rows"] if r["pair"] is None and r["truth"] == "full")
-    told = {"method": found["method"], "method.n": result["config"]["method"]["n"]}
-    made = {"overrides": told, **{key: found[key] for key in COLUMNS}, "ms": sum(found["ms"].values())}
-    return made | {"processor": result["meta"]["processor"]}
+    (scene_row,) = (r for r in result["rows"] if r["pair"] is None and r["truth"] == "full")
+    overrides = {"method": scene_row["method"], "method.n": result["config"]["method"]["n"]}
+    row = {"overrides": overrides, **{key: scene_row[key] for key in COLUMNS}, "ms": sum(scene_row["ms"].values())}
+    return row | {"processor": result["meta"]["processor"]}
 
 
 def main() -> int:

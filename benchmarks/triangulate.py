@@ -66,8 +66,8 @@ def measure(n: int, options: Any, compile_too: bool) -> list[dict[str, Any]]:
     calls["opencv"] = opencv
     if n <= KORNIA_POINTS:
         calls["kornia"] = lambda: kornia_epipolar.triangulate_points(P_0, P_1, uv_0, uv_1)[..., 2]
-    found = harness.in_turn([*calls.values()], repeats=options.repeats, clock=options.clock, warm_up=2)
-    times = dict(zip(calls, found, strict=True))
+    durations = harness.in_turn([*calls.values()], repeats=options.repeats, clock=options.clock, warm_up=2)
+    times = dict(zip(calls, durations, strict=True))
     error = {name: ((call() - truth).abs() / truth).median().item() for name, call in calls.items()}
     name = f"triangulate_{n // 1000}k" if n < 1_000_000 else f"triangulate_{n // 1_000_000}M"
     rows = []

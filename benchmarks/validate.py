@@ -36,20 +36,20 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
     def check() -> None:
         trace: dict[str, Any] = {}
         with torch.no_grad():
-            asked = dense.selected_views(METHOD(near, other, trace=trace), other, trace)
-            photometric.photometric_difference(reference.depth, near, asked)
+            selected = dense.selected_views(METHOD(near, other, trace=trace), other, trace)
+            photometric.photometric_difference(reference.depth, near, selected)
 
     def ours(method: Method, views: bool) -> None:
         validate_depth(reference.depth, near, other, method=method, views=views)
 
-    asked = {"sparse": (QUICK_METHOD, False), "sparse_512": (METHOD, False), "views": (METHOD, True)}
+    variants = {"sparse": (QUICK_METHOD, False), "sparse_512": (METHOD, False), "views": (METHOD, True)}
     modes = {"eager": ours, "compiled": harness.with_compiled_operators()(ours)}
-    sides = [(name, mode) for mode in modes for name in asked]
-    calls = [*(partial(modes[mode], *asked[name]) for name, mode in sides), check]
-    *found, peer = harness.in_turn(calls, repeats=options.repeats, clock=options.clock, least_ms=1000.0)
+    sides = [(name, mode) for mode in modes for name in variants]
+    calls = [*(partial(modes[mode], *variants[name]) for name, mode in sides), check]
+    *durations, peer = harness.in_turn(calls, repeats=options.repeats, clock=options.clock, least_ms=1000.0)
     return [
-        harness.row(f"validate_{name}", times, "photometric", peer, n=asked[name][0].n, mode=mode)
-        for (name, mode), times in zip(sides, found, strict=True)
+        harness.row(f"validate_{name}", times, "photometric", peer, n=variants[name][0].n, mode=mode)
+        for (name, mode), times in zip(sides, durations, strict=True)
     ]
 
 

@@ -44,18 +44,18 @@ def rows(path: Path, options: tuple[str, ...], folder: Path) -> list[dict[str, A
     """What is said of the recordings of a capture."""
     words = [sys.executable, "-m", "dhtorch", "validate", str(path), f"output={folder}", "pictures=30", *options]
     subprocess.run(words, check=True, cwd=folder)
-    found = []
+    records = []
     for file in sorted(folder.rglob("validate.json")):
-        said = json.loads(file.read_text())
+        report = json.loads(file.read_text())
         row = {
-            "recording": said["scene"],
+            "recording": report["scene"],
             "options": list(options),
             "processor": result_files.describe_processor(),
         }
-        row |= {"intrinsics_guessed": said["intrinsics_guessed"], "whole": said["whole"]}
-        row |= {"windows": [{k: w[k] for k in ("frames", "cause", "pairs")} for w in said["windows"]]}
-        found.append(row | {"frames": [{k: frame[k] for k in OF_FRAME} for frame in said["frames"]]})
-    return found
+        row |= {"intrinsics_guessed": report["intrinsics_guessed"], "whole": report["whole"]}
+        row |= {"windows": [{k: w[k] for k in ("frames", "cause", "pairs")} for w in report["windows"]]}
+        records.append(row | {"frames": [{k: frame[k] for k in OF_FRAME} for frame in report["frames"]]})
+    return records
 
 
 def main() -> int:
@@ -65,13 +65,13 @@ def main() -> int:
     parser.add_argument("--pages", type=Path, help="folder that keeps the pages; none = they are not kept")
     options = parser.parse_args()
     data = Path(os.environ["DHTORCH_DATA"])
-    found: list[dict[str, Any]] = []
+    records: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as scratch:
-        for name, asked in CAPTURES.items():
+        for name, arguments in CAPTURES.items():
             folder = Path(options.pages or scratch).resolve() / name
             folder.mkdir(parents=True, exist_ok=True)
-            found += [{"name": name} | row for row in rows(data / name, asked, folder)]
-    storage.write_json(options.json, storage.to_strict_json(found))
+            records += [{"name": name} | row for row in rows(data / name, arguments, folder)]
+    storage.write_json(options.json, storage.to_strict_json(records))
     return 0
 
 

@@ -64,7 +64,7 @@ def matches(seeds: tuple[int, ...]) -> dict[str, Tensor]:
     """Errors in cells, similarities and spreads of the valid matches in the rooms of these seeds."""
     draw = torch.Generator().manual_seed(0)
     net = xfeat.load_xfeat()
-    found: dict[str, list[Tensor]] = {"error": [], "similarity": [], "spread": []}
+    matches: dict[str, list[Tensor]] = {"error": [], "similarity": [], "spread": []}
     for seed in seeds:
         for path in PATHS:
             room = SyntheticRoom(seed=seed, path=path, n_frames=max(GAPS) + 1, supersample=1)
@@ -76,31 +76,31 @@ def matches(seeds: tuple[int, ...]) -> dict[str, Tensor]:
                 match = xfeat.search_matches(a, b, uv[0], SHARPNESS)
                 there, known = truth(room, 0, gap, uv)
                 use = (known & tracks.valid)[0]
-                found["error"].append(((tracks.uv_1 - there)[0] * torch.tensor(b.gain))[use])
-                found["similarity"].append(match.similarity[use])
-                found["spread"].append(match.spread[use])
-    return {k: torch.cat(v).double() for k, v in found.items()}
+                matches["error"].append(((tracks.uv_1 - there)[0] * torch.tensor(b.gain))[use])
+                matches["similarity"].append(match.similarity[use])
+                matches["spread"].append(match.spread[use])
+    return {k: torch.cat(v).double() for k, v in matches.items()}
 
 
-def squares(found: dict[str, Tensor], gain: float, unlike: float) -> Tensor:
+def squares(matches: dict[str, Tensor], gain: float, unlike: float) -> Tensor:
     """Squared errors (M,) in units of what :func:`xfeat.noise` states."""
-    cov = xfeat.match_covariance(found["similarity"], found["spread"], gain=gain, unlike=unlike)
-    return (found["error"] * torch.linalg.solve(cov, found["error"])).sum(-1)
+    cov = xfeat.match_covariance(matches["similarity"], matches["spread"], gain=gain, unlike=unlike)
+    return (matches["error"] * torch.linalg.solve(cov, matches["error"])).sum(-1)
 
 
-def fit(found: dict[str, Tensor]) -> tuple[float, float]:
+def fit(matches: dict[str, Tensor]) -> tuple[float, float]:
     """``GAIN`` and ``UNLIKE`` of matches that are no more than a cell off."""
-    noise = found["error"].square().sum(-1) < 1
-    y = squares(found, 1.0, 0.0)[noise].clamp_min(1e-12).log() - MEAN_LOG
-    x = 1 - found["similarity"][noise]
+    noise = matches["error"].square().sum(-1) < 1
+    y = squares(matches, 1.0, 0.0)[noise].clamp_min(1e-12).log() - MEAN_LOG
+    x = 1 - matches["similarity"][noise]
     slope = ((x - x.mean()) * y).sum() / (x - x.mean()).square().sum()
     return float((y.mean() - slope * x.mean()).exp()), float(slope)
 
 
-def worth(found: dict[str, Tensor], gain: float, unlike: float) -> dict[str, float]:
+def consistency(matches: dict[str, Tensor], gain: float, unlike: float) -> dict[str, float]:
     """What the constants are worth on some matches."""
-    d = squares(found, gain, unlike)
-    away = found["error"].square().sum(-1).sqrt()
+    d = squares(matches, gain, unlike)
+    away = matches["error"].square().sum(-1).sqrt()
     return {
         "n": len(d),
         "median_error_cells": float(away.median()),
@@ -124,12 +124,12 @@ def main() -> int:
     rooms = {"paths": PATHS, "gaps": GAPS}
     rows = [
         {"name": "constants", "gain": gain, "unlike": unlike, "expected": EXPECTED},
-        {"name": "fitted", "seeds": FITTED, **rooms, **worth(fitted, gain, unlike)},
-        {"name": "tested", "seeds": TESTED, **rooms, **worth(tested, gain, unlike)},
+        {"name": "fitted", "seeds": FITTED, **rooms, **consistency(fitted, gain, unlike)},
+        {"name": "tested", "seeds": TESTED, **rooms, **consistency(tested, gain, unlike)},
     ]
     for k, (low, high) in enumerate(pairwise([0.0, *limits.tolist(), 1.0])):
         some = {name: v[third == k] for name, v in tested.items()}
-        rows.append({"name": "tested", "similarity": (low, high), **worth(some, gain, unlike)})
+        rows.append({"name": "tested", "similarity": (low, high), **consistency(some, gain, unlike)})
     text = json.dumps(rows, indent=1)
     print(text)
     if path is not None:

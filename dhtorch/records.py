@@ -197,7 +197,7 @@ class Estimate(Record):
         return self.gate == Gate.ANSWER
 
     @classmethod
-    def silent(cls, samples: Samples, gate: int, *, n_views: int) -> Estimate:
+    def unanswered(cls, samples: Samples, gate: int, *, n_views: int) -> Estimate:
         """An estimate in which every sample is unanswered, rejected by the same gate."""
         nan = torch.full_like(samples.depth, torch.nan)
         zero = torch.zeros_like(samples.depth)

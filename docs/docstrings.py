@@ -57,8 +57,8 @@ def _lines(obj: Any) -> list[str]:
 def _comment_of(obj: Any) -> str:
     """What stands behind a field or a constant, or above it as ``#:``."""
     lines = _lines(obj)
-    if lines and (found := _COMMENT.search(_without_strings(lines[-1]))):
-        return lines[-1][found.start("text") :].strip()
+    if lines and (match := _COMMENT.search(_without_strings(lines[-1]))):
+        return lines[-1][match.start("text") :].strip()
     whole, above = obj.lines_collection[obj.filepath], []
     for line in reversed(whole[: (obj.lineno or 1) - 1]):
         if not line.strip().startswith("#:"):
@@ -75,9 +75,9 @@ def _note_shapes(function: Any) -> None:
         if '"""' in line:
             break
         opens = re.match(r"\s*(\w+)\s*[:=,]", line)
-        found = _COMMENT.search(_without_strings(line))
-        if opens and found and opens[1] in names:
-            shapes[opens[1]] = found["text"].strip()
+        match = _COMMENT.search(_without_strings(line))
+        if opens and match and opens[1] in names:
+            shapes[opens[1]] = match["text"].strip()
     if not shapes or function.docstring is None:
         return
     text = function.docstring.value

@@ -41,7 +41,7 @@ from dhtorch.viz.plots import colours as palette  # noqa: E402
 WORDS = ("", "inspect", "report", "complete", "align", "validate", "extract", "integrate", "stream", "view")
 
 _MARK = re.compile(r"^<!-- .*? -->\n", re.M)
-_ASKED = re.compile(
+_QUESTION = re.compile(
     r"Question: (?P<question>.*?\?)(?P<idea>.*?)(?P<when>Expectation[^:]*): (?P<expectation>.*)"
     r"What would refute it: (?P<refutation>.*)",
     re.S,
@@ -79,7 +79,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     return _MARK.sub("", markdown)
 
 
-def made(mark: str) -> str:
+def generate(mark: str) -> str:
     """What stands under ``<!-- make: name argument -->``.
 
     Raises:
@@ -96,11 +96,11 @@ def made(mark: str) -> str:
 
 def origin() -> str:
     """Web address of the repository that this clone came from; nothing where there is none."""
-    asked = ["git", "-C", str(REPO), "remote", "get-url", "origin"]
+    command = ["git", "-C", str(REPO), "remote", "get-url", "origin"]
     with contextlib.suppress(OSError):
-        said = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip().removesuffix(".git")
-        said = re.sub(r"^(?:ssh://)?git@([^:/]+)[:/]", r"https://\1/", said)
-        return said if said.startswith("https://") else ""
+        url = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip().removesuffix(".git")
+        url = re.sub(r"^(?:ssh://)?git@([^:/]+)[:/]", r"https://\1/", url)
+        return url if url.startswith("https://") else ""
     return ""
 
 
@@ -112,10 +112,10 @@ def notebooks() -> list[Path]:
 def notebook_title(path: Path) -> str:
     """The first heading of a notebook."""
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
-    found = re.search(
+    heading = re.search(
         r"^# +(.+)$", "\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown"), re.M
     )
-    return found[1] if found else path.stem
+    return heading[1] if heading else path.stem
 
 
 def article(path: Path) -> tuple[str, dict[str, bytes]]:
@@ -137,9 +137,9 @@ def article(path: Path) -> tuple[str, dict[str, bytes]]:
                 pictures[name] = base64.b64decode("".join(data["image/png"]))
                 parts.append(f"![A figure of this article]({name})")
                 continue
-            said = data.get("text/markdown") or data.get("text/html")
+            text = data.get("text/markdown") or data.get("text/html")
             plain = "".join(data.get("text/plain", output.get("text", ""))).rstrip()
-            parts.append("".join(said) if said else f"```text\n{plain}\n```" if plain else "")
+            parts.append("".join(text) if text else f"```text\n{plain}\n```" if plain else "")
     return "\n\n".join(parts), pictures
 
 
@@ -148,8 +148,8 @@ def article(path: Path) -> tuple[str, dict[str, bytes]]:
 
 def parts() -> list[str]:
     """Modules and packages of dhtorch, by name."""
-    found = {p.stem for p in PACKAGE.glob("*.py")} | {p.parent.name for p in PACKAGE.glob("*/__init__.py")}
-    return sorted(found - {"__init__", "__main__"})
+    modules = {p.stem for p in PACKAGE.glob("*.py")} | {p.parent.name for p in PACKAGE.glob("*/__init__.py")}
+    return sorted(modules - {"__init__", "__main__"})
 
 
 def api_page(part: str) -> str:
@@ -287,17 +287,17 @@ def sample_columns() -> str:
     return "\n".join(rows)
 
 
-def asked() -> dict[str, dict[str, str]]:
+def questions() -> dict[str, dict[str, str]]:
     """Experiment → question, idea, expectation and refutation, as its docstring has them."""
-    found = {}
+    by_experiment = {}
     for file in sorted((PACKAGE / "experiments").rglob("*.py"), key=lambda p: p.stem):
         text = ast.get_docstring(_tree(file)) or ""
         if text.startswith("Question:"):
-            said = _ASKED.fullmatch(text)
-            if not said:
+            match = _QUESTION.fullmatch(text)
+            if not match:
                 raise ValueError(f"{file}: expected a question, an expectation and what would refute it")
-            found[file.stem] = {k: v.strip() for k, v in said.groupdict().items()} | {"module": _dotted(file)}
-    return found
+            by_experiment[file.stem] = {k: v.strip() for k, v in match.groupdict().items()} | {"module": _dotted(file)}
+    return by_experiment
 
 
 def experiments() -> str:
@@ -307,15 +307,15 @@ def experiments() -> str:
         answer = f"{result['verdict']} on {result['data']['name']} (`{name}`)"
         answers.setdefault(result["experiment"], []).append(answer)
     rows, texts = ["| experiment | question | archived answers |", "| :-- | :-- | :-- |"], []
-    for name, said in asked().items():
-        question = said["question"][0].upper() + " ".join(said["question"][1:].split())
+    for name, fields in questions().items():
+        question = fields["question"][0].upper() + " ".join(fields["question"][1:].split())
         answer = "; ".join(answers.get(name, ["none"]))
         rows.append(f"| [`{name}`](#{name}) | {question} | {answer} |")
-        idea = f"{said['idea']}\n\n" if said["idea"] else ""
+        idea = f"{fields['idea']}\n\n" if fields["idea"] else ""
         texts.append(
-            f"## {name}\n\n**{question}**\n\n{idea}**{said['when']}.** {said['expectation']}\n\n"
-            f"**What would refute it.** {said['refutation']}\n\nArchived answers: {answer}. "
-            f"Code: [`{said['module']}`][{said['module']}]."
+            f"## {name}\n\n**{question}**\n\n{idea}**{fields['when']}.** {fields['expectation']}\n\n"
+            f"**What would refute it.** {fields['refutation']}\n\nArchived answers: {answer}. "
+            f"Code: [`{fields['module']}`][{fields['module']}]."
         )
     return "\n".join(rows) + "\n\n" + as_markdown("\n\n".join(texts))
 
@@ -323,12 +323,12 @@ def experiments() -> str:
 @cache
 def archived() -> dict[str, dict[str, Any]]:
     """Result files that answer a question: name → result."""
-    found = {}
+    results = {}
     for file in sorted((REPO / "benchmarks" / "results").glob("*.json")):
         result = json.loads(file.read_text(encoding="utf-8"))
         if isinstance(result, dict) and result.get("verdict"):
-            found[file.stem] = result
-    return found
+            results[file.stem] = result
+    return results
 
 
 def helps() -> str:
@@ -339,13 +339,13 @@ def helps() -> str:
 
 def help_of(word: str) -> str:
     """What ``dhtorch WORD --help`` prints."""
-    said, before = io.StringIO(), sys.argv
-    with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
+    stdout, before = io.StringIO(), sys.argv
+    with contextlib.redirect_stdout(stdout), contextlib.suppress(SystemExit):
         try:
             run.main([*([word] if word else []), "--help"])
         finally:
             sys.argv = before
-    return said.getvalue().strip("\n")
+    return stdout.getvalue().strip("\n")
 
 
 def exit_codes() -> str:

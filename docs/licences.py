@@ -74,14 +74,14 @@ TOOLS = {"plyfile": "GPL-3.0-or-later"}
 def requirements() -> dict[str, list[str]]:
     """Package → where it is asked for: ``dhtorch`` itself and the extras, in the order of ``pyproject.toml``."""
     project = tomllib.loads((REPO / "pyproject.toml").read_text())["project"]
-    found: dict[str, list[str]] = {}
+    groups_by_name: dict[str, list[str]] = {}
     groups = {"dhtorch": project["dependencies"], **project["optional-dependencies"]}
     for group, wanted in groups.items():
         for requirement in wanted:
             name = re.split(r"[\s\[<>=!~;]", requirement, maxsplit=1)[0]
             if name != "dhtorch":
-                found.setdefault(name, []).append(group)
-    return found
+                groups_by_name.setdefault(name, []).append(group)
+    return groups_by_name
 
 
 def licence(package: str) -> str | None:
@@ -112,8 +112,8 @@ def table() -> str:
     """A Markdown table of all direct dependencies."""
     rows = ["| package | asked for by | licence | |", "| :-- | :-- | :-- | :-- |"]
     for package, groups in sorted(requirements().items(), key=lambda item: item[0].lower()):
-        asked = ", ".join(group if group == "dhtorch" else f"`[{group}]`" for group in groups)
-        rows.append(f"| {package} | {asked} | {licence(package) or 'unknown'} | {REMARKS.get(package, '')} |")
+        extras = ", ".join(group if group == "dhtorch" else f"`[{group}]`" for group in groups)
+        rows.append(f"| {package} | {extras} | {licence(package) or 'unknown'} | {REMARKS.get(package, '')} |")
     return "\n".join(rows)
 
 

@@ -74,9 +74,9 @@ def triptych(path: Path) -> None:
     whole = recording[FRAME]
     near = range_split(whole, CUTOFF)
     others = stack([range_split(recording[k], CUTOFF) for k in pair.candidates])
-    found = dense.complete_depth(near, others, calibration=calibration.load_calibration("dense"))
+    completed = dense.complete_depth(near, others, calibration=calibration.load_calibration("dense"))
     image = whole.image[0].permute(1, 2, 0)
-    depth, source = found.depth[0].numpy(), found.source[0].numpy()
+    depth, source = completed.depth[0].numpy(), completed.source[0].numpy()
     sensed, known = source == Source.SENSOR, source != Source.NONE
     figure = Figure((15, 3.9), facecolor=colours.PICTURE)
     axes = figure.subplots(1, 3)
@@ -140,7 +140,7 @@ def viewer(path: Path, frames: int = 40, height: int = 450) -> None:
     if browser is None:
         raise SystemExit(f"found none of {', '.join(CHROMIUM)}: the page is drawn by a browser")
     common = Settings(cutoff=CUTOFF)
-    shown = make_exhibit(kitchen(), AUTO, by_choice, common, most=1, sweep=DenseSweep.asked(True))
+    shown = make_exhibit(kitchen(), AUTO, by_choice, common, most=1, sweep=DenseSweep.from_options(True))
     script = f"""
       const made = [];
       setTimeout(() => {{
@@ -164,8 +164,8 @@ def viewer(path: Path, frames: int = 40, height: int = 450) -> None:
         options = ["--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         options += [f"--window-size=1180,{height + 330}", "--virtual-time-budget=60000", "--dump-dom"]
         done = subprocess.run([browser, *options, page.as_uri()], capture_output=True, text=True, check=True)
-    found = re.findall(r'<img src="data:image/png;base64,([^"]+)"', done.stdout)
-    pictures = [Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB") for text in found]
+    encoded = re.findall(r'<img src="data:image/png;base64,([^"]+)"', done.stdout)
+    pictures = [Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB") for text in encoded]
     pictures[0].save(
         path, save_all=True, append_images=pictures[1:], duration=90, loop=0, quality=60, method=4, minimize_size=True
     )

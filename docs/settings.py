@@ -49,7 +49,7 @@ WIDTH = 120
 
 def document(name: str, method: Method) -> str:
     """The file of a method."""
-    lines = [f"# {line}" for line in _said(name)]
+    lines = [f"# {line}" for line in _source_comment(name)]
     lines += ["# Written from its record by `make conf`.", "_target_: dhtorch.pipeline.method.Method"]
     comments = _comments(MethodSpec)
     for field in fields(method):
@@ -65,14 +65,14 @@ def _option(name: str, value: Any, comment: str | None, depth: int) -> Iterator[
         line = f"{pad}{name}: {_scalar(value)}"
         yield line if comment is None or len(line) + len(comment) + 4 > WIDTH else f"{line}  # {comment}"
         return
-    given: Mapping[str, Any] = value.keywords if isinstance(value, partial) else {}
+    bound: Mapping[str, Any] = value.keywords if isinstance(value, partial) else {}
     yield f"{pad}{name}:"
     yield f"{pad}  _target_: {function.__module__}.{function.__qualname__}"
     yield f"{pad}  _partial_: true"
     comments = _comments(function)
     for key, parameter in inspect.signature(function).parameters.items():
         if parameter.kind is parameter.KEYWORD_ONLY and key not in AT_RUN_TIME:
-            yield from _option(key, given.get(key, parameter.default), comments.get(key), depth + 1)
+            yield from _option(key, bound.get(key, parameter.default), comments.get(key), depth + 1)
 
 
 def _scalar(value: Any) -> str:
@@ -93,31 +93,31 @@ def _scalar(value: Any) -> str:
     return str(value)
 
 
-def _said(name: str) -> list[str]:
+def _source_comment(name: str) -> list[str]:
     """The comment above a method's name in its module."""
     for module in (sys.modules["dhtorch.pipeline.presets"], first_release, opencv, xfeat):
         source = inspect.getsource(module)
-        if found := re.search(rf"((?:^#: .*\n)+)^{name.upper()} = ", source, re.M):
-            return [line.removeprefix("#: ").replace("``", "`") for line in found[1].splitlines()]
+        if match := re.search(rf"((?:^#: .*\n)+)^{name.upper()} = ", source, re.M):
+            return [line.removeprefix("#: ").replace("``", "`") for line in match[1].splitlines()]
     raise ValueError(f"{name}: found no comment above {name.upper()}")
 
 
 def _comments(function: Any) -> dict[str, str]:
     """Option → the first words about it: of a docstring's Args, or of the comment beside a record's field."""
     if inspect.isclass(function):
-        found = re.findall(r"^    (\w+): .* = .*?  # (.*)$", inspect.getsource(function), re.M)
-        return dict(found)
+        pairs = re.findall(r"^    (\w+): .* = .*?  # (.*)$", inspect.getsource(function), re.M)
+        return dict(pairs)
     text = inspect.getdoc(function) or ""
     args = re.search(r"^Args:\n((?: .*\n|\n)+)", text, re.M)
     if args is None:
         return {}
     entries = re.findall(r"^    ([\w, ]+): ((?:.*\n?)(?:      .*\n?)*)", args[1], re.M)
-    found = {}
+    summaries = {}
     for names, words in entries:
         first = re.split(r"(?<=\w)[.;] |:\s|\.$", " ".join(words.split()))[0]
         if "," not in names:
-            found[names] = first.replace("``", "`")
-    return found
+            summaries[names] = first.replace("``", "`")
+    return summaries
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -184,7 +184,7 @@ frames = json.loads(Path("nerf/transforms.json").read_text())["frames"]
 assert all(len(frame["dhtorch_trackability"]) == 256 for frame in frames)
 
 import hooks
-assert "| `trackability` | (N,) | float32 | 1 | texture there |  |" in hooks.made("sample_columns")
+assert "| `trackability` | (N,) | float32 | 1 | texture there |  |" in hooks.generate("sample_columns")
 """)
 
 
@@ -216,7 +216,7 @@ from dhtorch.experiments.report.overlays import overlay_layers
 (layer,) = overlay_layers({"u": [1.0], "v": [2.0], "source": [0], "gate": [Gate.TOO_FAR]})
 assert layer.label == "unanswered: too far"
 import hooks
-assert "| 13 | `TOO_FAR` | beyond a metre | go closer |" in hooks.made("codes") and "too far" in hooks.made("colours")
+assert "| 13 | `TOO_FAR` | beyond a metre | go closer |" in hooks.generate("codes") and "too far" in hooks.generate("colours")
 """)
 
 

@@ -115,8 +115,8 @@ def enriched(source: str, target: str, work: Path) -> tuple[Path, str]:
         *QUICK,
         *options,
     ]
-    found, why = call(sys.executable, *words)
-    return out, "" if found is not None else why
+    result, why = call(sys.executable, *words)
+    return out, "" if result is not None else why
 
 
 def place(source: str, work: Path) -> Path:
@@ -158,54 +158,54 @@ def rows(source: str, offered: Mapping[str, Sequence[Loader]], work: Path) -> li
     folder, *options = SOURCES[source]
     start = {"source": source, "data": folder, "options": options}
     nothing = {"opened": False, "compared": None, "step": None}
-    found = []
+    rows = []
     for target, clients in offered.items():
         root, why = enriched(source, target, work)
         for loader, python, compare, train in clients if not why else [("–", None, None, None)]:
             row = {**start, "target": target, "loader": loader, **nothing}
             row["why"] = why or ("" if python else "not installed")
             if python:
-                row |= asked(python, compare, train, root, work / root.name.replace("nerfstudio", "lerobot"))
-            found.append(row)
+                row |= run_loaders(python, compare, train, root, work / root.name.replace("nerfstudio", "lerobot"))
+            rows.append(row)
     if "data=rlds" in options:  # the set itself: its depth in the loader, without any step before
         fov = [option.removeprefix("data.fov=") for option in options if option.startswith("data.fov=")]
-        step, why = Served.of(sys.executable).ask("rlds_steps.py", str(place(source, work)), *fov)
+        step, why = Served.of(sys.executable).request("rlds_steps.py", str(place(source, work)), *fov)
         row = {**start, "target": "as it is", "loader": "RLDS steps", **nothing}
-        found.append(row | {"opened": step is not None, "step": step, "why": why})
-    print(*map(json.dumps, found), sep="\n", flush=True)
-    return found
+        rows.append(row | {"opened": step is not None, "step": step, "why": why})
+    print(*map(json.dumps, rows), sep="\n", flush=True)
+    return rows
 
 
 def own_depth(known: Mapping[str, Mapping[str, str]], work: Path) -> list[dict[str, Any]]:
     """Depth that LeRobot wrote, as LeRobot and as dhtorch read it; versions before 0.6 know none."""
-    found = []
+    rows = []
     for python, has in known.items():
-        if "lerobot" in has and not any(row["loader"] == f"lerobot {has['lerobot']}" for row in found):
+        if "lerobot" in has and not any(row["loader"] == f"lerobot {has['lerobot']}" for row in rows):
             with tempfile.TemporaryDirectory(dir=work) as folder:
-                said, why = Served.of(python).ask("lerobot_depth.py", folder)
+                reply, why = Served.of(python).request("lerobot_depth.py", folder)
             row = {"source": "LeRobot's own depth", "data": "written", "options": [], "target": "read by dhtorch"}
-            row |= {"loader": f"lerobot {has['lerobot']}", "opened": said is not None, "compared": said}
-            found.append({**row, "step": None, "why": why})
-    return found
+            row |= {"loader": f"lerobot {has['lerobot']}", "opened": reply is not None, "compared": reply}
+            rows.append({**row, "step": None, "why": why})
+    return rows
 
 
-def asked(python: str, compare: str | None, train: str | None, root: Path, twin: Path) -> dict[str, Any]:
+def run_loaders(python: str, compare: str | None, train: str | None, root: Path, twin: Path) -> dict[str, Any]:
     """What one loader made of one set."""
-    found: dict[str, Any] = {}
+    record: dict[str, Any] = {}
     folders = sorted(each.parent for each in root.rglob("transforms.json"))
     root = folders[0] if folders else root  # of several episodes the first
     if compare:
         beside = [str(twin)] if compare == "compare_nerfstudio.py" else []
-        compared, why = Served.of(python).ask(compare, str(root), *beside)
-        found |= {"opened": compared is not None, "compared": compared, "why": why}
+        compared, why = Served.of(python).request(compare, str(root), *beside)
+        record |= {"opened": compared is not None, "compared": compared, "why": why}
         if compared is None:
-            return found
+            return record
     if train:
         with tempfile.TemporaryDirectory() as folder:
             more = [f"{folder}/rows.tar"] if train == "webdataset_stream.py" else []
-            step, why = Served.of(python).ask(train, str(root), *more)
-        found |= {"opened": found.get("opened", False) or step is not None, "step": step, "why": why}
-    return found
+            step, why = Served.of(python).request(train, str(root), *more)
+        record |= {"opened": record.get("opened", False) or step is not None, "step": step, "why": why}
+    return record
 
 
 class Served:
@@ -230,7 +230,7 @@ class Served:
                 cls.known[python] = cls(python)
             return cls.known[python]
 
-    def ask(self, script: str, *words: str) -> tuple[dict[str, Any] | None, str]:
+    def request(self, script: str, *words: str) -> tuple[dict[str, Any] | None, str]:
         """What a script said, or None and why."""
         with self.lock:
             assert self.process.stdin and self.process.stdout
@@ -239,8 +239,8 @@ class Served:
             line = self.process.stdout.readline()
         if not line:
             return None, f"{script} ended its interpreter"
-        said, why = json.loads(line)
-        return said, short(why)
+        reply, why = json.loads(line)
+        return reply, short(why)
 
 
 def main() -> int:
@@ -261,10 +261,10 @@ def main() -> int:
     offered = {target: list(loaders(target, known)) for target in TARGETS}
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(args.at_once) as pool:
         of = partial(rows, offered=offered, work=args.work or Path(folder))
-        found = [row for some in pool.map(of, args.source or list(SOURCES)) for row in some]
-        found += own_depth(known, args.work or Path(folder))
+        table = [row for some in pool.map(of, args.source or list(SOURCES)) for row in some]
+        table += own_depth(known, args.work or Path(folder))
     if args.json:
-        args.json.write_text(json.dumps(found, indent=1) + "\n")
+        args.json.write_text(json.dumps(table, indent=1) + "\n")
     return 0
 
 

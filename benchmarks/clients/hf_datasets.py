@@ -18,11 +18,11 @@ GAP = 2
 
 
 def main(root: str) -> None:
-    found = columns(root, tables=True)
+    spec = columns(root, tables=True)
     files = [str(file) for file in sorted((Path(root) / "data").rglob("*.parquet"))]
     data = datasets.Dataset.from_parquet(files, cache_dir=str(Path(root).parent / "cache"), keep_in_memory=True)
-    stored, image = data.with_format(None), found["keys"]["image"]
-    transform = ExtendDepth(**found["keys"], other_image="before", n=256, tokens_hw=(56, 56))
+    stored, image = data.with_format(None), spec["keys"]["image"]
+    transform = ExtendDepth(**spec["keys"], other_image="before", n=256, tokens_hw=(56, 56))
 
     def extended(batch: dict[str, list[Any]]) -> dict[str, list[Any]]:
         earlier = stored[[max(i - GAP, 0) for i in batch["index"]]]
@@ -31,17 +31,17 @@ def main(root: str) -> None:
             row["before"] = earlier[image][i]
             row["before_is_pad"] = [row["index"] < GAP or earlier["episode_index"][i] != row["episode_index"]]
         out = [transform(row) for row in rows]
-        return {key: [row[key] for row in out] for key in ("dhtorch.tokens", "dhtorch.tokens_valid", found["target"])}
+        return {key: [row[key] for row in out] for key in ("dhtorch.tokens", "dhtorch.tokens_valid", spec["target"])}
 
     data.set_transform(extended)
     batch = data[:3]
-    tokens, target = torch.stack(batch["dhtorch.tokens"]), torch.tensor(batch[found["target"]])
+    tokens, target = torch.stack(batch["dhtorch.tokens"]), torch.tensor(batch[spec["target"]])
     head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
     loss = (head(tokens.flatten(1)) - target).square().mean()
     loss.backward()
     torch.optim.SGD(head.parameters(), 1e-3).step()
-    said = {"frames": len(data), "target": found["target"], "loss": float(loss.detach())}
-    print(json.dumps(said | {"tokens_known": int(torch.stack(batch["dhtorch.tokens_valid"]).sum())}))
+    result = {"frames": len(data), "target": spec["target"], "loss": float(loss.detach())}
+    print(json.dumps(result | {"tokens_known": int(torch.stack(batch["dhtorch.tokens_valid"]).sum())}))
 
 
 if __name__ == "__main__":

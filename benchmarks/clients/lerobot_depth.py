@@ -28,20 +28,20 @@ def written(root: Path, videos: bool) -> LeRobotDataset:
     features = {IMAGE: {**picture, "shape": (H, W, 3)}, "action": {"dtype": "float32", "shape": (7,), "names": None}}
     features[DEPTH] = {**picture, "shape": (H, W, 1), "info": {"is_depth_map": True}}
     options = {"fps": FPS, "root": root, "features": features, "use_videos": videos}
-    made = LeRobotDataset.create("local/set", **options)
+    dataset = LeRobotDataset.create("local/set", **options)
     for i in range(N):
         colour = np.full((H, W, 3), 40 * i, np.uint8)
         frame = {IMAGE: colour, DEPTH: truth(i), "action": np.zeros(7, np.float32), "task": "look"}
-        made.add_frame(frame)
-    made.save_episode()
-    made.finalize()
+        dataset.add_frame(frame)
+    dataset.save_episode()
+    dataset.finalize()
     return LeRobotDataset("local/set", root=root, video_backend="pyav", depth_output_unit="m")
 
 
 def main(folder: str) -> None:
     if "depth_output_unit" not in inspect.signature(LeRobotDataset).parameters:
         sys.exit("this LeRobot knows no depth, expected 0.6 or later")
-    said = {}
+    result = {}
     for kind in ("image", "video"):
         theirs = written(Path(folder) / kind, kind == "video")
         mine = open_all(Path(folder) / kind, "lerobot", fov=69)[0]
@@ -53,9 +53,9 @@ def main(folder: str) -> None:
             off["truth"] = max(off["truth"], float(np.abs(own - true)[known].max()))
             off["loaders"] = max(off["loaders"], float(np.abs(own - z)[known].max()))
         hole = theirs[0][DEPTH].numpy().squeeze()[8:16, 8:24]
-        said[kind] = {**off, "hole_in_lerobot_m": [float(hole.min()), float(hole.max())]}
-    off = {"depth": said["image"]["loaders"], "depth in video": said["video"]["loaders"]}
-    print(json.dumps({"frames": N, "unit": "m", "largest_difference": off, **said}))
+        result[kind] = {**off, "hole_in_lerobot_m": [float(hole.min()), float(hole.max())]}
+    off = {"depth": result["image"]["loaders"], "depth in video": result["video"]["loaders"]}
+    print(json.dumps({"frames": N, "unit": "m", "largest_difference": off, **result}))
 
 
 if __name__ == "__main__":

@@ -28,8 +28,8 @@ STATE, TOKENS = "observation.state", "observation.environment_state"
 
 
 def main(root: str) -> None:
-    found = columns(root)
-    keys, target, step = found["keys"], found["target"], 1 / found["fps"]
+    spec = columns(root)
+    keys, target, step = spec["keys"], spec["target"], 1 / spec["fps"]
     window = {keys["image"]: [-2 * step, 0.0], keys["depth"]: [-2 * step, 0.0]}
     window[target] = [k * step for k in range(HORIZON)]
     metres = {"depth_output_unit": "m"} if "depth_output_unit" in inspect.signature(LeRobotDataset).parameters else {}
@@ -55,21 +55,21 @@ def main(root: str) -> None:
 
     known = batch[depth] > 0  # 0 = no depth, which no statistics count
     seen = torch.where(known, sample[depth], 0.0).requires_grad_()
-    given = {**sample, image: interpolate(sample[image], (SIDE, SIDE))}
-    given[depth] = interpolate(seen.expand(-1, 3, -1, -1), (SIDE, SIDE))
+    policy_input = {**sample, image: interpolate(sample[image], (SIDE, SIDE))}
+    policy_input[depth] = interpolate(seen.expand(-1, 3, -1, -1), (SIDE, SIDE))
     policy = ACTPolicy(config)
     optimiser = torch.optim.AdamW(policy.parameters(), 1e-4)
-    loss, _ = policy(given)
+    loss, _ = policy(policy_input)
     loss.backward()
     through = policy.model.encoder_env_state_input_proj.weight.grad
     assert loss.isfinite() and through is not None and seen.grad is not None
     optimiser.step()
-    said = {"frames": len(data), "target": target, "known": float(known.float().mean()), "loss": float(loss.detach())}
-    said |= {"tokens_known": int(batch[f"{PREFIX}tokens_valid"].sum()), "kept": len(mine)}
-    said |= {"gradient": bool(through.any()), "depth_gradient": bool(seen.grad.any())}
+    result = {"frames": len(data), "target": target, "known": float(known.float().mean()), "loss": float(loss.detach())}
+    result |= {"tokens_known": int(batch[f"{PREFIX}tokens_valid"].sum()), "kept": len(mine)}
+    result |= {"gradient": bool(through.any()), "depth_gradient": bool(seen.grad.any())}
     if known.any():  # of normalised depth, m, over what is known
-        said["normalised"] = [float(seen.detach()[known].mean()), float(seen.detach()[known].std())]
-    print(json.dumps(said))
+        result["normalised"] = [float(seen.detach()[known].mean()), float(seen.detach()[known].std())]
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

@@ -18,18 +18,20 @@ AS_WRITTEN = {"orientation_method": "none", "center_method": "none", "auto_scale
 
 def main(root: str) -> None:
     parsed = NerfstudioDataParserConfig(data=Path(root), downscale_factor=1, **AS_WRITTEN).setup()
-    found = parsed.get_dataparser_outputs("train")
+    outputs = parsed.get_dataparser_outputs("train")
     about = json.loads((Path(root) / "transforms.json").read_text())
     shots = {str(Path(root) / shot["file_path"]): shot for shot in about["frames"]}
-    assert len(found.image_filenames) == len(shots) == len(found.cameras), f"{len(shots)} frames"
-    worst, unit = dict.fromkeys(("depth", "numbers"), 0.0), found.metadata["depth_unit_scale_factor"]
-    for i, (image, depth) in enumerate(zip(found.image_filenames, found.metadata["depth_filenames"], strict=True)):
-        shot, camera = shots[str(image)], found.cameras[i]
-        said = [float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy", "width", "height")]
+    assert len(outputs.image_filenames) == len(shots) == len(outputs.cameras), f"{len(shots)} frames"
+    worst, unit = dict.fromkeys(("depth", "numbers"), 0.0), outputs.metadata["depth_unit_scale_factor"]
+    for i, (image, depth) in enumerate(zip(outputs.image_filenames, outputs.metadata["depth_filenames"], strict=True)):
+        shot, camera = shots[str(image)], outputs.cameras[i]
+        values = [float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy", "width", "height")]
         own = [shot[name] for name in ("fl_x", "fl_y", "cx", "cy", "w", "h")]
         pose = camera.camera_to_worlds.numpy() - np.float32(shot["transform_matrix"])[:3]
-        worst["numbers"] = max(worst["numbers"], float(np.abs(pose).max()), *np.abs(np.subtract(said, np.float32(own))))
-        metres = get_depth_image_from_path(Path(depth), shot["h"], shot["w"], unit * found.dataparser_scale)
+        worst["numbers"] = max(
+            worst["numbers"], float(np.abs(pose).max()), *np.abs(np.subtract(values, np.float32(own)))
+        )
+        metres = get_depth_image_from_path(Path(depth), shot["h"], shot["w"], unit * outputs.dataparser_scale)
         stored = np.array(Image.open(Path(root) / shot["depth_file_path"])) * about["depth_unit_scale_factor"]
         rows, cols = (np.arange(n) * size // n for n, size in zip((shot["h"], shot["w"]), stored.shape, strict=True))
         stored = stored[rows[:, None], cols]  # a smaller map is repeated to the picture's size, never interpolated

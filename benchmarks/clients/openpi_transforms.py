@@ -37,13 +37,13 @@ def stack(samples: list[Any]) -> Any:
 
 
 def main(root: str) -> None:
-    found = columns(root, tables=True)
-    rows, keys = Rows(root), found["keys"]
+    spec = columns(root, tables=True)
+    rows, keys = Rows(root), spec["keys"]
 
     def repacked(i: int) -> dict[str, Any]:
         out = {KEYS[name]: rows[i][keys[name]] for name in ("image", "depth", "intrinsics")}
         out[KEYS["other_image"]] = rows[i - GAP][keys["image"]]
-        return {**out, "actions": rows[i][found["target"]], "prompt": "look around"}
+        return {**out, "actions": rows[i][spec["target"]], "prompt": "look around"}
 
     extend = NumpyTransform(ExtendDepth(**KEYS, depth_unit=keys["depth_unit"], n=256, tokens_hw=(56, 56)))
     batch = stack([policy_inputs(extend(repacked(i))) for i in (GAP, GAP + 1)])
@@ -53,8 +53,8 @@ def main(root: str) -> None:
     loss = (head(tokens.flatten(1)) - target).square().mean()
     loss.backward()
     torch.optim.SGD(head.parameters(), 1e-3).step()
-    said = {"frames": len(rows), "target": found["target"], "loss": float(loss.detach())}
-    print(json.dumps(said | {"tokens_known": int(batch["depth_mask"].sum())}))
+    result = {"frames": len(rows), "target": spec["target"], "loss": float(loss.detach())}
+    print(json.dumps(result | {"tokens_known": int(batch["depth_mask"].sum())}))
 
 
 if __name__ == "__main__":

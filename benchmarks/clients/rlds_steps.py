@@ -29,8 +29,8 @@ def steps(root: str, **options: Any) -> Iterator[dict[str, Any]]:
     records = [(file, span) for file in files for span in tfrecord.index_records(file)]
     episodes = open_all(root, "rlds", split="train", camera="observation/image_0", **options)
     for (file, span), recording in zip(records, episodes, strict=True):
-        found = tfrecord.parse_example(tfrecord.read_record(file, span), file, span.offset)
-        actions = tfrecord.read_feature_numbers(file, "action", found["steps/action"], 7 * len(recording)).reshape(
+        features = tfrecord.parse_example(tfrecord.read_record(file, span), file, span.offset)
+        actions = tfrecord.read_feature_numbers(file, "action", features["steps/action"], 7 * len(recording)).reshape(
             -1, 7
         )
         for i in range(len(recording)):
@@ -55,8 +55,8 @@ def main(root: str, fov: str | None = None) -> None:
     loss = (head(batch["dhtorch.tokens"].flatten(1)) - batch["action"]).square().mean()
     loss.backward()
     torch.optim.SGD(head.parameters(), 1e-3).step()
-    said = {"frames": sum(1 for _ in steps(root, **options)), "target": "action", "loss": float(loss.detach())}
-    print(json.dumps(said | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
+    result = {"frames": sum(1 for _ in steps(root, **options)), "target": "action", "loss": float(loss.detach())}
+    print(json.dumps(result | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
 
 
 if __name__ == "__main__":

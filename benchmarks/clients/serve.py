@@ -18,15 +18,15 @@ HERE = Path(__file__).resolve().parent
 def answer(script: str, *words: str) -> tuple[Any, str]:
     """What a script said, and what it ended with."""
     sys.argv = [script, *words]
-    said = io.StringIO()
+    stdout = io.StringIO()
     try:
-        with redirect_stdout(said):
+        with redirect_stdout(stdout):
             runpy.run_path(str(HERE / script), run_name="__main__")
     except SystemExit as stop:
         return None, str(stop)
     except Exception as error:  # whatever a loader of others raises is what the table is to say
         return None, " ".join("".join(traceback.format_exception_only(error)).split())
-    last = said.getvalue().strip().splitlines()[-1:]
+    last = stdout.getvalue().strip().splitlines()[-1:]
     return (json.loads(last[0]), "") if last else ({}, "")
 
 

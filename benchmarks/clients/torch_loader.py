@@ -37,18 +37,18 @@ class Rows(Dataset[dict[str, Any]]):
 
 
 def main(root: str, workers: str = "1") -> None:
-    found = columns(root, tables=True)
-    transform = ExtendDepth(**found["keys"], other_image="before", n=256, tokens_hw=(56, 56))
+    spec = columns(root, tables=True)
+    transform = ExtendDepth(**spec["keys"], other_image="before", n=256, tokens_hw=(56, 56))
     data = ExtendedDataset(Rows(root), transform, gap=2)
     loader = DataLoader(data, batch_size=3, num_workers=int(workers), worker_init_fn=one_thread)
     batch = next(iter(loader))
-    target = batch[found["target"]].float()
+    target = batch[spec["target"]].float()
     head = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(batch["dhtorch.tokens"][0].numel(), target.shape[1]))
     loss = (head(batch["dhtorch.tokens"]) - target).square().mean()
     loss.backward()
     torch.optim.SGD(head.parameters(), 1e-3).step()
-    said = {"frames": len(data), "target": found["target"], "loss": float(loss.detach())}
-    print(json.dumps(said | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
+    result = {"frames": len(data), "target": spec["target"], "loss": float(loss.detach())}
+    print(json.dumps(result | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
 
 
 if __name__ == "__main__":

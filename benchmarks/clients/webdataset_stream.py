@@ -19,13 +19,13 @@ GAP = 2
 
 
 def main(root: str, archive: str) -> None:
-    found = columns(root, tables=True)
-    keys, rows = found["keys"], Rows(root)
+    spec = columns(root, tables=True)
+    keys, rows = spec["keys"], Rows(root)
     with webdataset.TarWriter(archive) as tar:
         for i in range(GAP, len(rows)):
             row, before = rows[i], rows[i - GAP]
             if row["episode_index"] == before["episode_index"]:
-                numbers = {"intrinsics.npy": row[keys["intrinsics"]], "target.npy": row[found["target"]]}
+                numbers = {"intrinsics.npy": row[keys["intrinsics"]], "target.npy": row[spec["target"]]}
                 pictures = {"image.png": row[keys["image"]], "before.png": before[keys["image"]]}
                 tar.write({"__key__": f"{i:06d}", "depth.npy": row[keys["depth"]], **pictures, **numbers})
 
@@ -38,8 +38,8 @@ def main(root: str, archive: str) -> None:
     loss = (head(tokens.flatten(1)) - target).square().mean()
     loss.backward()
     torch.optim.SGD(head.parameters(), 1e-3).step()
-    said = {"frames": len(rows), "target": found["target"], "loss": float(loss.detach())}
-    print(json.dumps(said | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
+    result = {"frames": len(rows), "target": spec["target"], "loss": float(loss.detach())}
+    print(json.dumps(result | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
 
 
 if __name__ == "__main__":

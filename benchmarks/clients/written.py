@@ -41,10 +41,10 @@ def write_robot(root: Path) -> None:
         write_lerobot(at, episodes, version=2, camera=key, image="image", depth="tiff", fps=30, poses=False)
     number = {"dtype": "float32", "shape": [8], "names": [f"joint_{i}" for i in range(7)] + ["gripper"]}
     info, other = (folder / "meta" / "info.json" for folder in (root, at))
-    said, more = json.loads(info.read_text()), json.loads(other.read_text())["features"]
-    said["features"] |= {k: v for k, v in more.items() if k.startswith(CAMERAS[1])}
-    said["features"] |= {"observation.state": number, "action": number}
-    info.write_text(json.dumps(said))
+    metadata, more = json.loads(info.read_text()), json.loads(other.read_text())["features"]
+    metadata["features"] |= {k: v for k, v in more.items() if k.startswith(CAMERAS[1])}
+    metadata["features"] |= {"observation.state": number, "action": number}
+    info.write_text(json.dumps(metadata))
     tables = [sorted((folder / "data").rglob("*.parquet")) for folder in (root, at)]
     for file, beside, episode in zip(*tables, cameras[0], strict=True):
         table, right = parquet.read_table(file), parquet.read_table(beside)

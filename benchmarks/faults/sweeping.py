@@ -65,7 +65,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("sweep_depth", "swept if calibration is None else calibration.apply(swept)", "swept"),
         ("_check_options", "low <= value <= high", "value <= high"),
         ("dense_options", "isinstance(value, bool) or not", "not"),
-        ("top_views", "& ~asked.samples.usable", "& asked.samples.usable"),
+        ("top_views", "& ~selected.samples.usable", "& selected.samples.usable"),
         ("top_views", "gain[:source_views] > options.min_view_gain", "gain[:source_views] >= 0"),
         (
             "source_view_of",
@@ -113,8 +113,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "transforms.maps": [
         ("DenseMaps.complete", "self.sensor_depth(read.reference, method), completed", "completed, completed"),
         ("DenseMaps.complete", '"calibration": self.calibration, ', ""),
-        ("zero_unanswered", "torch.where(found.keep, values, 0.0)", "values"),
-        ("map_to_samples", "(found.depth, found.sigma)", "(found.depth, found.depth)"),
+        ("zero_unanswered", "torch.where(depth_map.keep, values, 0.0)", "values"),
+        ("map_to_samples", "(depth_map.depth, depth_map.sigma)", "(depth_map.depth, depth_map.depth)"),
     ],
     "ops.loader": [
         ("cache", "if folder:", "if not folder:"),
@@ -123,7 +123,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("build", "if process.returncode:", "if False:"),
         ("load", "if not path.is_file():", "if False:"),
         ("build", "_check_torch_version()", "None"),
-        ("_check_torch_version", "found < MIN_TORCH_VERSION", "found <= (2, 5)"),
+        ("_check_torch_version", "version < MIN_TORCH_VERSION", "version <= (2, 5)"),
         ("constants_header", "isinstance(value, int)", "isinstance(value, float)"),
     ],
     "ops.dispatch": [

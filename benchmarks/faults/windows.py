@@ -217,8 +217,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "geometry.free_space": [
         ("free_space_violations", "depth.detach() + 2 * sigma.detach()", "depth.detach() + sigma.detach()"),
-        ("free_space_violations", "asked & (return_ratio == 0)", "asked"),
-        ("free_space_violations", "median(sensed.detach(), held)", "median(sensed.detach(), has_return)"),
+        ("free_space_violations", "candidates & (return_ratio == 0)", "candidates"),
+        ("free_space_violations", "median(sensed.detach(), pose_returns)", "median(sensed.detach(), has_return)"),
         ("free_space_violations", "MIN_RETURN_RATIO * has_return.sum(-1)", "0 * has_return.sum(-1)"),
         ("free_space_violations", "n >= MIN_FREE_SPACE_ANSWERS", "n > MIN_FREE_SPACE_ANSWERS"),
         ("_return_ratio", "columns * row.clamp_max(rows - 1)", "rows * row.clamp_max(rows - 1)"),

@@ -57,7 +57,7 @@ class MetricReferences(NamedTuple):
 
 def collect_references(
     x: Tensor,  # (B, h, w)
-    given: Sequence[Samples | Estimate | DepthMap],
+    sources: Sequence[Samples | Estimate | DepthMap],
     hw: tuple[int, int],
     options: AlignmentOptions = DEFAULT_ALIGNMENT_OPTIONS,
 ) -> MetricReferences:
@@ -65,14 +65,14 @@ def collect_references(
 
     Args:
         x: the map, NaN where it has no value.
-        given: near returns (usable ``Samples``), far answers (``Estimate``), maps (``DepthMap``).
+        sources: near returns (usable ``Samples``), far answers (``Estimate``), maps (``DepthMap``).
         hw: height and width of the picture in whose pixels samples and estimates are.
         options: errors of references beyond the stated ones, and their largest number.
 
     Gradient: to map, depth and sigma. Raises ValueError for wrong shapes.
     """
     parts = [
-        _from_map(source, options) if isinstance(source, DepthMap) else _from_points(source, hw) for source in given
+        _from_map(source, options) if isinstance(source, DepthMap) else _from_points(source, hw) for source in sources
     ]
     per_source = []
     for share, depth, sigma, sigma_shared, near, keep in parts:

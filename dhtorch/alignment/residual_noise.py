@@ -39,7 +39,9 @@ CAUCHY_68_QUANTILE: Final = 1.84
 def residual_variance(
     points: MetricReferences,
     r: Tensor,  # (B, N)
-    told: tuple[Tensor, Tensor],  # (B, N) variance by the position within the pixel; standard deviation of the fit
+    noise_terms: tuple[
+        Tensor, Tensor
+    ],  # (B, N) variance by the position within the pixel; standard deviation of the fit
     log: Tensor,  # (B, h, w) log depth of the map
     known: Tensor,  # (B, h, w) bool
     options: AlignmentOptions = DEFAULT_ALIGNMENT_OPTIONS,
@@ -52,7 +54,7 @@ def residual_variance(
     Gradient: none. Cost: that of a few images; local errors are evaluated on a coarse grid of places and depths.
     Raises ValueError for wrong shapes.
     """
-    read, fit_sigma = told
+    read, fit_sigma = noise_terms
     with torch.no_grad():
         near = points.used & points.near
         r = r - masked_median(r, near).maximum(-fit_sigma).minimum(fit_sigma)

@@ -49,12 +49,12 @@ _ALIGNMENT_LIMITS = {
     "scale": "|median scale - 1| of the frames, of kind=metric",
     "change": "median relative change of depth, of kind=metric",
     "sigma": "median sigma / depth of the frames",
-    "silent": "fraction of the maps' pixels without an answer",
+    "no_answer": "fraction of the maps' pixels without an answer",
     "unaligned": "fraction of the maps that could not be aligned",
 }
 
 #: Columns of the page's table.
-_TABLE_COLUMNS = ("model", "scale", "sigma / depth", "silent", "near references", "far references")
+_TABLE_COLUMNS = ("model", "scale", "sigma / depth", "no answer", "near references", "far references")
 
 #: Options that determine the content of a frame's files; they enter the key.
 _KEY_OPTIONS = (
@@ -204,7 +204,7 @@ def _summarise_frame(x: Tensor, aligned: DepthMap, selection: align.ModelSelecti
     """Statistics of one alignment: model and its probability, scale, relative change, sigma / depth, gaps."""
     keep, has_value = aligned.keep, x > 0
     best = int(selection.model)
-    row: Row = {"model": None if best < 0 else selection.names[best], "silent": 1 - _masked_share(keep, has_value)}
+    row: Row = {"model": None if best < 0 else selection.names[best], "no_answer": 1 - _masked_share(keep, has_value)}
     row["probability"] = None if best < 0 else float(selection.weight[0, best])
     likeliest = int(selection.weight[0].argmax())
     row["likeliest"] = None if best < 0 else selection.names[likeliest]
@@ -224,7 +224,7 @@ def _masked_share(part: Tensor, whole: Tensor) -> float:
 
 
 def _summarise_recording(rows: Sequence[Row]) -> Row:
-    """Statistics of a recording; ``held`` are those that ``fail_on`` limits."""
+    """Statistics of a recording; ``limited`` are those that ``fail_on`` limits."""
     alignments = [row["aligned"] for row in rows]
     answered = [row for row in alignments if row["model"] is not None and row["scale"] is not None]
     medians = {
@@ -234,7 +234,7 @@ def _summarise_recording(rows: Sequence[Row]) -> Row:
         "scale": None if medians["scale"] is None else abs(medians["scale"] - 1),
         "change": medians["change"],
         "sigma": medians["sigma"],
-        "silent": statistics.fmean(row["silent"] for row in alignments),
+        "no_answer": statistics.fmean(row["no_answer"] for row in alignments),
         "unaligned": 1 - len(answered) / len(alignments),
     }
     models = Counter(row["model"] for row in answered)
@@ -244,13 +244,13 @@ def _summarise_recording(rows: Sequence[Row]) -> Row:
         "models": dict(models),
         "median": medians,
         "references": references,
-        "held": limited,
+        "limited": limited,
     }
 
 
 def _format_summary(name: str, kind: str, summary: Row, n_untouched: int) -> list[str]:
     """Printed summary of a recording, one sentence a line."""
-    limited, medians, n = summary["held"], summary["median"], summary["frames"]
+    limited, medians, n = summary["limited"], summary["median"], summary["frames"]
     untouched = f" ({n_untouched} left untouched)" if n_untouched else ""
     if medians["scale"] is None:
         return [f"{name}: none of {format_count(n, 'map')} could be aligned{untouched}: too few near returns."]
@@ -270,7 +270,7 @@ def _format_summary(name: str, kind: str, summary: Row, n_untouched: int) -> lis
             ["  Maps and near returns agree as if from one sensor: sigma does not include that sensor's own error."]
             * is_same_sensor
         ),
-        f"  Median sigma {medians['sigma']:.1%} of the depth; {limited['silent']:.1%} of the pixels have no answer.",
+        f"  Median sigma {medians['sigma']:.1%} of the depth; {limited['no_answer']:.1%} of the pixels have no answer.",
         f"  References per map: {near} near returns and {far} far answers (medians); "
         f"{limited['unaligned']:.0%} of the maps could not be aligned.",
     ]
@@ -282,18 +282,18 @@ def _write_page(task: CompletionTask, maps: DepthMaps, lines: Sequence[str], exc
     frames = []
     for i in order:
         row = task.done[task.name(i)]
-        cells = [_format_cell(row["aligned"][k]) for k in ("model", "scale", "sigma", "silent", "near", "far")]
+        cells = [_format_cell(row["aligned"][k]) for k in ("model", "scale", "sigma", "no_answer", "near", "far")]
         frames.append(
             pages.ValidatedFrame(f"frame {row['frame']}", cells, _render_frame(task, maps, i) if i in shown else None)
         )
     failed = [f"Exceeded: {limit_line}" for limit_line in exceeded]
     place, table = task.folder / "align.html", {"columns": _TABLE_COLUMNS, "frames": frames, "failed": failed}
-    return pages.write_validation_page(place, task.scene.name, said=lines, word="align", note=_PAGE_NOTE, **table)
+    return pages.write_validation_page(place, task.scene.name, sentences=lines, word="align", note=_PAGE_NOTE, **table)
 
 
 def _severity(row: Row) -> float:
     """Sort key of the frames: unanswered fraction plus sigma / depth."""
-    return float(row["silent"]) + (1.0 if row["sigma"] is None else float(row["sigma"]))
+    return float(row["no_answer"]) + (1.0 if row["sigma"] is None else float(row["sigma"]))
 
 
 def _format_cell(value: Any) -> str:

@@ -57,7 +57,7 @@ _OPTION_RANGES = {
 }
 
 #: Source name in a meta file → name in printed text.
-_SOURCE_LABELS = {"sensor": "sensor", "swept": "swept", "none": "silent"}
+_SOURCE_LABELS = {"sensor": "sensor", "swept": "swept", "none": "no answer"}
 
 #: Values of ``figures`` and ``points``: no frame, the first one, or all frames.
 _EXTRAS_CHOICES = (False, True, "all")
@@ -213,9 +213,9 @@ def _load_frame(task: CompletionTask, i: int) -> Frame:
     return range_split(frame, settings["cutoff"])
 
 
-def write_frame(task: CompletionTask, i: int, reference: Frame, found: DepthMap, asked: Row) -> None:
+def write_frame(task: CompletionTask, i: int, reference: Frame, depth_maps: DepthMap, views_row: Row) -> None:
     """Write the files of one frame; the meta file, which marks it complete, comes last."""
-    name, layout, depth_map = task.name(i), task.layout, found[0]
+    name, layout, depth_map = task.name(i), task.layout, depth_maps[0]
     steps = export.quantise_depth(depth_map.depth, depth_map.sigma, depth_map.source, layout.unit)
     pictures = {"depth": steps.depth, "sigma": steps.sigma, "source": steps.source}
     if layout.pictures:
@@ -228,7 +228,9 @@ def write_frame(task: CompletionTask, i: int, reference: Frame, found: DepthMap,
         storage.replace_file(layout.file(task.folder, kind, name), export.encode_png(pixels))
     if layout.arrays:
         storage.replace_file(layout.file(task.folder, "arrays", name), _encode_arrays(depth_map))
-    row = storage.to_strict_json(_describe_frame(task, i, reference, steps) | asked | _count_pixels(steps, depth_map))
+    row = storage.to_strict_json(
+        _describe_frame(task, i, reference, steps) | views_row | _count_pixels(steps, depth_map)
+    )
     storage.write_json(layout.file(task.folder, "meta", name), row)
     task.done[name] = row
 
@@ -257,8 +259,8 @@ def _count_pixels(steps: export.QuantisedDepth, depth_map: DepthMap) -> Row:
     if aligned := int((steps.source == Source.ALIGNED).sum()):
         pixels["aligned"] = aligned
     gates = {name.lower(): float((depth_map.gate == code).double().mean()) for code, name in names(Gate).items()}
-    silent = {name: share for name, share in gates.items() if share and name != "answer"}
-    return {"pixels": pixels, "silent": {**silent, "unfit": float(steps.unfit.mean())}}
+    no_answer = {name: share for name, share in gates.items() if share and name != "answer"}
+    return {"pixels": pixels, "no_answer": {**no_answer, "unfit": float(steps.unfit.mean())}}
 
 
 def _resize_picture(frame: Frame, hw: tuple[int, ...]) -> np.ndarray:
@@ -324,13 +326,13 @@ def _format_summary(task: CompletionTask, n_untouched: int) -> str:
     """Printed summary of one scene."""
     rows = [task.done[task.name(i)] for i in task.frames]
     pixels: Counter[str] = Counter()
-    silent: Counter[str] = Counter()
+    no_answer: Counter[str] = Counter()
     for row in rows:
         pixels.update(row["pixels"])
-        silent.update({k: share / len(rows) for k, share in row["silent"].items()})
+        no_answer.update({k: share / len(rows) for k, share in row["no_answer"].items()})
     sensor, swept, none = (f"{kind} {pixels[k] / pixels.total():.1%}" for k, kind in _SOURCE_LABELS.items())
-    unfit = silent.pop("unfit")
-    reasons = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in silent.most_common())
+    unfit = no_answer.pop("unfit")
+    reasons = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in no_answer.most_common())
     layout, (h, w) = task.layout, rows[0]["hw"]
     lines = [
         f"{task.scene.name}: {format_count(len(rows), 'frame')}{f' ({n_untouched} left untouched)' * (n_untouched > 0)}"

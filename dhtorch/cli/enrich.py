@@ -140,8 +140,8 @@ def _write_missing_episodes(
     with closing(progress(engine, format_count(len(work.whole), "frame"), len(positions))) as answers:  # type: ignore[type-var]
         for k, each in todo.items():
             for piece in (piece for files in each.values() for piece in files if piece.name not in done):
-                made = islice(answers, len(piece.rows))
-                kept = engines.filter_rows(made, settings["on_error"], work.rows, complaints, "on_error=flag")
+                answered = islice(answers, len(piece.rows))
+                kept = engines.filter_rows(answered, settings["on_error"], work.rows, complaints, "on_error=flag")
                 shards.write_shard(work.waiting, piece, kept, work.rows.wanted, work.shared)
             files = {
                 _camera_key(work, n): [work.waiting / p.name for p in own_pieces] for n, own_pieces in each.items()
@@ -164,14 +164,14 @@ def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJo
             raise ValueError(
                 f"out: found {out} inside the source {root}, which is never written to; expected another folder"
             )
-    asked = dense.dense_options(settings["dense"], "dense")
+    sweep_options = dense.dense_options(settings["dense"], "dense")
     first = [scenes[whole.order[n]] for n in _group_by_episode(whole)[0]]
-    size = _SAMPLED_MAP_SIDE_PX if asked is None else asked["size"]
+    size = _SAMPLED_MAP_SIDE_PX if sweep_options is None else sweep_options["size"]
     views = {v.key: v for v in (DatasetCamera.of(scene, size) for scene in first)}
     _check_views(settings, first, views)
     format = _resolve_format(settings["format"], first)
-    found = scenes, whole, views
-    origin = None if _OUTPUT_FORMATS[format] is None else _open_origin(settings, found)
+    inputs = scenes, whole, views
+    origin = None if _OUTPUT_FORMATS[format] is None else _open_origin(settings, inputs)
     wanted = map_columns(pictures=origin is None, n=method.n)
     shared = _build_metadata(settings, whole, wanted)
     rows = MapRowDataset(
@@ -188,7 +188,7 @@ def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJo
         dense=settings["dense"],
         **_pose_options(settings),
     )
-    target = _open_target(settings, found, out, format, shared["key"], origin, n=method.n)
+    target = _open_target(settings, inputs, out, format, shared["key"], origin, n=method.n)
     notes = []
     if _OUTPUT_FORMATS[format] is not None and settings["fps"] is None and not has_frame_rate(first[0].recording):
         notes.append(f"frame rate unknown: time stamps assume {DEFAULT_FPS:g} frames per second (set fps=N)")
@@ -209,9 +209,9 @@ def _check_views(settings: Mapping[str, Any], first: Sequence[Scene], views: Map
     sizes = {view.hw for view in views.values()}
     if settings["cameras"] and (len(views) < 2 or len(sizes) > 1 or settings["gap"] != plan.AUTO_GAP):
         seen = " and ".join(f"{w}x{h}" for h, w in sorted(sizes))
-        found = f"{len(views)} of {seen} pixels, gap={settings['gap']}"
+        actual = f"{len(views)} of {seen} pixels, gap={settings['gap']}"
         raise ValueError(
-            f"cameras: found {found}, expected two or more cameras of one image size in an episode, and gap=auto"
+            f"cameras: found {actual}, expected two or more cameras of one image size in an episode, and gap=auto"
         )
     unposed = [view.name for view in views.values() if not view.posed]
     if settings["pose"] != "near" and unposed:
@@ -226,10 +226,10 @@ def _pose_options(settings: Mapping[str, Any]) -> Row:
 
 
 def _open_origin(
-    settings: Mapping[str, Any], found: tuple[Sequence[Scene], plan.ExtractionPlan, dict[str, DatasetCamera]]
+    settings: Mapping[str, Any], inputs: tuple[Sequence[Scene], plan.ExtractionPlan, dict[str, DatasetCamera]]
 ) -> DatasetSource | None:
     """The source data set of the recordings where it has columns to copy (LeRobot, RLDS), else None."""
-    scenes, whole, _ = found
+    scenes, whole, _ = inputs
     groups = _group_by_episode(whole)
     recording, numbers = scenes[whole.order[0]].recording, [whole.episodes[group[0]] for group in groups]
     if recording.format == "lerobot" and recording.root is not None:
@@ -242,7 +242,7 @@ def _open_origin(
 
 def _open_target(
     settings: Mapping[str, Any],
-    found: tuple[Sequence[Scene], plan.ExtractionPlan, dict[str, DatasetCamera]],
+    inputs: tuple[Sequence[Scene], plan.ExtractionPlan, dict[str, DatasetCamera]],
     out: Path,
     format: str,
     key: str,
@@ -250,7 +250,7 @@ def _open_target(
     *,
     n: int,
 ) -> DatasetTarget:
-    scenes, whole, views = found
+    scenes, whole, views = inputs
     version, of_episode = _OUTPUT_FORMATS[format], _group_by_episode(whole)
     if version is None:
         unposed = [v.name for v in views.values() if not v.posed]
@@ -295,14 +295,14 @@ def _name_folders(
     return names_by_episode
 
 
-def _resolve_format(asked: str, first: Sequence[Scene]) -> str:
+def _resolve_format(requested: str, first: Sequence[Scene]) -> str:
     """The output format; ``same`` is resolved to that of the source.
 
     Raises:
         ValueError: ``same`` with a source format that cannot be written.
     """
-    if asked != "same":
-        return asked
+    if requested != "same":
+        return requested
     kind, root = first[0].recording.format, first[0].root
     if kind != "lerobot" or root is None:
         raise ValueError(
@@ -339,7 +339,7 @@ def _build_metadata(
             "columns": {k: c._asdict() for k, c in wanted.items()},
             "codes": {
                 **columns.code_tables(),
-                "silent": NO_ANSWER_REASONS,
+                "no_answer": NO_ANSWER_REASONS,
             },
         }
     )
@@ -392,7 +392,7 @@ def _camera_key(work: EnrichJob, n: int) -> str:
     return camera_key(work.scenes[work.whole.order[n]].recording)
 
 
-# ------------------------------------------------------------------------------------------------------ what is said
+# ------------------------------------------------------------------------------------------------------------- summary
 
 
 def _format_summary(work: EnrichJob, owns: Sequence[Row], n_untouched: int, complaints: Sequence[str]) -> list[str]:
@@ -404,7 +404,7 @@ def _format_summary(work: EnrichJob, owns: Sequence[Row], n_untouched: int, comp
         f"{work.out}: {format_count(len(owns), 'episode')}{kept}, {format_count(frames, 'frame')}, {size / 1e6:.1f} MB"
     ]
     for name, shares, reasons in enrich_page.summarise_cameras(owns):
-        kinds = ", ".join(f"{kind} {share:.1%}" for kind, share in shares.items())
+        kinds = ", ".join(f"{kind.replace('_', ' ')} {share:.1%}" for kind, share in shares.items())
         breakdown = ", ".join(f"{words(gate)} {share:.1%}" for gate, share in reasons.items())
         lines.append(f"  {name}: {kinds}" + (f" ({breakdown})" if breakdown else ""))
     lines += [f"  {line}" for line in (*enrich_page.describe_refuted_poses(owns), *work.notes)]

@@ -19,7 +19,7 @@ from dhtorch.extract.targets import UNKNOWN_CONVENTION
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.viz.plots import Axis, LegendKey, Panel
-from dhtorch.viz.plots.colours import GATE_COLOURS, RECOVERED, SENSOR, SILENT, SOFT, Stroke
+from dhtorch.viz.plots.colours import GATE_COLOURS, RECOVERED, SENSOR, SOFT, UNANSWERED, Stroke
 from dhtorch.viz.plots.document import build_document
 from dhtorch.viz.plots.markup import make_tag
 
@@ -38,9 +38,13 @@ _MAX_DRAWN_REASONS = 4
 _MIN_REASON_SHARE = 5e-4
 
 #: Kind of a pixel → its source codes.
-_CODES_OF_KIND = {"sensor": (Source.SENSOR,), "recovered": (Source.RECOVERED, Source.SWEPT), "silent": (Source.NONE,)}
+_CODES_OF_KIND = {
+    "sensor": (Source.SENSOR,),
+    "recovered": (Source.RECOVERED, Source.SWEPT),
+    "no_answer": (Source.NONE,),
+}
 _REASON_COLOURS = {**GATE_COLOURS, NO_OTHER_VIEW: SOFT}
-_KIND_COLOURS = {"sensor": SENSOR, "recovered": RECOVERED, "silent": SILENT}
+_KIND_COLOURS = {"sensor": SENSOR, "recovered": RECOVERED, "no_answer": UNANSWERED}
 
 
 def summarise_cameras(owns: Sequence[Row]) -> list[tuple[str, dict[str, float], dict[str, float]]]:
@@ -68,7 +72,7 @@ def describe_refuted_poses(owns: Sequence[Row]) -> list[str]:
 def write_enrich_page(folder: Path, about: Row, owns: Sequence[Row]) -> Path:
     """Write the page and its numbers as JSON; returns the path of the page."""
     listed = [{k: own[k] for k in ("number", "length", "cameras")} for own in owns]
-    codes = {"pixels": names(Source), "silent": NO_ANSWER_REASONS}
+    codes = {"pixels": names(Source), "no_answer": NO_ANSWER_REASONS}
     storage.write_json(folder / f"{_REPORT_NAME}.json", {"data": about["data"], "codes": codes, "episodes": listed})
     return storage.replace_file(folder / f"{_REPORT_NAME}.html", _build_page(about, owns).encode("utf-8"))
 
@@ -98,12 +102,12 @@ def _build_page(about: Row, owns: Sequence[Row]) -> str:
 
 def _pixel_shares(cameras: Sequence[Row]) -> tuple[dict[str, float], dict[str, float]]:
     pixels = np.sum([np.array(c["pixels"], float) for c in cameras if c["pixels"]], 0)
-    silent = np.sum([np.array(c["silent"], float) for c in cameras if c["pixels"]], 0)
+    no_answer = np.sum([np.array(c["no_answer"], float) for c in cameras if c["pixels"]], 0)
     total = max(1.0, float(np.sum(pixels)))
     if not np.size(pixels):
-        return dict.fromkeys(_CODES_OF_KIND, 0.0) | {"silent": 1.0}, {}
+        return dict.fromkeys(_CODES_OF_KIND, 0.0) | {"no_answer": 1.0}, {}
     kinds = {kind: float(sum(pixels[code] for code in codes)) / total for kind, codes in _CODES_OF_KIND.items()}
-    gates = {name: float(silent[code]) / total for code, name in NO_ANSWER_REASONS.items() if code != Gate.ANSWER}
+    gates = {name: float(no_answer[code]) / total for code, name in NO_ANSWER_REASONS.items() if code != Gate.ANSWER}
     return kinds, {
         name: share for name, share in sorted(gates.items(), key=lambda x: -x[1]) if share >= _MIN_REASON_SHARE
     }
@@ -154,7 +158,7 @@ def _build_worst_table(owns: Sequence[Row]) -> ReportTable:
     for own in owns:
         for name, camera in own["cameras"].items():
             kinds, reasons = _pixel_shares([camera])
-            cameras_by_episode.append((kinds["silent"], own["number"], name, kinds, reasons, camera["unread"]))
+            cameras_by_episode.append((kinds["no_answer"], own["number"], name, kinds, reasons, camera["unread"]))
     rows = []
     for _, number, name, kinds, reasons, unread in sorted(cameras_by_episode, key=lambda x: (-x[0], x[1], x[2]))[
         :_MAX_LISTED_EPISODES
@@ -179,7 +183,7 @@ def _build_time_figure(owns: Sequence[Row]) -> Figure | None:
 
 def _build_reason_figure(owns: Sequence[Row]) -> Figure | None:
     """Most frequent reasons for missing answers over episode time."""
-    averages = _average_over_episodes(owns, "silent_over_time")
+    averages = _average_over_episodes(owns, "no_answer_over_time")
     gates = [gate for gate in _REASON_COLOURS if any(mean[gate].max() > 0 for _, mean in averages)]
     gates = sorted(gates, key=lambda gate: -max(float(mean[gate].mean()) for _, mean in averages))[:_MAX_DRAWN_REASONS]
     panels = []

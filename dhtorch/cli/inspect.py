@@ -33,7 +33,7 @@ from dhtorch.data.survey import Survey, survey_pictures, survey_recording
 from dhtorch.experiments.focal import formats
 from dhtorch.experiments.focal.survey import survey_stacks
 from dhtorch.runtime.console import HELP_EPILOG, escape_markup, format_count, progress, unwrap_terminal
-from dhtorch.viz.plots.colours import DEPTH_CMAP, GREY_CMAP, INK, SCORE_CMAP, SERIES_COLOURS, SILENT
+from dhtorch.viz.plots.colours import DEPTH_CMAP, GREY_CMAP, INK, SCORE_CMAP, SERIES_COLOURS, UNANSWERED
 
 _MAX_LEVELS = 2  # levels of folders searched below the path
 _MAX_RECORDINGS = 12  # recordings shown of one capture
@@ -196,9 +196,9 @@ def _parse_value(text: str) -> Any:
 # -------------------------------------------------------------------------------------------------------------- search
 
 
-def _full_name(inspected: Path, found: Path, name: str) -> str:
+def _full_name(inspected: Path, path: Path, name: str) -> str:
     """Name of a capture with its folders below the inspected path: the last folder alone may be called ``9``."""
-    parts = found.relative_to(inspected).parts
+    parts = path.relative_to(inspected).parts
     return "/".join((inspected.resolve().name, *parts[:-1], name)) if parts else name
 
 
@@ -405,7 +405,7 @@ def _make_outline(shape: Sequence[int]) -> Any:
     """Outline of a depth map, whose holes are white."""
     from matplotlib.patches import Rectangle  # noqa: PLC0415
 
-    return Rectangle((-0.5, -0.5), shape[1], shape[0], fill=False, edgecolor=SILENT, linewidth=0.6)
+    return Rectangle((-0.5, -0.5), shape[1], shape[0], fill=False, edgecolor=UNANSWERED, linewidth=0.6)
 
 
 def _plot_depths(axes: Any, survey: Survey) -> None:

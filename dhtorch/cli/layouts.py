@@ -3,8 +3,8 @@
 - ``frames``: ``images/`` and ``depth/`` by frame number, ``K.txt``, ``poses.txt``; steps of 1 mm, of 5 mm where the
   sensor is a LiDAR of a car. Read by ``frames_dir``.
 - ``tum``: ``rgb/`` and ``depth/`` by time stamp, ``groundtruth.txt``; steps of 0.2 mm, so that it ends at 13.1 m.
-- ``stray``: ``depth/`` and ``confidence/`` (2 the sensor, 1 swept, 0 silent) by frame number, the capture's own tables
-  and video; steps of 1 mm.
+- ``stray``: ``depth/`` and ``confidence/`` (2 the sensor, 1 swept, 0 no answer) by frame number, the capture's own
+  tables and video; steps of 1 mm.
 - ``png``: the maps alone, as ``frames``.
 """
 

@@ -187,8 +187,8 @@ def validate_choices(argv: Sequence[str], folder: Path) -> None:
         choices = sorted(p.stem for p in (folder / key).glob("*.yaml"))
         for choice in value.strip("'\"").split(","):
             if choice.strip() not in choices and not choice.strip().startswith(("[", "{", "choice(", "glob(")):
-                found = f"{key}: found {choice!r}{console.suggest_name(choice, choices)}"
-                raise ValueError(f"{found}, expected one of {', '.join(choices)}")
+                actual = f"{key}: found {choice!r}{console.suggest_name(choice, choices)}"
+                raise ValueError(f"{actual}, expected one of {', '.join(choices)}")
 
 
 def validate_option_names(

@@ -145,7 +145,7 @@ def _find_recording_captures(path: Path, format: str = "auto") -> list[FoundCapt
     raise NothingToRecover(f"{path}: {what}; sensor depth of near surfaces is required for metric scale (docs/data.md)")
 
 
-def _open_captures(found: Sequence[FoundCapture]) -> tuple[list[Recording], list[str]]:
+def _open_captures(captures: Sequence[FoundCapture]) -> tuple[list[Recording], list[str]]:
     """The recordings of several captures, and an error message for each capture that cannot be opened.
 
     Raises:
@@ -153,11 +153,11 @@ def _open_captures(found: Sequence[FoundCapture]) -> tuple[list[Recording], list
     """
     recordings: list[Recording] = []
     refused: list[str] = []
-    for capture in found:
+    for capture in captures:
         try:
             recordings += _open_capture(capture)
         except (NothingToRecover, FormatError) as error:
-            if len(found) == 1:
+            if len(captures) == 1:
                 raise
             refused.append(str(error))
     return recordings, refused

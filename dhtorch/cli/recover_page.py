@@ -32,7 +32,7 @@ class RecoveryStats:
     frames: int
     sensor: float
     recovered: float
-    silent: float
+    no_answer: float
     pixels: float  # recovered pixels per frame
     reasons: tuple[tuple[str, float], ...]  # gate names and fractions of all pixels, the largest first
     near: float | None = None  # m; 2 % and 98 % percentile of recovered depth; None = nothing recovered
@@ -54,7 +54,7 @@ def measure_recovery(task: CompletionTask, frames: Sequence[int]) -> RecoverySta
     if len(depth):
         near, far = np.percentile(depth, (2, 98)).tolist()
         depth_stats = {"near": near, "far": far, "error": float(np.median(ratio))}
-    reasons = tuple(sorted(_average_silent_shares(rows).items(), key=lambda item: -item[1]))
+    reasons = tuple(sorted(_average_no_answer_shares(rows).items(), key=lambda item: -item[1]))
     return RecoveryStats(
         len(rows), fraction["sensor"], fraction["swept"], fraction["none"], pixels, reasons, **depth_stats
     )
@@ -71,51 +71,51 @@ def _read_swept_pixels(task: CompletionTask, frames: Sequence[int]) -> tuple[np.
     return np.concatenate(depth), np.concatenate(ratio)
 
 
-def _average_silent_shares(rows: Sequence[Row]) -> dict[str, float]:
+def _average_no_answer_shares(rows: Sequence[Row]) -> dict[str, float]:
     """Mean fraction of unanswered pixels by reason."""
-    silent: dict[str, float] = {}
+    shares: dict[str, float] = {}
     for row in rows:
-        for name, share in row["silent"].items():
-            silent[name] = silent.get(name, 0.0) + share / len(rows)
-    return silent
+        for name, share in row["no_answer"].items():
+            shares[name] = shares.get(name, 0.0) + share / len(rows)
+    return shares
 
 
-def describe_recovery(task: CompletionTask, found: RecoveryStats, hw: tuple[int, int]) -> list[str]:
+def describe_recovery(task: CompletionTask, stats: RecoveryStats, hw: tuple[int, int]) -> list[str]:
     """Printed sentences: the capture (images (h, w)), and what was recovered."""
     recording, (h, w) = task.recording, hw
     kind = f"{task.scene.name}: a {recording.format} capture, {format_count(len(recording), 'frame')} of {w}x{h}"
     guess = intrinsics_options.find_guess_report(recording.report)
-    sensor = f"{kind}; the sensor has depth at {found.sensor:.0%} of the pixels{f'; its {guess}' if guess else ''}."
-    if found.error is None:
-        return [sensor, f"Nothing was recovered: {_explain_silence(found)}."]
-    amount = f"Recovered {found.pixels:,.0f} pixels per frame without sensor depth, from {found.near:.1f} m to"
-    frames = f"({format_count(found.frames, 'frame')})"
-    return [sensor, f"{amount} {found.far:.1f} m, median sigma {found.error:.1%} of the depth {frames}."]
+    sensor = f"{kind}; the sensor has depth at {stats.sensor:.0%} of the pixels{f'; its {guess}' if guess else ''}."
+    if stats.error is None:
+        return [sensor, f"Nothing was recovered: {_explain_silence(stats)}."]
+    amount = f"Recovered {stats.pixels:,.0f} pixels per frame without sensor depth, from {stats.near:.1f} m to"
+    frames = f"({format_count(stats.frames, 'frame')})"
+    return [sensor, f"{amount} {stats.far:.1f} m, median sigma {stats.error:.1%} of the depth {frames}."]
 
 
-def build_opening(said: Sequence[str], found: RecoveryStats, picture: bytes, place: str) -> PageOpening:
+def build_opening(sentences: Sequence[str], stats: RecoveryStats, picture: bytes, place: str) -> PageOpening:
     """The opening of the page; ``picture`` is the PNG of a frame, ``place`` its title."""
-    shown = {"Recovered pixels per frame": f"{found.pixels:,.0f}"}
-    if found.error is not None:
-        shown |= {"Recovered depth range": f"{found.near:.1f} – {found.far:.1f} m"}
-        shown |= {"Median sigma / depth": f"{found.error:.1%}"}
-    fractions = {"Sensor": found.sensor, "Recovered": found.recovered, "No answer": found.silent}
+    shown = {"Recovered pixels per frame": f"{stats.pixels:,.0f}"}
+    if stats.error is not None:
+        shown |= {"Recovered depth range": f"{stats.near:.1f} – {stats.far:.1f} m"}
+        shown |= {"Median sigma / depth": f"{stats.error:.1%}"}
+    fractions = {"Sensor": stats.sensor, "Recovered": stats.recovered, "No answer": stats.no_answer}
     shown |= {f"{kind}, fraction of the pixels": f"{share:.1%}" for kind, share in fractions.items()}
-    silent = [
+    listed = [
         f"{reasons.describe_gate(name)} ({share:.1%} of the pixels)"
-        for name, share in found.reasons
+        for name, share in stats.reasons
         if share >= _MIN_REASON_SHARE
     ]
     reason_lines = (
-        [f"Most frequent reasons for no answer: {'; '.join(silent[:_MAX_LISTED_REASONS])}."] if silent else []
+        [f"Most frequent reasons for no answer: {'; '.join(listed[:_MAX_LISTED_REASONS])}."] if listed else []
     )
     panels = "image, sensor depth and completed depth on one scale in metres, and sigma / depth"
-    return PageOpening(shown, [*said, *reason_lines], picture, f"{place}: {panels}.")
+    return PageOpening(shown, [*sentences, *reason_lines], picture, f"{place}: {panels}.")
 
 
-def _explain_silence(found: RecoveryStats) -> str:
+def _explain_silence(stats: RecoveryStats) -> str:
     """Most frequent reason for missing answers that has a remedy."""
-    for name, share in found.reasons:
+    for name, share in stats.reasons:
         if share > 0.01 and (remedy := reasons.suggest_remedy(name)) is not None:
             return remedy
     return "the sensor has depth almost everywhere; cutoff=2.0 hides far returns to show what other views recover"

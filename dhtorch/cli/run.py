@@ -468,9 +468,9 @@ def _reject_stacks(error: BaseException, root: Any) -> None:
     if not isinstance(error, FormatError) or error.args[:2] != (str(root), "format"):
         return
     with contextlib.suppress(FormatError):
-        found = f"data: {root} holds focal stacks ({recognise_stacks(root)[0]}), images of one view"
+        actual = f"data: {root} holds focal stacks ({recognise_stacks(root)[0]}), images of one view"
         expected = "a recording of a moving camera; for focal stacks use experiment=focus_stack data=stacks"
-        raise ValueError(f"{found}, expected {expected}") from error
+        raise ValueError(f"{actual}, expected {expected}") from error
 
 
 def _resolve_output_folder(cfg: Any, overrides: Iterable[str], sweep: bool) -> Path:

@@ -132,7 +132,7 @@ def list_exceeded_limits(
     """Texts of the limits exceeded by a recording; an unknown quantity exceeds no limit."""
     lines = []
     for name, limit in limits.items():
-        value = whole["held"][name]
+        value = whole["limited"][name]
         if value is not None and value > limit:
             lines.append(f"{name} is {value:.4g}, limit {limit:g} ({known[name]})")
     return lines
@@ -161,23 +161,23 @@ def parse_limits(text: str | None, known: Mapping[str, str] = _VALIDATION_LIMITS
 
 
 def _validate_recording(
-    found: RecordingValidation, method: Method, settings: Mapping[str, Any], progress: Progress
+    validated: RecordingValidation, method: Method, settings: Mapping[str, Any], progress: Progress
 ) -> RecordingValidation:
     """Validate the frames one by one, then diagnose windows of frames."""
-    n = len(found.scene.recording)
-    frames = found.frame_positions(settings["every"])[: settings["most"]]
-    for i in progress(frames, f"{found.scene.name}: frames", len(frames)):
-        frame = _load_frame(found.scene, settings, i)
-        frame_validation = _validate_frame(found, frame, i, method, settings)
-        row = _summarise_frame(int(found.scene.recording.number[i]), frame_validation)
-        found.rows.append(row)
-        _keep_worst(found, frame, frame_validation, settings)
+    n = len(validated.scene.recording)
+    frames = validated.frame_positions(settings["every"])[: settings["most"]]
+    for i in progress(frames, f"{validated.scene.name}: frames", len(frames)):
+        frame = _load_frame(validated.scene, settings, i)
+        frame_validation = _validate_frame(validated, frame, i, method, settings)
+        row = _summarise_frame(int(validated.scene.recording.number[i]), frame_validation)
+        validated.rows.append(row)
+        _keep_worst(validated, frame, frame_validation, settings)
     if settings["window"]:
         size = min(settings["window"], n)
         firsts = sorted({min(k, n - size) for k in range(0, max(frames[-1] + 1 - size, 0) + 1, size)}) if n > 1 else []
-        for first in progress(firsts, f"{found.scene.name}: windows", len(firsts)):
-            found.windows.append(_diagnose_window(found, first, size, settings))
-    return found
+        for first in progress(firsts, f"{validated.scene.name}: windows", len(firsts)):
+            validated.windows.append(_diagnose_window(validated, first, size, settings))
+    return validated
 
 
 def _load_frame(scene: Scene, settings: Mapping[str, Any], i: int) -> Frame:
@@ -188,24 +188,24 @@ def _load_frame(scene: Scene, settings: Mapping[str, Any], i: int) -> Frame:
 
 
 def _validate_frame(
-    found: RecordingValidation, frame: Frame, i: int, method: Method, settings: Mapping[str, Any]
+    validated: RecordingValidation, frame: Frame, i: int, method: Method, settings: Mapping[str, Any]
 ) -> DepthValidation:
-    recording = found.scene.recording
+    recording = validated.scene.recording
     depth, source_views, source_maps = None, None, None
-    if found.maps is not None:
-        depth_map = found.maps[i]
+    if validated.maps is not None:
+        depth_map = validated.maps[i]
         depth = torch.zeros(1, *frame.hw) if depth_map is None else depth_map
         depth = depth.to(frame.camera.f)
     if len(recording) > 1:
         offered = candidate_frames(recording, i, settings["steps"])
-        source_views = stack([_load_frame(found.scene, settings, k) for k in offered])
-        maps = [] if found.maps is None else [found.maps[k] for k in offered]
+        source_views = stack([_load_frame(validated.scene, settings, k) for k in offered])
+        maps = [] if validated.maps is None else [validated.maps[k] for k in offered]
         available = [m for m in maps if m is not None]
         if available and len({m.shape for m in available}) == 1:
             source_maps = torch.stack([torch.zeros_like(available[0]) if m is None else m for m in maps])
     options = {k: settings[k] for k in ("views", "source_views", "size", "tolerance", "seed")}
     return validate_depth(
-        depth, frame, source_views, other_maps=source_maps, method=method, hint=found.scene.hint, **options
+        depth, frame, source_views, other_maps=source_maps, method=method, hint=validated.scene.hint, **options
     )
 
 
@@ -231,21 +231,21 @@ def _summarise_frame(number: int, validation: DepthValidation) -> Row:
 
 
 def _keep_worst(
-    found: RecordingValidation, frame: Frame, validation: DepthValidation, settings: Mapping[str, Any]
+    validated: RecordingValidation, frame: Frame, validation: DepthValidation, settings: Mapping[str, Any]
 ) -> None:
     """Keep the figures of the worst frames so far."""
-    order = sorted(range(len(found.rows)), key=lambda k: -_severity(found.rows[k]))[: settings["pictures"]]
-    latest = len(found.rows) - 1
+    order = sorted(range(len(validated.rows)), key=lambda k: -_severity(validated.rows[k]))[: settings["pictures"]]
+    latest = len(validated.rows) - 1
     if latest not in order:
         return
     out = io.BytesIO()
     single = validation[0]
-    number = found.rows[latest]["frame"]
-    title = append_cutoff(format_frame(found.scene.name, number), settings["cutoff"])
+    number = validated.rows[latest]["frame"]
+    title = append_cutoff(format_frame(validated.scene.name, number), settings["cutoff"])
     draw_validation(out, frame.image[0].cpu(), single.depth, single.state, single.evidence, title=title)
-    found.pictures[number] = out.getvalue()
-    kept = {found.rows[k]["frame"] for k in order}
-    found.pictures = {k: v for k, v in found.pictures.items() if k in kept}
+    validated.pictures[number] = out.getvalue()
+    kept = {validated.rows[k]["frame"] for k in order}
+    validated.pictures = {k: v for k, v in validated.pictures.items() if k in kept}
 
 
 def _severity(row: Row) -> float:
@@ -254,28 +254,28 @@ def _severity(row: Row) -> float:
     return float(wrong) if wrong is not None else -1.0
 
 
-def _diagnose_window(found: RecordingValidation, first: int, size: int, settings: Mapping[str, Any]) -> Row:
+def _diagnose_window(validated: RecordingValidation, first: int, size: int, settings: Mapping[str, Any]) -> Row:
     """Diagnose ``size`` consecutive frames -> row with the likely cause."""
-    frames = [_load_frame(found.scene, settings, k) for k in range(first, first + size)]
+    frames = [_load_frame(validated.scene, settings, k) for k in range(first, first + size)]
     diagnosis = faults.Diagnosis(None, None, {}, 0)
-    if found.maps is None:
+    if validated.maps is None:
         diagnosis = faults.diagnose(frames, seed=settings["seed"])
     else:
-        depth_maps_of_window = [found.maps[k] for k in range(first, first + size)]
+        depth_maps_of_window = [validated.maps[k] for k in range(first, first + size)]
         shapes = {m.shape for m in depth_maps_of_window if m is not None}
         if len(shapes) == 1:  # maps of different sizes have no common fault
             blank = torch.zeros(next(iter(shapes)))
             diagnosis = faults.diagnose(
                 frames, [blank if m is None else m for m in depth_maps_of_window], seed=settings["seed"]
             )
-    number = found.scene.recording.number
+    number = validated.scene.recording.number
     row: Row = {
         "frames": [int(number[first]), int(number[first + size - 1])],
         "pairs": diagnosis.n_pairs,
         "by": diagnosis.by,
     }
     clip_depth = _find_shared_clip_depth(
-        [found.by_number[k] for k in number[first : first + size].tolist() if k in found.by_number]
+        [validated.by_number[k] for k in number[first : first + size].tolist() if k in validated.by_number]
     )
     if diagnosis.cause is None and clip_depth is not None:
         return row | {"cause": f"cut at {clip_depth:.3g} m", "kind": "cut", "loss": dict(diagnosis.loss)}
@@ -294,9 +294,9 @@ def _find_shared_clip_depth(rows: Sequence[Row]) -> float | None:
 # ------------------------------------------------------------------------------------------------------------- summary
 
 
-def _summarise_recording(found: RecordingValidation) -> Row:
-    """Statistics of a recording; ``held`` are those that ``fail_on`` limits."""
-    rows = found.rows
+def _summarise_recording(validated: RecordingValidation) -> Row:
+    """Statistics of a recording; ``limited`` are those that ``fail_on`` limits."""
+    rows = validated.rows
     pixels = sum(row["pixels"] for row in rows)
     states = [name.lower() for name in names(State).values()]
     count = {name: sum(row[f"share_{name}"] * row["pixels"] for row in rows if row["pixels"]) for name in states}
@@ -306,7 +306,7 @@ def _summarise_recording(found: RecordingValidation) -> Row:
         values = [row[name]["value"] for row in rows if row[name] is not None]
         medians[name] = statistics.median(values) if values else None
     least = DEFAULT_VALIDATION_OPTIONS.min_window_pairs
-    diagnosable = [row for row in found.windows if row["pairs"] >= least or row["cause"] is not None]
+    diagnosable = [row for row in validated.windows if row["pairs"] >= least or row["cause"] is not None]
     causes = Counter(row["cause"] for row in diagnosable if row["cause"] is not None)
     limited = {
         "wrong": _wrong_lower_bound(rows),
@@ -325,7 +325,7 @@ def _summarise_recording(found: RecordingValidation) -> Row:
         "causes": dict(causes),
         "windows": len(diagnosable),
         "clip_depth": _find_shared_clip_depth(rows),
-        "held": limited,
+        "limited": limited,
     }
 
 
@@ -367,7 +367,7 @@ def _share_lower_bound(part: int, whole: int) -> float | None:
 
 def _format_summary(name: str, summary: Row, notes: Sequence[str] = ()) -> list[str]:
     """Printed summary of a recording."""
-    limited, medians = summary["held"], summary["median"]
+    limited, medians = summary["limited"], summary["median"]
     wrong = (
         "no pixel can be checked"
         if summary["wrong"] is None
@@ -390,20 +390,25 @@ def _format_factor(value: float) -> str:
     return f"{value:.3f}" if 0.1 <= value < 1e4 else f"{value:.4g}"
 
 
-def _write_page(place: Path, found: RecordingValidation, whole: Row, exceeded: Sequence[str]) -> Path:
-    rows = sorted(found.rows, key=_severity, reverse=True)
+def _write_page(place: Path, validated: RecordingValidation, whole: Row, exceeded: Sequence[str]) -> Path:
+    rows = sorted(validated.rows, key=_severity, reverse=True)
     frames = []
     for row in rows:
         checked = None if row["share_cannot_know"] is None else 1 - row["share_cannot_know"]
         cells = [pages.format_estimate(row["wrong"]), "–" if checked is None else f"{checked:.2f}"]
         cells += [pages.format_estimate(row[name]) for name in ("scale", "shift", "tilt")]
         cells.append("–" if row["clip_depth"] is None else f"{row['clip_depth']:.3g}")
-        frames.append(pages.ValidatedFrame(f"frame {row['frame']}", cells, found.pictures.get(row["frame"])))
+        frames.append(pages.ValidatedFrame(f"frame {row['frame']}", cells, validated.pictures.get(row["frame"])))
     failed = [f"Exceeded: {limit_line}" for limit_line in exceeded]
-    guess = intrinsics_options.find_guess_report(found.scene.recording.report)
-    lines = _format_summary(found.scene.name, whole, found.notes) + ([f"Its {guess}."] if guess else [])
+    guess = intrinsics_options.find_guess_report(validated.scene.recording.report)
+    lines = _format_summary(validated.scene.name, whole, validated.notes) + ([f"Its {guess}."] if guess else [])
     return pages.write_validation_page(
-        place / "validate.html", found.scene.name, said=lines, columns=_TABLE_COLUMNS, frames=frames, failed=failed
+        place / "validate.html",
+        validated.scene.name,
+        sentences=lines,
+        columns=_TABLE_COLUMNS,
+        frames=frames,
+        failed=failed,
     )
 
 

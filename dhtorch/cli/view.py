@@ -71,7 +71,7 @@ def _load_result_exhibit(target: Path, settings: Mapping[str, Any], progress: Pr
             raise ValueError(f"{error}; set root=PATH to the folder of the data") from error
         print(f"{error}; showing only the points of {ply} (set root=PATH to the folder of the data)", file=sys.stderr)
         return replace(points.read_ply_exhibit(ply), name=str(_select_item(scenes, name, str)))
-    facts = {"experiment": result["experiment"], "data": result["data"]["name"], "made": result["meta"]["utc"]}
+    facts = {"experiment": result["experiment"], "data": result["data"]["name"], "created": result["meta"]["utc"]}
     return replace(scene, facts={**facts, **scene.facts})
 
 
@@ -95,7 +95,7 @@ def _compute_exhibit(
     common = Settings(cutoff=cutoff(scene.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
     options: dict[str, Any] = {
         "most": settings["most"],
-        "sweep": DenseSweep.asked(settings["dense"]),
+        "sweep": DenseSweep.from_options(settings["dense"]),
         "progress": progress,
     }
     exhibit = make_exhibit(scene, parts["method"], parts["pairs"], common, **options)

@@ -35,13 +35,13 @@ class Scene:
             object.__setattr__(self, "gap", int(self.recording.number[1] - self.recording.number[0]))
 
     @classmethod
-    def of(cls, given: SceneLike) -> Scene:
+    def of(cls, item: SceneLike) -> Scene:
         """The scene itself, or a recording without notes.
 
         Raises:
             ValueError: neither a scene nor a recording.
         """
-        return given if isinstance(given, Scene) else cls(given)
+        return item if isinstance(item, Scene) else cls(item)
 
     @property
     def name(self) -> str:
@@ -73,29 +73,29 @@ class Scenes(LazySequence[Scene]):
     """Scenes of one data set with the same notes, each recording opened on access to its scene."""
 
     recordings: Sequence[Recording]
-    noted: Callable[[Recording], Scene] = Scene  # picklable; recording → scene
+    annotate: Callable[[Recording], Scene] = Scene  # picklable; recording → scene
 
     def __len__(self) -> int:
         return len(self.recordings)
 
-    def made(self, place: int) -> Scene:
+    def load_item(self, place: int) -> Scene:
         """The scene at ``place``."""
-        return self.noted(self.recordings[place])
+        return self.annotate(self.recordings[place])
 
     def __repr__(self) -> str:
         return f"Scenes({self.recordings!r})"
 
 
-def scenes_of(given: SceneLike | Sequence[SceneLike]) -> Sequence[Scene]:
+def scenes_of(data: SceneLike | Sequence[SceneLike]) -> Sequence[Scene]:
     """One scene or recording, or a sequence of them → sequence of scenes; lazy where the recordings are.
 
     Raises:
         ValueError: an item that is neither.
     """
-    if isinstance(given, Scenes):
-        return given
-    if isinstance(given, Recordings):
-        return Scenes(given)
-    if isinstance(given, Scene | Recording):
-        return [Scene.of(given)]
-    return [Scene.of(item) for item in (given if isinstance(given, list | tuple) else (given,))]
+    if isinstance(data, Scenes):
+        return data
+    if isinstance(data, Recordings):
+        return Scenes(data)
+    if isinstance(data, Scene | Recording):
+        return [Scene.of(data)]
+    return [Scene.of(item) for item in (data if isinstance(data, list | tuple) else (data,))]

@@ -68,7 +68,7 @@ class Survey:
     depths: Tensor = field(default_factory=lambda: torch.zeros(0))  # (M,) m, returns of the decoded frames
     path: Tensor | None = None  # (n, 3) m, camera centres
 
-    def say(self, what: str, text: str) -> None:
+    def add_fact(self, what: str, text: str) -> None:
         """Add a fact."""
         self.facts.append((what, text))
 
@@ -90,7 +90,7 @@ def survey_recording(
     out = Survey(recording.name, recording.format)
     n = len(recording)
     skipped = int(recording.number[-1] - recording.number[0]) + 1 - n
-    out.say("frames", f"{n}" + (f", {format_count(skipped, 'number')} missing in between" if skipped else ""))
+    out.add_fact("frames", f"{n}" + (f", {format_count(skipped, 'number')} missing in between" if skipped else ""))
     _report_times(recording.times, recording.rate_hz, out)
     places = sorted({round(k * (n - 1) / max(frames - 1, 1)) for k in range(frames)})
     shots: dict[int, Frame] = {}
@@ -120,7 +120,7 @@ def survey_pictures(name: str, images: dict[str, Tensor], depths: dict[str, Tens
     for what, maps in (("pictures", images), ("depth maps", depths)):
         if maps:
             sizes = sorted({f"{x.shape[-1]}x{x.shape[-2]}" for x in maps.values()})
-            out.say(what, f"{len(maps)}, {', '.join(sizes)}")
+            out.add_fact(what, f"{len(maps)}, {', '.join(sizes)}")
     if depths:
         report_depths(list(depths.values()), out)
     out.warn("no intrinsics and no poses: nothing can be measured in it")
@@ -135,15 +135,15 @@ def survey_pictures(name: str, images: dict[str, Tensor], depths: dict[str, Tens
 def _report_times(times: Tensor | None, rate_hz: float | None, out: Survey) -> None:
     nominal = f"nominal {rate_hz:.3g} Hz" if rate_hz else ""
     if times is None or len(times) < 2:
-        out.say("rate", nominal or "not known")
+        out.add_fact("rate", nominal or "not known")
         if times is None:
             out.warn("no time stamps")
         return
     step = times.diff()
     median_step = float(step.median())
     measured = f"{1 / median_step:.4g} Hz" if median_step > 0 else "0 s from frame to frame"
-    out.say("rate", f"{measured} measured" + (f", {nominal}" if nominal else ""))
-    out.say("duration", f"{float(times[-1] - times[0]):.3f} s")
+    out.add_fact("rate", f"{measured} measured" + (f", {nominal}" if nominal else ""))
+    out.add_fact("duration", f"{float(times[-1] - times[0]):.3f} s")
     if bool((step <= 0).any()):
         out.warn(f"time stamps do not increase at {format_count(int((step <= 0).sum()), 'place')}")
     gaps = step > 2.5 * median_step
@@ -154,11 +154,11 @@ def _report_times(times: Tensor | None, rate_hz: float | None, out: Survey) -> N
 def _report_pictures(shots: Sequence[Frame], out: Survey) -> None:
     image = shots[0].image
     if image.numel() == 0:
-        out.say("pictures", "none")
+        out.add_fact("pictures", "none")
         out.warn("depth only: there are no pictures")
         return
     h, w = shots[0].hw
-    out.say("pictures", f"{w}x{h}, {describe_pixels(image.shape[1], image)}")
+    out.add_fact("pictures", f"{w}x{h}, {describe_pixels(image.shape[1], image)}")
     warn_of_duplicates([s.image[0] for s in shots], out, "frames")
     brightness = torch.stack([patches.luma(s.image[:, :, ::4, ::4], 1).mean() for s in shots])
     if float(brightness.max()) < 0.02:
@@ -184,9 +184,9 @@ def _report_depth_maps(shots: Sequence[Frame], sparse: bool, out: Survey) -> Non
 def report_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", sparse: bool = False) -> None:
     """Add facts and warnings on depth maps (h, w) in m: sizes, fraction of holes, percentiles, range."""
     sizes = sorted({f"{d.shape[1]}x{d.shape[0]}" for d in depths})
-    out.say("depth", ", ".join(sizes) + remark)
+    out.add_fact("depth", ", ".join(sizes) + remark)
     holes = torch.stack([(d == 0).double().mean() for d in depths])
-    out.say("holes", _format_range([100 * h for h in holes.tolist()], "{:.1f}") + " % of the depth map")
+    out.add_fact("holes", _format_range([100 * h for h in holes.tolist()], "{:.1f}") + " % of the depth map")
     values = torch.cat([_subsample(d[d > 0]) for d in depths])
     out.depths = values
     if values.numel() == 0:
@@ -194,8 +194,8 @@ def report_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", spars
         return
     ranks = torch.quantile(values.double(), torch.tensor(_DEPTH_PERCENTILES).double() / 100)
     table = ", ".join(f"{p} %: {x:.3f}" for p, x in zip(_DEPTH_PERCENTILES, ranks.tolist(), strict=True))
-    out.say("depth percentiles", f"{table} m")
-    out.say("depth range", f"{float(values.min()):.3f} to {float(values.max()):.3f} m")
+    out.add_fact("depth percentiles", f"{table} m")
+    out.add_fact("depth range", f"{float(values.min()):.3f} to {float(values.max()):.3f} m")
     empty = int((holes == 1).sum())
     if empty:
         out.warn(f"{empty} of {len(depths)} depth maps that were read are empty")
@@ -217,7 +217,7 @@ def _report_confidence(maps: Sequence[Tensor], out: Survey) -> None:
     counts = torch.stack([torch.bincount(m.flatten().long(), minlength=3)[:3] for m in maps]).sum(0)
     percent = (100 * counts / counts.sum().clamp(min=1)).tolist()
     levels = zip(("low", "medium", "high"), percent, strict=True)
-    out.say("confidence", ", ".join(f"{word} {x:.1f} %" for word, x in levels))
+    out.add_fact("confidence", ", ".join(f"{word} {x:.1f} %" for word, x in levels))
     if max(percent) > 99.99:
         out.warn("confidence is the same everywhere")
 
@@ -226,12 +226,12 @@ def _report_cameras(shots: Sequence[Frame], out: Survey) -> None:
     hw, first = shots[0].hw, shots[0].camera
     if min(hw) == 0 and shots[0].depth_camera is not None:
         first, hw = shots[0].depth_camera, (shots[0].depth.shape[-2], shots[0].depth.shape[-1])
-    out.say("intrinsics", describe_camera(first, hw))
+    out.add_fact("intrinsics", describe_camera(first, hw))
     f = torch.cat([s.camera.f for s in shots])
     if float((f.amax(0) / f.amin(0)).max()) > 1 + 1e-6:
-        out.say("focal length", _format_range(f[:, 0].tolist(), "{:.2f}") + " px: it changes from frame to frame")
+        out.add_fact("focal length", _format_range(f[:, 0].tolist(), "{:.2f}") + " px: it changes from frame to frame")
     if shots[0].depth_camera is not None and min(shots[0].hw) > 0:
-        out.say("of the depth", describe_camera(shots[0].depth_camera, tuple(shots[0].depth.shape[-2:])))  # type: ignore[arg-type]
+        out.add_fact("of the depth", describe_camera(shots[0].depth_camera, tuple(shots[0].depth.shape[-2:])))  # type: ignore[arg-type]
     fx, fy = first.f[0].tolist()
     if not 0.95 < fx / fy < 1.05:
         out.warn(f"focal lengths {fx:.1f} and {fy:.1f} px: pixels are not square")
@@ -259,27 +259,27 @@ def _format_range(values: Sequence[float], form: str) -> str:
 def _report_poses(recording: Recording, out: Survey) -> None:
     poses: Pose | None = recording.poses
     if poses is None:
-        out.say("poses", "none")
+        out.add_fact("poses", "none")
         return
     out.path = poses.t
     determinant_error = float((torch.linalg.det(poses.R) - 1).abs().max())
-    out.say("poses", f"{len(recording)}, determinant within {determinant_error:.1e} of 1")
+    out.add_fact("poses", f"{len(recording)}, determinant within {determinant_error:.1e} of 1")
     if len(recording) < 2:
         return
     step = poses.t.diff(dim=0).norm(dim=-1)
     rotation = se3.rotation_angle(se3.relative(poses[1:], poses[:-1]).R)
     extent = float((poses.t.amax(0) - poses.t.amin(0)).norm())
     length, total_deg = float(step.sum()), _to_degrees(rotation.sum())
-    out.say("path", f"{length:.3f} m long inside a box of {extent:.3f} m, {total_deg:.1f}° of turning")
+    out.add_fact("path", f"{length:.3f} m long inside a box of {extent:.3f} m, {total_deg:.1f}° of turning")
     median = f"{float(step.median()):.4f} m and {_to_degrees(rotation.median()):.2f}° from frame to frame"
-    out.say("step", f"{median}, at most {float(step.max()):.3f} m")
+    out.add_fact("step", f"{median}, at most {float(step.max()):.3f} m")
     if float(step.sum()) < _MIN_MOTION_M and float(rotation.sum()) < _MIN_MOTION_RAD:
         out.warn("poses are constant")
     elif extent < _MIN_MOTION_M:
         out.warn("the camera turns but does not move: there is no baseline")
     if recording.times is not None:
         speed = step / recording.times.diff().clamp(min=1e-9)
-        out.say("speed", f"{float(speed.median()):.3f} m/s, at most {float(speed.max()):.3f} m/s")
+        out.add_fact("speed", f"{float(speed.median()):.3f} m/s, at most {float(speed.max()):.3f} m/s")
         if float(speed.max()) > _MAX_SPEED_M_S and not recording.sparse:
             number = int(recording.number[int(speed.argmax()) + 1])
             out.warn(f"the camera jumps: {float(speed.max()):.1f} m/s at frame {number}")
@@ -308,7 +308,7 @@ def _report_agreement(recording: Recording, shots: dict[int, Frame], out: Survey
         errors += [(with_poses, without_poses)] if with_poses is not None and without_poses is not None else []
     if errors:
         with_poses, without_poses = (sorted(column)[len(errors) // 2] for column in zip(*errors, strict=True))
-        out.say(
+        out.add_fact(
             "depth and poses",
             f"agree to {100 * with_poses:.2f} % from frame to frame ({100 * without_poses:.2f} % without poses)",
         )

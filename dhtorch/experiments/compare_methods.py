@@ -44,7 +44,7 @@ class MethodComparison:
     summary: dict[str, dict[str, Any]] = field(default_factory=dict)
     rows: list[dict[str, Any]] = field(default_factory=list)  # {method, scene, number: value}
     left_out: dict[str, list[str]] = field(default_factory=dict)  # method → scenes without a ratio: too few answers
-    silent: dict[str, list[str]] = field(
+    unanswered: dict[str, list[str]] = field(
         default_factory=dict
     )  # "<method>.<per cent>" → scenes without an answer above its threshold
 
@@ -95,7 +95,9 @@ def method_ratios(
         numbers |= evaluate_promises(ours, rooms, rows, draws, seed)
         for percent in _TARGET_PERCENT:
             key = f"realised_risk_{percent}"
-            comparison.silent[f"{method}.{percent}"] = [s for s, row in rows.items() if key in row and row[key] is None]
+            comparison.unanswered[f"{method}.{percent}"] = [
+                s for s, row in rows.items() if key in row and row[key] is None
+            ]
         for name, value in numbers.items():
             comparison.summary[f"{method}.{name}"] = value.entry(errors.metric_unit(name))
         comparison.rows += rows.values()

@@ -48,7 +48,7 @@ _JPEG_QUALITY = 82
 
 
 def make_exhibit(
-    given: SceneLike,
+    source: SceneLike,
     method: Method,
     pairs: ScenePairs,
     settings: Settings,
@@ -60,7 +60,7 @@ def make_exhibit(
     """Run a method on pairs of a recording, as the main job does → exhibit of its images, samples and point clouds.
 
     Args:
-        given: one scene, or a recording as a scene without a near limit or role.
+        source: one scene, or a recording as a scene without a near limit or role.
         method: of one source view or several.
         pairs: scene → list of :class:`dhtorch.data.pairs.Pair`, or plain (reference view, other).
         settings: cutoff, seed, device, batch, workers.
@@ -71,7 +71,7 @@ def make_exhibit(
     Raises:
         ValueError: bad data or options, as :func:`dhtorch.experiments.protocol.run` raises them.
     """
-    shown_scene = Scene.of(given)
+    shown_scene = Scene.of(source)
     recording = shown_scene.recording
     pair_exhibits: list[PairExhibit] = []
     views: dict[int, ExhibitView] = {}
@@ -84,7 +84,7 @@ def make_exhibit(
         pair_exhibits.append(_make_pair_exhibit(answer, list(views)))
         return {}
 
-    viewer_protocol = Protocol({"view": Variant(method, ask=sweep, chooses=True)}, columns=keep, min_candidates=0)
+    viewer_protocol = Protocol({"view": Variant(method, estimate=sweep, chooses=True)}, columns=keep, min_candidates=0)
     protocol.run(
         [shown_scene], viewer_protocol, lambda scene: _evenly_spaced(pairs(scene), most), settings, progress=progress
     )
@@ -131,7 +131,7 @@ def _make_pair_exhibit(answer: Answer, view_numbers: Sequence[int]) -> PairExhib
         view_0=view_numbers.index(i),
         view_1=view_numbers.index(j),
         seen=_return_cloud(reference, (reference.depth > 0) & (reference.depth <= cutoff)),
-        held=_return_cloud(held_back, held_back.depth > cutoff),
+        held_out=_return_cloud(held_back, held_back.depth > cutoff),
         swept=_swept_cloud(reference, answer.trace["dense"]) if "dense" in answer.trace else EMPTY_SWEPT_CLOUD,
         depth_image=_depth_image(reference, cutoff),
         facts=facts,

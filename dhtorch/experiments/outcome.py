@@ -23,7 +23,7 @@ class Example:
     truth: holdout.Truth
     pair: str = ""  # the reference view and the views that were used, as numbers of the recording
     cutoff: float | None = None  # m
-    asked: dict[str, Any] | None = (
+    call_options: dict[str, Any] | None = (
         None  # options of dhtorch.pipeline.dense.complete_depth; None for variants with a call or a pose of their own
     )
 

@@ -40,11 +40,11 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
     draw_samples(folder / "samples.png", image, uv, whole.source[0], e.estimate.gate[0], title=title)
     draw_holes(folder / "holes.png", image, uv, e.samples.hole[0], title=title)
     written = ["samples.png", "holes.png", "points.ply"]
-    if example.asked is not None:  # where the method ran without further options
+    if example.call_options is not None:  # where the method ran without further options
         with torch.no_grad():
-            maps = dense.complete_depth(example.frame, calibration=dense.default_calibration(), **example.asked).to(
-                "cpu"
-            )[0]
+            maps = dense.complete_depth(
+                example.frame, calibration=dense.default_calibration(), **example.call_options
+            ).to("cpu")[0]
         draw_completed(folder / "completed.png", image, maps.depth, maps.sigma, maps.source, title=title)
         written.append("completed.png")
     pooled = errors.points_from_estimate(e.estimate, e.truth)

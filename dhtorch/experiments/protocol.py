@@ -110,12 +110,12 @@ class Variant:
     """A method with the options of an experiment."""
 
     method: Method
-    ask: Callable[..., Estimate] | None = (
+    estimate: Callable[..., Estimate] | None = (
         None  # replaces the method's call: (method, reference view, source views, *, …)
     )
     fit: Callable[[Batch, int], PoseFit] | None = None  # replaces the estimated pose: (batch, number of samples) → fit
     seed: int | None = None  # None = the job's
-    given: Callable[[Batch], Mapping[str, Any]] = (
+    call_options: Callable[[Batch], Mapping[str, Any]] = (
         lambda _batch: {}
     )  # further options of the call, from the whole batch (for oracles)
     offers: CandidateViews | None = (
@@ -124,7 +124,7 @@ class Variant:
     needs: Callable[[Scene], str | None] = lambda _scene: (
         None
     )  # scene → reason why the variant cannot run there, None = it can
-    chooses: bool = False  # ``ask`` selects among candidate views, as the method does
+    chooses: bool = False  # ``estimate`` selects among candidate views, as the method does
     two_frames: bool = False  # no view selection: the held-out samples would influence it
 
 
@@ -234,7 +234,7 @@ class Protocol:
             ValueError: pairs with candidate views for such a variant.
         """
         for v in self.variants.values():
-            if v.two_frames or v.fit is not None or (v.ask is not None and not v.chooses):
+            if v.two_frames or v.fit is not None or (v.estimate is not None and not v.chooses):
                 to_fixed_pairs(pairs)
 
 
@@ -332,7 +332,7 @@ class _SceneCollector:
         variant, (reference, other) = self.protocol.variants[answer.variant], answer.batch.pairs[0]
         views = report.views if report is not None else (other,)
         options: dict[str, Any] | None = None
-        if others is not None and variant.ask is None and variant.fit is None:
+        if others is not None and variant.estimate is None and variant.fit is None:
             selected = others[:, :1] if others.image.dim() == 5 else others[:1]
             options = {
                 "others": selected,
@@ -347,7 +347,7 @@ class _SceneCollector:
             *(answer.samples, answer.estimate, answer.truths[self.deciding_cohort]),
             pair=f"{reference} → {', '.join(map(str, views))}",
             cutoff=self.cutoff,
-            asked=options,
+            call_options=options,
         )
 
     def rows(self) -> list[Row]:
@@ -402,12 +402,12 @@ class _SceneCollector:
         options: dict[str, Any] = {"seed": seed, "hint": self.scene.hint, "track": track}
         if variant.fit is not None:
             options["fit"] = variant.fit(batch, method.n)
-        options |= variant.given(batch)
+        options |= variant.call_options(batch)
         if others is None:  # no source view: all samples count, none is tracked
             options["track"] = _track_nothing
         with torch.no_grad():
-            ask = method if variant.ask is None else partial(variant.ask, method)
-            estimate = ask(reference, reference if others is None else others, trace=trace, **options)
+            call = method if variant.estimate is None else partial(variant.estimate, method)
+            estimate = call(reference, reference if others is None else others, trace=trace, **options)
         shared.charge(trace["ms"])
         return estimate, trace
 

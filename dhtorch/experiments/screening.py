@@ -32,11 +32,11 @@ ScreenedScene = TypeVar("ScreenedScene", bound=HasSceneRow)
 def screen_scenes(
     scenes: Sequence[ScreenedScene],
     items: Callable[[ScreenedScene], Sequence[ScreenedItem]],
-    ask: Callable[[ScreenedScene, ScreenedItem], Mapping[str, Row]],
+    evaluate: Callable[[ScreenedScene, ScreenedItem], Mapping[str, Row]],
     variants: Sequence[str],
     *,
     truth: str,
-    whole: Callable[[ScreenedScene, Sequence[Mapping[str, Row]]], Mapping[str, Row]] = lambda _scene, _found: {},
+    whole: Callable[[ScreenedScene, Sequence[Mapping[str, Row]]], Mapping[str, Row]] = lambda _scene, _results: {},
     progress: Progress,
 ) -> Outcome:
     """Evaluate every item of every scene → rows of items and scenes, and their summary.
@@ -48,17 +48,18 @@ def screen_scenes(
     Args:
         scenes: scenes, each with a row per variant.
         items: scene → pairs or frames to evaluate.
-        ask: scene, item → variant → numbers; a variant may be left out of an item.
+        evaluate: scene, item → variant → numbers; a variant may be left out of an item.
         variants: their names, in order.
         truth: name of the truth, for the rows.
-        whole: scene, results of ``ask`` on all its items → variant → numbers that replace those of the scene's row.
+        whole: scene, results of ``evaluate`` on all its items → variant → numbers that replace those of the scene's
+            row.
         progress: wraps the loop over a scene's items: (items, text, number of items) → items.
     """
     outcome = Outcome()
     for scene in scenes:
         chosen = list(items(scene))
         with torch.no_grad():
-            results = [ask(scene, item) for item in progress(chosen, scene.name, len(chosen))]
+            results = [evaluate(scene, item) for item in progress(chosen, scene.name, len(chosen))]
             replacements = whole(scene, results)
         scene_name = {"scene": scene.name}
         for item, result in zip(chosen, results, strict=True):

@@ -59,17 +59,17 @@ def stored_column(spec: schema.ColumnSpec, sizes: Mapping[str, int], *, half: bo
     return Column(kind, schema.resolve_shape(spec.shape, sizes), spec.unit, spec.meaning)
 
 
-def select_columns(found: Mapping[str, Column], wanted: Sequence[str] | None) -> dict[str, Column]:
+def select_columns(available: Mapping[str, Column], wanted: Sequence[str] | None) -> dict[str, Column]:
     """All columns and wanted names (None = all) -> key columns, wanted columns and ``problem``.
 
     Raises:
         ValueError: an unknown column.
     """
     for name in wanted or ():
-        if name not in found:
-            raise ValueError(f"extract.columns: found {name!r}, expected some of {', '.join(found)}")
-    keep = set(found if wanted is None else wanted) | {*KEY_COLUMNS, "problem"}
-    return {name: column for name, column in found.items() if name in keep}
+        if name not in available:
+            raise ValueError(f"extract.columns: found {name!r}, expected some of {', '.join(available)}")
+    keep = set(available if wanted is None else wanted) | {*KEY_COLUMNS, "problem"}
+    return {name: column for name, column in available.items() if name in keep}
 
 
 def blank_features(wanted: Mapping[str, Column]) -> Row:

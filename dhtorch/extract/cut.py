@@ -19,7 +19,7 @@ class TruncatedScenes(LazySequence[Scene]):
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def made(self, place: int) -> Scene:
+    def load_item(self, place: int) -> Scene:
         """Truncated scene at an index."""
         scene = self.scenes[place]
         return replace(scene, recording=truncate_recording(scene.recording, self.frames))
@@ -35,7 +35,7 @@ class SelectedRecordings(LazySequence[Recording]):
     def __len__(self) -> int:
         return len(self.places)
 
-    def made(self, place: int) -> Recording:
+    def load_item(self, place: int) -> Recording:
         """Recording at an index."""
         return self.scenes[self.places[place]].recording
 

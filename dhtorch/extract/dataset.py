@@ -127,12 +127,12 @@ class OpenRecording:
         self.steps = [] if isinstance(gap, str) else view_offsets(scene, gap, method.views)
         self.position = {int(number): i for i, number in enumerate(self.recording.number)} if self.steps else {}
         self.transforms: dict[tuple[Any, ...], ExtendDepth] = {}
-        self.held: OrderedDict[int, Frame | None] = OrderedDict()
+        self.cached: OrderedDict[int, Frame | None] = OrderedDict()
         self.beside = [(other, match_instants(self.recording, other)) for other in beside]
 
     def frame(self, i: int) -> Frame:
         """Frame ``i``; it is cached, because later frames use it as a source view."""
-        self.held[i] = frame = self.recording[i]
+        self.cached[i] = frame = self.recording[i]
         self._forget()
         return frame
 
@@ -161,17 +161,17 @@ class OpenRecording:
 
     def _cached_frame(self, at: int | None) -> Frame | None:
         """Frame ``at`` from the cache; None = no index, or unreadable."""
-        if at is not None and at not in self.held:
-            self.held[at] = try_read_frame(self.recording, at)
+        if at is not None and at not in self.cached:
+            self.cached[at] = try_read_frame(self.recording, at)
             self._forget()
-        return None if at is None else self.held[at]
+        return None if at is None else self.cached[at]
 
     def _forget(self) -> None:
         """Drop the oldest frames beyond the cache size. (Uncached, decoding backwards restarts at a key frame.)"""
-        frames = [frame for frame in self.held.values() if frame is not None]
+        frames = [frame for frame in self.cached.values() if frame is not None]
         size = max((frame.image.nbytes + frame.depth.nbytes for frame in frames), default=1)
-        while len(self.held) > max(2, _FRAME_CACHE_BYTES // size):
-            self.held.popitem(last=False)
+        while len(self.cached) > max(2, _FRAME_CACHE_BYTES // size):
+            self.cached.popitem(last=False)
 
     def _transform(self, views: int, optional: tuple[str, ...]) -> ExtendDepth:
         """Number of source views and optional keys of a sample -> its transform."""
@@ -195,9 +195,9 @@ def common_map_hw(scenes: Sequence[Scene], maps: DenseMaps) -> tuple[int, int]:
             continue  # reported row by row
         hw = maps.hw(frame.hw)
         if first is not None and hw != first[1]:
-            found = f"{recording.name} has pictures of {_format_hw(frame.hw)} and maps of {_format_hw(hw)}"
+            actual = f"{recording.name} has pictures of {_format_hw(frame.hw)} and maps of {_format_hw(hw)}"
             raise ValueError(
-                f"extract.dense: {found}, expected maps of {_format_hw(first[1])} as of {first[0]}; extract them apart"
+                f"extract.dense: {actual}, expected maps of {_format_hw(first[1])} as of {first[0]}; extract them apart"
             )
         first = first or (recording.name, hw)
     if first is None:
@@ -219,8 +219,8 @@ def _check_shapes(added: Mapping[str, Tensor], wanted: Mapping[str, Column]) -> 
     """Raises SampleError for a map of another size than its column: only maps depend on the image size."""
     for name, column in wanted.items():
         if name in added and tuple(added[name].shape) != column.shape:
-            found, expected = (_format_hw(shape) for shape in (added[name].shape, column.shape))
-            raise SampleError(f"{name}: found {found}, expected {expected} as of the first frame; extract it apart")
+            actual, expected = (_format_hw(shape) for shape in (added[name].shape, column.shape))
+            raise SampleError(f"{name}: found {actual}, expected {expected} as of the first frame; extract it apart")
 
 
 def _format_hw(hw: Sequence[int]) -> str:

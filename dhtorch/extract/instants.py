@@ -39,15 +39,15 @@ class PeekableRows:
         self.row = next(self.rows, None)
 
 
-def iter_instants(made: Mapping[str, PeekableRows]) -> Iterator[dict[str, Row]]:
+def iter_instants(rows_by_camera: Mapping[str, PeekableRows]) -> Iterator[dict[str, Row]]:
     """Rows by camera -> rows of each instant that all cameras have; other rows are skipped."""
-    while all(rows.row is not None for rows in made.values()):
-        latest = max(rows.row["frame_index"] for rows in made.values() if rows.row is not None)
-        for rows in made.values():
+    while all(rows.row is not None for rows in rows_by_camera.values()):
+        latest = max(rows.row["frame_index"] for rows in rows_by_camera.values() if rows.row is not None)
+        for rows in rows_by_camera.values():
             while rows.row is not None and rows.row["frame_index"] < latest:
                 rows.drop()
-        if all(rows.row is not None and rows.row["frame_index"] == latest for rows in made.values()):
-            yield {key: row for key, rows in made.items() if (row := rows.take(latest)) is not None}
+        if all(rows.row is not None and rows.row["frame_index"] == latest for rows in rows_by_camera.values()):
+            yield {key: row for key, rows in rows_by_camera.items() if (row := rows.take(latest)) is not None}
 
 
 def iter_groups(rows: Iterable[dict[str, Row]]) -> Iterator[list[dict[str, Row]]]:

@@ -192,10 +192,8 @@ class LeRobotSource:
     def more(self) -> dict[str, Path]:
         """Other files of the data set: relative name → file."""
         root = self.meta.root
-        files_found = [*(p for p in root.iterdir() if p.is_file()), *(root / "meta").iterdir()]
-        kept = (
-            p for p in sorted(files_found) if p.is_file() and p.name not in _REWRITTEN_META_FILES and self._is_inside(p)
-        )
+        files = [*(p for p in root.iterdir() if p.is_file()), *(root / "meta").iterdir()]
+        kept = (p for p in sorted(files) if p.is_file() and p.name not in _REWRITTEN_META_FILES and self._is_inside(p))
         return {str(p.relative_to(root)): p for p in kept}
 
 

@@ -75,10 +75,10 @@ class LeRobotTarget:
         self.origin, self.numbers, self.step, self.fps = origin, numbers, step, fps
         self.tasks = origin.tasks if origin is not None else (task or _DEFAULT_TASK,)
         self.key, self.n, self.cut = key, n, cut
-        self.given: dict[str, FeatureSpec] = {} if origin is None else origin.features
+        self.source_features: dict[str, FeatureSpec] = {} if origin is None else origin.features
         self.keys = {view.key: self._keys(view) for view in views.values()}
         self.renumbered = cut or list(numbers) != list(range(len(numbers)))
-        for name in (*self.given, *views):
+        for name in (*self.source_features, *views):
             if not name or any(mark in name for mark in ("/", "\\", "..", "\0")):
                 raise ValueError(f"data: found a feature called {name!r}, expected a name without / and ..")
         if version == 2 and isinstance(origin, LeRobotSource) and origin.version == 3:
@@ -89,7 +89,7 @@ class LeRobotTarget:
     def _keys(self, view: DatasetCamera) -> dict[str, str]:
         """Camera -> added columns: kind → column name."""
         depth = f"{view.key}_depth"
-        depth = f"{depth}_enriched" if depth in self.given else depth
+        depth = f"{depth}_enriched" if depth in self.source_features else depth
         columns = {
             name: f"{view.key}_dhtorch_{name}" if c.enrich == "png" else depth if name == "depth" else f"{depth}_{name}"
             for name, c in MAP_FILES.items()
@@ -99,9 +99,9 @@ class LeRobotTarget:
         if view.posed:
             columns["pose"] = f"observation.{view.name}.T_world_from_cam"
         for kind, key in list(columns.items()):
-            if key in self.given and kind in ("K", "pose"):
+            if key in self.source_features and kind in ("K", "pose"):
                 del columns[kind]  # the source has the same values
-            elif key in self.given:
+            elif key in self.source_features:
                 raise ValueError(f"data: found a column {key} in the source, expected a set that is not enriched yet")
         return columns
 
@@ -129,12 +129,12 @@ class LeRobotTarget:
 
     def features(self, columns: Iterable[str]) -> dict[str, FeatureSpec]:
         """LeRobot features of all columns of the tables, and of the videos."""
-        features = dict(self.given)
+        features = dict(self.source_features)
         for name in columns:
             if name not in features and name not in self.added():
                 is_integer = name.removeprefix("source.") != "timestamp" and name != "observation.time"
                 features[name] = lerobot.number_feature("int64" if is_integer else "float64")
-        if "timestamp" not in self.given:
+        if "timestamp" not in self.source_features:
             features["timestamp"] = lerobot.number_feature("float32")
         return features | self.added()
 

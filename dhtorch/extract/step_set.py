@@ -40,7 +40,7 @@ class RldsSource:
     numbers: Sequence[int]
     fps: float
     limit: int | None = None
-    held: dict[int, EpisodeSteps] = field(default_factory=dict, repr=False)  # steps of the episode read last
+    cached: dict[int, EpisodeSteps] = field(default_factory=dict, repr=False)  # steps of the episode read last
 
     version = None
     tasks = None
@@ -108,10 +108,10 @@ class RldsSource:
 
     def _steps(self, i: int) -> EpisodeSteps:
         """Steps of episode ``i``; the last episode is cached."""
-        if i not in self.held:
-            self.held.clear()
-            self.held[i] = EpisodeSteps.of(self.recordings[i])
-        return self.held[i]
+        if i not in self.cached:
+            self.cached.clear()
+            self.cached[i] = EpisodeSteps.of(self.recordings[i])
+        return self.cached[i]
 
 
 def _column_name(name: str, picture: bool = False) -> str:

@@ -43,7 +43,7 @@ class MapCounts:
 
     def __init__(self) -> None:
         self.pixels: list[np.ndarray] = []
-        self.silent: list[np.ndarray] = []
+        self.no_answer: list[np.ndarray] = []
         self.moments: FeatureMoments | None = None
         self.refuted: Counter[str] = Counter()
         self.unread = 0
@@ -54,7 +54,7 @@ class MapCounts:
             self.unread += 1
             return
         self.pixels.append(np.asarray(row["pixels"], np.int64))
-        self.silent.append(np.asarray(row["silent"], np.int64))
+        self.no_answer.append(np.asarray(row["no_answer"], np.int64))
         if row["refuted"]:
             self.refuted[CONVENTIONS[row["refuted"] - 1] or UNKNOWN_CONVENTION] += 1
         moments = FeatureMoments(*np.asarray(row["moments"], np.float64).reshape(5, 5))
@@ -63,14 +63,14 @@ class MapCounts:
     def summary(self) -> Row:
         """Pixels by source and by reason, in total and along time; refuted poses by the convention that they match."""
         if not self.pixels:
-            no_pixels: Row = {key: [] for key in ("pixels", "silent", "over_time", "silent_over_time")}
+            no_pixels: Row = {key: [] for key in ("pixels", "no_answer", "over_time", "no_answer_over_time")}
             return {**no_pixels, "unread": self.unread, "frames": 0, "refuted": {}}
-        pixels, silent = np.stack(self.pixels), np.stack(self.silent)
+        pixels, no_answer = np.stack(self.pixels), np.stack(self.no_answer)
         parts = np.array_split(np.arange(len(pixels)), min(_N_TIME_BINS, len(pixels)))
-        along, reasons = ([x[at].sum(0) / max(1, pixels[at].sum()) for at in parts] for x in (pixels, silent))
-        more = {"over_time": along, "silent_over_time": reasons, "unread": self.unread}
+        along, reasons = ([x[at].sum(0) / max(1, pixels[at].sum()) for at in parts] for x in (pixels, no_answer))
+        more = {"over_time": along, "no_answer_over_time": reasons, "unread": self.unread}
         more |= {"frames": len(pixels), "refuted": dict(sorted(self.refuted.items()))}
-        return {"pixels": pixels.sum(0), "silent": silent.sum(0), **more}
+        return {"pixels": pixels.sum(0), "no_answer": no_answer.sum(0), **more}
 
     def of_maps(self) -> tuple[FeatureMoments, FeatureMoments, FeatureMoments] | None:
         """Moments of depth, sigma and the image; None if no frame could be read."""

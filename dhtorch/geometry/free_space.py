@@ -27,8 +27,8 @@ MIN_FREE_SPACE_ANSWERS = 10
 def free_space_violations(
     uv: Tensor,  # (B, N, 2) px
     sensed: Tensor,  # (B, N) m, 0 = no return
-    held: Tensor,  # (B, N) bool
-    asked: Tensor,  # (B, N) bool
+    pose_returns: Tensor,  # (B, N) bool
+    candidates: Tensor,  # (B, N) bool
     depth: Tensor,  # (B, N) m
     sigma: Tensor,  # (B, N) m
 ) -> Tensor:
@@ -37,8 +37,8 @@ def free_space_violations(
     Args:
         uv: samples.
         sensed: depth of the sensor at the samples.
-        held: returns that the pose is estimated from; their median depth is within the range of the sensor.
-        asked: answers at samples whose return is missing for no other reason. Only those in cells of the picture
+        pose_returns: returns that the pose is estimated from; their median depth is within the range of the sensor.
+        candidates: answers at samples whose return is missing for no other reason. Only those in cells of the picture
             without any return are tested: small holes between returns are usual.
         depth, sigma: depth of the answers and its standard deviation.
 
@@ -52,18 +52,24 @@ def free_space_violations(
 
     Gradient: none.
     """
-    check("free_space_violations", uv=(uv, "B N 2"), sensed=(sensed, "B N"), held=(held, "B N"), asked=(asked, "B N"))
+    check(
+        "free_space_violations",
+        uv=(uv, "B N 2"),
+        sensed=(sensed, "B N"),
+        pose_returns=(pose_returns, "B N"),
+        candidates=(candidates, "B N"),
+    )
     check("free_space_violations", uv=(uv, "B N 2"), depth=(depth, "B N"), sigma=(sigma, "B N"))
     has_return = sensed > 0
-    held = held & has_return
+    pose_returns = pose_returns & has_return
     return_ratio = _return_ratio(uv, has_return)
     dense = torch.where(has_return, return_ratio, 0).sum(-1) >= MIN_RETURN_RATIO * has_return.sum(-1).clamp_min(1)
-    few_held = held.sum(-1) <= asked.sum(-1)
-    asked = asked & (return_ratio == 0)
-    violating = asked & (depth.detach() + 2 * sigma.detach() < masked_median(sensed.detach(), held))
-    n = asked.sum(-1)
+    few_returns = pose_returns.sum(-1) <= candidates.sum(-1)
+    candidates = candidates & (return_ratio == 0)
+    violating = candidates & (depth.detach() + 2 * sigma.detach() < masked_median(sensed.detach(), pose_returns))
+    n = candidates.sum(-1)
     ratio = violating.sum(-1) / n.clamp_min(1).to(depth.dtype)
-    testable = dense & held.any(-1) & (n >= MIN_FREE_SPACE_ANSWERS) & few_held
+    testable = dense & pose_returns.any(-1) & (n >= MIN_FREE_SPACE_ANSWERS) & few_returns
     return torch.where(testable, ratio, torch.zeros_like(ratio))
 
 

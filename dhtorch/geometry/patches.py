@@ -106,11 +106,11 @@ def whole_is_faster(hw: tuple[int, int], n: int, size: int) -> bool:
     return size % 2 == 1 and n >= WHOLE_IMAGE_RATIO * hw[0] * hw[1]
 
 
-def gather_reduced(found: Tensor, pixel: Tensor, size: int) -> Tensor:
-    """Results ``found`` (B, H, W) for the patch of every pixel -> (B, N), those that :func:`reduce_patches` gives for
+def gather_reduced(reduced: Tensor, pixel: Tensor, size: int) -> Tensor:
+    """Results ``reduced`` (B, H, W) for the patch of every pixel -> (B, N), those that :func:`reduce_patches` gives for
     the pixels (B, N, 2)."""
-    x, y = _clamp_inside(pixel, (found.shape[1], found.shape[2]), size)
-    return found.flatten(1).gather(1, torch.add(x, y, alpha=found.shape[2]).long())
+    x, y = _clamp_inside(pixel, (reduced.shape[1], reduced.shape[2]), size)
+    return reduced.flatten(1).gather(1, torch.add(x, y, alpha=reduced.shape[2]).long())
 
 
 @lru_cache(maxsize=32)

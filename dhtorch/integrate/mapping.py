@@ -117,7 +117,7 @@ def map_scene(
     """
     recording, chosen = scene.recording, list(pairs(scene))
     settings = {**settings, "voxel": choose_voxel(recording) if settings["voxel"] is None else settings["voxel"]}
-    sweep = DenseSweep.asked(settings["dense"])
+    sweep = DenseSweep.from_options(settings["dense"])
     options = {k: settings[k] for k in ("cutoff", "seed", "device")} | {"dtype": getattr(torch, settings["dtype"])}
     estimates = recordings.estimate_pairs(
         scene, method, chosen, sweep=sweep, shelf=SweepStore(Path(settings["output"])), **options
@@ -342,7 +342,7 @@ def _build_result(settings: Mapping[str, Any], sources: Sequence[Scene], rows: l
     named = result_files.list_files_named({k: config[k] for k in _CONFIG_GROUPS})
     digest = result_files.compute_data_digest({**result_files.list_files_below(r.root for r in sources), **named})
     metrics = ["n_voxels", "n_voxels_sensor", "voxels_vs_sensor", "n_fragments", "n_islands"]
-    metrics += ["n_voxels_sparse", "voxels_vs_sparse"] if DenseSweep.asked(settings["dense"]) is not None else []
+    metrics += ["n_voxels_sparse", "voxels_vs_sparse"] if DenseSweep.from_options(settings["dense"]) is not None else []
     summary = {}
     for metric in metrics:
         values = sorted(row[metric] for row in scenes if row[metric] is not None and row["role"] is None)
@@ -386,7 +386,7 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
         raise ValueError(f"cutoff: found {settings['cutoff']}, expected a positive number of metres, or null for none")
     if not isinstance(settings["min_maps"], int) or settings["min_maps"] < 1:
         raise ValueError(f"min_maps: found {settings['min_maps']!r}, expected a whole number of at least 1")
-    DenseSweep.asked(settings["dense"])
+    DenseSweep.from_options(settings["dense"])
     if settings["mesh"] and not should_mesh(None):
         raise ImportError("mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'")
     integrate.extract_points(

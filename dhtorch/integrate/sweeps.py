@@ -32,9 +32,9 @@ class DenseSweep:
     calibration: Calibration | None = field(default_factory=dense.default_calibration)
 
     @classmethod
-    def asked(cls, given: bool | Mapping[str, Any] | None, name: str = "dense") -> DenseSweep | None:
+    def from_options(cls, settings: bool | Mapping[str, Any] | None, name: str = "dense") -> DenseSweep | None:
         """The sweep of the option ``dense``, None if it is off; see :func:`dhtorch.pipeline.dense.dense_options`."""
-        options = dense.dense_options(given, name)
+        options = dense.dense_options(settings, name)
         return None if options is None else cls(options)
 
     def __call__(
@@ -84,7 +84,7 @@ class SweepStore:
         self._folder = folder
         self._file: IO[bytes] | None = None
 
-    def put(self, found: DepthMap, *, edge_rel: float = 0.1) -> StoredSweep:
+    def put(self, depth_map: DepthMap, *, edge_rel: float = 0.1) -> StoredSweep:
         """Store the swept pixels of a map (B = 1), except those beside a depth step of more than ``edge_rel``.
 
         Pixels there without a return were fitted in a window that reaches over the step, and may belong to either side.
@@ -93,9 +93,9 @@ class SweepStore:
             if self._folder is not None:
                 self._folder.mkdir(parents=True, exist_ok=True)
             self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115  (it lives as long as the store)
-        depth = torch.where(found.keep, found.depth, 0.0)
-        keep = found.keep & (found.source == Source.SWEPT) & (depth_step_rel(depth) <= edge_rel)
-        values = torch.cat((depth, found.sigma, found.score))
+        depth = torch.where(depth_map.keep, depth_map.depth, 0.0)
+        keep = depth_map.keep & (depth_map.source == Source.SWEPT) & (depth_step_rel(depth) <= edge_rel)
+        values = torch.cat((depth, depth_map.sigma, depth_map.score))
         stored = torch.where(keep, values, 0.0).cpu().numpy().astype(np.float16)
         offset = self._file.seek(0, 2)
         self._file.write(stored.tobytes())

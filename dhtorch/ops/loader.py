@@ -160,8 +160,8 @@ def is_loaded() -> bool:
 
 
 def _check_torch_version() -> None:
-    found = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
-    if found < MIN_TORCH_VERSION:
+    version = tuple(int(part) for part in torch.__version__.split("+")[0].split(".")[:2])
+    if version < MIN_TORCH_VERSION:
         expected = ".".join(map(str, MIN_TORCH_VERSION))
         raise OSError(f"compiled operators: found torch {torch.__version__}, expected at least {expected}")
 

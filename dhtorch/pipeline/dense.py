@@ -130,7 +130,7 @@ def complete_depth(
 
 def sweep_depth(
     reference: Frame,
-    asked: SelectedViews,
+    selected: SelectedViews,
     *,
     method: Method = AUTO,
     source_views: int = DenseOptions.source_views,
@@ -150,18 +150,20 @@ def sweep_depth(
     keywords: dict[str, Any] = dict(zip(DENSE_OPTIONS, values, strict=True))
     _check_options("complete_depth", keywords)
     options = replace(options, **keywords)
-    index, use = top_views(asked, source_views, options)
+    index, use = top_views(selected, source_views, options)
     base = plane_sweep.make_reference_view(*downscale_grey(reference, size))
-    swept_views = [source_view_of(asked, k, size, is_used, base.image) for k, is_used in zip(index, use, strict=True)]
-    nearest = _nearest_depth(asked.samples, reference.sparse, options)
+    swept_views = [
+        source_view_of(selected, k, size, is_used, base.image) for k, is_used in zip(index, use, strict=True)
+    ]
+    nearest = _nearest_depth(selected.samples, reference.sparse, options)
     q = torch.linspace(0, 1, planes).to(base.ray) / nearest[:, None].to(base.ray)
     start = surface.sweep_planes(base, swept_views, q, options)
     fitted = surface.refine_surface(base, swept_views, start, q, refinements, options)
     beyond = start.q >= q[:, -1, None, None] * (1 - 1e-6)
-    pair_gate = _pair_gate(asked, use)
+    pair_gate = _pair_gate(selected, use)
     swept = _gated(base, fitted, (beyond, start.alone), pair_gate, options)
     returns = _returns(reference, method, base.hw)
-    swept = _check_against_returns(swept, returns, asked.samples, options)
+    swept = _check_against_returns(swept, returns, selected.samples, options)
     return _merge_returns(swept if calibration is None else calibration.apply(swept), returns)
 
 
@@ -205,19 +207,21 @@ def downscale_grey(frame: Frame, size: int) -> tuple[Tensor, Camera]:
     return F.interpolate(grey, hw, mode="area"), cam.resize(frame.camera, frame.hw, hw)
 
 
-def dense_options(given: bool | Mapping[str, Any] | None, name: str = "dense") -> dict[str, Any] | None:
+def dense_options(settings: bool | Mapping[str, Any] | None, name: str = "dense") -> dict[str, Any] | None:
     """Keyword options of :func:`complete_depth` from a setting: True = the defaults, a mapping = changes of some,
     False or None = None (no maps).
 
     Raises:
         ValueError: another type, an unknown option, no number, or one out of range.
     """
-    if given is None or given is False:
+    if settings is None or settings is False:
         return None
-    if not isinstance(given, bool | Mapping):
-        raise ValueError(f"{name}: found {given!r}, expected true, false or options among {', '.join(DENSE_OPTIONS)}")
+    if not isinstance(settings, bool | Mapping):
+        raise ValueError(
+            f"{name}: found {settings!r}, expected true, false or options among {', '.join(DENSE_OPTIONS)}"
+        )
     options: dict[str, Any] = {option: getattr(DEFAULT_DENSE_OPTIONS, option) for option in DENSE_OPTIONS}
-    for option, value in (given if isinstance(given, Mapping) else {}).items():
+    for option, value in (settings if isinstance(settings, Mapping) else {}).items():
         if option not in options:
             raise ValueError(f"{name}: found {option!r}, expected some of {', '.join(DENSE_OPTIONS)}")
         is_whole = isinstance(options[option], int)
@@ -254,27 +258,27 @@ def selected_views(joined: Estimate, others: Frame | Sequence[Frame], trace: Tra
 
 
 def top_views(
-    asked: SelectedViews, source_views: int, options: DenseOptions = DEFAULT_DENSE_OPTIONS
+    selected: SelectedViews, source_views: int, options: DenseOptions = DEFAULT_DENSE_OPTIONS
 ) -> tuple[Tensor, Tensor]:
     """Indices (K, B) of the views of largest gain, in descending order, and whether they are to be swept (K, B) bool.
 
     The gain is Σ log(1 + (0.1 · depth / sigma)²) over a view's answers without a return.
     """
-    counts = asked.estimates.keep & ~asked.samples.usable & (asked.estimates.sigma > 0)
-    ratio = torch.where(counts, 0.1 * asked.estimates.depth / asked.estimates.sigma, 0.0).detach()
-    gain = torch.where(asked.fits.ok, torch.log1p(ratio.square()).sum(-1), -1.0)
+    counts = selected.estimates.keep & ~selected.samples.usable & (selected.estimates.sigma > 0)
+    ratio = torch.where(counts, 0.1 * selected.estimates.depth / selected.estimates.sigma, 0.0).detach()
+    gain = torch.where(selected.fits.ok, torch.log1p(ratio.square()).sum(-1), -1.0)
     gain, index = gain.sort(dim=0, descending=True, stable=True)
     return index[:source_views], gain[:source_views] > options.min_view_gain
 
 
-def source_view_of(asked: SelectedViews, index: Tensor, size: int, use: Tensor, like: Tensor) -> surface.SourceView:
+def source_view_of(selected: SelectedViews, index: Tensor, size: int, use: Tensor, like: Tensor) -> surface.SourceView:
     """The source views (B,) with index (B,), their images downscaled to ``size`` px; a placeholder motion where the
     pose is missing.
 
     ``use`` (B,) bool says which are swept; floating tensors get dtype and device of ``like``.
     """
     rows = index, torch.arange(len(index), device=index.device)
-    frame, fit = asked.frames[rows], asked.fits[rows]
+    frame, fit = selected.frames[rows], selected.fits[rows]
     image, camera = downscale_grey(frame, size)
     eye = torch.eye(3).to(like)
     R = torch.where(fit.ok[:, None, None], fit.T_1_from_0.R.to(like), eye)
@@ -301,16 +305,16 @@ def _nearest_depth(samples: Samples, sparse: Tensor | None, options: DenseOption
     return torch.where(n > 0, options.sweep_overlap * reach, torch.ones_like(reach))
 
 
-def _pair_gate(asked: SelectedViews, use: Tensor) -> Tensor:
+def _pair_gate(selected: SelectedViews, use: Tensor) -> Tensor:
     """Gate (B,) for all pixels of reference views without a source view to sweep, else ANSWER."""
-    no_baseline = (asked.fits.code == PoseCode.NO_BASELINE) | (asked.estimates.gate == Gate.NO_BASELINE).any(-1)
-    contradicted = (asked.joined.gate == Gate.CONTRADICTED).any(-1) & ~asked.joined.keep.any(-1)
+    no_baseline = (selected.fits.code == PoseCode.NO_BASELINE) | (selected.estimates.gate == Gate.NO_BASELINE).any(-1)
+    contradicted = (selected.joined.gate == Gate.CONTRADICTED).any(-1) & ~selected.joined.keep.any(-1)
     no_view = ~use.any(0)
     return first_reason(
         (contradicted, Gate.CONTRADICTED),
-        (no_view & (asked.fits.code == PoseCode.REFUTED).any(0), Gate.POSE_REFUTED),
+        (no_view & (selected.fits.code == PoseCode.REFUTED).any(0), Gate.POSE_REFUTED),
         (no_view & no_baseline.any(0), Gate.NO_BASELINE),
-        (no_view & ~asked.fits.ok.any(0), Gate.NO_POSE),
+        (no_view & ~selected.fits.ok.any(0), Gate.NO_POSE),
         (no_view, Gate.UNCERTAIN),
     )
 

@@ -103,7 +103,7 @@ class Stream:
                     index = trace["choice"].index
                     trace["back"] = torch.tensor(list(reversed(steps)), device=index.device)[index]
             else:
-                estimate = Estimate.silent(self.method.sample_depth(frame), Gate.NO_BASELINE, n_views=1)
+                estimate = Estimate.unanswered(self.method.sample_depth(frame), Gate.NO_BASELINE, n_views=1)
             self.past.append(frame)
             self.pushed += 1
         return estimate

@@ -42,21 +42,21 @@ def find_reachable_modules(names: Iterable[str], folder: str | Path | None = Non
         folder: of this package; None = the installed package.
     """
     folder = Path(__file__).parents[1] if folder is None else Path(folder)
-    found: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     waiting = list(names)
     while waiting:
         name = waiting.pop()
         for key, path in _find_module_files(name, folder).items():
-            if key in found:
+            if key in files:
                 continue
-            found[key] = path
+            files[key] = path
             # The package's own __init__ imports lazily: such modules appear under their own names.
             if key != "__init__.py":
                 waiting += iter_imports(path.read_text(encoding="utf-8"))
-    folders = {p.parent for key, p in found.items() if "/" in key and not key.startswith(_EXTERNAL_PREFIX)}
+    folders = {p.parent for key, p in files.items() if "/" in key and not key.startswith(_EXTERNAL_PREFIX)}
     for subfolder in folders:
-        found |= {p.relative_to(folder).as_posix(): p for p in subfolder.iterdir() if p.is_file() and p.suffix != ".py"}
-    return dict(sorted(found.items()))
+        files |= {p.relative_to(folder).as_posix(): p for p in subfolder.iterdir() if p.is_file() and p.suffix != ".py"}
+    return dict(sorted(files.items()))
 
 
 def iter_imports(source: str) -> Iterator[str]:

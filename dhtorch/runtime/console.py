@@ -33,13 +33,13 @@ def format_count(n: int, word: str) -> str:
     return f"{n} {word}{'s' * (n != 1)}"
 
 
-def suggest_name(found: str, known: Iterable[str]) -> str:
-    """`` (did you mean NAME?)`` with the known name nearest to ``found``; empty without a near one."""
+def suggest_name(unknown: str, known: Iterable[str]) -> str:
+    """`` (did you mean NAME?)`` with the known name nearest to ``unknown``; empty without a near one."""
     names = list(dict.fromkeys(known))
     full_names = {name.rpartition(".")[2]: name for name in reversed(names)}
-    near = difflib.get_close_matches(found, names, 1, 0.6)
+    near = difflib.get_close_matches(unknown, names, 1, 0.6)
     near = near or [
-        full_names[k] for k in difflib.get_close_matches(found.rpartition(".")[2], list(full_names), 1, 0.7)
+        full_names[k] for k in difflib.get_close_matches(unknown.rpartition(".")[2], list(full_names), 1, 0.7)
     ]
     return f" (did you mean {near[0]}?)" if near else ""
 

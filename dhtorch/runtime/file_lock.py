@@ -23,7 +23,7 @@ except ImportError:  # not on this system: no locking
     fcntl = None
 
 #: Locks held by this process, to which the system would grant a second lock.
-_held_locks: set[Path] = set()
+_locked_paths: set[Path] = set()
 
 
 @contextlib.contextmanager
@@ -42,10 +42,10 @@ def acquire_file_lock(file: str | Path, what: str) -> Iterator[None]:
         yield
         return
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path in _held_locks:
+    if path in _locked_paths:
         raise BlockingIOError(f"{what}: found this process already writing there, expected one writer")
     handle = _open_locked(path, what)
-    _held_locks.add(path)
+    _locked_paths.add(path)
     try:
         os.write(
             handle,
@@ -53,7 +53,7 @@ def acquire_file_lock(file: str | Path, what: str) -> Iterator[None]:
         )
         yield
     finally:
-        _held_locks.discard(path)
+        _locked_paths.discard(path)
         path.unlink(missing_ok=True)  # before release, so that no newer lock file is removed
         os.close(handle)
 

@@ -369,9 +369,9 @@ def _describe_kind(kind: Any) -> str:
     return " or ".join(kind_names[k] for k in (kind if isinstance(kind, tuple) else (kind,)))
 
 
-def _expect(condition: bool, where: str, found: Any, expected: str) -> None:
+def _expect(condition: bool, where: str, value: Any, expected: str) -> None:
     if not condition:
-        shown = repr(found)
+        shown = repr(value)
         raise ValueError(f"{where}: found {shown if len(shown) <= 60 else shown[:57] + '...'}, expected {expected}")
 
 

@@ -52,12 +52,12 @@ class _NearTracks(NamedTuple):
 
 
 def check_pose_prior(
-    given: PosePrior,
+    prior: PosePrior,
     samples: Samples,
     tracks: Tracks,
     camera_0: Camera,
     camera_1: Camera,
-    found: PoseFit,
+    fit: PoseFit,
     *,
     max_residual: float = 0.01,
     min_near: int = 8,
@@ -68,7 +68,7 @@ def check_pose_prior(
 ) -> PoseFit:
     """A given pose as the result of stage 5 with a covariance, or a code where the near returns refute it.
 
-    It is refuted where near returns that one rigid motion explains (``found``, from stage 5) mostly miss it: fewer than
+    It is refuted where near returns that one rigid motion explains (``fit``, from stage 5) mostly miss it: fewer than
     ``min_inlier_ratio`` of them lie within three standard deviations or ``max_residual``; or, where its covariance
     is stated, where the two motions differ by more than ``max_deviation`` standard deviations of both. Near returns
     that no rigid motion explains, or too few of them, refute nothing.
@@ -79,14 +79,14 @@ def check_pose_prior(
     stated covariance of zero.
 
     Args:
-        given: B poses.
+        prior: B poses.
         samples, tracks, camera_0, camera_1: the inputs of stage 5.
-        found: the result of stage 5.
+        fit: the result of stage 5.
         max_residual: residual of a near return that is always tolerated, of a ray with z = 1; a pixel at least.
         min_near: fewer near returns refute nothing.
         min_inlier_ratio: fraction of them that a pose must explain.
         min_confirmed: near returns that a pose without stated covariance must explain.
-        max_deviation: length of xi in standard deviations, those of ``found`` counted threefold; the default refutes
+        max_deviation: length of xi in standard deviations, those of ``fit`` counted threefold; the default refutes
             one right pose in a thousand.
         default_sigma: standard deviations (rad, m) of a pose that near returns confirm and do not measure.
 
@@ -94,7 +94,7 @@ def check_pose_prior(
         PoseFit with the given pose. Codes: TOO_FEW: not a finite pose, or too few near returns to estimate a covariance
         that is not stated; REFUTED, and ``matched_convention`` is then the index in
         :data:`dhtorch.geometry.pose_conventions.CONVENTIONS` under which the numbers would fit (0 = none, or not
-        tested); NO_BASELINE: no translation, or one within its own noise. ``sigma_px`` is that of ``found``, and
+        tested); NO_BASELINE: no translation, or one within its own noise. ``sigma_px`` is that of ``fit``, and
         ``t_snr`` is the larger of both.
 
     Raises:
@@ -103,41 +103,41 @@ def check_pose_prior(
     Gradient: R and t to the given pose; whether it is used, its covariance and the rest carry none.
     Cost: linear in N.
     """
-    check("check_pose_prior", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), R=(given.T_1_from_0.R, "B 3 3"))
-    check("check_pose_prior", t=(given.T_1_from_0.t, "B 3"), cov=(given.cov, "B 6 6"), f_1=(camera_1.f, "B 2"))
-    T = given.T_1_from_0.to(samples.xyz.dtype)
+    check("check_pose_prior", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), R=(prior.T_1_from_0.R, "B 3 3"))
+    check("check_pose_prior", t=(prior.T_1_from_0.t, "B 3"), cov=(prior.cov, "B 6 6"), f_1=(camera_1.f, "B 2"))
+    T = prior.T_1_from_0.to(samples.xyz.dtype)
     N = samples.uv.shape[1]
     with torch.no_grad():
         finite = T.R.isfinite().flatten(1).all(1) & T.t.isfinite().all(1)
-        if given.cov is not None:
-            finite = finite & given.cov.isfinite().flatten(1).all(1)
+        if prior.cov is not None:
+            finite = finite & prior.cov.isfinite().flatten(1).all(1)
         near = _near(samples, tracks)
         floor_px = (max_residual * camera_1.f.detach().amin(-1)).clamp_min(DEFAULT_TRACK_NOISE_PX)
-        own = select_batch(found.ok, found.T_1_from_0.detach().to(T.t.dtype), se3.identity(len(T.t), T.t))
+        own = select_batch(fit.ok, fit.T_1_from_0.detach().to(T.t.dtype), se3.identity(len(T.t), T.t))
         prior_pose = select_batch(finite, T.detach(), se3.identity(len(T.t), T.t))
-        own_cov = torch.where(found.ok[:, None, None], found.cov, 0.0).nan_to_num().to(T.t.dtype)
-        xi = torch.where(found.ok[:, None], se3.log(se3.compose(own, se3.invert(prior_pose))), 0.0)
-        prior_cov = None if given.cov is None else given.cov.detach().nan_to_num().to(T.t.dtype)
+        own_cov = torch.where(fit.ok[:, None, None], fit.cov, 0.0).nan_to_num().to(T.t.dtype)
+        xi = torch.where(fit.ok[:, None], se3.log(se3.compose(own, se3.invert(prior_pose))), 0.0)
+        prior_cov = None if prior.cov is None else prior.cov.detach().nan_to_num().to(T.t.dtype)
         explained = _square(near, prior_pose, camera_1, floor_px, prior_cov) < INLIER_SIGMAS**2
-        no_baseline = found.code == PoseCode.NO_BASELINE
-        rigid_near = near.used & (_square(near, own, camera_1, floor_px, None) < INLIER_SIGMAS**2) & found.ok[:, None]
+        no_baseline = fit.code == PoseCode.NO_BASELINE
+        rigid_near = near.used & (_square(near, own, camera_1, floor_px, None) < INLIER_SIGMAS**2) & fit.ok[:, None]
         rigid_near = rigid_near | (near.used & no_baseline[:, None])
         enough_near = rigid_near.sum(-1) >= min_near
         refuted = enough_near & ((explained & rigid_near).sum(-1) < min_inlier_ratio * rigid_near.sum(-1))
         count = (explained & near.used).sum(-1)
         unconfirmed = (count < min_confirmed) | (count < min_inlier_ratio * near.used.sum(-1))
-        unconfirmed = unconfirmed & ~found.ok & (prior_cov is None)
+        unconfirmed = unconfirmed & ~fit.ok & (prior_cov is None)
         if prior_cov is None:
             default_variance = torch.tensor([default_sigma[0] ** 2] * 3 + [default_sigma[1] ** 2] * 3).to(T.t)
             cov = torch.where(
-                found.ok[:, None, None], own_cov + xi[:, :, None] * xi[:, None], torch.diag(default_variance)
+                fit.ok[:, None, None], own_cov + xi[:, :, None] * xi[:, None], torch.diag(default_variance)
             )
         else:
             cov = prior_cov
             deviates = covariance.mahalanobis(xi, prior_cov + FIT_SIGMA_INFLATION**2 * own_cov) > max_deviation
-            refuted, no_baseline = refuted | (enough_near & found.ok & deviates), torch.zeros_like(no_baseline)
+            refuted, no_baseline = refuted | (enough_near & fit.ok & deviates), torch.zeros_like(no_baseline)
         t_snr = _t_snr(T.t, cov[:, 3:, 3:])
-        t_snr = torch.where(found.ok, torch.maximum(t_snr, found.t_snr.nan_to_num().to(t_snr)), t_snr)
+        t_snr = torch.where(fit.ok, torch.maximum(t_snr, fit.t_snr.nan_to_num().to(t_snr)), t_snr)
         code = first_reason(
             (~finite, PoseCode.TOO_FEW),
             (refuted, PoseCode.REFUTED),
@@ -149,9 +149,9 @@ def check_pose_prior(
         square = _square(near, prior_pose, camera_1, None, None)
         rms_px = (torch.where(inlier, square, 0.0).sum(-1) / inlier.sum(-1).clamp_min(1)).sqrt()
         convention = torch.zeros_like(code)
-        if given.hypotheses is not None:
+        if prior.hypotheses is not None:
             convention = torch.where(
-                refuted, _matched_convention(near, given.hypotheses, camera_1, rigid_near, floor_px), convention
+                refuted, _matched_convention(near, prior.hypotheses, camera_1, rigid_near, floor_px), convention
             )
 
     def answer(x: Tensor) -> Tensor:
@@ -163,20 +163,20 @@ def check_pose_prior(
         inlier=(inlier & ok[:, None])[:, :N],
         n_inlier=inlier.sum(-1),
         rms_px=answer(rms_px),
-        sigma_px=answer(torch.where(found.ok, found.sigma_px.to(rms_px), DEFAULT_TRACK_NOISE_PX)),
+        sigma_px=answer(torch.where(fit.ok, fit.sigma_px.to(rms_px), DEFAULT_TRACK_NOISE_PX)),
         t_snr=answer(t_snr),
         code=code,
         matched_convention=convention,
     )
 
 
-def reject_poses(fit: PoseFit, held: PoseFit) -> PoseFit:
-    """A fit without the poses whose check ``held`` (:func:`check_pose_prior`) is REFUTED or TOO_FEW, with that code.
+def reject_poses(fit: PoseFit, prior_fit: PoseFit) -> PoseFit:
+    """A fit without the poses that ``prior_fit`` (:func:`check_pose_prior`) has as REFUTED or TOO_FEW, with that code.
 
     Raises ValueError for wrong shapes. Gradient: to the poses that stay.
     """
-    check("reject_poses", R=(fit.T_1_from_0.R, "B 3 3"), code=(fit.code, "B"), code_held=(held.code, "B"))
-    rejected = fit.ok & ((held.code == PoseCode.REFUTED) | (held.code == PoseCode.TOO_FEW))
+    check("reject_poses", R=(fit.T_1_from_0.R, "B 3 3"), code=(fit.code, "B"), code_prior=(prior_fit.code, "B"))
+    rejected = fit.ok & ((prior_fit.code == PoseCode.REFUTED) | (prior_fit.code == PoseCode.TOO_FEW))
 
     def mask(x: Tensor) -> Tensor:
         return torch.where(rejected.view(-1, *[1] * (x.dim() - 1)), torch.nan, x)
@@ -189,7 +189,7 @@ def reject_poses(fit: PoseFit, held: PoseFit) -> PoseFit:
         sigma_px=mask(fit.sigma_px),
         t_snr=mask(fit.t_snr),
         shutter=None if fit.shutter is None else fit.shutter.map(mask),
-        code=torch.where(rejected, held.code, fit.code).to(fit.code.dtype),
+        code=torch.where(rejected, prior_fit.code, fit.code).to(fit.code.dtype),
     )
 
 

@@ -26,7 +26,7 @@ from dhtorch.synthetic.shading import ShadedRoom
 _VIEWER_POSE, _YAW = hand_held_path("static", 1, step_m=0.0, rate_hz=1.0, seed=0), 12.0
 
 #: Centre of the held body, in the viewer's axes (x right, y down, z forward).
-_HELD_CENTRE: Triple = (0.02, 0.05, 0.52)
+_CARRIED_CENTRE: Triple = (0.02, 0.05, 0.52)
 
 #: Centre of the turntable, in the viewer's axes, and its rotation, degrees per frame.
 _TURNTABLE_CENTRE: Triple = (0.0, 0.02, 1.07)
@@ -53,10 +53,10 @@ def _parcel_stack() -> list[Solid]:
     ]
 
 
-def _held_parcel() -> list[Solid]:
+def _carried_parcel() -> list[Solid]:
     """A parcel and the fingers that hold it, 0.4 to 0.6 m in front of the viewer."""
-    x, y, z = _HELD_CENTRE
-    parcel = _body_box(_HELD_CENTRE, (0.26, 0.19, 0.10), "poster:3", yaw=22, pitch=-16)
+    x, y, z = _CARRIED_CENTRE
+    parcel = _body_box(_CARRIED_CENTRE, (0.26, 0.19, 0.10), "poster:3", yaw=22, pitch=-16)
     label = _body_box((x - 0.02, y - 0.11, z + 0.01), (0.13, 0.07, 0.08), "poster:1", yaw=-14)
     fingers = [
         _body_box((x + 0.11, y + 0.03 * k - 0.02, z - 0.06), (0.09, 0.022, 0.022), "speckle", tile=0.15, yaw=30)
@@ -66,7 +66,7 @@ def _held_parcel() -> list[Solid]:
 
 
 #: Bodies by name.
-MOVING_BODIES = {"parcels": _parcel_stack, "held": _held_parcel}
+MOVING_BODIES = {"parcels": _parcel_stack, "held": _carried_parcel}
 
 
 @lru_cache(maxsize=2)
@@ -89,7 +89,7 @@ def move_in_hand(T_world_from_cam: Pose) -> Pose:
             3.0 * math.sin(0.41 * i), 2.0 * math.sin(0.29 * i + 1.0), 2.0 * math.sin(0.33 * i + 2.0)
         )
         shift = [0.012 * math.sin(0.37 * i), 0.010 * math.sin(0.31 * i + 2.0), 0.010 * math.sin(0.43 * i + 4.0)]
-        hand_motions.append(_rotate_about(_HELD_CENTRE, turn, shift))
+        hand_motions.append(_rotate_about(_CARRIED_CENTRE, turn, shift))
     home_from_viewer = se3.invert(_VIEWER_POSE)
     return se3.compose(
         se3.compose(T_world_from_cam, _stack_poses(hand_motions)), _repeat_pose(home_from_viewer, len(hand_motions))

@@ -34,7 +34,7 @@ def write_rlds(
     intrinsics: bool = True,
     poses: bool = True,
     shards: int = 1,
-    said: bool = True,
+    has_size: bool = True,
 ) -> None:
     """Write a set of one camera: per step ``observation/<camera>``, an action and the optional features.
 
@@ -47,11 +47,11 @@ def write_rlds(
         intrinsics: write ``observation/<camera>_intrinsics``, 9 numbers.
         poses: write ``observation/<camera>_T_world_from_cam``, 16 numbers.
         shards: number of files.
-        said: write the images' size in the features.
+        has_size: write the images' size in the features.
     """
     first = episodes[0][0]
     depth_name = camera.replace("image", "depth")
-    observation: dict[str, Any] = {camera: _describe_picture((*first.hw, 3) if said else (-1, -1, 3), "uint8")}
+    observation: dict[str, Any] = {camera: _describe_picture((*first.hw, 3) if has_size else (-1, -1, 3), "uint8")}
     if depth == "png":
         observation[depth_name] = _describe_picture((*first.depth.shape[1:], 1), "uint16")
     elif depth == "array":

@@ -48,8 +48,10 @@ def check_constant_pose(pose: PoseMatrix, kind: str) -> None:
     except (TypeError, ValueError):
         is_valid = False
     if not is_valid or kind != "1_from_0":
-        found = f"pose_kind {kind}" if is_valid else repr(pose)[:60]
-        raise ValueError(f"pose: found {found}, expected a key, or with pose_kind='1_from_0' 3x4 or 4x4 finite numbers")
+        actual = f"pose_kind {kind}" if is_valid else repr(pose)[:60]
+        raise ValueError(
+            f"pose: found {actual}, expected a key, or with pose_kind='1_from_0' 3x4 or 4x4 finite numbers"
+        )
 
 
 def parse_pose_sigmas(cov: str | Sequence[float] | None, name: str = "pose_cov") -> tuple[float, float] | None:

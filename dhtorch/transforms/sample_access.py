@@ -132,9 +132,9 @@ def check_sample(sample: Any, image: str, intrinsics: KeyOrNumbers, batched: boo
         is_texts = isinstance(value, list | tuple) and len(value) == n and all(isinstance(text, str) for text in value)
         is_index = shape == (n,) and key in _INDEX_KEYS
         if is_texts or is_index or (key == intrinsics and shape == (n, 3, 3)):
-            found = f"{n} texts" if is_texts else f"shape {shape}"
+            actual = f"{n} texts" if is_texts else f"shape {shape}"
             raise SampleError(
-                f"{key}: found {found} beside {n} pictures, expected one sample; batched=True reads {n} samples, "
+                f"{key}: found {actual} beside {n} pictures, expected one sample; batched=True reads {n} samples, "
                 f"batched=False one sample of {n} frames"
             )
 

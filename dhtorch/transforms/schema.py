@@ -294,9 +294,9 @@ def columns_of_options(options: Collection[str]) -> list[ColumnSpec]:
     return [column for column in COLUMNS if column.option is None or column.option in options]
 
 
-def compute_columns(found: SampleResults, options: Collection[str]) -> dict[str, Tensor]:
+def compute_columns(results: SampleResults, options: Collection[str]) -> dict[str, Tensor]:
     """Results and options -> key → values (B, …). Gradient: as the records' fields."""
-    return {column.key: column.compute(found) for column in columns_of_options(options)}
+    return {column.key: column.compute(results) for column in columns_of_options(options)}
 
 
 def fill_unreadable(added: Mapping[str, Tensor], bad: Tensor) -> dict[str, Tensor]:

@@ -36,7 +36,7 @@ def token_grid(hw: tuple[int, int], *, patch: int = 14, tokens_hw: tuple[int, in
 
 
 def patch_tokens(
-    found: MergedDepth,
+    merged: MergedDepth,
     hole: Tensor,  # (B, N) codes.Hole
     hw: tuple[int, int],
     *,
@@ -53,9 +53,9 @@ def patch_tokens(
     in a patch without samples.
 
     Args:
-        found: sensor and recovered depths, from :func:`dhtorch.pipeline.pair.merge`.
+        merged: sensor and recovered depths, from :func:`dhtorch.pipeline.pair.merge`.
         hole: class of each sample.
-        hw: size of the image that ``found.uv`` are pixels of.
+        hw: size of the image that ``merged.uv`` are pixels of.
         patch: side of a patch, px of the network's input.
         tokens_hw: size of the network's input; None = ``hw``. The remainder of a size that is no multiple of the
             patch, on the right and below, is dropped, as the network's convolution drops it.
@@ -66,15 +66,15 @@ def patch_tokens(
 
     Gradient: to depth and sigma; none through the patch of a sample and whether it has a depth.
     """
-    check("patch_tokens", uv=(found.uv, "B N 2"), depth=(found.depth, "B N"), hole=(hole, "B N"))
-    check("patch_tokens", depth=(found.depth, "B N"), sigma=(found.sigma, "B N"), source=(found.source, "B N"))
+    check("patch_tokens", uv=(merged.uv, "B N 2"), depth=(merged.depth, "B N"), hole=(hole, "B N"))
+    check("patch_tokens", depth=(merged.depth, "B N"), sigma=(merged.sigma, "B N"), source=(merged.source, "B N"))
     rows, columns = token_grid(hw, patch=patch, tokens_hw=tokens_hw)
     scale, margin = _placement(hw, tokens_hw or hw, fit)
     return _pool_tokens(
-        found.uv,
-        found.depth,
-        found.sigma,
-        found.source,
+        merged.uv,
+        merged.depth,
+        merged.sigma,
+        merged.source,
         hole,
         grid=(patch, rows, columns),
         scale=scale,

@@ -105,12 +105,12 @@ def _two_nearest_pixels(n: int, m: int, device: torch.device) -> tuple[Tensor, T
     return index.long(), second.long(), offset.abs() * (n < m)
 
 
-def inflate_sigma(found: ValidationReferences, loose: Tensor, hw: tuple[int, int]) -> ValidationReferences:
+def inflate_sigma(references: ValidationReferences, loose: Tensor, hw: tuple[int, int]) -> ValidationReferences:
     """References whose sigma includes the resolution of the map, ``loose`` (B, h, w) of log depth at their places;
     ``hw`` of the picture. Gradient: none."""
-    check("inflate_sigma", loose=(loose, "B h w"), uv=(found.uv, "B N 2"))
-    at = sample_nearest(loose, resize_pixels(found.uv, hw, (loose.shape[-2], loose.shape[-1])))[0]
-    return found._replace(sigma=(found.sigma.square() + at.square()).sqrt())
+    check("inflate_sigma", loose=(loose, "B h w"), uv=(references.uv, "B N 2"))
+    at = sample_nearest(loose, resize_pixels(references.uv, hw, (loose.shape[-2], loose.shape[-1])))[0]
+    return references._replace(sigma=(references.sigma.square() + at.square()).sqrt())
 
 
 def no_evidence(like: Tensor) -> Evidence:
@@ -122,7 +122,7 @@ def no_evidence(like: Tensor) -> Evidence:
 def sparse_evidence(
     depth: Tensor,  # (B, h, w) m, 0 = no value
     hw: tuple[int, int],  # of the picture
-    found: ValidationReferences,
+    references: ValidationReferences,
     tolerance: float | Tensor,  # (B, h, w), or a number for all pixels
     returns: Samples | None = None,  # (B, h, w) each: near returns at every pixel of the grid
     options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS,
@@ -133,14 +133,14 @@ def sparse_evidence(
     References around a pixel are not independent: their mean has the variance of one of them, plus the variance
     between them. Gradient: none.
     """
-    check("sparse_evidence", depth=(depth, "B h w"), uv=(found.uv, "B N 2"))
+    check("sparse_evidence", depth=(depth, "B h w"), uv=(references.uv, "B N 2"))
     h, w = depth.shape[-2:]
-    place = resize_pixels(found.uv, hw, (h, w))
+    place = resize_pixels(references.uv, hw, (h, w))
     at, inside = sample_nearest(depth, place)
-    used = found.used & inside & (at > 0)
-    ratio = torch.where(used, (at / found.depth).clamp_min(1e-9), 1.0).log()
-    weight = torch.where(used, 1 / found.sigma.square().clamp_min(1e-8), 0.0)
-    columns = torch.stack([torch.ones_like(ratio), ratio, ratio.square(), found.sigma.square()], 1)
+    used = references.used & inside & (at > 0)
+    ratio = torch.where(used, (at / references.depth).clamp_min(1e-9), 1.0).log()
+    weight = torch.where(used, 1 / references.sigma.square().clamp_min(1e-8), 0.0)
+    columns = torch.stack([torch.ones_like(ratio), ratio, ratio.square(), references.sigma.square()], 1)
     total, mean, mean_square, own_variance = _splat_on_surface(
         columns * weight[:, None], place, depth, at, options
     ).unbind(1)

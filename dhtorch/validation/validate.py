@@ -122,7 +122,7 @@ def validate_depth(
 def validate_against(
     depth_map: Tensor | None,  # (B, h, w) m, 0 or not finite = no value; None = the sensor's own
     reference: Frame,
-    asked: dense.SelectedViews | None,
+    selected: dense.SelectedViews | None,
     offered: Tensor | None = None,  # (views, B) index of the selected views among those passed; None = all
     *,
     other_maps: Tensor | None = None,  # (V, B, h', w') m
@@ -148,8 +148,8 @@ def validate_against(
     grid = _finite_positive(
         returns.depth if depth_map is None else _resize_nearest(depth_map.to(reference.camera.f), hw)
     )
-    samples = method.sample_depth(reference) if asked is None else asked.samples
-    estimate = Estimate.silent(samples, Gate.NO_TRACK, n_views=0) if asked is None else asked.joined
+    samples = method.sample_depth(reference) if selected is None else selected.samples
+    estimate = Estimate.unanswered(samples, Gate.NO_TRACK, n_views=0) if selected is None else selected.joined
     points = evidence.validation_references(samples, estimate, near=not is_sensor_map)
     resolution = torch.zeros_like(grid) if depth_map is None else evidence.resolution_sigma(depth_map.to(grid), hw)
     points = evidence.inflate_sigma(points, resolution, reference.hw)
@@ -158,13 +158,15 @@ def validate_against(
         grid, reference.hw, points, allowed_sigma, None if is_sensor_map else returns, options
     )
     kinds = [sparse]
-    if asked is not None and views:
-        number = offered if offered is not None else torch.arange(len(asked.fits.code))[:, None].expand(-1, len(grid))
+    if selected is not None and views:
+        number = (
+            offered if offered is not None else torch.arange(len(selected.fits.code))[:, None].expand(-1, len(grid))
+        )
         source_maps = None if is_sensor_map else other_maps
-        validated = _ValidatedMap(grid, reference, asked, number.to(grid.device), is_sensor_map)
+        validated = _ValidatedMap(grid, reference, selected, number.to(grid.device), is_sensor_map)
         kinds += _view_evidences(validated, source_maps, source_views, allowed_sigma, options)
     no_scale = torch.full((len(grid), 3), torch.nan).to(grid)
-    scale_vs_trajectory = no_scale if asked is None else _scale_vs_trajectory(reference, asked, options)
+    scale_vs_trajectory = no_scale if selected is None else _scale_vs_trajectory(reference, selected, options)
     numbers = _frame_numbers(grid, reference, points, is_sensor_map, options)
     return _assemble_validation(grid, kinds, numbers, scale_vs_trajectory, is_sensor_map, options)
 
@@ -321,7 +323,7 @@ def _assemble_validation(
 
 
 def clipped_depth(
-    grid: Tensor, state: Tensor, said: Tensor, options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS
+    grid: Tensor, state: Tensor, misfit: Tensor, options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS
 ) -> tuple[Tensor, Tensor]:
     """Map, states and misfits -> depth (B,) at which the map is clipped, NaN where it is not, and the pixels (B, h, w)
     at that depth.
@@ -335,7 +337,7 @@ def clipped_depth(
     farthest = grid.amax((1, 2))
     at_plateau = (grid > 0) & (grid >= farthest[:, None, None])
     n = (grid > 0).sum((1, 2)).clamp_min(1)
-    too_near, decided = (state == State.WRONG) & (said < 0), state != State.CANNOT_KNOW
+    too_near, decided = (state == State.WRONG) & (misfit < 0), state != State.CANNOT_KNOW
     rate, other_rate = (
         (too_near & m).sum((1, 2)) / (decided & m).sum((1, 2)).clamp_min(1)
         for m in (at_plateau, (grid > 0) & ~at_plateau)
@@ -502,12 +504,12 @@ def _scale_vs_trajectory(reference: Frame, selected: dense.SelectedViews, option
         return no_scale
     V = len(selected.fits.t_snr)
     T_world_from_reference = reference.T_world_from_cam.map(lambda x: x.expand(V, *x.shape))
-    given_baseline = torch.stack(
+    trajectory_baseline = torch.stack(
         [se3.relative(T_world_from_reference[k], selected.frames.T_world_from_cam[k]).t.norm(dim=-1) for k in range(V)]
     ).to(no_scale)
     baseline = selected.fits.T_1_from_0.t.norm(dim=-1)
-    used = selected.fits.ok & (selected.fits.t_snr > 10) & (given_baseline > 0.01) & baseline.isfinite()
-    log = torch.where(used, baseline / given_baseline.clamp_min(1e-6), 1.0).clamp_min(1e-6).log().T
+    used = selected.fits.ok & (selected.fits.t_snr > 10) & (trajectory_baseline > 0.01) & baseline.isfinite()
+    log = torch.where(used, baseline / trajectory_baseline.clamp_min(1e-6), 1.0).clamp_min(1e-6).log().T
     n = used.sum(0)
     median = masked_median(log, used.T)
     spread = 1.483 * masked_median((log - median).abs(), used.T)[:, 0].where(n > 2, 0.0)

@@ -25,7 +25,7 @@ def near(uv, depth, sigma=0.01):
 
 def far(uv, depth, sigma, shared, keep=True):
     """Far answers at pixels (N, 2)."""
-    silent = Estimate.silent(near(uv, depth), Gate.NO_TRACK, n_views=2)
+    silent = Estimate.unanswered(near(uv, depth), Gate.NO_TRACK, n_views=2)
     full = torch.full_like(silent.score, depth)
     gate = torch.full_like(silent.gate, Gate.ANSWER if keep else Gate.RESIDUAL)
     return silent.replace(depth=full, sigma=full * 0 + sigma, sigma_shared=full * 0 + shared, gate=gate)

@@ -30,12 +30,12 @@ def maps(tmp_path_factory, room):
 
 def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     out = tmp_path / "out"
-    asked = ["align", *ROOM, *LITTLE, f"depth={maps}", f"out={out}", "kind=inverse", 'fail_on="silent>0.9"']
+    asked = ["align", *ROOM, *LITTLE, f"depth={maps}", f"out={out}", "kind=inverse", 'fail_on="no_answer>0.9"']
     assert run.main(asked) == run.EXIT_DONE
     assert "2 maps" in capsys.readouterr().out
     found = json.loads((out / "align.json").read_text())
     assert [row["frame"] for row in found["frames"]] == [0, 3]
-    assert found["whole"]["held"]["unaligned"] == 0
+    assert found["whole"]["limited"]["unaligned"] == 0
     for row in (frame["aligned"] for frame in found["frames"]):
         assert 0 <= row["probability"] <= row["likeliest_probability"] <= 1
         assert (row["probability"] == row["likeliest_probability"]) == (row["model"] == row["likeliest"])
@@ -59,7 +59,7 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
 def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
     for k in range(len(room)):
         np.save(tmp_path / f"{k:04d}.npy", 1.5 * room.truth(k)["depth"][0].numpy())
-    words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "most=1", 'fail_on="scale>0.2,silent>0.99"']
+    words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "most=1", 'fail_on="scale>0.2,no_answer>0.99"']
     assert run.main(["align", *ROOM, *LITTLE, *words]) == run.EXIT_SOME_FAILED
     assert "exceeded: scale is 0.33" in capsys.readouterr().out
     assert "Exceeded" in (tmp_path / "out" / "align.html").read_text()

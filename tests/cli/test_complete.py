@@ -135,8 +135,8 @@ def test_the_meta_file_tells_what_the_others_are(room, numbered):
     assert torch.allclose(torch.tensor(row["K"])[[0, 1], [0, 1]], room[0].camera.f[0]) and row["distortion"] is None
     source = pixels(numbered / "source" / "000001.png")
     assert row["pixels"] == {"none": (source == 0).sum(), "sensor": (source == 1).sum(), "swept": (source == 3).sum()}
-    assert sum(row["silent"].values()) == pytest.approx((source == Source.NONE).mean())
-    assert set(row["silent"]) <= {name.lower() for name in names(Gate).values()} | {"unfit"}
+    assert sum(row["no_answer"].values()) == pytest.approx((source == Source.NONE).mean())
+    assert set(row["no_answer"]) <= {name.lower() for name in names(Gate).values()} | {"unfit"}
     assert about["codes"]["source"] == {str(k): v for k, v in names(Source).items()}
 
 
@@ -224,10 +224,10 @@ def test_steps_never_clip_and_never_wrap():
 def test_what_does_not_fit_is_silent_counted_and_said(captures, tmp_path):
     out = said(captures / "numbered", tmp_path / "maps", most=1, unit=0.00005)
     row = storage.parse_strict_json((tmp_path / "maps" / "meta" / "000000.json").read_text())
-    assert row["silent"]["unfit"] > 0.01 and "are beyond it" in out and "up to 3.3 m" in out
+    assert row["no_answer"]["unfit"] > 0.01 and "are beyond it" in out and "up to 3.3 m" in out
     back = data.open(tmp_path / "maps")[0].depth
     assert float(back.max()) <= 3.2768 and (back > NEAR).any()
-    assert row["pixels"]["none"] / back.numel() == pytest.approx(sum(row["silent"].values()))
+    assert row["pixels"]["none"] / back.numel() == pytest.approx(sum(row["no_answer"].values()))
 
 
 def test_png_loses_nothing():

@@ -58,7 +58,7 @@ def test_files_are_written_and_limits_decide_the_exit_code(tmp_path, maps):
     code, found = validated(out, f"depth={maps}", "depth_unit=mm", 'fail_on="scale>0.5,unknown>1"')
     assert code == run.EXIT_SOME_FAILED, "metres read as millimetres"
     assert len(found["exceeded"]) == 1
-    assert found["whole"]["held"]["scale"] == pytest.approx(0.999, abs=0.002)
+    assert found["whole"]["limited"]["scale"] == pytest.approx(0.999, abs=0.002)
     assert [row["frame"] for row in found["frames"]] == [0, 3]
     page = (out / "validate.html").read_text()
     assert page.count("data:image/png;base64,") == 2
@@ -106,7 +106,7 @@ def test_a_single_frame_exceeds_a_limit_by_its_bound_alone(tmp_path, maps):
     code, found = validated(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.05,wrong>0.9"')
     scale = found["frames"][0]["scale"]
     assert code == run.EXIT_SOME_FAILED
-    assert found["whole"]["held"]["scale"] == pytest.approx(scale["low"] - 1)
+    assert found["whole"]["limited"]["scale"] == pytest.approx(scale["low"] - 1)
     assert scale["low"] - 1 < 0.099 < scale["value"] - 1 + 0.01
     code, _ = validated(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.097"')
     assert code == run.EXIT_DONE, "the value is more, its interval is not"
@@ -178,9 +178,9 @@ def test_a_factor_is_legible_whatever_it_is():
 def test_limits():
     assert parse_limits("wrong>0.05, scale > 0.1") == {"wrong": 0.05, "scale": 0.1}
     assert parse_limits(None) == {}
-    held = {"wrong": 0.06, "scale": None}
-    assert list_exceeded_limits({"held": held}, {"wrong": 0.06, "scale": 0.0}) == [], "not more, and not known"
-    assert len(list_exceeded_limits({"held": held}, {"wrong": 0.05})) == 1
+    limited = {"wrong": 0.06, "scale": None}
+    assert list_exceeded_limits({"limited": limited}, {"wrong": 0.06, "scale": 0.0}) == [], "not more, and not known"
+    assert len(list_exceeded_limits({"limited": limited}, {"wrong": 0.05})) == 1
 
 
 def test_maps_are_matched_by_number_unit_and_kind(tmp_path, maps, room):
@@ -316,7 +316,7 @@ def test_a_study_counts_what_was_planted():
             "pair": None,
             "method": "validate",
             "role": None,
-            "validate.scale_found": 1.0,
+            "validate.scale_detected": 1.0,
             "validate.known": 0.5,
         },
         {
@@ -324,10 +324,10 @@ def test_a_study_counts_what_was_planted():
             "pair": None,
             "method": "validate",
             "role": None,
-            "validate.scale_found": 0.5,
+            "validate.scale_detected": 0.5,
             "validate.known": None,
         },
-        {"scene": "c", "pair": None, "method": "validate", "role": "rotation", "validate.scale_found": 0.0},
+        {"scene": "c", "pair": None, "method": "validate", "role": "rotation", "validate.scale_detected": 0.0},
     ]
 
     def window(fault, kind, named, moved):
@@ -340,7 +340,7 @@ def test_a_study_counts_what_was_planted():
     found = validate_study.summarise_validation([*rows, {**rows[0], "validate.called_right_wrong": 0.02}])
     assert found["validate.called_right_wrong_worst"]["value"] == 0.02
     found = validate_study.summarise_validation(rows)
-    assert found["validate.scale_found"]["value"] == 0.75
+    assert found["validate.scale_detected"]["value"] == 0.75
     assert found["validate.known"]["value"] == 0.5
     assert found["validate.named.unit"]["value"] == 0.5
     assert found["validate.named.mirrored"]["value"] == 1.0, "what moves less than two pixels does not count"
@@ -348,7 +348,7 @@ def test_a_study_counts_what_was_planted():
     assert found["validate.misnamed"]["value"] == 0.5
     holds, why = validate_study.verdict(found)
     assert holds is False
-    assert "validate.scale_found 0.750" in why
+    assert "validate.scale_detected 0.750" in why
     assert "not measured: " in why
 
 
@@ -366,5 +366,5 @@ def test_the_study_runs_on_a_room(room):
     found = validate_study.run([room], {"auto": AUTO.replace(n=512)}, None, Settings(cutoff=2.0), **options)
     told = {"called_right_wrong", "called_right_wrong_worst", "called_right_wrong_cut"}
     assert {f"{who}.{name}" for who in ("validate", "quick", "photometric") for name in told} <= set(found.summary)
-    assert found.summary["validate.scale_found_quick_far"]["n"] <= 1
+    assert found.summary["validate.scale_detected_quick_far"]["n"] <= 1
     assert found.verdict in ("supported", "refuted", "undecided")

@@ -111,7 +111,7 @@ def test_docstrings_arrive_whole(site):
 @pytest.mark.slow
 def test_every_experiment_has_its_row_and_words(site):
     _, pages = site
-    asked = script("hooks").asked()
+    asked = script("hooks").questions()
     shown = text_of(pages["experiments.html"])
     assert len(asked) >= 20
     for name, said in asked.items():
@@ -148,7 +148,7 @@ def test_the_pages_are_whole_without_the_site():
 
 def test_a_mark_that_nobody_makes_is_an_error():
     with pytest.raises(ValueError, match="'wishes', expected one of"):
-        script("hooks").made("wishes")
+        script("hooks").generate("wishes")
 
 
 @pytest.mark.parametrize("page", ["methods", "pipelines", "extend"])

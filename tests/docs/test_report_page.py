@@ -413,7 +413,7 @@ def test_an_overlay_draws_every_point_once_in_its_class():
     assert {key.text for key in figure.legend} >= set(drawn)
     svg = drawing.render_inline_svg(figure.panels[0])
     round_ends = [p.get("d").count("M") for p in ET.fromstring(svg).iter("path") if "linecap" in p.get("style")]
-    assert sum(round_ends) == sum(len(layer.uv) for layer in drawn.values() if layer.mark != "silent"), "a dot each"
+    assert sum(round_ends) == sum(len(layer.uv) for layer in drawn.values() if layer.mark != "unanswered"), "a dot each"
 
 
 def test_a_line_breaks_where_a_value_is_missing():

@@ -124,7 +124,7 @@ def test_promises_equal_plain_loops():
         met = [v <= percent / 100 for v, counts in zip(counted, enough, strict=True) if counts]
         expected = pytest.approx(statistics.mean(met)) if met else None
         assert found.summary[f"map.within_target_{percent}"]["value"] == expected
-        assert found.silent[f"map.{percent}"] == [s for s, v in zip("abcd", values, strict=True) if v is None]
+        assert found.unanswered[f"map.{percent}"] == [s for s, v in zip("abcd", values, strict=True) if v is None]
     for name, scenes in (("ece", applied), ("ece_sigmoid", sigmoid), ("ece_raw", joined)):
         wanted = reliability.ece_interval(list(scenes.values()), draws=200, seed=2)
         assert list(found.summary[f"map.{name}"].values())[:3] == list(wanted[:3]), name
@@ -158,9 +158,9 @@ def test_errors_below_a_millionth_count_as_one():
 def test_a_scene_without_any_error_is_not_silent():
     perfect, paper = ({name: [exact(130, error)] for name in "abc"} for error in (0.0, 0.5))
     found = compare.method_ratios({"paper": paper, "map": perfect}, draws=20)
-    assert found.silent == {"map.10": [], "map.5": []} and found.summary["map.realised_risk_5"]["value"] == 0
+    assert found.unanswered == {"map.10": [], "map.5": []} and found.summary["map.realised_risk_5"]["value"] == 0
     back = compare.method_ratios({"map": perfect, "paper": paper}, reference="map", draws=20)
-    assert back.silent == {"paper.10": list("abc"), "paper.5": list("abc")}
+    assert back.unanswered == {"paper.10": list("abc"), "paper.5": list("abc")}
     assert back.summary["paper.within_target_5"]["value"] is None, "silence counts neither way"
 
 
@@ -177,7 +177,7 @@ def test_a_fallback_fills_only_what_a_method_lacks_and_silence_of_a_target_is_na
     found = compare.method_ratios({"paper": paper, "map": ours, "window": window}, fallback={"window": "map"}, draws=20)
     alone = compare.method_ratios({"paper": paper, "window": {**ours, **window}}, draws=20)
     assert [r for r in found.rows if r["method"] == "window"] == alone.rows
-    assert set(found.silent) == {"map.10", "map.5", "window.10", "window.5"}
+    assert set(found.unanswered) == {"map.10", "map.5", "window.10", "window.5"}
     with pytest.raises(ValueError, match=r"compare\.window\.a: found nothing, expected 2 seeds as paper"):
         compare.method_ratios({"paper": paper, "map": ours, "window": window})
     assert not compare.method_ratios({"base": paper}, reference="base").summary
@@ -263,7 +263,7 @@ def test_scenes_with_few_answers_are_named_and_leave_the_mean():
     assert next(r for r in found.rows if r["scene"] == "c")["median_rel_ratio"] is None
     bad = seeds_of(0.5) | {"c": [scene_of(150, s, silent=1.1) for s in range(3)]}
     found = compare.method_ratios({"paper": seeds_of(1.0), "map": bad})
-    assert found.left_out == {"map": ["c"]} and found.silent["map.10"] == ["c"]
+    assert found.left_out == {"map": ["c"]} and found.unanswered["map.10"] == ["c"]
     realised = [row["realised_risk_10"] or 0.0 for row in found.rows]
     assert found.summary["map.realised_risk_10"]["value"] == pytest.approx(statistics.mean(realised))
 

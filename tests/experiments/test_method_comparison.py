@@ -106,7 +106,7 @@ def test_bars_of_many_views_are_higher():
 
 
 def test_silent_and_left_out_scenes_are_named():
-    found = replace(judged(), left_out={"map": ["terrace"]}, silent={"map.5": ["desk"]})
+    found = replace(judged(), left_out={"map": ["terrace"]}, unanswered={"map.5": ["desk"]})
     why = method_comparison.verdict(found, ["map"], set())[1]
     assert "without ratio: terrace" in why and "map.5 % risk: no answer on desk" in why
 

@@ -366,7 +366,7 @@ def test_steps_tell_their_time_their_task_and_how_pictures_are_encoded():
         "observation/image_0": [jpeg, png] * 6,
     }
     tasks = ["place", "reach"]  # of an episode before
-    tables = list(RldsSource([], [0], 5.0, held={0: FixedEstimate(features, each)}).batches(0, tasks))
+    tables = list(RldsSource([], [0], 5.0, cached={0: FixedEstimate(features, each)}).batches(0, tasks))
     found = [row for table in tables for row in table.to_pylist()]
     assert [table.num_rows for table in tables] == [8, 4]
     assert [row["timestamp"] for row in found] == pytest.approx([k / 5 for k in range(12)])
@@ -380,13 +380,13 @@ def test_counts_of_an_episode_are_sums_and_shares_along_it():
     tally = MapCounts()
     for k in range(48):  # two to a part; the second half is all recovered
         pixels = [6, 0, 2] if k < 24 else [0, 0, 8]
-        row = {"depth": b"x", "pixels": pixels, "silent": [pixels[0], 0], "refuted": 0, "moments": np.ones(25)}
+        row = {"depth": b"x", "pixels": pixels, "no_answer": [pixels[0], 0], "refuted": 0, "moments": np.ones(25)}
         tally.add(row)
     tally.add(None)
     found = tally.summary()
-    assert found["pixels"].tolist() == [144, 0, 240] and found["silent"].tolist() == [144, 0]
+    assert found["pixels"].tolist() == [144, 0, 240] and found["no_answer"].tolist() == [144, 0]
     assert np.allclose(found["over_time"], [[0.75, 0, 0.25]] * 12 + [[0, 0, 1]] * 12)
-    assert np.allclose(found["silent_over_time"], [[0.75, 0]] * 12 + [[0, 0]] * 12)
+    assert np.allclose(found["no_answer_over_time"], [[0.75, 0]] * 12 + [[0, 0]] * 12)
     assert (found["frames"], found["unread"]) == (48, 1)
 
 
@@ -508,8 +508,10 @@ def test_poses_that_near_returns_refute_are_said_everywhere_with_their_reading(t
     assert said in capsys.readouterr().out
     about = json.loads((out / "meta" / "report.json").read_text())
     (camera,) = (episode["cameras"]["front"] for episode in about["episodes"])
-    alone = [code for code, name in about["codes"]["silent"].items() if name == "NO_OTHER_VIEW"]
-    assert sum(camera["silent"]) == camera["pixels"][0] and 0 < camera["silent"][int(*alone)] < camera["pixels"][0]
+    alone = [code for code, name in about["codes"]["no_answer"].items() if name == "NO_OTHER_VIEW"]
+    assert (
+        sum(camera["no_answer"]) == camera["pixels"][0] and 0 < camera["no_answer"][int(*alone)] < camera["pixels"][0]
+    )
     assert camera["refuted"] == {"millimetres": 2} and camera["frames"] == 3
     page = (out / "meta" / "report.html").read_text()
     assert "millimetres" in page and "Input poses that contradict the near returns" in page

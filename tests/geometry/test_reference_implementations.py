@@ -147,7 +147,7 @@ def test_a_window_needs_more_texture_than_the_limit_times_its_pixels():
     texture = float(torch.linalg.eigvalsh(g @ g.T)[0]) / WINDOW**2
     for limit, found in ((0.999 * texture, True), (1.001 * texture, False)):
         o = reference.Options(WINDOW, min_eigenvalue=limit)
-        assert reference.search([level], [level], x, still, o, alike=True).found is found
+        assert reference.search([level], [level], x, still, o, alike=True).valid is found
 
 
 def test_half_a_pixel_around_the_outermost_ones_belongs_to_a_picture():

@@ -640,15 +640,15 @@ def test_a_shelf_holds_maps_of_all_sizes_and_leaves_nothing_behind(tmp_path):
 )
 def test_what_no_sweep_can_be_asked_for_is_refused(given, words):
     with pytest.raises(ValueError, match=words):
-        sweeps.DenseSweep.asked(given)
+        sweeps.DenseSweep.from_options(given)
 
 
 def test_a_sweep_is_asked_for_by_true_or_by_options():
-    assert sweeps.DenseSweep.asked(False) is None is sweeps.DenseSweep.asked(None)
+    assert sweeps.DenseSweep.from_options(False) is None is sweeps.DenseSweep.from_options(None)
     standard = dense.dense_options(True)
-    assert standard is not None and sweeps.DenseSweep.asked(True).options == standard
+    assert standard is not None and sweeps.DenseSweep.from_options(True).options == standard
     asked = {"min_correlation": 1, "size": 320}
-    assert sweeps.DenseSweep.asked(asked).options == standard | asked
+    assert sweeps.DenseSweep.from_options(asked).options == standard | asked
 
 
 def test_a_sweep_finds_more_of_the_far_walls_than_samples_and_the_method_runs_once():

@@ -299,7 +299,7 @@ def five(x):
 @pytest.mark.parametrize("n", [1, 7, 33, 90])
 @pytest.mark.parametrize("ties", [False, True])
 def test_curves_equal_plain_loops(n, ties):
-    p = random_points(n, seed=n, ties=ties, silent=0.0 if n == 1 else 0.3)
+    p = random_points(n, seed=n, ties=ties, unanswered=0.0 if n == 1 else 0.3)
     found, a = curves.sample_curves(p), p.answered()
     kept = a.keep.numel()
     ranked = sorted(zip(a.score.tolist(), a.error.tolist(), strict=True), key=lambda row: -row[0])

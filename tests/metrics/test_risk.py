@@ -57,7 +57,7 @@ def brute_measure(error, score, keep, min_points=10):
 @pytest.mark.parametrize("n", [1, 2, 9, 40, 150])
 def test_risk_equals_brute_force(n, ties):
     for seed in range(4):
-        p = random_points(n, seed, ties, silent=0.0 if n == 1 else 0.3)
+        p = random_points(n, seed, ties, unanswered=0.0 if n == 1 else 0.3)
         if not p.keep.any():
             continue
         # a score that means something, so that the coverages are not all zero
@@ -78,7 +78,7 @@ def test_risk_does_not_depend_on_the_order_of_the_list():
 
 
 def test_a_perfect_order_has_no_excess_and_a_reversed_one_falls():
-    p = random_points(200, silent=0.0)
+    p = random_points(200, unanswered=0.0)
     best, worst = risk.measure_risk(p.replace(score=-p.error)), risk.measure_risk(p.replace(score=p.error))
     assert best["aurc_excess"] == pytest.approx(0, abs=1e-12) and best["monotonicity"] == 1
     assert worst["aurc"] > best["aurc"] and worst["monotonicity"] == 0
@@ -190,7 +190,7 @@ def test_silent_scenes_and_none_at_all():
 
 
 def test_coverage_is_a_share_of_all_candidates():
-    p = random_points(50, silent=0.5)
+    p = random_points(50, unanswered=0.5)
     kept = int(p.keep.sum())
     coverage, found = risk.risk_coverage(p)
     assert coverage.tolist() == pytest.approx([k / 50 for k in range(1, kept + 1)])
@@ -204,7 +204,7 @@ def test_coverage_is_a_share_of_all_candidates():
 @pytest.mark.parametrize("n", [10, 11, 19, 23, 57])
 @pytest.mark.parametrize("seed", range(3))
 def test_monotonicity_equals_brute_force(n, seed):
-    p = random_points(n, seed, silent=0.0)
+    p = random_points(n, seed, unanswered=0.0)
     loss = risk.cap_error(p.error)[p.score.argsort(descending=True)].tolist()
     tenths = [statistics.mean(loss[: n * k // 10]) for k in range(1, 11)]
     found = risk.measure_risk(p)
@@ -238,7 +238,7 @@ def test_a_cut_through_equal_scores_takes_the_middles_of_equal_parts_of_the_tie(
 
 
 def test_what_a_cut_silences_is_silent_in_every_field():
-    p = random_points(30, silent=0.2)
+    p = random_points(30, unanswered=0.2)
     cut = risk.keep_surest(p, 7)
     assert torch.equal(cut.true_depth, p.true_depth) and not cut.score[~cut.keep].any()
     for name in ("depth", "sigma", "residual_px"):

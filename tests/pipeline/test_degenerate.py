@@ -45,7 +45,7 @@ def test_the_hopeless_stay_silent_and_the_healthy_answer(rows):
     assert all(answered[kind, "map"] <= 0.02 for kind in still)
     healthy = degenerate.join([(number, *make(number)) for number in range(0, 5 * len(KINDS), len(KINDS))])
     assert set(healthy.kinds) == {"nothing wrong"}
-    share = {method: float(healthy.ask(method)[0].keep.float().mean()) for method in ("map", "paper")}
+    share = {method: float(healthy.estimate(method)[0].keep.float().mean()) for method in ("map", "paper")}
     assert share["map"] > 0.2 and share["paper"] > 0.5
 
 
@@ -71,7 +71,7 @@ def test_a_pair_depends_on_its_number_alone():
 
 def test_every_broken_promise_is_seen():
     """Spoil one number after the other in a good answer: the promise about it is reported, for that pair alone."""
-    estimate, trace = alone(2 * len(KINDS)).ask("paper")
+    estimate, trace = alone(2 * len(KINDS)).estimate("paper")
     assert estimate.keep.any() and trace["fit"].ok.all()
     assert not any(v.any() for v in degenerate.broken(estimate, trace).values())
     said = estimate.keep & estimate.keep.cumsum(-1).eq(1)
@@ -142,5 +142,5 @@ def test_one_return_of_the_sky_does_not_make_a_line(sky):
     codes = []
     for value in (0.0, sky):
         pair.depth[at[1], at[0]] = value
-        codes.append(int(alone(2 * len(KINDS), pair).ask("map")[1]["fit"].code))
+        codes.append(int(alone(2 * len(KINDS), pair).estimate("map")[1]["fit"].code))
     assert codes[0] == codes[1] == PoseCode.OK

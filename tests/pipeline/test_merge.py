@@ -97,7 +97,7 @@ def test_the_map_is_the_sensor_else_the_answer_else_nothing_in_every_field():
 
 def test_the_map_without_an_estimate_is_that_of_a_silent_one():
     samples = samples_of(30 * rand(2, 20, 2))
-    alone, beside = merge(samples, None), merge(samples, Estimate.silent(samples, Gate.NO_TRACK, n_views=0))
+    alone, beside = merge(samples, None), merge(samples, Estimate.unanswered(samples, Gate.NO_TRACK, n_views=0))
     for name, x in vars(beside).items():
         assert torch.equal(getattr(alone, name), x) and getattr(alone, name).dtype == x.dtype, name
 

@@ -5,7 +5,7 @@ import math
 
 import pytest
 import torch
-from support.view_estimates import given_estimates, random_estimates
+from support.view_estimates import make_estimates, random_estimates
 
 from dhtorch.codes import Gate
 from dhtorch.geometry import camera as cam
@@ -109,22 +109,22 @@ def test_another_view_without_an_answer_costs_nothing():
 
 
 def test_a_contradiction_silences_and_an_outvoted_view_does_not():
-    found = fuse_consistent(given_estimates([4.0, 4.1, 4.05, 9.0], [0.1, 0.1, 0.1, 2.0]))
+    found = fuse_consistent(make_estimates([4.0, 4.1, 4.05, 9.0], [0.1, 0.1, 0.1, 2.0]))
     assert found.keep.all() and float(found.depth) == pytest.approx(4.05, abs=0.05) and int(found.n_views) == 4
-    assert int(fuse_consistent(given_estimates([4.0, 6.0], [0.1, 0.1])).gate) == Gate.INCONSISTENT
-    assert int(fuse_consistent(given_estimates([4.0, 4.1, 6.0], [0.1, 0.1, 0.1])).gate) == Gate.INCONSISTENT
+    assert int(fuse_consistent(make_estimates([4.0, 6.0], [0.1, 0.1])).gate) == Gate.INCONSISTENT
+    assert int(fuse_consistent(make_estimates([4.0, 4.1, 6.0], [0.1, 0.1, 0.1])).gate) == Gate.INCONSISTENT
 
 
 def test_one_view_alone_must_be_sure():
     for sigma, gate in ((0.19, Gate.ANSWER), (0.21, Gate.UNCERTAIN)):
-        assert int(fuse_consistent(given_estimates([4.0, 1.0], [sigma, 1.0], gate=[0, 2])).gate) == gate
-    both = fuse_consistent(given_estimates([4.0, 4.0], [0.5, 0.5]))
+        assert int(fuse_consistent(make_estimates([4.0, 1.0], [sigma, 1.0], gate=[0, 2])).gate) == gate
+    both = fuse_consistent(make_estimates([4.0, 4.0], [0.5, 0.5]))
     assert both.keep.all() and float(both.sigma) == pytest.approx(0.5), "what views share is not averaged out"
-    assert int(fuse_consistent(given_estimates([4.0, 4.0], [0.9, 0.9])).gate) == Gate.UNCERTAIN
+    assert int(fuse_consistent(make_estimates([4.0, 4.0], [0.9, 0.9])).gate) == Gate.UNCERTAIN
 
 
 def test_where_most_views_stand_still_none_is_used():
-    views = random_estimates(V=5, B=2, N=6, silent=0.0, spread=0.1)
+    views = random_estimates(V=5, B=2, N=6, unanswered=0.0, spread=0.1)
     for still, silenced in ((2, False), (3, True), (5, True)):
         gate = views.gate.clone()
         gate[:still, 1, 2] = Gate.NO_BASELINE
@@ -171,9 +171,9 @@ def test_it_captures():
 
 
 def test_an_answer_that_more_views_give_is_surer():
-    views = given_estimates([4.0] * 4, [0.2] * 4)
+    views = make_estimates([4.0] * 4, [0.2] * 4)
     some = [
-        fuse_consistent(views[:k] if k > 1 else given_estimates([4.0, 4.0], [0.2, 0.2], gate=[0, 2])) for k in (1, 2, 4)
+        fuse_consistent(views[:k] if k > 1 else make_estimates([4.0, 4.0], [0.2, 0.2], gate=[0, 2])) for k in (1, 2, 4)
     ]
     zero, uv = torch.zeros(1, 1), torch.zeros(1, 1, 2)
     samples = Samples(uv, zero, zero, torch.zeros(1, 1, 3), zero, zero.int(), zero, zero.int())
@@ -240,6 +240,6 @@ def test_a_small_picture_is_no_reason_to_be_less_sure(room):
 
 
 def test_key_views_takes_what_adds_most():
-    views = random_estimates(V=3, B=1, N=4, silent=0.0)
+    views = random_estimates(V=3, B=1, N=4, unanswered=0.0)
     sigma = views.depth * torch.tensor([0.5, 0.01, 0.02]).double()[:, None, None]
     assert rank_views(views.replace(sigma=sigma), 1).index.tolist() == [[1]]

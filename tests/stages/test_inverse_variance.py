@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 import torch
-from support.view_estimates import given_estimates, rand, random_estimates
+from support.view_estimates import make_estimates, rand, random_estimates
 
 from dhtorch import PAPER
 from dhtorch.codes import Gate
@@ -111,7 +111,7 @@ def test_sigma_is_the_spread_of_the_fused_depth(correlation, V):
     errors = own * (draw(1, N).expand(V, N) if correlation else draw(V, N)) + pose * draw(1, N)
     depth = 1 / (0.25 + errors)
     like = torch.ones(V, 1, N, dtype=torch.float64)
-    views = random_estimates(V=V, B=1, N=N, silent=0.0).replace(depth=depth[:, None])
+    views = random_estimates(V=V, B=1, N=N, unanswered=0.0).replace(depth=depth[:, None])
     views = views.replace(
         sigma=depth[:, None] ** 2 * (own**2 + pose**2).sqrt()[:, None] * like,
         sigma_shared=depth[:, None] ** 2 * pose,
@@ -125,27 +125,26 @@ def test_sigma_is_the_spread_of_the_fused_depth(correlation, V):
 
 def test_limits_hold_at_the_limit_itself():
     """Inverse depths 1/4 and 1/2 with a deviation of 1/8 each: each differs from the mean by as much."""
-    two = given_estimates([4.0, 2.0], [2.0, 0.5])
+    two = make_estimates([4.0, 2.0], [2.0, 0.5])
     gates = [int(inverse_variance(two, max_chi2=x, max_sigma_rel=None).gate) for x in (2.0, 1.9999)]
     assert gates == [Gate.ANSWER, Gate.INCONSISTENT]
-    same = given_estimates([4.0, 4.0], [0.5, 0.5])
+    same = make_estimates([4.0, 4.0], [0.5, 0.5])
     gates = [int(inverse_variance(same, max_sigma_rel=x).gate) for x in (0.125, 0.1249)]
     assert gates == [Gate.ANSWER, Gate.UNCERTAIN]
     assert (
-        int(inverse_variance(given_estimates([4.0, 4 / 3], [1e-9, 1e-9]), max_sigma_rel=1e-12).gate)
-        == Gate.INCONSISTENT
+        int(inverse_variance(make_estimates([4.0, 4 / 3], [1e-9, 1e-9]), max_sigma_rel=1e-12).gate) == Gate.INCONSISTENT
     )
-    assert int(inverse_variance(given_estimates([4.0] * 3, [0.1] * 3, gate=[0, 0, 7])).gate) == Gate.ANSWER
-    assert int(inverse_variance(given_estimates([4.0] * 3, [0.1] * 3, gate=[6, 0, 7])).gate) == Gate.RESIDUAL
-    assert int(inverse_variance(given_estimates([4.0] * 3, [0.1] * 3, gate=[6, 0, 0])).gate) == Gate.ANSWER
+    assert int(inverse_variance(make_estimates([4.0] * 3, [0.1] * 3, gate=[0, 0, 7])).gate) == Gate.ANSWER
+    assert int(inverse_variance(make_estimates([4.0] * 3, [0.1] * 3, gate=[6, 0, 7])).gate) == Gate.RESIDUAL
+    assert int(inverse_variance(make_estimates([4.0] * 3, [0.1] * 3, gate=[6, 0, 0])).gate) == Gate.ANSWER
 
 
 def test_a_view_without_a_positive_depth_and_a_finite_sigma_does_not_count():
-    good = inverse_variance(given_estimates([4.0, 5.0], [0.5, 0.5]), max_sigma_rel=None)
+    good = inverse_variance(make_estimates([4.0, 5.0], [0.5, 0.5]), max_sigma_rel=None)
     for depth, sigma in ((-4.0, 0.1), (0.0, 0.1), (4.0, 0.0), (4.0, math.inf), (4.0, math.nan), (math.nan, 0.1)):
-        found = inverse_variance(given_estimates([4.0, depth, 5.0], [0.5, sigma, 0.5]), max_sigma_rel=None)
+        found = inverse_variance(make_estimates([4.0, depth, 5.0], [0.5, sigma, 0.5]), max_sigma_rel=None)
         assert float(found.depth) == float(good.depth) and int(found.n_views) == 3, (depth, sigma)
-        alone = inverse_variance(given_estimates([4.0, depth], [0.5, sigma]), max_sigma_rel=None)
+        alone = inverse_variance(make_estimates([4.0, depth], [0.5, sigma]), max_sigma_rel=None)
         assert int(alone.gate) == Gate.INCONSISTENT, "an answer that cannot be weighed gives no better reason"
 
 
@@ -160,7 +159,7 @@ def test_one_view_is_its_own_answer_and_none_is_refused():
 
 def test_a_standstill_is_what_more_than_the_share_of_views_say():
     """Even of one point of the reference view; and of each reference view for itself."""
-    views = random_estimates(V=4, B=2, N=5, silent=0.0, spread=0.1)
+    views = random_estimates(V=4, B=2, N=5, unanswered=0.0, spread=0.1)
     for n, share, still in ((2, 0.5, False), (3, 0.5, True), (1, 0.25, False), (2, 0.25, True), (4, 1.0, False)):
         gate = views.gate.clone()
         gate[:n, 1, 3] = Gate.NO_BASELINE
@@ -198,7 +197,7 @@ def plain_key_views(views, count, good=0.1):
 
 @pytest.mark.parametrize("good", [0.1, 0.002])
 def test_key_views_are_added_one_by_one_each_the_one_that_adds_most(good):
-    views = random_estimates(V=6, B=4, N=6, silent=0.5, seed=3)
+    views = random_estimates(V=6, B=4, N=6, unanswered=0.5, seed=3)
     lone = views.gate.clone()
     lone[:, 0, 1:] = Gate.NO_TRACK
     lone[:, 0, 0] = 0  # all depends on one point, where further views add little
@@ -214,7 +213,7 @@ def test_key_views_are_added_one_by_one_each_the_one_that_adds_most(good):
 
 
 def test_what_a_view_adds_stands_beside_it():
-    views = random_estimates(V=4, B=3, N=6, silent=0.0, seed=1)
+    views = random_estimates(V=4, B=3, N=6, unanswered=0.0, seed=1)
     choice = rank_views(views, 3)
     worth = (0.1 * views.depth / views.sigma).square()
     for b in range(3):
@@ -229,7 +228,7 @@ def test_what_a_view_adds_stands_beside_it():
 
 
 def test_answers_without_a_sigma_add_nothing():
-    views = random_estimates(V=3, B=1, N=4, silent=0.0)
+    views = random_estimates(V=3, B=1, N=4, unanswered=0.0)
     sigma = views.sigma.clone()
     sigma[2], sigma[1, 0, :2], sigma[1, 0, 2:] = torch.nan, 0.0, torch.inf
     assert rank_views(views.replace(sigma=sigma), 1).index.tolist() == [[0]]
@@ -252,7 +251,7 @@ class RecordingStages:
         self.reference, self.others = frame(), stack([frame(seed=10 + k) for k in range(V)])
         self.n, self.calls, self.asked = n, [], {"track": [], "pose": [], "triangulate": []}
         self.uv = 10 + rand(2, n, 2, seed=30, high=40).float()
-        self.answers = random_estimates(V=V, N=n, silent=0.2, spread=0.2).to(torch.float32)
+        self.answers = random_estimates(V=V, N=n, unanswered=0.2, spread=0.2).to(torch.float32)
         self.fits = [known_pose_fit(se3.exp(rand(2, 6, seed=50 + k).float()), n) for k in range(V)]
 
     def number(self, image):

@@ -90,8 +90,8 @@ def disagreement(a: Frame, b: Frame, near: float = math.inf, reach: int = 0) -> 
             value, inside = patches.sample_nearest(b.depth, uv + torch.tensor([du, dv]))
             error = (z - value).abs() / value.clamp(min=1e-9)
             best = torch.where(inside & (value > 0) & (z > 0), torch.minimum(best, error), best)
-    found = best[torch.isfinite(best)]
-    return float(found.median()), found.numel()
+    finite = best[torch.isfinite(best)]
+    return float(finite.median()), finite.numel()
 
 
 def check_same(got: Recording, frames: list[Frame], step: float) -> None:

@@ -27,16 +27,16 @@ Capture = dict[str, bytes | None]  # None = a folder stands where the file was
 def mutate(good: Capture, draw: random.Random) -> tuple[str, Capture]:
     """(description, damaged capture): mostly one file changed, sometimes two, or files removed or exchanged."""
     want = dict(good)
-    told = []
+    changes = []
     for _ in range(1 if draw.random() < 0.85 else 2):
         if not any(content is not None for content in want.values()):
             break  # nothing left to damage
         if draw.random() < 0.12:
-            told.append(_move(want, draw))
+            changes.append(_move(want, draw))
             continue
         name = _victim(want, draw)
-        told.append(f"{name}: {_damage(want, name, draw)}")
-    return "; ".join(told), want
+        changes.append(f"{name}: {_damage(want, name, draw)}")
+    return "; ".join(changes), want
 
 
 def _victim(capture: Capture, draw: random.Random) -> str:
@@ -297,8 +297,8 @@ def _tar(content: bytes, name: str, draw: random.Random) -> bytes:
     odd = draw.choice(sorted(members)) if members and draw.random() < 0.2 else None
     out = io.BytesIO()
     with tarfile.open(fileobj=out, mode="w") as archive:
-        for member, given in members.items():
-            info, body = tarfile.TarInfo(member), given or b""
+        for member, content in members.items():
+            info, body = tarfile.TarInfo(member), content or b""
             info.size = len(body)
             if member == odd:
                 info.type, info.size = (

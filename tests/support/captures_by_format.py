@@ -116,7 +116,7 @@ def write_rlds(root: Path) -> Path:
 
 def write_rlds_array(root: Path) -> Path:
     """An RLDS data set with depth as an array, whose features do not name their encoding."""
-    writers.write_rlds(root / "1.0.0", three_episodes()[:1], depth="array", said=False)
+    writers.write_rlds(root / "1.0.0", three_episodes()[:1], depth="array", has_size=False)
     return root / "1.0.0"
 
 

@@ -53,9 +53,9 @@ class Outcome(NamedTuple):
 
 def read_all(path: Path) -> None:
     """Opens everything at ``path``, decodes every frame, truth and stack, and checks them."""
-    for found in _opened(path):
-        truth = getattr(found, "truth", None)
-        for i, each in enumerate(found):
+    for recording in _opened(path):
+        truth = getattr(recording, "truth", None)
+        for i, each in enumerate(recording):
             if isinstance(each, FocalStack):
                 check_stack(each)
                 continue
@@ -179,15 +179,15 @@ def run(read: Callable[[Path], Any], path: Path, tmp_path: Path) -> Outcome:
         os.close(end)
         _child(read, path, tmp_path, child_end)
     os.close(child_end)
-    said, level, killed = b"", 0, ""
+    output, level, killed = b"", 0, ""
     while True:
         ready = select.select([end], [], [], 0.01)[0]
         if ready:
             chunk = os.read(end, 65536)
             if not chunk:
                 break
-            said += chunk
-            level = level or int(said.split(b"\n")[0] if b"\n" in said else 0)
+            output += chunk
+            level = level or int(output.split(b"\n")[0] if b"\n" in output else 0)
         if not killed and time.perf_counter() - start > PATIENCE:
             killed = "hang"
             os.kill(pid, signal.SIGKILL)
@@ -199,7 +199,7 @@ def run(read: Callable[[Path], Any], path: Path, tmp_path: Path) -> Outcome:
     seconds = time.perf_counter() - start
     peak = max(used.ru_maxrss * 1024 - level, 0) if level else 0
     code = os.waitstatus_to_exitcode(status)
-    _, _, rest = said.partition(b"\n")
+    _, _, rest = output.partition(b"\n")
     kind, _, detail = rest.decode(errors="replace").partition("\n")
     if killed or peak > BYTES:
         kind, detail = killed or "memory", ""

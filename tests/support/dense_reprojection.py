@@ -56,7 +56,7 @@ def tracks(problem: PoseDepthProblem, at: Unknowns, noise: torch.Tensor, b: int 
     near, far = problem.near[b].tolist(), problem.far[b].tolist()
     R, t, shutter_rate = at.T.R[b].double().numpy(), at.T.t[b].double().numpy(), at.shutter_rate[b].double().numpy()
     nearest = max((P["inverse"][k] for k in range(len(near)) if near[k]), default=0.0)
-    found = []
+    tracks = []
     for k in range(len(near)):
         x, scale = P["ray"][:, k], float(noise[b, k])
         xx, xy, yy = P["shape"][:, k]
@@ -82,8 +82,8 @@ def tracks(problem: PoseDepthProblem, at: Unknowns, noise: torch.Tensor, b: int 
         r, s, D_pixel, Y = parts(q)
         J = D_pixel @ np.hstack((-hat(Y), q * np.eye(3), -y * hat(Y)))
         front = bool(Y[2] > 1e-6 and (near[k] or q < 2 * nearest))
-        found.append(Track(J, s, r, W, float(v), front, near[k], far[k]))
-    return found
+        tracks.append(Track(J, s, r, W, float(v), front, near[k], far[k]))
+    return tracks
 
 
 def weight(square: float, kernel: str | None, k: float) -> tuple[float, float, float]:
@@ -98,15 +98,15 @@ def weight(square: float, kernel: str | None, k: float) -> tuple[float, float, f
     return square, 1.0, 0.0
 
 
-def cost(found: list[Track], far_weight: float, kernel: str | None, bend: float) -> float:
+def cost(tracks: list[Track], far_weight: float, kernel: str | None, bend: float) -> float:
     """Robust cost of all tracks without any prior."""
-    return sum(weight(x.square, kernel, bend)[0] * (x.near + far_weight * x.far) for x in found)
+    return sum(weight(x.square, kernel, bend)[0] * (x.near + far_weight * x.far) for x in tracks)
 
 
-def reduced(found: list[Track], weights: list[float]) -> tuple[np.ndarray, np.ndarray]:
+def reduced(tracks: list[Track], weights: list[float]) -> tuple[np.ndarray, np.ndarray]:
     """Normal equations H (9, 9) and g (9,) of weighted tracks: one matrix with a column for every unknown inverse
     depth, then its Schur complement."""
-    used = [(x, w) for x, w in zip(found, weights, strict=True) if w > 0 and x.front]
+    used = [(x, w) for x, w in zip(tracks, weights, strict=True) if w > 0 and x.front]
     n = len(used)
     A, b = np.zeros((9 + n, 9 + n)), np.zeros(9 + n)
     for k, (x, w) in enumerate(used):

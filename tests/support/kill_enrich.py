@@ -48,16 +48,16 @@ def child(work: Callable[[], int]) -> tuple[int, str]:
     read, write = os.pipe()
     pid = os.fork()
     if pid == 0:
-        said, code = io.StringIO(), 99
-        with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+        stderr, code = io.StringIO(), 99
+        with contextlib.redirect_stderr(stderr), contextlib.redirect_stdout(io.StringIO()):
             code = work()
-        os.write(write, said.getvalue()[-4000:].encode())
+        os.write(write, stderr.getvalue()[-4000:].encode())
         os._exit(code)
     os.close(write)
     with os.fdopen(read, "rb") as stream:
-        said_there = stream.read().decode()
+        child_stderr = stream.read().decode()
     status = os.waitpid(pid, 0)[1]
-    return os.waitstatus_to_exitcode(status), said_there
+    return os.waitstatus_to_exitcode(status), child_stderr
 
 
 def struck(source: str, folder: Path, moments: int, options: Sequence[str]) -> dict[str, Any]:
@@ -72,8 +72,8 @@ def struck(source: str, folder: Path, moments: int, options: Sequence[str]) -> d
         return work
 
     log = folder / "moments"
-    with log.open("wb", buffering=0) as noted:
-        first = child(run(folder / "whole", lambda n: noted.write(b".") and None))
+    with log.open("wb", buffering=0) as calls:
+        first = child(run(folder / "whole", lambda n: calls.write(b".") and None))
     total = log.stat().st_size
     chosen = range(total) if not moments else [total * (k + 1) // (moments + 1) for k in range(moments)]
     ends = []

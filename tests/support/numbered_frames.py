@@ -45,10 +45,10 @@ def triangulate(samples, tracks, _fit, _camera_0, _camera_1):
     lost = (~tracks.valid).any(-1).tolist()
     shares = torch.tensor([0.0 if out else SHARES.get(step, 0.0) for step, out in zip(steps, lost, strict=True)])
     says = torch.arange(samples.uv.shape[1]) % 10 < 10 * shares[:, None]
-    silent = Estimate.silent(samples, Gate.NO_TRACK, n_views=2)
+    unanswered = Estimate.unanswered(samples, Gate.NO_TRACK, n_views=2)
     answer = torch.where(says, FAR, torch.nan)
-    gate = torch.where(says, Gate.ANSWER, silent.gate)
-    return silent.replace(depth=answer, sigma=answer / 100, sigma_shared=0 * answer, gate=gate)
+    gate = torch.where(says, Gate.ANSWER, unanswered.gate)
+    return unanswered.replace(depth=answer, sigma=answer / 100, sigma_shared=0 * answer, gate=gate)
 
 
 def score(estimate, _samples, _tracks, _fit):
@@ -64,7 +64,7 @@ def choosing(*steps):
     """A choice of views that takes the frames at these steps, in this order."""
 
     def choose(reference, others, views, *, fit=None):
-        found = (others.image.double() - reference.image.double()).mean((2, 3, 4))
-        return torch.stack([(found == step).double().argmax(0) for step in steps])
+        steps_of_views = (others.image.double() - reference.image.double()).mean((2, 3, 4))
+        return torch.stack([(steps_of_views == step).double().argmax(0) for step in steps])
 
     return MAP.replace(select_views=choose, views=len(steps))

@@ -122,7 +122,7 @@ def levels(image: Tensor, n: int, window: int) -> list[Level]:
     Half the size: smoothed by (1 4 6 4 1) / 16 along x and y, every other pixel. Slopes: Scharr's filter.
     """
     grey = luma(image).double()[None]
-    found = list[Level]()
+    levels = list[Level]()
     binomial = torch.tensor([1.0, 4, 6, 4, 1], dtype=torch.float64) / 16
     side, ahead = torch.tensor([3.0, 10, 3]).double() / 16, torch.tensor([-1.0, 0, 1]).double() / 2
     across, down = side[:, None] * ahead, ahead[:, None] * side
@@ -130,10 +130,10 @@ def levels(image: Tensor, n: int, window: int) -> list[Level]:
     for _ in range(n):
         slopes = F.conv2d(F.pad(grey, (1, 1, 1, 1), "reflect"), torch.stack((across, down))[:, None])
         mirrored = F.pad(grey, (pad,) * 4, "reflect")
-        found.append(Level(torch.cat((mirrored, F.pad(slopes, (pad,) * 4)), 1)[0], pad))
+        levels.append(Level(torch.cat((mirrored, F.pad(slopes, (pad,) * 4)), 1)[0], pad))
         smooth = F.conv2d(F.pad(grey, (2, 2, 2, 2), "reflect"), (binomial[:, None] * binomial)[None, None])
         grey = smooth[..., ::2, ::2]
-    return found
+    return levels
 
 
 # ------------------------------------------------------------------------------------------------ Lucas-Kanade
@@ -175,22 +175,22 @@ def lucas_kanade(
     there = search(levels_0, levels_1, x, d, o, alike=alike)
     forward, stayed = there.d, there.stayed
     backward, returned = torch.zeros_like(d), False
-    if there.found:
+    if there.valid:
         back = search(levels_1, levels_0, x + forward, -d, o, alike=alike)
-        backward, returned, stayed = back.d, back.found, stayed and back.stayed
+        backward, returned, stayed = back.d, back.valid, stayed and back.stayed
     error = float((forward + backward).norm())
     squares = difference(levels_0[0], levels_1[0], x, x + forward, o)
     variance = max(squares / (o.window**2 - 2), ROUNDING)
     cov = variance * torch.linalg.inv(there.A)  # (5)
-    valid = there.found and returned and error < max_round_trip_px
+    valid = there.valid and returned and error < max_round_trip_px
     return Track(x + forward, error, math.sqrt(squares / o.window**2), cov, valid, stayed)
 
 
-class Found(NamedTuple):
+class Displacement(NamedTuple):
     """Where a search ended."""
 
     d: Tensor  # (2,) px of the level
-    found: bool  # textured, at rest near where the last spell of steps began; on the finest level inside image 1, too
+    valid: bool  # textured, at rest near where the last spell of steps began; on the finest level inside image 1, too
     A: Tensor  # (2, 2)
     stayed: bool  # see Track
 
@@ -203,7 +203,7 @@ def search(
     o: Options,
     *,
     alike: bool,
-) -> Found:
+) -> Displacement:
     """Coarse to fine. Coarse levels only say where the next one starts, so they look at whole pixels and are content
     with four times the ``epsilon_px``.
 
@@ -212,7 +212,7 @@ def search(
     H, W = levels_0[0].hw
     top = len(levels_0) - 1
     rough = o._replace(epsilon_px=4 * o.epsilon_px)
-    place, found = x, list[Found]()
+    place, searched = x, list[Displacement]()
     starts = {0: x}
     for level in range(1, top + 1):
         if alike and level >= 2:
@@ -225,13 +225,13 @@ def search(
     for level in range(top, 0, -1):
         pixel = (starts[level] / 2**level + 0.5).floor()
         reach = (2, 2, 2, 2) if level == top else (1, 2, 2)
-        found.append(descend(levels_0[level], levels_1[level], pixel, d, rough, reach))
-        d = 2 * found[-1].d
+        searched.append(descend(levels_0[level], levels_1[level], pixel, d, rough, reach))
+        d = 2 * searched[-1].d
     reach = (1, 2, 2, 2) if top else (2, 2, 2, 2)
     last_one = descend(levels_0[0], levels_1[0], x, d, o, reach, finest=True)
     inside = within(x + last_one.d, levels_1[0].hw)
-    stayed = last_one.stayed and all(f.stayed for f in found)
-    return last_one._replace(found=last_one.found and inside, stayed=stayed)
+    stayed = last_one.stayed and all(f.stayed for f in searched)
+    return last_one._replace(valid=last_one.valid and inside, stayed=stayed)
 
 
 def descend(
@@ -243,7 +243,7 @@ def descend(
     reach: Sequence[int],
     *,
     finest: bool = False,
-) -> Found:
+) -> Displacement:
     """One level: up to ``iterations`` steps (3), eight in a spell, until the last of a spell is short enough.
 
     A spell searches ``reach`` px around the pixel it begins in; a point that is beyond at the end of its last spell
@@ -252,8 +252,8 @@ def descend(
     g, T = template(level_0, x, o)
     A = g @ g.T
     if torch.linalg.eigvalsh(A)[0] <= o.min_eigenvalue * o.window**2:
-        return Found(d, found=False, A=A, stayed=True)
-    held = stayed = True
+        return Displacement(d, valid=False, A=A, stayed=True)
+    on_map = stayed = True
     for spell, r in enumerate(reach):
         steps = min(8, o.iterations - 8 * spell)
         if steps <= 0:
@@ -266,11 +266,11 @@ def descend(
                 step = leap(last, step, o.epsilon_px)
             d = d - step  # (3)
             p = x + d - corner
-            held = bool(((p >= 0) & (p <= 2 * r + 1)).all())
-            stayed = stayed and held
+            on_map = bool(((p >= 0) & (p <= 2 * r + 1)).all())
+            stayed = stayed and on_map
         if step @ step <= o.epsilon_px**2:
             break
-    return Found(d, held, A, stayed)
+    return Displacement(d, on_map, A, stayed)
 
 
 def template(level: Level, x: Tensor, o: Options) -> tuple[Tensor, Tensor]:

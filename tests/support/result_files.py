@@ -105,7 +105,7 @@ def rows_of(variants, cohorts=("full",), scenes=SCENES, notes=None, more=None, s
 def result(experiment, rows, summary=None, data=None, **changes):
     variants = list(dict.fromkeys(r["method"] for r in rows))
     cohorts = list(dict.fromkeys(r.get("truth") for r in rows))
-    asked = {
+    overrides = {
         "question": "Does it?",
         "expectation": "It does.",
         "verdict": "refuted",
@@ -119,7 +119,7 @@ def result(experiment, rows, summary=None, data=None, **changes):
         "data": data or DATA,
         "summary": summarise_rows(rows, variants, cohorts) if summary is None else summary,
         "rows": rows,
-        **({} if experiment == "pair" else asked),
+        **({} if experiment == "pair" else overrides),
     }
     return result_files.build_result(**{**parts, **changes})
 
@@ -188,9 +188,9 @@ def hole_census():
     for scene in SCENES:
         base = {"scene": scene, "method": "paper", "truth": None}
         for pair in ([0, 0], [1, 1], None):
-            found = {k: measured(rng)[k] for k in ("hole_share",)}
-            found |= {"n_samples": 2048, "n_holes": 900, "hole_rate": 0.44, "trackability_hole": 4e-4 * rng.random()}
-            rows.append({**base, "pair": pair, **found, "trackability_valid": 2e-3})
+            numbers = {k: measured(rng)[k] for k in ("hole_share",)}
+            numbers |= {"n_samples": 2048, "n_holes": 900, "hole_rate": 0.44, "trackability_hole": 4e-4 * rng.random()}
+            rows.append({**base, "pair": pair, **numbers, "trackability_valid": 2e-3})
         rows[-1] |= {"role": ROLES.get(scene), "n_pairs": 2}
     scenes = [
         {k: v for k, v in r.items() if k not in ("pair", "role")} for r in rows if r["pair"] is None and not r["role"]
@@ -234,9 +234,9 @@ def learned():
     }
 
     def more(_rng, k, _variant):
-        said = {"scale": ("sensor", "oracle", "oracle", "sensor")[k], "metric": ("yes", "no", "no", "yes")[k]}
+        labels = {"scale": ("sensor", "oracle", "oracle", "sensor")[k], "metric": ("yes", "no", "no", "yes")[k]}
         numbers = {"parameters": (0, 571_000_000, 1_260_000_000, 1_260_000_000)[k], "seconds_per_video": 78.0 * k}
-        return {**said, **numbers, "device": "cpu", "on_ours": {"median_rel": 0.02, "n_kept": 50}}
+        return {**labels, **numbers, "device": "cpu", "on_ours": {"median_rel": 0.02, "n_kept": 50}}
 
     return result("learned", rows_of(variants, more=more))
 
@@ -257,8 +257,8 @@ def screened(experiment, variants, metrics, extra=None):
     for scene in SCENES:
         for variant in variants:
             base = {"scene": scene, "method": variant, "truth": "full", "n_candidates": 3000}
-            found = {m: rng.uniform(-0.2, 0.9) for m in metrics}
-            rows += [{**base, **found, "pair": [0, 0]}, {**base, **found, "pair": None, "role": ROLES.get(scene)}]
+            numbers = {m: rng.uniform(-0.2, 0.9) for m in metrics}
+            rows += [{**base, **numbers, "pair": [0, 0]}, {**base, **numbers, "pair": None, "role": ROLES.get(scene)}]
     return result(experiment, rows, summarise_rows(rows, variants, ["full"]) | (extra or {}))
 
 

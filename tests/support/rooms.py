@@ -13,7 +13,7 @@ def room(**options) -> SyntheticRoom:
     return SyntheticRoom(**{"supersample": 1, **options})
 
 
-def noted(recording, near=2.0, gap=6) -> Scene:
+def room_scene(recording, near=2.0, gap=6) -> Scene:
     """The recording as a scene with a near limit (m) and a frame gap; a scene is returned as it is."""
     if isinstance(recording, SyntheticRoom):
         return room_to_scene(recording, near, gap)

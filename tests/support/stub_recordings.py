@@ -44,13 +44,13 @@ class Load:
 def recording(n=4, numbers=None, name="one", load=None, gap=None, levels=None, **options):
     """A scene of ``n`` random frames."""
     number = torch.tensor(numbers if numbers is not None else list(range(n)))
-    made = Recording(name=name, format="made", load=load or Load(), number=number, **options)
-    return Scene(made, gap=gap, levels=levels)
+    recording = Recording(name=name, format="made", load=load or Load(), number=number, **options)
+    return Scene(recording, gap=gap, levels=levels)
 
 
 def rows(recordings, gap, method=None, wanted=None, **options):
     """The rows that an extraction of these recordings has, with the features of a stub method."""
     method = Stub(answer=method or FixedEstimate(), n=N)
-    found = columns.feature_columns(N, P)
-    made = plan.make_plan(recordings, gap, 1)
-    return RowDataset(recordings, made, wanted or found, method=method, gap=gap, tokens_hw=(H, W), **options)
+    features = columns.feature_columns(N, P)
+    whole = plan.make_plan(recordings, gap, 1)
+    return RowDataset(recordings, whole, wanted or features, method=method, gap=gap, tokens_hw=(H, W), **options)

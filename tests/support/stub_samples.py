@@ -34,14 +34,14 @@ def pose(batch, seed=0):
 class FixedEstimate:
     """Estimate of six samples: two known to the sensor, two triangulated, one with both, one with neither.
 
-    ``codes`` are the pose codes of the batch; ``asked`` holds the arguments of the last call.
+    ``codes`` are the pose codes of the batch; ``arguments`` holds the arguments of the last call.
     """
 
     def __init__(self, codes=None):
-        self.codes, self.asked, self.calls = codes, {}, 0
+        self.codes, self.arguments, self.calls = codes, {}, 0
 
     def __call__(self, reference, other, *, n=N, seed=0, trace=None):
-        self.asked, self.calls = {"reference": reference, "other": other, "n": n, "seed": seed}, self.calls + 1
+        self.arguments, self.calls = {"reference": reference, "other": other, "n": n, "seed": seed}, self.calls + 1
         g = torch.Generator().manual_seed(7)
         B = reference.image.shape[0]
         uv = torch.rand(1, n, 2, generator=g).expand(B, n, 2) * torch.tensor([W - 1.0, H - 1.0])
@@ -60,9 +60,9 @@ class FixedEstimate:
         estimate = Estimate(uv, far, 0.5 * far, 0.1 * far, depth, depth, place.int(), score, gate)
         code = torch.zeros(B, dtype=torch.int32) if self.codes is None else torch.tensor(self.codes, dtype=torch.int32)
         lost = ((code != 0) & (code != 4))[:, None, None]
-        found = pose(B)
+        fit = pose(B)
         cov = torch.arange(36.0).view(1, 6, 6) + torch.arange(B)[:, None, None]
-        R, t = torch.where(lost, torch.nan, found.R), torch.where(lost[..., 0], torch.nan, found.t)
+        R, t = torch.where(lost, torch.nan, fit.R), torch.where(lost[..., 0], torch.nan, fit.t)
         count = torch.zeros(B)
         fit = PoseFit(Pose(R, t), torch.where(lost, torch.nan, cov), sensed, count.long(), count, count, count, code)
         trace.update(samples=samples, fit=fit)

@@ -63,7 +63,7 @@ class Level:
 
 def levels(image, n, window):
     """Levels of one picture (1, H, W), finest first."""
-    found = [Level(image[0].double().numpy(), window)]
-    while len(found) < n:
-        found.append(found[-1].half(window))
-    return found
+    levels = [Level(image[0].double().numpy(), window)]
+    while len(levels) < n:
+        levels.append(levels[-1].half(window))
+    return levels

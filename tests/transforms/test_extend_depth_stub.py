@@ -36,7 +36,7 @@ def test_every_answer_has_its_place():
         *("T_1_from_0", "pose_cov", "pose_ok", "pose_code", "tokens", "tokens_valid", "problem"),
     ]
     trace = {}
-    estimate = method(method.asked["reference"], None, trace=trace)
+    estimate = method(method.arguments["reference"], None, trace=trace)
     samples = trace["samples"]
     assert mine["source"].tolist() == [1, 1, 2, 2, 1, 0] and mine["valid"].tolist() == [True] * 5 + [False]
     base = samples.trackability[0].tolist()
@@ -91,7 +91,7 @@ def test_tokens_are_those_of_the_merged_map():
         method = FixedEstimate()
         mine = added(tiny(method, **options)(sample()))
         trace = {}
-        estimate = method(method.asked["reference"], None, trace=trace)
+        estimate = method(method.arguments["reference"], None, trace=trace)
         found = dhtorch.merge(trace["samples"], estimate)
         tokens, known = patch_tokens(found, trace["samples"].hole, (H, W), **options)
         assert torch.equal(mine["tokens"], tokens[0]) and torch.equal(mine["tokens_valid"], known[0]) and known.any()
@@ -112,12 +112,12 @@ def test_the_sample_is_not_changed_and_keys_bear_the_prefix():
 def test_the_method_is_given_both_views_number_and_seed():
     method = FixedEstimate()
     tiny(method, n=12, seed=5)(sample())
-    assert method.asked["n"] == 12 and method.asked["seed"] == 5
+    assert method.arguments["n"] == 12 and method.arguments["seed"] == 5
     given = sample()
     for view, key in (("reference", "image"), ("other", "before")):
-        assert np.array_equal(method.asked[view].image[0].permute(1, 2, 0), given[key])
-    assert np.allclose(method.asked["reference"].depth[0], given["depth"] / 1000)
-    assert not method.asked["other"].depth.any()
+        assert np.array_equal(method.arguments[view].image[0].permute(1, 2, 0), given[key])
+    assert np.allclose(method.arguments["reference"].depth[0], given["depth"] / 1000)
+    assert not method.arguments["other"].depth.any()
 
 
 def test_the_number_of_samples_is_that_of_the_method():
@@ -143,12 +143,12 @@ def test_seeds_of_samples_are_told_apart_by_their_index():
     method = FixedEstimate()
     for index in (4, np.int64(4), torch.tensor([4]), np.array([[4]], np.int32)):
         tiny(method, seed=3, index_key="index")(sample(index=index))
-        assert torch.equal(method.asked["seed"], torch.tensor([7]))
+        assert torch.equal(method.arguments["seed"], torch.tensor([7]))
     given = batch(3)
     tiny(method, seed=10, index_key="index", batched=True)(given)
-    assert torch.equal(method.asked["seed"], torch.tensor([10, 11, 12]))
+    assert torch.equal(method.arguments["seed"], torch.tensor([10, 11, 12]))
     tiny(method, seed=10, batched=True)(given)
-    assert method.asked["seed"] == 10
+    assert method.arguments["seed"] == 10
     for wrong in (0.5, np.float32(2), [1, 2]):
         with pytest.raises(SampleError, match=r"index: found torch\.\w+ of shape .*, expected 1 whole numbers"):
             tiny(index_key="index")(sample(index=wrong))

@@ -60,15 +60,15 @@ def test_the_other_view_is_so_many_items_back_in_the_same_episode():
     for gap, pairs in ((1, {1: 0, 2: 1, 3: 2, 5: 4, 6: 5}), (2, {2: 0, 3: 1, 6: 4}), (3, {3: 0}), (4, {})):
         dataset, method = looking_back(gap)
         for i in range(7):
-            method.asked = {}
+            method.arguments = {}
             out = dataset[i]
             assert (out["dhtorch.problem"] == SampleProblem.NONE) == (i in pairs), (gap, i)
             assert out["index"] == i and "before" not in out and "before_is_pad" not in out
             if i in pairs:
-                assert np.array_equal(method.asked["other"].image[0].permute(1, 2, 0), sample(pairs[i])["image"])
-                assert np.array_equal(method.asked["reference"].image[0].permute(1, 2, 0), sample(i)["image"])
+                assert np.array_equal(method.arguments["other"].image[0].permute(1, 2, 0), sample(pairs[i])["image"])
+                assert np.array_equal(method.arguments["reference"].image[0].permute(1, 2, 0), sample(i)["image"])
             else:
-                assert out["dhtorch.problem"] == SampleProblem.NO_SECOND_VIEW and not method.asked
+                assert out["dhtorch.problem"] == SampleProblem.NO_SECOND_VIEW and not method.arguments
 
 
 def test_episodes_are_told_by_a_key_or_are_one():

@@ -52,7 +52,7 @@ def test_what_a_return_says_is_not_said_again_by_an_answer():
     samples = Samples(
         uv, two, 0.01 * two, torch.tensor([[[1.0] * 3, [torch.nan] * 3]]), zero + 1, flag, zero + 1, zero.int()
     )
-    answers = Estimate.silent(samples, Gate.ANSWER, n_views=2)
+    answers = Estimate.unanswered(samples, Gate.ANSWER, n_views=2)
     answers = answers.replace(depth=3 * two, sigma=0.1 * two, sigma_shared=0.05 * two)
     found = validation_references(samples, answers, near=True)
     assert found.depth.tolist() == [[1.0, 6.0]]

@@ -94,7 +94,7 @@ def _pixels(figure):
 
 def test_a_picture_lies_under_its_points(tmp_path):
     layers = [PointLayer("sensor", np.array([[0.0, 0.0], [3.0, 1.0]]), colours.SENSOR, "sensor")]
-    layers.append(PointLayer("silent", np.array([[1.0, 1.0]]), colours.SILENT, "silent"))
+    layers.append(PointLayer("unanswered", np.array([[1.0, 1.0]]), colours.UNANSWERED, "unanswered"))
     shown = LayeredPicture("two", (2, 4), layers, np.full((1, 2, 4), 0.5), width=80)
     pixels = _pixels(shown.figure(dpi=72))
     blue = np.argwhere(np.abs(pixels - colours.parse_rgb(colours.SENSOR)).max(-1) < 40)
@@ -123,7 +123,7 @@ def test_blue_is_the_sensor_orange_what_was_recovered_purple_what_was_swept_and_
         *colours.GATE_COLOURS.values(),
         *colours.HOLE_COLOURS.values(),
     ]
-    others += [c for pair in colours.PAGE_COLOURS.values() for c in pair] + [colours.PALE, colours.HELD]
+    others += [c for pair in colours.PAGE_COLOURS.values() for c in pair] + [colours.PALE, colours.HIDDEN_RETURN]
     assert not own & {c.upper() for c in others}
     assert (
         colours.SOURCE_COLOURS[Source.SENSOR] == colours.SENSOR
@@ -176,7 +176,7 @@ def test_what_is_drawn_on_a_page_is_seen_by_day_and_in_the_dark():
 
 def test_the_viewer_draws_in_these_colours():
     script = "".join((REPO / "dhtorch/viz/viewer" / name).read_text() for name in pages._SCRIPTS)
-    for name in ("sensor", "recovered", "swept", "silent", "pale", "held", "white", "black"):
+    for name in ("sensor", "recovered", "swept", "unanswered", "pale", "hidden_return", "white", "black"):
         assert f"DATA.colours.{name}" in script and name.upper() in pages._COLOUR_NAMES
     assert (
         set(re.findall(r'new Scale\([^;]*?, "(\w+)", \{', script))
@@ -249,7 +249,7 @@ def test_a_long_title_is_set_smaller_then_cut_in_its_middle():
     assert short.get_fontsize() > smaller.get_fontsize() >= cut.get_fontsize() >= 8
     assert smaller.get_text() == f"{'x' * 40}, cutoff 3 m", "whole"
     assert "…" in cut.get_text() and cut.get_text().endswith("x, cutoff 3 m"), "what it ends in stays"
-    assert canvas.said == [f"{'x' * 400}, cutoff 3 m"]
+    assert canvas.tooltips == [f"{'x' * 400}, cutoff 3 m"]
 
 
 def test_known_is_a_share_of_the_depth_in_the_figure_of_a_verdict(monkeypatch):

@@ -123,7 +123,7 @@ def test_points_seen_from_the_other_camera_lie_where_they_were_tracked(scene):
 def test_what_was_held_back_is_apart(scene):
     for shot in scene.shots:
         assert 0 < len(shot.seen.xyz) <= MAX_CLOUD_POINTS and 0 < shot.seen.xyz[:, 2].max() <= CUTOFF
-        assert 0 < len(shot.held.xyz) <= MAX_CLOUD_POINTS and shot.held.xyz[:, 2].min() > CUTOFF
+        assert 0 < len(shot.held_out.xyz) <= MAX_CLOUD_POINTS and shot.held_out.xyz[:, 2].min() > CUTOFF
         assert shot.depth_image.depth.max() <= CUTOFF and shot.seen.rgb.std() > 10
 
 
@@ -352,11 +352,11 @@ def test_a_recording_holds_everything(recorded):
         "path",
         "reference/picture",
         "reference/depth",
-        "reference/picture/samples/silent",
+        "reference/picture/samples/unanswered",
         "source/picture/tracks",
     ):
         assert f"/world/{name}" in paths, name
-    assert {"/pair", "/about", "/world/map/sensor", "/world/map/held_back", "/world/map/sigma"} <= paths
+    assert {"/pair", "/about", "/world/map/sensor", "/world/map/held_out", "/world/map/sigma"} <= paths
     assert "/world/map/swept" in paths
 
 
@@ -406,7 +406,7 @@ def test_a_recording_of_ones_own(command, tmp_path):
     assert (code, err) == (0, ""), err
     data = data_of((tmp_path / "own.html").read_text())
     assert len(data["shots"]) == 1 and data["facts"]["sensor"] == "all returns used"
-    assert not unpacked(data["shots"][0]["held"]["xyz"]).size
+    assert not unpacked(data["shots"][0]["held_out"]["xyz"]).size
 
 
 @pytest.mark.parametrize(

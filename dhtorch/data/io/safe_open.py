@@ -27,12 +27,12 @@ class FormatError(ValueError):
     Picklable, so that it is passed on intact from a data-loader worker.
     """
 
-    def __init__(self, file: str | Path, field: str = "", found: object = "", expected: object = "") -> None:
-        super().__init__(str(file), field, _shorten(found), _shorten(expected, 400))
+    def __init__(self, file: str | Path, field: str = "", value: object = "", expected: object = "") -> None:
+        super().__init__(str(file), field, _shorten(value), _shorten(expected, 400))
 
     def __str__(self) -> str:
-        file, field, found, expected = self.args
-        return f"{file}: {field}: found {found}, expected {expected}" if field else file
+        file, field, value, expected = self.args
+        return f"{file}: {field}: found {value}, expected {expected}" if field else file
 
 
 @contextmanager
@@ -105,20 +105,20 @@ def _check_link(file: Path) -> None:
         raise FormatError(file, "link", "one to outside the capture", "a file inside (follow_links=true allows)")
 
 
-def check_memory(file: Path, field: str, takes: int, found: object, asked: int = 0) -> None:
-    """Raise if ``takes`` exceeds both ``MAX_MEMORY_BYTES`` and ``MAX_MEMORY_RATIO`` times the bytes ``asked`` for.
+def check_memory(file: Path, field: str, takes: int, value: object, requested: int = 0) -> None:
+    """Raise if ``takes`` exceeds both ``MAX_MEMORY_BYTES`` and ``MAX_MEMORY_RATIO`` times the bytes ``requested`` for.
 
     Args:
-        file, field, found: for the error.
+        file, field, value: for the error.
         takes: upper bound of the bytes about to be allocated, computed without allocating them.
-        asked: bytes of the requested arrays, of a shape that the file is long enough for.
+        requested: bytes of the requested arrays, of a shape that the file is long enough for.
 
     Raises:
         FormatError: the limit is exceeded.
     """
-    limit = max(MAX_MEMORY_BYTES, MAX_MEMORY_RATIO * asked)
+    limit = max(MAX_MEMORY_BYTES, MAX_MEMORY_RATIO * requested)
     if takes > limit:
-        raise FormatError(file, field, f"{found}: {takes} bytes of memory", f"at most {limit}")
+        raise FormatError(file, field, f"{value}: {takes} bytes of memory", f"at most {limit}")
 
 
 def modification_time_ns(file: Path) -> int:
@@ -139,8 +139,8 @@ _OPEN_ERRORS = (OSError, ValueError)
 
 def unreadable_error(file: Path, error: Exception) -> FormatError:
     """The FormatError to raise instead of ``error``, one of ``_OPEN_ERRORS``."""
-    found = "no such file" if isinstance(error, FileNotFoundError) else error
-    return FormatError(file, "file", found, "a readable file")
+    reason = "no such file" if isinstance(error, FileNotFoundError) else error
+    return FormatError(file, "file", reason, "a readable file")
 
 
 def _shorten(value: object, limit: int = 120) -> str:

@@ -57,8 +57,8 @@ def flag_unmarked_depth(
             continue
         features[key] = replace(feature, info={**feature.info, "is_depth_map": True})
         if key != requested:
-            found = f"{key} looks like depth: one channel, {pixels.name}, without is_depth_map"
-            remarks.append(f"{found}; data.depth={key} sets it")
+            remark = f"{key} looks like depth: one channel, {pixels.name}, without is_depth_map"
+            remarks.append(f"{remark}; data.depth={key} sets it")
     return replace(meta, features=features), tuple(remarks)
 
 

@@ -30,7 +30,7 @@ class EpisodeSteps:
     place: rlds.RecordLocation
     n: int
     features: Mapping[str, rlds.StepFeature]  # the readable ones
-    found: Mapping[str, tfrecord.ExampleFeature]  # parsed record
+    parsed: Mapping[str, tfrecord.ExampleFeature]  # parsed record
     numbers: dict[str, np.ndarray] = field(default_factory=dict)  # cache of features that must be decoded whole
 
     @classmethod
@@ -67,14 +67,14 @@ class EpisodeSteps:
         Raises:
             FormatError: a damaged record.
         """
-        feature, described = self.found[f"{_STEPS}{name}"], self.features[name]
+        feature, described = self.parsed[f"{_STEPS}{name}"], self.features[name]
         if described.kind == "tensor":
             return self._numbers(name, steps)
         content = tfrecord.read_spans(self.place.file, [feature.spans[i] for i in steps])
         return content if described.kind == "image" else [text.decode("utf-8", "replace") for text in content]
 
     def _numbers(self, name: str, steps: range) -> np.ndarray:
-        feature, described = self.found[f"{_STEPS}{name}"], self.features[name]
+        feature, described = self.parsed[f"{_STEPS}{name}"], self.features[name]
         size = int(np.prod(described.shape))
         packed = feature.kind == "float" and len(feature.spans) == 1
         if packed and feature.spans[0].length == 4 * size * self.n:
@@ -98,7 +98,7 @@ class EpisodeSteps:
     def about(self) -> dict[str, Any]:
         """Metadata of the whole episode: split, number, and the record's texts and numbers."""
         metadata: dict[str, Any] = {"split": self.place.split, "number": self.place.number}
-        for name, feature in self.found.items():
+        for name, feature in self.parsed.items():
             if not name.startswith(_EPISODE):
                 continue
             if feature.kind == "bytes":

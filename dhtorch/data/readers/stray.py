@@ -180,8 +180,8 @@ class _Load:
             return files.read_depth_png(shot.depth, _UNITS_PER_METRE, self.depth_hw)
         code = pickles.read_npy(shot.depth)
         if not isinstance(code, np.ndarray) or code.dtype != np.uint16 or code.shape != self.depth_hw:
-            found = f"{getattr(code, 'dtype', type(code).__name__)} of shape {getattr(code, 'shape', None)}"
-            raise FormatError(shot.depth, "depth", found, f"uint16 of shape {self.depth_hw}")
+            actual = f"{getattr(code, 'dtype', type(code).__name__)} of shape {getattr(code, 'shape', None)}"
+            raise FormatError(shot.depth, "depth", actual, f"uint16 of shape {self.depth_hw}")
         return code.astype(np.float32) / np.float32(_UNITS_PER_METRE)
 
     def _conf(self, file: Path) -> np.ndarray:

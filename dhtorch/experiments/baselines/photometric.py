@@ -19,16 +19,16 @@ _WRONG_GREY_DIFFERENCE = 0.1
 
 
 @torch.no_grad()
-def photometric_difference(depth: Tensor, reference: Frame, asked: dense.SelectedViews) -> tuple[Tensor, Tensor]:
+def photometric_difference(depth: Tensor, reference: Frame, selected: dense.SelectedViews) -> tuple[Tensor, Tensor]:
     """Depth map (B, h, w) in m → (grey difference to the best source view, states), (B, h, w) each.
 
     CANNOT_KNOW: no depth, no relative pose, or outside the source image. Gradient: none.
     """
     size = max(depth.shape[-2:])
     base = plane_sweep.make_reference_view(*dense.downscale_grey(reference, size))
-    index, _ = dense.top_views(asked, 1)
-    has_pose = asked.fits.ok.gather(0, index)[0]
-    source_view = dense.source_view_of(asked, index[0], size, has_pose, base.image)
+    index, _ = dense.top_views(selected, 1)
+    has_pose = selected.fits.ok.gather(0, index)[0]
+    source_view = dense.source_view_of(selected, index[0], size, has_pose, base.image)
     inverse_depth = torch.where(depth > 0, 1 / depth.clamp_min(1e-6), 0.0)
     uv, front = plane_sweep.project_inverse_depth(source_view.view, base.ray, inverse_depth.flatten(1))
     grey, inside = plane_sweep.sample_bilinear(source_view.view.image, uv)

@@ -216,7 +216,7 @@ def match_optical_flow(
 def estimate_from_depth(samples: Samples, depth: Tensor, noise: Tensor, gate: Tensor) -> Estimate:
     """Depths (B, N) in m, relative noise and gates → estimate without sigma; the score decreases with the noise."""
     keep = (gate == Gate.ANSWER) & depth.isfinite()
-    unanswered = Estimate.silent(samples, Gate.NO_TRACK, n_views=2)
+    unanswered = Estimate.unanswered(samples, Gate.NO_TRACK, n_views=2)
     return unanswered.replace(
         depth=torch.where(keep, depth, torch.nan),
         score=torch.where(keep, _HALF_SCORE_ERROR / (_HALF_SCORE_ERROR + noise), 0.0),

@@ -143,9 +143,9 @@ def run(
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 
-def verdict(found: Mapping[str, Any]) -> tuple[bool | None, str]:
+def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
     """(all bars met, or None if one is undefined; the bars that are missed or undefined)."""
-    values = {name: found.get(name, {}).get("value") for name in ALIGN_BARS}
+    values = {name: summary.get(name, {}).get("value") for name in ALIGN_BARS}
     if undefined := [name for name, value in values.items() if value is None]:
         return None, f"not measured: {', '.join(undefined)}"
     missed = [

@@ -73,7 +73,7 @@ class ReferenceSweep:
 
     reference: Frame
     trace: Trace  # of the sparse method
-    asked: dense.SelectedViews
+    selected: dense.SelectedViews
     maps: Mapping[int, DepthMap]  # by the number of source views
     grid: Samples  # pixels of the map that are evaluated
     other: Frame  # the best source view
@@ -88,17 +88,21 @@ class SweepCache:
         self.options, self.stride = dict(options), stride
         self._last: ReferenceSweep | None = None
 
-    def ask(
-        self, say: Callable[[ReferenceSweep], tuple[Samples, Estimate]], method: Method, *views: Frame, **options: Any
+    def estimate(
+        self,
+        compute: Callable[[ReferenceSweep], tuple[Samples, Estimate]],
+        method: Method,
+        *views: Frame,
+        **options: Any,
     ) -> Estimate:
-        """Estimate of one variant at a reference view, in the signature of :attr:`protocol.Variant.ask`."""
+        """Estimate of one variant at a reference view, in the signature of :attr:`protocol.Variant.estimate`."""
         trace = options.pop("trace")
         reference, others = views
         if self._last is None or self._last.reference is not reference:
             self._last = self._sweep(method, reference, others, options)
         sweep = self._last
         trace |= sweep.trace
-        samples, estimate = say(sweep)
+        samples, estimate = compute(sweep)
         trace |= {"samples": samples, "ms": dict(sweep.ms), "rectifiable": is_rectifiable(sweep)}
         return estimate
 
@@ -131,7 +135,7 @@ class SweepCache:
         return ReferenceSweep(
             reference=reference,
             trace={**trace, "sparse": estimate},
-            asked=selected,
+            selected=selected,
             maps=maps,
             grid=grid,
             other=selected.frames[best],
@@ -239,17 +243,17 @@ def is_rectifiable(looked: ReferenceSweep) -> Tensor:
     return ~inside & looked.T_1_from_0.t.isfinite().all(-1)
 
 
-def sample_map(found: DepthMap, samples: Samples, frame: Frame) -> Estimate:
+def sample_map(depth_map: DepthMap, samples: Samples, frame: Frame) -> Estimate:
     """Map at samples of its frame → estimate: swept depth of the nearest pixel, else the gate that rejected it."""
-    h, w = found.depth.shape[-2:]
+    h, w = depth_map.depth.shape[-2:]
     map_uv = cam.depth_pixels(frame.camera, frame.hw, None, (h, w), samples.uv)
     depth, sigma, score, source, gate = (
-        sample_nearest(x.to(found.depth), map_uv)[0]
-        for x in (found.depth, found.sigma, found.score, found.source, found.gate)
+        sample_nearest(x.to(depth_map.depth), map_uv)[0]
+        for x in (depth_map.depth, depth_map.sigma, depth_map.score, depth_map.source, depth_map.gate)
     )
     keep = source == Source.SWEPT
     gate = torch.where(gate == Gate.ANSWER, Gate.NO_TRACK, gate)
-    return Estimate.silent(samples, Gate.NO_TRACK, n_views=2).replace(
+    return Estimate.unanswered(samples, Gate.NO_TRACK, n_views=2).replace(
         depth=torch.where(keep, depth, torch.nan),
         sigma=torch.where(keep, sigma, torch.nan),
         score=torch.where(keep, score, 0.0),
@@ -276,13 +280,13 @@ def _variants(method: Method, cache: SweepCache, seed: int, peers: bool) -> dict
             "bilateral": lambda x: (x.grid, filling.fill_bilateral(x.reference, x.grid)),
         }
     variants = {
-        name: Variant(method, ask=partial(cache.ask, answer), seed=seed, offers=candidate_frames)
+        name: Variant(method, estimate=partial(cache.estimate, answer), seed=seed, offers=candidate_frames)
         for name, answer in answers.items()
     }
     if peers:
-        own_calibration = partial(cache.ask, _match_own_calibration)
+        own_calibration = partial(cache.estimate, _match_own_calibration)
         variants["sgbm, own calibration"] = Variant(
-            method, ask=own_calibration, seed=seed, offers=candidate_frames, needs=_not_rectified_reason
+            method, estimate=own_calibration, seed=seed, offers=candidate_frames, needs=_not_rectified_reason
         )
     return variants
 

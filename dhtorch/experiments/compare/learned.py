@@ -114,9 +114,9 @@ def run(
     for name, network in networks.items():
         cached = CachedNetwork(network)
         for scale in scales:
-            ask = partial(estimate_with_network, network=cached, scale_pixels=scale_pixels)
+            estimate = partial(estimate_with_network, network=cached, scale_pixels=scale_pixels)
             scale_options = partial(_scale_reference, scale=scale, seed=settings.seed)
-            variants[f"{name}_{scale}"] = Variant(method, ask=ask, given=scale_options)
+            variants[f"{name}_{scale}"] = Variant(method, estimate=estimate, call_options=scale_options)
             labels[f"{name}_{scale}"] = {"scale": scale, "metric": _SCALE_SOURCES[scale], **_count_weights(network)}
     full_protocol = Protocol(variants, columns=_scale_columns)
     outcome = protocol.run(scenes, full_protocol, pairs, settings, progress=progress)

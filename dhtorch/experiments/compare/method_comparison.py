@@ -132,7 +132,7 @@ def verdict(
             n_met += holds(value, bar)
             missed += [] if holds(value, bar) else [f"{method}.{number} {value:.3f} (bar {bar:g})"]
     notes = [f"{m} without ratio: {', '.join(scenes)}" for m, scenes in comparison.left_out.items() if scenes]
-    notes += [f"{m} % risk: no answer on {', '.join(scenes)}" for m, scenes in comparison.silent.items() if scenes]
+    notes += [f"{m} % risk: no answer on {', '.join(scenes)}" for m, scenes in comparison.unanswered.items() if scenes]
     return not missed, "; ".join([f"{n_met} of {n_met + len(missed)} bars met", *missed, *notes])
 
 

@@ -48,7 +48,7 @@ EXPECTATION = "Every number of the list of bars is met; scenes, and of causes wi
 
 #: Number → (bar, whether it holds).
 VALIDATE_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
-    "validate.scale_found": (0.95, lambda value, bar: value >= bar),
+    "validate.scale_detected": (0.95, lambda value, bar: value >= bar),
     "validate.false_alarm": (0.02, lambda value, bar: value <= bar),
     "validate.jump_auroc": (0.95, lambda value, bar: value >= bar),
     "validate.called_right_wrong": (0.01, lambda value, bar: value <= bar),
@@ -96,7 +96,7 @@ class PlantedFault:
     lag: int = 0  # frames by which the maps lag behind the images
     focal: float = 1.0  # factor on the stated focal lengths
     ray: bool = False  # depth becomes the distance along the ray
-    told: bool = True  # planted in the sensor's own depth as well as in maps beside it
+    in_sensor: bool = True  # planted in the sensor's own depth as well as in maps beside it
 
 
 _PLANTED_FAULTS: dict[str, PlantedFault] = {
@@ -108,7 +108,7 @@ _PLANTED_FAULTS: dict[str, PlantedFault] = {
     "upside_down": PlantedFault("mirrored", partial(torch.flip, dims=(-2,))),
     "along_ray": PlantedFault("along the ray", ray=True),
     "inverse": PlantedFault(
-        "inverse", lambda depth: torch.where(depth > 0, 3 / depth.clamp_min(1e-3), 0.0), told=False
+        "inverse", lambda depth: torch.where(depth > 0, 3 / depth.clamp_min(1e-3), 0.0), in_sensor=False
     ),
     "rolled_90": PlantedFault("rolled", partial(faults.rot90_map, quarters=1)),
     "rolled_180": PlantedFault("rolled", partial(faults.rot90_map, quarters=2)),
@@ -141,7 +141,7 @@ def run(
     last], method ``causes``), one per scene. In the summary, ratios of reference views are means over scenes with
     intervals over scenes:
 
-    * ``validate.scale_found`` and ``validate.false_alarm`` (all evidence); suffix ``_5`` for a scale wrong by a
+    * ``validate.scale_detected`` and ``validate.false_alarm`` (all evidence); suffix ``_5`` for a scale wrong by a
       twentieth, ``_far`` for triangulated points alone;
     * ``validate.jump_auroc`` of pixels without a near return, ``_all`` of all pixels;
     * ``validate.called_right_wrong``, ``_worst`` of the worst scene, ``_cut`` of clipped maps alone;
@@ -189,9 +189,9 @@ def run(
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
 
 
-def verdict(found: Mapping[str, Any]) -> tuple[bool | None, str]:
+def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:
     """(all bars met, or None if undecided; the bars that are missed and the numbers that are undefined)."""
-    values = {name: found.get(name, {}).get("value") for name in VALIDATE_BARS}
+    values = {name: summary.get(name, {}).get("value") for name in VALIDATE_BARS}
     undefined = [name for name, value in values.items() if value is None]
     defined = {name: value for name, value in values.items() if value is not None}
     missed = [
@@ -290,7 +290,7 @@ def _make_validator(
     selected = dense.selected_views(estimate, others, trace)
     offered = trace["choice"].index if "choice" in trace else None
     return selected, partial(
-        validate_against, reference=reference, asked=selected, offered=offered, method=method, size=size
+        validate_against, reference=reference, selected=selected, offered=offered, method=method, size=size
     )
 
 
@@ -337,7 +337,7 @@ def _scene_row(scene: Scene, rows: Sequence[Row]) -> Row:
     for column, suffix in _SCALE_COLUMN_SUFFIXES.items():
         for percent, ending in (("10", ""), ("5", "_5")):
             alarms = [row[f"{column}.{percent}_{side}"] for row in with_baseline for side in ("long", "short")]
-            out[f"validate.scale_found{ending}{suffix}"] = mean_or_none([float(bool(x)) for x in alarms])
+            out[f"validate.scale_detected{ending}{suffix}"] = mean_or_none([float(bool(x)) for x in alarms])
         false_alarms = [float(bool(row[f"{column}.none"])) for row in with_baseline]
         out[f"validate.false_alarm{suffix}"] = mean_or_none(false_alarms)
     for name, prefix in _PREDICTOR_PREFIXES.items():
@@ -371,7 +371,7 @@ def _window_rows(scene: Scene, first: int, load: Callable[[int], Frame]) -> list
     rows = []
     for in_sensor in (True, False):
         for name, planted in _PLANTED_FAULTS.items():
-            if in_sensor and not planted.told:
+            if in_sensor and not planted.in_sensor:
                 continue
             frames, maps = _plant_fault(scene, frames_of, first, planted, in_sensor)
             diagnosis = faults.diagnose(frames, maps, watched=window_tracks)
@@ -382,7 +382,7 @@ def _window_rows(scene: Scene, first: int, load: Callable[[int], Frame]) -> list
                 "named": diagnosis.cause,
                 "named_kind": diagnosis.kind,
                 "moved_px": motion_px,
-                "n_pairs_told": diagnosis.n_pairs,
+                "n_diagnosed_pairs": diagnosis.n_pairs,
             }
             rows.append(row)
     return rows

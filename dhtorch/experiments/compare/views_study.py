@@ -31,7 +31,7 @@ EXPECTATION = "On every scene as much at 5 % mean risk as at the gap that is bes
 _MIN_REACHED_RATIO = 0.95
 
 #: Largest fraction of samples answered under pure rotation that counts as unanswered.
-_MAX_SILENT_RATIO = 0.005
+_MAX_ANSWERED_RATIO = 0.005
 
 #: Added to both coverages of a ratio: coverages below a few per cent are noise.
 _COVERAGE_FLOOR = 0.01
@@ -139,7 +139,7 @@ def verdict(outcome: Outcome, alone: Collection[str] = ()) -> tuple[bool | None,
     why += (
         f"; in a turn {answered:.2%} of the samples without a return answered, map at fixed gaps {map_answered}{note}"
     )
-    return worst >= _MIN_REACHED_RATIO and answered <= _MAX_SILENT_RATIO, why
+    return worst >= _MIN_REACHED_RATIO and answered <= _MAX_ANSWERED_RATIO, why
 
 
 def _check_options(

@@ -310,10 +310,10 @@ def _stack_items(scene: _StackRoom | Scene) -> list[ScreenedItem]:
     return [(i, i) for i in scene.indices] if isinstance(scene, _StackRoom) else [(0, 0)]
 
 
-def _flip_shares(_scene: _StackRoom | Scene, found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+def _flip_shares(_scene: _StackRoom | Scene, results: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
     """Variant → fraction of a scene's stacks with a negative correlation: a mean, as a median would be 0 or 1."""
     flips: dict[str, list[float]] = {}
-    for rows in found:
+    for rows in results:
         for variant, row in rows.items():
             flips.setdefault(variant, []).extend([row["flip_share"]] if row.get("flip_share") is not None else [])
     return {variant: {"flip_share": mean_or_none(values)} for variant, values in flips.items() if values}

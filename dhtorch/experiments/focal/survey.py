@@ -13,16 +13,16 @@ def survey_stacks(stacks: FocalStacks, shown: int = 8) -> Survey:
     stack: FocalStack = stacks[0]
     images = stack.images[0]
     s, c, h, w = images.shape
-    out.say("focal stacks", f"{len(stacks)}, of {format_count(s, 'picture')} each")
-    out.say("pictures", f"{w}x{h}, {describe_pixels(c, images)}")
+    out.add_fact("focal stacks", f"{len(stacks)}, of {format_count(s, 'picture')} each")
+    out.add_fact("pictures", f"{w}x{h}, {describe_pixels(c, images)}")
     if stack.focus_m is None:
         out.warn("no focus distances: only the order of the pictures is available")
     else:
-        out.say("in focus at", ", ".join(f"{x:.3g}" for x in stack.focus_m[0].tolist()) + " m")
+        out.add_fact("in focus at", ", ".join(f"{x:.3g}" for x in stack.focus_m[0].tolist()) + " m")
     if stack.focal_length_m is not None and stack.f_number is not None:
-        out.say("lens", f"f = {1e3 * float(stack.focal_length_m):g} mm, N = {float(stack.f_number):g}")
+        out.add_fact("lens", f"f = {1e3 * float(stack.focal_length_m):g} mm, N = {float(stack.f_number):g}")
     if stack.camera is not None:
-        out.say("intrinsics", describe_camera(stack.camera, (h, w)))
+        out.add_fact("intrinsics", describe_camera(stack.camera, (h, w)))
     if stack.depth is not None:
         report_depths([stack.depth[0]], out)
     warn_of_duplicates(list(images), out, "pictures")

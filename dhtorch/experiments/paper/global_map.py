@@ -32,12 +32,12 @@ from dhtorch.integrate.recording import (
     POSE_SOURCES,
     PairEstimate,
     PlacedFrames,
+    estimate_pairs,
     fuse_recording,
     linking_pairs,
     measure_coverage,
     place_frames,
 )
-from dhtorch.integrate.recording import estimate_pairs as ask_pairs
 from dhtorch.metrics import bootstrap
 
 QUESTION = "Does fusing recovered points widen the map, and do they stitch its fragments into one?"
@@ -81,10 +81,10 @@ def run(
         chosen = to_fixed_pairs(pairs(scene))
         return [*chosen, *linking_pairs(chosen)]
 
-    def ask(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
+    def evaluate(scene: Scene, item: ScreenedItem) -> dict[str, Row]:
         options: dict[str, Any] = {"seed": settings.seed, "device": settings.device, "dtype": settings.dtype}
         cutoff = settings.cutoff_of(scene)
-        (answer,) = ask_pairs(scene, method, [item], cutoff=cutoff, **options)
+        (answer,) = estimate_pairs(scene, method, [item], cutoff=cutoff, **options)
         estimates.setdefault(scene.name, {})[item] = answer
         row: Row = {"pnp_ok": int(answer.fit.ok[0]), "n_kept": int(answer.estimate.keep.sum())}
         row["n_recovered"] = int(answer.recovered.sum())
@@ -94,7 +94,7 @@ def run(
             {"sensor device": {}, "fused device": row} if is_pair and scene.recording.poses is not None else {}
         )
 
-    def whole(scene: Scene, _found: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
+    def whole(scene: Scene, _results: Sequence[Mapping[str, Row]]) -> dict[str, Row]:
         recording, of_item = scene.recording, estimates.pop(scene.name, {})
         maps = _Maps(recording, [of_item[p] for p in to_fixed_pairs(pairs(scene))], settings.cutoff_of(scene), voxel)
         rows: dict[str, Row] = {}
@@ -104,7 +104,9 @@ def run(
                 rows |= maps.rows(place_frames(recording, links, poses=poses), poses)
         return rows
 
-    outcome = screen_scenes(scenes_of(scenes), items, ask, VARIANTS, truth=MAP_TRUTH, whole=whole, progress=progress)
+    outcome = screen_scenes(
+        scenes_of(scenes), items, evaluate, VARIANTS, truth=MAP_TRUTH, whole=whole, progress=progress
+    )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 

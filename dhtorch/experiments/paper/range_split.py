@@ -62,7 +62,7 @@ def run(
         name: partial(trajectory_pose_fit, raw=raw) for name, raw in (("device_raw", True), ("device_gl_to_cv", False))
     }
     variants = {
-        "sensor_only": Variant(method, ask=sensor_only),
+        "sensor_only": Variant(method, estimate=sensor_only),
         **{name: Variant(method, fit=fit, needs=missing_trajectory_reason) for name, fit in device.items()},
         "no_gates": Variant(method.replace(triangulate=NO_GATES)),
         "gated": Variant(method),

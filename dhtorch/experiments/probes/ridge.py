@@ -239,7 +239,7 @@ def error_ratio(ours: Tensor, theirs: Tensor, *, level: float = 0.95, draws: int
     return _bootstrap_quotient(ours, theirs, (ours > 0) | (theirs > 0), level, draws, seed)
 
 
-def is_equivalent(found: Interval, margin: float = 0.02) -> bool | None:
+def is_equivalent(interval: Interval, margin: float = 0.02) -> bool | None:
     """Equivalence test of a ratio to 1 within ``margin``: True, False, or None if the interval does not decide.
 
     True: the whole interval lies within the margin. False: the whole interval lies outside, on one side. With an
@@ -247,11 +247,11 @@ def is_equivalent(found: Interval, margin: float = 0.02) -> bool | None:
 
     Source: D. Schuirmann, "A comparison of the two one-sided tests procedure …", 1987.
     """
-    if found.low is None or found.high is None:
+    if interval.low is None or interval.high is None:
         return None
-    if 1 - margin < found.low and found.high < 1 + margin:
+    if 1 - margin < interval.low and interval.high < 1 + margin:
         return True
-    return False if found.high < 1 - margin or found.low > 1 + margin else None
+    return False if interval.high < 1 - margin or interval.low > 1 + margin else None
 
 
 def _centred(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -124,7 +124,7 @@ def run(
                     shards.add(_make_shard(f"{scene.name} {k}", features, scene.recording, block, moving))
             arms = {k: names for k, names in PROBE_ARMS.items() if set(names) <= set(shards.widths)}
             options = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
-            probe_errors = probing.evaluate_probes(shards, arms, told={_POSE_ARM: _OWN_POSE_BLOCK}, **options)
+            probe_errors = probing.evaluate_probes(shards, arms, predictions={_POSE_ARM: _OWN_POSE_BLOCK}, **options)
         probing.record_probes(outcome, probe_errors, room)
         outcome.n_pairs += n_pairs
     outcome.summary = probing.summarise_over_scenes(outcome, arm_names)

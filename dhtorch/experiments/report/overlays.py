@@ -18,7 +18,7 @@ _PREFERRED_VARIANTS = ("gated", "anchored", "both gates", "gap x1", "map", "pape
 
 #: Layers from bottom to top (gates, sensor, recovered): (table, code) → label, colour, mark.
 _OVERLAY_LAYERS = {
-    ("gate", code): (f"unanswered: {words(names(Gate)[code])}", colour, "silent")
+    ("gate", code): (f"unanswered: {words(names(Gate)[code])}", colour, "unanswered")
     for code, colour in GATE_COLOURS.items()
 }
 _OVERLAY_LAYERS |= {
@@ -49,7 +49,7 @@ def overlay_figures(result: Result) -> list[Figure]:
         )
         used = {layer.label for panel in panels for layer in panel.layers}
         legend = [
-            LegendKey(label, colour, "cross" if mark == "silent" else "dot")
+            LegendKey(label, colour, "cross" if mark == "unanswered" else "dot")
             for label, colour, mark in _OVERLAY_LAYERS.values()
             if label in used
         ]

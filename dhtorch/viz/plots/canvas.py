@@ -41,7 +41,7 @@ class Mark(NamedTuple):
     kind: str  # line | dot | diamond | bar
     places: tuple[CanvasPoint, ...]
     stroke: Stroke
-    said: str = ""  # tooltip
+    tooltip: str = ""  # tooltip
     edge: str | None = None  # colour of the edge of a bar
 
 
@@ -54,12 +54,12 @@ class Canvas:
 
         self.figure = Figure((width / 72, height / 72), dpi=dpi)
         self.points = Affine2D().scale(1 / width, 1 / height) + self.figure.transFigure
-        self.said: list[str] = []  # tooltips of the artists named said-0, said-1, …
+        self.tooltips: list[str] = []  # tooltips of the artists named tooltip-0, tooltip-1, …
 
     def text(
-        self, text: str, u: float, v: float, *, size: float = TEXT_SIZE_PT, said: str = "", **options: Any
+        self, text: str, u: float, v: float, *, size: float = TEXT_SIZE_PT, tooltip: str = "", **options: Any
     ) -> None:
-        """Draw text at (u, v); ``said``: tooltip with the full text if it was truncated."""
+        """Draw text at (u, v); ``tooltip``: tooltip with the full text if it was truncated."""
         from matplotlib.text import Text  # noqa: PLC0415
 
         text = to_plain_line(text)
@@ -68,16 +68,16 @@ class Canvas:
         weight = "bold" if options.pop("bold", False) else "normal"
         artist = Text(u, v, text, color=INK if weight == "bold" else SOFT, fontsize=size, fontweight=weight, **options)
         artist.set(parse_math=False, rotation_mode="anchor", transform=self.points)
-        self._add(artist, said if to_plain_line(said) != text else "")
+        self._add(artist, tooltip if to_plain_line(tooltip) != text else "")
 
     def title(self, text: str, width: float, height: float, left: float = 0.0) -> None:
         """Draw a title along the upper edge; long titles are set smaller, then truncated in the middle."""
         text = to_plain_line(text)
         size = min(_TITLE_SIZE_PT, max(_MIN_TITLE_SIZE_PT, width / (_BOLD_LETTER_WIDTH_EM * max(len(text), 1))))
         shown = truncate_text(text, width * LETTER_WIDTH_EM / _BOLD_LETTER_WIDTH_EM, size, end=len(text) // 3)
-        self.text(shown, left + 2, height - 14, size=size, bold=True, said=text)
+        self.text(shown, left + 2, height - 14, size=size, bold=True, tooltip=text)
 
-    def lines(self, segments: Iterable[Sequence[CanvasPoint]], stroke: Stroke, said: str = "") -> None:
+    def lines(self, segments: Iterable[Sequence[CanvasPoint]], stroke: Stroke, tooltip: str = "") -> None:
         """Draw polylines as one path."""
         from matplotlib.path import Path  # noqa: PLC0415
 
@@ -88,31 +88,31 @@ class Canvas:
             codes += [Path.MOVETO, *[Path.LINETO] * (len(segment) - 1)]
         options = {"linewidth": stroke.width, "alpha": None if stroke.opacity == 1 else stroke.opacity}
         dashes = (0, stroke.dashes) if stroke.dashes else "solid"
-        self._path(places, codes, said, fill=False, edgecolor=stroke.colour, linestyle=dashes, **options)
+        self._path(places, codes, tooltip, fill=False, edgecolor=stroke.colour, linestyle=dashes, **options)
 
-    def dots(self, places: Iterable[CanvasPoint], stroke: Stroke, said: str = "") -> None:
+    def dots(self, places: Iterable[CanvasPoint], stroke: Stroke, tooltip: str = "") -> None:
         """Draw dots as wide as the stroke: zero-length lines with round caps, the shortest form in SVG."""
         from matplotlib.path import Path  # noqa: PLC0415
 
         ends = [end for u, v in places for end in ((u, v), (u + 1e-4, v))]
         codes = [Path.MOVETO, Path.LINETO] * (len(ends) // 2)
         options = {"linewidth": stroke.width, "capstyle": "round", "snap": False}
-        self._path(ends, codes, said, fill=False, edgecolor=stroke.colour, **options)
+        self._path(ends, codes, tooltip, fill=False, edgecolor=stroke.colour, **options)
 
     def mark(self, mark: Mark) -> None:
         """Draw one mark of a panel."""
         if mark.kind == "line":
-            self.lines([mark.places], mark.stroke, mark.said)
+            self.lines([mark.places], mark.stroke, mark.tooltip)
         elif mark.kind == "dot":
-            self.dots(mark.places, mark.stroke, mark.said)
+            self.dots(mark.places, mark.stroke, mark.tooltip)
         else:
-            self.area(mark.places, mark.stroke.colour, mark.said, mark.edge, 1.8 if mark.kind == "diamond" else 0.5)
+            self.area(mark.places, mark.stroke.colour, mark.tooltip, mark.edge, 1.8 if mark.kind == "diamond" else 0.5)
 
     def area(
         self,
         corners: Sequence[CanvasPoint],
         colour: str,
-        said: str = "",
+        tooltip: str = "",
         edge: str | None = None,
         width: float = 0.5,  # of the edge
     ) -> None:
@@ -121,7 +121,7 @@ class Canvas:
 
         codes = [Path.MOVETO, *[Path.LINETO] * (len(corners) - 1), Path.CLOSEPOLY]
         options = {"facecolor": colour, "edgecolor": edge or "none", "linewidth": width if edge else 0}
-        self._path([*corners, corners[0]], codes, said, **options)
+        self._path([*corners, corners[0]], codes, tooltip, **options)
 
     def axes(self) -> Any:
         """matplotlib axes over the whole canvas in points, for artists with a colour map."""
@@ -154,7 +154,7 @@ class Canvas:
             self.figure.legend(handles=list(map(_make_legend_handle, keys)), loc="upper left", **options)
         return self.figure
 
-    def _path(self, places: Sequence[Any], codes: Sequence[Any], said: str, **options: Any) -> None:
+    def _path(self, places: Sequence[Any], codes: Sequence[Any], tooltip: str, **options: Any) -> None:
         from matplotlib.patches import PathPatch  # noqa: PLC0415
         from matplotlib.path import Path  # noqa: PLC0415
 
@@ -162,12 +162,12 @@ class Canvas:
             path = Path(places, codes)
             path.should_simplify = False
             joined = {"joinstyle": "round"} | options
-            self._add(PathPatch(path, transform=self.points, **joined), said)
+            self._add(PathPatch(path, transform=self.points, **joined), tooltip)
 
-    def _add(self, artist: Any, said: str) -> None:
-        if said:
-            artist.set_gid(f"said-{len(self.said)}")
-            self.said.append(to_plain_line(said))
+    def _add(self, artist: Any, tooltip: str) -> None:
+        if tooltip:
+            artist.set_gid(f"tooltip-{len(self.tooltips)}")
+            self.tooltips.append(to_plain_line(tooltip))
         artist.set_figure(self.figure)
         artist.set_zorder(len(self.figure.artists))  # in drawing order
         self.figure.artists.append(artist)

@@ -16,8 +16,8 @@ import numpy as np
 
 from dhtorch.codes import CodeTable, Gate, Hole, Source, State, names
 
-#: What a depth comes from; what is silent is paler than what was answered.
-SENSOR, RECOVERED, SWEPT, ALIGNED, SILENT = "#0072B2", "#E69F00", "#C653A6", "#3F8F6B", "#B4B4B4"
+#: What a depth comes from; pixels without an answer are paler.
+SENSOR, RECOVERED, SWEPT, ALIGNED, UNANSWERED = "#0072B2", "#E69F00", "#C653A6", "#3F8F6B", "#B4B4B4"
 
 #: Variable of the pages → its colour by day and in the dark. Figures are drawn in those of the day.
 PAGE_COLOURS = {
@@ -39,8 +39,8 @@ PAGE_COLOURS = {
 INK, SOFT, FAINT, PICTURE = (PAGE_COLOURS[name][0] for name in ("ink", "soft", "faint", "picture"))
 #: Figures of the paper, beside ours: edge and inside.
 PAPER_EDGE, PAPER_FILL = PAGE_COLOURS["theirs"][0], PAGE_COLOURS["theirs-ground"][0]
-#: In space: what another colouring leaves aside, and the returns that were held back.
-PALE, HELD = "#737880", "#739E80"
+#: In space: what another colouring leaves aside, and the held-out returns.
+PALE, HIDDEN_RETURN = "#737880", "#739E80"
 #: Around a mark, so that it is seen on any picture.
 WHITE, BLACK = "#ffffff", "#000000"
 
@@ -92,7 +92,7 @@ _HOLE_COLOURS = {
 }
 HOLE_COLOURS = _with_defaults(Hole, _HOLE_COLOURS, Hole.NONE)
 _SOURCE_COLOURS = {
-    Source.NONE: SILENT,
+    Source.NONE: UNANSWERED,
     Source.SENSOR: SENSOR,
     Source.RECOVERED: RECOVERED,
     Source.SWEPT: SWEPT,
@@ -101,7 +101,7 @@ _SOURCE_COLOURS = {
 
 SOURCE_COLOURS = _with_defaults(Source, _SOURCE_COLOURS)
 
-#: What is said of a pixel of a judged map.
+#: State of a pixel of a validated map.
 _STATE_COLOURS = {State.CANNOT_KNOW: PICTURE, State.CONSISTENT: "#63c98a", State.WRONG: "#a8321f"}
 STATE_COLOURS = _with_defaults(State, _STATE_COLOURS)
 
@@ -124,11 +124,11 @@ def assign_strokes(names: Iterable[str]) -> dict[str, Stroke]:
     """Name → stroke: a method's own colour, the others in turn and then dashed."""
     names = list(dict.fromkeys(names))
     others = [name for name in names if name not in METHOD_COLOURS]
-    found = {name: Stroke(METHOD_COLOURS[name]) for name in names if name in METHOD_COLOURS}
+    strokes = {name: Stroke(METHOD_COLOURS[name]) for name in names if name in METHOD_COLOURS}
     for k, name in enumerate(others):
         again, colour = divmod(k, len(SERIES_COLOURS))
-        found[name] = Stroke(SERIES_COLOURS[colour], dashes=_SERIES_DASHES[again % len(_SERIES_DASHES)])
-    return {name: found[name] for name in names}
+        strokes[name] = Stroke(SERIES_COLOURS[colour], dashes=_SERIES_DASHES[again % len(_SERIES_DASHES)])
+    return {name: strokes[name] for name in names}
 
 
 def parse_rgb(colour: str) -> tuple[int, int, int]:
@@ -165,15 +165,22 @@ def to_css_colour(colour: str) -> str:
 
 def build_colour_variables() -> str:
     """The variables of a page by day and in the dark, and those of the colours that are the same in both."""
-    fixed = {"sensor": SENSOR, "recovered": RECOVERED, "swept": SWEPT, "silent": SILENT, "white": WHITE, "black": BLACK}
+    fixed = {
+        "sensor": SENSOR,
+        "recovered": RECOVERED,
+        "swept": SWEPT,
+        "unanswered": UNANSWERED,
+        "white": WHITE,
+        "black": BLACK,
+    }
     day, night = ({name: pair[k] for name, pair in PAGE_COLOURS.items()} for k in (0, 1))
     dark = f"@media (prefers-color-scheme: dark) {{ {_format_root_rule(night)} }}"
     return f"{_format_root_rule({**day, **fixed})}\n{dark}\n"
 
 
 def _format_root_rule(variables: dict[str, str]) -> str:
-    said = " ".join(f"--{name}: {colour};" for name, colour in variables.items())
-    return f":root {{ color-scheme: light dark; {said} }}"
+    declarations = " ".join(f"--{name}: {colour};" for name, colour in variables.items())
+    return f":root {{ color-scheme: light dark; {declarations} }}"
 
 
 _CSS_VARIABLES = {day.lower(): f"var(--{name})" for name, (day, _) in PAGE_COLOURS.items()}

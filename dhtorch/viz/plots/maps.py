@@ -70,14 +70,14 @@ def draw_completed(
 def draw_aligned(
     path: str | Path | IO[bytes],
     image: Any,  # (C, h, w) or (C, H, W) uint8, or float in [0, 1]
-    given: Any,  # (1, h, w) or (h, w), any unit, 0 or NaN without a value
+    input_map: Any,  # (1, h, w) or (h, w), any unit, 0 or NaN without a value
     depth: Any,  # (h, w) m, 0 or NaN without an answer
     sigma: Any,  # (h, w) m
     *,
     title: str = "",
 ) -> None:
     """Draw image, input map, aligned map, and its sigma / depth; both maps on log scales over their own ranges."""
-    x, z, s = (as_array(q) for q in (given, depth, sigma))
+    x, z, s = (as_array(q) for q in (input_map, depth, sigma))
     x = x.reshape(x.shape[-2:])
     has_value, answered = np.isfinite(x) & (x > 0), np.isfinite(z) & (z > 0)
     input_panel = (

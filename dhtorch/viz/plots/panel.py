@@ -79,15 +79,15 @@ class Panel:
                 self.marks.append(Mark("line", tuple(run), stroke))
             run = []
 
-    def dot(self, x: float, y: float, stroke: Stroke, said: str = "", width: float = 6.8) -> None:
-        """Add a dot with the tooltip ``said``."""
-        self.marks.append(Mark("dot", (self.at(x, y),), stroke._replace(width=width), said))
+    def dot(self, x: float, y: float, stroke: Stroke, tooltip: str = "", width: float = 6.8) -> None:
+        """Add a dot with the tooltip ``tooltip``."""
+        self.marks.append(Mark("dot", (self.at(x, y),), stroke._replace(width=width), tooltip))
 
-    def diamond(self, x: float, y: float, said: str = "") -> None:
+    def diamond(self, x: float, y: float, tooltip: str = "") -> None:
         """Add a diamond, the mark of the paper's values."""
         (u, v), r = self.at(x, y), 5
         corners = ((u, v - r), (u + r, v), (u, v + r), (u - r, v))
-        self.marks.append(Mark("diamond", corners, Stroke(PAPER_FILL), said, PAPER_EDGE))
+        self.marks.append(Mark("diamond", corners, Stroke(PAPER_FILL), tooltip, PAPER_EDGE))
 
     def bar(self, x_0: float, x_1: float, y_0: float, y_1: float, colour: str, edge: str | None = None) -> None:
         """Add a filled rectangle."""
@@ -131,7 +131,7 @@ class Panel:
                 self.left - 8,
                 v - 3.5,
                 ha="right",
-                said=name,
+                tooltip=name,
             )
         for tick in self.y.ticks() if self.y else ():
             v = self.at(self.x.low, tick)[1]

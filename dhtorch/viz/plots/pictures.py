@@ -22,7 +22,7 @@ from dhtorch.viz.plots.panel import Panel
 #: Smallest number of answers whose mean error is drawn.
 MIN_CURVE_ANSWERS = 10
 #: Mark of a layer → shape, diameter (points), width of its white edge (points).
-_LAYER_MARKS = {"sensor": ("dot", 2.8, 0.0), "silent": ("cross", 2.8, 0.0), "answer": ("dot", 3.8, 0.6)}
+_LAYER_MARKS = {"sensor": ("dot", 2.8, 0.0), "unanswered": ("cross", 2.8, 0.0), "answer": ("dot", 3.8, 0.6)}
 
 
 class PointLayer(NamedTuple):
@@ -91,7 +91,7 @@ def draw_samples(
     """Draw the outcome of every sample: sensor return, recovered depth, or the gate that rejected it."""
     source, gate = _to_array(source), _to_array(gate)
     layers = [
-        (words(name), (source == Source.NONE) & (gate == code), GATE_COLOURS[code], "silent")
+        (words(name), (source == Source.NONE) & (gate == code), GATE_COLOURS[code], "unanswered")
         for code, name in names(Gate).items()
         if code != Gate.ANSWER
     ]
@@ -196,7 +196,7 @@ def draw_risk_coverage(
     y = Axis(0.0, min(1.0, top), "mean relative error (at most 1), %", percent=True)
     panel = Panel(prefix_title("Risk against coverage", title), x, y, size=(400, 290))
     for level in (0.05, 0.1):
-        panel.line([x.low, x.high], [level, level], Stroke(colours.SILENT, 0.8))
+        panel.line([x.low, x.high], [level, level], Stroke(colours.UNANSWERED, 0.8))
     keys = [LegendKey(name, strokes[name].colour, stroke=strokes[name]) for name in drawn]
     if oracle is not None:
         ideal = Stroke(INK, 1, (4, 3))

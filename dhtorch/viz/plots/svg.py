@@ -30,21 +30,23 @@ def render_inline_svg(panel: Panel | LayeredPicture) -> str:
         warnings.filterwarnings(
             "ignore", message="Glyph"
         )  # glyphs missing in matplotlib's font; the page's font has them
-        body = _strip_svg(_render_svg(canvas), canvas.said)
+        body = _strip_svg(_render_svg(canvas), canvas.tooltips)
     box, label = f"0 0 {panel.width:g} {panel.height:g}", html.escape(to_plain_line(panel.words))
     return f'<svg viewBox="{box}" role="img" aria-label="{label}" style="--width: {panel.width:g}px">{body}</svg>'
 
 
-def _strip_svg(svg: str, said: Sequence[str] = ()) -> str:
+def _strip_svg(svg: str, tooltips: Sequence[str] = ()) -> str:
     """matplotlib SVG -> its content without metadata, ids and redundant styles.
 
     Args:
         svg: from ``savefig`` with text as text.
-        said: tooltips of the groups named said-0, said-1, …
+        tooltips: tooltips of the groups named tooltip-0, tooltip-1, …
     """
     body = svg[svg.index(">", svg.index("<svg")) + 1 : svg.rindex("</svg>")]
     body = re.sub(r"<metadata>.*?</metadata>|<defs>\s*<style.*?</style>\s*</defs>|<!--.*?-->", "", body, flags=re.S)
-    body = re.sub(r'<g id="said-(\d+)">\s*(<(?:path|text)[^>]*?)(?:/>|>([^<]*)</text>)', _make_title_writer(said), body)
+    body = re.sub(
+        r'<g id="tooltip-(\d+)">\s*(<(?:path|text)[^>]*?)(?:/>|>([^<]*)</text>)', _make_title_writer(tooltips), body
+    )
     body = re.sub(r"</?g\b[^>]*>|<defs/>", "", body)
     body = _COORDINATES.sub(lambda m: f'{m[1]}="{_round_coordinates(m[2])}"', body)
     body = re.sub(r' transform="rotate\(-?0 [^"]*\)"', "", body)
@@ -62,9 +64,9 @@ def _render_svg(canvas: Canvas) -> str:
     return out.getvalue()
 
 
-def _make_title_writer(said: Sequence[str]) -> Callable[[re.Match[str]], str]:
+def _make_title_writer(tooltips: Sequence[str]) -> Callable[[re.Match[str]], str]:
     def write(m: re.Match[str]) -> str:
-        title = f"<title>{html.escape(said[int(m[1])])}</title>"
+        title = f"<title>{html.escape(tooltips[int(m[1])])}</title>"
         return f"{m[2]}>{m[3]}{title}</text>" if m[3] is not None else f"{m[2]}>{title}</path>"
 
     return write

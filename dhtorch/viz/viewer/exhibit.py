@@ -74,7 +74,7 @@ class PairExhibit:
     view_0: int | None = None  # positions in ``Exhibit.views``; None = no images
     view_1: int | None = None
     seen: PointCloud = EMPTY_CLOUD  # input returns of the method
-    held: PointCloud = EMPTY_CLOUD  # held-out returns, or exact depth
+    held_out: PointCloud = EMPTY_CLOUD  # held-out returns, or exact depth
     swept: SweptPointCloud = EMPTY_SWEPT_CLOUD  # swept pixels of view 0, with dense depth
     depth_image: DepthImage | None = None  # input depth of the method
     facts: Mapping[str, str] = field(default_factory=dict)
@@ -93,7 +93,7 @@ class PageOpening:
     """Opening of a page, above the 3D view."""
 
     numbers: Mapping[str, str]  # name → value
-    said: Sequence[str] = ()  # sentences
+    sentences: Sequence[str] = ()  # sentences
     picture: bytes | None = None  # PNG
     caption: str = ""
 

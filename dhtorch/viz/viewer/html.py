@@ -28,7 +28,7 @@ _FOLDER = Path(__file__).parent
 _SCRIPTS = ("space.js", "pictures.js", "layers.js", "page.js")
 
 #: Colours that the scripts refer to by name.
-_COLOUR_NAMES = ("SENSOR", "RECOVERED", "SWEPT", "SILENT", "PALE", "HELD", "WHITE", "BLACK")
+_COLOUR_NAMES = ("SENSOR", "RECOVERED", "SWEPT", "UNANSWERED", "PALE", "HIDDEN_RETURN", "WHITE", "BLACK")
 _CMAP_OF_QUANTITY = {"depth": colours.DEPTH_CMAP, "score": colours.SCORE_CMAP, "error": colours.ERROR_CMAP}
 
 #: Quantisation of pixel coordinates in 16 bits, steps per px.
@@ -84,7 +84,7 @@ def _format_opening(opening: PageOpening) -> Markup:
     numbers = (
         make_tag("div", make_tag("dt", what), make_tag("dd", amount)) for what, amount in opening.numbers.items()
     )
-    parts = [make_tag("dl", *numbers, class_="numbers"), *(make_tag("p", text) for text in opening.said)]
+    parts = [make_tag("dl", *numbers, class_="numbers"), *(make_tag("p", text) for text in opening.sentences)]
     if opening.picture is not None:
         shown = make_tag("img", alt=opening.caption, src=encode_png_uri(opening.picture))
         below = make_tag("figcaption", opening.caption) if opening.caption else ""
@@ -132,7 +132,7 @@ def _encode_pair(shot: PairExhibit) -> dict[str, Any]:
         "view_0": shot.view_0,
         "view_1": shot.view_1,
         "seen": _encode_cloud(shot.seen),
-        "held": _encode_cloud(shot.held),
+        "held_out": _encode_cloud(shot.held_out),
     }
     encoded["swept"] = _encode_cloud(shot.swept) | _encode_confidence(shot.swept)
     poses = {"T_world_from_0": shot.T_world_from_0, "T_world_from_1": shot.T_world_from_1}

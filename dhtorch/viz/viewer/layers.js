@@ -21,11 +21,11 @@ const shots = DATA.shots.map((s) => {
   columns.score = Float32Array.from(columns.score, (v) => v / 65535);
   const swept = { ...cloud(s.swept), sigma: unpack(s.swept.sigma), score: Float32Array.from(unpack(s.swept.score), (v) => v / 65535) };
   swept.depth = Float32Array.from({ length: swept.n }, (_, k) => DATA.views.length ? swept.xyz[3 * k + 2] : Math.hypot(...swept.xyz.subarray(3 * k, 3 * k + 3))); // a map's origin is no camera
-  return { ...s, ...columns, n: columns.depth.length, seen: cloud(s.seen), held: cloud(s.held), swept };
+  return { ...s, ...columns, n: columns.depth.length, seen: cloud(s.seen), held_out: cloud(s.held_out), swept };
 });
 const outcomes = DATA.outcomes, gateOf = Object.fromEntries(DATA.gates.map((g) => [g.code, g])), holeOf = Object.fromEntries(DATA.holes.map((h) => [h.code, h]));
-const SENSOR = hex(DATA.colours.sensor), RECOVERED = hex(DATA.colours.recovered), SWEPT = hex(DATA.colours.swept), SILENT = hex(DATA.colours.silent);
-const PALE = hex(DATA.colours.pale), HELD = hex(DATA.colours.held), [BY_DAY, BY_NIGHT] = [0, 1].map((k) => ({ stage: hex(DATA.page.stage[k]), rim: hex(DATA.page.rim[k]) }));
+const SENSOR = hex(DATA.colours.sensor), RECOVERED = hex(DATA.colours.recovered), SWEPT = hex(DATA.colours.swept), UNANSWERED = hex(DATA.colours.unanswered);
+const PALE = hex(DATA.colours.pale), HIDDEN_RETURN = hex(DATA.colours.hidden_return), [BY_DAY, BY_NIGHT] = [0, 1].map((k) => ({ stage: hex(DATA.page.stage[k]), rim: hex(DATA.page.rim[k]) }));
 const everything = (name, wanted = () => true) => shots.flatMap((s) => Array.from(s[name]).filter((_, k) => wanted(s, k)));
 const answered = (s, k) => s.source[k] === 2;
 const hasErrors = shots.some((s) => s.error.some(Number.isFinite));
@@ -47,20 +47,20 @@ const show = Object.fromEntries([...document.querySelectorAll("[data-show]")].ma
 function sampleColour(s, k) {
   const mode = state.mode, source = s.source[k];
   if (mode === "hole") return holeOf[s.hole[k]] ? hex(holeOf[s.hole[k]].colour) : SENSOR;
-  if (mode === "gate") return source === 1 ? SENSOR : source === 2 ? RECOVERED : hex(gateOf[s.gate[k]]?.colour || DATA.colours.silent);
-  if (mode === "source" || mode === "picture") return [SILENT, SENSOR, RECOVERED][source];
-  if (source === 0 || (source === 1 && mode !== "depth")) return source ? PALE : SILENT;
+  if (mode === "gate") return source === 1 ? SENSOR : source === 2 ? RECOVERED : hex(gateOf[s.gate[k]]?.colour || DATA.colours.unanswered);
+  if (mode === "source" || mode === "picture") return [UNANSWERED, SENSOR, RECOVERED][source];
+  if (source === 0 || (source === 1 && mode !== "depth")) return source ? PALE : UNANSWERED;
   const value = mode === "sigma" ? s.sigma[k] / s.depth[k] : s[mode][k];
-  return Number.isFinite(value) ? scales[mode].colour(value) : SILENT;
+  return Number.isFinite(value) ? scales[mode].colour(value) : UNANSWERED;
 }
 
 // Colour of a return of a depth map: that of the image, tinted in modes that distinguish sources.
-function returnColour(cloud, k, held) {
+function returnColour(cloud, k, heldOut) {
   const rgb = [0, 1, 2].map((c) => cloud.rgb[3 * k + c] / 255), grey = luma(rgb);
   if (state.mode === "picture") return rgb;
   if (state.mode === "depth") return scales.depth.colour(cloud.xyz[3 * k + 2]).map((v) => v * (0.5 + 0.6 * grey));
   if (scales[state.mode]) return PALE.map((v) => 0.67 * v + 0.45 * grey);
-  if (held) return HELD.map((v) => v * (0.5 + grey));
+  if (heldOut) return HIDDEN_RETURN.map((v) => v * (0.5 + grey));
   return SENSOR.map((v, c) => 0.75 * v * (0.35 + 1.3 * grey) + 0.25 * rgb[c]);
 }
 
@@ -109,7 +109,7 @@ function buildShot(s) {
     bars: space.layer({ position: Float32Array.from(bars), colour: tone(2 * groups.recovered.length), score: twice(groups.recovered, 2) }),
     rays: space.layer({ position: Float32Array.from(rays), colour: colours(rays.length / 3, () => RECOVERED), score: twice(some, 2 * ends.length) }),
     seen: space.layer({ position: transformed(T, s.seen.xyz), colour: tone(s.seen.n) }),
-    held: space.layer({ position: transformed(T, s.held.xyz), colour: tone(s.held.n) }),
+    held_out: space.layer({ position: transformed(T, s.held_out.xyz), colour: tone(s.held_out.n) }),
     ...sweptLayers(s, T),
     frustums: frustums(s),
   };
@@ -151,7 +151,7 @@ const ground = (() => {
   const whole = ([low, high]) => { const first = Math.floor(low / metres), last = Math.ceil(high / metres); return Array.from({ length: Math.min(last - first, 60) + 1 }, (_, k) => (first + k) * metres); };
   const [us, vs] = [whole(across), whole(along)], at = (u, v) => add(add(add([0, 0, 0], eye.right, u), eye.ahead, v), eye.down, floor);
   const lines = [...us.flatMap((u) => [at(u, vs[0]), at(u, vs.at(-1))]), ...vs.flatMap((v) => [at(us[0], v), at(us.at(-1), v)])].flat();
-  return { metres, layer: space.layer({ position: Float32Array.from(lines), colour: colours(lines.length / 3, () => SILENT) }) };
+  return { metres, layer: space.layer({ position: Float32Array.from(lines), colour: colours(lines.length / 3, () => UNANSWERED) }) };
 })();
 
 // Cameras as pyramids with a height of a tenth of the typical depth.
@@ -186,7 +186,7 @@ function recolour() {
     const own = (k) => (state.mode === "picture" ? [0, 1, 2].map((c) => s.rgb[3 * k + c] / 255) : sampleColour(s, k));
     for (const name of ["sensor", "recovered"]) space.recolour(l[name], colours(l.groups[name].length, (k) => own(l.groups[name][k])));
     space.recolour(l.bars, colours(2 * l.groups.recovered.length, (k) => own(l.groups.recovered[k >> 1])));
-    for (const name of ["seen", "held"]) space.recolour(l[name], colours(s[name].n, (k) => returnColour(s[name], k, name === "held")));
+    for (const name of ["seen", "held_out"]) space.recolour(l[name], colours(s[name].n, (k) => returnColour(s[name], k, name === "held_out")));
     space.recolour(l.swept, colours(s.swept.n, (k) => sweptColour(s.swept, k)));
     if (l.grains) space.recolour(l.grains, colours(l.loose.length, (k) => sweptColour(s.swept, l.loose[k])));
     s.css = Array.from({ length: s.n }, (_, k) => css(sampleColour(s, k)));
@@ -197,7 +197,7 @@ function recolour() {
 const visible = (s) => (k) => {
   const source = s.source[k];
   if (source === 2) return show.recovered && s.score[k] >= state.threshold;
-  return source === 1 ? show.sensor : show.silent;
+  return source === 1 ? show.sensor : show.unanswered;
 };
 
 function drawSpace() {
@@ -211,7 +211,7 @@ function drawSpace() {
       space.points(l.seen, { size: grain, smallest: 1.4 });
       space.points(l.sensor, { size: 1.3 * grain, smallest: l.seen ? 1.6 : 2.5 });
     }
-    if (show.held) space.points(l.held, { size: grain, smallest: 1.4 });
+    if (show.held_out) space.points(l.held_out, { size: grain, smallest: 1.4 });
     if (show.swept && l.surface) space.surface(l.swept, l.surface, { threshold });
     if (show.swept) space.points(l.surface ? l.grains : l.swept, { size: grain, smallest: 1.4, threshold });
     if (show.recovered && l.recovered) {

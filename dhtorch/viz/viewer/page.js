@@ -95,7 +95,7 @@ function tellColours() {
     const list = mode === "hole" ? [[DATA.colours.sensor, "sensor"], ...DATA.holes.filter((h) => seen("hole", h.code, (x) => x !== 1)).map((h) => [h.colour, h.name])]
       : mode === "gate" ? outcomes.filter((o) => shots.some((s) => s.counts[o.key])).map((o) => [o.colour, o.name])
       : mode === "picture" ? []
-      : [[DATA.colours.sensor, "sensor"], [DATA.colours.recovered, "recovered"], ...(hasSwept ? [[DATA.colours.swept, "swept"]] : []), ...(hasViews ? [[DATA.colours.silent, "no answer (in the images)"]] : [])];
+      : [[DATA.colours.sensor, "sensor"], [DATA.colours.recovered, "recovered"], ...(hasSwept ? [[DATA.colours.swept, "swept"]] : []), ...(hasViews ? [[DATA.colours.unanswered, "no answer (in the images)"]] : [])];
     rows.push(element("ul", { class: "keys" }, ...list.map(([colour, name]) => key(colour, name))));
   }
   rows.push(element("p", { class: "grid-size" }, `grid: ${ground.metres} m`));
@@ -228,7 +228,7 @@ const KEYS = {
   c: () => chooseColour(MODES[(MODES.findIndex(([k]) => k === state.mode) + 1) % MODES.length][0]),
   "+": () => { eye.zoom(0.9); redraw(); }, "=": () => { eye.zoom(0.9); redraw(); }, "-": () => { eye.zoom(1 / 0.9); redraw(); },
   o: () => lookFrom("over"), v: () => lookFrom("camera"), a: () => lookFrom("above"), d: () => lookFrom("side"),
-  s: () => toggle("sensor"), r: () => toggle("recovered"), h: () => toggle("held"), w: () => toggle("swept"), u: () => toggle("sigma"), f: () => toggle("frustums"), t: () => toggle("tracks"), g: () => toggle("grid"),
+  s: () => toggle("sensor"), r: () => toggle("recovered"), h: () => toggle("held_out"), w: () => toggle("swept"), u: () => toggle("sigma"), f: () => toggle("frustums"), t: () => toggle("tracks"), g: () => toggle("grid"),
 };
 
 function listen() {
@@ -265,7 +265,7 @@ function begin() {
   document.querySelector('[data-place="camera"]').toggleAttribute("hidden", !hasViews);
   $("no-gl").toggleAttribute("hidden", Boolean(space.gl));
   $("space").setAttribute("aria-label", `Points of ${DATA.title} in space: arrow keys turn, plus and minus zoom`);
-  for (const [name, has] of [["held", shots.some((s) => s.held.n)], ["swept", hasSwept], ["silent", hasViews], ["tracks", hasViews], ["depth", hasViews], ["frustums", hasViews]]) {
+  for (const [name, has] of [["held_out", shots.some((s) => s.held_out.n)], ["swept", hasSwept], ["unanswered", hasViews], ["tracks", hasViews], ["depth", hasViews], ["frustums", hasViews]]) {
     document.querySelector(`[data-show="${name}"]`).closest("label").toggleAttribute("hidden", !has);
   }
   listen();

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import Gate, Source, names, words
-from dhtorch.viz.plots.colours import DEPTH_CMAP, GATE_COLOURS, RECOVERED, SENSOR, SILENT, SWEPT, parse_rgb
+from dhtorch.viz.plots.colours import DEPTH_CMAP, GATE_COLOURS, RECOVERED, SENSOR, SWEPT, UNANSWERED, parse_rgb
 from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PairExhibit, PointCloud
 
 RRD_SUFFIXES = (".rrd",)
@@ -93,7 +93,7 @@ def _log_exhibit(rr: Any, stream: Any, scene: Exhibit) -> None:
     about = "\n".join(f"{k}: {v}" for k, v in {"scene": scene.name, **scene.facts}.items())
     stream.log("about", rr.TextDocument(about), static=True)
     if scene.path is not None:
-        stream.log("world/path", rr.LineStrips3D([scene.path], colors=parse_rgb(SILENT)), static=True)
+        stream.log("world/path", rr.LineStrips3D([scene.path], colors=parse_rgb(UNANSWERED)), static=True)
     for name, (label, colour) in _describe_outcomes().items():
         stream.log(f"gates/{name.lower()}", rr.SeriesLines(names=label, colors=colour), static=True)
     swept = any(len(shot.swept.xyz) for shot in scene.shots)
@@ -142,7 +142,7 @@ def _log_points(rr: Any, stream: Any, shot: PairExhibit) -> None:
     stream.log("world/map/sigma", rr.LineStrips3D(bars, colors=[*parse_rgb(RECOVERED), 120]))
     sensed = s["source"] == Source.SENSOR
     seen = shot.seen if len(shot.seen.xyz) else PointCloud(s["xyz"][sensed], s["rgb"][sensed])
-    for name, cloud in (("sensor", seen), ("held_back", shot.held)):
+    for name, cloud in (("sensor", seen), ("held_out", shot.held_out)):
         stream.log(
             f"world/map/{name}", rr.Points3D(_transform_points(T, cloud.xyz), colors=cloud.rgb, radii=_MIN_RADIUS_M)
         )
@@ -163,7 +163,7 @@ def _log_views(rr: Any, stream: Any, shot: PairExhibit, view_0: ExhibitView, vie
         c = [m.c[0] + 0.5, m.c[1] + 0.5]
         stream.log("world/reference/depth", rr.Pinhole(focal_length=m.f, principal_point=c, width=w, height=h))
         stream.log("world/reference/depth", rr.DepthImage(m.depth, meter=1.0, colormap=DEPTH_CMAP))
-    groups = {"silent": Source.NONE, "sensor": Source.SENSOR, "recovered": Source.RECOVERED}
+    groups = {"unanswered": Source.NONE, "sensor": Source.SENSOR, "recovered": Source.RECOVERED}
     classes = np.where(s["source"] == Source.SENSOR, _SENSOR_CLASS, s["gate"]).astype(np.uint16)
     at_0, at_1 = _to_jpeg_pixels(view_0, s["uv_0"]), _to_jpeg_pixels(view_1, s["uv_1"])
     for name, code in groups.items():

@@ -29,7 +29,7 @@ class ValidatedFrame:
 
 def _build_page(
     title: str,
-    said: Sequence[str],
+    sentences: Sequence[str],
     columns: Sequence[str],
     frames: Sequence[ValidatedFrame],
     *,
@@ -40,7 +40,7 @@ def _build_page(
     """The page: summary lines, a table of all frames in the given order, and the figures."""
     top = [
         make_tag("h1", title),
-        *(make_tag("p", text) for text in said),
+        *(make_tag("p", text) for text in sentences),
         *(make_tag("p", text, class_="bad") for text in failed),
     ]
     heads = (

@@ -12,7 +12,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "stages.pose_prior": [
         (
             "check_pose_prior",
-            "refuted, no_baseline = refuted | (enough_near & found.ok & deviates)",
+            "refuted, no_baseline = refuted | (enough_near & fit.ok & deviates)",
             "refuted, no_baseline = refuted",
         ),
         ("check_pose_prior", "own_cov + xi[:, :, None] * xi[:, None]", "own_cov"),
@@ -21,8 +21,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("check_pose_prior", "(no_baseline | ~(t_snr >= MIN_PRIOR_T_SNR), PoseCode.NO_BASELINE),\n", ""),
         ("check_pose_prior", "(unconfirmed, PoseCode.TOO_FEW),\n", ""),
         ("check_pose_prior", "inlier=(inlier & ok[:, None])[:, :N]", "inlier=inlier[:, :N]"),
-        ("reject_poses", "| (held.code == PoseCode.TOO_FEW)", ""),
-        ("reject_poses", "code=torch.where(rejected, held.code, fit.code)", "code=fit.code"),
+        ("reject_poses", "| (prior_fit.code == PoseCode.TOO_FEW)", ""),
+        ("reject_poses", "code=torch.where(rejected, prior_fit.code, fit.code)", "code=fit.code"),
         ("priors_from_frames", ".unflatten(0, world_1.t.shape[:2])", ".unflatten(0, world_1.t.shape[:2][::-1])"),
         ("make_prior", "[sigma[0] ** 2] * 3 + [sigma[1] ** 2] * 3", "[sigma[1] ** 2] * 3 + [sigma[0] ** 2] * 3"),
         ("make_prior", "InitialPose if refine else PosePrior", "PosePrior"),
