@@ -21,15 +21,23 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.io.safe_open import restrict_links
 from dhtorch.data.readers import (
     arkitscenes,
+    bop,
     ca1m,
     driving,
     frames_dir,
     lerobot,
+    nerfstudio,
+    open3d,
+    polycam,
     record3d,
     rectified,
+    replica,
     rh20t,
     rlds,
+    scannet,
+    sens_folder,
     stray,
+    sun3d,
     tum,
 )
 from dhtorch.data.recording import Recording, Recordings
@@ -70,6 +78,14 @@ class Reader(Protocol):
 #: Name → reader, tried in this order; the first that recognises a path reads it.
 FORMATS: Final[dict[str, Reader]] = {
     "record3d": record3d,  # before tum: its folder holds rgb/ and depth/, too
+    "polycam": polycam,
+    "nerfstudio": nerfstudio,
+    "bop": bop,  # the image folders with a file that states their meaning: before those of names alone
+    "replica": replica,
+    "scannet": scannet,
+    "sens_folder": sens_folder,
+    "open3d": open3d,
+    "sun3d": sun3d,
     "tum": tum,
     "driving": driving,
     "rectified": rectified,

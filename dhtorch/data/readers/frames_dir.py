@@ -17,7 +17,6 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,23 +24,26 @@ import torch
 
 from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
-from dhtorch.data.codecs import pgm
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers.image_table import ImageRow, ImageTableLoader, list_images, read_depth_hw
 from dhtorch.data.recording import Recording
-from dhtorch.records import Camera, Frame, Pose
+from dhtorch.data.units import DepthUnit
+from dhtorch.records import Pose
 
-_NAMED_FRAME_PATTERN = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(?:png|jpg|jpeg|txt)")
-_IMAGE_PATTERN = re.compile(r"(.+)\.(?:png|jpg|jpeg|pgm)")
+_NAMED_FRAME_PATTERN = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(?:png|jpg|jpeg|pgm|txt)")
 _IMAGE_FOLDERS = ("images", "color", "rgb")  # of the *counted* layout
 _POSE_FILES = ("poses.txt", "pose.txt")
 _INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt", "intrinsics.txt")
+
+#: Depth codes of one metre where nothing states another. Source: convention of the layout, millimetres.
+_UNITS_PER_METRE = 1000.0
 
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     pictures, poses = _find_image_folder(root), _first_existing(root, _POSE_FILES)
-    if pictures is not None and any(map(_IMAGE_PATTERN.fullmatch, _list_names(root / "depth"))):
+    if pictures is not None and list_images(root / "depth"):
         return f"{pictures.name}/ and depth/" + (f" and {poses.name}" if poses else "")
     if _single(root) is not None:
         return "rgb, raw_depth.png and intrinsics.txt"
@@ -60,6 +62,7 @@ def read(
     distortion: Sequence[float] | None = None,
     units_per_metre: float | None = None,
     invalid: Sequence[int] | None = None,
+    rotated_bits: int = 0,
     fps: float | None = None,
     register: bool = True,
 ) -> list[Recording]:
@@ -72,8 +75,10 @@ def read(
         fov: horizontal field of view of the colour image in degrees, for a guessed K where none is available.
         K_depth: as ``K``, of a depth map that is not registered to colour. None = ``meta.json``, else as colour.
         distortion: of the colour image, in OpenCV's order. None = ``meta.json``, else none.
-        units_per_metre: of the depth codes. None = ``meta.json``, else 1000 (millimetres).
+        units_per_metre: of the depth codes. None = ``depth_scale`` of ``meta.json`` (below 1: metres of one code), else
+            1000 (millimetres) is assumed.
         invalid: depth codes that mean *no return* beside 0. None = ``meta.json``, else 65535.
+        rotated_bits: by which the depth codes are rotated to the left: 3 in SUN3D and SUN RGB-D.
         fps: frame rate, for time stamps. None = ``meta.json`` if it has a number, else no time stamps.
         register: warp depth with intrinsics of its own to the colour image (one z-buffer, holes are kept). The centres
             of the two cameras are assumed to coincide, since these sets have no extrinsics. False keeps the depth map
@@ -90,7 +95,7 @@ def read(
     meta = files.read_json(side_car) if side_car.is_file() else {}
     frames, poses, report = _list_frames(root)
     hw = files.read_image_header(frames[0].image).hw
-    depth_hw = _depth_hw(frames[0].depth)
+    depth_hw = read_depth_hw(frames[0].depth)
     stated = intrinsics_options.parse_intrinsics(root, hw, intrinsics, K, fov)
     if stated.feature is not None:
         raise FormatError(
@@ -104,17 +109,18 @@ def read(
     )
     # Depth has a camera of its own only where K_depth is set: most sets of this layout are registered.
     depth_K = _read_intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
-    units = units_per_metre if units_per_metre is not None else meta.get("depth_scale", 1000.0)
+    units, unit = _parse_unit(units_per_metre, meta, side_car)
     rate = _parse_rate(fps if fps is not None else meta.get("fps"), side_car)
     number = torch.tensor([frame.number for frame in frames])
-    load = _Load(
-        frames=tuple(frames),
+    load = ImageTableLoader(
+        rows=tuple(frames),
         hw=hw,
         depth_hw=depth_hw,
         camera=colour,
         depth_camera=convert.to_camera(depth_K[0], depth_hw, *depth_K[1:]) if depth_K else None,
-        units_per_metre=files.to_positive(units, side_car, "depth_scale"),
-        invalid=_parse_codes(invalid if invalid is not None else meta.get("invalid", (0, 65535)), side_car),
+        units_per_metre=units,
+        no_return=_parse_codes(invalid if invalid is not None else meta.get("invalid", (0, 65535)), side_car),
+        rotated_bits=rotated_bits,
         register=register,
     )
     return [
@@ -128,49 +134,9 @@ def read(
             poses=poses,
             rate_hz=rate,
             report=(*report, *stated.report),
+            depth_unit=unit,
         )
     ]
-
-
-@dataclass(frozen=True)
-class _Files:
-    """Image and depth file of one frame, and its number in the capture."""
-
-    number: int
-    image: Path
-    depth: Path
-
-
-@dataclass(frozen=True, eq=False)
-class _Load:
-    """Position → frame."""
-
-    frames: tuple[_Files, ...]
-    hw: tuple[int, int]
-    depth_hw: tuple[int, int]
-    camera: Camera
-    depth_camera: Camera | None
-    units_per_metre: float
-    invalid: tuple[int, ...]
-    register: bool
-
-    def __call__(self, i: int) -> Frame:
-        frame = self.frames[i]
-        image = torch.from_numpy(files.read_image(frame.image, self.hw))
-        depth = torch.from_numpy(self._depth(frame.depth))
-        depth_camera = self.depth_camera
-        if depth_camera is not None and self.register:
-            depth, depth_camera = convert.register_depth(depth, depth_camera, self.camera, self.hw), None
-        return Frame(image[None], depth[None], self.camera, depth_camera)
-
-    def _depth(self, file: Path) -> np.ndarray:
-        if file.suffix == ".pgm":
-            return files.to_metres(pgm.read_pgm(file, self.depth_hw), self.units_per_metre, self.invalid)
-        return files.read_depth_png(file, self.units_per_metre, self.depth_hw, self.invalid)
-
-
-def _list_names(folder: Path) -> list[str]:
-    return [file.name for file in folder.iterdir()] if folder.is_dir() else []
 
 
 def _first_existing(root: Path, names: Sequence[str]) -> Path | None:
@@ -179,25 +145,16 @@ def _first_existing(root: Path, names: Sequence[str]) -> Path | None:
 
 def _find_image_folder(root: Path) -> Path | None:
     """The image folder of the *counted* layout; None where there is none."""
-    return next(
-        (root / name for name in _IMAGE_FOLDERS if any(map(_IMAGE_PATTERN.fullmatch, _list_names(root / name)))), None
-    )
+    return next((root / name for name in _IMAGE_FOLDERS if list_images(root / name)), None)
 
 
-def _single(root: Path) -> _Files | None:
+def _single(root: Path) -> ImageRow | None:
     image = _first_existing(root, ("rgb.png", "rgb.jpg", "rgb.jpeg"))
     depth, K = root / "raw_depth.png", root / "intrinsics.txt"
-    return _Files(0, image, depth) if image is not None and depth.is_file() and K.is_file() else None
+    return ImageRow(0, image, depth) if image is not None and depth.is_file() and K.is_file() else None
 
 
-def _depth_hw(file: Path) -> tuple[int, int]:
-    if file.suffix != ".pgm":
-        return files.read_image_header(file).hw
-    h, w = pgm.read_pgm(file).shape
-    return h, w
-
-
-def _list_frames(root: Path) -> tuple[list[_Files], Pose | None, list[str]]:
+def _list_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
     """(frames, poses or None, report of what was left out) of the layout that ``root`` has."""
     if (pictures := _find_image_folder(root)) is not None or (root / "images").is_dir():
         return _list_counted_frames(root, pictures or root / "images")
@@ -205,7 +162,7 @@ def _list_frames(root: Path) -> tuple[list[_Files], Pose | None, list[str]]:
     return ([single], None, ["no poses in this layout"]) if single is not None else _list_named_frames(root)
 
 
-def _list_named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
+def _list_named_frames(root: Path) -> tuple[list[ImageRow], Pose, list[str]]:
     parts: dict[int, dict[str, Path]] = {}
     for file in root.iterdir() if root.is_dir() else ():
         if match := _NAMED_FRAME_PATTERN.fullmatch(file.name):
@@ -222,7 +179,7 @@ def _list_named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
             if matrix.shape != (4, 4):
                 raise FormatError(files_of["pose"], "pose", f"{len(matrix)} rows", "4 rows of 4 numbers")
             poses.append(matrix)
-            frames.append(_Files(number, files_of["color"], files_of["depth"]))
+            frames.append(ImageRow(number, files_of["color"], files_of["depth"]))
     if not frames:
         problem = f"none complete among {len(parts)}" if parts else "none"
         raise FormatError(root, "frames", problem, "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt")
@@ -234,8 +191,8 @@ def _list_named_frames(root: Path) -> tuple[list[_Files], Pose, list[str]]:
         raise
 
 
-def _list_counted_frames(root: Path, folder: Path) -> tuple[list[_Files], Pose | None, list[str]]:
-    images, depths = _list_pictures(folder), _list_pictures(root / "depth")
+def _list_counted_frames(root: Path, folder: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
+    images, depths = list_images(folder), list_images(root / "depth")
     file = _first_existing(root, _POSE_FILES)
     rows = None if file is None else files.read_table(file)
     if not images:
@@ -250,12 +207,12 @@ def _list_counted_frames(root: Path, folder: Path) -> tuple[list[_Files], Pose |
         raise FormatError(
             root, "file names", f"{unpaired} in one of {folder.name}/ and depth/", "the same names in both"
         )
-    stems = sorted(images, key=files.natural_sort_key)
+    stems = list(images)
     digits = [re.search(r"(\d+)\D*$", stem) for stem in stems]
     values = [int(m[1]) for m in digits if m]
     increasing = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
     numbers = values if increasing else range(len(stems))
-    frames = [_Files(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
+    frames = [ImageRow(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
     if file is None or rows is None:
         return frames, None, ["no poses.txt: no poses"]
     return frames, _parse_poses(rows, file), []
@@ -269,10 +226,6 @@ def _parse_poses(rows: np.ndarray, file: Path) -> Pose:
     return convert.to_poses(rows.reshape(-1, 4, 4), file)
 
 
-def _list_pictures(folder: Path) -> dict[str, Path]:
-    return {m[1]: file for file in sorted(folder.glob("*")) if (m := _IMAGE_PATTERN.fullmatch(file.name))}
-
-
 def _read_intrinsics(
     root: Path, key: str, option: Sequence[float] | None, meta: dict[str, object]
 ) -> tuple[object, Path, str] | None:
@@ -283,6 +236,19 @@ def _read_intrinsics(
         return meta[key], root / "meta.json", key
     file = _first_existing(root, _INTRINSICS_FILES)
     return (files.read_table(file, 3), file, "K") if file else None
+
+
+def _parse_unit(option: float | None, meta: dict[str, object], side_car: Path) -> tuple[float, DepthUnit]:
+    """(depth codes of one metre, the unit with what states it) from the option, else the side-car, else assumed."""
+    if option is not None:
+        units, source = files.to_positive(option, side_car, "option units_per_metre"), "option units_per_metre"
+        return units, DepthUnit(1 / units, source)
+    if "depth_scale" not in meta:
+        return _UNITS_PER_METRE, DepthUnit(1 / _UNITS_PER_METRE)
+    scale, source = files.to_positive(meta["depth_scale"], side_car, "depth_scale"), "meta.json: depth_scale"
+    # No camera stores less than one code per metre: such a number is metres of one code, as RealSense's.
+    units = scale if scale >= 1 else 1 / scale
+    return units, DepthUnit(1 / units, source)
 
 
 def _parse_rate(value: object, file: Path) -> float | None:

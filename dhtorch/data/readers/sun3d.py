@@ -1,0 +1,135 @@
+"""Reader of SUN3D sequences and SUN RGB-D images.
+
+``image/``, ``depth/`` (16-bit codes in mm, rotated by 3 bits to the left), ``intrinsics.txt`` (3×3) and
+``extrinsics/<date>.txt`` (3×4 camera-to-world matrices of all images, one below the other; the latest date is the
+current one). Names are ``<number>-<time stamp in µs>``; each image has the depth map nearest in time. A SUN RGB-D
+folder holds one image, and its extrinsics hold a tilt, which is no pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from dhtorch.data import intrinsics as intrinsics_options
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import image_table
+from dhtorch.data.recording import Recording
+from dhtorch.data.units import DepthUnit
+
+#: Depth codes of one metre, and bits by which they are rotated. Source: format definition (the data set's toolbox).
+_UNITS_PER_METRE = 1000.0
+_ROTATED_BITS = 3
+
+#: Least share of non-zero codes that are multiples of 8 in rotated codes: all below 8.192 m are; of plain millimetres
+#: an eighth is. Source: chosen between 1/8 and 1.
+_MIN_MULTIPLES = 0.7
+
+_INTRINSICS_FILE = "intrinsics.txt"
+
+
+def recognise(root: Path) -> str | None:
+    """The files by which ``root`` is recognised as this format, as text; None if it is not."""
+    if not (root / _INTRINSICS_FILE).is_file() or not image_table.list_images(root / "image"):
+        return None
+    if not image_table.list_images(root / "depth"):
+        return None
+    return f"image/, depth/ and {_INTRINSICS_FILE}"
+
+
+def read(
+    root: str | Path,
+    *,
+    intrinsics: intrinsics_options.IntrinsicsOption | None = None,
+    K: Sequence[float] | None = None,
+    fov: float | None = None,
+    rotated: bool | None = None,
+    fps: float | None = None,
+) -> list[Recording]:
+    """Open one sequence.
+
+    Args:
+        root: the folder of the sequence.
+        intrinsics: four numbers as ``K``, or one as ``fov``.
+        K: fx, fy, cx, cy of the images. None = ``intrinsics.txt``.
+        fov: horizontal field of view of the images in degrees, for a guessed K.
+        rotated: whether the depth codes are rotated by 3 bits. None = as the codes of the first depth map are, which is
+            reported where they are not.
+        fps: frame rate, for time stamps.
+
+    Returns:
+        One recording. Images without depth map or pose are left out and reported.
+
+    Raises:
+        FormatError: no frame, files that cannot be paired, a damaged file, or values that are no camera or pose.
+    """
+    root = Path(root)
+    images, depths = image_table.list_images(root / "image"), image_table.list_images(root / "depth")
+    pairs = image_table.pair_folders(root, images, depths, None)
+    if not pairs.rows:
+        raise FormatError(root, "depth maps", f"{len(depths)} for {len(images)} images", "one for each image")
+    poses, poses_file, report = _read_extrinsics(root, len(images))
+    rows = tuple(replace(row, c2w=poses.get(row.number)) for row in pairs.rows)
+    hw, depth_hw = files.read_image_header(rows[0].image).hw, image_table.read_depth_hw(rows[0].depth)
+    file = root / _INTRINSICS_FILE
+    stated = (_read_K(file), file, "K") if file.is_file() else None
+    camera, guess = image_table.choose_camera(root, hw, stated, intrinsics, K, fov, where=_INTRINSICS_FILE)
+    is_rotated = _are_rotated(rows[0].depth) if rotated is None else rotated
+    source: str | None = "SUN3D stores mm, rotated by 3 bits"
+    if not is_rotated:
+        source = None
+        report.append("depth codes are not rotated by 3 bits, unlike SUN3D's: read unrotated (data.rotated=true)")
+    loader = image_table.ImageTableLoader(
+        rows=rows,
+        hw=hw,
+        depth_hw=depth_hw,
+        camera=camera,
+        units_per_metre=_UNITS_PER_METRE,
+        rotated_bits=_ROTATED_BITS if is_rotated else 0,
+    )
+    return [
+        image_table.open_image_table(
+            root,
+            "sun3d",
+            loader,
+            unit=DepthUnit(1 / _UNITS_PER_METRE, source),
+            poses_file=poses_file,
+            fps=fps,
+            report=[*pairs.report, *report, *guess],
+        )
+    ]
+
+
+def _read_K(file: Path) -> np.ndarray:
+    """K (3, 3) of nine numbers, in three lines or one."""
+    words = [word for _, row in files.read_rows(file) for word in row]
+    try:
+        values = [float(word) for word in words[:9]]
+    except ValueError:
+        raise FormatError(file, "K", " ".join(words), "9 numbers (3x3 by rows)") from None
+    return files.to_array(values, (9,), file, "K").reshape(3, 3)
+
+
+def _read_extrinsics(root: Path, n_images: int) -> tuple[dict[int, np.ndarray], Path | None, list[str]]:
+    """Poses by the place of the image, their file, and the report; no poses where they do not belong to the images."""
+    tables = sorted((root / "extrinsics").glob("*.txt"))
+    if not tables or n_images == 1:
+        return {}, None, ["extrinsics/ holds the tilt of one image, no pose: not read"] if tables else []
+    file = tables[-1]
+    rows = files.read_table(file, 4)
+    if len(rows) != 3 * n_images:
+        raise FormatError(file, "lines", len(rows), f"{3 * n_images}, three for each of {n_images} images")
+    matrices = np.tile(np.eye(4), (n_images, 1, 1))
+    matrices[:, :3] = rows.reshape(-1, 3, 4)
+    return dict(enumerate(matrices)), file, []
+
+
+def _are_rotated(file: Path) -> bool:
+    """Whether the codes of a depth map are rotated by 3 bits, as far as its returns show."""
+    code = files.read_depth_png(file, 1).astype(np.uint16)
+    returns = code[code > 0]
+    return returns.size == 0 or float((returns % 8 == 0).mean()) >= _MIN_MULTIPLES
