@@ -16,7 +16,9 @@ import torch
 from torch import Tensor
 
 from dhtorch.data.io.safe_open import restrict_links
+from dhtorch.data.orientation import StoredSizes, check_orientation
 from dhtorch.data.units import DepthUnit
+from dhtorch.geometry.no_depth import clear_no_depth
 from dhtorch.records import Frame, Pose
 from dhtorch.runtime.console import format_count
 
@@ -51,6 +53,7 @@ class Recording(Sequence[Frame]):
     report: tuple[str, ...] = ()  # what was left out or guessed, and why
     camera_name: str | None = None  # the data set's name of the camera, where an episode has several
     depth_unit: DepthUnit | None = None  # of the stored depth; None = the format defines metres
+    stored: StoredSizes | None = None  # sizes and stated turn of the files, if not yet applied (orient_recording)
     bounds: Path | None = None  # symbolic links must not point outside it; None = no restriction
 
     def __post_init__(self) -> None:
@@ -76,7 +79,10 @@ class Recording(Sequence[Frame]):
         i = self._position(index)
         with restrict_links(self.bounds):
             frame = self.load(i)
+        if frame.depth_camera is None:
+            check_orientation(self.root or self.name, (frame.depth.shape[-2], frame.depth.shape[-1]), frame.hw)
         return frame.replace(
+            depth=clear_no_depth(frame.depth),
             time=None if self.times is None else self.times[i : i + 1],
             T_world_from_cam=None if self.poses is None else self.poses[i : i + 1],
             sparse=torch.tensor([True]) if self.sparse else frame.sparse,

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import State
+from dhtorch.geometry.no_depth import clear_codes, clear_no_depth
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import get_method
 from dhtorch.pytree import stack
@@ -110,7 +111,8 @@ class ValidateDepth(torch.nn.Module):
         leaves = SampleReader(sample, batched=self.batched, dtype=reference.camera.f.dtype)
         leaves.like = reference.image
         planes = leaves.planes(self.map, 1).to(reference.camera.f)
-        return planes[:, 0] * self.map_unit
+        codes = clear_codes(planes[:, 0])
+        return clear_no_depth(codes * self.map_unit)
 
 
 def _validation_keys(validation: DepthValidation) -> dict[str, Tensor]:

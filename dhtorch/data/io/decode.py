@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 
 from dhtorch.data.io.safe_open import FormatError, check_memory, open_regular, unreadable_error
+from dhtorch.geometry.no_depth import NO_DEPTH_CODES
 
 #: Largest number of pixels of an image, above that of all supported cameras; larger headers are damaged or hostile.
 MAX_PIXELS = 64_000_000
@@ -39,6 +40,12 @@ _WORD_BYTES = 64
 #: The same for a JSON document: per object, list, string and entry, counted by their characters.
 _JSON_BYTES = {"{": 240, "[": 64, '"': 32, ",": 40}
 
+#: Segment of a JPEG that holds EXIF; tag of the orientation and type of its value, a 16-bit number; longest block read.
+_JPEG_APP1 = 0xE1
+_EXIF_ORIENTATION = 0x0112
+_EXIF_SHORT = 3
+_MAX_EXIF_BYTES = 65_536
+
 _LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"
 
 #: Largest expansion of deflate: 1032 bytes from one.
@@ -51,12 +58,13 @@ _MAX_SCANNED_PIXELS = 20 * MAX_PIXELS
 
 
 class ImageHeader(NamedTuple):
-    """Size, channels and bit depth of an image file."""
+    """Size, channels, bit depth and EXIF orientation of an image file."""
 
-    hw: tuple[int, int]
+    hw: tuple[int, int]  # as stored
     channels: int
     bits: int  # per channel
     kind: str  # "png" or "jpeg"
+    orientation: int = 1  # EXIF's, 1 to 8: how the stored pixels are to be turned for display; 1 = not at all
 
 
 def import_optional(*libraries: str, extra: str = "data") -> ModuleType:
@@ -82,18 +90,25 @@ def set_opencv_threads(threads: int) -> None:
 # ---------------------------------------------------------------------------------------------------------- images
 
 
-def read_image(file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
-    """Image (C, H, W) uint8, RGB or grey, as stored: an orientation tag is not applied, K refers to these pixels.
+def read_image(file: Path, hw: tuple[int, int] | None = None, orientation: int | None = None) -> np.ndarray:
+    """Image (C, H, W) uint8, RGB or grey, as stored: an orientation tag is not applied.
+
+    Whether it must be, :func:`dhtorch.data.orientation.orient_recording` decides for a whole recording; ``orientation``
+    is then the tag of its first picture, None = any.
 
     Raises:
-        FormatError: missing, truncated or unknown file; not 8 bits; another size than ``hw``.
+        FormatError: missing, truncated or unknown file; not 8 bits; another size than ``hw`` or tag.
     """
-    return decode_image(read_bytes(file), file, hw)
+    return decode_image(read_bytes(file), file, hw, orientation)
 
 
-def decode_image(data: bytes, file: Path, hw: tuple[int, int] | None = None) -> np.ndarray:
+def decode_image(
+    data: bytes, file: Path, hw: tuple[int, int] | None = None, orientation: int | None = None
+) -> np.ndarray:
     """As :func:`read_image`, of bytes in memory; ``file`` names them in errors."""
     header = _check_header(file, data, hw)
+    if orientation not in (None, header.orientation):
+        raise FormatError(file, "EXIF orientation", header.orientation, f"{orientation}, as the first picture has")
     if header.bits != 8:
         raise FormatError(file, "bits per channel", header.bits, 8)
     flag = cv2.IMREAD_GRAYSCALE if header.channels == 1 else cv2.IMREAD_COLOR
@@ -107,7 +122,7 @@ def read_depth_png(
     file: Path,
     units_per_metre: float,
     hw: tuple[int, int] | None = None,
-    invalid: Sequence[int] = (0,),
+    invalid: Sequence[int] = NO_DEPTH_CODES,
 ) -> np.ndarray:
     """Depth (h, w) in m from a 16-bit one-channel PNG; 0 where the code is one of ``invalid`` (0 always is).
 
@@ -122,7 +137,7 @@ def decode_depth_png(
     file: Path,
     units_per_metre: float,
     hw: tuple[int, int] | None = None,
-    invalid: Sequence[int] = (0,),
+    invalid: Sequence[int] = NO_DEPTH_CODES,
 ) -> np.ndarray:
     """As :func:`read_depth_png`, of bytes in memory; ``file`` names them in errors."""
     header = _check_header(file, data, hw)
@@ -133,7 +148,7 @@ def decode_depth_png(
     return to_metres(code, units_per_metre, invalid)
 
 
-def to_metres(code: np.ndarray, units_per_metre: float, invalid: Sequence[int] = (0,)) -> np.ndarray:
+def to_metres(code: np.ndarray, units_per_metre: float, invalid: Sequence[int] = NO_DEPTH_CODES) -> np.ndarray:
     """Depth float32 in m of codes of any shape; 0 where the code is one of ``invalid``."""
     depth = code.astype(np.float32) / np.float32(units_per_metre)
     for value in invalid:
@@ -175,7 +190,8 @@ def _check_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageH
 def _parse_header(file: Path, data: bytes) -> ImageHeader:
     if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 33 and data[12:16] == b"IHDR":
         w, h, bits, colour = struct.unpack(">IIBB", data[16:26])
-        header = ImageHeader((h, w), {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0), 8 if colour == 3 else bits, "png")
+        channels = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}.get(colour, 0)
+        header = ImageHeader((h, w), channels, 8 if colour == 3 else bits, "png", _png_orientation(data))
     elif data.startswith(b"\xff\xd8"):
         header = _parse_jpeg_header(file, data)
     else:
@@ -192,14 +208,43 @@ def _parse_header(file: Path, data: bytes) -> ImageHeader:
 
 
 def _parse_jpeg_header(file: Path, data: bytes) -> ImageHeader:
-    at = 2
+    at, orientation = 2, 1
     while at + 9 < len(data) and data[at] == 0xFF:
         marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             bits, h, w, channels = struct.unpack(">BHHB", data[at + 4 : at + 10])
-            return ImageHeader((h, w), channels, bits, "jpeg")
+            return ImageHeader((h, w), channels, bits, "jpeg", orientation)
+        if marker == _JPEG_APP1 and data[at + 4 : at + 10] == b"Exif\0\0":
+            orientation = _parse_exif_orientation(data[at + 10 : at + 2 + length])
         at += 1 if marker == 0xFF else 2 + length
     raise FormatError(file, "content", f"a JPEG of {len(data)} bytes without a frame header", "a whole JPEG image")
+
+
+def _png_orientation(data: bytes) -> int:
+    """Orientation of the ``eXIf`` chunk; 1 where there is none."""
+    at = 8
+    while at + 12 <= len(data):
+        length, kind = struct.unpack(">I4s", data[at : at + 8])
+        if kind == b"eXIf":
+            return _parse_exif_orientation(data[at + 8 : at + 8 + min(length, _MAX_EXIF_BYTES)])
+        at += 12 + length
+    return 1
+
+
+def _parse_exif_orientation(exif: bytes) -> int:
+    """Orientation, 1 to 8, of an EXIF block (a TIFF file of tags); 1 where it has none or is damaged."""
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    if order is None or len(exif) < 8:
+        return 1
+    (start,) = struct.unpack(f"{order}I", exif[4:8])
+    if start + 2 > len(exif):
+        return 1
+    (count,) = struct.unpack(f"{order}H", exif[start : start + 2])
+    for at in range(start + 2, min(start + 2 + 12 * count, len(exif) - 11), 12):
+        tag, kind, _, value = struct.unpack(f"{order}HHIH", exif[at : at + 10])
+        if (tag, kind) == (_EXIF_ORIENTATION, _EXIF_SHORT):
+            return value if 1 <= value <= 8 else 1
+    return 1
 
 
 def _is_whole_png(data: bytes) -> bool:
@@ -367,6 +412,17 @@ def read_bytes(file: Path, limit: int = MAX_FILE_BYTES) -> bytes:
             return stream.read(limit)
         except OSError as error:
             raise unreadable_error(file, error) from None
+
+
+def resolve_inside(root: Path, name: str, file: Path, field: str) -> Path:
+    """The path ``root / name``, checked to lie below ``root``.
+
+    Raises:
+        FormatError: an absolute name, or one with ``..``.
+    """
+    if not name or "\x00" in name or len(name) > 1000 or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise FormatError(file, field, name, "a file inside the capture")
+    return root / name
 
 
 def natural_sort_key(name: Path | str) -> tuple[object, ...]:

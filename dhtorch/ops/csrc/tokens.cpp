@@ -66,16 +66,20 @@ void patch_tokens(Tensor uv, Tensor depth, Tensor sigma, Tensor source, Tensor h
   }
 }
 
+// Depth code as a number, 0 where it means no return: not positive, or 65535, the unsigned code that wraps to 0.
+float depth_code(int16_t raw) { return std::max(static_cast<float>(raw), 0.0f); }
+float depth_code(uint16_t raw) { return std::max(static_cast<float>(static_cast<uint16_t>(raw + 1)) - 1.0f, 0.0f); }
+
 template <typename Word>
 void over_unit(const Word* raw, float* __restrict z, int64_t n, float unit) {
   if (unit == 1000.0f) {
-    for (int64_t k = 0; k < n; ++k) z[k] = over<1000>(std::max(static_cast<float>(raw[k]), 0.0f));
+    for (int64_t k = 0; k < n; ++k) z[k] = over<1000>(depth_code(raw[k]));
   } else {
-    for (int64_t k = 0; k < n; ++k) z[k] = std::max(static_cast<float>(raw[k]), 0.0f) / unit;
+    for (int64_t k = 0; k < n; ++k) z[k] = depth_code(raw[k]) / unit;
   }
 }
 
-// raw: int16, or with `sign` false uint16 of the same bits. Output: z float32, raw / unit where positive, else 0.
+// raw: int16, or with `sign` false uint16 of the same bits. Output: z float32, raw / unit, 0 where that means no return.
 void write_metres(Tensor raw, Tensor z, double unit, bool sign) {
   const float per_metre = unit;
   if (sign) {
