@@ -5,6 +5,7 @@ Pixel centres are at integers here and at half-integers in nerfstudio, whose cam
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -29,8 +30,11 @@ def make_nerfstudio_frame(
     K: np.ndarray,  # (3, 3), pixel centres at integers
     T_world_from_cam: np.ndarray,  # (4, 4), OpenCV axes
     lens: Sequence[float] = (),  # OpenCV's order
+    time: float = math.nan,  # s, NaN = none
 ) -> dict[str, Any]:
     """One entry of ``frames`` in a ``transforms.json``.
+
+    ``timestamp`` is no field of nerfstudio, which ignores it; NeRFCapture writes it, too.
 
     Raises:
         ValueError: more distortion coefficients than nerfstudio has.
@@ -48,6 +52,7 @@ def make_nerfstudio_frame(
         "cx": float(K[0, 2]) + 0.5,
         "cy": float(K[1, 2]) + 0.5,
         **{name: float(x) for name, x in zip(_LENS_NAMES, lens, strict=False)},
+        **({"timestamp": float(time)} if math.isfinite(time) else {}),
         "transform_matrix": (np.asarray(T_world_from_cam, np.float64) @ _GL_FROM_CV).tolist(),
     }
 

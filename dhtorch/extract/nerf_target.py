@@ -64,6 +64,10 @@ class NerfstudioTarget:
         assert written is not None  # just written
         return written
 
+    def planned_files(self, missing: Sequence[int]) -> list[Path]:
+        """As :meth:`DatasetTarget.planned_files`."""
+        return [self._file(k, key) for k in missing for key in self.views]
+
     def finish(self, owns: Sequence[Row]) -> None:
         """As :meth:`DatasetTarget.finish`: nothing to write, the folders are independent."""
 
@@ -78,4 +82,4 @@ def _write_shot(folder: Path, row: Row, view: DatasetCamera) -> Row:
         storage.replace_file(folder / name / f"{stem}.png", content)
     K, pose = np.reshape(row["K"], (3, 3)), np.reshape(row["pose"], (4, 4))
     numbers = {f"dhtorch_{key}": np.asarray(row[key]).tolist() for key in NUMBER_COLUMNS}
-    return {**nerfstudio.make_nerfstudio_frame(stem, view.hw, K, pose, view.lens), **numbers}
+    return {**nerfstudio.make_nerfstudio_frame(stem, view.hw, K, pose, view.lens, row["timestamp"]), **numbers}

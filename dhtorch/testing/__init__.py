@@ -27,6 +27,7 @@ from dhtorch.testing.layouts import (
     write_tum,
 )
 from dhtorch.testing.lerobot import write_lerobot
+from dhtorch.testing.posed_images import write_nerfstudio, write_polycam
 from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
 from dhtorch.testing.rh20t import write_rh20t
 from dhtorch.testing.rlds import write_rlds
@@ -44,8 +45,10 @@ __all__ = [
     "write_icl_nuim",
     "write_lerobot",
     "write_named_frames",
+    "write_nerfstudio",
     "write_npz_pair",
     "write_open3d",
+    "write_polycam",
     "write_r3d",
     "write_record3d_exr",
     "write_record3d_mp4",

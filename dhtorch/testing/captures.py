@@ -12,6 +12,7 @@ from dhtorch.testing import image_folders, layouts
 from dhtorch.testing.arkitscenes import write_arkitscenes
 from dhtorch.testing.ca1m import write_ca1m
 from dhtorch.testing.lerobot import write_lerobot
+from dhtorch.testing.posed_images import write_nerfstudio, write_polycam
 from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
 from dhtorch.testing.rlds import write_rlds
 from dhtorch.testing.stray import write_stray
@@ -55,6 +56,15 @@ CAPTURE_WRITERS: Final[dict[str, CaptureWriter]] = {
     "sens_folder": CaptureWriter(image_folders.write_sens_folder, "sens_folder", 1 / 1000, is_exact=False),
     "open3d": CaptureWriter(image_folders.write_open3d, "open3d", 1 / 1000, states_unit=False),
     "sun3d": CaptureWriter(image_folders.write_sun3d, "sun3d", 1 / 1000),
+    "nerfstudio": CaptureWriter(write_nerfstudio, "nerfstudio", 1 / 1000),
+    "nerfcapture": CaptureWriter(
+        lambda root, frames: write_nerfstudio(
+            root, frames, unit_key="integer_depth_scale", unit_m=10 / 65535, depth_key="depth_path", suffix=""
+        ),
+        "nerfstudio",
+        10 / 65535,
+    ),
+    "polycam": CaptureWriter(write_polycam, "polycam", 1 / 1000),
     "stray": CaptureWriter(write_stray, "stray", 1 / 1000, is_exact=False, wants_even_sides=True),
     "r3d": CaptureWriter(
         lambda root, frames: write_r3d(root / "capture.r3d", frames), "record3d", path="capture.r3d", is_exact=False

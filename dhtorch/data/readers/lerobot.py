@@ -41,7 +41,13 @@ from dhtorch.data.readers.lerobot_meta import (
     read_lerobot_meta,
     select_colour_keys,
 )
-from dhtorch.data.readers.lerobot_rows import read_encoded_image, read_row_table, select_episode_rows
+from dhtorch.data.readers.lerobot_rows import (
+    find_capture_columns,
+    read_capture_clock,
+    read_encoded_image,
+    read_row_table,
+    select_episode_rows,
+)
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.records import Camera, Frame
 
@@ -92,8 +98,10 @@ def read(
         tolerance: s, largest distance of a video frame from its row's time.
 
     Returns:
-        Recordings named ``<data set>/episode_<number>/<camera>``, times from the start of the episode. Rows that are
-        missing or out of order are left out and reported. A table is read when one of its episodes is accessed.
+        Recordings named ``<data set>/episode_<number>/<camera>``, times from the start of the episode, or numbers and
+        times of the capture that ``dhtorch enrich`` wrote the set from (``observation.frame_number`` and ``.time``).
+        Rows that are missing or out of order are left out and reported. A table is read when one of its episodes is
+        accessed.
 
     Raises:
         FormatError: an unknown key or episode, or damaged metadata; on access to an episode also no K, a damaged
@@ -125,7 +133,7 @@ def read(
         )
         for key in keys
     ]
-    columns = sorted({c for rig in rigs for c in (rig.K_key, rig.pose_key) if c})
+    columns = sorted({c for rig in rigs for c in (rig.K_key, rig.pose_key) if c} | {*find_capture_columns(meta)})
     names = [rig.name(number) for number in episodes.numbers for rig in rigs]
     return Recordings(names, _MakeRecording(episodes, tuple(rigs), tuple(columns)))
 
@@ -282,6 +290,7 @@ class _CameraSpec:
             span=self.span,
             tolerance=self.tolerance,
         )
+        numbers, times = read_capture_clock(meta, table, rows, numbers, times)
         return Recording(
             name=self.name(episode.number),
             format="lerobot",

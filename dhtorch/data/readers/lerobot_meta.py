@@ -221,17 +221,6 @@ def select_colour_keys(meta: LeRobotMeta, requested: str | Sequence[str] | None 
     return keys
 
 
-def resolve_inside(root: Path, name: str, file: Path, field: str) -> Path:
-    """The path ``root / name``, checked to lie below ``root``.
-
-    Raises:
-        FormatError: an absolute name, or one with ``..``.
-    """
-    if not name or "\x00" in name or len(name) > 1000 or Path(name).is_absolute() or ".." in Path(name).parts:
-        raise FormatError(file, field, name, "a file inside the data set")
-    return root / name
-
-
 def _fill_path_template(meta: LeRobotMeta, key: str, values: dict[str, Any]) -> Path:
     """A path template with its fields filled in; ``str.format`` would also access attributes and pad to any width."""
     file, template = meta.root / "meta" / "info.json", getattr(meta, key)
@@ -245,7 +234,7 @@ def _fill_path_template(meta: LeRobotMeta, key: str, values: dict[str, Any]) -> 
     name = re.sub(r"\{(\w{1,40})(?::0(\d)d)?\}", fill, template[:500])
     if "{" in name or "}" in name:
         raise FormatError(file, key, template, "a path with fields such as {file_index:03d}")
-    return resolve_inside(meta.root, name, file, key)
+    return files.resolve_inside(meta.root, name, file, key)
 
 
 def _parse_feature(key: str, value: Any, file: Path) -> LeRobotFeature:

@@ -11,8 +11,11 @@ from dhtorch.data.codecs.parquet import read_cell, read_columns
 from dhtorch.data.io import decode as files
 from dhtorch.data.io import safe_open as doors
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.lerobot_meta import LeRobotEpisode, LeRobotMeta, resolve_inside
+from dhtorch.data.readers.lerobot_meta import LeRobotEpisode, LeRobotMeta
 from dhtorch.runtime.console import format_count
+
+#: Columns of ``dhtorch enrich``: frame number and time (s) in the capture that was enriched. Source: robot_target.
+_CAPTURE_COLUMNS = ("observation.frame_number", "observation.time")
 
 #: Largest difference in s between a float32 time stamp and the exact grid (frame number / fps) it was rounded from.
 _MAX_GRID_ERROR_S = 1e-4
@@ -78,6 +81,23 @@ def select_episode_rows(
     return rows, number.astype(np.int64), np.where(np.abs(grid - stamp) < _MAX_GRID_ERROR_S, grid, stamp), report
 
 
+def find_capture_columns(meta: LeRobotMeta) -> tuple[str, ...]:
+    """The columns in which ``dhtorch enrich`` keeps numbers and times of a capture; none in other data sets."""
+    return _CAPTURE_COLUMNS if {*_CAPTURE_COLUMNS} <= {*meta.features} else ()
+
+
+def read_capture_clock(
+    meta: LeRobotMeta, table: dict[str, np.ndarray], rows: np.ndarray, numbers: np.ndarray, times: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(numbers, times in s) of the capture from which ``dhtorch enrich`` wrote the rows, else those of the rows."""
+    if not find_capture_columns(meta):
+        return numbers, times
+    own_numbers, own_times = (table[name][rows].reshape(-1).astype(np.float64) for name in _CAPTURE_COLUMNS)
+    whole = np.isfinite(own_numbers).all() and (np.diff(own_numbers) > 0).all()
+    increasing = np.isfinite(own_times).all() and (np.diff(own_times) > 0).all()
+    return own_numbers.astype(np.int64) if whole else numbers, own_times if increasing else times
+
+
 def read_encoded_image(table: Path, root: Path, key: str, row: int) -> tuple[bytes, Path]:
     """Encoded image of a row and its file: bytes in the table, or the file that the table names.
 
@@ -92,7 +112,7 @@ def read_encoded_image(table: Path, root: Path, key: str, row: int) -> tuple[byt
         return data, table
     if not isinstance(path, str):
         raise FormatError(table, key, "neither bytes nor path", "an image")
-    file = resolve_inside(root, path, table, key)
+    file = files.resolve_inside(root, path, table, key)
     return files.read_bytes(file), file
 
 
