@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -255,7 +255,8 @@ def _diagnose_by_tracks(
         options=options,
     )
     hypotheses = {cause.name: cause for cause in window.hypotheses()}
-    losses = {name: window.loss(cause) for name, cause in hypotheses.items()}
+    base = window.sample_losses(NO_FAULT)
+    losses = {name: window.comparable_loss(cause, base) for name, cause in hypotheses.items()}
     diagnosis = select_cause(losses, options)._replace(pairs=watched.pairs)
     if diagnosis.cause is None or window.explains(hypotheses[diagnosis.cause]):
         return diagnosis
@@ -314,7 +315,7 @@ def _return_loss(
 ) -> Tensor:
     """Mean loss of a map (1, h, w) with a fault undone at near returns; NaN where too few have a value."""
     uv, returned = uv_and_depth
-    depth = _undo_fault(depth.to(returned), cause, frame.replace(depth_camera=None))
+    depth = undo_fault(depth.to(returned), cause, frame.replace(depth_camera=None))
     map_depth = _sample_map(depth, uv, frame.hw)
     map_depth = map_depth * _median_ratio(returned, map_depth) if cause.scaled else map_depth
     both = (returned > 0) & (map_depth > 0)
@@ -362,6 +363,23 @@ class WindowTracks(NamedTuple):
     pairs: Sequence[tuple[int, int]]
     samples: Sequence[Samples]
     tracks: Sequence[Tracks]
+
+
+@dataclass(frozen=True, eq=False)
+class SampleLosses:
+    """Losses of the samples of a window's pairs under one hypothesis."""
+
+    loss: Tensor  # (P, N) in [0, 1]
+    used: Tensor  # (P, N) bool: the sample has a depth and a track
+    defined: Tensor  # (P,) bool: the pair has a loss
+
+    def mean(self) -> Tensor:
+        """(P,) mean over the used samples; NaN where it is not defined or of too few samples."""
+        return torch.where(self.defined, _mean_loss(self.loss, self.used), torch.nan)
+
+    def replace(self, **fields: Tensor) -> SampleLosses:
+        """These losses with other fields."""
+        return replace(self, **fields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -416,7 +434,25 @@ class FaultWindow:
     def loss(
         self, cause: KnownFault, *, near: bool = False, sensor: bool = False, focal: float | None = None
     ) -> Tensor:
-        """(P,) loss with that fault undone; NaN where a pair has none.
+        """(P,) mean loss with that fault undone; NaN where a pair has none. Arguments as :meth:`sample_losses`."""
+        return self.sample_losses(cause, near=near, sensor=sensor, focal=focal).mean()
+
+    def comparable_loss(self, cause: KnownFault, base: SampleLosses) -> Tensor:
+        """(P,) loss with that fault undone, comparable with the loss ``base`` without a fault; NaN without one.
+
+        A fault that is undone may leave depth at some of the samples only, and some samples are easier than others: the
+        difference is taken over the samples with depth under both hypotheses, and added to the mean of ``base``.
+        """
+        if cause == NO_FAULT:
+            return base.mean()
+        losses = self.sample_losses(cause)
+        both = base.used & losses.used
+        return base.mean() + losses.replace(used=both).mean() - base.replace(used=both).mean()
+
+    def sample_losses(
+        self, cause: KnownFault, *, near: bool = False, sensor: bool = False, focal: float | None = None
+    ) -> SampleLosses:
+        """Losses (P, N) of the samples with that fault undone.
 
         Args:
             cause: the fault that is undone.
@@ -432,22 +468,23 @@ class FaultWindow:
         is_sensor_map = self.maps is None
         returns = self.references.depth
         if is_sensor_map:
-            returns = _undo_fault(torch.cat([self.depths[i] for i in frame_index]), cause, views[0])
+            returns = undo_fault(torch.cat([self.depths[i] for i in frame_index]), cause, views[0])
         view = views[0].replace(depth=returns)
         samples = self.method.backproject(view, self.samples.uv).replace(trackability=self.samples.trackability)
         returned = torch.where(samples.usable, samples.depth, 0.0)
         depth = returned
         if self.maps is not None and not sensor:
             picture_view = views[0].replace(depth_camera=None)
-            depth = _undo_fault(torch.cat([self.maps[i] for i in frame_index]).to(returned), cause, picture_view)
+            depth = undo_fault(torch.cat([self.maps[i] for i in frame_index]).to(returned), cause, picture_view)
             depth = _sample_map(depth, self.samples.uv, view.hw)
             depth = depth * _median_ratio(returned, depth) if cause.scaled else depth
             depth = torch.where(samples.usable, depth, 0.0) if near else depth
-        loss = self._loss_under_fitted_motion(samples, depth, views)
-        trajectory_loss = self._loss_under_trajectory(depth, views)
-        if trajectory_loss is not None:
-            loss = 0.5 * (torch.where(loss.isfinite(), loss, 1.0) + trajectory_loss)
-        return torch.where(in_window, loss, torch.nan)
+        losses = self._losses_under_fitted_motion(samples, depth, views)
+        trajectory = self._losses_under_trajectory(depth, views)
+        if trajectory is not None:
+            fitted = torch.where(losses.used & losses.defined[:, None], losses.loss, 1.0)
+            losses = trajectory.replace(loss=0.5 * (fitted + trajectory.loss))
+        return losses.replace(defined=losses.defined & in_window)
 
     @staticmethod
     def _scaled(frame: Frame, factor: float) -> Frame:
@@ -458,29 +495,30 @@ class FaultWindow:
             depth_camera = depth_camera.replace(f=depth_camera.f * factor)
         return frame.replace(camera=camera, depth_camera=depth_camera)
 
-    def _loss_under_fitted_motion(self, samples: Samples, depth: Tensor, views: tuple[Frame, Frame]) -> Tensor:
-        """Loss (P,) under motions fitted to near returns; without a motion 1 for the sensor's own depth, else NaN."""
+    def _losses_under_fitted_motion(self, samples: Samples, depth: Tensor, views: tuple[Frame, Frame]) -> SampleLosses:
+        """Losses under motions fitted to near returns; without a motion 1 for the sensor's own depth, else none."""
         cameras = views[0].camera, views[1].camera
         _, usable, fit = solve_pose_and_triangulate(
             self.method, samples, self.tracks, *cameras, seed=self.seed, fit=None, clock=StageTimer(None)
         )
         is_static = fit.t_snr < 3
-        loss = self._reprojection_loss(depth, usable, fit.T_1_from_0, cameras)
-        failed_loss = 1.0 if self.maps is None else torch.nan
-        return torch.where(fit.ok & ~(is_static & (self.maps is not None)), loss, failed_loss)
+        losses = self._reprojection_losses(depth, usable, fit.T_1_from_0, cameras)
+        if self.maps is None:
+            return losses.replace(loss=torch.where(fit.ok[:, None], losses.loss, 1.0))
+        return losses.replace(defined=fit.ok & ~is_static)
 
-    def _loss_under_trajectory(self, depth: Tensor, views: tuple[Frame, Frame]) -> Tensor | None:
-        """Loss (P,) under the motions of the frames' own poses; None where they have none."""
+    def _losses_under_trajectory(self, depth: Tensor, views: tuple[Frame, Frame]) -> SampleLosses | None:
+        """Losses under the motions of the frames' own poses; None where they have none."""
         a, b = views[0].T_world_from_cam, views[1].T_world_from_cam
         if a is None or b is None:
             return None
         T = se3.relative(a, b).map(lambda x: x.to(depth))
-        return self._reprojection_loss(depth, self.tracks, T, (views[0].camera, views[1].camera))
+        return self._reprojection_losses(depth, self.tracks, T, (views[0].camera, views[1].camera))
 
-    def _reprojection_loss(
+    def _reprojection_losses(
         self, depth: Tensor, tracks: Tracks, T: Pose, cameras: tuple[cam.Camera, cam.Camera]
-    ) -> Tensor:
-        """Mean loss (P,) of the samples that have a depth and a track."""
+    ) -> SampleLosses:
+        """Losses of the samples that have a depth and a track."""
         xyz = cam.unproject(cameras[0], self.samples.uv, depth)
         used = tracks.valid & (depth > 0) & xyz.isfinite().all(-1)
         xyz_1 = se3.apply(T, torch.where(used[..., None], xyz, 1.0))
@@ -488,7 +526,7 @@ class FaultWindow:
         uv = cam.project(cameras[1], torch.where(in_front[..., None], xyz_1, 1.0))
         miss = (uv - self.tracks.uv_1).norm(dim=-1) * (640 / self.references.hw[1])
         loss = torch.where(in_front, miss.square() / (miss.square() + self.options.half_loss_px**2), 1.0)
-        return _mean_loss(loss, used)
+        return SampleLosses(loss, used, torch.ones_like(used[:, 0]))
 
 
 def _mean_loss(loss: Tensor, used: Tensor) -> Tensor:
@@ -498,7 +536,7 @@ def _mean_loss(loss: Tensor, used: Tensor) -> Tensor:
     return torch.where(n >= 12, mean, torch.nan)
 
 
-def _undo_fault(depth: Tensor, cause: KnownFault, view: Frame) -> Tensor:
+def undo_fault(depth: Tensor, cause: KnownFault, view: Frame) -> Tensor:
     """Maps (P, h, w) with a fault undone, over the field of view of the pictures or of a depth camera."""
     depth = cause.undo(depth)
     if not cause.ray:

@@ -1,0 +1,275 @@
+"""Check of a capture before it is used: unit, poses, orientation, time and registration of its depth.
+
+A capture's files may mean something else than its reader assumes. One window of its frames is examined: values of
+depth for their unit, tracks against near returns for faults that all frames share (:mod:`dhtorch.validation.faults`),
+surfaces seen from two frames for the stated poses (:mod:`dhtorch.validation.pose_check`). Each finding has a cause, a
+sentence and the option that mends it. Refuted poses are removed from the recording, so that no command uses them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import torch
+
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.plausibility import plausibility_findings
+from dhtorch.data.recording import Recording
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import se3
+from dhtorch.records import Frame, Pose
+from dhtorch.runtime.console import format_count
+from dhtorch.validation import faults
+from dhtorch.validation.faults import Diagnosis, KnownFault, WindowTracks
+from dhtorch.validation.pose_check import PoseCheck, check_poses, describe_contradiction, describe_factor
+
+#: Frames of the window that is examined: pairs of up to 8 frames apart, and maps up to 5 frames late.
+#: Source: derived, the largest gap and twice the largest lag of dhtorch.validation.faults.
+WINDOW_FRAMES: Final = 20
+
+#: Kinds of faults for which the depth is turned or moved in time: the option that mends them, by name.
+_TURN_OPTIONS: Final = {
+    "mirrored left to right": "left_right",
+    "mirrored upside down": "upside_down",
+    "rolled by 90 degrees": "270",
+    "rolled by 180 degrees": "180",
+    "rolled by 270 degrees": "90",
+}
+
+#: Epipolar distances at which pictures are said to follow one of two sets of poses: the smaller median is at most this
+#: fraction of the larger one. Source: origin not recorded.
+_MAX_EPIPOLAR_RATIO: Final = 0.7
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that a capture's files mean otherwise than assumed, or that contradict each other."""
+
+    cause: str  # unit | poses | mirrored | rolled | registration | along the ray | time offset | scale | plausibility
+    text: str
+    remedy: str = ""  # option that mends it, empty where none does
+
+    def __str__(self) -> str:
+        return f"{self.text}; {self.remedy} reads it so" if self.remedy else self.text
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureCheck:
+    """Findings on one recording, and the recording as it can be used."""
+
+    recording: Recording  # without poses where they are refuted
+    notes: tuple[str, ...] = ()  # what was assumed, left out or guessed
+    findings: tuple[Finding, ...] = ()
+    poses: PoseCheck | None = None
+    diagnosis: Diagnosis | None = None
+
+    @property
+    def poses_refuted(self) -> bool:
+        """Whether the stated poses contradict the depth and are not used."""
+        return any(finding.cause == "poses" for finding in self.findings)
+
+    @property
+    def lines(self) -> list[str]:
+        """Notes and findings as text, each a line."""
+        return [*self.notes, *map(str, self.findings)]
+
+    def record(self) -> dict[str, object]:
+        """Notes and findings for a JSON file."""
+        findings = [{"cause": each.cause, "text": each.text, "remedy": each.remedy} for each in self.findings]
+        return {"notes": list(self.notes), "findings": findings, "poses_refuted": self.poses_refuted}
+
+
+def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = None, *, seed: int = 0) -> CaptureCheck:
+    """A recording -> findings on unit, poses, orientation, time and registration of its depth.
+
+    Args:
+        recording: of any format; unreadable frames are left out.
+        frames: frames of it that are decoded already, by position.
+        seed: of the pose search.
+
+    Gradient: none.
+    Cost: decodes up to :data:`WINDOW_FRAMES` frames and tracks eight pairs of them, about a second.
+    """
+    notes = _assumptions(recording)
+    window = _read_window(recording, frames or {})
+    depths = [frame.depth[0] for frame in window.values() if bool((frame.depth > 0).any())]
+    findings = [
+        Finding("plausibility", each.text, each.remedy)
+        for each in plausibility_findings(depths, recording.depth_unit, recording.sparse)
+    ]
+    if len(depths) < 2 or recording.sparse:
+        return CaptureCheck(recording, notes, tuple(findings))
+    views = {i: frame.replace(T_world_from_cam=None) for i, frame in window.items() if 0 not in frame.hw}
+    tracks, diagnosis = _diagnose_window(list(views.values()), seed)
+    positions = list(views)
+    pairs = [(positions[i], positions[j]) for i, j in tracks.pairs] or _neighbouring_pairs(list(window))
+    poses = None if recording.poses is None else check_poses(recording.poses, window, pairs)
+    shared_fault = _fault_of(diagnosis)
+    findings += _judge(recording, poses, shared_fault, window, pairs, tracks)
+    check = CaptureCheck(recording, notes, tuple(findings), poses, diagnosis)
+    return replace(check, recording=replace(recording, poses=None)) if check.poses_refuted else check
+
+
+def _assumptions(recording: Recording) -> tuple[str, ...]:
+    """What the reader assumed, left out or guessed, as lines."""
+    unit = recording.depth_unit
+    assumed = (f"{unit} (data.depth_unit= sets it)",) if unit is not None and unit.is_assumed else ()
+    return (*assumed, *recording.report)
+
+
+def _read_window(recording: Recording, known: Mapping[int, Frame]) -> dict[int, Frame]:
+    """Up to :data:`WINDOW_FRAMES` consecutive readable frames where the camera moves most, by position."""
+    n = len(recording)
+    first = _first_of_window(recording)
+    window: dict[int, Frame] = {}
+    for i in range(first, min(first + WINDOW_FRAMES, n)):
+        try:
+            window[i] = known[i] if i in known else recording[i]
+        except FormatError:
+            continue
+    return window
+
+
+def _first_of_window(recording: Recording) -> int:
+    """First frame of the window with the longest path; of the middle one without poses."""
+    last = max(len(recording) - WINDOW_FRAMES, 0)
+    if recording.poses is None or last == 0:
+        return last // 2
+    step = recording.poses.t.diff(dim=0).norm(dim=-1).nan_to_num(0.0)
+    # Steps far above the others are jumps of the tracking, not motion.
+    step = step.clamp(max=4 * float(step.median()))
+    total = torch.cat((torch.zeros(1, dtype=step.dtype), step.cumsum(0)))
+    length = total[WINDOW_FRAMES - 1 :] - total[: len(total) - WINDOW_FRAMES + 1]
+    return int(length[: last + 1].argmax())
+
+
+def _neighbouring_pairs(positions: Sequence[int]) -> list[tuple[int, int]]:
+    """Pairs of neighbouring frames, where pictures give no tracks."""
+    return list(itertools.pairwise(positions))[:8]
+
+
+def _diagnose_window(frames: Sequence[Frame], seed: int) -> tuple[WindowTracks, Diagnosis | None]:
+    """Tracks between pairs of a window, and the fault that its depth shares; none where a picture is missing."""
+    hws = {(frame.hw, tuple(frame.depth.shape)) for frame in frames}
+    if len(frames) < 2 or len(hws) != 1:
+        return WindowTracks([], [], []), None
+    tracks = faults.track_window(frames)
+    if not tracks.pairs:
+        return tracks, None
+    return tracks, faults.diagnose(frames, seed=seed, watched=tracks)
+
+
+def _fault_of(diagnosis: Diagnosis | None) -> KnownFault | None:
+    """The fault of a diagnosis; None without one."""
+    if diagnosis is None or diagnosis.cause is None:
+        return None
+    return next(each for each in faults.KNOWN_FAULTS if each.name == diagnosis.cause)
+
+
+# ----------------------------------------------------------------------------------------------------------- findings
+
+
+def _judge(
+    recording: Recording,
+    poses: PoseCheck | None,
+    fault: KnownFault | None,
+    window: Mapping[int, Frame],
+    pairs: Sequence[tuple[int, int]],
+    tracks: WindowTracks,
+) -> list[Finding]:
+    """Findings from the two checks: the fault of depth beside its pictures, and the poses beside the depth."""
+    if poses is None or not poses.contradicts:
+        findings = [] if fault is None else [_fault_finding(fault, agrees_with_poses=poses is not None)]
+        if poses is not None and poses.factor != 1:
+            findings.append(Finding("scale", describe_factor(poses)))
+        return findings
+    if fault is not None:
+        mended = check_poses(_poses_of(recording), _undo(fault, window), _inside(fault, pairs, window))
+        if mended is not None and not mended.contradicts:
+            return [_fault_finding(fault, agrees_with_poses=False)]
+    text, remedy = describe_contradiction(poses, recording.depth_unit)
+    lag = poses.best.lag if poses.is_explained else 0
+    if lag and _pictures_follow(_poses_of(recording), lag, window, pairs, tracks):
+        return [Finding("time offset", _lag_text(-lag), f"data.depth_lag={-lag}")]
+    findings = [Finding("poses", f"{text}; they are not used", remedy)]
+    return findings if fault is None or lag else [*findings, _fault_finding(fault, agrees_with_poses=False)]
+
+
+def _poses_of(recording: Recording) -> Pose:
+    assert recording.poses is not None
+    return recording.poses
+
+
+def _fault_finding(fault: KnownFault, *, agrees_with_poses: bool) -> Finding:
+    """Sentence and option for a fault of the depth beside its pictures."""
+    seen = "as tracks and near returns show"
+    if fault.kind == "time offset":
+        if agrees_with_poses:
+            late = "early" if fault.lag > 0 else "late"
+            frames = format_count(abs(fault.lag), "frame")
+            return Finding(fault.kind, f"the pictures are {frames} {late} against depth and poses, {seen}")
+        return Finding(fault.kind, _lag_text(fault.lag), f"data.depth_lag={fault.lag}")
+    if fault.kind in ("mirrored", "rolled"):
+        which = "the pictures (depth agrees with the poses)" if agrees_with_poses else "depth"
+        text = f"depth and pictures differ in orientation: {which} {_verb(which)} {fault.name}, {seen}"
+        return Finding(fault.kind, text, f"data.depth_turn={_TURN_OPTIONS[fault.name]}")
+    if fault.kind == "registration":
+        return Finding(fault.kind, f"depth does not lie over its pictures ({fault.name}), {seen}", "data.K_depth=")
+    return Finding(fault.kind, f"depth is wrong: {fault.name}, {seen}")
+
+
+def _verb(subject: str) -> str:
+    return "are" if subject.startswith("the pictures") else "is"
+
+
+def _lag_text(lag: int) -> str:
+    late = "late" if lag > 0 else "early"
+    return f"depth is {format_count(abs(lag), 'frame')} {late} against pictures and poses"
+
+
+def _undo(fault: KnownFault, window: Mapping[int, Frame]) -> dict[int, Frame]:
+    """Frames of a window with a fault of their depth undone."""
+    undone: dict[int, Frame] = {}
+    for i, frame in window.items():
+        source = window.get(i + fault.lag)
+        if source is not None:
+            undone[i] = frame.replace(depth=faults.undo_fault(source.depth, fault, frame))
+    return undone
+
+
+def _inside(
+    fault: KnownFault, pairs: Sequence[tuple[int, int]], window: Mapping[int, Frame]
+) -> Sequence[tuple[int, int]]:
+    return [(i, j) for i, j in pairs if i + fault.lag in window and j + fault.lag in window]
+
+
+# ---------------------------------------------------------------------------------------------- pictures beside poses
+
+
+def _pictures_follow(
+    poses: Pose, lag: int, window: Mapping[int, Frame], pairs: Sequence[tuple[int, int]], tracks: WindowTracks
+) -> bool:
+    """Whether tracks fit the stated poses clearly better than the poses ``lag`` frames later: then the depth is off."""
+    if not tracks.pairs:
+        return False
+    stated, shifted = (_epipolar_distance(poses, by, window, pairs, tracks) for by in (0, lag))
+    return stated <= _MAX_EPIPOLAR_RATIO * shifted
+
+
+def _epipolar_distance(
+    poses: Pose, by: int, window: Mapping[int, Frame], pairs: Sequence[tuple[int, int]], tracks: WindowTracks
+) -> float:
+    """Median angle of tracks from their epipolar planes under the poses ``by`` frames later, rad; NaN without any."""
+    angles = []
+    for (i, j), samples, track in zip(pairs, tracks.samples, tracks.tracks, strict=True):
+        if min(i, j) + by < 0 or max(i, j) + by >= len(poses.t):
+            continue
+        T = se3.relative(*(poses[k + by : k + by + 1].map(lambda x: x.double()) for k in (i, j)))
+        rays = (cam.rays(window[i].camera, samples.uv).double(), cam.rays(window[j].camera, track.uv_1).double())
+        normal = torch.linalg.cross(T.t[:, None].expand_as(rays[0]), se3.rotate(T.R, rays[0]))
+        sine = (normal * rays[1]).sum(-1).abs() / (normal.norm(dim=-1) * rays[1].norm(dim=-1)).clamp_min(1e-12)
+        angles.append(sine[track.valid])
+    return float(torch.cat(angles).median()) if angles else float("nan")
