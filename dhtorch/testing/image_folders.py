@@ -164,11 +164,14 @@ def write_sun3d(root: Path, frames: Sequence[Frame]) -> None:
     save_file(root / "extrinsics" / "20130512130736.txt", poses)
 
 
-def write_icl_nuim(root: Path, frames: Sequence[Frame], *, trajectory: str = "livingRoom0.gt.freiburg") -> None:
+def write_icl_nuim(
+    root: Path, frames: Sequence[Frame], *, trajectory: str = "livingRoom0.gt.freiburg", calibration: bool = True
+) -> None:
     """Write ICL-NUIM's TUM-compatible PNGs: ``rgb/0.png``, ``depth/0.png``, ``associations.txt``, ``*.gt.freiburg``.
 
     Depth stands in the first column of ``associations.txt``. The trajectory has a camera with y up and a world that is
-    mirrored like it (POV-Ray), for the published K with a negative fy; the images are upright.
+    mirrored like it (POV-Ray), for a K with a negative fy; the images are upright. ``calibration``: write that K to
+    ``calibration.txt``; the published sets have no file with K.
     """
     rows, poses = [], []
     for i, frame in enumerate(frames):
@@ -179,6 +182,9 @@ def write_icl_nuim(root: Path, frames: Sequence[Frame], *, trajectory: str = "li
         pose = _FLIP_Y @ pose_matrix(frame) @ _FLIP_Y
         poses.append(f"{i} " + format_row([*pose[:3, 3], *rotation_to_xyzw(pose[:3, :3])]))
     save_file(root / "associations.txt", "\n".join(rows) + "\n")
+    if calibration:
+        K = K_matrix(frames[0].camera)
+        save_file(root / "calibration.txt", format_row([K[0, 0], -K[1, 1], K[0, 2], K[1, 2]]) + "\n")
     save_file(root / trajectory, "\n".join(poses) + "\n")
 
 

@@ -38,13 +38,12 @@ def test_a_validation_twin_has_no_poses_and_other_files_are_passed_over(tmp_path
     assert float(recording[0].camera.f[0, 0]) == pytest.approx(535.4)
 
 
-def test_every_code_but_zero_is_a_depth(tmp_path: Path) -> None:
-    """65535, elsewhere a mark for no return, is 13.1 m here."""
+def test_the_largest_code_is_no_depth(tmp_path: Path) -> None:
     writers.write_tum(tmp_path, walk(1))
     codes = np.tile(np.array([0, 1, 5000, 65535], np.uint16), (HW[0], HW[1] // 4))
     next((tmp_path / "depth").iterdir()).write_bytes(parts.encode_unfiltered_png(codes))
     depth = data.open(tmp_path)[0].depth[0]
-    assert depth[0, :4].tolist() == pytest.approx([0, 0.0002, 1, 13.107])
+    assert depth[0, :4].tolist() == pytest.approx([0, 0.0002, 1, 0])
     assert data.open(tmp_path, units_per_metre=5208)[0].depth[0, 0, 2] == pytest.approx(5000 / 5208)
 
 
@@ -143,13 +142,13 @@ def test_bad_tum(tmp_path: Path) -> None:
     (tmp_path / "groundtruth.txt").write_text("# freiburg1\n1 2 3\n")
     fails(r"groundtruth.txt: line 2: found 3 columns, expected 8 numbers", tmp_path)
     (tmp_path / "groundtruth.txt").unlink()
-    fails(r"K: found no intrinsics, expected data.fov=69 .*data.camera=1, 2 or 3 \(freiburg\)", tmp_path)
+    fails(r"K: found no intrinsics, expected data.fov=69 .*data.camera=1, 2, 3 \(freiburg\) or icl", tmp_path)
     with pytest.warns(UserWarning, match="intrinsics are a guess from a field of view of 90°"):
         (guess,) = data.open_all(tmp_path, fov=90)
     assert float(guess[0].camera.f[0, 0]) == pytest.approx(guess[0].hw[1] / 2) and "are a guess" in guess.report[-1]
     assert data.open(tmp_path, intrinsics=[40, 41, 30, 20])[0].camera.f.tolist() == [[40, 41]]
     assert data.open(tmp_path, camera=2).poses is None
-    fails(r"option camera: found 4, expected 1, 2 or 3", tmp_path, camera=4)
+    fails(r"option camera: found 4, expected 1, 2, 3 or icl", tmp_path, camera=4)
     fails(r"option intrinsics: found default, expected camera or ros", tmp_path, intrinsics="default")
     restore()
     (tmp_path / "rgb.txt").write_text(good["rgb.txt"].replace("rgb/", "../rgb/"))

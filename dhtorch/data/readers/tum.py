@@ -1,15 +1,22 @@
-"""Reader of TUM RGB-D sequences: colour, depth and a motion-capture trajectory, each with its own time stamps.
+"""Reader of TUM RGB-D sequences and their variants: colour, depth and a trajectory, each with its own time stamps.
 
-``rgb/<stamp>.png``, ``depth/<stamp>.png`` (16 bits, 5000 = 1 m, already registered to colour), listed with their stamps
-in ``rgb.txt`` and ``depth.txt`` (or ``associations.txt``, or by the file names alone), and ``groundtruth.txt`` with
+``rgb/<stamp>.png``, ``depth/<stamp>.png`` (16 bits, already registered to colour), listed with their stamps in
+``rgb.txt`` and ``depth.txt`` (or ``associations.txt``, or by the file names alone), and ``groundtruth.txt`` with
 ``stamp tx ty tz qx qy qz qw``, the pose of the colour camera in the capture hall.
+
+- *TUM*: 5000 codes are 1 m; K is the published one of the camera that the folder's name or the trajectory names.
+- *ICL-NUIM*: numbers in place of stamps, depth in the first columns of ``associations.txt``, ``*.gt.freiburg`` as
+  trajectory. 5000 codes are 1 m. The published K has a negative fy, since the renderer's y axes point up; the images
+  are upright. fy is read as positive, and the poses, of camera and world with y up, are mirrored to y down.
+- *Recorders for ROS*, ETH3D's SLAM benchmark: ``calibration.txt`` holds fx fy cx cy. Nothing states the unit of depth:
+  1/5000 m is assumed.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +26,10 @@ from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import image_table
 from dhtorch.data.recording import Recording
-from dhtorch.records import Camera, Frame
+from dhtorch.data.units import DepthUnit
+from dhtorch.records import Camera
 
 #: Published calibration of the three colour cameras at 640×480: fx fy cx cy, then k1 k2 p1 p2 k3.
 _CAMERA_CALIBRATIONS = {
@@ -32,18 +41,43 @@ _ROS_INTRINSICS = (525.0, 525.0, 319.5, 239.5)
 _IMAGE_HW = (480, 640)
 _RATE_HZ = 30.0
 
+#: K of ICL-NUIM at 640×480, fx fy cx cy; published with a negative fy. Source: the data set's page.
+_ICL_INTRINSICS = (481.2, 480.0, 319.5, 239.5)
+
+#: Depth codes of one metre. Source: format definition of TUM RGB-D and ICL-NUIM.
+_UNITS_PER_METRE = 5000.0
+
+#: Stamps of digits alone are frame numbers below this limit; as seconds it is 11 days after 1970. Source: chosen.
+_MAX_FRAME_NUMBER = 1e6
+
+#: Files with fx fy cx cy, or a 3×3 matrix, and distortion.
+_CALIBRATION_FILES = ("calibration.txt", "K.txt", "camera-intrinsics.txt", "intrinsics.txt")
+
+#: Tables with the stamps and names of both images in each line.
+_JOINT_TABLES = ("associations.txt", "association.txt", "associated.txt", "associate.txt", "assoc.txt")
+
+#: Names of ICL-NUIM's sequences and of its trajectories.
+_ICL_NAME_PATTERN = re.compile(r"(living_?room|office_?room).*(traj|kt)\d|traj\d_frei_png", re.IGNORECASE)
+_ICL_TRAJECTORIES = "*.gt.freiburg"
+
+#: Reflection of the y axis, of camera and world: from y up to y down.
+_FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
+
+#: Files of the format that hold neither cameras nor poses of the camera.
+UNUSED_FILES = ("accelerometer.txt", *_JOINT_TABLES)
+
 #: Largest interval in s between two poses to interpolate in: across longer ones tracking was lost.
 _MAX_POSE_GAP_S = 0.05
 
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
-    has_listing = any((root / name).is_file() for name in ("rgb.txt", "associations.txt", "groundtruth.txt"))
     if not (root / "rgb").is_dir() or not (root / "depth").is_dir():
         return None
-    if has_listing or not any(file.stem.isdigit() for file in (root / "rgb").iterdir()):  # plain numbers are no stamps
-        return "rgb/ and depth/ folders of time-stamped images"
-    return None
+    has_listing = any((root / name).is_file() for name in ("rgb.txt", "groundtruth.txt", *_JOINT_TABLES))
+    if not (has_listing or _is_icl(root)) and any(file.stem.isdigit() for file in (root / "rgb").iterdir()):
+        return None  # plain numbers are no stamps
+    return "rgb/ and depth/ folders of time-stamped images"
 
 
 def read(
@@ -52,10 +86,10 @@ def read(
     intrinsics: intrinsics_options.IntrinsicsOption = "camera",
     K: Sequence[float] | None = None,
     fov: float | None = None,
-    camera: int | None = None,
+    camera: int | str | None = None,
     poses: bool = True,
     max_difference: float = 0.02,
-    units_per_metre: float = 5000.0,
+    units_per_metre: float | None = None,
 ) -> list[Recording]:
     """Open one sequence.
 
@@ -64,56 +98,76 @@ def read(
         intrinsics: ``"camera"`` = the published calibration of the camera that took it, with its distortion;
             ``"ros"`` = the driver's default used to register the depth (f = 525, no distortion); or four
             numbers as ``K``, or one as ``fov``.
-        K: fx, fy, cx, cy of the images, without distortion.
+        K: fx, fy, cx, cy of the images, without distortion. A negative fy is that of a camera with y up, as ICL-NUIM's.
         fov: horizontal field of view of the images in degrees, for a guessed K where none is available.
-        camera: 1, 2 or 3. None = the ``freiburgN`` (``frN``) in the folder's name or in the trajectory's header;
-            failing both, ``K`` and ``dist`` of a side-car ``meta.json``.
+        camera: 1, 2, 3 or icl. None = ``calibration.txt``; failing this, the ``freiburgN`` (``frN``) in the folder's
+            name or in the trajectory's header, or ICL-NUIM's names; failing all, ``K`` and ``dist`` of a side-car
+            ``meta.json``.
         poses: read the trajectory; frames that it does not cover are left out. False keeps every RGB-D frame.
         max_difference: s, largest time difference of associated images, depth maps and poses.
-        units_per_metre: of the depth codes: 5000 as documented. ORB-SLAM2 uses 5208 for camera 2, and factors for each
+        units_per_metre: of the depth codes. None = ``depth_scale`` of ``meta.json``, else 5000, as TUM and ICL-NUIM
+            document; of other sequences this is an assumption. ORB-SLAM2 uses 5208 for camera 2, and factors for each
             camera are quoted elsewhere (unconfirmed, or already applied in the files).
 
     Returns:
         One recording at the stamps of the colour images. Poses are interpolated between the two neighbouring ones
         where these are less than 0.05 s apart, else the nearest one within ``max_difference`` is used. Images without
-        depth or pose are left out and reported.
+        depth or pose are left out and reported. Where numbers stand in place of stamps, images, depth maps and poses of
+        one number belong together.
 
     Raises:
         FormatError: no image, nothing associates, an unknown camera, or a damaged file.
     """
     root = Path(root)
-    colour, depth = _read_listing(root, "rgb"), _read_listing(root, "depth")
+    (colour, is_numbered), (depth, _) = _read_listing(root, "rgb"), _read_listing(root, "depth")
     pairs = associate([t for t, _ in colour], [t for t, _ in depth], max_difference)
     if not pairs:
         problem = f"{len(colour)} images and {len(depth)} depth maps, none within {max_difference} s of one another"
         raise FormatError(root, "time stamps", problem, "pairs")
-    report = _format_unmatched(len(colour) - len(pairs), "images", "depth map", max_difference)
-    trajectory = root / "groundtruth.txt"
-    c2w = None
-    if poses and trajectory.is_file():
-        c2w, covered = _interpolate_trajectory(trajectory, np.array([colour[i][0] for i, _ in pairs]), max_difference)
-        report += _format_unmatched(int((~covered).sum()), "RGB-D frames", "pose", max_difference)
-        pairs = [pair for pair, keep in zip(pairs, covered, strict=True) if keep]
+    times = np.array([colour[i][0] for i, _ in pairs])
+    report = _format_unmatched(len(colour) - len(pairs), "images", "depth map", max_difference, is_numbered)
     hw = files.read_image_header(colour[pairs[0][0]][1]).hw
-    stated = intrinsics_options.parse_intrinsics(root, hw, None if isinstance(intrinsics, str) else intrinsics, K, fov)
-    load = _Load(
-        images=tuple(colour[i][1] for i, _ in pairs),
-        depths=tuple(depth[j][1] for _, j in pairs),
-        hw=hw,
-        camera=_make_camera(root, intrinsics, camera, hw, stated.K),
-        units_per_metre=files.to_positive(units_per_metre, root, "option units_per_metre"),
+    source = _find_camera(root, intrinsics, camera, hw, K, fov)
+    unit = _find_unit(root, units_per_metre, source)
+    trajectory = _find_trajectory(root)
+    c2w = None
+    if poses and trajectory is not None:
+        interpolate = _match_numbers if is_numbered else _interpolate_trajectory
+        c2w, covered = interpolate(trajectory, times, max_difference)
+        if is_numbered:
+            report += image_table.format_left_out(times[~covered].astype(int).tolist(), f"no pose in {trajectory.name}")
+        else:
+            report += _format_unmatched(int((~covered).sum()), "RGB-D frames", "pose", max_difference, is_numbered)
+        pairs = [pair for pair, keep in zip(pairs, covered, strict=True) if keep]
+        times = times[covered]
+        if source.is_y_up:
+            c2w = _FLIP_Y @ c2w @ _FLIP_Y
+    rows = tuple(
+        image_table.ImageRow(int(t) if is_numbered else i, colour[i][1], depth[j][1])
+        for (i, j), t in zip(pairs, times, strict=True)
     )
+    load = image_table.ImageTableLoader(
+        rows=rows,
+        hw=hw,
+        depth_hw=image_table.read_depth_hw(rows[0].depth),
+        camera=source.camera,
+        units_per_metre=1 / unit.metres,
+    )
+    if is_numbered and not source.is_icl:
+        report.append("images are numbered, not stamped: no times")
+    has_times = not is_numbered or source.is_icl
     return [
         Recording(
             name=root.resolve().name,
             format="tum",
             load=load,
-            number=torch.tensor([i for i, _ in pairs]),
+            number=torch.tensor([row.number for row in rows]),
             root=root,
-            times=torch.tensor([colour[i][0] for i, _ in pairs], dtype=torch.float64),
-            poses=None if c2w is None else convert.to_poses(c2w, trajectory),
-            rate_hz=_RATE_HZ,
-            report=(*report, *stated.report),
+            times=torch.tensor(times / _RATE_HZ if is_numbered else times, dtype=torch.float64) if has_times else None,
+            poses=None if c2w is None else convert.to_poses(c2w, trajectory or root),
+            rate_hz=_RATE_HZ if has_times else None,
+            report=(*report, *source.report),
+            depth_unit=unit,
         )
     ]
 
@@ -135,37 +189,25 @@ def associate(times_a: Sequence[float], times_b: Sequence[float], max_difference
     return sorted(pairs.items())
 
 
-@dataclass(frozen=True, eq=False)
-class _Load:
-    """Position → frame."""
-
-    images: tuple[Path, ...]
-    depths: tuple[Path, ...]
-    hw: tuple[int, int]
-    camera: Camera
-    units_per_metre: float
-
-    def __call__(self, i: int) -> Frame:
-        image = files.read_image(self.images[i], self.hw)
-        depth = files.read_depth_png(self.depths[i], self.units_per_metre, self.hw)
-        return Frame(torch.from_numpy(image)[None], torch.from_numpy(depth)[None], self.camera)
+def _format_unmatched(count: int, what: str, without: str, max_difference: float, is_numbered: bool) -> list[str]:
+    within = "of their number" if is_numbered else f"within {max_difference} s"
+    return [f"{count} {what} without a {without} {within}: left out"] if count else []
 
 
-def _format_unmatched(count: int, what: str, without: str, max_difference: float) -> list[str]:
-    return [f"{count} {what} without a {without} within {max_difference} s: left out"] if count else []
+def _read_listing(root: Path, kind: str) -> tuple[list[tuple[float, Path]], bool]:
+    """(stamp, file) of the images of ``kind`` ("rgb" or "depth"), sorted by stamp, and whether stamps are numbers.
 
-
-def _read_listing(root: Path, kind: str) -> list[tuple[float, Path]]:
-    """(stamp, file) of the images of ``kind`` ("rgb" or "depth"), sorted by time; of two with one stamp the first."""
-    table, joint = root / f"{kind}.txt", root / "associations.txt"
+    Of two images with one stamp the first is kept.
+    """
+    table = root / f"{kind}.txt"
+    joint = next((root / name for name in _JOINT_TABLES if (root / name).is_file()), None)
     if table.is_file():
         rows = [(table, line, words[:2]) for line, words in files.read_rows(table)]
-    elif joint.is_file():
-        column = 0 if kind == "rgb" else 2
-        rows = [(joint, line, words[column : column + 2]) for line, words in files.read_rows(joint)]
+    elif joint is not None:
+        rows = [(joint, line, _find_columns(words, kind)) for line, words in files.read_rows(joint)]
     else:
-        pictures = sorted((root / kind).glob("*.png")) if (root / kind).is_dir() else []
-        rows = [(root / kind, i, [file.stem, f"{kind}/{file.name}"]) for i, file in enumerate(pictures)]
+        pictures = image_table.list_images(root / kind)
+        rows = [(root / kind, i, [stem, f"{kind}/{pictures[stem].name}"]) for i, stem in enumerate(pictures)]
     by_stamp: dict[float, Path] = {}
     for file, line, words in rows:
         if len(words) != 2 or not re.fullmatch(r"\d+(\.\d*)?", words[0]):
@@ -176,16 +218,49 @@ def _read_listing(root: Path, kind: str) -> list[tuple[float, Path]]:
         by_stamp.setdefault(float(words[0]), root / picture)
     if not by_stamp:
         raise FormatError(root, f"{kind} frames", "none", f"time-stamped images in {kind}/")
-    return sorted(by_stamp.items())
+    is_numbered = all(words[0].isdigit() for _, _, words in rows) and max(by_stamp) < _MAX_FRAME_NUMBER
+    return sorted(by_stamp.items()), is_numbered
 
 
-def _interpolate_trajectory(file: Path, times: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
-    """Camera-to-world matrices of the covered ``times``, and the mask (n,) of covered times."""
+def _find_columns(words: Sequence[str], kind: str) -> list[str]:
+    """Stamp and name of the image of ``kind`` in a line of both: found by the folder in the names, not by position.
+
+    Names of other folders: colour stands in the first two columns, depth in the next two, as in TUM's files.
+    """
+    place = next((i for i, word in enumerate(words) if Path(word).parent.name == kind), None)
+    if place is None:
+        place = 1 if kind == "rgb" else 3
+    return list(words[max(place - 1, 0) : place + 1])
+
+
+def _find_trajectory(root: Path) -> Path | None:
+    candidates = (root / "groundtruth.txt", *sorted(root.glob(_ICL_TRAJECTORIES)))
+    return next((file for file in candidates if file.is_file()), None)
+
+
+def _match_numbers(file: Path, numbers: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
+    """Camera-to-world matrices of the frames whose number has a row, and the mask (n,) of these frames."""
+    rows = {row[0]: row for row in _read_trajectory(file)}
+    covered = np.array([number in rows for number in numbers])
+    if not covered.any():
+        raise FormatError(file, "frame numbers", "none of the images", f"{numbers[0]:g} to {numbers[-1]:g}")
+    kept = np.stack([rows[number] for number in numbers[covered]])
+    return convert.to_c2w(kept[:, 4:], kept[:, 1:4], file), covered
+
+
+def _read_trajectory(file: Path) -> np.ndarray:
+    """Rows (n, 8) with a finite pose, sorted by stamp, one for each stamp."""
     rows = files.read_table(file, 8)
     rows = rows[np.isfinite(rows).all(-1) & (np.linalg.norm(rows[:, 4:], axis=-1) > 1e-6)]
     rows = rows[np.unique(rows[:, 0], return_index=True)[1]]
     if len(rows) == 0:
         raise FormatError(file, "poses", "no usable row", "rows of stamp, position and quaternion")
+    return rows
+
+
+def _interpolate_trajectory(file: Path, times: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
+    """Camera-to-world matrices of the covered ``times``, and the mask (n,) of covered times."""
+    rows = _read_trajectory(file)
     after = np.searchsorted(rows[:, 0], times, "left").clip(1, max(len(rows) - 1, 1)).clip(max=len(rows) - 1)
     before = (after - 1).clip(0)
     a, b = rows[before], rows[after]
@@ -205,25 +280,97 @@ def _interpolate_trajectory(file: Path, times: np.ndarray, max_difference: float
     return convert.to_c2w(q, (1 - weight) * a[:, 1:4] + weight * b[:, 1:4], file), covered
 
 
-def _make_camera(
+@dataclass(frozen=True)
+class _CameraSource:
+    """Camera of a sequence, and what is known of the sequence by the way it was found."""
+
+    camera: Camera
+    report: tuple[str, ...] = ()
+    data_set: str | None = None  # whose unit of depth is documented; None = not known
+    is_y_up: bool = False  # whether camera and world of the trajectory have y up
+
+    @property
+    def is_icl(self) -> bool:
+        """Whether the sequence is one of ICL-NUIM."""
+        return self.data_set == "ICL-NUIM"
+
+
+def _find_camera(
     root: Path,
     intrinsics: intrinsics_options.IntrinsicsOption,
-    number: int | None,
+    camera: int | str | None,
     hw: tuple[int, int],
-    K: tuple[float, ...] | None,
-) -> Camera:
-    if K is not None:
-        return convert.to_camera(convert.make_K(*K), hw, root, "option K")
-    if intrinsics not in ("camera", "ros"):
+    K: Sequence[float] | None,
+    fov: float | None,
+) -> _CameraSource:
+    if isinstance(intrinsics, str) and intrinsics not in ("camera", "ros"):
         raise FormatError(root, "option intrinsics", intrinsics, "camera or ros")
-    if number not in (None, *_CAMERA_CALIBRATIONS):
-        raise FormatError(root, "option camera", number, "1, 2 or 3")
+    if camera not in (None, "icl", *_CAMERA_CALIBRATIONS):
+        raise FormatError(root, "option camera", camera, "1, 2, 3 or icl")
+    number = camera if isinstance(camera, int) else None if camera == "icl" else _find_camera_number(root)
+    is_icl = camera == "icl" or (camera is None and number is None and _is_icl(root))
+    data_set = "ICL-NUIM" if is_icl else None if number is None else "TUM RGB-D"
+    option = intrinsics_options.parse_intrinsics(root, hw, None if isinstance(intrinsics, str) else intrinsics, K, fov)
+    calibration = next((root / name for name in _CALIBRATION_FILES if (root / name).is_file()), None)
+    if option.K is not None:
+        source = _make_source(option.K, None, hw, root, "option K")
+    elif calibration is not None and camera is None and intrinsics == "camera":
+        values, distortion = _read_calibration(calibration)
+        source = _make_source(values, distortion, hw, calibration, "fx fy cx cy")
+    elif is_icl:
+        matrix, scaled = image_table.fit_K(convert.make_K(*_ICL_INTRINSICS), _IMAGE_HW, hw, Path("ICL-NUIM"))
+        source = _CameraSource(convert.to_camera(matrix, hw, root), scaled)
+    else:
+        source = _CameraSource(_make_camera(root, intrinsics, number, hw))
+    report = (*source.report, *option.report)
+    if source.is_y_up and not is_icl:  # ICL-NUIM's published K is known to have a negative fy
+        report = (*report, "K has a negative fy: that of a camera with y up; read as positive, poses are mirrored")
+    return replace(source, data_set=data_set, is_y_up=source.is_y_up or is_icl, report=report)
+
+
+def _make_source(
+    values: Sequence[float], distortion: np.ndarray | None, hw: tuple[int, int], file: Path, field: str
+) -> _CameraSource:
+    """Camera of fx fy cx cy; a negative fy is that of a camera with y up on upright images."""
+    fx, fy, cx, cy = values
+    camera = convert.to_camera(convert.make_K(fx, abs(fy), cx, cy), hw, file, field, distortion)
+    return _CameraSource(camera, is_y_up=fy < 0)
+
+
+def _read_calibration(file: Path) -> tuple[list[float], np.ndarray | None]:
+    """(fx fy cx cy, distortion or None) of four numbers, with or without distortion, or of a 3×3 matrix."""
+    words = [word for _, row in files.read_rows(file) for word in row]
+    expected = "fx fy cx cy, with or without 4 or 5 numbers of distortion, or a 3x3 matrix"
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        raise FormatError(file, "numbers", " ".join(words), expected) from None
+    if len(values) == 9 and values[6:] == [0, 0, 1]:
+        return [values[0], values[4], values[2], values[5]], None
+    if len(values) not in (4, 8, 9):
+        raise FormatError(file, "numbers", " ".join(words), expected)
+    return values[:4], np.array(values[4:]) if values[4:] else None
+
+
+def _find_unit(root: Path, option: float | None, source: _CameraSource) -> DepthUnit:
     side_car = root / "meta.json"
-    number = number or _find_camera_number(root)
+    if option is not None:
+        units = files.to_positive(option, root, "option units_per_metre")
+        return DepthUnit(1 / units, "option units_per_metre")
+    if side_car.is_file() and "depth_scale" in (meta := files.read_json(side_car)):
+        return DepthUnit(1 / files.to_positive(meta["depth_scale"], side_car, "depth_scale"), "meta.json: depth_scale")
+    stated = None if source.data_set is None else f"{source.data_set} stores 1/5000 m"
+    return DepthUnit(1 / _UNITS_PER_METRE, stated)
+
+
+def _make_camera(
+    root: Path, intrinsics: intrinsics_options.IntrinsicsOption, number: int | None, hw: tuple[int, int]
+) -> Camera:
+    side_car = root / "meta.json"
     if number is None and intrinsics == "camera":
         if not side_car.is_file():
             raise intrinsics_options.missing_intrinsics_error(
-                root, None, "data.camera=1, 2 or 3 (freiburg), data.intrinsics=ros", "meta.json"
+                root, None, "data.camera=1, 2, 3 (freiburg) or icl, data.intrinsics=ros", "calibration.txt, meta.json"
             )
         meta = files.read_json(side_car)
         return convert.to_camera(meta.get("K"), hw, side_car, "K", meta.get("dist"))
@@ -231,6 +378,11 @@ def _make_camera(
         raise FormatError(root, "image size", f"{hw[1]}x{hw[0]}", "640x480, the size of the published calibration")
     values, distortion = _CAMERA_CALIBRATIONS[number] if number and intrinsics == "camera" else (_ROS_INTRINSICS, None)
     return convert.to_camera(convert.make_K(*values), hw, root, "K", distortion)
+
+
+def _is_icl(root: Path) -> bool:
+    """Whether the trajectory or the folder has a name of ICL-NUIM."""
+    return any(root.glob(_ICL_TRAJECTORIES)) or _ICL_NAME_PATTERN.search(root.resolve().name) is not None
 
 
 def _find_camera_number(root: Path) -> int | None:
