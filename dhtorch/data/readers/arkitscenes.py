@@ -28,6 +28,7 @@ from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.laser import resample_laser_depth
 from dhtorch.data.recording import MeasuredRecording, Recording
+from dhtorch.data.units import DepthUnit
 from dhtorch.geometry.camera import resize
 from dhtorch.records import Camera, Frame
 from dhtorch.runtime.console import format_count
@@ -125,6 +126,7 @@ def read(
     fields: dict[str, Any] = {"name": _video_id(root), "format": "arkitscenes", "root": root, "load": load}
     fields |= {"number": torch.from_numpy(kept), "times": torch.from_numpy(times)}
     fields |= {"rate_hz": float(1 / np.median(np.diff(times))) if len(times) > 1 else None}
+    fields |= {"depth_unit": DepthUnit(1 / _UNITS_PER_METRE, "ARKitScenes stores mm")}
     if trajectory:
         fields["poses"] = convert.to_poses(convert.rot90_pose(c2w, turns), trajectory)
     laser = _list_asset_files(places, ("highres_depth",), "png") if truth else None

@@ -28,6 +28,7 @@ from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.laser import resample_laser_depth
 from dhtorch.data.recording import MeasuredRecording, Recording, Recordings
+from dhtorch.data.units import DepthUnit
 from dhtorch.geometry.camera import resize
 from dhtorch.records import Camera, Frame
 from dhtorch.runtime.console import format_count
@@ -214,6 +215,7 @@ def _make_recording(
     fields |= {"number": torch.tensor([number_of[key] for key in keys]), "times": torch.from_numpy(times)}
     fields |= {"poses": convert.to_poses(c2w, archive, "gt/RT")}
     fields |= {"rate_hz": float(1 / np.median(np.diff(times))) if len(times) > 1 else None}
+    fields |= {"depth_unit": DepthUnit(1 / _UNITS_PER_METRE, "CA-1M stores mm")}
     if "gt/depth" not in spans:
         return Recording(**fields, report=tuple(report))
     if (n_without := int((spans["gt/depth"][:, 0] < 0).sum())) > 0:

@@ -40,6 +40,7 @@ from dhtorch.data.readers.rh20t_robot import (
     read_tcp_in_base,
 )
 from dhtorch.data.recording import Recording
+from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame, Pose
 from dhtorch.runtime.console import format_count
@@ -47,6 +48,9 @@ from dhtorch.runtime.console import format_count
 __all__ = ["RobotStream", "read", "read_robot_streams", "recognise"]
 
 _RATE_HZ = 10.0
+
+#: Depth codes of one metre. Source: format definition (rh20t_api).
+_UNITS_PER_METRE = 1000
 
 
 def recognise(root: Path) -> str | None:
@@ -147,7 +151,7 @@ class _Load:
         if self.depth is None:
             return torch.zeros(h, w)
         planes = read_video_frame(self.depth, j, (2 * h, w), pixels="gray")
-        depth = torch.from_numpy(planes[:h].astype(np.float32) + planes[h:].astype(np.float32) * 256) / 1000
+        depth = torch.from_numpy(planes[:h].astype(np.float32) + planes[h:].astype(np.float32) * 256) / _UNITS_PER_METRE
         return _remove_outliers(depth, self.outlier) if self.outlier > 0 else depth
 
 
@@ -211,6 +215,7 @@ class _SceneCameras:
             poses=poses,
             rate_hz=header.rate_hz or _RATE_HZ,
             report=tuple(notes),
+            depth_unit=DepthUnit(1 / _UNITS_PER_METRE, "RH20T stores mm") if depth.is_file() else None,
         )
 
     def _camera(self, serial: str, hw: tuple[int, int]) -> Camera:
