@@ -103,7 +103,15 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     scene, out = scenes[0], Path(str(settings["out"])).expanduser()
     maps = depth_maps.open_depth_maps(settings["depth"], scene.recording, settings["depth_unit"])
     task = _make_alignment_task(scene, maps, parts["method"], settings, out)
-    completed.resume_folder(task)
+    with completed.open_task_folder(task, ("align.json", "align.html")):
+        return _align_task(task, maps, settings, limits, progress)
+
+
+def _align_task(
+    task: CompletionTask, maps: DepthMaps, settings: Mapping[str, Any], limits: Mapping[str, float], progress: Progress
+) -> int:
+    """Align the missing maps of a task, write and print the summary; returns the exit code."""
+    scene, out = task.scene, task.folder
     n_untouched = sum(task.name(i) in task.done for i in task.frames)
     todo = [i for i in task.frames if task.name(i) not in task.done]
     with complete.close_on_exit(task):
@@ -118,7 +126,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     storage.write_json(out / "align.json", storage.to_strict_json(content))
     lines = [
         *_format_summary(scene.name, settings["kind"], summary, n_untouched),
-        *(f"  {note}" for note in maps.notes),
+        *(f"  {note}" for note in [*(maps.doubts if settings["kind"] == "metric" else []), *maps.notes]),
     ]
     _write_page(task, maps, lines, exceeded)
     print("\n".join([*lines, *(f"  exceeded: {limit_line}" for limit_line in exceeded), "wrote", f"  {out}"]))

@@ -31,6 +31,7 @@ from dhtorch.pytree import stack
 from dhtorch.records import DepthValidation, Frame
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.validation import faults
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
 from dhtorch.validation.validate import share_interval, validate_depth
@@ -58,7 +59,7 @@ _VALIDATION_LIMITS = {
 #: Columns of the page's table.
 _TABLE_COLUMNS = ("wrong, of checked", "checked, of depth", "scale", "shift, m", "tilt", "cut at, m")
 
-_LIMIT_PATTERN = re.compile(r"\s*([a-z]+)\s*>\s*([0-9.eE+-]+)\s*")
+_LIMIT_PATTERN = re.compile(r"\s*([a-z_]+)\s*>\s*([0-9.eE+-]+)\s*")
 
 
 @dataclass
@@ -73,8 +74,8 @@ class RecordingValidation:
 
     @property
     def notes(self) -> list[str]:
-        """Notes on the matching of map files to frames."""
-        return [] if self.maps is None else self.maps.notes
+        """Doubts about the maps, and notes on their unit and on the matching of files to frames."""
+        return [] if self.maps is None else [*self.maps.doubts, *self.maps.notes]
 
     def frame_positions(self, every: int) -> list[int]:
         """Every ``every``-th position of the frames that have a map."""
@@ -100,15 +101,29 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if settings["depth"] is not None and len(scenes) > 1:
         raise ValueError(f"depth: found {len(scenes)} recordings for one folder of maps, expected one (data.root=…)")
     folder = Path(str(settings["output"])).expanduser()
+    folders = [folder if len(scenes) == 1 else folder / scene.name for scene in scenes]
+    with open_output_folder(folder, "output") as output:
+        output.check(place / name for place in folders for name in ("validate.json", "validate.html"))
+        return _validate_scenes(scenes, folders, parts["method"], settings, limits, progress)
+
+
+def _validate_scenes(
+    scenes: Sequence[Scene],
+    folders: Sequence[Path],
+    method: Method,
+    settings: Mapping[str, Any],
+    limits: Mapping[str, float],
+    progress: Progress,
+) -> int:
+    """Validate the scenes, write the files of each into its folder and print the summary; returns the exit code."""
     written, all_exceeded, lines = [], [], []
-    for scene in scenes:
+    for scene, scene_folder in zip(scenes, folders, strict=True):
         maps = None
         if settings["depth"] is not None:
             maps = depth_maps.open_depth_maps(settings["depth"], scene.recording, settings["depth_unit"])
-        validation = _validate_recording(RecordingValidation(scene, maps), parts["method"], settings, progress)
+        validation = _validate_recording(RecordingValidation(scene, maps), method, settings, progress)
         summary = _summarise_recording(validation)
         exceeded = list_exceeded_limits(summary, limits)
-        scene_folder = folder if len(scenes) == 1 else folder / scene.name
         content = {"scene": scene.name, "source": "sensor" if maps is None else "maps", "fail_on": settings["fail_on"]}
         content |= {} if maps is None else {"maps": maps.report}
         content |= {"intrinsics_guessed": intrinsics_options.find_guess_report(scene.recording.report)}

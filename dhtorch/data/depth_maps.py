@@ -1,9 +1,10 @@
-"""Reader of depth maps for a recording's frames: a folder with one file per frame, from a network or another source.
+"""Reader of depth maps for a recording's frames: a folder of files, or one file with the maps of a whole clip.
 
-Formats: 16-bit ``*.png`` in steps of a unit; ``*.npy``, ``*.npz`` (its only array, or the one named depth), ``*.tiff``,
-``*.pfm`` or ``*.exr`` with numbers in that unit. A map (h, w) covers the field of view of its frame's image at any size
-and is stretched where the aspect ratios differ. 0 and non-finite values are no depth. Output of ``dhtorch complete`` is
-read directly: the unit comes from its ``complete.json``.
+Formats: 16-bit ``*.png`` in steps of a unit; ``*.npy``, ``*.npz`` (its only array, or the one named depth),
+``*.tiff``, ``*.pfm`` or ``*.exr`` with numbers in that unit. A map (h, w), (1, h, w) or (h, w, 1) covers the field of
+view of its frame's image at any size and is stretched where the aspect ratios differ. A folder with one ``.npy`` or
+``.npz`` of shape (N, h, w) has N maps, one per frame. What stands for no return, :mod:`dhtorch.geometry.no_depth`
+says. Output of ``dhtorch complete`` is read directly: the unit comes from its ``complete.json``.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,19 +30,28 @@ from dhtorch.data.codecs.pfm import read_pfm
 from dhtorch.data.codecs.tiff import read_tiff
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import MAX_PIXELS, FormatError
+from dhtorch.data.plausibility import plausibility_findings
 from dhtorch.data.recording import Recording
+from dhtorch.data.units import UNIT_METRES, DepthUnit, parse_unit
+from dhtorch.geometry.no_depth import clear_codes, clear_no_depth
 from dhtorch.runtime.console import format_count
 
-#: Name of a unit → metres.
-_UNIT_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
-
 _SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".pfm", ".exr")
+
+#: Suffixes of files that may hold the maps of a whole clip.
+_CLIP_SUFFIXES = (".npy", ".npz")
 
 #: Relative difference between the aspect ratios of a map and its image up to which they count as equal.
 _MAX_ASPECT_DIFFERENCE = 0.05
 
-#: Name of the depth array in an archive with several arrays.
-_NPZ_KEY = "depth"
+#: Names of the depth array in an archive with several arrays.
+_NPZ_KEYS = ("depth", "depths", "depth_map", "depth_maps")
+
+#: End of the names of validity masks beside depth maps, as in DIODE; they are left out.
+_MASK_PATTERN = re.compile(r"(?:^|[_.-])(?:valid[_.-]?)?mask$", re.IGNORECASE)
+
+#: Maps whose values are examined for plausibility, evenly spaced.
+_N_EXAMINED_MAPS = 3
 
 
 @dataclass(frozen=True)
@@ -48,27 +59,45 @@ class DepthMaps:
     """Depth maps of a folder, indexed by position in the recording."""
 
     files: Sequence[Path | None]  # of every frame
-    unit: float  # m
+    unit: DepthUnit
     hw: tuple[int, int]  # of the images
-    by: str = "number"  # how files were matched to frames: number | order
+    by: str = "number"  # how files were matched to frames: number | order | clip
+    clip_index: Sequence[int] = ()  # of every frame's map in a file of a whole clip; empty = one file per map
+    warnings: Sequence[str] = ()  # on how files were matched
+    left_out: Sequence[str] = ()  # remarks on files that are no maps
 
     @property
     def frames(self) -> list[int]:
         """Positions of the frames with a map."""
         return [i for i, file in enumerate(self.files) if file is not None]
 
+    @cached_property
+    def doubts(self) -> list[str]:
+        """Warnings that the values of a few maps are no depth in the unit; of maps that are meant as metric depth."""
+        frames = self.frames
+        examined = sorted({frames[k * (len(frames) - 1) // (_N_EXAMINED_MAPS - 1)] for k in range(_N_EXAMINED_MAPS)})
+        findings = plausibility_findings([m[0] for i in examined if (m := self[i]) is not None], self.unit)
+        return [f"warning: maps: {text} ({remedy.removeprefix('data.')})" for _, text, remedy in findings]
+
     @property
     def notes(self) -> list[str]:
-        """Remarks for the user on how files were matched: missing maps, matching by order."""
+        """Remarks for the user: unit, how files were matched, missing maps; warnings first."""
         missing, n = len(self.files) - len(self.frames), len(self.files)
         gaps = [f"{missing} of {n} frames {'has' if missing == 1 else 'have'} no map."] if missing else []
-        ordered = ["No file has a frame's number: files were matched in their order."]
-        return gaps + (ordered if self.by == "order" else [])
+        ordered = ["No file has a frame's number: files were matched in their order."] if self.by == "order" else []
+        warned = [f"warning: {text}" for text in self.warnings]
+        return [*warned, *gaps, *ordered, *self.left_out, f"maps: {self.unit}"]
 
     @property
     def report(self) -> dict[str, Any]:
-        """How files were matched, as a record: number of missing maps, matched by number or order."""
-        return {"missing": len(self.files) - len(self.frames), "matched_by": self.by}
+        """How files were matched, as a record: number of missing maps, matched by number or order, unit, warnings."""
+        return {
+            "missing": len(self.files) - len(self.frames),
+            "matched_by": self.by,
+            "depth_unit": str(self.unit),
+            "depth_unit_m": self.unit.metres,
+            "warnings": [*self.warnings],
+        }
 
     def __getitem__(self, i: int) -> Tensor | None:
         """(1, h, w) m float32 of frame ``i``, 0 = no depth; None where there is no file.
@@ -79,24 +108,25 @@ class DepthMaps:
         file = self.files[i]
         if file is None:
             return None
-        array = _READERS[file.suffix.lower()](file)
+        array = _open_clip(file)[self.clip_index[i]] if self.clip_index else _READERS[file.suffix.lower()](file)
         _check_shape(file, array.shape, self.hw)
-        depth = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))[None] * self.unit
-        return torch.where(depth.isfinite() & (depth > 0), depth, 0.0)
+        stored = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))[None]
+        return clear_no_depth(clear_codes(stored) * self.unit.metres)
 
 
 def open_depth_maps(folder: str | Path, recording: Recording, unit: str | float | None = None) -> DepthMaps:
     """Open a folder of depth maps and match its files to the frames of a recording.
 
-    A file belongs to the frame whose number is the last one in the file's name: every frame must have a file, or every
-    file a frame. Where no file has a frame's number, and there are as many files as frames, they are matched in order,
-    sorted by the numbers in their names.
+    A file belongs to the frame whose number is in its name, the last one by which all names differ: every frame must
+    have a file, or every file a frame. Where no file has a frame's number, and there are as many files as frames, they
+    are matched in order, sorted by the numbers in their names. A single file with N maps needs N frames, or frames that
+    are all numbered below N. Masks (``*_mask.npy``) are left out.
 
     Args:
         folder: of the files, or the output folder of ``dhtorch complete``.
         recording: with the frames of the maps.
-        unit: m, cm, mm, inch, or metres per step; None = the unit in ``complete.json``, else mm for PNG and m for all
-            others.
+        unit: m, cm, mm, inch, 1/5000, or metres per step; None = the unit in ``complete.json``, else mm for PNG and m
+            for all others, which is reported as an assumption.
 
     Raises:
         FormatError: no folder, no map, maps of several formats, two of one number, or files that cannot be matched.
@@ -107,48 +137,91 @@ def open_depth_maps(folder: str | Path, recording: Recording, unit: str | float 
         raise FormatError(root, "depth", "no folder", f"a folder of files {', '.join(_SUFFIXES)}")
     metadata_file = root / "complete.json" if (root / "complete.json").is_file() else root.parent / "complete.json"
     depth_folder = root / "depth" if (root / "depth").is_dir() else root
-    map_files = sorted(file for file in depth_folder.iterdir() if file.suffix.lower() in _SUFFIXES)
+    candidates = sorted(file for file in depth_folder.iterdir() if file.suffix.lower() in _SUFFIXES)
+    masks = [file for file in candidates if _MASK_PATTERN.search(file.stem)]
+    map_files = [file for file in candidates if file not in masks]
     kinds = Counter(file.suffix.lower() for file in map_files)
     if len(kinds) != 1:
         listing = " and ".join(f"{n} {kind}" for kind, n in sorted(kinds.items())) or "no such file"
         raise FormatError(
             depth_folder, "depth", listing, f"one file a frame, all of one kind of {', '.join(_SUFFIXES)}"
         )
-    unit_m = _parse_unit(unit)
-    if unit_m is None and metadata_file.is_file():
-        unit_m = files.to_positive(files.read_json(metadata_file).get("unit_m"), metadata_file, "unit_m")
-    if unit_m is None:
-        unit_m = _UNIT_METRES["mm"] if set(kinds) == {".png"} else _UNIT_METRES["m"]
-    matched, matched_by = _match_files(depth_folder, map_files, recording.number.tolist())
-    return DepthMaps(matched, unit_m, recording[0].hw, matched_by)
+    depth_unit = _find_unit(unit, metadata_file, next(iter(kinds)))
+    left_out = [f"{format_count(len(masks), 'mask')} left out, such as {masks[0].name}."] if masks else []
+    numbers, hw = recording.number.tolist(), recording[0].hw
+    if len(map_files) == 1 and map_files[0].suffix.lower() in _CLIP_SUFFIXES:
+        clip = _open_clip(map_files[0])
+        if len(clip) > 1:
+            matched: list[Path | None] = [map_files[0]] * len(numbers)
+            indices = _match_clip(map_files[0], len(clip), numbers)
+            return DepthMaps(matched, depth_unit, hw, "clip", indices, left_out=left_out)
+    matched, matched_by, remarks = _match_files(depth_folder, map_files, numbers)
+    return DepthMaps(matched, depth_unit, hw, matched_by, warnings=remarks, left_out=left_out)
 
 
-def _match_files(folder: Path, map_files: Sequence[Path], frames: Sequence[int]) -> tuple[list[Path | None], str]:
-    """The file of every frame (None = no map), and whether they were matched by ``"number"`` or ``"order"``."""
-    numbers_of = [_numbers_in_name(file)[-1:] for file in map_files]
-    frame_numbers, file_numbers = set(frames), {n for numbers in numbers_of for n in numbers}
-    if file_numbers & frame_numbers and all(numbers_of):
+def _find_unit(unit: str | float | None, metadata_file: Path, suffix: str) -> DepthUnit:
+    """Unit of the maps: the option's, that of ``complete.json``, or the convention of the suffix, an assumption."""
+    if unit is not None:
+        return DepthUnit(parse_unit(unit), "option depth_unit")
+    if metadata_file.is_file():
+        stated = files.to_positive(files.read_json(metadata_file).get("unit_m"), metadata_file, "unit_m")
+        return DepthUnit(stated, "complete.json: unit_m")
+    return DepthUnit(UNIT_METRES["mm" if suffix == ".png" else "m"])
+
+
+def _match_clip(file: Path, n_maps: int, frames: Sequence[int]) -> list[int]:
+    """Index of every frame's map in a file of ``n_maps``: its place among as many frames, else its number."""
+    if n_maps == len(frames):
+        return [*range(n_maps)]
+    if max(frames) < n_maps:
+        return [*frames]
+    raise FormatError(file, "depth", f"a file that holds {n_maps} maps", f"one for each of {_describe_frames(frames)}")
+
+
+def _match_files(
+    folder: Path, map_files: Sequence[Path], frames: Sequence[int]
+) -> tuple[list[Path | None], str, list[str]]:
+    """The file of every frame (None = no map), whether they were matched by ``"number"`` or ``"order"``, warnings."""
+    numbers_of = _file_numbers(map_files)
+    frame_numbers, file_numbers = set(frames), {n for n in numbers_of if n is not None}
+    description = format_count(len(map_files), "map")
+    if file_numbers:
+        description += f" numbered {_format_range(file_numbers)}"
+    if file_numbers & frame_numbers and None not in numbers_of:
         if frame_numbers <= file_numbers or file_numbers <= frame_numbers:
-            by_number = _index_by_number(map_files, [numbers[0] for numbers in numbers_of])
-            return [by_number.get(k) for k in frames], "number"
+            by_number = _index_by_number(map_files, [n for n in numbers_of if n is not None])
+            remarks = []
+            if min(file_numbers) == min(frame_numbers) + 1:
+                first = min(file_numbers)
+                remarks.append(
+                    f"{description} for {_describe_frames(frames)}: matched by number, the map {first} to the frame "
+                    f"{first}; if they are numbered from 1, rename them"
+                )
+            return [by_number.get(k) for k in frames], "number", remarks
     elif not file_numbers & frame_numbers and len(map_files) == len(frames):
         in_order = sorted(map_files, key=_numbers_in_name)
-        return [*in_order], "order"
-    description = format_count(len(map_files), "file")
+        return [*in_order], "order", []
     if file_numbers:
-        n_shared = len(file_numbers & frame_numbers)
-        description += f" numbered {_format_range(file_numbers)}, {n_shared} of them with a frame's number"
-    raise FormatError(
-        folder,
-        "depth",
-        description,
-        f"one for each of {format_count(len(frames), 'frame')}, numbered {_format_range(frame_numbers)}",
-    )
+        description += f", {len(file_numbers & frame_numbers)} of them with a frame's number"
+    raise FormatError(folder, "depth", description, f"one for each of {_describe_frames(frames)}")
+
+
+def _describe_frames(frames: Sequence[int]) -> str:
+    return f"{format_count(len(frames), 'frame')} numbered {_format_range(set(frames))}"
 
 
 def _numbers_in_name(file: Path) -> list[int]:
     """All integers in a file's name, as a key for natural order (10 after 9)."""
     return [int(digits) for digits in re.findall(r"\d+", file.stem)]
+
+
+def _file_numbers(map_files: Sequence[Path]) -> list[int | None]:
+    """Number of every file, None without one: the last number by which all names differ, else the last in its name."""
+    rows = [_numbers_in_name(file) for file in map_files]
+    patterns = {re.sub(r"\d+", "0", file.stem) for file in map_files}
+    columns = list(zip(*rows, strict=True)) if len(patterns) == 1 else []
+    distinct = [column for column in columns if len(set(column)) == len(map_files)]
+    return [*distinct[-1]] if distinct else [row[-1] if row else None for row in rows]
 
 
 def _index_by_number(map_files: Sequence[Path], numbers: Sequence[int]) -> dict[int, Path]:
@@ -177,52 +250,61 @@ def _check_shape(file: Path, shape: tuple[int, ...], hw: tuple[int, int]) -> Non
         warnings.warn(text, UserWarning, stacklevel=3)
 
 
-def _parse_unit(unit: str | float | None) -> float | None:
-    if unit is None:
-        return None
-    if isinstance(unit, str) and unit in _UNIT_METRES:
-        return _UNIT_METRES[unit]
-    if isinstance(unit, int | float) and not isinstance(unit, bool) and unit > 0:
-        return float(unit)
-    raise ValueError(f"depth_unit: found {unit!r}, expected {', '.join(_UNIT_METRES)}, or metres per step")
-
-
-def _read_npy_map(file: Path) -> np.ndarray:
-    """NPY file → numbers (h, w); object arrays are refused, since unpickling can run code."""
+def _read_npy(file: Path) -> np.ndarray:
+    """NPY file → numbers; object arrays are refused, since unpickling can run code."""
     try:
         array = np.load(io.BytesIO(files.read_bytes(file)), allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
         raise FormatError(file, "depth", f"{type(error).__name__}", "a NPY array of numbers") from error
     if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
         raise FormatError(file, "depth", "no array of numbers", "a NPY array of numbers")
-    return _check_map(array, file)
+    return array
 
 
-def _read_npz_map(file: Path) -> np.ndarray:
-    """NPZ file → its only array (h, w), or the one named depth."""
+def _read_npz_depth(file: Path) -> np.ndarray:
+    """NPZ file → its only array, or the one named depth."""
     try:
         with zipfile.ZipFile(io.BytesIO(files.read_bytes(file))) as archive:
             keys = [name.removesuffix(".npy") for name in archive.namelist()]
     except (zipfile.BadZipFile, OSError, ValueError) as error:
         raise FormatError(file, "archive", f"{type(error).__name__}", "a whole .npz archive") from None
-    return _check_map(read_npz(file, keys[0] if len(keys) == 1 else _NPZ_KEY), file)
+    named = [key for key in _NPZ_KEYS if key in keys]
+    return read_npz(file, keys[0] if len(keys) == 1 else named[0] if named else _NPZ_KEYS[0])
+
+
+def _read_map(file: Path) -> np.ndarray:
+    """NPY or NPZ file → one map (h, w)."""
+    array = _ARRAY_READERS[file.suffix.lower()](file).squeeze()
+    if array.ndim != 2 or not 0 < array.size <= MAX_PIXELS:
+        raise FormatError(file, "depth", f"shape {array.shape}", "(height, width)")
+    return array
+
+
+def _open_clip(file: Path) -> np.ndarray:
+    """NPY or NPZ file → its maps (N, h, w); N = 1 where it holds one map, or none. The last file stays in memory."""
+    return _read_clip(file, file.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _read_clip(file: Path, time_ns: int) -> np.ndarray:
+    array = _ARRAY_READERS[file.suffix.lower()](file)
+    for axis in (-1, 1):
+        if array.ndim == 4 and array.shape[axis] == 1:
+            array = array.squeeze(axis)
+    is_one = array.ndim != 3 or 1 in (array.shape[0], array.shape[-1])
+    return array[None] if is_one else array
 
 
 def _read_png_map(file: Path) -> np.ndarray:
     return files.read_depth_png(file, 1.0)
 
 
-def _check_map(array: np.ndarray, file: Path) -> np.ndarray:
-    array = array.squeeze()
-    if array.ndim != 2 or not 0 < array.size <= MAX_PIXELS:
-        raise FormatError(file, "depth", f"shape {array.shape}", "(height, width)")
-    return array
-
+_ARRAY_READERS: dict[str, Callable[[Path], np.ndarray]] = {".npy": _read_npy, ".npz": _read_npz_depth}
 
 _READERS: dict[str, Callable[[Path], np.ndarray]] = {
     ".png": _read_png_map,
-    ".npy": _read_npy_map,
-    ".npz": _read_npz_map,
+    ".npy": _read_map,
+    ".npz": _read_map,
     ".tif": read_tiff,
     ".tiff": read_tiff,
     ".pfm": read_pfm,

@@ -25,6 +25,7 @@ from dhtorch.cli.validate import (
 from dhtorch.codes import State
 from dhtorch.data.depth_maps import open_depth_maps
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.units import DepthUnit
 from dhtorch.experiments.compare import validate_study
 from dhtorch.experiments.protocol import Settings
 from dhtorch.export import encode_png
@@ -194,7 +195,7 @@ def test_maps_are_matched_by_number_unit_and_kind(tmp_path, maps, room):
     (shorter / "1.png").write_bytes(encode_png(steps))
     assert torch.allclose(open_depth_maps(shorter, room, 0.002)[1], room.truth(1)["depth"], atol=0.0011)
     (shorter / "complete.json").write_text('{"unit_m": 0.002}')
-    assert open_depth_maps(shorter, room).unit == 0.002
+    assert open_depth_maps(shorter, room).unit == DepthUnit(0.002, "complete.json: unit_m")
     with pytest.raises(ValueError, match="depth_unit"):
         open_depth_maps(shorter, room, "furlong")
 
@@ -206,7 +207,7 @@ def test_damaged_or_hostile_maps_are_refused(tmp_path, room):
     with pytest.raises(FormatError, match="NPY array"):
         open_depth_maps(tmp_path, room)[0]
     np.save(tmp_path / "0.npy", np.zeros((2, 3, 4)))
-    with pytest.raises(FormatError, match="shape"):
+    with pytest.raises(FormatError, match="a file that holds 2 maps"):
         open_depth_maps(tmp_path, room)[0]
     (tmp_path / "0.png").write_bytes(b"")
     with pytest.raises(FormatError, match=r"1 \.npy and 1 \.png"):
@@ -229,17 +230,19 @@ def test_files_are_matched_by_number_else_in_order_and_never_by_halves(tmp_path,
     n = len(room)
     some = open_depth_maps(folder_of(tmp_path / "some", ["depth_3", "depth_1"]), room)
     assert depths(some)[:4] == [None, 2.0, None, 1.0] and some.frames == [1, 3]
-    assert some.notes == [f"{n - 2} of {n} frames have no map."]
-    assert some.report == {"missing": n - 2, "matched_by": "number"}
+    counted = f"2 maps numbered 1 to 3 for {n} frames numbered 0 to {n - 1}"
+    assert [note.partition(":")[0] for note in some.notes] == ["warning", f"{n - 2} of {n} frames have no map.", "maps"]
+    assert counted in some.notes[0] and "numbered from 1" in some.notes[0] and "unit assumed: 1 m" in some.notes[-1]
+    assert some.report["missing"] == n - 2 and some.report["matched_by"] == "number" and some.report["depth_unit_m"] == 1
     more = open_depth_maps(folder_of(tmp_path / "more", range(n + 5)), room)
-    assert depths(more) == [1.0 + k for k in range(n)] and not more.notes
+    assert depths(more) == [1.0 + k for k in range(n)] and not more.warnings and len(more.notes) == 1
     later = open_depth_maps(folder_of(tmp_path / "later", [f"{95 + k}" for k in range(n)]), room)
     assert depths(later) == [1.0 + k for k in range(n)], "99 comes before 100"
-    assert later.report == {"missing": 0, "matched_by": "order"} and "in their order" in later.notes[0]
+    assert later.report["matched_by"] == "order" and "in their order" in later.notes[0]
     named = open_depth_maps(folder_of(tmp_path / "named", "abcdefghijklmnopqrstuvwxyz"[:n]), room)
     assert depths(named) == [1.0 + k for k in range(n)] and named.by == "order"
     for k, names in enumerate((range(n - 1, 2 * n - 1), [*range(n - 1), "x"], ["a", "b"])):
-        with pytest.raises(FormatError, match=f"one for each of {n} frames, numbered 0 to {n - 1}"):
+        with pytest.raises(FormatError, match=f"one for each of {n} frames numbered 0 to {n - 1}"):
             open_depth_maps(folder_of(tmp_path / f"wrong{k}", names), room)
     with pytest.raises(FormatError, match=r"b_1\.npy: name: .*number 1 as a_1\.npy has"):
         open_depth_maps(folder_of(tmp_path / "twice", ["a_1", "b_1"]), room)

@@ -1,0 +1,136 @@
+"""Folders of depth maps as other tools write them: clips in one file, masks, units, sentinels, numbering."""
+
+import numpy as np
+import pytest
+import torch
+
+from dhtorch.data.depth_maps import open_depth_maps
+from dhtorch.data.io.decode import FormatError
+from dhtorch.export.frames import encode_png
+from dhtorch.synthetic.recording import SyntheticRoom
+
+N = 4
+
+
+@pytest.fixture(scope="module")
+def room():
+    return SyntheticRoom(n_frames=N, hw=(72, 96))
+
+
+@pytest.fixture(scope="module")
+def truth(room):
+    return np.stack([room.truth(k)["depth"][0].numpy() for k in range(N)])
+
+
+def read_all(maps):
+    return np.stack([maps[i][0].numpy() for i in range(N)])
+
+
+@pytest.mark.parametrize("shape", ["nhw", "nhw1", "n1hw"])
+@pytest.mark.parametrize("name", ["clip.npy", "depths", "depth", "anything"])
+def test_one_file_of_a_clip_holds_a_map_for_every_frame(tmp_path, room, truth, shape, name):
+    clip = {"nhw": truth, "nhw1": truth[..., None], "n1hw": truth[:, None]}[shape]
+    if name.endswith(".npy"):
+        np.save(tmp_path / name, clip)
+    else:
+        np.savez(tmp_path / "clip.npz", **{name: clip}, **({} if name == "anything" else {"fps": np.float32(30)}))
+    maps = open_depth_maps(tmp_path, room)
+    assert maps.frames == [0, 1, 2, 3] and maps.by == "clip" and not maps.warnings
+    assert np.array_equal(read_all(maps), truth)
+
+
+def test_a_clip_of_another_length_is_refused_with_its_number_of_maps(tmp_path, room, truth):
+    np.savez(tmp_path / "clip.npz", depths=truth[:3])
+    with pytest.raises(FormatError, match="a file that holds 3 maps, expected one for each of 4 frames"):
+        open_depth_maps(tmp_path, room)
+    np.savez(tmp_path / "clip.npz", depths=np.concatenate([truth, truth[:2]]))
+    assert np.array_equal(read_all(open_depth_maps(tmp_path, room)), truth), "all frames are numbered below six"
+
+
+def test_masks_are_left_out_and_the_number_that_differs_counts(tmp_path, room, truth):
+    for k in range(N):
+        np.save(tmp_path / f"{k:05d}_indoors_000_depth.npy", truth[k][..., None])
+        np.save(tmp_path / f"{k:05d}_indoors_000_depth_mask.npy", np.ones_like(truth[k]))
+    maps = open_depth_maps(tmp_path, room)
+    assert np.array_equal(read_all(maps), truth) and maps.by == "number"
+    assert any("4 masks left out" in note for note in maps.notes)
+
+
+def test_an_archive_with_other_numbers_beside_the_depth(tmp_path, room, truth):
+    for k in range(N):
+        np.savez(tmp_path / f"{k:05d}.npz", depth=truth[k], focallength_px=np.float32(525))
+    assert np.array_equal(read_all(open_depth_maps(tmp_path, room)), truth)
+
+
+def test_depth_packed_in_colours_is_refused(tmp_path, room, truth):
+    for k in range(N):
+        (tmp_path / f"{k}.png").write_bytes(encode_png(np.zeros((72, 96, 3), np.uint8)))
+    with pytest.raises(FormatError, match="png with 3 channels of 8 bits"):
+        open_depth_maps(tmp_path, room)[0]
+
+
+@pytest.mark.parametrize("suffix", ["png", "npy"])
+def test_saturated_values_and_far_planes_are_no_depth(tmp_path, room, truth, suffix):
+    for k in range(N):
+        code = (1000 * truth[k]).round().astype(np.uint16)
+        code[:18] = 65535
+        if suffix == "png":
+            (tmp_path / f"{k}.png").write_bytes(encode_png(code))
+        else:
+            np.save(tmp_path / f"{k}.npy", code / np.float32(1000))
+    depth = read_all(open_depth_maps(tmp_path, room))
+    assert not depth[:, :18].any() and np.allclose(depth[:, 18:], truth[:, 18:], atol=1e-3)
+    np.save(tmp_path / "clip.npy", np.where(np.arange(72)[:, None] < 18, 1000.0, truth))
+    for file in tmp_path.glob(f"[0-9].{suffix}"):
+        file.unlink()
+    assert np.array_equal(
+        read_all(open_depth_maps(tmp_path, room)) == 0, np.broadcast_to(np.arange(72)[:, None] < 18, depth.shape)
+    )
+
+
+def test_maps_numbered_from_one_are_warned_of_with_their_numbers(tmp_path, room, truth):
+    for k in range(N - 1):
+        np.save(tmp_path / f"{k + 1:05d}.npy", truth[k])
+    maps = open_depth_maps(tmp_path, room)
+    assert maps[0] is None and np.array_equal(maps[1][0].numpy(), truth[0])
+    (warning,) = maps.warnings
+    assert warning.startswith("3 maps numbered 1 to 3 for 4 frames numbered 0 to 3: matched by number")
+    assert maps.notes[0] == f"warning: {warning}" and maps.report["warnings"] == [warning]
+    np.save(tmp_path / "00000.npy", truth[0])
+    assert not open_depth_maps(tmp_path, room).warnings
+
+
+def test_the_unit_is_stated_or_named_as_an_assumption(tmp_path, room, truth):
+    for k in range(N):
+        (tmp_path / f"{k}.png").write_bytes(encode_png((1000 * truth[k]).round().astype(np.uint16)))
+    assumed = open_depth_maps(tmp_path, room)
+    assert assumed.unit.is_assumed and assumed.notes == ["maps: depth unit assumed: 1/1000 m"]
+    assert assumed.report["depth_unit"] == "depth unit assumed: 1/1000 m" and not assumed.doubts
+    stated = open_depth_maps(tmp_path, room, "1/10000")
+    assert stated.unit.metres == 1e-4 and stated.notes == ["maps: depth unit: 1/10000 m (option depth_unit)"]
+    assert torch.allclose(10 * stated[1], assumed[1])
+    (tmp_path / "complete.json").write_text('{"unit_m": 0.002}')
+    assert open_depth_maps(tmp_path, room).unit.source == "complete.json: unit_m"
+    for unit in ("furlong", "1/0", 0, True):
+        with pytest.raises(ValueError, match="depth_unit"):
+            open_depth_maps(tmp_path, room, unit)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda z: 10 * z, "depth unit 1/10000 m"),
+        (lambda z: 1 - 0.01 / z, "z-buffer"),
+        (lambda z: 1000 * z, "depth unit 1/1000 m"),
+    ],
+)
+def test_values_that_are_no_depth_in_the_unit_are_doubted(tmp_path, room, truth, change, words):
+    is_png = "10000" in words
+    for k in range(N):
+        x = change(truth[k].astype(np.float64))
+        if is_png:
+            (tmp_path / f"{k}.png").write_bytes(encode_png((1000 * x).round().astype(np.uint16)))
+        else:
+            np.save(tmp_path / f"{k}.npy", x.astype(np.float32))
+    (doubt,) = open_depth_maps(tmp_path, room).doubts
+    assert doubt.startswith("warning: maps: ") and words in doubt and "data." not in doubt
