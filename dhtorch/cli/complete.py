@@ -11,7 +11,7 @@ import contextlib
 import io
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ from dhtorch.pytree import stack
 from dhtorch.records import DepthMap, Frame
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.viz.plots import draw_completed
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
@@ -87,6 +88,16 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         data_files.set_opencv_threads(settings["threads"])
     scenes = scenes_of(parts["data"])
     out = Path(str(settings["out"])).expanduser()
+    with open_output_folder(out, "out") if len(scenes) > 1 else contextlib.nullcontext():
+        summaries = _complete_scenes(scenes, out, settings, parts["method"], progress)
+    print("\n".join([*summaries.values(), "wrote", *(f"  {folder}" for folder in summaries)]))
+    return 0
+
+
+def _complete_scenes(
+    scenes: Sequence[Scene], out: Path, settings: Mapping[str, Any], method: Method, progress: Progress
+) -> dict[Path, str]:
+    """Complete the scenes one by one -> output folder and summary of each."""
     summaries: dict[Path, str] = {}
     digests: dict[Path | None, str] = {}
     for scene in scenes:
@@ -95,13 +106,12 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
             raise ValueError(f"data: found two scenes named {scene.name}, expected one (data.camera=KEY, or one root)")
         if scene.root not in digests:
             digests[scene.root] = completed.digest_scene_files(scene, settings, out)
-        task = make_completion_task(scene, folder, parts["method"], settings, digests[scene.root])
-        completed.resume_folder(task)
-        n_untouched = sum(task.name(i) in task.done for i in task.frames)
-        _complete_missing(task, progress)
+        task = make_completion_task(scene, folder, method, settings, digests[scene.root])
+        with completed.open_task_folder(task):
+            n_untouched = sum(task.name(i) in task.done for i in task.frames)
+            _complete_missing(task, progress)
         summaries[folder] = _format_summary(task, n_untouched)
-    print("\n".join([*summaries.values(), "wrote", *(f"  {folder}" for folder in summaries)]))
-    return 0
+    return summaries
 
 
 def make_completion_task(

@@ -6,7 +6,8 @@ is complete. ``complete.json`` holds what all frames of a folder share.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from dhtorch.data.scene import Scene
 from dhtorch.pipeline.method import Method
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
+from dhtorch.runtime.output_folder import OutputFolder, open_output_folder
 from dhtorch.viz.plots import append_cutoff, format_frame
 
 Row = dict[str, Any]
@@ -60,6 +62,11 @@ class CompletionTask:
         first = next((k for k in self.frames if k in self.offers), self.frames[0])
         kinds = [kind for kind in EXTRA_FILES if self.settings[kind] == "all" or (self.settings[kind] and i == first)]
         return [self.folder / kind / f"{self.name(i)}{end}" for kind in kinds for end in EXTRA_FILES[kind]]
+
+    def files(self, i: int) -> list[Path]:
+        """All files that a frame ``i`` can have."""
+        extras = [self.folder / kind / f"{self.name(i)}{end}" for kind, ends in EXTRA_FILES.items() for end in ends]
+        return [*(self.layout.file(self.folder, kind, self.name(i)) for kind in self.layout.folders), *extras]
 
     def missing(self, i: int) -> bool:
         """Whether a file of frame ``i`` is missing."""
@@ -115,17 +122,35 @@ def digest_scene_files(scene: Scene, settings: Mapping[str, Any], out: Path) -> 
     return result_files.compute_data_digest({k: p for k, p in files.items() if not p.resolve().is_relative_to(output)})
 
 
-def resume_folder(task: CompletionTask) -> None:
-    """Register the complete frames of an output folder; remove files of incomplete frames left by a killed run.
+@contextlib.contextmanager
+def open_task_folder(task: CompletionTask, more: Iterable[str] = ()) -> Iterator[None]:
+    """Context in which the output folder of a task is written: its complete frames are registered, and the files of
+    incomplete frames, left by a killed run, are removed.
+
+    Args:
+        task: whose folder is opened.
+        more: names of the files that the command writes beside those of the layout.
 
     Raises:
-        FileExistsError: the folder holds other files; the message names the difference.
+        FileExistsError: the folder holds other files, or a link or a foreign file is in the way; the message names it.
+        BlockingIOError: another process writes there.
         NotADirectoryError: the path is a file.
     """
+    with open_output_folder(task.folder, "out") as folder:
+        _read_shared_file(task)
+        task.done.update(read_complete_frames(task))
+        if folder.is_unlisted:
+            _adopt_older_version(task, folder)
+        _check_files(task, folder, more)
+        for i in range(len(task.recording)):
+            for path in task.files(i) if task.name(i) not in task.done else ():
+                folder.remove(path)
+        yield
+
+
+def _read_shared_file(task: CompletionTask) -> None:
+    """Check that the folder is empty, or was written with the same settings from the same data."""
     folder, shared_file = task.folder, task.folder / "complete.json"
-    if folder.exists() and not folder.is_dir():
-        raise NotADirectoryError(f"out: {folder} is a file, expected a folder or a new path")
-    storage.remove_unfinished_files(shared_file)
     if not storage.has_files(folder):
         return
     if not shared_file.is_file():
@@ -142,11 +167,25 @@ def resume_folder(task: CompletionTask) -> None:
         raise FileExistsError(
             f"{shared_file}: found frames of another run ({difference}), expected the same settings or another out=DIR"
         )
-    task.done.update(read_complete_frames(task))
-    for kind in (*task.layout.folders, *EXTRA_FILES):
-        for file in (folder / kind).glob("*"):
-            if file.stem not in task.done:
-                file.unlink()
+
+
+def _adopt_older_version(task: CompletionTask, folder: OutputFolder) -> None:
+    """Enter the files of a folder without a manifest whose ``complete.json`` has the key of this run: those of complete
+    frames, and those beside the frames' folders."""
+    complete = [i for i in range(len(task.recording)) if task.name(i) in task.done]
+    beside = list(task.folder.iterdir()) if (task.folder / "complete.json").is_file() else []
+    folder.adopt([*beside, *(path for i in complete for path in task.files(i))])
+
+
+def _check_files(task: CompletionTask, folder: OutputFolder, more: Iterable[str]) -> None:
+    """Raise FileExistsError for a link or a foreign file where the command writes."""
+    extras = [kind for kind in EXTRA_FILES if task.settings[kind]]
+    folder.check_folders(task.folder / kind for kind in (*task.layout.folders, *extras))
+    folder.check(task.folder / name for name in ("complete.json", *task.layout.side_files, *more))
+    for i in task.frames:
+        if task.name(i) not in task.done:
+            folder.check(task.files(i))
+        folder.check(path for path in task.extras(i) if not (path.is_file() and folder.lists(path)))
 
 
 def read_complete_frames(task: CompletionTask) -> dict[str, Row]:

@@ -29,9 +29,10 @@ from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.extract.step_set import RldsSource
 from dhtorch.extract.targets import DatasetTarget
 from dhtorch.pipeline import dense
-from dhtorch.runtime import file_lock, storage
 from dhtorch.runtime import results as result_files
+from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import PRIVATE_FOLDER, OutputFolder, open_output_folder
 from dhtorch.transforms import poses
 
 Progress = Callable[..., Iterable[Any]]
@@ -47,8 +48,8 @@ _OUTPUT_FORMATS: dict[str, int | None] = {"lerobot": 3, "v3.0": 3, "lerobot_v2.1
 _KEY_OPTIONS = ("data", "method", "seed", "format", "dense", "causal", "gap", "cameras", "pose", "pose_sigma", "frames",
          "step", "fps", "task", "on_error")  # fmt: skip
 
-#: Folder of the shards of unfinished episodes; file of the shared metadata.
-_SHARDS_FOLDER, _METADATA_FILE = ".dhtorch", "dhtorch.json"
+#: File of the shared metadata.
+_METADATA_FILE = "dhtorch.json"
 
 #: Longer side of a depth map with dense=false (samples only), px.
 _SAMPLED_MAP_SIDE_PX = 640
@@ -79,7 +80,7 @@ class EnrichJob:
     @property
     def waiting(self) -> Path:
         """The folder of the shards."""
-        return self.out / _SHARDS_FOLDER
+        return self.out / PRIVATE_FOLDER / "shards"
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
@@ -101,11 +102,10 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     import_optional("pyarrow.parquet", extra="scale")
     _check_options(settings)
     work = _plan_job(settings, parts)
-    home = work.out.absolute()
     rest = "complete episodes are kept; run the same command again for the rest"
     try:
-        with file_lock.acquire_file_lock(home.parent / f".{home.name}.lock", f"out: {work.out}"):
-            before, owns, complaints = _write_missing_episodes(work, settings, progress)
+        with open_output_folder(work.out, "out") as folder:
+            before, owns, complaints = _write_missing_episodes(work, folder, settings, progress)
             if settings["report"]:
                 enrich_page.write_enrich_page(work.out / "meta", work.shared, owns)
     except KeyboardInterrupt:
@@ -121,14 +121,14 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
 
 
 def _write_missing_episodes(
-    work: EnrichJob, settings: Mapping[str, Any], progress: Progress
+    work: EnrichJob, folder: OutputFolder, settings: Mapping[str, Any], progress: Progress
 ) -> tuple[int, list[Row], list[str]]:
     """Write the missing episodes -> number of episodes complete before, statistics of all, unreadable frames."""
     of_episode = _group_by_episode(work.whole)
     owns = [work.target.own(k) for k in range(len(of_episode))]
     before = sum(own is not None for own in owns)
     every = work.whole.shards(settings["shard_rows"], apart=True)
-    _prepare_folder(work)
+    _prepare_folder(work, folder, [k for k, own in enumerate(owns) if own is None])
     done = shards.find_finished_shards(work.waiting, work.shared)
     todo = {k: _group_shards(every, work.whole, of_episode[k]) for k, own in enumerate(owns) if own is None}
     pieces = [piece for each in todo.values() for files in each.values() for piece in files if piece.name not in done]
@@ -346,16 +346,14 @@ def _build_metadata(
     return metadata
 
 
-def _prepare_folder(work: EnrichJob) -> None:
-    """Prepare the output folder for the missing episodes.
+def _prepare_folder(work: EnrichJob, folder: OutputFolder, missing: Sequence[int]) -> None:
+    """Prepare the output folder for the episodes ``missing``.
 
     Raises:
-        FileExistsError: it holds other files, or was written from other data or with other options.
+        FileExistsError: it holds other files, or was written from other data or with other options, or a link or a
+            foreign file is in the way.
     """
-    if work.out.exists() and not work.out.is_dir():
-        raise NotADirectoryError(f"out: {work.out} is a file, expected a folder or a new path")
     metadata_file = work.out / "meta" / _METADATA_FILE
-    storage.remove_unfinished_files(metadata_file)  # left by a run that was killed while writing it
     if metadata_file.is_file():
         existing = storage.parse_strict_json(metadata_file.read_text(encoding="utf-8"))
         if existing["key"] != work.shared["key"]:
@@ -363,12 +361,14 @@ def _prepare_folder(work: EnrichJob) -> None:
             raise FileExistsError(
                 f"{work.out}: found the data set of another run ({difference}), expected the same settings or out=DIR"
             )
+        if folder.is_unlisted:  # of an older version
+            folder.adopt(work.out.rglob("*"))
     elif storage.has_files(work.out):
         raise FileExistsError(f"{work.out}: found a folder with other files, expected an empty or a new one")
-    else:
+    folder.check_folders([work.waiting])
+    folder.check([*work.target.planned_files(missing), *enrich_page.page_files(work.out / "meta")])
+    if not metadata_file.is_file():
         storage.write_json(metadata_file, work.shared)
-    for unfinished in work.out.rglob(".*.tmp"):
-        unfinished.unlink(missing_ok=True)
     work.waiting.mkdir(exist_ok=True)
 
 
@@ -397,7 +397,7 @@ def _camera_key(work: EnrichJob, n: int) -> str:
 
 def _format_summary(work: EnrichJob, owns: Sequence[Row], n_untouched: int, complaints: Sequence[str]) -> list[str]:
     """The whole in words."""
-    size = sum(path.stat().st_size for path in work.out.rglob("*") if path.is_file())
+    size = sum(path.stat().st_size for path in result_files.list_files_below([work.out]).values())
     frames = sum(own["length"] for own in owns)
     kept = f" ({n_untouched} left untouched)" if n_untouched else ""
     lines = [

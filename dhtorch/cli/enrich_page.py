@@ -69,12 +69,18 @@ def describe_refuted_poses(owns: Sequence[Row]) -> list[str]:
     return sentences
 
 
+def page_files(folder: Path) -> tuple[Path, Path]:
+    """The files that :func:`write_enrich_page` writes: numbers and page."""
+    return folder / f"{_REPORT_NAME}.json", folder / f"{_REPORT_NAME}.html"
+
+
 def write_enrich_page(folder: Path, about: Row, owns: Sequence[Row]) -> Path:
     """Write the page and its numbers as JSON; returns the path of the page."""
     listed = [{k: own[k] for k in ("number", "length", "cameras")} for own in owns]
     codes = {"pixels": names(Source), "no_answer": NO_ANSWER_REASONS}
-    storage.write_json(folder / f"{_REPORT_NAME}.json", {"data": about["data"], "codes": codes, "episodes": listed})
-    return storage.replace_file(folder / f"{_REPORT_NAME}.html", _build_page(about, owns).encode("utf-8"))
+    numbers, page = page_files(folder)
+    storage.write_json(numbers, {"data": about["data"], "codes": codes, "episodes": listed})
+    return storage.replace_file(page, _build_page(about, owns).encode("utf-8"))
 
 
 def _build_page(about: Row, owns: Sequence[Row]) -> str:

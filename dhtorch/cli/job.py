@@ -5,6 +5,7 @@ The result is written last, after its figures: a folder with a valid ``result.js
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ from dhtorch.experiments.protocol import MIN_CANDIDATES, Outcome, Settings
 from dhtorch.runtime import console, storage
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import OutputFolder, open_output_folder
 
 _LOG = logging.getLogger(__name__)
 
@@ -76,10 +78,38 @@ def run(
         sequence = data_set.recording if isinstance(data_set, Scene) else data_set
         _LOG.debug("data: %s, %d of %s", data_set.name, len(sequence), sequence.format)
     _LOG.debug("digest %s, key %s", digest, key)
-    storage.remove_unfinished_files(target)
     if settings["resume"] and result_files.is_finished(target, key):
         print(f"{target}: finished and valid, left untouched")
         return JobStatus(str(folder), "untouched")
+    with open_output_folder(folder, "output") as output:
+        _check_files(output, target, data_sets)
+        return _write_result(settings, parts, names, (target, key, digest), data_sets, progress, swept=swept)
+
+
+def _check_files(output: OutputFolder, target: Path, data_sets: Sequence[Scene] | Sequence[FocalStacks]) -> None:
+    """Raise FileExistsError for a link or a foreign file where the job writes."""
+    folder = target.parent
+    if output.is_unlisted and target.is_file():
+        with contextlib.suppress(ValueError, OSError):
+            result_files.read_result(target)
+            output.adopt(folder.rglob("*"))  # a result of an older version, without a manifest
+    output.check_folders(folder / data_set.name for data_set in data_sets)
+    output.check([target, folder / DATA_ROOT_FILE])
+
+
+def _write_result(
+    settings: Mapping[str, Any],
+    parts: Mapping[str, Any],
+    names: Mapping[str, str],
+    place: tuple[Path, str, str],  # result file, key, digest of the data
+    data_sets: Sequence[Scene] | Sequence[FocalStacks],
+    progress: Callable[[Iterable[Any], str, int], Iterable[Any]],
+    *,
+    swept: bool,
+) -> JobStatus:
+    """Run the experiment and write its files."""
+    target, key, digest = place
+    folder = target.parent
     methods = {names["method"]: parts["method"]}
     outcome = parts["experiment"](data_sets, methods, parts["pairs"], _make_pair_settings(settings), progress=progress)
     _LOG.debug("%d pairs answered", outcome.n_pairs)
@@ -119,8 +149,7 @@ def _write_data_root(folder: Path, settings: Mapping[str, Any]) -> None:
     """Write the absolute data path beside the result (the result itself holds no machine paths)."""
     root = settings["data"].get("root") if isinstance(settings["data"], Mapping) else None
     if root is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / DATA_ROOT_FILE).write_text(f"{Path(root).resolve()}\n", encoding="utf-8")
+        storage.replace_file(folder / DATA_ROOT_FILE, f"{Path(root).resolve()}\n".encode())
 
 
 def _print_result(result: Mapping[str, Any], written: Sequence[Path], *, swept: bool) -> None:

@@ -1,8 +1,9 @@
 """File layouts of ``dhtorch complete``: folders, file names, depth units, and the files a reader needs beside them.
 
-- ``frames``: ``images/`` and ``depth/`` by frame number, ``K.txt``, ``poses.txt``; steps of 1 mm, of 5 mm where the
-  sensor is a LiDAR of a car. Read by ``frames_dir``.
-- ``tum``: ``rgb/`` and ``depth/`` by time stamp, ``groundtruth.txt``; steps of 0.2 mm, so that it ends at 13.1 m.
+- ``frames``: ``images/`` and ``depth/`` by frame number, ``K.txt``, ``poses.txt``, ``meta.json`` (unit, times, K of
+  every frame); steps of 1 mm, of 5 mm where the sensor is a LiDAR of a car. Read by ``frames_dir``.
+- ``tum``: ``rgb/`` and ``depth/`` by time stamp, ``groundtruth.txt``, ``calibration.txt``, ``meta.json`` (unit); steps
+  of 0.2 mm, so that it ends at 13.1 m.
 - ``stray``: ``depth/`` and ``confidence/`` (2 the sensor, 1 swept, 0 no answer) by frame number, the capture's own
   tables and video; steps of 1 mm.
 - ``png``: the maps alone, as ``frames``.
@@ -38,6 +39,13 @@ _STRAY_CONFIDENCE = {Source.NONE: 0, Source.SENSOR: 2, Source.RECOVERED: 1, Sour
 #: Files of a Stray capture that do not depend on its depth.
 _STRAY_FILES = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")
 
+#: Layout → names of the files beside the folders of its frames.
+_SIDE_FILES = {
+    "frames": ("K.txt", "meta.json", "poses.txt"),
+    "tum": ("meta.json", "calibration.txt", "groundtruth.txt"),
+    "stray": _STRAY_FILES,
+}
+
 #: Kind of file → suffix; ``.png`` otherwise.
 _FILE_SUFFIXES = {"meta": ".json", "arrays": ".npz"}
 
@@ -70,6 +78,11 @@ class Layout:
         """Largest depth that fits the 16 bits, m."""
         return self.unit * MAX_DEPTH_CODE
 
+    @property
+    def side_files(self) -> tuple[str, ...]:
+        """Names of the files that :meth:`close` may write."""
+        return _SIDE_FILES.get(self.name, ())
+
     def stem(self, recording: Recording, i: int) -> str:
         """Stem of the file names of a frame."""
         if self.stamped and recording.times is not None:
@@ -84,12 +97,12 @@ class Layout:
         """Write the camera, pose and time files that make ``frames`` (positions; metadata ``rows``) a recording."""
         poses = None if recording.poses is None else recording.poses[torch.tensor(frames)]
         if self.name == "frames" and poses is not None:
-            export.write_frames_dir_metadata(
-                folder, _read_camera(rows[0]), poses, unit=self.unit, fps=_frame_rate(recording)
-            )
+            fps = _frame_rate(recording)
+            times = None if fps is not None or recording.times is None else recording.times[list(frames)].tolist()
+            export.write_frames_dir_metadata(folder, _read_cameras(rows), poses, unit=self.unit, fps=fps, times=times)
         elif self.name == "tum":
             stamps = [self.stem(recording, i) for i in frames]
-            export.write_tum_metadata(folder, _read_camera(rows[0]), stamps, poses)
+            export.write_tum_metadata(folder, _read_cameras(rows[:1]), stamps, poses, unit=self.unit)
         elif self.name == "stray" and recording.root is not None:
             for name in _STRAY_FILES:
                 storage.copy_file(recording.root / name, folder / name)
@@ -158,10 +171,10 @@ def _find_lack(name: str, recording: Recording, same: bool) -> str | None:
     return None
 
 
-def _read_camera(row: Row) -> Camera:
-    """Metadata row -> camera of the map."""
-    lens = None if row["distortion"] is None else torch.tensor([row["distortion"]])
-    return from_matrix(torch.tensor([row["K"]]), lens)
+def _read_cameras(rows: Sequence[Row]) -> Camera:
+    """Metadata rows -> cameras of their maps."""
+    lens = None if rows[0]["distortion"] is None else torch.tensor([row["distortion"] for row in rows])
+    return from_matrix(torch.tensor([row["K"] for row in rows]), lens)
 
 
 def _frame_rate(recording: Recording) -> float | None:

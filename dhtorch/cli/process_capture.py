@@ -6,6 +6,7 @@ A capture from which nothing can be recovered gives one sentence with the reason
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,6 +33,7 @@ from dhtorch.integrate.mapping import choose_voxel, should_mesh, write_surface
 from dhtorch.pipeline.method import Method
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.viz.viewer import html, points
 from dhtorch.viz.viewer.exhibit import PageOpening
 
@@ -54,6 +56,10 @@ _COMPLETE_DEFAULTS = {
     "most": None,
     "every": 1,
 }
+
+
+#: Files written beside those of ``dhtorch complete``.
+_FURTHER_FILES = ("overview.png", "map.ply", "map.glb", "view.html")
 
 
 class NothingToRecover(ValueError):
@@ -93,18 +99,8 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     out = _resolve_folder(path, settings["out"])
     recordings, refused = _open_captures(captures)
     chosen = recordings[: settings["recordings"]]
-    start, n_done = time.monotonic(), 0
-    for n, recording in enumerate(chosen):
-        minutes = settings["minutes"]
-        until = None if minutes is None else start + 60 * minutes * (n + 1) / len(chosen)
-        folder = out if len(chosen) == 1 else out / recording.name
-        try:
-            lines = _process_recording(recording, folder, settings, parts["method"], until, progress)
-        except NothingToRecover as nothing:
-            refused.append(str(nothing))
-            continue
-        n_done += 1
-        print("\n".join(lines), flush=True)
+    with open_output_folder(out, "out") if len(chosen) > 1 else contextlib.nullcontext():
+        n_done = _process_recordings(chosen, out, settings, parts["method"], refused, progress)
     if n_done == 0:
         raise NothingToRecover("; ".join(refused[:3]))
     for line in refused:
@@ -112,6 +108,31 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if len(chosen) < len(recordings):
         print(f"{len(chosen)} of {len(recordings)} recordings done; recordings=null does all")
     return 0
+
+
+def _process_recordings(
+    chosen: Sequence[Recording],
+    out: Path,
+    settings: Mapping[str, Any],
+    method: Method,
+    refused: list[str],
+    progress: Progress,
+) -> int:
+    """Complete the recordings one by one and print their summaries -> their number; reasons of the others are added to
+    ``refused``."""
+    start, n_done = time.monotonic(), 0
+    for n, recording in enumerate(chosen):
+        minutes = settings["minutes"]
+        until = None if minutes is None else start + 60 * minutes * (n + 1) / len(chosen)
+        folder = out if len(chosen) == 1 else out / recording.name
+        try:
+            lines = _process_recording(recording, folder, settings, method, until, progress)
+        except NothingToRecover as nothing:
+            refused.append(str(nothing))
+            continue
+        n_done += 1
+        print("\n".join(lines), flush=True)
+    return n_done
 
 
 # --------------------------------------------------------------------------------------------------------------- input
@@ -263,7 +284,15 @@ def _process_recording(
     )
     order = [i for i in coarse_to_fine(len(recording)) if i in task.offers]
     task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
-    completed.resume_folder(task)
+    with completed.open_task_folder(task, _FURTHER_FILES):
+        return _recover_task(task, until, settings, progress)
+
+
+def _recover_task(
+    task: CompletionTask, until: float | None, settings: Mapping[str, Any], progress: Progress
+) -> list[str]:
+    """Complete the frames of a task and write the map and the page -> the printed lines."""
+    recording, folder = task.recording, task.folder
     recovered = _complete_in_time(task, until, progress)
     if not recovered.frames:
         reason = next(iter(recovered.broken.values()), "the time limit ended before the first frame (minutes=)")

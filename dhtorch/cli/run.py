@@ -28,8 +28,9 @@ from dhtorch.cli import errors, signals
 from dhtorch.cli import option_checks as words
 from dhtorch.cli import sweep_state as together
 from dhtorch.cli.option_checks import quote_value
-from dhtorch.runtime import console, file_lock, parent_watch
+from dhtorch.runtime import console, parent_watch
 from dhtorch.runtime.allocator import disable_malloc_trim
+from dhtorch.runtime.output_folder import OutputFolder, open_output_folder
 
 #: Sub-command → module with ``main(argv) -> int``.
 _COMMANDS = {"inspect": "dhtorch.cli.inspect", "report": "dhtorch.experiments.report"}
@@ -334,12 +335,22 @@ def _run_hydra(argv: list[str]) -> int:
             folder = _resolve_output_folder(cfg, overrides, sweep)
             overrides = [o for o in overrides if not o.startswith("output=")] + [f"output={quote_value(str(folder))}"]
             resume_command = _format_resume_command(argv, folder)
-            with file_lock.acquire_file_lock(folder.parent / f".{folder.name}.lock", f"output: {folder}"):
+            with open_output_folder(folder, "output") as output:
                 if sweep:
+                    _check_sweep_files(output)
                     return _run_sweep(engine, overrides, folder, resume_command, show_traceback=cfg.traceback)
                 return _run_single(engine, overrides, resume_command)
     except (HydraException, OmegaConfBaseException) as error:
         return _report_failure(error)
+
+
+def _check_sweep_files(output: OutputFolder) -> None:
+    """Raise FileExistsError for a link or a foreign file where a sweep writes beside its jobs."""
+    table, settings = output.path / "sweep.csv", output.path / "multirun.yaml"
+    if output.is_unlisted and any(output.path.glob("*/result.json")):  # of an older version, without a manifest
+        output.adopt([table, settings])
+    output.check([table])
+    output.claim(settings)  # written by Hydra
 
 
 def _run_single(engine: Any, overrides: Sequence[str], resume_command: str) -> int:

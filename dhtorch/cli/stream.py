@@ -18,6 +18,7 @@ from dhtorch.pipeline.spec import Trace
 from dhtorch.pipeline.stream import Stream
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import open_output_folder
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 Row = dict[str, Any]
@@ -36,8 +37,12 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
         files.set_opencv_threads(settings["threads"])
-    scenes = [stream_scene(scene, parts["method"], settings, progress=progress) for scene in scenes_of(parts["data"])]
-    path = storage.write_json(Path(settings["output"]) / "stream.json", {"scenes": scenes})
+    path = Path(settings["output"]) / "stream.json"
+    with open_output_folder(path.parent, "output") as folder:
+        folder.check([path])
+        sources = scenes_of(parts["data"])
+        scenes = [stream_scene(scene, parts["method"], settings, progress=progress) for scene in sources]
+        storage.write_json(path, {"scenes": scenes})
     print("\n".join(_format_summary(scene) for scene in scenes))
     print(f"wrote\n  {path}")
     return 0

@@ -18,9 +18,10 @@ from typing import Any
 
 from dhtorch.runtime import console
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import PRIVATE_FOLDER
 
 #: Folder of the progress files, below the sweep's folder.
-_NOTES_FOLDER = ".progress"
+_NOTES_FOLDER = Path(PRIVATE_FOLDER, "progress")
 
 #: Seconds between two updates of the bar, and of a job's file.
 _PAUSE_S = 0.25

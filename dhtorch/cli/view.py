@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 import sys
@@ -21,6 +22,7 @@ from dhtorch.experiments.protocol import Progress, Settings
 from dhtorch.integrate.sweeps import DenseSweep
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import open_output_file
 from dhtorch.viz.viewer import again, html, points, rrd
 from dhtorch.viz.viewer.exhibit import Exhibit
 
@@ -43,16 +45,29 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
     target = None if settings["result"] is None else Path(settings["result"])
-    if target is not None and target.suffix == ".ply":
-        scene = points.read_ply_exhibit(target)
-    elif target is not None:
-        scene = _load_result_exhibit(target, settings, progress)
-    else:
-        scene = _compute_exhibit(parts, settings, lambda _name: settings["holdout"]["cutoff"], progress)
     folder = Path(settings["output"]) if target is None else target if target.is_dir() else target.parent
-    for line in _show_exhibit(scene, page, recording, folder):
-        print(line)
+    notes: list[str] = []
+    if page is None and recording is None:
+        page, recording, notes = _choose_file(folder)
+    with contextlib.ExitStack() as stack:
+        for option, name in (("html", page), ("save", recording)):
+            if name is not None:
+                stack.enter_context(open_output_file(name, option))
+        scene = _make_scene(target, settings, parts, progress)
+        for line in [*notes, *_show_exhibit(scene, page, recording)]:
+            print(line)
     return 0
+
+
+def _make_scene(
+    target: Path | None, settings: Mapping[str, Any], parts: Mapping[str, Any], progress: Progress
+) -> Exhibit:
+    """The exhibit of a result, of a PLY file, or, without ``target``, of the recording and method of the settings."""
+    if target is not None and target.suffix == ".ply":
+        return points.read_ply_exhibit(target)
+    if target is not None:
+        return _load_result_exhibit(target, settings, progress)
+    return _compute_exhibit(parts, settings, lambda _name: settings["holdout"]["cutoff"], progress)
 
 
 def _load_result_exhibit(target: Path, settings: Mapping[str, Any], progress: Progress) -> Exhibit:
@@ -118,18 +133,20 @@ def _select_item(items: Sequence[Any], wanted: str | int | None, name: Any) -> A
     raise ValueError(f"scene: found {wanted!r}, expected a number below {len(names)} or one of {', '.join(names[:12])}")
 
 
-def _show_exhibit(scene: Exhibit, page: str | None, save: str | None, folder: Path) -> list[str]:
+def _choose_file(folder: Path) -> tuple[str | None, str | None, list[str]]:
+    """Page, recording and notes where the options name no file; no file where Rerun's viewer can open."""
+    if importlib.util.find_spec("rerun") is None:
+        note = "Rerun is not installed (pip install 'dhtorch[view]'): wrote a page instead"
+        return str(folder / "view.html"), None, [note]
+    return None, None if _has_screen() else str(folder / "view.rrd"), []
+
+
+def _show_exhibit(scene: Exhibit, page: str | None, save: str | None) -> list[str]:
     """Write the page or recording, or open the viewer -> printed lines."""
     lines = []
     if page is None and save is None:
-        if importlib.util.find_spec("rerun") is None:
-            page = str(folder / "view.html")
-            lines.append("Rerun is not installed (pip install 'dhtorch[view]'): wrote a page instead")
-        elif not _has_screen():
-            save = str(folder / "view.rrd")
-        else:
-            rrd.spawn_viewer(scene)
-            lines.append(f"{scene.name}: {format_count(len(scene.shots), 'pair')} in Rerun's viewer")
+        rrd.spawn_viewer(scene)
+        lines.append(f"{scene.name}: {format_count(len(scene.shots), 'pair')} in Rerun's viewer")
     if page is not None:
         path = html.write_viewer_page(Path(page), scene)
         lines.append(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): open it in any browser")

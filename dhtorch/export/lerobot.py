@@ -215,6 +215,13 @@ def make_info(
     }
 
 
+#: LeRobot version → names below ``meta/`` of the files that :func:`write_lerobot_meta` writes.
+META_FILES = {
+    2: ("episodes.jsonl", "tasks.jsonl", "episodes_stats.jsonl", "stats.json", "info.json"),
+    3: ("episodes/chunk-000/file-000.parquet", "tasks.parquet", "stats.json", "info.json"),
+}
+
+
 def write_lerobot_meta(
     root: Path,
     version: int,

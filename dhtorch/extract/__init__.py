@@ -23,9 +23,10 @@ from dhtorch.extract import columns, engines, plan, shards
 from dhtorch.extract.dataset import RowDataset, common_map_hw
 from dhtorch.extract.features import FeatureTable, JoinedDataset
 from dhtorch.pipeline.method import Method
-from dhtorch.runtime import file_lock, storage
 from dhtorch.runtime import results as result_files
+from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import OutputFolder, open_output_folder
 from dhtorch.transforms import TOKEN_CHANNELS, DenseMaps, schema, token_grid
 from dhtorch.transforms.extend_depth import ON_ERROR_CHOICES
 from dhtorch.transforms.tokens import FIT_MODES
@@ -95,10 +96,9 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
     scenes = scenes_of(parts["data"])
     extraction_plan = plan.make_plan(scenes, options.gap, parts["method"].views)
     rows = _make_rows(scenes, extraction_plan, parts["method"], settings["seed"], options)
-    folder = _make_folder(settings["out"])
-    with file_lock.acquire_file_lock(folder / ".lock", f"out: {folder}"):
-        shards.remove_unfinished(folder)  # left by an interrupted run
-        return _write_shards(settings, options, extraction_plan, rows, folder, progress)
+    folder = Path(str(settings["out"])).expanduser()
+    with open_output_folder(folder, "out") as output:
+        return _write_shards(settings, options, extraction_plan, rows, output, progress)
 
 
 def _write_shards(
@@ -106,13 +106,16 @@ def _write_shards(
     options: ExtractOptions,
     extraction_plan: plan.ExtractionPlan,
     rows: RowDataset,
-    folder: Path,
+    output: OutputFolder,
     progress: Callable[..., Iterable[Any]],
 ) -> int:
     """Compute and write the missing shards; returns the exit code."""
-    shared = _shared_metadata(settings, options, extraction_plan, rows)
+    folder, shared = output.path, _shared_metadata(settings, options, extraction_plan, rows)
     all_shards = extraction_plan.shards(options.shard_rows)
     done = shards.find_finished_shards(folder, shared)
+    if output.is_unlisted:  # of an older version
+        output.adopt(folder / name for name in done)
+    output.check(folder / shard.name for shard in all_shards if shard.name not in done)
     counts = dict(done)
     todo = [shard for shard in all_shards if shard.name not in done]
     positions = [position for shard in todo for position in shard.rows]
@@ -193,15 +196,6 @@ def _shared_metadata(
         }
     )
     return metadata
-
-
-def _make_folder(out: str) -> Path:
-    """Option ``out`` -> folder of the shards, created if missing."""
-    folder = Path(str(out)).expanduser()
-    if folder.exists() and not folder.is_dir():
-        raise NotADirectoryError(f"out: {folder} is a file, expected a folder or a new path")
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 def _print_summary(folder: Path, counts: Mapping[str, Counter[str]], n_before: int, complaints: Sequence[str]) -> None:

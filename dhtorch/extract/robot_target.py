@@ -163,9 +163,8 @@ class LeRobotTarget:
         task_indices: dict[int, None] = {}
         tasks = self._tasks(before)
         path = self.file(k)
-        path.parent.mkdir(parents=True, exist_ok=True)
         length, writer = 0, None
-        with storage.write_atomically(path, path.with_name(f".{path.name}.tmp")) as sink, ExitStack() as closing:
+        with storage.write_atomically(path) as sink, ExitStack() as closing:
             for table in self._join_rows(k, start, parts, tallies, tasks):
                 if writer is None:
                     layout = lerobot.make_arrow_schema(self.features(table.column_names), _column_types(table), {})
@@ -332,6 +331,11 @@ class LeRobotTarget:
         return {key: (path, clip._replace(chunk=chunk, file=file)) for key, (path, clip) in clips.items()}
 
     # ---------------------------------------------------------------------------------------------------- the whole
+
+    def planned_files(self, missing: Sequence[int]) -> list[Path]:
+        """As :meth:`DatasetTarget.planned_files`."""
+        names = (*lerobot.META_FILES[self.version], "source_episodes.jsonl", "intrinsics.json")
+        return [*(self.file(k) for k in missing), *(self.root / "meta" / name for name in names)]
 
     def finish(self, owns: Sequence[Row]) -> None:
         """As :meth:`DatasetTarget.finish`."""

@@ -32,7 +32,6 @@ _MAX_GROUP_ROWS = 16
 _MAX_GROUP_BYTES = 1 << 24
 
 _PATTERN = "shard-*.parquet"
-_UNFINISHED = ".tmp"
 
 
 def write_shard(
@@ -54,9 +53,8 @@ def write_shard(
     layout = arrow_schema(wanted, {_SHARED_METADATA_KEY.decode(): storage.dump_strict_json(shared)})
     problems = shared["codes"]["problem"]
     counts: Counter[str] = Counter()
-    unfinished = folder / f".{shard.name}{_UNFINISHED}"
     with (
-        storage.write_atomically(folder / shard.name, unfinished) as file,
+        storage.write_atomically(folder / shard.name) as file,
         parquet.ParquetWriter(file, layout, compression="zstd") as writer,
     ):
         for group in _iter_groups(rows, _rows_per_group(wanted)):
@@ -76,12 +74,6 @@ def _rows_per_group(wanted: Mapping[str, Column]) -> int:
 def shard_files(folder: Path) -> list[Path]:
     """Folder -> its shards, in the order of their rows."""
     return sorted(folder.glob(_PATTERN))
-
-
-def remove_unfinished(folder: Path) -> None:
-    """Remove the unfinished files of an interrupted writer. No other process may be writing in the folder."""
-    for file in folder.glob(f".{_PATTERN}{_UNFINISHED}"):
-        file.unlink(missing_ok=True)
 
 
 def find_finished_shards(folder: Path, shared: Mapping[str, Any]) -> dict[str, Counter[str]]:

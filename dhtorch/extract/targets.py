@@ -34,6 +34,9 @@ class DatasetTarget(Protocol):
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
         """Write the ``k``-th episode from the shards of its cameras; ``before``: summaries of the earlier episodes."""
 
+    def planned_files(self, missing: Sequence[int]) -> list[Path]:
+        """Files that the episodes ``missing`` and the metadata of the data set are written to, as far as known."""
+
     def finish(self, owns: Sequence[Row]) -> None:
         """Write the metadata of the data set; ``owns``: summaries of all episodes."""
 

@@ -33,6 +33,7 @@ from dhtorch.pipeline.pair import merge
 from dhtorch.records import Camera, Frame
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import open_output_folder
 from dhtorch.viz.plots import append_cutoff
 
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
@@ -44,6 +45,18 @@ _MIN_VOXEL_M, _MAX_VOXEL_M = 0.005, 0.2
 
 #: Option groups whose chosen names are stored in the result.
 _CONFIG_GROUPS = ("method", "data", "pairs")
+
+
+#: Files of a scene, below its folder.
+_MAP_FILES = (
+    "map.ply",
+    "map.glb",
+    "points.ply",
+    "map.png",
+    "colmap/cameras.txt",
+    "colmap/images.txt",
+    "colmap/points3D.txt",
+)
 
 
 @dataclass(frozen=True)
@@ -85,6 +98,15 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
         data_files.set_opencv_threads(settings["threads"])
     sources = scenes_of(parts["data"])
     folder = Path(settings["output"])
+    with open_output_folder(folder, "output") as output:
+        output.check([folder / "result.json", *(folder / each.name / name for each in sources for name in _MAP_FILES)])
+        return _write_maps(sources, folder, settings, parts, progress)
+
+
+def _write_maps(
+    sources: Sequence[Scene], folder: Path, settings: Mapping[str, Any], parts: Mapping[str, Any], progress: Progress
+) -> int:
+    """Map the scenes, write their files and the result; returns the exit code."""
     began = time.perf_counter()
     scene_rows: list[Row] = []
     rows: list[Row] = []
@@ -241,9 +263,7 @@ def write_mapped_scene(folder: Path, scene: MappedScene, settings: Mapping[str, 
     _write_colmap(folder / "colmap", scene)
     title = append_cutoff(scene.recording.name, scene.row["cutoff_m"])
     draw_map(folder / "map.png", surface, list(scene.places.poses.values()), up, voxel=voxel, title=title)
-    files = ["map.ply", "map.glb", "points.ply", "map.png"]
-    files += [f"colmap/{name}" for name in ("cameras.txt", "images.txt", "points3D.txt")]
-    return [folder / name for name in files]
+    return [folder / name for name in _MAP_FILES]
 
 
 def write_surface(path: Path, surface: integrate.Surface, axes: str, up: Sequence[float]) -> list[str]:

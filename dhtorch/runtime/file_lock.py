@@ -7,14 +7,13 @@ file (process, host, time) only serves the error message.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-
-from dhtorch.runtime.storage import dump_strict_json, parse_strict_json
 
 fcntl: ModuleType | None
 try:
@@ -41,7 +40,6 @@ def acquire_file_lock(file: str | Path, what: str) -> Iterator[None]:
     if fcntl is None:
         yield
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
     if path in _locked_paths:
         raise BlockingIOError(f"{what}: found this process already writing there, expected one writer")
     handle = _open_locked(path, what)
@@ -49,7 +47,7 @@ def acquire_file_lock(file: str | Path, what: str) -> Iterator[None]:
     try:
         os.write(
             handle,
-            dump_strict_json({"process": os.getpid(), "host": socket.gethostname(), "since": time.time()}).encode(),
+            json.dumps({"process": os.getpid(), "host": socket.gethostname(), "since": time.time()}).encode(),
         )
         yield
     finally:
@@ -62,7 +60,11 @@ def _open_locked(path: Path, what: str) -> int:
     """Open and lock the file at ``path`` -> descriptor; retries if the file was replaced meanwhile."""
     assert fcntl is not None
     while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+        except FileNotFoundError:  # its owner removed the folder meanwhile
+            continue
         try:
             fcntl.lockf(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if path.exists() and path.stat().st_ino == os.fstat(handle).st_ino:
@@ -80,8 +82,9 @@ def _open_locked(path: Path, what: str) -> int:
 
 def _describe_owner(text: bytes) -> str:
     try:
-        record = parse_strict_json(text.decode())
+        record = json.loads(text.decode())
         age = max(0, round(time.time() - float(record["since"])))
-        return f"process {int(record['process'])} on {record['host']} (for {age} s)"
-    except (ValueError, KeyError, TypeError):
-        return "another process"
+        owner = f"another dhtorch process ({int(record['process'])} on {record['host']}, for {age} s)"
+        return " ".join(owner.split())
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
+        return "another dhtorch process"

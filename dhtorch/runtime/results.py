@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from dhtorch.runtime import code_dependencies
+from dhtorch.runtime.output_folder import is_private
 from dhtorch.runtime.storage import dump_strict_json, parse_strict_json, replace_file, to_strict_json
 
 _RESULT_SCHEMA = 1
@@ -232,7 +233,8 @@ def list_files_below(roots: Iterable[Path | None]) -> dict[str, Path]:
     """Name → path of all files below folders (or single files); names are independent of the folders' locations."""
     files: dict[str, Path] = {}
     for k, root in enumerate(dict.fromkeys(root for root in roots if root is not None)):
-        paths = [p for p in root.rglob("*") if p.is_file()] if root.is_dir() else [root]
+        below = root.rglob("*") if root.is_dir() else [root]
+        paths = [p for p in below if p == root or (p.is_file() and not is_private(p.relative_to(root)))]
         files |= {f"{k}/{p.relative_to(root).as_posix() if p != root else p.name}": p for p in paths}
     return files
 

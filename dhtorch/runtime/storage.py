@@ -15,11 +15,16 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
+from dhtorch.runtime import output_folder
+
 #: Maximum nesting of lists and objects in a file, as they are traversed by recursion.
 _MAX_NESTING = 64
 
-#: Suffix of a file while it is written.
+#: Suffix of a file while it is written outside of an open output folder.
 _UNFINISHED_SUFFIX = ".tmp"
+
+#: Permissions of a written file: readable by all, writable by its owner.
+_FILE_MODE = 0o644
 
 
 def to_strict_json(value: Any) -> Any:
@@ -98,29 +103,53 @@ def _add_path_to_errors(path: Path) -> Iterator[None]:
 def replace_file(path: str | Path, content: bytes) -> Path:
     """Write a file atomically: ``path`` holds either its old content or all of the new content."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED_SUFFIX, dir=path.parent)
-    os.close(handle)
-    with write_atomically(path, Path(name)) as file:
+    with write_atomically(path) as file:
         file.write(content)
-        Path(name).chmod(0o644)
-    _sync_folder(path.parent)
     return path
 
 
 @contextlib.contextmanager
-def write_atomically(path: Path, unfinished: Path) -> Iterator[IO[bytes]]:
-    """Context with the open file ``unfinished`` (in the folder of ``path``): renamed to ``path`` at the end, removed if
-    the block fails."""
+def write_atomically(path: str | Path) -> Iterator[IO[bytes]]:
+    """Context with an open file, which gets the name ``path`` at the end; nothing is left if the block fails."""
+    path = Path(path)
+    with replace_at_end(path) as unfinished, _add_path_to_errors(path), unfinished.open("wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def replace_at_end(path: str | Path) -> Iterator[Path]:
+    """Context with a path to write to: the file gets the name ``path`` at the end; nothing is left if the block fails.
+
+    In an output folder that is open (:mod:`dhtorch.runtime.output_folder`) the file is entered in its manifest.
+
+    Raises:
+        FileExistsError: a link or a foreign file of an open output folder is in the way.
+    """
+    path = Path(path)
+    folder = output_folder.find_output_folder(path)
+    if folder is not None:
+        folder.check([path])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = _name_unfinished(path) if folder is None else folder.new_unfinished(path.suffix)
     try:
-        with _add_path_to_errors(path), unfinished.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
+        yield unfinished
+        unfinished.chmod(_FILE_MODE)
+        if folder is not None:
+            folder.record(path, unfinished)
         unfinished.replace(path)
     except BaseException:
         unfinished.unlink(missing_ok=True)
         raise
+    _sync_folder(path.parent)
+
+
+def _name_unfinished(path: Path) -> Path:
+    """A new file beside ``path``."""
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=_UNFINISHED_SUFFIX, dir=path.parent)
+    os.close(handle)
+    return Path(name)
 
 
 def copy_file(source: str | Path, path: str | Path) -> Path:
@@ -128,26 +157,16 @@ def copy_file(source: str | Path, path: str | Path) -> Path:
     source, path = Path(source), Path(path)
     if not source.is_file() or (path.is_file() and path.stat().st_size == source.stat().st_size):
         return path
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with (
-        source.open("rb") as source_file,
-        write_atomically(path, path.with_name(f".{path.name}.copy{_UNFINISHED_SUFFIX}")) as file,
-    ):
+    with source.open("rb") as source_file, write_atomically(path) as file:
         shutil.copyfileobj(source_file, file)
     return path
 
 
-def remove_unfinished_files(path: str | Path) -> None:
-    """Remove unfinished files left by a killed writer of ``path``. No other process may be writing ``path``."""
-    path = Path(path)
-    for unfinished in path.parent.glob(f".{path.name}.*{_UNFINISHED_SUFFIX}"):
-        unfinished.unlink(missing_ok=True)
-
-
 def has_files(folder: Path) -> bool:
-    """Whether a folder or its subfolders hold a file, unfinished files excluded."""
+    """Whether a folder or its subfolders hold a file, unfinished files and dhtorch's own records excluded."""
     inside = (entry for entry in folder.rglob("*") if entry.is_symlink() or not entry.is_dir())
-    return any(not (f.name.startswith(".") and f.name.endswith(_UNFINISHED_SUFFIX)) for f in inside)
+    files = (entry for entry in inside if not output_folder.is_private(entry.relative_to(folder)))
+    return any(not (f.name.startswith(".") and f.name.endswith(_UNFINISHED_SUFFIX)) for f in files)
 
 
 def _reject_constant(word: str) -> None:

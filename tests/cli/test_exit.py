@@ -130,7 +130,7 @@ def test_one_writer_at_a_time_and_dead_ones_block_nobody(tmp_path: Path) -> None
     other.start()
     try:
         assert ready.wait(30)
-        match = rf"out: x: found process {other.pid} on .* \(for \d+ s\) writing there, expected one writer at a time"
+        match = rf"out: x: found another dhtorch process \({other.pid} on .*, for \d+ s\) writing there, expected one writer"
         with pytest.raises(BlockingIOError, match=match), file_lock.acquire_file_lock(file, "out: x"):
             pass
     finally:
@@ -143,10 +143,10 @@ def test_one_writer_at_a_time_and_dead_ones_block_nobody(tmp_path: Path) -> None
 
 
 def test_a_second_sweep_in_a_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with file_lock.acquire_file_lock(tmp_path / ".out.lock", "x"):
+    with file_lock.acquire_file_lock(tmp_path / "out" / ".dhtorch" / "lock", "x"):
         assert run.main([f"output={tmp_path}/out"]) == 2
     assert "expected one writer" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+    assert not list((tmp_path / "out").rglob("*.json"))
 
 
 def test_a_full_disk_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -225,33 +225,13 @@ def test_the_same_rows_are_the_same_bytes(tmp_path):
 def test_a_shard_that_is_not_finished_leaves_nothing(tmp_path):
     def broken():
         yield row(0)
-        assert [p.name for p in tmp_path.iterdir()] == [".shard-00000.parquet.tmp"], (
-            "not under its name before it is whole"
-        )
+        (unfinished,) = tmp_path.iterdir()
+        assert unfinished.name.startswith(".shard-00000.parquet."), "not under its name before it is whole"
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         shards.write_shard(tmp_path, ShardSpec(0, 1, range(2)), broken(), columns.feature_columns(N, P), SHARED)
     assert not list(tmp_path.iterdir())
-
-
-def test_what_a_killed_writer_left_is_cleared(tmp_path):
-    for name in (
-        ".shard-00003.parquet.tmp",
-        "shard-00001.parquet",
-        ".other.tmp",
-        "shard-00001.parquet.tmp",
-        ".shard-x",
-    ):
-        (tmp_path / name).write_bytes(b"PAR1")
-    shards.remove_unfinished(tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} == {
-        "shard-00001.parquet",
-        ".other.tmp",
-        "shard-00001.parquet.tmp",
-        ".shard-x",
-    }
-    assert [p.name for p in shards.shard_files(tmp_path)] == ["shard-00001.parquet"]
 
 
 def test_finished_shards_are_whole_and_of_this_extraction(tmp_path):

@@ -7,10 +7,13 @@ import numpy as np
 from PIL import Image
 from pyarrow import parquet
 
+from dhtorch.runtime.output_folder import is_private
+
 
 def read_files(root):
-    """{path below the folder: content} of all files."""
-    return {str(p.relative_to(root)): p.read_bytes() for p in sorted(Path(root).rglob("*")) if p.is_file()}
+    """{path below the folder: content} of all files, dhtorch's private folder excluded."""
+    files = [p for p in sorted(Path(root).rglob("*")) if p.is_file() and not is_private(p.relative_to(root))]
+    return {str(p.relative_to(root)): p.read_bytes() for p in files}
 
 
 def read_rows(root):

@@ -23,6 +23,7 @@ from dhtorch.experiments.report.reading import Result, describe_result
 from dhtorch.experiments.report.tables import INTERVAL_LABEL, ReportTable, generic_tables
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import HELP_EPILOG, format_count, get_verbosity, progress
+from dhtorch.runtime.output_folder import open_output_folder
 
 #: Largest number of rows that the brief table shows; with more, only the summary.
 _MAX_BRIEF_ROWS = 8
@@ -80,9 +81,10 @@ def print_sweep(results: Sequence[Result], folder: Path, *, markdown: bool = Fal
     else:
         text.print_table(table)
     try:
-        message = f"wrote {jobs.write_jobs_csv(folder / 'sweep.csv', results)}"
-    except OSError as error:  # a read-only folder
-        message = f"{folder}: no sweep.csv written ({error.strerror})"
+        with open_output_folder(folder, "folder"):
+            message = f"wrote {jobs.write_jobs_csv(folder / 'sweep.csv', results)}"
+    except OSError as error:  # a read-only folder, a sweep that is running, a foreign file
+        message = f"{folder}: no sweep.csv written ({error.strerror or error})"
     if not markdown:
         print(message)
 

@@ -14,6 +14,7 @@ from dhtorch.experiments.report.reading import Result
 from dhtorch.experiments.report.tables import INTERVAL_LABEL, PUBLISHED_LABEL, ReportTable, full_tables, generic_tables
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
+from dhtorch.runtime.output_folder import open_output_file
 from dhtorch.viz.plots import LegendKey, render_inline_svg
 from dhtorch.viz.plots.colours import to_css_colour
 from dhtorch.viz.plots.document import build_document
@@ -69,7 +70,8 @@ def write_report(path: Path, results: Sequence[Result]) -> Path:
         raise ValueError(f"{path}: found {path.suffix or 'no ending'}, expected a name that ends in .html")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: folder {path.parent} does not exist")
-    return storage.replace_file(path, render_report(results).encode("utf-8"))
+    with open_output_file(path, "--html"):
+        return storage.replace_file(path, render_report(results).encode("utf-8"))
 
 
 def _section_ids(results: Sequence[Result]) -> list[str]:
