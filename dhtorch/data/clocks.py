@@ -18,6 +18,23 @@ def nearest_stamps(times: np.ndarray, others: np.ndarray, limit: float) -> np.nd
     return np.where(np.abs(others[nearest] - times) <= limit, nearest, -1)
 
 
+def pair_stamps(times: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Pairs (n, 2) of indices of mutually nearest stamps of two streams, in any order, within half the shorter period.
+
+    The period is the median step; where neither stream has two stamps, the limit is half a second. Pairs are sorted by
+    the first stream's stamps.
+    """
+    order, other_order = np.argsort(times, kind="stable"), np.argsort(others, kind="stable")
+    a, b = times[order], others[other_order]
+    if not (len(a) and len(b)):
+        return np.empty((0, 2), np.int64)
+    steps = [float(np.median(step)) for step in (np.diff(a), np.diff(b)) if len(step)]
+    limit = 0.5 * min([step for step in steps if step > 0], default=1.0)
+    nearest, back = nearest_stamps(a, b, limit), nearest_stamps(b, a, limit)
+    paired = np.flatnonzero((nearest >= 0) & (back[nearest] == np.arange(len(a))))
+    return np.stack((order[paired], other_order[nearest[paired]]), -1)
+
+
 def interpolate_poses(
     times: np.ndarray,
     others: np.ndarray,  # stamps of the poses

@@ -8,24 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Final
 
-import torch
-from torch import Tensor
-
+from dhtorch.data.orientation import DEPTH_TURNS, orient_recording
 from dhtorch.data.pose_convention import parse_pose_convention
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit, parse_unit
 from dhtorch.records import Frame
-
-#: How stored depth (…, h, w) must be turned to lie over its picture, counter-clockwise in degrees, or flipped.
-DEPTH_TURNS: Final[dict[str, Callable[[Tensor], Tensor]]] = {
-    "90": lambda depth: torch.rot90(depth, 1, (-2, -1)),
-    "180": lambda depth: torch.rot90(depth, 2, (-2, -1)),
-    "270": lambda depth: torch.rot90(depth, 3, (-2, -1)),
-    "left_right": lambda depth: depth.flip(-1),
-    "upside_down": lambda depth: depth.flip(-2),
-}
 
 
 @dataclass(frozen=True)
@@ -62,10 +50,11 @@ class Corrections:
         """The recording with these corrections.
 
         Raises:
+            FormatError: pictures and depth of different orientations, none of which explains the other.
             ValueError: a lag that leaves no frame.
         """
-        if self.depth_turn is not None:
-            recording = replace(recording, load=_TurnedDepth(recording.load, str(self.depth_turn)))
+        turn = None if self.depth_turn is None else DEPTH_TURNS[str(self.depth_turn)]
+        recording = orient_recording(recording, turn)
         if self.depth_unit is not None:
             metres = parse_unit(self.depth_unit)
             read_as = 1.0 if recording.depth_unit is None else recording.depth_unit.metres
@@ -89,20 +78,6 @@ class _ScaledDepth:
     def __call__(self, i: int) -> Frame:
         frame = self.load(i)
         return frame.replace(depth=frame.depth * self.factor)
-
-
-@dataclass(frozen=True)
-class _TurnedDepth:
-    """Position → frame with its depth map (and confidence) turned; a turn by 90° keeps the stored size if it is square,
-    else the map's height and width are exchanged."""
-
-    load: Callable[[int], Frame]
-    turn: str
-
-    def __call__(self, i: int) -> Frame:
-        frame, turn = self.load(i), DEPTH_TURNS[self.turn]
-        conf = None if frame.conf is None else turn(frame.conf)
-        return frame.replace(depth=turn(frame.depth), conf=conf)
 
 
 @dataclass(frozen=True)

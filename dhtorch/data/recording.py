@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.data.io.safe_open import restrict_links
-from dhtorch.data.orientation import StoredSizes, check_orientation
+from dhtorch.data.stored_sizes import StoredSizes, check_orientation
 from dhtorch.data.units import DepthUnit
 from dhtorch.geometry.no_depth import clear_no_depth
 from dhtorch.records import Frame, Pose

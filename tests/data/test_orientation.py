@@ -1,18 +1,24 @@
-"""Orientation of depth beside its picture: symmetries, and their scores on real captures and the built-in room."""
+"""Orientation of depth and pictures: symmetries and their scores, what files state, and recordings made consistent."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from dhtorch import data
-from dhtorch.data import orientation
+from dhtorch.data import FormatError, convert, orientation
+from dhtorch.data.codecs import video
+from dhtorch.data.io import decode as files
+from dhtorch.data.stored_sizes import describe_mismatch
 from dhtorch.synthetic import SyntheticRoom
+from dhtorch.testing.mp4 import write_video
 
 ROOT = os.environ.get("DHTORCH_DATA")
 #: Capture → least number of its six frames in which the stored orientation wins alone.
@@ -70,3 +76,176 @@ def test_a_map_without_edges_decides_nothing() -> None:
     selected, scores = orientation.select_symmetry([(image, torch.ones(60, 80)), (image, torch.zeros(60, 80))])
     assert selected is None
     assert torch.equal(scores, torch.zeros(8, dtype=torch.float64))
+
+
+# ------------------------------------------------------------------------------------------------------- recordings
+
+HW = (96, 128)
+
+
+@pytest.fixture(scope="module")
+def room() -> SyntheticRoom:
+    return SyntheticRoom(n_frames=5, hw=HW, lidar="exact", supersample=1)
+
+
+def write_folder(
+    root: Path, room: SyntheticRoom, *, picture: int = 0, depth: int = 0, K: int = 0, exif: int = 1, kind: str = "png"
+) -> None:
+    """The room in numbered folders with pictures, depth and K under a symmetry each, and an EXIF orientation."""
+    for i, frame in enumerate(room):
+        image = Image.fromarray(orientation.apply_symmetry(frame.image[0], picture).permute(1, 2, 0).numpy())
+        tags = Image.Exif()
+        if exif != 1:
+            tags[0x0112] = exif
+        (root / "rgb").mkdir(parents=True, exist_ok=True)
+        image.save(root / "rgb" / f"{i}.{kind}", exif=tags, **({"quality": 95} if kind == "jpg" else {}))
+        code = orientation.apply_symmetry((frame.depth[0] * 1000).round(), depth).numpy().astype(np.uint16)
+        (root / "depth").mkdir(exist_ok=True)
+        cv2.imwrite(str(root / "depth" / f"{i}.png"), code)
+    camera = convert.rot90_camera(room[0].camera, HW, K)
+    (fx, fy), (cx, cy) = camera.f[0].tolist(), camera.c[0].tolist()
+    (root / "K.txt").write_text(f"{fx} 0 {cx}\n0 {fy} {cy}\n0 0 1\n")
+
+
+def same(recording: data.Recording, room: SyntheticRoom, k: int, grey: float = 0.0) -> None:
+    """Picture, depth and K are those of the room under one symmetry."""
+    for got, true in zip(recording, room, strict=True):
+        picture = orientation.apply_symmetry(true.image[0], k)
+        assert got.image.shape[1:] == picture.shape
+        assert float((got.image[0].float() - picture.float()).abs().mean()) <= grey
+        depth = orientation.apply_symmetry(true.depth[0], k)
+        torch.testing.assert_close(got.depth[0], depth, atol=6e-4, rtol=0)
+        torch.testing.assert_close(got.camera.c, convert.rot90_camera(true.camera, HW, k).c, atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("kind", ["png", "jpg"])
+@pytest.mark.parametrize(("exif", "upright"), [(6, 1), (8, 3)])
+def test_stored_pictures_are_turned_as_exif_states_where_depth_is_upright(
+    tmp_path: Path, room: SyntheticRoom, exif: int, upright: int, kind: str
+) -> None:
+    write_folder(tmp_path, room, depth=upright, K=upright, exif=exif, kind=kind)
+    recording = data.open(tmp_path)
+    same(recording, room, upright, 6.0 if kind == "jpg" else 0.0)
+    assert any(f"EXIF orientation {exif}: pictures are turned" in line for line in recording.report)
+    assert recording.stored is None
+
+
+@pytest.mark.parametrize("exif", [3, 6, 8])
+def test_stored_pictures_stay_where_depth_is_stored_like_them(tmp_path: Path, room: SyntheticRoom, exif: int) -> None:
+    write_folder(tmp_path, room, exif=exif)
+    recording = data.open(tmp_path)
+    same(recording, room, 0)
+    assert any(f"EXIF orientation {exif}: pictures are read as stored" in line for line in recording.report)
+
+
+@pytest.mark.parametrize(("exif", "upright"), [(2, 4), (3, 2), (4, 6)])
+def test_edges_decide_where_sizes_do_not(tmp_path: Path, room: SyntheticRoom, exif: int, upright: int) -> None:
+    write_folder(tmp_path, room, depth=upright, exif=exif)
+    recording = data.open(tmp_path)
+    for got, true in zip(recording, room, strict=True):
+        assert torch.equal(got.image[0], orientation.apply_symmetry(true.image[0], upright))
+        torch.testing.assert_close(got.depth[0], orientation.apply_symmetry(true.depth[0], upright), atol=6e-4, rtol=0)
+
+
+def test_a_tag_that_depth_contradicts_is_refused(tmp_path: Path, room: SyntheticRoom) -> None:
+    write_folder(tmp_path, room, depth=3, K=3, exif=6)
+    with pytest.raises(FormatError, match=r"orientation: found EXIF orientation 6, but edges .*depth_turn"):
+        data.open(tmp_path)
+
+
+def test_pictures_of_other_tags_than_the_first_are_refused(tmp_path: Path, room: SyntheticRoom) -> None:
+    write_folder(tmp_path, room)
+    Image.open(tmp_path / "rgb" / "1.png").save(tmp_path / "rgb" / "1.png", exif=_tag(6))
+    recording = data.open(tmp_path)
+    with pytest.raises(FormatError, match=r"1.png: EXIF orientation: found 6, expected 1, as the first picture has"):
+        recording[1]
+
+
+def _tag(value: int) -> Image.Exif:
+    tags = Image.Exif()
+    tags[0x0112] = value
+    return tags
+
+
+@pytest.mark.parametrize("k", [1, 3, 5, 7])
+def test_portrait_depth_is_turned_back_where_K_is_that_of_the_picture(
+    tmp_path: Path, room: SyntheticRoom, k: int
+) -> None:
+    write_folder(tmp_path, room, depth=k)
+    recording = data.open(tmp_path)
+    same(recording, room, 0)
+    assert any("orientation: depth 96x128 (portrait) beside pictures 128x96" in line for line in recording.report)
+
+
+@pytest.mark.parametrize("k", [1, 3])
+def test_pictures_are_turned_back_where_K_is_that_of_depth(tmp_path: Path, room: SyntheticRoom, k: int) -> None:
+    write_folder(tmp_path, room, picture=k)
+    recording = data.open(tmp_path)
+    same(recording, room, 0)
+    assert any("pictures are turned" in line for line in recording.report)
+
+
+def test_portrait_depth_without_edges_is_refused_unless_an_option_decides(tmp_path: Path, room: SyntheticRoom) -> None:
+    write_folder(tmp_path, room, depth=1)
+    for file in (tmp_path / "depth").iterdir():
+        cv2.imwrite(str(file), np.full((128, 96), 2000, np.uint16))
+    with pytest.raises(FormatError, match=r"orientation: found depth 96x128 \(portrait\) .*depth_turn=90 or 270"):
+        data.open(tmp_path)
+    assert data.open(tmp_path, depth_turn=90)[0].depth.shape[1:] == HW
+
+
+@pytest.mark.parametrize(("turn", "k"), [("90", 1), (180, 2), ("270", 3), ("left_right", 4), ("upside_down", 6)])
+def test_option_depth_turn_undoes_a_turn(tmp_path: Path, room: SyntheticRoom, turn: object, k: int) -> None:
+    write_folder(tmp_path, room, depth=k)
+    same(data.open(tmp_path, depth_turn=turn), room, 0)
+
+
+def test_a_frame_of_mixed_orientation_is_refused_by_every_recording(room: SyntheticRoom) -> None:
+    frame = room[0].replace(depth=torch.ones(1, 128, 96), depth_camera=None)
+    recording = data.Recording("mixed", "none", lambda _: frame, torch.arange(1))
+    with pytest.raises(FormatError, match="mixed: orientation: found depth 96x128"):
+        recording[0]
+
+
+@pytest.mark.parametrize(
+    ("depth_hw", "hw", "differs"),
+    [
+        ((192, 256), (1440, 1920), False),
+        ((256, 192), (1440, 1920), True),
+        ((480, 480), (480, 640), False),
+        ((101, 100), (100, 101), False),  # rounding of a square
+        ((0, 0), (480, 640), False),
+    ],
+)
+def test_which_sizes_contradict(depth_hw: tuple[int, int], hw: tuple[int, int], differs: bool) -> None:
+    assert (describe_mismatch(depth_hw, hw) is not None) == differs
+
+
+# ------------------------------------------------------------------------------------------------------------ headers
+
+
+@pytest.mark.parametrize("exif", range(1, 9))
+@pytest.mark.parametrize("kind", ["jpg", "png"])
+def test_headers_state_the_exif_orientation(tmp_path: Path, exif: int, kind: str) -> None:
+    Image.new("RGB", (8, 6)).save(tmp_path / f"x.{kind}", exif=_tag(exif))
+    assert files.read_image_header(tmp_path / f"x.{kind}").orientation == exif
+
+
+@pytest.mark.parametrize("cut", range(4, 26, 3))
+def test_damaged_exif_states_nothing(cut: int) -> None:
+    whole = _tag(6).tobytes()[6:]
+    assert files._parse_exif_orientation(whole) == 6
+    assert files._parse_exif_orientation(whole[:cut]) in (1, 6)
+    assert files._parse_exif_orientation(whole[:cut] + b"\xff" * 40) in (1, 6)
+    assert files._parse_exif_orientation(b"\xff" * cut) == 1
+
+
+@pytest.mark.parametrize("k", range(8))
+def test_display_matrix_of_a_film_is_read_but_not_applied(tmp_path: Path, k: int) -> None:
+    pytest.importorskip("av")
+    picture = np.zeros((32, 48, 3), np.uint8)
+    picture[:16, :24] = 255
+    write_video(tmp_path / "film.mp4", [picture] * 3, [0, 1 / 30, 2 / 30], display=k)
+    header = video.read_video_header(tmp_path / "film.mp4")
+    assert (header.display, header.hw) == (k, (32, 48))
+    assert int(video.read_video_frame(tmp_path / "film.mp4", 0)[8, 8, 0]) > 200

@@ -1,6 +1,7 @@
-"""Check of an mp4's declared number of samples against its length, before a decoder allocates memory for them.
+"""Boxes of an mp4: check of the declared number of samples against the file's length, and display matrix.
 
-Some tables are short for any number of samples: all of one size, runs of one duration, fragments of defaults.
+The check precedes a decoder, which allocates memory for the samples: some tables are short for any number of samples,
+all of one size, runs of one duration, fragments of defaults.
 """
 
 from __future__ import annotations
@@ -21,6 +22,18 @@ _RUN_LENGTH_BOXES: Final = (b"stts", b"ctts")  # tables of (count, value)
 _BYTES_PER_SAMPLE: Final = 200  # memory of a decoder and of our table per sample
 _MAX_DEPTH: Final = 12
 _MAX_BOXES: Final = 200_000
+#: (a, b, c, d) of a track's matrix, x' = a x + c y and y' = b x + d y in a picture with y down -> symmetry of
+#: :mod:`dhtorch.data.orientation`.
+SYMMETRY_OF_MATRIX: Final = {
+    (1, 0, 0, 1): 0,
+    (0, 1, -1, 0): 1,
+    (-1, 0, 0, -1): 2,
+    (0, -1, 1, 0): 3,
+    (-1, 0, 0, 1): 4,
+    (0, -1, -1, 0): 5,
+    (1, 0, 0, -1): 6,
+    (0, 1, 1, 0): 7,
+}
 
 
 class _Box(NamedTuple):
@@ -47,6 +60,27 @@ def check_sample_count(stream: BinaryIO, file: Path) -> None:
         check_memory(
             file, "samples", _BYTES_PER_SAMPLE * max(n_samples, declared), f"{max(n_samples, declared)} samples"
         )
+
+
+def read_display_symmetry(stream: BinaryIO, track: int = 0) -> int:
+    """Symmetry that the display matrix of a video track applies to the stored frames; 0 where it is no quarter turn."""
+    matrix, videos = b"", 0
+    for number, box in enumerate(_iter_boxes(stream, _Box(b"", 0, stream.seek(0, 2)), 0)):
+        if number > _MAX_BOXES:
+            break
+        if box.kind == b"tkhd":
+            stream.seek(box.start)
+            version = stream.read(1)
+            stream.seek(box.start + (52 if version == b"\1" else 40))
+            matrix = stream.read(20)
+        elif box.kind == b"hdlr":
+            stream.seek(box.start + 8)
+            if stream.read(4) == b"vide":
+                if videos == track and len(matrix) == 20:
+                    a, b, _, c, d = (entry / 65536 for entry in struct.unpack(">5i", matrix))
+                    return SYMMETRY_OF_MATRIX.get((a, b, c, d), 0)
+                videos += 1
+    return 0
 
 
 def _iter_boxes(stream: BinaryIO, inside: _Box, depth: int) -> Iterator[_Box]:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.codecs.mp4 import MP4_FIRST_BOXES, check_sample_count
+from dhtorch.data.codecs.mp4 import MP4_FIRST_BOXES, check_sample_count, read_display_symmetry
 from dhtorch.data.io.decode import FormatError, import_optional
 from dhtorch.data.io.safe_open import modification_time_ns, open_regular
 
@@ -38,29 +38,31 @@ class VideoHeader(NamedTuple):
     rate_hz: float | None
     codec: str
     pixels: str  # format of the stored pixels, such as yuv420p
+    display: int = 0  # symmetry of the display matrix (an mp4's), see dhtorch.data.orientation; it is not applied
 
 
-def read_video_header(file: Path, *, all_frames: bool = False) -> VideoHeader:
+def read_video_header(file: Path, *, all_frames: bool = False, track: int = 0) -> VideoHeader:
     """Size, number of frames and rate of a video; decodes no frame.
 
     Args:
         file: the video.
         all_frames: count also frames that an edit list hides, such as one stamped before time 0.
+        track: number of the video track, where a file has several.
 
     Raises:
         FormatError: missing file, unknown format, no video stream, or a size beyond the limit.
         ImportError: no decoder is installed.
     """
-    return _get_decoder(file, all_frames).header
+    return _get_decoder(file, all_frames, track).header
 
 
-def read_video_times(file: Path, *, all_frames: bool = False) -> np.ndarray:
+def read_video_times(file: Path, *, all_frames: bool = False, track: int = 0) -> np.ndarray:
     """Presentation times (n,) in s of all frames, increasing. Reads all packets once, decodes none.
 
     Raises:
         FormatError: as :func:`read_video_header`, or packets without time stamps.
     """
-    decoder = _get_decoder(file, all_frames)
+    decoder = _get_decoder(file, all_frames, track)
     return decoder.table() * float(decoder.stream.time_base)
 
 
@@ -72,6 +74,7 @@ def read_video_frame(
     pixels: str = "rgb24",
     nearest: bool = False,
     all_frames: bool = False,
+    track: int = 0,
 ) -> np.ndarray:
     """Frame ``i`` as stored (a rotation tag is not applied), in the array layout of the pixel format.
 
@@ -83,11 +86,12 @@ def read_video_frame(
             ``luma`` gives the first plane as stored, (h, w) uint8 or uint16, without range conversion: coded numbers.
         nearest: repeat colour samples stored at lower resolution instead of interpolating them.
         all_frames: count also frames that an edit list hides.
+        track: number of the video track, where a file has several.
 
     Raises:
         FormatError: as :func:`read_video_header`, another size than ``hw``, or a missing or undecodable frame.
     """
-    decoder = _get_decoder(file, all_frames)
+    decoder = _get_decoder(file, all_frames, track)
     frame = decoder.frame(i)
     expected_hw = tuple(hw) if hw is not None else decoder.header.hw
     if (frame.height, frame.width) != expected_hw:
@@ -116,17 +120,17 @@ def close_videos() -> None:
     _open_decoders.clear()
 
 
-def _check_container(file: Path) -> str:
-    """FFmpeg's names of a container format, from its first bytes; checks an mp4's sample count."""
+def _check_container(file: Path, track: int) -> tuple[str, int]:
+    """FFmpeg's names of a container format, from its first bytes, and display symmetry; checks an mp4's samples."""
     with open_regular(file) as stream:
         head = stream.read(16)
         if head[4:8] in MP4_FIRST_BOXES:
             check_sample_count(stream, file)
-            return "mov,mp4,m4a,3gp,3g2,mj2"
+            return "mov,mp4,m4a,3gp,3g2,mj2", read_display_symmetry(stream, track)
     if head.startswith(b"\x1a\x45\xdf\xa3"):
-        return "matroska,webm"
+        return "matroska,webm", 0
     if head.startswith(b"RIFF") and head[8:12] == b"AVI ":
-        return "avi"
+        return "avi", 0
     raise FormatError(file, "content", repr(head[:12]), "a video file: mp4, mov, mkv, webm or avi")
 
 
@@ -138,8 +142,9 @@ def _index_entries(stream: Any) -> Any:
 class _Decoder:
     """One open video, its table of frames and its current position."""
 
-    def __init__(self, file: Path, all_frames: bool) -> None:
+    def __init__(self, file: Path, all_frames: bool, track: int) -> None:
         self.file = file
+        self.track = track
         self.pts: np.ndarray | None = None
         self.keys = np.empty((0, 2), np.int64)  # presentation and decoding stamp of the key frames
         self.frames: Iterator[Any] = iter(())
@@ -150,7 +155,7 @@ class _Decoder:
         self.errors: tuple[type[Exception], ...] = (av.FFmpegError, ValueError, MemoryError, OverflowError, EOFError)
         if not file.exists():
             raise FormatError(file, "file", "no such file", "a video")
-        container_format = _check_container(file)
+        container_format, self.display = _check_container(file, track)
         # No playlists, no network: the format is fixed and no other file may be opened.
         limits = {
             "max_pixels": str(_MAX_VIDEO_PIXELS),
@@ -171,9 +176,10 @@ class _Decoder:
             raise error if isinstance(error, FormatError) else FormatError(file, "header", error, "a video") from None
 
     def _start(self) -> VideoHeader:
-        if not self.container.streams.video:
-            raise FormatError(self.file, "streams", "no video", "a video stream")
-        self.stream = self.container.streams.video[0]
+        streams = self.container.streams.video
+        if len(streams) <= self.track:
+            raise FormatError(self.file, "streams", f"{len(streams)} of video", f"at least {self.track + 1}")
+        self.stream = streams[self.track]
         context = self.stream.codec_context
         if context is None:
             raise FormatError(self.file, "codec", "an unknown one", "a codec with a decoder")
@@ -187,7 +193,8 @@ class _Decoder:
         if not 0 < n <= _MAX_FRAMES or self.stream.time_base is None:
             raise FormatError(self.file, "frames", n, f"1 to {_MAX_FRAMES}, with a time base")
         rate = self.stream.average_rate
-        return VideoHeader((h, w), n, float(rate) if rate else None, context.name, context.pix_fmt or "unknown")
+        pixels = context.pix_fmt or "unknown"
+        return VideoHeader((h, w), n, float(rate) if rate else None, context.name, pixels, self.display)
 
     def table(self) -> np.ndarray:
         """(n,) int64 presentation stamps in time-base units, increasing; fills ``keys`` on the way."""
@@ -250,17 +257,17 @@ class _Decoder:
             yield from frames
 
 
-_open_decoders: OrderedDict[tuple[Path, bool, int], _Decoder] = OrderedDict()
+_open_decoders: OrderedDict[tuple[Path, bool, int, int], _Decoder] = OrderedDict()
 _inherited_decoders: list[_Decoder] = []
 
 
-def _get_decoder(file: Path, all_frames: bool) -> _Decoder:
+def _get_decoder(file: Path, all_frames: bool, track: int) -> _Decoder:
     """A cached decoder of this process, opened if needed."""
-    key = (file, all_frames, modification_time_ns(file))
+    key = (file, all_frames, track, modification_time_ns(file))
     if key not in _open_decoders:
         while len(_open_decoders) >= _MAX_OPEN_DECODERS:
             _open_decoders.popitem(last=False)[1].container.close()
-        _open_decoders[key] = _Decoder(file, all_frames)
+        _open_decoders[key] = _Decoder(file, all_frames, track)
     _open_decoders.move_to_end(key)
     return _open_decoders[key]
 

@@ -8,7 +8,8 @@
 
 Poses are camera-to-world with our axes. The intrinsics file applies to colour and depth unless ``K`` is set:
 7-Scenes' depth (f = 585) is not registered to its colour (f = 525), and its file gives the depth camera's. A side-car
-``meta.json`` (keys ``K``, ``K_depth``, ``dist``, ``depth_scale``, ``invalid``, ``fps``) is read where present; options
+``meta.json`` (keys ``K``, ``K_depth``, ``dist``, ``depth_scale``, ``invalid``, ``fps``, and ``times`` and ``K_frames``
+with a value for each image) is read where present; options
 override it, and it overrides the intrinsics file.
 """
 
@@ -17,6 +18,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +28,13 @@ from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.image_table import ImageRow, ImageTableLoader, list_images, read_depth_hw
+from dhtorch.data.readers.image_table import (
+    ImageRow,
+    ImageTableLoader,
+    list_images,
+    read_depth_hw,
+    read_stored_sizes,
+)
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
 from dhtorch.records import Pose
@@ -38,6 +46,9 @@ _INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt", "intrinsics.txt")
 
 #: Depth codes of one metre where nothing states another. Source: convention of the layout, millimetres.
 _UNITS_PER_METRE = 1000.0
+
+#: Largest relative difference of two matrices that state one camera. Source: chosen: rounding to three digits.
+_SAME_K_REL = 1e-3
 
 
 def recognise(root: Path) -> str | None:
@@ -109,9 +120,17 @@ def read(
     )
     # Depth has a camera of its own only where K_depth is set: most sets of this layout are registered.
     depth_K = _read_intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
+    if stated.K is None:
+        report += _compare_with_file(root, [source[0] for source in (colour_K, depth_K) if source is not None])
     units, unit = _parse_unit(units_per_metre, meta, side_car)
     rate = _parse_rate(fps if fps is not None else meta.get("fps"), side_car)
     number = torch.tensor([frame.number for frame in frames])
+    times = None if rate is None else number.double() / rate
+    if fps is None and "times" in meta:
+        times = torch.from_numpy(files.to_array(meta["times"], (len(frames),), side_car, "times"))
+    if K is None and "K_frames" in meta:
+        lens = distortion if distortion is not None else meta.get("dist")
+        frames = _set_cameras(frames, meta["K_frames"], hw, side_car, lens)
     load = ImageTableLoader(
         rows=tuple(frames),
         hw=hw,
@@ -123,6 +142,7 @@ def read(
         rotated_bits=rotated_bits,
         register=register,
     )
+    load, stored = read_stored_sizes(load)
     return [
         Recording(
             name=root.resolve().name,
@@ -130,12 +150,24 @@ def read(
             load=load,
             number=number,
             root=root,
-            times=None if rate is None else number.double() / rate,
+            times=times,
             poses=poses,
             rate_hz=rate,
             report=(*report, *stated.report),
             depth_unit=unit,
+            stored=stored,
         )
+    ]
+
+
+def _set_cameras(
+    frames: Sequence[ImageRow], values: object, hw: tuple[int, int], side_car: Path, distortion: object
+) -> list[ImageRow]:
+    """Frames with the cameras (fx fy cx cy, one row for each) that ``K_frames`` of the side-car states."""
+    rows = files.to_array(values, (len(frames), 4), side_car, "K_frames")
+    return [
+        replace(frame, camera=convert.to_camera(convert.make_K(*row), hw, side_car, "K_frames", distortion))
+        for frame, row in zip(frames, rows, strict=True)
     ]
 
 
@@ -162,15 +194,17 @@ def _list_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
     return ([single], None, ["no poses in this layout"]) if single is not None else _list_named_frames(root)
 
 
-def _list_named_frames(root: Path) -> tuple[list[ImageRow], Pose, list[str]]:
+def _list_named_frames(root: Path) -> tuple[list[ImageRow], Pose | None, list[str]]:
     parts: dict[int, dict[str, Path]] = {}
     for file in root.iterdir() if root.is_dir() else ():
         if match := _NAMED_FRAME_PATTERN.fullmatch(file.name):
             parts.setdefault(int(match[1]), {})[match[2]] = file
     frames, poses, report = [], list[np.ndarray](), []
+    has_poses = any("pose" in files_of for files_of in parts.values())
+    required = ("color", "depth", "pose") if has_poses else ("color", "depth")
     for number, files_of in sorted(parts.items()):
-        missing = [part for part in ("color", "depth", "pose") if part not in files_of]
-        matrix = files.read_table(files_of["pose"], 4) if not missing else None
+        missing = [part for part in required if part not in files_of]
+        matrix = None if missing else files.read_table(files_of["pose"], 4) if has_poses else np.eye(4)
         if matrix is None:
             report.append(f"frame {number}: no {' and no '.join(missing)}: left out")
         elif not np.isfinite(matrix).all():
@@ -183,6 +217,8 @@ def _list_named_frames(root: Path) -> tuple[list[ImageRow], Pose, list[str]]:
     if not frames:
         problem = f"none complete among {len(parts)}" if parts else "none"
         raise FormatError(root, "frames", problem, "frame-XXXXXX.color.{jpg,png}, .depth.png and .pose.txt")
+    if not has_poses:
+        return frames, None, [*report, "no frame-XXXXXX.pose.txt: no poses"]
     try:
         return frames, convert.to_poses(np.stack(poses), root), report
     except FormatError:  # check one by one, so that the error names the file
@@ -236,6 +272,19 @@ def _read_intrinsics(
         return meta[key], root / "meta.json", key
     file = _first_existing(root, _INTRINSICS_FILES)
     return (files.read_table(file, 3), file, "K") if file else None
+
+
+def _compare_with_file(root: Path, used: Sequence[object]) -> list[str]:
+    """Report where the intrinsics file states neither of the ``used`` matrices, which came from elsewhere."""
+    file = _first_existing(root, _INTRINSICS_FILES)
+    if file is None:
+        return []
+    stated = files.read_table(file, 3)
+    if any(np.shape(K) == stated.shape and np.allclose(np.asarray(K), stated, rtol=_SAME_K_REL) for K in used):
+        return []
+    return [
+        f"{file.name} states another K than the one in use: f {stated[0, 0]:g}, c {stated[0, 2]:g} {stated[1, 2]:g}"
+    ]
 
 
 def _parse_unit(option: float | None, meta: dict[str, object], side_car: Path) -> tuple[float, DepthUnit]:

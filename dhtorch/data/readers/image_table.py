@@ -20,6 +20,7 @@ from dhtorch.data.codecs import pgm
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
+from dhtorch.data.stored_sizes import StoredSizes
 from dhtorch.data.units import DepthUnit
 from dhtorch.records import Camera, Frame
 
@@ -28,11 +29,18 @@ IMAGE_NAME_PATTERN = re.compile(r"(.+)\.(?:png|jpg|jpeg|pgm)", re.IGNORECASE)
 #: Depth codes that mean no return: 0 by every format, 65535 as the largest of 16 bits. Source: format definitions.
 NO_RETURN_CODES = (0, 65535)
 
+#: Names of the images of layouts that number all files of a frame in one folder.
+NAMED_COLOUR_PATTERN = r"frame-(\d+)\.color\.(?:jpg|jpeg|png)"
+
 #: Name with a running number and a time stamp in microseconds, as SUN3D's and Redwood's ``0000012-000000366966``.
 _STAMPED_NAME_PATTERN = re.compile(r"\d+-(\d{9,})")
 
 #: Numbers of frames shown in a report line. Source: chosen on the width of a terminal.
 _MAX_NUMBERS_SHOWN = 6
+
+#: Least share of non-zero codes that are multiples of 8 in codes rotated by 3 bits: all are whose depth is below 8192
+#: steps; of plain codes an eighth is. Source: chosen between 1/8 and 1.
+_MIN_MULTIPLES = 0.7
 
 #: Largest relative difference of two aspect ratios that are one picture at two sizes. Source: derived: rounding of the
 #: shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's 1296×968 differs from 640×480 by 0.4 %.
@@ -67,12 +75,13 @@ class ImageTableLoader:
     no_return: tuple[int, ...] = NO_RETURN_CODES
     rotated_bits: int = 0  # bits by which the codes are rotated to the left
     register: bool = False  # warp depth with a camera of its own to the image
+    exif: int | None = None  # orientation tag of every image; None = not checked
 
     def __call__(self, i: int) -> Frame:
         """Decode the frame at position ``i``."""
         row = self.rows[i]
         camera = self.camera if row.camera is None else row.camera
-        image = torch.from_numpy(files.read_image(row.image, self.hw))
+        image = torch.from_numpy(files.read_image(row.image, self.hw, self.exif))
         depth = torch.from_numpy(self._read_depth(row))
         depth_camera = self.depth_camera
         if depth_camera is not None and self.register:
@@ -91,6 +100,20 @@ class ImageTableLoader:
         else:
             code = files.read_depth_png(file, 1, self.depth_hw).astype(np.uint16)
         return rotate_codes(code, self.rotated_bits)
+
+
+def read_stored_sizes(loader: ImageTableLoader) -> tuple[ImageTableLoader, StoredSizes]:
+    """The loader with the orientation tag of its first image, and what the files state of their orientation."""
+    exif = files.read_image_header(loader.rows[0].image).orientation
+    depth_hw = loader.depth_hw if loader.depth_camera is None else None
+    return replace(loader, exif=exif), StoredSizes.of_images(loader.hw, depth_hw, exif)
+
+
+def are_codes_rotated(file: Path, bits: int) -> bool:
+    """Whether the codes of a depth PNG are rotated to the left by ``bits``: most are multiples of 2 to that power."""
+    code = files.read_depth_png(file, 1).astype(np.uint16)
+    returns = code[code > 0]
+    return returns.size == 0 or float((returns % (1 << bits) == 0).mean()) >= _MIN_MULTIPLES
 
 
 def rotate_codes(code: np.ndarray, bits: int) -> np.ndarray:
@@ -135,10 +158,11 @@ def open_image_table(
         lines.append("no poses")
     rate = None if fps is None else files.to_positive(fps, root, "option fps")
     number = torch.tensor([row.number for row in rows])
+    loader, stored = read_stored_sizes(replace(loader, rows=tuple(rows)))
     return Recording(
         name=name or root.resolve().name,
         format=format,
-        load=replace(loader, rows=tuple(rows)),
+        load=loader,
         number=number,
         root=root,
         times=None if rate is None else number.double() / rate,
@@ -146,6 +170,7 @@ def open_image_table(
         rate_hz=rate,
         report=tuple(lines),
         depth_unit=unit,
+        stored=stored,
     )
 
 

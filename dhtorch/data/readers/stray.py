@@ -24,10 +24,12 @@ import torch
 
 from dhtorch.data import convert
 from dhtorch.data.codecs import pickles
-from dhtorch.data.codecs.video import read_video_frame, read_video_header
+from dhtorch.data.codecs.video import VideoHeader, read_video_frame, read_video_header
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
+from dhtorch.data.stored_sizes import StoredSizes, describe_mismatch
+from dhtorch.data.units import DepthUnit
 from dhtorch.geometry import camera as cameras
 from dhtorch.records import Frame
 from dhtorch.runtime.console import format_count
@@ -36,7 +38,12 @@ _ODOMETRY_COLUMNS = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw"
 _INTRINSICS_COLUMNS = ("fx", "fy", "cx", "cy")
 _DEFAULT_HW = (1440, 1920)  # of the images, where there is no video
 _UNITS_PER_METRE = 1000.0
+_DEPTH_UNIT = DepthUnit(1 / _UNITS_PER_METRE, "Stray Scanner's definition of depth/*.png")
 _N_TRIAL_FRAMES = 6  # frames decoded to determine whether the first or last video frame was lost
+
+
+#: Files of the app that hold neither cameras nor poses.
+UNUSED_FILES = ("imu.csv",)
 
 
 def recognise(root: Path) -> str | None:
@@ -80,7 +87,8 @@ def read(
     video = root / "rgb.mp4" if images else None
     if video is not None and not video.is_file():
         raise FormatError(video, "file", "no such file", "the images (images=False reads depth only)")
-    hw = read_video_header(video, all_frames=True).hw if video is not None else _parse_size(K_hw, root) or _DEFAULT_HW
+    header = None if video is None else read_video_header(video, all_frames=True)
+    hw = header.hw if header is not None else _parse_size(K_hw, root) or _DEFAULT_HW
     shots, missing = _list_shots(root, rows, poses)
     report += missing
     if (root / "distortion").is_dir():
@@ -106,6 +114,8 @@ def read(
             poses=None if c2w is None else convert.to_poses(c2w, root / "odometry.csv"),
             rate_hz=float(1 / times.diff().median()) if increasing and len(used) > 1 else None,
             report=tuple(report + ([] if increasing else ["time stamps do not increase: there are no times"])),
+            depth_unit=_DEPTH_UNIT,
+            stored=None if header is None else _stored_sizes(header, load.depth_hw),
         )
     ]
 
@@ -189,6 +199,13 @@ class _Load:
         if conf.max() > 2:
             raise FormatError(file, "confidence", int(conf.max()), "0, 1 or 2")
         return np.ascontiguousarray(conf)
+
+
+def _stored_sizes(header: VideoHeader, depth_hw: tuple[int, int]) -> StoredSizes:
+    """Sizes of film and depth. The app leaves the display matrix and stores both as the sensor sees, so that the matrix
+    counts only where their sizes contradict this."""
+    display = header.display if describe_mismatch(depth_hw, header.hw) else 0
+    return StoredSizes(header.hw, depth_hw, display, "display matrix of rgb.mp4")
 
 
 # ------------------------------------------------------------------------------------------------------------- tables
