@@ -65,6 +65,7 @@ PLACES = (
     "runtime/code_dependencies",
     "runtime/results",
     "runtime/allocator",
+    "runtime/output_folder",
     "runtime/storage",
     "extract",
 )

@@ -263,7 +263,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("OutputFolder.check_folders", 'folder / "x"', "folder"),
         ("OutputFolder.remove", "return False", "pass"),
         ("OutputFolder.remove", "if is_own:", "if True:"),
-        ("OutputFolder.adopt", "if self.private not in path.parents", "if path"),
+        ("OutputFolder.adopt", "if not is_private(Path(self._name(path)))", ""),
         ("OutputFolder._open_manifest", "os.write(self._handle, b\"\\n\")", "pass"),
         ("OutputFolder._close", "if not self._entries:", "if True:"),
         ("OutputFolder._remove_unfinished", "[] if folder.is_symlink() else", ""),

@@ -115,9 +115,9 @@ def _write_shards(
     done = shards.find_finished_shards(folder, shared)
     if output.is_unlisted:  # of an older version
         output.adopt(folder / name for name in done)
-    output.check(folder / shard.name for shard in all_shards if shard.name not in done)
-    counts = dict(done)
     todo = [shard for shard in all_shards if shard.name not in done]
+    output.check(folder / shard.name for shard in todo)
+    counts = dict(done)
     positions = [position for shard in todo for position in shard.rows]
     complaints: list[str] = []
     engine = engines.run_engine(options.engine, rows, positions, workers=settings["workers"], address=options.address)

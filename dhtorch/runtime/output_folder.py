@@ -57,7 +57,8 @@ class FileIdentity(NamedTuple):
             while block := file.read(_BLOCK_BYTES):
                 if not size:
                     head_crc = zlib.crc32(block[:_HEAD_BYTES])
-                size, crc = size + len(block), zlib.crc32(block, crc)
+                size += len(block)
+                crc = zlib.crc32(block, crc)
         return cls(size, crc, head_crc)
 
     def covers(self, other: FileIdentity) -> bool:
@@ -149,8 +150,8 @@ class OutputFolder:
 
     def adopt(self, paths: Iterable[Path]) -> None:
         """Enter existing files, written by an older version without a manifest; links are left out."""
-        found = [path for path in paths if stat.S_ISREG(getattr(_read_status(path), "st_mode", 0))]
-        self._add([(path, FileIdentity.of(path)) for path in found if self.private not in path.parents])
+        regular = [path for path in paths if stat.S_ISREG(getattr(_read_status(path), "st_mode", 0))]
+        self._add([(path, FileIdentity.of(path)) for path in regular if not is_private(Path(self._name(path)))])
 
     def new_unfinished(self, suffix: str) -> Path:
         """Path for a file while it is written; such files of a killed process are removed by the next one."""
@@ -324,7 +325,8 @@ def find_relative_path(path: Path, root: Path) -> Path | None:
     absolute = path.absolute()
     if absolute.is_relative_to(root) and ".." not in (name := absolute.relative_to(root)).parts:
         return name
-    start, place = root.resolve(), absolute.parent.resolve() / absolute.name
+    start = root.resolve()
+    place = absolute.parent.resolve() / absolute.name
     return place.relative_to(start) if place.is_relative_to(start) else None
 
 
