@@ -26,6 +26,7 @@ from torch import Tensor
 from dhtorch import data
 from dhtorch.data import FormatError
 from dhtorch.data import intrinsics as intrinsics_options
+from dhtorch.data.foreign_files import describe_foreign_file
 from dhtorch.data.io import decode as files
 from dhtorch.data.io import safe_open as doors
 from dhtorch.data.recording import Recording
@@ -42,11 +43,10 @@ _NO_INTRINSICS_MESSAGE = (
 )
 _ASSUMED_FOV_DEG = 60.0  # horizontal field of view assumed for a capture without intrinsics, degrees
 _SPARSE_SHARE = 0.1  # fraction of pixels with a return below which returns are drawn larger
-_CAPTURE_SUFFIXES = (".r3d", ".mp4", ".mov", ".tar", ".h5", ".hdf5")  # files that may be a whole capture
+_CAPTURE_SUFFIXES = (  # of files that may be a whole capture
+    (".r3d", ".mp4", ".mov", ".mkv", ".tar", ".h5", ".hdf5", ".bag", ".mcap", ".db3")
+)
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-_ARCHIVE_SUFFIXES = (".zip", ".gz", ".tgz", ".xz", ".bz2", ".zst", ".7z", ".rar")  # never unpacked automatically
-_VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm")
-_VIDEO_MESSAGE = "a video without depth; sensor depth of near surfaces is required for metric scale"
 
 
 @dataclass(frozen=True)
@@ -138,20 +138,12 @@ def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
 def _describe_content(path: Path) -> str:
     """Description of a path without a capture, with the step that would make it one."""
     if path.is_file():
-        description_of_suffix = {
-            **dict.fromkeys(_ARCHIVE_SUFFIXES, "an archive, unpack it first"),
-            **dict.fromkeys(_VIDEO_SUFFIXES, _VIDEO_MESSAGE),
-        }
-        return description_of_suffix.get(
-            path.suffix.lower(), f"a {path.suffix or 'plain'} file, which no reader supports"
-        )
+        return describe_foreign_file(path) or f"a {path.suffix or 'plain'} file, which no reader supports"
     if not any(path.iterdir()):
         return "an empty folder"
-    name_of_suffix = {file.suffix.lower(): file.name for file in path.iterdir() if file.is_file()}
-    for suffix in (*_ARCHIVE_SUFFIXES, *_VIDEO_SUFFIXES):
-        if suffix in name_of_suffix:
-            content = _VIDEO_MESSAGE if suffix in _VIDEO_SUFFIXES else "an archive, unpack it first"
-            return f"{name_of_suffix[suffix]}: {content}"
+    for file in sorted((entry for entry in path.iterdir() if entry.is_file()), key=files.natural_sort_key):
+        if content := describe_foreign_file(file):
+            return f"{file.name}: {content}"
     return "no capture here or up to two folders below"
 
 

@@ -17,10 +17,12 @@ from typing import Any, Final, Protocol
 
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.corrections import Corrections
+from dhtorch.data.foreign_files import describe_foreign_file
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.io.safe_open import restrict_links
 from dhtorch.data.readers import (
     arkitscenes,
+    azure_kinect,
     bop,
     ca1m,
     driving,
@@ -34,8 +36,10 @@ from dhtorch.data.readers import (
     replica,
     rh20t,
     rlds,
+    rosbag,
     scannet,
     sens_folder,
+    simulator_hdf5,
     stray,
     sun3d,
     tum,
@@ -95,6 +99,9 @@ FORMATS: Final[dict[str, Reader]] = {
     "lerobot": lerobot,
     "rlds": rlds,
     "stray": stray,
+    "rosbag": rosbag,
+    "azure_kinect": azure_kinect,
+    "simulator_hdf5": simulator_hdf5,
     "frames_dir": frames_dir,
 }
 
@@ -227,7 +234,9 @@ def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str
             if evidence := reader.recognise(root):
                 return name, evidence
     listing = (
-        sorted(entry.name for entry in root.iterdir())[:6] if root.is_dir() else [f"a {root.suffix or 'plain'} file"]
+        sorted(entry.name for entry in root.iterdir())[:6]
+        if root.is_dir()
+        else [describe_foreign_file(root) or f"a {root.suffix or 'plain'} file"]
     )
     expected = f"one of {', '.join(FORMATS)} (dhtorch inspect searches subfolders)"
     raise FormatError(root, "format", ", ".join(listing) or "an empty folder", expected)

@@ -298,6 +298,15 @@ def register_depth(
     return splat_depth(xyz[0], camera, hw)
 
 
+def size_of_registered_depth(depth_camera: Camera, camera: Camera, hw: tuple[int, int]) -> tuple[int, int]:
+    """Size at which depth is registered to an image of size ``hw``: the image's, or less where depth is coarser.
+
+    At the image's own size a coarser map would leave gaps between its samples.
+    """
+    scale = min(1.0, float((depth_camera.f / camera.f).min()))
+    return max(1, round(hw[0] * scale)), max(1, round(hw[1] * scale))
+
+
 def _window_min(depth: Tensor, reach: int) -> Tensor:
     """Minimum within ``reach`` rows and columns (square window), by doubling the window along each axis.
 

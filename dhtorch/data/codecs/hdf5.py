@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dhtorch.data.io.decode import MAX_FILE_BYTES, FormatError, import_optional
-from dhtorch.data.io.safe_open import check_regular_file, open_regular, unreadable_error
+from dhtorch.data.io.decode import MAX_FILE_BYTES, MAX_TEXT_BYTES, FormatError, import_optional
+from dhtorch.data.io.safe_open import check_memory, check_regular_file, open_regular, unreadable_error
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _FILTERS = {"gzip", "lzf", "shuffle", "fletcher32"}  # built into the library
@@ -23,7 +23,7 @@ _MAX_NAMES = 10_000
 
 
 class Hdf5Array(NamedTuple):
-    """An array in an HDF5 file: its key, shape and type."""
+    """An array in an HDF5 file: its key (names of groups and of the array, joined by ``/``), shape and type."""
 
     file: Path
     key: str
@@ -46,6 +46,20 @@ class Hdf5Array(NamedTuple):
                 raise FormatError(self.file, self.key, problem, f"{self.dtype} of {self.shape}")
             return np.asarray(array[i])
 
+    def values(self) -> np.ndarray:
+        """All entries of a small array, such as the poses of an episode.
+
+        Raises:
+            FormatError: beyond the memory limit, or as :meth:`row`.
+        """
+        size = math.prod(self.shape) * self.dtype.itemsize
+        check_memory(self.file, self.key, size, f"an array of {self.shape}")
+        with _open_hdf5(self.file) as group:
+            array = _check_array(group, self.key, self.file)
+            if array.shape != self.shape or array.dtype != self.dtype:
+                raise FormatError(self.file, self.key, f"{array.dtype} of {array.shape}", "an unchanged file")
+            return np.asarray(array[()])
+
 
 def list_hdf5_arrays(file: Path) -> dict[str, Hdf5Array]:
     """Name → array, for the arrays of numbers at the top level of a file; reads no values.
@@ -62,6 +76,53 @@ def list_hdf5_arrays(file: Path) -> dict[str, Hdf5Array]:
             array = _check_array(group, key, file)
             arrays[key] = Hdf5Array(file, key, array.shape, array.dtype)
         return arrays
+
+
+def list_hdf5_group(file: Path, path: str = "") -> dict[str, Hdf5Array | None]:
+    """Name → array, or None for a group, of the group ``path``; entries of other kinds are left out.
+
+    Raises:
+        FormatError: missing or damaged file, or a link on the way.
+        ImportError: no decoder is installed.
+    """
+    library = import_optional("h5py")
+    with _open_hdf5(file) as root:
+        group = _walk(root, path, file)
+        if not isinstance(group, library.Group):
+            raise FormatError(file, path or "/", "no group", "a group")
+        if len(group) > _MAX_NAMES:
+            raise FormatError(file, f"{path}/ names", f"{len(group)}", f"at most {_MAX_NAMES}")
+        entries: dict[str, Hdf5Array | None] = {}
+        for name in group:
+            if not isinstance(group.get(name, getlink=True), library.HardLink):
+                continue
+            kind = group.get(name, getclass=True)
+            if kind is library.Group:
+                entries[name] = None
+            elif kind is library.Dataset and group[name].dtype.kind in "fiu" and group[name].shape:
+                key = f"{path}/{name}".lstrip("/")
+                array = _check_array(root, key, file)
+                entries[name] = Hdf5Array(file, key, array.shape, array.dtype)
+        return entries
+
+
+def read_hdf5_text(file: Path, path: str, attribute: str) -> str | None:
+    """A text attribute of the group ``path``; None where there is none.
+
+    Raises:
+        FormatError: missing or damaged file, a link on the way, or no text.
+    """
+    with _open_hdf5(file) as root:
+        attributes = _walk(root, path, file).attrs
+        if attribute not in attributes:
+            return None
+        if (size := attributes.get_id(attribute).get_storage_size()) > MAX_TEXT_BYTES:
+            raise FormatError(file, attribute, f"{size} bytes", f"at most {MAX_TEXT_BYTES}")
+        value = attributes[attribute]
+    text = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
+    if not isinstance(text, str):
+        raise FormatError(file, attribute, type(value).__name__, "a text")
+    return text
 
 
 @contextmanager
@@ -83,12 +144,22 @@ def _open_hdf5(file: Path) -> Iterator[Any]:
         raise FormatError(file, "data", error or type(error).__name__, "a whole HDF5 file") from None
 
 
+def _walk(root: Any, path: str, file: Path) -> Any:
+    """The entry at a path of names, reached without links to elsewhere."""
+    library = import_optional("h5py")
+    entry = root
+    for name in filter(None, path.split("/")):
+        link = entry.get(name, getlink=True) if isinstance(entry, library.Group) else None
+        if not isinstance(link, library.HardLink):
+            raise FormatError(file, path, "nothing" if link is None else "a link", "an entry of this file")
+        entry = entry[name]
+    return entry
+
+
 def _check_array(group: Any, key: str, file: Path) -> Any:
     """The array ``key``, checked: numbers, stored in this file, with rows that fit into memory."""
     library = import_optional("h5py")
-    if not isinstance(group.get(key, getlink=True), library.HardLink):
-        raise FormatError(file, key, "a link", "an array in this file")
-    array = group.get(key)
+    array = _walk(group, key, file)
     if not isinstance(array, library.Dataset) or array.dtype.kind not in "fiu" or not array.shape:
         raise FormatError(file, key, type(array).__name__, "an array of numbers")
     if array.is_virtual or array.external:

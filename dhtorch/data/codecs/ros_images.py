@@ -1,0 +1,175 @@
+"""Codec of the pixels of ROS pictures: colour, depth, compressed depth, and the lens models of their calibration."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+
+from dhtorch.data.codecs.ros_messages import CameraInfo, RawImage
+from dhtorch.data.io.decode import MAX_PIXELS, FormatError, decode_depth_png, to_metres
+
+#: Encoding of depth → type of its pixels.
+DEPTH_ENCODINGS: Final = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+#: Encoding of colour → stored channels.
+COLOUR_CHANNELS: Final = {
+    "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4, "mono8": 1, "8UC1": 1,
+    "yuv422": 2, "uyvy": 2, "yuv422_yuy2": 2, "yuyv": 2,
+    "bayer_rggb8": 1, "bayer_bggr8": 1, "bayer_gbrg8": 1, "bayer_grbg8": 1,
+}  # fmt: skip
+
+#: Encoding → conversion to RGB; OpenCV names a Bayer pattern by its second row.
+_CONVERSIONS: Final = {
+    "bgr8": cv2.COLOR_BGR2RGB, "8UC3": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB,
+    "bgra8": cv2.COLOR_BGRA2RGB, "8UC4": cv2.COLOR_BGRA2RGB,
+    "yuv422": cv2.COLOR_YUV2RGB_UYVY, "uyvy": cv2.COLOR_YUV2RGB_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2, "yuyv": cv2.COLOR_YUV2RGB_YUY2,
+    "bayer_rggb8": cv2.COLOR_BayerBG2RGB, "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB, "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
+}  # fmt: skip
+
+_PNG_SIGNATURE: Final = b"\x89PNG"
+_DEPTH_HEADER: Final = struct.Struct("<iff")  # format, a and b of depth = a / (code - b)
+#: Lens models whose coefficients are OpenCV's.
+_OPENCV_MODELS: Final = ("plumb_bob", "rational_polynomial", "brown_conrady", "modified_brown_conrady")
+_GRID: Final = 41  # points along each side of the image at which an inverse lens model is inverted
+_MAX_INVERSION_PX: Final = 0.1  # px, largest error of an inverted model
+
+
+def decode_colour(image: RawImage, file: Path) -> np.ndarray:
+    """Picture (C, H, W) uint8, RGB or grey.
+
+    Raises:
+        FormatError: an unknown encoding, or fewer bytes than pixels.
+    """
+    if image.encoding not in COLOUR_CHANNELS:
+        raise FormatError(file, "encoding", image.encoding, ", ".join(COLOUR_CHANNELS))
+    pixels = _rows(image, np.dtype(np.uint8), COLOUR_CHANNELS[image.encoding], file)
+    try:
+        if image.encoding in _CONVERSIONS:
+            pixels = cv2.cvtColor(pixels, _CONVERSIONS[image.encoding])
+    except cv2.error as error:
+        raise FormatError(file, "data", error.err, f"pixels of {image.encoding}") from None
+    return np.ascontiguousarray(pixels.transpose(2, 0, 1))
+
+
+def decode_depth(image: RawImage, metres: float, file: Path) -> np.ndarray:
+    """Depth (h, w) float32 in m; 0 = no return.
+
+    Args:
+        image: of an encoding of ``DEPTH_ENCODINGS``.
+        metres: of a code of whole numbers; other numbers are metres times this.
+        file: names the picture in errors.
+
+    Raises:
+        FormatError: an unknown encoding, or fewer bytes than pixels.
+    """
+    if image.encoding not in DEPTH_ENCODINGS:
+        raise FormatError(file, "encoding", image.encoding, ", ".join(DEPTH_ENCODINGS))
+    kind = np.dtype((">" if image.is_big_endian else "<") + DEPTH_ENCODINGS[image.encoding])
+    pixels = _rows(image, kind, 1, file)[..., 0]
+    if kind.kind == "u":
+        return to_metres(pixels, 1 / metres)
+    return _clean(pixels.astype(np.float32) * np.float32(metres))
+
+
+def is_compressed_depth(encoding: str, topic: str) -> bool:
+    """Whether the format or the topic of a compressed picture is that of depth."""
+    pixels = encoding.partition(";")[0].strip()
+    return "compressedDepth" in encoding or topic.endswith("/compressedDepth") or pixels in ("16UC1", "32FC1")
+
+
+def strip_depth_header(data: bytes, is_depth: bool) -> bytes:
+    """PNG of compressed depth, which stands behind a header of twelve bytes; other data is unchanged."""
+    at = _DEPTH_HEADER.size
+    return data[at:] if is_depth and data[at : at + 4] == _PNG_SIGNATURE else data
+
+
+def decode_compressed_depth(data: bytes, encoding: str, metres: float, hw: tuple[int, int], file: Path) -> np.ndarray:
+    """As :func:`decode_depth`, of a ``CompressedImage``: PNG of codes, or of inverse depth for 32FC1.
+
+    Raises:
+        FormatError: another compression, such as RVL, or a damaged PNG.
+    """
+    png = strip_depth_header(data, is_depth=True)
+    if not png.startswith(_PNG_SIGNATURE):
+        raise FormatError(file, "compressed depth", encoding or repr(data[:4]), "PNG (compressedDepth png)")
+    if encoding.partition(";")[0].strip() != "32FC1":
+        return decode_depth_png(png, file, 1 / metres, hw)
+    if len(png) == len(data):
+        raise FormatError(file, "compressed depth", "32FC1 without its header", "twelve bytes before the PNG")
+    _, a, b = _DEPTH_HEADER.unpack(data[: _DEPTH_HEADER.size])
+    code = decode_depth_png(png, file, 1.0, hw, (0,))
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        depth = np.where(code > 0, np.float32(a) / (code - np.float32(b)), np.float32(0))
+    return _clean(depth.astype(np.float32) * np.float32(metres))
+
+
+def to_opencv_distortion(info: CameraInfo, file: Path) -> list[float] | None:
+    """Coefficients in OpenCV's order; None for a lens without distortion.
+
+    Raises:
+        FormatError: a model that is not OpenCV's, such as a fisheye.
+    """
+    D = list(info.D)
+    if not any(D):
+        return None
+    model = info.model.strip().lower().replace(" ", "_")
+    if model == "inverse_brown_conrady":
+        return _invert_brown_conrady(D, info, file)
+    if model not in _OPENCV_MODELS or len(D) < 4:
+        expected = f"{', '.join(_OPENCV_MODELS)}, or pictures rectified beforehand"
+        raise FormatError(file, "distortion_model", f"{info.model} of {len(D)} numbers", expected)
+    return D[: 8 if len(D) >= 8 else min(len(D), 5)]
+
+
+def _invert_brown_conrady(D: list[float], info: CameraInfo, file: Path) -> list[float]:
+    """Coefficients of the lens whose *inverse* has the stated ones, by least squares over the image.
+
+    The stated model maps distorted to ideal coordinates; with the pairs known, the wanted one is linear in its
+    coefficients.
+    """
+    if len(D) < 5:
+        raise FormatError(file, "D", f"{len(D)} numbers", "5: k1 k2 p1 p2 k3")
+    h, w = info.hw
+    u, v = np.meshgrid(np.linspace(0, w - 1, _GRID), np.linspace(0, h - 1, _GRID))
+    x, y = (u - info.K[0, 2]) / info.K[0, 0], (v - info.K[1, 2]) / info.K[1, 1]
+    distorted = np.stack((x, y), -1).reshape(-1, 2)
+    ideal = distorted + np.tensordot(_brown_conrady_terms(distorted), np.array(D[:5]), 1)
+    terms, target = _brown_conrady_terms(ideal).reshape(-1, 5), (distorted - ideal).reshape(-1)
+    coefficients = np.linalg.lstsq(terms, target, rcond=None)[0]
+    error = np.abs(terms @ coefficients - target).max() * info.K[0, 0]
+    if not error <= _MAX_INVERSION_PX:
+        raise FormatError(file, "D", f"a lens inverted to {error:.2g} px", f"at most {_MAX_INVERSION_PX} px")
+    return [float(c) for c in coefficients]
+
+
+def _brown_conrady_terms(xy: np.ndarray) -> np.ndarray:
+    """Derivatives (n, 2, 5) of the shift of points (n, 2) by k1 k2 p1 p2 k3."""
+    x, y = xy.T
+    r2 = x * x + y * y
+    along = (x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3)
+    down = (y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3)
+    return np.stack((np.stack(along, -1), np.stack(down, -1)), 1)
+
+
+def _rows(image: RawImage, kind: np.dtype, channels: int, file: Path) -> np.ndarray:
+    """Pixels (h, w, channels) without the padding of the rows."""
+    (h, w), size = image.hw, kind.itemsize * channels
+    used = w * size
+    if not 0 < h * w <= MAX_PIXELS or image.step < used:
+        problem = f"{w}x{h} pixels in rows of {image.step} bytes"
+        raise FormatError(file, "size, step", problem, f"1 to {MAX_PIXELS} pixels, {used} bytes or more in a row")
+    if len(image.data) < (h - 1) * image.step + used:
+        raise FormatError(file, "data", f"{len(image.data)} bytes", f"{h} rows of {image.step} bytes")
+    data = np.frombuffer(image.data, np.uint8)
+    rows = np.lib.stride_tricks.as_strided(data, (h, used), (image.step, 1))
+    return np.ascontiguousarray(rows).view(kind).reshape(h, w, channels)
+
+
+def _clean(depth: np.ndarray) -> np.ndarray:
+    """Depth with 0 for values that are not finite or not positive."""
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
