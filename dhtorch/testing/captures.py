@@ -17,6 +17,9 @@ from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record
 from dhtorch.testing.rlds import write_rlds
 from dhtorch.testing.stray import write_stray
 
+#: Range of depth of the Record3D film in m, which limits its step: 8 m in 1530 hues. Source: chosen for rooms.
+_MP4_RANGE_M = (0.0, 8.0)
+
 
 @dataclass(frozen=True)
 class CaptureWriter:
@@ -71,7 +74,9 @@ CAPTURE_WRITERS: Final[dict[str, CaptureWriter]] = {
     ),
     "record3d_exr": CaptureWriter(write_record3d_exr, "record3d", is_exact=False),
     "record3d_mp4": CaptureWriter(
-        lambda root, frames: write_record3d_mp4(root / "capture.mp4", frames),
+        lambda root, frames: write_record3d_mp4(
+            root / "capture.mp4", frames, depth_range=_MP4_RANGE_M, stored="yuv444p"
+        ),
         "record3d",
         path="capture.mp4",
         has_poses=False,
@@ -97,10 +102,15 @@ CAPTURE_WRITERS: Final[dict[str, CaptureWriter]] = {
         lambda root, frames: write_lerobot(root, [frames], image="image", depth="tiff"), "lerobot"
     ),
     "lerobot_png": CaptureWriter(
-        lambda root, frames: write_lerobot(root, [frames], image="image", depth="png"), "lerobot", 1 / 1000
+        lambda root, frames: write_lerobot(root, [frames], image="image", depth="png"),
+        "lerobot",
+        1 / 1000,
+        states_unit=False,
     ),
     "lerobot_video": CaptureWriter(
         lambda root, frames: write_lerobot(root, [frames]), "lerobot", is_exact=False, wants_even_sides=True
     ),
-    "rlds": CaptureWriter(lambda root, frames: write_rlds(root / "1.0.0", [frames]), "rlds", 1 / 1000, path="1.0.0"),
+    "rlds": CaptureWriter(
+        lambda root, frames: write_rlds(root / "1.0.0", [frames]), "rlds", 1 / 1000, path="1.0.0", states_unit=False
+    ),
 }

@@ -53,6 +53,8 @@ def open_regular(file: Path) -> Iterator[BinaryIO]:
         raise
     except _OPEN_ERRORS as error:
         raise unreadable_error(file, error) from None
+    if (opened := _opened_files.get()) is not None:
+        opened.add(file)
     with stream:
         yield stream
 
@@ -78,6 +80,21 @@ def check_regular_file(file: Path) -> int:
 
 #: The capture being read, whose links must not point outside it; None = no restriction.
 _restricted_root: ContextVar[Path | None] = ContextVar("capture", default=None)
+
+
+#: Files opened so far, where they are recorded; None = they are not.
+_opened_files: ContextVar[set[Path] | None] = ContextVar("opened_files", default=None)
+
+
+@contextmanager
+def record_opened_files() -> Iterator[set[Path]]:
+    """Context that collects the files which :func:`open_regular` opens in it."""
+    opened = set[Path]()
+    token = _opened_files.set(opened)
+    try:
+        yield opened
+    finally:
+        _opened_files.reset(token)
 
 
 @contextmanager

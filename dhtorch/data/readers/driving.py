@@ -28,6 +28,9 @@ from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3
 from dhtorch.records import Camera, Frame, Pose
 
+#: Side-car of dhtorch, of which this layout needs nothing.
+UNUSED_FILES = ("meta.json",)
+
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""

@@ -120,8 +120,8 @@ def read(
     )
     # Depth has a camera of its own only where K_depth is set: most sets of this layout are registered.
     depth_K = _read_intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
-    if stated.K is None:
-        report += _compare_with_file(root, [source[0] for source in (colour_K, depth_K) if source is not None])
+    other_K = _compare_with_file(root, [source[0] for source in (colour_K, depth_K) if source is not None])
+    report += other_K if stated.K is None else []
     units, unit = _parse_unit(units_per_metre, meta, side_car)
     rate = _parse_rate(fps if fps is not None else meta.get("fps"), side_car)
     number = torch.tensor([frame.number for frame in frames])
@@ -280,7 +280,8 @@ def _compare_with_file(root: Path, used: Sequence[object]) -> list[str]:
     if file is None:
         return []
     stated = files.read_table(file, 3)
-    if any(np.shape(K) == stated.shape and np.allclose(np.asarray(K), stated, rtol=_SAME_K_REL) for K in used):
+    matrices = [np.asarray(K, np.float64) for K in used]
+    if any(K.shape == stated.shape and np.allclose(K, stated, rtol=_SAME_K_REL) for K in matrices):
         return []
     return [
         f"{file.name} states another K than the one in use: f {stated[0, 0]:g}, c {stated[0, 2]:g} {stated[1, 2]:g}"

@@ -38,9 +38,12 @@ _STAMPED_NAME_PATTERN = re.compile(r"\d+-(\d{9,})")
 #: Numbers of frames shown in a report line. Source: chosen on the width of a terminal.
 _MAX_NUMBERS_SHOWN = 6
 
-#: Least share of non-zero codes that are multiples of 8 in codes rotated by 3 bits: all are whose depth is below 8192
-#: steps; of plain codes an eighth is. Source: chosen between 1/8 and 1.
-_MIN_MULTIPLES = 0.7
+#: Codes rotated by 3 bits hold the depth's 3 highest bits at the lower end, which are at most this number for depths
+#: below 3/8 of the range (24.6 m in mm); plain codes have all 8 numbers there. Source: derived.
+_MAX_LOW_BITS = 2
+#: Least share of non-zero codes with such lower bits in rotated codes; 3/8 of plain codes have them. Source: chosen
+#: between 3/8 and 1.
+_MIN_ROTATED = 0.7
 
 #: Largest relative difference of two aspect ratios that are one picture at two sizes. Source: derived: rounding of the
 #: shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's 1296×968 differs from 640×480 by 0.4 %.
@@ -109,11 +112,11 @@ def read_stored_sizes(loader: ImageTableLoader) -> tuple[ImageTableLoader, Store
     return replace(loader, exif=exif), StoredSizes.of_images(loader.hw, depth_hw, exif)
 
 
-def are_codes_rotated(file: Path, bits: int) -> bool:
-    """Whether the codes of a depth PNG are rotated to the left by ``bits``: most are multiples of 2 to that power."""
+def are_codes_rotated(file: Path) -> bool:
+    """Whether the codes of a depth PNG are rotated to the left by 3 bits, as far as its returns show."""
     code = files.read_depth_png(file, 1).astype(np.uint16)
     returns = code[code > 0]
-    return returns.size == 0 or float((returns % (1 << bits) == 0).mean()) >= _MIN_MULTIPLES
+    return returns.size == 0 or float((returns % 8 <= _MAX_LOW_BITS).mean()) >= _MIN_ROTATED
 
 
 def rotate_codes(code: np.ndarray, bits: int) -> np.ndarray:

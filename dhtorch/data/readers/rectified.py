@@ -29,6 +29,10 @@ from dhtorch.records import Camera, Frame, Pose
 _MIN_DISPARITY_PX = 1e-3
 
 
+#: Side-car of dhtorch, of which the layout with ``calib.txt`` needs nothing.
+UNUSED_FILES = ("meta.json",)
+
+
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     if (root / "calib.txt").is_file() and (root / "im0.png").is_file():

@@ -22,7 +22,6 @@ from dhtorch.data.units import DepthUnit
 
 _INFO_FILES = ("_info.txt", "info.txt")
 _FRAME_FOLDERS = (".", "sequence", "frames")
-_COLOUR_PATTERN = r"frame-(\d+)\.color\.(?:jpg|jpeg|png)"
 _DEPTH_PATTERN = r"frame-(\d+)\.depth\.(?:pgm|png)"
 _POSE_PATTERN = r"frame-(\d+)\.pose\.txt"
 _SHIFT_FIELD = "m_depthShift"
@@ -65,7 +64,7 @@ def read(
         raise FormatError(root, "files", "none", "_info.txt and frame-XXXXXX.color.jpg")
     info, folder = place
     fields = _read_fields(info)
-    images = image_table.list_numbered(folder, _COLOUR_PATTERN)
+    images = image_table.list_numbered(folder, image_table.NAMED_COLOUR_PATTERN)
     depths = image_table.list_numbered(folder, _DEPTH_PATTERN)
     poses = {
         number: image_table.read_pose(file) for number, file in image_table.list_numbered(folder, _POSE_PATTERN).items()
@@ -114,7 +113,7 @@ def _find_scan(root: Path) -> tuple[Path, Path] | None:
         info = next(
             (place / name for place in (folder, root) for name in _INFO_FILES if (place / name).is_file()), None
         )
-        if info is not None and image_table.list_numbered(folder, _COLOUR_PATTERN):
+        if info is not None and image_table.list_numbered(folder, image_table.NAMED_COLOUR_PATTERN):
             return info, folder
     return None
 

@@ -25,11 +25,10 @@ from dhtorch.data.units import DepthUnit
 _UNITS_PER_METRE = 1000.0
 _ROTATED_BITS = 3
 
-#: Least share of non-zero codes that are multiples of 8 in rotated codes: all below 8.192 m are; of plain millimetres
-#: an eighth is. Source: chosen between 1/8 and 1.
-_MIN_MULTIPLES = 0.7
-
 _INTRINSICS_FILE = "intrinsics.txt"
+
+#: Read, or named by the reader with the reason.
+UNUSED_FILES = ("extrinsics",)
 
 
 def recognise(root: Path) -> str | None:
@@ -78,7 +77,7 @@ def read(
     file = root / _INTRINSICS_FILE
     stated = (_read_K(file), file, "K") if file.is_file() else None
     camera, guess = image_table.choose_camera(root, hw, stated, intrinsics, K, fov, where=_INTRINSICS_FILE)
-    is_rotated = _are_rotated(rows[0].depth) if rotated is None else rotated
+    is_rotated = image_table.are_codes_rotated(rows[0].depth) if rotated is None else rotated
     source: str | None = "SUN3D stores mm, rotated by 3 bits"
     if not is_rotated:
         source = None
@@ -126,10 +125,3 @@ def _read_extrinsics(root: Path, n_images: int) -> tuple[dict[int, np.ndarray], 
     matrices = np.tile(np.eye(4), (n_images, 1, 1))
     matrices[:, :3] = rows.reshape(-1, 3, 4)
     return dict(enumerate(matrices)), file, []
-
-
-def _are_rotated(file: Path) -> bool:
-    """Whether the codes of a depth map are rotated by 3 bits, as far as its returns show."""
-    code = files.read_depth_png(file, 1).astype(np.uint16)
-    returns = code[code > 0]
-    return returns.size == 0 or float((returns % 8 == 0).mean()) >= _MIN_MULTIPLES
