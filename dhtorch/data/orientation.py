@@ -71,8 +71,9 @@ def apply_symmetry(x: Tensor, k: int) -> Tensor:
 def orientation_scores(
     image: Tensor,  # (C, H, W), C 1 or 3; float in [0, 1] or uint8
     depth: Tensor,  # (h, w) m, 0 = no return; any size
+    symmetries: Sequence[int] = range(8),
 ) -> Tensor:
-    """Agreement (8,) in [−1, 1] of the picture's edges with the edges of the depth map under each symmetry.
+    """Agreement (8,) in [−1, 1] of the picture's edges with the edges of the depth map under each of the symmetries.
 
     Both are resampled to one grid over the whole field of view. An edge is a vector (strength, strength · cos 2a,
     strength · sin 2a) with the direction a of its gradient; the score is the correlation coefficient of these vectors
@@ -88,7 +89,7 @@ def orientation_scores(
         _smooth_log_depth(depth, (hw[1], hw[0])),
     )
     scores = []
-    for k in range(len(SYMMETRY_NAMES)):
+    for k in symmetries:
         log_depth, covered = (apply_symmetry(x, k) for x in smooth[k % 2])
         scores.append(_correlation(picture, _edge_vectors(log_depth, covered), covered))
     return torch.tensor(scores, dtype=torch.float64)

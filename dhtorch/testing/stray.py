@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 
+from dhtorch.data.orientation import apply_symmetry
 from dhtorch.records import Frame
 from dhtorch.testing.mp4 import write_video
 from dhtorch.testing.parts import (
@@ -35,6 +37,10 @@ def write_stray(
     depth_format: Literal["png", "npy"] = "png",
     confidence_channels: int = 1,
     start: int = 0,
+    pictures: Sequence[int] | None = None,
+    film_times: Sequence[float] | None = None,
+    film_turn: int = 0,
+    display: int = 0,
 ) -> None:
     """Write ``rgb.mp4``, ``depth/``, ``confidence/`` (if any), ``odometry.csv`` and ``camera_matrix.csv``.
 
@@ -48,6 +54,10 @@ def write_stray(
         depth_format: ``npy`` as in the oldest versions.
         confidence_channels: 3 as written by some converters.
         start: number of the first frame.
+        pictures: places of the frames that the video has; None = all.
+        film_times: s, the video's own time stamps of these; None = those of the rows.
+        film_turn: symmetry applied to the pictures alone, see :mod:`dhtorch.data.orientation`: a video turned upright.
+        display: symmetry that the video's display matrix states.
     """
     times = [frame_time_s(frame) for frame in frames]
     lines = [_ODOMETRY_HEADER + (", fx, fy, cx, cy, distortion_center_x, distortion_center_y" if per_frame else "")]
@@ -72,6 +82,15 @@ def write_stray(
     K = K_matrix(frames[-1].camera)
     save_file(root / "camera_matrix.csv", "\n".join(", ".join(f"{x!r}" for x in row) for row in K.tolist()))
     if video:
-        kept = slice(1 if first_picture == "lost" else 0, None)
-        pictures = [frame_to_hwc(frame) for frame in frames][kept]
-        write_video(root / "rgb.mp4", pictures, times[kept], codec=codec, hide_first=first_picture == "hidden")
+        kept = range(len(frames)) if pictures is None else list(pictures)
+        kept = kept[1:] if first_picture == "lost" else kept
+        stamps = [times[i] for i in kept] if film_times is None else film_times
+        images = [_turn(frame_to_hwc(frames[i]), film_turn) for i in kept]
+        hide_first = first_picture == "hidden"
+        write_video(root / "rgb.mp4", images, stamps, codec=codec, hide_first=hide_first, display=display)
+
+
+def _turn(picture: np.ndarray, symmetry: int) -> np.ndarray:
+    """Picture (H, W, C) under a symmetry."""
+    turned = apply_symmetry(torch.from_numpy(picture).movedim(-1, 0), symmetry)
+    return np.ascontiguousarray(turned.movedim(0, -1).numpy())

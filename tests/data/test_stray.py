@@ -169,8 +169,8 @@ def test_first_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Fram
     recording = data.open(tmp_path)
     assert recording.number.tolist() == list(range(1, 9))
     assert recording.report == (
-        "rgb.mp4 lacks its first frame (by the edges of depth and image)",
-        "frame 0: no image: left out",
+        "rgb.mp4 has 8 frames for 9 rows: its first frame is lost (by the edges of depth and image)",
+        "row 0 has no picture in rgb.mp4: left out",
     )
     pictures = [f.image if f.image.dtype == torch.uint8 else f.image * 255 for f in room]
     assert all(
@@ -178,7 +178,7 @@ def test_first_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Fram
     )
     torch.testing.assert_close(recording.poses.t[0], room[1].T_world_from_cam.t[0].double())
     other = data.open(tmp_path, lost_first=False)
-    assert other.number.tolist() == list(range(8)) and "its last frame (option lost_first)" in other.report[0]
+    assert other.number.tolist() == list(range(8)) and "its last frame is lost (option lost_first)" in other.report[0]
 
 
 def test_last_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Frame]) -> None:
@@ -187,25 +187,114 @@ def test_last_picture_lost_is_told_by_the_edges(tmp_path: Path, room: list[Frame
     (tmp_path / "short" / "rgb.mp4").rename(tmp_path / "long" / "rgb.mp4")
     recording = data.open(tmp_path / "long")
     assert recording.number.tolist() == list(range(8))
-    assert recording.report[0] == "rgb.mp4 lacks its last frame (by the edges of depth and image)"
+    assert recording.report[0].endswith("its last frame is lost (by the edges of depth and image)")
     assert data.open(tmp_path / "long", lost_first=True).number.tolist() == list(range(1, 9))
 
 
-def test_longer_or_much_shorter_videos(tmp_path: Path) -> None:
+def test_a_longer_film_is_paired_from_the_first_picture_on(tmp_path: Path) -> None:
     frames = walk(6)
-    for name, count in (("rows", 4), ("film", 6), ("short", 2)):
-        writers.write_stray(tmp_path / name, frames[:count], per_frame=True)
+    writers.write_stray(tmp_path / "rows", frames[:4], per_frame=True)
+    writers.write_stray(tmp_path / "film", frames, per_frame=True)
     (tmp_path / "film" / "rgb.mp4").replace(tmp_path / "rows" / "rgb.mp4")
     recording = data.open(tmp_path / "rows")
-    assert recording.report == ("rgb.mp4 has 6 frames for 4 rows: the shorter is used",)
+    assert recording.report == ("rgb.mp4 has 6 frames for 4 rows: paired from the first on",)
     same_scene(recording, frames[:4])
-    (tmp_path / "short" / "rgb.mp4").replace(tmp_path / "rows" / "rgb.mp4")
-    recording = data.open(tmp_path / "rows")
+
+
+def test_a_shorter_film_of_constant_rate_is_refused_unless_an_option_decides(tmp_path: Path) -> None:
+    frames = walk(6)
+    writers.write_stray(tmp_path, frames, per_frame=True, pictures=[0, 1, 2], film_times=[0, 1 / 60, 2 / 60])
+    expected = r"rgb.mp4: frames: found 3 pictures less than rows at a constant rate.*data.lost_first=true"
+    with pytest.raises(FormatError, match=expected):
+        data.open(tmp_path)
+    recording = data.open(tmp_path, lost_first=False)
+    assert recording.report[0] == "rgb.mp4 has 3 frames for 6 rows: its last frames are lost (option lost_first)"
+    assert recording.report[1] == "rows 3, 4, 5 have no picture in rgb.mp4: left out"
+    same_scene(recording, frames[:3])
+    assert data.open(tmp_path, lost_first=True).number.tolist() == [3, 4, 5]
+
+
+# --------------------------------------------------------------------------------------------- pictures by their stamps
+
+
+def same_pictures(recording: data.Recording, frames: list[Frame], numbers: list[int]) -> None:
+    """The frames with these numbers, each with its own picture, depth and pose."""
+    assert recording.number.tolist() == numbers
+    for got, i in zip(recording, numbers, strict=True):
+        errors = [picture_error(got, frame) for frame in frames]
+        assert errors[i] == min(errors) < 12
+        torch.testing.assert_close(got.depth, frames[i].depth, atol=STEP / 2 + 1e-6, rtol=0)
+        torch.testing.assert_close(got.T_world_from_cam.t, frames[i].T_world_from_cam.t, atol=1e-12, rtol=0)
+
+
+LOST = [4, 5, 6]
+KEPT = [i for i in range(12) if i not in LOST]
+
+
+@pytest.mark.parametrize("rate", [60.0, 30.0, 24.0])
+def test_rows_of_lost_pictures_are_left_out_and_named(tmp_path: Path, rate: float) -> None:
+    """Whatever nominal rate a writer gave the film; the rows are at 60 Hz."""
+    frames = walk(12, steady)
+    writers.write_stray(tmp_path, frames, pictures=KEPT, film_times=[i / rate for i in KEPT])
+    recording = data.open(tmp_path)
+    same_pictures(recording, frames, KEPT)
+    assert recording.report[0].startswith("rgb.mp4 has 9 frames for 12 rows: paired by their time stamps")
+    assert ("its clock" in recording.report[0]) == (rate != 60)
+    assert recording.report[1] == "rows 4, 5, 6 have no picture in rgb.mp4: left out"
+
+
+@pytest.mark.parametrize("every", [2, 3])
+def test_a_film_of_a_fraction_of_the_rate(tmp_path: Path, every: int) -> None:
+    frames = walk(12, steady)
+    kept = list(range(0, 12, every))
+    writers.write_stray(tmp_path, frames, pictures=kept)
+    recording = data.open(tmp_path)
+    same_pictures(recording, frames, kept)
+    assert "have no picture in rgb.mp4: left out" in recording.report[1]
+
+
+def test_a_film_of_another_nominal_rate_or_a_variable_one_keeps_its_rows(tmp_path: Path) -> None:
+    frames = walk(8, steady)
+    jitter = [i / 60 + 0.006 * (-1) ** i for i in range(8)]
+    for name, stamps in (("nominal", [i / 30 for i in range(8)]), ("variable", jitter)):
+        writers.write_stray(tmp_path / name, frames, film_times=stamps)
+        recording = data.open(tmp_path / name)
+        assert recording.report == ()
+        same_pictures(recording, frames, list(range(8)))
+
+
+def test_stamps_that_jitter_do_not_hide_a_lost_picture(tmp_path: Path) -> None:
+    frames = walk(12, steady)
+    kept = [i for i in range(12) if i != 5]
+    writers.write_stray(tmp_path, frames, pictures=kept, film_times=[i / 60 + 0.002 * (-1) ** i for i in kept])
+    same_pictures(data.open(tmp_path), frames, kept)
+
+
+# ---------------------------------------------------------------------------------------------------------- orientation
+
+
+def test_display_matrix_with_lying_depth_changes_nothing(tmp_path: Path, room: list[Frame]) -> None:
+    writers.write_stray(tmp_path / "plain", room)
+    for k in (1, 2, 3):
+        writers.write_stray(tmp_path / str(k), room, display=k)
+        recording = data.open(tmp_path / str(k))
+        assert recording.report == ()
+        for got, want in zip(recording, data.open(tmp_path / "plain"), strict=True):
+            assert torch.equal(got.image, want.image) and torch.equal(got.depth, want.depth)
+
+
+@pytest.mark.parametrize("k", [1, 3])
+def test_a_film_turned_upright_is_turned_back(tmp_path: Path, room: list[Frame], k: int) -> None:
+    writers.write_stray(tmp_path, room, film_turn=k)
+    recording = data.open(tmp_path)
     assert recording.report == (
-        "rgb.mp4 has 2 frames for 4 rows: the shorter is used",
-        "2 frames (2, 3): no image: left out",
+        "orientation: depth 128x96 (landscape) beside pictures 96x128 (portrait): "
+        f"pictures are turned by {270 if k == 1 else 90} degrees, as their edges coincide",
     )
-    same_scene(recording, frames[:2])
+    for got, want in zip(recording, room, strict=True):
+        assert got.image.shape == want.image.shape
+        assert picture_error(got, want) < 6
+        torch.testing.assert_close(got.camera.c, want.camera.c)
 
 
 # ------------------------------------------------------------------------------------------------- damage and absence

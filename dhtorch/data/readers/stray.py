@@ -8,25 +8,28 @@ refer to that orientation. Colour and depth are registered, so depth has the sam
 read.
 
 The ``n``-th row belongs to the ``n``-th frame *stored* in the video, presented or not: the app stamps the first one
-before time 0, where an edit list may hide it. If the video still has one frame less than there are rows, either the
-first or the last was lost. Which one is not documented; it is determined from the edges of depth and image.
+before time 0, where an edit list may hide it. If their numbers differ, gaps and the length of the video show which rows
+have a frame, whatever its rate (:func:`dhtorch.data.clocks.pair_film`). If they do not, the first or the last frames
+were lost, which the edges of depth and image decide.
 """
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from dhtorch.data import convert
+from dhtorch.data.clocks import FilmPairing, format_numbers, pair_film
 from dhtorch.data.codecs import pickles
-from dhtorch.data.codecs.video import VideoHeader, read_video_frame, read_video_header
+from dhtorch.data.codecs.video import VideoHeader, read_video_frame, read_video_header, read_video_times
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
+from dhtorch.data.orientation import orientation_scores
 from dhtorch.data.recording import Recording
 from dhtorch.data.stored_sizes import StoredSizes, describe_mismatch
 from dhtorch.data.units import DepthUnit
@@ -39,7 +42,12 @@ _INTRINSICS_COLUMNS = ("fx", "fy", "cx", "cy")
 _DEFAULT_HW = (1440, 1920)  # of the images, where there is no video
 _UNITS_PER_METRE = 1000.0
 _DEPTH_UNIT = DepthUnit(1 / _UNITS_PER_METRE, "Stray Scanner's definition of depth/*.png")
-_N_TRIAL_FRAMES = 6  # frames decoded to determine whether the first or last video frame was lost
+_N_TRIAL_FRAMES = 6  # frames decoded to determine whether the first or last video frames were lost
+#: Lead of the better pairing's edge score, of both halves of these frames, from which it is decided if more than one
+#: frame was lost. Source: chosen on the built-in room, where the wrong pairing leads by less.
+_MIN_EDGE_LEAD = 0.02
+#: Ratio of the clocks of film and rows from which it is reported. Source: chosen: 60 and 59.94 Hz are one rate.
+_MIN_CLOCK_FACTOR = 1.02
 
 
 #: Files of the app that hold neither cameras nor poses.
@@ -70,8 +78,9 @@ def read(
             (1, 3, 0, 0), and cannot be mistaken for a dark one.
         poses: use the device's poses.
         per_frame: use the intrinsics of each frame where the capture has them; False = ``camera_matrix.csv`` for all.
-        lost_first: where the video has one frame less than there are rows: True = the first was lost, False = the
-            last. None = compare the edges of a few frames, the only case in which opening decodes images.
+        lost_first: where the video has fewer frames than there are rows, and its time stamps do not show which are
+            missing: True = the first were lost, False = the last. None = compare the edges of a few frames, the only
+            case in which opening decodes images.
         K_hw: (height, width) of the images that K refers to. None = the video's own, else 1440, 1920.
 
     Returns:
@@ -97,7 +106,7 @@ def read(
         raise FormatError(root, "frames", "; ".join(report) or "none", "rows with depth and pose")
     load = _Load(root, tuple(shots), video, hw, _read_intrinsics(root, hw, K_hw, per_frame), _depth_hw(shots))
     if video is not None:
-        load, remarks = _match_pictures(load, len(rows), lost_first)
+        load, remarks = _match_pictures(load, rows, lost_first)
         report += remarks
     used = load.shots
     times = torch.tensor([shot.row.time for shot in used], dtype=torch.float64)
@@ -313,62 +322,70 @@ def _depth_hw(shots: list[_Shot]) -> tuple[int, int]:
 # ---------------------------------------------------------------------------------------------- rows and the pictures
 
 
-def _match_pictures(load: _Load, n_rows: int, lost_first: bool | None) -> tuple[_Load, list[str]]:
-    """(loader with the shots that have a video frame, numbered; report)."""
+def _match_pictures(load: _Load, rows: list[_Row], lost_first: bool | None) -> tuple[_Load, list[str]]:
+    """(loader with the shots that have a picture, numbered; report)."""
     assert load.video is not None
     n = read_video_header(load.video, all_frames=True).n
-    report, shift = [], 0
-    if n == n_rows - 1:
-        first_lost = _is_first_picture_lost(load, n) if lost_first is None else lost_first
-        shift = 1 if first_lost else 0
-        reason = "by the edges of depth and image" if lost_first is None else "option lost_first"
-        report.append(f"rgb.mp4 lacks its {'first' if first_lost else 'last'} frame ({reason})")
-    elif n != n_rows:
-        report.append(f"rgb.mp4 has {format_count(n, 'frame')} for {format_count(n_rows, 'row')}: the shorter is used")
-    shots = [_Shot(s.row, s.depth, s.conf, s.row.place - shift) for s in load.shots if 0 <= s.row.place - shift < n]
+    times = read_video_times(load.video, all_frames=True)
+    counts = f"rgb.mp4 has {format_count(len(times), 'frame')} for {format_count(len(rows), 'row')}"
+    pairing, report = FilmPairing(np.arange(n)), list[str]()
+    if len(times) == n or n != len(rows):  # else it is cut off and lacks its last frames, which its index counts
+        candidates = pair_film(times, np.array([row.time for row in rows]))
+        pairing, choice = _choose_pairing(load, candidates, len(times) - len(rows), lost_first)
+        report += [f"{counts}: {choice}"] if choice else []
+    picture = pairing.picture.tolist()
+    shots = [replace(shot, picture=picture[shot.row.place]) for shot in load.shots if picture[shot.row.place] >= 0]
     if not shots:
         raise FormatError(load.video, "frames", f"{n} frames", "at least one with depth and pose")
-    lost = sorted({s.row.number for s in load.shots} - {s.row.number for s in shots})
-    return _Load(load.root, tuple(shots), load.video, load.hw, load.intrinsics, load.depth_hw), [
-        *report,
-        *files.format_left_out(lost, "no image"),
-    ]
+    lost = [row.number for row in rows if picture[row.place] < 0]
+    if lost:
+        verb = "have" if len(lost) > 1 else "has"
+        report.append(f"{format_numbers(lost, 'row')} {verb} no picture in rgb.mp4: left out")
+    return replace(load, shots=tuple(shots)), report
 
 
-def _is_first_picture_lost(load: _Load, n: int) -> bool:
-    """Whether row i fits video frame i − 1 better than frame i, by the correlation of depth and brightness edges."""
-    inner = [shot for shot in load.shots if 1 <= shot.row.place < n]
-    score = np.zeros(2)
-    for shot in inner[:: max(1, len(inner) // _N_TRIAL_FRAMES)]:
+def _choose_pairing(
+    load: _Load, candidates: list[FilmPairing], surplus: int, lost_first: bool | None
+) -> tuple[FilmPairing, str]:
+    """The pairing by stamps, option or edges where the film has ``surplus`` pictures more than rows, and the choice.
+
+    Raises:
+        FormatError: pictures are missing, and neither stamps nor edges show which.
+    """
+    early, late = candidates[0], candidates[-1]  # the film lacks its last pictures, or its first
+    if len(candidates) == 1:
+        factor = early.speed if early.speed > 1 else 1 / early.speed
+        word = "fast" if early.speed > 1 else "slow"
+        pace = "" if factor < _MIN_CLOCK_FACTOR else f", its clock {factor:.4g} times as {word}"
+        return early, f"paired by their time stamps{pace}" if early.by_stamps else ""
+    if surplus > 0 and lost_first is None:
+        return early, "paired from the first on"
+    if lost_first is not None:
+        first_lost, reason = lost_first, "option lost_first"
+    else:
+        leads = _edge_leads(load, early, late)
+        halves = [float(np.mean(half)) if len(half) else 0.0 for half in np.array_split(leads, 2)]
+        lost_inside = min(halves[0], -halves[1]) > _MIN_EDGE_LEAD
+        clear = min(map(abs, halves)) > _MIN_EDGE_LEAD and halves[0] * halves[1] > 0
+        if lost_inside or not (clear or surplus == -1):
+            found = f"{-surplus} pictures less than rows at a constant rate, which does not show where they were lost"
+            expected = "stamps with gaps, or data.lost_first=true (the film lacks its first ones) or false (its last)"
+            raise FormatError(load.video or load.root, "frames", found, expected)
+        first_lost, reason = sum(halves) <= 0, "by the edges of depth and image"
+    lost = f"its {'first' if first_lost else 'last'} frame{'s are' if surplus < -1 else ' is'} lost"
+    return (late if first_lost else early), f"{lost} ({reason})"
+
+
+def _edge_leads(load: _Load, early: FilmPairing, late: FilmPairing) -> np.ndarray:
+    """By how much depth fits the picture of the early pairing better than that of the late one, for a few rows."""
+    both = [shot for shot in load.shots if min(p.picture[shot.row.place] for p in (early, late)) >= 0]
+    leads = []
+    for shot in both[:: max(1, len(both) // _N_TRIAL_FRAMES)]:
         try:
-            depth = load.depth(shot)
-            edges = _edge_strength(np.log(np.where(depth > 0, depth, np.inf)))
-            pictures = [load.picture(shot.row.place - shift) for shift in (0, 1)]
+            depth = torch.from_numpy(load.depth(shot))
+            pictures = [load.picture(int(p.picture[shot.row.place])).transpose(2, 0, 1) for p in (early, late)]
         except FormatError:
             continue
-        score += [_edge_correlation(edges, _edge_strength(_block_mean(picture, load.depth_hw))) for picture in pictures]
-    return bool(score[1] >= score[0])
-
-
-def _edge_strength(x: np.ndarray) -> np.ndarray:
-    """(h, w) magnitude of the gradient, capped at 4 × its mean so that one silhouette does not dominate."""
-    with np.errstate(invalid="ignore"):
-        size = np.hypot(*np.gradient(x))
-    size = np.where(np.isfinite(size), size, 0)
-    return np.minimum(size, 4 * size.mean() + 1e-12)
-
-
-def _edge_correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Correlation coefficient of two edge maps."""
-    a, b = a - a.mean(), b - b.mean()
-    return float((a * b).sum() / max(float(np.sqrt((a * a).sum() * (b * b).sum())), 1e-12))
-
-
-def _block_mean(picture: np.ndarray, hw: tuple[int, int]) -> np.ndarray:
-    """Image (H, W, 3) → mean brightness (h, w) of its blocks for the size ``hw``."""
-    step = [max(1, size_in // size_out) for size_in, size_out in zip(picture.shape, hw, strict=False)]
-    grey = picture.mean(-1, dtype=np.float32)[: step[0] * hw[0], : step[1] * hw[1]]
-    rows, columns = np.arange(0, grey.shape[0], step[0]), np.arange(0, grey.shape[1], step[1])
-    blocks = np.add.reduceat(np.add.reduceat(grey, rows, 0), columns, 1) / (step[0] * step[1])
-    index = [np.arange(size_out) * size // size_out for size_out, size in zip(hw, blocks.shape, strict=True)]
-    return np.asarray(blocks[np.ix_(*index)])
+        scores = [float(orientation_scores(torch.from_numpy(picture), depth, (0,))) for picture in pictures]
+        leads.append(scores[0] - scores[1])
+    return np.array(leads)
