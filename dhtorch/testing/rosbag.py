@@ -72,14 +72,14 @@ def write_rosbag(
         store.register(typesys.get_types_from_msg(_TF_DEFINITION, "tf2_msgs/msg/TFMessage"))
     with _open_writer(path, layout) as writer:
         bag = BagWriter(writer, store, is_ros1)
-        first = frame_time_s(frames[0])
         if begin is not None:
             begin(bag)
         if layout.T_colour_from_depth is not None:
-            fixed = _stamped(bag, first, layout.colour_frame, layout.depth_frame, layout.T_colour_from_depth)
-            bag.write("/tf_static", "tf2_msgs/msg/TFMessage", first, {"transforms": [fixed]})
+            first = frame_time_s(frames[0])
+            frame_ids = layout.colour_frame, layout.depth_frame
+            bag.write_transform("/tf_static", first, *frame_ids, layout.T_colour_from_depth)
         for frame in frames:
-            _write_frame(bag, frame, layout)
+            bag.write_frame(frame, layout)
 
 
 @dataclass
@@ -112,6 +112,34 @@ class BagWriter:
         data = serialize(self.make(kind, **fields), kind)
         self.writer.write(self.connections[topic], round(time * 1e9), data)
 
+    def write_frame(self, frame: Frame, layout: BagLayout) -> None:
+        """Write picture, depth, calibrations and pose of a frame."""
+        time = frame_time_s(frame)
+        depth_time = time + layout.depth_lag_s
+        colour = _encode_colour(frame_to_hwc(frame), layout)
+        _write_picture(self, layout.colour_topic, time, layout.colour_frame, colour, layout)
+        _write_picture(self, layout.depth_topic, depth_time, layout.depth_frame, _encode_depth(frame, layout), layout)
+        if layout.infos:
+            h, w = frame.depth.shape[1:]
+            depth_camera = frame.depth_camera or frame.camera
+            for topic, at, name, camera, hw in (
+                (layout.colour_topic, time, layout.colour_frame, frame.camera, frame.hw),
+                (layout.depth_topic, depth_time, layout.depth_frame, depth_camera, (h, w)),
+            ):
+                _write_info(self, topic, at, frame_id=name, camera=camera, hw=hw, layout=layout)
+        if layout.poses:
+            self.write_transform("/tf", time, "map", layout.colour_frame, pose_matrix(frame))
+
+    def write_transform(self, topic: str, time: float, parent: str, child: str, T: np.ndarray) -> None:
+        """Write a transform of ``/tf`` or ``/tf_static``."""
+        stamped = self.make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self.header(time, parent),
+            child_frame_id=child,
+            transform=self.transform(T),
+        )
+        self.write(topic, "tf2_msgs/msg/TFMessage", time, {"transforms": [stamped]})
+
     def transform(self, T: np.ndarray) -> Any:
         """``geometry_msgs/Transform`` of a matrix (4, 4)."""
         x, y, z, w = (float(v) for v in rotation_to_xyzw(T[:3, :3]))
@@ -134,25 +162,6 @@ def _open_writer(path: Path, layout: BagLayout) -> Any:
     return library.Writer(path, version=9, storage_plugin=library.StoragePlugin[layout.storage.upper()])
 
 
-def _write_frame(bag: BagWriter, frame: Frame, layout: BagLayout) -> None:
-    time = frame_time_s(frame)
-    picture = frame_to_hwc(frame)
-    _write_picture(bag, layout.colour_topic, time, layout.colour_frame, _encode_colour(picture, layout), layout)
-    depth_time = time + layout.depth_lag_s
-    _write_picture(bag, layout.depth_topic, depth_time, layout.depth_frame, _encode_depth(frame, layout), layout)
-    h, w = frame.depth.shape[1:]
-    if layout.infos:
-        depth_camera = frame.depth_camera or frame.camera
-        for topic, at, name, camera, hw in (
-            (layout.colour_topic, time, layout.colour_frame, frame.camera, frame.hw),
-            (layout.depth_topic, depth_time, layout.depth_frame, depth_camera, (h, w)),
-        ):
-            _write_info(bag, topic, at, frame_id=name, camera=camera, hw=hw, layout=layout)
-    if layout.poses:
-        moving = _stamped(bag, time, "map", layout.colour_frame, pose_matrix(frame))
-        bag.write("/tf", "tf2_msgs/msg/TFMessage", time, {"transforms": [moving]})
-
-
 def _encode_colour(picture: np.ndarray, layout: BagLayout) -> tuple[str, np.ndarray | bytes]:
     encoding = layout.colour_encoding
     if encoding in ("jpeg", "png"):
@@ -167,7 +176,7 @@ def _encode_colour(picture: np.ndarray, layout: BagLayout) -> tuple[str, np.ndar
 def _encode_depth(frame: Frame, layout: BagLayout) -> tuple[str, np.ndarray | bytes]:
     encoding, _, packing = layout.depth_encoding.partition(" ")
     metric = np.ascontiguousarray(frame.depth[0].numpy(), np.float32)
-    codes = encode_depth_codes(frame.depth, 1 / layout.metres)
+    codes = encode_depth_codes(frame.depth.nan_to_num(0, 0, 0), 1 / layout.metres)
     if not packing:
         return encoding, metric if encoding == "32FC1" else codes
     head = np.zeros(12, np.uint8).tobytes()
@@ -219,12 +228,3 @@ def _write_info(
         "distortion_model": layout.distortion_model, **values, "binning_x": 0, "binning_y": 0, "roi": region,
     }  # fmt: skip
     bag.write(name, "sensor_msgs/msg/CameraInfo", time, fields)
-
-
-def _stamped(bag: BagWriter, time: float, parent: str, child: str, T: np.ndarray) -> Any:
-    return bag.make(
-        "geometry_msgs/msg/TransformStamped",
-        header=bag.header(time, parent),
-        child_frame_id=child,
-        transform=bag.transform(T),
-    )

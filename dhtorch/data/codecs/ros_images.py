@@ -53,7 +53,7 @@ def decode_colour(image: RawImage, file: Path) -> np.ndarray:
             pixels = cv2.cvtColor(pixels, _CONVERSIONS[image.encoding])
     except cv2.error as error:
         raise FormatError(file, "data", error.err, f"pixels of {image.encoding}") from None
-    return np.ascontiguousarray(pixels.transpose(2, 0, 1))
+    return pixels.transpose(2, 0, 1).copy()
 
 
 def decode_depth(image: RawImage, metres: float, file: Path) -> np.ndarray:
