@@ -11,6 +11,12 @@ TESTS: dict[str, list[str]] = {
         "tests/alignment/test_align.py",
         "tests/alignment/test_model_selection.py",
     ],
+    "alignment.map_family": [
+        ("least_absolute_line", "((A @ line)[..., 0] - 1).square()", "((A @ line)[..., 0]).square()"),
+        ("find_map_family", "1 / points.depth", "points.depth"),
+        ("find_map_family", "slopes[1] > 0, 1, 2", "slopes[1] > 0, 2, 1"),
+        ("find_map_family", "(errors[0] > options.family_min_error)", "(errors[0] > 0)"),
+    ],
     "alignment.residual_noise": ["tests/alignment/test_residual_noise.py", "tests/alignment/test_align.py"],
     "alignment.align": [
         "tests/alignment/test_model_selection.py",
@@ -97,7 +103,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("align_depth", "(x > 0) if kind", "(x == x) if kind"),
         ("align_depth", "hw or (x.shape[-2], x.shape[-1])", "(x.shape[-2], x.shape[-1])"),
         ("align_depth", 'of_depth=kind != "inverse"', "of_depth=True"),
-        ("_initial_heads", "((A @ line)[..., 0] - 1).square()", "((A @ line)[..., 0]).square()"),
         ("_select_model", ">= options.min_references", ">= 1"),
         ("_cross_validate", "& ~left_out", "& left_out"),
         ("_one_standard_error_choice", "has_shift & (", "("),

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from dhtorch.alignment import error_model, residual_noise
 from dhtorch.alignment.error_model import ERROR_MODELS, MODEL_HEADS, T1_68_QUANTILE, AlignmentProblem, ErrorModelFit
+from dhtorch.alignment.map_family import find_map_family, least_absolute_line
 from dhtorch.alignment.options import DEFAULT_ALIGNMENT_OPTIONS, AlignmentOptions
 from dhtorch.alignment.references import (
     ERROR_BLOCKS,
@@ -51,6 +52,9 @@ _MODELS_OF_KIND: Final = {
     "ordinal": tuple(MODEL_HEADS),
 }
 
+#: Kinds whose values are linear in depth. Source: derived, the definitions above.
+_KINDS_OF_DEPTH: Final = ("metric", "scale", "affine")
+
 #: Cross-validation folds of scattered blocks: 2 × 2 checkerboard classes. Source: derived, 2 · 2.
 N_SCATTERED_FOLDS = 4
 
@@ -65,6 +69,7 @@ class ModelSelection(NamedTuple):
     names: tuple[str, ...]
     weight: Tensor  # (B, K) probability by the evidence of all references; the selected one need not be the likeliest
     factor: Tensor  # (B,) by which sigma was multiplied
+    family: Tensor | None = None  # (B,) int64, index in ``map_family.MAP_FAMILIES``; None = not looked for
 
 
 def align_depth(
@@ -108,7 +113,8 @@ def align_depth(
 
     Returns:
         DepthMap of source ALIGNED. Score is 0.1 / (0.1 + sigma / depth). Gates: NO_TRACK where the map has no value,
-        NO_POSE where the references are fewer than eight or no model can be fitted, UNCERTAIN.
+        NO_POSE where the references are fewer than eight, no model can be fitted, or the near returns show that a map
+        of depth holds disparities or a z-buffer (:mod:`dhtorch.alignment.map_family`), UNCERTAIN.
 
     Raises:
         ValueError: wrong shapes, an unknown kind, no references, a limit that is not positive.
@@ -143,6 +149,9 @@ def align_depth(
         x, points = x / unit[..., None], points._replace(x=points.x / unit, within=points.within / unit)
     problem = _alignment_problem(x, valid, points, options, of_depth=kind != "inverse")
     fits, selection = _select_model(problem, _MODELS_OF_KIND[kind])
+    if kind in _KINDS_OF_DEPTH:
+        family = find_map_family(points, options)
+        selection = selection._replace(model=torch.where(family == 0, selection.model, -1), family=family)
     if trace is not None:
         trace["chosen"] = selection
     log_depth, sigma_rel = _average_models(problem, fits, selection, x, valid)
@@ -165,15 +174,8 @@ def _initial_heads(x: Tensor, y: Tensor, points: MetricReferences, options: Alig
     absolute relative error."""
     ratio = masked_median(y / torch.where(x == 0, torch.nan, x), points.used)[:, 0]
     scale = torch.stack((ratio.abs(), torch.zeros_like(ratio)), -1)
-    A = torch.stack((x, torch.ones_like(x)), -1) / y[..., None]
-    weight = points.weight(points.used, options)
-    eye = 1e-9 * torch.eye(2).to(x)
-    w = weight
-    for _ in range(10):
-        W = A * w[..., None]
-        line, ok = solve_spd(W.mT @ A + eye, W.sum(1)[..., None])
-        w = weight / (((A @ line)[..., 0] - 1).square() + options.huber_bend**2).sqrt()
-    line = torch.where((ok & (line[:, 0, 0] > 0))[:, None], line[..., 0], scale)
+    line, ok = least_absolute_line(x, y, points.weight(points.used, options), options)
+    line = torch.where((ok & (line[:, 0] > 0))[:, None], line, scale)
     ones = torch.ones_like(ratio)
     identity, shift = (
         torch.stack((ones, t), -1) for t in (torch.zeros_like(ratio), masked_median(y - x, points.used)[:, 0])

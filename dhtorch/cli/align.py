@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.alignment import align
+from dhtorch.alignment.map_family import MAP_FAMILIES
 from dhtorch.cli import complete
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli.completed_folder import CompletionTask
@@ -82,6 +83,12 @@ _CODE_ROOTS = (
 #: Median sigma / depth below which maps and near returns are taken to come from one sensor: two sensors never agree so
 #: well.
 _SAME_SENSOR_SIGMA_REL = 5e-4
+
+#: Family of a map that is no depth → the remark on it.
+_FAMILY_REMARKS = {
+    "disparity": "that its values are inverse depth: kind=inverse",
+    "z-buffer": "a z-buffer (non-linear depth): depth = near / (1 - value * (1 - near / far))",
+}
 
 _PAGE_NOTE = "Depth is coloured from near (blue) to far (red), each map over its own range. Blank: no answer."
 
@@ -213,6 +220,7 @@ def _summarise_frame(x: Tensor, aligned: DepthMap, selection: align.ModelSelecti
     keep, has_value = aligned.keep, x > 0
     best = int(selection.model)
     row: Row = {"model": None if best < 0 else selection.names[best], "no_answer": 1 - _masked_share(keep, has_value)}
+    row["family"] = None if selection.family is None else MAP_FAMILIES[int(selection.family)]
     row["probability"] = None if best < 0 else float(selection.weight[0, best])
     likeliest = int(selection.weight[0].argmax())
     row["likeliest"] = None if best < 0 else selection.names[likeliest]
@@ -247,9 +255,11 @@ def _summarise_recording(rows: Sequence[Row]) -> Row:
     }
     models = Counter(row["model"] for row in answered)
     references = {k: statistics.median(row[k] for row in alignments) for k in ("near", "far")}
+    families = Counter(family for row in alignments if (family := row.get("family")) in _FAMILY_REMARKS)
     return {
         "frames": len(alignments),
         "models": dict(models),
+        "families": dict(families),
         "median": medians,
         "references": references,
         "limited": limited,
@@ -260,8 +270,13 @@ def _format_summary(name: str, kind: str, summary: Row, n_untouched: int) -> lis
     """Printed summary of a recording, one sentence a line."""
     limited, medians, n = summary["limited"], summary["median"], summary["frames"]
     untouched = f" ({n_untouched} left untouched)" if n_untouched else ""
+    contradicted = [
+        f"  {format_count(count, 'map')}: near returns show {_FAMILY_REMARKS[family]}"
+        for family, count in sorted(summary["families"].items())
+    ]
     if medians["scale"] is None:
-        return [f"{name}: none of {format_count(n, 'map')} could be aligned{untouched}: too few near returns."]
+        why = ":" if contradicted else ": too few near returns."
+        return [f"{name}: none of {format_count(n, 'map')} could be aligned{untouched}{why}", *contradicted]
     n_unchanged = sum(count for model, count in summary["models"].items() if model == "raw")
     maps = format_count(n, "map")
     first = f"{name}: {maps}{untouched} converted to metres."
@@ -281,6 +296,7 @@ def _format_summary(name: str, kind: str, summary: Row, n_untouched: int) -> lis
         f"  Median sigma {medians['sigma']:.1%} of the depth; {limited['no_answer']:.1%} of the pixels have no answer.",
         f"  References per map: {near} near returns and {far} far answers (medians); "
         f"{limited['unaligned']:.0%} of the maps could not be aligned.",
+        *contradicted,
     ]
 
 
