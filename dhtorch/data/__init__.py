@@ -19,12 +19,14 @@ from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.corrections import Corrections
 from dhtorch.data.foreign_files import describe_foreign_file
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.io.safe_open import restrict_links
+from dhtorch.data.io.safe_open import record_opened_files, restrict_links
 from dhtorch.data.readers import (
+    apc,
     arkitscenes,
     azure_kinect,
     bop,
     ca1m,
+    colmap,
     driving,
     frames_dir,
     lerobot,
@@ -46,6 +48,7 @@ from dhtorch.data.readers import (
 )
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Scene, SceneLike, Scenes, scenes_of
+from dhtorch.data.unread import report_unread
 from dhtorch.runtime import console
 
 __all__ = [
@@ -88,6 +91,7 @@ FORMATS: Final[dict[str, Reader]] = {
     "replica": replica,
     "scannet": scannet,
     "sens_folder": sens_folder,
+    "apc": apc,
     "open3d": open3d,
     "sun3d": sun3d,
     "tum": tum,
@@ -102,6 +106,7 @@ FORMATS: Final[dict[str, Reader]] = {
     "rosbag": rosbag,
     "azure_kinect": azure_kinect,
     "simulator_hdf5": simulator_hdf5,
+    "colmap": colmap,
     "frames_dir": frames_dir,
 }
 
@@ -175,11 +180,16 @@ def open_all(
             raise ValueError(
                 f"data: format {format} has no option {shown}, expected one of {', '.join(reader_options)}"
             )
-    with restrict_links(bounds):
+    with restrict_links(bounds), record_opened_files() as opened:
         recordings = read(root, **options)
     if isinstance(recordings, Recordings):
         return replace(recordings, make=_RestrictedOpener(recordings.make, bounds, corrections))
-    return [corrections.apply(replace(recording, bounds=bounds)) for recording in recordings]
+    unread = report_unread(root, opened, getattr(FORMATS[format], "UNUSED_FILES", ()))
+    reports = [(*recording.report, *unread) for recording in recordings]
+    return [
+        corrections.apply(replace(recording, bounds=bounds, report=report))
+        for recording, report in zip(recordings, reports, strict=True)
+    ]
 
 
 @dataclass(frozen=True)
@@ -233,13 +243,11 @@ def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str
         for name, reader in FORMATS.items():
             if evidence := reader.recognise(root):
                 return name, evidence
-    listing = (
-        sorted(entry.name for entry in root.iterdir())[:6]
-        if root.is_dir()
-        else [describe_foreign_file(root) or f"a {root.suffix or 'plain'} file"]
-    )
+    foreign = describe_foreign_file(root) if root.is_file() else None
+    listing = sorted(entry.name for entry in root.iterdir())[:6] if root.is_dir() else [f"a {root.suffix or 'plain'} file"]
+    found = foreign.what if foreign else ", ".join(listing) or "an empty folder"
     expected = f"one of {', '.join(FORMATS)} (dhtorch inspect searches subfolders)"
-    raise FormatError(root, "format", ", ".join(listing) or "an empty folder", expected)
+    raise FormatError(root, "format", found, (foreign and foreign.remedy) or expected)
 
 
 def open_scenes(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[Scene]:

@@ -1,4 +1,4 @@
-"""Writer of COLMAP's text model: cameras.txt, images.txt and points3D.txt.
+"""Writer of COLMAP's text model: cameras.txt, images.txt and points3D.txt, and of times.txt, an addition.
 
 In COLMAP the centre of the first pixel is (0.5, 0.5), here (0, 0): half a pixel is added to all written coordinates.
 COLMAP's poses map world to camera.
@@ -28,6 +28,7 @@ class ColmapImage:
     camera: Camera
     hw: tuple[int, int]
     T_world_from_cam: Pose
+    time: float | None = None  # s
 
 
 def write_colmap(
@@ -40,7 +41,9 @@ def write_colmap(
     seen_by: Any,  # (P, V) indices of shots, -1 = none
     uv: Any,  # (P, V, 2) px in those shots, distorted
 ) -> None:
-    """Write a model: cameras, images with their observations, and points with their tracks.
+    """Write a model in metres: cameras, images with their observations, and points with their tracks.
+
+    COLMAP has no times: those of the images that have one go to ``times.txt`` (IMAGE_ID, s), which COLMAP ignores.
 
     Equal cameras are written once. Cameras without distortion become PINHOLE, those with up to four coefficients
     OPENCV, others FULL_OPENCV. Non-finite points and observations are left out; a point without observations is written
@@ -82,10 +85,15 @@ def write_colmap(
             "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]",
             *(f"{k + 1} {c}" for k, c in enumerate(distinct)),
         ],
-        "images.txt": ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; POINTS2D[] as X, Y, POINT3D_ID"],
+        "images.txt": [
+            "# metres",
+            "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME; POINTS2D[] as X, Y, POINT3D_ID",
+        ],
         "points3D.txt": ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)", *lines],
     }
     files["images.txt"] += image_lines
+    stamps = [f"{k + 1} {shot.time!r}" for k, shot in enumerate(shots) if shot.time is not None]
+    files["times.txt"] = ["# IMAGE_ID, TIME (s)", *stamps]
     for name, text in files.items():
         storage.replace_file(Path(folder) / name, ("\n".join(text) + "\n").encode("utf-8"))
 

@@ -94,17 +94,25 @@ def encode_png(
 
 def write_frames_dir_metadata(
     folder: str | Path,
-    camera: Camera,  # B = 1
+    camera: Camera,  # (n), or (1) for all
     T_world_from_cam: Pose,  # (n), in the order of the images' names
     *,
     unit: float,  # m, a step of depth
     fps: float | None = None,
+    times: Sequence[float] | None = None,  # (n) s, where they are not frame number / fps
 ) -> list[Path]:
-    """Write K.txt, meta.json, poses.txt beside ``images/`` and ``depth/``, as read by ``frames_dir``; their paths."""
+    """Write K.txt, meta.json, poses.txt beside ``images/`` and ``depth/``, as read by ``frames_dir``; their paths.
+
+    ``K_frames`` (fx fy cx cy) and ``times`` of meta.json hold what changes from image to image; K.txt has no place for
+    it.
+    """
     K = to_matrix(camera)[0].double().tolist()
     distortion = {} if camera.distortion is None else {"dist": camera.distortion[0].tolist()}
-    rate = {} if fps is None else {"fps": fps}
-    side_car = {"K": K, **distortion, "depth_scale": 1 / unit, "invalid": [0], **rate}
+    clock: dict[str, Any] = {} if fps is None else {"fps": fps}
+    clock |= {} if times is None else {"times": list(times)}
+    numbers = torch.cat((camera.f, camera.c), -1).double()
+    each = {"K_frames": numbers.tolist()} if bool((numbers != numbers[:1]).any()) else {}
+    side_car = {"K": K, **distortion, "depth_scale": 1 / unit, "invalid": [0], **clock, **each}
     return [
         _write_rows(Path(folder) / "K.txt", K),
         storage.write_json(Path(folder) / "meta.json", side_car),
@@ -117,16 +125,23 @@ def write_tum_metadata(
     camera: Camera,  # B = 1
     stamps: Sequence[str],  # s, as in the images' names
     T_world_from_cam: Pose | None = None,  # (n); poses that are not finite are left out
+    *,
+    unit: float,  # m, a step of depth
 ) -> list[Path]:
-    """Write meta.json and, for poses, groundtruth.txt beside ``rgb/`` and ``depth/``, as read by ``tum``; their paths.
+    """Write meta.json, calibration.txt and, for poses, groundtruth.txt beside ``rgb/`` and ``depth/``; their paths.
 
-    In folders named after a camera (``freiburg1``, ``fr1``) the reader uses that camera's published calibration, else
-    meta.json.
+    ``tum`` reads the camera from calibration.txt, which wins over a calibration published for the folder's name
+    (``freiburg1``) but holds at most five coefficients of distortion; with more only meta.json is written.
     """
     folder = Path(folder)
-    distortion = torch.zeros(1, 5) if camera.distortion is None else camera.distortion
-    side_car = {"K": to_matrix(camera)[0].double().tolist(), "dist": distortion[0].tolist()}
+    distortion = (torch.zeros(1, 5) if camera.distortion is None else camera.distortion)[0].tolist()
+    K = to_matrix(camera)[0].double().tolist()
+    side_car = {"K": K, "dist": distortion, "depth_scale": 1 / unit}
     written = [storage.write_json(folder / "meta.json", side_car)]
+    if not any(distortion[5:]):
+        lens = distortion[:5] if any(distortion) else []
+        row = [K[0][0], K[1][1], K[0][2], K[1][2], *lens]
+        written.append(_write_rows(folder / "calibration.txt", [row], "# fx fy cx cy, then k1 k2 p1 p2 k3 if any"))
     if T_world_from_cam is None:
         return written
     T = T_world_from_cam.map(lambda x: x.double())

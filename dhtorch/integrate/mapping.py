@@ -56,6 +56,7 @@ _MAP_FILES = (
     "colmap/cameras.txt",
     "colmap/images.txt",
     "colmap/points3D.txt",
+    "colmap/times.txt",
 )
 
 
@@ -300,7 +301,13 @@ def _write_colmap(folder: Path, scene: MappedScene) -> None:
     for k in poses:
         frame: Frame = scene.recording[k]
         intrinsics[k] = frame.camera, frame.hw
-    images = [export.ColmapImage(f"{int(scene.recording.number[k]):06d}.png", *intrinsics[k], poses[k]) for k in poses]
+    numbers, times = scene.recording.number, scene.recording.times
+    images = [
+        export.ColmapImage(
+            f"{int(numbers[k]):06d}.png", *intrinsics[k], poses[k], None if times is None else float(times[k])
+        )
+        for k in poses
+    ]
     pieces = [_triangulated_points(a, number, poses) for a in scene.answers if set(a.pair) <= set(poses)]
     empty = [torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2).long(), torch.zeros(0, 2, 2)]
     xyz, rgb, error, seen_by, uv = map(torch.cat, zip(*(pieces or [empty]), strict=True))

@@ -34,7 +34,7 @@ TINY = [
     "voxel=0.06",
 ]
 SWEPT = [option for option in TINY if option not in ("method=map", "dense=false")]
-FILES = {"map.ply", "map.glb", "points.ply", "map.png", "cameras.txt", "images.txt", "points3D.txt"}
+FILES = {"map.ply", "map.glb", "points.ply", "map.png", "cameras.txt", "images.txt", "points3D.txt", "times.txt"}
 
 
 @pytest.fixture(scope="module")

@@ -290,16 +290,16 @@ class _CameraSpec:
             span=self.span,
             tolerance=self.tolerance,
         )
-        numbers, times = read_capture_clock(meta, table, rows, numbers, times)
+        numbers, clock = read_capture_clock(meta, table, rows, numbers, times)
         return Recording(
             name=self.name(episode.number),
             format="lerobot",
             load=load,
             number=torch.from_numpy(numbers),
             root=meta.root,
-            times=torch.from_numpy(times),
+            times=None if clock is None else torch.from_numpy(clock),
             poses=poses,
-            rate_hz=meta.fps,
+            rate_hz=None if clock is None else meta.fps,
             report=tuple(report),
             episode=episode.number,
             camera_name=self.key,

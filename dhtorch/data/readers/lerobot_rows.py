@@ -88,14 +88,18 @@ def find_capture_columns(meta: LeRobotMeta) -> tuple[str, ...]:
 
 def read_capture_clock(
     meta: LeRobotMeta, table: dict[str, np.ndarray], rows: np.ndarray, numbers: np.ndarray, times: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(numbers, times in s) of the capture from which ``dhtorch enrich`` wrote the rows, else those of the rows."""
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """(numbers, times in s) of the capture from which ``dhtorch enrich`` wrote the rows, else those of the rows.
+
+    The times are None where that capture had none: those of the rows are then an assumed rate.
+    """
     if not find_capture_columns(meta):
         return numbers, times
     own_numbers, own_times = (table[name][rows].reshape(-1).astype(np.float64) for name in _CAPTURE_COLUMNS)
     whole = np.isfinite(own_numbers).all() and (np.diff(own_numbers) > 0).all()
     increasing = np.isfinite(own_times).all() and (np.diff(own_times) > 0).all()
-    return own_numbers.astype(np.int64) if whole else numbers, own_times if increasing else times
+    kept = own_times if increasing else None if np.isnan(own_times).all() else times
+    return own_numbers.astype(np.int64) if whole else numbers, kept
 
 
 def read_encoded_image(table: Path, root: Path, key: str, row: int) -> tuple[bytes, Path]:

@@ -29,6 +29,9 @@ from dhtorch.data.readers.posed_images import PosedImage, format_names_left_out,
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
 
+#: Files of the format that are not read: splits for training, what a converter printed, the sparse point cloud.
+UNUSED_FILES = ("transforms_*.json", "dataparser_transforms.json", "*_filelist.txt", "sparse_pc*")
+
 _FILE_NAME = "transforms.json"
 
 #: Camera models with OpenCV's lens: pinhole, radial and tangential terms. Source: nerfstudio's CAMERA_MODEL_TO_TYPE.

@@ -21,6 +21,9 @@ from dhtorch.data.readers.posed_images import PosedImage, open_posed_images
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
 
+#: Files of the format that are not read: of the mesh, and cameras (time stamps) of the folder that was not chosen.
+UNUSED_FILES = ("mesh_info.json", "[0-9]*.json")
+
 #: Folder of the cameras → folder of the images they belong to, in order of preference.
 _FOLDERS = {"corrected_cameras": "corrected_images", "cameras": "images"}
 
