@@ -7,6 +7,7 @@ listed by its reader as ``UNUSED_FILES`` (glob patterns of names).
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
@@ -39,6 +40,7 @@ _OTHER_NAMES = (
     ".*",
 )
 
+_NUMBER = re.compile(r"\d+")
 _MAX_NAMES_SHOWN = 5  # names in the line
 
 
@@ -47,14 +49,15 @@ def report_unread(root: Path, opened: Iterable[Path], unused: Sequence[str] = ()
 
     Args:
         root: folder of the capture; a file has nothing beside it.
-        opened: files that the reader opened. A folder with one of them is not searched: files of its kind are read when
-            their frame is.
+        opened: files that the reader opened. A folder with one of them is not searched, and a file whose name differs
+            from one of them by numbers alone is not named: it belongs to a frame that is left out or read later.
         unused: names of files of the format that are left unread on purpose, as glob patterns.
     """
     if not root.is_dir():
         return []
     read = {os.path.realpath(file) for file in opened}
     read_folders = {str(folder) for file in read for folder in Path(file).parents}
+    read_kinds = {_NUMBER.sub("#", file) for file in read if _NUMBER.search(Path(file).name)}
     names = []
     for entry in sorted(root.iterdir()):
         place = os.path.realpath(entry)
@@ -62,7 +65,7 @@ def report_unread(root: Path, opened: Iterable[Path], unused: Sequence[str] = ()
             continue
         if entry.is_dir():
             names += [] if place in read_folders else _list_folder(entry, unused)
-        elif place not in read and entry.suffix.lower() in _SUFFIXES:
+        elif place not in read and entry.suffix.lower() in _SUFFIXES and _NUMBER.sub("#", place) not in read_kinds:
             names.append(entry.name)
     if not names:
         return []
