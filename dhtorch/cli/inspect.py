@@ -46,6 +46,7 @@ _SPARSE_SHARE = 0.1  # fraction of pixels with a return below which returns are 
 _CAPTURE_SUFFIXES = (  # of files that may be a whole capture
     (".r3d", ".mp4", ".mov", ".mkv", ".tar", ".h5", ".hdf5", ".bag", ".mcap", ".db3")
 )
+_MAX_NAMES = 10_000  # of a level of folders that are looked at for files of other tools
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -131,20 +132,29 @@ def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
             if captures:
                 return captures
         level = [entry for entry in inside if entry.is_dir()]
+    found, remedy = _describe_content(path)
     known_formats = ", ".join((*data.FORMATS, *formats.STACK_FORMATS))
-    raise FormatError(path, "content", _describe_content(path), f"one of {known_formats}, or images")
+    raise FormatError(path, "content", found, remedy or f"one of {known_formats}, or images")
 
 
-def _describe_content(path: Path) -> str:
-    """Description of a path without a capture, with the step that would make it one."""
+def _describe_content(path: Path) -> tuple[str, str | None]:
+    """Description of a path without a capture, and the step that would make it one."""
     if path.is_file():
-        return describe_foreign_file(path) or f"a {path.suffix or 'plain'} file, which no reader supports"
+        if foreign := describe_foreign_file(path):
+            return foreign.what, foreign.remedy
+        return f"a {path.suffix or 'plain'} file, which no reader supports", None
     if not any(path.iterdir()):
-        return "an empty folder"
-    for file in sorted((entry for entry in path.iterdir() if entry.is_file()), key=files.natural_sort_key):
-        if content := describe_foreign_file(file):
-            return f"{file.name}: {content}"
-    return "no capture here or up to two folders below"
+        return "an empty folder", None
+    inside = [entry for pattern in ("*", "*/*", "*/*/*") for entry in islice(path.glob(pattern), _MAX_NAMES)]
+    for file in sorted((entry for entry in inside if entry.is_file()), key=_search_order):
+        if foreign := describe_foreign_file(file):
+            return f"{file.relative_to(path)}: {foreign.what}", foreign.remedy
+    return "no capture here or up to two folders below", None
+
+
+def _search_order(file: Path) -> tuple[object, ...]:
+    """Files of upper folders first, in natural order."""
+    return (len(file.parts), files.natural_sort_key(file))
 
 
 def survey_capture(capture: FoundCapture, frames: int = 8) -> Iterator[Survey]:

@@ -244,8 +244,9 @@ def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str
             if evidence := reader.recognise(root):
                 return name, evidence
     foreign = describe_foreign_file(root) if root.is_file() else None
-    listing = sorted(entry.name for entry in root.iterdir())[:6] if root.is_dir() else [f"a {root.suffix or 'plain'} file"]
-    found = foreign.what if foreign else ", ".join(listing) or "an empty folder"
+    listing = sorted(entry.name for entry in root.iterdir())[:6] if root.is_dir() else []
+    content = ", ".join(listing) if root.is_dir() else f"a {root.suffix or 'plain'} file"
+    found = foreign.what if foreign else content or "an empty folder"
     expected = f"one of {', '.join(FORMATS)} (dhtorch inspect searches subfolders)"
     raise FormatError(root, "format", found, (foreign and foreign.remedy) or expected)
 

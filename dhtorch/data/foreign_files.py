@@ -3,51 +3,65 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from dhtorch.data.codecs import matroska
 from dhtorch.data.io.decode import FormatError
 
-_UNPACK: Final = "an archive, unpack it first: {}"
-_TAR: Final = _UNPACK.format("tar -xf {}")
+_ZED: Final = ("a ZED recording", "ZED_SVO_Export {} FOLDER 4 (ZED SDK: left pictures and 16-bit depth)")
+_ARCHIVE: Final = "an archive, unpack it first"
 
-#: Name's end → description of the file; ``{}`` stands for its name. The longest end that fits counts.
-_DESCRIPTIONS: Final = {
-    ".zip": _UNPACK.format("unzip {}"),
-    ".tar.gz": _TAR,
-    ".tgz": _TAR,
-    ".tar.xz": _TAR,
-    ".tar.bz2": _TAR,
-    ".tar.zst": _TAR,
-    ".gz": _UNPACK.format("gunzip {}"),
-    ".xz": _UNPACK.format("unxz {}"),
-    ".bz2": _UNPACK.format("bunzip2 {}"),
-    ".zst": _UNPACK.format("zstd -d {}"),
-    ".zstd": _UNPACK.format("zstd -d {}"),
-    ".7z": _UNPACK.format("7z x {}"),
-    ".rar": _UNPACK.format("unrar x {}"),
-    ".svo": "a ZED recording; convert it: ZED_SVO_Export {} FOLDER 4 (ZED SDK; left pictures and 16-bit depth)",
-    ".svo2": "a ZED recording; convert it: ZED_SVO_Export {} FOLDER 4 (ZED SDK; left pictures and 16-bit depth)",
-    ".sens": "a ScanNet recording; convert it: python reader.py --filename {} --output_path FOLDER"
-    " --export_depth_images --export_color_images --export_poses --export_intrinsics (ScanNet/SensReader/python)",
-    ".oni": "an OpenNI recording; convert it: pyonitool.py --extractcolor FOLDER/images --extractdepth FOLDER/depth {}"
-    " (github.com/eruffaldi/pyoni)",
-    ".klg": "an ElasticFusion log; convert it: klg2png {} images depth 640 480 (github.com/wonhkim/klg2png)",
-    ".xef": "a Kinect Studio recording; convert it: xefextract {} (github.com/Isaac-W/KinectXEFTools)",
-    ".vrs": "a VRS recording; convert it: vrs extract-all {} --to FOLDER (github.com/facebookresearch/vrs)",
-    ".bag.active": "a ROS 1 bag that was not closed; mend it: rosbag reindex {}",
+#: Name's end → what the file is and the command that converts it; ``{}`` stands for its name. The longest end counts.
+_CONVERTERS: Final = {
+    ".zip": (_ARCHIVE, "unzip {}"),
+    **dict.fromkeys((".tar.gz", ".tgz", ".tar.xz", ".tar.bz2", ".tar.zst"), (_ARCHIVE, "tar -xf {}")),
+    ".gz": (_ARCHIVE, "gunzip {}"),
+    ".xz": (_ARCHIVE, "unxz {}"),
+    ".bz2": (_ARCHIVE, "bunzip2 {}"),
+    ".zst": (_ARCHIVE, "zstd -d {}"),
+    ".zstd": (_ARCHIVE, "zstd -d {}"),
+    ".7z": (_ARCHIVE, "7z x {}"),
+    ".rar": (_ARCHIVE, "unrar x {}"),
+    ".svo": _ZED,
+    ".svo2": _ZED,
+    ".sens": (
+        "a ScanNet recording",
+        "python reader.py --filename {} --output_path FOLDER --export_depth_images --export_color_images --export_poses"
+        " --export_intrinsics (ScanNet/SensReader/python)",
+    ),
+    ".oni": (
+        "an OpenNI recording",
+        "pyonitool.py --extractcolor FOLDER/images --extractdepth FOLDER/depth {} (github.com/eruffaldi/pyoni)",
+    ),
+    ".klg": ("an ElasticFusion log", "klg2png {} FOLDER/images FOLDER/depth 640 480 (github.com/wonhkim/klg2png)"),
+    ".xef": ("a Kinect Studio recording", "xefextract {} (github.com/Isaac-W/KinectXEFTools)"),
+    ".vrs": ("a VRS recording", "vrs extract-all {} --to FOLDER (github.com/facebookresearch/vrs)"),
+    ".bag.active": ("a ROS 1 bag that was not closed", "rosbag reindex {}"),
 }
 _VIDEO_SUFFIXES: Final = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 _NO_DEPTH: Final = "sensor depth of near surfaces is required for metric scale"
 
 
-def describe_foreign_file(file: Path) -> str | None:
+class ForeignFile(NamedTuple):
+    """What a file is, and the command that converts it."""
+
+    what: str
+    command: str | None = None
+
+    @property
+    def remedy(self) -> str | None:
+        """What an error names as expected; None without a command."""
+        return None if self.command is None else f"the files that this command writes: {self.command}"
+
+
+def describe_foreign_file(file: Path) -> ForeignFile | None:
     """What a file is and what converts it; None where its name's end is unknown."""
     name = file.name.lower()
-    ends = [end for end in _DESCRIPTIONS if name.endswith(end)]
+    ends = [end for end in _CONVERTERS if name.endswith(end)]
     if ends:
-        return _DESCRIPTIONS[max(ends, key=len)].format(file.name)
-    return _describe_video(file) if file.suffix.lower() in _VIDEO_SUFFIXES else None
+        what, command = _CONVERTERS[max(ends, key=len)]
+        return ForeignFile(what, command.format(file.name))
+    return ForeignFile(_describe_video(file)) if file.suffix.lower() in _VIDEO_SUFFIXES else None
 
 
 def _describe_video(file: Path) -> str:

@@ -6,10 +6,10 @@ of the RealSense SDK (``/device_0/sensor_0/Depth_0/image/data``) state the depth
 in topics of their own.
 
 For each colour camera the depth is that of its own frame, or called ``aligned_depth_to_color`` or ``depth_registered``
-where frames are not named; else the nearest by name. Depth of another camera is registered to the colour by a forward warp where the
-transform between the two is fixed in ``/tf_static`` or stated by the SDK; else it keeps its own intrinsics. Depth and
-colour are paired by their stamps within half a period. Poses are those of the colour's frame in the root of its chain
-of ``/tf``, where something of that chain moves. Pixels are decoded on access.
+where frames are not named; else the nearest by name. Depth of another camera is registered to the colour by a forward
+warp where the transform between the two is fixed in ``/tf_static`` or stated by the SDK; else it keeps its own
+intrinsics. Depth and colour are paired by their stamps within half a period. Poses are those of the colour's frame in
+the root of its chain of ``/tf``, where something of that chain moves. Pixels are decoded on access.
 """
 
 from __future__ import annotations
@@ -154,7 +154,8 @@ def _candidates(bag: BagIndex, name: str | None, *, is_depth: bool) -> list[Pict
             raise FormatError(bag.root, f"option {option}", name, f"one of {bag.format_topics()}")
         stream = bag.streams[name]
         if stream.head is None or stream.head.is_depth != is_depth:
-            raise FormatError(bag.root, f"option {option}", f"{name} of encoding {stream.encoding}", f"pictures of {option}")
+            found = f"{name} of encoding {stream.encoding}"
+            raise FormatError(bag.root, f"option {option}", found, f"pictures of {option}")
         return [stream]
     found = [s for s in bag.streams.values() if s.head is not None and s.head.is_depth == is_depth]
     if is_depth:

@@ -1,0 +1,143 @@
+"""Azure Kinect videos: written with and without the factory's calibration, and read back."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from support.box_scene import CAMERA, render, walk
+
+from dhtorch import data
+from dhtorch.data.codecs import matroska
+from dhtorch.data.intrinsics import MissingIntrinsicsError
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.readers import azure_kinect
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.records import Camera, Frame
+from dhtorch.testing.azure_kinect import write_azure_kinect
+
+pytest.importorskip("av")
+
+ROOT = os.environ.get("DHTORCH_DATA")
+K = [61.5, 58.25, 33.5, 21.75]
+LENS = torch.tensor([[0.4, -2.5, -1e-4, 2e-4, 1.4, 0.3, -2.3, 1.3]])  # as of a device, k1 k2 p1 p2 k3 … k6
+COLOUR = Camera(torch.tensor([[152.0, 152.5]]), torch.tensor([[159.0, 91.0]]), LENS)
+DEPTH = Camera(torch.tensor([[252.0, 252.25]]), torch.tensor([[161.5, 142.0]]))
+T_COLOUR_FROM_DEPTH = se3.exp(torch.tensor([[0.1, -0.002, 0.002, -0.032, -0.002, 0.004]]).double())
+
+
+def device_frames(n: int = 2) -> list[Frame]:
+    """Frames of the device's two cameras: colour of 320x180, depth of the binned narrow mode."""
+    frames = []
+    for frame in walk(n, COLOUR, (180, 320)):
+        seen = render(DEPTH, se3.compose(frame.T_world_from_cam, T_COLOUR_FROM_DEPTH), (288, 320))
+        frames.append(frame.replace(depth=seen.depth, depth_camera=DEPTH))
+    return frames
+
+
+@pytest.mark.parametrize("codec", ["rawvideo", "ffv1"])
+@pytest.mark.parametrize("names", [("COLOR", "DEPTH"), ("colour", "depth map")])
+def test_both_tracks_are_read(tmp_path: Path, codec: str, names: tuple[str, str]) -> None:
+    frames = walk(4)
+    write_azure_kinect(tmp_path / "a.mkv", frames, depth_codec=codec, names=names)
+    with pytest.raises(MissingIntrinsicsError, match=r"no intrinsics, expected .*data.K=.* calibration.json"):
+        data.open(tmp_path / "a.mkv")
+    recording = data.open(tmp_path / "a.mkv", K=K)
+    assert recording.format == "azure_kinect" and len(recording) == 4 and recording.depth_unit.is_assumed
+    assert recording.report == ("no calibration.json: depth is taken as registered to colour",)
+    for got, want in zip(pickle.loads(pickle.dumps(recording)), frames, strict=True):
+        torch.testing.assert_close(got.depth, want.depth, atol=5.01e-4, rtol=0)
+        torch.testing.assert_close(got.camera.f, CAMERA.f)
+        assert float((got.image.float() - want.image.float()).abs().mean()) < 5
+        torch.testing.assert_close(got.time, want.time - 100, atol=1e-3, rtol=0)
+
+
+def test_depth_is_registered_by_the_factorys_calibration(tmp_path: Path) -> None:
+    frames = device_frames()
+    write_azure_kinect(tmp_path / "a.mkv", frames, T_colour_from_depth=T_COLOUR_FROM_DEPTH)
+    recording = data.open(tmp_path / "a.mkv")
+    assert recording.report == () and "calibration.json" in recording.depth_unit.source
+    for got, want in zip(recording, frames, strict=True):
+        torch.testing.assert_close(got.camera.f, COLOUR.f, rtol=1e-6, atol=0)
+        torch.testing.assert_close(got.camera.c, COLOUR.c, rtol=1e-6, atol=0)
+        torch.testing.assert_close(got.camera.distortion, COLOUR.distortion)
+        size = tuple(got.depth.shape[1:])
+        exact = render(cameras.resize(COLOUR, (180, 320), size), want.T_world_from_cam, size).depth
+        seen = got.depth > 0
+        assert float(seen.float().mean()) > 0.5
+        error = ((got.depth - exact).abs() / exact)[seen]
+        assert float(error.median()) < 0.005
+
+
+def test_a_picture_without_depth_is_left_out_and_named(tmp_path: Path) -> None:
+    frames = walk(5)
+    write_azure_kinect(tmp_path / "a.mkv", frames, lost_depth=[1])
+    recording = data.open(tmp_path / "a.mkv", K=K)
+    assert recording.number.tolist() == [0, 2, 3, 4]
+    assert "frame 1: no depth map within half a period: left out" in recording.report
+    torch.testing.assert_close(recording[1].depth, frames[2].depth, atol=5.01e-4, rtol=0)
+
+
+def test_depth_of_another_size_needs_the_calibration(tmp_path: Path) -> None:
+    write_azure_kinect(tmp_path / "a.mkv", device_frames())
+    with pytest.raises(
+        FormatError, match=r"a depth track of 320x288 without calibration.json.*azure_kinect_mkv_reader"
+    ):
+        data.open(tmp_path / "a.mkv", K=K)
+
+
+def test_a_calibration_that_is_none(tmp_path: Path) -> None:
+    write_azure_kinect(tmp_path / "a.mkv", device_frames(), T_colour_from_depth=T_COLOUR_FROM_DEPTH)
+    whole = (tmp_path / "a.mkv").read_bytes()
+    for old, new, text in (
+        (b"CALIBRATION_CameraLocationPV0", b"CALIBRATION_CameraLocationXX0", "Cameras: found"),
+        (b"LensDistortionModelBrownConrady", b"LensDistortionModelFisheyeLens_", "ModelType: found"),
+        (b'"CalibrationInformation"', b'"CalibrationInformatio_"', "CalibrationInformation.Cameras: found nothing"),
+        (b'{"CalibrationInformation', b'["CalibrationInformation', "JSON"),
+    ):
+        assert len(old) == len(new) and old in whole
+        (tmp_path / "b.mkv").write_bytes(whole.replace(old, new))
+        with pytest.raises(FormatError, match=text) as caught:
+            data.open(tmp_path / "b.mkv")
+        assert "calibration.json" in str(caught.value)
+
+
+def test_the_header_is_read_without_a_decoder(tmp_path: Path) -> None:
+    write_azure_kinect(tmp_path / "a.mkv", device_frames(), T_colour_from_depth=T_COLOUR_FROM_DEPTH)
+    colour, depth = matroska.list_video_tracks(tmp_path / "a.mkv")
+    assert (colour.name, colour.codec, colour.hw) == ("COLOR", "V_MJPEG", (180, 320))
+    assert (depth.name, depth.fourcc, depth.hw) == ("DEPTH", "b16g", (288, 320))
+    text = matroska.read_attachment(tmp_path / "a.mkv", "calibration.json")
+    assert np.shape(json.loads(text.rstrip(b"\0"))["CalibrationInformation"]["Cameras"]) == (2,)
+    assert matroska.read_attachment(tmp_path / "a.mkv", "other") is None
+
+
+def test_truncated_videos(tmp_path: Path) -> None:
+    write_azure_kinect(tmp_path / "a.mkv", walk(4))
+    whole = (tmp_path / "a.mkv").read_bytes()
+    for share in (0.001, 0.01, 0.05, 0.5, 0.9):
+        (tmp_path / "b.mkv").write_bytes(whole[: int(len(whole) * share)])
+        try:
+            _ = [frame.depth for frame in data.open(tmp_path / "b.mkv", K=K)]
+        except FormatError as error:
+            assert "\n" not in str(error)
+
+
+def test_a_plain_video_is_no_recording(tmp_path: Path) -> None:
+    (tmp_path / "a.mkv").write_bytes(matroska.MATROSKA_SIGNATURE + b"\x80")
+    assert azure_kinect.recognise(tmp_path / "a.mkv") is None
+    assert azure_kinect.find_depth_track(tmp_path / "a.mkv") is None
+    with pytest.raises(FormatError, match="a video without depth"):
+        data.open(tmp_path / "a.mkv")
+
+
+@pytest.mark.skipif(not ROOT or not (Path(ROOT) / "field_cases").is_dir(), reason="needs DHTORCH_DATA")
+def test_the_field_case() -> None:
+    recording = data.open(Path(ROOT) / "field_cases/26-azure-kinect-mkv/capture.mkv", K=[525, 525, 319.5, 239.5])
+    assert len(recording) == 5 and 0.9 < float(recording[0].depth[recording[0].depth > 0].min()) < 1.1
