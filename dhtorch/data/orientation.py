@@ -91,8 +91,23 @@ def orientation_scores(
     scores = []
     for k in symmetries:
         log_depth, covered = (apply_symmetry(x, k) for x in smooth[k % 2])
-        scores.append(_correlation(picture, _edge_vectors(log_depth, covered), covered))
+        scores.append(edge_correlation(picture, _edge_vectors(log_depth, covered), covered))
     return torch.tensor(scores, dtype=torch.float64)
+
+
+def edge_fields(image: Tensor, depth: Tensor, *, grid_px: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Edges of a picture and of its depth on one grid, as in :func:`orientation_scores` for the stored orientation.
+
+    Returns:
+        Edge vectors (3, h, w) of the picture (C, H, W), those of the depth map, and the mask (h, w) of the latter;
+        ``grid_px`` is the longer side of the grid.
+    """
+    grey = image.float().mean(0) * (1.0 if image.dtype == torch.uint8 else 255.0)
+    scale = grid_px / max(grey.shape)
+    hw = max(2, round(grey.shape[0] * scale)), max(2, round(grey.shape[1] * scale))
+    picture = _edge_vectors(_blur((_resample(grey, hw) + _DARK_OFFSET).log()), torch.ones(hw, dtype=torch.bool))
+    log_depth, covered = _smooth_log_depth(depth, hw)
+    return picture, _edge_vectors(log_depth, covered), covered
 
 
 def select_symmetry(
@@ -278,7 +293,7 @@ def _edge_vectors(x: Tensor, mask: Tensor) -> Tensor:
     return strength.clamp_max(_MAX_EDGE_STRENGTH * mean) * direction
 
 
-def _correlation(a: Tensor, b: Tensor, mask: Tensor) -> float:
+def edge_correlation(a: Tensor, b: Tensor, mask: Tensor) -> float:
     """Correlation coefficient of two vector fields (3, h, w) over a mask; 0 where one of them is constant."""
     if not bool(mask.any()):
         return 0.0

@@ -23,6 +23,7 @@ from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
 from dhtorch.runtime.console import format_count
 from dhtorch.validation import faults
+from dhtorch.validation.edge_lag import find_edge_lag
 from dhtorch.validation.faults import Diagnosis, KnownFault, WindowTracks
 from dhtorch.validation.pose_check import PoseCheck, check_poses, describe_contradiction, describe_factor
 
@@ -39,6 +40,16 @@ _TURN_OPTIONS: Final = {
     "rolled by 270 degrees": "90",
 }
 
+#: Pictures instead of depth have a fault if undoing it in the depth raises the disagreement of surfaces under the poses
+#: by this ratio and this difference. Source: origin not recorded.
+_MIN_WORSE_RATIO: Final = 1.5
+_MIN_WORSE_DISAGREEMENT: Final = 0.003
+
+#: Offsets of the principal point from the middle of the picture, as fractions of its sides: above the first it is far,
+#: below the second near. Source: origin not recorded; K of the shared data are at most 0.04 off.
+_FAR_PRINCIPAL_POINT: Final = 0.08
+_NEAR_PRINCIPAL_POINT: Final = 0.05
+
 #: Epipolar distances at which pictures are said to follow one of two sets of poses: the smaller median is at most this
 #: fraction of the larger one. Source: origin not recorded.
 _MAX_EPIPOLAR_RATIO: Final = 0.7
@@ -48,7 +59,7 @@ _MAX_EPIPOLAR_RATIO: Final = 0.7
 class Finding:
     """One thing that a capture's files mean otherwise than assumed, or that contradict each other."""
 
-    cause: str  # unit | poses | mirrored | rolled | registration | along the ray | time offset | scale | plausibility
+    cause: str  # plausibility | intrinsics | poses | scale, or the kind of a KnownFault
     text: str
     remedy: str = ""  # option that mends it, empty where none does
 
@@ -100,15 +111,17 @@ def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = Non
         Finding("plausibility", each.text, each.remedy)
         for each in plausibility_findings(depths, recording.depth_unit, recording.sparse)
     ]
+    findings += _intrinsics_findings(list(window.values()))
     if len(depths) < 2 or recording.sparse:
         return CaptureCheck(recording, notes, tuple(findings))
     views = {i: frame.replace(T_world_from_cam=None) for i, frame in window.items() if 0 not in frame.hw}
     tracks, diagnosis = _diagnose_window(list(views.values()), seed)
     positions = list(views)
     pairs = [(positions[i], positions[j]) for i, j in tracks.pairs] or _neighbouring_pairs(list(window))
-    poses = None if recording.poses is None else check_poses(recording.poses, window, pairs)
-    shared_fault = _fault_of(diagnosis)
-    findings += _judge(recording, poses, shared_fault, window, pairs, tracks)
+    tracked = list(zip(tracks.samples, tracks.tracks, strict=True))
+    poses = None if recording.poses is None else check_poses(recording.poses, window, pairs, tracked)
+    fault = _fault_of(diagnosis) or _late_depth(list(views.values()))
+    findings += _judge(recording, poses, fault, window, pairs, tracks)
     check = CaptureCheck(recording, notes, tuple(findings), poses, diagnosis)
     return replace(check, recording=replace(recording, poses=None)) if check.poses_refuted else check
 
@@ -169,6 +182,33 @@ def _fault_of(diagnosis: Diagnosis | None) -> KnownFault | None:
     return next(each for each in faults.KNOWN_FAULTS if each.name == diagnosis.cause)
 
 
+def _intrinsics_findings(frames: Sequence[Frame]) -> list[Finding]:
+    """Findings on a principal point that is far from the middle of the picture, with what it would fit."""
+    if not frames or 0 in frames[0].hw:
+        return []
+    c, (h, w) = frames[0].camera.c[0].double() + 0.5, frames[0].hw
+    relative = c / torch.tensor([w, h], dtype=torch.float64)
+    if float((relative - 0.5).abs().max()) <= _FAR_PRINCIPAL_POINT:
+        return []
+    exchanged = c.flip(-1) / torch.tensor([w, h], dtype=torch.float64)
+    start = f"the principal point {c[0]:.0f}, {c[1]:.0f} px is far from the middle of pictures of {w}x{h}"
+    if float((exchanged - 0.5).abs().max()) <= _NEAR_PRINCIPAL_POINT:
+        return [Finding("intrinsics", f"{start}: cx and cy (and fx and fy) look exchanged", "data.K=[fx,fy,cx,cy]")]
+    factor = 2 * float(relative.mean())
+    if float((relative / relative.mean() - 1).abs().max()) <= _NEAR_PRINCIPAL_POINT:
+        text = f"{start}: the intrinsics look like those of pictures {factor:.3g} times as large"
+        return [Finding("intrinsics", text, "data.K=[fx,fy,cx,cy]")]
+    return []
+
+
+def _late_depth(frames: Sequence[Frame]) -> KnownFault | None:
+    """The time offset that the edges of pictures and depth show; None without one."""
+    lag = find_edge_lag(frames).lag if len(frames) > 1 else 0
+    return (
+        None if lag == 0 else KnownFault("time offset", f"{abs(lag)} frames {'late' if lag > 0 else 'early'}", lag=lag)
+    )
+
+
 # ----------------------------------------------------------------------------------------------------------- findings
 
 
@@ -181,21 +221,32 @@ def _judge(
     tracks: WindowTracks,
 ) -> list[Finding]:
     """Findings from the two checks: the fault of depth beside its pictures, and the poses beside the depth."""
+    mended = None
+    if poses is not None and fault is not None:
+        mended = check_poses(_poses_of(recording), _undo(fault, window), _inside(fault, pairs, window))
     if poses is None or not poses.contradicts:
-        findings = [] if fault is None else [_fault_finding(fault, agrees_with_poses=poses is not None)]
+        findings = [] if fault is None else [_fault_finding(fault, pictures=_are_pictures_wrong(poses, mended))]
         if poses is not None and poses.factor != 1:
             findings.append(Finding("scale", describe_factor(poses)))
         return findings
-    if fault is not None:
-        mended = check_poses(_poses_of(recording), _undo(fault, window), _inside(fault, pairs, window))
-        if mended is not None and not mended.contradicts:
-            return [_fault_finding(fault, agrees_with_poses=False)]
+    if fault is not None and mended is not None and not mended.contradicts:
+        return [_fault_finding(fault)]
     text, remedy = describe_contradiction(poses, recording.depth_unit)
     lag = poses.best.lag if poses.is_explained else 0
     if lag and _pictures_follow(_poses_of(recording), lag, window, pairs, tracks):
-        return [Finding("time offset", _lag_text(-lag), f"data.depth_lag={-lag}")]
+        return [Finding("time offset", _lag_text(-lag, "pictures and poses"), f"data.depth_lag={-lag}")]
     findings = [Finding("poses", f"{text}; they are not used", remedy)]
-    return findings if fault is None or lag else [*findings, _fault_finding(fault, agrees_with_poses=False)]
+    return findings if fault is None or lag else [*findings, _fault_finding(fault)]
+
+
+def _are_pictures_wrong(poses: PoseCheck | None, mended: PoseCheck | None) -> bool:
+    """Whether surfaces coincide under the poses clearly worse once a fault of the depth is undone."""
+    return (
+        poses is not None
+        and mended is not None
+        and mended.surfaces.stated > _MIN_WORSE_RATIO * poses.surfaces.stated
+        and mended.surfaces.stated - poses.surfaces.stated > _MIN_WORSE_DISAGREEMENT
+    )
 
 
 def _poses_of(recording: Recording) -> Pose:
@@ -203,31 +254,26 @@ def _poses_of(recording: Recording) -> Pose:
     return recording.poses
 
 
-def _fault_finding(fault: KnownFault, *, agrees_with_poses: bool) -> Finding:
-    """Sentence and option for a fault of the depth beside its pictures."""
-    seen = "as tracks and near returns show"
+def _fault_finding(fault: KnownFault, *, pictures: bool = False) -> Finding:
+    """Sentence and option for a fault of the depth beside its pictures; ``pictures``: these contradict the poses."""
+    which = "pictures" if pictures else "depth"
+    seen = "; depth and poses agree" if pictures else ""
     if fault.kind == "time offset":
-        if agrees_with_poses:
-            late = "early" if fault.lag > 0 else "late"
-            frames = format_count(abs(fault.lag), "frame")
-            return Finding(fault.kind, f"the pictures are {frames} {late} against depth and poses, {seen}")
-        return Finding(fault.kind, _lag_text(fault.lag), f"data.depth_lag={fault.lag}")
+        text = _lag_text(-fault.lag, "depth and poses", "the pictures are") if pictures else _lag_text(fault.lag)
+        return Finding(fault.kind, text, "" if pictures else f"data.depth_lag={fault.lag}")
     if fault.kind in ("mirrored", "rolled"):
-        which = "the pictures (depth agrees with the poses)" if agrees_with_poses else "depth"
-        text = f"depth and pictures differ in orientation: {which} {_verb(which)} {fault.name}, {seen}"
-        return Finding(fault.kind, text, f"data.depth_turn={_TURN_OPTIONS[fault.name]}")
+        verb = "are" if pictures else "is"
+        text = f"depth and pictures differ in orientation: {which} {verb} {fault.name}{seen}"
+        return Finding(fault.kind, text, "" if pictures else f"data.depth_turn={_TURN_OPTIONS[fault.name]}")
     if fault.kind == "registration":
-        return Finding(fault.kind, f"depth does not lie over its pictures ({fault.name}), {seen}", "data.K_depth=")
-    return Finding(fault.kind, f"depth is wrong: {fault.name}, {seen}")
+        text = f"depth does not lie over its pictures ({fault.name}){seen}: one of them is cropped, or depth has a K"
+        return Finding(fault.kind, f"{text} of its own (data.K_depth=)")
+    return Finding(fault.kind, f"depth is wrong: {fault.name}")
 
 
-def _verb(subject: str) -> str:
-    return "are" if subject.startswith("the pictures") else "is"
-
-
-def _lag_text(lag: int) -> str:
+def _lag_text(lag: int, against: str = "the pictures", subject: str = "depth is") -> str:
     late = "late" if lag > 0 else "early"
-    return f"depth is {format_count(abs(lag), 'frame')} {late} against pictures and poses"
+    return f"{subject} {format_count(abs(lag), 'frame')} {late} against {against}"
 
 
 def _undo(fault: KnownFault, window: Mapping[int, Frame]) -> dict[int, Frame]:

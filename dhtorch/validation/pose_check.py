@@ -3,7 +3,10 @@
 The returns of one frame are moved into another by the relative pose and compared with the depth there. This is done
 under the stated poses and under every reading that they might have instead (camera axes, world-to-camera, quaternion
 order, unit of translations, lag in frames): the best reading measures the noise of the depth itself, and names what the
-poses are if the stated reading is clearly worse. Colour is not used.
+poses are if the stated reading is clearly worse.
+
+Where tracks of the pictures are at hand, near returns moved by the same motions are also compared with where they were
+tracked to, which is far more precise for small motions and noisy depth.
 
 Alphabet: K pairs of frames, H readings; the *disagreement* of a pair is the median of |z − z'| / z' over the returns
 that meet a return, where z is the depth of a moved return and z' that of the frame there.
@@ -24,7 +27,8 @@ from dhtorch.data.units import UNIT_METRES, DepthUnit, format_unit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.patches import sample_nearest
-from dhtorch.records import Camera, Frame, Pose
+from dhtorch.records import Camera, Frame, Pose, Samples, Tracks
+from dhtorch.runtime.console import format_count
 
 #: Returns of a frame that are moved.
 #: Source: derived, the median of 3000 values has a standard error of two hundredths of their spread.
@@ -79,6 +83,18 @@ _MAX_UNEXPLAINED_DISAGREEMENT: Final = 0.05
 _MIN_FACTOR_GAIN: Final = 1.25
 _MIN_FACTOR_OFFSET: Final = 0.045
 
+#: By tracks another reading is clearly better if its loss is at most this fraction of that of the stated poses, which
+#: is at least this. Source: chosen on the sound captures of the shared data (fraction at least 0.81, or a loss of
+#: 0.15 or less) and on planted conventions and a factor of 1.1 (fraction at most 0.31).
+_MAX_TRACK_LOSS_RATIO: Final = 0.6
+_MIN_TRACK_LOSS: Final = 0.2
+
+#: Miss at which the loss of a tracked return is a half, px of a picture 640 wide. Source: as ValidationOptions.
+_HALF_LOSS_PX: Final = 2.0
+
+#: Tracked near returns that a pair must have. Source: as dhtorch.validation.faults.
+_MIN_TRACKS: Final = 12
+
 #: Metres of one step of common depth files, tried where the depth unit may be the wrong one.
 _COMMON_DEPTH_UNITS_M: Final = (1.0, 1e-2, 1e-3, 1e-4, 1 / 5000, 1 / 256, 1 / 6553.5, 1 / 4000, 0.0254)
 
@@ -95,71 +111,139 @@ class PoseReading(NamedTuple):
         unit = self.convention.unit
         return UNIT_METRES[unit] if isinstance(unit, str) else unit
 
+    @property
+    def is_small_factor(self) -> bool:
+        """Whether only the factor differs, and by too little for a confusion of units."""
+        return self.convention.unit in _FINE_FACTORS
+
+
+class ReadingScores(NamedTuple):
+    """Score of the readings by one witness, medians or means over pairs; the smaller the better."""
+
+    stated: float  # NaN: not measurable
+    without: float  # under identity poses
+    best: PoseReading
+    best_score: float
+
 
 @dataclass(frozen=True)
 class PoseCheck:
-    """Disagreement of depth between frames under the stated poses and under other readings, medians over pairs."""
+    """Agreement of poses with depth under the stated and under other readings, by two witnesses."""
 
-    stated: float  # NaN: no surface meets another one
-    without: float  # under identity poses
-    best: PoseReading  # reading with the least disagreement
-    best_disagreement: float
-    factor: float  # on translations, with the least disagreement; 1 where it is not distinguishable from 1
+    surfaces: ReadingScores  # disagreement of depth between frames
+    tracks: ReadingScores | None  # loss of near returns at their tracks, in [0, 1]; None without tracks
+    surface_factor: float  # on translations, near 1, with the least disagreement; 1 = not distinguishable from 1
     n_pairs: int
 
     @property
-    def contradicts(self) -> bool:
-        """Whether the stated poses are refuted by the depth."""
-        if math.isnan(self.stated):
-            return not math.isnan(self.best_disagreement)
-        gain = self.stated - self.best_disagreement
-        explained = any(
-            self.stated >= ratio * self.best_disagreement and gain >= least for ratio, least in _CONTRADICTION_LIMITS
+    def by_tracks(self) -> bool:
+        """Whether the tracks show another reading of the poses clearly better than the stated one."""
+        return (
+            self.tracks is not None
+            and self.tracks.stated >= _MIN_TRACK_LOSS
+            and self.tracks.best_score <= _MAX_TRACK_LOSS_RATIO * self.tracks.stated
         )
-        return explained or self.stated > max(_MAX_UNEXPLAINED_DISAGREEMENT, self.without)
+
+    @property
+    def best(self) -> PoseReading:
+        """The best reading, by tracks where these are decisive."""
+        return self.tracks.best if self.tracks is not None and self.by_tracks else self.surfaces.best
+
+    @property
+    def factor(self) -> float:
+        """Factor on translations that is no confusion of units but clearly not 1; 1 where there is none."""
+        if self.tracks is not None and self.by_tracks:
+            return self.tracks.best.factor if self.tracks.best.is_small_factor else 1.0
+        return self.surface_factor if self.tracks is None or math.isnan(self.tracks.stated) else 1.0
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the stated poses are refuted; a factor near 1 refutes neither the poses nor the depth."""
+        if self.by_tracks and self.tracks is not None:
+            return not self.tracks.best.is_small_factor
+        stated, best = self.surfaces.stated, self.surfaces.best_score
+        if math.isnan(stated):
+            return not math.isnan(best)
+        if self.surfaces.best.is_small_factor:
+            return False
+        explained = any(stated >= ratio * best and stated - best >= least for ratio, least in _CONTRADICTION_LIMITS)
+        return explained or stated > max(_MAX_UNEXPLAINED_DISAGREEMENT, self.surfaces.without)
 
     @property
     def is_explained(self) -> bool:
         """Whether the best reading agrees clearly better than the stated poses and than no poses."""
-        if self.best == PoseReading() or math.isnan(self.best_disagreement):
+        if self.by_tracks:
+            return True
+        best = self.surfaces.best_score
+        if self.surfaces.best == PoseReading() or math.isnan(best):
             return False
-        return self.best_disagreement < 0.5 * min(_or_infinite(self.stated), 2 * _or_infinite(self.without))
+        return best < 0.5 * min(_or_infinite(self.surfaces.stated), 2 * _or_infinite(self.surfaces.without))
 
 
-def check_poses(poses: Pose, frames: Mapping[int, Frame], pairs: Sequence[tuple[int, int]]) -> PoseCheck | None:
+def check_poses(
+    poses: Pose,
+    frames: Mapping[int, Frame],
+    pairs: Sequence[tuple[int, int]],
+    tracks: Sequence[tuple[Samples, Tracks]] = (),
+) -> PoseCheck | None:
     """Poses of a recording and some of its frames -> their agreement; None where too few returns meet.
 
     Args:
         poses: (n) T_world_from_cam of all frames as stated.
         frames: position → frame (B = 1) with depth, of all frames in ``pairs``.
         pairs: positions of two frames each, in whose views most surfaces are the same.
+        tracks: samples of the first picture of each pair and their tracks into the second; none = depth alone.
 
     Gradient: none.
     """
     poses = poses.map(lambda x: x.double())
     readings = pose_readings()
-    disagreements = torch.full((len(pairs), len(readings)), torch.nan, dtype=torch.float64)
-    without = torch.full((len(pairs),), torch.nan, dtype=torch.float64)
+    surface = torch.full((len(pairs), len(readings) + 1), torch.nan, dtype=torch.float64)  # the last: identity poses
+    track = surface.clone()
     with torch.no_grad():
         for k, (i, j) in enumerate(pairs):
-            returns = _sampled_returns(frames[i])
-            if len(returns) < _MIN_MEETING_RETURNS:
-                continue
             place, motions = _relative_poses(poses, i, j, readings)
-            values = depth_disagreement(returns, frames[j], _with_identity(motions))
-            disagreements[k, place], without[k] = values[:-1], values[-1]
-    median = _median_over_pairs(disagreements)
+            returns = _sampled_returns(frames[i])
+            if len(returns) >= _MIN_MEETING_RETURNS:
+                surface[k, place] = depth_disagreement(returns, frames[j], motions)
+            if tracks:
+                track[k, place] = _track_loss(*tracks[k], frames[i], frames[j], motions)
+    median = _median_over_pairs(surface)
     if not bool(median.isfinite().any()):
         return None
-    best = int(median.nan_to_num(torch.inf).argmin())
+    scores = _reading_scores(readings, median)
+    assert scores is not None
     return PoseCheck(
-        stated=float(median[0]),
-        without=float(_median_over_pairs(without[:, None])[0]),
-        best=readings[best],
-        best_disagreement=float(median[best]),
-        factor=_distinguishable_factor(readings, median, disagreements),
-        n_pairs=int(disagreements[:, 0].isfinite().sum()),
+        surfaces=scores,
+        tracks=_reading_scores(readings, _mean_over_pairs(track)),
+        surface_factor=_distinguishable_factor(readings, median, surface),
+        n_pairs=int(surface[:, 0].isfinite().sum()),
     )
+
+
+def _reading_scores(readings: Sequence[PoseReading], scores: Tensor) -> ReadingScores | None:
+    """Scores (H + 1,) of the readings and of identity poses -> the stated and the best one; None without any."""
+    if not bool(scores[:-1].isfinite().any()):
+        return None
+    best = int(scores[:-1].nan_to_num(torch.inf).argmin())
+    return ReadingScores(float(scores[0]), float(scores[-1]), readings[best], float(scores[best]))
+
+
+def _track_loss(samples: Samples, tracks: Tracks, a: Frame, b: Frame, motions: Pose) -> Tensor:
+    """Mean loss (H,) of near returns moved by motions (H) at the ends of their tracks; NaN of too few.
+
+    The loss of a miss is miss² / (miss² + c²), c = 2 px of a picture 640 wide, as in ``dhtorch.validation.faults``.
+    """
+    used = (samples.usable & tracks.valid)[0]
+    if int(used.sum()) < _MIN_TRACKS:
+        return torch.full((len(motions.t),), torch.nan, dtype=torch.float64)
+    xyz = cam.unproject(a.camera, samples.uv, samples.depth)[0, used].double()
+    moved = se3.apply(motions, xyz.expand(len(motions.t), -1, -1))
+    in_front = moved[..., 2] > 1e-6
+    moved = torch.where(in_front[..., None], moved, 1.0)
+    uv = cam.project(b.camera, moved.reshape(1, -1, 3).to(a.camera.f.dtype)).reshape(len(motions.t), -1, 2)
+    miss = (uv - tracks.uv_1[0, used]).norm(dim=-1) * (640 / a.hw[1])
+    return torch.where(in_front, miss.square() / (miss.square() + _HALF_LOSS_PX**2), 1.0).double().mean(-1)
 
 
 def pose_readings() -> list[PoseReading]:
@@ -204,26 +288,37 @@ def depth_camera_of(frame: Frame) -> Camera:
 
 def describe_contradiction(check: PoseCheck, unit: DepthUnit | None = None) -> tuple[str, str]:
     """A refuted set of poses -> (sentence, option that would mend it, empty where none does)."""
-    shown = "no surface meets another" if math.isnan(check.stated) else f"{100 * check.stated:.1f} % of the depth"
-    start = f"poses and depth contradict each other ({shown}"
+    start = f"poses and depth contradict each other ({_measured(check)})"
     if not check.is_explained:
-        return f"{start}, {100 * check.without:.1f} % without poses): no other reading of the poses explains it", ""
-    start += f"; {100 * check.best_disagreement:.1f} % if read otherwise)"
+        return f"{start}; no other reading of the poses explains it", ""
     reading = check.best
     if reading.lag:
-        frames = f"{abs(reading.lag)} frame{'s' * (abs(reading.lag) > 1)}"
         late = "late" if reading.lag < 0 else "early"
-        return f"{start}: depth is {frames} {late} against the poses", f"data.depth_lag={-reading.lag}"
+        return (
+            f"{start}: depth is {format_count(abs(reading.lag), 'frame')} {late} against the poses",
+            f"data.depth_lag={-reading.lag}",
+        )
     option = f"data.pose_convention={reading.convention}"
-    if reading.factor == 1:
-        return f"{start}: these look like {reading.convention.describe()}", option
-    other = _other_depth_unit(reading.factor, unit)
-    if isinstance(reading.convention.unit, str):
+    if reading.factor == 1 or isinstance(reading.convention.unit, str):
         return f"{start}: these look like {reading.convention.describe()}", option
     text = f"{start}: translations are {1 / reading.factor:.3g} times what the depth has"
+    other = _other_depth_unit(reading.factor, unit)
     if other is not None:
         return f"{text}; the depth unit may be {format_unit(other)}", f"data.depth_unit={other:.6g}"
     return f"{text}: the unit of the depth or of the poses is another one", option
+
+
+def _measured(check: PoseCheck) -> str:
+    """The measurement that decides, as text."""
+    if check.by_tracks and check.tracks is not None:
+        return (
+            f"near returns miss their tracks, loss {check.tracks.stated:.2f}, {check.tracks.best_score:.2f} otherwise"
+        )
+    scores = check.surfaces
+    stated = "no surface meets another" if math.isnan(scores.stated) else f"{100 * scores.stated:.1f} % of the depth"
+    if check.is_explained:
+        return f"{stated}, {100 * scores.best_score:.1f} % if read otherwise"
+    return f"{stated}, {100 * scores.without:.1f} % without poses"
 
 
 def describe_factor(check: PoseCheck) -> str:
@@ -244,8 +339,7 @@ def _other_depth_unit(factor: float, unit: DepthUnit | None) -> float | None:
 
 def _distinguishable_factor(readings: Sequence[PoseReading], median: Tensor, disagreements: Tensor) -> float:
     """Factor near 1 on translations with clearly less disagreement than 1, in most pairs; else 1."""
-    near = [k for k, each in enumerate(readings) if each.lag == 0 and each.convention.unit in (*_FINE_FACTORS, "m")]
-    near = [k for k in near if PoseReading(PoseConvention(unit=readings[k].convention.unit)) == readings[k]]
+    near = [k for k, each in enumerate(readings) if each.is_small_factor or each == PoseReading()]
     values = median[near].nan_to_num(torch.inf)
     k = near[int(values.argmin())]
     factor, value = readings[k].factor, float(median[k])
@@ -257,7 +351,7 @@ def _distinguishable_factor(readings: Sequence[PoseReading], median: Tensor, dis
 
 
 def _relative_poses(poses: Pose, i: int, j: int, readings: Sequence[PoseReading]) -> tuple[Tensor, Pose]:
-    """Places (H') of the readings with a pose, and the motions (H') of frame i's points into frame j."""
+    """Places (H') of the readings with a pose, and the motions (H') from frame i to frame j; the last is none."""
     place, motions = [], []
     for k, reading in enumerate(readings):
         a, b = i + reading.lag, j + reading.lag
@@ -267,14 +361,9 @@ def _relative_poses(poses: Pose, i: int, j: int, readings: Sequence[PoseReading]
             if bool(motion.t.isfinite().all() and motion.R.isfinite().all()):
                 place.append(k)
                 motions.append(motion)
-    if not motions:
-        return torch.zeros(0, dtype=torch.long), se3.identity(0, poses.t)
+    place.append(len(readings))
+    motions.append(se3.identity(1, poses.t))
     return torch.tensor(place), Pose(torch.cat([m.R for m in motions]), torch.cat([m.t for m in motions]))
-
-
-def _with_identity(motions: Pose) -> Pose:
-    last = se3.identity(1, motions.t)
-    return Pose(torch.cat((motions.R, last.R)), torch.cat((motions.t, last.t)))
 
 
 def _sampled_returns(frame: Frame) -> Tensor:
@@ -290,6 +379,12 @@ def _median_over_pairs(values: Tensor) -> Tensor:
     """Medians (H,) of (K, H) over the pairs; NaN where less than half of the pairs have a value."""
     enough = 2 * values.isfinite().sum(0) >= max(1, int(values.isfinite().any(1).sum()))
     return torch.where(enough, values.nanmedian(0).values, torch.nan)
+
+
+def _mean_over_pairs(values: Tensor) -> Tensor:
+    """Means (H,) of (K, H) over the pairs; NaN where less than half of the pairs have a value."""
+    enough = 2 * values.isfinite().sum(0) >= max(1, int(values.isfinite().any(1).sum()))
+    return torch.where(enough, values.nanmean(0), torch.nan)
 
 
 def _or_infinite(value: float) -> float:
