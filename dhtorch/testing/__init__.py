@@ -27,7 +27,7 @@ from dhtorch.testing.layouts import (
     write_tum,
 )
 from dhtorch.testing.lerobot import write_lerobot
-from dhtorch.testing.posed_images import write_nerfstudio, write_polycam
+from dhtorch.testing.posed_images import write_colmap_capture, write_nerfstudio, write_polycam
 from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
 from dhtorch.testing.rh20t import write_rh20t
 from dhtorch.testing.rlds import write_rlds
@@ -40,6 +40,7 @@ __all__ = [
     "write_bop",
     "write_ca1m",
     "write_calib_pair",
+    "write_colmap_capture",
     "write_counted_frames",
     "write_driving",
     "write_icl_nuim",

@@ -12,7 +12,7 @@ from dhtorch.testing import image_folders, layouts
 from dhtorch.testing.arkitscenes import write_arkitscenes
 from dhtorch.testing.ca1m import write_ca1m
 from dhtorch.testing.lerobot import write_lerobot
-from dhtorch.testing.posed_images import write_nerfstudio, write_polycam
+from dhtorch.testing.posed_images import write_colmap_capture, write_nerfstudio, write_polycam
 from dhtorch.testing.record3d import write_r3d, write_record3d_exr, write_record3d_mp4
 from dhtorch.testing.rlds import write_rlds
 from dhtorch.testing.stray import write_stray
@@ -68,6 +68,7 @@ CAPTURE_WRITERS: Final[dict[str, CaptureWriter]] = {
         10 / 65535,
     ),
     "polycam": CaptureWriter(write_polycam, "polycam", 1 / 1000),
+    "colmap": CaptureWriter(write_colmap_capture, "colmap", 1 / 1000, states_unit=False),
     "stray": CaptureWriter(write_stray, "stray", 1 / 1000, is_exact=False, wants_even_sides=True),
     "r3d": CaptureWriter(
         lambda root, frames: write_r3d(root / "capture.r3d", frames), "record3d", path="capture.r3d", is_exact=False

@@ -1,4 +1,4 @@
-"""Test writers of exports with a camera for every image: nerfstudio's ``transforms.json`` and Polycam's raw data."""
+"""Test writers of exports with a camera for every image: nerfstudio's ``transforms.json``, Polycam, COLMAP."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from dhtorch.testing.parts import (
     K_matrix,
     encode_depth_codes,
     encode_unfiltered_png,
+    format_row,
     frame_time_s,
     frame_to_hwc,
     pose_matrix,
+    rotation_to_xyzw,
     save_file,
 )
 
@@ -109,3 +111,30 @@ def write_polycam(root: Path, frames: Sequence[Frame], *, corrected: bool = True
         save_file(folder / "depth" / f"{stem}.png", encode_unfiltered_png(depth))
         save_file(folder / "confidence" / f"{stem}.png", encode_unfiltered_png(_POLYCAM_CONFIDENCE[levels]))
     save_file(root / "mesh_info.json", json.dumps({"alignmentTransform": np.eye(4).ravel().tolist()}))
+
+
+def write_colmap_capture(
+    root: Path, frames: Sequence[Frame], *, folder: str = "sparse/0", model: str = "OPENCV", is_metric: bool = True
+) -> None:
+    """Write a COLMAP text model below ``folder``, ``images/`` and ``depth/`` in mm.
+
+    ``is_metric``: state metres and write ``times.txt``, as dhtorch does; COLMAP itself has neither. ``model``: PINHOLE,
+    SIMPLE_RADIAL (of the first coefficient) or OPENCV.
+    """
+    cameras, images, times = [], [], []
+    for i, frame in enumerate(frames, start=1):
+        K, distortion, name = K_matrix(frame.camera), frame.camera.distortion, f"{i:04d}.png"
+        lens = np.zeros(4) if distortion is None else distortion[0, :4].double().numpy()
+        f, c = [K[0, 0], K[1, 1]], [K[0, 2] + 0.5, K[1, 2] + 0.5]
+        values = {"PINHOLE": [*f, *c], "SIMPLE_RADIAL": [f[0], *c, lens[0]], "OPENCV": [*f, *c, *lens]}[model]
+        cameras.append(f"{i} {model} {frame.hw[1]} {frame.hw[0]} {format_row(values)}")
+        w2c = np.linalg.inv(pose_matrix(frame))
+        x, y, z, w = rotation_to_xyzw(w2c[:3, :3])
+        images += [f"{i} {format_row([w, x, y, z, *w2c[:3, 3]])} {i} {name}", "12.5 7.25 -1" if i % 2 else ""]
+        times.append(f"{i} {format_row([frame_time_s(frame)])}")
+        save_file(root / "images" / name, encode_unfiltered_png(frame_to_hwc(frame)))
+        save_file(root / "depth" / name, encode_unfiltered_png(encode_depth_codes(frame.depth, 1000)))
+    head = ["# Image list with two lines of data per image", *(["# metres"] if is_metric else [])]
+    texts = {"cameras": ["# Camera list", *cameras], "images": [*head, *images], "points3D": ["# 3D point list"]}
+    for kind, lines in (texts | ({"times": times} if is_metric else {})).items():
+        save_file(root / folder / f"{kind}.txt", "\n".join(lines) + "\n")

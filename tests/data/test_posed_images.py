@@ -17,7 +17,7 @@ from dhtorch import data
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.units import DepthUnit
 from dhtorch.records import Camera, Frame
-from dhtorch.testing import write_nerfstudio, write_polycam
+from dhtorch.testing import write_colmap_capture, write_counted_frames, write_nerfstudio, write_polycam
 from dhtorch.testing.parts import encode_depth_codes, encode_unfiltered_png
 
 RIGID = np.array([[0.0, 1, 0, 0.3], [1, 0, 0, -0.2], [0, 0, -1, 1.5], [0, 0, 0, 1]])  # as nerfstudio's of COLMAP
@@ -324,3 +324,58 @@ def test_images_with_an_orientation_tag_are_turned_to_their_camera(tmp_path: Pat
     recording = data.open(tmp_path)
     check_same(recording, frames)
     assert any(line.startswith("orientation: EXIF orientation 6") for line in recording.report)
+
+
+# --------------------------------------------------------------------------------------------------------------- COLMAP
+
+
+@pytest.mark.parametrize("folder", ["sparse/0", "sparse", "colmap", "."])
+def test_colmap(folder: str, tmp_path: Path) -> None:
+    frames = walk(3)
+    write_colmap_capture(tmp_path, frames, folder=folder, model="PINHOLE")
+    assert data.recognise(tmp_path)[0] == "colmap"
+    recording = data.open(tmp_path)
+    check_same(recording, frames)
+    assert recording.number.tolist() == [1, 2, 3] and recording.report == ()
+    assert recording.depth_unit == DepthUnit(1e-3) and recording.pose_axes == "cv"
+
+
+@pytest.mark.parametrize(("model", "n"), [("SIMPLE_RADIAL", 1), ("OPENCV", 4)])
+def test_colmap_lenses(model: str, n: int, tmp_path: Path) -> None:
+    lens = torch.tensor([[0.01, -0.02, 0.003, -0.004]])
+    camera = Camera(torch.tensor([[61.0, 61.0]]), torch.tensor([[30.5, 22.5]]), lens)
+    write_colmap_capture(tmp_path, walk(2, camera), model=model, is_metric=False)
+    recording = data.open(tmp_path)
+    want = torch.where(torch.arange(4) < n, lens, 0.0)
+    assert torch.allclose(recording[0].camera.distortion, want) and torch.allclose(recording[0].camera.f, camera.f)
+    assert recording.times is None
+    assert recording.report == ("poses were estimated by COLMAP: their scale is not metric unless it was aligned",)
+
+
+def test_colmap_without_what_it_needs(tmp_path: Path) -> None:
+    write_colmap_capture(tmp_path, walk(2))
+    sparse = tmp_path / "sparse" / "0"
+    with pytest.raises(FormatError, match="images: found none beside the model"):
+        data.open(sparse)
+    assert data.open(sparse, images="../../images", depth="../../depth")[0].depth.any()
+    with pytest.raises(FormatError, match="images: found no folder pictures"):
+        data.open(tmp_path, images="pictures")
+    text = (sparse / "cameras.txt").read_text()
+    (sparse / "cameras.txt").write_text(text.replace("OPENCV", "OPENCV_FISHEYE"))
+    with pytest.raises(FormatError, match=r"model: found OPENCV_FISHEYE, expected .*undistort the images first"):
+        data.open(tmp_path)
+    (sparse / "cameras.txt").write_text(text.replace("\n2 OPENCV", "\n9 OPENCV"))
+    with pytest.raises(FormatError, match="camera of image 2: found 2, expected a camera"):
+        data.open(tmp_path)
+    (sparse / "cameras.txt").unlink()
+    with pytest.raises(FormatError, match="colmap model_converter"):
+        data.open(tmp_path, "colmap")
+
+
+def test_poses_of_numbered_frames_win_over_an_estimate(tmp_path: Path) -> None:
+    """A folder whose sensor has poses of its own beside a model of COLMAP."""
+    frames = walk(2)
+    write_counted_frames(tmp_path, frames)
+    write_colmap_capture(tmp_path / "other", frames)
+    (tmp_path / "other" / "sparse").rename(tmp_path / "sparse")
+    assert data.recognise(tmp_path)[0] == "frames_dir"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,9 @@ from dhtorch.data.readers import rh20t
 from dhtorch.experiments.focal import writers as stack_writers
 from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
+from dhtorch.testing.azure_kinect import write_azure_kinect
+from dhtorch.testing.rosbag import BagLayout, write_rosbag
+from dhtorch.testing.simulator_hdf5 import write_simulator_hdf5
 from support import record3d_captures, stray_frames
 from support.arkitscenes_frames import VGA, VGA_HW, shots
 from support.box_scene import walk
@@ -131,6 +135,30 @@ def read_rh20t(root: Path) -> None:
     rh20t.read_robot_streams(root)
 
 
+def write_simulator(root: Path) -> Path:
+    """A ManiSkill file of one episode."""
+    write_simulator_hdf5(root / "a.h5", [small_walk(2)], "maniskill3")
+    return root / "a.h5"
+
+
+def bag_writer(layout: BagLayout) -> Callable[[Path], Path]:
+    """The function that writes a bag of that layout."""
+
+    def write(root: Path) -> Path:
+        path = root / ("a.bag" if layout.storage == "ros1" else "bag")
+        write_rosbag(path, small_walk(), layout)
+        return path
+
+    return write
+
+
+def write_kinect(root: Path) -> Path:
+    """An Azure Kinect video of both cameras with its calibration."""
+    frames = [frame.replace(depth=torch.ones(1, 288, 320)) for frame in walk(2, hw=(36, 64))]
+    write_azure_kinect(root / "a.mkv", frames, T_colour_from_depth=se3.identity(1, torch.zeros(1).double()))
+    return root / "a.mkv"
+
+
 # ------------------------------------------------------------------------------------------------ focal stacks, files
 
 
@@ -159,6 +187,18 @@ def write_tiff(root: Path) -> Path:
     return root / "a.tiff"
 
 
+#: Bags need the library rosbags to be written.
+BAGS: dict[str, Callable[[Path], Path]] = (
+    {}
+    if importlib.util.find_spec("rosbags") is None
+    else {
+        "rosbag_mcap": bag_writer(BagLayout(colour_encoding="png", T_colour_from_depth=np.eye(4), depth_frame="depth")),
+        "rosbag_sqlite": bag_writer(BagLayout(storage="sqlite3", depth_encoding="32FC1 png")),
+        "rosbag_ros1": bag_writer(BagLayout(storage="ros1", colour_encoding="png")),
+        "rosbag_ros1_lz4": bag_writer(BagLayout(storage="ros1", compression="lz4")),
+    }
+)
+
 Sample = tuple[Callable[[Path], Path | None], Callable[[Path], Any]]
 
 #: By format: a function that writes a small capture below a folder and returns what to open (None = the folder), and
@@ -185,6 +225,12 @@ SAMPLES: dict[str, Sample] = {
             "lerobot_v2": write_lerobot_v2,
             "rlds": write_rlds,
             "rlds_array": write_rlds_array,
+            "nerfstudio": lambda root: writers.write_nerfstudio(root, small_walk()),
+            "polycam": lambda root: writers.write_polycam(root, small_walk()),
+            "colmap": lambda root: writers.write_colmap_capture(root, small_walk()),
+            "simulator_hdf5": write_simulator,
+            "azure_kinect": write_kinect,
+            **BAGS,
             "fod500": lambda root: stack_writers.write_fod500(root, {0: random_stack(0), 1: random_stack(1)}),
             "ddff12": write_ddff12,
             "light_field": write_light_field,

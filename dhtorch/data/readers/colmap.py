@@ -9,6 +9,7 @@ metres (``# metres``), with the times of the images in ``times.txt``; it writes 
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,11 +75,11 @@ def read(root: str | Path, *, images: str | None = None, depth: str | None = Non
     if model is None:
         command = "colmap model_converter --input_path sparse/0 --output_path sparse/0 --output_type TXT"
         raise FormatError(root, "model", "no text model", f"cameras.txt and images.txt (of a binary one: {command})")
-    pictures = root / images if images is not None else _find_folder(root, _IMAGE_FOLDERS)
+    pictures = _find_folder(root, _IMAGE_FOLDERS) if images is None else _join(root, images)
     if pictures is None or not pictures.is_dir():
         problem = "none beside the model" if images is None else f"no folder {images}"
         raise FormatError(root, "images", problem, "images/, or data.images=FOLDER and data.depth=FOLDER")
-    maps = root / depth if depth is not None else root / "depth"
+    maps = root / "depth" if depth is None else _join(root, depth)
     lenses = _read_cameras(model / "cameras.txt")
     times = _read_times(model / "times.txt")
     rows, missing = [], []
@@ -115,6 +116,11 @@ def _find_model(root: Path) -> Path | None:
 
 def _find_folder(root: Path, names: tuple[str, ...]) -> Path | None:
     return next((root / name for name in names if (root / name).is_dir()), None)
+
+
+def _join(root: Path, option: str) -> Path:
+    """Folder of an option, which may lie outside the capture."""
+    return Path(os.path.normpath(root / option))
 
 
 def _find_depth(folder: Path, image: Path) -> Path | None:

@@ -154,9 +154,9 @@ def _parse_row(
 def _check_model(values: Mapping[str, Any], file: Path, k: int) -> None:
     model = values.get("camera_model", _PERSPECTIVE_MODELS[0])
     if model not in _PERSPECTIVE_MODELS or values.get("is_fisheye") is True:
-        found = "is_fisheye" if model in _PERSPECTIVE_MODELS else model
+        actual = "is_fisheye" if model in _PERSPECTIVE_MODELS else model
         expected = f"{', '.join(_PERSPECTIVE_MODELS)} (undistort other lenses first)"
-        raise FormatError(file, f"frames.{k}.camera_model", found, expected)
+        raise FormatError(file, f"frames.{k}.camera_model", actual, expected)
 
 
 def _parse_size(values: Mapping[str, Any], image: Path, file: Path, k: int) -> tuple[int, int]:
