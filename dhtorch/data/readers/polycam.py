@@ -16,7 +16,7 @@ import numpy as np
 from dhtorch.data import convert
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
-from dhtorch.data.readers.image_table import format_left_out, list_images
+from dhtorch.data.readers.image_table import list_images
 from dhtorch.data.readers.posed_images import PosedImage, open_posed_images
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
@@ -68,7 +68,9 @@ def read(root: str | Path, *, corrected: bool = True) -> list[Recording]:
         for i, (name, picture) in enumerate(pictures.items())
         if name in sources
     ]
-    report += format_left_out([i for i, name in enumerate(pictures) if name not in sources], f"no file in {cameras}/")
+    report += files.format_left_out(
+        [i for i, name in enumerate(pictures) if name not in sources], f"no file in {cameras}/"
+    )
     return [
         open_posed_images(
             root,
