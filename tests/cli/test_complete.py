@@ -264,12 +264,14 @@ def test_said_again_it_makes_what_is_missing_and_no_more(captures, numbered, mon
 
 def test_leftovers_of_a_killed_run_are_removed(captures, tmp_path):
     out = tmp_path / "maps"
+    said(captures / "numbered", out, most=2)
+    meta, depth = out / "meta" / "000001.json", out / "depth" / "000001.png"
+    meta.write_bytes(meta.read_bytes()[:100])
+    depth.write_bytes(depth.read_bytes()[:100])
+    (out / ".dhtorch" / "unfinished").mkdir()
+    (out / ".dhtorch" / "unfinished" / "0.png").write_bytes(b"half")
     said(captures / "numbered", out, most=1)
-    (out / "depth" / "000002.png").write_bytes(b"half")
-    (out / "images" / ".000002.png.abc.tmp").write_bytes(b"half")
-    (out / "meta" / "000002.json").write_text('{"key": "torn')
-    said(captures / "numbered", out, most=1)
-    kept = {p.name for p in out.rglob("*") if p.is_file()}
+    kept = {p.name for p in out.rglob("*") if p.is_file() and p.name != "manifest"}
     assert kept == {"000000.png", "000000.json", "complete.json", "K.txt", "meta.json", "poses.txt"}
 
 

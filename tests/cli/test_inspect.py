@@ -129,7 +129,7 @@ def test_written_captures_are_found_and_shown(
     write(root)
     assert capture.main([str(tmp_path / "given"), "--out", str(tmp_path / "out"), "--frames", "3"]) == 0
     said = capsys.readouterr().out
-    sheets = sorted((tmp_path / "out").iterdir())
+    sheets = sorted((tmp_path / "out").glob("*.png"))
     assert len(sheets) == count and said.count("wrote ") == count and f" {format} (" in said
     check_sheet(sheets[0])
     if below:

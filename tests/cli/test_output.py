@@ -18,7 +18,8 @@ from dhtorch import testing as writers
 from dhtorch.cli import inspect as capture
 from dhtorch.cli.run import EXIT_CODES, config_dir, job_name
 from dhtorch.experiments.report import page
-from dhtorch.runtime import console
+from dhtorch.runtime import console, storage
+from dhtorch.runtime.output_folder import open_output_file
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.viz.viewer import html
 
@@ -228,7 +229,7 @@ def test_ctrl_c_leaves_the_sheets_that_are_written(command, frames, monkeypatch)
     monkeypatch.setattr(capture, "write_contact_sheet", stopping(capture.write_contact_sheet, 1))
     code, out, err = command("inspect", str(frames), "--out", "sheets")
     assert code == 130 and "1 contact sheet in sheets kept" in err and len(err.strip().splitlines()) == 1
-    assert [p.name for p in Path("sheets").iterdir()] == [re.search(r"sheets/(\S+png)", out)[1]]
+    assert [p.name for p in Path("sheets").glob("*.png")] == [re.search(r"sheets/(\S+png)", out)[1]]
 
 
 @pytest.mark.parametrize(
@@ -240,11 +241,14 @@ def test_ctrl_c_leaves_the_sheets_that_are_written(command, frames, monkeypatch)
 )
 def test_ctrl_c_keeps_the_old_page(command, monkeypatch, said, words, module, name):
     Path("job").symlink_to(said[0] / "job")
-    Path("out.html").write_text("the old one", encoding="utf-8")
+    with open_output_file("out.html", "html"):
+        storage.replace_file("out.html", b"the old one")
     monkeypatch.setattr(module, name, stopping(getattr(module, name), 0))
     code, _, err = command(*words)
     assert code == 130 and "interrupted" in err and "Traceback" not in err
-    assert Path("out.html").read_text(encoding="utf-8") == "the old one" and len(list(Path().glob("*out*"))) == 1
+    assert Path("out.html").read_text(encoding="utf-8") == "the old one" and len(list(Path().glob("*out*"))) == 2, (
+        "the page and its manifest"
+    )
 
 
 def test_version_is_ours(command):

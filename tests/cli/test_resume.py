@@ -71,7 +71,8 @@ def test_kill_9_in_the_middle_of_a_sweep_loses_and_doubles_nothing(tmp_path):
     before = seen(results(tmp_path))
     assert 2 <= len(before) < 6
     whole, torn, *_ = before
-    left = whole.parent / ".result.json.x.tmp"  # as if the kill had come while a result was being replaced
+    left = whole.parent / ".dhtorch" / "unfinished" / "0.json"  # as if the kill had come while a file was written
+    left.parent.mkdir(exist_ok=True)
     left.write_text("{")
     torn.write_text(torn.read_text()[:300])  # as a file system leaves it that loses the end of a file
     del before[torn]
@@ -83,7 +84,8 @@ def test_kill_9_in_the_middle_of_a_sweep_loses_and_doubles_nothing(tmp_path):
     assert sorted(combinations) == [(m, s) for m in ("opencv", "paper") for s in range(3)], "none lost, none doubled"
     assert len({result_files.read_result(p)["key"] for p in after}) == 6
     assert seen(before) == before, "what was finished is untouched"
-    assert {p.name for p in tmp_path.joinpath("sweep").rglob("*") if p.is_file()} == {"result.json", "multirun.yaml"}
+    files = {p.name for p in tmp_path.joinpath("sweep").rglob("*") if p.is_file()}
+    assert files == {"result.json", "multirun.yaml", "manifest"}
     n = len(before)
     assert f"6 jobs: {6 - n} finished, {n} left untouched, 0 failed" in (tmp_path / "out").read_text()
 

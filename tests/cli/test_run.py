@@ -60,7 +60,7 @@ def test_one_job_writes_one_result_and_its_pictures(job):
     result = result_files.read_result(path)
     assert result["experiment"] == "pair" and result["data"]["n_pairs"] == 1
     assert {p.name for p in path.parent.rglob("*") if p.is_file()} == {
-        "result.json", "completed.png", "samples.png", "holes.png", "depth.png", "risk_coverage.png", "points.ply",
+        "manifest", "result.json", "completed.png", "samples.png", "holes.png", "depth.png", "risk_coverage.png", "points.ply",
     }  # fmt: skip
     for word in (
         "coverage",
