@@ -15,7 +15,19 @@ FILES = sorted(ROOT.rglob("*.py"))
 #: Names of an interface that several modules implement: readers, experiments, commands, types of rows, cameras and
 #: poses as matrices.
 INTERFACES = {
-    *("main", "run", "read", "recognise", "verdict", "QUESTION", "EXPECTATION", "VARIANTS", "Row", "Progress"),
+    *(
+        "main",
+        "run",
+        "read",
+        "recognise",
+        "UNUSED_FILES",
+        "verdict",
+        "QUESTION",
+        "EXPECTATION",
+        "VARIANTS",
+        "Row",
+        "Progress",
+    ),
     *("from_matrix", "to_matrix"),
 }
 

@@ -71,7 +71,10 @@ __all__ = [
 
 
 class Reader(Protocol):
-    """Interface of a format's module: two functions."""
+    """Interface of a format's module: two functions.
+
+    It may list names of files in ``UNUSED_FILES`` (glob patterns) that :mod:`dhtorch.data.unread` does not report.
+    """
 
     @property
     def recognise(self) -> Callable[[Path], str | None]:

@@ -192,7 +192,8 @@ def write_ros_tum(root: Path, frames: Sequence[Frame], *, units_per_metre: float
     """Write TUM's layout as recorders for ROS do: ``calibration.txt`` holds K, nothing states the unit of depth."""
     lists: dict[str, list[str]] = {"rgb": [], "depth": [], "groundtruth": []}
     for frame in frames:
-        stamp, pose = f"{frame_time_s(frame):.6f}", pose_matrix(frame)
+        stamp = f"{frame_time_s(frame):.6f}"
+        pose = pose_matrix(frame)
         code = encode_depth_codes(frame.depth, units_per_metre)
         for kind, picture in (("rgb", frame_to_hwc(frame)), ("depth", code)):
             save_file(root / kind / f"{stamp}.png", encode_unfiltered_png(picture))

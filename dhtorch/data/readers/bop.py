@@ -94,7 +94,7 @@ def _read_sensor(
     depths = image_table.list_numbered(root / f"depth{sensor}", r"(\d+)\.png")
     poses = {number: pose for number, entry in entries.items() if (pose := _parse_pose(entry, table)) is not None}
     rows, report = image_table.pair_numbered(images, depths, poses)
-    report += image_table.format_left_out([row.number for row in rows if row.number not in entries], "no camera")
+    report += files.format_left_out([row.number for row in rows if row.number not in entries], "no camera")
     rows = [row for row in rows if row.number in entries]
     if not rows:
         count = f"{len(images)} images, {len(depths)} depth maps and {len(entries)} entries of {table.name}"

@@ -35,9 +35,6 @@ NAMED_COLOUR_PATTERN = r"frame-(\d+)\.color\.(?:jpg|jpeg|png)"
 #: Name with a running number and a time stamp in microseconds, as SUN3D's and Redwood's ``0000012-000000366966``.
 _STAMPED_NAME_PATTERN = re.compile(r"\d+-(\d{9,})")
 
-#: Numbers of frames shown in a report line. Source: chosen on the width of a terminal.
-_MAX_NUMBERS_SHOWN = 6
-
 #: Codes rotated by 3 bits hold the depth's 3 highest bits at the lower end, which are at most this number for depths
 #: below 3/8 of the range (24.6 m in mm); plain codes have all 8 numbers there. Source: derived.
 _MAX_LOW_BITS = 2
@@ -183,21 +180,15 @@ def _split_lost(rows: Sequence[ImageRow]) -> tuple[list[ImageRow], list[str]]:
         return list(rows), []
     without = [row.number for row in rows if row.c2w is None]
     lost = [row.number for row in rows if row.c2w is not None and not np.isfinite(row.c2w).all()]
-    report = [*format_left_out(without, "no pose"), *format_left_out(lost, "the pose is not finite (tracking lost)")]
+    report = [
+        *files.format_left_out(without, "no pose"),
+        *files.format_left_out(lost, "the pose is not finite (tracking lost)"),
+    ]
     left_out = {*without, *lost}
     kept = [row for row in rows if row.number not in left_out]
     if kept:
         return kept, report
     return [replace(row, c2w=None) for row in rows], ["every pose is missing or not finite (tracking lost)"]
-
-
-def format_left_out(numbers: Sequence[int], reason: str) -> list[str]:
-    """Report on frames that are left out, one line or none: ``frame 3: no pose: left out``."""
-    if not numbers:
-        return []
-    shown = ", ".join(str(number) for number in sorted(numbers)[:_MAX_NUMBERS_SHOWN])
-    more = f" and {len(numbers) - _MAX_NUMBERS_SHOWN} more" if len(numbers) > _MAX_NUMBERS_SHOWN else ""
-    return [f"frame{'s' if len(numbers) > 1 else ''} {shown}{more}: {reason}: left out"]
 
 
 # ------------------------------------------------------------------------------------------------------------ files
@@ -225,8 +216,8 @@ def pair_numbered(
 ) -> tuple[list[ImageRow], list[str]]:
     """Rows of the numbers that have an image and a depth map, and the report of the others."""
     both = sorted(images.keys() & depths.keys())
-    report = format_left_out(sorted(images.keys() - depths.keys()), "no depth map")
-    report += format_left_out(sorted(depths.keys() - images.keys()), "no image")
+    report = files.format_left_out(sorted(images.keys() - depths.keys()), "no depth map")
+    report += files.format_left_out(sorted(depths.keys() - images.keys()), "no image")
     return [ImageRow(i, images[i], depths[i], poses.get(i)) for i in both], report
 
 
@@ -249,7 +240,7 @@ def pair_folders(root: Path, images: Mapping[str, Path], depths: Mapping[str, Pa
     else:
         pairs = _pair_stamped(root, images, depths)
     paired = {stem for stem, _ in pairs}
-    report = format_left_out([places[stem] for stem in images if stem not in paired], "no depth map")
+    report = files.format_left_out([places[stem] for stem in images if stem not in paired], "no depth map")
     unused = len(depths) - len({stem for _, stem in pairs})
     if unused:
         report.append(f"{unused} depth map{'s' if unused > 1 else ''} without an image: left out")
@@ -266,14 +257,14 @@ class ImagePairs:
 
 
 def _read_pair_table(table: Path, images: Mapping[str, Path], depths: Mapping[str, Path]) -> list[tuple[str, str]]:
-    by_file = {(file.parent.name, file.name): (kind, stem) for kind, named in (("image", images), ("depth", depths))
-               for stem, file in named.items()}  # fmt: skip
+    by_file = {(file.parent.name, file.name): ("image", stem) for stem, file in images.items()}
+    by_file |= {(file.parent.name, file.name): ("depth", stem) for stem, file in depths.items()}
     pairs = []
     for line, words in files.read_rows(table):
-        found = dict(by_file[key] for word in words if (key := (Path(word).parent.name, Path(word).name)) in by_file)
-        if found.keys() != {"image", "depth"}:
+        named = dict(by_file[key] for word in words if (key := (Path(word).parent.name, Path(word).name)) in by_file)
+        if named.keys() != {"image", "depth"}:
             raise FormatError(table, f"line {line}", " ".join(words), "the names of an image and of its depth map")
-        pairs.append((found["image"], found["depth"]))
+        pairs.append((named["image"], named["depth"]))
     return list({image: (image, depth) for image, depth in reversed(pairs)}.values())
 
 

@@ -135,7 +135,7 @@ def read(
         interpolate = _match_numbers if is_numbered else _interpolate_trajectory
         c2w, covered = interpolate(trajectory, times, max_difference)
         if is_numbered:
-            report += image_table.format_left_out(times[~covered].astype(int).tolist(), f"no pose in {trajectory.name}")
+            report += files.format_left_out(times[~covered].astype(int).tolist(), f"no pose in {trajectory.name}")
         else:
             report += _format_unmatched(int((~covered).sum()), "RGB-D frames", "pose", max_difference, is_numbered)
         pairs = [pair for pair, keep in zip(pairs, covered, strict=True) if keep]
