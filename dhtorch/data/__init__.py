@@ -183,11 +183,15 @@ def open_all(
             raise ValueError(
                 f"data: format {format} has no option {shown}, expected one of {', '.join(reader_options)}"
             )
+    unused = getattr(FORMATS[format], "UNUSED_FILES", ())
     with restrict_links(bounds), record_opened_files() as opened:
-        recordings = read(root, **options)
+        try:
+            recordings = read(root, **options)
+        except intrinsics_options.MissingIntrinsicsError as error:
+            raise error.with_remarks(report_unread(root, opened, unused)) from None
     if isinstance(recordings, Recordings):
         return replace(recordings, make=_RestrictedOpener(recordings.make, bounds, corrections))
-    unread = report_unread(root, opened, getattr(FORMATS[format], "UNUSED_FILES", ()))
+    unread = report_unread(root, opened, unused)
     reports = [(*recording.report, *unread) for recording in recordings]
     return [
         corrections.apply(replace(recording, bounds=bounds, report=report))

@@ -29,6 +29,11 @@ IntrinsicsOption = str | float | Sequence[float]
 class MissingIntrinsicsError(FormatError):
     """K of a camera is neither stored nor set by an option: its images can be viewed but not measured."""
 
+    def with_remarks(self, remarks: Sequence[str]) -> MissingIntrinsicsError:
+        """The error with remarks after what was found, such as files that may hold K and are not read."""
+        file, field, value, expected = self.args
+        return MissingIntrinsicsError(file, field, "; ".join((value, *remarks)), expected)
+
 
 @dataclass(frozen=True)
 class ParsedIntrinsics:

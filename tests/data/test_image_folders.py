@@ -538,6 +538,39 @@ def test_two_intrinsics_that_differ_are_named(tmp_path: Path) -> None:
     assert data.open(tmp_path, K=[70, 70, 32, 24]).report == ()
 
 
+@pytest.mark.parametrize("name", ["cam_K.txt", "camera_intrinsics.txt", "intrinsic.txt"])
+@pytest.mark.parametrize("n", [1, 3, 4])
+def test_intrinsics_files_of_many_names_and_shapes(tmp_path: Path, name: str, n: int) -> None:
+    writers.write_counted_frames(tmp_path, walk(1))
+    (tmp_path / "K.txt").unlink()
+    matrix = np.eye(4)
+    matrix[:3, :3] = parts.K_matrix(CAMERA)
+    row = np.array([[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]])
+    (tmp_path / name).write_text(parts.format_rows(row if n == 1 else matrix[:n, :n]))
+    recording = data.open(tmp_path)
+    assert torch.equal(recording[0].camera.f, CAMERA.f) and torch.equal(recording[0].camera.c, CAMERA.c)
+    (tmp_path / name).write_text("1 2 3 4 5")
+    with pytest.raises(FormatError, match=f"{name}: K: found 5 numbers, expected fx fy cx cy, or a 3x3 or 4x4 matrix"):
+        data.open(tmp_path)
+
+
+@pytest.mark.parametrize("folder", ["poses", "pose"])
+def test_numbered_frames_with_a_pose_file_each(tmp_path: Path, folder: str) -> None:
+    frames = walk(4)
+    writers.write_counted_frames(tmp_path, frames)
+    (tmp_path / "poses.txt").unlink()
+    for i, frame in enumerate(frames):
+        parts.save_file(tmp_path / folder / f"{i:05d}.txt", parts.format_rows(parts.pose_matrix(frame)))
+    check_same(data.open(tmp_path), frames, 1e-3)
+    (tmp_path / folder / "00001.txt").write_text("nan nan nan nan\n" * 4)
+    (tmp_path / folder / "00002.txt").unlink()
+    recording = data.open(tmp_path)
+    assert recording.number.tolist() == [0, 3]
+    reasons = f"no file in {folder}/", "its pose is not finite (tracking lost)"
+    assert recording.report == (f"frame 2: {reasons[0]}: left out", f"frame 1: {reasons[1]}: left out")
+    torch.testing.assert_close(recording.poses.t[1], frames[3].T_world_from_cam.t[0])
+
+
 # ---------------------------------------------------------------------------------------------------------- unread files
 
 
@@ -576,6 +609,15 @@ def test_many_unread_files_are_counted(tmp_path: Path) -> None:
     for i in range(9):
         (tmp_path / f"{i}.json").unlink()
     assert data.open(tmp_path).report[0].startswith("not read: poses/ (9 files) (")
+
+
+def test_where_K_is_missing_the_files_that_may_hold_it_are_named(tmp_path: Path) -> None:
+    writers.write_counted_frames(tmp_path, walk(1))
+    (tmp_path / "K.txt").rename(tmp_path / "camera.yaml")
+    with pytest.raises(
+        FormatError, match=r"K: found no intrinsics; not read: camera.yaml \(.*\), expected data.fov=69"
+    ):
+        data.open(tmp_path)
 
 
 def test_poses_of_a_recording_are_read_as_before_where_another_file_lies_beside(tmp_path: Path) -> None:

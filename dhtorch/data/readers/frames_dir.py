@@ -3,7 +3,8 @@
 - *named*: ``frame-XXXXXX.color.{jpg,png}``, ``.depth.png``, ``.pose.txt`` (4×4) in one folder, as in 7-Scenes and
   its derivatives, with or without ``camera-intrinsics.txt`` (3×3).
 - *counted*: ``images/*`` (or ``color/``, ``rgb/``), ``depth/*.png`` or ``.pgm``, and optionally
-  ``poses.txt`` or ``pose.txt``: one line per frame, a 4×4 by rows or tx ty tz qx qy qz qw. ``K.txt`` (3×3).
+  ``poses.txt`` or ``pose.txt``: one line per frame, a 4×4 by rows or tx ty tz qx qy qz qw; or a 4×4 in a file for each
+  frame, ``poses/*.txt`` or ``pose/*.txt``. ``K.txt`` (3×3; also ``cam_K.txt``, ``intrinsics.txt`` and the like).
 - *single*: ``rgb.{jpg,png}``, ``raw_depth.png`` and ``intrinsics.txt`` (3×3), one frame without a pose.
 
 Poses are camera-to-world with our axes. The intrinsics file applies to colour and depth unless ``K`` is set:
@@ -33,6 +34,8 @@ from dhtorch.data.readers.image_table import (
     ImageTableLoader,
     list_images,
     read_depth_hw,
+    read_K,
+    read_pose,
     read_stored_sizes,
 )
 from dhtorch.data.recording import Recording
@@ -42,7 +45,15 @@ from dhtorch.records import Pose
 _NAMED_FRAME_PATTERN = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(?:png|jpg|jpeg|pgm|txt)")
 _IMAGE_FOLDERS = ("images", "color", "rgb")  # of the *counted* layout
 _POSE_FILES = ("poses.txt", "pose.txt")
-_INTRINSICS_FILES = ("K.txt", "camera-intrinsics.txt", "intrinsics.txt")
+_POSE_FOLDERS = ("poses", "pose")
+_INTRINSICS_FILES = (
+    "K.txt",
+    "camera-intrinsics.txt",
+    "intrinsics.txt",
+    "cam_K.txt",
+    "camera_intrinsics.txt",
+    "intrinsic.txt",
+)
 
 #: Depth codes of one metre where nothing states another. Source: convention of the layout, millimetres.
 _UNITS_PER_METRE = 1000.0
@@ -250,8 +261,34 @@ def _list_counted_frames(root: Path, folder: Path) -> tuple[list[ImageRow], Pose
     numbers = values if increasing else range(len(stems))
     frames = [ImageRow(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
     if file is None or rows is None:
-        return frames, None, ["no poses.txt: no poses"]
+        return _add_pose_files(root, frames, stems)
     return frames, _parse_poses(rows, file), []
+
+
+def _add_pose_files(
+    root: Path, frames: list[ImageRow], stems: Sequence[str]
+) -> tuple[list[ImageRow], Pose | None, list[str]]:
+    """Frames, poses and report where each frame has a pose in a file of its name; frames without one are left out."""
+    folder = next(
+        (root / name for name in _POSE_FOLDERS if any((root / name / f"{s}.txt").is_file() for s in stems)), None
+    )
+    if folder is None:
+        return frames, None, ["no poses.txt: no poses"]
+    places = [folder / f"{stem}.txt" for stem in stems]
+    matrices = [read_pose(place) if place.is_file() else None for place in places]
+    missing = [frame.number for frame, matrix in zip(frames, matrices, strict=True) if matrix is None]
+    usable = [
+        (frame, matrix)
+        for frame, matrix in zip(frames, matrices, strict=True)
+        if matrix is not None and np.isfinite(matrix).all()
+    ]
+    kept = {frame.number for frame, _ in usable}
+    lost = [frame.number for frame in frames if frame.number not in kept and frame.number not in missing]
+    report = files.format_left_out(missing, f"no file in {folder.name}/")
+    report += files.format_left_out(lost, "its pose is not finite (tracking lost)")
+    if not usable:
+        return frames, None, [f"{folder.name}/: every pose is not finite (tracking lost): no poses"]
+    return [frame for frame, _ in usable], convert.to_poses(np.stack([matrix for _, matrix in usable]), folder), report
 
 
 def _parse_poses(rows: np.ndarray, file: Path) -> Pose:
@@ -271,7 +308,7 @@ def _read_intrinsics(
     if key in meta:
         return meta[key], root / "meta.json", key
     file = _first_existing(root, _INTRINSICS_FILES)
-    return (files.read_table(file, 3), file, "K") if file else None
+    return (read_K(file), file, "K") if file else None
 
 
 def _compare_with_file(root: Path, used: Sequence[object]) -> list[str]:
@@ -279,7 +316,7 @@ def _compare_with_file(root: Path, used: Sequence[object]) -> list[str]:
     file = _first_existing(root, _INTRINSICS_FILES)
     if file is None:
         return []
-    stated = files.read_table(file, 3)
+    stated = read_K(file)
     matrices = [np.asarray(K, np.float64) for K in used]
     if any(K.shape == stated.shape and np.allclose(K, stated, rtol=_SAME_K_REL) for K in matrices):
         return []

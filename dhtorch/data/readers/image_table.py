@@ -42,6 +42,8 @@ _MAX_LOW_BITS = 2
 #: between 3/8 and 1.
 _MIN_ROTATED = 0.7
 
+_K_EXPECTED = "fx fy cx cy, or a 3x3 or 4x4 matrix"
+
 #: Largest relative difference of two aspect ratios that are one picture at two sizes. Source: derived: rounding of the
 #: shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's 1296×968 differs from 640×480 by 0.4 %.
 _MAX_ASPECT_ERROR = 0.01
@@ -278,6 +280,25 @@ def _pair_stamped(root: Path, images: Mapping[str, Path], depths: Mapping[str, P
             expected = "the same names in both, or a time stamp in each name"
             raise FormatError(root, "file names", f"{', '.join(named[:3]) or 'none'}, …", expected)
     return [(stems[0][i], stems[1][j]) for i, j in clocks.pair_stamps(*stamps)]
+
+
+def read_K(file: Path) -> np.ndarray:
+    """K (3, 3) of a text file with fx fy cx cy, or a 3×3, 3×4 or 4×4 matrix by rows, in any number of lines.
+
+    Raises:
+        FormatError: other numbers, or words that are no numbers.
+    """
+    words = [word for _, row in files.read_rows(file) for word in row]
+    try:
+        values = np.array([float(word) for word in words])
+    except ValueError:
+        raise FormatError(file, "K", " ".join(words), _K_EXPECTED) from None
+    if values.size == 4:
+        return convert.make_K(*values)
+    columns = {9: 3, 12: 4, 16: 4}.get(values.size)
+    if columns is None:
+        raise FormatError(file, "K", f"{values.size} numbers", _K_EXPECTED)
+    return values.reshape(-1, columns)[:3, :3]
 
 
 def read_pose(file: Path) -> np.ndarray:

@@ -39,6 +39,9 @@ _IMAGE_PATTERN = r"(\d+)\.(?:jpg|jpeg|png)"
 _COLOUR_FILES = ("intrinsic_color.txt", "intrinsics_color.txt", "intrinsic.txt")
 _DEPTH_FILES = ("intrinsic_depth.txt", "intrinsics_depth.txt", "depth_intrinsic.txt")
 _INTRINSICS_FOLDERS = ("intrinsic", "intrinsics", ".")
+#: Labels of the scan's mesh.
+UNUSED_FILES = ("*.segs.json", "*.aggregation.json")
+
 _EXTRINSICS_FILES = ("extrinsic_color.txt", "extrinsic_depth.txt")
 
 
@@ -107,16 +110,16 @@ def read(
     colour_file, depth_file = _find_intrinsics(root, _COLOUR_FILES), _find_intrinsics(root, _DEPTH_FILES)
     stated = None
     if colour_file is not None:
-        matrix, scaled = _fit_colour_K(_read_K(colour_file), hw, colour_file)
+        matrix, scaled = _fit_colour_K(image_table.read_K(colour_file), hw, colour_file)
         stated, report = (matrix, colour_file, "K"), [*report, *scaled]
     elif depth_file is not None and hw == depth_hw:
-        stated = (_read_K(depth_file), depth_file, "K")
+        stated = (image_table.read_K(depth_file), depth_file, "K")
     camera, guess = image_table.choose_camera(
         root, hw, stated, intrinsics, K, fov, where="intrinsic/intrinsic_color.txt"
     )
     depth_camera = None
     if depth_file is not None:
-        depth_camera = convert.to_camera(_read_K(depth_file), depth_hw, depth_file)
+        depth_camera = convert.to_camera(image_table.read_K(depth_file), depth_hw, depth_file)
     report += _report_extrinsics(root)
     loader = image_table.ImageTableLoader(
         rows=tuple(rows),
@@ -158,14 +161,6 @@ def _list_poses(root: Path, layout: _Layout) -> dict[int, Path]:
 def _find_intrinsics(root: Path, names: Sequence[str]) -> Path | None:
     places = (root / folder / name for folder in _INTRINSICS_FOLDERS for name in names)
     return next((place for place in places if place.is_file()), None)
-
-
-def _read_K(file: Path) -> np.ndarray:
-    """K (3, 3) of a 4×4 or 3×3 matrix."""
-    rows = files.read_table(file)
-    if rows.shape not in ((4, 4), (3, 3)):
-        raise FormatError(file, "K", f"{rows.shape[0]} rows of {rows.shape[1]} numbers", "a 4x4 or 3x3 matrix")
-    return rows[:3, :3]
 
 
 def _fit_colour_K(K: np.ndarray, hw: tuple[int, int], file: Path) -> tuple[np.ndarray, tuple[str, ...]]:

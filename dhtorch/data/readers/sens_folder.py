@@ -26,6 +26,9 @@ _DEPTH_PATTERN = r"frame-(\d+)\.depth\.(?:pgm|png)"
 _POSE_PATTERN = r"frame-(\d+)\.pose\.txt"
 _SHIFT_FIELD = "m_depthShift"
 
+#: Labels of the data sets' meshes.
+UNUSED_FILES = ("semseg*.json", "*.segs.json", "*.aggregation.json")
+
 
 def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""

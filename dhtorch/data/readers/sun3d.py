@@ -27,8 +27,8 @@ _ROTATED_BITS = 3
 
 _INTRINSICS_FILE = "intrinsics.txt"
 
-#: Read, or named by the reader with the reason.
-UNUSED_FILES = ("extrinsics",)
+#: Extrinsics are read, or named by the reader with the reason; the others hold labels.
+UNUSED_FILES = ("extrinsics", "annotation*", "scene.txt")
 
 
 def recognise(root: Path) -> str | None:
@@ -75,7 +75,7 @@ def read(
     rows = tuple(replace(row, c2w=poses.get(row.number)) for row in pairs.rows)
     hw, depth_hw = files.read_image_header(rows[0].image).hw, image_table.read_depth_hw(rows[0].depth)
     file = root / _INTRINSICS_FILE
-    stated = (_read_K(file), file, "K") if file.is_file() else None
+    stated = (image_table.read_K(file), file, "K") if file.is_file() else None
     camera, guess = image_table.choose_camera(root, hw, stated, intrinsics, K, fov, where=_INTRINSICS_FILE)
     is_rotated = image_table.are_codes_rotated(rows[0].depth) if rotated is None else rotated
     source: str | None = "SUN3D stores mm, rotated by 3 bits"
@@ -101,16 +101,6 @@ def read(
             report=[*pairs.report, *report, *guess],
         )
     ]
-
-
-def _read_K(file: Path) -> np.ndarray:
-    """K (3, 3) of nine numbers, in three lines or one."""
-    words = [word for _, row in files.read_rows(file) for word in row]
-    try:
-        values = [float(word) for word in words[:9]]
-    except ValueError:
-        raise FormatError(file, "K", " ".join(words), "9 numbers (3x3 by rows)") from None
-    return files.to_array(values, (9,), file, "K").reshape(3, 3)
 
 
 def _read_extrinsics(root: Path, n_images: int) -> tuple[dict[int, np.ndarray], Path | None, list[str]]:
