@@ -124,7 +124,8 @@ def test_the_source_archive_makes_the_same_wheel(wheel, tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(
-    "extra", ["data", "live", "learned", "view", "matchers", "mesh", "scale", "ray-launcher", "peers", "docs", "dev"]
+    "extra",
+    ["data", "live", "learned", "view", "matchers", "mesh", "robot", "scale", "ray-launcher", "peers", "docs", "dev"],
 )
 def test_extras_can_be_resolved(wheel, extra):
     """Dry run against the index, with the pinned torch."""
