@@ -34,7 +34,8 @@ def make_nerfstudio_frame(
 ) -> dict[str, Any]:
     """One entry of ``frames`` in a ``transforms.json``.
 
-    ``timestamp`` is no field of nerfstudio, which ignores it; NeRFCapture writes it, too.
+    ``timestamp`` and ``dhtorch_source_file_path`` (codes.Source of every depth) are no fields of nerfstudio, which
+    ignores them; NeRFCapture writes the first, too.
 
     Raises:
         ValueError: more distortion coefficients than nerfstudio has.
@@ -45,6 +46,7 @@ def make_nerfstudio_frame(
         "file_path": f"images/{stem}.png",
         "depth_file_path": f"depth/{stem}.png",
         "confidence_file_path": f"confidence/{stem}.png",
+        "dhtorch_source_file_path": f"source/{stem}.png",
         "w": int(hw[1]),
         "h": int(hw[0]),
         "fl_x": float(K[0, 0]),

@@ -1,4 +1,4 @@
-"""Writer of an enriched data set as nerfstudio folders, one per recording: images, depth, confidence and poses."""
+"""Writer of an enriched data set as nerfstudio folders, one per recording: images, depth with its source, poses."""
 
 from __future__ import annotations
 
@@ -78,6 +78,7 @@ def _write_shot(folder: Path, row: Row, view: DatasetCamera) -> Row:
     steps = nerfstudio.quantise_nerfstudio_depth(depth)
     confidence = nerfstudio.encode_confidence(np.where(steps > 0, depth, 0), sigma)
     pictures = {"images": row["picture"], "depth": encode_png(steps), "confidence": encode_png(confidence)}
+    pictures["source"] = row["source"]
     for name, content in pictures.items():
         storage.replace_file(folder / name / f"{stem}.png", content)
     K, pose = np.reshape(row["K"], (3, 3)), np.reshape(row["pose"], (4, 4))

@@ -74,6 +74,13 @@ def test_enrich(format: str, tum: Path, tmp_path: Path) -> None:
     assert back.format == ("nerfstudio" if format == "nerfstudio" else "lerobot")
     assert torch.equal(back.number, source.number)
     check_same(back, source, STEPS[format])
+    whole = data.open(out, recovered=True)
+    for frame, want, full in zip(back, source, whole, strict=True):
+        assert torch.equal(frame.depth > 0, want.depth > 0), "the sensor's returns alone"
+        assert torch.equal(full.depth[frame.depth > 0], frame.depth[frame.depth > 0])
+    assert any(bool((full.depth > frame.depth).any()) for full, frame in zip(whole, back, strict=True))
+    assert back.report == ("depths that dhtorch enrich recovered are left out (data.recovered=true reads them)",)
+    assert whole.report == ()
 
 
 @needs_data

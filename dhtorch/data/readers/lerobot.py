@@ -19,10 +19,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.codes import Source
 from dhtorch.data import convert
 from dhtorch.data import intrinsics as intrinsics_options
+from dhtorch.data.clocks import nearest_stamps
 from dhtorch.data.codecs.parquet import read_cell
-from dhtorch.data.codecs.video import read_video_frame, read_video_times
+from dhtorch.data.codecs.video import read_video_frame
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.readers.lerobot_depth import (
@@ -30,6 +32,7 @@ from dhtorch.data.readers.lerobot_depth import (
     dequantise_depth,
     find_depth_feature,
     find_depth_unit,
+    find_origin_feature,
     flag_unmarked_depth,
 )
 from dhtorch.data.readers.lerobot_meta import (
@@ -48,7 +51,9 @@ from dhtorch.data.readers.lerobot_rows import (
     read_row_table,
     select_episode_rows,
 )
+from dhtorch.data.readers.lerobot_video import find_row_stamps, pair_episode_videos
 from dhtorch.data.recording import Recording, Recordings
+from dhtorch.data.stored_sizes import StoredSizes
 from dhtorch.records import Camera, Frame
 
 
@@ -74,6 +79,7 @@ def read(
     pose: str | None = None,
     depth_range: Sequence[float] | None = None,
     tolerance: float = 1e-4,
+    recovered: bool = False,
 ) -> Recordings:
     """Open a data set folder, one recording for each episode and camera.
 
@@ -96,6 +102,7 @@ def read(
         depth_range: m, nearest and farthest return to keep; for lossy depth videos, whose zeros are blurred with
             their surroundings. None = all.
         tolerance: s, largest distance of a video frame from its row's time.
+        recovered: read also the depths that ``dhtorch enrich`` recovered, as if they were returns of the sensor.
 
     Returns:
         Recordings named ``<data set>/episode_<number>/<camera>``, times from the start of the episode, or numbers and
@@ -130,6 +137,7 @@ def read(
             remarks,
             span,
             tolerance,
+            recovered,
         )
         for key in keys
     ]
@@ -173,10 +181,16 @@ class _Load:
     step_m: float | None  # metres of one step of the stored depth; None = codes of LeRobot's depth videos
     span: tuple[float, float]
     tolerance: float
+    pictures: dict[str, np.ndarray]  # video's key → frame of each row; no entry = to be found by its time
+    origin: LeRobotFeature | None  # map of codes.Source: depth that is not the sensor's is left out; None = all is
 
     def __call__(self, i: int) -> Frame:
         camera = self.cameras[i : i + 1] if self.cameras.f.shape[0] > 1 else self.cameras
         depth = torch.zeros(self.image.hw) if self.depth is None else self._depth(i, self.depth)
+        if self.origin is not None:
+            data, file = self._bytes(i, self.origin.key)
+            origin = torch.from_numpy(files.decode_image(data, file, self.origin.hw)[0])
+            depth = torch.where(origin == Source.SENSOR, depth, 0.0)
         return Frame(self._image(i)[None], depth[None], camera, self.depth_camera)
 
     def _image(self, i: int) -> Tensor:
@@ -206,13 +220,13 @@ class _Load:
 
     def _video(self, i: int, feature: LeRobotFeature, pixels: str) -> np.ndarray:
         file, start = self.videos[feature.key]
-        times, target = read_video_times(file), start + float(self.times[i])
-        if start == 0 and len(times):
-            target += float(times[0])  # a video of one episode starts with it, whatever its first time stamp
-        nearest = int(np.abs(times - target).argmin()) if len(times) else -1
-        if nearest < 0 or abs(times[nearest] - target) > self.tolerance:
-            problem = f"nearest frame at {times[nearest]:.6f} s" if nearest >= 0 else "no frame"
-            raise FormatError(file, f"time {target:.6f} s", problem, f"one within {self.tolerance} s")
+        if feature.key in self.pictures:
+            return read_video_frame(file, int(self.pictures[feature.key][i]), feature.hw, pixels=pixels)
+        times, targets = find_row_stamps(file, start, self.times[i : i + 1])
+        nearest = int(nearest_stamps(targets, times, np.inf)[0])
+        if abs(times[nearest] - targets[0]) > self.tolerance:
+            problem = f"nearest frame at {times[nearest]:.6f} s"
+            raise FormatError(file, f"time {targets[0]:.6f} s", problem, f"one within {self.tolerance} s")
         return read_video_frame(file, nearest, feature.hw, pixels=pixels)
 
     def _bytes(self, i: int, key: str) -> tuple[bytes, Path]:
@@ -233,6 +247,7 @@ class _CameraSpec:
     remarks: tuple[str, ...]  # about the data set, for the reports
     span: tuple[float, float]
     tolerance: float
+    recovered: bool
 
     @property
     def image(self) -> LeRobotFeature:
@@ -272,6 +287,12 @@ class _CameraSpec:
         unit = None if depth is None else find_depth_unit(meta, depth, episode, int(rows[0]))
         if depth is None:
             report.append(f"{self.key}: no depth feature: depth is empty")
+        origin = None if self.recovered or depth is None else find_origin_feature(meta, self.key, depth)
+        if origin is not None:
+            report.append("depths that dhtorch enrich recovered are left out (data.recovered=true reads them)")
+        videos = {f.key: episode.videos[f.key] for f in (image, depth) if f is not None and f.dtype == "video"}
+        has_picture, pictures, remarks = pair_episode_videos(videos, numbers, times, self.tolerance)
+        rows, numbers, times, report = rows[has_picture], numbers[has_picture], times[has_picture], report + remarks
         cameras, depth_camera = self._cameras(table, rows, depth)
         poses = None
         if self.pose_key is not None:
@@ -283,12 +304,14 @@ class _CameraSpec:
             times=times,
             image=image,
             depth=depth,
-            videos={f.key: episode.videos[f.key] for f in (image, depth) if f is not None and f.dtype == "video"},
+            videos=videos,
             cameras=cameras,
             depth_camera=depth_camera,
             step_m=None if unit is None else unit.metres,
             span=self.span,
             tolerance=self.tolerance,
+            pictures=pictures,
+            origin=origin,
         )
         numbers, clock = read_capture_clock(meta, table, rows, numbers, times)
         return Recording(
@@ -304,6 +327,7 @@ class _CameraSpec:
             episode=episode.number,
             camera_name=self.key,
             depth_unit=unit,
+            stored=StoredSizes(image.hw, None if depth is None or depth_camera is not None else depth.hw),
         )
 
     def _cameras(

@@ -119,6 +119,12 @@ def find_depth_feature(meta: LeRobotMeta, camera: str, requested: str | None) ->
     return next(iter(depths.values())) if len(depths) == 1 and len(select_colour_keys(meta)) == 1 else None
 
 
+def find_origin_feature(meta: LeRobotMeta, camera: str, depth: LeRobotFeature) -> LeRobotFeature | None:
+    """The map of codes.Source that ``dhtorch enrich`` wrote beside its depth; None for depth of another writer."""
+    origin = meta.features.get(f"{camera}_dhtorch_source")
+    return origin if origin is not None and "quantiser_step_m" in depth.info and origin.hw == depth.hw else None
+
+
 def _distinctive_words(key: str) -> frozenset[str]:
     """The words of a key without those that name the kind of image (rgb, depth, images, …)."""
     kinds = {"observation", "images", "image", "depth", "depths", "rgb", "color", "colour", ""}

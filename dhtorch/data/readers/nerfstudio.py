@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -29,8 +30,9 @@ from dhtorch.data.readers.posed_images import PosedImage, format_names_left_out,
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
 
-#: Files of the format that are not read: splits for training, what a converter printed, the sparse point cloud.
-UNUSED_FILES = ("transforms_*.json", "dataparser_transforms.json", "*_filelist.txt", "sparse_pc*")
+#: Files of the format that are not read: splits for training, what a converter printed, the sparse point cloud, and the
+#: statistics of ``dhtorch enrich``.
+UNUSED_FILES = ("transforms_*.json", "dataparser_transforms.json", "*_filelist.txt", "sparse_pc*", "report.json")
 
 _FILE_NAME = "transforms.json"
 
@@ -43,6 +45,9 @@ _LENS_NAMES = ("k1", "k2", "p1", "p2", "k3")
 #: Names of the depth file of a frame → names of its unit, in the order in which they apply.
 _DEPTH_KEYS = ("depth_file_path", "depth_path")
 _UNIT_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
+
+#: Name of the map of origins that ``dhtorch enrich`` adds.
+_ORIGIN_KEY = "dhtorch_source_file_path"
 
 #: Suffixes tried for a ``file_path`` without one.
 _IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -57,8 +62,12 @@ def recognise(root: Path) -> str | None:
     return None if file is None else file.name
 
 
-def read(root: str | Path) -> list[Recording]:
+def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
     """Open a folder with ``transforms.json``, or a ``transforms*.json``, as one recording for each folder of images.
+
+    Args:
+        root: the folder, or the file.
+        recovered: read also the depths that ``dhtorch enrich`` recovered, as if they were returns of the sensor.
 
     Returns:
         Recordings named after the folder, followed by that of the images where there are several. Images that are
@@ -83,12 +92,13 @@ def read(root: str | Path) -> list[Recording]:
             missing.append(image)
             continue
         row = _parse_row(meta, entry, image, undo, file, k)
+        row = replace(row, origin=None) if recovered else row
         rows.setdefault(PurePosixPath(image.parent.relative_to(folder)), []).append(row)
     report += format_names_left_out(missing, "no such image")
     if any("colmap_im_id" in entry for entry in meta["frames"]):
         report.append("poses were estimated by COLMAP (colmap_im_id): their scale is not metric unless it was aligned")
-    if "dhtorch" in meta:
-        report.append("depth was completed by dhtorch enrich: recovered depths are read as returns of a sensor")
+    if any(row.origin is not None for images in rows.values() for row in images):
+        report.append("depths that dhtorch enrich recovered are left out (data.recovered=true reads them)")
     if not rows:
         raise FormatError(file, "frames", "; ".join(report) or "none", "at least one image")
     unit, name = _parse_unit(meta, file), folder.resolve().name
@@ -138,7 +148,7 @@ def _parse_row(
     hw = _parse_size(values, image, file, k)
     depth_name = next((entry[key] for key in _DEPTH_KEYS if isinstance(entry.get(key), str)), None)
     depth = None if depth_name is None else _resolve(file.parent, depth_name, file, f"frames.{k}.depth_file_path")
-    time = entry.get("timestamp")
+    time, origin = entry.get("timestamp"), entry.get(_ORIGIN_KEY)
     return PosedImage(
         image=image,
         depth=depth if depth is not None and depth.is_file() else None,
@@ -147,6 +157,7 @@ def _parse_row(
         c2w=_parse_pose(entry, undo, file, k),
         distortion=tuple(lens) if any(lens) else None,
         hw=hw,
+        origin=_resolve(file.parent, origin, file, f"frames.{k}.{_ORIGIN_KEY}") if isinstance(origin, str) else None,
         time=float(time) if isinstance(time, int | float) and not isinstance(time, bool) else None,
     )
 

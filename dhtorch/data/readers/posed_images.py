@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from dhtorch.codes import Source
 from dhtorch.data import convert
 from dhtorch.data.codecs import pickles, tiff
 from dhtorch.data.io import decode as files
@@ -51,6 +52,7 @@ class PosedImage:
     distortion: tuple[float, ...] | None = None  # OpenCV's order
     hw: tuple[int, int] | None = None  # of the image that K refers to; None = the stored image
     conf: Path | None = None
+    origin: Path | None = None  # map of codes.Source: depth that is not the sensor's is left out; None = all is
     time: float | None = None  # s
     number: int = -1  # in the capture; negative = not numbered
 
@@ -75,12 +77,14 @@ class PosedImageLoader:
             levels = self.level_of_code(files.read_image(row.conf, self.depth_hw)[0])
             conf = torch.from_numpy(np.ascontiguousarray(levels, np.uint8))[None]
         image = torch.from_numpy(files.read_image(row.image, self.hw, self.exif))
-        return Frame(image[None], self._depth(row.depth)[None], camera, conf=conf)
+        return Frame(image[None], self._depth(row)[None], camera, conf=conf)
 
-    def _depth(self, file: Path | None) -> Tensor:
-        if file is None:
+    def _depth(self, row: PosedImage) -> Tensor:
+        if row.depth is None:
             return torch.zeros(self.depth_hw)
-        depth = read_depth_steps(file, self.depth_hw) * self.step_m
+        depth = read_depth_steps(row.depth, self.depth_hw) * self.step_m
+        if row.origin is not None:
+            depth[files.read_image(row.origin, self.depth_hw)[0] != Source.SENSOR] = 0
         return torch.from_numpy(depth.astype(np.float32))
 
 
