@@ -32,6 +32,7 @@ from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import MAX_PIXELS, FormatError
 from dhtorch.data.plausibility import plausibility_findings
 from dhtorch.data.recording import Recording
+from dhtorch.data.stored_sizes import check_orientation
 from dhtorch.data.units import UNIT_METRES, DepthUnit, parse_unit
 from dhtorch.geometry.no_depth import clear_codes, clear_no_depth
 from dhtorch.runtime.console import format_count
@@ -241,10 +242,9 @@ def _check_shape(file: Path, shape: tuple[int, ...], hw: tuple[int, int]) -> Non
     """Refuse a portrait map of a landscape image (or vice versa); warn where aspect ratios differ otherwise."""
     if 0 in hw:
         return
+    check_orientation(file, (shape[0], shape[1]), hw)
     ratio, expected = shape[1] / shape[0], hw[1] / hw[0]
     size, picture = f"{shape[1]}x{shape[0]}", f"{hw[1]}x{hw[0]}"
-    if (ratio - 1) * (expected - 1) < 0 and abs(ratio / expected - 1) > _MAX_ASPECT_DIFFERENCE:
-        raise FormatError(file, "depth", f"a map of {size}", f"one over the field of view of its image, {picture}")
     if abs(ratio / expected - 1) > _MAX_ASPECT_DIFFERENCE:
         text = f"{file.parent}: maps of {size} are stretched over the whole image, {picture}"
         warnings.warn(text, UserWarning, stacklevel=3)

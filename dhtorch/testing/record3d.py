@@ -91,16 +91,19 @@ def write_record3d_mp4(
     depth_range: tuple[float, float] | None = None,
     crf: int = 4,
     stored: str = "yuv420p",
+    times: Sequence[float] | None = None,
 ) -> None:
     """Write the RGBD mp4: hue and colour side by side, intrinsics as JSON behind the video.
 
-    ``depth_range``: m, written to the file; None = 0 to 3 m, not written, as in older files.
+    ``depth_range``: m, written to the file; None = 0 to 3 m, not written, as in older files. ``times``: s, stamps of
+    the frames; None = at ``fps``.
     """
     near, far = depth_range or (0.0, 3.0)
     pictures = [
         np.concatenate((_hue_to_rgb((f.depth[0].numpy() - near) / (far - near)), frame_to_hwc(f)), 1) for f in frames
     ]
-    write_video(file, pictures, [i / fps for i in range(len(frames))], crf=crf, stored=stored)
+    stamps = [i / fps for i in range(len(frames))] if times is None else times
+    write_video(file, pictures, stamps, crf=crf, stored=stored)
     meta: dict[str, Any] = {"intrinsicMatrix": K_matrix(frames[0].camera).T.ravel().tolist()}
     if depth_range is not None:
         meta["rangeOfEncodedDepth"] = list(depth_range)

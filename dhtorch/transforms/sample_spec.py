@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from dhtorch.data.stored_sizes import describe_mismatch
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import pose_conventions as conventions
 from dhtorch.geometry.checks import all_known, any_possible, is_transformed
@@ -339,13 +340,20 @@ class SampleSpec:
         """Camera of the depth map; None = it covers the field of view of the image."""
         if self.depth_intrinsics is not None:
             return leaves.camera(self.depth_intrinsics, T, at, None)
+        check_sample_orientation(self.depth, depth, hw)
         h, w = depth.shape[-2:]
         if abs((h * hw[1]) / (w * hw[0]) - 1) > _MAX_ASPECT_MISMATCH:
             raise SampleError(
-                f"{self.depth}: found {h}x{w} (height x width), which is no scaled image of {hw[0]}x{hw[1]}; is it "
-                "transposed? A map with another field of view needs depth_intrinsics"
+                f"{self.depth}: found {h}x{w} (height x width), which is no scaled image of {hw[0]}x{hw[1]}; a map "
+                "with another field of view needs depth_intrinsics"
             )
         return None
+
+
+def check_sample_orientation(key: str, depth: Tensor, hw: tuple[int, int]) -> None:
+    """Raise SampleError for portrait maps (B, h, w) of a landscape image of size ``hw``, or vice versa."""
+    if mismatch := describe_mismatch((depth.shape[-2], depth.shape[-1]), hw):
+        raise SampleError(f"{key}: the orientation differs: {mismatch} (width x height); turn one of them and its K")
 
 
 def _probe_depth(depth: Tensor) -> Tensor:

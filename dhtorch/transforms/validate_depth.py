@@ -15,7 +15,7 @@ from dhtorch.pipeline.presets import get_method
 from dhtorch.pytree import stack
 from dhtorch.records import NO_HINT, DepthValidation, Frame, TrackHint
 from dhtorch.transforms.sample_access import SampleError, SampleReader, check_sample
-from dhtorch.transforms.sample_spec import SampleSpec
+from dhtorch.transforms.sample_spec import SampleSpec, check_sample_orientation
 from dhtorch.validation.validate import validate_depth
 
 #: Numbers of a frame that are added with their confidence interval: value, low, high.
@@ -111,6 +111,7 @@ class ValidateDepth(torch.nn.Module):
         leaves = SampleReader(sample, batched=self.batched, dtype=reference.camera.f.dtype)
         leaves.like = reference.image
         planes = leaves.planes(self.map, 1).to(reference.camera.f)
+        check_sample_orientation(self.map, planes, reference.hw)
         codes = clear_codes(planes[:, 0])
         return clear_no_depth(codes * self.map_unit)
 

@@ -251,7 +251,7 @@ def test_files_are_matched_by_number_else_in_order_and_never_by_halves(tmp_path,
 def test_a_map_is_laid_over_the_whole_picture(tmp_path, room):
     h, w = room[0].hw
     with pytest.raises(
-        FormatError, match=rf"a map of {h}x{w}, expected one over the field of view of its image, {w}x{h}"
+        FormatError, match=rf"orientation: found depth {h}x{w} \(portrait\) beside pictures {w}x{h} \(landscape\)"
     ):
         open_depth_maps(folder_of(tmp_path / "upright", ["0"], (w, h)), room)[0]
     with pytest.warns(UserWarning, match="maps of 64x64 are stretched"):

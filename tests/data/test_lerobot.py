@@ -33,7 +33,7 @@ from dhtorch.data.readers.lerobot_meta import LeRobotFeature
 from dhtorch.data.units import DepthUnit
 from dhtorch.records import Camera, Frame
 from dhtorch.testing.lerobot import quantise_lerobot_depth, write_lerobot
-from dhtorch.testing.lossless import write_lossless
+from dhtorch.testing.mp4 import write_video
 from dhtorch.testing.parts import encode_depth_codes
 
 KEY = "observation.images.front"
@@ -377,15 +377,54 @@ def test_missing_and_shuffled_rows_are_reported(tmp_path: Path) -> None:
     assert recording.number.tolist() == [0, 3] and "1 row out of order: left out" in recording.report[0]
 
 
-def test_a_shorter_video_is_an_error_where_it_ends(tmp_path: Path) -> None:
+def rewrite_video(root: Path, pictures: list[int], stamps: list[float] | None = None) -> None:
+    """Write the colour video of episode 1 anew, with these frames at these time stamps in s."""
+    file = root / "videos" / "chunk-000" / KEY / "episode_000001.mp4"
+    images = [two_episodes()[1][i].image[0].permute(1, 2, 0).numpy() for i in pictures]
+    write_video(file, images, [i / 30 for i in range(len(images))] if stamps is None else stamps, crf=1)
+
+
+def error_of(recording: data.Recording, place: int, number: int) -> float:
+    """Mean difference in grey values of a frame's picture from that of a row, below 12 where they are one."""
+    return float((recording[place].image.float() - two_episodes()[1][number].image.float()).abs().mean())
+
+
+def test_rows_beyond_a_shorter_video_are_left_out(tmp_path: Path) -> None:
     write_lerobot(tmp_path, two_episodes(), version=2, depth=None)
-    file = tmp_path / "videos" / "chunk-000" / KEY / "episode_000001.mp4"
-    pictures = [frame.image[0].permute(1, 2, 0).numpy() for frame in two_episodes()[1][:3]]
-    write_lossless(file, pictures, "rgb24")
+    rewrite_video(tmp_path, [0, 1, 2])
     recording = data.open(tmp_path, episode=1)
-    assert torch.equal(recording[2].image, two_episodes()[1][2].image)
-    with pytest.raises(FormatError, match=r"episode_000001.mp4: time 0.100000 s: found nearest frame at 0.066667 s"):
-        recording[3]
+    assert recording.number.tolist() == [0, 1, 2] and error_of(recording, 2, 2) < 12
+    assert "row 3 has no picture in episode_000001.mp4: left out; the video ends early" in recording.report[-1]
+
+
+def test_rows_of_lost_pictures_are_left_out(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, two_episodes(), version=2, depth="tiff")
+    rewrite_video(tmp_path, [0, 2, 3], [0, 2 / 30, 3 / 30])
+    recording = data.open(tmp_path, episode=1)
+    assert recording.number.tolist() == [0, 2, 3]
+    assert recording.report[0] == "row 1 has no picture in episode_000001.mp4: left out"
+    for place, number in enumerate((0, 2, 3)):
+        assert error_of(recording, place, number) < 12
+        torch.testing.assert_close(recording[place].depth, two_episodes()[1][number].depth)
+
+
+def test_a_video_at_another_rate_with_a_frame_for_each_row_is_paired_by_order(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, two_episodes(), version=2, depth=None)
+    rewrite_video(tmp_path, [0, 1, 2, 3], [i / 25 for i in range(4)])
+    recording = data.open(tmp_path, episode=1)
+    assert recording.number.tolist() == [0, 1, 2, 3] and max(error_of(recording, i, i) for i in range(4)) < 12
+    assert recording.report[-1].endswith("has as many frames as rows, but at other times: paired by their order")
+
+
+def test_a_wrong_stamp_does_not_reorder_numbered_rows(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, two_episodes(), version=2, depth=None)
+    file = tmp_path / "data" / "chunk-000" / "episode_000001.parquet"
+    wrong = pyarrow.array(np.array([0, 9, 2 / 30, 3 / 30], np.float32))
+    rewrite(file, lambda t: t.set_column(t.schema.get_field_index("timestamp"), "timestamp", wrong))
+    recording = data.open(tmp_path, episode=1)
+    assert recording.number.tolist() == [0, 1, 2, 3]
+    torch.testing.assert_close(recording.times, torch.arange(4).double() / 30)
+    assert "1 time stamp out of order: rows keep the order of their numbers" in recording.report[0]
 
 
 def test_opening_decodes_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

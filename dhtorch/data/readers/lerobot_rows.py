@@ -61,8 +61,11 @@ def select_episode_rows(
     rows = np.flatnonzero(table.get("episode_index", default) == episode.number)
     stamp = table["timestamp"][rows].astype(np.float64)
     number = table["frame_index"][rows].astype(np.float64) if "frame_index" in table else np.arange(float(len(rows)))
-    valid = (number >= 0) & (number < 2**31) & (number == np.floor(number)) & (stamp >= 0) & (stamp < 1e9)  # not NaN
+    numbered = (number >= 0) & (number < 2**31) & (number == np.floor(number))  # not NaN
     report = []
+    if "frame_index" in table and bool((numbered & _is_increasing(number, numbered)).all()):
+        stamp, report = _replace_disordered(stamp, number / meta.fps, f"episode {episode.number}")
+    valid = numbered & (stamp >= 0) & (stamp < 1e9)
     keep = valid & _is_increasing(number, valid) & _is_increasing(stamp, valid)
     if not keep.all():
         report.append(f"episode {episode.number}: {format_count(int((~keep).sum()), 'row')} out of order: left out")
@@ -79,6 +82,18 @@ def select_episode_rows(
         report.append(f"episode {episode.number}: times begin at {stamp[0]:.4g} s: images taken by the order of rows")
         stamp = grid
     return rows, number.astype(np.int64), np.where(np.abs(grid - stamp) < _MAX_GRID_ERROR_S, grid, stamp), report
+
+
+def _replace_disordered(stamp: np.ndarray, grid: np.ndarray, name: str) -> tuple[np.ndarray, list[str]]:
+    """Stamps of numbered rows, or the grid of their numbers where stamps do not increase and most lie on the grid."""
+    with np.errstate(invalid="ignore"):
+        if len(stamp) < 2 or bool((np.diff(stamp) > 0).all()):
+            return stamp, []
+        on_grid = np.abs(stamp - grid - np.nanmedian(stamp - grid)) < _MAX_GRID_ERROR_S
+    if on_grid.mean() <= 0.5:
+        return stamp, []
+    wrong = format_count(int((~on_grid).sum()), "time stamp")
+    return grid, [f"{name}: {wrong} out of order: rows keep the order of their numbers, at the nominal rate"]
 
 
 def find_capture_columns(meta: LeRobotMeta) -> tuple[str, ...]:

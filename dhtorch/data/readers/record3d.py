@@ -30,6 +30,7 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.members import Member, get_member, list_folder_members, list_zip_members
 from dhtorch.data.readers import record3d_video
 from dhtorch.data.recording import Recording
+from dhtorch.data.stored_sizes import StoredSizes
 from dhtorch.records import Frame
 
 _MEMBER_PATTERN = re.compile(r"(?:rgbd|rgb|depth)/(0|[1-9]\d{0,8})\.(jpg|depth|conf|exr)")
@@ -109,6 +110,8 @@ def read(
     report += files.format_left_out([shot.number for i, shot in enumerate(posed) if i not in set(intact)], "damaged")
     if not intact:
         raise FormatError(inner, "frames", "; ".join(report), "frames that decode")
+    first = posed[intact[0]].image
+    exif = files.decode_image_header(first.read(), first.path).orientation
     number = torch.tensor([posed[i].number for i in intact])
     times, remarks = _frame_times(number, meta)
     return [
@@ -122,6 +125,7 @@ def read(
             poses=None if c2w is None else convert.to_poses(c2w[intact], table.path),
             rate_hz=meta.fps,
             report=tuple(report + remarks),
+            stored=StoredSizes.of_images(load.hw, load.depth_hw, exif),
         )
     ]
 

@@ -59,6 +59,7 @@ def read(file: Path, *, depth_range: Sequence[float] | None = None, max_step: fl
     camera = convert.to_camera(K, hw, source, "intrinsicMatrix")
     load = _Load(file, header.hw, camera, float(near), float(far), files.to_positive(max_step, file, "option max_step"))
     number = torch.arange(header.n)
+    times, remarks = _read_times(file, header)
     return [
         Recording(
             name=file.stem,
@@ -66,9 +67,9 @@ def read(file: Path, *, depth_range: Sequence[float] | None = None, max_step: fl
             load=load,
             number=number,
             root=file,
-            times=None if header.rate_hz is None else number.double() / header.rate_hz,
+            times=times,
             rate_hz=header.rate_hz,
-            report=("no poses in this layout",),
+            report=("no poses in this layout", *remarks),
         )
     ]
 
@@ -91,6 +92,16 @@ class _Load:
         image = np.ascontiguousarray(picture[:, half:].transpose(2, 0, 1))
         depth = decode_hue_depth(picture[:, :half], self.near, self.far, self.max_step)
         return Frame(torch.from_numpy(image)[None], torch.from_numpy(depth)[None], self.camera)
+
+
+def _read_times(file: Path, header: video.VideoHeader) -> tuple[torch.Tensor | None, list[str]]:
+    """Time stamps (n,) of the frames from the first one on, s; those of the nominal rate where the file is cut off."""
+    times = video.read_video_times(file)
+    if len(times) == header.n:
+        return torch.from_numpy(times - times[0]), []
+    remark = f"the file has {len(times)} of {header.n} frames"
+    nominal = None if header.rate_hz is None else torch.arange(header.n).double() / header.rate_hz
+    return nominal, [f"{remark}: times are those of the nominal rate"]
 
 
 def decode_hue_depth(
