@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -147,6 +148,11 @@ def bag_writer(layout: BagLayout) -> Callable[[Path], Path]:
     def write(root: Path) -> Path:
         path = root / ("a.bag" if layout.storage == "ros1" else "bag")
         write_rosbag(path, small_walk(), layout)
+        if layout.storage == "mcap":  # the file alone, without its metadata.yaml
+            (file,) = path.glob("*.mcap")
+            file.rename(root / "a.mcap")
+            shutil.rmtree(path)
+            return root / "a.mcap"
         return path
 
     return write
