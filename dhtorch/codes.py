@@ -145,6 +145,12 @@ class Gate(CodeTable):
         meaning="the poses given contradict the near returns",
         advice="see their axes, direction and unit",
     )
+    MISALIGNED: Final = code(
+        13,
+        "depth and picture do not belong together: the returns do not explain the parallax of their pixels",
+        meaning="depth and picture do not belong together",
+        advice="see whether only one of them was mirrored, cropped, shifted or turned; the returns are at wrong pixels",
+    )
 
 
 class PoseCode(CodeTable):
@@ -156,6 +162,12 @@ class PoseCode(CodeTable):
     NO_BASELINE: Final = code(3, "the camera did not translate significantly, or stood still")
     KEPT_PNP: Final = code(4, "refinement did not improve the fit; the PnP pose was kept")
     REFUTED: Final = code(5, "the near returns contradict the given pose")
+    MISALIGNED: Final = code(
+        6,
+        "depth and picture do not belong together: the returns do not explain the parallax of their pixels",
+        meaning="depth and picture do not belong together",
+        advice="see whether only one of them was mirrored, cropped, shifted or turned; the returns are at wrong pixels",
+    )
 
 
 class Source(CodeTable):

@@ -147,6 +147,23 @@ class PoseFit(Record):
         """(B,) bool: there is a pose."""
         return (self.code == PoseCode.OK) | (self.code == PoseCode.KEPT_PNP)
 
+    def without_pose(self, rejected: Tensor, code: Tensor | int) -> PoseFit:
+        """The fit without the ``rejected`` (B,) poses, which get ``code``. Gradient: to the poses that stay."""
+
+        def mask(x: Tensor) -> Tensor:
+            return torch.where(rejected.view(-1, *[1] * (x.dim() - 1)), torch.nan, x)
+
+        return self.replace(
+            T_1_from_0=self.T_1_from_0.map(mask),
+            cov=mask(self.cov),
+            inlier=self.inlier & ~rejected[:, None],
+            rms_px=mask(self.rms_px),
+            sigma_px=mask(self.sigma_px),
+            t_snr=mask(self.t_snr),
+            shutter=None if self.shutter is None else self.shutter.map(mask),
+            code=torch.where(rejected, code, self.code).to(self.code.dtype),
+        )
+
 
 @record
 class PosePrior(Record):

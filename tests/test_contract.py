@@ -64,7 +64,7 @@ from dhtorch.pipeline import (
 )
 from dhtorch.pipeline.presets import MAP, PAPER, WINDOW
 from dhtorch.records import Frame
-from dhtorch.stages import backproject, holes, pose, pose_prior, score, track, triangulate
+from dhtorch.stages import backproject, holes, misalignment, pose, pose_prior, score, track, triangulate
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.validation import evidence, faults, validate
 
@@ -371,6 +371,7 @@ ROWS = [
     Row(score.expected_error_loss, lambda b, n, d: (uniform(n, dtype=d, low=-5), uniform(n, dtype=d), uniform(n, dtype=d)), "dtype capture gradcheck raises", grad=(0,), bad=wrong_last_axis(1)),
     Row(pose.pnp_ransac, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
     Row(pose_prior.check_pose_prior, held, "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(uv_1=a[2].uv_1[:, 1:]), *a[3:]), atol=1e-4),
+    Row(misalignment.reject_misaligned, tracked, "dtype batch vmap capture empty raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4),
     Row(pose_prior.relative_prior, lambda b, n, d: (poses(b, d), poses(b, d, seed=1)), "dtype batch vmap capture gradcheck", grad=(0, 1)),
     Row(pose_prior.make_prior, lambda b, n, d: (poses(b, d),), "dtype batch vmap capture gradcheck", grad=(0,)),
     Row(pose.map_pose, posed, "dtype batch vmap capture empty padding raises", (0, 1), bad=lambda a: (a[0], a[1].replace(uv_1=a[1].uv_1[:, 1:]), *a[2:]), atol=1e-4, slow="capture"),

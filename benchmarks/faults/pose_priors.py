@@ -2,6 +2,7 @@
 
 TESTS: dict[str, list[str]] = {
     "stages.pose_prior": ["tests/stages/test_pose_prior.py"],
+    "stages.misalignment": ["tests/stages/test_misalignment.py"],
     "geometry.pose_conventions": ["tests/stages/test_pose_prior.py", "tests/test_contract.py"],
     "geometry.pose_averaging": ["tests/pipeline/test_rig.py", "tests/test_contract.py"],
     "geometry.inference_mode": ["tests/geometry/test_inference_mode.py"],
@@ -22,13 +23,21 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("check_pose_prior", "(unconfirmed, PoseCode.TOO_FEW),\n", ""),
         ("check_pose_prior", "inlier=(inlier & ok[:, None])[:, :N]", "inlier=inlier[:, :N]"),
         ("reject_poses", "| (prior_fit.code == PoseCode.TOO_FEW)", ""),
-        ("reject_poses", "code=torch.where(rejected, prior_fit.code, fit.code)", "code=fit.code"),
+        ("reject_poses", "fit.without_pose(rejected, prior_fit.code)", "fit.without_pose(rejected, fit.code)"),
         ("priors_from_frames", ".unflatten(0, world_1.t.shape[:2])", ".unflatten(0, world_1.t.shape[:2][::-1])"),
         ("make_prior", "[sigma[0] ** 2] * 3 + [sigma[1] ** 2] * 3", "[sigma[1] ** 2] * 3 + [sigma[0] ** 2] * 3"),
         ("make_prior", "InitialPose if refine else PosePrior", "PosePrior"),
         ("_square", "(c * x * x - 2 * b * x * y + a * y * y)", "(a * x * x - 2 * b * x * y + c * y * y)"),
         ("_matched_convention", "< 0.5", "< 5.0"),
         ("_t_snr", "torch.where(exact, ", "torch.where(~exact, "),
+    ],
+    "stages.misalignment": [
+        ("_is_misaligned", "few_returns / n.clamp_min(1).sqrt()", "0 * n"),
+        ("_is_misaligned", "rejected | (gain", "(gain"),
+        ("_is_misaligned", "rejected = rejected | (gain", "rejected = rejected & (gain"),
+        ("_is_misaligned", "& (fit.t_snr >= min_t_snr)", ""),
+        ("_profile_cost", "(COST_BEND**2 / (COST_BEND**2 + square)) ** 2", "1"),
+        ("_near_parallax", "used = tracked & samples.usable", "used = samples.usable"),
     ],
     "geometry.pose_conventions": [
         ("TRANSLATION_UNITS", '"millimetres": 1e-3', '"millimetres": 1e3'),

@@ -312,6 +312,7 @@ def _pair_gate(selected: SelectedViews, use: Tensor) -> Tensor:
     no_view = ~use.any(0)
     return first_reason(
         (contradicted, Gate.CONTRADICTED),
+        (no_view & (selected.fits.code == PoseCode.MISALIGNED).any(0), Gate.MISALIGNED),
         (no_view & (selected.fits.code == PoseCode.REFUTED).any(0), Gate.POSE_REFUTED),
         (no_view & no_baseline.any(0), Gate.NO_BASELINE),
         (no_view & ~selected.fits.ok.any(0), Gate.NO_POSE),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from dhtorch.codes import Gate, PoseCode, Source
 from dhtorch.geometry import camera as cam
-from dhtorch.geometry.checks import all_finite, check, is_transformed
+from dhtorch.geometry.checks import all_finite, any_possible, check, is_transformed
 from dhtorch.geometry.linalg import small_matmul
 from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline.spec import MethodSpec, Trace
@@ -121,6 +122,8 @@ def solve_pose_and_triangulate(
         solved = method.pose(samples, usable, camera_0, camera_1, draws)
         fit = solved if fit is None else _apply_prior(fit, solved, samples, usable, camera_0, camera_1)
         fit = fit.replace(code=torch.where(_is_static(fit, usable), PoseCode.NO_BASELINE, fit.code).to(fit.code.dtype))
+        if (verify := method.verify) is not None:
+            fit = _verify(lambda pose: verify(samples, usable, pose, camera_0, camera_1), fit, solved)
     clock("pose", fit)
     estimate = clock("triangulate", method.triangulate(samples, usable, fit, camera_0, camera_1))
     untextured = (estimate.gate == Gate.NO_TRACK) & tracks.valid & ~textured
@@ -136,6 +139,20 @@ def _is_static(fit: PoseFit, tracks: Tracks) -> Tensor:
         n_tracks = tracks.valid.sum(-1)
         no_pose = (fit.code == PoseCode.TOO_FEW) | (fit.code == PoseCode.DEGENERATE)
         return no_pose & (n_tracks >= MIN_STATIC_TRACKS) & (n_static > STATIC_RATIO * n_tracks)
+
+
+def _verify(
+    verify: Callable[[PoseFit], PoseFit],
+    fit: PoseFit,
+    solved: PoseFit,
+) -> PoseFit:
+    """The fit without the poses that ``verify`` rejects; returns at wrong pixels do not refute a given pose."""
+    verified = verify(fit)
+    refuted = fit.code == PoseCode.REFUTED
+    if not any_possible(refuted):
+        return verified
+    misaligned = refuted & (verify(solved).code == PoseCode.MISALIGNED)
+    return verified.without_pose(misaligned, PoseCode.MISALIGNED)
 
 
 def _apply_prior(

@@ -31,6 +31,7 @@ from dhtorch.records import (
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.fuse import inverse_variance
 from dhtorch.stages.holes import classify
+from dhtorch.stages.misalignment import reject_misaligned
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.sample import spiral
 from dhtorch.stages.score import confidence
@@ -58,6 +59,7 @@ class MethodSpec:
     classify: Callable[..., Samples] = classify  # (frame, samples) -> samples with their holes
     track: Callable[..., Tracks] = lucas_kanade  # (image_0, image_1, uv_0, *, hint)
     pose: Callable[..., PoseFit] = pnp_ransac  # (samples, tracks, camera_0, camera_1, draws)
+    verify: Callable[..., PoseFit] | None = reject_misaligned  # (samples, tracks, fit, camera_0, camera_1)
     triangulate: Callable[..., Estimate] = two_view  # (samples, tracks, fit, camera_0, camera_1)
     score: Callable[..., Estimate] = confidence  # (estimate, samples, tracks, fit)
     fuse: Callable[..., Estimate] = inverse_variance  # (estimates (V, B, N)); called with several views only

@@ -177,20 +177,7 @@ def reject_poses(fit: PoseFit, prior_fit: PoseFit) -> PoseFit:
     """
     check("reject_poses", R=(fit.T_1_from_0.R, "B 3 3"), code=(fit.code, "B"), code_prior=(prior_fit.code, "B"))
     rejected = fit.ok & ((prior_fit.code == PoseCode.REFUTED) | (prior_fit.code == PoseCode.TOO_FEW))
-
-    def mask(x: Tensor) -> Tensor:
-        return torch.where(rejected.view(-1, *[1] * (x.dim() - 1)), torch.nan, x)
-
-    return fit.replace(
-        T_1_from_0=fit.T_1_from_0.map(mask),
-        cov=mask(fit.cov),
-        inlier=fit.inlier & ~rejected[:, None],
-        rms_px=mask(fit.rms_px),
-        sigma_px=mask(fit.sigma_px),
-        t_snr=mask(fit.t_snr),
-        shutter=None if fit.shutter is None else fit.shutter.map(mask),
-        code=torch.where(rejected, prior_fit.code, fit.code).to(fit.code.dtype),
-    )
+    return fit.without_pose(rejected, prior_fit.code)
 
 
 def priors_from_frames(

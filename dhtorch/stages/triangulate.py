@@ -94,8 +94,8 @@ def two_view(
         the pose's (with it the sensor's noise, which the pose has from the near points); ``sigma_shared`` is the pose's
         part, common to the pair's points.
 
-    Gates, the first that applies: NO_TRACK, NO_BASELINE, POSE_REFUTED, NO_POSE, BEHIND, PARALLAX, RESIDUAL,
-    INCONSISTENT, UNCERTAIN; CONTRADICTED in place of an answer.
+    Gates, the first that applies: NO_TRACK, NO_BASELINE, POSE_REFUTED, MISALIGNED, NO_POSE, BEHIND, PARALLAX,
+    RESIDUAL, INCONSISTENT, UNCERTAIN; CONTRADICTED in place of an answer.
     The rolling shutter of the fit (``fit.shutter``) is undone in ``uv_1`` and included in sigma.
 
     Raises:
@@ -135,6 +135,7 @@ def two_view(
         (~tracked, Gate.NO_TRACK),
         (static[:, None].expand_as(tracked), Gate.NO_BASELINE),
         ((fit.code == PoseCode.REFUTED)[:, None].expand_as(tracked), Gate.POSE_REFUTED),
+        ((fit.code == PoseCode.MISALIGNED)[:, None].expand_as(tracked), Gate.MISALIGNED),
         (~posed, Gate.NO_POSE),
         (_below(fit.t_snr[:, None].expand_as(tracked), min_t_snr), Gate.NO_BASELINE),
         (behind, Gate.BEHIND),

@@ -88,6 +88,7 @@ MAP_1 = Method(
         steps=6,
         threshold_px=3.0,
     ),
+    verify=None,
     triangulate=partial(
         two_view,
         min_parallax_deg=None,

@@ -33,7 +33,17 @@ _ALLOWED_MODULES = {
         "dhtorch.experiments.baselines.xfeat",
         *(
             f"dhtorch.stages.{name}"
-            for name in ("sample", "backproject", "holes", "track", "pose", "triangulate", "score", "fuse")
+            for name in (
+                "sample",
+                "backproject",
+                "holes",
+                "track",
+                "pose",
+                "misalignment",
+                "triangulate",
+                "score",
+                "fuse",
+            )
         ),
     ),
 }

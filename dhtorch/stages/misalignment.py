@@ -1,0 +1,279 @@
+"""Beside stage 5: does depth belong to the picture? Near returns and the parallax of their pixels → pose, or a code.
+
+A loader that mirrors, crops or shifts pictures and leaves depth and intrinsics as they are attaches returns to wrong
+pixels. A motion still fits such tracks, because most of their displacement is rotation and mean depth; but the rest of
+their parallax is not explained by the depth at their own pixels, or is explained better by the depth at others.
+
+Alphabet: ``p`` the inverse depth of a return and ``q`` that of its track triangulated under the pose (1/m); ``a`` =
+d(pixel of view 1) / dq along the epipolar line (px m), so that (q − p) a is the residual along that line in px.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import PoseCode
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import epipolar, ransac
+from dhtorch.geometry.checks import all_finite, check
+from dhtorch.geometry.covariance import masked_median
+from dhtorch.geometry.map_estimate import MEDIAN_1D, MIN_NOISE_PX
+from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
+from dhtorch.pytree import chunked_apply
+from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
+
+#: Limits the pairs that are tested together, a count; each near return has a row for every attachment.
+#: Source: MAP_CHUNK_PAIRS of stage 5.
+TEST_CHUNK_PAIRS = 16
+
+#: Relative error of returns that is always tolerated, added to their own sigma: distortion and registration of sensors.
+#: Source: chosen on shared_scenes, the field cases and the built-in rooms, sound and with altered pictures.
+DEPTH_TOLERANCE_REL = 0.04
+
+#: Limits the influence of a residual, in standard deviations: where the robust cost bends.
+#: Source: FitOptions.bend, the same kernel.
+COST_BEND = 2.0
+
+#: Reweighted steps in which the scale of an inverse depth profile is fitted, a count.
+#: Source: origin not recorded.
+SCALE_STEPS = 4
+
+#: Least first ratio of :func:`reject_misaligned` with the rolling shutter undone, without unit.
+#: Source: chosen on shared_scenes, the field cases and the built-in rooms, sound and with altered pictures.
+MIN_ROLLING_UNEXPLAINED = 0.5
+
+#: Fewest near returns of a pair on which the test is made, a count.
+#: Source: chosen on shared_scenes, the field cases and the built-in rooms.
+MIN_TESTED_RETURNS = 24
+
+#: Limits the near returns of a pair on which other attachments are tried, a count; more are thinned evenly.
+#: Source: chosen for speed, a quarter of the default samples.
+MAX_ATTACHED_RETURNS = 512
+
+#: Least fraction of the near returns that another attachment must also have a return for, without unit.
+#: Source: chosen on shared_scenes, the field cases and the built-in rooms.
+MIN_SHARED_RATIO = 0.25
+
+#: Least mean robust cost of the returns at their own pixels, in [0, 1], that another attachment may improve on.
+#: Source: chosen on shared_scenes, the field cases and the built-in rooms.
+MIN_OWN_COST = 0.05
+
+#: Cells (across, down) of the picture in which the inverse depth of returns is averaged for other attachments, a count.
+#: Source: chosen on shared_scenes, the field cases and the built-in rooms.
+DEPTH_CELLS = (40, 30)
+
+#: Other attachments that are tried: pixel of depth = centre + (sx, sy) · (pixel − centre) + (dx, dy) · picture size.
+#: Source: derived, what loaders do: flips, centre crops by 10 to 40 %, shifts by 5 and 10 %.
+ATTACHMENTS = (
+    *((-1.0, 1.0, 0.0, 0.0), (1.0, -1.0, 0.0, 0.0), (-1.0, -1.0, 0.0, 0.0)),
+    *((s, s, 0.0, 0.0) for s in (0.9, 0.8, 0.7, 0.6)),
+    *((1.0, 1.0, d, 0.0) for d in (-0.1, -0.05, 0.05, 0.1)),
+    *((1.0, 1.0, 0.0, d) for d in (-0.1, -0.05, 0.05, 0.1)),
+)
+
+
+class _Parallax(NamedTuple):
+    """Near returns of B pairs with the parallax of their tracks; unused ones hold safe finite values."""
+
+    uv: Tensor  # (B, N, 2) px of view 0
+    p: Tensor  # (B, N) 1/m
+    q: Tensor  # (B, N) 1/m
+    a: Tensor  # (B, N) px m
+    variance_rel: Tensor  # (B, N) relative variance of p
+    noise: Tensor  # (B, 1) px, of a track across its epipolar line
+    used: Tensor  # (B, N) bool
+
+
+def reject_misaligned(
+    samples: Samples,
+    tracks: Tracks,
+    fit: PoseFit,
+    camera_0: Camera,
+    camera_1: Camera,
+    *,
+    max_unexplained: float = 0.62,
+    min_gain: float = 0.85,
+    few_returns: float = 3.0,
+    min_t_snr: float = 30.0,
+) -> PoseFit:
+    """A fit without the poses of pairs whose depth does not belong to their pictures, which get the code MISALIGNED.
+
+    Two ratios of mean robust costs, in [0, 1], of the residuals along the epipolar lines of n near returns decide. The
+    first is the cost of the returned depths over that of one depth for all: returns at wrong pixels hardly improve on
+    it. The second is the cost of the depths at other pixels (:data:`ATTACHMENTS`) over that of the depths at the
+    tracks' own. Returns whose parallax hardly varies, or few of them, refute nothing.
+
+    A shutter rate that was fitted to such pairs absorbs part of what the depths leave unexplained. So the first ratio
+    is taken with the rolling shutter as it is, and must also exceed :data:`MIN_ROLLING_UNEXPLAINED` where it is undone.
+
+    Args:
+        samples, tracks, camera_0, camera_1: the inputs of stage 5.
+        fit: the result of stage 5.
+        max_unexplained: limit of the first ratio; a pair is rejected above this plus ``few_returns`` / √n.
+        min_gain: limit of the second ratio; a pair is rejected below this minus ``few_returns`` / √n.
+        few_returns: standard deviation of the ratios times √n, as a margin.
+        min_t_snr: length of the translation, in its own standard deviations, from which pairs are tested: with less
+            there is no parallax to explain.
+
+    Raises:
+        ValueError: wrong shapes.
+
+    Gradient: to the poses that stay; whether they do carries none.
+    Cost: linear in N; two triangulations and 17 evaluations of the residuals along the epipolar lines.
+    """
+    check("reject_misaligned", xyz=(samples.xyz, "B N 3"), uv_1=(tracks.uv_1, "B N 2"), R=(fit.T_1_from_0.R, "B 3 3"))
+    check("reject_misaligned", f_0=(camera_0.f, "B 2"), f_1=(camera_1.f, "B 2"))
+    reject = partial(
+        _reject, max_unexplained=max_unexplained, min_gain=min_gain, few_returns=few_returns, min_t_snr=min_t_snr
+    )
+    return chunked_apply(reject, TEST_CHUNK_PAIRS, fit, samples, tracks, cam.ideal(camera_0), cam.ideal(camera_1))
+
+
+def _reject(fit: PoseFit, *inputs: Samples | Tracks | Camera, **limits: float) -> PoseFit:
+    """:func:`reject_misaligned` for one chunk of pairs."""
+    with torch.no_grad():
+        rejected = _is_misaligned(fit, *inputs, **limits)  # type: ignore[arg-type]
+    return fit.without_pose(rejected, PoseCode.MISALIGNED)
+
+
+def _is_misaligned(
+    fit: PoseFit,
+    samples: Samples,
+    tracks: Tracks,
+    camera_0: Camera,
+    camera_1: Camera,
+    *,
+    max_unexplained: float,
+    min_gain: float,
+    few_returns: float,
+    min_t_snr: float,
+) -> Tensor:
+    """Whether (B,) there is a pose and the limits of :func:`reject_misaligned` reject it."""
+    straight = _near_parallax(samples, tracks, fit, camera_0, camera_1)
+    rolling = straight
+    if fit.shutter is not None:
+        rolling = _near_parallax(samples, tracks, fit.replace(shutter=None), camera_0, camera_1)
+    n = straight.used.sum(-1)
+    rejected = _unexplained_ratio(rolling) > max_unexplained + few_returns / n.clamp_min(1).sqrt()
+    if fit.shutter is not None:
+        rejected = rejected & (_unexplained_ratio(straight) > MIN_ROLLING_UNEXPLAINED)
+    gain, n_shared = _attachment_gain(_thinned(straight), samples, camera_0)
+    rejected = rejected | (gain < min_gain - few_returns / n_shared.clamp_min(1).sqrt()).any(-1)
+    return rejected & fit.ok & (n >= MIN_TESTED_RETURNS) & (fit.t_snr >= min_t_snr)
+
+
+def _near_parallax(samples: Samples, tracks: Tracks, fit: PoseFit, camera_0: Camera, camera_1: Camera) -> _Parallax:
+    """Near returns and the parallax of their tracks under the pose, the fit's rolling shutter undone."""
+    posed = fit.ok[:, None]
+    tracked = tracks.valid & all_finite(tracks.uv_0, -1) & all_finite(tracks.uv_1, -1) & posed
+    uv_0, uv_1 = (torch.where(tracked[..., None], x, torch.zeros_like(x)) for x in (tracks.uv_0, tracks.uv_1))
+    if fit.shutter is not None:
+        rate = torch.where(posed, fit.shutter.shutter_rate, torch.zeros_like(fit.shutter.shutter_rate))
+        height = cam.rays(camera_0, uv_0)[..., 1]
+        uv_1 = undo_rolling_shutter(uv_1.transpose(1, 2), camera_1.f, camera_1.c, height, rate).transpose(1, 2)
+    eye = torch.eye(3, dtype=uv_1.dtype, device=uv_1.device)
+    T = fit.T_1_from_0
+    T = Pose(torch.where(posed[..., None], T.R, eye), torch.where(posed, T.t, eye[0]))
+    geometry = epipolar.triangulate(uv_0, uv_1, camera_0, camera_1, T)
+    z, depth = samples.xyz[..., 2], geometry.depth
+    q = 1 / torch.where(depth.abs() > 1e-6, depth, torch.full_like(depth, 1e-6))
+    a = torch.linalg.vector_norm(geometry.slope, dim=-1) * depth * depth
+    used = tracked & samples.usable & (z > 0) & samples.sigma.isfinite() & (a > 0) & a.isfinite()
+    p = 1 / torch.where(used, z, torch.ones_like(z))
+    q, a, sigma = (torch.where(used, x, torch.zeros_like(x)) for x in (q, a, samples.sigma))
+    far = tracked & ~samples.usable
+    across = [torch.where(m.any(-1, keepdim=True), masked_median(geometry.residual_px, m), 0.0) for m in (used, far)]
+    noise = (torch.maximum(*across) / MEDIAN_1D).clamp_min(MIN_NOISE_PX)
+    return _Parallax(uv_0, p, q, a, (sigma * p) ** 2 + DEPTH_TOLERANCE_REL**2, noise, used)
+
+
+def _thinned(near: _Parallax) -> _Parallax:
+    """At most :data:`MAX_ATTACHED_RETURNS` of the used returns."""
+    if near.used.shape[1] == 0:
+        return near
+    index, count = ransac.usable_first(near.used, min(MAX_ATTACHED_RETURNS, near.used.shape[1]))
+    used = torch.arange(index.shape[1], device=index.device) < count[:, None]
+    p, q, a, variance_rel = (x.gather(1, index) for x in (near.p, near.q, near.a, near.variance_rel))
+    return _Parallax(near.uv.gather(1, index[..., None].expand(-1, -1, 2)), p, q, a, variance_rel, near.noise, used)
+
+
+def _profile_cost(near: _Parallax, p: Tensor, used: Tensor, scale: Tensor | None) -> Tensor:
+    """Mean robust cost (…) of the residuals (q − s p) a of inverse depths p (…, N); s = 1, or fitted from ``scale``."""
+    square = _square(near, p if scale is None else scale * p)
+    if scale is not None:
+        for _ in range(SCALE_STEPS):
+            weight = near.a**2 / _variance(near, scale * p) * (COST_BEND**2 / (COST_BEND**2 + square)) ** 2
+            weight = torch.where(used, weight, 0.0)
+            total = (weight * p * p).sum(-1, keepdim=True)
+            fitted = (weight * p * near.q).sum(-1, keepdim=True) / torch.where(total > 0, total, 1.0)
+            scale = torch.where(fitted > 0, fitted, scale)
+            square = _square(near, scale * p)
+    cost = torch.where(used, square / (COST_BEND**2 + square), 0.0)
+    return cost.sum(-1) / used.sum(-1).clamp_min(1)
+
+
+def _variance(near: _Parallax, p: Tensor) -> Tensor:
+    """Variance px² of a residual along the epipolar line: track and sensor."""
+    return near.noise**2 + near.variance_rel * (p * near.a) ** 2
+
+
+def _square(near: _Parallax, p: Tensor) -> Tensor:
+    """Squared residual in variances."""
+    return ((near.q - p) * near.a) ** 2 / _variance(near, p)
+
+
+def _unexplained_ratio(near: _Parallax) -> Tensor:
+    """Cost of the returned depths over that of one depth for all (B,)."""
+    one = torch.ones_like(near.p)
+    own = _profile_cost(near, near.p, near.used, None)
+    flat = _profile_cost(near, one, near.used, masked_median(near.q, near.used).clamp_min(1e-6))
+    return own / torch.where(flat > 0, flat, 1.0)
+
+
+def _attachment_gain(near: _Parallax, samples: Samples, camera_0: Camera) -> tuple[Tensor, Tensor]:
+    """Cost of the depths at other pixels over that of the depths at the own ones (B, K), and the shared returns."""
+    size = 2 * camera_0.c[:, None]
+    mean, filled = _cell_means(samples, size)
+    change = near.p.new_tensor([(1.0, 1.0, 0.0, 0.0), *ATTACHMENTS])
+    centre = camera_0.c[:, None, None]
+    at = centre + (near.uv[:, None] - centre) * change[:, None, :2] + change[:, None, 2:] * size[:, None]
+    cell, inside = _cells(at.flatten(1, 2), size)
+    p, has = (x.gather(1, cell).view(at.shape[:-1]) for x in (mean, filled))
+    has = has & inside.view(has.shape) & near.used[:, None]
+    used = has[:, 1:] & has[:, :1]
+    own, other = (torch.where(used, x, torch.ones_like(x)) for x in (p[:, :1].expand_as(used), p[:, 1:]))
+    own_sum, other_sum = (torch.where(used, x, 0.0).sum(-1, keepdim=True) for x in (own, other))
+    wide = _Parallax(*(x[:, None] for x in near))
+    own_cost = _profile_cost(wide, own, used, torch.ones_like(own_sum))
+    scale = torch.where(other_sum > 0, own_sum / torch.where(other_sum > 0, other_sum, 1.0), 1.0)
+    cost = _profile_cost(wide, other, used, scale)
+    n = used.sum(-1)
+    testable = (n >= MIN_TESTED_RETURNS) & (n >= MIN_SHARED_RATIO * near.used.sum(-1, keepdim=True))
+    testable = testable & (own_cost > MIN_OWN_COST)
+    return torch.where(testable, cost / torch.where(own_cost > 0, own_cost, 1.0), torch.inf), n
+
+
+def _cells(uv: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
+    """Index of the cell of each pixel (B, M, 2), and whether the pixel is inside the picture."""
+    place = uv / size
+    inside = ((place >= 0) & (place < 1)).all(-1)
+    across, down = DEPTH_CELLS
+    column, row = (place[..., i].nan_to_num().clamp(0, 1) for i in (0, 1))
+    cell = (column * across).long().clamp(0, across - 1) + across * (row * down).long().clamp(0, down - 1)
+    return cell, inside
+
+
+def _cell_means(samples: Samples, size: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean inverse depth of the returns in each cell (B, cells), and whether there is one."""
+    z = samples.xyz[..., 2]
+    usable = samples.usable & (z > 0)
+    cell, inside = _cells(samples.uv.to(z.dtype), size)
+    count = (usable & inside).to(z.dtype)
+    inverse = count / torch.where(usable, z, torch.ones_like(z))
+    empty = z.new_zeros(len(z), DEPTH_CELLS[0] * DEPTH_CELLS[1])
+    total, n = empty.scatter_add(1, cell, inverse), empty.scatter_add(1, cell, count)
+    return total / n.clamp_min(1), n > 0
