@@ -66,7 +66,11 @@ class CompletionTask:
     def files(self, i: int) -> list[Path]:
         """All files that a frame ``i`` can have."""
         extras = [self.folder / kind / f"{self.name(i)}{end}" for kind, ends in EXTRA_FILES.items() for end in ends]
-        return [*(self.layout.file(self.folder, kind, self.name(i)) for kind in self.layout.folders), *extras]
+        return [*self.map_files(i), *extras]
+
+    def map_files(self, i: int) -> list[Path]:
+        """Files of the maps of frame ``i``."""
+        return [self.layout.file(self.folder, kind, self.name(i)) for kind in self.layout.folders]
 
     def missing(self, i: int) -> bool:
         """Whether a file of frame ``i`` is missing."""
@@ -105,7 +109,7 @@ def build_shared_metadata(
             "calibration": calibration,
             "key": result_files.compute_result_key({**config, "files": _FORMAT_VERSION, **more}, digest, roots=roots),
             "config": result_files.make_portable(config),
-            "data": {"name": name, "digest": digest},
+            "data": {"name": name, "digest": digest, "notes": list(scene.recording.report)},
             "codes": {"source": names(Source), "gate": names(Gate)},
         }
     )
@@ -184,7 +188,7 @@ def _check_files(task: CompletionTask, folder: OutputFolder, more: Iterable[str]
     folder.check(task.folder / name for name in ("complete.json", *task.layout.side_files, *more))
     for i in task.frames:
         if task.name(i) not in task.done:
-            folder.check(task.files(i))
+            folder.check(task.map_files(i))
         folder.check(path for path in task.extras(i) if not (path.is_file() and folder.lists(path)))
 
 

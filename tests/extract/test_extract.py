@@ -190,7 +190,6 @@ def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command)
     before = seen(files("features"))
     assert 3 <= len(before) < 12
     assert all(parquet.read_table(Path("features") / name).num_rows == 1 for name in before)
-    (Path("features") / ".shard-00011.parquet.tmp").write_bytes(b"PAR1")  # as a killed writer leaves it
     code, out, err = command(*args)
     assert code == 0, err
     assert f"12 shards ({len(before)} left untouched), 12 rows" in out
@@ -199,7 +198,7 @@ def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command)
     assert FeatureTable("features", ["depth"]).place["frame_index"].tolist() == list(range(12)), (
         "none lost, none doubled"
     )
-    assert [p.name for p in Path("features").iterdir() if p.name.startswith(".")] == []
+    assert [p.name for p in (Path("features") / ".dhtorch").iterdir()] == ["manifest"]
     assert command(*[a.replace("out=features", "out=whole") for a in args])[0] == 0
     assert contents("whole") == contents("features"), "the same as without the kill"
 
@@ -327,7 +326,7 @@ def test_a_full_disk_is_one_line(robot, command, monkeypatch):
     monkeypatch.setattr(shards, "_MAX_GROUP_ROWS", 1)
     monkeypatch.setattr(shards, "arrow_table", full)
     code, _, err = command(*asked(robot))
-    assert code == 2 and "No space left" in err and not list(Path("features").iterdir()), err
+    assert code == 2 and "No space left" in err and not Path("features").exists(), err
 
 
 def test_shards_of_another_extraction_are_not_mixed(robot, command, tmp_path):

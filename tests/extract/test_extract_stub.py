@@ -52,8 +52,8 @@ def test_every_frame_is_a_row(made):
     assert done.code == 0 and features.place["episode_index"].tolist() == [0, 0, 0, 1, 1, 1]
     assert features.place["frame_index"].tolist() == [0, 1, 2] * 2
     assert [int(row["dhtorch.problem"]) for row in features] == [1, 0, 0] * 2, "no view goes across episodes"
-    assert [p.name for p in sorted(done.folder.iterdir())] == ["shard-00000.parquet", "shard-00001.parquet"]
-    size = sum(p.stat().st_size for p in done.folder.iterdir())
+    assert [p.name for p in sorted(done.folder.iterdir())] == [".dhtorch", "shard-00000.parquet", "shard-00001.parquet"]
+    size = sum(p.stat().st_size for p in done.folder.glob("*.parquet"))
     assert done.said == (
         f"{done.folder}: 2 shards, 6 rows, {size / 1e6:.1f} MB\nframes with a problem: 2 no second view\n"
     )
@@ -61,8 +61,8 @@ def test_every_frame_is_a_row(made):
 
 
 def test_what_a_killed_run_left_is_gone(made, tmp_path):
-    (tmp_path / "out").mkdir()
-    left = tmp_path / "out" / ".shard-00007.parquet.tmp"
+    left = tmp_path / "out" / ".dhtorch" / "unfinished" / "7.parquet"
+    left.parent.mkdir(parents=True)
     left.write_bytes(b"PAR1")
     assert made().code == 0 and not left.exists()
 
@@ -93,10 +93,9 @@ def test_the_same_question_is_answered_once(made):
     before = bytes_of(first.folder)
     torn = shards.shard_files(first.folder)[1]
     torn.write_bytes(torn.read_bytes()[:-100])
-    (first.folder / ".shard-00001.parquet.tmp").write_bytes(b"PAR1")
     again = made()
     assert "2 shards (1 left untouched), 6 rows" in again.said and again.shown == [("6 frames", 2)]
-    assert bytes_of(first.folder) == before and not list(first.folder.glob(".*"))
+    assert bytes_of(first.folder) == before and [p.name for p in (first.folder / ".dhtorch").iterdir()] == ["manifest"]
     third = made()
     assert "2 shards (2 left untouched), 6 rows" in third.said and "2 no second view" in third.said
     assert third.shown == [], "nothing is asked for"
