@@ -34,7 +34,7 @@ from dhtorch.data.plausibility import plausibility_findings
 from dhtorch.data.recording import Recording
 from dhtorch.data.stored_sizes import check_orientation
 from dhtorch.data.units import UNIT_METRES, DepthUnit, parse_unit
-from dhtorch.geometry.no_depth import clear_codes, clear_no_depth
+from dhtorch.geometry.no_depth import clear_no_depth
 from dhtorch.runtime.console import format_count
 
 _SUFFIXES = (".png", ".npy", ".npz", ".tif", ".tiff", ".pfm", ".exr")
@@ -112,7 +112,7 @@ class DepthMaps:
         array = _open_clip(file)[self.clip_index[i]] if self.clip_index else _READERS[file.suffix.lower()](file)
         _check_shape(file, array.shape, self.hw)
         stored = torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))[None]
-        return clear_no_depth(clear_codes(stored) * self.unit.metres)
+        return clear_no_depth(stored * self.unit.metres, self.unit.metres)
 
 
 def open_depth_maps(folder: str | Path, recording: Recording, unit: str | float | None = None) -> DepthMaps:

@@ -4,8 +4,8 @@
 - *Metres*: NaN, infinite, zero and negative values; 65535 codes of a millimetre, 65.535; 65504, the largest half float;
   and 65535 itself.
 - *Far constants*: the distance of the far plane, which simulators and networks write where the scene has no surface.
-  The map's largest value is one if all of these hold: it is at least 10 m; at least 1 % of the map's pixels have
-  exactly this value; other pixels are nearer; and it is a whole multiple of 10 m, or the values between half of it and
+  The largest of about 1,000 evenly spaced values is one if all of these hold: it is at least 10 m; at least 1 % of them
+  have exactly this value; others are nearer; and it is a whole multiple of 10 m, or the values between half of it and
   it are at most a twentieth as many. A wall seen from the front is nearer, or has floor, ceiling or side walls that
   reach up to it.
 
@@ -44,61 +44,57 @@ _FAR_GRID_M: Final = 10.0
 #: Most values between half a far constant and it, per value equal to it. Source: origin not recorded.
 _MAX_NEARBY_RATIO: Final = 0.05
 
-#: Values per map from which it is seen whether it can have a far constant. Source: derived, ten times the reciprocal
-#: of the least share.
+#: Evenly spaced values of a map by which its far constant is found. Source: derived, ten times the reciprocal of the
+#: least share.
 _N_FAR_PROBES: Final = 1024
 
 
-def clear_no_depth(depth: Tensor) -> Tensor:
-    """Depth maps (…, h, w) in m -> the same with 0 where a value stands for no return. Gradient: to the values kept."""
+def clear_no_depth(depth: Tensor, unit: float = 1.0) -> Tensor:
+    """Depth maps (…, h, w) in m, stored in steps of ``unit`` m -> the same with 0 where a value stands for no return.
+
+    Gradient: to the values kept.
+    """
     depth = torch.where((depth > 0) & (depth < torch.inf), depth, 0.0)
-    return clear_far_constant(clear_saturated(depth))
+    return clear_far_constant(clear_saturated(depth, unit))
 
 
-def clear_codes(stored: Tensor) -> Tensor:
-    """Stored numbers (…) of any unit and type -> the same with 0 where one is a code of *no return*."""
-    for code in NO_DEPTH_CODES[1:]:
-        stored = stored if _is_below(stored, code) else stored.masked_fill(stored == code, 0)
-    return stored
-
-
-def clear_saturated(depth: Tensor) -> Tensor:
-    """Depth (…) in m, finite and not negative -> the same with 0 where a value is a saturated code."""
-    for value in _NO_DEPTH_METRES:
+def clear_saturated(depth: Tensor, unit: float = 1.0) -> Tensor:
+    """Depth (…) in m, finite and not negative, stored in steps of ``unit`` m -> the same with 0 where it is a saturated
+    code."""
+    for value in sorted((*_NO_DEPTH_METRES, NO_DEPTH_CODES[-1] * unit)):
         if _is_below(depth, value * (1 - _FLOAT32_ROUNDING)):
             return depth
         depth = depth.masked_fill((depth - value).abs() <= value * _FLOAT32_ROUNDING, 0.0)
     return depth
 
 
-def _is_below(x: Tensor, limit: float) -> bool:
-    """Whether all values are seen to be below a limit; reading them once is cheaper than changing them."""
-    return x.numel() == 0 or (_is_readable(x) and float(x.detach().amax()) < limit)
-
-
 def clear_far_constant(depth: Tensor) -> Tensor:
-    """Depth maps (…, h, w) in m, 0 = none -> the same with 0 where the value is a map's far constant, if it has one.
-
-    Few values of each map are read where these show that no map has a far constant.
-    """
-    probes = depth.detach().flatten(-2)[..., :: max(1, depth.shape[-2] * depth.shape[-1] // _N_FAR_PROBES)]
-    if _is_below(probes, _MIN_FAR_M):
+    """Depth maps (…, h, w) in m, 0 = none -> the same with 0 where the value is a map's far constant, if it has one."""
+    probes = depth.flatten(-2)[..., :: max(1, depth.shape[-2] * depth.shape[-1] // _N_FAR_PROBES)]
+    if _is_below(probes, _MIN_FAR_M * (1 - _FLOAT32_ROUNDING)):
         return depth
-    far = _find_far_constant(depth.detach())
+    far = _find_far_constant(probes.detach())
+    if _is_readable(far) and not bool((far > 0).any()):
+        return depth
     return depth.masked_fill(depth.detach() == far[..., None, None], 0.0)
 
 
-def _find_far_constant(depth: Tensor) -> Tensor:
-    """Maps (…, h, w) -> far constant (…) of each, NaN where it has none."""
-    values = depth.flatten(-2)
-    far = values.amax(-1)
-    n_far, n_returns = (values == far[..., None]).sum(-1), (values > 0).sum(-1)
-    n_nearby = (values > far[..., None] / 2).sum(-1) - n_far
+def _find_far_constant(probes: Tensor) -> Tensor:
+    """Probed values (…, k) of maps -> far constant (…) of each, NaN where it has none."""
+    far = probes.amax(-1)
+    n_far = (probes == far[..., None]).sum(-1)
+    n_returns = (probes > 0).sum(-1)
+    n_nearby = (probes > far[..., None] / 2).sum(-1) - n_far
     remainder = (far / _FAR_GRID_M - (far / _FAR_GRID_M).round()).abs() * _FAR_GRID_M
     on_grid = remainder <= far * _FLOAT32_ROUNDING
-    is_far = (far >= _MIN_FAR_M * (1 - _FLOAT32_ROUNDING)) & (n_far >= _MIN_FAR_SHARE * values.shape[-1])
+    is_far = (far >= _MIN_FAR_M * (1 - _FLOAT32_ROUNDING)) & (n_far >= _MIN_FAR_SHARE * probes.shape[-1])
     is_far = is_far & (n_returns > n_far) & (on_grid | (n_nearby <= _MAX_NEARBY_RATIO * n_far))
     return torch.where(is_far, far, torch.nan)
+
+
+def _is_below(x: Tensor, limit: float) -> bool:
+    """Whether all values are seen to be below a limit; reading them once is cheaper than changing them."""
+    return x.numel() == 0 or (_is_readable(x) and float(x.detach().amax()) < limit)
 
 
 def _is_readable(x: Tensor) -> bool:

@@ -20,8 +20,8 @@ from torch import Tensor
 from dhtorch.data.stored_sizes import describe_mismatch
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import pose_conventions as conventions
-from dhtorch.geometry.checks import all_known, any_possible, is_transformed
-from dhtorch.geometry.no_depth import clear_codes, clear_far_constant, clear_saturated
+from dhtorch.geometry.checks import all_known, is_transformed
+from dhtorch.geometry.no_depth import clear_far_constant, clear_saturated
 from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import stack
 from dhtorch.records import Camera, Frame, PosePrior
@@ -282,11 +282,18 @@ class SampleSpec:
     def _scaled(self, x: Tensor) -> Tensor:
         """Depths in the data set's unit -> metres, 0 for those that mean no return."""
         if not x.is_floating_point():
-            return _to_metres(clear_codes(x.float()), x.dtype.is_signed, self.depth_unit)
-        x = clear_codes(x.nan_to_num(0.0, 0.0, 0.0).relu())
+            return clear_saturated(_to_metres(x.float(), x.dtype.is_signed, self.depth_unit), self._unit_m)
+        x = x.nan_to_num(0.0, 0.0, 0.0).relu()
         if not isinstance(self.depth_unit, str):
-            return clear_saturated(x * float(self.depth_unit))
-        return clear_saturated(x if self.depth_unit == "m" else x / SAMPLE_UNITS_PER_METRE[self.depth_unit])
+            x = x * float(self.depth_unit)
+        elif self.depth_unit != "m":
+            x = x / SAMPLE_UNITS_PER_METRE[self.depth_unit]
+        return clear_saturated(x, self._unit_m)
+
+    @property
+    def _unit_m(self) -> float:
+        unit = self.depth_unit
+        return 1 / SAMPLE_UNITS_PER_METRE[unit] if isinstance(unit, str) else unit
 
     def _check_depth(self, depth: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor, str]]]:
         """Maps (B, h, w) -> whether each has a return (B,), and the checks of the unit."""
@@ -396,13 +403,12 @@ def _write_metres_kernel(into: Tensor, words: Tensor, *, signed: bool, unit: str
 @operator(kernel=_write_metres_kernel, dtypes={"into": torch.float32, "words": torch.int16}, when=_has_integer_unit)
 def _write_metres(into: Tensor, words: Tensor, *, signed: bool, unit: str | float) -> None:
     """Fill ``into`` (…) with metres, 0 = no return, from the 16-bit integers ``words`` (…), signed or unsigned."""
-    if signed:
-        _to_metres(into.copy_(words), signed, unit)
-    else:
-        saturated = words == -1  # the bits of the code 65535
-        _to_metres(into.copy_(words.view(torch.uint16)), signed, unit)
-        if any_possible(saturated):
-            into.masked_fill_(saturated, 0.0)
+    _to_metres(into.copy_(words if signed else words.view(torch.uint16)), signed, unit)
+    if not signed:
+        unit_m = 1 / SAMPLE_UNITS_PER_METRE[unit] if isinstance(unit, str) else unit
+        cleared = clear_saturated(into, unit_m)
+        if cleared is not into:
+            into.copy_(cleared)
 
 
 def _to_metres(x: Tensor, signed: bool, unit: str | float) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import State
-from dhtorch.geometry.no_depth import clear_codes, clear_no_depth
+from dhtorch.geometry.no_depth import clear_no_depth
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import get_method
 from dhtorch.pytree import stack
@@ -112,8 +112,7 @@ class ValidateDepth(torch.nn.Module):
         leaves.like = reference.image
         planes = leaves.planes(self.map, 1).to(reference.camera.f)
         check_sample_orientation(self.map, planes, reference.hw)
-        codes = clear_codes(planes[:, 0])
-        return clear_no_depth(codes * self.map_unit)
+        return clear_no_depth(planes[:, 0] * self.map_unit, self.map_unit)
 
 
 def _validation_keys(validation: DepthValidation) -> dict[str, Tensor]:
