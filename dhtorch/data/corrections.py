@@ -1,7 +1,7 @@
 """Corrections of what a reader assumes, as options of every format: unit, lag and turn of depth, pose convention.
 
 Files may mean something else than their layout suggests, which a capture check detects; each correction is the option
-that its warning names.
+that its warning names. Orientation and rate of every recording are checked here too, since all of them pass.
 """
 
 from __future__ import annotations
@@ -9,11 +9,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
+
+from dhtorch.data.clocks import describe_rate
 from dhtorch.data.orientation import DEPTH_TURNS, orient_recording
 from dhtorch.data.pose_convention import parse_pose_convention
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit, parse_unit
 from dhtorch.records import Frame
+
+#: Relative difference up to which a recording's rate is that of its own stamps. Source: derived: rounding.
+_MEASURED_RATE_REL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -65,7 +71,18 @@ class Corrections:
         if self.pose_convention is not None and recording.poses is not None:
             convention = parse_pose_convention(self.pose_convention)
             recording = replace(recording, poses=convention.apply(recording.poses))
+        return _report_rate(recording)
+
+
+def _report_rate(recording: Recording) -> Recording:
+    """The recording with a remark where its time stamps have no plausible rate, which no option corrects."""
+    if recording.times is None or len(recording) < 2:
         return recording
+    times, nominal = recording.times.numpy(), recording.rate_hz
+    if nominal is not None and abs(nominal * float(np.median(np.diff(times))) - 1) < _MEASURED_RATE_REL:
+        nominal = None  # a rate that was measured by the same stamps
+    remark = describe_rate(times, nominal)
+    return recording if remark is None else replace(recording, report=(*recording.report, remark))
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,8 @@ def decode_image_header(data: bytes, file: Path) -> ImageHeader:
 def _check_header(file: Path, data: bytes, hw: tuple[int, int] | None) -> ImageHeader:
     header = _parse_header(file, data)
     if hw is not None and header.hw != tuple(hw):
-        raise FormatError(file, "size", _format_size(header.hw), _format_size(hw))
+        turned = ", another orientation" if header.hw == (hw[1], hw[0]) else ""
+        raise FormatError(file, "size", f"{_format_size(header.hw)}{turned}", _format_size(hw))
     is_whole = _is_whole_png(data) if header.kind == "png" else data.rfind(b"\xff\xd9") > data.rfind(b"\xff\xda")
     if not is_whole:
         raise FormatError(

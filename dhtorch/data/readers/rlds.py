@@ -27,6 +27,7 @@ from dhtorch.data.codecs import tfrecord
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings, consecutive_frame_numbers
+from dhtorch.data.stored_sizes import StoredSizes
 from dhtorch.data.units import DepthUnit
 from dhtorch.records import Camera, Frame, Pose
 
@@ -360,7 +361,13 @@ class _CameraSpec:
             episode=episode.place,
             camera_name=self.image,
             depth_unit=_ASSUMED_DEPTH_UNITS.get(self.features[self.depth].kind) if self.depth else None,
+            stored=StoredSizes(self.hw, self._registered_depth_hw()),
         )
+
+    def _registered_depth_hw(self) -> tuple[int, int] | None:
+        """Size of depth over the picture's field, if the features state it; None for depth with its own K."""
+        h, w = (*(self.features[self.depth].shape if self.depth else ()), -1, -1)[:2]
+        return None if self.K_depth is not None or min(h, w) < 1 else (h, w)
 
     def _pictures(
         self, file: Path, example: dict[str, tfrecord.ExampleFeature], key: str

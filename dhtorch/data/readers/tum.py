@@ -156,6 +156,7 @@ def read(
     if is_numbered and not source.is_icl:
         report.append("images are numbered, not stamped: no times")
     has_times = not is_numbered or source.is_icl
+    load, stored = image_table.read_stored_sizes(load)
     return [
         Recording(
             name=root.resolve().name,
@@ -168,6 +169,7 @@ def read(
             rate_hz=_RATE_HZ if has_times else None,
             report=(*report, *source.report),
             depth_unit=unit,
+            stored=stored,
         )
     ]
 

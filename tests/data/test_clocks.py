@@ -1,0 +1,118 @@
+"""Films beside rows of tables: pairing by stamps and places, and rates that are not plausible."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dhtorch import data
+from dhtorch.data import corrections
+from dhtorch.data.clocks import describe_rate, format_numbers, pair_film
+from dhtorch.synthetic import SyntheticRoom
+
+ROWS = np.arange(12) / 30
+LOST = [4, 5, 6]
+GAP = [0, 1, 2, 3, -1, -1, -1, 4, 5, 6, 7, 8]
+
+
+def paired(pictures: Sequence[float] | np.ndarray, rows: Sequence[float] | np.ndarray = ROWS) -> list[list[int]]:
+    return [pairing.picture.tolist() for pairing in pair_film(np.array(pictures), np.array(rows))]
+
+
+@pytest.mark.parametrize("rate", [30.0, 60.0, 24.0, 0.03])
+@pytest.mark.parametrize("start", [0.0, 86400.5])
+def test_gaps_of_a_film_show_which_rows_have_no_picture(rate: float, start: float) -> None:
+    assert paired(np.delete(np.arange(12) / rate, LOST), ROWS + start) == [GAP]
+
+
+def test_a_film_of_a_fraction_or_a_multiple_of_the_rate_is_paired_by_its_length() -> None:
+    assert paired(ROWS[::2]) == [[0, -1, 1, -1, 2, -1, 3, -1, 4, -1, 5, -1]]
+    assert paired(ROWS[::3]) == [[0, -1, -1, 1, -1, -1, 2, -1, -1, 3, -1, -1]]
+    assert paired(np.arange(24) / 60) == [list(range(0, 24, 2))]
+
+
+def test_a_short_film_of_constant_rate_may_start_at_any_row() -> None:
+    candidates = paired(ROWS[:9])
+    assert candidates[0] == [*range(9), -1, -1, -1] and candidates[-1] == [-1, -1, -1, *range(9)]
+    assert len(paired(ROWS[:6])) == 7  # a nominal rate and the first half, or the whole at half the rate: not known
+
+
+def test_a_gap_and_a_lost_end_fit_twice() -> None:
+    assert len(paired(np.delete(ROWS, [4, 5, 11]))) == 2
+
+
+@pytest.mark.parametrize(
+    "pictures",
+    [
+        ROWS,
+        np.arange(12) / 60,
+        ROWS + 0.01 * np.sin(np.arange(12)),
+        np.sort(np.random.default_rng(0).uniform(0, 0.4, 12)),
+        np.zeros(12),
+        np.full(12, np.nan),
+    ],
+)
+def test_as_many_pictures_as_rows_are_paired_by_their_places(pictures: np.ndarray) -> None:
+    assert paired(pictures) == [list(range(12))]
+
+
+def test_as_many_pictures_as_rows_with_gaps_elsewhere_are_paired_by_stamps() -> None:
+    assert paired(np.delete(ROWS, [8, 9]), np.delete(ROWS, [3, 4])) == [[0, 1, 2, 5, 6, 7, -1, -1, 8, 9]]
+
+
+def test_a_pause_of_the_table_does_not_shift_a_film_that_counts_on() -> None:
+    rows = [0, 1 / 15, 2 / 15, 1.2, 1.2 + 1 / 15, 1.2 + 2 / 15]
+    assert paired(np.arange(6) / 60, rows) == [list(range(6))]
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.001])
+@pytest.mark.parametrize("drift", [1.0, 1.001])
+def test_clocks_may_drift_and_jitter(jitter: float, drift: float) -> None:
+    rows = np.arange(2000) / 60
+    kept = np.delete(np.arange(2000), [500, 501, 1400])
+    film = drift * rows[kept] + np.random.default_rng(1).uniform(-jitter, jitter, len(kept))
+    (pairing,) = paired(film, rows)
+    found = np.array(pairing)
+    assert (found[kept] == np.arange(len(kept))).mean() > 0.99
+    assert (found[[500, 501, 1400]] == -1).all()
+
+
+def test_without_stamps_the_first_or_the_last_pictures_are_lost() -> None:
+    assert paired([0, 0, 0], [0, 0, 0, 0, 0]) == [[0, 1, 2, -1, -1], [-1, -1, 0, 1, 2]]
+
+
+@pytest.mark.parametrize(
+    ("step", "nominal", "remark"),
+    [
+        (1 / 30, None, None),
+        (1 / 30, 60.0, None),
+        (1 / 3, 30.0, None),  # one frame of ten
+        (33.3, None, "milliseconds"),
+        (33.3e3, 30.0, "microseconds"),
+        (33.3e6, None, "nanoseconds"),
+        (1 / 5230, None, "5,230 Hz"),
+        (1 / 240, 30.0, "240 Hz, 30 Hz nominal"),
+    ],
+)
+def test_rates_that_are_not_plausible(step: float, nominal: float | None, remark: str | None) -> None:
+    described = describe_rate(np.arange(20) * step, nominal)
+    assert (described is None) if remark is None else (described is not None and remark in described)
+
+
+def test_every_recording_reports_its_rate() -> None:
+    room = SyntheticRoom(n_frames=4, hw=(24, 32))
+    sound = data.Recording("room", "none", room.load, room.number, times=room.times, rate_hz=room.rate_hz)
+    assert corrections.Corrections().apply(sound).report == ()
+    wrong = corrections.Corrections().apply(replace(sound, times=1000 * torch.arange(4).double() / 30, rate_hz=None))
+    assert wrong.report[-1] == "time stamps are likely in milliseconds: frames follow at 0.03 Hz"
+
+
+def test_numbers_as_text() -> None:
+    assert format_numbers([0], "row") == "row 0"
+    assert format_numbers([4, 5, 6], "row") == "rows 4, 5, 6"
+    assert format_numbers([1, 3, 4, 5, 6, 9], "row") == "rows 1, 3 to 6, 9"
+    assert format_numbers(range(1, 21, 2), "row") == "rows 1, 3, 5, 7, 9, 11 and 4 more"
