@@ -222,8 +222,7 @@ def run_row(frames: Frames, layout: str, fault: PlantedFault, root: Path) -> dic
             right = is_right(recording, frames, len(frames) - len(spoilt)) if fault.causes else None
         lines = [*check.lines, *(str(w.message) for w in caught if issubclass(w.category, UserWarning))]
         causes = [finding.cause for finding in check.findings]
-        unit = [line for line in check.notes if line.startswith("depth unit assumed")]
-        lines = [line for line in lines if line not in unit]
+        lines = [line for line in lines if line != check.assumed_unit]
     except (data.FormatError, ValueError) as error:
         return {"outcome": "refused", "causes": [], "lines": [str(error)[:300]]}
     words = [cause for cause in fault.causes if cause in WORDS and re.search(WORDS[cause], " ".join(lines))]

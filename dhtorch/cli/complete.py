@@ -212,8 +212,18 @@ def _compute_map(task: CompletionTask, i: int) -> tuple[Frame, DepthMap, Row]:
     with torch.no_grad():
         completed_map = dense.complete_depth(reference, source_views, **options, trace=trace)
     choice = report_selection(i, offered, trace)
-    number = task.recording.number
-    return reference, completed_map.to("cpu"), {"views": [int(number[k]) for k in choice.views], **choice.row()["why"]}
+    views = [int(task.recording.number[k]) for k in choice.views]
+    row: Row = {"views": views, **choice.row()["why"]}
+    if task.recording.poses is None:
+        row["motions"] = _solved_motions(views, trace)
+    return reference, completed_map.to("cpu"), row
+
+
+def _solved_motions(views: Sequence[int], trace: Trace) -> Row:
+    """Frame number of a source view → its solved pose relative to the reference view, a matrix (4, 4)."""
+    fits = [each["fit"] for each in trace.get("views", ())] or [trace["fit"]]
+    solved = [(number, fit) for number, fit in zip(views, fits, strict=False) if bool(fit.ok[0])]
+    return {str(number): se3.to_matrix(fit.T_1_from_0.to("cpu"))[0] for number, fit in solved}
 
 
 def _load_frame(task: CompletionTask, i: int) -> Frame:

@@ -174,6 +174,7 @@ def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJo
     origin = None if _OUTPUT_FORMATS[format] is None else _open_origin(settings, inputs)
     wanted = map_columns(pictures=origin is None, n=method.n)
     shared = _build_metadata(settings, whole, wanted)
+    shared["data"]["notes"] = list(dict.fromkeys(line for scene in first for line in scene.recording.report))
     rows = MapRowDataset(
         scenes,
         whole,

@@ -12,7 +12,7 @@ import inspect
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from itertools import islice
@@ -33,7 +33,10 @@ from dhtorch.data.recording import Recording
 from dhtorch.data.survey import Survey, survey_pictures, survey_recording
 from dhtorch.experiments.focal import formats
 from dhtorch.experiments.focal.survey import survey_stacks
+from dhtorch.runtime import storage
 from dhtorch.runtime.console import HELP_EPILOG, escape_markup, format_count, progress, unwrap_terminal
+from dhtorch.runtime.output_folder import open_output_folder
+from dhtorch.validation.capture_check import check_capture
 from dhtorch.viz.plots.colours import DEPTH_CMAP, GREY_CMAP, INK, SCORE_CMAP, SERIES_COLOURS, UNANSWERED
 
 _MAX_LEVELS = 2  # levels of folders searched below the path
@@ -94,19 +97,25 @@ def main(argv: Sequence[str]) -> int:
     reader_options = _parse_reader_options(options.options)
     captures = [replace(capture, follow_links=options.follow_links, options=reader_options) for capture in captures]
     now = datetime.now()
-    out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S}"
+    out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S-%f}"
+    with open_output_folder(out, "--out"):
+        _survey_captures(captures, options.path, options.frames, out)
+    return 0
+
+
+def _survey_captures(captures: Iterable[FoundCapture], root: Path, n_frames: int, out: Path) -> None:
+    """Print the content of captures and write their contact sheets into ``out``."""
     sheets: list[Path] = []
     try:
         for capture in captures:
-            for survey in survey_capture(capture, options.frames):
-                survey.name = _full_name(options.path, capture.path, survey.name)
+            for survey in survey_capture(capture, n_frames):
+                survey.name = _full_name(root, capture.path, survey.name)
                 print_survey(capture, survey)
                 sheets.append(write_contact_sheet(survey, out))
                 print(f"wrote {sheets[-1]}\n")
     except KeyboardInterrupt:
         stay = f"{format_count(len(sheets), 'contact sheet')} in {out} kept; " if sheets else ""
         raise KeyboardInterrupt(f"{stay}run the same command again for the rest") from None
-    return 0
 
 
 def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
@@ -242,7 +251,21 @@ def _survey_recordings(capture: FoundCapture, frames: int) -> Iterator[Survey]:
             survey.facts = [(what, text) for what, text in survey.facts if what != "intrinsics"]
             survey.warnings = [line for line in survey.warnings if intrinsics_options.find_guess_report([line]) is None]
         survey.warnings.extend(warning)
+        add_check(survey, recording)
         yield survey
+
+
+def add_check(survey: Survey, recording: Recording) -> None:
+    """Add what the check of the capture shows to its survey: unit, agreement of poses and depth, findings."""
+    check = check_capture(recording)
+    unit = check.assumed_unit or (str(recording.depth_unit) if recording.depth_unit is not None else "")
+    if unit:
+        survey.add_fact("unit", unit)
+    if check.poses is not None:
+        surfaces = check.poses.surfaces
+        agreement = f"agree to {100 * surfaces.stated:.2f} % from frame to frame"
+        survey.add_fact("depth and poses", f"{agreement} ({100 * surfaces.without:.2f} % without poses)")
+    survey.warnings.extend(str(finding) for finding in check.findings)
 
 
 def _open_recordings(capture: FoundCapture, warning: list[str]) -> Sequence[Recording]:
@@ -355,9 +378,9 @@ def write_contact_sheet(survey: Survey, out: Path) -> Path:
     _draw_tiles(parts[0], rows, survey)
     for k, draw in enumerate(plots):
         draw(parts[1].add_subplot(1, len(plots), k + 1), survey)
-    out.mkdir(parents=True, exist_ok=True)
     file = out / f"{re.sub(r'[^A-Za-z0-9._-]+', '_', survey.name) or 'capture'}.png"
-    figure.savefig(file)
+    with storage.replace_at_end(file) as unfinished:
+        figure.savefig(unfinished, format="png")
     return file
 
 

@@ -77,7 +77,7 @@ _OPTION_RULES: dict[str, _OptionRule] = {
     "cutoff": _or_null(_above_zero()),
     "holdout.cutoff": _or_null(_above_zero()),
     "holdout.truth": _one_of("raw", "5x5", "full"),
-    "poses": _one_of("device", "anchored"),
+    "poses": _one_of("auto", "device", "anchored"),
     "voxel": _or_null(_above_zero()),
     "truncation": _or_null(_above_zero()),
     **dict.fromkeys(("sensor_sigma_m", "sensor_sigma_rel", "min_weight"), _at_least_zero()),

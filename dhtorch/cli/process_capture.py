@@ -20,6 +20,7 @@ import torch
 from dhtorch import export
 from dhtorch.cli import complete, recover_page
 from dhtorch.cli import completed_folder as completed
+from dhtorch.cli.capture_checks import print_check
 from dhtorch.cli.complete import Progress
 from dhtorch.cli.completed_folder import CompletionTask
 from dhtorch.cli.inspect import FoundCapture, classify_images, find_captures
@@ -28,12 +29,16 @@ from dhtorch.data import FORMATS, FormatError, open_all
 from dhtorch.data.io import decode as files
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
+from dhtorch.geometry import se3
 from dhtorch.integrate.from_maps import FrameMap, fuse_frame_maps
 from dhtorch.integrate.mapping import choose_voxel, should_mesh, write_surface
+from dhtorch.integrate.recording import chain_poses
 from dhtorch.pipeline.method import Method
+from dhtorch.records import Pose
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 from dhtorch.runtime.output_folder import open_output_folder
+from dhtorch.validation.capture_check import CaptureCheck, check_capture
 from dhtorch.viz.viewer import html, points
 from dhtorch.viz.viewer.exhibit import PageOpening
 
@@ -272,8 +277,11 @@ def _process_recording(
     reader_options |= {name: value for name, value in settings["data"].items() if value is not None}
     complete_settings = {**_COMPLETE_DEFAULTS, **settings, "out": str(folder), "data": reader_options}
     complete_settings["choices"] = {**settings["choices"], "data": recording.format}
-    scene = Scene.of(recording)
     usable = _find_usable_frame(recording)
+    check = check_capture(recording)
+    print_check(recording.name, check)
+    recording = replace(check.recording, report=tuple(check.lines))
+    scene = Scene.of(recording)
     task = complete.make_completion_task(
         scene,
         folder,
@@ -285,11 +293,11 @@ def _process_recording(
     order = [i for i in coarse_to_fine(len(recording)) if i in task.offers]
     task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
     with completed.open_task_folder(task, _FURTHER_FILES):
-        return _recover_task(task, until, settings, progress)
+        return _recover_task(task, check, until, settings, progress)
 
 
 def _recover_task(
-    task: CompletionTask, until: float | None, settings: Mapping[str, Any], progress: Progress
+    task: CompletionTask, check: CaptureCheck, until: float | None, settings: Mapping[str, Any], progress: Progress
 ) -> list[str]:
     """Complete the frames of a task and write the map and the page -> the printed lines."""
     recording, folder = task.recording, task.folder
@@ -300,11 +308,16 @@ def _recover_task(
     rows = [task.done[task.name(i)] for i in recovered.frames]
     best = max(zip(rows, recovered.frames, strict=True), key=lambda each: each[0]["pixels"].get("swept", 0))[1]
     stats = recover_page.measure_recovery(task, recovered.frames)
-    lines = recover_page.describe_recovery(task, stats, recording[recovered.frames[0]].hw)
+    placed = _place_frames(recovered)
+    lines = recover_page.describe_recovery(task, stats, recording[recovered.frames[0]].hw, check)
+    lines += recover_page.describe_placing(check, recording, placed)
     opening = recover_page.build_opening(
-        lines, stats, _write_overview(task, best), completed.format_frame_title(task, best)
+        [*recover_page.describe_check(check), *lines],
+        stats,
+        _write_overview(task, best),
+        completed.format_frame_title(task, best),
     )
-    written = ["depth/", "overview.png", *_write_map(recovered, opening, settings, progress)]
+    written = ["depth/", "overview.png", *_write_map(recovered, placed, opening, settings, progress)]
     return [*lines, _format_next_step(recovered, written[-1]), f"Wrote {', '.join(written)} in {folder}."]
 
 
@@ -365,8 +378,32 @@ def _write_overview(task: CompletionTask, i: int) -> bytes:
     return picture
 
 
+def _place_frames(recovered: RecoveredFrames) -> Recording:
+    """The recording with poses that join its frames: its own, else the motions that near returns gave, chained.
+
+    Frames that no motion links to the first completed one have no finite pose.
+    """
+    task = recovered.task
+    if task.recording.poses is not None:
+        return task.recording
+    position = {int(number): i for i, number in enumerate(task.recording.number)}
+    links: dict[int, list[tuple[int, Pose]]] = {i: [] for i in range(len(task.recording))}
+    for i in recovered.frames:
+        for number, matrix in task.done[task.name(i)].get("motions", {}).items():
+            T_view_from_frame = se3.from_matrix(torch.tensor(matrix, dtype=torch.float64)[None])
+            links[i].append((position[int(number)], se3.invert(T_view_from_frame)))
+            links[position[int(number)]].append((i, T_view_from_frame))
+    first = recovered.frames[0]
+    placed = chain_poses(first, se3.identity(1, torch.zeros((), dtype=torch.float64)), links)
+    n = len(task.recording)
+    R, t = torch.full((n, 3, 3), torch.nan, dtype=torch.float64), torch.full((n, 3), torch.nan, dtype=torch.float64)
+    for k, pose in placed.items():
+        R[k], t[k] = pose.R[0], pose.t[0]
+    return replace(task.recording, poses=Pose(R, t))
+
+
 def _write_map(
-    recovered: RecoveredFrames, opening: PageOpening, settings: Mapping[str, Any], progress: Progress
+    recovered: RecoveredFrames, placed: Recording, opening: PageOpening, settings: Mapping[str, Any], progress: Progress
 ) -> list[str]:
     """Write the fused map (PLY, GLB) and the viewer page; returns the file names."""
     task = recovered.task
@@ -379,7 +416,7 @@ def _write_map(
 
     frames = recovered.frames[:_MAX_MAPPED_FRAMES]
     surface, up = fuse_frame_maps(
-        task.recording, frames, read, voxel=voxel, meshed=should_mesh(settings["mesh"]), progress=progress
+        placed, frames, read, voxel=voxel, meshed=should_mesh(settings["mesh"]), progress=progress
     )
     if not len(surface.xyz):
         return []

@@ -12,7 +12,9 @@ from dhtorch.cli import gate_messages as reasons
 from dhtorch.cli.completed_folder import CompletionTask, Row
 from dhtorch.codes import Source
 from dhtorch.data import intrinsics as intrinsics_options
+from dhtorch.data.recording import Recording
 from dhtorch.runtime.console import format_count
+from dhtorch.validation.capture_check import CaptureCheck
 from dhtorch.viz.viewer.exhibit import PageOpening
 
 #: Maximum number of frames read for depth range and stated error; further frames show the same surfaces.
@@ -80,17 +82,35 @@ def _average_no_answer_shares(rows: Sequence[Row]) -> dict[str, float]:
     return shares
 
 
-def describe_recovery(task: CompletionTask, stats: RecoveryStats, hw: tuple[int, int]) -> list[str]:
-    """Printed sentences: the capture (images (h, w)), and what was recovered."""
+def describe_recovery(
+    task: CompletionTask, stats: RecoveryStats, hw: tuple[int, int], check: CaptureCheck
+) -> list[str]:
+    """Printed sentences: the capture (images (h, w)), and what was recovered; where nothing was, what its check shows."""
     recording, (h, w) = task.recording, hw
     kind = f"{task.scene.name}: a {recording.format} capture, {format_count(len(recording), 'frame')} of {w}x{h}"
     guess = intrinsics_options.find_guess_report(recording.report)
     sensor = f"{kind}; the sensor has depth at {stats.sensor:.0%} of the pixels{f'; its {guess}' if guess else ''}."
     if stats.error is None:
-        return [sensor, f"Nothing was recovered: {_explain_silence(stats)}."]
+        reason = str(check.findings[0]) if check.findings else _explain_silence(stats)
+        return [sensor, f"Nothing was recovered: {reason}."]
     amount = f"Recovered {stats.pixels:,.0f} pixels per frame without sensor depth, from {stats.near:.1f} m to"
     frames = f"({format_count(stats.frames, 'frame')})"
     return [sensor, f"{amount} {stats.far:.1f} m, median sigma {stats.error:.1%} of the depth {frames}."]
+
+
+def describe_check(check: CaptureCheck) -> list[str]:
+    """Sentences of the page on what was assumed and on the findings."""
+    assumed = [f"{check.assumed_unit[:1].upper()}{check.assumed_unit[1:]}."] if check.assumed_unit else []
+    return [*assumed, *(f"Warning: {finding}." for finding in check.findings)]
+
+
+def describe_placing(check: CaptureCheck, recording: Recording, placed: Recording) -> list[str]:
+    """Sentence on how the map is joined where the capture's poses are not used; none where they are."""
+    if recording.poses is not None or placed.poses is None:
+        return []
+    n = int(placed.poses.t.isfinite().all(-1).sum())
+    why = "the stated poses are refuted" if check.poses_refuted else "the capture has no poses"
+    return [f"The map is joined by the motion that near returns give ({format_count(n, 'frame')}): {why}."]
 
 
 def build_opening(sentences: Sequence[str], stats: RecoveryStats, picture: bytes, place: str) -> PageOpening:

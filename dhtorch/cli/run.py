@@ -213,6 +213,10 @@ def _run_configured(word: str, argv: list[str]) -> int:
     _LOG.debug("%s: %s", word, ", ".join(f"{k}={v}" for k, v in groups.items()))
     disable_malloc_trim()
     try:
+        if "data" in parts:
+            from dhtorch.cli.capture_checks import check_data  # noqa: PLC0415
+
+            parts["data"] = check_data(parts["data"])
         with console.mute_if_quiet():
             return int(module.run({**settings, "choices": groups}, parts, progress=console.progress) or EXIT_DONE)
     except errors.USER_ERRORS as error:

@@ -126,6 +126,7 @@ def _validate_scenes(
         exceeded = list_exceeded_limits(summary, limits)
         content = {"scene": scene.name, "source": "sensor" if maps is None else "maps", "fail_on": settings["fail_on"]}
         content |= {} if maps is None else {"maps": maps.report}
+        content |= {"notes": list(scene.recording.report)}
         content |= {"intrinsics_guessed": intrinsics_options.find_guess_report(scene.recording.report)}
         content |= {"exceeded": exceeded, "whole": summary, "windows": validation.windows, "frames": validation.rows}
         written += [
@@ -415,8 +416,8 @@ def _write_page(place: Path, validated: RecordingValidation, whole: Row, exceede
         cells.append("–" if row["clip_depth"] is None else f"{row['clip_depth']:.3g}")
         frames.append(pages.ValidatedFrame(f"frame {row['frame']}", cells, validated.pictures.get(row["frame"])))
     failed = [f"Exceeded: {limit_line}" for limit_line in exceeded]
-    guess = intrinsics_options.find_guess_report(validated.scene.recording.report)
-    lines = _format_summary(validated.scene.name, whole, validated.notes) + ([f"Its {guess}."] if guess else [])
+    notes = [f"{line[:1].upper()}{line[1:]}." for line in validated.scene.recording.report]
+    lines = _format_summary(validated.scene.name, whole, validated.notes) + notes
     return pages.write_validation_page(
         place / "validate.html",
         validated.scene.name,

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
-from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import patches, se3
 from dhtorch.records import Camera, Frame, Pose
 from dhtorch.runtime.console import format_count
@@ -31,16 +30,6 @@ _MAX_SPEED_M_S = 5.0
 
 #: Fraction of a depth map's pixels without depth above which a warning is issued.
 _MAX_HOLE_RATIO = 0.5
-
-#: Median depth in m above which the unit is doubted: millimetres read as metres.
-_MAX_MEDIAN_DEPTH_M = 200.0
-
-#: Median relative difference of depth warped from frame to frame above which poses and depth contradict each other;
-#: sound captures have 0.3 to 1.3 %.
-_MAX_DISAGREEMENT = 0.02
-
-#: Frames between the two frames whose depth is compared.
-_AGREEMENT_STEP_FRAMES = 5
 
 #: Depth values per frame that enter the percentiles.
 _MAX_SAMPLED_VALUES = 200_000
@@ -105,7 +94,6 @@ def survey_recording(
         _report_confidence([s.conf for s in shots.values() if s.conf is not None], out)
         _report_cameras(list(shots.values()), out)
     _report_poses(recording, out)
-    _report_agreement(recording, shots, out)
     out.warnings.extend(recording.report)
     for i, shot in shots.items():
         conf = None if shot.conf is None else shot.conf[0]
@@ -201,8 +189,6 @@ def report_depths(depths: Sequence[Tensor], out: Survey, remark: str = "", spars
         out.warn(f"{empty} of {len(depths)} depth maps that were read are empty")
     elif float(holes.mean()) > _MAX_HOLE_RATIO and not sparse:
         out.warn(f"most of the depth map is holes ({100 * float(holes.mean()):.0f} %)")
-    if float(ranks[3]) > _MAX_MEDIAN_DEPTH_M:
-        out.warn(f"median depth is {float(ranks[3]):.0f} m: are these millimetres?")
     if float(values.max() - values.min()) < 1e-3:
         out.warn("depth is the same everywhere")
 
@@ -287,50 +273,3 @@ def _report_poses(recording: Recording, out: Survey) -> None:
 
 def _to_degrees(angle: Tensor) -> float:
     return math.degrees(float(angle))
-
-
-def _report_agreement(recording: Recording, shots: dict[int, Frame], out: Survey) -> None:
-    """Compare depth warped by the poses into a later frame with the depth there, and with that of identity poses."""
-    if recording.poses is None or recording.sparse or len(recording) < 2:
-        return
-    step = min(_AGREEMENT_STEP_FRAMES, len(recording) - 1)  # at least 1
-    errors: list[tuple[float, float]] = []
-    for i in list(shots)[:: max(1, len(shots) // 3)]:
-        j = i + step if i + step < len(recording) else max(i - step, 0)
-        try:
-            later = shots.get(j) or recording[j]
-        except FormatError:
-            continue
-        with_poses = _relative_disagreement(
-            shots[i], later, se3.relative(recording.poses[i : i + 1], recording.poses[j : j + 1])
-        )
-        without_poses = _relative_disagreement(shots[i], later, se3.identity(1, recording.poses.t))
-        errors += [(with_poses, without_poses)] if with_poses is not None and without_poses is not None else []
-    if errors:
-        with_poses, without_poses = (sorted(column)[len(errors) // 2] for column in zip(*errors, strict=True))
-        out.add_fact(
-            "depth and poses",
-            f"agree to {100 * with_poses:.2f} % from frame to frame ({100 * without_poses:.2f} % without poses)",
-        )
-        if with_poses > max(_MAX_DISAGREEMENT, without_poses):
-            out.warn("depth and poses contradict each other: axes, units or scale may be wrong")
-
-
-def _relative_disagreement(a: Frame, b: Frame, T_b_from_a: Pose) -> float | None:
-    """Median of |z − z'| / z' of the returns of ``a`` warped into ``b``; None for fewer than 50 common pixels."""
-    v, u = (x[::7] for x in torch.nonzero(a.depth[0] > 0, as_tuple=True))
-    uv = torch.stack((u, v), -1)[None].to(a.camera.f.dtype)
-    xyz = se3.apply(T_b_from_a, cameras.unproject(_get_depth_camera(a), uv, a.depth[0, v, u][None]).double())
-    value, inside = patches.sample_nearest(b.depth, cameras.project(_get_depth_camera(b), xyz.to(uv.dtype)))
-    meet = inside & (value > 0) & (xyz[..., 2] > 0)
-    if int(meet.sum()) < 50:
-        return None
-    return float(((xyz[..., 2] - value).abs() / value)[meet].median())
-
-
-def _get_depth_camera(frame: Frame) -> Camera:
-    """The camera of a frame's depth map: its own, else the image's at the map's size."""
-    hw = (frame.depth.shape[-2], frame.depth.shape[-1])
-    if frame.depth_camera is not None:
-        return frame.depth_camera
-    return frame.camera if hw == frame.hw else cameras.resize(frame.camera, frame.hw, hw)

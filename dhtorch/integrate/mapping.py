@@ -140,6 +140,8 @@ def map_scene(
     """
     recording, chosen = scene.recording, list(pairs(scene))
     settings = {**settings, "voxel": choose_voxel(recording) if settings["voxel"] is None else settings["voxel"]}
+    if settings["poses"] == "auto":
+        settings["poses"] = "anchored" if recording.poses is None else "device"
     sweep = DenseSweep.from_options(settings["dense"])
     options = {k: settings[k] for k in ("cutoff", "seed", "device")} | {"dtype": getattr(torch, settings["dtype"])}
     estimates = recordings.estimate_pairs(
@@ -407,8 +409,9 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
     """Raise an error for options that would otherwise fail only after minutes."""
     if settings["dtype"] not in ("float32", "float64"):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
-    if settings["poses"] not in recordings.POSE_SOURCES:
-        raise ValueError(f"poses: found {settings['poses']!r}, expected one of {', '.join(recordings.POSE_SOURCES)}")
+    pose_sources = ("auto", *recordings.POSE_SOURCES)
+    if settings["poses"] not in pose_sources:
+        raise ValueError(f"poses: found {settings['poses']!r}, expected one of {', '.join(pose_sources)}")
     if settings["cutoff"] is not None and not settings["cutoff"] > 0:
         raise ValueError(f"cutoff: found {settings['cutoff']}, expected a positive number of metres, or null for none")
     if not isinstance(settings["min_maps"], int) or settings["min_maps"] < 1:

@@ -176,7 +176,7 @@ def place_frames(recording: Recording, answers: Sequence[PairEstimate], *, poses
     for k in frames:
         if not any(k in fragment for fragment in fragments):
             start = own_poses.get(k, se3.identity(1, torch.zeros(1, dtype=torch.float64)))
-            fragments.append(_chain_poses(k, start, links))
+            fragments.append(chain_poses(k, start, links))
     largest = max(fragments, key=len) if fragments else {}
     return PlacedFrames(largest, len(fragments), len(frames) - len(largest))
 
@@ -378,7 +378,7 @@ def _own_pose(recording: Recording, k: int) -> Pose:
     return recording.poses[k : k + 1].to(torch.float64)
 
 
-def _chain_poses(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]]]) -> dict[int, Pose]:
+def chain_poses(first: int, start: Pose, links: dict[int, list[tuple[int, Pose]]]) -> dict[int, Pose]:
     """Poses of all frames that links connect to the first one, each along the fewest links."""
     poses, queue = {first: start}, deque([first])
     while queue:

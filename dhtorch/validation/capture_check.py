@@ -64,7 +64,7 @@ class Finding:
     remedy: str = ""  # option that mends it, empty where none does
 
     def __str__(self) -> str:
-        return f"{self.text}; {self.remedy} reads it so" if self.remedy else self.text
+        return f"{self.text} (remedy: {self.remedy})" if self.remedy else self.text
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class CaptureCheck:
     """Findings on one recording, and the recording as it can be used."""
 
     recording: Recording  # without poses where they are refuted
-    notes: tuple[str, ...] = ()  # what was assumed, left out or guessed
+    assumed_unit: str = ""  # the unit that nothing states, as a sentence
     findings: tuple[Finding, ...] = ()
     poses: PoseCheck | None = None
     diagnosis: Diagnosis | None = None
@@ -84,13 +84,14 @@ class CaptureCheck:
 
     @property
     def lines(self) -> list[str]:
-        """Notes and findings as text, each a line."""
-        return [*self.notes, *map(str, self.findings)]
+        """The assumed unit, the reader's report and the findings, each a line."""
+        assumed = [self.assumed_unit] if self.assumed_unit else []
+        return [*assumed, *self.recording.report, *map(str, self.findings)]
 
     def record(self) -> dict[str, object]:
-        """Notes and findings for a JSON file."""
+        """The findings for a JSON file."""
         findings = [{"cause": each.cause, "text": each.text, "remedy": each.remedy} for each in self.findings]
-        return {"notes": list(self.notes), "findings": findings, "poses_refuted": self.poses_refuted}
+        return {"assumed_unit": self.assumed_unit or None, "findings": findings, "poses_refuted": self.poses_refuted}
 
 
 def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = None, *, seed: int = 0) -> CaptureCheck:
@@ -104,7 +105,8 @@ def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = Non
     Gradient: none.
     Cost: decodes up to :data:`WINDOW_FRAMES` frames and tracks eight pairs of them, about a second.
     """
-    notes = _assumptions(recording)
+    unit = recording.depth_unit
+    assumed = f"{unit} (data.depth_unit= sets it)" if unit is not None and unit.is_assumed else ""
     window = _read_window(recording, frames or {})
     depths = [frame.depth[0] for frame in window.values() if bool((frame.depth > 0).any())]
     findings = [
@@ -113,7 +115,7 @@ def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = Non
     ]
     findings += _intrinsics_findings(list(window.values()))
     if len(depths) < 2 or recording.sparse:
-        return CaptureCheck(recording, notes, tuple(findings))
+        return CaptureCheck(recording, assumed, tuple(findings))
     views = {i: frame.replace(T_world_from_cam=None) for i, frame in window.items() if 0 not in frame.hw}
     tracks, diagnosis = _diagnose_window(list(views.values()), seed)
     positions = list(views)
@@ -122,15 +124,8 @@ def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = Non
     poses = None if recording.poses is None else check_poses(recording.poses, window, pairs, tracked)
     fault = _fault_of(diagnosis) or _late_depth(list(views.values()))
     findings += _judge(recording, poses, fault, window, pairs, tracks)
-    check = CaptureCheck(recording, notes, tuple(findings), poses, diagnosis)
+    check = CaptureCheck(recording, assumed, tuple(findings), poses, diagnosis)
     return replace(check, recording=replace(recording, poses=None)) if check.poses_refuted else check
-
-
-def _assumptions(recording: Recording) -> tuple[str, ...]:
-    """What the reader assumed, left out or guessed, as lines."""
-    unit = recording.depth_unit
-    assumed = (f"{unit} (data.depth_unit= sets it)",) if unit is not None and unit.is_assumed else ()
-    return (*assumed, *recording.report)
 
 
 def _read_window(recording: Recording, known: Mapping[int, Frame]) -> dict[int, Frame]:

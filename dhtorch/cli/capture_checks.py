@@ -1,0 +1,72 @@
+"""Check of the captures that a command reads, before it uses them: printed notes and warnings, refuted poses removed.
+
+All commands call it on the recordings of their data, so that one capture gives one set of findings everywhere. The
+lines become the recordings' report, which the commands write into their files.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from dhtorch.data.recording import Recording, Recordings
+from dhtorch.data.scene import Scene, Scenes
+from dhtorch.runtime.console import get_verbosity
+from dhtorch.validation.capture_check import CaptureCheck, check_capture
+
+#: Recordings of one data set that are checked: episodes of a set are written by one program. Limits the time at the
+#: start of a command to some seconds. Source: origin not recorded.
+_MAX_CHECKED_RECORDINGS = 12
+
+
+def check_data(data: Any) -> Any:
+    """Scenes of a command -> the same scenes with checked recordings; other data are returned as they are.
+
+    Of a lazily opened set only the first recording is checked: its findings are printed, and where its poses are
+    refuted, those of all recordings are removed.
+    """
+    if isinstance(data, Recordings | Scenes):
+        scenes = data if isinstance(data, Scenes) else Scenes(data)
+        first = check_scene(scenes[0])
+        if scenes[0].recording.poses is None or first.recording.poses is not None:
+            return scenes
+        return replace(scenes, annotate=_WithoutPoses(scenes.annotate))
+    if isinstance(data, Scene | Recording):
+        return check_scene(Scene.of(data))
+    if isinstance(data, Sequence) and all(isinstance(each, Scene | Recording) for each in data):
+        all_scenes = [Scene.of(each) for each in data]
+        checked = [check_scene(each) for each in all_scenes[:_MAX_CHECKED_RECORDINGS]]
+        return [*checked, *all_scenes[_MAX_CHECKED_RECORDINGS:]]
+    return data
+
+
+def check_scene(scene: Scene) -> Scene:
+    """A scene with its recording checked; findings are printed. Recordings that are not from disk are left alone."""
+    if scene.recording.root is None:
+        return scene
+    check = check_capture(scene.recording)
+    print_check(scene.name, check)
+    return replace(scene, recording=replace(check.recording, report=tuple(check.lines)))
+
+
+def print_check(name: str, check: CaptureCheck) -> None:
+    """Print what was assumed and the reader's report to stderr, and the findings as warnings."""
+    for line in (*([check.assumed_unit] if check.assumed_unit else []), *check.recording.report):
+        if get_verbosity() != "quiet":
+            print(f"{name}: {line}", file=sys.stderr)
+    for finding in check.findings:
+        warnings.warn(f"{name}: {finding}", stacklevel=2)
+
+
+class _WithoutPoses:
+    """Recording → scene without poses."""
+
+    def __init__(self, annotate: Any) -> None:
+        self.annotate = annotate
+
+    def __call__(self, recording: Recording) -> Scene:
+        scene: Scene = self.annotate(recording)
+        return replace(scene, recording=replace(scene.recording, poses=None))
