@@ -226,6 +226,19 @@ def test_depth_without_a_flag_is_recognised_by_its_pixels(depth: str, tmp_path: 
     assert unflagged.depth_unit == flagged.depth_unit == (None if depth == "video" else DepthUnit(1e-3))
 
 
+def test_depth_whose_shape_counts_three_channels_is_recognised_by_its_format(tmp_path: Path) -> None:
+    write_lerobot(tmp_path, two_episodes(), depth="video")
+    flagged = data.open(tmp_path, episode=0)
+
+    def change(info: dict[str, Any]) -> None:
+        feature = info["features"][f"{KEY}_depth"]
+        feature["shape"] = [*feature["shape"][:2], 3]
+        feature["info"] |= {"is_depth_map": False, "video.pix_fmt": "gray12le"}
+
+    edit(tmp_path, change)
+    assert torch.equal(data.open(tmp_path, episode=0)[1].depth, flagged[1].depth)
+
+
 def test_a_grey_camera_of_8_bits_is_no_depth(tmp_path: Path) -> None:
     """One channel alone does not make depth: infrared cameras have it, too."""
     write_lerobot(tmp_path, two_episodes(), depth="video", depth_pixels="yuv420p12le")

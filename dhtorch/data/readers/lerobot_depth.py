@@ -22,6 +22,7 @@ from dhtorch.data.readers.lerobot_meta import LeRobotEpisode, LeRobotFeature, Le
 from dhtorch.data.readers.lerobot_rows import read_encoded_image
 from dhtorch.data.units import UNIT_METRES, DepthUnit
 
+_GREY = "gray"  # start of FFmpeg's names of pixel formats with one channel
 _CODE_BITS = 12  # of LeRobot's depth videos
 _N_DEPTH_CODES = 2**_CODE_BITS
 _DEFAULT_DEPTH_RANGE = {"depth_min": 0.01, "depth_max": 10.0, "shift": 3.5}  # m
@@ -48,7 +49,9 @@ def flag_unmarked_depth(
     """
     features, remarks = dict(meta.features), list[str]()
     for key, feature in meta.features.items():
-        if feature.dtype not in ("video", "image") or feature.is_depth or feature.channels != 1:
+        if feature.dtype not in ("video", "image") or feature.is_depth:
+            continue
+        if feature.channels != 1 and not str(_stated_pixel_format(feature)).startswith(_GREY):
             continue
         if key in episode.videos and not episode.videos[key][0].is_file():
             continue
@@ -89,13 +92,18 @@ def _has_stated_range(feature: LeRobotFeature) -> bool:
     return any(f"{prefix}{name}" in feature.info for name in _DEFAULT_DEPTH_RANGE for prefix in ("", "video."))
 
 
+def _stated_pixel_format(feature: LeRobotFeature) -> str | None:
+    """FFmpeg's name of a video's pixel format in the feature's info; None = not stated."""
+    stated = feature.info.get("video.pix_fmt", feature.info.get("pix_fmt"))
+    return stated if isinstance(stated, str) else None
+
+
 def _read_pixel_type(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobotEpisode, row: int) -> _PixelType:
     """Type of a feature's pixels: from its info or the header of its video or of the image in ``row``."""
     if feature.dtype == "video":
-        stated = feature.info.get("video.pix_fmt", feature.info.get("pix_fmt"))
-        name = stated if isinstance(stated, str) else read_video_header(episode.videos[feature.key][0]).pixels
+        name = _stated_pixel_format(feature) or read_video_header(episode.videos[feature.key][0]).pixels
         bits = re.search(r"(\d+)[lb]e$", name)
-        return _PixelType(name, int(bits[1]) if bits else 8, 1 if name.startswith("gray") else feature.channels)
+        return _PixelType(name, int(bits[1]) if bits else 8, 1 if name.startswith(_GREY) else feature.channels)
     if feature.dtype != "image":
         return _PixelType(feature.dtype, 8 * np.dtype(feature.dtype).itemsize, 1)
     data, file = read_encoded_image(episode.data, meta.root, feature.key, row)
