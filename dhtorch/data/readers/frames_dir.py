@@ -40,6 +40,7 @@ from dhtorch.data.readers.image_table import (
 )
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
+from dhtorch.geometry.no_depth import NO_DEPTH_CODES
 from dhtorch.records import Pose
 
 _NAMED_FRAME_PATTERN = re.compile(r"frame-(\d+)\.(color|depth|pose)\.(?:png|jpg|jpeg|pgm|txt)")
@@ -149,7 +150,7 @@ def read(
         camera=colour,
         depth_camera=convert.to_camera(depth_K[0], depth_hw, *depth_K[1:]) if depth_K else None,
         units_per_metre=units,
-        no_return=_parse_codes(invalid if invalid is not None else meta.get("invalid", (0, 65535)), side_car),
+        no_return=_parse_codes(invalid if invalid is not None else meta.get("invalid", NO_DEPTH_CODES), side_car),
         rotated_bits=rotated_bits,
         register=register,
     )

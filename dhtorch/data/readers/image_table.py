@@ -22,12 +22,10 @@ from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording
 from dhtorch.data.stored_sizes import StoredSizes
 from dhtorch.data.units import DepthUnit
+from dhtorch.geometry.no_depth import NO_DEPTH_CODES
 from dhtorch.records import Camera, Frame
 
 IMAGE_NAME_PATTERN = re.compile(r"(.+)\.(?:png|jpg|jpeg|pgm)", re.IGNORECASE)
-
-#: Depth codes that mean no return: 0 by every format, 65535 as the largest of 16 bits. Source: format definitions.
-NO_RETURN_CODES = (0, 65535)
 
 #: Names of the images of layouts that number all files of a frame in one folder.
 NAMED_COLOUR_PATTERN = r"frame-(\d+)\.color\.(?:jpg|jpeg|png)"
@@ -74,7 +72,7 @@ class ImageTableLoader:
     camera: Camera
     depth_camera: Camera | None = None  # None = ``camera`` scaled to the depth's size
     units_per_metre: float = 1000.0
-    no_return: tuple[int, ...] = NO_RETURN_CODES
+    no_return: tuple[int, ...] = NO_DEPTH_CODES
     rotated_bits: int = 0  # bits by which the codes are rotated to the left
     register: bool = False  # warp depth with a camera of its own to the image
     exif: int | None = None  # orientation tag of every image; None = not checked
