@@ -28,6 +28,7 @@ from dhtorch.geometry import (
     filters,
     least_squares,
     map_estimate,
+    no_depth,
     p3p,
     patches,
     plane_sweep,
@@ -446,6 +447,10 @@ ROWS = [
     Row(with_options(registration.estimate_normals, neighbours=4), lambda b, n, d: registered(b, n, d)[:1], "dtype batch vmap capture shuffle raises", (0,), bad=wrong_last_axis(0)),
     Row(clusters.largest_cluster, clustered, "dtype batch vmap capture shuffle raises", (0, 1), bad=wrong_last_axis(0)),
     Row(holdout.select_candidates, judged, "dtype batch vmap capture empty shuffle raises", (0, 1), bad=lambda a: (a[0], a[1].replace(depth=a[1].depth[:, 1:]), a[2])),
+    *(
+        Row(clear, lambda b, n, d: (torch.where(frames(b, n, d)[0].depth > 2, 50.0, frames(b, n, d)[0].depth),), POINTLESS, grad=(0,))
+        for clear in (no_depth.clear_no_depth, no_depth.clear_saturated, no_depth.clear_far_constant)
+    ),
     Row(filters.grayscale, lambda b, n, d: (frames(b, n, d)[0].image,), POINTLESS, grad=(0,)),
     Row(filters.correlate_separable, lambda b, n, d: (frames(b, n, d)[0].image, [0.25, 0.5, 0.25], [-0.5, 0.0, 0.5]), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], *a[1:])),
     Row(filters.gaussian_blur, lambda b, n, d: (frames(b, n, d)[0].image, 1.2), POINTLESS + " raises", grad=(0,), bad=lambda a: (a[0][0], a[1])),
