@@ -207,9 +207,11 @@ def _decide_symmetry(recording: Recording, stored: StoredSizes) -> tuple[int, st
     if len(possible) == 1:
         k = _select(recording, range(1, 8, 2))
         if k not in (None, upright):
-            found = f"{stored.source}, but edges of depth and pictures coincide where depth is {SYMMETRY_NAMES[k]}"
+            contradiction = (
+                f"{stored.source}, but edges of depth and pictures coincide where depth is {SYMMETRY_NAMES[k]}"
+            )
             expected = "pictures that state how depth lies (data.depth_turn overrides)"
-            raise FormatError(recording.root or recording.name, "orientation", found, expected)
+            raise FormatError(recording.root or recording.name, "orientation", contradiction, expected)
         return upright, f"orientation: {stored.source}: {{done}}, as depth lies"
     k = _select(recording, possible)
     if k is None:

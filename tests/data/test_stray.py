@@ -283,6 +283,18 @@ def test_display_matrix_with_lying_depth_changes_nothing(tmp_path: Path, room: l
             assert torch.equal(got.image, want.image) and torch.equal(got.depth, want.depth)
 
 
+def test_a_display_matrix_applies_where_depth_lies_as_the_film_is_displayed(tmp_path: Path, room: list[Frame]) -> None:
+    writers.write_stray(tmp_path, room, film_turn=3, display=1)
+    recording = data.open(tmp_path)
+    assert recording.report == (
+        "orientation: display matrix of rgb.mp4: pictures are turned by 90 degrees, as depth lies",
+    )
+    assert max(picture_error(got, want) for got, want in zip(recording, room, strict=True)) < 6
+    writers.write_stray(tmp_path / "wrong", room, film_turn=1, display=1)
+    with pytest.raises(FormatError, match=r"orientation: found display matrix of rgb.mp4, but edges"):
+        data.open(tmp_path / "wrong")
+
+
 @pytest.mark.parametrize("k", [1, 3])
 def test_a_film_turned_upright_is_turned_back(tmp_path: Path, room: list[Frame], k: int) -> None:
     writers.write_stray(tmp_path, room, film_turn=k)

@@ -368,9 +368,11 @@ def _choose_pairing(
         lost_inside = min(halves[0], -halves[1]) > _MIN_EDGE_LEAD
         clear = min(map(abs, halves)) > _MIN_EDGE_LEAD and halves[0] * halves[1] > 0
         if lost_inside or not (clear or surplus == -1):
-            found = f"{-surplus} pictures less than rows at a constant rate, which does not show where they were lost"
+            shortage = (
+                f"{-surplus} pictures less than rows at a constant rate, which does not show where they were lost"
+            )
             expected = "stamps with gaps, or data.lost_first=true (the film lacks its first ones) or false (its last)"
-            raise FormatError(load.video or load.root, "frames", found, expected)
+            raise FormatError(load.video or load.root, "frames", shortage, expected)
         first_lost, reason = sum(halves) <= 0, "by the edges of depth and image"
     lost = f"its {'first' if first_lost else 'last'} frame{'s are' if surplus < -1 else ' is'} lost"
     return (late if first_lost else early), f"{lost} ({reason})"
