@@ -14,7 +14,7 @@ from pathlib import Path
 
 from dhtorch.runtime.console import format_count
 
-_SUFFIXES = (".json", ".yaml", ".yml", ".txt", ".log", ".csv", ".ini", ".toml", ".xml")
+_SUFFIXES = (".json", ".yaml", ".yml", ".txt", ".log", ".csv", ".ini", ".toml", ".xml", ".freiburg", ".sim", ".traj")
 
 #: Names of folders of calibration or poses, whose files count whatever their suffix.
 _FOLDERS = ("pose*", "intrinsic*", "extrinsic*", "calib*", "camera*", "cam_info*")

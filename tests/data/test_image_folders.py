@@ -566,9 +566,26 @@ def test_numbered_frames_with_a_pose_file_each(tmp_path: Path, folder: str) -> N
     (tmp_path / folder / "00002.txt").unlink()
     recording = data.open(tmp_path)
     assert recording.number.tolist() == [0, 3]
-    reasons = f"no file in {folder}/", "its pose is not finite (tracking lost)"
-    assert recording.report == (f"frame 2: {reasons[0]}: left out", f"frame 1: {reasons[1]}: left out")
+    lost = "frame 1: the pose is not finite (tracking lost): left out"
+    assert recording.report == ("frame 2: no pose: left out", lost)
     torch.testing.assert_close(recording.poses.t[1], frames[3].T_world_from_cam.t[0])
+
+
+@pytest.mark.parametrize("lost", ["nan " * 16, "-inf " * 16, "nan " * 7, "0 0 0 0 0 0 0"])
+def test_lost_poses_of_numbered_frames_are_left_out(tmp_path: Path, lost: str) -> None:
+    frames = walk(3)
+    writers.write_counted_frames(tmp_path, frames)
+    file = tmp_path / "poses.txt"
+    lines = file.read_text().splitlines()
+    if len(lost.split()) == 7:
+        matrices = [parts.pose_matrix(frame) for frame in frames]
+        lines = [parts.format_row([*T[:3, 3], *parts.rotation_to_xyzw(T[:3, :3])]) for T in matrices]
+    lines[1] = lost
+    file.write_text("\n".join(lines))
+    recording = data.open(tmp_path)
+    assert recording.number.tolist() == [0, 2]
+    assert recording.report == ("frame 1: the pose is not finite (tracking lost): left out",)
+    torch.testing.assert_close(recording.poses.R[1], frames[2].T_world_from_cam.R[0], atol=1e-12, rtol=0)
 
 
 # ---------------------------------------------------------------------------------------------------------- unread files

@@ -37,6 +37,7 @@ from dhtorch.data.readers.image_table import (
     read_K,
     read_pose,
     read_stored_sizes,
+    split_lost,
 )
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
@@ -261,43 +262,37 @@ def _list_counted_frames(root: Path, folder: Path) -> tuple[list[ImageRow], Pose
     increasing = len(values) == len(stems) and all(a < b for a, b in itertools.pairwise(values))
     numbers = values if increasing else range(len(stems))
     frames = [ImageRow(number, images[stem], depths[stem]) for number, stem in zip(numbers, stems, strict=True)]
-    if file is None or rows is None:
-        return _add_pose_files(root, frames, stems)
-    return frames, _parse_poses(rows, file), []
-
-
-def _add_pose_files(
-    root: Path, frames: list[ImageRow], stems: Sequence[str]
-) -> tuple[list[ImageRow], Pose | None, list[str]]:
-    """Frames, poses and report where each frame has a pose in a file of its name; frames without one are left out."""
-    folder = next(
-        (root / name for name in _POSE_FOLDERS if any((root / name / f"{s}.txt").is_file() for s in stems)), None
-    )
-    if folder is None:
+    source = file or _find_pose_folder(root, stems)
+    if source is None:
         return frames, None, ["no poses.txt: no poses"]
+    poses = _read_pose_files(source, stems) if rows is None else _parse_poses(rows, source)
+    frames, report = split_lost([replace(frame, c2w=pose) for frame, pose in zip(frames, poses, strict=True)])
+    c2w = [frame.c2w for frame in frames if frame.c2w is not None]
+    return frames, convert.to_poses(np.stack(c2w), source) if c2w else None, report
+
+
+def _find_pose_folder(root: Path, stems: Sequence[str]) -> Path | None:
+    """The folder with a pose file named as an image; None where there is none."""
+    folders = [root / name for name in _POSE_FOLDERS]
+    return next((folder for folder in folders if any((folder / f"{stem}.txt").is_file() for stem in stems)), None)
+
+
+def _read_pose_files(folder: Path, stems: Sequence[str]) -> list[np.ndarray | None]:
+    """Camera-to-world (4, 4) of each image from the file of its name; None where there is none."""
     places = [folder / f"{stem}.txt" for stem in stems]
-    matrices = [read_pose(place) if place.is_file() else None for place in places]
-    missing = [frame.number for frame, matrix in zip(frames, matrices, strict=True) if matrix is None]
-    usable = [
-        (frame, matrix)
-        for frame, matrix in zip(frames, matrices, strict=True)
-        if matrix is not None and np.isfinite(matrix).all()
-    ]
-    kept = {frame.number for frame, _ in usable}
-    lost = [frame.number for frame in frames if frame.number not in kept and frame.number not in missing]
-    report = files.format_left_out(missing, f"no file in {folder.name}/")
-    report += files.format_left_out(lost, "its pose is not finite (tracking lost)")
-    if not usable:
-        return frames, None, [f"{folder.name}/: every pose is not finite (tracking lost): no poses"]
-    return [frame for frame, _ in usable], convert.to_poses(np.stack([matrix for _, matrix in usable]), folder), report
+    return [read_pose(place) if place.is_file() else None for place in places]
 
 
-def _parse_poses(rows: np.ndarray, file: Path) -> Pose:
-    if rows.shape[1] not in (7, 16):
+def _parse_poses(rows: np.ndarray, file: Path) -> list[np.ndarray | None]:
+    """Camera-to-world (4, 4) of each row, not finite where its row is not or has no rotation."""
+    if rows.shape[1] == 16:
+        return list(rows.reshape(-1, 4, 4))
+    if rows.shape[1] != 7:
         raise FormatError(file, "columns", rows.shape[1], "16 (4x4 by rows) or 7 (tx ty tz qx qy qz qw) numbers")
-    if rows.shape[1] == 7:
-        return convert.to_poses(convert.to_c2w(rows[:, 3:], rows[:, :3], file, "pose"), file)
-    return convert.to_poses(rows.reshape(-1, 4, 4), file)
+    is_lost = ~np.isfinite(rows).all(-1) | ~rows[:, 3:].any(-1)
+    c2w = convert.to_c2w(np.where(is_lost[:, None], [0, 0, 0, 1], rows[:, 3:]), rows[:, :3], file, "pose")
+    c2w[is_lost] = np.nan
+    return list(c2w)
 
 
 def _read_intrinsics(

@@ -147,7 +147,7 @@ def open_image_table(
     Raises:
         FormatError: no row, or values that are no poses.
     """
-    rows, lost = _split_lost(loader.rows)
+    rows, lost = split_lost(loader.rows)
     lines = [*report, *lost]
     if not rows:
         raise FormatError(root, "frames", "none with image, depth map and pose", "at least one")
@@ -174,7 +174,7 @@ def open_image_table(
     )
 
 
-def _split_lost(rows: Sequence[ImageRow]) -> tuple[list[ImageRow], list[str]]:
+def split_lost(rows: Sequence[ImageRow]) -> tuple[list[ImageRow], list[str]]:
     """Rows with a usable pose, or all rows without poses where none has one; report of those left out."""
     if all(row.c2w is None for row in rows):
         return list(rows), []
