@@ -141,9 +141,9 @@ def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
             if captures:
                 return captures
         level = [entry for entry in inside if entry.is_dir()]
-    found, remedy = _describe_content(path)
+    content, remedy = _describe_content(path)
     known_formats = ", ".join((*data.FORMATS, *formats.STACK_FORMATS))
-    raise FormatError(path, "content", found, remedy or f"one of {known_formats}, or images")
+    raise FormatError(path, "content", content, remedy or f"one of {known_formats}, or images")
 
 
 def _describe_content(path: Path) -> tuple[str, str | None]:

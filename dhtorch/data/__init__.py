@@ -253,9 +253,9 @@ def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str
     foreign = describe_foreign_file(root) if root.is_file() else None
     listing = sorted(entry.name for entry in root.iterdir())[:6] if root.is_dir() else []
     content = ", ".join(listing) if root.is_dir() else f"a {root.suffix or 'plain'} file"
-    found = foreign.what if foreign else content or "an empty folder"
     expected = f"one of {', '.join(FORMATS)} (dhtorch inspect searches subfolders)"
-    raise FormatError(root, "format", found, (foreign and foreign.remedy) or expected)
+    remedy = foreign.remedy if foreign else None
+    raise FormatError(root, "format", foreign.what if foreign else content or "an empty folder", remedy or expected)
 
 
 def open_scenes(root: str | Path | None = None, scenes: Sequence[Mapping[str, Any]] = ()) -> list[Scene]:

@@ -154,13 +154,13 @@ def _candidates(bag: BagIndex, name: str | None, *, is_depth: bool) -> list[Pict
             raise FormatError(bag.root, f"option {option}", name, f"one of {bag.format_topics()}")
         stream = bag.streams[name]
         if stream.head is None or stream.head.is_depth != is_depth:
-            found = f"{name} of encoding {stream.encoding}"
-            raise FormatError(bag.root, f"option {option}", found, f"pictures of {option}")
+            actual = f"{name} of encoding {stream.encoding}"
+            raise FormatError(bag.root, f"option {option}", actual, f"pictures of {option}")
         return [stream]
-    found = [s for s in bag.streams.values() if s.head is not None and s.head.is_depth == is_depth]
+    streams = [s for s in bag.streams.values() if s.head is not None and s.head.is_depth == is_depth]
     if is_depth:
-        return found
-    return [s for s in found if not _NO_COLOUR.search(s.base.lower())] or found
+        return streams
+    return [s for s in streams if not _NO_COLOUR.search(s.base.lower())] or streams
 
 
 def _score(bag: BagIndex, colour: PictureStream, depth: PictureStream) -> tuple[float, ...]:
@@ -293,12 +293,14 @@ def _relate(
 
 def _find_extrinsics(bag: BagIndex, pair: _Pair) -> np.ndarray | None:
     """T_colour_from_depth (4, 4) of the SDK or of the fixed transforms; None where the bag has none."""
-    found: list[dict[str, np.ndarray]] = []
+    stated: list[dict[str, np.ndarray]] = []
     for stream in (pair.colour, pair.depth):
         prefix = f"{stream.base.removesuffix('/image/data')}/tf/"
-        found.append({n.removeprefix(prefix): T for n, T in bag.sdk_transforms.items() if n.startswith(prefix)})
-    for reference in found[0].keys() & found[1].keys():  # transforms map points of the reference to the stream
-        return found[0][reference] @ np.linalg.inv(found[1][reference])
+        stated.append({n.removeprefix(prefix): T for n, T in bag.sdk_transforms.items() if n.startswith(prefix)})
+    for reference in sorted(
+        stated[0].keys() & stated[1].keys()
+    ):  # transforms map points of the reference to the stream
+        return stated[0][reference] @ np.linalg.inv(stated[1][reference])
     assert pair.colour.head is not None and pair.depth.head is not None
     if not pair.colour.head.frame or not pair.depth.head.frame:
         return None
@@ -326,10 +328,10 @@ def _find_poses(
         return None, pairs, []
     if not bag.tree.is_whole:
         return None, pairs, [f"{bag.tree.count} transforms are too many to read: no poses"]
-    found = bag.tree.poses(colour.head.frame, times_ns[pairs[:, 0]], bag.root)
-    if found is None:
+    trajectory = bag.tree.poses(colour.head.frame, times_ns[pairs[:, 0]], bag.root)
+    if trajectory is None:
         return None, pairs, []
-    c2w, covered, world = found
+    c2w, covered, world = trajectory
     if covered.mean() < _MIN_POSED_SHARE:
         remark = f"transforms of {colour.head.frame} cover {int(covered.sum())} of {len(covered)} frames: no poses"
         return None, pairs, [remark]
