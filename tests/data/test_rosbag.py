@@ -152,6 +152,29 @@ def test_a_raw_topic_is_preferred_and_topics_can_be_set(tmp_path: Path) -> None:
         data.open(tmp_path / "b", depth="/camera/color/image_raw")
 
 
+def test_each_camera_is_a_recording(tmp_path: Path) -> None:
+    left, right = walk(2), [frame.replace(image=255 - frame.image, depth=frame.depth + 1) for frame in walk(2)]
+    layouts = [
+        BagLayout(
+            colour_topic=f"/{side}/color/image_raw", depth_topic=f"/{side}/aligned_depth_to_color/image_raw",
+            colour_frame=f"{side}_optical", depth_frame=f"{side}_optical", poses=False,
+        )
+        for side in ("left", "right")
+    ]  # fmt: skip
+
+    def begin(bag: BagWriter) -> None:
+        for frame in right:
+            bag.write_frame(frame, layouts[1])
+
+    write_rosbag(tmp_path / "bag", left, layouts[0], begin=begin)
+    recordings = data.open_all(tmp_path / "bag")
+    by_camera = {recording.camera_name: recording for recording in recordings}
+    assert by_camera.keys() == {"/left/color/image_raw", "/right/color/image_raw"}
+    assert len({recording.name for recording in recordings}) == 2
+    same_frames(by_camera["/left/color/image_raw"], left)
+    same_frames(by_camera["/right/color/image_raw"], right)
+
+
 # ------------------------------------------------------------------------------------------------- two cameras, poses
 
 
