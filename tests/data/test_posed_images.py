@@ -177,7 +177,11 @@ def test_images_without_depth_and_of_two_cameras(tmp_path: Path) -> None:
     recordings = data.open_all(tmp_path)
     assert [r.name.removeprefix(tmp_path.name) for r in recordings] == ["/images/left", "/images"]
     assert [len(r) for r in recordings] == [2, 2] and all(r.depth_unit is None for r in recordings)
-    assert recordings[0].report == ("no depth maps: depth is empty",) and not recordings[0][0].depth.any()
+    assert recordings[0].report == (
+        "depth/ is not read: transforms.json names no depth maps (depth_file_path of each frame)",
+        "no depth maps: depth is empty",
+    )
+    assert not recordings[0][0].depth.any()
 
 
 def test_images_of_another_size_than_stated(tmp_path: Path) -> None:
@@ -273,13 +277,13 @@ def test_polycam(corrected: bool, tmp_path: Path) -> None:
     recording = data.open(tmp_path)
     check_same(recording, frames)
     assert recording.name == data.open(tmp_path / "keyframes").name == tmp_path.name
-    assert recording.report == (("poses from corrected_cameras/",) if corrected else ())
+    assert recording.report == ()
     assert recording.depth_unit == DepthUnit(1e-3, "format definition: Polycam stores millimetres")
     assert recording.pose_axes == "gl" and (recording[0].conf == 2).all()
     if corrected:
         captured = data.open(tmp_path, corrected=False)
         offset = captured[0].T_world_from_cam.t - frames[0].T_world_from_cam.t
-        assert torch.allclose(offset, torch.ones(1, 3).double()) and captured.report == ("poses from cameras/",)
+        assert torch.allclose(offset, torch.ones(1, 3).double())
 
 
 def test_polycam_confidence_and_what_is_missing(tmp_path: Path) -> None:

@@ -44,6 +44,7 @@ _LENS_NAMES = ("k1", "k2", "p1", "p2", "k3")
 
 #: Names of the depth file of a frame → names of its unit, in the order in which they apply.
 _DEPTH_KEYS = ("depth_file_path", "depth_path")
+_DEPTH_FOLDERS = ("depth", "depths", "depth_images")
 _UNIT_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
 
 #: Name of the map of origins that ``dhtorch enrich`` adds.
@@ -99,6 +100,12 @@ def read(root: str | Path, *, recovered: bool = False) -> list[Recording]:
         report.append("poses were estimated by COLMAP (colmap_im_id): their scale is not metric unless it was aligned")
     if any(row.origin is not None for images in rows.values() for row in images):
         report.append("depths that dhtorch enrich recovered are left out (data.recovered=true reads them)")
+    if not any(key in entry for entry in meta["frames"] for key in _DEPTH_KEYS):
+        report += [
+            f"{name}/ is not read: {file.name} names no depth maps ({_DEPTH_KEYS[0]} of each frame)"
+            for name in _DEPTH_FOLDERS
+            if (folder / name).is_dir()
+        ]
     if not rows:
         raise FormatError(file, "frames", "; ".join(report) or "none", "at least one image")
     unit, name = _parse_unit(meta, file), folder.resolve().name

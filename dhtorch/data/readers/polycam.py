@@ -62,13 +62,12 @@ def read(root: str | Path, *, corrected: bool = True) -> list[Recording]:
     pictures, depths = list_images(keyframes / images), list_images(keyframes / "depth")
     confidences = list_images(keyframes / "confidence")
     sources = {file.stem: file for file in sorted((keyframes / cameras).glob("*.json"))}
-    report = [f"poses from {cameras}/"] if len(_existing_folders(keyframes)) > 1 else []
     rows = [
         _parse_row(sources[name], i, picture, depths.get(name), confidences.get(name))
         for i, (name, picture) in enumerate(pictures.items())
         if name in sources
     ]
-    report += files.format_left_out(
+    report = files.format_left_out(
         [i for i, name in enumerate(pictures) if name not in sources], f"no file in {cameras}/"
     )
     return [
