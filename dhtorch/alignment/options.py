@@ -153,7 +153,7 @@ class AlignmentOptions:
     #: Median relative error of a line from value to depth up to which the map is one of depth, and the largest ratio of
     #: the error of a line to inverse depth to it. Source: chosen on depth of ten recordings of DHTORCH_DATA as z-buffer
     #: and as disparity, ratios below 0.001, and with every fault of synthetic.depth_faults, above 0.24.
-    family_min_error: float = 0.004
+    family_min_error: float = 0.001
     family_max_ratio: float = 0.2
 
     # Residual noise

@@ -56,6 +56,21 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
     assert run.main([*asked, "kind=affine"]) == run.EXIT_FAILED, "other maps in the same folder"
 
 
+def test_a_z_buffer_is_named_and_gets_no_answer(tmp_path, room, capsys):
+    for k in range(len(room)):
+        np.save(tmp_path / f"{k:04d}.npy", 1 - 0.01 / room.truth(k)["depth"][0].numpy())
+    words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "most=1", "cutoff=null"]
+    assert run.main(["align", *ROOM, *LITTLE, *words]) == run.EXIT_DONE
+    lines = capsys.readouterr().out.splitlines()
+    assert "none of 1 map could be aligned" in lines[0] and "few" not in lines[0]
+    assert "1 map: near returns show a z-buffer (non-linear depth)" in lines[1]
+    assert any(line.startswith("  warning: maps: ") and "z-buffer" in line for line in lines)
+    assert "  maps: depth unit assumed: 1 m" in lines
+    report = json.loads((tmp_path / "out/align.json").read_text())
+    assert report["frames"][0]["aligned"]["family"] == "z-buffer" and report["whole"]["families"] == {"z-buffer": 1}
+    assert report["maps"]["depth_unit"] == "depth unit assumed: 1 m"
+
+
 def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
     for k in range(len(room)):
         np.save(tmp_path / f"{k:04d}.npy", 1.5 * room.truth(k)["depth"][0].numpy())
