@@ -95,7 +95,7 @@ def reject_misaligned(
     camera_0: Camera,
     camera_1: Camera,
     *,
-    max_unexplained: float = 0.62,
+    max_unexplained: float = 0.65,
     min_gain: float = 0.85,
     few_returns: float = 3.0,
     min_t_snr: float = 30.0,
