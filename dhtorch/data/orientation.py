@@ -297,7 +297,11 @@ def _edge_vectors(x: Tensor, mask: Tensor) -> Tensor:
 
 def edge_correlation(a: Tensor, b: Tensor, mask: Tensor) -> float:
     """Correlation coefficient of two vector fields (3, h, w) over a mask; 0 where one of them is constant."""
-    if not bool(mask.any()):
+    n = float(mask.sum())
+    if n == 0:
         return 0.0
-    a, b = (x[:, mask] - x[:, mask].mean(-1, keepdim=True) for x in (a, b))
+    weight = mask.to(a.dtype).flatten()
+    a, b = a.flatten(1), b.flatten(1)
+    mean_a, mean_b = a @ weight / n, b @ weight / n
+    a, b = (a - mean_a[:, None]) * weight, (b - mean_b[:, None]) * weight
     return float((a * b).sum() / ((a * a).sum() * (b * b).sum()).sqrt().clamp_min(1e-12))
