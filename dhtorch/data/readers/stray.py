@@ -9,7 +9,7 @@ read.
 
 The ``n``-th row belongs to the ``n``-th frame *stored* in the video, presented or not: the app stamps the first one
 before time 0, where an edit list may hide it. If their numbers differ, gaps and the length of the video show which rows
-have a frame, whatever its rate (:func:`dhtorch.data.clocks.pair_film`). If they do not, the edges of depth and image may
+have a frame, whatever its rate (:func:`dhtorch.data.clocks.pair_film`). If not, the edges of depth and image may
 show clearly that the first or the last frames were lost; else an option must decide.
 """
 
