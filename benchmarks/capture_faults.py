@@ -25,13 +25,16 @@ windows without a fault (false alarms) at most 2 %.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
+import multiprocessing
 import os
 import re
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -162,9 +165,7 @@ FAULTS: dict[str, PlantedFault] = {
     "exif_3": PlantedFault(("rolled", "orientation"), files=_turn_pictures(3)),
     "exif_6": PlantedFault(("rolled", "orientation"), files=_turn_pictures(6)),
     "exif_8": PlantedFault(("rolled", "orientation"), files=_turn_pictures(8)),
-    "rolled_90": PlantedFault(
-        ("rolled", "orientation"), _depth(lambda d: torch.rot90(d, 1, (-2, -1))), needs="turn"
-    ),
+    "rolled_90": PlantedFault(("rolled", "orientation"), _depth(lambda d: torch.rot90(d, 1, (-2, -1))), needs="turn"),
     "rolled_180": PlantedFault(("rolled",), _depth(lambda d: torch.rot90(d, 2, (-2, -1)))),
     "left_right": PlantedFault(("mirrored",), _depth(lambda d: d.flip(-1))),
     "upside_down": PlantedFault(("mirrored",), _depth(lambda d: d.flip(-2))),
@@ -180,7 +181,11 @@ FAULTS: dict[str, PlantedFault] = {
 }
 
 #: Faults of which the causes are words of a report line or an error instead.
-WORDS = {"orientation": "orientation", "lost": "no picture|without a picture|left out|no image|count", "intrinsics": "exchanged|intrinsics"}
+WORDS = {
+    "orientation": "orientation",
+    "lost": "no picture|without a picture|left out|no image|count",
+    "intrinsics": "exchanged|intrinsics",
+}
 
 
 def windows() -> Iterator[tuple[str, Frames, Sequence[str]]]:
@@ -276,29 +281,39 @@ def counts(frames: Frames) -> bool:
     return sorted(near)[len(near) // 2] >= 100 and float((t - t[0]).norm(dim=-1).max()) >= 0.03
 
 
+@functools.cache
+def window_frames(name: str) -> tuple[Frames, bool]:
+    """Frames of a window, and whether its faults count."""
+    torch.set_num_threads(1)
+    frames = next(frames for each, frames, _ in windows() if each == name)
+    return frames, counts(frames)
+
+
+def measure(task: tuple[str, str, str]) -> dict[str, Any] | None:
+    """Row of (window, layout, fault); None where the fault cannot be planted."""
+    window, layout, name = task
+    frames, counted = window_frames(window)
+    with tempfile.TemporaryDirectory() as scratch:
+        row = run_row(frames, layout, FAULTS[name], Path(scratch) / "capture")
+    return None if row is None else {"window": window, "layout": layout, "fault": name, "counted": counted, **row}
+
+
 def main() -> None:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="words that the row's name must contain")
+    parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    torch.set_num_threads(1)
+    tasks = [(window, layout, fault) for window, _, layouts in windows() for layout in layouts for fault in FAULTS]
+    tasks = [task for task in tasks if all(word in " ".join(task) for word in options.only.split())]
     rows = []
-    for window, frames, layouts in windows():
-        counted = None
-        for layout in layouts:
-            for name, fault in FAULTS.items():
-                label = f"{window} {layout} {name}"
-                if not all(word in label for word in options.only.split()):
-                    continue
-                counted = counts(frames) if counted is None else counted
-                with tempfile.TemporaryDirectory() as scratch:
-                    row = run_row(frames, layout, fault, Path(scratch) / "capture")
-                if row is None:
-                    continue
-                rows.append({"window": window, "layout": layout, "fault": name, "counted": counted, **row})
-                shown = "; ".join(row["lines"])[:150] if row["outcome"] not in ("right",) else ""
-                print(f"{label:44} {row['outcome']:10} {','.join(row['causes']):16} {shown}", flush=True)
+    with ProcessPoolExecutor(options.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        for row in filter(None, pool.map(measure, tasks)):
+            rows.append(row)
+            shown = "; ".join(row["lines"])[:150] if row["outcome"] not in ("right",) else ""
+            label = f"{row['window']} {row['layout']} {row['fault']}"
+            print(f"{label:44} {row['outcome']:10} {','.join(row['causes']):16} {shown}", flush=True)
     summary = summarise(rows)
     print(json.dumps(summary, indent=1))
     if options.json:
@@ -311,7 +326,9 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     sound = [row for row in rows if row["fault"] == "none"]
     counted = [row for row in planted if row["counted"]]
     good = [row for row in counted if row["outcome"] in ("right", "named", "refused")]
-    outcomes = {x: sum(row["outcome"] == x for row in planted) for x in ("right", "refused", "named", "otherwise", "silent")}
+    outcomes = {
+        x: sum(row["outcome"] == x for row in planted) for x in ("right", "refused", "named", "otherwise", "silent")
+    }
     return {
         "outcomes": outcomes,
         "n_counted": len(counted),

@@ -85,7 +85,7 @@ def _average_no_answer_shares(rows: Sequence[Row]) -> dict[str, float]:
 def describe_recovery(
     task: CompletionTask, stats: RecoveryStats, hw: tuple[int, int], check: CaptureCheck
 ) -> list[str]:
-    """Printed sentences: the capture (images (h, w)), and what was recovered; where nothing was, what its check shows."""
+    """Printed sentences: the capture (images (h, w)), and what was recovered, else what its check shows."""
     recording, (h, w) = task.recording, hw
     kind = f"{task.scene.name}: a {recording.format} capture, {format_count(len(recording), 'frame')} of {w}x{h}"
     guess = intrinsics_options.find_guess_report(recording.report)

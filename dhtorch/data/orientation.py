@@ -80,10 +80,8 @@ def orientation_scores(
     over pixels with returns. A map of another aspect ratio is stretched. One frame decides rarely against the truth
     (8 of 93), several nearly never: average the scores of a few frames.
     """
-    grey = image.float().mean(0) * (1.0 if image.dtype == torch.uint8 else 255.0)
-    scale = _GRID_PX / max(grey.shape)
-    hw = max(2, round(grey.shape[0] * scale)), max(2, round(grey.shape[1] * scale))
-    picture = _edge_vectors(_blur((_resample(grey, hw) + _DARK_OFFSET).log()), torch.ones(hw, dtype=torch.bool))
+    picture = picture_edges(image, grid_px=_GRID_PX)
+    hw = picture.shape[-2], picture.shape[-1]
     smooth = (
         _smooth_log_depth(depth, hw),
         _smooth_log_depth(depth, (hw[1], hw[0])),
@@ -95,19 +93,18 @@ def orientation_scores(
     return torch.tensor(scores, dtype=torch.float64)
 
 
-def edge_fields(image: Tensor, depth: Tensor, *, grid_px: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Edges of a picture and of its depth on one grid, as in :func:`orientation_scores` for the stored orientation.
-
-    Returns:
-        Edge vectors (3, h, w) of the picture (C, H, W), those of the depth map, and the mask (h, w) of the latter;
-        ``grid_px`` is the longer side of the grid.
-    """
+def picture_edges(image: Tensor, *, grid_px: int) -> Tensor:
+    """Edge vectors (3, h, w) of a picture (C, H, W) on a grid whose longer side is ``grid_px``."""
     grey = image.float().mean(0) * (1.0 if image.dtype == torch.uint8 else 255.0)
     scale = grid_px / max(grey.shape)
     hw = max(2, round(grey.shape[0] * scale)), max(2, round(grey.shape[1] * scale))
-    picture = _edge_vectors(_blur((_resample(grey, hw) + _DARK_OFFSET).log()), torch.ones(hw, dtype=torch.bool))
+    return _edge_vectors(_blur((_resample(grey, hw) + _DARK_OFFSET).log()), torch.ones(hw, dtype=torch.bool))
+
+
+def depth_edges(depth: Tensor, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Edge vectors (3, h, w) of a depth map resampled to a grid, and the mask (h, w) where it has returns."""
     log_depth, covered = _smooth_log_depth(depth, hw)
-    return picture, _edge_vectors(log_depth, covered), covered
+    return _edge_vectors(log_depth, covered), covered
 
 
 def select_symmetry(

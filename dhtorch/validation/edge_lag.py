@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 import torch
 
-from dhtorch.data.orientation import edge_correlation, edge_fields
+from dhtorch.data.orientation import depth_edges, edge_correlation, picture_edges
 from dhtorch.records import Frame
 
 #: Largest lag that is tried, frames. Source: chosen to equal the lags of dhtorch.validation.faults.
@@ -40,12 +40,13 @@ class EdgeLag(NamedTuple):
 def find_edge_lag(frames: Sequence[Frame]) -> EdgeLag:
     """Consecutive frames (B = 1 each, with pictures) -> lag of their depth. Gradient: none."""
     with torch.no_grad():
-        fields = [edge_fields(frame.image[0], frame.depth[0], grid_px=_GRID_PX) for frame in frames]
-    n, best = len(fields), EdgeLag(0, 0.0)
+        pictures = [picture_edges(frame.image[0], grid_px=_GRID_PX) for frame in frames]
+        hw = pictures[0].shape[-2], pictures[0].shape[-1]
+        depths = [depth_edges(frame.depth[0], hw) for frame in frames]
+    n, best = len(frames), EdgeLag(0, 0.0)
 
     def score(i: int, lag: int) -> float:
-        _, depth_edges, covered = fields[i + lag]
-        return edge_correlation(fields[i][0], depth_edges, covered)
+        return edge_correlation(pictures[i], *depths[i + lag])
 
     without = [score(i, 0) for i in range(n)]
     for lag in range(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 1):

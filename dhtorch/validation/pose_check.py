@@ -154,7 +154,7 @@ class PoseCheck:
         """Factor on translations that is no confusion of units but clearly not 1; 1 where there is none."""
         if self.tracks is not None and self.by_tracks:
             return self.tracks.best.factor if self.tracks.best.is_small_factor else 1.0
-        return self.surface_factor if self.tracks is None or math.isnan(self.tracks.stated) else 1.0
+        return self.surface_factor
 
     @property
     def contradicts(self) -> bool:
@@ -196,6 +196,8 @@ def check_poses(
 
     Gradient: none.
     """
+    if not pairs:
+        return None
     poses = poses.map(lambda x: x.double())
     readings = pose_readings()
     surface = torch.full((len(pairs), len(readings) + 1), torch.nan, dtype=torch.float64)  # the last: identity poses
