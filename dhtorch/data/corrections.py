@@ -27,7 +27,7 @@ class Corrections:
     """Options of every format; None = as the reader reads it."""
 
     depth_unit: str | float | None = None  # m, cm, mm, inch, 1/5000, or metres of one step
-    pose_convention: str | None = None  # see parse_pose_convention
+    pose_convention: str | float | None = None  # see parse_pose_convention
     depth_lag: int | None = None  # frames by which depth comes late; negative: early
     depth_turn: str | int | None = None  # a key of DEPTH_TURNS: how the stored depth is to be turned, counter-clockwise
 

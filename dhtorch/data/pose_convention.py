@@ -8,6 +8,7 @@ translations in metres, unless its format states otherwise. A :class:`PoseConven
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -103,7 +104,7 @@ def right_handed_axes() -> list[str]:
     return [axes for axes in words if float(torch.linalg.det(_axes_matrix(axes))) > 0.5]
 
 
-def parse_pose_convention(text: str) -> PoseConvention:
+def parse_pose_convention(text: str | float) -> PoseConvention:
     """Words joined by ``+`` → convention: ``opengl``, ``world_to_camera+opengl``, ``wxyz``, ``mm``, ``0.1``.
 
     Words: ``world_to_camera``; ``opengl``, ``ros`` or the directions of three axes, as ``right_up_back``; ``wxyz`` or
@@ -113,7 +114,7 @@ def parse_pose_convention(text: str) -> PoseConvention:
         ValueError: another word.
     """
     convention: dict[str, str | float | bool] = {}
-    for word in text.split("+"):
+    for word in str(text).split("+"):
         axes = _AXES_ALIASES.get(word, word)
         if word == "world_to_camera":
             convention["inverse"] = True
@@ -124,12 +125,20 @@ def parse_pose_convention(text: str) -> PoseConvention:
         elif word in UNIT_METRES:
             convention["unit"] = word
         else:
-            try:
-                convention["unit"] = float(word)
-            except ValueError:
-                known = ("world_to_camera", *_AXES_ALIASES, "right_up_back …", *_QUATERNION_ORDERS, *UNIT_METRES)
-                raise ValueError(f"pose_convention: found {word!r}, expected {', '.join(known)}") from None
+            convention["unit"] = _parse_metres(word)
     return PoseConvention(**convention)  # type: ignore[arg-type]
+
+
+def _parse_metres(word: str) -> float:
+    """A number of metres, greater than 0, as text → the number."""
+    try:
+        metres = float(word)
+    except ValueError:
+        metres = 0.0
+    if 0 < metres < math.inf:
+        return metres
+    known = ("world_to_camera", *_AXES_ALIASES, "right_up_back …", *_QUATERNION_ORDERS, *UNIT_METRES, "metres")
+    raise ValueError(f"pose_convention: found {word!r}, expected {', '.join(known)}")
 
 
 def _quaternion(R: Tensor) -> Tensor:

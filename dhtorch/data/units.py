@@ -45,14 +45,15 @@ def parse_unit(unit: str | float) -> float:
     Raises:
         ValueError: anything else.
     """
+    metres: object = unit
     if isinstance(unit, str):
         if unit in UNIT_METRES:
             return UNIT_METRES[unit]
         numerator, _, denominator = unit.removesuffix("m").strip().partition("/")
         try:
-            unit = float(numerator) / float(denominator or 1)
+            metres = float(numerator) / float(denominator or 1)
         except (ValueError, ZeroDivisionError):
-            unit = -1.0
-    if isinstance(unit, int | float) and not isinstance(unit, bool) and 0 < unit < float("inf"):
-        return float(unit)
+            metres = None
+    if isinstance(metres, int | float) and not isinstance(metres, bool) and 0 < metres < float("inf"):
+        return float(metres)
     raise ValueError(f"depth_unit: found {unit!r}, expected {', '.join(UNIT_METRES)}, 1/5000, or metres of one step")
