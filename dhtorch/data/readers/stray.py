@@ -357,7 +357,7 @@ def _choose_pairing(
     if len(candidates) == 1:
         factor = early.speed if early.speed > 1 else 1 / early.speed
         word = "fast" if early.speed > 1 else "slow"
-        pace = "" if factor < _MIN_CLOCK_FACTOR else f", its clock {factor:.4g} times as {word}"
+        pace = "" if factor < _MIN_CLOCK_FACTOR else f", it plays {factor:.4g} times as {word}"
         return early, f"paired by their time stamps{pace}" if early.by_stamps else ""
     if surplus > 0 and lost_first is None:
         return early, "paired from the first on"
