@@ -1,0 +1,147 @@
+"""Corrections of every format: each option takes what its fault has made of a capture back to the truth."""
+
+import re
+
+import pytest
+import torch
+from support import box_scene as box
+from support.stated_poses import poses_of, state_poses, with_poses
+
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.data.corrections import Corrections
+from dhtorch.data.pose_convention import parse_pose_convention
+from dhtorch.data.recording import Recording
+from dhtorch.data.units import DepthUnit
+from dhtorch.geometry import se3
+from dhtorch.records import Camera
+
+N = 6
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return box.walk(N, hw=(24, 32))
+
+
+@pytest.fixture(scope="module")
+def folder(frames, tmp_path_factory):
+    """A folder of numbered frames whose depth is in millimetres by its layout alone."""
+    root = tmp_path_factory.mktemp("counted")
+    writers.write_counted_frames(root, frames)
+    return root
+
+
+def recording(frames, **fields):
+    return Recording("box", "made", frames.__getitem__, torch.arange(10, 10 + len(frames)), **fields)
+
+
+@pytest.mark.parametrize(
+    "convention", ["world_to_camera", "opengl", "ros", "wxyz", "xyzw", "mm", "0.5", "world_to_camera+opengl"]
+)
+@pytest.mark.parametrize("write", [writers.write_counted_frames, writers.write_tum])
+def test_stated_poses_are_taken_back(convention, write, frames, tmp_path):
+    true = poses_of(frames)
+    write(tmp_path, with_poses(frames, state_poses(true, parse_pose_convention(convention))))
+    (as_read,) = data.open_all(tmp_path)
+    (corrected,) = data.open_all(tmp_path, pose_convention=convention)
+    assert float((se3.to_matrix(as_read.poses) - se3.to_matrix(true)).abs().max()) > 0.1
+    assert float((se3.to_matrix(corrected.poses) - se3.to_matrix(true)).abs().max()) < 1e-5
+    assert torch.equal(corrected[1].T_world_from_cam.t, corrected.poses.t[1:2])
+
+
+@pytest.mark.parametrize("unit", ["1/5000", "inch", 0.004])
+def test_a_unit_is_applied_to_the_stored_steps(unit, folder):
+    (as_read,) = data.open_all(folder)
+    (corrected,) = data.open_all(folder, depth_unit=unit)
+    metres = {"1/5000": 1 / 5000, "inch": 0.0254, 0.004: 0.004}[unit]
+    assert as_read.depth_unit == DepthUnit(0.001) and corrected.depth_unit == DepthUnit(metres, "option depth_unit")
+    torch.testing.assert_close(corrected[2].depth, as_read[2].depth * metres / 0.001)
+    assert torch.equal(corrected[2].image, as_read[2].image)
+
+
+def test_the_assumed_unit_may_be_confirmed(folder):
+    (confirmed,) = data.open_all(folder, depth_unit="mm")
+    assert not confirmed.depth_unit.is_assumed
+    assert torch.equal(confirmed[0].depth, data.open_all(folder)[0][0].depth)
+
+
+def test_a_unit_of_a_format_in_metres_is_a_factor(frames):
+    corrected = Corrections(depth_unit="cm").apply(recording(frames))
+    torch.testing.assert_close(corrected[0].depth, frames[0].depth / 100)
+
+
+@pytest.mark.parametrize("lag", [1, 3, -2])
+def test_a_lag_is_undone(lag, frames):
+    """Depth that comes ``lag`` frames late, with the confidence and the camera of its own frame."""
+    cameras = [Camera(torch.full((1, 2), 20.0 + k), torch.full((1, 2), 15.0)) for k in range(N)]
+    conf = [torch.full((1, 24, 32), k, dtype=torch.uint8) for k in range(N)]
+    true = [f.replace(depth_camera=c, conf=x) for f, c, x in zip(frames, cameras, conf, strict=True)]
+    places = [min(max(k - lag, 0), N - 1) for k in range(N)]
+    late = [
+        true[k].replace(depth=true[p].depth, conf=true[p].conf, depth_camera=true[p].depth_camera)
+        for k, p in enumerate(places)
+    ]
+    times = torch.arange(N, dtype=torch.float64) / 30
+    corrected = Corrections(depth_lag=lag).apply(recording(late, poses=poses_of(true), times=times))
+    assert len(corrected) == N - abs(lag)
+    for frame, number in zip(corrected, corrected.number.tolist(), strict=True):
+        want = true[number - 10]
+        assert torch.equal(frame.image, want.image) and torch.equal(frame.depth, want.depth)
+        assert torch.equal(frame.conf, want.conf) and torch.equal(frame.depth_camera.f, want.depth_camera.f)
+        assert torch.equal(frame.T_world_from_cam.t, want.T_world_from_cam.t)
+        assert float(frame.time) == float(times[number - 10])
+    assert f"depth is that of {abs(lag)} frames {'later' if lag > 0 else 'earlier'}" in corrected.report
+
+
+def test_a_lag_of_0_changes_nothing(frames):
+    whole = recording(frames)
+    assert len(Corrections(depth_lag=0).apply(whole)) == N
+    assert Corrections(depth_lag=0).apply(whole).load == whole.load
+
+
+@pytest.mark.parametrize("turn", ["left_right", "upside_down", "180", 180])
+def test_a_turn_is_undone(turn, frames):
+    undo = {"left_right": (-1,), "upside_down": (-2,), "180": (-2, -1)}[str(turn)]
+    turned = [frame.replace(depth=frame.depth.flip(undo)) for frame in frames]
+    corrected = Corrections(depth_turn=turn).apply(recording(turned))
+    assert torch.equal(corrected[3].depth, frames[3].depth) and torch.equal(corrected[3].image, frames[3].image)
+
+
+def test_all_corrections_at_once(frames):
+    opened = Corrections(depth_unit=0.5, depth_lag=1, pose_convention="cm").apply(
+        recording(frames, poses=poses_of(frames), depth_unit=DepthUnit(1.0))
+    )
+    torch.testing.assert_close(opened[0].depth, frames[1].depth / 2)
+    torch.testing.assert_close(opened.poses.t, poses_of(frames).t[:-1] / 100)
+    assert torch.equal(opened[0].image, frames[0].image)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("depth_unit", "feet", "m, cm, mm, inch"),
+        ("pose_convention", "gl", "world_to_camera, opencv"),
+        ("pose_convention", "0", "world_to_camera, opencv"),
+        ("depth_turn", 45, "90"),
+        ("depth_turn", "left", "left_right"),
+        ("depth_lag", 1.5, "a whole number of frames"),
+        ("depth_lag", "1", "a whole number of frames"),
+        ("depth_lag", True, "a whole number of frames"),
+    ],
+)
+def test_a_wrong_value_is_refused_before_anything_is_read(option, value, expected, folder):
+    with pytest.raises(ValueError, match=rf"^{option}: found {re.escape(repr(value))[:4]}.*expected .*{expected}"):
+        data.open_all(folder, **{option: value})
+
+
+@pytest.mark.parametrize("lag", [N, -N, 100])
+def test_a_lag_as_long_as_the_recording_is_refused(lag, folder):
+    with pytest.raises(ValueError, match=f"depth_lag: found {lag} for {N} frames, expected less"):
+        data.open_all(folder, depth_lag=lag)
+
+
+def test_a_factor_of_poses_may_be_a_number(folder, frames):
+    """A command line gives ``0.1`` as a number."""
+    (corrected,) = data.open_all(folder, pose_convention=0.1)
+    torch.testing.assert_close(corrected.poses.t, 0.1 * poses_of(frames).t, atol=1e-6, rtol=0)

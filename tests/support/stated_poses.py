@@ -1,0 +1,68 @@
+"""Poses as files of other conventions state them, from the true poses."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from dhtorch.data.pose_convention import PoseConvention
+from dhtorch.data.units import UNIT_METRES
+from dhtorch.geometry import se3
+from dhtorch.records import Frame, Pose
+
+#: Direction of a camera axis → vector in axes x right, y down, z forward.
+DIRECTIONS = {
+    "right": (1, 0, 0),
+    "left": (-1, 0, 0),
+    "down": (0, 1, 0),
+    "up": (0, -1, 0),
+    "forward": (0, 0, 1),
+    "back": (0, 0, -1),
+}
+
+
+def rotation(q: Tensor) -> Tensor:
+    """Unit quaternions (B, 4), x y z w → rotations (B, 3, 3)."""
+    x, y, z, w = q.unbind(-1)
+    rows = [
+        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)), -1),
+        torch.stack((2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)), -1),
+        torch.stack((2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)), -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def quaternion(R: Tensor) -> Tensor:
+    """Rotations (B, 3, 3) → unit quaternions (B, 4), x y z w: the eigenvector of the largest eigenvalue."""
+    m = R.flatten(1).unbind(-1)
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = m
+    N = [
+        [xx - yy - zz, xy + yx, xz + zx, zy - yz],
+        [xy + yx, yy - xx - zz, yz + zy, xz - zx],
+        [xz + zx, yz + zy, zz - xx - yy, yx - xy],
+        [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+    ]
+    return torch.linalg.eigh(torch.stack([torch.stack(row, -1) for row in N], -2)).eigenvectors[..., -1]
+
+
+def state_poses(true: Pose, convention: PoseConvention) -> Pose:
+    """True poses (B) → poses (B) as a reader has them from a file in a convention."""
+    axes = torch.tensor([DIRECTIONS[word] for word in convention.axes.split("_")], dtype=true.R.dtype)
+    stated = Pose(true.R @ axes.mT, true.t)
+    stated = se3.invert(stated) if convention.inverse else stated
+    R, unit = stated.R, convention.unit
+    if convention.quaternion is not None:
+        order = {"wxyz": [3, 0, 1, 2], "xyzw": [1, 2, 3, 0]}[convention.quaternion]
+        R = rotation(quaternion(R)[:, order])
+    return Pose(R, stated.t / (UNIT_METRES[unit] if isinstance(unit, str) else unit))
+
+
+def poses_of(frames: list[Frame]) -> Pose:
+    """Poses (n) of frames."""
+    poses = [frame.T_world_from_cam for frame in frames]
+    return Pose(torch.cat([p.R for p in poses]).double(), torch.cat([p.t for p in poses]).double())
+
+
+def with_poses(frames: list[Frame], poses: Pose) -> list[Frame]:
+    """Frames with other poses (n)."""
+    return [frame.replace(T_world_from_cam=poses[k : k + 1]) for k, frame in enumerate(frames)]
