@@ -1,7 +1,7 @@
 """Faults planted into captures: does opening and checking a capture read it right, or name what is wrong?
 
-    python benchmarks/capture_faults.py --json benchmarks/results/capture_faults.json     all windows, layouts and faults
-    python benchmarks/capture_faults.py --only "holo_a counted_frames lag"                rows whose name has these words
+    python benchmarks/capture_faults.py --json benchmarks/results/capture_faults.json    all
+    python benchmarks/capture_faults.py --only "holo_a counted_frames lag"               rows with these words
 
 
 A row is one window of frames, written in one layout with one fault, opened with ``format="auto"`` and checked by
@@ -102,7 +102,10 @@ def _lag(by: int) -> Callable[[Frames, CaptureWriter], Frames]:
 def _swap_bytes(frames: Frames, writer: CaptureWriter) -> Frames:
     step = writer.step_m or 0.001
     codes = [(frame.depth / step).round().clamp(0, 65535).to(torch.int32).numpy().astype(np.uint16) for frame in frames]
-    return [f.replace(depth=torch.from_numpy(c.byteswap().astype(np.float32)) * step) for f, c in zip(frames, codes)]
+    return [
+        f.replace(depth=torch.from_numpy(c.byteswap().astype(np.float32)) * step)
+        for f, c in zip(frames, codes, strict=True)
+    ]
 
 
 def _sentinel(frames: Frames, writer: CaptureWriter) -> Frames:

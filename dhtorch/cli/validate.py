@@ -59,6 +59,12 @@ _VALIDATION_LIMITS = {
 #: Columns of the page's table.
 _TABLE_COLUMNS = ("wrong, of checked", "checked, of depth", "scale", "shift, m", "tilt", "cut at, m")
 
+#: Difference of a scale from 1, as a log ratio, from which the wrong one of sensor and maps is named.
+_MIN_SCALE_DIFFERENCE = 0.03
+
+#: The poses agree with one of the two if its log ratio to them is at most this fraction of the other's.
+_MAX_WITNESS_RATIO = 1 / 3
+
 _LIMIT_PATTERN = re.compile(r"\s*([a-z_]+)\s*>\s*([0-9.eE+-]+)\s*")
 
 
@@ -335,6 +341,7 @@ def _summarise_recording(validated: RecordingValidation) -> Row:
     }
     return {
         "frames": len(rows),
+        "has_maps": validated.maps is not None,
         "pixels": pixels,
         "median": medians,
         "wrong": count["wrong"] / checked if checked else None,
@@ -398,7 +405,31 @@ def _format_summary(name: str, summary: Row, notes: Sequence[str] = ()) -> list[
         lines.append(f"  likely cause in {n} of {format_count(summary['windows'], 'window')}: {cause}")
     if summary["clip_depth"] is not None and not any(cause.startswith("cut at") for cause in summary["causes"]):
         lines.append(f"  cut at {summary['clip_depth']:.3g} m: larger depths are set to this value")
+    if summary["has_maps"]:
+        lines += [f"  {line}" for line in _name_wrong_scale(medians, limited["scale"])]
     return lines + [f"  {note}" for note in notes]
+
+
+def _name_wrong_scale(medians: Mapping[str, float | None], deviation: float | None) -> list[str]:
+    """Sentence on whether the sensor or the maps have the wrong scale, by the poses as a third witness.
+
+    Args:
+        medians: ``scale``, maps over the sensor's near returns, and ``scale_vs_trajectory``, the sensor's depth over
+            what the poses imply; None = not measured.
+        deviation: distance of the interval of ``scale`` from 1.
+    """
+    scale, sensor = medians["scale"], medians["scale_vs_trajectory"]
+    if scale is None or scale <= 0 or not deviation or abs(math.log(scale)) < _MIN_SCALE_DIFFERENCE:
+        return []
+    start = f"maps are {_format_factor(scale)} times the sensor's depth"
+    if sensor is None or sensor <= 0:
+        return [f"{start}; without usable poses it cannot be known which of the two is wrong"]
+    off_maps, off_sensor = abs(math.log(scale * sensor)), abs(math.log(sensor))
+    if off_maps < _MAX_WITNESS_RATIO * off_sensor:
+        return [f"{start}, and agree with the poses: the sensor's scale is wrong (data.depth_unit=)"]
+    if off_sensor < _MAX_WITNESS_RATIO * off_maps:
+        return [f"{start}, which agrees with the poses: the maps' scale is wrong"]
+    return [f"{start}; the poses agree with neither, it cannot be known which is wrong"]
 
 
 def _format_factor(value: float) -> str:
