@@ -150,10 +150,13 @@ class AlignmentOptions:
     #: Fewest near returns that show that inverse depth is linear in the values, not depth. Source: origin not recorded.
     family_min_references: int = 50
 
-    #: Median relative error of a line from value to depth up to which the map is one of depth, and the largest ratio of
-    #: the error of a line to inverse depth to it. Source: chosen on depth of ten recordings of DHTORCH_DATA as z-buffer
-    #: and as disparity, ratios below 0.001, and with every fault of synthetic.depth_faults, above 0.24.
+    #: Median relative error of a line from value to depth up to which the map is one of depth.
+    #: Source: chosen on depth of ten recordings of DHTORCH_DATA as z-buffer and as disparity.
     family_min_error: float = 0.001
+
+    #: Largest ratio of the error of a line to inverse depth to that error at which the map is one of inverse depth.
+    #: Source: chosen on depth of ten recordings of DHTORCH_DATA as z-buffer and as disparity, ratios below 0.001, and
+    #: with every fault of synthetic.depth_faults, above 0.24.
     family_max_ratio: float = 0.2
 
     # Residual noise

@@ -21,24 +21,26 @@ from torch import Tensor
 
 from dhtorch.geometry.checks import is_static
 
-#: Depth codes that mean *no return*, 0 first. Source: 0, 16-bit PNG by convention; 65535, unsigned 16-bit saturation
-#: (ScanNet++, MatrixCity, Azure Kinect exports).
+#: Depth codes that mean *no return*, 0 first. Source: derived, 0 by the convention of 16-bit PNG; 65535, unsigned
+#: 16-bit saturation (ScanNet++, MatrixCity, Azure Kinect exports).
 NO_DEPTH_CODES: Final = (0, 65535)
 
-#: Values in m that mean *no return*, and their relative rounding in float32.
+#: Values in m that mean *no return*.
 #: Source: derived, 65535 / 1000; largest finite half float (UnrealCV, AirSim, Blender); 65535 as a float.
 _NO_DEPTH_METRES: Final = (65.535, 65504.0, 65535.0)  # increasing
+
+#: Relative rounding of these values in float32. Source: derived, some units of the last place, 1.2e-7.
 _FLOAT32_ROUNDING: Final = 3e-7
 
-#: Least distance of a far constant, m. Source: origin not recorded; beyond the surfaces of most rooms.
+#: Least distance of a far constant, m, beyond the surfaces of most rooms. Source: origin not recorded.
 _MIN_FAR_M: Final = 10.0
 
 #: Least share of the map's pixels that have a far constant. Source: chosen on the captures of DHTORCH_DATA, where no
 #: share of the largest value from 10 m on is above 0.1 %.
 _MIN_FAR_SHARE: Final = 0.01
 
-#: Grid of distances, m, of which a far constant is usually a multiple. Source: far planes and depth limits of
-#: simulators and data sets: 10, 20, 50, 80, 100, 200, 1000 m.
+#: Grid of distances, m, of which a far constant is usually a multiple. Source: chosen on far planes and
+#: depth limits of simulators and data sets: 10, 20, 50, 80, 100, 200, 1000 m.
 _FAR_GRID_M: Final = 10.0
 
 #: Most values between half a far constant and it, per value equal to it. Source: origin not recorded.

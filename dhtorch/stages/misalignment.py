@@ -51,7 +51,7 @@ MIN_ROLLING_UNEXPLAINED = 0.5
 MIN_TESTED_RETURNS = 24
 
 #: Limits the near returns of a pair on which other attachments are tried, a count; more are thinned evenly.
-#: Source: chosen for speed, a quarter of the default samples.
+#: Source: derived, a quarter of the default samples; limits the time.
 MAX_ATTACHED_RETURNS = 512
 
 #: Least fraction of the near returns that another attachment must also have a return for, without unit.

@@ -55,13 +55,17 @@ _OPTIONS: Final = ValidationOptions(max_window_pairs=6)
 _MAX_EXPLAINED_LOSS: Final = 0.25
 
 #: Pictures instead of depth have a fault if undoing it in the depth raises the disagreement of surfaces under the poses
-#: by this ratio and this difference. Source: origin not recorded.
+#: by this ratio. Source: origin not recorded.
 _MIN_WORSE_RATIO: Final = 1.5
+
+#: Least difference of that disagreement. Source: origin not recorded.
 _MIN_WORSE_DISAGREEMENT: Final = 0.003
 
-#: Offsets of the principal point from the middle of the picture, as fractions of its sides: above the first it is far,
-#: below the second near. Source: origin not recorded; K of the shared data are at most 0.04 off.
+#: Offset of the principal point from the middle of the picture, as a fraction of its sides, above which it is far.
+#: Source: chosen on K of the shared data, which are at most 0.04 off.
 _FAR_PRINCIPAL_POINT: Final = 0.08
+
+#: Offset up to which it is near. Source: chosen on K of the shared data, which are at most 0.04 off.
 _NEAR_PRINCIPAL_POINT: Final = 0.05
 
 #: Epipolar distances at which pictures are said to follow one of two sets of poses: the smaller median is at most this

@@ -23,16 +23,19 @@ _KINDS: Final = ("mirrored", "rolled", "registration")
 #: Frames that are examined, evenly spread. Limits the time to about a second. Source: origin not recorded.
 _MAX_FRAMES: Final = 6
 
-#: Fewest frames. Source: as the orientation of files, where three frames never decided wrongly.
+#: Fewest frames. Source: derived, as the orientation of files, where three
+#: frames never decided wrongly.
 _MIN_FRAMES: Final = 3
 
-#: Longer side of the grid on which edges are compared, px. Source: as :mod:`dhtorch.data.orientation`.
+#: Longer side of the grid on which edges are compared, px. Source: derived, as :mod:`dhtorch.data.orientation`.
 _GRID_PX: Final = 160
 
-#: A fault is reported if the mean correlation of edges with it undone exceeds that without by this, and by this many
-#: standard errors over the frames. Source: chosen on the sound captures of the shared data (at most 0.03: 7-Scenes,
-#: whose depth lies some pixels beside its pictures) and on planted faults.
+#: A fault is reported if the mean correlation of edges with it undone exceeds that without by this.
+#: Source: chosen on the sound captures of the shared data (at most 0.03: 7-Scenes, whose depth lies some pixels beside
+#: its pictures) and on planted faults.
 _MIN_LEAD: Final = 0.05
+
+#: Least lead in standard errors over the frames. Source: origin not recorded.
 _MIN_LEAD_ERRORS: Final = 4.0
 
 

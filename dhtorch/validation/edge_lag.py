@@ -13,17 +13,19 @@ import torch
 from dhtorch.data.orientation import depth_edges, edge_correlation, picture_edges
 from dhtorch.records import Frame
 
-#: Largest lag that is tried, frames. Source: chosen to equal the lags of dhtorch.validation.faults.
+#: Largest lag that is tried, frames. Source: derived, the largest lag of dhtorch.validation.faults.
 _MAX_LAG_FRAMES: Final = 5
 
 #: Longer side of the grid on which edges are compared, px.
 #: Source: chosen on lags planted into holo_a, 7-Scenes and desk9 (160 misses lags of one frame).
 _GRID_PX: Final = 320
 
-#: A lag is reported if the mean correlation of edges exceeds that without lag by this, and by this many standard errors
-#: over the frames. Source: chosen on the sound captures of the shared data: at most 0.030 (7-Scenes, whose depth lies
+#: A lag is reported if the mean correlation of edges exceeds that without lag by this.
+#: Source: chosen on the sound captures of the shared data: at most 0.030 (7-Scenes, whose depth lies
 #: some pixels beside its pictures), and on planted lags of one frame: at least 0.042 where pictures move 3 px a frame.
 _MIN_LEAD: Final = 0.038
+
+#: Least lead in standard errors over the frames. Source: origin not recorded.
 _MIN_LEAD_ERRORS: Final = 4.0
 
 #: Fewest frames with both a picture and the depth of another frame. Source: origin not recorded.

@@ -39,7 +39,7 @@ _MAX_RETURNS: Final = 3000
 _MIN_MEETING_RETURNS: Final = 50
 
 #: Largest lag between depth and poses that is tried, frames.
-#: Source: chosen to equal the lags of dhtorch.validation.faults.
+#: Source: derived, the largest lag of dhtorch.validation.faults.
 _MAX_LAG_FRAMES: Final = 5
 
 #: Factors on translations that are tried around 1, where a factor is not a confusion of units.
@@ -77,25 +77,31 @@ _CONTRADICTION_LIMITS: Final = ((2.0, 0.01), (3.0, 0.003))
 #: Source: chosen on the sound captures of the shared data: at most 1.6 % between neighbouring views.
 _MAX_UNEXPLAINED_DISAGREEMENT: Final = 0.05
 
-#: A factor near 1 is reported if the disagreement without it is larger by this ratio and the factor differs from 1 by
-#: more than this.
+#: A factor near 1 is reported if the disagreement without it is larger by this ratio.
 #: Source: chosen on the sound captures of the shared data (largest ratio 1.1) and on depth that is 10 % too long.
 _MIN_FACTOR_GAIN: Final = 1.25
+
+#: Least difference from 1 of a factor that is reported.
+#: Source: chosen on the sound captures of the shared data and on depth that is 10 % too long.
 _MIN_FACTOR_OFFSET: Final = 0.045
 
-#: By tracks another reading is clearly better if its loss is at most this fraction of that of the stated poses, which
-#: is at least this. Source: chosen on the sound captures of the shared data (fraction at least 0.81, or a loss of
-#: 0.15 or less) and on planted conventions and a factor of 1.1 (fraction at most 0.31).
+#: By tracks another reading is clearly better if its loss is at most this fraction of that of the stated poses.
+#: Source: chosen on the sound captures of the shared data (at least 0.81) and on planted conventions and a factor of
+#: 1.1 (at most 0.31).
 _MAX_TRACK_LOSS_RATIO: Final = 0.6
+
+#: Least loss of the stated poses for that. Source: chosen on the sound captures of the shared data: 0.15 or less where
+#: the fraction is small.
 _MIN_TRACK_LOSS: Final = 0.2
 
-#: Miss at which the loss of a tracked return is a half, px of a picture 640 wide. Source: as ValidationOptions.
+#: Miss at which the loss of a tracked return is a half, px of a picture 640 wide. Source: ValidationOptions.
 _HALF_LOSS_PX: Final = 2.0
 
-#: Tracked near returns that a pair must have. Source: as dhtorch.validation.faults.
+#: Tracked near returns that a pair must have. Source: derived, as dhtorch.validation.faults.
 _MIN_TRACKS: Final = 12
 
 #: Metres of one step of common depth files, tried where the depth unit may be the wrong one.
+#: Source: derived, metres, cm, mm and inches, and the steps of TUM, KITTI, Replica and LeRobot's or ScanNet's files.
 _COMMON_DEPTH_UNITS_M: Final = (1.0, 1e-2, 1e-3, 1e-4, 1 / 5000, 1 / 256, 1 / 6553.5, 1 / 4000, 0.0254)
 
 
