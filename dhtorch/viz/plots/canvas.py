@@ -6,10 +6,12 @@ changes.
 
 from __future__ import annotations
 
+import pathlib
 import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
+from dhtorch.runtime import storage
 from dhtorch.viz.plots.colours import GREY_CMAP, INK, PAPER_EDGE, SOFT, Stroke
 
 #: Font size of text, points.
@@ -212,7 +214,11 @@ def save_figure(figure: Any, path: Any) -> None:
     """Write a figure, including artists outside its axes."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph")  # glyphs missing in the font
-        figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
+        if not isinstance(path, str | pathlib.Path):  # an open file
+            figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
+            return
+        with storage.replace_at_end(path) as unfinished:
+            figure.savefig(unfinished, bbox_inches="tight", pad_inches=0.1, format=pathlib.Path(path).suffix[1:])
 
 
 def _make_legend_handle(key: LegendKey) -> Any:

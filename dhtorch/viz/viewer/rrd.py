@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.codes import Gate, Source, names, words
+from dhtorch.runtime import storage
 from dhtorch.viz.plots.colours import DEPTH_CMAP, GATE_COLOURS, RECOVERED, SENSOR, SWEPT, UNANSWERED, parse_rgb
 from dhtorch.viz.viewer.exhibit import Exhibit, ExhibitView, PairExhibit, PointCloud
 
@@ -36,12 +37,12 @@ def write_rrd(path: Path, scene: Exhibit) -> Path:
         OSError: the file cannot be written.
     """
     rr = _import_rerun()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    stream = rr.RecordingStream("dhtorch")
-    stream.save(path, default_blueprint=_make_blueprint())
-    _log_exhibit(rr, stream, scene)
-    stream.flush()
-    stream.disconnect()
+    with storage.replace_at_end(path) as unfinished:
+        stream = rr.RecordingStream("dhtorch")
+        stream.save(unfinished, default_blueprint=_make_blueprint())
+        _log_exhibit(rr, stream, scene)
+        stream.flush()
+        stream.disconnect()
     return path
 
 
