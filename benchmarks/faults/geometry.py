@@ -6,10 +6,18 @@ TESTS: dict[str, list[str]] = {
     "geometry.epipolar": ["tests/geometry/test_epipolar.py", "tests/test_contract.py"],
     "geometry.checks": ["tests/geometry/test_camera.py", "tests/test_contract.py"],
     "geometry.determinism": ["tests/geometry/test_se3.py", "tests/test_contract.py"],
+    "geometry.no_depth": ["tests/geometry/test_no_depth.py"],
     "geometry.linalg": ["tests/geometry/test_linalg.py", "tests/test_contract.py"],
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
+    "geometry.no_depth": [
+        ("clear_no_depth", "(depth > 0) & (depth < torch.inf)", "depth > 0"),
+        ("clear_saturated", "NO_DEPTH_CODES[-1] * unit", "NO_DEPTH_CODES[-1]"),
+        ("_find_far_constant", "(n_returns > n_far)", "(n_returns > 0)"),
+        ("_find_far_constant", "on_grid | (n_nearby", "on_grid & (n_nearby"),
+        ("_find_far_constant", "& (n_far >= _MIN_FAR_SHARE * probes.shape[-1])", ""),
+    ],
     "geometry.linalg": [
         ("determinant_2x2", "a * d - b * c", "a * d + b * c"),
         ("adjugate_2x2", "d, -b, -c, a", "a, -b, -c, d"),
