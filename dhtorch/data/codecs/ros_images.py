@@ -6,11 +6,10 @@ import struct
 from pathlib import Path
 from typing import Final
 
-import cv2
 import numpy as np
 
 from dhtorch.data.codecs.ros_messages import CameraInfo, RawImage
-from dhtorch.data.io.decode import MAX_PIXELS, FormatError, decode_depth_png, to_metres
+from dhtorch.data.io.decode import MAX_PIXELS, FormatError, convert_colour, decode_depth_png, to_metres
 
 #: Encoding of depth → type of its pixels.
 DEPTH_ENCODINGS: Final = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
@@ -21,14 +20,14 @@ COLOUR_CHANNELS: Final = {
     "bayer_rggb8": 1, "bayer_bggr8": 1, "bayer_gbrg8": 1, "bayer_grbg8": 1,
 }  # fmt: skip
 
-#: Encoding → conversion to RGB; OpenCV names a Bayer pattern by its second row.
+#: Encoding → name of OpenCV's conversion to RGB; it names a Bayer pattern by its second row.
 _CONVERSIONS: Final = {
-    "bgr8": cv2.COLOR_BGR2RGB, "8UC3": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB,
-    "bgra8": cv2.COLOR_BGRA2RGB, "8UC4": cv2.COLOR_BGRA2RGB,
-    "yuv422": cv2.COLOR_YUV2RGB_UYVY, "uyvy": cv2.COLOR_YUV2RGB_UYVY,
-    "yuv422_yuy2": cv2.COLOR_YUV2RGB_YUY2, "yuyv": cv2.COLOR_YUV2RGB_YUY2,
-    "bayer_rggb8": cv2.COLOR_BayerBG2RGB, "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB, "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
+    "bgr8": "BGR2RGB", "8UC3": "BGR2RGB", "rgba8": "RGBA2RGB",
+    "bgra8": "BGRA2RGB", "8UC4": "BGRA2RGB",
+    "yuv422": "YUV2RGB_UYVY", "uyvy": "YUV2RGB_UYVY",
+    "yuv422_yuy2": "YUV2RGB_YUY2", "yuyv": "YUV2RGB_YUY2",
+    "bayer_rggb8": "BayerBG2RGB", "bayer_bggr8": "BayerRG2RGB",
+    "bayer_gbrg8": "BayerGR2RGB", "bayer_grbg8": "BayerGB2RGB",
 }  # fmt: skip
 
 _PNG_SIGNATURE: Final = b"\x89PNG"
@@ -48,11 +47,8 @@ def decode_colour(image: RawImage, file: Path) -> np.ndarray:
     if image.encoding not in COLOUR_CHANNELS:
         raise FormatError(file, "encoding", image.encoding, ", ".join(COLOUR_CHANNELS))
     pixels = _rows(image, np.dtype(np.uint8), COLOUR_CHANNELS[image.encoding], file)
-    try:
-        if image.encoding in _CONVERSIONS:
-            pixels = cv2.cvtColor(pixels, _CONVERSIONS[image.encoding])
-    except cv2.error as error:
-        raise FormatError(file, "data", error.err, f"pixels of {image.encoding}") from None
+    if image.encoding in _CONVERSIONS:
+        pixels = convert_colour(pixels, _CONVERSIONS[image.encoding], file)
     return pixels.transpose(2, 0, 1).copy()
 
 

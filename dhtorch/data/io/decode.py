@@ -118,6 +118,18 @@ def decode_image(
     return np.ascontiguousarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB).transpose(2, 0, 1))
 
 
+def convert_colour(pixels: np.ndarray, conversion: str, file: Path) -> np.ndarray:
+    """Pixels (h, w, C) uint8 after OpenCV's colour conversion of that name, as ``BGR2RGB``; ``file`` is for errors.
+
+    Raises:
+        FormatError: pixels that the conversion does not accept.
+    """
+    try:
+        return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{conversion}")))
+    except cv2.error as error:
+        raise FormatError(file, "data", error.err, f"pixels for {conversion}") from None
+
+
 def read_depth_png(
     file: Path,
     units_per_metre: float,
