@@ -62,7 +62,7 @@ def select_episode_rows(
     stamp = table["timestamp"][rows].astype(np.float64)
     number = table["frame_index"][rows].astype(np.float64) if "frame_index" in table else np.arange(float(len(rows)))
     numbered = (number >= 0) & (number < 2**31) & (number == np.floor(number))  # not NaN
-    report = []
+    report: list[str] = []
     if "frame_index" in table and bool((numbered & _is_increasing(number, numbered)).all()):
         stamp, report = _replace_disordered(stamp, number / meta.fps, f"episode {episode.number}")
     valid = numbered & (stamp >= 0) & (stamp < 1e9)
