@@ -158,6 +158,9 @@ def _lose_pictures(root: Path) -> bool:
     return len(files) > 8
 
 
+#: Outcomes of a planted fault that mislead nobody.
+GOOD_OUTCOMES = ("right", "named", "refused")
+
 _POSES = ("poses",)
 FAULTS: dict[str, PlantedFault] = {
     "none": PlantedFault(()),
@@ -362,7 +365,8 @@ def main() -> None:
     summary = summarise(rows)
     print(json.dumps(summary, indent=1))
     if options.json:
-        options.json.write_text(json.dumps({"summary": summary, "rows": rows}, indent=1) + "\n", encoding="utf-8")
+        kept = [{**row, "lines": row["lines"][:1]} for row in rows]
+        options.json.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -370,7 +374,7 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     planted = [row for row in rows if row["fault"] != "none"]
     sound = [row for row in rows if row["fault"] == "none"]
     counted = [row for row in planted if row["counted"]]
-    good = [row for row in counted if row["outcome"] in ("right", "named", "refused")]
+    good = [row for row in counted if row["outcome"] in GOOD_OUTCOMES]
     outcomes = {
         x: sum(row["outcome"] == x for row in planted) for x in ("right", "refused", "named", "otherwise", "silent")
     }

@@ -491,6 +491,37 @@ def clients() -> str:
     )
 
 
+def faults_of_captures() -> str:
+    """Planted faults of captures: outcomes by fault, over windows and layouts."""
+    rows = [row for row in json.loads((RESULTS / "capture_faults.json").read_text()) if row["counted"]]
+    cells = []
+    for fault in dict.fromkeys(row["fault"] for row in rows):
+        outcomes = [row["outcome"] for row in rows if row["fault"] == fault]
+        counts = [str(outcomes.count(x) or "") for x in ("right", "refused", "named", "otherwise", "silent", "alarm")]
+        cells.append([f"`{fault}`", str(len(outcomes)), *counts])
+    return table(
+        ["fault", "captures", "read right", "refused", "named", "other warning", "silent", "false alarm"], cells
+    )
+
+
+def sensitivities() -> str:
+    """Options whose half or twice value changes coverage or median error most, and those that change neither."""
+    rows = json.loads((RESULTS / "sensitivity.json").read_text())
+    numbers = ("coverage", "median_rel")
+    cells = []
+    for row in rows:
+        shown = [
+            " / ".join(
+                "–" if row[at].get(x) is None or row[at][x] != row[at][x] else f"{row[at][x]:.3f}"
+                for at in ("half", "as_is", "twice")
+            )
+            for x in numbers
+        ]
+        cells.append([f"`{row['name']}`", f"{row['value']:g}", *shown, "yes" if row["candidate_for_removal"] else ""])
+    head = ["option", "value", "coverage at half / value / twice", "median error", "changes nothing"]
+    return table(head, cells)
+
+
 def client(name: str) -> str:
     """A script of ``clients/`` as it stands."""
     return f"```python\n{(HERE / 'clients' / f'{name}.py').read_text(encoding='utf-8').rstrip()}\n```"
@@ -521,6 +552,8 @@ TABLES |= {
     "enriched": enriched,
     "loader": loader_times,
     "questions": questions,
+    "capture faults": faults_of_captures,
+    "sensitivity": sensitivities,
 }
 
 #: Numbers of the method comparison in words, and on which side of its bar each belongs.

@@ -36,6 +36,7 @@ EXPERIMENTS = {
     "stress": "experiment=method_comparison data=synthetic_stress experiment.seeds=2",
     "views_study": "experiment=views_study data=shared_scenes experiment.reference_views=3",
     "dense": "experiment=dense_comparison data=shared_scenes experiment.reference_views=6",
+    "field_study": "experiment=field_study",
     "validate_study": "experiment=validate_study data=shared_scenes",
     "validate_study_streams": "experiment=validate_study data=streams experiment.rooms=[]",
     "validate_study_unseen": "experiment=validate_study data=synthetic_seeds "
@@ -90,6 +91,8 @@ SCRIPTS |= {
     "dense_speed": "--clock cpu --repeats 5",
     "start": "--clock cpu --repeats 3",
     "degenerate": "",
+    "sensitivity": "",
+    "capture_faults": "",
     "mutants": "--quiet",
     "kornia": "--clock cpu",
     "xfeat_noise": "",

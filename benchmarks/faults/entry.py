@@ -264,7 +264,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("OutputFolder.remove", "return False", "pass"),
         ("OutputFolder.remove", "if is_own:", "if True:"),
         ("OutputFolder.adopt", "if not is_private(Path(self._name(path)))", ""),
-        ("OutputFolder._open_manifest", "os.write(self._handle, b\"\\n\")", "pass"),
+        ("OutputFolder._open_manifest", 'os.write(self._handle, b"\\n")', "pass"),
         ("OutputFolder._close", "if not self._entries:", "if True:"),
         ("OutputFolder._remove_unfinished", "[] if folder.is_symlink() else", ""),
         ("open_output_folder", "opened._remove_unfinished()", "pass"),
@@ -274,7 +274,11 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("open_output_file", "is_inside = (file.parent / PRIVATE_FOLDER).is_dir()", "is_inside = False"),
         ("find_output_folder", "len(each.root.parts)", "-len(each.root.parts)"),
         ("is_private", 'part.startswith(".") and', ""),
-        ("find_relative_path", '".." not in (name := absolute.relative_to(root)).parts', "(name := absolute.relative_to(root))"),
+        (
+            "find_relative_path",
+            '".." not in (name := absolute.relative_to(root)).parts',
+            "(name := absolute.relative_to(root))",
+        ),
     ],
     "runtime.results": [
         ("_RESULT_SCHEMA", "1", "2"),
