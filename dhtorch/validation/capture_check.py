@@ -166,7 +166,8 @@ def _first_of_window(recording: Recording) -> int:
         return last // 2
     step = recording.poses.t.diff(dim=0).norm(dim=-1).nan_to_num(0.0)
     # Steps far above the others are jumps of the tracking, not motion.
-    step = step.clamp(max=4 * float(step.median()))
+    moving = step[step > 0]
+    step = step.clamp(max=4 * float(moving.median())) if len(moving) else step
     total = torch.cat((torch.zeros(1, dtype=step.dtype), step.cumsum(0)))
     length = total[WINDOW_FRAMES - 1 :] - total[: len(total) - WINDOW_FRAMES + 1]
     return int(length[: last + 1].argmax())

@@ -1,0 +1,228 @@
+"""Every command checks its capture first: notes and warnings are printed, refuted poses are removed, maps still joined."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from support import box_scene as box
+from support import textured_box
+from support.stated_poses import poses_of, state_poses, with_poses
+
+from dhtorch import data
+from dhtorch import testing as writers
+from dhtorch.cli import capture_checks, inspect, process_capture, recover_page
+from dhtorch.cli.capture_checks import check_data, check_scene, print_check
+from dhtorch.data.pose_convention import parse_pose_convention
+from dhtorch.data.recording import Recording, Recordings
+from dhtorch.data.scene import Scene, Scenes
+from dhtorch.data.survey import Survey
+from dhtorch.data.units import DepthUnit
+from dhtorch.geometry import se3
+from dhtorch.runtime import console
+from dhtorch.validation.capture_check import CaptureCheck, Finding
+
+FINDING = Finding("poses", "poses and depth contradict each other", "data.pose_convention=opengl")
+ASSUMED = "depth unit assumed: 1/1000 m (data.depth_unit= sets it)"
+
+
+def recording(root, name="box", poses=True, n=3):
+    frames = box.walk(n, hw=(6, 8))
+    return Recording(
+        name,
+        "made",
+        frames.__getitem__,
+        torch.arange(n),
+        root=root,
+        poses=poses_of(frames) if poses else None,
+        report=("a frame was left out",),
+        depth_unit=DepthUnit(0.001),
+    )
+
+
+@pytest.fixture
+def checked(monkeypatch):
+    """Names of the recordings that were checked; every check refutes the poses, if there are any."""
+    names = []
+
+    def check(recording, frames=None, *, seed=0):
+        names.append(recording.name)
+        findings = () if recording.poses is None else (FINDING,)
+        return CaptureCheck(replace(recording, poses=None), ASSUMED, findings)
+
+    monkeypatch.setattr(capture_checks, "check_capture", check)
+    return names
+
+
+def test_a_recording_is_checked_and_its_report_has_all_lines(checked, tmp_path, capsys):
+    with pytest.warns(UserWarning, match=r"^box: poses and depth contradict each other \(remedy: data\.pose_con"):
+        scene = check_data(recording(tmp_path))
+    assert isinstance(scene, Scene) and scene.recording.poses is None
+    assert scene.recording.report == (ASSUMED, "a frame was left out", str(FINDING))
+    out, err = capsys.readouterr()
+    assert out == "" and err.splitlines() == [f"box: {ASSUMED}", "box: a frame was left out"]
+
+
+def test_notes_of_a_scene_are_kept(checked, tmp_path):
+    with pytest.warns(UserWarning, match="contradict"):
+        scene = check_data(Scene(recording(tmp_path), near=1.5, gap=4))
+    assert (scene.near, scene.gap, scene.recording.poses) == (1.5, 4, None)
+
+
+def test_quiet_prints_no_notes_but_warns(tmp_path, capsys, monkeypatch):
+    check = CaptureCheck(recording(tmp_path), ASSUMED, (FINDING,))
+    monkeypatch.setattr(capture_checks, "get_verbosity", lambda: "quiet")
+    with pytest.warns(UserWarning, match="^name: poses"):
+        print_check("name", check)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_recordings_that_are_not_from_disk_are_left_alone(checked):
+    scene = Scene(recording(None))
+    assert check_scene(scene) is scene and checked == []
+
+
+def test_a_list_is_checked_up_to_its_first_dozen(checked, tmp_path):
+    scenes = [recording(tmp_path, f"box{k}", poses=k != 1) for k in range(14)]
+    with pytest.warns(UserWarning, match="contradict") as caught:
+        got = check_data(scenes)
+    assert checked == [f"box{k}" for k in range(12)] and len(caught) == 11
+    assert [scene.name for scene in got] == [each.name for each in scenes]
+    assert [scene.recording.poses is None for scene in got] == [True] * 12 + [False] * 2
+
+
+def test_a_lazy_set_is_judged_by_its_first_recording(checked, tmp_path):
+    opened = []
+
+    def make(k):
+        opened.append(k)
+        return recording(tmp_path, f"box{k}")
+
+    names = [f"box{k}" for k in range(1000)]
+    with pytest.warns(UserWarning, match="contradict") as caught:
+        scenes = check_data(Recordings(names, make))
+    assert len(caught) == 1 and checked == ["box0"] and set(opened) == {0}, "the others stay unopened"
+    assert isinstance(scenes, Scenes) and len(scenes) == 1000
+    assert scenes[0].recording.poses is None and scenes[777].recording.poses is None
+    assert scenes[777].name == "box777"
+
+
+def test_a_sound_lazy_set_keeps_its_poses_and_notes(monkeypatch, tmp_path):
+    monkeypatch.setattr(capture_checks, "check_capture", CaptureCheck)
+    whole = Scenes(Recordings(["a", "b"], lambda k: recording(tmp_path, "ab"[k])), lambda r: Scene(r, near=2.0))
+    scenes = check_data(whole)
+    assert scenes[1].recording.poses is not None and scenes[1].near == 2.0
+
+
+@pytest.mark.parametrize("other", [None, "text", 3, [1, 2], {"a": 1}])
+def test_other_data_are_returned_as_they_are(other):
+    assert check_data(other) is other
+
+
+# ------------------------------------------------------------------------------------------------------------- commands
+
+
+@pytest.fixture(scope="module")
+def refuted(tmp_path_factory):
+    """A capture whose poses have OpenGL camera axes."""
+    frames = [textured_box.near(textured_box.view(textured_box.at(k))) for k in range(8)]
+    root = tmp_path_factory.mktemp("captures") / "walk"
+    opengl = state_poses(poses_of(frames), parse_pose_convention("opengl"))
+    writers.write_counted_frames(root, with_poses(frames, opengl))
+    return root
+
+
+def test_inspect_shows_unit_agreement_and_findings(refuted):
+
+    survey = Survey("walk", "frames_dir")
+    inspect.add_check(survey, data.open(refuted))
+    facts = dict(survey.facts)
+    assert facts["unit"] == ASSUMED
+    assert "agree to" in facts["depth and poses"] and "% without poses" in facts["depth and poses"]
+    (warning,) = survey.warnings
+    assert "OpenGL camera axes" in warning and "remedy: data.pose_convention=opengl" in warning
+    corrected = Survey("walk", "frames_dir")
+    inspect.add_check(corrected, data.open(refuted, pose_convention="opengl", depth_unit="mm"))
+    assert corrected.warnings == [] and dict(corrected.facts)["unit"] == "depth unit: 1/1000 m (option depth_unit)"
+
+
+def test_a_refuted_capture_is_joined_by_the_motion_of_near_returns(refuted, tmp_path, command):
+    little = ["method=map", "method.n=512", "planes=16", "steps=[2]", "mesh=false", "threads=1"]
+    with pytest.warns(UserWarning, match="these look like OpenGL camera axes"):
+        code, out, err = command(str(refuted), f"out={tmp_path / 'out'}", *little)
+    assert code == 0, err
+    assert f"walk: {ASSUMED}" in err
+    assert "The map is joined by the motion that near returns give (" in out and "the stated poses are refuted" in out
+    page = (tmp_path / "out" / "view.html").read_text(encoding="utf-8")
+    assert "Depth unit assumed: 1/1000 m" in page and "Warning: poses and depth contradict each other" in page
+    rows = [json.loads(file.read_text()) for file in (tmp_path / "out" / "meta").iterdir()]
+    motions = [row["motions"] for row in rows]
+    assert any(motions) and all(np.shape(matrix) == (4, 4) for each in motions for matrix in each.values())
+
+
+# ------------------------------------------------------------------------------------------------------ chained motions
+
+
+def recovered(rows, poses=None, frames=(2, 0, 4)):
+    """Completed frames of a recording of 6, numbered from 10, with rows by frame."""
+    task = SimpleNamespace(
+        recording=Recording("box", "made", lambda i: None, torch.arange(10, 16), poses=poses),
+        done={f"{i:06d}": rows[i] for i in frames},
+        name=lambda i: f"{i:06d}",
+    )
+    return process_capture.RecoveredFrames(task, list(frames), {}, 0)
+
+
+def motion(true, i, j):
+    """Matrix (4, 4) of the pose of view j relative to frame i, as a row has it."""
+    return se3.to_matrix(se3.relative(true[i : i + 1], true[j : j + 1]))[0].tolist()
+
+
+def test_motions_are_chained_from_the_first_frame():
+    true = poses_of(box.walk(6, hw=(2, 2)))
+    rows = {2: {"motions": {"11": motion(true, 2, 1)}}, 0: {"motions": {"11": motion(true, 0, 1)}}, 4: {"motions": {}}}
+    placed = process_capture._place_frames(recovered(rows)).poses
+    assert placed.t.isfinite().all(-1).tolist() == [True, True, True, False, False, False]
+    for k in (0, 1):
+        got = se3.to_matrix(se3.relative(placed[2:3], placed[k : k + 1]))
+        torch.testing.assert_close(got, se3.to_matrix(se3.relative(true[2:3], true[k : k + 1])), atol=1e-9, rtol=0)
+    torch.testing.assert_close(se3.to_matrix(placed[2:3])[0], torch.eye(4, dtype=torch.float64))
+
+
+def test_usable_poses_are_kept():
+    true = poses_of(box.walk(6, hw=(2, 2)))
+    whole = recovered({2: {}, 0: {}, 4: {}}, poses=true)
+    assert process_capture._place_frames(whole) is whole.task.recording
+    assert (
+        recover_page.describe_placing(CaptureCheck(whole.task.recording), whole.task.recording, whole.task.recording)
+        == []
+    )
+
+
+def test_the_sentence_on_joining_names_the_reason():
+    true = poses_of(box.walk(6, hw=(2, 2)))
+    none = recovered({2: {}, 0: {}, 4: {}}).task.recording
+    placed = replace(none, poses=true)
+    sound, bad = CaptureCheck(none), CaptureCheck(none, findings=(FINDING,))
+    (line,) = recover_page.describe_placing(sound, none, placed)
+    assert line == "The map is joined by the motion that near returns give (6 frames): the capture has no poses."
+    assert recover_page.describe_placing(bad, none, placed)[0].endswith("the stated poses are refuted.")
+
+
+def test_sentences_of_the_page():
+    none = recovered({2: {}, 0: {}, 4: {}}).task.recording
+    lines = recover_page.describe_check(CaptureCheck(none, ASSUMED, (FINDING,)))
+    assert lines == [f"D{ASSUMED[1:]}.", f"Warning: {FINDING}."]
+    assert recover_page.describe_check(CaptureCheck(none)) == []
+
+
+def test_verbosity_is_read_when_printing(tmp_path, capsys, monkeypatch):
+    """The environment variable of ``--quiet`` silences the notes."""
+    monkeypatch.setenv(console._VERBOSITY_VARIABLE, "quiet")
+    print_check("name", CaptureCheck(recording(tmp_path), ASSUMED))
+    assert capsys.readouterr().err == ""
+    monkeypatch.setenv(console._VERBOSITY_VARIABLE, "normal")
+    print_check("name", CaptureCheck(recording(tmp_path), ASSUMED))
+    assert f"name: {ASSUMED}" in capsys.readouterr().err

@@ -1,0 +1,223 @@
+"""Check of a capture: each planted fault has a finding of its kind whose option undoes it; sound captures have none."""
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from support.cluttered_walk import N, walk
+from support.stated_poses import poses_of, state_poses
+
+from dhtorch import data
+from dhtorch.data.corrections import Corrections
+from dhtorch.data.io.decode import FormatError
+from dhtorch.data.pose_convention import parse_pose_convention
+from dhtorch.data.recording import Recording
+from dhtorch.data.units import DepthUnit
+from dhtorch.records import Pose
+from dhtorch.validation.capture_check import CaptureCheck, Finding, check_capture
+
+ROOT = Path(os.environ.get("DHTORCH_DATA", "nowhere"))
+needs_data = pytest.mark.skipif(not ROOT.is_dir(), reason="no DHTORCH_DATA")
+
+ASSUMED = "depth unit assumed: 1/1000 m (data.depth_unit= sets it)"
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return list(walk())
+
+
+@pytest.fixture(scope="module")
+def true(frames):
+    return poses_of(frames)
+
+
+def recording(frames, poses=None, **fields):
+    fields = {"report": ("a remark",), "depth_unit": DepthUnit(0.001), **fields}
+    return Recording("walk", "made", frames.__getitem__, torch.arange(len(frames)), poses=poses, **fields)
+
+
+def options_of(remedy):
+    """Text of a remedy → options of a capture."""
+    name, _, value = remedy.removeprefix("data.").partition("=")
+    return {name: int(value) if name == "depth_lag" else value}
+
+
+def undone(check, spoilt):
+    """The recording with the option of the only finding."""
+    (finding,) = check.findings
+    return Corrections.from_options(options_of(finding.remedy)).apply(spoilt)
+
+
+def test_a_sound_capture_has_no_finding(frames, true):
+    check = check_capture(recording(frames, true))
+    assert check.findings == () and not check.poses_refuted and check.recording.poses is true
+    assert check.assumed_unit == ASSUMED and check.lines == [ASSUMED, "a remark"]
+    assert check.record() == {"assumed_unit": ASSUMED, "findings": [], "poses_refuted": False}
+    assert check.poses.surfaces.stated < 0.01
+
+
+def test_a_stated_unit_is_not_announced(frames):
+    check = check_capture(recording(frames, depth_unit=DepthUnit(0.001, "camera.json: scale"), report=()))
+    assert check.lines == [] and check.poses is None and check.record()["assumed_unit"] is None
+    assert check_capture(recording(frames, depth_unit=None, report=())).lines == []
+
+
+@pytest.mark.parametrize("convention", ["world_to_camera", "opengl", "wxyz", "mm", "world_to_camera+opengl"])
+def test_refuted_poses_are_named_and_removed(convention, frames, true):
+    parsed = parse_pose_convention(convention)
+    spoilt = recording(frames, state_poses(true, parsed))
+    check = check_capture(spoilt)
+    (finding,) = check.findings
+    assert finding.cause == "poses" and parsed.describe() in finding.text and "they are not used" in finding.text
+    assert finding.remedy == f"data.pose_convention={convention}"
+    assert check.poses_refuted and check.recording.poses is None and spoilt.poses is not None
+    corrected = undone(check, spoilt)
+    torch.testing.assert_close(corrected.poses.t, true.t, atol=1e-9, rtol=0)
+    torch.testing.assert_close(corrected.poses.R, true.R, atol=1e-6, rtol=0)
+    assert check.record()["poses_refuted"] and check.record()["findings"][0]["cause"] == "poses"
+    assert check.lines[-1].endswith(f"(remedy: data.pose_convention={convention})")
+
+
+@pytest.mark.parametrize("has_poses", [True, False])
+@pytest.mark.parametrize("lag", [1, 3, -2])
+def test_late_depth_is_named_with_its_lag(lag, has_poses, frames, true):
+    inside = [k for k in range(N) if 0 <= k - lag < N]
+    late = [frames[k].replace(depth=frames[k - lag].depth) for k in inside]
+    spoilt = recording(late, true[torch.tensor(inside)] if has_poses else None)
+    check = check_capture(spoilt)
+    (finding,) = check.findings
+    assert finding.cause == "time offset" and finding.remedy == f"data.depth_lag={lag}"
+    shown = f"{abs(lag)} frame{'s' if abs(lag) > 1 else ''} {'late' if lag > 0 else 'early'} against "
+    assert f"depth is {shown}" in finding.text and not check.poses_refuted
+    for frame, number in zip(corrected := undone(check, spoilt), undone(check, spoilt).number, strict=True):
+        assert torch.equal(frame.depth, frames[inside[int(number)]].depth)
+    assert not check_capture(corrected).findings
+
+
+@pytest.mark.parametrize("turn", ["left_right", "upside_down", "180"])
+def test_turned_depth_is_named_with_its_turn(turn, frames, true):
+    flip = {"left_right": (-1,), "upside_down": (-2,), "180": (-2, -1)}[turn]
+    spoilt = recording([f.replace(depth=f.depth.flip(flip)) for f in frames], true)
+    check = check_capture(spoilt)
+    (finding,) = check.findings
+    assert finding.cause == ("rolled" if turn == "180" else "mirrored")
+    assert finding.text.startswith("depth and pictures differ in orientation: depth is ")
+    assert finding.remedy == f"data.depth_turn={turn}" and not check.poses_refuted
+    assert torch.equal(undone(check, spoilt)[2].depth, frames[2].depth)
+
+
+def test_a_factor_near_1_is_a_scale_without_a_culprit(frames, true):
+    check = check_capture(recording([f.replace(depth=1.1 * f.depth) for f in frames], true))
+    (finding,) = check.findings
+    assert finding.cause == "scale" and not check.poses_refuted and finding.remedy == ""
+    assert "depth is 1.1" in finding.text and "which one, depth and poses alone do not show" in finding.text
+    assert str(finding) == finding.text
+
+
+def test_depth_in_another_unit_is_named(frames, true):
+    """Steps of 1/5000 m that are read as millimetres."""
+    spoilt = recording([f.replace(depth=5 * f.depth) for f in frames], true)
+    check = check_capture(spoilt)
+    finding = next(each for each in check.findings if each.cause == "poses")
+    assert "the depth unit may be 1/5000 m" in finding.text and finding.remedy == "data.depth_unit=0.0002"
+    corrected = Corrections(depth_unit="0.0002").apply(spoilt)
+    torch.testing.assert_close(corrected[1].depth, frames[1].depth)
+
+
+def test_exchanged_intrinsics_are_named(frames, true):
+    def exchanged(frame):
+        return frame.replace(camera=frame.camera.replace(f=frame.camera.f.flip(-1), c=frame.camera.c.flip(-1)))
+
+    causes = check_capture(recording([exchanged(f) for f in frames], true)).findings
+    assert causes[0].cause == "intrinsics" and "cx and cy (and fx and fy) look exchanged" in causes[0].text
+    assert causes[0].remedy == "data.K=[fx,fy,cx,cy]"
+
+
+def test_intrinsics_of_larger_pictures_are_named(frames):
+    twice = [f.replace(camera=f.camera.replace(f=2 * f.camera.f, c=2 * f.camera.c + 0.5)) for f in frames[:3]]
+    finding = check_capture(recording(twice)).findings[0]
+    assert finding.cause == "intrinsics" and finding.remedy == "data.K=[fx,fy,cx,cy]"
+    assert "the intrinsics look like those of pictures 1.98 times as large" in finding.text
+
+
+def test_the_window_is_where_the_camera_moves_and_broken_frames_are_left_out(frames, true):
+    """A capture that stands still, then walks; frames are decoded only in the window, unreadable ones left out."""
+    still = 30
+    decoded = []
+
+    def load(i):
+        decoded.append(i)
+        if i == still + 3:
+            raise FormatError("x", "frame", "nothing", "a picture")
+        return frames[max(i - still, 0)]
+
+    t = torch.cat((true.t[:1].expand(still, 3), true.t))
+    R = torch.cat((true.R[:1].expand(still, 3, 3), true.R))
+    whole = Recording("walk", "made", load, torch.arange(still + N), poses=Pose(R, t))
+    check = check_capture(whole)
+    assert check.findings == () and check.poses is not None
+    assert min(decoded) >= still + N - 20 and still + N - 1 in decoded
+
+
+def test_frames_that_are_decoded_already_are_not_decoded_again(frames, true):
+    def load(i):
+        raise AssertionError(f"frame {i} was decoded")
+
+    whole = Recording("walk", "made", load, torch.arange(N), poses=true)
+    assert check_capture(whole, dict(enumerate(frames))).poses.n_pairs > 2
+
+
+def test_little_is_enough(frames, true):
+    """One frame, no depth, no texture, and sparse depth: no finding and no error."""
+    assert check_capture(recording(frames[:1], true[:1])).findings == ()
+    empty = [f.replace(depth=torch.zeros_like(f.depth)) for f in frames]
+    assert check_capture(recording(empty, true)).findings == ()
+    grey = [f.replace(image=torch.full_like(f.image, 90)) for f in frames]
+    check = check_capture(recording(grey, state_poses(true, parse_pose_convention("opengl"))))
+    assert check.poses_refuted, "surfaces alone refute the poses"
+    assert check_capture(recording(grey, true)).findings == ()
+    sparse = check_capture(recording(frames, state_poses(true, parse_pose_convention("mm")), sparse=True))
+    assert sparse.poses is None and not sparse.poses_refuted
+    lost = Pose(true.R, torch.full_like(true.t, torch.nan))
+    assert check_capture(recording(frames, lost)).poses is None
+
+
+def test_pictures_of_two_sizes_are_checked_without_tracks(frames, true):
+    mixed = [f if k % 2 else f.replace(image=f.image[..., ::2, ::2]) for k, f in enumerate(frames)]
+    mixed = [f if k % 2 else f.replace(depth=f.depth[..., ::2, ::2]) for k, f in enumerate(mixed)]
+    assert check_capture(recording(mixed, true)).diagnosis is None
+
+
+def test_lines_and_words_of_findings():
+    finding = Finding("poses", "wrong", "data.x=1")
+    assert str(finding) == "wrong (remedy: data.x=1)" and str(Finding("scale", "wrong")) == "wrong"
+    check = CaptureCheck(recording([None]), findings=(finding, Finding("scale", "far")))
+    assert check.poses_refuted and check.lines == ["a remark", "wrong (remedy: data.x=1)", "far"]
+    assert not CaptureCheck(recording([None]), findings=(Finding("scale", "far"),)).poses_refuted
+
+
+FIELD_CASES = {
+    "11a-poses-gl": ("poses", "OpenGL"),
+    "11b-poses-w2c": ("poses", "inverted"),
+    "11c-poses-wxyz": ("poses", "contradict"),
+    "24-depth-lags-one-frame": ("time offset", "1 frame late"),
+    "25-depth-off-by-1.1": ("scale", "1.1"),
+    "10-flipped-depth": ("mirrored", "upside down"),
+}
+
+
+@needs_data
+@pytest.mark.parametrize("name", FIELD_CASES)
+def test_field_cases_are_named(name):
+    cause, words = FIELD_CASES[name]
+    check = check_capture(data.open_all(ROOT / "field_cases" / name)[0])
+    assert any(each.cause == cause and words in each.text for each in check.findings), check.lines
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["holo_a", "field_cases/11e-poses-ok"])
+def test_sound_captures_have_no_finding(name):
+    check = check_capture(data.open_all(ROOT / name)[0])
+    assert check.findings == () and check.recording.poses is not None
