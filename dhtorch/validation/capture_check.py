@@ -24,7 +24,7 @@ from dhtorch.geometry import se3
 from dhtorch.records import Frame, Pose
 from dhtorch.runtime.console import format_count
 from dhtorch.validation import faults
-from dhtorch.validation.edge_fault import find_edge_fault
+from dhtorch.validation.edge_fault import do_edges_refute, find_edge_fault
 from dhtorch.validation.edge_lag import find_edge_lag
 from dhtorch.validation.faults import Diagnosis, KnownFault, WindowTracks
 from dhtorch.validation.options import ValidationOptions
@@ -140,7 +140,9 @@ def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = Non
     pairs = [(positions[i], positions[j]) for i, j in tracks.pairs] or _neighbouring_pairs(list(window))
     tracked = list(zip(tracks.samples, tracks.tracks, strict=True))
     poses = None if recording.poses is None else check_poses(recording.poses, {**window, **views}, pairs, tracked)
-    fault = _fault_of(diagnosis) or _edge_fault(list(views.values()), diagnosis)
+    fault = _fault_of(diagnosis)
+    if fault is None or do_edges_refute(list(views.values()), fault):
+        fault = _edge_fault(list(views.values()), diagnosis)
     findings += _combined_findings(recording, poses, fault, {**window, **views}, pairs, tracks)
     check = CaptureCheck(recording, assumed, tuple(findings), poses, diagnosis)
     return replace(check, recording=replace(recording, poses=None)) if check.poses_refuted else check

@@ -41,8 +41,7 @@ _MIN_LEAD_ERRORS: Final = 4.0
 
 def find_edge_fault(frames: Sequence[Frame]) -> KnownFault | None:
     """Frames (B = 1 each, with pictures and depth) -> the fault of their depth that edges show. Gradient: none."""
-    chosen = [frames[round(k * (len(frames) - 1) / (_MAX_FRAMES - 1))] for k in range(_MAX_FRAMES)] if frames else []
-    chosen = list({id(frame): frame for frame in chosen}.values())
+    chosen = _chosen_frames(frames)
     if len(chosen) < _MIN_FRAMES:
         return None
     with torch.no_grad():
@@ -58,6 +57,24 @@ def find_edge_fault(frames: Sequence[Frame]) -> KnownFault | None:
             if mean > max(_MIN_LEAD, _MIN_LEAD_ERRORS * error, best_lead):
                 best, best_lead = fault, mean
     return best
+
+
+def do_edges_refute(frames: Sequence[Frame], fault: KnownFault) -> bool:
+    """Whether edges coincide clearly better without a fault than with it undone. Gradient: none."""
+    chosen = _chosen_frames(frames)
+    if fault.kind not in _KINDS or len(chosen) < _MIN_FRAMES:
+        return False
+    with torch.no_grad():
+        pictures = [picture_edges(frame.image[0], grid_px=_GRID_PX) for frame in chosen]
+        depths = [_coarse(frame.depth) for frame in chosen]
+        loss = _scores(pictures, depths, NO_FAULT) - _scores(pictures, depths, fault)
+    return float(loss.mean()) > max(_MIN_LEAD, _MIN_LEAD_ERRORS * float(loss.std()) / len(chosen) ** 0.5)
+
+
+def _chosen_frames(frames: Sequence[Frame]) -> list[Frame]:
+    """Up to :data:`_MAX_FRAMES` evenly spread frames, each once."""
+    chosen = [frames[round(k * (len(frames) - 1) / (_MAX_FRAMES - 1))] for k in range(_MAX_FRAMES)] if frames else []
+    return list({id(frame): frame for frame in chosen}.values())
 
 
 def _coarse(depth: Tensor) -> Tensor:

@@ -4,9 +4,9 @@ import pytest
 import torch
 from support.cluttered_walk import N, walk
 
-from dhtorch.validation.edge_fault import find_edge_fault
+from dhtorch.validation.edge_fault import do_edges_refute, find_edge_fault
 from dhtorch.validation.edge_lag import EdgeLag, find_edge_lag
-from dhtorch.validation.faults import rot90_map
+from dhtorch.validation.faults import KNOWN_FAULTS, rot90_map
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +58,15 @@ def test_a_turn_is_found(name, plant, frames):
     fault = find_edge_fault(turned)
     assert fault is not None and fault.name == name
     assert torch.equal(fault.undo(turned[0].depth), frames[0].depth) or "90" in name
+
+
+def test_edges_refute_a_fault_that_is_none(frames):
+    by_kind = {fault.kind: fault for fault in KNOWN_FAULTS}
+    turned = [frame.replace(depth=frame.depth.flip(-2)) for frame in frames]  # the last of its kind
+    for kind in ("mirrored", "rolled", "registration"):
+        assert do_edges_refute(frames, by_kind[kind])
+    assert not do_edges_refute(turned, by_kind["mirrored"]) and not do_edges_refute(frames[:2], by_kind["mirrored"])
+    assert not do_edges_refute(frames, by_kind["time offset"]), "edges of one frame show no lag"
 
 
 def test_a_turn_of_two_frames_is_not_decided(frames):
