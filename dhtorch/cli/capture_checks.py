@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from dhtorch.data.recording import Recording, Recordings
@@ -25,15 +25,18 @@ _MAX_CHECKED_RECORDINGS = 12
 def check_data(data: Any) -> Any:
     """Scenes of a command -> the same scenes with checked recordings; other data are returned as they are.
 
-    Of a lazily opened set only the first recording is checked: its findings are printed, and where its poses are
-    refuted, those of all recordings are removed.
+    Of a lazily opened set only the first recording is checked: its assumed unit and findings enter the report of all
+    recordings, and where its poses are refuted, those of all recordings are removed.
     """
+    if isinstance(data, Scenes) and not isinstance(data.recordings, Recordings):
+        return check_data(list(data))
     if isinstance(data, Recordings | Scenes):
         scenes = data if isinstance(data, Scenes) else Scenes(data)
-        first = check_scene(scenes[0])
-        if scenes[0].recording.poses is None or first.recording.poses is not None:
-            return scenes
-        return replace(scenes, annotate=_WithoutPoses(scenes.annotate))
+        first = scenes[0]
+        checked = check_scene(first).recording
+        added = tuple(line for line in checked.report if line not in first.recording.report)
+        is_refuted = first.recording.poses is not None and checked.poses is None
+        return replace(scenes, annotate=_AsFirst(scenes.annotate, added, is_refuted))
     if isinstance(data, Scene | Recording):
         return check_scene(Scene.of(data))
     if isinstance(data, Sequence) and all(isinstance(each, Scene | Recording) for each in data):
@@ -61,12 +64,16 @@ def print_check(name: str, check: CaptureCheck) -> None:
         warnings.warn(f"{name}: {finding}", stacklevel=2)
 
 
-class _WithoutPoses:
-    """Recording → scene without poses."""
+@dataclass(frozen=True)
+class _AsFirst:
+    """Recording → scene with what the check of the set's first recording showed."""
 
-    def __init__(self, annotate: Any) -> None:
-        self.annotate = annotate
+    annotate: Callable[[Recording], Scene]
+    added: tuple[str, ...]  # lines of its report
+    is_refuted: bool  # whether its poses are
 
     def __call__(self, recording: Recording) -> Scene:
-        scene: Scene = self.annotate(recording)
-        return replace(scene, recording=replace(scene.recording, poses=None))
+        scene = self.annotate(recording)
+        poses = None if self.is_refuted else scene.recording.poses
+        report = (*scene.recording.report, *self.added)
+        return replace(scene, recording=replace(scene.recording, poses=poses, report=report))

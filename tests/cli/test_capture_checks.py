@@ -107,6 +107,14 @@ def test_a_lazy_set_is_judged_by_its_first_recording(checked, tmp_path):
     assert isinstance(scenes, Scenes) and len(scenes) == 1000
     assert scenes[0].recording.poses is None and scenes[777].recording.poses is None
     assert scenes[777].name == "box777"
+    assert scenes[777].recording.report == ("a frame was left out", ASSUMED, str(FINDING))
+
+
+def test_an_opened_capture_is_checked_recording_by_recording(checked, tmp_path):
+    """Scenes of a few opened recordings, as of a car with several cameras, keep all lines for the files."""
+    scenes = check_data(Scenes([recording(tmp_path, name, poses=False) for name in "ab"], lambda r: Scene(r, near=2.0)))
+    assert checked == ["a", "b"] and [scene.near for scene in scenes] == [2.0, 2.0]
+    assert [scene.recording.report for scene in scenes] == [(ASSUMED, "a frame was left out")] * 2
 
 
 def test_a_sound_lazy_set_keeps_its_poses_and_notes(monkeypatch, tmp_path):

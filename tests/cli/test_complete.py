@@ -367,8 +367,9 @@ def test_the_command_takes_a_path_and_ends_bad_input_in_one_line(captures, tmp_p
     assert "1 frame of 160x120" in capsys.readouterr().out and len(data.open(tmp_path / "maps")) == 1
     for bad in (["planes=24"], ["siez=3"]):
         assert run.main([*words, *bad]) == 2
-        err = capsys.readouterr().err
-        assert bad[0].split("=")[0] in err and len(err.strip().splitlines()) == 1
+        *notes, error = capsys.readouterr().err.strip().splitlines()
+        assert error.startswith("dhtorch: ") and bad[0].split("=")[0] in error
+        assert notes in ([], ["numbered: depth unit assumed: 1/1000 m (data.depth_unit= sets it)"])
 
 
 def test_a_broken_frame_ends_it_and_the_others_stay(captures, tmp_path):

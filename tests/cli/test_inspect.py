@@ -141,7 +141,9 @@ def test_facts_of_a_recording(tmp_path: Path) -> None:
     frames[1] = frames[1].replace(depth=frames[1].depth * (torch.arange(HW[1]) >= HW[1] // 2))
     writers.write_named_frames(tmp_path, frames, fps=30)
     survey = survey_recording(data.open(tmp_path))
+    capture.add_check(survey, data.open(tmp_path))
     said = facts(survey)
+    assert said["unit"] == "depth unit assumed: 1/1000 m (data.depth_unit= sets it)"
     assert said["frames"] == "4" and said["rate"] == "30 Hz measured, nominal 30 Hz" and said["duration"] == "0.100 s"
     assert said["pictures"] == "64x48, colour, 8 bits" and said["depth"] == "64x48"
     assert said["holes"] == "0.0 to 50.0 % of the depth map"
@@ -194,7 +196,10 @@ def recording(frames: list[Frame], **options: object) -> Recording:
 
 
 def warned(frames: list[Frame], **options: object) -> list[str]:
-    return survey_recording(recording(frames, **options)).warnings
+    written = recording(frames, **options)
+    survey = survey_recording(written)
+    capture.add_check(survey, written)
+    return survey.warnings
 
 
 def test_sound_recordings_raise_no_warning() -> None:
@@ -218,11 +223,16 @@ def test_poses_that_jump_or_contradict_the_depth() -> None:
         w.startswith("the camera jumps: ") and w.endswith("at frame 3")
         for w in warned(frames, poses=Pose(good.R, jump))
     )
-    contradiction = "depth and poses contradict each other: axes, units or scale may be wrong"
     flipped = good.R @ torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))
-    for poses in (Pose(flipped, good.t), se3.invert(good), Pose(good.R, good.t * 10)):
-        assert contradiction in warned(frames, poses=poses)
-    assert contradiction not in warned(frames)
+    readings = {
+        "OpenGL camera axes": Pose(flipped, good.t),
+        "world-to-camera poses": se3.invert(good),
+        "translations are 10 times what the depth has": Pose(good.R, good.t * 10),
+    }
+    for reading, poses in readings.items():
+        (contradiction,) = [w for w in warned(frames, poses=poses) if "contradict" in w]
+        assert contradiction.startswith("poses and depth contradict each other (") and reading in contradiction
+    assert not any("contradict" in w for w in warned(frames))
 
 
 def test_times_that_stand_or_gap() -> None:
@@ -241,7 +251,7 @@ def test_depth_that_cannot_be() -> None:
         return warned([f.replace(depth=change(f.depth)) for f in frames])
 
     assert "no depth at all in the frames that were read" in with_depth(torch.zeros_like)
-    assert any("are these millimetres?" in w for w in with_depth(lambda d: d * 1000))
+    assert any("m is beyond the reach of any depth sensor" in w for w in with_depth(lambda d: d * 1000))
     assert "depth is the same everywhere" in with_depth(torch.ones_like)
     holes = with_depth(lambda d: d * (torch.arange(HW[1]) < 10))
     assert any(w.startswith("most of the depth map is holes (84 %)") for w in holes)

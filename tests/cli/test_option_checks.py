@@ -161,7 +161,7 @@ def test_a_job_says_little_and_all_of_it_when_asked(command):
 
 
 def test_jobs_note_how_far_they_are(tmp_path):
-    (tmp_path / together._NOTES_FOLDER).mkdir()
+    (tmp_path / together._NOTES_FOLDER).mkdir(parents=True)
     wrap = together.record_progress(tmp_path, "one", 2)
     assert list(wrap(range(4), "first", 4)) == [0, 1, 2, 3]
     assert together._read_progress(tmp_path / together._NOTES_FOLDER) == (0.5, 0, ["first"])

@@ -77,7 +77,8 @@ def test_a_guessed_camera_is_told_on_the_page_and_one_frame_is_one(tmp_path, roo
     words = ["data=frames_dir", f"data.root={capture}", "data.fov=60", *LITTLE, "most=1", f"output={tmp_path / 'out'}"]
     assert run.main(["validate", *words]) == run.EXIT_DONE
     page = (tmp_path / "out/validate.html").read_text()
-    assert "<p>Its intrinsics are a guess from a field of view of 60°" in page
+    assert "<p>Intrinsics are a guess from a field of view of 60°" in page
+    assert "<p>Depth unit assumed: 1/1000 m (data.depth_unit= sets it)." in page
     assert "capture: 1 frame: " in page and "checked, of depth" in page
     assert "60°" in json.loads((tmp_path / "out/validate.json").read_text())["intrinsics_guessed"]
 
@@ -233,7 +234,9 @@ def test_files_are_matched_by_number_else_in_order_and_never_by_halves(tmp_path,
     counted = f"2 maps numbered 1 to 3 for {n} frames numbered 0 to {n - 1}"
     assert [note.partition(":")[0] for note in some.notes] == ["warning", f"{n - 2} of {n} frames have no map.", "maps"]
     assert counted in some.notes[0] and "numbered from 1" in some.notes[0] and "unit assumed: 1 m" in some.notes[-1]
-    assert some.report["missing"] == n - 2 and some.report["matched_by"] == "number" and some.report["depth_unit_m"] == 1
+    assert (
+        some.report["missing"] == n - 2 and some.report["matched_by"] == "number" and some.report["depth_unit_m"] == 1
+    )
     more = open_depth_maps(folder_of(tmp_path / "more", range(n + 5)), room)
     assert depths(more) == [1.0 + k for k in range(n)] and not more.warnings and len(more.notes) == 1
     later = open_depth_maps(folder_of(tmp_path / "later", [f"{95 + k}" for k in range(n)]), room)
