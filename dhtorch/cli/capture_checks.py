@@ -33,9 +33,9 @@ def check_data(data: Any) -> Any:
     if isinstance(data, Recordings | Scenes):
         scenes = data if isinstance(data, Scenes) else Scenes(data)
         first = scenes[0]
-        checked = check_scene(first).recording
-        added = tuple(line for line in checked.report if line not in first.recording.report)
-        is_refuted = first.recording.poses is not None and checked.poses is None
+        examined = check_scene(first).recording
+        added = tuple(line for line in examined.report if line not in first.recording.report)
+        is_refuted = first.recording.poses is not None and examined.poses is None
         return replace(scenes, annotate=_AsFirst(scenes.annotate, added, is_refuted))
     if isinstance(data, Scene | Recording):
         return check_scene(Scene.of(data))
