@@ -202,7 +202,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "validation.edge_fault": [
         ("find_edge_fault", "- without", ""),
-        ("find_edge_fault", "best_lead)", "0.0)"),
         ("find_edge_fault", "len(chosen) < _MIN_FRAMES", "len(chosen) < 1"),
         ("_scores", "fault.undo(d)[0]", "d[0]"),
     ],
