@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,9 @@ from dhtorch.records import Frame
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime import storage
 from dhtorch.synthetic.recording import SyntheticRoom
+from dhtorch.testing.azure_kinect import write_azure_kinect
+from dhtorch.testing.rosbag import write_rosbag
+from dhtorch.testing.simulator_hdf5 import write_simulator_hdf5
 
 FRAMES, STEP = 3, 2.0**-10
 SHORT = (f"frames={FRAMES}", "dense={size: 160}")
@@ -52,11 +56,14 @@ REAL = {
     "gr00t_demo": ("data=lerobot", "data.fov=60", "data.episode=[0,1]"),
     "lerobot_g1": ("data=lerobot", "data.fov=69"),
     "rlds_bridge/bridge_dataset/1.0.0": ("data=rlds", "data.fov=60", "data.split=train", "data.episode=[0,1]"),
+    "apc_arm": (),
 }
+#: Written sources that have a writer of one signature, named by it.
+LAYOUTS = ("bop", "replica", "scannet", "sens_folder", "open3d", "sun3d", "nerfstudio", "polycam", "colmap")
 
 
-def written(folder: Path) -> dict[str, Path]:
-    """Sources of the other formats: name → path."""
+def written(folder: Path) -> dict[str, tuple[Path, tuple[str, ...]]]:
+    """Sources of the other formats: name → path and the command's arguments beside it."""
     room = SyntheticRoom(hw=(72, 128), depth_hw=(72, 128), n_frames=4, supersample=1)
     frames = [room[i] for i in range(len(room))]
     makers: dict[str, Callable[[Path], Any]] = {
@@ -68,11 +75,18 @@ def written(folder: Path) -> dict[str, Path]:
         "ca1m/ca1m-val-1.tar": lambda p: testing.write_ca1m(p, frames, frames),
         "rh20t": lambda p: testing.write_rh20t(p, {"036422060909": frames}),
         "robot": lambda p: testing.write_lerobot(p, [frames, frames[:2]], depth="tiff"),
+        **{f"layouts/{name}": partial(testing.CAPTURE_WRITERS[name].write, frames=frames) for name in LAYOUTS},
+        "rosbag": lambda p: write_rosbag(p, frames),
+        "azure_kinect.mkv": lambda p: write_azure_kinect(p, frames),
+        "maniskill.h5": lambda p: write_simulator_hdf5(p, [frames, frames[:2]], "maniskill3"),
     }
     for name, make in makers.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         make(folder / name)
-    return {name: next((folder / name).glob("task_*")) if name == "rh20t" else folder / name for name in makers}
+    paths = {name: next((folder / name).glob("task_*")) if name == "rh20t" else folder / name for name in makers}
+    K = ",".join(f"{v:g}" for v in (*frames[0].camera.f[0].tolist(), *frames[0].camera.c[0].tolist()))
+    options = {"azure_kinect.mkv": ("data=azure_kinect", f"data.K=[{K}]")}  # written without its calibration
+    return {name: (path, options.get(name, ())) for name, path in paths.items()}
 
 
 def run(words: Sequence[str]) -> tuple[subprocess.CompletedProcess[str], float]:
@@ -94,7 +108,8 @@ def row(name: str, path: Path, arguments: Sequence[str], target: str, folder: Pa
     before = digest(path)
     done, seconds = run(words)
     if done.returncode:
-        errors = [line for line in done.stderr.splitlines() if not line.startswith("dhtorch: warning: ")]
+        lines = [line for line in done.stderr.splitlines() if line.startswith("dhtorch: ")]
+        errors = [line for line in lines if not line.startswith("dhtorch: warning: ")]  # others: notes on the capture
         if len(errors) != 1 or out.exists():
             raise ValueError(f"{name} as {target}: found {errors} and {out.exists()=}, expected one line and no folder")
         return record | {"refused": errors[0].removeprefix("dhtorch: ").replace(f"{path.parent}{os.sep}", "")}
@@ -232,16 +247,16 @@ def main() -> int:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--only", help="sources whose name contains it")
+    parser.add_argument("--only", nargs="+", help="sources whose name contains one of these")
     options = parser.parse_args()
     home, rows = Path(os.environ["DHTORCH_DATA"]), []
     with tempfile.TemporaryDirectory(prefix="dhtorch-enrich-") as place:
         folder = Path(place)
         sources = {name: (home / name, arguments) for name, arguments in REAL.items() if (home / name).exists()}
-        sources |= {name: (path, ()) for name, path in written(folder / "written").items()}
+        sources |= written(folder / "written")
         for target in TARGETS:
             for name, (path, arguments) in sources.items():
-                if options.only is not None and options.only not in name:
+                if options.only is not None and not any(part in name for part in options.only):
                     continue
                 record = row(name, path, arguments, target, folder)
                 record |= {"processor": result_files.describe_processor(), "cores": os.cpu_count()}

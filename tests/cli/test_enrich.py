@@ -23,6 +23,7 @@ from dhtorch.export.lerobot import FeatureMoments
 from dhtorch.extract import shards
 from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.runtime import storage
+from dhtorch.runtime.output_folder import PRIVATE_FOLDER
 from dhtorch.synthetic.recording import SyntheticRoom
 
 HW, LENGTHS, NEAR = (48, 64), (4, 3), 2.5
@@ -230,9 +231,11 @@ def test_a_format_that_nothing_writes_is_refused_in_a_line(kind, shots, tmp_path
     }[kind]()
     out = tmp_path / "out"
     assert main(["enrich", str(source), str(out), *ASKED, "format=same"]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and not out.exists()
-    assert said.startswith(f"dhtorch: format=same: found {kind}, which dhtorch cannot write; expected lerobot, ")
+    *notes, refusal = capsys.readouterr().err.splitlines()
+    assert not any(note.startswith("dhtorch: ") for note in notes) and not out.exists()
+    assert refusal.startswith(f"dhtorch: format=same: found {kind}, which dhtorch cannot write; expected lerobot, ")
+    if kind in ("frames_dir", "rlds"):  # layouts that state no unit
+        assert any("depth unit assumed: 1/1000 m" in note for note in notes)
 
 
 def test_every_format_that_is_read_was_written_in_every_format_or_refused():
@@ -270,7 +273,8 @@ def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):
 def test_a_write_that_failed_at_the_first_file_is_no_other_set(robot, enriched, tmp_path):
     """As a full disk or a kill leaves the folder: no file, or half of the first."""
     out = tmp_path / "set"
-    (out / "meta").mkdir(parents=True)
-    (out / "meta" / ".dhtorch.json.x1.tmp").write_text("{")
+    unfinished = out / PRIVATE_FOLDER / "unfinished" / "0.json"
+    unfinished.parent.mkdir(parents=True)
+    unfinished.write_text("{")
     assert main(["enrich", str(robot), str(out), *ASKED]) == 0
-    assert read_files(out) == read_files(enriched)
+    assert read_files(out) == read_files(enriched) and not unfinished.exists()
