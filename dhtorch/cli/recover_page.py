@@ -91,7 +91,8 @@ def describe_recovery(
     guess = intrinsics_options.find_guess_report(recording.report)
     sensor = f"{kind}; the sensor has depth at {stats.sensor:.0%} of the pixels{f'; its {guess}' if guess else ''}."
     if stats.error is None:
-        reason = str(check.findings[0]) if check.findings else _explain_silence(stats)
+        blamed = bool(check.findings) and stats.no_answer > _MIN_REASON_SHARE
+        reason = str(check.findings[0]) if blamed else _explain_silence(stats)
         return [sensor, f"Nothing was recovered: {reason}."]
     amount = f"Recovered {stats.pixels:,.0f} pixels per frame without sensor depth, from {stats.near:.1f} m to"
     frames = f"({format_count(stats.frames, 'frame')})"

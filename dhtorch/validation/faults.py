@@ -440,11 +440,15 @@ class FaultWindow:
     def comparable_loss(self, cause: KnownFault, base: SampleLosses) -> Tensor:
         """(P,) loss with that fault undone, comparable with the loss ``base`` without a fault; NaN without one.
 
-        A fault that is undone may leave depth at some of the samples only, and some samples are easier than others: the
-        difference is taken over the samples with depth under both hypotheses, and added to the mean of ``base``.
+        A fault of the sensor's own depth that is undone may leave depth at some of the samples only, to which the
+        motion is then fitted, too, and some samples are easier than others: the difference is taken over the samples
+        with depth under both hypotheses, and added to the mean of ``base``. Motions of maps beside the sensor do not
+        depend on the fault, and losses are compared as they are.
         """
         if cause == NO_FAULT:
             return base.mean()
+        if self.maps is not None:
+            return self.loss(cause)
         losses = self.sample_losses(cause)
         both = base.used & losses.used
         return base.mean() + losses.replace(used=both).mean() - base.replace(used=both).mean()
