@@ -188,6 +188,31 @@ class State(CodeTable):
     WRONG: Final = code(2, "contradicted by evidence, and supported by none")
 
 
+class WrongCause(CodeTable):
+    """Codes of the causes of wrong pixels of a validated depth map."""
+
+    NONE: Final = code(0, "not wrong, or not known")
+    OTHER: Final = code(1, "wrong for none of the causes below")
+    GHOST: Final = code(
+        2,
+        "a surface nearer than the sensor's minimum range has a false depth far behind it",
+        meaning="ghosts of surfaces nearer than the sensor measures",
+        advice="keep things farther than the sensor's minimum range",
+    )
+    FLYING_PIXEL: Final = code(
+        3,
+        "between a foreground and a background, on neither",
+        meaning="flying pixels between foreground and background",
+        advice="remove pixels whose neighbours have other depths",
+    )
+    EDGE_BLEED: Final = code(
+        4,
+        "the depth of one side of an outline on the other side",
+        meaning="edges that bleed over the neighbouring surface",
+        advice="leave out a few pixels along outlines, or upsample depth less",
+    )
+
+
 def describe(table: type[CodeTable], name: str) -> CodeEntry | None:
     """The entry of a code by its name in any case; None where the table has no such code."""
     numbers = {code_name: number for number, code_name in names(table).items()}

@@ -272,6 +272,8 @@ class DepthValidation(Record):
     sparse_evidence: Tensor  # (B, h, w) from near returns and triangulated points
     photometric_evidence: Tensor  # (B, h, w) from the images of the source views
     consistency_evidence: Tensor  # (B, h, w) from the same source's maps of other views; only negative: seen through
+    outline_evidence: Tensor  # (B, h, w) from the surface beyond an outline near the pixel, and of flying pixels
+    cause: Tensor  # (B, h, w) int32, codes.WrongCause, of wrong pixels
     scale: Tensor  # (B, 3) map depth over true depth; NaN without a metric reference besides the map
     scale_near: Tensor  # (B, 3) from near returns alone
     scale_far: Tensor  # (B, 3) from triangulated points alone

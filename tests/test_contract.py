@@ -592,6 +592,11 @@ ELSEWHERE = {
         f"dhtorch.validation.evidence.{name}"
         for name in ("sparse_evidence", "photometric_evidence", "depth_consistency_evidence", "nearest_surface")
     ),
+    "dhtorch.validation.evidence.triangulated_depth",
+    *(
+        f"dhtorch.validation.wrong_causes.{name}"
+        for name in ("extend_surface", "flying_evidence", "outline_evidence", "name_causes")
+    ),
     *(
         f"dhtorch.validation.faults.{name}"
         for name in ("rot90_map", "diagnose", "select_cause", "track_window", "ray_lengths")

@@ -26,7 +26,8 @@ TESTS: dict[str, list[str]] = {
     "validation.edge_lag": ["tests/validation/test_edge_checks.py"],
     "validation.edge_fault": ["tests/validation/test_edge_checks.py"],
     "validation.capture_check": ["tests/validation/test_capture_check.py"],
-    "validation.validate": ["tests/validation/test_validate.py"],
+    "validation.wrong_causes": ["tests/validation/test_wrong_causes.py"],
+    "validation.validate": ["tests/validation/test_validate.py", "tests/validation/test_wrong_causes.py"],
     "metrics.detection": ["tests/validation/test_validate.py", "tests/test_contract.py"],
     "transforms.validate_depth": ["tests/transforms/test_extend_depth.py", "tests/cli/test_validate_command.py"],
 }
@@ -124,6 +125,17 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "validation.options": [
         ("ValidationOptions.share_window_pixels", "(2 * self.evidence_radius_px + 1)", "(2 * self.evidence_radius_px)"),
+    ],
+    "validation.wrong_causes": [
+        ("extend_surface", "beyond > ratio * extended", "beyond < ratio * extended"),
+        ("extend_surface", "(extended > 0) & reached", "reached"),
+        ("flying_evidence", "n_level <= options.max_flying_neighbours", "n_level >= options.max_flying_neighbours"),
+        ("flying_evidence", "torch.minimum(n_before, n_behind)", "torch.maximum(n_before, n_behind)"),
+        ("flying_evidence", "torch.where(nearer, size, -size)", "torch.where(nearer, -size, size)"),
+        ("outline_evidence", "-sigmas if far else sigmas", "sigmas if far else -sigmas"),
+        ("name_causes", "point_depth < options.min_sensor_range_m", "point_depth > options.min_sensor_range_m"),
+        ("name_causes", "(has_farther & (misfit < 0))", "(has_farther & (misfit > 0))"),
+        ("name_causes", "bleeds & ~_is_wide(wrong & ~flying, steps)", "bleeds"),
     ],
     "validation.evidence": [
         ("validation_references", "samples.usable & ((samples.flag", "samples.usable | ((samples.flag"),

@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from dhtorch.codes import State, names
+from dhtorch.codes import State, WrongCause, names, words
 from dhtorch.data import depth_maps
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.depth_maps import DepthMaps
@@ -64,6 +64,10 @@ _MIN_SCALE_DIFFERENCE = 0.03
 
 #: The poses agree with one of the two if its log ratio to them is at most this fraction of the other's.
 _MAX_WITNESS_RATIO = 1 / 3
+
+#: Causes of wrong pixels that the summary names, and the least fraction of the checked pixels from which it does.
+_NAMED_CAUSES = ("ghost", "flying_pixel", "edge_bleed")
+_MIN_NAMED_SHARE = 0.0005
 
 _LIMIT_PATTERN = re.compile(r"\s*([a-z_]+)\s*>\s*([0-9.eE+-]+)\s*")
 
@@ -238,6 +242,11 @@ def _summarise_frame(number: int, validation: DepthValidation) -> Row:
     row: Row = {"frame": number, "pixels": n}
     for code, name in names(State).items():
         row[f"share_{name.lower()}"] = int(((validation.state == code) & has_depth).sum()) / n if n else None
+    wrong_by_cause = validation.cause[has_depth & (validation.state == State.WRONG)]
+    row["wrong_causes"] = {
+        name.lower(): int((wrong_by_cause == code).sum()) for code, name in names(WrongCause).items()
+    }
+    del row["wrong_causes"]["none"]
     for name in _INTERVAL_FIELDS:
         value, low, high = (float(x) for x in getattr(validation, name)[0])
         row[name] = None if math.isnan(value) else {"value": value, "low": low, "high": high}
@@ -345,11 +354,16 @@ def _summarise_recording(validated: RecordingValidation) -> Row:
         "pixels": pixels,
         "median": medians,
         "wrong": count["wrong"] / checked if checked else None,
+        "wrong_causes": {name: _sum_cause(rows, name) / checked if checked else None for name in _NAMED_CAUSES},
         "causes": dict(causes),
         "windows": len(diagnosable),
         "clip_depth": _find_shared_clip_depth(rows),
         "limited": limited,
     }
+
+
+def _sum_cause(rows: Sequence[Row], name: str) -> int:
+    return sum(row["wrong_causes"][name] for row in rows)
 
 
 def _deviation_lower_bound(rows: Sequence[Row], name: str, sound: float) -> float | None:
@@ -394,7 +408,7 @@ def _format_summary(name: str, summary: Row, notes: Sequence[str] = ()) -> list[
     wrong = (
         "no pixel can be checked"
         if summary["wrong"] is None
-        else f"{summary['wrong']:.1%} of the checked pixels are wrong"
+        else f"{summary['wrong']:.1%} of the checked pixels are wrong{_format_wrong_causes(summary['wrong_causes'])}"
     )
     unknown = "no depth" if limited["unknown"] is None else f"{limited['unknown']:.1%} cannot be checked"
     scale = "scale unknown" if medians["scale"] is None else f"scale {_format_factor(medians['scale'])}"
@@ -408,6 +422,14 @@ def _format_summary(name: str, summary: Row, notes: Sequence[str] = ()) -> list[
     if summary["has_maps"]:
         lines += [f"  {line}" for line in _name_wrong_scale(medians, limited["scale"])]
     return lines + [f"  {note}" for note in notes]
+
+
+def _format_wrong_causes(share: Mapping[str, float | None]) -> str:
+    """Fractions of the checked pixels by cause -> `` (1.2% flying pixel, 0.4% edge bleed)``; empty without any."""
+    named = sorted(
+        ((value, name) for name, value in share.items() if value and value >= _MIN_NAMED_SHARE), reverse=True
+    )
+    return f" ({', '.join(f'{value:.1%} {words(name)}' for value, name in named)})" if named else ""
 
 
 def _name_wrong_scale(medians: Mapping[str, float | None], deviation: float | None) -> list[str]:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
+import torch.nn.functional as F
 from torch import Generator, Tensor
 
 from dhtorch.geometry.checks import check
@@ -48,6 +49,21 @@ _ROLL_SHARE = 0.1
 
 #: Quantile of depth at which a map is clipped.
 _CLIP_SHARE = 0.6
+
+#: Ratio of two depths from which they belong to different surfaces. Source: chosen, steeper surfaces are not mixed.
+_SIDE_RATIO = 1.2
+
+#: Flying pixels: fraction of the pixels along an outline, one on either side of it, that are mixed, and the least
+#: weight of either side. Source: chosen, a time-of-flight camera without a filter.
+_FLYING_SHARE, _MIN_FLYING_WEIGHT = 0.6, 0.1
+
+#: Edge bleed: fewest and most pixels by which a foreground spreads over its background. Source: chosen, depth maps that
+#: were upsampled by two to six.
+_BLEED_PX = (2, 6)
+
+#: Ghosts: depth below which a sensor returns a false depth, m, and the least and the largest false depth, m.
+#: Source: chosen, minimum ranges of phone LiDARs and depth cameras.
+_MIN_RANGE_M, _GHOST_DEPTH_M = 0.35, (1.0, 10.0)
 
 #: Relative change of depth above which a pixel of a faulty map counts as wrong.
 _MIN_WRONG_REL = 0.02
@@ -140,6 +156,42 @@ def clip_far_depth(depth: Tensor, nearer: float = _CLIP_SHARE) -> Tensor:
     return depth.minimum(valid.gather(1, last[:, None])[..., None])
 
 
+def mix_outlines(depth: Tensor, generator: Generator) -> Tensor:
+    """The map with flying pixels: along outlines, random pixels with a random mean of the foreground's and the
+    background's depth."""
+    share, weight = torch.rand(2, *depth.shape[-2:], generator=generator, dtype=torch.float64).to(depth)
+    near, far = _extreme_neighbours(depth)
+    weight = _MIN_FLYING_WEIGHT + (1 - 2 * _MIN_FLYING_WEIGHT) * weight
+    mixed = (depth > 0) & (far > _SIDE_RATIO * near) & (share < _FLYING_SHARE)
+    return torch.where(mixed, weight * near + (1 - weight) * far, depth)
+
+
+def bleed_edges(depth: Tensor, generator: Generator, *, foreground: bool = True) -> Tensor:
+    """The map with a foreground that spreads over its background by two to six pixels, or the reverse."""
+    low, high = _BLEED_PX
+    for _ in range(int(torch.randint(low, high + 1, (), generator=generator))):
+        near, far = _extreme_neighbours(depth)
+        spread = near if foreground else far
+        reached = (spread < depth / _SIDE_RATIO) if foreground else (spread > depth * _SIDE_RATIO)
+        depth = torch.where((depth > 0) & reached, spread, depth)
+    return depth
+
+
+def ghost_returns(depth: Tensor, generator: Generator) -> Tensor:
+    """The map with a smooth false depth of 1 to 10 m where the true one is below the sensor's minimum range."""
+    low, high = _GHOST_DEPTH_M
+    middle, slope = torch.rand(2, generator=generator, dtype=torch.float64).tolist()
+    x, y = _pixel_grid(depth)
+    false_depth = (low * (high / low) ** middle * (1 + 0.1 * (slope - 0.5) * (x + y))).clamp(low, high)
+    return torch.where((depth > 0) & (depth < _MIN_RANGE_M), false_depth, depth)
+
+
+def _extreme_neighbours(depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Least and largest depth (B, h, w) in the 3 × 3 window around each pixel, holes left out."""
+    near = -F.max_pool2d(-torch.where(depth > 0, depth, torch.inf)[:, None], 3, 1, 1)[:, 0]
+    return near, F.max_pool2d(depth[:, None], 3, 1, 1)[:, 0]
+
+
 def _deterministic(fault: Callable[[Tensor], Tensor]) -> DepthFault:
     """A deterministic fault as a :data:`DepthFault`, which ignores the generator."""
     return lambda depth, _generator: fault(depth)
@@ -172,6 +224,13 @@ DEPTH_FAULTS = NETWORK_FAULTS | FILE_FAULTS
 #: Faults of file formats that leave only a lower bound of the depth.
 FORMAT_FAULTS: dict[str, DepthFault] = {"cut": _deterministic(clip_far_depth)}
 
+#: Faults of a sensor at single pixels, by the name of their cause in :class:`dhtorch.codes.WrongCause`.
+RETURN_FAULTS: dict[str, DepthFault] = {
+    "ghost": ghost_returns,
+    "flying_pixel": mix_outlines,
+    "edge_bleed": bleed_edges,
+}
+
 #: The fault of using the map of another frame.
 WRONG_TIME = "time"
 
@@ -186,7 +245,7 @@ def apply_fault(
     """The map with a fault, and a mask of pixels wrong by more than ``_MIN_WRONG_REL``, (B, h, w) each.
 
     Args:
-        name: of :data:`DEPTH_FAULTS` or :data:`FORMAT_FAULTS`, or ``time``.
+        name: of :data:`DEPTH_FAULTS`, :data:`FORMAT_FAULTS` or :data:`RETURN_FAULTS`, or ``time``.
         depth: the true map.
         seed: of the random draws.
         other: the map that ``time`` returns.
@@ -201,7 +260,7 @@ def apply_fault(
         if other is None:
             raise ValueError("apply_fault: found no map of another time, expected other=")
         faulty = other
-    elif name in (faults := DEPTH_FAULTS | FORMAT_FAULTS):
+    elif name in (faults := DEPTH_FAULTS | FORMAT_FAULTS | RETURN_FAULTS):
         faulty = faults[name](depth, Generator().manual_seed(seed))
     else:
         raise ValueError(f"apply_fault: found {name!r}, expected one of {', '.join((*faults, WRONG_TIME))}")

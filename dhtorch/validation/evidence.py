@@ -163,6 +163,23 @@ def sparse_evidence(
     )
 
 
+def triangulated_depth(
+    depth: Tensor,  # (B, h, w) m, 0 = no value
+    hw: tuple[int, int],  # of the picture
+    references: ValidationReferences,
+    options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS,
+) -> Tensor:
+    """Map and references -> geometric mean depth (B, h, w) m of the triangulated points around each pixel on the same
+    surface of the map, NaN without any. Gradient: none."""
+    check("triangulated_depth", depth=(depth, "B h w"), uv=(references.uv, "B N 2"))
+    place = resize_pixels(references.uv, hw, (depth.shape[-2], depth.shape[-1]))
+    at, inside = sample_nearest(depth, place)
+    weight = (references.used & ~references.near & inside & (at > 0)).to(depth)
+    columns = torch.stack([weight, weight * references.depth.clamp_min(1e-6).log()], 1)
+    total, log_sum = _splat_on_surface(columns, place, depth, at, options).unbind(1)
+    return torch.where(total > 0, (log_sum / total.clamp_min(1e-9)).exp(), torch.nan)
+
+
 def photometric_evidence(
     depth: Tensor,  # (B, h, w) m, 0 = no value
     base: plane_sweep.ReferenceView,

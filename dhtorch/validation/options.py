@@ -54,6 +54,52 @@ class ValidationOptions:
     #: Source: origin not recorded.
     min_filled_ratio: float = 0.6
 
+    # Evidence at outlines, and causes of wrong pixels
+
+    #: Ratio of the depths of neighbouring pixels from which an outline lies between them.
+    #: Source: derived, the least error that must be detected, 20 %.
+    side_ratio: float = 1.2
+
+    #: Distance from an outline within which pixels may have the depth of its other side, grid pixels.
+    #: Source: derived, a bleed of 6 px and one pixel of the grid.
+    outline_reach_px: int = 7
+
+    #: Gain of the depth beyond an outline, sigmas² of grey values, that refutes a pixel at a foreground's depth.
+    #: Source: chosen on built-in room 0, holo_a, 7s_redkitchen_000 and tum_fr1_desk9: as much gain 0.05, 0.3, 0.7 and
+    #: 0.3 % of the sound pixels.
+    outline_gain: float = 2.0
+
+    #: The same for a pixel at a background's depth, which the foreground may hide in other views.
+    #: Source: chosen on built-in room 0, holo_a, 7s_redkitchen_000 and tum_fr1_desk9: as much gain 0.2, 0.4, 0.7 and
+    #: 0.2 % of the sound pixels.
+    occluding_outline_gain: float = 3.5
+
+    #: Least amount, sigmas² of grey values, by which pictures must fit a foreground's own depth better than the one
+    #: beyond its outline, for wider windows to support it.
+    #: Source: chosen on built-in rooms 0 to 2 and holo_a: a thousandth of the sound pixels more becomes unknown than
+    #: with 1.
+    min_own_gain: float = 2.0
+
+    #: Largest difference of two depths, as a log ratio, of pixels that support each other in a window of 5 × 5.
+    #: Source: chosen, more than the slope of steep surfaces over two pixels.
+    flying_log_ratio: float = 0.05
+
+    #: Most pixels of the window of 5 × 5 around a flying pixel at its depth.
+    #: Source: derived, one less than a line of one pixel's width has.
+    max_flying_neighbours: int = 3
+
+    #: Fewest pixels of that window before a flying pixel, and behind it.
+    #: Source: derived, a side of the window, 5, less the flying pixels on it.
+    min_side_pixels: int = 3
+
+    #: Depth below which sensors have no true return, m.
+    #: Source: minimum ranges in data sheets of phone LiDARs, time-of-flight and structured-light cameras, 0.1 to 0.3 m.
+    min_sensor_range_m: float = 0.35
+
+    #: Least ratio of a ghost's depth to the true one.
+    #: Source: derived, 1 m over the largest minimum range, 0.35 m.
+    ghost_ratio: float = 2.8
+
     # States and numbers of a frame
 
     #: Misfit from which on evidence refutes a pixel, sigmas.

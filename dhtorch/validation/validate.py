@@ -31,7 +31,7 @@ from dhtorch.pipeline.presets import AUTO, MAP
 from dhtorch.pipeline.spec import Trace
 from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.records import NO_HINT, DepthValidation, Estimate, Frame, PoseFit, TrackHint
-from dhtorch.validation import evidence
+from dhtorch.validation import evidence, wrong_causes
 from dhtorch.validation.evidence import Evidence, ValidationReferences
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS, ValidationOptions
 
@@ -158,6 +158,8 @@ def validate_against(
         grid, reference.hw, points, allowed_sigma, None if is_sensor_map else returns, options
     )
     kinds = [sparse]
+    nothing = evidence.no_evidence(grid)
+    flying = outlines = wrong_causes.RefutedPixels(nothing.misfit, nothing.view, nothing.sure)
     if selected is not None and views:
         number = (
             offered if offered is not None else torch.arange(len(selected.fits.code))[:, None].expand(-1, len(grid))
@@ -165,10 +167,32 @@ def validate_against(
         source_maps = None if is_sensor_map else other_maps
         validated = _ValidatedMap(grid, reference, selected, number.to(grid.device), is_sensor_map)
         kinds += _view_evidences(validated, source_maps, source_views, allowed_sigma, options)
+        flying = _flying_pixels(grid, depth_map, allowed_sigma, options)
+        outlines = _outline_evidence(validated, options)
+        # Between two pixels of a coarser map an outline lies anywhere.
+        is_between = resolution > tolerance
+        outlines = outlines._replace(
+            misfit=outlines.misfit.masked_fill(is_between, torch.nan), unsupported=outlines.unsupported & ~is_between
+        )
     no_scale = torch.full((len(grid), 3), torch.nan).to(grid)
     scale_vs_trajectory = no_scale if selected is None else _scale_vs_trajectory(reference, selected, options)
     numbers = _frame_numbers(grid, reference, points, is_sensor_map, options)
-    return _assemble_validation(grid, kinds, numbers, scale_vs_trajectory, is_sensor_map, options)
+    point_depth = evidence.triangulated_depth(grid, reference.hw, points, options)
+    agrees = torch.zeros_like(flying.unsupported)
+    if not is_sensor_map:
+        ratio = torch.where(returns.usable, grid / torch.where(returns.usable, returns.depth, 1.0), 0.0)
+        agrees = ratio.clamp_min(1e-6).log().abs() < options.supporting_evidence_sigmas * allowed_sigma
+    parts = _OutlineParts(flying, outlines, point_depth, agrees)
+    return _assemble_validation(grid, kinds, parts, (numbers, scale_vs_trajectory), is_sensor_map, options)
+
+
+class _OutlineParts(NamedTuple):
+    """What decides the causes of wrong pixels."""
+
+    flying: wrong_causes.RefutedPixels
+    outlines: wrong_causes.RefutedPixels
+    point_depth: Tensor  # (B, h, w) m, of triangulated points
+    agrees: Tensor  # (B, h, w) bool, with a near return at the pixel itself, of another sensor than the map
 
 
 class _ValidatedMap(NamedTuple):
@@ -221,6 +245,36 @@ def _view_evidences(
             grid, base, source_view_list, [_finite_positive(depth) for depth in depths], tolerance, options
         )
     return _renumber_views(pictures, number), _renumber_views(maps, number)
+
+
+def _outline_evidence(validated: _ValidatedMap, options: ValidationOptions) -> wrong_causes.RefutedPixels:
+    """Evidence at outlines from all views with a motion, numbered among the views passed."""
+    grid, selected = validated.grid, validated.selected
+    base = plane_sweep.make_reference_view(*dense.downscale_grey(validated.reference, max(grid.shape[-2:])))
+    index, use_view = dense.top_views(selected, len(selected.fits.code))
+    use_view = selected.fits.ok.gather(0, index) & (use_view | _has_baseline(selected).gather(0, index))
+    source_view_list = [
+        dense.source_view_of(selected, k, max(base.hw), use, base.image) for k, use in zip(index, use_view, strict=True)
+    ]
+    at_outlines = wrong_causes.outline_evidence(grid, base, source_view_list, options)
+    number = validated.number.gather(0, index)
+    batch = torch.arange(len(grid), device=grid.device)[:, None, None]
+    view = at_outlines.view
+    place = number[view.clamp_min(0).long(), batch].to(torch.int32)
+    return at_outlines._replace(view=torch.where(view >= 0, place, view))
+
+
+def _flying_pixels(
+    grid: Tensor, depth_map: Tensor | None, allowed_sigma: Tensor, options: ValidationOptions
+) -> wrong_causes.RefutedPixels:
+    """Flying pixels on the grid, of a coarser map on its own pixels."""
+    hw = (grid.shape[-2], grid.shape[-1])
+    if depth_map is None or not evidence.is_coarser(depth_map, hw):
+        return wrong_causes.flying_evidence(grid, allowed_sigma, options)
+    own = _finite_positive(depth_map.to(grid))
+    sigma = _resize_nearest(allowed_sigma, (own.shape[-2], own.shape[-1]))
+    flying = wrong_causes.flying_evidence(own, sigma, options)
+    return wrong_causes.RefutedPixels(*(_resize_nearest(x, hw) for x in flying))
 
 
 def _has_baseline(selected: dense.SelectedViews) -> Tensor:
@@ -289,13 +343,16 @@ def _sensor_map(frame: Frame, hw: tuple[int, int]) -> Tensor:
 def _assemble_validation(
     grid: Tensor,
     kinds: Sequence[Evidence],
-    numbers: FrameNumbers,
-    scale_vs_trajectory: Tensor,
+    parts: _OutlineParts,
+    frame_numbers: tuple[FrameNumbers, Tensor],
     is_sensor_map: bool,
     options: ValidationOptions,
 ) -> DepthValidation:
-    """Evidence and numbers of the frame -> DepthValidation; photometric and consistency evidence may be missing."""
+    """Evidence, numbers of the frame and the scale against the trajectory -> DepthValidation; photometric and
+    consistency evidence may be missing."""
+    numbers, scale_vs_trajectory = frame_numbers
     state, misfit, view = combine_evidence(*kinds, options=options)
+    is_flying, at_outline, state, misfit, view = _refute_outlines((state, misfit, view), parts, options)
     clip_depth, at_clip_depth = clipped_depth(grid, state, misfit, options)
     state = torch.where(at_clip_depth & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
     sparse, photometric, consistency = list(kinds) + [evidence.no_evidence(grid)] * (3 - len(kinds))
@@ -311,6 +368,8 @@ def _assemble_validation(
         sparse_evidence=sparse.misfit,
         photometric_evidence=photometric.misfit,
         consistency_evidence=consistency.misfit,
+        outline_evidence=at_outline,
+        cause=wrong_causes.name_causes(grid, state, misfit, parts.point_depth, is_flying, options),
         scale=scale_vs_trajectory if is_sensor_map else numbers.scale,
         scale_near=numbers.near,
         scale_far=no_scale if is_sensor_map else numbers.far,
@@ -320,6 +379,29 @@ def _assemble_validation(
         wrong=share_interval(n_wrong.to(grid), n_known.to(grid)),
         clip_depth=clip_depth,
     )
+
+
+def _refute_outlines(
+    combined: tuple[Tensor, Tensor, Tensor],
+    parts: _OutlineParts,
+    options: ValidationOptions,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """State, misfit and view of the other evidence, changed where flying pixels or the surface beyond an outline refute
+    a pixel -> flying pixels, evidence at outlines, state, misfit, view.
+
+    Windows and references around a pixel do not support it there: it is unknown where the pictures fit its own depth
+    little better than the surface beyond the outline. Where a near return at the pixel itself agrees, nothing changes.
+    """
+    state, misfit, view = combined
+    is_flying = parts.flying.misfit.isfinite()
+    at_outline, outline_view, unsupported = (
+        torch.where(is_flying, a, b) for a, b in zip(parts.flying, parts.outlines, strict=True)
+    )
+    refuted = (at_outline.abs() > options.refuting_evidence_sigmas) & ~parts.agrees
+    new = refuted & (state != State.WRONG)
+    unsupported = (state == State.CONSISTENT) & unsupported & ~parts.agrees
+    state = torch.where(new, State.WRONG, torch.where(unsupported, State.CANNOT_KNOW, state)).to(torch.int32)
+    return is_flying, at_outline, state, torch.where(new, at_outline, misfit), torch.where(new, outline_view, view)
 
 
 def clipped_depth(

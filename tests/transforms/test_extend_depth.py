@@ -488,6 +488,7 @@ def test_what_a_verdict_does_not_know_is_0_and_said_to_be_unknown():
     told = {"state": pixel.int(), "view": pixel.int(), "clip_depth": torch.tensor([0.0, 3.0, nan])}
     told["depth"] = torch.tensor([[[1.0, 0.0]]]).expand(3, 1, 2)
     told |= dict.fromkeys(("evidence", "sparse_evidence", "photometric_evidence", "consistency_evidence"), pixel)
+    told |= {"outline_evidence": pixel, "cause": pixel.int()}
     numbers = ("scale", "scale_near", "scale_far", "scale_vs_trajectory", "shift", "tilt", "wrong")
     keys = validate_depth._validation_keys(DepthValidation(**told, **dict.fromkeys(numbers, number)))
     assert keys["state_share"].tolist() == [[1.0, 0.0, 0.0]] * 3, "where the map says nothing, nothing is shared out"
