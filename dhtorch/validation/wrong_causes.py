@@ -60,6 +60,11 @@ _LEVEL_RATIO = 0.1
 _OCCLUSION_STEP = 0.03
 
 
+#: Distance over which pixels of one surface of the map share the name of a ghost, grid pixels.
+#: Source: chosen, an eighth of a picture 320 wide.
+_MAX_GHOST_RADIUS_PX = 40
+
+
 class RefutedPixels(NamedTuple):
     """What refutes pixels of a map, (B, h, w) each."""
 
@@ -231,12 +236,14 @@ def name_causes(
 ) -> Tensor:
     """Map, states and evidence -> codes.WrongCause (B, h, w) int32 of the wrong pixels, NONE of all others.
 
-    Ghost: triangulated points there lie below the minimum range, and the map lies far behind them. Edge bleed: the
+    Ghost: triangulated points there, or elsewhere on the same surface of the map, lie below the minimum range, and the
+    map lies far behind them. Edge bleed: the
     pixel lies within ``outline_reach_px`` of an outline, on the surface of one side, in a band of wrong pixels no wider
     than twice that, and its evidence points to the other side. Gradient: none.
     """
     wrong = state == State.WRONG
-    ghost = (point_depth < options.min_sensor_range_m) & (depth > options.ghost_ratio * point_depth)
+    below_range = (point_depth < options.min_sensor_range_m) & (depth > options.ghost_ratio * point_depth)
+    ghost = _same_surface(wrong & below_range, depth, options.surface_log_ratio)
     steps, ratio = options.outline_reach_px, options.side_ratio
     has_farther, has_nearer = (extend_surface(depth, steps, ratio, far=far) != depth for far in (True, False))
     bleeds = (has_farther & (misfit < 0)) | (has_nearer & (misfit > 0))
@@ -247,6 +254,16 @@ def name_causes(
         (bleeds & ~_is_wide(wrong & ~flying, steps), WrongCause.EDGE_BLEED),
         otherwise=WrongCause.OTHER,
     )
+
+
+def _same_surface(mask: Tensor, depth: Tensor, max_log_ratio: float) -> Tensor:
+    """Mask (B, h, w) grown over neighbouring pixels of similar depth, by ``_MAX_GHOST_RADIUS_PX``."""
+    grown = torch.where(mask, depth, 0.0)
+    for _ in range(_MAX_GHOST_RADIUS_PX):
+        beside = F.max_pool2d(grown[:, None], 3, 1, 1)[:, 0]
+        level = (depth / beside.clamp_min(1e-6)).clamp_min(1e-6).log().abs() < max_log_ratio
+        grown = torch.where((grown == 0) & (depth > 0) & level, depth, grown)
+    return grown > 0
 
 
 def _is_wide(mask: Tensor, radius: int) -> Tensor:

@@ -172,6 +172,8 @@ def test_the_cause_follows_from_where_a_pixel_lies_and_what_refutes_it():
     points[0, 5, 8], points[0, 5, 6] = 0.2, 0.6
     cause = name_causes(depth, state, misfit, points, flying)
     assert cause[0, 5, 6:9].tolist() == [WrongCause.EDGE_BLEED, WrongCause.FLYING_PIXEL, WrongCause.GHOST]
+    state[0, 9, 12] = State.WRONG
+    assert name_causes(depth, state, misfit, points, flying)[0, 9, 12] == WrongCause.GHOST, "one surface of the map"
 
 
 def test_a_wide_wrong_region_does_not_bleed():
