@@ -4,7 +4,9 @@ import pytest
 import torch
 
 from dhtorch import AUTO, validate_depth
+from dhtorch.cli.validate import _format_wrong_causes
 from dhtorch.codes import State, WrongCause
+from dhtorch.experiments.compare.validate_study import _cause_ratios
 from dhtorch.geometry import plane_sweep
 from dhtorch.metrics.detection import auroc
 from dhtorch.metrics.holdout import range_split
@@ -106,6 +108,26 @@ def test_a_ghost_is_named_by_points_below_the_minimum_range(room, true):
     named = validation.cause == WrongCause.GHOST
     assert (named & on_card).sum() > 0.5 * detected.sum()
     assert (named & ~on_card).sum() < 0.1 * named.sum()
+
+
+def test_a_card_needs_a_pose(room):
+    with pytest.raises(ValueError, match="has no pose"):
+        add_near_card(room[ANCHOR].replace(T_world_from_cam=None), room[ANCHOR].T_world_from_cam, seed=0)
+
+
+def test_the_summary_names_causes_by_their_fraction():
+    share = {"ghost": 0.0, "flying_pixel": 0.004, "edge_bleed": 0.012}
+    assert _format_wrong_causes(share) == " (1.2% edge bleed, 0.4% flying pixel)"
+    assert _format_wrong_causes(dict.fromkeys(share, None)) == ""
+
+
+def test_ratios_of_causes_are_of_the_detected_pixels():
+    row = {"outline_alarms": 0.01, "auroc.ghost": 0.9, "planted.ghost": 10, "known_planted.ghost": 8}
+    row |= {"detected.ghost": 4, "cause_right.ghost": 1}
+    ratios = _cause_ratios([row, {"outline_alarms": None}])
+    assert ratios["validate.ghost_auroc"] == 0.9 and ratios["validate.ghost_known"] == 0.8
+    assert ratios["validate.cause_right_ghost"] == ratios["validate.cause_right"] == 0.25
+    assert ratios["validate.edge_bleed_auroc"] is None and ratios["validate.cause_right_edge_bleed"] is None
 
 
 # -------------------------------------------------------------------------------------------------- on small maps
