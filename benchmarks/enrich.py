@@ -116,7 +116,8 @@ def row(name: str, path: Path, arguments: Sequence[str], target: str, folder: Pa
     again, idle = run(words)
     frames = sum(min(FRAMES, len(each)) for each in source)
     sizes = [p.stat().st_size for p in out.rglob("*") if p.is_file() and p.suffix != ".mp4" and p.parent.name != "meta"]
-    rate = json.loads((out / "meta" / "info.json").read_text())["fps"] if target != "nerfstudio" else None
+    about = out / "meta" / "info.json"  # of LeRobot sets
+    rate = json.loads(about.read_text())["fps"] if about.is_file() else None
     return record | {
         "frames": frames,
         "s_per_frame": max(0.0, seconds - idle) / frames,
@@ -125,7 +126,7 @@ def row(name: str, path: Path, arguments: Sequence[str], target: str, folder: Pa
         "printed": [line.strip() for line in done.stdout.splitlines()[1:]],
         "done_again": again.returncode == 0 and "left untouched" in again.stdout,
         "source_untouched": digest(path) == before,
-        "compared": (nerfstudio if target == "nerfstudio" else robot)(path, source, out),
+        "compared": (nerfstudio if rate is None else robot)(path, source, out),
     }
 
 

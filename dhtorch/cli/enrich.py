@@ -305,6 +305,8 @@ def _resolve_format(requested: str, first: Sequence[Scene]) -> str:
     if requested != "same":
         return requested
     kind, root = first[0].recording.format, first[0].root
+    if kind == "nerfstudio":
+        return kind
     if kind != "lerobot" or root is None:
         raise ValueError(
             f"format=same: found {kind}, which dhtorch cannot write; expected {', '.join(_OUTPUT_FORMATS)}"

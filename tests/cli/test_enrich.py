@@ -238,6 +238,15 @@ def test_a_format_that_nothing_writes_is_refused_in_a_line(kind, shots, tmp_path
         assert any("depth unit assumed: 1/1000 m" in note for note in notes)
 
 
+def test_a_nerfstudio_folder_becomes_one(shots, tmp_path):
+    writers.write_nerfstudio(tmp_path / "room", shots[:3])
+    out = tmp_path / "out"
+    assert main(["enrich", str(tmp_path / "room"), str(out), *ASKED, "format=same"]) == 0
+    again = data.open(out)
+    assert again.format == "nerfstudio" and len(again) == 3
+    assert torch.equal(again[1].image, shots[1].image)
+
+
 def test_every_format_that_is_read_was_written_in_every_format_or_refused():
     """``same`` among them: docs/enrich.md says so of its table."""
     file = Path(__file__).parents[2] / "benchmarks" / "results" / "enrich.json"
@@ -246,8 +255,9 @@ def test_every_format_that_is_read_was_written_in_every_format_or_refused():
     assert len(targets) == 4 and {row["source"] for row in found} == set(data.FORMATS)
     assert {(row["source"], row["target"]) for row in found} == set(itertools.product(data.FORMATS, targets))
     for row in (row for row in found if row["target"] == "the source's own"):
-        assert ("refused" in row) == (row["source"] != "lerobot"), row["data"]
-        assert "no writer here; expected lerobot" in row["refused"] if "refused" in row else row["compared"] > 0
+        assert ("refused" in row) == (row["source"] not in ("lerobot", "nerfstudio")), row["data"]
+        refusal = f"found {row['source']}, which dhtorch cannot write; expected lerobot"
+        assert refusal in row["refused"] if "refused" in row else row["compared"] > 0
 
 
 def test_a_table_without_frame_index_counts_its_rows(shots, tmp_path):

@@ -128,6 +128,14 @@ def test_a_factor_near_1_is_a_scale_and_refutes_nothing(factor, tracked, frames,
     assert f"depth is {check.factor:.2f} times what the poses' translations imply" in describe_factor(check)
 
 
+def test_one_pair_or_two_decide_neither_by_tracks_nor_on_a_factor_near_1(frames, true, tracks):
+    scaled = {k: f.replace(depth=1.1 * f.depth) for k, f in frames.items()}
+    by = [(s.replace(depth=1.1 * s.depth), t) for s, t in tracks]
+    for n, factor in ((1, 1.0), (2, 1.0), (3, 1.1)):
+        check = check_poses(true, scaled, PAIRS[:n], by[:n])
+        assert check.factor == pytest.approx(factor, rel=0.015) and (check.tracks is not None) == (n > 2)
+
+
 def test_depth_of_another_common_unit_is_named(frames, true):
     """Codes of 1/5000 m that are read as millimetres: the unit is named, not a factor of the poses."""
     scaled = {k: f.replace(depth=5 * f.depth) for k, f in frames.items()}
