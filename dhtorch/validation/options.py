@@ -81,7 +81,7 @@ class ValidationOptions:
     min_own_gain: float = 2.0
 
     #: Largest difference of two depths, as a log ratio, of pixels that support each other in a window of 5 × 5.
-    #: Source: chosen, more than the slope of steep surfaces over two pixels.
+    #: Source: derived, twice the default tolerance of a map, 0.025.
     flying_log_ratio: float = 0.05
 
     #: Most pixels of the window of 5 × 5 around a flying pixel at its depth.
@@ -93,7 +93,7 @@ class ValidationOptions:
     min_side_pixels: int = 3
 
     #: Depth below which sensors have no true return, m.
-    #: Source: minimum ranges in data sheets of phone LiDARs, time-of-flight and structured-light cameras, 0.1 to 0.3 m.
+    #: Source: derived, a sixth more than 0.3 m, the larger one of usual minimum ranges of depth cameras.
     min_sensor_range_m: float = 0.35
 
     #: Least ratio of a ghost's depth to the true one.
