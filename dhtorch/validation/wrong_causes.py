@@ -56,7 +56,7 @@ _MAX_GAIN = 8.0
 _LEVEL_RATIO = 0.1
 
 #: Fraction of the largest inverse depth by which an occluding pixel must be nearer.
-#: Source: origin not recorded, the value of dhtorch.validation.evidence.
+#: The same as in dhtorch.validation.evidence. Source: origin not recorded.
 _OCCLUSION_STEP = 0.03
 
 
