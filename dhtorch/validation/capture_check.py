@@ -31,8 +31,8 @@ from dhtorch.validation.options import ValidationOptions
 from dhtorch.validation.pose_check import PoseCheck, check_poses, describe_contradiction, describe_factor
 
 #: Frames of the window that is examined: pairs of up to 8 frames apart, and maps up to 5 frames late.
-#: Source: derived, the largest gap and twice the largest lag of dhtorch.validation.faults.
-WINDOW_FRAMES: Final = 20
+#: Source: derived, more than three times the largest lag of dhtorch.validation.faults, whose references need it.
+WINDOW_FRAMES: Final = 16
 
 #: Kinds of faults for which the depth is turned or moved in time: the option that mends them, by name.
 _TURN_OPTIONS: Final = {
@@ -47,12 +47,12 @@ _TURN_OPTIONS: Final = {
 #: Source: derived, the losses of dhtorch.validation.faults.
 _MAX_TRACKED_PX: Final = 640
 
-#: Options of the diagnosis: six pairs instead of eight. Limits the time. Source: origin not recorded.
-_OPTIONS: Final = ValidationOptions(max_window_pairs=6)
+#: Options of the diagnosis: five pairs instead of eight. Limits the time. Source: origin not recorded.
+_OPTIONS: Final = ValidationOptions(max_window_pairs=5)
 
 #: Mean loss of tracks under the motions of near returns up to which the latter explain them.
 #: Source: chosen on the sound captures of the shared data: 0.11 to 0.23 where motion is moderate.
-_MAX_EXPLAINED_LOSS: Final = 0.25
+_MAX_EXPLAINED_LOSS: Final = 0.3
 
 #: Mean loss of tracks from which on depth and pictures contradict each other although no known fault explains it.
 #: Source: chosen on the sound captures of the shared data (at most 0.45) and on rolled depth with its own K (0.69).

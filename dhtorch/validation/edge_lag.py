@@ -5,6 +5,7 @@ Works without poses and without texture on surfaces, where the picture moves by 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -29,12 +30,12 @@ _MIN_LEAD: Final = 0.038
 #: Least lead in standard errors over the frames. Source: origin not recorded.
 _MIN_LEAD_ERRORS: Final = 4.0
 
-#: Largest shift of depth beside its pictures that is no lag, px of the grid: 6 px of a picture 640 wide.
+#: Shifts of depth beside its pictures that are no lag, px of the grid: up to 6 px of a picture 640 wide.
 #: Source: chosen on 7-Scenes, whose depth is not registered exactly.
-_MAX_SHIFT_PX: Final = 3
+_SHIFTS_PX: Final = (-3, -1, 0, 1, 3)
 
 #: Frames that are compared under all shifts. Limits the time. Source: origin not recorded.
-_MAX_SHIFTED_FRAMES: Final = 8
+_MAX_SHIFTED_FRAMES: Final = 5
 
 #: Fewest frames with both a picture and the depth of another frame. Source: origin not recorded.
 _MIN_FRAMES: Final = 4
@@ -50,13 +51,13 @@ class EdgeLag(NamedTuple):
 def find_edge_lag(frames: Sequence[Frame]) -> EdgeLag:
     """Consecutive frames (B = 1 each, with pictures) -> lag of their depth. Gradient: none."""
     with torch.no_grad():
-        pictures = [picture_edges(frame.image[0], grid_px=_GRID_PX) for frame in frames]
+        pictures = {i: picture_edges(frames[i].image[0], grid_px=_GRID_PX) for i in range(len(frames))}
         hw = pictures[0].shape[-2], pictures[0].shape[-1]
         depths = [depth_edges(frame.depth[0], hw) for frame in frames]
     n, best = len(frames), EdgeLag(0, 0.0)
-    without = [edge_correlation(pictures[i], *depths[i]) for i in range(n)]
+    without = {i: edge_correlation(picture, *depths[i]) for i, picture in pictures.items()}
     for lag in range(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 1):
-        places = [i for i in range(n) if 0 <= i + lag < n]
+        places = [i for i in pictures if 0 <= i + lag < n]
         if lag == 0 or len(places) < _MIN_FRAMES:
             continue
         lead = [edge_correlation(pictures[i], *depths[i + lag]) - without[i] for i in places]
@@ -64,7 +65,7 @@ def find_edge_lag(frames: Sequence[Frame]) -> EdgeLag:
             best = EdgeLag(lag, mean)
     if best.lag == 0:
         return best
-    places = [i for i in range(n) if 0 <= i + best.lag < n]
+    places = [i for i in pictures if 0 <= i + best.lag < n]
     places = places[:: max(1, len(places) // _MAX_SHIFTED_FRAMES)]
     late, now = (
         _shifted_scores([pictures[i] for i in places], [depths[i + by] for i in places]) for by in (best.lag, 0)
@@ -81,14 +82,12 @@ def _clear_mean(lead: Sequence[float]) -> float:
 
 
 def _shifted_scores(pictures: Sequence[Tensor], depths: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """Correlations (n, shifts) of edges with those of depth moved by up to ``_MAX_SHIFT_PX``.
+    """Correlations (n, shifts) of edges with those of depth moved by up to 3 px each way.
 
     Depth that lies some pixels beside its pictures looks late or early while the camera moves steadily: a lag counts
     only beyond what one shift of all frames explains.
     """
-    shifts = [
-        (v, u) for v in range(-_MAX_SHIFT_PX, _MAX_SHIFT_PX + 1) for u in range(-_MAX_SHIFT_PX, _MAX_SHIFT_PX + 1)
-    ]
+    shifts = list(itertools.product(_SHIFTS_PX, repeat=2))
     rows = []
     for picture, (edges, covered) in zip(pictures, depths, strict=True):
         moved = ((torch.roll(edges, by, (-2, -1)), torch.roll(covered, by, (-2, -1))) for by in shifts)
