@@ -352,8 +352,8 @@ def _assemble_validation(
     consistency evidence may be missing."""
     numbers, scale_vs_trajectory = frame_numbers
     state, misfit, view = combine_evidence(*kinds, options=options)
-    is_flying, at_outline, state, misfit, view = _refute_outlines((state, misfit, view), parts, options)
     clip_depth, at_clip_depth = clipped_depth(grid, state, misfit, options)
+    is_flying, at_outline, state, misfit, view = _refute_outlines((state, misfit, view), parts, options)
     state = torch.where(at_clip_depth & (state != State.WRONG), State.CANNOT_KNOW, state).to(torch.int32)
     sparse, photometric, consistency = list(kinds) + [evidence.no_evidence(grid)] * (3 - len(kinds))
     no_scale = torch.full_like(scale_vs_trajectory, torch.nan)
