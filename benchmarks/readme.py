@@ -353,9 +353,12 @@ def enriched() -> str:
         "loaders",
     ]
     grid = text.table_to_markdown(ReportTable("", head, rows))
-    first = json.loads(file.read_text())[0]
+    timed: dict[str, list[str]] = {}
+    for record in (record for record in json.loads(file.read_text()) if "refused" not in record):
+        timed.setdefault(f"{record['processor']}, {record['cores']} cores", []).append(record["source"])
+    processors = "; ".join(f"{name}: {', '.join(sorted(set(sources)))}" for name, sources in timed.items())
     options = "`frames=3 'dense={size: 160}'`"
-    return f"{grid}\n\n{options}; processor time of {first['processor']}, {first['cores']} cores, beside other work."
+    return f"{grid}\n\n{options}; processor time, beside other work. {processors}."
 
 
 #: What validation is to find, in words, and its bars.
