@@ -25,6 +25,7 @@ from support.dataset_folders import decode_map, read_files, read_rows
 
 from dhtorch import data
 from dhtorch import testing as writers
+from dhtorch.cli import capture_checks
 from dhtorch.cli.run import main
 from dhtorch.data.codecs import tfrecord
 from dhtorch.data.readers.rlds import StepFeature
@@ -497,12 +498,17 @@ def test_the_sources_poses_are_used(robot, tmp_path):
     assert recovered[1] > 0 and recovered[0] == 0
 
 
-def test_poses_that_near_returns_refute_are_said_everywhere_with_their_reading(tmp_path, capsys):
+def test_poses_that_near_returns_refute_are_said_everywhere_with_their_reading(tmp_path, capsys, monkeypatch):
+    """Of a capture whose poses the check at the start lets pass: it sees some frames of a set's first episode."""
     source, out = tmp_path / "source", tmp_path / "set"
     poses = [shot.T_world_from_cam for shot in shots(3)]
     in_mm = [shot.replace(T_world_from_cam=T.replace(t=1000 * T.t)) for shot, T in zip(shots(3), poses, strict=True)]
     source.mkdir()
     writers.write_lerobot(source, [in_mm], depth="tiff")
+    with pytest.warns(UserWarning, match="poses and depth contradict each other .* they are not used"):
+        assert main(["enrich", str(source), str(out), *ASKED, "pose=device"]) == 2
+    assert "pose: found no poses of front" in capsys.readouterr().err and not out.exists()
+    monkeypatch.setattr(capture_checks, "check_scene", lambda scene: scene)
     enrich(source, out, "method.n=256", "pose=device")
     said = "front: the input poses contradict the near returns in 2 of 3 frames; they fit as millimetres"
     assert said in capsys.readouterr().out

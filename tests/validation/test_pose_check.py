@@ -26,7 +26,7 @@ from dhtorch.validation.pose_check import (
 
 N = 12
 PAIRS = [(3, 5), (4, 6), (5, 7), (6, 8)]
-NONE = PoseReading()
+NONE, UP_BACK = PoseReading(), PoseReading(PoseConvention("right_up_back"))
 
 
 @pytest.fixture(scope="module")
@@ -207,9 +207,7 @@ def test_readings_are_distinct_and_the_stated_one_is_first():
     assert all(r.is_small_factor == (0.67 < r.factor < 1.5 and r.convention.unit != "m") for r in readings)
 
 
-def check_of(
-    stated, best_score, best=PoseReading(PoseConvention("right_up_back")), without=0.1, tracks=None, factor=1.0
-):
+def check_of(stated, best_score, best=UP_BACK, without=0.1, tracks=None, factor=1.0):
     return PoseCheck(scores(stated, without, best, best_score), tracks, factor, 4)
 
 
