@@ -67,7 +67,7 @@ from dhtorch.pipeline.presets import MAP, PAPER, WINDOW
 from dhtorch.records import Frame
 from dhtorch.stages import backproject, holes, misalignment, pose, pose_prior, score, track, triangulate
 from dhtorch.synthetic import SyntheticRoom
-from dhtorch.validation import evidence, faults, validate
+from dhtorch.validation import evidence, faults, validate, wrong_causes
 
 FEW = 11  # points; no other axis of any answer is as long
 
@@ -520,6 +520,7 @@ ELSEWHERE = {
         for name in (
             "estimate_pairs",
             "place_frames",
+            "chain_poses",
             "linking_pairs",
             "fuse_recording",
             "fuse_recording_grids",
@@ -599,7 +600,7 @@ ELSEWHERE = {
     ),
     *(
         f"dhtorch.validation.faults.{name}"
-        for name in ("rot90_map", "diagnose", "select_cause", "track_window", "ray_lengths")
+        for name in ("rot90_map", "diagnose", "select_cause", "track_window", "ray_lengths", "undo_fault")
     ),
     "dhtorch.metrics.detection.auroc",
     "dhtorch.alignment.align.align_depth",
@@ -876,6 +877,7 @@ def public_functions():
         evidence,
         faults,
         validate,
+        wrong_causes,
         *ESTIMATORS,
     ]
     parts.append(importlib.import_module("dhtorch.experiments.probes.ridge"))

@@ -208,8 +208,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "validation.edge_lag": [
         ("find_edge_lag", "*depths[i + lag]", "*depths[i - lag]"),
-        ("find_edge_lag", "score(i, lag) - without[i]", "score(i, lag)"),
-        ("find_edge_lag", "best.lead)", "0.0)"),
+        ("find_edge_lag", "- without[i]", ""),
+        ("_clear_mean", "mean if mean >", "mean if 1 + mean >"),
         ("find_edge_lag", "len(places) < _MIN_FRAMES", "len(places) < 1"),
     ],
     "validation.edge_fault": [

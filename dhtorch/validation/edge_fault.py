@@ -21,7 +21,7 @@ from dhtorch.validation.faults import KNOWN_FAULTS, NO_FAULT, KnownFault
 _KINDS: Final = ("mirrored", "rolled", "registration")
 
 #: Frames that are examined, evenly spread. Limits the time to about a second. Source: origin not recorded.
-_MAX_FRAMES: Final = 4
+_MAX_FRAMES: Final = 6
 
 #: Fewest frames. Source: derived, as the orientation of files, where three
 #: frames never decided wrongly.

@@ -79,7 +79,7 @@ _MAX_UNEXPLAINED_DISAGREEMENT: Final = 0.05
 
 #: A factor near 1 is reported if the disagreement without it is larger by this ratio.
 #: Source: chosen on the sound captures of the shared data (largest ratio 1.1) and on depth that is 10 % too long.
-_MIN_FACTOR_GAIN: Final = 1.25
+_MIN_FACTOR_GAIN: Final = 1.15
 
 #: Least difference from 1 of a factor that is reported.
 #: Source: chosen on the sound captures of the shared data and on depth that is 10 % too long.

@@ -516,7 +516,10 @@ def test_a_depth_map_has_the_shape_of_the_picture_or_a_camera_of_its_own():
         )
     wide = sample(image=picture(shape=(10, 40, 3)), intrinsics=[9, 9, 19.5, 4.5], depth=np.ones((5, 20), np.float32))
     assert read(wide).reference.depth_camera is None
-    refused({**wide, "depth": np.ones((20, 5), np.float32)}, r"orientation differs: depth 5x20 \(portrait\) beside pictures 40x10 \(landscape\)")
+    refused(
+        {**wide, "depth": np.ones((20, 5), np.float32)},
+        r"orientation differs: depth 5x20 \(portrait\) beside pictures 40x10 \(landscape\)",
+    )
 
 
 # ---------------------------------------------------------------------------------------------------- the other view

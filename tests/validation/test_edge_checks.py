@@ -16,9 +16,7 @@ def frames():
 
 def delayed(frames, lag):
     """Frames whose depth comes ``lag`` frames late."""
-    return [
-        frame.replace(depth=frames[k - lag].depth) for k, frame in enumerate(frames) if 0 <= k - lag < len(frames)
-    ]
+    return [frame.replace(depth=frames[k - lag].depth) for k, frame in enumerate(frames) if 0 <= k - lag < len(frames)]
 
 
 def test_sound_windows_show_nothing(frames):
