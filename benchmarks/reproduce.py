@@ -126,8 +126,9 @@ NAMED = {
 }
 NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items() for name in names}
 
-#: Options that change no number, and which a file may hold otherwise.
-ASIDE = {"figures", "traceback", "root"}
+#: Options that change no number of the archived results, and which a file may hold otherwise: ``verify`` silences only
+#: pairs whose depth belongs to other pixels, and the corrections of a capture are unset.
+ASIDE = {"figures", "traceback", "root", "verify", "depth_unit", "depth_lag", "depth_turn", "pose_convention"}
 
 #: Files that were made with other settings than today's, and wait for a quiet machine.
 OUTDATED: set[str] = {"part_ablation"}

@@ -49,7 +49,7 @@ REPLACED = {
     "found": "the quantity: depth_map, fit, summary, actual",
     "say": "add_fact, compute",
     "made": "load_item, the thing made",
-    "noted": "annotate",
+    "room_scene": "annotate",
     "silent": "unanswered, no_answer",
     "held": "cached, limited, pose_returns",
 }

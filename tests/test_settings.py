@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from dhtorch.cli import option_checks as words
 from dhtorch.cli.run import config_dir
 from dhtorch.data import FORMATS
+from dhtorch.data.corrections import Corrections
 from dhtorch.data.pairs import by_choice, by_gap, by_time
 from dhtorch.pipeline.method import Method
 from dhtorch.synthetic import SyntheticRoom
@@ -92,6 +93,8 @@ def test_every_setting_composes_and_names_real_options(choice):
             known |= options(FORMATS[node["format"]].read)
         elif "format" in node:  # or of the one that recognises the files, which may lack a camera
             known |= dict.fromkeys(("intrinsics", "K", "fov"))
+        if node["_target_"].endswith(".open_capture"):  # and corrections, which every format has
+            known |= dict.fromkeys(Corrections.names())
         if node["_target_"].endswith(".open_room"):  # hands further options to the room
             known |= options(SyntheticRoom)
         keys = {k for k in node if not k.startswith("_")}

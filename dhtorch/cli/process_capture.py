@@ -396,7 +396,8 @@ def _place_frames(recovered: RecoveredFrames) -> Recording:
     first = recovered.frames[0]
     placed = chain_poses(first, se3.identity(1, torch.zeros((), dtype=torch.float64)), links)
     n = len(task.recording)
-    R, t = torch.full((n, 3, 3), torch.nan, dtype=torch.float64), torch.full((n, 3), torch.nan, dtype=torch.float64)
+    R = torch.full((n, 3, 3), torch.nan, dtype=torch.float64)
+    t = torch.full((n, 3), torch.nan, dtype=torch.float64)
     for k, pose in placed.items():
         R[k], t[k] = pose.R[0], pose.t[0]
     return replace(task.recording, poses=Pose(R, t))

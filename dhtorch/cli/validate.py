@@ -446,7 +446,8 @@ def _name_wrong_scale(medians: Mapping[str, float | None], deviation: float | No
     start = f"maps are {_format_factor(scale)} times the sensor's depth"
     if sensor is None or sensor <= 0:
         return [f"{start}; without usable poses it cannot be known which of the two is wrong"]
-    off_maps, off_sensor = abs(math.log(scale * sensor)), abs(math.log(sensor))
+    off_maps = abs(math.log(scale * sensor))
+    off_sensor = abs(math.log(sensor))
     if off_maps < _MAX_WITNESS_RATIO * off_sensor:
         return [f"{start}, and agree with the poses: the sensor's scale is wrong (data.depth_unit=)"]
     if off_sensor < _MAX_WITNESS_RATIO * off_maps:

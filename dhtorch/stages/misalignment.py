@@ -130,7 +130,8 @@ def reject_misaligned(
     reject = partial(
         _reject, max_unexplained=max_unexplained, min_gain=min_gain, few_returns=few_returns, min_t_snr=min_t_snr
     )
-    return chunked_apply(reject, TEST_CHUNK_PAIRS, fit, samples, tracks, cam.ideal(camera_0), cam.ideal(camera_1))
+    cameras = (cam.ideal(camera_0), cam.ideal(camera_1))
+    return chunked_apply(reject, TEST_CHUNK_PAIRS, fit, samples, tracks, *cameras)
 
 
 def _reject(fit: PoseFit, *inputs: Samples | Tracks | Camera, **limits: float) -> PoseFit:
@@ -188,7 +189,8 @@ def _near_parallax(samples: Samples, tracks: Tracks, fit: PoseFit, camera_0: Cam
     far = tracked & ~samples.usable
     across = [torch.where(m.any(-1, keepdim=True), masked_median(geometry.residual_px, m), 0.0) for m in (used, far)]
     noise = (torch.maximum(*across) / MEDIAN_1D).clamp_min(MIN_NOISE_PX)
-    return _Parallax(uv_0, p, q, a, (sigma * p) ** 2 + DEPTH_TOLERANCE_REL**2, noise, used)
+    variance_rel = (sigma * p) ** 2 + DEPTH_TOLERANCE_REL**2
+    return _Parallax(uv_0, p, q, a, variance_rel=variance_rel, noise=noise, used=used)
 
 
 def _thinned(near: _Parallax) -> _Parallax:
@@ -198,7 +200,8 @@ def _thinned(near: _Parallax) -> _Parallax:
     index, count = ransac.usable_first(near.used, min(MAX_ATTACHED_RETURNS, near.used.shape[1]))
     used = torch.arange(index.shape[1], device=index.device) < count[:, None]
     p, q, a, variance_rel = (x.gather(1, index) for x in (near.p, near.q, near.a, near.variance_rel))
-    return _Parallax(near.uv.gather(1, index[..., None].expand(-1, -1, 2)), p, q, a, variance_rel, near.noise, used)
+    uv = near.uv.gather(1, index[..., None].expand(-1, -1, 2))
+    return _Parallax(uv, p, q, a, variance_rel=variance_rel, noise=near.noise, used=used)
 
 
 def _profile_cost(near: _Parallax, p: Tensor, used: Tensor, scale: Tensor | None) -> Tensor:

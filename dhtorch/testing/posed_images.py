@@ -97,7 +97,8 @@ def write_polycam(root: Path, frames: Sequence[Frame], *, corrected: bool = True
     folder = root / "keyframes"
     for frame in frames:
         stem = str(round(frame_time_s(frame) * _POLYCAM_STAMPS_PER_S))
-        K, c2w = K_matrix(frame.camera), pose_matrix(frame) @ _FLIP_Y_AND_Z
+        K = K_matrix(frame.camera)
+        c2w = pose_matrix(frame) @ _FLIP_Y_AND_Z
         picture = encode_unfiltered_png(frame_to_hwc(frame))
         camera = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "blur_score": 100.0}
         camera |= {"width": frame.hw[1], "height": frame.hw[0]}

@@ -53,7 +53,8 @@ def find_edge_fault(frames: Sequence[Frame]) -> KnownFault | None:
             if fault.kind not in _KINDS:
                 continue
             lead = _scores(pictures, depths, fault) - without
-            mean, error = float(lead.mean()), float(lead.std()) / len(chosen) ** 0.5
+            mean = float(lead.mean())
+            error = float(lead.std()) / len(chosen) ** 0.5
             if mean > max(_MIN_LEAD, _MIN_LEAD_ERRORS * error, best_lead):
                 best, best_lead = fault, mean
     return best

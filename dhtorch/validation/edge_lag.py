@@ -54,7 +54,8 @@ def find_edge_lag(frames: Sequence[Frame]) -> EdgeLag:
         pictures = {i: picture_edges(frames[i].image[0], grid_px=_GRID_PX) for i in range(len(frames))}
         hw = pictures[0].shape[-2], pictures[0].shape[-1]
         depths = [depth_edges(frame.depth[0], hw) for frame in frames]
-    n, best = len(frames), EdgeLag(0, 0.0)
+    n = len(frames)
+    best = EdgeLag(0, 0.0)
     without = {i: edge_correlation(picture, *depths[i]) for i, picture in pictures.items()}
     for lag in range(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 1):
         places = [i for i in pictures if 0 <= i + lag < n]
@@ -77,7 +78,8 @@ def find_edge_lag(frames: Sequence[Frame]) -> EdgeLag:
 def _clear_mean(lead: Sequence[float]) -> float:
     """Mean of leads over the frames, 0 where it is not clear."""
     values = torch.tensor(lead, dtype=torch.float64)
-    mean, error = float(values.mean()), float(values.std()) / len(lead) ** 0.5
+    mean = float(values.mean())
+    error = float(values.std()) / len(lead) ** 0.5
     return mean if mean > max(_MIN_LEAD, _MIN_LEAD_ERRORS * error) else 0.0
 
 

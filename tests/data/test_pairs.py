@@ -168,10 +168,14 @@ def test_scenes_are_opened_when_they_are_asked_for() -> None:
 
     whole = scenes_of(Recordings(("a", "b", "c"), make))
     assert len(whole) == 3 and opened == [] and len(whole[1].recording) == 4 and opened == [1]
-    noted = Scenes(whole.recordings, partial(Scene, near=2.0, room="hall"))
-    assert [(s.near, s.gap, s.place, s.hint.levels) for s in noted[1:]] == [(2.0, None, "hall", None)] * 2
-    assert scenes_of(noted) is noted and Scene(line(3), levels=6).hint.levels == 6 and Scene(line(3)).place == "line"
-    first = noted[0]
+    room_scene = Scenes(whole.recordings, partial(Scene, near=2.0, room="hall"))
+    assert [(s.near, s.gap, s.place, s.hint.levels) for s in room_scene[1:]] == [(2.0, None, "hall", None)] * 2
+    assert (
+        scenes_of(room_scene) is room_scene
+        and Scene(line(3), levels=6).hint.levels == 6
+        and Scene(line(3)).place == "line"
+    )
+    first = room_scene[0]
     assert scenes_of(first) == [first] and scenes_of([first, line(4)])[0] is first
     assert [s.recording.name for s in scenes_of(line(4))] == ["line"]
 

@@ -2,7 +2,7 @@
 
 import pytest
 from support.paper_protocol_runs import configured_method, outcome_of_rows
-from support.rooms import Changed, noted
+from support.rooms import Changed, room_scene
 
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.paper import global_map as experiment
@@ -16,7 +16,7 @@ def room(**options):
 
 def asked(recording):
     return experiment.run(
-        [noted(recording, gap=2)], {"paper": configured_method()}, by_gap, Settings(), n=700, voxel=0.03
+        [room_scene(recording, gap=2)], {"paper": configured_method()}, by_gap, Settings(), n=700, voxel=0.03
     )
 
 

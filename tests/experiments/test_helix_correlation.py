@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
-from support.rooms import noted
+from support.rooms import room_scene
 
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.negative import helix_correlation as experiment
@@ -158,7 +158,9 @@ def test_forward_motion_is_not_seen_where_plain_flow_sees_it():
     up = ahead.camera.f[0, 1] * math.tan(math.radians(9))  # the viewer looks 9 degrees below where it goes
     focus = ahead.camera.c[0] - torch.tensor([0.0, float(up)])
     gaze = tuple(focus.tolist())
-    outcome = experiment.run([noted(ahead, gap=3)], {"paper": base}, by_gap, Settings(), gaze=gaze, round_arms=True)
+    outcome = experiment.run(
+        [room_scene(ahead, gap=3)], {"paper": base}, by_gap, Settings(), gaze=gaze, round_arms=True
+    )
     found = {v: outcome.scenes(v)["synthetic_room"] for v in experiment.VARIANTS}
     assert found["flow"]["corr"] > 0.6 and found["own_arm"]["corr"] < 0.5 * found["flow"]["corr"]
     assert found["flow_along_arm"]["flow_share"] < 0.15 and found["own_arm"]["flow_share"] < 0.3

@@ -5,8 +5,8 @@ from functools import partial
 
 import pytest
 import torch
-from support.rooms import noted
 from support.rooms import room as rendered
+from support.rooms import room_scene
 
 from dhtorch import extend
 from dhtorch.data.pairs import by_gap
@@ -27,7 +27,7 @@ def measured(**options):
     fast = {"rounds": 2, "front_end_repeats": 10, "pair_repeats": 1, "dinov2_repeats": 1, "peak": False}
     chosen = {"paper": PAPER}
     options = {**fast, "sizes": SIZES, "n": 64, "dinov2": partial(dinov2.load_dinov2, **TINY), **options}
-    return latency.run([noted(room)], chosen, partial(by_gap, gap=2), Settings(), **options)
+    return latency.run([room_scene(room)], chosen, partial(by_gap, gap=2), Settings(), **options)
 
 
 def test_every_stage_has_a_row_at_every_size():

@@ -7,7 +7,7 @@ from functools import partial
 
 import pytest
 import torch
-from support.rooms import noted
+from support.rooms import room_scene
 
 from dhtorch import extend
 from dhtorch.codes import Gate
@@ -201,7 +201,7 @@ def room():
 def asked(room, installed, **options):
     models = {name: partial(ADAPTERS[name], weights=installed[name]) for name in ADAPTERS}
     pairs = partial(by_gap, gap=6)
-    return learned.run([noted(room)], {"paper": PAPER}, pairs, Settings(), **{"models": models, **options})
+    return learned.run([room_scene(room)], {"paper": PAPER}, pairs, Settings(), **{"models": models, **options})
 
 
 @pytest.mark.slow

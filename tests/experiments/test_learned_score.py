@@ -4,7 +4,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
-from support.rooms import noted
+from support.rooms import room_scene
 
 from dhtorch.cli.run import config_dir
 from dhtorch.data.pairs import by_gap
@@ -36,7 +36,7 @@ class Room(SyntheticRoom):
 @pytest.fixture(scope="module")
 def rooms():
     """Two, which differ in how far their views lie apart."""
-    return [noted(room, gap=16) for room in (Room(name="room0"), Room(name="room1", step_m=0.025))]
+    return [room_scene(room, gap=16) for room in (Room(name="room0"), Room(name="room1", step_m=0.025))]
 
 
 def held_out(scene, method):

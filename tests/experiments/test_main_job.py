@@ -8,8 +8,8 @@ import hydra
 import pytest
 import torch
 from hydra.utils import instantiate
-from support.rooms import noted
 from support.rooms import room as rendered
+from support.rooms import room_scene
 
 from dhtorch import data
 from dhtorch.cli.run import config_dir
@@ -42,7 +42,7 @@ def scene_row(outcome, **wanted):
 def test_exact_room_without_sensor_noise():
     """Median error of recovered far depth < 1 %, silently wrong < 0.5 %; mirror and window are counted apart."""
     room = rendered(lidar="exact", image_noise=0.0, hw=(240, 320), n_frames=8, supersample=2)
-    row = scene_row(pair.run([noted(room)], {"paper": method("paper")}, by_gap, pair.Settings()))
+    row = scene_row(pair.run([room_scene(room)], {"paper": method("paper")}, by_gap, pair.Settings()))
     assert row["n_pairs"] == 2 and row["n_candidates"] > 400
     assert row["median_rel"] < 0.01 and row["wrong_share"] < 0.005 and row["coverage"] > 0.93, row
     assert set(row["apart"]) == {"mirror", "window"} and row["apart"]["mirror"]["n_candidates"] > 100
@@ -66,13 +66,13 @@ def test_the_committed_rooms_of_five_seeds_keep_their_bounds():
 @pytest.mark.parametrize("seed", BOUNDS)
 def test_the_room_of_every_seed_keeps_its_bound(seed):
     room = SyntheticRoom(seed=seed, lidar="exact", image_noise=0.0)
-    row = scene_row(pair.run([noted(room)], {"paper": method("paper")}, by_gap, pair.Settings()))
+    row = scene_row(pair.run([room_scene(room)], {"paper": method("paper")}, by_gap, pair.Settings()))
     assert row["median_rel"] < BOUNDS[seed] and row["wrong_share"] < 0.005 and row["coverage"] > 0.9, row
 
 
 def test_room_with_the_phone_lidar():
     room = rendered(hw=(240, 320), n_frames=8)
-    outcome = pair.run([noted(room)], {"paper": method("paper")}, by_gap, pair.Settings())
+    outcome = pair.run([room_scene(room)], {"paper": method("paper")}, by_gap, pair.Settings())
     row = scene_row(outcome)
     assert row["coverage"] > 0.9 and row["median_rel"] < 0.03, row
     shares = row["hole_share"]
@@ -88,7 +88,7 @@ def small(**options):
 
 def test_without_a_cutoff_there_is_no_truth():
     outcome = pair.run(
-        [noted(small())], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings(cutoff=float("inf"))
+        [room_scene(small())], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings(cutoff=float("inf"))
     )
     row = scene_row(outcome)
     assert row["n_candidates"] == 0 and row["median_rel"] is None and row["n_pairs"] == 2
@@ -96,14 +96,16 @@ def test_without_a_cutoff_there_is_no_truth():
 
 
 def test_pairs_with_few_candidates_are_dropped_and_counted():
-    outcome = pair.run([noted(small())], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings(cutoff=50.0))
+    outcome = pair.run(
+        [room_scene(small())], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings(cutoff=50.0)
+    )
     row = scene_row(outcome)
     assert row["n_few"] == 2 and row["n_pairs"] == 0 and "median_rel" not in row
 
 
 def test_a_rotation_scene_never_enters_the_summary():
     rotation = small(path="rotation", lidar="exact")
-    outcome = pair.run([noted(rotation)], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings())
+    outcome = pair.run([room_scene(rotation)], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings())
     assert scene_row(outcome)["role"] == "rotation" and outcome.summary == {}
 
 
@@ -120,7 +122,9 @@ def test_variants_share_tracks_and_pay_for_them():
         "other_seed": protocol.Variant(base.replace(track=track), seed=7),
         "own": protocol.Variant(base),
     }
-    outcome = protocol.run([noted(small())], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings())
+    outcome = protocol.run(
+        [room_scene(small())], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings()
+    )
     assert len(asked) == outcome.n_pairs == 1
     rows = [scene_row(outcome, method=name) for name in variants]
     assert rows[0]["ms"]["track"] == pytest.approx(rows[1]["ms"]["track"], rel=0.5)
@@ -138,7 +142,9 @@ def test_views_of_a_window_are_shared_too():
 
     base = method("window").replace(track=track, views=3)
     variants = {name: protocol.Variant(base, seed=k) for k, name in enumerate(("first", "second"))}
-    outcome = protocol.run([noted(small())], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings())
+    outcome = protocol.run(
+        [room_scene(small())], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings()
+    )
     assert len(asked) == 3 and asked[0] is None and asked[2] is not None, "one search for each view, not for each seed"
     first, second = (scene_row(outcome, method=name) for name in variants)
     assert first["ms"]["track"] == pytest.approx(second["ms"]["track"], rel=0.5)
@@ -154,7 +160,7 @@ def test_a_scene_without_pairs_keeps_a_row_that_says_so():
 
 def test_curves_of_a_scene_are_what_its_points_say():
     outcome = pair.run(
-        [noted(small(lidar="exact"))], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings()
+        [room_scene(small(lidar="exact"))], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings()
     )
     row, points = scene_row(outcome), outcome.points["synthetic_room", "paper", "full"]
     curve = row["curves"]["risk_coverage"]
@@ -171,7 +177,7 @@ def test_curves_of_a_scene_are_what_its_points_say():
 def test_candidates_do_not_depend_on_the_method():
     methods = {name: method(name) for name in ("paper", "opencv")}
     outcome = opencv_twin.run(
-        [noted(small(lidar="exact"))], {}, partial(by_gap, gap=2), pair.Settings(), methods=methods
+        [room_scene(small(lidar="exact"))], {}, partial(by_gap, gap=2), pair.Settings(), methods=methods
     )
     for truth in ("raw", "5x5", "full"):
         a, b = (scene_row(outcome, method=m, truth=truth) for m in methods)

@@ -7,7 +7,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from support import numbered_frames as stepping
-from support.rooms import noted, room
+from support.rooms import room, room_scene
 
 from dhtorch.cli.run import config_dir
 from dhtorch.data.pairs import by_gap
@@ -154,7 +154,7 @@ def test_one_group_alone_also_where_there_is_one_other_frame():
 
 def test_every_variant_runs_and_tells_its_cost(methods):
     outcome = part_ablation.run(
-        [noted(room(n_frames=4, hw=(192, 256), lidar="exact"), gap=3)],
+        [room_scene(room(n_frames=4, hw=(192, 256), lidar="exact"), gap=3)],
         methods,
         by_gap,
         Settings(),

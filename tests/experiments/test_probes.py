@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from support.room_truth import room_distance
-from support.rooms import noted
+from support.rooms import room_scene
 
 from dhtorch import data
 from dhtorch.data.codecs.video import close_videos
@@ -247,7 +247,7 @@ def test_xfeat_stands_beside_with_weights_of_its_own(robot_set, monkeypatch):
     assert ratio["low"] < ratio["value"] < ratio["high"]
     room = SyntheticRoom(hw=(60, 80), n_frames=9, step_m=0.04)
     options = {"blocks": 3, "min_pairs": 3, "penalties": (0.01, 1.0)}
-    moved = vo_probe.run([noted(room)], {"map": small()}, None, Settings(), dinov2=None, xfeat=True, **options)
+    moved = vo_probe.run([room_scene(room)], {"map": small()}, None, Settings(), dinov2=None, xfeat=True, **options)
     assert moved.verdict == "undecided" and "To XFeat" in moved.why and "synthetic_room" in moved.why
     assert moved.summary["dhtorch.vs_xfeat"]["n"] == 1
 
@@ -334,7 +334,7 @@ def test_visual_odometry_within_the_room():
     room = SyntheticRoom(hw=(120, 160), n_frames=12, step_m=0.04)
     short = SyntheticRoom(hw=(60, 80), n_frames=6, name="short")
     outcome = vo_probe.run(
-        [noted(room), noted(short)],
+        [room_scene(room), room_scene(short)],
         {"map": small()},
         None,
         Settings(),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
-from support.rooms import Changed, noted, untold
+from support.rooms import Changed, room_scene, untold
 
 from dhtorch.cli.run import config_dir, main
 from dhtorch.data.pairs import by_gap
@@ -28,7 +28,7 @@ from dhtorch.runtime import results as result_files
 
 
 def asked(experiment, *rooms, **options):
-    scenes = [noted(each, gap=3) for each in rooms or [small_room()]]
+    scenes = [room_scene(each, gap=3) for each in rooms or [small_room()]]
     return experiment.run(scenes, {"paper": configured_method()}, by_gap, Settings(), **options)
 
 
@@ -40,7 +40,14 @@ def scene(outcome, variant, cohort="full"):
 def batch_of(recording, i=0, j=3):
     nothing = torch.full((1,), torch.nan)
     return Batch(
-        noted(recording), [(i, j)], 2.0, recording[i], (recording[j],), recording[i], nothing.view(1, 1, 1), nothing
+        room_scene(recording),
+        [(i, j)],
+        2.0,
+        recording[i],
+        (recording[j],),
+        recording[i],
+        nothing.view(1, 1, 1),
+        nothing,
     )
 
 
@@ -212,7 +219,7 @@ def test_gates_and_gaps():
 @pytest.mark.slow
 def test_recovery_rises_with_the_baseline():
     rooms = [
-        noted(Changed(small_room(n_frames=6, hw=(144, 192), path=path), name=f"synthetic_{path}"), gap=2)
+        room_scene(Changed(small_room(n_frames=6, hw=(144, 192), path=path), name=f"synthetic_{path}"), gap=2)
         for path in ("walk", "static")
     ]
     outcome = asked(motion, *rooms, factors=(0.5, 1.0, 2.0))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 import torch.nn.functional as F
-from support.rooms import noted, room
+from support.rooms import room, room_scene
 
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.baselines import xfeat
@@ -235,7 +235,7 @@ def test_who_lacks_the_package(nothing):
 
 
 def test_a_comparison_says_that_the_package_is_missing(nothing):
-    scene = noted(room(hw=(192, 256), n_frames=4, lidar="exact"), gap=3)
+    scene = room_scene(room(hw=(192, 256), n_frames=4, lidar="exact"), gap=3)
     methods = {"paper": PAPER.replace(n=400), "strict": PAPER.replace(n=400, triangulate={"max_residual_px": 0.5})}
     methods["xfeat"] = xfeat.XFEAT
     outcome = method_comparison.run([scene], {}, by_gap, Settings(), methods=methods, seeds=1)

@@ -158,17 +158,17 @@ def test_tasks_that_are_noted_for_an_episode_are_kept(version, tmp_path):
     source = tmp_path / "source"
     source.mkdir()
     writers.write_lerobot(source, [shots(2)], depth="tiff", version=version)
-    noted = ["look", "look carefully"]
+    room_scene = ["look", "look carefully"]
     if version == 2:
         file = source / "meta" / "episodes.jsonl"
-        file.write_text(json.dumps({**json.loads(file.read_text()), "tasks": noted}) + "\n")
+        file.write_text(json.dumps({**json.loads(file.read_text()), "tasks": room_scene}) + "\n")
     else:
         file = next((source / "meta" / "episodes").rglob("*.parquet"))
         table = parquet.read_table(file)
-        parquet.write_table(table.set_column(table.column_names.index("tasks"), "tasks", [[noted]]), file)
+        parquet.write_table(table.set_column(table.column_names.index("tasks"), "tasks", [[room_scene]]), file)
     out = enrich(source, tmp_path / "set")
     (table,) = (out / "meta" / "episodes").rglob("*.parquet")
-    assert parquet.read_table(table)["tasks"].to_pylist() == [noted]
+    assert parquet.read_table(table)["tasks"].to_pylist() == [room_scene]
     assert {row["task_index"] for row in read_rows(out)} == {0}
 
 

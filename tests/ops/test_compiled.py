@@ -135,8 +135,8 @@ def counted(monkeypatch, *names):
     calls = []
     for name in names:
         was = getattr(torch.ops.dhtorch, name).default
-        noted = SimpleNamespace(default=lambda *a, was=was, name=name, **k: (calls.append(name), was(*a, **k)))
-        monkeypatch.setattr(torch.ops.dhtorch, name, noted)
+        room_scene = SimpleNamespace(default=lambda *a, was=was, name=name, **k: (calls.append(name), was(*a, **k)))
+        monkeypatch.setattr(torch.ops.dhtorch, name, room_scene)
     return calls
 
 

@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from support.rooms import noted
+from support.rooms import room_scene
 
 from dhtorch.cli import run
 from dhtorch.data.pairs import by_choice, by_gap
@@ -35,7 +35,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def outcome(room):
-    return pair.run([noted(room)], SMALL, OFFERED, protocol.Settings(cutoff=math.inf))
+    return pair.run([room_scene(room)], SMALL, OFFERED, protocol.Settings(cutoff=math.inf))
 
 
 def test_every_method_chooses_among_what_is_offered(outcome):
@@ -65,13 +65,13 @@ def test_a_single_view_answers_as_the_pair_does(room):
 
 
 def test_rows_do_not_depend_on_the_batch(room, outcome):
-    again = pair.run([noted(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf, batch=2))
+    again = pair.run([room_scene(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf, batch=2))
     assert _told(again) == [row for row in _told(outcome) if row["method"] == "map"]
 
 
 @pytest.mark.slow
 def test_rows_do_not_depend_on_the_workers(room, outcome):
-    again = pair.run([noted(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf, workers=2))
+    again = pair.run([room_scene(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf, workers=2))
     assert _told(again) == [row for row in _told(outcome) if row["method"] == "map"]
 
 
@@ -134,18 +134,18 @@ def test_what_a_view_adds_and_which_say_nothing(room):
 def test_experiments_that_cannot_choose_say_what_to_say(room):
     for run_it in (heldout.run, range_split.run, global_map.run):
         with pytest.raises(ValueError, match=r"candidate frames \(pairs=auto\).*pairs=gap"):
-            run_it([noted(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf))
+            run_it([room_scene(room)], {"map": SMALL["map"]}, OFFERED, protocol.Settings(cutoff=math.inf))
 
 
 def test_two_frames_are_each_others_view():
     two = SyntheticRoom(hw=(120, 160), n_frames=2, supersample=1, step_m=0.08, lidar="exact")
-    found = pair.run([noted(two)], {"auto": SMALL["auto"]}, by_choice, protocol.Settings(cutoff=math.inf))
+    found = pair.run([room_scene(two)], {"auto": SMALL["auto"]}, by_choice, protocol.Settings(cutoff=math.inf))
     rows = [r for r in found.rows if r["pair"] is not None]
     assert [(r["pair"], r["views"], r["why"]["gain"]) for r in rows] == [([0, 1], [1], None), ([1, 0], [0], None)]
 
 
 def test_what_is_shown_is_the_last_view_that_was_asked(room):
-    shown = make_exhibit(noted(room), SMALL["map"], OFFERED, protocol.Settings(cutoff=math.inf), most=1)
+    shown = make_exhibit(room_scene(room), SMALL["map"], OFFERED, protocol.Settings(cutoff=math.inf), most=1)
     (shot,) = shown.shots
     j = int(shot.label.split(" → ")[1])
     assert shot.label.startswith("0 → ") and shown.views[shot.view_1].number == j

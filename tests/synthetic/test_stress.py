@@ -232,7 +232,7 @@ def test_bodies_go_with_the_viewer_half_as_far_in_his_hand_or_round():
     held = room("held_object")
     seen_by_him = se3.compose(se3.invert(held.true_poses), held.body_poses)
     middle = se3.apply(
-        seen_by_him, se3.apply(guests._VIEWER_POSE, torch.tensor([[guests._HELD_CENTRE]]).double()).expand(8, 1, 3)
+        seen_by_him, se3.apply(guests._VIEWER_POSE, torch.tensor([[guests._CARRIED_CENTRE]]).double()).expand(8, 1, 3)
     )
     assert 0.005 < (middle[6, 0] - middle[0, 0]).norm() < 0.05
     turned = se3.rotation_angle(seen_by_him.R[6:] @ seen_by_him.R[:2].mT).rad2deg()

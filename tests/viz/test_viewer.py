@@ -20,7 +20,7 @@ import torch
 from omegaconf import OmegaConf
 from PIL import Image
 from support.room_truth import room_distance
-from support.rooms import Changed, noted
+from support.rooms import Changed, room_scene
 from support.rooms import room as rendered
 
 from dhtorch import export
@@ -146,14 +146,14 @@ def test_swept_pixels_are_a_cloud_of_their_own(scene):
 
 def test_without_a_sweep_there_are_no_swept_pixels():
     found = make_exhibit(
-        noted(SyntheticRoom(hw=(40, 60), n_frames=2)), METHODS["paper"], lambda r: by_gap(r, 1), Settings()
+        room_scene(SyntheticRoom(hw=(40, 60), n_frames=2)), METHODS["paper"], lambda r: by_gap(r, 1), Settings()
     )
     data = data_of(pages.build_viewer_page(found))
     assert len(found.shots[0].swept.xyz) == 0 and "swept" not in data["about"]
 
 
 def test_a_method_that_chooses_sweeps_what_it_chose():
-    room = noted(rendered(hw=(180, 240), n_frames=6))
+    room = room_scene(rendered(hw=(180, 240), n_frames=6))
     method = METHODS["window"].replace(n=256, views=2)
     found = make_exhibit(
         room, method, lambda r: by_choice(r, stride=9), Settings(cutoff=CUTOFF), sweep=DenseSweep({"planes": 16})
@@ -164,14 +164,14 @@ def test_a_method_that_chooses_sweeps_what_it_chose():
 def test_without_a_trajectory_every_pair_stands_alone():
     whole = SyntheticRoom(hw=(60, 80), n_frames=4)
     room = Changed(whole, lambda frame: frame.replace(T_world_from_cam=None), poses=None)
-    found = make_exhibit(noted(room), METHODS["paper"], lambda r: by_gap(r, 2), Settings())
+    found = make_exhibit(room_scene(room), METHODS["paper"], lambda r: by_gap(r, 2), Settings())
     assert found.path is None and not found.placed and len(found.shots) == 2
     assert all((shot.T_world_from_0 == np.eye(4)).all() for shot in found.shots)
 
 
 def test_of_many_pairs_some_are_shown():
     room = SyntheticRoom(hw=(40, 60), n_frames=8)
-    found = make_exhibit(noted(room), METHODS["paper"], lambda r: by_gap(r, 1), Settings(), most=3)
+    found = make_exhibit(room_scene(room), METHODS["paper"], lambda r: by_gap(r, 1), Settings(), most=3)
     assert [shot.label for shot in found.shots] == ["0 → 1", "3 → 4", "6 → 7"]
 
 
