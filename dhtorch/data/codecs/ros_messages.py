@@ -1,6 +1,6 @@
 """Codec of ROS messages: pictures, camera calibrations and transforms, of ROS 1 and of ROS 2 (CDR).
 
-Definitions are fixed here and never taken from a file. Strings and arrays have their length checked against the bytes
+Definitions are fixed here and never taken from a file. The lengths of strings and arrays are compared with the bytes
 of the message before they are read.
 """
 
