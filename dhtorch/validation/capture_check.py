@@ -54,15 +54,6 @@ _OPTIONS: Final = ValidationOptions(max_window_pairs=5)
 #: Source: chosen on the sound captures of the shared data: 0.11 to 0.23 where motion is moderate.
 _MAX_EXPLAINED_LOSS: Final = 0.3
 
-#: Mean loss of tracks from which on depth and pictures contradict each other although no known fault explains it.
-#: Source: chosen on the sound captures of the shared data (at most 0.45) and on rolled depth with its own K (0.69).
-_MIN_UNEXPLAINED_LOSS: Final = 0.6
-
-_UNEXPLAINED_TEXT: Final = (
-    "near returns do not explain how points move between the pictures: depth and pictures contradict each other, by "
-    "none of the known faults; look at intrinsics, registration, timing and moving objects"
-)
-
 #: Pictures instead of depth have a fault if undoing it in the depth raises the disagreement of surfaces under the poses
 #: by this ratio. Source: origin not recorded.
 _MIN_WORSE_RATIO: Final = 1.5
@@ -86,7 +77,7 @@ _MAX_EPIPOLAR_RATIO: Final = 0.7
 class Finding:
     """One thing that a capture's files mean otherwise than assumed, or that contradict each other."""
 
-    cause: str  # plausibility | intrinsics | poses | scale | unexplained, or the kind of a KnownFault
+    cause: str  # plausibility | intrinsics | poses | scale, or the kind of a KnownFault
     text: str
     remedy: str = ""  # option that mends it, empty where none does
 
@@ -152,8 +143,6 @@ def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = Non
     fault = _fault_of(diagnosis)
     if fault is None or do_edges_refute(list(views.values()), fault):
         fault = _edge_fault(list(views.values()), diagnosis)
-    if fault is None and _is_unexplained(diagnosis):
-        findings.append(Finding("unexplained", _UNEXPLAINED_TEXT))
     findings += _combined_findings(recording, poses, fault, {**window, **views}, pairs, tracks)
     check = CaptureCheck(recording, assumed, tuple(findings), poses, diagnosis)
     return replace(check, recording=replace(recording, poses=None)) if check.poses_refuted else check
@@ -218,13 +207,6 @@ def _fault_of(diagnosis: Diagnosis | None) -> KnownFault | None:
     if diagnosis is None or diagnosis.cause is None:
         return None
     return next(each for each in faults.KNOWN_FAULTS if each.name == diagnosis.cause)
-
-
-def _is_unexplained(diagnosis: Diagnosis | None) -> bool:
-    """Whether enough pairs are tracked and near returns explain none of their motion."""
-    if diagnosis is None or diagnosis.n_pairs < _OPTIONS.min_window_pairs:
-        return False
-    return diagnosis.loss.get(faults.NO_FAULT.name, 0.0) >= _MIN_UNEXPLAINED_LOSS
 
 
 def _intrinsics_findings(frames: Sequence[Frame]) -> list[Finding]:

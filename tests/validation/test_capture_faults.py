@@ -62,7 +62,6 @@ def test_numbers_of_the_summary():
     ("fault", "layout", "outcome"),
     [
         ("opengl", "counted_frames", "named"),
-        ("sentinel", "counted_frames", "right"),
         ("w2c", "record3d_mp4", None),
     ],
 )
