@@ -20,6 +20,9 @@ from dhtorch.metrics.holdout import range_split
 from dhtorch.runtime.output_folder import PRIVATE_FOLDER, is_private, open_output_folder
 from dhtorch.synthetic.recording import SyntheticRoom
 
+#: Many whole runs of commands: minutes. `pytest -m slow` runs them.
+pytestmark = pytest.mark.slow
+
 ROOM = ["data=synthetic", "data.hw=[96,128]", "data.depth_hw=[96,128]", "data.supersample=1", "data.n_frames=6"]
 COMPLETE = ["planes=16", "refinements=1", "steps=[1]", "cutoff=2.0", "method=map", "method.n=256", "threads=1"]
 PAIR = [*ROOM, "pairs.gap=3", "method=paper", "method.n=256"]

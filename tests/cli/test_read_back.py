@@ -21,6 +21,9 @@ from dhtorch.data.recording import Recording
 from dhtorch.records import Frame
 from dhtorch.synthetic import SyntheticRoom
 
+#: Many whole runs of commands: minutes. `pytest -m slow` runs them.
+pytestmark = pytest.mark.slow
+
 HW, NEAR = (48, 64), 2.5
 SMALL = ["method=paper", "method.n=64", "method.hypotheses=10", "dense={size: 64, planes: 8}"]
 HOLO = Path(os.environ.get("DHTORCH_DATA", "/nowhere")) / "holo_a"

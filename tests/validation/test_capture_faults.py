@@ -14,6 +14,9 @@ sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
 import capture_faults
 
+#: Many whole runs of commands: minutes. `pytest -m slow` runs them.
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def frames():
