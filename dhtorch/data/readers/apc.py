@@ -73,18 +73,16 @@ def read(
     hw = files.read_image_header(rows[0].image).hw
     stated = (matrices[_COLOUR_TITLE], info, _COLOUR_TITLE) if _COLOUR_TITLE in matrices else None
     camera, guess = image_table.choose_camera(root, hw, stated, intrinsics, K, fov, where=_INFO_FILE)
-    is_rotated = image_table.are_codes_rotated(rows[0].depth) if rotated is None else rotated
+    bits, plain = image_table.choose_rotated_bits(rows[0].depth, rotated, _ROTATED_BITS, "this format's")
     loader = image_table.ImageTableLoader(
         rows=tuple(rows),
         hw=hw,
         depth_hw=image_table.read_depth_hw(rows[0].depth),
         camera=camera,
         units_per_metre=_UNITS_PER_METRE,
-        rotated_bits=_ROTATED_BITS if is_rotated else 0,
+        rotated_bits=bits,
     )
-    source = "the challenge's scenes store 1/10000 m, rotated by 3 bits" if is_rotated else None
-    if not is_rotated:
-        report.append("depth codes are not rotated by 3 bits, unlike this format's: read unrotated (data.rotated=true)")
+    source = "the challenge's scenes store 1/10000 m, rotated by 3 bits" if bits else None
     return [
         image_table.open_image_table(
             root,
@@ -93,7 +91,7 @@ def read(
             unit=DepthUnit(1 / _UNITS_PER_METRE, source),
             poses_file=info,
             fps=fps,
-            report=[*report, *guess],
+            report=[*report, *plain, *guess],
         )
     ]
 

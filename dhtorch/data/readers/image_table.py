@@ -116,6 +116,20 @@ def are_codes_rotated(file: Path) -> bool:
     return returns.size == 0 or float((returns % 8 <= _MAX_LOW_BITS).mean()) >= _MIN_ROTATED
 
 
+def choose_rotated_bits(file: Path, rotated: bool | None, bits: int, whose: str) -> tuple[int, tuple[str, ...]]:
+    """Bits by which the codes of a format that rotates them are rotated, and the remark where they are not.
+
+    Args:
+        file: a depth map, which decides where ``rotated`` is None.
+        rotated: the reader's option.
+        bits: of the format.
+        whose: the format, for the remark.
+    """
+    if are_codes_rotated(file) if rotated is None else rotated:
+        return bits, ()
+    return 0, (f"depth codes are not rotated by {bits} bits, unlike {whose}: read unrotated (data.rotated=true)",)
+
+
 def rotate_codes(code: np.ndarray, bits: int) -> np.ndarray:
     """Codes uint16 that are stored rotated to the left by ``bits`` → the codes."""
     return code if bits == 0 else np.right_shift(code, bits) | np.left_shift(code, 16 - bits)

@@ -77,18 +77,15 @@ def read(
     file = root / _INTRINSICS_FILE
     stated = (image_table.read_K(file), file, "K") if file.is_file() else None
     camera, guess = image_table.choose_camera(root, hw, stated, intrinsics, K, fov, where=_INTRINSICS_FILE)
-    is_rotated = image_table.are_codes_rotated(rows[0].depth) if rotated is None else rotated
-    source: str | None = "SUN3D stores mm, rotated by 3 bits"
-    if not is_rotated:
-        source = None
-        report.append("depth codes are not rotated by 3 bits, unlike SUN3D's: read unrotated (data.rotated=true)")
+    bits, plain = image_table.choose_rotated_bits(rows[0].depth, rotated, _ROTATED_BITS, "SUN3D's")
+    source = "SUN3D stores mm, rotated by 3 bits" if bits else None
     loader = image_table.ImageTableLoader(
         rows=rows,
         hw=hw,
         depth_hw=depth_hw,
         camera=camera,
         units_per_metre=_UNITS_PER_METRE,
-        rotated_bits=_ROTATED_BITS if is_rotated else 0,
+        rotated_bits=bits,
     )
     return [
         image_table.open_image_table(
@@ -98,7 +95,7 @@ def read(
             unit=DepthUnit(1 / _UNITS_PER_METRE, source),
             poses_file=poses_file,
             fps=fps,
-            report=[*pairs.report, *report, *guess],
+            report=[*pairs.report, *report, *plain, *guess],
         )
     ]
 
