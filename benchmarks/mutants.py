@@ -40,6 +40,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 #: Folders and files of the package that faults are planted in.
 PLACES = (
+    "records",
     "stages",
     "geometry",
     "pipeline/spec",

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import Gate, PoseCode, State
-from dhtorch.geometry.camera import Camera
+from dhtorch.geometry.camera import Camera, resize
 from dhtorch.geometry.checks import all_finite
 from dhtorch.geometry.coarse_flow import CoarseFlow
 from dhtorch.geometry.pyramid import PyramidCache
@@ -61,6 +61,14 @@ class Frame(Record):
     def hw(self) -> tuple[int, int]:
         """(height, width) of the image."""
         return self.image.shape[-2], self.image.shape[-1]
+
+    @property
+    def map_camera(self) -> Camera:
+        """The camera of the depth map: its own, else the image's at the map's size. Gradient: to the intrinsics."""
+        hw = (self.depth.shape[-2], self.depth.shape[-1])
+        if self.depth_camera is not None:
+            return self.depth_camera
+        return self.camera if hw == self.hw else resize(self.camera, self.hw, hw)
 
 
 @record

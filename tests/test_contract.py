@@ -600,7 +600,15 @@ ELSEWHERE = {
     ),
     *(
         f"dhtorch.validation.faults.{name}"
-        for name in ("rot90_map", "diagnose", "select_cause", "track_window", "ray_lengths", "undo_fault")
+        for name in (
+            "rot90_map",
+            "diagnose",
+            "select_cause",
+            "track_window",
+            "ray_lengths",
+            "undo_fault",
+            "bounded_loss",
+        )
     ),
     "dhtorch.metrics.detection.auroc",
     "dhtorch.alignment.align.align_depth",

@@ -24,6 +24,7 @@ TESTS: dict[str, list[str]] = {
     "validation.faults": ["tests/validation/test_faults.py"],
     "validation.pose_check": ["tests/validation/test_pose_check.py"],
     "validation.edge_lag": ["tests/validation/test_edge_checks.py"],
+    "records": ["tests/validation/test_pose_check.py"],
     "validation.edge_fault": ["tests/validation/test_edge_checks.py"],
     "validation.capture_check": ["tests/validation/test_capture_check.py"],
     "validation.wrong_causes": ["tests/validation/test_wrong_causes.py"],
@@ -198,7 +199,6 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("depth_disagreement", "(moved[..., 2] - value).abs() / value", "(moved[..., 2] - value).abs()"),
         ("depth_disagreement", "& (moved[..., 2] > 0)", ""),
         ("depth_disagreement", "meets.sum(-1) >= _MIN_MEETING_RETURNS", "meets.sum(-1) >= 1"),
-        ("depth_camera_of", "return frame.depth_camera", "return frame.camera"),
         ("describe_contradiction", '"late" if reading.lag < 0 else "early"', '"late" if reading.lag > 0 else "early"'),
         ("describe_contradiction", "data.depth_lag={-reading.lag}", "data.depth_lag={reading.lag}"),
         ("_other_depth_unit", "unit.metres / factor", "unit.metres * factor"),
@@ -209,13 +209,16 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "validation.edge_lag": [
         ("find_edge_lag", "*depths[i + lag]", "*depths[i - lag]"),
         ("find_edge_lag", "- without[i]", ""),
-        ("_clear_mean", "mean if mean >", "mean if 1 + mean >"),
+        ("clear_lead", "mean if mean >", "mean if 1 + mean >"),
         ("find_edge_lag", "len(places) < _MIN_FRAMES", "len(places) < 1"),
+    ],
+    "records": [
+        ("Frame.map_camera", "return self.depth_camera", "return self.camera"),
     ],
     "validation.edge_fault": [
         ("find_edge_fault", "- without", ""),
-        ("find_edge_fault", "len(chosen) < _MIN_FRAMES", "len(chosen) < 1"),
-        ("_scores", "fault.undo(d)[0]", "d[0]"),
+        ("_reduced_frames", "len(chosen) < _MIN_FRAMES", "len(chosen) < 1"),
+        ("_scores", "fault.undo(depth)[0]", "depth[0]"),
     ],
     "validation.capture_check": [
         ("_TURN_OPTIONS", '"mirrored left to right": "left_right"', '"mirrored left to right": "upside_down"'),

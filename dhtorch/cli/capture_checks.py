@@ -52,7 +52,7 @@ def check_scene(scene: Scene) -> Scene:
         return scene
     check = check_capture(scene.recording)
     print_check(scene.name, check)
-    return replace(scene, recording=replace(check.recording, report=tuple(check.lines)))
+    return replace(scene, recording=check.reported)
 
 
 def print_check(name: str, check: CaptureCheck) -> None:

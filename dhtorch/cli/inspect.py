@@ -257,7 +257,7 @@ def _survey_recordings(capture: FoundCapture, frames: int) -> Iterator[Survey]:
 
 def add_check(survey: Survey, recording: Recording) -> None:
     """Add what the check of the capture shows to its survey: unit, agreement of poses and depth, findings."""
-    check = check_capture(recording)
+    check = check_capture(recording, survey.decoded)
     unit = check.assumed_unit or (str(recording.depth_unit) if recording.depth_unit is not None else "")
     if unit:
         survey.add_fact("unit", unit)

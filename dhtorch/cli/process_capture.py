@@ -280,7 +280,7 @@ def _process_recording(
     usable = _find_usable_frame(recording)
     check = check_capture(recording)
     print_check(recording.name, check)
-    recording = replace(check.recording, report=tuple(check.lines))
+    recording = check.reported
     scene = Scene.of(recording)
     task = complete.make_completion_task(
         scene,

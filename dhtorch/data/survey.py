@@ -56,6 +56,7 @@ class Survey:
     tiles: list[Tile] = field(default_factory=list)
     depths: Tensor = field(default_factory=lambda: torch.zeros(0))  # (M,) m, returns of the decoded frames
     path: Tensor | None = None  # (n, 3) m, camera centres
+    decoded: dict[int, Frame] = field(default_factory=dict)  # position → frame that was read
 
     def add_fact(self, what: str, text: str) -> None:
         """Add a fact."""
@@ -82,7 +83,7 @@ def survey_recording(
     out.add_fact("frames", f"{n}" + (f", {format_count(skipped, 'number')} missing in between" if skipped else ""))
     _report_times(recording.times, recording.rate_hz, out)
     places = sorted({round(k * (n - 1) / max(frames - 1, 1)) for k in range(frames)})
-    shots: dict[int, Frame] = {}
+    shots = out.decoded
     for i in progress(places, recording.name, len(places)):
         try:
             shots[i] = recording[i]

@@ -313,7 +313,7 @@ def view_from_sensor(
     """
     depth = torch.where(frame.depth.isfinite() & (frame.depth > 0), frame.depth, 0.0)
     hw = (depth.shape[-2], depth.shape[-1])
-    camera = frame.depth_camera or (frame.camera if hw == frame.hw else cameras.resize(frame.camera, frame.hw, hw))
+    camera = frame.map_camera
     score = torch.ones_like(depth) if frame.conf is None else frame.conf.to(depth) / 2
     if frame.conf is not None:
         depth = torch.where(frame.conf >= min_conf, depth, 0.0)

@@ -47,8 +47,7 @@ def add_near_card(frame: Frame, T_world_from_card_view: Pose, seed: int) -> tupl
     colour = (colour * scale).to(frame.image.dtype).expand(-1, frame.image.shape[1], -1, -1)
     image = torch.where(depth[:, None] > 0, colour, frame.image)
     depth_hw = frame.depth.shape[-2], frame.depth.shape[-1]
-    depth_camera = frame.depth_camera or cam.resize(frame.camera, frame.hw, depth_hw)
-    on_card = _card_in_view(depth_camera, depth_hw, T_card_from_cam)[0] > 0
+    on_card = _card_in_view(frame.map_camera, depth_hw, T_card_from_cam)[0] > 0
     return frame.replace(image=image, depth=frame.depth.masked_fill(on_card, 0.0)), depth
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame
 from dhtorch.testing.parts import (
     K_matrix,
@@ -46,8 +45,7 @@ def write_arkitscenes(
                 save_file(root / asset / f"{name}.png", encode_unfiltered_png(encode_depth_codes(frame.depth, 1000)))
                 colour_asset = "lowres_wide" if asset == "lowres_depth" else "wide"
                 hw = (frame.depth.shape[-2], frame.depth.shape[-1])
-                camera = frame.depth_camera or cameras.resize(frame.camera, frame.hw, hw)
-                _write_pincam(root / f"{colour_asset}_intrinsics" / f"{name}.pincam", camera, hw)
+                _write_pincam(root / f"{colour_asset}_intrinsics" / f"{name}.pincam", frame.map_camera, hw)
                 if asset == "lowres_depth" and frame.conf is not None:
                     save_file(root / "confidence" / f"{name}.png", encode_unfiltered_png(frame.conf[0].numpy()))
                 continue

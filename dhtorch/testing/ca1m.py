@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dhtorch.export.tiff import encode_float_tiff
-from dhtorch.geometry import camera as cameras
-from dhtorch.records import Camera, Frame
+from dhtorch.records import Frame
 from dhtorch.testing.parts import (
     K_matrix,
     encode_depth_codes,
@@ -63,21 +62,16 @@ def _make_members(frame: Frame, laser: Frame) -> dict[str, bytes]:
         "wide/image.png": encode_unfiltered_png(frame_to_hwc(frame)),
         "wide/image/K.json": _matrix_json(K_matrix(frame.camera)),
         "wide/depth.png": encode_unfiltered_png(encode_depth_codes(frame.depth, 1000)),
-        "wide/depth/K.json": _matrix_json(K_matrix(_depth_camera(frame))),
+        "wide/depth/K.json": _matrix_json(K_matrix(frame.map_camera)),
         "wide/instances.json": b"[]",
         "wide/T_gravity.json": _matrix_json(np.eye(3)),
         "gt/RT.json": _matrix_json(pose_matrix(frame)),
         "gt/depth.png": encode_unfiltered_png(encode_depth_codes(laser.depth, 1000)),
-        "gt/depth/K.json": _matrix_json(K_matrix(_depth_camera(laser))),
+        "gt/depth/K.json": _matrix_json(K_matrix(laser.map_camera)),
     }
     if frame.conf is not None:
         members["wide/depth/confidence.tiff"] = encode_float_tiff(frame.conf[0].numpy() / np.float32(2))
     return members
-
-
-def _depth_camera(frame: Frame) -> Camera:
-    hw = (frame.depth.shape[-2], frame.depth.shape[-1])
-    return frame.depth_camera or cameras.resize(frame.camera, frame.hw, hw)
 
 
 def _matrix_json(matrix: np.ndarray) -> bytes:

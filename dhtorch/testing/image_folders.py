@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame
 from dhtorch.testing.parts import (
     K_matrix,
@@ -92,7 +91,7 @@ def write_scannet(root: Path, frames: Sequence[Frame], *, lost: Sequence[int] = 
         save_file(root / "depth" / f"{i}.png", encode_unfiltered_png(code))
         pose = np.full((4, 4), -np.inf) if i in lost else pose_matrix(frame)
         save_file(root / "pose" / f"{i}.txt", format_rows(pose))
-    for kind, camera in (("color", frames[0].camera), ("depth", _depth_camera(frames[0]))):
+    for kind, camera in (("color", frames[0].camera), ("depth", frames[0].map_camera)):
         save_file(root / "intrinsic" / f"intrinsic_{kind}.txt", format_rows(_K_4x4(camera)))
         save_file(root / "intrinsic" / f"extrinsic_{kind}.txt", format_rows(np.eye(4)))
 
@@ -122,7 +121,7 @@ def write_sens_folder(root: Path, frames: Sequence[Frame], *, pgm: bool = True, 
         *(f"m_{name} = {value}" for name, value in (("depthWidth", depth_w), ("depthHeight", depth_h))),
         f"m_depthShift = {_CODES_PER_METRE_MM:g}",
         f"m_calibrationColorIntrinsic = {format_row(_K_4x4(first.camera).ravel())}",
-        f"m_calibrationDepthIntrinsic = {format_row(_K_4x4(_depth_camera(first)).ravel())}",
+        f"m_calibrationDepthIntrinsic = {format_row(_K_4x4(first.map_camera).ravel())}",
         f"m_frames.size = {len(frames)}",
     ]
     save_file(root / "_info.txt", "\n".join(lines) + "\n")
@@ -214,11 +213,6 @@ def _encode_jpeg(frame: Frame) -> bytes:
 def _encode_pgm(code: np.ndarray) -> bytes:
     """(h, w) uint16 → bytes of a binary grey map."""
     return f"P5\n{code.shape[1]} {code.shape[0]}\n65535\n".encode() + code.astype(">u2").tobytes()
-
-
-def _depth_camera(frame: Frame) -> Camera:
-    h, w = frame.depth.shape[-2:]
-    return frame.depth_camera or cameras.resize(frame.camera, frame.hw, (h, w))
 
 
 def _K_4x4(camera: Camera) -> np.ndarray:

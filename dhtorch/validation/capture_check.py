@@ -3,7 +3,7 @@
 A capture's files may mean something else than its reader assumes. One window of its frames is examined: values of
 depth for their unit, tracks against near returns for faults that all frames share (:mod:`dhtorch.validation.faults`),
 surfaces seen from two frames for the stated poses (:mod:`dhtorch.validation.pose_check`). Each finding has a cause, a
-sentence and the option that mends it. Refuted poses are removed from the recording, so that no command uses them.
+sentence and the option that corrects it. Refuted poses are removed from the recording, so that no command uses them.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from dhtorch.validation.pose_check import PoseCheck, check_poses, describe_contr
 #: Source: derived, more than three times the largest lag of dhtorch.validation.faults, whose references need it.
 WINDOW_FRAMES: Final = 16
 
-#: Kinds of faults for which the depth is turned or moved in time: the option that mends them, by name.
+#: Name of a fault of orientation → value of the option ``depth_turn`` that corrects it.
 _TURN_OPTIONS: Final = {
     "mirrored left to right": "left_right",
     "mirrored upside down": "upside_down",
@@ -79,7 +79,7 @@ class Finding:
 
     cause: str  # plausibility | intrinsics | poses | scale, or the kind of a KnownFault
     text: str
-    remedy: str = ""  # option that mends it, empty where none does
+    remedy: str = ""  # option that corrects it, empty where none does
 
     def __str__(self) -> str:
         return f"{self.text} (remedy: {self.remedy})" if self.remedy else self.text
@@ -106,10 +106,10 @@ class CaptureCheck:
         assumed = [self.assumed_unit] if self.assumed_unit else []
         return [*assumed, *self.recording.report, *map(str, self.findings)]
 
-    def record(self) -> dict[str, object]:
-        """The findings for a JSON file."""
-        findings = [{"cause": each.cause, "text": each.text, "remedy": each.remedy} for each in self.findings]
-        return {"assumed_unit": self.assumed_unit or None, "findings": findings, "poses_refuted": self.poses_refuted}
+    @property
+    def reported(self) -> Recording:
+        """The recording as it can be used, with these lines as its report."""
+        return replace(self.recording, report=tuple(self.lines))
 
 
 def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = None, *, seed: int = 0) -> CaptureCheck:
@@ -121,7 +121,7 @@ def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = Non
         seed: of the pose search.
 
     Gradient: none.
-    Cost: decodes up to :data:`WINDOW_FRAMES` frames and tracks eight pairs of them, about a second.
+    Cost: decodes up to :data:`WINDOW_FRAMES` frames and tracks five pairs of them, about a second.
     """
     unit = recording.depth_unit
     assumed = f"{unit} (data.depth_unit= sets it)" if unit is not None and unit.is_assumed else ""

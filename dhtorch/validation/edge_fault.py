@@ -15,6 +15,7 @@ from torch import Tensor
 
 from dhtorch.data.orientation import depth_edges, edge_correlation, picture_edges
 from dhtorch.records import Frame
+from dhtorch.validation.edge_lag import clear_lead
 from dhtorch.validation.faults import KNOWN_FAULTS, NO_FAULT, KnownFault
 
 #: Kinds of faults that are tried.
@@ -35,47 +36,40 @@ _GRID_PX: Final = 160
 #: its pictures) and on planted faults.
 _MIN_LEAD: Final = 0.05
 
-#: Least lead in standard errors over the frames. Source: origin not recorded.
-_MIN_LEAD_ERRORS: Final = 4.0
-
 
 def find_edge_fault(frames: Sequence[Frame]) -> KnownFault | None:
     """Frames (B = 1 each, with pictures and depth) -> the fault of their depth that edges show. Gradient: none."""
-    chosen = _chosen_frames(frames)
-    if len(chosen) < _MIN_FRAMES:
+    inputs = _reduced_frames(frames)
+    if inputs is None:
         return None
-    with torch.no_grad():
-        pictures = [picture_edges(frame.image[0], grid_px=_GRID_PX) for frame in chosen]
-        depths = [_coarse(frame.depth) for frame in chosen]
-        without = _scores(pictures, depths, NO_FAULT)
-        best, best_lead = None, 0.0
-        for fault in KNOWN_FAULTS:
-            if fault.kind not in _KINDS:
-                continue
-            lead = _scores(pictures, depths, fault) - without
-            mean = float(lead.mean())
-            error = float(lead.std()) / len(chosen) ** 0.5
-            if mean > max(_MIN_LEAD, _MIN_LEAD_ERRORS * error, best_lead):
-                best, best_lead = fault, mean
+    without = _scores(*inputs, NO_FAULT)
+    best, best_lead = None, 0.0
+    for fault in KNOWN_FAULTS:
+        if fault.kind not in _KINDS:
+            continue
+        lead = clear_lead(_scores(*inputs, fault) - without, _MIN_LEAD)
+        if lead > best_lead:
+            best, best_lead = fault, lead
     return best
 
 
 def do_edges_refute(frames: Sequence[Frame], fault: KnownFault) -> bool:
     """Whether edges coincide clearly better without a fault than with it undone. Gradient: none."""
-    chosen = _chosen_frames(frames)
-    if fault.kind not in _KINDS or len(chosen) < _MIN_FRAMES:
+    inputs = _reduced_frames(frames) if fault.kind in _KINDS else None
+    if inputs is None:
         return False
+    return clear_lead(_scores(*inputs, NO_FAULT) - _scores(*inputs, fault), _MIN_LEAD) > 0
+
+
+def _reduced_frames(frames: Sequence[Frame]) -> tuple[list[Tensor], list[Tensor]] | None:
+    """Edges of the pictures and coarse depth of up to :data:`_MAX_FRAMES` spread frames, each once; None of too few."""
+    spread = [frames[round(k * (len(frames) - 1) / (_MAX_FRAMES - 1))] for k in range(_MAX_FRAMES)] if frames else []
+    chosen = list({id(frame): frame for frame in spread}.values())
+    if len(chosen) < _MIN_FRAMES:
+        return None
     with torch.no_grad():
         pictures = [picture_edges(frame.image[0], grid_px=_GRID_PX) for frame in chosen]
-        depths = [_coarse(frame.depth) for frame in chosen]
-        loss = _scores(pictures, depths, NO_FAULT) - _scores(pictures, depths, fault)
-    return float(loss.mean()) > max(_MIN_LEAD, _MIN_LEAD_ERRORS * float(loss.std()) / len(chosen) ** 0.5)
-
-
-def _chosen_frames(frames: Sequence[Frame]) -> list[Frame]:
-    """Up to :data:`_MAX_FRAMES` evenly spread frames, each once."""
-    chosen = [frames[round(k * (len(frames) - 1) / (_MAX_FRAMES - 1))] for k in range(_MAX_FRAMES)] if frames else []
-    return list({id(frame): frame for frame in chosen}.values())
+    return pictures, [_coarse(frame.depth) for frame in chosen]
 
 
 def _coarse(depth: Tensor) -> Tensor:
@@ -87,5 +81,7 @@ def _coarse(depth: Tensor) -> Tensor:
 def _scores(pictures: Sequence[Tensor], depths: Sequence[Tensor], fault: KnownFault) -> Tensor:
     """Correlation (n,) of edges of pictures with those of depth (1, h, w) each with a fault undone."""
     hw = pictures[0].shape[-2], pictures[0].shape[-1]
-    scores = [edge_correlation(p, *depth_edges(fault.undo(d)[0], hw)) for p, d in zip(pictures, depths, strict=True)]
+    with torch.no_grad():
+        edges = [depth_edges(fault.undo(depth)[0], hw) for depth in depths]
+    scores = [edge_correlation(picture, *each) for picture, each in zip(pictures, edges, strict=True)]
     return torch.tensor(scores, dtype=torch.float64)

@@ -14,9 +14,7 @@ from torch import Tensor
 
 from dhtorch.data.orientation import depth_edges, edge_correlation, picture_edges
 from dhtorch.records import Frame
-
-#: Largest lag that is tried, frames. Source: derived, the largest lag of dhtorch.validation.faults.
-_MAX_LAG_FRAMES: Final = 5
+from dhtorch.validation.faults import MAX_LAG_FRAMES
 
 #: Longer side of the grid on which edges are compared, px.
 #: Source: chosen on lags planted into holo_a, 7-Scenes and desk9 (160 misses lags of one frame).
@@ -51,36 +49,38 @@ class EdgeLag(NamedTuple):
 def find_edge_lag(frames: Sequence[Frame]) -> EdgeLag:
     """Consecutive frames (B = 1 each, with pictures) -> lag of their depth. Gradient: none."""
     with torch.no_grad():
-        pictures = {i: picture_edges(frames[i].image[0], grid_px=_GRID_PX) for i in range(len(frames))}
+        pictures = [picture_edges(frame.image[0], grid_px=_GRID_PX) for frame in frames]
         hw = pictures[0].shape[-2], pictures[0].shape[-1]
         depths = [depth_edges(frame.depth[0], hw) for frame in frames]
     n = len(frames)
     best = EdgeLag(0, 0.0)
-    without = {i: edge_correlation(picture, *depths[i]) for i, picture in pictures.items()}
-    for lag in range(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 1):
-        places = [i for i in pictures if 0 <= i + lag < n]
+    without = [edge_correlation(pictures[i], *depths[i]) for i in range(n)]
+    for lag in range(-MAX_LAG_FRAMES, MAX_LAG_FRAMES + 1):
+        places = [i for i in range(n) if 0 <= i + lag < n]
         if lag == 0 or len(places) < _MIN_FRAMES:
             continue
         lead = [edge_correlation(pictures[i], *depths[i + lag]) - without[i] for i in places]
-        if (mean := _clear_mean(lead)) > best.lead:
+        if (mean := clear_lead(torch.tensor(lead, dtype=torch.float64), _MIN_LEAD)) > best.lead:
             best = EdgeLag(lag, mean)
     if best.lag == 0:
         return best
-    places = [i for i in pictures if 0 <= i + best.lag < n]
+    places = [i for i in range(n) if 0 <= i + best.lag < n]
     places = places[:: max(1, len(places) // _MAX_SHIFTED_FRAMES)]
     late, now = (
         _shifted_scores([pictures[i] for i in places], [depths[i + by] for i in places]) for by in (best.lag, 0)
     )
-    lead = (late[:, int(late.mean(0).argmax())] - now[:, int(now.mean(0).argmax())]).tolist()
-    return best if _clear_mean(lead) > 0 else EdgeLag(0, 0.0)
+    shifted_lead = late[:, int(late.mean(0).argmax())] - now[:, int(now.mean(0).argmax())]
+    return best if clear_lead(shifted_lead, _MIN_LEAD) > 0 else EdgeLag(0, 0.0)
 
 
-def _clear_mean(lead: Sequence[float]) -> float:
-    """Mean of leads over the frames, 0 where it is not clear."""
-    values = torch.tensor(lead, dtype=torch.float64)
-    mean = float(values.mean())
-    error = float(values.std()) / len(lead) ** 0.5
-    return mean if mean > max(_MIN_LEAD, _MIN_LEAD_ERRORS * error) else 0.0
+def clear_lead(lead: Tensor, least: float) -> float:
+    """Mean lead (n,) of one hypothesis over another in n frames where it is above ``least`` and four errors, else 0.
+
+    The error is the standard error of the mean. Gradient: none.
+    """
+    mean = float(lead.mean())
+    error = float(lead.std()) / len(lead) ** 0.5
+    return mean if mean > max(least, _MIN_LEAD_ERRORS * error) else 0.0
 
 
 def _shifted_scores(pictures: Sequence[Tensor], depths: Sequence[tuple[Tensor, Tensor]]) -> Tensor:

@@ -49,6 +49,10 @@ TRACKING_METHOD = Method(
 #: Source: origin not recorded.
 MAX_LAG_FRAMES = 5
 
+#: Fewest samples of a pair's mean loss.
+#: Source: origin not recorded.
+MIN_LOSSES = 12
+
 #: Factors on the focal length that are tried.
 #: Source: origin not recorded.
 FOCAL_FACTORS = (0.8, 0.87, 0.93, 0.95, 1.05, 1.07, 1.15, 1.25)
@@ -322,7 +326,7 @@ def _return_loss(
     miss = torch.where(both, map_depth / torch.where(both, returned, 1.0), 1.0).log() / math.log(
         options.half_loss_ratio
     )
-    return _mean_loss(miss.square() / (miss.square() + 1), both)[0].cpu()
+    return _mean_loss(bounded_loss(miss, 1.0), both)[0].cpu()
 
 
 def select_cause(losses: Mapping[str, Tensor], options: ValidationOptions = DEFAULT_VALIDATION_OPTIONS) -> Diagnosis:
@@ -529,15 +533,20 @@ class FaultWindow:
         in_front = used & (xyz_1[..., 2] > 1e-6)
         uv = cam.project(cameras[1], torch.where(in_front[..., None], xyz_1, 1.0))
         miss = (uv - self.tracks.uv_1).norm(dim=-1) * (640 / self.references.hw[1])
-        loss = torch.where(in_front, miss.square() / (miss.square() + self.options.half_loss_px**2), 1.0)
+        loss = torch.where(in_front, bounded_loss(miss, self.options.half_loss_px), 1.0)
         return SampleLosses(loss, used, torch.ones_like(used[:, 0]))
 
 
+def bounded_loss(miss: Tensor, half: float) -> Tensor:
+    """Misses (any shape) -> losses in [0, 1): miss² / (miss² + half²), a half at ``half``. Gradient: to the misses."""
+    return miss.square() / (miss.square() + half**2)
+
+
 def _mean_loss(loss: Tensor, used: Tensor) -> Tensor:
-    """Mean (P,) of the used losses (P, N); NaN of fewer than 12."""
+    """Mean (P,) of the used losses (P, N); NaN of fewer than :data:`MIN_LOSSES`."""
     n = used.sum(-1)
     mean = torch.where(used, loss, 0.0).sum(-1) / n.clamp_min(1)
-    return torch.where(n >= 12, mean, torch.nan)
+    return torch.where(n >= MIN_LOSSES, mean, torch.nan)
 
 
 def undo_fault(depth: Tensor, cause: KnownFault, view: Frame) -> Tensor:

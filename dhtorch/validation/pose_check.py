@@ -27,8 +27,10 @@ from dhtorch.data.units import UNIT_METRES, DepthUnit, format_unit
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.patches import sample_nearest
-from dhtorch.records import Camera, Frame, Pose, Samples, Tracks
+from dhtorch.records import Frame, Pose, Samples, Tracks
 from dhtorch.runtime.console import format_count
+from dhtorch.validation.faults import MAX_LAG_FRAMES, MIN_LOSSES, bounded_loss
+from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
 
 #: Returns of a frame that are moved.
 #: Source: derived, the median of 2000 values has a standard error of two hundredths of their spread.
@@ -37,10 +39,6 @@ _MAX_RETURNS: Final = 2000
 #: Returns that must meet a return for a disagreement.
 #: Source: origin not recorded.
 _MIN_MEETING_RETURNS: Final = 50
-
-#: Largest lag between depth and poses that is tried, frames.
-#: Source: derived, the largest lag of dhtorch.validation.faults.
-_MAX_LAG_FRAMES: Final = 5
 
 #: Factors on translations that are tried around 1, where a factor is not a confusion of units.
 #: Source: derived, steps of 2.5 % resolve a factor that is wrong by a twentieth.
@@ -93,12 +91,6 @@ _MAX_TRACK_LOSS_RATIO: Final = 0.6
 #: Least loss of the stated poses for that. Source: chosen on the sound captures of the shared data: 0.15 or less where
 #: the fraction is small.
 _MIN_TRACK_LOSS: Final = 0.2
-
-#: Miss at which the loss of a tracked return is a half, px of a picture 640 wide. Source: ValidationOptions.
-_HALF_LOSS_PX: Final = 2.0
-
-#: Tracked near returns that a pair must have. Source: derived, as dhtorch.validation.faults.
-_MIN_TRACKS: Final = 12
 
 #: Pairs that must have tracks for these to count, or meeting surfaces for a factor near 1: fewer agree by chance.
 #: Source: chosen on exact synthetic captures of 48 x 64 px, of which 1 or 2 pairs refuted true poses, 3 did not.
@@ -244,10 +236,10 @@ def _reading_scores(readings: Sequence[PoseReading], scores: Tensor) -> ReadingS
 def _track_loss(samples: Samples, tracks: Tracks, a: Frame, b: Frame, motions: Pose) -> Tensor:
     """Mean loss (H,) of near returns moved by motions (H) at the ends of their tracks; NaN of too few.
 
-    The loss of a miss is miss² / (miss² + c²), c = 2 px of a picture 640 wide, as in ``dhtorch.validation.faults``.
+    Misses are in pixels of a picture 640 wide; their loss is that of ``dhtorch.validation.faults``.
     """
     used = (samples.usable & tracks.valid)[0]
-    if int(used.sum()) < _MIN_TRACKS:
+    if int(used.sum()) < MIN_LOSSES:
         return torch.full((len(motions.t),), torch.nan, dtype=torch.float64)
     xyz = cam.unproject(a.camera, samples.uv, samples.depth)[0, used].double()
     moved = se3.apply(motions, xyz.expand(len(motions.t), -1, -1))
@@ -255,7 +247,8 @@ def _track_loss(samples: Samples, tracks: Tracks, a: Frame, b: Frame, motions: P
     moved = torch.where(in_front[..., None], moved, 1.0)
     uv = cam.project(b.camera, moved.reshape(1, -1, 3).to(a.camera.f.dtype)).reshape(len(motions.t), -1, 2)
     miss = (uv - tracks.uv_1[0, used]).norm(dim=-1) * (640 / a.hw[1])
-    return torch.where(in_front, miss.square() / (miss.square() + _HALF_LOSS_PX**2), 1.0).double().mean(-1)
+    half = DEFAULT_VALIDATION_OPTIONS.half_loss_px
+    return torch.where(in_front, bounded_loss(miss, half), 1.0).double().mean(-1)
 
 
 def pose_readings() -> list[PoseReading]:
@@ -271,7 +264,7 @@ def pose_readings() -> list[PoseReading]:
     named_factors = {UNIT_METRES[unit] for unit in UNIT_METRES}
     factors = [each for each in factors if each.unit not in named_factors]
     readings = [PoseReading(each) for each in (*conventions, *units, *factors) if not each.is_trivial]
-    lags = [PoseReading(lag=k) for k in range(-_MAX_LAG_FRAMES, _MAX_LAG_FRAMES + 1) if k]
+    lags = [PoseReading(lag=k) for k in range(-MAX_LAG_FRAMES, MAX_LAG_FRAMES + 1) if k]
     return [PoseReading(), *readings, *lags]
 
 
@@ -282,20 +275,12 @@ def depth_disagreement(xyz: Tensor, frame: Frame, T_frame_from_points: Pose) -> 
     """
     n_motions = len(T_frame_from_points.t)
     moved = se3.apply(T_frame_from_points, xyz.expand(n_motions, -1, -1))
-    uv = cam.project(depth_camera_of(frame), moved.reshape(1, -1, 3).to(frame.camera.f.dtype))
+    uv = cam.project(frame.map_camera, moved.reshape(1, -1, 3).to(frame.camera.f.dtype))
     value, inside = sample_nearest(frame.depth, uv)
     value, inside = (x.reshape(n_motions, -1) for x in (value, inside))
     meets = inside & (value > 0) & (moved[..., 2] > 0)
     difference = torch.where(meets, (moved[..., 2] - value).abs() / value, torch.nan)
     return torch.where(meets.sum(-1) >= _MIN_MEETING_RETURNS, difference.nanmedian(-1).values, torch.nan)
-
-
-def depth_camera_of(frame: Frame) -> Camera:
-    """The camera of a frame's depth map: its own, else the image's at the map's size."""
-    hw = (frame.depth.shape[-2], frame.depth.shape[-1])
-    if frame.depth_camera is not None:
-        return frame.depth_camera
-    return frame.camera if hw == frame.hw else cam.resize(frame.camera, frame.hw, hw)
 
 
 def describe_contradiction(check: PoseCheck, unit: DepthUnit | None = None) -> tuple[str, str]:
@@ -324,7 +309,8 @@ def _measured(check: PoseCheck) -> str:
     """The measurement that decides, as text."""
     if check.by_tracks and check.tracks is not None:
         return (
-            f"near returns miss their tracks, loss {check.tracks.stated:.2f}, {check.tracks.best_score:.2f} otherwise"
+            f"near returns miss their tracks: mean loss {check.tracks.stated:.2f} of 1, "
+            f"{check.tracks.best_score:.2f} if read otherwise"
         )
     scores = check.surfaces
     stated = "no surface meets another" if math.isnan(scores.stated) else f"{100 * scores.stated:.1f} % of the depth"
@@ -385,7 +371,7 @@ def _sampled_returns(frame: Frame) -> Tensor:
     step = max(1, len(v) // _MAX_RETURNS)
     v, u = v[step // 2 :: step], u[step // 2 :: step]
     uv = torch.stack((u, v), -1)[None].to(frame.camera.f.dtype)
-    return cam.unproject(depth_camera_of(frame), uv, frame.depth[0, v, u][None].to(uv.dtype))[0].double()
+    return cam.unproject(frame.map_camera, uv, frame.depth[0, v, u][None].to(uv.dtype))[0].double()
 
 
 def _median_over_pairs(values: Tensor) -> Tensor:

@@ -54,13 +54,13 @@ def test_a_sound_capture_has_no_finding(frames, true):
     check = check_capture(recording(frames, true))
     assert check.findings == () and not check.poses_refuted and check.recording.poses is true
     assert check.assumed_unit == ASSUMED and check.lines == [ASSUMED, "a remark"]
-    assert check.record() == {"assumed_unit": ASSUMED, "findings": [], "poses_refuted": False}
+    assert check.reported.poses is true and check.reported.report == (ASSUMED, "a remark")
     assert check.poses.surfaces.stated < 0.01
 
 
 def test_a_stated_unit_is_not_announced(frames):
     check = check_capture(recording(frames, depth_unit=DepthUnit(0.001, "camera.json: scale"), report=()))
-    assert check.lines == [] and check.poses is None and check.record()["assumed_unit"] is None
+    assert check.lines == [] and check.poses is None and check.assumed_unit == ""
     assert check_capture(recording(frames, depth_unit=None, report=())).lines == []
 
 
@@ -76,7 +76,7 @@ def test_refuted_poses_are_named_and_removed(convention, frames, true):
     corrected = undone(check, spoilt)
     torch.testing.assert_close(corrected.poses.t, true.t, atol=1e-9, rtol=0)
     torch.testing.assert_close(corrected.poses.R, true.R, atol=1e-6, rtol=0)
-    assert check.record()["poses_refuted"] and check.record()["findings"][0]["cause"] == "poses"
+    assert check.reported.poses is None and check.reported.report[-1] == str(finding)
     assert check.lines[-1].endswith(f"(remedy: data.pose_convention={convention})")
 
 

@@ -17,7 +17,6 @@ from dhtorch.validation.pose_check import (
     PoseReading,
     ReadingScores,
     check_poses,
-    depth_camera_of,
     depth_disagreement,
     describe_contradiction,
     describe_factor,
@@ -194,9 +193,9 @@ def test_disagreement_is_the_median_relative_difference(frames):
 def test_the_camera_of_a_smaller_map(frames):
     frame = frames[0]
     half = frame.replace(depth=frame.depth[:, ::2, ::2])
-    torch.testing.assert_close(depth_camera_of(half).f, frame.camera.f / 2)
+    torch.testing.assert_close(half.map_camera.f, frame.camera.f / 2)
     own = frame.replace(depth_camera=box.CAMERA.replace(f=torch.tensor([[7.0, 7.0]])))
-    assert torch.equal(depth_camera_of(own).f, own.depth_camera.f) and depth_camera_of(frame) is frame.camera
+    assert torch.equal(own.map_camera.f, own.depth_camera.f) and frame.map_camera is frame.camera
 
 
 def test_readings_are_distinct_and_the_stated_one_is_first():
