@@ -444,9 +444,11 @@ def _format_next_step(recovered: RecoveredFrames, shown: str) -> str:
     if recovered.left:
         again = f"run the same command again for the {format_count(recovered.left, 'frame')} left (minutes=null: all)"
         return f"Next: open {shown}; {again}.{broken}"
-    reader_options = {name: value for name, value in recovered.task.settings["data"].items() if value is not None}
+    path = recovered.task.settings["path"]
+    options = {name: value for name, value in recovered.task.settings["data"].items() if name != "path"}
+    reader_options = {name: value for name, value in options.items() if value is not None}
     reader_words = "".join(f" data.{name}={_format_value(value)}" for name, value in reader_options.items())
-    path, cutoff = recovered.task.settings["path"], _median_sensor_depth(recovered)
+    cutoff = _median_sensor_depth(recovered)
     command = f"dhtorch run data=auto data.root={path}{reader_words} holdout.cutoff={cutoff:.2g}"
     return f"Next: open {shown}; to measure the error on your capture: {command}.{broken}"
 

@@ -17,6 +17,7 @@ from dhtorch.data.pose_convention import parse_pose_convention
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit, parse_unit
 from dhtorch.records import Frame
+from dhtorch.runtime.console import format_count
 
 #: Relative difference up to which a recording's rate is that of its own stamps. Source: derived: rounding.
 _MEASURED_RATE_REL = 1e-3
@@ -122,5 +123,8 @@ def _shift_depth(recording: Recording, lag: int) -> Recording:
         number=recording.number[kept],
         times=None if recording.times is None else recording.times[kept],
         poses=None if recording.poses is None else recording.poses[kept],
-        report=(*recording.report, f"depth is that of {abs(lag)} frames {'later' if lag > 0 else 'earlier'}"),
+        report=(
+            *recording.report,
+            f"depth is that of {format_count(abs(lag), 'frame')} {'later' if lag > 0 else 'earlier'}",
+        ),
     )

@@ -56,7 +56,7 @@ def test_the_page_begins_with_the_numbers_and_the_picture(made):
     assert "kitchen, frame" in opening and ", with frame" in opening, "whose picture, and of which views"
 
 
-def test_it_says_what_it_is_what_was_recovered_and_what_to_do_next(capture, made, capsys):
+def test_it_says_what_it_is_what_was_recovered_and_what_to_do_next(capture, made, tmp_path, capsys):
     before = {p: p.stat().st_mtime_ns for p in (made / "meta").iterdir()}
     assert main(["recover", str(capture), f"out={made}", *SMALL]) == 0
     what, found, then, wrote = capsys.readouterr().out.strip().splitlines()
@@ -64,6 +64,8 @@ def test_it_says_what_it_is_what_was_recovered_and_what_to_do_next(capture, made
     assert found.startswith("Recovered ") and " pixels per frame without sensor depth, from " in found
     assert then.startswith("Next: ") and str(made) in wrote
     assert {p: p.stat().st_mtime_ns for p in (made / "meta").iterdir()} == before, "complete frames are kept"
+    command = then.partition("on your capture: dhtorch ")[2].rstrip(".")
+    assert main([*command.split(), "method=map", "method.n=64", f"hydra.run.dir={tmp_path / 'job'}"]) == 0, "as printed"
 
 
 def test_the_beginning_is_made_where_time_is_short_and_said_again_it_goes_on(capture, tmp_path, capsys):
