@@ -91,7 +91,8 @@ def test_a_lag_is_undone(lag, frames):
         assert torch.equal(frame.conf, want.conf) and torch.equal(frame.depth_camera.f, want.depth_camera.f)
         assert torch.equal(frame.T_world_from_cam.t, want.T_world_from_cam.t)
         assert float(frame.time) == float(times[number - 10])
-    assert f"depth is that of {abs(lag)} frames {'later' if lag > 0 else 'earlier'}" in corrected.report
+    plural = "s" * (abs(lag) > 1)
+    assert f"depth is that of {abs(lag)} frame{plural} {'later' if lag > 0 else 'earlier'}" in corrected.report
 
 
 def test_a_lag_of_0_changes_nothing(frames):
