@@ -21,7 +21,7 @@ FLOORS = (
     {"validation", "integrate", "synthetic"},
     {"pipeline", "testing"},
     {"calibration"},
-    {"stages", "alignment", "metrics", "export", "data"},
+    {"stages", "alignment", "metrics", "losses", "export", "data"},
     {"viz"},
     {"records"},
     {"geometry"},

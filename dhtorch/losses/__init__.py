@@ -1,0 +1,5 @@
+"""Losses for training on recovered depths and through the stages: depth with a sigma, pixels with a covariance."""
+
+from dhtorch.losses.weighted import reprojection_loss, sigma_weighted_depth_loss
+
+__all__ = ["reprojection_loss", "sigma_weighted_depth_loss"]
