@@ -1,162 +1,282 @@
-"""Our functions beside kornia's: time, difference, and whether kornia's keeps what an answer here must keep.
+"""Our functions and kornia's on the calls of whole methods, and the table of docs/kornia.md.
 
-Both sides are asked the same question in turn, one thread, float32. Beside the time stand the largest and the median
-relative difference, the latter in float64 as well; whether either side answers a batch as it answers each element
-alone, and a point among others as among fewer, bit for bit; whether ``torch.compile`` captures it as one graph; whether
-its gradient is finite, also where a formula divides by zero. A function that now calls kornia is compared as it was
-before, see :mod:`before_kornia`.
+    python benchmarks/beside_kornia.py --clock cpu --json benchmarks/results/kornia.json
 
-``--before FOLDER`` asks both methods of real pairs (``DHTORCH_DATA``), here and in an earlier checkout; without it the
-file's answers stay.
-
-This file is not called ``kornia.py``, because every script beside it would then import it instead of the library.
+The calls of a function in ``PAPER``, ``MAP`` and ``complete_depth`` on the built-in room are recorded with their
+arguments; both implementations then answer the same calls in turn. Where kornia's function is the one in use, ours is
+the formula that it replaced.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import subprocess
+import statistics
 import sys
-import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import harness
 import torch
-from kornia_peers import PEERS, Peer
+from kornia import filters as kf
+from kornia.feature import gftt_response
+from kornia.geometry import epipolar as ke
+from kornia.geometry.camera import project_points
+from kornia.geometry.camera.projection_z1 import dx_project_points_z1
+from kornia.geometry.liegroup import Se3
+from kornia.geometry.transform import build_pyramid
+from speed_tables import ratio
 from torch import Tensor
 from torch.utils import _pytree as pytree
 
-HERE = Path(__file__).resolve().parent
+from dhtorch import MAP, PAPER, complete_depth
+from dhtorch.experiments.report import ReportTable, text
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry import epipolar, filters, least_squares, pyramid, se3
+from dhtorch.geometry.patches import luma
+from dhtorch.records import Camera, Frame, Pose
+from dhtorch.runtime import storage
+from dhtorch.stages import holes
+from dhtorch.synthetic import SyntheticRoom
 
-#: Sizes of the checks that compare bits: where there are points enough of them that a vector loop has a tail, else as
-#: many elements; pictures are few.
-B, MANY, N, FEW = 3, 67, 501, 37
+RESULTS = Path(__file__).resolve().parent / "results"
 
-
-def run(repeats: int, only: str = "", clock: str = "wall") -> list[dict[str, Any]]:
-    """A row for every pair of functions."""
-    return [compare(peer, repeats, clock) for peer in PEERS if only in f"{peer.ours} {peer.kornia}"]
-
-
-def compare(peer: Peer, repeats: int, clock: str) -> dict[str, Any]:
-    """Time both sides and say how they differ."""
-    args = peer.make(torch.float32, *peer.size)
-    calls = (lambda: peer.mine(*args), lambda: peer.theirs(*args))
-    with torch.no_grad():
-        ours, theirs = harness.in_turn(calls, repeats=repeats, least_ms=20, clock=clock)
-        largest, typical = difference(*(call() for call in calls))
-        exact = peer.make(torch.float64, *peer.size)
-        _, typical_64 = difference(peer.mine(*exact), peer.theirs(*exact))
-    more: dict[str, Any] = {"kornia": peer.kornia, "used": peer.used, "why": peer.why, "note": peer.note}
-    more |= {"largest": largest, "median_rel": typical, "median_rel_float64": typical_64}
-    for side, fn in (("ours", peer.mine), ("kornia", peer.theirs)):
-        arrays = peer.arrays and side == "ours"
-        more[f"{side}_steady"] = steady(peer, fn)
-        more[f"{side}_captures"] = None if arrays else captures(peer, fn)
-        more[f"{side}_gradient"] = None if arrays else gradient(fn, peer.make(torch.float32, B, FEW))
-        more[f"{side}_hard"] = None if peer.hard is None else gradient(fn, peer.hard())
-    versions = {name: version(name) for name in ("torch", "kornia")}
-    size = {"n": peer.size[1], "batch": peer.size[0], "clock": clock}
-    return harness.row(peer.ours, ours, "kornia", theirs, **size, **more, versions=versions)
+#: Limits the part of a call's time that kornia's function adds where its bits are the same and it is used, in per cent.
+#: Source: chosen, as the spread of a call's time between runs (``spread_percent`` of the result).
+MAX_ADDED_PERCENT = 0.5
 
 
-def difference(a: Tensor, b: Tensor) -> tuple[float, float]:
-    """Largest absolute and median relative difference of what is finite on both sides."""
-    a, b = a.double().flatten(), b.double().flatten()
+#: Arguments and options of calls.
+Calls = list[tuple[tuple[Any, ...], dict[str, Any]]]
+
+
+class Peer(NamedTuple):
+    """A function of dhtorch, and who else computes it."""
+
+    ours: str  # dotted, below dhtorch
+    kornia: str  # dotted, below kornia
+    recorded: Callable[..., Any]  # the function whose calls are recorded
+    mine: Callable[..., Any]
+    theirs: Callable[..., Any]
+    why: str
+    used: str = "ours"
+
+
+def _unproject(camera: Camera, uv: Tensor, depth: Tensor) -> Tensor:
+    xy = (cam.undistort(camera, uv) - camera.c[:, None]) / camera.f[:, None]
+    return torch.cat((xy * depth[..., None], depth[..., None]), -1)
+
+
+def _hat(v: Tensor) -> Tensor:
+    return torch.linalg.cross(v[..., None], torch.eye(3).to(v).expand(*v.shape[:-1], 3, 3), dim=-2)
+
+
+def _triangulate(uv_0: Tensor, uv_1: Tensor, camera_0: Camera, camera_1: Camera, T: Pose) -> Tensor:
+    K_0, K_1, matrix = cam.to_matrix(camera_0), cam.to_matrix(camera_1), se3.to_matrix(T)[:, :3]
+    P_0 = torch.cat((K_0, torch.zeros_like(K_0[..., :1])), -1)
+    return ke.triangulate_points(P_0, K_1 @ matrix, uv_0, uv_1, solver="cofactor")[..., 2]
+
+
+def _moved(T: Pose, xi: Tensor) -> Tensor:
+    return (Se3.exp(xi.roll(3, -1)) * T.to_kornia()).matrix()[:, :3]
+
+
+def _pyramid(image: Tensor, levels: int, *_: Any, **__: Any) -> list[Tensor]:
+    return [kf.spatial_gradient(level) for level in build_pyramid(filters.grayscale(image), levels)]
+
+
+def _gftt(image: Tensor, uv: Tensor, **_: Any) -> Tensor:
+    at = uv.round().long()
+    return gftt_response(filters.grayscale(image))[:, 0][:, at[0, :, 1], at[0, :, 0]]
+
+
+PEERS = (
+    Peer(
+        "geometry.camera.unproject",
+        "geometry.camera.unproject_points",
+        cam.unproject,
+        _unproject,
+        cam.unproject,
+        "the same bits",
+        "kornia",
+    ),
+    Peer("geometry.se3.hat", "geometry.liegroup.So3.hat", se3.hat, _hat, se3.hat, "the same bits", "kornia"),
+    Peer(
+        "geometry.filters.grayscale",
+        "color.rgb_to_grayscale",
+        filters.grayscale,
+        lambda image: luma(image, 1),
+        filters.grayscale,
+        "the same bits",
+        "kornia",
+    ),
+    Peer(
+        "geometry.camera.project",
+        "geometry.camera.project_points",
+        cam.project,
+        cam.project,
+        lambda c, xyz: project_points(xyz, cam.to_matrix(c)),
+        "multiplies by 1/z where ours divides: other bits",
+    ),
+    Peer(
+        "geometry.epipolar.triangulate",
+        "geometry.epipolar.triangulate_points",
+        epipolar.triangulate,
+        lambda *a: epipolar.triangulate(*a).depth,
+        _triangulate,
+        "both pixels are noisy there, here the reference view's is exact; no covariance",
+    ),
+    Peer(
+        "geometry.epipolar.point_jacobians",
+        "geometry.camera.dx_project_points_z1",
+        epipolar.point_jacobians,
+        lambda *a: epipolar.point_jacobians(*a)[0],
+        lambda c, xyz: dx_project_points_z1(xyz) * c.f[:, None, :, None],
+        "no guard at z = 0; the Jacobian of the pose, which shares its terms with ours, is not computed",
+    ),
+    Peer(
+        "geometry.least_squares.move_pose",
+        "geometry.liegroup.Se3.exp",
+        least_squares.move_pose,
+        lambda *a: se3.to_matrix(least_squares.move_pose(*a))[:, :3],
+        _moved,
+        "in every step of a refinement, where Cayley's map needs no sine",
+    ),
+    Peer(
+        "geometry.pyramid.build_pyramid",
+        "geometry.transform.build_pyramid",
+        pyramid.build_pyramid,
+        pyramid.build_pyramid,
+        _pyramid,
+        "levels at other places, no padding for windows, Sobel's gradients (`filters.spatial_gradient`), not Scharr's",
+    ),
+    Peer(
+        "stages.holes.min_eigenvalue",
+        "feature.gftt_response",
+        holes.min_eigenvalue,
+        holes.min_eigenvalue,
+        _gftt,
+        "the whole picture for some points, and another window",
+    ),
+)
+
+
+@cache
+def _frames() -> list[Frame]:
+    """Views of the built-in room as a phone takes them; the sensor ends at 2 m."""
+    room = SyntheticRoom(seed=2, n_frames=12, hw=(480, 640), depth_hw=(192, 256))
+    frames = [room[k] for k in (3, 4, 5, 7, 9)]
+    return [f.replace(image=f.image.contiguous(), depth=torch.where(f.depth > 2, 0.0, f.depth)) for f in frames]
+
+
+#: Name → a call of a whole method.
+METHODS: dict[str, Callable[[], Any]] = {
+    "paper": lambda: PAPER(_frames()[0], _frames()[-1]),
+    "map": lambda: MAP(_frames()[0], _frames()[-1]),
+    "complete": lambda: complete_depth(_frames()[0], _frames()[1:]),
+}
+
+
+def recorded_calls(fn: Callable[..., Any], run: Callable[[], Any]) -> Calls:
+    """Arguments of the calls of ``fn`` in a run."""
+    calls: Calls = []
+
+    def spy(*args: Any, **options: Any) -> Any:
+        calls.append((args, options))
+        return fn(*args, **options)
+
+    modules = [m for name, m in sys.modules.items() if name.startswith("dhtorch")]
+    places = [(m, name) for m in modules for name, value in vars(m).items() if value is fn]
+    for module, name in places:
+        setattr(module, name, spy)
+    try:
+        run()
+    finally:
+        for module, name in places:
+            setattr(module, name, fn)
+    normal: Calls = pytree.tree_map_only(Tensor, lambda x: x.clone() if x.is_inference() else x, calls)
+    return normal
+
+
+def replayed(fn: Callable[..., Any], calls: Calls) -> list[Any]:
+    """The answers of ``fn`` to recorded calls."""
+    return [fn(*args, **options) for args, options in calls]
+
+
+def largest_difference(a: Any, b: Any) -> float | None:
+    """Largest absolute difference of two tensors of one shape where both are finite; None for other answers."""
+    if not isinstance(a, Tensor) or a.shape != b.shape:
+        return None
     both = a.isfinite() & b.isfinite()
-    a, b = a[both], b[both]
-    scale = a.abs().clamp_min(1e-6 * float(a.abs().max()) + 1e-300)
-    return float((a - b).abs().max()), float(((a - b).abs() / scale).median())
+    return float((a - b)[both].abs().amax()) if both.any() else 0.0
 
 
-def steady(peer: Peer, fn: Callable[..., Any]) -> bool:
-    """Whether each element alone, and a few points alone, get the bits that they get in company."""
-    many = MANY if not peer.points and peer.size[0] > B else B
-    args = peer.make(torch.float32, many, N)
-    whole = fn(*args)
-    if len(whole) != many:
-        return True
-    alone = torch.cat([fn(*(x[k : k + 1] for x in args)) for k in range(many)])
-    same = torch.equal(alone.nan_to_num(), whole.nan_to_num())
-    if peer.points:
-        few = fn(*(x[:, :FEW] if k in peer.points else x for k, x in enumerate(args)))
-        same = same and torch.equal(few.nan_to_num(), whole[:, :FEW].nan_to_num())
-    return same
+def measured(peer: Peer, total_ms: dict[str, float], repeats: int, clock: str) -> dict[str, Any]:
+    """A row: both sides on the calls of every method."""
+    added: dict[str, float] = {}
+    ours_ms = theirs_ms = 0.0
+    differences: list[float | None] = []
+    for name, run in METHODS.items():
+        calls = recorded_calls(peer.recorded, run)
+        added[name] = 0.0
+        if calls:
+            sides = [partial(replayed, fn, calls) for fn in (peer.mine, peer.theirs)]
+            times = harness.in_turn(sides, repeats=repeats, least_ms=5, clock=clock)
+            ours, theirs = (statistics.median(x) for x in times)
+            ours_ms, theirs_ms = ours_ms + ours, theirs_ms + theirs
+            added[name] = 100 * (theirs - ours) / total_ms[name]
+            differences += [largest_difference(a, b) for a, b in zip(*(side() for side in sides), strict=True)]
+    known = [x for x in differences if x is not None]
+    largest = max(known) if len(known) == len(differences) else None
+    more = {"kornia": peer.kornia, "used": peer.used, "why": peer.why, "added_percent": added, "largest": largest}
+    return {"name": peer.ours, "ratio": ours_ms / theirs_ms, **more}
 
 
-def captures(peer: Peer, fn: Callable[..., Any]) -> bool:
-    """Whether it compiles as one graph."""
-    torch._dynamo.reset()
-    with contextlib.suppress(Exception):
-        torch.compile(fn, backend="eager", fullgraph=True)(*peer.make(torch.float32, B, FEW))
-        return True
-    return False
+def run(repeats: int, clock: str) -> dict[str, Any]:
+    """The result file."""
+    with torch.no_grad():
+        whole = {name: harness.in_turn([call], repeats=5, warm_up=1, clock=clock)[0] for name, call in METHODS.items()}
+        total_ms = {name: statistics.median(times) for name, times in whole.items()}
+        rows = [measured(peer, total_ms, repeats, clock) for peer in PEERS]
+    spread = {name: 100 * harness.iqr(times) / total_ms[name] for name, times in whole.items()}
+    versions = {name: version(name) for name in ("torch", "kornia")}
+    threads = {"threads": torch.get_num_threads(), "clock": clock, "versions": versions, **harness.place()}
+    return {"total_ms": total_ms, "spread_percent": spread, "rows": rows, **threads}
 
 
-def gradient(fn: Callable[..., Any], args: tuple[Any, ...]) -> bool:
-    """Whether there is a gradient, and all of it finite."""
-    args = pytree.tree_map(lambda x: x.clone().requires_grad_(), args)
-    with contextlib.suppress(Exception):
-        result = fn(*args)
-        torch.where(result.isfinite(), result, 0.0).sum().backward()
-        grads = [x.grad for x in _tensors(args) if x.grad is not None]
-        return bool(grads) and all(bool(g.isfinite().all()) for g in grads)
-    return False
-
-
-def _tensors(args: Any) -> Iterator[Tensor]:
-    yield from (x for x in pytree.tree_leaves(args) if isinstance(x, Tensor) and x.is_floating_point())
-
-
-def answers(before: Path) -> list[dict[str, Any]]:
-    """What the methods say of real pairs, here and in the checkout ``before``: a row for each scene and method."""
-    with tempfile.TemporaryDirectory() as folder:
-        dumps = []
-        for side, root in (("before", before), ("now", HERE.parent)):
-            path = Path(folder) / f"{side}.pt"
-            environment = {**os.environ, "PYTHONPATH": str(root)}
-            subprocess.run(
-                [sys.executable, str(HERE / "answers.py"), str(path)], env=environment, cwd=folder, check=True
-            )
-            dumps.append(torch.load(path))
-    commit = subprocess.check_output(["git", "rev-parse", "--short", "HEAD"], cwd=before, text=True).strip()
-    rows = []
-    for key in dict.fromkeys((scene, method) for scene, method, _ in dumps[0]):
-        pairs = [k for k in dumps[0] if k[:2] == key]
-        a, b = ({name: torch.cat([side[k][name] for k in pairs]) for name in ("depth", "gate")} for side in dumps)
-        both = (a["gate"] == 0) & (b["gate"] == 0)
-        moved = ((a["depth"] - b["depth"]).abs() / a["depth"])[both]
-        numbers = {"answered": int((a["gate"] == 0).sum()), "flipped": float((a["gate"] != b["gate"]).double().mean())}
-        numbers |= {"median_rel": float(moved.median()), "largest_rel": float(moved.max())}
-        rows.append({"name": "answers", "scene": key[0], "method": key[1], "pairs": len(pairs), **numbers})
-        rows[-1]["before"] = commit
-    return rows
+def table() -> str:
+    """The rows of the result file, those that are kornia's first."""
+    file = json.loads((RESULTS / "kornia.json").read_text())
+    shown = []
+    for r in sorted(file["rows"], key=lambda r: r["used"] != "kornia"):
+        cells = [f"`{r['name']}`", f"`{r['kornia']}`", r["used"], ratio(r["ratio"])]
+        cells += [f"{round(r['added_percent'][name], 2) + 0:+.2f} %" for name in METHODS]
+        shown.append([*cells, "–" if r["largest"] is None else f"{r['largest']:.1g}", r["why"]])
+    head = ["ours", "kornia's", "used", "ratio", *(f"adds to `{name}`" for name in METHODS), "largest", "why"]
+    versions = ", ".join(f"{name} {value}" for name, value in file["versions"].items())
+    times = ", ".join(
+        f"`{name}` {file['total_ms'][name]:.0f} ms ± {file['spread_percent'][name]:.1f} %" for name in METHODS
+    )
+    where = f"Measured on: {file['processor']}; {file['threads']} thread; {versions}. Whole calls: {times}."
+    return f"{text.table_to_markdown(ReportTable('', head, shown, n_label=3))}\n\n{where}"
 
 
 def main() -> None:
-    """Print the rows, and write them with ``--json``."""
-    parser = harness.arguments(__doc__ or "")
-    parser.add_argument("--only", default="", help="rows whose names hold this")
-    parser.add_argument("--before", type=Path, help="an earlier checkout, whose answers to real pairs are compared")
-    options = parser.parse_args()
+    """Print the table, and write the result file with ``--json``."""
+    options = harness.arguments(__doc__ or "").parse_args()
     harness.set_threads(1)
-    rows = run(options.repeats, options.only, options.clock)
-    for r in rows:
-        counts = " ".join(f"{k}={r[k]}" for k in r if k.endswith(("steady", "captures", "gradient", "hard")))
-        print(f"{r['name']:46} {r['kornia']:52} {r['ratio']:7.3f} {r['largest']:9.2e} {r['median_rel']:9.2e} {counts}")
-    if options.before is not None:
-        rows += answers(options.before)
-        print(*rows[len(rows) - 8 :], sep="\n")
-    elif options.json is not None and options.json.is_file():  # answers are not asked again for the sake of times
-        rows += [r for r in json.loads(options.json.read_text()) if r["name"] == "answers"]
+    result = run(options.repeats, options.clock)
+    for r in result["rows"]:
+        added = " ".join(f"{name} {value:+.3f} %" for name, value in r["added_percent"].items())
+        print(f"{r['name']:36} {r['kornia']:40} {r['ratio']:7.3f} {added}  {r['largest']}")
     if options.json is not None:
-        options.json.write_text(json.dumps(rows, indent=1, allow_nan=False) + "\n")
+        storage.write_json(options.json, result)
 
+
+#: Tables of docs/kornia.md.
+TABLES = {"kornia functions": table}
 
 if __name__ == "__main__":
     main()

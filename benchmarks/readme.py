@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import kornia_tables
+import beside_kornia
 import mutants
 import pose_tables
 import speed_tables
@@ -546,7 +546,7 @@ TABLES |= {
 TABLES |= {"every pixel": partial(every_pixel, "dense", "dense_streams")}
 TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= (
-    {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | kornia_tables.TABLES | pose_tables.TABLES
+    {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | beside_kornia.TABLES | pose_tables.TABLES
 )
 TABLES |= {
     "how good": how_good,

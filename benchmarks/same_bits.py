@@ -596,15 +596,15 @@ def dump(path: Path, quick: bool, threads: int, only: str, data: bool) -> None:
 
 def measured(compute: Callable[[], Any], values: dict[str, np.ndarray]) -> list[Leaf] | str:
     """The reduced tensors of an item, their values added by digest; the error where there is one."""
-    leaves = []
+    digests = []
     try:
         for label, tensor in leaves(compute()):
             leaf, kept = reduced(label, tensor)
             values.setdefault(leaf.digest, kept)
-            leaves.append(leaf)
+            digests.append(leaf)
     except Exception as error:
         return f"{type(error).__name__}: {error}"
-    return leaves if leaves else "no tensor"
+    return digests if digests else "no tensor"
 
 
 # ---------------------------------------------------------------------------------------------------- both checkouts

@@ -195,7 +195,7 @@ def slerp(
 ) -> np.ndarray:
     """Spherical linear interpolation (n, 4) along the shortest arc from ``a`` to ``b``; both ends bit for bit.
 
-    kornia's ``Quaternion.slerp`` rounds them and takes five times as long.
+    kornia's ``Quaternion.slerp`` rounds them.
     """
     dot = (a * b).sum(-1)
     b = np.where(dot < 0, -1.0, 1.0)[:, None] * b  # q and −q are one rotation
@@ -308,10 +308,7 @@ def size_of_registered_depth(depth_camera: Camera, camera: Camera, hw: tuple[int
 
 
 def _window_min(depth: Tensor, reach: int) -> Tensor:
-    """Minimum within ``reach`` rows and columns (square window), by doubling the window along each axis.
-
-    kornia's ``erosion`` takes twenty times as long.
-    """
+    """Minimum within ``reach`` rows and columns (square window), by doubling the window along each axis."""
     minimum = torch.nn.functional.pad(depth, (reach,) * 4, value=torch.inf)
     for dim in (0, 1):
         width = 1

@@ -54,8 +54,8 @@ def triangulate(
         :class:`TwoView`. Without a baseline, or where the rays are exactly parallel, depth is 0 and the rest finite
         but meaningless.
 
-    kornia's ``triangulate_points`` lets both pixels move, and takes twenty times as long at best;
-    ``sampson_epipolar_distance`` would be that distance for two noisy pixels.
+    kornia's ``triangulate_points`` lets both pixels move; ``sampson_epipolar_distance`` would be that distance for two
+    noisy pixels.
 
     Gradient: to pixels, both cameras and the pose; smooth except at the epipole.
     Checked against ``cv2.triangulatePoints`` and ``kornia.geometry.epipolar.triangulate_points``

@@ -1,6 +1,6 @@
 """Filters of whole pictures: grey values, Gaussian and box blur, separable correlation; rounding independent of batch.
 
-kornia's where kornia is as fast; filters of few taps are sums of shifted copies, a third of the time of a convolution.
+Grey values and Gaussian blur are kornia's; filters of few taps are sums of shifted copies instead of a convolution.
 
 Alphabet: ``x`` (B, C, H, W); ``taps`` weights along one axis, odd in number. Beyond the border its pixels repeat.
 """
@@ -21,8 +21,8 @@ def grayscale(image: Tensor) -> Tensor:
     """Pictures (B, C, H, W) -> grey values (B, 1, H, W) in [0, 1]; BT.601.
 
     C is 1 or 3, the pictures are float in [0, 1] or uint8. By kornia: bit for bit the values of
-    :func:`dhtorch.geometry.patches.luma` in float32 and float64, which is twice as fast on patches and reads channels
-    along any axis. Bytes become float32, divided first.
+    :func:`dhtorch.geometry.patches.luma` in float32 and float64, which is for patches and reads channels along any
+    axis. Bytes become float32, divided first.
 
     Gradient: to the picture.
     """
@@ -34,8 +34,6 @@ def grayscale(image: Tensor) -> Tensor:
 
 def correlate_separable(x: Tensor, down: Sequence[float], across: Sequence[float]) -> Tensor:
     """Pictures (B, C, H, W) -> correlation with the taps ``down`` along the height and ``across`` along the width.
-
-    kornia's ``filter2d_separable`` takes at least three times as long for up to 17 taps.
 
     Raises:
         ValueError: wrong shape, or an even number of taps.
@@ -87,10 +85,7 @@ def gaussian_blur(x: Tensor, sigma_px: float, *, reach_px: int | None = None) ->
 
 
 def box_mean(x: Tensor, radius: int) -> Tensor:
-    """Pictures (B, C, H, W) -> means over squares of ``2 radius + 1`` pixels. Gradient: to ``x``.
-
-    kornia's ``box_blur`` takes four times as long for a radius of 1.
-    """
+    """Pictures (B, C, H, W) -> means over squares of ``2 radius + 1`` pixels. Gradient: to ``x``."""
     side = 2 * radius + 1
     return correlate_separable(x, [1 / side] * side, [1 / side] * side)
 

@@ -239,7 +239,7 @@ def luma(rgb: Tensor, dim: int) -> Tensor:
     """Pixels with channels along ``dim`` (1 or 3, float in [0, 1] or uint8) -> grey values in [0, 1], BT.601.
 
     The channel dimension is kept with size 1. Floating images keep their dtype, uint8 becomes float32. For patches;
-    whole pictures use :func:`dhtorch.geometry.filters.grayscale`, by kornia, which takes twice as long on patches.
+    whole pictures use :func:`dhtorch.geometry.filters.grayscale`, by kornia.
     """
     # Divided first, so that a picture in bytes and the same picture in floats have equal grey values, bit for bit.
     rgb = rgb.float().div_(255) if rgb.dtype == torch.uint8 else rgb

@@ -214,8 +214,8 @@ def _fill_level(below: Tensor, level: Tensor, *, pad: int, finest: bool) -> None
 def _downscale(level: Tensor, pad: int, part: slice) -> Tensor:
     """Padded level -> rows ``part`` of its half-size image, as ``cv2.pyrDown`` (``tests/geometry/test_pyramid.py``).
 
-    kornia's ``pyrdown`` samples at other positions and takes four to ten times as long. Rows first, because their
-    slices are contiguous; then even and odd columns are separated once.
+    kornia's ``pyrdown`` samples at other positions. Rows first, because their slices are contiguous; then even and odd
+    columns are separated once.
     """
     w = (level.shape[-1] - 2 * pad + 1) // 2
     top, bottom = (pad + 2 * row for row in (part.start, part.stop))

@@ -1,5 +1,6 @@
 """Our values as kornia's and back: cameras, motions, and what both say of the same points; kornia's functions here."""
 
+import json
 import re
 import subprocess
 import sys
@@ -16,14 +17,15 @@ from dhtorch import Camera, Pose
 from dhtorch.data import convert
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
+from dhtorch.pipeline.presets import METHODS
+from dhtorch.synthetic import SyntheticRoom
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
-import before_kornia
-import kornia_peers
-import kornia_tables
+import beside_kornia
 
 REPO = Path(__file__).resolve().parents[2]
+PAGE = (REPO / "docs/kornia.md").read_text(encoding="utf-8")
 B, HW = 3, (120, 160)
 
 
@@ -88,20 +90,51 @@ def test_gradients_cross_the_border():
     assert bool((t.grad == 2).all())
 
 
-def test_what_kornia_does_here_is_what_was_done_before():
+def test_quaternions_and_matrices_by_kornia_are_those_of_the_exponential_map():
     g = np.random.default_rng(0)
-    rotations = np.concatenate(
-        (np.zeros((1, 3)), 1e-9 * g.normal(size=(5, 3)), g.normal(size=(50, 3)), [[np.pi, 0, 0]])
-    )
-    q = convert.to_quaternions(rotations)
-    np.testing.assert_allclose(q, before_kornia.to_quaternions(rotations), atol=1e-15)
-    found = convert.to_c2w(3 * q, rotations, Path("poses"))
-    np.testing.assert_allclose(found, before_kornia.to_c2w(3 * q, rotations), atol=1e-15)
-    assert convert.to_c2w(q[:0], rotations[:0], Path("poses")).shape == (0, 4, 4)
-    camera, uv = cameras(), 160 * torch.rand(B, 30, 2, generator=torch.Generator().manual_seed(3)).double()
-    torch.testing.assert_close(cam.distort(camera, uv), before_kornia.distort(camera, uv), rtol=1e-12, atol=1e-10)
-    T = motions()
-    assert torch.equal(se3.to_matrix(T), before_kornia.to_matrix(T))
+    vectors = np.concatenate((np.zeros((1, 3)), 1e-9 * g.normal(size=(5, 3)), g.normal(size=(50, 3)), [[np.pi, 0, 0]]))
+    q = convert.to_quaternions(vectors)
+    found = convert.to_c2w(3 * q, vectors, Path("poses"))
+    cross = np.cross(vectors[:, None], np.eye(3)).swapaxes(1, 2)
+    np.testing.assert_allclose(found[:, :3, :3], torch.matrix_exp(torch.from_numpy(cross)), atol=1e-14)
+    assert (found[:, :3, 3] == vectors).all() and (found[:, 3] == [0, 0, 0, 1]).all()
+    assert convert.to_c2w(q[:0], vectors[:0], Path("poses")).shape == (0, 4, 4)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_kornias_functions_that_are_used_give_the_bits_of_the_formulas_that_they_replaced(dtype):
+    camera, uv = cameras(dtype), 160 * torch.rand(B, 500, 2, generator=torch.Generator().manual_seed(3)).to(dtype)
+    camera = camera.replace(distortion=0.02 * camera.distortion)
+    depth = 1 + points(500, dtype)[..., 2]
+    arguments = {
+        "geometry.camera.unproject": (camera, uv, depth),
+        "geometry.se3.hat": (points(500, dtype),),
+        "geometry.filters.grayscale": (torch.rand(B, 3, *HW, dtype=dtype),),
+    }
+    used = {p.ours: p for p in beside_kornia.PEERS if p.used == "kornia"}
+    assert used.keys() == arguments.keys()
+    for name, peer in used.items():
+        mine, theirs = peer.mine(*arguments[name]), peer.theirs(*arguments[name])
+        assert torch.equal(mine, theirs) and mine.isfinite().all(), name
+    assert torch.equal(cam.rays(camera, uv), used["geometry.camera.unproject"].mine(camera, uv, depth**0))
+
+
+@pytest.mark.parametrize("method", ["paper", "map"])
+def test_methods_enter_kornias_geometry(method):
+    room = SyntheticRoom(seed=2, n_frames=6, hw=HW, depth_hw=(48, 64))
+    entered = set()
+
+    def profile(frame, event, _):
+        if event == "call" and "/kornia/" in frame.f_code.co_filename:
+            entered.add(frame.f_code.co_name)
+
+    sys.setprofile(profile)
+    try:
+        METHODS[method](room[0], room[3])
+    finally:
+        sys.setprofile(None)
+    assert {"unproject_points", "rgb_to_grayscale"} <= entered
+    assert ("hat" in entered) == (method == "map")
 
 
 def test_behind_a_wide_lens_kornias_steps_have_not_arrived():
@@ -119,15 +152,31 @@ def test_kornia_is_loaded_where_it_is_first_used():
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "False"
 
 
-def test_the_page_has_a_row_for_every_pair_of_functions():
-    asked = [(p.ours, p.kornia, p.used, p.why, p.note) for p in kornia_peers.PEERS]
-    rows = [r for r in kornia_tables.rows() if r["name"] != "answers"]
-    assert asked == [(r["name"], r["kornia"], r["used"], r["why"], r["note"]) for r in rows]
-    assert len(asked) >= 15 and {p.used for p in kornia_peers.PEERS} == {"ours", "kornia"}
-    assert all(p.why for p in kornia_peers.PEERS if p.used == "ours"), "where we depart, the reason is said"
+def test_the_result_has_a_row_for_every_pair_of_functions_and_kornias_are_used_where_they_cost_nothing():
+    file = json.loads((REPO / "benchmarks/results/kornia.json").read_text())
+    assert [(p.ours, p.kornia, p.used, p.why) for p in beside_kornia.PEERS] == [
+        (r["name"], r["kornia"], r["used"], r["why"]) for r in file["rows"]
+    ]
+    for row in file["rows"]:
+        free = max(row["added_percent"].values()) < beside_kornia.MAX_ADDED_PERCENT
+        assert (row["used"] == "kornia") == (free and row["largest"] == 0), row["name"]
+    assert f"adds less than {beside_kornia.MAX_ADDED_PERCENT} %" in PAGE.replace("\n", " ")
 
 
-@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", (REPO / "docs/kornia.md").read_text(), re.S))
+def test_the_page_lists_the_functions_that_are_imported_from_kornia():
+    """Outside the stages that are written on it, the adapters and the experiments; classes (without "_") convert."""
+    imported = set()
+    for path in (REPO / "dhtorch").rglob("*.py"):
+        if not {"kornia", "transforms", "experiments"} & set(path.relative_to(REPO).parts):
+            for names in re.findall(r"from kornia\.\S+ import ([\w, ]+)", path.read_text(encoding="utf-8")):
+                imported |= {name.strip() for name in names.split(",") if "_" in name}
+    table = PAGE.partition("## Function by function")[2].partition("The next table")[0]
+    first_column = "".join(row.split("|")[1] for row in table.splitlines() if row.startswith("| "))
+    listed = set(re.findall(r"`(?:\w+\.)*(\w+)`", first_column))
+    assert listed == imported | {"hat"}
+
+
+@pytest.mark.parametrize("code", re.findall(r"```python\n(.*?)```", PAGE, re.S))
 def test_the_example_of_the_page_runs(code):
     found = {}
     exec(compile(code, "docs/kornia.md", "exec"), found)

@@ -40,8 +40,7 @@ def measure_sharpness(
     """Sharpness (B, S, H, W) of every pixel in every image, averaged over a Gaussian window.
 
     ``modified_laplacian``: sum of the absolute second differences along both axes. ``gradient_energy``: sum of the
-    squared first differences (Sobel; kornia's ``spatial_gradient`` takes up to three times as long). ``variance``: of
-    the grey values in the window.
+    squared first differences (Sobel). ``variance``: of the grey values in the window.
 
     Args:
         images: B stacks of at least two images.
