@@ -24,7 +24,7 @@ from dhtorch.records import Camera, Frame
 from dhtorch.transforms import DenseMaps, ExtendDepth, SampleError
 
 #: Readers return metres and the camera of the same pixels: the checks of unit and intrinsics are switched off.
-_READER_OPTIONS = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "max_offset": np.inf}
+_READER_OPTIONS = {"depth_unit": "m", "layout": "chw", "max_depth": np.inf, "min_depth": 0.0, "min_focal": 0.0}
 
 
 #: Maximum bytes of cached frames, which are read again as source views of later frames.

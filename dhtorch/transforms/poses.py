@@ -19,7 +19,7 @@ from dhtorch.geometry import se3
 from dhtorch.pytree import stack
 from dhtorch.records import Pose, PoseFit, PosePrior
 from dhtorch.stages import pose_prior
-from dhtorch.transforms.sample_access import SampleError, SampleReader
+from dhtorch.transforms.sample_access import SampleError, SampleReader, get_value, is_kornia_camera
 
 #: Accepted ``pose_kind``: the mapping that a pose in a sample represents.
 POSE_KINDS = ("world_from_cam", "1_from_0")
@@ -155,7 +155,8 @@ def _read_matrix(
         assert leaves.like is not None
         matrix = torch.as_tensor(np.asarray(key), dtype=torch.float64, device=leaves.like.device)
         return matrix.expand(leaves.like.shape[0], *matrix.shape)
-    x = leaves.get(key)
+    value = get_value(leaves.sample, key)
+    x = leaves.per_sample(_world_from_kornia(value, key)) if is_kornia_camera(value) else leaves.get(key)
     rows, columns = tail
     shape = tuple(x.shape[1:])
     if x.ndim == 4 and x.shape[1] in (1, T):
@@ -164,6 +165,13 @@ def _read_matrix(
         expected = " or ".join(f"{r}x{columns}" for r in rows)
         raise SampleError(f"{key}: found shape {shape}, expected {expected}, with or without {T} in front")
     return x.double()
+
+
+def _world_from_kornia(camera: Any, key: str) -> Tensor:
+    """World_from_cam (n, 4, 4) of a camera of kornia, whose extrinsics map the world into the camera."""
+    if not hasattr(camera, "extrinsics"):
+        raise SampleError(f"{key}: found {type(camera).__name__}, expected a pose or a PinholeCamera")
+    return se3.to_matrix(se3.invert(Pose.from_kornia(camera)))
 
 
 def _read_covariance(leaves: SampleReader, key: str, T: int, at: int) -> Tensor:

@@ -6,22 +6,34 @@ Alphabet: B samples, T frames of a sample along time, C × H × W image, h × w 
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import is_transformed
+from dhtorch.geometry.checks import all_known, is_transformed
 from dhtorch.geometry.least_squares import has_graph
 from dhtorch.records import Camera
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
+    from kornia.sensors.camera import CameraModelBase
 
 #: Source of numbers: a key of the sample, or the numbers themselves, the same for every sample.
 KeyOrNumbers = str | Sequence[float]
 
+#: Source of intrinsics: as above, or a camera of kornia under the key or the same for every sample.
+KeyOrCamera: TypeAlias = "KeyOrNumbers | PinholeCamera | CameraModelBase"
+
 
 #: Unsigned dtypes for which torch has few operations -> the signed dtype they are converted to.
 _SIGNED_DTYPES = {torch.uint16: torch.int32, torch.uint32: torch.int64}
+
+
+#: Limits how far the last row of an intrinsic matrix may be off 0 0 1, without unit: rounding.
+#: Source: derived, single precision; a transposed matrix is off by its principal point in pixels.
+MAX_LAST_ROW_ERROR = 1e-3
 
 
 class SampleError(ValueError):
@@ -55,6 +67,23 @@ def drop_keys(sample: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
         elif rest and isinstance(out.get(head), Mapping):
             out[head] = drop_keys(out[head], [rest])
     return out
+
+
+def replace_values(sample: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Copy of a sample with other values under keys that :func:`get_value` finds; changed nested dicts are copied."""
+    out = dict(sample)
+    for key, value in values.items():
+        head, _, rest = key.replace("/", ".").partition(".")
+        if key not in out and rest and isinstance(out.get(head), Mapping):
+            out[head] = replace_values(out[head], {rest: value})
+        else:
+            out[key] = value
+    return out
+
+
+def is_kornia_camera(value: Any) -> bool:
+    """Whether a value is an object of kornia, as cameras in samples are."""
+    return type(value).__module__.partition(".")[0] == "kornia"
 
 
 #: Sentinel for a missing key.
@@ -103,7 +132,7 @@ def numbers_fingerprint(value: Any) -> Hashable | None:
 _INDEX_KEYS = ("episode_index", "index", "frame_index")
 
 
-def check_sample(sample: Any, image: str, intrinsics: KeyOrNumbers, batched: bool | None) -> None:
+def check_sample(sample: Any, image: str, intrinsics: KeyOrCamera, batched: bool | None) -> None:
     """Reject what is no sample; if ``batched`` is None also a batch, whose samples would be read as frames along time.
 
     Raises:
@@ -113,7 +142,8 @@ def check_sample(sample: Any, image: str, intrinsics: KeyOrNumbers, batched: boo
         size = f" of shape {tuple(sample.shape)}" if hasattr(sample, "shape") else ""
         raise SampleError(
             f"sample: found {type(sample).__name__}{size}, expected a dict with pictures and depth; image_transforms "
-            "passes single images only: wrap the data set instead, ExtendedDataset(dataset, transform)"
+            "passes single images only: wrap the data set instead, ExtendedDataset(dataset, transform), or kornia's "
+            "container, dhtorch.transforms.kornia.AugmentSample(container)"
         )
     if batched is not None:
         return
@@ -128,10 +158,10 @@ def check_sample(sample: Any, image: str, intrinsics: KeyOrNumbers, batched: boo
     candidates: tuple[Any, ...] = () if n < 2 else (intrinsics, *_INDEX_KEYS, *sample)
     for key in candidates:
         value = sample.get(key) if isinstance(key, str) else None
-        shape = tuple(getattr(value, "shape", ()))
+        shape = tuple(getattr(getattr(value, "intrinsics", value), "shape", ()))
         is_texts = isinstance(value, list | tuple) and len(value) == n and all(isinstance(text, str) for text in value)
         is_index = shape == (n,) and key in _INDEX_KEYS
-        if is_texts or is_index or (key == intrinsics and shape == (n, 3, 3)):
+        if is_texts or is_index or (key == intrinsics and shape in ((n, 3, 3), (n, 4, 4))):
             actual = f"{n} texts" if is_texts else f"shape {shape}"
             raise SampleError(
                 f"{key}: found {actual} beside {n} pictures, expected one sample; batched=True reads {n} samples, "
@@ -199,17 +229,20 @@ class SampleReader:
             x = self.get(numbers)
         else:
             x = torch.as_tensor(numbers, device=self.like.device)[None].expand(self.like.shape[0], *np.shape(numbers))
-        if x.ndim >= 3 and x.shape[-1] == x.shape[-2] == 3:
-            x = x.flatten(-2)
+        return self._row(x, name, T, at).to(self.dtype)
+
+    def _row(self, x: Tensor, name: str, T: int, at: int) -> Tensor:
+        """Numbers (B, k), (B, 1, k), (B, T, k), or 3x3 or 4x4 for k -> those of a frame (B, k)."""
+        x = intrinsic_rows(x, T)
         if x.ndim == 3 and x.shape[1] in (1, T):
             x = x[:, at if x.shape[1] > 1 else 0]
         if x.ndim != 2:
             raise SampleError(
                 f"{name}: found shape {tuple(x.shape[1:])}, expected one row of numbers, or one per frame"
             )
-        return x.to(self.dtype)
+        return x
 
-    def fingerprint(self, numbers: KeyOrNumbers) -> Hashable | None:
+    def fingerprint(self, numbers: KeyOrCamera) -> Hashable | None:
         """Numbers -> cache key of the tensors read from them; None if they cannot be cached.
 
         These are numbers with a graph, on another device or of a type unknown to numpy, and all in inference mode,
@@ -223,16 +256,45 @@ class SampleReader:
             return None
         return digest, self.dtype, self.like.device, self.batched, len(self.like)
 
-    def camera(self, numbers: KeyOrNumbers, T: int, at: int, distortion: Tensor | None) -> Camera:
-        """Intrinsics -> camera (B,) of the frame with index ``at`` along time."""
-        x = self.numbers(numbers, T, at)
+    def camera(
+        self, numbers: KeyOrCamera, T: int, at: int, distortion: Tensor | None, checks: list[Any] | None = None
+    ) -> Camera:
+        """Intrinsics -> camera (B,) of the frame with index ``at`` along time; appends to ``checks``."""
+        name = numbers if isinstance(numbers, str) else "intrinsics"
+        value = get_value(self.sample, numbers) if isinstance(numbers, str) else numbers
+        if is_kornia_camera(value):
+            return self._kornia_camera(value, name, T, at, distortion)
+        x = self.numbers(numbers, T, at)  # type: ignore[arg-type]  # no camera of kornia
         assert x is not None
         if x.shape[1] == 4:
             return Camera(x[:, :2], x[:, 2:], distortion)
         if x.shape[1] != 9:
-            name = numbers if isinstance(numbers, str) else "intrinsics"
-            raise SampleError(f"{name}: found {x.shape[1]} numbers, expected 3x3, or fx fy cx cy")
+            raise SampleError(f"{name}: found {x.shape[1]} numbers, expected 3x3, 4x4, fx fy cx cy or a camera")
+        if checks is not None:
+            last = (x[:, 6:] - x.new_tensor([0.0, 0, 1])).detach().abs().amax(-1)
+            if not (last.device.type == "cpu" and all_known(last == 0)):
+                text = f"{name}: the last row is off 0 0 1 by {{:.4g}}; is the matrix transposed?"
+                checks.append((~(last < MAX_LAST_ROW_ERROR), last, text))
         return Camera(x[:, 0:5:4].contiguous(), x[:, 2:6:3].contiguous(), distortion)
+
+    def _kornia_camera(self, value: Any, name: str, T: int, at: int, distortion: Tensor | None) -> Camera:
+        """Camera of kornia -> camera (B,) of a frame: it holds one, or one per sample, or per frame of one sample."""
+        try:
+            camera = Camera.from_kornia(value)
+        except TypeError as error:
+            raise SampleError(f"{name}: {error}") from error
+        if camera.distortion is not None and distortion is not None:
+            raise SampleError(f"{name}: found a camera with a distortion, expected none beside the option distortion")
+        f, c = (self._row(self.per_sample(x), name, T, at).to(self.dtype) for x in (camera.f, camera.c))
+        if camera.distortion is not None:
+            distortion = self._row(self.per_sample(camera.distortion), name, T, at).to(self.dtype)
+        return Camera(f, c, distortion)
+
+    def per_sample(self, x: Tensor) -> Tensor:
+        """Numbers (n, …) of a camera of kornia: of n samples, of n frames of one, or the same for all -> (B, …)."""
+        assert self.like is not None
+        x, B = x.to(self.like.device), len(self.like)
+        return x if self.batched and len(x) == B else x.expand(B, *x.shape)
 
     def pad(self, key: str, T: int) -> Tensor:
         """Image key -> (B, T) bool, True for frames that pad an episode: LeRobot's ``<key>_is_pad``."""
@@ -244,6 +306,21 @@ class SampleReader:
         if x.shape[1] != T:
             raise SampleError(f"{name}: found {x.shape[1]} values, expected {T}")
         return x
+
+
+def intrinsic_rows(x: Tensor, T: int) -> Tensor:
+    """Numbers (B, …) of samples, 3x3 or 4x4 matrices among them -> matrices as rows of nine numbers.
+
+    Four rows of four numbers are fx fy cx cy of T = 4 frames, unless they end in 0 0 0 1.
+    """
+    if x.ndim < 3 or x.shape[-1] != x.shape[-2] or x.shape[-1] not in (3, 4):
+        return x
+    if x.shape[-1] == 4:
+        last = x[..., 3, :]
+        if x.ndim == 3 and T == 4 and not all_known(last == last.new_tensor([0, 0, 0, 1])):
+            return x
+        x = x[..., :3, :3]
+    return x.flatten(-2)
 
 
 def _list_keys(sample: Mapping[str, Any], prefix: str = "") -> list[str]:

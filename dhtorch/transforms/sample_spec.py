@@ -26,7 +26,7 @@ from dhtorch.ops.dispatch import operator
 from dhtorch.pytree import stack
 from dhtorch.records import Camera, Frame, PosePrior
 from dhtorch.transforms import poses
-from dhtorch.transforms.sample_access import KeyOrNumbers, SampleError, SampleReader
+from dhtorch.transforms.sample_access import KeyOrCamera, KeyOrNumbers, SampleError, SampleReader
 
 #: Named depth units -> units per metre.
 SAMPLE_UNITS_PER_METRE = {"m": 1.0, "mm": 1000.0}
@@ -83,12 +83,12 @@ class SampleSpec:
     depth_unit: str | float = ""  # "m", "mm", or metres per unit; required
     image: str = "image"  # key of the reference view's image
     depth: str = "depth"  # key of the reference view's depth map
-    intrinsics: KeyOrNumbers = "intrinsics"  # 3×3, or fx fy cx cy, px of the image
+    intrinsics: KeyOrCamera = "intrinsics"  # 3×3, 4×4, fx fy cx cy, or a camera of kornia, px of the image
     distortion: KeyOrNumbers | None = None  # of the image, in OpenCV's order
-    depth_intrinsics: KeyOrNumbers | None = None  # px of the depth map; None = it covers the same field as the image
+    depth_intrinsics: KeyOrCamera | None = None  # px of the depth map; None = it covers the same field as the image
     confidence: str | None = None  # key of the sensor's confidence: 0 low, 1 medium, 2 high
     other_image: str | None = None  # key of the source view's image; None = another frame along time
-    other_intrinsics: KeyOrNumbers | None = None  # None = those of the reference view
+    other_intrinsics: KeyOrCamera | None = None  # None = those of the reference view
     sparse: bool = False  # the depth map is a projected LiDAR sweep, mostly empty between returns
     at: int = -1  # index of the reference view along time
     other_at: int | Sequence[int] = 0  # index of the source view; several are for a multi-view method
@@ -108,7 +108,7 @@ class SampleSpec:
     depth_range: tuple[float, float] = (0.0, float("inf"))  # m, depths outside are no returns (a codec's "no return")
     max_depth: float = 100.0  # m, a larger median depth means a wrong unit
     min_depth: float = 0.01  # m, a smaller median depth means a wrong unit
-    max_offset: float = 0.2  # maximum offset of the principal point from the centre, fraction of the image size
+    min_focal: float = 0.05  # smaller focal lengths, as a fraction of the longer image side, are of another unit
     _cameras: dict[Any, Camera] = field(default_factory=dict, init=False, repr=False, compare=False)  # cache
 
     def __post_init__(self) -> None:
@@ -312,36 +312,30 @@ class SampleSpec:
         ]
 
     def _camera(
-        self, leaves: SampleReader, numbers: KeyOrNumbers, hw: tuple[int, int], T: int, at: int, checks: list[Any]
+        self, leaves: SampleReader, numbers: KeyOrCamera, hw: tuple[int, int], T: int, at: int, checks: list[Any]
     ) -> Camera:
         fingerprint = None if self.distortion is not None else leaves.fingerprint(numbers)
         cache_key = (fingerprint, hw, T, at)
         if fingerprint is not None and cache_key in self._cameras:
             return self._cameras[cache_key]
-        camera = leaves.camera(numbers, T, at, leaves.numbers(self.distortion, T, at))
+        failed: list[Any] = []
+        camera = leaves.camera(numbers, T, at, leaves.numbers(self.distortion, T, at), failed)
         if self.intrinsics_hw is not None and self.intrinsics_hw != hw:
             camera = cam.resize(camera, self.intrinsics_hw, hw)
-        if self._is_clearly_plausible(camera, hw):
+        least = self.min_focal * max(hw)
+        if not failed and _is_clearly_plausible(camera, least):
             if fingerprint is not None and len(self._cameras) < MAX_CACHED_CAMERAS:
                 self._cameras[cache_key] = camera
             return camera
         name = numbers if isinstance(numbers, str) else "intrinsics"
-        size = torch.tensor([hw[1], hw[0]], dtype=camera.c.dtype, device=camera.c.device)
-        off = ((camera.c.detach() + 0.5) / size - 0.5).abs().amax(-1)
-        small = camera.f.detach().amin(-1)
-        limit = f"at most {self.max_offset:g} in an image of {hw[0]}x{hw[1]}; do they belong to another size?"
-        checks.append(
-            (~(off <= self.max_offset), off, f"{name}: principal point {{:.2f}} sizes off the centre, {limit}")
-        )
+        small, centre = camera.f.detach().amin(-1), camera.c.detach().sum(-1)
+        limit = f"{name}: focal length {{:.4g}} px in an image of {hw[0]}x{hw[1]}, expected at least {least:.4g}"
+        hint = f"(min_focal={self.min_focal:g} of its longer side); are they normalised, or of another size?"
+        checks += failed
         checks.append((~(small > 0), small, f"{name}: found focal length {{:.4g}}, expected a positive number of px"))
+        checks.append((~(small >= least), small, f"{limit} {hint}"))
+        checks.append((~centre.isfinite(), centre, f"{name}: found a principal point of {{:.4g}}, expected numbers"))
         return camera
-
-    def _is_clearly_plausible(self, camera: Camera, hw: tuple[int, int]) -> bool:
-        """Whether the intrinsics pass all checks regardless of rounding; plain Python is faster for so few numbers."""
-        if not (_is_cheap_to_read(camera.c) and camera.f.dtype == camera.c.dtype):
-            return False
-        off = (abs((c + 0.5) / n - 0.5) for row in camera.c.tolist() for c, n in zip(row, (hw[1], hw[0]), strict=True))
-        return all(x < self.max_offset - _ROUNDING_REL for x in off) and all(x > 0 for x in camera.f.flatten().tolist())
 
     def _depth_camera(self, leaves: SampleReader, depth: Tensor, hw: tuple[int, int], T: int, at: int) -> Camera | None:
         """Camera of the depth map; None = it covers the field of view of the image."""
@@ -431,6 +425,14 @@ def _frame_index(at: int, T: int, key: str) -> int:
     if not -T <= at < T:
         raise SampleError(f"{key}: found {T} frames along time, expected one at {at}")
     return at % T
+
+
+def _is_clearly_plausible(camera: Camera, least: float) -> bool:
+    """Whether the intrinsics pass all checks regardless of rounding; plain Python is faster for so few numbers."""
+    if not (_is_cheap_to_read(camera.c) and camera.f.dtype == camera.c.dtype):
+        return False
+    f, c = camera.f.flatten().tolist(), camera.c.flatten().tolist()
+    return all(x > 0 and x > least * (1 + _ROUNDING_REL) for x in f) and all(map(math.isfinite, c))
 
 
 def _is_cheap_to_read(x: Tensor) -> bool:

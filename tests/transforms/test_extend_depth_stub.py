@@ -305,7 +305,7 @@ BAD = {
     "other K": (lambda s: {**s, "intrinsics": s["intrinsics"] * 4}, "principal point"),
     "nan K": (lambda s: {**s, "intrinsics": s["intrinsics"] * np.nan}, "principal point"),
     "no focal length": (lambda s: {**s, "intrinsics": s["intrinsics"] * [0.0, 1, 1, 1]}, "focal length"),
-    "K of six": (lambda s: {**s, "intrinsics": np.ones(6)}, "3x3, or fx fy cx cy"),
+    "K of six": (lambda s: {**s, "intrinsics": np.ones(6)}, "3x3, 4x4, fx fy cx cy or a camera"),
     "text": (lambda s: {**s, "depth": "depth.png"}, "expected an array of numbers"),
     "none": (lambda s: {**s, "depth": None}, "expected an array of numbers"),
     "index": (lambda s: {**s, "index": 0.5}, "whole numbers"),
