@@ -133,6 +133,20 @@ def multiview_ratios(
     return numbers, rows
 
 
+def twin_ratios(ours: SeedPoints, theirs: SeedPoints, name: str) -> dict[str, Interval]:
+    """How two implementations of one method agree: geometric means over scenes of the ratios of coverage and error.
+
+    Returns:
+        ``coverage_ratio_to_<name>``, of the answered fractions of the candidates; ``error_ratio_to_<name>``, of the
+        median relative errors of each one's answers. Scenes with too few answers of either have no ratio.
+    """
+    metrics = {"coverage": lambda p: float(p.keep.double().mean()), "error": _median_rel}
+    scenes = {k: (ours[k], theirs[k]) for k in ours if k in theirs}
+    pair = [{k: v[i] for k, v in scenes.items()} for i in (0, 1)]
+    ratios = {f"{k}_ratio_to_{name}": ratio_over_seeds(*pair, metric)[0] for k, metric in metrics.items()}
+    return {k: _geometric_mean(v, draws=2000, seed=0) for k, v in ratios.items()}
+
+
 def ratio_over_seeds(
     ours: SeedPoints,
     theirs: SeedPoints,

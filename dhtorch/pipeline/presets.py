@@ -8,6 +8,11 @@ from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.view_selection import select_views_by_preview
 from dhtorch.stages.fuse import fuse_consistent
+from dhtorch.stages.kornia.backproject import backproject_kornia
+from dhtorch.stages.kornia.holes import classify_kornia
+from dhtorch.stages.kornia.pose import pnp_ransac_kornia
+from dhtorch.stages.kornia.track import lucas_kanade_kornia
+from dhtorch.stages.kornia.triangulate import two_view_kornia
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.score import confidence_from_error, confidence_from_sigma
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
@@ -18,6 +23,17 @@ PAPER = Method()
 
 #: The paper's method as a function of two frames.
 extend = PAPER
+
+#: ``PAPER`` written on kornia and torch alone: the method in its shortest form, differentiable from end to end, and the
+#: independent implementation that the tests compare ``PAPER`` with. It is slower, and its answers depend on the batch
+#: within rounding.
+KORNIA = PAPER.replace(
+    backproject=backproject_kornia,
+    classify=classify_kornia,
+    track=lucas_kanade_kornia,
+    pose=pnp_ransac_kornia,
+    triangulate=two_view_kornia,
+)
 
 #: Pyramid levels of ``MAP``, for motions larger than 30 px. Source: derived, the paper's 4 levels + 1.
 MAP_PYRAMID_LEVELS = 5
@@ -62,7 +78,7 @@ AUTO = MAP.replace(
 )
 
 #: Methods by name.
-METHODS = {"paper": PAPER, "map": MAP, "window": WINDOW, "auto": AUTO}
+METHODS = {"paper": PAPER, "kornia": KORNIA, "map": MAP, "window": WINDOW, "auto": AUTO}
 
 
 def get_method(method: str | Method, n: int | None = None) -> Method:

@@ -51,7 +51,8 @@ def run(
     *,
     methods: Mapping[str, Method] | None = None,
     reference: str = "paper",
-    once: Sequence[str] = ("opencv", "xfeat"),
+    once: Sequence[str] = ("opencv", "kornia", "xfeat"),
+    twins: Sequence[str] = ("kornia",),
     seeds: int = 5,
     stand_ins: Mapping[str, str] | None = None,
     baseline: str = "window",
@@ -72,6 +73,8 @@ def run(
         methods: name → method; None = ``chosen``.
         reference: name of the method to compare with.
         once: methods that are run with one seed and not compared.
+        twins: other implementations of the reference among them, which make ``<method>.coverage_ratio_to_<reference>``
+            and ``<method>.error_ratio_to_<reference>``, geometric means over scenes.
         seeds: number of seeds, from the job's own upwards.
         stand_ins: method of several views → method of one; None = the first compared method for all.
         baseline: the method of several views with which the others of several views are compared as well.
@@ -103,6 +106,10 @@ def run(
     comparison = compare.method_ratios(complete, reference=reference, rooms=rooms)
     keep_first_seed(outcome, methods, seeds)
     outcome.summary |= comparison.summary
+    for name in (n for n in twins if n in methods):
+        one, other = (points_by_seed(outcome, n, 1, apart=with_role) for n in (name, reference))
+        ratios = compare.twin_ratios(one, other, reference)
+        outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in ratios.items()}
     outcome.summary |= _indoor_coverage(comparison, rooms, indoor)
     for name, scene_points in all_points.items():
         outcome.summary |= _worst_wrong_share(name, [p for scene, p in scene_points.items() if rooms[scene] in moving])
