@@ -65,7 +65,7 @@ from dhtorch.pipeline import (
 )
 from dhtorch.pipeline.presets import MAP, PAPER, WINDOW
 from dhtorch.records import Frame
-from dhtorch.stages import backproject, holes, misalignment, pose, pose_prior, score, track, triangulate
+from dhtorch.stages import backproject, features, holes, misalignment, pose, pose_prior, score, track, triangulate
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.validation import evidence, faults, validate, wrong_causes
 
@@ -251,6 +251,17 @@ def with_options(fn, **options):
     return functools.update_wrapper(functools.partial(fn, **options), fn)
 
 
+#: A picture turned by a quarter, enlarged and shifted.
+AFFINE = torch.tensor([[[0.0, -2.0, 40.0], [2.0, 0.0, 3.0], [0.0, 0.0, 1.0]]])
+
+
+def grid_matches(image_0, image_1):
+    """A matcher: pixels of a grid, and their neighbours."""
+    v, u = torch.meshgrid(torch.arange(2.0, HW[0], 4), torch.arange(2.0, HW[1], 4), indexing="ij")
+    uv = torch.stack((u, v), -1).flatten(0, 1)
+    return uv, uv + torch.tensor([1.0, 0.5])
+
+
 def lenses(batch, dtype):
     """A fast lens behind which a metre is a few pixels of blur."""
     values = ((0.03, 0.04), (1.0, 2.0), (1e-4, 2e-4))
@@ -301,6 +312,7 @@ ROWS = [
     Row(camera.ideal, lambda b, n, d: (cameras(b, d, True),), POINTLESS, grad=(0,)),
     Row(camera.resize_pixels, lambda b, n, d: (pixels(b, n, d), HW, (24, 32)), "dtype batch vmap capture gradcheck empty", grad=(0,)),
     Row(camera.resize, lambda b, n, d: (cameras(b, d), HW, (24, 32)), POINTLESS, grad=(0,)),
+    Row(camera.warp, lambda b, n, d: (cameras(b, d, True), AFFINE.to(d).expand(b, 3, 3)), POINTLESS + " raises", grad=(0, 1), bad=wrong_last_axis(1)),
     Row(camera.project, lambda b, n, d: (cameras(b, d, True), uniform(b, n, 3, dtype=d, low=1, high=2)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
     Row(camera.unproject, lambda b, n, d: (cameras(b, d, True), pixels(b, n, d), uniform(b, n, dtype=d, low=1)), ALL, (1, 2), (0, 1, 2), bad=wrong_last_axis(1), leaks=True),
     Row(camera.rays, lambda b, n, d: (cameras(b, d, True), pixels(b, n, d)), ALL, (1,), (0, 1), bad=wrong_last_axis(1), leaks=True),
@@ -400,6 +412,7 @@ ROWS = [
     Row(neighbours.window_extreme, lambda b, n, d: (uniform(b, 12, 15, dtype=d), 2, torch.maximum), "dtype batch vmap capture gradcheck", grad=(0,)),
     Row(neighbours.window_range, lambda b, n, d: (uniform(b, 12, 15, dtype=d), 2), "dtype batch vmap capture"),
     Row(plane_sweep.occlusion_mask, lambda b, n, d: (plane_sweep.epipolar_warp(*swept(b, n, d)[:2]), swept(b, n, d)[2], uniform(b, dtype=d, high=0.1)), "batch capture"),
+    Row(with_options(features.match_features, matcher=grid_matches), shifted, "dtype batch empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2)),
     Row(track.lucas_kanade_affine, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(affine_alignment.register_affine, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d)), "dtype batch capture empty shuffle padding nan raises", (2, 3), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(affine_alignment.registration_step, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d), torch.eye(2, dtype=d).expand(b, n, 2, 2)), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3, 4), (0, 1), bad=wrong_last_axis(2), atol=1e-4),

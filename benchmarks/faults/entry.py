@@ -4,6 +4,7 @@ TESTS: dict[str, list[str]] = {
     "transforms": ["tests/transforms/test_extend_depth_stub.py"],
     "transforms.sample_spec": ["tests/transforms/test_sample_spec.py"],
     "transforms.sample_access": ["tests/transforms/test_sample_spec.py", "tests/transforms/test_extend_depth_stub.py"],
+    "transforms.kornia": ["tests/transforms/test_kornia_samples.py"],
     "transforms.adapters": ["tests/transforms/test_wrappers.py", "tests/runtime/test_allocator.py"],
     "transforms.tokens": ["tests/transforms/test_tokens.py"],
     "transforms.status": ["tests/transforms/test_extend_depth_stub.py"],
@@ -33,6 +34,17 @@ TESTS: dict[str, list[str]] = {
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
+    "transforms.kornia": [
+        ("_Augmented.apply", ".to(self.A)\n            A = A", ".to(self.A).mT\n            A = A"),
+        ("_Augmented._moved_map", "torch.where(inside, values, torch.zeros_like(values))", "values"),
+        ("_Augmented._moved_map", "+ 0.5 + TIE_PX", "+ TIE_PX"),
+        ("_Augmented._poses", "L @ x[..., :3, :3] @ inverse", "L @ x[..., :3, :3]"),
+        ("_Augmented._poses", 'if views.pose_kind == "1_from_0" else W\n        values', "\n        values"),
+        ("_world_mirror", ".sign()", ".abs()"),
+        ("_moved_kornia", "@ E @ (mirror + last)", "@ E"),
+        ("_is_colour", "isinstance(module, IntensityAugmentationBase2D) or ", ""),
+        ("_Augmented.write", "is_still or self.has_answers", "is_still"),
+    ],
     "transforms.sample_spec": [
         ("SampleSpec._camera", "(fingerprint, hw, T, at)", "(fingerprint, T, at)"),
         ("SampleSpec._camera", " and len(self._cameras) < MAX_CACHED_CAMERAS", ""),

@@ -22,6 +22,7 @@ from dhtorch.pytree import Record, record
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
+    from kornia.sensors.camera import CameraModelBase
 
 #: Numbers of coefficients that a distortion may have: k1 k2 p1 p2 [k3 [k4 k5 k6]].
 #: Source: OpenCV calibrateCamera, distortion models without thin prism and tilt.
@@ -38,15 +39,37 @@ class Camera(Record):
     readout: Tensor | None = None  # (B,) s from first to last row (rolling shutter); None = global shutter
 
     @classmethod
-    def from_kornia(cls, camera: PinholeCamera, distortion: Tensor | None = None) -> Camera:
-        """The intrinsics of a ``kornia.geometry.camera.PinholeCamera``; its pose is ``Pose.from_kornia``.
+    def from_kornia(cls, camera: PinholeCamera | CameraModelBase, distortion: Tensor | None = None) -> Camera:
+        """The intrinsics of a camera of kornia; the pose of a ``PinholeCamera`` is ``Pose.from_kornia``.
 
-        Its matrix is used unchanged: kornia leaves the position of pixel centres to the caller; here they are at whole
-        numbers. Skew is dropped. kornia stores distortion apart from its cameras: ``distortion`` (B, k).
+        Numbers are used unchanged: kornia leaves the position of pixel centres to the caller; here they are at whole
+        numbers. Skew is dropped.
 
-        Gradient: to the intrinsics.
+        Args:
+            camera: ``kornia.geometry.camera.PinholeCamera``, or of ``kornia.sensors.camera`` a ``PinholeModel`` or
+                ``BrownConradyModel`` (also within a ``CameraModel``); without a batch dimension B is 1.
+            distortion: (B, k) of a ``PinholeCamera`` or ``PinholeModel``, which store none.
+
+        Raises:
+            TypeError: another camera (fisheye, orthographic), or a distortion beside a camera's own.
+
+        Gradient: to the intrinsics and the distortion.
         """
-        return from_matrix(camera.intrinsics[:, :3, :3], distortion)
+        from kornia.geometry.camera import PinholeCamera  # noqa: PLC0415  (imported where it is used: 0.2 s)
+        from kornia.sensors.camera import BrownConradyModel, PinholeModel  # noqa: PLC0415
+
+        if isinstance(camera, PinholeCamera):
+            return from_matrix(camera.intrinsics[:, :3, :3], distortion)
+        model = getattr(camera, "_model", camera)  # what a CameraModel delegates to
+        if not isinstance(model, PinholeModel | BrownConradyModel) or (
+            distortion is not None and isinstance(model, BrownConradyModel)
+        ):
+            found = f"{type(model).__name__}{'' if distortion is None else ' with another distortion'}"
+            raise TypeError(
+                f"Camera.from_kornia: found {found}, expected a PinholeCamera, PinholeModel or BrownConradyModel"
+            )
+        params = model.params.reshape(-1, model.params.shape[-1])
+        return cls(params[:, :2], params[:, 2:4], params[:, 4:] if isinstance(model, BrownConradyModel) else distortion)
 
     def to_kornia(self, hw: tuple[int, int], T_cam_from_world: Pose | None = None) -> PinholeCamera:
         """As a ``kornia.geometry.camera.PinholeCamera`` of images of size ``hw``; distortion is dropped.
@@ -94,6 +117,29 @@ def resize_pixels(uv: Tensor, hw: tuple[int, int], new_hw: tuple[int, int]) -> T
     """Pixels (…, 2) of an image in the image resampled from ``hw`` to ``new_hw``. Gradient: to uv."""
     s = torch.as_tensor([new_hw[1] / hw[1], new_hw[0] / hw[0]]).to(uv)
     return (uv + 0.5) * s - 0.5
+
+
+def warp(camera: Camera, A: Tensor) -> tuple[Camera, Tensor]:
+    """Camera of the image whose pixel ``u`` moved to ``A u``, and what its axes did, for affine A (B, 3, 3) px.
+
+    Flips, crops, resizes and rotations turn the camera about its optical axis, or mirror it: A K = K' Q with K' of
+    positive focal lengths and Q (B, 3, 3) = diag(q, 1), whose q is orthogonal. A point X of the camera's axes is Q X in
+    the new ones, its z-depth the same. A shear has no such camera: its q is not orthogonal, for the caller to see.
+
+    Gradient: to the intrinsics and A.
+    """
+    check("camera.warp", f=(camera.f, "B 2"), A=(A, "B 3 3"))
+    linear = A[:, :2, :2] * camera.f[:, None]
+    f = torch.linalg.vector_norm(linear, dim=-1)
+    q = linear / f[..., None]
+    c = (A[:, :2, :2] * camera.c[:, None]).sum(-1) + A[:, :2, 2]
+    distortion = camera.distortion
+    if distortion is not None:  # p2, p1 is a vector of the image plane, the other coefficients multiply the radius
+        p2, p1 = (q * distortion[:, None, [3, 2]]).sum(-1).unbind(-1)
+        distortion = torch.cat((distortion[:, :2], torch.stack((p1, p2), -1), distortion[:, 4:]), -1)
+    Q = torch.nn.functional.pad(q, (0, 1, 0, 1))
+    Q = Q + torch.diag(Q.new_tensor([0.0, 0.0, 1.0]))
+    return camera.replace(f=f, c=c, distortion=distortion), Q
 
 
 def project(

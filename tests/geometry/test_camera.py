@@ -101,6 +101,26 @@ def test_unprojected_points_have_that_depth_and_project_onto_their_pixels():
         close(cam.rays(camera, uv), xyz / depth[..., None])
 
 
+@pytest.mark.parametrize("lens", [None, LENSES["tangential"]], ids=["ideal", "lens"])
+@pytest.mark.parametrize(
+    "linear", [[[-1.0, 0], [0, 1]], [[0, -1.0], [1, 0]], [[1.5, 0], [0, 2]], [[-0.8, 0.6], [0.6, 0.8]]]
+)
+def test_the_camera_of_a_moved_picture_sees_the_turned_point_at_the_moved_pixel(linear, lens):
+    camera = pinhole(lens)
+    if linear[0][0] and linear[0][1]:
+        camera = camera.replace(f=camera.f[:, :1].expand(1, 2))  # only square pixels turn by any angle
+    A = torch.eye(3, dtype=torch.float64)[None].clone()
+    A[0, :2, :2], A[0, :2, 2] = double(*linear), double(20.0, -7.0)
+    moved, Q = cam.warp(camera, A)
+    assert (moved.f > 0).all()
+    close(Q @ Q.mT, torch.eye(3, dtype=torch.float64)[None])
+    uv, z = grid(), torch.linspace(1, 4, 35, dtype=torch.float64)[None]
+    xyz = cam.unproject(camera, uv, z)
+    close(cam.project(moved, xyz @ Q.mT), uv @ A[:, :2, :2].mT + A[:, None, :2, 2], atol=1e-6)
+    sheared = cam.warp(camera, A + double([0, 0.1, 0], [0, 0, 0], [0, 0, 0]))[1]
+    assert (sheared @ sheared.mT - torch.eye(3).double()).abs().max() > 0.01
+
+
 def test_matrices_hold_focal_lengths_and_centre():
     K = double(
         [[300.0, 0.0, 310.5], [0.0, 330.0, 250.0], [0.0, 0.0, 1.0]], [[410.0, 0, 333.0], [0, 380.0, 221.5], [0, 0, 1]]

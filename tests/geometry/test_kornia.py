@@ -12,6 +12,16 @@ import torch
 from kornia.geometry.calibration import undistort_points
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import Se3
+from kornia.geometry.vector import Vector3
+from kornia.image import ImageSize
+from kornia.sensors.camera import (
+    BrownConradyModel,
+    CameraModel,
+    CameraModelType,
+    KannalaBrandtK3,
+    Orthographic,
+    PinholeModel,
+)
 
 from dhtorch import Camera, Pose
 from dhtorch.data import convert
@@ -56,6 +66,45 @@ def test_a_camera_comes_back_as_it_went():
     assert torch.equal(where.R, T.R) and torch.equal(where.t, T.t)
     assert Camera.from_kornia(ours.to_kornia(HW)).distortion is None
     assert torch.equal(Pose.from_kornia(ours.to_kornia(HW)).R, torch.eye(3).double().expand(B, 3, 3))
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+@pytest.mark.parametrize("batch", [(), (B,)])
+def test_cameras_of_kornias_sensors_see_points_where_ours_do(batch, wrapped):
+    ours, xyz = cameras(), points()[:1]
+    lens = torch.tensor([-0.05, 0.02, 0.02, -0.013, 0.01, 0.02, 0.01, 0.0], dtype=torch.float64)
+    params = torch.cat((ours.f, ours.c), -1) if batch else torch.cat((ours.f[0], ours.c[0]))
+    kinds = {
+        CameraModelType.PINHOLE: params,
+        CameraModelType.BROWN_CONRADY: torch.cat((params, lens.expand(*batch, 8)), -1),
+    }
+    for kind, numbers in kinds.items():
+        made = {CameraModelType.PINHOLE: PinholeModel, CameraModelType.BROWN_CONRADY: BrownConradyModel}[kind]
+        theirs = CameraModel(ImageSize(*HW), kind, numbers) if wrapped else made(ImageSize(*HW), numbers)
+        camera = Camera.from_kornia(theirs)
+        assert len(camera.f) == (B if batch else 1) and (camera.distortion is None) == (made is PinholeModel)
+        for b in range(len(camera.f)):
+            alone = made(ImageSize(*HW), numbers[b] if batch else numbers)
+            one = Camera(*(None if x is None else x[b : b + 1] for x in (camera.f, camera.c, camera.distortion)))
+            seen = alone.project(Vector3(xyz[0])).data
+            torch.testing.assert_close(cam.project(one, xyz)[0], seen, rtol=1e-9, atol=1e-9)
+
+
+def test_cameras_without_a_counterpart_are_refused_by_name():
+    lens = torch.zeros(1, 4)
+    for theirs, options, name in (
+        (KannalaBrandtK3(ImageSize(*HW), torch.rand(8)), {}, "KannalaBrandtK3"),
+        (Orthographic(ImageSize(*HW), torch.rand(4)), {}, "Orthographic"),
+        (CameraModel(ImageSize(*HW), CameraModelType.ORTHOGRAPHIC, torch.rand(4)), {}, "Orthographic"),
+        (BrownConradyModel(ImageSize(*HW), torch.rand(12)), {"distortion": lens}, "BrownConradyModel with another"),
+        (torch.eye(3), {}, "Tensor"),
+    ):
+        with pytest.raises(
+            TypeError, match=f"^Camera.from_kornia: found {name}.*, expected a PinholeCamera, PinholeModel"
+        ):
+            Camera.from_kornia(theirs, **options)
+    given = PinholeModel(ImageSize(*HW), torch.rand(1, 4))
+    assert Camera.from_kornia(given, lens).distortion is lens
 
 
 def test_both_see_a_point_of_the_world_at_the_same_pixel():
@@ -153,11 +202,11 @@ def test_kornia_is_loaded_where_it_is_first_used():
 
 
 def test_the_result_has_a_row_for_every_pair_of_functions_and_kornias_are_used_where_they_cost_nothing():
-    file = json.loads((REPO / "benchmarks/results/kornia.json").read_text())
+    rows = json.loads((REPO / "benchmarks/results/kornia.json").read_text())
     assert [(p.ours, p.kornia, p.used, p.why) for p in beside_kornia.PEERS] == [
-        (r["name"], r["kornia"], r["used"], r["why"]) for r in file["rows"]
+        (r["name"], r["kornia"], r["used"], r["why"]) for r in rows
     ]
-    for row in file["rows"]:
+    for row in rows:
         free = max(row["added_percent"].values()) < beside_kornia.MAX_ADDED_PERCENT
         assert (row["used"] == "kornia") == (free and row["largest"] == 0), row["name"]
     assert f"adds less than {beside_kornia.MAX_ADDED_PERCENT} %" in PAGE.replace("\n", " ")

@@ -283,8 +283,9 @@ def test_torchvision_pipeline(items):
     x = (uv.double() - K[:2, 2]) / K[[0, 1], [0, 1]]
     xyz = out["dhtorch.xyz"][sensed].double()
     assert sensed.sum() > 20 and torch.allclose(xyz[:, :2] / xyz[:, 2:], x, atol=1e-5)
-    with pytest.raises(SampleError, match=r"principal point.*another size"):
-        Compose([halve, ExtendDepth(depth_unit="mm", other_image="before", n=N)])(sample)
+    unmoved = ExtendDepth(method="map", depth_unit="mm", other_image="before", n=1024)
+    assert Compose([unmoved])(sample)["dhtorch.pose_ok"]
+    assert not Compose([halve, unmoved])(sample)["dhtorch.pose_ok"], "K of another size is contradicted"
 
 
 # ----------------------------------------------------------------------------------------- samples and batches

@@ -234,7 +234,7 @@ def test_a_depth_map_of_its_own_size_and_camera(sample):
     whole = added(transform()(sample))
     both = (out["source"] == Source.SENSOR) & (whole["source"] == Source.SENSOR)
     assert both.sum() > 20 and ((out["depth"] / whole["depth"])[both] - 1).abs().median() < 0.01
-    with pytest.raises(SampleError, match="transposed"):
+    with pytest.raises(SampleError, match="no scaled image"):
         transform()({**sample, "depth": np.repeat(sample["depth"], 2, 0)})
 
 

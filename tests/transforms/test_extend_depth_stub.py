@@ -295,15 +295,15 @@ BAD = {
     "missing other": (lambda s: {k: v for k, v in s.items() if k != "before"}, "before: found no such key"),
     "metres as mm": (lambda s: {**s, "depth": s["depth"] / 1e3}, r"0\.00.* m .*are the numbers metres"),
     "mm as 10 m": (lambda s: {**s, "depth": s["depth"] * 1e3}, "millimetres"),
-    "transposed": (lambda s: {**s, "depth": s["depth"].T}, "transposed"),
+    "transposed": (lambda s: {**s, "depth": s["depth"].T}, "orientation differs"),
     "two channels": (lambda s: {**s, "image": s["image"][..., :2]}, "1 or 3 channels"),
     "two dimensions": (lambda s: {**s, "image": s["image"][..., 0]}, "expected .C, H, W. or .H, W, C."),
     "normalised": (lambda s: {**s, "image": s["image"] / 127.5 - 1}, r"expected floats in \[0, 1\]"),
     "0 to 255 float": (lambda s: {**s, "image": s["image"].astype(np.float32)}, r"expected floats in \[0, 1\]"),
     "int32 image": (lambda s: {**s, "image": s["image"].astype(np.int32)}, "expected uint8"),
     "nan image": (lambda s: {**s, "image": s["image"] * np.nan}, r"expected floats in \[0, 1\]"),
-    "other K": (lambda s: {**s, "intrinsics": s["intrinsics"] * 4}, "principal point"),
-    "nan K": (lambda s: {**s, "intrinsics": s["intrinsics"] * np.nan}, "principal point"),
+    "normalised K": (lambda s: {**s, "intrinsics": s["intrinsics"] / 42}, "min_focal=0.05"),
+    "nan K": (lambda s: {**s, "intrinsics": s["intrinsics"] * np.nan}, "focal length nan"),
     "no focal length": (lambda s: {**s, "intrinsics": s["intrinsics"] * [0.0, 1, 1, 1]}, "focal length"),
     "K of six": (lambda s: {**s, "intrinsics": np.ones(6)}, "3x3, 4x4, fx fy cx cy or a camera"),
     "text": (lambda s: {**s, "depth": "depth.png"}, "expected an array of numbers"),
@@ -333,7 +333,7 @@ def test_bad_samples_say_what_is_wrong(name):
 def test_a_flagged_sample_has_the_shapes_of_a_good_one_and_no_number():
     extender = tiny(on_error="flag", patch=7, n=12)
     good = added(extender(sample()))
-    for wrong, word in (({"depth": "x"}, "depth: found str"), ({"intrinsics": [1.0, 1, 90, 90]}, "principal point")):
+    for wrong, word in (({"depth": "x"}, "depth: found str"), ({"intrinsics": [1.0, 1, 90, 90]}, "focal length 1 px")):
         with pytest.warns(UserWarning, match=f"^flagged: .*{word}") as caught:
             bad = added(extender(sample(**wrong)))
         assert len(caught) == 1
@@ -352,7 +352,7 @@ def test_a_skipped_sample_is_none():
 
 
 def test_a_bad_sample_raises_unless_told_otherwise():
-    with pytest.raises(SampleError, match="principal point"):
+    with pytest.raises(SampleError, match="focal length 1 px"):
         tiny()(sample(intrinsics=[1.0, 1, 90, 90]))
     with pytest.raises(SampleError, match="depth: found no such key"):
         tiny()({k: v for k, v in sample().items() if k != "depth"})
@@ -376,8 +376,8 @@ def test_tokens_of_a_picture_that_is_missing_take_the_size_last_seen():
 def test_a_bad_row_of_a_batch_is_zero_and_the_others_stay():
     given = batch(4)
     good = added(tiny(batched=True)(given))
-    given["intrinsics"][2, 2] = 1e3
-    with pytest.raises(SampleError, match="sample 2 of the batch: intrinsics: principal point"):
+    given["intrinsics"][2, 0] = 1e-3
+    with pytest.raises(SampleError, match="sample 2 of the batch: intrinsics: focal length"):
         tiny(batched=True)(given)
     extender = tiny(batched=True, on_error="flag")
     with pytest.warns(UserWarning, match="flagged: sample 2 of the batch") as caught:

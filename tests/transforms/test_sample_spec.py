@@ -361,7 +361,9 @@ def test_intrinsics_are_a_matrix_or_four_numbers():
         assert torch.equal(numbers(read(sample(intrinsics=given)).reference.camera), wanted)
         assert torch.equal(numbers(read(sample(intrinsics="unused"), intrinsics=given).reference.camera), wanted)
     for wrong, count in ((np.ones(6), 6), (np.ones(3), 3), (np.ones(16), 16)):
-        refused(sample(intrinsics=wrong), f"intrinsics: found {count} numbers, expected 3x3, 4x4, fx fy cx cy or a camera")
+        refused(
+            sample(intrinsics=wrong), f"intrinsics: found {count} numbers, expected 3x3, 4x4, fx fy cx cy or a camera"
+        )
         refused(sample(), f"intrinsics: found {count} numbers, expected", intrinsics=wrong.tolist())
     refused(sample(intrinsics=np.ones((2, 2, 4))), r"intrinsics: found shape \(2, 2, 4\), expected one row of numbers")
     refused(sample(), r"numbers: found shape \(\), expected one row", intrinsics=5.0)
