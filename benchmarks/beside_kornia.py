@@ -234,32 +234,33 @@ def measured(peer: Peer, total_ms: dict[str, float], repeats: int, clock: str) -
     return {"name": peer.ours, "ratio": ours_ms / theirs_ms, **more}
 
 
-def run(repeats: int, clock: str) -> dict[str, Any]:
-    """The result file."""
+def run(repeats: int, clock: str) -> list[dict[str, Any]]:
+    """A row for every pair of functions."""
     with torch.no_grad():
         whole = {name: harness.in_turn([call], repeats=5, warm_up=1, clock=clock)[0] for name, call in METHODS.items()}
         total_ms = {name: statistics.median(times) for name, times in whole.items()}
         rows = [measured(peer, total_ms, repeats, clock) for peer in PEERS]
     spread = {name: 100 * harness.iqr(times) / total_ms[name] for name, times in whole.items()}
     versions = {name: version(name) for name in ("torch", "kornia")}
-    threads = {"threads": torch.get_num_threads(), "clock": clock, "versions": versions, **harness.place()}
-    return {"total_ms": total_ms, "spread_percent": spread, "rows": rows, **threads}
+    where = {"threads": torch.get_num_threads(), "clock": clock, "versions": versions, **harness.place()}
+    return [{**row, "total_ms": total_ms, "spread_percent": spread, **where} for row in rows]
 
 
 def table() -> str:
     """The rows of the result file, those that are kornia's first."""
-    file = json.loads((RESULTS / "kornia.json").read_text())
+    rows = json.loads((RESULTS / "kornia.json").read_text())
     shown = []
-    for r in sorted(file["rows"], key=lambda r: r["used"] != "kornia"):
+    for r in sorted(rows, key=lambda r: r["used"] != "kornia"):
         cells = [f"`{r['name']}`", f"`{r['kornia']}`", r["used"], ratio(r["ratio"])]
         cells += [f"{round(r['added_percent'][name], 2) + 0:+.2f} %" for name in METHODS]
         shown.append([*cells, "–" if r["largest"] is None else f"{r['largest']:.1g}", r["why"]])
     head = ["ours", "kornia's", "used", "ratio", *(f"adds to `{name}`" for name in METHODS), "largest", "why"]
-    versions = ", ".join(f"{name} {value}" for name, value in file["versions"].items())
+    first = rows[0]
+    versions = ", ".join(f"{name} {value}" for name, value in first["versions"].items())
     times = ", ".join(
-        f"`{name}` {file['total_ms'][name]:.0f} ms ± {file['spread_percent'][name]:.1f} %" for name in METHODS
+        f"`{name}` {first['total_ms'][name]:.0f} ms ± {first['spread_percent'][name]:.1f} %" for name in METHODS
     )
-    where = f"Measured on: {file['processor']}; {file['threads']} thread; {versions}. Whole calls: {times}."
+    where = f"Measured on: {first['processor']}; {first['threads']} thread; {versions}. Whole calls: {times}."
     return f"{text.table_to_markdown(ReportTable('', head, shown, n_label=3))}\n\n{where}"
 
 
@@ -267,12 +268,12 @@ def main() -> None:
     """Print the table, and write the result file with ``--json``."""
     options = harness.arguments(__doc__ or "").parse_args()
     harness.set_threads(1)
-    result = run(options.repeats, options.clock)
-    for r in result["rows"]:
+    rows = run(options.repeats, options.clock)
+    for r in rows:
         added = " ".join(f"{name} {value:+.3f} %" for name, value in r["added_percent"].items())
         print(f"{r['name']:36} {r['kornia']:40} {r['ratio']:7.3f} {added}  {r['largest']}")
     if options.json is not None:
-        storage.write_json(options.json, result)
+        storage.write_json(options.json, rows)
 
 
 #: Tables of docs/kornia.md.

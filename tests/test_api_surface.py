@@ -23,6 +23,8 @@ PACKAGES = (
     "dhtorch.alignment",
     "dhtorch.validation",
     "dhtorch.metrics",
+    "dhtorch.losses",
+    "dhtorch.functional",
     "dhtorch.export",
 )
 

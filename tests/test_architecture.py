@@ -19,7 +19,7 @@ FLOORS = (
     {"extract", "experiments"},
     {"transforms"},
     {"validation", "integrate", "synthetic"},
-    {"pipeline", "testing"},
+    {"pipeline", "testing", "functional"},
     {"calibration"},
     {"stages", "alignment", "metrics", "losses", "export", "data"},
     {"viz"},
