@@ -275,9 +275,12 @@ def solve_pnp_ransac(
     batch, N = world_points.shape[:-2], world_points.shape[-2]
     xyz, uv = _flat(world_points, (), 2), _flat(img_points, (), 2)
     used = torch.ones_like(uv[..., 0], dtype=torch.bool) if mask is None else _flat(mask, batch, 1)
-    zero, code = torch.zeros_like(uv[..., 0]), torch.zeros_like(uv[..., 0], dtype=torch.int32)
-    samples = Samples(uv, zero, zero, xyz, zero, code, zero, code)
-    tracks = Tracks(uv, uv, zero, zero, torch.eye(2, dtype=uv.dtype, device=uv.device).expand(*uv.shape, 2), used)
+    zero = torch.zeros_like(uv[..., 0])
+    code = zero.to(torch.int32)
+    eye = torch.eye(2, dtype=uv.dtype, device=uv.device).expand(*uv.shape, 2)
+    unread = {"depth": zero, "sigma": zero, "confidence": zero, "trackability": zero, "flag": code, "hole": code}
+    samples = Samples(uv=uv, xyz=xyz, **unread)
+    tracks = Tracks(uv_0=uv, uv_1=uv, error=zero, photometric=zero, cov=eye, valid=used)
     camera = cam.from_matrix(_flat(intrinsics, batch, 2))
     draws = torch.rand(len(xyz), num_hypotheses, 3, generator=generator).to(xyz)
     fit = pnp_ransac(samples, tracks, camera, camera, draws, threshold_px=inlier_threshold, min_inlier=min_inliers)
