@@ -11,7 +11,7 @@ from dhtorch.geometry.camera import depth_pixels, undistort
 from dhtorch.geometry.filters import grayscale
 from dhtorch.records import Frame, Samples
 
-#: Radii, px, that limit a sample's neighbourhood and, in a sparse depth map, the search for a return. Source: ``PAPER``.
+#: Radii, px, that limit a sample's surroundings and, in a sparse depth map, the search for a return. Source: ``PAPER``.
 RADIUS_PX, SPARSE_RADIUS_PX = 2, 3
 
 
@@ -27,13 +27,11 @@ def backproject_kornia(
     dark: float = 0.05,
     saturated: float = 0.99,
     highlight: float = 0.85,
-    highlight_colour: float = 0.15,
-    highlight_contrast: float = 0.1,
 ) -> Samples:
     """Samples of a frame at pixels uv: depth, sigma, points X = z K⁻¹ (u, v, 1), confidence and flags.
 
-    Depth is read from the nearest pixel of its map, in a sparse map from the nearest return. Options, flags and missing
-    values are those of :func:`dhtorch.stages.backproject.backproject`.
+    Depth is read from the nearest pixel of its map, in a sparse map from the nearest return. Options, flags, missing
+    values: :func:`dhtorch.stages.backproject.backproject`.
 
     Gradient: ``xyz``, ``depth`` and ``sigma`` to the depth map, ``xyz`` also to intrinsics and ``uv``.
     Source: paper, "Spiral sampling and confidence-aware sparse 3D".
@@ -42,12 +40,11 @@ def backproject_kornia(
     depth, level, is_edge = _read_returns(frame, uv, edge_rel)
     camera = frame.camera.to_kornia(frame.hw)
     xyz = kg.camera.unproject_points(undistort(frame.camera, uv), depth[..., None], camera.camera_matrix)
-
     colours, pixel = _read_windows(frame.image.detach(), uv, RADIUS_PX)
     grey, centre = grayscale(colours)[:, 0], colours.shape[-1] // 2
     colour, grey_centre, mean = colours[..., centre], grey[..., centre], grey.mean(-1)
     last = pixel.new_tensor([frame.hw[1] - 1, frame.hw[0] - 1])
-    is_colourless = colour.amax(1) - colour.amin(1) <= highlight_colour * colour.amax(1)
+    is_colourless = colour.amax(1) - colour.amin(1) <= 0.15 * colour.amax(1)  # as in PAPER, and 0.1 below
     flags = {
         Flag.NO_DEPTH: depth <= 0,
         Flag.LOW_CONF: (depth > 0) & (level < min_conf),
@@ -56,7 +53,7 @@ def backproject_kornia(
         Flag.BORDER: ((pixel < 0) | (pixel > last)).flatten(2).any(-1),
         Flag.UNDEREXPOSED: mean <= dark,
         Flag.SATURATED: mean >= saturated,
-        Flag.SPECULAR: is_colourless & (grey_centre >= highlight) & (grey_centre - mean >= highlight_contrast),
+        Flag.SPECULAR: is_colourless & (grey_centre >= highlight) & (grey_centre - mean >= 0.1),
     }
     flag = torch.stack([torch.where(mask, bit, 0) for bit, mask in flags.items()]).sum(0).int()
     doubts = [torch.where(flags[bit], 0.5, 1.0) for bit in (Flag.DEPTH_EDGE, Flag.SPECULAR, Flag.SATURATED)]
@@ -79,22 +76,23 @@ def _read_returns(frame: Frame, uv: Tensor, edge_rel: float) -> tuple[Tensor, Te
     hw, radius = frame.depth.shape[-2:], RADIUS_PX if frame.sparse is None else SPARSE_RADIUS_PX
     place = depth_pixels(frame.camera, frame.hw, frame.depth_camera, (hw[0], hw[1]), uv)
     depth = frame.depth.nan_to_num(0, 0, 0).relu().to(uv.dtype)
-    level = torch.full_like(depth, 2) if frame.conf is None else frame.conf.to(depth)
-    windows, pixel = _read_windows(torch.stack((depth, level), 1), place, radius)
-    around = windows[:, 0].detach()
-    index = torch.full_like(around[..., 0], around.shape[-1] // 2, dtype=torch.int64)
+    maps = torch.stack((depth, torch.full_like(depth, 2) if frame.conf is None else frame.conf.to(depth)), 1)
+    windows, pixel = _read_windows(maps, place, radius)
+    around, centre = windows[:, 0].detach(), pixel.shape[2] // 2
+    index = torch.full_like(around[..., 0], centre, dtype=torch.int64)
     if frame.sparse is not None:
-        distance = torch.where(around > 0, (pixel - place[:, :, None]).square().sum(-1), torch.inf)
-        index = torch.where(frame.sparse[:, None] & (around > 0).any(-1), distance.argmin(-1), index)
+        offset, sparse = pixel - pixel[:, :, [centre]], frame.sparse[:, None, None]
+        around = torch.where(sparse | (offset.abs().amax(-1) <= RADIUS_PX), around, 0.0)
+        distance = torch.where(around > 0, offset.square().sum(-1), torch.inf)
+        index = torch.where(sparse[..., 0] & (around > 0).any(-1), distance.argmin(-1), index)
     value, level = windows.gather(3, index[:, None, :, None].expand(-1, 2, -1, 1))[..., 0].unbind(1)
-    lowest = torch.where(around > 0, around, torch.inf).amin(-1)
-    return value, level.detach(), (value > 0) & (around.amax(-1) > lowest * (1 + edge_rel))
+    limit = (1 + edge_rel) * torch.where(around > 0, around, torch.inf).amin(-1)
+    return value, level.detach(), (value > 0) & (around.amax(-1) > limit)
 
 
 def _read_windows(maps: Tensor, uv: Tensor, radius: int) -> tuple[Tensor, Tensor]:
     """Values (B, C, N, P) of maps (B, C, H, W) in the P pixels around places (B, N, 2), 0 outside; and those pixels."""
     side = torch.arange(-radius, radius + 1, device=uv.device)
     pixel = (uv.detach().nan_to_num(-100.0) + 0.5).floor()[:, :, None] + torch.cartesian_prod(side, side).flip(-1)
-    u, v = pixel.unbind(-1)
-    values = kg.transform.remap(maps.to(uv.dtype), u, v, mode="nearest", align_corners=True)
+    values = kg.transform.remap(maps.to(uv.dtype), pixel[..., 0], pixel[..., 1], mode="nearest", align_corners=True)
     return values.to(maps.dtype), pixel

@@ -9,25 +9,20 @@ from dhtorch.codes import Flag, Hole, first_reason
 from dhtorch.geometry.filters import grayscale
 from dhtorch.records import MIN_TRACKABILITY, Frame, Samples
 
-#: Factor on kornia's response to squared gradients per px, which ``MIN_TRACKABILITY`` counts per 2 px, as OpenCV does.
-#: Source: derived, 2².
-RESPONSE_SCALE = 4.0
-
 
 def classify_kornia(frame: Frame, samples: Samples, *, min_trackability: float = MIN_TRACKABILITY) -> Samples:
     """Samples with their trackability and, where they have no usable return, their hole class.
 
-    Trackability is the smaller eigenvalue of the gradients' second moments (Shi–Tomasi), under kornia's Gaussian window
-    of 1 px where :func:`dhtorch.stages.holes.classify` takes the mean over 7 × 7 px. The classes and their order are
-    the same.
+    Trackability is the smaller eigenvalue of the gradients' second moments (Shi–Tomasi) under a Gaussian of 1 px;
+    :func:`dhtorch.stages.holes.classify`, whose classes and order are used, takes the mean over 7 × 7 px.
 
     Gradient: ``trackability`` to the image; classes carry none.
     Source: paper, "Hole taxonomy".
     """
-    grey = grayscale(frame.image).to(samples.uv.dtype)
+    # Gradients are per px, but per 2 px in ``MIN_TRACKABILITY`` and in OpenCV: hence 4 = 2².
+    response = 4 * gftt_response(grayscale(frame.image).to(samples.uv.dtype))
     u, v = (samples.uv.detach() + 0.5).floor()[:, None].unbind(-1)
-    response = remap(gftt_response(grey), u, v, mode="nearest", padding_mode="border", align_corners=True)
-    trackability = RESPONSE_SCALE * response[:, 0, 0]
+    trackability = remap(response, u, v, mode="nearest", padding_mode="border", align_corners=True)[:, 0, 0]
     hole = first_reason(
         (samples.usable, Hole.NONE),
         ((samples.flag & Flag.BORDER) > 0, Hole.AT_BORDER),

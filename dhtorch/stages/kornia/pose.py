@@ -39,8 +39,7 @@ def pnp_ransac_kornia(
 
     The three points of each draw have up to four poses. The one of least cost Σ min(r², threshold²) is refined by
     Gauss–Newton steps T ← exp(ξ) T on its inliers. A last Newton step, with the exact derivative of Σ Jᵀ r, makes the
-    result differentiable (the implicit function theorem). Fields, codes and covariance are those of
-    :func:`dhtorch.stages.pose.pnp_ransac`.
+    result differentiable (implicit function theorem). Fields and codes: :func:`dhtorch.stages.pose.pnp_ransac`.
 
     Gradient: R and t to near ``xyz``, ``uv_1`` and camera 1; the other fields are detached. Float64 inside.
     Source: paper, "LiDAR-anchored relative pose", with P3P in place of EPnP.
@@ -53,32 +52,25 @@ def pnp_ransac_kornia(
         T, found = _search(xyz, uv, usable, K, draws.double(), threshold_px)
         for _ in range(steps + 1):
             start = T
-            r, J, inlier = _linearise(start, xyz, uv, K, usable, threshold_px)
-            H, g = torch.einsum("bnki,bnkj->bij", J, J), torch.einsum("bnki,bnk->bi", J, r)
-            T = _move(start, _solve(H, -g[..., None])[0])
-
-    def gradient(xi: Tensor, xyz: Tensor, uv: Tensor, K: Tensor) -> Tensor:
-        r, J, _ = _linearise(_move(start, xi), xyz, uv, K, inlier, torch.inf)
-        return torch.einsum("bnki,bnk->bi", J, r)[..., None]
-
+            g, H, square, inlier = _linearise(start, xyz, uv, K, usable, threshold_px)
+            T = _move(start, _solve(H, -g)[0])
     # Row k of ∂(Σ Jᵀ r)/∂ξ of every pair at once: pairs are independent, so that the sum over them separates.
-    zero, fixed = torch.zeros_like(g)[..., None], [x.detach() for x in (xyz, uv, K)]
-    rows = torch.func.jacrev(lambda xi: gradient(xi, *fixed).sum(0))(zero)
-    xi, solved = _solve(rows[:, 0, :, :, 0].detach().movedim(0, 1), -gradient(zero, xyz, uv, K))
+    data = (xyz.detach(), uv.detach(), K.detach(), inlier, torch.inf)
+    rows = torch.func.jacrev(lambda xi: _linearise(_move(start, xi), *data)[0].sum(0))(torch.zeros_like(g))
+    g, *_ = _linearise(start, xyz, uv, K, inlier, torch.inf)
+    xi, solved = _solve(rows[:, 0, :, :, 0].detach().movedim(0, 1), -g)
     T = _move(start, xi)
     R, t = T.so3.matrix(), T.t
     if not (torch.is_grad_enabled() and any(x.requires_grad for x in (xyz, uv, K))):
         R, t = R.detach(), t.detach()  # kornia's groups hold parameters
     with torch.no_grad():
-        n_inlier, total = inlier.sum(-1), torch.where(inlier, r.square().sum(-1), 0.0).sum(-1)
+        n_inlier, total = inlier.sum(-1), torch.where(inlier, square, 0.0).sum(-1)
         sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(1e-6)
         inverse, regular = _solve(H, torch.eye(6).to(H).expand_as(H))
         cov = inverse * sigma_px.square()[:, None, None]
-        regular = regular & solved
         whitened, _ = _solve(cov[:, 3:, 3:], t[..., None])
-        few, degenerate = PoseCode.TOO_FEW, PoseCode.DEGENERATE
-        enough = usable.sum(-1) >= min_inlier
-        code = first_reason((~enough, few), (~found, degenerate), (n_inlier < min_inlier, few), (~regular, degenerate))
+        few, bad, enough = PoseCode.TOO_FEW, PoseCode.DEGENERATE, usable.sum(-1) >= min_inlier
+        code = first_reason((~enough, few), (~found, bad), (n_inlier < min_inlier, few), (~(regular & solved), bad))
     fit = PoseFit(
         T_1_from_0=Pose(R, t),
         cov=cov,
@@ -115,15 +107,17 @@ def _search(xyz: Tensor, uv: Tensor, usable: Tensor, K: Tensor, draws: Tensor, l
 
 
 def _linearise(T: Se3, xyz: Tensor, uv: Tensor, K: Tensor, usable: Tensor, limit: float) -> tuple[Tensor, ...]:
-    """Residuals r (B, N, 2) px, their Jacobian J (B, N, 2, 6) for ξ, 0 except for inliers, and these (B, N)."""
+    """Σ Jᵀ r (B, 6, 1) and Σ Jᵀ J (B, 6, 6) of inliers, r = projection − uv and J = ∂r/∂ξ; r² and inliers (B, N)."""
     Y = kg.transform_points(T.matrix(), xyz)
     in_front = Y[..., 2] > 1e-6
     Y = torch.where(in_front[..., None], Y, 1.0)
     r = kg.project_points(Y, K) - uv
-    inlier = usable & in_front & (r.detach().square().sum(-1) < limit**2)
+    square = r.square().sum(-1)
+    inlier = usable & in_front & (square < limit**2)
     J_point = K[:, None, :2, :2] @ kg.camera.dx_project_points_z1(Y)
-    J = torch.cat((torch.linalg.cross(Y[..., None, :], J_point), J_point), -1)
-    return r, torch.where(inlier[..., None, None], J, 0.0), inlier
+    J = torch.cat((torch.linalg.cross(Y[..., None, :], J_point), J_point), -1)  # rotation, translation
+    J = torch.where(inlier[..., None, None], J, 0.0)
+    return torch.einsum("bnki,bnk->bi", J, r)[..., None], torch.einsum("bnki,bnkj->bij", J, J), square, inlier
 
 
 def _solve(H: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:

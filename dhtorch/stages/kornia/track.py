@@ -6,8 +6,6 @@ their gradient, ``J`` (B, N, P) those of image 1 around ``y`` (B, N, 2); A = Σ 
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from kornia.filters import spatial_gradient
 from kornia.geometry.transform import build_pyramid, remap
@@ -20,9 +18,6 @@ from dhtorch.records import NO_HINT, TrackHint, Tracks
 #: Least eigenvalue of A per pixel of a window that is tracked, squared grey values in [0, 1] per px².
 #: Source: OpenCV calcOpticalFlowPyrLK default minEigThreshold 1e-4, derived, times 2^10 / 255².
 MIN_EIGENVALUE = 1e-4 * 2**10 / 255**2
-
-#: Least determinant of ∂(Σ g (J − T))/∂y, over that of A, for a Newton step. Source: chosen on the built-in room.
-MIN_DETERMINANT_RATIO = 0.1
 
 
 def lucas_kanade_kornia(
@@ -40,8 +35,8 @@ def lucas_kanade_kornia(
     """Tracks of points uv_0 from image 0 to image 1 and back; a track that does not return to its start is not valid.
 
     From coarse to fine, every window takes Gauss–Newton steps y ← y − A⁻¹ Σ g (J − T) until one is shorter than
-    ``epsilon_px``. A last Newton step, with the exact derivative of Σ g (J − T), makes the result differentiable (the
-    implicit function theorem). Options and fields are those of :func:`dhtorch.stages.track.lucas_kanade`.
+    ``epsilon_px``. A last Newton step, with the exact derivative of Σ g (J − T), makes the result differentiable
+    (implicit function theorem). Options and fields: :func:`dhtorch.stages.track.lucas_kanade`.
 
     Gradient: ``uv_1`` to both images and ``uv_0``; the other fields are detached.
     Source: Lucas and Kanade 1981; Bouguet 2000 (pyramid).
@@ -52,9 +47,9 @@ def lucas_kanade_kornia(
         n_levels = max([k + 1 for k in range(most) if side >> k > window], default=1)
         pyramid_0, pyramid_1 = (build_pyramid(grey, n_levels) for grey in (grey_0, grey_1))
         start = uv_0 if hint.start is None else torch.where(hint.start.isfinite(), hint.start, uv_0)
-        search = partial(_search, window=window, iterations=iterations, epsilon_px=epsilon_px)
-        y, valid, A = search(pyramid_0, pyramid_1, uv_0, start)
-        x, returned, _ = search(pyramid_1, pyramid_0, y, y + uv_0 - start)
+        o = (window, iterations, epsilon_px)
+        y, valid, A = _search(pyramid_0, pyramid_1, uv_0, start, o)
+        x, returned, _ = _search(pyramid_1, pyramid_0, y, y + uv_0 - start, o)
         error = (x - uv_0).norm(dim=-1)
     uv_1, difference = _newton_step(grey_0, grey_1, uv_0, y, valid, A=A, window=window)
     if not (torch.is_grad_enabled() and any(v.requires_grad for v in (image_0, image_1, uv_0))):
@@ -72,9 +67,10 @@ def lucas_kanade_kornia(
 
 
 def _search(
-    source: list[Tensor], target: list[Tensor], x: Tensor, y: Tensor, *, window: int, iterations: int, epsilon_px: float
+    source: list[Tensor], target: list[Tensor], x: Tensor, y: Tensor, o: tuple[int, int, float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Positions (B, N, 2) in ``target`` of points x of ``source``, searched from y on; which are valid (B, N); A."""
+    window, iterations, epsilon_px = o
     valid = _is_inside(source[0], x) & y.isfinite().all(-1)
     x, y = (torch.where(valid[..., None], p, 0.0) for p in (x, y))
     pair = torch.arange(len(x), device=x.device)[:, None]
@@ -109,7 +105,7 @@ def _newton_step(
         residual = (g @ difference[..., None])[..., 0]
         rows = [torch.autograd.grad(residual[..., k].sum(), at, retain_graph=True)[0] for k in (0, 1)]
     H = torch.stack(rows, -2)
-    regular = (valid & (torch.linalg.det(H) > MIN_DETERMINANT_RATIO * torch.linalg.det(A)))[..., None]
+    regular = (valid & (torch.linalg.det(H) > 0.1 * torch.linalg.det(A)))[..., None]  # else far from a parabola
     step = torch.linalg.solve(torch.where(regular[..., None], H, torch.eye(2).to(H)), residual)
     return y - torch.where(regular, step, 0.0), difference.detach()
 

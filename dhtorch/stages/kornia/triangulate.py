@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import kornia.geometry as kg
 import torch
-from kornia.geometry import epipolar
-from kornia.geometry.camera import dx_project_points_z1
 from torch import Tensor
 
 from dhtorch.codes import Gate, PoseCode, first_reason
@@ -25,8 +24,7 @@ def two_view_kornia(
     """Triangulate every track under the metric pose → depth with a sigma, or a gate where the geometry is weak.
 
     The pixel of view 0 is exact. That of view 1 moves perpendicularly onto its epipolar line, by ``residual_px``, and
-    the two rays meet. Options, fields, gates and their order are those of
-    :func:`dhtorch.stages.triangulate.two_view`; a rolling shutter in ``fit`` is ignored.
+    the rays meet. Fields and gates: :func:`dhtorch.stages.triangulate.two_view`; a rolling shutter is ignored.
 
     With s = ∂uv_1/∂depth and g = s / (sᵀ s), sigma² = gᵀ Σ_track g + gᵀ J Σ_pose Jᵀ g, J = ∂uv_1/∂pose; the last term
     is ``sigma_shared``², common to the points of a pair.
@@ -38,28 +36,25 @@ def two_view_kornia(
     tracked = tracks.valid & tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
     usable = tracked & posed
     # What is missing is replaced by valid numbers, so that values and gradients are finite.
-    R, t = (
-        torch.where(mask, x.double(), y)
-        for mask, x, y in ((posed[..., None], fit.T_1_from_0.R, eye), (posed, fit.T_1_from_0.t, eye[0]))
-    )
+    R = torch.where(posed[..., None], fit.T_1_from_0.R.double(), eye)
+    t = torch.where(posed, fit.T_1_from_0.t.double(), eye[0])
     uv_0, uv_1 = (torch.where(usable[..., None], x, 0.0).double() for x in (tracks.uv_0, tracks.uv_1))
     K_0, K_1 = (to_matrix(camera).double() for camera in (camera_0, camera_1))
 
-    P_0 = epipolar.projection_from_KRt(K_0, eye.expand_as(R), torch.zeros_like(t)[..., None])
-    P_1 = epipolar.projection_from_KRt(K_1, R, t[..., None])
-    F = epipolar.fundamental_from_projections(P_0, P_1)
-    residual_px = epipolar.left_to_right_epipolar_distance(uv_0, uv_1, F)
-    on_line = epipolar.get_closest_point_on_epipolar_line(uv_0, uv_1, F)
-    X = epipolar.triangulate_points(P_0, P_1, uv_0, on_line, solver="cofactor")
+    P_0 = kg.epipolar.projection_from_KRt(K_0, eye.expand_as(R), torch.zeros_like(t)[..., None])
+    P_1 = kg.epipolar.projection_from_KRt(K_1, R, t[..., None])
+    F = kg.epipolar.fundamental_from_projections(P_0, P_1)
+    residual_px = kg.epipolar.left_to_right_epipolar_distance(uv_0, uv_1, F)
+    on_line = kg.epipolar.get_closest_point_on_epipolar_line(uv_0, uv_1, F)
+    X = kg.epipolar.triangulate_points(P_0, P_1, uv_0, on_line, solver="cofactor")
     meet = X.isfinite().all(-1) & (X[..., 2].abs() > 1e-9)
     X = torch.where(meet[..., None], X, eye[2])
     along, depth = X @ R.mT, X[..., 2]  # from the centre of camera 0 to the point, in the axes of camera 1
     Y = along + t[:, None]
     in_front = meet & (depth > 0) & (Y[..., 2] > 0)
-    sine = _root(torch.linalg.cross(along, Y).square().sum(-1))
-    parallax_deg = torch.atan2(sine, (along * Y).sum(-1)).rad2deg()
+    parallax_deg = torch.atan2(_root(torch.linalg.cross(along, Y).square().sum(-1)), (along * Y).sum(-1)).rad2deg()
 
-    J_point = K_1[:, None, :2, :2] @ dx_project_points_z1(torch.where(in_front[..., None], Y, 1.0))
+    J_point = K_1[:, None, :2, :2] @ kg.camera.dx_project_points_z1(torch.where(in_front[..., None], Y, 1.0))
     s = (J_point @ (along / depth[..., None])[..., None])[..., 0]
     g = s / s.square().sum(-1, keepdim=True).clamp_min(1e-18)
     by_point = (g[..., None, :] @ J_point)[..., 0, :]

@@ -1,0 +1,344 @@
+"""The method on kornia: which of its functions run, exact gradients, and the independent implementation beside PAPER."""
+
+import sys
+
+import pytest
+import torch
+from support.contract_inputs import shifted, tracked
+from support.textures import waves
+from torch.autograd import gradcheck
+
+from dhtorch import KORNIA, PAPER, pytree
+from dhtorch.codes import Flag, Gate, PoseCode
+from dhtorch.geometry.camera import resize
+from dhtorch.metrics import holdout
+from dhtorch.pipeline.pair import uniform_draws
+from dhtorch.records import Camera, Frame, Pose, TrackHint
+from dhtorch.stages.kornia.backproject import backproject_kornia
+from dhtorch.stages.kornia.holes import classify_kornia
+from dhtorch.stages.kornia.pose import pnp_ransac_kornia
+from dhtorch.stages.kornia.track import lucas_kanade_kornia
+from dhtorch.stages.kornia.triangulate import two_view_kornia
+from dhtorch.synthetic import SyntheticRoom
+
+D = torch.float64
+N = 384
+
+
+def views(dtype=torch.float32, near=2.0, **options):
+    """Two frames of a room of 120 × 160 pixels with a short-range sensor."""
+    room = SyntheticRoom(**{"seed": 2, "hw": (120, 160), "path": "orbit", "n_frames": 17, "lidar": "exact", **options})
+    frames = [holdout.range_split(room[k], near).to(dtype) for k in (0, 16)]
+    return [f.replace(image=f.image.to(dtype) / 255) for f in frames]
+
+
+def answer(method, frames):
+    trace = {}
+    method(*frames, n=N, trace=trace)
+    return trace
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return views()
+
+
+@pytest.fixture(scope="module")
+def both(pair):
+    return answer(PAPER, pair), answer(KORNIA, pair)
+
+
+# ------------------------------------------------------------------------------------------------ what runs
+
+
+def kornia_calls(fn):
+    """Names of kornia's functions, without those of its core, that run during ``fn()``."""
+    names = set()
+
+    def note(frame, event, _):
+        module = frame.f_globals.get("__name__", "")
+        if event == "call" and module.startswith(("kornia.geometry.", "kornia.feature.", "kornia.filters.")):
+            names.add(f"{module.split('.')[1]}.{frame.f_code.co_name}")
+
+    before = sys.getprofile()
+    sys.setprofile(note)
+    try:
+        fn()
+    finally:
+        sys.setprofile(before)
+    return names
+
+
+def test_each_of_the_five_stages_with_geometry_runs_on_kornia(pair, both):
+    trace = both[1]
+    samples, tracks, fit = trace["samples"], trace["tracks"], trace["fit"]
+    cameras = pair[0].camera, pair[1].camera
+    runs = {
+        "backproject": lambda: KORNIA.backproject(pair[0], samples.uv),
+        "classify": lambda: KORNIA.classify(pair[0], samples),
+        "track": lambda: KORNIA.track(pair[0].image, pair[1].image, samples.uv),
+        "pose": lambda: KORNIA.pose(samples, tracks, *cameras, uniform_draws(0, 1, 50).float()),
+        "triangulate": lambda: KORNIA.triangulate(samples, tracks, fit, *cameras),
+    }
+    expected = {
+        "backproject": {"geometry.unproject_points", "geometry.remap"},
+        "classify": {"feature.gftt_response", "geometry.remap"},
+        "track": {"geometry.build_pyramid", "filters.spatial_gradient", "geometry.remap"},
+        "pose": {"geometry.project_points", "geometry.dx_project_points_z1", "geometry.projection_from_KRt"},
+        "triangulate": {"geometry.triangulate_points", "geometry.fundamental_from_projections"},
+    }
+    expected["pose"] |= {"geometry.exp", "geometry._mul_se3", "geometry.unproject_points"}
+    expected["triangulate"] |= {"geometry.get_closest_point_on_epipolar_line"}
+    expected["triangulate"] |= {"geometry.left_to_right_epipolar_distance"}
+    calls = {name: kornia_calls(run) for name, run in runs.items()}
+    assert len(calls) == 5
+    assert {name: expected[name] - calls[name] for name in calls if not expected[name] <= calls[name]} == {}
+    assert kornia_calls(lambda: samples.uv + 1) == set(), "the profile sees only what runs"
+
+
+# ------------------------------------------------------------------------------------------------ beside PAPER
+
+
+def test_samples_are_those_of_paper(both):
+    """Same pixels, returns, points, flags and confidence; trackability differs by its window, and with it some holes."""
+    paper, kornia = (trace["samples"] for trace in both)
+    for field in ("uv", "depth", "sigma", "confidence"):
+        torch.testing.assert_close(getattr(kornia, field), getattr(paper, field), msg=field)
+    torch.testing.assert_close(kornia.xyz, paper.xyz, equal_nan=True)
+    assert torch.equal(kornia.usable, paper.usable) and (kornia.flag == paper.flag).float().mean() > 0.99
+    assert (kornia.hole == paper.hole).float().mean() > 0.95
+    ratio = (kornia.trackability / paper.trackability.clamp_min(1e-12)).log()
+    assert (
+        ratio.median().abs() < 1
+        and torch.corrcoef(torch.stack((kornia.trackability[0], paper.trackability[0])))[0, 1] > 0.5
+    )
+
+
+@pytest.mark.parametrize("own_camera", [False, True])
+def test_returns_of_sparse_maps_confidence_and_a_lens_are_read_as_by_paper(own_camera):
+    draw = torch.Generator().manual_seed(0)
+    depth = torch.rand(2, 45, 60, generator=draw, dtype=D) + 1
+    depth = torch.where(torch.rand(2, 45, 60, generator=draw) < 0.05, depth, 0.0)
+    lens = torch.tensor([[0.05, -0.02, 0.001, -0.002, 0.01]], dtype=D).expand(2, -1)
+    camera = Camera(torch.full((2, 2), 70.0, dtype=D), torch.tensor([[39.5, 29.5]], dtype=D).expand(2, 2), lens)
+    frame = Frame(
+        (255 * torch.rand(2, 3, 60, 80, generator=draw)).byte(),
+        depth,
+        camera,
+        depth_camera=resize(camera.replace(distortion=None), (60, 80), (45, 60)) if own_camera else None,
+        conf=torch.randint(0, 3, (2, 45, 60), generator=draw, dtype=torch.uint8),
+        sparse=torch.tensor([True, False]),
+    )
+    uv = torch.rand(2, 300, 2, generator=draw, dtype=D) * torch.tensor([86.0, 66.0]) - 3
+    options = {"near_limit": 1.8, "min_conf": 1, "sigma_m": 0.01}
+    paper, kornia = PAPER.backproject(frame, uv, **options), backproject_kornia(frame, uv, **options)
+    assert paper.usable[0].float().mean() > 0.2 > paper.usable[1].float().mean() > 0
+    for field in ("depth", "sigma", "xyz"):
+        torch.testing.assert_close(getattr(kornia, field), getattr(paper, field), equal_nan=True, msg=field)
+    inner = ((uv > 6) & (uv < torch.tensor([73.0, 53.0]))).all(-1)  # windows end at the border, PAPER's move inside
+    assert inner.float().mean() > 0.5
+    assert torch.equal(kornia.flag[inner], paper.flag[inner]) and torch.equal(
+        kornia.confidence[inner], paper.confidence[inner]
+    )
+    returns = Flag.NO_DEPTH | Flag.LOW_CONF | Flag.BEYOND_NEAR | Flag.BORDER
+    assert torch.equal(kornia.flag & returns, paper.flag & returns)
+
+
+def test_tracks_are_those_of_paper(both):
+    paper, kornia = (trace["tracks"] for trace in both)
+    valid = paper.valid & kornia.valid
+    assert (paper.valid == kornia.valid).float().mean() > 0.9 and valid.float().mean() > 0.5
+    assert (paper.uv_1 - kornia.uv_1)[valid].norm(dim=-1).median() < 0.02
+    for field in ("photometric", "cov"):
+        a, b = (
+            getattr(x, field)[valid].flatten(1) if field == "cov" else getattr(x, field)[valid] for x in (paper, kornia)
+        )
+        assert ((a - b).abs() / a.abs().clamp_min(1e-6)).median() < 0.1, field
+
+
+def test_the_pose_from_papers_tracks_is_papers(pair, both):
+    """The same near points: both end at the same minimum, and state the same covariance and scale."""
+    samples, tracks = both[0]["samples"], both[0]["tracks"]
+    args = samples, tracks, pair[0].camera, pair[1].camera, uniform_draws(0, 1, 200).float()
+    paper, kornia = PAPER.pose(*args), pnp_ransac_kornia(*args)
+    sigma = paper.cov.diagonal(dim1=1, dim2=2).sqrt()
+    turn = (kornia.T_1_from_0.R @ paper.T_1_from_0.R.mT)[0]
+    angles = torch.stack((turn[2, 1], turn[0, 2], turn[1, 0]))  # small
+    assert (paper.inlier == kornia.inlier).float().mean() > 0.99
+    assert (angles.abs() < sigma[0, :3]).all()
+    assert ((paper.T_1_from_0.t - kornia.T_1_from_0.t).abs() < sigma[:, 3:]).all()
+    for field in ("cov", "sigma_px", "rms_px", "t_snr", "n_inlier"):
+        a, b = getattr(paper, field).double(), getattr(kornia, field).double()
+        assert (a - b).abs().max() < 0.15 * a.abs().max(), field
+
+
+def test_triangulation_is_papers_to_rounding():
+    samples, tracks, fit, *cameras = tracked(3, 40, D, noise=6.0)
+    fit = fit.replace(code=torch.tensor([PoseCode.OK, PoseCode.OK, PoseCode.MISALIGNED], dtype=torch.int32))
+    tracks = tracks.replace(valid=torch.arange(40).expand(3, -1) % 7 > 0)
+    paper, kornia = (m.triangulate(samples, tracks, fit, *cameras) for m in (PAPER, KORNIA))
+    assert torch.equal(paper.gate, kornia.gate) and torch.equal(paper.n_views, kornia.n_views)
+    assert {int(g) for g in paper.gate.unique()} >= {Gate.ANSWER, Gate.NO_TRACK, Gate.RESIDUAL, Gate.MISALIGNED}
+    for field in ("depth", "sigma", "sigma_shared", "score"):
+        torch.testing.assert_close(getattr(kornia, field), getattr(paper, field), equal_nan=True, rtol=1e-9, atol=0)
+    for field in ("parallax_deg", "residual_px"):
+        in_front = (paper.gate == Gate.ANSWER) | (paper.gate == Gate.RESIDUAL)
+        torch.testing.assert_close(
+            getattr(kornia, field)[in_front], getattr(paper, field)[in_front], rtol=1e-9, atol=1e-9
+        )
+
+
+def test_the_methods_agree_on_the_built_in_room(both):
+    """Coverage of the holes within a tenth, error of far depth at most 15 % apart."""
+    whole = views(near=100.0)[0]
+    coverage, error = [], []
+    for trace in both:
+        estimate, samples = trace["estimate"], trace["samples"]
+        truth = PAPER.backproject(whole, samples.uv).depth
+        far = ~samples.usable & (truth > 0)
+        keep = estimate.keep & far
+        coverage.append(float(keep.sum() / far.sum()))
+        error.append(float(((estimate.depth - truth).abs() / truth)[keep].median()))
+    assert min(coverage) > 0.4
+    assert 0.9 < coverage[1] / coverage[0] < 1.1 and 0.85 < error[1] / error[0] < 1.15, (coverage, error)
+
+
+# ------------------------------------------------------------------------------------------------ gradients
+
+
+def test_gradients_of_backproject_and_classify_are_exact():
+    draw = torch.Generator().manual_seed(0)
+    image, depth = torch.rand(1, 3, 24, 32, generator=draw, dtype=D), 1 + torch.rand(1, 12, 16, generator=draw, dtype=D)
+    camera = Camera(torch.tensor([[30.0, 31.0]], dtype=D), torch.tensor([[16.0, 12.0]], dtype=D))
+    uv = 4 + 16 * torch.rand(1, 5, 2, generator=draw, dtype=D)
+
+    def points(depth, f, c, uv):
+        samples = backproject_kornia(Frame(image, depth, Camera(f, c)), uv)
+        return samples.xyz, samples.depth, samples.sigma
+
+    assert gradcheck(points, [x.clone().requires_grad_() for x in (depth, camera.f, camera.c, uv)])
+
+    def trackability(image):
+        frame = Frame(image, depth, camera)
+        return classify_kornia(frame, backproject_kornia(frame, uv)).trackability
+
+    assert gradcheck(trackability, [image.clone().requires_grad_()], fast_mode=True)
+
+
+@pytest.mark.parametrize("wanted", ["points", "images"])
+def test_gradients_of_the_tracks_are_exact(wanted):
+    """At the converged position; the derivative includes that of the template's gradient."""
+    images = waves(1, 60, 70, shortest=9.0), waves(1, 60, 70, (1.3, -0.9), shortest=9.0)
+    uv = torch.tensor([[[30.3, 25.2], [22.3, 40.6]]], dtype=D)
+    options = {"window": 9, "levels": 2, "iterations": 50, "epsilon_px": 1e-12}
+    inputs = [
+        x.clone().requires_grad_(one == wanted)
+        for x, one in zip((*images, uv), ("images", "images", "points"), strict=True)
+    ]
+    assert lucas_kanade_kornia(*inputs, **options).valid.all()
+    assert gradcheck(
+        lambda *x: lucas_kanade_kornia(*x, **options).uv_1, inputs, atol=1e-5, fast_mode=wanted == "images"
+    )
+
+
+def test_gradients_of_the_pose_are_exact():
+    samples, tracks, _, camera_0, camera_1 = tracked(1, 9, D, noise=0.1)
+    draws = uniform_draws(0, 1, 8)
+
+    def pose(xyz, uv_1, f, c):
+        seen = samples.replace(xyz=xyz), tracks.replace(uv_1=uv_1), camera_0, Camera(f, c)
+        T = pnp_ransac_kornia(*seen, draws, steps=6).T_1_from_0
+        return T.R, T.t
+
+    inputs = (samples.xyz, tracks.uv_1, camera_1.f, camera_1.c)
+    assert gradcheck(pose, [x.clone().requires_grad_() for x in inputs], atol=1e-5)
+
+
+def test_gradients_of_the_triangulation_are_exact():
+    samples, tracks, fit, camera_0, camera_1 = tracked(1, 8, D)
+    T, cov_pose = fit.T_1_from_0, 1e4 * fit.cov  # large beside the step of the numerical derivative
+
+    def estimate(uv_0, uv_1, f_0, f_1, c_1, R, t, cov, cov_pose):
+        seen = tracks.replace(uv_0=uv_0, uv_1=uv_1, cov=cov), fit.replace(T_1_from_0=Pose(R, t), cov=cov_pose)
+        e = two_view_kornia(samples, *seen, Camera(f_0, camera_0.c), Camera(f_1, c_1))
+        return e.depth, e.sigma, e.sigma_shared, e.parallax_deg, e.residual_px
+
+    inputs = (tracks.uv_0, tracks.uv_1, camera_0.f, camera_1.f, camera_1.c, T.R, T.t, tracks.cov, cov_pose)
+    assert gradcheck(estimate, [x.clone().requires_grad_() for x in inputs], atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+def test_gradients_through_a_whole_pair_are_finite(dtype):
+    frames = views(dtype)
+    inputs = [frames[0].image, frames[1].image, frames[0].depth, frames[0].camera.f, frames[1].camera.f]
+    inputs = [x.clone().requires_grad_() for x in inputs]
+    reference = frames[0].replace(image=inputs[0], depth=inputs[2], camera=frames[0].camera.replace(f=inputs[3]))
+    source = frames[1].replace(image=inputs[1], camera=frames[1].camera.replace(f=inputs[4]))
+    estimate = KORNIA(reference, source, n=N)
+    keep = estimate.keep
+    assert estimate.depth.dtype == dtype and keep.float().mean() > 0.4
+    loss = sum(getattr(estimate, name)[keep].sum() for name in ("depth", "sigma", "score"))
+    for gradient in torch.autograd.grad(loss, inputs):
+        assert gradient.isfinite().all() and (gradient != 0).any()
+
+
+def test_without_a_graph_nothing_asks_for_a_gradient(pair, both):
+    """kornia's groups hold parameters; none of them reaches an answer."""
+    for record in (both[1]["tracks"], both[1]["fit"], both[1]["estimate"]):
+        assert not any(x.requires_grad for x in torch.utils._pytree.tree_leaves(record) if isinstance(x, torch.Tensor))
+    image = pair[0].image.clone().requires_grad_()
+    with torch.no_grad():
+        assert not KORNIA(pair[0].replace(image=image), pair[1], n=64).depth.requires_grad
+
+
+# ------------------------------------------------------------------------------------------------ rare inputs
+
+
+def test_a_pair_answers_alone_as_among_others_within_rounding():
+    frames = views(D), views(D, seed=5)
+    several = KORNIA(*(pytree.collate([pair[k] for pair in frames]) for k in (0, 1)), n=128)
+    for b, one in enumerate(frames):
+        alone = KORNIA(*one, n=128)
+        assert torch.equal(alone.gate[0], several.gate[b])
+        torch.testing.assert_close(alone.depth[0], several.depth[b], equal_nan=True, rtol=1e-8, atol=0)
+
+
+def test_a_pair_without_a_pose_has_papers_code():
+    samples, tracks, _, *cameras = tracked(5, 30, D)
+    line = samples.xyz.clone()
+    line[1] = torch.linspace(0.5, 2, 30, dtype=D)[:, None] * torch.tensor([0.1, 0.2, 1.0], dtype=D) + 1
+    valid = tracks.valid.clone()
+    valid[2], valid[3, 5:] = False, False
+    samples, tracks = samples.replace(xyz=line), tracks.replace(valid=valid)
+    codes = [pose(samples, tracks, *cameras, uniform_draws(0, 5, 64)).code for pose in (PAPER.pose, KORNIA.pose)]
+    assert torch.equal(*codes) and codes[1].tolist() == [PoseCode.OK, PoseCode.DEGENERATE, *[PoseCode.TOO_FEW] * 2, 0]
+
+
+def test_hopeless_pairs_have_no_answer_and_finite_gradients(pair):
+    """A blank picture, no depth, and a source picture of something else, in one batch."""
+    draw = torch.Generator().manual_seed(0)
+    blank = pair[0].replace(image=torch.full_like(pair[0].image, 0.5))
+    blind = pair[0].replace(depth=torch.full_like(pair[0].depth, torch.nan))
+    other = pair[1].replace(image=torch.rand(pair[1].image.shape, generator=draw))
+    frames = pytree.collate([blank, blind, pair[0]]), pytree.collate([pair[1], pair[1], other])
+    images = [f.image.clone().requires_grad_() for f in frames]
+    estimate = KORNIA(*(f.replace(image=image) for f, image in zip(frames, images, strict=True)), n=128)
+    assert not estimate.keep.any() and not estimate.score.any()
+    total = estimate.parallax_deg.sum() + estimate.residual_px.nan_to_num(0, 0, 0).sum()
+    if total.requires_grad:
+        for gradient in torch.autograd.grad(total, images, allow_unused=True):
+            assert gradient is None or gradient.isfinite().all()
+
+
+def test_no_samples_make_an_empty_answer(pair):
+    assert KORNIA(*pair, n=0).depth.shape == (1, 0)
+
+
+def test_a_hinted_start_reaches_a_motion_beyond_the_pyramid():
+    image_0, image_1, uv = shifted(2, 20, torch.float32)
+    far = torch.roll(image_1, (12, 12), (-2, -1))
+    options = {"window": 9, "levels": 1}
+    lost = lucas_kanade_kornia(image_0, far, uv, **options)
+    hint = PAPER.track(image_0, image_1, uv, **options)
+    tracks = lucas_kanade_kornia(image_0, far, uv, hint=TrackHint(start=hint.uv_1 + 12), **options)
+    assert tracks.valid.float().mean() > lost.valid.float().mean() + 0.3
