@@ -63,7 +63,7 @@ def truth(room: SyntheticRoom, i: int, j: int, uv: Tensor) -> tuple[Tensor, Tens
 def matches(seeds: tuple[int, ...]) -> dict[str, Tensor]:
     """Errors in cells, similarities and spreads of the valid matches in the rooms of these seeds."""
     draw = torch.Generator().manual_seed(0)
-    net = xfeat.load_xfeat()
+    net = xfeat.load_xfeat().net
     matches: dict[str, list[Tensor]] = {"error": [], "similarity": [], "spread": []}
     for seed in seeds:
         for path in PATHS:

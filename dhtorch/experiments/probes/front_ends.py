@@ -187,7 +187,7 @@ def load_network_front_ends(
     """
     network, trained = load_visual_front_end(dinov2, cells=cells, device=device)
     front_ends: dict[str, FrontEnd] = {} if network is None else {"dinov2": network}
-    return front_ends | ({"xfeat": DenseFeatures(xfeat.load_xfeat(device))} if xfeat_too else {}), trained
+    return front_ends | ({"xfeat": DenseFeatures(xfeat.load_xfeat(device).net)} if xfeat_too else {}), trained
 
 
 def depth_tokens_for_scene(method: Method, scene: Scene, **options: Any) -> DepthTokens:
