@@ -118,8 +118,8 @@ def _template(picture: Tensor, x: Tensor, window: int) -> tuple[Tensor, Tensor]:
 def _read(picture: Tensor, x: Tensor, window: int, padding_mode: str = "reflection") -> Tensor:
     """Bilinear values (B, C, N, P) of pictures (B, C, H, W) in windows around points (B, N, 2); (B, N, P) for C = 1."""
     side = torch.arange(window, device=x.device) - window // 2
-    u, v = (x[:, :, None] + torch.cartesian_prod(side, side).flip(-1)).unbind(-1)
-    values = remap(picture, u, v, padding_mode=padding_mode, align_corners=True)
+    dv, du = torch.cartesian_prod(side, side).unbind(-1)
+    values = remap(picture, x[..., :1] + du, x[..., 1:] + dv, padding_mode=padding_mode, align_corners=True)
     return values[:, 0] if picture.shape[1] == 1 else values
 
 
