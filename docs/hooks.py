@@ -17,6 +17,7 @@ import json
 import re
 import subprocess
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -170,7 +171,8 @@ _TABLE_HEAD = ["| name | |", "| :-- | :-- |"]
 
 def _public_table(package: ModuleType) -> list[str]:
     """``__all__`` of a package as a table: each name, linked to where it is described, and its first sentence."""
-    names = [(name, getattr(package, name)) for name in package.__all__]
+    values = [(name, getattr(package, name)) for name in package.__all__]
+    names = [(n, x) for n, x in values if callable(x) or isinstance(x, ModuleType)]  # constants stand with their module
     return [*_TABLE_HEAD, *(f"| [`{n}`][{_home(n, x)}] | {_first(x.__doc__)} |" for n, x in names)]
 
 
@@ -230,6 +232,23 @@ def module(dotted: str) -> str:
     file = REPO / Path(*dotted.split("."))
     file = file / "__init__.py" if file.is_dir() else file.with_suffix(".py")
     return as_markdown(ast.get_docstring(_tree(file)) or "")
+
+
+def code(dotted: str) -> str:
+    """The source of a function without its docstring; of a public one, which the API describes, the body alone."""
+    home, _, name = dotted.rpartition(".")
+    file = REPO / Path(*home.split(".")).with_suffix(".py")
+    (node,) = (n for n in _tree(file).body if isinstance(n, ast.FunctionDef) and n.name == name)
+    first, last = node.body[1], node.body[-1]
+    lines = file.read_text(encoding="utf-8").splitlines()
+    comment = first.lineno - 1
+    while lines[comment - 1].strip().startswith("#"):
+        comment -= 1
+    text = textwrap.dedent("\n".join(lines[comment : last.end_lineno]))
+    if name.startswith("_"):
+        head = " ".join(" ".join(lines[node.lineno - 1 : node.body[0].lineno - 1]).split())
+        text = head.replace("( ", "(").replace(" )", ")") + "\n" + textwrap.indent(text, "    ")
+    return f"```python\n{text}\n```"
 
 
 def reader(name: str) -> str:
@@ -394,5 +413,5 @@ def licences() -> str:
 
 MAKERS: dict[str, Callable[..., str]] = {
     f.__name__: f
-    for f in (module, reader, choices, codes, sample_columns, experiments, helps, exit_codes, licences, colours)
+    for f in (module, code, reader, choices, codes, sample_columns, experiments, helps, exit_codes, licences, colours)
 }

@@ -151,7 +151,7 @@ def test_a_mark_that_nobody_makes_is_an_error():
         script("hooks").generate("wishes")
 
 
-@pytest.mark.parametrize("page", ["methods", "pipelines", "extend"])
+@pytest.mark.parametrize("page", ["methods", "pipelines", "extend", "learning"])
 def test_the_examples_run(page, capsys, monkeypatch):
     blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.M | re.S)
     names: dict = {}
@@ -161,6 +161,9 @@ def test_the_examples_run(page, capsys, monkeypatch):
     if page == "methods":
         score = names["estimate"].score
         assert ((score > 0) == names["estimate"].keep).all() and (score > 0).any()
+    elif page == "learning":
+        gradient, keep = names["predicted"].grad, names["labels"].keep
+        assert gradient.isfinite().all() and gradient[keep].ne(0).all() and 50 < int(keep.sum()) < keep.numel()
     elif page == "extend":
         said = capsys.readouterr().out
         assert "3 frames" in said and "torch.Size([1, 24, 32])" in said and "R. Hartley, A. Zisserman" in said
@@ -206,3 +209,9 @@ def test_an_expression_fits_where_one_of_its_choices_does():
     fits = script("licences").compatible
     assert fits("MIT") and fits("MIT OR GPL-3.0-only") and fits("Apache-2.0 AND (BSD-3-Clause)")
     assert not fits("GPL-3.0-only") and not fits("MIT AND GPL-3.0-only") and not fits("proprietary")
+
+
+def test_every_part_of_the_package_has_a_page_of_the_api():
+    hooks = script("hooks")
+    for part in hooks.parts():
+        assert hooks.api_page(part).startswith(f"# {part}\n"), part
