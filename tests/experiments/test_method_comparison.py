@@ -31,12 +31,13 @@ def outcome():
     rooms = open_rooms(("walk", "lateral", "rotation"), n_frames=4, hw=(192, 256), gap=3, lidar="exact")
     methods = {"paper": method(), "strict": method().replace(triangulate={"max_residual_px": 0.5})}
     methods["opencv"] = method("opencv")
+    methods["kornia"] = methods["paper"]  # a twin that agrees whatever the scene
     moving = ["synthetic_lateral", "synthetic_rotation", "elsewhere"]
     return method_comparison.run(rooms, {}, by_gap, Settings(), methods=methods, seeds=2, moving=moving)
 
 
 def test_rows_are_those_of_the_first_seed(outcome):
-    assert {r["method"] for r in outcome.rows} == {"paper", "strict", "opencv"}
+    assert {r["method"] for r in outcome.rows} == {"paper", "strict", "opencv", "kornia"}
     assert not any("seed" in k for k in outcome.summary)
     row = outcome.scenes("strict")["synthetic_walk"]
     numbers = row["against_paper"]
@@ -51,6 +52,20 @@ def test_summary_has_every_number_of_the_bars(outcome):
     assert outcome.verdict == "refuted" and "bars met" in outcome.why
     ratios = [outcome.scenes("strict")[s]["against_paper"]["median_rel_ratio"] for s in outcome.scenes("strict")]
     assert outcome.summary["strict.median_rel_ratio"]["value"] == pytest.approx((ratios[0] * ratios[1]) ** 0.5)
+
+
+def test_a_twin_has_its_coverage_and_error_as_ratios(outcome):
+    for number in ("coverage_ratio_to_paper", "error_ratio_to_paper"):
+        assert (
+            outcome.summary[f"kornia.{number}"]["value"] == pytest.approx(1)
+            and f"strict.{number}" not in outcome.summary
+        )
+        assert outcome.summary[f"kornia.{number}"]["n"] == 2, "the rotation stays out"
+    half = candidates(200, 0, 200), candidates(100, 100, 200)
+    whole = candidates(400, 0, 0), candidates(0, 400, 0)
+    ours, theirs = ({name: [points] for name, points in zip("ab", side, strict=True)} for side in (half, whole))
+    found = compare.twin_ratios(ours, theirs, "paper")
+    assert found["coverage_ratio_to_paper"].value == pytest.approx(0.5) and found["error_ratio_to_paper"].n == 2
 
 
 def test_wrong_answers_where_near_things_move_count_whatever_the_role(outcome):
