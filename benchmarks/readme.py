@@ -20,6 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import beside_kornia
+import kornia_adapters
+import learning_tables
 import mutants
 import pose_tables
 import speed_tables
@@ -548,6 +550,7 @@ TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= (
     {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | beside_kornia.TABLES | pose_tables.TABLES
 )
+TABLES |= kornia_adapters.TABLES | learning_tables.TABLES
 TABLES |= {
     "how good": how_good,
     "sweep": swept,

@@ -64,9 +64,9 @@ class Camera(Record):
         if not isinstance(model, PinholeModel | BrownConradyModel) or (
             distortion is not None and isinstance(model, BrownConradyModel)
         ):
-            found = f"{type(model).__name__}{'' if distortion is None else ' with another distortion'}"
+            actual = f"{type(model).__name__}{'' if distortion is None else ' with another distortion'}"
             raise TypeError(
-                f"Camera.from_kornia: found {found}, expected a PinholeCamera, PinholeModel or BrownConradyModel"
+                f"Camera.from_kornia: found {actual}, expected a PinholeCamera, PinholeModel or BrownConradyModel"
             )
         params = model.params.reshape(-1, model.params.shape[-1])
         return cls(params[:, :2], params[:, 2:4], params[:, 4:] if isinstance(model, BrownConradyModel) else distortion)

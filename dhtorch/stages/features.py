@@ -49,7 +49,7 @@ WEIGHTED_VARIANCE = 0.606
 
 #: Largest ratio of the distances to the first and second nearest descriptor of a match, without unit.
 #: Source: Lowe's ratio, loosened: a sample needs agreeing neighbours as well.
-MAX_RATIO = 0.95
+MAX_DESCRIPTOR_RATIO = 0.95
 
 #: Least spread of residuals by which matches are weighted, px: rounding of keypoints to whole pixels.
 #: Source: derived, the standard deviation of an even distribution over one pixel.
@@ -118,10 +118,10 @@ def match_features(
             there = _predict(matches, x[b], neighbours, reach * max(image_0.shape[-2:]))
             back = _predict(_reversed(matches), there[0], neighbours, reach * max(image_1.shape[-2:]))
             rows.append((*there, back[0], back[2]))
-        uv_1, cov, found, returned, found_back = (torch.stack(column) for column in zip(*rows, strict=True))
+        uv_1, cov, is_near, returned, is_back = (torch.stack(column) for column in zip(*rows, strict=True))
         error = torch.linalg.vector_norm(returned - x, dim=-1)
         inside = _is_inside(x, image_0) & _is_inside(uv_1, image_1)
-        valid = found & found_back & inside & (error < max_round_trip_px)
+        valid = is_near & is_back & inside & (error < max_round_trip_px)
         safe = torch.where(valid[..., None], uv_1, x.clamp(min=0))
         pyramids = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
         rms = _grey_difference(pyramids, image_1, x.clamp(min=0), safe, window)
@@ -152,12 +152,12 @@ def _find_matches(
     if isinstance(matcher, feature.XFeat):
         matcher = matcher.match_xfeat_star
     if isinstance(matcher, feature.LocalFeatureMatcher | feature.LoFTR):
-        found = matcher({"image0": grayscale(image_0), "image1": grayscale(image_1)})
-        lafs = [found.get(f"lafs{k}") for k in (0, 1)]
-        return _as_matches(found["keypoints0"], found["keypoints1"], *lafs)
+        output = matcher({"image0": grayscale(image_0), "image1": grayscale(image_1)})
+        lafs = [output.get(f"lafs{k}") for k in (0, 1)]
+        return _as_matches(output["keypoints0"], output["keypoints1"], *lafs)
     if isinstance(matcher, feature.LocalFeature):
         (lafs_0, d_0), (lafs_1, d_1) = (_described_lafs(matcher, grayscale(x)) for x in (image_0, image_1))
-        pairs = feature.match_smnn(d_0, d_1, MAX_RATIO)[1]
+        pairs = feature.match_smnn(d_0, d_1, MAX_DESCRIPTOR_RATIO)[1]
         lafs_0, lafs_1 = lafs_0[pairs[:, 0]], lafs_1[pairs[:, 1]]
         return _as_matches(lafs_0[..., 2], lafs_1[..., 2], lafs_0[None], lafs_1[None])
     if isinstance(matcher, feature.DISK | feature.ALIKED):
@@ -227,8 +227,8 @@ def _predict(matches: _Matches, x: Tensor, neighbours: int, reach_px: float) -> 
     row = torch.linalg.solve(normal, ridge.new_tensor([1.0, 0, 0]).expand(len(x), 3)[..., None])[..., 0]
     leverage = ((X @ row[..., None])[..., 0] * weight).square().sum(-1)
     cov = scatter * ((1 + leverage) / (freedom * WEIGHTED_VARIANCE))[:, None, None]
-    found = (distance[:, 0] <= reach_px) & (effective > _PLANE_PARAMETERS) & x.isfinite().all(-1)
-    return plane[:, 0], cov, found
+    is_near = (distance[:, 0] <= reach_px) & (effective > _PLANE_PARAMETERS) & x.isfinite().all(-1)
+    return plane[:, 0], cov, is_near
 
 
 def _unit(image: Tensor) -> Tensor:
@@ -245,7 +245,8 @@ def _is_inside(uv: Tensor, image: Tensor) -> Tensor:
 def _grey_difference(pyramids: PyramidCache, image_1: Tensor, uv_0: Tensor, uv_1: Tensor, window: int) -> Tensor:
     """Rms grey difference (B, N) of the windows around points of both pictures."""
     B, N, _ = uv_0.shape
-    source, target = pyramids(1, window), build_pyramid(image_1, 1, window, gradients=False)
+    source = pyramids(1, window)
+    target = build_pyramid(image_1, 1, window, gradients=False)
     options = lk.SearchOptions(window, 1, 0.0, 0.0, "none")
     fill = round_up(B * N) - B * N
     x, x_1 = (

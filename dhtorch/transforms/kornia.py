@@ -169,7 +169,8 @@ class _Augmented:
 
     def apply(self, module: torch.nn.Module, param: ParamItem, extra: dict[str, Any]) -> None:
         """One augmentation, with the same parameters on all pictures."""
-        name, moves = type(module).__name__, not _is_colour(module)
+        name = type(module).__name__
+        moves = not _is_colour(module)
         if moves and self.has_answers:
             raise SampleError(f"{name}: moves pixels behind ExtendDepth, expected it before")
         if moves and len({x.shape[-2:] for x in self.pictures.values()}) > 1:
@@ -193,7 +194,7 @@ class _Augmented:
     def write(self) -> dict[str, Any]:
         """The sample with its pictures as they are now, and everything else moved by A."""
         views, new_hw = self.views, self._size()
-        values: dict[str, Any] = {key: self._as_given(key, x) for key, x in self.pictures.items()}
+        values: dict[str, Any] = {key: self._in_layout(key, x) for key, x in self.pictures.items()}
         is_still = new_hw == self.hw and torch.equal(self.A, torch.eye(3).to(self.A).expand_as(self.A))
         if is_still or self.has_answers:
             return replace_values(self.sample, values)
@@ -228,7 +229,7 @@ class _Augmented:
         picture = self.pictures[self.views.image]
         return picture.shape[-2], picture.shape[-1]
 
-    def _given(self, key: str) -> Tensor:
+    def _stored(self, key: str) -> Tensor:
         """Value of a key with B in front."""
         x = to_tensor(get_value(self.sample, key), key, signed=False).to(self.A.device)
         return x if self.batched else x[None]
@@ -237,12 +238,12 @@ class _Augmented:
         """Value (B, …) as it stands in the sample."""
         return (x if self.batched else x[0]).contiguous()
 
-    def _as_given(self, key: str, x: Tensor) -> Tensor:
+    def _in_layout(self, key: str, x: Tensor) -> Tensor:
         """Pictures (B, T, C, H, W) in the layout that the sample has them in."""
-        given = self._given(key)
-        layout = self.views.layout or ("chw" if given.shape[-3] in (1, 3) else "hwc")
+        stored = self._stored(key)
+        layout = self.views.layout or ("chw" if stored.shape[-3] in (1, 3) else "hwc")
         x = x.movedim(2, -1) if layout == "hwc" else x
-        return self._returned(x if given.ndim == 5 else x[:, 0])
+        return self._returned(x if stored.ndim == 5 else x[:, 0])
 
     def _depth_places(self, camera: Camera, new_hw: tuple[int, int]) -> tuple[tuple[int, int], Tensor]:
         """Size of the moved depth map, and the pixels (B, h' w', 2) of the given map under its own."""
@@ -261,8 +262,8 @@ class _Augmented:
 
     def _moved_map(self, key: str, size: tuple[int, int], places: Tensor) -> Tensor:
         """A depth or confidence map at other places, 0 outside; in the type and layout of the sample."""
-        given = self._given(key)
-        x = self._reader(given.dtype).planes(key, self.T, signed=False)
+        stored = self._stored(key)
+        x = self._reader(stored.dtype).planes(key, self.T, signed=False)
         x = x.view(torch.int16) if x.dtype == torch.uint16 else x
         h, w = x.shape[-2:]
         u, v = (places + 0.5 + TIE_PX).floor().long().unbind(-1)
@@ -270,10 +271,10 @@ class _Augmented:
         index = (v.clamp(0, h - 1) * w + u.clamp(0, w - 1))[:, None].expand(-1, x.shape[1], -1)
         values = x.flatten(-2).gather(-1, index)
         values = torch.where(inside, values, torch.zeros_like(values))
-        axes = (-2, -1) if given.shape[-2:] == (h, w) else (-3, -2)
-        shape = list(given.shape)
+        axes = (-2, -1) if stored.shape[-2:] == (h, w) else (-3, -2)
+        shape = list(stored.shape)
         shape[axes[0]], shape[axes[1]] = size
-        return self._returned(values.reshape(shape).view(given.dtype))
+        return self._returned(values.reshape(shape).view(stored.dtype))
 
     def _per_value(self, M: Tensor, x: Tensor, tail: int) -> Tensor:
         """Matrices (B, k, k) as (B, 1, …, k, k) for values (B, …) whose last ``tail`` axes are one value."""
@@ -281,12 +282,12 @@ class _Augmented:
 
     def _moved_intrinsics(self, key: str, hw: tuple[int, int]) -> Any:
         """Intrinsics under a key, moved by A, in the form that the sample has them in."""
-        given = get_value(self.sample, key)
-        if is_kornia_camera(given):
-            camera = Camera.from_kornia(given)
+        stored = get_value(self.sample, key)
+        if is_kornia_camera(stored):
+            camera = Camera.from_kornia(stored)
             A = self.A.to(camera.f) if len(self.A) == len(camera.f) else self.A[:1].to(camera.f).expand_as(camera.f)
-            return _moved_kornia(given, *cam.warp(camera, A), hw)
-        x = self._given(key)
+            return _moved_kornia(stored, *cam.warp(camera, A), hw)
+        x = self._stored(key)
         rows = intrinsic_rows(x, self.T).double()
         at_f, at_c = ((0, 1), (2, 3)) if rows.shape[-1] == 4 else ((0, 4), (2, 5))
         A = self._per_value(self.A, rows, 1).expand(*rows.shape[:-1], 3, 3).flatten(0, -3)
@@ -296,10 +297,10 @@ class _Augmented:
     def _depth_intrinsics(self, camera: Camera, hw: tuple[int, int]) -> Any:
         """Intrinsics of the moved depth map, in the form that the sample has them in."""
         key = str(self.views.depth_intrinsics)
-        given = get_value(self.sample, key)
-        if is_kornia_camera(given):
-            return _moved_kornia(given, camera, torch.eye(3).to(camera.f).expand(len(camera.f), 3, 3), hw)
-        x = self._given(key)
+        stored = get_value(self.sample, key)
+        if is_kornia_camera(stored):
+            return _moved_kornia(stored, camera, torch.eye(3).to(camera.f).expand(len(camera.f), 3, 3), hw)
+        x = self._stored(key)
         rows = intrinsic_rows(x, self.T).double()
         if rows.ndim != 2:
             raise SampleError(f"{key}: found {tuple(x.shape[1:])}, expected one row of numbers or a matrix")
@@ -307,7 +308,7 @@ class _Augmented:
 
     def _moved_distortion(self, key: str, f: Tensor) -> Tensor:
         """Distortion under a key, turned with the picture."""
-        x = self._given(key)
+        x = self._stored(key)
         A = self._per_value(self.A, x, 1).expand(*x.shape[:-1], 3, 3).flatten(0, -3)
         f = f.view(len(f), *(1,) * (x.ndim - 2), 2).expand(*x.shape[:-1], 2).flatten(0, -2)
         turned = cam.warp(Camera(f, torch.zeros_like(f), x.to(f).flatten(0, -2)), A)[0].distortion
@@ -327,7 +328,7 @@ class _Augmented:
             if is_kornia_camera(get_value(self.sample, key)):
                 values[key] = self._moved_intrinsics(key, hw)
                 continue
-            x = self._given(key)
+            x = self._stored(key)
             L, inverse = (self._per_value(m, x, 2).to(x) for m in (left, right.mT))
             R, t = L @ x[..., :3, :3] @ inverse, L @ x[..., :3, 3:]
             values[key] = self._returned(torch.cat((torch.cat((R, t), -1), x[..., 3:, :]), -2))
@@ -335,7 +336,7 @@ class _Augmented:
             about = Q if views.pose_kind == "1_from_0" else W
             turn = torch.linalg.det(about).sign()[:, None, None] * about  # a rotation vector is axial
             zero = torch.zeros_like(about)
-            x = self._given(views.pose_cov)
+            x = self._stored(views.pose_cov)
             J = torch.cat((torch.cat((turn, zero), -1), torch.cat((zero, about), -1)), -2)
             J = self._per_value(J, x, 2).to(x)
             values[views.pose_cov] = self._returned(J @ x @ J.mT)
@@ -364,13 +365,13 @@ def _with_rows(x: Tensor, rows: Tensor, camera: Camera) -> Tensor:
     return x
 
 
-def _moved_kornia(given: Any, camera: Camera, Q: Tensor, hw: tuple[int, int]) -> Any:
+def _moved_kornia(stored: Any, camera: Camera, Q: Tensor, hw: tuple[int, int]) -> Any:
     """A camera of kornia with other intrinsics, turned by Q, for pictures of another size."""
-    if not isinstance(given, PinholeCamera):
+    if not isinstance(stored, PinholeCamera):
         lens = () if camera.distortion is None else (camera.distortion,)
-        params = torch.cat((camera.f, camera.c, *lens), -1).view(given.params.shape).to(given.params)
-        return type(getattr(given, "_model", given))(ImageSize(*hw), params)
-    K, E = given.intrinsics.clone(), given.extrinsics
+        params = torch.cat((camera.f, camera.c, *lens), -1).view(stored.params.shape).to(stored.params)
+        return type(getattr(stored, "_model", stored))(ImageSize(*hw), params)
+    K, E = stored.intrinsics.clone(), stored.extrinsics
     K[:, :3, :3] = cam.to_matrix(camera).to(K)
     turn, mirror = (torch.nn.functional.pad(m, (0, 1, 0, 1)).to(E) for m in (Q, _world_mirror(Q)))
     last = torch.diag(E.new_tensor([0.0, 0, 0, 1]))

@@ -293,7 +293,8 @@ class SampleReader:
     def per_sample(self, x: Tensor) -> Tensor:
         """Numbers (n, …) of a camera of kornia: of n samples, of n frames of one, or the same for all -> (B, …)."""
         assert self.like is not None
-        x, B = x.to(self.like.device), len(self.like)
+        B = len(self.like)
+        x = x.to(self.like.device)
         return x if self.batched and len(x) == B else x.expand(B, *x.shape)
 
     def pad(self, key: str, T: int) -> Tensor:
