@@ -151,7 +151,7 @@ def test_a_mark_that_nobody_makes_is_an_error():
         script("hooks").generate("wishes")
 
 
-@pytest.mark.parametrize("page", ["methods", "pipelines", "extend", "learning"])
+@pytest.mark.parametrize("page", ["methods", "pipelines", "extend", "learning", "upstream"])
 def test_the_examples_run(page, capsys, monkeypatch):
     blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / f"{page}.md").read_text(encoding="utf-8"), re.M | re.S)
     names: dict = {}
@@ -161,6 +161,9 @@ def test_the_examples_run(page, capsys, monkeypatch):
     if page == "methods":
         score = names["estimate"].score
         assert ((score > 0) == names["estimate"].keep).all() and (score > 0).any()
+    elif page == "upstream":
+        assert names["solution"].valid.all() and (names["points"][..., 2] > 0).all()
+        assert names["tracks"].points.shape == (2, 5, 2)
     elif page == "learning":
         gradient, keep = names["predicted"].grad, names["labels"].keep
         assert gradient.isfinite().all() and gradient[keep].ne(0).all() and 50 < int(keep.sum()) < keep.numel()
