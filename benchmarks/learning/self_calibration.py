@@ -1,7 +1,7 @@
 """Self-calibration: focal length, depth scale and colour–depth time offset by gradient descent through ``MAP``.
 
-    python benchmarks/learning/self_calibration.py                  the built-in room, one seed
-    python benchmarks/learning/self_calibration.py --data holo_a    a capture below DHTORCH_DATA
+    python benchmarks/learning/self_calibration.py                       the built-in room, one seed
+    python benchmarks/learning/self_calibration.py --data holo_a room    also a capture below DHTORCH_DATA
 
 A moving camera with known poses determines its own focal length (tracks must lie on their epipolar lines), the scale of
 its depth sensor (sensed depth must equal triangulated depth) and the time of its depth (the sensor of another time was
@@ -223,9 +223,9 @@ def run(capture: Frame, name: str, *, seed: int, **options: Any) -> dict[str, An
     }
 
 
-def open_recording(name: str | None) -> Recording:
-    """A capture by its path or its name below DHTORCH_DATA; without a name the built-in room."""
-    if name is None:
+def open_recording(name: str) -> Recording:
+    """A capture by its path or its name below DHTORCH_DATA; ``room`` is the built-in room."""
+    if name == "room":
         return SyntheticRoom(path="orbit", n_frames=24, step_m=0.06, hw=(240, 320), lidar="exact")
     return data.open(name if Path(name).exists() else data.scenes_root(None) / name)
 
@@ -233,21 +233,27 @@ def open_recording(name: str | None) -> Recording:
 def main() -> int:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", help="a capture with poses and registered depth, or its name below DHTORCH_DATA")
+    parser.add_argument(
+        "--data",
+        nargs="+",
+        default=["room"],
+        help="captures with poses and registered depth: paths, names below DHTORCH_DATA, or room, the built-in one",
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    recording = open_recording(options.data)
-    capture, rows = load_capture(recording), []
-    for seed in options.seeds:
-        row = run(capture, recording.name, seed=seed)
-        recovered = row["recovered"]
-        print(
-            f"seed {seed}: focal {recovered['focal']:+.2%}, scale {recovered['scale']:+.2%}, "
-            f"offset {recovered['offset']:+.3f} frames, {row['cpu_s']:.0f} s of processor time",
-            flush=True,
-        )
-        rows.append(row)
+    rows = []
+    for name in options.data:
+        capture = load_capture(open_recording(name))
+        for seed in options.seeds:
+            row = run(capture, name, seed=seed)
+            recovered = row["recovered"]
+            print(
+                f"{name}, seed {seed}: focal {recovered['focal']:+.2%}, scale {recovered['scale']:+.2%}, "
+                f"offset {recovered['offset']:+.3f} frames, {row['cpu_s']:.0f} s of processor time",
+                flush=True,
+            )
+            rows.append(row)
     if options.json:
         storage.write_json(options.json, storage.to_strict_json(rows))
     return 0
