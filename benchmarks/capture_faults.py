@@ -11,6 +11,7 @@ A row is one window of frames, written in one layout with one fault, opened with
 * ``refused``: the reader refuses with an error;
 * ``named``: not right, and a finding has one of the fault's causes;
 * ``otherwise``: not right, and there are findings or report lines, none with such a cause;
+* ``unchecked``: not right, no finding, but ``inspect`` states that the window cannot show the scale;
 * ``silent``: not right, without a word.
 
 Windows: the built-in room in every layout of ``dhtorch.testing.CAPTURE_WRITERS``, and frames of holo_a, two pieces of
@@ -260,7 +261,7 @@ def run_row(frames: Frames, layout: str, fault: PlantedFault, sound: Sound | Non
     elif words or set(causes) & set(fault.causes):
         outcome = "named"
     else:
-        outcome = "otherwise" if lines else "silent"
+        outcome = "otherwise" if lines else "unchecked" if check.limits and "scale" in fault.causes else "silent"
     return {"outcome": outcome, "causes": causes, "lines": [line[:200] for line in lines]}
 
 
@@ -398,7 +399,8 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     counted = [row for row in planted if row["counted"]]
     good = [row for row in counted if row["outcome"] in GOOD_OUTCOMES]
     outcomes = {
-        x: sum(row["outcome"] == x for row in planted) for x in ("right", "refused", "named", "otherwise", "silent")
+        x: sum(row["outcome"] == x for row in planted)
+        for x in ("right", "refused", "named", "otherwise", "unchecked", "silent")
     }
     return {
         "outcomes": outcomes,

@@ -265,6 +265,8 @@ def add_check(survey: Survey, recording: Recording) -> None:
         surfaces = check.poses.surfaces
         agreement = f"agree to {100 * surfaces.stated:.2f} % from frame to frame"
         survey.add_fact("depth and poses", f"{agreement} ({100 * surfaces.without:.2f} % without poses)")
+    for limit in check.limits:
+        survey.add_fact("not checked", limit)
     survey.warnings.extend(str(finding) for finding in check.findings)
 
 

@@ -289,13 +289,17 @@ def register_depth(
     hw: tuple[int, int],
     T_cam_from_depth: Pose | None = None,  # None = same centre and axes
 ) -> Tensor:
-    """Depth map → depth map (H, W) of the colour camera: forward warp with a z-buffer, holes are not filled."""
+    """Depth map → depth map over the field of view of an image of size ``hw``.
+
+    Its size is that of :func:`size_of_registered_depth`. Forward warp with a z-buffer; holes are not filled.
+    """
     v, u = torch.nonzero(depth > 0, as_tuple=True)
     uv = torch.stack((u, v), -1).to(depth_camera.f.dtype)
     xyz = cameras.unproject(depth_camera, uv[None], depth[v, u][None])
     if T_cam_from_depth is not None:
         xyz = se3.apply(T_cam_from_depth, xyz)
-    return splat_depth(xyz[0], camera, hw)
+    size = size_of_registered_depth(depth_camera, camera, hw)
+    return splat_depth(xyz[0], cameras.resize(camera, hw, size), size)
 
 
 def size_of_registered_depth(depth_camera: Camera, camera: Camera, hw: tuple[int, int]) -> tuple[int, int]:

@@ -9,6 +9,7 @@ sentence and the option that corrects it. Refuted poses are removed from the rec
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -21,13 +22,14 @@ from dhtorch.data.plausibility import plausibility_findings
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.records import Frame, Pose
+from dhtorch.records import Frame, Pose, Samples, Tracks
 from dhtorch.runtime.console import format_count
 from dhtorch.validation import faults
 from dhtorch.validation.edge_fault import do_edges_refute, find_edge_fault
 from dhtorch.validation.edge_lag import find_edge_lag
 from dhtorch.validation.faults import Diagnosis, KnownFault, WindowTracks
 from dhtorch.validation.options import ValidationOptions
+from dhtorch.validation.picture_field import PictureField, measure_picture_field
 from dhtorch.validation.pose_check import PoseCheck, check_poses, describe_contradiction, describe_factor
 
 #: Frames of the window that is examined: pairs of up to 8 frames apart, and maps up to 5 frames late.
@@ -73,6 +75,14 @@ _NEAR_PRINCIPAL_POINT: Final = 0.05
 _MAX_EPIPOLAR_RATIO: Final = 0.7
 
 
+#: Error of the scale of depth and poses above which it is stated that a smaller one is not noticed.
+#: Source: derived, twice the least factor that is reported.
+_NOTEWORTHY_SCALE_ERROR: Final = 0.09
+
+#: Kinds of a known fault that pictures of another field of view may look like.
+_FIELD_KINDS: Final = ("registration", "focal length", "along the ray")
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing that a capture's files mean otherwise than assumed, or that contradict each other."""
@@ -99,6 +109,15 @@ class CaptureCheck:
     def poses_refuted(self) -> bool:
         """Whether the stated poses contradict the depth and are not used."""
         return any(finding.cause == "poses" for finding in self.findings)
+
+    @property
+    def limits(self) -> list[str]:
+        """What the window cannot show, each a sentence."""
+        error = None if self.poses is None or self.findings else self.poses.scale_error
+        if error is None or error <= _NOTEWORTHY_SCALE_ERROR:
+            return []
+        size = "of a third or less" if math.isinf(error) else f"up to {error:.0%}"
+        return [f"the scale of depth and poses is not checked exactly: an error {size} would not show in this motion"]
 
     @property
     def lines(self) -> list[str]:
@@ -143,7 +162,11 @@ def check_capture(recording: Recording, frames: Mapping[int, Frame] | None = Non
     fault = _fault_of(diagnosis)
     if fault is None or do_edges_refute(list(views.values()), fault):
         fault = _edge_fault(list(views.values()), diagnosis)
-    findings += _combined_findings(recording, poses, fault, {**window, **views}, pairs, tracks)
+    field = _field_of_pictures(recording, poses, fault, views, list(zip(pairs, tracked, strict=False)))
+    if field is not None:
+        findings.append(_field_finding(field, next(iter(views.values()))))
+    else:
+        findings += _combined_findings(recording, poses, fault, {**window, **views}, pairs, tracks)
     check = CaptureCheck(recording, assumed, tuple(findings), poses, diagnosis)
     return replace(check, recording=replace(recording, poses=None)) if check.poses_refuted else check
 
@@ -241,6 +264,28 @@ def _edge_fault(frames: Sequence[Frame], diagnosis: Diagnosis | None) -> KnownFa
     return None if explained else find_edge_fault(frames)
 
 
+def _field_of_pictures(
+    recording: Recording,
+    poses: PoseCheck | None,
+    fault: KnownFault | None,
+    views: Mapping[int, Frame],
+    tracked: Sequence[tuple[tuple[int, int], tuple[Samples, Tracks]]],
+) -> PictureField | None:
+    """The field of view of the pictures where it is not the stated one; None where it is, or is not measurable.
+
+    Poses and depth must agree, and no fault of another kind may explain the tracks.
+    """
+    is_other = fault is not None and fault.kind not in _FIELD_KINDS
+    if poses is None or poses.surfaces_contradict or is_other or not tracked:
+        return None
+    pairs, tracks = zip(*tracked, strict=True)
+    field = measure_picture_field(_poses_of(recording), views, pairs, tracks)
+    if field is None or not field.differs:
+        return None
+    by_poses = 1.0 if poses.tracks is None else poses.tracks.best_score
+    return field if field.loss < by_poses else None
+
+
 # ----------------------------------------------------------------------------------------------------------- findings
 
 
@@ -269,6 +314,18 @@ def _combined_findings(
         return [Finding("time offset", _lag_text(-lag, "pictures and poses"), f"data.depth_lag={-lag}")]
     findings = [Finding("poses", f"{text}; they are not used", remedy)]
     return findings if fault is None or lag else [*findings, _fault_finding(fault)]
+
+
+def _field_finding(field: PictureField, view: Frame) -> Finding:
+    """Sentence for pictures of another field of view than K states."""
+    camera = field.camera(view.camera, view.hw)
+    K = ", ".join(f"{x:.0f}" for x in (*camera.f[0].tolist(), *camera.c[0].tolist()))
+    text = (
+        f"depth does not lie over its pictures: these show {1 / field.zoom:.2f} of the field of view that K states, "
+        f"while depth and poses agree: they are cropped or resized alone, "
+        f"and their own K is about fx, fy, cx, cy = {K} px at {view.hw[1]}x{view.hw[0]}"
+    )
+    return Finding("registration", text)
 
 
 def _are_pictures_wrong(poses: PoseCheck | None, mended: PoseCheck | None) -> bool:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from dhtorch.data.orientation import depth_edges, edge_correlation, picture_edges
 from dhtorch.records import Frame
-from dhtorch.validation.edge_lag import clear_lead
+from dhtorch.validation.edge_lag import clear_lead, depth_over_picture
 from dhtorch.validation.faults import KNOWN_FAULTS, NO_FAULT, KnownFault
 
 #: Kinds of faults that are tried.
@@ -61,27 +61,29 @@ def do_edges_refute(frames: Sequence[Frame], fault: KnownFault) -> bool:
     return clear_lead(_scores(*inputs, NO_FAULT) - _scores(*inputs, fault), _MIN_LEAD) > 0
 
 
-def _reduced_frames(frames: Sequence[Frame]) -> tuple[list[Tensor], list[Tensor]] | None:
-    """Edges of the pictures and coarse depth of up to :data:`_MAX_FRAMES` spread frames, each once; None of too few."""
+def _reduced_frames(frames: Sequence[Frame]) -> tuple[list[Tensor], list[Frame]] | None:
+    """Edges of pictures and their frames, up to :data:`_MAX_FRAMES` spread ones, each once; None of too few."""
     spread = [frames[round(k * (len(frames) - 1) / (_MAX_FRAMES - 1))] for k in range(_MAX_FRAMES)] if frames else []
     chosen = list({id(frame): frame for frame in spread}.values())
     if len(chosen) < _MIN_FRAMES:
         return None
     with torch.no_grad():
         pictures = [picture_edges(frame.image[0], grid_px=_GRID_PX) for frame in chosen]
-    return pictures, [_coarse(frame.depth) for frame in chosen]
+    return pictures, [_coarse(frame) for frame in chosen]
 
 
-def _coarse(depth: Tensor) -> Tensor:
-    """Every k-th value of a map (1, h, w), so that its longer side has at least twice the grid's."""
-    step = max(1, max(depth.shape[-2:]) // (2 * _GRID_PX))
-    return depth[..., ::step, ::step]
+def _coarse(frame: Frame) -> Frame:
+    """A frame with every k-th value of its depth, so that the longer side has at least twice the grid's."""
+    if frame.depth_camera is not None:
+        return frame
+    step = max(1, max(frame.depth.shape[-2:]) // (2 * _GRID_PX))
+    return frame.replace(depth=frame.depth[..., ::step, ::step])
 
 
-def _scores(pictures: Sequence[Tensor], depths: Sequence[Tensor], fault: KnownFault) -> Tensor:
-    """Correlation (n,) of edges of pictures with those of depth (1, h, w) each with a fault undone."""
+def _scores(pictures: Sequence[Tensor], frames: Sequence[Frame], fault: KnownFault) -> Tensor:
+    """Correlation (n,) of edges of pictures with those of the frames' depth with a fault undone."""
     hw = pictures[0].shape[-2], pictures[0].shape[-1]
     with torch.no_grad():
-        edges = [depth_edges(fault.undo(depth)[0], hw) for depth in depths]
+        edges = [depth_edges(depth_over_picture(frame, fault.undo(frame.depth)), hw) for frame in frames]
     scores = [edge_correlation(picture, *each) for picture, each in zip(pictures, edges, strict=True)]
     return torch.tensor(scores, dtype=torch.float64)

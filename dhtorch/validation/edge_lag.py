@@ -13,6 +13,9 @@ import torch
 from torch import Tensor
 
 from dhtorch.data.orientation import depth_edges, edge_correlation, picture_edges
+from dhtorch.geometry import camera as cam
+from dhtorch.geometry.patches import sample_nearest
+from dhtorch.pipeline.dense import map_pixel_centres
 from dhtorch.records import Frame
 from dhtorch.validation.faults import MAX_LAG_FRAMES
 
@@ -51,7 +54,7 @@ def find_edge_lag(frames: Sequence[Frame]) -> EdgeLag:
     with torch.no_grad():
         pictures = [picture_edges(frame.image[0], grid_px=_GRID_PX) for frame in frames]
         hw = pictures[0].shape[-2], pictures[0].shape[-1]
-        depths = [depth_edges(frame.depth[0], hw) for frame in frames]
+        depths = [depth_edges(depth_over_picture(frame, frame.depth), hw) for frame in frames]
     n = len(frames)
     best = EdgeLag(0, 0.0)
     without = [edge_correlation(pictures[i], *depths[i]) for i in range(n)]
@@ -71,6 +74,19 @@ def find_edge_lag(frames: Sequence[Frame]) -> EdgeLag:
     )
     shifted_lead = late[:, int(late.mean(0).argmax())] - now[:, int(now.mean(0).argmax())]
     return best if clear_lead(shifted_lead, _MIN_LEAD) > 0 else EdgeLag(0, 0.0)
+
+
+def depth_over_picture(frame: Frame, depth: Tensor) -> Tensor:
+    """Depth (1, h, w) m as stored in a frame (B = 1) -> (h, w) over the field of view of the picture, 0 outside.
+
+    The frame's depth camera is used where it has one. Gradient: to the depth.
+    """
+    if frame.depth_camera is None:
+        return depth[0]
+    h, w = depth.shape[-2:]
+    rays = cam.rays(frame.camera, map_pixel_centres(frame, (h, w)))
+    value, inside = sample_nearest(depth, cam.project(frame.depth_camera, rays))
+    return torch.where(inside, value, 0.0).view(h, w)
 
 
 def clear_lead(lead: Tensor, least: float) -> float:

@@ -136,6 +136,7 @@ class PoseCheck:
     tracks: ReadingScores | None  # loss of near returns at their tracks, in [0, 1]; None with tracks in too few pairs
     surface_factor: float  # on translations, near 1, with the least disagreement; 1 = not distinguishable from 1
     n_pairs: int
+    scale_error: float = math.inf  # largest relative error of the scale of depth or poses that would not be noticed
 
     @property
     def by_tracks(self) -> bool:
@@ -163,6 +164,11 @@ class PoseCheck:
         """Whether the stated poses are refuted; a factor near 1 refutes neither the poses nor the depth."""
         if self.by_tracks and self.tracks is not None:
             return not self.tracks.best.is_small_factor
+        return self.surfaces_contradict
+
+    @property
+    def surfaces_contradict(self) -> bool:
+        """Whether surfaces seen from two frames refute the stated poses."""
         stated, best = self.surfaces.stated, self.surfaces.best_score
         if math.isnan(stated):
             return not math.isnan(best)
@@ -222,6 +228,7 @@ def check_poses(
         tracks=_reading_scores(readings, _mean_over_pairs(track)) if is_tracked else None,
         surface_factor=_distinguishable_factor(readings, median, surface),
         n_pairs=int(surface[:, 0].isfinite().sum()),
+        scale_error=_unnoticed_scale_error(readings, median, _mean_over_pairs(track) if is_tracked else None),
     )
 
 
@@ -347,6 +354,25 @@ def _distinguishable_factor(readings: Sequence[PoseReading], median: Tensor, dis
     both = disagreements[:, k].isfinite() & disagreements[:, 0].isfinite()
     is_clear = int(both.sum()) >= _MIN_DECIDING_PAIRS and bool((better & both).sum() >= 0.75 * both.sum())
     return factor if is_clear else 1.0
+
+
+def _unnoticed_scale_error(readings: Sequence[PoseReading], surface: Tensor, track: Tensor | None) -> float:
+    """Largest relative error of the scale, within the factors near 1, under which neither score would be reported.
+
+    If the scale were wrong by a factor, the poses as stated would score as they do under that factor now.
+    """
+    near = sorted((each.factor, k) for k, each in enumerate(readings) if each.is_small_factor or k == 0)
+    places = [k for _, k in near]
+    noticed = surface[places] > _MIN_FACTOR_GAIN * surface[places].nan_to_num(torch.inf).min()
+    if track is not None:
+        loss = track[places]
+        best = loss.nan_to_num(torch.inf).min()
+        noticed |= (loss >= _MIN_TRACK_LOSS) & (best <= _MAX_TRACK_LOSS_RATIO * loss)
+    error = _MIN_FACTOR_OFFSET
+    for (factor, _), seen in zip(near, noticed.tolist(), strict=True):
+        if not seen:
+            error = max(error, math.exp(abs(math.log(factor))) - 1)
+    return math.inf if bool((~noticed[[0, -1]]).any()) else error
 
 
 def _relative_poses(poses: Pose, i: int, j: int, readings: Sequence[PoseReading]) -> tuple[Tensor, Pose]:

@@ -680,3 +680,22 @@ def test_field_case_ros_recorder(field_cases: Path) -> None:
     assert recording[0].camera.f.tolist() == [[525, 525]] and recording.depth_unit == DepthUnit(1 / 5000)
     depth: Tensor = data.open(field_cases / "20-ros-tum-mm", depth_unit="mm")[0].depth
     assert float(depth[depth > 0].median()) == pytest.approx(1.861, rel=0.01)
+
+
+def test_depth_that_lies_turned_against_its_own_camera_is_refused(tmp_path: Path) -> None:
+    frames = [frame.replace(depth_camera=cameras.resize(CAMERA, frame.hw, frame.depth.shape[-2:])) for frame in walk(2)]
+    writers.write_named_frames(tmp_path / "upright", frames)
+    assert data.open(tmp_path / "upright")[0].depth.shape == frames[0].depth.shape
+    writers.write_named_frames(tmp_path / "turned", [frame.replace(depth=frame.depth.mT) for frame in frames])
+    with pytest.raises(FormatError, match=r"depth\.png: size: found \d+x\d+, turned against its intrinsics"):
+        data.open(tmp_path / "turned")
+
+
+def test_coarse_depth_with_a_camera_of_its_own_has_no_gaps(tmp_path: Path) -> None:
+    """It is registered to the picture at its own density, not at that of the picture."""
+    (frame,) = walk(1)
+    coarse = torch.full((1, frame.hw[0] // 2, frame.hw[1] // 2), 2.0)
+    camera = cameras.resize(CAMERA, frame.hw, tuple(coarse.shape[-2:]))
+    writers.write_named_frames(tmp_path, [frame.replace(depth=coarse, depth_camera=camera)])
+    depth = data.open(tmp_path)[0].depth
+    assert depth.shape == coarse.shape and (depth[0, 1:-1, 1:-1] == 2).all()

@@ -1,10 +1,12 @@
 """Check of a capture: each planted fault has a finding of its kind whose option undoes it; sound captures have none."""
 
 import os
+import re
 from pathlib import Path
 
 import pytest
 import torch
+import torch.nn.functional as F
 from support.cluttered_walk import N, walk
 from support.stated_poses import poses_of, state_poses
 
@@ -114,6 +116,35 @@ def test_a_factor_near_1_is_a_scale_without_a_culprit(frames, true):
     assert finding.cause == "scale" and not check.poses_refuted and finding.remedy == ""
     assert "depth is 1.1" in finding.text and "which one, depth and poses alone do not show" in finding.text
     assert str(finding) == finding.text
+
+
+@pytest.mark.parametrize(("top", "left"), [(10, 13), (0, 26), (19, 0)])
+def test_pictures_that_were_cropped_alone_are_named_with_their_intrinsics(top, left, frames, true):
+    """80 % of each picture, enlarged to its size again: depth, poses and K stay those of the whole picture."""
+
+    def crop(frame):
+        inner = frame.image[..., top : top + 77, left : left + 102].float()
+        return frame.replace(image=F.interpolate(inner, frame.hw, mode="bilinear").round().to(frame.image.dtype))
+
+    check = check_capture(recording([crop(f) for f in frames], true))
+    (finding,) = check.findings
+    assert finding.cause == "registration" and not check.poses_refuted
+    share = float(re.search(r"these show (\d\.\d\d) of the field of view", finding.text).group(1))
+    stated = [float(x) for x in re.search(r"= ([-\d, ]+) px at 128x96", finding.text).group(1).split(",")]
+    h, w = frames[0].hw
+    zoom = w / 102
+    true_K = [100 * zoom, 98 * h / 77, (64.5 + 0.5 - left) * zoom - 0.5, (46.0 + 0.5 - top) * h / 77 - 0.5]
+    assert share == pytest.approx(1 / zoom, abs=0.06)
+    assert stated == pytest.approx(true_K, abs=8)
+
+
+def test_a_motion_that_does_not_show_the_scale_is_stated(frames, true):
+    assert check_capture(recording(frames, true)).limits == []
+    assert check_capture(recording(frames)).limits == []
+    still = Pose(true.R[:1].expand(N, 3, 3), true.t[:1].expand(N, 3))
+    check = check_capture(recording([frames[0]] * N, still))
+    (limit,) = check.limits
+    assert limit.startswith("the scale of depth and poses is not checked exactly: an error of a third or less")
 
 
 def test_depth_in_another_unit_is_named(frames, true):

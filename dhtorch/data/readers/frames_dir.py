@@ -133,7 +133,7 @@ def read(
     )
     # Depth has a camera of its own only where K_depth is set: most sets of this layout are registered.
     depth_K = _read_intrinsics(root, "K_depth", K_depth, meta) if K_depth is not None or "K_depth" in meta else None
-    other_K = _compare_with_file(root, [source[0] for source in (colour_K, depth_K) if source is not None])
+    other_K = _compare_with_file(root, colour_K, depth_K)
     report += other_K if stated.K is None else []
     units, unit = _parse_unit(units_per_metre, meta, side_car)
     rate = _parse_rate(fps if fps is not None else meta.get("fps"), side_car)
@@ -307,14 +307,14 @@ def _read_intrinsics(
     return (read_K(file), file, "K") if file else None
 
 
-def _compare_with_file(root: Path, used: Sequence[object]) -> list[str]:
-    """Report where the intrinsics file states neither of the ``used`` matrices, which came from elsewhere."""
+def _compare_with_file(root: Path, *used: tuple[object, Path, str] | None) -> list[str]:
+    """Report where the intrinsics file states none of the ``used`` (K, file, field), which came from elsewhere."""
     file = _first_existing(root, _INTRINSICS_FILES)
     if file is None:
         return []
     stated = read_K(file)
-    matrices = [np.asarray(K, np.float64) for K in used]
-    if any(K.shape == stated.shape and np.allclose(K, stated, rtol=_SAME_K_REL) for K in matrices):
+    matrices = [files.to_array(source[0], (3, 3), *source[1:]) for source in used if source is not None]
+    if any(np.allclose(K, stated, rtol=_SAME_K_REL) for K in matrices):
         return []
     return [
         f"{file.name} states another K than the one in use: f {stated[0, 0]:g}, c {stated[0, 2]:g} {stated[1, 2]:g}"

@@ -46,6 +46,10 @@ _K_EXPECTED = "fx fy cx cy, or a 3x3 or 4x4 matrix"
 #: shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's 1296×968 differs from 640×480 by 0.4 %.
 _MAX_ASPECT_ERROR = 0.01
 
+#: Offset of a principal point from the middle of a map, as a fraction of its sides, up to which K fits the map's size.
+#: Source: chosen on K of the shared data, which are at most 0.04 off.
+_MAX_CENTRE_OFFSET = 0.06
+
 #: Names of depth files that are decoded by the PGM codec.
 _PGM_SUFFIX = ".pgm"
 
@@ -74,7 +78,7 @@ class ImageTableLoader:
     units_per_metre: float = 1000.0
     no_return: tuple[int, ...] = NO_DEPTH_CODES
     rotated_bits: int = 0  # bits by which the codes are rotated to the left
-    register: bool = False  # warp depth with a camera of its own to the image
+    register: bool = False  # warp depth with a camera of its own to the image, at most at its own density
     exif: int | None = None  # orientation tag of every image; None = not checked
 
     def __call__(self, i: int) -> Frame:
@@ -105,8 +109,20 @@ class ImageTableLoader:
 def read_stored_sizes(loader: ImageTableLoader) -> tuple[ImageTableLoader, StoredSizes]:
     """The loader with the orientation tag of its first image, and what the files state of their orientation."""
     exif = files.read_image_header(loader.rows[0].image).orientation
+    _refuse_turned_depth(loader)
     depth_hw = loader.depth_hw if loader.depth_camera is None else None
     return replace(loader, exif=exif), StoredSizes.of_images(loader.hw, depth_hw, exif)
+
+
+def _refuse_turned_depth(loader: ImageTableLoader) -> None:
+    """Raise if depth maps lie turned by 90 degrees against the intrinsics of their own camera."""
+    if loader.depth_camera is None:
+        return
+    c, (h, w) = loader.depth_camera.c[0] + 0.5, loader.depth_hw
+    stated, turned = (float((c / c.new_tensor(size) - 0.5).abs().max()) for size in ((w, h), (h, w)))
+    if turned <= _MAX_CENTRE_OFFSET and stated > 2 * _MAX_CENTRE_OFFSET:
+        found = f"{w}x{h}, turned against its intrinsics with the principal point {c[0]:.0f}, {c[1]:.0f} px"
+        raise FormatError(loader.rows[0].depth, "size", found, "depth maps as their camera lies")
 
 
 def are_codes_rotated(file: Path) -> bool:

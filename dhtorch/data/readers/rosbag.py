@@ -44,7 +44,6 @@ from dhtorch.data.readers.rosbag_index import (
 from dhtorch.data.readers.rosbag_transforms import WORLD_FRAMES
 from dhtorch.data.recording import Recording
 from dhtorch.data.units import DepthUnit
-from dhtorch.geometry import camera as cameras
 from dhtorch.records import Camera, Frame, Pose
 
 #: Files of the format that are not read: ``metadata.yaml`` repeats what the others hold.
@@ -379,7 +378,4 @@ class _Load:
 
     def _register(self, depth: Tensor, depth_camera: Camera, T: Pose) -> Tensor:
         """Depth of the colour camera at the density of the depth camera."""
-        size = convert.size_of_registered_depth(depth_camera, self.camera, self.hw)
-        return convert.register_depth(
-            depth, depth_camera, cameras.resize(self.camera, self.hw, size), size, T.to(depth.dtype)
-        )
+        return convert.register_depth(depth, depth_camera, self.camera, self.hw, T.to(depth.dtype))
