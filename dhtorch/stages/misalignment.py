@@ -62,6 +62,10 @@ MIN_SHARED_RATIO = 0.25
 #: Source: chosen on shared_scenes, the field cases and the built-in rooms.
 MIN_OWN_COST = 0.05
 
+#: Limits the direction error of points by the pose's own covariance up to which a pair is tested, rad: a pose stated
+#: with more leaves residuals that no depth explains. Source: derived, 1.5 px of a picture with f = 500 px.
+MAX_POSE_ANGLE = 0.003
+
 #: Cells (across, down) of the picture in which the inverse depth of returns is averaged for other attachments, a count.
 #: Source: chosen on shared_scenes, the field cases and the built-in rooms.
 DEPTH_CELLS = (40, 30)
@@ -164,7 +168,18 @@ def _is_misaligned(
         rejected = rejected & (_unexplained_ratio(straight) > MIN_ROLLING_UNEXPLAINED)
     gain, n_shared = _attachment_gain(_thinned(straight), samples, camera_0)
     rejected = rejected | (gain < min_gain - few_returns / n_shared.clamp_min(1).sqrt()).any(-1)
-    return rejected & fit.ok & (n >= MIN_TESTED_RETURNS) & (fit.t_snr >= min_t_snr)
+    is_exact = _pose_angle(fit, masked_median(straight.p, straight.used)) <= MAX_POSE_ANGLE
+    return rejected & fit.ok & is_exact & (n >= MIN_TESTED_RETURNS) & (fit.t_snr >= min_t_snr)
+
+
+def _pose_angle(fit: PoseFit, p: Tensor) -> Tensor:
+    """Standard deviation (B,) rad of the direction of a point at inverse depth p (B, 1) by the pose's covariance.
+
+    The mean of all directions; 0 for a pose without a covariance.
+    """
+    variance = fit.cov.diagonal(dim1=-2, dim2=-1).nan_to_num(0.0)
+    rotation, translation = variance.split(3, -1)
+    return (rotation.mean(-1) + translation.mean(-1) * p[:, 0].nan_to_num(0.0).square()).sqrt()
 
 
 def _near_parallax(samples: Samples, tracks: Tracks, fit: PoseFit, camera_0: Camera, camera_1: Camera) -> _Parallax:

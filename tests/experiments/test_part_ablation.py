@@ -114,7 +114,8 @@ def test_every_difference_of_auto_belongs_to_one_part(every):
     assert set().union(*parts) == set(differences(window, other)) - {"chain"}
     assert sum(map(len, parts)) == len(set().union(*parts))
     assert variants["- hypotheses of auto"].hypotheses == window.hypotheses
-    assert not [name for name in part_ablation.build_auto_ablations(window, every["auto"]) if "of auto" in name]
+    names = part_ablation.build_auto_ablations(window, every["auto"])
+    assert [name for name in names if "of auto" in name] == ["+ verify of auto", "- verify of auto"]
     known = other.replace(triangulate={"residual_px": 0.3})
     assert "+ triangulate of auto" in part_ablation.build_auto_ablations(window, known)
 

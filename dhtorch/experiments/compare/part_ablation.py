@@ -161,7 +161,7 @@ def build_auto_ablations(window: Method, auto: Method) -> dict[str, Method]:
     gated = _swap_contradiction_gates(_swap_sigma_gate(window, auto), auto)
     parts = _ABLATION_PARTS | {
         f"{stage} of auto": partial(_swap_stage, stage)
-        for stage in ("sample", "backproject", "classify", "pose", "triangulate", "n", "hypotheses", "min_trackability")
+        for stage in _COMPARED_STAGES
         if stage_key(getattr(gated, stage)) != stage_key(getattr(auto, stage))
     }
     alone = {f"+ {name}": part(window, auto) for name, part in parts.items()}
@@ -189,6 +189,11 @@ def _swap_gates(names: Sequence[str], method: Method, other: Method) -> Method:
     changed = {name: value for name, value in theirs.items() if value != own[name]}
     return method.replace(triangulate=changed) if changed else method
 
+
+#: Stages and options of a method that are a part of their own where they differ.
+_COMPARED_STAGES = (
+    *("sample", "backproject", "classify", "pose", "verify", "triangulate", "n", "hypotheses", "min_trackability"),
+)
 
 #: Limit of the sigma of a single view, before views are fused.
 _swap_sigma_gate = partial(_swap_gates, ("max_sigma_rel",))
