@@ -115,6 +115,14 @@ def test_verdict_goes_either_way(changes, expected):
     assert method_comparison.verdict(judged(**changes), ["map"], set())[0] is expected
 
 
+@pytest.mark.parametrize(("coverage", "expected"), [(1.1, True), (0.89, False), (1.11, False), (None, None)])
+def test_a_twin_must_agree_with_the_reference(coverage, expected):
+    ratios = {"kornia.coverage_ratio_to_paper": {"value": coverage}, "kornia.error_ratio_to_paper": {"value": 1.15}}
+    met, why = method_comparison.verdict(judged(), ["map"], set(), ratios)
+    assert met is expected and ("kornia.coverage_ratio_to_paper" in why) == (not expected)
+    assert method_comparison.verdict(judged(), [], set(), ratios)[0] is expected, "a twin alone is enough"
+
+
 def test_bars_of_many_views_are_higher():
     assert method_comparison.verdict(judged(median_rel_ratio=0.65), ["map"], set())[0] is True
     assert method_comparison.verdict(judged(median_rel_ratio=0.65), ["map"], {"map"})[0] is False

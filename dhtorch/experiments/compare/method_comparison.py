@@ -4,7 +4,8 @@ Expectation (written before the run): over the scenes the median error falls to 
 0.6), no scene is more than 15 % worse at equal coverage, the area under the risk–coverage curve falls to 0.65 (0.55),
 more than a quarter of the candidates can be answered at 5 % mean risk, about 68 % of the errors lie within one stated
 sigma and 90 % within two, the recalibrated score is off by at most 0.07, and thresholds chosen on other rooms keep the
-mean error within their target.
+mean error within their target; another implementation of the reference (``kornia``) has .9 to 1.1 of its coverage and
+.9 to 1.15 of its error.
 What would refute it: any of these numbers missed.
 """
 
@@ -41,6 +42,9 @@ METHOD_BARS: dict[str, tuple[float, float, Callable[[float, float], bool]]] = {
     "realised_risk_10": (0.10, 0.10, lambda value, bar: value <= bar),
     "realised_risk_5": (0.05, 0.05, lambda value, bar: value <= bar),
 }
+
+#: Number of a twin → the interval in which its ratio to the reference must lie.
+TWIN_BARS = {"coverage_ratio": (0.9, 1.1), "error_ratio": (0.9, 1.15)}
 
 
 def run(
@@ -83,11 +87,12 @@ def run(
             the largest fraction over scenes of candidates (all seeds) that are answered with an error above 20 %.
 
     Raises:
-        ValueError: no reference, or nothing to compare with it; else as the main job.
+        ValueError: no reference, or neither a method to compare with it nor a twin; else as the main job.
     """
     methods = dict(methods or chosen)
     compared = [name for name in methods if name not in (*once, reference)]
-    if reference not in methods or not compared:
+    twins = [name for name in twins if name in methods]
+    if reference not in methods or not (compared or twins):
         raise ValueError(f"experiment.methods: found {', '.join(methods)}, expected {reference} and one more")
     fallback = stand_ins or {name: compared[0] for name in compared if methods[name].views > 1}
     variants = {
@@ -106,10 +111,12 @@ def run(
     comparison = compare.method_ratios(complete, reference=reference, rooms=rooms)
     keep_first_seed(outcome, methods, seeds)
     outcome.summary |= comparison.summary
-    for name in (n for n in twins if n in methods):
+    agreement: Row = {}
+    for name in twins:
         one, other = (points_by_seed(outcome, n, 1, apart=with_role) for n in (name, reference))
         ratios = compare.twin_ratios(one, other, reference)
-        outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in ratios.items()}
+        agreement |= {f"{name}.{k}": v.entry("1") for k, v in ratios.items()}
+    outcome.summary |= agreement
     outcome.summary |= _indoor_coverage(comparison, rooms, indoor)
     for name, scene_points in all_points.items():
         outcome.summary |= _worst_wrong_share(name, [p for scene, p in scene_points.items() if rooms[scene] in moving])
@@ -120,14 +127,23 @@ def run(
         for scene, row in outcome.scenes(name).items():
             row.update(by_scene.get(scene, {}))  # none where there were too few candidates
     _add_to_scene_rows(outcome.rows, comparison.rows, f"against_{reference}")
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(comparison, compared, set(several)))
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(comparison, compared, set(several), agreement))
 
 
 def verdict(
-    comparison: compare.MethodComparison, compared: Sequence[str], several: set[str]
+    comparison: compare.MethodComparison, compared: Sequence[str], several: set[str], agreement: Row | None = None
 ) -> tuple[bool | None, str]:
-    """(all bars met, or None if a number is undefined; bars that are missed, scenes without a ratio or an answer)."""
+    """(all bars met, or None if a number is undefined; bars that are missed, scenes without a ratio or an answer).
+
+    ``agreement``: ``<twin>.<number>_to_<reference>`` → entry of the summary.
+    """
     missed, n_met = [], 0
+    for name, entry in (agreement or {}).items():
+        low, high = next(bars for number, bars in TWIN_BARS.items() if f".{number}_to_" in name)
+        if entry["value"] is None:
+            return None, f"{name} is not defined on these scenes"
+        n_met += low <= entry["value"] <= high
+        missed += [] if low <= entry["value"] <= high else [f"{name} {entry['value']:.3f} (bars {low:g}, {high:g})"]
     for method in compared:
         for number, (two_view_bar, multi_view_bar, holds) in METHOD_BARS.items():
             value, bar = (
