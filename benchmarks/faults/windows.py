@@ -13,6 +13,7 @@ TESTS: dict[str, list[str]] = {
         "tests/stages/test_track.py",
         "tests/test_contract.py",
     ],
+    "stages.features": ["tests/stages/test_features.py"],
     "stages.track": [
         "tests/geometry/test_affine_alignment_reference.py",
         "tests/geometry/test_lucas_kanade.py",
@@ -397,6 +398,18 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_compose", "_inverse(_identity(change) + change[1:] / half)", "_identity(change) - change[1:] / half"),
         ("_compose", "(sides * change[0, :, None]).sum(0) / half", "change[0]"),
         ("_determinant", "closed_form.determinant_2x2(*A.flatten(0, 1))", "A[0, 0] * A[1, 1]"),
+    ],
+    "stages.features": [
+        ("match_features", "reach * max(image_0.shape[-2:])", "reach * min(image_0.shape[-2:])"),
+        ("match_features", "is_near & is_back & inside", "is_back & inside"),
+        ("match_features", "_predict(_reversed(matches), there[0]", "_predict(matches, there[0]"),
+        ("_find_matches", "matcher = matcher.match_xfeat_star", "matcher = matcher.match_xfeat_dense"),
+        ("_described_lafs", "lafs[0][filled], descriptors[0][filled]", "lafs[0], descriptors[0]"),
+        ("_as_matches", "frame_1 @ inverse", "inverse @ frame_1"),
+        ("_predict", "matches.uv_1[index] - (", "matches.uv_1[index] + ("),
+        ("_predict", "+ ridge", "+ 100 * ridge"),
+        ("_predict", "(1 + leverage) / (freedom * WEIGHTED_VARIANCE)", "leverage / freedom"),
+        ("_predict", "size / spread.clamp_min(MIN_SPREAD_PX)", "0 * size"),
     ],
     "stages.track": [
         ("MIN_TRACK_EIGENVALUE", "1e-4 * 2**10 / 255**2", "1e-4 * 2**5 / 255**2"),
