@@ -292,13 +292,22 @@ def _edge_vectors(x: Tensor, mask: Tensor) -> Tensor:
     return strength.clamp_max(_MAX_EDGE_STRENGTH * mean) * direction
 
 
+def edge_correlations(a: Tensor, b: Tensor, masks: Tensor) -> Tensor:
+    """Vector fields (n, 3, h, w) and (m, 3, h, w) → correlation coefficients (n, m), float64, of each with each.
+
+    Each is taken over the mask (m, h, w) of the second field; 0 where one of them is constant. All are products of
+    matrices. Gradient: none.
+    """
+    weight = masks.to(a.dtype).flatten(1)
+    count = weight.sum(1).double().clamp_min(1)
+    a, b = a.flatten(2), b.flatten(2) * weight[:, None]
+    sum_a, sum_b = torch.einsum("ncp,mp->nmc", a, weight).double(), b.sum(2).double()
+    square_a = (a.square().sum(1) @ weight.T).double() - sum_a.square().sum(2) / count
+    square_b = b.square().sum((1, 2)).double() - sum_b.square().sum(1) / count
+    product = (a.flatten(1) @ b.flatten(1).T).double() - (sum_a * sum_b).sum(2) / count
+    return product / (square_a * square_b).clamp_min(0).sqrt().clamp_min(1e-12)
+
+
 def edge_correlation(a: Tensor, b: Tensor, mask: Tensor) -> float:
     """Correlation coefficient of two vector fields (3, h, w) over a mask; 0 where one of them is constant."""
-    n = float(mask.sum())
-    if n == 0:
-        return 0.0
-    weight = mask.to(a.dtype).flatten()
-    a, b = a.flatten(1), b.flatten(1)
-    mean_a, mean_b = a @ weight / n, b @ weight / n
-    a, b = (a - mean_a[:, None]) * weight, (b - mean_b[:, None]) * weight
-    return float((a * b).sum() / ((a * a).sum() * (b * b).sum()).sqrt().clamp_min(1e-12))
+    return float(edge_correlations(a[None], b[None], mask[None]))

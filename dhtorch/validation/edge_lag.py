@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.data.orientation import depth_edges, edge_correlation, picture_edges
+from dhtorch.data.orientation import depth_edges, edge_correlations, picture_edges
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.pipeline.dense import map_pixel_centres
@@ -52,25 +52,27 @@ class EdgeLag(NamedTuple):
 def find_edge_lag(frames: Sequence[Frame]) -> EdgeLag:
     """Consecutive frames (B = 1 each, with pictures) -> lag of their depth. Gradient: none."""
     with torch.no_grad():
-        pictures = [picture_edges(frame.image[0], grid_px=_GRID_PX) for frame in frames]
-        hw = pictures[0].shape[-2], pictures[0].shape[-1]
+        pictures = torch.stack([picture_edges(frame.image[0], grid_px=_GRID_PX) for frame in frames])
+        hw = pictures.shape[-2], pictures.shape[-1]
         depths = [depth_edges(depth_over_picture(frame, frame.depth), hw) for frame in frames]
+        edges, covered = (torch.stack(each) for each in zip(*depths, strict=True))
+        scores = edge_correlations(pictures, edges, covered)
     n = len(frames)
     best = EdgeLag(0, 0.0)
-    without = [edge_correlation(pictures[i], *depths[i]) for i in range(n)]
     for lag in range(-MAX_LAG_FRAMES, MAX_LAG_FRAMES + 1):
         places = [i for i in range(n) if 0 <= i + lag < n]
         if lag == 0 or len(places) < _MIN_FRAMES:
             continue
-        lead = [edge_correlation(pictures[i], *depths[i + lag]) - without[i] for i in places]
-        if (mean := clear_lead(torch.tensor(lead, dtype=torch.float64), _MIN_LEAD)) > best.lead:
+        lead = scores[places, [i + lag for i in places]] - scores[places, places]
+        if (mean := clear_lead(lead, _MIN_LEAD)) > best.lead:
             best = EdgeLag(lag, mean)
     if best.lag == 0:
         return best
     places = [i for i in range(n) if 0 <= i + best.lag < n]
     places = places[:: max(1, len(places) // _MAX_SHIFTED_FRAMES)]
     late, now = (
-        _shifted_scores([pictures[i] for i in places], [depths[i + by] for i in places]) for by in (best.lag, 0)
+        torch.stack([_shifted_scores(pictures[i], edges[i + by], covered[i + by]) for i in places])
+        for by in (best.lag, 0)
     )
     shifted_lead = late[:, int(late.mean(0).argmax())] - now[:, int(now.mean(0).argmax())]
     return best if clear_lead(shifted_lead, _MIN_LEAD) > 0 else EdgeLag(0, 0.0)
@@ -99,15 +101,12 @@ def clear_lead(lead: Tensor, least: float) -> float:
     return mean if mean > max(least, _MIN_LEAD_ERRORS * error) else 0.0
 
 
-def _shifted_scores(pictures: Sequence[Tensor], depths: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
-    """Correlations (n, shifts) of edges with those of depth moved by up to 3 px each way.
+def _shifted_scores(picture: Tensor, edges: Tensor, covered: Tensor) -> Tensor:
+    """Correlations (shifts,) of edges of a picture with those of depth moved by up to 3 px each way.
 
     Depth that lies some pixels beside its pictures looks late or early while the camera moves steadily: a lag counts
     only beyond what one shift of all frames explains.
     """
     shifts = list(itertools.product(_SHIFTS_PX, repeat=2))
-    rows = []
-    for picture, (edges, covered) in zip(pictures, depths, strict=True):
-        moved = ((torch.roll(edges, by, (-2, -1)), torch.roll(covered, by, (-2, -1))) for by in shifts)
-        rows.append([edge_correlation(picture, *each) for each in moved])
-    return torch.tensor(rows, dtype=torch.float64)
+    moved, masks = (torch.stack([torch.roll(x, by, (-2, -1)) for by in shifts]) for x in (edges, covered))
+    return edge_correlations(picture[None], moved, masks)[0]
