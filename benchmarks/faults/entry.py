@@ -99,7 +99,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("SampleSpec._camera", "camera.f.detach().amin(-1)", "camera.f.detach()[:, 0]"),
         ("SampleSpec._camera", "self.min_focal * max(hw)", "self.min_focal * min(hw)"),
         ("SampleSpec._camera", "not failed and ", ""),
-        ("_is_clearly_plausible", "x > 0 and x > least", "x > least"),
+        ("_is_clearly_plausible", "x > least", "x >= 0"),
         ("_is_clearly_plausible", "all(map(math.isfinite, c))", "True"),
         ("SampleSpec._camera", "leaves.numbers(self.distortion, T, at)", "leaves.numbers(self.distortion, T, 0)"),
         ("SampleSpec._camera", "~(small >= least)", "small < least / 2"),

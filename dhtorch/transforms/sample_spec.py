@@ -432,7 +432,7 @@ def _is_clearly_plausible(camera: Camera, least: float) -> bool:
     if not (_is_cheap_to_read(camera.c) and camera.f.dtype == camera.c.dtype):
         return False
     f, c = camera.f.flatten().tolist(), camera.c.flatten().tolist()
-    return all(x > 0 and x > least * (1 + _ROUNDING_REL) for x in f) and all(map(math.isfinite, c))
+    return all(x > least * (1 + _ROUNDING_REL) for x in f) and all(map(math.isfinite, c))
 
 
 def _is_cheap_to_read(x: Tensor) -> bool:

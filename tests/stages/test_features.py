@@ -74,7 +74,8 @@ def test_frames_of_matches_say_how_their_surroundings_move():
     """Local affine frames carry the motion over distances that the matches alone do not."""
     uv = torch.tensor([[40.0, 40.0], [120.0, 40.0], [40.0, 90.0], [120.0, 90.0]])
     A = torch.tensor([[1.05, 0.1], [-0.08, 0.95]])
-    lafs = torch.cat((5 * torch.eye(2).expand(4, 2, 2), uv[..., None]), -1)[None]
+    frame = torch.tensor([[5.0, 2.0], [0.0, 3.0]])
+    lafs = torch.cat((frame.expand(4, 2, 2), uv[..., None]), -1)[None]
     moved = torch.cat((A @ lafs[0, :, :, :2], affine(uv)[..., None]), -1)[None]
     found = features._as_matches(uv, affine(uv), lafs, moved)
     torch.testing.assert_close(found.A, A.expand(4, 2, 2))
@@ -90,6 +91,13 @@ def test_samples_that_no_match_reaches_are_not_valid():
     tracks = tracked(matcher=half, reach=0.05)
     right = pixels()[..., 0] > 95
     assert not tracks.valid[right].any() and tracks.valid[pixels()[..., 0] < 70].float().mean() > 0.8
+    columns = torch.stack(
+        torch.meshgrid(torch.arange(8.0, 81, 4), torch.arange(4.0, 116, 4), indexing="ij"), -1
+    ).flatten(0, 1)
+    row = torch.tensor([[[87.0, 60.0], [89.0, 60.0]]])
+    assert tracked(row, matcher=lambda a, b: (columns, columns), reach=0.05).valid.tolist() == [[True, False]], "8 px"
+    smaller = tracked(row, matcher=lambda a, b: (columns, 0.4 * columns), reach=0.03)
+    assert not smaller.valid.any(), "near in the other picture alone"
     none = tracked(matcher=lambda a, b: (torch.zeros(0, 2), torch.zeros(0, 2)))
     assert not none.valid.any() and none.uv_1.isfinite().all() and none.cov.isfinite().all()
     for options in ({"neighbours": 3}, {"reach": 0.0}):
@@ -130,6 +138,12 @@ def test_every_kind_of_matcher_is_called(kind):
     if "LocalFeature" in kind:
         off = (tracks.uv_1 - pixels() - torch.tensor([3.0, -2.0]))[tracks.valid]
         assert tracks.valid.float().mean() > 0.7 and off.abs().median() < 0.7
+
+
+def test_slots_that_a_detector_left_empty_match_nothing():
+    images = waves(1, *HW).float(), waves(1, *HW, shift=(3.0, -2.0)).float()
+    found = features._find_matches(kinds()["a detector and a descriptor"].eval(), *images)
+    assert len(found.uv_0) > 50 and (found.uv_0 > 1).all()
 
 
 def test_another_module_is_refused_by_name():
