@@ -96,7 +96,7 @@ def test_samples_that_no_match_reaches_are_not_valid():
     ).flatten(0, 1)
     row = torch.tensor([[[87.0, 60.0], [89.0, 60.0]]])
     assert tracked(row, matcher=lambda a, b: (columns, columns), reach=0.05).valid.tolist() == [[True, False]], "8 px"
-    smaller = tracked(row, matcher=lambda a, b: (columns, 0.4 * columns), reach=0.03)
+    smaller = tracked(row, matcher=lambda a, b: (columns, 0.4 * columns), reach=0.04)
     assert not smaller.valid.any(), "near in the other picture alone"
     none = tracked(matcher=lambda a, b: (torch.zeros(0, 2), torch.zeros(0, 2)))
     assert not none.valid.any() and none.uv_1.isfinite().all() and none.cov.isfinite().all()
@@ -112,7 +112,7 @@ class Detector(torch.nn.Module):
         v, u = torch.meshgrid(torch.arange(16.0, HW[0] - 15, 8), torch.arange(16.0, HW[1] - 15, 8), indexing="ij")
         uv = torch.stack((u, v), -1).flatten(0, 1)[None]
         lafs = KF.laf_from_center_scale_ori(uv, torch.full((1, uv.shape[1], 1, 1), 12.0))
-        return torch.cat((lafs, torch.zeros(1, 5, 2, 3)), 1), torch.ones(1, uv.shape[1] + 5)
+        return torch.cat((lafs, torch.zeros(1, 1, 2, 3)), 1), torch.ones(1, uv.shape[1] + 1)
 
 
 def kinds():
