@@ -23,15 +23,6 @@ from dhtorch.records import Samples, TrackHint, Tracks
 from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.track import lucas_kanade
 
-__all__ = [
-    "PnPSolution",
-    "PointTracks",
-    "solve_p3p",
-    "solve_pnp_ransac",
-    "track_points_lk",
-    "triangulate_points_one_sided",
-]
-
 
 class PointTracks(NamedTuple):
     """Points found in another image."""
