@@ -121,8 +121,8 @@ def _refuse_turned_depth(loader: ImageTableLoader) -> None:
     c, (h, w) = loader.depth_camera.c[0] + 0.5, loader.depth_hw
     stated, turned = (float((c / c.new_tensor(size) - 0.5).abs().max()) for size in ((w, h), (h, w)))
     if turned <= _MAX_CENTRE_OFFSET and stated > 2 * _MAX_CENTRE_OFFSET:
-        found = f"{w}x{h}, turned against its intrinsics with the principal point {c[0]:.0f}, {c[1]:.0f} px"
-        raise FormatError(loader.rows[0].depth, "size", found, "depth maps as their camera lies")
+        size = f"{w}x{h}, turned against its intrinsics with the principal point {c[0]:.0f}, {c[1]:.0f} px"
+        raise FormatError(loader.rows[0].depth, "size", size, "depth maps as their camera lies")
 
 
 def are_codes_rotated(file: Path) -> bool:
