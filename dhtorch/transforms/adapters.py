@@ -4,7 +4,8 @@ LeRobot returns samples one by one, map-style or as a stream: :class:`ExtendedDa
 the data set (its own ``image_transforms`` gets one image and no depth). openpi calls ``dict → dict`` with numpy
 leaves: :class:`NumpyTransform`. OpenVLA calls ``batch_transform`` on an RLDS frame and then a collator for its own
 keys: :class:`RldsBatchTransform`, :class:`AddedCollate`. In ``torchvision.transforms.v2.Compose`` the transform is used
-directly, before any crop: a crop would not adapt the intrinsics.
+directly, before any crop: a crop would not adapt the intrinsics. kornia's containers move the intrinsics within
+:class:`dhtorch.transforms.kornia.AugmentSample`.
 """
 
 from __future__ import annotations

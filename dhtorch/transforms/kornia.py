@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from kornia.augmentation import IntensityAugmentationBase2D, RigidAffineAugmentationBase2D
 from kornia.augmentation.container import AugmentationSequential, ImageSequential, PatchSequential, VideoSequential
@@ -141,13 +142,14 @@ class AugmentSample(torch.nn.Module):
         if not isinstance(container, AugmentationSequential) or container.data_keys is not None:
             return sample
         own = {*self.views.keys(), self.views.metric_depth_key}
-        names = tuple(key for key in sample if key not in own and isinstance(sample[key], Tensor))
+        names = tuple(k for k, x in sample.items() if k not in own and isinstance(x, Tensor | np.ndarray))
         unknown = container._read_datakeys_from_dict(names)[1] or ()
-        others = {key: sample[key] for key in names if key not in unknown}
+        others = {key: to_tensor(sample[key], key) for key in names if key not in unknown}
         if not others:
             return sample
+        others = others if self.batched else {key: x[None] for key, x in others.items()}
         moved = container(others, params=[p for p in params if not self._takes_samples(p)])
-        return {**sample, **moved}
+        return sample | (moved if self.batched else {key: x[0] for key, x in moved.items()})
 
     def _takes_samples(self, param: ParamItem) -> bool:
         return isinstance(self.container.get_submodule(param.name), _SAMPLE_TRANSFORMS)

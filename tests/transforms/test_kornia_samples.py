@@ -370,6 +370,11 @@ def test_masks_and_keypoints_of_a_sample_move_with_kornia():
     assert torch.equal(out["mask"][:, 0] > 0, out["depth"] > 0) and out["task"] == ["a", "b"]
     for b in range(2):
         torch.testing.assert_close(out["keypoints"][b].double(), moved_pixels(A[b], points[b]), rtol=0, atol=1e-3)
+    alone = {key: value[0] for key, value in given.items() if key != "task"} | {"mask": inside[0].numpy()}
+    chain = K.AugmentationSequential(K.RandomVerticalFlip(p=1.0), data_keys=None)
+    out, A = augment(chain, alone, batched=False)
+    assert torch.equal(out["mask"][0] > 0, out["depth"] > 0) and out["mask"].shape == (1, H, W)
+    torch.testing.assert_close(out["keypoints"].double(), moved_pixels(A[0], points[0]), rtol=0, atol=1e-3)
 
 
 def test_the_keys_of_a_pair_of_loftr():
@@ -454,3 +459,13 @@ def test_nested_keys_and_confidence_move():
     out, _ = augment(K.RandomCrop((30, 37), p=1.0), frames, batched=False)
     assert out["image"].shape == (3, 3, 30, 37) and out["depth"].shape == (3, 30, 37), "frames along time alike"
     assert torch.equal(out["image"][0], out["image"][2])
+
+
+def test_gradients_reach_picture_depth_and_intrinsics():
+    leaves = {key: value.clone().requires_grad_() for key, value in sample(1).items()}
+    out, _ = augment(K.RandomHorizontalFlip(p=1.0), leaves)
+    sum(out[key].square().sum() for key in leaves).backward()
+    torch.testing.assert_close(leaves["depth"].grad, 2 * leaves["depth"].detach())
+    torch.testing.assert_close(leaves["image"].grad, 2 * leaves["image"].detach())
+    numbers = leaves["intrinsics"].grad[0]
+    assert numbers[0, 0] == 80 and numbers[0, 2] == pytest.approx(-2 * (W - 1 - 33), abs=1e-3)
