@@ -276,7 +276,10 @@ class _Augmented:
         axes = (-2, -1) if stored.shape[-2:] == (h, w) else (-3, -2)
         shape = list(stored.shape)
         shape[axes[0]], shape[axes[1]] = size
-        return self._returned(values.reshape(shape).view(stored.dtype))
+        values = (
+            values.view(torch.uint16) if stored.dtype == torch.uint16 else values
+        )  # a view of a dtype has no gradient
+        return self._returned(values.reshape(shape))
 
     def _per_value(self, M: Tensor, x: Tensor, tail: int) -> Tensor:
         """Matrices (B, k, k) as (B, 1, …, k, k) for values (B, …) whose last ``tail`` axes are one value."""
