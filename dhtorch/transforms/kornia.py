@@ -276,9 +276,8 @@ class _Augmented:
         axes = (-2, -1) if stored.shape[-2:] == (h, w) else (-3, -2)
         shape = list(stored.shape)
         shape[axes[0]], shape[axes[1]] = size
-        values = (
-            values.view(torch.uint16) if stored.dtype == torch.uint16 else values
-        )  # a view of a dtype has no gradient
+        if stored.dtype == torch.uint16:
+            values = values.view(torch.uint16)  # for no other type: a view of a type has no gradient
         return self._returned(values.reshape(shape))
 
     def _per_value(self, M: Tensor, x: Tensor, tail: int) -> Tensor:
