@@ -99,6 +99,21 @@ def shared() -> str:
     return table(head, rows)
 
 
+def twin() -> str:
+    """The paper's method and its implementation on kornia: both side by side, and how their times compare."""
+    rows = []
+    for scene, methods in scenes("kornia_twin", "full").items():
+        both = methods["paper"], methods["kornia"]
+        cells = [scene, str(both[0]["n_candidates"])]
+        cells += [" / ".join(percent(row[key]) for row in both) for key in ("coverage", "median_rel")]
+        of_paper, of_kornia = (sum(row["ms"].values()) for row in both)
+        rows.append([*cells, number(of_kornia / of_paper)])
+    summary = json.loads((RESULTS / "kornia_twin.json").read_text())["summary"]
+    ratios = [number(summary[f"kornia.{k}_ratio_to_paper"]["value"]) for k in ("coverage", "error")]
+    rows.append(["`kornia` / `paper`, geometric mean", "", *ratios, ""])
+    return table(["scene", "candidates", "coverage, `paper` / `kornia`", "median error", "time, ratio"], rows)
+
+
 def truths() -> str:
     """What the truth test changes: medians over scenes."""
     summary = json.loads((RESULTS / "shared_scenes.json").read_text())["summary"]
@@ -534,6 +549,7 @@ def client(name: str) -> str:
 
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
+TABLES |= {"kornia twin": twin}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
 TABLES |= {
     "validate": validated,

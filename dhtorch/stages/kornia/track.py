@@ -50,7 +50,7 @@ def lucas_kanade_kornia(
         o = (window, iterations, epsilon_px)
         y, valid, A = _search(pyramid_0, pyramid_1, uv_0, start, o)
         x, returned, _ = _search(pyramid_1, pyramid_0, y, y + uv_0 - start, o)
-        error = (x - uv_0).norm(dim=-1)
+        error = (x - uv_0).nan_to_num(0.0, 0.0, 0.0).norm(dim=-1)
     uv_1, difference = _newton_step(grey_0, grey_1, uv_0, y, valid, A=A, window=window)
     if not (torch.is_grad_enabled() and any(v.requires_grad for v in (image_0, image_1, uv_0))):
         uv_1 = uv_1.detach()
@@ -72,7 +72,7 @@ def _search(
     """Positions (B, N, 2) in ``target`` of points x of ``source``, searched from y on; which are valid (B, N); A."""
     window, iterations, epsilon_px = o
     valid = _is_inside(source[0], x) & y.isfinite().all(-1)
-    x, y = (torch.where(valid[..., None], p, 0.0) for p in (x, y))
+    x, y = (p.nan_to_num(0.0, 0.0, 0.0) for p in (x, y))
     pair = torch.arange(len(x), device=x.device)[:, None]
     for picture_0, picture_1 in zip(reversed(source), reversed(target), strict=True):
         T, g = _template(picture_0, _to_level(x, source[0], picture_0), window)
