@@ -49,7 +49,7 @@ def pnp_ransac_kornia(
     xyz, uv, usable = (F.pad(x, (0, 0) * (x.dim() - 2) + (0, 1), value=1) for x in (xyz, uv, usable))
     usable[:, -1] = False  # one more point, which is not used: no pair is without points
     with torch.no_grad():
-        T, found = _search(xyz, uv, usable, K, draws.double(), threshold_px)
+        T, has_pose = _search(xyz, uv, usable, K, draws.double(), threshold_px)
         for _ in range(steps + 1):
             start = T
             g, H, square, inlier = _linearise(start, xyz, uv, K, usable, threshold_px)
@@ -70,7 +70,7 @@ def pnp_ransac_kornia(
         cov = inverse * sigma_px.square()[:, None, None]
         whitened, _ = _solve(cov[:, 3:, 3:], t[..., None])
         few, bad, enough = PoseCode.TOO_FEW, PoseCode.DEGENERATE, usable.sum(-1) >= min_inlier
-        code = first_reason((~enough, few), (~found, bad), (n_inlier < min_inlier, few), (~(regular & solved), bad))
+        code = first_reason((~enough, few), (~has_pose, bad), (n_inlier < min_inlier, few), (~(regular & solved), bad))
     fit = PoseFit(
         T_1_from_0=Pose(R, t),
         cov=cov,
