@@ -166,7 +166,7 @@ def _is_misaligned(
     rejected = _unexplained_ratio(rolling) > max_unexplained + few_returns / n.clamp_min(1).sqrt()
     if fit.shutter is not None:
         rejected = rejected & (_unexplained_ratio(straight) > MIN_ROLLING_UNEXPLAINED)
-    gain, n_shared = _attachment_gain(_thinned(straight), samples, camera_0)
+    gain, n_shared = _attachment_gain(_thinned(straight), samples)
     rejected = rejected | (gain < min_gain - few_returns / n_shared.clamp_min(1).sqrt()).any(-1)
     is_exact = _pose_angle(fit, masked_median(straight.p, straight.used)) <= MAX_POSE_ANGLE
     return rejected & fit.ok & is_exact & (n >= MIN_TESTED_RETURNS) & (fit.t_snr >= min_t_snr)
@@ -252,12 +252,12 @@ def _unexplained_ratio(near: _Parallax) -> Tensor:
     return own / torch.where(flat > 0, flat, 1.0)
 
 
-def _attachment_gain(near: _Parallax, samples: Samples, camera_0: Camera) -> tuple[Tensor, Tensor]:
+def _attachment_gain(near: _Parallax, samples: Samples) -> tuple[Tensor, Tensor]:
     """Cost of the depths at other pixels over that of the depths at the own ones (B, K), and the shared returns."""
-    size = 2 * camera_0.c[:, None]
+    size = _sampled_size(samples)
     mean, filled = _cell_means(samples, size)
     change = near.p.new_tensor([(1.0, 1.0, 0.0, 0.0), *ATTACHMENTS])
-    centre = camera_0.c[:, None, None]
+    centre = size[:, None] / 2
     at = centre + (near.uv[:, None] - centre) * change[:, None, :2] + change[:, None, 2:] * size[:, None]
     cell, inside = _cells(at.flatten(1, 2), size)
     p, has = (x.gather(1, cell).view(at.shape[:-1]) for x in (mean, filled))
@@ -273,6 +273,14 @@ def _attachment_gain(near: _Parallax, samples: Samples, camera_0: Camera) -> tup
     testable = (n >= MIN_TESTED_RETURNS) & (n >= MIN_SHARED_RATIO * near.used.sum(-1, keepdim=True))
     testable = testable & (own_cost > MIN_OWN_COST)
     return torch.where(testable, cost / torch.where(own_cost > 0, own_cost, 1.0), torch.inf), n
+
+
+def _sampled_size(samples: Samples) -> Tensor:
+    """Size (B, 1, 2) px of the picture that samples cover; the principal point of a crop is not its middle."""
+    if samples.uv.shape[1] == 0:
+        return samples.xyz.new_ones(len(samples.uv), 1, 2)
+    first, last = samples.uv.aminmax(dim=1, keepdim=True)
+    return (first + last + 1).to(samples.xyz.dtype)
 
 
 def _cells(uv: Tensor, size: Tensor) -> tuple[Tensor, Tensor]:
