@@ -296,6 +296,15 @@ def test_without_a_graph_nothing_asks_for_a_gradient(pair, both):
         assert not KORNIA(pair[0].replace(image=image), pair[1], n=64).depth.requires_grad
 
 
+def test_inference_mode_changes_no_bit(pair):
+    grey = [f.replace(image=f.image.mean(1, keepdim=True)) for f in pair]
+    plain = KORNIA(*grey, n=128)
+    with torch.inference_mode():
+        inferred = KORNIA(*(f.map(torch.clone) for f in grey), n=128)
+    assert torch.equal(plain.gate, inferred.gate) and plain.keep.any()
+    assert torch.equal(plain.depth[plain.keep], inferred.depth[plain.keep])
+
+
 # ------------------------------------------------------------------------------------------------ rare inputs
 
 

@@ -24,6 +24,7 @@ MAX_SCORED_POINTS = 256
 MIN_POSE_PIVOT = 1e-6
 
 
+@torch.inference_mode(False)  # it differentiates inside
 def pnp_ransac_kornia(
     samples: Samples,
     tracks: Tracks,
@@ -94,7 +95,6 @@ def _search(xyz: Tensor, uv: Tensor, usable: Tensor, K: Tensor, draws: Tensor, l
     index = order.gather(1, triples.flatten(1).clamp(max=order.shape[1] - 1))[..., None].expand(-1, -1, 3)
     rays = kg.camera.unproject_points(uv, torch.ones_like(uv[..., :1]), K)
     R, t, valid = (x.flatten(1, 2) for x in p3p(*(x.gather(1, index).unflatten(1, (-1, 3)) for x in (rays, xyz))))
-
     slots = (torch.arange(MAX_SCORED_POINTS, device=n.device) + 0.5) / MAX_SCORED_POINTS * count[:, None]
     scored = order.gather(1, slots.long())[..., None]
     points = kg.convert_points_to_homogeneous(xyz.gather(1, scored.expand(-1, -1, 3)))

@@ -20,6 +20,7 @@ from dhtorch.records import NO_HINT, TrackHint, Tracks
 MIN_EIGENVALUE = 1e-4 * 2**10 / 255**2
 
 
+@torch.inference_mode(False)  # it differentiates inside
 def lucas_kanade_kornia(
     image_0: Tensor,  # (B, C, H, W) C 1 or 3; float in [0, 1] or uint8
     image_1: Tensor,  # (B, C, H', W')
@@ -41,7 +42,7 @@ def lucas_kanade_kornia(
     Gradient: ``uv_1`` to both images and ``uv_0``; the other fields are detached.
     Source: Lucas and Kanade 1981; Bouguet 2000 (pyramid).
     """
-    grey_0, grey_1 = (grayscale(image).to(uv_0.dtype) for image in (image_0, image_1))
+    grey_0, grey_1 = (grayscale(image).to(uv_0.dtype, copy=True) for image in (image_0, image_1))
     with torch.no_grad():
         side, most = min(*grey_0.shape[-2:], *grey_1.shape[-2:]), levels if hint.levels is None else hint.levels
         n_levels = max([k + 1 for k in range(most) if side >> k > window], default=1)

@@ -62,7 +62,6 @@ def two_view_kornia(
     own = torch.einsum("bni,bnij,bnj->bn", g, torch.where(usable[..., None, None], tracks.cov, 0.0).double(), g)
     cov_pose = torch.where(posed[..., None], fit.cov, 0.0).double()
     shared = torch.einsum("bni,bij,bnj->bn", by_pose, cov_pose, by_pose)
-
     gates = {Gate.NO_BASELINE: PoseCode.NO_BASELINE, Gate.POSE_REFUTED: PoseCode.REFUTED}
     gates[Gate.MISALIGNED] = PoseCode.MISALIGNED
     gate = first_reason(
