@@ -4,10 +4,23 @@ A row is (function, text that is there once, text that takes its place); a fourt
 answer. Rows come from what was once not noticed, and from what the rules of ``mutants.py --sweep`` drew.
 """
 
-from faults import enriching, entry, front, geometry, joining, judging, pose_priors, ruling, solving, sweeping, windows
+from faults import (
+    enriching,
+    entry,
+    front,
+    geometry,
+    joining,
+    judging,
+    kornia,
+    pose_priors,
+    ruling,
+    solving,
+    sweeping,
+    windows,
+)
 from faults.rows import Fault, faults
 
-PARTS = (geometry, solving, windows, front, joining, pose_priors, sweeping, entry, enriching, judging, ruling)
+PARTS = (geometry, solving, windows, front, kornia, joining, pose_priors, sweeping, entry, enriching, judging, ruling)
 
 FAULTS: list[Fault] = [fault for part in PARTS for fault in faults(part.FAULTS)]
 

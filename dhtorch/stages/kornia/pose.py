@@ -20,9 +20,6 @@ from dhtorch.records import Camera, Pose, PoseFit, Samples, Tracks
 #: Limits the points that hypotheses are scored on, a count; more are thinned evenly. Source: ``PAPER``.
 MAX_SCORED_POINTS = 256
 
-#: Limits the pivots of a normal matrix of unit diagonal from below, without unit: singular below. Source: ``PAPER``.
-MIN_POSE_PIVOT = 1e-6
-
 
 @torch.inference_mode(False)  # it differentiates inside
 def pnp_ransac_kornia(
@@ -45,7 +42,8 @@ def pnp_ransac_kornia(
     Gradient: R and t to near ``xyz``, ``uv_1`` and camera 1; the other fields are detached. Float64 inside.
     Source: paper, "LiDAR-anchored relative pose", with P3P in place of EPnP.
     """
-    usable, K = tracks.valid & samples.usable & tracks.uv_1.isfinite().all(-1), to_matrix(camera_1).double()
+    K = to_matrix(camera_1).double()
+    usable = tracks.valid & samples.usable & tracks.uv_1.isfinite().all(-1)
     xyz, uv = (torch.where(usable[..., None], x, 1.0).double() for x in (samples.xyz, tracks.uv_1))
     xyz, uv, usable = (F.pad(x, (0, 0) * (x.dim() - 2) + (0, 1), value=1) for x in (xyz, uv, usable))
     usable[:, -1] = False  # one more point, which is not used: no pair is without points
@@ -65,7 +63,8 @@ def pnp_ransac_kornia(
     if not (torch.is_grad_enabled() and any(x.requires_grad for x in (xyz, uv, K))):
         R, t = R.detach(), t.detach()  # kornia's groups hold parameters
     with torch.no_grad():
-        n_inlier, total = inlier.sum(-1), torch.where(inlier, square, 0.0).sum(-1)
+        n_inlier = inlier.sum(-1)
+        total = torch.where(inlier, square, 0.0).sum(-1)
         sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(1e-6)
         inverse, regular = _solve(H, torch.eye(6).to(H).expand_as(H))
         cov = inverse * sigma_px.square()[:, None, None]
@@ -87,7 +86,8 @@ def pnp_ransac_kornia(
 
 def _search(xyz: Tensor, uv: Tensor, usable: Tensor, K: Tensor, draws: Tensor, limit: float) -> tuple[Se3, Tensor]:
     """The pose (B,) of least truncated cost among those of all triples, and whether there is one (B,)."""
-    count, order = usable.sum(-1), (~usable).to(torch.uint8).argsort(stable=True, dim=-1)  # usable points first
+    count = usable.sum(-1)
+    order = (~usable).to(torch.uint8).argsort(stable=True, dim=-1)  # usable points first
     n = count.clamp_min(3)[:, None]
     first, second, third = (torch.minimum((draws[..., k] * (n - k)).long(), n - k - 1) for k in range(3))
     # Both are counted from the first point on; the third skips the second.
@@ -121,10 +121,10 @@ def _linearise(T: Se3, xyz: Tensor, uv: Tensor, K: Tensor, usable: Tensor, limit
 
 
 def _solve(H: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
-    """H⁻¹ rhs (B, n, m) of symmetric matrices, 0 where one is not positive; and whether (B,) it is."""
+    """H⁻¹ rhs (B, n, m) of symmetric matrices, 0 where one is not positive (as in ``PAPER``); whether (B,) it is."""
     scale = H.diagonal(dim1=1, dim2=2).clamp_min(1e-300).rsqrt()[..., None]
     L, info = torch.linalg.cholesky_ex(scale * H * scale.mT)
-    positive = ((info == 0) & (L.diagonal(dim1=1, dim2=2).amin(-1) > MIN_POSE_PIVOT))[:, None, None]
+    positive = ((info == 0) & (L.diagonal(dim1=1, dim2=2).amin(-1) > 1e-6))[:, None, None]
     x = scale * torch.cholesky_solve(scale * rhs, torch.where(positive, L, torch.eye(H.shape[-1]).to(H)))
     return torch.where(positive, x, 0.0), positive.flatten()
 

@@ -55,8 +55,8 @@ def lucas_kanade_kornia(
     uv_1, difference = _newton_step(grey_0, grey_1, uv_0, y, valid, A=A, window=window)
     if not (torch.is_grad_enabled() and any(v.requires_grad for v in (image_0, image_1, uv_0))):
         uv_1 = uv_1.detach()
-    square, trace = difference.square().sum(-1), A.diagonal(dim1=-2, dim2=-1).sum(-1)
-    A = A + 1e-5 * trace.clamp_min(1e-4)[..., None, None] * torch.eye(2).to(A)  # no texture: large, not infinite
+    square = difference.square().sum(-1)
+    A = A + 1e-5 * A.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(1e-4)[..., None, None] * torch.eye(2).to(A)
     return Tracks(
         uv_0=uv_0,
         uv_1=uv_1,
@@ -80,7 +80,8 @@ def _search(
         A = torch.einsum("bnip,bnjp->bnij", g, g)
         textured = torch.linalg.eigvalsh(A)[..., 0] > MIN_EIGENVALUE * window**2
         A_inv = torch.linalg.inv(torch.where(textured[..., None, None], A, torch.eye(2).to(A)))
-        y, length = _to_level(y, target[0], picture_1), torch.zeros_like(y[..., 0])
+        y = _to_level(y, target[0], picture_1)
+        length = torch.zeros_like(y[..., 0])
         active = valid & textured & _is_inside(picture_1, y)
         for _ in range(iterations if active.any() else 0):
             n = int(active.sum(1).amax())

@@ -40,7 +40,6 @@ def two_view_kornia(
     t = torch.where(posed, fit.T_1_from_0.t.double(), eye[0])
     uv_0, uv_1 = (torch.where(usable[..., None], x, 0.0).double() for x in (tracks.uv_0, tracks.uv_1))
     K_0, K_1 = (to_matrix(camera).double() for camera in (camera_0, camera_1))
-
     P_0 = kg.epipolar.projection_from_KRt(K_0, eye.expand_as(R), torch.zeros_like(t)[..., None])
     P_1 = kg.epipolar.projection_from_KRt(K_1, R, t[..., None])
     F = kg.epipolar.fundamental_from_projections(P_0, P_1)
