@@ -19,10 +19,10 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("classify_kornia", "trackability < min_trackability", "trackability > min_trackability"),
     ],
     "stages.kornia.track": [
-        ("lucas_kanade_kornia", "y, y + uv_0 - start, o", "y, uv_0 + start - y, o"),
+        ("lucas_kanade_kornia", "(error < max_round_trip_px)", "(error > max_round_trip_px)"),
         ("lucas_kanade_kornia", "window**2 - 2", "window"),
         ("_newton_step", "y - torch.where(regular, step", "y + torch.where(regular, step"),
-        ("_to_level", "(x + 0.5) * scale - 0.5", "x * scale"),
+        ("_to_level", "other.shape[-1] / picture.shape[-1]", "picture.shape[-1] / other.shape[-1]"),
         ("_template", '"zeros").transpose(1, 2)', '"zeros").transpose(1, 2).flip(2)'),
     ],
     "stages.kornia.pose": [

@@ -144,6 +144,17 @@ def test_returns_of_sparse_maps_confidence_and_a_lens_are_read_as_by_paper(own_c
     assert torch.equal(kornia.flag & returns, paper.flag & returns)
 
 
+def test_a_return_at_the_limit_is_used_and_texture_is_that_of_the_nearest_pixel():
+    draw = torch.Generator().manual_seed(0)
+    camera = Camera(torch.full((1, 2), 30.0), torch.tensor([[15.5, 11.5]]))
+    frame = Frame(torch.rand(1, 1, 24, 32, generator=draw), torch.full((1, 24, 32), 1.5), camera)
+    uv = torch.tensor([[10.0, 12.0], [10.4, 11.7], [10.6, 12.2], [11.0, 12.0]])
+    samples = classify_kornia(frame, backproject_kornia(frame, uv, near_limit=1.5))
+    assert samples.usable.all() and not backproject_kornia(frame, uv, near_limit=1.499).usable.any()
+    first, same, other, next_one = samples.trackability[0].tolist()
+    assert first == same != other == next_one
+
+
 def test_tracks_are_those_of_paper(both):
     paper, kornia = (trace["tracks"] for trace in both)
     valid = paper.valid & kornia.valid
