@@ -43,7 +43,8 @@ def risk_coverage_loss(
     if not temperature > 0:
         raise ValueError(f"risk_coverage_loss: temperature is {temperature}, expected a positive number")
     used = torch.ones_like(error, dtype=torch.bool) if keep is None else keep
-    c, e = torch.where(used, confidence, 0), torch.where(used, error, 0).clamp(max=1)
+    c = torch.where(used, confidence, 0)
+    e = torch.where(used, error, 0).clamp(max=1)
     n = used.sum(-1, keepdim=True).to(c)
     ahead = ((c[..., None, :] - c[..., :, None]) / temperature).sigmoid()
     others = used[..., None, :] & ~torch.eye(c.shape[-1], dtype=torch.bool, device=c.device)
