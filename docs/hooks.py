@@ -244,10 +244,9 @@ def code(dotted: str) -> str:
     comment = first.lineno - 1
     while lines[comment - 1].strip().startswith("#"):
         comment -= 1
-    text = textwrap.dedent("\n".join(lines[comment : last.end_lineno]))
-    if name.startswith("_"):
-        head = " ".join(" ".join(lines[node.lineno - 1 : node.body[0].lineno - 1]).split())
-        text = head.replace("( ", "(").replace(" )", ")") + "\n" + textwrap.indent(text, "    ")
+    body = lines[comment : last.end_lineno]
+    head = lines[node.lineno - 1 : node.body[0].lineno - 1] if name.startswith("_") else []
+    text = "\n".join([*head, *body]) if head else textwrap.dedent("\n".join(body))
     return f"```python\n{text}\n```"
 
 
