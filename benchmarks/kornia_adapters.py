@@ -160,7 +160,7 @@ def run() -> Iterator[dict[str, Any]]:
 
 def rows_of(what: str, name: str, method: str) -> list[dict[str, Any]]:
     """Rows of the result file."""
-    rows = json.loads(RESULT.read_text(encoding="utf-8"))["rows"]
+    rows = json.loads(RESULT.read_text(encoding="utf-8"))
     return [row for row in rows if (row["what"], row["augmentation"], row["method"]) == (what, name, method)]
 
 
@@ -211,7 +211,7 @@ def main() -> int:
     torch.set_num_threads(1)
     rows = list(run())
     versions = {"torch": torch.__version__, "kornia": kornia.__version__}
-    text = json.dumps({"versions": versions, "rows": rows}, indent=1)
+    text = json.dumps([{**row, "versions": versions} for row in rows], indent=1)
     path.write_text(text + "\n", encoding="utf-8")
     print(agreement() + "\n" + contradicted()) if path.resolve() == RESULT else None
     return 0

@@ -89,7 +89,7 @@ def interval(entry: Mapping[str, Any], digits: int = 2) -> str:
 
 
 def _rows(name: str) -> list[dict[str, Any]]:
-    return json.loads((RESULTS / f"{name}.json").read_text())["rows"]
+    return json.loads((RESULTS / f"{name}.json").read_text())
 
 
 TABLES = {

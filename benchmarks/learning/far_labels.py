@@ -305,13 +305,14 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="result file")
     args = parser.parse_args()
     parameters = sum(p.numel() for p in DepthNetwork().parameters())
-    result: dict[str, Any] = {"seeds": args.seeds, "steps": args.steps, "parameters": parameters, "rows": []}
+    shared = {"seeds": args.seeds, "steps": args.steps, "parameters": parameters}
+    rows: list[dict[str, Any]] = []
     studies = {name: open_study(name) for name in args.data}
     for row in run(studies, args.seeds, steps=args.steps, workers=args.workers):
         print(describe(row), flush=True)
-        result["rows"].append(row)
+        rows.append(row | shared)
         if args.json is not None:
-            storage.write_json(args.json, result)
+            storage.write_json(args.json, rows)
 
 
 if __name__ == "__main__":

@@ -143,7 +143,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--json", type=Path, help="result file")
     args = parser.parse_args()
-    result: dict[str, Any] = {"seeds": args.seeds, "steps": args.steps, "rows": []}
+    rows: list[dict[str, Any]] = []
     for name in args.data:
         scenes = open_scenes(name)
         labelled = label_scenes(scenes, MAP)
@@ -151,12 +151,12 @@ def main() -> None:
         areas = [measure(labelled, rooms, seed, args.steps) for seed in args.seeds]
         answers = {scene: found.error.numel() for scene, found in labelled.items()}
         row = {"data": name, "answers": answers, "rooms": len({rooms[scene] for scene in labelled})}
-        result["rows"].append(row | compare(areas) | {"aurc": areas})
-        for key, entry in result["rows"][-1].items():
+        rows.append(row | compare(areas) | {"aurc": areas, "seeds": args.seeds, "steps": args.steps})
+        for key, entry in rows[-1].items():
             if "aurc_ratio" in key:
                 print(f"{name:14} {key:30} {entry['value']:.3f} ({entry['low']:.3f}–{entry['high']:.3f})", flush=True)
     if args.json is not None:
-        storage.write_json(args.json, result)
+        storage.write_json(args.json, rows)
 
 
 if __name__ == "__main__":

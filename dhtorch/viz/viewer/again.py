@@ -34,15 +34,8 @@ _ALLOWED_MODULES = {
         *(
             f"dhtorch.stages.{name}"
             for name in (
-                "sample",
-                "backproject",
-                "holes",
-                "track",
-                "pose",
-                "misalignment",
-                "triangulate",
-                "score",
-                "fuse",
+                *("sample", "backproject", "holes", "track", "pose", "misalignment", "triangulate", "score", "fuse"),
+                *(f"kornia.{name}" for name in ("backproject", "holes", "track", "pose", "triangulate")),
             )
         ),
     ),
