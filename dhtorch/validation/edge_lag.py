@@ -86,7 +86,7 @@ def depth_over_picture(frame: Frame, depth: Tensor) -> Tensor:
     if frame.depth_camera is None:
         return depth[0]
     h, w = depth.shape[-2:]
-    rays = cam.rays(frame.camera, map_pixel_centres(frame, (h, w)))
+    rays = cam.rays(frame.camera, map_pixel_centres(frame, (h, w))[None])
     value, inside = sample_nearest(depth, cam.project(frame.depth_camera, rays))
     return torch.where(inside, value, 0.0).view(h, w)
 

@@ -117,7 +117,7 @@ def test_the_camera_of_a_moved_picture_sees_the_turned_point_at_the_moved_pixel(
     uv, z = grid(), torch.linspace(1, 4, 35, dtype=torch.float64)[None]
     xyz = cam.unproject(camera, uv, z)
     close(cam.project(moved, xyz @ Q.mT), uv @ A[:, :2, :2].mT + A[:, None, :2, 2], atol=1e-6)
-    sheared = cam.warp(camera, A + double([0, 0.1, 0], [0, 0, 0], [0, 0, 0]))[1]
+    sheared = cam.warp(camera, A @ double([1, 0.1, 0], [0, 1, 0], [0, 0, 1]))[1]
     assert (sheared @ sheared.mT - torch.eye(3).double()).abs().max() > 0.01
 
 

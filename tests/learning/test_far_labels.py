@@ -105,7 +105,7 @@ def test_the_far_labels_script(monkeypatch, tmp_path, study, labelled, capsys):
     monkeypatch.setattr(far_labels, "ProcessPoolExecutor", lambda *_, **__: ThreadPoolExecutor(1))
     monkeypatch.setattr(sys, "argv", ["far_labels.py", "--steps", "2", "--json", str(tmp_path / "result.json")])
     far_labels.main()
-    (row,) = json.loads((tmp_path / "result.json").read_text())["rows"]
+    (row,) = json.loads((tmp_path / "result.json").read_text())
     assert row["held_out_frames"] == 2 and row["training_frames"] == 6
     assert row["near.far_ratio"]["value"] == 1 and row["constant.far_error"]["value"] > 0
     printed = capsys.readouterr().out

@@ -63,7 +63,7 @@ def test_the_confidence_script(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(learned_confidence, "FEWEST", 10)
     monkeypatch.setattr(sys, "argv", ["learned_confidence.py", "--steps", "2", "--json", str(tmp_path / "result.json")])
     learned_confidence.main()
-    (row,) = json.loads((tmp_path / "result.json").read_text())["rows"]
+    (row,) = json.loads((tmp_path / "result.json").read_text())
     assert [*row["answers"]] == ["a", "b"] and row["rooms"] == 2
     for of_scene in row["aurc"][0].values():
         assert 0 < of_scene["by_error"] < 0.3

@@ -47,6 +47,7 @@ WHITE, BLACK = "#ffffff", "#000000"
 #: Method → its colour.
 METHOD_COLOURS = {
     "paper": INK,
+    "kornia": "#4B8BBE",
     "map": "#009E73",
     "window": "#CC79A7",
     "auto": "#C03A5A",
