@@ -776,7 +776,15 @@ def test_vmap_is_a_batch(row):
     equal(tuple(leaves(row.fn(*args))), tuple(mapped), atol=1e-9)
 
 
-@named("capture")
+def captured():
+    """Rows that are captured; those of geometry, which the stages capture with themselves, among the slow tests."""
+    for row in (row for row in ROWS if "capture" in row.promises.split()):
+        is_inner = row.fn.__module__.startswith("dhtorch.geometry.")
+        param = case(row, "capture")
+        yield pytest.param(*param.values, id=param.id, marks=[*param.marks, *[pytest.mark.slow] * is_inner])
+
+
+@pytest.mark.parametrize("row", captured())
 def test_captures_as_one_graph(row):
     torch._dynamo.reset()
     args = row.make(2, 7, torch.float64)

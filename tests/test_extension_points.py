@@ -74,6 +74,7 @@ def fork(tmp_path):
     return Fork(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_tracker_is_one_file(fork):
     (fork.desk / "mine.py").write_text(
         "from dhtorch.stages.track import lucas_kanade\n\n\n"
@@ -243,6 +244,7 @@ def run(scenes, methods, pairs, settings, *, least=0.1, progress=no_progress):
 '''
 
 
+@pytest.mark.slow
 def test_an_experiment_is_a_file_and_its_settings(fork):
     fork.write("dhtorch/experiments/paper/brightness.py", EXPERIMENT)
     settings = "# How bright is the picture?\n_target_: dhtorch.experiments.paper.brightness.run\n_partial_: true\nleast: 0.1\n"

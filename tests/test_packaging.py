@@ -67,6 +67,7 @@ def test_the_wheel_says_what_it_is(wheel):
     assert "dhtorch = dhtorch.cli.run:main" in entry
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # seconds of work, but a busy machine stretches them
 def test_the_wheel_works_where_no_checkout_is(wheel, tmp_path):
     """In an environment of its own beside the present libraries: a job, an experiment and every word."""

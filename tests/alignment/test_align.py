@@ -396,6 +396,7 @@ def test_a_pixel_that_is_not_sure_enough_is_silent():
     assert ((found.gate == Gate.UNCERTAIN) | found.keep).all() and found.depth[~found.keep].isnan().all()
 
 
+@pytest.mark.slow
 def test_options_change_what_they_name():
     """One option of each stage: the references, the fits, the selection and the noise."""
     truth, near, far = world()

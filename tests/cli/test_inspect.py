@@ -405,6 +405,7 @@ def test_warnings_are_printed(tmp_path: Path) -> None:
     assert "warning" in out.getvalue() and "frame [7]: left out" in out.getvalue()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["named", "stray_depth_only", "images"])
 def test_damaged_captures_are_inspected_or_refused_in_one_line(name: str, tmp_path: Path) -> None:
     def look(path: Path) -> None:

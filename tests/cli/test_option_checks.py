@@ -177,6 +177,7 @@ def test_silence_comes_with_advice(gate, word):
     assert advice({"rows": [{**row, "gate_share": {"answer": 0.3, gate: 0.7}}]}) == []
 
 
+@pytest.mark.slow
 def test_one_bar_covers_all_jobs_and_scenes_of_every_process(command, tmp_path, monkeypatch):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     seen, asked = [], []

@@ -90,6 +90,7 @@ def test_kill_9_in_the_middle_of_a_sweep_loses_and_doubles_nothing(tmp_path):
     assert f"6 jobs: {6 - n} finished, {n} left untouched, 0 failed" in (tmp_path / "out").read_text()
 
 
+@pytest.mark.slow
 def test_an_interrupted_sweep_says_how_to_go_on(tmp_path, command, monkeypatch):
     real, calls = job.run, []
 

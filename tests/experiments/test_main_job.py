@@ -231,6 +231,7 @@ def test_real_scenes_give_far_depth(name, near, gap, coverage, median):
     assert row["coverage"] > coverage and row["median_rel"] < median and row["pnp_success"] > 0.7, row
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
 def test_alone_or_in_a_batch_the_rows_of_a_real_scene_are_equal():

@@ -131,6 +131,7 @@ class Clock:
         return end.at - self.at
 
 
+@pytest.mark.slow
 def test_its_benchmark_runs_through_with_a_device_that_is_played(monkeypatch, capsys, tmp_path):
     """Everything but the device: records moved, events recorded, a series that ends where memory does, rows written."""
     moved, waited = [], []

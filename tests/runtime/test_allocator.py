@@ -44,6 +44,7 @@ def clean():
     return {k: v for k, v in os.environ.items() if k not in allocator._MALLOC_VARIABLES}
 
 
+@pytest.mark.slow
 @glibc
 def test_what_is_freed_is_not_asked_for_again():
     _, given_back = said("nothing")

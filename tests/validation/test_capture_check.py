@@ -239,6 +239,7 @@ FIELD_CASES = {
 }
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.parametrize("name", FIELD_CASES)
 def test_field_cases_are_named(name):
@@ -247,6 +248,7 @@ def test_field_cases_are_named(name):
     assert any(each.cause == cause and words in each.text for each in check.findings), check.lines
 
 
+@pytest.mark.slow
 @needs_data
 @pytest.mark.parametrize("name", ["holo_a", "field_cases/11e-poses-ok"])
 def test_sound_captures_have_no_finding(name):
