@@ -305,6 +305,8 @@ def _combined_findings(
         findings = [] if fault is None else [_fault_finding(fault, pictures=_are_pictures_wrong(poses, mended))]
         if poses is not None and poses.factor != 1:
             findings.append(Finding("scale", describe_factor(poses)))
+        if poses is not None and poses.is_depth_noise:
+            findings.append(Finding("plausibility", _noise_text(poses)))
         return findings
     if fault is not None and mended is not None and not mended.contradicts:
         return [_fault_finding(fault)]
@@ -358,6 +360,13 @@ def _fault_finding(fault: KnownFault, *, pictures: bool = False) -> Finding:
         text = f"depth does not lie over its pictures ({fault.name}){seen}: one of them is cropped, or depth has a K"
         return Finding(fault.kind, f"{text} of its own (data.K_depth=)")
     return Finding(fault.kind, f"depth is wrong: {fault.name}")
+
+
+def _noise_text(poses: PoseCheck) -> str:
+    """Sentence for depth that disagrees with itself under every reading of the poses."""
+    scores = poses.surfaces
+    best = 100 * min(scores.best_score, scores.without)
+    return f"depths of two frames disagree by {best:.0f} % at best: these are no distances (encoding, byte order)"
 
 
 def _lag_text(lag: int, against: str = "the pictures", subject: str = "depth is") -> str:

@@ -75,6 +75,10 @@ _CONTRADICTION_LIMITS: Final = ((2.0, 0.01), (3.0, 0.003))
 #: Source: chosen on the sound captures of the shared data: at most 1.6 % between neighbouring views.
 _MAX_UNEXPLAINED_DISAGREEMENT: Final = 0.05
 
+#: Disagreement under the best reading, and without poses, from which on the depth itself is doubted.
+#: Source: derived, ten times the largest between neighbouring views of the sound captures of the shared data.
+_MIN_NOISE_DISAGREEMENT: Final = 0.15
+
 #: A factor near 1 is reported if the disagreement without it is larger by this ratio.
 #: Source: chosen on the sound captures of the shared data (largest ratio 1.1) and on depth that is 10 % too long.
 _MIN_FACTOR_GAIN: Final = 1.15
@@ -176,6 +180,12 @@ class PoseCheck:
             return False
         explained = any(stated >= ratio * best and stated - best >= least for ratio, least in _CONTRADICTION_LIMITS)
         return explained or stated > max(_MAX_UNEXPLAINED_DISAGREEMENT, self.surfaces.without)
+
+    @property
+    def is_depth_noise(self) -> bool:
+        """Whether the depths of two frames disagree widely under every reading of the poses and without any."""
+        scores = self.surfaces.best_score, self.surfaces.without
+        return all(score > _MIN_NOISE_DISAGREEMENT for score in scores)  # NaN: nothing meets
 
     @property
     def is_explained(self) -> bool:

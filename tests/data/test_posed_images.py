@@ -301,6 +301,9 @@ def test_polycam_confidence_and_what_is_missing(tmp_path: Path) -> None:
         "frame 1: no file in cameras/: left out",
         f"image {stems[2]}.png: no depth map: its depth is empty",
     )
+    image = next((tmp_path / "keyframes" / "images").glob(f"{stems[2]}.*"))
+    image.unlink()
+    assert f"frame {stems[2]}: no file in images/: left out" in data.open(tmp_path).report
 
 
 def test_polycam_damage_names_the_file(tmp_path: Path) -> None:

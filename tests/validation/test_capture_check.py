@@ -157,6 +157,14 @@ def test_depth_in_another_unit_is_named(frames, true):
     torch.testing.assert_close(corrected[1].depth, frames[1].depth)
 
 
+def test_depth_that_disagrees_with_itself_is_named(frames, true):
+    """Returns of a random depth in every frame, by which no reading of the poses agrees."""
+    noise = torch.Generator().manual_seed(0)
+    random = [f.replace(depth=torch.rand(f.depth.shape, generator=noise) * 9 + 1) for f in frames]
+    findings = check_capture(recording(random, true)).findings
+    assert any("depths of two frames disagree by" in finding.text for finding in findings)
+
+
 def test_exchanged_intrinsics_are_named(frames, true):
     def exchanged(frame):
         return frame.replace(camera=frame.camera.replace(f=frame.camera.f.flip(-1), c=frame.camera.c.flip(-1)))

@@ -70,6 +70,7 @@ def read(root: str | Path, *, corrected: bool = True) -> list[Recording]:
     report = files.format_left_out(
         [i for i, name in enumerate(pictures) if name not in sources], f"no file in {cameras}/"
     )
+    report += files.format_left_out([name for name in sources if name not in pictures], f"no file in {images}/")
     return [
         open_posed_images(
             root,
