@@ -376,6 +376,7 @@ def main() -> None:
     options = parser.parse_args()
     tasks = [(window, layout) for window, _, layouts in windows() for layout in layouts]
     tasks = [task for task in tasks if all(word in " ".join(task) for word in options.only.split())]
+    tasks.sort(key=lambda task: task[0] == "room")  # real windows first
     rows: list[dict[str, Any]] = []
     with ProcessPoolExecutor(options.jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
         for done in concurrent.futures.as_completed([pool.submit(measure, task) for task in tasks]):
@@ -384,12 +385,11 @@ def main() -> None:
                 shown = "; ".join(row["lines"])[:150] if row["outcome"] != "right" else ""
                 label = f"{row['window']} {row['layout']} {row['fault']}"
                 print(f"{label:44} {row['outcome']:10} {','.join(row['causes']):16} {shown}", flush=True)
-    rows.sort(key=lambda row: (row["window"], row["layout"]))
-    summary = summarise(rows)
-    print(json.dumps(summary, indent=1))
-    if options.json:
-        kept = [{**row, "lines": row["lines"][:1]} for row in rows]
-        options.json.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+            if options.json:  # after each task: a run that is stopped leaves what it measured
+                rows.sort(key=lambda row: (row["window"], row["layout"]))
+                kept = [{**row, "lines": row["lines"][:1]} for row in rows]
+                options.json.write_text(json.dumps(kept, indent=1) + "\n", encoding="utf-8")
+    print(json.dumps(summarise(rows), indent=1))
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -517,10 +517,24 @@ def faults_of_captures() -> str:
     cells = []
     for fault in dict.fromkeys(row["fault"] for row in rows):
         outcomes = [row["outcome"] for row in rows if row["fault"] == fault]
-        counts = [str(outcomes.count(x) or "") for x in ("right", "refused", "named", "otherwise", "silent", "alarm")]
+        counts = [
+            str(outcomes.count(x) or "")
+            for x in ("right", "refused", "named", "otherwise", "unchecked", "silent", "alarm")
+        ]
         cells.append([f"`{fault}`", str(len(outcomes)), *counts])
     return table(
-        ["fault", "captures", "read right", "refused", "named", "other warning", "silent", "false alarm"], cells
+        [
+            "fault",
+            "captures",
+            "read right",
+            "refused",
+            "named",
+            "other warning",
+            "stated as unchecked",
+            "silent",
+            "false alarm",
+        ],
+        cells,
     )
 
 
