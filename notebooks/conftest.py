@@ -10,7 +10,7 @@ import pytest
 KERNEL_START_S = 600
 
 #: Notebooks that take half a minute each.
-SLOW = ("4_gradients.ipynb", "5_your_own_capture.ipynb")
+SLOW = ("3_beside_dinov2.ipynb", "4_gradients.ipynb", "5_your_own_capture.ipynb")
 
 nbmake.nb_run.NotebookClient = partial(nbmake.nb_run.NotebookClient, startup_timeout=KERNEL_START_S)
 

@@ -146,6 +146,7 @@ assert "data/readers/stacked.py" in find_reachable_modules(["dhtorch.data.open_c
     assert "stacked" in said and "3 rows" in said
 
 
+@pytest.mark.slow
 def test_a_column_is_an_entry_and_its_function(fork):
     schema = "dhtorch/transforms/schema.py"
     function = "def _trackability(found: SampleResults) -> Tensor:\n    return found.samples.trackability\n\n\n"

@@ -43,6 +43,7 @@ TRACKING_METHOD = Method(
     hypotheses=100,
     track=partial(lucas_kanade, levels=5, window=21, normalise="bias", start=coarse_flow),
     pose=pnp_ransac,
+    verify=None,  # hypotheses attach depth to other pixels on purpose
 )
 
 #: Largest delay or lead of a map that is tried, frames.

@@ -149,6 +149,7 @@ def test_silence():
     assert (lost.gate == Gate.NO_POSE).all() and (lost.score == 0).all() and lost.depth.isnan().all()
 
 
+@pytest.mark.slow
 def test_alone_as_in_a_batch_and_in_both_floats():
     truth, near, far = world(batch=2)
     x = depth_faults.tilt_depth(truth, 0.1, 0.5) * torch.tensor([1.0, 1.3]).view(2, 1, 1).double()

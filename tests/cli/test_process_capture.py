@@ -68,6 +68,7 @@ def test_it_says_what_it_is_what_was_recovered_and_what_to_do_next(capture, made
     assert main([*command.split(), "method=map", "method.n=64", f"hydra.run.dir={tmp_path / 'job'}"]) == 0, "as printed"
 
 
+@pytest.mark.slow
 def test_the_beginning_is_made_where_time_is_short_and_said_again_it_goes_on(capture, tmp_path, capsys):
     words = [str(capture), f"out={tmp_path / 'x'}", *SMALL]
     assert main([*words, "minutes=1e-6"]) == 0

@@ -118,6 +118,7 @@ def test_an_interrupted_job_writes_nothing(tmp_path, command, monkeypatch):
     assert code == 130 and "resume=true output=outputs/" in err and not results(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_failing_job_stops_no_other(command, tmp_path):
     sweep = ["-m", "resume=true", *TINY, "pairs.gap=2,9,1"]
     code, out, err = command(*sweep)

@@ -52,6 +52,7 @@ def test_the_stored_orientation_of_sound_captures_wins(capture: str) -> None:
     assert orientation.select_symmetry(frames)[0] in (0, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k", range(8))
 def test_the_symmetry_that_undoes_a_planted_one_is_selected(k: int) -> None:
     room = SyntheticRoom(n_frames=3, hw=(240, 320))

@@ -330,6 +330,7 @@ def test_blocks_share_no_frame_and_pairs_keep_their_distance():
     assert vo_probe.split_into_blocks(replace(scene, role="rotation"), 3, 3) == []
 
 
+@pytest.mark.slow
 def test_visual_odometry_within_the_room():
     pytest.importorskip("transformers")
     room = SyntheticRoom(hw=(120, 160), n_frames=12, step_m=0.04)

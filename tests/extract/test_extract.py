@@ -334,6 +334,7 @@ def test_a_full_disk_is_one_line(robot, command, monkeypatch):
     assert code == 2 and "No space left" in err and not Path("features").exists(), err
 
 
+@pytest.mark.slow
 def test_shards_of_another_extraction_are_not_mixed(robot, command, tmp_path):
     assert command(*asked(robot))[0] == 0
     before = seen(files("features"))

@@ -262,6 +262,7 @@ def test_a_voxel_is_two_pixels_of_the_sensor(name, least, most):
     assert voxel == pytest.approx(max(0.005, 2 * sorted(sizes)[1]), rel=0.06), "two digits"
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.skipif("DHTORCH_DATA" not in os.environ, reason="DHTORCH_DATA is unset")
 def test_a_real_desk_becomes_a_map(tmp_path, monkeypatch, capsys):

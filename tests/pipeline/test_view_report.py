@@ -183,6 +183,7 @@ def test_an_option_of_one_choice_alone_chooses_it(words, choice):
     assert run._add_implied_choice(words) == [*words, *choice]
 
 
+@pytest.mark.slow
 def test_a_job_and_a_map_without_a_gap(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     tiny = [

@@ -29,7 +29,7 @@ from support.captures_by_format import SAMPLES, write_tum
 from dhtorch import data
 from dhtorch.data import FormatError
 
-MUTANTS, MANY = 10, 2000  # of every format; the many run with the slow tests
+MUTANTS, MANY = 20, 2000  # of every format; the many run with the slow tests
 
 
 @pytest.mark.parametrize("name", SAMPLES)
@@ -78,6 +78,7 @@ def _misread(path: Path, misdeed: Callable[[Path], Any]) -> None:
         misdeed(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("misdeed", "kind"),
     [

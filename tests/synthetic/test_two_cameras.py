@@ -45,6 +45,7 @@ def robot(tmp_path_factory):
     return both
 
 
+@pytest.mark.slow
 def test_a_job_of_two_cameras_is_that_of_each_alone(robot, tmp_path):
     source = ["data=lerobot", f"data.root={robot}", "pairs.gap=2", "holdout=none", "figures=false", *ASKED]
     for name, said in (("both", f"[{LEFT},{FRONT}]"), ("left", LEFT), ("front", FRONT)):
@@ -61,6 +62,7 @@ def test_a_job_of_two_cameras_is_that_of_each_alone(robot, tmp_path):
     assert of(both, "left") != [{**row, "scene": row["scene"].replace("front", "left")} for row in of(both, "front")]
 
 
+@pytest.mark.slow
 def test_enriched_maps_stand_beside_their_own_camera(robot, tmp_path, capsys):
     asked = ["data=lerobot", *ASKED, "gap=2", "dense={size: 64, planes: 8}"]
     cells = {}
@@ -77,6 +79,7 @@ def test_enriched_maps_stand_beside_their_own_camera(robot, tmp_path, capsys):
     assert cells["both"][made["left"]] != cells["both"][made["front"]]
 
 
+@pytest.mark.slow
 def test_features_of_two_cameras_are_refused_and_name_the_option(robot, tmp_path, capsys):
     words = ["extract", "data=lerobot", f"data.root={robot}", "data.gap=2", *ASKED, f"out={tmp_path / 'set'}"]
     assert main(words) == 2

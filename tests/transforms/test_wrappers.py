@@ -248,6 +248,7 @@ print(*said)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
 def test_a_worker_forked_beside_opencvs_threads_does_not_wait_for_them():
     said = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True, check=True, timeout=60)
