@@ -91,14 +91,14 @@ def depth_over_picture(frame: Frame, depth: Tensor) -> Tensor:
     return torch.where(inside, value, 0.0).view(h, w)
 
 
-def clear_lead(lead: Tensor, least: float) -> float:
-    """Mean lead (n,) of one hypothesis over another in n frames where it is above ``least`` and four errors, else 0.
+def clear_lead(lead: Tensor, least: float, errors: float = _MIN_LEAD_ERRORS) -> float:
+    """Mean lead (n,) of one hypothesis over another in n frames where it is above ``least`` and ``errors``, else 0.
 
     The error is the standard error of the mean. Gradient: none.
     """
     mean = float(lead.mean())
     error = float(lead.std()) / len(lead) ** 0.5
-    return mean if mean > max(least, _MIN_LEAD_ERRORS * error) else 0.0
+    return mean if mean > max(least, errors * error) else 0.0
 
 
 def _shifted_scores(picture: Tensor, edges: Tensor, covered: Tensor) -> Tensor:
