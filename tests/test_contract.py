@@ -350,6 +350,7 @@ ROWS = [
     Row(patches.rescale_field_of_view, lambda b, n, d: (frames(b, n, d)[0].depth, 1.3, 0.1), "dtype batch vmap capture gradcheck", (0,), (0,)),
     Row(patches.containing_pixels, lambda b, n, d: (pixels(b, n, d),), "batch vmap capture empty shuffle padding nan", (0,)),
     Row(patches.is_patch_inside, lambda b, n, d: (pixels(b, n, d).int(), HW, 5), "batch vmap capture empty shuffle padding", (0,)),
+    Row(patches.is_inside_picture, lambda b, n, d: (pixels(b, n, d), frames(b, n, d)[0].image), "batch vmap capture empty shuffle padding", (0,)),
     Row(patches.gather_reduced, lambda b, n, d: (frames(b, n, d)[0].depth, pixels(b, n, d).int(), 5), "dtype batch vmap capture gradcheck empty shuffle padding", (1,), (0,)),
     Row(patches.round_half_up, lambda b, n, d: (pixels(b, n, d),), "dtype batch vmap capture empty shuffle padding nan", (0,)),
     Row(sparse_grid.pack_cells, lambda b, n, d: (places(b, n),), "batch vmap capture empty shuffle padding raises", (0,), bad=wrong_last_axis(0)),

@@ -178,6 +178,12 @@ def is_patch_inside(pixel: Tensor, hw: tuple[int, int], size: int) -> Tensor:
     return (x == pixel[..., 0]) & (y == pixel[..., 1])
 
 
+def is_inside_picture(uv: Tensor, picture: Tensor) -> Tensor:
+    """Whether points (B, N, 2) px lie in a picture (…, H, W), (B, N): its outer pixels belong to it entirely."""
+    H, W = picture.shape[-2:]
+    return ((uv >= -0.5) & (uv <= uv.new_tensor([W, H]) - 0.5)).all(-1)
+
+
 def flatten_images(image: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:
     """Images -> one flat tensor in memory order, and its strides of image, channel, row and column."""
     C, H, W = image.shape[1:]

@@ -20,6 +20,7 @@ from dhtorch.geometry.checks import check
 from dhtorch.geometry.determinism import round_up
 from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.map_estimate import MEDIAN_2D
+from dhtorch.geometry.patches import is_inside_picture
 from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
@@ -120,7 +121,7 @@ def match_features(
             rows.append((*there, back[0], back[2]))
         uv_1, cov, is_near, returned, is_back = (torch.stack(column) for column in zip(*rows, strict=True))
         error = torch.linalg.vector_norm(returned - x, dim=-1)
-        inside = _is_inside(x, image_0) & _is_inside(uv_1, image_1)
+        inside = is_inside_picture(x, image_0) & is_inside_picture(uv_1, image_1)
         valid = is_near & is_back & inside & (error < max_round_trip_px)
         safe = torch.where(valid[..., None], uv_1, x.clamp(min=0))
         pyramids = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
@@ -234,12 +235,6 @@ def _predict(matches: _Matches, x: Tensor, neighbours: int, reach_px: float) -> 
 def _unit(image: Tensor) -> Tensor:
     """Pictures as floats in [0, 1]."""
     return image.float() / 255 if image.dtype == torch.uint8 else image.float()
-
-
-def _is_inside(uv: Tensor, image: Tensor) -> Tensor:
-    """Whether pixels (B, N, 2) lie inside a picture."""
-    H, W = image.shape[-2:]
-    return ((uv >= -0.5) & (uv <= uv.new_tensor([W - 0.5, H - 0.5]))).all(-1)
 
 
 def _grey_difference(pyramids: PyramidCache, image_1: Tensor, uv_0: Tensor, uv_1: Tensor, window: int) -> Tensor:

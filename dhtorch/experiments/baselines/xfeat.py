@@ -22,7 +22,7 @@ from torch import Tensor
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.determinism import ELEMENTWISE_LANES, MAX_CHUNK_POINTS, round_up
-from dhtorch.geometry.patches import extract_windows
+from dhtorch.geometry.patches import extract_windows, is_inside_picture
 from dhtorch.geometry.pyramid import PyramidCache, build_pyramid
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import MAP
@@ -163,7 +163,7 @@ def match(
         extract = partial(extract_xfeat, net, scale=scale, longest_px=longest_px)
         features_0 = pyramids.once(("xfeat", net, scale, longest_px), extract)
         features_1 = extract(image_1)
-        inside = _is_inside(uv_0, image_0)
+        inside = is_inside_picture(uv_0, image_0)
         start = torch.where(inside[..., None], uv_0.detach(), torch.zeros_like(uv_0)).float()
         pairs = list(zip(features_0, features_1, start, strict=True))
         matches = [search_matches(a, b, x, sharpness) for a, b, x in pairs]
@@ -171,7 +171,7 @@ def match(
         uv_1, similarity, spread = (torch.stack(x) for x in zip(*matches, strict=True))
         error = (torch.stack([f.uv for f in back]) - start).square().sum(-1).sqrt()
         cells = uv_1.new_tensor([1 / g for g in features_1[0].gain])
-        valid = inside & _is_inside(uv_1, image_1) & (similarity >= min_similarity) & (error < max_round_trip_px)
+        valid = inside & is_inside_picture(uv_1, image_1) & (similarity >= min_similarity) & (error < max_round_trip_px)
         rms, textured = _grey_difference(
             pyramids, image_1, start, torch.where(valid[..., None], uv_1, start), window, min_eigenvalue
         )
@@ -257,12 +257,6 @@ def match_covariance(
     step_spread = torch.eye(2, device=spread.device, dtype=spread.dtype) / (12 * _STEPS_PER_CELL**2)
     factor = gain * (unlike * (1 - similarity.nan_to_num(-1.0)).clamp(0, 1)).exp()
     return factor[..., None, None] * (spread.nan_to_num() + step_spread)
-
-
-def _is_inside(uv: Tensor, image: Tensor) -> Tensor:
-    """Whether pixels (B, N, 2) lie inside an image."""
-    H, W = image.shape[-2:]
-    return ((uv >= -0.5) & (uv <= uv.new_tensor([W - 0.5, H - 0.5]))).all(-1)
 
 
 def _grey_difference(

@@ -12,7 +12,7 @@ from kornia.geometry.transform import build_pyramid, remap
 from torch import Tensor
 
 from dhtorch.geometry.filters import grayscale
-from dhtorch.geometry.patches import QUANTISATION_VARIANCE
+from dhtorch.geometry.patches import QUANTISATION_VARIANCE, is_inside_picture
 from dhtorch.records import NO_HINT, TrackHint, Tracks
 
 #: Least eigenvalue of A per pixel of a window that is tracked, squared grey values in [0, 1] per px².
@@ -72,7 +72,7 @@ def _search(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Positions (B, N, 2) in ``target`` of points x of ``source``, searched from y on; which are valid (B, N); A."""
     window, iterations, epsilon_px = o
-    valid = _is_inside(source[0], x) & y.isfinite().all(-1)
+    valid = is_inside_picture(x, source[0]) & y.isfinite().all(-1)
     x, y = (p.nan_to_num(0.0, 0.0, 0.0) for p in (x, y))
     pair = torch.arange(len(x), device=x.device)[:, None]
     for picture_0, picture_1 in zip(reversed(source), reversed(target), strict=True):
@@ -82,7 +82,7 @@ def _search(
         A_inv = torch.linalg.inv(torch.where(textured[..., None, None], A, torch.eye(2).to(A)))
         y = _to_level(y, target[0], picture_1)
         length = torch.zeros_like(y[..., 0])
-        active = valid & textured & _is_inside(picture_1, y)
+        active = valid & textured & is_inside_picture(y, picture_1)
         for _ in range(iterations if active.any() else 0):
             n = int(active.sum(1).amax())
             some = pair, (~active).to(torch.uint8).argsort(stable=True, dim=1)[:, :n]  # the active points come first
@@ -90,9 +90,9 @@ def _search(
             step = torch.einsum("bnij,bnj->bni", A_inv[some], (g[some] @ (J - T[some])[..., None])[..., 0])
             y[some] = torch.where(moving[..., None], y[some] - step, y[some])
             length[some] = torch.where(moving, step.norm(dim=-1), length[some])
-            active[some] = moving & (length[some] > epsilon_px) & _is_inside(picture_1, y[some])
+            active[some] = moving & (length[some] > epsilon_px) & is_inside_picture(y[some], picture_1)
         y = _to_level(y, picture_1, target[0])
-    return y, valid & textured & _is_inside(target[0], y) & (length < 1), A
+    return y, valid & textured & is_inside_picture(y, target[0]) & (length < 1), A
 
 
 def _newton_step(
@@ -129,8 +129,3 @@ def _to_level(x: Tensor, picture: Tensor, other: Tensor) -> Tensor:
     """Points (B, N, 2) of one level of a pyramid on another; kornia's levels cover the same area."""
     scale = x.new_tensor([other.shape[-1] / picture.shape[-1], other.shape[-2] / picture.shape[-2]])
     return (x + 0.5) * scale - 0.5
-
-
-def _is_inside(picture: Tensor, x: Tensor) -> Tensor:
-    """Whether points lie in a picture (B, N): half a pixel around its outermost centres belongs to it."""
-    return ((x >= -0.5) & (x <= x.new_tensor([picture.shape[-1], picture.shape[-2]]) - 0.5)).all(-1)
