@@ -219,14 +219,15 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("find_edge_lag", "- scores[places, places]", ""),
         ("clear_lead", "mean if mean >", "mean if 1 + mean >"),
         ("find_edge_lag", "len(places) < _MIN_FRAMES", "len(places) < 1"),
+        ("_shifted_scores", "edges = edges * mask", "edges = edges"),
     ],
     "records": [
         ("Frame.map_camera", "return self.depth_camera", "return self.camera"),
     ],
     "validation.edge_fault": [
         ("find_edge_fault", "- without", ""),
-        ("_reduced_frames", "len(chosen) < _MIN_FRAMES", "len(chosen) < 1"),
-        ("_scores", "fault.undo(frame.depth)", "frame.depth"),
+        ("_ReducedFrames.of", "len(chosen) < _MIN_FRAMES", "len(chosen) < 1"),
+        ("_ReducedFrames.scores", "fault.undo(x)", "x"),
     ],
     "validation.capture_check": [
         ("_TURN_OPTIONS", '"mirrored left to right": "left_right"', '"mirrored left to right": "upside_down"'),

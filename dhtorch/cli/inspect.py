@@ -45,6 +45,7 @@ _NO_INTRINSICS_MESSAGE = (
     "no intrinsics: depth cannot be computed without them; set data.K=[fx,fy,cx,cy] or data.fov=DEGREES"
 )
 _ASSUMED_FOV_DEG = 60.0  # horizontal field of view assumed for a capture without intrinsics, degrees
+_TILE_GAP = 0.02  # margin around a tile of the contact sheet, in widths of its cell
 _SPARSE_SHARE = 0.1  # fraction of pixels with a return below which returns are drawn larger
 _CAPTURE_SUFFIXES = (  # of files that may be a whole capture
     (".r3d", ".mp4", ".mov", ".mkv", ".tar", ".h5", ".hdf5", ".bag", ".mcap", ".db3")
@@ -387,17 +388,32 @@ def write_contact_sheet(survey: Survey, out: Path) -> Path:
 
 
 def _draw_tiles(figure: Any, rows: Sequence[str], survey: Survey) -> None:
+    """One axes a row, each tile in a cell of width 1: an axes a tile takes several times as long."""
     limits = _depth_limits(survey.depths)
-    for k, tile in enumerate(survey.tiles):
-        title = tile.title[:22]
-        for r, kind in enumerate(rows):
-            axes = figure.add_subplot(len(rows), len(survey.tiles), r * len(survey.tiles) + k + 1)
-            axes.axis("off")
+    sizes = [
+        getattr(tile, kind).shape[-2:] for tile in survey.tiles for kind in rows if getattr(tile, kind) is not None
+    ]
+    height = max((h / w for h, w in sizes), default=0.75)
+    for r, kind in enumerate(rows):
+        axes = figure.add_subplot(len(rows), 1, r + 1)
+        axes.axis("off")
+        for k, tile in enumerate(survey.tiles):
             picture = getattr(tile, kind)
-            if picture is not None:
-                _draw_tile(axes, picture, kind, limits)
-                axes.set_title(title, fontsize=6, pad=2)
-                title = ""  # only above the first image of a column
+            if picture is None:
+                continue
+            extent = _extent(k, picture.shape[-2:], height)
+            _draw_tile(axes, picture, kind, limits, extent)
+            if not any(getattr(tile, above) is not None for above in rows[:r]):
+                place = (extent[0] + extent[1]) / 2, extent[3]
+                axes.annotate(tile.title[:22], place, (0, 2), textcoords="offset points", fontsize=6, ha="center")
+        axes.set(xlim=(-_TILE_GAP, len(survey.tiles) + _TILE_GAP), ylim=(0, height), aspect="equal")
+
+
+def _extent(k: int, hw: Sequence[int], height: float) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top of a map of size ``hw`` in the middle of the k-th cell of 1 x ``height``."""
+    half_width = (0.5 - _TILE_GAP) * min(1.0, height * hw[1] / hw[0])
+    half_height = half_width * hw[0] / hw[1]
+    return k + 0.5 - half_width, k + 0.5 + half_width, height / 2 - half_height, height / 2 + half_height
 
 
 def _depth_limits(depths: Tensor) -> tuple[float, float]:
@@ -407,18 +423,22 @@ def _depth_limits(depths: Tensor) -> tuple[float, float]:
     return float(low), float(max(high, low + 1e-3))
 
 
-def _draw_tile(axes: Any, picture: Tensor, kind: str, limits: tuple[float, float]) -> None:
+def _draw_tile(
+    axes: Any, picture: Tensor, kind: str, limits: tuple[float, float], extent: tuple[float, float, float, float]
+) -> None:
     step = max(1, max(picture.shape[-2:]) // 400)
     if kind == "image":
         pixels = picture[:, ::step, ::step].permute(1, 2, 0).numpy()
-        axes.imshow(pixels if pixels.shape[2] == 3 else pixels[..., 0], cmap=GREY_CMAP)
+        axes.imshow(pixels if pixels.shape[2] == 3 else pixels[..., 0], cmap=GREY_CMAP, extent=extent)
     elif kind == "depth":
         sparse = float((picture > 0).double().mean()) < _SPARSE_SHARE
         shown = _nearest_per_block(picture, 3 * step) if sparse else picture[::step, ::step]
-        axes.imshow(np.ma.masked_equal(shown.numpy(), 0), cmap=DEPTH_CMAP, vmin=limits[0], vmax=limits[1])
-        axes.add_patch(_make_outline(shown.shape))
+        masked = np.ma.masked_equal(shown.numpy(), 0)
+        axes.imshow(masked, cmap=DEPTH_CMAP, vmin=limits[0], vmax=limits[1], extent=extent)
+        axes.add_patch(_make_outline(extent))
     else:
-        axes.imshow(picture[::step, ::step].numpy(), cmap=SCORE_CMAP, vmin=0, vmax=2, interpolation="nearest")
+        pixels = picture[::step, ::step].numpy()
+        axes.imshow(pixels, cmap=SCORE_CMAP, vmin=0, vmax=2, interpolation="nearest", extent=extent)
 
 
 def _nearest_per_block(depth: Tensor, size: int) -> Tensor:
@@ -428,11 +448,12 @@ def _nearest_per_block(depth: Tensor, size: int) -> Tensor:
     return torch.where(torch.isfinite(best), best, torch.zeros_like(best))
 
 
-def _make_outline(shape: Sequence[int]) -> Any:
+def _make_outline(extent: tuple[float, float, float, float]) -> Any:
     """Outline of a depth map, whose holes are white."""
     from matplotlib.patches import Rectangle  # noqa: PLC0415
 
-    return Rectangle((-0.5, -0.5), shape[1], shape[0], fill=False, edgecolor=UNANSWERED, linewidth=0.6)
+    left, right, bottom, top = extent
+    return Rectangle((left, bottom), right - left, top - bottom, fill=False, edgecolor=UNANSWERED, linewidth=0.6)
 
 
 def _plot_depths(axes: Any, survey: Survey) -> None:

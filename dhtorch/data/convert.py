@@ -273,10 +273,11 @@ def splat_depth(
     h, w = hw
     uv = round_half_up(cameras.project(camera, xyz_cam[None].to(camera.f.dtype))[0])
     z = xyz_cam[:, 2]
-    inside = (uv >= 0).all(-1) & (uv[:, 0] <= w - 1) & (uv[:, 1] <= h - 1) & (z > 0) & torch.isfinite(z)
-    index = (uv[inside, 1] * w + uv[inside, 0]).long()
-    far = torch.full((h * w,), torch.inf)
-    depth = far.scatter_reduce(0, index, z[inside].to(far.dtype), "amin").view(h, w)
+    u, v = uv.unbind(-1)
+    inside = (u >= 0) & (v >= 0) & (u <= w - 1) & (v <= h - 1) & (z > 0) & torch.isfinite(z)
+    index = torch.where(inside, v * w + u, h * w).long()  # points outside share one place after the last pixel
+    far = torch.full((h * w + 1,), torch.inf)
+    depth = far.scatter_reduce(0, index, z.to(far.dtype), "amin")[:-1].view(h, w)
     if hide_px > 0:
         depth = torch.where(depth > 1.1 * _window_min(depth, hide_px), torch.inf, depth)
     return torch.where(torch.isfinite(depth), depth, torch.zeros_like(depth))
@@ -293,9 +294,9 @@ def register_depth(
 
     Its size is that of :func:`size_of_registered_depth`. Forward warp with a z-buffer; holes are not filled.
     """
-    v, u = torch.nonzero(depth > 0, as_tuple=True)
-    uv = torch.stack((u, v), -1).to(depth_camera.f.dtype)
-    xyz = cameras.unproject(depth_camera, uv[None], depth[v, u][None])
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=depth_camera.f.dtype) for n in depth.shape), indexing="ij")
+    uv = torch.stack((u, v), -1).view(1, -1, 2)
+    xyz = cameras.unproject(depth_camera, uv, torch.where(depth > 0, depth, torch.nan).view(1, -1))
     if T_cam_from_depth is not None:
         xyz = se3.apply(T_cam_from_depth, xyz)
     size = size_of_registered_depth(depth_camera, camera, hw)

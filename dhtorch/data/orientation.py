@@ -82,14 +82,11 @@ def orientation_scores(
     """
     picture = picture_edges(image, grid_px=_GRID_PX)
     hw = picture.shape[-2], picture.shape[-1]
-    smooth = (
-        _smooth_log_depth(depth, hw),
-        _smooth_log_depth(depth, (hw[1], hw[0])),
-    )
+    smooth = smooth_log_depth(depth, hw), smooth_log_depth(depth, (hw[1], hw[0]))
     scores = []
     for k in symmetries:
         log_depth, covered = (apply_symmetry(x, k) for x in smooth[k % 2])
-        scores.append(edge_correlation(picture, _edge_vectors(log_depth, covered), covered))
+        scores.append(edge_correlation(picture, *log_depth_edges(log_depth, covered)))
     return torch.tensor(scores, dtype=torch.float64)
 
 
@@ -103,8 +100,22 @@ def picture_edges(image: Tensor, *, grid_px: int) -> Tensor:
 
 def depth_edges(depth: Tensor, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Edge vectors (3, h, w) of a depth map resampled to a grid, and the mask (h, w) where it has returns."""
-    log_depth, covered = _smooth_log_depth(depth, hw)
-    return _edge_vectors(log_depth, covered), covered
+    return log_depth_edges(*smooth_log_depth(depth, hw))
+
+
+def smooth_log_depth(depth: Tensor, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Logarithm (h, w) of the mean inverse depth of the returns near each grid pixel, and the mask of covered ones."""
+    has_return = depth > 0
+    inverse = torch.where(has_return, 1 / torch.where(has_return, depth, 1.0), 0.0)
+    total, coverage = _blur(_resample(inverse, hw)), _blur(_resample(has_return, hw))
+    covered = coverage > _MIN_COVERAGE
+    return torch.where(covered, total / coverage.clamp_min(1e-6), 1.0).clamp_min(1e-9).log(), covered
+
+
+def log_depth_edges(log_depth: Tensor, covered: Tensor) -> tuple[Tensor, Tensor]:
+    """Logarithm (h, w) of depth and its mask -> edge vectors (3, h, w), and the mask without pixels beside a gap."""
+    inner = -F.max_pool2d(-covered.float()[None], 3, 1, 1)[0] > 0  # gradients do not touch gaps
+    return _edge_vectors(log_depth, inner), inner
 
 
 def select_symmetry(
@@ -269,17 +280,6 @@ def _resample(x: Tensor, hw: tuple[int, int]) -> Tensor:
 
 def _blur(x: Tensor) -> Tensor:
     return filters.gaussian_blur(x[None, None], _BLUR_PX)[0, 0]
-
-
-def _smooth_log_depth(depth: Tensor, hw: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Logarithm (h, w) of the mean inverse depth of the returns near each grid pixel, and the mask of covered ones."""
-    has_return = depth > 0
-    inverse = torch.where(has_return, 1 / torch.where(has_return, depth, 1.0), 0.0)
-    total, coverage = _blur(_resample(inverse, hw)), _blur(_resample(has_return, hw))
-    enough = coverage > _MIN_COVERAGE
-    log_depth = torch.where(enough, total / coverage.clamp_min(1e-6), 1.0).clamp_min(1e-9).log()
-    inner = -F.max_pool2d(-enough.float()[None], 3, 1, 1)[0] > 0  # gradients do not touch gaps
-    return log_depth, inner
 
 
 def _edge_vectors(x: Tensor, mask: Tensor) -> Tensor:

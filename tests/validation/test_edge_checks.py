@@ -1,11 +1,14 @@
 """Edges of pictures and depth show by how many frames depth is late, and how it is turned; sound windows show nothing."""
 
+import itertools
+
 import pytest
 import torch
 from support.cluttered_walk import N, walk
 
+from dhtorch.data.orientation import edge_correlations
 from dhtorch.validation.edge_fault import do_edges_refute, find_edge_fault
-from dhtorch.validation.edge_lag import EdgeLag, find_edge_lag
+from dhtorch.validation.edge_lag import _SHIFTS_PX, EdgeLag, _shifted_scores, find_edge_lag
 from dhtorch.validation.faults import KNOWN_FAULTS, rot90_map
 
 
@@ -28,6 +31,16 @@ def test_sound_windows_show_nothing(frames):
 def test_a_lag_is_found(lag, frames):
     shown = find_edge_lag(delayed(frames, lag))
     assert shown.lag == lag and shown.lead > 0.04
+
+
+def test_correlations_under_shifts_are_those_of_shifted_depth():
+    generator = torch.Generator().manual_seed(0)
+    picture, edges = (torch.rand(3, 47, 60, generator=generator) for _ in range(2))
+    covered = torch.rand(47, 60, generator=generator) > 0.3
+    shifts = list(itertools.product(_SHIFTS_PX, repeat=2))
+    moved, masks = (torch.stack([x.roll(by, (-2, -1)) for by in shifts]) for x in (edges, covered))
+    expected = edge_correlations(picture[None], moved, masks)[0]
+    torch.testing.assert_close(_shifted_scores(picture, edges, covered), expected, atol=1e-5, rtol=0)
 
 
 def test_a_still_camera_shows_no_lag(frames):
