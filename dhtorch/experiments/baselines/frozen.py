@@ -1,4 +1,4 @@
-"""Methods of the first release with every option written out, as a fixed reference for later ones.
+"""Methods of earlier releases with every option written out, as fixed references for later ones.
 
 Changes of defaults elsewhere do not affect them.
 """
@@ -7,18 +7,21 @@ from __future__ import annotations
 
 from functools import partial
 
+from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.geometry.epipolar import triangulate
 from dhtorch.pipeline.method import Method
+from dhtorch.pipeline.view_selection import select_views_by_preview
 from dhtorch.stages.backproject import backproject
-from dhtorch.stages.fuse import inverse_variance
+from dhtorch.stages.fuse import fuse_consistent, inverse_variance
 from dhtorch.stages.holes import classify
+from dhtorch.stages.misalignment import reject_misaligned
 from dhtorch.stages.pose import map_pose, pnp_ransac
 from dhtorch.stages.sample import spiral
-from dhtorch.stages.score import confidence_from_error
+from dhtorch.stages.score import confidence_from_error, confidence_from_sigma
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.triangulate import two_view
 
-#: One source view: pose from near and far tracks together, a sigma for every answer.
+#: First release, one source view: pose from near and far tracks together, a sigma for every answer.
 MAP_1 = Method(
     sample=partial(
         spiral,
@@ -132,5 +135,58 @@ MAP_1 = Method(
     chain=True,
 )
 
-#: Five source views, evenly spaced up to the last one; their inverse depths are fused where at least two agree.
+#: First release, five source views, evenly spaced up to the last one; inverse depths are fused where two or more agree.
 WINDOW_1 = MAP_1.replace(views=5)
+
+#: Second release: five source views, selected by previews; consistent or sure estimates are fused.
+AUTO_2 = MAP_1.replace(
+    track={
+        "track": partial(
+            lucas_kanade,
+            window=21,
+            levels=4,
+            iterations=30,
+            epsilon_px=0.01,
+            max_round_trip_px=1.0,
+            normalise="bias",
+            min_eigenvalue=1.5747789311803154e-06,
+            start=None,
+        ),
+        "start": partial(
+            coarse_flow,
+            reach=0.25,
+            rotations_deg=(0.0, -30.0, -15.0, 15.0, 30.0),
+            zooms=(1.0, 1 / 1.4, 1.4),
+        ),
+    },
+    verify=partial(
+        reject_misaligned,
+        max_unexplained=0.65,
+        min_gain=0.85,
+        few_returns=3.0,
+        min_t_snr=30.0,
+    ),
+    triangulate={"max_sigma_rel": 1.0, "max_far_noise": 0.0025, "max_in_reach": 0.18},
+    score=partial(
+        confidence_from_sigma,
+        half_error=0.1,
+        recalibration=None,
+        min_score=0.0,
+    ),
+    fuse=partial(
+        fuse_consistent,
+        max_chi2=9.0,
+        max_conflict_ratio=0.25,
+        sure_rel=0.05,
+        sure_rel_each=0.08,
+        max_sigma_rel=0.2,
+        max_static_ratio=0.7,
+    ),
+    select_views=partial(
+        select_views_by_preview,
+        long=240,
+        good_sigma_rel=0.1,
+    ),
+    views=5,
+    chain=False,
+)
