@@ -76,13 +76,13 @@ def stack(records: Iterable[R], dim: int = 0) -> R:
     return _join(list(records), lambda xs: torch.stack(xs, dim))
 
 
-def collate(records: Iterable[R]) -> R:
-    """Join records along their first (batch) dimension; the ``collate_fn`` of a data loader over frames or pairs.
+def collate(records: Iterable[R], dim: int = 0) -> R:
+    """Join records along a dimension, the first (batch); the ``collate_fn`` of a data loader over frames or pairs.
 
     Raises:
         ValueError: no record, different kinds of records, a field present in some records only, or unequal shapes.
     """
-    return _join(list(records), torch.cat)
+    return _join(list(records), lambda xs: torch.cat(xs, dim))
 
 
 def chunked_apply(fn: Callable[..., R], size: int, *batch: Any) -> R:

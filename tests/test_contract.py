@@ -564,7 +564,7 @@ ELSEWHERE = {
     "dhtorch.geometry.free_space.free_space_violations",
     *(
         f"dhtorch.pipeline.view_selection.{name}"
-        for name in ("select_views_by_preview", "downscale_frame", "rank_views")
+        for name in ("select_views_by_preview", "downscale_frame", "rank_views", "tracked_motion")
     ),
     *(f"dhtorch.geometry.coarse_flow.{name}" for name in ("downscale", "is_not_identity", "invert_similarity")),
     "dhtorch.stages.track.resolve_coarse_flow",

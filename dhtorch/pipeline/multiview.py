@@ -11,11 +11,13 @@ line, which a single pair cannot detect.
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from dhtorch import pytree
+from dhtorch.codes import Gate
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.pyramid import PyramidCache
 from dhtorch.pipeline.pair import StageTimer, solve_pose_and_triangulate, track_in_chunks, upcast_intrinsics
@@ -65,9 +67,18 @@ def estimate_multiview(
         start_time = time.perf_counter()
         choice = _select_views(method, reference, others, samples, seed=seed, fit=fit, hint=hint)
         ms["select_views"] = 1e3 * (time.perf_counter() - start_time)
-        rows = choice.index, torch.arange(len(samples.uv), device=choice.index.device)
-        others, fit = others[rows], None if fit is None else fit[rows]
-    traces = _estimate_views(method, reference, others, samples, seed=seed, fit=fit, hint=hint, ms=ms)
+
+    def estimate_views(index: Tensor) -> list[Trace]:
+        """Traces of the views of an index (v, B)."""
+        views, poses = others, fit
+        if len(index) < len(others.image):
+            rows = index, torch.arange(len(samples.uv), device=index.device)
+            views, poses = others[rows], None if fit is None else fit[rows]
+        return _estimate_views(method, reference, views, samples, seed=seed, fit=poses, hint=hint, ms=ms)
+
+    traces = estimate_views(choice.index)
+    if choice.reserve is not None and len(choice.reserve) and bool(_is_mute(traces).any()):
+        traces, choice = _replace_mute_views(traces, estimate_views(choice.reserve), choice, choice.reserve)
     last, start_time = traces[-1], time.perf_counter()
     estimate = method.fuse(stack([t["estimate"] for t in traces]))
     estimate = method.score(estimate, samples, last["tracks_ideal"], last["fit"])
@@ -75,6 +86,33 @@ def estimate_multiview(
     if trace is not None:
         trace.update({**last, "estimate": estimate, "ms": ms, "views": traces, "choice": choice})
     return estimate
+
+
+def _is_mute(traces: Sequence[Trace]) -> Tensor:
+    """Whether views (V, B) answer no sample, other than for a camera that did not move: a wider view would not, either."""
+    gates = torch.stack([t["estimate"].gate for t in traces])
+    return ((gates != Gate.ANSWER) & (gates != Gate.NO_BASELINE)).all(-1)
+
+
+def _replace_mute_views(
+    traces: Sequence[Trace], reserve: Sequence[Trace], choice: ViewSelection, reserve_index: Tensor
+) -> tuple[list[Trace], ViewSelection]:
+    """The traces with views without an answer replaced by the first of the reserve with one, and the new choice.
+
+    Views stay in rising order. Their gains are those of the preview, 0 of the replacements.
+    """
+    everything = [*traces, *reserve]
+    index = torch.cat((choice.index, reserve_index))
+    order = _is_mute(everything).long().argsort(dim=0, stable=True)[: len(traces)]
+    order = order.gather(0, index.gather(0, order).argsort(dim=0, stable=True))
+    rows = order, torch.arange(order.shape[1], device=order.device)
+    names = [name for name in everything[0] if isinstance(everything[0][name], pytree.Record) and name != "samples"]
+    chosen = {name: stack([t[name] for t in everything])[rows] for name in names}
+    gain = None
+    if choice.gain is not None:
+        gain = torch.cat((choice.gain, choice.gain.new_zeros(reserve_index.shape)))[rows]
+    new = [{**traces[k], **{name: chosen[name][k] for name in names}} for k in range(len(traces))]
+    return new, choice.replace(index=index[rows], gain=gain, reserve=None)
 
 
 def _select_views(

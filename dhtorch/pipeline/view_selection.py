@@ -10,20 +10,27 @@ from functools import partial
 
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
+from dhtorch import pytree
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.coarse_flow import downscale
 from dhtorch.geometry.determinism import pad_elementwise
-from dhtorch.pipeline.pair import estimate_pair, upcast_intrinsics
+from dhtorch.pipeline.pair import StageTimer, solve_pose_and_triangulate, track_in_chunks, upcast_intrinsics
 from dhtorch.pipeline.spec import MethodSpec
-from dhtorch.records import Estimate, Frame, PoseFit, PosePrior, ViewSelection
+from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, PosePrior, Samples, Tracks, ViewSelection
 from dhtorch.stages.pose import map_pose
+from dhtorch.stages.sample import spiral
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
 
 #: Longest side of the images on which candidates are compared, px. Source: origin not recorded.
 PREVIEW_SIDE_PX = 240
+
+#: Places, evenly spread over the image, among which near returns for the previews' poses are sought, a count: a few
+#: returns in a thousand pixels are met. Source: derived, 10 of them where two pixels in a thousand have a return.
+N_NEAR_PLACES = 8192
 
 #: Method of the previews: every estimate with a sigma counts, weighted by it. Few samples, few hypotheses and no
 #: rolling-shutter rotation are enough to order views, where accurate points are not needed.
@@ -36,6 +43,11 @@ PREVIEW_METHOD = MethodSpec(
 )
 
 
+#: Weight of a view's tracks beside its gain: small enough to order equal gains alone.
+#: Source: derived, gains differ by more than 1e-6 where they differ, and a sum over 256 tracks is below 2000.
+TIE_WEIGHT = 1e-10
+
+
 def select_views_by_preview(
     reference: Frame,
     others: Frame,  # (V, B)
@@ -43,9 +55,15 @@ def select_views_by_preview(
     *,
     fit: PoseFit | PosePrior | None = None,  # (V, B)
     long: int = PREVIEW_SIDE_PX,
+    near: int = 128,
     good_sigma_rel: float = 0.1,
+    prefer_tracked: bool = True,
+    reserve: int | None = None,
 ) -> ViewSelection:
     """The best of many candidate views, and the gain of each, from previews on small images.
+
+    The pose of a preview needs near returns, which a few evenly spread samples miss where the sensor has few:
+    ``near`` further samples lie at returns, wherever these are. They enter the pose and not the ranking.
 
     Args:
         reference: B views.
@@ -53,7 +71,11 @@ def select_views_by_preview(
         views: how many to select.
         fit: given poses of the candidates; the pose search is then skipped.
         long: longest side of the small images, px; smaller images stay as they are.
+        near: most further samples at near returns.
         good_sigma_rel: see :func:`rank_views`.
+        prefer_tracked: whether views without an estimate are ordered by their tracks (:func:`tracked_motion`), not by
+            their place alone.
+        reserve: how many of the next best replace selected views that turn out to have no answer; None = ``views``.
 
     Raises:
         ValueError: wrong shapes, or not 1 <= views <= V.
@@ -65,12 +87,64 @@ def select_views_by_preview(
     with torch.no_grad():
         reference, scale = downscale_frame(reference, long)
         V, B = others.image.shape[:2]
-        flat = others.map(lambda x: x.flatten(0, 1))
-        references = reference.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
-        flat_fit = None if fit is None else fit.map(lambda x: x.flatten(0, 1))
-        estimate = estimate_pair(PREVIEW_METHOD, references, downscale_frame(flat, long)[0], fit=flat_fit)
-        estimate = estimate.map(lambda x: x.unflatten(0, (V, B)))
-        return rank_views(estimate.replace(sigma=estimate.sigma / scale), views, good_sigma_rel=good_sigma_rel)
+        samples = _preview_samples(reference, near)
+        flat = downscale_frame(others.map(lambda x: x.flatten(0, 1)), long)[0]
+        estimate, tracks = _preview_pairs(
+            reference.map(lambda x: x.expand(V, *x.shape).flatten(0, 1)),
+            samples.map(lambda x: x.expand(V, *x.shape).flatten(0, 1)),
+            flat,
+            None if fit is None else fit.map(lambda x: x.flatten(0, 1)),
+        )
+        estimate = estimate.map(lambda x: x[:, : PREVIEW_METHOD.n].unflatten(0, (V, B)))
+        motion = tracked_motion(tracks, long).unflatten(0, (V, B)) if prefer_tracked else None
+        return rank_views(
+            estimate.replace(sigma=estimate.sigma / scale),
+            views,
+            good_sigma_rel=good_sigma_rel,
+            motion=motion,
+            reserve=min(views if reserve is None else reserve, V - views),
+        )
+
+
+def _preview_samples(frame: Frame, near: int) -> Samples:
+    """Samples (B, N) of :data:`PREVIEW_METHOD`, then ``near`` at near returns with texture, evenly spread.
+
+    Of fewer returns all; the rest is not used (trackability 0).
+    """
+    even = PREVIEW_METHOD.sample_depth(frame)
+    if near < 1:
+        return even
+    uv = spiral(frame.hw, N_NEAR_PLACES, foveation=0.5, device=even.uv.device, dtype=even.uv.dtype)
+    places = PREVIEW_METHOD.sample_depth_at(frame, uv)
+    is_near = places.usable & (places.trackability >= PREVIEW_METHOD.min_trackability)
+    n = is_near.sum(-1, keepdim=True)
+    k = torch.arange(near, device=uv.device)
+    rank = torch.where(n > near, ((2 * k + 1) * n).div(2 * near, rounding_mode="floor"), k)
+    index = (~is_near).long().argsort(dim=-1, stable=True).gather(-1, rank)
+    chosen = places[torch.arange(len(index), device=index.device)[:, None], index]
+    chosen = chosen.replace(trackability=torch.where(k < n, chosen.trackability, 0.0))
+    return pytree.collate((even, chosen), dim=1)
+
+
+def _preview_pairs(
+    references: Frame, samples: Samples, others: Frame, fit: PoseFit | PosePrior | None
+) -> tuple[Estimate, Tracks]:
+    """Estimates and tracks (P, N) of pairs of small images."""
+    tracks = track_in_chunks(PREVIEW_METHOD, references.image, others.image, samples.uv, NO_HINT)
+    estimate, usable, _ = solve_pose_and_triangulate(
+        PREVIEW_METHOD, samples, tracks, references.camera, others.camera, seed=0, fit=fit, clock=StageTimer(None)
+    )
+    return estimate, usable
+
+
+def tracked_motion(tracks: Tracks, long: int) -> Tensor:
+    """How many points are tracked how far: sum (P,) over the tracks (P, N) of log(1 + (10 motion / ``long``)²).
+
+    It orders views without an estimate: more tracks are better, and so is a wider motion, less and less from a tenth
+    of the longer side on. Gradient: none.
+    """
+    motion = (tracks.uv_1 - tracks.uv_0).detach().norm(dim=-1) * (10 / long)
+    return torch.where(tracks.valid, motion.square().log1p(), 0.0).sum(-1)
 
 
 def downscale_frame(frame: Frame, long: int) -> tuple[Frame, int]:
@@ -92,12 +166,15 @@ def rank_views(
     views: int,
     *,
     good_sigma_rel: float = 0.1,
+    motion: Tensor | None = None,  # (V, B)
+    reserve: int = 0,
 ) -> ViewSelection:
     """The best views, greedily by the information of their estimates, and the gain of each over those before it.
 
     A wide view has a smaller sigma, a near one sees more points. The information of a set of views is the sum over the
     points of log(1 + sum of (good_sigma_rel · depth / sigma)² over its views); views are added one by one, each time
-    the one of largest gain, the wider of equals.
+    the one of largest gain; of equals, that of more ``motion`` (:func:`tracked_motion`), then the later one.
+    The ``reserve`` are those that would be added next.
 
     Raises:
         ValueError: wrong shapes, or not 1 <= views <= V.
@@ -109,19 +186,34 @@ def rank_views(
         raise ValueError(f"rank_views: views is {views}, expected 1 to {V}")
     is_answered = estimates.keep & (estimates.sigma > 0) & estimates.sigma.isfinite()
     ratio = good_sigma_rel * estimates.depth / torch.where(is_answered, estimates.sigma, 1.0)
-    information = (
-        torch.where(is_answered, ratio, 0.0).detach().double().square().flip(0)
-    )  # argmax takes the first of equals
+    # Reversed: argmax takes the first of equals.
+    information = torch.where(is_answered, ratio, 0.0).detach().double().square().flip(0)
+    preference = torch.zeros_like(information[..., 0])
+    if motion is not None:
+        preference = TIE_WEIGHT * motion.detach().double().flip(0)
+    rank, gain = _greedy_order(information, preference, min(V, views + reserve))
+    index = (rank < views).flip(0).long().argsort(dim=0, descending=True, stable=True)[:views]
+    selection = ViewSelection(index, gain.flip(0).gather(0, index), ~is_answered.any(-1))
+    if reserve < 1:
+        return selection
+    is_next = ((rank >= views) & (rank < views + reserve)).flip(0)
+    order = is_next.long().argsort(dim=0, descending=True, stable=True)
+    return selection.replace(reserve=order[: min(V - views, reserve)])
+
+
+def _greedy_order(information: Tensor, preference: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Rank (V, B) of views by information (V, B, N) where they are added one by one, V for those that are not, and the
+    gain of each."""
+    V = len(information)
     selected_information = torch.zeros_like(information[0])
-    is_free = torch.ones_like(information[:, :, 0], dtype=torch.bool)
-    added = torch.zeros_like(information[:, :, 0])
-    for _ in range(views):
+    rank = torch.full_like(preference, V, dtype=torch.int64)
+    added = torch.zeros_like(preference)
+    for k in range(count):
         gain = (
-            pad_elementwise(torch.log1p, selected_information + information).sum(-1).masked_fill(~is_free, -torch.inf)
+            pad_elementwise(torch.log1p, selected_information + information).sum(-1).masked_fill(rank < V, -torch.inf)
         )
-        best = F.one_hot(gain.argmax(0), V).T.bool()
+        best = F.one_hot((gain + preference).argmax(0), V).T.bool()
         added = torch.where(best, gain - pad_elementwise(torch.log1p, selected_information).sum(-1), added)
         selected_information = selected_information + torch.where(best[..., None], information, 0.0).sum(0)
-        is_free = is_free & ~best
-    index = is_free.flip(0).long().argsort(dim=0, stable=True)[:views]
-    return ViewSelection(index, added.flip(0).gather(0, index), ~is_answered.any(-1))
+        rank = torch.where(best, k, rank)
+    return rank, added

@@ -48,7 +48,7 @@ def inverse_variance(
         ``score`` is 1 where answered.
 
     Gates: NO_BASELINE for all points of a reference view whose views mostly have none; with too few views, the gate of
-    the last unanswered view; INCONSISTENT, UNCERTAIN.
+    the unanswered view in which the point came furthest, NO_POSE where no view has a pose; INCONSISTENT, UNCERTAIN.
 
     Raises:
         ValueError: wrong shapes, or no view.
@@ -72,7 +72,7 @@ def inverse_variance(
     sigma = depth * depth * (own_2 * widening + shared_2).sqrt()
     unsure = torch.zeros_like(n, dtype=torch.bool) if max_sigma_rel is None else sigma > max_sigma_rel * depth
     gate = first_reason((~(chi2 <= max_chi2), Gate.INCONSISTENT), (unsure, Gate.UNCERTAIN))
-    gate = torch.where(n < min(max(min_views, 1), V), _last_reason(estimates.gate, answered), gate)
+    gate = torch.where(n < min(max(min_views, 1), V), _furthest_reason(estimates.gate, answered), gate)
     return _joint_estimate(
         estimates,
         _static_gate(estimates, gate, max_static_ratio),
@@ -119,8 +119,9 @@ def fuse_consistent(
         ``parallax_deg`` is their largest, ``residual_px`` their weighted rms; ``score`` is 1 where answered.
 
     Gates: NO_BASELINE for all points of a reference view whose views mostly have none; where no view answers, the gate
-    of the last; INCONSISTENT (other views disagree), UNCERTAIN (a sigma too large for so many views); CONTRADICTED for
-    all answers where more views are CONTRADICTED than answer.
+    of the view in which the point came furthest, NO_POSE where no view has a pose; INCONSISTENT (other views disagree),
+    UNCERTAIN (a sigma too large for so many views); CONTRADICTED for all answers where more views are CONTRADICTED than
+    answer.
 
     Raises:
         ValueError: wrong shapes, or no view.
@@ -152,7 +153,7 @@ def fuse_consistent(
         max=math.inf if max_sigma_rel is None else max_sigma_rel
     )
     gate = first_reason((contradicted, Gate.INCONSISTENT), (sigma > max_rel * depth, Gate.UNCERTAIN))
-    gate = torch.where(n_agreeing < 1, _last_reason(estimates.gate, answered), gate)
+    gate = torch.where(n_agreeing < 1, _furthest_reason(estimates.gate, answered), gate)
     gate = _contradicted_gate(estimates, gate)
     parallax = torch.where(
         agreeing | (n_agreeing < 1), estimates.parallax_deg, torch.zeros_like(estimates.parallax_deg)
@@ -256,12 +257,16 @@ def _inverse_depth(estimates: Estimate, answered: Tensor) -> tuple[Tensor, Tenso
     return inverse, own, shared
 
 
-def _last_reason(gate: Tensor, is_answered: Tensor) -> Tensor:
-    """Gate (B, N) of the last unanswered view of (V, B, N)."""
-    reason = torch.full_like(gate[0], Gate.INCONSISTENT)
-    for code, answered in zip(gate, is_answered, strict=True):
-        reason = torch.where(answered | (code == Gate.ANSWER), reason, code)
-    return reason
+def _furthest_reason(gate: Tensor, answered: Tensor) -> Tensor:
+    """Gate (B, N) of the unanswered view (V, B, N) in which the point came furthest; gates are in order of precedence.
+
+    NO_POSE for all points where no view has a pose: that some are not tracked either is not why they stay unanswered.
+    """
+    reason = torch.where(answered | (gate == Gate.ANSWER), -1, gate).amax(0)
+    reason = torch.where(reason < 0, Gate.INCONSISTENT, reason)
+    no_pose = (gate == Gate.NO_POSE).any(-1).all(0)
+    untracked = (reason == Gate.NO_TRACK) | (reason == Gate.NO_TEXTURE)
+    return torch.where(no_pose[:, None] & untracked, Gate.NO_POSE, reason).to(gate.dtype)
 
 
 def _root(x: Tensor) -> Tensor:

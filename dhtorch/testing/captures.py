@@ -86,7 +86,7 @@ CAPTURE_WRITERS: Final[dict[str, CaptureWriter]] = {
     ),
     "arkitscenes": CaptureWriter(
         lambda root, frames: write_arkitscenes(
-            root / "41048190", {"lowres_wide": frames, "lowres_depth": frames}, trajectory=frames
+            root / "41048190", {"vga_wide": frames, "lowres_depth": frames}, trajectory=frames
         ),
         "arkitscenes",
         1 / 1000,

@@ -232,6 +232,7 @@ def test_a_frame_missing_in_the_middle_is_skipped_and_reported(tmp_path: Path) -
     recording = stored(root)
     assert recording.number.tolist() == [0, 2, 4, 6]  # of seven images
     assert recording.report == (
+        "1 depth map without a picture: left out",
         "1 image without depth: left out",
         "1 image without confidence: left out",
         "1 image without intrinsics: left out",

@@ -49,8 +49,9 @@ def test_every_method_chooses_among_what_is_offered(outcome):
         assert row["why"]["n_offered"] == 3 and len(row["why"]["gain"]) == len(views)
         assert max(row["why"]["gain"]) > 0 and 0 <= row["why"]["n_no_answer"] < 3
     of = {name: [r["views"] for r in rows if r["method"] == name] for name in SMALL}
-    assert of["paper"] == of["map"] and of["window"] == of["auto"], "all choose alike"
-    assert all(one[0] in two for one, two in zip(of["map"], of["auto"], strict=True)), "the best is chosen first"
+    assert of["paper"] == of["map"], "all choose alike"
+    for name in ("window", "auto"):
+        assert all(one[0] in two for one, two in zip(of["map"], of[name], strict=True)), "the best is chosen first"
 
 
 def test_a_single_view_answers_as_the_pair_does(room):

@@ -105,7 +105,25 @@ def test_another_view_without_an_answer_costs_nothing():
     spoken = (views.gate == 0).any(0)
     assert torch.equal(before.gate[spoken], after.gate[spoken])
     assert torch.equal(before.depth.nan_to_num(), after.depth.nan_to_num())
-    assert bool((after.gate[~spoken] == Gate.NO_TRACK).all())
+    assert torch.equal(before.gate[~spoken], after.gate[~spoken]), "the point came further in another view"
+
+
+def test_the_reason_is_that_of_the_view_in_which_the_point_came_furthest():
+    for gates, expected in (
+        ([Gate.NO_TRACK, Gate.UNCERTAIN, Gate.NO_TRACK], Gate.UNCERTAIN),
+        ([Gate.NO_POSE, Gate.NO_TRACK, Gate.NO_TRACK], Gate.NO_POSE),
+        ([Gate.NO_TRACK, Gate.NO_TRACK, Gate.NO_TRACK], Gate.NO_TRACK),
+    ):
+        assert int(fuse_consistent(make_estimates([4.0] * 3, [0.1] * 3, gate=gates)).gate) == expected
+
+
+def test_no_view_with_a_pose_is_the_reason_for_every_point():
+    views = random_estimates(V=3, N=4)
+    gate = torch.full_like(views.gate, int(Gate.NO_TRACK))
+    gate[:, :, 0] = int(Gate.NO_POSE)
+    assert bool((fuse_consistent(views.replace(gate=gate)).gate == Gate.NO_POSE).all())
+    gate[1, :, 0] = int(Gate.UNCERTAIN)
+    assert fuse_consistent(views.replace(gate=gate)).gate[0, 1:].tolist() == [Gate.NO_TRACK] * 3
 
 
 def test_a_contradiction_silences_and_an_outvoted_view_does_not():

@@ -33,6 +33,9 @@ from dhtorch.geometry.camera import resize
 from dhtorch.records import Camera, Frame
 from dhtorch.runtime.console import format_count
 
+#: Gap between two pictures, in their median step, above which a picture is missing. Source: derived, half a step more.
+_LONG_GAP_STEPS = 1.5
+
 #: Colour assets and their folder names, in order of preference.
 _COLOUR_ASSETS = {"lowres_wide": ("lowres_wide",), "vga_wide": ("vga_wide",), "wide": ("wide", "color")}
 
@@ -117,6 +120,8 @@ def read(
     if trajectory is not None:
         gap = max_pose_gap if interpolate else 0.0
         c2w, has["a pose"] = _read_poses(trajectory, pictures.times, max_pose_difference, gap)
+    if (lost := _count_lost_pictures(pictures.times, links["depth"])) > 0:
+        report.append(f"{format_count(lost, 'depth map')} without a picture: left out")
     kept = _select_complete(root, name, has, report)
     turns, c2w = 0, c2w[kept] if trajectory else c2w
     if upright and trajectory:
@@ -310,6 +315,19 @@ def _match_assets(
     if lowres is not None and name != "lowres_wide":
         links["intrinsics of the depth"] = _AssetMatch(lowres, nearest_stamps(times, lowres.times, max_difference))
     return links, report
+
+
+def _count_lost_pictures(times: np.ndarray, depth: _AssetMatch) -> int:
+    """Unmatched depth maps where pictures are missing: in gaps of their times that are longer than their usual step.
+
+    Pictures at a lower rate than depth leave depth maps unmatched everywhere, which is no loss.
+    """
+    if len(times) < 3:
+        return 0
+    unmatched = np.delete(depth.stamped.times, depth.at[depth.at >= 0])
+    gaps, after = np.diff(times), np.searchsorted(times, unmatched)
+    inside = (after > 0) & (after < len(times))
+    return int((gaps[after[inside] - 1] > _LONG_GAP_STEPS * np.median(gaps)).sum())
 
 
 def _select_complete(root: Path, name: str, has: dict[str, np.ndarray], report: list[str]) -> np.ndarray:

@@ -185,7 +185,10 @@ AUTO_2 = MAP_1.replace(
     select_views=partial(
         select_views_by_preview,
         long=240,
+        near=0,
         good_sigma_rel=0.1,
+        prefer_tracked=False,
+        reserve=0,
     ),
     views=5,
     chain=False,
