@@ -551,6 +551,9 @@ ELSEWHERE = {
         f"dhtorch.pipeline.pair.{name}"
         for name in (
             "estimate_pair",
+            "sample_returns",
+            "add_pose_samples",
+            "without_added",
             "track_in_chunks",
             "solve_pose_and_triangulate",
             "merge",

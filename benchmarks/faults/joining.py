@@ -1,7 +1,12 @@
 """The pair pipeline, and several views."""
 
 TESTS: dict[str, list[str]] = {
-    "pipeline.pair": ["tests/pipeline/test_merge.py", "tests/pipeline/test_pair.py", "tests/pipeline/test_method.py"],
+    "pipeline.pair": [
+        "tests/pipeline/test_few_returns.py",
+        "tests/pipeline/test_merge.py",
+        "tests/pipeline/test_pair.py",
+        "tests/pipeline/test_method.py",
+    ],
     "pipeline.method": ["tests/pipeline/test_method.py"],
     "pipeline.spec": ["tests/pipeline/test_method.py"],
     "pipeline.presets": ["tests/pipeline/test_merge.py", "tests/pipeline/test_method.py"],
@@ -11,7 +16,11 @@ TESTS: dict[str, list[str]] = {
         "tests/pipeline/test_multiview.py",
         "tests/stages/test_contradicted.py",
     ],
-    "pipeline.view_selection": ["tests/stages/test_fuse.py", "tests/stages/test_inverse_variance.py"],
+    "pipeline.view_selection": [
+        "tests/pipeline/test_few_returns.py",
+        "tests/stages/test_fuse.py",
+        "tests/stages/test_inverse_variance.py",
+    ],
     "pipeline.stream": ["tests/pipeline/test_stream.py"],
     "pipeline.multiview": ["tests/stages/test_inverse_variance.py", "tests/pipeline/test_multiview.py"],
     "pipeline.view_report": ["tests/pipeline/test_view_report.py"],
@@ -19,6 +28,9 @@ TESTS: dict[str, list[str]] = {
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
     "pipeline.pair": [
+        ("sample_returns", "torch.where(k < count, chosen.trackability, 0.0)", "chosen.trackability"),
+        ("sample_returns", "(~is_usable)", "is_usable"),
+        ("add_pose_samples", "torch.where(is_short, added.trackability, 0.0)", "added.trackability"),
         ("track_in_chunks", "hint=hint)", "hint=NO_HINT)"),
         ("TRACK_CHUNK_PAIRS", "8", "16"),
         ("solve_pose_and_triangulate", "tracks.valid & textured)", "tracks.valid)"),
@@ -119,8 +131,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
             "samples.map(lambda x: x.repeat_interleave(V, 0))",
         ),
         ("select_views_by_preview", "x[:, : PREVIEW_METHOD.n]", "x"),
-        ("_preview_samples", "near < 1", "near < 1e9"),
-        ("_preview_samples", "torch.where(k < n, chosen.trackability, 0.0)", "chosen.trackability"),
+        ("_preview_samples", "if near > 0", "if near < 0"),
         ("tracked_motion", "torch.where(tracks.valid, motion.square().log1p(), 0.0)", "motion.square().log1p()"),
         ("downscale_frame", "frame.camera.f / small.scale", "frame.camera.f"),
         ("downscale_frame", "(frame.camera.c - small.first) / small.scale", "frame.camera.c / small.scale"),

@@ -20,7 +20,14 @@ from dhtorch import pytree
 from dhtorch.codes import Gate
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.pyramid import PyramidCache
-from dhtorch.pipeline.pair import StageTimer, solve_pose_and_triangulate, track_in_chunks, upcast_intrinsics
+from dhtorch.pipeline.pair import (
+    StageTimer,
+    add_pose_samples,
+    solve_pose_and_triangulate,
+    track_in_chunks,
+    upcast_intrinsics,
+    without_added,
+)
 from dhtorch.pipeline.spec import MethodSpec, Trace
 from dhtorch.pipeline.view_selection import rank_views
 from dhtorch.pytree import R, stack
@@ -59,6 +66,8 @@ def estimate_multiview(
     start_time, ms = time.perf_counter(), {}
     reference, others = upcast_intrinsics(reference), upcast_intrinsics(others)
     samples = method.sample_depth(reference)
+    n = samples.uv.shape[1]
+    samples = add_pose_samples(method, reference, samples)
     ms["samples"] = 1e3 * (time.perf_counter() - start_time)
     hint = hint if hint.pyramid is not None else hint.replace(pyramid=PyramidCache(reference.image))
     all_views = torch.arange(len(others.image), device=samples.uv.device)[:, None].expand(-1, len(samples.uv))
@@ -79,6 +88,9 @@ def estimate_multiview(
     traces = estimate_views(choice.index)
     if choice.reserve is not None and len(choice.reserve) and bool(_is_mute(traces).any()):
         traces, choice = _replace_mute_views(traces, estimate_views(choice.reserve), choice, choice.reserve)
+    if samples.uv.shape[1] > n:
+        samples = without_added(samples, n)
+        traces = [_without_added(t, n) for t in traces]
     last, start_time = traces[-1], time.perf_counter()
     estimate = method.fuse(stack([t["estimate"] for t in traces]))
     estimate = method.score(estimate, samples, last["tracks_ideal"], last["fit"])
@@ -88,8 +100,15 @@ def estimate_multiview(
     return estimate
 
 
+def _without_added(trace: Trace, n: int) -> Trace:
+    """The trace of a view without the samples after the n-th, which only its pose used."""
+    fit: PoseFit = trace["fit"]
+    records = {name: without_added(trace[name], n) for name in ("samples", "tracks", "tracks_ideal", "estimate")}
+    return {**trace, **records, "fit": fit.replace(inlier=fit.inlier[:, :n])}
+
+
 def _is_mute(traces: Sequence[Trace]) -> Tensor:
-    """Whether views (V, B) answer no sample, other than for a camera that did not move: a wider view would not, either."""
+    """Whether views (V, B) answer no sample, other than for a camera that stood still: others would not."""
     gates = torch.stack([t["estimate"].gate for t in traces])
     return ((gates != Gate.ANSWER) & (gates != Gate.NO_BASELINE)).all(-1)
 

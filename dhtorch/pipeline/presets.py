@@ -73,6 +73,7 @@ AUTO = MAP.replace(
     fuse=partial(fuse_consistent, max_static_ratio=0.7),
     score=confidence_from_sigma,
     select_views=select_views_by_preview,
+    pose_samples=256,
     views=5,
     chain=False,
 )

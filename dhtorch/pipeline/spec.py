@@ -69,6 +69,9 @@ class MethodSpec:
     pose_prior: Callable[..., PosePrior] | None = None  # (reference, others) -> relative poses, or None
 
     n: int = 2048  # samples per reference view
+    pose_samples: int = (
+        0  # near returns that the pose has at least, where the samples meet fewer and the sensor has them
+    )
     hypotheses: int = 200  # minimal samples drawn by the pose search
     min_trackability: float = MIN_TRACKABILITY  # samples below it are not used (gate NO_TEXTURE)
     views: int = 1  # most other views that are used; of more, the best are selected

@@ -17,20 +17,21 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.coarse_flow import downscale
 from dhtorch.geometry.determinism import pad_elementwise
-from dhtorch.pipeline.pair import StageTimer, solve_pose_and_triangulate, track_in_chunks, upcast_intrinsics
+from dhtorch.pipeline.pair import (
+    StageTimer,
+    sample_returns,
+    solve_pose_and_triangulate,
+    track_in_chunks,
+    upcast_intrinsics,
+)
 from dhtorch.pipeline.spec import MethodSpec
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, PosePrior, Samples, Tracks, ViewSelection
 from dhtorch.stages.pose import map_pose
-from dhtorch.stages.sample import spiral
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
 
 #: Longest side of the images on which candidates are compared, px. Source: origin not recorded.
 PREVIEW_SIDE_PX = 240
-
-#: Places, evenly spread over the image, among which near returns for the previews' poses are sought, a count: a few
-#: returns in a thousand pixels are met. Source: derived, 10 of them where two pixels in a thousand have a return.
-N_NEAR_PLACES = 8192
 
 #: Method of the previews: every estimate with a sigma counts, weighted by it. Few samples, few hypotheses and no
 #: rolling-shutter rotation are enough to order views, where accurate points are not needed.
@@ -107,23 +108,9 @@ def select_views_by_preview(
 
 
 def _preview_samples(frame: Frame, near: int) -> Samples:
-    """Samples (B, N) of :data:`PREVIEW_METHOD`, then ``near`` at near returns with texture, evenly spread.
-
-    Of fewer returns all; the rest is not used (trackability 0).
-    """
+    """Samples (B, N) of :data:`PREVIEW_METHOD`, then ``near`` at near returns."""
     even = PREVIEW_METHOD.sample_depth(frame)
-    if near < 1:
-        return even
-    uv = spiral(frame.hw, N_NEAR_PLACES, foveation=0.5, device=even.uv.device, dtype=even.uv.dtype)
-    places = PREVIEW_METHOD.sample_depth_at(frame, uv)
-    is_near = places.usable & (places.trackability >= PREVIEW_METHOD.min_trackability)
-    n = is_near.sum(-1, keepdim=True)
-    k = torch.arange(near, device=uv.device)
-    rank = torch.where(n > near, ((2 * k + 1) * n).div(2 * near, rounding_mode="floor"), k)
-    index = (~is_near).long().argsort(dim=-1, stable=True).gather(-1, rank)
-    chosen = places[torch.arange(len(index), device=index.device)[:, None], index]
-    chosen = chosen.replace(trackability=torch.where(k < n, chosen.trackability, 0.0))
-    return pytree.collate((even, chosen), dim=1)
+    return pytree.collate((even, sample_returns(PREVIEW_METHOD, frame, near)), dim=1) if near > 0 else even
 
 
 def _preview_pairs(

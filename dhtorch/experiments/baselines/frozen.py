@@ -129,6 +129,7 @@ MAP_1 = Method(
     ),
     select_views=None,
     n=2048,
+    pose_samples=0,
     hypotheses=200,
     min_trackability=1e-05,
     views=1,
