@@ -6,6 +6,7 @@ a return is 0 and its ``xyz`` NaN; ``depth`` and ``sigma`` of an unanswered esti
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -110,6 +111,7 @@ class TrackHint:
     pyramid: PyramidCache | None = None  # of image 0, shared between the tracker calls
     levels: int | None = None  # pyramid levels for the motion in this scene; None = the tracker's own
     flows: tuple[CoarseFlow, CoarseFlow] | None = None  # coarse flow of the whole image, to image 1 and back
+    between: Sequence[Tensor] | Tensor | None = None  # K × (B, C, H, W), images between image 0 and 1, in their order
 
     def replace(self, **changes: Any) -> TrackHint:
         """A copy with some fields replaced."""
@@ -120,7 +122,8 @@ class TrackHint:
         start = None if self.start is None else self.start[part]
         pyramid = None if self.pyramid is None else self.pyramid[part]
         flows = None if self.flows is None else (self.flows[0][part], self.flows[1][part])
-        return replace(self, start=start, pyramid=pyramid, flows=flows)
+        between = None if self.between is None else tuple(image[part] for image in self.between)
+        return replace(self, start=start, pyramid=pyramid, flows=flows, between=between)
 
 
 #: A hint without any information.

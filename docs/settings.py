@@ -25,7 +25,7 @@ import torch
 
 from dhtorch.experiments.baselines import frozen, opencv, xfeat
 from dhtorch.pipeline.method import Method
-from dhtorch.pipeline.presets import METHODS
+from dhtorch.pipeline.presets import METHODS, PAPER_DIRECT
 from dhtorch.pipeline.spec import MethodSpec
 
 FOLDER = Path(__file__).resolve().parent.parent / "conf" / "method"
@@ -36,6 +36,7 @@ AT_RUN_TIME = {"hint", "device", "dtype", "seed", "fit", "linear"}
 #: File name → method, and what its file says first.
 WRITTEN: dict[str, Method] = {
     **METHODS,
+    "paper_direct": PAPER_DIRECT,
     "map_1": frozen.MAP_1,
     "window_1": frozen.WINDOW_1,
     "auto_2": frozen.AUTO_2,

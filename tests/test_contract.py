@@ -64,8 +64,19 @@ from dhtorch.pipeline import (
     view_selection,
 )
 from dhtorch.pipeline.presets import MAP, PAPER, WINDOW
-from dhtorch.records import Frame
-from dhtorch.stages import backproject, features, holes, misalignment, pose, pose_prior, score, track, triangulate
+from dhtorch.records import Frame, TrackHint
+from dhtorch.stages import (
+    backproject,
+    features,
+    holes,
+    misalignment,
+    pose,
+    pose_prior,
+    score,
+    track,
+    track_chain,
+    triangulate,
+)
 from dhtorch.synthetic import SyntheticRoom
 from dhtorch.validation import evidence, faults, validate, wrong_causes
 
@@ -251,6 +262,12 @@ def with_options(fn, **options):
     return functools.update_wrapper(functools.partial(fn, **options), fn)
 
 
+def chained(image_0, image_1, uv_0):
+    """Tracks through an image between."""
+    hint = TrackHint(between=((image_0 + image_1) / 2,))
+    return track_chain.track_chain(image_0, image_1, uv_0, hint=hint, track=track.lucas_kanade)
+
+
 #: A picture turned by a quarter, enlarged and shifted.
 AFFINE = torch.tensor([[[0.0, -2.0, 40.0], [2.0, 0.0, 3.0], [0.0, 0.0, 1.0]]])
 
@@ -414,6 +431,7 @@ ROWS = [
     Row(neighbours.window_range, lambda b, n, d: (uniform(b, 12, 15, dtype=d), 2), "dtype batch vmap capture"),
     Row(plane_sweep.occlusion_mask, lambda b, n, d: (plane_sweep.epipolar_warp(*swept(b, n, d)[:2]), swept(b, n, d)[2], uniform(b, dtype=d, high=0.1)), "batch capture"),
     Row(with_options(features.match_features, matcher=grid_matches), shifted, "dtype batch empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2)),
+    Row(functools.update_wrapper(chained, track_chain.track_chain), shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(track.lucas_kanade_affine, shifted, "dtype batch capture empty shuffle padding nan raises", (2,), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(affine_alignment.register_affine, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d)), "dtype batch capture empty shuffle padding nan raises", (2, 3), bad=wrong_last_axis(2), atol=1e-4, slow="capture"),
     Row(affine_alignment.registration_step, lambda b, n, d: (*pyramids(b, n, d), *nearby(b, n, d), torch.eye(2, dtype=d).expand(b, n, 2, 2)), "dtype batch capture gradcheck empty shuffle padding nan raises", (2, 3, 4), (0, 1), bad=wrong_last_axis(2), atol=1e-4),
@@ -651,6 +669,7 @@ ELSEWHERE = {
     "dhtorch.alignment.residual_noise.residual_variance",
     "dhtorch.geometry.determinism.round_up",
     "dhtorch.geometry.least_squares.minimise",
+    *(f"dhtorch.stages.track_chain.{name}" for name in ("frames_between", "images_used")),
     "dhtorch.geometry.reprojection_problem.pose_normal_equations_at",
     *(
         f"dhtorch.geometry.lucas_kanade.{n}"

@@ -195,6 +195,7 @@ def _make_pair_settings(settings: Mapping[str, Any]) -> Settings:
         dtype=dtype,
         batch=settings["batch"],
         workers=settings["workers"],
+        between=settings["between"],
     )
 
 

@@ -70,6 +70,7 @@ _OPTION_RULES: dict[str, _OptionRule] = {
     "threads": _or_null(_whole_number(1)),
     "batch": _whole_number(1),
     "workers": _whole_number(0),
+    "between": _or_null(_whole_number(0)),
     "dtype": _one_of("float32", "float64"),
     "device": ((lambda v: isinstance(v, str)), "a device that torch can use on this machine, e.g. cpu or cuda"),
     "figures": _one_of(True, False, "all"),

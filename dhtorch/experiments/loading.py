@@ -13,14 +13,16 @@ from dhtorch import pytree
 from dhtorch.data.io.decode import set_opencv_threads
 from dhtorch.data.pairs import Pair, spaced_frames
 from dhtorch.data.recording import Recording, TruthRecording
+from dhtorch.data.rig import Rig
 from dhtorch.records import Frame
 from dhtorch.runtime.parent_watch import exit_with_parent
+from dhtorch.stages.track_chain import frames_between
 
 CandidateViews = Callable[[Recording, int], Sequence[int]]  # (recording, reference view) → positions of source views
 
 #: (reference view, source views, reference view with its true depth, kinds of surface, disagreement of truth and
-#: sensor, candidate views around it)
-LoadedPair = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor, tuple[Frame, ...]]
+#: sensor, candidate views around it, images between reference view and source view)
+LoadedPair = tuple[Frame, tuple[Frame, ...], Frame, Tensor, Tensor, tuple[Frame, ...], tuple[Tensor, ...]]
 
 
 class PairDataset(Dataset[LoadedPair]):
@@ -33,8 +35,10 @@ class PairDataset(Dataset[LoadedPair]):
         dtype: torch.dtype,
         views: int = 1,
         offers: CandidateViews | None = None,
+        between: int = 0,
     ) -> None:
         self.recording, self.pairs, self.dtype, self.views, self.offers = recording, pairs, dtype, views, offers
+        self.between = between
 
     def __len__(self) -> int:
         return len(self.pairs)
@@ -43,15 +47,20 @@ class PairDataset(Dataset[LoadedPair]):
         i, other = pair = Pair(*self.pairs[index])
         pair_views = spaced_frames(i, other, self.views) if isinstance(other, int) else []
         candidates = candidate_views(pair, self.recording, self.offers)
-        frames = {k: self.recording[k].to(self.dtype) for k in sorted({i, *pair_views, *candidates})}
+        positions_between = images_between(pair, self.recording, self.between)
+        wanted = sorted({i, *pair_views, *candidates, *positions_between})
+        frames = {k: self.recording[k].to(self.dtype) for k in wanted}
         reference = frames[i]
         others, candidate_frames = (tuple(frames[k] for k in positions) for positions in (pair_views, candidates))
+        between = tuple(frames[k].image for k in positions_between)
         if not isinstance(self.recording, TruthRecording):
-            return reference, others, reference, torch.zeros(1, 1, 1), torch.full((1,), torch.nan), candidate_frames
+            no_kinds = torch.zeros(1, 1, 1)
+            unknown = torch.full((1,), torch.nan)
+            return reference, others, reference, no_kinds, unknown, candidate_frames, between
         exact = self.recording.truth(i)
         true_reference = reference.replace(depth=exact["depth"].to(self.dtype), depth_camera=None)
         disagreement = exact.get("disagreement", torch.full((1,), torch.nan))
-        return reference, others, true_reference, exact["surface"].float(), disagreement, candidate_frames
+        return reference, others, true_reference, exact["surface"].float(), disagreement, candidate_frames, between
 
 
 def load_pairs(data: PairDataset, *, batch: int, workers: int) -> DataLoader[LoadedPair]:
@@ -73,8 +82,15 @@ def candidate_views(pair: Pair, recording: Recording, offers: CandidateViews | N
     return pair.candidates or (() if offers is None else offers(recording, pair.reference))
 
 
+def images_between(pair: Pair, recording: Recording, most: int) -> list[int]:
+    """Positions of at most ``most`` frames between the two of a pair; none of a rig, where these are other cameras."""
+    if not isinstance(pair.other, int) or isinstance(recording, Rig):
+        return []
+    return frames_between(pair.reference, pair.other, most)
+
+
 def _collate(items: list[LoadedPair]) -> LoadedPair:
-    reference, others, exact, surface, disagreement, around = zip(*items, strict=True)
+    reference, others, exact, surface, disagreement, around, between = zip(*items, strict=True)
     views, candidates = (tuple(pytree.collate(v) for v in zip(*columns, strict=True)) for columns in (others, around))
     return (
         pytree.collate(reference),
@@ -83,6 +99,7 @@ def _collate(items: list[LoadedPair]) -> LoadedPair:
         torch.cat(surface),
         torch.cat(disagreement),
         candidates,
+        tuple(torch.cat(images) for images in zip(*between, strict=True)),
     )
 
 

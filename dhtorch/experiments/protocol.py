@@ -31,6 +31,7 @@ from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
 from dhtorch.pipeline.view_report import ViewReport, report_selection, with_view_selection
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, Samples, TrackHint, Tracks
+from dhtorch.stages.track_chain import frames_between, images_used
 
 ScenePairs = Callable[[Scene], Sequence[Pair] | Sequence[tuple[int, int]]]
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
@@ -59,6 +60,7 @@ class Settings:
     dtype: torch.dtype = torch.float32
     batch: int = 1
     workers: int = 0
+    between: int | None = None  # frames between the two of a pair for its tracker, at most; None = as many as it uses
 
     def cutoff_of(self, scene: Scene) -> float | None:
         """Cutoff of a scene, m; None where it has no near limit."""
@@ -79,6 +81,7 @@ class Batch:
     surface: Tensor  # (B, H, W) kind of surface, (B, 1, 1) where the recording has none
     disagreement: Tensor  # (B,) median relative difference of the independent truth from the sensor; NaN = none
     around: tuple[Frame, ...] = ()  # candidate source views of any variant, in the order of the recording
+    between: tuple[Tensor, ...] = ()  # images (B, C, H, W) between the reference view and the pair's own source view
 
     @property
     def odd(self) -> dict[int, str]:
@@ -166,6 +169,7 @@ class Answer:
                 reference=self.batch.reference[cut],
                 others=tuple(f[cut] for f in self.batch.others),
                 around=tuple(f[cut] for f in self.batch.around),
+                between=tuple(image[cut] for image in self.batch.between),
                 exact=self.batch.exact[cut],
                 surface=self.batch.surface[cut],
                 disagreement=self.batch.disagreement[cut],
@@ -223,9 +227,18 @@ class Protocol:
         most = max((v.method.views for v in self.variants.values() if v.offers is None), default=1)
         return min([most, *(max(1, j - i) for i, j in pairs if isinstance(j, int))])
 
+    def between(self, settings: Settings) -> int:
+        """Number of frames loaded between the two of a pair: the settings', else the maximum over variants."""
+        if settings.between is not None:
+            return settings.between
+        return max((images_used(v.method.track) for v in self.variants.values() if v.offers is None), default=0)
+
     def batch(self, settings: Settings, pairs: Sequence[Pair]) -> int:
-        """Pairs per call: one where the number of candidate views may differ between reference views."""
-        return settings.batch if self.offers is None and not any(pair.candidates for pair in pairs) else 1
+        """Pairs per call: one where the number of candidate views or of frames between may differ."""
+        most = self.between(settings)
+        n_between = {len(frames_between(i, j, most)) for i, j in pairs if isinstance(j, int)}
+        same = self.offers is None and not any(pair.candidates for pair in pairs) and len(n_between) <= 1
+        return settings.batch if same else 1
 
     def allows(self, pairs: Sequence[Pair]) -> None:
         """Check that pairs have a fixed source view if a variant cannot select views.
@@ -267,7 +280,8 @@ def run(
         chosen = [Pair(*pair) for pair in pairs(scene)]  # first: raises for a data set without pairs of views
         protocol.allows(chosen)
         collector = _SceneCollector(scene, protocol, settings)
-        data = PairDataset(scene.recording, chosen, settings.dtype, protocol.views(chosen), protocol.offers)
+        views, between = protocol.views(chosen), protocol.between(settings)
+        data = PairDataset(scene.recording, chosen, settings.dtype, views, protocol.offers, between)
         size = protocol.batch(settings, chosen)
         loader = load_pairs(data, batch=size, workers=settings.workers)
         for start, items in zip(range(0, len(chosen), size), progress(loader, scene.name, len(loader)), strict=True):
@@ -338,7 +352,7 @@ class _SceneCollector:
                 "others": selected,
                 "method": variant.method,
                 "seed": self.settings.seed,
-                "hint": self.scene.hint,
+                "hint": self._hint(answer.batch, selected),
             }
         return Example(
             self.scene.name,
@@ -399,7 +413,8 @@ class _SceneCollector:
         distort = getattr(self.scene.recording, "spoil_track", lambda track: track)
         seed = self.settings.seed if variant.seed is None else variant.seed
         track = distort(shared.shared_tracker(method.track))
-        options: dict[str, Any] = {"seed": seed, "hint": self.scene.hint, "track": track}
+        hint = self.scene.hint if variant.offers is not None else self._hint(batch, others)
+        options: dict[str, Any] = {"seed": seed, "hint": hint, "track": track}
         if variant.fit is not None:
             options["fit"] = variant.fit(batch, method.n)
         options |= variant.call_options(batch)
@@ -410,6 +425,12 @@ class _SceneCollector:
             estimate = call(reference, reference if others is None else others, trace=trace, **options)
         shared.charge(trace["ms"])
         return estimate, trace
+
+    def _hint(self, batch: Batch, others: Frame | None) -> TrackHint:
+        """The scene's hint, with the images between the reference view and its only source view."""
+        if not batch.between or others is None or others.image.dim() != 4:
+            return self.scene.hint
+        return self.scene.hint.replace(between=tuple(image[: len(others.image)] for image in batch.between))
 
     def _selection_report(self, answer: Answer) -> ViewReport | None:
         """Report of the view selection of one answer; None for a variant without candidate views."""

@@ -48,9 +48,13 @@ class SharedTracks:
     ) -> Tracks:
         start = time.perf_counter()
         key = stage_key(track), hint.levels
-        inputs = (image_0, image_1, uv_0, uv_0 if hint.start is None else hint.start)
+        inputs = (image_0, image_1, uv_0, uv_0 if hint.start is None else hint.start, *(hint.between or ()))
         for cached_key, cached_inputs, tracks, ms in self._cached:
-            if cached_key == key and all(map(_is_same_tensor, cached_inputs, inputs)):
+            if (
+                cached_key == key
+                and len(cached_inputs) == len(inputs)
+                and all(map(_is_same_tensor, cached_inputs, inputs))
+            ):
                 self._uncharged_ms += ms
                 return tracks
         tracks = track(image_0, image_1, uv_0, hint=hint)

@@ -48,7 +48,8 @@ class Method(MethodSpec):
             fit: a pose that is used as it is, (B,) or (V, B): stage 5 is then skipped; or a :class:`PosePrior`, which
                 near returns may refute (:func:`dhtorch.stages.pose_prior.check_pose_prior`). None = the prior of
                 ``pose_prior``, if there is one.
-            hint: prior knowledge of the motion, for the tracker.
+            hint: prior knowledge of the motion, for the tracker. Images between the two views (``between``) are used
+                with one other view only.
             trace: a dict that receives ``samples``, ``tracks`` (as tracked), ``tracks_ideal`` (undistorted), ``fit``,
                 ``estimate`` and ``ms`` (milliseconds by stage). With several views those of the last, ``ms`` summed
                 over all, and ``views``, the traces of all.

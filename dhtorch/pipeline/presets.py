@@ -16,10 +16,15 @@ from dhtorch.stages.kornia.triangulate import two_view_kornia
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.score import confidence_from_error, confidence_from_sigma
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
+from dhtorch.stages.track_chain import track_chain
 from dhtorch.stages.triangulate import two_view
 
-#: The paper's method and parameters; the one difference is P3P instead of EPnP as the minimal solver.
+#: The paper's method and parameters; the one difference is P3P instead of EPnP as the minimal solver. Tracks go through
+#: the images between the two views where the hint has them.
 PAPER = Method()
+
+#: ``PAPER`` with one jump of the tracks from view to view, whatever lies between.
+PAPER_DIRECT = PAPER.replace(track=lucas_kanade)
 
 #: The paper's method as a function of two frames.
 extend = PAPER
@@ -30,7 +35,7 @@ extend = PAPER
 KORNIA = PAPER.replace(
     backproject=backproject_kornia,
     classify=classify_kornia,
-    track=lucas_kanade_kornia,
+    track=partial(track_chain, track=lucas_kanade_kornia),
     pose=pnp_ransac_kornia,
     triangulate=two_view_kornia,
 )

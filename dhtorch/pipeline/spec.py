@@ -36,6 +36,7 @@ from dhtorch.stages.pose import pnp_ransac
 from dhtorch.stages.sample import spiral
 from dhtorch.stages.score import confidence
 from dhtorch.stages.track import lucas_kanade
+from dhtorch.stages.track_chain import track_chain
 from dhtorch.stages.triangulate import two_view
 
 #: Intermediates and milliseconds by stage name; fill one with ``method(..., trace=trace)``.
@@ -57,7 +58,7 @@ class MethodSpec:
     sample: Callable[..., Tensor] = spiral  # (hw, n, *, device, dtype) -> uv (n, 2) px
     backproject: Callable[..., Samples] = backproject  # (frame, uv)
     classify: Callable[..., Samples] = classify  # (frame, samples) -> samples with their holes
-    track: Callable[..., Tracks] = lucas_kanade  # (image_0, image_1, uv_0, *, hint)
+    track: Callable[..., Tracks] = partial(track_chain, track=lucas_kanade)  # (image_0, image_1, uv_0, *, hint)
     pose: Callable[..., PoseFit] = pnp_ransac  # (samples, tracks, camera_0, camera_1, draws)
     verify: Callable[..., PoseFit] | None = reject_misaligned  # (samples, tracks, fit, camera_0, camera_1)
     triangulate: Callable[..., Estimate] = two_view  # (samples, tracks, fit, camera_0, camera_1)
