@@ -69,7 +69,8 @@ def estimate_multiview(
     n = samples.uv.shape[1]
     samples = add_pose_samples(method, reference, samples)
     ms["samples"] = 1e3 * (time.perf_counter() - start_time)
-    hint = hint.replace(pyramid=hint.pyramid or PyramidCache(reference.image), between=None)
+    hint = hint.replace(between=None)
+    hint = hint if hint.pyramid is not None else hint.replace(pyramid=PyramidCache(reference.image))
     all_views = torch.arange(len(others.image), device=samples.uv.device)[:, None].expand(-1, len(samples.uv))
     choice = ViewSelection(all_views)
     if len(others.image) > method.views:

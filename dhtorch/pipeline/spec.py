@@ -39,6 +39,9 @@ from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.track_chain import track_chain
 from dhtorch.stages.triangulate import two_view
 
+#: The paper's short tracks: through the images between the two views where the hint has them.
+_PAPER_TRACK = partial(track_chain, track=lucas_kanade)
+
 #: Intermediates and milliseconds by stage name; fill one with ``method(..., trace=trace)``.
 Trace = dict[str, Any]
 
@@ -58,7 +61,7 @@ class MethodSpec:
     sample: Callable[..., Tensor] = spiral  # (hw, n, *, device, dtype) -> uv (n, 2) px
     backproject: Callable[..., Samples] = backproject  # (frame, uv)
     classify: Callable[..., Samples] = classify  # (frame, samples) -> samples with their holes
-    track: Callable[..., Tracks] = partial(track_chain, track=lucas_kanade)  # (image_0, image_1, uv_0, *, hint)
+    track: Callable[..., Tracks] = _PAPER_TRACK  # (image_0, image_1, uv_0, *, hint)
     pose: Callable[..., PoseFit] = pnp_ransac  # (samples, tracks, camera_0, camera_1, draws)
     verify: Callable[..., PoseFit] | None = reject_misaligned  # (samples, tracks, fit, camera_0, camera_1)
     triangulate: Callable[..., Estimate] = two_view  # (samples, tracks, fit, camera_0, camera_1)

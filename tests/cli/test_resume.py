@@ -260,7 +260,7 @@ def test_changed_data_are_another_question(command, tmp_path):
 def test_files_that_settings_name_count_by_content_not_by_place(tmp_path, capsys):
     """The same weights elsewhere ask the same, other weights do not."""
     common = {"threads": None, "resume": True, "figures": False, "device": "cpu", "dtype": "float32", "seed": 0}
-    common |= {"batch": 1, "workers": 0, "holdout": {"cutoff": 1.0, "truth": "full"}}
+    common |= {"batch": 1, "workers": 0, "between": None, "holdout": {"cutoff": 1.0, "truth": "full"}}
     parts = {"data": SyntheticRoom(hw=(8, 8), n_frames=2), "method": None, "pairs": None}
     asked = []
 

@@ -88,7 +88,10 @@ def small(**options):
 
 def test_without_a_cutoff_there_is_no_truth():
     outcome = pair.run(
-        [room_scene(small())], {"paper": method("paper")}, partial(by_gap, gap=2), pair.Settings(cutoff=float("inf"))
+        [room_scene(small())],
+        {"paper": method("paper_direct")},
+        partial(by_gap, gap=2),
+        pair.Settings(cutoff=float("inf")),
     )
     row = scene_row(outcome)
     assert row["n_candidates"] == 0 and row["median_rel"] is None and row["n_pairs"] == 2
@@ -123,7 +126,7 @@ def test_variants_share_tracks_and_pay_for_them():
         "own": protocol.Variant(base),
     }
     outcome = protocol.run(
-        [room_scene(small())], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings()
+        [room_scene(small())], protocol.Protocol(variants), partial(by_gap, gap=3), protocol.Settings(between=0)
     )
     assert len(asked) == outcome.n_pairs == 1
     rows = [scene_row(outcome, method=name) for name in variants]

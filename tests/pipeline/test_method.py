@@ -93,7 +93,7 @@ def test_a_plain_function_in_every_stage_answers_as_the_stage_itself(room):
 def test_it_runs_in_the_protocol_with_the_levels_of_the_scene(room, views):
     scene = Scene(room, near=2.0, levels=2)
     methods = {"plain": PLAIN.replace(views=views), "usual": USUAL.replace(views=views)}
-    outcome = pairs.run([scene], methods, partial(by_gap, gap=3), protocol.Settings())
+    outcome = pairs.run([scene], methods, partial(by_gap, gap=3), protocol.Settings(between=0))
     plain, usual = (
         {k: v for k, v in outcome.scenes(m)["synthetic_room"].items() if k not in ("ms", "method")} for m in methods
     )
@@ -129,7 +129,7 @@ def test_it_runs_in_the_viewer_and_its_result_in_the_report(room, tmp_path):
     assert len(shown.shots) == 4 and (shown.shots[0].samples["gate"] == 0).sum() > 20
     settings = {"threads": None, "resume": False, "figures": False, "seed": 0, "device": "cpu", "dtype": "float32"}
     settings |= {"batch": 1, "workers": 0, "holdout": {"cutoff": None, "truth": "full"}, "method": {}, "data": {}}
-    settings |= {"pairs": {}, "experiment": {}}
+    settings |= {"pairs": {}, "experiment": {}, "between": None}
     parts = {"data": Scene(room, near=2.0), "method": PLAIN, "pairs": partial(by_gap, gap=3), "experiment": pairs.run}
     choices = dict.fromkeys(job.SETTINGS_GROUPS, "mine") | {"experiment": "pair", "method": "plain"}
     ended = job.run(settings, parts, choices, tmp_path, progress=lambda items, *_: items)

@@ -96,11 +96,11 @@ def test_no_image_is_used_where_none_is_asked():
 def test_drift_does_not_add_up_with_the_number_of_hops(track):
     def spread(hops, register):
         images = sequence(hops, noise=0.04)
-        chain = through(images, points(80), track, between=hops - 1, register=register, levels=2)
+        chain = through(images, points(30), track, between=hops - 1, register=register, levels=2)
         return float(distance(chain)[chain.valid].square().mean().sqrt())
 
-    assert max(spread(5, True), spread(20, True)) < 0.01
-    assert spread(20, False) > 1.7 * spread(5, False) > 0.05
+    assert max(spread(5, True), spread(15, True)) < 0.01
+    assert spread(15, False) > 1.4 * spread(5, False) > 0.04
 
 
 def test_registered_tracks_are_those_of_the_tracker_from_there():
@@ -209,6 +209,19 @@ def test_a_lost_point_is_tracked_directly_at_the_end_only():
     lost = through(numbered(5), UV, stand_in(lost=((1, 2), (0, 4))), between=3)
     assert lost.valid.tolist() == [[False, True, True]]
     assert not through(numbered(5), UV, stand_in(lost=((1, 2),)), between=3, register=False).valid[0, 0]
+
+
+def test_what_is_lost_stays_lost_and_where_it_was():
+    def sure(image_0, image_1, uv_0, *, hint):
+        """Loses point 0 from image 1 to 2 and nothing else, not even what lies outside."""
+        tracks = stand_in()(image_0, image_1, uv_0, hint=hint)
+        valid = torch.ones_like(tracks.valid)
+        valid[:, 0] = (float(image_0[0, 0, 0, 0]), float(image_1[0, 0, 0, 0])) != (1, 2)
+        return tracks.replace(valid=valid)
+
+    chain = through(numbered(5), UV, sure, between=3, register=False)
+    assert chain.valid.tolist() == [[False, True, True]]
+    assert torch.equal(chain.uv_1[0], UV[0] + torch.tensor([[20.0, 0], [40, 0], [40, 0]]))
 
 
 def test_hops_have_a_tracker_of_their_own():
