@@ -10,7 +10,7 @@ from torch import Tensor
 from dhtorch.data.recording import TruthRecording
 from dhtorch.data.scene import Scene
 from dhtorch.experiments.baselines.device_pose import known_pose_fit
-from dhtorch.experiments.protocol import Batch, Method, Variant
+from dhtorch.experiments.protocol import Batch, Method, Settings, Variant, far_truth
 from dhtorch.geometry import se3
 from dhtorch.metrics import holdout
 from dhtorch.pipeline.spec import Trace
@@ -38,8 +38,8 @@ class PoseHalfClassifier:
 class HeldOut:
     """Cohorts of the hold-out: set B, and for the naive protocol the pose's own inliers of set A."""
 
-    def __init__(self, method: Method, seed: int) -> None:
-        self.method, self.seed = method, seed
+    def __init__(self, method: Method, settings: Settings) -> None:
+        self.method, self.seed, self.test = method, settings.seed, settings.truth[-1]
 
     def variant(self, **more: Any) -> Variant:
         """Variant with set B hidden from the method; without view selection, which would use the returns of set B."""
@@ -63,14 +63,21 @@ class HeldOut:
 
     def _truth(self, batch: Batch, trace: Trace) -> tuple[Samples, holdout.Truth]:
         samples = self.whole(batch, trace["samples"].uv)
-        truth_at_samples = holdout.sample_truth(batch.reference, samples.uv)
+        truth_at_samples = holdout.sample_truth(batch.reference, samples.uv, truth=self.test)
         return samples, holdout.select_candidates(samples, truth_at_samples, 0.0)
 
 
-def real_holes(batch: Batch, trace: Trace) -> holdout.Truth:
+def far_real_holes(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Truth:
+    """Independent truth beyond the cutoff where the sensor has no return: the real holes beside the range split."""
+    uv = trace["samples"].uv
+    no_return = holdout.sample_truth(batch.reference, uv, truth="raw").depth <= 0
+    return _restrict_candidates(far_truth(batch, trace, test=test), no_return)
+
+
+def real_holes(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Truth:
     """Truth of the sensor's own drop-outs, from independent truth; no candidates where there is none."""
     samples: Samples = trace["samples"]
-    truth = holdout.sample_truth(batch.exact, samples.uv)
+    truth = holdout.sample_truth(batch.exact, samples.uv, truth=test)
     if missing_truth_reason(batch.scene) is not None:
         return truth.replace(code=torch.full_like(truth.code, holdout.TruthCode.NO_RETURN))
     kinds = batch.kinds(samples.uv)

@@ -94,7 +94,7 @@ def make_exhibit(
 
 def _make_pair_exhibit(answer: Answer, view_numbers: Sequence[int]) -> PairExhibit:
     batch, samples, estimate = answer.batch, answer.samples, answer.estimate
-    tracks, fit, truth = answer.trace["tracks"], answer.trace["fit"], answer.truths["full"]
+    tracks, fit, truth = answer.trace["tracks"], answer.trace["fit"], list(answer.truths.values())[-1]
     whole, reference, i, j = merge(samples, estimate), batch.reference, batch.pairs[0].reference, answer.other[0]
     filled = whole.source != Source.NONE
     xyz = cam.unproject(reference.camera, whole.uv, whole.depth)

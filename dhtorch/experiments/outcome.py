@@ -46,22 +46,25 @@ class Outcome:
     verdict: str | None = None
     why: str | None = None
     points: dict[tuple[str, str, str], errors.Points] = field(default_factory=dict)  # (scene, variant, cohort) → pool
+    cohort: str = "full"  # the one that the verdict and the numbers of the summary without a cohort are about
 
     def decide(self, question: str, expectation: str, holds: bool | None, why: str) -> Outcome:
         """Outcome with the answer to its question: True supported, False refuted, None undecided."""
         words = {True: "supported", False: "refuted", None: "undecided"}
         return replace(self, question=question, expectation=expectation, verdict=words[holds], why=why)
 
-    def scenes(self, variant: str, cohort: str = "full") -> dict[str, Row]:
-        """Scene → row of one variant and cohort; scenes with a role are left out."""
-        key = (variant, cohort, None, None)
+    def scenes(self, variant: str, cohort: str | None = None) -> dict[str, Row]:
+        """Scene → row of one variant and cohort (None = the deciding one); scenes with a role are left out."""
+        key = (variant, cohort or self.cohort, None, None)
         return {r["scene"]: r for r in self.rows if (r["method"], r["truth"], r["pair"], r.get("role")) == key}
 
 
 def join_outcomes(outcomes: Iterable[Outcome]) -> Outcome:
-    """Outcomes of several runs as one; their variants must have different names."""
-    joined = Outcome()
-    for part in outcomes:
+    """Outcomes of several runs as one, with the deciding cohort of the first; their variants must have different names.
+    """
+    parts = list(outcomes)
+    joined = Outcome(cohort=parts[0].cohort) if parts else Outcome()
+    for part in parts:
         joined.rows += part.rows
         joined.summary |= part.summary
         joined.examples += [e for e in part.examples if e.scene not in {x.scene for x in joined.examples}]

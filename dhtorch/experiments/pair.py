@@ -6,7 +6,6 @@ It has no question (question, expectation and verdict are null), unlike the othe
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 
 from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
@@ -26,5 +25,4 @@ def run(
     Args and errors: as :func:`dhtorch.experiments.protocol.run`; ``methods`` is name → method.
     """
     variants = {name: Variant(method) for name, method in methods.items()}
-    cohorts = {test: partial(protocol.held_back_truth, test=test) for test in settings.truth}
-    return protocol.run(scenes, Protocol(variants, cohorts), pairs, settings, progress=progress)
+    return protocol.run(scenes, Protocol(variants), pairs, settings, progress=progress)

@@ -130,6 +130,11 @@ class Variant:
     chooses: bool = False  # ``estimate`` selects among candidate views, as the method does
     two_frames: bool = False  # no view selection: the held-out samples would influence it
 
+    @property
+    def states_sigma(self) -> bool:
+        """Whether the sigma of its estimates is a statement: always for ``estimate``, else as the method."""
+        return self.estimate is not None or self.method.states_sigma
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -181,7 +186,15 @@ class Answer:
 
 
 def held_back_truth(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Truth:
-    """Cohort of the range split: truth at samples whose return was held back and passes the truth test."""
+    """Cohort of the range split: truth at samples whose return was masked and whose truth passes the truth test."""
+    truth = far_truth(batch, trace, test=test)
+    if batch.cutoff is None or batch.cutoff == math.inf:
+        return truth
+    return holdout.require_masked(truth, batch.reference, trace["samples"].uv, batch.cutoff)
+
+
+def far_truth(batch: Batch, trace: Trace, *, test: str = "full") -> holdout.Truth:
+    """Truth beyond the cutoff that passes the truth test, whether or not the sensor has a return there."""
     samples: Samples = trace["samples"]
     kinds = batch.kinds(samples.uv)
     odd = None if kinds is None else torch.isin(kinds, torch.tensor([*batch.odd], dtype=kinds.dtype).to(kinds.device))
@@ -189,6 +202,11 @@ def held_back_truth(batch: Batch, trace: Trace, *, test: str = "full") -> holdou
     return holdout.select_candidates(
         samples, truth_at_samples, batch.cutoff if _has_cutoff(batch.cutoff) else None, excluded=odd
     )
+
+
+def range_split_cohorts(settings: Settings) -> dict[str, Cohort]:
+    """Cohorts of the range split by their truth test, one for each of ``settings.truth``."""
+    return {test: partial(held_back_truth, test=test) for test in settings.truth}
 
 
 def spread_pairs(pairs: ScenePairs, references: int | None, scene: Scene) -> list[tuple[int, int]]:
@@ -210,11 +228,12 @@ class Protocol:
 
     variants: Mapping[str, Variant]
     cohorts: Mapping[str, Cohort] = field(
-        default_factory=lambda: {"full": held_back_truth}
-    )  # the last one selects the pairs
+        default_factory=dict
+    )  # the last one selects the pairs; none = those of the range split, by the truth tests of the settings
     hide: Callable[[Frame, float | None], Frame] = holdout.range_split  # (view, cutoff) → the view as a method sees it
     columns: Callable[[Answer], Row] = no_columns  # of one pair; numbers enter the scene's row as medians over pairs
     min_candidates: int = MIN_CANDIDATES
+    reads_scores: bool = False  # the score of every method is evaluated as a probability, also one that only orders
 
     @property
     def offers(self) -> CandidateViews | None:
@@ -275,7 +294,8 @@ def run(
     Raises:
         ValueError: bad data or options, as the readers, ``pairs`` and the hold-out raise them.
     """
-    outcome = Outcome()
+    protocol = protocol if protocol.cohorts else replace(protocol, cohorts=range_split_cohorts(settings))
+    outcome = Outcome(cohort=list(protocol.cohorts)[-1])
     for scene in scenes_of(scenes):
         chosen = [Pair(*pair) for pair in pairs(scene)]  # first: raises for a data set without pairs of views
         protocol.allows(chosen)
@@ -383,9 +403,10 @@ class _SceneCollector:
                         if k
                     }
                     separate = {k[2]: p for k, p in self.separate_points.items() if k[:2] == key}
-                    row |= scene_row(pair_rows, self.pooled[key], self.dropped[key], separate) | {
-                        "hole_share": hole_ratios
-                    }
+                    reads_score = self.protocol.reads_scores or self.variants[name].states_sigma
+                    pooled, dropped = self.pooled[key], self.dropped[key]
+                    row |= scene_row(pair_rows, pooled, dropped, separate, reads_score=reads_score)
+                    row["hole_share"] = hole_ratios
                     row |= {"overlay": self.overlays[name]} if cohort == self.deciding_cohort else {}
                 rows.append(row)
         return rows
@@ -449,6 +470,8 @@ class _SceneCollector:
     def _add_pair(self, answer: Answer, report: ViewReport | None) -> None:
         """Add the rows and points of one pair."""
         estimate, fit, kinds = answer.estimate, answer.trace["fit"], answer.batch.kinds(answer.samples.uv)
+        if not self.variants[answer.variant].states_sigma:
+            estimate = estimate.replace(sigma=torch.full_like(estimate.sigma, torch.nan))
         hole = ~answer.samples.usable
         gate_ratio = {gate.lower(): float((estimate.gate == code).float().mean()) for code, gate in names(Gate).items()}
         pair = [answer.batch.pairs[0].reference, answer.other[0]]
@@ -465,7 +488,8 @@ class _SceneCollector:
             points = errors.points_from_estimate(estimate, truth)
             self.pooled.setdefault((answer.variant, cohort), []).append(points)
             self.dropped.setdefault((answer.variant, cohort), []).append(truth.dropped())
-            self.pair_rows.append({**identity, "truth": cohort, **columns, **errors.measure_errors(points), **extra})
+            counted = {"n_real_holes": truth.n_real_holes, **errors.measure_errors(points)}
+            self.pair_rows.append({**identity, "truth": cohort, **columns, **counted, **extra})
             for code, kind in answer.batch.odd.items() if kinds is not None else ():
                 on_kind = truth.replace(code=_reopen_kind(truth, kinds, code))
                 self.separate_points.setdefault((answer.variant, cohort, kind), []).append(

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from dhtorch import pytree
-from dhtorch.metrics import curves, errors, reliability, risk
+from dhtorch.metrics import curves, errors, holdout, reliability, risk
 from dhtorch.pipeline.pair import merge
 from dhtorch.records import Estimate, Samples
 
@@ -31,6 +31,7 @@ _RECOMPUTED_COLUMNS = {
     "n_inlier",
     "n_holes",
     "n_recovered",
+    "n_real_holes",
 }
 
 
@@ -39,6 +40,8 @@ def scene_row(
     points: Sequence[errors.Points],
     dropped: Sequence[Mapping[str, int]],
     apart: Mapping[str, Sequence[errors.Points]],
+    *,
+    reads_score: bool = True,
 ) -> Row:
     """Rows and points of the pairs of one scene and variant → scene row: pooled metrics, means and medians over pairs.
 
@@ -47,12 +50,16 @@ def scene_row(
         points: candidates of each pair.
         dropped: counts of returns that the truth test removed, of each pair.
         apart: kind of surface → candidates on it, of surfaces that are evaluated separately.
+        reads_score: evaluate the score as a probability; None otherwise: a score that only orders answers claims none.
     """
     pool = pytree.collate(points)
-    row: Row = errors.measure_errors(pool) | risk.measure_risk(pool) | reliability.measure_reliability([pool])
+    row: Row = errors.measure_errors(pool) | risk.measure_risk(pool)
+    row |= reliability.measure_reliability([pool if reads_score else pool[:0]])
     row["pnp_success"] = mean_or_none([float(r["pnp_ok"]) for r in pairs])
     row |= {key: mean_or_none([r[key] for r in pairs]) for key in ("n_holes", "n_recovered")}
     row["n_dropped"] = {k: sum(d[k] for d in dropped) for k in dropped[0]}
+    row["truth_kept"] = holdout.truth_kept_ratio(pool.keep.numel(), row["n_dropped"])
+    row["n_real_holes"] = sum(r["n_real_holes"] for r in pairs)
     row["gate_share"] = {k: mean_or_none([r["gate_share"][k] for r in pairs]) for k in pairs[0]["gate_share"]}
     row["ms"] = {k: median_or_none([r["ms"].get(k, 0.0) for r in pairs]) for k in pairs[0]["ms"]}
     row["apart"] = {kind: errors.measure_errors(pytree.collate(p)) for kind, p in apart.items()}

@@ -8,6 +8,7 @@ smooth, and every rejected return is counted under the rule that rejected it.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
@@ -39,6 +40,7 @@ class TruthCode:
     WIDE = 4  #: a step within the reach of a track's patch
     EXCLUDED = 5  #: excluded by the caller (a mirror, a window)
     TEXTURE = 6  #: not trackable by any method
+    REAL_HOLE = 7  #: the sensor has no return there: nothing was held back
 
 
 @record
@@ -55,8 +57,26 @@ class Truth(Record):
 
     def dropped(self) -> dict[str, int]:
         """Number of held-back returns rejected by each rule: the metric ``n_dropped``."""
-        rules = {code: name for code, name in names(TruthCode).items() if code > TruthCode.NEAR}
-        return {name.lower(): int((self.code == code).sum()) for code, name in rules.items()}
+        return {names(TruthCode)[code].lower(): int((self.code == code).sum()) for code in _REJECTING_RULES}
+
+    @property
+    def n_real_holes(self) -> int:
+        """Number of samples with truth at which the sensor has no return: they are in no range-split cohort."""
+        return int((self.code == TruthCode.REAL_HOLE).sum())
+
+
+#: Codes of held-back returns that are rejected.
+_REJECTING_RULES = (TruthCode.CLOSE, TruthCode.WIDE, TruthCode.EXCLUDED, TruthCode.TEXTURE)
+
+
+def truth_kept_ratio(n_candidates: int, n_dropped: Mapping[str, int]) -> float | None:
+    """Fraction of the held-back returns that pass the truth test, from ``n_candidates`` and ``n_dropped`` of a row.
+
+    Excluded and textureless samples have passed it. None without a held-back return.
+    """
+    n_rejected = n_dropped["close"] + n_dropped["wide"]
+    n = n_candidates + sum(n_dropped.values())
+    return 1 - n_rejected / n if n else None
 
 
 def range_split(frame: Frame, cutoff: float | None) -> Frame:
@@ -233,6 +253,33 @@ def select_candidates(
         (textureless, TruthCode.TEXTURE),
     )
     return truth.replace(code=code)
+
+
+def require_masked(truth: Truth, frame: Frame, uv: Tensor, cutoff: float) -> Truth:
+    """Candidates of the range split → those at which ``cutoff`` masked a return of the sensor, and only a far one.
+
+    Truth of another instrument has depth also where the sensor has no return (a real hole), and in a sparse map a near
+    return may remain within the reach of the sample whose nearest return was masked.
+
+    Args:
+        truth: from :func:`select_candidates`, at the samples.
+        frame: the views with the sensor's full depth.
+        uv: (B, N, 2) px, the samples.
+        cutoff: m, of :func:`range_split`.
+
+    Returns:
+        Truth whose codes of held-back returns became REAL_HOLE where the sensor has no return, and NEAR where the
+        masked map still has one. EXCLUDED samples, which are evaluated separately, keep their code.
+
+    Raises:
+        ValueError: wrong shapes.
+    """
+    check("require_masked", depth=(truth.depth, "B N"), uv=(uv, "B N 2"))
+    full, masked = (sample_truth(view, uv, truth="raw").depth for view in (frame, range_split(frame, cutoff)))
+    fixed = (TruthCode.NO_RETURN, TruthCode.NEAR, TruthCode.EXCLUDED)
+    counted = ~torch.isin(truth.code, torch.tensor(fixed, dtype=truth.code.dtype, device=truth.code.device))
+    code = torch.where(counted & (full <= 0), TruthCode.REAL_HOLE, truth.code)
+    return truth.replace(code=torch.where(counted & (masked > 0), TruthCode.NEAR, code).to(truth.code.dtype))
 
 
 def select_real_holes(

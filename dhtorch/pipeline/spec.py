@@ -95,6 +95,18 @@ class MethodSpec:
         values: Any = {k: partial(getattr(self, k), **v) if isinstance(v, Mapping) else v for k, v in changes.items()}
         return replace(self, **values)
 
+    @property
+    def states_sigma(self) -> bool:
+        """Whether sigma is a statement of the method, and its score an expected error made of it.
+
+        Not with the paper's score, of parallax and residual: it orders answers. The sigma that stage 6 computes beside
+        it contains the noise of tracks and pose, is fitted to no error and is not evaluated.
+        """
+        score = self.score
+        while isinstance(score, partial):
+            score = score.func
+        return score is not confidence
+
     def sample_depth(self, frame: Frame) -> Samples:
         """Stages 1 to 3, frame -> samples (B, n): pixels, near returns, the reason where a return is missing."""
         like = frame.camera.f

@@ -59,7 +59,7 @@ def test_set_b_is_hidden_from_the_method_and_measured_by_its_returns():
         return base.pose(samples, tracks, *rest, **options)
 
     base = configured_method()
-    split = HeldOut(base, seed=3)
+    split = HeldOut(base, Settings(seed=3))
     trace = {}
     variant = split.variant().method.replace(pose=pose)
     variant(recording[0], recording[3], trace=trace)
@@ -305,7 +305,7 @@ def test_ablation_changes_one_thing_at_a_time():
 def test_drop_outs_and_halves_refuse_wrong_shapes():
     frame, samples = (
         small_room()[0],
-        HeldOut(configured_method(), 0).whole(
+        HeldOut(configured_method(), Settings()).whole(
             batch_of(small_room()), torch.rand(1, 9, 2, generator=torch.Generator().manual_seed(0)) * 100
         ),
     )

@@ -118,10 +118,9 @@ def run(
             scale_options = partial(_scale_reference, scale=scale, seed=settings.seed)
             variants[f"{name}_{scale}"] = Variant(method, estimate=estimate, call_options=scale_options)
             labels[f"{name}_{scale}"] = {"scale": scale, "metric": _SCALE_SOURCES[scale], **_count_weights(network)}
-    full_protocol = Protocol(variants, columns=_scale_columns)
-    outcome = protocol.run(scenes, full_protocol, pairs, settings, progress=progress)
+    outcome = protocol.run(scenes, Protocol(variants, columns=_scale_columns), pairs, settings, progress=progress)
     _complete_rows(outcome, ours, labels, settings.device)
-    outcome.summary = summarise_rows(outcome.rows, list(variants), list(full_protocol.cohorts))
+    outcome.summary = summarise_rows(outcome.rows, list(variants), list(settings.truth))
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, ours, f"{_DECIDING_NETWORK}_oracle"))
 
 

@@ -215,7 +215,7 @@ def points_by_seed(outcome: Outcome, method: str, seeds: int, apart: Collection[
     scenes: dict[str, list[Points]] = {}
     for k in range(seeds):
         for (scene, variant, cohort), points in outcome.points.items():
-            if (variant, cohort) == (seed_variant_name(method, k), "full") and scene not in apart:
+            if (variant, cohort) == (seed_variant_name(method, k), outcome.cohort) and scene not in apart:
                 scenes.setdefault(scene, []).append(points)
     return scenes
 

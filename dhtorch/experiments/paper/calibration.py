@@ -34,7 +34,8 @@ def run(
 ) -> Outcome:
     """Reliability, risk–coverage and risk at thresholds of every method, on the range split and on the hold-out.
 
-    Cohorts ``heldout`` and ``full`` (the range split, which decides). Scene rows carry ``mean_risk`` and, under
+    Cohorts ``heldout`` and that of the range split (``full``, or another ``holdout.truth``), which decides. Scene rows
+    carry ``mean_risk`` and, under
     ``at_<threshold>``, coverage, median and p90 error of the answers whose score reaches the threshold. The summary
     adds ``<method>.ece_pooled``: all scenes in one reliability table, each of equal weight.
 
@@ -44,18 +45,19 @@ def run(
 
     Source: paper, "Calibration" and the figure on selective risk–coverage.
     """
-    range_protocol = Protocol({name: Variant(m) for name, m in methods.items()})
+    range_protocol = Protocol({name: Variant(m) for name, m in methods.items()}, reads_scores=True)
     parts = [protocol.run(scenes, range_protocol, pairs, settings, progress=progress)]
     for name, method in methods.items():
-        heldout = HeldOut(method, settings.seed)
-        heldout_protocol = Protocol({name: heldout.variant()}, {"heldout": heldout.heldout}, hide_nothing)
+        heldout = HeldOut(method, settings)
+        cohorts = {"heldout": heldout.heldout}
+        heldout_protocol = Protocol({name: heldout.variant()}, cohorts, hide_nothing, reads_scores=True)
         parts.append(protocol.run(scenes, heldout_protocol, pairs, settings, progress=progress))
     outcome = join_outcomes(parts)
     for row in outcome.rows:
         key = (row["scene"], row["method"], row["truth"])
         if row["pair"] is None and key in outcome.points:
             row.update(_at_thresholds(outcome.points[key], thresholds))
-    outcome.summary = summarise_rows(outcome.rows, list(methods), ["heldout", "full"])
+    outcome.summary = summarise_rows(outcome.rows, list(methods), ["heldout", *settings.truth])
     for name in methods:
         outcome.summary |= _pooled(outcome, name)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, next(iter(methods))))
@@ -88,7 +90,7 @@ def _at_thresholds(points: errors.Points, thresholds: Sequence[float]) -> Row:
 
 def _pooled(outcome: Outcome, method: str) -> dict[str, Any]:
     with_role = {r["scene"] for r in outcome.rows if r.get("role")}
-    scenes = [p for (s, m, t), p in outcome.points.items() if (m, t) == (method, "full") and s not in with_role]
+    scenes = [p for (s, m, t), p in outcome.points.items() if (m, t) == (method, outcome.cohort) and s not in with_role]
     return {
         f"{method}.ece_pooled": bootstrap.without_interval(reliability.measure_reliability(scenes)["ece"], len(scenes))
     }

@@ -48,7 +48,7 @@ def run(
     Args and errors: as :func:`dhtorch.experiments.protocol.run`; of ``methods`` the first is used.
     Source: paper, "LiDAR-anchored relative pose".
     """
-    split = HeldOut(next(iter(methods.values())), settings.seed)
+    split = HeldOut(next(iter(methods.values())), settings)
     variants = {
         "device_raw": split.variant(fit=partial(trajectory_pose_fit, raw=True), needs=missing_trajectory_reason),
         "device_gl_to_cv": split.variant(fit=trajectory_pose_fit, needs=missing_trajectory_reason),

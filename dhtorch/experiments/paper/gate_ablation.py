@@ -50,7 +50,7 @@ def run(
 
     Source: paper, "Effect of the gate".
     """
-    split = HeldOut(next(iter(methods.values())), settings.seed)
+    split = HeldOut(next(iter(methods.values())), settings)
     gate_options = {
         "both gates": {},
         "parallax gate off": {"min_parallax_deg": None},

@@ -58,9 +58,10 @@ def run(
     """
     parts = []
     for name, method in methods.items():
-        split = HeldOut(method, settings.seed)
+        split = HeldOut(method, settings)
         cohorts = {"cyclic": split.cyclic, "heldout": split.heldout}
-        heldout_protocol = Protocol({name: split.variant()}, cohorts, hide_nothing, partial(recovery_columns, split))
+        columns = partial(recovery_columns, split)
+        heldout_protocol = Protocol({name: split.variant()}, cohorts, hide_nothing, columns, reads_scores=True)
         part = protocol.run(scenes, heldout_protocol, pairs, settings, progress=progress)
         part.summary |= {f"{name}.{k}": v for k, v in _mark_passes(part.rows, name).items()}
         parts.append(part)

@@ -52,7 +52,7 @@ def run(
 
     Source: paper, "Held-out triangulation on in-house captures" and "Limitations" (motion dependence).
     """
-    split = HeldOut(next(iter(methods.values())), settings.seed)
+    split = HeldOut(next(iter(methods.values())), settings)
     parts = sweep_gaps(scenes, split, pairs_at_gaps(factors, ()), settings, progress, partial(_baseline_columns, split))
     outcome = join_outcomes(parts)
     for name in dict.fromkeys(r["scene"] for r in outcome.rows):

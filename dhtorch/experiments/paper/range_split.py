@@ -14,10 +14,15 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from dhtorch.data.scene import SceneLike
+from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines.sensor_only import sensor_only
-from dhtorch.experiments.cohorts import missing_trajectory_reason, trajectory_pose_fit
+from dhtorch.experiments.cohorts import (
+    far_real_holes,
+    missing_trajectory_reason,
+    missing_truth_reason,
+    trajectory_pose_fit,
+)
 from dhtorch.experiments.outcome import join_outcomes
 from dhtorch.experiments.protocol import Answer, Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
@@ -47,13 +52,19 @@ def run(
     Variants: ``sensor_only``, ``device_raw``, ``device_gl_to_cv``, ``no_gates``, ``gated`` at the scene's cutoff;
     ``gated, cutoff x0.75`` for each of ``cutoff_factors`` and ``gated, cutoff 1.5 m`` for each of ``cutoffs``.
     Candidates are counted before any of them runs, from independent truth where the recording has it; rows then carry
-    ``truth_disagreement``, the median relative difference of truth and sensor where both have depth.
+    ``truth_disagreement``, the median relative difference of truth and sensor where both have depth. A candidate is a
+    sample whose return the cutoff masked; those beyond it at which the sensor has no return are the cohort
+    ``real_holes``, of the recordings with independent truth. The truth test is that of ``settings.truth``, and
+    ``truth_kept`` the fraction of the masked returns that pass it.
 
     Args:
         scenes, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`.
         methods: name → method; the first is used.
         cutoff_factors: further cutoffs, as factors on the scene's.
         cutoffs: further cutoffs in metres.
+
+    Raises:
+        ValueError: a candidate of a scene has a return in the input of the methods; else as the main job.
 
     Source: paper, "Strict near/far range split".
     """
@@ -67,18 +78,44 @@ def run(
         "no_gates": Variant(method.replace(triangulate=NO_GATES)),
         "gated": Variant(method),
     }
-    main = protocol.run(scenes, Protocol(variants, columns=_truth_columns), pairs, settings, progress=progress)
+    test = settings.truth[-1]
+    cohorts: dict[str, protocol.Cohort] = {test: partial(protocol.held_back_truth, test=test)}
+    if any(missing_truth_reason(scene) is None for scene in scenes_of(scenes)):
+        cohorts = {"real_holes": partial(far_real_holes, test=test), **cohorts}
+    main_protocol = Protocol(variants, cohorts, columns=_truth_columns)
+    main = protocol.run(scenes, main_protocol, pairs, settings, progress=progress)
+    require_no_returns(main.rows, test)
     sweep = {f"gated, cutoff x{f:g}": replace(settings, cutoff_factor=f) for f in cutoff_factors}
     sweep |= {f"gated, cutoff {c:g} m": replace(settings, cutoff=c, cutoff_factor=1.0) for c in cutoffs}
     parts = [main]
     for name, cutoff_settings in sweep.items():
         part = protocol.run(
-            scenes, Protocol({name: Variant(method)}, columns=_truth_columns), pairs, cutoff_settings, progress=progress
+            scenes,
+            Protocol({name: Variant(method)}, {test: cohorts[test]}, columns=_truth_columns),
+            pairs,
+            cutoff_settings,
+            progress=progress,
         )
         part.summary = {f"{name}.{k}": v for k, v in part.summary.items()}
         parts.append(part)
     outcome = join_outcomes(parts)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome.summary))
+
+
+def require_no_returns(rows: Sequence[Row], cohort: str) -> None:
+    """Check that the sensor alone answers no candidate of the range split.
+
+    Raises:
+        ValueError: it does; the message names the scenes.
+    """
+    answered = {
+        row["scene"]: row["n_kept"]
+        for row in rows
+        if row["pair"] is None and (row["method"], row["truth"]) == ("sensor_only", cohort) and row.get("n_kept")
+    }
+    if answered:
+        counts = ", ".join(f"{scene} {n}" for scene, n in answered.items())
+        raise ValueError(f"range_split: found candidates with a return of the sensor ({counts}), expected none")
 
 
 def verdict(summary: Mapping[str, Any]) -> tuple[bool | None, str]:

@@ -8,6 +8,7 @@ What would refute it: on the median scene the error on real holes is not above t
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 from dhtorch.data.scene import SceneLike
 from dhtorch.experiments import protocol
@@ -31,7 +32,7 @@ def run(
 
     Needs independent truth: other scenes have a row with a note. A drop-out counts if it passes the filter of
     :func:`dhtorch.metrics.holdout.select_real_holes`; ``n_dropped`` counts the others. Cohorts: ``full`` (hidden
-    returns) and ``real_holes``; variants ``no_gates`` and ``gated``.
+    returns; another ``holdout.truth`` by its name) and ``real_holes``; variants ``no_gates`` and ``gated``.
 
     Args and errors: as :func:`dhtorch.experiments.protocol.run`; of ``methods`` the first is used.
     Source: paper, "Real holes are harder than masked ones".
@@ -41,16 +42,17 @@ def run(
         "no_gates": Variant(method.replace(triangulate=NO_GATES), needs=missing_truth_reason),
         "gated": Variant(method, needs=missing_truth_reason),
     }
-    cohorts = {"full": protocol.held_back_truth, "real_holes": real_holes}
+    test = settings.truth[-1]
+    cohorts = {test: partial(protocol.held_back_truth, test=test), "real_holes": partial(real_holes, test=test)}
     hole_protocol = Protocol(variants, cohorts, min_candidates=1)
     outcome = protocol.run(scenes, hole_protocol, pairs, settings, progress=progress)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, test))
 
 
-def verdict(outcome: Outcome) -> tuple[bool | None, str]:
+def verdict(outcome: Outcome, hidden_cohort: str = "full") -> tuple[bool | None, str]:
     """(the gated method has the larger error on real holes; both errors, scenes without an answer)."""
     holes = outcome.scenes("gated", "real_holes")
-    real, hidden = (outcome.summary.get(f"gated.{k}median_rel", {}).get("value") for k in ("", "full."))
+    real, hidden = (outcome.summary.get(f"gated.{k}median_rel", {}).get("value") for k in ("", f"{hidden_cohort}."))
     measured = {s: r for s, r in holes.items() if r.get("n_candidates")}
     unanswered = [s for s, r in measured.items() if not r["n_kept"]]
     n = sum(r["n_candidates"] for r in measured.values())

@@ -171,7 +171,7 @@ def compare_scores(outcome: Outcome, apart: set[str]) -> dict[str, bootstrap.Int
     """Geometric means over scenes of AURC ratios; scenes in ``apart`` and those with few answers are left out."""
     seeds: dict[str, dict[str, list[Any]]] = {}
     for (scene, variant, cohort), points in outcome.points.items():
-        if cohort == "full" and scene not in apart:
+        if cohort == outcome.cohort and scene not in apart:
             seeds.setdefault(variant, {})[scene] = [points]
     intervals = {}
     for name, ours, theirs in (

@@ -68,9 +68,14 @@ def layout_tables(result: Result) -> list[ReportTable]:
 def _range_split(result: Result) -> list[ReportTable]:
     """Tables of the range split: far-field recovery by variant, and the sweep over cutoffs."""
     title = "Controlled far-field recovery, medians over scenes"
-    columns = ("n_scenes", "coverage", "corr", "median_rel", "p90_rel")
+    columns = ("n_scenes", "truth_kept", "coverage", "corr", "median_rel", "p90_rel")
     lines = match_lines(result, _RANGE_SPLIT_LINES, without=_CUTOFF_PATTERN)
     tables = [variant_table(result, title, columns, lines, published.RANGE_SPLIT)]
+    if "real_holes" in cohort_names(result):
+        hole_title = "Beyond the cutoff where the sensor has no return, medians over scenes; candidates added up"
+        lines = [TableLine(v, v) for v in variant_names(result) if scene_rows(result, "real_holes", v)]
+        hole_columns = ("n_scenes", "n_candidates", "coverage", "median_rel", "p90_rel")
+        tables.append(variant_table(result, hole_title, hole_columns, lines, truth="real_holes"))
     if any(re.fullmatch(_CUTOFF_PATTERN, v) for v in variant_names(result)):
         title = "Cutoff sensitivity, gated, medians over scenes; candidates added up"
         sweep_columns = ("cutoff_m", "pnp_success", "n_candidates", "coverage", "median_rel")
@@ -85,17 +90,20 @@ def _range_split(result: Result) -> list[ReportTable]:
 
 def _real_holes(result: Result) -> list[ReportTable]:
     """Tables of the real holes: drop-outs of the sensor, and hidden far returns if measured."""
-    columns = ("n_scenes", "n_candidates", "coverage", "median_rel", "p90_rel")
+    columns = ("n_scenes", "n_candidates", "truth_kept", "coverage", "median_rel", "p90_rel")
     tables, title = [], "The sensor's true drop-outs, medians over scenes"
     tables.append(variant_table(result, title, columns, match_lines(result, _REAL_HOLES_LINES), published.REAL_HOLES))
-    if "full" in cohort_names(result) and last_cohort(result) != "full":
-        tables.append(variant_table(result, "The same on hidden far returns", columns, truth="full"))
+    tables += [
+        variant_table(result, "The same on hidden far returns", columns, truth=hidden)
+        for hidden in cohort_names(result)
+        if hidden != last_cohort(result)
+    ]
     return tables
 
 
 def _gate_ablation(result: Result) -> list[ReportTable]:
     """Table of the gate ablation by variant."""
-    columns = ("n_scenes", "corr", "median_rel", "coverage", "p90_rel")
+    columns = ("n_scenes", "truth_kept", "corr", "median_rel", "coverage", "p90_rel")
     return [
         variant_table(
             result,
@@ -110,7 +118,7 @@ def _gate_ablation(result: Result) -> list[ReportTable]:
 def _held_out(result: Result) -> list[ReportTable]:
     """Tables of the hold-out: by scene, cyclic against held out, and over scenes."""
     truth = "heldout" if "heldout" in cohort_names(result) else None
-    columns: tuple[str, ...] = ("n_kept", "corr", "median_rel", "residual_px", "passes", "coverage")
+    columns: tuple[str, ...] = ("truth_kept", "n_kept", "corr", "median_rel", "residual_px", "passes", "coverage")
     columns += ("n_recovered", "reach_p95_m", "reach_max_m", "returns_p95_m")
     title = "Hold-out triangulation (set B never sees the pose calibration)"
     tables = [scene_table(result, title, columns, truth, published.HELD_OUT)]
@@ -141,7 +149,7 @@ def _naive_protocol(result: Result) -> ReportTable:
 
 def _calibration(result: Result) -> list[ReportTable]:
     """Tables of the calibration by ground truth, and of thresholds; the paper has hold-outs and the range split."""
-    columns = ("n_scenes", "ece", "ece_pooled", "aurc", "aurc_excess", "mean_risk", "monotonicity")
+    columns = ("n_scenes", "truth_kept", "ece", "ece_pooled", "aurc", "aurc_excess", "mean_risk", "monotonicity")
     tables = []
     for truth in reversed(cohort_names(result)):
         held_out = truth == "heldout" or len(cohort_names(result)) == 1
@@ -192,14 +200,15 @@ def _census(result: Result) -> list[ReportTable]:
 
 def _device_pose(result: Result) -> list[ReportTable]:
     """Table of triangulation with the device trajectory and with the estimated pose."""
-    columns = ("n_scenes", "rotation_deg", "translation_m", "direction_deg", "corr", "coverage", "median_rel")
+    columns: tuple[str, ...] = ("n_scenes", "rotation_deg", "translation_m", "direction_deg")
+    columns += ("truth_kept", "corr", "coverage", "median_rel")
     title = "Triangulation from the device's trajectory and from the metric pose estimate, medians over scenes"
     return [variant_table(result, title, columns, None, published.DEVICE_POSE)]
 
 
 def _motion(result: Result) -> list[ReportTable]:
     """Table of errors and recovered holes by baseline."""
-    columns = ("n_scenes", "baseline_m", "coverage", "median_rel", "n_recovered", "recovered_share")
+    columns = ("n_scenes", "baseline_m", "truth_kept", "coverage", "median_rel", "n_recovered", "recovered_share")
     return [variant_table(result, "Motion dependence, medians over scenes", columns, None, published.BASELINE_MOTION)]
 
 
@@ -213,7 +222,7 @@ def _learned(result: Result) -> list[ReportTable]:
 
 def _ablation(result: Result) -> list[ReportTable]:
     """Table of the ablation by part."""
-    columns = ("n_scenes", "coverage", "median_rel", "p90_rel", "corr", "aurc", "median_rel_ratio")
+    columns = ("n_scenes", "truth_kept", "coverage", "median_rel", "p90_rel", "corr", "aurc", "median_rel_ratio")
     return [variant_table(result, "Ablation, medians over scenes", columns)]
 
 

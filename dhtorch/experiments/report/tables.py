@@ -45,7 +45,7 @@ OURS_LABEL = "ours"
 
 #: Columns of the main table, one row per scene; the optional ones appear if the result has them.
 MAIN_COLUMNS = ("n_candidates", "coverage", "median_rel", "p90_rel", "corr", "residual_px", "pnp_success")
-_OPTIONAL_COLUMNS = ("wrong_share", "aurc", "ece")
+_OPTIONAL_COLUMNS = ("truth_kept", "n_real_holes", "wrong_share", "aurc", "ece")
 #: Metrics of every scene that are only in the full tables.
 _DETAIL_METRICS = {
     "within_sigma",
@@ -113,7 +113,7 @@ def generic_tables(result: Result, shown: Sequence[str] = ()) -> list[ReportTabl
     if any(metric in row for row in rows for metric in MAIN_COLUMNS) or (rows and all(row.get("note") for row in rows)):
         has_cohorts = len(cohort_names(result)) > 1
         for truth in cohort_names(result):
-            columns = (*MAIN_COLUMNS, *(m for m in _OPTIONAL_COLUMNS if any(row.get(m) is not None for row in rows)))
+            columns = (*MAIN_COLUMNS, *(m for m in _OPTIONAL_COLUMNS if _is_measured(rows, m)))
             title = f"{describe_result(result)}; ground truth: {truth}" if has_cohorts else describe_result(result)
             tables.append(scene_table(result, title, columns, truth))
         excluded = _DETAIL_METRICS | set(MAIN_COLUMNS) | set(_OPTIONAL_COLUMNS) | set(NON_METRIC_FIELDS) | set(shown)
@@ -123,6 +123,12 @@ def generic_tables(result: Result, shown: Sequence[str] = ()) -> list[ReportTabl
         tables.append(_plain_table(result, rows))
     groups = [_group_table(result, *group) for group in _METRIC_GROUPS]
     return tables + [table for table in (_odd_surface_table(result), *groups) if table]
+
+
+def _is_measured(rows: Sequence[Row], metric: str) -> bool:
+    """Whether a metric is defined in a row; of a count whether any row has more than none."""
+    values = [row[metric] for row in rows if row.get(metric) is not None]
+    return any(values) if metric.startswith("n_") else bool(values)
 
 
 def scene_table(
