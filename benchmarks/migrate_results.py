@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from dhtorch.metrics import bootstrap
+from dhtorch.metrics.holdout import truth_kept_ratio
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.storage import replace_file
 
@@ -169,6 +171,72 @@ def present_rows(value: Any) -> Any:
     return row | {"method": METHODS[row["method"]]} if row.get("method") in METHODS else row
 
 
+#: Experiments that evaluate the score of every method as a probability, also one that only orders answers.
+READ_SCORES = ("heldout", "calibration")
+
+#: Numbers of a sigma, and of a score as a probability.
+SIGMA_NUMBERS, SCORE_NUMBERS = ("within_sigma", "within_2sigma"), ("ece", "ece_equal_mass")
+
+UNDEFINED = {"value": None, "low": None, "high": None, "n": 0}
+
+
+def states_no_sigma(config: Mapping[str, Any], variant: str) -> bool:
+    """Whether the settings of a variant are those of a method that states no sigma (``Method.states_sigma``).
+
+    A variant that the settings do not name is the job's own method, unless they name several.
+    """
+    experiment = config.get("experiment") or {}
+    named = {**(experiment.get("methods") or {}), **(experiment.get("others") or {})}
+    own = {} if experiment.get("methods") else config.get("method") or {}
+    method = named.get(variant) or own
+    score, triangulate = (method.get(stage) or {} for stage in ("score", "triangulate"))
+    orders_alone = score.get("_target_") == "dhtorch.stages.score.confidence"
+    return orders_alone and not triangulate.get("fitted_noise")
+
+
+def blank_unstated(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A result without numbers of a sigma or a probability that the method does not state."""
+    names = SIGMA_NUMBERS if content["experiment"] in READ_SCORES else (*SIGMA_NUMBERS, *SCORE_NUMBERS)
+    variants = dict.fromkeys(row["method"] for row in content["rows"] if "method" in row)
+    silent = {v for v in variants if states_no_sigma(content["config"], v)}
+
+    def blank(row: Any) -> Any:
+        if not isinstance(row, Mapping):
+            return row
+        return {k: None if k in names else blank(v) for k, v in row.items()}
+
+    def is_blank(key: str) -> bool:
+        owner = next(
+            (v for v in variants if key.startswith(f"{v}.")), None if len(variants) > 1 else next(iter(variants))
+        )
+        return owner in silent and key.rpartition(".")[2] in names
+
+    if not silent:
+        return dict(content)
+    rows = [blank(row) if row.get("method") in silent else row for row in content["rows"]]
+    summary = {k: {**v, **UNDEFINED} if is_blank(k) else v for k, v in content["summary"].items()}
+    return {**content, "rows": rows, "summary": summary}
+
+
+def with_truth_kept(content: Mapping[str, Any]) -> dict[str, Any]:
+    """A result whose rows of scenes, and whose summary, have the fraction of the returns that pass the truth test."""
+
+    def complete(row: Mapping[str, Any]) -> dict[str, Any]:
+        if row["pair"] is not None or not row.get("n_dropped") or "truth_kept" in row:
+            return dict(row)
+        return {**row, "truth_kept": truth_kept_ratio(row["n_candidates"], row["n_dropped"])}
+
+    rows, summary = [complete(row) for row in content["rows"]], dict(content["summary"])
+    for variant, truth in dict.fromkeys((row.get("method"), row.get("truth")) for row in rows):
+        prefixes = (f"{variant}.{truth}.", f"{variant}.", "")
+        prefix = next((p for p in prefixes if f"{p}n_dropped.close" in summary), None)
+        scenes = [r for r in rows if (r["pair"], r.get("method"), r.get("truth")) == (None, variant, truth)]
+        values = [r["truth_kept"] for r in scenes if "truth_kept" in r and r["role"] is None]
+        if prefix is not None and values:
+            summary.setdefault(f"{prefix}truth_kept", bootstrap.interval_over_scenes(values).entry("1"))
+    return {**content, "rows": rows, "summary": summary}
+
+
 def migrate(path: Path) -> None:
     """Rewrite one file; one without earlier names stays as it is, byte for byte."""
     content = json.loads(path.read_text(encoding="utf-8"))
@@ -179,6 +247,7 @@ def migrate(path: Path) -> None:
             "summary": {present_key(key): value for key, value in content["summary"].items()},
             "rows": present_rows(content["rows"]),
         }
+        new = blank_unstated(with_truth_kept(new))
         if new != content:
             result_files.write_result(path, new)
     elif isinstance(content, list) and any(_is_earlier(row) for row in content):
@@ -191,7 +260,7 @@ def _is_earlier(row: Mapping[str, Any]) -> bool:
     torch_alone = str(row.get("name")).startswith(("triangulate", "start"))  # rows that have no compiled operators
     if any(_present_text(value) != value for value in row.values()):
         return True
-    other_mode = row.get("mode") == "native" or (torch_alone and row["mode"] == "compiled")
+    other_mode = row.get("mode") == "native" or (torch_alone and row.get("mode") == "compiled")
     return other_mode or row.get("name") in ROW_NAMES or not COLUMNS.keys().isdisjoint(row)
 
 

@@ -97,15 +97,17 @@ class MethodSpec:
 
     @property
     def states_sigma(self) -> bool:
-        """Whether sigma is a statement of the method, and its score an expected error made of it.
+        """Whether sigma is a statement of the method: its score is made of sigma, or stage 6 fits the tracks' noise.
 
-        Not with the paper's score, of parallax and residual: it orders answers. The sigma that stage 6 computes beside
-        it contains the noise of tracks and pose, is fitted to no error and is not evaluated.
+        Neither holds for the paper's method: its score, of parallax and residual, only orders answers, and the sigma
+        that stage 6 computes beside it is fitted to nothing. Experiments leave such a sigma and score unevaluated.
         """
-        score = self.score
+        score, fits_noise = self.score, False
+        if isinstance(self.triangulate, partial):
+            fits_noise = bool(self.triangulate.keywords.get("fitted_noise"))
         while isinstance(score, partial):
             score = score.func
-        return score is not confidence
+        return fits_noise or score is not confidence
 
     def sample_depth(self, frame: Frame) -> Samples:
         """Stages 1 to 3, frame -> samples (B, n): pixels, near returns, the reason where a return is missing."""

@@ -16,6 +16,8 @@ _METRIC_HEADINGS = {
     "n_kept": "answers",
     "n_scenes": "scenes",
     "n_recovered": "holes recovered",
+    "n_real_holes": "real holes",
+    "truth_kept": "truth kept",
     "n_views": "views",
     "median_rel": "median",
     "p90_rel": "p90",
@@ -79,6 +81,7 @@ _METRIC_STYLES = {
     "pnp_success": "percent",
     "within_sigma": "percent",
     "within_2sigma": "percent",
+    "truth_kept": "percent",
 }
 _METRIC_STYLES |= dict.fromkeys(("rho_abs", "corr", "rank_corr", "abs_corr", "gated_corr", "gated_abs_corr"), "ratio")
 _METRIC_STYLES |= {"order_corr": "ratio", "halves_corr": "ratio", "side_right": "percent", "mean_rel_ratio": "fine"}

@@ -7,7 +7,14 @@ from collections.abc import Callable
 
 from dhtorch.experiments.report import negatives, probes, published, timings
 from dhtorch.experiments.report.cells import EMPTY_CELL, format_value, metric_heading
-from dhtorch.experiments.report.reading import Result, cohort_names, last_cohort, summary_entry, variant_names
+from dhtorch.experiments.report.reading import (
+    Result,
+    cohort_names,
+    last_cohort,
+    scene_rows,
+    summary_entry,
+    variant_names,
+)
 from dhtorch.experiments.report.tables import (
     DERIVED_NUMBERS,
     OURS_LABEL,
