@@ -170,6 +170,12 @@ def judged(batch, n, dtype):
     return samples, holdout.sample_truth(frame, samples.uv), 1.0
 
 
+def masked(batch, n, dtype):
+    frame, samples = sampled(batch, n, dtype)
+    truth = holdout.select_candidates(*judged(batch, n, dtype))
+    return truth, frame, samples.uv, 1.0
+
+
 def planes(batch, n, dtype):
     """Linearisation of the pose problem: the point axis is last."""
     camera_1 = cameras(batch, dtype)
@@ -472,6 +478,7 @@ ROWS = [
     Row(holdout.sample_truth, frames, ALL, (1,), (0,), bad=wrong_last_axis(1)),
     Row(holdout.split_half, lambda b, n, d: (sampled(b, n, d)[1], 3), "dtype batch empty raises", (0,), bad=lambda a: (a[0].replace(trackability=a[0].trackability[:, 1:]), a[1])),
     Row(holdout.hide_returns, lambda b, n, d: (sampled(b, n, d)[1], torch.rand(b, n, generator=generator(3)) < 0.5), ALL, (0, 1), (0,), bad=lambda a: (a[0], a[1][:, 1:])),
+    Row(holdout.require_masked, masked, "dtype batch vmap capture empty shuffle raises", (0, 2), bad=lambda a: (a[0].replace(depth=a[0].depth[:, 1:]), *a[1:])),
     Row(holdout.select_real_holes, lambda b, n, d: (*sampled(b, n, d), holdout.sample_truth(*frames(b, n, d))), "dtype batch vmap capture empty raises", (1, 2), bad=lambda a: (a[0], a[1], a[2].replace(depth=a[2].depth[:, 1:]))),
     Row(arms.sample_arm, lambda b, n, d: (frames(b, n, d)[0].image, pixels(1, n, d)[0]), "dtype batch capture gradcheck raises", grad=(0, 1), shared=(1,), bad=wrong_last_axis(1)),
     Row(arms.correlate_windows, waves, "dtype batch vmap capture gradcheck empty shuffle padding raises", (2, 3), (0, 1), bad=wrong_last_axis(3)),
@@ -677,6 +684,7 @@ ELSEWHERE = {
             "search_displacements",
             "lucas_kanade_step",
             "squared_differences",
+            "compare_windows",
             "window_covariance",
             "masked_apply",
             "is_between",

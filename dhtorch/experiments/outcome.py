@@ -60,7 +60,7 @@ class Outcome:
 
 
 def join_outcomes(outcomes: Iterable[Outcome]) -> Outcome:
-    """Outcomes of several runs as one, with the deciding cohort of the first; their variants must have different names."""
+    """Outcomes of several runs as one, with the deciding cohort of the first; their variants have different names."""
     parts = list(outcomes)
     joined = Outcome(cohort=parts[0].cohort) if parts else Outcome()
     for part in parts:

@@ -26,7 +26,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry.checks import all_finite, is_static
-from dhtorch.geometry.determinism import ELEMENTWISE_LANES, MAX_CHUNK_POINTS
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES, MAX_CHUNK_POINTS, round_up
 from dhtorch.geometry.linalg import adjugate_2x2, determinant_2x2, eigenvalues_2x2
 from dhtorch.geometry.patches import QUANTISATION_VARIANCE
 from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, OUTSIDE_MARGIN_PX, Pyramid
@@ -182,6 +182,25 @@ def squared_differences(
         sums.append((J - T).square().sum(-1))
     total = torch.cat(sums)
     return torch.where(total.isfinite(), total, torch.full_like(total, o.window**2))
+
+
+def compare_windows(
+    source: Pyramid,
+    target: Pyramid,
+    o: SearchOptions,
+    uv_0: Tensor,  # (B, N, 2) px
+    uv_1: Tensor,  # (B, N, 2) px
+) -> tuple[Tensor, Tensor]:
+    """Windows of two pictures around points -> rms grey difference (B, N), and whether the first has texture (B, N)."""
+    B, N, _ = uv_0.shape
+    fill = round_up(B * N) - B * N
+    like = source.levels[0]
+    x, x_1 = (F.pad(uv.to(like.dtype).permute(2, 0, 1).reshape(2, -1), (0, fill)) for uv in (uv_0, uv_1))
+    batch = F.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
+    rms = (squared_differences(source, target, o, x, x_1 - x, batch) / o.window**2).sqrt()
+    chunks = zip(*(y.split(MAX_CHUNK_POINTS, -1) for y in (x, x_1, batch)), strict=True)
+    textured = torch.cat([lucas_kanade_step(source, target, o, *chunk)[1] for chunk in chunks])
+    return rms[: B * N].view(B, N), textured[: B * N].view(B, N)
 
 
 def window_covariance(A: Tensor, variance: Tensor) -> Tensor:

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from dhtorch.geometry import lucas_kanade as lk
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.determinism import round_up
 from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.map_estimate import MEDIAN_2D
 from dhtorch.geometry.patches import is_inside_picture
@@ -125,7 +124,9 @@ def match_features(
         valid = is_near & is_back & inside & (error < max_round_trip_px)
         safe = torch.where(valid[..., None], uv_1, x.clamp(min=0))
         pyramids = PyramidCache(image_0) if hint.pyramid is None else hint.pyramid
-        rms = _grey_difference(pyramids, image_1, x.clamp(min=0), safe, window)
+        target = build_pyramid(image_1, 1, window, gradients=False)
+        options = lk.SearchOptions(window, 1, 0.0, 0.0, "none")
+        rms, _ = lk.compare_windows(pyramids(1, window), target, options, x.clamp(min=0), safe)
         kept = uv_1.isfinite().all(-1, keepdim=True) & uv_0.isfinite().all(-1, keepdim=True)
         floor = noise_px**2 * torch.eye(2, device=cov.device, dtype=cov.dtype)
         return Tracks(
@@ -235,19 +236,3 @@ def _predict(matches: _Matches, x: Tensor, neighbours: int, reach_px: float) -> 
 def _unit(image: Tensor) -> Tensor:
     """Pictures as floats in [0, 1]."""
     return image.float() / 255 if image.dtype == torch.uint8 else image.float()
-
-
-def _grey_difference(pyramids: PyramidCache, image_1: Tensor, uv_0: Tensor, uv_1: Tensor, window: int) -> Tensor:
-    """Rms grey difference (B, N) of the windows around points of both pictures."""
-    B, N, _ = uv_0.shape
-    source = pyramids(1, window)
-    target = build_pyramid(image_1, 1, window, gradients=False)
-    options = lk.SearchOptions(window, 1, 0.0, 0.0, "none")
-    fill = round_up(B * N) - B * N
-    x, x_1 = (
-        torch.nn.functional.pad(uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, -1), (0, fill))
-        for uv in (uv_0, uv_1)
-    )
-    batch = torch.nn.functional.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
-    rms = (lk.squared_differences(source, target, options, x, x_1 - x, batch) / window**2).sqrt()
-    return rms[: B * N].view(B, N)

@@ -17,6 +17,7 @@ from typing import Final
 import torch
 import torch.nn.functional as F
 
+from dhtorch.data.intrinsics import MAX_CENTRE_OFFSET
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.plausibility import plausibility_findings
 from dhtorch.data.recording import Recording
@@ -63,17 +64,9 @@ _MIN_WORSE_RATIO: Final = 1.5
 #: Least difference of that disagreement. Source: origin not recorded.
 _MIN_WORSE_DISAGREEMENT: Final = 0.003
 
-#: Offset of the principal point from the middle of the picture, as a fraction of its sides, above which it is far.
-#: Source: chosen on K of the shared data, which are at most 0.04 off.
-_FAR_PRINCIPAL_POINT: Final = 0.08
-
-#: Offset up to which it is near. Source: chosen on K of the shared data, which are at most 0.04 off.
-_NEAR_PRINCIPAL_POINT: Final = 0.05
-
 #: Epipolar distances at which pictures are said to follow one of two sets of poses: the smaller median is at most this
 #: fraction of the larger one. Source: origin not recorded.
 _MAX_EPIPOLAR_RATIO: Final = 0.7
-
 
 #: Error of the scale of depth and poses above which it is stated that a smaller one is not noticed.
 #: Source: derived, twice the least factor that is reported.
@@ -238,14 +231,14 @@ def _intrinsics_findings(frames: Sequence[Frame]) -> list[Finding]:
         return []
     c, (h, w) = frames[0].camera.c[0].double() + 0.5, frames[0].hw
     relative = c / torch.tensor([w, h], dtype=torch.float64)
-    if float((relative - 0.5).abs().max()) <= _FAR_PRINCIPAL_POINT:
+    if float((relative - 0.5).abs().max()) <= MAX_CENTRE_OFFSET:
         return []
     exchanged = c.flip(-1) / torch.tensor([w, h], dtype=torch.float64)
     start = f"the principal point {c[0]:.0f}, {c[1]:.0f} px is far from the middle of pictures of {w}x{h}"
-    if float((exchanged - 0.5).abs().max()) <= _NEAR_PRINCIPAL_POINT:
+    if float((exchanged - 0.5).abs().max()) <= MAX_CENTRE_OFFSET:
         return [Finding("intrinsics", f"{start}: cx and cy (and fx and fy) look exchanged", "data.K=[fx,fy,cx,cy]")]
     factor = 2 * float(relative.mean())
-    if float((relative / relative.mean() - 1).abs().max()) <= _NEAR_PRINCIPAL_POINT:
+    if float((relative / relative.mean() - 1).abs().max()) <= MAX_CENTRE_OFFSET:
         text = f"{start}: the intrinsics look like those of pictures {factor:.3g} times as large"
         return [Finding("intrinsics", text, "data.K=[fx,fy,cx,cy]")]
     return []

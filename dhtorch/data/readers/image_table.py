@@ -46,10 +46,6 @@ _K_EXPECTED = "fx fy cx cy, or a 3x3 or 4x4 matrix"
 #: shorter side to a pixel at 120 pixels is 0.8 %, ScanNet's 1296×968 differs from 640×480 by 0.4 %.
 _MAX_ASPECT_ERROR = 0.01
 
-#: Offset of a principal point from the middle of a map, as a fraction of its sides, up to which K fits the map's size.
-#: Source: chosen on K of the shared data, which are at most 0.04 off.
-_MAX_CENTRE_OFFSET = 0.06
-
 #: Names of depth files that are decoded by the PGM codec.
 _PGM_SUFFIX = ".pgm"
 
@@ -120,7 +116,7 @@ def _refuse_turned_depth(loader: ImageTableLoader) -> None:
         return
     c, (h, w) = loader.depth_camera.c[0] + 0.5, loader.depth_hw
     stated, turned = (float((c / c.new_tensor(size) - 0.5).abs().max()) for size in ((w, h), (h, w)))
-    if turned <= _MAX_CENTRE_OFFSET and stated > 2 * _MAX_CENTRE_OFFSET:
+    if turned <= intrinsics_options.MAX_CENTRE_OFFSET and stated > 2 * intrinsics_options.MAX_CENTRE_OFFSET:
         size = f"{w}x{h}, turned against its intrinsics with the principal point {c[0]:.0f}, {c[1]:.0f} px"
         raise FormatError(loader.rows[0].depth, "size", size, "depth maps as their camera lies")
 

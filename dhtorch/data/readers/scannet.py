@@ -31,10 +31,6 @@ _UNITS_PER_METRE = 1000.0
 #: Image size (h, w) for which the scans' K of colour is stated. Source: format definition.
 _COLOUR_HW = (968, 1296)
 
-#: Largest distance of the principal point from the image's centre, as share of the image's width, up to which K belongs
-#: to the images' size. Source: derived: K of 1296 px on images of 640 px is 0.51 off, ScanNet's own is 0.002 off.
-_MAX_CENTRE_OFFSET = 0.25
-
 _IMAGE_PATTERN = r"(\d+)\.(?:jpg|jpeg|png)"
 _COLOUR_FILES = ("intrinsic_color.txt", "intrinsics_color.txt", "intrinsic.txt")
 _DEPTH_FILES = ("intrinsic_depth.txt", "intrinsics_depth.txt", "depth_intrinsic.txt")
@@ -165,7 +161,7 @@ def _find_intrinsics(root: Path, names: Sequence[str]) -> Path | None:
 
 def _fit_colour_K(K: np.ndarray, hw: tuple[int, int], file: Path) -> tuple[np.ndarray, tuple[str, ...]]:
     """K of the images' size: many exports have smaller images beside the K of the original size."""
-    if abs(K[0, 2] - (hw[1] - 1) / 2) <= _MAX_CENTRE_OFFSET * hw[1]:
+    if abs(K[0, 2] - (hw[1] - 1) / 2) <= intrinsics_options.MAX_CENTRE_OFFSET * hw[1]:
         return K, ()
     return image_table.fit_K(K, _COLOUR_HW, hw, file)
 

@@ -172,9 +172,10 @@ def match(
         error = (torch.stack([f.uv for f in back]) - start).square().sum(-1).sqrt()
         cells = uv_1.new_tensor([1 / g for g in features_1[0].gain])
         valid = inside & is_inside_picture(uv_1, image_1) & (similarity >= min_similarity) & (error < max_round_trip_px)
-        rms, textured = _grey_difference(
-            pyramids, image_1, start, torch.where(valid[..., None], uv_1, start), window, min_eigenvalue
-        )
+        target = build_pyramid(image_1, 1, window, gradients=False)
+        options = lk.SearchOptions(window, 1, 0.0, min_eigenvalue, "none")
+        at = torch.where(valid[..., None], uv_1, start)
+        rms, textured = lk.compare_windows(pyramids(1, window), target, options, start, at)
         uv_1 = torch.where(inside[..., None] & uv_1.isfinite(), uv_1.to(uv_0), uv_0.detach().nan_to_num(0.0, 0.0, 0.0))
         return Tracks(
             uv_0=uv_0,
@@ -257,23 +258,6 @@ def match_covariance(
     step_spread = torch.eye(2, device=spread.device, dtype=spread.dtype) / (12 * _STEPS_PER_CELL**2)
     factor = gain * (unlike * (1 - similarity.nan_to_num(-1.0)).clamp(0, 1)).exp()
     return factor[..., None, None] * (spread.nan_to_num() + step_spread)
-
-
-def _grey_difference(
-    pyramid_of: PyramidCache, image_1: Tensor, uv_0: Tensor, uv_1: Tensor, window: int, min_eigenvalue: float
-) -> tuple[Tensor, Tensor]:
-    """(rms grey difference of the windows around points of both images, whether the first has texture), (B, N) each."""
-    B, N, _ = uv_0.shape
-    source = pyramid_of(1, window)
-    target = build_pyramid(image_1, 1, window, gradients=False)
-    o = lk.SearchOptions(window, 1, 0.0, min_eigenvalue, "none")
-    fill = round_up(B * N) - B * N
-    x, x_1 = (F.pad(uv.to(source.levels[0].dtype).permute(2, 0, 1).reshape(2, -1), (0, fill)) for uv in (uv_0, uv_1))
-    batch = F.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
-    rms = (lk.squared_differences(source, target, o, x, x_1 - x, batch) / window**2).sqrt()
-    chunks = zip(*(y.split(MAX_CHUNK_POINTS, -1) for y in (x, x_1, batch)), strict=True)
-    textured = torch.cat([lk.lucas_kanade_step(source, target, o, *chunk)[1] for chunk in chunks])
-    return rms[: B * N].view(B, N), textured[: B * N].view(B, N)
 
 
 #: ``MAP`` with XFeat as track stage, followed by affine registration of every window, as a match is off by about a
