@@ -234,8 +234,8 @@ def run_row(frames: Frames, layout: str, fault: PlantedFault, sound: Sound | Non
     spoilt = fault.frames(list(frames), writer)
     if fault.needs == "poses" and not writer.has_poses:
         return None
-    if writer.step_m is not None and max(float(frame.depth.max()) for frame in spoilt) > 65534 * writer.step_m:
-        return None  # no 16-bit code holds it
+    if not writer.holds(max(float(frame.depth.max()) for frame in spoilt)):
+        return None
     try:
         path = writer(root, spoilt)
     except (ValueError, AssertionError, KeyError, OSError, RuntimeError):

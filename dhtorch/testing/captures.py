@@ -28,12 +28,18 @@ class CaptureWriter:
     write: Callable[[Path, Sequence[Frame]], object]
     format: str  # name of the reader
     step_m: float | None = None  # metres of one depth code; None = the layout stores metres, or rounds to no fixed step
+    max_m: float | None = None  # largest depth that the layout holds; None = that of 16-bit codes, or no limit
     path: str = "."  # what to open, relative to the folder
     has_poses: bool = True
     is_exact: bool = True  # images and depth come back bit for bit, apart from the step of depth
     states_unit: bool = True  # whether the layout states the unit of its depth
     wants_even_sides: bool = False  # the images are stored as a film
     options: Mapping[str, object] = field(default_factory=dict)  # of the reader, so that images come back as written
+
+    def holds(self, depth_m: float) -> bool:
+        """Whether the layout stores a depth, m, instead of clipping it."""
+        limit = self.max_m if self.step_m is None else 65534 * self.step_m
+        return limit is None or depth_m <= limit
 
     def __call__(self, root: Path, frames: Sequence[Frame]) -> Path:
         """Write the capture below the folder ``root`` → the path to open."""
@@ -109,7 +115,11 @@ CAPTURE_WRITERS: Final[dict[str, CaptureWriter]] = {
         states_unit=False,
     ),
     "lerobot_video": CaptureWriter(
-        lambda root, frames: write_lerobot(root, [frames]), "lerobot", is_exact=False, wants_even_sides=True
+        lambda root, frames: write_lerobot(root, [frames]),
+        "lerobot",
+        max_m=10.0,
+        is_exact=False,
+        wants_even_sides=True,
     ),
     "rlds": CaptureWriter(
         lambda root, frames: write_rlds(root / "1.0.0", [frames]), "rlds", 1 / 1000, path="1.0.0", states_unit=False
