@@ -520,6 +520,7 @@ ROWS = [
 ELSEWHERE = {
     *(f"dhtorch.stages.pose_prior.{name}" for name in ("priors_from_frames", "reject_poses")),
     "dhtorch.geometry.inference_mode.run_without_grad",
+    "dhtorch.metrics.holdout.truth_kept_ratio",
     "dhtorch.geometry.least_squares.has_graph",
     "dhtorch.geometry.patches.product_is_exact",
     *(f"dhtorch.geometry.patches.{name}" for name in ("fits_window_kernel", "window_arguments")),

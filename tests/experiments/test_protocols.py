@@ -1,5 +1,7 @@
 """Experiments of the paper on small rooms: cohorts, variants, hidden returns, and verdicts both ways."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from support.paper_protocol_runs import configured_method, outcome_of_rows, small_room
@@ -7,7 +9,8 @@ from support.rooms import Changed, room_scene, untold
 
 from dhtorch.cli.run import config_dir, main
 from dhtorch.data.pairs import by_gap
-from dhtorch.experiments.cohorts import HeldOut, trajectory_pose, trajectory_pose_fit
+from dhtorch.experiments import pair
+from dhtorch.experiments.cohorts import HeldOut, far_real_holes, trajectory_pose, trajectory_pose_fit
 from dhtorch.experiments.paper import (
     ablation,
     calibration,
@@ -19,7 +22,7 @@ from dhtorch.experiments.paper import (
     range_split,
     real_holes,
 )
-from dhtorch.experiments.protocol import Batch, Settings
+from dhtorch.experiments.protocol import Batch, Settings, far_truth, held_back_truth
 from dhtorch.geometry import se3
 from dhtorch.metrics import holdout
 from dhtorch.metrics.correlation import _ranks
@@ -122,6 +125,73 @@ def test_range_split_has_one_cohort_for_all_variants():
     assert scene(outcome, "gated, cutoff 1.5 m")["cutoff_m"] == 1.5
     assert scene(outcome, "gated, cutoff x1.25")["cutoff_m"] == 2.5
     assert {f"{v}.coverage" for v in five} | {"gated, cutoff 1.5 m.pnp_success"} <= set(outcome.summary)
+
+
+def test_real_holes_beyond_the_cutoff_are_counted_apart():
+    """Independent truth knows depth where the sensor has none: those samples are in a cohort of their own."""
+    recording = small_room()
+    outcome = asked(range_split, recording, cutoff_factors=())
+    for variant in ("sensor_only", "gated"):
+        masked, holes = scene(outcome, variant), scene(outcome, variant, "real_holes")
+        assert masked["n_candidates"] > 100 and holes["n_candidates"] > 30
+        assert masked["n_real_holes"] > holes["n_candidates"], "counted before the truth test and the texture limit"
+    batch, samples = batch_of(recording), configured_method().sample_depth(holdout.range_split(recording[0], 2.0))
+    batch = replace(batch, exact=recording[0].replace(depth=recording.truth(0)["depth"], depth_camera=None))
+    held, far = (of(batch, {"samples": samples}) for of in (held_back_truth, far_truth))
+    sensor = holdout.sample_truth(recording[0], samples.uv, truth="raw").depth
+    assert bool((sensor[held.ok] > 2).all()) and not bool(samples.usable[held.ok].any())
+    apart = far_real_holes(batch, {"samples": samples})
+    assert bool((sensor[apart.ok] == 0).all()) and bool((apart.depth[apart.ok] > 2).all())
+    assert not bool((held.ok & apart.ok).any())
+    remaining = far.ok & ~held.ok & ~apart.ok
+    assert bool((sensor[remaining] > 0).all()) and bool((sensor[remaining] <= 2).all()), "a near return over far truth"
+
+
+def test_a_recording_without_independent_truth_has_no_cohort_of_real_holes():
+    outcome = asked(range_split, untold(small_room()), cutoff_factors=())
+    assert {row["truth"] for row in outcome.rows} == {"full"}
+    assert scene(outcome, "gated")["n_real_holes"] == 0 < scene(outcome, "gated")["n_candidates"]
+
+
+def test_a_candidate_with_a_return_of_the_sensor_raises_with_the_scene():
+    def rows(kept):
+        return outcome_of_rows(
+            ("attic", "sensor_only", "full", {"n_kept": kept}), ("attic", "gated", "full", {"n_kept": 7})
+        )
+
+    range_split.require_no_returns(rows(0).rows, "full")
+    with pytest.raises(ValueError, match=r"attic 3.*expected none"):
+        range_split.require_no_returns(rows(3).rows, "full")
+
+
+@pytest.mark.parametrize("experiment", [range_split, heldout, real_holes, gate_ablation, device_pose, calibration])
+def test_the_protocols_take_the_truth_test_and_state_what_it_keeps(experiment):
+    """Without a test every return is kept: more candidates, and a share of one."""
+    options = {range_split: {"cutoff_factors": ()}, gate_ablation: {"factors": ()}}.get(experiment, {})
+    scenes = [room_scene(small_room(), gap=3)]
+    found = {}
+    for test in ("raw", "full"):
+        outcome = experiment.run(scenes, {"paper": configured_method()}, by_gap, Settings(truth=(test,)), **options)
+        rows = [r for r in outcome.rows if r["pair"] is None and r["method"] != "sensor_only"]
+        assert not ({"raw", "full"} - {test}) & {r["truth"] for r in rows}, "a cohort bears the name of its test"
+        found[test] = {(r["method"], r["truth"].replace(test, "far")): r for r in rows if r["n_pairs"]}
+    assert found["raw"].keys() == found["full"].keys() != set()
+    for key, raw in found["raw"].items():
+        full = found["full"][key]
+        assert raw["truth_kept"] == 1 > full["truth_kept"], key
+        assert raw["n_candidates"] > full["n_candidates"] > 0, key
+
+
+def test_a_method_that_states_no_sigma_has_no_number_of_it():
+    methods = {name: configured_method(name) for name in ("paper", "opencv", "map")}
+    outcome = pair.run([room_scene(small_room(), gap=3)], methods, by_gap, Settings())
+    for name in ("paper", "opencv"):
+        row = scene(outcome, name)
+        assert [row[k] for k in ("within_sigma", "within_2sigma", "ece", "ece_equal_mass")] == [None] * 4, name
+        assert row["aurc"] is not None and outcome.summary[f"{name}.within_sigma"]["value"] is None
+    row = scene(outcome, "map")
+    assert 0 < row["within_sigma"] <= row["within_2sigma"] and row["ece"] is not None
+    assert bool(outcome.points["synthetic_room", "map", "full"].answered().sigma.isfinite().all())
 
 
 @pytest.mark.parametrize(

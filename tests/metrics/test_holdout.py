@@ -313,6 +313,44 @@ def test_what_stays_of_a_split_frame_keeps_its_gradient():
     assert depth.grad.tolist() == [[[1.0, 0.0]]]
 
 
+# ---------------------------------------------------------------------------------------------------- masked returns
+
+
+def test_a_candidate_needs_a_masked_return_of_the_sensor():
+    """Truth of another instrument is 4 m everywhere; the sensor has a far return, none, a near one, and none (left out)."""
+    sensor = torch.zeros(1, 40)
+    sensor[0, 5], sensor[0, 25] = 4.1, 1.5
+    uv = at((5, 0), (15, 0), (25, 0), (35, 0))
+    depth, code = torch.full((1, 4), 4.0), torch.zeros(1, 4, dtype=torch.int32)
+    code[0, 3] = TruthCode.EXCLUDED
+    truth = holdout.require_masked(holdout.Truth(depth, code), frame_of(sensor), uv, 2.0)
+    expected = [TruthCode.CANDIDATE, TruthCode.REAL_HOLE, TruthCode.NEAR, TruthCode.EXCLUDED]
+    assert truth.code[0].tolist() == expected and truth.n_real_holes == 1
+    assert "real_hole" not in truth.dropped() and truth.dropped()["excluded"] == 1
+    assert truth.code.dtype == torch.int32 and torch.equal(truth.depth, depth)
+    for rejected in (TruthCode.CLOSE, TruthCode.TEXTURE):  # counted only where a return was masked
+        before = holdout.Truth(depth, torch.full_like(code, rejected))
+        after = holdout.require_masked(before, frame_of(sensor), uv, 2.0).code[0].tolist()
+        assert after == [rejected, TruthCode.REAL_HOLE, TruthCode.NEAR, TruthCode.REAL_HOLE]
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_a_near_return_within_reach_of_a_sparse_sample_is_no_masked_return(sparse):
+    sensor = torch.zeros(20, 40)
+    sensor[10, 10], sensor[10, 12] = 2.05, 1.98  # the nearest lies beyond the cutoff, the next before it
+    frame, uv = frame_of(sensor, sparse=sparse), at((10, 10))
+    truth = holdout.select_candidates(samples_of(torch.ones(1, 1)), holdout.sample_truth(frame, uv, truth="raw"), 2.0)
+    assert bool(truth.ok.all())
+    code = int(holdout.require_masked(truth, frame, uv, 2.0).code)
+    assert code == (TruthCode.NEAR if sparse else TruthCode.CANDIDATE)
+
+
+def test_the_share_that_the_truth_test_keeps():
+    dropped = {"close": 1, "wide": 3, "excluded": 2, "texture": 4}
+    assert holdout.truth_kept_ratio(10, dropped) == pytest.approx(1 - 4 / 20)
+    assert holdout.truth_kept_ratio(0, dict.fromkeys(dropped, 0)) is None
+
+
 # ---------------------------------------------------------------------------------------------------- halves
 
 

@@ -10,11 +10,12 @@ import torch
 from support.rooms import room as rendered
 
 import dhtorch
-from dhtorch import MAP, PAPER, WINDOW, TrackHint, pytree
+from dhtorch import AUTO, KORNIA, MAP, PAPER, WINDOW, TrackHint, pytree
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.scene import Scene
 from dhtorch.experiments import pair as pairs
 from dhtorch.experiments import protocol
+from dhtorch.experiments.baselines.opencv import OPENCV
 from dhtorch.extract import plan
 from dhtorch.extract.dataset import RowDataset
 from dhtorch.geometry import camera as cam
@@ -92,7 +93,8 @@ def test_a_plain_function_in_every_stage_answers_as_the_stage_itself(room):
 @pytest.mark.parametrize("views", [1, 3])
 def test_it_runs_in_the_protocol_with_the_levels_of_the_scene(room, views):
     scene = Scene(room, near=2.0, levels=2)
-    methods = {"plain": PLAIN.replace(views=views), "usual": USUAL.replace(views=views)}
+    # A score of one's own may be made of sigma, so that sigma is evaluated: not so with the paper's function itself.
+    methods = {"plain": PLAIN.replace(views=views), "usual": USUAL.replace(views=views, score=score)}
     outcome = pairs.run([scene], methods, partial(by_gap, gap=3), protocol.Settings(between=0))
     plain, usual = (
         {k: v for k, v in outcome.scenes(m)["synthetic_room"].items() if k not in ("ms", "method")} for m in methods
@@ -216,3 +218,12 @@ def test_networks_of_a_method_are_found_in_partials():
 def test_several_views_must_be_some(room):
     with pytest.raises(ValueError, match="found no other view"):
         PAPER(room[0], [])
+
+
+def test_a_method_states_a_sigma_with_a_score_made_of_it_or_with_fitted_noise():
+    """The paper's score orders answers; OpenCV's and kornia's stages change nothing about that."""
+    silent = (PAPER, KORNIA, OPENCV, PAPER.replace(n=512, score={"half_parallax_deg": 1.0}))
+    assert not any(each.states_sigma for each in silent)
+    parts = (PAPER.replace(score=MAP.score), MAP.replace(score=PAPER.score), PAPER.replace(score=lambda e, *_: e))
+    assert all(each.states_sigma for each in (MAP, WINDOW, AUTO, *parts))
+    assert not MAP.replace(score=PAPER.score, triangulate={"fitted_noise": False}).states_sigma
