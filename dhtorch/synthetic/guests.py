@@ -32,6 +32,9 @@ _CARRIED_CENTRE: Triple = (0.02, 0.05, 0.52)
 _TURNTABLE_CENTRE: Triple = (0.0, 0.02, 1.07)
 _TURN_DEG_PER_FRAME = 2.0
 
+#: Frames in which a body in a lane speeds up and slows down once.
+_SURGE_FRAMES = 9
+
 
 def _body_box(
     at: Triple, size: Triple, picture: str, *, tile: float | None = None, yaw: float = 0, pitch: float = 0
@@ -79,6 +82,23 @@ def move_with_viewer(T_world_from_cam: Pose, *, share: float = 1.0) -> Pose:
     """``T_world_from_home`` (n) of a body that translates by ``share`` times the viewer's translation."""
     moved = T_world_from_cam.t - _VIEWER_POSE.t
     return Pose(se3.identity(len(moved), moved).R, share * moved)
+
+
+def move_in_lanes(T_world_from_cam: Pose, *, shares: tuple[float, ...], unevenness: float = 0.0) -> Pose:
+    """``T_world_from_home`` (n k), the k motions of a frame one after the other, of bodies in lanes of their own.
+
+    A body translates by its of the k ``shares`` times the viewer's translation, backwards where negative. Its speed
+    rises and falls by the fraction ``unevenness`` of the viewer's within :data:`_SURGE_FRAMES` frames.
+    """
+    moved = T_world_from_cam.t - _VIEWER_POSE.t
+    steps = torch.diff(moved, dim=0, prepend=moved[:1])
+    lanes = []
+    for k, share in enumerate(shares):
+        phase = [2 * math.pi * (i / _SURGE_FRAMES + k / len(shares)) for i in range(len(moved))]
+        surge = torch.tensor([[math.sin(p)] for p in phase], dtype=moved.dtype)
+        lanes.append(share * moved + unevenness * (surge * steps).cumsum(0))
+    t = torch.stack(lanes, 1).flatten(0, 1)
+    return Pose(se3.identity(len(t), t).R, t)
 
 
 def move_in_hand(T_world_from_cam: Pose) -> Pose:

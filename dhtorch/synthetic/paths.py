@@ -8,7 +8,7 @@ that poses do not depend on vector widths.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from random import Random
 
 import torch
@@ -35,6 +35,30 @@ def hand_held_path(
         torch.tensor([rotation_from_angles(*angles) for angles in turns], dtype=torch.float64),
         torch.tensor([(x, -height, z) for (x, height, z), _ in stations], dtype=torch.float64),
     )
+
+
+def turn_by_hand(times: Sequence[float], *, duration_s: float, degrees: float, reach_m: float, seed: int) -> Pose:
+    """``T_world_from_cam`` (n), float64, of a camera that a hand turns on the spot, at ``times`` in s.
+
+    The viewing direction swings by ``degrees`` within ``duration_s``, in a seeded direction that is mostly sideways,
+    and the camera rolls by a quarter of that. The wrist, not the camera's centre, is the centre of the rotation, and
+    sways: within ``duration_s`` the camera's centre moves by about ``reach_m``.
+    """
+    hand = _Hand(seed)
+    draw = Random(f"wrist {seed}")
+    tilt, sense = math.radians(draw.uniform(-35.0, 35.0)), draw.choice((-1, 1))
+    lever = torch.tensor([0.0, 0.0, 0.9 * reach_m / math.radians(degrees)], dtype=torch.float64)
+    x0, height0, z0 = _START_POSITION
+    start = torch.tensor([x0, -height0, z0], dtype=torch.float64)
+    rotations, centres = [], []
+    for time in times:
+        turn = 0.5 * sense * degrees * -math.cos(math.pi * time / duration_s)
+        roll = 0.25 * degrees * hand.sway(0, time / duration_s)
+        R = rotation_from_angles(_YAW + turn * math.cos(tilt), _PITCH + turn * math.sin(tilt), roll)
+        rotations.append(torch.tensor(R, dtype=torch.float64))
+        sway = [0.1 * reach_m * hand.sway(1 + k, 2 * math.pi * time / duration_s) for k in range(3)]
+        centres.append(start + rotations[-1] @ lever + torch.tensor(sway, dtype=torch.float64))
+    return Pose(torch.stack(rotations), torch.stack(centres))
 
 
 class _Hand:

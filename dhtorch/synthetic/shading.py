@@ -78,12 +78,17 @@ class ShadedRoom:
         return room
 
     def moved(self, motion: Pose) -> ShadedRoom:
-        """The room with its ``SURFACE_MOVING`` solids after a rigid motion (1) of the world, in unchanged light.
+        """The room with its ``SURFACE_MOVING`` solids after rigid motions (n) of the world, in unchanged light.
 
-        A surface point keeps its colour, so that it can be tracked like any other.
+        The k-th of them has the motion k mod n. A surface point keeps its colour, so that it can be tracked like any
+        other.
         """
-        room = copy.copy(self)
-        room.solids = Solids([s.moved(motion) if s.surface.kind == SURFACE_MOVING else s for s in self.solids.each])
+        room, solids, k = copy.copy(self), list(self.solids.each), 0
+        for i, solid in enumerate(solids):
+            if solid.surface.kind == SURFACE_MOVING:
+                turn = k % len(motion.t)
+                solids[i], k = solid.moved(motion[turn : turn + 1]), k + 1
+        room.solids = Solids(solids)
         return room
 
     def shade(

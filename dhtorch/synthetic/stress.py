@@ -1,7 +1,8 @@
 """Stress recordings of the built-in room: one per difficulty of a capture, with exact ground truth.
 
 Difficulties: paths with little parallax, near returns that hardly constrain a pose, a noisier sensor, a rolling
-shutter, displaced image tiles, wrong tracks, moving bodies near by, large motion, exposure jumps and motion blur.
+shutter, displaced image tiles, wrong tracks, moving bodies near by, a camera turned by hand, large motion, exposure
+jumps and motion blur.
 Recordings are named ``stress_<name>``.
 """
 
@@ -21,8 +22,8 @@ from dhtorch.data.scene import Scene
 from dhtorch.geometry.camera import Camera, depth_pixels
 from dhtorch.geometry.patches import round_half_up
 from dhtorch.records import Frame, Pose, Tracks
-from dhtorch.synthetic.guests import move_in_hand, move_with_viewer, room_with_body, turn_on_turntable
-from dhtorch.synthetic.paths import hand_held_path, rotation_from_angles
+from dhtorch.synthetic.guests import move_in_hand, move_in_lanes, move_with_viewer, room_with_body, turn_on_turntable
+from dhtorch.synthetic.paths import hand_held_path, rotation_from_angles, turn_by_hand
 from dhtorch.synthetic.raycast import SURFACE_MOVING, world_rays
 from dhtorch.synthetic.recording import SURFACE_NAMES, SyntheticRoom, room_to_scene
 from dhtorch.synthetic.shading import ShadedRoom
@@ -48,6 +49,10 @@ _EXPOSURE_STOPS = (0.5, 1.0)
 
 #: ``motion_blur``: range of the blur length, px at 640 columns; its direction differs from frame to frame.
 _SMEAR_RANGE_PX = (5.0, 15.0)
+
+#: Hand-turned cameras: bands of rows with the same exposure, seconds of exposure, moments that make an exposure, and
+#: amplitude of the changes of exposure between frames, stops.
+_N_TURN_BANDS, _TURN_EXPOSURE_S, _N_TURN_EXPOSURES, _EXPOSURE_SWING_STOPS = 8, 0.012, 2, 0.3
 
 #: Positions of samples: ``(hw, n) -> uv (n, 2)``.
 _SamplePattern = Callable[[tuple[int, int], int], Tensor]
@@ -92,10 +97,15 @@ class StressRoom(SyntheticRoom):
             self.bands, options["true_poses"] = _rolling_shutter_poses(**path_options)
         if stress == "fast":
             options["true_poses"] = _panning_poses(**path_options)
+        self.turn = STRESSES[stress].turn
+        if self.turn is not None:
+            n_frames, rate_hz = options.get("n_frames", 12), options.get("rate_hz", 30.0)
+            self._pose_at = partial(self.turn.poses, duration_s=n_frames / rate_hz, seed=options.get("seed", 2))
+            options["true_poses"] = self._pose_at([i / rate_hz for i in range(n_frames)])
         super().__init__(**options)
         self.stress, self.places, self.n_places = stress, places, n_places
         moving = STRESSES[stress].moving
-        #: T_world_from_home (n_frames) of the moving body, None without one: see :mod:`dhtorch.synthetic.guests`.
+        #: T_world_from_home (n_frames k) of the moving body, None without one: see :mod:`dhtorch.synthetic.guests`.
         self.body_poses = None if moving is None else moving.motion(self.true_poses)
         self.near, self.gap = near, gap
         if self.bands:
@@ -112,15 +122,20 @@ class StressRoom(SyntheticRoom):
     def world(self, index: int) -> ShadedRoom:
         """As :meth:`SyntheticRoom.world`, with the moving body at its position in frame ``index``."""
         i, moving = self._position(index), STRESSES[self.stress].moving
+        if self.turn is not None:
+            return room_with_body(self.seed, "parcels")
         if moving is None or self.body_poses is None:
             return super().world(i)
-        return room_with_body(self.seed, moving.guest).moved(self.body_poses[i : i + 1])
+        k = len(self.body_poses.t) // len(self)
+        return room_with_body(self.seed, moving.guest).moved(self.body_poses[i * k : (i + 1) * k])
 
     def gain(self, index: int) -> float:
-        """Factor on the grey values of frame ``index`` before clipping; 1 except for ``exposure_jump``."""
+        """Factor on the grey values of frame ``index`` before clipping; 1 except for ``exposure_jump`` and turns."""
+        i = self._position(index)
+        if self.turn is not None:
+            return math.pow(2.0, _EXPOSURE_SWING_STOPS * math.sin(0.9 * i + self.seed))
         if self.stress != "exposure_jump":
             return 1.0
-        i = self._position(index)
         stops = (
             _EXPOSURE_STOPS[0]
             + (_EXPOSURE_STOPS[1] - _EXPOSURE_STOPS[0]) * torch.rand(1, generator=self._generator(i, "gain")).item()
@@ -146,6 +161,8 @@ class StressRoom(SyntheticRoom):
     def _picture(self, i: int) -> Tensor:
         if self.stress == "motion_blur":
             return self._smeared(i)
+        if self.turn is not None:
+            return self._turned(i)
         if not self.bands:
             return self._photograph(i, self.camera, self.true_poses[i : i + 1], self.hw, exposure=self.gain(i))
         return torch.cat([self._photograph(i, camera, pose, hw) for camera, pose, hw in self._rows(i)], 2)
@@ -164,6 +181,25 @@ class StressRoom(SyntheticRoom):
             )
             total = total + self._photograph(i, self.camera, Pose(pose.R @ turn, pose.t), self.hw)
         return total / n
+
+    def _turned(self, i: int) -> Tensor:
+        """Image under a rolling shutter with motion blur: bands of rows, each the mean over its exposure."""
+        turn, rate_hz = self.turn, self.rate_hz
+        assert turn is not None and rate_hz is not None
+        edges = [round(k * self.hw[0] / _N_TURN_BANDS) for k in range(_N_TURN_BANDS + 1)]
+        bands = []
+        for top, bottom in pairwise(edges):
+            camera = self.camera.replace(c=self.camera.c - torch.tensor([[0.0, float(top)]]))
+            middle = i / rate_hz + turn.readout_s * ((top + bottom) / (2 * self.hw[0]) - 0.5)
+            offsets = [(k + 0.5) / _N_TURN_EXPOSURES - 0.5 for k in range(_N_TURN_EXPOSURES)]
+            moments = [middle + _TURN_EXPOSURE_S * offset for offset in offsets]
+            poses = self._pose_at(moments)
+            parts = [
+                self._photograph(i, camera, poses[k : k + 1], (bottom - top, self.hw[1]), exposure=self.gain(i))
+                for k in range(_N_TURN_EXPOSURES)
+            ]
+            bands.append(torch.stack(parts).mean(0))
+        return torch.cat(bands, 2)
 
     def _render(self, i: int) -> Frame:
         return STRESSES[self.stress].spoil(self, i, super()._render(i))
@@ -214,7 +250,8 @@ def open_stress(
 ) -> list[Scene]:
     """The room under each of :data:`STRESSES` (None = all), one scene each; options as :class:`StressRoom`.
 
-    A scene with a moving body has the role ``moving`` and a cutoff of at most that of the body.
+    A scene with a moving body has the role ``moving`` and a cutoff of at most that of the body; one with a camera that
+    is turned by hand has the role ``rotation``.
     """
     options: dict[str, Any] = {"seed": seed, "n_frames": n_frames, "hw": hw, "near": near, "gap": gap}
     names = STRESSES if stresses is None else stresses
@@ -223,7 +260,9 @@ def open_stress(
 
 
 def _to_scene(room: StressRoom, near: float, gap: int) -> Scene:
-    moving = STRESSES[room.stress].moving
+    moving, turn = STRESSES[room.stress].moving, STRESSES[room.stress].turn
+    if turn is not None:
+        return replace(room_to_scene(room, min(near, turn.near), gap), role="rotation")
     if moving is None:
         return room_to_scene(room, near, gap)
     return replace(room_to_scene(room, min(near, moving.near), gap), role="moving")
@@ -321,8 +360,21 @@ class MovingBody(NamedTuple):
     """A moving body of a stress."""
 
     guest: str  # name in guests.MOVING_BODIES
-    motion: Callable[[Pose], Pose]  # T_world_from_cam (n) → T_world_from_home (n)
+    motion: Callable[[Pose], Pose]  # T_world_from_cam (n) → T_world_from_home (n k), k motions of a frame
     near: float  # m, cutoff at which all or half of the near returns are of the body
+
+
+class HandTurn(NamedTuple):
+    """A camera turned by hand before a stack of parcels, see :func:`dhtorch.synthetic.paths.turn_by_hand`."""
+
+    degrees: float
+    reach_m: float
+    readout_s: float = 0.02  # of the rolling shutter, from the first row to the last
+    near: float = 1.3  # m, cutoff at which near returns lie on the parcels
+
+    def poses(self, times: Sequence[float], *, duration_s: float, seed: int) -> Pose:
+        """``T_world_from_cam`` (n) at times in s, in a recording of ``duration_s``."""
+        return turn_by_hand(times, duration_s=duration_s, degrees=self.degrees, reach_m=self.reach_m, seed=seed)
 
 
 class Stress(NamedTuple):
@@ -331,7 +383,17 @@ class Stress(NamedTuple):
     options: dict[str, Any]
     spoil: Callable[[StressRoom, int, Frame], Frame] = _keep_all
     moving: MovingBody | None = None
+    turn: HandTurn | None = None
 
+
+#: Traffic: all that is near moves along the viewer's way, at speeds that rise and fall. Far depths then have a wrong
+#: scale, and neither lie within the sensor's reach nor contradict the near tracks.
+_ONCOMING = partial(move_in_lanes, shares=(-0.5,), unevenness=0.5)
+_UNEVEN = partial(move_in_lanes, shares=(0.3,), unevenness=0.5)
+_LANES = partial(move_in_lanes, shares=(0.4, -0.5, 0.4), unevenness=0.2)
+
+#: Options of rooms with a camera that is turned by hand; the exposure already averages over pixels.
+_TURNED: dict[str, Any] = {"path": "static", "supersample": 1}
 
 #: The stresses by name.
 STRESSES: dict[str, Stress] = {
@@ -340,6 +402,10 @@ STRESSES: dict[str, Stress] = {
     "orbit": Stress({"path": "orbit"}),
     "rotation": Stress({"path": "rotation"}),
     "rotation_exact": Stress({"path": "rotation", "lidar": "exact", "image_noise": 0.0}),
+    "rotation_hand_6": Stress(_TURNED, turn=HandTurn(6.0, 0.02)),
+    "rotation_hand_8": Stress(_TURNED, turn=HandTurn(8.0, 0.03)),
+    "rotation_hand_20": Stress(_TURNED, turn=HandTurn(20.0, 0.03, readout_s=0.0)),
+    "rotation_hand_30": Stress(_TURNED, turn=HandTurn(30.0, 0.03, readout_s=0.0)),
     "planar_near": Stress({"path": "walk"}, _keep_one_plane),
     "few_near": Stress({"path": "walk"}, _keep_few_returns),
     "depth_noise": Stress({"path": "walk"}, _add_depth_noise),
@@ -348,6 +414,9 @@ STRESSES: dict[str, Stress] = {
     "mistracks": Stress({"path": "walk"}),
     "convoy": Stress({"path": "walk"}, moving=MovingBody("parcels", move_with_viewer, 1.3)),
     "convoy_slow": Stress({"path": "walk"}, moving=MovingBody("parcels", partial(move_with_viewer, share=0.5), 1.3)),
+    "convoy_oncoming": Stress({"path": "lateral"}, moving=MovingBody("parcels", _ONCOMING, 1.3)),
+    "convoy_uneven": Stress({"path": "walk"}, moving=MovingBody("parcels", _UNEVEN, 1.3)),
+    "convoy_lanes": Stress({"path": "walk"}, moving=MovingBody("parcels", _LANES, 1.3)),
     "held_object": Stress({"path": "walk"}, moving=MovingBody("held", move_in_hand, 2.0)),
     "turntable": Stress({"path": "static"}, moving=MovingBody("parcels", turn_on_turntable, 1.3)),
     "fast": Stress({"path": "lateral"}),

@@ -22,6 +22,7 @@ from dhtorch.synthetic.stress import STRESSES, StressRoom, open_stress
 SMALL = {"hw": (96, 128), "n_frames": 8, "supersample": 1, "depth_hw": (96, 128)}
 NEAR = 2.0
 MOVING_ROOMS = [name for name, of in STRESSES.items() if of.moving]
+TURNED_ROOMS = [name for name, of in STRESSES.items() if of.turn]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def near(frame):
 def test_one_recording_for_each_stress():
     rooms = open_stress(hw=(48, 64), n_frames=7)
     assert [r.name for r in rooms] == [f"stress_{name}" for name in STRESSES]
-    assert {r.recording.stress for r in rooms if r.role == "rotation"} == {"rotation", "rotation_exact"}
+    assert {r.recording.stress for r in rooms if r.role == "rotation"} == {"rotation", "rotation_exact", *TURNED_ROOMS}
     with pytest.raises(ValueError, match="earthquake"):
         open_stress(["earthquake"])
 
@@ -193,7 +194,7 @@ def carried(recording, i, j, motion=None):
     return inside, depth, (image.T - grey).abs().mean(-1), surface, found
 
 
-@pytest.mark.parametrize("name", MOVING_ROOMS)
+@pytest.mark.parametrize("name", [name for name in MOVING_ROOMS if name != "convoy_lanes"])
 def test_background_stands_and_the_body_goes_as_said(name):
     """Truth against render: what is carried to another frame by the right motion has its depth and its grey there."""
     there = room(name, image_noise=0.0, supersample=2)
@@ -259,6 +260,46 @@ def test_near_returns_lie_on_the_body(name, least, most):
             there.recording.truth(i)["surface"] != SURFACE_MOVING
         )
         assert candidates.double().mean() > 0.4
+
+
+def test_bodies_in_lanes_follow_the_viewer_with_speeds_of_their_own():
+    there = room("convoy_lanes")
+    moved = (there.true_poses.t - there.true_poses.t[:1]).norm(dim=-1)
+    lanes = (there.body_poses.t.unflatten(0, (8, 3)) - there.body_poses.t[:3]).norm(dim=-1)
+    assert (lanes[1:].amin(1) > 0.2 * moved[1:]).all() and (lanes[1:].amax(1) < 0.75 * moved[1:]).all()
+    home = [s.centre for s in guests.room_with_body(2, "parcels").solids.each if s.surface.kind == SURFACE_MOVING]
+    now = [s.centre for s in there.world(5).solids.each if s.surface.kind == SURFACE_MOVING]
+    shift = torch.tensor(now, dtype=torch.float64) - torch.tensor(home, dtype=torch.float64)
+    assert torch.allclose(shift, there.body_poses.t[[15, 16, 17, 15, 16]], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["convoy_oncoming", "convoy_uneven"])
+def test_the_share_of_a_convoy_varies_over_time(name):
+    there = room(name)
+    way, body = there.true_poses.t.diff(dim=0), there.body_poses.t.diff(dim=0)
+    share = (way * body).sum(-1) / way.square().sum(-1)
+    assert share.max() - share.min() > 0.5
+
+
+@pytest.mark.parametrize("name", TURNED_ROOMS)
+def test_a_hand_turns_the_camera_on_the_spot(name):
+    turned, turn = room(name), STRESSES[name].turn
+    T = [se3.relative(turned.true_poses[i : i + 1], turned.true_poses[7:8]) for i in range(7)]
+    angle = se3.rotation_angle(T[0].R).rad2deg().item()
+    assert 5 <= turn.degrees <= 40 and 0.8 * turn.degrees < angle < 1.2 * turn.degrees
+    assert 0.5 * turn.reach_m < max(x.t.norm().item() for x in T) < 1.2 * turn.reach_m <= 0.036
+    gains = [turned.gain(i) for i in range(8)]
+    assert max(gains) / min(gains) > 1.3
+
+
+def test_a_turned_picture_is_smeared_and_its_depth_is_not():
+    turned = room("rotation_hand_30", hw=(48, 64))
+    still = SyntheticRoom(**SMALL | {"hw": (48, 64)}, true_poses=turned.true_poses)
+    sharp = still._photograph(4, turned.camera, turned.true_poses[4:5], (48, 64), exposure=turned.gain(4))
+    edges = [(x.diff(dim=-1).abs().mean()) for x in (turned._picture(4), sharp)]
+    assert edges[0] < 0.9 * edges[1]
+    depth = guests.room_with_body(2, "parcels").solids.view(turned.camera, turned.true_poses[4:5], (48, 64))[0]
+    assert torch.equal(turned.truth(4)["depth"].flatten(), depth)
 
 
 def test_a_moving_body_is_counted_apart():
