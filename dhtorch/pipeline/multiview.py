@@ -89,10 +89,12 @@ def estimate_multiview(
     traces = estimate_views(choice.index)
     if choice.reserve is not None and len(choice.reserve) and bool(_is_mute(traces).any()):
         traces, choice = _replace_mute_views(traces, estimate_views(choice.reserve), choice, choice.reserve)
+    start_time = time.perf_counter()
+    traces = _verify_views(method, samples, traces)
     if samples.uv.shape[1] > n:
         samples = without_added(samples, n)
         traces = [_without_added(t, n) for t in traces]
-    last, start_time = traces[-1], time.perf_counter()
+    last = traces[-1]
     estimate = method.fuse(stack([t["estimate"] for t in traces]))
     estimate = method.score(estimate, samples, last["tracks_ideal"], last["fit"])
     ms["fuse"] = 1e3 * (time.perf_counter() - start_time)
@@ -106,6 +108,15 @@ def _without_added(trace: Trace, n: int) -> Trace:
     fit: PoseFit = trace["fit"]
     records = {name: without_added(trace[name], n) for name in ("samples", "tracks", "tracks_ideal", "estimate")}
     return {**trace, **records, "fit": fit.replace(inlier=fit.inlier[:, :n])}
+
+
+def _verify_views(method: MethodSpec, samples: Samples, traces: list[Trace]) -> list[Trace]:
+    """The traces with the estimates that ``method.verify_views`` makes of all views' together."""
+    if method.verify_views is None:
+        return traces
+    inputs = (stack([t[name] for t in traces]) for name in ("tracks_ideal", "fit", "estimate"))
+    verified = method.verify_views(samples, *inputs)
+    return [{**t, "estimate": verified[k]} for k, t in enumerate(traces)]
 
 
 def _is_mute(traces: Sequence[Trace]) -> Tensor:

@@ -16,7 +16,7 @@ from dhtorch.geometry.checks import all_finite, any_possible, check, is_transfor
 from dhtorch.geometry.linalg import small_matmul
 from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline.spec import MethodSpec, Trace
-from dhtorch.pytree import R, chunked_apply
+from dhtorch.pytree import R, chunked_apply, stack
 from dhtorch.records import (
     NO_HINT,
     Camera,
@@ -90,6 +90,8 @@ def estimate_pair(
     estimate, usable, solved = solve_pose_and_triangulate(
         method, samples, tracks, *cameras, seed=seed, fit=fit, clock=clock
     )
+    if method.verify_views is not None:
+        estimate = method.verify_views(samples, *(stack([x]) for x in (usable, solved, estimate)))[0]
     if samples.uv.shape[1] > n:
         samples = without_added(samples, n)
         tracks = without_added(tracks, n)

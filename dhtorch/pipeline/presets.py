@@ -15,6 +15,7 @@ from dhtorch.stages.kornia.track import lucas_kanade_kornia
 from dhtorch.stages.kornia.triangulate import two_view_kornia
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.score import confidence_from_error, confidence_from_sigma
+from dhtorch.stages.shared_error import verify_views
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.track_chain import track_chain
 from dhtorch.stages.triangulate import two_view
@@ -75,6 +76,7 @@ AUTO = MAP.replace(
         lucas_kanade_affine, levels=MAP_PYRAMID_LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="bias")
     ),
     triangulate={"max_sigma_rel": 1.0, "max_far_noise": 0.0025, "max_in_reach": 0.18},
+    verify_views=verify_views,
     fuse=partial(fuse_consistent, max_static_ratio=0.7),
     score=confidence_from_sigma,
     select_views=select_views_by_preview,

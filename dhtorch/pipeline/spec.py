@@ -66,6 +66,7 @@ class MethodSpec:
     verify: Callable[..., PoseFit] | None = reject_misaligned  # (samples, tracks, fit, camera_0, camera_1)
     triangulate: Callable[..., Estimate] = two_view  # (samples, tracks, fit, camera_0, camera_1)
     score: Callable[..., Estimate] = confidence  # (estimate, samples, tracks, fit)
+    verify_views: Callable[..., Estimate] | None = None  # (samples, tracks, fits, estimates (V, B, N)) -> estimates
     fuse: Callable[..., Estimate] = inverse_variance  # (estimates (V, B, N)); called with several views only
     select_views: Callable[..., Tensor | ViewSelection] | None = (
         None  # (reference, others, views, *, fit) -> (views, B)

@@ -119,6 +119,7 @@ MAP_1 = Method(
         recalibration=None,
         min_score=0.0,
     ),
+    verify_views=None,
     fuse=partial(
         inverse_variance,
         min_views=2,
