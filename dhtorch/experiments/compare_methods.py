@@ -8,7 +8,7 @@ evaluated on that one, with the seeds of a scene pooled and every scene of the s
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -267,6 +267,35 @@ def evaluate_promises(
     for name, scenes in (("ece", calibrated), ("ece_sigmoid", sigmoid), ("ece_raw", pooled)):
         numbers[name] = reliability.ece_interval([scenes[s] for s in calibrated], draws=draws, seed=seed)
     return numbers
+
+
+def rotation_answered(
+    rows: Sequence[Mapping[str, Any]], variants: Collection[str], cohort: str = "full"
+) -> dict[str, Any]:
+    """``<first variant>.rotation_answered``: fraction of the samples or pixels without a return that are answered where
+    the camera only turns, pooled over such scenes and the variants, which are the seeds of a method."""
+    rotations = {row["scene"] for row in rows if row.get("role") == "rotation"}
+    pairs = [
+        row
+        for row in rows
+        if row["scene"] in rotations
+        and row["pair"] is not None
+        and row["method"] in variants
+        and row["truth"] == cohort
+    ]
+    holes = sum(row["n_holes"] for row in pairs)
+    answered = sum(row["n_recovered"] for row in pairs) / holes if holes else None
+    return {f"{next(iter(variants))}.rotation_answered": bootstrap.without_interval(answered, len(rotations))}
+
+
+def worst_wrong_share(name: str, scenes: Sequence[Sequence[Points]]) -> dict[str, Any]:
+    """``<name>.convoy_wrong``: largest fraction over scenes of candidates that are answered and wrong; seeds of a scene
+    are pooled. Empty without a candidate."""
+    pooled = [points for points in map(pytree.collate, scenes) if points.keep.numel()]
+    if not pooled:
+        return {}
+    ratios = [float((points.keep & (points.error > errors.GROSS_ERROR_REL)).double().mean()) for points in pooled]
+    return {f"{name}.convoy_wrong": bootstrap.without_interval(max(ratios), len(ratios))}
 
 
 def complete_scenes(

@@ -89,9 +89,9 @@ def candidates(answered, wrong, silent):
 def test_the_worst_room_is_the_one_with_most_wrong_answers_a_candidate():
     few = [candidates(0, 1, 9), candidates(0, 3, 7)]  # all that is said is wrong, but little is said
     many = [candidates(5, 4, 1), candidates(7, 2, 1)]
-    found = method_comparison._worst_wrong_share("map", [few, many, [candidates(0, 0, 0)]])
+    found = compare.worst_wrong_share("map", [few, many, [candidates(0, 0, 0)]])
     assert found["map.convoy_wrong"]["value"] == pytest.approx(0.3) and found["map.convoy_wrong"]["n"] == 2
-    assert method_comparison._worst_wrong_share("map", []) == {}
+    assert compare.worst_wrong_share("map", []) == {}
 
 
 def test_the_rooms_of_the_settings_are_those_in_which_a_body_moves():

@@ -53,7 +53,8 @@ DENSE_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
     "dense.within_sigma": (0.68, lambda value, bar: abs(value - bar) <= 0.07),
     "dense.within_2sigma": (0.90, lambda value, bar: value >= bar),
     "dense.error_ratio_to_sgbm": (1.0, lambda value, bar: value <= bar),
-    "dense.rotation_answered": (0.005, lambda value, bar: value <= bar),
+    "dense.rotation_answered": (0.003, lambda value, bar: value <= bar),
+    "dense.convoy_wrong": (0.01, lambda value, bar: value <= bar),
     "dense.wrong_share": (0.05, lambda value, bar: value <= bar),
     "dense.room_within_1": (0.90, lambda value, bar: value >= bar),
 }
@@ -157,6 +158,7 @@ def run(
     peers: bool = True,
     indoor: Sequence[str] = (),
     rotations: Sequence[SceneLike] = (),
+    convoys: Sequence[SceneLike] = (),
     rooms: Sequence[int] = (0, 1, 2),
     progress: Progress = protocol.no_progress,
 ) -> Outcome:
@@ -170,7 +172,8 @@ def run(
     ``dense.pixels_at_5_indoor`` (on all pixels), ``dense.ause_ratio`` (median over scenes), ``dense.within_sigma`` and
     the other numbers of :func:`dhtorch.experiments.compare_methods.evaluate_promises`, ``dense.wrong_share`` (mean over
     scenes), ``dense.error_ratio_to_sgbm`` (one source view each, rectifiable pairs, equal coverage; geometric mean),
-    ``dense.error_ratio_to_<peer>`` likewise, ``dense.rotation_answered`` and ``dense.room_within_1``.
+    ``dense.error_ratio_to_<peer>`` likewise, ``dense.rotation_answered``, ``dense.convoy_wrong`` (largest fraction of
+    the candidates of a scene with the role ``moving`` that are answered and wrong) and ``dense.room_within_1``.
 
     Args:
         scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`; of ``pairs``
@@ -182,6 +185,7 @@ def run(
         peers: run the baselines as well.
         indoor: rooms over which the coverages at 5 % are averaged.
         rotations: further scenes in which the camera only turns.
+        convoys: further scenes in which near objects move.
         rooms: seeds of built-in rooms with exact depth and poses.
 
     Raises:
@@ -191,12 +195,13 @@ def run(
     sparse = method or next(iter(chosen.values()))
     options = dict(sweep or {})
     all_scenes = list(scenes_of(scenes))
-    all_scenes += [scene for scene in scenes_of(rotations) if scene.name not in {listed.name for listed in all_scenes}]
+    for scene in (*scenes_of(rotations), *scenes_of(convoys)):
+        all_scenes += [scene] if scene.name not in {listed.name for listed in all_scenes} else []
     cache = SweepCache(options, stride)
     variants = _variants(sparse, cache, settings.seed, peers)
     spread = partial(protocol.spread_pairs, pairs, reference_views)
     parts = []
-    for is_rotation in (False, True):
+    for is_rotation in (False, True):  # also rotations without a candidate count
         selected = [scene for scene in all_scenes if (scene.role == "rotation") == is_rotation]
         cohorts: dict[str, protocol.Cohort] = {
             _RECTIFIABLE: partial(_far_cohort, rectifiable_only=True),
@@ -208,7 +213,8 @@ def run(
         parts.append(protocol.run(selected, dense_protocol, spread, settings, progress=progress))
     outcome = join_outcomes(parts)
     outcome.summary |= _summary(outcome, {scene.name: scene.place for scene in all_scenes}, indoor, peers)
-    outcome.summary["dense.rotation_answered"] = rotation_answered(outcome)
+    outcome.summary |= compare.rotation_answered(outcome.rows, [DENSE_VARIANT])
+    outcome.summary |= compare.worst_wrong_share(DENSE_VARIANT, _moving_points(outcome))
     if rooms:
         outcome.summary |= share_within_1_percent(rooms, sparse, options)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, peers))
@@ -392,20 +398,14 @@ def _scene_points(outcome: Outcome, variant: str, cohort: str = FULL_COHORT) -> 
     }
 
 
-def rotation_answered(outcome: Outcome) -> Row:
-    """Fraction of pixels without a return that are answered under pure rotation, pooled over such scenes."""
-    rotations = {row["scene"] for row in outcome.rows if row.get("role") == "rotation"}
-    rotation_rows = [
-        row
-        for row in outcome.rows
-        if row["scene"] in rotations
-        and row["pair"] is not None
-        and (row["method"], row["truth"]) == (DENSE_VARIANT, FULL_COHORT)
+def _moving_points(outcome: Outcome) -> list[list[Points]]:
+    """Candidates of every scene in which near objects move."""
+    moving = {row["scene"] for row in outcome.rows if row.get("role") == "moving"}
+    return [
+        [points]
+        for (scene, *of), points in outcome.points.items()
+        if scene in moving and of == [DENSE_VARIANT, FULL_COHORT]
     ]
-    holes = sum(row["n_holes"] for row in rotation_rows)
-    return bootstrap.without_interval(
-        sum(row["n_recovered"] for row in rotation_rows) / holes if holes else None, len(rotations)
-    )
 
 
 def _interval_over(values: Sequence[float | None], statistic: str) -> Row:

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 
-from dhtorch import pytree
 from dhtorch.data.pairs import candidate_frames, to_fixed_pairs
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
@@ -22,7 +21,7 @@ from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import xfeat
 from dhtorch.experiments.protocol import Method, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
-from dhtorch.metrics import bootstrap, errors
+from dhtorch.metrics import bootstrap
 from dhtorch.metrics.errors import Points
 
 QUESTION = "Is the method more accurate than the paper's, and does it know what it does not know?"
@@ -86,6 +85,9 @@ def run(
         moving: rooms in which near objects move; their scenes, whatever their role, make ``<method>.convoy_wrong``,
             the largest fraction over scenes of candidates (all seeds) that are answered with an error above 20 %.
 
+    Scenes with the role ``rotation`` make ``<method>.rotation_answered``
+    (:func:`dhtorch.experiments.compare_methods.rotation_answered`).
+
     Raises:
         ValueError: no reference, or neither a method to compare with it nor a twin; else as the main job.
     """
@@ -109,6 +111,9 @@ def run(
     }
     complete = compare.complete_scenes(points_of, reference, fallback)
     comparison = compare.method_ratios(complete, reference=reference, rooms=rooms)
+    for name in (reference, *compared):
+        seeds_of = [seed_variant_name(name, k) for k in range(seeds)]
+        outcome.summary |= compare.rotation_answered(outcome.rows, seeds_of)
     keep_first_seed(outcome, methods, seeds)
     outcome.summary |= comparison.summary
     agreement: Row = {}
@@ -119,7 +124,9 @@ def run(
     outcome.summary |= agreement
     outcome.summary |= _indoor_coverage(comparison, rooms, indoor)
     for name, scene_points in all_points.items():
-        outcome.summary |= _worst_wrong_share(name, [p for scene, p in scene_points.items() if rooms[scene] in moving])
+        outcome.summary |= compare.worst_wrong_share(
+            name, [p for scene, p in scene_points.items() if rooms[scene] in moving]
+        )
     several = [name for name in compared if methods[name].views > 1]
     for name in (n for n in several if n != baseline and baseline in compared):
         numbers, by_scene = compare.multiview_ratios(complete[name], complete[baseline], baseline)
@@ -169,15 +176,6 @@ def _indoor_coverage(comparison: compare.MethodComparison, rooms: Mapping[str, s
         f"{name}.coverage_at_5_indoor": bootstrap.interval_over_scenes(values, statistic="mean").entry("1")
         for name, values in coverages.items()
     }
-
-
-def _worst_wrong_share(name: str, scenes: Sequence[Sequence[Points]]) -> Row:
-    """Largest fraction over scenes of candidates that are answered and wrong; seeds of a scene are pooled."""
-    pooled = [points for points in map(pytree.collate, scenes) if points.keep.numel()]
-    if not pooled:
-        return {}
-    ratios = [float((points.keep & (points.error > errors.GROSS_ERROR_REL)).double().mean()) for points in pooled]
-    return {f"{name}.convoy_wrong": bootstrap.without_interval(max(ratios), len(ratios))}
 
 
 def _make_variant(method: Method, seed: int, pairs: ScenePairs | None) -> Variant:
