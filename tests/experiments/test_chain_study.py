@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 from support.numbered_frames import MAP, NEAR, frame, scene, track
-from support.rooms import room, room_scene
+from support.rooms import room
 
 from dhtorch.data.pairs import Pair, by_choice, by_gap
 from dhtorch.data.rig import join_cameras
