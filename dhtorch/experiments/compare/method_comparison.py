@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
+from itertools import product
 
 from dhtorch.data.pairs import candidate_frames, to_fixed_pairs
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
@@ -58,7 +59,7 @@ def run(
     twins: Sequence[str] = ("kornia",),
     seeds: int = 5,
     stand_ins: Mapping[str, str] | None = None,
-    baseline: str = "window",
+    baselines: Sequence[str] = ("window",),
     indoor: Sequence[str] = (),
     moving: Sequence[str] = (),
     progress: Progress = protocol.no_progress,
@@ -80,7 +81,7 @@ def run(
             and ``<method>.error_ratio_to_<reference>``, geometric means over scenes.
         seeds: number of seeds, from the job's own upwards.
         stand_ins: method of several views → method of one; None = the first compared method for all.
-        baseline: the method of several views with which the others of several views are compared as well.
+        baselines: methods of several views with each of which the others of several views are compared as well.
         indoor: rooms whose scenes make the mean ``<method>.coverage_at_5_indoor``.
         moving: rooms in which near objects move; their scenes, whatever their role, make ``<method>.convoy_wrong``,
             the largest fraction over scenes of candidates (all seeds) that are answered with an error above 20 %.
@@ -128,7 +129,9 @@ def run(
             name, [p for scene, p in scene_points.items() if rooms[scene] in moving]
         )
     several = [name for name in compared if methods[name].views > 1]
-    for name in (n for n in several if n != baseline and baseline in compared):
+    for name, baseline in product((n for n in several if n not in baselines), baselines):
+        if baseline not in compared:
+            continue
         numbers, by_scene = compare.multiview_ratios(complete[name], complete[baseline], baseline)
         outcome.summary |= {f"{name}.{k}": v.entry("1") for k, v in numbers.items()}
         for scene, row in outcome.scenes(name).items():
