@@ -109,6 +109,26 @@ def twin() -> str:
     return table(["scene", "candidates", "coverage, `paper` / `kornia`", "median error", "time, ratio"], rows)
 
 
+def chained() -> str:
+    """Methods with tracks through the frames between and without: scene by scene, and their ratios."""
+    names = ("paper_direct", "paper", "kornia", "map", "map_chain")
+    rows = []
+    for scene, methods in scenes("track_chain", "full").items():
+        pairs = [f"{percent(methods[m]['coverage'])}, {percent(methods[m]['median_rel'])}" for m in names]
+        rows.append([scene, str(methods["paper"]["n_candidates"]), *pairs])
+    summary = json.loads((RESULTS / "track_chain.json").read_text())["summary"]
+    medians = [[summary[f"{m}.{key}"]["value"] for key in ("coverage", "median_rel", "p90_rel")] for m in names]
+    rows.append(["median over scenes", "", *(f"{percent(c)}, {percent(e)}" for c, e, _ in medians)])
+    rows.append(["90th percentile of the error, median", "", *(percent(p) for _, _, p in medians)])
+    for ours, other in (("paper", "paper_direct"), ("map_chain", "map"), ("kornia", "paper")):
+        values = [
+            number(summary[f"{ours}.{k}_ratio_to_{other}"]["value"]) for k in ("coverage", "error", "equal_error")
+        ]
+        cells = [", ".join(values) if name == ours else "" for name in names]
+        rows.append([f"`{ours}` / `{other}`: coverage, error, error at equal coverage", "", *cells])
+    return table(["scene", "candidates", *(f"`{name}`" for name in names)], rows)
+
+
 def truths() -> str:
     """What the truth test changes: medians over scenes."""
     summary = json.loads((RESULTS / "shared_scenes.json").read_text())["summary"]
@@ -562,7 +582,7 @@ def client(name: str) -> str:
 
 TABLES = {"room": room, "room seeds": room_by_seed, "shared": shared, "truths": truths, "comparison": comparison}
 TABLES |= {"comparison scenes": partial(by_scene, "method_comparison"), "stress": partial(by_scene, "stress")}
-TABLES |= {"kornia twin": twin}
+TABLES |= {"kornia twin": twin, "track chain": chained}
 TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams"), "beside chosen": beside_chosen}
 TABLES |= {
     "validate": validated,

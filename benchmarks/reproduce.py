@@ -32,6 +32,7 @@ EXPERIMENTS = {
     "method_comparison": "experiment=method_comparison data=shared_scenes",
     "kornia_twin": "experiment=method_comparison data=shared_scenes experiment.seeds=1 ~experiment.methods.opencv "
     "~experiment.methods.xfeat ~experiment.methods.map ~experiment.methods.window ~experiment.methods.auto",
+    "track_chain": "experiment=chain_study data=shared_scenes pairs.stride=12",
     "streams": "experiment=method_comparison data=streams",
     "part_ablation": "experiment=part_ablation data=shared_scenes",
     "part_ablation_auto": "experiment=part_ablation data=shared_scenes experiment.groups=[auto] experiment.seeds=1",
@@ -136,11 +137,42 @@ NAMED = {
 NAMED |= {f"{name}_{how}": NAMED.get(name, name) for how, names in AGAIN.items() for name in names}
 
 #: Options that change no number of the archived results, and which a file may hold otherwise: ``verify`` silences only
-#: pairs whose depth belongs to other pixels, and the corrections of a capture are unset.
-ASIDE = {"figures", "traceback", "root", "verify", "depth_unit", "depth_lag", "depth_turn", "pose_convention"}
+#: pairs whose depth belongs to other pixels, the corrections of a capture are unset, and images ``between`` are nothing
+#: to a tracker that has no option of that name.
+ASIDE = {
+    "figures",
+    "traceback",
+    "root",
+    "verify",
+    "depth_unit",
+    "depth_lag",
+    "depth_turn",
+    "pose_convention",
+    "between",
+}
 
 #: Files that were made with other settings than today's, and wait for a quiet machine.
 OUTDATED: set[str] = {"part_ablation", "method_comparison", "streams", "stress"}
+#: Those in which ``paper``, ``paper_dlt`` or ``kornia`` still jumps from view to view.
+OUTDATED |= {
+    "ablation",
+    "calibration",
+    "device_pose",
+    "gate_ablation",
+    "heldout",
+    "hole_census",
+    "kornia_twin",
+    "latency",
+}
+OUTDATED |= {"motion", "part_ablation_auto", "paths_motion", "range_split", "room_device_pose", "room_exact"}
+OUTDATED |= {
+    "room_gate_ablation",
+    "room_phone",
+    "room_range_split",
+    "room_real_holes",
+    "room_rotation",
+    "shared_scenes",
+}
 
 
 def command(name: str) -> str:

@@ -30,12 +30,12 @@ def test_a_result_was_made_with_the_settings_that_its_command_has_today(name):
 
 
 def test_another_setting_is_seen(tmp_path, monkeypatch):
-    result = result_files.read_result(REPO / "benchmarks/results/hole_census.json")
-    result["config"]["experiment"]["stride"] = 1
-    (tmp_path / "hole_census.json").write_text(json.dumps(result))
+    result = result_files.read_result(REPO / "benchmarks/results/views_study.json")
+    result["config"]["experiment"]["reference_views"] = 1
+    (tmp_path / "views_study.json").write_text(json.dumps(result))
     monkeypatch.setattr(reproduce, "RESULTS", tmp_path)
-    (line,) = reproduce.check("hole_census")
-    assert "experiment.stride: found 1, expected 4" in line and "experiment.stride=4" in line
+    (line,) = reproduce.check("views_study")
+    assert "experiment.reference_views: found 1, expected 3" in line and "experiment.reference_views=3" in line
     (line,) = reproduce.check("icp")
     assert "no icp.json" in line
 

@@ -155,7 +155,8 @@ def stand_in(calls=None, hop_shift=None, lost=(), unregistered=(), round_trip=0.
             calls.append((j, k, uv_0.clone(), hint))
         cov = 0.01 * (1 + abs(k - j)) * torch.eye(2).expand(*valid.shape, 2, 2)
         error = torch.full_like(uv_0[..., 0], round_trip)
-        return Tracks(uv_0, uv_1, error, error + k, cov, valid)
+        photometric = error + k + (0.1 if j else 0.0)
+        return Tracks(uv_0, uv_1, error, photometric, cov, valid)
 
     return track
 
@@ -173,7 +174,7 @@ def test_covariance_and_error_are_the_registrations_or_sums():
     torch.testing.assert_close(chain.cov[0, 2], 0.05 * torch.eye(2))  # one track over four images
     torch.testing.assert_close(chain.cov[0, 1], (0.03 + 0.02 + 0.02) * torch.eye(2))  # registered in 2, then two hops
     torch.testing.assert_close(chain.error[0], torch.tensor([0.1, 0.3, 0.1]))
-    torch.testing.assert_close(chain.photometric[0], torch.tensor([4.1, 4.1, 4.1]))
+    torch.testing.assert_close(chain.photometric[0], torch.tensor([4.1, 4.2, 4.1]))  # of a registration or a hop
 
 
 def test_a_wrong_hop_is_put_right_or_removed():
