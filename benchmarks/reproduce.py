@@ -175,6 +175,15 @@ OUTDATED |= {
 }
 
 
+#: Files with the settings of today that were made before their range-split candidates had to be masked returns of the
+#: sensor: on independent truth (built-in rooms) real holes are among their candidates, on sparse maps (driving scenes)
+#: 6 of 330 samples with a near return in reach. They wait for a quiet machine.
+UNMASKED_CANDIDATES: set[str] = {
+    *("ablation", "dense", "dense_streams", "kornia_twin", "learned_confidence", "learned_score", "part_ablation_auto"),
+    *("sweep", "views_study"),
+}
+
+
 def command(name: str) -> str:
     """What a shell is told to make a result file."""
     if name in EXPERIMENTS:

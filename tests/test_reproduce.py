@@ -29,6 +29,25 @@ def test_a_result_was_made_with_the_settings_that_its_command_has_today(name):
     assert (reproduce.check(name) == []) == (name not in reproduce.OUTDATED)
 
 
+@pytest.mark.parametrize("name", sorted(reproduce.EXPERIMENTS))
+def test_candidates_of_a_result_are_masked_returns_or_it_is_listed(name):
+    """A range split that counts real holes apart says so in every row of a scene that has candidates."""
+    rows = result_files.read_result(REPO / f"benchmarks/results/{name}.json")["rows"]
+    split = [r for r in rows if r["pair"] is None and r.get("truth") in ("raw", "5x5", "full") and "n_dropped" in r]
+    is_listed = name in reproduce.UNMASKED_CANDIDATES | reproduce.OUTDATED
+    assert is_listed == (bool(split) and not all("n_real_holes" in row for row in split))
+
+
+def test_no_result_has_a_sigma_of_a_method_that_states_none():
+    result = result_files.read_result(REPO / "benchmarks/results/method_comparison.json")
+    blank = ("within_sigma", "within_2sigma", "ece", "ece_equal_mass")
+    rows = [row for row in result["rows"] if row["pair"] is None]
+    for method, states in (("paper", False), ("opencv", False), ("map", True), ("auto", True)):
+        numbers = [row.get(key) for row in rows if row["method"] == method for key in blank]
+        assert any(value is not None for value in numbers) == states, method
+        assert (result["summary"][f"{method}.within_sigma"]["value"] is not None) == states, method
+
+
 def test_another_setting_is_seen(tmp_path, monkeypatch):
     result = result_files.read_result(REPO / "benchmarks/results/views_study.json")
     result["config"]["experiment"]["reference_views"] = 1

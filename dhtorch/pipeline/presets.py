@@ -20,7 +20,8 @@ from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.track_chain import track_chain
 from dhtorch.stages.triangulate import two_view
 
-#: The paper's method and parameters; the one difference is P3P instead of EPnP as the minimal solver. Tracks go through
+#: The paper's method. Its text fixes the order of the stages and the two gates; numbers, score formula and minimal
+#: solver that it leaves open were chosen here, and are listed in docs/methods.md, "What `paper` is". Tracks go through
 #: the images between the two views where the hint has them.
 PAPER = Method()
 

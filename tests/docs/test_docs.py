@@ -10,6 +10,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
+import yaml
 
 from dhtorch import data
 from dhtorch.experiments.report import layouts
@@ -178,6 +179,22 @@ def test_the_examples_run(page, capsys, monkeypatch):
         assert float((tracked.depth / names["estimate"].depth - 1).abs()[both].median()) < 0.1, "the half-size tracker"
     else:
         assert "torch.Size([80, 10])" in capsys.readouterr().out and names["more"]["task"] == "pick up the cup"
+
+
+def test_what_paper_is_has_the_values_of_its_settings():
+    """Each option in the table on the method ``paper`` has the value of ``conf/method/paper.yaml``."""
+    text = (DOCS / "methods.md").read_text(encoding="utf-8")
+    part = text[text.index("### What `paper` is") : text.index("### A learned tracker")]
+    rows = re.findall(r"^\| `([\w.]+)` \| .*? \| `([^`]+)` \| .+ \|$", part, re.M)
+    settings = yaml.safe_load((REPO / "conf/method/paper.yaml").read_text(encoding="utf-8"))
+    for name, told in rows:
+        value = settings
+        for key in name.split("."):
+            value = value[key]
+        value = value["_target_"].rpartition(".")[2] if isinstance(value, dict) else value
+        assert value == yaml.safe_load(told), name
+    assert len(rows) == len(re.findall(r"^\| `", part, re.M)) > 20
+    assert {"n", "hypotheses", "track.window", "track.levels", "score"} <= {name for name, _ in rows}
 
 
 def test_options_that_the_pages_name_exist():

@@ -232,13 +232,14 @@ def test_ours_stands_beside_the_papers_line():
     assert main.flat_head() == [
         "",
         "scenes",
+        "truth kept",
         *(f"{m}, {who}" for m in ("coverage", "corr", "median", "p90") for who in ("ours", "published")),
     ]
     assert [row[0] for row in main.rows] == list(published.RANGE_SPLIT.lines), "the paper's lines in the paper's order"
     gated = main.rows[4]
     ours = archived.range_split()["summary"]["gated.coverage"]["value"]
-    assert gated[2:4] == [f"{100 * ours:.1f} %", "64.2 %"] and gated[1] == "2"
-    assert main.rows[0][2:6] == ["0 %", "0.0 %", "–", "–"], "silent, not missing"
+    assert gated[3:5] == [f"{100 * ours:.1f} %", "64.2 %"] and gated[1] == "2"
+    assert main.rows[0][3:7] == ["0 %", "0.0 %", "–", "–"], "silent, not missing"
     assert [row[0] for row in cutoffs.rows] == [
         "gated, cutoff x0.75 (published: 1.5 m)",
         "gated (published: 2.0 m)",
@@ -305,7 +306,7 @@ def test_what_was_not_measured_says_why():
     )
     result = archived.result("range_split", rows)
     main = layouts.layout_tables(result)[0]
-    cells = {row[0]: row[2::2] for row in main.rows}
+    cells = {row[0]: row[3::2] for row in main.rows}
     assert cells["gated"] == ["too short"] * 4 and cells["device pose (raw)"] == ["no device trajectory"] * 4
     assert cells["no gates"] == ["not run"] * 4
     by_scene = next(t for t in report.tables(result) if "pairs" in t.head)
@@ -333,7 +334,7 @@ def test_the_cohort_that_the_summary_leaves_unnamed_decides():
     assert "heldout" in held.title and held.quoted == 2 and "full" in split.title and split.quoted == 0
     result["summary"]["paper.heldout.ece"]["value"], result["summary"]["paper.ece"]["value"] = 0.111, 0.222
     held, split, steps = layouts.layout_tables(result)[:3]
-    assert held.rows[0][2] == "0.111" and split.rows[0][2] == "0.222"
+    assert held.rows[0][3] == "0.111" and split.rows[0][3] == "0.222"
     assert [row[0] for row in steps.rows] == ["0", "0.1", "0.3", "0.5"]
     assert [steps.rows[2][k] for k in (2, 4)] == ["34.3 %", "9.5 %"]
 

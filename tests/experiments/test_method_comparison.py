@@ -50,6 +50,8 @@ def test_summary_has_every_number_of_the_bars(outcome):
     assert "strict.median_rel_ratio_at_equal_coverage" in outcome.summary
     assert outcome.summary["strict.median_rel_ratio"]["n"] == 2, "the rotation stays out"
     assert outcome.verdict == "refuted" and "bars met" in outcome.why
+    assert outcome.why.endswith("strict states no sigma") or "strict states no sigma;" in outcome.why
+    assert outcome.summary["strict.within_sigma"]["value"] is None and "strict.within" not in outcome.why
     ratios = [outcome.scenes("strict")[s]["against_paper"]["median_rel_ratio"] for s in outcome.scenes("strict")]
     assert outcome.summary["strict.median_rel_ratio"]["value"] == pytest.approx((ratios[0] * ratios[1]) ** 0.5)
 

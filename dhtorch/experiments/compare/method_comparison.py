@@ -43,6 +43,9 @@ METHOD_BARS: dict[str, tuple[float, float, Callable[[float, float], bool]]] = {
     "realised_risk_5": (0.05, 0.05, lambda value, bar: value <= bar),
 }
 
+#: Numbers that only a method which states a sigma has.
+_SIGMA_NUMBERS = ("within_sigma", "within_2sigma")
+
 #: Number of a twin → the interval in which its ratio to the reference must lie.
 TWIN_BARS = {"coverage_ratio": (0.9, 1.1), "error_ratio": (0.9, 1.15)}
 
@@ -137,15 +140,21 @@ def run(
         for scene, row in outcome.scenes(name).items():
             row.update(by_scene.get(scene, {}))  # none where there were too few candidates
     _add_to_scene_rows(outcome.rows, comparison.rows, f"against_{reference}")
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(comparison, compared, set(several), agreement))
+    without_sigma = {name for name in compared if not methods[name].states_sigma}
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(comparison, compared, set(several), agreement, without_sigma))
 
 
 def verdict(
-    comparison: compare.MethodComparison, compared: Sequence[str], several: set[str], agreement: Row | None = None
+    comparison: compare.MethodComparison,
+    compared: Sequence[str],
+    several: set[str],
+    agreement: Row | None = None,
+    without_sigma: Collection[str] = (),
 ) -> tuple[bool | None, str]:
     """(all bars met, or None if a number is undefined; bars that are missed, scenes without a ratio or an answer).
 
-    ``agreement``: ``<twin>.<number>_to_<reference>`` → entry of the summary.
+    ``agreement``: ``<twin>.<number>_to_<reference>`` → entry of the summary. ``without_sigma``: methods that state none
+    and have no bars of it.
     """
     missed, n_met = [], 0
     for name, entry in (agreement or {}).items():
@@ -156,6 +165,8 @@ def verdict(
         missed += [] if low <= entry["value"] <= high else [f"{name} {entry['value']:.3f} (bars {low:g}, {high:g})"]
     for method in compared:
         for number, (two_view_bar, multi_view_bar, holds) in METHOD_BARS.items():
+            if method in without_sigma and number in _SIGMA_NUMBERS:
+                continue
             value, bar = (
                 comparison.summary.get(f"{method}.{number}", {}).get("value"),
                 multi_view_bar if method in several else two_view_bar,
@@ -165,6 +176,7 @@ def verdict(
             n_met += holds(value, bar)
             missed += [] if holds(value, bar) else [f"{method}.{number} {value:.3f} (bar {bar:g})"]
     notes = [f"{m} without ratio: {', '.join(scenes)}" for m, scenes in comparison.left_out.items() if scenes]
+    notes += [f"{m} states no sigma" for m in without_sigma]
     notes += [f"{m} % risk: no answer on {', '.join(scenes)}" for m, scenes in comparison.unanswered.items() if scenes]
     return not missed, "; ".join([f"{n_met} of {n_met + len(missed)} bars met", *missed, *notes])
 
