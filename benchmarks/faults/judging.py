@@ -153,7 +153,10 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "metrics.holdout": [
         ("_MAX_CLOSE_SPREAD", "0.15", "0.2"),
         ("TruthCode", "CLOSE = 3", "CLOSE = 4"),
-        ("Truth.dropped", "code > TruthCode.NEAR", "code >= TruthCode.NEAR"),
+        ("_REJECTING_RULES", "TruthCode.EXCLUDED, TruthCode.TEXTURE", "TruthCode.EXCLUDED, TruthCode.REAL_HOLE"),
+        ("require_masked", "counted & (full <= 0)", "full <= 0"),
+        ("require_masked", "counted & (masked > 0), TruthCode.NEAR", "counted & (masked < 0), TruthCode.NEAR"),
+        ("truth_kept_ratio", 'n_dropped["close"] + n_dropped["wide"]', 'n_dropped["wide"]'),
         ("range_split", "frame.depth > cutoff", "frame.depth >= cutoff"),
         ("split_half", "draw < share", "draw > share"),
         ("split_half", "samples.trackability >= min_trackability", "samples.trackability > min_trackability"),

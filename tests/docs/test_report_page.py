@@ -255,6 +255,26 @@ def test_ours_stands_beside_the_papers_line():
     ]
 
 
+def test_the_comparison_says_what_paper_is_and_leaves_its_sigma_blank():
+    result = result_files.read_result(REPO / "benchmarks/results/method_comparison.json")
+    (table,) = layouts.layout_tables(result)
+    rows = {row[0]: dict(zip(table.head, row, strict=True)) for row in table.rows}
+    heads = [cells.metric_heading(m) for m in ("within_sigma", "within_2sigma", "ece")]
+    assert all(rows[name][head] == cells.EMPTY_CELL for name in ("paper", "opencv") for head in heads)
+    assert all(rows["auto"][head] != cells.EMPTY_CELL for head in heads)
+    assert [row[0] for row in table.rows][:2] == ["paper", "opencv"] and "minimal solver" in table.note
+
+
+def test_real_holes_beyond_the_cutoff_have_a_table_of_their_own():
+    result = result_files.read_result(REPO / "benchmarks/results/room_range_split.json")
+    main, holes, _ = layouts.layout_tables(result)
+    assert holes.title.startswith("Beyond the cutoff where the sensor has no return") and len(holes.rows) == 5
+    rows = [r for r in result["rows"] if r["pair"] is None and r["truth"] == "real_holes" and r["method"] == "gated"]
+    gated = dict(zip(holes.head, holes.rows[-1], strict=True))
+    assert gated["candidates"] == f"{sum(r['n_candidates'] for r in rows):,}"
+    assert main.flat_head()[2] == "truth kept" and main.rows[0][3] == "0 %", "the sensor alone answers nothing"
+
+
 def test_negative_results_stand_beside_the_papers_figure():
     """Ours from the committed files, not copied here: the cell beside the paper's is the summary's number."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 from dhtorch.experiments.report import negatives, probes, published, timings
 from dhtorch.experiments.report.cells import EMPTY_CELL, format_value, metric_heading
@@ -26,6 +27,13 @@ from dhtorch.experiments.report.tables import (
     published_source,
     scene_table,
     variant_table,
+)
+
+#: What the method of the paper is here, and why some of its cells are blank.
+_COMPARISON_NOTE = (
+    "paper: what its text leaves open (samples, window, levels, hypotheses, minimal solver, score formula) was chosen "
+    "here, see docs/methods.md; opencv: the same stages of OpenCV. Cells of a sigma or a probability are blank for "
+    "methods that state none."
 )
 
 _CUTOFF_PATTERN = r"(?:gated,? )?cutoff .*"
@@ -238,7 +246,8 @@ def _comparison(result: Result) -> list[ReportTable]:
     columns = ["coverage", "median_rel", "median_rel_ratio", "worst_scene_ratio", "aurc", "aurc_ratio", "coverage_at_5"]
     columns += ["within_sigma", "within_2sigma", "ece", "realised_risk_5", "realised_risk_10"]
     measured = [m for m in columns if any(summary_entry(result, v, m) for v in variant_names(result))]
-    return [variant_table(result, "Methods, over scenes", ["n_scenes", *measured])]
+    table = variant_table(result, "Methods, over scenes", ["n_scenes", *measured])
+    return [replace(table, note=_COMPARISON_NOTE)]
 
 
 def _part_ablation(result: Result) -> list[ReportTable]:
