@@ -194,7 +194,7 @@ def test_what_paper_is_has_the_values_of_its_settings():
         value = value["_target_"].rpartition(".")[2] if isinstance(value, dict) else value
         assert value == yaml.safe_load(told), name
     assert len(rows) == len(re.findall(r"^\| `", part, re.M)) > 20
-    assert {"n", "hypotheses", "track.window", "track.levels", "score"} <= {name for name, _ in rows}
+    assert {"n", "hypotheses", "track.track.window", "track.track.levels", "score"} <= {name for name, _ in rows}
 
 
 def test_options_that_the_pages_name_exist():
