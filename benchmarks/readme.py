@@ -652,7 +652,7 @@ PIXELS = {
     "dense.error_ratio_to_sgbm_own_calibration": ("the same, SGBM under the data set's own calibration", ""),
     "dense.error_ratio_to_dis_flow": ("the same, DIS flow triangulated", ""),
     "dense.error_ratio_to_bilateral": ("the same, the sensor filled by a joint bilateral filter", ""),
-    "dense.rotation_answered": ("pixels answered where the camera only turns", "≤ 0.005"),
+    "dense.rotation_answered": ("pixels answered where the camera only turns", "≤ 0.003"),
     "dense.room_within_1": ("built-in rooms, exact motion: answered pixels within 1 %", "≥ 0.90"),
     "dense.room_within_1_of_all": ("the same of all that was asked, silence counted as a miss", ""),
 }

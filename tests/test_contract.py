@@ -590,6 +590,7 @@ ELSEWHERE = {
     ),
     "dhtorch.stages.fuse.inverse_variance",
     "dhtorch.stages.fuse.fuse_consistent",
+    "dhtorch.stages.shared_error.verify_views",
     "dhtorch.geometry.free_space.free_space_violations",
     *(
         f"dhtorch.pipeline.view_selection.{name}"

@@ -7,10 +7,12 @@ from dhtorch import MAP
 from dhtorch.codes import Gate, Source
 from dhtorch.data.pairs import by_gap
 from dhtorch.data.scene import Scene
+from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments.baselines import filling, stereo
 from dhtorch.experiments.compare import dense_comparison, exact_rooms
 from dhtorch.experiments.protocol import Outcome, Settings
 from dhtorch.geometry import se3
+from dhtorch.metrics import errors
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
 from dhtorch.records import DepthMap
@@ -84,8 +86,27 @@ def test_a_turn_is_counted_by_its_holes():
     whole = {"scene": "carousel", "method": "dense", "truth": "full", "pair": None, "role": "rotation"}
     pairs = [whole | {"pair": [k, k + 1], "role": None, "n_holes": 100, "n_recovered": n} for k, n in ((0, 1), (1, 4))]
     others = [pairs[0] | {"method": "sgbm"}, pairs[0] | {"truth": "rectifiable"}, pairs[0] | {"scene": "hall"}]
-    found = dense_comparison.rotation_answered(Outcome(rows=[whole, *pairs, *others]))
+    (found,) = compare.rotation_answered([whole, *pairs, *others], ["dense"]).values()
     assert found["value"] == pytest.approx(5 / 200) and found["n"] == 1
+    both = compare.rotation_answered([whole, *pairs, *others], ["dense", "sgbm"])
+    assert both["dense.rotation_answered"]["value"] == pytest.approx(6 / 300), "seeds of a method are pooled"
+    assert compare.rotation_answered(pairs, ["dense"])["dense.rotation_answered"]["value"] is None
+
+
+def test_convoys_are_counted_by_their_role():
+    depth = torch.tensor([1.0] * 6 + [1.3] * 2 + [torch.nan] * 2)
+    points = errors.make_points(depth, torch.ones_like(depth))
+    names = [
+        ("cars", "dense", "full"),
+        ("cars", "sgbm", "full"),
+        ("cars", "dense", "rectifiable"),
+        ("hall", "dense", "full"),
+    ]
+    rows = [{"scene": "cars", "role": "moving"}, {"scene": "hall", "role": None}]
+    moving = dense_comparison._moving_points(Outcome(rows=rows, points=dict.fromkeys(names, points)))
+    assert len(moving) == 1 and moving[0][0] is points
+    found = compare.worst_wrong_share("dense", moving)["dense.convoy_wrong"]
+    assert found["value"] == pytest.approx(0.2) and found["n"] == 1
 
 
 def test_bars_are_held_one_by_one():

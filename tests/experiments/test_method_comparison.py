@@ -83,6 +83,14 @@ def test_wrong_answers_where_near_things_move_count_whatever_the_role(outcome):
     assert "opencv.convoy_wrong" not in outcome.summary
 
 
+def test_answers_where_the_camera_turns_are_counted_over_all_seeds(outcome):
+    rows = [r for r in outcome.rows if r["scene"] == "synthetic_rotation" and r["pair"] and r["method"] == "paper"]
+    found = outcome.summary["paper.rotation_answered"]
+    first = sum(r["n_recovered"] for r in rows) / sum(r["n_holes"] for r in rows)
+    assert found["n"] == 1 and found["value"] == pytest.approx(first, abs=0.05)
+    assert "opencv.rotation_answered" not in outcome.summary
+
+
 def candidates(answered, wrong, silent):
     depth = torch.tensor([1.0] * answered + [1.3] * wrong + [torch.nan] * silent)
     return errors.make_points(depth, torch.ones_like(depth))
