@@ -70,9 +70,9 @@ MAP = PAPER.replace(
 WINDOW = MAP.replace(views=5)
 
 #: Source views are selected among those around the reference view; tracks start at the coarse flow of the whole image,
-#: whatever the exposures. An answer needs consistent views or one with a small sigma, and near returns that far points
-#: do not contradict, and poses without an error that all points of a view share. Single views may be uncertain: the
-#: sigma of the fused estimate counts.
+#: whatever the exposures. An answer needs consistent views or one with a small sigma, near returns that far points do
+#: not contradict, and poses without a large error that all points share. Single views may be uncertain: the sigma of
+#: the fused estimate counts.
 AUTO = MAP.replace(
     track=partial(
         lucas_kanade_affine, levels=MAP_PYRAMID_LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="bias")
