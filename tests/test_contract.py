@@ -582,6 +582,8 @@ ELSEWHERE = {
             "without_added",
             "track_in_chunks",
             "solve_pose_and_triangulate",
+            "solve_pairs",
+            "repeat_views",
             "merge",
             "upcast_intrinsics",
             "undistort_tracks",
@@ -594,10 +596,17 @@ ELSEWHERE = {
     "dhtorch.geometry.free_space.free_space_violations",
     *(
         f"dhtorch.pipeline.view_selection.{name}"
-        for name in ("select_views_by_preview", "downscale_frame", "rank_views", "tracked_motion")
+        for name in (
+            "select_views_by_preview",
+            "select_views_by_pose",
+            "downscale_frame",
+            "rank_views",
+            "tracked_motion",
+        )
     ),
     *(f"dhtorch.geometry.coarse_flow.{name}" for name in ("downscale", "is_not_identity", "invert_similarity")),
     "dhtorch.stages.track.resolve_coarse_flow",
+    "dhtorch.stages.guided_search.guided_search",
     "dhtorch.geometry.patches.whole_is_faster",
     *(
         f"dhtorch.geometry.plane_sweep.{name}"

@@ -2,6 +2,7 @@
 
 TESTS: dict[str, list[str]] = {
     "stages.pose_prior": ["tests/stages/test_pose_prior.py"],
+    "stages.guided_search": ["tests/stages/test_guided_search.py"],
     "stages.misalignment": ["tests/stages/test_misalignment.py"],
     "geometry.pose_conventions": ["tests/stages/test_pose_prior.py", "tests/test_contract.py"],
     "geometry.pose_averaging": ["tests/pipeline/test_rig.py", "tests/test_contract.py"],
@@ -30,6 +31,21 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_square", "(c * x * x - 2 * b * x * y + a * y * y)", "(a * x * x - 2 * b * x * y + c * y * y)"),
         ("_matched_convention", "< 0.5", "< 5.0"),
         ("_t_snr", "torch.where(exact, ", "torch.where(~exact, "),
+    ],
+    "stages.guided_search": [
+        ("guided_search", "searched if wanted is None else searched & wanted", "searched"),
+        ("guided_search", "unique = searched & (unique[0] > 0)", "unique = unique[0] > 0"),
+        ("_places", "torch.where(near[..., None], there, matched)", "matched"),
+        ("_points", "near_quantile * samples.usable.sum(-1)", "0.9 * samples.usable.sum(-1)"),
+        ("_split_points", "part(points.uv_0, k)", "part(points.uv_0, 0)"),
+        ("_search", "_vertex(joint, k)[0] * step", "_vertex(joint, k)[0] * step + 3 * step"),
+        ("_search", "limits.max_cost_ratio * (1 - elsewhere", "2 * (1 - elsewhere"),
+        ("_search", "n_posed // 2", "n_posed"),
+        ("_peaks", "torch.where(is_peak, vertex, middle)", "middle"),
+        ("_matches_of_views", "(1 - score.clamp(0, 1).square()) / (bend * n)", "score / (bend * n)"),
+        ("_correlate", "product / energy.sqrt()", "product"),
+        ("_correlate", "turn = small_0.scale / small_1.scale / AFFINE_HALF_WIDTH_PX", "turn = 0.0"),
+        ("_read_bilinear", "fy * (bottom - top)", "fx * (bottom - top)"),
     ],
     "stages.misalignment": [
         ("_is_misaligned", "few_returns / n.clamp_min(1).sqrt()", "0 * n"),

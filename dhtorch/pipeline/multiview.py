@@ -23,14 +23,15 @@ from dhtorch.geometry.pyramid import PyramidCache
 from dhtorch.pipeline.pair import (
     StageTimer,
     add_pose_samples,
-    solve_pose_and_triangulate,
+    repeat_views,
+    solve_pairs,
     track_in_chunks,
     upcast_intrinsics,
     without_added,
 )
 from dhtorch.pipeline.spec import MethodSpec, Trace
-from dhtorch.pipeline.view_selection import rank_views
-from dhtorch.pytree import R, stack
+from dhtorch.pipeline.view_selection import rank_views, select_views_by_pose
+from dhtorch.pytree import stack
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, PosePrior, Samples, TrackHint, Tracks, ViewSelection
 
 #: Approximate number of samples by which views are selected. Source: origin not recorded.
@@ -156,7 +157,13 @@ def _select_views(
     fit: PoseFit | PosePrior | None,
     hint: TrackHint,
 ) -> ViewSelection:
-    """The views to use (views, B), by the method's ``select_views`` or by the estimates of a few of the samples."""
+    """The views to use (views, B), by the method's ``select_views`` or by the estimates of a few of the samples.
+
+    With a prior and a guide, which finds what the poses predict, by the poses alone.
+    """
+    if method.guide is not None and isinstance(fit, PosePrior):
+        depth = torch.where(samples.usable, samples.depth, 0.0).amax(-1)  # the farthest return
+        return select_views_by_pose(reference, others, method.views, fit.T_1_from_0, depth)
     if method.select_views is not None:
         selection = method.select_views(reference, others, method.views, fit=fit)
         return selection if isinstance(selection, ViewSelection) else ViewSelection(selection)
@@ -184,27 +191,20 @@ def _estimate_views(
             hint = hint.replace(start=_extrapolate_tracks(tracks[-1], (k + 1) / k))
         tracks.append(clock("track", track_in_chunks(method, reference.image, image, samples.uv, hint)))
     V, B = others.image.shape[:2]
-    solved = solve_pose_and_triangulate(
+    solved = solve_pairs(
         method,
-        _repeat_views(samples, V),
+        reference,
+        others,
+        repeat_views(samples, V),
         pytree.collate(tracks),
-        _repeat_views(reference.camera, V),
-        others.camera.map(lambda x: x.flatten(0, 1)),
         seed=seed if isinstance(seed, int) else seed.repeat(V),
         fit=None if fit is None else fit.map(lambda x: x.flatten(0, 1)),
+        hint=hint,
         clock=clock,
     )
-    names = "estimate", "tracks_ideal", "fit"
+    names = "tracks", "estimate", "tracks_ideal", "fit"
     by_view = dict(zip(names, (x.map(lambda y: y.unflatten(0, (V, B))) for x in solved), strict=True))
-    return [
-        {"ms": ms, "samples": samples, "tracks": tracks[k], **{name: x[k] for name, x in by_view.items()}}
-        for k in range(V)
-    ]
-
-
-def _repeat_views(record: R, V: int) -> R:
-    """A record of the reference view (B, …) repeated for every view: (V B, …)."""
-    return record.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
+    return [{"ms": ms, "samples": samples, **{name: x[k] for name, x in by_view.items()}} for k in range(V)]
 
 
 def _extrapolate_tracks(tracks: Tracks, pace: float) -> Tensor:

@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from dhtorch import pytree
 from dhtorch.codes import Gate, PoseCode, Source
 from dhtorch.geometry import camera as cam
+from dhtorch.geometry import se3
 from dhtorch.geometry.checks import all_finite, any_possible, check, is_transformed
+from dhtorch.geometry.epipolar import triangulate
+from dhtorch.geometry.least_squares import select_batch
 from dhtorch.geometry.linalg import small_matmul
 from dhtorch.ops.dispatch import operator
 from dhtorch.pipeline.spec import MethodSpec, Trace
-from dhtorch.pytree import R, chunked_apply, stack
+from dhtorch.pytree import R, chunked_apply, collate, stack
 from dhtorch.records import (
     NO_HINT,
     Camera,
@@ -24,15 +31,19 @@ from dhtorch.records import (
     Frame,
     InitialPose,
     MergedDepth,
+    Pose,
     PoseFit,
     PosePrior,
     Samples,
+    Shutter,
     TrackHint,
     Tracks,
 )
+from dhtorch.stages.guided_search import GuidedMatches
 from dhtorch.stages.pose import map_pose
 from dhtorch.stages.pose_prior import check_pose_prior, reject_poses
 from dhtorch.stages.sample import spiral
+from dhtorch.stages.track import refine_tracks
 
 #: Most pairs tracked at once: more are no faster, and their pyramids cost memory. Source: origin not recorded.
 TRACK_CHUNK_PAIRS = 8
@@ -51,6 +62,27 @@ MIN_STATIC_TRACKS = 16
 
 #: Motion below which a track counts as static, px. Source: origin not recorded.
 STATIC_FLOW_PX = 0.25
+
+#: Pyramid levels of a track that begins at a predicted place. Source: origin not recorded.
+GUIDED_LEVELS = 2
+
+#: Largest distances of tracks from where a pose allows, of a ray with z = 1: of a prior's pose, then of the pose
+#: refined from it. Source: derived, ``MAX_START_RESIDUAL`` and the residual that ``check_pose_prior`` always tolerates.
+GUIDED_TOLERANCES = (0.04, 0.005)
+
+#: Largest turn between a prior's pose and that of the near returns for the two to agree, rad: twice the arm's.
+#: Source: chosen on: apc_arm, whose poses are off by .4 to 1.1 degrees.
+MAX_PRIOR_TURN_RAD = 0.04
+
+#: Largest distance between them, as a fraction of the translation; a moving foreground is off by more than half.
+#: Source: chosen on: apc_arm, whose poses are off by 2 to 8 of 80 mm.
+MAX_PRIOR_SHIFT_RATIO = 0.25
+
+#: Views that answer a sample from which on it is not searched for, a count. Source: derived, two can agree.
+ENOUGH_VIEWS = 2
+
+#: Least correlation of a match in a view that is used as a track of its own. Source: origin not recorded.
+MIN_MATCH_NCC = 0.7
 
 #: Largest residual of near returns under a pose that is only a start, for a ray with z = 1.
 #: Source: origin not recorded.
@@ -86,9 +118,9 @@ def estimate_pair(
     n = samples.uv.shape[1]
     samples = add_pose_samples(method, frame_0, samples)
     tracks = clock("track", track_in_chunks(method, frame_0.image, frame_1.image, samples.uv, hint))
-    cameras = frame_0.camera, frame_1.camera
-    estimate, usable, solved = solve_pose_and_triangulate(
-        method, samples, tracks, *cameras, seed=seed, fit=fit, clock=clock
+    others = frame_1.map(lambda x: x[None])
+    tracks, estimate, usable, solved = solve_pairs(
+        method, frame_0, others, samples, tracks, seed=seed, fit=fit, hint=hint, clock=clock
     )
     if method.verify_views is not None:
         estimate = method.verify_views(samples, *(stack([x]) for x in (usable, solved, estimate)))[0]
@@ -150,6 +182,203 @@ def track_in_chunks(method: MethodSpec, image_0: Tensor, image_1: Tensor, uv: Te
         return method.track(image_0, image_1, uv, hint=hint)
 
     return chunked_apply(track_chunk, TRACK_CHUNK_PAIRS, image_0, image_1, uv, hint)
+
+
+#: Tracks, estimate, tracks in ideal pixels, and poses of pairs.
+Solved = tuple[Tracks, Estimate, Tracks, PoseFit]
+
+
+class _Views(NamedTuple):
+    """V views of each of B reference views."""
+
+    method: MethodSpec
+    reference: Frame  # (B,)
+    others: Frame  # (V, B)
+    samples: Samples  # (V · B,)
+
+
+def solve_pairs(
+    method: MethodSpec,
+    reference: Frame,  # (B,)
+    others: Frame,  # (V, B)
+    samples: Samples,  # (V · B,)
+    tracks: Tracks,  # (V · B,)
+    *,
+    seed: int | Tensor,
+    fit: PoseFit | PosePrior | None,  # (V · B,)
+    hint: TrackHint,
+    clock: StageTimer,
+) -> Solved:
+    """Stages 5 and 6 of V views of each reference view, with ``method.guide`` after stage 5: (V · B) pairs.
+
+    A prior's pose predicts where tracks begin a second time; of the poses with and without it that one is kept which
+    answers most. Under the poses kept, samples without an answer are searched for in all views together.
+
+    Returns:
+        Tracks, the estimate, the tracks in ideal pixels, and the poses.
+    """
+    views = _Views(method, reference, others, samples)
+    flat = others.map(lambda x: x.flatten(0, 1))
+    cameras = repeat_views(reference.camera, len(others.image)), flat.camera
+
+    def solve(tracks: Tracks, use: PoseFit | PosePrior | None) -> Solved:
+        run = partial(solve_pose_and_triangulate, samples=samples, tracks=tracks, seed=seed, clock=clock)
+        estimate, usable, pose = run(method, camera_0=cameras[0], camera_1=cameras[1], fit=use)
+        if use is not None and isinstance(fit, PosePrior) and (unmoved := _without_far_noise(method)) is not None:
+            free, _, _ = run(unmoved, camera_0=cameras[0], camera_1=cameras[1], fit=pose)
+            estimate = select_batch(_agrees(pose, fit.T_1_from_0), free, estimate)
+        return tracks, estimate, usable, pose
+
+    if method.guide is None:
+        return solve(tracks, fit)
+    tracks = tracks.replace(valid=tracks.valid & ~_is_attached(samples, tracks))
+    solved = solve(tracks, fit if isinstance(fit, PoseFit) else None)
+    if isinstance(fit, PosePrior):
+        start = InitialPose(fit.T_1_from_0, fit.cov, fit.hypotheses)
+        T, uses = fit.T_1_from_0, [] if isinstance(fit, InitialPose) else [fit]
+        for tolerance in GUIDED_TOLERANCES:
+            possible = _is_possible(samples, undistort_tracks(tracks, *cameras), *cameras, T, tolerance)
+            matches = _search_matches(views, T, wanted=None)
+            tracks = tracks.replace(valid=tracks.valid & possible)
+            tracks = clock("guide", _track_again(views, tracks, matches, hint))
+            started = solve(tracks, start)
+            T = select_batch(started[3].ok, started[3].T_1_from_0.detach().to(T.t.dtype), T)
+        solved = _most_answers(samples, [solved, solve(tracks, None), *(solve(tracks, use) for use in uses), started])
+    return _answer_matches(views, solved, solve, clock)
+
+
+def _without_far_noise(method: MethodSpec) -> MethodSpec | None:
+    """The method without the limit on far noise, from which near returns count as moving; None if it has none."""
+    stage = method.triangulate
+    if not (isinstance(stage, partial) and stage.keywords.get("max_far_noise") is not None):
+        return None
+    return replace(method, triangulate=partial(stage, max_far_noise=None))
+
+
+def _agrees(fit: PoseFit, T_1_from_0: Pose) -> Tensor:
+    """Whether poses (B,) are those of a prior up to its errors: near returns then do not move by themselves."""
+    with torch.no_grad():
+        T = select_batch(fit.ok, fit.T_1_from_0, T_1_from_0.to(fit.T_1_from_0.t.dtype))
+        turn, shift = se3.log(se3.compose(T, se3.invert(T_1_from_0.to(T.t.dtype)))).split(3, -1)
+        near_turn = turn.norm(dim=-1) <= MAX_PRIOR_TURN_RAD
+        return fit.ok & near_turn & (shift.norm(dim=-1) <= MAX_PRIOR_SHIFT_RATIO * T_1_from_0.t.norm(dim=-1))
+
+
+def _is_possible(
+    samples: Samples, tracks: Tracks, camera_0: Camera, camera_1: Camera, T_1_from_0: Pose, tolerance: float
+) -> Tensor:
+    """Whether ideal tracks (B, N) end within ``tolerance`` (of a ray with z = 1) of where a pose allows."""
+    with torch.no_grad():
+        camera_0, camera_1 = cam.ideal(camera_0), cam.ideal(camera_1)
+        uv_0, uv_1 = (torch.where(tracks.valid[..., None], x, 0.0) for x in (tracks.uv_0, tracks.uv_1))
+        T = T_1_from_0.to(uv_1.dtype)
+        off_line = triangulate(uv_0, uv_1, camera_0, camera_1, T).residual_px
+        xyz = torch.where(samples.usable[..., None], samples.xyz, 1.0)
+        off_point = (cam.project(camera_1, se3.apply(T, xyz)) - uv_1).norm(dim=-1)
+        limit_px = tolerance * camera_1.f.amin(-1)[:, None]
+        return ~(torch.where(samples.usable, off_point, off_line) > limit_px)
+
+
+def _is_attached(samples: Samples, tracks: Tracks) -> Tensor:
+    """Near returns (B, N) that do not move in the picture while most others do: parts of the camera's carrier."""
+    with torch.no_grad():
+        near = tracks.valid & samples.usable
+        static = near & ((tracks.uv_1 - tracks.uv_0).square().sum(-1) < STATIC_FLOW_PX**2)
+        return static & (static.sum(-1) < STATIC_RATIO * near.sum(-1))[:, None]
+
+
+def _search_matches(views: _Views, T_1_from_0: Pose, wanted: Tensor | None) -> GuidedMatches:
+    """Matches under the poses (V · B,), as (V, B, …); ``wanted`` (B, N)."""
+    method, reference, others, samples = views
+    assert method.guide is not None
+    V, B = others.image.shape[:2]
+    T = T_1_from_0.map(lambda x: x.detach().unflatten(0, (V, B)))
+    arguments = samples[:B], reference.image, others.image, reference.camera, others.camera, T
+    return method.guide(*arguments, wanted=wanted)
+
+
+def _track_again(views: _Views, tracks: Tracks, matches: GuidedMatches, hint: TrackHint) -> Tracks:
+    """The tracks, those that are not valid tracked once more from returns' predictions and unique matches (V, B, N)."""
+    method, reference, others, samples = views
+    V, B = others.image.shape[:2]
+    known = samples.usable.unflatten(0, (V, B)) | matches.unique
+    wanted = ~tracks.valid.unflatten(0, (V, B)) & known & matches.uv_1.isfinite().all(-1)
+    outside = -2.0 * max(reference.hw)  # a point there costs nothing
+    uv = torch.where(wanted[..., None], samples.uv.expand(V * B, -1, 2).unflatten(0, (V, B)), outside)
+    start = hint.replace(levels=GUIDED_LEVELS)
+    new = collate(
+        track_in_chunks(method, reference.image, image, uv[k], start.replace(start=matches.uv_1[k]))
+        for k, image in enumerate(others.image)
+    )
+    better = new.valid & wanted.flatten(0, 1)
+    merged = _select_points(better, new, tracks)
+    return merged.replace(uv_0=tracks.uv_0, valid=tracks.valid | better)
+
+
+def _select_points(mask: Tensor, new: R, old: R) -> R:
+    """Points of ``new`` where ``mask`` (B, N) holds, of ``old`` elsewhere; records of tensors (B, N, …)."""
+    return tree_map(lambda a, b: torch.where(mask.view(*mask.shape, *[1] * (a.ndim - 2)), a, b), new, old)
+
+
+def _most_answers(samples: Samples, results: list[Solved]) -> Solved:
+    """Of several results the one with most answers without a return, pair by pair; the last of equals.
+
+    The convention under which a refuted prior would fit stays known: it is the last result's.
+    """
+    count = torch.stack([(estimate.keep & ~samples.usable).sum(-1) for _, estimate, _, _ in results])
+    best = (len(results) - 1) - count.flip(0).argmax(0)
+    pair = torch.arange(len(best), device=best.device)
+    tracks, estimates, usable, fits = (list(field) for field in zip(*results, strict=True))
+    convention = fits[-1].matched_convention
+    has_shutter = any(fit.shutter is not None for fit in fits)
+    fits = [_with_shutter(fit, has_shutter).replace(matched_convention=None) for fit in fits]
+    fit = stack(fits)[best, pair].replace(matched_convention=convention)
+    return stack(tracks)[best, pair], stack(estimates)[best, pair], stack(usable)[best, pair], fit
+
+
+def _with_shutter(fit: PoseFit, wanted: bool) -> PoseFit:
+    """The fit with a global shutter where it has none and one is ``wanted``."""
+    if fit.shutter is not None or not wanted:
+        return fit
+    return fit.replace(shutter=Shutter(torch.zeros_like(fit.T_1_from_0.t), F.pad(fit.cov, (0, 3, 0, 3))))
+
+
+def _answer_matches(
+    views: _Views, solved: Solved, solve: Callable[[Tracks, PoseFit], Solved], clock: StageTimer
+) -> Solved:
+    """The result with unique matches of samples that no track answers as tracks of their own."""
+    method, _, others, samples = views
+    tracks, estimate, _, fit = solved
+    V, B = others.image.shape[:2]
+    textured = samples.trackability >= method.min_trackability
+    answered = estimate.keep.unflatten(0, (V, B)).sum(0)
+    few = (answered < min(V, ENOUGH_VIEWS)) & (textured & ~samples.usable)[:B]
+    open_ = ~estimate.keep.unflatten(0, (V, B)) & few
+    matches = _search_matches(views, fit.T_1_from_0, few)
+    matched = (open_ & matches.unique & (matches.ncc >= MIN_MATCH_NCC) & matches.uv_1.isfinite().all(-1)).flatten(0, 1)
+    uv_1, cov, rms = (x.flatten(0, 1) for x in (_differentiable_places(views, matches), matches.cov, matches.rms))
+    matched_tracks = tracks.replace(uv_1=uv_1, cov=cov, photometric=rms, error=cov[..., 0, 0].sqrt(), valid=matched)
+    return solve(clock("guide", _select_points(matched, matched_tracks, tracks)), fit)
+
+
+def _differentiable_places(views: _Views, matches: GuidedMatches) -> Tensor:
+    """The places (V, B, N, 2) of matches, with the gradient of a tracker's last step where a gradient is asked for."""
+    _, reference, others, samples = views
+    graph = reference.image.requires_grad or others.image.requires_grad or samples.uv.requires_grad
+    if not (graph and torch.is_grad_enabled()):
+        return matches.uv_1
+    uv_0 = samples.uv.expand(*matches.uv_1.flatten(0, 1).shape).unflatten(0, matches.uv_1.shape[:2])
+    steps = [
+        refine_tracks(reference.image, image, uv_0[v], matches.uv_1[v], normalise="bias")
+        for v, image in enumerate(others.image)
+    ]
+    step = torch.stack(steps)
+    return matches.uv_1 + (step - step.detach())
+
+
+def repeat_views(record: R, V: int) -> R:
+    """A record of the reference view (B, …) repeated for every view: (V B, …)."""
+    return record.map(lambda x: x.expand(V, *x.shape).flatten(0, 1))
 
 
 def solve_pose_and_triangulate(

@@ -8,6 +8,7 @@ from dhtorch.geometry.coarse_flow import coarse_flow
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.view_selection import select_views_by_preview
 from dhtorch.stages.fuse import fuse_consistent
+from dhtorch.stages.guided_search import guided_search
 from dhtorch.stages.kornia.backproject import backproject_kornia
 from dhtorch.stages.kornia.holes import classify_kornia
 from dhtorch.stages.kornia.pose import pnp_ransac_kornia
@@ -70,9 +71,9 @@ MAP = PAPER.replace(
 WINDOW = MAP.replace(views=5)
 
 #: Source views are selected among those around the reference view; tracks start at the coarse flow of the whole image,
-#: whatever the exposures. An answer needs consistent views or one with a small sigma, near returns that far points do
-#: not contradict, and poses without a large error that all points share. Single views may be uncertain: the sigma of
-#: the fused estimate counts.
+#: whatever the exposures; what no track answers is searched for where the poses say. An answer needs consistent views or
+#: one with a small sigma, near returns that far points do not contradict, and poses without a large error that all
+#: points share. Single views may be uncertain: the sigma of the fused estimate counts.
 AUTO = MAP.replace(
     track=partial(
         lucas_kanade_affine, levels=MAP_PYRAMID_LEVELS, start=coarse_flow, track=partial(lucas_kanade, normalise="bias")
@@ -83,6 +84,7 @@ AUTO = MAP.replace(
     score=confidence_from_sigma,
     select_views=select_views_by_preview,
     pose_samples=256,
+    guide=guided_search,
     views=5,
     chain=False,
 )

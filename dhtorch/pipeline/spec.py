@@ -30,6 +30,7 @@ from dhtorch.records import (
 )
 from dhtorch.stages.backproject import backproject
 from dhtorch.stages.fuse import inverse_variance
+from dhtorch.stages.guided_search import GuidedMatches
 from dhtorch.stages.holes import classify
 from dhtorch.stages.misalignment import reject_misaligned
 from dhtorch.stages.pose import pnp_ransac
@@ -72,6 +73,7 @@ class MethodSpec:
         None  # (reference, others, views, *, fit) -> (views, B)
     )
     pose_prior: Callable[..., PosePrior] | None = None  # (reference, others) -> relative poses, or None
+    guide: Callable[..., GuidedMatches] | None = None  # (samples, image_0, images_1, camera_0, cameras_1, T_1_from_0)
 
     n: int = 2048  # samples per reference view
     pose_samples: int = (

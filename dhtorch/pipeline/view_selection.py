@@ -14,9 +14,11 @@ from torch import Tensor
 
 from dhtorch import pytree
 from dhtorch.geometry import camera as cam
+from dhtorch.geometry import se3
 from dhtorch.geometry.checks import check
 from dhtorch.geometry.coarse_flow import downscale
 from dhtorch.geometry.determinism import pad_elementwise
+from dhtorch.geometry.patches import is_inside_picture
 from dhtorch.pipeline.pair import (
     StageTimer,
     sample_returns,
@@ -25,8 +27,9 @@ from dhtorch.pipeline.pair import (
     upcast_intrinsics,
 )
 from dhtorch.pipeline.spec import MethodSpec
-from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, PosePrior, Samples, Tracks, ViewSelection
+from dhtorch.records import NO_HINT, Estimate, Frame, Pose, PoseFit, PosePrior, Samples, Tracks, ViewSelection
 from dhtorch.stages.pose import map_pose
+from dhtorch.stages.sample import spiral
 from dhtorch.stages.track import lucas_kanade
 from dhtorch.stages.triangulate import two_view
 
@@ -43,6 +46,13 @@ PREVIEW_METHOD = MethodSpec(
     triangulate=partial(two_view, min_parallax_deg=None, min_t_snr=1.0, fitted_noise=True, sensor_share=1.0),
 )
 
+
+#: Turn of a line of sight at which a window is recognised with e^-1/2 of the certainty, rad.
+#: Source: origin not recorded.
+RECOGNISED_TURN_RAD = 0.2
+
+#: Standard deviation of a track by which parallax becomes information, px. Source: origin not recorded.
+PREVIEW_TRACK_NOISE_PX = 1.0
 
 #: Weight of a view's tracks beside its gain: small enough to order equal gains alone.
 #: Source: derived, gains differ by more than 1e-6 where they differ, and a sum over 256 tracks is below 2000.
@@ -105,6 +115,56 @@ def select_views_by_preview(
             motion=motion,
             reserve=min(views if reserve is None else reserve, V - views),
         )
+
+
+def select_views_by_pose(
+    reference: Frame,
+    others: Frame,  # (V, B)
+    views: int,
+    T_1_from_0: Pose,  # (V, B)
+    depth: Tensor,  # (B,) m
+    *,
+    good_sigma_rel: float = 0.1,
+) -> ViewSelection:
+    """The best of many candidate views by their poses: parallax of points that the view shows, from a similar side.
+
+    The points lie at one depth in all directions of the reference view. A window is recognised less and less the more
+    its line of sight has turned; the information of a point is weighted accordingly. Views whose pose is not finite
+    come last.
+
+    Raises:
+        ValueError: wrong shapes, or not 1 <= views <= V.
+
+    Gradient: none; a choice.
+    """
+    V = check("select_views_by_pose", image_0=(reference.image, "B C H W"), t=(T_1_from_0.t, "V B 3"))["V"]
+    check("select_views_by_pose", image_0=(reference.image, "B C H W"), depth=(depth, "B"))
+    if not 1 <= views <= V:
+        raise ValueError(f"select_views_by_pose: views is {views}, expected 1 to {V}")
+    with torch.no_grad():
+        uv = spiral(reference.hw, PREVIEW_METHOD.n, device=depth.device, dtype=reference.camera.f.dtype)
+        uv = uv.expand(len(depth), *uv.shape)
+        xyz = cam.unproject(reference.camera, uv, depth[:, None].expand(uv.shape[:2]).to(uv.dtype))
+        information = torch.stack(
+            [_information(xyz, others[v], T_1_from_0[v], good_sigma_rel) for v in range(V)]
+        ).double()
+        information = information.flip(0)
+        rank, gain = _greedy_order(information, torch.zeros_like(information[..., 0]), views)
+        index = (rank < views).flip(0).long().argsort(dim=0, descending=True, stable=True)[:views]
+        return ViewSelection(index, gain.flip(0).gather(0, index))
+
+
+def _information(xyz: Tensor, frame: Frame, T: Pose, good_sigma_rel: float) -> Tensor:
+    """Expected information (B, N) of points (B, N, 3) of view 0 in a view with pose T; 0 where not shown."""
+    T = T.to(xyz.dtype)
+    there = se3.apply(T, xyz)
+    pixel = cam.project(frame.camera, there)
+    shown = (there[..., 2] > 0) & is_inside_picture(pixel, frame.image)
+    line = F.normalize(se3.rotate(T.R, xyz), dim=-1)
+    turn = (line * F.normalize(there, dim=-1)).sum(-1).clamp(-1, 1).acos()
+    precision = good_sigma_rel * turn * frame.camera.f.amin(-1)[:, None] / PREVIEW_TRACK_NOISE_PX
+    seen = (-0.5 * (turn / RECOGNISED_TURN_RAD).square()).exp()
+    return torch.where(shown, (precision * seen).square(), 0.0).nan_to_num(0.0)
 
 
 def _preview_samples(frame: Frame, near: int) -> Samples:

@@ -189,8 +189,11 @@ def refine_tracks(
 def resolve_coarse_flow(
     image_0: Tensor, image_1: Tensor, hint: TrackHint, start: Callable[..., CoarseFlow] | None
 ) -> tuple[CoarseFlow, CoarseFlow] | None:
-    """Coarse motion of the images, forward and backward: the hint's, else the result of ``start``, else None."""
-    if hint.flows is not None or start is None:
+    """Coarse motion of the images, forward and backward: the hint's, else the result of ``start``, else None.
+
+    A hint that says where the points begin needs no coarse motion.
+    """
+    if hint.flows is not None or hint.start is not None or start is None:
         return hint.flows
     forward = start(image_0, image_1)
     return forward, start(image_1, image_0, linear=invert_similarity(forward.linear))

@@ -129,6 +129,7 @@ MAP_1 = Method(
         max_static_ratio=0.5,
     ),
     select_views=None,
+    guide=None,
     n=2048,
     pose_samples=0,
     hypotheses=200,
