@@ -46,10 +46,10 @@ def verify_views(
 ) -> Estimate:
     """Add the error that the points of a view share to their sigma, and withhold answers of views that cannot be right.
 
-    The limits were chosen on the stress rooms ``rotation_hand_*`` and ``convoy_*`` of seeds 2 and 3: ``min_ratio`` above
-    the ratio of all their views but one, ``max_disagreement`` below that of the reference views of ``convoy_oncoming``
-    and ``convoy_uneven`` that answered, ``max_refuted`` for those of ``convoy_lanes``, ``turn_share`` by the coverage
-    that it costs on ``data=shared_scenes``.
+    The limits were chosen on the stress rooms ``rotation_hand_*`` and ``convoy_*`` of seeds 2 and 3: ``min_ratio``
+    above the ratio of all their views but one, ``max_disagreement`` below that of the reference views of
+    ``convoy_oncoming`` and ``convoy_uneven`` that answered, ``max_refuted`` for those of ``convoy_lanes``,
+    ``turn_share`` by the coverage that it costs on ``data=shared_scenes``.
 
     Args:
         samples: (B, N) of the reference view; medians are those of samples without a return.
