@@ -36,7 +36,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("guided_search", "searched if wanted is None else searched & wanted", "searched"),
         ("guided_search", "unique = searched & (unique[0] > 0)", "unique = unique[0] > 0"),
         ("_places", "torch.where(near[..., None], there, matched)", "matched"),
-        ("_points", "near_quantile * samples.usable.sum(-1)", "0.9 * samples.usable.sum(-1)"),
+        ("_points", "near_quantile * returned.sum(-1)", "0.9 * returned.sum(-1)"),
         ("_split_points", "part(points.uv_0, k)", "part(points.uv_0, 0)"),
         ("_search", "_vertex(joint, k)[0] * step", "_vertex(joint, k)[0] * step + 3 * step"),
         ("_search", "limits.max_cost_ratio * (1 - elsewhere", "2 * (1 - elsewhere"),

@@ -162,7 +162,8 @@ def _select_views(
     With a prior and a guide, which finds what the poses predict, by the poses alone.
     """
     if method.guide is not None and isinstance(fit, PosePrior):
-        depth = torch.where(samples.usable, samples.depth, 0.0).amax(-1)  # the farthest return
+        returned = samples.usable & (samples.trackability >= method.min_trackability)
+        depth = torch.where(returned, samples.depth, 0.0).amax(-1)  # the farthest return
         return select_views_by_pose(reference, others, method.views, fit.T_1_from_0, depth)
     if method.select_views is not None:
         selection = method.select_views(reference, others, method.views, fit=fit)

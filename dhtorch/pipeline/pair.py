@@ -231,7 +231,7 @@ def solve_pairs(
 
     if method.guide is None:
         return solve(tracks, fit)
-    tracks = tracks.replace(valid=tracks.valid & ~_is_attached(samples, tracks))
+    tracks = tracks.replace(valid=tracks.valid & ~_is_attached(method, samples, tracks))
     solved = solve(tracks, fit if isinstance(fit, PoseFit) else None)
     if isinstance(fit, PosePrior):
         start = InitialPose(fit.T_1_from_0, fit.cov, fit.hypotheses)
@@ -279,10 +279,10 @@ def _is_possible(
         return ~(torch.where(samples.usable, off_point, off_line) > limit_px)
 
 
-def _is_attached(samples: Samples, tracks: Tracks) -> Tensor:
+def _is_attached(method: MethodSpec, samples: Samples, tracks: Tracks) -> Tensor:
     """Near returns (B, N) that do not move in the picture while most others do: parts of the camera's carrier."""
     with torch.no_grad():
-        near = tracks.valid & samples.usable
+        near = tracks.valid & samples.usable & (samples.trackability >= method.min_trackability)
         static = near & ((tracks.uv_1 - tracks.uv_0).square().sum(-1) < STATIC_FLOW_PX**2)
         return static & (static.sum(-1) < STATIC_RATIO * near.sum(-1))[:, None]
 

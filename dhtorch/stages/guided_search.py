@@ -222,8 +222,9 @@ def _points(
     uv_0 = samples.uv.detach().to(T.t.dtype).expand(B, N, 2)
     shifts = (0.0, 0.0), (AFFINE_HALF_WIDTH_PX, 0.0), (0.0, AFFINE_HALF_WIDTH_PX)
     rays = [cam.rays(camera_0, uv_0 + uv_0.new_tensor(shift)).nan_to_num(0.0, 0.0, 0.0) for shift in shifts]
-    depth = torch.where(samples.usable, samples.depth.detach(), torch.inf).to(T.t.dtype).sort(-1).values
-    rank = (near_quantile * samples.usable.sum(-1)).long().clamp(max=N - 1)
+    returned = samples.usable & (samples.trackability > 0)  # those without texture may be mere filling of a batch
+    depth = torch.where(returned, samples.depth.detach(), torch.inf).to(T.t.dtype).sort(-1).values
+    rank = (near_quantile * returned.sum(-1)).long().clamp(max=N - 1)
     nearest = depth.gather(-1, rank[:, None])[:, 0]
     q_max = torch.where(nearest.isfinite() & (nearest > 0), 1 / nearest, 0.0)
 
