@@ -114,8 +114,8 @@ def main() -> int:
         found.append(row)
         shown = {k: v for k, v in row.items() if k != "stations"}
         print(shown, [round(s["coverage"] or 0, 2) for s in row["stations"]], flush=True)
-    if options.json:
-        storage.write_json(options.json, storage.to_strict_json(found))
+        if options.json:
+            storage.write_json(options.json, storage.to_strict_json(found))
     return 0
 
 
