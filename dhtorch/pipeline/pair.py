@@ -81,6 +81,10 @@ MAX_PRIOR_SHIFT_RATIO = 0.25
 #: Views that answer a sample from which on it is not searched for, a count. Source: derived, two can agree.
 ENOUGH_VIEWS = 2
 
+#: Fraction of the samples with texture that are tracked into enough views, below which samples are searched for without
+#: a prior. Source: chosen on: apc_arm (.02 to .29) against kitchens, desk9 and holo_a (.50 to .92).
+MIN_TRACKED_RATIO = 0.4
+
 #: Least correlation of a match in a view that is used as a track of its own. Source: origin not recorded.
 MIN_MATCH_NCC = 0.7
 
@@ -229,7 +233,7 @@ def solve_pairs(
             estimate = select_batch(_agrees(pose, fit.T_1_from_0), free, estimate)
         return tracks, estimate, usable, pose
 
-    if method.guide is None:
+    if method.guide is None or not (isinstance(fit, PosePrior) or any_possible(_is_poorly_tracked(views, tracks))):
         return solve(tracks, fit)
     tracks = tracks.replace(valid=tracks.valid & ~_is_attached(method, samples, tracks))
     solved = solve(tracks, fit if isinstance(fit, PoseFit) else None)
@@ -244,7 +248,19 @@ def solve_pairs(
             started = solve(tracks, start)
             T = select_batch(started[3].ok, started[3].T_1_from_0.detach().to(T.t.dtype), T)
         solved = _most_answers(samples, [solved, solve(tracks, None), *(solve(tracks, use) for use in uses), started])
-    return _answer_matches(views, solved, solve, clock)
+    wanted = None if isinstance(fit, PosePrior) else _is_poorly_tracked(views, tracks)
+    return _answer_matches(views, solved, solve, clock, wanted)
+
+
+def _is_poorly_tracked(views: _Views, tracks: Tracks) -> Tensor:
+    """Reference views (B,) of whose samples with texture most are tracked into fewer views than can agree.
+
+    Elsewhere a search answers little and its matches, less exact than tracks, lower the coverage at a given error.
+    """
+    V, B = views.others.image.shape[:2]
+    textured = (views.samples.trackability >= views.method.min_trackability)[:B]
+    is_tracked = tracks.valid.unflatten(0, (V, B)).sum(0) >= min(V, ENOUGH_VIEWS)
+    return (is_tracked & textured).sum(-1) < MIN_TRACKED_RATIO * textured.sum(-1)
 
 
 def _without_far_noise(method: MethodSpec) -> MethodSpec | None:
@@ -344,15 +360,20 @@ def _with_shutter(fit: PoseFit, wanted: bool) -> PoseFit:
 
 
 def _answer_matches(
-    views: _Views, solved: Solved, solve: Callable[[Tracks, PoseFit], Solved], clock: StageTimer
+    views: _Views,
+    solved: Solved,
+    solve: Callable[[Tracks, PoseFit], Solved],
+    clock: StageTimer,
+    wanted: Tensor | None,  # (B,) bool
 ) -> Solved:
-    """The result with unique matches of samples that no track answers as tracks of their own."""
+    """The result with unique matches of samples that no track answers as tracks of their own; None = of all views."""
     method, _, others, samples = views
     tracks, estimate, _, fit = solved
     V, B = others.image.shape[:2]
     textured = samples.trackability >= method.min_trackability
     answered = estimate.keep.unflatten(0, (V, B)).sum(0)
     few = (answered < min(V, ENOUGH_VIEWS)) & (textured & ~samples.usable)[:B]
+    few = few if wanted is None else few & wanted[:, None]
     open_ = ~estimate.keep.unflatten(0, (V, B)) & few
     matches = _search_matches(views, fit.T_1_from_0, few)
     matched = (open_ & matches.unique & (matches.ncc >= MIN_MATCH_NCC) & matches.uv_1.isfinite().all(-1)).flatten(0, 1)
