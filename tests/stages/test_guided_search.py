@@ -119,7 +119,7 @@ def flat_scene(texture):
 
 
 def stripes(u, v):
-    return 0.5 + 0.3 * (2 * math.pi * u / 12).sin() + 0.1 * (2 * math.pi * v / 17).sin()
+    return 0.5 + 0.3 * (2 * math.pi * u / 8).sin() + 0.1 * (2 * math.pi * v / 17).sin()
 
 
 def paint(u, v):
