@@ -10,6 +10,7 @@ from typing import Any
 
 from cells import percent, table
 
+from dhtorch.pipeline.presets import METHODS
 from dhtorch.runtime.console import format_count
 
 RESULTS = Path(__file__).resolve().parent / "results"
@@ -19,7 +20,11 @@ USED = {"as it is": "as it is", "stated": "0.005 rad, 0.01 m stated", "refined":
 
 
 def given_poses(method: str) -> str:
-    """What is answered under right poses of every capture, by what is made of them, beside near returns alone."""
+    """What is answered under right poses of every capture, by what is made of them, beside near returns alone.
+
+    Columns of sigma are those of a method that states one.
+    """
+    ends = ("near returns", "as it is", "refined") if METHODS[method].states_sigma else ()
     rows = []
     for scene, runs in by_capture(method).items():
         right = {row["use"]: row for row in runs if row["pose"] in ("right", "none")}
@@ -27,9 +32,8 @@ def given_poses(method: str) -> str:
         uses = [right["near returns"], *(right[use] for use in USED)]
         cells = [" / ".join(percent(row[key]) for row in uses) for key in ("coverage", "median_rel")]
         honest = [f"{percent(row['within_sigma'])}, {percent(row['within_2sigma'])}" for row in uses[:2] + uses[3:]]
-        rows.append([name, str(right["near returns"]["n_candidates"]), *cells, *honest])
+        rows.append([name, str(right["near returns"]["n_candidates"]), *cells, *honest[: len(ends)]])
     head = [f"{first}: near returns / {' / '.join(USED.values())}" for first in ("answered", "median error")]
-    ends = ("near returns", "as it is", "refined")
     return table(["capture", "held back", *head, *(f"within 1, 2 sigma: {end}" for end in ends)], rows)
 
 

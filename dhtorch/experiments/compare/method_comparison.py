@@ -117,7 +117,7 @@ def run(
     comparison = compare.method_ratios(complete, reference=reference, rooms=rooms)
     for name in (reference, *compared):
         seeds_of = [seed_variant_name(name, k) for k in range(seeds)]
-        outcome.summary |= compare.rotation_answered(outcome.rows, seeds_of)
+        outcome.summary |= compare.rotation_answered(outcome.rows, seeds_of, outcome.cohort)
     keep_first_seed(outcome, methods, seeds)
     outcome.summary |= comparison.summary
     agreement: Row = {}
