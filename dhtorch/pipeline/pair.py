@@ -71,18 +71,18 @@ GUIDED_LEVELS = 2
 GUIDED_TOLERANCES = (0.04, 0.005)
 
 #: Largest turn between a prior's pose and that of the near returns for the two to agree, rad: twice the arm's.
-#: Source: chosen on: apc_arm, whose poses are off by .4 to 1.1 degrees.
+#: Source: chosen on apc_arm, whose poses are off by .4 to 1.1 degrees.
 MAX_PRIOR_TURN_RAD = 0.04
 
 #: Largest distance between them, as a fraction of the translation; a moving foreground is off by more than half.
-#: Source: chosen on: apc_arm, whose poses are off by 2 to 8 of 80 mm.
+#: Source: chosen on apc_arm, whose poses are off by 2 to 8 of 80 mm.
 MAX_PRIOR_SHIFT_RATIO = 0.25
 
 #: Views that answer a sample from which on it is not searched for, a count. Source: derived, two can agree.
 ENOUGH_VIEWS = 2
 
 #: Fraction of the samples with texture that are tracked into enough views, below which samples are searched for without
-#: a prior. Source: chosen on: apc_arm (.02 to .29) against kitchens, desk9 and holo_a (.50 to .92).
+#: a prior. Source: chosen on apc_arm (.02 to .29) against kitchens, desk9 and holo_a (.50 to .92).
 MIN_TRACKED_RATIO = 0.4
 
 #: Least correlation of a match in a view that is used as a track of its own. Source: origin not recorded.

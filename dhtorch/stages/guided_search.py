@@ -24,10 +24,10 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.pytree import Record, record
 from dhtorch.records import Camera, Samples
 
-#: Longest sides of the images that are searched, px, from coarse to fine. Source: chosen on: the built-in rooms.
+#: Longest sides of the images that are searched, px, from coarse to fine. Source: chosen on the built-in rooms.
 SEARCH_SIDES_PX = (160, 320, 640)
 
-#: Widths of the windows on these images, in samples, odd. Source: chosen on: the built-in rooms.
+#: Widths of the windows on these images, in samples, odd. Source: chosen on the built-in rooms.
 SEARCH_WINDOWS = (7, 9, 11)
 
 #: Distance of a window's samples on these images, px of the image. Source: derived, windows of 21 to 28 px of 640.
@@ -61,7 +61,7 @@ CORRELATED_SAMPLES = 9
 #: Least bend of a correlation over three hypotheses, in correlation: no division by 0. Source: derived, float32.
 MIN_BEND = 1e-6
 
-#: Added to the costs that are compared, in correlation: below it costs do not differ. Source: chosen on: the built-in
+#: Added to the costs that are compared, in correlation: below it costs do not differ. Source: chosen on the built-in
 #: rooms, where interpolation alone costs some hundredths.
 COST_FLOOR = 0.05
 

@@ -46,7 +46,8 @@ def turn_by_hand(times: Sequence[float], *, duration_s: float, degrees: float, r
     """
     hand = _Hand(seed)
     draw = Random(f"wrist {seed}")
-    tilt, sense = math.radians(draw.uniform(-35.0, 35.0)), draw.choice((-1, 1))
+    tilt = math.radians(draw.uniform(-35.0, 35.0))
+    sense = draw.choice((-1, 1))
     lever = torch.tensor([0.0, 0.0, 0.9 * reach_m / math.radians(degrees)], dtype=torch.float64)
     x0, height0, z0 = _START_POSITION
     start = torch.tensor([x0, -height0, z0], dtype=torch.float64)

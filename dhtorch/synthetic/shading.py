@@ -83,7 +83,9 @@ class ShadedRoom:
         The k-th of them has the motion k mod n. A surface point keeps its colour, so that it can be tracked like any
         other.
         """
-        room, solids, k = copy.copy(self), list(self.solids.each), 0
+        room = copy.copy(self)
+        solids = list(self.solids.each)
+        k = 0
         for i, solid in enumerate(solids):
             if solid.surface.kind == SURFACE_MOVING:
                 turn = k % len(motion.t)
