@@ -32,7 +32,7 @@ EXPERIMENTS = {
     "method_comparison": "experiment=method_comparison data=shared_scenes",
     "kornia_twin": "experiment=method_comparison data=shared_scenes experiment.seeds=1 ~experiment.methods.opencv "
     "~experiment.methods.xfeat ~experiment.methods.map ~experiment.methods.window ~experiment.methods.auto",
-    "track_chain": "experiment=chain_study data=shared_scenes pairs.stride=12",
+    "track_chain": "experiment=chain_study data=shared_scenes pairs.stride=6",
     "streams": "experiment=method_comparison data=streams",
     "part_ablation": "experiment=part_ablation data=shared_scenes",
     "part_ablation_auto": "experiment=part_ablation data=shared_scenes experiment.groups=[auto] experiment.seeds=1",
