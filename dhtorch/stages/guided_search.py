@@ -389,7 +389,7 @@ def _correlate(
     window = _read_bilinear(small_1.grey, batch, x.flatten(1), y.flatten(1)).unflatten(1, (q.shape[1], -1))
     window = window - window.mean(-1, keepdim=True)
     noise = len(u) * WINDOW_NOISE**2 / small_0.scale
-    product = (window @ template[..., None])[..., 0]
+    product = (window * template[:, None]).sum(-1)  # not a matrix product, whose sums depend on the batch
     energy = (template.square().sum(-1)[:, None] + noise) * (window.square().sum(-1) + noise)
     H, W = small_1.grey.shape[-2:]
     inside = (centre >= 0).all(0) & (centre[0] <= W - 1) & (centre[1] <= H - 1)
