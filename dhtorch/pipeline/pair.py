@@ -233,9 +233,10 @@ def solve_pairs(
             estimate = select_batch(_agrees(pose, fit.T_1_from_0), free, estimate)
         return tracks, estimate, usable, pose
 
+    if method.guide is not None:
+        tracks = tracks.replace(valid=tracks.valid & ~_is_attached(method, samples, tracks))
     if method.guide is None or not (isinstance(fit, PosePrior) or any_possible(_is_poorly_tracked(views, tracks))):
         return solve(tracks, fit)
-    tracks = tracks.replace(valid=tracks.valid & ~_is_attached(method, samples, tracks))
     solved = solve(tracks, fit if isinstance(fit, PoseFit) else None)
     if isinstance(fit, PosePrior):
         start = InitialPose(fit.T_1_from_0, fit.cov, fit.hypotheses)
