@@ -126,5 +126,7 @@ def test_without_a_guide_nothing_is_searched():
 
     measured(PLAIN, whole, other, fit=make_prior(T))
     assert not calls
-    measured(GUIDED.replace(guide=guide), whole, other)
-    assert len(calls) == 1
+    measured(GUIDED.replace(guide=guide), whole, other)  # most samples are tracked
+    assert not calls
+    measured(GUIDED.replace(guide=guide), whole, other, fit=make_prior(T))
+    assert len(calls) == 3  # under the prior's pose, under the refined one, and for what no track answers
