@@ -48,12 +48,12 @@ def test_no_result_has_a_sigma_of_a_method_that_states_none():
 
 
 def test_another_setting_is_seen(tmp_path, monkeypatch):
-    result = result_files.read_result(REPO / "benchmarks/results/views_study.json")
-    result["config"]["experiment"]["reference_views"] = 1
-    (tmp_path / "views_study.json").write_text(json.dumps(result))
+    result = result_files.read_result(REPO / "benchmarks/results/global_map.json")
+    result["config"]["experiment"]["n"] = 1
+    (tmp_path / "global_map.json").write_text(json.dumps(result))
     monkeypatch.setattr(reproduce, "RESULTS", tmp_path)
-    (line,) = reproduce.check("views_study")
-    assert "experiment.reference_views: found 1, expected 3" in line and "experiment.reference_views=3" in line
+    (line,) = reproduce.check("global_map")
+    assert "experiment.n: found 1, expected 1024" in line and "experiment.n=1024" in line
     (line,) = reproduce.check("icp")
     assert "no icp.json" in line
 
