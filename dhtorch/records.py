@@ -203,7 +203,7 @@ class ViewSelection(Record):
     index: Tensor  # (views, B) int64, rising
     gain: Tensor | None = None  # (views, B) gain over the views selected before it; None = not computed
     no_answer: Tensor | None = None  # (V, B) bool: view without estimates, no pose or no baseline; None = not computed
-    reserve: Tensor | None = None  # (R, B) int64, the next best, rising; they replace selected views without an answer
+    reserve: Tensor | None = None  # (R, B) int64, the next best, best first: they replace views without a pose
 
 
 @record

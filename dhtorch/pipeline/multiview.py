@@ -88,8 +88,9 @@ def estimate_multiview(
         return _estimate_views(method, reference, views, samples, seed=seed, fit=poses, hint=hint, ms=ms)
 
     traces = estimate_views(choice.index)
-    if choice.reserve is not None and len(choice.reserve) and bool(_is_mute(traces).any()):
-        traces, choice = _replace_mute_views(traces, estimate_views(choice.reserve), choice, choice.reserve)
+    if choice.reserve is not None and (n_mute := min(int(_is_mute(traces).sum(0).max()), len(choice.reserve))) > 0:
+        next_best = choice.reserve[:n_mute]
+        traces, choice = _replace_mute_views(traces, estimate_views(next_best), choice, next_best)
     start_time = time.perf_counter()
     traces = _verify_views(method, samples, traces)
     if samples.uv.shape[1] > n:
@@ -121,21 +122,24 @@ def _verify_views(method: MethodSpec, samples: Samples, traces: list[Trace]) -> 
 
 
 def _is_mute(traces: Sequence[Trace]) -> Tensor:
-    """Whether views (V, B) answer no sample, other than for a camera that stood still: others would not."""
-    gates = torch.stack([t["estimate"].gate for t in traces])
-    return ((gates != Gate.ANSWER) & (gates != Gate.NO_BASELINE)).all(-1)
+    """Whether views (V, B) have no pose. Those without a baseline, or contradicted, are evidence and are kept."""
+    return torch.stack([(t["estimate"].gate <= Gate.NO_POSE).all(-1) & ~t["estimate"].keep.any(-1) for t in traces])
 
 
 def _replace_mute_views(
     traces: Sequence[Trace], reserve: Sequence[Trace], choice: ViewSelection, reserve_index: Tensor
 ) -> tuple[list[Trace], ViewSelection]:
-    """The traces with views without an answer replaced by the first of the reserve with one, and the new choice.
+    """The traces with views without a pose replaced by those of the reserve that have one, and the new choice.
 
-    Views stay in rising order. Their gains are those of the preview, 0 of the replacements.
+    As many of the reserve count as a reference view has views without a pose, whatever its batch has. Views stay in
+    rising order. Their gains are those of the preview, 0 of the replacements.
     """
     everything = [*traces, *reserve]
     index = torch.cat((choice.index, reserve_index))
-    order = _is_mute(everything).long().argsort(dim=0, stable=True)[: len(traces)]
+    is_mute = _is_mute(everything)
+    place = torch.arange(len(reserve), device=is_mute.device)[:, None]
+    is_mute[len(traces) :] |= place >= is_mute[: len(traces)].sum(0)
+    order = is_mute.long().argsort(dim=0, stable=True)[: len(traces)]
     order = order.gather(0, index.gather(0, order).argsort(dim=0, stable=True))
     rows = order, torch.arange(order.shape[1], device=order.device)
     names = [name for name in everything[0] if isinstance(everything[0][name], pytree.Record) and name != "samples"]

@@ -81,10 +81,6 @@ MAX_PRIOR_SHIFT_RATIO = 0.25
 #: Views that answer a sample from which on it is not searched for, a count. Source: derived, two can agree.
 ENOUGH_VIEWS = 2
 
-#: Fraction of the samples with texture that are tracked into enough views, below which samples are searched for without
-#: a prior. Source: chosen on apc_arm (.02 to .29) against kitchens, desk9 and holo_a (.50 to .92).
-MIN_TRACKED_RATIO = 0.4
-
 #: Least correlation of a match in a view that is used as a track of its own. Source: origin not recorded.
 MIN_MATCH_NCC = 0.7
 
@@ -213,9 +209,10 @@ def solve_pairs(
     hint: TrackHint,
     clock: StageTimer,
 ) -> Solved:
-    """Stages 5 and 6 of V views of each reference view, with ``method.guide`` after stage 5: (V · B) pairs.
+    """Stages 5 and 6 of V views of each reference view, (V · B) pairs; with a prior ``method.guide`` searches, too.
 
-    A prior's pose predicts where tracks begin a second time; of the poses with and without it that one is kept which
+    Without a prior a search lowers the coverage at a given error: matches are less exact than tracks. A prior's pose
+    predicts where tracks begin a second time; of the poses with and without it that one is kept which
     answers most. Under the poses kept, samples without an answer are searched for in all views together.
 
     Returns:
@@ -235,33 +232,20 @@ def solve_pairs(
 
     if method.guide is not None:
         tracks = tracks.replace(valid=tracks.valid & ~_is_attached(method, samples, tracks))
-    if method.guide is None or not (isinstance(fit, PosePrior) or any_possible(_is_poorly_tracked(views, tracks))):
+    if method.guide is None or not isinstance(fit, PosePrior):
         return solve(tracks, fit)
-    solved = solve(tracks, fit if isinstance(fit, PoseFit) else None)
-    if isinstance(fit, PosePrior):
-        start = InitialPose(fit.T_1_from_0, fit.cov, fit.hypotheses)
-        T, uses = fit.T_1_from_0, [] if isinstance(fit, InitialPose) else [fit]
-        for tolerance in GUIDED_TOLERANCES:
-            possible = _is_possible(samples, undistort_tracks(tracks, *cameras), *cameras, T, tolerance)
-            matches = _search_matches(views, T, wanted=None)
-            tracks = tracks.replace(valid=tracks.valid & possible)
-            tracks = clock("guide", _track_again(views, tracks, matches, hint))
-            started = solve(tracks, start)
-            T = select_batch(started[3].ok, started[3].T_1_from_0.detach().to(T.t.dtype), T)
-        solved = _most_answers(samples, [solved, solve(tracks, None), *(solve(tracks, use) for use in uses), started])
-    wanted = None if isinstance(fit, PosePrior) else _is_poorly_tracked(views, tracks)
-    return _answer_matches(views, solved, solve, clock, wanted)
-
-
-def _is_poorly_tracked(views: _Views, tracks: Tracks) -> Tensor:
-    """Reference views (B,) of whose samples with texture most are tracked into fewer views than can agree.
-
-    Elsewhere a search answers little and its matches, less exact than tracks, lower the coverage at a given error.
-    """
-    V, B = views.others.image.shape[:2]
-    textured = (views.samples.trackability >= views.method.min_trackability)[:B]
-    is_tracked = tracks.valid.unflatten(0, (V, B)).sum(0) >= min(V, ENOUGH_VIEWS)
-    return (is_tracked & textured).sum(-1) < MIN_TRACKED_RATIO * textured.sum(-1)
+    solved = solve(tracks, None)
+    start = InitialPose(fit.T_1_from_0, fit.cov, fit.hypotheses)
+    T, uses = fit.T_1_from_0, [] if isinstance(fit, InitialPose) else [fit]
+    for tolerance in GUIDED_TOLERANCES:
+        possible = _is_possible(samples, undistort_tracks(tracks, *cameras), *cameras, T, tolerance)
+        matches = _search_matches(views, T, wanted=None)
+        tracks = tracks.replace(valid=tracks.valid & possible)
+        tracks = clock("guide", _track_again(views, tracks, matches, hint))
+        started = solve(tracks, start)
+        T = select_batch(started[3].ok, started[3].T_1_from_0.detach().to(T.t.dtype), T)
+    solved = _most_answers(samples, [solved, solve(tracks, None), *(solve(tracks, use) for use in uses), started])
+    return _answer_matches(views, solved, solve, clock)
 
 
 def _without_far_noise(method: MethodSpec) -> MethodSpec | None:
@@ -365,16 +349,14 @@ def _answer_matches(
     solved: Solved,
     solve: Callable[[Tracks, PoseFit], Solved],
     clock: StageTimer,
-    wanted: Tensor | None,  # (B,) bool
 ) -> Solved:
-    """The result with unique matches of samples that no track answers as tracks of their own; None = of all views."""
+    """The result with unique matches of samples that no track answers as tracks of their own."""
     method, _, others, samples = views
     tracks, estimate, _, fit = solved
     V, B = others.image.shape[:2]
     textured = samples.trackability >= method.min_trackability
     answered = estimate.keep.unflatten(0, (V, B)).sum(0)
     few = (answered < min(V, ENOUGH_VIEWS)) & (textured & ~samples.usable)[:B]
-    few = few if wanted is None else few & wanted[:, None]
     open_ = ~estimate.keep.unflatten(0, (V, B)) & few
     matches = _search_matches(views, fit.T_1_from_0, few)
     matched = (open_ & matches.unique & (matches.ncc >= MIN_MATCH_NCC) & matches.uv_1.isfinite().all(-1)).flatten(0, 1)

@@ -71,8 +71,8 @@ MAP = PAPER.replace(
 WINDOW = MAP.replace(views=5)
 
 #: Source views are selected among those around the reference view; tracks start at the coarse flow of the whole image,
-#: whatever the exposures; what no track answers is searched for where the poses say. An answer needs consistent views
-#: or one with a small sigma, near returns that far points do not contradict, and poses without a large error that all
+#: whatever the exposures; with a pose prior, what no track answers is searched for. An answer needs consistent views or
+#: one with a small sigma, near returns that far points do not contradict, and poses without a large error that all
 #: points share. Single views may be uncertain: the sigma of the fused estimate counts.
 AUTO = MAP.replace(
     track=partial(

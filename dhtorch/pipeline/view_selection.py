@@ -86,7 +86,7 @@ def select_views_by_preview(
         good_sigma_rel: see :func:`rank_views`.
         prefer_tracked: whether views without an estimate are ordered by their tracks (:func:`tracked_motion`), not by
             their place alone.
-        reserve: how many of the next best replace selected views that turn out to have no answer; None = ``views``.
+        reserve: how many of the next best replace selected views that turn out to have no pose; None = ``views``.
 
     Raises:
         ValueError: wrong shapes, or not 1 <= views <= V.
@@ -221,7 +221,7 @@ def rank_views(
     A wide view has a smaller sigma, a near one sees more points. The information of a set of views is the sum over the
     points of log(1 + sum of (good_sigma_rel · depth / sigma)² over its views); views are added one by one, each time
     the one of largest gain; of equals, that of more ``motion`` (:func:`tracked_motion`), then the later one.
-    The ``reserve`` are those that would be added next.
+    The ``reserve`` are those that would be added next, the best first.
 
     Raises:
         ValueError: wrong shapes, or not 1 <= views <= V.
@@ -243,9 +243,8 @@ def rank_views(
     selection = ViewSelection(index, gain.flip(0).gather(0, index), ~is_answered.any(-1))
     if reserve < 1:
         return selection
-    is_next = ((rank >= views) & (rank < views + reserve)).flip(0)
-    order = is_next.long().argsort(dim=0, descending=True, stable=True)
-    return selection.replace(reserve=order[: min(V - views, reserve)])
+    order = rank.flip(0).argsort(dim=0, stable=True)
+    return selection.replace(reserve=order[views : min(V, views + reserve)])
 
 
 def _greedy_order(information: Tensor, preference: Tensor, count: int) -> tuple[Tensor, Tensor]:

@@ -41,6 +41,7 @@ def measured(method, whole, others, **options):
     return errors.measure_errors(errors.points_from_estimate(estimate, truth)), trace
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("refine", [False, True])
 def test_a_turn_that_no_track_follows_is_answered_rightly_with_a_prior(refine):
     (whole, other), (T,) = orbit(35)
@@ -52,6 +53,7 @@ def test_a_turn_that_no_track_follows_is_answered_rightly_with_a_prior(refine):
     assert guided["wrong_share"] < 0.1
 
 
+@pytest.mark.slow
 def test_a_wrong_prior_does_not_lower_coverage():
     (whole, other), (T,) = orbit(15)
     without, _ = measured(GUIDED, whole, other)
@@ -116,6 +118,7 @@ def test_a_match_has_the_gradient_of_a_trackers_last_step():
     assert gradient.abs().sum() > 0
 
 
+@pytest.mark.slow
 def test_without_a_guide_nothing_is_searched():
     (whole, other), (T,) = orbit(15)
     calls = []
