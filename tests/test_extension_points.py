@@ -190,6 +190,7 @@ assert "| `trackability` | (N,) | float32 | 1 | texture there |  |" in hooks.gen
 """)
 
 
+@pytest.mark.slow
 def test_a_gate_is_an_entry_and_the_line_that_sets_it(fork):
     entry = '    TOO_FAR: Final = code(13, "beyond a metre", meaning="too far for a test", advice="go closer")\n\n\n'
     fork.insert("dhtorch/codes.py", "class PoseCode(CodeTable):", entry)

@@ -214,6 +214,7 @@ def test_poses_that_are_constant_or_turn_only() -> None:
     assert "the camera turns but does not move: there is no baseline" in warned(frames, poses=turning)
 
 
+@pytest.mark.slow
 def test_poses_that_jump_or_contradict_the_depth() -> None:
     frames = walk(6)
     good = recording(frames).poses

@@ -138,6 +138,7 @@ def test_bounds_of_a_recording():
     assert _wrong_lower_bound([nothing]) is None
 
 
+@pytest.mark.slow
 def test_maps_that_are_cut_are_told(tmp_path, maps, room):
     for file in maps.glob("*.npy"):
         np.save(file, np.minimum(np.load(file), np.float32(2.55)))

@@ -227,6 +227,7 @@ def test_networks_are_measured_on_our_candidates(room, installed):
     storage.to_strict_json(outcome.rows)
 
 
+@pytest.mark.slow
 def test_a_network_is_asked_once_for_all_its_scales(room, installed):
     calls = []
 

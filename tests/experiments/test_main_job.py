@@ -39,6 +39,7 @@ def scene_row(outcome, **wanted):
     return row
 
 
+@pytest.mark.slow
 def test_exact_room_without_sensor_noise():
     """Median error of recovered far depth < 1 %, silently wrong < 0.5 %; mirror and window are counted apart."""
     room = rendered(lidar="exact", image_noise=0.0, hw=(240, 320), n_frames=8, supersample=2)

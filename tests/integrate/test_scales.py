@@ -59,6 +59,7 @@ def seen(room, sigma_rel):
     return read
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_rel", [0.01, 0.06])
 def test_swept_depth_is_in_the_map_however_unsure_it_is(room, sigma_rel):
     read, voxel = seen(room, sigma_rel), 0.02

@@ -193,6 +193,7 @@ def test_wrong_shapes_are_refused():
         verify_views(samples, tracks[:1], fits, estimates)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stress", "gate", "positions"),
     [

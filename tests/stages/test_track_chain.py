@@ -92,6 +92,7 @@ def test_no_image_is_used_where_none_is_asked():
     assert all(torch.equal(getattr(jump, name), getattr(chain, name)) for name in FIELDS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("track", [lucas_kanade, lucas_kanade_kornia])
 def test_drift_does_not_add_up_with_the_number_of_hops(track):
     def spread(hops, register):

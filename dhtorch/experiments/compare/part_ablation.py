@@ -116,7 +116,7 @@ def run(
         name: method for group in ABLATION_GROUPS if group in groups for name, method in ablations[group].items()
     }
     options: dict[str, Any] = {"once": (), "seeds": seeds, "stand_ins": _SPARSE_SCENE_STAND_INS, "progress": progress}
-    outcome = method_comparison.run(scenes, {}, pairs, settings, methods=variants, **options)
+    outcome = method_comparison.run(scenes, {}, pairs, settings, methods=variants, baselines=("window",), **options)
     pair_ms = {name: _median_pair_ms(outcome, name) for name in variants}
     for name, ms in pair_ms.items():
         extra = None if ms is None or pair_ms["paper"] is None else ms - pair_ms["paper"]
@@ -192,7 +192,8 @@ def _swap_gates(names: Sequence[str], method: Method, other: Method) -> Method:
 
 #: Stages and options of a method that are a part of their own where they differ.
 _COMPARED_STAGES = (
-    *("sample", "backproject", "classify", "pose", "verify", "triangulate", "n", "hypotheses", "min_trackability"),
+    *("sample", "backproject", "classify", "pose", "verify", "triangulate", "verify_views", "guide", "n"),
+    *("pose_samples", "hypotheses", "min_trackability"),
 )
 
 #: Limit of the sigma of a single view, before views are fused.

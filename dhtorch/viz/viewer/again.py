@@ -34,7 +34,8 @@ _ALLOWED_MODULES = {
         *(
             f"dhtorch.stages.{name}"
             for name in (
-                *("sample", "backproject", "holes", "track", "pose", "misalignment", "triangulate", "score", "fuse"),
+                *("sample", "backproject", "holes", "track", "track_chain", "guided_search", "pose", "misalignment"),
+                *("triangulate", "shared_error", "score", "fuse"),
                 *(f"kornia.{name}" for name in ("backproject", "holes", "track", "pose", "triangulate")),
             )
         ),
