@@ -116,9 +116,7 @@ def test_every_difference_of_auto_belongs_to_one_part(every):
     assert variants["- hypotheses of auto"].hypotheses == window.hypotheses
     names = part_ablation.build_auto_ablations(window, every["auto"])
     new = ("verify", "verify_views", "guide", "pose_samples")
-    assert [name for name in names if "of auto" in name] == [
-        f"{sign} {part} of auto" for sign in "+-" for part in new
-    ]
+    assert [name for name in names if "of auto" in name] == [f"{sign} {part} of auto" for sign in "+-" for part in new]
     known = other.replace(triangulate={"residual_px": 0.3})
     assert "+ triangulate of auto" in part_ablation.build_auto_ablations(window, known)
 
