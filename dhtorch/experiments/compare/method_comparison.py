@@ -62,7 +62,7 @@ def run(
     twins: Sequence[str] = ("kornia",),
     seeds: int = 5,
     stand_ins: Mapping[str, str] | None = None,
-    baselines: Sequence[str] = ("window",),
+    baselines: Sequence[str] = ("auto_2",),
     indoor: Sequence[str] = (),
     moving: Sequence[str] = (),
     progress: Progress = protocol.no_progress,
