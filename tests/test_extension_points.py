@@ -127,6 +127,7 @@ def read(root):
 '''
 
 
+@pytest.mark.slow
 def test_a_reader_is_a_module_and_a_line(fork):
     fork.write("dhtorch/data/readers/stacked.py", READER)
     fork.insert("dhtorch/data/__init__.py", "    frames_dir,\n", "    stacked,\n")

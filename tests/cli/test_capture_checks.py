@@ -156,6 +156,7 @@ def test_inspect_shows_unit_agreement_and_findings(refuted):
     assert corrected.warnings == [] and dict(corrected.facts)["unit"] == "depth unit: 1/1000 m (option depth_unit)"
 
 
+@pytest.mark.slow
 def test_a_refuted_capture_is_joined_by_the_motion_of_near_returns(refuted, tmp_path, command):
     little = ["method=map", "method.n=512", "planes=16", "steps=[2]", "mesh=false", "threads=1"]
     with pytest.warns(UserWarning, match="these look like OpenGL camera axes"):

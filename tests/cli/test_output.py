@@ -62,6 +62,7 @@ def said(frames, tmp_path_factory):
     return folder, done
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # seconds of work, but a busy machine stretches them
 def test_a_normal_run_of_any_word_says_nothing_on_stderr(said):
     """Neither progress nor warnings, our own or other libraries'."""
@@ -83,6 +84,7 @@ def test_folders_of_jobs_have_such_names_whatever_the_options():
         assert not REFUSED.search(job_name(text)), job_name(text)
 
 
+@pytest.mark.slow
 def test_quiet_says_where_the_result_is_and_no_more(command, tmp_path):
     code, out, err = command("-q", *TINY, "output=job")
     assert (code, err) == (0, "") and out.strip() == str(tmp_path / "job" / "result.json")
@@ -137,6 +139,7 @@ def test_progress_is_for_terminals(monkeypatch, stream, level, drawn):
     assert drawn or shown.getvalue() == ""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="a terminal is made by a POSIX call")
 def test_no_color(tmp_path):
     """On a terminal of its own: a warning in yellow, and without colour where NO_COLOR asks for that."""

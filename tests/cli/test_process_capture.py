@@ -56,6 +56,7 @@ def test_the_page_begins_with_the_numbers_and_the_picture(made):
     assert "kitchen, frame" in opening and ", with frame" in opening, "whose picture, and of which views"
 
 
+@pytest.mark.slow
 def test_it_says_what_it_is_what_was_recovered_and_what_to_do_next(capture, made, tmp_path, capsys):
     before = {p: p.stat().st_mtime_ns for p in (made / "meta").iterdir()}
     assert main(["recover", str(capture), f"out={made}", *SMALL]) == 0

@@ -93,6 +93,7 @@ def strike(robot, folder, moments):
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moments", [2, pytest.param(0, marks=[pytest.mark.slow, pytest.mark.timeout(1800)])])
 def test_killed_at_any_moment_or_out_of_disk_it_ends_with_the_same_bytes(moments, robot, whole, tmp_path):
     before = digest(robot)

@@ -159,6 +159,7 @@ def test_episodes_keep_their_numbers(robot, command):
         features.at(1, 0)
 
 
+@pytest.mark.slow
 def test_workers_make_the_same_files(robot, command):
     assert command(*asked(robot))[0] == 0
     code, _, err = command(*asked(robot, "workers=2", out="other"))

@@ -21,6 +21,7 @@ def capture():
     return example.load_capture(SyntheticRoom(path="orbit", **options))
 
 
+@pytest.mark.slow
 def test_planted_errors_are_recovered(capture):
     """In less than half of the steps, on few pixels, from a start without errors: the focal length within 1.5 %, the
     scale within 2 %, and the time offset, which is still moving, far from none."""

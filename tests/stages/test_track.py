@@ -276,6 +276,7 @@ def test_no_points():
     assert refine_tracks(src, src, torch.zeros(2, 0, 2), torch.zeros(2, 0, 2)).shape == (2, 0, 2)
 
 
+@pytest.mark.slow
 def test_mapped_and_captured_with_a_graph_it_equals_eager():
     """The search picks out points by value in eager mode only; a graph or vmap sees fixed shapes and the same answers."""
     src, dst = scene(2, 70, 90, dtype=torch.float32), scene(2, 70, 90, (6.0, 2.0), dtype=torch.float32)

@@ -208,6 +208,7 @@ def test_frames_that_are_decoded_already_are_not_decoded_again(frames, true):
     assert check_capture(whole, dict(enumerate(frames))).poses.n_pairs > 2
 
 
+@pytest.mark.slow
 def test_little_is_enough(frames, true):
     """One frame, no depth, no texture, and sparse depth: no finding and no error."""
     assert check_capture(recording(frames[:1], true[:1])).findings == ()
