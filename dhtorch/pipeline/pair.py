@@ -212,8 +212,9 @@ def solve_pairs(
     """Stages 5 and 6 of V views of each reference view, (V · B) pairs; with a prior ``method.guide`` searches, too.
 
     Without a prior a search lowers the coverage at a given error: matches are less exact than tracks. A prior's pose
-    predicts where tracks begin a second time; of the poses with and without it that one is kept which
-    answers most. Under the poses kept, samples without an answer are searched for in all views together.
+    predicts where tracks begin a second time; of the poses with and without it that one is kept which answers most.
+    Under the poses kept, samples without an answer are searched for in all views together. A method without a guide is
+    not changed by any of this.
 
     Returns:
         Tracks, the estimate, the tracks in ideal pixels, and the poses.
@@ -225,7 +226,8 @@ def solve_pairs(
     def solve(tracks: Tracks, use: PoseFit | PosePrior | None) -> Solved:
         run = partial(solve_pose_and_triangulate, samples=samples, tracks=tracks, seed=seed, clock=clock)
         estimate, usable, pose = run(method, camera_0=cameras[0], camera_1=cameras[1], fit=use)
-        if use is not None and isinstance(fit, PosePrior) and (unmoved := _without_far_noise(method)) is not None:
+        is_guided = method.guide is not None and use is not None and isinstance(fit, PosePrior)
+        if is_guided and (unmoved := _without_far_noise(method)) is not None:
             free, _, _ = run(unmoved, camera_0=cameras[0], camera_1=cameras[1], fit=pose)
             estimate = select_batch(_agrees(pose, fit.T_1_from_0), free, estimate)
         return tracks, estimate, usable, pose

@@ -7,7 +7,7 @@ import pytest
 import torch
 from support.rooms import room
 
-from dhtorch.codes import Hole
+from dhtorch.codes import Gate, Hole
 from dhtorch.geometry import se3
 from dhtorch.metrics import errors, holdout
 from dhtorch.pipeline.presets import AUTO
@@ -133,3 +133,14 @@ def test_without_a_guide_nothing_is_searched():
     assert not calls
     measured(GUIDED.replace(guide=guide), whole, other, fit=make_prior(T))
     assert len(calls) == 3  # under the prior's pose, under the refined one, and for what no track answers
+
+
+def test_a_prior_lifts_no_limit_of_a_method_without_a_guide():
+    """Nor of the frozen methods: near returns that contradict far tracks stay contradicted."""
+    (whole, other), (T,) = orbit(6)
+    strict = {"triangulate": {"max_far_noise": 1e-9}}
+    prior, seen = make_prior(T), holdout.range_split(whole, NEAR_M)
+    assert PLAIN(seen, other, fit=prior).keep.any()
+    refused = PLAIN(seen, other, fit=prior, **strict)
+    assert not refused.keep.any() and (refused.gate == Gate.CONTRADICTED).any()
+    assert GUIDED(seen, other, fit=prior, **strict).keep.any(), "the guide's poses agree with the prior"
