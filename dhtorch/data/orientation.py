@@ -302,9 +302,20 @@ def edge_correlations(a: Tensor, b: Tensor, masks: Tensor) -> Tensor:
     count = weight.sum(1).double().clamp_min(1)
     a, b = a.flatten(2), b.flatten(2) * weight[:, None]
     sum_a, sum_b = torch.einsum("ncp,mp->nmc", a, weight).double(), b.sum(2).double()
-    square_a = (a.square().sum(1) @ weight.T).double() - sum_a.square().sum(2) / count
-    square_b = b.square().sum((1, 2)).double() - sum_b.square().sum(1) / count
-    product = (a.flatten(1) @ b.flatten(1).T).double() - (sum_a * sum_b).sum(2) / count
+    square_a, square_b = (a.square().sum(1) @ weight.T).double(), b.square().sum((1, 2)).double()
+    return correlation_of_sums(count, sum_a, sum_b, square_a, square_b, (a.flatten(1) @ b.flatten(1).T).double())
+
+
+def correlation_of_sums(
+    count: Tensor, sum_a: Tensor, sum_b: Tensor, square_a: Tensor, square_b: Tensor, product: Tensor
+) -> Tensor:
+    """Sums over ``count`` places of two vector fields (..., 3), of squares and products (...) -> correlation (...).
+
+    0 where one of the fields is constant. Gradient: none.
+    """
+    square_a = square_a - sum_a.square().sum(-1) / count
+    square_b = square_b - sum_b.square().sum(-1) / count
+    product = product - (sum_a * sum_b).sum(-1) / count
     return product / (square_a * square_b).clamp_min(0).sqrt().clamp_min(1e-12)
 
 

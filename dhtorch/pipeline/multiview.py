@@ -94,22 +94,14 @@ def estimate_multiview(
     start_time = time.perf_counter()
     traces = _verify_views(method, samples, traces)
     if samples.uv.shape[1] > n:
-        samples = without_added(samples, n)
-        traces = [_without_added(t, n) for t in traces]
+        traces = [without_added(t, n) for t in traces]
     last = traces[-1]
     estimate = method.fuse(stack([t["estimate"] for t in traces]))
-    estimate = method.score(estimate, samples, last["tracks_ideal"], last["fit"])
+    estimate = method.score(estimate, last["samples"], last["tracks_ideal"], last["fit"])
     ms["fuse"] = 1e3 * (time.perf_counter() - start_time)
     if trace is not None:
         trace.update({**last, "estimate": estimate, "ms": ms, "views": traces, "choice": choice})
     return estimate
-
-
-def _without_added(trace: Trace, n: int) -> Trace:
-    """The trace of a view without the samples after the n-th, which only its pose used."""
-    fit: PoseFit = trace["fit"]
-    records = {name: without_added(trace[name], n) for name in ("samples", "tracks", "tracks_ideal", "estimate")}
-    return {**trace, **records, "fit": fit.replace(inlier=fit.inlier[:, :n])}
 
 
 def _verify_views(method: MethodSpec, samples: Samples, traces: list[Trace]) -> list[Trace]:
@@ -123,7 +115,8 @@ def _verify_views(method: MethodSpec, samples: Samples, traces: list[Trace]) -> 
 
 def _is_mute(traces: Sequence[Trace]) -> Tensor:
     """Whether views (V, B) have no pose. Those without a baseline, or contradicted, are evidence and are kept."""
-    return torch.stack([(t["estimate"].gate <= Gate.NO_POSE).all(-1) & ~t["estimate"].keep.any(-1) for t in traces])
+    gates = torch.stack([t["estimate"].gate for t in traces])
+    return ((gates > Gate.ANSWER) & (gates <= Gate.NO_POSE)).all(-1)
 
 
 def _replace_mute_views(

@@ -124,15 +124,13 @@ def estimate_pair(
     )
     if method.verify_views is not None:
         estimate = method.verify_views(samples, *(stack([x]) for x in (usable, solved, estimate)))[0]
+    parts = {"samples": samples, "tracks": tracks, "tracks_ideal": usable, "fit": solved, "estimate": estimate}
     if samples.uv.shape[1] > n:
-        samples = without_added(samples, n)
-        tracks = without_added(tracks, n)
-        usable = without_added(usable, n)
-        estimate = without_added(estimate, n)
-        solved = solved.replace(inlier=solved.inlier[:, :n])
-    estimate = clock("score", method.score(estimate, samples, usable, solved))
+        parts = without_added(parts, n)
+    estimate = method.score(*(parts[name] for name in ("estimate", "samples", "tracks_ideal", "fit")))
+    estimate = clock("score", estimate)
     if trace is not None:
-        trace.update(samples=samples, tracks=tracks, tracks_ideal=usable, fit=solved, estimate=estimate)
+        trace.update({**parts, "estimate": estimate})
     return estimate
 
 
@@ -170,9 +168,12 @@ def add_pose_samples(method: MethodSpec, frame: Frame, samples: Samples) -> Samp
     return pytree.collate((samples, added), dim=1)
 
 
-def without_added(record: R, n: int) -> R:
-    """A record of samples, tracks or estimates (…, N) without those after the n-th."""
-    return record.map(lambda x: x[:, :n])
+def without_added(trace: Trace, n: int) -> Trace:
+    """The trace of a pair without the samples (…, N) after the n-th, which only its pose used."""
+    fit: PoseFit = trace["fit"]
+    names = "samples", "tracks", "tracks_ideal", "estimate"
+    cut = {name: trace[name].map(lambda x: x[:, :n]) for name in names}
+    return {**trace, **cut, "fit": fit.replace(inlier=fit.inlier[:, :n])}
 
 
 def track_in_chunks(method: MethodSpec, image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
@@ -226,8 +227,8 @@ def solve_pairs(
     def solve(tracks: Tracks, use: PoseFit | PosePrior | None) -> Solved:
         run = partial(solve_pose_and_triangulate, samples=samples, tracks=tracks, seed=seed, clock=clock)
         estimate, usable, pose = run(method, camera_0=cameras[0], camera_1=cameras[1], fit=use)
-        is_guided = method.guide is not None and use is not None and isinstance(fit, PosePrior)
-        if is_guided and (unmoved := _without_far_noise(method)) is not None:
+        unmoved = None if method.guide is None or use is None else _without_far_noise(method)
+        if unmoved is not None and isinstance(fit, PosePrior):
             free, _, _ = run(unmoved, camera_0=cameras[0], camera_1=cameras[1], fit=pose)
             estimate = select_batch(_agrees(pose, fit.T_1_from_0), free, estimate)
         return tracks, estimate, usable, pose

@@ -21,6 +21,7 @@ from dhtorch.geometry.determinism import pad_elementwise
 from dhtorch.geometry.patches import is_inside_picture
 from dhtorch.pipeline.pair import (
     StageTimer,
+    repeat_views,
     sample_returns,
     solve_pose_and_triangulate,
     track_in_chunks,
@@ -101,8 +102,8 @@ def select_views_by_preview(
         samples = _preview_samples(reference, near)
         flat = downscale_frame(others.map(lambda x: x.flatten(0, 1)), long)[0]
         estimate, tracks = _preview_pairs(
-            reference.map(lambda x: x.expand(V, *x.shape).flatten(0, 1)),
-            samples.map(lambda x: x.expand(V, *x.shape).flatten(0, 1)),
+            repeat_views(reference, V),
+            repeat_views(samples, V),
             flat,
             None if fit is None else fit.map(lambda x: x.flatten(0, 1)),
         )
@@ -145,13 +146,8 @@ def select_views_by_pose(
         uv = spiral(reference.hw, PREVIEW_METHOD.n, device=depth.device, dtype=reference.camera.f.dtype)
         uv = uv.expand(len(depth), *uv.shape)
         xyz = cam.unproject(reference.camera, uv, depth[:, None].expand(uv.shape[:2]).to(uv.dtype))
-        information = torch.stack(
-            [_information(xyz, others[v], T_1_from_0[v], good_sigma_rel) for v in range(V)]
-        ).double()
-        information = information.flip(0)
-        rank, gain = _greedy_order(information, torch.zeros_like(information[..., 0]), views)
-        index = (rank < views).flip(0).long().argsort(dim=0, descending=True, stable=True)[:views]
-        return ViewSelection(index, gain.flip(0).gather(0, index))
+        information = [_information(xyz, others[v], T_1_from_0[v], good_sigma_rel) for v in range(V)]
+        return _select_greedily(torch.stack(information).double(), views)
 
 
 def _information(xyz: Tensor, frame: Frame, T: Pose, good_sigma_rel: float) -> Tensor:
@@ -233,28 +229,26 @@ def rank_views(
         raise ValueError(f"rank_views: views is {views}, expected 1 to {V}")
     is_answered = estimates.keep & (estimates.sigma > 0) & estimates.sigma.isfinite()
     ratio = good_sigma_rel * estimates.depth / torch.where(is_answered, estimates.sigma, 1.0)
-    # Reversed: argmax takes the first of equals.
-    information = torch.where(is_answered, ratio, 0.0).detach().double().square().flip(0)
-    preference = torch.zeros_like(information[..., 0])
-    if motion is not None:
-        preference = TIE_WEIGHT * motion.detach().double().flip(0)
-    rank, gain = _greedy_order(information, preference, min(V, views + reserve))
-    index = (rank < views).flip(0).long().argsort(dim=0, descending=True, stable=True)[:views]
-    selection = ViewSelection(index, gain.flip(0).gather(0, index), ~is_answered.any(-1))
-    if reserve < 1:
-        return selection
-    order = rank.flip(0).argsort(dim=0, stable=True)
-    return selection.replace(reserve=order[views : min(V, views + reserve)])
+    information = torch.where(is_answered, ratio, 0.0).detach().double().square()
+    preference = None if motion is None else TIE_WEIGHT * motion.detach().double()
+    selection = _select_greedily(information, views, preference, reserve)
+    return selection.replace(no_answer=~is_answered.any(-1))
 
 
-def _greedy_order(information: Tensor, preference: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Rank (V, B) of views by information (V, B, N) where they are added one by one, V for those that are not, and the
-    gain of each."""
+def _select_greedily(
+    information: Tensor, views: int, preference: Tensor | None = None, reserve: int = 0
+) -> ViewSelection:
+    """Views of most information (V, B, N), added one by one, with their gains, and the ``reserve`` next ones.
+
+    ``preference`` (V, B) is added to the gain where the best is chosen.
+    """
     V = len(information)
+    information = information.flip(0)  # argmax takes the first of equals
+    preference = torch.zeros_like(information[..., 0]) if preference is None else preference.flip(0)
     selected_information = torch.zeros_like(information[0])
     rank = torch.full_like(preference, V, dtype=torch.int64)
     added = torch.zeros_like(preference)
-    for k in range(count):
+    for k in range(min(V, views + reserve)):
         gain = (
             pad_elementwise(torch.log1p, selected_information + information).sum(-1).masked_fill(rank < V, -torch.inf)
         )
@@ -262,4 +256,7 @@ def _greedy_order(information: Tensor, preference: Tensor, count: int) -> tuple[
         added = torch.where(best, gain - pad_elementwise(torch.log1p, selected_information).sum(-1), added)
         selected_information = selected_information + torch.where(best[..., None], information, 0.0).sum(0)
         rank = torch.where(best, k, rank)
-    return rank, added
+    order = rank.flip(0).argsort(dim=0, stable=True)
+    index = order[:views].sort(dim=0).values
+    next_best = order[views : min(V, views + reserve)] if reserve > 0 else None
+    return ViewSelection(index, added.flip(0).gather(0, index), reserve=next_best)

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.data.orientation import depth_edges, edge_correlations, picture_edges
+from dhtorch.data.orientation import correlation_of_sums, depth_edges, edge_correlations, picture_edges
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.pipeline.dense import map_pixel_centres
@@ -118,9 +118,8 @@ def _shifted_scores(picture: Tensor, edges: Tensor, covered: Tensor) -> Tensor:
 
     edges = edges * mask
     count = mask.sum().double().clamp_min(1)
-    sum_a = sums(picture, mask)
+    sum_a = sums(picture, mask).T
     sum_b = edges.sum((1, 2)).double()
-    square_a = sums(picture.square().sum(0), mask) - sum_a.square().sum(0) / count
-    square_b = edges.square().sum().double() - sum_b.square().sum() / count
-    product = sums(picture, edges).sum(0) - (sum_a * sum_b[:, None]).sum(0) / count
-    return product / (square_a * square_b).clamp_min(0).sqrt().clamp_min(1e-12)
+    square_a = sums(picture.square().sum(0), mask)
+    square_b = edges.square().sum().double()
+    return correlation_of_sums(count, sum_a, sum_b, square_a, square_b, sums(picture, edges).sum(0))

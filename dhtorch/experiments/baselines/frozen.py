@@ -21,6 +21,18 @@ from dhtorch.stages.score import confidence_from_error, confidence_from_sigma
 from dhtorch.stages.track import lucas_kanade, lucas_kanade_affine
 from dhtorch.stages.triangulate import two_view
 
+_LUCAS_KANADE = partial(
+    lucas_kanade,
+    window=21,
+    levels=4,
+    iterations=30,
+    epsilon_px=0.01,
+    max_round_trip_px=1.0,
+    normalise="none",
+    min_eigenvalue=1.5747789311803154e-06,
+    start=None,
+)
+
 #: First release, one source view: pose from near and far tracks together, a sigma for every answer.
 MAP_1 = Method(
     sample=partial(
@@ -50,17 +62,7 @@ MAP_1 = Method(
     ),
     track=partial(
         lucas_kanade_affine,
-        track=partial(
-            lucas_kanade,
-            window=21,
-            levels=4,
-            iterations=30,
-            epsilon_px=0.01,
-            max_round_trip_px=1.0,
-            normalise="none",
-            min_eigenvalue=1.5747789311803154e-06,
-            start=None,
-        ),
+        track=_LUCAS_KANADE,
         window=21,
         levels=5,
         iterations=7,
@@ -144,17 +146,7 @@ WINDOW_1 = MAP_1.replace(views=5)
 #: Second release: five source views, selected by previews; consistent or sure estimates are fused.
 AUTO_2 = MAP_1.replace(
     track={
-        "track": partial(
-            lucas_kanade,
-            window=21,
-            levels=4,
-            iterations=30,
-            epsilon_px=0.01,
-            max_round_trip_px=1.0,
-            normalise="bias",
-            min_eigenvalue=1.5747789311803154e-06,
-            start=None,
-        ),
+        "track": partial(_LUCAS_KANADE, normalise="bias"),
         "start": partial(
             coarse_flow,
             reach=0.25,
