@@ -10,7 +10,7 @@ new code has a text everywhere and, until ``viz.plots.colours`` defines one for 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 import torch
 from torch import Tensor
@@ -178,6 +178,7 @@ class Source(CodeTable):
     RECOVERED: Final = code(2, "a tracked sample, triangulated")
     SWEPT: Final = code(3, "a pixel of a dense map, matched along its epipolar line")
     ALIGNED: Final = code(4, "a pixel of an external depth map, aligned to returns and recovered depths")
+    FILLED: Final = code(5, "a pixel of a dense map, interpolated from neighbours on the same surface")
 
 
 class State(CodeTable):
@@ -211,6 +212,14 @@ class WrongCause(CodeTable):
         meaning="edges that bleed over the neighbouring surface",
         advice="leave out a few pixels along outlines, or upsample depth less",
     )
+
+
+def is_swept(source: Any) -> Any:
+    """Whether a pixel of a dense map has a depth without a return: matched, or interpolated from such neighbours.
+
+    ``source``: a tensor or an array of codes of :class:`Source`; the result is of the same kind, bool.
+    """
+    return (source == Source.SWEPT) | (source == Source.FILLED)
 
 
 def describe(table: type[CodeTable], name: str) -> CodeEntry | None:

@@ -276,8 +276,11 @@ def _count_pixels(steps: export.QuantisedDepth, depth_map: DepthMap) -> Row:
     """Pixel counts by source, and fractions of all pixels without an answer, by reason."""
     kinds = {code: name.lower() for code, name in names(Source).items() if name.lower() in _SOURCE_LABELS}
     pixels = {name: int((steps.source == code).sum()) for code, name in kinds.items()}
-    if aligned := int((steps.source == Source.ALIGNED).sum()):
-        pixels["aligned"] = aligned
+    others = {
+        "aligned": int((steps.source == Source.ALIGNED).sum()),
+        "filled": int((steps.source == Source.FILLED).sum()),
+    }
+    pixels |= {name: n for name, n in others.items() if n}
     gates = {name.lower(): float((depth_map.gate == code).double().mean()) for code, name in names(Gate).items()}
     no_answer = {name: share for name, share in gates.items() if share and name != "answer"}
     return {"pixels": pixels, "no_answer": {**no_answer, "unfit": float(steps.unfit.mean())}}
@@ -350,6 +353,7 @@ def _format_summary(task: CompletionTask, n_untouched: int) -> str:
     for row in rows:
         pixels.update(row["pixels"])
         no_answer.update({k: share / len(rows) for k, share in row["no_answer"].items()})
+    pixels["swept"] += pixels.pop("filled", 0)
     sensor, swept, none = (f"{kind} {pixels[k] / pixels.total():.1%}" for k, kind in _SOURCE_LABELS.items())
     unfit = no_answer.pop("unfit")
     reasons = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in no_answer.most_common())

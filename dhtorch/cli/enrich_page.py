@@ -40,7 +40,7 @@ _MIN_REASON_SHARE = 5e-4
 #: Kind of a pixel → its source codes.
 _CODES_OF_KIND = {
     "sensor": (Source.SENSOR,),
-    "recovered": (Source.RECOVERED, Source.SWEPT),
+    "recovered": (Source.RECOVERED, Source.SWEPT, Source.FILLED),
     "no_answer": (Source.NONE,),
 }
 _REASON_COLOURS = {**GATE_COLOURS, NO_OTHER_VIEW: SOFT}

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from dhtorch import export
-from dhtorch.codes import Source
+from dhtorch.codes import Source, names
 from dhtorch.data.recording import Recording
 from dhtorch.export.frames import MAX_DEPTH_CODE, SIGMA_STEPS_PER_DEPTH_STEP
 from dhtorch.geometry.camera import from_matrix
@@ -34,7 +34,7 @@ Row = Mapping[str, Any]
 _SPARSE_DEPTH_STEP_M = 0.005
 
 #: codes.Source → confidence value of a Stray capture.
-_STRAY_CONFIDENCE = {Source.NONE: 0, Source.SENSOR: 2, Source.RECOVERED: 1, Source.SWEPT: 1, Source.ALIGNED: 1}
+_STRAY_CONFIDENCE = dict.fromkeys(names(Source), 1) | {Source.NONE: 0, Source.SENSOR: 2}
 
 #: Files of a Stray capture that do not depend on its depth.
 _STRAY_FILES = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")

@@ -10,7 +10,7 @@ import numpy as np
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli import gate_messages as reasons
 from dhtorch.cli.completed_folder import CompletionTask, Row
-from dhtorch.codes import Source
+from dhtorch.codes import is_swept
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.recording import Recording
 from dhtorch.runtime.console import format_count
@@ -46,11 +46,16 @@ def measure_recovery(task: CompletionTask, frames: Sequence[int]) -> RecoverySta
     """Statistics of complete frames."""
     rows = [task.done[task.name(i)] for i in frames]
     totals = [sum(row["pixels"].values()) for row in rows]
+
+    def n_of(row: Row, kind: str) -> int:
+        pixels = row["pixels"]
+        return pixels.get(kind, 0) + (pixels.get("filled", 0) if kind == "swept" else 0)
+
     fraction = {
-        kind: float(np.mean([row["pixels"].get(kind, 0) / n for row, n in zip(rows, totals, strict=True)]))
+        kind: float(np.mean([n_of(row, kind) / n for row, n in zip(rows, totals, strict=True)]))
         for kind in ("sensor", "swept", "none")
     }
-    pixels = sum(row["pixels"].get("swept", 0) for row in rows) / len(rows)
+    pixels = sum(n_of(row, "swept") for row in rows) / len(rows)
     depth_stats: dict[str, float] = {}
     depth, ratio = _read_swept_pixels(task, frames)
     if len(depth):
@@ -67,7 +72,7 @@ def _read_swept_pixels(task: CompletionTask, frames: Sequence[int]) -> tuple[np.
     depth, ratio = [np.zeros(0)], [np.zeros(0)]
     for i in frames[:_MAX_MEASURED_FRAMES]:
         maps, source = completed.read_completed_maps(task, i)
-        swept = (source == Source.SWEPT) & (maps["depth"] > 0)
+        swept = is_swept(source) & (maps["depth"] > 0)
         depth.append(maps["depth"][swept])
         ratio.append(maps["sigma"][swept] / maps["depth"][swept])
     return np.concatenate(depth), np.concatenate(ratio)

@@ -116,7 +116,7 @@ def test_figures_leave_nothing_behind(tmp_path):
 
 
 def test_blue_is_the_sensor_orange_what_was_recovered_purple_what_was_swept_and_nothing_else():
-    own = {colours.SENSOR, colours.RECOVERED, colours.SWEPT, colours.ALIGNED}
+    own = {colours.SENSOR, colours.RECOVERED, colours.SWEPT, colours.ALIGNED, colours.FILLED}
     others = [
         *colours.METHOD_COLOURS.values(),
         *colours.SERIES_COLOURS,

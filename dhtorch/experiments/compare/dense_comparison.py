@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Gate, Source
+from dhtorch.codes import Gate, is_swept
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
@@ -257,7 +257,7 @@ def sample_map(depth_map: DepthMap, samples: Samples, frame: Frame) -> Estimate:
         sample_nearest(x.to(depth_map.depth), map_uv)[0]
         for x in (depth_map.depth, depth_map.sigma, depth_map.score, depth_map.source, depth_map.gate)
     )
-    keep = source == Source.SWEPT
+    keep = is_swept(source)
     gate = torch.where(gate == Gate.ANSWER, Gate.NO_TRACK, gate)
     return Estimate.unanswered(samples, Gate.NO_TRACK, n_views=2).replace(
         depth=torch.where(keep, depth, torch.nan),

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.codes import PoseCode, Source
+from dhtorch.codes import PoseCode, is_swept
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
@@ -81,7 +81,7 @@ def _evaluate_room(seed: int, method: Method, options: Mapping[str, Any]) -> tup
             **options,
         )
     evaluated = evaluated_pixels(reference, other, _odd_surface_mask(room, _VIEW_FRAMES[0]))
-    answered = evaluated & (depth_map.source == Source.SWEPT)
+    answered = evaluated & is_swept(depth_map.source)
     right = answered & ((depth_map.depth - reference.depth).abs() < _MAX_RELATIVE_ERROR * reference.depth)
     return int(right.sum()), int(answered.sum()), int(evaluated.sum())
 

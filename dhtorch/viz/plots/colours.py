@@ -18,6 +18,7 @@ from dhtorch.codes import CodeTable, Gate, Hole, Source, State, names
 
 #: What a depth comes from; pixels without an answer are paler.
 SENSOR, RECOVERED, SWEPT, ALIGNED, UNANSWERED = "#0072B2", "#E69F00", "#C653A6", "#3F8F6B", "#B4B4B4"
+FILLED = "#7A5AA8"
 
 #: Variable of the pages → its colour by day and in the dark. Figures are drawn in those of the day.
 PAGE_COLOURS = {
@@ -98,6 +99,7 @@ _SOURCE_COLOURS = {
     Source.RECOVERED: RECOVERED,
     Source.SWEPT: SWEPT,
     Source.ALIGNED: ALIGNED,
+    Source.FILLED: FILLED,
 }
 
 SOURCE_COLOURS = _with_defaults(Source, _SOURCE_COLOURS)

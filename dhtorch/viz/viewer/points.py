@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dhtorch.codes import Gate, Hole, Source
+from dhtorch.codes import Gate, Hole, Source, is_swept
 from dhtorch.geometry.se3 import turn_between
 from dhtorch.viz.viewer.exhibit import EMPTY_SWEPT_CLOUD, Exhibit, PairExhibit, SweptPointCloud
 
@@ -45,9 +45,9 @@ def read_ply_exhibit(path: Path) -> Exhibit:
     xyz = xyz if up is None else (xyz @ turn_between(up).T.numpy()).astype(np.float32)
     grey = np.full(n, 128, np.uint8)
     rgb = np.stack([vertex[c] if c in properties else grey for c in ("red", "green", "blue")], -1)
-    is_swept = source == Source.SWEPT
+    swept_only = is_swept(source)
     swept = SweptPointCloud(
-        xyz[is_swept], rgb[is_swept].astype(np.uint8), *(column[name][is_swept] for name in ("sigma", "score"))
+        xyz[swept_only], rgb[swept_only].astype(np.uint8), *(column[name][swept_only] for name in ("sigma", "score"))
     )
     missing = np.full(n, np.nan, np.float32)
     zero = np.zeros((n, 2), np.float32)
@@ -56,10 +56,10 @@ def read_ply_exhibit(path: Path) -> Exhibit:
     samples |= {"uv_0": zero, "uv_1": zero, "tracked": np.zeros(n, bool), "candidate": np.zeros(n, bool)}
     samples |= {"gate": np.full(n, Gate.ANSWER, np.int32), "hole": hole.astype(np.int32)}
     samples |= dict.fromkeys(("parallax_deg", "residual_px", "error"), missing)
-    other_samples = {name: values[~is_swept] for name, values in samples.items()}
+    other_samples = {name: values[~swept_only] for name, values in samples.items()}
     return Exhibit(
         path.name,
-        [PairExhibit(path.name, other_samples, np.eye(4), swept=swept if is_swept.any() else EMPTY_SWEPT_CLOUD)],
+        [PairExhibit(path.name, other_samples, np.eye(4), swept=swept if swept_only.any() else EMPTY_SWEPT_CLOUD)],
     )
 
 
