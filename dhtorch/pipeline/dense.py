@@ -32,6 +32,7 @@ from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.se3 import Pose
 from dhtorch.pipeline import surface
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
+from dhtorch.pipeline.map_filters import SensorReturns, filter_map
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.pipeline.spec import Trace
@@ -164,6 +165,7 @@ def sweep_depth(
     swept = _gated(base, fitted, (beyond, start.alone), pair_gate, options)
     returns = _returns(reference, method, base.hw)
     swept = _check_against_returns(swept, returns, selected.samples, options)
+    swept = filter_map(swept, returns, nearest / options.sweep_overlap, reference.sparse, options)
     return _merge_returns(swept if calibration is None else calibration.apply(swept), returns)
 
 
@@ -348,15 +350,6 @@ def _gated(
     )
 
 
-class SensorReturns(NamedTuple):
-    """The sensor's returns at every pixel of a map, (B, h, w) each."""
-
-    depth: Tensor  # m
-    sigma: Tensor  # m
-    confidence: Tensor  # in [0, 1]
-    usable: Tensor  # bool
-
-
 def _returns(reference: Frame, method: Method, hw: tuple[int, int]) -> SensorReturns:
     """The sensor's returns at every pixel of a map of height and width ``hw``, by ``method.backproject``."""
     samples = method.backproject(reference, map_pixel_centres(reference, hw))
@@ -395,7 +388,7 @@ def _merge_returns(swept: DepthMap, returns: SensorReturns) -> DepthMap:
         depth=torch.where(usable, returns.depth.to(nan), torch.where(keep, swept.depth, nan)),
         sigma=torch.where(usable, returns.sigma.to(nan), torch.where(keep, swept.sigma, nan)),
         score=torch.where(usable, returns.confidence.to(nan), torch.where(keep, swept.score, 0.0)),
-        source=(keep.int() * Source.SWEPT).masked_fill(usable, Source.SENSOR),
+        source=torch.where(keep, swept.source, Source.NONE).masked_fill(usable, Source.SENSOR),
         gate=swept.gate.masked_fill(usable, Gate.ANSWER),
     )
 

@@ -134,6 +134,44 @@ class DenseOptions:
     #: Source: origin not recorded.
     edge_sigma_ratio: float = 0.17
 
+    # Filters of the map
+
+    #: Fraction of the sensor's reach within which its silence speaks against a foreground.
+    #: Source: chosen on built-in rooms: returns thin out in the last tenth of the reach.
+    halo_reach: float = 0.9
+
+    #: Distance from a return at its own depth within which a swept pixel may be its halo, px.
+    #: Source: chosen on built-in rooms.
+    halo_radius_px: int = 8
+
+    #: Distance within which something farther makes such a pixel an edge, px.
+    #: Source: chosen on built-in rooms.
+    background_radius_px: int = 12
+
+    #: Ratio of depths, farther over nearer, above which two pixels lie on two surfaces.
+    #: Source: that of the measured depth steps (metrics.map_quality).
+    step_ratio: float = 1.15
+
+    #: Relative difference of inverse depth within which neighbours lie on one surface.
+    #: Source: chosen on built-in rooms.
+    same_surface_ratio: float = 0.05
+
+    #: Pixels of one surface below which they are a speck, and of silence below which it is a pinhole, px.
+    #: Source: that of the measured artefacts (metrics.map_quality).
+    speck_px: int = 30
+
+    #: Half the side of the window whose rim pixels determine the plane that fills a pinhole, px.
+    #: Source: derived: half the side of a square pinhole, and its rim.
+    rim_radius_px: int = 4
+
+    #: Fewest rim pixels of that plane.
+    #: Source: derived: one more than its parameters.
+    min_rim_pixels: int = 4
+
+    #: Largest distance of a rim pixel from that plane, ratio of inverse depth.
+    #: Source: chosen on built-in rooms.
+    rim_ratio: float = 0.05
+
 
 #: The default of every function that takes options.
 DEFAULT_DENSE_OPTIONS: Final = DenseOptions()
