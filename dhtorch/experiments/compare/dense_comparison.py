@@ -25,14 +25,14 @@ from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import filling, stereo
-from dhtorch.experiments.compare.exact_rooms import share_within_1_percent
+from dhtorch.experiments.compare.exact_rooms import measure_rooms
 from dhtorch.experiments.outcome import join_outcomes
 from dhtorch.experiments.protocol import Batch, Outcome, Progress, Protocol, ScenePairs, Settings, Variant
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.patches import sample_nearest
-from dhtorch.metrics import bootstrap, errors, holdout, risk
+from dhtorch.metrics import bootstrap, errors, holdout, map_quality, risk
 from dhtorch.metrics.errors import Points
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.method import Method
@@ -57,6 +57,8 @@ DENSE_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
     "dense.convoy_wrong": (0.01, lambda value, bar: value <= bar),
     "dense.wrong_share": (0.05, lambda value, bar: value <= bar),
     "dense.room_within_1": (0.90, lambda value, bar: value >= bar),
+    "dense.artefact_share": (0.02, lambda value, bar: value <= bar),
+    "dense.room_step_wrong_share": (0.10, lambda value, bar: value <= bar),
 }
 
 #: Variants: all pixels of the map; the map sampled at the sparse method's samples; the map from one source view, for
@@ -105,6 +107,7 @@ class SweepCache:
         trace |= sweep.trace
         samples, estimate = compute(sweep)
         trace |= {"samples": samples, "ms": dict(sweep.ms), "rectifiable": is_rectifiable(sweep)}
+        trace["map"] = sweep.maps[max(sweep.maps)]
         return estimate
 
     def _sweep(
@@ -171,9 +174,12 @@ def run(
     ``indoor`` rooms, on the samples) with their ratio ``dense.coverage_ratio_at_5_indoor``,
     ``dense.pixels_at_5_indoor`` (on all pixels), ``dense.ause_ratio`` (median over scenes), ``dense.within_sigma`` and
     the other numbers of :func:`dhtorch.experiments.compare_methods.evaluate_promises`, ``dense.wrong_share`` (mean over
-    scenes), ``dense.error_ratio_to_sgbm`` (one source view each, rectifiable pairs, equal coverage; geometric mean),
-    ``dense.error_ratio_to_<peer>`` likewise, ``dense.rotation_answered``, ``dense.convoy_wrong`` (largest fraction of
-    the candidates of a scene with the role ``moving`` that are answered and wrong) and ``dense.room_within_1``.
+    scenes), ``dense.artefact_share`` and ``dense.step_wrong_share`` (means over scenes of medians over reference views:
+    artefacts over swept pixels, and wrong answers over answers beside a true depth step, with raw truth, see
+    :mod:`dhtorch.metrics.map_quality`), ``dense.error_ratio_to_sgbm`` (one source view each, rectifiable pairs, equal
+    coverage; geometric mean), ``dense.error_ratio_to_<peer>`` likewise, ``dense.rotation_answered``,
+    ``dense.convoy_wrong`` (largest fraction of the candidates of a scene with the role ``moving`` that are answered and
+    wrong) and ``dense.room_within_1`` and ``dense.room_step_wrong_share``.
 
     Args:
         scenes, chosen, pairs, settings, progress: as :func:`dhtorch.experiments.protocol.run`; of ``pairs``
@@ -208,7 +214,10 @@ def run(
             FULL_COHORT: _far_cohort,
         }
         dense_protocol = Protocol(
-            variants, cohorts=cohorts, min_candidates=0 if is_rotation else protocol.MIN_CANDIDATES
+            variants,
+            cohorts=cohorts,
+            columns=_map_columns,
+            min_candidates=0 if is_rotation else protocol.MIN_CANDIDATES,
         )
         parts.append(protocol.run(selected, dense_protocol, spread, settings, progress=progress))
     outcome = join_outcomes(parts)
@@ -216,7 +225,7 @@ def run(
     outcome.summary |= compare.rotation_answered(outcome.rows, [DENSE_VARIANT])
     outcome.summary |= compare.worst_wrong_share(DENSE_VARIANT, _moving_points(outcome))
     if rooms:
-        outcome.summary |= share_within_1_percent(rooms, sparse, options)
+        outcome.summary |= measure_rooms(rooms, sparse, options)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, peers))
 
 
@@ -329,6 +338,24 @@ def _far_cohort(batch: Batch, trace: Trace, *, rectifiable_only: bool = False) -
     return truth.replace(code=code)
 
 
+def _map_columns(answer: protocol.Answer) -> Row:
+    """Shares of artefacts, and of wrong answers beside true depth steps, of the map of one reference view."""
+    if answer.variant != DENSE_VARIANT:
+        return {}
+    depth_map: DepthMap = answer.trace["map"]
+    hw = depth_map.depth.shape[-2], depth_map.depth.shape[-1]
+    centres = dense.map_pixel_centres(answer.batch.exact, hw)[None]
+    truth = holdout.sample_truth(answer.batch.exact, centres, truth="raw")
+    depth = torch.where(truth.code == holdout.TruthCode.CANDIDATE, truth.depth, 0.0).unflatten(1, hw)
+    counts = torch.ones_like(depth, dtype=torch.bool)
+    if answer.batch.odd:
+        kind = sample_nearest(answer.batch.surface, centres)[0].unflatten(1, hw)
+        counts = ~torch.isin(kind, torch.tensor([*answer.batch.odd], dtype=kind.dtype, device=kind.device))
+    shares = (map_quality.artefact_counts(depth_map), map_quality.step_counts(depth_map, depth, counts))
+    names = ("artefact_share", "step_wrong_share")
+    return {name: part / whole for name, (part, whole) in zip(names, shares, strict=True) if whole}
+
+
 def _summary(outcome: Outcome, rooms: Mapping[str, str], indoor: Sequence[str], peers: bool) -> Row:
     points_of = {name: _scene_points(outcome, name) for name in ("sparse", _AT_SAMPLES, DENSE_VARIANT)}
     rows: dict[str, Row] = {scene: {} for scene in points_of[DENSE_VARIANT]}
@@ -344,6 +371,9 @@ def _summary(outcome: Outcome, rooms: Mapping[str, str], indoor: Sequence[str], 
     summary["dense.answered"] = _interval_over([m["coverage"] for m in metrics.values()], "median")
     summary["dense.wrong_share"] = _interval_over([m["wrong_share"] for m in metrics.values()], "mean")
     summary["dense.ause_ratio"] = _interval_over([row["ause_ratio"] for row in rows.values()], "median")
+    for name in ("artefact_share", "step_wrong_share"):
+        shares = {scene: row.get(name) for scene, row in outcome.scenes(DENSE_VARIANT).items() if scene in rows}
+        summary[f"dense.{name}"] = _interval_over(list(shares.values()), "mean")
     ratios = [row["error_ratio_to_sparse"] for row in rows.values()]
     summary["dense.error_ratio_to_sparse"] = _interval_over(ratios, "geometric_mean")
     summary |= _indoor_coverage(points_of, {scene for scene in rows if rooms[scene] in indoor})

@@ -21,6 +21,7 @@ from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.patches import sample_nearest
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.holdout import range_split
+from dhtorch.metrics.map_quality import step_counts
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.method import Method
 from dhtorch.records import Frame, PoseFit
@@ -48,24 +49,29 @@ _MAX_RELATIVE_ERROR = 0.01
 _SAME_SURFACE_RATIO = 0.03
 
 
-def share_within_1_percent(seeds: Sequence[int], method: Method, options: Mapping[str, Any]) -> Row:
+def measure_rooms(seeds: Sequence[int], method: Method, options: Mapping[str, Any]) -> Row:
     """Fraction of pixels within 1 %, mean over rooms: ``dense.room_within_1`` of answered pixels, ``…_of_all`` of all.
 
-    Unanswered pixels count as misses in ``dense.room_within_1_of_all``.
+    Unanswered pixels count as misses in ``dense.room_within_1_of_all``. ``dense.room_step_wrong_share``: wrong answers
+    over answers beside a depth step (:func:`dhtorch.metrics.map_quality.step_counts`).
     """
-    of_answered, of_all = [], []
+    of_answered, of_all, at_steps = [], [], []
     for seed in seeds:
-        n_right, n_answered, n_evaluated = _evaluate_room(seed, method, options)
+        (n_right, n_answered, n_evaluated), (n_wrong, n_beside) = _evaluate_room(seed, method, options)
         of_answered.append(n_right / max(n_answered, 1))
         of_all.append(n_right / max(n_evaluated, 1))
+        at_steps.append(n_wrong / max(n_beside, 1))
     return {
+        "dense.room_step_wrong_share": bootstrap.interval_over_scenes(at_steps, statistic="mean").entry("1"),
         "dense.room_within_1": bootstrap.interval_over_scenes(of_answered, statistic="mean").entry("1"),
         "dense.room_within_1_of_all": bootstrap.interval_over_scenes(of_all, statistic="mean").entry("1"),
     }
 
 
-def _evaluate_room(seed: int, method: Method, options: Mapping[str, Any]) -> tuple[int, int, int]:
-    """Numbers of pixels of one room: (within 1 %, answered, evaluated)."""
+def _evaluate_room(
+    seed: int, method: Method, options: Mapping[str, Any]
+) -> tuple[tuple[int, int, int], tuple[int, int]]:
+    """Numbers of pixels of one room: (within 1 %, answered, evaluated), (wrong, all answered beside a depth step)."""
     room = SyntheticRoom(
         n_frames=max(_VIEW_FRAMES) + 1, hw=_ROOM_HW, depth_hw=_ROOM_HW, lidar="exact", image_noise=0.0, seed=seed
     )
@@ -80,10 +86,12 @@ def _evaluate_room(seed: int, method: Method, options: Mapping[str, Any]) -> tup
             fit=fit,
             **options,
         )
-    evaluated = evaluated_pixels(reference, other, _odd_surface_mask(room, _VIEW_FRAMES[0]))
+    odd = _odd_surface_mask(room, _VIEW_FRAMES[0])
+    evaluated = evaluated_pixels(reference, other, odd)
     answered = evaluated & is_swept(depth_map.source)
     right = answered & ((depth_map.depth - reference.depth).abs() < _MAX_RELATIVE_ERROR * reference.depth)
-    return int(right.sum()), int(answered.sum()), int(evaluated.sum())
+    counts = int(right.sum()), int(answered.sum()), int(evaluated.sum())
+    return counts, step_counts(depth_map, reference.depth, ~odd)
 
 
 def exact_pose_fit(reference: Frame, other: Frame, n: int) -> PoseFit:
