@@ -34,6 +34,7 @@ from dhtorch.experiments.baselines import opencv
 from dhtorch.experiments.baselines.frozen import WINDOW_1
 from dhtorch.metrics import errors, holdout
 from dhtorch.pipeline import dense
+from dhtorch.pipeline.completion import complete_depth
 from dhtorch.pipeline.presets import AUTO, MAP, PAPER
 from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.records import DepthMap, Frame
@@ -135,7 +136,7 @@ def measure_every_pixel(threads: int, options: Any, n: int = 2048) -> list[dict[
 
     def ours(mode: str = "eager") -> DepthMap:
         with torch.no_grad(), MODES[mode]():
-            return dense.complete_depth(near, other, method=MAP, source_views=1)
+            return complete_depth(near, other, method=MAP, source_views=1)
 
     def peer() -> None:
         with torch.no_grad():

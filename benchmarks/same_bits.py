@@ -63,7 +63,7 @@ NAMES: dict[str, tuple[str, ...]] = {
     "room": ("synthetic.SyntheticRoom", "synthetic.recording.SyntheticRoom"),
     "complete_depth": (
         "complete_depth",
-        "pipeline.dense.complete_depth",
+        "pipeline.completion.complete_depth",
         "pipeline.dense.complete",
         "dense.complete",
     ),

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dhtorch.alignment.align import align_depth
-    from dhtorch.pipeline.dense import complete_depth
+    from dhtorch.pipeline.completion import complete_depth
     from dhtorch.pipeline.method import Method
     from dhtorch.pipeline.pair import merge
     from dhtorch.pipeline.presets import AUTO, KORNIA, MAP, PAPER, WINDOW, extend
@@ -74,7 +74,7 @@ _HOMES |= {
     "ValidateDepth": "transforms",
     "align_depth": "alignment.align",
     "collate": "pytree",
-    "complete_depth": "pipeline.dense",
+    "complete_depth": "pipeline.completion",
     "merge": "pipeline.pair",
     "validate_depth": "validation.validate",
 }

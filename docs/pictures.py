@@ -36,7 +36,7 @@ from dhtorch.experiments.exhibits import make_exhibit
 from dhtorch.experiments.protocol import Settings
 from dhtorch.integrate.sweeps import DenseSweep
 from dhtorch.metrics.holdout import range_split
-from dhtorch.pipeline import dense
+from dhtorch.pipeline.completion import complete_depth
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.pytree import stack
 from dhtorch.viz.plots import Axis, LegendKey, Panel, Stroke, colours, save_figure
@@ -74,7 +74,7 @@ def triptych(path: Path) -> None:
     whole = recording[FRAME]
     near = range_split(whole, CUTOFF)
     others = stack([range_split(recording[k], CUTOFF) for k in pair.candidates])
-    completed = dense.complete_depth(near, others, calibration=calibration.load_calibration("dense"))
+    completed = complete_depth(near, others, calibration=calibration.load_calibration("fused"))
     image = whole.image[0].permute(1, 2, 0)
     depth, source = completed.depth[0].numpy(), completed.source[0].numpy()
     sensed, known = source == Source.SENSOR, source != Source.NONE

@@ -16,7 +16,7 @@ import math
 import re
 import sys
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,12 @@ def document(name: str, method: Method) -> str:
 def _option(name: str, value: Any, comment: str | None, depth: int) -> Iterator[str]:
     """The lines of one option; of a function with all its options below."""
     pad = "  " * depth
+    if is_dataclass(value):  # a record of options
+        yield f"{pad}{name}:"
+        yield f"{pad}  _target_: {type(value).__module__}.{type(value).__qualname__}"
+        for field in fields(value):
+            yield from _option(field.name, getattr(value, field.name), None, depth + 1)
+        return
     function = value.func if isinstance(value, partial) else value
     if not callable(function):
         line = f"{pad}{name}: {_scalar(value)}"

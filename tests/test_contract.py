@@ -615,16 +615,21 @@ ELSEWHERE = {
     *(
         f"dhtorch.pipeline.dense.{name}"
         for name in (
-            "complete_depth",
             "map_hw",
             "dense_options",
             "map_pixel_centres",
             "downscale_grey",
             "sensor_depth_map",
-            "default_calibration",
+            "check_dense_options",
         )
     ),
-    *(f"dhtorch.pipeline.dense.{name}" for name in ("sweep_depth", "selected_views", "top_views")),
+    *(
+        f"dhtorch.pipeline.dense.{name}"
+        for name in ("sweep_depth", "sweep_views", "gate_sweep", "filter_sweep", "merge_returns", "selected_views")
+    ),
+    "dhtorch.pipeline.dense.top_views",
+    *(f"dhtorch.pipeline.completion.{name}" for name in ("complete_depth", "default_calibration")),
+    "dhtorch.pipeline.fused.fuse_with_sweep",
     "dhtorch.pipeline.dense.source_view_of",
     *(f"dhtorch.pipeline.surface.{name}" for name in ("sweep_planes", "refine_surface", "pose_variance")),
     *(

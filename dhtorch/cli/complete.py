@@ -31,6 +31,7 @@ from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
+from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
 from dhtorch.pipeline.view_report import report_selection, with_view_selection
@@ -44,7 +45,7 @@ from dhtorch.viz.plots import draw_completed
 Progress = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 #: Name of the calibration included in the package.
-_DEFAULT_CALIBRATION_NAME = "dense"
+_DEFAULT_CALIBRATION_NAME = "fused"
 
 #: Options that determine the content of a frame's files, beside the resolved format and unit; they enter the key.
 _KEY_OPTIONS = ("data", "method", "seed", "dtype", "cutoff", "steps", "past", *dense.DENSE_OPTIONS, "arrays")
@@ -64,7 +65,12 @@ _SOURCE_LABELS = {"sensor": "sensor", "swept": "swept", "none": "no answer"}
 _EXTRAS_CHOICES = (False, True, "all")
 
 #: Modules that determine the result, beside those that the settings name.
-_CODE_ROOTS = ("dhtorch.pipeline.dense", "dhtorch.pipeline.view_report", "dhtorch.data.pairs", "dhtorch.export.frames")
+_CODE_ROOTS = (
+    "dhtorch.pipeline.completion",
+    "dhtorch.pipeline.view_report",
+    "dhtorch.data.pairs",
+    "dhtorch.export.frames",
+)
 
 
 def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Progress) -> int:
@@ -141,13 +147,9 @@ def make_completion_task(
             digest,
             keyed=_KEY_OPTIONS,
             roots=_CODE_ROOTS,
-            calibration=_default_calibration_name(),
+            calibration=_DEFAULT_CALIBRATION_NAME,
         ),
     )
-
-
-def _default_calibration_name() -> str | None:
-    return None if dense.default_calibration() is None else _DEFAULT_CALIBRATION_NAME
 
 
 # ------------------------------------------------------------------------------------------------------------- frames
@@ -205,12 +207,12 @@ def _compute_map(task: CompletionTask, i: int) -> tuple[Frame, DepthMap, Row]:
     options: dict[str, Any] = {k: settings[k] for k in (*dense.DENSE_OPTIONS, "seed")}
     options |= {
         "method": with_view_selection(task.method),
-        "calibration": dense.default_calibration(),
+        "calibration": default_calibration(),
         "hint": task.scene.hint,
     }
     trace: Trace = {}
     with torch.no_grad():
-        completed_map = dense.complete_depth(reference, source_views, **options, trace=trace)
+        completed_map = complete_depth(reference, source_views, **options, trace=trace)
     choice = report_selection(i, offered, trace)
     views = [int(task.recording.number[k]) for k in choice.views]
     row: Row = {"views": views, **choice.row()["why"]}

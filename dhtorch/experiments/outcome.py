@@ -23,9 +23,8 @@ class Example:
     truth: holdout.Truth
     pair: str = ""  # the reference view and the views that were used, as numbers of the recording
     cutoff: float | None = None  # m
-    call_options: dict[str, Any] | None = (
-        None  # options of dhtorch.pipeline.dense.complete_depth; None for variants with a call or a pose of their own
-    )
+    #: Options of dhtorch.pipeline.completion.complete_depth; None for variants with a call or a pose of their own.
+    call_options: dict[str, Any] | None = None
 
     def cpu(self) -> Example:
         """Example on the CPU, for figures."""

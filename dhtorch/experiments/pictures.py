@@ -12,7 +12,7 @@ from dhtorch.export import write_ply
 from dhtorch.geometry.camera import unproject
 from dhtorch.metrics import errors
 from dhtorch.metrics.risk import risk_coverage
-from dhtorch.pipeline import dense
+from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.pair import merge
 from dhtorch.viz.plots import (
     append_cutoff,
@@ -42,9 +42,7 @@ def draw_example(folder: str | Path, example: Any) -> list[Path]:
     written = ["samples.png", "holes.png", "points.ply"]
     if example.call_options is not None:  # where the method ran without further options
         with torch.no_grad():
-            maps = dense.complete_depth(
-                example.frame, calibration=dense.default_calibration(), **example.call_options
-            ).to("cpu")[0]
+            maps = complete_depth(example.frame, calibration=default_calibration(), **example.call_options).to("cpu")[0]
         draw_completed(folder / "completed.png", image, maps.depth, maps.sigma, maps.source, title=title)
         written.append("completed.png")
     pooled = errors.points_from_estimate(e.estimate, e.truth)

@@ -19,6 +19,7 @@ from torch import Tensor
 from dhtorch.calibration.score_calibration import Calibration
 from dhtorch.codes import is_swept
 from dhtorch.pipeline import dense
+from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
 from dhtorch.records import DepthMap, Estimate, Frame
@@ -29,7 +30,7 @@ class DenseSweep:
     """Dense completion of a reference view: its non-default options, and the calibration of its sigma."""
 
     options: Mapping[str, Any] = field(default_factory=dict)
-    calibration: Calibration | None = field(default_factory=dense.default_calibration)
+    calibration: Calibration = field(default_factory=default_calibration)
 
     @classmethod
     def from_options(cls, settings: bool | Mapping[str, Any] | None, name: str = "dense") -> DenseSweep | None:
@@ -40,19 +41,19 @@ class DenseSweep:
     def __call__(
         self, method: Method, reference: Frame, others: Frame, *, trace: Trace, track: Any = None, **run_options: Any
     ) -> Estimate:
-        """The sparse estimate of ``method(reference, others)``; the dense maps are stored in ``trace["dense"]``.
+        """The estimate of ``method(reference, others)``; the dense maps are stored in ``trace["dense"]``.
 
         Args:
-            method, reference, others: as :func:`dhtorch.pipeline.dense.complete_depth` takes them.
+            method, reference, others: as :func:`dhtorch.pipeline.completion.complete_depth` takes them.
             trace: receives the intermediate results of the method.
             track: another function for the method's stage 4; None = its own.
             run_options: ``seed``, ``fit`` and ``hint``.
         """
         method = method if track is None else method.replace(track=track)
         complete_options: dict[str, Any] = {**self.options, "calibration": self.calibration, **run_options}
-        trace["dense"] = dense.complete_depth(reference, others, method=method, trace=trace, **complete_options)
-        sparse: Estimate = trace["sparse"]
-        return sparse
+        trace["dense"] = complete_depth(reference, others, method=method, trace=trace, **complete_options)
+        joint: Estimate = trace["fused"]
+        return joint
 
 
 @dataclass(frozen=True, eq=False)

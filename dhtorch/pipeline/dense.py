@@ -1,11 +1,11 @@
-"""Dense completion: depth, sigma and score for every pixel beyond the sensor's reach, from a plane sweep.
+"""Plane sweep of a reference view: depth, sigma and score for every pixel beyond the sensor's reach.
 
-    method ─ motions, gain of the views ──┐
-    reference image ──────────────────────┼─ sweep ─ surface ─ fit ─ gates ─┐
-    source images ────────────────────────┘                                 ├─ DepthMap
-    sensor ─────────────────────────────────────────────────────────────────┘
+    method ─ poses, gain of the views ──┐
+    reference image ────────────────────┼─ sweep ─ surface ─ fit ─ gates ─ filters ─┐
+    source images ──────────────────────┘                                           ├─ DepthMap
+    sensor ─────────────────────────────────────────────────────────────────────────┘
 
-The sparse method gives the metric motions with their covariances, and the source views that are worth sweeping. The
+The sparse method gives the metric poses with their covariances, and the source views that are worth sweeping. The
 sweep estimates one number per pixel, its inverse depth. The sensor's returns are no input to that search: where both
 have a depth, the returns validate the swept one.
 """
@@ -22,8 +22,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch import pytree
-from dhtorch.calibration import list_calibrations, load_calibration
-from dhtorch.calibration.score_calibration import Calibration
 from dhtorch.codes import Gate, PoseCode, Source, first_reason
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import plane_sweep
@@ -33,10 +31,8 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.pipeline import surface
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.map_filters import SensorReturns, filter_map
-from dhtorch.pipeline.method import Method
-from dhtorch.pipeline.presets import AUTO
-from dhtorch.pipeline.spec import Trace
-from dhtorch.records import NO_HINT, Camera, DepthMap, Estimate, Frame, PoseFit, PosePrior, Samples, TrackHint
+from dhtorch.pipeline.spec import MethodSpec, Trace
+from dhtorch.records import Camera, DepthMap, Estimate, Frame, PoseFit, Samples
 
 #: Closed range of every keyword option of :func:`complete_depth` that is a number.
 DENSE_RANGES: Final[dict[str, tuple[float, float]]] = {
@@ -60,125 +56,93 @@ class SelectedViews(NamedTuple):
     samples: Samples  # (B, N) of the reference view
 
 
-def complete_depth(
-    reference: Frame,
-    others: Frame | Sequence[Frame],
-    *,
-    method: Method = AUTO,
-    source_views: int = DenseOptions.source_views,
-    planes: int = DenseOptions.planes,
-    size: int = DenseOptions.size,
-    refinements: int = DenseOptions.refinements,
-    min_correlation: float = DenseOptions.min_correlation,
-    max_sigma_rel: float = DenseOptions.max_sigma_rel,
-    calibration: Calibration | None = None,
-    seed: int | Tensor = 0,
-    fit: PoseFit | PosePrior | None = None,
-    hint: TrackHint = NO_HINT,
-    trace: Trace | None = None,
-    options: DenseOptions = DEFAULT_DENSE_OPTIONS,
-) -> DepthMap:
-    """Complete depth maps of the reference views: near returns, and swept depths where there is no return.
+class Sweep(NamedTuple):
+    """The surface of reference views from their source views, before its gates; maps (B, h, w)."""
 
-    Args:
-        reference: B views.
-        others: as :class:`dhtorch.pipeline.method.Method` takes them: B views, or V × B of them, or a sequence of V.
-        method: the sparse method that gives the motions; it selects views as it does when called alone.
-        source_views: most views that are swept, those of largest gain (at most eight).
-        planes: inverse depths that are tested, evenly spaced from infinity to within the sensor's reach; where a
-            reference view's returns are ``sparse``, to the nearest of them.
-        size: longer side of the map and of the images that are swept, px; smaller images keep their size.
-        refinements: Gauss-Newton steps from the best plane.
-        min_correlation: correlation of a pixel's window in the view that fits best, below which it is unanswered.
-        max_sigma_rel: sigma / depth above which a pixel is unanswered, before ``calibration``.
-        calibration: corrects sigma and score of swept pixels; None leaves them as the fit gives them.
-        seed, fit, hint, trace: as :class:`dhtorch.pipeline.method.Method` takes them; the trace also gets ``sparse``,
-            the sparse estimate.
-        options: the other tuning constants; its fields that are keywords here are ignored.
-
-    Returns:
-        DepthMap (B, h, w) over the field of view of the reference image: near returns where they are usable (as
-        ``method.backproject`` reads them), swept depths, unanswered pixels. Score is h / (h + sigma / depth), h = 0.1.
-
-    Gates: that of the pair for all pixels where no source view is usable (NO_BASELINE, NO_POSE, CONTRADICTED, or
-    UNCERTAIN where the gain of all is too small); NO_TRACK (visible in no view, nearer than the sweep, or without a
-    match), UNCERTAIN. CONTRADICTED where near returns refute the sweep.
-
-    Raises:
-        ValueError: wrong shapes, no other view, or an option out of range.
-
-    Gradient: swept depth to all images, to intrinsics and through the motions to the near depth, by the implicit
-    function theorem where the last fit ends; planes, source views, sigma and gates carry none.
-    Memory: less than four bytes for every pixel and plane, whatever the number of views, and images.
-    Cost: linear in planes, pixels and source views.
-    """
-    trace = {} if trace is None else trace
-    joined = trace["sparse"] = method(reference, others, seed=seed, fit=fit, hint=hint, trace=trace)
-    return sweep_depth(
-        reference,
-        selected_views(joined, others, trace),
-        method=method,
-        source_views=source_views,
-        planes=planes,
-        size=size,
-        refinements=refinements,
-        min_correlation=min_correlation,
-        max_sigma_rel=max_sigma_rel,
-        calibration=calibration,
-        options=options,
-    )
+    base: plane_sweep.ReferenceView
+    surface: surface.RefinedSurface
+    beyond: Tensor  # bool, nearer than the nearest plane
+    alone: Tensor  # bool, unique best plane
+    n_views: Tensor  # (B,) swept views and the reference view
+    pair_gate: Tensor  # (B,) gate of all pixels of reference views without a source view to sweep
+    returns: SensorReturns
+    near: Samples  # (B, N)
+    reach: Tensor  # (B,) m, depth to which the sensor returns
+    sparse: Tensor | None  # (B,) bool, whether the returns are sparse
 
 
 def sweep_depth(
     reference: Frame,
     selected: SelectedViews,
     *,
-    method: Method = AUTO,
+    method: MethodSpec,
     source_views: int = DenseOptions.source_views,
     planes: int = DenseOptions.planes,
     size: int = DenseOptions.size,
     refinements: int = DenseOptions.refinements,
     min_correlation: float = DenseOptions.min_correlation,
     max_sigma_rel: float = DenseOptions.max_sigma_rel,
-    calibration: Calibration | None = None,
     options: DenseOptions = DEFAULT_DENSE_OPTIONS,
 ) -> DepthMap:
-    """The second half of :func:`complete_depth`: the sweep of selected views under given motions.
+    """Depth maps (B, h, w) of the sweep alone: near returns, and swept depths under the poses of the selected views.
 
-    Arguments, result, errors, gradient, memory and cost as there; of ``method`` only ``backproject`` is used.
+    Arguments, gates, errors, gradient, memory and cost as of :func:`dhtorch.pipeline.completion.complete_depth`; of
+    ``method`` only ``backproject`` is used.
     """
-    values = (source_views, planes, size, refinements, min_correlation, max_sigma_rel)
-    keywords: dict[str, Any] = dict(zip(DENSE_OPTIONS, values, strict=True))
-    _check_options("complete_depth", keywords)
-    options = replace(options, **keywords)
-    index, use = top_views(selected, source_views, options)
-    base = plane_sweep.make_reference_view(*downscale_grey(reference, size))
-    swept_views = [
-        source_view_of(selected, k, size, is_used, base.image) for k, is_used in zip(index, use, strict=True)
+    keywords = dict(
+        zip(DENSE_OPTIONS, (source_views, planes, size, refinements, min_correlation, max_sigma_rel), strict=True)
+    )
+    check_dense_options("sweep_depth", keywords)
+    options = replace(options, **keywords)  # type: ignore[arg-type]
+    sweep = sweep_views(reference, selected, method, options)
+    return merge_returns(filter_sweep(sweep, gate_sweep(sweep, options), options), sweep.returns)
+
+
+def sweep_views(reference: Frame, selected: SelectedViews, method: MethodSpec, options: DenseOptions) -> Sweep:
+    """The surface of the reference views by a plane sweep of the selected views of largest gain."""
+    index, use = top_views(selected, options.source_views, options)
+    base = plane_sweep.make_reference_view(*downscale_grey(reference, options.size))
+    source_views = [
+        source_view_of(selected, k, options.size, is_used, base.image) for k, is_used in zip(index, use, strict=True)
     ]
     nearest = _nearest_depth(selected.samples, reference.sparse, options)
-    q = torch.linspace(0, 1, planes).to(base.ray) / nearest[:, None].to(base.ray)
-    start = surface.sweep_planes(base, swept_views, q, options)
-    fitted = surface.refine_surface(base, swept_views, start, q, refinements, options)
-    beyond = start.q >= q[:, -1, None, None] * (1 - 1e-6)
-    pair_gate = _pair_gate(selected, use)
-    swept = _gated(base, fitted, (beyond, start.alone), pair_gate, options)
-    returns = _returns(reference, method, base.hw)
-    swept = _check_against_returns(swept, returns, selected.samples, options)
-    swept = filter_map(swept, returns, nearest / options.sweep_overlap, reference.sparse, options)
-    return _merge_returns(swept if calibration is None else calibration.apply(swept), returns)
+    q = torch.linspace(0, 1, options.planes).to(base.ray) / nearest[:, None].to(base.ray)
+    start = surface.sweep_planes(base, source_views, q, options)
+    return Sweep(
+        base=base,
+        surface=surface.refine_surface(base, source_views, start, q, options.refinements, options),
+        beyond=start.q >= q[:, -1, None, None] * (1 - 1e-6),
+        alone=start.alone,
+        n_views=use.sum(0) + 1,
+        pair_gate=_pair_gate(selected, use),
+        returns=_returns(reference, method, base.hw),
+        near=selected.samples,
+        reach=nearest / options.sweep_overlap,
+        sparse=reference.sparse,
+    )
 
 
-def sensor_depth_map(reference: Frame, *, method: Method = AUTO, size: int = DenseOptions.size) -> DepthMap:
+def gate_sweep(sweep: Sweep, options: DenseOptions) -> DepthMap:
+    """The swept map (B, h, w) with its gates, before it is filtered by its neighbours."""
+    swept = _gated(sweep.base, sweep.surface, (sweep.beyond, sweep.alone), sweep.pair_gate, options)
+    return _check_against_returns(swept, sweep.returns, sweep.near, options)
+
+
+def filter_sweep(sweep: Sweep, swept: DepthMap, options: DenseOptions) -> DepthMap:
+    """The swept map without answers that their neighbours or the returns refute, and with those that they imply."""
+    return filter_map(swept, sweep.returns, sweep.reach, sweep.sparse, options)
+
+
+def sensor_depth_map(reference: Frame, *, method: MethodSpec, size: int = DenseOptions.size) -> DepthMap:
     """The depth maps (B, h, w) of reference views without a source view: near returns, else unanswered (NO_TRACK).
 
     Arguments, result, errors and gradient as of :func:`complete_depth`.
     """
-    _check_options("sensor_depth_map", {"size": size})
+    check_dense_options("sensor_depth_map", {"size": size})
     nan = torch.full((len(reference.camera.f), *map_hw(reference.hw, size)), torch.nan).to(reference.camera.f)
     code = torch.zeros_like(nan, dtype=torch.int32)
     unanswered = DepthMap(nan, nan, torch.zeros_like(nan), code, torch.full_like(code, Gate.NO_TRACK))
-    return _merge_returns(unanswered, _returns(reference, method, map_hw(reference.hw, size)))
+    return merge_returns(unanswered, _returns(reference, method, map_hw(reference.hw, size)))
 
 
 def map_hw(hw: tuple[int, int], size: int) -> tuple[int, int]:
@@ -230,11 +194,11 @@ def dense_options(settings: bool | Mapping[str, Any] | None, name: str = "dense"
         if isinstance(value, bool) or not isinstance(value, int if is_whole else (int, float)):
             raise ValueError(f"{name}.{option}: found {value!r}, expected a {'whole ' * is_whole}number")
         options[option] = value
-    _check_options(name, options)
+    check_dense_options(name, options)
     return options
 
 
-def _check_options(name: str, options: Mapping[str, float]) -> None:
+def check_dense_options(name: str, options: Mapping[str, float]) -> None:
     """Raise ValueError for an option out of its range."""
     for option, value in options.items():
         low, high = DENSE_RANGES[option]
@@ -350,7 +314,7 @@ def _gated(
     )
 
 
-def _returns(reference: Frame, method: Method, hw: tuple[int, int]) -> SensorReturns:
+def _returns(reference: Frame, method: MethodSpec, hw: tuple[int, int]) -> SensorReturns:
     """The sensor's returns at every pixel of a map of height and width ``hw``, by ``method.backproject``."""
     samples = method.backproject(reference, map_pixel_centres(reference, hw))
     columns = samples.depth, samples.sigma, samples.confidence, samples.usable
@@ -379,7 +343,7 @@ def _check_against_returns(swept: DepthMap, returns: SensorReturns, near: Sample
     return swept.replace(sigma=swept_sigma, gate=gate)
 
 
-def _merge_returns(swept: DepthMap, returns: SensorReturns) -> DepthMap:
+def merge_returns(swept: DepthMap, returns: SensorReturns) -> DepthMap:
     """The sensor's returns where they are usable, else the swept map where it is answered."""
     usable = returns.usable
     keep = swept.keep & ~usable
@@ -391,8 +355,3 @@ def _merge_returns(swept: DepthMap, returns: SensorReturns) -> DepthMap:
         source=torch.where(keep, swept.source, Source.NONE).masked_fill(usable, Source.SENSOR),
         gate=swept.gate.masked_fill(usable, Gate.ANSWER),
     )
-
-
-def default_calibration() -> Calibration | None:
-    """The calibration of swept depths in the package's data, None if there is none."""
-    return load_calibration("dense") if "dense" in list_calibrations() else None

@@ -8,9 +8,10 @@ from typing import Any
 
 from torch import Tensor
 
+from dhtorch.pipeline.dense import selected_views
 from dhtorch.pipeline.inputs import validate_views
 from dhtorch.pipeline.multiview import estimate_multiview
-from dhtorch.pipeline.pair import estimate_pair
+from dhtorch.pipeline.pair import StageTimer, estimate_pair
 from dhtorch.pipeline.spec import MethodSpec, Trace
 from dhtorch.records import NO_HINT, Estimate, Frame, PoseFit, PosePrior, TrackHint
 
@@ -52,11 +53,13 @@ class Method(MethodSpec):
                 with one other view only.
             trace: a dict that receives ``samples``, ``tracks`` (as tracked), ``tracks_ideal`` (undistorted), ``fit``,
                 ``estimate`` and ``ms`` (milliseconds by stage). With several views those of the last, ``ms`` summed
-                over all, and ``views``, the traces of all.
+                over all, and ``views``, the traces of all. A stage ``complete`` adds ``sparse``, the estimate before
+                it, and ``dense``, the depth map.
             **changes: stages and options for this call alone, as :meth:`replace` takes them.
 
         Returns:
-            Estimate for the B × n samples, unanswered ones with their reason; in the dtype of the intrinsics, float32
+            Estimate for the B × n samples, with a stage ``complete`` the joint one, unanswered ones with their reason;
+            in the dtype of the intrinsics, float32
             where these are half precision. Images and depth may be of any floating dtype, different for each frame
             (:func:`dhtorch.pipeline.inputs.validate_views`).
 
@@ -74,5 +77,13 @@ class Method(MethodSpec):
         reference, others = validate_views(reference, others)
         if fit is None and method.pose_prior is not None:
             fit = method.pose_prior(reference, others)
-        estimate = estimate_pair if others.image.dim() == 4 else estimate_multiview
-        return estimate(method, reference, others, seed=seed, fit=fit, hint=hint, trace=trace)
+        trace = {} if trace is None and method.complete is not None else trace
+        estimate_views = estimate_pair if others.image.dim() == 4 else estimate_multiview
+        estimate = estimate_views(method, reference, others, seed=seed, fit=fit, hint=hint, trace=trace)
+        if method.complete is None or trace is None:
+            return estimate
+        clock = StageTimer(trace)
+        joint, depth_map = method.complete(method, reference, selected_views(estimate, others, trace))
+        clock("complete", joint)
+        trace |= {"sparse": estimate, "estimate": joint, "dense": depth_map}
+        return joint

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from dhtorch.geometry.coarse_flow import coarse_flow
+from dhtorch.pipeline.fused import fuse_with_sweep
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.view_selection import select_views_by_preview
 from dhtorch.stages.fuse import fuse_consistent
@@ -89,8 +90,11 @@ AUTO = MAP.replace(
     chain=False,
 )
 
+#: ``AUTO`` joined with a plane sweep of its views: one answer per sample and per pixel, of either or of both.
+FUSED = AUTO.replace(complete=fuse_with_sweep)
+
 #: Methods by name.
-METHODS = {"paper": PAPER, "kornia": KORNIA, "map": MAP, "window": WINDOW, "auto": AUTO}
+METHODS = {"paper": PAPER, "kornia": KORNIA, "map": MAP, "window": WINDOW, "auto": AUTO, "fused": FUSED}
 
 
 def get_method(method: str | Method, n: int | None = None) -> Method:

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from dhtorch.records import (
     MIN_TRACKABILITY,
+    DepthMap,
     Estimate,
     Frame,
     PoseFit,
@@ -74,6 +75,9 @@ class MethodSpec:
     )
     pose_prior: Callable[..., PosePrior] | None = None  # (reference, others) -> relative poses, or None
     guide: Callable[..., GuidedMatches] | None = None  # (samples, image_0, images_1, camera_0, cameras_1, T_1_from_0)
+    complete: Callable[..., tuple[Estimate, DepthMap]] | None = (
+        None  # (method, reference, selected views) -> answers at the samples and at every pixel
+    )
 
     n: int = 2048  # samples per reference view
     pose_samples: int = (

@@ -39,7 +39,7 @@ class ExtendDepth(torch.nn.Module):
         hint: prior information on the motion between the views, for the tracker.
         seed: of the pose search. With ``index_key`` each sample has the seed ``seed + sample[index_key]``.
         index_key: key of an integer that identifies a sample; None = the same draws for all samples.
-        dense: True = also a dense depth map, with the defaults of :func:`dhtorch.pipeline.dense.complete_depth`;
+        dense: True = also a dense depth map, with the defaults of :func:`dhtorch.pipeline.completion.complete_depth`;
             a mapping = options for it: ``source_views``, ``planes``, ``size``, ``refinements``, ``min_correlation``,
             ``max_sigma_rel``. Sigma and score of swept pixels are calibrated with the package's default calibration.
         patch, tokens_hw, fit: the network's patches, see :func:`dhtorch.transforms.patch_tokens`.
@@ -68,7 +68,7 @@ class ExtendDepth(torch.nn.Module):
         SampleError: a bad sample, depending on ``on_error``.
 
     Gradient: points, maps, tokens and pose to images, depth and intrinsics, as ``dhtorch.extend`` and
-    ``dhtorch.pipeline.dense.complete_depth``; none in a worker, whose samples cannot carry a graph.
+    ``dhtorch.pipeline.completion.complete_depth``; none in a worker, whose samples cannot carry a graph.
     Memory: with ``dense`` that of ``complete_depth``, and about a third of it again for tokens.
     Cost: as the method; with ``dense`` the plane sweep dominates. In workers use one thread
     (``worker_init_fn=one_thread``). A process that has used several threads should not be forked: set one thread
@@ -196,7 +196,7 @@ class ExtendDepth(torch.nn.Module):
             estimate = self.method(read.reference, read.other, **method_args)
         else:
             dense = self.maps.complete(read, self.method, **method_args)
-            estimate = trace["sparse"]
+            estimate = trace["fused"]
         estimate = estimate.replace(gate=torch.where(read.paired[:, None], estimate.gate, Gate.NO_TRACK))
         return trace["samples"], estimate, [view["fit"] for view in trace.get("views", [trace])], dense
 

@@ -1,4 +1,4 @@
-"""Dense depth maps of samples, computed by :func:`dhtorch.pipeline.dense.complete_depth`."""
+"""Dense depth maps of samples, computed by :func:`dhtorch.pipeline.completion.complete_depth`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor
 from dhtorch import pytree
 from dhtorch.calibration.score_calibration import Calibration
 from dhtorch.pipeline import dense
+from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method
 from dhtorch.records import DepthMap, Frame, MergedDepth
 from dhtorch.transforms.sample_spec import SampleViews
@@ -22,7 +23,7 @@ class DenseMaps:
     """Options of the dense maps of samples, and the calibration of their sigma and score (the package's default)."""
 
     options: Mapping[str, Any]
-    calibration: Calibration | None = field(default_factory=dense.default_calibration)
+    calibration: Calibration = field(default_factory=default_calibration)
 
     @classmethod
     def from_options(cls, setting: bool | Mapping[str, Any], name: str = "dense") -> DenseMaps | None:
@@ -44,7 +45,7 @@ class DenseMaps:
         """
         assert read.other is not None
         options = {**self.options, "method": method, "calibration": self.calibration, **method_args}
-        completed = dense.complete_depth(read.reference, read.other, **options)
+        completed = complete_depth(read.reference, read.other, **options)
         if bool(read.paired.all()):
             return completed
         rows = torch.arange(len(read.paired), device=read.paired.device)

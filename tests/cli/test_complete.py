@@ -29,7 +29,7 @@ from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import Recording
 from dhtorch.geometry.camera import resize, unproject
 from dhtorch.metrics.holdout import range_split
-from dhtorch.pipeline import dense
+from dhtorch.pipeline import completion, dense
 from dhtorch.pipeline.view_report import with_view_selection
 from dhtorch.pytree import stack
 from dhtorch.runtime import results as result_files
@@ -110,10 +110,10 @@ def test_the_files_hold_what_complete_says(room, captures, numbered):
         "method": with_view_selection(METHOD),
         "planes": 16,
         "refinements": 1,
-        "calibration": dense.default_calibration(),
+        "calibration": completion.default_calibration(),
     }
     with torch.no_grad():
-        found = dense.complete_depth(frames[0], stack(frames[1:]), **options)[0]
+        found = completion.complete_depth(frames[0], stack(frames[1:]), **options)[0]
     depth, sigma, source = (pixels(numbered / kind / "000001.png") for kind in ("depth", "sigma", "source"))
     assert depth.dtype == sigma.dtype == np.uint16 and source.dtype == np.uint8
     assert np.array_equal(source, found.source.numpy()) and {0, 1, 3} == set(np.unique(source))
@@ -249,8 +249,8 @@ def test_faces_join_neighbours_of_one_surface_alone():
 
 def test_said_again_it_makes_what_is_missing_and_no_more(captures, numbered, monkeypatch):
     asked = []
-    whole = complete.dense.complete_depth
-    monkeypatch.setattr(complete.dense, "complete_depth", lambda *a, **k: asked.append(1) or whole(*a, **k))
+    whole = complete.complete_depth
+    monkeypatch.setattr(complete, "complete_depth", lambda *a, **k: asked.append(1) or whole(*a, **k))
     before = stamps(numbered)
     more = {"arrays": True, "points": True, "figures": True}
     assert "3 frames (3 left untouched)" in said(captures / "numbered", numbered, most=3, **more) and not asked
@@ -418,7 +418,7 @@ def test_sparse_depth_has_longer_steps_and_pictures_are_asked_for(room):
 
 
 def test_the_sweeps_options_have_the_functions_defaults():
-    defaults = {k: p.default for k, p in inspect.signature(dense.complete_depth).parameters.items()}
+    defaults = {k: p.default for k, p in inspect.signature(completion.complete_depth).parameters.items()}
     settings = composed()
     assert {k: settings[k] for k in dense.DENSE_OPTIONS} == {k: defaults[k] for k in dense.DENSE_OPTIONS}
 

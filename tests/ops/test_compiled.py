@@ -35,6 +35,7 @@ from dhtorch.metrics.holdout import range_split
 from dhtorch.ops import constants, dispatch, loader
 from dhtorch.pipeline import dense, surface
 from dhtorch.pipeline.pair import merge
+from dhtorch.pipeline.presets import AUTO
 from dhtorch.records import NO_HINT, Frame, MergedDepth, PoseFit, Samples, Shutter, TrackHint, Tracks
 from dhtorch.stages import pose
 from dhtorch.stages.backproject import backproject
@@ -475,7 +476,7 @@ def test_maps_agree_to_far_less_than_their_sigma(loaded, monkeypatch, source_vie
         trace = {}
         asked = dense.selected_views(WINDOW(reference, others, trace=trace), others, trace)
     found, expected = both_ways(
-        lambda: dense.sweep_depth(reference, asked, source_views=source_views, planes=48, max_sigma_rel=0.5),
+        lambda: dense.sweep_depth(reference, asked, method=AUTO, source_views=source_views, planes=48, max_sigma_rel=0.5),
         monkeypatch,
     )
     assert (found.gate != expected.gate).float().mean() <= 0.005 and torch.equal(found.gate == 0, found.depth > 0)

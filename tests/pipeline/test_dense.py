@@ -10,7 +10,8 @@ from dhtorch.calibration.score_calibration import Calibration, SigmaModel
 from dhtorch.codes import Gate, Source
 from dhtorch.experiments.compare.exact_rooms import exact_pose_fit
 from dhtorch.metrics.holdout import range_split
-from dhtorch.pipeline.dense import complete_depth, downscale_grey, selected_views, sensor_depth_map, sweep_depth
+from dhtorch.pipeline.completion import complete_depth
+from dhtorch.pipeline.dense import downscale_grey, selected_views, sensor_depth_map, sweep_depth
 from dhtorch.pytree import collate, stack
 from dhtorch.synthetic import SyntheticRoom
 

@@ -17,7 +17,7 @@ from dhtorch.cli.run import main
 from dhtorch.codes import Source
 from dhtorch.extract import ExtractOptions, FeatureTable, columns, shards
 from dhtorch.extract.dataset import common_map_hw
-from dhtorch.pipeline import dense
+from dhtorch.pipeline import completion, dense
 from dhtorch.records import MergedDepth
 from dhtorch.transforms import (
     AddedCollate,
@@ -79,8 +79,8 @@ def test_maps_and_tokens_are_those_of_the_dense_method(sample, pair):
     out = pair[0]
     read = SampleSpec(depth_unit="mm", other_image="before").read(sample)
     with torch.no_grad():
-        found = dense.complete_depth(
-            read.reference, read.other, method=METHOD, calibration=dense.default_calibration(), **DENSE
+        found = completion.complete_depth(
+            read.reference, read.other, method=METHOD, calibration=completion.default_calibration(), **DENSE
         )
     swept = found.source == Source.SWEPT
     assert swept.sum() > 500 and (~found.keep).sum() > 500, "or there is nothing to compare"
@@ -178,7 +178,7 @@ def test_options_that_cannot_be_raise_when_it_is_made(wrong, said):
 def test_true_is_what_complete_does_by_itself():
     standard = DenseMaps.from_options(True)
     assert standard.options == DenseMaps.from_options({}).options and DenseMaps.from_options(False) is None
-    assert {k: dense.complete_depth.__kwdefaults__[k] for k in standard.options} == standard.options
+    assert {k: completion.complete_depth.__kwdefaults__[k] for k in standard.options} == standard.options
     changed = DenseMaps.from_options({"size": 224, "max_sigma_rel": 1}).options
     assert changed == {**standard.options, "size": 224, "max_sigma_rel": 1}
 

@@ -38,6 +38,7 @@ from dhtorch.geometry.patches import sample_nearest
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline import dense
+from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.spec import Trace
 from dhtorch.pytree import stack
@@ -230,14 +231,14 @@ def _make_case(
     trace: Trace = {}
     with torch.no_grad():
         others = stack([near_view(k) for k in candidates])
-        estimate = method(reference, others, seed=settings.seed, hint=scene.hint, trace=trace)
-        far: list[Any] = [estimate]
+        options: dict[str, Any] = {"seed": settings.seed, "hint": scene.hint, "trace": trace}
         if swept:
-            selected = dense.selected_views(estimate, others, trace)
-            swept_map = dense.sweep_depth(
-                reference, selected, method=method, size=size, calibration=dense.default_calibration()
+            completed = complete_depth(
+                reference, others, method=method, size=size, calibration=default_calibration(), **options
             )
-            far.append(_swept_only(swept_map))
+            far: list[Any] = [trace["fused"], _swept_only(completed)]
+        else:
+            far = [method(reference, others, **options)]
     other_time = i + _WRONG_TIME_FRAMES if i + _WRONG_TIME_FRAMES < len(recording) else max(i - _WRONG_TIME_FRAMES, 0)
     truth, other_truth = (_true_map(scene, k, recording[k].to(settings.dtype), size) for k in (i, other_time))
     return AlignmentCase(truth, other_truth, [trace["samples"], *far], reference.hw, near)

@@ -23,6 +23,7 @@ from dhtorch.metrics import bootstrap
 from dhtorch.metrics.holdout import range_split
 from dhtorch.metrics.map_quality import step_counts
 from dhtorch.pipeline import dense
+from dhtorch.pipeline.completion import complete_depth
 from dhtorch.pipeline.method import Method
 from dhtorch.records import Frame, PoseFit
 from dhtorch.synthetic import SyntheticRoom
@@ -79,7 +80,7 @@ def _evaluate_room(
     near_view = range_split(reference, _NEAR_LIMIT_M)
     fit = exact_pose_fit(reference, other, method.n)
     with torch.no_grad():
-        depth_map = dense.complete_depth(
+        depth_map = complete_depth(
             near_view,
             range_split(other, _NEAR_LIMIT_M),
             method=method.replace(views=1, select_views=None),
