@@ -28,7 +28,7 @@ import harness
 import torch
 
 from dhtorch import data, pytree
-from dhtorch.codes import is_swept
+from dhtorch.codes import is_estimated
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments.baselines import opencv
 from dhtorch.experiments.baselines.frozen import WINDOW_1
@@ -160,7 +160,7 @@ def pixel_errors(depth_map: DepthMap, pair: tuple[str, Frame, Frame, Frame, floa
     _, near, _, reference, cutoff = pair
     chosen = torch.zeros_like(depth_map.keep)
     chosen[:, ::EVERY, ::EVERY] = True
-    chosen &= is_swept(depth_map.source)
+    chosen &= is_estimated(depth_map.source)
     _, h, w = depth_map.depth.shape
     truth = holdout.sample_truth(reference, dense.map_pixel_centres(near, (h, w))[chosen.flatten()][None])
     counts = truth.ok & (truth.depth > cutoff)

@@ -222,6 +222,14 @@ def is_swept(source: Any) -> Any:
     return (source == Source.SWEPT) | (source == Source.FILLED)
 
 
+def is_estimated(source: Any) -> Any:
+    """Whether a pixel of a dense map has a depth from images: swept, filled, or a sparse answer at that pixel.
+
+    ``source``: a tensor or an array of codes of :class:`Source`; the result is of the same kind, bool.
+    """
+    return is_swept(source) | (source == Source.RECOVERED)
+
+
 def describe(table: type[CodeTable], name: str) -> CodeEntry | None:
     """The entry of a code by its name in any case; None where the table has no such code."""
     numbers = {code_name: number for number, code_name in names(table).items()}

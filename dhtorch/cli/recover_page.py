@@ -10,7 +10,7 @@ import numpy as np
 from dhtorch.cli import completed_folder as completed
 from dhtorch.cli import gate_messages as reasons
 from dhtorch.cli.completed_folder import CompletionTask, Row
-from dhtorch.codes import is_swept
+from dhtorch.codes import is_estimated
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.recording import Recording
 from dhtorch.runtime.console import format_count
@@ -72,7 +72,7 @@ def _read_swept_pixels(task: CompletionTask, frames: Sequence[int]) -> tuple[np.
     depth, ratio = [np.zeros(0)], [np.zeros(0)]
     for i in frames[:_MAX_MEASURED_FRAMES]:
         maps, source = completed.read_completed_maps(task, i)
-        swept = is_swept(source) & (maps["depth"] > 0)
+        swept = is_estimated(source) & (maps["depth"] > 0)
         depth.append(maps["depth"][swept])
         ratio.append(maps["sigma"][swept] / maps["depth"][swept])
     return np.concatenate(depth), np.concatenate(ratio)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dhtorch.codes import Source, is_swept
+from dhtorch.codes import Source, is_estimated
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, SceneLike
 from dhtorch.experiments import protocol
@@ -179,10 +179,10 @@ def _swept_cloud(frame: Frame, depth_map: DepthMap) -> SweptPointCloud:
     """Swept pixels of a map (B = 1), thinned to every second, third … row and column → points."""
     depth_map = depth_map.to("cpu")
     hw = depth_map.depth.shape[-2], depth_map.depth.shape[-1]
-    stride = math.ceil(math.sqrt(max(1, int(is_swept(depth_map.source).sum())) / MAX_SWEPT_POINTS))
+    stride = math.ceil(math.sqrt(max(1, int(is_estimated(depth_map.source).sum())) / MAX_SWEPT_POINTS))
     lattice = torch.zeros(hw, dtype=torch.bool)
     lattice[::stride, ::stride] = True
-    index = (is_swept(depth_map.source)[0] & lattice).flatten().nonzero()[:, 0][:MAX_SWEPT_POINTS]
+    index = (is_estimated(depth_map.source)[0] & lattice).flatten().nonzero()[:, 0][:MAX_SWEPT_POINTS]
     uv = map_pixel_centres(frame, hw)[index].cpu()[None]
     depth, sigma, score = (x.flatten(1)[:, index].float() for x in (depth_map.depth, depth_map.sigma, depth_map.score))
     xyz = cam.unproject(frame.camera.to("cpu"), uv, depth)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Source, is_swept
+from dhtorch.codes import Source, is_estimated
 from dhtorch.data.recording import Recording
 from dhtorch.geometry import se3
 from dhtorch.integrate.level import estimate_up, mean_camera_up
@@ -105,7 +105,7 @@ def _fuse_sources(
 
 def _swept_sigmas(maps: Sequence[FrameMap]) -> Tensor:
     """Standard deviations (P,) m of the swept pixels."""
-    return torch.cat([m.sigma[is_swept(m.source) & (m.depth > 0)] for m in maps])
+    return torch.cat([m.sigma[is_estimated(m.source) & (m.depth > 0)] for m in maps])
 
 
 def _finite_poses(recording: Recording, frames: Sequence[int]) -> dict[int, Pose]:
@@ -118,7 +118,7 @@ def _finite_poses(recording: Recording, frames: Sequence[int]) -> dict[int, Pose
 def _make_view(recording: Recording, k: int, frame_map: FrameMap, source: int, T_world_from_cam: Pose) -> DepthView:
     """Depth view of the pixels of one source, without those beside a depth step."""
     depth, sigma = frame_map.depth[None], frame_map.sigma[None]
-    chosen = is_swept(frame_map.source) if source == Source.SWEPT else frame_map.source == source
+    chosen = is_estimated(frame_map.source) if source == Source.SWEPT else frame_map.source == source
     keep = chosen[None] & (depth > 0) & (sigma > 0) & (depth_step_rel(depth) <= _MAX_DEPTH_STEP_REL)
     depth = torch.where(keep, depth, 0.0)
     score = torch.where(keep, 0.1 / (0.1 + sigma / torch.where(keep, depth, 1.0)), 0.0)

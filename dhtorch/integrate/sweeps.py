@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.calibration.score_calibration import Calibration
-from dhtorch.codes import is_swept
+from dhtorch.codes import is_estimated
 from dhtorch.pipeline import dense
 from dhtorch.pipeline.completion import complete_depth, default_calibration
 from dhtorch.pipeline.method import Method
@@ -95,7 +95,7 @@ class SweepStore:
                 self._folder.mkdir(parents=True, exist_ok=True)
             self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115  (it lives as long as the store)
         depth = torch.where(depth_map.keep, depth_map.depth, 0.0)
-        keep = depth_map.keep & is_swept(depth_map.source) & (depth_step_rel(depth) <= edge_rel)
+        keep = depth_map.keep & is_estimated(depth_map.source) & (depth_step_rel(depth) <= edge_rel)
         values = torch.cat((depth, depth_map.sigma, depth_map.score))
         stored = torch.where(keep, values, 0.0).cpu().numpy().astype(np.float16)
         offset = self._file.seek(0, 2)

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.codes import is_swept
+from dhtorch.codes import is_estimated
 from dhtorch.geometry.components import small_components
 from dhtorch.metrics.errors import GROSS_ERROR_REL
 from dhtorch.records import DepthMap
@@ -41,7 +41,7 @@ def find_artefacts(depth_map: DepthMap) -> Artefacts:
     neighbours. A return is no artefact; a pinhole amid returns is one, a gap that reaches the border of the map is not.
     """
     answered = depth_map.keep
-    swept = answered & is_swept(depth_map.source)
+    swept = answered & is_estimated(depth_map.source)
     blocks = answered[:, 1:, 1:] & answered[:, 1:, :-1] & answered[:, :-1, 1:] & answered[:, :-1, :-1]
     padded = F.pad(blocks, (1, 1, 1, 1))
     in_block = padded[:, 1:, 1:] | padded[:, 1:, :-1] | padded[:, :-1, 1:] | padded[:, :-1, :-1]
@@ -53,7 +53,7 @@ def find_artefacts(depth_map: DepthMap) -> Artefacts:
 def artefact_counts(depth_map: DepthMap) -> tuple[int, int]:
     """Numbers of pixels of the maps that are an artefact of any kind, and that are swept."""
     speck, line, pinhole = find_artefacts(depth_map)
-    return int((speck | line | pinhole).sum()), int((depth_map.keep & is_swept(depth_map.source)).sum())
+    return int((speck | line | pinhole).sum()), int((depth_map.keep & is_estimated(depth_map.source)).sum())
 
 
 def near_depth_step(depth: Tensor, ratio: float = STEP_RATIO, radius: int = STEP_RADIUS_PX) -> Tensor:
@@ -76,7 +76,7 @@ def step_counts(depth_map: DepthMap, depth: Tensor, counts: Tensor | None = None
         depth: (B, h, w) m, true depth of their pixels, 0 = none.
         counts: (B, h, w) bool, pixels that are evaluated; None = all.
     """
-    beside = depth_map.keep & is_swept(depth_map.source) & (depth > 0) & near_depth_step(depth)
+    beside = depth_map.keep & is_estimated(depth_map.source) & (depth > 0) & near_depth_step(depth)
     if counts is not None:
         beside &= counts
     wrong = beside & ((depth_map.depth - depth).abs() > GROSS_ERROR_REL * depth)

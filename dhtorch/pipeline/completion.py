@@ -8,6 +8,7 @@ source images ──────────────────┘
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -15,9 +16,8 @@ from torch import Tensor
 from dhtorch.calibration import load_calibration
 from dhtorch.calibration.score_calibration import Calibration
 from dhtorch.codes import Source
-from dhtorch.pipeline.dense import DenseOptions, check_dense_options, selected_views, sweep_depth
-from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS
-from dhtorch.pipeline.fused import FusedDepth
+from dhtorch.pipeline.dense import check_dense_options, selected_views, sweep_depth
+from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.presets import FUSED
 from dhtorch.pipeline.spec import Trace
@@ -78,7 +78,7 @@ def complete_depth(
     Memory: less than four bytes for every pixel and plane, whatever the number of views, and images.
     Cost: linear in planes, pixels and source views.
     """
-    keywords = {
+    keywords: dict[str, Any] = {
         "source_views": source_views,
         "planes": planes,
         "size": size,
@@ -91,11 +91,12 @@ def complete_depth(
     sparse = method.replace(complete=None)(reference, others, seed=seed, fit=fit, hint=hint, trace=trace)
     selected = selected_views(sparse, others, trace)
     if method.complete is None:
-        fused = FusedDepth(sparse, sweep_depth(reference, selected, method=method, **keywords, options=options))
+        estimate = sparse
+        depth_map = sweep_depth(reference, selected, method=method, **keywords, options=options)
     else:
-        fused = method.complete(method, reference, selected, **keywords, options=options)
-    trace |= {"sparse": sparse, "fused": fused.estimate}
-    return fused.depth_map if calibration is None else _calibrate(fused.depth_map, calibration)
+        estimate, depth_map = method.complete(method, reference, selected, **keywords, options=options)
+    trace |= {"sparse": sparse, "fused": estimate}
+    return depth_map if calibration is None else _calibrate(depth_map, calibration)
 
 
 def _calibrate(depth_map: DepthMap, calibration: Calibration) -> DepthMap:

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from dhtorch.alignment import align
 from dhtorch.alignment.references import collect_references
-from dhtorch.codes import is_swept
+from dhtorch.codes import is_estimated
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
@@ -246,7 +246,7 @@ def _make_case(
 
 def _swept_only(depth_map: DepthMap) -> DepthMap:
     """Map with the swept depths as its only answers; the sensor's returns are references of their own."""
-    swept = is_swept(depth_map.source)
+    swept = is_estimated(depth_map.source)
     return depth_map.replace(gate=torch.where(swept, depth_map.gate, 1).to(torch.int32))
 
 

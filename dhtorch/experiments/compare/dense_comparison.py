@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.codes import Gate, is_swept
+from dhtorch.codes import Gate, is_estimated
 from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments import compare_methods as compare
@@ -72,12 +72,13 @@ _RECTIFIABLE, FULL_COHORT = "rectifiable", "full"
 
 @dataclass(frozen=True)
 class ReferenceSweep:
-    """Sparse answers and swept maps of one reference view, computed once for all variants."""
+    """Sparse answers and maps of one reference view, computed once for all variants."""
 
     reference: Frame
     trace: Trace  # of the sparse method
     selected: dense.SelectedViews
     maps: Mapping[int, DepthMap]  # by the number of source views
+    at_samples: Estimate  # the joint answers at the samples; of a method without them, the map's
     grid: Samples  # pixels of the map that are evaluated
     other: Frame  # the best source view
     T_1_from_0: Pose  # NaN where the pose failed
@@ -115,15 +116,18 @@ class SweepCache:
     ) -> ReferenceSweep:
         trace: Trace = {}
         method = method.replace(track=call_options["track"])
+        complete = method.complete or _sweep_alone
         start = time.perf_counter()
-        estimate = method(reference, others, seed=call_options["seed"], hint=call_options["hint"], trace=trace)
+        estimate = method.replace(complete=None)(
+            reference, others, seed=call_options["seed"], hint=call_options["hint"], trace=trace
+        )
         selected = dense.selected_views(estimate, others, trace)
         ms = {"sparse": 1e3 * (time.perf_counter() - start)}
-        maps = {}
-        for source_views in (self.options.get("source_views", 3), 1):
+        maps: dict[int, DepthMap] = {}
+        for source_views in (1, self.options.get("source_views", 3)):
             start = time.perf_counter()
-            maps[source_views] = dense.sweep_depth(
-                reference, selected, method=method, **{**self.options, "source_views": source_views}
+            at_samples, maps[source_views] = complete(
+                method, reference, selected, **{**self.options, "source_views": source_views}
             )
             ms[f"sweep_{source_views}"] = 1e3 * (time.perf_counter() - start)
         hw = next(iter(maps.values())).depth.shape[-2:]
@@ -141,11 +145,20 @@ class SweepCache:
             trace={**trace, "sparse": estimate},
             selected=selected,
             maps=maps,
+            at_samples=at_samples,
             grid=grid,
             other=selected.frames[best],
             T_1_from_0=Pose(R, t),
             ms=ms,
         )
+
+
+def _sweep_alone(
+    method: Method, reference: Frame, selected: dense.SelectedViews, **options: Any
+) -> tuple[Estimate, DepthMap]:
+    """The sweep in the place of the stage ``complete``."""
+    depth_map = dense.sweep_depth(reference, selected, method=method, **options)
+    return sample_map(depth_map, selected.samples, reference), depth_map
 
 
 def run(
@@ -266,7 +279,7 @@ def sample_map(depth_map: DepthMap, samples: Samples, frame: Frame) -> Estimate:
         sample_nearest(x.to(depth_map.depth), map_uv)[0]
         for x in (depth_map.depth, depth_map.sigma, depth_map.score, depth_map.source, depth_map.gate)
     )
-    keep = is_swept(source)
+    keep = is_estimated(source)
     gate = torch.where(gate == Gate.ANSWER, Gate.NO_TRACK, gate)
     return Estimate.unanswered(samples, Gate.NO_TRACK, n_views=2).replace(
         depth=torch.where(keep, depth, torch.nan),
@@ -284,7 +297,7 @@ def _variants(method: Method, cache: SweepCache, seed: int, peers: bool) -> dict
 
     answers: dict[str, Callable[[ReferenceSweep], tuple[Samples, Estimate]]] = {
         "sparse": lambda x: (x.trace["samples"], x.trace["sparse"]),
-        _AT_SAMPLES: lambda x: (x.trace["samples"], sample_map(x.maps[max_views], x.trace["samples"], x.reference)),
+        _AT_SAMPLES: lambda x: (x.trace["samples"], x.at_samples),
         _ONE_VIEW: at(1),
         DENSE_VARIANT: at(max_views),
     }

@@ -13,7 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from dhtorch.codes import PoseCode, is_swept
+from dhtorch.codes import PoseCode, is_estimated
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
@@ -89,7 +89,7 @@ def _evaluate_room(
         )
     odd = _odd_surface_mask(room, _VIEW_FRAMES[0])
     evaluated = evaluated_pixels(reference, other, odd)
-    answered = evaluated & is_swept(depth_map.source)
+    answered = evaluated & is_estimated(depth_map.source)
     right = answered & ((depth_map.depth - reference.depth).abs() < _MAX_RELATIVE_ERROR * reference.depth)
     counts = int(right.sum()), int(answered.sum()), int(evaluated.sum())
     return counts, step_counts(depth_map, reference.depth, ~odd)
