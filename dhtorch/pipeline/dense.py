@@ -130,7 +130,7 @@ def gate_sweep(sweep: Sweep, options: DenseOptions) -> DepthMap:
 
 def filter_sweep(sweep: Sweep, swept: DepthMap, options: DenseOptions) -> DepthMap:
     """The swept map without answers that their neighbours or the returns refute, and with those that they imply."""
-    return filter_map(swept, sweep.returns, sweep.reach, sweep.sparse, options)
+    return filter_map(swept, sweep.returns, sweep.base.image[:, 0], sweep.reach, sweep.sparse, options)
 
 
 def sensor_depth_map(reference: Frame, *, method: MethodSpec, size: int = DenseOptions.size) -> DepthMap:

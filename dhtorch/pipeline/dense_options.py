@@ -138,11 +138,11 @@ class DenseOptions:
 
     #: Fraction of the sensor's reach within which its silence speaks against a foreground.
     #: Source: chosen on built-in rooms: returns thin out in the last tenth of the reach.
-    halo_reach: float = 0.9
+    halo_reach: float = 0.99
 
     #: Distance from a return at its own depth within which a swept pixel may be its halo, px.
     #: Source: chosen on built-in rooms.
-    halo_radius_px: int = 8
+    halo_radius_px: int = 10
 
     #: Distance within which something farther makes such a pixel an edge, px.
     #: Source: chosen on built-in rooms.
@@ -152,21 +152,50 @@ class DenseOptions:
     #: Source: that of the measured depth steps (metrics.map_quality).
     step_ratio: float = 1.15
 
+    #: Difference of inverse depth above which a step beside a pixel is none of its noise, sigmas of the pixel.
+    #: Source: chosen on built-in rooms.
+    step_sigmas: float = 2.0
+
+    #: Difference of grey values at which two pixels are 1/e as similar as equal ones.
+    #: Source: chosen on built-in rooms.
+    grey_similarity: float = 0.06
+
+    #: Mean similarity to what is farther, as a ratio to that to its own surface, above which a pixel beside a depth
+    #: step belongs to the farther surface.
+    #: Source: chosen on built-in rooms.
+    fattened_ratio: float = 2.0
+
+    #: Sigmas beyond which a swept depth and a return beside it on one surface are inconsistent.
+    #: Source: as that of a contradiction by returns.
+    seam_sigmas: float = 3.0
+
+    #: Ratio of depths, farther over nearer, above which pixels that look alike are two surfaces all the same.
+    #: Source: chosen above the seams that were seen (1.34).
+    seam_ratio: float = 1.5
+
     #: Relative difference of inverse depth within which neighbours lie on one surface.
     #: Source: chosen on built-in rooms.
-    same_surface_ratio: float = 0.05
+    same_surface_ratio: float = 0.1
+
+    #: Difference of inverse depth within which they do as well, sigmas of the surer one.
+    #: Source: chosen on built-in rooms.
+    same_surface_sigmas: float = 3.0
 
     #: Pixels of one surface below which they are a speck, and of silence below which it is a pinhole, px.
     #: Source: that of the measured artefacts (metrics.map_quality).
     speck_px: int = 30
 
-    #: Half the side of the window whose rim pixels determine the plane that fills a pinhole, px.
-    #: Source: derived: half the side of a square pinhole, and its rim.
-    rim_radius_px: int = 4
+    #: Distance within which an unanswered pixel must meet answers in all four directions to be filled, px.
+    #: Source: derived: the side of the window that a single outlier silences (``edge_radius_px``).
+    hole_radius_px: int = 9
+
+    #: Width of a gap amid returns within the sensor's reach above which its silence speaks against their surface, px.
+    #: Source: derived: that of a square pinhole of fewer than ``speck_px``.
+    max_gap_px: int = 5
 
     #: Fewest rim pixels of that plane.
-    #: Source: derived: one more than its parameters.
-    min_rim_pixels: int = 4
+    #: Source: chosen as two more than its parameters.
+    min_rim_pixels: int = 5
 
     #: Largest distance of a rim pixel from that plane, ratio of inverse depth.
     #: Source: chosen on built-in rooms.

@@ -1,16 +1,19 @@
-"""Filters of a swept map by its neighbours and by the sensor's returns, before both are merged.
+"""Filters of a swept map by its neighbours, the picture and the sensor's returns, before map and returns are merged.
 
-    swept map ─ halo ─ seam ─ lines, specks ─ pinholes, gaps amid returns ─ swept map
-    returns ─────┴───────┴──────────┴────────────────┘
+    swept map ─┐
+    returns ───┼─ halo ─ fattened edges ─ seam ─ lines, specks ─ pinholes, gaps ─ swept map
+    picture ───┘
 
-A filter makes an answer UNCERTAIN, widens its sigma, or answers an unanswered pixel from its neighbours (FILLED); every
-other pixel keeps its bits.
+A filter makes an answer UNCERTAIN, or answers an unanswered pixel from its neighbours on the same surface (FILLED);
+every other pixel keeps its bits.
 
-Alphabet: maps (B, h, w); q inverse depth (1/m): linear in the pixel on a plane.
+Alphabet: maps (B, h, w); q inverse depth (1/m), which is linear in the pixel on a plane. Windows are read at every
+second pixel, in both directions, and only around the pixels in question.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -22,6 +25,19 @@ from dhtorch.geometry.components import small_components
 from dhtorch.geometry.windows import window_extreme
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.records import DepthMap
+
+#: Right, down, left and up: (rows, columns).
+_SIDES = ((0, 1), (1, 0), (0, -1), (-1, 0))
+
+#: Directions in which the rim of a pinhole is looked for, each followed by its opposite.
+_DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
+
+#: Least determinant of the normal equations of a plane through pixels; that of three corners of a square is 1.
+#: Source: derived: determinants are whole numbers, and 0 where the pixels lie on a line.
+_MIN_DETERMINANT = 0.5
+
+#: Least inverse depth that a filled pixel divides by, 1/m. Source: as that of the swept ones.
+_MIN_INVERSE_DEPTH = 1e-9
 
 
 class SensorReturns(NamedTuple):
@@ -39,47 +55,65 @@ class _Known(NamedTuple):
     q: Tensor  # 1/m
     sigma: Tensor  # 1/m
     usable: Tensor  # bool, a return
-    answered: Tensor  # bool, a return or a swept depth
+    swept: Tensor  # bool, a swept depth and no return
+
+    @property
+    def answered(self) -> Tensor:
+        """(B, h, w) bool: a return or a swept depth."""
+        return self.usable | self.swept
 
 
 def filter_map(
     swept: DepthMap,
     returns: SensorReturns,
+    grey: Tensor,
     reach: Tensor,
     sparse: Tensor | None = None,
     options: DenseOptions = DEFAULT_DENSE_OPTIONS,
 ) -> DepthMap:
-    """The swept map without halos, seams, lines one pixel wide and specks; pinholes of one surface are filled.
+    """The swept map without halos, seams, lines one pixel wide and specks, its pinholes filled.
 
     Args:
         swept: map (B, h, w) before the merge.
         returns: of the same pixels.
+        grey: (B, h, w) in [0, 1], the picture at the same pixels.
         reach: (B,) m, depth to which the sensor returns.
-        sparse: (B,) bool, whether the returns are sparse: then silence is no evidence, and gaps are no pinholes.
+        sparse: (B,) bool, whether the returns are sparse: then a missing one is no evidence.
         options: tuning constants.
 
-    Gradient: of depths that are kept; filled ones carry none.
+    Gradient: to depths that are kept; filled ones carry none.
+    Cost: reads windows of some hundred pixels around the pixels beside depth steps and in pinholes, and makes
+    ``speck_px`` passes over the map.
     """
-    dense = torch.ones_like(reach, dtype=torch.bool) if sparse is None else ~sparse
-    with torch.no_grad():
-        halo = _halo(_known(swept, returns), reach, dense, options)
-        swept = _silence(swept, halo)
-        swept = _silence(swept, _unsupported(_known(swept, returns), options))
-        filled = _fill(_known(swept, returns), dense, options)
-    return _answer(swept, *filled)
+    within = returns.usable & (returns.depth.detach() < options.halo_reach * reach[:, None, None])
+    within = within if sparse is None else within & ~sparse[:, None, None]
+    grey = grey.detach()
+    swept = _silence(swept, _halo(_known(swept, returns), within, options))
+    swept = _silence(swept, _fattened(_known(swept, returns), grey, options))
+    swept = _silence(swept, _torn(_known(swept, returns), grey, options))
+    swept = _silence(swept, _unsupported(_known(swept, returns), options))
+    where, q, sigma = _fill(_known(swept, returns), within, options)
+    depth = 1 / q
+    return swept.replace(
+        depth=torch.where(where, depth, swept.depth),
+        sigma=torch.where(where, sigma * depth.square(), swept.sigma),
+        score=torch.where(where, 0.1 / (0.1 + sigma * depth), swept.score),
+        source=swept.source.masked_fill(where, Source.FILLED),
+        gate=swept.gate.masked_fill(where, Gate.ANSWER),
+    )
 
 
+@torch.no_grad()
 def _known(swept: DepthMap, returns: SensorReturns) -> _Known:
-    keep = swept.keep & ~returns.usable
-    depth = torch.where(returns.usable, returns.depth.to(swept.depth), torch.where(keep, swept.depth, torch.inf))
-    sigma = torch.where(returns.usable, returns.sigma.to(swept.sigma), torch.where(keep, swept.sigma, 0.0))
+    usable, keep = returns.usable, swept.keep & ~returns.usable
+    depth = torch.where(usable, returns.depth.to(swept.depth), torch.where(keep, swept.depth, torch.inf))
+    sigma = torch.where(usable, returns.sigma.to(swept.sigma), torch.where(keep, swept.sigma, 0.0))
     q = 1 / depth
-    return _Known(q, sigma * q.square(), returns.usable, keep | returns.usable)
+    return _Known(q, sigma * q.square(), usable, keep)
 
 
 def _silence(swept: DepthMap, which: Tensor) -> DepthMap:
-    """The map with pixels ``which`` (B, h, w) UNCERTAIN."""
-    which = which & swept.keep
+    """The map with answers ``which`` (B, h, w) bool UNCERTAIN."""
     nan = torch.full_like(swept.depth, torch.nan)
     return swept.replace(
         depth=torch.where(which, nan, swept.depth),
@@ -90,134 +124,193 @@ def _silence(swept: DepthMap, which: Tensor) -> DepthMap:
     )
 
 
-def _halo(known: _Known, reach: Tensor, dense: Tensor, options: DenseOptions) -> Tensor:
-    """Swept pixels (B, h, w) bool at the depth of returns beside them, in front of something farther.
+def _halo(known: _Known, within: Tensor, options: DenseOptions) -> Tensor:
+    """Swept pixels (B, h, w) bool at the depth of returns ``within`` the reach beside them, where the sensor is silent.
 
-    Where the sensor reaches it would return from such a foreground; its silence there refutes the depth. A window that
-    holds the edge of the foreground is matched at the foreground's depth on both sides of the edge.
+    A window that holds the edge of a foreground is matched at the foreground's depth on both sides of the edge. Where
+    the sensor reaches it would return from there, so its silence refutes the depth: if something farther is beside the
+    pixel, or if the silent strip is no wider than such windows make it. A gap between two returns is no such strip.
     """
-    q, _, usable, answered = known
-    swept = answered & ~usable
-    within = q * (options.halo_reach * reach)[:, None, None] > 1
-    near = torch.where(usable, q, 0.0)
-    beside = window_extreme(near, options.halo_radius_px, torch.maximum) * options.step_ratio > q
-    far = torch.where(swept, q, torch.inf)
-    background = window_extreme(far, options.background_radius_px, torch.minimum) * options.step_ratio < q
-    return swept & within & beside & background & dense[:, None, None]
+    q, _, usable, swept = known
+    r, ratio = options.halo_radius_px, options.step_ratio
+    near = swept & window_extreme(within, r, torch.logical_or)
+    beside = _has_neighbour(q, near, torch.where(within, q, 0.0), r, ratio)
+    farthest = window_extreme(torch.where(swept, q, torch.inf), options.background_radius_px, torch.minimum)
+    goes_on = _has_neighbour(q, beside, torch.where(swept & ~beside, q, 0.0), r, ratio)
+    return beside & ((farthest * ratio < q) | ~(goes_on | _in_gap(usable)))
+
+
+def _has_neighbour(q: Tensor, which: Tensor, of: Tensor, radius: int, ratio: float) -> Tensor:
+    """Pixels ``which`` (B, h, w) bool with one of ``of`` (B, h, w) 1/m, 0 = none, at their depth in the window."""
+    b, y, x = which.nonzero(as_tuple=True)
+    padded, own = F.pad(of, (radius,) * 4), q[b, y, x]
+    low, high = own / ratio, own * ratio
+    found = torch.zeros_like(own, dtype=torch.bool)
+    for dy, dx in _window(radius):
+        other = padded[b, y + dy, x + dx]
+        found |= (other > low) & (other < high)
+    out = torch.zeros_like(which)
+    out[b, y, x] = found
+    return out
+
+
+def _fattened(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
+    """Swept pixels (B, h, w) bool beside something farther, which they resemble more than their own surface.
+
+    Compared are mean similarities, exp(-difference of grey values / ``grey_similarity``), to the answered pixels of the
+    window at the pixel's depth or nearer, and to the farther ones.
+    """
+    q, sigma, _, swept = known
+    r, ratio = options.halo_radius_px, options.step_ratio
+    farthest = window_extreme(torch.where(swept, q, torch.inf), r, torch.minimum)
+    step = torch.maximum(q - q / ratio, options.step_sigmas * sigma)
+    b, y, x = (swept & (q - farthest > step)).nonzero(as_tuple=True)
+    depths, shades = (F.pad(v, (r,) * 4) for v in (q, grey))
+    own, shade = q[b, y, x], grey[b, y, x]
+    near, far, n_near, n_far = (torch.zeros_like(own) for _ in range(4))
+    for dy, dx in _window(r):
+        other = depths[b, y + dy, x + dx]
+        alike = torch.exp((shades[b, y + dy, x + dx] - shade).abs() / -options.grey_similarity)
+        is_near, is_far = other * ratio > own, (other > 0) & (other * ratio < own)
+        near, n_near = near + alike * is_near, n_near + is_near
+        far, n_far = far + alike * is_far, n_far + is_far
+    out = torch.zeros_like(swept)
+    out[b, y, x] = far * n_near > options.fattened_ratio * near * n_far
+    return out
+
+
+def _window(radius: int) -> Iterator[tuple[int, int]]:
+    """Every second pixel of the window, in rows and columns of a map that is padded by its radius."""
+    for dy in range(0, 2 * radius + 1, 2):
+        yield from ((dy, dx) for dx in range(0, 2 * radius + 1, 2))
+
+
+def _torn(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
+    """Swept pixels (B, h, w) bool within two pixels of a return, without an edge of the picture between, that are
+    inconsistent with it: both would be one surface.
+
+    Depths that differ by more than ``seam_ratio`` are those of two surfaces that look alike.
+    """
+    q, sigma, usable, swept = known
+    out = torch.zeros_like(swept)
+    for step in (1, 2):
+        for dy, dx in _SIDES:
+            other, other_sigma, other_grey = (_shift(v, step * dy, step * dx) for v in (q, sigma, grey))
+            differ = (q - other).abs()
+            torn = differ.square() > options.seam_sigmas**2 * (sigma.square() + other_sigma.square())
+            one = torch.maximum(q, other) < options.seam_ratio * torch.minimum(q, other)
+            alike = (grey - other_grey).abs() < options.grey_similarity
+            out |= _shift(usable, step * dy, step * dx) & torn & one & alike
+    return out & swept
 
 
 def _same_surface(known: _Known, options: DenseOptions) -> tuple[Tensor, Tensor]:
     """Whether a pixel and its right, its lower neighbour are answered on one surface: (B, h, w-1), (B, h-1, w) bool."""
-
-    def same(a: Tensor, b: Tensor) -> Tensor:
-        return (a - b).abs() <= options.same_surface_ratio * torch.minimum(a, b)
-
     q, answered = known.q, known.answered
-    right = answered[..., 1:] & answered[..., :-1] & same(q[..., 1:], q[..., :-1])
-    return right, answered[:, 1:] & answered[:, :-1] & same(q[:, 1:], q[:, :-1])
+    limit = torch.maximum(options.same_surface_ratio * q, options.same_surface_sigmas * known.sigma)
+    right = (q[..., 1:] - q[..., :-1]).abs() <= torch.minimum(limit[..., 1:], limit[..., :-1])
+    down = (q[:, 1:] - q[:, :-1]).abs() <= torch.minimum(limit[:, 1:], limit[:, :-1])
+    return right & answered[..., 1:] & answered[..., :-1], down & answered[:, 1:] & answered[:, :-1]
 
 
 def _unsupported(known: _Known, options: DenseOptions) -> Tensor:
     """Swept pixels (B, h, w) bool in lines one pixel wide, and in specks that remain without those."""
     right, down = _same_surface(known, options)
-    block = right[:, 1:] & right[:, :-1] & down[..., 1:] & down[..., :-1]
-    padded = F.pad(block, (1, 1, 1, 1))
-    line = ~(padded[:, 1:, 1:] | padded[:, 1:, :-1] | padded[:, :-1, 1:] | padded[:, :-1, :-1])
-    line &= ~known.usable
-    rest = known.answered & ~line
-    speck = small_components(rest, options.speck_px, same=(right, down)) & ~known.usable
-    return (line & known.answered) | speck
+    line = known.swept & ~_in_block(right[:, 1:] & right[:, :-1] & down[..., 1:] & down[..., :-1])
+    speck = small_components(known.answered & ~line, options.speck_px, same=(right, down))
+    return line | (speck & known.swept)
 
 
-class _Filled(NamedTuple):
-    """Pixels with an interpolated depth."""
-
-    where: Tensor  # (B, h, w) bool
-    depth: Tensor  # (B, h, w) m
-    sigma: Tensor  # (B, h, w) m
+def _in_block(corner: Tensor) -> Tensor:
+    """Pixels (B, h, w) bool in any of the 2 × 2 blocks (B, h - 1, w - 1) bool, by their upper left pixels."""
+    padded = F.pad(corner, (1, 1, 1, 1))
+    return padded[:, 1:, 1:] | padded[:, 1:, :-1] | padded[:, :-1, 1:] | padded[:, :-1, :-1]
 
 
-def _fill(known: _Known, dense: Tensor, options: DenseOptions) -> _Filled:
-    """Depth of pinholes, and of gaps of one pixel amid returns, whose rim lies on one plane."""
-    r, margin = options.rim_radius_px, options.speck_px
-    silent = F.pad(~known.answered, (margin,) * 4, value=True)
-    hole = small_components(silent, margin)[:, margin:-margin, margin:-margin]
-    usable = known.usable
-    gap = ~known.answered & (_between(usable, 1) | _between(usable, 2))
-    hole = (hole | gap) & dense[:, None, None]
-    rim = known.answered & window_extreme(hole, 1, torch.logical_or)
-    b, y, x = hole.nonzero(as_tuple=True)
-    padded = [F.pad(torch.where(rim, v, 0.0), (r,) * 4) for v in (known.q, known.sigma)]
-    weight = F.pad(rim, (r,) * 4).to(known.q)
-    offsets = [(dy, dx) for dy in range(-r, r + 1) for dx in range(-r, r + 1)]
+def _fill(known: _Known, within: Tensor, options: DenseOptions) -> tuple[Tensor, Tensor, Tensor]:
+    """Unanswered pixels (B, h, w) bool in pinholes, and in gaps amid answers, whose rim lies on one plane; its inverse
+    depth there and sigma, the rim's mean plus the spread about the plane.
 
-    def at(values: Tensor, dy: int, dx: int) -> Tensor:
-        return values[b, y + (r + dy), x + (r + dx)]
-
-    sums = [torch.zeros_like(x, dtype=known.q.dtype) for _ in range(10)]
-    n, sx, sy, sxx, sxy, syy, sq, sxq, syq, ss = sums
-    for dy, dx in offsets:
-        w, q = at(weight, dy, dx), at(padded[0], dy, dx)
-        n += w
-        ss += at(padded[1], dy, dx)
-        for total, value, factor in (
-            (sx, w, dx),
-            (sy, w, dy),
-            (sxx, w, dx * dx),
-            (sxy, w, dx * dy),
-            (syy, w, dy * dy),
-            (sxq, q, dx),
-            (syq, q, dy),
-            (sq, q, 1),
-        ):
-            if factor:
-                total += value * factor
-    # normal equations of q = a + b dx + c dy, by cofactors
-    c_xx, c_xy, c_yy = syy * n - sy * sy, sx * sy - sxy * n, sxx * n - sx * sx
-    c_nx, c_ny = sxy * sy - sx * syy, sxy * sx - sxx * sy
-    c_nn = sxx * syy - sxy * sxy
-    det = c_nn * n + c_nx * sx + c_ny * sy
-    inv = 1 / det.clamp_min(1e-6)
-    a0 = (c_nn * sq + c_nx * sxq + c_ny * syq) * inv
-    a1 = (c_nx * sq + c_xx * sxq + c_xy * syq) * inv
-    a2 = (c_ny * sq + c_xy * sxq + c_yy * syq) * inv
-    worst, square = torch.zeros_like(a0), torch.zeros_like(a0)
-    for dy, dx in offsets:
-        residual = (at(padded[0], dy, dx) - (a0 + a1 * dx + a2 * dy)) * at(weight, dy, dx)
-        worst = torch.maximum(worst, residual.abs())
-        square += residual * residual
-    n_1 = n.clamp_min(1)
-    sigma = ss / n_1 + (square / n_1).sqrt()
-    fits = (det > 0.5) & (n >= options.min_rim_pixels) & (a0 > 0) & (worst <= options.rim_ratio * a0)
-    where = torch.zeros_like(hole)
-    depth, spread = torch.zeros_like(known.q), torch.zeros_like(known.q)
+    The rim of a pixel are the answered pixels that are met first in eight directions. The sensor's silence refutes the
+    plane if some of them are returns ``within`` its reach and the gap is wider than ``max_gap_px`` in all directions.
+    """
+    r, answered = options.hole_radius_px, known.answered
+    b, y, x = ((_enclosed(answered, r) | _in_gap(answered)) & ~answered).nonzero(as_tuple=True)
+    padded, near, values, sigmas = (F.pad(v, (r,) * 4) for v in (answered, within, known.q, known.sigma))
+    rim, widths, total_sigma, refuted = [], [], torch.zeros_like(known.q[b, y, x]), torch.zeros_like(answered[b, y, x])
+    for dy, dx in _DIRECTIONS:
+        steps = torch.zeros_like(x)
+        for k in range(r, 0, -1):
+            steps = torch.where(padded[b, y + (r + k * dy), x + (r + k * dx)], k, steps)
+        at = b, y + r + steps * dy, x + r + steps * dx  # the pixel itself, 0, where none is met
+        rim.append(_RimPoint((steps > 0).to(values), (steps * dx).to(values), (steps * dy).to(values), values[at]))
+        total_sigma = total_sigma + sigmas[at]
+        refuted |= near[at]
+        widths.append(torch.where(steps > 0, steps, options.max_gap_px + 1))
+    narrowest = torch.stack([one + other - 1 for one, other in zip(widths[::2], widths[1::2], strict=True)]).amin(0)
+    refuted &= narrowest > options.max_gap_px
+    q, distance = _fit_plane(rim)
+    n = sum((point.met for point in rim), torch.zeros_like(q)).clamp_min(1)
+    sigma = total_sigma / n
+    limit = torch.maximum(options.rim_ratio * q, options.same_surface_sigmas * sigma)
+    fits = ~refuted & (n >= options.min_rim_pixels) & (q > _MIN_INVERSE_DEPTH) & (distance.amax(0) <= limit)
+    where, filled, spread = torch.zeros_like(answered), torch.ones_like(known.q), torch.zeros_like(known.q)
     where[b, y, x] = fits
-    depth[b, y, x] = 1 / a0.clamp_min(1e-9)
-    spread[b, y, x] = sigma / a0.clamp_min(1e-9).square()
-    return _Filled(where, depth, spread)
+    both = answered | where
+    where &= _in_block(both[:, 1:, 1:] & both[:, 1:, :-1] & both[:, :-1, 1:] & both[:, :-1, :-1])
+    filled[b, y, x] = torch.where(fits, q, 1.0)
+    spread[b, y, x] = sigma + (distance.square().sum(0) / n).sqrt()
+    return where, filled, spread
 
 
-def _between(mask: Tensor, step: int) -> Tensor:
-    """Pixels (B, h, w) with pixels of the mask on two opposite sides, ``step`` and one px away, or one px and ``step``."""
-    m = F.pad(mask, (step,) * 4)
-    h, w = mask.shape[1:]
+class _RimPoint(NamedTuple):
+    """One rim pixel of each of K pixels, (K,) each; all 0 where there is none."""
 
-    def shifted(dy: int, dx: int) -> Tensor:
-        return m[:, step + dy : step + dy + h, step + dx : step + dx + w]
+    met: Tensor  # 0 or 1
+    x: Tensor  # px, from the pixel
+    y: Tensor
+    q: Tensor  # 1/m
 
-    out = torch.zeros_like(mask)
-    for dy, dx in ((0, 1), (1, 0)):
-        out |= shifted(dy, dx) & shifted(-step * dy, -step * dx)
-        out |= shifted(step * dy, step * dx) & shifted(-dy, -dx)
+
+def _fit_plane(rim: list[_RimPoint]) -> tuple[Tensor, Tensor]:
+    """Rims -> inverse depth (K,) 1/m of their planes at the pixels, and distances (P, K) 1/m of the points from them.
+
+    NaN where the points do not determine a plane. Written out as sums: rounding depends on no other pixel.
+    """
+    n, x, y, xx, xy, yy, q, xq, yq = (torch.zeros_like(rim[0].q) for _ in range(9))
+    for met, u, v, value in rim:
+        n, x, y, q = n + met, x + u, y + v, q + value
+        xx, xy, yy, xq, yq = xx + u * u, xy + u * v, yy + v * v, xq + u * value, yq + v * value
+    # cofactors of the normal equations of q = a + b x + c y
+    aa, ab, ac = xx * yy - xy * xy, xy * y - x * yy, x * xy - xx * y
+    bb, bc, cc = n * yy - y * y, x * y - n * xy, n * xx - x * x
+    det = n * aa + x * ab + y * ac
+    scale = 1 / torch.where(det > _MIN_DETERMINANT, det, torch.nan)
+    a, b, c = ((i * q + j * xq + k * yq) * scale for i, j, k in ((aa, ab, ac), (ab, bb, bc), (ac, bc, cc)))
+    return a, torch.stack([(value - (a * met + b * u + c * v)).abs() for met, u, v, value in rim])
+
+
+def _enclosed(mask: Tensor, radius: int) -> Tensor:
+    """Pixels (B, h, w) bool with one of the mask within ``radius`` px on each of the four sides."""
+    out = torch.ones_like(mask)
+    for dy, dx in _SIDES:
+        side = torch.zeros_like(mask)
+        for k in range(1, radius + 1):
+            side |= _shift(mask, k * dy, k * dx)
+        out &= side
     return out
 
 
-def _answer(swept: DepthMap, where: Tensor, depth: Tensor, sigma: Tensor) -> DepthMap:
-    """The map with filled pixels; those that are too uncertain stay unanswered."""
-    return swept.replace(
-        depth=torch.where(where, depth.to(swept.depth), swept.depth),
-        sigma=torch.where(where, sigma.to(swept.sigma), swept.sigma),
-        score=torch.where(where, 0.1 / (0.1 + sigma / depth.clamp_min(1e-9)), swept.score),
-        source=swept.source.masked_fill(where, Source.FILLED),
-        gate=swept.gate.masked_fill(where, Gate.ANSWER),
-    )
+def _in_gap(mask: Tensor) -> Tensor:
+    """Pixels (B, h, w) bool between two of the mask, one or two pixels wide, in their row or column."""
+    out = torch.zeros_like(mask)
+    for dy, dx in _SIDES:
+        out |= _shift(mask, dy, dx) & (_shift(mask, -dy, -dx) | _shift(mask, -2 * dy, -2 * dx))
+    return out
+
+
+def _shift(x: Tensor, rows: int, columns: int) -> Tensor:
+    """Map (B, h, w) -> the value so many rows below and columns to the right of each pixel; 0 outside."""
+    h, w = x.shape[1:]
+    margin = max(abs(rows), abs(columns))
+    return F.pad(x, (margin,) * 4)[:, margin + rows : margin + rows + h, margin + columns : margin + columns + w]
