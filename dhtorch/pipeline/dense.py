@@ -31,6 +31,7 @@ from dhtorch.geometry.se3 import Pose
 from dhtorch.pipeline import surface
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.map_filters import SensorReturns, filter_map
+from dhtorch.pipeline.planes import fill_planes
 from dhtorch.pipeline.spec import MethodSpec, Trace
 from dhtorch.records import Camera, DepthMap, Estimate, Frame, PoseFit, Samples
 
@@ -130,7 +131,9 @@ def gate_sweep(sweep: Sweep, options: DenseOptions) -> DepthMap:
 
 def filter_sweep(sweep: Sweep, swept: DepthMap, options: DenseOptions) -> DepthMap:
     """The swept map without answers that their neighbours or the returns refute, and with those that they imply."""
-    return filter_map(swept, sweep.returns, sweep.base.image[:, 0], sweep.reach, sweep.sparse, options)
+    image, reach, sparse = sweep.base.image, sweep.reach, sweep.sparse
+    filtered = filter_map(swept, sweep.returns, image[:, 0], reach, sparse, options)
+    return fill_planes(filtered, swept, sweep.returns, image, reach, sparse=sparse, options=options)
 
 
 def sensor_depth_map(reference: Frame, *, method: MethodSpec, size: int = DenseOptions.size) -> DepthMap:

@@ -201,6 +201,76 @@ class DenseOptions:
     #: Source: chosen on built-in rooms.
     rim_ratio: float = 0.05
 
+    # Planes of weakly textured surfaces
+
+    #: Side of the cells that planes are fitted to, px.
+    #: Source: chosen: the cost; the half a window of the sweep.
+    plane_cell_px: int = 8
+
+    #: Fewest answered pixels of a cell that supports planes.
+    #: Source: chosen: a line of one pixel across the cell.
+    min_cell_pixels: int = 8
+
+    #: Cells up to which a ray looks for support: the longest extrapolation of a plane.
+    #: Source: chosen on built-in rooms and shared scenes: 24 cells are .3 of the longer side of a map.
+    plane_reach_cells: int = 24
+
+    #: Support cells that a ray collects.
+    #: Source: chosen: those behind the nearest determine the slant.
+    plane_ray_support: int = 4
+
+    #: Largest difference of grey value (in [0, 1]) from that of the cell at which a ray goes on.
+    #: Source: chosen on built-in rooms and shared scenes; .03 halves the filled pixels at the same errors.
+    plane_grey_difference: float = 0.06
+
+    #: Largest distance of support from its plane, ratio of inverse depth; three standard deviations.
+    #: Source: chosen: three times the median error of swept answers on weak texture.
+    plane_inlier_ratio: float = 0.09
+
+    #: Least area spanned by the support cells of a hypothesis, over that of a cell.
+    #: Source: chosen: three cells by three.
+    min_triple_area: float = 9.0
+
+    #: Fewest support cells on a plane, of 64.
+    #: Source: chosen on built-in rooms: with fewer, one in ten filled pixels is more than 20 % off.
+    min_plane_support: int = 20
+
+    #: Least share of the support that lies on the plane.
+    #: Source: chosen on built-in rooms and shared scenes.
+    min_plane_share: float = 0.6
+
+    #: Largest standard deviation of a plane at the middle of its cell, relative, by independent errors of its support.
+    #: Source: chosen on built-in rooms and shared scenes.
+    max_plane_sigma_rel: float = 0.01
+
+    #: Cells around whose planes are compared.
+    #: Source: chosen: a plane that fits by chance ends within two cells.
+    plane_neighbours: int = 2
+
+    #: Largest mean relative difference of inverse depth between the planes of a cell and of those around.
+    #: Source: chosen on built-in rooms and shared scenes.
+    max_plane_disagreement: float = 0.04
+
+    #: Relative difference of inverse depth as which a larger one counts in that mean.
+    #: Source: chosen: one in six neighbours on another surface exceeds the limit.
+    max_plane_difference: float = 0.3
+
+    #: Fraction of the sensor's reach nearer than which its silence refutes a plane.
+    #: Source: chosen: the reach less the error of a plane.
+    plane_reach: float = 0.97
+
+    #: Largest share of the rays that end on a plane along which the sensor's silence refutes it.
+    #: Source: chosen: a few rays end in holes of the sensor.
+    max_refuted_rays: float = 0.1
+
+    #: Independent errors per support cell: neighbours share windows and edges.
+    #: Source: chosen on built-in rooms: the filled pixels within one sigma.
+    independent_support: float = 0.25
+
+    #: Part of the support's sigma that is common to all of it, by motions and scale.
+    #: Source: chosen on built-in rooms: the filled pixels within one sigma.
+    common_sigma_ratio: float = 0.45
+
 
 #: The default of every function that takes options.
 DEFAULT_DENSE_OPTIONS: Final = DenseOptions()
