@@ -1,0 +1,220 @@
+"""Sparse and swept answers joined: the rules on single answers, and the product on the built-in room."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from dhtorch.codes import Gate, Source, is_estimated
+from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline import fused
+from dhtorch.pipeline.completion import complete_depth
+from dhtorch.pipeline.dense import selected_views, sweep_depth
+from dhtorch.pipeline.presets import FUSED
+from dhtorch.pytree import collate, stack
+from dhtorch.synthetic import SyntheticRoom
+
+NEAR = 2.0
+METHOD = FUSED.replace(n=512, complete={"planes": 48})
+
+
+def answers(depth: float, sigma_rel: float, *, keep: bool = True, n_views: int = 2) -> fused._Answers:
+    """One answer of one sample."""
+    q, sigma = (torch.tensor([[x]], dtype=torch.float64) for x in (1 / depth, sigma_rel))
+    return fused._Answers(
+        torch.tensor([[keep]]), q, sigma, 0.5 * sigma, sigma / (n_views - 1) ** 0.5, torch.tensor([[n_views]])
+    )
+
+
+NONE = answers(1.0, 1.0, keep=False)
+RULES = {"limits": (2.0, 3.0), "factors": (0.6, 2.0)}
+
+
+def joint_depth(joint: fused._Joint) -> float:
+    w = joint.weight
+    return float(1 / (w * joint.sparse.q + (1 - w) * joint.swept.q))
+
+
+def test_answers_that_agree_become_their_weighted_mean():
+    sparse, swept = answers(4.0, 0.02, n_views=3), answers(4.1, 0.04)
+    joint = fused._join((sparse, NONE), (swept, NONE), **RULES)
+    e_one, e_other = 0.02 / 2**0.5, 0.04
+    weight = e_other**2 / (e_one**2 + e_other**2)
+    assert float(joint.weight) == pytest.approx(weight)
+    assert 1 / joint_depth(joint) == pytest.approx(weight / 4.0 + (1 - weight) / 4.1)
+    assert float(joint.expected) == pytest.approx(0.6 * e_one)
+
+
+def test_of_answers_that_conflict_the_surer_stands_with_less_certainty():
+    joint = fused._join((answers(4.0, 0.04), NONE), (answers(5.0, 0.02), NONE), **RULES)
+    assert joint_depth(joint) == pytest.approx(5.0)
+    assert float(joint.expected) == pytest.approx(2 * 0.02)
+
+
+def test_between_agreement_and_conflict_the_surer_stands_as_it_is():
+    joint = fused._join((answers(4.0, 0.02), NONE), (answers(4.3, 0.02), NONE), **RULES)
+    z = (1 / 4.0 - 1 / 4.3) / (0.02**2 / 16 + 0.02**2 / 4.3**2) ** 0.5
+    assert 2 < z < 3
+    assert joint_depth(joint) == pytest.approx(4.0) and float(joint.expected) == pytest.approx(0.02)
+
+
+def test_an_uncertain_answer_counts_only_where_one_of_the_other_kind_agrees():
+    alone = fused._join((NONE, answers(4.0, 0.25)), (NONE, NONE), **RULES)
+    assert not bool(alone.keep)
+    apart = fused._join((NONE, answers(4.0, 0.05)), (NONE, answers(9.0, 0.05)), **RULES)
+    assert not bool(apart.keep)
+    together = fused._join((NONE, answers(4.0, 0.25)), (NONE, answers(4.4, 0.3)), **RULES)
+    assert bool(together.keep) and 4.0 < joint_depth(together) < 4.4
+    confirmed = fused._join((answers(4.0, 0.02), NONE), (NONE, answers(4.1, 0.3)), **RULES)
+    assert 4.0 <= joint_depth(confirmed) < 4.01
+
+
+def test_one_answer_alone_stays_as_it_is():
+    for sides in (((answers(4.0, 0.1), NONE), (NONE, NONE)), ((NONE, NONE), (answers(4.0, 0.1), NONE))):
+        joint = fused._join(*sides, **RULES)
+        assert joint_depth(joint) == pytest.approx(4.0) and float(joint.expected) == pytest.approx(0.1)
+
+
+@pytest.fixture(scope="module")
+def room():
+    return SyntheticRoom(n_frames=12, hw=(240, 320), depth_hw=(240, 320), lidar="exact", image_noise=0.0)
+
+
+@pytest.fixture(scope="module")
+def views(room):
+    """A reference view whose returns end at two metres, and the other views."""
+    return range_split(room[3], NEAR), stack([range_split(room[k], NEAR) for k in (0, 6, 9, 11)])
+
+
+@pytest.fixture(scope="module")
+def found(views):
+    trace = {}
+    with torch.no_grad():
+        estimate = METHOD(*views, trace=trace)
+    return estimate, trace
+
+
+def test_the_joint_estimate_answers_what_either_answers_and_keeps_the_samples_with_returns(found):
+    estimate, trace = found
+    sparse, samples = trace["sparse"], trace["samples"]
+    open_ = ~samples.usable
+    assert bool(estimate.keep[open_ & sparse.keep].all())
+    assert int((estimate.keep & open_).sum()) > 1.1 * int((sparse.keep & open_).sum())
+    for name in ("depth", "sigma", "gate", "n_views", "score"):
+        torch.testing.assert_close(getattr(estimate, name)[~open_], getattr(sparse, name)[~open_], equal_nan=True)
+    kept = estimate.keep
+    assert bool((estimate.sigma[kept] > 0).all()) and bool((estimate.sigma_shared <= estimate.sigma)[kept].all())
+    assert bool((estimate.score[~kept] == 0).all()) and bool(estimate.depth[~kept].isnan().all())
+
+
+def test_the_joint_errors_are_no_larger_and_lie_as_often_within_sigma(room, found):
+    estimate, trace = found
+    truth = room[3].depth[0]
+    uv = trace["samples"].uv[0].round().long()
+    true = truth[uv[:, 1], uv[:, 0]]
+    both = (estimate.keep & trace["sparse"].keep & ~trace["samples"].usable)[0] & (true > NEAR)
+    error, before = ((x.depth[0] - true).abs()[both] / true[both] for x in (estimate, trace["sparse"]))
+    assert both.sum() > 50 and float(error.median()) <= 1.05 * float(before.median())
+    within, within_before = (
+        float(((x.depth[0] - true).abs() < 2 * x.sigma[0])[both].float().mean()) for x in (estimate, trace["sparse"])
+    )
+    assert within >= within_before - 0.05
+
+
+def test_the_map_has_returns_swept_pixels_and_joint_answers_at_samples(views, found):
+    estimate, trace = found
+    depth_map, samples = trace["dense"], trace["samples"]
+    sensed = depth_map.source == Source.SENSOR
+    torch.testing.assert_close(depth_map.depth[sensed], views[0].depth[sensed])
+    assert bool((depth_map.source == Source.RECOVERED).any()) and bool((depth_map.source == Source.SWEPT).any())
+    uv = samples.uv[0].round().long()
+    at = depth_map.map(lambda x: x[:, uv[:, 1], uv[:, 0]])
+    joint = (at.source == Source.RECOVERED) & estimate.keep & ~samples.usable
+    shares = (at.depth == estimate.depth)[joint].float().mean()  # several samples may share a pixel
+    assert joint.sum() > 10 and float(shares) > 0.9
+    answered = depth_map.keep
+    assert bool((answered == (sensed | is_estimated(depth_map.source))).all())
+
+
+def test_a_joint_answer_beside_no_answered_pixel_is_not_in_the_map():
+    swept = complete_map = fused.DepthMap(
+        *(torch.full((1, 5, 5), v) for v in (torch.nan, torch.nan, 0.0)),
+        torch.zeros(1, 5, 5, dtype=torch.int32),
+        torch.full((1, 5, 5), Gate.NO_TRACK, dtype=torch.int32),
+    )
+    swept = swept.replace(gate=swept.gate.clone())
+    swept.gate[0, 0, 0] = Gate.ANSWER
+    at = torch.tensor([[[1.0, 1.0], [4.0, 4.0], [1.0, 1.0]]])
+    one = torch.ones(1, 3)
+    estimate = fused.Estimate(
+        uv=at, depth=torch.tensor([[2.0, 3.0, 4.0]]), sigma=0.1 * one, sigma_shared=0.0 * one, parallax_deg=one,
+        residual_px=one, n_views=2 * one.int(), score=torch.tensor([[0.3, 0.9, 0.6]]), gate=0 * one.int(),
+    )  # fmt: skip
+    answer = fused._Answers(one.bool(), 1 / estimate.depth, one, one, one, one.int())
+    joint = fused._Joint(one.bool(), one, one, answer, answer)
+
+    class Selected:
+        class samples:
+            usable = torch.zeros(1, 3, dtype=torch.bool)
+
+    got = fused._insert(swept, at, estimate, Selected, joint)  # type: ignore[arg-type]
+    assert float(got.depth[0, 1, 1]) == 4.0  # of two samples at a pixel that with the larger score
+    assert bool(got.depth[0, 4, 4].isnan()) and int(got.gate[0, 4, 4]) == Gate.NO_TRACK
+    assert int(got.source[0, 1, 1]) == Source.RECOVERED and complete_map.gate[0, 0, 0] == Gate.NO_TRACK
+
+
+def test_sigma_of_the_sweep_has_at_least_the_pose_error_of_the_sparse_answers(views, found):
+    _, trace = found
+    selected = selected_views(trace["sparse"], views[1], trace)
+    shared = float(fused._shared_error(selected))
+    sparse = trace["sparse"]
+    counts = sparse.keep & ~trace["samples"].usable
+    expected = float((sparse.sigma_shared / sparse.depth**2)[counts].median())
+    assert shared == pytest.approx(expected, rel=1e-6) and shared > 0
+    depth_map = trace["dense"]
+    swept = depth_map.source == Source.SWEPT
+    assert bool((depth_map.sigma[swept] >= 0.999 * shared * depth_map.depth[swept].square()).all())
+    few = selected._replace(joined=sparse.replace(gate=torch.where(counts, Gate.UNCERTAIN, sparse.gate)))
+    assert float(fused._shared_error(few)) == 0
+
+
+def test_complete_depth_and_the_method_give_one_product(views, found):
+    estimate, trace = found
+    again = {}
+    with torch.no_grad():
+        depth_map = complete_depth(*views, method=METHOD, planes=48, trace=again)
+    for name in ("depth", "sigma", "score", "source", "gate"):
+        assert torch.equal(getattr(depth_map, name).nan_to_num(), getattr(trace["dense"], name).nan_to_num()), name
+        if name != "source":
+            assert torch.equal(getattr(again["fused"], name).nan_to_num(), getattr(estimate, name).nan_to_num()), name
+
+
+def test_without_the_stage_the_map_is_the_sweep_alone(views):
+    method, trace = METHOD.replace(complete=None), {}
+    with torch.no_grad():
+        depth_map = complete_depth(*views, method=method, planes=48, trace=trace)
+        swept = sweep_depth(views[0], selected_views(trace["sparse"], views[1], trace), method=method, planes=48)
+    assert torch.equal(depth_map.depth.nan_to_num(), swept.depth.nan_to_num())
+    assert torch.equal(trace["fused"].depth.nan_to_num(), trace["sparse"].depth.nan_to_num())
+
+
+def test_a_batch_is_a_loop_bit_for_bit(room, views):
+    reference = range_split(room[4], NEAR)
+    others = stack([range_split(room[k], NEAR) for k in (1, 7, 10, 11)])
+    with torch.no_grad():
+        together = METHOD(collate([views[0], reference]), collate([views[1], others], dim=1))
+        alone = [METHOD(views[0], views[1]), METHOD(reference, others)]
+    for b, one in enumerate(alone):
+        for name in ("depth", "sigma", "score", "gate"):
+            assert torch.equal(getattr(together, name)[b : b + 1].nan_to_num(), getattr(one, name).nan_to_num()), name
+
+
+def test_joint_depth_carries_gradients(views):
+    reference, others = views
+    image, depth = reference.image.float(), reference.depth
+    image = image / 255 if reference.image.dtype == torch.uint8 else image
+    image, depth = (x.clone().requires_grad_() for x in (image, depth))
+    estimate = METHOD(reference.replace(image=image, depth=depth), others)
+    estimate.depth[estimate.keep].sum().backward()
+    for x in (image, depth):
+        assert bool(x.grad.isfinite().all()) and bool((x.grad != 0).any())
