@@ -3,8 +3,9 @@
 python benchmarks/fit_calibration.py      on the shared scenes, five seeds; writes dhtorch/calibration/map.json
 python benchmarks/fit_calibration.py --method auto --seeds 2          the same of methods of several views, whose
 python benchmarks/fit_calibration.py --method window_1 --seeds 2      thresholds nine scenes in ten keep, one by one
-python benchmarks/fit_calibration.py --dense                          of swept pixels under the motions of auto, four
-                                      reference views a scene, one seed; writes dhtorch/calibration/dense.json
+python benchmarks/fit_calibration.py --method fused                   of the joint answers at samples and at pixels, also
+                                      of five built-in rooms with a phone's noise; four reference views a scene, one
+                                      seed; writes dhtorch/calibration/fused.json
 
 Scenes with a role are left out; every scene has the same weight, its seeds are pooled. What the same recipe is worth in
 rooms it was not fitted on is measured by ``dhtorch experiment=method_comparison`` (rows ``ece``, ``realised_risk_…``).
@@ -27,23 +28,27 @@ from dhtorch import calibration, pytree
 from dhtorch.calibration import score_calibration
 from dhtorch.cli.run import config_dir
 from dhtorch.data.pairs import by_gap, candidate_frames
+from dhtorch.data.scene import scenes_of
 from dhtorch.experiments import protocol
 from dhtorch.experiments.compare import dense_comparison
 from dhtorch.experiments.compare_methods import MIN_ANSWERS_ABOVE_THRESHOLD as FEW
 from dhtorch.metrics import control
 from dhtorch.metrics.errors import Points
 
-#: Reference views of every scene whose maps a calibration of swept pixels is fitted on.
-ANCHORS = 4
+#: Reference views of every scene whose maps the calibration of joint answers is fitted on.
+REFERENCE_VIEWS = 4
 
 HERE = Path(__file__).resolve().parent
 
 
 def settings(method: str) -> tuple[protocol.Method, list[Any]]:
-    """The method and the shared scenes, as the command would make them."""
+    """The method and its scenes, as the command would make them: the shared ones, for joint answers also rooms."""
+    chosen: list[Any] = []
     with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
-        cfg = hydra.compose("run", [f"method={method}", "data=shared_scenes"])
-    return instantiate(cfg.method, _convert_="all"), instantiate(cfg.data, _convert_="all")
+        for data in ("shared_scenes", "synthetic_seeds")[: 2 if method == "fused" else 1]:
+            cfg = hydra.compose("run", [f"method={method}", f"data={data}"])
+            chosen += scenes_of(instantiate(cfg.data, _convert_="all"))
+    return instantiate(cfg.method, _convert_="all"), chosen
 
 
 def _sparse(method: protocol.Method, chosen: list[Any], seeds: int) -> dict[str, list[Points]]:
@@ -53,13 +58,15 @@ def _sparse(method: protocol.Method, chosen: list[Any], seeds: int) -> dict[str,
     return _by_scene(protocol.run(chosen, protocol.Protocol(variants), by_gap, protocol.Settings()).points)
 
 
-def _dense(method: protocol.Method, chosen: list[Any]) -> dict[str, list[Points]]:
-    """Scene → hidden pixels of the maps of some reference views."""
+def _joint(method: protocol.Method, chosen: list[Any]) -> dict[str, list[Points]]:
+    """Scene → hidden samples, and hidden pixels of the maps, of some reference views."""
     study = dense_comparison.run(
-        chosen, {"auto": method}, by_gap, protocol.Settings(), reference_views=ANCHORS, peers=False, rooms=()
+        chosen, {"fused": method}, by_gap, protocol.Settings(), reference_views=REFERENCE_VIEWS, peers=False, rooms=()
     )
-    wanted = (dense_comparison.DENSE_VARIANT, dense_comparison.FULL_COHORT)
-    return _by_scene({k: p for k, p in study.points.items() if k[1:] == wanted and p.keep.numel()})
+    wanted = [
+        (name, dense_comparison.FULL_COHORT) for name in (dense_comparison.DENSE_VARIANT, dense_comparison.AT_SAMPLES)
+    ]
+    return _by_scene({k: p for k, p in study.points.items() if k[1:] in wanted and p.keep.numel()})
 
 
 def _by_scene(points_by_key: dict[tuple[str, str, str], Points]) -> dict[str, list[Points]]:
@@ -74,28 +81,26 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--method", default="map")
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--dense", action="store_true")
     parser.add_argument("--output", type=Path, default=None)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    if options.dense:
-        options.method, options.seeds = "auto", 1
+    if options.method == "fused":
+        options.seeds = 1
     method, chosen = settings(options.method)
-    points_by_scene = _dense(method, chosen) if options.dense else _sparse(method, chosen, options.seeds)
+    points_by_scene = _joint(method, chosen) if options.method == "fused" else _sparse(method, chosen, options.seeds)
     scenes = [scene.name for scene in chosen if scene.role is None]
     pooled = {s: pytree.collate(points_by_scene[s]) for s in scenes if points_by_scene.get(s)}
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], cwd=HERE, capture_output=True, text=True, check=False
     ).stdout.strip()
-    name = "dense" if options.dense else options.method
-    origin = {"method": name, "scenes": [*pooled], "truth": "full", "seeds": options.seeds, "git": commit}
+    origin = {"method": options.method, "scenes": [*pooled], "truth": "full", "seeds": options.seeds, "git": commit}
     choose = (
         control.plug_in_threshold
         if method.views == 1
         else partial(control.scene_quantile_threshold, few=FEW * options.seeds)
     )
-    fitted = score_calibration.fit_calibration(list(pooled.values()), select_views=choose, provenance=origin)
-    target = options.output or HERE.parent / "dhtorch" / "calibration" / f"{name}.json"
+    fitted = score_calibration.fit_calibration(list(pooled.values()), choose=choose, provenance=origin)
+    target = options.output or HERE.parent / "dhtorch" / "calibration" / f"{options.method}.json"
     print(calibration.save_calibration(fitted, target))
     return 0
 

@@ -156,7 +156,7 @@ ASIDE = {
 }
 
 #: Options that a file may lack, and the value that leaves the part of the method out.
-LEFT_OUT: dict[str, Any] = {"pose_samples": 0, "verify_views": None, "guide": None}
+LEFT_OUT: dict[str, Any] = {"pose_samples": 0, "verify_views": None, "guide": None, "complete": None}
 
 #: Files that were made with other settings than today's, and wait for a quiet machine.
 OUTDATED: set[str] = {"part_ablation", "streams", "stress"}

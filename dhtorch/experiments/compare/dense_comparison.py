@@ -63,7 +63,7 @@ DENSE_BARS: dict[str, tuple[float, Callable[[float, float], bool]]] = {
 
 #: Variants: all pixels of the map; the map sampled at the sparse method's samples; the map from one source view, for
 #: comparison with two-view baselines.
-DENSE_VARIANT, _AT_SAMPLES, _ONE_VIEW = "dense", "dense, at samples", "dense, one view"
+DENSE_VARIANT, AT_SAMPLES, _ONE_VIEW = "dense", "dense, at samples", "dense, one view"
 _PEERS = ("sgbm", "sgbm, own calibration", "dis flow", "bilateral")
 
 #: Cohorts: pairs that can be rectified, and all.
@@ -297,7 +297,7 @@ def _variants(method: Method, cache: SweepCache, seed: int, peers: bool) -> dict
 
     answers: dict[str, Callable[[ReferenceSweep], tuple[Samples, Estimate]]] = {
         "sparse": lambda x: (x.trace["samples"], x.trace["sparse"]),
-        _AT_SAMPLES: lambda x: (x.trace["samples"], x.at_samples),
+        AT_SAMPLES: lambda x: (x.trace["samples"], x.at_samples),
         _ONE_VIEW: at(1),
         DENSE_VARIANT: at(max_views),
     }
@@ -370,7 +370,7 @@ def _map_columns(answer: protocol.Answer) -> Row:
 
 
 def _summary(outcome: Outcome, rooms: Mapping[str, str], indoor: Sequence[str], peers: bool) -> Row:
-    points_of = {name: _scene_points(outcome, name) for name in ("sparse", _AT_SAMPLES, DENSE_VARIANT)}
+    points_of = {name: _scene_points(outcome, name) for name in ("sparse", AT_SAMPLES, DENSE_VARIANT)}
     rows: dict[str, Row] = {scene: {} for scene in points_of[DENSE_VARIANT]}
     summary: Row = {}
     for number, value in compare.evaluate_promises(
@@ -379,7 +379,7 @@ def _summary(outcome: Outcome, rooms: Mapping[str, str], indoor: Sequence[str], 
         summary[f"dense.{number}"] = value.entry(errors.metric_unit(number))
     for scene, points in points_of[DENSE_VARIANT].items():
         rows[scene] |= {"ause_ratio": risk.ause(points)}
-        rows[scene]["error_ratio_to_sparse"] = _error_ratio(points_of[_AT_SAMPLES][scene], points_of["sparse"][scene])
+        rows[scene]["error_ratio_to_sparse"] = _error_ratio(points_of[AT_SAMPLES][scene], points_of["sparse"][scene])
     metrics = {scene: errors.measure_errors(points) for scene, points in points_of[DENSE_VARIANT].items()}
     summary["dense.answered"] = _interval_over([m["coverage"] for m in metrics.values()], "median")
     summary["dense.wrong_share"] = _interval_over([m["wrong_share"] for m in metrics.values()], "mean")
@@ -411,7 +411,7 @@ def _indoor_coverage(points_of: Mapping[str, Mapping[str, Points]], scenes: set[
         for name, scene_points in points_of.items()
     }
     summary: Row = {
-        "dense.coverage_at_5_indoor": _interval_over(coverages[_AT_SAMPLES], "mean"),
+        "dense.coverage_at_5_indoor": _interval_over(coverages[AT_SAMPLES], "mean"),
         "sparse.coverage_at_5_indoor": _interval_over(coverages["sparse"], "mean"),
         "dense.pixels_at_5_indoor": _interval_over(coverages[DENSE_VARIANT], "mean"),
     }

@@ -26,6 +26,8 @@ _ALLOWED_MODULES = {
         *(
             "dhtorch.pipeline.method",
             "dhtorch.pipeline.view_selection",
+            "dhtorch.pipeline.fused",
+            "dhtorch.pipeline.dense_options",
             "dhtorch.geometry.epipolar",
             "dhtorch.geometry.coarse_flow",
         ),
