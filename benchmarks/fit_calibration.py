@@ -3,9 +3,9 @@
 python benchmarks/fit_calibration.py      on the shared scenes, five seeds; writes dhtorch/calibration/map.json
 python benchmarks/fit_calibration.py --method auto --seeds 2          the same of methods of several views, whose
 python benchmarks/fit_calibration.py --method window_1 --seeds 2      thresholds nine scenes in ten keep, one by one
-python benchmarks/fit_calibration.py --method fused                   of the joint answers at samples and at pixels, also
-                                      of five built-in rooms with a phone's noise; four reference views a scene, one
-                                      seed; writes dhtorch/calibration/fused.json
+python benchmarks/fit_calibration.py --method fused                of the joint answers at samples and at pixels, also
+                                   of five built-in rooms with a phone's noise; four reference views a scene, one
+                                   seed; writes dhtorch/calibration/fused.json
 
 Scenes with a role are left out; every scene has the same weight, its seeds are pooled. What the same recipe is worth in
 rooms it was not fitted on is measured by ``dhtorch experiment=method_comparison`` (rows ``ece``, ``realised_risk_…``).
