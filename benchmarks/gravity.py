@@ -133,10 +133,14 @@ def written(path: Path, folder: Path) -> dict[str, dict[str, Any]]:
     directions = {}
     for ply in sorted(folder.rglob("map.ply")):
         head = ply.read_bytes().partition(b"end_header\n")[0].decode("ascii")
-        match = re.search(r"^comment up (\S+) (\S+) (\S+)$", head, re.MULTILINE)
-        up = [float(x) for x in match.groups()] if match else None
+        match = re.search(r"^comment up (.+)\ncomment world_from_file (.+)$", head, re.MULTILINE)
+        if match is None:
+            up, turned = None, None
+        else:
+            up, turn = (torch.tensor([float(x) for x in text.split()], dtype=torch.float64) for text in match.groups())
+            turned = angle(in_glb(ply.with_name("map.glb"), up.tolist()), (0.0, 1.0, 0.0))
+            up = (turn.reshape(3, 3) @ up).tolist()
         inside = ply.parent.relative_to(folder).as_posix()
-        turned = None if up is None else angle(in_glb(ply.with_name("map.glb"), up), (0.0, 1.0, 0.0))
         directions["" if inside == "." else inside] = {"written": up, "glb_from_y_deg": turned}
     return directions
 

@@ -547,6 +547,8 @@ ELSEWHERE = {
         f"dhtorch.integrate.mapping.{name}"
         for name in ("map_scene", "run", "choose_voxel", "should_mesh", "write_mapped_scene", "write_surface")
     ),
+    *(f"dhtorch.integrate.mapping.{name}" for name in ("surface_shape", "file_from_world")),
+    "dhtorch.integrate.colmap_model.write_colmap_workspace",
     *(
         f"dhtorch.integrate.level.{name}"
         for name in (

@@ -31,7 +31,7 @@ from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.geometry import se3
 from dhtorch.integrate.from_maps import FrameMap, fuse_frame_maps
-from dhtorch.integrate.mapping import choose_voxel, should_mesh, write_surface
+from dhtorch.integrate.mapping import choose_voxel, file_from_world, should_mesh, surface_shape, write_surface
 from dhtorch.integrate.recording import chain_poses
 from dhtorch.pipeline.method import Method
 from dhtorch.records import Pose
@@ -96,6 +96,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     if settings["threads"] is not None:
         torch.set_num_threads(settings["threads"])
         files.set_opencv_threads(settings["threads"])
+    file_from_world(settings["axes"], (0.0, 1.0, 0.0))  # refuses other axes before the computation
     path = Path(str(settings["path"])).expanduser()
     reader_options = {name: value for name, value in settings["data"].items() if value is not None}
     captures = [
@@ -423,10 +424,9 @@ def _write_map(
         return []
     world = "world" if task.recording.poses is not None else "camera"
     ply = task.folder / "map.ply"
-    write_surface(ply, surface, f"{task.scene.name}'s {world}", up)
-    values = {"sigma": surface.sigma, "source": surface.source}
-    shape = export.Shape("map", surface.xyz, surface.features[:, :3], surface.normal, surface.face, values=values)
-    export.write_glb(task.folder / "map.glb", [shape], up=up)
+    turn = file_from_world(settings["axes"], up)
+    write_surface(ply, surface, f"{task.scene.name}'s {world}", up, turn)
+    export.write_glb(task.folder / "map.glb", [surface_shape("map", surface, turn, voxel)], up=(0.0, 1.0, 0.0))
     html.write_viewer_page(
         task.folder / "view.html", replace(points.read_ply_exhibit(ply), name=task.scene.name, opening=opening)
     )

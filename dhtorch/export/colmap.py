@@ -37,7 +37,7 @@ def write_colmap(
     xyz: Any,  # (P, 3) m in the world
     *,
     rgb: Any,  # (P, 3) uint8, or float in [0, 1]
-    error: Any,  # (P,) px, reprojection error
+    error: Any,  # (P,) px, mean reprojection error; -1 = unknown
     seen_by: Any,  # (P, V) indices of shots, -1 = none
     uv: Any,  # (P, V, 2) px in those shots, distorted
 ) -> None:

@@ -1,6 +1,7 @@
 """Writer of GLB, the binary form of glTF 2.0, for points and meshes; read by browsers, Blender and MeshLab.
 
-glTF's world has y up and linear vertex colours: scenes are rotated and colours converted from sRGB here.
+glTF's world has y up and linear vertex colours: scenes are rotated and colours converted from sRGB here. Open3D leaves
+out glTF's points, therefore points may also be written as small squares.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,9 @@ class Shape:
     normal: Any = None  # (P, 3)
     face: Any = None  # (F, 3)
     values: Mapping[str, Any] = field(default_factory=dict)  # (P,) each; written as float attributes _NAME
+    square: float | None = (
+        None  # m, side of the squares across the normals as which points are written; None = as points
+    )
 
 
 def write_glb(path: str | Path, shapes: Sequence[Shape], *, up: Sequence[float] = (0.0, -1.0, 0.0)) -> None:
@@ -69,6 +73,7 @@ class _GltfBuilder:
         self.nodes: list[dict[str, Any]] = []
 
     def add(self, shape: Shape, rotation: list[float]) -> None:
+        shape = shape if shape.square is None or shape.face is not None else _squares(shape, shape.square)
         points = check_rows("write_glb", "xyz", shape.xyz, None, 3)
         n = len(points)
         corners = None if shape.face is None else check_rows("write_glb", "face", to_numpy(shape.face), None, 3)
@@ -136,6 +141,24 @@ class _GltfBuilder:
         self.data += values.tobytes() + b"\0" * (-size % 4)
         self.accessors.append(entry)
         return len(self.accessors) - 1
+
+
+def _squares(shape: Shape, side: float) -> Shape:
+    """The mesh with a square of two triangles, across the normal, in place of each point."""
+    centre = check_rows("write_glb", "xyz", shape.xyz, None, 3).astype(np.float64)
+    n = len(centre)
+    normal = np.zeros((n, 3)) if shape.normal is None else check_rows("write_glb", "normal", shape.normal, n, 3)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    valid = np.isfinite(length) & (length > 0)
+    normal = np.where(valid, normal / np.where(valid, length, 1), np.array([0.0, 0.0, 1.0]))
+    a = np.cross(normal, np.eye(3)[np.abs(normal).argmin(1)])
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    b = np.cross(normal, a)
+    corner = (centre[:, None] + side / 2 * np.stack((-a - b, a - b, a + b, b - a), 1)).reshape(-1, 3)
+    face = (4 * np.arange(n)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    rgb = None if shape.rgb is None else check_rows("write_glb", "rgb", shape.rgb, n, 3).repeat(4, 0)
+    values = {k: check_rows("write_glb", k, v, n, None).repeat(4) for k, v in shape.values.items()}
+    return replace(shape, xyz=corner, rgb=rgb, normal=normal.repeat(4, 0), face=face, values=values)
 
 
 def _rotation_to_y_up(up: np.ndarray) -> list[float]:

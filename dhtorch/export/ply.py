@@ -28,7 +28,8 @@ def write_ply(
 
     Properties: x y z, nx ny nz, red green blue, then ``values`` in their order. Integers from 0 to 255 (codes) become
     uchar, other integers int, everything else float. ``sigma``, ``score``, ``hole`` (class of the sensor's hole,
-    codes.Hole; written as ``class``) and ``source`` (codes.Source) are the names used throughout.
+    codes.Hole; written as ``class``) and ``source`` (codes.Source) are the names used throughout. ``sigma`` is written
+    again as ``quality``, the property that MeshLab colours and selects by.
 
     Args:
         path: of the file.
@@ -55,6 +56,8 @@ def write_ply(
     for name, value in values.items():
         if value is not None:
             columns["class" if name == "hole" else name] = _to_ply_number(check_rows("write_ply", name, value, n, None))
+    if "sigma" in columns:
+        columns.setdefault("quality", columns["sigma"])
     corners = None if face is None else check_rows("write_ply", "face", to_numpy(face), None, 3)
     finite, corners = select_finite(points, corners)
     vertex = np.zeros(n, [(name, column.dtype) for name, column in columns.items()])

@@ -1,4 +1,7 @@
-"""Writer of an enriched data set as nerfstudio folders, one per recording: images, depth with its source, poses."""
+"""Writer of an enriched data set as nerfstudio folders, one per recording: images, depth with its source, poses.
+
+``sparse_pc.ply`` holds points of the sure depth of all frames, from which splatfacto starts.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +9,28 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from dhtorch.data.codecs.tiff import decode_tiff
-from dhtorch.export import encode_png, nerfstudio
+from dhtorch.data.io.decode import decode_image
+from dhtorch.export import encode_png, nerfstudio, write_ply
 from dhtorch.extract.enriched import NUMBER_COLUMNS, DatasetCamera
 from dhtorch.extract.instants import iter_rows
 from dhtorch.extract.targets import MapCounts, Row
+from dhtorch.geometry import camera as cameras
 from dhtorch.runtime import storage
+
+#: File of the points, as nerfstudio names its own.
+_POINTS_FILE = "sparse_pc.ply"
+
+#: Most points of a frame. Source: chosen as a few times those that a picture observes in COLMAP.
+_MAX_POINTS_PER_FRAME = 5000
+
+#: Most points of a recording, halved beyond twice as many. Source: chosen as those of a larger COLMAP model.
+_MAX_POINTS = 200_000
+
+#: Largest sigma / depth of a point. Source: that of a confidence of one half, see dhtorch.export.nerfstudio.
+_MAX_SIGMA_REL = 0.1
 
 
 class NerfstudioTarget:
@@ -49,32 +67,67 @@ class NerfstudioTarget:
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
         """As :meth:`DatasetTarget.assemble`."""
         for key, view in self.views.items():
-            tally, shots = MapCounts(), []
+            tally, shots, cloud = MapCounts(), [], _PointCloud()
             folder = self._file(k, key).parent
             for row in iter_rows(parts[key]):
                 tally.add(row)
                 if row["depth"] and np.isfinite(row["pose"]).all():
-                    shots.append(_write_shot(folder, row, view))
+                    shots.append(_write_shot(folder, row, view, cloud))
             if not shots:
                 raise ValueError(f"{folder.name}: found no frame with a pose, expected poses (format=nerfstudio)")
             cameras = {view.name: tally.summary()}
             summary = storage.to_strict_json({"key": self.key, "number": k, "length": len(shots), "cameras": cameras})
-            storage.write_json(self._file(k, key), nerfstudio.make_transforms(shots, dhtorch=summary))
+            cloud.write(folder / _POINTS_FILE)
+            contents = nerfstudio.make_transforms(shots, dhtorch=summary, ply_file_path=_POINTS_FILE)
+            storage.write_json(self._file(k, key), contents)
         written = self.own(k)
         assert written is not None  # just written
         return written
 
     def planned_files(self, missing: Sequence[int]) -> list[Path]:
         """As :meth:`DatasetTarget.planned_files`."""
-        return [self._file(k, key) for k in missing for key in self.views]
+        files = [self._file(k, key) for k in missing for key in self.views]
+        return [*files, *(file.with_name(_POINTS_FILE) for file in files)]
 
     def finish(self, owns: Sequence[Row]) -> None:
         """As :meth:`DatasetTarget.finish`: nothing to write, the folders are independent."""
 
 
-def _write_shot(folder: Path, row: Row, view: DatasetCamera) -> Row:
+class _PointCloud:
+    """Coloured points (m, world of the recording) of some pixels of many frames."""
+
+    def __init__(self) -> None:
+        self.parts: list[np.ndarray] = []  # (P, 6) each: position, colour 0 to 255
+        self.stride = 1
+
+    def add(self, depth: np.ndarray, sigma: np.ndarray, row: Row, view: DatasetCamera, folder: Path) -> None:
+        """Add pixels of a frame, evenly taken among those of small sigma."""
+        chosen = np.flatnonzero((depth > 0) & (sigma <= _MAX_SIGMA_REL * depth))
+        chosen = chosen[:: self.stride * max(1, -(-len(chosen) // _MAX_POINTS_PER_FRAME))]
+        pixels = np.stack(np.unravel_index(chosen, depth.shape)[::-1], 1)  # u, v of the map
+        uv = (pixels + 0.5) * np.divide(view.hw, view.map_hw)[::-1] - 0.5
+        K, T = np.reshape(row["K"], (3, 3)), np.reshape(row["pose"], (4, 4))
+        lens = torch.tensor([view.lens], dtype=torch.float64) if any(view.lens) else None
+        camera = cameras.from_matrix(torch.from_numpy(K[None].astype(np.float64)), lens)
+        z = torch.from_numpy(depth.astype(np.float64).flatten()[chosen])
+        xyz = cameras.unproject(camera, torch.from_numpy(uv)[None], z[None])[0].numpy()
+        column, line = (x.clip(0, n - 1) for x, n in zip(uv.round().astype(int).T, view.hw[::-1], strict=True))
+        picture = np.broadcast_to(decode_image(row["picture"], folder / _POINTS_FILE), (3, *view.hw))
+        xyz, rgb = xyz @ T[:3, :3].T + T[:3, 3], picture[:, line, column].T
+        self.parts.append(np.concatenate((xyz, rgb), 1).astype(np.float32))
+        if sum(map(len, self.parts)) > 2 * _MAX_POINTS:
+            self.parts, self.stride = [part[::2] for part in self.parts], 2 * self.stride
+
+    def write(self, path: Path) -> None:
+        """Write the points as PLY."""
+        points = np.concatenate(self.parts)
+        write_ply(path, points[:, :3], points[:, 3:].astype(np.uint8), comments=("metres; world of transforms.json",))
+
+
+def _write_shot(folder: Path, row: Row, view: DatasetCamera, cloud: _PointCloud) -> Row:
     stem = f"frame_{row['frame_index']:06d}"
     depth, sigma = (decode_tiff(row[kind], folder / stem, view.map_hw) for kind in ("depth", "sigma"))
+    cloud.add(depth, sigma, row, view, folder)
     steps = nerfstudio.quantise_nerfstudio_depth(depth)
     confidence = nerfstudio.encode_confidence(np.where(steps > 0, depth, 0), sigma)
     pictures = {"images": row["picture"], "depth": encode_png(steps), "confidence": encode_png(confidence)}

@@ -22,6 +22,7 @@ from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.integrate import recording as recordings
+from dhtorch.integrate.colmap_model import IMAGE_FOLDER, MODEL_FILES, MODEL_FOLDER, write_colmap_workspace
 from dhtorch.integrate.level import estimate_up
 from dhtorch.integrate.picture import draw_map
 from dhtorch.integrate.recording import PairEstimate, PlacedFrames
@@ -30,7 +31,7 @@ from dhtorch.integrate.sweeps import DenseSweep, SweepStore
 from dhtorch.metrics import bootstrap
 from dhtorch.pipeline.method import Method
 from dhtorch.pipeline.pair import merge
-from dhtorch.records import Camera, Frame
+from dhtorch.records import Frame
 from dhtorch.runtime import results as result_files
 from dhtorch.runtime.console import format_count
 from dhtorch.runtime.output_folder import open_output_folder
@@ -53,11 +54,11 @@ _MAP_FILES = (
     "map.glb",
     "points.ply",
     "map.png",
-    "colmap/cameras.txt",
-    "colmap/images.txt",
-    "colmap/points3D.txt",
-    "colmap/times.txt",
+    *(str(Path("colmap", MODEL_FOLDER, name)) for name in MODEL_FILES),
 )
+
+#: Axes of the written points and meshes.
+MAP_AXES = ("y_up", "world")
 
 
 @dataclass(frozen=True)
@@ -101,6 +102,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     folder = Path(settings["output"])
     with open_output_folder(folder, "output") as output:
         output.check([folder / "result.json", *(folder / each.name / name for each in sources for name in _MAP_FILES)])
+        output.check_folders([folder / each.name / "colmap" / IMAGE_FOLDER for each in sources])
         return _write_maps(sources, folder, settings, parts, progress)
 
 
@@ -249,81 +251,111 @@ def _coverage_columns(points: Mapping[str, integrate.Surface], voxel: float) -> 
 
 def write_mapped_scene(folder: Path, scene: MappedScene, settings: Mapping[str, Any]) -> list[Path]:
     """Write the files of one scene into ``folder``; returns their paths."""
-    surface, voxel, up = scene.surface, scene.voxel, scene.up
-    rgb = surface.features[:, :3]
-    comments = write_surface(folder / "map.ply", surface, f"{scene.recording.name}'s world", up)
+    surface, up = scene.surface, scene.up
+    turn = file_from_world(settings["axes"], up)
+    comments = write_surface(folder / "map.ply", surface, f"{scene.recording.name}'s world", up, turn)
     cloud = _collect_samples(scene)
-    recovered = cloud["source"] == Source.RECOVERED
-    values = {"sigma": surface.sigma, "source": surface.source}
-    shapes = [export.Shape("surface", surface.xyz, rgb, surface.normal, surface.face, values=values)]
-    points = cloud["xyz"][recovered], cloud["rgb"][recovered]
-    shapes.append(export.Shape("recovered", *points, values={"sigma": cloud["sigma"][recovered]}))
-    swept = surface.source == Source.SWEPT
-    shapes.append(export.Shape("swept", surface.xyz[swept], rgb[swept], values={"sigma": surface.sigma[swept]}))
-    export.write_glb(folder / "map.glb", shapes, up=up)
+    export.write_glb(folder / "map.glb", _map_shapes(scene, cloud, turn), up=(0.0, 1.0, 0.0))
     columns = {k: cloud[k] for k in ("sigma", "score", "hole", "source")}
-    export.write_ply(folder / "points.ply", cloud["xyz"], cloud["rgb"], comments=comments, **columns)
-    _write_colmap(folder / "colmap", scene)
+    export.write_ply(folder / "points.ply", cloud["xyz"].double() @ turn.T, cloud["rgb"], comments=comments, **columns)
+    counts = write_colmap_workspace(folder / "colmap", scene.recording, scene.answers, scene.places.poses)
+    scene.row.update({f"colmap_{name}": n for name, n in counts._asdict().items()})
     title = append_cutoff(scene.recording.name, scene.row["cutoff_m"])
-    draw_map(folder / "map.png", surface, list(scene.places.poses.values()), up, voxel=voxel, title=title)
-    return [folder / name for name in _MAP_FILES]
+    draw_map(folder / "map.png", surface, list(scene.places.poses.values()), up, voxel=scene.voxel, title=title)
+    return [*(folder / name for name in _MAP_FILES), folder / "colmap" / IMAGE_FOLDER]
 
 
-def write_surface(path: Path, surface: integrate.Surface, axes: str, up: Sequence[float]) -> list[str]:
-    """Write a surface as PLY; returns its comments, for other files of the same map. ``axes`` names its world."""
+def _map_shapes(scene: MappedScene, cloud: Mapping[str, Tensor], turn: Tensor) -> list[export.Shape]:
+    """The surface, the recovered points as squares of one voxel, and the swept part of the surface."""
+    surface, recovered = scene.surface, cloud["source"] == Source.RECOVERED
+    xyz, normal = (cloud[k][recovered].double() @ turn.T for k in ("xyz", "normal"))
+    columns = {"values": {"sigma": cloud["sigma"][recovered]}, "square": scene.row["cell_m"]}
+    shapes = [
+        surface_shape("surface", surface, turn, scene.voxel),
+        export.Shape("recovered", xyz, cloud["rgb"][recovered], normal, **columns),
+    ]
+    swept = surface.source == Source.SWEPT
+    if bool(swept.any()):
+        face = None if surface.face is None else (swept.cumsum(0) - 1)[surface.face[swept[surface.face].all(1)]]
+        shapes.append(
+            surface_shape("swept", surface.replace(face=None)[swept].replace(face=face), turn, scene.row["cell_m"])
+        )
+    return shapes
+
+
+def surface_shape(
+    name: str,
+    surface: integrate.Surface,  # in the world
+    turn: Tensor,  # (3, 3) from the world to the axes of the file
+    square: float,
+) -> export.Shape:
+    """A surface for a GLB file: its triangles, or a square of side ``square`` (m) for each point if it has none."""
+    xyz, normal = (x.double() @ turn.T for x in (surface.xyz, surface.normal))
+    values = {"sigma": surface.sigma, "source": surface.source}
+    return export.Shape(name, xyz, surface.features[:, :3], normal, surface.face, values=values, square=square)
+
+
+def file_from_world(
+    axes: str,
+    up: Sequence[float],  # in the world
+) -> Tensor:
+    """Rotation (3, 3) from the world to the axes of the files: ``y_up``, as in glTF, or ``world``, none.
+
+    Raises:
+        ValueError: other axes.
+    """
+    if axes not in MAP_AXES:
+        raise ValueError(f"axes: found {axes!r}, expected one of {', '.join(MAP_AXES)}")
+    return se3.turn_between(up, (0.0, 1.0, 0.0)) if axes == "y_up" else torch.eye(3, dtype=torch.float64)
+
+
+def write_surface(
+    path: Path,
+    surface: integrate.Surface,  # in the world
+    world: str,
+    up: Sequence[float],  # in the world
+    turn: Tensor,  # (3, 3) from the world to the axes of the file
+) -> list[str]:
+    """Write a surface as PLY; returns its comments, for other files of the same map. ``world`` names its world."""
     rgb, score = surface.features[:, :3], surface.features[:, 3]
     codes = ", ".join(f"{code} {words(name)}" for code, name in names(Source).items())
-    comments = [f"metres; axes of {axes}", f"up {' '.join(f'{v:.6f}' for v in up)}", f"source: {codes}"]
+    turned_up = turn @ torch.tensor(list(up), dtype=torch.float64)
+    comments = [f"metres; up and world_from_file (row by row) relate these axes to those of {world}"]
+    comments += [f"up {_format_numbers(turned_up)}", f"world_from_file {_format_numbers(turn.T)}", f"source: {codes}"]
     columns = {"sigma": surface.sigma, "score": score, "source": surface.source}
-    export.write_ply(path, surface.xyz, rgb, normal=surface.normal, face=surface.face, comments=comments, **columns)
+    xyz, normal = (x.double() @ turn.T for x in (surface.xyz, surface.normal))
+    export.write_ply(path, xyz, rgb, normal=normal, face=surface.face, comments=comments, **columns)
     return comments
 
 
+def _format_numbers(values: Tensor) -> str:
+    return " ".join(f"{v:.9f}" for v in (values.flatten() + 0.0).tolist())
+
+
 def _collect_samples(scene: MappedScene) -> dict[str, Tensor]:
-    """All samples with sensor or recovered depth of the placed reference views, as points in the world with columns."""
-    parts: dict[str, list[Tensor]] = {k: [] for k in ("xyz", "rgb", "sigma", "score", "hole", "source")}
+    """All samples with sensor or recovered depth of the placed reference views, as points in the world with columns.
+
+    ``normal`` is the vector from the point to the camera.
+    """
+    parts: dict[str, list[Tensor]] = {k: [] for k in ("xyz", "rgb", "normal", "sigma", "score", "hole", "source")}
     for answer in scene.answers:
         if answer.pair[0] in scene.places.poses:
             merged = merge(answer.samples, answer.estimate)
             has_depth = merged.source[0] != Source.NONE
             xyz = cameras.unproject(answer.camera, merged.uv, merged.depth)
-            world = se3.apply(scene.places.poses[answer.pair[0]], xyz.double())
-            values = {"xyz": world, "rgb": answer.rgb, "sigma": merged.sigma, "score": merged.score}
+            T = scene.places.poses[answer.pair[0]]
+            world = se3.apply(T, xyz.double())
+            values = {
+                "xyz": world,
+                "normal": T.t[:, None] - world,
+                "rgb": answer.rgb,
+                "sigma": merged.sigma,
+                "score": merged.score,
+            }
             for name, value in {**values, "hole": answer.samples.hole, "source": merged.source}.items():
                 parts[name].append(value[0][has_depth])
-    empty = {"xyz": torch.zeros(0, 3), "rgb": torch.zeros(0, 3)}
+    empty = dict.fromkeys(("xyz", "rgb", "normal"), torch.zeros(0, 3))
     return {k: torch.cat(v) if v else empty.get(k, torch.zeros(0)) for k, v in parts.items()}
-
-
-def _write_colmap(folder: Path, scene: MappedScene) -> None:
-    """Write the views, tracks and triangulated points of a scene as a COLMAP text model."""
-    poses = scene.places.poses
-    number = {k: n for n, k in enumerate(poses)}
-    intrinsics: dict[int, tuple[Camera, tuple[int, int]]] = {}
-    for k in poses:
-        frame: Frame = scene.recording[k]
-        intrinsics[k] = frame.camera, frame.hw
-    numbers, times = scene.recording.number, scene.recording.times
-    images = [
-        export.ColmapImage(
-            f"{int(numbers[k]):06d}.png", *intrinsics[k], poses[k], None if times is None else float(times[k])
-        )
-        for k in poses
-    ]
-    pieces = [_triangulated_points(a, number, poses) for a in scene.answers if set(a.pair) <= set(poses)]
-    empty = [torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2).long(), torch.zeros(0, 2, 2)]
-    xyz, rgb, error, seen_by, uv = map(torch.cat, zip(*(pieces or [empty]), strict=True))
-    export.write_colmap(folder, images, xyz, rgb=rgb, error=error, seen_by=seen_by, uv=uv)
-
-
-def _triangulated_points(answer: PairEstimate, number: Mapping[int, int], poses: Mapping[int, Any]) -> list[Tensor]:
-    """Points in the world, colours, errors, view indices and pixels of one pair's triangulated samples."""
-    keep = answer.estimate.keep[0]
-    xyz = cameras.unproject(answer.camera, answer.estimate.uv, answer.estimate.depth.nan_to_num(1.0))
-    world = se3.apply(poses[answer.pair[0]], xyz.double())[0]
-    uv = torch.stack((answer.tracks.uv_0[0], answer.tracks.uv_1[0]), 1)
-    views = torch.tensor([number[k] for k in answer.pair]).expand(len(keep), 2)
-    return [x[keep] for x in (world, answer.rgb[0], answer.estimate.residual_px[0], views, uv)]
 
 
 def _linking_pairs(answers: Sequence[PairEstimate]) -> list[tuple[int, int]]:
@@ -416,6 +448,7 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
         raise ValueError(f"cutoff: found {settings['cutoff']}, expected a positive number of metres, or null for none")
     if not isinstance(settings["min_maps"], int) or settings["min_maps"] < 1:
         raise ValueError(f"min_maps: found {settings['min_maps']!r}, expected a whole number of at least 1")
+    file_from_world(settings["axes"], (0.0, 1.0, 0.0))
     DenseSweep.from_options(settings["dense"])
     if settings["mesh"] and not should_mesh(None):
         raise ImportError("mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'")

@@ -216,8 +216,29 @@ def test_a_recording_becomes_a_set_and_a_nerfstudio_folder(tmp_path, capsys):
     assert np.abs(depth - column).max() <= 1e-3
     pose = np.array(found[1]["observation.camera.T_world_from_cam"]).reshape(4, 4)
     assert np.allclose(np.array(about["frames"][1]["transform_matrix"]) @ np.diag([1, -1, -1, 1]), pose)
+    check_points(nerf / about["ply_file_path"], about, nerf)
     assert main(["enrich", "out=" + str(tmp_path / "x"), "data=synthetic", "format=same", *ASKED]) == 2
     assert "cannot write" in capsys.readouterr().err
+
+
+def check_points(ply, about, root):
+    """The points of a nerfstudio folder project onto pixels of their depth and colour."""
+    vertex = pytest.importorskip("plyfile").PlyData.read(ply)["vertex"]
+    xyz = np.stack([vertex[axis] for axis in "xyz"], 1).astype(np.float64)
+    assert len(xyz) > 100
+    matched = np.zeros(len(xyz), bool)
+    for frame in about["frames"]:
+        T = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
+        x, y, z = T[:3, :3] @ xyz.T + T[:3, 3:]
+        u, v = frame["fl_x"] * x / z + frame["cx"] - 0.5, frame["fl_y"] * y / z + frame["cy"] - 0.5
+        inside = (z > 0) & (u > -0.5) & (v > -0.5) & (u < frame["w"] - 0.5) & (v < frame["h"] - 0.5)
+        u, v = (np.where(inside, c, 0).round().astype(int) for c in (u, v))
+        depth = np.array(Image.open(root / frame["depth_file_path"])) * about["depth_unit_scale_factor"]
+        at = (v * depth.shape[0] // frame["h"], u * depth.shape[1] // frame["w"])
+        colour = np.array(Image.open(root / frame["file_path"]))[v, u]
+        same = (colour == np.stack([vertex[c] for c in ("red", "green", "blue")], 1)).all(1)
+        matched |= inside & same & (np.abs(depth[at] - z) < 2e-3)
+    assert matched.mean() > 0.99
 
 
 @pytest.mark.parametrize("kind", ["stray", "record3d", "frames_dir", "rlds"])

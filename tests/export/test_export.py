@@ -40,8 +40,10 @@ def test_plyfile_reads_every_property(ply):
     assert data.byte_order == "<" and not data.text and data.comments == ["metres; x right, y down, z forward"]
     vertex = data["vertex"]
     names = ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue", "sigma", "score", "class", "source"]
+    names.append("quality")
     assert [p.name for p in vertex.properties] == names
-    assert [p.val_dtype for p in vertex.properties] == ["f4"] * 6 + ["u1"] * 3 + ["f4"] * 2 + ["u1"] * 2
+    assert [p.val_dtype for p in vertex.properties] == ["f4"] * 6 + ["u1"] * 3 + ["f4"] * 2 + ["u1"] * 2 + ["f4"]
+    np.testing.assert_array_equal(vertex["quality"], vertex["sigma"])
     np.testing.assert_array_equal(np.stack([vertex[k] for k in "xyz"], 1), XYZ[KEPT])
     assert vertex["red"].tolist() == [0, 255, 26] and vertex["green"].tolist() == [128, 51, 0]
     for name in ("sigma", "score", "source"):
@@ -198,6 +200,32 @@ def test_a_glb_without_anything_is_a_valid_one(tmp_path):
     assert document == {"asset": {"version": "2.0", "generator": "dhtorch"}, "scene": 0, "scenes": [{}]} and not body
     with pytest.raises(ValueError, match="expected a direction"):
         write_glb(tmp_path / "map.glb", [], up=(0, 0, 0))
+
+
+def test_points_become_squares_that_every_mesh_reader_keeps(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    normal = torch.tensor([[0.0, 0, 1], [1, 0, 0], [math.nan, 0, 0], [0, 3, 4]])
+    cloud = Shape("cloud", XYZ, RGB, normal=normal, values={"sigma": ABOUT["sigma"]}, square=0.1)
+    write_glb(tmp_path / "map.glb", [cloud], up=(0, 1, 0))
+    (mesh,) = trimesh.load(tmp_path / "map.glb", process=False).geometry.values()
+    assert len(mesh.vertices) == 12 and len(mesh.faces) == 6, "four corners and two triangles a point"
+    corners = mesh.vertices.reshape(3, 4, 3)
+    np.testing.assert_allclose(corners.mean(1), XYZ[KEPT], atol=1e-6)
+    np.testing.assert_allclose(mesh.area_faces, 0.005, rtol=1e-4)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    np.testing.assert_allclose(across, [[0, 0, 1], [0, 0, 1], [0, 0.6, 0.8]], atol=1e-5)
+    sigma = mesh.vertex_attributes["_SIGMA"] if "_SIGMA" in mesh.vertex_attributes else mesh.vertex_attributes["_sigma"]
+    np.testing.assert_allclose(sigma.ravel(), np.repeat(ABOUT["sigma"][KEPT], 4))
+
+
+def test_open3d_keeps_the_squares(tmp_path):
+    open3d = pytest.importorskip("open3d")
+    write_glb(tmp_path / "map.glb", [Shape("cloud", XYZ, RGB, square=0.1)], up=(0, 1, 0))
+    mesh = open3d.io.read_triangle_mesh(str(tmp_path / "map.glb"))
+    assert len(mesh.triangles) == 6
+    centre = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)].reshape(3, 6, 3)[:, [0, 1, 2, 5]].mean(1)
+    np.testing.assert_allclose(centre, XYZ[KEPT], atol=1e-6)
 
 
 # ------------------------------------------------------------------------------------------------------------- COLMAP

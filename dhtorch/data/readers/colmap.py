@@ -4,7 +4,7 @@
 ``images/`` (or ``rgb/``, ``color/``) under the names in ``images.txt``; depth maps in ``depth/`` under the images'
 stems. The file's poses map world to camera, and the centre of its first pixel is (0.5, 0.5). COLMAP estimates poses up
 to scale: unless they were aligned they are not metric, which the report states. ``dhtorch integrate`` writes models in
-metres (``# metres``), with the times of the images in ``times.txt``; it writes no images: name them by the options.
+metres (``# metres``) with their images, and the times of these in ``times.txt``.
 """
 
 from __future__ import annotations

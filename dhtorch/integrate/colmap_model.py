@@ -1,0 +1,153 @@
+"""A map as a COLMAP workspace: pictures in ``images/``, cameras, poses and points with tracks in ``sparse/0/``.
+
+The layout is that of COLMAP's own workspaces, which gsplat, nerfstudio and other trainers of splats open. They take
+depth from the points that a picture observes: the recovered points, the sensor's, and some of the swept ones are
+written, so that these trainers get all three without further files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from dhtorch.codes import Source
+from dhtorch.data.recording import Recording
+from dhtorch.export import ColmapImage, encode_png, write_colmap
+from dhtorch.export.arrays import colour_to_uint8
+from dhtorch.geometry import camera as cameras
+from dhtorch.geometry import se3
+from dhtorch.integrate.recording import PairEstimate
+from dhtorch.pipeline.dense import map_pixel_centres
+from dhtorch.pipeline.pair import merge
+from dhtorch.records import Frame, Pose
+from dhtorch.runtime import storage
+
+#: Folders of the workspace.
+MODEL_FOLDER, IMAGE_FOLDER = Path("sparse/0"), Path("images")
+
+#: Files of the model.
+MODEL_FILES = ("cameras.txt", "images.txt", "points3D.txt", "times.txt")
+
+#: Largest distance, px, of an observation from the point's projection by the written poses.
+#: Source: COLMAP's default for its own points (``filter_max_reproj_error`` = 4).
+_MAX_REPROJECTION_PX = 4.0
+
+#: Most swept points of a picture: a map has a hundred times more, which no trainer needs to start from.
+#: Source: chosen as a few times the samples of a view, 500 to 2000.
+_MAX_SWEPT_POINTS = 4000
+
+#: COLMAP's error of a point without one: nothing was triangulated.
+_NO_ERROR = -1.0
+
+
+class _Points(NamedTuple):
+    """Points with their observations in up to two pictures."""
+
+    xyz: Tensor  # (P, 3) m in the world
+    rgb: Tensor  # (P, 3) in [0, 1]
+    error: Tensor  # (P,) px
+    seen_by: Tensor  # (P, 2) numbers of pictures, -1 = none
+    uv: Tensor  # (P, 2, 2) px
+
+
+class ColmapCounts(NamedTuple):
+    """Points of a written workspace."""
+
+    n_points: int
+    n_triangulated: int  # observed in two pictures
+    n_outliers: int  # observations left out: farther than 4 px from the projection
+
+
+def write_colmap_workspace(
+    folder: Path, recording: Recording, answers: Sequence[PairEstimate], poses: Mapping[int, Pose]
+) -> ColmapCounts:
+    """Write the pictures, cameras, poses and points of a map.
+
+    Observations farther than 4 px from the point's projection are left out, and recovered points with a single
+    observation left. Sensor and swept points may have one observation, in the picture whose depth they are.
+
+    Args:
+        folder: of the workspace.
+        recording: its frames are the pictures.
+        answers: estimates of pairs.
+        poses: frame → T_world_from_cam (1); other frames are not written.
+    """
+    shots: list[ColmapImage] = []
+    number: dict[int, int] = {}
+    for k, T in poses.items():
+        frame: Frame = recording[k]
+        name = f"{int(recording.number[k]):06d}.png"
+        picture = colour_to_uint8(frame.image[0].movedim(0, -1).cpu().numpy())
+        picture = picture[..., 0] if picture.shape[-1] == 1 else picture
+        storage.replace_file(folder / IMAGE_FOLDER / name, encode_png(picture))
+        number[k] = len(shots)
+        time = None if recording.times is None else float(recording.times[k])
+        shots.append(ColmapImage(name, frame.camera, frame.hw, T, time))
+    placed = [answer for answer in answers if answer.pair[0] in poses]
+    parts = [_sample_points(answer, shots, number) for answer in placed]
+    points = [part for part, _ in parts]
+    points += [_swept_points(a, recording[a.pair[0]], shots, number) for a in placed if a.swept is not None]
+    empty = _Points(
+        torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 2).long(), torch.zeros(0, 2, 2)
+    )
+    joined = _Points(*(torch.cat(column) for column in zip(*(points or [empty]), strict=True)))
+    write_colmap(folder / MODEL_FOLDER, shots, joined.xyz, **{k: v for k, v in joined._asdict().items() if k != "xyz"})
+    pairs = int((joined.seen_by >= 0).all(1).sum())
+    return ColmapCounts(len(joined.xyz), pairs, sum(n for _, n in parts))
+
+
+def _sample_points(
+    answer: PairEstimate, shots: Sequence[ColmapImage], number: Mapping[int, int]
+) -> tuple[_Points, int]:
+    """Points of the samples of one pair, and the number of observations left out."""
+    merged = merge(answer.samples, answer.estimate)
+    reference, other = number[answer.pair[0]], number.get(answer.pair[1], -1)
+    world = _to_world(answer, merged.uv, merged.depth, shots[reference])
+    seen = [answer.samples.uv.isfinite().all(-1)[0], answer.tracks.valid[0] & (other >= 0)]
+    uv = torch.stack((answer.tracks.uv_0[0], answer.tracks.uv_1[0]), 1)
+    distance = torch.stack(
+        [_distance_px(world, uv[:, n], shots[v]) for n, v in enumerate((reference, max(other, 0)))], 1
+    )
+    observed = torch.stack(seen, 1)
+    agrees = observed & (distance <= _MAX_REPROJECTION_PX)
+    count = agrees.sum(1)
+    source = merged.source[0]
+    keep = ((source == Source.SENSOR) & agrees[:, 0]) | ((source == Source.RECOVERED) & (count == 2))
+    error = torch.where(count == 2, (distance * agrees).nan_to_num().sum(1) / 2, _NO_ERROR)
+    seen_by = torch.where(agrees, torch.tensor([reference, other]), -1)
+    outliers = int((observed & ~agrees)[source != Source.NONE].sum())
+    return _Points(*(x[keep] for x in (world, answer.rgb[0], error, seen_by, uv))), outliers
+
+
+def _swept_points(
+    answer: PairEstimate, frame: Frame, shots: Sequence[ColmapImage], number: Mapping[int, int]
+) -> _Points:
+    """Some of the swept pixels of a reference view, evenly taken, each observed in that picture."""
+    assert answer.swept is not None
+    depth = answer.swept.read()[0].flatten()
+    chosen = (depth > 0).nonzero()[:, 0]
+    chosen = chosen[:: max(1, -(-len(chosen) // _MAX_SWEPT_POINTS))]
+    uv = map_pixel_centres(frame, answer.swept.hw)[chosen]
+    shot = number[answer.pair[0]]
+    world = _to_world(answer, uv[None], depth[None, chosen], shots[shot])
+    row, column = (uv.round().long()[:, axis].clamp(0, n - 1) for axis, n in ((1, frame.hw[0]), (0, frame.hw[1])))
+    picture = frame.image[0] if frame.image.is_floating_point() else frame.image[0] / 255
+    rgb = picture.expand(3, *frame.hw)[:, row, column].T.to(answer.rgb)
+    pixels = torch.stack((uv, torch.full_like(uv, torch.nan)), 1)
+    return _Points(world, rgb, torch.full((len(uv),), _NO_ERROR), torch.tensor([[shot, -1]]).expand(len(uv), 2), pixels)
+
+
+def _to_world(answer: PairEstimate, uv: Tensor, depth: Tensor, shot: ColmapImage) -> Tensor:
+    """Points (P, 3) m in the world, float64."""
+    return se3.apply(shot.T_world_from_cam, cameras.unproject(answer.camera, uv, depth).double())[0]
+
+
+def _distance_px(world: Tensor, uv: Tensor, shot: ColmapImage) -> Tensor:
+    """Distance (P,) px of pixels from the projections of points; infinite for those behind the camera."""
+    camera = se3.apply(se3.invert(shot.T_world_from_cam), world[None])
+    distance = (cameras.project(shot.camera.to(torch.float64), camera)[0] - uv).norm(dim=-1)
+    return torch.where(camera[0, :, 2] > 0, distance, torch.inf).nan_to_num(torch.inf)

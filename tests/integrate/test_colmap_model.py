@@ -1,0 +1,49 @@
+"""The COLMAP workspace of a map: what it leaves out where the written poses contradict the tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from dhtorch.data.recording import Recording
+from dhtorch.geometry import se3
+from dhtorch.integrate.colmap_model import write_colmap_workspace
+from dhtorch.integrate.recording import PairEstimate, estimate_pairs
+from dhtorch.pipeline.presets import METHODS
+from dhtorch.records import Pose
+from dhtorch.synthetic import SyntheticRoom
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[Recording, list[PairEstimate]]:
+    room = SyntheticRoom(hw=(240, 320), n_frames=4, step_m=0.04, supersample=1)
+    return room, list(estimate_pairs(room, METHODS["map"].replace(n=512), [(0, 3)], cutoff=2.0))
+
+
+def poses_of(room: Recording, turn_deg: float = 0.0) -> dict[int, Pose]:
+    assert room.poses is not None
+    twist = torch.tensor([[0.0, np.deg2rad(turn_deg), 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    return {0: room.poses[:1], 3: se3.compose(room.poses[3:4], se3.exp(twist))}
+
+
+def test_observations_that_the_poses_contradict_are_left_out(pair, tmp_path: Path) -> None:
+    room, answers = pair
+    right = write_colmap_workspace(tmp_path / "right", room, answers, poses_of(room))
+    wrong = write_colmap_workspace(tmp_path / "wrong", room, answers, poses_of(room, 5.0))
+    assert right.n_triangulated > 30 and right.n_outliers < 0.1 * right.n_triangulated
+    assert wrong.n_triangulated < 0.1 * right.n_triangulated and wrong.n_outliers >= right.n_triangulated
+    assert 0 < wrong.n_points < right.n_points, "the sensor's depth stays, in the picture whose depth it is"
+
+
+def test_the_pictures_are_the_frames(pair, tmp_path: Path) -> None:
+    room, answers = pair
+    write_colmap_workspace(tmp_path, room, answers, poses_of(room))
+    names = sorted(p.name for p in (tmp_path / "images").iterdir())
+    assert names == ["000000.png", "000003.png"]
+    picture = np.asarray(Image.open(tmp_path / "images" / names[1]))
+    assert room[3].image.dtype == torch.uint8
+    np.testing.assert_array_equal(picture, room[3].image[0].movedim(0, -1))
