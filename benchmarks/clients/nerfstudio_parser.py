@@ -1,9 +1,10 @@
-"""nerfstudio's own parser of an enriched folder: pictures, cameras, poses and depth, against the files.
+"""nerfstudio's own parser of an enriched folder: pictures, cameras, poses, depth and points, against the files.
 
-In an environment that has nerfstudio, of which only what its parsers import is needed:
+In an environment that has nerfstudio, of which only what its parsers import is needed (and open3d for the points):
 python benchmarks/clients/nerfstudio_parser.py NERFSTUDIO
 """
 
+import importlib.util
 import json
 import sys
 from pathlib import Path
@@ -17,7 +18,9 @@ AS_WRITTEN = {"orientation_method": "none", "center_method": "none", "auto_scale
 
 
 def main(root: str) -> None:
-    parsed = NerfstudioDataParserConfig(data=Path(root), downscale_factor=1, **AS_WRITTEN).setup()
+    points = importlib.util.find_spec("open3d") is not None  # nerfstudio reads splatfacto's points by it
+    options = {**AS_WRITTEN, "downscale_factor": 1, "load_3D_points": points}
+    parsed = NerfstudioDataParserConfig(data=Path(root), **options).setup()
     outputs = parsed.get_dataparser_outputs("train")
     about = json.loads((Path(root) / "transforms.json").read_text())
     shots = {str(Path(root) / shot["file_path"]): shot for shot in about["frames"]}
@@ -37,7 +40,15 @@ def main(root: str) -> None:
         stored = stored[rows[:, None], cols]  # a smaller map is repeated to the picture's size, never interpolated
         assert np.array_equal(stored > 0, metres.numpy()[..., 0] > 0), i
         worst["depth"] = max(worst["depth"], float(np.abs(metres.numpy()[..., 0] - stored).max()))
-    print(json.dumps({"frames": len(shots), "unit": unit, "largest_difference": worst}))
+    said = {"frames": len(shots), "unit": unit, "largest_difference": worst}
+    if points:
+        header, _, body = (Path(root) / about["ply_file_path"]).read_bytes().partition(b"end_header\n")
+        assert header.count(b"property") == 6, "x y z as floats, red green blue as bytes"
+        stored = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+        assert np.array_equal(outputs.metadata["points3D_rgb"].numpy(), stored["rgb"])
+        worst["points"] = float(np.abs(outputs.metadata["points3D_xyz"].numpy() - stored["xyz"]).max())
+        said["points"] = len(stored)
+    print(json.dumps(said))
 
 
 if __name__ == "__main__":

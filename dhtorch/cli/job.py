@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +142,7 @@ def _build_result(
         expectation=outcome.expectation,
         verdict=outcome.verdict,
         why=outcome.why,
+        metrics=[asdict(metric) for metric in outcome.metrics],
     )
 
 

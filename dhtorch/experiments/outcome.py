@@ -2,13 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import errors, holdout
 from dhtorch.records import Estimate, Frame, Samples
+
+
+@dataclass(frozen=True)
+class MainMetric:
+    """A metric by which the jobs of a sweep are compared; its unit is that of its entries in the summary."""
+
+    name: str  # in the summary, without the name of the variant
+    larger_is_better: bool | None = None  # None = neither is
+    with_interval: bool = False  # compared with its interval
+
+
+#: Main metrics of experiments on depth at samples.
+DEPTH_METRICS = (
+    MainMetric("coverage", larger_is_better=True),
+    MainMetric("median_rel", larger_is_better=False),
+    MainMetric("p90_rel", larger_is_better=False),
+    MainMetric("coverage_at_5", larger_is_better=True),
+    MainMetric("ms", larger_is_better=False),
+)
 
 
 @dataclass(frozen=True)
@@ -46,6 +65,7 @@ class Outcome:
     why: str | None = None
     points: dict[tuple[str, str, str], errors.Points] = field(default_factory=dict)  # (scene, variant, cohort) → pool
     cohort: str = "full"  # the one that the verdict and the numbers of the summary without a cohort are about
+    metrics: Sequence[MainMetric] = DEPTH_METRICS  # by which the jobs of a sweep are compared
 
     def decide(self, question: str, expectation: str, holds: bool | None, why: str) -> Outcome:
         """Outcome with the answer to its question: True supported, False refuted, None undecided."""
@@ -61,7 +81,7 @@ class Outcome:
 def join_outcomes(outcomes: Iterable[Outcome]) -> Outcome:
     """Outcomes of several runs as one, with the deciding cohort of the first; their variants have different names."""
     parts = list(outcomes)
-    joined = Outcome(cohort=parts[0].cohort) if parts else Outcome()
+    joined = Outcome(cohort=parts[0].cohort, metrics=parts[0].metrics) if parts else Outcome()
     for part in parts:
         joined.rows += part.rows
         joined.summary |= part.summary

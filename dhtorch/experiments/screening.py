@@ -7,6 +7,7 @@ from typing import Protocol, TypeVar
 
 import torch
 
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Outcome, Progress
 from dhtorch.experiments.rows import Row, mean_or_none, median_or_none, summarise_rows
 
@@ -36,6 +37,7 @@ def screen_scenes(
     variants: Sequence[str],
     *,
     truth: str,
+    metrics: Sequence[MainMetric],
     whole: Callable[[ScreenedScene, Sequence[Mapping[str, Row]]], Mapping[str, Row]] = lambda _scene, _results: {},
     progress: Progress,
 ) -> Outcome:
@@ -51,11 +53,12 @@ def screen_scenes(
         evaluate: scene, item → variant → numbers; a variant may be left out of an item.
         variants: their names, in order.
         truth: name of the truth, for the rows.
+        metrics: main metrics of the experiment.
         whole: scene, results of ``evaluate`` on all its items → variant → numbers that replace those of the scene's
             row.
         progress: wraps the loop over a scene's items: (items, text, number of items) → items.
     """
-    outcome = Outcome()
+    outcome = Outcome(metrics=metrics)
     for scene in scenes:
         chosen = list(items(scene))
         with torch.no_grad():

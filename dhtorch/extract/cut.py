@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 from dhtorch.data.recording import LazySequence, Recording
 from dhtorch.data.scene import Scene
@@ -48,9 +48,7 @@ def truncate_scenes(scenes: Sequence[Scene], frames: int | None) -> Sequence[Sce
 def truncate_recording(recording: Recording, frames: int) -> Recording:
     """Recording -> recording of its first frames."""
     times, poses = recording.times, recording.poses
-    return replace(
-        recording,
-        number=recording.number[:frames],
-        times=None if times is None else times[:frames],
-        poses=None if poses is None else poses[:frames],
-    )
+    kept = {field.name: getattr(recording, field.name) for field in fields(Recording)}  # a subclass has other arguments
+    kept |= {"number": recording.number[:frames]}
+    kept |= {"times": None if times is None else times[:frames], "poses": None if poses is None else poses[:frames]}
+    return Recording(**kept)

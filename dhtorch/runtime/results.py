@@ -13,7 +13,7 @@ import math
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ _RESULT_FIELDS: dict[str, Any] = {
 _META_FIELDS: dict[str, Any] = {"utc": str, "git": _OPTIONAL_TEXT, "versions": dict}
 _META_FIELDS |= {"device": str, "dtype": str, "threads": int, "seed": int}
 #: Fields added later: optional when reading.
-_ADDED_RESULT_FIELDS: dict[str, Any] = {"seal": str}
+_ADDED_RESULT_FIELDS: dict[str, Any] = {"seal": str, "metrics": list}
 _ADDED_META_FIELDS: dict[str, Any] = {"processor": str}
 _DATA_FIELDS: dict[str, Any] = {"name": str, "scenes": list, "n_pairs": int, "digest": str}
 _SUMMARY_FIELDS: dict[str, Any] = {
@@ -72,6 +72,7 @@ _SUMMARY_FIELDS: dict[str, Any] = {
     "n": int,
     "unit": str,
 }
+_METRIC_FIELDS: dict[str, Any] = {"name": str, "larger_is_better": (bool, None), "with_interval": bool}
 _ROW_FIELDS: dict[str, Any] = {"scene": str, "pair": (list, None), "method": str}
 
 
@@ -88,6 +89,7 @@ def build_result(
     expectation: str | None = None,
     verdict: str | None = None,
     why: str | None = None,
+    metrics: Sequence[Mapping[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """Fields -> valid result in strict JSON: non-finite numbers become null, tuples and tensors lists.
 
@@ -100,12 +102,15 @@ def build_result(
         summary: metric → ``{value, low, high, n, unit}``.
         rows: one per pair and, with pair null, one per scene.
         question, expectation, verdict, why: of an experiment with a question.
+        metrics: by which jobs of this experiment are compared, ``{name, larger_is_better, with_interval}`` each; None =
+            none is named.
 
     Raises:
         ValueError: a field is missing, unknown or of the wrong type; the message names it.
     """
     fields = {"question": question, "expectation": expectation, "verdict": verdict, "why": why, "key": key}
-    parts = {"meta": meta, "config": make_portable(config), "data": data, "summary": summary, "rows": rows}
+    parts: dict[str, Any] = {} if metrics is None else {"metrics": list(metrics)}
+    parts |= {"meta": meta, "config": make_portable(config), "data": data, "summary": summary, "rows": rows}
     result = to_strict_json({"schema": _RESULT_SCHEMA, "experiment": experiment, **fields, **parts})
     validate_result(result)
     return dict(result)
@@ -139,6 +144,8 @@ def validate_result(result: Any, where: str = "result") -> None:
     _check_fields(result["data"], _DATA_FIELDS, f"{where}.data")
     for name, entry in result["summary"].items():
         _check_fields(entry, _SUMMARY_FIELDS, f"{where}.summary.{name}")
+    for k, metric in enumerate(result.get("metrics", ())):
+        _check_fields(metric, _METRIC_FIELDS, f"{where}.metrics.{k}")
     for k, row in enumerate(result["rows"]):
         _check_fields(row, _ROW_FIELDS, f"{where}.rows.{k}", more=True)
         pair = row["pair"]
@@ -355,12 +362,13 @@ def _is_of_kind(value: Any, kind: Any) -> bool:
     if kind is None:
         return value is None
     if isinstance(value, bool):
-        return False
+        return kind is bool
     return isinstance(value, int | float) if kind is float else isinstance(value, kind)
 
 
 def _describe_kind(kind: Any) -> str:
     kind_names = {
+        bool: "true or false",
         int: "a whole number",
         float: "a number",
         str: "a text",

@@ -12,6 +12,7 @@ from dhtorch import testing as writers
 from dhtorch.cli import job, run, view
 from dhtorch.cli import option_checks as words
 from dhtorch.cli import sweep_state as together
+from dhtorch.experiments.outcome import DEPTH_METRICS
 from dhtorch.experiments.report import advice, jobs
 from dhtorch.runtime import results as result_files
 from dhtorch.synthetic.recording import SyntheticRoom
@@ -141,7 +142,7 @@ def test_a_sweep_ends_with_one_table_and_its_file(command, tmp_path):
     with (tmp_path / "a=b/sweep.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [r["pairs.gap"] for r in rows] == ["1", "2"]
-    assert list(rows[0]) == ["pairs.gap", *jobs.JOB_METRICS]
+    assert list(rows[0]) == ["pairs.gap", *(metric.name for metric in DEPTH_METRICS)]
     (at,) = [k for k, line in enumerate(out.splitlines()) if re.match(r"\s*pairs.gap\s+coverage\s+median\s+p90", line)]
     assert len(out.splitlines()) - at < 12
     assert not (tmp_path / "a=b" / together._NOTES_FOLDER).exists()

@@ -212,6 +212,11 @@ def test_scenes_without_poses_of_the_hand_are_noted(robot_set, tmp_path):
     assert [r["scene"] for r in short.rows if "note" in r] == [scenes[0].name] and short.n_pairs == 3
 
 
+def test_too_few_tasks_are_refused_before_any_feature_is_computed(robot_set):
+    with pytest.raises(ValueError, match="found 2 parts of 2 groups, expected at least three of each"):
+        rh20t_probe.run(robot_set[:2], {"none": None}, None, Settings(), dinov2=None, horizon=0.2, history=0.2)
+
+
 def test_the_robot_probe_runs_and_does_not_decide_with_random_weights(robot_set):
     pytest.importorskip("transformers")
     outcome = rh20t_probe.run(

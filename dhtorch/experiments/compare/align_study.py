@@ -31,6 +31,7 @@ from dhtorch.data.recording import TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import protocol
 from dhtorch.experiments.baselines import scale_shift
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
@@ -45,6 +46,15 @@ from dhtorch.pytree import stack
 from dhtorch.records import DepthMap, Frame
 from dhtorch.synthetic import depth_faults
 from dhtorch.synthetic.depth_faults import NETWORK_FAULTS, WRONG_TIME
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("simulated_median", larger_is_better=False),
+    MainMetric("ratio_to_near_affine", larger_is_better=False),
+    MainMetric("worst_ratio_to_better", larger_is_better=False),
+    MainMetric("within_sigma", larger_is_better=None),
+    MainMetric("within_2sigma", larger_is_better=None),
+)
 
 QUESTION = "Does anybody's map become as metric as the reference views allow, and is it left alone where it is right?"
 EXPECTATION = "Every number of the list of bars is met; scenes are the unit."
@@ -122,7 +132,7 @@ def run(
     if size < 16:
         raise ValueError(f"experiment.size: found {size}, expected at least 16")
     method = next(iter(methods.values()))
-    outcome = Outcome()
+    outcome = Outcome(metrics=_METRICS)
     for scene in scenes_of(scenes):
         near = settings.cutoff_of(scene)
         if note := _skip_reason(scene, near):

@@ -18,10 +18,17 @@ from typing import Any
 
 from dhtorch.data import scenes_root
 from dhtorch.data.scene import SceneLike
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 from dhtorch.pipeline.method import Method
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("cases_right", larger_is_better=True),
+    MainMetric("commands_right", larger_is_better=True),
+)
 
 QUESTION = "Does every command read captures of other tools with the right unit, orientation, time and axes?"
 EXPECTATION = "Each output has the true value, or a refusal or warning with the true cause."
@@ -57,7 +64,7 @@ def run(
     methods of the settings are not used.
     """
     base = scenes_root(root) / folder
-    outcome = Outcome()
+    outcome = Outcome(metrics=_METRICS)
     for name in progress(list(cases), "cases", len(cases)):
         with tempfile.TemporaryDirectory() as scratch:
             rows = [_command_row(base / name, command, Path(scratch) / str(k)) for k, command in enumerate(cases[name])]

@@ -25,6 +25,7 @@ from dhtorch.data.pairs import candidate_frames
 from dhtorch.data.recording import Recording, TruthRecording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.baselines import photometric
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row, mean_or_none
 from dhtorch.geometry import camera as cam
@@ -45,6 +46,15 @@ from dhtorch.synthetic.near_card import add_near_card, card_over_map
 from dhtorch.validation import faults
 from dhtorch.validation.options import DEFAULT_VALIDATION_OPTIONS
 from dhtorch.validation.validate import QUICK_METHOD, validate_against
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("called_right_wrong", larger_is_better=False),
+    MainMetric("called_wrong_right", larger_is_better=False),
+    MainMetric("false_alarm", larger_is_better=False),
+    MainMetric("scale_detected", larger_is_better=True),
+    MainMetric("jump_auroc", larger_is_better=True),
+)
 
 QUESTION = "Does the judge find what is wrong with a depth map, and keep silent where nothing can tell?"
 EXPECTATION = "Every number of the list of bars is met; scenes, and of causes windows, are the unit."
@@ -182,7 +192,7 @@ def run(
     selecting_method = with_view_selection(method or next(iter(chosen.values())))
     all_scenes = [scene for scene in scenes_of(scenes) if len(scene.recording) > 1]
     all_scenes += [Scene(_make_room(seed), near=2.0, gap=6) for seed in rooms]
-    outcome = Outcome()
+    outcome = Outcome(metrics=_METRICS)
     for scene in all_scenes:
         load = partial(_load_frame, scene, settings)
         reference_rows = []

@@ -30,6 +30,7 @@ from dhtorch.experiments.focal.blur import (
     guess_side_by_height,
     inverse_depth_from_blur,
 )
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row, median_or_none
 from dhtorch.experiments.screening import ScreenedItem, screen_scenes
@@ -39,6 +40,14 @@ from dhtorch.metrics.correlation import pearson, spearman
 from dhtorch.records import Frame
 from dhtorch.synthetic.recording import SyntheticRoom
 from dhtorch.synthetic.thin_lens import make_lens, render_defocus
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("rho_abs", larger_is_better=True),
+    MainMetric("rank_corr", larger_is_better=True),
+    MainMetric("side_right", larger_is_better=True),
+    MainMetric("coverage", larger_is_better=True),
+)
 
 QUESTION = "How much depth is there in the defocus of a single picture?"
 EXPECTATION = (
@@ -113,7 +122,13 @@ def run(
         )
 
     outcome = screen_scenes(
-        scenes_of(scenes), lambda _r: [(0, 0)], evaluate_item, VARIANTS, truth="full", progress=progress
+        scenes_of(scenes),
+        lambda _r: [(0, 0)],
+        evaluate_item,
+        VARIANTS,
+        truth="full",
+        metrics=_METRICS,
+        progress=progress,
     )
     outcome.summary |= {
         k: bootstrap.without_interval(v, 1) for k, v in measure_ambiguities(noise=noise, window_px=window_px).items()

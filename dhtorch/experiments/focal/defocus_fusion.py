@@ -25,6 +25,7 @@ from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.focal.blur import estimate_blur
 from dhtorch.experiments.focal.defocus import has_exact_depth
 from dhtorch.experiments.focal.filling import fill_bilinear, fill_defocus_guided, fill_guided, fill_joint_bilateral
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
@@ -32,6 +33,14 @@ from dhtorch.metrics import bootstrap
 from dhtorch.metrics.correlation import pearson
 from dhtorch.records import Frame
 from dhtorch.synthetic.thin_lens import make_lens, render_defocus
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("mean_rel", larger_is_better=False),
+    MainMetric("median_rel", larger_is_better=False),
+    MainMetric("edge_mean_rel", larger_is_better=False),
+    MainMetric("rmse_m", larger_is_better=False),
+)
 
 QUESTION = "Does defocus help to fill in between the returns of a depth sensor?"
 EXPECTATION = "No: plain interpolation is hard to beat, and defocus raises its error slightly."
@@ -100,7 +109,9 @@ def run(
             image, return_noise = _render_through_lens(frame, lens.to(settings.dtype), noise, generator), sensor_noise
         return _evaluate_frame(image, frame.depth, factor, return_noise, noise, generator)
 
-    outcome = screen_scenes(scenes_of(scenes), items, evaluate_item, VARIANTS, truth="left_out", progress=progress)
+    outcome = screen_scenes(
+        scenes_of(scenes), items, evaluate_item, VARIANTS, truth="left_out", metrics=_METRICS, progress=progress
+    )
     _add_ratios(outcome)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 

@@ -28,6 +28,7 @@ from dhtorch.data.scene import Scene, SceneLike
 from dhtorch.experiments.focal.defocus import has_exact_depth
 from dhtorch.experiments.focal.sharpness import align_stack, depth_at_focus, find_sharpest, measure_sharpness
 from dhtorch.experiments.focal.stacks import FocalStack, FocalStacks
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row, mean_or_none
 from dhtorch.experiments.screening import ScreenedItem, screen_scenes
@@ -36,6 +37,14 @@ from dhtorch.metrics import bootstrap
 from dhtorch.metrics.correlation import pearson, spearman
 from dhtorch.records import Frame
 from dhtorch.synthetic.thin_lens import make_lens, render_defocus
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("rank_corr", larger_is_better=True),
+    MainMetric("corr", larger_is_better=True),
+    MainMetric("gated_rank_corr", larger_is_better=True),
+    MainMetric("flip_share", larger_is_better=False),
+)
 
 QUESTION = "Does the classical recipe, the sharpest picture of every pixel, read depth off a focal stack?"
 EXPECTATION = "On clean stacks; on light fields it fails, flips sign on some scenes, and confidence does not rescue it."
@@ -131,7 +140,14 @@ def run(
     ]
     variants = _possible_variants(rooms, names)
     outcome = screen_scenes(
-        rooms, _stack_items, evaluate_item, variants, truth="full", whole=_flip_shares, progress=progress
+        rooms,
+        _stack_items,
+        evaluate_item,
+        variants,
+        truth="full",
+        whole=_flip_shares,
+        metrics=_METRICS,
+        progress=progress,
     )
     for name in variants:
         flips = [row.get("flip_share") for row in outcome.scenes(name).values()]

@@ -26,6 +26,7 @@ from torch import Tensor
 from dhtorch.data.pairs import to_fixed_pairs
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.negative.arms import ArmShift, correlate_windows, sample_arm
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row, median_or_none
 from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
@@ -33,6 +34,13 @@ from dhtorch.metrics import bootstrap, holdout
 from dhtorch.metrics.correlation import pearson, spearman
 from dhtorch.records import Frame, TrackHint
 from dhtorch.stages.sample import spiral
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("corr", larger_is_better=True),
+    MainMetric("rank_corr", larger_is_better=True),
+    MainMetric("coverage", larger_is_better=True),
+)
 
 QUESTION = "Does correlating the two spiral signals in time squeeze out parallax?"
 EXPECTATION = "No: its shifts hardly correlate with inverse depth, plain 2-D flow does; forward motion is not seen."
@@ -115,6 +123,7 @@ def run(
         evaluate_item,
         VARIANTS,
         truth="full",
+        metrics=_METRICS,
         progress=progress,
     )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))

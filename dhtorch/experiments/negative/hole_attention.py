@@ -20,6 +20,7 @@ from torch import Tensor
 from dhtorch.codes import Hole
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.negative.clusters import Cluster, largest_cluster
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.paper.hole_census import classify_frame, count_holes
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
@@ -27,6 +28,14 @@ from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_sc
 from dhtorch.metrics import bootstrap
 from dhtorch.records import Samples
 from dhtorch.stages.sample import vogel_spiral
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("hole_rate", larger_is_better=None),
+    MainMetric("cluster_share", larger_is_better=True),
+    MainMetric("cluster_returns", larger_is_better=True),
+    MainMetric("rise", larger_is_better=True),
+)
 
 QUESTION = "Does looking at the holes fill them?"
 EXPECTATION = "No: the hole rate rises; the classes of the holes say what could fill them."
@@ -89,7 +98,9 @@ def run(
             samples["attention"] = classify_frame(_with_gaze(method, cluster.gaze[0]), frame)
         return {v: _count_holes(samples[v], before, cluster, frame.hw) for v in VARIANTS if v in samples}
 
-    outcome = screen_scenes(scenes_of(scenes), items, evaluate_item, VARIANTS, truth=_TRUTH, progress=progress)
+    outcome = screen_scenes(
+        scenes_of(scenes), items, evaluate_item, VARIANTS, truth=_TRUTH, metrics=_METRICS, progress=progress
+    )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 
 

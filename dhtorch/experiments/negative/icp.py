@@ -24,6 +24,7 @@ from torch import Tensor
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.negative.registration import IcpRegistration, estimate_normals, register_icp
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
@@ -32,6 +33,14 @@ from dhtorch.metrics import bootstrap
 from dhtorch.records import Frame, Pose
 from dhtorch.runtime.console import format_count
 from dhtorch.synthetic.recording import SyntheticRoom
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("rotation_deg", larger_is_better=False),
+    MainMetric("translation_m", larger_is_better=False),
+    MainMetric("n_voxels", larger_is_better=True),
+    MainMetric("drift_rel", larger_is_better=False),
+)
 
 QUESTION = "Does ICP between independently sampled sparse sets add anything to a good device pose?"
 EXPECTATION = "No: it covers fewer voxels than the pose alone; without a pose it ends nearer to the truth than nothing."
@@ -114,7 +123,14 @@ def run(
         return consecutive_links(scene.recording, links)
 
     outcome = screen_scenes(
-        scenes_of(scenes), items, evaluate_item, VARIANTS, truth=_TRUTH, whole=whole, progress=progress
+        scenes_of(scenes),
+        items,
+        evaluate_item,
+        VARIANTS,
+        truth=_TRUTH,
+        whole=whole,
+        metrics=_METRICS,
+        progress=progress,
     )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 

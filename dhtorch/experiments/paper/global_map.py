@@ -24,6 +24,7 @@ from dhtorch.codes import Source
 from dhtorch.data.pairs import to_fixed_pairs
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 from dhtorch.experiments.screening import ScreenedItem, paired_metric, screen_scenes
@@ -39,6 +40,14 @@ from dhtorch.integrate.recording import (
     place_frames,
 )
 from dhtorch.metrics import bootstrap
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("n_voxels", larger_is_better=True),
+    MainMetric("right_share", larger_is_better=True),
+    MainMetric("n_islands", larger_is_better=False),
+    MainMetric("n_fragments", larger_is_better=False),
+)
 
 QUESTION = "Does fusing recovered points widen the map, and do they stitch its fragments into one?"
 EXPECTATION = "Wider, but not stitched: the fused map covers more voxels than the sensor's and has no fewer islands."
@@ -105,7 +114,7 @@ def run(
         return rows
 
     outcome = screen_scenes(
-        scenes_of(scenes), items, evaluate, VARIANTS, truth=MAP_TRUTH, whole=whole, progress=progress
+        scenes_of(scenes), items, evaluate, VARIANTS, truth=MAP_TRUTH, whole=whole, metrics=_METRICS, progress=progress
     )
     return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome))
 

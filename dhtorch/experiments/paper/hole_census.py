@@ -15,10 +15,19 @@ import torch
 
 from dhtorch.codes import ROUTE_OF_HOLE, Hole, Route, names
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row, mean_or_none, median_or_none
 from dhtorch.metrics import errors
 from dhtorch.records import Samples
+
+#: Main metrics of the experiment.
+_METRICS = (
+    MainMetric("hole_rate", larger_is_better=None),
+    MainMetric("hole_share.trackable_no_lidar", larger_is_better=None),
+    MainMetric("trackability_hole", larger_is_better=None),
+    MainMetric("trackability_valid", larger_is_better=None),
+)
 
 QUESTION = "Are most of the sensor's holes places where the picture could still be tracked?"
 EXPECTATION = "At least half of the holes are TRACKABLE_NO_LIDAR, of trackability like that of samples with a return."
@@ -48,7 +57,7 @@ def run(
     Source: paper, "Hole taxonomy".
     """
     name, method = next(iter(methods.items()))
-    outcome = Outcome()
+    outcome = Outcome(metrics=_METRICS)
     for scene in scenes_of(scenes):
         recording = scene.recording
         frames = list(range(0, len(recording), stride))

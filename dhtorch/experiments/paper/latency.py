@@ -32,6 +32,7 @@ from dhtorch.data.pairs import to_fixed_pairs
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments import memory
 from dhtorch.experiments.baselines import dinov2 as visual
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import camera as cam
@@ -149,7 +150,9 @@ def run(
     rows = [_timing_row(scene.name, b, stage, settings, n) for b in branches for stage in b.rounds[0]]
     if note:
         rows.append({"scene": scene.name, "pair": None, "method": VISUAL_BRANCH, "stage": "forward", "note": note})
-    outcome = Outcome(rows=rows, summary=summarise_timings(branches), n_pairs=1)
+    named = dict.fromkeys(f"{b.stage}.{'x'.join(map(str, b.hw))}" for b in branches)
+    metrics = tuple(MainMetric(stage, larger_is_better=False, with_interval=True) for stage in named)
+    outcome = Outcome(rows=rows, summary=summarise_timings(branches), n_pairs=1, metrics=metrics)
     return outcome.decide(QUESTION, EXPECTATION, *verdict(name, outcome.summary, sizes, note))
 
 

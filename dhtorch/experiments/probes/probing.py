@@ -17,11 +17,20 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.experiments.outcome import MainMetric
 from dhtorch.experiments.probes import ridge as probe
 from dhtorch.experiments.protocol import Outcome
 from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 from dhtorch.metrics.bootstrap import Interval
+
+#: Main metrics of the experiment.
+PROBE_METRICS = (
+    MainMetric("mse", larger_is_better=False, with_interval=True),
+    MainMetric("vs_context", larger_is_better=False, with_interval=True),
+    MainMetric("vs_dinov2", larger_is_better=False, with_interval=True),
+    MainMetric("vs_xfeat", larger_is_better=False, with_interval=True),
+)
 
 CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK = "context", "dinov2", "xfeat"
 
@@ -291,8 +300,7 @@ def record_probes(outcome: Outcome, probe_errors: ProbeErrors, scene: str | None
 
     Fields: ``mse`` in units of the targets' variance; ``n_samples``; ``vs_context``, ``vs_dinov2`` and, if XFeat was
     run, ``vs_xfeat``: ratios to the errors of those arms. The same fields below ``moving`` are of the samples that
-    move. A row of a whole scene also has 95 % intervals over its groups, ``vs_dinov2_low`` and ``vs_dinov2_high``, and
-    those of XFeat.
+    move. A row of a whole scene also has 95 % intervals over its groups, as ``vs_dinov2_low`` and ``vs_dinov2_high``.
     """
     for arm in probe_errors.arms:
         common: Row = {"pair": None, "method": arm, "truth": PROBE_TRUTH, "role": None}
@@ -332,7 +340,10 @@ def summarise_probes(probe_errors: ProbeErrors) -> dict[str, Any]:
 
 
 def summarise_over_scenes(outcome: Outcome, arms: Sequence[str]) -> dict[str, Any]:
-    """Summary entries as of :func:`summarise_probes` if every scene has its own probes: geometric means over scenes."""
+    """Summary entries as of :func:`summarise_probes` if every scene has its own probes: geometric means over scenes.
+
+    If there is a single scene, the intervals are those of its row, over its groups.
+    """
     summary: dict[str, Any] = {}
     for arm in arms:
         scene_rows = list(outcome.scenes(arm, PROBE_TRUTH).values())
@@ -343,6 +354,9 @@ def summarise_over_scenes(outcome: Outcome, arms: Sequence[str]) -> dict[str, An
             xfeat_ratio = ("vs_xfeat",) if XFEAT_BLOCK in arms else ()
             for name in ("mse", "vs_context", "vs_dinov2", *xfeat_ratio):
                 interval = bootstrap.interval_over_scenes([row.get(name) for row in rows], statistic="geometric_mean")
+                if interval.n == 1:
+                    (row,) = (row for row in rows if row.get(name) is not None)
+                    interval = Interval(row[name], row.get(f"{name}_low"), row.get(f"{name}_high"), 1)
                 summary[prefix + name] = interval.entry()
     return summary
 
@@ -358,15 +372,13 @@ def compare_with_xfeat(ratios: Mapping[str, tuple[Any, Any, Any]]) -> str:
 
 def _overall_numbers(errors: ProbeErrors, arm: str, cohort: str) -> Row:
     """Fields of one arm and cohort over all groups."""
-    row: Row = {
-        "n_samples": int(errors.counts[cohort].sum()),
-        "mse": errors.mean(arm, cohort).value,
-        "vs_context": errors.ratio(arm, CONTEXT_BLOCK, cohort).value,
-    }
-    for baseline in (REFERENCE_BLOCK, XFEAT_BLOCK):
-        if baseline == REFERENCE_BLOCK or (baseline, cohort) in errors.squares:
-            ratio = errors.ratio(arm, baseline, cohort)
-            row |= {f"vs_{baseline}": ratio.value, f"vs_{baseline}_low": ratio.low, f"vs_{baseline}_high": ratio.high}
+    row: Row = {"n_samples": int(errors.counts[cohort].sum())}
+    intervals = {"mse": errors.mean(arm, cohort)}
+    for baseline in (CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK):
+        if baseline != XFEAT_BLOCK or (baseline, cohort) in errors.squares:
+            intervals[f"vs_{baseline}"] = errors.ratio(arm, baseline, cohort)
+    for name, interval in intervals.items():
+        row |= {name: interval.value, f"{name}_low": interval.low, f"{name}_high": interval.high}
     return row
 
 

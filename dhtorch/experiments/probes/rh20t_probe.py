@@ -38,6 +38,7 @@ from dhtorch.experiments.probes.probing import (
     CONTEXT_BLOCK,
     MOVING_COHORT,
     PROBE_ARMS,
+    PROBE_METRICS,
     PROBE_PENALTIES,
     PROBE_TRUTH,
     REFERENCE_BLOCK,
@@ -113,15 +114,18 @@ def run(
     networks, real = front_ends.load_network_front_ends(
         dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device
     )
+    select = partial(select_robot_samples, horizon=horizon, history=history, stride=stride)
+    chosen = [(scene, select(scene.recording)) for scene in scenes_of(scenes)]
+    tasks = [task_name(scene.recording) for scene, (index, *_) in chosen if index]
+    if not tasks:
+        raise ValueError(f"rh20t_probe: found no sample, expected scenes longer than {history + horizon} s")
+    probe.make_folds(tasks, n_folds, seed=settings.seed)  # too few tasks are refused before the features are computed
     method = next(iter(methods.values()))
-    outcome = Outcome()
+    outcome = Outcome(metrics=PROBE_METRICS)
     with ProbeShards() as shards:
-        for scene in scenes_of(scenes):
+        for scene, (index, before, context, target) in chosen:
             recording = scene.recording
-            index, before, context, target = select_robot_samples(
-                recording, horizon=horizon, history=history, stride=stride
-            )
-            if not len(index):
+            if not index:
                 outcome.rows.append(_skip_reason(recording))
                 continue
             options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
@@ -140,8 +144,6 @@ def run(
             blocks = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
             is_moving = target[:, :3].norm(dim=-1) > moving
             shards.add(ProbeShard(task_name(recording), {CONTEXT_BLOCK: context, **blocks}, target, is_moving))
-        if not shards.n:
-            raise ValueError(f"rh20t_probe: found no sample, expected scenes longer than {history + horizon} s")
         arms = {k: blocks for k, blocks in PROBE_ARMS.items() if set(blocks) <= set(shards.widths)}
         probe_errors = probing.evaluate_probes(shards, arms, n_folds=n_folds, penalties=penalties, seed=settings.seed)
         outcome.n_pairs = shards.n

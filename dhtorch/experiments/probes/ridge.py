@@ -201,7 +201,7 @@ def make_folds(groups: Sequence[str], n: int = 5, *, seed: int = 0) -> list[Prob
     names = sorted(set(groups))
     n = min(n, len(names))
     if n < 3:
-        raise ValueError(f"make_folds: found {n} parts of {len(names)} groups, expected at least three of each")
+        raise ValueError(f"experiment.n_folds: found {n} parts of {len(names)} groups, expected at least three of each")
     Random(f"folds {seed}").shuffle(names)
     parts = [tuple(names[k::n]) for k in range(n)]
     return [

@@ -30,6 +30,7 @@ from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes.probing import (
     CONTEXT_BLOCK,
     PROBE_ARMS,
+    PROBE_METRICS,
     PROBE_PENALTIES,
     PROBE_TRUTH,
     REFERENCE_BLOCK,
@@ -47,6 +48,9 @@ EXPECTATION = "Yes: on every scene the error with depth features is smaller than
 
 #: Block of a shard with the method's own relative pose.
 _OWN_POSE_BLOCK = "pose"
+
+#: Least number of blocks: one for the test, one for the penalties, one to train on.
+_MIN_BLOCKS = 3
 
 _OURS, _POSE_ARM = "dhtorch", "two_view_pose"
 
@@ -92,13 +96,13 @@ def run(
 
     Source: paper, section 6.7, "Downstream behaviour as a visual front-end".
     """
-    if blocks < 3:
-        raise ValueError(f"vo_probe: blocks is {blocks}, expected at least 3")
+    if blocks < _MIN_BLOCKS:
+        raise ValueError(f"vo_probe: blocks is {blocks}, expected at least {_MIN_BLOCKS}")
     networks, real = front_ends.load_network_front_ends(
         dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device
     )
     arm_names = [*(arm for arm, blocks in PROBE_ARMS.items() if xfeat or XFEAT_BLOCK not in blocks), _POSE_ARM]
-    outcome = Outcome()
+    outcome = Outcome(metrics=PROBE_METRICS)
     rooms: dict[str, list[Scene]] = {}
     for scene in scenes_of(scenes):
         rooms.setdefault(scene.place, []).append(scene)
@@ -107,6 +111,10 @@ def run(
         n_pairs = sum(len(block) for scene_blocks in blocks_of.values() for block in scene_blocks)
         if n_pairs < min_pairs:
             note = f"{n_pairs} pairs with known motion, fewer than {min_pairs}"
+            outcome.rows += [_empty_row(room, arm, note) for arm in arm_names]
+            continue
+        if sum(bool(block) for scene_blocks in blocks_of.values() for block in scene_blocks) < _MIN_BLOCKS:
+            note = f"fewer than {_MIN_BLOCKS} blocks with pairs"
             outcome.rows += [_empty_row(room, arm, note) for arm in arm_names]
             continue
         with ProbeShards() as shards:

@@ -74,6 +74,10 @@ _METRIC_HEADINGS = {
     "edge_mean_rel": "mean at edges",
     "rmse_m": "RMSE m",
     "changed_rel": "changed",
+    "mse": "squared error / variance",
+    "vs_context": "ratio to context",
+    "vs_dinov2": "ratio to DINOv2",
+    "vs_xfeat": "ratio to XFeat",
 }
 #: Metric → style, where the rules of :func:`metric_style` do not apply.
 _METRIC_STYLES = {
@@ -85,6 +89,7 @@ _METRIC_STYLES = {
 }
 _METRIC_STYLES |= dict.fromkeys(("rho_abs", "corr", "rank_corr", "abs_corr", "gated_corr", "gated_abs_corr"), "ratio")
 _METRIC_STYLES |= {"order_corr": "ratio", "halves_corr": "ratio", "side_right": "percent", "mean_rel_ratio": "fine"}
+_METRIC_STYLES |= dict.fromkeys(("mse", "vs_context", "vs_dinov2", "vs_xfeat"), "fine")
 _METRIC_STYLES |= {"ece": "fine", "ece_equal_mass": "fine", "ece_pooled": "fine", "monotonicity": "fine"}
 _METRIC_STYLES |= {"parameters": "large", "weight_bytes": "bytes", "peak_mib": "mebibytes"}
 _STYLE_DECIMALS = {"count": 0, "number": 1, "ratio": 2, "fine": 3}

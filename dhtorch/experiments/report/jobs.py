@@ -1,4 +1,8 @@
-"""Table of the jobs of a sweep: the settings that differ, then the main metrics; as cells and as CSV."""
+"""Table of the jobs of a sweep: the settings that differ, then the main metrics; as cells and as CSV.
+
+Which metrics are the main ones, and which of their values is better, is named by the experiment, in its result. Of a
+result without such names, those of experiments on depth are taken, and if it has none of these its first metrics.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +12,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from dhtorch.experiments.report.cells import EMPTY_CELL, format_value, metric_heading
+from dhtorch.experiments.outcome import DEPTH_METRICS, MainMetric
+from dhtorch.experiments.report.cells import EMPTY_CELL, format_metric_interval, format_value, metric_heading
 from dhtorch.experiments.report.reading import Result, summary_entry, variant_names
-from dhtorch.experiments.report.tables import ReportTable
+from dhtorch.experiments.report.tables import INTERVAL_LABEL, ReportTable
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
 
-#: Metrics of the table → whether a larger value is better.
-JOB_METRICS = {"coverage": True, "median_rel": False, "p90_rel": False, "coverage_at_5": True, "ms": False}
+#: Columns of a result that names no metrics and has none of depth, at most.
+_MAX_UNNAMED_METRICS = 6
+
+#: Prefix of the summary's entries of a stage's time, which the metric ``ms`` adds up.
+_STAGE_TIMES = "ms."
 
 #: Settings that do not distinguish jobs.
 _IGNORED_SETTINGS = ("output", "resume", "traceback", "figures", "workers", "threads", "launch")
@@ -44,29 +52,58 @@ def differing_settings(results: Sequence[Result]) -> list[dict[str, str]]:
     return differing
 
 
-def job_numbers(result: Result, variant: str) -> dict[str, float | None]:
-    """Metrics of one variant of a job; ``ms`` is the sum over the stages."""
-    numbers = {m: summary_entry(result, variant, m).get("value") for m in JOB_METRICS if m != "ms"}
-    stages = {name.rpartition("ms.")[2] for name in result["summary"] if "ms." in f".{name}"}
-    spent = [summary_entry(result, variant, f"ms.{stage}").get("value") for stage in stages]
-    return {**numbers, "ms": sum(v for v in spent if v is not None) if any(v is not None for v in spent) else None}
+def main_metrics(results: Sequence[Result]) -> list[MainMetric]:
+    """Metrics of a table of results, without those of which no result has a value; all if none has any."""
+    named = {metric.name: metric for result in results for metric in _named_metrics(result)}
+    valued = [
+        metric
+        for name, metric in named.items()
+        if any(_entry(result, v, name).get("value") is not None for result in results for v in variant_names(result))
+    ]
+    return valued or list(named.values())
 
 
-def job_rows(results: Sequence[Result]) -> tuple[list[str], list[tuple[list[str], dict[str, float | None]]]]:
-    """Label columns, and a row of labels and metrics for every job and variant."""
-    settings = differing_settings(results)
+def _named_metrics(result: Result) -> Sequence[MainMetric]:
+    """The metrics that a result names; else those of depth, if it has any; else its first ones."""
+    if "metrics" in result:
+        return [MainMetric(**metric) for metric in result["metrics"]]
+    variants = variant_names(result)
+    if any(_entry(result, v, metric.name) for v in variants for metric in DEPTH_METRICS):
+        return DEPTH_METRICS
+    names = [name.removeprefix(f"{v}.") for v in variants[:1] for name in result["summary"] if name.startswith(f"{v}.")]
+    names = names or list(result["summary"])
+    return [MainMetric(name) for name in names[:_MAX_UNNAMED_METRICS]]
+
+
+def _entry(result: Result, variant: str, metric: str) -> Mapping[str, Any]:
+    """Summary entry of a main metric; ``ms`` is the sum over the stages."""
+    entry = summary_entry(result, variant, metric)
+    if metric != "ms" or entry:
+        return entry
+    stages = {name.rpartition(_STAGE_TIMES)[2] for name in result["summary"] if _STAGE_TIMES in f".{name}"}
+    spent = [summary_entry(result, variant, _STAGE_TIMES + stage).get("value") for stage in stages]
+    spent = [value for value in spent if value is not None]
+    return {"value": sum(spent), "unit": "ms"} if spent else {}
+
+
+#: Labels of a job and variant, and the summary entry of each metric.
+_JobRow = tuple[list[str], dict[str, Mapping[str, Any]]]
+
+
+def job_rows(results: Sequence[Result]) -> tuple[list[str], list[_JobRow]]:
+    """Label columns, and a row of labels and summary entries for every job and variant that has a value."""
+    settings, metrics = differing_settings(results), main_metrics(results)
     names = list(dict.fromkeys(name for row in settings for name in row))
     show_method = "method" not in names and any(len(variant_names(result)) > 1 for result in results)
-    rows = []
+    heads = _column_headings(names, show_method)
+    rows: list[_JobRow] = []
     for result, row in zip(results, settings, strict=True):
-        for variant in variant_names(result):
+        entries = {v: {m.name: _entry(result, v, m.name) for m in metrics} for v in variant_names(result)}
+        valued = [v for v, of in entries.items() if any(e.get("value") is not None for e in of.values())]
+        for variant in valued or list(entries)[:1]:
             label = {**row, "method": variant} if "method" in row or show_method else row
-            rows.append(
-                ([label.get(n, EMPTY_CELL) for n in _column_headings(names, show_method)], job_numbers(result, variant))
-            )
-    return _column_headings(names, show_method) or ["job"], rows if _column_headings(
-        names, show_method
-    ) else _number_duplicates(rows)
+            rows.append(([label.get(name, EMPTY_CELL) for name in heads], entries[variant]))
+    return (heads, rows) if heads else (["job"], [([str(k + 1)], of) for k, (_, of) in enumerate(rows)])
 
 
 def jobs_table(results: Sequence[Result]) -> ReportTable | None:
@@ -74,23 +111,27 @@ def jobs_table(results: Sequence[Result]) -> ReportTable | None:
     if len(results) < 2:
         return None
     heads, rows = job_rows(results)
-    body = [
-        [*labels, *(format_value(numbers[m], m) if m != "ms" else _format_ms(numbers[m]) for m in JOB_METRICS)]
-        for labels, numbers in rows
-    ]
-    best = set()
-    for k, (metric, larger_is_better) in enumerate(JOB_METRICS.items(), start=len(heads)):
-        values = {n: v for n, (_, numbers) in enumerate(rows) if (v := numbers[metric]) is not None}
-        if len(values) > 1:
-            best_value = max(values.values()) if larger_is_better else min(values.values())
-            best |= {(n, k) for n, v in values.items() if v == best_value and len(set(values.values())) > 1}
-    headings = {"coverage_at_5": "coverage at 5 %", "ms": "ms"}
-    title = format_count(len(results), "job")
+    head, body, best = list(heads), [list(labels) for labels, _ in rows], set()
+    for metric in main_metrics(results):
+        values = [of[metric.name].get("value") for _, of in rows]
+        known = [value for value in values if value is not None]
+        if metric.larger_is_better is not None and len(set(known)) > 1:
+            best_value = max(known) if metric.larger_is_better else min(known)
+            best |= {(n, len(head)) for n, value in enumerate(values) if value == best_value}
+        head.append(_metric_heading(metric, [of[metric.name] for _, of in rows]))
+        for cells, value in zip(body, values, strict=True):
+            cells.append(_format_ms(value) if metric.name == "ms" else format_value(value, metric.name))
+        if _has_interval(metric, rows):
+            head.append(INTERVAL_LABEL)
+            for cells, (_, of) in zip(body, rows, strict=True):
+                entry = of[metric.name]
+                cells.append(format_metric_interval(entry.get("low"), entry.get("high"), metric.name) or EMPTY_CELL)
     return ReportTable(
-        title,
-        [*heads, *(headings.get(m) or metric_heading(m) for m in JOB_METRICS)],
+        format_count(len(results), "job"),
+        head,
         body,
         len(heads),
+        note=_describe_directions(main_metrics(results)),
         best=frozenset(best),
     )
 
@@ -98,28 +139,52 @@ def jobs_table(results: Sequence[Result]) -> ReportTable | None:
 def write_jobs_csv(path: Path, results: Sequence[Result]) -> Path:
     """Write the table of jobs as CSV with all digits: fractions from 0 to 1, empty cells without a value.
 
+    A metric with an interval is followed by its ends, ``NAME_low`` and ``NAME_high``.
+
     Raises:
         OSError: the file cannot be written.
     """
     heads, rows = job_rows(results)
+    columns = [
+        (f"{metric.name}{suffix}", metric.name, field)
+        for metric in main_metrics(results)
+        for field, suffix in (("value", ""), ("low", "_low"), ("high", "_high"))
+        if field == "value" or _has_interval(metric, rows)
+    ]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*heads, *JOB_METRICS])
-    for labels, numbers in rows:
-        writer.writerow([*labels, *("" if numbers[m] is None else repr(numbers[m]) for m in JOB_METRICS)])
+    writer.writerow([*heads, *(heading for heading, _, _ in columns)])
+    for labels, of in rows:
+        numbers = [of[name].get(field) for _, name, field in columns]
+        writer.writerow([*labels, *("" if number is None else repr(number) for number in numbers)])
     return storage.replace_file(path, text.getvalue().encode())
+
+
+def _has_interval(metric: MainMetric, rows: Sequence[_JobRow]) -> bool:
+    """Whether the intervals of a metric are shown: it is compared with them, and a row has one."""
+    return metric.with_interval and any(of[metric.name].get("low") is not None for _, of in rows)
+
+
+def _metric_heading(metric: MainMetric, entries: Sequence[Mapping[str, Any]]) -> str:
+    """Heading of a metric's column, with its unit where the heading does not name it."""
+    heading = {"coverage_at_5": "coverage at 5 %", "ms": "ms"}.get(metric.name) or metric_heading(metric.name)
+    units = {entry["unit"] for entry in entries if entry.get("unit") not in (None, "", "1", "count")}
+    unit = units.pop() if len(units) == 1 else ""
+    return heading if not unit or unit in heading.split() else f"{heading}, {unit}"
+
+
+def _describe_directions(metrics: Sequence[MainMetric]) -> str:
+    """Sentence that says of which metrics larger values are better, and of which smaller ones."""
+    parts = []
+    for larger, text in ((True, "larger is better"), (False, "smaller is better")):
+        names = [_metric_heading(metric, ()) for metric in metrics if metric.larger_is_better is larger]
+        parts += [f"{text}: {', '.join(names)}"] if names else []
+    return "; ".join(parts)
 
 
 def _column_headings(names: Sequence[str], show_method: bool) -> list[str]:
     """Headings of the label columns."""
     return [*names, *(["method"] if show_method else [])]
-
-
-def _number_duplicates(
-    rows: list[tuple[list[str], dict[str, float | None]]],
-) -> list[tuple[list[str], dict[str, float | None]]]:
-    """Rows labelled by number, for jobs with equal settings."""
-    return [([str(k + 1)], numbers) for k, (_, numbers) in enumerate(rows)]
 
 
 def _format_ms(value: float | None) -> str:
