@@ -2,7 +2,8 @@
 
 The layout is that of COLMAP's own workspaces, which gsplat, nerfstudio and other trainers of splats open. They take
 depth from the points that a picture observes: the recovered points, the sensor's, and some of the swept ones are
-written, so that these trainers get all three without further files.
+written, so that these trainers get all three without further files. Most of them know no lens: pictures are written
+undistorted, as ``colmap image_undistorter`` does.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -23,7 +26,7 @@ from dhtorch.geometry import se3
 from dhtorch.integrate.recording import PairEstimate
 from dhtorch.pipeline.dense import map_pixel_centres
 from dhtorch.pipeline.pair import merge
-from dhtorch.records import Frame, Pose
+from dhtorch.records import Camera, Frame, Pose
 from dhtorch.runtime import storage
 
 #: Folders of the workspace.
@@ -77,18 +80,19 @@ def write_colmap_workspace(
         poses: frame → T_world_from_cam (1); other frames are not written.
     """
     shots: list[ColmapImage] = []
+    lenses: list[Camera] = []
     number: dict[int, int] = {}
     for k, T in poses.items():
         frame: Frame = recording[k]
         name = f"{int(recording.number[k]):06d}.png"
-        picture = colour_to_uint8(frame.image[0].movedim(0, -1).cpu().numpy())
-        picture = picture[..., 0] if picture.shape[-1] == 1 else picture
+        picture, camera = _undistort(frame)
         storage.replace_file(folder / IMAGE_FOLDER / name, encode_png(picture))
         number[k] = len(shots)
         time = None if recording.times is None else float(recording.times[k])
-        shots.append(ColmapImage(name, frame.camera, frame.hw, T, time))
+        shots.append(ColmapImage(name, camera, frame.hw, T, time))
+        lenses.append(frame.camera)
     placed = [answer for answer in answers if answer.pair[0] in poses]
-    parts = [_sample_points(answer, shots, number) for answer in placed]
+    parts = [_sample_points(answer, shots, lenses, number) for answer in placed]
     points = [part for part, _ in parts]
     points += [_swept_points(a, recording[a.pair[0]], shots, number) for a in placed if a.swept is not None]
     empty = _Points(
@@ -100,26 +104,41 @@ def write_colmap_workspace(
     return ColmapCounts(len(joined.xyz), pairs, sum(n for _, n in parts))
 
 
+def _undistort(frame: Frame) -> tuple[np.ndarray, Camera]:
+    """Picture (H, W) or (H, W, 3) uint8 without distortion and without empty pixels, and its camera."""
+    picture = colour_to_uint8(frame.image[0].movedim(0, -1).cpu().numpy())
+    picture = picture[..., 0] if picture.shape[-1] == 1 else picture
+    if frame.camera.distortion is None or not bool(frame.camera.distortion.any()):
+        return picture, cameras.ideal(frame.camera)
+    K, lens = (x[0].double().cpu().numpy() for x in (cameras.to_matrix(frame.camera), frame.camera.distortion))
+    size = picture.shape[1], picture.shape[0]
+    K_new, _ = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)
+    maps = cv2.initUndistortRectifyMap(K, lens, None, K_new, size, cv2.CV_32FC1)
+    undistorted = cv2.remap(picture, *maps, cv2.INTER_LINEAR)
+    return undistorted, cameras.from_matrix(torch.from_numpy(K_new)[None])
+
+
 def _sample_points(
-    answer: PairEstimate, shots: Sequence[ColmapImage], number: Mapping[int, int]
+    answer: PairEstimate, shots: Sequence[ColmapImage], lenses: Sequence[Camera], number: Mapping[int, int]
 ) -> tuple[_Points, int]:
     """Points of the samples of one pair, and the number of observations left out."""
     merged = merge(answer.samples, answer.estimate)
-    reference, other = number[answer.pair[0]], number.get(answer.pair[1], -1)
-    world = _to_world(answer, merged.uv, merged.depth, shots[reference])
-    seen = [answer.samples.uv.isfinite().all(-1)[0], answer.tracks.valid[0] & (other >= 0)]
-    uv = torch.stack((answer.tracks.uv_0[0], answer.tracks.uv_1[0]), 1)
-    distance = torch.stack(
-        [_distance_px(world, uv[:, n], shots[v]) for n, v in enumerate((reference, max(other, 0)))], 1
-    )
-    observed = torch.stack(seen, 1)
+    source = merged.source[0]
+    views = [number[answer.pair[0]], number.get(answer.pair[1], number[answer.pair[0]])]
+    world = _to_world(answer, merged.uv, merged.depth, shots[views[0]])
+    tracked = [torch.ones_like(source, dtype=torch.bool), answer.tracks.valid[0] & (views[0] != views[1])]
+    pixels = [
+        _undistort_pixels(uv, lenses[view], shots[view])
+        for uv, view in zip((merged.uv, answer.tracks.uv_1), views, strict=True)
+    ]
+    uv, observed = torch.stack(pixels, 1), torch.stack(tracked, 1)
+    distance = torch.stack([_distance_px(world, pixels[n], shots[view]) for n, view in enumerate(views)], 1)
     agrees = observed & (distance <= _MAX_REPROJECTION_PX)
     count = agrees.sum(1)
-    source = merged.source[0]
     keep = ((source == Source.SENSOR) & agrees[:, 0]) | ((source == Source.RECOVERED) & (count == 2))
-    error = torch.where(count == 2, (distance * agrees).nan_to_num().sum(1) / 2, _NO_ERROR)
-    seen_by = torch.where(agrees, torch.tensor([reference, other]), -1)
-    outliers = int((observed & ~agrees)[source != Source.NONE].sum())
+    error = torch.where(count == 2, torch.where(agrees, distance, 0.0).sum(1) / 2, _NO_ERROR)
+    seen_by = torch.where(agrees, torch.tensor(views), -1)
+    outliers = int((observed & (distance > _MAX_REPROJECTION_PX))[source != Source.NONE].sum())
     return _Points(*(x[keep] for x in (world, answer.rgb[0], error, seen_by, uv))), outliers
 
 
@@ -134,11 +153,19 @@ def _swept_points(
     uv = map_pixel_centres(frame, answer.swept.hw)[chosen]
     shot = number[answer.pair[0]]
     world = _to_world(answer, uv[None], depth[None, chosen], shots[shot])
-    row, column = (uv.round().long()[:, axis].clamp(0, n - 1) for axis, n in ((1, frame.hw[0]), (0, frame.hw[1])))
+    pixels = _undistort_pixels(uv[None], frame.camera, shots[shot])
+    inside = pixels.isfinite().all(1)
+    column, row = (x.clamp(0, n - 1) for x, n in zip(uv.round().long().unbind(1), frame.hw[::-1], strict=True))
     picture = frame.image[0] if frame.image.is_floating_point() else frame.image[0] / 255
     rgb = picture.expand(3, *frame.hw)[:, row, column].T.to(answer.rgb)
-    pixels = torch.stack((uv, torch.full_like(uv, torch.nan)), 1)
-    return _Points(world, rgb, torch.full((len(uv),), _NO_ERROR), torch.tensor([[shot, -1]]).expand(len(uv), 2), pixels)
+    points = _Points(
+        world,
+        rgb,
+        torch.full((len(uv),), _NO_ERROR, dtype=world.dtype),
+        torch.tensor([[shot, -1]]).expand(len(uv), 2),
+        torch.stack((pixels, torch.full_like(pixels, torch.nan)), 1),
+    )
+    return _Points(*(x[inside] for x in points))
 
 
 def _to_world(answer: PairEstimate, uv: Tensor, depth: Tensor, shot: ColmapImage) -> Tensor:
@@ -146,8 +173,16 @@ def _to_world(answer: PairEstimate, uv: Tensor, depth: Tensor, shot: ColmapImage
     return se3.apply(shot.T_world_from_cam, cameras.unproject(answer.camera, uv, depth).double())[0]
 
 
+def _undistort_pixels(uv: Tensor, lens: Camera, shot: ColmapImage) -> Tensor:
+    """Pixels (1, P, 2) of a frame in its undistorted picture, (P, 2) float64; NaN outside of the picture."""
+    on_rays = cameras.unproject(lens.to(torch.float64), uv.double(), torch.ones_like(uv[..., 0], dtype=torch.float64))
+    pixels = cameras.project(shot.camera.to(torch.float64), on_rays)[0]
+    limit = torch.tensor(shot.hw[::-1], dtype=torch.float64) - 0.5
+    return torch.where(((pixels > -0.5) & (pixels < limit)).all(1, keepdim=True), pixels, torch.nan)
+
+
 def _distance_px(world: Tensor, uv: Tensor, shot: ColmapImage) -> Tensor:
-    """Distance (P,) px of pixels from the projections of points; infinite for those behind the camera."""
+    """Distance (P,) px of pixels from the projections of points; infinite for those behind the camera, NaN outside."""
     camera = se3.apply(se3.invert(shot.T_world_from_cam), world[None])
     distance = (cameras.project(shot.camera.to(torch.float64), camera)[0] - uv).norm(dim=-1)
-    return torch.where(camera[0, :, 2] > 0, distance, torch.inf).nan_to_num(torch.inf)
+    return torch.where((camera[0, :, 2] > 0) | distance.isnan(), distance, torch.inf)

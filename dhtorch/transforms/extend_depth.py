@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -70,6 +70,7 @@ class ExtendDepth(torch.nn.Module):
     Gradient: points, maps, tokens and pose to images, depth and intrinsics, as ``dhtorch.extend`` and
     ``dhtorch.pipeline.completion.complete_depth``; none in a worker, whose samples cannot carry a graph.
     Memory: with ``dense`` that of ``complete_depth``, and about a third of it again for tokens.
+    Compilation: ``torch.compile`` leaves the transform as it is and compiles what is around it in a model.
     Cost: as the method; with ``dense`` the plane sweep dominates. In workers use one thread
     (``worker_init_fn=one_thread``). A process that has used several threads should not be forked: set one thread
     before, or spawn the workers.
@@ -113,6 +114,11 @@ class ExtendDepth(torch.nn.Module):
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
         """Sample or batch -> copy of it with the added columns; None if it is skipped."""
+        if torch.compiler.is_compiling():
+            return _run_uncompiled(ExtendDepth._extend)(self, sample)
+        return self._extend(sample)
+
+    def _extend(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
         if sample is None and self.on_error == "skip":  # a data set may return None for an unreadable item
             return self.left_out({}, SampleError("sample: found None, expected a dict with pictures and depth"))
         check_sample(sample, self.views.image, self.views.intrinsics, self._batched_option)
@@ -128,7 +134,7 @@ class ExtendDepth(torch.nn.Module):
                     raise
                 return self.left_out(sample, error)
             if flagged:
-                warnings.warn(f"flagged: {read.complaint()}", stacklevel=2)
+                warnings.warn(f"flagged: {read.complaint()}", stacklevel=3)
             added = self._compute_columns(read, seed, flagged)
         self._count_problems(added["problem"], read.reference.hw)
         return self._add_columns(sample, added)
@@ -147,7 +153,7 @@ class ExtendDepth(torch.nn.Module):
         if self.on_error == "flag" and hw is None:
             missing = "maps" if self.maps else "tokens: give tokens_hw"
             raise SampleError(f"{error} (and no image gives the size of its {missing})") from error
-        warnings.warn(f"{'skipped' if self.on_error == 'skip' else 'flagged'}: {error}", stacklevel=3)
+        warnings.warn(f"{'skipped' if self.on_error == 'skip' else 'flagged'}: {error}", stacklevel=4)
         self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))
         return None if self.on_error == "skip" or hw is None else self._add_columns(sample, self._blank_columns(hw))
 
@@ -236,6 +242,13 @@ class ExtendDepth(torch.nn.Module):
         # Contiguous copies: a row of a shared table would be sent to the main process with the whole table.
         prefixed = {self.prefix + key: x if self.batched else x[0].contiguous() for key, x in added.items()}
         return {**sample, **prefixed}
+
+
+def _run_uncompiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function as ``torch.compile`` calls it without tracing into it."""
+    return torch.compiler.disable(
+        function, reason="ExtendDepth reads a sample in Python, and its control flow depends on values"
+    )
 
 
 def _problem_codes(read: SampleViews, flagged: bool) -> list[int]:

@@ -527,3 +527,12 @@ def test_one_return_that_no_probe_meets_is_a_return():
     assert 2 * sample_spec._MAX_PROBES < 60 * 80
     assert sample_spec._has_return(depth, sample_spec._probe_depth(depth)).tolist() == [False, True]
     assert sample_spec._has_return(depth[1:] + 1, sample_spec._probe_depth(depth[1:] + 1)).tolist() == [True]
+
+
+def test_torch_compile_leaves_the_transform_as_it_is(sample):
+    """It would trace for many minutes into a sample that Python reads; a model around the transform is compiled."""
+    extend = transform()
+    model = torch.nn.Sequential(extend)
+    plain = extend(sample)
+    for compiled in (torch.compile(extend, backend="eager"), torch.compile(model, backend="eager")):
+        same(compiled(sample), plain)
