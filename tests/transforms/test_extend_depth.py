@@ -535,4 +535,4 @@ def test_torch_compile_leaves_the_transform_as_it_is(sample):
     model = torch.nn.Sequential(extend)
     plain = extend(sample)
     for compiled in (torch.compile(extend, backend="eager"), torch.compile(model, backend="eager")):
-        same(compiled(sample), plain)
+        assert same(compiled(sample), plain)
