@@ -24,6 +24,7 @@ import kornia_adapters
 import learning_tables
 import mutants
 import pose_tables
+import reader_tables
 import speed_tables
 from cells import number, percent, table
 
@@ -599,7 +600,7 @@ TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= (
     {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | beside_kornia.TABLES | pose_tables.TABLES
 )
-TABLES |= kornia_adapters.TABLES | learning_tables.TABLES
+TABLES |= kornia_adapters.TABLES | learning_tables.TABLES | reader_tables.TABLES
 TABLES |= {
     "how good": how_good,
     "sweep": swept,

@@ -109,6 +109,13 @@ def test_nerfstudio_parses_its_folder(enriched, client):
     assert said["frames"] == 4 and max(said["largest_difference"].values()) < 1e-5
 
 
+@pytest.mark.slow
+def test_ray_actors_extend_the_rows(enriched, client):
+    pytest.importorskip("ray.data")
+    said = client("ray_data", enriched / "lerobot")
+    assert said["frames"] == 4 and said["batch"] == [3, 16, 10] and said["tokens_known"] > 5
+
+
 def test_rlds_steps_without_tensorflow(client, tmp_path):
     write_rlds(tmp_path, [[room()[i] for i in range(n, n + 3)] for n in (0, 3)])
     said = client("rlds_steps", tmp_path)

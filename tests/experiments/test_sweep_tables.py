@@ -95,6 +95,18 @@ def test_a_probe_sweep_has_error_ratio_and_interval_in_every_cell(tmp_path: Path
     assert all(float(row["vs_dinov2_low"]) <= float(row["vs_dinov2"]) <= float(row["vs_dinov2_high"]) for row in rows)
 
 
+def test_a_job_without_values_says_why(tmp_path: Path) -> None:
+    results = [probe_result(1, 0), probe_result(2, 0)]
+    for name in results[1]["summary"]:
+        results[1]["summary"][name] = {"value": None, "low": None, "high": None, "n": 0, "unit": "1"}
+    results[1]["rows"] = [{**row, "note": "5 pairs, fewer than 30"} for row in results[1]["rows"]]
+    table = jobs.jobs_table(results)
+    assert table is not None and table.head[-1] == "note" and len(table.rows) == 7
+    assert [row[-1] for row in table.rows] == [""] * 6 + ["room: 5 pairs, fewer than 30"]
+    rows = list(csv.DictReader(jobs.write_jobs_csv(tmp_path / "sweep.csv", results).read_text().splitlines()))
+    assert rows[-1]["note"] == "room: 5 pairs, fewer than 30" and rows[-1]["mse"] == "" and rows[0]["note"] == ""
+
+
 def test_a_result_that_names_no_metric_still_has_a_table() -> None:
     result = {key: value for key, value in probe_result(1, 0).items() if key != "metrics"}
     assert [metric.name for metric in jobs.main_metrics([result])][:2] == ["mse", "vs_context"]

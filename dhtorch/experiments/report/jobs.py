@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -86,24 +87,36 @@ def _entry(result: Result, variant: str, metric: str) -> Mapping[str, Any]:
     return {"value": sum(spent), "unit": "ms"} if spent else {}
 
 
-#: Labels of a job and variant, and the summary entry of each metric.
-_JobRow = tuple[list[str], dict[str, Mapping[str, Any]]]
+@dataclass(frozen=True)
+class JobRow:
+    """Row of a job and variant."""
+
+    labels: list[str]
+    entries: dict[str, Mapping[str, Any]]  # metric → its entry in the summary
+    note: str = ""  # why it has no value, if it has none
 
 
-def job_rows(results: Sequence[Result]) -> tuple[list[str], list[_JobRow]]:
-    """Label columns, and a row of labels and summary entries for every job and variant that has a value."""
+def job_rows(results: Sequence[Result]) -> tuple[list[str], list[JobRow]]:
+    """Label columns, and a row for every job and variant that has a value; a job without values has one with a note."""
     settings, metrics = differing_settings(results), main_metrics(results)
     names = list(dict.fromkeys(name for row in settings for name in row))
     show_method = "method" not in names and any(len(variant_names(result)) > 1 for result in results)
     heads = _column_headings(names, show_method)
-    rows: list[_JobRow] = []
+    rows: list[JobRow] = []
     for result, row in zip(results, settings, strict=True):
         entries = {v: {m.name: _entry(result, v, m.name) for m in metrics} for v in variant_names(result)}
         valued = [v for v, of in entries.items() if any(e.get("value") is not None for e in of.values())]
         for variant in valued or list(entries)[:1]:
             label = {**row, "method": variant} if "method" in row or show_method else row
-            rows.append(([label.get(name, EMPTY_CELL) for name in heads], entries[variant]))
-    return (heads, rows) if heads else (["job"], [([str(k + 1)], of) for k, (_, of) in enumerate(rows)])
+            note = "" if valued else _explain_absence(result)
+            rows.append(JobRow([label.get(name, EMPTY_CELL) for name in heads], entries[variant], note))
+    return (heads, rows) if heads else (["job"], [replace(row, labels=[str(k + 1)]) for k, row in enumerate(rows)])
+
+
+def _explain_absence(result: Result) -> str:
+    """Why a job has no value: the first note of its rows, else the reason of its verdict."""
+    notes = [f"{row['scene']}: {row['note']}" for row in result["rows"] if row.get("note")]
+    return next(iter([*notes, *filter(None, [result.get("why")])]), "")
 
 
 def jobs_table(results: Sequence[Result]) -> ReportTable | None:
@@ -111,21 +124,24 @@ def jobs_table(results: Sequence[Result]) -> ReportTable | None:
     if len(results) < 2:
         return None
     heads, rows = job_rows(results)
-    head, body, best = list(heads), [list(labels) for labels, _ in rows], set()
+    head, body, best = list(heads), [list(row.labels) for row in rows], set()
     for metric in main_metrics(results):
-        values = [of[metric.name].get("value") for _, of in rows]
+        values = [row.entries[metric.name].get("value") for row in rows]
         known = [value for value in values if value is not None]
         if metric.larger_is_better is not None and len(set(known)) > 1:
             best_value = max(known) if metric.larger_is_better else min(known)
             best |= {(n, len(head)) for n, value in enumerate(values) if value == best_value}
-        head.append(_metric_heading(metric, [of[metric.name] for _, of in rows]))
+        head.append(_metric_heading(metric, [row.entries[metric.name] for row in rows]))
         for cells, value in zip(body, values, strict=True):
             cells.append(_format_ms(value) if metric.name == "ms" else format_value(value, metric.name))
         if _has_interval(metric, rows):
             head.append(INTERVAL_LABEL)
-            for cells, (_, of) in zip(body, rows, strict=True):
-                entry = of[metric.name]
+            for cells, row in zip(body, rows, strict=True):
+                entry = row.entries[metric.name]
                 cells.append(format_metric_interval(entry.get("low"), entry.get("high"), metric.name) or EMPTY_CELL)
+    if any(row.note for row in rows):
+        head.append("note")
+        body = [[*cells, row.note] for cells, row in zip(body, rows, strict=True)]
     return ReportTable(
         format_count(len(results), "job"),
         head,
@@ -139,7 +155,8 @@ def jobs_table(results: Sequence[Result]) -> ReportTable | None:
 def write_jobs_csv(path: Path, results: Sequence[Result]) -> Path:
     """Write the table of jobs as CSV with all digits: fractions from 0 to 1, empty cells without a value.
 
-    A metric with an interval is followed by its ends, ``NAME_low`` and ``NAME_high``.
+    A metric with an interval is followed by its ends, ``NAME_low`` and ``NAME_high``. Where a job has no value, a last
+    column ``note`` says why.
 
     Raises:
         OSError: the file cannot be written.
@@ -153,16 +170,18 @@ def write_jobs_csv(path: Path, results: Sequence[Result]) -> Path:
     ]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*heads, *(heading for heading, _, _ in columns)])
-    for labels, of in rows:
-        numbers = [of[name].get(field) for _, name, field in columns]
-        writer.writerow([*labels, *("" if number is None else repr(number) for number in numbers)])
+    noted = any(row.note for row in rows)
+    writer.writerow([*heads, *(heading for heading, _, _ in columns), *(["note"] if noted else [])])
+    for row in rows:
+        numbers = [row.entries[name].get(field) for _, name, field in columns]
+        cells = ["" if number is None else repr(number) for number in numbers]
+        writer.writerow([*row.labels, *cells, *([row.note] if noted else [])])
     return storage.replace_file(path, text.getvalue().encode())
 
 
-def _has_interval(metric: MainMetric, rows: Sequence[_JobRow]) -> bool:
+def _has_interval(metric: MainMetric, rows: Sequence[JobRow]) -> bool:
     """Whether the intervals of a metric are shown: it is compared with them, and a row has one."""
-    return metric.with_interval and any(of[metric.name].get("low") is not None for _, of in rows)
+    return metric.with_interval and any(row.entries[metric.name].get("low") is not None for row in rows)
 
 
 def _metric_heading(metric: MainMetric, entries: Sequence[Mapping[str, Any]]) -> str:
