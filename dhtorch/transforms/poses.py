@@ -144,7 +144,7 @@ def warn_refuted_poses(fits: Sequence[PoseFit], paired: Tensor, matched: Tensor,
     if bool(refuted.any()):
         conventions_seen = [conventions.CONVENTIONS[i] for i in sorted(set(matched[refuted].tolist())) if i]
         guess = f"; looks like {' or '.join(conventions_seen)}" if conventions_seen else ""
-        warnings.warn(f"{name}: the near returns contradict the pose{guess}", stacklevel=4)
+        warnings.warn(f"{name}: the near returns contradict the pose{guess}", stacklevel=5)
 
 
 def _read_matrix(
