@@ -46,6 +46,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         *("data=rlds", "data.fov=69", "data.rate_hz=5", "data.split=train"),
         *("data.camera=observation/image_0", "data.episode=[0,1]"),
     ),
+    "robot": ("written", "data=lerobot", DENSE),
     "two-camera robot": ("written", "data=lerobot", DENSE),
     "RLDS with depth": ("written", "data=rlds", "data.rate_hz=10", DENSE),
 }

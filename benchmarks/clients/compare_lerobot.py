@@ -19,7 +19,8 @@ def main(root: str) -> None:
     tables = sorted((Path(root) / "data").rglob("*.parquet"))
     rows = [row for table in tables for row in parquet.read_table(table).to_pylist()]
     assert len(rows) == len(data), f"{len(data)} frames, the tables have {len(rows)}"
-    features, known = data.meta.features, set(getattr(data.meta, "depth_keys", []) or [])
+    features = data.meta.features
+    known = {k for k in getattr(data.meta, "depth_keys", []) if features[k]["dtype"] == "image"}  # given in mm
     maps = [k for k, f in features.items() if "quantiser_step_m" in (f.get("info") or {})]
     numbers = [k for k in features if k.endswith((".intrinsics", ".T_world_from_cam")) or k == "action"]
     worst = dict.fromkeys(("depth", "sigma", "numbers", "statistics"), 0.0)
@@ -31,7 +32,8 @@ def main(root: str) -> None:
         for key in numbers:
             worst["numbers"] = max(worst["numbers"], float(np.abs(np.float32(row[key]) - item[key].numpy()).max()))
         for key in maps:
-            stored = np.array(Image.open(io.BytesIO(row[key]["bytes"])))
+            cell = row[key]  # numbers, or a picture
+            stored = np.array(Image.open(io.BytesIO(cell["bytes"])) if isinstance(cell, dict) else cell).squeeze()
             z = item[key].numpy().squeeze() * (1e-3 if key in known else 1.0)
             assert np.array_equal(z > 0, stored > 0), (i, key)
             name = "sigma" if "_depth_sigma" in key else "depth"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,22 +34,22 @@ def hand(frame: Frame) -> np.ndarray:
     return np.append(_solve_joints(np.linalg.inv(BASE) @ T), 0.02 + 0.01 * np.sin(40 * T[2, 3]))
 
 
-def write_robot(root: Path) -> None:
-    """A LeRobot v2.1 set of two cameras with depth, a state of 8 numbers, and as action the state a frame later."""
-    cameras = seen()
-    for key, episodes in zip(CAMERAS, cameras, strict=True):
-        at = root if key == CAMERAS[0] else root.with_name(f"{root.name}-{key}")
+def write_robot(root: Path, keys: Sequence[str] = CAMERAS) -> None:
+    """A LeRobot v2.1 set of cameras with depth, a state of 8 numbers, and as action the state a frame later."""
+    cameras = seen()[: len(keys)]
+    for key, episodes in zip(keys, cameras, strict=True):
+        at = root if key == keys[0] else root.with_name(f"{root.name}-{key}")
         write_lerobot(at, episodes, version=2, camera=key, image="image", depth="tiff", fps=30, poses=False)
     number = {"dtype": "float32", "shape": [8], "names": [f"joint_{i}" for i in range(7)] + ["gripper"]}
     info, other = (folder / "meta" / "info.json" for folder in (root, at))
     metadata, more = json.loads(info.read_text()), json.loads(other.read_text())["features"]
-    metadata["features"] |= {k: v for k, v in more.items() if k.startswith(CAMERAS[1])}
+    metadata["features"] |= {k: v for k, v in more.items() if k.startswith(keys[-1])}
     metadata["features"] |= {"observation.state": number, "action": number}
     info.write_text(json.dumps(metadata))
     tables = [sorted((folder / "data").rglob("*.parquet")) for folder in (root, at)]
     for file, beside, episode in zip(*tables, cameras[0], strict=True):
         table, right = parquet.read_table(file), parquet.read_table(beside)
-        for name in (name for name in right.column_names if name.startswith(CAMERAS[1])):
+        for name in (name for name in right.column_names if name not in table.column_names):
             table = table.append_column(name, right[name])
         states = np.stack([hand(frame) for frame in episode]).astype(np.float32)
         nexts = np.concatenate([states[1:], states[-1:]])
@@ -63,4 +64,8 @@ def write_steps(root: Path) -> None:
 
 
 #: Name of such a set → what writes it.
-WRITTEN = {"two-camera robot": write_robot, "RLDS with depth": write_steps}
+WRITTEN = {
+    "robot": lambda root: write_robot(root, CAMERAS[:1]),
+    "two-camera robot": write_robot,
+    "RLDS with depth": write_steps,
+}

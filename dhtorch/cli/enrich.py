@@ -22,7 +22,7 @@ from dhtorch.data.io.decode import import_optional
 from dhtorch.data.rig import Rig
 from dhtorch.data.scene import Scene, scenes_of
 from dhtorch.extract import columns, cut, engines, plan, shards
-from dhtorch.extract.enriched import NO_ANSWER_REASONS, DatasetCamera, MapRowDataset, camera_key, map_columns
+from dhtorch.extract.enriched import MAP_FILES, NO_ANSWER_REASONS, DatasetCamera, MapRowDataset, camera_key, map_columns
 from dhtorch.extract.nerf_target import NerfstudioTarget
 from dhtorch.extract.origin import DEFAULT_FPS, DatasetSource, LeRobotSource, frame_rate, has_frame_rate
 from dhtorch.extract.robot_target import LeRobotTarget
@@ -46,7 +46,7 @@ _OUTPUT_FORMATS: dict[str, int | None] = {"lerobot": 3, "v3.0": 3, "lerobot_v2.1
 
 #: Options that determine what is written; they enter the key.
 _KEY_OPTIONS = ("data", "method", "seed", "format", "dense", "causal", "gap", "cameras", "pose", "pose_sigma", "frames",
-         "step", "fps", "task", "on_error")  # fmt: skip
+         "columns", "maps", "step", "fps", "task", "on_error")  # fmt: skip
 
 #: File of the shared metadata.
 _METADATA_FILE = "dhtorch.json"
@@ -62,6 +62,10 @@ _DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 #: Values of ``pose``: relative pose from near returns, from the device, or from the device as a start value.
 _POSE_SOURCES = ("near", "device", "start")
+
+
+#: Values of ``maps``: maps in LeRobot tables are arrays of numbers, or images.
+_MAP_FORMS = ("numbers", "images")
 
 
 @dataclass(frozen=True)
@@ -269,6 +273,8 @@ def _open_target(
         origin=origin,
         numbers=[whole.episodes[group[0]] for group in of_episode],
         step=settings["step"],
+        maps=settings["columns"],
+        as_images=settings["maps"] == "images",
         fps=settings["fps"] or fps,
         task=settings["task"],
         key=key,
@@ -423,10 +429,14 @@ def _check_options(settings: Mapping[str, Any]) -> None:
         "engine": engines.ENGINES,
         "on_error": ("raise", "flag"),
         "pose": _POSE_SOURCES,
+        "maps": _MAP_FORMS,
     }
     for name, choices in choices_of.items():
         if settings[name] not in choices:
             raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(choices)}")
+    wanted = settings["columns"]
+    if not isinstance(wanted, Sequence) or isinstance(wanted, str) or not {"depth"} <= {*wanted} <= {*MAP_FILES}:
+        raise ValueError(f"columns: found {wanted!r}, expected depth and any of {', '.join(MAP_FILES)}, as a list")
     for name in ("causal", "report", "cameras"):
         if not isinstance(settings[name], bool):
             raise ValueError(f"{name}: found {settings[name]!r}, expected true or false")

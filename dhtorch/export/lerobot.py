@@ -1,8 +1,10 @@
 """Writer of LeRobot data sets v3.0 and v2.1: features, table schemas, statistics and the files below ``meta/``.
 
-A depth map is an image in the table: float32 TIFF in metres, 0 = no depth, as LeRobot itself stores depth images
-(``is_depth_map`` and ``depth_unit`` in the feature's info). LeRobot's other form, 12-bit video, has no code for *no
-return*. Tables hold one episode each, in both versions; ``meta/info.json`` is written last.
+A map (depth, its standard deviation, codes) is either an array (1, h, w) of numbers in the table or an image in it, as
+float32 TIFF in metres or 8-bit PNG; 0 = no depth. LeRobot's policies take every image and video feature as a picture of
+three channels, whatever ``is_depth_map`` states, so that only sets whose maps are numbers train without further
+options. LeRobot's other form of depth, 12-bit video, has no code for *no return*. Tables hold one episode each, in both
+versions; ``meta/info.json`` is written last.
 """
 
 from __future__ import annotations
@@ -26,6 +28,17 @@ _CODEBASE_VERSIONS = {3: "v3.0", 2: "v2.1"}
 FILES_PER_CHUNK = 1000
 
 _HWC_NAMES = ["height", "width", "channels"]
+_CHW_NAMES = ["channels", "height", "width"]
+
+#: Bins of a :class:`LogHistogram` per factor of two: a bin is 2.2 % wide. Source: derived: 2^(1/32).
+_BINS_PER_OCTAVE = 32
+
+#: Octaves of a :class:`LogHistogram`, powers of two of a metre: 0.06 mm to 4 km. Source: derived: an eighth of the
+#: default step of depth (2^-13 m) and a half of it, to beyond any range sensor.
+_OCTAVES = (-14, 12)
+
+#: Fractions of answered values in the statistics of a map, by LeRobot's names. Source: names of LeRobot 0.4's stats.
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _PATH_TEMPLATES = {
     3: ("data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"),
@@ -101,6 +114,66 @@ class FeatureMoments(NamedTuple):
         return {**{k: x.reshape(shape).tolist() for k, x in values.items()}, "count": [frames]}
 
 
+class LogHistogram(NamedTuple):
+    """Counts of positive numbers in bins of equal ratio, of which robust ranges are computed; sums combine sets."""
+
+    counts: np.ndarray  # (N_BINS,) int64
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> LogHistogram:
+        """Histogram of the numbers above 0; the others are left out."""
+        x = np.asarray(values, np.float64)
+        place = np.floor((np.log2(x[np.isfinite(x) & (x > 0)]) - _OCTAVES[0]) * _BINS_PER_OCTAVE)
+        return cls(np.bincount(place.clip(0, N_BINS - 1).astype(np.int64), minlength=N_BINS))
+
+    @classmethod
+    def parse(cls, packed: Sequence[Sequence[int]]) -> LogHistogram:
+        """Inverse of :meth:`pack`."""
+        counts = np.zeros(N_BINS, np.int64)
+        for place, count in packed:
+            counts[place] = count
+        return cls(counts)
+
+    def pack(self) -> list[list[int]]:
+        """Lists (bin, count) of the bins that are not empty, for JSON."""
+        return [[int(place), int(self.counts[place])] for place in np.flatnonzero(self.counts)]
+
+    def __add__(self, other: LogHistogram) -> LogHistogram:  # type: ignore[override]
+        """Histogram of both sets of numbers."""
+        return LogHistogram(self.counts + other.counts)
+
+    def quantile(self, fraction: float) -> float:
+        """Value below which a fraction of the numbers is, exact to a bin's width; NaN = of no numbers."""
+        sums = np.cumsum(self.counts)
+        if not sums[-1]:
+            return float("nan")
+        target = fraction * sums[-1]
+        place = int(np.searchsorted(sums, target))
+        inside = (target - (sums[place] - self.counts[place])) / max(self.counts[place], 1)
+        return float(2.0 ** (_OCTAVES[0] + (place + inside) / _BINS_PER_OCTAVE))
+
+    def stats(self, moments: FeatureMoments, frames: int, shape: Sequence[int]) -> dict[str, Any]:
+        """The entry of ``meta/stats`` of a map: over its answered pixels, with the 1 % and 99 % quantiles as range.
+
+        A few wrong depths decide over the extremes, and thereby over a policy's normalisation. A map without any
+        answer has the entry that changes nothing: mean 0, standard deviation 1, range 0 to 1.
+        """
+        if not self.counts.any():
+            values = {"min": 0.0, "max": 1.0, "mean": 0.0, "std": 1.0} | dict.fromkeys(_QUANTILES, 0.0)
+            values["q99"] = 1.0
+        else:
+            values = {name: self.quantile(fraction) for name, fraction in _QUANTILES.items()}
+            low, high = float(moments.low[0]), float(moments.high[0])
+            values = {name: min(max(value, low), high) for name, value in values.items()}
+            std = float(np.sqrt(moments.spread[0] / moments.n[0]))
+            values |= {"min": values["q01"], "max": values["q99"], "mean": float(moments.mean[0]), "std": std}
+        return {**{k: np.full(shape, x).tolist() for k, x in values.items()}, "count": [frames]}
+
+
+#: Bins of a :class:`LogHistogram`.
+N_BINS = (_OCTAVES[1] - _OCTAVES[0]) * _BINS_PER_OCTAVE
+
+
 # -------------------------------------------------------------------------------------------------------- features
 
 
@@ -114,9 +187,19 @@ def image_feature(hw: Sequence[int], channels: int = 3, **info: Any) -> FeatureS
     return {"dtype": "image", "shape": [*hw, channels], "names": list(_HWC_NAMES), **({"info": info} if info else {})}
 
 
-def depth_feature(hw: Sequence[int], step: float) -> FeatureSpec:
-    """Specification of depth maps in metres (see the module), whose values are multiples of ``step`` m."""
-    return image_feature(hw, 1, is_depth_map=True, depth_unit="m", quantiser_step_m=step, no_depth=0.0)
+def map_feature(hw: Sequence[int], kind: str, **info: Any) -> FeatureSpec:
+    """Specification of a map (1, h, w) of numbers in the table."""
+    return {"dtype": kind, "shape": [1, *hw], "names": list(_CHW_NAMES), "info": info}
+
+
+def depth_feature(hw: Sequence[int], step: float, *, as_image: bool) -> FeatureSpec:
+    """Specification of depth maps in metres (see the module), whose values are multiples of ``step`` m.
+
+    An array of numbers has no ``depth_unit``: LeRobot 0.6 would convert the statistics of the feature into its output
+    unit, and not the numbers.
+    """
+    info = {"is_depth_map": True, "quantiser_step_m": step, "no_depth": 0.0}
+    return image_feature(hw, 1, depth_unit="m", **info) if as_image else map_feature(hw, "float32", unit="m", **info)
 
 
 def make_arrow_schema(
@@ -135,9 +218,32 @@ def make_arrow_schema(
             kind = cell
         elif kind is None:
             kind = pyarrow.from_numpy_dtype(np.dtype(feature["dtype"]))
-            kind = kind if list(feature["shape"]) == [1] else pyarrow.list_(kind, int(np.prod(feature["shape"])))
+            if len(feature["shape"]) > 1:
+                kind = nested_list_type(kind, len(feature["shape"]))
+            elif list(feature["shape"]) != [1]:
+                kind = pyarrow.list_(kind, feature["shape"][0])
         fields.append(pyarrow.field(key, kind))
     return pyarrow.schema(fields, metadata={**dict(metadata), b"huggingface": _huggingface_metadata(features)})
+
+
+def nested_list_type(kind: Any, depth: int) -> Any:
+    """Arrow type of lists in lists, ``depth`` of them, as the library ``datasets`` stores arrays."""
+    import pyarrow  # noqa: PLC0415
+
+    for _ in range(depth):
+        kind = pyarrow.list_(kind)
+    return kind
+
+
+def nested_lists(values: np.ndarray) -> Any:
+    """Array (n, …) -> Arrow column of n nested lists."""
+    import pyarrow  # noqa: PLC0415
+
+    column = pyarrow.array(np.ascontiguousarray(values).reshape(-1))
+    for axis in range(values.ndim - 1, 0, -1):
+        offsets = np.arange(int(np.prod(values.shape[:axis])) + 1, dtype=np.int64) * values.shape[axis]
+        column = pyarrow.ListArray.from_arrays(pyarrow.array(offsets.astype(np.int32)), column)
+    return column
 
 
 def _huggingface_metadata(features: Mapping[str, FeatureSpec]) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -11,10 +12,12 @@ import torch
 from torch import Tensor
 
 from dhtorch.codes import Gate, PoseCode, Source, names
+from dhtorch.data.codecs.tiff import decode_tiff
+from dhtorch.data.io.decode import decode_image
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
 from dhtorch.export import encode_png
-from dhtorch.export.lerobot import FeatureMoments
+from dhtorch.export.lerobot import N_BINS, FeatureMoments, LogHistogram
 from dhtorch.export.tiff import encode_float_tiff
 from dhtorch.extract.columns import KEY_COLUMNS, Column, Row, stored_column
 from dhtorch.extract.dataset import OpenRecording, RowDataset, try_read_frame
@@ -28,7 +31,7 @@ from dhtorch.transforms import SampleError, schema
 MAP_STEPS: Final = {"sigma": 8}
 
 #: File type of a map -> numpy dtype of its pixels.
-_MAP_DTYPES: Final = {"tiff": np.float32, "png": np.uint8}
+MAP_DTYPES: Final = {"tiff": np.float32, "png": np.uint8}
 
 #: Maps of the transform that an enriched data set stores, one file per image, by name.
 MAP_FILES: Final = {c.key.removesuffix("_map"): c for c in schema.COLUMNS if c.enrich in ("tiff", "png")}
@@ -122,6 +125,7 @@ def map_columns(pictures: bool, n: int = 0) -> dict[str, Column]:
         "no_answer": Column(whole, (len(NO_ANSWER_REASONS),), "1", "unanswered ones by NO_ANSWER_REASONS"),
         "refuted": Column(whole, (), "code", "0 = no pose is, else 1 + which of CONVENTIONS it looks like"),
         "moments": Column(f, _MOMENTS_SHAPE, "m, 1", "of depth, sigma, red, green, blue"),
+        "ranges": Column("int32", (2, N_BINS), "1", "answered pixels by depth and by sigma, see LogHistogram"),
         "problem": Column("uint8", (), "code", "what was wrong with the frame"),
     }
 
@@ -180,6 +184,7 @@ class MapRowDataset(RowDataset):
             "no_answer": np.bincount(reason[source == Source.NONE], minlength=len(NO_ANSWER_REASONS)),
             "refuted": _refuted_code(added),
             "moments": _compute_moments(maps["depth"], maps["sigma"], image),
+            "ranges": np.stack([LogHistogram.of(maps[name]).counts for name in ("depth", "sigma")]).astype(np.int32),
             "problem": added["problem"].numpy(),
         }
         return columns if "picture" not in self.wanted else {**columns, "picture": encode_png(image)}
@@ -195,7 +200,15 @@ def to_rgb_uint8(frame: Frame) -> np.ndarray:
 
 def blank_maps(view: DatasetCamera) -> dict[str, bytes]:
     """Maps of an unreadable frame as files: no depth anywhere."""
-    return {name: _encode_map(np.zeros(view.map_hw, _MAP_DTYPES[str(c.enrich)]), name) for name, c in MAP_FILES.items()}
+    return {name: _encode_map(np.zeros(view.map_hw, MAP_DTYPES[str(c.enrich)]), name) for name, c in MAP_FILES.items()}
+
+
+def decode_map(content: bytes, name: str, hw: tuple[int, int]) -> np.ndarray:
+    """Inverse of the encoding of a map in a shard -> (h, w)."""
+    place = Path(f"shard {name}")
+    if MAP_FILES[name].enrich == "tiff":
+        return decode_tiff(content, place, hw)
+    return decode_image(content, place, hw)[0]
 
 
 def _encode_map(field: np.ndarray, name: str) -> bytes:
@@ -204,7 +217,7 @@ def _encode_map(field: np.ndarray, name: str) -> bytes:
 
 def _extract_maps(added: Mapping[str, Tensor], view: DatasetCamera) -> dict[str, np.ndarray]:
     """Columns of the transform -> maps (h, w) by name, and ``gate``; without dense maps only sampled pixels are set."""
-    kinds: dict[str, Any] = {name: _MAP_DTYPES[str(c.enrich)] for name, c in MAP_FILES.items()} | {"gate": np.int64}
+    kinds: dict[str, Any] = {name: MAP_DTYPES[str(c.enrich)] for name, c in MAP_FILES.items()} | {"gate": np.int64}
     if "depth_map" in added:
         return {name: added[f"{name}_map"].numpy().astype(kind) for name, kind in kinds.items()}
     h, w = view.map_hw

@@ -31,6 +31,7 @@ _REWRITTEN_META_FILES = (
     "episodes.jsonl",
     "episodes_stats.jsonl",
     "intrinsics.json",
+    "source_features.json",
 )
 
 
@@ -64,6 +65,14 @@ class DatasetSource(Protocol):
     @property
     def more(self) -> dict[str, Path]:
         """Other files of the data set: relative name → file."""
+
+    @property
+    def root(self) -> Path | None:
+        """Folder of the files that image cells name; None = cells hold images."""
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """Statistics by feature, as in ``meta/stats.json``; empty if it has none."""
 
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
         """Rows of episode ``i`` in order, as Arrow tables of few rows; new task texts are appended to ``tasks``."""
@@ -111,6 +120,18 @@ class LeRobotSource:
     def fps(self) -> float:
         """Rows per second."""
         return self.meta.fps
+
+    @property
+    def root(self) -> Path:
+        """Folder of the data set."""
+        return self.meta.root
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """Statistics in ``meta/stats.json``, where it is."""
+        file = self.meta.root / "meta" / "stats.json"
+        content = files.read_json(file) if file.is_file() and self._is_inside(file) else {}
+        return content if isinstance(content, dict) else {}
 
     @property
     def robot(self) -> str:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from functools import reduce
+from operator import add
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,8 @@ import numpy as np
 from dhtorch.codes import names
 from dhtorch.data.io.decode import import_optional
 from dhtorch.export import lerobot
-from dhtorch.export.lerobot import FeatureMoments, FeatureSpec
+from dhtorch.export.lerobot import FeatureMoments, FeatureSpec, LogHistogram
+from dhtorch.extract import pixel_columns
 from dhtorch.extract.columns import Column
 from dhtorch.extract.enriched import (
     MAP_FILES,
@@ -21,6 +24,7 @@ from dhtorch.extract.enriched import (
     NUMBER_COLUMNS,
     DatasetCamera,
     blank_maps,
+    decode_map,
     number_column,
 )
 from dhtorch.extract.instants import PeekableRows, iter_groups, iter_instants, iter_rows
@@ -45,6 +49,9 @@ class LeRobotTarget:
         origin: source data set; None = recordings, whose images are in the shards.
         numbers: episode numbers in the source.
         step: m, quantisation step of the depth maps.
+        maps: names of the maps to write, see :data:`MAP_FILES`.
+        as_images: maps are images in the tables; else numbers, and one-channel images of the source, which LeRobot's
+            policies take as pictures of three channels, become numbers, too.
         fps: of a recording.
         task: of a recording.
         key: of the settings and data, stored in every table.
@@ -65,6 +72,8 @@ class LeRobotTarget:
         origin: DatasetSource | None,
         numbers: Sequence[int],
         step: float,
+        maps: Sequence[str],
+        as_images: bool,
         fps: float,
         task: str | None,
         key: str,
@@ -75,7 +84,10 @@ class LeRobotTarget:
         self.origin, self.numbers, self.step, self.fps = origin, numbers, step, fps
         self.tasks = origin.tasks if origin is not None else (task or _DEFAULT_TASK,)
         self.key, self.n, self.cut = key, n, cut
+        self.maps, self.as_images = tuple(maps), as_images
         self.source_features: dict[str, FeatureSpec] = {} if origin is None else origin.features
+        self.unlisted = [] if as_images else pixel_columns.find_one_channel(self.source_features, "video", views)
+        self.pixels = {} if origin is None or as_images else self._pixel_features(origin)
         self.keys = {view.key: self._keys(view) for view in views.values()}
         self.renumbered = cut or list(numbers) != list(range(len(numbers)))
         for name in (*self.source_features, *views):
@@ -86,6 +98,19 @@ class LeRobotTarget:
 
     # -------------------------------------------------------------------------------------------------- the columns
 
+    def _pixel_features(self, origin: DatasetSource) -> dict[str, FeatureSpec]:
+        """Image columns of the source that become numbers -> their features, by the type of the first image."""
+        keys = pixel_columns.find_one_channel(self.source_features, "image", self.views)
+        if not keys:
+            return {}
+        first = next(iter(origin.batches(0, [])))
+        return {
+            key: pixel_columns.read_pixel_feature(
+                key, self.source_features[key], first.column(key)[0].as_py(), origin.root
+            )
+            for key in keys
+        }
+
     def _keys(self, view: DatasetCamera) -> dict[str, str]:
         """Camera -> added columns: kind → column name."""
         depth = f"{view.key}_depth"
@@ -93,6 +118,7 @@ class LeRobotTarget:
         columns = {
             name: f"{view.key}_dhtorch_{name}" if c.enrich == "png" else depth if name == "depth" else f"{depth}_{name}"
             for name, c in MAP_FILES.items()
+            if name in self.maps
         }
         columns |= {key: f"observation.{view.name}.dhtorch_{key}" for key in NUMBER_COLUMNS}
         columns["K"] = f"observation.{view.name}.intrinsics"
@@ -123,13 +149,17 @@ class LeRobotTarget:
     def _map_feature(self, name: str, view: DatasetCamera) -> FeatureSpec:
         spec = MAP_FILES[name]
         if spec.enrich == "tiff":
-            return lerobot.depth_feature(view.map_hw, self.step / MAP_STEPS.get(name, 1))
+            step = self.step / MAP_STEPS.get(name, 1)
+            return lerobot.depth_feature(view.map_hw, step, as_image=self.as_images)
         table = {} if spec.codes is None else names(spec.codes)
-        return lerobot.image_feature(view.map_hw, 1, codes={str(k): name.lower() for k, name in table.items()})
+        codes = {str(k): name.lower() for k, name in table.items()}
+        if self.as_images:
+            return lerobot.image_feature(view.map_hw, 1, codes=codes)
+        return lerobot.map_feature(view.map_hw, "uint8", codes=codes)
 
     def features(self, columns: Iterable[str]) -> dict[str, FeatureSpec]:
         """LeRobot features of all columns of the tables, and of the videos."""
-        features = dict(self.source_features)
+        features = {key: self.pixels.get(key, f) for key, f in self.source_features.items() if key not in self.unlisted}
         for name in columns:
             if name not in features and name not in self.added():
                 is_integer = name.removeprefix("source.") != "timestamp" and name != "observation.time"
@@ -172,7 +202,7 @@ class LeRobotTarget:
                 writer.write_table(table.select(layout.names).cast(layout))
                 length += table.num_rows
                 task_indices |= dict.fromkeys(table.column("task_index").to_pylist())
-                _add_moments(moments, table)
+                self._add_moments(moments, table)
             if writer is None:
                 raise ValueError(f"episode {self.numbers[k]}: found no frame that can be read, expected one")
             task_texts = [tasks[i] for i in task_indices if i is not None and 0 <= i < len(tasks)]
@@ -202,7 +232,7 @@ class LeRobotTarget:
             return
         done = 0
         for part in self.origin.batches(k, tasks):
-            table, n = part, part.num_rows
+            table, n = self._unpack_images(part), part.num_rows
             numbers = part.column("frame_index").to_pylist()
             for key, rows in rows_by_camera.items():
                 camera_rows = [rows.take(i) for i in numbers]
@@ -212,6 +242,15 @@ class LeRobotTarget:
                     table = table.append_column(column, values)
             yield self._renumber(table, k, start + done)
             done += n
+
+    def _unpack_images(self, table: Any) -> Any:
+        """Rows of the source, with its images of one channel as numbers."""
+        for key, feature in self.pixels.items():
+            cells = table.column(key).to_pylist()
+            root = None if self.origin is None else self.origin.root
+            pixels = pixel_columns.decode_cells(key, self.source_features[key], cells, root, feature["dtype"])
+            table = table.set_column(table.column_names.index(key), key, pixels)
+        return table
 
     def _recording_rows(
         self, k: int, start: int, rows_by_camera: Mapping[str, PeekableRows], tallies: Mapping[str, MapCounts]
@@ -259,6 +298,10 @@ class LeRobotTarget:
             if kind in blanks:
                 suffix = MAP_FILES[kind].enrich
                 files = [row[kind] if row is not None and row["depth"] else blanks[kind] for row in camera_rows]
+                if not self.as_images:
+                    maps = [decode_map(file, kind, self.views[key].map_hw) for file in files]
+                    cells[column] = lerobot.nested_lists(np.stack(maps)[:, None])
+                    continue
                 values = [{"bytes": file, "path": f"frame-{done + i:06d}.{suffix}"} for i, file in enumerate(files)]
             elif kind in NUMBER_COLUMNS:
                 stored = number_column(NUMBER_COLUMNS[kind], self.n)
@@ -297,10 +340,13 @@ class LeRobotTarget:
         tallies: Mapping[str, MapCounts],
     ) -> Row:
         """Summary of a complete episode."""
+        ranges: dict[str, LogHistogram] = {}
         for key, tally in tallies.items():
-            maps = tally.of_maps()
-            if maps is not None:
-                moments |= {self.keys[key]["depth"]: maps[0], self.keys[key]["sigma"]: maps[1], key: maps[2]}
+            image = tally.image_moments()
+            moments |= {} if image is None else {key: image}
+            for name, (map_moments, histogram) in tally.map_stats().items():
+                if name in self.keys[key]:
+                    moments[self.keys[key][name]], ranges[self.keys[key][name]] = map_moments, histogram
         episode_tasks = None if self.origin is None else self.origin.words(k)
         summary: Row = storage.to_strict_json(
             {
@@ -313,7 +359,8 @@ class LeRobotTarget:
                 "cameras": {self.views[key].name: tally.summary() for key, tally in tallies.items()},
             }
         )
-        return summary | {"moments": {name: each.pack() for name, each in moments.items()}}
+        packed = {name: each.pack() for name, each in ranges.items()}
+        return summary | {"moments": {name: each.pack() for name, each in moments.items()}, "ranges": packed}
 
     def _copy_videos(self, k: int, length: int) -> None:
         """Copy the videos of an episode unchanged."""
@@ -334,7 +381,7 @@ class LeRobotTarget:
 
     def planned_files(self, missing: Sequence[int]) -> list[Path]:
         """As :meth:`DatasetTarget.planned_files`."""
-        names = (*lerobot.META_FILES[self.version], "source_episodes.jsonl", "intrinsics.json")
+        names = (*lerobot.META_FILES[self.version], "source_episodes.jsonl", "source_features.json", "intrinsics.json")
         return [*(self.file(k) for k in missing), *(self.root / "meta" / name for name in names)]
 
     def finish(self, owns: Sequence[Row]) -> None:
@@ -343,6 +390,9 @@ class LeRobotTarget:
         features = self.features(parquet.read_schema(self.file(0)).names)
         self._write_lenses()
         self._write_about(owns)
+        if self.unlisted:
+            unlisted = {key: self.source_features[key] for key in self.unlisted}
+            storage.write_json(self.root / "meta" / "source_features.json", unlisted)
         tasks = self._tasks(owns)
         for name, file in ({} if self.origin is None else self.origin.more).items():
             storage.copy_file(file, self.root / name)
@@ -373,29 +423,65 @@ class LeRobotTarget:
     def _stats(self, owns: Sequence[Row], features: Mapping[str, FeatureSpec]) -> dict[str, Any]:
         """Summaries and features -> statistics of columns of numbers, images and maps.
 
+        LeRobot's training ends in an error where an image or a video has no statistics: without pictures that could be
+        read, those of the source are kept, else they change nothing (mean 0, standard deviation 1).
         LeRobot for v2.1 rejects a data set unless every feature with "image" in its name has statistics of three
         channels: those of a map are repeated three times, those of numbers with such a name are left out.
         """
         frames = sum(summary["length"] for summary in owns)
+        maps = {self.keys[key][name] for key in self.views for name in ("depth", "sigma") if name in self.keys[key]}
         stats = {}
         for name, feature in features.items():
-            all_moments = [
-                FeatureMoments.parse(summary["moments"][name]) for summary in owns if name in summary["moments"]
-            ]
-            if not all_moments:
-                continue
-            total = all_moments[0]
-            for moments in all_moments[1:]:
-                total = total + moments
-            visual = feature["dtype"] in ("image", "video")
-            entry = total.stats(frames, (len(total.n), 1, 1) if visual else (len(total.n),))
+            is_map, is_picture = name in maps, feature["dtype"] in ("image", "video")
+            packed = [summary["moments"][name] for summary in owns if name in summary["moments"]]
+            total = reduce(add, map(FeatureMoments.parse, packed)) if packed else None
+            entry = None
+            if is_map:
+                ranges = [summary["ranges"][name] for summary in owns if name in summary["ranges"]]
+                histogram = reduce(add, map(LogHistogram.parse, ranges), LogHistogram.parse([]))
+                entry = histogram.stats(total or FeatureMoments.of(np.zeros((0, 1))), frames, (1, 1, 1))
+            elif total is not None:
+                entry = total.stats(frames, (len(total.n), 1, 1) if is_picture else (len(total.n),))
+            if entry is None and is_picture:
+                entry = self._source_stats(name, pixel_columns.count_channels(name, feature), frames)
             if self.version == 2 and "image" in name and entry is not None:
-                if not visual:
+                if not (is_map or is_picture):
                     continue
                 entry = {k: v * (3 // len(v)) if k != "count" else v for k, v in entry.items()}
             if entry is not None:
                 stats[name] = entry
         return stats
+
+    def _source_stats(self, name: str, channels: int, frames: int) -> dict[str, Any]:
+        """Statistics of a picture that was not read: the source's, else those that change nothing."""
+        entry = {} if self.origin is None else self.origin.stats.get(name, {})
+        shapes = [np.shape(entry.get(k) or 0) for k in ("mean", "std")] if isinstance(entry, dict) else []
+        if shapes == [(channels, 1, 1)] * 2:
+            return {**entry, "count": [frames]}
+        return LogHistogram.parse([]).stats(FeatureMoments.of(np.zeros((0, 1))), frames, (channels, 1, 1))
+
+    def _add_moments(self, moments: dict[str, FeatureMoments], table: Any) -> None:
+        """Add to ``moments`` those of numbers, and of the first picture of every image column that no camera reads."""
+        for name in table.column_names:
+            kind = str(table.schema.field(name).type)
+            if kind.startswith("struct"):
+                feature = self.source_features.get(name)
+                if feature is None or name in self.views or pixel_columns.count_channels(name, feature) != 3:
+                    continue
+                root = None if self.origin is None else self.origin.root
+                here = pixel_columns.colour_moments(name, feature, table.column(name)[0].as_py(), root)
+            elif kind.count("list<") > 1:
+                continue  # maps, whose moments are those of their pixels
+            else:
+                try:
+                    cells = table.column(name).to_pylist()
+                    values = np.array(cells, np.float64).reshape(len(cells), -1)
+                except (TypeError, ValueError):
+                    continue  # text, or rows of different length
+                if not values.size or values.shape[1] > 4096:
+                    continue
+                here = FeatureMoments.of(values)
+            moments[name] = moments[name] + here if name in moments else here
 
     def _splits(self, owns: Sequence[Row]) -> dict[str, str]:
         """Splits of the source in the new episode numbers, if the episodes of a split are consecutive."""
@@ -437,19 +523,6 @@ def _flat_number(value: Any) -> Any:
 
 def _column_types(table: Any) -> dict[str, Any]:
     return dict(zip(table.schema.names, table.schema.types, strict=True))
-
-
-def _add_moments(moments: dict[str, FeatureMoments], table: Any) -> None:
-    """Add the moments of the numeric columns of a table to ``moments``."""
-    for name in table.column_names:
-        cells = table.column(name).to_pylist() if "struct" not in str(table.schema.field(name).type) else []
-        try:
-            values = np.array(cells, np.float64).reshape(len(cells), -1)
-        except (TypeError, ValueError):
-            continue  # text, or rows of different length
-        if values.size and values.shape[1] <= 4096:
-            here = FeatureMoments.of(values)
-            moments[name] = moments[name] + here if name in moments else here
 
 
 def _refuse_shared_videos(origin: LeRobotSource) -> None:

@@ -44,6 +44,7 @@ class RldsSource:
 
     version = None
     tasks = None
+    root = None
     robot = "unknown"
 
     @property
@@ -70,6 +71,11 @@ class RldsSource:
     @property
     def splits(self) -> dict[str, list[int]]:
         """None: the split is part of :meth:`about` of each episode."""
+        return {}
+
+    @property
+    def stats(self) -> dict[str, Any]:
+        """None: the format has no statistics."""
         return {}
 
     @property

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dhtorch.export.lerobot import FeatureMoments
+from dhtorch.export.lerobot import FeatureMoments, LogHistogram
 from dhtorch.geometry.pose_conventions import CONVENTIONS
 
 Row = dict[str, Any]
@@ -48,6 +48,7 @@ class MapCounts:
         self.pixels: list[np.ndarray] = []
         self.no_answer: list[np.ndarray] = []
         self.moments: FeatureMoments | None = None
+        self.ranges: tuple[LogHistogram, LogHistogram] | None = None
         self.refuted: Counter[str] = Counter()
         self.unread = 0
 
@@ -62,6 +63,8 @@ class MapCounts:
             self.refuted[CONVENTIONS[row["refuted"] - 1] or UNKNOWN_CONVENTION] += 1
         moments = FeatureMoments(*np.asarray(row["moments"], np.float64).reshape(5, 5))
         self.moments = moments if self.moments is None else self.moments + moments
+        depth, sigma = (LogHistogram(counts) for counts in np.asarray(row["ranges"], np.int64).reshape(2, -1))
+        self.ranges = (depth, sigma) if self.ranges is None else (self.ranges[0] + depth, self.ranges[1] + sigma)
 
     def summary(self) -> Row:
         """Pixels by source and by reason, in total and along time; refuted poses by the convention that they match."""
@@ -75,9 +78,13 @@ class MapCounts:
         more |= {"frames": len(pixels), "refuted": dict(sorted(self.refuted.items()))}
         return {"pixels": pixels.sum(0), "no_answer": no_answer.sum(0), **more}
 
-    def of_maps(self) -> tuple[FeatureMoments, FeatureMoments, FeatureMoments] | None:
-        """Moments of depth, sigma and the image; None if no frame could be read."""
-        if self.moments is None:
-            return None
-        parts = [FeatureMoments(*(x[span] for x in self.moments)) for span in (slice(0, 1), slice(1, 2), slice(2, 5))]
-        return parts[0], parts[1], parts[2]
+    def map_stats(self) -> dict[str, tuple[FeatureMoments, LogHistogram]]:
+        """Moments and histogram of depth and sigma; empty if no frame could be read."""
+        if self.moments is None or self.ranges is None:
+            return {}
+        moments = [FeatureMoments(*(x[k : k + 1] for x in self.moments)) for k in range(2)]
+        return dict(zip(("depth", "sigma"), zip(moments, self.ranges, strict=True), strict=True))
+
+    def image_moments(self) -> FeatureMoments | None:
+        """Moments of red, green and blue; None if no frame could be read."""
+        return None if self.moments is None else FeatureMoments(*(x[2:5] for x in self.moments))

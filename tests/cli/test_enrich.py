@@ -19,7 +19,7 @@ from support.dataset_folders import decode_map, read_files, read_rows
 from dhtorch import data
 from dhtorch import testing as writers
 from dhtorch.cli.run import main
-from dhtorch.export.lerobot import FeatureMoments
+from dhtorch.export.lerobot import FeatureMoments, LogHistogram
 from dhtorch.extract import shards
 from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.runtime import storage
@@ -71,12 +71,59 @@ def test_statistics_of_large_numbers_keep_their_spread():
 
 
 def test_what_the_source_had_is_there_value_for_value(robot, enriched):
+    own_depth = f"{CAMERA}_depth"  # an image of one channel: numbers now, see the next test
     for before, after in zip(read_rows(robot), read_rows(enriched), strict=True):
-        assert {k: after[k] for k in before} == before
+        assert np.array_equal(decode_map(after, own_depth), decode_map(before, own_depth))
+        assert {k: after[k] for k in before if k != own_depth} == {k: v for k, v in before.items() if k != own_depth}
     videos = {k: v for k, v in read_files(robot).items() if k.startswith("videos/")}
     assert videos and videos.items() <= read_files(enriched).items()
     before, after = (json.loads((r / "meta" / "info.json").read_text())["features"] for r in (robot, enriched))
+    assert before.pop(own_depth)["dtype"] == "image" and after[own_depth]["dtype"] == "float32"
     assert {k: after[k] for k in before} == before
+
+
+def test_no_feature_but_pictures_of_three_channels_is_an_image(robot, enriched, tmp_path):
+    """LeRobot's policies take every image and video as such a picture, and want statistics of each."""
+    assert main(["enrich", str(robot), str(tmp_path / "set"), *ASKED, "maps=images", "columns=[depth,source]"]) == 0
+    for root, images in ((enriched, {CAMERA}), (tmp_path / "set", {CAMERA, DEPTH, f"{CAMERA}_dhtorch_source"})):
+        features = json.loads((root / "meta" / "info.json").read_text())["features"]
+        pictures = {k for k, f in features.items() if f["dtype"] in ("image", "video")}
+        assert pictures - {f"{CAMERA}_depth"} == images and (f"{CAMERA}_depth" in pictures) == (root != enriched)
+        assert pictures <= json.loads((root / "meta" / "stats.json").read_text()).keys()
+        assert features[DEPTH]["info"]["is_depth_map"] is True
+    assert features[DEPTH]["info"]["depth_unit"] == "m" and f"{DEPTH}_sigma" not in features
+    for left, right in zip(read_rows(enriched), read_rows(tmp_path / "set"), strict=True):
+        assert np.array_equal(decode_map(left, DEPTH), decode_map(right, DEPTH))
+    frames = [data.open_all(root, depth=DEPTH)[0][1] for root in (enriched, tmp_path / "set")]
+    assert torch.equal(frames[0].depth, frames[1].depth), "both forms read back alike"
+
+
+def test_a_depth_video_of_the_source_stays_as_a_file(shots, tmp_path):
+    writers.write_lerobot(tmp_path / "source", [shots[:2]], depth="video")
+    assert main(["enrich", str(tmp_path / "source"), str(tmp_path / "set"), *ASKED, "dense=false", "gap=1"]) == 0
+    key, meta = f"{CAMERA}_depth", tmp_path / "set" / "meta"
+    assert key not in json.loads((meta / "info.json").read_text())["features"]
+    assert json.loads((meta / "source_features.json").read_text())[key]["dtype"] == "video"
+    assert any(name.startswith(f"videos/{key}/") for name in read_files(tmp_path / "set"))
+
+
+def test_a_camera_without_a_picture_that_can_be_read_has_statistics_that_change_nothing():
+    entry = LogHistogram.of(np.zeros(4)).stats(FeatureMoments.of(np.zeros((0, 1))), 3, (1, 1, 1))
+    assert {k: np.ravel(v).tolist() for k, v in entry.items() if k in ("min", "max", "mean", "std")} == {
+        "min": [0.0], "max": [1.0], "mean": [0.0], "std": [1.0]
+    }  # fmt: skip
+
+
+def test_the_range_of_a_map_is_that_of_most_pixels():
+    """One pixel in a thousand at 35 m in a room of 7 m, over two frames: no range that a policy is to divide by."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0.5, 7.0, 20_000)
+    x[::1000], x[1::10] = 35.0, 0.0
+    histogram = LogHistogram.of(x[:9000]) + LogHistogram.parse(LogHistogram.of(x[9000:]).pack())
+    entry = histogram.stats(FeatureMoments.of(x[x > 0, None]), 2, (1, 1, 1))
+    for name, fraction in (("min", 0.01), ("q10", 0.1), ("q50", 0.5), ("q90", 0.9), ("max", 0.99)):
+        assert np.ravel(entry[name])[0] == pytest.approx(np.quantile(x[x > 0], fraction), rel=0.02), name
+    assert np.ravel(entry["mean"])[0] == pytest.approx(x[x > 0].mean())
 
 
 def test_an_episode_begins_and_ends_in_its_video_where_it_did(robot, enriched):
@@ -112,10 +159,12 @@ def test_statistics_are_of_what_is_known(enriched):
         np.float64
     )
     found = stats[DEPTH]
-    want = {"min": known.min(), "max": known.max(), "mean": known.mean(), "std": known.std()}
+    want = {"mean": known.mean(), "std": known.std()}
     assert {k: np.shape(found[k]) for k in want} == dict.fromkeys(want, (1, 1, 1))
     for name, value in want.items():
         assert np.ravel(found[name])[0] == pytest.approx(value, rel=1e-6)
+    for name, fraction in (("min", 0.01), ("max", 0.99)):
+        assert np.ravel(found[name])[0] == pytest.approx(np.quantile(known, fraction), rel=0.03)
     assert np.shape(stats[CAMERA]["mean"]) == (3, 1, 1) and found["count"] == [sum(LENGTHS)]
     features = json.loads((enriched / "meta" / "info.json").read_text())["features"]
     stated = [features[f"{DEPTH}{end}"]["info"]["quantiser_step_m"] for end in ("", "_sigma")]

@@ -31,6 +31,7 @@ from dhtorch.data.codecs import tfrecord
 from dhtorch.data.readers.rlds import StepFeature
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
+from dhtorch.export.lerobot import N_BINS
 from dhtorch.extract import cut, plan
 from dhtorch.extract.enriched import DatasetCamera, MapRowDataset, camera_feature, camera_key, map_columns
 from dhtorch.extract.instants import PeekableRows
@@ -146,7 +147,8 @@ def test_an_episode_made_with_other_settings_is_not_whole(format, robot, tmp_pat
     def own(key, k=0):
         if format == "nerfstudio":
             return NerfstudioTarget(out, views, [{FRONT: ""}, {FRONT: "1"}], key).own(k)
-        return LeRobotTarget(out, 3, views, origin=None, numbers=[0, 1], step=0.0, fps=30.0, task=None, key=key).own(k)
+        made = {"step": 0.0, "maps": ("depth",), "as_images": False, "fps": 30.0, "task": None, "key": key}
+        return LeRobotTarget(out, 3, views, origin=None, numbers=[0, 1], **made).own(k)
 
     assert own(key)["length"] == LENGTHS[0]
     assert own(f"{key}x") is None
@@ -235,9 +237,9 @@ def test_the_past_alone_counts_and_of_the_same_episode(robot, whole, tmp_path):
     assert [row["episode_index"] for row in short] == [0, 0, 1, 1]
     assert [row["source.index"] for row in short] == [0, 1, 3, 4] and [row["index"] for row in short] == [0, 1, 2, 3]
     for row, same in zip(short, [every[0], every[1], every[3], every[4]], strict=True):
-        assert all(row[key]["bytes"] == same[key]["bytes"] for key in keys), "a later frame changed an earlier one"
+        assert all(row[key] == same[key] for key in keys), "a later frame changed an earlier one"
     second = read_rows(enrich(robot, tmp_path / "second", "data=lerobot", "data.episode=1"))
-    assert [row[keys[0]]["bytes"] for row in second] == [row[keys[0]]["bytes"] for row in every[3:]]
+    assert [row[keys[0]] for row in second] == [row[keys[0]] for row in every[3:]]
     recovered = [int((decode_map(row, keys[1]) == 2).sum()) for row in every]
     assert recovered[0] == recovered[3] == 0 and sum(recovered) > 0
     both = read_rows(enrich(robot, tmp_path / "both", "causal=false", "gap=auto"))
@@ -267,7 +269,7 @@ def test_an_older_version_of_the_format(robot, whole, tmp_path):
     again = data.open_all(out, depth=f"{FRONT}_depth_enriched")
     assert [len(each) for each in again] == list(LENGTHS)
     for a, b in zip(read_rows(out), read_rows(whole), strict=True):
-        assert a[f"{FRONT}_depth_enriched"]["bytes"] == b[f"{FRONT}_depth_enriched"]["bytes"]
+        assert a[f"{FRONT}_depth_enriched"] == b[f"{FRONT}_depth_enriched"]
 
 
 def test_the_whole_is_never_held(tmp_path, monkeypatch):
@@ -383,6 +385,7 @@ def test_counts_of_an_episode_are_sums_and_shares_along_it():
     for k in range(48):  # two to a part; the second half is all recovered
         pixels = [6, 0, 2] if k < 24 else [0, 0, 8]
         row = {"depth": b"x", "pixels": pixels, "no_answer": [pixels[0], 0], "refuted": 0, "moments": np.ones(25)}
+        row["ranges"] = np.ones((2, N_BINS))
         tally.add(row)
     tally.add(None)
     found = tally.summary()

@@ -23,5 +23,8 @@ def read_rows(root):
 
 
 def decode_map(row, key):
-    """The map (H, W) that is stored as a picture in a row."""
+    """The map (H, W) that is stored in a row, as an array or as a picture."""
+    if isinstance(row[key], list):
+        values = np.array(row[key])[0]
+        return values.astype(np.float32) if values.dtype.kind == "f" else values
     return np.array(Image.open(io.BytesIO(row[key]["bytes"])))

@@ -188,8 +188,7 @@ class _Load:
         camera = self.cameras[i : i + 1] if self.cameras.f.shape[0] > 1 else self.cameras
         depth = torch.zeros(self.image.hw) if self.depth is None else self._depth(i, self.depth)
         if self.origin is not None:
-            data, file = self._bytes(i, self.origin.key)
-            origin = torch.from_numpy(files.decode_image(data, file, self.origin.hw)[0])
+            origin = torch.tensor(self._codes(i, self.origin))
             depth = torch.where(origin == Source.SENSOR, depth, 0.0)
         return Frame(self._image(i)[None], depth[None], camera, self.depth_camera)
 
@@ -208,10 +207,22 @@ class _Load:
             data, file = self._bytes(i, feature.key)
             values = decode_depth_picture(data, file, feature.hw)
         else:
-            values = np.asarray(read_cell(self.data, feature.key, int(self.rows[i])))
-            if values.size != feature.hw[0] * feature.hw[1] or values.dtype.kind not in "fiu":
-                raise FormatError(self.data, feature.key, f"shape {values.shape}", f"{feature.hw} numbers")
+            values = self._numbers(i, feature)
         return self._within(values.reshape(feature.hw).astype(np.float64) * (self.step_m or 1.0))
+
+    def _codes(self, i: int, feature: LeRobotFeature) -> np.ndarray:
+        """Codes (h, w) of a row, stored as an image or as numbers."""
+        if feature.dtype != "image":
+            return self._numbers(i, feature)
+        data, file = self._bytes(i, feature.key)
+        return files.decode_image(data, file, feature.hw)[0]
+
+    def _numbers(self, i: int, feature: LeRobotFeature) -> np.ndarray:
+        """Numbers (h, w) of a row, stored as an array."""
+        values = np.asarray(read_cell(self.data, feature.key, int(self.rows[i])))
+        if values.size != feature.hw[0] * feature.hw[1] or values.dtype.kind not in "fiu":
+            raise FormatError(self.data, feature.key, f"shape {values.shape}", f"{feature.hw} numbers")
+        return values.reshape(feature.hw)
 
     def _within(self, depth: np.ndarray) -> Tensor:
         low, high = self.span

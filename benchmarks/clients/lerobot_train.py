@@ -1,0 +1,98 @@
+"""``lerobot-train``, as it is installed, on sets that ``dhtorch enrich`` wrote: version × policy × set.
+
+python benchmarks/clients/lerobot_train.py --lerobot PYTHON --lerobot PYTHON --json FILE
+
+Two steps on the CPU, with no option about features or statistics. Each of :data:`VERSIONS` that no interpreter has gets
+rows that say ``not run``. An interpreter in another root folder is named by a script that enters it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from all import SOURCES, enriched, environment, short, versions
+
+#: Versions of LeRobot: the last that runs on Python 3.11, and the newest, which needs 3.12.
+VERSIONS = ("0.4.4", "0.6.1")
+
+#: Policy → options that make its network small, for a CPU.
+POLICIES: dict[str, tuple[str, ...]] = {
+    "act": ("--policy.chunk_size=16", "--policy.n_action_steps=16"),
+    "diffusion": ("--policy.down_dims=[64,128,256]",),
+}
+
+#: Set → what it is there for; each has an action and a state, which these policies want.
+SETS = {
+    "robot": "depth",
+    "two-camera robot": "depth, two cameras",
+    "GR00T, LeRobot v2.0": "no depth anywhere",
+    "RLDS": "no depth anywhere, four cameras of which one is enriched",
+}
+
+#: What every run has; ``{root}`` is the set, ``{out}`` a new folder.
+OPTIONS = (
+    *("--policy.push_to_hub=false", "--policy.pretrained_backbone_weights=null", "--policy.device=cpu"),
+    *("--dataset.repo_id=local/set", "--dataset.root={root}", "--dataset.video_backend=pyav"),
+    *("--steps=2", "--batch_size=2", "--num_workers=0", "--save_checkpoint=false", "--log_freq=1"),
+    "--output_dir={out}",
+)
+
+#: Seconds after which a run has failed.
+LIMIT_S = 1800
+
+
+def train(python: str, policy: str, root: Path) -> dict[str, Any]:
+    """Whether a run ended well, the loss of its last step, and else its last words."""
+    with tempfile.TemporaryDirectory() as folder:
+        places = {"root": str(root), "out": f"{folder}/out"}
+        words = [f"--policy.type={policy}", *POLICIES[policy], *(option.format(**places) for option in OPTIONS)]
+        command = [python, "-m", "lerobot.scripts.lerobot_train", *words]
+        env = environment() | {"HF_HOME": f"{folder}/hf", "PYTHONPATH": ""}
+        try:
+            done = subprocess.run(command, env=env, capture_output=True, text=True, check=False, timeout=LIMIT_S)
+        except subprocess.TimeoutExpired:
+            return {"passed": False, "loss": None, "why": f"no end within {LIMIT_S} s"}
+    said = done.stderr + done.stdout
+    losses = [float(word.removeprefix("loss:")) for word in said.split() if word.startswith("loss:")]
+    passed = done.returncode == 0 and "End of training" in said and len(losses) == 2
+    lines = [line for line in said.splitlines() if "Error" in line.split(":")[0]]
+    why = "" if passed else short((lines or said.strip().splitlines() or ["no word"])[-1])
+    return {"passed": passed, "loss": losses[-1] if losses else None, "why": why}
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--lerobot", action="append", default=[], metavar="PYTHON")
+    parser.add_argument("--set", action="append", choices=SETS, help="only this one")
+    parser.add_argument("--work", type=Path, help="folder of the sets, which are kept; a temporary one")
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    known = {versions(python).get("lerobot"): python for python in args.lerobot}
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name in args.set or SETS:
+            root, why = enriched(name, "lerobot v3.0", args.work or Path(folder))
+            if why:
+                sys.exit(f"{name}: {why}")
+            for version in VERSIONS:
+                for policy in POLICIES:
+                    start = {"set": name, "about": SETS[name], "options": SOURCES[name][1:], "policy": policy}
+                    python = known.get(version)
+                    none = {"passed": None, "loss": None, "why": "not run"}
+                    row = {**start, "lerobot": version, **(train(python, policy, root) if python else none)}
+                    rows.append(row)
+                    print(json.dumps(row), flush=True)
+    if args.json:
+        args.json.write_text(json.dumps(rows, indent=1) + "\n")
+    return 0 if all(row["passed"] is not False for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
