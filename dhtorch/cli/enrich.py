@@ -16,7 +16,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from dhtorch.cli import enrich_page
+from dhtorch.cli import enrich_card, enrich_page
 from dhtorch.codes import words
 from dhtorch.data.io.decode import import_optional
 from dhtorch.data.rig import Rig
@@ -110,6 +110,8 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     try:
         with open_output_folder(work.out, "out") as folder:
             before, owns, complaints = _write_missing_episodes(work, folder, settings, progress)
+            if isinstance(work.target, LeRobotTarget):
+                enrich_card.write_enrich_card(work.target, work.shared, owns)
             if settings["report"]:
                 enrich_page.write_enrich_page(work.out / "meta", work.shared, owns)
     except KeyboardInterrupt:
@@ -375,7 +377,8 @@ def _prepare_folder(work: EnrichJob, folder: OutputFolder, missing: Sequence[int
     elif storage.has_files(work.out):
         raise FileExistsError(f"{work.out}: found a folder with other files, expected an empty or a new one")
     folder.check_folders([work.waiting])
-    folder.check([*work.target.planned_files(missing), *enrich_page.page_files(work.out / "meta")])
+    card = [work.out / enrich_card.CARD] if isinstance(work.target, LeRobotTarget) else []
+    folder.check([*work.target.planned_files(missing), *card, *enrich_page.page_files(work.out / "meta")])
     if not metadata_file.is_file():
         storage.write_json(metadata_file, work.shared)
     work.waiting.mkdir(exist_ok=True)

@@ -39,6 +39,10 @@ _EPISODE_METADATA_KEY = b"dhtorch.episode"
 _DEFAULT_TASK = "look around"
 
 
+#: Name of the source's data set card beside that of the enriched set.
+SOURCE_CARD = "README.source.md"
+
+
 class LeRobotTarget:
     """Writer of LeRobot tables.
 
@@ -395,7 +399,7 @@ class LeRobotTarget:
             storage.write_json(self.root / "meta" / "source_features.json", unlisted)
         tasks = self._tasks(owns)
         for name, file in ({} if self.origin is None else self.origin.more).items():
-            storage.copy_file(file, self.root / name)
+            storage.copy_file(file, self.root / (SOURCE_CARD if name == "README.md" else name))
         episodes = [
             lerobot.EpisodeSpec(
                 number=k,

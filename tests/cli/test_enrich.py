@@ -358,3 +358,27 @@ def test_a_write_that_failed_at_the_first_file_is_no_other_set(robot, enriched, 
     unfinished.write_text("{")
     assert main(["enrich", str(robot), str(out), *ASKED]) == 0
     assert read_files(out) == read_files(enriched) and not unfinished.exists()
+
+
+def test_the_card_states_cameras_shares_and_the_licence_of_the_source(shots, tmp_path, capsys):
+    source = tmp_path / "source"
+    writers.write_lerobot(source, [shots[:3]], depth="tiff")
+    (source / "README.md").write_text("---\npretty_name: x\nlicense: cc-by-4.0\ntags:\n- LeRobot\n---\n# Mine\n")
+    assert main(["enrich", str(source), str(tmp_path / "set"), *ASKED, "dense=false", "gap=1", "report=false"]) == 0
+    card = (tmp_path / "set" / "README.md").read_text()
+    head, body = card.removeprefix("---\n").split("---\n", 1)
+    assert "license: cc-by-4.0\n" in head and "- LeRobot\n" in head and "data_files: data/*/*.parquet" in head
+    assert (tmp_path / "set" / "README.source.md").read_text().endswith("# Mine\n")
+    (line,) = (line for line in body.splitlines() if line.startswith(f"| `{CAMERA}`"))
+    cells = [cell.strip() for cell in line.strip("|").split("|")]
+    said = capsys.readouterr().out
+    assert cells[1:3] == ["64×48", "64×48"] and f"sensor {cells[4]}, recovered {cells[5]}" in said
+    stats = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
+    assert cells[-2] == f"{stats[DEPTH]['q01'][0][0][0]:.2f}–{stats[DEPTH]['q99'][0][0][0]:.2f}"
+    K = shots[0].camera
+    assert cells[3].startswith(f"{float(K.f[0, 0]):.1f}") and f'dataset[0]["{DEPTH}"]' in body
+
+
+def test_a_source_without_a_card_has_no_licence_in_it(enriched):
+    card = (enriched / "README.md").read_text()
+    assert "license:" not in card and "not stated by the source" in card and "lerobot-train" not in card
