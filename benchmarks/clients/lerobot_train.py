@@ -2,8 +2,8 @@
 
 python benchmarks/clients/lerobot_train.py --lerobot PYTHON --lerobot PYTHON --json FILE
 
-Two steps on the CPU, with no option about features or statistics. Each of :data:`VERSIONS` that no interpreter has gets
-rows that say ``not run``. An interpreter in another root folder is named by a script that enters it.
+Two steps on the CPU, with no option about features or statistics. For each of :data:`VERSIONS` that no interpreter has,
+the rows that FILE holds are kept; where there are none, they say ``not run``. An interpreter in another root folder is named by a script that enters it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SETS = {
 OPTIONS = (
     *("--policy.push_to_hub=false", "--policy.pretrained_backbone_weights=null", "--policy.device=cpu"),
     *("--dataset.repo_id=local/set", "--dataset.root={root}", "--dataset.video_backend=pyav"),
-    *("--steps=2", "--batch_size=2", "--num_workers=0", "--save_checkpoint=false", "--log_freq=1"),
+    *("--steps=2", "--batch_size=1", "--num_workers=0", "--save_checkpoint=false", "--log_freq=1"),
     "--output_dir={out}",
 )
 
@@ -75,6 +75,8 @@ def main() -> int:
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     known = {versions(python).get("lerobot"): python for python in args.lerobot}
+    before = json.loads(args.json.read_text()) if args.json and args.json.is_file() else []
+    kept = {(row["set"], row["policy"], row["lerobot"]): row for row in before}
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for name in args.set or SETS:
@@ -85,8 +87,11 @@ def main() -> int:
                 for policy in POLICIES:
                     start = {"set": name, "about": SETS[name], "options": SOURCES[name][1:], "policy": policy}
                     python = known.get(version)
-                    none = {"passed": None, "loss": None, "why": "not run"}
-                    row = {**start, "lerobot": version, **(train(python, policy, root) if python else none)}
+                    row = {**start, "lerobot": version, "passed": None, "loss": None, "why": "not run"}
+                    if python:
+                        row |= train(python, policy, root)
+                    else:
+                        row = kept.get((name, policy, version), row)
                     rows.append(row)
                     print(json.dumps(row), flush=True)
     if args.json:

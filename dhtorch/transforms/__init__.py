@@ -1,6 +1,6 @@
 """dhtorch inside a data loader: :class:`ExtendDepth` maps a sample dict to the same dict plus far depth.
 
-transform = ExtendDepth(image="observation.images.wrist", depth="observation.depth.wrist", depth_unit="mm")
+transform = ExtendDepth(image="observation.images.wrist", depth="observation.images.wrist_depth", depth_unit="auto")
 dataset = ExtendedDataset(dataset, transform)
 loader = DataLoader(dataset, collate_fn=dataset.collate, num_workers=2, worker_init_fn=one_thread)
 """
@@ -14,6 +14,7 @@ from dhtorch.transforms.adapters import (
     collate_kept,
     one_thread,
 )
+from dhtorch.transforms.declared_unit import declared_depth_unit
 from dhtorch.transforms.extend_depth import ExtendDepth
 from dhtorch.transforms.maps import DenseMaps
 from dhtorch.transforms.sample_access import SampleError
@@ -36,6 +37,7 @@ __all__ = [
     "SampleSpec",
     "ValidateDepth",
     "collate_kept",
+    "declared_depth_unit",
     "one_thread",
     "patch_tokens",
     "token_grid",

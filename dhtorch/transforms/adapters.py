@@ -20,8 +20,10 @@ from torch.utils.data import Dataset, IterableDataset, default_collate
 
 from dhtorch.runtime.allocator import disable_malloc_trim
 from dhtorch.transforms.collate import collate_shared, pack_shared
+from dhtorch.transforms.declared_unit import declared_depth_unit
 from dhtorch.transforms.extend_depth import ExtendDepth
 from dhtorch.transforms.sample_access import SampleError, drop_keys, get_value, has_key, to_tensor
+from dhtorch.transforms.sample_spec import AUTO_UNIT
 
 #: Maximum distance of the neighbour whose shapes replace those of an item that cannot be loaded.
 _MAX_NEIGHBOURS_TRIED = 16
@@ -49,7 +51,8 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
 
     Args:
         dataset: ``dataset[i]`` is a dict.
-        transform: for single samples; with ``by_batch`` for batches.
+        transform: for single samples; ``by_batch`` makes one for batches of it. With ``depth_unit="auto"`` the unit is
+            that which the data set declares, see :func:`dhtorch.transforms.declared_depth_unit`.
         gap: items from the source view to the reference view; None = the sample itself holds both.
         episode_key: key of the episode number; None = there is one episode.
         by_batch: items stay unchanged, and :meth:`collate`, then required as the loader's ``collate_fn``, transforms
@@ -58,8 +61,9 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
             dropped from items and batches, so that no worker copies them into shared memory.
 
     Raises:
-        ValueError: a gap without ``other_image``; a transform for batches without ``by_batch``, or with it one for
-            single samples or one that does not raise; a consumed key that the transform does not read.
+        ValueError: a gap without ``other_image``; a transform for batches without ``by_batch``, or with it one made
+            with ``batched=False`` or one that does not raise; a consumed key that the transform does not read;
+            ``depth_unit="auto"`` of a data set that declares none.
     """
 
     def __init__(
@@ -74,10 +78,11 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
     ) -> None:
         if gap is not None and (gap < 1 or transform.views.other_image is None):
             raise ValueError(f"gap is {gap}: expected a positive one, and a transform with other_image")
-        if transform.batched != by_batch:
-            single = "single samples, expected ExtendDepth(batched=True)"
-            batches = "batches, expected one for single samples, or by_batch=True"
-            raise ValueError(f"found a transform for {single if by_batch else batches}")
+        transform = _resolve_unit(transform, dataset)
+        if by_batch:
+            transform = transform.with_options(batched=True)
+        elif transform.batched:
+            raise ValueError("found a transform for batches, expected one for single samples, or by_batch=True")
         if by_batch and transform.on_error != "raise":
             raise ValueError(f"on_error is {transform.on_error!r}, expected raise where by_batch is set")
         keys = transform.views.keys()
@@ -174,7 +179,8 @@ class ExtendedStream(_DatasetWrapper, IterableDataset[Any]):
     """Iterable data set -> transformed samples; skipped ones are left out of the stream."""
 
     def __init__(self, dataset: Iterable[Any], transform: Callable[[Any], dict[str, Any] | None]) -> None:
-        self.dataset, self.transform = dataset, transform
+        self.dataset = dataset
+        self.transform = _resolve_unit(transform, dataset) if isinstance(transform, ExtendDepth) else transform
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for sample in self.dataset:
@@ -246,6 +252,14 @@ def one_thread(worker: int = 0) -> None:
     opencv = sys.modules.get("cv2")
     if opencv is not None:
         opencv.setNumThreads(0)  # 1 would wait for the threads of the pool, which do not exist in a forked worker
+
+
+def _resolve_unit(transform: ExtendDepth, dataset: Any) -> ExtendDepth:
+    """Transform with ``depth_unit="auto"`` -> the same with the unit that the data set declares."""
+    views = transform.views
+    if views.depth_unit != AUTO_UNIT:
+        return transform
+    return transform.with_options(depth_unit=declared_depth_unit(dataset, views.depth))
 
 
 def _collect_key(samples: Sequence[Any], key: str) -> list[torch.Tensor]:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -19,7 +21,7 @@ from dhtorch.pipeline.spec import iter_networks
 from dhtorch.records import NO_HINT, DepthMap, Estimate, PoseFit, Samples, TrackHint
 from dhtorch.transforms import maps, poses, schema
 from dhtorch.transforms.sample_access import SampleError, check_sample, get_value, to_tensor
-from dhtorch.transforms.sample_spec import SampleSpec, SampleViews
+from dhtorch.transforms.sample_spec import SampleSpec, SampleViews, default_prefix
 from dhtorch.transforms.status import ProblemCounts, SampleProblem
 from dhtorch.transforms.tokens import FIT_MODES, patch_tokens, token_grid
 
@@ -49,7 +51,8 @@ class ExtendDepth(torch.nn.Module):
         batched: True = samples are collated batches, False = single samples. None = single samples, and a sample that
             looks like a batch (3x3 intrinsics, texts, an index or episode for each image) is rejected instead of being
             read as frames along time. A batch with a missing key or a wrong shape raises in any case.
-        prefix: of the added keys.
+        prefix: of the added keys. None = ``dhtorch.``, and ``observation.dh_`` where ``image`` is named as LeRobot
+            names its pictures (``observation.images.…``): its processors keep no other keys.
         **views: keys, layouts and units of the images, the depth and the intrinsics: see
             :class:`dhtorch.transforms.SampleSpec`. ``depth_unit`` is required.
 
@@ -90,7 +93,7 @@ class ExtendDepth(torch.nn.Module):
         fit: str = "stretch",
         on_error: str = "raise",
         batched: bool | None = None,
-        prefix: str = "dhtorch.",
+        prefix: str | None = None,
         **views: Any,
     ) -> None:
         super().__init__()
@@ -107,10 +110,26 @@ class ExtendDepth(torch.nn.Module):
         self.learned = torch.nn.ModuleList(iter_networks(self.method))  # so that .to() and .parameters() find them
         self.seed, self.index_key = seed, index_key
         self.patch, self.tokens_hw, self.fit = patch, tokens_hw, fit
-        self.on_error, self.batched, self.prefix = on_error, bool(batched), prefix
+        self.on_error, self.batched = on_error, bool(batched)
+        self.prefix = default_prefix(self.views.image) if prefix is None else prefix
         self._batched_option = batched
         self.tally = ProblemCounts()
         self._seen_hw: tuple[int, int] | None = None
+
+    def with_options(self, *, depth_unit: str | float | None = None, batched: bool | None = None) -> ExtendDepth:
+        """The same transform with another unit or for batches; networks and counts of problems are shared.
+
+        Raises:
+            ValueError: ``batched`` other than that stated when the transform was made.
+        """
+        other = copy.copy(self)
+        if depth_unit is not None:
+            other.views = replace(self.views, depth_unit=depth_unit)
+        if batched is not None:
+            if self._batched_option not in (None, batched):
+                raise ValueError(f"batched is {self._batched_option}, expected {batched}, or no statement")
+            other.batched, other._batched_option = batched, batched
+        return other
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any] | None:
         """Sample or batch -> copy of it with the added columns; None if it is skipped."""

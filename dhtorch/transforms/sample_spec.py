@@ -68,6 +68,18 @@ class SampleViews(NamedTuple):
         return message if len(self.bad) == 1 else f"sample {row} of the batch: {message}"
 
 
+#: Value of ``depth_unit``: the unit that the data set declares.
+AUTO_UNIT = "auto"
+
+#: Start of the names of LeRobot's pictures.
+_LEROBOT_PICTURES = "observation.images."
+
+
+def default_prefix(image: str) -> str:
+    """Key of the picture -> prefix of added keys: for names of LeRobot's pictures one that its processors keep."""
+    return "observation.dh_" if image.startswith(_LEROBOT_PICTURES) else "dhtorch."
+
+
 @dataclass(frozen=True, kw_only=True)
 class SampleSpec:
     """Keys, layouts and units of the views in a sample.
@@ -80,7 +92,8 @@ class SampleSpec:
         ValueError: an invalid option.
     """
 
-    depth_unit: str | float = ""  # "m", "mm", or metres per unit; required
+    # "m", "mm", or metres per unit; required. "auto" = what the data set declares that ExtendedDataset wraps.
+    depth_unit: str | float = ""
     image: str = "image"  # key of the reference view's image
     depth: str = "depth"  # key of the reference view's depth map
     intrinsics: KeyOrCamera = "intrinsics"  # 3×3, 4×4, fx fy cx cy, or a camera of kornia, px of the image
@@ -113,10 +126,9 @@ class SampleSpec:
 
     def __post_init__(self) -> None:
         unit = self.depth_unit
-        if not (unit in SAMPLE_UNITS_PER_METRE or (isinstance(unit, float | int) and unit > 0)):
-            raise ValueError(
-                f"depth_unit is {unit!r}, expected one of {sorted(SAMPLE_UNITS_PER_METRE)} or metres per unit"
-            )
+        if not (unit in (*SAMPLE_UNITS_PER_METRE, AUTO_UNIT) or (isinstance(unit, float | int) and unit > 0)):
+            expected = f"one of {sorted(SAMPLE_UNITS_PER_METRE)}, metres per unit, or {AUTO_UNIT}"
+            raise ValueError(f"depth_unit is {unit!r}, expected {expected}")
         if self.layout not in (None, "hwc", "chw"):
             raise ValueError(f"layout is {self.layout!r}, expected hwc, chw or None")
         self._check_pose()
@@ -132,6 +144,9 @@ class SampleSpec:
             SampleError: a missing key, or a shape or dtype that contradicts the options. Values that contradict them
                 are marked in ``bad``.
         """
+        if self.depth_unit == AUTO_UNIT:
+            expected = "a data set that declares its unit in ExtendedDataset(dataset, transform), or m, mm, a number"
+            raise ValueError(f"depth_unit is {AUTO_UNIT!r} for samples without a data set: expected {expected}")
         leaves = SampleReader(sample, batched, dtype)
         images = leaves.images(self.image, self.layout)
         T, hw = images.shape[1], (images.shape[-2], images.shape[-1])

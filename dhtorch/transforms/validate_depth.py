@@ -15,7 +15,7 @@ from dhtorch.pipeline.presets import get_method
 from dhtorch.pytree import stack
 from dhtorch.records import NO_HINT, DepthValidation, Frame, TrackHint
 from dhtorch.transforms.sample_access import SampleError, SampleReader, check_sample
-from dhtorch.transforms.sample_spec import SampleSpec, check_sample_orientation
+from dhtorch.transforms.sample_spec import SampleSpec, check_sample_orientation, default_prefix
 from dhtorch.validation.validate import validate_depth
 
 #: Numbers of a frame that are added with their confidence interval: value, low, high.
@@ -38,7 +38,8 @@ class ValidateDepth(torch.nn.Module):
         hint: prior information on the motion between the views, for the tracker.
         seed: of the pose search.
         batched: samples are collated batches; None = single samples, and a sample that looks like a batch is rejected.
-        prefix: of the added keys.
+        prefix: of the added keys. None = ``dhtorch.``, and ``observation.dh_`` where ``image`` is named as LeRobot
+            names its pictures (``observation.images.…``): its processors keep no other keys.
         **views: keys, layouts and units of the images, the depth and the intrinsics: see
             :class:`dhtorch.transforms.SampleSpec`. ``depth_unit`` is required.
 
@@ -68,7 +69,7 @@ class ValidateDepth(torch.nn.Module):
         hint: TrackHint = NO_HINT,
         seed: int = 0,
         batched: bool | None = None,
-        prefix: str = "dhtorch.",
+        prefix: str | None = None,
         **views: Any,
     ) -> None:
         super().__init__()
@@ -80,7 +81,8 @@ class ValidateDepth(torch.nn.Module):
             raise ValueError(f"map_unit is {map_unit!r}, expected a positive number of metres")
         self.views = SampleSpec(**views)
         self.method, self.map, self.map_unit, self.judging = method, map, map_unit, dict(judging or {})
-        self.hint, self.seed, self.batched, self.prefix = hint, seed, bool(batched), prefix
+        self.hint, self.seed, self.batched = hint, seed, bool(batched)
+        self.prefix = default_prefix(self.views.image) if prefix is None else prefix
         self._batched_option = batched
 
     def forward(self, sample: Mapping[str, Any]) -> dict[str, Any]:

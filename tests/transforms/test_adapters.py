@@ -1,6 +1,7 @@
 """Hooks of other projects, imitated by what is known of them; none of the packages is installed here."""
 
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,7 +86,7 @@ def wrist(items, **options):
     K = items[0]["intrinsics"].astype(float)
     keys = {"image": LeRobot.camera, "depth": LeRobot.depth, "depth_unit": "mm", "depth_range": (0.0102, 9.99)}
     keys["intrinsics"] = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]  # the format has no place for them
-    return ExtendDepth(**{**keys, "index_key": "index", "n": N, **options})
+    return ExtendDepth(**{**keys, "index_key": "index", "n": N, "prefix": "dhtorch.", **options})
 
 
 def test_lerobot_frames_along_time(items):
@@ -324,8 +325,11 @@ def test_a_loader_extends_whole_batches_and_the_bits_are_the_same(items):
     assert all(torch.equal(a[k], b[k]) for k in a if isinstance(a[k], torch.Tensor))
     with pytest.raises(ValueError, match="expected one for single samples, or by_batch=True"):
         ExtendedDataset(source, whole.transform)
-    with pytest.raises(ValueError, match=r"expected ExtendDepth\(batched=True\)"):
-        ExtendedDataset(source, single.transform, by_batch=True)
+    itself = ExtendedDataset(source, single.transform, gap=1, by_batch=True)
+    c = next(iter(DataLoader(itself, batch_size=2, collate_fn=itself.collate)))
+    assert all(torch.equal(b[k], c[k]) for k in b if isinstance(b[k], torch.Tensor)) and not single.transform.batched
+    with pytest.raises(ValueError, match="batched is False, expected True"):
+        ExtendedDataset(source, wrist(items, **options, batched=False), by_batch=True)
 
 
 @pytest.mark.parametrize("by_batch", [False, True])
@@ -364,8 +368,61 @@ def test_what_was_consumed_stays_in_the_worker_and_changes_no_answer(items, by_b
             ExtendedDataset(Nested(), whole.transform, by_batch=by_batch, consumed=wrong)
 
 
+class Declared(torch.utils.data.Dataset):
+    """A LeRobot set's metadata and the unit in which it hands out its depth."""
+
+    def __init__(self, dtype, info, output=None):
+        self.meta = SimpleNamespace(features={"d": {"dtype": dtype, "info": info}}, depth_keys=["d"] if output else [])
+        if output:
+            self.depth_output_unit = output
+
+    def __len__(self):
+        return 1
+
+    def __getitem__(self, i):
+        raise AssertionError("the unit is not inferred from numbers")
+
+
+@pytest.mark.parametrize(
+    ("dtype", "info", "output", "unit"),
+    [
+        ("image", {"is_depth_map": True, "depth_unit": "m"}, "mm", "mm"),  # LeRobot 0.6 converts it
+        ("image", {"is_depth_map": True, "depth_unit": "m"}, None, "m"),  # 0.4 does not
+        ("video", {"is_depth_map": True}, "m", "m"),
+        ("float32", {"is_depth_map": True, "unit": "m"}, "mm", "m"),  # arrays stay as they are, in every version
+        ("uint16", {"depth_unit": "mm"}, None, "mm"),
+        ("video", {"is_depth_map": True}, None, None),  # 0.4 decodes it as a picture
+        ("image", {"is_depth_map": True}, "mm", None),
+        ("float32", None, "mm", None),
+    ],
+)
+def test_the_unit_is_that_which_the_data_set_declares(dtype, info, output, unit):
+    transform = ExtendDepth(image="i", depth="d", depth_unit="auto")
+    if unit is None:
+        with pytest.raises(
+            ValueError, match="without a unit that this LeRobot declares, expected depth_unit in its info"
+        ):
+            ExtendedDataset(Declared(dtype, info, output), transform)
+        return
+    assert ExtendedDataset(Declared(dtype, info, output), transform).transform.views.depth_unit == unit
+    assert ExtendedStream(Declared(dtype, info, output), transform).transform.views.depth_unit == unit
+    assert transform.views.depth_unit == "auto", "the transform itself is unchanged"
+
+
+def test_without_a_data_set_no_unit_is_declared():
+    transform = ExtendDepth(image="i", depth="d", depth_unit="auto")
+    with pytest.raises(ValueError, match="found list, expected a LeRobot data set"):
+        ExtendedDataset([{}], transform)
+    with pytest.raises(ValueError, match="found no feature d, expected one of other"):
+        ExtendedDataset(SimpleNamespace(meta=SimpleNamespace(features={"other": {}})), transform)
+    with pytest.raises(ValueError, match="'auto' for samples without a data set"):
+        tiny(depth_unit="auto")(tiny_sample())
+
+
 def test_the_prefix_that_lerobots_processors_keep():
     """They keep what begins with "observation." and the action; everything else is gone behind them."""
+    assert ExtendDepth(image="observation.images.front", depth_unit="m").prefix == "observation.dh_"
+    assert ExtendDepth(image="observation.image_primary", depth_unit="m").prefix == "dhtorch."
     out = tiny(prefix="observation.dh_")(tiny_sample())
     kept = {k for k in out if k.startswith("observation.")}
     assert len(kept) == len(tiny()(tiny_sample()).keys() - tiny_sample().keys()) == 17

@@ -250,7 +250,7 @@ def test_rows_of_a_batch_without_a_view_are_silent_beside_the_others():
 @pytest.mark.parametrize("batched", [True, False])
 def test_a_padded_view_of_a_nested_sample_is_no_view(padded, batched):
     given = batch(2) if batched else sample()
-    where = {"image": "observation.images.front", "other_image": "observation.images.before"}
+    where = {"image": "observation.images.front", "other_image": "observation.images.before", "prefix": "dhtorch."}
     pictures = {"front": given.pop("image"), "before": given.pop("before")}
     pictures["before_is_pad"] = torch.tensor([[False], [padded]]) if batched else torch.tensor([padded])
     mine = added(
