@@ -1,9 +1,10 @@
-"""``lerobot-train``, as it is installed, on sets that ``dhtorch enrich`` wrote: version × policy × set.
+"""``lerobot-train``, as installed, on sets that ``dhtorch enrich`` wrote, and README's example of a loader.
 
 python benchmarks/clients/lerobot_train.py --lerobot PYTHON --lerobot PYTHON --json FILE
 
 Two steps on the CPU, with no option about features or statistics. For each of :data:`VERSIONS` that no interpreter has,
-the rows that FILE holds are kept; where there are none, they say ``not run``. An interpreter in another root folder is named by a script that enters it.
+the rows that FILE holds are kept; where there are none, they say ``not run``. An interpreter in another root folder is
+named by a script that enters it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from all import SOURCES, enriched, environment, short, versions
+from all import SOURCES, call, enriched, environment, short, versions
 
 #: Versions of LeRobot: the last that runs on Python 3.11, and the newest, which needs 3.12.
 VERSIONS = ("0.4.4", "0.6.1")
@@ -34,6 +35,9 @@ SETS = {
     "GR00T, LeRobot v2.0": "no depth anywhere",
     "RLDS": "no depth anywhere, four cameras of which one is enriched",
 }
+
+#: Name of the example in README, which is run as it stands.
+EXAMPLE = "README"
 
 #: What every run has; ``{root}`` is the set, ``{out}`` a new folder.
 OPTIONS = (
@@ -66,37 +70,53 @@ def train(python: str, policy: str, root: Path) -> dict[str, Any]:
     return {"passed": passed, "loss": losses[-1] if losses else None, "why": why}
 
 
+def run_readme(python: str) -> dict[str, Any]:
+    """Whether README's example of a loader ends well and prints what stands under it."""
+    with tempfile.TemporaryDirectory() as folder:
+        reply, why = call(python, "readme_snippet.py", folder)
+    return {"passed": reply is not None, "loss": None, "why": why, **({} if reply is None else {"unit": reply["unit"]})}
+
+
 def main() -> int:
     """The command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--lerobot", action="append", default=[], metavar="PYTHON")
-    parser.add_argument("--set", action="append", choices=SETS, help="only this one")
+    parser.add_argument("--set", action="append", choices=[*SETS, EXAMPLE], help="only this one")
     parser.add_argument("--work", type=Path, help="folder of the sets, which are kept; a temporary one")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="rows that are not run now stay as they are in it")
     args = parser.parse_args()
     known = {versions(python).get("lerobot"): python for python in args.lerobot}
     before = json.loads(args.json.read_text()) if args.json and args.json.is_file() else []
-    kept = {(row["set"], row["policy"], row["lerobot"]): row for row in before}
+    kept = {(row["set"], row["command"], row["lerobot"]): row for row in before}
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        for name in args.set or SETS:
-            root, why = enriched(name, "lerobot v3.0", args.work or Path(folder))
+        for name, version in ((name, version) for name in (*SETS, EXAMPLE) for version in VERSIONS):
+            python = known.get(version) if name in (args.set or (*SETS, EXAMPLE)) else None
+            root, why = (
+                enriched(name, "lerobot v3.0", args.work or Path(folder)) if python and name in SETS else (None, "")
+            )
             if why:
                 sys.exit(f"{name}: {why}")
-            for version in VERSIONS:
-                for policy in POLICIES:
-                    start = {"set": name, "about": SETS[name], "options": SOURCES[name][1:], "policy": policy}
-                    python = known.get(version)
-                    row = {**start, "lerobot": version, "passed": None, "loss": None, "why": "not run"}
-                    if python:
-                        row |= train(python, policy, root)
-                    else:
-                        row = kept.get((name, policy, version), row)
-                    rows.append(row)
-                    print(json.dumps(row), flush=True)
+            for command in POLICIES if name in SETS else ("the example",):
+                row = {"set": name, "about": SETS.get(name, "a loader with depth tokens"), "command": command}
+                row |= {"options": SOURCES[name][1:] if name in SETS else [], "lerobot": version}
+                if python is None:
+                    none = {**row, "passed": None, "loss": None, "why": "not run"}
+                    rows.append(kept.get((name, command, version), none))
+                    continue
+                rows.append(row | (run_readme(python) if root is None else train(python, command, root)))
+                print(json.dumps(rows[-1]), flush=True)
+                if args.json:
+                    args.json.write_text(json.dumps([*rows, *_rest(kept, rows)], indent=1) + "\n")
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1) + "\n")
     return 0 if all(row["passed"] is not False for row in rows) else 1
+
+
+def _rest(kept: dict[tuple[str, str, str], dict[str, Any]], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows of an earlier run that none of the new ones replaces."""
+    made = {(row["set"], row["command"], row["lerobot"]) for row in rows}
+    return [row for key, row in kept.items() if key not in made]
 
 
 if __name__ == "__main__":

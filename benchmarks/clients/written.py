@@ -18,12 +18,15 @@ CAMERAS = ("observation.images.left", "observation.images.right")
 BASE = np.array([[0, -1, 0, 0], [0, 0, -1, 0.35], [1, 0, 0, -0.5], [0, 0, 0, 1.0]])  # world from base: z up, m
 EPISODES, LENGTH = 2, 6
 
+#: Frames of an episode that Diffusion trains on: LeRobot leaves out the last 7 of each.
+LONG = 10
 
-def seen() -> list[list[list[Frame]]]:
+
+def seen(length: int = LENGTH) -> list[list[list[Frame]]]:
     """Camera → episode → frames of a robot that walks through the built-in room."""
-    sized = {"n_frames": LENGTH, "hw": (96, 128), "depth_hw": (48, 64), "supersample": 1, "range_limit": 3.0}
+    sized = {"n_frames": length, "hw": (96, 128), "depth_hw": (48, 64), "supersample": 1, "range_limit": 3.0}
     rigs = [open_two_cameras(seed=seed, **sized)[0].recording for seed in range(2, 2 + EPISODES)]
-    spans = range(0, LENGTH), range(LENGTH, 2 * LENGTH)
+    spans = range(0, length), range(length, 2 * length)
     return [[[rig[i] for i in span] for rig in rigs] for span in spans]
 
 
@@ -34,9 +37,9 @@ def hand(frame: Frame) -> np.ndarray:
     return np.append(_solve_joints(np.linalg.inv(BASE) @ T), 0.02 + 0.01 * np.sin(40 * T[2, 3]))
 
 
-def write_robot(root: Path, keys: Sequence[str] = CAMERAS) -> None:
+def write_robot(root: Path, keys: Sequence[str] = CAMERAS, length: int = LENGTH) -> None:
     """A LeRobot v2.1 set of cameras with depth, a state of 8 numbers, and as action the state a frame later."""
-    cameras = seen()[: len(keys)]
+    cameras = seen(length)[: len(keys)]
     for key, episodes in zip(keys, cameras, strict=True):
         at = root if key == keys[0] else root.with_name(f"{root.name}-{key}")
         write_lerobot(at, episodes, version=2, camera=key, image="image", depth="tiff", fps=30, poses=False)
@@ -65,7 +68,7 @@ def write_steps(root: Path) -> None:
 
 #: Name of such a set → what writes it.
 WRITTEN = {
-    "robot": lambda root: write_robot(root, CAMERAS[:1]),
-    "two-camera robot": write_robot,
+    "robot": lambda root: write_robot(root, CAMERAS[:1], LONG),
+    "two-camera robot": lambda root: write_robot(root, length=LONG),
     "RLDS with depth": write_steps,
 }

@@ -41,6 +41,8 @@ class Shifted(Dataset):
     def __init__(self, name):
         wide = torch.nn.functional.avg_pool2d(torch.rand(1, 3, 480, 720, generator=torch.manual_seed(0)), 5, 1, 2)[0]
         self.name, self.wide = name, wide
+        depth = {"dtype": "image", "info": {"is_depth_map": True, "depth_unit": "m"}}
+        self.meta = types.SimpleNamespace(features={"observation.images.front_depth": depth})
 
     def __len__(self):
         return 8
