@@ -531,6 +531,24 @@ def clients() -> str:
     )
 
 
+def lerobot_trained() -> str:
+    """Commands of LeRobot by set and version: passed, failed and why, or not run."""
+    file = RESULTS / "lerobot_train.json"
+    if not file.is_file():
+        return "Not run yet: `benchmarks/results/lerobot_train.json` is not there."
+    rows = json.loads(file.read_text())
+    versions = sorted({row["lerobot"] for row in rows})
+    found = {(row["set"], row["command"], row["lerobot"]): row for row in rows}
+    cells = []
+    for name, command in dict.fromkeys((row["set"], row["command"]) for row in rows):
+        each = [found.get((name, command, version), {"passed": None, "why": "not run"}) for version in versions]
+        about = next(row["about"] for row in rows if row["set"] == name)
+        said = ["passed" if row["passed"] else row["why"].replace("|", "/") for row in each]
+        shown = f"`--policy.type={command}`" if command in ("act", "diffusion") else command
+        cells.append([name, about, shown, *said])
+    return table(["set", "with", "command", *(f"LeRobot {version}" for version in versions)], cells)
+
+
 def faults_of_captures() -> str:
     """Planted faults of captures: outcomes by fault, over windows and layouts."""
     rows = [row for row in json.loads((RESULTS / "capture_faults.json").read_text()) if row["counted"]]
@@ -589,6 +607,7 @@ TABLES |= {
     "validate": validated,
     "validate real": validated_real,
     "clients": clients,
+    "lerobot train": lerobot_trained,
     "align": partial(
         aligned,
         *("align_study", "align_study_streams", "align_study_rooms"),

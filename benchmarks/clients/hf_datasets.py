@@ -31,17 +31,20 @@ def main(root: str) -> None:
             row["before"] = earlier[image][i]
             row["before_is_pad"] = [row["index"] < GAP or earlier["episode_index"][i] != row["episode_index"]]
         out = [transform(row) for row in rows]
-        return {key: [row[key] for row in out] for key in ("dhtorch.tokens", "dhtorch.tokens_valid", spec["target"])}
+        return {
+            key: [row[key] for row in out]
+            for key in ("observation.dh_tokens", "observation.dh_tokens_valid", spec["target"])
+        }
 
     data.set_transform(extended)
     batch = data[:3]
-    tokens, target = torch.stack(batch["dhtorch.tokens"]), torch.tensor(batch[spec["target"]])
+    tokens, target = torch.stack(batch["observation.dh_tokens"]), torch.tensor(batch[spec["target"]])
     head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
     loss = (head(tokens.flatten(1)) - target).square().mean()
     loss.backward()
     torch.optim.SGD(head.parameters(), 1e-3).step()
     result = {"frames": len(data), "target": spec["target"], "loss": float(loss.detach())}
-    print(json.dumps(result | {"tokens_known": int(torch.stack(batch["dhtorch.tokens_valid"]).sum())}))
+    print(json.dumps(result | {"tokens_known": int(torch.stack(batch["observation.dh_tokens_valid"]).sum())}))
 
 
 if __name__ == "__main__":

@@ -5,7 +5,6 @@ The samples go through LeRobot's own processors: pictures, depth, state and acti
 In an environment that has lerobot and dhtorch:  python benchmarks/clients/lerobot_policy.py DST
 """
 
-import inspect
 import json
 import sys
 
@@ -23,7 +22,7 @@ from dhtorch.transforms import ExtendedDataset
 
 SIDE, HORIZON = 96, 4  # px; frames that are predicted
 ACT = {"dim_model": 64, "dim_feedforward": 64, "n_heads": 2, "device": "cpu"}
-PREFIX = "observation.dh_"  # LeRobot's processors drop what does not begin with observation
+PREFIX = "observation.dh_"  # of what is added to pictures named as LeRobot's: its processors keep such keys alone
 STATE, TOKENS = "observation.state", "observation.environment_state"
 
 
@@ -32,9 +31,8 @@ def main(root: str) -> None:
     keys, target, step = spec["keys"], spec["target"], 1 / spec["fps"]
     window = {keys["image"]: [-2 * step, 0.0], keys["depth"]: [-2 * step, 0.0]}
     window[target] = [k * step for k in range(HORIZON)]
-    metres = {"depth_output_unit": "m"} if "depth_output_unit" in inspect.signature(LeRobotDataset).parameters else {}
-    data = LeRobotDataset("local/set", root=root, delta_timestamps=window, video_backend="pyav", **metres)
-    extended = ExtendedDataset(data, ExtendDepth(**keys, prefix=PREFIX, n=256, tokens_hw=(56, 56)))
+    data = LeRobotDataset("local/set", root=root, delta_timestamps=window, video_backend="pyav")
+    extended = ExtendedDataset(data, ExtendDepth(**{**keys, "depth_unit": "auto"}, n=256, tokens_hw=(56, 56)))
     batch = torch.utils.data.default_collate([extended[i] for i in (2, 3)])
 
     image, depth, stats = keys["image"], keys["depth"], data.meta.stats

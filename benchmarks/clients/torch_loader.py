@@ -43,12 +43,14 @@ def main(root: str, workers: str = "1") -> None:
     loader = DataLoader(data, batch_size=3, num_workers=int(workers), worker_init_fn=one_thread)
     batch = next(iter(loader))
     target = batch[spec["target"]].float()
-    head = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(batch["dhtorch.tokens"][0].numel(), target.shape[1]))
-    loss = (head(batch["dhtorch.tokens"]) - target).square().mean()
+    head = torch.nn.Sequential(
+        torch.nn.Flatten(), torch.nn.Linear(batch["observation.dh_tokens"][0].numel(), target.shape[1])
+    )
+    loss = (head(batch["observation.dh_tokens"]) - target).square().mean()
     loss.backward()
     torch.optim.SGD(head.parameters(), 1e-3).step()
     result = {"frames": len(data), "target": spec["target"], "loss": float(loss.detach())}
-    print(json.dumps(result | {"tokens_known": int(batch["dhtorch.tokens_valid"].sum())}))
+    print(json.dumps(result | {"tokens_known": int(batch["observation.dh_tokens_valid"].sum())}))
 
 
 if __name__ == "__main__":

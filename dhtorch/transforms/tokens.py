@@ -52,6 +52,9 @@ def patch_tokens(
     give the reasons for missing returns, ``hole_none`` being the fraction with a usable return; they sum to 1, or to 0
     in a patch without samples.
 
+    The channels need no statistics of a data set: fractions lie in [0, 1], ``inverse_depth`` and ``sigma`` are 1/m on
+    the same scale in every set: 0 to 4 for depths beyond 0.25 m, 0 in a patch without a depth.
+
     Args:
         merged: sensor and recovered depths, from :func:`dhtorch.pipeline.pair.merge`.
         hole: class of each sample.
