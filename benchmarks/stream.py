@@ -3,7 +3,8 @@
     python benchmarks/stream.py --json benchmarks/results/stream.json
 
 ``auto`` is a whole anchor: the choice among the frames around it, five views and their joining; its peer is ``window``,
-handed five views. ``push`` is the newest frame answered from past ones at 640×480 with 1,024 samples; its peer is the
+handed five views. ``fused`` is that joined with a plane sweep; its peer is the second release's ``auto`` and sweep, without
+filters of the map. ``push`` is the newest frame answered from past ones at 640×480 with 1,024 samples; its peer is the
 same work in OpenCV's stages: the views that the stream asked, each tracked, posed and triangulated. Frames of
 7s_redkitchen_stream_200 (640×480, near limit 2 m) where DHTORCH_DATA is set, else of the built-in room. All sides take
 turns in one process.
@@ -23,8 +24,11 @@ from dhtorch import data, extend
 from dhtorch.data.pairs import candidate_frames, spaced_frames
 from dhtorch.data.recording import Recording
 from dhtorch.experiments.baselines import opencv
+from dhtorch.experiments.baselines.frozen import AUTO_2
 from dhtorch.metrics.holdout import range_split
-from dhtorch.pipeline.presets import AUTO, WINDOW
+from dhtorch.pipeline import dense
+from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS
+from dhtorch.pipeline.presets import AUTO, FUSED, WINDOW
 from dhtorch.pipeline.stream import Stream
 from dhtorch.pytree import stack
 from dhtorch.records import Frame
@@ -69,8 +73,23 @@ def measure(threads: int, options: Any) -> list[dict[str, Any]]:
         with torch.no_grad():
             WINDOW(view(i), five)
 
-    ours, theirs = harness.in_turn([auto, window], repeats=options.repeats, clock=options.clock)
-    rows = [harness.row("auto_reference_view", ours, "window", theirs, n=AUTO.n, batch=1, bar=True)]
+    def fused() -> None:
+        with torch.no_grad():
+            FUSED(view(i), offered)
+
+    def auto_and_sweep() -> None:
+        with torch.no_grad():
+            trace: dict[str, Any] = {}
+            selected = dense.selected_views(AUTO_2(view(i), offered, trace=trace), offered, trace)
+            swept = dense.sweep_views(view(i), selected, AUTO_2, DEFAULT_DENSE_OPTIONS)
+            dense.merge_returns(dense.gate_sweep(swept, DEFAULT_DENSE_OPTIONS), swept.returns)
+
+    sides = harness.in_turn([auto, window, fused, auto_and_sweep], repeats=options.repeats, clock=options.clock)
+    settings = {"n": AUTO.n, "batch": 1, "bar": True}
+    rows = [
+        harness.row("auto_reference_view", sides[0], "window", sides[1], **settings),
+        harness.row("fused_reference_view", sides[2], "auto_2 and its sweep", sides[3], **settings),
+    ]
 
     method = AUTO.replace(n=1024)
     stream = Stream(method)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from dhtorch.pipeline.completion import complete_depth
     from dhtorch.pipeline.method import Method
     from dhtorch.pipeline.pair import merge
-    from dhtorch.pipeline.presets import AUTO, KORNIA, MAP, PAPER, WINDOW, extend
+    from dhtorch.pipeline.presets import AUTO, FUSED, KORNIA, MAP, PAPER, WINDOW, extend
     from dhtorch.pipeline.stream import Stream
     from dhtorch.pytree import collate
     from dhtorch.records import (
@@ -39,6 +39,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AUTO",
+    "FUSED",
     "KORNIA",
     "MAP",
     "PAPER",
@@ -66,7 +67,7 @@ __all__ = [
 ]
 
 #: Public name → module that defines it, if that is not ``records``.
-_HOMES = dict.fromkeys(("AUTO", "KORNIA", "MAP", "PAPER", "WINDOW", "extend"), "pipeline.presets")
+_HOMES = dict.fromkeys(("AUTO", "FUSED", "KORNIA", "MAP", "PAPER", "WINDOW", "extend"), "pipeline.presets")
 _HOMES |= {
     "ExtendDepth": "transforms",
     "Method": "pipeline.method",

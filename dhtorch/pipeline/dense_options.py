@@ -8,7 +8,7 @@ from typing import Final
 
 @dataclass(frozen=True)
 class DenseOptions:
-    """Options of :func:`dhtorch.pipeline.dense.complete_depth`: its tuning constants with their meaning, unit and
+    """Options of :func:`dhtorch.pipeline.completion.complete_depth`: its tuning constants with their meaning, unit and
     origin."""
 
     # Defaults of the keywords of complete_depth
