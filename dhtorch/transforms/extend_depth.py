@@ -36,7 +36,8 @@ class ExtendDepth(torch.nn.Module):
     batch. Without a source view only the front end runs: the sensor's own returns, flags and hole classes.
 
     Args:
-        method: a name (:data:`dhtorch.pipeline.presets.METHODS`) or a :class:`dhtorch.pipeline.method.Method`.
+        method: a name (:data:`dhtorch.pipeline.presets.METHODS`) or a :class:`dhtorch.pipeline.method.Method`; None =
+            ``fused`` with ``dense``, else ``paper``.
         n: samples per image; None = the method's own number.
         hint: prior information on the motion between the views, for the tracker.
         seed: of the pose search. With ``index_key`` each sample has the seed ``seed + sample[index_key]``.
@@ -82,7 +83,7 @@ class ExtendDepth(torch.nn.Module):
     def __init__(
         self,
         *,
-        method: str | Method = "paper",
+        method: str | Method | None = None,
         n: int | None = None,
         hint: TrackHint = NO_HINT,
         seed: int = 0,
@@ -97,7 +98,8 @@ class ExtendDepth(torch.nn.Module):
         **views: Any,
     ) -> None:
         super().__init__()
-        method = get_method(method, n)
+        default = "paper" if dense is False else "fused"
+        method = get_method(default if method is None else method, n)
         if on_error not in ON_ERROR_CHOICES or (batched and on_error == "skip"):
             expected = ("raise", "flag") if batched else ON_ERROR_CHOICES
             raise ValueError(f"on_error is {on_error!r}, expected one of {', '.join(expected)}")
