@@ -53,6 +53,7 @@ PLACES = (
     "pipeline/stream",
     "pipeline/dense",
     "pipeline/surface",
+    "pipeline/map_filters",
     "ops/loader",
     "ops/dispatch",
     "alignment",

@@ -5,7 +5,8 @@
 
 ``triptych`` and ``viewer`` show holo_a below DHTORCH_DATA (HoloLens frames of ardaduz/deep-video-mvs, MIT), returns
 beyond 2.5 m hidden; ``viewer`` is the page of ``dhtorch view``, turned by a headless Chromium; ``risk`` is drawn from
-``benchmarks/results/method_comparison.json``.
+``benchmarks/results/method_comparison.json``. ``maps`` shows dense maps before and after their filters: four built-in
+rooms, holo_a and holo_stream (MIT), tum_fr1_desk9 (TUM, CC BY 4.0) and the three cameras of dgp_drive6cam (MIT).
 """
 
 from __future__ import annotations
@@ -22,13 +23,18 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
+import hydra
 import numpy as np
 import torch
+from hydra.utils import instantiate
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from PIL import Image
 
 from dhtorch import calibration, data
+from dhtorch.cli.run import config_dir
 from dhtorch.codes import Source
 from dhtorch.data.pairs import by_choice
 from dhtorch.data.scene import Scene
@@ -39,6 +45,7 @@ from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.completion import complete_depth
 from dhtorch.pipeline.presets import AUTO
 from dhtorch.pytree import stack
+from dhtorch.synthetic.recording import open_rooms
 from dhtorch.viz.plots import Axis, LegendKey, Panel, Stroke, colours, save_figure
 from dhtorch.viz.viewer import html
 
@@ -50,6 +57,14 @@ CUTOFF, FRAME = 2.5, 0
 
 #: Depths of one colour scale, m.
 DEPTHS = (1.0, 6.0)
+
+#: Scenes of the contact sheet besides the rooms, those whose licences allow it.
+SHEET_SCENES = (
+    "holo_a",
+    "holo_stream",
+    "tum_fr1_desk9",
+    *(f"dgp_drive6cam/CAMERA_0{k}" for k in (1, 5, 7)),
+)
 
 CHROMIUM = ("chromium", "chromium-browser", "chromium-headless-shell", "google-chrome")
 
@@ -94,6 +109,38 @@ def triptych(path: Path) -> None:
     figure.subplots_adjust(wspace=0.03)
     figure.colorbar(shown, ax=axes, label="depth, m", shrink=0.78, pad=0.01)
     figure.savefig(path, dpi=90, bbox_inches="tight", pil_kwargs={"quality": 88})
+
+
+def maps(path: Path) -> None:
+    """Contact sheet: picture, sensor, swept map before and after the filters, of the middle frame of ten scenes."""
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        shown = [hydra.compose("run", [f"data={name}"]) for name in ("shared_scenes", "streams")]
+    scenes = [scene for cfg in shown for scene in instantiate(cfg.data, _convert_="all") if scene.name in SHEET_SCENES]
+    scenes += open_rooms(paths=["walk"], seed=[100, 101, 102, 103])
+    figure = Figure((16, 3 * len(scenes)), facecolor=colours.PICTURE)
+    axes = figure.subplots(len(scenes), 4)
+    for scene, row in zip(scenes, axes, strict=True):
+        pairs = by_choice(scene, stride=1)
+        pair = pairs[len(pairs) // 2]
+        near = range_split(scene.recording[pair.reference], scene.near)
+        others = stack([range_split(scene.recording[k], scene.near) for k in pair.candidates])
+        trace: dict[str, Any] = {}
+        selected = dense.selected_views(AUTO(near, others, trace=trace), others, trace)
+        with mock.patch.object(dense, "filter_map", lambda swept, *_: swept):
+            before = dense.sweep_depth(near, selected)
+        after = dense.sweep_depth(near, selected)
+        low, high = np.nanpercentile(after.depth.numpy(), (1, 99))
+        norm = LogNorm(low, high)
+        row[0].imshow(near.image[0].permute(1, 2, 0), cmap=colours.GREY_CMAP)
+        sensed = torch.where(after.source == Source.SENSOR, after.depth, torch.nan)
+        for axis, depth in zip(row[1:], (sensed, before.depth, after.depth), strict=True):
+            axis.imshow(depth[0], cmap=colours.DEPTH_CMAP, norm=norm, interpolation="nearest")
+        titles = (f"{scene.name}, frame {int(scene.recording.number[pair.reference])}", f"sensor to {scene.near:g} m")
+        for axis, title in zip(row, (*titles, "swept", "filtered"), strict=True):
+            axis.set_title(title, fontsize=9)
+            axis.axis("off")
+    figure.subplots_adjust(wspace=0.02, hspace=0.12)
+    figure.savefig(path, dpi=75, bbox_inches="tight", pil_kwargs={"quality": 80})
 
 
 def risk(path: Path) -> None:
@@ -171,7 +218,7 @@ def viewer(path: Path, frames: int = 40, height: int = 450) -> None:
     )
 
 
-PICTURES = {"triptych": (triptych, "jpg"), "risk": (risk, "png"), "viewer": (viewer, "webp")}
+PICTURES = {"triptych": (triptych, "jpg"), "maps": (maps, "jpg"), "risk": (risk, "png"), "viewer": (viewer, "webp")}
 
 
 def main() -> int:

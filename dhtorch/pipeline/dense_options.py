@@ -136,6 +136,10 @@ class DenseOptions:
 
     # Filters of the map
 
+    #: Stride of the pixels from whose returns the sensor's reach is taken, px; it reaches all rows and columns alike.
+    #: Source: as ``motion_stride_px``.
+    reach_stride_px: int = 17
+
     #: Fraction of the sensor's reach within which its silence speaks against a foreground.
     #: Source: chosen on built-in rooms: returns thin out in the last tenth of the reach.
     halo_reach: float = 0.99
@@ -156,7 +160,7 @@ class DenseOptions:
     #: Source: chosen on built-in rooms.
     step_sigmas: float = 2.0
 
-    #: Difference of grey values at which two pixels are 1/e as similar as equal ones.
+    #: Difference of grey values at which two pixels are half as similar as equal ones.
     #: Source: chosen on built-in rooms.
     grey_similarity: float = 0.06
 

@@ -67,7 +67,6 @@ def filter_map(
     swept: DepthMap,
     returns: SensorReturns,
     grey: Tensor,
-    reach: Tensor,
     sparse: Tensor | None = None,
     options: DenseOptions = DEFAULT_DENSE_OPTIONS,
 ) -> DepthMap:
@@ -77,7 +76,6 @@ def filter_map(
         swept: map (B, h, w) before the merge.
         returns: of the same pixels.
         grey: (B, h, w) in [0, 1], the picture at the same pixels.
-        reach: (B,) m, depth to which the sensor returns.
         sparse: (B,) bool, whether the returns are sparse: then a missing one is no evidence.
         options: tuning constants.
 
@@ -85,7 +83,8 @@ def filter_map(
     Cost: reads windows of some hundred pixels around the pixels beside depth steps and in pinholes, and makes
     ``speck_px`` passes over the map.
     """
-    within = returns.usable & (returns.depth.detach() < options.halo_reach * reach[:, None, None])
+    reach = _reach(returns, options)[:, None, None]
+    within = returns.usable & (returns.depth.detach() < options.halo_reach * reach)
     within = within if sparse is None else within & ~sparse[:, None, None]
     grey = grey.detach()
     swept = _silence(swept, _halo(_known(swept, returns), within, options))
@@ -101,6 +100,15 @@ def filter_map(
         source=swept.source.masked_fill(where, Source.FILLED),
         gate=swept.gate.masked_fill(where, Gate.ANSWER),
     )
+
+
+def _reach(returns: SensorReturns, options: DenseOptions) -> Tensor:
+    """Depth (B,) m to which the sensor returns, by every ``reach_stride_px``-th pixel; 0 without returns."""
+    usable, depth = (v.flatten(1)[:, :: options.reach_stride_px] for v in (returns.usable, returns.depth.detach()))
+    depth = torch.where(usable, depth, torch.inf).sort(-1).values
+    n = usable.sum(-1)
+    rank = (options.reach_quantile * (n - 1).clamp_min(0)).long()
+    return torch.where(n > 0, depth.gather(-1, rank[:, None])[:, 0], 0.0)
 
 
 @torch.no_grad()
@@ -157,7 +165,7 @@ def _has_neighbour(q: Tensor, which: Tensor, of: Tensor, radius: int, ratio: flo
 def _fattened(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
     """Swept pixels (B, h, w) bool beside something farther, which they resemble more than their own surface.
 
-    Compared are mean similarities, exp(-difference of grey values / ``grey_similarity``), to the answered pixels of the
+    Compared are mean similarities, 1 / (1 + (difference of grey values / ``grey_similarity``)²), to the answered pixels of the
     window at the pixel's depth or nearer, and to the farther ones.
     """
     q, sigma, _, swept = known
@@ -170,7 +178,7 @@ def _fattened(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
     near, far, n_near, n_far = (torch.zeros_like(own) for _ in range(4))
     for dy, dx in _window(r):
         other = depths[b, y + dy, x + dx]
-        alike = torch.exp((shades[b, y + dy, x + dx] - shade).abs() / -options.grey_similarity)
+        alike = 1 / (1 + ((shades[b, y + dy, x + dx] - shade) / options.grey_similarity).square())
         is_near, is_far = other * ratio > own, (other > 0) & (other * ratio < own)
         near, n_near = near + alike * is_near, n_near + is_near
         far, n_far = far + alike * is_far, n_far + is_far
@@ -256,10 +264,14 @@ def _fill(known: _Known, within: Tensor, options: DenseOptions) -> tuple[Tensor,
     fits = ~refuted & (n >= options.min_rim_pixels) & (q > _MIN_INVERSE_DEPTH) & (distance.amax(0) <= limit)
     where, filled, spread = torch.zeros_like(answered), torch.ones_like(known.q), torch.zeros_like(known.q)
     where[b, y, x] = fits
+    silent = ~(answered | where)
+    for dy, dx in _SIDES:  # beside a pixel that stays silent it would be the edge of an island in a larger hole
+        where &= ~_shift(silent, dy, dx)
     both = answered | where
     where &= _in_block(both[:, 1:, 1:] & both[:, 1:, :-1] & both[:, :-1, 1:] & both[:, :-1, :-1])
     filled[b, y, x] = torch.where(fits, q, 1.0)
-    spread[b, y, x] = sigma + (distance.square().sum(0) / n).sqrt()
+    square = sum((one.square() for one in distance), torch.zeros_like(q))
+    spread[b, y, x] = sigma + (square / n).sqrt()
     return where, filled, spread
 
 

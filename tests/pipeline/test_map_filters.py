@@ -30,6 +30,10 @@ class Planted:
         if grey is not None:
             self.grey[part] = grey
 
+    def reach_out(self):
+        """A corner of returns at the end of the sensor's reach."""
+        self.plant(slice(40, None), slice(0, 10), REACH, returned=True, grey=0.1)
+
     def maps(self):
         keep, nan = self.answered, torch.full_like(self.depth, torch.nan)
         depth = torch.where(keep, self.depth, nan)
@@ -41,7 +45,7 @@ class Planted:
 
     def filtered(self, sparse=None):
         swept, returns = self.maps()
-        return filter_map(swept, returns, self.grey, torch.tensor([REACH]), sparse)
+        return filter_map(swept, returns, self.grey, sparse)
 
 
 def changed(planted, found):
@@ -69,6 +73,7 @@ def test_a_clean_map_keeps_its_bits():
 
 def test_a_halo_beside_returns_is_silent_and_a_surface_that_goes_on_is_not():
     planted = Planted()
+    planted.reach_out()
     planted.plant(slice(20, 40), slice(30, 50), 1.5, returned=True)
     planted.plant(slice(14, 20), slice(30, 50), 1.55)
     planted.depth[0, 20:40, 50:] = 1.5  # the box goes on to the border, where the sensor is silent
@@ -82,6 +87,7 @@ def test_a_halo_beside_returns_is_silent_and_a_surface_that_goes_on_is_not():
 
 def test_a_halo_stays_where_the_sensor_does_not_reach():
     planted = Planted()
+    planted.reach_out()
     planted.plant(slice(20, 40), slice(30, 50), 2.99, returned=True, grey=0.9)  # at the end of its reach
     planted.plant(slice(14, 20), slice(30, 50), 3.0, grey=0.9)
     assert not changed(planted, planted.filtered())[14:20, 30:50].any()
@@ -174,6 +180,7 @@ def test_gaps_amid_returns_are_filled_however_long():
 def test_a_wider_silence_amid_returns_is_no_pinhole():
     planted = Planted(2.0)
     planted.plant(slice(None), slice(None), 2.0, returned=True)
+    planted.reach_out()
     for row, width in ((5, 5), (20, 6), (40, 8)):
         planted.returned[0, row : row + width, 30:38] = planted.answered[0, row : row + width, 30:38] = False
     filled = planted.filtered().source[0] == Source.FILLED
@@ -185,6 +192,7 @@ def test_each_map_of_a_batch_is_filtered_as_if_alone():
     first, second = Planted(), Planted()
     first.plant(slice(20, 24), slice(30, 36))
     second.depth *= 1 + 0.3 * torch.rand(1, H, W, generator=torch.Generator().manual_seed(0))
+    second.reach_out()
     second.plant(slice(20, 40), slice(30, 50), 1.5, returned=True, grey=0.9)
     second.plant(slice(14, 20), slice(30, 50), 1.55)
     parts = [planted.maps() for planted in (first, second)]
@@ -193,7 +201,7 @@ def test_each_map_of_a_batch_is_filtered_as_if_alone():
     )
     returns = SensorReturns(*(torch.cat(columns) for columns in zip(*(r for _, r in parts), strict=True)))
     grey = torch.cat([first.grey, second.grey])
-    both = filter_map(swept, returns, grey, torch.tensor([REACH, REACH]))
+    both = filter_map(swept, returns, grey)
     for b, planted in enumerate((first, second)):
         alone = planted.filtered()
         for name in ("depth", "sigma", "score", "source", "gate"):
@@ -205,7 +213,7 @@ def test_kept_depths_keep_their_gradient_and_filled_ones_have_none():
     planted.plant(slice(20, 24), slice(30, 36))
     swept, returns = planted.maps()
     depth = swept.depth.requires_grad_()
-    found = filter_map(swept.replace(depth=depth), returns, planted.grey, torch.tensor([REACH]))
+    found = filter_map(swept.replace(depth=depth), returns, planted.grey)
     found.depth.sum().backward()
     hole = box(slice(20, 24), slice(30, 36))
     assert (depth.grad[0][~hole] == 1).all() and (depth.grad[0][hole] == 0).all()
