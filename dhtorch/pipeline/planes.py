@@ -172,20 +172,13 @@ def _cell_sums(x: Tensor, options: DenseOptions) -> Tensor:
     h, w = x.shape[1:]
     x = F.pad(x, (0, -w % side, 0, -h % side))
     for dim in (1, 2):
-        x = sum_in_order(x.unflatten(dim, (-1, side)).movedim(dim + 1, 1))
+        x = _sums(x.unflatten(dim, (-1, side)).movedim(dim + 1, 1))
     return x
 
 
-def sum_in_order(x: Tensor) -> Tensor:
-    """Sums (B, …) over the second axis of (B, S, …), of halves: their rounding does not depend on the other axes.
-
-    Gradient: to x.
-    """
-    while (n := x.shape[1]) > 1:
-        rest = x[:, n - 1 :]
-        x = x[:, : n // 2] + x[:, n // 2 : n - n % 2]
-        x = torch.cat([x, rest], 1) if n % 2 else x
-    return x[:, 0]
+def _sums(x: Tensor) -> Tensor:
+    """Sums (B, …) over the second axis of (B, S, …), view by view: their rounding depends on no batch mate."""
+    return torch.stack([view.sum(0) for view in x])
 
 
 def _cell_middles(cells: _Cells, options: DenseOptions) -> tuple[Tensor, Tensor]:
@@ -253,8 +246,11 @@ def _best_hypothesis(support: _Support, options: DenseOptions) -> Tensor:
 
     Source: P. Torr, A. Zisserman, "MLESAC" (CVIU 2000), the truncated score.
     """
-    blocks = [_Support(*part) for part in zip(*(x.split(CELLS_PER_BLOCK, 2) for x in support), strict=True)]
-    return torch.cat([_cheapest_plane(block, options) for block in blocks], 2)
+    rows = []
+    for view in zip(*(x.split(1) for x in support), strict=True):  # the sums then depend on no batch mate
+        blocks = zip(*(x.split(CELLS_PER_BLOCK, 2) for x in view), strict=True)
+        rows.append(torch.cat([_cheapest_plane(_Support(*block), options) for block in blocks], 2))
+    return torch.cat(rows)
 
 
 def _cheapest_plane(support: _Support, options: DenseOptions) -> Tensor:
@@ -274,7 +270,7 @@ def _cheapest_plane(support: _Support, options: DenseOptions) -> Tensor:
         a, b = (dq[0] * dy[1] - dy[0] * dq[1]) / area, (dx[0] * dq[1] - dq[0] * dx[1]) / area
         c = q[:, i] - a * x[:, i] - b * y[:, i]
         residual = _residual((a, b, c), terms)
-        cost = sum_in_order(residual.mul_(residual).clamp_max_(1))
+        cost = residual.mul_(residual).clamp_max_(1).sum(1)
         better = valid & (c > 0) & (cost < least)
         least = torch.where(better, cost, least)
         plane = [torch.where(better, new, old) for new, old in zip((a, b, c), plane, strict=True)]
@@ -305,7 +301,7 @@ def _least_squares(support: _Support, inlier: Tensor, options: DenseOptions) -> 
     n = inlier.sum(1).to(support.q)
 
     def mean(x: Tensor) -> Tensor:
-        return sum_in_order(torch.where(inlier, x, torch.zeros_like(x))) / n.clamp_min(1)
+        return _sums(torch.where(inlier, x, torch.zeros_like(x))) / n.clamp_min(1)
 
     x_0, y_0, q_0 = mean(support.x.detach()), mean(support.y.detach()), mean(support.q)
     dx, dy, dq = support.x - x_0[:, None], support.y - y_0[:, None], support.q - q_0[:, None]

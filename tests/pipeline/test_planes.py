@@ -133,14 +133,14 @@ def test_without_support_all_is_silent():
     assert int(filled(depth, none).keep.sum()) == 256
 
 
-def test_sigma_grows_with_the_distance_until_the_plane_ends():
-    depth = slanted((120, 320))
-    silent = torch.arange(320).expand(1, 120, 320) >= 100
-    after = filled(depth, silent, max_plane_sigma_rel=0.03)
+def test_sigma_grows_away_from_the_support_until_the_plane_ends():
+    depth, hole = slanted(), square(top=40, bottom=80, left=0, right=56)
+    after = filled(depth, hole, max_plane_sigma_rel=0.03)
     share = (after.sigma / after.depth)[0, 60]
-    reached = int(after.keep[0, 60].sum())
-    assert 110 < reached < 320 and not bool(after.keep[0, :, reached + 32 :].any())
-    assert float(share[reached - 4]) > 1.2 * float(share[104])
+    assert bool(after.keep[hole].all()) and float(share[0]) > 1.2 * float(share[40])
+    assert bool((share[8:16].diff() < 0).all())  # within a cell too
+    open_side = torch.arange(HW[1]).expand(1, *HW) >= 80
+    assert not bool(filled(depth, open_side).keep[..., 88:].any())
 
 
 def test_sigma_is_that_of_the_errors():
@@ -202,3 +202,13 @@ def test_the_gradient_reaches_the_support():
     assert not after.sigma[hole].requires_grad or not bool(
         torch.autograd.grad(after.sigma[hole].sum(), depth, allow_unused=True)[0][hole].any()
     )
+
+
+def test_silence_before_a_foreground_refutes_a_plane_to_the_background():
+    depth, hole = slanted(a=-2e-3, b=0.0, c=0.6), square()
+    left = (torch.arange(HW[1]) < 50).expand(1, *HW)
+    beyond = hole & (depth > 2.25)
+    bridged = filled(depth, hole | left, usable=left, reach=2.2, max_refuted_rays=1.0)
+    refuted = filled(depth, hole | left, usable=left, reach=2.2)
+    assert float(bridged.keep[beyond].float().mean()) > 0.9
+    assert float(refuted.keep[beyond].float().mean()) < 0.5 * float(bridged.keep[beyond].float().mean())
