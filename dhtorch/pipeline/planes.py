@@ -23,7 +23,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.codes import Gate, Source
+from dhtorch.geometry.checks import any_possible
 from dhtorch.geometry.linalg import quadratic_form
+from dhtorch.geometry.windows import window_extreme
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.map_filters import SensorReturns
 from dhtorch.records import DepthMap
@@ -118,12 +120,16 @@ def fill_planes(
     Gradient: of filled depths to the depths of their support; its selection and sigma carry none.
     Cost: linear in pixels; independent of the number of planes and source views.
     """
+    has_sweep = support.keep.flatten(1).any(1)[:, None, None]
+    silent = has_sweep & ~swept.keep & ~returns.usable
+    if not any_possible(silent):
+        return swept
     cells = _cells(*_known(support, returns), grey[:, 0].detach().to(swept.depth), options)
     with torch.no_grad():
         slots = _support_slots(cells, options)
     middle = _cell_middles(cells, options)
     supports = _take(cells, slots, middle)
-    planes = _fit_planes(supports, options)
+    planes = _fit_planes(supports, _wanted(silent, options), options)
     accepted, disagreement = _tested(planes, supports, cells.answered.shape, options)
     dense = torch.ones_like(reach, dtype=torch.bool) if sparse is None else ~sparse
     reach = torch.where(dense, options.plane_reach * reach, 0.0).to(swept.depth)
@@ -132,8 +138,7 @@ def fill_planes(
     accepted = _per_pixel(accepted, swept.depth.shape, options)
     within_reach = q * reach[:, None, None] > 1
     plausible = (q > MIN_PLANE_INVERSE_DEPTH) & (relative <= options.max_sigma_rel)
-    has_sweep = support.keep.flatten(1).any(1)[:, None, None]
-    where = accepted & plausible & ~within_reach & has_sweep & ~swept.keep & ~returns.usable
+    where = silent & accepted & plausible & ~within_reach
     return _answer(swept, where, 1 / torch.where(where, q, torch.ones_like(q)), relative)
 
 
@@ -240,17 +245,25 @@ def _triples(per_ray: int) -> list[tuple[int, int, int]]:
     return out
 
 
+def _wanted(silent: Tensor, options: DenseOptions) -> Tensor:
+    """Cells (B, N) bool with pixels to fill, and those around whose planes are compared."""
+    to_fill = _cell_sums(silent.float(), options) > 0
+    return window_extreme(to_fill, options.plane_neighbours, torch.logical_or).flatten(1)
+
+
 @torch.no_grad()
-def _best_hypothesis(support: _Support, options: DenseOptions) -> Tensor:
-    """Support cells (B, S, N) bool on the plane through three of them that costs least, by truncated squares.
+def _best_hypothesis(support: _Support, wanted: Tensor, options: DenseOptions) -> Tensor:
+    """Support cells (B, S, N) bool on the plane through three of them that costs least, by truncated squares, of
+    ``wanted`` cells (B, N) bool; none of the others.
 
     Source: P. Torr, A. Zisserman, "MLESAC" (CVIU 2000), the truncated score.
     """
-    rows = []
-    for view in zip(*(x.split(1) for x in support), strict=True):  # the sums then depend on no batch mate
-        blocks = zip(*(x.split(CELLS_PER_BLOCK, 2) for x in view), strict=True)
-        rows.append(torch.cat([_cheapest_plane(_Support(*block), options) for block in blocks], 2))
-    return torch.cat(rows)
+    inlier = torch.zeros_like(support.exists)
+    for k in range(len(wanted)):  # view by view: the sums then depend on no batch mate
+        for index in wanted[k].nonzero()[:, 0].split(CELLS_PER_BLOCK):
+            block = _Support(*(x[k : k + 1, :, index] for x in support))
+            inlier[k : k + 1, :, index] = _cheapest_plane(block, options)
+    return inlier
 
 
 def _cheapest_plane(support: _Support, options: DenseOptions) -> Tensor:
@@ -284,9 +297,10 @@ def _residual(plane: Sequence[Tensor], terms: tuple[Tensor, ...]) -> Tensor:
     return (a * x).addcmul_(b, y).addcmul_(c, one).sub_(q)
 
 
-def _fit_planes(support: _Support, options: DenseOptions) -> _Planes:
-    """The plane of the best hypothesis, fitted to its support twice: the second time to that of the first fit."""
-    inlier = _best_hypothesis(support, options)
+def _fit_planes(support: _Support, wanted: Tensor, options: DenseOptions) -> _Planes:
+    """The plane of the best hypothesis, fitted to its support twice: the second time to that of the first fit; without
+    support in cells that are not ``wanted`` (B, N) bool."""
+    inlier = _best_hypothesis(support, wanted, options)
     with torch.no_grad():
         planes = _least_squares(support, inlier, options)
         residual = planes.at(support.x.movedim(1, 0), support.y.movedim(1, 0)).movedim(0, 1) - support.q
