@@ -52,6 +52,7 @@ PLACES = (
     "pipeline/view_selection",
     "pipeline/stream",
     "pipeline/dense",
+    "pipeline/planes",
     "pipeline/surface",
     "pipeline/map_filters",
     "ops/loader",

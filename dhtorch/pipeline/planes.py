@@ -303,10 +303,9 @@ def _fit_planes(support: _Support, wanted: Tensor, options: DenseOptions) -> _Pl
     inlier = _best_hypothesis(support, wanted, options)
     with torch.no_grad():
         planes = _least_squares(support, inlier, options)
-        residual = planes.at(support.x.movedim(1, 0), support.y.movedim(1, 0)).movedim(0, 1) - support.q
-        inlier = (
-            inlier.any(1, keepdim=True) & support.exists & (residual.abs() < options.plane_inlier_ratio * support.q)
-        )
+        q = planes.at(support.x.movedim(1, 0), support.y.movedim(1, 0)).movedim(0, 1)
+        near = (q - support.q).abs() < options.plane_inlier_ratio * support.q
+        inlier = inlier.any(1, keepdim=True) & support.exists & near
     return _least_squares(support, inlier, options)
 
 

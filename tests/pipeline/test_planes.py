@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from dhtorch.codes import Gate, Source
-from dhtorch.pipeline.dense_options import DenseOptions
+from dhtorch.pipeline import planes
+from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.pipeline.map_filters import SensorReturns
 from dhtorch.pipeline.planes import fill_planes
 from dhtorch.records import DepthMap
@@ -158,6 +159,7 @@ def test_sigma_is_that_of_the_errors():
 def test_the_sensors_silence_refutes_a_plane_within_its_reach():
     depth, hole = slanted(), square()
     assert not bool(filled(depth, hole, reach=6.0).keep[hole].any())
+    assert not bool(filled(depth, hole, reach=6.0, max_refuted_rays=1.0).keep[hole].any())
     sparse = torch.ones(1, dtype=torch.bool)
     assert bool(filled(depth, hole, reach=6.0, sparse=sparse).keep[hole].all())
 
@@ -213,3 +215,57 @@ def test_silence_before_a_foreground_refutes_a_plane_to_the_background():
     refuted = filled(depth, hole | left, usable=left, reach=2.2)
     assert float(bridged.keep[beyond].float().mean()) > 0.9
     assert float(refuted.keep[beyond].float().mean()) < 0.5 * float(bridged.keep[beyond].float().mean())
+
+
+def test_a_surface_that_leaves_the_sensors_reach_is_not_refuted():
+    depth = slanted(a=-2e-3, b=0.0, c=0.6)
+    returns = (torch.arange(HW[1]) < 64).expand(1, *HW)  # to the last cell within the reach
+    hole = square(left=64, right=100)
+    after = filled(depth, hole | returns, usable=returns, reach=2.2)
+    assert float(after.keep[hole & (depth > 2.2)].float().mean()) > 0.6
+
+
+def test_a_step_needs_a_majority_and_widens_sigma():
+    depth = torch.full((1, *HW), 2.0)
+    depth[..., 75:] = 3.0
+    hole = square()
+    loose = {"max_plane_disagreement": 1.0, "min_plane_share": 0.2, "max_plane_sigma_rel": 0.03}
+    some, all_ = (filled(depth, hole, **{**loose, "min_plane_share": share}) for share in (0.8, 0.2))
+    assert int(some.keep.sum()) < int(all_.keep.sum())
+    beside = all_.keep & square(left=64, right=88)
+    assert float((all_.sigma / all_.depth)[beside].median()) > 0.04
+
+
+def test_few_cells_are_no_support():
+    depth, silent = slanted(), torch.ones(1, *HW, dtype=torch.bool)
+    silent[:, 24:96:24, 24:136:24] = False  # one pixel of a cell each
+    few = {"min_cell_pixels": 1, "max_plane_sigma_rel": 0.1, "max_plane_disagreement": 1.0}
+    sets = [int(filled(depth, silent, min_plane_support=n, **few).keep.sum()) for n in (4, 40)]
+    assert sets[0] > sets[1] == int((~silent).sum())
+
+
+def test_support_lies_along_the_rays_from_the_nearest():
+    answered = torch.ones(1, 9, 12, dtype=torch.bool)
+    cells = planes._Cells(*[torch.zeros(1, 9, 12)] * 4, answered, torch.zeros(1, 9, 12))
+    slots = planes._support_slots(cells, DEFAULT_DENSE_OPTIONS)[0, :, 4 * 12 + 5].unflatten(0, (16, 4))
+    assert slots[0].tolist() == [54, 55, 56, 57] and slots[4].tolist() == [65, 77, 89, 101]
+    assert slots[8].tolist() == [52, 51, 50, 49] and slots[2].tolist() == [66, 66, 79, 92]
+
+
+def test_the_fit_is_least_squares_with_its_covariance():
+    g = torch.Generator().manual_seed(5)
+    x, y = (40 * torch.randn(1, 64, 7, generator=g).double() for _ in range(2))
+    q = 0.3 + 4e-4 * x - 2e-4 * y + 0.002 * torch.randn(1, 64, 7, generator=g)
+    exists = torch.rand(1, 64, 7, generator=g) > 0.3
+    support = planes._Support(x, y, q, torch.zeros_like(q), exists)
+    wanted = torch.ones(1, 7, dtype=torch.bool)
+    got = planes._fit_planes(support, wanted, DEFAULT_DENSE_OPTIONS)
+    assert torch.equal(got.n[0], exists[0].sum(0).double())
+    for k in range(7):
+        use = exists[0, :, k]
+        rows = torch.stack([x[0, use, k], y[0, use, k], torch.ones_like(x[0, use, k])], 1)
+        expected = torch.linalg.lstsq(rows, q[0, use, k, None]).solution[:, 0]
+        at = torch.tensor([7.0, -5.0, 1.0]).double()
+        here, there = (torch.full((1, 7), float(v)).double() for v in at[:2])
+        torch.testing.assert_close(got.at(here, there)[0, k], at @ expected)
+        torch.testing.assert_close(got.leverage(here, there)[0, k], at @ torch.linalg.inv(rows.T @ rows) @ at)
