@@ -121,15 +121,15 @@ def fill_planes(
     Cost: linear in pixels; independent of the number of planes and source views.
     """
     has_sweep = support.keep.flatten(1).any(1)[:, None, None]
-    silent = has_sweep & ~swept.keep & ~returns.usable
-    if not any_possible(silent):
+    unanswered = has_sweep & ~swept.keep & ~returns.usable
+    if not any_possible(unanswered):
         return swept
     cells = _cells(*_known(support, returns), grey[:, 0].detach().to(swept.depth), options)
     with torch.no_grad():
         slots = _support_slots(cells, options)
     middle = _cell_middles(cells, options)
     supports = _take(cells, slots, middle)
-    planes = _fit_planes(supports, _wanted(silent, options), options)
+    planes = _fit_planes(supports, _wanted(unanswered, options), options)
     accepted, disagreement = _tested(planes, supports, cells.answered.shape, options)
     dense = torch.ones_like(reach, dtype=torch.bool) if sparse is None else ~sparse
     reach = torch.where(dense, options.plane_reach * reach, 0.0).to(swept.depth)
@@ -138,7 +138,7 @@ def fill_planes(
     accepted = _per_pixel(accepted, swept.depth.shape, options)
     within_reach = q * reach[:, None, None] > 1
     plausible = (q > MIN_PLANE_INVERSE_DEPTH) & (relative <= options.max_sigma_rel)
-    where = silent & accepted & plausible & ~within_reach
+    where = unanswered & accepted & plausible & ~within_reach
     return _answer(swept, where, 1 / torch.where(where, q, torch.ones_like(q)), relative)
 
 
@@ -205,7 +205,7 @@ def _support_slots(cells: _Cells, options: DenseOptions) -> Tensor:
     rays = []
     for k in range(_DIRECTIONS):
         angle = 2 * math.pi * k / _DIRECTIONS
-        found = torch.full((per_ray, *cells.q.shape), -1, dtype=torch.int32, device=cells.q.device)
+        support = torch.full((per_ray, *cells.q.shape), -1, dtype=torch.int32, device=cells.q.device)
         count = torch.zeros_like(cells.answered, dtype=torch.int32)
         open_ = torch.ones_like(cells.answered)
         for r in range(1, reach + 1):
@@ -214,9 +214,9 @@ def _support_slots(cells: _Cells, options: DenseOptions) -> Tensor:
             open_ = open_ & ((grey[place] - cells.grey).abs() <= options.plane_grey_difference)
             take = open_ & answered[place]
             for slot in range(per_ray):
-                found[slot] = torch.where(take & (count == slot), index[place], found[slot])
+                support[slot] = torch.where(take & (count == slot), index[place], support[slot])
             count = count + take.to(count.dtype)
-        rays.append(found)
+        rays.append(support)
     return torch.cat(rays).transpose(0, 1).flatten(2).long()
 
 
@@ -245,9 +245,9 @@ def _triples(per_ray: int) -> list[tuple[int, int, int]]:
     return out
 
 
-def _wanted(silent: Tensor, options: DenseOptions) -> Tensor:
+def _wanted(unanswered: Tensor, options: DenseOptions) -> Tensor:
     """Cells (B, N) bool with pixels to fill, and those around whose planes are compared."""
-    to_fill = _cell_sums(silent.float(), options) > 0
+    to_fill = _cell_sums(unanswered.float(), options) > 0
     return window_extreme(to_fill, options.plane_neighbours, torch.logical_or).flatten(1)
 
 
@@ -316,7 +316,7 @@ def _least_squares(support: _Support, inlier: Tensor, options: DenseOptions) -> 
     def mean(x: Tensor) -> Tensor:
         return _sums(torch.where(inlier, x, torch.zeros_like(x))) / n.clamp_min(1)
 
-    x_0, y_0, q_0 = mean(support.x.detach()), mean(support.y.detach()), mean(support.q)
+    x_0, y_0, q_0 = (mean(values) for values in (support.x.detach(), support.y.detach(), support.q))
     dx, dy, dq = support.x - x_0[:, None], support.y - y_0[:, None], support.q - q_0[:, None]
     xx, xy, yy, xq, yq = (mean(product) for product in (dx * dx, dx * dy, dy * dy, dx * dq, dy * dq))
     det = (xx * yy - xy * xy).clamp_min((options.plane_cell_px**2 / 12) ** 2)  # at least the scatter within one cell
@@ -324,7 +324,17 @@ def _least_squares(support: _Support, inlier: Tensor, options: DenseOptions) -> 
     residual = (a[:, None] * dx + b[:, None] * dy - dq).detach() / support.q.detach().clamp_min(MIN_PLANE_INVERSE_DEPTH)
     scale = 1 / (det * n.clamp_min(1))
     inverse = yy * scale, -xy * scale, xx * scale
-    return _Planes(q_0, x_0, y_0, a, b, n, inverse, mean(residual.square()).sqrt(), mean(support.variance))
+    return _Planes(
+        q_0=q_0,
+        x_0=x_0,
+        y_0=y_0,
+        a=a,
+        b=b,
+        n=n,
+        inverse=inverse,
+        residual=mean(residual.square()).sqrt(),
+        common=mean(support.variance),
+    )
 
 
 @torch.no_grad()
