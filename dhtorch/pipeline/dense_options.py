@@ -245,7 +245,7 @@ class DenseOptions:
 
     #: Largest standard deviation of a plane at the middle of its cell, relative, by independent errors of its support.
     #: Source: chosen on built-in rooms and shared scenes.
-    max_plane_sigma_rel: float = 0.01
+    max_plane_sigma_rel: float = 0.012
 
     #: Cells around whose planes are compared.
     #: Source: chosen: a plane that fits by chance ends within two cells.
