@@ -4,7 +4,17 @@ WHOLE = ["tests/cli/test_enrich.py", "tests/extract/test_enrich_guarantees.py"]
 
 TESTS: dict[str, list[str]] = {
     f"extract.{name}": WHOLE
-    for name in ("cut", "enriched", "instants", "nerf_target", "origin", "robot_target", "step_set", "targets")
+    for name in (
+        "cut",
+        "enriched",
+        "instants",
+        "nerf_target",
+        "origin",
+        "pixel_columns",
+        "robot_target",
+        "step_set",
+        "targets",
+    )
 }
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
@@ -61,6 +71,12 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     "extract.targets": [
         ("MapCounts.summary", "max(1, pixels[at].sum())", "1"),
         ("MapCounts.summary", "pixels.sum(0)", "pixels[0]"),
-        ("MapCounts.of_maps", "slice(0, 1), slice(1, 2)", "slice(1, 2), slice(0, 1)"),
+        ("MapCounts.map_stats", "x[k : k + 1]", "x[1 - k : 2 - k]"),
+        ("MapCounts.image_moments", "x[2:5]", "x[1:4]"),
+    ],
+    "extract.pixel_columns": [
+        ("find_one_channel", ".channels == 1", ".channels == 3"),
+        ("read_pixel_feature", "str(pixels.dtype)", '"uint16"'),
+        ("colour_moments", "/ 255", "/ 256"),
     ],
 }

@@ -6,6 +6,7 @@ TESTS: dict[str, list[str]] = {
     "transforms.sample_access": ["tests/transforms/test_sample_spec.py", "tests/transforms/test_extend_depth_stub.py"],
     "transforms.kornia": ["tests/transforms/test_kornia_samples.py"],
     "transforms.adapters": ["tests/transforms/test_wrappers.py", "tests/runtime/test_allocator.py"],
+    "transforms.declared_unit": ["tests/transforms/test_adapters.py"],
     "transforms.tokens": ["tests/transforms/test_tokens.py"],
     "transforms.status": ["tests/transforms/test_extend_depth_stub.py"],
     "transforms.extend_depth": [
@@ -147,6 +148,11 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("numbers_fingerprint", "value.dtype.str, value.shape", "value.dtype.str"),
         ("SampleReader.pad", "x.shape[1] != T", "x.shape[1] < T"),
         ("_list_keys", 'f"{prefix}{key}."', 'f"{key}."'),
+    ],
+    "transforms.declared_unit": [
+        ("declared_depth_unit", 'feature["dtype"] == "video" or stored is not None', "True"),
+        ("declared_depth_unit", 'None if feature["dtype"] == "video" else stored', "stored"),
+        ("declared_depth_unit", 'or info.get("unit")', ""),
     ],
     "transforms.adapters": [
         ("ExtendedDataset.__init__", "gap < 1 or", "gap < 0 or"),

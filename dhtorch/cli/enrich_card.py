@@ -43,9 +43,9 @@ def _format_card(target: LeRobotTarget, about: Mapping[str, Any], owns: Sequence
     head += ["  data_files: data/*/*.parquet", "---", "", f"# {_plain(about['data']['name'])} with depth", ""]
     frames = format_count(info["total_frames"], "frame")
     size = f"{format_count(info['total_episodes'], 'episode')}, {frames} at {info['fps']:g} per second"
-    made = f"dhtorch {about['version']} (`dhtorch enrich`, method {about['method']})"
+    writer = f"dhtorch {about['version']} (`dhtorch enrich`, method {about['method']})"
     code = info["codebase_version"]
-    body = [f"LeRobot {code} set, written from `{source}` by {made}: {size}.", ""]
+    body = [f"LeRobot {code} set, written from `{source}` by {writer}: {size}.", ""]
     body += ["## Cameras", "", *_camera_table(target, owns, stats), ""]
     body += [_describe_maps(target, about), ""]
     known = f"`{licence}`, by its card (`{SOURCE_CARD}`)" if licence else "not stated by the source"
@@ -122,7 +122,7 @@ def _loading(target: LeRobotTarget, info: Mapping[str, Any]) -> list[str]:
 def _first_intrinsics(target: LeRobotTarget) -> dict[str, list[float]]:
     """Camera -> fx, fy, cx, cy of the first row that has them."""
     parquet = import_optional("pyarrow.parquet", extra="scale")
-    file, found = target.file(0), {}
+    file, intrinsics = target.file(0), {}
     names = set(parquet.read_schema(file).names)
     for key, view in target.views.items():
         column = f"observation.{view.name}.intrinsics"
@@ -130,8 +130,8 @@ def _first_intrinsics(target: LeRobotTarget) -> dict[str, list[float]]:
             rows = np.array(parquet.read_table(file, columns=[column]).column(column).to_pylist(), np.float64)
             valid = rows[np.isfinite(rows).all(1)] if rows.ndim == 2 and rows.shape[1] == 9 else rows[:0]
             if len(valid):
-                found[key] = valid[0][[0, 4, 2, 5]].tolist()
-    return found
+                intrinsics[key] = valid[0][[0, 4, 2, 5]].tolist()
+    return intrinsics
 
 
 def _source_licence(card: Path) -> str | None:

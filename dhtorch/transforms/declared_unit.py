@@ -33,6 +33,7 @@ def declared_depth_unit(dataset: Any, key: str) -> str:
     else:
         unit = None if feature["dtype"] == "video" else stored or info.get("unit")
     if unit not in ("m", "mm"):
-        found = f"found {key} ({feature['dtype']}) without a unit that this LeRobot declares"
-        raise ValueError(f"depth_unit=auto: {found}, expected depth_unit in its info; else depth_unit='m' or 'mm'")
+        feature_text = f"{key} ({feature['dtype']}) without a unit that this LeRobot declares"
+        expected = "depth_unit in its info; else depth_unit='m' or 'mm'"
+        raise ValueError(f"depth_unit=auto: found {feature_text}, expected {expected}")
     return str(unit)

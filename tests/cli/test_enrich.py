@@ -360,6 +360,25 @@ def test_a_write_that_failed_at_the_first_file_is_no_other_set(robot, enriched, 
     assert read_files(out) == read_files(enriched) and not unfinished.exists()
 
 
+def test_a_picture_that_no_camera_reads_has_statistics(shots, tmp_path):
+    """LeRobot's training ends in an error without those of any picture: here, another camera that is not enriched."""
+    source, other = tmp_path / "source", "observation.images.other"
+    writers.write_lerobot(source, [shots[:3]], image="image", depth="tiff")
+    info = json.loads((source / "meta" / "info.json").read_text())
+    info["features"][other] = info["features"][CAMERA]
+    (source / "meta" / "info.json").write_text(json.dumps(info))
+    (file,) = (source / "data").rglob("*.parquet")
+    table = parquet.read_table(file)
+    parquet.write_table(table.append_column(other, table[CAMERA]), file)
+    words = ["data=lerobot", f"data.camera={CAMERA}", *ASKED, "dense=false", "gap=1", "report=false"]
+    assert main(["enrich", str(source), str(tmp_path / "set"), *words]) == 0
+    stats = json.loads((tmp_path / "set" / "meta" / "stats.json").read_text())
+    pictures = np.stack([decode_map(row, CAMERA) for row in read_rows(source)]) / 255
+    for key, part in ((CAMERA, pictures), (other, pictures[:1])):  # of the latter every eighth
+        for name, value in (("mean", part.mean((0, 1, 2))), ("std", part.std((0, 1, 2))), ("max", part.max((0, 1, 2)))):
+            assert np.ravel(stats[key][name]) == pytest.approx(value, rel=1e-6), (key, name)
+
+
 def test_the_card_states_cameras_shares_and_the_licence_of_the_source(shots, tmp_path, capsys):
     source = tmp_path / "source"
     writers.write_lerobot(source, [shots[:3]], depth="tiff")
