@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from dhtorch.cli.enrich_page import summarise_cameras
+from dhtorch.codes import Source, names
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import import_optional
 from dhtorch.extract.robot_target import SOURCE_CARD, LeRobotTarget
@@ -98,7 +99,8 @@ def _describe_maps(target: LeRobotTarget, about: Mapping[str, Any]) -> str:
     if "sigma" in target.keys[key]:
         lines.append(f"`{target.keys[key]['sigma']}` is the standard deviation of the depth, in metres.")
     if "source" in target.keys[key]:
-        lines.append(f"`{target.keys[key]['source']}`: 0 no depth, 1 the sensor's, 2 recovered, 3 swept.")
+        codes = ", ".join(f"{code} {name.lower()}" for code, name in names(Source).items())
+        lines.append(f"`{target.keys[key]['source']}` is where a depth comes from: {codes}.")
     if "K" in target.keys[key]:
         lines.append(f"`{target.keys[key]['K']}` is K of the picture by rows; pixel centres are whole numbers.")
     return "\n".join(lines)
