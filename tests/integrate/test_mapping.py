@@ -225,7 +225,7 @@ def test_a_dense_map_says_what_the_sweep_added(command, tmp_path):
     assert pair["map_hw"] == [120, 160] and pair["n_swept"] == scene["n_swept"] > 1000
     assert scene["n_voxels"] > scene["n_voxels_sparse"] > scene["n_voxels_sensor"]
     assert scene["voxels_vs_sparse"] == scene["n_voxels"] / scene["n_voxels_sparse"]
-    assert result["summary"]["auto.voxels_vs_sparse"]["value"] == scene["voxels_vs_sparse"]
+    assert result["summary"]["fused.voxels_vs_sparse"]["value"] == scene["voxels_vs_sparse"]
     assert result["config"]["dense"] == {"planes": 32, "size": 160}
     words = (here / "synthetic_room" / "map.ply").read_bytes()[:400]
     assert b"source: 0 none, 1 sensor, 2 recovered, 3 swept" in words
@@ -253,7 +253,7 @@ def test_the_built_in_room_shows_what_views_add_and_a_recording_hides_nothing():
 
 @pytest.mark.parametrize("word", ["integrate", "view"])
 def test_what_sweeps_is_a_method_of_several_views_unless_another_is_said(word):
-    assert composed("dense=true", word=word)[1].method == "auto"
+    assert composed("dense=true", word=word)[1].method == "fused"
     assert composed("dense=true", "method=map", word=word)[1].method == "map"
     assert METHODS[composed(word=word)[1].method].views > 1
 
