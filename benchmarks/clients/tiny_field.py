@@ -1,6 +1,6 @@
 """A small radiance field with and without our depth: error of held-out depth and PSNR of held-out pictures.
 
-python benchmarks/clients/tiny_field.py --json benchmarks/results/tiny_field.json     (about two minutes on one core)
+python benchmarks/clients/tiny_field.py --json benchmarks/results/tiny_field.json
 
 A voxel grid of density and colour is fitted to every second picture of a recording. Returns beyond ``--cutoff`` are
 hidden from everything but the evaluation. Three fits differ in their depth alone: none, the returns that are left, and
@@ -23,7 +23,7 @@ from dhtorch import data
 from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
 from dhtorch.metrics.holdout import range_split
-from dhtorch.pipeline import dense
+from dhtorch.pipeline import completion, dense
 from dhtorch.pytree import stack
 from dhtorch.records import Frame
 from dhtorch.runtime import storage
@@ -100,8 +100,8 @@ def fit(columns: dict[str, Tensor], box: tuple[Tensor, Tensor], steps: int) -> F
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--recording", default="holo_a", help="below DHTORCH_DATA")
-    parser.add_argument("--cutoff", type=float, default=2.0, help="m")
-    parser.add_argument("--steps", type=int, default=STEPS)
+    for name, kind, default in (("--cutoff", float, 2.0), ("--steps", int, STEPS)):
+        parser.add_argument(name, type=kind, default=default)
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -112,7 +112,8 @@ def main() -> None:
     rows: dict[str, list[Tensor]] = {k: [] for k in ("o", "d", "rgb", "sensor", "ours", "trust")}
     for k, frame in visible.items():
         others = stack([visible[k + j] for j in OFFSETS if k + j in visible])
-        maps = dense.complete_depth(frame, others, size=WIDTH, planes=64, calibration=dense.default_calibration())
+        options = {"size": WIDTH, "planes": 64, "calibration": completion.default_calibration()}
+        maps = completion.complete_depth(frame, others, **options)
         depth, rel = (x[0].flatten().nan_to_num() for x in (maps.depth, maps.sigma / maps.depth))
         rows["sensor"].append(torch.where(maps.source[0].flatten() == 1, depth, 0.0))
         rows["ours"].append(depth)
