@@ -52,6 +52,8 @@ PLACES = (
     "pipeline/view_selection",
     "pipeline/stream",
     "pipeline/dense",
+    "pipeline/fused",
+    "pipeline/completion",
     "pipeline/planes",
     "pipeline/surface",
     "pipeline/map_filters",

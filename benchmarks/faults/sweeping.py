@@ -78,7 +78,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_fill", "refuted &= narrowest", "refuted |= narrowest"),
         ("_fill", "sigma + (square", "(square"),
         ("_fill", "distance.amax(0) <= limit", "distance.amin(0) <= limit"),
-        ("_fill", "where &= ~_shift(silent, dy, dx)", "pass"),
+        ("_fill", "where &= ~_shift(unanswered, dy, dx)", "pass"),
         ("_fit_plane", "xy * y - x * yy", "x * yy - xy * y"),
         ("_enclosed", "range(1, radius + 1)", "range(1, radius)"),
     ],

@@ -45,8 +45,8 @@ def find_artefacts(depth_map: DepthMap) -> Artefacts:
     blocks = answered[:, 1:, 1:] & answered[:, 1:, :-1] & answered[:, :-1, 1:] & answered[:, :-1, :-1]
     padded = F.pad(blocks, (1, 1, 1, 1))
     in_block = padded[:, 1:, 1:] | padded[:, 1:, :-1] | padded[:, :-1, 1:] | padded[:, :-1, :-1]
-    silent = F.pad(~answered, (SPECK_PX,) * 4, value=True)  # what reaches the border is not small
-    pinhole = small_components(silent, SPECK_PX)[:, SPECK_PX:-SPECK_PX, SPECK_PX:-SPECK_PX]
+    unanswered = F.pad(~answered, (SPECK_PX,) * 4, value=True)  # what reaches the border is not small
+    pinhole = small_components(unanswered, SPECK_PX)[:, SPECK_PX:-SPECK_PX, SPECK_PX:-SPECK_PX]
     return Artefacts(swept & small_components(answered, SPECK_PX), swept & ~in_block, pinhole)
 
 

@@ -137,11 +137,11 @@ class DenseOptions:
     # Filters of the map
 
     #: Stride of the pixels from whose returns the sensor's reach is taken, px; it reaches all rows and columns alike.
-    #: Source: as ``motion_stride_px``.
+    #: Source: derived, as ``motion_stride_px``.
     reach_stride_px: int = 17
 
     #: Fraction of the sensor's reach within which its silence speaks against a foreground.
-    #: Source: chosen on built-in rooms: returns thin out in the last tenth of the reach.
+    #: Source: chosen on built-in rooms, returns thin out in the last tenth of the reach.
     halo_reach: float = 0.99
 
     #: Distance from a return at its own depth within which a swept pixel may be its halo, px.
@@ -153,7 +153,7 @@ class DenseOptions:
     background_radius_px: int = 12
 
     #: Ratio of depths, farther over nearer, above which two pixels lie on two surfaces.
-    #: Source: that of the measured depth steps (metrics.map_quality).
+    #: Source: derived, that of the measured depth steps (metrics.map_quality).
     step_ratio: float = 1.15
 
     #: Difference of inverse depth above which a step beside a pixel is none of its noise, sigmas of the pixel.
@@ -170,11 +170,11 @@ class DenseOptions:
     fattened_ratio: float = 2.0
 
     #: Sigmas beyond which a swept depth and a return beside it on one surface are inconsistent.
-    #: Source: as that of a contradiction by returns.
+    #: Source: derived, as that of a contradiction by returns.
     seam_sigmas: float = 3.0
 
     #: Ratio of depths, farther over nearer, above which pixels that look alike are two surfaces all the same.
-    #: Source: chosen above the seams that were seen (1.34).
+    #: Source: chosen on data=shared_scenes, above the seams of up to 1.34.
     seam_ratio: float = 1.5
 
     #: Relative difference of inverse depth within which neighbours lie on one surface.
@@ -186,19 +186,19 @@ class DenseOptions:
     same_surface_sigmas: float = 3.0
 
     #: Pixels of one surface below which they are a speck, and of silence below which it is a pinhole, px.
-    #: Source: that of the measured artefacts (metrics.map_quality).
+    #: Source: derived, that of the measured artefacts (metrics.map_quality).
     speck_px: int = 30
 
     #: Distance within which an unanswered pixel must meet answers in all four directions to be filled, px.
-    #: Source: derived: the side of the window that a single outlier silences (``edge_radius_px``).
+    #: Source: derived, the side of the window that a single outlier silences (``edge_radius_px``).
     hole_radius_px: int = 9
 
     #: Width of a gap amid returns within the sensor's reach above which its silence speaks against their surface, px.
-    #: Source: derived: that of a square pinhole of fewer than ``speck_px``.
+    #: Source: derived, that of a square pinhole of fewer than ``speck_px``.
     max_gap_px: int = 5
 
     #: Fewest rim pixels of that plane.
-    #: Source: chosen as two more than its parameters.
+    #: Source: derived, two more than its parameters.
     min_rim_pixels: int = 5
 
     #: Largest distance of a rim pixel from that plane, ratio of inverse depth.
@@ -208,11 +208,11 @@ class DenseOptions:
     # Planes of weakly textured surfaces
 
     #: Side of the cells that planes are fitted to, px.
-    #: Source: chosen: the cost; the half a window of the sweep.
+    #: Source: chosen on built-in rooms, the cost; the half a window of the sweep.
     plane_cell_px: int = 8
 
     #: Fewest answered pixels of a cell that supports planes.
-    #: Source: chosen: a line of one pixel across the cell.
+    #: Source: chosen on built-in rooms, a line of one pixel across the cell.
     min_cell_pixels: int = 8
 
     #: Cells up to which a ray looks for support: the longest extrapolation of a plane.
@@ -220,7 +220,7 @@ class DenseOptions:
     plane_reach_cells: int = 24
 
     #: Support cells that a ray collects.
-    #: Source: chosen: those behind the nearest determine the slant.
+    #: Source: chosen on built-in rooms, those behind the nearest determine the slant.
     plane_ray_support: int = 4
 
     #: Largest difference of grey value (in [0, 1]) from that of the cell at which a ray goes on.
@@ -228,15 +228,15 @@ class DenseOptions:
     plane_grey_difference: float = 0.06
 
     #: Largest distance of support from its plane, ratio of inverse depth; three standard deviations.
-    #: Source: chosen: three times the median error of swept answers on weak texture.
+    #: Source: chosen on built-in rooms, three times the median error of swept answers on weak texture.
     plane_inlier_ratio: float = 0.09
 
     #: Least area spanned by the support cells of a hypothesis, over that of a cell.
-    #: Source: chosen: three cells by three.
+    #: Source: chosen on built-in rooms, three cells by three.
     min_triple_area: float = 9.0
 
     #: Fewest support cells on a plane, of 64.
-    #: Source: chosen on built-in rooms: with fewer, one in ten filled pixels is more than 20 % off.
+    #: Source: chosen on built-in rooms, with fewer, one in ten filled pixels is more than 20 % off.
     min_plane_support: int = 20
 
     #: Least share of the support that lies on the plane.
@@ -248,7 +248,7 @@ class DenseOptions:
     max_plane_sigma_rel: float = 0.012
 
     #: Cells around whose planes are compared.
-    #: Source: chosen: a plane that fits by chance ends within two cells.
+    #: Source: chosen on built-in rooms, a plane that fits by chance ends within two cells.
     plane_neighbours: int = 2
 
     #: Largest mean relative difference of inverse depth between the planes of a cell and of those around.
@@ -256,23 +256,23 @@ class DenseOptions:
     max_plane_disagreement: float = 0.04
 
     #: Relative difference of inverse depth as which a larger one counts in that mean.
-    #: Source: chosen: one in six neighbours on another surface exceeds the limit.
+    #: Source: chosen on built-in rooms, one in six neighbours on another surface exceeds the limit.
     max_plane_difference: float = 0.3
 
     #: Fraction of the sensor's reach nearer than which its silence refutes a plane.
-    #: Source: chosen: the reach less the error of a plane.
+    #: Source: chosen on built-in rooms, the reach less the error of a plane.
     plane_reach: float = 0.97
 
     #: Largest share of the rays that end on a plane along which the sensor's silence refutes it.
-    #: Source: chosen: a few rays end in holes of the sensor.
+    #: Source: chosen on built-in rooms, a few rays end in holes of the sensor.
     max_refuted_rays: float = 0.1
 
     #: Independent errors per support cell: neighbours share windows and edges.
-    #: Source: chosen on built-in rooms: the filled pixels within one sigma.
+    #: Source: chosen on built-in rooms, the filled pixels within one sigma.
     independent_support: float = 0.25
 
     #: Part of the support's sigma that is common to all of it, by motions and scale.
-    #: Source: chosen on built-in rooms: the filled pixels within one sigma.
+    #: Source: chosen on built-in rooms, the filled pixels within one sigma.
     common_sigma_ratio: float = 0.45
 
 

@@ -26,17 +26,18 @@ from dhtorch.geometry.windows import window_extreme
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
 from dhtorch.records import DepthMap
 
-#: Right, down, left and up: (rows, columns).
+#: Right, down, left and up: (rows, columns). Source: derived, the four neighbours.
 _SIDES = ((0, 1), (1, 0), (0, -1), (-1, 0))
 
 #: Directions in which the rim of a pinhole is looked for, each followed by its opposite.
+#: Source: derived, the eight neighbours.
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
 #: Least determinant of the normal equations of a plane through pixels; that of three corners of a square is 1.
-#: Source: derived: determinants are whole numbers, and 0 where the pixels lie on a line.
+#: Source: derived, determinants are whole numbers, and 0 where the pixels lie on a line.
 _MIN_DETERMINANT = 0.5
 
-#: Least inverse depth that a filled pixel divides by, 1/m. Source: as that of the swept ones.
+#: Least inverse depth that a filled pixel divides by, 1/m. Source: derived, as that of the swept ones.
 _MIN_INVERSE_DEPTH = 1e-9
 
 
@@ -133,11 +134,11 @@ def _silence(swept: DepthMap, which: Tensor) -> DepthMap:
 
 
 def _halo(known: _Known, within: Tensor, options: DenseOptions) -> Tensor:
-    """Swept pixels (B, h, w) bool at the depth of returns ``within`` the reach beside them, where the sensor is silent.
+    """Swept pixels (B, h, w) bool at the depth of returns ``within`` the reach beside them, where the sensor has no return.
 
     A window that holds the edge of a foreground is matched at the foreground's depth on both sides of the edge. Where
     the sensor reaches it would return from there, so its silence refutes the depth: if something farther is beside the
-    pixel, or if the silent strip is no wider than such windows make it. A gap between two returns is no such strip.
+    pixel, or if the unanswered strip is no wider than such windows make it. A gap between two returns is no such strip.
     """
     q, _, usable, swept = known
     r, ratio = options.halo_radius_px, options.step_ratio
@@ -153,12 +154,12 @@ def _has_neighbour(q: Tensor, which: Tensor, of: Tensor, radius: int, ratio: flo
     b, y, x = which.nonzero(as_tuple=True)
     padded, own = F.pad(of, (radius,) * 4), q[b, y, x]
     low, high = own / ratio, own * ratio
-    found = torch.zeros_like(own, dtype=torch.bool)
+    between = torch.zeros_like(own, dtype=torch.bool)
     for dy, dx in _window(radius):
         other = padded[b, y + dy, x + dx]
-        found |= (other > low) & (other < high)
+        between |= (other > low) & (other < high)
     out = torch.zeros_like(which)
-    out[b, y, x] = found
+    out[b, y, x] = between
     return out
 
 
@@ -264,9 +265,9 @@ def _fill(known: _Known, within: Tensor, options: DenseOptions) -> tuple[Tensor,
     fits = ~refuted & (n >= options.min_rim_pixels) & (q > _MIN_INVERSE_DEPTH) & (distance.amax(0) <= limit)
     where, filled, spread = torch.zeros_like(answered), torch.ones_like(known.q), torch.zeros_like(known.q)
     where[b, y, x] = fits
-    silent = ~(answered | where)
-    for dy, dx in _SIDES:  # beside a pixel that stays silent it would be the edge of an island in a larger hole
-        where &= ~_shift(silent, dy, dx)
+    unanswered = ~(answered | where)
+    for dy, dx in _SIDES:  # beside a pixel that stays unanswered it would be the edge of an island in a larger hole
+        where &= ~_shift(unanswered, dy, dx)
     both = answered | where
     where &= _in_block(both[:, 1:, 1:] & both[:, 1:, :-1] & both[:, :-1, 1:] & both[:, :-1, :-1])
     filled[b, y, x] = torch.where(fits, q, 1.0)

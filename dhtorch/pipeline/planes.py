@@ -31,7 +31,7 @@ from dhtorch.pipeline.map_filters import SensorReturns
 from dhtorch.records import DepthMap
 
 #: Least inverse depth that is divided by, 1/m: of farther points than any sensor or sweep measures.
-#: Source: chosen, 1e6 m.
+#: Source: derived, a distance of 1e6 m.
 MIN_PLANE_INVERSE_DEPTH = 1e-6
 
 #: Directions of the second and third support cell of a hypothesis, in sixteenths of a turn from the first, the step
