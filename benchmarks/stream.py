@@ -2,12 +2,12 @@
 
     python benchmarks/stream.py --json benchmarks/results/stream.json
 
-``auto`` is a whole anchor: the choice among the frames around it, five views and their joining; its peer is ``window``,
-handed five views. ``fused`` is that joined with a plane sweep; its peer is the second release's ``auto`` and sweep,
-without filters of the map. ``push`` is the newest frame answered from past ones at 640×480 with 1,024 samples; its peer is the
-same work in OpenCV's stages: the views that the stream asked, each tracked, posed and triangulated. Frames of
-7s_redkitchen_stream_200 (640×480, near limit 2 m) where DHTORCH_DATA is set, else of the built-in room. All sides take
-turns in one process.
+``auto`` is a whole anchor: the choice among the frames around it, five views and their joining; its peer is
+``window``, handed five views. ``fused`` is that joined with a plane sweep; its peer is the second release's ``auto``
+and sweep, without filters of the map. ``push`` is the newest frame answered from past ones at 640×480 with 1,024
+samples; its peer is the same work in OpenCV's stages: the views that the stream asked, each tracked, posed and
+triangulated. Frames of 7s_redkitchen_stream_200 (640×480, near limit 2 m) where DHTORCH_DATA is set, else of the
+built-in room. All sides take turns in one process.
 """
 
 from __future__ import annotations

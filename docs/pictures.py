@@ -23,7 +23,6 @@ import sys
 import tempfile
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import hydra
 import numpy as np
@@ -42,8 +41,11 @@ from dhtorch.experiments.exhibits import make_exhibit
 from dhtorch.experiments.protocol import Settings
 from dhtorch.integrate.sweeps import DenseSweep
 from dhtorch.metrics.holdout import range_split
+from dhtorch.pipeline import dense
 from dhtorch.pipeline.completion import complete_depth
-from dhtorch.pipeline.presets import AUTO
+from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS
+from dhtorch.pipeline.fused import fuse_with_sweep
+from dhtorch.pipeline.presets import AUTO, FUSED
 from dhtorch.pytree import stack
 from dhtorch.synthetic.recording import open_rooms
 from dhtorch.viz.plots import Axis, LegendKey, Panel, Stroke, colours, save_figure
@@ -112,7 +114,7 @@ def triptych(path: Path) -> None:
 
 
 def maps(path: Path) -> None:
-    """Contact sheet: picture, sensor, swept map before and after the filters, of the middle frame of ten scenes."""
+    """Contact sheet: picture, sensor, swept map without filters, joint map, of the middle frame of ten scenes."""
     with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
         shown = [hydra.compose("run", [f"data={name}"]) for name in ("shared_scenes", "streams")]
     scenes = [scene for cfg in shown for scene in instantiate(cfg.data, _convert_="all") if scene.name in SHEET_SCENES]
@@ -126,9 +128,9 @@ def maps(path: Path) -> None:
         others = stack([range_split(scene.recording[k], scene.near) for k in pair.candidates])
         trace: dict[str, Any] = {}
         selected = dense.selected_views(AUTO(near, others, trace=trace), others, trace)
-        with mock.patch.object(dense, "filter_map", lambda swept, *_: swept):
-            before = dense.sweep_depth(near, selected)
-        after = dense.sweep_depth(near, selected)
+        swept = dense.sweep_views(near, selected, AUTO, DEFAULT_DENSE_OPTIONS)
+        before = dense.merge_returns(dense.gate_sweep(swept, DEFAULT_DENSE_OPTIONS), swept.returns)
+        after = fuse_with_sweep(FUSED, near, selected).depth_map
         low, high = np.nanpercentile(after.depth.numpy(), (1, 99))
         norm = LogNorm(low, high)
         row[0].imshow(near.image[0].permute(1, 2, 0), cmap=colours.GREY_CMAP)
@@ -136,7 +138,7 @@ def maps(path: Path) -> None:
         for axis, depth in zip(row[1:], (sensed, before.depth, after.depth), strict=True):
             axis.imshow(depth[0], cmap=colours.DEPTH_CMAP, norm=norm, interpolation="nearest")
         titles = (f"{scene.name}, frame {int(scene.recording.number[pair.reference])}", f"sensor to {scene.near:g} m")
-        for axis, title in zip(row, (*titles, "swept", "filtered"), strict=True):
+        for axis, title in zip(row, (*titles, "swept", "joint map"), strict=True):
             axis.set_title(title, fontsize=9)
             axis.axis("off")
     figure.subplots_adjust(wspace=0.02, hspace=0.12)

@@ -210,7 +210,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_share_memory", "counts.share_memory_()", "counts"),
     ],
     "transforms.extend_depth": [
-        ("ExtendDepth.__init__", "method = get_method(default if method is None else method, n)", "method = get_method(method, None)"),
+        ("ExtendDepth.__init__", "default if method is None else method, n)", "default if method is None else method)"),
         ("ExtendDepth.forward", "torch.is_grad_enabled() and get_worker_info() is None", "torch.is_grad_enabled()"),
         (
             "ExtendDepth.left_out",

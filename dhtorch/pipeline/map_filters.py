@@ -134,7 +134,7 @@ def _silence(swept: DepthMap, which: Tensor) -> DepthMap:
 
 
 def _halo(known: _Known, within: Tensor, options: DenseOptions) -> Tensor:
-    """Swept pixels (B, h, w) bool at the depth of returns ``within`` the reach beside them, where the sensor has no return.
+    """Swept pixels (B, h, w) bool at the depth of returns ``within`` the reach beside them, without a return.
 
     A window that holds the edge of a foreground is matched at the foreground's depth on both sides of the edge. Where
     the sensor reaches it would return from there, so its silence refutes the depth: if something farther is beside the
@@ -166,8 +166,8 @@ def _has_neighbour(q: Tensor, which: Tensor, of: Tensor, radius: int, ratio: flo
 def _fattened(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
     """Swept pixels (B, h, w) bool beside something farther, which they resemble more than their own surface.
 
-    Compared are mean similarities, 1 / (1 + (difference of grey values / ``grey_similarity``)²), to the answered pixels of the
-    window at the pixel's depth or nearer, and to the farther ones.
+    Compared are mean similarities, 1 / (1 + (difference of grey values / ``grey_similarity``)²), to the answered pixels of
+    the window at the pixel's depth or nearer, and to the farther ones.
     """
     q, sigma, _, swept = known
     r, ratio = options.halo_radius_px, options.step_ratio
