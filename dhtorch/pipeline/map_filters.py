@@ -166,7 +166,7 @@ def _has_neighbour(q: Tensor, which: Tensor, of: Tensor, radius: int, ratio: flo
 def _fattened(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
     """Swept pixels (B, h, w) bool beside something farther, which they resemble more than their own surface.
 
-    Compared are mean similarities, 1 / (1 + (difference of grey values / ``grey_similarity``)²), to the answered pixels of
+    Compared are mean similarities, 1 / (1 + (difference of grey values / ``grey_similarity``)²), to answered pixels of
     the window at the pixel's depth or nearer, and to the farther ones.
     """
     q, sigma, _, swept = known
