@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.codes import Source
@@ -106,16 +106,27 @@ def write_colmap_workspace(
 
 def _undistort(frame: Frame) -> tuple[np.ndarray, Camera]:
     """Picture (H, W) or (H, W, 3) uint8 without distortion and without empty pixels, and its camera."""
-    picture = colour_to_uint8(frame.image[0].movedim(0, -1).cpu().numpy())
-    picture = picture[..., 0] if picture.shape[-1] == 1 else picture
-    if frame.camera.distortion is None or not bool(frame.camera.distortion.any()):
-        return picture, cameras.ideal(frame.camera)
-    K, lens = (x[0].double().cpu().numpy() for x in (cameras.to_matrix(frame.camera), frame.camera.distortion))
-    size = picture.shape[1], picture.shape[0]
-    K_new, _ = cv2.getOptimalNewCameraMatrix(K, lens, size, 0)
-    maps = cv2.initUndistortRectifyMap(K, lens, None, K_new, size, cv2.CV_32FC1)
-    undistorted = cv2.remap(picture, *maps, cv2.INTER_LINEAR)
-    return undistorted, cameras.from_matrix(torch.from_numpy(K_new)[None])
+    camera = frame.camera.to(torch.float64)
+    if camera.distortion is None or not bool(camera.distortion.any()):
+        return _to_pixels(frame.image[0]), cameras.ideal(frame.camera)
+    h, w = frame.hw
+    v, u = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (h, w)), indexing="ij")
+    grid = torch.stack((u, v), -1)
+    ideal = cameras.undistort(camera, grid.reshape(1, -1, 2)).reshape(h, w, 2)
+    low = torch.stack((ideal[:, 0, 0].max(), ideal[0, :, 1].max()))
+    high = torch.stack((ideal[:, -1, 0].min(), ideal[-1, :, 1].min()))
+    scale = torch.tensor([w - 1, h - 1]) / (high - low)
+    lens = cameras.distort(camera, (grid / scale + low).reshape(1, -1, 2)).reshape(1, h, w, 2)
+    where = 2 * lens / torch.tensor([w - 1, h - 1]) - 1
+    image = frame.image.double() if frame.image.is_floating_point() else frame.image / 255
+    picture = F.grid_sample(image.double(), where, align_corners=True, padding_mode="border")
+    return _to_pixels(picture[0]), cameras.ideal(camera).replace(f=camera.f * scale, c=(camera.c - low) * scale)
+
+
+def _to_pixels(image: Tensor) -> np.ndarray:
+    """Image (C, H, W) -> (H, W) or (H, W, 3) uint8."""
+    picture = colour_to_uint8(image.movedim(0, -1).cpu().numpy())
+    return picture[..., 0] if picture.shape[-1] == 1 else picture
 
 
 def _sample_points(

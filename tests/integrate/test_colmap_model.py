@@ -10,11 +10,13 @@ import torch
 from PIL import Image
 
 from dhtorch.data.recording import Recording
+from dhtorch.geometry import camera as cameras
 from dhtorch.geometry import se3
+from dhtorch.integrate import colmap_model
 from dhtorch.integrate.colmap_model import write_colmap_workspace
 from dhtorch.integrate.recording import PairEstimate, estimate_pairs
 from dhtorch.pipeline.presets import METHODS
-from dhtorch.records import Pose
+from dhtorch.records import Camera, Frame, Pose
 from dhtorch.synthetic import SyntheticRoom
 
 
@@ -47,3 +49,18 @@ def test_the_pictures_are_the_frames(pair, tmp_path: Path) -> None:
     picture = np.asarray(Image.open(tmp_path / "images" / names[1]))
     assert room[3].image.dtype == torch.uint8
     np.testing.assert_array_equal(picture, room[3].image[0].movedim(0, -1))
+
+
+def test_pictures_are_undistorted_as_opencv_does_and_have_no_empty_pixels() -> None:
+    cv2 = pytest.importorskip("cv2")
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(1, 256, (1, 3, 60, 80), generator=generator, dtype=torch.uint8)
+    lens = torch.tensor([[0.26, -0.95, -0.005, 0.003, 1.16]])
+    camera = Camera(torch.tensor([[66.0, 65.0]]), torch.tensor([[40.5, 29.0]]), lens)
+    picture, pinhole = colmap_model._undistort(Frame(image, torch.zeros(1, 60, 80), camera))
+    K, K_new = (cameras.to_matrix(each)[0].double().numpy() for each in (camera, pinhole))
+    maps = cv2.initUndistortRectifyMap(K, lens[0].double().numpy(), None, K_new, (80, 60), cv2.CV_32FC1)
+    assert maps[0].min() > -0.01 and maps[0].max() < 79.01 and maps[1].min() > -0.01 and maps[1].max() < 59.01
+    assert pinhole.distortion is None and not np.allclose(K, K_new)
+    other = cv2.remap(image[0].movedim(0, -1).numpy(), *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    assert np.abs(picture.astype(int) - other.astype(int)).max() <= 5, "weights of 1/32 px in OpenCV, exact ones here"
