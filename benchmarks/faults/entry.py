@@ -325,7 +325,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("collect_run_metadata", 'isoformat(timespec="seconds")', "isoformat()"),
         ("make_portable", 'name == "root" or', ""),
         ("make_portable", "if k not in _LOCAL_OPTIONS}\n        if", "}\n        if"),
-        ("_is_of_kind", "if isinstance(value, bool):\n        return False\n", ""),
+        ("_is_of_kind", "if isinstance(value, bool):\n        return kind is bool\n", ""),
         ("_update_digest", 'total.update(len(part).to_bytes(8, "big"))', "pass"),
         ("_drop_non_key_options", "str(k) not in _NON_KEY_OPTIONS", "True"),
         ("_shorten_path", "resolved != resolved_base and", ""),
