@@ -20,7 +20,7 @@ TESTS: dict[str, list[str]] = {
 FAULTS: dict[str, list[tuple[str, ...]]] = {
     "extract.cut": [
         ("truncate_scenes", "scenes if frames is None else", "scenes if frames else"),
-        ("truncate_recording", "number=recording.number[:frames]", "number=recording.number"),
+        ("truncate_recording", "recording.number[:frames]", "recording.number"),
     ],
     "extract.enriched": [
         ("MAP_STEPS", "8", "4"),

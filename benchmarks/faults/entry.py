@@ -211,7 +211,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
     ],
     "transforms.extend_depth": [
         ("ExtendDepth.__init__", "default if method is None else method, n)", "default if method is None else method)"),
-        ("ExtendDepth.forward", "torch.is_grad_enabled() and get_worker_info() is None", "torch.is_grad_enabled()"),
+        ("ExtendDepth._extend", "torch.is_grad_enabled() and get_worker_info() is None", "torch.is_grad_enabled()"),
         (
             "ExtendDepth.left_out",
             "self.views.image_hw(sample) or self._seen_hw",
