@@ -25,7 +25,8 @@ def declared_depth_unit(dataset: Any, key: str) -> str:
         raise ValueError(f"depth_unit=auto: found no feature {key}, expected one of {', '.join(features)}")
     feature = features[key]
     info = feature.get("info") or {}
-    stored, converts = info.get("depth_unit"), getattr(dataset, "depth_output_unit", None)
+    stored = info.get("depth_unit")
+    converts = getattr(dataset, "depth_output_unit", None)
     marked = key in (getattr(dataset.meta, "depth_keys", None) or ())
     if feature["dtype"] in _PICTURE_FORMS and marked and converts in ("m", "mm"):
         is_converted = feature["dtype"] == "video" or stored is not None
