@@ -68,8 +68,8 @@ def flag_unmarked_depth(
 def find_depth_unit(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobotEpisode, row: int) -> DepthUnit | None:
     """Unit of the stored depth; None = a video of LeRobot's codes, whose range defines metres.
 
-    ``depth_unit`` of the feature's info, else m for floats and mm for integers, as in LeRobot. ``row`` of the table
-    holds an image of the episode.
+    ``depth_unit`` of the feature's info, for an array also ``unit`` (as ``dhtorch enrich`` writes it), else m for
+    floats and mm for integers, as in LeRobot. ``row`` of the table holds an image of the episode.
 
     Raises:
         FormatError: an unknown unit, or a damaged image or video.
@@ -78,14 +78,15 @@ def find_depth_unit(meta: LeRobotMeta, feature: LeRobotFeature, episode: LeRobot
         if _has_stated_range(feature) or _read_pixel_type(meta, feature, episode, row).bits <= _CODE_BITS:
             return None
         return DepthUnit(UNIT_METRES["mm"])
-    stated = feature.info.get("depth_unit")
+    entry = "unit" if feature.dtype != "image" and "depth_unit" not in feature.info else "depth_unit"
+    stated = feature.info.get(entry)
     if stated is None:
         is_float = _read_pixel_type(meta, feature, episode, row).name.startswith("float")
         return DepthUnit(UNIT_METRES["m" if is_float else "mm"])
     if not isinstance(stated, str) or stated not in UNIT_METRES:
         expected = f"one of {', '.join(UNIT_METRES)}"
-        raise FormatError(meta.root / "meta" / "info.json", f"{feature.key} depth_unit", stated, expected)
-    return DepthUnit(UNIT_METRES[stated], f"meta/info.json: {feature.key} depth_unit")
+        raise FormatError(meta.root / "meta" / "info.json", f"{feature.key} {entry}", stated, expected)
+    return DepthUnit(UNIT_METRES[stated], f"meta/info.json: {feature.key} {entry}")
 
 
 def _has_stated_range(feature: LeRobotFeature) -> bool:
