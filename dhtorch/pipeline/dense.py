@@ -27,6 +27,7 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry import plane_sweep
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.filters import grayscale
+from dhtorch.geometry.least_squares import select_batch
 from dhtorch.geometry.se3 import Pose
 from dhtorch.pipeline import surface
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
@@ -130,15 +131,18 @@ def gate_sweep(sweep: Sweep, options: DenseOptions) -> DepthMap:
 
 
 def filter_sweep(sweep: Sweep, swept: DepthMap, options: DenseOptions) -> DepthMap:
-    """The swept map without answers that their neighbours or the returns refute, and with those that they imply."""
+    """The swept map without answers that their neighbours or the returns refute, and with those that they imply.
+
+    Reference views without a source view to sweep keep the sensor's returns alone.
+    """
     image, reach, sparse = sweep.base.image, sweep.reach, sweep.sparse
     filtered = filter_map(swept, sweep.returns, image[:, 0], sparse, options)
-    return fill_planes(filtered, swept, sweep.returns, image, reach, sparse=sparse, options=options)
+    filled = fill_planes(filtered, swept, sweep.returns, image, reach, sparse=sparse, options=options)
+    return select_batch(sweep.pair_gate == Gate.ANSWER, filled, swept)
 
 
 def sensor_depth_map(reference: Frame, *, method: MethodSpec, size: int = DenseOptions.size) -> DepthMap:
-    """The depth maps (B, h, w) of reference views without a source view: near returns, gaps amid them filled, else
-    unanswered (NO_TRACK).
+    """The depth maps (B, h, w) of reference views without a source view: near returns, else unanswered (NO_TRACK).
 
     Arguments, result, errors and gradient as of :func:`complete_depth`.
     """
@@ -146,9 +150,7 @@ def sensor_depth_map(reference: Frame, *, method: MethodSpec, size: int = DenseO
     nan = torch.full((len(reference.camera.f), *map_hw(reference.hw, size)), torch.nan).to(reference.camera.f)
     code = torch.zeros_like(nan, dtype=torch.int32)
     unanswered = DepthMap(nan, nan, torch.zeros_like(nan), code, torch.full_like(code, Gate.NO_TRACK))
-    returns = _returns(reference, method, map_hw(reference.hw, size))
-    filled = filter_map(unanswered, returns, torch.zeros_like(nan), reference.sparse)
-    return merge_returns(filled, returns)
+    return merge_returns(unanswered, _returns(reference, method, map_hw(reference.hw, size)))
 
 
 def map_hw(hw: tuple[int, int], size: int) -> tuple[int, int]:

@@ -97,7 +97,7 @@ def test_a_camera_that_only_turns_gets_the_sensor_alone():
     room = SyntheticRoom(n_frames=6, hw=(240, 320), depth_hw=(120, 160), path="rotation")
     with torch.no_grad():
         got = complete_depth(range_split(room[0], NEAR), range_split(room[4], NEAR), **FAST)
-    assert bool((got.source != Source.SWEPT).all()) and bool((got.source == Source.SENSOR).any())
+    assert bool((~is_swept(got.source)).all()) and bool((got.source == Source.SENSOR).any())
     assert bool((got.gate[got.source == Source.NONE] == Gate.NO_BASELINE).all())
 
 
@@ -106,10 +106,7 @@ def test_without_another_view_the_map_is_the_sensors(views):
     got = sensor_depth_map(reference, method=FAST["method"])
     seen = reference.depth > 0
     assert torch.equal(got.depth[seen], reference.depth[seen]) and bool((got.source[seen] == Source.SENSOR).all())
-    filled = got.source == Source.FILLED
-    assert bool(((got.depth / views[2] - 1).abs()[filled] < 0.05).all()) and float(filled.float().mean()) < 0.005
-    silent = ~(seen | filled)
-    assert bool((got.gate[silent] == Gate.NO_TRACK).all()) and bool(got.depth[silent].isnan().all())
+    assert bool((got.gate[~seen] == Gate.NO_TRACK).all()) and bool(got.depth[~seen].isnan().all())
 
 
 def test_a_calibration_changes_swept_pixels_alone(views, found):

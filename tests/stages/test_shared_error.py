@@ -162,6 +162,16 @@ def test_views_without_a_motion_refute_others_that_move_less(gate):
     assert verify_views(samples, tracks, fits, tie, max_refuted=1.5).keep.any()
 
 
+@pytest.mark.parametrize(("motion", "refuted"), [((2.0, 9.0, 15.0), True), ((2.0, 7.0, 15.0), False)])
+def test_a_misaligned_view_of_half_its_motion_refutes_a_single_answering_view(motion, refuted):
+    samples, tracks, fits, estimates = views(motion=motion)
+    estimates = silence(silence(estimates, 0, Gate.NO_POSE), 1, Gate.MISALIGNED)
+    options = {**OFF, "max_refuted": 1.0}
+    assert bool(verify_views(samples, tracks, fits, estimates, **options).keep.any()) != refuted
+    two = silence(views(motion=motion)[3], 1, Gate.MISALIGNED)
+    assert verify_views(samples, tracks, fits, two, **options).keep.any()
+
+
 def test_gradients_stay_finite_beside_unanswered_points_and_views():
     samples, tracks, fits, estimates = views()
     estimates = silence(estimates, 1, Gate.NO_POSE)
