@@ -610,6 +610,11 @@ ELSEWHERE = {
     "dhtorch.stages.track.resolve_coarse_flow",
     "dhtorch.stages.guided_search.guided_search",
     "dhtorch.geometry.patches.whole_is_faster",
+    "dhtorch.geometry.components.small_components",
+    *(
+        f"dhtorch.metrics.map_quality.{name}"
+        for name in ("find_artefacts", "artefact_counts", "near_depth_step", "step_counts")
+    ),
     *(
         f"dhtorch.geometry.plane_sweep.{name}"
         for name in ("add_census_costs", "rectify_view", "census_cost", "second_best_margin")

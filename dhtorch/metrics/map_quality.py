@@ -14,15 +14,15 @@ from dhtorch.metrics.errors import GROSS_ERROR_REL
 from dhtorch.records import DepthMap
 
 #: Pixels of a component of answers below which it is a speck, and of silence below which it is a pinhole, px.
-#: Source: chosen as the least patch that is seen as one in a map of 640 x 480.
+#: Source: chosen on maps of 640 x 480, as the least patch that is seen as one.
 SPECK_PX = 30
 
 #: Ratio of the depths of neighbours, farther over nearer, above which they lie on two surfaces.
-#: Source: chosen as three times the spread that the truth test allows (5 %).
+#: Source: derived, three times the spread that the truth test allows (5 %).
 STEP_RATIO = 1.15
 
 #: Distance from a true depth step within which an answer lies beside it, px of the map along rows and columns.
-#: Source: chosen as the radius of the matched window and two pixels around it.
+#: Source: derived, the radius of the matched window and two pixels around it.
 STEP_RADIUS_PX = 6
 
 

@@ -141,15 +141,15 @@ class DenseOptions:
     reach_stride_px: int = 17
 
     #: Fraction of the sensor's reach within which its silence speaks against a foreground.
-    #: Source: chosen on built-in rooms, returns thin out in the last tenth of the reach.
+    #: Source: chosen on built-in rooms and shared scenes.
     halo_reach: float = 0.99
 
     #: Distance from a return at its own depth within which a swept pixel may be its halo, px.
-    #: Source: chosen on built-in rooms.
+    #: Source: chosen on built-in rooms and shared scenes.
     halo_radius_px: int = 10
 
     #: Distance within which something farther makes such a pixel an edge, px.
-    #: Source: chosen on built-in rooms.
+    #: Source: chosen on built-in rooms and shared scenes.
     background_radius_px: int = 12
 
     #: Ratio of depths, farther over nearer, above which two pixels lie on two surfaces.
@@ -157,32 +157,32 @@ class DenseOptions:
     step_ratio: float = 1.15
 
     #: Difference of inverse depth above which a step beside a pixel is none of its noise, sigmas of the pixel.
-    #: Source: chosen on built-in rooms.
+    #: Source: chosen on built-in rooms and shared scenes.
     step_sigmas: float = 2.0
 
     #: Difference of grey values at which two pixels are half as similar as equal ones.
-    #: Source: chosen on built-in rooms.
+    #: Source: chosen on built-in rooms and shared scenes.
     grey_similarity: float = 0.06
 
     #: Mean similarity to what is farther, as a ratio to that to its own surface, above which a pixel beside a depth
     #: step belongs to the farther surface.
-    #: Source: chosen on built-in rooms.
+    #: Source: chosen on built-in rooms and shared scenes.
     fattened_ratio: float = 2.0
 
     #: Sigmas beyond which a swept depth and a return beside it on one surface are inconsistent.
-    #: Source: derived, as that of a contradiction by returns.
+    #: Source: derived, as ``refuting_sigmas``.
     seam_sigmas: float = 3.0
 
     #: Ratio of depths, farther over nearer, above which pixels that look alike are two surfaces all the same.
-    #: Source: chosen on data=shared_scenes, above the seams of up to 1.34.
+    #: Source: chosen on tum_fr1_desk9, whose seams were 1.34 at most.
     seam_ratio: float = 1.5
 
     #: Relative difference of inverse depth within which neighbours lie on one surface.
-    #: Source: chosen on built-in rooms.
+    #: Source: chosen on built-in rooms and shared scenes.
     same_surface_ratio: float = 0.1
 
     #: Difference of inverse depth within which they do as well, sigmas of the surer one.
-    #: Source: chosen on built-in rooms.
+    #: Source: chosen on built-in rooms and shared scenes.
     same_surface_sigmas: float = 3.0
 
     #: Pixels of one surface below which they are a speck, and of silence below which it is a pinhole, px.
@@ -202,7 +202,7 @@ class DenseOptions:
     min_rim_pixels: int = 5
 
     #: Largest distance of a rim pixel from that plane, ratio of inverse depth.
-    #: Source: chosen on built-in rooms.
+    #: Source: chosen on built-in rooms and shared scenes.
     rim_ratio: float = 0.05
 
     # Planes of weakly textured surfaces
