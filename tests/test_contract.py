@@ -56,10 +56,14 @@ from dhtorch.geometry import (
 )
 from dhtorch.metrics import holdout
 from dhtorch.pipeline import (
+    completion,
     dense,
+    fused,
+    map_filters,
     method,
     multiview,
     pair,
+    planes,
     surface,
     view_selection,
 )
@@ -952,6 +956,10 @@ def public_functions():
         view_selection,
         multiview,
         dense,
+        completion,
+        fused,
+        map_filters,
+        planes,
         references,
         error_model,
         residual_noise,
