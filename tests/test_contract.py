@@ -63,7 +63,6 @@ from dhtorch.pipeline import (
     method,
     multiview,
     pair,
-    planes,
     surface,
     view_selection,
 )
@@ -641,6 +640,8 @@ ELSEWHERE = {
     "dhtorch.pipeline.dense.top_views",
     *(f"dhtorch.pipeline.completion.{name}" for name in ("complete_depth", "default_calibration")),
     "dhtorch.pipeline.fused.fuse_with_sweep",
+    "dhtorch.pipeline.map_filters.filter_map",
+    "dhtorch.pipeline.planes.fill_planes",
     "dhtorch.pipeline.dense.source_view_of",
     *(f"dhtorch.pipeline.surface.{name}" for name in ("sweep_planes", "refine_surface", "pose_variance")),
     *(
@@ -959,7 +960,7 @@ def public_functions():
         completion,
         fused,
         map_filters,
-        planes,
+        importlib.import_module("dhtorch.pipeline.planes"),
         references,
         error_model,
         residual_noise,

@@ -476,7 +476,9 @@ def test_maps_agree_to_far_less_than_their_sigma(loaded, monkeypatch, source_vie
         trace = {}
         asked = dense.selected_views(WINDOW(reference, others, trace=trace), others, trace)
     found, expected = both_ways(
-        lambda: dense.sweep_depth(reference, asked, method=AUTO, source_views=source_views, planes=48, max_sigma_rel=0.5),
+        lambda: dense.sweep_depth(
+            reference, asked, method=AUTO, source_views=source_views, planes=48, max_sigma_rel=0.5
+        ),
         monkeypatch,
     )
     assert (found.gate != expected.gate).float().mean() <= 0.005 and torch.equal(found.gate == 0, found.depth > 0)
