@@ -35,7 +35,8 @@ WITHOUT_SLOW += " experiment.twins=[]"
 EXPERIMENTS = {
     "method_comparison": f"experiment=method_comparison data=shared_scenes {WITHOUT_SLOW} experiment.seeds=2",
     "kornia_twin": "experiment=method_comparison data=shared_scenes experiment.seeds=1 ~experiment.methods.opencv "
-    "~experiment.methods.xfeat ~experiment.methods.map ~experiment.methods.auto_2 ~experiment.methods.auto",
+    "~experiment.methods.xfeat ~experiment.methods.map ~experiment.methods.auto_2 ~experiment.methods.auto "
+    "~experiment.methods.fused",
     "track_chain": "experiment=chain_study data=shared_scenes pairs.stride=6",
     "streams": f"experiment=method_comparison data=streams {WITHOUT_SLOW} experiment.seeds=2",
     "part_ablation": "experiment=part_ablation data=shared_scenes",
