@@ -156,7 +156,7 @@ def risk(path: Path) -> None:
         size=(560, 330),
     )
     keys = []
-    for name in ("paper", "map", "auto"):
+    for name in ("paper", "map", "auto", "fused"):
         curves = [
             r["curves"]["risk_coverage"]
             for r in rows

@@ -278,11 +278,9 @@ def _count_pixels(steps: export.QuantisedDepth, depth_map: DepthMap) -> Row:
     """Pixel counts by source, and fractions of all pixels without an answer, by reason."""
     kinds = {code: name.lower() for code, name in names(Source).items() if name.lower() in _SOURCE_LABELS}
     pixels = {name: int((steps.source == code).sum()) for code, name in kinds.items()}
-    others = {
-        "aligned": int((steps.source == Source.ALIGNED).sum()),
-        "filled": int((steps.source == Source.FILLED).sum()),
-    }
-    pixels |= {name: n for name, n in others.items() if n}
+    others = {name: getattr(Source, name.upper()) for name in ("recovered", "aligned", "filled")}
+    counts = {name: int((steps.source == code).sum()) for name, code in others.items()}
+    pixels |= {name: n for name, n in counts.items() if n}
     gates = {name.lower(): float((depth_map.gate == code).double().mean()) for code, name in names(Gate).items()}
     no_answer = {name: share for name, share in gates.items() if share and name != "answer"}
     return {"pixels": pixels, "no_answer": {**no_answer, "unfit": float(steps.unfit.mean())}}
@@ -355,7 +353,9 @@ def _format_summary(task: CompletionTask, n_untouched: int) -> str:
     for row in rows:
         pixels.update(row["pixels"])
         no_answer.update({k: share / len(rows) for k, share in row["no_answer"].items()})
-    pixels["swept"] += pixels.pop("filled", 0)
+    pixels["swept"] = completed.count_estimated(pixels)
+    for name in completed.ESTIMATED[1:]:
+        pixels.pop(name, None)
     sensor, swept, none = (f"{kind} {pixels[k] / pixels.total():.1%}" for k, kind in _SOURCE_LABELS.items())
     unfit = no_answer.pop("unfit")
     reasons = ", ".join(f"{words(name.upper())} {share:.1%}" for name, share in no_answer.most_common())

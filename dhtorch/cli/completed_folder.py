@@ -33,6 +33,9 @@ _FORMAT_VERSION = 1
 #: Folder of derived files → their suffixes.
 EXTRA_FILES = {"figures": (".png",), "points": (".ply", ".glb")}
 
+#: Names of the sources of a pixel whose depth is estimated from images, in a frame's meta file.
+ESTIMATED = ("swept", "recovered", "filled")
+
 
 @dataclass(frozen=True)
 class CompletionTask:
@@ -223,3 +226,8 @@ def read_completed_maps(task: CompletionTask, i: int) -> tuple[dict[str, np.ndar
         for kind, unit in (("depth", layout.unit), ("sigma", layout.sigma_unit))
     }
     return maps, data_files.read_image(layout.file(task.folder, "source", name))[0]
+
+
+def count_estimated(pixels: Mapping[str, int]) -> int:
+    """Number of pixels with a depth from images, of a meta file's numbers of pixels by source."""
+    return sum(pixels.get(name, 0) for name in ESTIMATED)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,8 +48,8 @@ def measure_recovery(task: CompletionTask, frames: Sequence[int]) -> RecoverySta
     totals = [sum(row["pixels"].values()) for row in rows]
 
     def n_of(row: Row, kind: str) -> int:
-        pixels = row["pixels"]
-        return pixels.get(kind, 0) + (pixels.get("filled", 0) if kind == "swept" else 0)
+        pixels: Mapping[str, int] = row["pixels"]
+        return completed.count_estimated(pixels) if kind == "swept" else pixels.get(kind, 0)
 
     fraction = {
         kind: float(np.mean([n_of(row, kind) / n for row, n in zip(rows, totals, strict=True)]))
