@@ -162,7 +162,11 @@ def test_figure_and_points_are_of_the_first_frame(room, numbered):
     assert pixels(numbered / "figures" / "000000.png").shape[1] > 1000
     head, _, body = (numbered / "points" / "000000.ply").read_bytes().partition(b"end_header\n")
     depth, source = (pixels(numbered / kind / "000000.png") for kind in ("depth", "source"))
-    layout = [(a, "<f4") for a in "xyz"] + [(c, "u1") for c in "rgb"] + [("sigma", "<f4"), ("source", "u1")]
+    layout = (
+        [(a, "<f4") for a in "xyz"]
+        + [(c, "u1") for c in "rgb"]
+        + [("sigma", "<f4"), ("source", "u1"), ("quality", "<f4")]
+    )
     points = np.frombuffer(body, layout)
     assert f"element vertex {(depth > 0).sum()}".encode() in head and len(points) == (depth > 0).sum()
     assert np.array_equal(points["source"], source[depth > 0])
