@@ -7,7 +7,8 @@ python benchmarks/fit_calibration.py --method fused                of the joint 
                                    of five built-in rooms with a phone's noise; four reference views a scene, one
                                    seed; writes dhtorch/calibration/fused.json
 
-Scenes with a role are left out; every scene has the same weight, its seeds are pooled. What the same recipe is worth in
+Scenes with a role are left out; every scene has the same weight, its seeds are pooled. Sigma is that of the real
+scenes: tracks in the built-in rooms are cleaner than a phone's. What the same recipe is worth in
 rooms it was not fitted on is measured by ``dhtorch experiment=method_comparison`` (rows ``ece``, ``realised_risk_…``).
 """
 
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -100,6 +102,8 @@ def main() -> int:
         else partial(control.scene_quantile_threshold, few=FEW * options.seeds)
     )
     fitted = score_calibration.fit_calibration(list(pooled.values()), choose=choose, provenance=origin)
+    real = [points for name, points in pooled.items() if not name.startswith("synthetic")]
+    fitted = replace(fitted, sigma=score_calibration.fit_sigma_model(real))
     target = options.output or HERE.parent / "dhtorch" / "calibration" / f"{options.method}.json"
     print(calibration.save_calibration(fitted, target))
     return 0
