@@ -121,6 +121,9 @@ SCRIPTS |= {
     "fuzz": "--full",
     "kills": "--times 50",
     "clients": "",  # interpreters of the loaders in DHTORCH_CLIENTS
+    "readers_3d": "",
+    "tiny_field": "",
+    "lerobot_train": "",
 }
 
 #: Speeds again: with the vectors of processors that lack AVX-512, and where freed memory stays with the process, as in
@@ -134,6 +137,7 @@ NAMED = {
     "loader_workers0": "loader",
     "dense_speed": "dense",
     "clients": "clients/all",
+    **{name: f"clients/{name}" for name in ("readers_3d", "tiny_field", "lerobot_train")},
     "validate_speed": "validate",
     "self_calibration": "learning/self_calibration",
     "far_labels": "learning/far_labels",

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from dhtorch import testing as writers
+from dhtorch.cli.completed_folder import count_estimated
 from dhtorch.cli.process_capture import coarse_to_fine
 from dhtorch.cli.run import main
 from dhtorch.metrics.holdout import range_split
@@ -48,7 +49,7 @@ def test_one_word_makes_maps_a_map_a_page_and_a_picture(made):
 def test_the_page_begins_with_the_numbers_and_the_picture(made):
     page = (made / "view.html").read_text(encoding="utf-8")
     rows = [json.loads(p.read_text()) for p in (made / "meta").iterdir()]
-    pixels = sum(row["pixels"]["swept"] for row in rows) / len(rows)
+    pixels = sum(count_estimated(row["pixels"]) for row in rows) / len(rows)
     opening = page[page.index('<section id="opening"') : page.index("<main>")]
     assert f"<dd>{pixels:,.0f}</dd>" in opening and "Median sigma / depth" in opening
     assert base64.b64encode((made / "overview.png").read_bytes()).decode() in opening

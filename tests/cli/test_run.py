@@ -90,7 +90,7 @@ def test_the_point_cloud_has_sensor_and_recovered_points(job):
     layout = (
         [(a, "<f4") for a in "xyz"]
         + [(c, "u1") for c in "rgb"]
-        + [("sigma", "<f4"), ("score", "<f4"), ("class", "u1"), ("source", "u1")]
+        + [("sigma", "<f4"), ("score", "<f4"), ("class", "u1"), ("source", "u1"), ("quality", "<f4")]
     )
     points = np.frombuffer(body, layout)
     assert len(points) == count > 50 and set(points["source"]) <= {1, 2} and 1 in points["source"]

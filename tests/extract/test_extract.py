@@ -110,7 +110,7 @@ class Items(torch.utils.data.Dataset):
 def live(root, **options):
     """The transform in a loader over the same frames."""
     method = dhtorch.PAPER.replace(hypotheses=20)
-    views = {"image": CAMERA, "other_image": "other", "depth_unit": "m", "tokens_hw": (224, 224)}
+    views = {"image": CAMERA, "other_image": "other", "depth_unit": "m", "tokens_hw": (224, 224), "prefix": "dhtorch."}
     return ExtendedDataset(Items(root), ExtendDepth(method=method, n=N, **views, **options), gap=GAP)
 
 

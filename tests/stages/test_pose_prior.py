@@ -407,12 +407,12 @@ def test_a_gap_brings_the_pose_along():
 
 
 def test_maps_are_swept_under_the_given_pose(sample):
-    out = transform(dense={"size": 56, "planes": 24, "source_views": 1})(sample)
+    out = transform(method="paper", dense={"size": 56, "planes": 24, "source_views": 1})(sample)
     T = se3.relative(room().true_poses[GAP : GAP + 1], room().true_poses[:1])
     assert torch.allclose(out["dhtorch.T_1_from_0"][:3, 3], T.t[0].float(), atol=1e-5)
     sample["pose"] = torch.linalg.inv(torch.as_tensor(sample["pose"]))
     with pytest.warns(UserWarning, match="contradict"):
-        out = transform(dense={"size": 56, "planes": 24, "source_views": 1})(sample)
+        out = transform(method="paper", dense={"size": 56, "planes": 24, "source_views": 1})(sample)
     silent = out["dhtorch.gate_map"][out["dhtorch.source_map"] == 0]
     assert (silent == Gate.POSE_REFUTED).all()
 

@@ -517,7 +517,7 @@ def test_no_sample_is_skipped_but_cannot_be_flagged():
 
 @pytest.mark.parametrize("transform", [ExtendDepth, ValidateDepth])
 def test_a_transform_without_a_unit_says_which_there_are(transform):
-    with pytest.raises(ValueError, match=r"depth_unit is '', expected one of \['m', 'mm'\] or metres per unit"):
+    with pytest.raises(ValueError, match=r"depth_unit is '', expected one of \['m', 'mm'\], metres per unit, or auto"):
         transform()
 
 

@@ -163,7 +163,7 @@ def test_a_method_is_a_name_or_a_record():
     assert ExtendDepth(depth_unit="m", method="map").method is dhtorch.pipeline.presets.METHODS["map"]
     with pytest.raises(
         ValueError,
-        match=r"method is 'mapp', expected one of \['auto', 'kornia', 'map', 'paper', 'window'\] or a Method",
+        match=r"method is 'mapp', expected one of \['auto', 'fused', 'kornia', 'map', 'paper', 'window'\] or a Method",
     ):
         ExtendDepth(depth_unit="m", method="mapp")
 

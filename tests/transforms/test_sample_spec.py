@@ -784,7 +784,9 @@ def test_a_unit_is_a_name_or_a_positive_number(unit):
 
 
 def test_options_that_cannot_be_are_refused():
-    with pytest.raises(ValueError, match=r"depth_unit is 'cm', expected one of \['m', 'mm'\] or metres per unit"):
+    with pytest.raises(
+        ValueError, match=r"depth_unit is 'cm', expected one of \['m', 'mm'\], metres per unit, or auto"
+    ):
         SampleSpec(depth_unit="cm")
     with pytest.raises(ValueError, match="layout is 'bgr', expected hwc, chw or None"):
         SampleSpec(depth_unit="m", layout="bgr")

@@ -422,7 +422,7 @@ def read_bytes(file: Path, limit: int = MAX_FILE_BYTES) -> bytes:
         if not 0 < size <= limit:
             raise FormatError(file, "file size", f"{size} bytes", f"1 to {limit} bytes")
         try:
-            return stream.read(limit)
+            return stream.read(size)  # of ``limit`` bytes a buffer would be allocated
         except OSError as error:
             raise unreadable_error(file, error) from None
 

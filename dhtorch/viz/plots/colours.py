@@ -52,7 +52,7 @@ METHOD_COLOURS = {
     "map": "#009E73",
     "window": "#CC79A7",
     "auto": "#C03A5A",
-    "fused": "#3D5A98",
+    "fused": "#E0662F",
     "opencv": "#8C6D31",
     "xfeat": "#7A5CC8",
 }
