@@ -436,6 +436,7 @@ REAL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @real
 @pytest.mark.parametrize("name", REAL)

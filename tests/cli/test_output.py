@@ -178,6 +178,7 @@ def test_no_color(tmp_path):
 # --------------------------------------------------------------------------------------------------- exit codes, Ctrl-C
 
 
+@pytest.mark.slow
 def test_exit_codes_stand_in_every_help(command):
     _, out, _ = command("--help")
     text = " ".join(out.split())

@@ -30,6 +30,7 @@ def measured(**options):
     return latency.run([room_scene(room)], chosen, partial(by_gap, gap=2), Settings(), **options)
 
 
+@pytest.mark.slow
 def test_every_stage_has_a_row_at_every_size():
     pytest.importorskip("transformers")
     outcome = measured()
@@ -120,6 +121,7 @@ def hungry(x, mib):
     return x.sum() + (x.new_ones(mib * 2**20 // x.element_size()) + 1).sum()
 
 
+@pytest.mark.slow
 def test_peak_memory_counts_what_the_call_needs_and_not_its_inputs():
     """100 MiB made and a second 100 MiB for the sum count; the input of 64 MiB does not."""
     found = memory.peak_mib(partial(hungry, torch.ones(2**24), 100))

@@ -242,6 +242,7 @@ def test_a_network_is_asked_once_for_all_its_scales(room, installed):
     assert len(times) == 2 and times[0] == times[1] > 0
 
 
+@pytest.mark.slow
 def test_the_control_is_worth_its_scale_alone(room, installed):
     """The same depth everywhere times an oracle's scale is the median depth of what the oracle saw."""
     outcome = asked(room, installed, models={"constant": relative.ConstantDepth}, scales=("oracle",))

@@ -71,6 +71,7 @@ def test_the_room_of_every_seed_keeps_its_bound(seed):
     assert row["median_rel"] < BOUNDS[seed] and row["wrong_share"] < 0.005 and row["coverage"] > 0.9, row
 
 
+@pytest.mark.slow
 def test_room_with_the_phone_lidar():
     room = rendered(hw=(240, 320), n_frames=8)
     outcome = pair.run([room_scene(room)], {"paper": method("paper")}, by_gap, pair.Settings())
@@ -218,6 +219,7 @@ def test_verdict_goes_either_way():
         opencv_twin.run([], {"paper": method("paper")}, by_gap, pair.Settings())
 
 
+@pytest.mark.slow
 @pytest.mark.data
 @pytest.mark.skipif(not ROOT, reason="DHTORCH_DATA is not set")
 @pytest.mark.parametrize(

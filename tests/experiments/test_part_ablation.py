@@ -154,6 +154,7 @@ def test_one_group_alone_also_where_there_is_one_other_frame():
     assert "ratio to window of areas with silence as 1" in outcome.why and "at equal coverage" not in outcome.why
 
 
+@pytest.mark.slow
 def test_every_variant_runs_and_tells_its_cost(methods):
     outcome = part_ablation.run(
         [room_scene(room(n_frames=4, hw=(192, 256), lidar="exact"), gap=3)],

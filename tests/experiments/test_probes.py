@@ -241,6 +241,7 @@ class FakeXFeat(torch.nn.Module):
         return torch.nn.functional.pixel_unshuffle(x.mean(1, keepdim=True), 8), None, None
 
 
+@pytest.mark.slow
 def test_xfeat_stands_beside_with_weights_of_its_own(robot_set, monkeypatch):
     monkeypatch.setattr(xfeat, "load_xfeat", lambda device: SimpleNamespace(net=FakeXFeat()))
     outcome = rh20t_probe.run(

@@ -112,6 +112,7 @@ def test_verdict_of_heldout_goes_either_way():
     assert heldout.verdict(outcome(None, 0.03, False), "m")[0] is None
 
 
+@pytest.mark.slow
 def test_range_split_has_one_cohort_for_all_variants():
     recording = small_room(trajectory_axes="gl", trajectory_offset_deg=5.0)
     outcome = asked(range_split, recording, cutoffs=(1.5,), cutoff_factors=(1.25,))
@@ -269,6 +270,7 @@ def test_device_pose_measures_the_disagreement():
     assert verdict(good, {"corr": None, "median_rel": None}) is None
 
 
+@pytest.mark.slow
 def test_gates_and_gaps():
     outcome = asked(gate_ablation, small_room(n_frames=7), gaps=(16,), factors=(2.0,))
     both, free = (scene(outcome, v, "heldout") for v in ("both gates", "parallax gate off"))
@@ -358,6 +360,7 @@ def test_calibration_reads_thresholds_off_the_same_answers():
     assert verdict(0.05, 0.3) is True and verdict(0.05, 0.05) is False and verdict(0.2, 0.3) is False
 
 
+@pytest.mark.slow
 def test_ablation_changes_one_thing_at_a_time():
     outcome = asked(
         ablation, small_room(lidar="exact"), n=(256,), windows=(15,), others={"opencv": configured_method("opencv")}

@@ -230,6 +230,7 @@ def test_two_writers_do_not_share_a_folder(robot, whole, tmp_path, capsys):
     assert "one writer" in capsys.readouterr().err and not list((tmp_path / "set").rglob("*.json"))
 
 
+@pytest.mark.slow
 def test_the_past_alone_counts_and_of_the_same_episode(robot, whole, tmp_path):
     keys = [f"{FRONT}_depth_enriched", f"{FRONT}_dhtorch_source"]
     every = read_rows(whole)

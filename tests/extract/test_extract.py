@@ -181,6 +181,7 @@ def many(tmp_path, shots):
     ]
 
 
+@pytest.mark.slow
 def test_kill_9_in_the_middle_loses_and_doubles_nothing(tmp_path, many, command):
     """With a worker; then the same command again."""
     args = [*many, "workers=1"]
@@ -229,6 +230,7 @@ def test_ctrl_c_leaves_whole_shards_and_says_how_to_go_on(robot, command, monkey
     assert {k: v for k, v in seen(files("features")).items() if k in before} == before
 
 
+@pytest.mark.slow
 def test_ctrl_c_from_a_terminal_ends_the_workers_quietly(tmp_path, many):
     process = start(tmp_path, "extract", *many, "workers=2")
     code = stop(process, partial(files, tmp_path / "features"), 2, signal.SIGINT)
@@ -380,6 +382,7 @@ def test_a_method_of_many_views_looks_back_several_times(command):
     assert problems == [1, 1, 0, 0, 0, 0], "the nearer view, two frames back, is there before the farther one"
 
 
+@pytest.mark.slow
 def test_without_a_gap_the_method_chooses_among_earlier_frames(command):
     room = ["data.hw=[120,160]", "data.n_frames=6", "data.supersample=1", "data.step_m=0.04", "data.lidar=exact"]
     room += ["method.n=256", "extract.columns=[T_1_from_0,pose_ok,problem]"]

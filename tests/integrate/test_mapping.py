@@ -154,6 +154,7 @@ def test_wrong_options_end_in_one_line_and_no_file(command, tmp_path, option, wo
     assert not (tmp_path / "here").exists()
 
 
+@pytest.mark.slow
 def test_a_recording_without_a_trajectory_is_anchored_unless_its_own_is_asked_for(command, tmp_path):
     room = SyntheticRoom(hw=(240, 320), n_frames=4, supersample=1, step_m=0.04, lidar="exact")
     folder = tmp_path / "walk"

@@ -275,6 +275,7 @@ def _killed_at(folder: Path, moment: int) -> bool:
     return os.WIFSIGNALED(os.waitpid(pid, 0)[1])
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 @pytest.mark.parametrize("is_written_before", [False, True])
 def test_kill_9_at_any_moment_leaves_only_files_that_the_next_run_replaces(tmp_path, is_written_before):

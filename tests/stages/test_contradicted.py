@@ -165,6 +165,7 @@ def test_a_reference_with_more_contradicted_than_answering_views_has_no_answer()
     assert found.depth.isnan().all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stress", "answers"), [("convoy_slow", False), ("held_object", False), ("lateral", True)])
 def test_rooms_in_which_near_things_move_have_no_answer(stress, answers):
     """Also where the moving body covers half of the near points."""

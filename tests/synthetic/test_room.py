@@ -122,6 +122,7 @@ def test_exact_and_absent_sensor():
     assert (none[0].depth == 0).all() and (none[0].conf == 0).all()
 
 
+@pytest.mark.slow
 def test_same_seed_same_bits_in_any_order_and_process():
     first = SyntheticRoom(n_frames=4, **SMALL)
     frames = [first[i] for i in range(4)]

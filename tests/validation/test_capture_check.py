@@ -138,6 +138,7 @@ def test_pictures_that_were_cropped_alone_are_named_with_their_intrinsics(top, l
     assert stated == pytest.approx(true_K, abs=8)
 
 
+@pytest.mark.slow
 def test_a_motion_that_does_not_show_the_scale_is_stated(frames, true):
     assert check_capture(recording(frames, true)).limits == []
     assert check_capture(recording(frames)).limits == []
