@@ -35,11 +35,11 @@ def small_components(mask: Tensor, n_pixels: int, *, same: tuple[Tensor, Tensor]
     for _ in range(n_pixels - 1):
         a, c = label[..., :-1], label[..., 1:]
         least = label.clone()
-        torch.minimum(least[..., :-1], c + not_right, out=least[..., :-1])
-        torch.minimum(least[..., 1:], a + not_right, out=least[..., 1:])
+        least[..., :-1] = torch.minimum(least[..., :-1], c + not_right)
+        least[..., 1:] = torch.minimum(least[..., 1:], a + not_right)
         a, c = label[:, :-1], label[:, 1:]
-        torch.minimum(least[:, :-1], c + not_down, out=least[:, :-1])
-        torch.minimum(least[:, 1:], a + not_down, out=least[:, 1:])
+        least[:, :-1] = torch.minimum(least[:, :-1], c + not_down)
+        least[:, 1:] = torch.minimum(least[:, 1:], a + not_down)
         label = least
     differs = torch.zeros_like(mask)
     border = right & (label[..., 1:] != label[..., :-1])

@@ -133,6 +133,7 @@ def gate_sweep(sweep: Sweep, options: DenseOptions) -> DepthMap:
 def filter_sweep(sweep: Sweep, swept: DepthMap, options: DenseOptions) -> DepthMap:
     """The swept map without answers that their neighbours or the returns refute, and with those that they imply.
 
+    ``torch.compile`` breaks its graph here: the pixels to fill are gathered, and their number depends on the map.
     Reference views without a source view to sweep keep the sensor's returns alone.
     """
     image, reach, sparse = sweep.base.image, sweep.reach, sweep.sparse

@@ -11,7 +11,15 @@ from dhtorch.codes import Gate, Source, is_swept
 from dhtorch.experiments.compare.exact_rooms import exact_pose_fit
 from dhtorch.metrics.holdout import range_split
 from dhtorch.pipeline.completion import complete_depth
-from dhtorch.pipeline.dense import downscale_grey, selected_views, sensor_depth_map, sweep_depth
+from dhtorch.pipeline.dense import (
+    downscale_grey,
+    gate_sweep,
+    merge_returns,
+    selected_views,
+    sensor_depth_map,
+    sweep_views,
+)
+from dhtorch.pipeline.dense_options import DenseOptions
 from dhtorch.pytree import collate, stack
 from dhtorch.synthetic import SyntheticRoom
 
@@ -297,7 +305,7 @@ def test_a_mirror_shows_what_stands_behind_it():
 
 
 @pytest.mark.slow
-def test_a_sweep_is_captured_as_one_graph():
+def test_a_sweep_is_captured_as_one_graph_up_to_its_filters():
     room = SyntheticRoom(n_frames=12, hw=(60, 80), depth_hw=(60, 80))
     reference, other = (range_split(room[k], NEAR) for k in (1, 9))
     method, trace = MAP.replace(n=256), {}
@@ -305,8 +313,11 @@ def test_a_sweep_is_captured_as_one_graph():
         joined = method(reference, other, trace=trace)
         asked = selected_views(joined, other, trace)
 
+        options = DenseOptions(planes=16, source_views=1)
+
         def sweep(reference, asked):
-            return sweep_depth(reference, asked, method=method, planes=16, source_views=1)
+            swept = sweep_views(reference, asked, method, options)
+            return merge_returns(gate_sweep(swept, options), swept.returns)
 
         plain = sweep(reference, asked)
         captured = torch.compile(sweep, fullgraph=True, backend="eager")(reference, asked)
