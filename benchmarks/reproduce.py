@@ -166,7 +166,7 @@ LEFT_OUT: dict[str, Any] = {"pose_samples": 0, "verify_views": None, "guide": No
 #: Files that were made with other settings than today's, and wait for a quiet machine.
 OUTDATED: set[str] = {"part_ablation", "streams", "stress"}
 #: Those whose ``auto`` is that of the second release.
-OUTDATED |= {"dense_streams", "views_study", *(f"validate_study{of}" for of in ("", "_streams", "_unseen"))}
+OUTDATED |= {"views_study", *(f"validate_study{of}" for of in ("", "_streams", "_unseen"))}
 #: Those in which ``paper``, ``paper_dlt`` or ``kornia`` still jumps from view to view.
 OUTDATED |= {
     "ablation",
@@ -193,7 +193,7 @@ OUTDATED |= {
 #: sensor: on independent truth (built-in rooms) real holes are among their candidates, on sparse maps (driving scenes)
 #: 6 of 330 samples with a near return in reach. They wait for a quiet machine.
 UNMASKED_CANDIDATES: set[str] = {
-    *("ablation", "dense_streams", "kornia_twin", "learned_confidence", "learned_score", "part_ablation_auto"),
+    *("ablation", "kornia_twin", "learned_confidence", "learned_score", "part_ablation_auto"),
     *("sweep", "track_chain", "views_study"),
 }
 
