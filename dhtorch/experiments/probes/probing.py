@@ -3,12 +3,20 @@
 A *shard* holds the samples of one group as blocks of features side by side: ``context`` (features that need no image)
 and one block per front end. An *arm* is the context and a subset of the blocks. Features are computed once and read
 again shard by shard; over all samples only means and scatter matrices are held in memory.
+
+Two arms are controls: ``true_motion`` has the target itself with noise (it must beat the context, or the samples are
+too few to decode anything), ``shuffled`` the depth features of other samples (it must not beat the context, or the
+split leaks). No verdict without both.
 """
 
 from __future__ import annotations
 
+import hashlib
+import math
+import os
+import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -34,6 +42,16 @@ PROBE_METRICS = (
 
 CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK = "context", "dinov2", "xfeat"
 
+#: Blocks and arms of the controls.
+POSITIVE_CONTROL, NEGATIVE_CONTROL = "true_motion", "shuffled"
+
+#: Noise of the positive control, in standard deviations of the targets of a group.
+#: Source: derived, a linear probe of it has an error of .3² / (1 + .3²) = .08 of the variance.
+CONTROL_NOISE = 0.3
+
+#: Power and level of the number of groups that a verdict would need. Source: derived, the customary ones.
+_POWER_Z, _LEVEL_Z = 0.8416, 1.96
+
 #: Arm → blocks beside the context.
 PROBE_ARMS: dict[str, tuple[str, ...]] = {
     CONTEXT_BLOCK: (),
@@ -44,6 +62,8 @@ PROBE_ARMS: dict[str, tuple[str, ...]] = {
     "dhtorch + dinov2": ("depth", "dinov2"),
     XFEAT_BLOCK: ("xfeat",),
     "dhtorch + xfeat": ("depth", "xfeat"),
+    POSITIVE_CONTROL: (POSITIVE_CONTROL,),
+    NEGATIVE_CONTROL: (NEGATIVE_CONTROL,),
 }
 
 #: Ridge penalties tried for a block of visual features; the penalty of the context is chosen from the same list.
@@ -51,7 +71,7 @@ PROBE_PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 
 #: Reason for no verdict if the network has random weights.
 RANDOM_WEIGHTS_NOTE = (
-    "DINOv2 had random weights (experiment.dinov2.weights=FOLDER gives its own), so nothing follows for or against it"
+    "DINOv2 had random weights (experiment.dinov2.weights=PATH gives its own), so nothing follows for or against it"
 )
 
 #: Cohorts: the sets of samples over which errors are averaged.
@@ -76,30 +96,53 @@ class ProbeShard:
 
 
 class ProbeShards:
-    """Shards in a temporary folder, read one at a time: ``with ProbeShards() as shards``."""
+    """Shards in a folder, read one at a time: ``with ProbeShards() as shards``.
 
-    def __init__(self) -> None:
-        self._folder = tempfile.TemporaryDirectory(prefix="dhtorch_probe_")
+    Args:
+        folder: kept, so that an interrupted run computes only the shards that are missing; None = a temporary folder.
+    """
+
+    def __init__(self, folder: str | Path | None = None) -> None:
+        self._temporary = tempfile.TemporaryDirectory(prefix="dhtorch_probe_") if folder is None else None
+        self._folder = Path(self._temporary.name if self._temporary else str(folder))
+        self._folder.mkdir(parents=True, exist_ok=True)
         self._files: list[tuple[str, Path]] = []
         self.widths: dict[str, int] = {}
         self.n = 0
 
-    def add(self, shard: ProbeShard) -> None:
-        """Write a shard to the folder.
+    def add(self, group: str, key: object, make: Callable[[], ProbeShard]) -> None:
+        """Add a shard, computed by ``make`` unless the folder has one of the same group and key.
+
+        Args:
+            group: name of the group.
+            key: everything else that the features depend on; its ``repr`` counts, without addresses of objects. Code
+                does not: empty the folder when it changes.
+            make: computes the shard.
 
         Raises:
             ValueError: the blocks differ from those of the earlier shards.
         """
+        text = re.sub(r" at 0x[0-9a-f]+", "", repr((group, key)))
+        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+        file = self._folder / f"{digest}.pt"
+        if not file.is_file():
+            shard = make()
+            partial_file = file.with_suffix(f".{os.getpid()}.partial")
+            torch.save({**shard.__dict__, "blocks": dict(shard.blocks)}, partial_file)
+            partial_file.replace(file)
+        shard = self._load(file)
         widths = {name: block.shape[-1] for name, block in shard.blocks.items()}
         if self.widths and widths != self.widths:
             raise ValueError(
-                f"probe: group {shard.group} has blocks {widths}, expected {self.widths} as in the earlier groups"
+                f"probe: group {group} has blocks {widths}, expected {self.widths} as in the earlier groups"
             )
         self.widths = widths
-        file = Path(self._folder.name) / f"{len(self._files):06d}.pt"
-        torch.save({**shard.__dict__, "blocks": dict(shard.blocks)}, file)
-        self._files.append((shard.group, file))
+        self._files.append((group, file))
         self.n += len(shard.target)
+
+    @staticmethod
+    def _load(file: Path) -> ProbeShard:
+        return ProbeShard(**torch.load(file, weights_only=True))
 
     @property
     def groups(self) -> list[str]:
@@ -111,7 +154,7 @@ class ProbeShards:
         wanted = set(groups)
         for group, file in self._files:
             if group in wanted:
-                yield ProbeShard(**torch.load(file, weights_only=True))
+                yield self._load(file)
 
     def columns(self, blocks: Sequence[str]) -> Tensor:
         """Column indices of the named blocks among all features: (f,) int64."""
@@ -125,7 +168,31 @@ class ProbeShards:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._folder.cleanup()
+        if self._temporary is not None:
+            self._temporary.cleanup()
+
+
+def add_controls(blocks: Mapping[str, Tensor], target: Tensor, seed: int) -> dict[str, Tensor]:
+    """The blocks (n, F) with those of the controls.
+
+    Args:
+        blocks: with ``depth``.
+        target: (n, D).
+        seed: of the noise and of the order.
+
+    Returns:
+        The blocks; ``true_motion`` (n, D): the target with :data:`CONTROL_NOISE`; ``shuffled``: the depth features with
+        every column in a random order of its own, so that the values are those of the group and the samples nobody's.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    spread = target.std(0, unbiased=False) if len(target) else target.new_zeros(target.shape[-1])
+    noise = torch.randn(target.shape, generator=generator, dtype=target.dtype)
+    order = torch.rand(blocks["depth"].shape, generator=generator).argsort(0)
+    controls = {
+        POSITIVE_CONTROL: target + CONTROL_NOISE * spread * noise,
+        NEGATIVE_CONTROL: blocks["depth"].gather(0, order),
+    }
+    return {**blocks, **controls}
 
 
 @dataclass
@@ -290,6 +357,47 @@ def _choose_penalties(
     chosen: list[float] = penalties[k].tolist()
     fitted.probes[arm] = (index, linear[best], chosen)
     return chosen
+
+
+def check_controls(positive: Interval, negative: Interval) -> str | None:
+    """Reason why the controls allow no verdict, from the intervals of their ratios to the context; None = they do."""
+    if positive.value is None or negative.value is None:
+        return "the controls have no ratio"
+    if not (positive.high if positive.high is not None else positive.value) < 1:
+        return f"the positive control does not beat the context ({format_ratio(positive)})"
+    if (negative.high if negative.high is not None else negative.value) < 1:
+        return f"shuffled depth features beat the context ({format_ratio(negative)})"
+    return None
+
+
+def describe_error(error: float | None, vs_context: Interval) -> str:
+    """Sentences on an error (in targets' variances) that predicting the mean, or the context, would not exceed."""
+    parts = []
+    if error is not None and error > 1:
+        parts.append(f"the error {error:.2f} exceeds the variance of the targets: worse than their mean")
+    if vs_context.high is not None and vs_context.high >= 1:
+        parts.append(f"depth features do not beat the context ({format_ratio(vs_context)})")
+    return "; ".join(parts)
+
+
+def groups_needed(errors: ProbeErrors, arm: str, other: str, cohort: str, ratio: float) -> int | None:
+    """Number of groups with which a ratio of the errors of two arms would be seen at 5 % with a power of 80 %.
+
+    From the spread of the log ratio over the groups at hand, as of a paired z test; None with fewer than three.
+    """
+    ours, theirs = errors.squares[arm, cohort], errors.squares[other, cohort]
+    both = (ours > 0) & (theirs > 0)
+    if int(both.sum()) < 3:
+        return None
+    spread = float((ours[both] / theirs[both]).log().std())
+    return math.ceil(((_LEVEL_Z + _POWER_Z) * spread / math.log(ratio)) ** 2)
+
+
+def format_ratio(interval: Interval) -> str:
+    """Text ``value (low to high)``; a dash without a value."""
+    if interval.value is None:
+        return "–"
+    return f"{interval.value:.3f}" + ("" if interval.low is None else f" ({interval.low:.3f} to {interval.high:.3f})")
 
 
 # ---------------------------------------------------------------------------------------------------------- results

@@ -29,7 +29,7 @@ from torch import Tensor
 from dhtorch.data import convert
 from dhtorch.data.readers import rh20t
 from dhtorch.data.recording import Recording
-from dhtorch.data.scene import SceneLike, scenes_of
+from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.baselines import dinov2 as visual_branch
 from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes import ridge as probe
@@ -37,6 +37,8 @@ from dhtorch.experiments.probes.probing import (
     ALL_COHORT,
     CONTEXT_BLOCK,
     MOVING_COHORT,
+    NEGATIVE_CONTROL,
+    POSITIVE_CONTROL,
     PROBE_ARMS,
     PROBE_METRICS,
     PROBE_PENALTIES,
@@ -80,6 +82,7 @@ def run(
     rgb_side: int = 16,
     dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load_dinov2,
     xfeat: bool = False,
+    features: str | None = None,
     progress: Progress = no_progress,
 ) -> Outcome:
     """Run the experiment: features of every scene, cross-validated ridge probes over tasks, verdict.
@@ -100,6 +103,7 @@ def run(
         rgb_side: side of the downsampled image, px.
         dinov2: builds the network; None = leave it out.
         xfeat: also run XFeat's dense features; its package contains the trained weights.
+        features: folder that keeps the features, so that an interrupted run goes on; None = a temporary one.
         progress: wraps the loop over a scene's samples.
 
     Returns:
@@ -111,7 +115,7 @@ def run(
 
     Source: paper, section 6.7, "Downstream behaviour as a visual front-end".
     """
-    networks, real = front_ends.load_network_front_ends(
+    networks, origin = front_ends.load_network_front_ends(
         dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device
     )
     select = partial(select_robot_samples, horizon=horizon, history=history, stride=stride)
@@ -122,34 +126,21 @@ def run(
     probe.make_folds(tasks, n_folds, seed=settings.seed)  # too few tasks are refused before the features are computed
     method = next(iter(methods.values()))
     outcome = Outcome(metrics=PROBE_METRICS)
-    with ProbeShards() as shards:
-        for scene, (index, before, context, target) in chosen:
-            recording = scene.recording
-            if not index:
-                outcome.rows.append(_skip_reason(recording))
+    with ProbeShards(features) as shards:
+        for scene, samples in chosen:
+            if not samples[0]:
+                outcome.rows.append(_skip_reason(scene.recording))
                 continue
-            options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
-            two_view, one_view = (front_ends.depth_tokens_for_scene(method, scene, views=v, **options) for v in (2, 1))
-            features_of = partial(
-                _frame_features,
-                recording,
-                settings,
-                two_view=two_view,
-                one_view=one_view,
-                networks=networks,
-                rgb_side=rgb_side,
-            )
-            samples = progress(list(zip(index, before, strict=True)), recording.name, len(index))
-            rows = [features_of(i, j) for i, j in samples]
-            blocks = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
-            is_moving = target[:, :3].norm(dim=-1) > moving
-            shards.add(ProbeShard(task_name(recording), {CONTEXT_BLOCK: context, **blocks}, target, is_moving))
+            sizes: dict[str, Any] = {"cells": depth_cells, "rgb_side": rgb_side, "moving": moving}
+            key = (scene.name, samples[:2], method, sizes, origin, sorted(networks), settings.seed, str(settings.dtype))
+            make = partial(_make_shard, scene, samples, method, networks, settings, progress=progress, **sizes)
+            shards.add(task_name(scene.recording), key, make)
         arms = {k: blocks for k, blocks in PROBE_ARMS.items() if set(blocks) <= set(shards.widths)}
         probe_errors = probing.evaluate_probes(shards, arms, n_folds=n_folds, penalties=penalties, seed=settings.seed)
         outcome.n_pairs = shards.n
     probing.record_probes(outcome, probe_errors)
     outcome.summary = probing.summarise_probes(probe_errors)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(probe_errors, real, margin))
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(probe_errors, origin, margin))
 
 
 def select_robot_samples(
@@ -200,12 +191,18 @@ def select_robot_samples(
     return index.tolist(), before[index].tolist(), context.round(decimals=_CONTEXT_DECIMALS), target
 
 
-def verdict(probe_errors: ProbeErrors, real: bool, margin: float) -> tuple[bool | None, str]:
-    """Verdict and text: equivalence over all samples and over those that move; None with random DINOv2 weights."""
+def verdict(probe_errors: ProbeErrors, origin: str | None, margin: float) -> tuple[bool | None, str]:
+    """Verdict and text: equivalence over all samples and over those that move.
+
+    Args:
+        probe_errors: of all arms.
+        origin: of DINOv2's weights; None = random: no verdict.
+        margin: of equivalence.
+    """
     n = len(probe_errors.groups)
     error = probe_errors.mean(_OURS, ALL_COHORT).value or 0.0
     context_ratio = probe_errors.ratio(_OURS, CONTEXT_BLOCK, ALL_COHORT)
-    ratio = _format_interval(context_ratio)
+    ratio = probing.format_ratio(context_ratio)
     text = f"error {error:.3f} of the targets' variance, {ratio} times that of the context alone ({n} tasks)"
     if (XFEAT_BLOCK, ALL_COHORT) in probe_errors.squares:
         cohorts = (ALL_COHORT, MOVING_COHORT)
@@ -219,11 +216,19 @@ def verdict(probe_errors: ProbeErrors, real: bool, margin: float) -> tuple[bool 
         cohort: probe_errors.ratio(_OURS, REFERENCE_BLOCK, cohort, level=probe.EQUIVALENCE_LEVEL)
         for cohort in (ALL_COHORT, MOVING_COHORT)
     }
-    ratios = ", ".join(f"{cohort} {_format_interval(interval)}" for cohort, interval in reference_ratios.items())
+    ratios = ", ".join(f"{cohort} {probing.format_ratio(interval)}" for cohort, interval in reference_ratios.items())
     published = "paper: 1.006, 1.013"
-    if not real:
+    if origin is None:
         reason = f"{probing.RANDOM_WEIGHTS_NOTE}; ratio to the random network, 90 % intervals: {ratios} ({published})"
         return None, f"{reason}. With depth features: {text}"
+    failed = None
+    if (POSITIVE_CONTROL, ALL_COHORT) in probe_errors.squares:
+        controls = (probe_errors.ratio(a, CONTEXT_BLOCK, ALL_COHORT) for a in (POSITIVE_CONTROL, NEGATIVE_CONTROL))
+        failed = probing.check_controls(*controls)
+    remarks = "; ".join(filter(None, (failed, probing.describe_error(error, context_ratio))))
+    text = f"{origin}. {text}{f' [{remarks}]' * bool(remarks)}"
+    if failed:
+        return None, f"no verdict, {failed}; ratio to DINOv2, 90 % intervals: {ratios}; {published}. {text}"
     equivalent = [probe.is_equivalent(interval, margin) for interval in reference_ratios.values()]
     holds = False if False in equivalent else True if all(equivalent) else None
     return holds, f"ratio to DINOv2, 90 % intervals, margin {margin:.0%}: {ratios}; {published}. {text}"
@@ -248,27 +253,42 @@ def _skip_reason(recording: Recording) -> Row:
     }
 
 
-def _frame_features(
-    recording: Recording,
-    settings: Settings,
-    i: int,
-    j: int,
-    *,
-    two_view: front_ends.DepthTokens,
-    one_view: front_ends.DepthTokens,
+@torch.no_grad()
+def _make_shard(
+    scene: Scene,
+    samples: tuple[list[int], list[int], Tensor, Tensor],
+    method: Method,
     networks: Mapping[str, front_ends.FrontEnd],
+    settings: Settings,
+    *,
+    cells: int,
     rgb_side: int,
-) -> dict[str, Tensor]:
-    """Features of frame ``i`` by block, (1, F) each, with frame ``j`` as second view."""
-    frame, second = (recording[k].to(settings.dtype).to(settings.device) for k in (i, j))
-    with torch.no_grad():
-        features = {
-            "rgb": front_ends.resize_to_square(frame, side=rgb_side),
-            "depth": two_view(frame, second),
-            "depth_one_view": one_view(frame),
-            **{name: network(frame) for name, network in networks.items()},
-        }
-    return {name: x.cpu() for name, x in features.items()}
+    moving: float,
+    progress: Progress,
+) -> ProbeShard:
+    """Shard of one scene's samples (indices, those ``history`` before, context, target), ``settings.batch`` at once."""
+    index, before, context, target = samples
+    recording = scene.recording
+    options: dict[str, Any] = {"cells": cells, "seed": settings.seed}
+    two_view, one_view = (front_ends.depth_tokens_for_scene(method, scene, views=v, **options) for v in (2, 1))
+    all_front_ends: dict[str, front_ends.FrontEnd] = {
+        "rgb": partial(front_ends.resize_to_square, side=rgb_side),
+        "depth": two_view,
+        "depth_one_view": one_view,
+        **networks,
+    }
+    parts: dict[str, list[Tensor]] = {name: [] for name in all_front_ends}
+    starts = range(0, len(index), max(1, settings.batch))
+    for start in progress(list(starts), recording.name, len(starts)):
+        chunk = slice(start, start + max(1, settings.batch))
+        frames, seconds = (
+            [recording[k].to(settings.dtype).to(settings.device) for k in part[chunk]] for part in (index, before)
+        )
+        for name, front_end in all_front_ends.items():
+            parts[name].append(front_end(frames, seconds).cpu())
+    blocks = probing.add_controls({name: torch.cat(x) for name, x in parts.items()}, target, settings.seed)
+    is_moving = target[:, :3].norm(dim=-1) > moving
+    return ProbeShard(task_name(recording), {CONTEXT_BLOCK: context, **blocks}, target, is_moving)
 
 
 def _pose_matrices(tcp: np.ndarray, file: Path) -> np.ndarray:
@@ -281,10 +301,3 @@ def _motion_vectors(T: np.ndarray) -> Tensor:
     R = torch.from_numpy(np.ascontiguousarray(T[:, :3, :3]))
     turn = rotation_matrix_to_axis_angle(R) if len(R) else R.new_zeros(0, 3)
     return torch.cat((torch.from_numpy(T[:, :3, 3]), turn), 1)
-
-
-def _format_interval(interval: Any) -> str:
-    """Text ``value (low to high)``; a dash without a value."""
-    if interval.value is None:
-        return "–"
-    return f"{interval.value:.3f}" + ("" if interval.low is None else f" ({interval.low:.3f} to {interval.high:.3f})")

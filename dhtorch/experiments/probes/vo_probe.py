@@ -3,19 +3,22 @@
 Samples are pairs of frames, a third of the scene's usable gap apart; the target is how the camera moved between them,
 rotation vector and translation from the recording's own trajectory. The input of the probe is the features of the
 first frame and their change to the second; depth tokens of either frame have the other one as second view. A sequence
-is cut into consecutive blocks that share no frame, and whole blocks are held out: every block is evaluated once. There
-is no context, so the arm ``context`` predicts the mean motion. ``two_view_pose`` is no probe but the method's own
-relative pose, no motion if it has none: the estimate of the geometry itself.
+is cut into consecutive blocks that share no frame, and whole blocks are held out: every block is evaluated once. With
+``hold_out=rooms`` all rooms share their probes and whole rooms are held out, so that intervals are over rooms. There is
+no context, so the arm ``context`` predicts the mean motion. ``two_view_pose`` is no probe but the method's own relative
+pose, no motion if it has none: the estimate of the geometry itself.
 
 Expectation (written before the run): yes; on every scene the error with depth features is smaller than DINOv2's (the
 paper: 1.32 against 1.63, ratio 0.81, one scene, geometry-favoured as it says itself).
 What would refute it: the 95 % interval of the ratio, from resampling blocks, lies wholly above 1 on half of the scenes.
-Undecided in between, and with random weights, which say nothing about DINOv2.
+Undecided in between, where the controls fail (:mod:`dhtorch.experiments.probes.probing`), and with random weights,
+which say nothing about DINOv2. An undecided ratio comes with the number of rooms or blocks that would show the paper's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -23,12 +26,13 @@ import torch
 from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 from torch import Tensor
 
-from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene, SceneLike, scenes_of
 from dhtorch.experiments.baselines import dinov2 as visual_branch
 from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes.probing import (
     CONTEXT_BLOCK,
+    NEGATIVE_CONTROL,
+    POSITIVE_CONTROL,
     PROBE_ARMS,
     PROBE_METRICS,
     PROBE_PENALTIES,
@@ -41,7 +45,7 @@ from dhtorch.experiments.probes.probing import (
 from dhtorch.experiments.protocol import Method, Outcome, Progress, ScenePairs, Settings, no_progress
 from dhtorch.experiments.rows import Row
 from dhtorch.geometry import se3
-from dhtorch.records import Frame
+from dhtorch.metrics.bootstrap import Interval
 
 QUESTION = "Within one scene, do depth features tell a ridge probe more of the camera's motion than DINOv2's do?"
 EXPECTATION = "Yes: on every scene the error with depth features is smaller than DINOv2's."
@@ -54,6 +58,15 @@ _MIN_BLOCKS = 3
 
 _OURS, _POSE_ARM = "dhtorch", "two_view_pose"
 
+#: Ratio of the errors in the paper: 1.32 against 1.63. Source: paper.
+_PUBLISHED_RATIO = 0.81
+
+#: What is held out at a time.
+_HOLD_OUTS = ("blocks", "rooms")
+
+#: Name of the rows of probes that all rooms share.
+_ALL_ROOMS = "all rooms"
+
 
 def run(
     scenes: Sequence[SceneLike],
@@ -61,6 +74,7 @@ def run(
     pairs: ScenePairs,
     settings: Settings,
     *,
+    hold_out: str = "blocks",
     gap_parts: int = 3,
     blocks: int = 5,
     min_pairs: int = 30,
@@ -71,72 +85,77 @@ def run(
     rgb_side: int = 16,
     dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load_dinov2,
     xfeat: bool = False,
+    features: str | None = None,
     progress: Progress = no_progress,
 ) -> Outcome:
-    """Run the experiment: ridge probes of every scene separately, verdict; scenes of one room are joined.
+    """Run the experiment: ridge probes of every room separately or of all together, verdict.
 
     Args:
         scenes: with poses; those without, with a role, or of rooms with few pairs are left out, with a note.
         methods: name → method; the first fills the depth tokens.
         pairs: not used: every frame starts a pair, to have enough samples.
-        settings: of the job; the method sees all returns.
+        settings: of the job; the method sees all returns; ``batch`` pairs or pictures per forward pass.
+        hold_out: ``blocks`` of a room, each room with probes of its own; or ``rooms``, with probes that all share.
         gap_parts: the frames of a pair are the scene's own gap divided by this apart, at least one frame.
         blocks: consecutive parts of a scene, at least three; split evenly over the scenes of a room.
-        min_pairs: smallest number of pairs of a scene.
+        min_pairs: smallest number of pairs of a room.
         moving: m; a pair moves if the camera's translation is larger.
+        features: folder that keeps the features, so that an interrupted run goes on; None = a temporary one.
         penalties, depth_cells, dinov2_cells, rgb_side, dinov2, xfeat, progress: as
             :func:`dhtorch.experiments.probes.rh20t_probe.run`.
 
     Returns:
-        Outcome with one row per scene and arm; see :func:`probing.record_probes`.
+        Outcome with one row per room (or for all rooms) and arm; see :func:`probing.record_probes`.
 
     Raises:
         ImportError: ``transformers`` or XFeat's package is missing; the message says what to install.
-        ValueError: fewer than three blocks.
+        ValueError: fewer than three blocks, or an unknown ``hold_out``.
 
     Source: paper, section 6.7, "Downstream behaviour as a visual front-end".
     """
     if blocks < _MIN_BLOCKS:
         raise ValueError(f"vo_probe: blocks is {blocks}, expected at least {_MIN_BLOCKS}")
-    networks, real = front_ends.load_network_front_ends(
+    if hold_out not in _HOLD_OUTS:
+        raise ValueError(f"vo_probe: hold_out is {hold_out!r}, expected {' or '.join(_HOLD_OUTS)}")
+    networks, origin = front_ends.load_network_front_ends(
         dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device
     )
-    arm_names = [*(arm for arm, blocks in PROBE_ARMS.items() if xfeat or XFEAT_BLOCK not in blocks), _POSE_ARM]
+    arm_names = [*(arm for arm, names in PROBE_ARMS.items() if xfeat or XFEAT_BLOCK not in names), _POSE_ARM]
+    extractor = _PairFeatures(
+        settings, next(iter(methods.values())), networks, cells=depth_cells, rgb_side=rgb_side, origin=origin
+    )
     outcome = Outcome(metrics=PROBE_METRICS)
     rooms: dict[str, list[Scene]] = {}
     for scene in scenes_of(scenes):
         rooms.setdefault(scene.place, []).append(scene)
+    probed: dict[str, list[tuple[Scene, list[list[tuple[int, int]]]]]] = {}
     for room, members in rooms.items():
-        blocks_of = {s.name: split_into_blocks(s, gap_parts, max(1, -(-blocks // len(members)))) for s in members}
-        n_pairs = sum(len(block) for scene_blocks in blocks_of.values() for block in scene_blocks)
-        if n_pairs < min_pairs:
-            note = f"{n_pairs} pairs with known motion, fewer than {min_pairs}"
+        blocks_of = [(s, split_into_blocks(s, gap_parts, max(1, -(-blocks // len(members))))) for s in members]
+        note = _reason_to_leave_out([block for _, scene_blocks in blocks_of for block in scene_blocks], min_pairs)
+        if note:
             outcome.rows += [_empty_row(room, arm, note) for arm in arm_names]
-            continue
-        if sum(bool(block) for scene_blocks in blocks_of.values() for block in scene_blocks) < _MIN_BLOCKS:
-            note = f"fewer than {_MIN_BLOCKS} blocks with pairs"
-            outcome.rows += [_empty_row(room, arm, note) for arm in arm_names]
-            continue
-        with ProbeShards() as shards:
-            for scene in members:
-                options: dict[str, Any] = {"cells": depth_cells, "seed": settings.seed}
-                two_view, one_view = (
-                    front_ends.depth_tokens_for_scene(next(iter(methods.values())), scene, views=v, **options)
-                    for v in (2, 1)
-                )
-                features_of = _PairFeatures(scene.recording, settings, two_view, one_view, networks, rgb_side)
-                pairs_of_scene = [pair for block in blocks_of[scene.name] for pair in block]
-                rows = iter([features_of(*pair) for pair in progress(pairs_of_scene, scene.name, len(pairs_of_scene))])
-                for k, block in enumerate(blocks_of[scene.name]):
-                    features = [next(rows) for _ in block]
-                    shards.add(_make_shard(f"{scene.name} {k}", features, scene.recording, block, moving))
+        else:
+            probed[_ALL_ROOMS if hold_out == "rooms" else room] = [
+                *probed.get(_ALL_ROOMS if hold_out == "rooms" else room, []),
+                *blocks_of,
+            ]
+    needed: dict[str, int | None] = {}
+    for name, members_blocks in probed.items():
+        with ProbeShards(features) as shards:
+            for scene, scene_blocks in members_blocks:
+                for k, block in enumerate(scene_blocks):
+                    if block:
+                        group = scene.place if hold_out == "rooms" else f"{scene.name} {k}"
+                        extractor.add(shards, group, scene, block, moving, progress)
             arms = {k: names for k, names in PROBE_ARMS.items() if set(names) <= set(shards.widths)}
-            options = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
-            probe_errors = probing.evaluate_probes(shards, arms, predictions={_POSE_ARM: _OWN_POSE_BLOCK}, **options)
-        probing.record_probes(outcome, probe_errors, room)
-        outcome.n_pairs += n_pairs
+            options: dict[str, Any] = {"n_folds": len(shards.groups), "penalties": penalties, "seed": settings.seed}
+            errors = probing.evaluate_probes(shards, arms, predictions={_POSE_ARM: _OWN_POSE_BLOCK}, **options)
+            outcome.n_pairs += shards.n
+        probing.record_probes(outcome, errors, name)
+        if REFERENCE_BLOCK in arms:
+            needed[name] = probing.groups_needed(errors, _OURS, REFERENCE_BLOCK, probing.ALL_COHORT, _PUBLISHED_RATIO)
     outcome.summary = probing.summarise_over_scenes(outcome, arm_names)
-    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, real))
+    return outcome.decide(QUESTION, EXPECTATION, *verdict(outcome, origin, needed))
 
 
 def split_into_blocks(scene: Scene, gap_parts: int, n: int) -> list[list[tuple[int, int]]]:
@@ -149,8 +168,16 @@ def split_into_blocks(scene: Scene, gap_parts: int, n: int) -> list[list[tuple[i
     return [[(i, i + step) for i in range(a, b - step)] for a, b in pairwise(edges)]
 
 
-def verdict(outcome: Outcome, real: bool) -> tuple[bool | None, str]:
-    """Verdict and text: error below DINOv2's on every scene; None with random DINOv2 weights."""
+def verdict(
+    outcome: Outcome, origin: str | None, needed: Mapping[str, int | None] | None = None
+) -> tuple[bool | None, str]:
+    """Verdict and text: error below DINOv2's in every room.
+
+    Args:
+        outcome: with its rows.
+        origin: of DINOv2's weights; None = random: no verdict.
+        needed: number of blocks, or rooms, with which the paper's ratio would be seen, by the name of the row.
+    """
     ours, theirs = outcome.scenes(_OURS, PROBE_TRUTH), outcome.scenes(REFERENCE_BLOCK, PROBE_TRUTH)
     xfeat_text = probing.compare_with_xfeat(
         {s: (row.get("vs_xfeat"), row.get("vs_xfeat_low"), row.get("vs_xfeat_high")) for s, row in ours.items()}
@@ -159,76 +186,128 @@ def verdict(outcome: Outcome, real: bool) -> tuple[bool | None, str]:
     if not scenes:
         has_error = any(row.get("mse") is not None for row in ours.values())
         return None, f"{'DINOv2 was left out' if has_error else 'no scene with enough pairs'}{xfeat_text}"
-    parts = [f"{s} {ours[s]['mse']:.2f} against {theirs[s]['mse']:.2f}{_format_interval(ours[s])}" for s in scenes]
-    text = f"{'; '.join(parts)} (paper: 1.32 against 1.63, ratio 0.81){xfeat_text}"
-    if not real:
+    parts = [_describe_room(s, ours[s], theirs[s], (needed or {}).get(s)) for s in scenes]
+    text = f"{'; '.join(parts)} (paper: 1.32 against 1.63, ratio 0.81, one scene){xfeat_text}"
+    if origin is None:
         return None, f"{probing.RANDOM_WEIGHTS_NOTE}; error with depth features and with the random network: {text}"
-    below = [ours[s]["vs_dinov2_high"] is not None and ours[s]["vs_dinov2_high"] < 1 for s in scenes]
-    above = [ours[s]["vs_dinov2_low"] is not None and ours[s]["vs_dinov2_low"] > 1 for s in scenes]
-    holds = True if all(below) else False if 2 * sum(above) >= len(scenes) else None
-    return holds, text
+    text = f"{origin}: {text}"
+    failed = {s: reason for s in scenes if (reason := _failed_control(outcome, s))}
+    judged = [s for s in scenes if s not in failed]
+    if failed:
+        text += f". No verdict on {'; '.join(f'{s}: {reason}' for s, reason in failed.items())}"
+    below = [ours[s]["vs_dinov2_high"] is not None and ours[s]["vs_dinov2_high"] < 1 for s in judged]
+    above = [ours[s]["vs_dinov2_low"] is not None and ours[s]["vs_dinov2_low"] > 1 for s in judged]
+    refuted = bool(judged) and 2 * sum(above) >= len(judged)
+    return (True if below and all(below) and not failed else False if refuted else None), text
+
+
+def _failed_control(outcome: Outcome, scene: str) -> str | None:
+    """Reason why the controls of a row allow no verdict; None = they do, or were not run."""
+    rows = [outcome.scenes(arm, PROBE_TRUTH).get(scene, {}) for arm in (POSITIVE_CONTROL, NEGATIVE_CONTROL)]
+    return probing.check_controls(*(_interval(row, "vs_context") for row in rows)) if any(rows) else None
+
+
+def _describe_room(scene: str, ours: Row, theirs: Row, needed: int | None) -> str:
+    """Errors, ratio and what is to be said of them."""
+    text = f"{scene} {ours['mse']:.2f} against {theirs['mse']:.2f}{_format_interval(ours)}"
+    remarks = probing.describe_error(ours["mse"], _interval(ours, "vs_context"))
+    low, high = ours.get("vs_dinov2_low"), ours.get("vs_dinov2_high")
+    if needed is not None and low is not None and high is not None and low <= 1 <= high:
+        remarks += f"{'; ' * bool(remarks)}the paper's ratio would be seen with about {needed} such groups"
+    return f"{text} [{remarks}]" if remarks else text
+
+
+def _interval(row: Row, name: str) -> Interval:
+    return Interval(row.get(name), row.get(f"{name}_low"), row.get(f"{name}_high"), row.get("n_samples") or 0)
+
+
+def _reason_to_leave_out(blocks: Sequence[Sequence[tuple[int, int]]], min_pairs: int) -> str | None:
+    """Why a room with these blocks of pairs is not probed; None = it is."""
+    if (n := sum(map(len, blocks))) < min_pairs:
+        return f"{n} pairs with known motion, fewer than {min_pairs}"
+    return f"fewer than {_MIN_BLOCKS} blocks with pairs" if sum(map(bool, blocks)) < _MIN_BLOCKS else None
 
 
 class _PairFeatures:
-    """Features of the pairs of one recording; single-frame features are computed once per frame."""
+    """Features of pairs, ``settings.batch`` at once; those of a single frame are computed once per block."""
 
     def __init__(
         self,
-        recording: Recording,
         settings: Settings,
-        two_view: front_ends.DepthTokens,
-        one_view: front_ends.DepthTokens,
+        method: Method,
         networks: Mapping[str, front_ends.FrontEnd],
+        *,
+        cells: int,
         rgb_side: int,
+        origin: str | None,
     ) -> None:
-        self.recording, self.settings, self.two_view, self.one_view = recording, settings, two_view, one_view
-        self.networks, self.rgb_side = networks, rgb_side
-        self._cache: dict[int, tuple[Frame, dict[str, Tensor]]] = {}
+        self.settings, self.method, self.networks = settings, method, networks
+        self.cells, self.rgb_side, self.origin = cells, rgb_side, origin
+
+    def add(
+        self,
+        shards: ProbeShards,
+        group: str,
+        scene: Scene,
+        block: Sequence[tuple[int, int]],
+        moving: float,
+        progress: Progress,
+    ) -> None:
+        """Add the shard of one block of pairs: features, motions, and whether each moves more than ``moving`` m."""
+        source = (scene.name, len(scene.recording), list(block), moving)
+        key = (*source, self.method, self.cells, self.rgb_side, self.origin, sorted(self.networks), self.settings.seed)
+
+        def make() -> ProbeShard:
+            i, j = torch.tensor(list(block), dtype=torch.int64).view(-1, 2).unbind(-1)
+            poses = scene.recording.poses
+            assert poses is not None  # scenes without poses have no blocks
+            target = _motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
+            features = probing.add_controls(self._features(scene, block, progress), target, self.settings.seed)
+            blocks = {CONTEXT_BLOCK: target.new_zeros(len(target), 0), **features}
+            return ProbeShard(group, blocks, target, target[:, 3:].norm(dim=-1) > moving)
+
+        shards.add(group, key, make)
 
     @torch.no_grad()
-    def __call__(self, i: int, j: int) -> dict[str, Tensor]:
-        """Features of a pair by block: those of frame ``i``, concatenated with those of ``j`` minus those of ``i``."""
-        (a, single_a), (b, single_b) = self._single_frame(i), self._single_frame(j)
-        forth, added = self.two_view.features_and_keys(a, b)
-        back = self.two_view(b, a)
-        features = {name: torch.cat((x, single_b[name] - x), 1) for name, x in single_a.items()}
-        features["depth"] = torch.cat((forth, back - forth), 1)
-        # The transform's pose maps the reference view into the other view: the same way round as the target.
-        features[_OWN_POSE_BLOCK] = torch.where(
-            added["pose_ok"], _motion_vectors(added["T_1_from_0"][None].double()), 0.0
+    def _features(self, scene: Scene, block: Sequence[tuple[int, int]], progress: Progress) -> dict[str, Tensor]:
+        """Features (n, F) of the pairs by block of features: frame ``i``, then ``j`` minus ``i``."""
+        settings = self.settings
+        frames = {
+            k: scene.recording[k].to(settings.dtype).to(settings.device) for k in sorted({k for p in block for k in p})
+        }
+        two_view, one_view = (
+            front_ends.depth_tokens_for_scene(self.method, scene, cells=self.cells, seed=settings.seed, views=v)
+            for v in (2, 1)
         )
-        return {name: x.cpu() for name, x in features.items()}
+        single: dict[str, front_ends.FrontEnd] = {
+            "rgb": partial(front_ends.resize_to_square, side=self.rgb_side),
+            "depth_one_view": one_view,
+            **self.networks,
+        }
+        order = {k: n for n, k in enumerate(frames)}
+        a, b = ([order[p[side]] for p in block] for side in (0, 1))
+        features = {}
+        for name, front_end in single.items():
+            parts = [front_end(chunk) for chunk in _chunks(list(frames.values()), settings.batch)]
+            x = torch.cat(parts).cpu()
+            features[name] = torch.cat((x[a], x[b] - x[a]), 1)
+        forth, back, own = [], [], []
+        chunks = _chunks(list(block), settings.batch)
+        for chunk in progress(chunks, scene.name, len(chunks)):
+            first, second = ([frames[p[side]] for p in chunk] for side in (0, 1))
+            x, added = two_view.features_and_keys(first, second)
+            forth.append(x.cpu())
+            back.append(two_view(second, first).cpu())
+            # The transform's pose maps the reference view into the other view: the same way round as the target.
+            motion = _motion_vectors(added["T_1_from_0"].double())
+            own.append(torch.where(added["pose_ok"].view(-1, 1), motion, 0.0).cpu())
+        depth, change = torch.cat(forth), torch.cat(back) - torch.cat(forth)
+        return {**features, "depth": torch.cat((depth, change), 1), _OWN_POSE_BLOCK: torch.cat(own)}
 
-    def _single_frame(self, i: int) -> tuple[Frame, dict[str, Tensor]]:
-        """Frame ``i`` on the device, and the features that need no second view; the latest frames are cached."""
-        if i not in self._cache:
-            self._cache = {k: v for k, v in self._cache.items() if k >= i - 64}  # bounds the memory of a long recording
-            frame = self.recording[i].to(self.settings.dtype).to(self.settings.device)
-            features = {
-                "rgb": front_ends.resize_to_square(frame, side=self.rgb_side),
-                "depth_one_view": self.one_view(frame),
-            }
-            features |= {name: network(frame) for name, network in self.networks.items()}
-            self._cache[i] = frame, features
-        return self._cache[i]
 
-
-def _make_shard(
-    group: str,
-    rows: Sequence[Mapping[str, Tensor]],
-    recording: Recording,
-    block: Sequence[tuple[int, int]],
-    moving: float,
-) -> ProbeShard:
-    """Shard of one block: concatenated features, target motions, and whether each pair moves more than ``moving`` m."""
-    i, j = torch.tensor(list(block), dtype=torch.int64).view(-1, 2).unbind(-1)
-    poses = recording.poses
-    assert poses is not None  # scenes without poses have no blocks
-    target = _motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
-    blocks = {name: torch.cat([row[name] for row in rows]) for name in rows[0]}
-    return ProbeShard(
-        group, {CONTEXT_BLOCK: target.new_zeros(len(target), 0), **blocks}, target, target[:, 3:].norm(dim=-1) > moving
-    )
+def _chunks(items: Sequence[Any], n: int) -> list[Sequence[Any]]:
+    """Consecutive parts of at most ``n`` items."""
+    return [items[k : k + n] for k in range(0, len(items), max(1, n))]
 
 
 def _motion_vectors(T: Tensor) -> Tensor:
