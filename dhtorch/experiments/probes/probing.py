@@ -40,7 +40,7 @@ PROBE_METRICS = (
     MainMetric("vs_xfeat", larger_is_better=False, with_interval=True),
 )
 
-CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK = "context", "dinov2", "xfeat"
+CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK, EFFICIENTNET_BLOCK = "context", "dinov2", "xfeat", "efficientnet"
 
 #: Blocks and arms of the controls.
 POSITIVE_CONTROL, NEGATIVE_CONTROL = "true_motion", "shuffled"
@@ -62,6 +62,8 @@ PROBE_ARMS: dict[str, tuple[str, ...]] = {
     "dhtorch + dinov2": ("depth", "dinov2"),
     XFEAT_BLOCK: ("xfeat",),
     "dhtorch + xfeat": ("depth", "xfeat"),
+    EFFICIENTNET_BLOCK: ("efficientnet",),
+    "dhtorch + efficientnet": ("depth", "efficientnet"),
     POSITIVE_CONTROL: (POSITIVE_CONTROL,),
     NEGATIVE_CONTROL: (NEGATIVE_CONTROL,),
 }

@@ -82,6 +82,7 @@ def run(
     rgb_side: int = 16,
     dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load_dinov2,
     xfeat: bool = False,
+    efficientnet: bool = False,
     features: str | None = None,
     progress: Progress = no_progress,
 ) -> Outcome:
@@ -102,7 +103,8 @@ def run(
         depth_cells, dinov2_cells: cells per side over which tokens are averaged.
         rgb_side: side of the downsampled image, px.
         dinov2: builds the network; None = leave it out.
-        xfeat: also run XFeat's dense features; its package contains the trained weights.
+        xfeat, efficientnet: also run XFeat's dense features, EfficientNet-Lite0's; their packages contain the trained
+            weights.
         features: folder that keeps the features, so that an interrupted run goes on; None = a temporary one.
         progress: wraps the loop over a scene's samples.
 
@@ -116,7 +118,7 @@ def run(
     Source: paper, section 6.7, "Downstream behaviour as a visual front-end".
     """
     networks, origin = front_ends.load_network_front_ends(
-        dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device
+        dinov2, cells=dinov2_cells, xfeat_too=xfeat, efficientnet_too=efficientnet, device=settings.device
     )
     select = partial(select_robot_samples, horizon=horizon, history=history, stride=stride)
     chosen = [(scene, select(scene.recording)) for scene in scenes_of(scenes)]

@@ -31,6 +31,7 @@ from dhtorch.experiments.baselines import dinov2 as visual_branch
 from dhtorch.experiments.probes import front_ends, probing
 from dhtorch.experiments.probes.probing import (
     CONTEXT_BLOCK,
+    EFFICIENTNET_BLOCK,
     NEGATIVE_CONTROL,
     POSITIVE_CONTROL,
     PROBE_ARMS,
@@ -85,6 +86,7 @@ def run(
     rgb_side: int = 16,
     dinov2: Callable[..., torch.nn.Module] | None = visual_branch.load_dinov2,
     xfeat: bool = False,
+    efficientnet: bool = False,
     features: str | None = None,
     progress: Progress = no_progress,
 ) -> Outcome:
@@ -101,7 +103,7 @@ def run(
         min_pairs: smallest number of pairs of a room.
         moving: m; a pair moves if the camera's translation is larger.
         features: folder that keeps the features, so that an interrupted run goes on; None = a temporary one.
-        penalties, depth_cells, dinov2_cells, rgb_side, dinov2, xfeat, progress: as
+        penalties, depth_cells, dinov2_cells, rgb_side, dinov2, xfeat, efficientnet, progress: as
             :func:`dhtorch.experiments.probes.rh20t_probe.run`.
 
     Returns:
@@ -118,9 +120,10 @@ def run(
     if hold_out not in _HOLD_OUTS:
         raise ValueError(f"vo_probe: hold_out is {hold_out!r}, expected {' or '.join(_HOLD_OUTS)}")
     networks, origin = front_ends.load_network_front_ends(
-        dinov2, cells=dinov2_cells, xfeat_too=xfeat, device=settings.device
+        dinov2, cells=dinov2_cells, xfeat_too=xfeat, efficientnet_too=efficientnet, device=settings.device
     )
-    arm_names = [*(arm for arm, names in PROBE_ARMS.items() if xfeat or XFEAT_BLOCK not in names), _POSE_ARM]
+    left_out = {XFEAT_BLOCK: not xfeat, EFFICIENTNET_BLOCK: not efficientnet}
+    arm_names = [*(a for a, names in PROBE_ARMS.items() if not any(left_out.get(n) for n in names)), _POSE_ARM]
     extractor = _PairFeatures(
         settings, next(iter(methods.values())), networks, cells=depth_cells, rgb_side=rgb_side, origin=origin
     )
