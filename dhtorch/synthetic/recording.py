@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import inspect
 import itertools
-import math
 from collections.abc import Sequence
 from random import Random
 from typing import Any, ClassVar
@@ -19,10 +18,10 @@ from torch import Generator, Tensor
 
 from dhtorch.data.recording import TruthRecording, consecutive_frame_numbers
 from dhtorch.data.scene import Scene
-from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera, resize
 from dhtorch.records import Frame, Pose
 from dhtorch.runtime.console import format_count
+from dhtorch.synthetic.device_trajectory import reported_poses
 from dhtorch.synthetic.paths import CAMERA_PATHS, hand_held_path
 from dhtorch.synthetic.raycast import SURFACE_DARK, SURFACE_MIRROR, SURFACE_ORDINARY, SURFACE_WINDOW, world_rays
 from dhtorch.synthetic.room import furnished_room
@@ -52,8 +51,9 @@ class SyntheticRoom(TruthRecording):
         supersample: rays per pixel and axis.
         trajectory_axes: ``cv`` or ``gl``, the axes stated for the device's trajectory (``pose_axes``; frames have
             OpenCV axes in any case).
-        trajectory_offset_deg: constant angle between the device's axes and the camera's; the frames' trajectory is
-            then wrong by it, ``true_poses`` is not.
+        trajectory_offset_deg, trajectory_lag_s, trajectory_drift_deg_per_s, trajectory_rotation_noise_deg: errors of
+            the frames' trajectory, which ``true_poses`` does not have; see
+            :func:`dhtorch.synthetic.device_trajectory.reported_poses`.
         name: of the recording.
         true_poses: (n_frames) T_world_from_cam, float64, instead of the path's.
         times: (n_frames) s, float64, instead of the frame rate's.
@@ -82,6 +82,9 @@ class SyntheticRoom(TruthRecording):
         supersample: int = 2,
         trajectory_axes: str = "cv",
         trajectory_offset_deg: float = 0.0,
+        trajectory_lag_s: float = 0.0,
+        trajectory_drift_deg_per_s: float = 0.0,
+        trajectory_rotation_noise_deg: float = 0.0,
         name: str = "synthetic_room",
         true_poses: Pose | None = None,
         times: Tensor | None = None,
@@ -98,13 +101,23 @@ class SyntheticRoom(TruthRecording):
                 raise ValueError(f"synthetic room: {option} is {value}, expected a positive number")
         if true_poses is None:
             true_poses = hand_held_path(path, n_frames, step_m=step_m, rate_hz=rate_hz, seed=seed)
+        times = consecutive_frame_numbers(n_frames).double() / rate_hz if times is None else times
+        reported = reported_poses(
+            true_poses,
+            times,
+            offset_deg=trajectory_offset_deg,
+            lag_s=trajectory_lag_s,
+            drift_deg_per_s=trajectory_drift_deg_per_s,
+            rotation_noise_deg=trajectory_rotation_noise_deg,
+            seed=seed,
+        )
         super().__init__(
             name=name,
             format="synthetic",
             load=self._render,
             number=consecutive_frame_numbers(n_frames),
-            times=consecutive_frame_numbers(n_frames).double() / rate_hz if times is None else times,
-            poses=_rotate_device_axes(true_poses, trajectory_offset_deg),
+            times=times,
+            poses=reported,
             pose_axes=trajectory_axes,
             rate_hz=rate_hz,
         )
@@ -302,12 +315,6 @@ def simulate_phone_lidar(
     depth = torch.where(answered, reported, torch.zeros_like(reported))
     conf = torch.where(answered, level, 0).to(torch.uint8)
     return depth.view(1, *hw), conf.view(1, *hw)
-
-
-def _rotate_device_axes(poses: Pose, degrees: float) -> Pose:
-    """Poses reported by a device whose axes are rotated by a constant angle against those of its camera."""
-    turn = se3.exp(poses.t.new_tensor([[math.radians(degrees) / 3**0.5] * 3 + [0.0] * 3]))
-    return Pose(poses.R @ turn.R, poses.t)
 
 
 def _photograph(

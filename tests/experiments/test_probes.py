@@ -102,7 +102,7 @@ def test_controls_show_what_the_split_can_decide():
     with probing.ProbeShards() as shards:
         for k in range(8):
             y = torch.randn(60, 2, generator=g, dtype=torch.float64)
-            blocks = {"context": y[:, :0], **probing.add_controls({"depth": y + 0.1}, y, seed=k)}
+            blocks = {"context": y[:, :0], **probing.add_positive_control({"depth": y + 0.1}, y, seed=k)}
             shards.add(f"g{k}", None, partial(probing.ProbeShard, f"g{k}", blocks, y, y[:, 0] > 0))
         arms = {"context": (), "true_motion": ("true_motion",), "shuffled": ("shuffled",), "dhtorch": ("depth",)}
         errors = probing.evaluate_probes(shards, arms)

@@ -14,7 +14,7 @@ import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from dhtorch.data.scene import SceneLike
+from dhtorch.data.scene import SceneLike, scenes_of
 from dhtorch.experiments import protocol
 from dhtorch.experiments.cohorts import (
     HeldOut,
@@ -41,7 +41,8 @@ def run(
 ) -> Outcome:
     """Errors of held-out samples triangulated under the device's trajectory, raw and converted, and under ours.
 
-    Variants ``device_raw``, ``device_gl_to_cv``, ``anchored`` (the pose estimated from near returns); rows carry
+    Variants ``device_raw`` (left out where every trajectory has OpenCV axes: it would be ``device_gl_to_cv`` again),
+    ``device_gl_to_cv``, ``anchored`` (the pose estimated from near returns); rows carry
     ``rotation_deg``, ``translation_m`` and ``direction_deg``, by which each variant's relative pose differs from the
     converted trajectory's. Cohort: set B of the hold-out, the same for all three.
 
@@ -49,8 +50,9 @@ def run(
     Source: paper, "LiDAR-anchored relative pose".
     """
     split = HeldOut(next(iter(methods.values())), settings)
-    variants = {
-        "device_raw": split.variant(fit=partial(trajectory_pose_fit, raw=True), needs=missing_trajectory_reason),
+    has_other_axes = any(s.recording.pose_axes != "cv" for s in scenes_of(scenes) if s.recording.poses is not None)
+    raw = split.variant(fit=partial(trajectory_pose_fit, raw=True), needs=missing_trajectory_reason)
+    variants = ({"device_raw": raw} if has_other_axes else {}) | {
         "device_gl_to_cv": split.variant(fit=trajectory_pose_fit, needs=missing_trajectory_reason),
         "anchored": split.variant(),
     }
@@ -90,5 +92,7 @@ def verdict(outcome: Outcome) -> tuple[bool | None, str]:
         corr, error = (summary[f"{variant}.{k}"]["value"] for k in ("corr", "median_rel"))
         return "no answer" if corr is None else f"corr {corr:.2f}, error {error:.1%}"
 
-    why = "; ".join(f"{v}: {describe(v)}" for v in ("device_raw", "device_gl_to_cv", "anchored"))
+    variants = [v for v in ("device_raw", "device_gl_to_cv", "anchored") if f"{v}.corr" in summary]
+    why = "; ".join(f"{v}: {describe(v)}" for v in variants)
+    why += "" if "device_raw" in variants else "; all trajectories have OpenCV axes: raw and converted are the same"
     return sum(better) > len(both) / 2, f"anchored better in both on {sum(better)} of {len(both)} scenes; {why}"

@@ -5,7 +5,7 @@ and one block per front end. An *arm* is the context and a subset of the blocks.
 again shard by shard; over all samples only means and scatter matrices are held in memory.
 
 Two arms are controls: ``true_motion`` has the target itself with noise (it must beat the context, or the samples are
-too few to decode anything), ``shuffled`` the depth features of other samples (it must not beat the context, or the
+too few to decode anything), ``shuffled`` the depth features of another group (it must not beat the context, or the
 split leaks). No verdict without both.
 """
 
@@ -17,7 +17,7 @@ import os
 import re
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -44,6 +44,9 @@ CONTEXT_BLOCK, REFERENCE_BLOCK, XFEAT_BLOCK, EFFICIENTNET_BLOCK = "context", "di
 
 #: Blocks and arms of the controls.
 POSITIVE_CONTROL, NEGATIVE_CONTROL = "true_motion", "shuffled"
+
+#: Block whose features the negative control takes from another group.
+_SHUFFLED_BLOCK = "depth"
 
 #: Noise of the positive control, in standard deviations of the targets of a group.
 #: Source: derived, a linear probe of it has an error of .3² / (1 + .3²) = .08 of the variance.
@@ -134,11 +137,10 @@ class ProbeShards:
             partial_file.replace(file)
         shard = self._load(file)
         widths = {name: block.shape[-1] for name, block in shard.blocks.items()}
-        if self.widths and widths != self.widths:
-            raise ValueError(
-                f"probe: group {group} has blocks {widths}, expected {self.widths} as in the earlier groups"
-            )
-        self.widths = widths
+        known = {name: width for name, width in self.widths.items() if name != NEGATIVE_CONTROL}
+        if known and widths != known:
+            raise ValueError(f"probe: group {group} has blocks {widths}, expected {known} as in the earlier groups")
+        self.widths = widths | ({NEGATIVE_CONTROL: widths[_SHUFFLED_BLOCK]} if _SHUFFLED_BLOCK in widths else {})
         self._files.append((group, file))
         self.n += len(shard.target)
 
@@ -154,9 +156,17 @@ class ProbeShards:
     def read(self, groups: Sequence[str]) -> Iterator[ProbeShard]:
         """Load the shards of the named groups, one after another."""
         wanted = set(groups)
-        for group, file in self._files:
+        for k, (group, file) in enumerate(self._files):
             if group in wanted:
-                yield self._load(file)
+                yield self._with_negative_control(self._load(file), k)
+
+    def _with_negative_control(self, shard: ProbeShard, k: int) -> ProbeShard:
+        """Shard ``k`` with the depth features of the shard half of all shards away: of other samples, elsewhere."""
+        if NEGATIVE_CONTROL not in self.widths:
+            return shard
+        other = self._load(self._files[(k + len(self._files) // 2) % len(self._files)][1]).blocks[_SHUFFLED_BLOCK]
+        rows = torch.arange(len(shard.target)) % max(len(other), 1)
+        return replace(shard, blocks={**shard.blocks, NEGATIVE_CONTROL: other[rows]})
 
     def columns(self, blocks: Sequence[str]) -> Tensor:
         """Column indices of the named blocks among all features: (f,) int64."""
@@ -174,27 +184,12 @@ class ProbeShards:
             self._temporary.cleanup()
 
 
-def add_controls(blocks: Mapping[str, Tensor], target: Tensor, seed: int) -> dict[str, Tensor]:
-    """The blocks (n, F) with those of the controls.
-
-    Args:
-        blocks: with ``depth``.
-        target: (n, D).
-        seed: of the noise and of the order.
-
-    Returns:
-        The blocks; ``true_motion`` (n, D): the target with :data:`CONTROL_NOISE`; ``shuffled``: the depth features with
-        every column in a random order of its own, so that the values are those of the group and the samples nobody's.
-    """
+def add_positive_control(blocks: Mapping[str, Tensor], target: Tensor, seed: int) -> dict[str, Tensor]:
+    """The blocks with ``true_motion`` (n, D): the target (n, D) with :data:`CONTROL_NOISE`, from ``seed``."""
     generator = torch.Generator().manual_seed(seed)
     spread = target.std(0, unbiased=False) if len(target) else target.new_zeros(target.shape[-1])
     noise = torch.randn(target.shape, generator=generator, dtype=target.dtype)
-    order = torch.rand(blocks["depth"].shape, generator=generator).argsort(0)
-    controls = {
-        POSITIVE_CONTROL: target + CONTROL_NOISE * spread * noise,
-        NEGATIVE_CONTROL: blocks["depth"].gather(0, order),
-    }
-    return {**blocks, **controls}
+    return {**blocks, POSITIVE_CONTROL: target + CONTROL_NOISE * spread * noise}
 
 
 @dataclass

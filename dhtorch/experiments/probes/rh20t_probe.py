@@ -288,7 +288,7 @@ def _make_shard(
         )
         for name, front_end in all_front_ends.items():
             parts[name].append(front_end(frames, seconds).cpu())
-    blocks = probing.add_controls({name: torch.cat(x) for name, x in parts.items()}, target, settings.seed)
+    blocks = probing.add_positive_control({name: torch.cat(x) for name, x in parts.items()}, target, settings.seed)
     is_moving = target[:, :3].norm(dim=-1) > moving
     return ProbeShard(task_name(recording), {CONTEXT_BLOCK: context, **blocks}, target, is_moving)
 

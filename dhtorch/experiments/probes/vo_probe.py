@@ -265,7 +265,7 @@ class _PairFeatures:
             poses = scene.recording.poses
             assert poses is not None  # scenes without poses have no blocks
             target = _motion_vectors(se3.to_matrix(se3.relative(poses[i], poses[j])).double())
-            features = probing.add_controls(self._features(scene, block, progress), target, self.settings.seed)
+            features = probing.add_positive_control(self._features(scene, block, progress), target, self.settings.seed)
             blocks = {CONTEXT_BLOCK: target.new_zeros(len(target), 0), **features}
             return ProbeShard(group, blocks, target, target[:, 3:].norm(dim=-1) > moving)
 
