@@ -243,8 +243,11 @@ def verdicts(names: Sequence[str]) -> str:
     rows = []
     for name in names:
         result = json.loads((RESULTS / f"{name}.json").read_text())
-        rows.append([f"`{result['experiment']}` on {result['data']['name']}", result["verdict"], result["why"]])
-    return text.table_to_markdown(ReportTable("", ["experiment", "verdict", "why"], rows, n_label=3))
+        n_scenes, n_pairs = len(result["data"]["scenes"]), result["data"].get("n_pairs") or 0
+        count = f"{n_scenes} / {n_pairs}" if n_scenes > 1 else f"**1** / {n_pairs}"
+        question = f"`{result['experiment']}` on {result['data']['name']}"
+        rows.append([question, count, result["verdict"], result["why"]])
+    return text.table_to_markdown(ReportTable("", ["experiment", "scenes / pairs", "verdict", "why"], rows, n_label=4))
 
 
 def row_of(name: str, scene: str, method: str) -> dict[str, Any]:

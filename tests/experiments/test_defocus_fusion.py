@@ -93,5 +93,6 @@ def test_verdict_goes_either_way():
             ]
         return experiment.verdict(Outcome(rows=rows))[0]
 
-    assert said((0.03, 0.02), (0.03, 0.02), (0.01, 0.02)) is True
-    assert said((0.01, 0.02), (0.01, 0.02), (0.03, 0.02)) is False and said() is None
+    assert said((0.03, 0.02), (0.03, 0.02), (0.02, 0.02)) is True
+    assert said((0.03, 0.02), (0.03, 0.02), (0.01, 0.02)) is False, "never lower, says the paper"
+    assert said((0.02, 0.02), (0.02, 0.02)) is None and said() is None

@@ -184,11 +184,17 @@ def test_a_scene_without_trajectory_or_depth_has_no_answer():
 
 
 @pytest.mark.parametrize(
-    ("covered", "nearer", "expected"),
-    [(90, 0.1, True), (100, 0.1, False), (90, 0.3, False), (None, 0.1, None)],
+    ("covered", "nearer", "confident", "expected"),
+    [
+        (90, 0.1, 0.3, True),
+        (100, 0.1, 0.3, False),
+        (90, 0.3, 0.3, False),
+        (90, 0.1, 0.7, False),
+        (None, 0.1, 0.3, None),
+    ],
 )
-def test_verdict_goes_either_way(covered, nearer, expected):
-    refined = {"n_voxels": covered, "confident_share": 0.5, "n_pairs": 1}
+def test_verdict_goes_either_way(covered, nearer, confident, expected):
+    refined = {"n_voxels": covered, "confident_share": confident, "n_pairs": 1}
     outcome = outcome_of_rows(
         ("a", "good", "trajectory", {"n_voxels": 100}),
         ("a", "good + icp points", "trajectory", refined),

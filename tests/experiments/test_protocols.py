@@ -106,9 +106,9 @@ def test_verdict_of_heldout_goes_either_way():
             ("a", "m", "cyclic", {"median_rel": naive}), ("a", "m", "heldout", {"median_rel": honest, "passes": passed})
         )
 
-    assert heldout.verdict(outcome(0.01, 0.03, True), "m")[0] is True
-    assert heldout.verdict(outcome(0.03, 0.01, True), "m")[0] is False
-    assert heldout.verdict(outcome(0.01, 0.03, False), "m")[0] is False
+    assert heldout.verdict(outcome(0.01, 0.06, True), "m")[0] is True
+    assert heldout.verdict(outcome(0.01, 0.03, True), "m")[0] is False
+    assert heldout.verdict(outcome(0.01, 0.06, False), "m")[0] is False
     assert heldout.verdict(outcome(None, 0.03, False), "m")[0] is None
 
 

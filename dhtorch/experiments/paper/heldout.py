@@ -1,10 +1,10 @@
 """Question: when the pose never sees the points it is judged by, how good is triangulated depth, scene by scene?
 
 Expectation (written before the run): the hold-out error is well above that of the naive protocol, which judges the
-pose by the inliers it was fitted to (the paper: 3.5 against 0.7 %); most scenes with a clear baseline pass the strict
-line, nearly static or nearly rotating ones do not.
-What would refute it: the naive protocol is not the smaller of the two on most scenes, or fewer than half the scenes
-pass the strict line.
+pose by the inliers it was fitted to (the paper: 3.5 against 0.7 %, five times); most scenes with a clear baseline pass
+the strict line, nearly static or nearly rotating ones do not.
+What would refute it: the 95 % interval of the median ratio of the two errors lies below the paper's factor of five, or
+fewer than half the scenes pass the strict line. Undecided where the interval holds five and the ratio is below it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,12 @@ from dhtorch.experiments.rows import Row
 from dhtorch.metrics import bootstrap
 
 QUESTION = "How good is triangulated depth on points that the pose never saw, and how many scenes pass the strict line?"
-EXPECTATION = "Judging by the pose's own inliers flatters; at least half of the scenes pass the strict line."
+EXPECTATION = (
+    "The hold-out error is five times that on the pose's own inliers; half of the scenes pass the strict line."
+)
+
+#: Hold-out error over that of the naive protocol. Source: paper.
+_PUBLISHED_RATIO = 5.0
 
 #: Strict line of a scene: least correlation of depth and truth.
 _MIN_CORR = 0.8
@@ -103,7 +108,7 @@ def _mark_passes(rows: Sequence[Row], method: str) -> dict[str, Any]:
 
 
 def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:
-    """(the naive error is smaller on most scenes and half of the scenes pass; counts and ratio)."""
+    """(the hold-out error is five times the naive one and half of the scenes pass; counts and ratio)."""
     naive, heldout = outcome.scenes(method, "cyclic"), outcome.scenes(method, "heldout")
     both = [s for s in heldout if None not in (naive[s].get("median_rel"), heldout[s].get("median_rel"))]
     if not both:
@@ -111,9 +116,12 @@ def verdict(outcome: Outcome, method: str) -> tuple[bool | None, str]:
     ratios = torch.tensor([heldout[s]["median_rel"] / max(naive[s]["median_rel"], 1e-9) for s in both])
     n_smaller = int((ratios > 1).sum())
     n_passes = sum(r["passes"] for r in heldout.values())
-    median_ratio = bootstrap.interval_over_scenes(ratios.tolist()).value
-    holds = n_smaller > len(both) / 2 and n_passes >= len(heldout) / 2
+    ratio = bootstrap.interval_over_scenes(ratios.tolist())
+    assert ratio.value is not None  # there is a scene
+    low, high = (ratio.value if bound is None else bound for bound in (ratio.low, ratio.high))
+    passes = n_passes >= len(heldout) / 2
+    holds = False if not passes or high < _PUBLISHED_RATIO else True if ratio.value >= _PUBLISHED_RATIO else None
     return holds, (
         f"{n_passes} of {len(heldout)} scenes pass the strict line; hold-out error over the naive protocol's: "
-        f"median {median_ratio:.2f}, above 1 on {n_smaller} of {len(both)} scenes"
+        f"median {ratio.value:.2f} ({low:.2f} to {high:.2f}; paper 5), above 1 on {n_smaller} of {len(both)} scenes"
     )
