@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import beside_kornia
+import fidelity
 import kornia_adapters
 import learning_tables
 import mutants
@@ -688,9 +689,10 @@ SUPPORTED = (
     *("hole_census", "device_pose", "motion", "ablation", "latency"),
     *("room_range_split", "room_gate_ablation", "room_device_pose", "room_real_holes", "paths_motion"),
 )
-PIPELINES = ("rh20t_probe", "vo_probe", "learned_score")
+PIPELINES = ("rh20t_probe", "vo_probe", "vo_probe_streams", "vo_probe_rooms", "learned_score")
 NEGATIVE = ("helix_correlation", "defocus", "focus_stack", "defocus_fusion", "icp", "hole_attention")
 TABLES |= {"verdicts": partial(verdicts, SUPPORTED), "negative": partial(verdicts, NEGATIVE)}
+TABLES |= {"fidelity": fidelity.table, "fidelity commands": fidelity.commands}
 TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, ("global_map",))}
 
 

