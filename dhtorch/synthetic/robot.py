@@ -1,8 +1,9 @@
 """A small synthetic robot data set in RH20T's format: an arm with an in-hand camera in the built-in room.
 
-A task is an object in the room and a motion towards it; the scenes of a task differ in start, pace, direction and in
-the room's paint. The remaining way of the hand is the distance of the object beyond the stopping distance, so the
-motions can be predicted from depth. The set is for tests of reading and probing; it does not represent real robots.
+A task is an object in the room and a motion towards it; the scenes of a task differ in start, pace, direction, in the
+room's paint and in where the arm stands. The remaining way of the hand is the distance of the object beyond the
+stopping distance: it can be predicted from depth, and not from the state, because the arm's base is elsewhere in every
+scene. The set is for tests of reading and probing; it does not represent real robots.
 
 Alphabet: ``d`` (m) distance from the camera to the object; axes of the world as the room's: x right, y down, z forward.
 """
@@ -49,6 +50,12 @@ _RATE_HZ = 10.0
 
 _CONFIGURATION = 1  # a Flexiv arm
 _START_MS = 1_600_000_000_000
+
+#: Time between the calibrations of the scenes of a task, ms: each has its own. Source: derived, above any task count.
+_MS_BETWEEN_CALIBRATIONS = 10_000
+
+#: Half the width of the box in which the arm's base stands, m. Source: derived, several times the way of the hand.
+_BASE_SPREAD_M = 0.25
 _OPEN_MM, _CLOSED_MM = 80.0, 25.0
 
 
@@ -111,7 +118,7 @@ def write_robot(root: Path, *, tasks: int, scenes: int, n_frames: int, hw: tuple
                 times=torch.tensor([start + t for t in times], dtype=torch.float64),
             )
             base = episode.base()
-            home = _Episode.of(task, 0, seed).camera(0.0)
+            home = episode.camera(0.0)
             arm = ROBOT_ARMS[_CONFIGURATION]
             write_rh20t(
                 root,
@@ -120,7 +127,7 @@ def write_robot(root: Path, *, tasks: int, scenes: int, n_frames: int, hw: tuple
                 T_world_from_base=base,
                 hand_at_calibration=home,
                 name=f"task_{task + 1:04d}_user_0001_scene_{scene + 1:04d}",
-                stamp=_START_MS + task,
+                stamp=_START_MS + task + _MS_BETWEEN_CALIBRATIONS * scene,
                 joint=np.stack([_solve_joints(np.linalg.inv(base) @ T @ arm.X) for T in c2w]),
                 width=np.array([episode.width(t) for t in times]),
             )
@@ -141,6 +148,7 @@ class _Episode:
     side: float  # m, of a slide
     roll: float  # degrees, of a screw
     offset: tuple[float, float]  # m, how far beside the object the camera looks
+    base_offset: tuple[float, float, float]  # m, world, of the arm's base
 
     @staticmethod
     def of(task: int, scene: int, seed: int) -> _Episode:
@@ -160,6 +168,7 @@ class _Episode:
             side=draw.choice((-1, 1)) * draw.uniform(0.10, 0.16),
             roll=draw.choice((-1, 1)) * draw.uniform(40, 70),
             offset=(draw.uniform(-0.05, 0.05), draw.uniform(-0.03, 0.03)),
+            base_offset=tuple(draw.uniform(-_BASE_SPREAD_M, _BASE_SPREAD_M) for _ in range(3)),  # type: ignore[arg-type]
         )
 
     def camera(self, time: float) -> np.ndarray:
@@ -184,8 +193,8 @@ class _Episode:
         return T
 
     def base(self) -> np.ndarray:
-        """Base of the arm to world (4, 4): in front of and below the object, z up; equal for all scenes of a task."""
-        x, y, z = self.thing
+        """Base of the arm to world (4, 4): in front of and below the object, z up; elsewhere in every scene."""
+        x, y, z = (a + b for a, b in zip(self.thing, self.base_offset, strict=True))
         T = np.eye(4)
         T[:3, :3] = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]  # base x = world z, base z = up
         T[:3, 3] = [x, y + 0.35, z - 1.05]
