@@ -258,6 +258,11 @@ def open_rooms(
     return scenes
 
 
+def join_scenes(parts: Sequence[Sequence[Scene]]) -> list[Scene]:
+    """Scenes of several sources in one list, e.g. real ones and built-in rooms."""
+    return [scene for part in parts for scene in part]
+
+
 def simulate_phone_lidar(
     scene: ShadedRoom,
     camera: Camera,

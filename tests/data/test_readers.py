@@ -88,6 +88,25 @@ def test_rectified_pairs_give_back_the_scene(tmp_path: Path) -> None:
         assert disagreement(recording[0], right)[0] < 0.005
 
 
+def test_a_pair_of_middlebury_2005_states_what_it_assumes(tmp_path: Path) -> None:
+    codes = np.full((370, 463), 90, np.uint8)
+    codes[:, :50] = 0
+    for name, image in {"view1": codes, "view5": codes, "disp1": codes, "disp5": codes + 1}.items():
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image)
+    (tmp_path / "dmin.txt").write_text("270\n")
+    recording = data.open(tmp_path)
+    left, right = recording
+    # A third of the size: f = 3740 / 3 px, disparity 90 / 3 px, and a shift of 270 / 3 px between the two principal points.
+    assert left.camera.f[0, 0] == pytest.approx(3740 / 3) and float(right.camera.c[0, 0] - left.camera.c[0, 0]) == 90
+    assert not left.depth[0, :, :50].any() and (left.depth[0, :, 50:] > 0).all()
+    assert float(left.depth[0, 0, 60]) == pytest.approx(0.16 * 3740 / 3 / (90 / 3 + 270 / 3))
+    assert float(right.depth[0, 0, 60]) == pytest.approx(0.16 * 3740 / 3 / (91 / 3 + 270 / 3))
+    assert recording.poses.t[1].tolist() == [0.16, 0, 0] and "principal point assumed" in recording.report[0]
+    (tmp_path / "dmin.txt").write_text("far\n")
+    with pytest.raises(FormatError, match=r"dmin\.txt: shift"):
+        data.open(tmp_path)
+
+
 def test_driving_gives_back_the_scene(tmp_path: Path) -> None:
     frames = walk(3)
     lidar = [se3.exp(torch.tensor([[1.0, -0.3 + 0.1 * i, 0.2, 0.1, 0.2, 0.3]]).double()) for i in range(3)]

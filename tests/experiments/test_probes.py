@@ -266,7 +266,14 @@ def test_too_few_tasks_are_refused_before_any_feature_is_computed(robot_set):
 def test_the_robot_probe_runs_and_does_not_decide_with_random_weights(robot_set):
     pytest.importorskip("transformers")
     outcome = rh20t_probe.run(
-        robot_set, {"map": small()}, None, Settings(), dinov2=NETWORK, horizon=0.2, history=0.2, penalties=(10.0, 1000.0)
+        robot_set,
+        {"map": small()},
+        None,
+        Settings(),
+        dinov2=NETWORK,
+        horizon=0.2,
+        history=0.2,
+        penalties=(10.0, 1000.0),
     )
     assert outcome.verdict == "undecided" and "random weights" in outcome.why and outcome.n_pairs == 12
     rows = outcome.scenes("dhtorch + dinov2", probing.PROBE_TRUTH)

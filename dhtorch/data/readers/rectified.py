@@ -5,6 +5,10 @@
   ``baseline`` in mm.
 - *npz* layout (scikit-image's motorcycle): ``*_left.png``, ``*_right.png``, ``*_disp.npz`` and a side-car ``meta.json``
   with ``K_left``, ``K_right``, ``baseline_m``, ``doffs``; which is needed to convert this disparity to metres.
+- *views* layout (Middlebury 2005 and 2006): ``view1.png``, ``view5.png``, ``disp1.png``, ``disp5.png`` and
+  ``dmin.txt``. Codes are disparities times the factor by which the pictures were reduced (1, 2 or 3 by their
+  width), 0 = unknown; ``dmin.txt`` is in pixels of the full size. The focal length (3740 px at the full size) and the
+  baseline (0.16 m) are those of the data set's page, the principal point is taken to be the picture's centre.
 
 Depth is ``f · baseline / (disparity + doffs)`` with ``doffs`` the difference of the principal points.
 """
@@ -29,6 +33,20 @@ from dhtorch.records import Camera, Frame, Pose
 _MIN_DISPARITY_PX = 1e-3
 
 
+#: Focal length of the Middlebury 2005 and 2006 pictures at full size, px, and their baseline, m.
+#: Source: https://vision.middlebury.edu/stereo/data/scenes2005/.
+_VIEWS_FOCAL_PX, _VIEWS_BASELINE_M = 3740.0, 0.16
+
+#: What is assumed of such a pair, as a line of the recording's report.
+_VIEWS_ASSUMPTION = (
+    f"intrinsics: f = {_VIEWS_FOCAL_PX:g} px at full size and baseline {_VIEWS_BASELINE_M:g} m, as the page of "
+    "Middlebury 2005 states; principal point assumed at the picture's centre"
+)
+
+#: Widths from which on such pictures have their full size or half of it; smaller ones have a third.
+#: Source: derived, full ones are 1240 to 1396 px wide.
+_VIEWS_FULL_WIDTH_PX, _VIEWS_HALF_WIDTH_PX = 1000, 550
+
 #: Side-car of dhtorch, of which the layout with ``calib.txt`` needs nothing.
 UNUSED_FILES = ("meta.json",)
 
@@ -37,6 +55,8 @@ def recognise(root: Path) -> str | None:
     """The files by which ``root`` is recognised as this format, as text; None if it is not."""
     if (root / "calib.txt").is_file() and (root / "im0.png").is_file():
         return "calib.txt and im0.png"
+    if all((root / name).is_file() for name in ("view1.png", "disp1.png", "dmin.txt")):
+        return "view1.png, disp1.png and dmin.txt"
     if root.is_dir() and any(root.glob("*_disp.npz")) and any(root.glob("*_left.png")):
         return "*_left.png and *_disp.npz"
     return None
@@ -51,7 +71,13 @@ def read(root: str | Path) -> list[Recording]:
         FormatError: a missing or damaged file, or an invalid calibration.
     """
     root = Path(root)
-    pair = _read_calib_pair(root) if (root / "calib.txt").is_file() else _read_npz_pair(root)
+    report: tuple[str, ...] = ()
+    if (root / "calib.txt").is_file():
+        pair = _read_calib_pair(root)
+    elif (root / "dmin.txt").is_file():
+        pair, report = _read_views_pair(root), (_VIEWS_ASSUMPTION,)
+    else:
+        pair = _read_npz_pair(root)
     eye = torch.eye(3, dtype=torch.float64).expand(2, 3, 3).clone()
     t = torch.tensor([[0.0, 0.0, 0.0], [pair.baseline, 0.0, 0.0]], dtype=torch.float64)
     return [
@@ -62,6 +88,7 @@ def read(root: str | Path) -> list[Recording]:
             number=consecutive_frame_numbers(2),
             root=root,
             poses=Pose(eye, t),
+            report=report,
         )
     ]
 
@@ -76,14 +103,17 @@ class _LoadPair:
     hw: tuple[int, int]
     baseline: float  # m
     doffs: float  # px
+    codes_per_px: float = 1.0  # of the disparity maps; codes of 0 are then unknown
 
     def __call__(self, i: int) -> Frame:
         image = torch.from_numpy(files.read_image(self.images[i], self.hw))
         camera, file = self.cameras[i], self.disparities[i]
         depth = np.zeros(self.hw, np.float32)
         if file is not None:
-            disparity = _read_disparity(file, self.hw).astype(np.float64) + self.doffs
-            usable = np.isfinite(disparity) & (disparity > _MIN_DISPARITY_PX)
+            code = _read_disparity(file, self.hw)
+            disparity = code.astype(np.float64) / self.codes_per_px + self.doffs
+            is_known = code > 0 if file.suffix == ".png" else np.isfinite(disparity)
+            usable = is_known & (disparity > _MIN_DISPARITY_PX)
             f = camera.f[0, 0].double().item()
             depth = np.where(usable, f * self.baseline / np.where(usable, disparity, 1), 0).astype(np.float32)
         return Frame(image[None], torch.from_numpy(depth)[None], camera)
@@ -123,6 +153,21 @@ def _read_npz_pair(root: Path) -> _LoadPair:
     )
 
 
+def _read_views_pair(root: Path) -> _LoadPair:
+    file = root / "dmin.txt"
+    images = (root / "view1.png", root / "view5.png")
+    hw = files.read_image_header(images[0]).hw
+    factor = 1 if hw[1] >= _VIEWS_FULL_WIDTH_PX else 2 if hw[1] >= _VIEWS_HALF_WIDTH_PX else 3
+    doffs = float(files.to_array(files.read_text(file).strip(), (), file, "shift")) / factor
+    f = _VIEWS_FOCAL_PX / factor
+    c = ((hw[1] - 1) / 2, (hw[0] - 1) / 2)
+    cameras = [convert.to_camera([[f, 0, c[0] + x], [0, f, c[1]], [0, 0, 1]], hw, file, "K") for x in (0, doffs)]
+    second = root / "disp5.png"
+    maps = (root / "disp1.png", second if second.is_file() else None)
+    pair = _LoadPair(images, maps, (cameras[0], cameras[1]), hw, _VIEWS_BASELINE_M, doffs, factor)
+    return _check_pair(pair, file)
+
+
 def _check_pair(pair: _LoadPair, file: Path) -> _LoadPair:
     """Check the calibration: positive baseline, equal focal lengths, ``doffs`` = difference of the principal points."""
     if not 0 < pair.baseline <= convert.MAX_COORDINATE_M:
@@ -139,6 +184,8 @@ def _check_pair(pair: _LoadPair, file: Path) -> _LoadPair:
 def _read_disparity(file: Path, hw: tuple[int, int]) -> np.ndarray:
     if file.suffix == ".pfm":
         return pfm.read_pfm(file, hw)
+    if file.suffix == ".png":
+        return files.read_image(file, hw)[0]
     disparity = npy.read_npz(file, "arr_0")
     if disparity.shape != hw:
         raise FormatError(file, "arr_0", f"shape {disparity.shape}", f"{hw}, as the image")
