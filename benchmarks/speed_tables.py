@@ -173,6 +173,30 @@ def memory() -> str:
     return on("memory", text.table_to_markdown(ReportTable("", head, rows)))
 
 
+def accelerator() -> str:
+    """Calls on an accelerator: at once, as recorded graphs, on the CPU and, where it has them, by kornia."""
+    by_name: dict[tuple[str, str], dict[str, Any]] = {(r["name"], r["mode"]): r for r in timings("gpu")}
+    rows = []
+    for (name, mode), r in by_name.items():
+        if mode != "eager" or r["peer"] == "kornia":
+            continue
+        graph, kornia = by_name.get((name, "graph")), by_name.get((f"{name}.kornia", "eager"))
+        others = [
+            "–" if other is None else f"{other[key]:.3g}" for other, key in ((graph, "ours_ms"), (kornia, "peer_ms"))
+        ]
+        least = min(r["ours_ms"], r["ours_ms"] if graph is None else graph["ours_ms"])
+        flips = ["–" if r.get(k) is None else f"{r[k]:.2g}" for k in ("gate_flips", "change_sigma")]
+        cells = [f"`{name.removeprefix('gpu_').rpartition('_b')[0]}`", str(r["batch"]), f"{r['ours_ms']:.3g}", *others]
+        cells += [f"{r['peer_ms']:.3g}", f"{1e3 / least:,.0f}", f"{r['peak_mib']:.0f}", str(r["waits"])]
+        rows.append([*cells, errors(r), " / ".join(flips)])
+    head = ["call", "at once", "ms", "replayed, ms", "kornia, ms", "CPU, ms", "a second, at best", "peak, MiB", "waits"]
+    head += ["errors, device / CPU", "other gates / change in sigmas"]
+    cards = sorted({f"{r['card']}, torch {r['torch']}" for r in timings("gpu")})
+    return f"{text.table_to_markdown(ReportTable('', head, rows))}\n\nDevice: {'; '.join(cards)}. CPU beside it: " + (
+        f"{timings('gpu')[0]['processor']}, {timings('gpu')[0]['threads']} threads{code(timings('gpu'))}."
+    )
+
+
 #: Tables by marker.
-TABLES: dict[str, Callable[[], str]] = {"bars": bars, "scaling": scaling, "memory": memory}
+TABLES: dict[str, Callable[[], str]] = {"bars": bars, "scaling": scaling, "memory": memory, "accelerator": accelerator}
 TABLES |= {f"rows {file}": partial(every_row, file) for file in SCRIPTS}

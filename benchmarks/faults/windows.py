@@ -252,8 +252,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("squared_differences", ".clamp(*CONTRAST_RATIO_RANGE)[:, None]", "[:, None]"),
         (
             "squared_differences",
-            "(y.split(MAX_CHUNK_POINTS, -1) for y in (x, x + d, batch))",
-            "(y.split(MAX_CHUNK_POINTS, -1) for y in (x, x - d, batch))",
+            "(y.split(size, -1) for y in (x, x + d, batch))",
+            "(y.split(size, -1) for y in (x, x - d, batch))",
         ),
         ("window_covariance", "torch.stack(adjugate_2x2(a, b, b, c))", "torch.stack(adjugate_2x2(c, b, b, a))"),
         ("window_covariance", "torch.stack(adjugate_2x2(a, b, b, c))", "torch.stack(adjugate_2x2(a, -b, -b, c))"),

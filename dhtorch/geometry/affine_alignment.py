@@ -25,11 +25,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry import linalg as closed_form
-from dhtorch.geometry.checks import check, is_static
-from dhtorch.geometry.determinism import MAX_CHUNK_POINTS
+from dhtorch.geometry.checks import any_possible, check, constant, is_static
+from dhtorch.geometry.determinism import MAX_CHUNK_POINTS, chunk_size
 from dhtorch.geometry.inference_mode import run_without_grad
 from dhtorch.geometry.least_squares import MIN_PIVOT, solve_spd
-from dhtorch.geometry.linalg import matmul_planes
+from dhtorch.geometry.linalg import matmul_planes, solve_cholesky
 from dhtorch.geometry.lucas_kanade import masked_apply
 from dhtorch.geometry.patches import QUANTISATION_VARIANCE, round_half_up
 from dhtorch.geometry.pyramid import (
@@ -337,11 +337,10 @@ def _register_level(
     pyramid_0, pyramid_1, o = views
     scale = 0.5**level
     level_options = o._replace(epsilon_px=o.epsilon_px * scale)
-    buffers = None if is_static(warp) else warp.new_empty(2, min(MAX_CHUNK_POINTS, len(batch)), 8, o.window * o.window)
+    size = chunk_size(MAX_CHUNK_POINTS, warp)
+    buffers = None if is_static(warp) else warp.new_empty(2, min(size, len(batch)), 8, o.window * o.window)
     parts = []
-    for q_, point_, warp_, batch_ in zip(
-        *(y.split(MAX_CHUNK_POINTS, -1) for y in (q, point, warp * scale, batch)), strict=True
-    ):
+    for q_, point_, warp_, batch_ in zip(*(y.split(size, -1) for y in (q, point, warp * scale, batch)), strict=True):
         patch, corner = _patch(pyramid_1, level, warp_[0], batch_, o.window)
         Q = _basis_images(pyramid_0, q_, batch_, o.window, None if buffers is None else buffers[0, : len(batch_)])
         products = None if buffers is None else buffers[1, : len(batch_)]
@@ -370,7 +369,7 @@ def _iterate(
         warp = torch.where(moving, _compose(warp, step, o.window), warp)
         J = _read(patch, warp, o.window)
         moving = moving & (change.abs().sum(0).amax(0) > o.epsilon_px)
-        if not is_static(warp) and not moving.any():
+        if not any_possible(moving):
             break
     if o.steps:
         quality = _quality(Q[:, 6], J, _interpolation_noise_factor(_positions(warp, o.window).flatten(2)))
@@ -418,7 +417,7 @@ def _covariance(state: _State, point: Tensor, window: int) -> Tensor:
     square, n = state.quality[0].clamp(*REGISTRATION_GAIN_RANGE).double().square(), window * window
     variance = _noise(state.quality).double().clamp_min(QUANTISATION_VARIANCE) * (n / (n - 8))
     u2 = (window // 2 + 1) / (window // 2) / 3  # mean over the window
-    energy = R.new_tensor([1.0, 1.0, u2, u2, u2, u2, 1 / GRADIENT_NOISE, 0.0]) * GRADIENT_NOISE * n
+    energy = constant(R, [1.0, 1.0, u2, u2, u2, u2, 1 / GRADIENT_NOISE, 0.0]) * GRADIENT_NOISE * n
     noise = (R[:, None] * R[None] * energy[:, None]).sum(2) * variance
     S = _inverse(C)
     spurious = matmul_planes(matmul_planes(S, noise), S)
@@ -474,7 +473,7 @@ def _patch(target: Pyramid, level: int, x: Tensor, batch: Tensor, window: int) -
     """Patches (M, 1, s, s) of image 1 that cover the window and its search range, and their first pixels (2, M)."""
     reach = window // 2 + SEARCH_PADDING_PX
     H, W = target.hw(level)
-    middle = torch.minimum(round_half_up(x).clamp_min(0), x.new_tensor([[W - 1], [H - 1]]))
+    middle = torch.minimum(round_half_up(x).clamp_min(0), constant(x, [[W - 1], [H - 1]]))
     first, _ = target.locate(level, middle, batch, reach, (GREY_PLANE,))
     side = 2 * reach + 1
     return target.read(level, first, side)[0].unflatten(-1, (side, side))[:, None], middle - reach
@@ -520,7 +519,7 @@ def _noise(quality: Tensor) -> Tensor:
 
 def _normal_matrix(Q: Tensor) -> Tensor:
     """Normal equations (M, 8, 8) of the eight images."""
-    damping = torch.tensor([0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0], dtype=Q.dtype, device=Q.device) * AFFINE_DAMPING
+    damping = constant(Q, [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0]) * AFFINE_DAMPING
     return torch.bmm(Q, Q.transpose(1, 2)) + torch.diag(damping)
 
 
@@ -532,7 +531,11 @@ def _invert(H: Tensor) -> tuple[Tensor, Tensor]:
     L, info = torch.linalg.cholesky_ex(H * s)
     textured = (info == 0) & (L.diagonal(dim1=1, dim2=2).amin(-1) > MIN_PIVOT)
     L = torch.where(textured[:, None, None], L, torch.eye(8, dtype=L.dtype, device=L.device) * AFFINE_DAMPING**0.5)
-    return (torch.cholesky_inverse(L) * s).to(H.dtype), textured
+    if L.is_cpu:
+        inverse = torch.cholesky_inverse(L)
+    else:
+        inverse = solve_cholesky(torch.eye(L.shape[-1], dtype=L.dtype, device=L.device).expand_as(L), L)
+    return (inverse * s).to(H.dtype), textured
 
 
 def _warp_change(solution: Tensor) -> Tensor:

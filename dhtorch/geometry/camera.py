@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry import se3
-from dhtorch.geometry.checks import all_known, check
+from dhtorch.geometry.checks import all_known, check, constant
 from dhtorch.geometry.linalg import inverse_2x2
 from dhtorch.geometry.se3 import Pose
 from dhtorch.pytree import Record, record
@@ -138,7 +138,7 @@ def warp(camera: Camera, A: Tensor) -> tuple[Camera, Tensor]:
         p2, p1 = (q * distortion[:, None, [3, 2]]).sum(-1).unbind(-1)
         distortion = torch.cat((distortion[:, :2], torch.stack((p1, p2), -1), distortion[:, 4:]), -1)
     Q = torch.nn.functional.pad(q, (0, 1, 0, 1))
-    Q = Q + torch.diag(Q.new_tensor([0.0, 0.0, 1.0]))
+    Q = Q + torch.diag(constant(Q, [0.0, 0.0, 1.0]))
     return camera.replace(f=f, c=c, distortion=distortion), Q
 
 

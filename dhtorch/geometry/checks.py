@@ -5,11 +5,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
 import torch
 from torch import Tensor
 
 #: Largest number of cached checks; the cache is then cleared. Source: origin not recorded.
 MAX_CACHED_CHECKS = 4096
+
+#: Largest number of kept constants of accelerators. Source: origin not recorded.
+MAX_CONSTANTS = 512
 
 #: Patterns and shapes that passed -> sizes: an iterative fit repeats the same checks at every step.
 _cache: dict[tuple[tuple[str, torch.Size | None], ...], dict[str, int]] = {}
@@ -66,17 +73,49 @@ def _bind_axes(where: str, args: dict[str, tuple[Tensor | None, str]]) -> dict[s
 
 
 def is_static(x: Tensor) -> bool:
-    """Whether shapes must not depend on values: under ``torch.compile``, and under the transforms of ``torch.func``."""
-    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x)
+    """Whether values must not be read, and shapes not depend on them: under ``torch.compile`` and the transforms of
+    ``torch.func``; and on an accelerator, for which the host would wait."""
+    return torch.compiler.is_compiling() or torch._C._functorch.is_functorch_wrapped_tensor(x) or not x.is_cpu
+
+
+def constant(like: Tensor, values: Sequence[Any]) -> Tensor:
+    """Numbers, or rows of them -> tensor of the device and dtype of ``like``; not to be written to.
+
+    An accelerator keeps it for the next call: the host waits for each copy of its memory.
+    """
+    if like.is_cpu or is_transformed():
+        return like.new_tensor(values)
+    return _kept(tuple(v if isinstance(v, int | float) else tuple(v) for v in values), like.dtype, like.device)
+
+
+@lru_cache(maxsize=MAX_CONSTANTS)
+def keep_beside(x: Tensor, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A kept tensor of the CPU, by identity, on an accelerator, which keeps it, too; not to be written to."""
+    with torch.inference_mode(False):
+        return x.to(dtype).to(device)
+
+
+def move_from_host(x: Tensor, like: Tensor) -> Tensor:
+    """``x.to(like)`` of a tensor of the CPU, for which the host does not wait."""
+    x = x.to(like.dtype)
+    if like.is_cpu:
+        return x
+    return (x.pin_memory() if like.is_cuda else x).to(like.device, non_blocking=True)
+
+
+@lru_cache(maxsize=MAX_CONSTANTS)
+def _kept(values: tuple[Any, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # else it could enter no graph later
+        return torch.tensor(values, dtype=dtype, device=device)
 
 
 def all_known(mask: Tensor) -> bool:
-    """Whether a mask is true everywhere; false where shapes are static and values must not be read."""
+    """Whether a mask is true everywhere; false where values must not be read."""
     return not is_static(mask) and bool(mask.all())
 
 
 def any_possible(mask: Tensor) -> bool:
-    """Whether a mask is true anywhere; true where shapes are static and values must not be read."""
+    """Whether a mask is true anywhere; true where values must not be read."""
     return is_static(mask) or bool(mask.any())
 
 

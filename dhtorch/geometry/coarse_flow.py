@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry import linalg as closed_form
-from dhtorch.geometry.checks import any_possible, check
+from dhtorch.geometry.checks import any_possible, check, constant
 from dhtorch.geometry.filters import grayscale
 from dhtorch.pytree import Record, record
 
@@ -191,7 +191,7 @@ def apply_similarity(
 
     Under the identity they are unchanged, bit for bit. Gradient: to both.
     """
-    middle = uv.new_tensor([(hw[1] - 1) / 2, (hw[0] - 1) / 2])
+    middle = constant(uv, [(hw[1] - 1) / 2, (hw[0] - 1) / 2])
     transformed = (linear.to(uv)[:, None] * (uv - middle)[..., None, :]).sum(-1) + middle
     return torch.where(is_not_identity(linear)[:, None, None], transformed, uv)
 
@@ -214,7 +214,7 @@ def undo_similarity(
         rows, columns = (torch.arange(n, device=image.device, dtype=picture.dtype) for n in (H, W))
         v, u = torch.meshgrid(rows, columns, indexing="ij")
         uv = apply_similarity(linear, torch.stack([u, v], -1).reshape(1, H * W, 2).expand(len(picture), -1, -1), (H, W))
-        grid = ((2 * uv + 1) / uv.new_tensor([W, H]) - 1).reshape(-1, H, W, 2)
+        grid = ((2 * uv + 1) / constant(uv, [W, H]) - 1).reshape(-1, H, W, 2)
         sampled = F.grid_sample(picture, grid, mode="bilinear", padding_mode="border", align_corners=False)
         picture = torch.where(is_not_identity(linear)[:, None, None, None], sampled, picture)
     gain = gain.to(picture)[:, None, None, None]
@@ -263,8 +263,9 @@ def _best_similarity(
 ) -> Tensor:
     """Two images -> similarity (B, 2, 2) of the candidates with the highest mean correlation."""
     a, b = (_quantised(downscale(image, ROTATION_SIDE_PX)) for image in (image_0, image_1))
-    angle = torch.tensor([math.radians(t) for z in zooms for t in rotations_deg], device=a.device)
-    zoom = torch.tensor([z for z in zooms for t in rotations_deg], device=a.device)
+    like = a.new_empty(0, dtype=torch.get_default_dtype())
+    angle = constant(like, [math.radians(t) for z in zooms for t in rotations_deg])
+    zoom = constant(like, [z for z in zooms for t in rotations_deg])
     c, s = zoom * angle.cos(), zoom * angle.sin()
     candidates = torch.stack([c, -s, s, c], -1).reshape(1, -1, 2, 2).expand(len(a), -1, -1, -1)
     score = _match(a, b, candidates, reach, ROTATION_WINDOW_PX, ROTATION_STEP_PX)[3]
@@ -282,9 +283,9 @@ def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int
     """Pictures a, b and candidates A -> cell centres (R, C, 2), offsets to b (B, G, R, C, 2), small px, correlations
     (B, G, R, C), and mean correlation (B, G) of the cells that A maps into the picture."""
     (h, w), (h_1, w_1) = a.shape[-2:], b.shape[-2:]
-    centre = _cell_centres(h, w, step).to(a)
+    centre = _cell_centres(h, w, step, device=a.device).to(a)
     radius = math.ceil(reach * max(h_1, w_1))
-    middle_0, middle_1 = (a.new_tensor([(x - 1) / 2, (y - 1) / 2]) for y, x in ((h, w), (h_1, w_1)))
+    middle_0, middle_1 = (constant(a, [(x - 1) / 2, (y - 1) / 2]) for y, x in ((h, w), (h_1, w_1)))
     projected = (A[:, :, None, None] * (centre - middle_0)[..., None, :]).sum(-1) + middle_1  # (B, G, R, C, 2)
     templates = _normalise(_sample_windows(a, centre.reshape(1, 1, -1, 2), A, window), _flat_variance(a))
     S = _correlation(templates, b, window)
@@ -295,15 +296,15 @@ def _match(a: Tensor, b: Tensor, A: Tensor, reach: float, window: int, step: int
     peak = _max_3x3(V)
     fit = peak.flatten(-2).gather(-1, i[..., None])[..., 0] / CORRELATION_UNIT**2
     shift = torch.stack([i % D, i // D], -1) - radius
-    inside = ((projected > -0.5) & (projected < projected.new_tensor([w_1 - 0.5, h_1 - 0.5]))).all(-1)
+    inside = ((projected > -0.5) & (projected < constant(projected, [w_1 - 0.5, h_1 - 0.5]))).all(-1)
     score = torch.where(inside, fit, torch.zeros_like(fit)).sum((-2, -1)) / inside.sum((-2, -1)).clamp_min(1)
     return centre, projected.round() + shift - centre, fit, score
 
 
-def _cell_centres(h: int, w: int, step: int) -> Tensor:
+def _cell_centres(h: int, w: int, step: int, *, device: torch.device) -> Tensor:
     """Size of a small picture -> centres (R, C, 2) of its cells."""
     R, C = (max(2, round(n / step)) for n in (h, w))
-    v, u = ((torch.arange(m) + 0.5) * (n / m) - 0.5 for m, n in ((R, h), (C, w)))
+    v, u = ((torch.arange(m, device=device) + 0.5) * (n / m) - 0.5 for m, n in ((R, h), (C, w)))
     return torch.stack(torch.meshgrid(u, v, indexing="xy"), -1)
 
 
@@ -315,7 +316,7 @@ def _sample_windows(a: Tensor, centre: Tensor, A: Tensor, window: int) -> Tensor
     source_offset = (invert_similarity(A)[:, :, None] * offset[:, None, :]).sum(-1)  # (B, G, window², 2)
     uv = centre[..., None, :] + source_offset[:, :, None]
     h, w = a.shape[-2:]
-    grid = (2 * uv + 1) / uv.new_tensor([w, h]) - 1
+    grid = (2 * uv + 1) / constant(uv, [w, h]) - 1
     out = F.grid_sample(a[:, None], grid.flatten(1, 2), mode="bilinear", padding_mode="border", align_corners=False)
     return out[:, 0].unflatten(1, (*A.shape[1:2], -1))
 

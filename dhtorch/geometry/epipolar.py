@@ -17,7 +17,7 @@ from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
 from dhtorch.geometry.checks import check
-from dhtorch.geometry.determinism import pad_elementwise
+from dhtorch.geometry.determinism import chunk_size, pad_elementwise
 from dhtorch.geometry.linalg import quadratic_form, upper_triangle
 from dhtorch.geometry.se3 import Pose
 
@@ -87,7 +87,7 @@ def triangulate_depth(
     check(
         "triangulate_depth", uv_0=(uv_0, "B N 2"), uv_1=(uv_1, "B N 2"), f0=(camera_0.f, "B 2"), f1=(camera_1.f, "B 2")
     )
-    step = max(MAX_CHUNK_TRIANGULATED // max(uv_0.shape[0], 1), 1)
+    step = max(chunk_size(MAX_CHUNK_TRIANGULATED, uv_0) // max(uv_0.shape[0], 1), 1)
     chunks = (
         [(uv_0, uv_1)] if torch.compiler.is_compiling() else zip(uv_0.split(step, 1), uv_1.split(step, 1), strict=True)
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import check, constant
 from dhtorch.geometry.covariance import masked_median
 
 #: Approximate number of samples in a cell of the picture. Source: origin not recorded.
@@ -79,7 +79,7 @@ def _return_ratio(uv: Tensor, has_return: Tensor) -> Tensor:
     rows = max(1, round((0.75 * N / SAMPLES_PER_CELL) ** 0.5))
     columns = max(1, round(N / SAMPLES_PER_CELL / rows))
     lowest, highest = uv.detach().amin(1, keepdim=True), uv.detach().amax(1, keepdim=True)
-    cell_position = (uv.detach() - lowest) / (highest - lowest).clamp_min(1e-6) * uv.new_tensor([columns, rows])
+    cell_position = (uv.detach() - lowest) / (highest - lowest).clamp_min(1e-6) * constant(uv, [columns, rows])
     column, row = cell_position.long().unbind(-1)
     cell = column.clamp_max(columns - 1) + columns * row.clamp_max(rows - 1)
     ones = torch.ones_like(uv[..., 0])

@@ -19,7 +19,7 @@ from torch.autograd.forward_ad import unpack_dual
 from torch.utils import _pytree as pytree
 
 from dhtorch.geometry.checks import all_known, check
-from dhtorch.geometry.linalg import small_matmul
+from dhtorch.geometry.linalg import small_matmul, solve_cholesky
 from dhtorch.geometry.se3 import Pose
 
 #: Limits the depth of a point in front of a camera from below, m.
@@ -230,8 +230,8 @@ def solve_spd(
     if not all_known(ok):
         L, A = torch.where(singular, eye, L), torch.where(singular, eye, A)
         rhs = rhs.masked_fill(singular, 0.0)
-    start = torch.cholesky_solve(rhs.detach(), L)
-    x = start + torch.cholesky_solve(rhs - small_matmul(A, start), L)
+    start = solve_cholesky(rhs.detach(), L)
+    x = start + solve_cholesky(rhs - small_matmul(A, start), L)
     return (x * s)[:, :n].to(b.dtype), ok
 
 

@@ -87,3 +87,11 @@ def cofactor_planes(A: Tensor) -> Tensor:
     Gradient: to ``A``.
     """
     return torch.linalg.cross(A.roll(-1, 0), A.roll(-2, 0), dim=1)
+
+
+def solve_cholesky(b: Tensor, L: Tensor) -> Tensor:
+    """Solution x (B, n, k) of L Lᵀ x = b for lower triangles L (B, n, n). Gradient: to b and L."""
+    if L.is_cpu:
+        return torch.cholesky_solve(b, L)
+    y = torch.linalg.solve_triangular(L, b, upper=False)  # of a batch, cholesky_solve lets the host wait for a device
+    return torch.linalg.solve_triangular(L.mT, y, upper=True)

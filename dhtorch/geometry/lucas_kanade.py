@@ -26,7 +26,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.geometry.checks import all_finite, is_static
-from dhtorch.geometry.determinism import ELEMENTWISE_LANES, MAX_CHUNK_POINTS, round_up
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES, MAX_CHUNK_POINTS, chunk_size, round_up
 from dhtorch.geometry.linalg import adjugate_2x2, determinant_2x2, eigenvalues_2x2
 from dhtorch.geometry.patches import QUANTISATION_VARIANCE
 from dhtorch.geometry.pyramid import GRAD_X_PLANE, GRAD_Y_PLANE, GREY_PLANE, OUTSIDE_MARGIN_PX, Pyramid
@@ -171,8 +171,8 @@ def squared_differences(
     source: Pyramid, target: Pyramid, o: SearchOptions, x: Tensor, d: Tensor, batch: Tensor
 ) -> Tensor:
     """Sum (M,) of squared grey differences between the windows at ``x`` and ``x + d``, after normalisation."""
-    sums = []
-    for p, q, b in zip(*(y.split(MAX_CHUNK_POINTS, -1) for y in (x, x + d, batch)), strict=True):
+    sums, size = [], chunk_size(MAX_CHUNK_POINTS, x)
+    for p, q, b in zip(*(y.split(size, -1) for y in (x, x + d, batch)), strict=True):
         T = source.windows(0, p, b, o.window, (GREY_PLANE,))[0]
         J = target.windows(0, q, b, o.window, (GREY_PLANE,))[0]
         if o.normalise != "none":
@@ -198,7 +198,8 @@ def compare_windows(
     x, x_1 = (F.pad(uv.to(like.dtype).permute(2, 0, 1).reshape(2, -1), (0, fill)) for uv in (uv_0, uv_1))
     batch = F.pad(torch.arange(B, device=x.device).repeat_interleave(N), (0, fill))
     rms = (squared_differences(source, target, o, x, x_1 - x, batch) / o.window**2).sqrt()
-    chunks = zip(*(y.split(MAX_CHUNK_POINTS, -1) for y in (x, x_1, batch)), strict=True)
+    size = chunk_size(MAX_CHUNK_POINTS, x)
+    chunks = zip(*(y.split(size, -1) for y in (x, x_1, batch)), strict=True)
     textured = torch.cat([lucas_kanade_step(source, target, o, *chunk)[1] for chunk in chunks])
     return rms[: B * N].view(B, N), textured[: B * N].view(B, N)
 
@@ -429,8 +430,8 @@ def _correlation_map(
     )
     first_0, fraction = pair.source.locate(pair.level, x, batch, w // 2, planes)
     first_1, _ = pair.target.locate(pair.level, corner + radius, batch, w // 2 + radius, (GREY_PLANE,))
-    maps, sums = [], []
-    for i, j, f in zip(*(y.split(MAX_CHUNK_POINTS, -1) for y in (first_0, first_1, fraction)), strict=True):
+    maps, sums, size = [], [], chunk_size(MAX_CHUNK_POINTS, x)
+    for i, j, f in zip(*(y.split(size, -1) for y in (first_0, first_1, fraction)), strict=True):
         G = _remove_gain_bias(pair.source.read(pair.level, i, w, None if pair.level else f), o.normalise)
         if moments is None:
             sums.append(_moments(G, o.normalise))

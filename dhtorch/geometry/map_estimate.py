@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import all_known, is_static
+from dhtorch.geometry.checks import all_known, constant, is_static
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.determinism import SUM_LANES, round_up
 from dhtorch.geometry.least_squares import (
@@ -209,7 +209,7 @@ def _translates(
     problem: PoseDepthProblem, at: Unknowns, noise: Tensor, far: Tensor, precision: Tensor, o: FitOptions
 ) -> Tensor:
     """Whether (B,) the cost is far below that of the best rotation without translation, under the same noise."""
-    free = noise.new_tensor([1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # the least t would be a baseline for a far track
+    free = constant(noise, [1.0] * 3 + [0.0] * 3 + [1.0] * 3)  # the least t would be a baseline for a far track
 
     normal, cost_at = pose_normal_equations_at(problem, noise, far, precision, kernel=o.kernel, bend=o.bend)
 

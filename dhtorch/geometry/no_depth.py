@@ -76,7 +76,7 @@ def clear_far_constant(depth: Tensor) -> Tensor:
     if _is_below(probes, _MIN_FAR_M * (1 - _FLOAT32_ROUNDING)):
         return depth
     far = _find_far_constant(probes.detach())
-    if _is_readable(far) and not bool((far > 0).any()):
+    if not is_static(far) and not bool((far > 0).any()):
         return depth
     return depth.masked_fill(depth.detach() == far[..., None, None], 0.0)
 
@@ -96,9 +96,4 @@ def _find_far_constant(probes: Tensor) -> Tensor:
 
 def _is_below(x: Tensor, limit: float) -> bool:
     """Whether all values are seen to be below a limit; reading them once is cheaper than changing them."""
-    return x.numel() == 0 or (_is_readable(x) and float(x.detach().amax()) < limit)
-
-
-def _is_readable(x: Tensor) -> bool:
-    """Whether a value can be read, and without waiting for a device."""
-    return x.device.type == "cpu" and not is_static(x)
+    return x.numel() == 0 or (not is_static(x) and float(x.detach().amax()) < limit)

@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from dhtorch.geometry.checks import check, is_transformed
-from dhtorch.geometry.determinism import ELEMENTWISE_LANES
+from dhtorch.geometry.checks import check, constant, is_transformed
+from dhtorch.geometry.determinism import ELEMENTWISE_LANES, chunk_size
 from dhtorch.ops.constants import LUMA_THOUSANDTHS, MAX_KERNEL_WINDOW_PX
 from dhtorch.ops.dispatch import operator
 
@@ -68,7 +68,8 @@ def reduce_patches(
     centre, padding = centre.flatten(), -(B * N) % ELEMENTWISE_LANES
     if padding:
         centre = torch.nn.functional.pad(centre, (0, padding), value=(size // 2) * (u + v))
-    chunk_points = max(MAX_CHUNK_NUMBERS // (C * size * size * ELEMENTWISE_LANES), 1) * ELEMENTWISE_LANES
+    most = chunk_size(MAX_CHUNK_NUMBERS, image)
+    chunk_points = max(most // (C * size * size * ELEMENTWISE_LANES), 1) * ELEMENTWISE_LANES
     read = partial(_read_patches, flat, (C, c))
     compiling = torch.compiler.is_compiling()
     offsets = (_patch_offsets.__wrapped__ if is_transformed() else _patch_offsets)(size, (v, u), **index_kwargs)
@@ -181,7 +182,7 @@ def is_patch_inside(pixel: Tensor, hw: tuple[int, int], size: int) -> Tensor:
 def is_inside_picture(uv: Tensor, picture: Tensor) -> Tensor:
     """Whether points (B, N, 2) px lie in a picture (…, H, W), (B, N): its outer pixels belong to it entirely."""
     H, W = picture.shape[-2:]
-    return ((uv >= -0.5) & (uv <= uv.new_tensor([W, H]) - 0.5)).all(-1)
+    return ((uv >= -0.5) & (uv <= constant(uv, [W, H]) - 0.5)).all(-1)
 
 
 def flatten_images(image: Tensor) -> tuple[Tensor, tuple[int, int, int, int]]:

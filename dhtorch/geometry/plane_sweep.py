@@ -24,7 +24,7 @@ from torch import Tensor
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
 from dhtorch.geometry.camera import Camera
-from dhtorch.geometry.checks import all_finite, all_known, check
+from dhtorch.geometry.checks import all_finite, all_known, check, constant
 from dhtorch.geometry.se3 import Pose
 from dhtorch.geometry.windows import window_sum
 from dhtorch.ops.constants import FIT_RADIUS_PX
@@ -160,8 +160,8 @@ def make_reference_view(image: Tensor, camera: Camera) -> ReferenceView:
     check("make_reference_view", image=(image, "B 1 h w"), f=(camera.f, "B 2"))
     ray = pixel_rays(camera, (image.shape[-2], image.shape[-1]))
     has_ray = all_finite(ray, -1) if camera.distortion is not None else _has_focal_length(camera, ray)
-    if not (has_ray.is_cpu and all_known(has_ray)):
-        ray = torch.where(has_ray[..., None], ray, ray.new_tensor([0.0, 0.0, 1.0]))
+    if not all_known(has_ray):
+        ray = torch.where(has_ray[..., None], ray, constant(ray, [0.0, 0.0, 1.0]))
     return ReferenceView(image, camera, ray, has_ray, census_transform(image.detach()))
 
 
@@ -240,7 +240,7 @@ def sample_bilinear(image: Tensor, uv: Tensor) -> tuple[Tensor, Tensor]:
 
     Gradient: to both."""
     H, W = image.shape[-2:]
-    size = uv.new_tensor([W, H])
+    size = constant(uv, [W, H])
     inside = ((uv >= 0) & (uv <= size - 1)).all(-1)
     grid = ((2 * uv + 1) / size - 1).clamp(-2, 2)[:, :, None]
     values = F.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=False)

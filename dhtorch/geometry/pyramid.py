@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry import filters
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import check, constant
 from dhtorch.geometry.patches import extract_windows
 from dhtorch.geometry.windows import row_bands
 from dhtorch.ops.dispatch import operator
@@ -56,7 +56,7 @@ class Pyramid(NamedTuple):
         A point that overshoots the border on a coarse level may return; on the finest level it is lost.
         """
         H, W = self.hw()
-        high = self.levels[0].new_tensor([[W - 0.5], [H - 0.5]])
+        high = constant(self.levels[0], [[W - 0.5], [H - 0.5]])
         margin = OUTSIDE_MARGIN_PX if level else 0
         return torch.full_like(high, -0.5) * 0.5**level - margin, high * 0.5**level + margin
 

@@ -108,7 +108,7 @@ def sweep_views(reference: Frame, selected: SelectedViews, method: MethodSpec, o
         source_view_of(selected, k, options.size, is_used, base.image) for k, is_used in zip(index, use, strict=True)
     ]
     nearest = _nearest_depth(selected.samples, reference.sparse, options)
-    q = torch.linspace(0, 1, options.planes).to(base.ray) / nearest[:, None].to(base.ray)
+    q = torch.linspace(0, 1, options.planes, device=base.ray.device).to(base.ray) / nearest[:, None].to(base.ray)
     start = surface.sweep_planes(base, source_views, q, options)
     return Sweep(
         base=base,
@@ -255,7 +255,7 @@ def source_view_of(selected: SelectedViews, index: Tensor, size: int, use: Tenso
     rows = index, torch.arange(len(index), device=index.device)
     frame, fit = selected.frames[rows], selected.fits[rows]
     image, camera = downscale_grey(frame, size)
-    eye = torch.eye(3).to(like)
+    eye = torch.eye(3, dtype=like.dtype, device=like.device)
     R = torch.where(fit.ok[:, None, None], fit.T_1_from_0.R.to(like), eye)
     t = torch.where(fit.ok[:, None], fit.T_1_from_0.t.to(like), eye[0])
     shutter_rate = None if fit.shutter is None else torch.where(fit.ok[:, None], fit.shutter.shutter_rate.to(like), 0.0)

@@ -21,6 +21,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.codes import Gate, Source
+from dhtorch.geometry.checks import is_static
 from dhtorch.geometry.components import small_components
 from dhtorch.geometry.windows import window_extreme
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
@@ -151,7 +152,7 @@ def _halo(known: _Known, within: Tensor, options: DenseOptions) -> Tensor:
 
 def _has_neighbour(q: Tensor, which: Tensor, of: Tensor, radius: int, ratio: float) -> Tensor:
     """Pixels ``which`` (B, h, w) bool with one of ``of`` (B, h, w) 1/m, 0 = none, at their depth in the window."""
-    b, y, x = which.nonzero(as_tuple=True)
+    b, y, x = _pixels(which)
     padded, own = F.pad(of, (radius,) * 4), q[b, y, x]
     low, high = own / ratio, own * ratio
     between = torch.zeros_like(own, dtype=torch.bool)
@@ -160,7 +161,16 @@ def _has_neighbour(q: Tensor, which: Tensor, of: Tensor, radius: int, ratio: flo
         between |= (other > low) & (other < high)
     out = torch.zeros_like(which)
     out[b, y, x] = between
-    return out
+    return out & which
+
+
+def _pixels(mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Indices of the pixels of a mask (B, h, w); of all pixels where values must not be read."""
+    if not is_static(mask):
+        return mask.nonzero(as_tuple=True)
+    axes = (torch.arange(n, device=mask.device) for n in mask.shape)
+    b, y, x = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
+    return b, y, x
 
 
 def _fattened(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
@@ -173,7 +183,8 @@ def _fattened(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
     r, ratio = options.halo_radius_px, options.step_ratio
     farthest = window_extreme(torch.where(swept, q, torch.inf), r, torch.minimum)
     step = torch.maximum(q - q / ratio, options.step_sigmas * sigma)
-    b, y, x = (swept & (q - farthest > step)).nonzero(as_tuple=True)
+    edge = swept & (q - farthest > step)
+    b, y, x = _pixels(edge)
     depths, shades = (F.pad(v, (r,) * 4) for v in (q, grey))
     own, shade = q[b, y, x], grey[b, y, x]
     near, far, n_near, n_far = (torch.zeros_like(own) for _ in range(4))
@@ -185,7 +196,7 @@ def _fattened(known: _Known, grey: Tensor, options: DenseOptions) -> Tensor:
         far, n_far = far + alike * is_far, n_far + is_far
     out = torch.zeros_like(swept)
     out[b, y, x] = far * n_near > options.fattened_ratio * near * n_far
-    return out
+    return out & edge
 
 
 def _window(radius: int) -> Iterator[tuple[int, int]]:
@@ -244,7 +255,8 @@ def _fill(known: _Known, within: Tensor, options: DenseOptions) -> tuple[Tensor,
     plane if some of them are returns ``within`` its reach and the gap is wider than ``max_gap_px`` in all directions.
     """
     r, answered = options.hole_radius_px, known.answered
-    b, y, x = ((_enclosed(answered, r) | _in_gap(answered)) & ~answered).nonzero(as_tuple=True)
+    open_ = (_enclosed(answered, r) | _in_gap(answered)) & ~answered
+    b, y, x = _pixels(open_)
     padded, near, values, sigmas = (F.pad(v, (r,) * 4) for v in (answered, within, known.q, known.sigma))
     rim, widths, total_sigma, refuted = [], [], torch.zeros_like(known.q[b, y, x]), torch.zeros_like(answered[b, y, x])
     for dy, dx in _DIRECTIONS:
@@ -265,6 +277,7 @@ def _fill(known: _Known, within: Tensor, options: DenseOptions) -> tuple[Tensor,
     fits = ~refuted & (n >= options.min_rim_pixels) & (q > _MIN_INVERSE_DEPTH) & (distance.amax(0) <= limit)
     where, filled, spread = torch.zeros_like(answered), torch.ones_like(known.q), torch.zeros_like(known.q)
     where[b, y, x] = fits
+    where &= open_
     unanswered = ~(answered | where)
     for dy, dx in _SIDES:  # beside a pixel that stays unanswered it would be the edge of an island in a larger hole
         where &= ~_shift(unanswered, dy, dx)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import torch
@@ -17,7 +17,7 @@ from dhtorch import pytree
 from dhtorch.codes import Gate, PoseCode, Source
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.geometry.checks import all_finite, any_possible, check, is_transformed
+from dhtorch.geometry.checks import all_finite, any_possible, check, is_transformed, keep_beside, move_from_host
 from dhtorch.geometry.epipolar import triangulate
 from dhtorch.geometry.least_squares import select_batch
 from dhtorch.geometry.linalg import small_matmul
@@ -47,6 +47,9 @@ from dhtorch.stages.track import refine_tracks
 
 #: Most pairs tracked at once: more are no faster, and their pyramids cost memory. Source: origin not recorded.
 TRACK_CHUNK_PAIRS = 8
+
+#: The same on an accelerator. Source: derived, pyramids of 640×480 pixels in 700 MB.
+ACCELERATOR_CHUNK_PAIRS = 64
 
 #: Places, evenly spread over the image, among which :func:`sample_returns` finds returns, a count: a few returns in a
 #: thousand pixels are met. Source: derived, 10 of them where one pixel in eight hundred has a return.
@@ -182,7 +185,8 @@ def track_in_chunks(method: MethodSpec, image_0: Tensor, image_1: Tensor, uv: Te
     def track_chunk(image_0: Tensor, image_1: Tensor, uv: Tensor, hint: TrackHint) -> Tracks:
         return method.track(image_0, image_1, uv, hint=hint)
 
-    return chunked_apply(track_chunk, TRACK_CHUNK_PAIRS, image_0, image_1, uv, hint)
+    size = TRACK_CHUNK_PAIRS if image_0.is_cpu else ACCELERATOR_CHUNK_PAIRS
+    return chunked_apply(track_chunk, size, image_0, image_1, uv, hint)
 
 
 #: Tracks, estimate, tracks in ideal pixels, and poses of pairs.
@@ -409,7 +413,7 @@ def solve_pose_and_triangulate(
     usable = undistort_tracks(usable, camera_0, camera_1)
     camera_0, camera_1 = cam.ideal(camera_0), cam.ideal(camera_1)
     if not isinstance(fit, PoseFit):
-        draws = uniform_draws(seed, camera_0.f.shape[0], method.hypotheses).to(camera_0.f)
+        draws = _draws_beside(camera_0.f, seed, method.hypotheses)
         solved = method.pose(samples, usable, camera_0, camera_1, draws)
         fit = solved if fit is None else _apply_prior(fit, solved, samples, usable, camera_0, camera_1)
         fit = fit.replace(code=torch.where(_is_static(fit, usable), PoseCode.NO_BASELINE, fit.code).to(fit.code.dtype))
@@ -563,6 +567,18 @@ def uniform_draws(seed: int | Tensor, batch: int, hypotheses: int) -> Tensor:
     if seed.shape != (batch,):
         raise ValueError(f"extend: seed has shape {tuple(seed.shape)}, expected an int or ({batch},) int64")
     return draws(seed.cpu(), hypotheses)
+
+
+def _draws_beside(like: Tensor, seed: int | Tensor, hypotheses: int) -> Tensor:
+    """:func:`uniform_draws` of a batch (B, …), in its dtype and on its device; an accelerator keeps those of an int."""
+    if like.is_cpu or is_transformed() or not isinstance(seed, int):
+        return move_from_host(uniform_draws(seed, len(like), hypotheses), like)
+    return keep_beside(_draws_of_int(seed, hypotheses), like.dtype, like.device).expand(len(like), -1, -1)
+
+
+@lru_cache(maxsize=64)
+def _draws_of_int(seed: int, hypotheses: int) -> Tensor:
+    return _draw_rows(torch.tensor([seed]), hypotheses)
 
 
 def _draw_rows(seed: Tensor, hypotheses: int) -> Tensor:

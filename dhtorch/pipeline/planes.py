@@ -23,7 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from dhtorch.codes import Gate, Source
-from dhtorch.geometry.checks import any_possible
+from dhtorch.geometry.checks import any_possible, is_static
 from dhtorch.geometry.linalg import quadratic_form
 from dhtorch.geometry.windows import window_extreme
 from dhtorch.pipeline.dense_options import DEFAULT_DENSE_OPTIONS, DenseOptions
@@ -189,7 +189,9 @@ def _sums(x: Tensor) -> Tensor:
 def _cell_middles(cells: _Cells, options: DenseOptions) -> tuple[Tensor, Tensor]:
     """Pixels u and v (N,) of the middles of the cells."""
     side = options.plane_cell_px
-    rows, columns = (torch.arange(n).to(cells.q) * side + (side - 1) / 2 for n in cells.q.shape[1:])
+    rows, columns = (
+        torch.arange(n, device=cells.q.device).to(cells.q) * side + (side - 1) / 2 for n in cells.q.shape[1:]
+    )
     return columns.expand(len(rows), -1).flatten(), rows[:, None].expand(-1, len(columns)).flatten()
 
 
@@ -258,6 +260,8 @@ def _best_hypothesis(support: _Support, wanted: Tensor, options: DenseOptions) -
 
     Source: P. Torr, A. Zisserman, "MLESAC" (CVIU 2000), the truncated score.
     """
+    if is_static(wanted):
+        return _cheapest_plane(support, options) & wanted[:, None]
     inlier = torch.zeros_like(support.exists)
     for k in range(len(wanted)):  # view by view: the sums then depend on no batch mate
         for index in wanted[k].nonzero()[:, 0].split(CELLS_PER_BLOCK):
@@ -394,7 +398,9 @@ def _at_pixels(
     def pixel(x: Tensor) -> Tensor:
         return _per_pixel(x.view(cells), shape, options)
 
-    rows, columns = (torch.arange(n).to(disagreement) % side - (side - 1) / 2 for n in shape[1:])
+    rows, columns = (
+        torch.arange(n, device=disagreement.device).to(disagreement) % side - (side - 1) / 2 for n in shape[1:]
+    )
     y, x = rows[:, None], columns
     at = _Planes(*(tuple(map(pixel, p)) if isinstance(p, tuple) else pixel(p) for p in planes))  # type: ignore[arg-type]
     with torch.no_grad():

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import check, constant
 from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.map_estimate import MEDIAN_2D
 from dhtorch.geometry.patches import is_inside_picture
@@ -186,17 +186,23 @@ def _as_matches(uv_0: Tensor, uv_1: Tensor, lafs_0: Tensor | None = None, lafs_1
     """Matched pixels, and frames (1, M, 2, 3) or None → matches; also of tensors of inference mode."""
     uv_0, uv_1 = uv_0.clone().float(), uv_1.clone().float()
     if lafs_0 is None or lafs_1 is None:
-        return _Matches(uv_0, uv_1, torch.eye(2).to(uv_0).expand(len(uv_0), 2, 2))
+        return _Matches(uv_0, uv_1, torch.eye(2, dtype=uv_0.dtype, device=uv_0.device).expand(len(uv_0), 2, 2))
     frame_0, frame_1 = (x[0, :, :, :2].float() for x in (lafs_0, lafs_1))
     regular = torch.linalg.det(frame_0).abs() > torch.finfo(frame_0.dtype).eps
-    inverse = torch.linalg.inv(torch.where(regular[:, None, None], frame_0, torch.eye(2).to(frame_0)))
-    return _Matches(uv_0, uv_1, torch.where(regular[:, None, None], frame_1 @ inverse, torch.eye(2).to(uv_0)))
+    inverse = torch.linalg.inv(
+        torch.where(regular[:, None, None], frame_0, torch.eye(2, dtype=frame_0.dtype, device=frame_0.device))
+    )
+    return _Matches(
+        uv_0,
+        uv_1,
+        torch.where(regular[:, None, None], frame_1 @ inverse, torch.eye(2, dtype=uv_0.dtype, device=uv_0.device)),
+    )
 
 
 def _reversed(matches: _Matches) -> _Matches:
     """The matches from image 1 to image 0."""
     regular = (torch.linalg.det(matches.A).abs() > torch.finfo(matches.A.dtype).eps)[:, None, None]
-    eye = torch.eye(2).to(matches.A)
+    eye = torch.eye(2, dtype=matches.A.dtype, device=matches.A.device)
     inverse = torch.where(regular, torch.linalg.inv(torch.where(regular, matches.A, eye)), eye)
     return _Matches(matches.uv_1, matches.uv_0, inverse)
 
@@ -213,7 +219,7 @@ def _predict(matches: _Matches, x: Tensor, neighbours: int, reach_px: float) -> 
     scale = distance[:, -1:].clamp_min(1.0)
     X = torch.cat((torch.ones_like(o[..., :1]), o / scale[..., None]), -1)
     near = (-(distance**2) / scale**2).exp()
-    ridge = _SLOPE_WEIGHT * torch.diag(X.new_tensor([0.0, 1, 1]))
+    ridge = _SLOPE_WEIGHT * torch.diag(constant(X, [0.0, 1, 1]))
     residual = p - p.median(1, keepdim=True).values
     for _ in range(_FIT_STEPS):
         size = torch.linalg.vector_norm(residual, dim=-1)
@@ -226,7 +232,7 @@ def _predict(matches: _Matches, x: Tensor, neighbours: int, reach_px: float) -> 
     effective = total**2 / (weight**2).sum(-1)
     scatter = ((residual * weight[..., None]).mT @ residual) / total[:, None, None]
     freedom = (effective - _PLANE_PARAMETERS).clamp_min(1.0) / effective
-    row = torch.linalg.solve(normal, ridge.new_tensor([1.0, 0, 0]).expand(len(x), 3)[..., None])[..., 0]
+    row = torch.linalg.solve(normal, constant(ridge, [1.0, 0, 0]).expand(len(x), 3)[..., None])[..., 0]
     leverage = ((X @ row[..., None])[..., 0] * weight).square().sum(-1)
     cov = scatter * ((1 + leverage) / (freedom * WEIGHTED_VARIANCE))[:, None, None]
     is_near = (distance[:, 0] <= reach_px) & (effective > _PLANE_PARAMETERS) & x.isfinite().all(-1)

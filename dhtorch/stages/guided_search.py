@@ -17,8 +17,9 @@ from torch import Tensor
 
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import se3
-from dhtorch.geometry.checks import check
+from dhtorch.geometry.checks import check, constant
 from dhtorch.geometry.coarse_flow import DownscaledImage, downscale
+from dhtorch.geometry.determinism import chunk_size
 from dhtorch.geometry.lucas_kanade import masked_apply
 from dhtorch.geometry.se3 import Pose
 from dhtorch.pytree import Record, record
@@ -168,7 +169,8 @@ def guided_search(
         T = T_1_from_0.detach().map(lambda x: x.to(dtype))
         posed = T.R.isfinite().flatten(2).all(2) & T.t.isfinite().all(2)  # (V, B)
         T = Pose(
-            torch.where(posed[..., None, None], T.R, torch.eye(3).to(T.R)), torch.where(posed[..., None], T.t, 0.0)
+            torch.where(posed[..., None, None], T.R, torch.eye(3, dtype=T.R.dtype, device=T.R.device)),
+            torch.where(posed[..., None], T.t, 0.0),
         )
         searched = ~samples.usable & posed.any(0)[:, None]
         searched = searched if wanted is None else searched & wanted
@@ -183,7 +185,8 @@ def guided_search(
 
         def search(uv_0: Tensor, q_max: Tensor, batch: Tensor, *segments: _Segment) -> tuple[Tensor, ...]:
             points = _Points(uv_0, q_max, batch, segments)
-            chunks = [_search(levels, part, limits) for part in _split_points(points, SEARCH_CHUNK_POINTS)]
+            size = chunk_size(SEARCH_CHUNK_POINTS, uv_0)
+            chunks = [_search(levels, part, limits) for part in _split_points(points, size)]
             return tuple(torch.cat(field, -1) for field in zip(*chunks, strict=True))
 
         fields = masked_apply(
@@ -198,7 +201,7 @@ def guided_search(
             _places(samples, points.segments[v], q[v], searched & posed[v][:, None], cameras_1[v], T[v])
             for v in range(V)
         ]
-        cov = variance[..., None, None] * torch.eye(2).to(variance)
+        cov = variance[..., None, None] * torch.eye(2, dtype=variance.dtype, device=variance.device)
         uv_1, cov, ncc, rms = (x.to(samples.uv.dtype) for x in (torch.stack(views), cov, ncc, rms))
         return GuidedMatches(uv_1, cov, ncc, rms, unique)
 
@@ -221,7 +224,7 @@ def _points(
     B, N = samples.xyz.shape[:2]
     uv_0 = samples.uv.detach().to(T.t.dtype).expand(B, N, 2)
     shifts = (0.0, 0.0), (AFFINE_HALF_WIDTH_PX, 0.0), (0.0, AFFINE_HALF_WIDTH_PX)
-    rays = [cam.rays(camera_0, uv_0 + uv_0.new_tensor(shift)).nan_to_num(0.0, 0.0, 0.0) for shift in shifts]
+    rays = [cam.rays(camera_0, uv_0 + constant(uv_0, shift)).nan_to_num(0.0, 0.0, 0.0) for shift in shifts]
     returned = samples.usable & (samples.trackability > 0)  # those without texture may be mere filling of a batch
     depth = torch.where(returned, samples.depth.detach(), torch.inf).to(T.t.dtype).sort(-1).values
     rank = (near_quantile * returned.sum(-1)).long().clamp(max=N - 1)

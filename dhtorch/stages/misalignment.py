@@ -19,7 +19,7 @@ from torch import Tensor
 from dhtorch.codes import PoseCode
 from dhtorch.geometry import camera as cam
 from dhtorch.geometry import epipolar, ransac
-from dhtorch.geometry.checks import all_finite, check
+from dhtorch.geometry.checks import all_finite, check, constant
 from dhtorch.geometry.covariance import masked_median
 from dhtorch.geometry.map_estimate import MEDIAN_1D, MIN_NOISE_PX
 from dhtorch.geometry.reprojection_problem import undo_rolling_shutter
@@ -256,7 +256,7 @@ def _attachment_gain(near: _Parallax, samples: Samples) -> tuple[Tensor, Tensor]
     """Cost of the depths at other pixels over that of the depths at the own ones (B, K), and the shared returns."""
     size = _sampled_size(samples)
     mean, filled = _cell_means(samples, size)
-    change = near.p.new_tensor([(1.0, 1.0, 0.0, 0.0), *ATTACHMENTS])
+    change = constant(near.p, [(1.0, 1.0, 0.0, 0.0), *ATTACHMENTS])
     centre = size[:, None] / 2
     at = centre + (near.uv[:, None] - centre) * change[:, None, :2] + change[:, None, 2:] * size[:, None]
     cell, inside = _cells(at.flatten(1, 2), size)

@@ -12,6 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from dhtorch.geometry.checks import is_transformed, keep_beside
+
 #: Step of the angle of a Vogel spiral, rad.
 #: Source: derived, π (3 − √5), the golden section of a full turn.
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -60,7 +62,9 @@ def spiral(
     uv = _constant_arms(
         (hw[0], hw[1]), n, turns=turns, foveation=foveation, gaze=centre, inner_px=inner_px, margin_px=margin_px
     )
-    return uv.to(device=device, dtype=dtype, copy=True)
+    if torch.empty(0, device=device).is_cpu or is_transformed():
+        return uv.to(device=device, dtype=dtype, copy=True)
+    return keep_beside(uv, dtype, torch.empty(0, device=device).device).clone()
 
 
 def _constant_arms(*args: Any, **options: Any) -> Tensor:

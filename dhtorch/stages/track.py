@@ -16,7 +16,7 @@ from torch import Tensor
 
 from dhtorch.geometry import affine_alignment
 from dhtorch.geometry import lucas_kanade as lk
-from dhtorch.geometry.checks import any_possible, check
+from dhtorch.geometry.checks import any_possible, check, constant
 from dhtorch.geometry.coarse_flow import (
     CoarseFlow,
     apply_similarity,
@@ -224,7 +224,7 @@ class _DerotatedImage:
         """Tracks into the derotated image as tracks into image 1."""
         A = self.linear.to(tracks.cov)[:, None]
         uv_1 = apply_similarity(self.linear, tracks.uv_1, self.hw)
-        inside = ((uv_1 >= -0.5) & (uv_1 <= uv_1.new_tensor([self.hw[1] - 0.5, self.hw[0] - 0.5]))).all(-1)
+        inside = ((uv_1 >= -0.5) & (uv_1 <= constant(uv_1, [self.hw[1] - 0.5, self.hw[0] - 0.5]))).all(-1)
         cov = torch.where(
             self.rotated[:, None, None, None], small_matmul(small_matmul(A, tracks.cov), A.mT), tracks.cov
         )

@@ -152,7 +152,14 @@ def test_its_benchmark_runs_through_with_a_device_that_is_played(monkeypatch, ca
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "synchronize", lambda: waited.append(1))
     monkeypatch.setattr(torch.cuda, "Event", Clock)
-    for name, value in {"CPU_BATCH": 2, "N": 64, "SIZES": (1, 3, 4), "METHODS": {"paper": until_full}}.items():
+    for name in ("reset_peak_memory_stats", "memory_allocated", "max_memory_allocated", "get_device_name"):
+        monkeypatch.setattr(torch.cuda, name, lambda: 0)
+    series, all_calls = ("frontend", "pnp_n500", "triangulate", "pair_paper"), gpu.calls
+    played_options = {"CPU_BATCH": 2, "N": 64, "VIEWS": 1, "SIZES": (1, 3, 4), "OF_VIEWS": ()}
+    played_options |= {"METHODS": {**METHODS, "paper": until_full}, "waits": lambda call: 0}
+    played_options["graph_times"] = lambda *_: None
+    played_options["calls"] = lambda *of: {k: v for k, v in all_calls(*of).items() if k in series}
+    for name, value in played_options.items():
         monkeypatch.setattr(gpu, name, value)
     monkeypatch.delenv("DHTORCH_DATA", raising=False)
     monkeypatch.setattr(sys, "argv", ["gpu.py", "--repeats", "2", "--json", str(tmp_path / "gpu.json")])

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from dhtorch.codes import Flag
 from dhtorch.geometry.camera import depth_pixels, undistort
+from dhtorch.geometry.checks import constant
 from dhtorch.geometry.filters import grayscale
 from dhtorch.records import Frame, Samples
 
@@ -43,7 +44,7 @@ def backproject_kornia(
     colours, pixel = _read_windows(frame.image.detach(), uv, RADIUS_PX)
     grey, centre = grayscale(colours)[:, 0], colours.shape[-1] // 2
     colour, grey_centre, mean = colours[..., centre], grey[..., centre], grey.mean(-1)
-    last = pixel.new_tensor([frame.hw[1] - 1, frame.hw[0] - 1])
+    last = constant(pixel, [frame.hw[1] - 1, frame.hw[0] - 1])
     is_colourless = colour.amax(1) - colour.amin(1) <= 0.15 * colour.amax(1)  # as in PAPER, and 0.1 below
     flags = {
         Flag.NO_DEPTH: depth <= 0,

@@ -66,7 +66,7 @@ def pnp_ransac_kornia(
         n_inlier = inlier.sum(-1)
         total = torch.where(inlier, square, 0.0).sum(-1)
         sigma_px = (total / (2 * n_inlier - 6).clamp_min(1)).sqrt().clamp_min(1e-6)
-        inverse, regular = _solve(H, torch.eye(6).to(H).expand_as(H))
+        inverse, regular = _solve(H, torch.eye(6, dtype=H.dtype, device=H.device).expand_as(H))
         cov = inverse * sigma_px.square()[:, None, None]
         whitened, _ = _solve(cov[:, 3:, 3:], t[..., None])
         few, bad, enough = PoseCode.TOO_FEW, PoseCode.DEGENERATE, usable.sum(-1) >= min_inlier

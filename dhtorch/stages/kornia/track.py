@@ -11,6 +11,7 @@ from kornia.filters import spatial_gradient
 from kornia.geometry.transform import build_pyramid, remap
 from torch import Tensor
 
+from dhtorch.geometry.checks import constant
 from dhtorch.geometry.filters import grayscale
 from dhtorch.geometry.patches import QUANTISATION_VARIANCE, is_inside_picture
 from dhtorch.records import NO_HINT, TrackHint, Tracks
@@ -18,6 +19,10 @@ from dhtorch.records import NO_HINT, TrackHint, Tracks
 #: Least eigenvalue of A per pixel of a window that is tracked, squared grey values in [0, 1] per px².
 #: Source: OpenCV calcOpticalFlowPyrLK default minEigThreshold 1e-4, derived, times 2^10 / 255².
 MIN_EIGENVALUE = 1e-4 * 2**10 / 255**2
+
+#: Pairs whose eigenvalues are computed at once. Source: chosen on an H100, whose cuSOLVER fails for 64 pairs of 2,048
+#: points.
+MAX_EIGEN_PAIRS = 8
 
 
 @torch.inference_mode(False)  # it differentiates inside
@@ -56,7 +61,9 @@ def lucas_kanade_kornia(
     if not (torch.is_grad_enabled() and any(v.requires_grad for v in (image_0, image_1, uv_0))):
         uv_1 = uv_1.detach()
     square = difference.square().sum(-1)
-    A = A + 1e-5 * A.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(1e-4)[..., None, None] * torch.eye(2).to(A)
+    A = A + 1e-5 * A.diagonal(dim1=-2, dim2=-1).sum(-1).clamp_min(1e-4)[..., None, None] * torch.eye(
+        2, dtype=A.dtype, device=A.device
+    )
     return Tracks(
         uv_0=uv_0,
         uv_1=uv_1,
@@ -78,8 +85,11 @@ def _search(
     for picture_0, picture_1 in zip(reversed(source), reversed(target), strict=True):
         T, g = _template(picture_0, _to_level(x, source[0], picture_0), window)
         A = torch.einsum("bnip,bnjp->bnij", g, g)
-        textured = torch.linalg.eigvalsh(A)[..., 0] > MIN_EIGENVALUE * window**2
-        A_inv = torch.linalg.inv(torch.where(textured[..., None, None], A, torch.eye(2).to(A)))
+        eigenvalues = torch.cat([torch.linalg.eigvalsh(part) for part in A.split(MAX_EIGEN_PAIRS)])
+        textured = eigenvalues[..., 0] > MIN_EIGENVALUE * window**2
+        A_inv = torch.linalg.inv(
+            torch.where(textured[..., None, None], A, torch.eye(2, dtype=A.dtype, device=A.device))
+        )
         y = _to_level(y, target[0], picture_1)
         length = torch.zeros_like(y[..., 0])
         active = valid & textured & is_inside_picture(y, picture_1)
@@ -108,7 +118,9 @@ def _newton_step(
         rows = [torch.autograd.grad(residual[..., k].sum(), at, retain_graph=True)[0] for k in (0, 1)]
     H = torch.stack(rows, -2)
     regular = (valid & (torch.linalg.det(H) > 0.1 * torch.linalg.det(A)))[..., None]  # else far from a parabola
-    step = torch.linalg.solve(torch.where(regular[..., None], H, torch.eye(2).to(H)), residual)
+    step = torch.linalg.solve(
+        torch.where(regular[..., None], H, torch.eye(2, dtype=H.dtype, device=H.device)), residual
+    )
     return y - torch.where(regular, step, 0.0), difference.detach()
 
 
@@ -127,5 +139,5 @@ def _read(picture: Tensor, x: Tensor, window: int, padding_mode: str = "reflecti
 
 def _to_level(x: Tensor, picture: Tensor, other: Tensor) -> Tensor:
     """Points (B, N, 2) of one level of a pyramid on another; kornia's levels cover the same area."""
-    scale = x.new_tensor([other.shape[-1] / picture.shape[-1], other.shape[-2] / picture.shape[-2]])
+    scale = constant(x, [other.shape[-1] / picture.shape[-1], other.shape[-2] / picture.shape[-2]])
     return (x + 0.5) * scale - 0.5

@@ -32,7 +32,7 @@ def two_view_kornia(
     Gradient: depth, sigma, parallax and residual to pixels, cameras and pose; gates carry none. Float64 inside.
     Source: paper, "Gated two-view triangulation and abstention".
     """
-    posed, eye = fit.ok[:, None], torch.eye(3).to(fit.T_1_from_0.t).double()
+    posed, eye = fit.ok[:, None], torch.eye(3, dtype=fit.T_1_from_0.t.dtype, device=fit.T_1_from_0.t.device).double()
     tracked = tracks.valid & tracks.uv_0.isfinite().all(-1) & tracks.uv_1.isfinite().all(-1)
     usable = tracked & posed
     # What is missing is replaced by valid numbers, so that values and gradients are finite.
