@@ -1,4 +1,4 @@
-"""Triangulation, tracking and pose as functions of plain tensors in kornia's conventions."""
+"""Triangulation, tracking and pose in kornia's conventions, and depth as a picture or as points: plain tensors."""
 
 from dhtorch.functional.points import (
     PnPSolution,
@@ -8,10 +8,15 @@ from dhtorch.functional.points import (
     track_points_lk,
     triangulate_points_one_sided,
 )
+from dhtorch.functional.policy_inputs import GeometryImage, decode_geometry_image, geometry_image, point_cloud
 
 __all__ = [
+    "GeometryImage",
     "PnPSolution",
     "PointTracks",
+    "decode_geometry_image",
+    "geometry_image",
+    "point_cloud",
     "solve_p3p",
     "solve_pnp_ransac",
     "track_points_lk",
