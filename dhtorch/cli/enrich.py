@@ -25,6 +25,7 @@ from dhtorch.extract import columns, cut, engines, plan, shards
 from dhtorch.extract.enriched import MAP_FILES, NO_ANSWER_REASONS, DatasetCamera, MapRowDataset, camera_key, map_columns
 from dhtorch.extract.nerf_target import NerfstudioTarget
 from dhtorch.extract.origin import DEFAULT_FPS, DatasetSource, LeRobotSource, frame_rate, has_frame_rate
+from dhtorch.extract.policy_columns import POLICY_COLUMNS
 from dhtorch.extract.robot_target import LeRobotTarget
 from dhtorch.extract.step_set import RldsSource
 from dhtorch.extract.targets import DatasetTarget
@@ -438,8 +439,12 @@ def _check_options(settings: Mapping[str, Any]) -> None:
         if settings[name] not in choices:
             raise ValueError(f"{name}: found {settings[name]!r}, expected one of {', '.join(choices)}")
     wanted = settings["columns"]
-    if not isinstance(wanted, Sequence) or isinstance(wanted, str) or not {"depth"} <= {*wanted} <= {*MAP_FILES}:
-        raise ValueError(f"columns: found {wanted!r}, expected depth and any of {', '.join(MAP_FILES)}, as a list")
+    known = (*MAP_FILES, *POLICY_COLUMNS)
+    if not isinstance(wanted, Sequence) or isinstance(wanted, str) or not {"depth"} <= {*wanted} <= {*known}:
+        raise ValueError(f"columns: found {wanted!r}, expected depth and any of {', '.join(known)}, as a list")
+    if settings["format"] == "nerfstudio" and {*wanted} & {*POLICY_COLUMNS}:
+        more = ", ".join(name for name in POLICY_COLUMNS if name in wanted)
+        raise ValueError(f"columns: found {more} with format=nerfstudio, expected a LeRobot format")
     for name in ("causal", "report", "cameras"):
         if not isinstance(settings[name], bool):
             raise ValueError(f"{name}: found {settings[name]!r}, expected true or false")

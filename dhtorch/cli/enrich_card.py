@@ -17,6 +17,7 @@ from dhtorch.cli.enrich_page import summarise_cameras
 from dhtorch.codes import Source, names
 from dhtorch.data.io import decode as files
 from dhtorch.data.io.decode import import_optional
+from dhtorch.extract.policy_columns import N_POINTS
 from dhtorch.extract.robot_target import SOURCE_CARD, LeRobotTarget
 from dhtorch.runtime import storage
 from dhtorch.runtime.console import format_count
@@ -48,7 +49,7 @@ def _format_card(target: LeRobotTarget, about: Mapping[str, Any], owns: Sequence
     code = info["codebase_version"]
     body = [f"LeRobot {code} set, written from `{source}` by {writer}: {size}.", ""]
     body += ["## Cameras", "", *_camera_table(target, owns, stats), ""]
-    body += [_describe_maps(target, about), ""]
+    body += [_describe_maps(target, about, info), ""]
     known = f"`{licence}`, by its card (`{SOURCE_CARD}`)" if licence else "not stated by the source"
     body += ["## Licence", "", f"Pictures, states and actions are the source's: {known}.", ""]
     return "\n".join([*head, *body, *_loading(target, info)]) + "\n"
@@ -87,7 +88,7 @@ def _span(entry: Mapping[str, Any]) -> str:
     return f"{low:.2f}–{high:.2f}"
 
 
-def _describe_maps(target: LeRobotTarget, about: Mapping[str, Any]) -> str:
+def _describe_maps(target: LeRobotTarget, about: Mapping[str, Any], info: Mapping[str, Any]) -> str:
     key = next(iter(target.views))
     step = f"in steps of {1e3 * about['step_m']:.3g} mm" if about["step_m"] else "not quantised"
     form = "32-bit TIFF" if target.as_images else "an array of numbers (1, h, w)"
@@ -101,9 +102,30 @@ def _describe_maps(target: LeRobotTarget, about: Mapping[str, Any]) -> str:
     if "source" in target.keys[key]:
         codes = ", ".join(f"{code} {name.lower()}" for code, name in names(Source).items())
         lines.append(f"`{target.keys[key]['source']}` is where a depth comes from: {codes}.")
+    if "geometry_image" in target.keys[key]:
+        lines += _describe_geometry(target.keys[key]["geometry_image"], info["features"])
+    if "point_cloud" in target.keys[key]:
+        lines.append(f"`{target.keys[key]['point_cloud']}` is {N_POINTS} points (x right, y down, z forward) in metres")
+        lines.append(
+            "of the camera, by pixels with a depth in a fixed order; they repeat where there are fewer, and are"
+        )
+        lines.append("all 0 in a frame without depth. Its first points are a smaller cloud of the whole picture.")
     if "K" in target.keys[key]:
         lines.append(f"`{target.keys[key]['K']}` is K of the picture by rows; pixel centres are whole numbers.")
     return "\n".join(lines)
+
+
+def _describe_geometry(key: str, features: Mapping[str, Any]) -> list[str]:
+    """Lines on the video of geometry images and its decoding, which the feature's info states too."""
+    info = features[key]["info"]
+    decoding = info["geometry_image"]
+    return [
+        f"`{key}` is a video without loss ({info['video.codec']}, {info['video.pix_fmt']}) of bytes that decode as",
+        f"`depth_m = {decoding['depth_m']}`,",
+        f"`sigma_m = {decoding['sigma_m']}`,",
+        f"`source = {decoding['source']}` (`{decoding['function']}`);",
+        "encoded again with loss, its depth is no longer exact to half a code.",
+    ]
 
 
 def _loading(target: LeRobotTarget, info: Mapping[str, Any]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import reduce
 from operator import add
 from pathlib import Path
@@ -16,7 +16,8 @@ from dhtorch.codes import names
 from dhtorch.data.io.decode import import_optional
 from dhtorch.export import lerobot
 from dhtorch.export.lerobot import FeatureMoments, FeatureSpec, LogHistogram
-from dhtorch.extract import pixel_columns
+from dhtorch.export.video import open_lossless_video
+from dhtorch.extract import pixel_columns, policy_columns
 from dhtorch.extract.columns import Column
 from dhtorch.extract.enriched import (
     MAP_FILES,
@@ -29,6 +30,7 @@ from dhtorch.extract.enriched import (
 )
 from dhtorch.extract.instants import PeekableRows, iter_groups, iter_instants, iter_rows
 from dhtorch.extract.origin import DatasetSource, LeRobotSource
+from dhtorch.extract.policy_columns import POLICY_COLUMNS, PolicyColumnWriter
 from dhtorch.extract.targets import MapCounts, Row
 from dhtorch.runtime import storage
 
@@ -53,7 +55,8 @@ class LeRobotTarget:
         origin: source data set; None = recordings, whose images are in the shards.
         numbers: episode numbers in the source.
         step: m, quantisation step of the depth maps.
-        maps: names of the maps to write, see :data:`MAP_FILES`.
+        maps: names of the maps to write, see :data:`MAP_FILES`, and of the columns made of them, see
+            :data:`dhtorch.extract.policy_columns.POLICY_COLUMNS`.
         as_images: maps are images in the tables; else numbers, and one-channel images of the source, which LeRobot's
             policies take as pictures of three channels, become numbers, too.
         fps: of a recording.
@@ -125,6 +128,8 @@ class LeRobotTarget:
             if name in self.maps
         }
         columns |= {key: f"observation.{view.name}.dhtorch_{key}" for key in NUMBER_COLUMNS}
+        policy = {"geometry_image": f"{view.key}_geometry_image", "point_cloud": f"observation.{view.name}.point_cloud"}
+        columns |= {kind: column for kind, column in policy.items() if kind in self.maps}
         columns["K"] = f"observation.{view.name}.intrinsics"
         if view.posed:
             columns["pose"] = f"observation.{view.name}.T_world_from_cam"
@@ -142,6 +147,8 @@ class LeRobotTarget:
             by_kind: dict[str, FeatureSpec] = {
                 **{name: self._map_feature(name, view) for name in MAP_FILES},
                 **{key: _number_feature(number_column(c, self.n)) for key, c in NUMBER_COLUMNS.items()},
+                "geometry_image": policy_columns.geometry_feature(view.hw, self.fps),
+                "point_cloud": policy_columns.cloud_feature(),
                 "K": lerobot.number_feature("float64", 9),
                 "pose": lerobot.number_feature("float64", 16),
             }
@@ -199,7 +206,8 @@ class LeRobotTarget:
         path = self.file(k)
         length, writer = 0, None
         with storage.write_atomically(path) as sink, ExitStack() as closing:
-            for table in self._join_rows(k, start, parts, tallies, tasks):
+            policy = {key: closing.enter_context(self._open_policy_columns(k, key)) for key in self.views}
+            for table in self._join_rows(k, start, parts, tallies, policy, tasks):
                 if writer is None:
                     layout = lerobot.make_arrow_schema(self.features(table.column_names), _column_types(table), {})
                     writer = closing.enter_context(parquet.ParquetWriter(sink, layout, compression="zstd"))
@@ -210,6 +218,7 @@ class LeRobotTarget:
             if writer is None:
                 raise ValueError(f"episode {self.numbers[k]}: found no frame that can be read, expected one")
             task_texts = [tasks[i] for i in task_indices if i is not None and 0 <= i < len(tasks)]
+            moments |= {column: each for writer in policy.values() for column, each in writer.moments.items()}
             summary = self._summary(k, start, length, task_texts, moments, tallies)
             writer.add_key_value_metadata({_EPISODE_METADATA_KEY: storage.dump_strict_json(summary)})
             self._copy_videos(k, length)
@@ -227,22 +236,25 @@ class LeRobotTarget:
         start: int,
         parts: Mapping[str, Sequence[Path]],
         tallies: Mapping[str, MapCounts],
+        policy: Mapping[str, PolicyColumnWriter],
         tasks: list[str],
     ) -> Iterator[Any]:
         """Rows of an episode with the added columns, as Arrow tables of few rows."""
         rows_by_camera = {key: PeekableRows(iter_rows(files)) for key, files in parts.items()}
         if self.origin is None:
-            yield from self._recording_rows(k, start, rows_by_camera, tallies)
+            yield from self._recording_rows(k, start, rows_by_camera, tallies, policy)
             return
         done = 0
         for part in self.origin.batches(k, tasks):
             table, n = self._unpack_images(part), part.num_rows
             numbers = part.column("frame_index").to_pylist()
+            times = part.column("timestamp").to_pylist() if "timestamp" in part.column_names else self._times(numbers)
             for key, rows in rows_by_camera.items():
                 camera_rows = [rows.take(i) for i in numbers]
                 for row in camera_rows:
                     tallies[key].add(row)
-                for column, values in self._cells(key, camera_rows, done).items():
+                cells = {**self._cells(key, camera_rows, done), **policy[key].add(camera_rows, times)}
+                for column, values in cells.items():
                     table = table.append_column(column, values)
             yield self._renumber(table, k, start + done)
             done += n
@@ -257,7 +269,12 @@ class LeRobotTarget:
         return table
 
     def _recording_rows(
-        self, k: int, start: int, rows_by_camera: Mapping[str, PeekableRows], tallies: Mapping[str, MapCounts]
+        self,
+        k: int,
+        start: int,
+        rows_by_camera: Mapping[str, PeekableRows],
+        tallies: Mapping[str, MapCounts],
+        policy: Mapping[str, PolicyColumnWriter],
     ) -> Iterator[Any]:
         """Rows of an episode from recordings, without instants that have an unreadable frame."""
         pyarrow = import_optional("pyarrow", extra="scale")
@@ -287,7 +304,11 @@ class LeRobotTarget:
                 pictures = [
                     {"bytes": row["picture"], "path": f"frame-{i:06d}.png"} for row, i in zip(rows, index, strict=True)
                 ]
-                cells = {key: pyarrow.array(pictures), **self._cells(key, rows, done)}
+                cells = {
+                    key: pyarrow.array(pictures),
+                    **self._cells(key, rows, done),
+                    **policy[key].add(rows, self._times(index)),
+                }
                 for column, values in cells.items():
                     table = table.append_column(column, values)
             yield table
@@ -299,6 +320,8 @@ class LeRobotTarget:
         blanks, cells = blank_maps(self.views[key]), {}
         values: list[Any]
         for kind, column in self.keys[key].items():
+            if kind in POLICY_COLUMNS:
+                continue  # of PolicyColumnWriter
             if kind in blanks:
                 suffix = MAP_FILES[kind].enrich
                 files = [row[kind] if row is not None and row["depth"] else blanks[kind] for row in camera_rows]
@@ -366,6 +389,31 @@ class LeRobotTarget:
         packed = {name: each.pack() for name, each in ranges.items()}
         return summary | {"moments": {name: each.pack() for name, each in moments.items()}, "ranges": packed}
 
+    @contextmanager
+    def _open_policy_columns(self, k: int, key: str) -> Iterator[PolicyColumnWriter]:
+        """Writer of the policy columns of a camera in episode ``k``; its video is complete at the end."""
+        view, keys = self.views[key], {kind: self.keys[key][kind] for kind in POLICY_COLUMNS if kind in self.keys[key]}
+        if "geometry_image" not in keys:
+            yield PolicyColumnWriter(keys, view, None)
+            return
+        clip = self._new_clip(k, 0)
+        path = self.root / lerobot.episode_video_path(self.version, keys["geometry_image"], clip, k)
+        with open_lossless_video(path, view.hw, self.fps) as append:
+            yield PolicyColumnWriter(keys, view, append)
+
+    def _times(self, numbers: Sequence[int] | np.ndarray) -> list[float]:
+        """Frame numbers of an episode -> times in s by the frame rate."""
+        return [float(i / self.fps) for i in numbers]
+
+    def _new_clip(self, k: int, length: int) -> lerobot.VideoSegment:
+        """Segment of a video that is written for the ``k``-th episode alone."""
+        return lerobot.VideoSegment(*divmod(k, lerobot.FILES_PER_CHUNK), 0.0, length / self.fps)
+
+    def _geometry_videos(self) -> dict[str, str]:
+        """Name of the camera → feature of its geometry images."""
+        kind = "geometry_image"
+        return {f"{view.name}_{kind}": self.keys[key][kind] for key, view in self.views.items() if kind in self.maps}
+
     def _copy_videos(self, k: int, length: int) -> None:
         """Copy the videos of an episode unchanged."""
         for key, (file, clip) in self._clips(k, length).items():
@@ -386,7 +434,13 @@ class LeRobotTarget:
     def planned_files(self, missing: Sequence[int]) -> list[Path]:
         """As :meth:`DatasetTarget.planned_files`."""
         names = (*lerobot.META_FILES[self.version], "source_episodes.jsonl", "source_features.json", "intrinsics.json")
-        return [*(self.file(k) for k in missing), *(self.root / "meta" / name for name in names)]
+        videos = [
+            self.root / lerobot.episode_video_path(self.version, key, self._new_clip(k, 0), k)
+            for key in self._geometry_videos().values()
+            for k in missing
+        ]
+        files = [*(self.file(k) for k in missing), *videos, *(self.root / "meta" / name for name in names)]
+        return [*files, self.root / policy_columns.MODALITY_FILE] if videos else files
 
     def finish(self, owns: Sequence[Row]) -> None:
         """As :meth:`DatasetTarget.finish`."""
@@ -400,13 +454,19 @@ class LeRobotTarget:
         tasks = self._tasks(owns)
         for name, file in ({} if self.origin is None else self.origin.more).items():
             storage.copy_file(file, self.root / (SOURCE_CARD if name == "README.md" else name))
+        if videos := self._geometry_videos():
+            modality = policy_columns.make_modality(self.root, features, videos)
+            storage.write_json(self.root / policy_columns.MODALITY_FILE, modality)
         episodes = [
             lerobot.EpisodeSpec(
                 number=k,
                 length=summary["length"],
                 start=summary["start"],
                 tasks=summary["tasks"],
-                videos={key: clip for key, (_, clip) in self._clips(k, summary["length"]).items()},
+                videos={
+                    **{key: clip for key, (_, clip) in self._clips(k, summary["length"]).items()},
+                    **{key: self._new_clip(k, summary["length"]) for key in self._geometry_videos().values()},
+                },
                 stats=self._stats([summary], features) if self.version == 2 else {},
             )
             for k, summary in enumerate(owns)

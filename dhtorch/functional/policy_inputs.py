@@ -173,5 +173,6 @@ def point_cloud(
 
 def _pixel_order(h: int, w: int, device: torch.device) -> Tensor:
     """Indices (h · w,) of the pixels in an order whose first ones cover the picture evenly."""
-    v, u = torch.arange(h, device=device)[:, None], torch.arange(w, device=device)
+    v = torch.arange(h, device=device)[:, None]
+    u = torch.arange(w, device=device)
     return ((v * _ROW_STEP + u * _COLUMN_STEP) % 2**32).reshape(-1).argsort(stable=True)

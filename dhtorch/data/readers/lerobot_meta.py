@@ -209,9 +209,8 @@ def select_colour_keys(meta: LeRobotMeta, requested: str | Sequence[str] | None 
         FormatError: no colour feature, or an unknown key.
     """
     pictures = [key for key, f in meta.features.items() if f.dtype in ("video", "image") and not f.is_depth]
-    colour = [
-        key for key in pictures if "codes" not in meta.features[key].info
-    ]  # without maps of codes, which we write
+    ours = {"codes", "geometry_image"}  # pictures that are maps of codes, which dhtorch writes
+    colour = [key for key in pictures if not ours & meta.features[key].info.keys()]
     keys = colour if requested is None else [requested] if isinstance(requested, str) else list(requested)
     unknown = [key for key in keys if key not in colour]
     if unknown or not keys:

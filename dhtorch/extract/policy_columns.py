@@ -1,0 +1,144 @@
+"""Columns of an enriched LeRobot set for policies that take pictures or points: geometry images and point clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from dhtorch.data.io import decode as files
+from dhtorch.data.io.decode import FormatError
+from dhtorch.export import lerobot
+from dhtorch.export.lerobot import FeatureMoments, FeatureSpec
+from dhtorch.export.video import LOSSLESS_CODEC, LOSSLESS_PIXELS, AppendFrame
+from dhtorch.extract.enriched import DatasetCamera, decode_map
+from dhtorch.extract.targets import Row
+from dhtorch.functional import policy_inputs
+from dhtorch.geometry import camera as cam
+
+#: Columns that are computed from the maps of a frame, by name in ``columns=``.
+POLICY_COLUMNS: Final[tuple[str, ...]] = ("geometry_image", "point_cloud")
+
+#: Points of a cloud. Source: the number that 3D Diffusion Policy (DP3) takes from a camera.
+N_POINTS: Final = 1024
+
+#: Description file of GR00T, below the data set.
+MODALITY_FILE: Final = "meta/modality.json"
+
+
+def geometry_feature(hw: tuple[int, int], fps: float) -> FeatureSpec:
+    """LeRobot feature of a video of geometry images; its info has the decoding of the three bytes."""
+    last, near, low = 255, policy_inputs.NEAREST_M, policy_inputs.LOWEST_RATIO
+    decoding = {
+        "depth_m": f"{last * near:g} / channel_0",
+        "sigma_m": f"depth_m * {low:g} ** (1 - (channel_1 - 1) / {last - 1}); unknown where channel_1 = 0",
+        "source": f"round(channel_2 / {policy_inputs.SOURCE_STEP}); 0 = no depth",
+        "function": "dhtorch.functional.decode_geometry_image",
+    }
+    video: dict[str, Any] = {
+        "video.height": hw[0],
+        "video.width": hw[1],
+        "video.codec": LOSSLESS_CODEC,
+        "video.pix_fmt": LOSSLESS_PIXELS,
+        "video.is_depth_map": False,
+        "video.fps": int(fps) if float(fps).is_integer() else fps,
+        "video.channels": 3,
+        "has_audio": False,
+    }
+    return {**lerobot.image_feature(hw, **video, geometry_image=decoding), "dtype": "video"}
+
+
+def cloud_feature() -> FeatureSpec:
+    """LeRobot feature of a point cloud."""
+    about = {"unit": "m", "axes": "camera of the picture: x right, y down, z forward", "no_depth": "all points 0"}
+    return {"dtype": "float32", "shape": [N_POINTS, 3], "names": ["point", "xyz"], "info": about}
+
+
+class PolicyColumnWriter:
+    """The policy columns of one camera in one episode: pictures go to a video, points into the table.
+
+    Args:
+        keys: kind → column name, see :data:`POLICY_COLUMNS`.
+        view: the camera.
+        append: writes a picture (h, w, 3) of the video at its time; None = without geometry images.
+    """
+
+    def __init__(self, keys: Mapping[str, str], view: DatasetCamera, append: AppendFrame | None) -> None:
+        self.keys, self.view, self.append = keys, view, append
+        self.moments: dict[str, FeatureMoments] = {}
+
+    def add(self, rows: Sequence[Row | None], times: Sequence[float]) -> dict[str, Any]:
+        """Next rows (None = unreadable) at their times in s -> column → Arrow array; the video gets their pictures."""
+        clouds = []
+        for row, time in zip(rows, times, strict=True):
+            maps = (
+                None
+                if row is None or not row["depth"]
+                else {name: decode_map(row[name], name, self.view.map_hw) for name in ("depth", "sigma", "source")}
+            )
+            if self.append is not None:
+                picture = encode_geometry(maps, self.view)
+                self.append(picture, time)
+                self._count(self.keys["geometry_image"], picture.reshape(-1, 3) / 255)
+            if "point_cloud" in self.keys:
+                points = np.zeros((N_POINTS, 3), np.float32)
+                if maps is not None and row is not None and maps["depth"].any():
+                    points = sample_cloud(maps["depth"], row["K"], self.view)
+                    self._count(self.keys["point_cloud"], points)
+                clouds.append(points)
+        return {self.keys["point_cloud"]: lerobot.nested_lists(np.stack(clouds))} if clouds else {}
+
+    def _count(self, column: str, values: np.ndarray) -> None:
+        here = FeatureMoments.of(values)
+        self.moments[column] = self.moments[column] + here if column in self.moments else here
+
+
+def encode_geometry(maps: Mapping[str, np.ndarray] | None, view: DatasetCamera) -> np.ndarray:
+    """Maps of a frame (None = unreadable) -> geometry image (h, w, 3) of the picture's size, by nearest pixels."""
+    if maps is None:
+        return np.zeros((*view.hw, 3), np.uint8)
+    image = policy_inputs.geometry_image(*(torch.from_numpy(maps[name]) for name in ("depth", "sigma", "source")))
+    v, u = ((2 * np.arange(n) + 1) * m // (2 * n) for n, m in zip(view.hw, view.map_hw, strict=True))
+    return image.permute(1, 2, 0).numpy()[v[:, None], u]
+
+
+def sample_cloud(depth: np.ndarray, K: Sequence[float], view: DatasetCamera) -> np.ndarray:
+    """Depth map (h, w) m and K of the picture by rows -> points (N_POINTS, 3) float32 m in the camera."""
+    lens = torch.tensor(view.lens, dtype=torch.float64) if view.lens else None
+    camera = cam.from_matrix(torch.tensor(K, dtype=torch.float64).view(1, 3, 3))
+    K_map = cam.to_matrix(cam.resize(camera, view.hw, view.map_hw))[0]
+    points = policy_inputs.point_cloud(torch.from_numpy(depth).double(), K_map, n=N_POINTS, distortion=lens)
+    return points.float().numpy()
+
+
+def make_modality(root: Path, features: Mapping[str, FeatureSpec], videos: Mapping[str, str]) -> dict[str, Any]:
+    """Contents of GR00T's ``modality.json``: the source's with further videos, or of the features where it has none.
+
+    Args:
+        root: of the new data set, with the copy of the source's file.
+        features: of the new data set.
+        videos: name → video feature, to be added.
+
+    Raises:
+        FormatError: a file that is not an object of objects.
+    """
+    path = root / MODALITY_FILE
+    modality = files.read_json(path) if path.is_file() else _default_modality(features)
+    if not isinstance(modality, dict) or not isinstance(modality.get("video", {}), dict):
+        raise FormatError(path, "video", "no object", "names of videos, each with original_key")
+    added = {name: {"original_key": key} for name, key in videos.items()}
+    return {**modality, "video": {**modality.get("video", {}), **added}}
+
+
+def _default_modality(features: Mapping[str, FeatureSpec]) -> dict[str, Any]:
+    """State and action as one part each, and every video by its name."""
+    modality: dict[str, Any] = {}
+    for part, key in (("state", "observation.state"), ("action", "action")):
+        if key in features:
+            modality[part] = {part: {"start": 0, "end": int(np.prod(features[key]["shape"]))}}
+    videos = (key for key, feature in features.items() if feature["dtype"] == "video")
+    modality["video"] = {key.removeprefix("observation.images."): {"original_key": key} for key in videos}
+    return {**modality, "annotation": {"human.action.task_description": {"original_key": "task_index"}}}
