@@ -6,11 +6,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from dhtorch.data.io.decode import import_optional
 from dhtorch.runtime import storage
 
 #: Encoder and its options: no quantisation and no colour conversion; every second frame is a key frame, as in LeRobot's
@@ -37,7 +36,8 @@ def open_lossless_video(path: Path, hw: tuple[int, int], fps: float) -> Iterator
     Raises:
         ImportError: PyAV is not installed.
     """
-    av: Any = import_optional("av")
+    import av  # noqa: PLC0415
+
     rate = Fraction(fps).limit_denominator(_MAX_RATE_DENOMINATOR)
     with storage.write_atomically(path) as sink, av.open(sink, "w", format="mp4") as container:
         stream = container.add_stream(_ENCODER, rate=rate, options=dict(_OPTIONS))

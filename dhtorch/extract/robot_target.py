@@ -92,6 +92,8 @@ class LeRobotTarget:
         self.tasks = origin.tasks if origin is not None else (task or _DEFAULT_TASK,)
         self.key, self.n, self.cut = key, n, cut
         self.maps, self.as_images = tuple(maps), as_images
+        if "geometry_image" in self.maps:
+            import_optional("av")
         self.source_features: dict[str, FeatureSpec] = {} if origin is None else origin.features
         self.unlisted = [] if as_images else pixel_columns.find_one_channel(self.source_features, "video", views)
         self.pixels = {} if origin is None or as_images else self._pixel_features(origin)
