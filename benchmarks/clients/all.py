@@ -54,6 +54,12 @@ SOURCES: dict[str, tuple[str, ...]] = {
 #: Target → what ``format=`` is told.
 TARGETS = {"lerobot v3.0": "lerobot", "lerobot v2.1": "v2.1", "nerfstudio": "nerfstudio"}
 
+#: Columns for policies of pictures or points, which some sets are written with once more.
+POLICY_COLUMNS = "columns=[depth,sigma,source,geometry_image,point_cloud]"
+
+#: Sources of such sets.
+POLICY_SOURCES = ("two-camera robot", "GR00T, LeRobot v2.0")
+
 #: Loader that needs only torch, or a package → the script of one training step.
 STEPS = {
     "torch": "torch_loader.py",
@@ -102,10 +108,13 @@ def versions(python: str) -> dict[str, str]:
     return call(python, "-c", code)[0] or {}
 
 
-def enriched(source: str, target: str, work: Path) -> tuple[Path, str]:
-    """The folder of one source in one format, and why there is none; what is there already is not made again."""
+def enriched(source: str, target: str, work: Path, *more: str) -> tuple[Path, str]:
+    """The folder of one source in one format, and why there is none; what is there already is not made again.
+
+    With ``more`` options the set has a folder of its own.
+    """
     _, *options = SOURCES[source]
-    out = work / f"{source.replace(',', '').replace(' ', '-')}-{TARGETS[target]}"
+    out = work / f"{source.replace(',', '').replace(' ', '-')}-{TARGETS[target]}{'-policy' if more else ''}"
     words = [
         "-m",
         "dhtorch",
@@ -115,6 +124,7 @@ def enriched(source: str, target: str, work: Path) -> tuple[Path, str]:
         f"format={TARGETS[target]}",
         *QUICK,
         *options,
+        *more,
     ]
     result, why = call(sys.executable, *words)
     return out, "" if result is not None else why
@@ -177,6 +187,26 @@ def rows(source: str, offered: Mapping[str, Sequence[Loader]], work: Path) -> li
     return rows
 
 
+def policy_rows(source: str, known: Mapping[str, Mapping[str, str]], work: Path) -> list[dict[str, Any]]:
+    """A set with geometry images and points: in openpi's transforms, and by GR00T's ``modality.json``."""
+    having = next((p for p, has in known.items() if "openpi_client" in has), None)
+    version = "" if having is None else f" {known[having]['openpi_client']}"
+    openpi = f"openpi_client{version}", having, None, "openpi_transforms.py"
+    groot: Loader = "modality.json by its fields", sys.executable, "groot_modality.py", None
+    rows = []
+    for target in ("lerobot v3.0", "lerobot v2.1"):
+        root, why = enriched(source, target, work, POLICY_COLUMNS)
+        for loader, python, compare, train in (openpi, groot):
+            row = {"source": f"{source}, pictures and points", "data": SOURCES[source][0]}
+            row |= {"options": [*SOURCES[source][1:], POLICY_COLUMNS], "target": target, "loader": loader}
+            row |= {"opened": False, "compared": None, "step": None, "why": why or ("" if python else "not installed")}
+            if python and not why:
+                row |= run_loaders(python, compare, train, root, root)
+            rows.append(row)
+    print(*map(json.dumps, rows), sep="\n", flush=True)
+    return rows
+
+
 def own_depth(known: Mapping[str, Mapping[str, str]], work: Path) -> list[dict[str, Any]]:
     """Depth that LeRobot wrote, as LeRobot and as dhtorch read it; versions before 0.6 know none."""
     rows = []
@@ -207,6 +237,21 @@ def run_loaders(python: str, compare: str | None, train: str | None, root: Path,
             step, why = Served.of(python).request(train, str(root), *more)
         record |= {"opened": record.get("opened", False) or step is not None, "step": step, "why": why}
     return record
+
+
+def keep(table: list[dict[str, Any]], file: Path | None) -> list[dict[str, Any]]:
+    """Write the rows made so far, before those of earlier runs that none of them replaces."""
+    if file is not None:
+        before = json.loads(file.read_text()) if file.is_file() else []
+        made = {_subject(row) for row in table}
+        file.write_text(json.dumps([*table, *(row for row in before if _subject(row) not in made)], indent=1) + "\n")
+    return table
+
+
+def _subject(row: dict[str, Any]) -> tuple[str, str, str]:
+    """Source, target and loader of a row; of LeRobot, whose formats differ, with its version."""
+    loader = str(row["loader"])
+    return row["source"], row["target"], loader if loader.startswith("lerobot") else loader.split(" ")[0]
 
 
 class Served:
@@ -254,7 +299,7 @@ def main() -> int:
     parser.add_argument("--source", action="append", choices=SOURCES, help="only this one")
     parser.add_argument("--work", type=Path, help="folder of the sets, which are kept; a temporary one")
     parser.add_argument("--at-once", type=int, default=1, metavar="N", help="sources")
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="rows that are not run now stay as they are in it")
     args = parser.parse_args()
     named = [python for python in os.environ.get("DHTORCH_CLIENTS", "").split(":") if python]
     pythons = dict.fromkeys([*args.lerobot, *args.webdataset, *args.openpi, *args.nerfstudio, *named, sys.executable])
@@ -262,10 +307,12 @@ def main() -> int:
     offered = {target: list(loaders(target, known)) for target in TARGETS}
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(args.at_once) as pool:
         of = partial(rows, offered=offered, work=args.work or Path(folder))
-        table = [row for some in pool.map(of, args.source or list(SOURCES)) for row in some]
-        table += own_depth(known, args.work or Path(folder))
-    if args.json:
-        args.json.write_text(json.dumps(table, indent=1) + "\n")
+        table = []
+        for some in pool.map(of, args.source or list(SOURCES)):
+            table = keep(table + some, args.json)
+        for source in (source for source in POLICY_SOURCES if source in (args.source or SOURCES)):
+            table = keep(table + policy_rows(source, known, args.work or Path(folder)), args.json)
+        keep(table + own_depth(known, args.work or Path(folder)), args.json)
     return 0
 
 

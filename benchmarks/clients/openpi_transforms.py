@@ -1,21 +1,26 @@
 """In openpi's manner: dict → dict transforms of NumPy leaves one after the other, then every leaf stacked.
 
-openpi itself is no package of an index; pictures become its size by what its client installs, ``openpi_client``.
+openpi itself is no package of an index; pictures become its size by what its client installs, ``openpi_client``. A
+geometry image, where the set has one, takes a second place of a camera; its codes are not blended by the resizing.
 
 In an environment that has openpi-client and dhtorch:  python benchmarks/clients/openpi_transforms.py DST
 """
 
 import json
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from columns import columns
 from openpi_client import image_tools
+from PIL import Image
 from torch_loader import Rows
 
 from dhtorch import ExtendDepth
+from dhtorch.data.codecs.video import read_video_frame
+from dhtorch.functional import decode_geometry_image
 from dhtorch.transforms import NumpyTransform
 
 GAP, SIDE = 2, 224  # frames; px
@@ -26,6 +31,9 @@ def policy_inputs(data: dict[str, Any]) -> dict[str, Any]:
     """What the model takes: pictures by their name there, and the depth tokens beside them."""
     picture = image_tools.resize_with_pad(image_tools.convert_to_uint8(data["observation/image"]), SIDE, SIDE)
     images = {"image": {"base_0_rgb": picture}, "image_mask": {"base_0_rgb": np.True_}}
+    if "observation/geometry" in data:
+        geometry = image_tools.resize_with_pad(data["observation/geometry"], SIDE, SIDE, method=Image.NEAREST)
+        images["image"]["left_wrist_0_rgb"], images["image_mask"]["left_wrist_0_rgb"] = geometry, np.True_
     tokens = {"depth_tokens": data["dhtorch.tokens"], "depth_mask": data["dhtorch.tokens_valid"]}
     return {**images, **tokens, "actions": np.asarray(data["actions"], np.float32), "prompt": data["prompt"]}
 
@@ -43,6 +51,10 @@ def main(root: str) -> None:
     def repacked(i: int) -> dict[str, Any]:
         out = {KEYS[name]: rows[i][keys[name]] for name in ("image", "depth", "intrinsics")}
         out[KEYS["other_image"]] = rows[i - GAP][keys["image"]]
+        geometry = sorted(Path(root).glob(f"videos/**/{keys['image']}_geometry_image/**/*.mp4"))
+        if geometry:  # a file for each episode, from its first frame
+            file = geometry[rows[i]["episode_index"]]
+            out["observation/geometry"] = read_video_frame(file, rows[i]["frame_index"])
         return {**out, "actions": rows[i][spec["target"]], "prompt": "look around"}
 
     extend = NumpyTransform(ExtendDepth(**KEYS, depth_unit=keys["depth_unit"], n=256, tokens_hw=(56, 56)))
@@ -50,10 +62,18 @@ def main(root: str) -> None:
     tokens, target = torch.from_numpy(batch["depth_tokens"]), torch.from_numpy(batch["actions"])
     head = torch.nn.Linear(tokens[0].numel(), target.shape[1])
     assert batch["image"]["base_0_rgb"].shape == (2, SIDE, SIDE, 3)
+    geometry = batch["image"].get("left_wrist_0_rgb")
     loss = (head(tokens.flatten(1)) - target).square().mean()
     loss.backward()
     torch.optim.SGD(head.parameters(), 1e-3).step()
     result = {"frames": len(rows), "target": spec["target"], "loss": float(loss.detach())}
+    if geometry is not None:  # every code is one of the stored ones
+        stored = torch.from_numpy(np.stack([repacked(i)["observation/geometry"] for i in (GAP, GAP + 1)]))
+        before, resized = (
+            decode_geometry_image(each.movedim(-1, 1)).depth for each in (stored, torch.from_numpy(geometry))
+        )
+        assert {*resized.unique().tolist()} <= {0.0, *before.unique().tolist()}
+        result["geometry_known"] = float((resized > 0).float().mean())
     print(json.dumps(result | {"tokens_known": int(batch["depth_mask"].sum())}))
 
 
