@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import beside_kornia
+import client_tables
 import fidelity
 import kornia_adapters
 import learning_tables
@@ -519,23 +520,6 @@ def caught() -> str:
     return table(["faults planted in", "caught", "change no answer"], cells)
 
 
-def clients() -> str:
-    """Which loader opened which enriched set, what differed, and whether a training step was taken."""
-    rows = []
-    for row in json.loads((RESULTS / "clients.json").read_text()):
-        off = (row["compared"] or {}).get("largest_difference", {})
-        compared = ", ".join(
-            f"{name} {off[name]:.1g}" for name in ("depth", "depth in video", "sigma", "numbers") if name in off
-        )
-        took = row["step"]
-        step = "–" if took is None else f"{took['target'].rpartition('.')[2]}, {took['tokens_known']}"
-        cells = [row["source"], row["target"], row["loader"], "yes" if row["opened"] else "no", compared or "–", step]
-        rows.append([*cells, row["why"].replace("|", "/")])
-    return table(
-        ["source", "target", "loader", "opened", "compared", "one step: predicts, tokens with depth", "why not"], rows
-    )
-
-
 def lerobot_trained() -> str:
     """Commands of LeRobot by set and version: passed, failed and why, or not run."""
     file = RESULTS / "lerobot_train.json"
@@ -611,7 +595,6 @@ TABLES |= {"chosen views": partial(chosen_views, "method_comparison", "streams")
 TABLES |= {
     "validate": validated,
     "validate real": validated_real,
-    "clients": clients,
     "lerobot train": lerobot_trained,
     "align": partial(
         aligned,
@@ -624,7 +607,7 @@ TABLES |= {"pixels by scene": partial(pixels_by_scene, "dense")}
 TABLES |= (
     {"speed": speed_tables.stages, "mutants": caught} | speed_tables.TABLES | beside_kornia.TABLES | pose_tables.TABLES
 )
-TABLES |= kornia_adapters.TABLES | learning_tables.TABLES | reader_tables.TABLES
+TABLES |= kornia_adapters.TABLES | learning_tables.TABLES | reader_tables.TABLES | client_tables.TABLES
 TABLES |= {
     "how good": how_good,
     "sweep": swept,

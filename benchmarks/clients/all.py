@@ -251,7 +251,7 @@ def keep(table: list[dict[str, Any]], file: Path | None) -> list[dict[str, Any]]
 def _subject(row: dict[str, Any]) -> tuple[str, str, str]:
     """Source, target and loader of a row; of LeRobot, whose formats differ, with its version."""
     loader = str(row["loader"])
-    return row["source"], row["target"], loader if loader.startswith("lerobot") else loader.split(" ")[0]
+    return row["source"], row["target"], loader if loader.startswith("lerobot") else loader.partition(" ")[0]
 
 
 class Served:

@@ -17,7 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from all import SOURCES, call, enriched, environment, short, versions
+from all import POLICY_COLUMNS, SOURCES, call, enriched, environment, short, versions
 
 #: Versions of LeRobot: the last that runs on Python 3.11, and the newest, which needs 3.12.
 VERSIONS = ("0.4.4", "0.6.1")
@@ -34,7 +34,12 @@ SETS = {
     "two-camera robot": "depth, two cameras",
     "GR00T, LeRobot v2.0": "no depth anywhere",
     "RLDS": "no depth anywhere, four cameras of which one is enriched",
+    "two-camera robot, pictures and points": "geometry images and points of two cameras",
+    "GR00T, LeRobot v2.0, pictures and points": "geometry images and points without any depth",
 }
+
+#: End of the name of a set that is another one with columns for policies of pictures or points.
+POLICY = ", pictures and points"
 
 #: Name of the example in README, which is run as it stands.
 EXAMPLE = "README"
@@ -92,14 +97,17 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         for name, version in ((name, version) for name in (*SETS, EXAMPLE) for version in VERSIONS):
             python = known.get(version) if name in (args.set or (*SETS, EXAMPLE)) else None
+            source, more = name.removesuffix(POLICY), [POLICY_COLUMNS] if name.endswith(POLICY) else []
             root, why = (
-                enriched(name, "lerobot v3.0", args.work or Path(folder)) if python and name in SETS else (None, "")
+                enriched(source, "lerobot v3.0", args.work or Path(folder), *more)
+                if python and name in SETS
+                else (None, "")
             )
             if why:
                 sys.exit(f"{name}: {why}")
             for command in POLICIES if name in SETS else ("the example",):
                 row = {"set": name, "about": SETS.get(name, "a loader with depth tokens"), "command": command}
-                row |= {"options": SOURCES[name][1:] if name in SETS else [], "lerobot": version}
+                row |= {"options": [*SOURCES[source][1:], *more] if name in SETS else [], "lerobot": version}
                 if python is None:
                     none = {**row, "passed": None, "loss": None, "why": "not run"}
                     rows.append(kept.get((name, command, version), none))
