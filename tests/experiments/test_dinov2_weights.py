@@ -99,6 +99,20 @@ def test_an_official_file_is_the_network_that_it_describes(tmp_path, picture, op
     torch.testing.assert_close(features[0, WIDTH:].view(WIDTH, 2, 2)[:, 0, 0], corner, atol=2e-5, rtol=1e-4)
 
 
+def test_no_progress_bar_of_transformers_is_drawn_and_its_switch_stays(tmp_path, capfd):
+    logging = pytest.importorskip("transformers").utils.logging
+    torch.save(official(), tmp_path / "dinov2_vitx14_pretrain.pth")
+    had_bar = logging.is_progress_bar_enabled()
+    logging.enable_progress_bar()
+    try:
+        dinov2.load_dinov2(tmp_path / "dinov2_vitx14_pretrain.pth")
+        assert logging.is_progress_bar_enabled()
+    finally:
+        if not had_bar:
+            logging.disable_progress_bar()
+    assert capfd.readouterr() == ("", "")
+
+
 def test_other_layouts_of_the_same_parameters(tmp_path, picture):
     pytest.importorskip("transformers")
     from safetensors.torch import save_file  # noqa: PLC0415
