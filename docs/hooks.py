@@ -33,13 +33,10 @@ from docstrings import markdown as as_markdown  # noqa: E402
 
 import dhtorch  # noqa: E402
 from dhtorch import codes as code_tables  # noqa: E402
-from dhtorch.cli import run  # noqa: E402
+from dhtorch.cli import commands, run  # noqa: E402
 from dhtorch.codes import CodeTable, Gate, Hole, Source, names, words  # noqa: E402
 from dhtorch.transforms import schema  # noqa: E402
 from dhtorch.viz.plots import colours as palette  # noqa: E402
-
-#: Words of the command with a help text of their own.
-WORDS = ("", "inspect", "report", "complete", "align", "validate", "extract", "integrate", "stream", "view")
 
 _MARK = re.compile(r"^<!-- .*? -->\n", re.M)
 _QUESTION = re.compile(
@@ -351,7 +348,8 @@ def archived() -> dict[str, dict[str, Any]]:
 
 def helps() -> str:
     """Every help text of the command, as a terminal shows it."""
-    names = {word: f"dhtorch {word}".strip() for word in WORDS}
+    names = {"": "dhtorch"} | {name: each.words or f"dhtorch {name}" for name, each in commands.COMMANDS.items()}
+    names["recover"] = "dhtorch PATH"
     return "\n\n".join(f"## {name}\n\n```text\n{help_of(word)}\n```" for word, name in names.items())
 
 

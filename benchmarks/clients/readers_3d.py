@@ -43,7 +43,7 @@ def commands(source: str | None, out: Path) -> dict[str, list[str]]:
     made = {
         "integrate": ["integrate", *data, "cutoff=2.0", f"output={out / 'map'}", *SMALL],
         "enrich": ["enrich", *data, *enrich],
-        "view": ["view", *data, "most=2", f"save={out / 'view.rrd'}", "method.n=512"],
+        "view": ["view", *data, "max_frames=2", f"save={out / 'view.rrd'}", "method.n=512"],
     }
     if source is not None:
         made["recover"] = [source, f"out={out / 'recover'}", "minutes=0.25", "size=160", "planes=32"]

@@ -19,8 +19,8 @@ TESTS: dict[str, list[str]] = {
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
     "extract.cut": [
-        ("truncate_scenes", "scenes if frames is None else", "scenes if frames else"),
-        ("truncate_recording", "recording.number[:frames]", "recording.number"),
+        ("subsample_scenes", "scenes if every == 1 and max_frames is None else", "scenes if every == 1 else"),
+        ("subsample_recording", "recording.number[part]", "recording.number"),
     ],
     "extract.enriched": [
         ("MAP_STEPS", "8", "4"),

@@ -148,7 +148,7 @@ def _make_alignment_task(
 ) -> CompletionTask:
     """The completion task of a recording: every frame that has a map."""
     recording = scene.recording
-    frames = maps.frames[:: settings["every"]][: settings["most"]]
+    frames = maps.frames[:: settings["every"]][: settings["max_frames"]]
     hw = recording[frames[0]].hw
     if 0 in hw:
         raise ValueError(f"{scene.name}: found frames without images, expected images (data.images=true)")
@@ -334,10 +334,10 @@ def _render_frame(task: CompletionTask, maps: DepthMaps, i: int) -> bytes:
 
 def _check_options(settings: Mapping[str, Any]) -> dict[str, float]:
     """Validate the options early; returns the limits of ``fail_on``."""
-    for name, low in (("every", 1), ("most", 1), ("pictures", 0)):
+    for name, low in (("every", 1), ("max_frames", 1), ("pictures", 0)):
         value = settings[name]
         is_whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
-        if not is_whole and not (name == "most" and value is None):
+        if not is_whole and not (name == "max_frames" and value is None):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
     for name, choices in (("dtype", ("float32", "float64")), ("kind", align.ALIGNMENT_KINDS)):
         if settings[name] not in choices:

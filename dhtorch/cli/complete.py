@@ -124,7 +124,7 @@ def make_completion_task(
     scene: Scene, folder: Path, method: Method, settings: Mapping[str, Any], digest: str, *, sized_as: int = 0
 ) -> CompletionTask:
     """The completion task of a scene; the image size is that of frame ``sized_as``."""
-    frames = range(0, len(scene.recording), settings["every"])[: settings["most"]]
+    frames = range(0, len(scene.recording), settings["every"])[: settings["max_frames"]]
     hw = scene.recording[sized_as].hw
     if 0 in hw:
         raise ValueError(f"{scene.name}: found frames without images, expected images (data.images=true)")
@@ -375,9 +375,9 @@ def _format_summary(task: CompletionTask, n_untouched: int) -> str:
 
 def _check_options(settings: Mapping[str, Any]) -> None:
     """Validate options that would otherwise fail late."""
-    for name in ("most", "every"):
+    for name in ("max_frames", "every"):
         value = settings[name]
-        if not (isinstance(value, int) and value >= 1) and not (name == "most" and value is None):
+        if not (isinstance(value, int) and value >= 1) and not (name == "max_frames" and value is None):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least 1")
     choices_of = {
         "format": ("auto", *FRAME_LAYOUTS),

@@ -163,7 +163,7 @@ def _write_missing_episodes(
 
 
 def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJob:
-    scenes, method = cut.truncate_scenes(scenes_of(parts["data"]), settings["frames"]), parts["method"]
+    scenes, method = _subsample(scenes_of(parts["data"]), settings), parts["method"]
     whole = plan.make_plan(scenes, settings["gap"], method.views, rigs=True)
     out = Path(str(settings["out"])).expanduser()
     for root in whole.roots:
@@ -205,6 +205,16 @@ def _plan_job(settings: Mapping[str, Any], parts: Mapping[str, Any]) -> EnrichJo
     )
 
 
+def _subsample(scenes: Sequence[Scene], settings: Mapping[str, Any]) -> Sequence[Scene]:
+    """The scenes with their wanted frames; raises ValueError for ``every`` with a data set, whose rows are all kept."""
+    if settings["every"] > 1 and scenes[0].recording.format in ("lerobot", "rlds"):
+        raise ValueError(
+            f"every: found {settings['every']} with a {scenes[0].recording.format} set, all of whose rows are kept; "
+            "expected 1 (max_frames=N limits them)"
+        )
+    return cut.subsample_scenes(scenes, settings["every"], settings["max_frames"])
+
+
 def _check_views(settings: Mapping[str, Any], first: Sequence[Scene], views: Mapping[str, DatasetCamera]) -> None:
     """Validate the cameras of an episode against the options; raises ValueError."""
     names = ", ".join(scene.name for scene in first)
@@ -241,10 +251,10 @@ def _open_origin(
     groups = _group_by_episode(whole)
     recording, numbers = scenes[whole.order[0]].recording, [whole.episodes[group[0]] for group in groups]
     if recording.format == "lerobot" and recording.root is not None:
-        return LeRobotSource.open(recording.root, numbers, limit=settings["frames"], bounds=recording.bounds)
+        return LeRobotSource.open(recording.root, numbers, limit=settings["max_frames"], bounds=recording.bounds)
     if recording.format == "rlds":
         each = cut.SelectedRecordings(scenes, tuple(whole.order[group[0]] for group in groups))
-        return RldsSource(each, numbers, settings["fps"] or frame_rate(recording), settings["frames"])
+        return RldsSource(each, numbers, settings["fps"] or frame_rate(recording), settings["max_frames"])
     return None
 
 
@@ -282,7 +292,7 @@ def _open_target(
         task=settings["task"],
         key=key,
         n=n,
-        cut=settings["frames"] is not None,
+        cut=settings["max_frames"] is not None,
     )
 
 
@@ -453,8 +463,10 @@ def _check_options(settings: Mapping[str, Any]) -> None:
         is_whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
         if not is_whole and not (name == "gap" and value == plan.AUTO_GAP):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
-    if settings["frames"] is not None and not (isinstance(settings["frames"], int) and settings["frames"] >= 1):
-        raise ValueError(f"frames: found {settings['frames']!r}, expected a whole number of at least 1, or null")
+    if settings["max_frames"] is not None and not (
+        isinstance(settings["max_frames"], int) and settings["max_frames"] >= 1
+    ):
+        raise ValueError(f"max_frames: found {settings['frames']!r}, expected a whole number of at least 1, or null")
     if settings["pose_sigma"] is not None and settings["pose"] == "near":
         raise ValueError(f"pose_sigma: found {settings['pose_sigma']} with pose=near, expected pose=device or start")
     poses.parse_pose_sigmas(settings["pose_sigma"], "pose_sigma")

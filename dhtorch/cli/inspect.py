@@ -83,12 +83,12 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("options", nargs="*", default=[], metavar="data.NAME=VALUE", help=options_help)
     parser.add_argument("--out", type=Path, help="folder of the contact sheet (default: outputs/<date>/<time>)")
     parser.add_argument("--format", default="auto", help="name of the format (default: recognised from the content)")
-    parser.add_argument("--frames", type=int, default=8, help="number of frames to decode and show (default: 8)")
+    parser.add_argument("--max-frames", type=int, default=8, help="number of frames to decode and show (default: 8)")
     parser.add_argument("--follow-links", action="store_true", help="follow links that lead out of the capture")
     parser.add_argument("--traceback", action="store_true", help="show the traceback of an error")
     options = parser.parse_intermixed_args(argv)
-    if options.frames < 1:
-        raise ValueError(f"--frames: found {options.frames}, expected at least 1")
+    if options.max_frames < 1:
+        raise ValueError(f"--max-frames: found {options.max_frames}, expected at least 1")
     is_auto = options.format == "auto"
     captures = (
         find_captures(options.path, options.follow_links)
@@ -100,7 +100,7 @@ def main(argv: Sequence[str]) -> int:
     now = datetime.now()
     out = options.out or Path("outputs") / f"{now:%Y-%m-%d}" / f"{now:%H-%M-%S-%f}"
     with open_output_folder(out, "--out"):
-        _survey_captures(captures, options.path, options.frames, out)
+        _survey_captures(captures, options.path, options.max_frames, out)
     return 0
 
 

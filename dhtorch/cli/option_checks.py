@@ -86,7 +86,7 @@ _OPTION_RULES: dict[str, _OptionRule] = {
     "min_maps": _whole_number(1),
     "mesh": _or_null(_TRUE_OR_FALSE),
     "dense": _DENSE_OPTIONS,
-    "most": _or_null(_whole_number(1)),
+    "max_frames": _or_null(_whole_number(1)),
     "every": _whole_number(1),
     "source_views": _whole_number(1),
     "planes": _whole_number(2),

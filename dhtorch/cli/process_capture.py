@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import math
+import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -58,13 +60,26 @@ _COMPLETE_DEFAULTS = {
     "arrays": False,
     "figures": False,
     "points": False,
-    "most": None,
+    "max_frames": None,
     "every": 1,
 }
 
 
+#: Frames whose returns determine the suggested cutoff. Source: origin not recorded; bounds the time of the summary.
+_CUTOFF_FRAMES = 8
+
+#: Suggested cutoff where no completed frame has a return, m. Source: origin not recorded.
+_DEFAULT_CUTOFF_M = 2.0
+
 #: Files written beside those of ``dhtorch complete``.
 _FURTHER_FILES = ("overview.png", "map.ply", "map.glb", "view.html")
+
+
+class FoundRecording(NamedTuple):
+    """A recording and the path at which it is opened."""
+
+    path: Path
+    recording: Recording
 
 
 class NothingToRecover(ValueError):
@@ -104,7 +119,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     ]
     out = _resolve_folder(path, settings["out"])
     recordings, refused = _open_captures(captures)
-    chosen = recordings[: settings["recordings"]]
+    chosen: Sequence[FoundRecording] = recordings[: settings["recordings"]]
     with open_output_folder(out, "out") if len(chosen) > 1 else contextlib.nullcontext():
         n_done = _process_recordings(chosen, out, settings, parts["method"], refused, progress)
     if n_done == 0:
@@ -117,7 +132,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
 
 
 def _process_recordings(
-    chosen: Sequence[Recording],
+    chosen: Sequence[FoundRecording],
     out: Path,
     settings: Mapping[str, Any],
     method: Method,
@@ -127,12 +142,12 @@ def _process_recordings(
     """Complete the recordings one by one and print their summaries -> their number; reasons of the others are added to
     ``refused``."""
     start, n_done = time.monotonic(), 0
-    for n, recording in enumerate(chosen):
+    for n, (path, recording) in enumerate(chosen):
         minutes = settings["minutes"]
         until = None if minutes is None else start + 60 * minutes * (n + 1) / len(chosen)
         folder = out if len(chosen) == 1 else out / recording.name
         try:
-            lines = _process_recording(recording, folder, settings, method, until, progress)
+            lines = _process_recording(recording, folder, {**settings, "path": path}, method, until, progress)
         except NothingToRecover as nothing:
             refused.append(str(nothing))
             continue
@@ -172,17 +187,17 @@ def _find_recording_captures(path: Path, format: str = "auto") -> list[FoundCapt
     raise NothingToRecover(f"{path}: {what}; sensor depth of near surfaces is required for metric scale (docs/data.md)")
 
 
-def _open_captures(captures: Sequence[FoundCapture]) -> tuple[list[Recording], list[str]]:
+def _open_captures(captures: Sequence[FoundCapture]) -> tuple[list[FoundRecording], list[str]]:
     """The recordings of several captures, and an error message for each capture that cannot be opened.
 
     Raises:
         NothingToRecover, FormatError: the only capture cannot be opened.
     """
-    recordings: list[Recording] = []
+    recordings: list[FoundRecording] = []
     refused: list[str] = []
     for capture in captures:
         try:
-            recordings += _open_capture(capture)
+            recordings += [FoundRecording(capture.path, recording) for recording in _open_capture(capture)]
         except (NothingToRecover, FormatError) as error:
             if len(captures) == 1:
                 raise
@@ -276,7 +291,8 @@ def _process_recording(
     """Complete one recording and write all its files -> the printed lines."""
     reader_options = {"path": str(settings["path"]), "format": recording.format}
     reader_options |= {name: value for name, value in settings["data"].items() if value is not None}
-    complete_settings = {**_COMPLETE_DEFAULTS, **settings, "out": str(folder), "data": reader_options}
+    complete_settings = {**settings, **_COMPLETE_DEFAULTS, "out": str(folder), "data": reader_options}
+    complete_settings["reader_format"] = settings["format"]
     complete_settings["choices"] = {**settings["choices"], "data": recording.format}
     usable = _find_usable_frame(recording)
     check = check_capture(recording)
@@ -291,7 +307,8 @@ def _process_recording(
         completed.digest_scene_files(scene, complete_settings, folder),
         sized_as=usable,
     )
-    order = [i for i in coarse_to_fine(len(recording)) if i in task.offers]
+    order = [i for i in coarse_to_fine(len(recording)) if i in task.offers and i % settings["every"] == 0]
+    order = order[: settings["max_frames"]]
     task = replace(task, frames=order, offers={i: list(offered) for i, offered in task.offers.items()})
     with completed.open_task_folder(task, _FURTHER_FILES):
         return _recover_task(task, check, until, settings, progress)
@@ -440,17 +457,22 @@ def _format_next_step(recovered: RecoveredFrames, shown: str) -> str:
     """The printed next step; ``shown`` is the file to open."""
     n, name = len(recovered.broken), recovered.task.scene.name
     cause = next(iter(recovered.broken.values()), "")
-    broken = f" {format_count(n, 'frame')} of {name} could not be read ({cause})." if n else ""
+    broken = f"\n{format_count(n, 'frame')} of {name} could not be read ({cause})." if n else ""
     if recovered.left:
-        again = f"run the same command again for the {format_count(recovered.left, 'frame')} left (minutes=null: all)"
+        left = format_count(recovered.left, "frame")
+        again = f"run the same command again for the {left} left (--minutes null: all at once)"
         return f"Next: open {shown}; {again}.{broken}"
-    path = recovered.task.settings["path"]
-    options = {name: value for name, value in recovered.task.settings["data"].items() if name != "path"}
-    reader_options = {name: value for name, value in options.items() if value is not None}
-    reader_words = "".join(f" data.{name}={_format_value(value)}" for name, value in reader_options.items())
-    cutoff = _median_sensor_depth(recovered)
-    command = f"dhtorch run data=auto data.root={path}{reader_words} holdout.cutoff={cutoff:.2g}"
-    return f"Next: open {shown}; to measure the error on your capture: {command}.{broken}"
+    return f"Next: open {shown}; to measure the error on your capture: {_format_run_command(recovered)}{broken}"
+
+
+def _format_run_command(recovered: RecoveredFrames) -> str:
+    """The command that measures the error on a capture: the same reader options, a cutoff among its returns."""
+    settings = recovered.task.settings
+    reader = {name: value for name, value in settings["data"].items() if name not in ("path", "format")}
+    if settings["reader_format"] != "auto":
+        reader["format"] = settings["reader_format"]
+    words = [f"data.{name}={_format_value(value)}" for name, value in reader.items() if value is not None]
+    return shlex.join(["dhtorch", "run", str(settings["path"]), *words, "--cutoff", f"{_choose_cutoff(recovered):g}"])
 
 
 def _format_value(value: Any) -> str:
@@ -459,8 +481,15 @@ def _format_value(value: Any) -> str:
     return f"[{','.join(map(str, value))}]" if listed else str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _median_sensor_depth(recovered: RecoveredFrames) -> float:
-    """Median return depth of the first frame, m: the suggested cutoff beyond which returns are held out."""
-    maps, source = completed.read_completed_maps(recovered.task, recovered.frames[0])
-    near = maps["depth"][(source == Source.SENSOR) & (maps["depth"] > 0)]
-    return float(np.median(near)) if len(near) else 2.0
+def _choose_cutoff(recovered: RecoveredFrames) -> float:
+    """Median return depth over some frames, m, rounded up to two digits: half of the returns lie beyond it."""
+    task, medians = recovered.task, []
+    for i in recovered.frames[:_CUTOFF_FRAMES]:
+        maps, source = completed.read_completed_maps(task, i)
+        returns = maps["depth"][(source == Source.SENSOR) & (maps["depth"] > 0)]
+        medians += [float(np.median(returns))] if len(returns) else []
+    if not medians:
+        return _DEFAULT_CUTOFF_M
+    median = float(np.median(medians))
+    step = 10.0 ** (math.floor(math.log10(median)) - 1)
+    return math.ceil(median / step - 1e-9) * step

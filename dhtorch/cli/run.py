@@ -19,12 +19,12 @@ import shlex
 import sys
 import traceback
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import dhtorch
-from dhtorch.cli import errors, signals
+from dhtorch.cli import commands, errors, signals
 from dhtorch.cli import option_checks as words
 from dhtorch.cli import sweep_state as together
 from dhtorch.cli.option_checks import quote_value
@@ -33,7 +33,7 @@ from dhtorch.runtime.allocator import disable_malloc_trim
 from dhtorch.runtime.output_folder import OutputFolder, open_output_folder
 
 #: Sub-command → module with ``main(argv) -> int``.
-_COMMANDS = {"inspect": "dhtorch.cli.inspect", "report": "dhtorch.experiments.report"}
+_PARSED_COMMANDS = {"inspect": "dhtorch.cli.inspect", "report": "dhtorch.experiments.report"}
 
 #: Sub-command with its own settings ``conf/<name>.yaml`` → module with ``run(settings, parts, *, progress)`` -> exit
 #: code; ``settings`` are all options as plain values, ``parts`` the instantiated options that name a function.
@@ -51,14 +51,17 @@ _CONFIGURED_COMMANDS = {
 
 #: Sub-command → the options set by its positional arguments.
 _POSITIONAL_OPTIONS = {
-    "align": ("data.root",),
-    "complete": ("data.root",),
+    **dict.fromkeys(("align", "complete", "extract", "integrate", "run", "stream", "validate"), ("data.root",)),
     "enrich": ("data.root", "out"),
     "recover": ("path",),
-    "stream": ("data.root",),
-    "validate": ("data.root",),
     "view": ("result",),
 }
+
+#: Sub-commands whose recordings are subsampled by ``every`` and ``max_frames`` before they run → whether by the latter.
+_SUBSAMPLED_COMMANDS = {"extract": True, "integrate": True, "stream": True, "view": False}
+
+#: Sub-commands that compute in data-loader processes, on the CPU.
+_CPU_COMMANDS = ("enrich", "extract")
 
 EXIT_DONE, EXIT_SOME_FAILED, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_BROKEN_PIPE = 0, 1, 2, 130, 141
 EXIT_SIGHUP, EXIT_SIGTERM = 129, 143
@@ -80,7 +83,8 @@ _LOG = logging.getLogger("dhtorch.cli.run")
 _IMPLIED_CHOICES = {"pairs.gap": "pairs=gap", "pairs.seconds": "pairs=time", "pairs.metres": "pairs=baseline"}
 
 #: Hydra flags that print information and run no job.
-_HYDRA_INFO_FLAGS = {"-h", "--help", "--hydra-help", "-i", "--info", "-sc", "--shell-completion", "-c", "--cfg"}
+_HYDRA_INFO_FLAGS = {"--hydra-help", "-i", "--info", "-sc", "--shell-completion", "-c", "--cfg"}
+_HELP_FLAGS = {"-h", "--help", "--help-all"}
 _SWEEP_FLAGS = {"-m", "--multirun"}
 
 #: Final state of a job → printed text.
@@ -90,6 +94,9 @@ _JOB_STATES = {"finished": "finished", "untouched": "left untouched", "failed": 
 _RESUMED_FOLDER = Path("outputs/resumed")
 
 _SEPARATORS = "/\\"
+
+#: End of a word that is the name of a file.
+_FILE_END = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,4}$")
 
 #: Characters beyond which a folder name is cut and completed by a hash.
 _MAX_NAME_LENGTH = 120
@@ -125,25 +132,75 @@ def _run_guarded(argv: list[str]) -> int:
 
 
 def _dispatch(argv: list[str]) -> int:
-    if argv == ["--version"]:
-        print(f"dhtorch {dhtorch.__version__}")
+    if argv == ["--version"] or (len(argv) == 1 and argv[0] in _HELP_FLAGS):
+        print(f"dhtorch {dhtorch.__version__}" if argv[0] == "--version" else commands.format_overview(EXIT_CODES))
         return EXIT_DONE
-    if argv and argv[0] in _COMMANDS:
-        return int(importlib.import_module(_COMMANDS[argv[0]]).main(argv[1:]) or 0)
-    if argv[:1] == ["run"]:
-        argv = argv[1:]
-    elif _is_capture(argv):
-        argv = ["recover", *argv]
-    argv = _add_implied_choice(argv)
-    if argv and argv[0] in _CONFIGURED_COMMANDS:
-        return _run_configured(argv[0], argv[1:])
-    words.validate_words(argv, ["run", *_COMMANDS, *_CONFIGURED_COMMANDS])
-    return _run_hydra(argv)
+    named = bool(argv) and argv[0] in commands.COMMANDS
+    if not named and argv:
+        _reject_missing_path(argv[0])
+    name = argv[0] if named else "recover" if _is_capture(argv) else "run"
+    typed = argv[1:] if named else argv
+    if _HELP_FLAGS & set(typed):
+        return _show_help(name, [a for a in typed if a not in _HELP_FLAGS], everything="--help-all" in argv)
+    flags = _SWEEP_FLAGS | _HYDRA_INFO_FLAGS if name == "run" else _HYDRA_INFO_FLAGS
+    known = commands.list_options(name, config_dir())
+    argv = commands.to_overrides(name, typed, known, flags, console.suggest_name)
+    if name in _PARSED_COMMANDS:
+        parsed = commands.to_parser_arguments(argv, known)
+        return int(importlib.import_module(_PARSED_COMMANDS[name]).main(parsed) or 0)
+    if name == "run":
+        argv = _add_implied_choice(_name_positionals(name, argv) if named else argv)
+        words.validate_words(argv, ["PATH", *(each for each in commands.COMMANDS if each != "recover")])
+        return _run_hydra(argv)
+    return _run_demo(argv) if name == "demo" else _run_configured(name, _add_implied_choice(argv))
 
 
 def _is_capture(argv: Sequence[str]) -> bool:
     """Whether the first argument is an existing path and no sub-command."""
-    return bool(argv) and argv[0] not in _CONFIGURED_COMMANDS and argv[0][:1] not in "-~+" and Path(argv[0]).exists()
+    return bool(argv) and argv[0][:1] not in "-+" and Path(argv[0]).expanduser().exists()
+
+
+def _reject_missing_path(word: str) -> None:
+    """Raise an error for a first argument that looks like a path and does not exist."""
+    path = Path(word).expanduser()
+    looks_like_path = bool({*_SEPARATORS} & {*word}) or word.startswith("~") or bool(_FILE_END.search(word))
+    is_option = word.startswith(("-", "+", "hydra/")) or ("=" in word and not word.startswith((*_SEPARATORS, "~", ".")))
+    if is_option or path.exists():
+        return
+    near = console.suggest_path(path)
+    if looks_like_path or (near and not console.suggest_name(word, commands.COMMANDS)):
+        raise ValueError(f"{word}: no such file or folder{near}, expected a capture or a command (dhtorch --help)")
+
+
+def _show_help(name: str, argv: list[str], *, everything: bool) -> int:
+    """Print the help of a command; ``everything`` also lists the groups and the composed settings."""
+    print(commands.format_command_help(name, config_dir()))
+    if everything and name not in _PARSED_COMMANDS:
+        name = commands.COMMANDS[name].config or name
+        overrides = [a for a in argv if "=" in a]
+        print("\nGroups (choose with group=name):")
+        for folder in sorted(p for p in config_dir().iterdir() if p.is_dir()):
+            print(f"{folder.name}: {', '.join(sorted(p.stem for p in folder.glob('*.yaml')))}")
+        print("\nOptions (set with key=value), with their present values:\n")
+        _show_hydra_info(name, [*overrides, "--cfg", "job"])
+    return EXIT_DONE
+
+
+def _run_demo(argv: list[str]) -> int:
+    """Write the built-in room as a capture and process it as ``dhtorch PATH`` does."""
+    options = {"out": "dhtorch_out/demo", "browser": "true"}
+    options |= {k: v for k, _, v in (a.partition("=") for a in argv) if k in options}
+    if options["browser"] not in ("true", "false"):
+        raise ValueError(f"browser: found {options['browser']!r}, expected true or false")
+    rest = [a for a in argv if a.partition("=")[0] not in ("out", "browser")]
+    words.validate_words(rest, ())
+    from dhtorch.cli import demo  # noqa: PLC0415
+
+    capture, out = demo.write_demo_capture(Path(options["out"]))
+    code = _run_configured("recover", [str(capture), f"out={quote_value(str(out))}", *rest])
+    if code == EXIT_DONE:
+        demo.open_page(out / "view.html", in_browser=options["browser"] == "true")
+    return code
 
 
 def _add_implied_choice(argv: list[str]) -> list[str]:
@@ -184,15 +241,10 @@ def _run_configured(word: str, argv: list[str]) -> int:
     from omegaconf import OmegaConf  # noqa: PLC0415
     from omegaconf.errors import OmegaConfBaseException  # noqa: PLC0415
 
+    argv = _name_positionals(word, argv)
     if _HYDRA_INFO_FLAGS & {a.split("=")[0] for a in argv}:
         return _show_hydra_info(word, argv)
     _check_flags(argv, _HYDRA_INFO_FLAGS)
-    if word == "view" and _lacks_result(argv[:1]):
-        argv = [
-            f"data.root={quote_value(argv[0])}",
-            *(argv[1:] if _is_chosen(argv, "data") else ["data=auto", *argv[1:]]),
-        ]
-    argv = _name_output_folder(word, _name_positionals(argv, _POSITIONAL_OPTIONS.get(word, ())))
     words.validate_words(argv, ())
     argv = words.quote_words(argv)
     try:
@@ -205,6 +257,7 @@ def _run_configured(word: str, argv: list[str]) -> int:
         del cfg["hydra"]
         settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
         words.validate_values(settings, defaults)
+        _check_device(word, settings["device"])
         function_options = [k for k, v in settings.items() if isinstance(v, dict) and "_target_" in v]
         parts = _instantiate_parts(cfg, function_options)
     except (HydraException, OmegaConfBaseException) as error:
@@ -214,13 +267,42 @@ def _run_configured(word: str, argv: list[str]) -> int:
     disable_malloc_trim()
     try:
         if "data" in parts:
-            from dhtorch.cli.capture_checks import check_data  # noqa: PLC0415
-
-            parts["data"] = check_data(parts["data"])
+            parts["data"] = _prepare_data(word, settings, parts["data"])
         with console.mute_if_quiet():
             return int(module.run({**settings, "choices": groups}, parts, progress=console.progress) or EXIT_DONE)
     except errors.USER_ERRORS as error:
         return _report_failure(error, show=settings.get("traceback", False))
+
+
+def _prepare_data(name: str, settings: Mapping[str, Any], data: Any) -> Any:
+    """The scenes of a sub-command, with the wanted frames, and checked."""
+    from dhtorch.cli.capture_checks import check_data  # noqa: PLC0415
+    from dhtorch.data.scene import scenes_of  # noqa: PLC0415
+    from dhtorch.extract.cut import subsample_scenes  # noqa: PLC0415
+
+    if name in _SUBSAMPLED_COMMANDS:
+        max_frames = settings["max_frames"] if _SUBSAMPLED_COMMANDS[name] else None
+        data = subsample_scenes(scenes_of(data), settings["every"], max_frames)
+    return check_data(data)
+
+
+def _check_device(name: str, device: str) -> None:
+    """Raise an error for a device that a command, or torch on this machine, cannot use."""
+    if device == "cpu":
+        return
+    import torch  # noqa: PLC0415
+
+    if name in _CPU_COMMANDS:
+        raise ValueError(
+            f"device: found {device!r}, expected cpu: {name} computes in data-loader processes (workers=N)"
+        )
+    try:
+        torch.empty(0, device=device)
+    except Exception as error:  # of other types for each kind of device
+        reason = f"torch {torch.__version__} cannot use it on this machine"
+        raise ValueError(
+            f"device: found {device!r}, expected cpu or another device of this machine: {reason}"
+        ) from error
 
 
 def _check_overrides(name: str, argv: Sequence[str]) -> tuple[Any, list[str]]:
@@ -268,19 +350,28 @@ def _load_settings(path: Path) -> Any:
     return OmegaConf.to_container(OmegaConf.load(path)) if path.is_file() else {}
 
 
-def _name_positionals(argv: list[str], options: Sequence[str]) -> list[str]:
-    """The arguments with the option names of the positional ones added."""
-    for k, option in enumerate(options[: len(argv)]):
-        if "=" in argv[k] and not Path(argv[k]).exists():
-            break
-        argv = [*argv[:k], f"{option}={quote_value(argv[k])}", *argv[k + 1 :]]
-    return argv
+def _name_positionals(name: str, argv: Sequence[str]) -> list[str]:
+    """The arguments with the option names of the positional ones added, first; a path chooses ``data=auto``."""
+    options = _POSITIONAL_OPTIONS.get(name, ())
+    places = [k for k, word in enumerate(argv) if _is_positional(word)][: len(options)]
+    if name == "view" and places and _lacks_result(argv[places[0]]):
+        options = ("data.root",)
+    named = [f"{option}={quote_value(argv[k])}" for k, option in zip(places, options, strict=False)]
+    rest = [word for k, word in enumerate(argv) if k not in places]
+    if places and options[0] == "data.root" and not _is_chosen(argv, "data"):
+        named.insert(0, "data=auto")
+    return [*named, *rest]
 
 
-def _lacks_result(first: Sequence[str]) -> bool:
-    """Whether the first argument is an existing path without a result."""
-    place = Path(first[0]) if first and not first[0].startswith("-") else None
-    if place is None or not place.exists() or place.suffix in (".json", ".ply"):
+def _is_positional(word: str) -> bool:
+    """Whether an argument is a path and neither an option nor a flag."""
+    return not word.startswith(("-", "+")) and ("=" not in word or Path(word).exists())
+
+
+def _lacks_result(word: str) -> bool:
+    """Whether an argument is an existing path without a result."""
+    place = Path(word)
+    if not place.exists() or place.suffix in (".json", ".ply"):
         return False
     return not any(place.glob("result.json")) and not any(place.glob("*/result.json"))
 
@@ -289,16 +380,12 @@ def _is_chosen(argv: Sequence[str], group: str) -> bool:
     return any(a.startswith(f"{group}=") for a in argv)
 
 
-def _name_output_folder(name: str, argv: Iterable[str]) -> list[str]:
-    """The arguments with ``out`` or ``output`` replaced by the name that the settings use."""
-    own = "out" if "out" in _load_settings(config_dir() / f"{name}.yaml") else "output"
-    return [f"{own}={a.partition('=')[2]}" if a.startswith(("out=", "output=")) else a for a in argv]
-
-
 def _show_hydra_info(name: str, argv: list[str]) -> int:
-    """Run Hydra's own flags: help, composed settings, shell completion."""
+    """Run Hydra's own flags: composed settings, information, shell completion."""
     import hydra  # noqa: PLC0415
 
+    if "--cfg" in argv:  # Hydra expects the options side by side
+        argv = sorted(argv, key=lambda word: "=" not in word or word.startswith("-"))
     sys.argv = [sys.argv[0], *argv]
     hydra.main(config_path=str(config_dir()), config_name=name, version_base="1.3")(_run_hydra_job)()
     return EXIT_DONE
@@ -323,7 +410,7 @@ def _run_hydra(argv: list[str]) -> int:
         return _show_hydra_info("run", argv)
     _check_flags(argv, _SWEEP_FLAGS | _HYDRA_INFO_FLAGS)
     sweep = bool({*_SWEEP_FLAGS, "hydra.mode=MULTIRUN"} & set(argv))
-    overrides = words.quote_words(_name_output_folder("run", [a for a in argv if a not in _SWEEP_FLAGS]), sweep)
+    overrides = words.quote_words([a for a in argv if a not in _SWEEP_FLAGS], sweep)
     if console.get_verbosity() == "quiet":
         overrides.append("hydra/hydra_logging=disabled")  # the launcher's messages
     try:
@@ -441,6 +528,7 @@ def _run_job(cfg: Any) -> Any:
     try:
         settings: Any = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)
         words.validate_values(settings)
+        _check_device("run", settings["device"])
         parts = _instantiate_parts(cfg, ("data", "method", "pairs", "experiment"))
         scenes = len(parts["data"]) if isinstance(parts["data"], Sequence) else 1
         progress = together.record_progress(sweep, name, scenes) if swept else console.progress

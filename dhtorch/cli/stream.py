@@ -30,8 +30,10 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     Raises:
         ValueError, OSError: bad options or data.
     """
-    if settings["most"] is not None and (not isinstance(settings["most"], int) or settings["most"] < 1):
-        raise ValueError(f"most: found {settings['most']!r}, expected a whole number of at least 1")
+    if settings["max_frames"] is not None and (
+        not isinstance(settings["max_frames"], int) or settings["max_frames"] < 1
+    ):
+        raise ValueError(f"max_frames: found {settings['most']!r}, expected a whole number of at least 1")
     if settings["dtype"] not in ("float32", "float64"):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
     if settings["threads"] is not None:
@@ -56,7 +58,7 @@ def stream_scene(scene: Scene, method: Method, settings: Mapping[str, Any], *, p
     """
     recording, hint = scene.recording, scene.hint
     stream = Stream(method, steps=settings["steps"], seed=settings["seed"], hint=hint)
-    n = len(recording) if settings["most"] is None else min(settings["most"], len(recording))
+    n = len(recording)
     rows: list[Row] = []
     for k in progress(range(n), f"{scene.name}: frames", n):
         frame = recording[k].to(getattr(torch, settings["dtype"])).to(settings["device"])

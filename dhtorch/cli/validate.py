@@ -191,7 +191,7 @@ def _validate_recording(
 ) -> RecordingValidation:
     """Validate the frames one by one, then diagnose windows of frames."""
     n = len(validated.scene.recording)
-    frames = validated.frame_positions(settings["every"])[: settings["most"]]
+    frames = validated.frame_positions(settings["every"])[: settings["max_frames"]]
     for i in progress(frames, f"{validated.scene.name}: frames", len(frames)):
         frame = _load_frame(validated.scene, settings, i)
         frame_validation = _validate_frame(validated, frame, i, method, settings)
@@ -484,10 +484,17 @@ def _write_page(place: Path, validated: RecordingValidation, whole: Row, exceede
 
 def _check_options(settings: Mapping[str, Any]) -> dict[str, float]:
     """Validate the options early; returns the limits of ``fail_on``."""
-    for name, low in (("every", 1), ("most", 1), ("window", 0), ("pictures", 0), ("source_views", 1), ("size", 16)):
+    for name, low in (
+        ("every", 1),
+        ("max_frames", 1),
+        ("window", 0),
+        ("pictures", 0),
+        ("source_views", 1),
+        ("size", 16),
+    ):
         value = settings[name]
         is_whole = isinstance(value, int) and not isinstance(value, bool) and value >= low
-        if not is_whole and not (name == "most" and value is None):
+        if not is_whole and not (name == "max_frames" and value is None):
             raise ValueError(f"{name}: found {value!r}, expected a whole number of at least {low}")
     if settings["window"] == 1:
         raise ValueError("window: found 1, expected 0 or at least 2 frames")

@@ -105,11 +105,11 @@ def _compute_exhibit(
     dtype = getattr(torch, str(settings["dtype"]), None)
     if dtype not in (torch.float32, torch.float64):
         raise ValueError(f"dtype: found {settings['dtype']!r}, expected float32 or float64")
-    if not isinstance(settings["most"], int) or settings["most"] < 1:
-        raise ValueError(f"most: found {settings['most']!r}, expected a whole number of at least 1")
+    if not isinstance(settings["max_frames"], int) or settings["max_frames"] < 1:
+        raise ValueError(f"max_frames: found {settings['most']!r}, expected a whole number of at least 1")
     common = Settings(cutoff=cutoff(scene.name), seed=settings["seed"], device=settings["device"], dtype=dtype)
     options: dict[str, Any] = {
-        "most": settings["most"],
+        "most": settings["max_frames"],
         "sweep": DenseSweep.from_options(settings["dense"]),
         "progress": progress,
     }
@@ -138,7 +138,7 @@ def _choose_file(folder: Path) -> tuple[str | None, str | None, list[str]]:
     if importlib.util.find_spec("rerun") is None:
         note = "Rerun is not installed (pip install 'dhtorch[view]'): wrote a page instead"
         return str(folder / "view.html"), None, [note]
-    return None, None if _has_screen() else str(folder / "view.rrd"), []
+    return None, None if has_screen() else str(folder / "view.rrd"), []
 
 
 def _show_exhibit(scene: Exhibit, page: str | None, save: str | None) -> list[str]:
@@ -156,5 +156,6 @@ def _show_exhibit(scene: Exhibit, page: str | None, save: str | None) -> list[st
     return lines
 
 
-def _has_screen() -> bool:
+def has_screen() -> bool:
+    """Whether windows can be opened on this machine."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,28 +1,30 @@
-"""Subsets of a data set, opened lazily: the first frames of each recording, or selected recordings."""
+"""Subsets of a data set, opened lazily: some frames of each recording, or selected recordings."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 from dhtorch.data.recording import LazySequence, Recording
 from dhtorch.data.scene import Scene
+from dhtorch.records import Frame
 
 
 @dataclass(frozen=True, eq=False)
-class TruncatedScenes(LazySequence[Scene]):
-    """Scenes of at most ``frames`` frames each."""
+class SubsampledScenes(LazySequence[Scene]):
+    """Scenes of every ``every``-th frame, of at most ``max_frames`` frames each."""
 
     scenes: Sequence[Scene]
-    frames: int
+    every: int
+    max_frames: int | None
 
     def __len__(self) -> int:
         return len(self.scenes)
 
     def load_item(self, place: int) -> Scene:
-        """Truncated scene at an index."""
+        """Subsampled scene at an index."""
         scene = self.scenes[place]
-        return replace(scene, recording=truncate_recording(scene.recording, self.frames))
+        return replace(scene, recording=subsample_recording(scene.recording, self.every, self.max_frames))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,15 +42,30 @@ class SelectedRecordings(LazySequence[Recording]):
         return self.scenes[self.places[place]].recording
 
 
-def truncate_scenes(scenes: Sequence[Scene], frames: int | None) -> Sequence[Scene]:
-    """Scenes -> scenes of their first frames; None = all frames."""
-    return scenes if frames is None else TruncatedScenes(scenes, frames)
+def subsample_scenes(scenes: Sequence[Scene], every: int, max_frames: int | None) -> Sequence[Scene]:
+    """Scenes -> scenes of every ``every``-th frame, of the first ``max_frames`` of these; None = all."""
+    return scenes if every == 1 and max_frames is None else SubsampledScenes(scenes, every, max_frames)
 
 
-def truncate_recording(recording: Recording, frames: int) -> Recording:
-    """Recording -> recording of its first frames."""
+def subsample_recording(recording: Recording, every: int, max_frames: int | None) -> Recording:
+    """Recording -> recording of every ``every``-th frame, of the first ``max_frames`` of these."""
+    part = slice(None, None if max_frames is None else every * max_frames, every)
     times, poses = recording.times, recording.poses
     kept = {field.name: getattr(recording, field.name) for field in fields(Recording)}  # a subclass has other arguments
-    kept |= {"number": recording.number[:frames]}
-    kept |= {"times": None if times is None else times[:frames], "poses": None if poses is None else poses[:frames]}
+    kept |= {
+        "number": recording.number[part],
+        "load": recording.load if every == 1 else _EveryFrame(recording.load, every),
+    }
+    kept |= {"times": None if times is None else times[part], "poses": None if poses is None else poses[part]}
     return Recording(**kept)
+
+
+@dataclass(frozen=True)
+class _EveryFrame:
+    """Loads the frame at ``every`` times the position; it can be pickled, as data-loader processes need."""
+
+    load: Callable[[int], Frame]
+    every: int
+
+    def __call__(self, position: int) -> Frame:
+        return self.load(position * self.every)

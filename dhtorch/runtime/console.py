@@ -15,11 +15,16 @@ import sys
 import unicodedata
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from pathlib import Path
 from typing import Any, TextIO
 
 #: Flag → level.
 VERBOSITY_FLAGS = {"-q": "quiet", "--quiet": "quiet", "-v": "verbose", "--verbose": "verbose"}
 _VERBOSITY_VARIABLE = "DHTORCH_VERBOSITY"
+
+#: Names of a folder that are compared with a missing one. Source: origin not recorded; bounds the time of a message.
+_MAX_NAMES_COMPARED = 2000
 
 #: End of the help text of sub-commands with their own argument parser.
 HELP_EPILOG = (
@@ -42,6 +47,19 @@ def suggest_name(unknown: str, known: Iterable[str]) -> str:
         full_names[k] for k in difflib.get_close_matches(unknown.rpartition(".")[2], list(full_names), 1, 0.7)
     ]
     return f" (did you mean {near[0]}?)" if near else ""
+
+
+def suggest_path(missing: Path) -> str:
+    """`` (did you mean PATH?)`` with the nearest name in the deepest existing folder above; empty without one."""
+    below = missing
+    while not below.parent.is_dir() and below.parent != below:
+        below = below.parent
+    try:
+        names = [entry.name for entry in islice(below.parent.iterdir(), _MAX_NAMES_COMPARED)]
+    except OSError:
+        return ""
+    near = difflib.get_close_matches(below.name, names, 1, 0.6)
+    return f" (did you mean {below.with_name(near[0])}?)" if near else ""
 
 
 def escape_control(text: str) -> str:

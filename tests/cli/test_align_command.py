@@ -11,7 +11,7 @@ from dhtorch.data.depth_maps import open_depth_maps
 from dhtorch.synthetic import SyntheticRoom
 
 ROOM = ["data=synthetic", "data.hw=[96,128]", "data.depth_hw=[96,128]", "data.supersample=1", "data.n_frames=6"]
-LITTLE = ["method.n=256", "cutoff=2.0", "most=2", "every=3", "steps=[1,2]"]
+LITTLE = ["method.n=256", "cutoff=2.0", "max_frames=2", "every=3", "steps=[1,2]"]
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_maps_are_written_in_metres_and_stay(tmp_path, maps, room, capsys):
 def test_a_z_buffer_is_named_and_gets_no_answer(tmp_path, room, capsys):
     for k in range(len(room)):
         np.save(tmp_path / f"{k:04d}.npy", 1 - 0.01 / room.truth(k)["depth"][0].numpy())
-    words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "most=1", "cutoff=null"]
+    words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "max_frames=1", "cutoff=null"]
     assert run.main(["align", *ROOM, *LITTLE, *words]) == run.EXIT_DONE
     lines = capsys.readouterr().out.splitlines()
     assert "none of 1 map could be aligned" in lines[0] and "few" not in lines[0]
@@ -75,7 +75,7 @@ def test_a_z_buffer_is_named_and_gets_no_answer(tmp_path, room, capsys):
 def test_a_limit_decides_the_exit_code(tmp_path, room, capsys):
     for k in range(len(room)):
         np.save(tmp_path / f"{k:04d}.npy", 1.5 * room.truth(k)["depth"][0].numpy())
-    words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "most=1", 'fail_on="scale>0.2,no_answer>0.99"']
+    words = [f"depth={tmp_path}", f"out={tmp_path / 'out'}", "max_frames=1", 'fail_on="scale>0.2,no_answer>0.99"']
     assert run.main(["align", *ROOM, *LITTLE, *words]) == run.EXIT_SOME_FAILED
     assert "exceeded: scale is 0.33" in capsys.readouterr().out
     assert "Exceeded" in (tmp_path / "out" / "align.html").read_text()
@@ -85,7 +85,7 @@ def test_a_hole_in_a_file_is_no_value_of_any_kind_and_a_sensor_beside_itself_is_
     for k in range(2):
         depth = room[k].depth[0].numpy()
         np.save(tmp_path / f"{k:04d}.npy", np.where(np.arange(128) < 20, 0, depth))
-    words = [f"depth={tmp_path}", "most=1", "kind=affine"]
+    words = [f"depth={tmp_path}", "max_frames=1", "kind=affine"]
     assert run.main(["align", *ROOM, *LITTLE[:1], *words, f"out={tmp_path / 'out'}"]) == run.EXIT_DONE
     assert "from one sensor" in capsys.readouterr().out
     depth = data.open(tmp_path / "out")[0].depth

@@ -65,7 +65,7 @@ def captures(room, tmp_path_factory):
 def numbered(captures, tmp_path_factory):
     """Three frames of the numbered capture, completed."""
     out = tmp_path_factory.mktemp("out") / "maps"
-    said(captures / "numbered", out, most=3, arrays=True, points=True, figures=True)
+    said(captures / "numbered", out, max_frames=3, arrays=True, points=True, figures=True)
     return out
 
 
@@ -198,7 +198,7 @@ def test_a_stray_capture_stays_one_with_confidence_and_video(room, tmp_path):
     conf = torch.full((1, 60, 80), 2, dtype=torch.uint8)
     frames = [room[i].replace(conf=conf, depth=room[i].depth[:, ::2, ::2]) for i in range(3)]
     writers.write_stray(tmp_path / "capture", frames, codec="libx264")
-    assert "2 frames of 80x60" in said(tmp_path / "capture", tmp_path / "maps", most=2, size=80)
+    assert "2 frames of 80x60" in said(tmp_path / "capture", tmp_path / "maps", max_frames=2, size=80)
     there, back = data.open(tmp_path / "capture"), data.open(tmp_path / "maps")
     assert back.format == "stray" and back.number.tolist() == [0, 1] and len(there) == 3
     assert torch.equal(back[0].image, there[0].image) and torch.equal(back.poses.t, there.poses.t[:2])
@@ -227,7 +227,7 @@ def test_steps_never_clip_and_never_wrap():
 
 
 def test_what_does_not_fit_is_silent_counted_and_said(captures, tmp_path):
-    out = said(captures / "numbered", tmp_path / "maps", most=1, unit=0.00005)
+    out = said(captures / "numbered", tmp_path / "maps", max_frames=1, unit=0.00005)
     row = storage.parse_strict_json((tmp_path / "maps" / "meta" / "000000.json").read_text())
     assert row["no_answer"]["unfit"] > 0.01 and "are beyond it" in out and "up to 3.3 m" in out
     back = data.open(tmp_path / "maps")[0].depth
@@ -258,7 +258,7 @@ def test_said_again_it_makes_what_is_missing_and_no_more(captures, numbered, mon
     monkeypatch.setattr(complete, "complete_depth", lambda *a, **k: asked.append(1) or whole(*a, **k))
     before = stamps(numbered)
     more = {"arrays": True, "points": True, "figures": True}
-    assert "3 frames (3 left untouched)" in said(captures / "numbered", numbered, most=3, **more) and not asked
+    assert "3 frames (3 left untouched)" in said(captures / "numbered", numbered, max_frames=3, **more) and not asked
     closing = {"K.txt", "meta.json", "poses.txt"}
     after = stamps(numbered)
     assert before.keys() == after.keys() and all(after[k] == before[k] for k in before if k not in closing)
@@ -269,13 +269,13 @@ def test_said_again_it_makes_what_is_missing_and_no_more(captures, numbered, mon
 
 def test_leftovers_of_a_killed_run_are_removed(captures, tmp_path):
     out = tmp_path / "maps"
-    said(captures / "numbered", out, most=2)
+    said(captures / "numbered", out, max_frames=2)
     meta, depth = out / "meta" / "000001.json", out / "depth" / "000001.png"
     meta.write_bytes(meta.read_bytes()[:100])
     depth.write_bytes(depth.read_bytes()[:100])
     (out / ".dhtorch" / "unfinished").mkdir()
     (out / ".dhtorch" / "unfinished" / "0.png").write_bytes(b"half")
-    said(captures / "numbered", out, most=1)
+    said(captures / "numbered", out, max_frames=1)
     kept = {p.name for p in out.rglob("*") if p.is_file() and p.name != "manifest"}
     assert kept == {"000000.png", "000000.json", "complete.json", "K.txt", "meta.json", "poses.txt"}
 
@@ -292,7 +292,7 @@ def test_ctrl_c_leaves_whole_frames_and_a_recording_of_them(captures, tmp_path):
         said(captures / "numbered", tmp_path, stopped)
     assert len(data.open(tmp_path)) == 1
     before = stamps(tmp_path)
-    assert "(1 left untouched)" in said(captures / "numbered", tmp_path, most=2)
+    assert "(1 left untouched)" in said(captures / "numbered", tmp_path, max_frames=2)
     assert stamps(tmp_path)["depth/000000.png"] == before["depth/000000.png"] and len(data.open(tmp_path)) == 2
 
 
@@ -323,7 +323,7 @@ def test_a_stopped_process_loses_the_frame_that_was_being_made(captures, tmp_pat
 
 
 def test_other_settings_data_or_files_are_refused(captures, numbered, tmp_path):
-    asked = {"arrays": True, "most": 3}
+    asked = {"arrays": True, "max_frames": 3}
     before = stamps(numbered)
     for name, there, here in (("seed", 0, 1), ("planes", 16, 32), ("unit", 0.001, 0.002)):
         with pytest.raises(FileExistsError, match=rf"complete.json: .*\({name} {there} there, {here} here\)"):
@@ -344,7 +344,7 @@ def test_other_settings_data_or_files_are_refused(captures, numbered, tmp_path):
 @pytest.mark.parametrize(
     ("option", "said_of_it"),
     [
-        ({"most": 0}, "most: found 0"),
+        ({"max_frames": 0}, "max_frames: found 0"),
         ({"every": -1}, "every: found -1"),
         ({"format": "zip"}, "format: found 'zip', expected one of auto, frames, tum, stray, png"),
         ({"format": "tum"}, "format=tum: numbered has no time stamps"),
@@ -368,7 +368,7 @@ def test_bad_options_are_named_and_leave_nothing(captures, tmp_path, option, sai
 
 
 def test_the_command_takes_a_path_and_ends_bad_input_in_one_line(captures, tmp_path, capsys):
-    words = ["complete", str(captures / "numbered"), f"out={tmp_path / 'maps'}", "most=1", "method=map", "method.n=256"]
+    words = ["complete", str(captures / "numbered"), f"out={tmp_path / 'maps'}", "max_frames=1", "method=map", "method.n=256"]
     assert run.main([*words, "planes=16", "figures=false"]) == 0
     assert "1 frame of 160x120" in capsys.readouterr().out and len(data.open(tmp_path / "maps")) == 1
     for bad in (["planes=24"], ["siez=3"]):

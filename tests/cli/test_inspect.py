@@ -127,7 +127,7 @@ def test_written_captures_are_found_and_shown(
     root = tmp_path / "given" / below
     root.mkdir(parents=True)
     write(root)
-    assert capture.main([str(tmp_path / "given"), "--out", str(tmp_path / "out"), "--frames", "3"]) == 0
+    assert capture.main([str(tmp_path / "given"), "--out", str(tmp_path / "out"), "--max-frames", "3"]) == 0
     said = capsys.readouterr().out
     sheets = sorted((tmp_path / "out").glob("*.png"))
     assert len(sheets) == count and said.count("wrote ") == count and f" {format} (" in said
@@ -383,8 +383,8 @@ def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
     assert run.main(["inspect", str(tmp_path / "nowhere")]) != 0
     with pytest.raises(FormatError, match="format: found frame_dir, expected auto, record3d"):
         capture.main([str(tmp_path), "--format", "frame_dir"])
-    with pytest.raises(ValueError, match="--frames: found 0, expected at least 1"):
-        capture.main([str(tmp_path), "--frames", "0"])
+    with pytest.raises(ValueError, match="--max-frames: found 0, expected at least 1"):
+        capture.main([str(tmp_path), "--max-frames", "0"])
 
 
 def test_command_writes_to_outputs(

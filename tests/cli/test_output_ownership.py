@@ -34,16 +34,16 @@ COMMANDS = {
         ["CAPTURE", "out=OUT", "method=map", "method.n=256", "planes=16", "steps=[1]", "mesh=false"],
         "view.html",
     ),
-    "align": (["align", *ROOM, "depth=MAPS", "out=OUT", "most=1", "steps=[1]", "method.n=256"], "align.html"),
-    "validate": (["validate", *ROOM, "most=1", "window=0", "size=96", "method.n=256", "output=OUT"], "validate.json"),
-    "stream": (["stream", *ROOM, "most=2", "method.n=256", "output=OUT"], "stream.json"),
+    "align": (["align", *ROOM, "depth=MAPS", "out=OUT", "max_frames=1", "steps=[1]", "method.n=256"], "align.html"),
+    "validate": (["validate", *ROOM, "max_frames=1", "window=0", "size=96", "method.n=256", "output=OUT"], "validate.json"),
+    "stream": (["stream", *ROOM, "max_frames=2", "method.n=256", "output=OUT"], "stream.json"),
     "run": (["run", *PAIR, "output=OUT"], "result.json"),
     "sweep": (["-m", *PAIR, "seed=0,1", "output=OUT"], "multirun.yaml"),
     "integrate": (["integrate", *PAIR, "mesh=false", "dense=false", "output=OUT"], "synthetic_room/map.ply"),
     "extract": (["extract", *ROOM, "method.n=64", "out=OUT"], "shard-00000.parquet"),
     "enrich": (["enrich", "CAPTURE", "OUT", "dense=false", "method.n=64"], "meta/info.json"),
     "inspect": (["inspect", "CAPTURE", "--out", "OUT"], "kitchen.png"),
-    "view": (["view", "RESULT", "html=OUT/page.html", "most=1"], "page.html"),
+    "view": (["view", "RESULT", "html=OUT/page.html", "max_frames=1"], "page.html"),
     "report": (["report", "RESULT", "--html", "OUT/page.html"], "page.html"),
 }
 
@@ -72,7 +72,7 @@ def inputs(capture, tmp_path_factory):
 def completed(capture, tmp_path_factory):
     """Two frames of the capture, completed."""
     out = tmp_path_factory.mktemp("completed") / "out"
-    assert complete(capture, out, "most=2", "figures=all") == 0
+    assert complete(capture, out, "max_frames=2", "figures=all") == 0
     return out
 
 
@@ -196,7 +196,7 @@ def test_a_second_complete_leaves_files_and_links_of_others(capture, again, tmp_
     (again / "figures" / "more").symlink_to(elsewhere)
     (again / "points").symlink_to(elsewhere)  # a folder that these options do not write
     before, others = contents(again), contents(elsewhere)
-    assert complete(capture, again, "most=3", "figures=all") == 0
+    assert complete(capture, again, "max_frames=3", "figures=all") == 0
     after = contents(again)
     assert {name: after[name] for name in before if name != "poses.txt"} == {
         name: content for name, content in before.items() if name != "poses.txt"
@@ -211,7 +211,7 @@ def test_a_folder_that_is_a_link_stops_it(capture, again, tmp_path, capsys, fold
     (tmp_path / "elsewhere" / "mine.png").write_bytes(b"mine")
     (again / folder).symlink_to(tmp_path / target)
     before = contents(tmp_path)
-    assert complete(capture, again, "most=3", "figures=all") == run.EXIT_FAILED
+    assert complete(capture, again, "max_frames=3", "figures=all") == run.EXIT_FAILED
     assert f"found {again / folder}, a link" in one_line(capsys)
     assert contents(tmp_path) == before
 
@@ -227,10 +227,10 @@ def test_a_foreign_name_of_a_frame_stops_it_before_anything_is_changed(capture, 
     else:
         (again / name).mkdir()
     before = contents(tmp_path)
-    assert complete(capture, again, "most=3", "figures=all") == run.EXIT_FAILED
+    assert complete(capture, again, "max_frames=3", "figures=all") == run.EXIT_FAILED
     assert f"found {again / name}, a {kind}" in one_line(capsys)
     assert contents(tmp_path) == before
-    assert complete(capture, again, "most=2", "figures=all") == 0, "frames that are not wanted are not in the way"
+    assert complete(capture, again, "max_frames=2", "figures=all") == 0, "frames that are not wanted are not in the way"
 
 
 def test_a_file_that_was_edited_is_not_replaced(capture, again, capsys):
@@ -238,7 +238,7 @@ def test_a_file_that_was_edited_is_not_replaced(capture, again, capsys):
         original = (again / name).read_bytes()
         (again / name).write_bytes(original + b"# mine\n")
         before = contents(again)
-        assert complete(capture, again, "most=3", "figures=all") == (run.EXIT_FAILED if is_written else 0)
+        assert complete(capture, again, "max_frames=3", "figures=all") == (run.EXIT_FAILED if is_written else 0)
         if is_written:
             assert f"found {again / name}, a file that was changed since" in one_line(capsys)
             assert contents(again) == before
@@ -250,7 +250,7 @@ def test_a_file_that_was_edited_is_not_replaced(capture, again, capsys):
 def test_files_of_a_frame_that_a_killed_run_left_are_removed(capture, again):
     (again / "meta" / "000001.json").unlink()
     (again / "depth" / "mine.png").write_bytes(b"mine")
-    assert complete(capture, again, "most=1") == 0
+    assert complete(capture, again, "max_frames=1") == 0
     assert {name for name in contents(again) if "00000" in name or "mine" in name} == {
         *(f"{kind}/000000.png" for kind in ("depth", "sigma", "source", "images", "figures")),
         "meta/000000.json",
@@ -262,13 +262,13 @@ def test_a_folder_of_an_older_version_is_resumed(capture, again, capsys):
     shutil.rmtree(again / PRIVATE_FOLDER)
     (again / "depth" / "000002.png").write_bytes(b"mine or of a killed run")
     before = contents(again)
-    assert complete(capture, again, "most=3") == run.EXIT_FAILED
+    assert complete(capture, again, "max_frames=3") == run.EXIT_FAILED
     assert f"found {again / 'depth' / '000002.png'}, a file that dhtorch did not write" in one_line(capsys)
     assert contents(again) == before
     (again / "depth" / "000002.png").unlink()
-    assert complete(capture, again, "most=3") == 0
+    assert complete(capture, again, "max_frames=3") == 0
     (again / "meta" / "000000.json").unlink()
-    assert complete(capture, again, "most=3") == 0, "the older files are in the manifest now"
+    assert complete(capture, again, "max_frames=3") == 0, "the older files are in the manifest now"
     assert len(data.open(again)) == 3
 
 

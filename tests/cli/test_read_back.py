@@ -133,7 +133,7 @@ def test_complete_keeps_the_intrinsics_of_every_frame(shots: list[Frame], tmp_pa
 
 @needs_data
 def test_complete_of_a_real_capture(tmp_path: Path) -> None:
-    source, back = data.open(HOLO), completed(HOLO, tmp_path / "out", "most=2", "every=20", "format=frames")
+    source, back = data.open(HOLO), completed(HOLO, tmp_path / "out", "max_frames=2", "every=20", "format=frames")
     assert back.number.tolist() == source.number[[0, 20]].tolist() and back.depth_unit is not None
     for frame, want in zip(back, (source[0], source[20]), strict=True):
         assert torch.equal(frame.image, want.image)

@@ -173,25 +173,6 @@ def test_a_traceback_is_shown_when_asked_for(command):
     assert code != 0 and "Traceback" in err
 
 
-def test_help_reads_well(command):
-    code, out, _ = command("--help")
-    assert not code
-    for word in (
-        "dhtorch",
-        "data=auto",
-        "method: ",
-        "paper",
-        "holdout",
-        "--multirun",
-        "resume=true",
-        "launch: ",
-        "130",
-    ):
-        assert word in out, word
-    groups = ("data: ", "experiment: ")  # a list of all choices, which Hydra prints as one line
-    assert max(len(line) for line in out.splitlines() if not line.startswith(groups)) < 120
-
-
 @pytest.mark.slow
 def test_batches_and_workers_give_the_same_rows(tmp_path):
     rows = []

@@ -34,7 +34,7 @@ from dhtorch.synthetic import SyntheticRoom
 from dhtorch.transforms import SampleError, ValidateDepth
 
 ROOM = ["data=synthetic", "data.hw=[96,128]", "data.depth_hw=[96,128]", "data.supersample=1", "data.n_frames=6"]
-LITTLE = ["method.n=256", "size=96", "window=0", "most=2", "every=3"]
+LITTLE = ["method.n=256", "size=96", "window=0", "max_frames=2", "every=3"]
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +74,7 @@ def test_a_guessed_camera_is_told_on_the_page_and_one_frame_is_one(tmp_path, roo
     capture = tmp_path / "capture"
     writers.write_counted_frames(capture, [room[0], room[3]])
     (capture / "K.txt").unlink()
-    words = ["data=frames_dir", f"data.root={capture}", "data.fov=60", *LITTLE, "most=1", f"output={tmp_path / 'out'}"]
+    words = ["data=frames_dir", f"data.root={capture}", "data.fov=60", *LITTLE, "max_frames=1", f"output={tmp_path / 'out'}"]
     assert run.main(["validate", *words]) == run.EXIT_DONE
     page = (tmp_path / "out/validate.html").read_text()
     assert "<p>Intrinsics are a guess from a field of view of 60°" in page
@@ -105,12 +105,12 @@ def test_a_single_frame_exceeds_a_limit_by_its_bound_alone(tmp_path, maps):
     for file in maps.glob("*.npy"):
         np.save(file, 1.1 * np.load(file))
     out = tmp_path / "out"
-    code, found = validated(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.05,wrong>0.9"')
+    code, found = validated(out, f"depth={maps}", "views=false", "max_frames=1", 'fail_on="scale>0.05,wrong>0.9"')
     scale = found["frames"][0]["scale"]
     assert code == run.EXIT_SOME_FAILED
     assert found["whole"]["limited"]["scale"] == pytest.approx(scale["low"] - 1)
     assert scale["low"] - 1 < 0.099 < scale["value"] - 1 + 0.01
-    code, _ = validated(out, f"depth={maps}", "views=false", "most=1", 'fail_on="scale>0.097"')
+    code, _ = validated(out, f"depth={maps}", "views=false", "max_frames=1", 'fail_on="scale>0.097"')
     assert code == run.EXIT_DONE, "the value is more, its interval is not"
     assert found["intrinsics_guessed"] is None
 
@@ -142,7 +142,7 @@ def test_bounds_of_a_recording():
 def test_maps_that_are_cut_are_told(tmp_path, maps, room):
     for file in maps.glob("*.npy"):
         np.save(file, np.minimum(np.load(file), np.float32(2.55)))
-    code, found = validated(tmp_path / "out", f"depth={maps}", "window=6", "every=2", "most=3", "method.n=512")
+    code, found = validated(tmp_path / "out", f"depth={maps}", "window=6", "every=2", "max_frames=3", "method.n=512")
     assert code == run.EXIT_DONE
     assert [row["clip_depth"] for row in found["frames"]] == pytest.approx([2.55] * 3)
     assert [(row["cause"], row["kind"]) for row in found["windows"]] == [("cut at 2.55 m", "cut")]
@@ -162,7 +162,7 @@ def test_a_guessed_field_of_view_is_told(tmp_path, room):
             (tmp_path / "capture" / name).mkdir(parents=True, exist_ok=True)
             array = picture.permute(1, 2, 0).numpy() if name == "rgb" else picture.numpy()
             (tmp_path / "capture" / name / f"{k}.png").write_bytes(encode_png(np.ascontiguousarray(array)))
-    words = ["validate", str(tmp_path / "capture"), "data.fov=60", "method.n=256", "size=96", "window=0", "most=1"]
+    words = ["validate", str(tmp_path / "capture"), "data.fov=60", "method.n=256", "size=96", "window=0", "max_frames=1"]
     with pytest.warns(UserWarning, match="intrinsics are a guess"):
         assert run.main([*words, f"output={tmp_path}"]) == run.EXIT_DONE
     told = json.loads((tmp_path / "validate.json").read_text())["intrinsics_guessed"]

@@ -218,7 +218,7 @@ def test_every_record_of_the_bridge_set_is_whole() -> None:
 
 @needs_data
 def test_the_bridge_set_can_be_looked_at(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert inspect.main([str(ROOT), "--frames", "2", "--out", str(tmp_path)]) == 0
+    assert inspect.main([str(ROOT), "--max-frames", "2", "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "rlds" in said and "no intrinsics" in said and "64x64" in said
 

@@ -197,7 +197,7 @@ def test_ctrl_c_keeps_the_scenes_that_are_whole(tmp_path, monkeypatch):
 
 
 def test_help_shows_every_option(command):
-    code, out, _ = command("--help")
+    code, out, _ = command("--help-all")
     assert code == 0
     for word in (
         "poses",

@@ -100,14 +100,14 @@ def test_after_a_reset_it_is_as_new(frames: list[Frame]) -> None:
 
 def test_the_command_streams_a_recording(tmp_path, capsys) -> None:
     options = ["data=synthetic", "data.n_frames=4", "data.hw=[192,256]", "method.n=256", "method.views=2"]
-    assert main(["stream", *options, "most=3", "cutoff=2.0", f"output={tmp_path}"]) == 0
+    assert main(["stream", *options, "max_frames=3", "cutoff=2.0", f"output={tmp_path}"]) == 0
     said = capsys.readouterr().out
     assert "3 frames" in said and "frames/s" in said
     (scene,) = json.loads((tmp_path / "stream.json").read_text())["scenes"]
     assert scene["n_frames"] == 3 and [row["frame"] for row in scene["frames"]] == [0, 1, 2]
     assert scene["frames"][0]["n_recovered"] == 0 < scene["frames"][0]["n_holes"]
     assert scene["frames"][2]["n_recovered"] > 0 and not scene["cuts"]
-    assert main(["stream", *options, "most=0", f"output={tmp_path}"]) == 2
+    assert main(["stream", *options, "max_frames=0", f"output={tmp_path}"]) == 2
     assert "most: found 0" in capsys.readouterr().err
 
 

@@ -76,7 +76,7 @@ def test_another_allocator_is_left_alone(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("words", [["stream", "most=2"], ["pairs=gap", "pairs.gap=1", "figures=false"]])
+@pytest.mark.parametrize("words", [["stream", "max_frames=2"], ["pairs=gap", "pairs.gap=1", "figures=false"]])
 def test_commands_that_work_on_frames_keep_what_they_free(words, tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(run, "disable_malloc_trim", lambda: asked.append(1))

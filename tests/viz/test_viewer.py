@@ -396,13 +396,13 @@ def test_without_a_screen_a_recording_is_written_and_without_rerun_a_page(comman
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setenv("DISPLAY", screen)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    code, out, err = command("view", *TINY, "most=1", "output=new")
+    code, out, err = command("view", *TINY, "max_frames=1", "output=new")
     path = Path("new", name)
     assert (code, err) == (0, "") and path.stat().st_size > 10_000 and str(path) in out.strip().splitlines()[-1]
 
 
 def test_a_recording_of_ones_own(command, tmp_path):
-    code, _, err = command("view", *TINY, "most=1", "holdout=none", "html=own.html")
+    code, _, err = command("view", *TINY, "max_frames=1", "holdout=none", "html=own.html")
     assert (code, err) == (0, ""), err
     data = data_of((tmp_path / "own.html").read_text())
     assert len(data["shots"]) == 1 and data["facts"]["sensor"] == "all returns used"
@@ -413,7 +413,7 @@ def test_a_recording_of_ones_own(command, tmp_path):
     ("args", "words"),
     [
         (["nowhere"], ["nowhere"]),
-        ([*TINY, "most=0"], ["most", "0"]),
+        ([*TINY, "max_frames=0"], ["max_frames", "0"]),
         ([*TINY, "dense={sise: 3}"], ["dense", "sise", "source_views"]),
         ([*TINY, "scene=hall", "html=x.html"], ["scene", "hall", "synthetic_room"]),
         (["html=x.txt"], ["x.txt", ".html"]),

@@ -1,0 +1,209 @@
+"""One way to type every command: ``dhtorch COMMAND PATH [--option value | option=value ...]``, and its help."""
+
+import re
+import shlex
+from types import SimpleNamespace
+
+import pytest
+from support.tiny_runs import TINY
+
+from dhtorch import testing as writers
+from dhtorch.cli import commands, demo, process_capture, run
+from dhtorch.cli.commands import COMMANDS, list_options, resolve_option, to_overrides
+from dhtorch.runtime import console
+from dhtorch.synthetic.recording import SyntheticRoom
+
+#: Commands that read a capture and compute maps from its frames.
+COMPUTING = [name for name in COMMANDS if name not in ("inspect", "report", "run")]
+
+
+def overrides(name, *argv):
+    return to_overrides(name, argv, list_options(name, run.config_dir()), {"--multirun", "--cfg"}, console.suggest_name)
+
+
+def test_the_list_of_commands_is_short_and_complete(command):
+    code, out, _ = command("--help")
+    lines = out.splitlines()
+    assert code == 0 and len(lines) <= 30 and max(map(len, lines)) < 120
+    for name in {*run._CONFIGURED_COMMANDS, *run._PARSED_COMMANDS, "run", "demo"} - {"recover"}:
+        (line,) = [line for line in lines if line.startswith(f"  {name} ")]
+        assert len(line.split()) > 4, line
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_help_of_a_command_is_short(command, name):
+    code, out, _ = command(name, "--help")
+    lines = out.splitlines()
+    assert code == 0 and len(lines) <= 45 and max(map(len, lines)) < 120
+    assert len(COMMANDS[name].examples) == 3
+    assert len(COMMANDS[name].options) <= 15 and (len(COMMANDS[name].options) >= 8 or name == "report")
+    known = list_options(name, run.config_dir())
+    for option in COMMANDS[name].options:
+        note = known[resolve_option(name, option, known)]
+        assert (note.default and (note.note or option == "seed")) or option == "out", option
+    assert "Exit code: 0 done" in out and "130 interrupted" in out
+
+
+@pytest.mark.parametrize("name", COMPUTING)
+def test_common_options_have_one_name(name):
+    known = list_options(name, run.config_dir())
+    for option in ("max_frames", "every", "method", "device", "out"):
+        assert resolve_option(name, option, known), option
+
+
+@pytest.mark.parametrize(
+    ("name", "typed", "expected"),
+    [
+        ("complete", "x --out d --max-frames 3", "x out=d max_frames=3"),
+        ("complete", "x --out=d max-frames=3", "x out=d max_frames=3"),
+        ("stream", "x --out d", "x output=d"),
+        ("complete", "--points --no-figures x", "points=true figures=false x"),
+        ("complete", "--points x --arrays false", "points=true x arrays=false"),
+        ("complete", "--fov 69 --K 1,2,3,4 x", "data.fov=69 data.K=1,2,3,4 x"),
+        ("extract", "x --gap 5 --columns a,b --tokens-hw 56,56", "x extract.gap=5 extract.columns=[a,b] extract.tokens_hw=[56,56]"),
+        ("extract", "--dense --half", "extract.dense=true extract.half=true"),
+        ("run", "x --cutoff 2.0 --method.n 512", "x holdout.cutoff=2.0 method.n=512"),
+        ("run", "--multirun method=map,paper --cfg job", "--multirun method=map,paper --cfg job"),
+        ("recover", "x --mesh --minutes null", "x mesh=true minutes=null"),
+    ],
+)  # fmt: skip
+def test_options_and_overrides_are_the_same(name, typed, expected):
+    assert overrides(name, *typed.split()) == expected.split()
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["complete", "x", "--size"], ["--size: found no value", "expected --size VALUE"]),
+        (["complete", "x", "--max-frame", "3"], ["--max-frame", "(did you mean --max-frames?)"]),
+        (["complete", "x", "--no-size"], ["--no-size", "unknown option"]),
+        (["/nope/room.r3d"], ["/nope/room.r3d: no such file or folder"]),
+        (["./captures/kitchen"], ["./captures/kitchen: no such file or folder", "did you mean captures/kitchn?"]),
+        (["kitchn.r3d"], ["kitchn.r3d: no such file or folder"]),
+        (["capturs"], ["capturs: no such file or folder (did you mean captures?)"]),
+        (["inspec", "captures"], ["inspec: found an unknown argument (did you mean inspect?)"]),
+        (["run", "/nope/room"], ["/nope/room: path: found no such file or folder"]),
+        (["validate", "nope/room"], ["nope/room: path: found no such file or folder"]),
+    ],
+)
+def test_a_slip_has_one_line_with_the_nearest_name(command, tmp_path, argv, words):
+    (tmp_path / "captures" / "kitchn").mkdir(parents=True)
+    code, out, err = command(*argv)
+    (line,) = err.strip().splitlines()
+    assert code == 2 and not out and line.startswith("dhtorch: ")
+    for word in words:
+        assert word in line, line
+
+
+@pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("inspect", "report")])
+def test_a_device_that_torch_cannot_use_is_one_line(command, monkeypatch, name):
+    words = {
+        "recover": ["recover", "."],
+        "align": ["align", ".", "depth=.", "out=o"],
+        "complete": ["complete", ".", "out=o"],
+    }
+    words |= {
+        "enrich": ["enrich", ".", "o"],
+        "extract": ["extract", "data=synthetic", "out=o"],
+        "demo": ["demo", "--no-browser"],
+    }
+    monkeypatch.setattr(demo, "write_demo_capture", lambda folder: (folder, folder))
+    code, _, err = command(
+        *words.get(name, [name, *TINY] if name == "run" else [name, "data=synthetic"]), "--device", "cuda:7"
+    )
+    (line,) = err.strip().splitlines()
+    assert code == 2 and line.startswith("dhtorch: device: found 'cuda:7', expected cpu"), line
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"), [(name, example) for name, each in COMMANDS.items() for example, _ in each.examples]
+)
+def test_examples_of_the_help_are_accepted(command, monkeypatch, tmp_path, name, arguments):
+    """Every example is parsed, composed and checked as printed; its computation is replaced by a record of the call."""
+    called = []
+    record = SimpleNamespace(run=lambda *_, **__: called.append(name), main=lambda _: called.append(name))
+    monkeypatch.setattr(run, "importlib", SimpleNamespace(import_module=lambda _: record))
+    monkeypatch.setattr(run, "_instantiate_parts", lambda *_: {})
+    monkeypatch.setattr(run, "_run_single", lambda *_: called.append(name) or 0)
+    monkeypatch.setattr(run, "_run_sweep", lambda *_, **__: called.append(name) or 0)
+    monkeypatch.setattr(demo, "write_demo_capture", lambda _: (tmp_path / "PATH", tmp_path / "out"))
+    monkeypatch.setattr(demo, "open_page", lambda *_, **__: None)
+    for folder in ("PATH", "SRC"):
+        (tmp_path / folder).mkdir()
+    code, _, err = command(*(["recover"] if name == "recover" else [name]), *shlex.split(arguments))
+    assert code == 0 and called == [name], err
+
+
+def test_everything_is_shown_on_request(command):
+    code, out, _ = command("complete", "--help-all")
+    assert code == 0 and "min_correlation: 0.75" in out and "method: auto, " in out and "_target_" in out
+    code, out, _ = command("complete", "x", "--cfg", "job", "--out", "d", "--size", "96")
+    assert code == 0 and "root: x" in out and "size: 96" in out
+
+
+SMALL_DEMO = ["--max-frames", "1", "--size", "64", "--method.n", "256", "--no-browser"]
+
+
+def test_the_demo_goes_the_whole_way(command, monkeypatch, tmp_path):
+    monkeypatch.setattr(demo, "_IMAGE_HW", (96, 128))
+    monkeypatch.setattr(demo, "_N_FRAMES", 4)
+    code, out, err = command("demo", *SMALL_DEMO, "--out", "d")
+    assert code == 0 and not err
+    page = tmp_path / "d" / "result" / "view.html"
+    assert page.is_file() and out.splitlines()[-1] == f"Open {page.as_uri()}"
+    assert command("demo", *SMALL_DEMO, "--out", "d")[0] == 0, "the capture is used again"
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("notes")
+    code, _, err = command("demo", "--out", "mine")
+    assert code == 2 and "has other content" in err
+
+
+def next_command(out):
+    (line,) = [line for line in out.splitlines() if line.startswith("Next: ")]
+    return shlex.split(line.partition("dhtorch ")[2])
+
+
+def test_the_printed_next_command_runs(command, tmp_path):
+    """The way of a phone scan, with a name beyond ASCII: the map is written and the printed command measures the error."""
+    name = "it's küche 寝室"
+    room = SyntheticRoom(n_frames=4, hw=(120, 160), depth_hw=(120, 160), step_m=0.05)
+    writers.write_tum(tmp_path / name, [room[k] for k in range(4)])
+    code, out, err = command(name, "--max-frames", "2", "--size", "96", "--method.n", "512")
+    assert code == 0, err
+    header = (tmp_path / "dhtorch_out" / name / "map.ply").read_bytes().partition(b"end_header")[0]
+    assert header.isascii() and b"vertex" in header
+    words = next_command(out)
+    assert words[:2] == ["run", name]
+    code, out, err = command(*words, "figures=false")
+    assert code == 0 and re.search(r"coverage|answered", out), err
+
+
+def test_the_next_command_has_the_reader_options_of_this_one(command, tmp_path):
+    room = SyntheticRoom(n_frames=3, hw=(120, 160), depth_hw=(120, 160), step_m=0.05)
+    writers.write_counted_frames(tmp_path / "above" / "capture", [room[k] for k in range(3)])
+    (tmp_path / "above" / "capture" / "K.txt").unlink(missing_ok=True)
+    code, out, err = command("above", "--max-frames", "1", "--size", "96", "--method.n", "512", "--fov", "60")
+    assert code == 0, err
+    words = next_command(out)
+    assert words[:2] == ["run", "above/capture"] and "data.fov=60" in words
+    assert command(*words, "figures=false")[0] == 0
+
+
+def test_the_cutoff_lies_among_the_returns(monkeypatch):
+    import numpy as np  # noqa: PLC0415
+
+    from dhtorch.codes import Source  # noqa: PLC0415
+
+    for depth in (0.9531, 1.0, 104.2, 9.96, 0.0123):
+        maps = {"depth": np.full((4, 4), depth)}, np.full((4, 4), int(Source.SENSOR))
+        monkeypatch.setattr(process_capture.completed, "read_completed_maps", lambda *_, maps=maps: maps)
+        cutoff = process_capture._choose_cutoff(SimpleNamespace(task=None, frames=[0]))
+        assert depth <= float(f"{cutoff:g}") < 1.11 * depth, depth
+
+
+def test_a_list_of_settings_files_is_read(tmp_path):
+    file = tmp_path / "x.yaml"
+    file.write_text("defaults:\n  - method: map\na: 1 # one\nb:\n  c: [1, 2] # two\nd: null\nhydra:\n  e: 3\n")
+    notes = commands.read_option_notes(file)
+    assert notes["a"] == ("1", "one") and notes["b.c"] == ("[1, 2]", "two") and notes["d"] == ("null", "")
+    assert notes["method"].default == "map" and not any("e" in name.split(".") for name in notes)
