@@ -17,6 +17,10 @@ TORCH = test -z "$(TORCH_INDEX)" || $(PIP) --retries 0 --timeout 15 --index-url 
 run: $(VENV)/.installed
 	@echo "== dhtorch on the built-in scene"
 	$(BIN)/dhtorch $(ARGS)
+	@echo "== The table: depth beyond the cutoff was hidden and recovered. coverage: share of samples with an answer;"
+	@echo "   median and p90: relative error of the answers; > 20 % off: share of answers that are wrong by more."
+	@echo "== Next, your own capture:  . $(BIN)/activate && dhtorch PATH     (or without activating: $(BIN)/dhtorch PATH)"
+	@echo "   A demo with a 3D page: dhtorch demo. All commands: dhtorch --help"
 
 test: $(VENV)/.installed-dev lint
 	@echo "== tests (real sequences: $${DHTORCH_DATA:-DHTORCH_DATA is unset, their tests skip})"

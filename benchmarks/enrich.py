@@ -43,7 +43,7 @@ from dhtorch.testing.rosbag import write_rosbag
 from dhtorch.testing.simulator_hdf5 import write_simulator_hdf5
 
 FRAMES, STEP = 3, 2.0**-10
-SHORT = (f"frames={FRAMES}", "dense={size: 160}")
+SHORT = (f"max_frames={FRAMES}", "dense={size: 160}")
 TARGETS = {"lerobot v3.0": "lerobot", "lerobot v2.1": "v2.1", "nerfstudio": "nerfstudio", "the source's own": "same"}
 
 #: Sources in DHTORCH_DATA: name → what the command is told beside the path.

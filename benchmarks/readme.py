@@ -400,7 +400,7 @@ def enriched() -> str:
     for record in (record for record in json.loads(file.read_text()) if "refused" not in record):
         timed.setdefault(f"{record['processor']}, {record['cores']} cores", []).append(record["source"])
     processors = "; ".join(f"{name}: {', '.join(sorted(set(sources)))}" for name, sources in timed.items())
-    options = "`frames=3 'dense={size: 160}'`"
+    options = "`max_frames=3 'dense={size: 160}'`"
     return f"{grid}\n\n{options}; processor time, beside other work. {processors}."
 
 

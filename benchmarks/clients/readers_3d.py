@@ -39,7 +39,7 @@ Numbers = dict[str, float]
 def commands(source: str | None, out: Path) -> dict[str, list[str]]:
     """Output → the command that writes it, as words after ``dhtorch``."""
     data = ["data=synthetic", *ROOM] if source is None else ["data=auto", f"data.root={source}"]
-    enrich = [f"out={out / 'nerf'}", "format=nerfstudio", "report=false", "frames=6", *SMALL]
+    enrich = [f"out={out / 'nerf'}", "format=nerfstudio", "report=false", "max_frames=6", *SMALL]
     made = {
         "integrate": ["integrate", *data, "cutoff=2.0", f"output={out / 'map'}", *SMALL],
         "enrich": ["enrich", *data, *enrich],

@@ -555,9 +555,8 @@ def to_overrides(
             raise ValueError(f"{flag}: found an unknown option{near}, expected one listed by --help")
         if not sign:
             is_switch = full in known and known[full].is_switch
-            has_value = bool(words) and not (
-                words[0].startswith("--") or (is_switch and words[0] not in _SWITCH_VALUES)
-            )
+            is_value = bool(words) and not words[0].startswith("--")
+            has_value = is_value and (not is_switch or words[0] in _SWITCH_VALUES or words[0].startswith("{"))
             if not has_value and not is_switch:
                 raise ValueError(f"{flag}: found no value, expected {flag} VALUE")
             value = words.pop(0) if has_value else "true"

@@ -104,7 +104,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
             full disk.
         KeyboardInterrupt: Ctrl-C; complete episodes are kept.
     """
-    import_optional("pyarrow.parquet", extra="scale")
+    import_optional("pyarrow.parquet")
     _check_options(settings)
     work = _plan_job(settings, parts)
     rest = "complete episodes are kept; run the same command again for the rest"

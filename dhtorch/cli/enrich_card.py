@@ -145,7 +145,7 @@ def _loading(target: LeRobotTarget, info: Mapping[str, Any]) -> list[str]:
 
 def _first_intrinsics(target: LeRobotTarget) -> dict[str, list[float]]:
     """Camera -> fx, fy, cx, cy of the first row that has them."""
-    parquet = import_optional("pyarrow.parquet", extra="scale")
+    parquet = import_optional("pyarrow.parquet")
     file, intrinsics = target.file(0), {}
     names = set(parquet.read_schema(file).names)
     for key, view in target.views.items():

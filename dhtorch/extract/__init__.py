@@ -90,7 +90,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Call
         KeyboardInterrupt: Ctrl-C; finished shards stay.
     """
     options: ExtractOptions = parts["extract"]
-    import_optional("pyarrow.parquet", extra="scale")
+    import_optional("pyarrow.parquet")
     if not isinstance(settings["workers"], int) or settings["workers"] < 0:
         raise ValueError(f"workers: found {settings['workers']!r}, expected a whole number of at least 0")
     scenes = scenes_of(parts["data"])

@@ -87,7 +87,7 @@ def code_tables() -> dict[str, dict[int, str]]:
 
 def arrow_schema(wanted: Mapping[str, Column], metadata: Mapping[str, str]) -> Any:
     """Columns and metadata -> Arrow schema: fixed-size lists, unit and meaning in every field."""
-    pyarrow = import_optional("pyarrow", extra="scale")
+    pyarrow = import_optional("pyarrow")
     fields = [
         pyarrow.field(name, _arrow_type(pyarrow, c), nullable=False, metadata={"unit": c.unit, "about": c.about})
         for name, c in wanted.items()
@@ -97,7 +97,7 @@ def arrow_schema(wanted: Mapping[str, Column], metadata: Mapping[str, str]) -> A
 
 def arrow_table(rows: Iterable[Row], wanted: Mapping[str, Column], layout: Any) -> Any:
     """Rows (at least one) -> Arrow table with the schema of :func:`arrow_schema`."""
-    pyarrow = import_optional("pyarrow", extra="scale")
+    pyarrow = import_optional("pyarrow")
     rows = list(rows)
     arrays = []
     for name, column in wanted.items():

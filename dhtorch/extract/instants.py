@@ -12,7 +12,7 @@ from dhtorch.extract.origin import TABLE_GROUP_ROWS
 
 def iter_rows(parts: Sequence[Path]) -> Iterator[Row]:
     """Shards -> their rows in order, one group in memory at a time."""
-    parquet = import_optional("pyarrow.parquet", extra="scale")
+    parquet = import_optional("pyarrow.parquet")
     for path in parts:
         with parquet.ParquetFile(path) as file:
             for batch in file.iter_batches(batch_size=8):

@@ -186,7 +186,7 @@ class LeRobotSource:
 
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
         """As :meth:`DatasetSource.batches`; missing ``frame_index`` and ``task_index`` are added."""
-        pyarrow, dataset = import_optional("pyarrow", extra="scale"), import_optional("pyarrow.dataset", extra="scale")
+        pyarrow, dataset = import_optional("pyarrow"), import_optional("pyarrow.dataset")
         episode = self.episodes[i]
         table = dataset.dataset(str(episode.data), format="parquet")
         has_episodes = "episode_index" in table.schema.names
@@ -220,7 +220,7 @@ class LeRobotSource:
 
 def _with_frame_index(part: Any, done: int, first: float) -> Any:
     """Add ``frame_index`` to rows, counted from ``done``; time stamps are shifted to start at 0 if ``first`` is not."""
-    pyarrow = import_optional("pyarrow", extra="scale")
+    pyarrow = import_optional("pyarrow")
     stamp = part.column("timestamp").to_numpy()
     part = part.append_column("frame_index", pyarrow.array(done + np.arange(len(stamp))))
     if not first:
@@ -232,7 +232,7 @@ def _with_frame_index(part: Any, done: int, first: float) -> Any:
 
 def _with_task_index(part: Any) -> Any:
     """Add ``task_index`` 0 to rows without one."""
-    pyarrow = import_optional("pyarrow", extra="scale")
+    pyarrow = import_optional("pyarrow")
     if "task_index" in part.column_names:
         return part
     return part.append_column("task_index", pyarrow.array(np.zeros(part.num_rows, np.int64)))
@@ -248,7 +248,7 @@ def _read_tasks(meta: LeRobotMeta) -> list[str]:
             if row is not None:
                 tasks[files.get_entry(row, "task_index", int, lines)] = files.get_entry(row, "task", str, lines)
     elif table.is_file():
-        content = import_optional("pyarrow.parquet", extra="scale").read_table(table)
+        content = import_optional("pyarrow.parquet").read_table(table)
         names = [name for name in content.column_names if name != "task_index"]
         if "task_index" not in content.column_names or not names:
             raise FormatError(table, "columns", ", ".join(content.column_names), "task_index and task")
@@ -268,7 +268,7 @@ def _read_episode_tasks(meta: LeRobotMeta) -> dict[int, list[str]]:
             if isinstance(row.get("tasks"), list):
                 episode_tasks[row["episode_index"]] = [str(task) for task in row["tasks"]]
         return episode_tasks
-    parquet = import_optional("pyarrow.parquet", extra="scale")
+    parquet = import_optional("pyarrow.parquet")
     for table in sorted((meta.root / "meta" / "episodes").glob("*/*.parquet")):
         if "tasks" in parquet.read_schema(table).names:
             content = parquet.read_table(table, columns=["episode_index", "tasks"])

@@ -189,7 +189,7 @@ class LeRobotTarget:
 
     def own(self, k: int) -> Row | None:
         """As :meth:`DatasetTarget.own`."""
-        parquet = import_optional("pyarrow.parquet", extra="scale")
+        parquet = import_optional("pyarrow.parquet")
         try:
             metadata = parquet.read_metadata(self.file(k)).metadata or {}
             summary: Row = storage.parse_strict_json(metadata[_EPISODE_METADATA_KEY].decode())
@@ -199,7 +199,7 @@ class LeRobotTarget:
 
     def assemble(self, k: int, before: Sequence[Row], parts: Mapping[str, Sequence[Path]]) -> Row:
         """As :meth:`DatasetTarget.assemble`."""
-        parquet = import_optional("pyarrow.parquet", extra="scale")
+        parquet = import_optional("pyarrow.parquet")
         start = sum(each["length"] for each in before)
         tallies = {key: MapCounts() for key in self.views}
         moments: dict[str, FeatureMoments] = {}
@@ -279,7 +279,7 @@ class LeRobotTarget:
         policy: Mapping[str, PolicyColumnWriter],
     ) -> Iterator[Any]:
         """Rows of an episode from recordings, without instants that have an unreadable frame."""
-        pyarrow = import_optional("pyarrow", extra="scale")
+        pyarrow = import_optional("pyarrow")
         done = 0
         for group in iter_groups(iter_instants(rows_by_camera)):
             for shots in group:
@@ -318,7 +318,7 @@ class LeRobotTarget:
 
     def _cells(self, key: str, camera_rows: Sequence[Row | None], done: int) -> dict[str, Any]:
         """Camera and rows (None = unreadable) -> column → Arrow array of cells."""
-        pyarrow = import_optional("pyarrow", extra="scale")
+        pyarrow = import_optional("pyarrow")
         blanks, cells = blank_maps(self.views[key]), {}
         values: list[Any]
         for kind, column in self.keys[key].items():
@@ -345,7 +345,7 @@ class LeRobotTarget:
 
     def _renumber(self, table: Any, k: int, start: int) -> Any:
         """Number episodes from 0 and rows consecutively; changed numbers of the source are kept under ``source.``."""
-        pyarrow = import_optional("pyarrow", extra="scale")
+        pyarrow = import_optional("pyarrow")
         n = table.num_rows
         numbers = {"episode_index": np.full(n, k), "index": start + np.arange(n)}
         for name, values in numbers.items():
@@ -446,7 +446,7 @@ class LeRobotTarget:
 
     def finish(self, owns: Sequence[Row]) -> None:
         """As :meth:`DatasetTarget.finish`."""
-        parquet = import_optional("pyarrow.parquet", extra="scale")
+        parquet = import_optional("pyarrow.parquet")
         features = self.features(parquet.read_schema(self.file(0)).names)
         self._write_lenses()
         self._write_about(owns)

@@ -49,7 +49,7 @@ def write_shard(
     Returns:
         Number of rows by problem, and of the skipped ones as ``skipped``.
     """
-    parquet = import_optional("pyarrow.parquet", extra="scale")
+    parquet = import_optional("pyarrow.parquet")
     layout = arrow_schema(wanted, {_SHARED_METADATA_KEY.decode(): storage.dump_strict_json(shared)})
     problems = shared["codes"]["problem"]
     counts: Counter[str] = Counter()
@@ -103,7 +103,7 @@ def read_shard_metadata(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     Raises:
         FormatError: no shard of dhtorch extract, or a damaged one.
     """
-    parquet = import_optional("pyarrow.parquet", extra="scale")
+    parquet = import_optional("pyarrow.parquet")
     try:
         metadata = parquet.read_metadata(path).metadata or {}
         return storage.parse_strict_json(metadata[_SHARED_METADATA_KEY].decode()), storage.parse_strict_json(

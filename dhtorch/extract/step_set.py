@@ -85,7 +85,7 @@ class RldsSource:
 
     def batches(self, i: int, tasks: list[str]) -> Iterator[Any]:
         """As :meth:`DatasetSource.batches`."""
-        pyarrow = import_optional("pyarrow", extra="scale")
+        pyarrow = import_optional("pyarrow")
         steps = self._steps(i)
         n = steps.n if self.limit is None else min(steps.n, self.limit)
         for start in range(0, n, TABLE_GROUP_ROWS):
@@ -128,7 +128,7 @@ def _column_name(name: str, picture: bool = False) -> str:
 
 def _read_cells(steps: EpisodeSteps, name: str, part: range) -> Any:
     """Feature and range of steps -> Arrow array."""
-    pyarrow = import_optional("pyarrow", extra="scale")
+    pyarrow = import_optional("pyarrow")
     values = steps.values(name, part)
     kind = steps.features[name].kind
     if kind == "image":

@@ -451,7 +451,7 @@ def _check_settings(settings: Mapping[str, Any]) -> None:
     file_from_world(settings["axes"], (0.0, 1.0, 0.0))
     DenseSweep.from_options(settings["dense"])
     if settings["mesh"] and not should_mesh(None):
-        raise ImportError("mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'")
+        raise ImportError("mesh: found no scikit-image, expected it: pip install scikit-image")
     integrate.extract_points(
         integrate.make_volume(settings["voxel"] or _MIN_VOXEL_M, truncation=settings["truncation"]),
         min_weight=settings["min_weight"],

@@ -80,7 +80,7 @@ def extract_mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
         from skimage.measure import marching_cubes  # noqa: PLC0415
     except ImportError as error:
         raise ImportError(
-            "extract_mesh: found no scikit-image, expected the extra: pip install 'dhtorch[mesh]'"
+            "extract_mesh: found no scikit-image, expected it: pip install scikit-image"
         ) from error
     vertices, faces, count = [], [], 0
     for origin, distance, observed in _dense_bricks(volume, min_weight):

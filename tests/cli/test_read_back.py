@@ -90,7 +90,7 @@ def test_enrich(format: str, tum: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("format", ["nerfstudio", "lerobot"])
 def test_enrich_of_a_real_capture(format: str, tmp_path: Path) -> None:
     out, options = tmp_path / "out", ["method=paper", "method.n=64", "method.hypotheses=10", "dense=false"]
-    assert main(["enrich", str(HOLO), str(out), *options, "gap=1", "frames=2", f"format={format}"]) == 0
+    assert main(["enrich", str(HOLO), str(out), *options, "gap=1", "max_frames=2", f"format={format}"]) == 0
     source, back = data.open(HOLO), data.open(out)
     assert torch.equal(back.number, source.number[:2]) and (source.times is None) == (back.times is None)
     for i in range(2):

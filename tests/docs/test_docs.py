@@ -125,7 +125,7 @@ def test_every_experiment_has_its_row_and_words(site):
 def test_the_command_s_help_is_shown(site):
     _, pages = site
     shown = text_of(pages["command.html"])
-    for words in ("dhtorch inspect", "--multirun", "extract.engine", "voxel", "-q, --quiet", "130"):
+    for words in ("dhtorch inspect", "--multirun", "--engine", "voxel", "-q, --quiet", "130"):
         assert words in shown, words
 
 

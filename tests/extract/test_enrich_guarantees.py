@@ -234,7 +234,7 @@ def test_two_writers_do_not_share_a_folder(robot, whole, tmp_path, capsys):
 def test_the_past_alone_counts_and_of_the_same_episode(robot, whole, tmp_path):
     keys = [f"{FRONT}_depth_enriched", f"{FRONT}_dhtorch_source"]
     every = read_rows(whole)
-    short = read_rows(enrich(robot, tmp_path / "short", "frames=2"))
+    short = read_rows(enrich(robot, tmp_path / "short", "max_frames=2"))
     assert [row["episode_index"] for row in short] == [0, 0, 1, 1]
     assert [row["source.index"] for row in short] == [0, 1, 3, 4] and [row["index"] for row in short] == [0, 1, 2, 3]
     for row, same in zip(short, [every[0], every[1], every[3], every[4]], strict=True):
@@ -486,7 +486,7 @@ def test_a_row_is_taken_by_its_own_frame_alone():
         (["cameras=true"], "two or more cameras of one image size"),
         (["pose_sigma=[0.01,0.02]"], "pose=near"),
         (["pose=device", "pose_sigma=[0.01]"], "pose_sigma"),
-        (["frames=0"], "frames"),
+        (["max_frames=0"], "max_frames"),
         (["fps=0"], "fps"),
         (["pose=robot"], "near, device, start"),
     ],

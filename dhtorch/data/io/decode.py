@@ -67,11 +67,11 @@ class ImageHeader(NamedTuple):
     orientation: int = 1  # EXIF's, 1 to 8: how the stored pixels are to be turned for display; 1 = not at all
 
 
-def import_optional(*libraries: str, extra: str = "data") -> ModuleType:
-    """Import the first installed one of ``libraries``: decoders of rare formats are optional dependencies.
+def import_optional(*libraries: str, extra: str | None = None) -> ModuleType:
+    """Import the first installed one of ``libraries``, which only some formats need.
 
     Raises:
-        ImportError: none is installed; the message names the extra that installs one.
+        ImportError: none is installed; the message names what installs one: an extra, or without ``extra`` the package.
     """
     for library in libraries:
         try:
@@ -79,7 +79,8 @@ def import_optional(*libraries: str, extra: str = "data") -> ModuleType:
         except ImportError:
             continue
     names = " or ".join(libraries)
-    raise ImportError(f"this format needs {names}, which is not installed: pip install 'dhtorch[{extra}]'")
+    wanted = libraries[0].partition(".")[0] if extra is None else f"'dhtorch[{extra}]'"
+    raise ImportError(f"this format needs {names}, which is not installed: pip install {wanted}")
 
 
 def set_opencv_threads(threads: int) -> None:
