@@ -12,14 +12,62 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from dhtorch.data.io.decode import FormatError
 from dhtorch.data.recording import Recording, Recordings
 from dhtorch.data.scene import Scene, Scenes
-from dhtorch.runtime.console import get_verbosity
+from dhtorch.runtime.console import format_count, get_verbosity
 from dhtorch.validation.capture_check import CaptureCheck, check_capture
 
 #: Recordings of one data set that are checked: episodes of a set are written by one program. Limits the time at the
 #: start of a command to some seconds. Source: origin not recorded.
 _MAX_CHECKED_RECORDINGS = 12
+
+#: Frames of a recording that are examined for depth. Limits the time. Source: origin not recorded.
+_MAX_EXAMINED_FRAMES = 4
+
+NEEDS_DEPTH = "sensor depth of near surfaces is required for metric scale"
+
+
+def require_depth(scenes: Sequence[Scene]) -> None:
+    """Raise an error if no recording of a command from disk has depth; print those of several that have none.
+
+    Raises:
+        ValueError: none of the examined recordings has depth.
+    """
+    missing: list[str] = []
+    n_examined = min(len(scenes), _MAX_CHECKED_RECORDINGS)
+    for k in range(n_examined):
+        recording = scenes[k].recording
+        if recording.root is None or (n := _count_without_depth(recording)) is None:
+            if isinstance(scenes, Scenes):
+                return  # opened lazily: the first with depth is enough
+            continue
+        missing.append(describe_missing_depth(recording, n))
+    if missing and len(missing) == n_examined:
+        more = f" ({n_examined} recordings examined)" if n_examined > 1 else ""
+        raise ValueError(f"{missing[0]}{more}")
+    for line in missing:
+        warnings.warn(line, stacklevel=2)
+
+
+def describe_missing_depth(recording: Recording, n: int) -> str:
+    """The message on a recording of whose ``n`` examined frames none has depth."""
+    what = f"{format_count(len(recording), 'frame')}, none of the {n} examined has depth"
+    return f"{recording.name}: {what}; {NEEDS_DEPTH}"
+
+
+def _count_without_depth(recording: Recording) -> int | None:
+    """Number of examined frames if none has depth; None where one has, or where no frame can be read."""
+    n, step = 0, max(1, len(recording) // _MAX_EXAMINED_FRAMES)
+    for k in range(0, len(recording), step):
+        try:
+            frame = recording[k]
+        except FormatError:
+            continue
+        if bool((frame.depth > 0).any()):
+            return None
+        n += 1
+    return n or None
 
 
 def check_data(data: Any) -> Any:

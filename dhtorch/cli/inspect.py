@@ -26,7 +26,7 @@ from torch import Tensor
 from dhtorch import data
 from dhtorch.data import FormatError
 from dhtorch.data import intrinsics as intrinsics_options
-from dhtorch.data.foreign_files import describe_foreign_file
+from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file
 from dhtorch.data.io import decode as files
 from dhtorch.data.io import safe_open as doors
 from dhtorch.data.recording import Recording
@@ -143,8 +143,8 @@ def find_captures(path: Path, follow_links: bool = False) -> list[FoundCapture]:
                 return captures
         level = [entry for entry in inside if entry.is_dir()]
     content, remedy = _describe_content(path)
-    known_formats = ", ".join((*data.FORMATS, *formats.STACK_FORMATS))
-    raise FormatError(path, "content", content, remedy or f"one of {known_formats}, or images")
+    expected = f"{PHONE_EXPORTS}; or one of the {len(data.FORMATS)} formats of docs/data.md"
+    raise FormatError(path, "content", content, remedy or expected)
 
 
 def _describe_content(path: Path) -> tuple[str, str | None]:

@@ -22,15 +22,17 @@ import torch
 from dhtorch import export
 from dhtorch.cli import complete, recover_page
 from dhtorch.cli import completed_folder as completed
-from dhtorch.cli.capture_checks import print_check
+from dhtorch.cli.capture_checks import NEEDS_DEPTH, describe_missing_depth, print_check
 from dhtorch.cli.complete import Progress
 from dhtorch.cli.completed_folder import CompletionTask
 from dhtorch.cli.inspect import FoundCapture, classify_images, find_captures
 from dhtorch.codes import Source
 from dhtorch.data import FORMATS, FormatError, open_all
+from dhtorch.data.foreign_files import PHONE_EXPORTS
 from dhtorch.data.io import decode as files
 from dhtorch.data.recording import Recording
 from dhtorch.data.scene import Scene
+from dhtorch.experiments.focal.image_folder import list_camera_files
 from dhtorch.geometry import se3
 from dhtorch.integrate.from_maps import FrameMap, fuse_frame_maps
 from dhtorch.integrate.mapping import choose_voxel, file_from_world, should_mesh, surface_shape, write_surface
@@ -183,8 +185,11 @@ def _find_recording_captures(path: Path, format: str = "auto") -> list[FoundCapt
             f"{format_count(len(pictures), 'picture')} and {format_count(len(depths), 'depth map')} of no known format"
         )
         raise NothingToRecover(f"{path}: {what}; a layout of docs/data.md is required, e.g. rgb/ beside depth/")
+    camera_files = list_camera_files(captures[0].path)
     what = f"{format_count(len(pictures), 'picture')} without depth"
-    raise NothingToRecover(f"{path}: {what}; sensor depth of near surfaces is required for metric scale (docs/data.md)")
+    what += f" (cameras in {', '.join(camera_files[:3])})" if camera_files else ""
+    remedy = "" if camera_files else f" ({PHONE_EXPORTS})"
+    raise NothingToRecover(f"{path}: {what}; {NEEDS_DEPTH}{remedy}")
 
 
 def _open_captures(captures: Sequence[FoundCapture]) -> tuple[list[FoundRecording], list[str]]:
@@ -272,8 +277,7 @@ def _find_usable_frame(recording: Recording) -> int:
             return k
         n_without_depth += 1
     if n_without_depth:
-        what = f"{format_count(len(recording), 'frame')}, none of the {n_without_depth} examined has depth"
-        raise NothingToRecover(f"{recording.name}: {what}; sensor depth of near surfaces is required for metric scale")
+        raise NothingToRecover(describe_missing_depth(recording, n_without_depth))
     raise NothingToRecover(f"{recording.name}: no frame can be read: {causes[0]}")
 
 

@@ -60,6 +60,12 @@ _POSITIONAL_OPTIONS = {
 #: Sub-commands whose recordings are subsampled by ``every`` and ``max_frames`` before they run → whether by the latter.
 _SUBSAMPLED_COMMANDS = {"extract": True, "integrate": True, "stream": True, "view": False}
 
+#: Sub-commands whose result is empty without sensor depth.
+_DEPTH_COMMANDS = ("align", "complete", "enrich", "integrate", "stream")
+
+#: Experiments that hide sensor depth and recover it.
+_DEPTH_EXPERIMENTS = ("pair", "range_split", "method_comparison")
+
 #: Sub-commands that compute in data-loader processes, on the CPU.
 _CPU_COMMANDS = ("enrich", "extract")
 
@@ -276,14 +282,17 @@ def _run_configured(word: str, argv: list[str]) -> int:
 
 def _prepare_data(name: str, settings: Mapping[str, Any], data: Any) -> Any:
     """The scenes of a sub-command, with the wanted frames, and checked."""
-    from dhtorch.cli.capture_checks import check_data  # noqa: PLC0415
+    from dhtorch.cli.capture_checks import check_data, require_depth  # noqa: PLC0415
     from dhtorch.data.scene import scenes_of  # noqa: PLC0415
     from dhtorch.extract.cut import subsample_scenes  # noqa: PLC0415
 
     if name in _SUBSAMPLED_COMMANDS:
         max_frames = settings["max_frames"] if _SUBSAMPLED_COMMANDS[name] else None
         data = subsample_scenes(scenes_of(data), settings["every"], max_frames)
-    return check_data(data)
+    data = check_data(data)
+    if name in _DEPTH_COMMANDS and settings.get("pose", "near") == "near":
+        require_depth(scenes_of(data))
+    return data
 
 
 def _check_device(name: str, device: str) -> None:
@@ -521,6 +530,7 @@ def _run_job(cfg: Any) -> Any:
     console.ignore_foreign_warnings()
     console.configure_logging()
     from dhtorch.cli import job  # noqa: PLC0415
+    from dhtorch.data.scene import scenes_of  # noqa: PLC0415
 
     runtime = HydraConfig.get().runtime
     swept = not OmegaConf.is_missing(HydraConfig.get().job, "num")  # only jobs of a sweep are numbered
@@ -530,6 +540,10 @@ def _run_job(cfg: Any) -> Any:
         words.validate_values(settings)
         _check_device("run", settings["device"])
         parts = _instantiate_parts(cfg, ("data", "method", "pairs", "experiment"))
+        if runtime.choices["experiment"] in _DEPTH_EXPERIMENTS:
+            from dhtorch.cli.capture_checks import require_depth  # noqa: PLC0415
+
+            require_depth(scenes_of(parts["data"]))
         scenes = len(parts["data"]) if isinstance(parts["data"], Sequence) else 1
         progress = together.record_progress(sweep, name, scenes) if swept else console.progress
         _LOG.debug("job in %s: %s", runtime.output_dir, HydraConfig.get().job.override_dirname or "defaults")

@@ -17,7 +17,7 @@ from typing import Any, Final, Protocol
 
 from dhtorch.data import intrinsics as intrinsics_options
 from dhtorch.data.corrections import Corrections
-from dhtorch.data.foreign_files import describe_foreign_file
+from dhtorch.data.foreign_files import PHONE_EXPORTS, describe_foreign_file
 from dhtorch.data.io.decode import FormatError
 from dhtorch.data.io.safe_open import record_opened_files, restrict_links
 from dhtorch.data.readers import (
@@ -118,6 +118,9 @@ _SCENES_ROOT_VARIABLE: Final = "DHTORCH_DATA"
 
 #: Unset intrinsics options: passed by settings for all formats, ignored by readers without these options.
 _UNSET_INTRINSICS = [(name, None) for name in intrinsics_options.INTRINSICS_OPTIONS]
+
+#: Names of folders with the images of a recording.
+_IMAGE_FOLDERS: Final = ("images", "image", "rgb", "color", "colour")
 
 _MAX_NAMES_SHOWN = 4  # names of recordings in a message
 
@@ -251,9 +254,11 @@ def recognise(root: str | Path, *, follow_links: bool = False) -> tuple[str, str
             if evidence := reader.recognise(root):
                 return name, evidence
     foreign = describe_foreign_file(root) if root.is_file() else None
-    listing = sorted(entry.name for entry in root.iterdir())[:6] if root.is_dir() else []
-    content = ", ".join(listing) if root.is_dir() else f"a {root.suffix or 'plain'} file"
-    expected = f"one of {', '.join(FORMATS)} (dhtorch inspect searches subfolders)"
+    listing = sorted(entry.name for entry in root.iterdir()) if root.is_dir() else []
+    content = ", ".join(listing[:6]) if root.is_dir() else f"a {root.suffix or 'plain'} file"
+    if any(name in listing for name in _IMAGE_FOLDERS) and not any("depth" in name.lower() for name in listing):
+        content += " (no depth)"
+    expected = f"{PHONE_EXPORTS}; or one of the {len(FORMATS)} formats of docs/data.md"
     remedy = foreign.remedy if foreign else None
     raise FormatError(root, "format", foreign.what if foreign else content or "an empty folder", remedy or expected)
 

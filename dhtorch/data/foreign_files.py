@@ -38,6 +38,17 @@ _CONVERTERS: Final = {
     ".vrs": ("a VRS recording", "vrs extract-all {} --to FOLDER (github.com/facebookresearch/vrs)"),
     ".bag.active": ("a ROS 1 bag that was not closed", "rosbag reindex {}"),
 }
+#: What to export from the apps of phones.
+PHONE_EXPORTS: Final = (
+    "from a phone: Record3D's .r3d or EXR + RGB export, Stray Scanner's folder, Polycam's raw data (developer mode on "
+    "before the scan; unzip it). Scaniverse exports finished models only: scan with one of these"
+)
+
+#: Endings of finished models, which no longer have the frames they were made from.
+_MODEL_SUFFIXES: Final = (
+    *(".usdz", ".usdc", ".usda", ".obj", ".fbx", ".stl", ".glb", ".gltf", ".dae", ".ply", ".las", ".laz", ".e57"),
+    *(".splat", ".spz", ".pts", ".xyz"),
+)
 _VIDEO_SUFFIXES: Final = (".mp4", ".mov", ".avi", ".mkv", ".webm")
 _NO_DEPTH: Final = "sensor depth of near surfaces is required for metric scale"
 
@@ -47,10 +58,13 @@ class ForeignFile(NamedTuple):
 
     what: str
     command: str | None = None
+    export: str | None = None  # what to export instead
 
     @property
     def remedy(self) -> str | None:
-        """What an error names as expected; None without a command."""
+        """What an error names as expected; None where there is neither a command nor another export."""
+        if self.export is not None:
+            return self.export
         return None if self.command is None else f"the files that this command writes: {self.command}"
 
 
@@ -61,7 +75,18 @@ def describe_foreign_file(file: Path) -> ForeignFile | None:
     if ends:
         what, command = _CONVERTERS[max(ends, key=len)]
         return ForeignFile(what, command.format(file.name))
-    return ForeignFile(_describe_video(file)) if file.suffix.lower() in _VIDEO_SUFFIXES else None
+    if file.suffix.lower() in _MODEL_SUFFIXES:
+        return ForeignFile("a finished 3D model without its frames", export=f"the frames, {PHONE_EXPORTS}")
+    return (
+        ForeignFile(_describe_video(file), export=_export_of_video(file))
+        if file.suffix.lower() in _VIDEO_SUFFIXES
+        else None
+    )
+
+
+def _export_of_video(file: Path) -> str | None:
+    """What to export instead of a phone's plain video; None for videos of other devices."""
+    return f"colour and depth, {PHONE_EXPORTS}" if file.suffix.lower() in (".mp4", ".mov") else None
 
 
 def _describe_video(file: Path) -> str:

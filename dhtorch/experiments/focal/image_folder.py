@@ -18,17 +18,37 @@ _MAX_CHECKED_IMAGES = 16  # number of images whose headers are compared when rec
 _DEPTH_FOLDERS = ("depth", "depths", "depth_maps")
 _IMAGE_PATTERN = re.compile(r"[^.].*\.(png|jpe?g|tiff?)", re.IGNORECASE)
 
+#: Files with intrinsics or poses, which a focal stack of one still camera does not have.
+_CAMERA_FILES = (
+    *("K.txt", "intrinsics.txt", "intrinsics.json", "camera.json", "cameras.json", "calibration.txt"),
+    *("poses.txt", "pose", "poses", "trajectory.txt", "traj.txt", "groundtruth.txt", "transforms.json"),
+    *("cameras.txt", "cameras.bin", "images.txt", "images.bin", "sparse", "odometry.csv", "camera_matrix.csv"),
+)
+
+#: Names of image folders of a recording, whose camera files lie in the folder above.
+_IMAGE_FOLDERS = ("images", "image", "rgb", "color", "colour", "frames")
+
 
 def recognise(root: Path) -> str | None:
     """Text of the evidence that ``root`` is a stack of this format; None without evidence."""
     if any((root / name).is_dir() for name in _DEPTH_FOLDERS):
         return None  # an RGB-D recording
+    if list_camera_files(root):
+        return None  # a moving camera
     pictures = sorted(_image_files(root), key=files.natural_sort_key)
     sampled = pictures[:: max(1, len(pictures) // _MAX_CHECKED_IMAGES)]
     kinds = {_image_kind(file) for file in (*sampled, *pictures[-1:])}
     if len(pictures) < 2 or None in kinds or len(kinds) != 1:
         return None
     return f"{len(pictures)} pictures of one size"
+
+
+def list_camera_files(folder: Path) -> list[str]:
+    """Names of files with the intrinsics or poses of images, in their folder or in that above ``images/``."""
+    if not folder.is_dir():
+        return []
+    above = [folder.parent] if folder.name.lower() in _IMAGE_FOLDERS else []
+    return [name for place in (folder, *above) for name in _CAMERA_FILES if (place / name).exists()]
 
 
 def read(root: str | Path, *, focus_m: Sequence[float] | None = None) -> FocalStacks:
