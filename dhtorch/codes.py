@@ -9,6 +9,7 @@ new code has a text everywhere and, until ``viz.plots.colours`` defines one for 
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
@@ -240,6 +241,43 @@ def names(table: type) -> dict[int, str]:
     """``{code: name}`` of a code table, in numeric order; composite masks are left out for bit sets."""
     pairs = {v: k for k, v in vars(table).items() if k.isupper() and isinstance(v, int) and k != "UNUSABLE"}
     return dict(sorted(pairs.items()))
+
+
+def name(column: str | type[CodeTable], value: Any) -> Any:
+    """Names of integer codes, as loaders, features and estimates hold them.
+
+    Args:
+        column: name of the column (``gate``, ``hole``, ``dhtorch.source_map``, …), or the code table.
+        value: an int, a tensor or an array of integers.
+
+    Returns:
+        The name; nested lists of names for a tensor or an array. Bits of a flag are joined by ``|``; ``""`` = none.
+
+    Raises:
+        ValueError: a column without codes, or a code that its table does not have.
+    """
+    table = column if isinstance(column, type) else _find_table(column)
+    codes = value.tolist() if hasattr(value, "tolist") else value
+    return [name(table, each) for each in codes] if isinstance(codes, list) else _name_code(table, int(codes))
+
+
+def _find_table(column: str) -> type[CodeTable]:
+    """The code table of a column, with or without the prefix of a sample's keys."""
+    plain = column.rpartition(".")[2].removeprefix("dh_").removesuffix("_map")
+    tables = {re.sub(r"(?<!^)(?=[A-Z])", "_", table.__name__).lower(): table for table in CodeTable.__subclasses__()}
+    tables |= {key.removeprefix("sample_").removeprefix("wrong_"): table for key, table in tables.items()}
+    if plain not in tables:
+        raise ValueError(f"codes: found the column {column!r}, expected one of {', '.join(tables)}")
+    return tables[plain]
+
+
+def _name_code(table: type[CodeTable], value: int) -> str:
+    known = names(table)
+    if table is Flag:
+        return "|".join(text for bit, text in known.items() if value & bit)
+    if value not in known:
+        raise ValueError(f"{table.__name__}: found the code {value}, expected one of {', '.join(map(str, known))}")
+    return known[value]
 
 
 def words(name: str) -> str:

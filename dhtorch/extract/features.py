@@ -62,6 +62,9 @@ class FeatureTable(Sequence[dict[str, Tensor]]):
         pairs = zip(self.place["episode_index"].tolist(), self.place["frame_index"].tolist(), strict=True)
         self._row = {pair: i for i, pair in enumerate(pairs)}
 
+    def __repr__(self) -> str:
+        return f"FeatureTable({len(self)} rows of {self.files[0].parent}: {', '.join(self.columns)})"
+
     def __len__(self) -> int:
         return int(self._starts[-1])
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any
 
 from torch import Tensor
@@ -26,6 +27,12 @@ class Method(MethodSpec):
 
     The defaults are the paper's (:data:`dhtorch.pipeline.presets.PAPER`).
     """
+
+    def __repr__(self) -> str:
+        stages = {field.name: getattr(self, field.name) for field in fields(self)}
+        shown = {name: _component_name(stage) for name, stage in stages.items() if callable(stage)}
+        used = ", ".join(f"{name}={text}" for name, text in shown.items() if name != "fuse" or self.views > 1)
+        return f"Method(n={self.n}, views={self.views}, {used})"
 
     def __call__(
         self,
@@ -87,3 +94,10 @@ class Method(MethodSpec):
         clock("complete", joint)
         trace |= {"sparse": estimate, "estimate": joint, "dense": depth_map}
         return joint
+
+
+def _component_name(stage: Any) -> str:
+    """Name of a stage's function; a ``functools.partial`` is named by its function."""
+    while isinstance(stage, partial):
+        stage = stage.func
+    return getattr(stage, "__name__", type(stage).__name__)

@@ -147,6 +147,7 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
         """Item ``i``, with ``gap`` plus the source view from an earlier item."""
         sample = self.dataset[i]
         if self.gap is None:
+            self._require_source_view(sample)
             return sample
         earlier = self.dataset[i - self.gap] if i >= self.gap else sample
         same = i >= self.gap and self._episode(earlier) == self._episode(sample)
@@ -155,6 +156,18 @@ class ExtendedDataset(_DatasetWrapper, Dataset[Any]):
         if len(self._gap_keys) > len(values):
             values.append(get_value(source, str(views.pose)))
         return {**sample, **dict(zip(self._gap_keys, values, strict=True))}
+
+    def _require_source_view(self, sample: Mapping[str, Any]) -> None:
+        """Raise SampleError for an item without the source view, which a ``gap`` would add."""
+        other = self.transform.views.other_image
+        if isinstance(other, str) and not has_key(sample, other):
+            expected = "gap=N, the items from the source view to the reference view, or that key in the items"
+            raise SampleError(f"{other}: found no such key and no gap, expected {expected}")
+
+    def __repr__(self) -> str:
+        gap = "the source view in each item" if self.gap is None else f"the source view {self.gap} items before"
+        gap = gap if self.transform.views.other_image is not None else "no source view"
+        return f"ExtendedDataset({len(self)} items of {type(self.dataset).__name__}, {gap}, {self.transform!r})"
 
     def _episode(self, sample: Mapping[str, Any]) -> int:
         return 0 if self.episode_key is None else int(get_value(sample, self.episode_key))

@@ -118,6 +118,11 @@ class ExtendDepth(torch.nn.Module):
         self.tally = ProblemCounts()
         self._seen_hw: tuple[int, int] | None = None
 
+    def __repr__(self) -> str:
+        dense = "" if self.maps is None else ", dense maps"
+        keys = ", ".join(str(key) for key in self.views.keys())
+        return f"ExtendDepth({self.method!r}{dense}; reads {keys}; adds {self.prefix}*)"
+
     def with_options(self, *, depth_unit: str | float | None = None, batched: bool | None = None) -> ExtendDepth:
         """The same transform with another unit or for batches; networks and counts of problems are shared.
 

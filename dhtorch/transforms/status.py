@@ -9,16 +9,16 @@ import torch
 from torch import Tensor
 from torch.utils.data import get_worker_info
 
-from dhtorch.codes import names
+from dhtorch.codes import CodeTable, code, names
 
 
-class SampleProblem:
+class SampleProblem(CodeTable):
     """Codes of ``problem``: the worst problem of a sample."""
 
-    NONE: Final = 0
-    NO_SECOND_VIEW: Final = 1  #: front end only: one frame, or the source view only pads the episode
-    NO_DEPTH: Final = 2  #: the sensor has no return at all
-    UNREADABLE: Final = 3  #: left out; all added numbers are 0
+    NONE: Final = code(0, "none")
+    NO_SECOND_VIEW: Final = code(1, "front end only: one frame, or the source view only pads the episode")
+    NO_DEPTH: Final = code(2, "the sensor has no return at all")
+    UNREADABLE: Final = code(3, "left out; all added numbers are 0")
 
 
 #: Rows of the table of counts; more workers than rows share a row, and may then lose counts.
@@ -36,8 +36,8 @@ class ProblemCounts:
         worker = get_worker_info()
         row = 0 if worker is None else 1 + worker.id % (_MAX_COUNT_ROWS - 1)
         counts = self.counts[row].numpy()  # numpy: several torch operations per sample cost more
-        for code in problem.tolist():
-            counts[code] += 1
+        for number in problem.tolist():
+            counts[number] += 1
 
     def report(self) -> dict[str, int]:
         """Number of samples by problem, summed over all workers."""

@@ -35,7 +35,7 @@ def blind(tmp_path_factory):
     ],
 )
 def test_a_capture_without_depth_is_announced(command, blind, tmp_path, words):
-    code, out, err = command(*(str(blind) if word == "PATH" else word for word in words), "--quiet")
+    code, _, err = command(*(str(blind) if word == "PATH" else word for word in words), "--quiet")
     line = err.strip().splitlines()[-1]
     assert code == 2 and "blind: 4 frames, none of the 4 examined has depth; sensor depth" in line, err
     assert not (tmp_path / "o").exists()
@@ -65,7 +65,7 @@ def test_a_phone_s_model_or_video_names_what_to_export(command, tmp_path, name):
 
 def test_a_missing_decoder_names_its_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(ImportError, match="needs OpenEXR, which is not installed: pip install OpenEXR$"):
+    with pytest.raises(ImportError, match=r"needs OpenEXR, which is not installed: pip install OpenEXR$"):
         decode.import_optional("OpenEXR")
     with pytest.raises(ImportError, match=r"pip install 'dhtorch\[robot\]'"):
         decode.import_optional("no_such_library", extra="robot")
