@@ -4,8 +4,8 @@
         [--minutes N] [--json benchmarks/results/front_door.json]
 
 Only what README, docs/command.md, ``--help`` or the output of an earlier command show is typed, as a process of its own
-in an empty folder, with few frames. A role ends in ``ok``, in one sentence with exit code 2 (``said``), or it ``failed``:
-another exit code, a traceback, more than one line, or a sentence without what was expected. Results are added to the
+in an empty folder, with few frames. A role ends in ``ok``, in one sentence with exit code 2 (``said``), or it
+``failed``: another exit code, a traceback, more than one line, or a sentence without what was expected. Results are added to the
 file, so that several runs complete it; captures of another commit are measured again.
 """
 

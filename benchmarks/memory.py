@@ -44,7 +44,14 @@ def measure(frames: int) -> dict[str, Any]:
             room._frames.clear()  # the room keeps what it has rendered, a recording in files does not
 
     room = SyntheticRoom(n_frames=frames, hw=HW, depth_hw=HW)
-    settings = {"steps": (1, 2, 3, 5, 8), "seed": 0, "max_frames": None, "dtype": "float32", "device": "cpu", "cutoff": 2.0}
+    settings = {
+        "steps": (1, 2, 3, 5, 8),
+        "seed": 0,
+        "max_frames": None,
+        "dtype": "float32",
+        "device": "cpu",
+        "cutoff": 2.0,
+    }
     summary = stream_scene(Scene(room, near=2.0), MAP.replace(n=SAMPLES), settings, progress=watched)
     return {
         "name": "stream_recording",

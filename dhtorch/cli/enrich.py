@@ -46,8 +46,8 @@ _FORMAT_VERSION = 1
 _OUTPUT_FORMATS: dict[str, int | None] = {"lerobot": 3, "v3.0": 3, "lerobot_v2.1": 2, "v2.1": 2, "nerfstudio": None}
 
 #: Options that determine what is written; they enter the key.
-_KEY_OPTIONS = ("data", "method", "seed", "format", "dense", "causal", "gap", "cameras", "pose", "pose_sigma", "columns",
-         "max_frames", "every", "maps", "step", "fps", "task", "on_error")  # fmt: skip
+_KEY_OPTIONS = ("data", "method", "seed", "format", "dense", "causal", "gap", "cameras", "pose", "pose_sigma",
+         "columns", "max_frames", "every", "maps", "step", "fps", "task", "on_error")  # fmt: skip
 
 #: File of the shared metadata.
 _METADATA_FILE = "dhtorch.json"

@@ -79,9 +79,7 @@ def extract_mesh(volume: Volume, *, min_weight: float = 0.0) -> Surface:
     try:
         from skimage.measure import marching_cubes  # noqa: PLC0415
     except ImportError as error:
-        raise ImportError(
-            "extract_mesh: found no scikit-image, expected it: pip install scikit-image"
-        ) from error
+        raise ImportError("extract_mesh: found no scikit-image, expected it: pip install scikit-image") from error
     vertices, faces, count = [], [], 0
     for origin, distance, observed in _dense_bricks(volume, min_weight):
         cell = _meshable_cells(distance, observed, _MAX_STEP_TRUNCATIONS * volume.truncation)

@@ -120,7 +120,7 @@ class ExtendDepth(torch.nn.Module):
 
     def __repr__(self) -> str:
         dense = "" if self.maps is None else ", dense maps"
-        keys = ", ".join(str(key) for key in self.views.keys())
+        keys = ", ".join(map(str, self.views.keys()))
         return f"ExtendDepth({self.method!r}{dense}; reads {keys}; adds {self.prefix}*)"
 
     def with_options(self, *, depth_unit: str | float | None = None, batched: bool | None = None) -> ExtendDepth:

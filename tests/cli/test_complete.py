@@ -368,7 +368,14 @@ def test_bad_options_are_named_and_leave_nothing(captures, tmp_path, option, sai
 
 
 def test_the_command_takes_a_path_and_ends_bad_input_in_one_line(captures, tmp_path, capsys):
-    words = ["complete", str(captures / "numbered"), f"out={tmp_path / 'maps'}", "max_frames=1", "method=map", "method.n=256"]
+    words = [
+        "complete",
+        str(captures / "numbered"),
+        f"out={tmp_path / 'maps'}",
+        "max_frames=1",
+        "method=map",
+        "method.n=256",
+    ]
     assert run.main([*words, "planes=16", "figures=false"]) == 0
     assert "1 frame of 160x120" in capsys.readouterr().out and len(data.open(tmp_path / "maps")) == 1
     for bad in (["planes=24"], ["siez=3"]):

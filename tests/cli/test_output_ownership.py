@@ -35,7 +35,10 @@ COMMANDS = {
         "view.html",
     ),
     "align": (["align", *ROOM, "depth=MAPS", "out=OUT", "max_frames=1", "steps=[1]", "method.n=256"], "align.html"),
-    "validate": (["validate", *ROOM, "max_frames=1", "window=0", "size=96", "method.n=256", "output=OUT"], "validate.json"),
+    "validate": (
+        ["validate", *ROOM, "max_frames=1", "window=0", "size=96", "method.n=256", "output=OUT"],
+        "validate.json",
+    ),
     "stream": (["stream", *ROOM, "max_frames=2", "method.n=256", "output=OUT"], "stream.json"),
     "run": (["run", *PAIR, "output=OUT"], "result.json"),
     "sweep": (["-m", *PAIR, "seed=0,1", "output=OUT"], "multirun.yaml"),

@@ -74,7 +74,14 @@ def test_a_guessed_camera_is_told_on_the_page_and_one_frame_is_one(tmp_path, roo
     capture = tmp_path / "capture"
     writers.write_counted_frames(capture, [room[0], room[3]])
     (capture / "K.txt").unlink()
-    words = ["data=frames_dir", f"data.root={capture}", "data.fov=60", *LITTLE, "max_frames=1", f"output={tmp_path / 'out'}"]
+    words = [
+        "data=frames_dir",
+        f"data.root={capture}",
+        "data.fov=60",
+        *LITTLE,
+        "max_frames=1",
+        f"output={tmp_path / 'out'}",
+    ]
     assert run.main(["validate", *words]) == run.EXIT_DONE
     page = (tmp_path / "out/validate.html").read_text()
     assert "<p>Intrinsics are a guess from a field of view of 60°" in page
@@ -162,7 +169,15 @@ def test_a_guessed_field_of_view_is_told(tmp_path, room):
             (tmp_path / "capture" / name).mkdir(parents=True, exist_ok=True)
             array = picture.permute(1, 2, 0).numpy() if name == "rgb" else picture.numpy()
             (tmp_path / "capture" / name / f"{k}.png").write_bytes(encode_png(np.ascontiguousarray(array)))
-    words = ["validate", str(tmp_path / "capture"), "data.fov=60", "method.n=256", "size=96", "window=0", "max_frames=1"]
+    words = [
+        "validate",
+        str(tmp_path / "capture"),
+        "data.fov=60",
+        "method.n=256",
+        "size=96",
+        "window=0",
+        "max_frames=1",
+    ]
     with pytest.warns(UserWarning, match="intrinsics are a guess"):
         assert run.main([*words, f"output={tmp_path}"]) == run.EXIT_DONE
     told = json.loads((tmp_path / "validate.json").read_text())["intrinsics_guessed"]
