@@ -119,7 +119,7 @@ def dinov2_from_onnx(path: str | Path) -> Dinov2Weights:
         tensors = {t.name: torch.from_numpy(numpy_helper.to_array(t).copy()) for t in graph.initializer}
     except Exception as error:  # protobuf's and onnx's own exceptions share no base class
         raise FormatError(path, "file", f"{type(error).__name__}: {error}", "an ONNX model with its tensors") from None
-    made_by = {output: node for node in graph.node for output in node.output}
+    node_of_output = {output: node for node in graph.node for output in node.output}
     marker = "embeddings.patch_embeddings.projection.weight"
     prefix = next((name.removesuffix(marker) for name in tensors if name.endswith(marker)), None)
     if prefix is None:
@@ -127,7 +127,7 @@ def dinov2_from_onnx(path: str | Path) -> Dinov2Weights:
     state = {name.removeprefix(prefix): x for name, x in tensors.items() if name.startswith(prefix)}
     for node in graph.node:
         bias = next((i for i in node.input if i in tensors and i.startswith(prefix) and i.endswith(".bias")), None)
-        source = next((made_by[i] for i in node.input if i in made_by), None)
+        source = next((node_of_output[i] for i in node.input if i in node_of_output), None)
         if node.op_type == "Add" and bias is not None and source is not None and source.op_type == "MatMul":
             weight = next((tensors[i] for i in source.input if i in tensors), None)
             if weight is not None:

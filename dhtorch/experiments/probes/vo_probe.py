@@ -195,12 +195,12 @@ def verdict(
         return None, f"{probing.RANDOM_WEIGHTS_NOTE}; error with depth features and with the random network: {text}"
     text = f"{origin}: {text}"
     failed = {s: reason for s in scenes if (reason := _failed_control(outcome, s))}
-    judged = [s for s in scenes if s not in failed]
+    decided = [s for s in scenes if s not in failed]
     if failed:
         text += f". No verdict on {'; '.join(f'{s}: {reason}' for s, reason in failed.items())}"
-    below = [ours[s]["vs_dinov2_high"] is not None and ours[s]["vs_dinov2_high"] < 1 for s in judged]
-    above = [ours[s]["vs_dinov2_low"] is not None and ours[s]["vs_dinov2_low"] > 1 for s in judged]
-    refuted = bool(judged) and 2 * sum(above) >= len(judged)
+    below = [ours[s]["vs_dinov2_high"] is not None and ours[s]["vs_dinov2_high"] < 1 for s in decided]
+    above = [ours[s]["vs_dinov2_low"] is not None and ours[s]["vs_dinov2_low"] > 1 for s in decided]
+    refuted = bool(decided) and 2 * sum(above) >= len(decided)
     return (True if below and all(below) and not failed else False if refuted else None), text
 
 
@@ -304,8 +304,8 @@ class _PairFeatures:
             # The transform's pose maps the reference view into the other view: the same way round as the target.
             motion = _motion_vectors(added["T_1_from_0"].double())
             own.append(torch.where(added["pose_ok"].view(-1, 1), motion, 0.0).cpu())
-        depth, change = torch.cat(forth), torch.cat(back) - torch.cat(forth)
-        return {**features, "depth": torch.cat((depth, change), 1), _OWN_POSE_BLOCK: torch.cat(own)}
+        depth = torch.cat(forth)
+        return {**features, "depth": torch.cat((depth, torch.cat(back) - depth), 1), _OWN_POSE_BLOCK: torch.cat(own)}
 
 
 def _chunks(items: Sequence[Any], n: int) -> list[Sequence[Any]]:
