@@ -67,7 +67,7 @@ class Inputs:
         recording, near, gap = pairs._recording()
         i, j = pairs.by_gap(recording, gap)[0]
         around = [k for k in range(len(recording)) if k not in (i, j)]
-        around = [j, *sorted(around, key=lambda k: (abs(k - i), k))[: VIEWS - 1]]
+        around = [j, *sorted(around, key=lambda k: (abs(abs(k - i) - gap), k))[: VIEWS - 1]]
         self.views = [holdout.range_split(recording[k], near) for k in around]
 
 
@@ -121,7 +121,7 @@ def error(name: str, device: str, one: Inputs) -> float | None:
 
 def change(there: Any, here: Any) -> dict[str, float]:
     """Share of other gates than on the CPU, and the median change of the depth both answer, in sigmas; of answers."""
-    if not hasattr(here, "gate"):
+    if not hasattr(here, "gate") or not here.keep.any():
         return {}
     there = there.to("cpu")
     both = (there.keep & here.keep).nonzero(as_tuple=True)

@@ -185,7 +185,8 @@ def accelerator() -> str:
             "–" if other is None else f"{other[key]:.3g}" for other, key in ((graph, "ours_ms"), (kornia, "peer_ms"))
         ]
         least = min(r["ours_ms"], r["ours_ms"] if graph is None else graph["ours_ms"])
-        flips = ["–" if r.get(k) is None else f"{r[k]:.2g}" for k in ("gate_flips", "change_sigma")]
+        is_compared = bool(r.get("change_sigma"))  # 0 where the CPU answers nothing
+        flips = [f"{r[k]:.2g}" if is_compared else "–" for k in ("gate_flips", "change_sigma")]
         cells = [f"`{name.removeprefix('gpu_').rpartition('_b')[0]}`", str(r["batch"]), f"{r['ours_ms']:.3g}", *others]
         cells += [f"{r['peer_ms']:.3g}", f"{1e3 / least:,.0f}", f"{r['peak_mib']:.0f}", str(r["waits"])]
         rows.append([*cells, errors(r), " / ".join(flips)])

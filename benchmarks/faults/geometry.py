@@ -182,8 +182,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("triangulate_depth", "_rotated_rays(a, camera_0", "_rotated_rays(a, camera_1"),
         (
             "triangulate_depth",
-            "max(MAX_CHUNK_TRIANGULATED // max(uv_0.shape[0], 1), 1)",
-            "MAX_CHUNK_TRIANGULATED // max(uv_0.shape[0], 1)",
+            "max(chunk_size(MAX_CHUNK_TRIANGULATED, uv_0) // max(uv_0.shape[0], 1), 1)",
+            "chunk_size(MAX_CHUNK_TRIANGULATED, uv_0) // max(uv_0.shape[0], 1)",
         ),
         ("_triangulated_depth", "stretch = fy / fx", "stretch = fx / fy"),
         ("_triangulated_depth", "(stretch * stretch)", "stretch"),

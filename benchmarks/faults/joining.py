@@ -62,8 +62,8 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ),
         (
             "solve_pose_and_triangulate",
-            "uniform_draws(seed, camera_0.f.shape[0], method.hypotheses)",
-            "uniform_draws(0, camera_0.f.shape[0], method.hypotheses)",
+            "_draws_beside(camera_0.f, seed, method.hypotheses)",
+            "_draws_beside(camera_0.f, 0, method.hypotheses)",
         ),
         (
             "solve_pose_and_triangulate",

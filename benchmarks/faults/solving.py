@@ -45,7 +45,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("solve_spd", "& (pivot > MIN_PIVOT)", "& (pivot > MIN_PIVOT**2)"),
         ("solve_spd", " & (rhs * 0 == 0).flatten(1).all(1)", ""),
         ("solve_spd", "(rhs * 0 == 0).flatten(1).all(1)", "(rhs * 0 == 0).all()"),
-        ("solve_spd", "x = start + torch.cholesky_solve", "x = start - torch.cholesky_solve"),
+        ("solve_spd", "x = start + solve_cholesky", "x = start - solve_cholesky"),
         ("solve_spd", "return (x * s)[:, :n]", "return (x / s)[:, :n]"),
         ("solve_spd", "A, rhs = A * (s * s.transpose(1, 2)), rhs * s", "A, rhs = A * (s * s.transpose(1, 2)), rhs"),
         ("gauss_newton_step", "-g[..., None]", "g[..., None]"),

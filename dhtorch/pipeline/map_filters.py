@@ -166,10 +166,11 @@ def _has_neighbour(q: Tensor, which: Tensor, of: Tensor, radius: int, ratio: flo
 
 def _pixels(mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Indices of the pixels of a mask (B, h, w); of all pixels where values must not be read."""
-    if not is_static(mask):
-        return mask.nonzero(as_tuple=True)
-    axes = (torch.arange(n, device=mask.device) for n in mask.shape)
-    b, y, x = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
+    if is_static(mask):
+        axes = (torch.arange(n, device=mask.device) for n in mask.shape)
+        b, y, x = (axis.flatten() for axis in torch.meshgrid(*axes, indexing="ij"))
+    else:
+        b, y, x = mask.nonzero(as_tuple=True)
     return b, y, x
 
 
