@@ -5,8 +5,8 @@
 
 Only what README, docs/command.md, ``--help`` or the output of an earlier command show is typed, as a process of its own
 in an empty folder, with few frames. A role ends in ``ok``, in one sentence with exit code 2 (``said``), or it
-``failed``: another exit code, a traceback, more than one line, or a sentence without what was expected. Results are added to the
-file, so that several runs complete it; captures of another commit are measured again.
+``failed``: another exit code, a traceback, more than one line, or a sentence without what was
+expected. Results are added to the file, so that several runs complete it.
 """
 
 from __future__ import annotations
@@ -43,75 +43,87 @@ class Failed(Exception):
     """A command that ended otherwise."""
 
 
-def dhtorch(folder: Path, *words: str) -> str:
+def typed(folder: Path, *words: str) -> str:
     """Run ``dhtorch`` with some words in a folder -> standard output."""
     env = {**os.environ, "PYTHONPATH": str(REPO), "OMP_NUM_THREADS": "1"}
     run = [sys.executable, "-m", "dhtorch", *words]
-    typed = shlex.join(["dhtorch", *words])
+    line = shlex.join(["dhtorch", *words])
     try:
         done = subprocess.run(run, cwd=folder, env=env, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        raise Failed(f"{typed}: more than {TIMEOUT_S} s") from None
+        raise Failed(f"{line}: more than {TIMEOUT_S} s") from None
     last = (done.stderr.strip().splitlines() or [""])[-1]
     if done.returncode in (0, 1):
         return done.stdout
     if done.returncode == 2 and last.startswith("dhtorch: ") and "Traceback" not in done.stderr and RIGHT.search(last):
-        raise Said(f"{typed}: {last}")
-    raise Failed(f"{typed}: exit code {done.returncode}: {last}")
+        raise Said(f"{line}: {last}")
+    raise Failed(f"{line}: exit code {done.returncode}: {last}")
+
+
+def below(folder: Path, capture: str) -> str:
+    """The capture that a sentence of ``dhtorch validate`` names where PATH holds several; PATH itself otherwise."""
+    try:
+        typed(folder, "validate", capture, "--max-frames", "1", "--method.n", "64", "--size", "64", "--window", "0")
+    except (Said, Failed) as end:
+        match = re.search(r"captures below, expected one of ([^,]+)", str(end))
+        return match[1] if match else capture
+    return capture
 
 
 def retried(folder: Path, options: list[str], *words: str) -> str:
-    """As ``dhtorch``; where the sentence names an option for the camera, that is typed, and kept in ``options``."""
+    """As ``typed``; where the sentence names an option for the camera, that is typed, and kept in ``options``."""
     try:
-        return dhtorch(folder, *words, *options)
+        return typed(folder, *words, *options)
     except Said as said:
         if "data.fov=69" not in str(said) or options:
             raise
         options.append("data.fov=69")
-        return dhtorch(folder, *words, *options)
+        return typed(folder, *words, *options)
 
 
 def scan(folder: Path, capture: str) -> None:
     """README, "Your own capture": inspect, PATH, and the command that it prints."""
     options: list[str] = []
-    dhtorch(folder, "inspect", capture, "--max-frames", "2")
+    typed(folder, "inspect", capture, "--max-frames", "2")
     out = retried(folder, options, capture, *FEW, "--recordings", "1")
     for line in out.splitlines():
         if line.startswith("Next: ") and ": dhtorch " in line:
             words = shlex.split(line.rpartition(": dhtorch ")[2])
-            dhtorch(folder, *words, "--method.n", "256", "--no-figures", "pairs.stride=20")
+            typed(folder, *words, "--method.n", "256", "--no-figures", "pairs.stride=20")
             return
     raise Failed("no command was printed as the next step")
 
 
 def robot(folder: Path, capture: str) -> None:
     """README: enrich, then extract, and the enriched set is read again."""
+    few = ("--max-frames", "2", "--method.n", "256")
     options: list[str] = []
-    retried(
-        folder, options, "enrich", capture, "set", "--max-frames", "2", "--dense", "{size: 160}", "--method.n", "256"
-    )
-    dhtorch(folder, "extract", capture, "--out", "features", "--max-frames", "2", "--method.n", "256", *options)
-    dhtorch(folder, "inspect", "set", "--max-frames", "2")
+    capture = below(folder, capture)
+    retried(folder, options, "enrich", capture, "set", *few, "--dense", "{size: 160}")
+    typed(folder, "extract", capture, "--out", "features", *few, *options)
+    typed(folder, "inspect", "set", "--max-frames", "2")
 
 
 def sweep(folder: Path, capture: str) -> None:
     """`dhtorch run --help`: a sweep over methods on a capture, and its report."""
     options: list[str] = []
+    capture = below(folder, capture)
     words = ("run", capture, "--multirun", "method=paper,map", "--method.n", "256", "pairs.stride=40", "--no-figures")
     retried(folder, options, *words, "--cutoff", "2.0", "--out", "sweep")
-    dhtorch(folder, "report", "sweep")
+    typed(folder, "report", "sweep")
 
 
 def network(folder: Path, capture: str) -> None:
     """`dhtorch validate --help`: the sensor's depth, then maps (those of complete) validated and aligned."""
     options: list[str] = []
+    capture = below(folder, capture)
     small = ("--max-frames", "1", "--method.n", "512")
     retried(folder, options, "complete", capture, "--out", "maps", *small, "--size", "160", "--no-figures")
     maps = "maps" if (folder / "maps" / "depth").is_dir() else None
-    dhtorch(folder, "validate", capture, *small, "--size", "96", "--window", "0", "--out", "sensor", *options)
+    typed(folder, "validate", capture, *small, "--size", "96", "--window", "0", "--out", "sensor", *options)
     if maps is not None:  # one recording: several have a folder each
-        dhtorch(folder, "validate", capture, "--depth", maps, *small, "--window", "0", "--out", "checked", *options)
-        dhtorch(folder, "align", capture, "--depth", maps, "--out", "aligned", *small, *options)
+        typed(folder, "validate", capture, "--depth", maps, *small, "--window", "0", "--out", "checked", *options)
+        typed(folder, "align", capture, "--depth", maps, "--out", "aligned", *small, *options)
 
 
 ROLES = {"scan": scan, "robot": robot, "sweep": sweep, "network": network}

@@ -99,6 +99,9 @@ _JOB_STATES = {"finished": "finished", "untouched": "left untouched", "failed": 
 #: Default ``output`` with ``resume=true``.
 _RESUMED_FOLDER = Path("outputs/resumed")
 
+#: Captures below a path that a message names. Source: origin not recorded.
+_MAX_CAPTURES_SHOWN = 4
+
 _SEPARATORS = "/\\"
 
 #: End of a word that is the name of a file.
@@ -573,8 +576,34 @@ def _instantiate_parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
     try:
         return {name: instantiate(cfg[name], _convert_="all") for name in names}
     except Exception as error:
-        _reject_stacks(errors.unwrap_cause(error), cfg.data.get("root"))
-        raise
+        cause, root = errors.unwrap_cause(error), cfg.data.get("root")
+        _reject_stacks(cause, root)
+        below = _find_capture_below(cause, root)
+        if below is None:
+            raise
+    cfg.data.root = below
+    return {name: instantiate(cfg[name], _convert_="all") for name in names}
+
+
+def _find_capture_below(error: BaseException, root: Any) -> str | None:
+    """The only recording below a path that is none itself; None without one, or for another error.
+
+    Raises:
+        ValueError: several.
+    """
+    from dhtorch.cli.inspect import find_captures  # noqa: PLC0415
+    from dhtorch.data.io.decode import FormatError  # noqa: PLC0415
+
+    if not isinstance(error, FormatError) or error.args[:2] != (str(root), "format"):
+        return None
+    try:
+        captures = [str(each.path) for each in find_captures(Path(str(root))) if each.kind == "recording"]
+    except FormatError:
+        return None
+    if len(captures) > 1:
+        names = ", ".join(captures[:_MAX_CAPTURES_SHOWN]) + (", …" if len(captures) > _MAX_CAPTURES_SHOWN else "")
+        raise ValueError(f"{root}: found {len(captures)} captures below, expected one of {names}") from error
+    return captures[0] if captures else None
 
 
 def _reject_stacks(error: BaseException, root: Any) -> None:

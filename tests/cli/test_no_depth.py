@@ -76,3 +76,13 @@ def test_pictures_alone_name_what_to_export(command, tmp_path):
     Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(tmp_path / "photos" / "a.jpg")
     code, _, err = command("photos")
     assert code == 2 and "1 picture without depth" in err and "Record3D" in err
+
+
+def test_a_capture_below_the_path_is_found_by_every_command(command, tmp_path):
+    room = SyntheticRoom(n_frames=3, hw=(48, 64), depth_hw=(48, 64))
+    writers.write_tum(tmp_path / "above" / "one", [room[k] for k in range(3)])
+    code, out, err = command("stream", "above", "--max-frames", "1", "--method", "map", "--method.n", "64")
+    assert code == 0 and out.startswith("one: 1 frame"), err
+    writers.write_tum(tmp_path / "above" / "two", [room[k] for k in range(3)])
+    code, _, err = command("stream", "above")
+    assert code == 2 and "above: found 2 captures below, expected one of above/one, above/two" in err
