@@ -52,10 +52,11 @@ def typed(folder: Path, *words: str) -> str:
         done = subprocess.run(run, cwd=folder, env=env, capture_output=True, text=True, check=False, timeout=TIMEOUT_S)
     except subprocess.TimeoutExpired:
         raise Failed(f"{line}: more than {TIMEOUT_S} s") from None
-    last = (done.stderr.strip().splitlines() or [""])[-1]
-    if done.returncode in (0, 1):
+    said = [text for text in done.stderr.splitlines() if text.startswith(("dhtorch: ", "failed: "))]
+    last = (said or done.stderr.strip().splitlines() or [""])[-1]
+    if done.returncode == 0:
         return done.stdout
-    if done.returncode == 2 and last.startswith("dhtorch: ") and "Traceback" not in done.stderr and RIGHT.search(last):
+    if done.returncode in (1, 2) and said and "Traceback" not in done.stderr and RIGHT.search(last):
         raise Said(f"{line}: {last}")
     raise Failed(f"{line}: exit code {done.returncode}: {last}")
 
