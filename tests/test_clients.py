@@ -14,6 +14,7 @@ from pyarrow import parquet
 from support.sample_dicts import room
 
 from dhtorch.cli.run import main
+from dhtorch.functional.policy_inputs import NEAREST_M
 from dhtorch.testing import write_rlds
 
 CLIENTS = Path(__file__).resolve().parents[1] / "benchmarks" / "clients"
@@ -101,6 +102,27 @@ def test_a_picture_that_is_video_ends_a_loader_of_tables_in_a_sentence(robot, cl
     (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
     with pytest.raises(SystemExit, match=r"observation.images.left is video: found no picture in the tables"):
         client("torch_loader", tmp_path, 0)
+
+
+@pytest.fixture(scope="module")
+def pictured(robot, tmp_path_factory):
+    """The robot's set with geometry images and points."""
+    out = tmp_path_factory.mktemp("pictured") / "set"
+    more = ["data=lerobot", "method=paper", "method.n=32", "method.hypotheses=8", "dense={size: 40}", "report=false"]
+    columns = "columns=[depth,sigma,source,geometry_image,point_cloud]"
+    assert main(["enrich", str(robot / "source"), str(out), *more, "gap=1", columns]) == 0
+    return out
+
+
+def test_groot_reads_geometry_images_by_its_modality(pictured, client):
+    said = client("groot_modality", pictured)
+    assert said["frames"] == 12 and said["missing"] == [] and said["parts"] == 2 and said["pictures"] == 24
+    assert said["known"] > 100 and said["largest_difference"]["inverse depth"] <= 0.5 / (255 * NEAREST_M) * 1.001
+
+
+def test_openpi_resizes_geometry_images_without_new_codes(pictured, client):
+    pytest.importorskip("openpi_client")
+    assert client("openpi_transforms", pictured)["geometry_known"] > 0.05
 
 
 def test_nerfstudio_parses_its_folder(enriched, client):
