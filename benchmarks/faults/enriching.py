@@ -15,7 +15,7 @@ TESTS: dict[str, list[str]] = {
         "step_set",
         "targets",
     )
-}
+} | {"extract.policy_columns": ["tests/extract/test_policy_columns.py"]}
 
 FAULTS: dict[str, list[tuple[str, ...]]] = {
     "extract.cut": [
@@ -51,6 +51,14 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("LeRobotSource.more", "and p.name not in _REWRITTEN_META_FILES", ""),
         ("_with_frame_index", "done + np.arange(len(stamp))", "np.arange(len(stamp))"),
         ("frame_rate", "recording.times.diff() / recording.number.diff()", "recording.times.diff()"),
+    ],
+    "extract.policy_columns": [
+        ("encode_geometry", "(2 * np.arange(n) + 1) * m // (2 * n)", "(2 * np.arange(n) + 1) * m // (2 * n) - 1"),
+        ("encode_geometry", "v[:, None], u", "v[:, None], u[::-1]"),
+        ("sample_cloud", "view.hw, view.map_hw", "view.map_hw, view.hw"),
+        ("PolicyColumnWriter.add", "self.append(picture, time)", "self.append(picture, times[0])"),
+        ("make_modality", "**modality.get(\"video\", {}), **added", "**added"),
+        ("_default_modality", '("action", "action")', '("action", "observation.state")'),
     ],
     "extract.robot_target": [
         ("LeRobotTarget.own", 'summary["key"] == self.key', "True"),

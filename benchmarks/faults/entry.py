@@ -202,7 +202,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("_patch_index", "column.clamp(0, columns - 1)", "column.clamp(0, columns)"),
     ],
     "transforms.status": [
-        ("SampleProblem", "NO_SECOND_VIEW: Final = 1", "NO_SECOND_VIEW: Final = 4"),
+        ("SampleProblem", "NO_SECOND_VIEW: Final = code(1,", "NO_SECOND_VIEW: Final = code(4,"),
         ("ProblemCounts.add", "1 + worker.id % (_MAX_COUNT_ROWS - 1)", "worker.id % (_MAX_COUNT_ROWS - 1)"),
         ("ProblemCounts.add", "1 + worker.id % (_MAX_COUNT_ROWS - 1)", "1 + worker.id"),
         ("ProblemCounts.report", "self.counts.sum(0)", "self.counts[0]"),

@@ -576,7 +576,8 @@ def _instantiate_parts(cfg: Any, names: Iterable[str]) -> dict[str, Any]:
     try:
         return {name: instantiate(cfg[name], _convert_="all") for name in names}
     except Exception as error:
-        cause, root = errors.unwrap_cause(error), cfg.data.get("root")
+        cause = errors.unwrap_cause(error)
+        root = cfg.data.get("root")
         _reject_stacks(cause, root)
         below = _find_capture_below(cause, root)
         if below is None:
