@@ -53,9 +53,15 @@ REAL = {
     "r3d_door": (),
     "dgp_drive6cam": (),
     "middlebury_motorcycle": (),
-    "gr00t_demo": ("data=lerobot", "data.fov=60", "data.episode=[0,1]"),
-    "lerobot_g1": ("data=lerobot", "data.fov=69"),
-    "rlds_bridge/bridge_dataset/1.0.0": ("data=rlds", "data.fov=60", "data.split=train", "data.episode=[0,1]"),
+    "gr00t_demo": ("data=lerobot", "data.fov=60", "data.episode=[0,1]", "without_depth=true"),
+    "lerobot_g1": ("data=lerobot", "data.fov=69", "without_depth=true"),
+    "rlds_bridge/bridge_dataset/1.0.0": (
+        "data=rlds",
+        "data.fov=60",
+        "data.split=train",
+        "data.episode=[0,1]",
+        "without_depth=true",
+    ),
     "apc_arm": (),
 }
 #: Written sources that have a writer of one signature, named by it.

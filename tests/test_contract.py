@@ -535,7 +535,16 @@ ELSEWHERE = {
     *(f"dhtorch.stages.sample.{name}" for name in ("spiral", "vogel_spiral", "regular_grid")),
     *(
         f"dhtorch.geometry.checks.{name}"
-        for name in ("all_finite", "check", "is_static", "is_transformed", "any_possible", "all_known", "constant", "move_from_host")
+        for name in (
+            "all_finite",
+            "check",
+            "is_static",
+            "is_transformed",
+            "any_possible",
+            "all_known",
+            "constant",
+            "move_from_host",
+        )
     ),
     *(f"dhtorch.geometry.sparse_grid.{name}" for name in ("occupied_cells", "connected_components")),
     *(

@@ -33,6 +33,9 @@ QUICK = ("method=paper", "method.n=128", "gap=2", "dense=false", "report=false")
 
 DENSE = "dense={size: 80}"
 
+#: Of sets without any depth, whose maps are then empty.
+WITHOUT_DEPTH = "without_depth=true"
+
 #: Source → its folder below ``DHTORCH_DATA``, or that it is written, and the options it needs.
 SOURCES: dict[str, tuple[str, ...]] = {
     "TUM": ("tum_fr1_desk9", DENSE),
@@ -40,11 +43,11 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "7-Scenes": ("7s_redkitchen_000",),
     "HoloLens": ("holo_a",),
     "LeRobot v2.1": ("lerobot_g1", "data=lerobot", "data.fov=69", "data.episode=[29]"),
-    "GR00T, LeRobot v2.0": ("gr00t_demo", "data=lerobot", "data.fov=69", "data.episode=[4]"),
+    "GR00T, LeRobot v2.0": ("gr00t_demo", "data=lerobot", "data.fov=69", "data.episode=[4]", WITHOUT_DEPTH),
     "RLDS": (
         "rlds_bridge/bridge_dataset/1.0.0",
         *("data=rlds", "data.fov=69", "data.rate_hz=5", "data.split=train"),
-        *("data.camera=observation/image_0", "data.episode=[0,1]"),
+        *("data.camera=observation/image_0", "data.episode=[0,1]", WITHOUT_DEPTH),
     ),
     "robot": ("written", "data=lerobot", DENSE),
     "two-camera robot": ("written", "data=lerobot", DENSE),

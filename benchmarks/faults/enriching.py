@@ -57,7 +57,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("encode_geometry", "v[:, None], u", "v[:, None], u[::-1]"),
         ("sample_cloud", "view.hw, view.map_hw", "view.map_hw, view.hw"),
         ("PolicyColumnWriter.add", "self.append(picture, time)", "self.append(picture, times[0])"),
-        ("make_modality", "**modality.get(\"video\", {}), **added", "**added"),
+        ("make_modality", '**modality.get("video", {}), **added', "**added"),
         ("_default_modality", '("action", "action")', '("action", "observation.state")'),
     ],
     "extract.robot_target": [

@@ -28,8 +28,12 @@ _MAX_EXAMINED_FRAMES = 4
 NEEDS_DEPTH = "sensor depth of near surfaces is required for metric scale"
 
 
-def require_depth(scenes: Sequence[Scene]) -> None:
+def require_depth(scenes: Sequence[Scene], *, remedy: str | None = None) -> None:
     """Raise an error if no recording of a command from disk has depth; print those of several that have none.
+
+    Args:
+        scenes: of the command.
+        remedy: appended to the error's message.
 
     Raises:
         ValueError: none of the examined recordings has depth.
@@ -45,7 +49,7 @@ def require_depth(scenes: Sequence[Scene]) -> None:
         missing.append(describe_missing_depth(recording, n))
     if missing and len(missing) == n_examined:
         more = f" ({n_examined} recordings examined)" if n_examined > 1 else ""
-        raise ValueError(f"{missing[0]}{more}")
+        raise ValueError("; ".join(filter(None, (f"{missing[0]}{more}", remedy))))
     for line in missing:
         warnings.warn(line, stacklevel=2)
 

@@ -293,8 +293,8 @@ def _prepare_data(name: str, settings: Mapping[str, Any], data: Any) -> Any:
         max_frames = settings["max_frames"] if _SUBSAMPLED_COMMANDS[name] else None
         data = subsample_scenes(scenes_of(data), settings["every"], max_frames)
     data = check_data(data)
-    if name in _DEPTH_COMMANDS and settings.get("pose", "near") == "near":
-        require_depth(scenes_of(data))
+    if name in _DEPTH_COMMANDS and settings.get("pose", "near") == "near" and not settings.get("without_depth"):
+        require_depth(scenes_of(data), remedy="without_depth=true writes empty maps" if name == "enrich" else None)
     return data
 
 

@@ -39,6 +39,15 @@ def test_a_capture_without_depth_is_announced(command, blind, tmp_path, words):
     line = err.strip().splitlines()[-1]
     assert code == 2 and "blind: 4 frames, none of the 4 examined has depth; sensor depth" in line, err
     assert not (tmp_path / "o").exists()
+    if words[0] == "enrich":
+        assert line.endswith("without_depth=true writes empty maps")
+
+
+def test_a_set_without_depth_is_written_on_request(command, blind, tmp_path):
+    options = ["method=paper", "method.n=64", "dense=false", "report=false", "without_depth=true"]
+    code, _, err = command("enrich", str(blind), "o", *options, "--quiet")
+    assert code == 0, err
+    assert (tmp_path / "o" / "meta" / "info.json").is_file()
 
 
 def test_images_with_cameras_are_no_focal_stack(command, tmp_path):
