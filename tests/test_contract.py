@@ -399,6 +399,7 @@ ROWS = [
     Row(small.matmul_planes, lambda b, n, d: (uniform(3, 2, b, n, dtype=d), uniform(2, 3, b, n, dtype=d)), "dtype capture gradcheck empty", grad=(0, 1)),
     Row(small.solve_cholesky, lambda b, n, d: (uniform(b, 6, 2, dtype=d), torch.linalg.cholesky(positive(b, n, d))), "dtype batch vmap capture"),
     Row(small.rotate_planes, lambda b, n, d: (poses(b, d).R, uniform(b, 3, n, dtype=d)), "dtype batch vmap capture gradcheck empty", grad=(0, 1)),
+    Row(small.solve_cholesky, lambda b, n, d: (uniform(b, 6, 1, dtype=d), torch.linalg.cholesky(positive(b, n, d))), "dtype batch vmap capture"),
     Row(small.cofactor_planes, lambda b, n, d: (uniform(3, 3, b, n, dtype=d),), "dtype capture gradcheck empty", grad=(0,)),
     Row(backproject.backproject, frames, ALL, (1,), (0, 1), bad=wrong_last_axis(1)),
     Row(holes.classify, sampled, "dtype batch vmap capture empty shuffle padding nan raises", (1,), (), bad=wrong_last_axis(1)),
@@ -524,6 +525,8 @@ ROWS = [
 ELSEWHERE = {
     *(f"dhtorch.stages.pose_prior.{name}" for name in ("priors_from_frames", "reject_poses")),
     "dhtorch.geometry.inference_mode.run_without_grad",
+    *(f"dhtorch.geometry.checks.{name}" for name in ("constant", "move_from_host")),  # tests/pipeline/test_accelerator.py
+    "dhtorch.geometry.determinism.chunk_size",
     "dhtorch.metrics.holdout.truth_kept_ratio",
     "dhtorch.geometry.least_squares.has_graph",
     "dhtorch.geometry.patches.product_is_exact",

@@ -11,7 +11,7 @@ import torch
 from torch.utils.data import default_collate
 
 from dhtorch import pytree
-from dhtorch.geometry import checks
+from dhtorch.geometry import checks, determinism
 from dhtorch.metrics import holdout
 from dhtorch.pipeline.completion import complete_depth
 from dhtorch.pipeline.presets import AUTO, METHODS
@@ -91,6 +91,18 @@ def test_the_pretended_device_records_waits_and_refuses_a_mixture():
             there + x
     kinds = sorted(kind for kind, _ in device.waits.elements())
     assert kinds == ["copy to cpu", "copy to meta", "copy to meta", "item", "mask index"]
+
+
+def test_a_constant_is_kept_beside_an_accelerator_and_made_anew_on_the_cpu():
+    x = torch.zeros(2, dtype=torch.float64)
+    assert torch.equal(checks.constant(x, [[1, 2.5]]), torch.tensor([[1, 2.5]], dtype=torch.float64))
+    assert checks.constant(x, [1.0]) is not checks.constant(x, [1.0])
+    with PretendDevice():
+        there = OnDevice(x)
+        assert checks.constant(there, [1.0]) is checks.constant(there, [1.0])
+        assert checks.move_from_host(x, there).device == there.device
+        assert determinism.chunk_size(256, there) == determinism.ACCELERATOR_CHUNKS * determinism.chunk_size(256, x)
+    checks._kept.cache_clear()
 
 
 # ---------------------------------------------------------------------------------------------------- on a device
