@@ -80,7 +80,7 @@ def calls(batch: int, device: str, one: Inputs) -> dict[str, Call]:
     uv_0, uv_1, view, T, _ = triangulate.scene(N)
     seen = [x.repeat(batch, 1, 1).to(device) for x in (uv_0, uv_1)]
     view, T = pytree.collate([view] * batch).to(device), pytree.collate([T] * batch).to(device)
-    eye, zero = torch.eye(3, device=device).expand_as(T.R), torch.zeros_like(T.t)[..., None]
+    eye, zero = torch.eye(3).to(device).expand_as(T.R), torch.zeros_like(T.t)[..., None]
     K = cam.to_matrix(view)
     P_0, P_1 = (kornia_epipolar.projection_from_KRt(K, R, t) for R, t in ((eye, zero), (T.R, T.t[..., None])))
     transform = ExtendDepth(depth_unit="m", other_image="other", n=N, batched=True)
