@@ -376,8 +376,9 @@ def _name_positionals(name: str, argv: Sequence[str]) -> list[str]:
 
 
 def _is_positional(word: str) -> bool:
-    """Whether an argument is a path and neither an option nor a flag."""
-    return not word.startswith(("-", "+")) and ("=" not in word or Path(word).exists())
+    """Whether an argument is a path and neither an option, a flag nor a deletion (``~group``; ``~/`` is a path)."""
+    is_deletion = word.startswith("~") and not word.startswith("~/")
+    return not is_deletion and not word.startswith(("-", "+")) and ("=" not in word or Path(word).exists())
 
 
 def _lacks_result(word: str) -> bool:

@@ -207,3 +207,13 @@ def test_a_list_of_settings_files_is_read(tmp_path):
     notes = commands.read_option_notes(file)
     assert notes["a"] == ("1", "one") and notes["b.c"] == ("[1, 2]", "two") and notes["d"] == ("null", "")
     assert notes["method"].default == "map" and not any("e" in name.split(".") for name in notes)
+
+
+@pytest.mark.parametrize(
+    "words", [["~method@experiment.methods.kornia", "data=synthetic"], ["+seed=1"], ["-m", "seed=1"]]
+)
+def test_deletions_and_additions_of_hydra_are_no_paths(words):
+    assert run._name_positionals("run", words) == words
+    assert run._name_positionals("run", ["~/room.r3d", *words])[:2] == ["data=auto", "data.root=~/room.r3d"] or (
+        "data=synthetic" in words
+    )
