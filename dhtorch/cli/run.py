@@ -398,7 +398,7 @@ def _show_hydra_info(name: str, argv: list[str]) -> int:
     import hydra  # noqa: PLC0415
 
     if "--cfg" in argv:  # Hydra expects the options side by side
-        argv = sorted(argv, key=lambda word: "=" not in word or word.startswith("-"))
+        argv = sorted(argv, key=lambda word: word.startswith("-") or not ("=" in word or word[0] in "~+"))
     sys.argv = [sys.argv[0], *argv]
     hydra.main(config_path=str(config_dir()), config_name=name, version_base="1.3")(_run_hydra_job)()
     return EXIT_DONE

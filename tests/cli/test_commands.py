@@ -209,11 +209,15 @@ def test_a_list_of_settings_files_is_read(tmp_path):
     assert notes["method"].default == "map" and not any("e" in name.split(".") for name in notes)
 
 
-@pytest.mark.parametrize(
-    "words", [["~method@experiment.methods.kornia", "data=synthetic"], ["+seed=1"], ["-m", "seed=1"]]
-)
+@pytest.mark.parametrize("words", [["~method@experiment.methods.kornia"], ["+seed=1"], ["-m", "seed=1"]])
 def test_deletions_and_additions_of_hydra_are_no_paths(words):
     assert run._name_positionals("run", words) == words
-    assert run._name_positionals("run", ["~/room.r3d", *words])[:2] == ["data=auto", "data.root=~/room.r3d"] or (
-        "data=synthetic" in words
-    )
+    assert run._name_positionals("run", ["~/room.r3d", *words]) == ["data=auto", "data.root='~/room.r3d'", *words]
+
+
+@pytest.mark.parametrize("flags", [["--cfg", "job"], ["-c", "job"], ["--info", "defaults-tree"]])
+def test_hydra_s_own_flags_go_with_deletions(command, flags):
+    argv = ["experiment=method_comparison", "~method@experiment.methods.kornia", *flags, "experiment.seeds=1"]
+    code, out, err = command("run", *argv)
+    assert code == 0, err
+    assert "kornia" not in out or "defaults-tree" in flags
