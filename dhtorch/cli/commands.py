@@ -552,7 +552,8 @@ def to_overrides(
             names = [each.rpartition(".")[2].replace("_", "-") for each in known]
             near = suggest(option, [*(each[2:] for each in flags if each.startswith("--")), *names])
             near = near.replace("mean ", "mean --")
-            raise ValueError(f"{flag}: found an unknown option{near}, expected one listed by --help")
+            kept = ", ".join(sorted(each for each in flags if each.startswith("--")))
+            raise ValueError(f"{flag}: found an unknown option{near}, expected one listed by --help, or {kept}")
         if not sign:
             is_switch = full in known and known[full].is_switch
             is_value = bool(words) and not words[0].startswith("--")
