@@ -117,7 +117,7 @@ def run(settings: Mapping[str, Any], parts: Mapping[str, Any], *, progress: Prog
     path = Path(str(settings["path"])).expanduser()
     reader_options = {name: value for name, value in settings["data"].items() if value is not None}
     captures = [
-        replace(capture, options=reader_options) for capture in _find_recording_captures(path, settings["format"])
+        replace(capture, options=reader_options) for capture in find_recording_captures(path, settings["format"])
     ]
     out = _resolve_folder(path, settings["out"])
     recordings, refused = _open_captures(captures)
@@ -161,7 +161,7 @@ def _process_recordings(
 # --------------------------------------------------------------------------------------------------------------- input
 
 
-def _find_recording_captures(path: Path, format: str = "auto") -> list[FoundCapture]:
+def find_recording_captures(path: Path, format: str = "auto") -> list[FoundCapture]:
     """Captures at a path, or up to two folders below, that are recordings of a moving camera.
 
     Raises:

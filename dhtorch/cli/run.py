@@ -591,15 +591,15 @@ def _find_capture_below(error: BaseException, root: Any) -> str | None:
     """The only recording below a path that is none itself; None without one, or for another error.
 
     Raises:
-        ValueError: several.
+        ValueError: several, or captures of other kinds (focal stacks, images without depth).
     """
-    from dhtorch.cli.inspect import find_captures  # noqa: PLC0415
+    from dhtorch.cli.process_capture import find_recording_captures  # noqa: PLC0415
     from dhtorch.data.io.decode import FormatError  # noqa: PLC0415
 
     if not isinstance(error, FormatError) or error.args[:2] != (str(root), "format"):
         return None
     try:
-        captures = [str(each.path) for each in find_captures(Path(str(root))) if each.kind == "recording"]
+        captures = [str(each.path) for each in find_recording_captures(Path(str(root)))]
     except FormatError:
         return None
     if len(captures) > 1:

@@ -58,6 +58,8 @@ def test_images_with_cameras_are_no_focal_stack(command, tmp_path):
     assert code == 2 and "3 pictures without depth" in err and "poses.txt" in err and "still camera" not in err
     with pytest.raises(FormatError, match=r"\(no depth\)"):
         data.open(tmp_path / "posed")
+    code, _, err = command("stream", "posed")
+    assert code == 2 and "3 pictures without depth" in err
 
 
 @pytest.mark.parametrize("name", ["scan.usdz", "scan.obj", "scan.mp4"])
