@@ -377,7 +377,7 @@ def test_nothing_there_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture
     (tmp_path / "a" / "b" / "c").mkdir(parents=True)
     writers.write_named_frames(tmp_path / "a" / "b" / "c", walk(1))
     assert run.main(["inspect", str(tmp_path)]) != 0
-    assert "content: found no capture here or up to two folders below, expected one of " in " ".join(
+    assert "content: found no capture here or up to two folders below, expected from a phone: " in " ".join(
         capsys.readouterr().err.split()
     )
     assert run.main(["inspect", str(tmp_path / "nowhere")]) != 0
