@@ -518,6 +518,11 @@ def _format_option(option: str, note: OptionNote) -> list[str]:
 # ----------------------------------------------------------------------------------------------------------- arguments
 
 
+#: Flags of Hydra with a value → their long form, in which the value stays beside its flag.
+HYDRA_VALUE_FLAGS = {"-c": "--cfg", "-i": "--info", "-p": "--package"}
+HYDRA_VALUE_FLAGS |= {long: long for long in HYDRA_VALUE_FLAGS.values()}
+
+
 def to_overrides(
     name: str, argv: Sequence[str], known: Mapping[str, OptionNote], flags: Iterable[str], suggest: Suggest
 ) -> list[str]:
@@ -538,9 +543,8 @@ def to_overrides(
         word = words.pop(0)
         flag, sign, value = word.partition("=")
         if flag in flags or not flag.startswith("--") or flag == "--":
-            out.append(word)
-            if flag == "--cfg" and not sign and words:
-                out.append(words.pop(0))
+            has_value = word in HYDRA_VALUE_FLAGS and words and words[0][:1] != "-" and "=" not in words[0]
+            out.append(f"{HYDRA_VALUE_FLAGS[word]}={words.pop(0)}" if has_value else word)
             continue
         option = flag.removeprefix("--")
         full = option if "." in option else resolve_option(name, option, known)

@@ -89,7 +89,7 @@ _LOG = logging.getLogger("dhtorch.cli.run")
 _IMPLIED_CHOICES = {"pairs.gap": "pairs=gap", "pairs.seconds": "pairs=time", "pairs.metres": "pairs=baseline"}
 
 #: Hydra flags that print information and run no job.
-_HYDRA_INFO_FLAGS = {"--hydra-help", "-i", "--info", "-sc", "--shell-completion", "-c", "--cfg"}
+_HYDRA_INFO_FLAGS = {"--hydra-help", "-sc", "--shell-completion", *commands.HYDRA_VALUE_FLAGS}
 _HELP_FLAGS = {"-h", "--help", "--help-all"}
 _SWEEP_FLAGS = {"-m", "--multirun"}
 
@@ -397,8 +397,8 @@ def _show_hydra_info(name: str, argv: list[str]) -> int:
     """Run Hydra's own flags: composed settings, information, shell completion."""
     import hydra  # noqa: PLC0415
 
-    if "--cfg" in argv:  # Hydra expects the options side by side
-        argv = sorted(argv, key=lambda word: word.startswith("-") or not ("=" in word or word[0] in "~+"))
+    # Hydra expects the options side by side, before or behind its own flags with their values.
+    argv = sorted(argv, key=lambda word: word.startswith("-") or not ("=" in word or word[:1] in ("~", "+")))
     sys.argv = [sys.argv[0], *argv]
     hydra.main(config_path=str(config_dir()), config_name=name, version_base="1.3")(_run_hydra_job)()
     return EXIT_DONE
