@@ -63,7 +63,7 @@ def test_common_options_have_one_name(name):
         ("extract", "x --gap 5 --columns a,b --tokens-hw 56,56", "x extract.gap=5 extract.columns=[a,b] extract.tokens_hw=[56,56]"),
         ("extract", "--dense --half", "extract.dense=true extract.half=true"),
         ("run", "x --cutoff 2.0 --method.n 512", "x holdout.cutoff=2.0 method.n=512"),
-        ("run", "--multirun method=map,paper --cfg job", "--multirun method=map,paper --cfg job"),
+        ("run", "--multirun method=map,paper --cfg job", "--multirun method=map,paper --cfg=job"),
         ("recover", "x --mesh --minutes null", "x mesh=true minutes=null"),
     ],
 )  # fmt: skip
