@@ -181,7 +181,7 @@ class ExtendDepth(torch.nn.Module):
             raise SampleError(f"{error} (and no image gives the size of its {missing})") from error
         warnings.warn(f"{'skipped' if self.on_error == 'skip' else 'flagged'}: {error}", stacklevel=4)
         self.tally.add(torch.tensor([SampleProblem.UNREADABLE]))
-        return None if self.on_error == "skip" or hw is None else self._add_columns(sample, self._blank_columns(hw))
+        return None if self.on_error == "skip" or hw is None else self._add_columns(sample, self.blank_columns(hw))
 
     def _compute_columns(self, read: SampleViews, seed: int | Tensor, flagged: bool) -> dict[str, Tensor]:
         """Views of B samples -> added columns (B, …), unreadable samples blanked where ``flagged``."""
@@ -244,7 +244,7 @@ class ExtendDepth(torch.nn.Module):
             )
         return index.long().cpu() + self.seed
 
-    def _blank_columns(self, hw: tuple[int, int]) -> dict[str, Tensor]:
+    def blank_columns(self, hw: tuple[int, int]) -> dict[str, Tensor]:
         """Image size -> blank columns (1, …) of an unreadable sample, in the usual shapes."""
         rows, columns = token_grid(hw, patch=self.patch, tokens_hw=self.tokens_hw)
         sizes = {"N": self.method.n, "P": rows * columns}
