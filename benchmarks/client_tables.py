@@ -17,6 +17,7 @@ FIXES: dict[str, tuple[str, str]] = {
     r"found no picture in the tables": ("pictures are video, which it does not decode", "LeRobot's own loader"),
     r"found no poses": ("a source without poses", "a source with poses, or a LeRobot format"),
     r"knows no depth": ("knows no depth", "LeRobot 0.6 or later"),
+    r"lerobot-rollout is in": ("has no `lerobot-rollout`", "LeRobot 0.6 or later"),
     r"\Anot installed\Z|\Anot run\Z": ("not run", "an environment with it, see the command below"),
 }
 
@@ -99,7 +100,7 @@ def _trained() -> Iterator[Outcome]:
 def _plugin() -> Iterator[Outcome]:
     """Rows of lerobot_plugin.json, one for each test of the package."""
     for row in _read("lerobot_plugin"):
-        yield Outcome("LeRobot", row["lerobot"], "tests of `lerobot-dhtorch`", row["passed"], row["why"])
+        yield Outcome("LeRobot", row["lerobot"], "tests of `integrations/lerobot`", row["passed"], row["why"])
 
 
 def _readers() -> Iterator[Outcome]:

@@ -132,6 +132,7 @@ SCRIPTS |= {
     "readers_3d": "",
     "tiny_field": "",
     "lerobot_train": "",
+    "lerobot_plugin": "",  # interpreters named by --lerobot
 }
 
 #: Speeds again: with the vectors of processors that lack AVX-512, and where freed memory stays with the process, as in
@@ -145,7 +146,7 @@ NAMED = {
     "loader_workers0": "loader",
     "dense_speed": "dense",
     "clients": "clients/all",
-    **{name: f"clients/{name}" for name in ("readers_3d", "tiny_field", "lerobot_train")},
+    **{name: f"clients/{name}" for name in ("readers_3d", "tiny_field", "lerobot_train", "lerobot_plugin")},
     "validate_speed": "validate",
     "self_calibration": "learning/self_calibration",
     "far_labels": "learning/far_labels",

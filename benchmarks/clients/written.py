@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pyarrow import array, parquet
@@ -22,9 +23,9 @@ EPISODES, LENGTH = 2, 6
 LONG = 10
 
 
-def seen(length: int = LENGTH) -> list[list[list[Frame]]]:
+def seen(length: int = LENGTH, **options: Any) -> list[list[list[Frame]]]:
     """Camera → episode → frames of a robot that walks through the built-in room."""
-    sized = {"n_frames": length, "hw": (96, 128), "depth_hw": (48, 64), "supersample": 1, "range_limit": 3.0}
+    sized = {"n_frames": length, "hw": (96, 128), "depth_hw": (48, 64), "supersample": 1, "range_limit": 3.0} | options
     rigs = [open_two_cameras(seed=seed, **sized)[0].recording for seed in range(2, 2 + EPISODES)]
     spans = range(0, length), range(length, 2 * length)
     return [[[rig[i] for i in span] for rig in rigs] for span in spans]
@@ -37,9 +38,12 @@ def hand(frame: Frame) -> np.ndarray:
     return np.append(_solve_joints(np.linalg.inv(BASE) @ T), 0.02 + 0.01 * np.sin(40 * T[2, 3]))
 
 
-def write_robot(root: Path, keys: Sequence[str] = CAMERAS, length: int = LENGTH) -> None:
-    """A LeRobot v2.1 set of cameras with depth, a state of 8 numbers, and as action the state a frame later."""
-    cameras = seen(length)[: len(keys)]
+def write_robot(root: Path, keys: Sequence[str] = CAMERAS, length: int = LENGTH, **options: Any) -> None:
+    """A LeRobot v2.1 set of cameras with depth, a state of 8 numbers, and as action the state a frame later.
+
+    ``options`` are those of the room (:func:`dhtorch.synthetic.two_cameras.open_two_cameras`).
+    """
+    cameras = seen(length, **options)[: len(keys)]
     for key, episodes in zip(keys, cameras, strict=True):
         at = root if key == keys[0] else root.with_name(f"{root.name}-{key}")
         write_lerobot(at, episodes, version=2, camera=key, image="image", depth="tiff", fps=30, poses=False)

@@ -65,13 +65,18 @@ def test_commands_plugin_and_readers_have_rows_and_what_was_not_run_never_passes
     found = {(name, command): (passed, why) for name, _, command, passed, _, why, _ in cells(client_tables.clients())}
     assert found == {
         ("LeRobot", "`lerobot-train --policy.type=act`"): ("not run", "not run"),
-        ("LeRobot", "tests of `lerobot-dhtorch`"): ("2 of 2", ""),
+        ("LeRobot", "tests of `integrations/lerobot`"): ("2 of 2", ""),
         ("Open3D", "`dhtorch PATH`"): ("0 of 1", "a / b"),
     }
 
 
 def test_every_failure_in_the_result_files_has_a_fix():
-    for outcome in (*client_tables._loaders(), *client_tables._trained(), *client_tables._readers()):
+    for outcome in (
+        *client_tables._loaders(),
+        *client_tables._trained(),
+        *client_tables._plugin(),
+        *client_tables._readers(),
+    ):
         if not outcome.passed:
             assert client_tables.explain(outcome.why)[1], outcome
 

@@ -1,0 +1,23 @@
+"""dhtorch in LeRobot: an import registers the processor steps and the camera type ``dhtorch``."""
+
+from lerobot_camera_dhtorch.camera import DhtorchCamera
+from lerobot_camera_dhtorch.config_dhtorch import DhtorchCameraConfig
+from lerobot_camera_dhtorch.steps import (
+    ExtendDepthStep,
+    GeometryImageStep,
+    MaskSilenceStep,
+    PointCloudStep,
+    ValidateDepthStep,
+    insert_steps,
+)
+
+__all__ = [
+    "DhtorchCamera",
+    "DhtorchCameraConfig",
+    "ExtendDepthStep",
+    "GeometryImageStep",
+    "MaskSilenceStep",
+    "PointCloudStep",
+    "ValidateDepthStep",
+    "insert_steps",
+]
