@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import statistics
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -27,6 +28,7 @@ import learning_tables
 import mutants
 import pose_tables
 import reader_tables
+import reproduce
 import speed_tables
 from cells import number, percent, table
 
@@ -258,7 +260,7 @@ def row_of(name: str, scene: str, method: str) -> dict[str, Any]:
 
 
 def how_good() -> str:
-    """README's one table: what is answered, how well, and at what price, by method."""
+    """Coverage, errors and time of the methods on the shared scenes."""
     sparse = json.loads((RESULTS / "method_comparison.json").read_text())["summary"]
     pixels = json.loads((RESULTS / "dense.json").read_text())["summary"]
     rows = []
@@ -266,12 +268,36 @@ def how_good() -> str:
         cells = [percent(sparse.get(f"{m}.{key}", {}).get("value")) for m in README_METHODS]
         rows.append([words, *cells, percent(pixels.get(f"dense.{DENSE_KEY.get(key, key)}", {}).get("value"))])
     turned = [percent(row_of("method_comparison", TURNED, m)["coverage"]) for m in README_METHODS]
-    rows.append(["answered where the camera only turns", *turned, percent(pixels["dense.rotation_answered"]["value"])])
+    rows.append(["coverage where the camera only turns", *turned, percent(pixels["dense.rotation_answered"]["value"])])
     timed = [(timing(file, name), side) for file, name, side in TIMED]
     where = " and ".join(sorted({r["processor"] for r, _ in timed}))
     rows.append([f"ms a reference view of 640×480, one thread ({where})", *(f"{r[s]:,.0f}" for r, s in timed)])
     rows[-1][-1] = "as `fused`"
     return table(["median over eleven scenes", *(f"`{m}`" for m in (*README_METHODS, "dense"))], rows)
+
+
+def untouched() -> str:
+    """README's one table: coverage and errors on scenes that no constant was chosen on, beside peers."""
+    samples = json.loads((RESULTS / "untouched.json").read_text())
+    maps = json.loads((RESULTS / "untouched_dense.json").read_text())
+    over_scenes = {
+        name: [r for r in maps["rows"] if r["pair"] is None and (r["method"], r["truth"]) == (name, "full")]
+        for name in UNTOUCHED_MAPS
+    }
+
+    def of_maps(name: str, key: str) -> str:
+        values = [row[key] for row in over_scenes[name] if row.get(key) is not None]
+        return percent(statistics.median(values) if values else None)
+
+    rows = []
+    for key, words in GOOD.items():
+        cells = [percent(samples["summary"].get(f"{m}.{key}", {}).get("value")) for m in UNTOUCHED_METHODS]
+        rows.append([words, *cells, *(of_maps(name, key) for name in UNTOUCHED_MAPS)])
+    n = len({r["scene"] for r in maps["rows"]})
+    heads = [f"median over {n} scenes", *(f"`{m}`" for m in UNTOUCHED_METHODS), *UNTOUCHED_MAPS.values()]
+    commit = samples["meta"]["git"]["commit"][:8] if samples["meta"].get("git") else "an exported tree"
+    made = f"`{reproduce.command('untouched')}` and `experiment=dense_comparison`, commit {commit}."
+    return f"{table(heads, rows)}\n\n{made}"
 
 
 def timing(file: str, name: str) -> dict[str, Any]:
@@ -280,15 +306,20 @@ def timing(file: str, name: str) -> dict[str, Any]:
     return next(r for r in speed_tables.timings(file) if (r["name"], r["threads"], r["mode"]) == wanted)
 
 
-#: What README's table says, in words; what a dense map calls it; the scene without a baseline; what was timed.
+#: What the tables say, in words; what a dense map calls it; the scene without a baseline; what was timed.
 GOOD = {
-    "coverage": "answered",
+    "coverage": "coverage",
     "median_rel": "median error",
-    "p90_rel": "nine in ten are within",
-    "wrong_share": "off by more than a fifth",
-    "coverage_at_5": "answered at 5 % mean error",
+    "p90_rel": "p90 error",
+    "wrong_share": "errors above 20 %",
+    "coverage_at_5": "coverage at 5 % risk",
     "within_sigma": "errors within one stated sigma (68 % wanted)",
 }
+
+#: Methods of samples, and maps, in README's table.
+UNTOUCHED_METHODS = ("paper", "map", "auto", "fused")
+UNTOUCHED_MAPS = {"dense": "map of `fused`", "sgbm": "OpenCV SGBM", "bilateral": "filled sensor"}
+
 DENSE_KEY = {"coverage": "answered"}
 TURNED = "tum_fr1_rpy_a"
 README_METHODS = ("paper", "opencv", "map", "auto", "fused")
@@ -675,7 +706,7 @@ SUPPORTED = (
 PIPELINES = ("rh20t_probe", "vo_probe", "vo_probe_streams", "vo_probe_rooms", "learned_score")
 NEGATIVE = ("helix_correlation", "defocus", "focus_stack", "defocus_fusion", "icp", "hole_attention")
 TABLES |= {"verdicts": partial(verdicts, SUPPORTED), "negative": partial(verdicts, NEGATIVE)}
-TABLES |= {"fidelity": fidelity.table, "fidelity commands": fidelity.commands}
+TABLES |= {"untouched": untouched, "fidelity": fidelity.table, "fidelity commands": fidelity.commands}
 TABLES |= {"pipelines": partial(verdicts, PIPELINES), "map": partial(verdicts, ("global_map",))}
 
 

@@ -41,6 +41,8 @@ ROOMS = ",".join(str(seed) for seed in range(100, 124))
 #: Result of an experiment → the options of ``dhtorch``; pictures are left out of all of them.
 EXPERIMENTS = {
     "method_comparison": f"experiment=method_comparison data=shared_scenes {WITHOUT_SLOW} experiment.seeds=2",
+    "untouched": f"experiment=method_comparison data=untouched {WITHOUT_SLOW} experiment.seeds=1",
+    "untouched_dense": "experiment=dense_comparison data=untouched experiment.reference_views=3",
     "kornia_twin": "experiment=method_comparison data=shared_scenes experiment.seeds=1 ~experiment.methods.opencv "
     "~experiment.methods.xfeat ~experiment.methods.map ~experiment.methods.auto_2 ~experiment.methods.auto "
     "~experiment.methods.fused",

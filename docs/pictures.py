@@ -102,15 +102,15 @@ def triptych(path: Path) -> None:
         shown = axis.imshow(np.where(mask, depth, np.nan), cmap=colours.DEPTH_CMAP, vmin=DEPTHS[0], vmax=DEPTHS[1])
     titles = (
         f"holo_a, frame {int(recording.number[FRAME])}",
-        f"a sensor that reaches {CUTOFF:g} m: {100 * sensed.mean():.0f} %",
-        f"completed: {100 * known.mean():.0f} %, the rest is silent",
+        f"sensor, returns within {CUTOFF:g} m: {100 * sensed.mean():.0f} % of the pixels",
+        f"completed: {100 * known.mean():.0f} %; white: no depth, with a reason",
     )
     for axis, title in zip(axes, titles, strict=True):
         axis.set_title(title, fontsize=13)
         axis.axis("off")
     figure.subplots_adjust(wspace=0.03)
     figure.colorbar(shown, ax=axes, label="depth, m", shrink=0.78, pad=0.01)
-    figure.savefig(path, dpi=90, bbox_inches="tight", pil_kwargs={"quality": 88})
+    figure.savefig(path, dpi=160, bbox_inches="tight", pil_kwargs={"quality": 88})
 
 
 def maps(path: Path) -> None:
