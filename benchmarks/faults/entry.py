@@ -226,7 +226,7 @@ FAULTS: dict[str, list[tuple[str, ...]]] = {
         ("ExtendDepth._run_method", '"hint": self.hint, ', ""),
         ("ExtendDepth._seeds", "index.long().cpu() + self.seed", "index.long().cpu()"),
         ("ExtendDepth._seeds", "index.shape[0] != batch or index.is_floating_point()", "index.shape[0] != batch"),
-        ("ExtendDepth._blank_columns", "rows * columns", "rows + columns"),
+        ("ExtendDepth.blank_columns", "rows * columns", "rows + columns"),
         ("ExtendDepth._column_options", "self.views.pose is not None", "True"),
     ],
     "transforms.schema": [
