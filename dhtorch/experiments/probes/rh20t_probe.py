@@ -105,7 +105,7 @@ def run(
         dinov2: builds the network; None = leave it out.
         xfeat, efficientnet: also run XFeat's dense features, EfficientNet-Lite0's; their packages contain the trained
             weights.
-        features: folder that keeps the features, so that an interrupted run goes on; None = a temporary one.
+        features: folder that keeps the features, so that an interrupted run resumes; None = a temporary one.
         progress: wraps the loop over a scene's samples.
 
     Returns:

@@ -102,7 +102,7 @@ def run(
         blocks: consecutive parts of a scene, at least three; split evenly over the scenes of a room.
         min_pairs: smallest number of pairs of a room.
         moving: m; a pair moves if the camera's translation is larger.
-        features: folder that keeps the features, so that an interrupted run goes on; None = a temporary one.
+        features: folder that keeps the features, so that an interrupted run resumes; None = a temporary one.
         penalties, depth_cells, dinov2_cells, rgb_side, dinov2, xfeat, efficientnet, progress: as
             :func:`dhtorch.experiments.probes.rh20t_probe.run`.
 
