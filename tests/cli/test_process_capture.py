@@ -52,9 +52,11 @@ def test_the_page_begins_with_the_numbers_and_the_picture(made):
     pixels = sum(count_estimated(row["pixels"]) for row in rows) / len(rows)
     opening = page[page.index('<section id="opening"') : page.index("<main>")]
     assert f"<dd>{pixels:,.0f}</dd>" in opening and "Median sigma / depth" in opening
-    assert base64.b64encode((made / "overview.png").read_bytes()).decode() in opening
+    poster = page[page.index('<section id="poster"') :]
+    assert page.index("</main>") < page.index('<section id="poster"'), "the map comes first"
+    assert base64.b64encode((made / "overview.png").read_bytes()).decode() in poster
     assert "Recovered " in opening and "Most frequent reasons for no answer: " in opening and "no_track" not in opening
-    assert "kitchen, frame" in opening and ", with frame" in opening, "whose picture, and of which views"
+    assert "kitchen, frame" in poster and ", with frame" in poster, "whose picture, and of which views"
 
 
 @pytest.mark.slow

@@ -57,6 +57,7 @@ def build_viewer_page(scene: Exhibit) -> str:
         "title": escape_html(f"{scene.name} · dhtorch"),
         "style": build_style_sheet(_FOLDER / "page.css"),
         "opening": _format_opening(scene.opening) if scene.opening is not None else "",
+        "poster": _format_poster(scene.opening) if scene.opening is not None else "",
         # "</script" and "<!--" must not occur in a script; in JSON strings an escape is equivalent.
         "data": text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
         "script": "\n".join(_read_asset(name) for name in _SCRIPTS),
@@ -80,16 +81,22 @@ def write_viewer_page(path: Path, scene: Exhibit) -> Path:
 
 
 def _format_opening(opening: PageOpening) -> Markup:
-    """Opening -> markup: numbers, sentences and an image, above the 3D view."""
+    """Opening -> markup: numbers and sentences, above the 3D view."""
     numbers = (
         make_tag("div", make_tag("dt", what), make_tag("dd", amount)) for what, amount in opening.numbers.items()
     )
     parts = [make_tag("dl", *numbers, class_="numbers"), *(make_tag("p", text) for text in opening.sentences)]
-    if opening.picture is not None:
-        shown = make_tag("img", alt=opening.caption, src=encode_png_uri(opening.picture))
-        below = make_tag("figcaption", opening.caption) if opening.caption else ""
-        parts.append(make_tag("figure", make_tag("div", shown, class_="scroll", tabindex="0"), below))
     return make_tag("section", *parts, id="opening", aria_label="What was recovered")
+
+
+def _format_poster(opening: PageOpening) -> Markup | str:
+    """Opening -> markup of its image, below the 3D view; empty without one."""
+    if opening.picture is None:
+        return ""
+    shown = make_tag("img", alt=opening.caption, src=encode_png_uri(opening.picture))
+    below = make_tag("figcaption", opening.caption) if opening.caption else ""
+    figure = make_tag("figure", make_tag("div", shown, class_="scroll", tabindex="0"), below)
+    return make_tag("section", figure, id="poster", aria_label="A frame and its depth")
 
 
 def _encode_exhibit(scene: Exhibit) -> dict[str, Any]:
