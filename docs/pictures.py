@@ -102,8 +102,8 @@ def triptych(path: Path) -> None:
         shown = axis.imshow(np.where(mask, depth, np.nan), cmap=colours.DEPTH_CMAP, vmin=DEPTHS[0], vmax=DEPTHS[1])
     titles = (
         f"holo_a, frame {int(recording.number[FRAME])}",
-        f"sensor, returns within {CUTOFF:g} m: {100 * sensed.mean():.0f} % of the pixels",
-        f"completed: {100 * known.mean():.0f} %; white: no depth, with a reason",
+        f"sensor, within {CUTOFF:g} m: {100 * sensed.mean():.0f} %",
+        f"completed: {100 * known.mean():.0f} % of the pixels",
     )
     for axis, title in zip(axes, titles, strict=True):
         axis.set_title(title, fontsize=13)
