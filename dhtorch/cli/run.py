@@ -400,7 +400,13 @@ def _show_hydra_info(name: str, argv: list[str]) -> int:
     # Hydra expects the options side by side, before or behind its own flags with their values.
     argv = sorted(argv, key=lambda word: word.startswith("-") or not ("=" in word or word[:1] in ("~", "+")))
     sys.argv = [sys.argv[0], *argv]
-    hydra.main(config_path=str(config_dir()), config_name=name, version_base="1.3")(_run_hydra_job)()
+    root = logging.getLogger()
+    handlers, level = list(root.handlers), root.level
+    try:
+        hydra.main(config_path=str(config_dir()), config_name=name, version_base="1.3")(_run_hydra_job)()
+    finally:  # Hydra's handlers hold today's stdout
+        root.handlers[:] = handlers
+        root.setLevel(level)
     return EXIT_DONE
 
 

@@ -1,5 +1,6 @@
 """One way to type every command: ``dhtorch COMMAND PATH [--option value | option=value ...]``, and its help."""
 
+import logging
 import re
 import shlex
 from types import SimpleNamespace
@@ -218,6 +219,8 @@ def test_deletions_and_additions_of_hydra_are_no_paths(words):
 @pytest.mark.parametrize("flags", [["--cfg", "job"], ["-c", "job"], ["--info", "defaults-tree"]])
 def test_hydra_s_own_flags_go_with_deletions(command, flags):
     argv = ["experiment=method_comparison", "~method@experiment.methods.kornia", *flags, "experiment.seeds=1"]
+    handlers = list(logging.getLogger().handlers)
     code, out, err = command("run", *argv)
     assert code == 0, err
+    assert logging.getLogger().handlers == handlers, "a later job of the process would write to a closed stream"
     assert not re.search(r"^ +kornia:", out, re.M)

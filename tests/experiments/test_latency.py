@@ -9,6 +9,7 @@ from support.rooms import room as rendered
 from support.rooms import room_scene
 
 from dhtorch import extend
+from dhtorch.data import FormatError
 from dhtorch.data.pairs import by_gap
 from dhtorch.experiments import memory
 from dhtorch.experiments.baselines import dinov2
@@ -152,7 +153,7 @@ def test_dinov2_shapes_seed_and_local_weights(tmp_path):
             pixel_values=dinov2.preprocess_image(image, 56)
         ).last_hidden_state
     assert torch.equal(tokens, local)
-    with pytest.raises(FileNotFoundError, match="nowhere"):
+    with pytest.raises(FormatError, match="nowhere"):
         dinov2.load_dinov2(tmp_path / "nowhere")
 
 

@@ -63,7 +63,7 @@ def probe_result(cells: int, seed: int) -> dict[str, Any]:
     """Result of ``vo_probe`` on one scene, with random errors."""
     generator = torch.Generator().manual_seed(seed)
     errors = ProbeErrors([f"room {k}" for k in range(5)])
-    arms = [arm for arm, blocks in PROBE_ARMS.items() if not any("xfeat" in block for block in blocks)]
+    arms = [arm for arm, blocks in PROBE_ARMS.items() if not {"xfeat", "efficientnet"} & set(blocks)]
     for cohort in ("moving", "all"):
         errors.counts[cohort] = torch.full((5,), 20.0, dtype=torch.float64)
         errors.squares |= {(arm, cohort): 10 + 10 * torch.rand(5, generator=generator).double() for arm in arms}
@@ -83,7 +83,7 @@ def probe_result(cells: int, seed: int) -> dict[str, Any]:
 def test_a_probe_sweep_has_error_ratio_and_interval_in_every_cell(tmp_path: Path) -> None:
     results = [probe_result(cells, seed) for seed, cells in enumerate((1, 2, 4))]
     table = jobs.jobs_table(results)
-    assert table is not None and len(table.rows) == 3 * 6
+    assert table is not None and len(table.rows) == 3 * 8
     assert table.head[:2] == ["experiment.depth_cells", "method"]
     assert table.head[2::2] == ["squared error / variance", "ratio to context", "ratio to DINOv2"]
     assert not any(cell in ("", EMPTY_CELL) for row in table.rows for cell in row), "no empty cell"
@@ -101,8 +101,8 @@ def test_a_job_without_values_says_why(tmp_path: Path) -> None:
         results[1]["summary"][name] = {"value": None, "low": None, "high": None, "n": 0, "unit": "1"}
     results[1]["rows"] = [{**row, "note": "5 pairs, fewer than 30"} for row in results[1]["rows"]]
     table = jobs.jobs_table(results)
-    assert table is not None and table.head[-1] == "note" and len(table.rows) == 7
-    assert [row[-1] for row in table.rows] == [""] * 6 + ["room: 5 pairs, fewer than 30"]
+    assert table is not None and table.head[-1] == "note" and len(table.rows) == 9
+    assert [row[-1] for row in table.rows] == [""] * 8 + ["room: 5 pairs, fewer than 30"]
     rows = list(csv.DictReader(jobs.write_jobs_csv(tmp_path / "sweep.csv", results).read_text().splitlines()))
     assert rows[-1]["note"] == "room: 5 pairs, fewer than 30" and rows[-1]["mse"] == "" and rows[0]["note"] == ""
 

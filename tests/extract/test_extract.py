@@ -300,7 +300,7 @@ def test_a_corrupt_frame_is_flagged_with_zeros(damaged, command):
         (["out=file", "data.n_frames=3"], ["file", "expected a folder"]),
         (["out=file/below", "data.n_frames=3"], ["file"]),
         (["out=x", "method=window", "extract.gap=3"], ["views", "5"]),
-        (["--out", "x"], ["--out", "unknown flag"]),
+        (["--outt", "x"], ["--outt", "unknown option"]),
     ],
 )  # fmt: skip
 def test_bad_input_gets_one_clear_line(command, args, words):

@@ -343,7 +343,7 @@ def test_wrong_shapes_and_options_raise():
 
 def test_a_mesh_without_scikit_image_names_the_extra(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "skimage.measure", None)
-    with pytest.raises(ImportError, match=r"dhtorch\[mesh\]"):
+    with pytest.raises(ImportError, match=r"pip install scikit-image"):
         extract_mesh(make_volume())
 
 

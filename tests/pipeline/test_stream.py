@@ -108,7 +108,7 @@ def test_the_command_streams_a_recording(tmp_path, capsys) -> None:
     assert scene["frames"][0]["n_recovered"] == 0 < scene["frames"][0]["n_holes"]
     assert scene["frames"][2]["n_recovered"] > 0 and not scene["cuts"]
     assert main(["stream", *options, "max_frames=0", f"output={tmp_path}"]) == 2
-    assert "most: found 0" in capsys.readouterr().err
+    assert "max_frames: found 0" in capsys.readouterr().err
 
 
 def test_wrong_frames_and_steps_are_refused(frames: list[Frame]) -> None:

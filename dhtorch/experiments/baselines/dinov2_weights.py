@@ -162,7 +162,7 @@ def _read_folder(folder: Path) -> Dinov2Weights:
     """Weights of a folder of ``save_pretrained``; its ``config.json`` must name a DINOv2 model."""
     config_file = folder / "config.json"
     try:
-        config = json.loads(config_file.read_text())
+        config = json.loads(config_file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise FormatError(config_file, "file", f"{type(error).__name__}", "config.json of a DINOv2 network") from None
     model_type = config.get("model_type") if isinstance(config, dict) else config
