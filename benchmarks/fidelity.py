@@ -98,7 +98,7 @@ FINDINGS: tuple[Finding, ...] = (
     Finding(published.FUTURE_MOTION_MOVING, "DH-Active", "vs_dinov2", "rh20t_probe", "dhtorch.moving.vs_dinov2"),
     *(
         Finding(published.VISUAL_ODOMETRY, line, metric, name, f"{arm}.{metric}")
-        for name in ("vo_probe", "vo_probe_streams", "vo_probe_rooms")
+        for name in ("vo_probe", "vo_probe_streams")
         for line, arm in (("DH-Active", "dhtorch"), ("DINOv2", "dinov2"))
         for metric in ("mse", "vs_dinov2")
         if metric in published.VISUAL_ODOMETRY.lines[line]

@@ -162,25 +162,25 @@ def main() -> int:
     git = subprocess.run(
         ["git", "rev-parse", "--short=8", "HEAD"], cwd=REPO, capture_output=True, text=True, check=False
     )
-    result = json.loads(options.json.read_text(encoding="utf-8")) if options.json.is_file() else {"captures": {}}
+    rows = json.loads(options.json.read_text(encoding="utf-8")) if options.json.is_file() else []
+    played = {(row["capture"], row["role"]): row for row in rows}
     began, found = time.monotonic(), captures(Path(os.environ["DHTORCH_DATA"]))
     wanted = options.only.split(",") if options.only else list(found)
     for name in wanted:
-        rows = result["captures"].setdefault(name, {})
         for role in options.roles.split(","):
             if time.monotonic() - began > 60 * options.minutes:
                 break
-            if role in rows and not (options.again and rows[role]["end"] == "failed"):
+            if (name, role) in played and not (options.again and played[name, role]["end"] == "failed"):
                 continue
             start = time.monotonic()
-            rows[role] = play(role, found[name]) | {"commit": git.stdout.strip()}
+            end = play(role, found[name])
+            played[name, role] = {"capture": name, "role": role, **end, "commit": git.stdout.strip()}
             seconds = time.monotonic() - start
-            print(f"{name}: {role}: {rows[role]['end']} {rows[role].get('sentence', '')} ({seconds:.0f} s)", flush=True)
-            result["ends"] = dict(
-                Counter(row["end"] for roles in result["captures"].values() for row in roles.values())
-            )
-            options.json.write_text(json.dumps(result, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    return int(any(row["end"] == "failed" for roles in result["captures"].values() for row in roles.values()))
+            print(f"{name}: {role}: {end['end']} {end.get('sentence', '')} ({seconds:.0f} s)", flush=True)
+            text = json.dumps(list(played.values()), indent=1, ensure_ascii=False)
+            options.json.write_text(text + "\n", encoding="utf-8")
+    print(dict(Counter(row["end"] for row in played.values())))
+    return int(any(row["end"] == "failed" for row in played.values()))
 
 
 if __name__ == "__main__":

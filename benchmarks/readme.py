@@ -703,7 +703,7 @@ SUPPORTED = (
     *("hole_census", "device_pose", "motion", "ablation", "latency"),
     *("room_range_split", "room_gate_ablation", "room_device_pose", "room_real_holes", "paths_motion"),
 )
-PIPELINES = ("rh20t_probe", "vo_probe", "vo_probe_streams", "vo_probe_rooms", "learned_score")
+PIPELINES = ("rh20t_probe", "vo_probe", "vo_probe_streams", "learned_score")
 NEGATIVE = ("helix_correlation", "defocus", "focus_stack", "defocus_fusion", "icp", "hole_attention")
 TABLES |= {"verdicts": partial(verdicts, SUPPORTED), "negative": partial(verdicts, NEGATIVE)}
 TABLES |= {"untouched": untouched, "fidelity": fidelity.table, "fidelity commands": fidelity.commands}

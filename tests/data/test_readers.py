@@ -263,7 +263,10 @@ def test_nothing_there_or_unknown(tmp_path: Path, named: Path) -> None:
     every = ", ".join(data.FORMATS)
     fails(r"format: found an empty folder, expected from a phone: Record3D's \.r3d", tmp_path / "empty")
     (tmp_path / "scan.xyz").write_text("1 2 3")
-    fails(r"scan.xyz: format: found a finished 3D model without its frames, expected the frames, from a phone", tmp_path / "scan.xyz")
+    fails(
+        r"scan.xyz: format: found a finished 3D model without its frames, expected the frames, from a phone",
+        tmp_path / "scan.xyz",
+    )
     for format in data.FORMATS:  # also where the reader is named and the path is a file
         fails(r"scan.xyz", tmp_path / "scan.xyz", format)
     fails(rf"format: found kitti, expected auto, {every}", named, "kitti")
