@@ -78,3 +78,16 @@ def test_a_constant_without_origin_is_found(tmp_path, monkeypatch):
         "class FitOptions:\n    #: Weight. Source: origin not recorded.\n    d: float = 0.1\n    e: int = 2\n"
     )
     assert list(without_source(file)) == ["module.py:5: B, C", "module.py:10: e"]
+
+
+def test_no_constant_was_chosen_on_the_untouched_scenes():
+    """README's numbers are of ``data=untouched``: whatever cites one of its scenes as an origin would be tuned to it."""
+    scenes = re.compile(r"untouched|middlebury_2005|slambook|seeds? 100\d", re.I)
+    cited = [
+        f"{path.relative_to(ROOT)}: {comment}"
+        for path in sorted(ROOT.rglob("*.py"))
+        for comment in re.findall(r"Source:[^\n]*(?:\n\s*#:?[^\n]*)*", path.read_text(encoding="utf-8"))
+        if scenes.search(comment.split("Source:")[1]) and "vision.middlebury.edu" not in comment
+    ]
+    calibrations = [p.name for p in sorted(ROOT.rglob("*.json")) if scenes.search(p.read_text(encoding="utf-8"))]
+    assert cited == [] and calibrations == []
