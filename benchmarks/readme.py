@@ -28,7 +28,6 @@ import learning_tables
 import mutants
 import pose_tables
 import reader_tables
-import reproduce
 import speed_tables
 from cells import number, percent, table
 
@@ -278,26 +277,30 @@ def how_good() -> str:
 
 def untouched() -> str:
     """README's one table: coverage and errors on scenes that no constant was chosen on, beside peers."""
-    samples = json.loads((RESULTS / "untouched.json").read_text())
-    maps = json.loads((RESULTS / "untouched_dense.json").read_text())
-    over_scenes = {
-        name: [r for r in maps["rows"] if r["pair"] is None and (r["method"], r["truth"]) == (name, "full")]
-        for name in UNTOUCHED_MAPS
-    }
-
-    def of_maps(name: str, key: str) -> str:
-        values = [row[key] for row in over_scenes[name] if row.get(key) is not None]
-        return percent(statistics.median(values) if values else None)
-
+    samples, maps = (json.loads((RESULTS / f"{name}.json").read_text()) for name in ("untouched", "untouched_dense"))
+    scenes = {row["scene"] for row in samples["rows"]}  # the other file has stress rooms as well
+    maps["rows"] = [row for row in maps["rows"] if row["scene"] in scenes]
+    columns = [(samples, m, f"`{m}`") for m in UNTOUCHED_METHODS]
+    columns += [(maps, m, words) for m, words in UNTOUCHED_MAPS.items()]
     rows = []
-    for key, words in GOOD.items():
-        cells = [percent(samples["summary"].get(f"{m}.{key}", {}).get("value")) for m in UNTOUCHED_METHODS]
-        rows.append([words, *cells, *(of_maps(name, key) for name in UNTOUCHED_MAPS)])
-    n = len({r["scene"] for r in maps["rows"]})
-    heads = [f"median over {n} scenes", *(f"`{m}`" for m in UNTOUCHED_METHODS), *UNTOUCHED_MAPS.values()]
-    commit = samples["meta"]["git"]["commit"][:8] if samples["meta"].get("git") else "an exported tree"
-    made = f"`{reproduce.command('untouched')}` and `experiment=dense_comparison`, commit {commit}."
-    return f"{table(heads, rows)}\n\n{made}"
+    for label, is_room in (("real", False), ("rooms", True)):
+        for key in UNTOUCHED_KEYS:
+            cells = [percent(_median_over_scenes(result, method, key, is_room)) for result, method, _ in columns]
+            rows.append([f"{label}: {GOOD[key]}", *cells])
+    n = [len(_scenes_of(samples, UNTOUCHED_METHODS[0], is_room)) for is_room in (False, True)]
+    about = f"medians over {n[0]} real scenes, {n[1]} rooms; commit {samples['meta']['git']}"
+    return table([about, *(words for *_, words in columns)], rows)
+
+
+def _scenes_of(result: dict[str, Any], method: str, is_room: bool) -> list[dict[str, Any]]:
+    """Rows of a method over whole scenes: the built-in rooms, or the others."""
+    chosen = [r for r in result["rows"] if r["pair"] is None and (r["method"], r.get("truth")) == (method, "full")]
+    return [row for row in chosen if row["scene"].startswith("synthetic") is is_room]
+
+
+def _median_over_scenes(result: dict[str, Any], method: str, key: str, is_room: bool) -> float | None:
+    values = [row[key] for row in _scenes_of(result, method, is_room) if row.get(key) is not None]
+    return statistics.median(values) if values else None
 
 
 def timing(file: str, name: str) -> dict[str, Any]:
@@ -316,7 +319,8 @@ GOOD = {
     "within_sigma": "errors within one stated sigma (68 % wanted)",
 }
 
-#: Methods of samples, and maps, in README's table.
+#: Rows, methods of samples, and maps, in README's table.
+UNTOUCHED_KEYS = ("coverage", "median_rel", "p90_rel", "coverage_at_5")
 UNTOUCHED_METHODS = ("paper", "map", "auto", "fused")
 UNTOUCHED_MAPS = {"dense": "map of `fused`", "sgbm": "OpenCV SGBM", "bilateral": "filled sensor"}
 
