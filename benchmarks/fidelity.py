@@ -115,7 +115,7 @@ def table() -> str:
 def commands() -> str:
     """The commands of the files in the table, in Markdown."""
     names = dict.fromkeys(finding.result for finding in FINDINGS)
-    return "\n".join(f"- `{name}.json`: `{reproduce.command(name)}`" for name in names)
+    return "\n".join(f"- `{name}.json`: `dhtorch {reproduce.EXPERIMENTS[name]}`" for name in names)
 
 
 def _cells() -> Iterator[list[str]]:
