@@ -179,10 +179,7 @@ OUTDATED |= {"views_study", *(f"validate_study{of}" for of in ("", "_streams", "
 #: Those in which ``paper``, ``paper_dlt`` or ``kornia`` still jumps from view to view.
 OUTDATED |= {
     "ablation",
-    "calibration",
-    "device_pose",
     "gate_ablation",
-    "heldout",
     "hole_census",
     "kornia_twin",
     "latency",
