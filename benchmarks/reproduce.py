@@ -173,7 +173,7 @@ LEFT_OUT: dict[str, Any] = {"pose_samples": 0, "verify_views": None, "guide": No
 LEFT_OUT |= dict.fromkeys(("trajectory_lag_s", "trajectory_drift_deg_per_s", "trajectory_rotation_noise_deg"), 0.0)
 
 #: Files that were made with other settings than today's, and wait for a quiet machine.
-OUTDATED: set[str] = {"part_ablation", "rh20t_probe", "streams", "stress"}
+OUTDATED: set[str] = {"part_ablation", "streams", "stress"}
 #: Those whose ``auto`` is that of the second release.
 OUTDATED |= {"views_study", *(f"validate_study{of}" for of in ("", "_streams", "_unseen"))}
 #: Those in which ``paper``, ``paper_dlt`` or ``kornia`` still jumps from view to view.
