@@ -517,7 +517,7 @@ def test_points_of_a_file(tmp_path):
     assert "points" in data_of(pages.build_viewer_page(points.read_ply_exhibit(tmp_path / "p.ply")))["about"]
 
 
-def test_what_opens_a_page_is_text_and_stands_before_the_space(tmp_path):
+def test_what_opens_a_page_is_text_and_its_picture_stands_below_the_space(tmp_path):
     evil = '</script><b onload="x">\udcff&'
     export.write_ply(tmp_path / "p.ply", np.ones((1, 3)))
     opening = viewer.PageOpening({evil: evil}, [evil], b"PNG", evil)
@@ -527,8 +527,8 @@ def test_what_opens_a_page_is_text_and_stands_before_the_space(tmp_path):
     assert (
         made.index("</header>")
         < made.index("<dl class=")
-        < made.index("data:image/png;base64,UE5H")
         < made.index("<main>")
+        < made.index("data:image/png;base64,UE5H")
     )
     assert '<section id="opening"' not in pages.build_viewer_page(points.read_ply_exhibit(tmp_path / "p.ply"))
 
